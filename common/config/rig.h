@@ -1,0 +1,55 @@
+#pragma once
+
+#include <filesystem>
+#include <map>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "common/geometry/pose.h"
+#include "common/schema/body_schema.h"
+
+namespace bodyschema {
+
+/// One tag of a rig's markers.yaml.
+struct TagPlacement {
+  int id = 0;
+  double size_m = 0;  ///< side of the black square
+  int part = 0;
+  /// Pose of the marker on its part; std::nullopt where it was never measured: then the part may
+  /// carry no other tag, and its frame is the marker's.
+  std::optional<Pose> X_BM;
+};
+
+/// markers.yaml: which tags there are and which body part each belongs to.
+struct Markers {
+  std::string family;  ///< AprilTag family, e.g. "tag36h11"
+  std::vector<TagPlacement> tags;  ///< ascending id
+  std::vector<int> parts() const;  ///< ascending, each once
+  const TagPlacement* find(int tag_id) const;
+};
+
+/// signals.yaml: the action signals and their limits, and what the rig calls its root and its end
+/// effector.
+struct Signals {
+  std::vector<Signal> signals;
+  std::optional<int> root_part;
+  int end_effector_part = 0;
+};
+
+/// network.yaml: where the bus of a rig's process group lives.
+struct Network {
+  bool is_private = true;  ///< in a network namespace of its own, else on the host's network
+  int port = 0;            ///< UDP port of the bus; images use port + 1
+  int ttl = 0;
+
+  std::string bus_url() const;
+  std::string images_url() const;
+};
+
+/// @throws ConfigError.
+Markers load_markers(const std::filesystem::path& rig_folder);
+Signals load_signals(const std::filesystem::path& rig_folder);
+Network load_network(const std::filesystem::path& rig_folder);
+
+}  // namespace bodyschema

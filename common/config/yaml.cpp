@@ -1,0 +1,252 @@
+#include "common/config/yaml.h"
+
+#include <algorithm>
+#include <cmath>
+#include <fstream>
+#include <sstream>
+
+#include <yaml-cpp/yaml.h>
+
+namespace bodyschema {
+namespace {
+
+/// Levenshtein distance: what turns an unknown key into "did you mean".
+std::size_t edit_distance(const std::string& a, const std::string& b) {
+  std::vector<std::size_t> row(b.size() + 1);
+  for (std::size_t j = 0; j <= b.size(); ++j) row[j] = j;
+  for (std::size_t i = 1; i <= a.size(); ++i) {
+    std::size_t diagonal = row[0]++;
+    for (std::size_t j = 1; j <= b.size(); ++j) {
+      const std::size_t substituted = diagonal + (a[i - 1] != b[j - 1]);
+      diagonal = row[j];
+      row[j] = std::min({row[j] + 1, row[j - 1] + 1, substituted});
+    }
+  }
+  return row[b.size()];
+}
+
+std::string nearest(const std::string& key, const std::set<std::string>& known) {
+  const auto best = std::min_element(known.begin(), known.end(), [&](const auto& a, const auto& b) {
+    return edit_distance(key, a) < edit_distance(key, b);
+  });
+  if (best == known.end()) return "";
+  return "; did you mean '" + *best + "'?";
+}
+
+bool same_mapping(const YAML::Node& a, const YAML::Node& b) { return a.is(b); }
+
+}  // namespace
+
+struct Yaml::File {
+  std::filesystem::path name;
+  std::string text;
+};
+
+/// What was asked of a mapping, shared by all copies of its Yaml, so that finish() can tell what
+/// was not.
+struct Yaml::Usage {
+  std::set<std::string> asked;
+  std::vector<Yaml> below;
+};
+
+Yaml::Yaml(std::shared_ptr<File> file, const YAML::Node& node, std::string path)
+    : file_(std::move(file)),
+      node_(std::make_shared<YAML::Node>(node)),
+      path_(std::move(path)),
+      usage_(std::make_shared<Usage>()) {
+  if (!node.IsMap()) {
+    throw ConfigError(file_->name.string() + ":" + std::to_string(node.Mark().line + 1) + ": " +
+                      (path_.empty() ? "" : path_ + ": ") + "expected a mapping 'key: value'");
+  }
+  std::set<std::string> keys;
+  for (const auto& entry : node) {
+    const auto key = entry.first.as<std::string>();
+    if (!keys.insert(key).second) throw error(key, "this key stands twice");
+  }
+}
+
+Yaml Yaml::load(const std::filesystem::path& file) {
+  std::ifstream stream(file);
+  if (!stream) throw ConfigError(file.string() + ": cannot be read: no such file or no permission");
+  std::stringstream text;
+  text << stream.rdbuf();
+  if (!stream || stream.bad()) throw ConfigError(file.string() + ": cannot be read");
+  return parse(text.str(), file.string());
+}
+
+Yaml Yaml::parse(const std::string& text, const std::string& name) {
+  auto file = std::make_shared<File>(File{name, text});
+  try {
+    return Yaml(file, YAML::Load(text), "");
+  } catch (const YAML::Exception& problem) {
+    throw ConfigError(name + ":" + std::to_string(problem.mark.line + 1) + ":" +
+                      std::to_string(problem.mark.column + 1) + ": " + problem.msg);
+  }
+}
+
+ConfigError Yaml::error(const std::string& key, const std::string& what) const {
+  int line = node_->Mark().line;
+  for (const auto& entry : *node_) {
+    if (entry.first.as<std::string>() == key) line = entry.first.Mark().line;
+  }
+  const std::string path = path_.empty() ? key : path_ + "." + key;
+  return ConfigError(file_->name.string() + ":" + std::to_string(line + 1) + ": " + path + ": " +
+                     what);
+}
+
+const std::string& Yaml::file_text() const { return file_->text; }
+std::filesystem::path Yaml::file() const { return file_->name; }
+
+bool Yaml::has(const std::string& key) const {
+  usage_->asked.insert(key);
+  return (*node_)[key].IsDefined();
+}
+
+const YAML::Node Yaml::child(const std::string& key) const {
+  if (has(key)) return (*node_)[key];
+  // A key that nobody knows yet may be this one misspelt.
+  std::set<std::string> others;
+  for (const auto& entry : *node_) {
+    const auto name = entry.first.as<std::string>();
+    if (!usage_->asked.count(name) && edit_distance(name, key) <= 1 + key.size() / 3) {
+      others.insert(name);
+    }
+  }
+  throw error(key, others.empty() ? "this key is missing"
+                                  : "this key is missing; is '" + *others.begin() + "' meant?");
+}
+
+double Yaml::number(const std::string& key, double lowest, double highest) const {
+  double value = 0;
+  try {
+    value = child(key).as<double>();
+  } catch (const YAML::Exception&) {
+    throw error(key, "expected a number");
+  }
+  if (!std::isfinite(value)) throw error(key, "expected a finite number");
+  if (value < lowest || value > highest) {
+    std::ostringstream range;
+    range << value << " is outside " << lowest << " … " << highest;
+    throw error(key, range.str());
+  }
+  return value;
+}
+
+std::int64_t Yaml::integer(const std::string& key, std::int64_t lowest,
+                           std::int64_t highest) const {
+  std::int64_t value = 0;
+  try {
+    value = child(key).as<std::int64_t>();
+  } catch (const YAML::Exception&) {
+    throw error(key, "expected an integer");
+  }
+  if (value < lowest || value > highest) {
+    throw error(key, std::to_string(value) + " is outside " + std::to_string(lowest) + " … " +
+                         std::to_string(highest));
+  }
+  return value;
+}
+
+bool Yaml::boolean(const std::string& key) const {
+  try {
+    return child(key).as<bool>();
+  } catch (const YAML::Exception&) {
+    throw error(key, "expected true or false");
+  }
+}
+
+std::string Yaml::text(const std::string& key) const {
+  const YAML::Node node = child(key);
+  if (!node.IsScalar()) throw error(key, "expected a text");
+  return node.as<std::string>();
+}
+
+std::string Yaml::choice(const std::string& key, const std::vector<std::string>& choices) const {
+  const std::string value = text(key);
+  if (std::find(choices.begin(), choices.end(), value) != choices.end()) return value;
+  std::string all;
+  for (const auto& choice : choices) all += (all.empty() ? "" : ", ") + choice;
+  throw error(key, "'" + value + "' is none of: " + all);
+}
+
+std::vector<double> Yaml::numbers(const std::string& key, int count) const {
+  std::vector<double> values;
+  try {
+    values = child(key).as<std::vector<double>>();
+  } catch (const YAML::Exception&) {
+    throw error(key, "expected a list of numbers");
+  }
+  if (count >= 0 && values.size() != static_cast<std::size_t>(count)) {
+    throw error(key, "expected " + std::to_string(count) + " numbers, found " +
+                         std::to_string(values.size()));
+  }
+  for (const double value : values) {
+    if (!std::isfinite(value)) throw error(key, "expected finite numbers");
+  }
+  return values;
+}
+
+std::vector<std::int64_t> Yaml::integers(const std::string& key) const {
+  try {
+    return child(key).as<std::vector<std::int64_t>>();
+  } catch (const YAML::Exception&) {
+    throw error(key, "expected a list of integers");
+  }
+}
+
+Eigen::Vector3d Yaml::vector3(const std::string& key) const {
+  return Eigen::Vector3d(numbers(key, 3).data());
+}
+
+Pose Yaml::pose(const std::string& key) const {
+  const Yaml yaml = section(key);
+  const Eigen::Vector3d position = yaml.vector3("position_m");
+  if (yaml.has("rotation_wxyz")) {
+    const auto wxyz = yaml.numbers("rotation_wxyz", 4);
+    const Eigen::Quaterniond q(wxyz[0], wxyz[1], wxyz[2], wxyz[3]);
+    if (std::abs(q.norm() - 1) > 1e-3) throw yaml.error("rotation_wxyz", "is not a unit quaternion");
+    return make_pose(q, position);
+  }
+  if (!yaml.has("rpy_deg")) return make_pose(Eigen::Quaterniond::Identity(), position);
+  const Eigen::Vector3d rpy = yaml.vector3("rpy_deg") * (M_PI / 180);
+  using Eigen::AngleAxisd;
+  using Eigen::Vector3d;
+  return make_pose(AngleAxisd(rpy.z(), Vector3d::UnitZ()) * AngleAxisd(rpy.y(), Vector3d::UnitY()) *
+                       AngleAxisd(rpy.x(), Vector3d::UnitX()),
+                   position);
+}
+
+Yaml Yaml::section(const std::string& key) const {
+  for (const Yaml& known : usage_->below) {
+    if (has(key) && same_mapping(*known.node_, (*node_)[key])) return known;
+  }
+  const YAML::Node node = child(key);
+  if (!node.IsMap()) throw error(key, "expected a mapping 'key: value'");
+  Yaml below(file_, node, path_.empty() ? key : path_ + "." + key);
+  usage_->below.push_back(below);
+  return below;
+}
+
+std::vector<Yaml> Yaml::list(const std::string& key) const {
+  const YAML::Node node = child(key);
+  if (!node.IsSequence()) throw error(key, "expected a list");
+  std::vector<Yaml> items;
+  for (std::size_t i = 0; i < node.size(); ++i) {
+    items.push_back(Yaml(file_, node[i],
+                         (path_.empty() ? key : path_ + "." + key) + "[" + std::to_string(i) + "]"));
+    usage_->below.push_back(items.back());
+  }
+  return items;
+}
+
+void Yaml::finish() const {
+  for (const auto& entry : *node_) {
+    const auto key = entry.first.as<std::string>();
+    if (!usage_->asked.count(key)) {
+      throw error(key, "this key is unknown" + nearest(key, usage_->asked));
+    }
+  }
+  for (const Yaml& below : usage_->below) below.finish();
+}
+
+}  // namespace bodyschema
