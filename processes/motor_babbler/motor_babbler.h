@@ -1,0 +1,96 @@
+#pragma once
+
+#include <Eigen/Core>
+#include <cstdint>
+#include <filesystem>
+#include <optional>
+#include <string>
+
+#include "bodyschema/action_command_t.hpp"
+#include "bodyschema/model_health_t.hpp"
+#include "bodyschema/motion_status_t.hpp"
+#include "bodyschema/sample_t.hpp"
+#include "common/config/rig.h"
+
+namespace bodyschema {
+
+/// When babbling ends: after max_samples, or from min_samples on once the monitor finds the schema
+/// complete and its worst part within both errors on at least min_test_samples TEST samples.
+struct StoppingRule {
+  std::int64_t min_samples = 0;
+  std::int64_t max_samples = 0;
+  std::int64_t min_test_samples = 0;
+  double position_m = 0;
+  double rotation_rad = 0;
+};
+
+struct MotorBabblerConfig {
+  std::vector<Signal> signals;
+  double extreme_share = 0;            ///< share of actions drawn from the ends of the ranges, 0..1
+  double extreme_from = 0;             ///< these lie at extreme_from..1 of each half range
+  std::int64_t test_every = 0;         ///< every n-th sample is TEST
+  std::int64_t expiry_us = 0;          ///< of a command, driver's time
+  std::int64_t resend_us = 0;          ///< a command without an answer is sent again after this
+  std::int64_t sample_timeout_us = 0;  ///< a settled action without a SAMPLE is given up after this
+  std::int64_t verdict_timeout_us = 0;  ///< a TEST sample's MODEL_HEALTH is awaited this long
+  StoppingRule stop;
+
+  /// Reads motor_babbler.yaml and signals.yaml beside it. @throws ConfigError.
+  static MotorBabblerConfig load(const std::filesystem::path& file);
+};
+
+/// The action number `action_id` of a run: a pure function of the seed, so that a restart or a
+/// rejected action changes nothing about the others.
+Eigen::VectorXd random_action(const MotorBabblerConfig& config, std::int64_t seed,
+                              std::int64_t action_id);
+
+/// Motor babbling: random actions within the limits, one at a time, each answered by the driver and
+/// followed by its SAMPLE, until the stopping rule holds. Collisions are the driver's to refuse: a
+/// rejected action is replaced by the next.
+///
+/// Before the first MOTION_STATUS it does nothing (start guard). When the driver falls silent it
+/// repeats its last command, which the driver answers without moving twice. While a STOP is latched
+/// it waits for RESUME. After each TEST sample it waits for the monitor's verdict, so that with a
+/// fast bus or a slow learner the run ends at the same sample.
+class MotorBabbler {
+ public:
+  MotorBabbler(MotorBabblerConfig config, std::int64_t seed);
+
+  std::optional<action_command_t> on_motion_status(const motion_status_t& status);
+  std::optional<action_command_t> on_sample(const sample_t& sample);
+  std::optional<action_command_t> on_model_health(const model_health_t& health);
+  /// `now_us`: the clock. Sees silence.
+  std::optional<action_command_t> on_tick(std::int64_t now_us);
+
+  bool is_done() const { return done_; }
+  /// What it does or waits for, for people.
+  std::string activity() const;
+  std::int64_t num_samples() const { return num_samples_; }
+  std::int64_t num_rejected() const { return num_rejected_; }
+  /// Settled actions whose SAMPLE never came.
+  std::int64_t num_unseen() const { return num_unseen_; }
+
+ private:
+  enum class Wait { kDriver, kAnswer, kSample, kVerdict, kResume, kDone };
+
+  std::optional<action_command_t> act();
+  bool is_mine(const motion_status_t& status) const;
+  bool should_stop() const;
+
+  const MotorBabblerConfig config_;
+  const std::int64_t seed_;
+  Wait wait_ = Wait::kDriver;
+  std::int64_t epoch_ = 0;
+  std::int64_t action_id_ = 0;
+  std::int64_t num_samples_ = 0;
+  std::int64_t num_rejected_ = 0;
+  std::int64_t num_unseen_ = 0;
+  std::int64_t driver_utime_ = 0;
+  std::int64_t last_test_sample_ = -1;
+  std::int64_t wait_since_us_ = -1;  ///< clock; −1: not yet seen by a tick
+  bool done_ = false;
+  action_command_t command_{};
+  model_health_t health_{};
+};
+
+}  // namespace bodyschema
