@@ -1,0 +1,75 @@
+#pragma once
+
+#include <cstdint>
+#include <deque>
+#include <filesystem>
+#include <map>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "bodyschema/body_schema_t.hpp"
+#include "bodyschema/model_health_t.hpp"
+#include "bodyschema/sample_t.hpp"
+#include "common/schema/body_schema.h"
+#include "common/schema/sample.h"
+
+namespace bodyschema {
+
+struct ModelMonitorConfig {
+  double max_mahalanobis2 = 0;   ///< d² above which a TEST observation counts as refuting
+  double max_outlier_share = 0;  ///< an edge is refuted if more than this share of its tests refute
+  Noise model_error;             ///< added to every Σ_z: the view-dependent bias of real markers
+
+  /// Reads model_monitor.yaml. @throws ConfigError.
+  static ModelMonitorConfig load(const std::filesystem::path& file);
+};
+
+/// The only publisher of BODY_SCHEMA. A proposal of the learner becomes the body schema when none
+/// of its edges is refuted by the TEST samples up to the proposal's last sample, data that it was
+/// not trained on, and when it is not a step back from a complete schema to an incomplete one. An
+/// edge that no TEST sample could judge yet is marked provisional.
+///
+/// Version n+1 rests on the samples 0..n, so that a replay gives the same bytes. Before the first
+/// accepted proposal nothing is published; when inputs stop, the last schema stands.
+class ModelMonitor {
+ public:
+  explicit ModelMonitor(ModelMonitorConfig config);
+
+  /// A schema saved by an earlier run of this process.
+  void reload(const body_schema_t& saved);
+
+  /// Returns true if a proposal that was waiting for this sample was judged: schema() and health()
+  /// may have changed.
+  bool on_sample(const sample_t& sample);
+  /// Returns true if the proposal was judged.
+  bool on_learned_schema(const body_schema_t& proposal);
+
+  /// The body schema; std::nullopt before the first.
+  const std::optional<body_schema_t>& schema() const { return schema_message_; }
+  const model_health_t& health() const { return health_; }
+
+ private:
+  struct EdgeTest {
+    int num_tests = 0;
+    int num_refuting = 0;
+    double median_mahalanobis2 = -1;
+  };
+
+  EdgeTest test(const Edge& edge, std::int64_t up_to_sample) const;
+  void judge(const body_schema_t& proposal);
+  void assess(std::int64_t up_to_sample);
+  void add_event(std::int8_t kind, std::int64_t sample_index, std::int64_t utime, std::string text);
+
+  const ModelMonitorConfig config_;
+  std::vector<ActionPoseSample> tests_;
+  std::map<int, std::vector<std::int64_t>> seen_in_;  ///< part → indices of samples that show it
+  std::int64_t last_sample_index_ = -1;
+  std::optional<body_schema_t> waiting_;  ///< proposal that is ahead of the samples heard here
+  BodySchema schema_;
+  std::optional<body_schema_t> schema_message_;
+  model_health_t health_{};
+  std::int64_t num_events_ = 0;
+};
+
+}  // namespace bodyschema
