@@ -1,0 +1,509 @@
+#include "common/bus/bus.h"
+
+#include <arpa/inet.h>
+#include <dirent.h>
+#include <fcntl.h>
+#include <lcm/lcm.h>
+#include <netinet/in.h>
+#include <poll.h>
+#include <spdlog/spdlog.h>
+#include <sys/socket.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <cctype>
+#include <cerrno>
+#include <charconv>
+#include <cmath>
+#include <cstdlib>
+#include <cstring>
+#include <deque>
+#include <mutex>
+#include <optional>
+#include <set>
+#include <stdexcept>
+#include <string_view>
+#include <vector>
+
+#include "common/bus/event_log.h"
+
+namespace bodyschema {
+namespace {
+
+using Clock = std::chrono::steady_clock;
+
+constexpr std::chrono::milliseconds kLongestBatch{100};
+/// Events of other channels that one handle() skips in a replay.
+constexpr int kMostSkipped = 10'000;
+constexpr const char* kDefaultUrl = "udpm://239.255.76.67:7667?ttl=0";
+constexpr const char* kReceiveBuffer = "recv_buf_size=2097152";
+constexpr const char* kMulticastHelp =
+    "no route for multicast. Type: ip link set lo multicast on; ip route add 224.0.0.0/4 dev lo "
+    "(as root), or start the program with ./run";
+
+struct Url {
+  std::string scheme;
+  std::string target;
+  std::map<std::string, std::string> options;
+
+  bool is_file() const { return scheme == "file"; }
+};
+
+std::runtime_error url_error(const std::string& url, const std::string& what) {
+  return std::runtime_error(fmt::format("{}: {}", url, what));
+}
+
+/// Strict, because LCM ignores an option that it does not know: a typing error would pass unseen.
+Url parse_url(const std::string& url) {
+  static const std::map<std::string, std::set<std::string>> kOptions = {
+      {"udpm", {"ttl", "recv_buf_size"}}, {"tcpq", {}}, {"memq", {}}, {"file", {"speed", "mode"}}};
+  const std::size_t separator = url.find("://");
+  Url result;
+  if (separator != std::string::npos) result.scheme = url.substr(0, separator);
+  const auto known = kOptions.find(result.scheme);
+  if (known == kOptions.end()) {
+    throw url_error(url,
+                    "is no bus. Type one of udpm://239.255.76.67:7667?ttl=0, tcpq://HOST:7700, "
+                    "memq://, file://PATH?speed=0 (in), file://PATH?mode=w (out)");
+  }
+  const std::string rest = url.substr(separator + 3);
+  const std::size_t question = rest.find('?');
+  result.target = rest.substr(0, question);
+  std::string_view options =
+      question == std::string::npos ? "" : std::string_view(rest).substr(question + 1);
+  while (!options.empty()) {
+    const std::string_view option = options.substr(0, options.find('&'));
+    options.remove_prefix(std::min(options.size(), option.size() + 1));
+    const std::size_t equals = option.find('=');
+    const std::string key(option.substr(0, equals));
+    if (equals == std::string_view::npos || known->second.count(key) == 0) {
+      throw url_error(url, fmt::format("unknown option \"{}\"; {} knows: {}", option, result.scheme,
+                                       fmt::join(known->second, ", ")));
+    }
+    result.options[key] = std::string(option.substr(equals + 1));
+  }
+  return result;
+}
+
+double parse_number(const std::string& url, const std::string& key, const std::string& text) {
+  double value = 0;
+  const auto [end, error] = std::from_chars(text.data(), text.data() + text.size(), value);
+  if (error != std::errc() || end != text.data() + text.size() || !std::isfinite(value)) {
+    throw url_error(url, fmt::format("{}=\"{}\" is not a number", key, text));
+  }
+  return value;
+}
+
+/// LCM finds out too, but says it on stderr only, in its own words, or ten seconds later.
+void probe_multicast(const std::string& url, const Url& parsed) {
+  std::string address = parsed.target.substr(0, parsed.target.find(':'));
+  if (address.empty()) address = "239.255.76.67";
+  std::string port = "7667";
+  if (const std::size_t colon = parsed.target.find(':'); colon != std::string::npos) {
+    port = parsed.target.substr(colon + 1);
+  }
+  int port_number = 0;
+  const auto [end, error] = std::from_chars(port.data(), port.data() + port.size(), port_number);
+  if (error != std::errc() || end != port.data() + port.size() || port_number < 1 ||
+      port_number > 65535) {
+    throw url_error(url, fmt::format("\"{}\" is not a port (1 … 65535)", port));
+  }
+  sockaddr_in destination{};
+  destination.sin_family = AF_INET;
+  destination.sin_port = htons(static_cast<std::uint16_t>(port_number));
+  if (::inet_pton(AF_INET, address.c_str(), &destination.sin_addr) != 1 ||
+      !IN_MULTICAST(ntohl(destination.sin_addr.s_addr))) {
+    throw url_error(url, fmt::format("\"{}\" is not a multicast address (224.0.0.0 … "
+                                     "239.255.255.255)",
+                                     address));
+  }
+  const int probe = ::socket(AF_INET, SOCK_DGRAM | SOCK_CLOEXEC, 0);
+  const bool has_route =
+      probe >= 0 &&
+      ::connect(probe, reinterpret_cast<const sockaddr*>(&destination), sizeof destination) == 0;
+  if (probe >= 0) ::close(probe);
+  if (!has_route) throw url_error(url, kMulticastHelp);
+}
+
+std::set<int> open_descriptors() {
+  std::set<int> descriptors;
+  DIR* folder = ::opendir("/proc/self/fd");
+  if (folder == nullptr) return descriptors;
+  while (const dirent* entry = ::readdir(folder)) {
+    if (std::isdigit(static_cast<unsigned char>(entry->d_name[0])) != 0) {
+      descriptors.insert(std::atoi(entry->d_name));
+    }
+  }
+  descriptors.erase(::dirfd(folder));
+  ::closedir(folder);
+  return descriptors;
+}
+
+using LcmPointer = std::shared_ptr<lcm_t>;
+
+LcmPointer open_lcm(const std::string& url, const Url& parsed) {
+  std::string full = url;
+  if (parsed.scheme == "udpm") {
+    probe_multicast(url, parsed);
+    if (parsed.options.count("ttl") == 1) parse_number(url, "ttl", parsed.options.at("ttl"));
+    if (parsed.options.count("recv_buf_size") == 0) {
+      full += url.find('?') == std::string::npos ? "?" : url.back() == '?' ? "" : "&";
+      full += kReceiveBuffer;
+    }
+  }
+  const std::set<int> before = open_descriptors();
+  LcmPointer lcm(lcm_create(full.c_str()), [](lcm_t* raw) {
+    if (raw != nullptr) lcm_destroy(raw);
+  });
+  // Asking for the descriptor makes LCM connect and test itself; later it would return broken
+  // subscriptions instead of an error.
+  if (lcm == nullptr || lcm_get_fileno(lcm.get()) < 0) {
+    throw url_error(url, parsed.scheme == "tcpq"
+                             ? "nobody answers. Type: java -cp /usr/share/java/lcm.jar "
+                               "lcm.lcm.TCPService 7700"
+                             : kMulticastHelp);
+  }
+  // LCM's descriptors must not outlive an exec in a child: its port would stay taken.
+  for (const int descriptor : open_descriptors()) {
+    if (before.count(descriptor) == 0) {
+      ::fcntl(descriptor, F_SETFD, ::fcntl(descriptor, F_GETFD) | FD_CLOEXEC);
+    }
+  }
+  return lcm;
+}
+
+/// LCM takes a channel for a regular expression between ^ and $.
+std::string escape(const std::string& channel) {
+  std::string pattern;
+  for (const char c : channel) {
+    if (std::isalnum(static_cast<unsigned char>(c)) == 0 && c != '_') pattern += '\\';
+    pattern += c;
+  }
+  return pattern;
+}
+
+}  // namespace
+
+struct Bus::Impl {
+  struct Subscriber {
+    Handler handler;
+    bool latest_only = false;
+    std::shared_ptr<const void> newest;
+  };
+  struct ChannelState {
+    std::string name;
+    Decoder decoder = nullptr;
+    /// Handlers may subscribe, and a deque keeps its elements in place.
+    std::deque<Subscriber> subscribers;
+    std::int64_t received = 0;
+    std::int64_t malformed = 0;
+    std::int64_t senseless = 0;
+    std::int64_t skipped = 0;
+    Impl* bus = nullptr;
+  };
+  struct Pending {
+    ChannelState* channel;
+    std::vector<std::uint8_t> bytes;
+  };
+
+  std::string in_url;
+  std::string out_url;
+  LcmPointer input;
+  LcmPointer output;
+  std::unique_ptr<LogAppender> output_log;
+
+  std::unique_ptr<LogReader> log;
+  bool log_has_event = false;
+  double log_speed = 1;
+  std::int64_t log_first_utime = -1;
+  std::int64_t log_event_utime = -1;
+  Clock::time_point log_start;
+
+  std::map<std::string, ChannelState> channels;
+  /// In order of subscription.
+  std::vector<ChannelState*> order;
+  std::deque<Pending> pending;
+  std::int64_t last_utime = -1;
+
+  /// Counters are read and publish() is called by other threads as well.
+  mutable std::mutex mutex;
+  std::map<std::string, std::int64_t> published;
+  std::int64_t truncated_logs = 0;
+
+  void open_log(const Url& url) {
+    if (url.target.empty()) throw url_error(in_url, "names no file. Type file://PATH?speed=0");
+    if (url.options.count("mode") == 1 && url.options.at("mode") != "r") {
+      throw url_error(in_url, "an input is not written: mode belongs to --out");
+    }
+    if (url.options.count("speed") == 1) {
+      log_speed = parse_number(in_url, "speed", url.options.at("speed"));
+    }
+    log = std::make_unique<LogReader>(url.target);
+    log_has_event = log->next();
+    if (log_has_event) log_first_utime = log_event_utime = log->event().event_utime;
+    if (!log_has_event) report_tail();
+  }
+
+  void open_output_log(const Url& url) {
+    const auto mode = url.options.find("mode");
+    if (url.target.empty() || mode == url.options.end() ||
+        (mode->second != "w" && mode->second != "a") || url.options.count("speed") == 1) {
+      throw url_error(out_url,
+                      "as an output type file://PATH?mode=w (a new log) or "
+                      "file://PATH?mode=a (extend it)");
+    }
+    output_log = std::make_unique<LogAppender>(
+        url.target,
+        mode->second == "w" ? LogAppender::Mode::kOverwrite : LogAppender::Mode::kAppend,
+        LogAppender::Durability::kToKernel);
+  }
+
+  void report_tail() {
+    const auto& truncated = log->report().truncated_at_byte;
+    if (!truncated) return;
+    const std::scoped_lock lock(mutex);
+    ++truncated_logs;
+    spdlog::warn("{}: log ends in the middle of an event at byte {}; the {} before it are used",
+                 in_url, *truncated, log->report().events);
+  }
+
+  void advance_log() {
+    try {
+      log_has_event = log->next();
+      if (!log_has_event) report_tail();
+    } catch (const std::runtime_error& error) {
+      // What was read so far is good and was used; nothing after this byte can be trusted.
+      log_has_event = false;
+      const std::scoped_lock lock(mutex);
+      ++truncated_logs;
+      spdlog::warn("{}; the {} events before it are used", error.what(), log->report().events);
+    }
+  }
+
+  void dispatch(ChannelState& channel, const void* data, std::size_t size) {
+    Incoming incoming = channel.decoder(data, size);
+    {
+      const std::scoped_lock lock(mutex);
+      ++channel.received;
+      if (incoming.message == nullptr) {
+        std::int64_t& count = incoming.is_malformed ? channel.malformed : channel.senseless;
+        if (++count == 1) {
+          spdlog::warn("{}: dropped a {} message: {} (further ones are only counted)", channel.name,
+                       incoming.is_malformed ? "malformed" : "senseless", incoming.problem);
+        }
+        return;
+      }
+    }
+    if (channel.name != kProcessInfo.name) last_utime = std::max(last_utime, incoming.utime);
+    bool skips = false;
+    for (Subscriber& subscriber : channel.subscribers) {
+      if (!subscriber.latest_only) continue;
+      skips = skips || subscriber.newest != nullptr;
+      subscriber.newest = incoming.message;
+    }
+    if (skips) {
+      const std::scoped_lock lock(mutex);
+      ++channel.skipped;
+    }
+    // By index: a handler may subscribe to its own channel.
+    for (std::size_t i = 0; i < channel.subscribers.size(); ++i) {
+      if (!channel.subscribers[i].latest_only)
+        channel.subscribers[i].handler(incoming.message.get());
+    }
+  }
+
+  void dispatch_newest() {
+    for (std::size_t c = 0; c < order.size(); ++c) {
+      for (std::size_t i = 0; i < order[c]->subscribers.size(); ++i) {
+        Subscriber& subscriber = order[c]->subscribers[i];
+        // Taken before the call, so that a message whose handler threw is not handled twice.
+        const auto newest = std::exchange(subscriber.newest, nullptr);
+        if (newest != nullptr) subscriber.handler(newest.get());
+      }
+    }
+  }
+
+  /// Called by LCM, from C: only takes the bytes along.
+  static void on_lcm_message(const lcm_recv_buf_t* buffer, const char*, void* user) noexcept {
+    auto* channel = static_cast<ChannelState*>(user);
+    const auto* bytes = static_cast<const std::uint8_t*>(buffer->data);
+    channel->bus->pending.push_back({channel, {bytes, bytes + buffer->data_size}});
+  }
+
+  void subscribe_lcm(ChannelState& channel, int queue_capacity) {
+    lcm_subscription_t* subscription =
+        lcm_subscribe(input.get(), escape(channel.name).c_str(), &on_lcm_message, &channel);
+    if (subscription == nullptr || lcm_get_fileno(input.get()) < 0) {
+      throw url_error(in_url, "the connection is dead: cannot subscribe to " + channel.name);
+    }
+    lcm_subscription_set_queue_capacity(subscription, queue_capacity);
+  }
+
+  /// Lets LCM hand over what has arrived, without waiting.
+  void receive() {
+    // Never lcm_handle(): on memq:// it crashes when a signal interrupts its wait.
+    if (lcm_handle_timeout(input.get(), 0) < 0 && errno != EINTR && errno != EAGAIN) {
+      throw url_error(in_url, "the connection broke");
+    }
+  }
+
+  bool handle_live(std::chrono::milliseconds timeout) {
+    const auto wait_ms = static_cast<int>(std::max<std::int64_t>(0, timeout.count()));
+    if (input == nullptr) {
+      ::poll(nullptr, 0, wait_ms);
+      return true;
+    }
+    if (pending.empty()) {
+      pollfd ready{lcm_get_fileno(input.get()), POLLIN, 0};
+      // Interrupted by a signal or silent: the caller has other things to look at.
+      if (::poll(&ready, 1, wait_ms) <= 0) return true;
+    }
+    const Clock::time_point begin = Clock::now();
+    do {
+      if (pending.empty()) receive();
+      if (pending.empty()) break;
+      const Pending message = std::move(pending.front());
+      pending.pop_front();
+      dispatch(*message.channel, message.bytes.data(), message.bytes.size());
+    } while (Clock::now() - begin < kLongestBatch);
+    dispatch_newest();
+    return true;
+  }
+
+  /// Waits until the log's next event is due. False if that is later or a signal came.
+  bool wait_until_due(std::chrono::milliseconds timeout) {
+    if (log_speed <= 0) return true;
+    if (log_start == Clock::time_point{}) log_start = Clock::now();
+    const std::chrono::duration<double, std::micro> offset(
+        static_cast<double>(log->event().event_utime - log_first_utime) / log_speed);
+    const auto due = log_start + std::chrono::duration_cast<Clock::duration>(offset);
+    const auto left = std::chrono::ceil<std::chrono::milliseconds>(due - Clock::now());
+    if (left.count() <= 0) return true;
+    const auto wait = std::max(std::chrono::milliseconds(0), std::min(left, timeout));
+    return ::poll(nullptr, 0, static_cast<int>(wait.count())) == 0 && left <= timeout;
+  }
+
+  bool handle_replay(std::chrono::milliseconds timeout) {
+    for (int skipped = 0; log_has_event && skipped < kMostSkipped; ++skipped) {
+      const auto channel = channels.find(log->event().channel);
+      if (channel == channels.end()) {
+        advance_log();
+        continue;
+      }
+      if (!wait_until_due(timeout)) return true;
+      const LogEvent event = log->event();
+      log_event_utime = event.event_utime;
+      // First, so that an exception of a handler does not bring the same event again.
+      advance_log();
+      dispatch(channel->second, event.data.data(), event.data.size());
+      dispatch_newest();
+      return true;
+    }
+    return log_has_event;
+  }
+};
+
+Bus::Bus(const std::string& in_url, const std::string& out_url) : impl_(std::make_unique<Impl>()) {
+  impl_->in_url = in_url;
+  impl_->out_url = out_url;
+  std::optional<Url> in;
+  if (!in_url.empty()) {
+    in = parse_url(in_url);
+    if (in->is_file()) {
+      impl_->open_log(*in);
+    } else {
+      impl_->input = open_lcm(in_url, *in);
+    }
+  }
+  if (out_url.empty()) return;
+  const Url out = parse_url(out_url);
+  if (out.is_file()) {
+    std::error_code error;
+    if (in && in->is_file() && std::filesystem::equivalent(in->target, out.target, error)) {
+      throw url_error(out_url, "is the log that is read");
+    }
+    impl_->open_output_log(out);
+  } else if (in_url == out_url) {
+    impl_->output = impl_->input;
+  } else if (out.scheme == "memq") {
+    throw url_error(out_url, "is heard by nobody unless it is the input as well");
+  } else {
+    impl_->output = open_lcm(out_url, out);
+  }
+}
+
+Bus::~Bus() = default;
+
+void Bus::subscribe_raw(const std::string& channel, Decoder decoder, int queue_capacity,
+                        Handler handler, bool latest_only) {
+  if (channel.empty() || channel.size() > LCM_MAX_CHANNEL_NAME_LENGTH) {
+    throw std::logic_error("a channel's name has 1 to 63 bytes: \"" + channel + "\"");
+  }
+  const auto [place, is_new] = impl_->channels.try_emplace(channel);
+  Impl::ChannelState& state = place->second;
+  if (is_new) {
+    state.name = channel;
+    state.decoder = decoder;
+    state.bus = impl_.get();
+    impl_->order.push_back(&state);
+    if (impl_->input != nullptr) impl_->subscribe_lcm(state, queue_capacity);
+  } else if (state.decoder != decoder) {
+    throw std::logic_error(channel + " is subscribed with two types");
+  }
+  state.subscribers.push_back({std::move(handler), latest_only, nullptr});
+}
+
+void Bus::publish_raw(const std::string& channel, std::span<const std::uint8_t> bytes) {
+  if (channel.empty() || channel.size() > LCM_MAX_CHANNEL_NAME_LENGTH) {
+    throw std::logic_error("a channel's name has 1 to 63 bytes: \"" + channel + "\"");
+  }
+  const std::scoped_lock lock(impl_->mutex);
+  if (impl_->output_log != nullptr) {
+    const auto now = std::chrono::duration_cast<std::chrono::microseconds>(
+        std::chrono::system_clock::now().time_since_epoch());
+    impl_->output_log->append_bytes(channel, bytes,
+                                    is_replay() ? impl_->log_event_utime : now.count());
+  } else if (impl_->output != nullptr) {
+    if (lcm_publish(impl_->output.get(), channel.c_str(), bytes.data(),
+                    static_cast<unsigned>(bytes.size())) < 0) {
+      throw url_error(impl_->out_url,
+                      fmt::format("cannot send {}: {}", channel, std::strerror(errno)));
+    }
+  } else {
+    return;
+  }
+  ++impl_->published[channel];
+}
+
+bool Bus::handle(std::chrono::milliseconds timeout) {
+  return is_replay() ? impl_->handle_replay(timeout) : impl_->handle_live(timeout);
+}
+
+bool Bus::is_replay() const { return impl_->log != nullptr; }
+
+bool Bus::is_recording() const { return impl_->output_log != nullptr; }
+
+std::int64_t Bus::last_utime() const { return impl_->last_utime; }
+
+std::int64_t Bus::event_utime() const { return impl_->log_event_utime; }
+
+std::map<std::string, std::int64_t> Bus::counters() const {
+  const std::scoped_lock lock(impl_->mutex);
+  std::map<std::string, std::int64_t> counters;
+  for (const Impl::ChannelState* channel : impl_->order) {
+    counters["received " + channel->name] = channel->received;
+    counters["malformed " + channel->name] = channel->malformed;
+    counters["senseless " + channel->name] = channel->senseless;
+    counters["skipped " + channel->name] = channel->skipped;
+  }
+  for (const auto& [channel, count] : impl_->published) counters["published " + channel] = count;
+  if (impl_->truncated_logs > 0) counters["truncated log"] = impl_->truncated_logs;
+  return counters;
+}
+
+std::string default_url() {
+  const char* url = std::getenv("LCM_DEFAULT_URL");
+  return url != nullptr && *url != '\0' ? url : kDefaultUrl;
+}
+
+}  // namespace bodyschema

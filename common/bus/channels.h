@@ -1,0 +1,34 @@
+#pragma once
+
+#include "bodyschema/action_command_t.hpp"
+#include "bodyschema/body_schema_t.hpp"
+#include "bodyschema/camera_image_t.hpp"
+#include "bodyschema/camera_info_t.hpp"
+#include "bodyschema/marker_poses_t.hpp"
+#include "bodyschema/model_health_t.hpp"
+#include "bodyschema/motion_status_t.hpp"
+#include "bodyschema/process_info_t.hpp"
+#include "bodyschema/sample_t.hpp"
+#include "bodyschema/sim_state_t.hpp"
+
+namespace bodyschema {
+
+/// A channel and the one type that travels on it. The table in lcmtypes/README.md lists the same.
+template <class Message>
+struct Channel {
+  const char* name;
+};
+
+inline constexpr Channel<action_command_t> kActionCommand{"ACTION_COMMAND"};
+inline constexpr Channel<motion_status_t> kMotionStatus{"MOTION_STATUS"};
+inline constexpr Channel<sim_state_t> kSimState{"SIM_STATE"};
+inline constexpr Channel<camera_image_t> kCameraImage{"CAMERA_IMAGE"};
+inline constexpr Channel<camera_info_t> kCameraInfo{"CAMERA_INFO"};
+inline constexpr Channel<marker_poses_t> kMarkerPoses{"MARKER_POSES"};
+inline constexpr Channel<sample_t> kSample{"SAMPLE"};
+inline constexpr Channel<body_schema_t> kLearnedSchema{"LEARNED_SCHEMA"};
+inline constexpr Channel<body_schema_t> kBodySchema{"BODY_SCHEMA"};
+inline constexpr Channel<model_health_t> kModelHealth{"MODEL_HEALTH"};
+inline constexpr Channel<process_info_t> kProcessInfo{"PROCESS_INFO"};
+
+}  // namespace bodyschema

@@ -1,0 +1,32 @@
+#pragma once
+
+#include <string>
+
+#include "common/bus/channels.h"
+
+namespace bodyschema {
+
+// Does a well-formed message make sense? "" if so, else what is wrong, for people, beginning with
+// the field ("parts[3].X_CB.rotation_wxyz has norm 0.5, not 1"): NaN, a quaternion that is not unit
+// (1e-3), a covariance that is not symmetric positive semidefinite, ids that repeat or are out of
+// order, counts beyond reason or unlike the length of their array, times before 0, an unknown
+// constant, a string that is not UTF-8, edges that are no tree ordered from the root outwards.
+// The bus calls check() before any handler; what fails is dropped and counted as "senseless".
+// publish() calls it too; there a failure is a bug.
+
+std::string check(const action_command_t& message);
+std::string check(const motion_status_t& message);
+std::string check(const sim_state_t& message);
+std::string check(const camera_image_t& message);
+std::string check(const camera_info_t& message);
+std::string check(const marker_poses_t& message);
+std::string check(const sample_t& message);
+std::string check(const body_schema_t& message);
+std::string check(const model_health_t& message);
+std::string check(const process_info_t& message);
+
+/// `text` with every byte replaced by '?' that keeps it from being UTF-8 without zero bytes. For
+/// what comes from outside: files, host names, a camera's error messages.
+std::string as_text(std::string text);
+
+}  // namespace bodyschema

@@ -1,0 +1,231 @@
+#include "common/bus/convert.h"
+
+#include <Eigen/Geometry>
+#include <stdexcept>
+
+namespace bodyschema {
+
+pose_t to_message(const Pose& X_AB) {
+  Eigen::Quaterniond q_AB(X_AB.linear());
+  q_AB.normalize();
+  // Of q and −q always the same one, so that equal poses make equal bytes.
+  if (q_AB.w() < 0) q_AB.coeffs() = -q_AB.coeffs();
+  pose_t message{};
+  for (int i = 0; i < 3; ++i) message.position_m[i] = X_AB.translation()[i];
+  message.rotation_wxyz[0] = q_AB.w();
+  message.rotation_wxyz[1] = q_AB.x();
+  message.rotation_wxyz[2] = q_AB.y();
+  message.rotation_wxyz[3] = q_AB.z();
+  return message;
+}
+
+Pose from_message(const pose_t& message) {
+  const double* q = message.rotation_wxyz;
+  return make_pose(
+      Eigen::Quaterniond(q[0], q[1], q[2], q[3]),
+      Eigen::Vector3d(message.position_m[0], message.position_m[1], message.position_m[2]));
+}
+
+void to_message(const Matrix6d& matrix, double (&message)[6][6]) {
+  for (int i = 0; i < 6; ++i) {
+    for (int j = 0; j < 6; ++j) message[i][j] = matrix(i, j);
+  }
+}
+
+Matrix6d from_message(const double (&message)[6][6]) {
+  Matrix6d matrix;
+  for (int i = 0; i < 6; ++i) {
+    for (int j = 0; j < 6; ++j) matrix(i, j) = message[i][j];
+  }
+  return matrix;
+}
+
+ActionPoseSample from_message(const sample_t& message) {
+  ActionPoseSample sample;
+  sample.utime = message.utime;
+  sample.sample_index = message.sample_index;
+  sample.purpose = static_cast<Purpose>(message.purpose);
+  sample.action = Eigen::Map<const Eigen::VectorXd>(
+      message.action.data(), static_cast<Eigen::Index>(message.action.size()));
+  for (const part_observation_t& part : message.parts) {
+    PartObservation& observation = sample.parts.emplace_back();
+    observation.part = part.part_id;
+    observation.X_CB = from_message(part.X_CB);
+    observation.covariance = from_message(part.covariance);
+    if (part.has_other == 1) observation.X_CB_other = from_message(part.X_CB_other);
+    observation.error_ratio = part.error_ratio;
+  }
+  return sample;
+}
+
+sample_t to_message(const ActionPoseSample& sample) {
+  sample_t message{};
+  message.utime = sample.utime;
+  message.sample_index = sample.sample_index;
+  message.purpose = static_cast<std::int8_t>(sample.purpose);
+  set_array(message.num_signals, message.action,
+            std::vector<double>(sample.action.begin(), sample.action.end()));
+  std::vector<part_observation_t> parts;
+  for (const PartObservation& observation : sample.parts) {
+    part_observation_t& part = parts.emplace_back();
+    part.part_id = observation.part;
+    part.X_CB = to_message(observation.X_CB);
+    to_message(observation.covariance, part.covariance);
+    part.has_other = observation.X_CB_other ? 1 : 0;
+    part.X_CB_other = to_message(observation.X_CB_other.value_or(observation.X_CB));
+    part.error_ratio = observation.X_CB_other ? observation.error_ratio : 0;
+    part.num_frames = 1;
+  }
+  set_array(message.num_parts, message.parts, std::move(parts));
+  return message;
+}
+
+namespace {
+
+static_assert(static_cast<int>(EdgeState::kOk) == schema_edge_t::EDGE_OK);
+static_assert(static_cast<int>(EdgeState::kSuspect) == schema_edge_t::EDGE_SUSPECT);
+static_assert(static_cast<int>(EdgeState::kInvalid) == schema_edge_t::EDGE_INVALID);
+static_assert(static_cast<int>(EdgeState::kProvisional) == schema_edge_t::EDGE_PROVISIONAL);
+static_assert(static_cast<int>(Unconnected::kNeverSeen) == unconnected_part_t::REASON_NEVER_SEEN);
+static_assert(static_cast<int>(Unconnected::kNotEnoughData) ==
+              unconnected_part_t::REASON_NOT_ENOUGH_DATA);
+static_assert(static_cast<int>(Unconnected::kNoValidModel) ==
+              unconnected_part_t::REASON_NO_VALID_MODEL);
+
+schema_edge_t to_message(const Edge& edge) {
+  schema_edge_t message{};
+  message.from_part = edge.from;
+  message.to_part = edge.to;
+  message.base_kind = edge.joints.empty() ? schema_edge_t::EDGE_RIGID : schema_edge_t::EDGE_SCREW;
+  message.X_left = bodyschema::to_message(edge.left);
+  std::vector<screw_joint_t> joints;
+  for (const ScrewJoint& joint : edge.joints) {
+    screw_joint_t& out = joints.emplace_back();
+    out.signal_index = joint.signal;
+    out.gain = joint.gain;
+    out.offset = joint.offset;
+    out.slide_m = joint.slide;
+    out.turn_rad = joint.turn;
+    out.X_after = bodyschema::to_message(joint.X_after);
+  }
+  set_array(message.num_joints, message.joints, std::move(joints));
+  message.X_right = bodyschema::to_message(edge.right);
+  const Eigen::MatrixXd& covariance = edge.parameter_covariance;
+  std::vector<float> packed;
+  for (Eigen::Index i = 0; i < covariance.rows(); ++i) {
+    for (Eigen::Index j = 0; j <= i; ++j) packed.push_back(static_cast<float>(covariance(i, j)));
+  }
+  set_array(message.num_covariance, message.parameter_covariance, std::move(packed));
+  message.position_rms_m = edge.position_rms_m;
+  message.rotation_rms_rad = edge.rotation_rms_rad;
+  message.num_samples_used = edge.num_samples;
+  message.num_outliers = edge.num_outliers;
+  message.valid_since_sample = edge.valid_since_sample;
+  message.confidence = edge.confidence;
+  message.state = static_cast<std::int8_t>(edge.state);
+  return message;
+}
+
+Edge from_message(const schema_edge_t& message) {
+  Edge edge;
+  edge.from = message.from_part;
+  edge.to = message.to_part;
+  edge.left = bodyschema::from_message(message.X_left);
+  for (const screw_joint_t& joint : message.joints) {
+    ScrewJoint& out = edge.joints.emplace_back();
+    out.signal = joint.signal_index;
+    out.gain = joint.gain;
+    out.offset = joint.offset;
+    out.slide = joint.slide_m;
+    out.turn = joint.turn_rad;
+    out.X_after = bodyschema::from_message(joint.X_after);
+  }
+  edge.right = bodyschema::from_message(message.X_right);
+  if (!message.parameter_covariance.empty()) {
+    const auto side = static_cast<Eigen::Index>(6 + 8 * edge.joints.size());
+    if (static_cast<Eigen::Index>(message.parameter_covariance.size()) != side * (side + 1) / 2) {
+      throw std::invalid_argument("parameter_covariance does not go with the number of joints");
+    }
+    edge.parameter_covariance.resize(side, side);
+    std::size_t k = 0;
+    for (Eigen::Index i = 0; i < side; ++i) {
+      for (Eigen::Index j = 0; j <= i; ++j, ++k) {
+        edge.parameter_covariance(i, j) = edge.parameter_covariance(j, i) =
+            message.parameter_covariance[k];
+      }
+    }
+  }
+  edge.position_rms_m = message.position_rms_m;
+  edge.rotation_rms_rad = message.rotation_rms_rad;
+  edge.num_samples = message.num_samples_used;
+  edge.num_outliers = message.num_outliers;
+  edge.valid_since_sample = message.valid_since_sample;
+  edge.confidence = message.confidence;
+  edge.state = static_cast<EdgeState>(message.state);
+  return edge;
+}
+
+}  // namespace
+
+body_schema_t to_message(const BodySchema& schema) {
+  body_schema_t message{};
+  message.utime = schema.utime;
+  message.schema_version = schema.version;
+  message.base_version = schema.base_version;
+  message.last_sample_index = schema.last_sample_index;
+  message.num_samples_seen = schema.num_samples;
+  message.is_complete = schema.complete ? 1 : 0;
+  set_array(message.num_parts, message.part_ids,
+            std::vector<std::int32_t>(schema.parts.begin(), schema.parts.end()));
+  message.root_part = schema.root;
+  message.X_CR = to_message(schema.X_CR);
+  to_message(schema.X_CR_covariance, message.X_CR_covariance);
+  std::vector<signal_t> signals;
+  for (const Signal& signal : schema.signals) {
+    signal_t& out = signals.emplace_back();
+    out.signal_name = signal.name;
+    out.lower_limit = signal.lower;
+    out.upper_limit = signal.upper;
+  }
+  set_array(message.num_signals, message.signals, std::move(signals));
+  std::vector<schema_edge_t> edges;
+  for (const Edge& edge : schema.edges) edges.push_back(to_message(edge));
+  set_array(message.num_edges, message.edges, std::move(edges));
+  std::vector<unconnected_part_t> unconnected;
+  for (const UnconnectedPart& part : schema.unconnected) {
+    unconnected_part_t& out = unconnected.emplace_back();
+    out.unconnected_part = part.part;
+    out.reason = static_cast<std::int8_t>(part.reason);
+    out.detail = part.detail;
+  }
+  set_array(message.num_unconnected, message.unconnected, std::move(unconnected));
+  message.noise_position_m = schema.noise.position_m;
+  message.noise_rotation_rad = schema.noise.rotation_rad;
+  return message;
+}
+
+BodySchema from_message(const body_schema_t& message) {
+  BodySchema schema;
+  schema.utime = message.utime;
+  schema.version = message.schema_version;
+  schema.base_version = message.base_version;
+  schema.last_sample_index = message.last_sample_index;
+  schema.num_samples = message.num_samples_seen;
+  schema.complete = message.is_complete == 1;
+  schema.parts.assign(message.part_ids.begin(), message.part_ids.end());
+  schema.root = message.root_part;
+  schema.X_CR = from_message(message.X_CR);
+  schema.X_CR_covariance = from_message(message.X_CR_covariance);
+  for (const signal_t& signal : message.signals) {
+    schema.signals.push_back({signal.signal_name, signal.lower_limit, signal.upper_limit});
+  }
+  for (const schema_edge_t& edge : message.edges) schema.edges.push_back(from_message(edge));
+  for (const unconnected_part_t& part : message.unconnected) {
+    schema.unconnected.push_back(
+        {part.unconnected_part, static_cast<Unconnected>(part.reason), part.detail});
+  }
+  schema.noise = {message.noise_position_m, message.noise_rotation_rad};
+  return schema;
+}
+
+}  // namespace bodyschema

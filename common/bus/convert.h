@@ -1,0 +1,41 @@
+#pragma once
+
+#include <string>
+#include <vector>
+
+#include "bodyschema/body_schema_t.hpp"
+#include "bodyschema/camera_info_t.hpp"
+#include "bodyschema/marker_poses_t.hpp"
+#include "bodyschema/pose_t.hpp"
+#include "bodyschema/sample_t.hpp"
+#include "common/geometry/pose.h"
+#include "common/schema/body_schema.h"
+#include "common/schema/sample.h"
+
+namespace bodyschema {
+
+// Between messages and the types of common/. Only these functions know the order of a quaternion
+// on the wire (w x y z). from_message() of a message that passed check() does not throw.
+
+pose_t to_message(const Pose& X_AB);
+Pose from_message(const pose_t& message);
+
+void to_message(const Matrix6d& matrix, double (&message)[6][6]);
+Matrix6d from_message(const double (&message)[6][6]);
+
+/// `corners` are left out: sample_t carries them, ActionPoseSample does not.
+ActionPoseSample from_message(const sample_t& message);
+/// Source, epoch, action id, rest interval and corners are left empty.
+sample_t to_message(const ActionPoseSample& sample);
+
+body_schema_t to_message(const BodySchema& schema);
+BodySchema from_message(const body_schema_t& message);
+
+/// Sets a message's array together with its count.
+template <class Count, class Element>
+void set_array(Count& count, std::vector<Element>& array, std::vector<Element> values) {
+  array = std::move(values);
+  count = static_cast<Count>(array.size());
+}
+
+}  // namespace bodyschema

@@ -1,0 +1,265 @@
+#include "common/bus/event_log.h"
+
+#include <fcntl.h>
+#include <spdlog/fmt/fmt.h>
+#include <sys/file.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <array>
+#include <cerrno>
+#include <cstring>
+#include <random>
+#include <system_error>
+#include <utility>
+
+namespace bodyschema {
+namespace {
+
+constexpr std::uint32_t kSync = 0xEDA1DA01;
+constexpr std::size_t kHeaderSize = 28;
+/// lcm-logplayer refuses longer names.
+constexpr std::int32_t kLongestChannel = 999;
+
+template <class Integer>
+Integer read_big_endian(const std::uint8_t* bytes) {
+  std::make_unsigned_t<Integer> value = 0;
+  for (std::size_t i = 0; i < sizeof(Integer); ++i) {
+    value = static_cast<std::make_unsigned_t<Integer>>((value << 8) | bytes[i]);
+  }
+  return static_cast<Integer>(value);
+}
+
+template <class Integer>
+void append_big_endian(std::vector<std::uint8_t>& bytes, Integer value) {
+  for (int shift = 8 * (static_cast<int>(sizeof(Integer)) - 1); shift >= 0; shift -= 8) {
+    bytes.push_back(static_cast<std::uint8_t>(static_cast<std::uint64_t>(value) >> shift));
+  }
+}
+
+std::runtime_error file_error(const std::filesystem::path& path, const std::string& what) {
+  return std::runtime_error(fmt::format("{}: {}", path.string(), what));
+}
+
+std::runtime_error system_error(const std::filesystem::path& path, const std::string& what) {
+  return file_error(path, fmt::format("{}: {}", what, std::generic_category().message(errno)));
+}
+
+/// Closes on the way out of an exception.
+class Descriptor {
+ public:
+  explicit Descriptor(int descriptor) : descriptor_(descriptor) {}
+  ~Descriptor() {
+    if (descriptor_ >= 0) ::close(descriptor_);
+  }
+  Descriptor(const Descriptor&) = delete;
+  Descriptor& operator=(const Descriptor&) = delete;
+  int get() const { return descriptor_; }
+  int release() { return std::exchange(descriptor_, -1); }
+
+ private:
+  int descriptor_;
+};
+
+/// 0, or errno.
+int write_all(int file, std::span<const std::uint8_t> bytes) {
+  while (!bytes.empty()) {
+    const ssize_t written = ::write(file, bytes.data(), bytes.size());
+    if (written < 0) {
+      if (errno == EINTR) continue;
+      return errno;
+    }
+    bytes = bytes.subspan(static_cast<std::size_t>(written));
+  }
+  return 0;
+}
+
+void sync_folder(const std::filesystem::path& path) {
+  const std::filesystem::path folder = path.has_parent_path() ? path.parent_path() : ".";
+  const Descriptor descriptor(::open(folder.c_str(), O_RDONLY | O_DIRECTORY | O_CLOEXEC));
+  // Some file systems cannot sync a folder (EINVAL); then there is nothing more to be done.
+  if (descriptor.get() < 0 || (::fsync(descriptor.get()) != 0 && errno != EINVAL)) {
+    throw system_error(folder, "cannot sync the folder");
+  }
+}
+
+}  // namespace
+
+std::string describe_malformed(const void* data, std::size_t size, const char* type_name,
+                               std::int64_t fingerprint) {
+  if (size < 8) return fmt::format("{} bytes are no message", size);
+  const auto found = read_big_endian<std::int64_t>(static_cast<const std::uint8_t*>(data));
+  if (found != fingerprint) {
+    return fmt::format(
+        "fingerprint {:016x} is not {}'s ({:016x}): another type, or a program built "
+        "from other message definitions",
+        static_cast<std::uint64_t>(found), type_name, static_cast<std::uint64_t>(fingerprint));
+  }
+  return fmt::format("{} bytes do not decode as {}: cut off, too long or damaged", size, type_name);
+}
+
+LogReader::LogReader(const std::filesystem::path& path) : path_(path) {
+  std::error_code error;
+  if (std::filesystem::is_directory(path, error)) throw file_error(path, "is a folder, not a log");
+  file_ = std::fopen(path.c_str(), "rbe");
+  if (file_ == nullptr) throw system_error(path, "cannot read the log");
+}
+
+LogReader::~LogReader() { std::fclose(file_); }
+
+bool LogReader::next() {
+  if (report_.truncated_at_byte) return false;
+
+  std::array<std::uint8_t, kHeaderSize> header;
+  const std::size_t header_read = std::fread(header.data(), 1, header.size(), file_);
+  if (std::ferror(file_) != 0) throw system_error(path_, "cannot read the log");
+  if (header_read == 0) return false;
+
+  const auto truncated = [&] {
+    report_.truncated_at_byte = position_;
+    return false;
+  };
+  const auto not_an_event = [&] {
+    return file_error(
+        path_, position_ == 0 ? "is not an LCM log (its first bytes are no event)"
+                              : fmt::format("is damaged: no event begins at byte {}", position_));
+  };
+
+  // Zeros up to the end are what a power cut leaves of an event that was never written back.
+  if (std::all_of(header.begin(), header.begin() + header_read, [](auto b) { return b == 0; })) {
+    int byte = 0;
+    while ((byte = std::fgetc(file_)) == 0) {
+    }
+    if (byte == EOF && position_ > 0) return truncated();
+    throw not_an_event();
+  }
+  const std::array<std::uint8_t, 4> sync = {0xED, 0xA1, 0xDA, 0x01};
+  const std::size_t comparable = std::min(header_read, sync.size());
+  if (!std::equal(sync.begin(), sync.begin() + comparable, header.begin())) throw not_an_event();
+  if (header_read < header.size()) return truncated();
+
+  const auto channel_size = read_big_endian<std::int32_t>(&header[20]);
+  const auto data_size = read_big_endian<std::int32_t>(&header[24]);
+  if (channel_size < 1 || channel_size > kLongestChannel || data_size < 0 ||
+      static_cast<std::size_t>(data_size) > kLargestMessage) {
+    throw not_an_event();
+  }
+  // A length that the file cannot hold must not be allocated before it is found out.
+  std::error_code error;
+  const auto file_size = static_cast<std::int64_t>(std::filesystem::file_size(path_, error));
+  const std::int64_t end =
+      position_ + static_cast<std::int64_t>(kHeaderSize) + channel_size + data_size;
+  if (!error && end > file_size) return truncated();
+
+  event_.event_number = read_big_endian<std::int64_t>(&header[4]);
+  event_.event_utime = read_big_endian<std::int64_t>(&header[12]);
+  event_.channel.resize(static_cast<std::size_t>(channel_size));
+  event_.data.resize(static_cast<std::size_t>(data_size));
+  if (std::fread(event_.channel.data(), 1, event_.channel.size(), file_) != event_.channel.size() ||
+      std::fread(event_.data.data(), 1, event_.data.size(), file_) != event_.data.size()) {
+    if (std::ferror(file_) != 0) throw system_error(path_, "cannot read the log");
+    return truncated();
+  }
+  position_ = end;
+  ++report_.events;
+  return true;
+}
+
+LogReport for_each_event(const std::filesystem::path& path,
+                         const std::function<void(const LogEvent&)>& visit) {
+  LogReader reader(path);
+  while (reader.next()) visit(reader.event());
+  return reader.report();
+}
+
+LogAppender::LogAppender(const std::filesystem::path& path, Mode mode, Durability durability)
+    : path_(path), durability_(durability) {
+  Descriptor file(::open(path.c_str(), O_RDWR | O_CREAT | O_CLOEXEC, 0666));
+  if (file.get() < 0) throw system_error(path, "cannot write the log");
+  // Released by the kernel when the process dies, however it dies.
+  if (::flock(file.get(), LOCK_EX | LOCK_NB) != 0) {
+    throw file_error(path, "is being written by another process");
+  }
+  if (mode == Mode::kAppend) {
+    LogReader reader(path);
+    while (reader.next()) next_number_ = reader.event().event_number + 1;
+    found_ = reader.report();
+    end_ = reader.position();
+  }
+  struct stat status {};
+  const bool is_regular = ::fstat(file.get(), &status) == 0 && S_ISREG(status.st_mode);
+  if (is_regular &&
+      (::ftruncate(file.get(), end_) != 0 || ::lseek(file.get(), end_, SEEK_SET) != end_)) {
+    throw system_error(path, "cannot cut off the torn tail");
+  }
+  if (is_regular && durability_ == Durability::kToDisk) {
+    if (::fsync(file.get()) != 0) throw system_error(path, "cannot sync");
+    sync_folder(path);
+  }
+  file_ = file.release();
+}
+
+LogAppender::~LogAppender() { ::close(file_); }
+
+void LogAppender::append_bytes(const std::string& channel, std::span<const std::uint8_t> data,
+                               std::int64_t event_utime) {
+  const std::vector<std::uint8_t> event = encode_event(channel, data, event_utime, next_number_);
+  int error = write_all(file_, event);
+  if (error == 0 && durability_ == Durability::kToDisk && ::fdatasync(file_) != 0) error = errno;
+  if (error != 0) {
+    // Half an event would hide everything that is appended after it.
+    if (::ftruncate(file_, end_) == 0) ::lseek(file_, end_, SEEK_SET);
+    errno = error;
+    throw system_error(path_, "cannot append to the log");
+  }
+  end_ += static_cast<std::int64_t>(event.size());
+  ++next_number_;
+}
+
+std::vector<std::uint8_t> encode_event(const std::string& channel,
+                                       std::span<const std::uint8_t> data, std::int64_t event_utime,
+                                       std::int64_t event_number) {
+  if (channel.empty() || channel.size() > static_cast<std::size_t>(kLongestChannel) ||
+      data.size() > kLargestMessage) {
+    throw std::logic_error(
+        "an event needs a channel name of 1 to 999 bytes and at most 2^28 bytes");
+  }
+  std::vector<std::uint8_t> bytes;
+  bytes.reserve(kHeaderSize + channel.size() + data.size());
+  append_big_endian(bytes, kSync);
+  append_big_endian(bytes, event_number);
+  append_big_endian(bytes, event_utime);
+  append_big_endian(bytes, static_cast<std::int32_t>(channel.size()));
+  append_big_endian(bytes, static_cast<std::int32_t>(data.size()));
+  bytes.insert(bytes.end(), channel.begin(), channel.end());
+  bytes.insert(bytes.end(), data.begin(), data.end());
+  return bytes;
+}
+
+void write_file_atomically(const std::filesystem::path& path, const std::string& text) {
+  // Not named after the process: process ids repeat in containers and namespaces.
+  std::random_device random;
+  std::filesystem::path temporary;
+  int descriptor = -1;
+  for (int attempt = 0; attempt < 100 && descriptor < 0; ++attempt) {
+    temporary = path;
+    temporary.replace_filename(fmt::format(".{}.{:08x}", path.filename().string(), random()));
+    descriptor = ::open(temporary.c_str(), O_WRONLY | O_CREAT | O_EXCL | O_CLOEXEC, 0666);
+    if (descriptor < 0 && errno != EEXIST) break;
+  }
+  const Descriptor file(descriptor);
+  if (file.get() < 0) throw system_error(path, "cannot write beside it");
+  const auto* bytes = reinterpret_cast<const std::uint8_t*>(text.data());
+  int error = write_all(file.get(), {bytes, text.size()});
+  if (error == 0 && ::fsync(file.get()) != 0) error = errno;
+  if (error == 0 && ::rename(temporary.c_str(), path.c_str()) != 0) error = errno;
+  if (error != 0) {
+    ::unlink(temporary.c_str());
+    errno = error;
+    throw system_error(path, "cannot replace the file");
+  }
+  sync_folder(path);
+}
+
+}  // namespace bodyschema

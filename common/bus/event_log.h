@@ -1,0 +1,152 @@
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <cstdio>
+#include <filesystem>
+#include <functional>
+#include <optional>
+#include <span>
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+#include "common/bus/codec.h"
+
+namespace bodyschema {
+
+// LCM event logs, as lcm-logger writes and lcm-logplayer reads them. An event is a header of 28
+// bytes, all big-endian: 0xEDA1DA01, int64 event number, int64 event time [µs since 1970], int32
+// length of the channel's name, int32 length of the data; then the name and the data.
+//
+// LCM's own reader is not used: it stops silently at the first damaged byte, drops the whole event
+// before it, cannot say where it was and does not open an empty log.
+
+/// One event of a log.
+struct LogEvent {
+  std::string channel;
+  std::vector<std::uint8_t> data;
+  /// When it was recorded, or the message's own utime in files that must be reproducible [µs].
+  std::int64_t event_utime = 0;
+  std::int64_t event_number = 0;
+};
+
+/// What a log was found to hold.
+struct LogReport {
+  /// Whole events read.
+  std::int64_t events = 0;
+  /// Where the last event begins, if the file ends before that event does: what a writer leaves
+  /// that was killed or ran out of disk. Everything before it is good.
+  std::optional<std::int64_t> truncated_at_byte;
+};
+
+/// Reads a log from its beginning, event by event.
+class LogReader {
+ public:
+  /// @throws std::runtime_error if there is no such file, it cannot be read or is not an LCM log.
+  explicit LogReader(const std::filesystem::path& path);
+  ~LogReader();
+  LogReader(const LogReader&) = delete;
+  LogReader& operator=(const LogReader&) = delete;
+
+  /// Reads the next event into event(). False at the end, also where the tail is truncated.
+  /// @throws std::runtime_error naming the byte where something begins that is not an event.
+  bool next();
+  const LogEvent& event() const { return event_; }
+  const LogReport& report() const { return report_; }
+  /// Where the next event begins [bytes].
+  std::int64_t position() const { return position_; }
+
+ private:
+  std::filesystem::path path_;
+  std::FILE* file_ = nullptr;
+  std::int64_t position_ = 0;
+  LogEvent event_;
+  LogReport report_;
+};
+
+/// Calls `visit` with every event of the log. @throws as LogReader does.
+LogReport for_each_event(const std::filesystem::path& path,
+                         const std::function<void(const LogEvent&)>& visit);
+
+/// All messages of one channel, in order. A truncated tail is no error but reported.
+/// @throws std::runtime_error as LogReader does, and if a message of that channel is malformed or
+/// makes no sense (naming the event).
+template <class Message>
+std::vector<Message> read_log(const std::filesystem::path& path, const Channel<Message>& channel,
+                              LogReport* report = nullptr) {
+  std::vector<Message> messages;
+  const LogReport found = for_each_event(path, [&](const LogEvent& event) {
+    if (event.channel != channel.name) return;
+    Decoded<Message> decoded = decode<Message>(event.data.data(), event.data.size());
+    if (!decoded.message) {
+      throw std::runtime_error(path.string() + ": event " + std::to_string(event.event_number) +
+                               " (" + event.channel + "): " + decoded.problem);
+    }
+    messages.push_back(*std::move(decoded.message));
+  });
+  if (report != nullptr) *report = found;
+  return messages;
+}
+
+/// Writes events at the end of a log, each in one write, so that a killed writer leaves at most one
+/// torn event behind. While it lives no other LogAppender can open the same file.
+class LogAppender {
+ public:
+  enum class Mode { kAppend, kOverwrite };
+  /// kToDisk: append() returns after fdatasync (0.1 ms … 10 ms): the event survives a power cut.
+  /// kToKernel: the event survives the death of the process only.
+  enum class Durability { kToDisk, kToKernel };
+
+  /// Opens or creates the log. A torn tail is cut off, so that what follows can be read.
+  /// @throws std::runtime_error if the file cannot be written, is damaged elsewhere than at its
+  /// tail, or is being written by somebody else.
+  explicit LogAppender(const std::filesystem::path& path, Mode mode = Mode::kAppend,
+                       Durability durability = Durability::kToDisk);
+  ~LogAppender();
+  LogAppender(const LogAppender&) = delete;
+  LogAppender& operator=(const LogAppender&) = delete;
+
+  /// Appends the message with its utime as event time.
+  /// @throws std::logic_error if it does not pass check(); std::runtime_error if the disk is full
+  /// (the log then ends after the event before).
+  template <class Message>
+  void append(const Channel<Message>& channel, const Message& message) {
+    append_bytes(channel.name, encode(channel, message), message.utime);
+  }
+  void append_bytes(const std::string& channel, std::span<const std::uint8_t> data,
+                    std::int64_t event_utime);
+
+  /// What the log held when it was opened.
+  const LogReport& found() const { return found_; }
+
+ private:
+  std::filesystem::path path_;
+  Durability durability_;
+  int file_ = -1;
+  std::int64_t end_ = 0;
+  std::int64_t next_number_ = 0;
+  LogReport found_;
+};
+
+/// The bytes of one event as they stand in a log.
+std::vector<std::uint8_t> encode_event(const std::string& channel,
+                                       std::span<const std::uint8_t> data, std::int64_t event_utime,
+                                       std::int64_t event_number);
+
+/// Replaces a file as a whole: a temporary file in the same folder, synced, renamed, the folder
+/// synced. Whoever reads `path` sees the old or the new text, also after a power cut.
+/// @throws std::runtime_error naming the file.
+void write_file_atomically(const std::filesystem::path& path, const std::string& text);
+
+/// A log of one event, written atomically: the form of a schema file. Its event time is the
+/// message's utime, so equal messages make equal files.
+template <class Message>
+void write_one_event_log(const std::filesystem::path& path, const Channel<Message>& channel,
+                         const Message& message) {
+  const std::vector<std::uint8_t> event =
+      encode_event(channel.name, encode(channel, message), message.utime, 0);
+  write_file_atomically(path, std::string(event.begin(), event.end()));
+}
+
+}  // namespace bodyschema

@@ -1,0 +1,250 @@
+#include "common/bus/process.h"
+
+#include <signal.h>
+#include <spdlog/sinks/stdout_color_sinks.h>
+#include <spdlog/spdlog.h>
+#include <unistd.h>
+
+#include <CLI/CLI.hpp>
+#include <algorithm>
+#include <array>
+#include <atomic>
+#include <chrono>
+#include <cstdio>
+#include <exception>
+#include <fstream>
+#include <iterator>
+#include <map>
+#include <sstream>
+#include <stdexcept>
+#include <utility>
+#include <vector>
+
+#include "common/bus/convert.h"
+
+namespace bodyschema {
+namespace {
+
+using SteadyClock = std::chrono::steady_clock;
+
+constexpr std::chrono::milliseconds kTickPeriod{100};
+constexpr std::chrono::milliseconds kInfoPeriod{1000};
+constexpr std::chrono::milliseconds kShortestInfoPeriod{100};
+
+std::atomic<bool> stop_requested{false};
+static_assert(std::atomic<bool>::is_always_lock_free, "set by a signal handler");
+
+void request_stop(int) { stop_requested = true; }
+
+/// The first signal ends the loop, a second one the process, should a handler never return. No
+/// SA_RESTART: a wait for messages must end early.
+void install_signal_handlers() {
+  stop_requested = false;
+  struct sigaction action {};
+  action.sa_handler = &request_stop;
+  action.sa_flags = static_cast<int>(SA_RESETHAND);
+  sigemptyset(&action.sa_mask);
+  ::sigaction(SIGTERM, &action, nullptr);
+  ::sigaction(SIGINT, &action, nullptr);
+  // A relay that went away is reported by publish(), not by a signal.
+  ::signal(SIGPIPE, SIG_IGN);
+}
+
+std::int64_t now_us() {
+  return std::chrono::duration_cast<std::chrono::microseconds>(
+             std::chrono::system_clock::now().time_since_epoch())
+      .count();
+}
+
+std::string host_name() {
+  std::array<char, 256> name{};
+  return ::gethostname(name.data(), name.size() - 1) == 0 ? name.data() : "";
+}
+
+std::string read_text(const std::filesystem::path& file) {
+  std::ifstream stream(file);
+  std::string text{std::istreambuf_iterator<char>(stream), {}};
+  if (std::filesystem::is_directory(file) || !stream) {
+    throw std::runtime_error(file.string() + ": cannot read the configuration file");
+  }
+  return text;
+}
+
+std::string one_line(std::string text) {
+  std::replace(text.begin(), text.end(), '\n', ' ');
+  return text;
+}
+
+int fail(const std::string& name, const std::string& what) {
+  std::fprintf(stderr, "%s: %s\n", name.c_str(), one_line(what).c_str());
+  return 1;
+}
+
+}  // namespace
+
+struct Process::Impl {
+  Impl(std::string process_name, std::filesystem::path config, const std::string& in_url,
+       const std::string& out_url)
+      : config_file(std::move(config)), bus(in_url, out_url) {
+    info.process_name = std::move(process_name);
+    info.host = as_text(host_name());
+    info.pid = static_cast<std::int32_t>(::getpid());
+    info.start_utime = bus.is_replay() ? std::max<std::int64_t>(0, bus.event_utime()) : now_us();
+    info.program_version = BODYSCHEMA_VERSION;
+    info.seed = -1;
+    info.configuration = as_text(read_text(config_file));
+  }
+
+  std::filesystem::path config_file;
+  Bus bus;
+  process_info_t info{};
+  bool info_changed = true;
+  SteadyClock::time_point last_info{};
+  SteadyClock::time_point last_tick{};
+  std::map<std::string, std::int64_t> counters;
+  std::vector<std::function<void(std::int64_t)>> tick_handlers;
+  std::vector<std::function<void()>> idle_handlers;
+  std::vector<std::function<void()>> end_handlers;
+
+  void publish_info() {
+    info.utime = bus.is_replay() ? std::max<std::int64_t>(0, bus.last_utime()) : now_us();
+    // std::map: ascending names, as the message wants them.
+    std::map<std::string, std::int64_t> all = bus.counters();
+    for (const auto& [name, value] : counters) all[name] += value;
+    std::vector<counter_t> list;
+    for (const auto& [name, value] : all) {
+      counter_t& counter = list.emplace_back();
+      counter.counter_name = name;
+      counter.count = value;
+    }
+    set_array(info.num_counters, info.counters, std::move(list));
+    bus.publish(kProcessInfo, info);
+    info_changed = false;
+    last_info = SteadyClock::now();
+  }
+
+  void publish_info_if_due() {
+    if (bus.is_replay()) return;
+    const auto age = SteadyClock::now() - last_info;
+    if (age >= kInfoPeriod || (info_changed && age >= kShortestInfoPeriod)) publish_info();
+  }
+
+  void tick() {
+    if (bus.is_replay()) {
+      if (bus.last_utime() < 0) return;
+      for (const auto& handler : tick_handlers) handler(bus.last_utime());
+      return;
+    }
+    const auto now = SteadyClock::now();
+    if (now - last_tick < kTickPeriod) return;
+    last_tick = now;
+    for (const auto& handler : tick_handlers) handler(now_us());
+  }
+};
+
+Process::Process(std::unique_ptr<Impl> impl) : impl_(std::move(impl)) {}
+Process::~Process() = default;
+
+Bus& Process::bus() { return impl_->bus; }
+
+const std::filesystem::path& Process::config_file() const { return impl_->config_file; }
+
+std::filesystem::path Process::rig_folder() const {
+  return impl_->config_file.has_parent_path() ? impl_->config_file.parent_path() : ".";
+}
+
+std::int64_t Process::epoch() const { return impl_->info.start_utime; }
+
+void Process::set_activity(std::int8_t phase, std::string activity) {
+  activity = as_text(std::move(activity));
+  if (phase == impl_->info.phase && activity == impl_->info.activity) return;
+  impl_->info.phase = phase;
+  impl_->info.activity = std::move(activity);
+  impl_->info_changed = true;
+}
+
+void Process::set_seed(std::int64_t seed) { impl_->info.seed = seed; }
+
+void Process::count(const std::string& name, std::int64_t increment) {
+  impl_->counters[name] += increment;
+}
+
+void Process::on_tick(std::function<void(std::int64_t)> handler) {
+  impl_->tick_handlers.push_back(std::move(handler));
+}
+
+void Process::on_idle(std::function<void()> handler) {
+  impl_->idle_handlers.push_back(std::move(handler));
+}
+
+void Process::on_end(std::function<void()> handler) {
+  impl_->end_handlers.push_back(std::move(handler));
+}
+
+void Process::run() {
+  impl_->publish_info_if_due();
+  bool has_more = true;
+  while (has_more && !stop_requested) {
+    has_more = impl_->bus.handle(kTickPeriod);
+    impl_->tick();
+    for (const auto& handler : impl_->idle_handlers) handler();
+    impl_->publish_info_if_due();
+  }
+  for (const auto& handler : impl_->end_handlers) handler();
+  impl_->info.phase = process_info_t::PHASE_ENDED;
+  impl_->publish_info();
+}
+
+int run_process(const std::string& name, int argc, char** argv,
+                const std::function<void(Process&)>& body,
+                const std::function<void(CLI::App&)>& add_options) {
+  try {
+    // Before anything slow, so that a SIGTERM during start-up also ends in good order.
+    install_signal_handlers();
+    std::string config;
+    std::string in_url;
+    std::string out_url;
+    std::string log_level = "info";
+    CLI::App app("One process of bodyschema.", name);
+    app.add_option("--config", config, "its configuration file (YAML)")->type_name("FILE");
+    app.add_option("--in", in_url, "bus or log to listen to; default: " + default_url())
+        ->type_name("URL");
+    CLI::Option* out =
+        app.add_option("--out", out_url,
+                       "bus or log to publish to; default: the same as --in, nowhere for a log")
+            ->type_name("URL");
+    app.add_option("--log-level", log_level, "what goes to stderr")
+        ->check(CLI::IsMember({"trace", "debug", "info", "warning", "error", "critical", "off"}))
+        ->capture_default_str();
+    app.set_version_flag("--version", std::string(BODYSCHEMA_VERSION));
+    if (add_options) add_options(app);
+    try {
+      app.parse(argc, argv);
+    } catch (const CLI::Success& request) {
+      return app.exit(request);
+    } catch (const CLI::ParseError& error) {
+      return fail(name, std::string(error.what()) + ". Type: " + name + " --help");
+    }
+    if (config.empty()) {
+      return fail(
+          name, "--config is missing. Type: " + name + " --config config/<rig>/" + name + ".yaml");
+    }
+    if (in_url.empty()) in_url = default_url();
+    if (out->count() == 0) out_url = in_url.rfind("file://", 0) == 0 ? "" : in_url;
+
+    spdlog::set_default_logger(std::make_shared<spdlog::logger>(
+        name, std::make_shared<spdlog::sinks::stderr_color_sink_mt>()));
+    spdlog::set_level(spdlog::level::from_str(log_level));
+    spdlog::set_pattern("%H:%M:%S.%e %n %^%l%$: %v");
+
+    Process process(std::make_unique<Process::Impl>(name, config, in_url, out_url));
+    body(process);
+    return 0;
+  } catch (const std::exception& error) {
+    return fail(name, error.what());
+  } catch (...) {
+    return fail(name, "ended by an exception of an unknown type");
+  }
+}
+
+}  // namespace bodyschema

@@ -1,0 +1,81 @@
+#pragma once
+
+#include <cstdint>
+#include <filesystem>
+#include <functional>
+#include <memory>
+#include <string>
+
+#include "common/bus/bus.h"
+
+namespace CLI {
+class App;
+}
+
+namespace bodyschema {
+
+/// What every process has: `--config FILE --in URL --out URL --log-level LEVEL`, a bus, a loop that
+/// ends on SIGTERM, SIGINT or at the end of a log, PROCESS_INFO at 1 Hz, an exit code.
+///
+///   int main(int argc, char** argv) {
+///     return run_process("observer", argc, argv, [](Process& process) {
+///       Observer observer(ObserverConfig::load(process.config_file()));
+///       process.bus().subscribe(kMarkerPoses, …);
+///       process.run();
+///     });
+///   }
+///
+/// `--in` is default_url() unless given. `--out` is then the same bus, but nowhere where the input
+/// is a log: a replay must not reach a robot by accident.
+class Process {
+ public:
+  ~Process();
+  Process(const Process&) = delete;
+  Process& operator=(const Process&) = delete;
+
+  Bus& bus();
+  const std::filesystem::path& config_file() const;
+  /// The folder of the configuration file: the rig.
+  std::filesystem::path rig_folder() const;
+  /// Start of this process, µs since 1970; in a replay the event time of the log's first event, so
+  /// that a replay gives the same bytes again.
+  std::int64_t epoch() const;
+
+  /// What PROCESS_INFO says. `phase` is process_info_t::PHASE_*. Bytes of `activity` that are not
+  /// UTF-8 are replaced by '?'.
+  void set_activity(std::int8_t phase, std::string activity);
+  void set_seed(std::int64_t seed);
+  /// A counter of the process's own beside those of the bus.
+  void count(const std::string& name, std::int64_t increment = 1);
+
+  /// Called about every 100 ms (every message in a replay) with the clock's time, or the newest
+  /// message's in a replay [µs].
+  void on_tick(std::function<void(std::int64_t now_us)> handler);
+  /// Called after every batch of messages, and at least every 100 ms when live; may publish. The
+  /// place to look whether a worker has finished.
+  void on_idle(std::function<void()> handler);
+  /// Called once when the loop ends, in order (SIGTERM, end of the log): the place for the last
+  /// answer and the safe command.
+  void on_end(std::function<void()> handler);
+
+  /// Returns after SIGTERM or SIGINT (the message in hand is finished first) or at the end of a
+  /// log. A second signal kills. Live, PROCESS_INFO is sent at 1 Hz and on change (at most 10 Hz);
+  /// in a replay once, at the end.
+  void run();
+
+ private:
+  friend int run_process(const std::string&, int, char**, const std::function<void(Process&)>&,
+                         const std::function<void(CLI::App&)>&);
+  struct Impl;
+  explicit Process(std::unique_ptr<Impl> impl);
+  std::unique_ptr<Impl> impl_;
+};
+
+/// Parses the arguments, constructs a Process, calls `body`, and turns an exception into one line
+/// "name: what" on stderr and exit code 1. `add_options` adds a process's own flags. Logs go to
+/// stderr; stdout belongs to results.
+int run_process(const std::string& name, int argc, char** argv,
+                const std::function<void(Process&)>& body,
+                const std::function<void(CLI::App&)>& add_options = nullptr);
+
+}  // namespace bodyschema

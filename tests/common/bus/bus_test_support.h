@@ -1,0 +1,75 @@
+#pragma once
+
+#include <sys/types.h>
+
+#include <chrono>
+#include <cstdint>
+#include <filesystem>
+#include <string>
+#include <vector>
+
+#include "common/bus/bus.h"
+
+namespace bodyschema::test {
+
+/// A folder that is gone when the test is over.
+class TemporaryFolder {
+ public:
+  TemporaryFolder();
+  ~TemporaryFolder();
+  TemporaryFolder(const TemporaryFolder&) = delete;
+  TemporaryFolder& operator=(const TemporaryFolder&) = delete;
+  std::filesystem::path operator/(const std::string& name) const { return path_ / name; }
+  const std::filesystem::path& path() const { return path_; }
+
+ private:
+  std::filesystem::path path_;
+};
+
+std::vector<std::uint8_t> read_bytes(const std::filesystem::path& file);
+void write_bytes(const std::filesystem::path& file, const std::vector<std::uint8_t>& bytes);
+
+/// Asks `is_done()` between waits of `ask()` until it is true; false after ten seconds.
+template <class Ask, class IsDone>
+bool ask_until(Ask ask, IsDone is_done) {
+  const auto end = std::chrono::steady_clock::now() + std::chrono::seconds(10);
+  while (!is_done()) {
+    if (std::chrono::steady_clock::now() > end) return false;
+    ask();
+  }
+  return true;
+}
+
+/// Handles messages until `is_done()`; false after ten seconds.
+template <class IsDone>
+bool handle_until(Bus& bus, IsDone is_done) {
+  return ask_until([&] { bus.handle(std::chrono::milliseconds(20)); }, is_done);
+}
+
+/// A program that runs beside the test; killed and reaped when this goes away.
+class Program {
+ public:
+  explicit Program(const std::vector<std::string>& arguments);
+  ~Program();
+  Program(const Program&) = delete;
+  Program& operator=(const Program&) = delete;
+
+  /// Waits until stdout holds `text`; false after ten seconds or at its end.
+  bool wait_for_output(const std::string& text);
+  void send_signal(int number) const;
+  /// Waits for the end. Exit code, or 128 + signal; −1 after thirty seconds.
+  int wait();
+  /// Everything written until now (all of it after wait()).
+  const std::string& out() const { return texts_[0]; }
+  const std::string& err() const { return texts_[1]; }
+  pid_t pid() const { return pid_; }
+
+ private:
+  /// Reads what is there; false when both ends are closed.
+  bool read_some(int timeout_ms);
+  pid_t pid_ = -1;
+  int pipes_[2] = {-1, -1};
+  std::string texts_[2];
+};
+
+}  // namespace bodyschema::test

@@ -1,0 +1,194 @@
+#include "common/bus/check.h"
+
+#include <gtest/gtest.h>
+
+#include <functional>
+#include <string>
+#include <type_traits>
+#include <utility>
+
+#include "tests/lcmtypes/example_messages.h"
+
+namespace bodyschema::test {
+namespace {
+
+/// Fails unless check() refuses the changed message and its complaint begins with `field`.
+template <class Message>
+void expect_refused(Message message, const std::string& field,
+                    const std::type_identity_t<std::function<void(Message&)>>& change) {
+  ASSERT_EQ(check(message), "");
+  change(message);
+  const std::string problem = check(message);
+  EXPECT_EQ(problem.substr(0, field.size() + 1), field + " ") << "complaint: " << problem;
+}
+
+TEST(Check, AcceptsEveryExample) {
+  for_each_channel([](const auto& channel, const auto& message) {
+    EXPECT_EQ(check(message), "") << channel.name;
+  });
+}
+
+TEST(Check, RefusesTimesBeforeZero) {
+  expect_refused(example_action_command(), "utime", [](auto& m) { m.utime = -1; });
+  expect_refused(example_action_command(), "expiry_utime", [](auto& m) { m.expiry_utime = -1; });
+  expect_refused(example_motion_status(), "rest_since_utime",
+                 [](auto& m) { m.rest_since_utime = -2; });
+  expect_refused(example_sample(), "rest_end_utime",
+                 [](auto& m) { m.rest_end_utime = m.rest_begin_utime - 1; });
+}
+
+TEST(Check, RefusesConstantsThatNobodyDefined) {
+  expect_refused(example_action_command(), "kind", [](auto& m) { m.kind = 4; });
+  expect_refused(example_action_command(), "purpose", [](auto& m) { m.purpose = -1; });
+  expect_refused(example_motion_status(), "state", [](auto& m) { m.state = 8; });
+  expect_refused(example_camera_image(), "encoding", [](auto& m) { m.encoding = 3; });
+  expect_refused(example_body_schema(), "edges[0].state", [](auto& m) { m.edges[0].state = 4; });
+  expect_refused(example_process_info(), "phase", [](auto& m) { m.phase = 9; });
+  expect_refused(example_model_health(), "events[0].event_kind",
+                 [](auto& m) { m.events[0].event_kind = 4; });
+  expect_refused(example_sample(), "parts[0].has_other", [](auto& m) { m.parts[0].has_other = 2; });
+}
+
+TEST(Check, RefusesQuaternionsThatAreNotUnit) {
+  expect_refused(example_sample(), "parts[1].X_CB.rotation_wxyz",
+                 [](auto& m) { m.parts[1].X_CB.rotation_wxyz[0] += 0.01; });
+  expect_refused(example_sim_state(), "X_WG[2].pose.rotation_wxyz", [](auto& m) {
+    for (double& q : m.X_WG[2].rotation_wxyz) q = 0;
+  });
+}
+
+TEST(Check, RefusesCovariancesThatAreNone) {
+  expect_refused(example_sample(), "parts[0].covariance",
+                 [](auto& m) { m.parts[0].covariance[1][2] += 1e-7; });
+  expect_refused(example_sample(), "parts[0].covariance",
+                 [](auto& m) { m.parts[0].covariance[1][2] = m.parts[0].covariance[2][1] = 1; });
+  expect_refused(example_sample(), "parts[0].covariance",
+                 [](auto& m) { m.parts[0].covariance[3][3] = -1e-9; });
+  expect_refused(example_marker_poses(), "markers[0].covariance", [](auto& m) {
+    for (auto& row : m.markers[0].covariance) {
+      for (double& value : row) value = 0;
+    }
+  });
+  expect_refused(example_body_schema(), "edges[0].parameter_covariance",
+                 [](auto& m) { m.edges[0].parameter_covariance[1] = 1; });
+  body_schema_t schema = example_body_schema();
+  for (auto& row : schema.X_CR_covariance) {
+    for (double& value : row) value = 0;
+  }
+  EXPECT_EQ(check(schema), "") << "an unknown camera pose has no covariance yet";
+}
+
+TEST(Check, AcceptsASingularCovarianceAndOneWithVeryDifferentUnits) {
+  sample_t sample = example_sample();
+  for (int i = 0; i < 6; ++i) {
+    for (int j = 0; j < 6; ++j) {
+      const double scale_i = i < 3 ? 1e-6 : 1e3;
+      const double scale_j = j < 3 ? 1e-6 : 1e3;
+      sample.parts[0].covariance[i][j] = scale_i * scale_j;
+    }
+  }
+  EXPECT_EQ(check(sample), "");
+}
+
+TEST(Check, RefusesIdsThatRepeatOrAreOutOfOrder) {
+  expect_refused(example_sample(), "parts[1].part_id",
+                 [](auto& m) { m.parts[1].part_id = m.parts[0].part_id; });
+  expect_refused(example_sample(), "parts[0].part_id", [](auto& m) { m.parts[0].part_id = -1; });
+  expect_refused(example_marker_poses(), "markers[1].marker_id",
+                 [](auto& m) { m.markers[1].marker_id = 2; });
+  expect_refused(example_sim_state(), "true_part", [](auto& m) { m.true_part = {7, 1}; });
+  expect_refused(example_body_schema(), "part_ids", [](auto& m) { m.part_ids[3] = 1; });
+  expect_refused(example_process_info(), "counters[1].counter_name",
+                 [](auto& m) { m.counters[1].counter_name = m.counters[0].counter_name; });
+}
+
+TEST(Check, RefusesCountsThatAreNotTheLengthOfTheirArray) {
+  expect_refused(example_sample(), "action", [](auto& m) { ++m.num_signals; });
+  expect_refused(example_sample(), "parts", [](auto& m) { m.num_parts = -1; });
+  expect_refused(example_sample(), "parts[0].tags", [](auto& m) { ++m.parts[0].num_tags; });
+  expect_refused(example_camera_image(), "data", [](auto& m) { --m.num_bytes; });
+  expect_refused(example_sim_state(), "geom_alpha", [](auto& m) { m.geom_alpha.pop_back(); });
+}
+
+TEST(Check, RefusesCountsBeyondReason) {
+  expect_refused(example_sample(), "parts", [](auto& m) {
+    m.parts.resize(10'001);
+    m.num_parts = 10'001;
+  });
+  expect_refused(example_model_health(), "events", [](auto& m) {
+    m.events.resize(33);
+    m.num_events = 33;
+  });
+}
+
+TEST(Check, RefusesAnImageThatItsBytesCannotBe) {
+  expect_refused(example_camera_image(), "num_bytes", [](auto& m) { ++m.height; });
+  expect_refused(example_camera_image(), "width", [](auto& m) { m.width = 31; });
+  expect_refused(example_camera_image(), "height", [](auto& m) { m.height = 16'385; });
+  expect_refused(example_camera_info(), "num_coefficients", [](auto& m) {
+    m.distortion.resize(3);
+    m.num_coefficients = 3;
+  });
+  expect_refused(example_camera_info(), "fx", [](auto& m) { m.fx = 0; });
+}
+
+TEST(Check, RefusesASchemaThatIsNoTreeOfItsOwnPartsAndSignals) {
+  expect_refused(example_body_schema(), "edges[0].to_part",
+                 [](auto& m) { m.edges[0].to_part = 5; });
+  expect_refused(example_body_schema(), "edges[0].from_part",
+                 [](auto& m) { m.edges[0].from_part = 5; });
+  expect_refused(example_body_schema(), "edges[1].to_part",
+                 [](auto& m) { m.edges[1].to_part = 2; });
+  expect_refused(example_body_schema(), "edges[1].to_part",
+                 [](auto& m) { std::swap(m.edges[0], m.edges[1]); });
+  expect_refused(example_body_schema(), "edges[0].joints[1].signal_index",
+                 [](auto& m) { m.edges[0].joints[1].signal_index = 2; });
+  expect_refused(example_body_schema(), "root_part", [](auto& m) { m.root_part = -1; });
+  expect_refused(example_body_schema(), "is_complete", [](auto& m) { m.is_complete = 1; });
+  expect_refused(example_body_schema(), "edges[1].base_kind",
+                 [](auto& m) { m.edges[1].base_kind = schema_edge_t::EDGE_SCREW; });
+  expect_refused(example_body_schema(), "edges[0].num_covariance", [](auto& m) {
+    m.edges[0].parameter_covariance.resize(21);
+    m.edges[0].num_covariance = 21;
+  });
+}
+
+TEST(Check, KnowsMinusOneOnlyWhereItMeansNotMeasured) {
+  expect_refused(example_model_health(), "worst_position_m",
+                 [](auto& m) { m.worst_position_m = -0.5; });
+  expect_refused(example_body_schema(), "noise_position_m",
+                 [](auto& m) { m.noise_position_m = -1; });
+  model_health_t health = example_model_health();
+  health.worst_position_m = health.part_health[0].position_median_m = -1;
+  health.edge_health[0].median_mahalanobis2 = -1;
+  EXPECT_EQ(check(health), "");
+}
+
+TEST(Check, RefusesTextThatIsNotUtf8) {
+  expect_refused(example_motion_status(), "reason", [](auto& m) { m.reason = "50 \xB0"; });
+  expect_refused(example_motion_status(), "reason",
+                 [](auto& m) { m.reason = std::string("a\0b", 3); });
+  expect_refused(example_motion_status(), "reason", [](auto& m) { m.reason = "\xED\xA0\x80"; });
+  expect_refused(example_action_command(), "source", [](auto& m) { m.source.clear(); });
+}
+
+TEST(Check, OnlyAMoveHasAnAction) {
+  expect_refused(example_action_command(), "num_signals",
+                 [](auto& m) { m.kind = action_command_t::KIND_STOP; });
+  expect_refused(example_action_command(), "num_signals", [](auto& m) {
+    m.action.clear();
+    m.num_signals = 0;
+  });
+}
+
+TEST(AsText, ReplacesOnlyWhatIsNotUtf8) {
+  EXPECT_EQ(as_text("2 → 4, 50°"), "2 → 4, 50°");
+  EXPECT_EQ(as_text("50 \xB0"
+                    "C"),
+            "50 ?C");
+  EXPECT_EQ(as_text(std::string("a\0b", 3)), "a?b");
+  EXPECT_EQ(as_text("cut \xE2\x86"), "cut ??");
+}
+
+}  // namespace
+}  // namespace bodyschema::test

@@ -1,0 +1,116 @@
+#include "common/bus/convert.h"
+
+#include <gtest/gtest.h>
+
+#include <random>
+
+#include "common/bus/check.h"
+#include "tests/lcmtypes/example_messages.h"
+
+namespace bodyschema::test {
+namespace {
+
+Pose random_pose(std::mt19937_64& rng) {
+  std::normal_distribution<double> normal;
+  return make_pose(Eigen::Quaterniond(normal(rng), normal(rng), normal(rng), normal(rng)),
+                   Eigen::Vector3d(normal(rng), normal(rng), normal(rng)));
+}
+
+TEST(Convert, APoseSurvivesTheWireAndItsQuaternionIsUnitWithPositiveW) {
+  std::mt19937_64 rng(1);
+  for (int n = 0; n < 200; ++n) {
+    const Pose X = random_pose(rng);
+    const pose_t message = to_message(X);
+    EXPECT_GE(message.rotation_wxyz[0], 0);
+    EXPECT_TRUE(from_message(message).matrix().isApprox(X.matrix(), 1e-14));
+  }
+}
+
+TEST(Convert, TheWireOrderIsWXYZ) {
+  const pose_t message =
+      to_message(make_pose(Eigen::Quaterniond(0.5, 0.5, -0.5, 0.5), Eigen::Vector3d(1, 2, 3)));
+  EXPECT_DOUBLE_EQ(message.rotation_wxyz[0], 0.5);
+  EXPECT_DOUBLE_EQ(message.rotation_wxyz[1], 0.5);
+  EXPECT_DOUBLE_EQ(message.rotation_wxyz[2], -0.5);
+  EXPECT_DOUBLE_EQ(message.rotation_wxyz[3], 0.5);
+  EXPECT_EQ(message.position_m[2], 3);
+}
+
+TEST(Convert, AQuaternionThatPassesCheckBecomesARotation) {
+  pose_t message = to_message(Pose::Identity());
+  message.rotation_wxyz[0] = 1.0009;
+  const Eigen::Matrix3d R = from_message(message).linear();
+  EXPECT_TRUE((R * R.transpose()).isApprox(Eigen::Matrix3d::Identity(), 1e-14));
+}
+
+TEST(Convert, ASampleSurvivesTheWire) {
+  const ActionPoseSample sample = from_message(example_sample());
+  EXPECT_EQ(sample.sample_index, 12);
+  EXPECT_EQ(sample.purpose, Purpose::kProbe);
+  EXPECT_EQ(sample.action, Eigen::Vector2d(0.25, -0.5));
+  ASSERT_EQ(sample.parts.size(), 2U);
+  EXPECT_FALSE(sample.parts[0].X_CB_other);
+  EXPECT_TRUE(sample.parts[1].X_CB_other);
+  EXPECT_EQ(sample.parts[1].error_ratio, 2.5);
+
+  const sample_t message = to_message(sample);
+  EXPECT_EQ(check(message), "");
+  const ActionPoseSample again = from_message(message);
+  EXPECT_EQ(again.utime, sample.utime);
+  EXPECT_EQ(again.action, sample.action);
+  for (std::size_t i = 0; i < sample.parts.size(); ++i) {
+    EXPECT_EQ(again.parts[i].part, sample.parts[i].part);
+    EXPECT_TRUE(again.parts[i].X_CB.isApprox(sample.parts[i].X_CB, 1e-14));
+    EXPECT_EQ(again.parts[i].covariance, sample.parts[i].covariance);
+    EXPECT_EQ(again.parts[i].X_CB_other.has_value(), sample.parts[i].X_CB_other.has_value());
+    EXPECT_EQ(again.parts[i].error_ratio, sample.parts[i].error_ratio);
+  }
+}
+
+TEST(Convert, ABodySchemaSurvivesTheWire) {
+  body_schema_t message = example_body_schema();
+  // What the structure learner does not use.
+  for (signal_t& signal : message.signals) {
+    signal.warp_weights.clear();
+    signal.num_warp = 0;
+  }
+  const BodySchema schema = from_message(message);
+  EXPECT_EQ(schema.version, 4);
+  EXPECT_EQ(schema.root, 2);
+  EXPECT_EQ(schema.edges[0].state, EdgeState::kSuspect);
+  EXPECT_EQ(schema.unconnected[0].reason, Unconnected::kNoValidModel);
+  ASSERT_EQ(schema.edges[0].parameter_covariance.rows(), 22);
+  EXPECT_EQ(schema.edges[0].parameter_covariance, schema.edges[0].parameter_covariance.transpose());
+
+  const body_schema_t again = to_message(schema);
+  EXPECT_EQ(check(again), "");
+  const BodySchema twice = from_message(again);
+  ASSERT_EQ(twice.edges.size(), schema.edges.size());
+  const Eigen::Vector2d action(0.3, -0.7);
+  for (std::size_t i = 0; i < schema.edges.size(); ++i) {
+    EXPECT_TRUE(twice.edges[i].predict(action).isApprox(schema.edges[i].predict(action), 1e-13));
+    EXPECT_EQ(twice.edges[i].parameter_covariance, schema.edges[i].parameter_covariance);
+  }
+  EXPECT_EQ(twice.parts, schema.parts);
+  EXPECT_EQ(twice.noise.position_m, schema.noise.position_m);
+}
+
+TEST(Convert, AParameterCovarianceKeepsFloatPrecision) {
+  std::mt19937_64 rng(3);
+  std::normal_distribution<double> normal;
+  BodySchema schema = from_message(example_body_schema());
+  Eigen::MatrixXd root(22, 22);
+  for (double& value : root.reshaped()) value = 1e-3 * normal(rng);
+  schema.edges[0].parameter_covariance = root * root.transpose();
+  const body_schema_t message = to_message(schema);
+  EXPECT_EQ(check(message), "");
+  const Eigen::MatrixXd found = from_message(message).edges[0].parameter_covariance;
+  EXPECT_TRUE(found.isApprox(schema.edges[0].parameter_covariance, 1e-6));
+}
+
+TEST(Convert, AnEmptySchemaIsAMessageThatMakesSense) {
+  EXPECT_EQ(check(to_message(BodySchema{})), "");
+}
+
+}  // namespace
+}  // namespace bodyschema::test

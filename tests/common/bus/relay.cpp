@@ -1,0 +1,42 @@
+// relay: SAMPLE, MOTION_STATUS -> MOTION_STATUS
+// The smallest process, for tests of what every process has: passes MOTION_STATUS on, answers each
+// SAMPLE with a MOTION_STATUS, and says on stdout where it is.
+
+#include <CLI/CLI.hpp>
+#include <cstdio>
+#include <memory>
+#include <stdexcept>
+
+#include "common/bus/process.h"
+
+int main(int argc, char** argv) {
+  using namespace bodyschema;
+  bool fails = false;
+  const auto body = [&](Process& process) {
+    std::int64_t num_ticks = 0;
+    process.bus().subscribe(kMotionStatus, [&](const motion_status_t& status) {
+      if (fails) throw std::runtime_error("the handler\nfailed");
+      process.set_activity(process_info_t::PHASE_WORKING, "relays");
+      process.count("relayed");
+      process.bus().publish(kMotionStatus, status);
+    });
+    process.bus().subscribe(kSample, [&](const sample_t& sample) {
+      motion_status_t status{};
+      status.utime = sample.utime;
+      status.epoch = process.epoch();
+      status.action_id = sample.action_id;
+      process.bus().publish(kMotionStatus, status);
+    });
+    process.on_tick([&](std::int64_t) {
+      if (++num_ticks > 1) return;
+      std::puts("ready");
+      std::fflush(stdout);
+    });
+    process.on_end([] { std::puts("first end"); });
+    process.on_end([] { std::puts("second end"); });
+    process.run();
+    std::puts("ended");
+  };
+  return run_process("relay", argc, argv, body,
+                     [&](CLI::App& app) { app.add_flag("--fail", fails, "throw in a handler"); });
+}

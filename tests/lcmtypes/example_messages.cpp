@@ -1,0 +1,292 @@
+#include "tests/lcmtypes/example_messages.h"
+
+#include <cmath>
+#include <utility>
+#include <vector>
+
+namespace bodyschema::test {
+namespace {
+
+template <class Count, class Element>
+void fill(Count& count, std::vector<Element>& array, std::vector<Element> values) {
+  count = static_cast<Count>(values.size());
+  array = std::move(values);
+}
+
+/// A pose that differs from number to number.
+pose_t pose(int number) {
+  const double angle = 0.3 + 0.1 * number;
+  pose_t X{};
+  X.position_m[0] = 0.01 * number + 0.1;
+  X.position_m[1] = -0.02 * number;
+  X.position_m[2] = 1.5;
+  X.rotation_wxyz[0] = std::cos(angle / 2);
+  X.rotation_wxyz[1] = 0.6 * std::sin(angle / 2);
+  X.rotation_wxyz[3] = 0.8 * std::sin(angle / 2);
+  return X;
+}
+
+/// B Bᵀ with B = 1e-3 (identity + a little everywhere).
+void covariance(double (&wire)[6][6]) {
+  for (int i = 0; i < 6; ++i) {
+    for (int j = 0; j < 6; ++j) {
+      wire[i][j] = 0;
+      for (int k = 0; k < 6; ++k) {
+        wire[i][j] += 1e-6 * ((i == k) + 0.02 * (i + k)) * ((j == k) + 0.02 * (j + k));
+      }
+    }
+  }
+}
+
+void corners(double (&wire)[4][2], double offset) {
+  const double unit[4][2] = {{-1, 1}, {1, 1}, {1, -1}, {-1, -1}};
+  for (int i = 0; i < 4; ++i) {
+    wire[i][0] = 320 + offset + 20 * unit[i][0];
+    wire[i][1] = 240 - offset + 20 * unit[i][1];
+  }
+}
+
+schema_edge_t edge(int from, int to, int num_joints) {
+  schema_edge_t edge{};
+  edge.from_part = from;
+  edge.to_part = to;
+  edge.base_kind = num_joints == 0 ? schema_edge_t::EDGE_RIGID : schema_edge_t::EDGE_SCREW;
+  edge.X_left = pose(to);
+  std::vector<screw_joint_t> joints;
+  for (int n = 0; n < num_joints; ++n) {
+    screw_joint_t& joint = joints.emplace_back();
+    joint.signal_index = n % 2;
+    joint.gain = 1;
+    joint.offset = 0.01;
+    joint.slide_m = 0.002;
+    joint.turn_rad = 1.02;
+    joint.X_after = pose(10 + n);
+  }
+  fill(edge.num_joints, edge.joints, joints);
+  edge.X_right = pose(20 + to);
+  std::vector<float> packed;
+  for (int i = 0; i < 6 + 8 * num_joints; ++i) {
+    for (int j = 0; j <= i; ++j) packed.push_back(i == j ? 1e-6F : 1e-8F);
+  }
+  fill(edge.num_covariance, edge.parameter_covariance, packed);
+  edge.position_rms_m = 0.0012;
+  edge.rotation_rms_rad = 0.011;
+  edge.num_samples_used = 40;
+  edge.num_outliers = 2;
+  edge.valid_since_sample = 3;
+  edge.confidence = 0.93;
+  edge.state = schema_edge_t::EDGE_SUSPECT;
+  return edge;
+}
+
+}  // namespace
+
+action_command_t example_action_command() {
+  action_command_t message{};
+  message.utime = 1'000'001;
+  message.source = "motor_babbler";
+  message.epoch = 77;
+  message.action_id = 5;
+  message.kind = action_command_t::KIND_MOVE;
+  message.purpose = action_command_t::PURPOSE_TEST;
+  message.expiry_utime = 3'000'000;
+  fill(message.num_signals, message.action, {0.25, -0.5, 1.25});
+  return message;
+}
+
+motion_status_t example_motion_status() {
+  motion_status_t message{};
+  message.utime = 1'000'002;
+  message.source = "motor_babbler";
+  message.epoch = 77;
+  message.action_id = 5;
+  message.kind = action_command_t::KIND_MOVE;
+  message.purpose = action_command_t::PURPOSE_TEST;
+  message.state = motion_status_t::STATE_REJECTED;
+  message.reason = "joint 2 would hit the table (5°)";
+  message.rest_since_utime = 900'000;
+  message.stop_latched = 1;
+  fill(message.num_signals, message.commanded, {0.25, -0.5, 1.25});
+  return message;
+}
+
+sim_state_t example_sim_state() {
+  sim_state_t message{};
+  message.utime = 1'000'003;
+  message.action_id = -1;
+  message.seed = -42;
+  message.X_WC = pose(1);
+  fill(message.num_geoms, message.X_WG, {pose(2), pose(3), pose(4)});
+  message.geom_alpha = {0, 0.5F, 1};
+  fill(message.num_parts, message.true_part, {1, 7});
+  message.X_WB = {pose(5), pose(6)};
+  return message;
+}
+
+camera_image_t example_camera_image() {
+  camera_image_t message{};
+  message.utime = 1'000'004;
+  message.image_seq = 8;
+  message.width = 40;
+  message.height = 32;
+  message.encoding = camera_image_t::ENCODING_GREY;
+  std::vector<std::uint8_t> data(40 * 32);
+  for (std::size_t i = 0; i < data.size(); ++i) data[i] = static_cast<std::uint8_t>(i * 7);
+  fill(message.num_bytes, message.data, data);
+  return message;
+}
+
+camera_info_t example_camera_info() {
+  camera_info_t message{};
+  message.utime = 1'000'005;
+  message.camera_name = "ceiling";
+  message.image_width = 1280;
+  message.image_height = 960;
+  message.fx = 1159.5;
+  message.fy = 1160.5;
+  message.cx = 639.5;
+  message.cy = 479.5;
+  message.distortion_model = camera_info_t::MODEL_PLUMB_BOB;
+  fill(message.num_coefficients, message.distortion, {0.1, -0.2, 0.001, 0.002, 0.05});
+  return message;
+}
+
+marker_poses_t example_marker_poses() {
+  marker_poses_t message{};
+  message.utime = 1'000'006;
+  message.image_seq = 9;
+  std::vector<marker_pose_t> markers;
+  for (const int id : {4, 11}) {
+    marker_pose_t& marker = markers.emplace_back();
+    marker.marker_id = id;
+    marker.size_m = 0.05;
+    corners(marker.corner_px, id);
+    marker.num_hypotheses = 2;
+    marker.X_CM[0] = pose(id);
+    marker.X_CM[1] = pose(id + 1);
+    marker.reprojection_error_px[0] = 0.2;
+    marker.reprojection_error_px[1] = 0.9;
+    covariance(marker.covariance);
+    marker.decision_margin = 61.5;
+    marker.hamming = 1;
+  }
+  fill(message.num_markers, message.markers, markers);
+  return message;
+}
+
+sample_t example_sample() {
+  sample_t message{};
+  message.utime = 1'000'007;
+  message.sample_index = 12;
+  message.source = "motor_babbler";
+  message.epoch = 77;
+  message.action_id = 5;
+  message.purpose = action_command_t::PURPOSE_PROBE;
+  message.rest_begin_utime = 900'000;
+  message.rest_end_utime = 1'000'007;
+  fill(message.num_signals, message.action, {0.25, -0.5});
+  std::vector<part_observation_t> parts;
+  for (const int id : {0, 3}) {
+    part_observation_t& part = parts.emplace_back();
+    part.part_id = id;
+    part.X_CB = pose(id);
+    covariance(part.covariance);
+    part.has_other = id == 3 ? 1 : 0;
+    part.X_CB_other = pose(id == 3 ? 4 : 0);
+    part.error_ratio = id == 3 ? 2.5 : 0;
+    part.num_frames = 3;
+    tag_corners_t tag{};
+    tag.tag_id = 10 + id;
+    corners(tag.mean_corner_px, id);
+    fill(part.num_tags, part.tags, {tag});
+  }
+  fill(message.num_parts, message.parts, parts);
+  return message;
+}
+
+body_schema_t example_body_schema() {
+  body_schema_t message{};
+  message.utime = 1'000'008;
+  message.schema_version = 4;
+  message.base_version = 3;
+  message.last_sample_index = 50;
+  message.num_samples_seen = 40;
+  message.is_complete = 0;
+  fill(message.num_parts, message.part_ids, {1, 2, 4, 9});
+  message.root_part = 2;
+  message.X_CR = pose(2);
+  covariance(message.X_CR_covariance);
+  std::vector<signal_t> signals(2);
+  for (int n = 0; n < 2; ++n) {
+    signals[n].signal_name = n == 0 ? "shoulder" : "elbow";
+    signals[n].lower_limit = -1.5 - n;
+    signals[n].upper_limit = 1.5;
+    fill(signals[n].num_warp, signals[n].warp_weights, {0.1, -0.1});
+  }
+  fill(message.num_signals, message.signals, signals);
+  fill(message.num_edges, message.edges, {edge(2, 4, 2), edge(4, 1, 0)});
+  unconnected_part_t lost{};
+  lost.unconnected_part = 9;
+  lost.reason = unconnected_part_t::REASON_NO_VALID_MODEL;
+  lost.detail = "refuted up to 3 signals";
+  fill(message.num_unconnected, message.unconnected, {lost});
+  message.noise_position_m = 0.003;
+  message.noise_rotation_rad = 0.017;
+  return message;
+}
+
+model_health_t example_model_health() {
+  model_health_t message{};
+  message.utime = 1'000'009;
+  message.schema_version = 4;
+  message.judged_sample = 50;
+  message.schema_complete = 1;
+  message.num_test_samples = 10;
+  message.worst_position_m = 0.012;
+  message.worst_rotation_rad = -1;
+  edge_health_t edge{};
+  edge.health_from = 2;
+  edge.health_to = 4;
+  edge.edge_state = schema_edge_t::EDGE_INVALID;
+  edge.num_tests = 9;
+  edge.median_mahalanobis2 = 5.3;
+  fill(message.num_edges, message.edge_health, {edge});
+  part_health_t part{};
+  part.health_part = 4;
+  part.num_predicted = 9;
+  part.visibility = 0.75;
+  part.position_median_m = 0.012;
+  part.rotation_median_rad = -1;
+  fill(message.num_parts, message.part_health, {part});
+  health_event_t event{};
+  event.event_number = 6;
+  event.utime = 1'000'009;
+  event.event_sample = 50;
+  event.event_kind = health_event_t::EVENT_STRUCTURE_CHANGED;
+  event.event_text = "edge 2 → 4 replaced";
+  fill(message.num_events, message.events, {event});
+  return message;
+}
+
+process_info_t example_process_info() {
+  process_info_t message{};
+  message.utime = 1'700'000'000'000'000;
+  message.process_name = "structure_learner";
+  message.host = "lab3";
+  message.pid = 4711;
+  message.start_utime = 1'699'999'999'000'000;
+  message.program_version = "0.1.0";
+  message.seed = -1;
+  message.phase = process_info_t::PHASE_WORKING;
+  message.activity = "fits 12 pairs";
+  message.configuration = "max_k: 3\n";
+  std::vector<counter_t> counters(2);
+  counters[0].counter_name = "malformed SAMPLE";
+  counters[0].count = 1;
+  counters[1].counter_name = "received SAMPLE";
+  counters[1].count = 99;
+  fill(message.num_counters, message.counters, counters);
+  return message;
+}
+
+}  // namespace bodyschema::test

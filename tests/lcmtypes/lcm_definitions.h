@@ -1,0 +1,43 @@
+#pragma once
+
+#include <filesystem>
+#include <map>
+#include <string>
+#include <vector>
+
+namespace bodyschema::test {
+
+/// One field of an .lcm file.
+struct FieldDefinition {
+  std::string type;
+  std::string name;
+  /// Sizes of an array: a number or the name of the field that counts.
+  std::vector<std::string> dimensions;
+  std::string comment;
+};
+
+struct TypeDefinition {
+  std::string name;
+  std::string comment;
+  std::vector<FieldDefinition> fields;
+};
+
+/// Reads every .lcm file of a folder, by type. Knows as much of the language as our files use: one
+/// struct a file, one field a line, comments with //.
+/// @throws std::runtime_error naming file and line of what it does not understand.
+std::map<std::string, TypeDefinition> read_definitions(const std::filesystem::path& folder);
+
+/// Where in an encoded message the floating-point numbers stand.
+struct FloatPlace {
+  std::string field;
+  std::size_t offset = 0;
+  /// 4 or 8.
+  std::size_t size = 0;
+};
+
+/// Walks over the bytes of a message (fingerprint included) as its definition says.
+std::vector<FloatPlace> find_floats(const std::map<std::string, TypeDefinition>& definitions,
+                                    const std::string& type,
+                                    const std::vector<std::uint8_t>& bytes);
+
+}  // namespace bodyschema::test
