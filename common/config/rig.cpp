@@ -64,13 +64,15 @@ Signals load_signals(const std::filesystem::path& rig_folder) {
   for (const Yaml& item : yaml.list("signals")) {
     Signal signal;
     signal.name = item.text("name");
+    if (signal.name.empty()) throw item.error("name", "expected a name");
     signal.lower = item.number("lower");
     signal.upper = item.number("upper");
     if (signal.upper <= signal.lower) throw item.error("upper", "must be above lower");
     if (!names.insert(signal.name).second) throw item.error("name", "this name stands twice");
     result.signals.push_back(signal);
   }
-  if (yaml.has("root_part")) result.root_part = static_cast<int>(yaml.integer("root_part", 0, 9999));
+  if (yaml.has("root_part"))
+    result.root_part = static_cast<int>(yaml.integer("root_part", 0, 9999));
   result.end_effector_part = static_cast<int>(yaml.integer("end_effector_part", 0, 9999));
   yaml.finish();
   return result;

@@ -1,11 +1,11 @@
 #include "common/config/yaml.h"
 
+#include <yaml-cpp/yaml.h>
+
 #include <algorithm>
 #include <cmath>
 #include <fstream>
 #include <sstream>
-
-#include <yaml-cpp/yaml.h>
 
 namespace bodyschema {
 namespace {
@@ -35,6 +35,9 @@ std::string nearest(const std::string& key, const std::set<std::string>& known) 
 
 bool same_mapping(const YAML::Node& a, const YAML::Node& b) { return a.is(b); }
 
+/// Counted from 1. An empty file's node stands nowhere.
+int line_of(const YAML::Node& node) { return std::max(node.Mark().line, 0) + 1; }
+
 }  // namespace
 
 struct Yaml::File {
@@ -54,12 +57,14 @@ Yaml::Yaml(std::shared_ptr<File> file, const YAML::Node& node, std::string path)
       node_(std::make_shared<YAML::Node>(node)),
       path_(std::move(path)),
       usage_(std::make_shared<Usage>()) {
-  if (!node.IsMap()) {
-    throw ConfigError(file_->name.string() + ":" + std::to_string(node.Mark().line + 1) + ": " +
-                      (path_.empty() ? "" : path_ + ": ") + "expected a mapping 'key: value'");
-  }
+  const auto refuse = [&](const YAML::Node& where, const std::string& what) {
+    throw ConfigError(file_->name.string() + ":" + std::to_string(line_of(where)) + ": " +
+                      (path_.empty() ? "" : path_ + ": ") + what);
+  };
+  if (!node.IsMap()) refuse(node, "expected a mapping 'key: value'");
   std::set<std::string> keys;
   for (const auto& entry : node) {
+    if (!entry.first.IsScalar()) refuse(entry.first, "expected a key that is a text");
     const auto key = entry.first.as<std::string>();
     if (!keys.insert(key).second) throw error(key, "this key stands twice");
   }
@@ -85,13 +90,12 @@ Yaml Yaml::parse(const std::string& text, const std::string& name) {
 }
 
 ConfigError Yaml::error(const std::string& key, const std::string& what) const {
-  int line = node_->Mark().line;
+  int line = line_of(*node_);
   for (const auto& entry : *node_) {
-    if (entry.first.as<std::string>() == key) line = entry.first.Mark().line;
+    if (entry.first.as<std::string>() == key) line = line_of(entry.first);
   }
   const std::string path = path_.empty() ? key : path_ + "." + key;
-  return ConfigError(file_->name.string() + ":" + std::to_string(line + 1) + ": " + path + ": " +
-                     what);
+  return ConfigError(file_->name.string() + ":" + std::to_string(line) + ": " + path + ": " + what);
 }
 
 const std::string& Yaml::file_text() const { return file_->text; }
@@ -204,7 +208,8 @@ Pose Yaml::pose(const std::string& key) const {
   if (yaml.has("rotation_wxyz")) {
     const auto wxyz = yaml.numbers("rotation_wxyz", 4);
     const Eigen::Quaterniond q(wxyz[0], wxyz[1], wxyz[2], wxyz[3]);
-    if (std::abs(q.norm() - 1) > 1e-3) throw yaml.error("rotation_wxyz", "is not a unit quaternion");
+    if (std::abs(q.norm() - 1) > 1e-3)
+      throw yaml.error("rotation_wxyz", "is not a unit quaternion");
     return make_pose(q, position);
   }
   if (!yaml.has("rpy_deg")) return make_pose(Eigen::Quaterniond::Identity(), position);
@@ -216,15 +221,20 @@ Pose Yaml::pose(const std::string& key) const {
                    position);
 }
 
-Yaml Yaml::section(const std::string& key) const {
+Yaml Yaml::below(const YAML::Node& node, const std::string& name) const {
+  // Whoever asks twice adds to the same usage.
   for (const Yaml& known : usage_->below) {
-    if (has(key) && same_mapping(*known.node_, (*node_)[key])) return known;
+    if (same_mapping(*known.node_, node)) return known;
   }
-  const YAML::Node node = child(key);
-  if (!node.IsMap()) throw error(key, "expected a mapping 'key: value'");
-  Yaml below(file_, node, path_.empty() ? key : path_ + "." + key);
+  Yaml below(file_, node, path_.empty() ? name : path_ + "." + name);
   usage_->below.push_back(below);
   return below;
+}
+
+Yaml Yaml::section(const std::string& key) const {
+  const YAML::Node node = child(key);
+  if (!node.IsMap()) throw error(key, "expected a mapping 'key: value'");
+  return below(node, key);
 }
 
 std::vector<Yaml> Yaml::list(const std::string& key) const {
@@ -232,9 +242,7 @@ std::vector<Yaml> Yaml::list(const std::string& key) const {
   if (!node.IsSequence()) throw error(key, "expected a list");
   std::vector<Yaml> items;
   for (std::size_t i = 0; i < node.size(); ++i) {
-    items.push_back(Yaml(file_, node[i],
-                         (path_.empty() ? key : path_ + "." + key) + "[" + std::to_string(i) + "]"));
-    usage_->below.push_back(items.back());
+    items.push_back(below(node[i], key + "[" + std::to_string(i) + "]"));
   }
   return items;
 }

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <Eigen/Core>
 #include <filesystem>
 #include <limits>
 #include <memory>
@@ -7,8 +8,6 @@
 #include <stdexcept>
 #include <string>
 #include <vector>
-
-#include <Eigen/Core>
 
 #include "common/geometry/pose.h"
 
@@ -72,6 +71,7 @@ class Yaml {
   struct File;
   Yaml(std::shared_ptr<File> file, const YAML::Node& node, std::string path);
   const YAML::Node child(const std::string& key) const;
+  Yaml below(const YAML::Node& node, const std::string& name) const;
 
   std::shared_ptr<File> file_;
   std::shared_ptr<YAML::Node> node_;

@@ -1,0 +1,58 @@
+#pragma once
+
+#include <Eigen/Core>
+#include <optional>
+#include <vector>
+
+#include "common/geometry/pose.h"
+#include "common/camera/lens.h"
+
+namespace bodyschema {
+
+/// A local minimum of the reprojection error of a body B's points.
+struct PoseFit {
+  Pose X_CB = Pose::Identity();
+  double rms_sigma = 0;  ///< root mean square of the residual over the 2n coordinates [sigmas]
+  /// JᵀJ of the residual, right perturbation in B, order (translation [m], rotation [rad]): its
+  /// inverse is the covariance of X_CB.
+  Matrix6d information = Matrix6d::Zero();
+};
+
+/// Where the points `p_BP` of body B, posed at X_CB, are seen, minus where they were measured:
+/// 2n values in units of their standard deviations. `jacobian`, if given, receives the 2n×6
+/// derivative with respect to ξ in X_CB · exp(ξ). std::nullopt if a point lies behind the camera.
+std::optional<Eigen::VectorXd> reprojection_residual(
+    const Pose& X_CB, const std::vector<Eigen::Vector3d>& p_BP,
+    const std::vector<ImagePoint>& measured, Eigen::Matrix<double, Eigen::Dynamic, 6>* jacobian);
+
+/// Levenberg–Marquardt from `start` down to the local minimum of the reprojection error of at least
+/// 3 points. std::nullopt if the start has a point behind the camera or the points do not determine
+/// the pose.
+std::optional<PoseFit> fit_pose(const Pose& start, const std::vector<Eigen::Vector3d>& p_BP,
+                                const std::vector<ImagePoint>& measured);
+
+/// (JᵀJ)⁻¹, exactly symmetric. std::nullopt if the information is singular.
+std::optional<Matrix6d> covariance_from(const Matrix6d& information);
+
+/// True if both are the same minimum, found from two starts: two different minima of a planar
+/// target are never closer than this in rotation.
+bool is_same_minimum(const Pose& a, const Pose& b);
+
+/// How well the corners of a tag are known. Where the tag is so small or steep that blur mixes its
+/// cells, the corners are pulled by the bits next to the border: a bias that grows as the cells
+/// shrink, measured to go with 1/side² of the shortest side.
+struct CornerNoise {
+  double corner_noise_px = 0;     ///< standard deviation of a coordinate, of any tag …
+  double small_tag_noise_px = 0;  ///< … and what a tag with a side of 20 px has beside it
+
+  /// Standard deviation of each coordinate of a tag with these 4 corners [px].
+  double sigma_px(const std::vector<Eigen::Vector2d>& corners_px) const;
+};
+
+/// Length of the shortest side of the quadrangle [px].
+double shortest_side_px(const std::vector<Eigen::Vector2d>& corners_px);
+
+/// Corners of a tag of side `size_m` in its own frame M, AprilTag's order: (−,+) (+,+) (+,−) (−,−).
+std::vector<Eigen::Vector3d> tag_corners(double size_m);
+
+}  // namespace bodyschema

@@ -1,0 +1,198 @@
+#include "common/schema/body_schema.h"
+
+#include <algorithm>
+#include <stdexcept>
+
+namespace bodyschema {
+namespace {
+
+// Exp of the screw (0, 0, slide, 0, 0, turn) scaled by θ.
+Pose screw_motion(const ScrewJoint& joint, double theta) {
+  Pose X = Pose::Identity();
+  X.linear() = Eigen::AngleAxisd(joint.turn * theta, Eigen::Vector3d::UnitZ()).toRotationMatrix();
+  X.translation().z() = joint.slide * theta;
+  return X;
+}
+
+double displacement(const ScrewJoint& joint, const Eigen::VectorXd& action) {
+  if (joint.signal < 0 || joint.signal >= action.size())
+    throw std::invalid_argument("action has no signal " + std::to_string(joint.signal));
+  return joint.gain * action(joint.signal) + joint.offset;
+}
+
+// One step along a path: an edge, walked forwards or backwards.
+struct Step {
+  const Edge* edge;
+  bool forward;
+};
+
+// The path from part `from` to part `to`, or std::nullopt. Works for edges in any order.
+std::optional<std::vector<Step>> path_between(const std::vector<Edge>& edges, int from, int to) {
+  std::map<int, Step> reached_by;  // part → the step that reached it
+  std::vector<int> frontier{from};
+  std::map<int, int> predecessor{{from, from}};
+  while (!frontier.empty() && !predecessor.count(to)) {
+    std::vector<int> next;
+    for (const int part : frontier) {
+      for (const Edge& edge : edges) {
+        const bool forward = edge.from == part;
+        if (!forward && edge.to != part) continue;
+        const int other = forward ? edge.to : edge.from;
+        if (!predecessor.emplace(other, part).second) continue;
+        reached_by.emplace(other, Step{&edge, forward});
+        next.push_back(other);
+      }
+    }
+    frontier = std::move(next);
+  }
+  if (!predecessor.count(to)) return std::nullopt;
+  std::vector<Step> path;
+  for (int part = to; part != from; part = predecessor.at(part))
+    path.push_back(reached_by.at(part));
+  std::reverse(path.begin(), path.end());
+  return path;
+}
+
+}  // namespace
+
+const char* Edge::kind() const { return joints.empty() ? "rigid" : "screw"; }
+
+std::vector<int> Edge::signals() const {
+  std::vector<int> result;
+  for (const ScrewJoint& joint : joints)
+    if (std::find(result.begin(), result.end(), joint.signal) == result.end())
+      result.push_back(joint.signal);
+  return result;
+}
+
+Pose Edge::predict(const Eigen::VectorXd& action) const {
+  Pose X = left;
+  for (const ScrewJoint& joint : joints)
+    X = X * screw_motion(joint, displacement(joint, action)) * joint.X_after;
+  return X * right;
+}
+
+Eigen::MatrixXd Edge::jacobian(const Eigen::VectorXd& action) const {
+  Eigen::MatrixXd J = Eigen::MatrixXd::Zero(6, action.size());
+  Pose suffix = right;  // what follows the joint's own motion, which commutes with its screw
+  for (auto joint = joints.rbegin(); joint != joints.rend(); ++joint) {
+    const double theta = displacement(*joint, action);
+    suffix = joint->X_after * suffix;
+    const Matrix6d A = adjoint(suffix.inverse());
+    J.col(joint->signal) += joint->gain * (joint->slide * A.col(2) + joint->turn * A.col(5));
+    suffix = screw_motion(*joint, theta) * suffix;
+  }
+  return J;
+}
+
+Matrix6d Edge::prediction_covariance(const Eigen::VectorXd& action) const {
+  const Eigen::Index size = 6 + 8 * static_cast<Eigen::Index>(joints.size());
+  if (parameter_covariance.rows() != size || parameter_covariance.cols() != size)
+    return Matrix6d::Zero();
+  // ∂(right perturbation of the prediction)/∂parameters, from the last parameter to the first.
+  Eigen::MatrixXd G(6, size);
+  Pose suffix = right;
+  for (std::size_t d = joints.size(); d-- > 0;) {
+    const ScrewJoint& joint = joints[d];
+    const double theta = displacement(joint, action);
+    const Eigen::Index column = 6 + 8 * static_cast<Eigen::Index>(d);
+    G.middleCols<6>(column + 2) = adjoint(suffix.inverse());
+    suffix = joint.X_after * suffix;
+    const Matrix6d A = adjoint(suffix.inverse());
+    G.col(column) = theta * A.col(2);
+    G.col(column + 1) = theta * A.col(5);
+    suffix = screw_motion(joint, theta) * suffix;
+  }
+  G.leftCols<6>() = adjoint(suffix.inverse());
+  return G * parameter_covariance * G.transpose();
+}
+
+bool BodySchema::has_part(int part) const {
+  return std::find(parts.begin(), parts.end(), part) != parts.end();
+}
+
+std::vector<int> BodySchema::unused_signals() const {
+  std::vector<bool> used(signals.size(), false);
+  for (const Edge& edge : edges)
+    for (const int signal : edge.signals())
+      if (signal >= 0 && signal < static_cast<int>(used.size())) used[signal] = true;
+  std::vector<int> result;
+  for (std::size_t s = 0; s < used.size(); ++s)
+    if (!used[s]) result.push_back(static_cast<int>(s));
+  return result;
+}
+
+namespace {
+
+void check_action(const BodySchema& schema, const Eigen::VectorXd& action) {
+  if (action.size() != static_cast<Eigen::Index>(schema.signals.size()))
+    throw std::invalid_argument("action has " + std::to_string(action.size()) + " values, not " +
+                                std::to_string(schema.signals.size()));
+}
+
+}  // namespace
+
+std::optional<PosePrediction> BodySchema::predict(int from, int to,
+                                                  const Eigen::VectorXd& action) const {
+  check_action(*this, action);
+  const auto path = path_between(edges, from, to);
+  if (!path) return std::nullopt;
+  PosePrediction result;
+  for (const Step& step : *path) {
+    Pose X = step.edge->predict(action);
+    Matrix6d covariance = step.edge->prediction_covariance(action);
+    if (!step.forward) {
+      // (X exp ε)⁻¹ = X⁻¹ exp(−Ad(X) ε)
+      const Matrix6d A = adjoint(X);
+      covariance = A * covariance * A.transpose();
+      X = X.inverse();
+    }
+    const Matrix6d A = adjoint(X.inverse());
+    result.covariance = A * result.covariance * A.transpose() + covariance;
+    result.X_AB = result.X_AB * X;
+  }
+  return result;
+}
+
+std::map<int, Pose> BodySchema::predict_all(const Eigen::VectorXd& action) const {
+  check_action(*this, action);
+  std::map<int, Pose> X_RB;
+  if (root < 0) return X_RB;
+  X_RB.emplace(root, Pose::Identity());
+  // Edges come ordered from the root outwards; the loop repeats only if somebody reordered them.
+  for (bool grown = true; grown;) {
+    grown = false;
+    for (const Edge& edge : edges) {
+      const auto from = X_RB.find(edge.from);
+      const auto to = X_RB.find(edge.to);
+      if ((from == X_RB.end()) == (to == X_RB.end())) continue;
+      const Pose X = edge.predict(action);
+      if (to == X_RB.end())
+        X_RB.emplace(edge.to, from->second * X);
+      else
+        X_RB.emplace(edge.from, to->second * X.inverse());
+      grown = true;
+    }
+  }
+  return X_RB;
+}
+
+std::optional<Eigen::MatrixXd> BodySchema::jacobian(int from, int to,
+                                                    const Eigen::VectorXd& action) const {
+  check_action(*this, action);
+  const auto path = path_between(edges, from, to);
+  if (!path) return std::nullopt;
+  Eigen::MatrixXd J = Eigen::MatrixXd::Zero(6, action.size());
+  for (const Step& step : *path) {
+    Pose X = step.edge->predict(action);
+    Eigen::MatrixXd J_edge = step.edge->jacobian(action);
+    if (!step.forward) {
+      J_edge = -adjoint(X) * J_edge;
+      X = X.inverse();
+    }
+    J = adjoint(X.inverse()) * J + J_edge;
+  }
+  return J;
+}
+
+}  // namespace bodyschema

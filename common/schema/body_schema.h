@@ -1,0 +1,131 @@
+#pragma once
+
+#include <cstdint>
+#include <map>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "common/geometry/pose.h"
+
+namespace bodyschema {
+
+/// An action signal as the learners know it.
+struct Signal {
+  std::string name;
+  /// Limits in command units.
+  double lower = 0;
+  double upper = 0;
+};
+
+/// One screw joint inside a local model: Exp(ŝ θ) · X_after with θ = gain·q + offset and
+/// ŝ = (0, 0, slide, 0, 0, turn), that is a motion along and about the joint frame's z axis.
+/// Revolute: slide = 0. Prismatic: turn = 0. Helical: both.
+struct ScrewJoint {
+  int signal = 0;                   ///< index into BodySchema::signals
+  double gain = 1;                  ///< a (0: a stuck joint)
+  double offset = 0;                ///< b, in command units
+  double slide = 0;                 ///< [m per command unit]
+  double turn = 0;                  ///< [rad per command unit]
+  Pose X_after = Pose::Identity();  ///< the constant transform that follows
+};
+
+enum class EdgeState : std::int8_t { kOk = 0, kSuspect = 1, kInvalid = 2, kProvisional = 3 };
+
+/// A local model Δ_ij(q) = X_ij between two body parts (Section 3.1 of the chapter):
+///   Δ(q) = left · ∏_d [Exp(ŝ_d (a_d q_d + b_d)) · X_after_d] · right.
+/// No joints: a rigid edge.
+struct Edge {
+  int from = 0;
+  int to = 0;
+  Pose left = Pose::Identity();
+  std::vector<ScrewJoint> joints;
+  Pose right = Pose::Identity();
+
+  /// Covariance of the parameters, order: left tangent (6); per joint: slide, turn, X_after tangent
+  /// (6). Right perturbations. Side 6 + 8·|joints|. Singular along the gauge of the screw frames.
+  Eigen::MatrixXd parameter_covariance;
+
+  /// Root mean square of the leave-one-out residuals of the inliers: over the three axes together.
+  double position_rms_m = 0;
+  double rotation_rms_rad = 0;
+  int num_samples = 0;
+  int num_outliers = 0;
+  std::int64_t valid_since_sample = 0;
+  double confidence = 1;
+  EdgeState state = EdgeState::kOk;
+
+  /// "rigid" or "screw".
+  const char* kind() const;
+  /// Distinct signal indices, in the order of the joints.
+  std::vector<int> signals() const;
+
+  Pose predict(const Eigen::VectorXd& action) const;
+  /// ∂/∂action of the predicted pose: 6×m, right perturbation in the frame of `to`:
+  /// predict(q + δ) = predict(q) · exp(J δ + O(δ²)).
+  Eigen::MatrixXd jacobian(const Eigen::VectorXd& action) const;
+  /// First-order covariance of the prediction from parameter_covariance (right perturbation in the
+  /// frame of `to`).
+  Matrix6d prediction_covariance(const Eigen::VectorXd& action) const;
+};
+
+/// Why a part has no edge.
+enum class Unconnected : std::int8_t {
+  kNeverSeen = 0,
+  kNotEnoughData = 1,  ///< nothing speaks against a model yet, but too few samples to trust one
+  kNoValidModel = 2,   ///< enough data, and every model up to the largest k was refuted
+};
+
+struct UnconnectedPart {
+  int part = 0;
+  Unconnected reason = Unconnected::kNotEnoughData;
+  /// For people: what was tried and what is missing.
+  std::string detail;
+};
+
+/// Noise of one marker per axis, as configured or estimated.
+struct Noise {
+  double position_m = 0;
+  double rotation_rad = 0;
+};
+
+struct PosePrediction {
+  Pose X_AB = Pose::Identity();
+  Matrix6d covariance = Matrix6d::Zero();  ///< right perturbation in frame B
+};
+
+/// The body schema: a forest of local models over the observed parts, spanning when complete.
+/// An immutable value once published: change a copy, give it a new version.
+struct BodySchema {
+  std::int64_t utime = 0;
+  std::int64_t version = 0;
+  std::int64_t base_version = 0;
+  /// Index of the last sample that this schema rests on; −1 before the first.
+  std::int64_t last_sample_index = -1;
+  int num_samples = 0;  ///< samples used
+  bool complete = false;
+  std::vector<int> parts;  ///< observed parts, ascending
+  int root = -1;           ///< −1: no part was seen yet
+  /// Pose of the root part in the camera's frame, and its covariance (right perturbation).
+  Pose X_CR = Pose::Identity();
+  Matrix6d X_CR_covariance = Matrix6d::Zero();
+  std::vector<Signal> signals;
+  std::vector<Edge> edges;  ///< ordered from the root outwards; `from` is nearer to the root
+  std::vector<UnconnectedPart> unconnected;
+  Noise noise;
+
+  bool has_part(int part) const;
+  /// Signals that no edge uses (indices).
+  std::vector<int> unused_signals() const;
+
+  /// Pose of part `to` in part `from` along the tree, with first-order covariance (Section 3.3,
+  /// eq. 17). std::nullopt if they are not connected.
+  /// @throws std::invalid_argument if `action` does not have one value per signal.
+  std::optional<PosePrediction> predict(int from, int to, const Eigen::VectorXd& action) const;
+  /// All parts connected to the root, X_RB by part id.
+  std::map<int, Pose> predict_all(const Eigen::VectorXd& action) const;
+  /// 6×m Jacobian of the pose of `to` in `from`; right perturbation in the frame of `to`.
+  std::optional<Eigen::MatrixXd> jacobian(int from, int to, const Eigen::VectorXd& action) const;
+};
+
+}  // namespace bodyschema

@@ -1,0 +1,40 @@
+#pragma once
+
+#include <cstdint>
+#include <optional>
+#include <vector>
+
+#include "common/geometry/pose.h"
+
+namespace bodyschema {
+
+/// What one camera view says about one body part B, in the camera's frame C.
+struct PartObservation {
+  int part = 0;
+  Pose X_CB = Pose::Identity();
+  /// 6×6 covariance of X_CB, tangent order (translation [m], rotation [rad]), right perturbation in
+  /// the part's frame: X_CB = X_CB_true · exp(ε), ε ~ N(0, covariance).
+  Matrix6d covariance = Matrix6d::Zero();
+  /// The second pose hypothesis of a planar marker, if there is one.
+  std::optional<Pose> X_CB_other;
+  /// Reprojection error of the other hypothesis over that of X_CB; ≥ 1. 0 when there is no other.
+  double error_ratio = 0;
+};
+
+enum class Purpose : std::int8_t { kTrain = 0, kTest = 1, kProbe = 2, kControl = 3 };
+
+/// One action and what was seen after the arm had come to rest.
+struct ActionPoseSample {
+  std::int64_t utime = 0;
+  /// Counts the instants of a recording from 0.
+  std::int64_t sample_index = 0;
+  Purpose purpose = Purpose::kTrain;
+  /// Action signals q_1..q_m in command units.
+  Eigen::VectorXd action;
+  /// Seen parts only, ascending part id, each at most once.
+  std::vector<PartObservation> parts;
+
+  const PartObservation* find(int part) const;
+};
+
+}  // namespace bodyschema

@@ -1,0 +1,174 @@
+#include "common/config/rig.h"
+
+#include <gtest/gtest.h>
+#include <unistd.h>
+
+#include <filesystem>
+#include <fstream>
+#include <functional>
+
+#include "common/config/yaml.h"
+
+namespace bodyschema {
+namespace {
+
+/// A folder of its own for every test.
+class RigTest : public testing::Test {
+ protected:
+  RigTest() {
+    const auto* test = testing::UnitTest::GetInstance()->current_test_info();
+    folder_ = std::filesystem::path(testing::TempDir()) /
+              ("rig_" + std::to_string(getpid()) + test->name());
+    std::filesystem::create_directories(folder_);
+  }
+  ~RigTest() override { std::filesystem::remove_all(folder_); }
+
+  void write(const std::string& name, const std::string& text) const {
+    std::ofstream(folder_ / name) << text;
+  }
+  std::string error_of(const std::function<void()>& action) const {
+    try {
+      action();
+    } catch (const ConfigError& error) {
+      const std::string text = error.what();
+      const std::string prefix = folder_.string() + "/";
+      EXPECT_EQ(text.rfind(prefix, 0), 0U) << text;
+      return text.substr(prefix.size());
+    }
+    ADD_FAILURE() << "no error";
+    return "";
+  }
+  Markers markers(const std::string& tags) const {
+    write("markers.yaml", "family: tag36h11\ntags:\n" + tags);
+    return load_markers(folder_);
+  }
+  Signals signals(const std::string& text) const {
+    write("signals.yaml", text);
+    return load_signals(folder_);
+  }
+  Network network(const std::string& text) const {
+    write("network.yaml", text);
+    return load_network(folder_);
+  }
+
+  std::filesystem::path folder_;
+};
+
+TEST_F(RigTest, MarkersAreSortedByIdAndFoundByIt) {
+  const Markers read = markers(
+      "  - {id: 9, size_m: 0.08, part: 2, placement: {position_m: [0, 0, 0.1]}}\n"
+      "  - {id: 3, size_m: 0.05, part: 1, placement: none}\n"
+      "  - {id: 5, size_m: 0.08, part: 2, placement: {position_m: [0.1, 0, 0], rpy_deg: [0, 0, "
+      "90]}}\n");
+  ASSERT_EQ(read.tags.size(), 3U);
+  EXPECT_EQ(read.tags[0].id, 3);
+  EXPECT_EQ(read.tags[1].id, 5);
+  EXPECT_EQ(read.tags[2].id, 9);
+  EXPECT_EQ(read.parts(), (std::vector<int>{1, 2}));
+  ASSERT_NE(read.find(5), nullptr);
+  EXPECT_EQ(read.find(5)->part, 2);
+  EXPECT_EQ(read.find(4), nullptr);
+  EXPECT_EQ(read.find(10), nullptr);
+  EXPECT_EQ(read.find(-1), nullptr);
+}
+
+TEST_F(RigTest, APlacementIsAPoseOrNone) {
+  const Markers read = markers(
+      "  - {id: 0, size_m: 0.05, part: 1, placement: none}\n"
+      "  - {id: 1, size_m: 0.08, part: 2, placement: {position_m: [0.1, 0, 0], rpy_deg: [0, 0, "
+      "90]}}\n");
+  EXPECT_FALSE(read.tags[0].X_BM.has_value());
+  ASSERT_TRUE(read.tags[1].X_BM.has_value());
+  const Eigen::Vector3d p_B = *read.tags[1].X_BM * Eigen::Vector3d(1, 0, 0);
+  EXPECT_LT((p_B - Eigen::Vector3d(0.1, 1, 0)).norm(), 1e-12);
+}
+
+TEST_F(RigTest, APartWithSeveralTagsNeedsAPlacementOfEach) {
+  EXPECT_EQ(error_of([&] {
+              markers(
+                  "  - {id: 0, size_m: 0.05, part: 7, placement: none}\n"
+                  "  - {id: 1, size_m: 0.05, part: 7, placement: {position_m: [0, 0, 0]}}\n");
+            }),
+            "markers.yaml:2: tags: part 7 has several tags, so each needs a placement");
+}
+
+TEST_F(RigTest, ATagIdStandsOnce) {
+  EXPECT_EQ(error_of([&] {
+              markers(
+                  "  - {id: 4, size_m: 0.05, part: 1, placement: none}\n"
+                  "  - {id: 4, size_m: 0.05, part: 2, placement: none}\n");
+            }),
+            "markers.yaml:2: tags: tag id 4 stands twice");
+}
+
+TEST_F(RigTest, BrokenMarkersPointAtTheKey) {
+  EXPECT_EQ(error_of([&] { markers("  - {id: 4, size_m: 0.05, part: 1}\n"); }),
+            "markers.yaml:3: tags[0].placement: this key is missing");
+  EXPECT_EQ(error_of([&] { markers("  - {id: 4, size_m: 0.05, part: 1, placement: nowhere}\n"); }),
+            "markers.yaml:3: tags[0].placement: expected a mapping 'key: value'");
+  EXPECT_EQ(error_of([&] { markers("  - {id: 587, size_m: 0.05, part: 1, placement: none}\n"); }),
+            "markers.yaml:3: tags[0].id: 587 is outside 0 … 586");
+  EXPECT_EQ(error_of([&] { markers("  - {id: 4, size_m: 80, part: 1, placement: none}\n"); }),
+            "markers.yaml:3: tags[0].size_m: 80 is outside 0.001 … 10");
+  EXPECT_EQ(error_of([&] {
+              markers("  - {id: 4, size_m: 0.05, part: 1, placement: none, a: 1}\n");
+            }).rfind("markers.yaml:3: tags[0].a: this key is unknown", 0),
+            0U);
+  write("markers.yaml", "family: tag25h9\ntags: []\n");
+  EXPECT_EQ(error_of([&] { load_markers(folder_); }),
+            "markers.yaml:1: family: 'tag25h9' is none of: tag36h11");
+}
+
+TEST_F(RigTest, SignalsKeepTheirOrderAndTheRootIsOptional) {
+  const Signals read = signals(
+      "signals:\n  - {name: shoulder, lower: -60, upper: 60}\n  - {name: elbow, lower: 0, upper: "
+      "1}\n"
+      "end_effector_part: 5\n");
+  ASSERT_EQ(read.signals.size(), 2U);
+  EXPECT_EQ(read.signals[0].name, "shoulder");
+  EXPECT_EQ(read.signals[0].lower, -60);
+  EXPECT_EQ(read.signals[1].upper, 1);
+  EXPECT_EQ(read.root_part, std::nullopt);
+  EXPECT_EQ(read.end_effector_part, 5);
+  EXPECT_EQ(signals("signals: []\nroot_part: 2\nend_effector_part: 5\n").root_part, 2);
+}
+
+TEST_F(RigTest, SenselessSignalsAreRefused) {
+  EXPECT_EQ(error_of([&] {
+              signals("signals:\n  - {name: a, lower: 1, upper: 1}\nend_effector_part: 5\n");
+            }),
+            "signals.yaml:2: signals[0].upper: must be above lower");
+  EXPECT_EQ(error_of([&] {
+              signals(
+                  "signals:\n  - {name: a, lower: 0, upper: 1}\n"
+                  "  - {name: a, lower: 0, upper: 1}\nend_effector_part: 5\n");
+            }),
+            "signals.yaml:3: signals[1].name: this name stands twice");
+  EXPECT_EQ(error_of([&] {
+              signals("signals:\n  - {name: '', lower: 0, upper: 1}\nend_effector_part: 5\n");
+            }),
+            "signals.yaml:2: signals[0].name: expected a name");
+  EXPECT_EQ(error_of([&] { signals("signals: []\n"); }),
+            "signals.yaml:1: end_effector_part: this key is missing");
+}
+
+TEST_F(RigTest, TheNetworkGivesTwoUrlsWithPortsNextToEachOther) {
+  const Network read = network("network: host\nport: 7700\nttl: 1\n");
+  EXPECT_FALSE(read.is_private);
+  EXPECT_EQ(read.bus_url(), "udpm://239.255.76.67:7700?ttl=1");
+  EXPECT_EQ(read.images_url(), "udpm://239.255.76.67:7701?ttl=1");
+  EXPECT_TRUE(network("network: private\nport: 7667\nttl: 0\n").is_private);
+  // The images' port must exist as well.
+  EXPECT_EQ(error_of([&] { network("network: host\nport: 65535\nttl: 0\n"); }),
+            "network.yaml:2: port: 65535 is outside 1024 … 65534");
+  EXPECT_EQ(error_of([&] { network("network: wifi\nport: 7667\nttl: 0\n"); }),
+            "network.yaml:1: network: 'wifi' is none of: private, host");
+}
+
+TEST_F(RigTest, AMissingFileIsNamed) {
+  EXPECT_EQ(error_of([&] { load_markers(folder_); }),
+            "markers.yaml: cannot be read: no such file or no permission");
+}
+
+}  // namespace
+}  // namespace bodyschema

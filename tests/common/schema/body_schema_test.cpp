@@ -1,0 +1,177 @@
+#include "common/schema/body_schema.h"
+
+#include <gtest/gtest.h>
+
+#include "common/schema/sample.h"
+#include "tests/support/synthetic_robot.h"
+
+namespace bodyschema {
+namespace {
+
+using test::Rng;
+
+Edge random_edge(int from, int to, const std::vector<int>& signals, Rng& rng) {
+  Edge edge;
+  edge.from = from;
+  edge.to = to;
+  edge.left = test::random_pose(rng, 0, 0.2);
+  edge.right = test::random_pose(rng, 0, 0.2);
+  for (const int signal : signals) {
+    ScrewJoint joint;
+    joint.signal = signal;
+    joint.gain = test::uniform(rng, -2, 2);
+    joint.offset = test::uniform(rng, -1, 1);
+    joint.slide = test::uniform(rng, -0.1, 0.1);
+    joint.turn = test::uniform(rng, -1, 1);
+    joint.X_after = test::random_pose(rng, 0, 0.2);
+    edge.joints.push_back(joint);
+  }
+  const Eigen::Index size = 6 + 8 * static_cast<Eigen::Index>(signals.size());
+  edge.parameter_covariance = 1e-8 * Eigen::MatrixXd::Identity(size, size);
+  return edge;
+}
+
+// 1 → 2 → 3, 2 → 4; signal 0 moves two edges.
+BodySchema random_schema(Rng& rng) {
+  BodySchema schema;
+  schema.parts = {1, 2, 3, 4, 5};
+  schema.root = 1;
+  schema.signals = {{"q1", -1, 1}, {"q2", -1, 1}, {"q3", -1, 1}, {"q4", -1, 1}};
+  schema.edges = {random_edge(1, 2, {0}, rng), random_edge(2, 3, {1, 2}, rng),
+                  random_edge(2, 4, {0}, rng)};
+  return schema;
+}
+
+Eigen::VectorXd random_action(Rng& rng, int size) {
+  Eigen::VectorXd q(size);
+  for (int n = 0; n < size; ++n) q(n) = test::uniform(rng, -1, 1);
+  return q;
+}
+
+template <typename Predict>
+Eigen::MatrixXd central_differences(const Predict& predict, const Eigen::VectorXd& q) {
+  const double h = 1e-6;
+  Eigen::MatrixXd J(6, q.size());
+  const Pose inverse = predict(q).inverse();
+  for (Eigen::Index n = 0; n < q.size(); ++n) {
+    const Eigen::VectorXd step = h * Eigen::VectorXd::Unit(q.size(), n);
+    J.col(n) = (log(inverse * predict(q + step)) - log(inverse * predict(q - step))) / (2 * h);
+  }
+  return J;
+}
+
+TEST(Edge, JacobianAgreesWithCentralDifferences) {
+  Rng rng(1);
+  for (int n = 0; n < 20; ++n) {
+    const Edge edge =
+        random_edge(1, 2, n % 2 ? std::vector<int>{2, 0} : std::vector<int>{1, 1}, rng);
+    const Eigen::VectorXd q = random_action(rng, 3);
+    const auto predict = [&](const Eigen::VectorXd& a) { return edge.predict(a); };
+    EXPECT_LT((edge.jacobian(q) - central_differences(predict, q)).norm(), 1e-8);
+  }
+}
+
+TEST(Edge, PredictionCovarianceAgreesWithPerturbedParameters) {
+  Rng rng(2);
+  const Edge edge = random_edge(1, 2, {1, 0}, rng);
+  const Eigen::VectorXd q = random_action(rng, 2);
+  Matrix6d expected = Matrix6d::Zero();
+  const double h = 1e-6;
+  const auto perturbed = [&](int parameter, double step) {
+    Edge e = edge;
+    Vector6d xi = Vector6d::Zero();
+    if (parameter < 6) {
+      xi(parameter) = step;
+      e.left = e.left * exp(xi);
+    } else {
+      ScrewJoint& joint = e.joints[(parameter - 6) / 8];
+      const int k = (parameter - 6) % 8;
+      if (k == 0) joint.slide += step;
+      if (k == 1) joint.turn += step;
+      if (k > 1) {
+        xi(k - 2) = step;
+        joint.X_after = joint.X_after * exp(xi);
+      }
+    }
+    return log(edge.predict(q).inverse() * e.predict(q));
+  };
+  for (int n = 0; n < 22; ++n) {
+    const Vector6d column = (perturbed(n, h) - perturbed(n, -h)) / (2 * h);
+    expected += 1e-8 * column * column.transpose();
+  }
+  EXPECT_LT((edge.prediction_covariance(q) - expected).norm(), 1e-6 * expected.norm());
+}
+
+TEST(Edge, SignalsAreListedOnceInTheOrderOfTheJoints) {
+  Rng rng(3);
+  EXPECT_EQ(random_edge(1, 2, {2, 0, 2}, rng).signals(), (std::vector<int>{2, 0}));
+  EXPECT_STREQ(random_edge(1, 2, {}, rng).kind(), "rigid");
+  EXPECT_STREQ(random_edge(1, 2, {1}, rng).kind(), "screw");
+}
+
+TEST(BodySchema, PredictionComposesAlongThePathInBothDirections) {
+  Rng rng(4);
+  const BodySchema schema = random_schema(rng);
+  const Eigen::VectorXd q = random_action(rng, 4);
+  const auto forward = schema.predict(3, 4, q), backward = schema.predict(4, 3, q);
+  ASSERT_TRUE(forward && backward);
+  EXPECT_TRUE((forward->X_AB * backward->X_AB).isApprox(Pose::Identity(), 1e-12));
+  const Matrix6d A = adjoint(forward->X_AB);
+  EXPECT_TRUE((A * forward->covariance * A.transpose()).isApprox(backward->covariance, 1e-9));
+  EXPECT_TRUE(forward->X_AB.isApprox(
+      schema.edges[1].predict(q).inverse() * schema.edges[2].predict(q), 1e-12));
+}
+
+TEST(BodySchema, JacobianAgreesWithCentralDifferencesOverBranches) {
+  Rng rng(5);
+  const BodySchema schema = random_schema(rng);
+  const Eigen::VectorXd q = random_action(rng, 4);
+  for (const auto& [from, to] : {std::pair{1, 3}, {3, 1}, {3, 4}, {4, 3}, {1, 1}}) {
+    const auto predict = [&, from = from, to = to](const Eigen::VectorXd& a) {
+      return schema.predict(from, to, a)->X_AB;
+    };
+    EXPECT_LT((*schema.jacobian(from, to, q) - central_differences(predict, q)).norm(), 1e-8);
+  }
+}
+
+TEST(BodySchema, PredictAllGivesEveryConnectedPartInTheRoot) {
+  Rng rng(6);
+  const BodySchema schema = random_schema(rng);
+  const Eigen::VectorXd q = random_action(rng, 4);
+  const auto all = schema.predict_all(q);
+  EXPECT_EQ(all.size(), 4u);
+  for (const auto& [part, X_RB] : all)
+    EXPECT_TRUE(X_RB.isApprox(schema.predict(1, part, q)->X_AB, 1e-12));
+}
+
+TEST(BodySchema, UnconnectedPartsHaveNoPrediction) {
+  Rng rng(7);
+  const BodySchema schema = random_schema(rng);
+  EXPECT_FALSE(schema.predict(1, 5, random_action(rng, 4)));
+  EXPECT_FALSE(schema.jacobian(5, 1, random_action(rng, 4)));
+}
+
+TEST(BodySchema, AnActionOfTheWrongSizeIsRefused) {
+  Rng rng(8);
+  const BodySchema schema = random_schema(rng);
+  EXPECT_THROW(schema.predict(1, 2, random_action(rng, 3)), std::invalid_argument);
+  EXPECT_THROW(schema.predict_all(random_action(rng, 5)), std::invalid_argument);
+  EXPECT_THROW(schema.jacobian(1, 2, random_action(rng, 0)), std::invalid_argument);
+}
+
+TEST(BodySchema, SignalsThatNoEdgeUsesAreListed) {
+  Rng rng(9);
+  EXPECT_EQ(random_schema(rng).unused_signals(), std::vector<int>{3});
+}
+
+TEST(ActionPoseSample, FindsAPartOrNothing) {
+  ActionPoseSample sample;
+  sample.parts.resize(2);
+  sample.parts[0].part = 3;
+  sample.parts[1].part = 7;
+  EXPECT_EQ(sample.find(7), &sample.parts[1]);
+  EXPECT_EQ(sample.find(5), nullptr);
+}
+
+}  // namespace
+}  // namespace bodyschema
