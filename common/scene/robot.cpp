@@ -1,0 +1,183 @@
+#include "common/scene/robot.h"
+
+#include <algorithm>
+#include <cmath>
+#include <set>
+#include <sstream>
+
+#include "common/config/yaml.h"
+
+namespace bodyschema {
+namespace {
+
+constexpr double kDegree = M_PI / 180;
+
+Pose pose_or_identity(const Yaml& yaml, const std::string& key) {
+  return yaml.has(key) ? yaml.pose(key) : Pose::Identity();
+}
+
+Shape load_shape(const Yaml& yaml) {
+  Shape shape;
+  const std::string kind = yaml.choice("shape", {"box", "cylinder", "capsule", "sphere"});
+  if (kind == "box") {
+    shape.kind = Shape::Kind::kBox;
+    shape.half_size_m = yaml.vector3("size_m") / 2;
+    if (shape.half_size_m.minCoeff() <= 0) throw yaml.error("size_m", "sides must be positive");
+  } else {
+    shape.half_size_m.x() = yaml.number("radius_m", 1e-4, 10);
+    if (kind != "sphere") shape.half_size_m.y() = yaml.number("length_m", 1e-4, 10) / 2;
+    shape.kind = kind == "cylinder"  ? Shape::Kind::kCylinder
+                 : kind == "capsule" ? Shape::Kind::kCapsule
+                                     : Shape::Kind::kSphere;
+  }
+  shape.X_LS = pose_or_identity(yaml, "X_LS");
+  shape.mass_kg = yaml.number("mass_kg", 0, 1000);
+  shape.grey = yaml.number("grey", 0.05, 1);
+  if (yaml.has("collides")) shape.collides = yaml.boolean("collides");
+  return shape;
+}
+
+Servo load_servo(const Yaml& yaml) {
+  return {yaml.number("stiffness_nm_per_rad", 1e-3, 1e6),
+          yaml.number("damping_nms_per_rad", 1e-3, 1e6), yaml.number("armature_kgm2", 0, 100)};
+}
+
+int signal_index(const Signals& signals, const Yaml& yaml, const std::string& key) {
+  std::vector<std::string> names;
+  for (const Signal& signal : signals.signals) names.push_back(signal.name);
+  const std::string name = yaml.choice(key, names);
+  return static_cast<int>(std::find(names.begin(), names.end(), name) - names.begin());
+}
+
+RobotJoint load_joint(const Yaml& yaml, const Servo& servo, const Signals& signals) {
+  RobotJoint joint;
+  joint.name = yaml.text("name");
+  const bool is_revolute = yaml.choice("type", {"revolute", "prismatic"}) == "revolute";
+  joint.kind = is_revolute ? RobotJoint::Kind::kRevolute : RobotJoint::Kind::kPrismatic;
+  joint.axis = yaml.vector3("axis");
+  if (joint.axis.norm() < 1e-9) throw yaml.error("axis", "must not be zero");
+  joint.axis.normalize();
+  const std::string unit = is_revolute ? "_deg" : "_m";
+  const double scale = is_revolute ? kDegree : 1;
+  const std::vector<double> range = yaml.numbers("range" + unit, 2);
+  if (range[0] >= range[1]) throw yaml.error("range" + unit, "must ascend");
+  joint.lower = range[0] * scale;
+  joint.upper = range[1] * scale;
+  joint.max_speed = yaml.number("max_speed" + unit + "_per_s", 1e-3, 1e4) * scale;
+  joint.servo = yaml.has("servo") ? load_servo(yaml.section("servo")) : servo;
+  joint.signal = signal_index(signals, yaml, "signal");
+  joint.gain = yaml.number("gain" + unit + "_per_unit") * scale;
+  joint.offset = yaml.number("offset" + unit) * scale;
+  return joint;
+}
+
+}  // namespace
+
+Eigen::VectorXd Robot::joint_positions(const Eigen::VectorXd& action) const {
+  if (action.size() != home.size()) {
+    throw std::invalid_argument("an action of this robot has " + std::to_string(home.size()) +
+                                " signals, not " + std::to_string(action.size()));
+  }
+  Eigen::VectorXd positions(joints.size());
+  for (std::size_t i = 0; i < joints.size(); ++i) {
+    positions[i] = joints[i].gain * action[joints[i].signal] + joints[i].offset;
+  }
+  return positions;
+}
+
+std::optional<std::string> Robot::beyond_range(const Eigen::VectorXd& joint_positions) const {
+  for (std::size_t i = 0; i < joints.size(); ++i) {
+    const RobotJoint& joint = joints[i];
+    const double position = joint_positions[i];
+    // A nanometre of tolerance: limits that were converted from degrees must be reachable.
+    if (position >= joint.lower - 1e-9 && position <= joint.upper + 1e-9) continue;
+    const bool is_revolute = joint.kind == RobotJoint::Kind::kRevolute;
+    const double scale = is_revolute ? 1 / kDegree : 1;
+    std::ostringstream text;
+    text << "joint " << joint.name << " would be at " << position * scale << ", beyond "
+         << joint.lower * scale << " … " << joint.upper * scale << (is_revolute ? " deg" : " m");
+    return text.str();
+  }
+  return std::nullopt;
+}
+
+Robot load_robot(const std::filesystem::path& rig_folder, const Signals& signals,
+                 const Markers& markers) {
+  const Yaml yaml = Yaml::load(rig_folder / "robot.yaml");
+  Robot robot;
+  robot.name = yaml.text("name");
+  robot.X_WC = yaml.pose("X_WC");
+  const Servo servo = load_servo(yaml.section("servo"));
+
+  const std::vector<double> home = yaml.numbers("home", static_cast<int>(signals.signals.size()));
+  robot.home = Eigen::Map<const Eigen::VectorXd>(home.data(), home.size());
+  for (std::size_t i = 0; i < home.size(); ++i) {
+    if (home[i] < signals.signals[i].lower || home[i] > signals.signals[i].upper) {
+      throw yaml.error("home", signals.signals[i].name + " is outside its limits");
+    }
+  }
+
+  std::vector<std::string> names{"world"};
+  std::set<std::string> joint_names;
+  std::set<int> driving;
+  for (const Yaml& item : yaml.list("links")) {
+    Link link;
+    link.name = item.text("name");
+    link.parent = item.choice("parent", names);
+    if (std::find(names.begin(), names.end(), link.name) != names.end()) {
+      throw item.error("name", "this name stands twice");
+    }
+    names.push_back(link.name);
+    link.X_PL = pose_or_identity(item, "X_PL");
+    if (item.has("joint")) {
+      const Yaml section = item.section("joint");
+      robot.joints.push_back(load_joint(section, servo, signals));
+      if (!joint_names.insert(robot.joints.back().name).second) {
+        throw section.error("name", "this name stands twice");
+      }
+      driving.insert(robot.joints.back().signal);
+      link.joint = static_cast<int>(robot.joints.size()) - 1;
+    }
+    double mass_kg = 0;
+    for (const Yaml& shape : item.list("shapes")) {
+      link.shapes.push_back(load_shape(shape));
+      mass_kg += link.shapes.back().mass_kg;
+    }
+    if (link.joint && mass_kg <= 0) throw item.error("shapes", "a moving link needs a mass");
+    robot.links.push_back(std::move(link));
+  }
+  for (std::size_t i = 0; i < signals.signals.size(); ++i) {
+    if (!driving.contains(static_cast<int>(i))) {
+      throw yaml.error("links", "no joint is driven by signal " + signals.signals[i].name);
+    }
+  }
+
+  const std::vector<std::string> link_names(names.begin() + 1, names.end());
+  for (const Yaml& item : yaml.list("parts")) {
+    PartPlacement part;
+    part.part = static_cast<int>(item.integer("part", 0, 9999));
+    const std::string link = item.choice("link", link_names);
+    part.link = static_cast<int>(std::find(link_names.begin(), link_names.end(), link) -
+                                 link_names.begin());
+    part.X_LB = item.pose("X_LB");
+    robot.parts.push_back(part);
+  }
+  std::stable_sort(robot.parts.begin(), robot.parts.end(),
+                   [](const auto& a, const auto& b) { return a.part < b.part; });
+  std::vector<int> parts;
+  for (const PartPlacement& part : robot.parts) parts.push_back(part.part);
+  if (parts != markers.parts()) {
+    throw yaml.error("parts", "must be the parts of markers.yaml, each once");
+  }
+
+  for (const Yaml& item : yaml.list("may_touch")) {
+    robot.may_touch.emplace_back(item.choice("link", link_names), item.choice("other", link_names));
+  }
+  yaml.finish();
+  if (const auto problem = robot.beyond_range(robot.joint_positions(robot.home))) {
+    throw yaml.error("home", *problem);
+  }
+  return robot;
+}
+
+}  // namespace bodyschema

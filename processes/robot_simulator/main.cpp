@@ -1,0 +1,46 @@
+// robot_simulator: ACTION_COMMAND -> MOTION_STATUS, SIM_STATE
+
+#include <CLI/CLI.hpp>
+
+#include "common/bus/process.h"
+#include "processes/robot_simulator/robot_simulator.h"
+
+using namespace bodyschema;
+
+int main(int argc, char** argv) {
+  std::int64_t seed = 1;
+  std::vector<int> hidden;
+  std::filesystem::path state_file;
+  const auto add_options = [&](CLI::App& app) {
+    app.add_option("--seed", seed, "Seed of the image noise");
+    app.add_option("--hide", hidden, "Body part whose markers are invisible; may be repeated");
+    app.add_option("--state", state_file, "Saved at every rest, restored at the start");
+  };
+  const auto body = [&](Process& process) {
+    RobotSimulatorConfig config = RobotSimulatorConfig::load(process.config_file());
+    config.seed = seed;
+    config.hidden_parts = {hidden.begin(), hidden.end()};
+    RobotSimulator simulator(config);
+    if (!state_file.empty() && std::filesystem::exists(state_file)) simulator.restore(state_file);
+    process.set_seed(simulator.state().seed);
+
+    const auto send = [&](const RobotSimulator::Answer& answer) {
+      for (const motion_status_t& status : answer.statuses) {
+        process.bus().publish(kMotionStatus, status);
+      }
+      if (answer.state) process.bus().publish(kSimState, *answer.state);
+    };
+    process.bus().subscribe<action_command_t>(kActionCommand, [&](const action_command_t& command) {
+      const RobotSimulator::Answer answer = simulator.on_command(command);
+      // Saved before it is told: who hears of a pose can rely on it after a crash.
+      if (!state_file.empty()) simulator.save(state_file);
+      send(answer);
+      process.set_activity(process_info_t::PHASE_WORKING,
+                           "action " + std::to_string(command.action_id) + " of " + command.source);
+    });
+    process.on_tick([&](std::int64_t now_us) { send(simulator.on_tick(now_us)); });
+    process.set_activity(process_info_t::PHASE_WAITING, "waits for the first action");
+    process.run();
+  };
+  return run_process("robot_simulator", argc, argv, body, add_options);
+}

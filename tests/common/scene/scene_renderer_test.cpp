@@ -1,0 +1,241 @@
+#include "common/scene/scene_renderer.h"
+
+#include <apriltag/apriltag.h>
+#include <apriltag/tag36h11.h>
+#include <gtest/gtest.h>
+
+#include <array>
+#include <cmath>
+#include <map>
+#include <opencv2/calib3d.hpp>
+
+#include "common/bus/convert.h"
+#include "common/scene/scene.h"
+
+namespace bodyschema {
+namespace {
+
+const std::filesystem::path kConfig = BODYSCHEMA_CONFIG_FOLDER;
+
+using Corners = std::array<Eigen::Vector2d, 4>;
+
+/// Corners of all tags, pixel-centre convention.
+std::map<int, Corners> detect(const cv::Mat& image) {
+  apriltag_family_t* family = tag36h11_create();
+  apriltag_detector_t* detector = apriltag_detector_create();
+  apriltag_detector_add_family_bits(detector, family, 1);
+  detector->quad_decimate = 1;
+  detector->refine_edges = 1;
+  detector->nthreads = 1;
+  detector->qtp.min_white_black_diff = 20;
+  image_u8_t view{image.cols, image.rows, static_cast<int>(image.step), image.data};
+  zarray_t* found = apriltag_detector_detect(detector, &view);
+  std::map<int, Corners> result;
+  for (int i = 0; i < zarray_size(found); ++i) {
+    apriltag_detection_t* detection;
+    zarray_get(found, i, &detection);
+    for (int k = 0; k < 4; ++k) {
+      // AprilTag's origin is the corner of the first pixel, OpenCV's its centre.
+      result[detection->id][k] = {detection->p[k][0] - 0.5, detection->p[k][1] - 0.5};
+    }
+  }
+  apriltag_detections_destroy(found);
+  apriltag_detector_destroy(detector);
+  tag36h11_destroy(family);
+  return result;
+}
+
+/// Where the corners of a tag must be, in marker_pose_t's order.
+Corners project(const CameraCalibration& c, const Pose& X_CM, double size_m) {
+  const double h = size_m / 2;
+  std::vector<cv::Point3d> points;
+  for (const auto& [x, y] : {std::pair{-h, h}, {h, h}, {h, -h}, {-h, -h}}) {
+    const Eigen::Vector3d p = X_CM * Eigen::Vector3d(x, y, 0);
+    points.emplace_back(p.x(), p.y(), p.z());
+  }
+  const cv::Matx33d K(c.fx, 0, c.cx, 0, c.fy, c.cy, 0, 0, 1);
+  std::vector<cv::Point2d> pixels;
+  cv::projectPoints(points, cv::Vec3d(), cv::Vec3d(), K, c.distortion, pixels);
+  Corners corners;
+  for (int k = 0; k < 4; ++k) corners[k] = {pixels[k].x, pixels[k].y};
+  return corners;
+}
+
+struct Comparison {
+  int num_tags = 0;
+  double worst_px = 0;
+  double mean_px = 0;
+  Eigen::Vector2d bias_px = Eigen::Vector2d::Zero();
+};
+
+/// Detected against projected corners of the tags that are no more tilted than `max_tilt_deg`.
+Comparison compare(const Scene& scene, const CameraCalibration& calibration,
+                   const sim_state_t& state, const cv::Mat& image, double max_tilt_deg) {
+  Comparison result;
+  const Pose X_CW = from_message(state.X_WC).inverse();
+  for (const auto& [id, corners] : detect(image)) {
+    const TagPlacement* tag = scene.markers().find(id);
+    if (!tag) {
+      ADD_FAILURE() << "tag " << id << " is not in the scene";
+      continue;
+    }
+    const Pose X_CM = X_CW * from_message(state.X_WG[scene.tag_geom(id)]) *
+                      Eigen::Translation3d(0, 0, -kSheetThickness_m / 2);
+    const double cosine = X_CM.translation().normalized().dot(X_CM.linear().col(2));
+    if (cosine < std::cos(max_tilt_deg * M_PI / 180)) continue;
+    const Corners expected = project(calibration, X_CM, tag->size_m);
+    for (int k = 0; k < 4; ++k) {
+      const Eigen::Vector2d error = corners[k] - expected[k];
+      result.worst_px = std::max(result.worst_px, error.norm());
+      result.mean_px += error.norm();
+      result.bias_px += error;
+    }
+    ++result.num_tags;
+  }
+  result.mean_px /= std::max(1, 4 * result.num_tags);
+  result.bias_px /= std::max(1, 4 * result.num_tags);
+  return result;
+}
+
+/// A camera `distance_m` in front of tag `id`, turned so that it sees it tilted and rotated.
+void look_at(const Scene& scene, int id, double distance_m, double tilt_deg, double roll_deg,
+             sim_state_t& state) {
+  const Pose X_WM = from_message(state.X_WG[scene.tag_geom(id)]) *
+                    Eigen::Translation3d(0, 0, -kSheetThickness_m / 2);
+  Pose X_CM = Pose::Identity();
+  X_CM.translation() = Eigen::Vector3d(0.03, -0.02, distance_m);
+  X_CM.linear() = (Eigen::AngleAxisd(roll_deg * M_PI / 180, Eigen::Vector3d::UnitZ()) *
+                   Eigen::AngleAxisd(tilt_deg * M_PI / 180, Eigen::Vector3d(0.6, 0.8, 0)))
+                      .toRotationMatrix();
+  state.X_WC = to_message(Pose(X_WM * X_CM.inverse()));
+}
+
+ImageEffects no_noise() {
+  ImageEffects effects;
+  effects.noise_sd = 0;
+  return effects;
+}
+
+TEST(SceneRenderer, ShowsTheTagsCornersWherePinholeProjectionPutsThem) {
+  const Scene scene(kConfig / "arm2");
+  // Pixels that are far from square, and the centre far from the middle.
+  CameraCalibration calibration{"test", 1280, 960, 1100, 1040, 590.3, 521.7, {}, {}};
+  SceneRenderer renderer(kConfig / "arm2", calibration, no_noise());
+  sim_state_t state = scene.state_at(scene.robot().home, 1, 0);
+  for (const double tilt_deg : {0.0, 20.0, 40.0}) {
+    for (const double roll_deg : {10.0, 75.0, 160.0, -100.0}) {
+      look_at(scene, 12, 0.7, tilt_deg, roll_deg, state);
+      const cv::Mat image = renderer.render(state, 0);
+      const std::map<int, Corners> found = detect(image);
+      ASSERT_TRUE(found.contains(12)) << tilt_deg << " " << roll_deg;
+      const Pose X_CM = from_message(state.X_WC).inverse() *
+                        from_message(state.X_WG[scene.tag_geom(12)]) *
+                        Eigen::Translation3d(0, 0, -kSheetThickness_m / 2);
+      const Corners expected = project(calibration, X_CM, scene.markers().find(12)->size_m);
+      for (int k = 0; k < 4; ++k) {
+        EXPECT_LT((found.at(12)[k] - expected[k]).norm(), 0.2)
+            << "corner " << k << ", tilt " << tilt_deg << ", roll " << roll_deg << ": "
+            << (found.at(12)[k] - expected[k]).transpose();
+      }
+    }
+  }
+}
+
+class RenderedRig : public testing::TestWithParam<const char*> {};
+
+INSTANTIATE_TEST_SUITE_P(SceneRenderer, RenderedRig, testing::Values("arm2", "arm4", "arm7"),
+                         [](const auto& info) { return std::string(info.param); });
+
+TEST_P(RenderedRig, ShowsItsTagsToTheDetectorWithoutBias) {
+  const Scene scene(kConfig / GetParam());
+  SceneRenderer renderer(kConfig / GetParam());
+  const sim_state_t state = scene.state_at(scene.robot().home, 1, 0);
+  const cv::Mat image = renderer.render(state, 0);
+  ASSERT_EQ(image.cols, renderer.calibration().width);
+  ASSERT_EQ(image.rows, renderer.calibration().height);
+  ASSERT_EQ(image.type(), CV_8UC1);
+  const Comparison result = compare(scene, renderer.calibration(), state, image, 60);
+  RecordProperty("mean_px", std::to_string(result.mean_px));
+  EXPECT_GE(result.num_tags, static_cast<int>(scene.markers().parts().size()) - 1);
+  EXPECT_LT(result.mean_px, 0.25);
+  EXPECT_LT(result.bias_px.norm(), 0.1) << result.bias_px.transpose();
+}
+
+TEST(SceneRenderer, DistortsAsOpenCvProjects) {
+  const Scene scene(kConfig / "arm2");
+  using Model = CameraCalibration::Model;
+  for (const auto& [model, coefficients] :
+       {std::pair{Model::kPlumbBob, std::vector<double>{-0.22, 0.1, 0.001, -0.0015, -0.02}},
+        std::pair{Model::kRational,
+                  std::vector<double>{0.1, -0.05, 0.0008, 0.0005, 0.01, 0.3, -0.02, 0.004}}}) {
+    const CameraCalibration calibration{"test", 1280,  960,   1104.6,      1090.9,
+                                        655.2,  470.8, model, coefficients};
+    SceneRenderer renderer(kConfig / "arm2", calibration, no_noise());
+    sim_state_t state = scene.state_at(scene.robot().home, 1, 0);
+    int num_tags = 0;
+    // Tags all over the image, also where the distortion is strong; small ones, since the detector
+    // fits straight lines to what are curves now.
+    for (const double right : {-0.45, -0.25, 0.0, 0.25, 0.45}) {
+      look_at(scene, 12, 1.3, 25, 15, state);
+      const Pose X_WC = from_message(state.X_WC) * Eigen::Translation3d(right, right / 2, 0);
+      state.X_WC = to_message(Pose(X_WC));
+      const Comparison result = compare(scene, calibration, state, renderer.render(state, 0), 45);
+      EXPECT_LT(result.worst_px, 0.3) << right;
+      EXPECT_LT(result.bias_px.norm(), 0.1) << right;
+      num_tags += result.num_tags;
+    }
+    EXPECT_GE(num_tags, 5);
+  }
+}
+
+TEST(SceneRenderer, GivesTheSameBytesForTheSameStateAndFrame) {
+  const Scene scene(kConfig / "arm2");
+  SceneRenderer one(kConfig / "arm2");
+  SceneRenderer other(kConfig / "arm2");
+  const sim_state_t state = scene.state_at(scene.robot().home, 5, 9);
+  const cv::Mat first = one.render(state, 0);
+  // Another state in between must leave no trace.
+  one.render(scene.state_at(Eigen::Vector2d(0.5, 20), 5, 10), 3);
+  EXPECT_EQ(cv::norm(first, one.render(state, 0), cv::NORM_INF), 0);
+  EXPECT_EQ(cv::norm(first, other.render(state, 0), cv::NORM_INF), 0);
+}
+
+TEST(SceneRenderer, DrawsNoiseOfItsOwnForEveryFrameActionAndSeed) {
+  const Scene scene(kConfig / "arm2");
+  SceneRenderer renderer(kConfig / "arm2");
+  SceneRenderer clean(kConfig / "arm2", no_noise());
+  const Eigen::VectorXd home = scene.robot().home;
+  const cv::Mat image = renderer.render(scene.state_at(home, 5, 9), 0);
+  EXPECT_NE(cv::norm(image, renderer.render(scene.state_at(home, 5, 9), 1), cv::NORM_INF), 0);
+  EXPECT_NE(cv::norm(image, renderer.render(scene.state_at(home, 5, 8), 0), cv::NORM_INF), 0);
+  EXPECT_NE(cv::norm(image, renderer.render(scene.state_at(home, 6, 9), 0), cv::NORM_INF), 0);
+
+  cv::Mat difference;
+  cv::subtract(image, clean.render(scene.state_at(home, 5, 9), 0), difference, cv::noArray(),
+               CV_64F);
+  cv::Scalar mean, sd;
+  cv::meanStdDev(difference, mean, sd);
+  EXPECT_NEAR(mean[0], 0, 0.02);
+  EXPECT_NEAR(sd[0], std::sqrt(2 * 2 + 1 / 12.0), 0.02);
+}
+
+TEST(SceneRenderer, DoesNotShowWhatHasAlphaZero) {
+  const Scene scene(kConfig / "arm2");
+  SceneRenderer renderer(kConfig / "arm2");
+  sim_state_t state = scene.state_at(scene.robot().home, 1, 0);
+  ASSERT_TRUE(detect(renderer.render(state, 0)).contains(4));
+  for (const int geom : scene.plate_geoms(2)) state.geom_alpha[geom] = 0;
+  const auto found = detect(renderer.render(state, 0));
+  EXPECT_FALSE(found.contains(4));
+  EXPECT_FALSE(found.contains(5));
+  EXPECT_TRUE(found.contains(0));
+}
+
+TEST(SceneRenderer, RefusesTheStateOfAnotherRig) {
+  const Scene other(kConfig / "arm4");
+  SceneRenderer renderer(kConfig / "arm2");
+  EXPECT_THROW(renderer.render(other.state_at(other.robot().home, 1, 0), 0), std::invalid_argument);
+}
+
+}  // namespace
+}  // namespace bodyschema
