@@ -1,0 +1,108 @@
+// camera: device or SIM_STATE -> CAMERA_IMAGE, CAMERA_INFO
+
+#include <CLI/CLI.hpp>
+#include <atomic>
+#include <optional>
+#include <stdexcept>
+#include <utility>
+
+#include "common/bus/images_url.h"
+#include "common/bus/process.h"
+#include "common/scene/scene_renderer.h"
+#include "processes/camera/camera.h"
+#include "processes/camera/capture.h"
+
+using namespace bodyschema;
+
+namespace {
+constexpr int kMaxRepeats = 30;  // of the images of one SIM_STATE, at 1 Hz
+}
+
+int main(int argc, char** argv) {
+  std::string images_option;
+  CLI::App* arguments = nullptr;
+  const auto add_options = [&](CLI::App& app) {
+    arguments = &app;
+    app.add_option("--images", images_option, "URL of the images; default: the next port of --out");
+  };
+  const auto body = [&](Process& process) {
+    const CameraConfig config = CameraConfig::load(process.config_file());
+    const auto url = [&](const char* option) {
+      const auto text = arguments->get_option(option)->as<std::string>();
+      return text.empty() ? default_url() : text;
+    };
+    const bool has_out = arguments->get_option("--out")->count() > 0;
+    const std::string out = has_out ? url("--out") : process.bus().is_replay() ? "" : url("--in");
+    const std::string images_to = images_option.empty() ? images_url(out) : images_option;
+    std::optional<Bus> images_bus;
+    if (images_to != out) images_bus.emplace("", images_to);
+    Bus& images = images_bus ? *images_bus : process.bus();
+
+    std::atomic<std::int64_t> utime = 0;  // of the newest frame
+    const auto send_info = [&] {
+      process.bus().publish(kCameraInfo, make_info(config.calibration, utime));
+    };
+    send_info();
+    std::int64_t info_sent_us = 0;
+    process.on_tick([&](std::int64_t now_us) {
+      if (now_us - info_sent_us < 1'000'000) return;
+      info_sent_us = now_us;
+      send_info();
+    });
+
+    std::optional<SceneRenderer> renderer;
+    std::optional<SimulatedCamera> simulated;
+    std::optional<Capture> capture;
+    std::int64_t num_losses = 0;
+    if (config.simulation) {
+      const SimulationConfig& simulation = *config.simulation;
+      renderer.emplace(process.rig_folder(), config.calibration,
+                       ImageEffects{.blur_sd_px = simulation.blur_sd_px,
+                                    .noise_sd = simulation.noise_sd,
+                                    .msaa_samples = simulation.msaa_samples});
+      simulated.emplace(config, [&](const sim_state_t& state, int frame) {
+        return renderer->render(state, frame);
+      });
+      process.bus().subscribe(kSimState, [&, shown_utime = std::int64_t{-1},
+                                          num_repeats = 0](const sim_state_t& state) mutable {
+        // Repeated for who missed them, but not for ever: an arm that was left alone would fill the
+        // disk with the same images.
+        num_repeats = state.utime == shown_utime ? num_repeats + 1 : 0;
+        shown_utime = state.utime;
+        if (num_repeats > kMaxRepeats) return;
+        try {
+          for (const camera_image_t& image : simulated->on_sim_state(state)) {
+            images.publish(kCameraImage, image);
+            utime = image.utime;
+          }
+        } catch (const std::invalid_argument&) {
+          process.count("refused SIM_STATE");  // another rig's
+          return;
+        }
+        process.set_activity(process_info_t::PHASE_WORKING,
+                             "shows action " + std::to_string(state.action_id));
+      });
+      process.set_activity(process_info_t::PHASE_WAITING, "waits for SIM_STATE");
+    } else {
+      std::int64_t image_seq = 0;
+      capture.emplace(
+          *config.capture, [&, image_seq](const cv::Mat& frame, std::int64_t now_us) mutable {
+            images.publish(kCameraImage, make_image(frame, config.calibration, config.encoding,
+                                                    now_us, image_seq++));
+            utime = now_us;
+          });
+      process.on_idle([&] {
+        capture->check();
+        const Capture::State state = capture->state();
+        process.count("camera lost",
+                      state.num_losses - std::exchange(num_losses, state.num_losses));
+        process.set_activity(state.phase == Capture::Phase::kRunning
+                                 ? process_info_t::PHASE_WORKING
+                                 : process_info_t::PHASE_WAITING,
+                             state.text);
+      });
+    }
+    process.run();
+  };
+  return run_process("camera", argc, argv, body, add_options);
+}

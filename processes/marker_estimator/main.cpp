@@ -1,0 +1,85 @@
+// marker_estimator: CAMERA_IMAGE, CAMERA_INFO -> MARKER_POSES
+
+#include <CLI/CLI.hpp>
+#include <exception>
+#include <mutex>
+#include <thread>
+
+#include "common/bus/images_url.h"
+#include "common/bus/process.h"
+#include "processes/marker_estimator/marker_estimator.h"
+
+using namespace bodyschema;
+
+int main(int argc, char** argv) {
+  std::string images_option;
+  CLI::App* arguments = nullptr;
+  const auto add_options = [&](CLI::App& app) {
+    arguments = &app;
+    app.add_option("--images", images_option, "URL of the images; default: the next port of --in");
+  };
+  const auto body = [&](Process& process) {
+    const auto config = MarkerEstimatorConfig::load(process.config_file());
+    MarkerEstimator estimator(config, load_markers(process.rig_folder()));
+    std::mutex mutex;  // guards estimator and failure
+
+    const auto on_image = [&](const camera_image_t& image) {
+      const std::lock_guard lock(mutex);
+      if (const auto poses = estimator.on_camera_image(image)) {
+        process.bus().publish(kMarkerPoses, *poses);
+      }
+    };
+    process.bus().subscribe(kCameraInfo, [&](const camera_info_t& info) {
+      const std::lock_guard lock(mutex);
+      estimator.on_camera_info(info);
+    });
+    std::string in = arguments->get_option("--in")->as<std::string>();
+    if (in.empty()) in = default_url();
+    const std::string images_from = images_option.empty() ? images_url(in) : images_option;
+    const auto subscribe_images = [&](Bus& bus) {
+      if (config.every_image) {
+        bus.subscribe(kCameraImage, on_image);
+      } else {
+        bus.subscribe_latest(kCameraImage, on_image);
+      }
+    };
+    // The images' bus is waited for by a thread of its own, so that a frame need not wait for the
+    // loop's next round. Logs are read in the loop: first the calibration, then its images.
+    std::exception_ptr failure;
+    std::optional<Bus> images;
+    std::jthread listener;
+    if (images_from == in) {
+      subscribe_images(process.bus());
+    } else {
+      subscribe_images(images.emplace(images_from, ""));
+      if (images->is_replay()) {
+        process.on_end([&] {
+          while (images->handle(std::chrono::milliseconds(0))) {
+          }
+        });
+      } else {
+        listener = std::jthread([&](const std::stop_token& stop) {
+          try {
+            while (!stop.stop_requested()) images->handle(std::chrono::milliseconds(100));
+          } catch (...) {
+            const std::lock_guard lock(mutex);
+            failure = std::current_exception();
+          }
+        });
+      }
+    }
+    std::map<std::string, std::int64_t> reported;
+    process.on_idle([&] {
+      const std::lock_guard lock(mutex);
+      if (failure) std::rethrow_exception(failure);
+      for (const auto& [name, count] : estimator.counters()) {
+        process.count(name, count - std::exchange(reported[name], count));
+      }
+      process.set_activity(
+          estimator.is_working() ? process_info_t::PHASE_WORKING : process_info_t::PHASE_WAITING,
+          estimator.activity());
+    });
+    process.run();
+  };
+  return run_process("marker_estimator", argc, argv, body, add_options);
+}

@@ -1,0 +1,157 @@
+#include "processes/marker_estimator/marker_estimator.h"
+
+#include <algorithm>
+#include <cmath>
+#include <opencv2/imgcodecs.hpp>
+#include <stdexcept>
+
+#include "common/bus/convert.h"
+#include "common/config/yaml.h"
+#include "processes/marker_estimator/tag_pose.h"
+
+namespace bodyschema {
+
+MarkerEstimatorConfig MarkerEstimatorConfig::load(const std::filesystem::path& file) {
+  const Yaml yaml = Yaml::load(file);
+  MarkerEstimatorConfig config;
+  config.every_image = yaml.boolean("every_image");
+  config.noise.corner_noise_px = yaml.number("corner_noise_px", 1e-3, 10);
+  config.noise.small_tag_noise_px = yaml.number("small_tag_noise_px", 0, 10);
+  config.max_hamming = static_cast<int>(yaml.integer("max_hamming", 0, 2));
+  config.min_decision_margin = yaml.number("min_decision_margin", 0, 255);
+  config.min_white_black_difference =
+      static_cast<int>(yaml.integer("min_white_black_difference", 1, 255));
+  config.min_border_contrast = yaml.number("min_border_contrast", 0, 1);
+  config.min_side_px = yaml.number("min_side_px", 0, 10000);
+  config.max_reprojection_error_px = yaml.number("max_reprojection_error_px", 1e-3, 100);
+  config.max_tilt_rad = yaml.number("max_tilt_deg", 0, 90) * M_PI / 180;
+  yaml.finish();
+  return config;
+}
+
+MarkerEstimator::MarkerEstimator(const MarkerEstimatorConfig& config, Markers markers)
+    : config_(config),
+      markers_(std::move(markers)),
+      detector_(markers_.family, config.max_hamming, config.min_white_black_difference) {}
+
+void MarkerEstimator::on_camera_info(const camera_info_t& info) {
+  try {
+    lens_ = Lens(info);
+  } catch (const std::invalid_argument&) {
+    ++counters_["refused CAMERA_INFO"];
+  }
+}
+
+std::optional<cv::Mat> MarkerEstimator::decode(const camera_image_t& image) {
+  cv::Mat grey;
+  // The message holds bytes of no particular type; OpenCV does not write to what it decodes.
+  auto* bytes = const_cast<std::uint8_t*>(image.data.data());
+  if (image.encoding == camera_image_t::ENCODING_GREY) {
+    if (image.num_bytes == static_cast<std::int64_t>(image.width) * image.height) {
+      grey = cv::Mat(image.height, image.width, CV_8UC1, bytes);
+    }
+  } else if (image.num_bytes > 0) {
+    try {
+      grey = cv::imdecode(cv::Mat(1, image.num_bytes, CV_8UC1, bytes), cv::IMREAD_GRAYSCALE);
+    } catch (const cv::Exception&) {
+      grey.release();
+    }
+  }
+  if (grey.empty() || grey.cols != image.width || grey.rows != image.height) {
+    ++counters_["image unreadable"];
+    refused_ = "the image cannot be decoded";
+    return std::nullopt;
+  }
+  if (grey.cols != lens_->width() || grey.rows != lens_->height()) {
+    ++counters_["image not of the calibrated size"];
+    refused_ = "the image is " + std::to_string(grey.cols) + "×" + std::to_string(grey.rows) +
+               " px but the calibration holds for " + std::to_string(lens_->width()) + "×" +
+               std::to_string(lens_->height());
+    return std::nullopt;
+  }
+  if (std::min(grey.cols, grey.rows) < TagDetector::kMinSide_px) {
+    ++counters_["image too small"];
+    refused_ = "the image is too small for a tag";
+    return std::nullopt;
+  }
+  refused_.clear();
+  return grey;
+}
+
+std::optional<marker_poses_t> MarkerEstimator::on_camera_image(const camera_image_t& image) {
+  if (!lens_) {
+    ++counters_["image before CAMERA_INFO"];
+    return std::nullopt;
+  }
+  const auto grey = decode(image);
+  if (!grey) return std::nullopt;
+  ++num_images_;
+  std::vector<marker_pose_t> markers;
+  for (const TagDetection& detection : detector_.detect(*grey)) {
+    const TagPlacement* tag = markers_.find(detection.id);
+    if (!tag) {
+      ++counters_["tag not in markers.yaml"];
+      continue;
+    }
+    if (const auto marker = estimate(detection, tag->size_m)) markers.push_back(*marker);
+  }
+  marker_poses_t poses;
+  poses.utime = image.utime;
+  poses.image_seq = image.image_seq;
+  set_array(poses.num_markers, poses.markers, std::move(markers));
+  num_seen_ = poses.num_markers;
+  return poses;
+}
+
+std::optional<marker_pose_t> MarkerEstimator::estimate(const TagDetection& detection,
+                                                       double size_m) {
+  const auto refuse = [&](const char* why) {
+    ++counters_[why];
+    return std::nullopt;
+  };
+  if (detection.decision_margin < config_.min_decision_margin) return refuse("tag unclear");
+  if (detection.border_contrast < config_.min_border_contrast) return refuse("tag half covered");
+  std::vector<ImagePoint> corners;
+  if (shortest_side_px(detection.corners_px) < config_.min_side_px) return refuse("tag too small");
+  const double sigma_px = config_.noise.sigma_px(detection.corners_px);
+  for (const Eigen::Vector2d& p_px : detection.corners_px) {
+    const auto corner = lens_->straighten(p_px);
+    if (!corner) return refuse("tag outside of the lens model");
+    corners.push_back(*corner);
+    corners.back().sigma_px = sigma_px;
+  }
+  const std::vector<PoseFit> minima = solve_tag_pose(size_m, corners);
+  if (minima.empty()) return refuse("tag without a pose");
+  if (minima[0].rms_sigma * sigma_px > config_.max_reprojection_error_px)
+    return refuse("tag not square");
+  if (tilt_rad(minima[0].X_CB) > config_.max_tilt_rad) return refuse("tag too steep");
+  const auto covariance = covariance_from(minima[0].information);
+  if (!covariance) return refuse("tag without a pose");
+
+  marker_pose_t marker;
+  marker.marker_id = detection.id;
+  marker.size_m = size_m;
+  for (int i = 0; i < 4; ++i) {
+    marker.corner_px[i][0] = detection.corners_px[i].x();
+    marker.corner_px[i][1] = detection.corners_px[i].y();
+  }
+  marker.num_hypotheses = static_cast<std::int8_t>(minima.size());
+  for (int h = 0; h < 2; ++h) {
+    const PoseFit& fit = minima[std::min<std::size_t>(h, minima.size() - 1)];
+    marker.X_CM[h] = to_message(fit.X_CB);
+    marker.reprojection_error_px[h] = fit.rms_sigma * sigma_px;
+  }
+  to_message(*covariance, marker.covariance);
+  marker.decision_margin = detection.decision_margin;
+  marker.hamming = static_cast<std::int8_t>(detection.hamming);
+  return marker;
+}
+
+std::string MarkerEstimator::activity() const {
+  if (!lens_) return "waits for CAMERA_INFO";
+  if (!refused_.empty()) return "refuses images: " + refused_;
+  if (num_images_ == 0) return "waits for CAMERA_IMAGE";
+  return std::to_string(num_seen_) + " tags in image " + std::to_string(num_images_);
+}
+
+}  // namespace bodyschema

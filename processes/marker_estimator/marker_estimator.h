@@ -1,0 +1,70 @@
+#pragma once
+
+#include <cstdint>
+#include <filesystem>
+#include <map>
+#include <optional>
+#include <string>
+
+#include "bodyschema/camera_image_t.hpp"
+#include "bodyschema/camera_info_t.hpp"
+#include "bodyschema/marker_poses_t.hpp"
+#include "common/config/rig.h"
+#include "common/camera/fit_pose.h"
+#include "processes/marker_estimator/tag_detector.h"
+
+namespace bodyschema {
+
+struct MarkerEstimatorConfig {
+  bool every_image = true;  ///< false: only the newest image waiting (a live camera faster than we)
+  CornerNoise noise;
+  int max_hamming = 0;                   ///< corrected bits
+  double min_decision_margin = 0;        ///< AprilTag's, grey levels
+  int min_white_black_difference = 0;    ///< grey levels
+  double min_border_contrast = 0;        ///< see TagDetection::border_contrast
+  double min_side_px = 0;                ///< shortest side of the black square in the image
+  double max_reprojection_error_px = 0;  ///< rms of the better hypothesis
+  double max_tilt_rad = 0;               ///< between the line of sight and the marker's normal
+
+  /// Reads marker_estimator.yaml. @throws ConfigError.
+  static MarkerEstimatorConfig load(const std::filesystem::path& file);
+};
+
+/// Finds the rig's tags in an image and estimates their poses X_CM in the camera's frame: both
+/// hypotheses of a planar marker, each refined to its local minimum, and the covariance of the
+/// better one from the corner noise. It knows ids and sizes, not what carries the markers.
+///
+/// Before the first CAMERA_INFO it answers nothing, since pixels mean no poses yet. Afterwards it
+/// answers every readable image of the calibrated size, with no markers where none is seen. An
+/// image that cannot be read or has another size is refused and counted. When images stop, so do
+/// the answers.
+class MarkerEstimator {
+ public:
+  MarkerEstimator(const MarkerEstimatorConfig& config, Markers markers);
+
+  /// A calibration that makes no sense is refused and counted; the last good one stays.
+  void on_camera_info(const camera_info_t& info);
+  std::optional<marker_poses_t> on_camera_image(const camera_image_t& image);
+
+  /// False while it waits for the calibration or the first image, or refuses what it gets.
+  bool is_working() const { return lens_ && num_images_ > 0 && refused_.empty(); }
+  /// What it does or waits for, for people.
+  std::string activity() const;
+  /// What was refused and why, since the start.
+  const std::map<std::string, std::int64_t>& counters() const { return counters_; }
+
+ private:
+  std::optional<cv::Mat> decode(const camera_image_t& image);
+  std::optional<marker_pose_t> estimate(const TagDetection& detection, double size_m);
+
+  const MarkerEstimatorConfig config_;
+  const Markers markers_;
+  TagDetector detector_;
+  std::optional<Lens> lens_;
+  std::map<std::string, std::int64_t> counters_;
+  std::string refused_;  ///< why the newest image was refused; empty: it was not
+  std::int64_t num_images_ = 0;
+  int num_seen_ = 0;  ///< markers in the newest image
+};
+
+}  // namespace bodyschema

@@ -1,0 +1,271 @@
+#include "processes/observer/observer.h"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <stdexcept>
+
+#include "bodyschema/action_command_t.hpp"
+#include "common/bus/convert.h"
+#include "common/config/yaml.h"
+
+namespace bodyschema {
+namespace {
+
+constexpr std::int64_t kNotEnded = std::numeric_limits<std::int64_t>::max();
+constexpr std::size_t kMaxRests = 16;
+constexpr double kDegree = M_PI / 180;
+
+std::string name_of(const motion_status_t& status) {
+  return "action " + std::to_string(status.action_id) + " of " + status.source;
+}
+
+}  // namespace
+
+ObserverConfig ObserverConfig::load(const std::filesystem::path& file) {
+  const Yaml yaml = Yaml::load(file);
+  ObserverConfig config;
+  config.frames_per_sample = static_cast<int>(yaml.integer("frames_per_sample", 1, 100));
+  config.settle_margin_us = std::llround(yaml.number("settle_margin_s", 0, 60) * 1e6);
+  config.max_buffered_frames =
+      static_cast<std::size_t>(yaml.integer("max_buffered_frames", 1, 10000));
+  if (config.max_buffered_frames < static_cast<std::size_t>(config.frames_per_sample)) {
+    throw yaml.error("max_buffered_frames", "must not be below frames_per_sample");
+  }
+  config.max_motion_px = yaml.number("max_motion_px", 0, 100);
+  config.noise.corner_noise_px = yaml.number("corner_noise_px", 1e-3, 10);
+  config.noise.small_tag_noise_px = yaml.number("small_tag_noise_px", 0, 10);
+  config.part_pose.floor_position_m = yaml.number("floor_position_m", 0, 1);
+  config.part_pose.floor_rotation_rad = yaml.number("floor_rotation_deg", 0, 45) * kDegree;
+  config.part_pose.max_tag_error_px = yaml.number("max_tag_error_px", 1e-3, 100);
+  config.part_pose.min_other_rotation_rad = yaml.number("min_other_rotation_deg", 0, 90) * kDegree;
+  config.part_pose.max_error_ratio = yaml.number("max_error_ratio", 1, 1e6);
+  yaml.finish();
+  return config;
+}
+
+Observer::Observer(const ObserverConfig& config, Markers markers)
+    : config_(config), markers_(std::move(markers)) {}
+
+void Observer::restore(const std::vector<sample_t>& samples) {
+  for (const sample_t& sample : samples) {
+    done_.emplace(sample.source, sample.epoch, sample.action_id);
+    next_index_ = std::max(next_index_, sample.sample_index + 1);
+  }
+}
+
+Observer::ActionKey Observer::key_of(const motion_status_t& status) {
+  return {status.source, status.epoch, status.action_id};
+}
+
+std::optional<sample_t> Observer::on_camera_info(const camera_info_t& info) {
+  try {
+    lens_ = Lens(info);
+  } catch (const std::invalid_argument&) {
+    ++counters_["refused CAMERA_INFO"];
+  }
+  return make_sample();
+}
+
+std::optional<sample_t> Observer::on_marker_poses(const marker_poses_t& poses) {
+  if (!frames_.try_emplace(poses.utime, poses).second) {
+    ++counters_["frame seen before"];
+    return std::nullopt;
+  }
+  auto sample = make_sample();
+  if (frames_.size() > config_.max_buffered_frames) frames_.erase(frames_.begin());
+  return sample;
+}
+
+void Observer::end_rests(const motion_status_t& status) {
+  for (Rest& rest : rests_) {
+    if (rest.end_utime != kNotEnded) continue;
+    if (status.rest_since_utime == rest.status.rest_since_utime) {
+      rest.known_until_utime = std::max(rest.known_until_utime, status.utime);
+    } else if (status.rest_since_utime < 0) {
+      rest.end_utime = status.utime;  // the motion has begun by then
+    } else {
+      // It moved in between and we did not hear of it.
+      rest.end_utime = rest.known_until_utime;
+    }
+  }
+}
+
+std::optional<sample_t> Observer::on_motion_status(const motion_status_t& status) {
+  if (status.utime < driver_utime_) {
+    // The driver began anew: frames of its earlier life may carry times that come again.
+    frames_.clear();
+    rests_.clear();
+    ++counters_["driver time ran backwards"];
+  }
+  driver_utime_ = status.utime;
+  end_rests(status);
+  const bool is_settled_move = status.state == motion_status_t::STATE_SETTLED &&
+                               status.kind == action_command_t::KIND_MOVE &&
+                               status.rest_since_utime >= 0 && !status.commanded.empty();
+  const auto is_same = [&](const Rest& rest) { return key_of(rest.status) == key_of(status); };
+  if (is_settled_move && !done_.count(key_of(status)) &&
+      std::none_of(rests_.begin(), rests_.end(), is_same)) {
+    rests_.push_back({status, kNotEnded, status.utime});
+    if (rests_.size() > kMaxRests) {
+      rests_.pop_front();
+      ++counters_["action never seen"];
+    }
+  }
+  return make_sample();
+}
+
+std::vector<const marker_poses_t*> Observer::frames_of(const Rest& rest) const {
+  std::vector<const marker_poses_t*> frames;
+  const auto n = static_cast<std::size_t>(config_.frames_per_sample);
+  auto frame = frames_.lower_bound(rest.status.rest_since_utime + config_.settle_margin_us);
+  for (; frame != frames_.end() && frame->first < rest.end_utime && frames.size() < n; ++frame) {
+    frames.push_back(&frame->second);
+  }
+  return frames;
+}
+
+std::optional<sample_t> Observer::make_sample() {
+  if (!lens_) return std::nullopt;
+  // Every message completes one rest at most, so one answer is enough.
+  for (auto rest = rests_.begin(); rest != rests_.end(); ++rest) {
+    const auto frames = frames_of(*rest);
+    if (frames.size() < static_cast<std::size_t>(config_.frames_per_sample)) continue;
+    const Rest complete = *rest;
+    // Those before it were overtaken; nothing more will be seen of them.
+    counters_["action never seen"] += rest - rests_.begin();
+    rests_.erase(rests_.begin(), rest + 1);
+    done_.insert(key_of(complete.status));
+    return sample_from(complete, frames);
+  }
+  return std::nullopt;
+}
+
+sample_t Observer::sample_from(const Rest& rest, const std::vector<const marker_poses_t*>& frames) {
+  // The same tag in all frames.
+  std::map<int, std::vector<const marker_pose_t*>> sightings;
+  std::map<int, std::set<const marker_poses_t*>> frames_of_part;
+  for (const marker_poses_t* frame : frames) {
+    for (const marker_pose_t& marker : frame->markers) {
+      const TagPlacement* tag = markers_.find(marker.marker_id);
+      if (!tag) {
+        ++counters_["tag not in markers.yaml"];
+        continue;
+      }
+      sightings[marker.marker_id].push_back(&marker);
+      frames_of_part[tag->part].insert(frame);
+    }
+  }
+  std::map<int, std::vector<SeenTag>> tags_of_part;
+  std::map<int, tag_corners_t> corners_of_tag;
+  for (const auto& [id, seen] : sightings) {
+    tag_corners_t mean{};
+    mean.tag_id = id;
+    double motion_px = 0;
+    for (const marker_pose_t* marker : seen) {
+      for (int c = 0; c < 4; ++c) {
+        for (int axis = 0; axis < 2; ++axis) {
+          mean.mean_corner_px[c][axis] +=
+              marker->corner_px[c][axis] / static_cast<double>(seen.size());
+        }
+        motion_px =
+            std::max(motion_px, std::hypot(marker->corner_px[c][0] - seen[0]->corner_px[c][0],
+                                           marker->corner_px[c][1] - seen[0]->corner_px[c][1]));
+      }
+    }
+    if (motion_px > config_.max_motion_px) {
+      ++counters_["tag moved between frames"];
+      continue;
+    }
+    const TagPlacement& placement = *markers_.find(id);
+    SeenTag tag{id, placement.size_m, placement.X_BM.value_or(Pose::Identity()), {}, {}};
+    std::vector<Eigen::Vector2d> corners_px;
+    for (const auto& corner : mean.mean_corner_px) corners_px.emplace_back(corner[0], corner[1]);
+    for (const Eigen::Vector2d& p_px : corners_px) {
+      if (auto point = lens_->straighten(p_px)) {
+        point->sigma_px = config_.noise.sigma_px(corners_px);
+        tag.corners.push_back(*point);
+      }
+    }
+    if (tag.corners.size() < 4) {
+      ++counters_["tag outside of the lens model"];
+      continue;
+    }
+    for (int h = 0; h < seen[0]->num_hypotheses; ++h) {
+      tag.X_CM.push_back(from_message(seen[0]->X_CM[h]));
+    }
+    tags_of_part[placement.part].push_back(std::move(tag));
+    corners_of_tag[id] = mean;
+  }
+
+  std::vector<part_observation_t> parts;
+  for (auto& [part, tags] : tags_of_part) {
+    const auto pose = solve_part_pose(std::move(tags), config_.part_pose);
+    if (!pose) {
+      ++counters_["part without a pose"];
+      continue;
+    }
+    counters_["tag disagrees with its part"] += static_cast<std::int64_t>(pose->dropped.size());
+    part_observation_t observation{};
+    observation.part_id = part;
+    observation.X_CB = to_message(pose->X_CB);
+    // Not divided by the number of frames: what a corner is off is mostly the same in all of them.
+    to_message(pose->covariance, observation.covariance);
+    observation.has_other = pose->X_CB_other ? 1 : 0;
+    observation.X_CB_other = to_message(pose->X_CB_other.value_or(pose->X_CB));
+    observation.error_ratio = pose->error_ratio;
+    observation.num_frames = static_cast<std::int32_t>(frames_of_part[part].size());
+    std::vector<tag_corners_t> corners;
+    for (const int id : pose->used) corners.push_back(corners_of_tag[id]);
+    set_array(observation.num_tags, observation.tags, std::move(corners));
+    parts.push_back(std::move(observation));
+  }
+
+  const motion_status_t& status = rest.status;
+  sample_t sample{};
+  sample.utime = frames.back()->utime;
+  sample.sample_index = next_index_++;
+  sample.source = status.source;
+  sample.epoch = status.epoch;
+  sample.action_id = status.action_id;
+  sample.purpose = status.purpose;
+  sample.rest_begin_utime = status.rest_since_utime;
+  sample.rest_end_utime = sample.utime;
+  set_array(sample.num_signals, sample.action, status.commanded);
+  num_parts_ = static_cast<int>(parts.size());
+  set_array(sample.num_parts, sample.parts, std::move(parts));
+  ++num_samples_;
+  return sample;
+}
+
+std::optional<std::string> Observer::on_tick(std::int64_t now_us) {
+  constexpr std::int64_t kPatience_us = 5'000'000;
+  const auto key = rests_.empty() ? std::nullopt : std::optional(key_of(rests_.back().status));
+  if (key != waited_for_) {
+    waited_for_ = key;
+    waiting_since_us_ = now_us;
+    has_warned_ = false;
+  }
+  if (!key || has_warned_ || now_us - waiting_since_us_ < kPatience_us) return std::nullopt;
+  has_warned_ = true;
+  return activity();
+}
+
+std::string Observer::activity() const {
+  if (!lens_) return "waits for CAMERA_INFO";
+  if (!rests_.empty()) {
+    const Rest& rest = rests_.back();
+    const auto missing = config_.frames_per_sample - static_cast<int>(frames_of(rest).size());
+    return "waits for " + std::to_string(missing) + " of " +
+           std::to_string(config_.frames_per_sample) + " frames of " + name_of(rest.status) +
+           " at rest since " + std::to_string(rest.status.rest_since_utime) + " us" +
+           (frames_.empty()
+                ? "; no MARKER_POSES at all"
+                : "; newest MARKER_POSES at " + std::to_string(frames_.rbegin()->first) + " us");
+  }
+  if (num_samples_ == 0) return "waits for a settled action";
+  return "sample " + std::to_string(next_index_ - 1) + ": " + std::to_string(num_parts_) +
+         " parts seen";
+}
+
+}  // namespace bodyschema

@@ -1,0 +1,98 @@
+#pragma once
+
+#include <cstdint>
+#include <deque>
+#include <filesystem>
+#include <map>
+#include <optional>
+#include <set>
+#include <string>
+#include <tuple>
+#include <vector>
+
+#include "bodyschema/camera_info_t.hpp"
+#include "bodyschema/marker_poses_t.hpp"
+#include "bodyschema/motion_status_t.hpp"
+#include "bodyschema/sample_t.hpp"
+#include "common/config/rig.h"
+#include "common/camera/lens.h"
+#include "processes/observer/part_pose.h"
+
+namespace bodyschema {
+
+struct ObserverConfig {
+  int frames_per_sample = 0;
+  std::int64_t settle_margin_us = 0;  ///< frames earlier than this after the arm came to rest wait
+  std::size_t max_buffered_frames = 0;
+  double max_motion_px = 0;  ///< a tag whose corners move more between the frames is not used
+  CornerNoise noise;
+  PartPoseOptions part_pose;
+
+  /// Reads observer.yaml. @throws ConfigError.
+  static ObserverConfig load(const std::filesystem::path& file);
+};
+
+/// Joins each settled action with what was seen while the arm was at rest: one SAMPLE for every
+/// (source, epoch, action_id) of kind MOVE, from the first frames_per_sample frames whose utime
+/// lies in the rest interval. Tags become body parts here: one pose a part, over all its visible
+/// tags.
+///
+/// Times of frames and of MOTION_STATUS must come from one clock. Messages may arrive in either
+/// order: frames and rest intervals wait for each other in bounded buffers. A frame that was seen
+/// before (same utime) is ignored. A rest interval ends when a later motion begins; what was not
+/// seen by then never becomes a sample. Nothing is invented: without frames, status or calibration
+/// it waits, and activity() says for what. With the same messages the samples are the same bytes.
+class Observer {
+ public:
+  Observer(const ObserverConfig& config, Markers markers);
+
+  /// Continues after samples of earlier runs, in the order of their indices.
+  void restore(const std::vector<sample_t>& samples);
+
+  std::optional<sample_t> on_marker_poses(const marker_poses_t& poses);
+  std::optional<sample_t> on_motion_status(const motion_status_t& status);
+  std::optional<sample_t> on_camera_info(const camera_info_t& info);
+
+  /// A sentence when it has waited for the frames of one action for 5 s, once per action.
+  /// `now_us`: the clock.
+  std::optional<std::string> on_tick(std::int64_t now_us);
+
+  /// What it does or waits for, for people.
+  std::string activity() const;
+  bool is_waiting() const { return !lens_ || num_samples_ == 0 || !rests_.empty(); }
+  /// What was left out and why, since the start.
+  const std::map<std::string, std::int64_t>& counters() const { return counters_; }
+
+ private:
+  using ActionKey = std::tuple<std::string, std::int64_t, std::int64_t>;  // source, epoch, id
+
+  /// A settled action that waits for its frames.
+  struct Rest {
+    motion_status_t status;
+    std::int64_t end_utime;          ///< frames at or after it are not at rest
+    std::int64_t known_until_utime;  ///< newest status that saw this rest
+  };
+
+  static ActionKey key_of(const motion_status_t& status);
+  void end_rests(const motion_status_t& status);
+  std::vector<const marker_poses_t*> frames_of(const Rest& rest) const;
+  std::optional<sample_t> make_sample();
+  sample_t sample_from(const Rest& rest, const std::vector<const marker_poses_t*>& frames);
+
+  const ObserverConfig config_;
+  const Markers markers_;
+  std::optional<Lens> lens_;
+  std::map<std::int64_t, marker_poses_t> frames_;  // by utime
+  std::deque<Rest> rests_;                         // oldest first
+  std::set<ActionKey> done_;
+  std::int64_t next_index_ = 0;
+  std::int64_t driver_utime_ = -1;
+  std::map<std::string, std::int64_t> counters_;
+  std::int64_t num_samples_ = 0;
+  int num_parts_ = 0;  // in the newest sample
+  std::optional<ActionKey> waited_for_;
+  std::int64_t waiting_since_us_ = -1;
+  bool has_warned_ = false;
+};
+
+}  // namespace bodyschema

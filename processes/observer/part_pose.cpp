@@ -1,0 +1,106 @@
+#include "processes/observer/part_pose.h"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+
+namespace bodyschema {
+namespace {
+
+struct Points {
+  std::vector<Eigen::Vector3d> p_BP;
+  std::vector<ImagePoint> measured;
+};
+
+Points points_of(const std::vector<SeenTag>& tags) {
+  Points points;
+  for (const SeenTag& tag : tags) {
+    for (const Eigen::Vector3d& p_MP : tag_corners(tag.size_m)) {
+      points.p_BP.push_back(tag.X_BM * p_MP);
+    }
+    points.measured.insert(points.measured.end(), tag.corners.begin(), tag.corners.end());
+  }
+  return points;
+}
+
+/// All local minima that the tags' hypotheses lead to, best first.
+std::vector<PoseFit> minima_of(const std::vector<SeenTag>& tags) {
+  const Points points = points_of(tags);
+  std::vector<PoseFit> minima;
+  for (const SeenTag& tag : tags) {
+    for (const Pose& X_CM : tag.X_CM) {
+      const auto fit = fit_pose(X_CM * tag.X_BM.inverse(), points.p_BP, points.measured);
+      if (!fit) continue;
+      const auto same = [&](const PoseFit& m) { return is_same_minimum(m.X_CB, fit->X_CB); };
+      if (std::none_of(minima.begin(), minima.end(), same)) minima.push_back(*fit);
+    }
+  }
+  std::stable_sort(minima.begin(), minima.end(),
+                   [](const PoseFit& a, const PoseFit& b) { return a.rms_sigma < b.rms_sigma; });
+  return minima;
+}
+
+/// Largest rms [px] of one tag under the common pose.
+double worst_tag_error(const Pose& X_CB, const std::vector<SeenTag>& tags) {
+  double worst = 0;
+  for (const SeenTag& tag : tags) {
+    const Points points = points_of({tag});
+    const auto residual = reprojection_residual(X_CB, points.p_BP, points.measured, nullptr);
+    if (!residual) return std::numeric_limits<double>::infinity();
+    worst = std::max(worst, std::sqrt(residual->squaredNorm() / 8) * tag.corners[0].sigma_px);
+  }
+  return worst;
+}
+
+}  // namespace
+
+std::optional<PartPose> solve_part_pose(std::vector<SeenTag> tags, const PartPoseOptions& options) {
+  PartPose result;
+  std::vector<PoseFit> minima = minima_of(tags);
+  while (!minima.empty() && worst_tag_error(minima[0].X_CB, tags) > options.max_tag_error_px) {
+    if (tags.size() == 1) return std::nullopt;
+    // The tag with the largest residual need not be the wrong one: it may be the only right one far
+    // from the others. So each is left out in turn.
+    double best_error = std::numeric_limits<double>::infinity();
+    std::size_t culprit = 0;
+    std::vector<PoseFit> best_minima;
+    for (std::size_t i = 0; i < tags.size(); ++i) {
+      std::vector<SeenTag> others = tags;
+      others.erase(others.begin() + static_cast<std::ptrdiff_t>(i));
+      std::vector<PoseFit> without = minima_of(others);
+      if (without.empty() || without[0].rms_sigma >= best_error) continue;
+      best_error = without[0].rms_sigma;
+      best_minima = std::move(without);
+      culprit = i;
+    }
+    result.dropped.push_back(tags[culprit].id);
+    tags.erase(tags.begin() + static_cast<std::ptrdiff_t>(culprit));
+    minima = std::move(best_minima);
+  }
+  if (minima.empty()) return std::nullopt;
+  const auto covariance = covariance_from(minima[0].information);
+  if (!covariance) return std::nullopt;
+  result.X_CB = minima[0].X_CB;
+  result.covariance = *covariance;
+  result.covariance.diagonal().head<3>().array() += std::pow(options.floor_position_m, 2);
+  result.covariance.diagonal().tail<3>().array() += std::pow(options.floor_rotation_rad, 2);
+  for (std::size_t i = 1; i < minima.size(); ++i) {
+    if (rotation_angle(result.X_CB.inverse() * minima[i].X_CB) < options.min_other_rotation_rad) {
+      continue;
+    }
+    // Errors far below the noise say nothing, and 0 would make any ratio infinite.
+    constexpr double kLeast = 1e-2;
+    const double ratio =
+        std::max(minima[i].rms_sigma, kLeast) / std::max(minima[0].rms_sigma, kLeast);
+    if (ratio <= options.max_error_ratio) {
+      result.X_CB_other = minima[i].X_CB;
+      result.error_ratio = ratio;
+    }
+    break;
+  }
+  for (const SeenTag& tag : tags) result.used.push_back(tag.id);
+  std::sort(result.dropped.begin(), result.dropped.end());
+  return result;
+}
+
+}  // namespace bodyschema

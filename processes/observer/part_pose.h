@@ -1,0 +1,43 @@
+#pragma once
+
+#include <optional>
+#include <vector>
+
+#include "common/config/rig.h"
+#include "common/camera/fit_pose.h"
+
+namespace bodyschema {
+
+/// One tag of a body part B as it was seen while the arm was at rest.
+struct SeenTag {
+  int id = 0;
+  double size_m = 0;
+  Pose X_BM = Pose::Identity();
+  std::vector<ImagePoint> corners;  ///< four, AprilTag's order
+  std::vector<Pose> X_CM;           ///< hypotheses of its pose: the starts of the fit
+};
+
+struct PartPoseOptions {
+  double floor_position_m = 0;  ///< added to the covariance: what calibration and plates are off
+  double floor_rotation_rad = 0;
+  double max_tag_error_px = 0;        ///< a tag with a larger rms in the common fit disagrees
+  double min_other_rotation_rad = 0;  ///< a second minimum closer than this is the same pose
+  double max_error_ratio = 0;         ///< a second minimum worse than this is no hypothesis
+};
+
+struct PartPose {
+  Pose X_CB = Pose::Identity();
+  Matrix6d covariance = Matrix6d::Zero();  ///< (translation [m], rotation [rad]), right, in B
+  std::optional<Pose> X_CB_other;          ///< the best other minimum, if it is a hypothesis
+  double error_ratio = 0;                  ///< its reprojection error over that of X_CB, ≥ 1
+  std::vector<int> used;                   ///< ids of the tags it rests on, ascending
+  std::vector<int> dropped;                ///< ids of the tags that disagreed
+};
+
+/// The pose of a part over all its tags at once: the minimum of the reprojection error of all
+/// corners, searched from every hypothesis of every tag. Tags in different planes leave one
+/// minimum; a single tag seen from afar has two. While a tag disagrees with the common pose the one
+/// whose absence helps most is dropped. std::nullopt if nothing is left that fits.
+std::optional<PartPose> solve_part_pose(std::vector<SeenTag> tags, const PartPoseOptions& options);
+
+}  // namespace bodyschema

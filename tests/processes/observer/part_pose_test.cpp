@@ -1,0 +1,171 @@
+#include "processes/observer/part_pose.h"
+
+#include <gtest/gtest.h>
+
+#include <Eigen/LU>
+#include <random>
+
+#include "processes/marker_estimator/tag_pose.h"
+
+namespace bodyschema {
+namespace {
+
+constexpr double kSize_m = 0.08;
+constexpr double kFocal_px = 1159;
+
+PartPoseOptions options() {
+  PartPoseOptions options;
+  options.max_tag_error_px = 1.5;
+  options.min_other_rotation_rad = 0.035;
+  options.max_error_ratio = 10;
+  return options;
+}
+
+/// Three sides of a box with edges of 10 cm: all seen from the front left above.
+std::vector<Pose> box() {
+  std::vector<Pose> X_BM(3, Pose::Identity());
+  X_BM[0].translation() = Eigen::Vector3d(0, 0, -0.05);
+  X_BM[1].linear() = exp_so3(Eigen::Vector3d(0, M_PI / 2, 0));
+  X_BM[1].translation() = Eigen::Vector3d(-0.05, 0, 0);
+  X_BM[2].linear() = exp_so3(Eigen::Vector3d(-M_PI / 2, 0, 0));
+  X_BM[2].translation() = Eigen::Vector3d(0, -0.05, 0);
+  return X_BM;
+}
+
+Pose X_CB_of(std::mt19937& random) {
+  std::uniform_real_distribution<double> u(-1, 1);
+  Pose X = Pose::Identity();
+  X.linear() = exp_so3(Eigen::Vector3d(0.55 + 0.1 * u(random), -0.6 + 0.1 * u(random), 0)) *
+               exp_so3(Eigen::Vector3d(0, 0, 0.2 * u(random)));
+  X.translation() = Eigen::Vector3d(0.1 * u(random), 0.1 * u(random), 1.2 + 0.2 * u(random));
+  return X;
+}
+
+SeenTag seen(int id, const Pose& X_CB, const Pose& X_BM, double sigma_px, std::mt19937& random) {
+  std::normal_distribution<double> noise(0, sigma_px / kFocal_px);
+  SeenTag tag{id, kSize_m, X_BM, {}, {}};
+  for (const Eigen::Vector3d& p_MP : tag_corners(kSize_m)) {
+    const Eigen::Vector3d p_C = X_CB * X_BM * p_MP;
+    ImagePoint point;
+    point.ray = p_C.head<2>() / p_C.z() + Eigen::Vector2d(noise(random), noise(random));
+    point.px_per_ray = kFocal_px * Eigen::Matrix2d::Identity();
+    point.sigma_px = sigma_px;
+    tag.corners.push_back(point);
+  }
+  for (const PoseFit& fit : solve_tag_pose(kSize_m, tag.corners)) tag.X_CM.push_back(fit.X_CB);
+  return tag;
+}
+
+std::vector<SeenTag> seen_box(const Pose& X_CB, int num_tags, double sigma_px,
+                              std::mt19937& random) {
+  std::vector<SeenTag> tags;
+  for (int i = 0; i < num_tags; ++i) tags.push_back(seen(i, X_CB, box()[i], sigma_px, random));
+  return tags;
+}
+
+TEST(SolvePartPose, IsBetterOverSeveralTagsThanOverOne) {
+  std::mt19937 random(1);
+  double squares[4] = {};
+  constexpr int kViews = 200;
+  for (int i = 0; i < kViews; ++i) {
+    const Pose X_CB = X_CB_of(random);
+    for (const int num_tags : {1, 2, 3}) {
+      const auto pose = solve_part_pose(seen_box(X_CB, num_tags, 0.1, random), options());
+      ASSERT_TRUE(pose);
+      squares[num_tags] += (pose->X_CB.translation() - X_CB.translation()).squaredNorm();
+    }
+  }
+  for (const int num_tags : {1, 2, 3}) {
+    RecordProperty("rms_mm_" + std::to_string(num_tags) + "_tags",
+                   std::to_string(1e3 * std::sqrt(squares[num_tags] / kViews)));
+  }
+  EXPECT_LT(squares[2], 0.5 * squares[1]);
+  EXPECT_LT(squares[3], squares[2]);
+}
+
+TEST(SolvePartPose, HasACovarianceThatIsConsistentWithGaussianCornerNoise) {
+  for (const unsigned seed : {1u, 2u, 3u}) {
+    for (const int num_tags : {1, 2, 3}) {
+      std::mt19937 random(seed);
+      double sum = 0;
+      constexpr int kViews = 300;
+      for (int i = 0; i < kViews; ++i) {
+        const Pose X_CB = X_CB_of(random);
+        const auto pose = solve_part_pose(seen_box(X_CB, num_tags, 0.1, random), options());
+        ASSERT_TRUE(pose);
+        const Vector6d error = log(pose->X_CB.inverse() * X_CB);
+        sum += error.dot(pose->covariance.inverse() * error);
+      }
+      RecordProperty("mean_d2_" + std::to_string(num_tags) + "_tags_seed_" + std::to_string(seed),
+                     std::to_string(sum / kViews));
+      EXPECT_NEAR(sum / kViews, 6, 0.9) << num_tags << " tags, seed " << seed;
+    }
+  }
+}
+
+TEST(SolvePartPose, TellsTheOtherPoseOfASingleDistantTagButNotOfTagsInTwoPlanes) {
+  std::mt19937 random(3);
+  int num_other_single = 0, num_other_two = 0;
+  for (int i = 0; i < 100; ++i) {
+    Pose X_CB = Pose::Identity();
+    X_CB.linear() = exp_so3(Eigen::Vector3d(0.2, 0.15, 0));
+    X_CB.translation() = Eigen::Vector3d(0, 0, 2);
+    const auto single = solve_part_pose({seen(0, X_CB, Pose::Identity(), 0.3, random)}, options());
+    ASSERT_TRUE(single);
+    if (single->X_CB_other) {
+      ++num_other_single;
+      EXPECT_GE(single->error_ratio, 1);
+      EXPECT_LE(single->error_ratio, 10);
+      const double best = std::min(rotation_angle(single->X_CB.inverse() * X_CB),
+                                   rotation_angle(single->X_CB_other->inverse() * X_CB));
+      EXPECT_LT(best, 0.25);
+    } else {
+      EXPECT_EQ(single->error_ratio, 0);
+    }
+    const auto two = solve_part_pose(seen_box(X_CB_of(random), 2, 0.1, random), options());
+    ASSERT_TRUE(two);
+    num_other_two += two->X_CB_other.has_value();
+  }
+  EXPECT_GT(num_other_single, 50);
+  EXPECT_EQ(num_other_two, 0);
+}
+
+TEST(SolvePartPose, DropsTheTagThatDisagrees) {
+  std::mt19937 random(4);
+  for (int i = 0; i < 20; ++i) {
+    const Pose X_CB = X_CB_of(random);
+    std::vector<SeenTag> tags = seen_box(X_CB, 3, 0.1, random);
+    Pose moved = X_CB;
+    moved.translation().x() += 0.02;
+    tags[i % 3] = seen(i % 3, moved, box()[i % 3], 0.1, random);
+    const auto pose = solve_part_pose(tags, options());
+    ASSERT_TRUE(pose);
+    EXPECT_EQ(pose->dropped, std::vector<int>{i % 3});
+    EXPECT_EQ(pose->used.size(), 2u);
+    EXPECT_LT((pose->X_CB.translation() - X_CB.translation()).norm(), 3e-3);
+  }
+}
+
+TEST(SolvePartPose, WidensItsCovarianceByTheFloor) {
+  std::mt19937 random(5);
+  const auto tags = seen_box(X_CB_of(random), 3, 0.1, random);
+  PartPoseOptions floored = options();
+  floored.floor_position_m = 0.01;
+  floored.floor_rotation_rad = 0.02;
+  const Matrix6d difference =
+      solve_part_pose(tags, floored)->covariance - solve_part_pose(tags, options())->covariance;
+  Vector6d expected;
+  expected << 1e-4, 1e-4, 1e-4, 4e-4, 4e-4, 4e-4;
+  EXPECT_LT((difference - Matrix6d(expected.asDiagonal())).norm(), 1e-12);
+}
+
+TEST(SolvePartPose, GivesNothingForATagThatFitsNoPose) {
+  std::mt19937 random(6);
+  SeenTag tag = seen(0, X_CB_of(random), Pose::Identity(), 0.1, random);
+  tag.corners[0].ray.x() += 20 / kFocal_px;
+  EXPECT_FALSE(solve_part_pose({tag}, options()));
+  EXPECT_FALSE(solve_part_pose({}, options()));
+}
+
+}  // namespace
+}  // namespace bodyschema
