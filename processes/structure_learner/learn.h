@@ -1,0 +1,54 @@
+#pragma once
+
+#include <cstdint>
+#include <optional>
+#include <vector>
+
+#include "common/schema/body_schema.h"
+#include "common/schema/sample.h"
+
+namespace bodyschema {
+
+struct LearnOptions {
+  /// The root part; else the lowest part id seen.
+  std::optional<int> root;
+  /// Parts that should be there: reported where they were never seen.
+  std::vector<int> expected_parts;
+  /// Standard deviations per axis per marker: replace the covariances of the observations. Without
+  /// them and with all covariances zero, the noise is estimated (see noise_estimate.h).
+  std::optional<Noise> noise;
+  /// Added to the covariance of every relative pose: the view-dependent bias of real tags, which no
+  /// number of samples averages out (about 1 mm and 0.2°). Under-stating it rejects true models in
+  /// the end; over-stating it hides joints that move less.
+  Noise model_error;
+  /// Largest number of joints in one local model (0 to 2).
+  int max_signals = 2;
+  /// Expected share of outliers per marker: flips of planar tags, false detections.
+  double outlier_rate = 0.03;
+  /// A second pose hypothesis is offered to the fits while its reprojection error is below this
+  /// multiple of the first's.
+  double max_error_ratio = 10;
+};
+
+/// A pose that disagrees with the rest of the learned schema.
+struct Outlier {
+  std::int64_t sample_index = 0;
+  int part = 0;
+};
+
+struct LearnResult {
+  BodySchema schema;
+  std::vector<Outlier> outliers;  ///< ascending by sample, then part
+  int num_screens = 0;            ///< closed-form hypotheses looked at
+  int num_fits = 0;               ///< Levenberg–Marquardt fits
+};
+
+/// Learns the body schema from scratch: structure and local models (Sections 3.1 and 3.2). A pure
+/// function of its arguments. Poses must be finite rigid transforms (callers check what comes in
+/// from outside). `utime`, `version` and `base_version` of the schema are left to the caller.
+/// @throws std::invalid_argument if an action does not have one value per signal, or max_signals is
+/// out of range.
+LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPoseSample>& samples,
+                  const LearnOptions& options = {});
+
+}  // namespace bodyschema

@@ -1,0 +1,232 @@
+#include "processes/structure_learner/local_model.h"
+
+#include <Eigen/Eigenvalues>
+#include <cmath>
+#include <limits>
+
+namespace bodyschema {
+namespace {
+
+Pose screw_motion(double slide, double turn, double q) {
+  Pose X = Pose::Identity();
+  const double c = std::cos(turn * q), s = std::sin(turn * q);
+  X.linear() << c, -s, 0, s, c, 0, 0, 0, 1;
+  X.translation().z() = slide * q;
+  return X;
+}
+
+double robust_cost(double d2) { return (kStudentNu + 6) / 2 * std::log1p(d2 / kStudentNu); }
+
+// Whitened residual and its Jacobian: log((Δ̂ exp δ)⁻¹ z) = r − J_l⁻¹(r) δ + O(δ²).
+void whitened_jacobian(const PairHypothesis& h, const Vector6d& residual, ParameterJacobian* J) {
+  const Matrix6d M = -h.whitening * right_jacobian_inverse(-residual);
+  for (Eigen::Index n = 0; n < J->cols(); ++n) J->col(n) = (M * J->col(n)).eval();
+}
+
+// JᵀWJ and JᵀWr. Frames are stacked before they are multiplied: one product of a few hundred rows
+// costs a fraction of many of six.
+void normal_equations(const Fit& fit, const PairData& pair, const NormalizedActions& actions,
+                      ParameterMatrix* H, ParameterVector* g) {
+  constexpr int kBlock = 32;
+  const int p = fit.model.num_parameters();
+  H->setZero(p, p);
+  g->setZero(p);
+  Eigen::MatrixXd rows(6 * kBlock, p);
+  Eigen::VectorXd residuals(6 * kBlock);
+  ParameterJacobian J;
+  for (int first = 0; first < pair.size(); first += kBlock) {
+    const int count = std::min(kBlock, pair.size() - first);
+    for (int n = 0; n < count; ++n) {
+      const FrameFit& frame = fit.frames[first + n];
+      const PairHypothesis& h = pair.hypotheses[frame.hypothesis];
+      const Pose prediction =
+          predict_with_jacobian(fit.model, actions, pair.frames[first + n].sample, &J);
+      whitened_jacobian(h, log(prediction.inverse() * h.z), &J);
+      const double root_w = std::sqrt(robust_weight(frame.squared_distance));
+      rows.middleRows<6>(6 * n) = root_w * J;
+      residuals.segment<6>(6 * n) = root_w * frame.residual;
+    }
+    const auto block = rows.topRows(6 * count);
+    H->selfadjointView<Eigen::Lower>().rankUpdate(block.transpose());
+    g->noalias() += block.transpose() * residuals.head(6 * count);
+  }
+  *H = H->selfadjointView<Eigen::Lower>();
+}
+
+}  // namespace
+
+bool LocalModel::uses(int s) const {
+  for (int d = 0; d < num_joints; ++d)
+    if (signal[d] == s) return true;
+  return false;
+}
+
+Pose LocalModel::predict(const NormalizedActions& actions, int sample) const {
+  Pose X = A[0];
+  for (int d = 0; d < num_joints; ++d)
+    X = X * screw_motion(slide[d], turn[d], actions(sample, signal[d])) * A[d + 1];
+  return X;
+}
+
+LocalModel LocalModel::inverse() const {
+  LocalModel result;
+  result.num_joints = num_joints;
+  for (int d = 0; d < num_joints; ++d) {
+    result.signal[d] = signal[num_joints - 1 - d];
+    result.slide[d] = -slide[num_joints - 1 - d];
+    result.turn[d] = -turn[num_joints - 1 - d];
+  }
+  for (int d = 0; d <= num_joints; ++d) result.A[d] = A[num_joints - d].inverse();
+  return result;
+}
+
+Pose predict_with_jacobian(const LocalModel& model, const NormalizedActions& actions, int sample,
+                           ParameterJacobian* jacobian) {
+  ParameterJacobian& J = *jacobian;
+  J.resize(6, model.num_parameters());
+  Pose suffix = Pose::Identity();
+  for (int d = model.num_joints; d-- > 0;) {
+    const double q = actions(sample, model.signal[d]);
+    const int column = 6 + 8 * d;
+    J.middleCols<6>(column + 2) = adjoint(suffix.inverse());
+    suffix = model.A[d + 1] * suffix;
+    // Exp(ŝq) commutes with ŝ, so the screw's own motion drops out of the suffix. The columns are
+    // those of Ad(suffix⁻¹) for translation along and rotation about z.
+    const Eigen::Vector3d z_axis = suffix.linear().row(2).transpose();
+    J.col(column) << q * z_axis, Eigen::Vector3d::Zero();
+    J.col(column + 1) << q * (suffix.linear().transpose() *
+                              Eigen::Vector3d(-suffix.translation().y(), suffix.translation().x(),
+                                              0)),
+        q * z_axis;
+    suffix = screw_motion(model.slide[d], model.turn[d], q) * suffix;
+  }
+  J.leftCols<6>() = adjoint(suffix.inverse());
+  return model.A[0] * suffix;
+}
+
+LocalModel perturbed(const LocalModel& model, const ParameterVector& step) {
+  LocalModel result = model;
+  result.A[0] = model.A[0] * exp(step.head<6>());
+  for (int d = 0; d < model.num_joints; ++d) {
+    const int row = 6 + 8 * d;
+    result.slide[d] += step(row);
+    result.turn[d] += step(row + 1);
+    result.A[d + 1] = model.A[d + 1] * exp(step.segment<6>(row + 2));
+  }
+  return result;
+}
+
+FrameFit best_reading(const PairData& pair, int frame, const Pose& prediction) {
+  const PairFrame& f = pair.frames[frame];
+  const Pose inverse = prediction.inverse();
+  FrameFit best;
+  double best_score = std::numeric_limits<double>::infinity();
+  for (int n = 0; n < f.num_hypotheses; ++n) {
+    const PairHypothesis& h = pair.hypotheses[f.first_hypothesis + n];
+    const Vector6d r = h.whitening * log(inverse * h.z);
+    const double d2 = r.squaredNorm();
+    // The readings' shares in a heavy-tailed likelihood: a reading far off by both hypotheses must
+    // not be decided by their determinants.
+    const double score = 2 * robust_cost(d2) + h.log_det + h.penalty;
+    if (score < best_score) {
+      best_score = score;
+      best = {f.first_hypothesis + n, r, d2};
+    }
+  }
+  return best;
+}
+
+Fit evaluate(const LocalModel& model, const PairData& pair, const NormalizedActions& actions) {
+  Fit fit;
+  fit.model = model;
+  fit.frames.reserve(pair.size());
+  for (int t = 0; t < pair.size(); ++t) {
+    fit.frames.push_back(best_reading(pair, t, model.predict(actions, pair.frames[t].sample)));
+    fit.cost += robust_cost(fit.frames.back().squared_distance);
+  }
+  return fit;
+}
+
+Fit fit_local_model(const LocalModel& start, const PairData& pair, const NormalizedActions& actions,
+                    int max_iterations, double tolerance) {
+  Fit fit = evaluate(start, pair, actions);
+  ParameterMatrix H;
+  ParameterVector g;
+  double damping = 1e-4;
+  for (int iteration = 0; iteration < max_iterations; ++iteration) {
+    normal_equations(fit, pair, actions, &H, &g);
+    bool improved = false;
+    double decrease = 0;
+    for (int attempt = 0; attempt < 8 && !improved; ++attempt) {
+      ParameterMatrix damped = H;
+      damped.diagonal() += damping * H.diagonal();
+      damped.diagonal().array() += 1e-14 * H.diagonal().maxCoeff();
+      const Eigen::LLT<ParameterMatrix> llt(damped);
+      if (llt.info() == Eigen::Success) {
+        const ParameterVector step = -llt.solve(g);
+        if (step.allFinite()) {
+          Fit candidate = evaluate(perturbed(fit.model, step), pair, actions);
+          if (candidate.cost < fit.cost) {
+            decrease = fit.cost - candidate.cost;
+            fit = std::move(candidate);
+            improved = true;
+            damping = std::max(damping / 10, 1e-10);
+          }
+        }
+      }
+      if (!improved) damping *= 10;
+    }
+    // Residuals far below the noise go on to the end of the arithmetic: it costs a step or two.
+    if (!improved || (decrease < tolerance && fit.cost > 1e-3 * pair.size())) break;
+    // Stuck where no model is valid (a valid one costs about 5 a frame, outliers 30).
+    if (iteration >= 12 && fit.cost > 16 * pair.size() && decrease < 0.01 * fit.cost) break;
+  }
+  return fit;
+}
+
+LeaveOneOut leave_one_out(const Fit& fit, const PairData& pair, const NormalizedActions& actions) {
+  ParameterMatrix H;
+  ParameterVector g;
+  normal_equations(fit, pair, actions, &H, &g);
+  const int p = fit.model.num_parameters();
+  LeaveOneOut result;
+  // Scaled to a unit diagonal, so that metres and radians count alike in the rank.
+  ParameterVector scale(p);
+  for (int n = 0; n < p; ++n) scale(n) = H(n, n) > 0 ? 1 / std::sqrt(H(n, n)) : 1;
+  const ParameterMatrix scaled = scale.asDiagonal() * H * scale.asDiagonal();
+  const Eigen::SelfAdjointEigenSolver<Eigen::MatrixXd> eigen(scaled);
+  const double threshold = 1e-9 * std::max(eigen.eigenvalues()(p - 1), 1e-300);
+  ParameterMatrix root(p, p);  // (JᵀWJ)⁺ = root · rootᵀ
+  root.setZero();
+  for (int n = 0; n < p; ++n) {
+    if (eigen.eigenvalues()(n) <= threshold) continue;
+    root.col(n) =
+        scale.cwiseProduct(eigen.eigenvectors().col(n)) / std::sqrt(eigen.eigenvalues()(n));
+    ++result.rank;
+  }
+  result.parameter_covariance = root * root.transpose();
+
+  result.squared_distance.reserve(pair.size());
+  result.residual.reserve(pair.size());
+  ParameterJacobian J;
+  for (int t = 0; t < pair.size(); ++t) {
+    const FrameFit& frame = fit.frames[t];
+    const PairHypothesis& h = pair.hypotheses[frame.hypothesis];
+    const Pose prediction = predict_with_jacobian(fit.model, actions, pair.frames[t].sample, &J);
+    whitened_jacobian(h, log(prediction.inverse() * h.z), &J);
+    const ParameterJacobian JR = J * root;
+    const Matrix6d I_minus_H =
+        Matrix6d::Identity() - robust_weight(frame.squared_distance) * (JR * JR.transpose());
+    // A frame that alone decides a parameter has eigenvalue 0 here: it cannot be predicted from the
+    // others, so its residual of 0 is no evidence. The floor keeps that finite.
+    const Eigen::SelfAdjointEigenSolver<Matrix6d> e(I_minus_H);
+    const Vector6d coordinates = e.eigenvectors().transpose() * frame.residual;
+    const Vector6d left_out = coordinates.cwiseQuotient(e.eigenvalues().cwiseMax(1e-3));
+    result.squared_distance.push_back(coordinates.dot(left_out));
+    result.residual.push_back(
+        h.whitening.triangularView<Eigen::Lower>().solve(e.eigenvectors() * left_out));
+  }
+  return result;
+}
+
+}  // namespace bodyschema

@@ -1,0 +1,91 @@
+#pragma once
+
+#include <array>
+#include <vector>
+
+#include "processes/structure_learner/pair_data.h"
+
+namespace bodyschema {
+
+/// Largest number of joints inside one local model.
+inline constexpr int kMaxJoints = 2;
+inline constexpr int kMaxParameters = 6 + 8 * kMaxJoints;
+
+/// A local model in the learner's own terms, over normalised signals q ∈ [−1, 1]:
+///   Δ(q) = A_0 ∏_d Exp(ŝ_d q_d) A_d,  ŝ_d = (0, 0, slide_d, 0, 0, turn_d)
+/// Revolute, prismatic and helical joints in one form; the command's gain is in ŝ, its offset in
+/// A_0. k = 0 is a rigid connection.
+struct LocalModel {
+  int num_joints = 0;
+  std::array<int, kMaxJoints> signal{};
+  std::array<double, kMaxJoints> slide{};  ///< [m per half range]
+  std::array<double, kMaxJoints> turn{};   ///< [rad per half range]
+  std::array<Pose, kMaxJoints + 1> A{Pose::Identity(), Pose::Identity(), Pose::Identity()};
+
+  int num_parameters() const { return 6 + 8 * num_joints; }
+  bool uses(int s) const;
+  /// Pose of j in i at sample `sample`.
+  Pose predict(const NormalizedActions& actions, int sample) const;
+  /// The same motion seen from the other side: Δ_ji = Δ_ij⁻¹.
+  LocalModel inverse() const;
+};
+
+using ParameterJacobian = Eigen::Matrix<double, 6, Eigen::Dynamic, 0, 6, kMaxParameters>;
+using ParameterMatrix =
+    Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, 0, kMaxParameters, kMaxParameters>;
+using ParameterVector = Eigen::Matrix<double, Eigen::Dynamic, 1, 0, kMaxParameters, 1>;
+
+/// Prediction and its Jacobian ∂(right perturbation)/∂parameters; parameters in the order A_0
+/// tangent (6), then per joint slide, turn, A_d tangent (6).
+Pose predict_with_jacobian(const LocalModel& model, const NormalizedActions& actions, int sample,
+                           ParameterJacobian* jacobian);
+
+/// The model moved by a parameter step.
+LocalModel perturbed(const LocalModel& model, const ParameterVector& step);
+
+/// Student-t degrees of freedom of the robust fits: weight (ν + 6)/(ν + d²).
+inline constexpr double kStudentNu = 4;
+inline double robust_weight(double squared_distance) {
+  return (kStudentNu + 6) / (kStudentNu + squared_distance);
+}
+
+/// What one frame says about a model.
+struct FrameFit {
+  int hypothesis = 0;                    ///< index into PairData::hypotheses: the likeliest reading
+  Vector6d residual = Vector6d::Zero();  ///< whitened log(Δ̂⁻¹ z)
+  double squared_distance = 0;           ///< |residual|²
+};
+
+struct Fit {
+  LocalModel model;
+  double cost = 0;  ///< Σ (ν + 6)/2 · log(1 + d²/ν)
+  std::vector<FrameFit> frames;
+};
+
+/// The likeliest reading of a frame under a prediction. Deterministic; no memory of earlier
+/// choices.
+FrameFit best_reading(const PairData& pair, int frame, const Pose& prediction);
+
+/// Residuals and cost of a model as it is.
+Fit evaluate(const LocalModel& model, const PairData& pair, const NormalizedActions& actions);
+
+/// Levenberg–Marquardt from `start` with Student-t weights and analytic Jacobian. The gauge freedom
+/// of the screw frames is held by the damping alone. Ends when a step gains less than `tolerance`
+/// [nats].
+Fit fit_local_model(const LocalModel& start, const PairData& pair, const NormalizedActions& actions,
+                    int max_iterations, double tolerance = 1e-8);
+
+/// Leave-one-out diagnostics of a fit in closed form.
+struct LeaveOneOut {
+  /// d²_t = rᵀ(I − H_tt)⁻¹ r, χ²₆ a frame under a true model.
+  std::vector<double> squared_distance;
+  /// log(Δ̂₋ₜ⁻¹ z) predicted without frame t, not whitened: (translation [m], rotation [rad]).
+  std::vector<Vector6d> residual;
+  /// Pseudo-inverse (JᵀWJ)⁺ along the gauge, over normalised parameters.
+  ParameterMatrix parameter_covariance;
+  /// Rank of JᵀWJ: 6 + 6k for revolute and helical joints, less for prismatic ones.
+  int rank = 0;
+};
+LeaveOneOut leave_one_out(const Fit& fit, const PairData& pair, const NormalizedActions& actions);
+
+}  // namespace bodyschema

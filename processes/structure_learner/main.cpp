@@ -1,0 +1,80 @@
+// structure_learner: SAMPLE -> LEARNED_SCHEMA
+
+#include <CLI/CLI.hpp>
+#include <future>
+#include <stdexcept>
+
+#include "common/bus/process.h"
+#include "common/bus/sample_intake.h"
+#include "processes/structure_learner/structure_learner.h"
+
+using namespace bodyschema;
+
+int main(int argc, char** argv) {
+  std::string samples_file;
+  const auto add_options = [&](CLI::App& app) {
+    app.add_option("--samples", samples_file, "The observer's samples.lcmlog, read at start");
+  };
+  const auto body = [&](Process& process) {
+    StructureLearner learner(StructureLearnerConfig::load(process.config_file()));
+    SampleIntake intake(samples_file, [&](const sample_t& sample) {
+      try {
+        learner.on_sample(sample);
+      } catch (const std::invalid_argument&) {
+        process.count("refused SAMPLE");  // another rig's
+      }
+    });
+
+    // The fit runs beside the loop: listening never waits for learning.
+    std::future<body_schema_t> fit;
+    body_schema_t learned;
+    bool has_learned = false;
+    std::int64_t sent_us = 0;
+    const auto publish = [&] {
+      process.bus().publish(kLearnedSchema, learned);
+      process.set_activity(process_info_t::PHASE_WORKING,
+                           std::to_string(learned.num_samples_seen) + " samples learned, " +
+                               std::to_string(learned.num_edges) + " edges of " +
+                               std::to_string(learned.num_parts) + " parts");
+    };
+    const auto collect = [&] {
+      learned = fit.get();
+      has_learned = true;
+      publish();
+    };
+    const auto learn_now = [&] {
+      fit = std::async(std::launch::deferred, learner.take_job());
+      collect();
+    };
+    const auto work = [&] {
+      if (fit.valid() && fit.wait_for(std::chrono::seconds(0)) == std::future_status::ready)
+        collect();
+      if (process.bus().is_replay()) {
+        // A log does not wait: what the monitor will judge is learned at once, the rest at the end,
+        // so that a replay always writes the same messages.
+        while (learner.has_test_job()) learn_now();
+      } else if (!fit.valid() && learner.has_job()) {
+        fit = std::async(std::launch::async, learner.take_job());
+      }
+    };
+
+    process.set_activity(process_info_t::PHASE_WAITING, "waiting for SAMPLE");
+    process.bus().subscribe<sample_t>(kSample,
+                                      [&](const sample_t& sample) { intake.on_sample(sample); });
+    process.on_idle(work);
+    process.on_tick([&](std::int64_t now_us) {
+      intake.on_tick(now_us);
+      work();
+      if (has_learned && !process.bus().is_replay() && now_us - sent_us >= 1'000'000) {
+        sent_us = now_us;
+        publish();
+      }
+    });
+    process.on_end([&] {
+      if (fit.valid()) collect();
+      while (learner.has_job()) learn_now();
+    });
+    process.run();
+  };
+  return run_process("structure_learner", argc, argv, body, add_options);
+}

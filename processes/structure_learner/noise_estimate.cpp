@@ -1,0 +1,266 @@
+#include "processes/structure_learner/noise_estimate.h"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <map>
+#include <numeric>
+#include <set>
+
+#include "processes/structure_learner/screen.h"
+
+namespace bodyschema {
+namespace {
+
+constexpr double kMedianChi3 = 2.366;  // median of χ²₃
+constexpr double kSafety = 1.2;
+constexpr int kMaxFrames = 120;
+constexpr int kMinRepeats = 5;
+
+double median(std::vector<double> values) {
+  const auto middle = values.begin() + values.size() / 2;
+  std::nth_element(values.begin(), middle, values.end());
+  return *middle;
+}
+
+// A residual log(Δ̂⁻¹ z) of a relative pose with the lever arm that carries the rotation noise of
+// part i into its position. For a single marker the lever is 0 and `markers` 1.
+struct NoiseResidual {
+  Vector6d residual;
+  Eigen::Vector3d lever = Eigen::Vector3d::Zero();
+  double markers = 2;
+};
+
+// Noise per axis of one marker from residuals whose covariance is `markers`·σ² plus the lever's
+// part.
+Noise noise_from(const std::vector<NoiseResidual>& residuals) {
+  Noise noise;
+  std::vector<double> values;
+  for (const auto& r : residuals) values.push_back(r.residual.tail<3>().squaredNorm() / r.markers);
+  noise.rotation_rad = std::sqrt(median(values) / kMedianChi3);
+  const double rotation_variance = noise.rotation_rad * noise.rotation_rad;
+  // The position variance that brings the median of the whitened position residuals to that of χ²₃:
+  // the covariance is v·m along the lever and v·m + |lever|²σ_r² across it.
+  const auto median_at = [&](double v) {
+    values.clear();
+    for (const auto& r : residuals) {
+      const double l2 = r.lever.squaredNorm();
+      const double along2 = l2 > 0 ? std::pow(r.residual.head<3>().dot(r.lever), 2) / l2 : 0.0;
+      const double across2 = r.residual.head<3>().squaredNorm() - along2;
+      values.push_back(along2 / (v * r.markers) +
+                       across2 / (v * r.markers + l2 * rotation_variance));
+    }
+    return median(values);
+  };
+  double low = 1e-20, high = 1e2;  // [m²]
+  for (int n = 0; n < 60; ++n) {
+    const double middle = std::sqrt(low * high);
+    (median_at(middle) > kMedianChi3 ? low : high) = middle;
+  }
+  noise.position_m = std::sqrt(high);
+  return noise;
+}
+
+Noise floored(Noise noise, double factor) {
+  noise.position_m = std::max(noise.position_m * factor, kNoiseFloor.position_m);
+  noise.rotation_rad = std::max(noise.rotation_rad * factor, kNoiseFloor.rotation_rad);
+  return noise;
+}
+
+Noise believable(Noise noise) {
+  noise = floored(noise, kSafety);
+  noise.position_m = std::min(noise.position_m, kNoiseCeiling.position_m);
+  noise.rotation_rad = std::min(noise.rotation_rad, kNoiseCeiling.rotation_rad);
+  return noise;
+}
+
+// Median pose: iteratively re-weighted mean with weights 1/|residual|.
+Pose robust_mean(const std::vector<Pose>& poses) {
+  Pose mean = poses[poses.size() / 2];
+  for (int round = 0; round < 20; ++round) {
+    Eigen::Vector3d dv = Eigen::Vector3d::Zero(), dw = Eigen::Vector3d::Zero();
+    double sv = 0, sw = 0;
+    for (const Pose& pose : poses) {
+      const Vector6d r = log(mean.inverse() * pose);
+      const double wv = 1 / std::max(r.head<3>().norm(), 1e-9);
+      const double ww = 1 / std::max(r.tail<3>().norm(), 1e-9);
+      dv += wv * r.head<3>();
+      dw += ww * r.tail<3>();
+      sv += wv;
+      sw += ww;
+    }
+    Vector6d step;
+    step << dv / sv, dw / sw;
+    mean = mean * exp(step);
+  }
+  return mean;
+}
+
+std::optional<Noise> noise_from_repeats(const std::vector<ActionPoseSample>& samples,
+                                        const NormalizedActions& actions) {
+  if (actions.moving().empty()) return std::nullopt;
+  // Repeats: the same action up to a millionth of the range.
+  std::map<std::vector<long>, std::vector<int>> groups;
+  for (int t = 0; t < actions.num_samples(); ++t) {
+    std::vector<long> key;
+    for (const int s : actions.moving()) key.push_back(std::lround(actions(t, s) * 1e6));
+    groups[key].push_back(t);
+  }
+  std::vector<NoiseResidual> residuals;
+  for (const auto& [key, members] : groups) {
+    std::map<int, std::vector<Pose>> poses;
+    for (const int t : members)
+      for (const PartObservation& o : samples[t].parts) poses[o.part].push_back(o.X_CB);
+    for (const auto& [part, of_part] : poses) {
+      const double n = static_cast<double>(of_part.size());
+      if (n < kMinRepeats) continue;
+      const Pose mean = robust_mean(of_part);
+      for (const Pose& pose : of_part)
+        residuals.push_back(
+            {std::sqrt(n / (n - 1)) * log(mean.inverse() * pose), Eigen::Vector3d::Zero(), 1.0});
+    }
+  }
+  if (residuals.size() < 10) return std::nullopt;
+  return noise_from(residuals);
+}
+
+// A model of a pair with its leave-one-out residuals and the noise that they speak of.
+struct ScaledFit {
+  std::vector<NoiseResidual> residuals;
+  Noise noise;
+  double scale = std::numeric_limits<double>::infinity();  // log of position × rotation noise
+};
+
+class ModelNoise {
+ public:
+  ModelNoise(const std::vector<ActionPoseSample>& samples, const NormalizedActions& actions)
+      : samples_(samples), actions_(actions) {}
+
+  // The start refined at its own noise: whitening and model in turn.
+  ScaledFit refine(LocalModel model, int part_i, int part_j, Noise noise) const {
+    ScaledFit result;
+    for (int round = 0; round < 4; ++round) {
+      const PairData pair = pair_data(part_i, part_j, noise);
+      const Fit fit = fit_local_model(model, pair, actions_, round == 0 ? 15 : 8);
+      const LeaveOneOut loo = leave_one_out(fit, pair, actions_);
+      if (6 * pair.size() - loo.rank < 6) return ScaledFit{};
+      model = fit.model;
+      std::vector<NoiseResidual> residuals;
+      for (int t = 0; t < pair.size(); ++t)
+        residuals.push_back({loo.residual[t],
+                             pair.hypotheses[fit.frames[t].hypothesis].z.inverse().translation(),
+                             2.0});
+      // Leave-one-out residuals are wider than the noise by the model's own uncertainty: exactly so
+      // that the mean of d² with (I − H)⁻¹ in it is unbiased. Undo the average widening.
+      const double dof = 6.0 * pair.size();
+      const double shrink = std::sqrt((dof - loo.rank) / dof);
+      for (auto& r : residuals) r.residual *= shrink;
+      result.noise = noise_from(residuals);
+      result.residuals = std::move(residuals);
+      noise = floored(result.noise, 1);
+    }
+    const Noise bounded = floored(result.noise, 1);
+    result.scale = std::log(bounded.position_m) + std::log(bounded.rotation_rad);
+    return result;
+  }
+
+  ScaledFit best(int part_i, int part_j, bool with_two_joints) const {
+    ScaledFit best;
+    const auto offer = [&](ScaledFit fit) {
+      if (fit.scale < best.scale) best = std::move(fit);
+    };
+    const Noise rough{0.005, 0.03};
+    const PairData pair = pair_data(part_i, part_j, rough);
+    if (pair.size() < 3) return best;
+    if (!with_two_joints) {
+      offer(refine(screen_rigid(pair, actions_).model, part_i, part_j, rough));
+      const RelativeMotions motions = relative_motions(pair, 200);
+      const auto regressions = screen_one_joint(motions, actions_);
+      if (!regressions.empty())
+        offer(refine(one_joint_start(regressions[0], pair, actions_, motions.sigma_rad).model,
+                     part_i, part_j, rough));
+    } else {
+      const RelativeMotions motions = relative_motions(pair, 200);
+      const std::vector<std::vector<double>> turns(actions_.num_signals(), default_turns());
+      const auto starts = screen_two_joints(pair, actions_, motions, turns, 6);
+      for (std::size_t n = 0; n < starts.size(); ++n)
+        offer(refine(starts[n].model, part_i, part_j, rough));
+    }
+    return best;
+  }
+
+ private:
+  PairData pair_data(int part_i, int part_j, const Noise& noise) const {
+    MeasurementModel measurement;
+    measurement.noise = noise;
+    return make_pair_data(samples_, part_i, part_j, measurement, kMaxFrames);
+  }
+
+  const std::vector<ActionPoseSample>& samples_;
+  const NormalizedActions& actions_;
+};
+
+}  // namespace
+
+std::optional<Noise> estimate_noise(const std::vector<ActionPoseSample>& samples, int num_signals,
+                                    int max_signals) {
+  const NormalizedActions actions(samples, num_signals);
+  if (const auto noise = noise_from_repeats(samples, actions)) return believable(*noise);
+
+  std::set<int> seen;
+  for (const auto& sample : samples)
+    for (const auto& o : sample.parts) seen.insert(o.part);
+  const std::vector<int> parts(seen.begin(), seen.end());
+  const int n = static_cast<int>(parts.size());
+  if (n < 2) return std::nullopt;
+
+  const ModelNoise model_noise(samples, actions);
+  std::map<std::pair<int, int>, ScaledFit> fits;
+  for (int i = 0; i < n; ++i)
+    for (int j = i + 1; j < n; ++j) fits[{i, j}] = model_noise.best(parts[i], parts[j], false);
+
+  // Prim's minimum spanning tree by scale: every part by the partner that predicts it best.
+  std::vector<bool> in_tree(n, false);
+  in_tree[0] = true;
+  std::vector<std::pair<int, int>> tree;
+  for (int step = 1; step < n; ++step) {
+    std::pair<int, int> best{-1, -1};
+    double best_scale = std::numeric_limits<double>::infinity();
+    for (const auto& [ij, fit] : fits) {
+      if (in_tree[ij.first] == in_tree[ij.second] || !(fit.scale < best_scale)) continue;
+      best_scale = fit.scale;
+      best = ij;
+    }
+    if (best.first < 0) break;
+    in_tree[best.first] = in_tree[best.second] = true;
+    tree.push_back(best);
+  }
+  if (tree.empty()) return std::nullopt;
+
+  // Where one joint does not suffice, two may. Edges far above the quietest do, and with few edges
+  // any may.
+  double quietest = std::numeric_limits<double>::infinity();
+  for (const auto& ij : tree) quietest = std::min(quietest, fits[ij].scale);
+  if (max_signals >= 2) {
+    for (const auto& ij : tree) {
+      if (tree.size() > 2 && fits[ij].scale < quietest + std::log(4.0)) continue;
+      ScaledFit two = model_noise.best(parts[ij.first], parts[ij.second], true);
+      if (two.scale < fits[ij].scale) fits[ij] = std::move(two);
+    }
+  }
+
+  // Pool the edges no worse than four times the lower quartile (in the product of both noises): an
+  // edge across two hidden parts has no model here and would speak of motion, not of noise.
+  std::vector<double> scales;
+  for (const auto& ij : tree) scales.push_back(fits[ij].scale);
+  std::sort(scales.begin(), scales.end());
+  const double limit = scales[scales.size() / 4] + std::log(4.0);
+  std::vector<NoiseResidual> pooled;
+  for (const auto& ij : tree)
+    if (fits[ij].scale <= limit)
+      pooled.insert(pooled.end(), fits[ij].residuals.begin(), fits[ij].residuals.end());
+  if (pooled.size() < 6) return std::nullopt;
+  return believable(noise_from(pooled));
+}
+
+}  // namespace bodyschema

@@ -1,0 +1,30 @@
+#pragma once
+
+#include <optional>
+#include <vector>
+
+#include "processes/structure_learner/pair_data.h"
+
+namespace bodyschema {
+
+/// Below this no measurement is believed: 0.1 mm and 0.02° per axis.
+inline constexpr Noise kNoiseFloor{1e-4, 3.4906585e-4};
+
+/// Above this it is no measurement but motion that no model explains: four times the noise of the
+/// chapter's markers. Without a ceiling, poses at random would pass for a rigid body badly seen.
+inline constexpr Noise kNoiseCeiling{0.1, 0.41887902};
+
+/// Noise per axis of one marker, for data that bring neither noise nor covariances.
+///
+/// From repeats where an action recurs at least five times: residuals of each part's pose to its
+/// robust mean over the repeats. Else from the best screw models (k ≤ 2) of a minimum spanning tree
+/// over the parts: their pooled leave-one-out residuals. Both through medians, so that outliers do
+/// not count; position and rotation apart (the rotation noise of part i reaches the position of
+/// z_ij through the lever arm). The estimate is returned 1.2 × too large: too small a noise rejects
+/// true models, too large a noise by that factor costs nearly nothing. Never below kNoiseFloor or above
+/// kNoiseCeiling.
+/// std::nullopt: too few data.
+std::optional<Noise> estimate_noise(const std::vector<ActionPoseSample>& samples, int num_signals,
+                                    int max_signals = 2);
+
+}  // namespace bodyschema

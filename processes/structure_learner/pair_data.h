@@ -1,0 +1,83 @@
+#pragma once
+
+#include <vector>
+
+#include "common/geometry/pose.h"
+#include "common/schema/body_schema.h"
+#include "common/schema/sample.h"
+
+namespace bodyschema {
+
+/// The training actions, each signal scaled to [−1, 1] over its observed range, so that nothing in
+/// the fits depends on command units.
+class NormalizedActions {
+ public:
+  /// @throws std::invalid_argument if an action does not have `num_signals` values.
+  NormalizedActions(const std::vector<ActionPoseSample>& samples, int num_signals);
+
+  int num_signals() const { return static_cast<int>(centre_.size()); }
+  int num_samples() const { return static_cast<int>(values_.cols()); }
+  double operator()(int sample, int signal) const { return values_(signal, sample); }
+  /// q = centre + half_range · value, in command units.
+  double centre(int signal) const { return centre_(signal); }
+  double half_range(int signal) const { return half_range_(signal); }
+  /// The signals that took more than one value, ascending. The others can explain nothing.
+  const std::vector<int>& moving() const { return moving_; }
+
+ private:
+  Eigen::MatrixXd values_;  // signals × samples
+  Eigen::VectorXd centre_, half_range_;
+  std::vector<int> moving_;
+};
+
+/// One reading of z_ij = y_i⁻¹ y_j.
+struct PairHypothesis {
+  Pose z = Pose::Identity();
+  /// L⁻¹ of Σ_z = L Lᵀ: whitens a residual log(Δ̂⁻¹ z).
+  Matrix6d whitening = Matrix6d::Identity();
+  /// log |2πΣ_z|
+  double log_det = 0;
+  /// −2 log of the prior odds against this reading: 0 for the first hypotheses of both markers.
+  double penalty = 0;
+};
+
+/// One instant at which both parts were seen. Planar markers may be read in two ways, so there are
+/// up to four readings; the first is that of both primary hypotheses.
+struct PairFrame {
+  int sample = 0;
+  int first_hypothesis = 0;
+  int num_hypotheses = 0;
+};
+
+struct PairData {
+  int part_i = 0;
+  int part_j = 0;
+  std::vector<PairFrame> frames;
+  std::vector<PairHypothesis> hypotheses;
+
+  int size() const { return static_cast<int>(frames.size()); }
+  /// The reading of both primary hypotheses.
+  const PairHypothesis& primary(int frame) const {
+    return hypotheses[frames[frame].first_hypothesis];
+  }
+};
+
+/// What is assumed about the measurements.
+struct MeasurementModel {
+  /// Replaces the covariances of the observations where given.
+  std::optional<Noise> noise;
+  /// Added to every Σ_z: what no noise model of a marker knows (view-dependent bias).
+  Noise model_error;
+  /// A second hypothesis whose reprojection error exceeds the first's by more than this factor is
+  /// not offered.
+  double max_error_ratio = 10;
+};
+
+/// Instants at which both parts were seen, as (sample, observation of i, observation of j).
+int count_common(const std::vector<ActionPoseSample>& samples, int part_i, int part_j);
+
+/// The pair's data, thinned evenly to at most `max_frames` instants.
+PairData make_pair_data(const std::vector<ActionPoseSample>& samples, int part_i, int part_j,
+                        const MeasurementModel& measurement, int max_frames);
+
+}  // namespace bodyschema

@@ -1,0 +1,70 @@
+#include "processes/structure_learner/structure_learner.h"
+
+#include <algorithm>
+#include <stdexcept>
+
+#include "bodyschema/action_command_t.hpp"
+#include "common/bus/convert.h"
+#include "common/config/yaml.h"
+
+namespace bodyschema {
+
+StructureLearnerConfig StructureLearnerConfig::load(const std::filesystem::path& file) {
+  constexpr double kRadians = M_PI / 180;
+  const Yaml yaml = Yaml::load(file);
+  const Signals signals = load_signals(file.parent_path());
+  StructureLearnerConfig config;
+  config.signals = signals.signals;
+  config.options.root = signals.root_part;
+  config.options.expected_parts = load_markers(file.parent_path()).parts();
+  config.options.max_signals = static_cast<int>(yaml.integer("max_signals", 0, 2));
+  config.options.outlier_rate = yaml.number("outlier_rate", 0, 0.5);
+  config.options.model_error.position_m = yaml.number("model_error_position_m", 0, 1);
+  config.options.model_error.rotation_rad =
+      yaml.number("model_error_rotation_deg", 0, 90) * kRadians;
+  yaml.finish();
+  return config;
+}
+
+StructureLearner::StructureLearner(StructureLearnerConfig config) : config_(std::move(config)) {}
+
+void StructureLearner::on_sample(const sample_t& sample) {
+  if (sample.sample_index <= last_sample_index_) return;
+  if (sample.action.size() != config_.signals.size()) {
+    throw std::invalid_argument("SAMPLE has " + std::to_string(sample.action.size()) +
+                                " action signals, signals.yaml names " +
+                                std::to_string(config_.signals.size()));
+  }
+  last_sample_index_ = sample.sample_index;
+  if (sample.purpose == action_command_t::PURPOSE_TRAIN ||
+      sample.purpose == action_command_t::PURPOSE_PROBE) {
+    samples_.push_back(from_message(sample));
+  }
+  if (!pending_.empty() && !pending_.back().is_test) pending_.pop_back();
+  pending_.push_back({samples_.size(), sample.sample_index, sample.utime,
+                      sample.purpose == action_command_t::PURPOSE_TEST});
+}
+
+std::function<body_schema_t()> StructureLearner::take_job() {
+  const Prefix prefix = pending_.front();
+  pending_.pop_front();
+  const auto end = samples_.begin() + static_cast<std::ptrdiff_t>(prefix.num_training);
+  return [config = config_, samples = std::vector<ActionPoseSample>(samples_.begin(), end),
+          prefix] {
+    LearnOptions options = config.options;
+    const bool is_root_seen = std::any_of(
+        samples.begin(), samples.end(),
+        [&](const ActionPoseSample& sample) { return options.root && sample.find(*options.root); });
+    if (options.root && !is_root_seen) {
+      // Nothing can hang on a root that nobody saw; that it is missing keeps the schema incomplete.
+      options.expected_parts.push_back(*options.root);
+      options.root.reset();
+    }
+    BodySchema schema = learn(config.signals, samples, options).schema;
+    schema.last_sample_index = prefix.last_sample_index;
+    schema.utime = prefix.utime;
+    return to_message(schema);
+  };
+}
+
+}  // namespace bodyschema

@@ -1,0 +1,65 @@
+#pragma once
+
+#include <cstdint>
+#include <deque>
+#include <filesystem>
+#include <functional>
+#include <optional>
+#include <vector>
+
+#include "bodyschema/body_schema_t.hpp"
+#include "bodyschema/sample_t.hpp"
+#include "common/config/rig.h"
+#include "processes/structure_learner/learn.h"
+
+namespace bodyschema {
+
+struct StructureLearnerConfig {
+  std::vector<Signal> signals;
+  LearnOptions options;
+
+  /// Reads structure_learner.yaml, and beside it signals.yaml and, for the parts there are,
+  /// markers.yaml. @throws ConfigError.
+  static StructureLearnerConfig load(const std::filesystem::path& file);
+};
+
+/// Collects TRAIN and PROBE samples and turns them into a proposal, LEARNED_SCHEMA. The proposal
+/// after sample n is a pure function of the samples 0..n: nothing is carried over from an earlier
+/// one, and which prefixes were skipped while a fit was running does not matter. TEST samples are
+/// never learned from; they only advance last_sample_index, so that the monitor can judge.
+///
+/// Before the first sample there is no proposal; when samples stop, the last proposal stands.
+class StructureLearner {
+ public:
+  explicit StructureLearner(StructureLearnerConfig config);
+
+  /// Samples in order of sample_index; one that is not newer than the last is ignored.
+  /// @throws std::invalid_argument if the action does not have one value per signal.
+  void on_sample(const sample_t& sample);
+
+  std::int64_t last_sample_index() const { return last_sample_index_; }
+  /// True if there is a prefix of the samples to learn from that was not given out yet.
+  bool has_job() const { return !pending_.empty(); }
+  /// The same for a prefix that ends with a TEST sample.
+  bool has_test_job() const { return has_job() && pending_.front().is_test; }
+  /// The fit of the next prefix, on a copy, to be run in any thread. Prefixes that end with a TEST
+  /// sample come in order and none is left out, since the monitor judges these; of the others only
+  /// the newest waits. There must be one.
+  std::function<body_schema_t()> take_job();
+
+ private:
+  /// The samples 0..last_sample_index.
+  struct Prefix {
+    std::size_t num_training = 0;
+    std::int64_t last_sample_index = 0;
+    std::int64_t utime = 0;
+    bool is_test = false;
+  };
+
+  const StructureLearnerConfig config_;
+  std::vector<ActionPoseSample> samples_;
+  std::int64_t last_sample_index_ = -1;
+  std::deque<Prefix> pending_;
+};
+
+}  // namespace bodyschema

@@ -1,0 +1,334 @@
+#include "processes/structure_learner/structure_search.h"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <numeric>
+#include <tuple>
+
+namespace bodyschema {
+namespace {
+
+// Starts whose mean robust cost a frame is above these are beyond repair by a local fit. (A frame
+// at the squared distance d² costs 5 log(1 + d²/4).)
+constexpr double kMaxRigidStartCost = 20;
+constexpr double kMaxScrewStartCost = 26;
+// Two signal sets of one size whose likelihoods differ by less [nats] are not told apart.
+constexpr double kAmbiguityMargin = 3;
+
+class Forest {
+ public:
+  explicit Forest(int size) : parent_(size) { std::iota(parent_.begin(), parent_.end(), 0); }
+  int find(int x) const {
+    while (parent_[x] != x) x = parent_[x];
+    return x;
+  }
+  bool connected(int x, int y) const { return find(x) == find(y); }
+  void connect(int x, int y) { parent_[std::max(find(x), find(y))] = std::min(find(x), find(y)); }
+  bool spans() const {
+    for (int x = 1; x < static_cast<int>(parent_.size()); ++x)
+      if (!connected(0, x)) return false;
+    return true;
+  }
+
+ private:
+  std::vector<int> parent_;
+};
+
+struct Candidate {
+  int i = 0, j = 0;  // indices into parts
+  LocalModel model;
+  double score = 0;
+  int num_frames = 0;
+  int num_outliers = 0;
+  double mean_capped = 0;  // mean of min(d², 2c)
+  bool doubtful = false;
+  bool on_all_data = false;
+};
+
+std::set<int> signal_set(const LocalModel& model) {
+  return {model.signal.begin(), model.signal.begin() + model.num_joints};
+}
+
+class Search {
+ public:
+  Search(const std::vector<ActionPoseSample>& samples, const NormalizedActions& actions,
+         const std::vector<int>& parts, const SearchOptions& options)
+      : samples_(samples),
+        actions_(actions),
+        parts_(parts),
+        options_(options),
+        forest_(static_cast<int>(parts.size())) {
+    const int n = static_cast<int>(parts.size());
+    const int num_pairs = std::max(1, n * (n - 1) / 2);
+    max_frames_ = std::clamp(40000 / num_pairs, 60, 150);
+    max_motions_ = num_pairs > 200 ? 150 : 300;
+    pairs_.resize(static_cast<std::size_t>(n) * n);
+    motions_.resize(pairs_.size());
+    for (int i = 0; i < n; ++i)
+      for (int j = i + 1; j < n; ++j)
+        record(i, j).num_common = count_common(samples, parts[i], parts[j]);
+  }
+
+  SearchResult run() {
+    for (int k = 0; k <= options_.max_signals && !forest_.spans(); ++k) {
+      if (k == 0) layer_rigid();
+      if (k == 1) layer_one_joint();
+      if (k == 2) layer_two_joints();
+    }
+    settle_doubtful();
+    return std::move(result_);
+  }
+
+ private:
+  PairRecord& record(int i, int j) { return result_.records[{parts_[i], parts_[j]}]; }
+
+  void note_undecided(int i, int j, int k, double mean_capped) {
+    const auto [it, is_new] = record(i, j).undecided.emplace(k, mean_capped);
+    if (!is_new) it->second = std::min(it->second, mean_capped);
+  }
+
+  // Is a smaller model between the same components undecided, and not clearly worse than this one?
+  bool smaller_undecided(const Candidate& c) {
+    const int n = static_cast<int>(parts_.size());
+    const int k = c.model.num_joints;
+    for (int x = 0; x < n; ++x) {
+      if (!forest_.connected(x, c.i)) continue;
+      for (int y = 0; y < n; ++y) {
+        if (!forest_.connected(y, c.j)) continue;
+        for (const auto& [smaller, mean_capped] : record(std::min(x, y), std::max(x, y)).undecided)
+          if (smaller < k && (!is_clean_ || c.num_frames * (mean_capped - c.mean_capped) <
+                                                6 * (k - smaller) * std::log(6.0 * c.num_frames)))
+            return true;
+      }
+    }
+    return false;
+  }
+
+  const PairData& pair(int i, int j) {
+    auto& slot = pairs_[static_cast<std::size_t>(i) * parts_.size() + j];
+    if (!slot)
+      slot = make_pair_data(samples_, parts_[i], parts_[j], options_.measurement, max_frames_);
+    return *slot;
+  }
+
+  const RelativeMotions& motions(int i, int j) {
+    auto& slot = motions_[static_cast<std::size_t>(i) * parts_.size() + j];
+    if (!slot) slot = relative_motions(pair(i, j), max_motions_);
+    return *slot;
+  }
+
+  // Fits and tests a start on the pair's subset of the data.
+  std::optional<Candidate> try_start(int i, int j, const LocalModel& start) {
+    const PairData& data = pair(i, j);
+    const bool all = data.size() == record(i, j).num_common;
+    Fit fit = fit_local_model(start, data, actions_, 40, 1e-4);
+    ++result_.num_fits;
+    ValidityOptions options = options_.validity;
+    options.lenient = !all;
+    const Validity validity =
+        check_validity(fit, leave_one_out(fit, data, actions_), data, actions_, options);
+    if (validity.verdict == Verdict::kNotEnoughData)
+      note_undecided(i, j, start.num_joints, validity.mean_capped);
+    if (validity.verdict != Verdict::kValid) return std::nullopt;
+    return Candidate{i,
+                     j,
+                     fit.model,
+                     validity.score,
+                     data.size(),
+                     validity.num_outliers,
+                     validity.mean_capped,
+                     validity.doubtful,
+                     all};
+  }
+
+  bool confirm_on_all_data(Candidate* candidate) {
+    if (candidate->on_all_data) return true;
+    const PairData data = make_pair_data(samples_, parts_[candidate->i], parts_[candidate->j],
+                                         options_.measurement, std::numeric_limits<int>::max());
+    const Fit fit = fit_local_model(candidate->model, data, actions_, 15, 1e-2);
+    ++result_.num_fits;
+    const Validity validity =
+        check_validity(fit, leave_one_out(fit, data, actions_), data, actions_, options_.validity);
+    candidate->model = fit.model;
+    candidate->on_all_data = true;
+    return validity.verdict == Verdict::kValid;
+  }
+
+  // Keeps a pair's best model, unless another signal set explains the data as well.
+  void decide(int i, int j, std::vector<Candidate> valid, std::vector<Candidate>* candidates) {
+    if (valid.empty()) return;
+    std::stable_sort(valid.begin(), valid.end(),
+                     [](const auto& x, const auto& y) { return x.score > y.score; });
+    const int frames = pair(i, j).size();
+    for (const Candidate& other : valid) {
+      if (signal_set(other.model) == signal_set(valid.front().model)) continue;
+      if ((valid.front().score - other.score) * frames < kAmbiguityMargin) {
+        note_undecided(i, j, other.model.num_joints, other.mean_capped);
+        return;
+      }
+    }
+    candidates->push_back(std::move(valid.front()));
+  }
+
+  // Kruskal on one layer. Doubtful models wait for settle_doubtful().
+  void connect(std::vector<Candidate> candidates) {
+    sort_by_quality(&candidates);
+    for (const Candidate& c : candidates) {
+      num_judged_ += c.num_frames;
+      num_outliers_ += c.num_outliers;
+    }
+    // Fewer outliers in all than the assumed rate would bring: then many on one model speak against
+    // it.
+    is_clean_ =
+        num_outliers_ < binomial_quantile(num_judged_, pair_outlier_rate(options_.validity), 0.02);
+    for (Candidate& c : candidates) {
+      if (forest_.connected(c.i, c.j)) continue;
+      if ((is_clean_ && c.doubtful) || smaller_undecided(c)) {
+        note_undecided(c.i, c.j, c.model.num_joints, c.mean_capped);
+        doubtful_.push_back(c);
+      } else if (confirm_on_all_data(&c)) {
+        accept(c);
+      }
+    }
+  }
+
+  // What is still open after the last layer: the simplest doubtful model first.
+  void settle_doubtful() {
+    sort_by_quality(&doubtful_);
+    for (Candidate& c : doubtful_)
+      if (!forest_.connected(c.i, c.j) && !smaller_undecided(c) && confirm_on_all_data(&c))
+        accept(c);
+  }
+
+  static void sort_by_quality(std::vector<Candidate>* candidates) {
+    std::stable_sort(candidates->begin(), candidates->end(), [](const auto& x, const auto& y) {
+      return std::tie(x.model.num_joints, y.score, x.i, x.j) <
+             std::tie(y.model.num_joints, x.score, y.i, y.j);
+    });
+  }
+
+  void accept(const Candidate& c) {
+    forest_.connect(c.i, c.j);
+    result_.models.push_back({parts_[c.i], parts_[c.j], c.model, c.score});
+  }
+
+  template <typename Visitor>
+  void for_each_open_pair(Visitor&& visit) {
+    const int n = static_cast<int>(parts_.size());
+    for (int i = 0; i < n; ++i)
+      for (int j = i + 1; j < n; ++j)
+        if (!forest_.connected(i, j) && record(i, j).num_common >= 2) visit(i, j);
+  }
+
+  void layer_rigid() {
+    std::vector<Candidate> candidates;
+    for_each_open_pair([&](int i, int j) {
+      ++result_.num_screens;
+      const Start start = screen_rigid(pair(i, j), actions_);
+      if (start.score > kMaxRigidStartCost) return;
+      if (auto c = try_start(i, j, start.model)) candidates.push_back(std::move(*c));
+    });
+    connect(std::move(candidates));
+  }
+
+  void layer_one_joint() {
+    constexpr std::size_t kMaxFits = 3;
+    std::vector<Candidate> candidates;
+    for_each_open_pair([&](int i, int j) {
+      const auto regressions = screen_one_joint(motions(i, j), actions_);
+      result_.num_screens += static_cast<int>(regressions.size());
+      std::vector<Candidate> valid;
+      for (std::size_t n = 0; n < std::min(kMaxFits, regressions.size()); ++n) {
+        if (n >= 2 && regressions[n].score > 1.5 * regressions[0].score) break;
+        const Start start =
+            one_joint_start(regressions[n], pair(i, j), actions_, motions(i, j).sigma_rad);
+        if (start.score > kMaxScrewStartCost) continue;
+        if (auto c = try_start(i, j, start.model)) valid.push_back(std::move(*c));
+      }
+      decide(i, j, std::move(valid), &candidates);
+    });
+    connect(std::move(candidates));
+  }
+
+  // Joint ranges of the signals where the forest already knows them, else a grid.
+  std::vector<std::vector<double>> assumed_turns(bool known_only) const {
+    std::vector<std::vector<double>> turns(actions_.num_signals());
+    if (known_only)
+      for (const AcceptedModel& m : result_.models)
+        for (int d = 0; d < m.model.num_joints; ++d)
+          if (std::abs(m.model.turn[d]) > 0.1)
+            turns[m.model.signal[d]].push_back(std::abs(m.model.turn[d]));
+    bool any_known = false;
+    for (auto& t : turns) {
+      any_known |= !t.empty();
+      if (t.empty()) t = default_turns();
+    }
+    if (known_only && !any_known) turns.clear();
+    return turns;
+  }
+
+  void layer_two_joints() {
+    // What the forest knows of a signal's range may not hold for its other joints: so a second pass
+    // without it, where the first leaves gaps.
+    for (const bool known_only : {true, false}) {
+      const auto turns = assumed_turns(known_only);
+      if (turns.empty() || forest_.spans()) continue;
+      two_joints_pass(turns);
+    }
+  }
+
+  void two_joints_pass(const std::vector<std::vector<double>>& turns) {
+    struct Screened {
+      int i, j;
+      Start start;
+    };
+    std::map<std::pair<int, int>, std::vector<Screened>> by_components;
+    for_each_open_pair([&](int i, int j) {
+      auto& list = by_components[std::minmax(forest_.find(i), forest_.find(j))];
+      for (const auto& t : turns) result_.num_screens += static_cast<int>(2 * t.size());
+      for (Start& start : screen_two_joints(pair(i, j), actions_, motions(i, j), turns, 10))
+        list.push_back({i, j, std::move(start)});
+    });
+    std::vector<Candidate> candidates;
+    for (auto& [components, list] : by_components) {
+      std::stable_sort(list.begin(), list.end(),
+                       [](const auto& x, const auto& y) { return x.start.score < y.start.score; });
+      std::map<std::pair<int, int>, std::vector<Candidate>> valid;
+      std::size_t num_tried = 0;
+      for (const Screened& s : list) {
+        const std::size_t max_fits = std::clamp(1200 / std::max(pair(s.i, s.j).size(), 1), 8, 40);
+        if (num_tried++ >= max_fits) break;
+        if (auto c = try_start(s.i, s.j, s.start.model)) valid[{s.i, s.j}].push_back(*c);
+      }
+      for (auto& [ij, of_pair] : valid)
+        decide(ij.first, ij.second, std::move(of_pair), &candidates);
+    }
+    connect(std::move(candidates));
+  }
+
+  const std::vector<ActionPoseSample>& samples_;
+  const NormalizedActions& actions_;
+  const std::vector<int>& parts_;
+  const SearchOptions& options_;
+  Forest forest_;
+  int max_frames_ = 0;
+  int max_motions_ = 0;
+  std::vector<std::optional<PairData>> pairs_;
+  std::vector<std::optional<RelativeMotions>> motions_;
+  std::vector<Candidate> doubtful_;
+  int num_judged_ = 0;  // frames of the valid models found so far, and the outliers among them
+  int num_outliers_ = 0;
+  bool is_clean_ = false;
+  SearchResult result_;
+};
+
+}  // namespace
+
+SearchResult search_structure(const std::vector<ActionPoseSample>& samples,
+                              const NormalizedActions& actions, const std::vector<int>& parts,
+                              const SearchOptions& options) {
+  return Search(samples, actions, parts, options).run();
+}
+
+}  // namespace bodyschema

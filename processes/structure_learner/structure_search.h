@@ -1,0 +1,64 @@
+#pragma once
+
+#include <map>
+#include <set>
+#include <utility>
+#include <vector>
+
+#include "processes/structure_learner/local_model.h"
+#include "processes/structure_learner/screen.h"
+#include "processes/structure_learner/validity.h"
+
+namespace bodyschema {
+
+struct SearchOptions {
+  MeasurementModel measurement;
+  ValidityOptions validity;
+  int max_signals = 2;  ///< largest k, at most kMaxJoints
+};
+
+/// An accepted local model between parts i < j.
+struct AcceptedModel {
+  int part_i = 0;
+  int part_j = 0;
+  LocalModel model;
+  double score = 0;
+};
+
+/// What the search tried between two parts.
+struct PairRecord {
+  int num_common = 0;  ///< instants at which both were seen
+  /// The models that were not refuted but that the data are too few to trust: mean of min(d², 2c)
+  /// of the best, by k.
+  std::map<int, double> undecided;
+};
+
+struct SearchResult {
+  std::vector<AcceptedModel> models;  ///< the forest, in the order of acceptance
+  std::map<std::pair<int, int>, PairRecord> records;
+  int num_screens = 0;  ///< closed-form starts and regressions
+  int num_fits = 0;     ///< Levenberg–Marquardt fits
+};
+
+/// Layered search for the minimum spanning forest of valid local models (Section 3.2.1, Algorithm
+/// 1).
+///
+/// The quality q(M) = s(M) − kΛ with Λ above the spread of s is the lexicographic order (k, −s). So
+/// Kruskal may work layer by layer: k = 0 first, then k = 1 for the pairs that the forest has not
+/// yet connected, then k = 2. That is exact (the spanning forests are a matroid) and leaves most
+/// models unevaluated.
+///
+/// With few frames a true model may be kept out by bad luck (too many outliers) and would come back
+/// as a superset of its signals: so no larger model is accepted between two components while a
+/// smaller one is undecided. A wrong one may pass by calling what it cannot explain outliers: so
+/// where the data as a whole show fewer outliers than assumed, models with many wait until the
+/// layers are through, and a larger model takes their place if it explains the data better by more
+/// than its parameters are worth (6 log 6N a signal).
+///
+/// Hypotheses are screened and fitted on an even subset of the instants; what is about to enter the
+/// forest must be valid on all of them.
+SearchResult search_structure(const std::vector<ActionPoseSample>& samples,
+                              const NormalizedActions& actions, const std::vector<int>& parts,
+                              const SearchOptions& options);
+
+}  // namespace bodyschema

@@ -1,0 +1,114 @@
+// structure_table: how often is the learned structure right? Prints a Markdown table
+//   robot | regime | noise | N | right / incomplete / wrong % | mean CPU ms | fits
+//
+// structure_table ROBOTS REGIMES NOISE NS FIRST_SEED NUM_SEEDS [verbose]
+//   ROBOTS   comma-separated: a, c, co, d, dP, tree, tree3 (adjacent hidden parts), tree12
+//   REGIMES  free, chapter, tag, tag_iso
+//   NOISE    covariance (in the observations), given (isotropic), estimated, other (covariances and
+//            second hypotheses)
+//   NS       numbers of samples
+
+#include <cstdio>
+#include <ctime>
+#include <iostream>
+#include <sstream>
+
+#include "processes/structure_learner/learn.h"
+#include "tests/support/synthetic_robot.h"
+
+using namespace bodyschema;
+using namespace bodyschema::test;
+
+namespace {
+
+std::vector<std::string> split(const std::string& text) {
+  std::vector<std::string> result;
+  std::istringstream in(text);
+  for (std::string item; std::getline(in, item, ',');) result.push_back(item);
+  return result;
+}
+
+SyntheticRobot make_robot(const std::string& name, Rng& rng) {
+  RandomTreeOptions options;
+  if (name == "tree3") options.adjacent_hidden = true;
+  if (name == "tree12") {
+    options.num_parts = 12;
+    options.num_hidden = 2;
+  }
+  if (name == "tree40") {
+    options.num_parts = 40;
+    options.num_hidden = 3;
+    options.share_fixed = 0.25;
+  }
+  if (name.rfind("tree", 0) == 0) return random_tree(options, rng);
+  return chapter_robot(name, rng);
+}
+
+void describe(const BodySchema& schema, const SyntheticRobot& robot) {
+  for (const Edge& e : schema.edges) {
+    std::printf("    %d-%d {", e.from, e.to);
+    for (const int s : e.signals()) std::printf(" %d", s);
+    std::printf(" } true {");
+    for (const int s : robot.path_signals(e.from, e.to)) std::printf(" %d", s);
+    std::printf(" } rms %.2g m %.2g rad, %d of %d outliers\n", e.position_rms_m, e.rotation_rms_rad,
+                e.num_outliers, e.num_samples);
+  }
+  for (const auto& u : schema.unconnected)
+    std::printf("    unconnected %d: %d %s\n", u.part, static_cast<int>(u.reason),
+                u.detail.c_str());
+  std::printf("    noise %.3g m %.3g rad\n", schema.noise.position_m, schema.noise.rotation_rad);
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+  if (argc < 7) {
+    std::cerr << "usage: structure_table ROBOTS REGIMES NOISE NS FIRST_SEED NUM_SEEDS [verbose]\n";
+    return 2;
+  }
+  const int first_seed = std::stoi(argv[5]), num_seeds = std::stoi(argv[6]);
+  const bool verbose = argc > 7;
+  std::printf("| robot | regime | noise | N | right / incomplete / wrong %% | ms | fits |\n");
+  std::printf("|---|---|---|---|---|---|---|\n");
+  for (const std::string& robot_name : split(argv[1])) {
+    for (const std::string& regime_name : split(argv[2])) {
+      for (const std::string& noise : split(argv[3])) {
+        for (const std::string& n_text : split(argv[4])) {
+          const int n = std::stoi(n_text);
+          int counts[3] = {0, 0, 0};
+          double seconds = 0;
+          long fits = 0;
+          for (int seed = first_seed; seed < first_seed + num_seeds; ++seed) {
+            Rng rng(seed);
+            const SyntheticRobot robot = make_robot(robot_name, rng);
+            ObservationOptions observation;
+            for (const Regime r : {Regime::kFree, Regime::kChapter, Regime::kTag, Regime::kTagIso})
+              if (regime_name == name_of(r)) observation.regime = r;
+            observation.with_covariances = noise == "covariance" || noise == "other";
+            observation.with_other_hypothesis = noise == "other";
+            LearnOptions options;
+            if (noise == "given") options.noise = nominal_noise(observation.regime);
+            const auto samples = babble(robot, n, observation, rng);
+            const std::clock_t start = std::clock();
+            const LearnResult result = learn(robot.signals, samples, options);
+            seconds += static_cast<double>(std::clock() - start) / CLOCKS_PER_SEC;
+            fits += result.num_fits;
+            const Rightness rightness = judge(result.schema, robot);
+            ++counts[static_cast<int>(rightness)];
+            if (verbose && rightness != Rightness::kRight) {
+              std::printf("  seed %d: %s\n", seed,
+                          rightness == Rightness::kWrong ? "wrong" : "incomplete");
+              describe(result.schema, robot);
+            }
+          }
+          std::printf("| %s | %s | %s | %d | %.0f / %.0f / %.0f | %.1f | %.0f |\n",
+                      robot_name.c_str(), regime_name.c_str(), noise.c_str(), n,
+                      100.0 * counts[0] / num_seeds, 100.0 * counts[1] / num_seeds,
+                      100.0 * counts[2] / num_seeds, 1e3 * seconds / num_seeds,
+                      static_cast<double>(fits) / num_seeds);
+          std::fflush(stdout);
+        }
+      }
+    }
+  }
+}

@@ -1,0 +1,258 @@
+#include "processes/structure_learner/learn.h"
+
+#include <gtest/gtest.h>
+
+#include <sstream>
+
+#include "tests/support/synthetic_robot.h"
+
+namespace bodyschema {
+namespace {
+
+using test::is_right;
+using test::Regime;
+using test::Rightness;
+using test::Rng;
+
+// Robots out of `num_seeds` whose structure is right.
+int count_right(const std::string& name, Regime regime, int num_samples, int num_seeds,
+                bool given_noise) {
+  int right = 0;
+  for (int seed = 1; seed <= num_seeds; ++seed) {
+    Rng rng(seed);
+    const auto robot = test::chapter_robot(name, rng);
+    LearnOptions options;
+    if (given_noise) options.noise = test::nominal_noise(regime);
+    const auto result =
+        learn(robot.signals, test::babble(robot, num_samples, {regime}, rng), options);
+    right += is_right(result.schema, robot);
+  }
+  return right;
+}
+
+TEST(Learn, FindsTheChaptersRobotsFromFiveExactSamples) {
+  for (const char* name : {"a", "c", "co", "d", "dP"})
+    EXPECT_EQ(count_right(name, Regime::kFree, 5, 5, false), 5) << name;
+}
+
+TEST(Learn, FindsTheSevenAxisRobotInTheChaptersNoise) {
+  EXPECT_GE(count_right("d", Regime::kChapter, 20, 6, true), 6);
+}
+
+TEST(Learn, FindsTheSevenAxisRobotDespiteFlipsAndMissingMarkers) {
+  EXPECT_GE(count_right("d", Regime::kTag, 25, 6, true), 6);
+  EXPECT_GE(count_right("d", Regime::kTag, 25, 6, false), 6);
+}
+
+TEST(Learn, PredictsExactlyFromExactSamples) {
+  Rng rng(11);
+  const auto robot = test::chapter_robot("d", rng);
+  const auto result = learn(robot.signals, test::babble(robot, 10, {}, rng));
+  for (int n = 0; n < 20; ++n) {
+    const Eigen::VectorXd q = robot.random_action(rng);
+    const auto truth = robot.poses_in_camera(q);
+    for (const auto& [part, X_RB] : result.schema.predict_all(q))
+      EXPECT_LT(log((truth.at(1) * X_RB).inverse() * truth.at(part)).norm(), 1e-6) << part;
+  }
+  EXPECT_TRUE(result.schema.X_CR.isApprox(robot.X_CR, 1e-9));
+}
+
+TEST(Learn, HandlesGainsOffsetsBranchesScrewsAndIdleSignals) {
+  for (int seed = 1; seed <= 6; ++seed) {
+    Rng rng(seed);
+    const auto robot = test::random_tree({}, rng);
+    const auto result = learn(robot.signals, test::babble(robot, 25, {Regime::kTag}, rng));
+    EXPECT_NE(test::judge(result.schema, robot), Rightness::kWrong) << seed;
+    EXPECT_TRUE(is_right(learn(robot.signals, test::babble(robot, 15, {}, rng)).schema, robot))
+        << seed;
+  }
+}
+
+TEST(Learn, ReportsPartsBehindTwoHiddenOnesInsteadOfGuessing) {
+  int incomplete = 0;
+  for (int seed = 1; seed <= 6; ++seed) {
+    Rng rng(seed);
+    test::RandomTreeOptions options;
+    options.adjacent_hidden = true;
+    const auto robot = test::random_tree(options, rng);
+    LearnOptions given;
+    given.noise = test::nominal_noise(Regime::kTag);
+    const auto schema =
+        learn(robot.signals, test::babble(robot, 30, {Regime::kTag}, rng), given).schema;
+    EXPECT_NE(test::judge(schema, robot), Rightness::kWrong) << seed;
+    if (schema.complete) continue;
+    ++incomplete;
+    EXPECT_FALSE(schema.unconnected.empty());
+    for (const auto& u : schema.unconnected) EXPECT_FALSE(u.detail.empty());
+  }
+  EXPECT_GT(incomplete, 0);
+}
+
+TEST(Learn, EdgesPointAwayFromTheRootInOrder) {
+  Rng rng(12);
+  const auto robot = test::chapter_robot("d", rng);
+  LearnOptions options;
+  options.root = 6;
+  const auto schema = learn(robot.signals, test::babble(robot, 10, {}, rng), options).schema;
+  EXPECT_TRUE(is_right(schema, robot));
+  std::set<int> reached{6};
+  for (const Edge& edge : schema.edges) {
+    EXPECT_TRUE(reached.count(edge.from));
+    EXPECT_TRUE(reached.insert(edge.to).second);
+  }
+}
+
+TEST(Learn, IsAPureFunctionOfItsInput) {
+  Rng rng(13);
+  const auto robot = test::chapter_robot("d", rng);
+  const auto samples = test::babble(robot, 15, {Regime::kTag}, rng);
+  const auto one = learn(robot.signals, samples), two = learn(robot.signals, samples);
+  ASSERT_EQ(one.schema.edges.size(), two.schema.edges.size());
+  for (std::size_t n = 0; n < one.schema.edges.size(); ++n) {
+    EXPECT_EQ(one.schema.edges[n].left.matrix(), two.schema.edges[n].left.matrix());
+    EXPECT_EQ(one.schema.edges[n].parameter_covariance, two.schema.edges[n].parameter_covariance);
+  }
+}
+
+TEST(Learn, DoesNotDependOnCommandUnits) {
+  Rng rng(14);
+  const auto robot = test::chapter_robot("co", rng);
+  auto samples = test::babble(robot, 15, {Regime::kTagIso}, rng);
+  for (auto& s : samples) s.action = (s.action.array() * 700 + 2048).matrix();
+  EXPECT_TRUE(is_right(learn(robot.signals, samples).schema, robot));
+}
+
+TEST(Learn, BlamesTheMarkerThatWasWrong) {
+  Rng rng(15);
+  const auto robot = test::chapter_robot("c", rng);
+  auto samples = test::babble(robot, 30, {Regime::kFree}, rng);
+  const auto spoil = [&](int t, int part) {
+    for (auto& o : samples[t].parts)
+      if (o.part == part) o.X_CB.linear() = o.X_CB.linear() * exp_so3({0.7, 0, 0});
+  };
+  spoil(4, 3);   // inner part
+  spoil(9, 5);   // leaf
+  spoil(20, 1);  // root
+  const auto result = learn(robot.signals, samples);
+  EXPECT_TRUE(is_right(result.schema, robot));
+  ASSERT_EQ(result.outliers.size(), 3u);
+  EXPECT_EQ(result.outliers[0].sample_index, 4);
+  EXPECT_EQ(result.outliers[0].part, 3);
+  EXPECT_EQ(result.outliers[1].sample_index, 9);
+  EXPECT_EQ(result.outliers[1].part, 5);
+  EXPECT_EQ(result.outliers[2].sample_index, 20);
+  EXPECT_EQ(result.outliers[2].part, 1);
+}
+
+TEST(Learn, BlamesTheMovingPartOfTwoByTheRestingRoot) {
+  Rng rng(16);
+  test::SyntheticRobot robot = test::chapter_robot("a", rng);
+  auto samples = test::babble(robot, 20, {}, rng);
+  for (auto& s : samples)
+    std::erase_if(s.parts, [](auto& o) { return o.part != 1 && o.part != 3; });
+  samples[3].parts[0].X_CB.translation().x() += 0.1;
+  samples[5].parts[1].X_CB.translation().x() += 0.1;
+  const auto result = learn(robot.signals, samples);
+  ASSERT_EQ(result.outliers.size(), 2u);
+  EXPECT_EQ(result.outliers[0].part, 1);
+  EXPECT_EQ(result.outliers[1].part, 3);
+}
+
+TEST(Learn, TellsNeverSeenFromTooFewSamples) {
+  Rng rng(17);
+  const auto robot = test::chapter_robot("c", rng);
+  auto samples = test::babble(robot, 20, {}, rng);
+  for (std::size_t t = 2; t < samples.size(); ++t)
+    std::erase_if(samples[t].parts, [](auto& o) { return o.part == 5; });
+  LearnOptions options;
+  options.expected_parts = {1, 2, 3, 4, 5, 6};
+  const auto schema = learn(robot.signals, samples, options).schema;
+  EXPECT_FALSE(schema.complete);
+  ASSERT_EQ(schema.unconnected.size(), 2u);
+  EXPECT_EQ(schema.unconnected[0].part, 5);
+  EXPECT_EQ(schema.unconnected[0].reason, Unconnected::kNotEnoughData);
+  EXPECT_EQ(schema.unconnected[1].part, 6);
+  EXPECT_EQ(schema.unconnected[1].reason, Unconnected::kNeverSeen);
+}
+
+TEST(Learn, SaysSoWhereNoModelIsValid) {
+  Rng rng(18);
+  const auto robot = test::chapter_robot("a", rng);
+  auto samples = test::babble(robot, 30, {}, rng);
+  for (auto& s : samples)
+    for (auto& o : s.parts)
+      if (o.part == 5) o.X_CB = test::random_pose(rng, 1, 2);
+  LearnOptions options;
+  options.noise = Noise{0.001, 0.01};
+  const auto schema = learn(robot.signals, samples, options).schema;
+  ASSERT_EQ(schema.unconnected.size(), 1u);
+  EXPECT_EQ(schema.unconnected[0].part, 5);
+  EXPECT_EQ(schema.unconnected[0].reason, Unconnected::kNoValidModel);
+}
+
+TEST(Learn, AConstantSignalExplainsNothing) {
+  Rng rng(19);
+  const auto robot = test::chapter_robot("a", rng);
+  std::vector<ActionPoseSample> samples;
+  for (int t = 0; t < 15; ++t) {
+    Eigen::VectorXd q = robot.random_action(rng);
+    q(1) = 0.3;
+    samples.push_back(test::observe(robot, q, {Regime::kTagIso}, t, rng));
+  }
+  const auto schema = learn(robot.signals, samples).schema;
+  EXPECT_TRUE(schema.complete);
+  EXPECT_EQ(schema.unused_signals(), std::vector<int>{1});
+}
+
+TEST(Learn, ReadsTheOtherHypothesisOfFlippedMarkers) {
+  Rng rng(20);
+  const auto robot = test::chapter_robot("c", rng);
+  const auto result =
+      learn(robot.signals, test::babble(robot, 30, {Regime::kTag, true, true}, rng));
+  EXPECT_TRUE(is_right(result.schema, robot));
+  int outliers = 0;
+  for (const Edge& edge : result.schema.edges) outliers += edge.num_outliers;
+  EXPECT_LE(outliers, 2);
+}
+
+TEST(Learn, NothingSeenIsAnEmptySchema) {
+  const auto none = learn({{"q1", -1, 1}}, {});
+  EXPECT_FALSE(none.schema.complete);
+  EXPECT_EQ(none.schema.root, -1);
+  EXPECT_EQ(none.schema.last_sample_index, -1);
+  ActionPoseSample sample;
+  sample.action.setZero(1);
+  sample.parts.resize(1);
+  const auto one = learn({{"q1", -1, 1}}, {sample});
+  EXPECT_TRUE(one.schema.complete);
+  EXPECT_TRUE(one.schema.edges.empty());
+}
+
+TEST(Learn, RefusesActionsOfTheWrongSize) {
+  ActionPoseSample sample;
+  sample.action.setZero(2);
+  EXPECT_THROW(learn({{"q1", -1, 1}}, {sample}), std::invalid_argument);
+  LearnOptions options;
+  options.max_signals = 3;
+  EXPECT_THROW(learn({}, {}, options), std::invalid_argument);
+}
+
+TEST(SyntheticRobot, CsvRoundTripKeepsThePoses) {
+  Rng rng(21);
+  const auto robot = test::chapter_robot("c", rng);
+  const auto samples = test::babble(robot, 3, {Regime::kTag}, rng);
+  std::stringstream csv;
+  test::write_csv(samples, csv);
+  int num_signals = 0;
+  const auto read = test::read_csv(csv, &num_signals);
+  ASSERT_EQ(num_signals, 4);
+  ASSERT_EQ(read.size(), 3u);
+  for (std::size_t t = 0; t < 3; ++t) {
+    ASSERT_EQ(read[t].parts.size(), samples[t].parts.size());
+    for (std::size_t n = 0; n < read[t].parts.size(); ++n)
+      EXPECT_TRUE(read[t].parts[n].X_CB.isApprox(samples[t].parts[n].X_CB, 1e-9));
+  }
+}
+
+}  // namespace
+}  // namespace bodyschema

@@ -1,0 +1,110 @@
+#include "processes/structure_learner/screen.h"
+
+#include <gtest/gtest.h>
+
+#include "tests/support/synthetic_robot.h"
+
+namespace bodyschema {
+namespace {
+
+using test::Rng;
+
+enum class Joint { kRevolute, kPrismatic, kHelical };
+
+// Parts 1 and 3 with the joints given between them on signals 1 and 3 of four; part 2 hidden.
+test::SyntheticRobot two_joint_robot(Joint a, Joint b, bool parallel, Rng& rng) {
+  test::SyntheticRobot robot;
+  for (int s = 0; s < 4; ++s) robot.signals.push_back({"q", -100, 300});
+  robot.links.push_back({.part = 1});
+  const auto link = [&](int part, int parent, int signal, Joint type) {
+    test::TrueLink l;
+    l.part = part;
+    l.parent = parent;
+    l.signal = signal;
+    l.X_before = test::random_pose(rng, 0.05, 0.15);
+    l.X_after = test::random_pose(rng, 0.05, 0.15);
+    if (type != Joint::kPrismatic) l.turn = test::uniform(rng, 0.5, 1.2) / 200;
+    if (type == Joint::kPrismatic) l.slide = 0.05 / 200;
+    if (type == Joint::kHelical) l.slide = 0.03 / 200;
+    return l;
+  };
+  robot.links.push_back(link(2, 1, 1, a));
+  robot.links.push_back(link(3, 2, 3, b));
+  if (parallel) robot.links[2].X_before.linear() = robot.links[1].X_after.linear().transpose();
+  robot.links[1].hidden = true;
+  return robot;
+}
+
+struct Case {
+  const char* name;
+  Joint a, b;
+  bool parallel;
+};
+
+class TwoJointScreen : public ::testing::TestWithParam<Case> {};
+
+TEST_P(TwoJointScreen, LeadsAFitToTheTruth) {
+  for (int seed = 1; seed <= 5; ++seed) {
+    Rng rng(seed);
+    const auto robot = two_joint_robot(GetParam().a, GetParam().b, GetParam().parallel, rng);
+    const auto samples = test::babble(robot, 15, {}, rng);
+    const NormalizedActions actions(samples, 4);
+    const PairData pair = make_pair_data(samples, 1, 3, {Noise{1e-4, 3e-4}, {}}, 100);
+    const auto starts = screen_two_joints(pair, actions, relative_motions(pair, 300),
+                                          std::vector(4, default_turns()), 10);
+    double best = 1e9;
+    for (const Start& start : starts) {
+      const Fit fit = fit_local_model(start.model, pair, actions, 60);
+      if (fit.cost > 1e-9) continue;
+      best = fit.cost;
+      EXPECT_TRUE(fit.model.uses(1) && fit.model.uses(3));
+    }
+    EXPECT_LT(best, 1e-9) << "seed " << seed;
+  }
+}
+
+INSTANTIATE_TEST_SUITE_P(
+    Joints, TwoJointScreen,
+    ::testing::Values(Case{"revolute_revolute", Joint::kRevolute, Joint::kRevolute, false},
+                      Case{"parallel_axes", Joint::kRevolute, Joint::kRevolute, true},
+                      Case{"revolute_prismatic", Joint::kRevolute, Joint::kPrismatic, false},
+                      Case{"prismatic_revolute", Joint::kPrismatic, Joint::kRevolute, false},
+                      Case{"prismatic_prismatic", Joint::kPrismatic, Joint::kPrismatic, false},
+                      Case{"helical_revolute", Joint::kHelical, Joint::kRevolute, false},
+                      Case{"revolute_helical", Joint::kRevolute, Joint::kHelical, false}),
+    [](const auto& info) { return info.param.name; });
+
+TEST(OneJointScreen, PutsTheTrueSignalFirstAndStartsAtTheTruth) {
+  for (int seed = 1; seed <= 10; ++seed) {
+    Rng rng(seed);
+    auto robot = two_joint_robot(seed % 2 ? Joint::kRevolute : Joint::kPrismatic, Joint::kRevolute,
+                                 false, rng);
+    robot.links[1].hidden = false;
+    const auto samples = test::babble(robot, 6, {}, rng);
+    const NormalizedActions actions(samples, 4);
+    const PairData pair = make_pair_data(samples, 1, 2, {Noise{1e-4, 3e-4}, {}}, 100);
+    const RelativeMotions motions = relative_motions(pair, 300);
+    const auto regressions = screen_one_joint(motions, actions);
+    ASSERT_FALSE(regressions.empty());
+    EXPECT_EQ(regressions.front().signal, 1);
+    const Start start = one_joint_start(regressions.front(), pair, actions, motions.sigma_rad);
+    EXPECT_LT(start.score, 1e-3);
+  }
+}
+
+TEST(OneJointScreen, CoversAFullTurn) {
+  Rng rng(3);
+  auto robot = two_joint_robot(Joint::kRevolute, Joint::kRevolute, false, rng);
+  robot.links[1].hidden = false;
+  robot.links[1].turn = 2 * M_PI / 400;
+  const auto samples = test::babble(robot, 30, {}, rng);
+  const NormalizedActions actions(samples, 4);
+  const PairData pair = make_pair_data(samples, 1, 2, {Noise{1e-4, 3e-4}, {}}, 100);
+  const auto regressions = screen_one_joint(relative_motions(pair, 300), actions);
+  EXPECT_EQ(regressions.front().signal, 1);
+  EXPECT_NEAR(regressions.front().xi.tail<3>().norm() / actions.half_range(1), 2 * M_PI / 400,
+              1e-4);
+}
+
+}  // namespace
+}  // namespace bodyschema

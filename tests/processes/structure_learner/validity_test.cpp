@@ -1,0 +1,85 @@
+#include "processes/structure_learner/validity.h"
+
+#include <gtest/gtest.h>
+
+#include <numeric>
+
+#include "processes/structure_learner/screen.h"
+#include "tests/support/synthetic_robot.h"
+
+namespace bodyschema {
+namespace {
+
+using test::Regime;
+using test::Rng;
+
+Validity rigid_validity(const std::vector<ActionPoseSample>& samples, const Noise& noise) {
+  const NormalizedActions actions(samples, static_cast<int>(samples[0].action.size()));
+  const PairData pair = make_pair_data(samples, 1, 2, {noise, {}}, 1000);
+  const Fit fit = fit_local_model(screen_rigid(pair, actions).model, pair, actions, 40);
+  return check_validity(fit, leave_one_out(fit, pair, actions), pair, actions, {});
+}
+
+// Two parts with one joint of ±range_rad.
+test::SyntheticRobot hinge(double range_rad, Rng& rng) {
+  test::SyntheticRobot robot;
+  robot.signals = {{"q1", -1, 1}, {"q2", -1, 1}};
+  robot.links.push_back({.part = 1});
+  test::TrueLink link;
+  link.part = 2;
+  link.parent = 1;
+  link.signal = 0;
+  link.turn = range_rad;
+  link.X_before = test::random_pose(rng, 0.06, 0.16);
+  link.X_after = test::random_pose(rng, 0.06, 0.16);
+  robot.links.push_back(link);
+  robot.X_CR.translation().z() = 2;
+  return robot;
+}
+
+TEST(Validity, ATrueRigidConnectionIsValid) {
+  int valid = 0;
+  for (int seed = 1; seed <= 50; ++seed) {
+    Rng rng(seed);
+    const auto samples = test::babble(hinge(0, rng), 40, {Regime::kChapter}, rng);
+    valid +=
+        rigid_validity(samples, test::nominal_noise(Regime::kChapter)).verdict == Verdict::kValid;
+  }
+  EXPECT_GE(valid, 48);
+}
+
+TEST(Validity, AJointOfTwoDegreesIsFoundInTagNoise) {
+  int refuted = 0;
+  for (int seed = 1; seed <= 50; ++seed) {
+    Rng rng(seed);
+    const auto samples = test::babble(hinge(2 * M_PI / 180, rng), 40, {Regime::kTagIso}, rng);
+    const Validity v = rigid_validity(samples, {0.001, 0.6 * M_PI / 180});
+    refuted += v.verdict == Verdict::kRefuted;
+  }
+  EXPECT_GE(refuted, 40);
+}
+
+TEST(Validity, AHingeOfNinetyDegreesIsNotRigid) {
+  for (int seed = 1; seed <= 50; ++seed) {
+    Rng rng(seed);
+    const auto samples = test::babble(hinge(M_PI / 2, rng), 20, {Regime::kChapter}, rng);
+    EXPECT_EQ(rigid_validity(samples, test::nominal_noise(Regime::kChapter)).verdict,
+              Verdict::kRefuted);
+  }
+}
+
+TEST(Validity, TwoSamplesAreNotEnough) {
+  Rng rng(1);
+  const auto samples = test::babble(hinge(0, rng), 2, {Regime::kFree}, rng);
+  EXPECT_EQ(rigid_validity(samples, {1e-4, 3e-4}).verdict, Verdict::kNotEnoughData);
+}
+
+TEST(Validity, QuantilesAreThoseOfTheTables) {
+  EXPECT_NEAR(chi_square_quantile(6, 0.0027), kOutlierThreshold, 0.05);
+  EXPECT_NEAR(chi_square_quantile(1, 0.05), 3.8415, 1e-3);
+  EXPECT_EQ(binomial_quantile(10, 0.5, 0.5), 5);
+  EXPECT_EQ(binomial_quantile(20, 0.07, 0.995), 5);
+}
+
+}  // namespace
+}  // namespace bodyschema

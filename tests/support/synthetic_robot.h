@@ -1,0 +1,106 @@
+#pragma once
+
+#include <map>
+#include <ostream>
+#include <random>
+#include <set>
+#include <string>
+#include <vector>
+
+#include "common/schema/body_schema.h"
+#include "common/schema/sample.h"
+
+namespace bodyschema::test {
+
+using Rng = std::mt19937_64;
+
+double uniform(Rng& rng, double low, double high);
+double gaussian(Rng& rng);
+Vector6d gaussian6(Rng& rng);
+Eigen::Matrix3d random_rotation(Rng& rng);
+/// Uniform rotation, translation of a length in [min_m, max_m].
+Pose random_pose(Rng& rng, double min_m, double max_m);
+
+/// A body part with the joint that carries it: X_PB(q) = X_before · Exp(screw · θ) · X_after with
+/// θ = turn_or_slide · (q − zero). `signal` −1: fixed.
+struct TrueLink {
+  int part = 0;
+  int parent = -1;  ///< part id; −1: this is the base, fixed in front of the camera
+  Pose X_before = Pose::Identity();
+  Pose X_after = Pose::Identity();
+  int signal = -1;
+  double turn = 0;   ///< [rad per command unit] about the joint's z axis
+  double slide = 0;  ///< [m per command unit] along it
+  double zero = 0;   ///< command at which the joint is at rest [command units]
+  bool hidden = false;
+};
+
+/// Ground truth that no learner sees.
+struct SyntheticRobot {
+  std::string name;
+  std::vector<Signal> signals;
+  std::vector<TrueLink> links;  ///< parents before children
+  Pose X_CR = Pose::Identity();
+
+  std::map<int, Pose> poses_in_camera(const Eigen::VectorXd& action) const;
+  /// The signal of every moving joint on the path between two parts.
+  std::vector<int> path_joints(int part_a, int part_b) const;
+  /// Signals of the joints on the path between two parts.
+  std::set<int> path_signals(int part_a, int part_b) const;
+  std::vector<int> visible_parts() const;
+  Eigen::VectorXd random_action(Rng& rng) const;
+};
+
+enum class Regime {
+  kFree,     ///< exact
+  kChapter,  ///< 25.4 mm and 6.1° per axis
+  kTag,      ///< lateral 0.8, depth 2.8 mm, tilt 0.67°, in-plane 0.3°; 3 % flips, 15 % missing
+  kTagIso,   ///< 3 mm and 1° per axis; 3 % outliers: 70 % flips, 30 % anywhere
+};
+const char* name_of(Regime regime);
+/// Standard deviations per axis of the regime, averaged over the axes; for kFree the floor.
+Noise nominal_noise(Regime regime);
+
+struct ObservationOptions {
+  Regime regime = Regime::kFree;
+  bool with_covariances = false;  ///< else all zero
+  bool with_other_hypothesis = false;
+};
+
+ActionPoseSample observe(const SyntheticRobot& robot, const Eigen::VectorXd& action,
+                         const ObservationOptions& options, std::int64_t sample_index, Rng& rng);
+std::vector<ActionPoseSample> babble(const SyntheticRobot& robot, int num_samples,
+                                     const ObservationOptions& options, Rng& rng);
+
+/// The chapter's robots, random geometry. 'a': 2-DOF, 5 parts (Fig. 3); 'c': 4-DOF, 5 parts (Fig.
+/// 7); "co": c with part 3 hidden (Fig. 8); "d": 7-DOF, 10 parts, part 4 hidden, two hinged fingers
+/// on one signal; "dP": d with sliding fingers.
+SyntheticRobot chapter_robot(const std::string& name, Rng& rng);
+
+struct RandomTreeOptions {
+  int num_parts = 9;
+  int num_hidden = 1;
+  bool adjacent_hidden = false;  ///< two hidden parts in a row: an edge of three signals
+  double share_prismatic = 0.15;
+  double share_helical = 0.05;
+  double share_fixed = 0.15;
+  double share_parallel = 0.15;  ///< axis parallel to the parent's
+  bool shared_signal = true;     ///< the last two joints follow one signal
+  bool idle_signal = true;       ///< one more signal that moves nothing
+};
+/// A random tree with branches; command gains 0.5 to 2 of either sign, offsets.
+SyntheticRobot random_tree(const RandomTreeOptions& options, Rng& rng);
+
+enum class Rightness { kRight, kIncomplete, kWrong };
+/// Right: spans the visible parts, every edge's signals are exactly those on the true path between
+/// its two parts, and the number of signals over all edges is minimal. Incomplete: not spanning,
+/// and every edge's signals are right. Wrong: the rest.
+Rightness judge(const BodySchema& schema, const SyntheticRobot& truth);
+bool is_right(const BodySchema& schema, const SyntheticRobot& truth);
+
+/// Columns t, q1..qm, part, x, y, z, qw, qx, qy, qz; metres, unit quaternions.
+void write_csv(const std::vector<ActionPoseSample>& samples, std::ostream& out);
+/// The inverse; rows of one t make one sample.
+std::vector<ActionPoseSample> read_csv(std::istream& in, int* num_signals);
+
+}  // namespace bodyschema::test
