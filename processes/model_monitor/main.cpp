@@ -54,6 +54,7 @@ int main(int argc, char** argv) {
     });
     std::int64_t sent_us = 0;
     process.on_tick([&](std::int64_t now_us) {
+      intake.on_tick(now_us);
       if (bus.is_replay() || now_us - sent_us < 1'000'000) return;
       sent_us = now_us;
       publish();

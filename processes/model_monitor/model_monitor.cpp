@@ -12,12 +12,13 @@ namespace bodyschema {
 namespace {
 
 constexpr std::size_t kMaxEvents = 32;
+constexpr std::size_t kMaxWaiting = 32;
 
+/// Mean of the two middle values where their number is even; −1 if there is none.
 double median(std::vector<double> values) {
   if (values.empty()) return -1;
-  const auto middle = values.begin() + values.size() / 2;
-  std::nth_element(values.begin(), middle, values.end());
-  return *middle;
+  std::sort(values.begin(), values.end());
+  return 0.5 * (values[(values.size() - 1) / 2] + values[values.size() / 2]);
 }
 
 Matrix6d diagonal(const Noise& noise) {
@@ -68,21 +69,37 @@ bool ModelMonitor::on_sample(const sample_t& message) {
   ActionPoseSample sample = from_message(message);
   if (sample.purpose == Purpose::kTest) tests_.push_back(std::move(sample));
 
-  if (!waiting_ || waiting_->last_sample_index > last_sample_index_) return false;
-  const body_schema_t proposal = *waiting_;
-  waiting_.reset();
-  judge(proposal);
-  return true;
+  bool is_judged = false;
+  while (!waiting_.empty() && waiting_.front().last_sample_index <= last_sample_index_) {
+    const body_schema_t proposal = std::move(waiting_.front());
+    waiting_.pop_front();
+    is_judged |= on_learned_schema(proposal);
+  }
+  return is_judged;
 }
 
 bool ModelMonitor::on_learned_schema(const body_schema_t& proposal) {
   if (proposal.last_sample_index > last_sample_index_) {
-    waiting_ = proposal;
+    if (waiting_.empty() || proposal.last_sample_index > waiting_.back().last_sample_index) {
+      waiting_.push_back(proposal);
+      if (waiting_.size() > kMaxWaiting) waiting_.pop_front();
+    }
     return false;
   }
   if (proposal.last_sample_index <= health_.judged_sample) return false;
+  if (!is_test(proposal.last_sample_index)) return false;
   judge(proposal);
   return true;
+}
+
+bool ModelMonitor::is_test(std::int64_t sample_index) const {
+  return std::any_of(tests_.rbegin(), tests_.rend(), [&](const ActionPoseSample& sample) {
+    return sample.sample_index == sample_index;
+  });
+}
+
+bool ModelMonitor::fits(const ActionPoseSample& sample) const {
+  return sample.action.size() == static_cast<Eigen::Index>(schema_.signals.size());
 }
 
 ModelMonitor::EdgeTest ModelMonitor::test(const Edge& edge, std::int64_t up_to_sample) const {
@@ -93,7 +110,7 @@ ModelMonitor::EdgeTest ModelMonitor::test(const Edge& edge, std::int64_t up_to_s
     if (sample.sample_index > up_to_sample) break;
     const PartObservation* from = sample.find(edge.from);
     const PartObservation* to = sample.find(edge.to);
-    if (!from || !to || sample.action.size() != static_cast<int>(schema_.signals.size())) continue;
+    if (!from || !to || !fits(sample)) continue;
     const Pose predicted = edge.predict(sample.action);
     const Matrix6d model = edge.prediction_covariance(sample.action) + model_error;
     // A planar marker has two poses; the likelier one under the model speaks.
@@ -145,9 +162,11 @@ void ModelMonitor::judge(const body_schema_t& message) {
       add_event(health_event_t::EVENT_SCHEMA_REFUSED, index, proposal.utime, objection);
     }
   } else {
-    schema_.base_version = previous.version;
+    // base_version stays the proposal's: which version stood here before depends on the speed of
+    // the learner.
     schema_.version = index + 1;
     schema_message_ = to_message(schema_);
+    schema_ = from_message(*schema_message_);  // judged as published, and as it will be reloaded
     add_event(health_event_t::EVENT_SCHEMA_ACCEPTED, index, schema_.utime,
               "version " + std::to_string(schema_.version) + ": " +
                   std::to_string(schema_.edges.size()) + " edges, " +
@@ -189,7 +208,7 @@ void ModelMonitor::assess(std::int64_t up_to_sample) {
     for (const ActionPoseSample& sample : tests_) {
       if (sample.sample_index > up_to_sample) break;
       const PartObservation* seen = sample.find(part);
-      if (!seen || schema_.root < 0) continue;
+      if (!seen || schema_.root < 0 || !fits(sample)) continue;
       const auto predicted = schema_.predict(schema_.root, part, sample.action);
       if (!predicted) continue;
       // The camera and the root stand still, so the root's mean pose serves: its orientation noise

@@ -42,7 +42,8 @@ class ModelMonitor {
   /// Returns true if a proposal that was waiting for this sample was judged: schema() and health()
   /// may have changed.
   bool on_sample(const sample_t& sample);
-  /// Returns true if the proposal was judged.
+  /// Returns true if the proposal was judged: only those whose last sample is a TEST sample are. The
+  /// learner leaves none of them out, so the body schema does not depend on its speed.
   bool on_learned_schema(const body_schema_t& proposal);
 
   /// The body schema; std::nullopt before the first.
@@ -56,6 +57,10 @@ class ModelMonitor {
     double median_mahalanobis2 = -1;
   };
 
+  /// Whether the sample has one value per signal of the schema: a reloaded one may be another
+  /// rig's.
+  bool fits(const ActionPoseSample& sample) const;
+  bool is_test(std::int64_t sample_index) const;
   EdgeTest test(const Edge& edge, std::int64_t up_to_sample) const;
   void judge(const body_schema_t& proposal);
   void assess(std::int64_t up_to_sample);
@@ -65,7 +70,7 @@ class ModelMonitor {
   std::vector<ActionPoseSample> tests_;
   std::map<int, std::vector<std::int64_t>> seen_in_;  ///< part → indices of samples that show it
   std::int64_t last_sample_index_ = -1;
-  std::optional<body_schema_t> waiting_;  ///< proposal that is ahead of the samples heard here
+  std::deque<body_schema_t> waiting_;  ///< proposals that are ahead of the samples heard here
   BodySchema schema_;
   std::optional<body_schema_t> schema_message_;
   model_health_t health_{};

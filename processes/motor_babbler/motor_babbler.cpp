@@ -1,5 +1,7 @@
 #include "processes/motor_babbler/motor_babbler.h"
 
+#include <algorithm>
+#include <cmath>
 #include <random>
 
 #include "common/bus/convert.h"
@@ -9,6 +11,7 @@ namespace bodyschema {
 namespace {
 
 constexpr char kSource[] = "motor_babbler";
+constexpr int kMaxHastyRejections = 20;
 
 std::int64_t microseconds(double seconds) { return std::llround(seconds * 1e6); }
 
@@ -60,7 +63,9 @@ Eigen::VectorXd random_action(const MotorBabblerConfig& config, std::int64_t see
 }
 
 MotorBabbler::MotorBabbler(MotorBabblerConfig config, std::int64_t seed)
-    : config_(std::move(config)), seed_(seed) {}
+    : config_(std::move(config)), seed_(seed) {
+  health_.judged_sample = -1;
+}
 
 bool MotorBabbler::is_mine(const motion_status_t& status) const {
   return status.source == kSource && status.epoch == epoch_ &&
@@ -85,17 +90,24 @@ std::optional<action_command_t> MotorBabbler::on_motion_status(const motion_stat
     return at_rest ? act() : std::nullopt;
   }
   if (wait_ != Wait::kAnswer || !is_mine(status)) return std::nullopt;
+  wait_since_us_ = -1;  // the driver is not silent
   switch (status.state) {
     case motion_status_t::STATE_REJECTED:
+      // Asking again while the arm moves would only be refused again.
+      if (!at_rest) return std::nullopt;
       ++num_rejected_;
-      return act();
+      rejection_ = status.reason;
+      if (++num_rejected_in_a_row_ <= kMaxHastyRejections) return act();
+      // A driver that refuses everything is asked at leisure: on_tick sends what act() chose.
+      act();
+      return std::nullopt;
     case motion_status_t::STATE_EXPIRED:
     case motion_status_t::STATE_STOPPED:
     case motion_status_t::STATE_HOLDING:
       return at_rest ? act() : std::nullopt;
     case motion_status_t::STATE_SETTLED:
+      num_rejected_in_a_row_ = 0;
       wait_ = Wait::kSample;
-      wait_since_us_ = -1;
       return std::nullopt;
     default:
       return std::nullopt;
@@ -103,7 +115,7 @@ std::optional<action_command_t> MotorBabbler::on_motion_status(const motion_stat
 }
 
 std::optional<action_command_t> MotorBabbler::on_sample(const sample_t& sample) {
-  num_samples_ = sample.sample_index + 1;
+  num_samples_ = std::max(num_samples_, sample.sample_index + 1);
   const bool is_answer = (wait_ == Wait::kSample || wait_ == Wait::kAnswer) &&
                          sample.source == kSource && sample.epoch == epoch_ &&
                          sample.action_id == command_.action_id;
@@ -121,6 +133,8 @@ std::optional<action_command_t> MotorBabbler::on_sample(const sample_t& sample) 
 
 std::optional<action_command_t> MotorBabbler::on_model_health(const model_health_t& health) {
   health_ = health;
+  // What a babbler that was restarted did not hear of.
+  num_samples_ = std::max(num_samples_, health.judged_sample + 1);
   if (wait_ == Wait::kVerdict && health_.judged_sample >= last_test_sample_) return act();
   return std::nullopt;
 }
@@ -143,9 +157,13 @@ std::optional<action_command_t> MotorBabbler::on_tick(std::int64_t now_us) {
 bool MotorBabbler::should_stop() const {
   const StoppingRule& stop = config_.stop;
   if (num_samples_ >= stop.max_samples) return true;
-  return num_samples_ >= stop.min_samples && health_.schema_complete &&
+  // Only right after a TEST sample is a verdict waited for; which others arrive, and when, depends
+  // on the speed of learner and monitor.
+  const bool has_verdict =
+      last_test_sample_ == num_samples_ - 1 && health_.judged_sample >= last_test_sample_;
+  return has_verdict && num_samples_ >= stop.min_samples && health_.schema_complete &&
          health_.num_test_samples >= stop.min_test_samples && health_.worst_position_m >= 0 &&
-         health_.worst_position_m <= stop.position_m &&
+         health_.worst_position_m <= stop.position_m && health_.worst_rotation_rad >= 0 &&
          health_.worst_rotation_rad <= stop.rotation_rad;
 }
 
@@ -181,7 +199,8 @@ std::string MotorBabbler::activity() const {
       return "waiting for MOTION_STATUS of a driver";
     case Wait::kAnswer:
       return samples + ", waiting for the driver's answer to action " +
-             std::to_string(command_.action_id);
+             std::to_string(command_.action_id) +
+             (num_rejected_in_a_row_ > 0 ? "; refused before: " + rejection_ : "");
     case Wait::kSample:
       return samples + ", waiting for the SAMPLE of action " + std::to_string(command_.action_id);
     case Wait::kVerdict:

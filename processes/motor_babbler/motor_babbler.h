@@ -5,6 +5,7 @@
 #include <filesystem>
 #include <optional>
 #include <string>
+#include <vector>
 
 #include "bodyschema/action_command_t.hpp"
 #include "bodyschema/model_health_t.hpp"
@@ -14,8 +15,9 @@
 
 namespace bodyschema {
 
-/// When babbling ends: after max_samples, or from min_samples on once the monitor finds the schema
-/// complete and its worst part within both errors on at least min_test_samples TEST samples.
+/// When babbling ends: after max_samples, or from min_samples on after a TEST sample for which the
+/// monitor finds the schema complete and its worst part within both errors on at least
+/// min_test_samples TEST samples.
 struct StoppingRule {
   std::int64_t min_samples = 0;
   std::int64_t max_samples = 0;
@@ -84,6 +86,8 @@ class MotorBabbler {
   std::int64_t action_id_ = 0;
   std::int64_t num_samples_ = 0;
   std::int64_t num_rejected_ = 0;
+  int num_rejected_in_a_row_ = 0;
+  std::string rejection_;  ///< why the driver refused the last action that it refused
   std::int64_t num_unseen_ = 0;
   std::int64_t driver_utime_ = 0;
   std::int64_t last_test_sample_ = -1;

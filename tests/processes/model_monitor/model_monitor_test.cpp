@@ -1,0 +1,614 @@
+#include "processes/model_monitor/model_monitor.h"
+
+#include <gtest/gtest.h>
+#include <unistd.h>
+
+#include <filesystem>
+#include <fstream>
+
+#include "common/bus/check.h"
+#include "common/bus/codec.h"
+#include "common/bus/convert.h"
+#include "common/config/yaml.h"
+#include "processes/structure_learner/learn.h"
+#include "tests/support/synthetic_robot.h"
+
+namespace bodyschema {
+namespace {
+
+using test::Rng;
+using Bytes = std::vector<std::uint8_t>;
+
+constexpr double kDegree = M_PI / 180;
+
+ModelMonitorConfig test_config() {
+  return {.max_mahalanobis2 = 20.06,
+          .max_outlier_share = 0.2,
+          .model_error = {.position_m = 0.001, .rotation_rad = 0.2 * kDegree}};
+}
+
+Bytes bytes_of(const ModelMonitor& monitor) {
+  EXPECT_TRUE(monitor.schema());
+  return monitor.schema() ? encode(kBodySchema, *monitor.schema()) : Bytes();
+}
+
+/// Health without the history of how it came about.
+Bytes judgement_of(const ModelMonitor& monitor) {
+  model_health_t health = monitor.health();
+  set_array(health.num_events, health.events, {});
+  return encode(kModelHealth, health);
+}
+
+Matrix6d covariance(double position_m, double rotation_rad) {
+  Vector6d diagonal;
+  diagonal << Eigen::Vector3d::Constant(position_m * position_m),
+      Eigen::Vector3d::Constant(rotation_rad * rotation_rad);
+  return diagonal.asDiagonal();
+}
+
+PartObservation observation(int part, const Pose& X_CB, double position_m, double rotation_rad) {
+  PartObservation result;
+  result.part = part;
+  result.X_CB = X_CB;
+  result.covariance = covariance(position_m, rotation_rad);
+  return result;
+}
+
+/// A babbling 2-DOF robot seen through tags, every fifth sample TEST, and what is learned from it.
+class ModelMonitorTest : public testing::Test {
+ protected:
+  static constexpr int kNumSamples = 45;
+
+  ModelMonitorTest() {
+    Rng rng(31);
+    robot_ = test::chapter_robot("a", rng);
+    const test::ObservationOptions options{
+        .regime = test::Regime::kTag, .with_covariances = true, .with_other_hypothesis = true};
+    samples_ = test::babble(robot_, kNumSamples, options, rng);
+    for (ActionPoseSample& sample : samples_) {
+      sample.utime = 1'000'000 * (sample.sample_index + 1);
+      if (sample.sample_index % 5 == 4) sample.purpose = Purpose::kTest;
+    }
+  }
+
+  /// What the learner proposes after sample `index`.
+  BodySchema learned(std::int64_t index) const {
+    std::vector<ActionPoseSample> training;
+    for (const ActionPoseSample& sample : samples_) {
+      if (sample.sample_index <= index && sample.purpose == Purpose::kTrain)
+        training.push_back(sample);
+    }
+    LearnOptions options;
+    options.root = 1;
+    BodySchema schema = learn(robot_.signals, training, options).schema;
+    schema.last_sample_index = index;
+    schema.utime = samples_.at(index).utime;
+    return schema;
+  }
+  body_schema_t proposal(std::int64_t index) const { return to_message(learned(index)); }
+  sample_t sample(std::int64_t index) const { return to_message(samples_.at(index)); }
+  /// A monitor that has heard the samples 0..index.
+  ModelMonitor monitor_at(std::int64_t index) const {
+    ModelMonitor monitor(test_config());
+    for (std::int64_t i = 0; i <= index; ++i) monitor.on_sample(sample(i));
+    return monitor;
+  }
+
+  test::SyntheticRobot robot_;
+  std::vector<ActionPoseSample> samples_;
+};
+
+TEST_F(ModelMonitorTest, SaysNothingBeforeTheFirstProposal) {
+  const ModelMonitor monitor = monitor_at(44);
+  EXPECT_FALSE(monitor.schema());
+  EXPECT_EQ(monitor.health().judged_sample, -1);
+  EXPECT_EQ(monitor.health().schema_complete, 0);
+  EXPECT_EQ(monitor.health().worst_position_m, -1);
+  EXPECT_EQ(check(monitor.health()), "");
+}
+
+TEST_F(ModelMonitorTest, NothingBecomesTheBodySchemaWithoutATest) {
+  for (ActionPoseSample& sample : samples_) sample.purpose = Purpose::kTrain;
+  ModelMonitor monitor = monitor_at(44);
+  EXPECT_FALSE(monitor.on_learned_schema(proposal(44)));
+  EXPECT_FALSE(monitor.schema());
+  EXPECT_EQ(monitor.health().judged_sample, -1);
+  EXPECT_EQ(monitor.health().schema_version, 0);
+  EXPECT_EQ(monitor.health().num_events, 0);
+  EXPECT_EQ(check(monitor.health()), "");
+}
+
+TEST_F(ModelMonitorTest, TestsAfterTheProposalDoNotCount) {
+  ModelMonitor monitor = monitor_at(44);
+  EXPECT_TRUE(monitor.on_learned_schema(proposal(29)));
+  ASSERT_TRUE(monitor.schema());
+  EXPECT_EQ(monitor.health().num_test_samples, 6);
+  ModelMonitor earlier = monitor_at(29);
+  earlier.on_learned_schema(proposal(29));
+  EXPECT_EQ(bytes_of(monitor), bytes_of(earlier));
+  EXPECT_EQ(judgement_of(monitor), judgement_of(earlier));
+}
+
+TEST_F(ModelMonitorTest, OnlyAProposalThatEndsWithATestIsJudged) {
+  ModelMonitor monitor = monitor_at(44);
+  for (std::int64_t i = 0; i < kNumSamples; ++i) {
+    BodySchema schema = learned(29);
+    schema.last_sample_index = i;
+    EXPECT_EQ(monitor.on_learned_schema(to_message(schema)), i % 5 == 4) << i;
+  }
+}
+
+TEST_F(ModelMonitorTest, ARightSchemaIsAccepted) {
+  ModelMonitor monitor = monitor_at(44);
+  const body_schema_t right = proposal(44);
+  ASSERT_TRUE(test::is_right(from_message(right), robot_));
+  EXPECT_TRUE(monitor.on_learned_schema(right));
+  ASSERT_TRUE(monitor.schema());
+  EXPECT_EQ(check(*monitor.schema()), "");
+  EXPECT_TRUE(test::is_right(from_message(*monitor.schema()), robot_));
+  EXPECT_EQ(monitor.schema()->schema_version, 45);
+  EXPECT_EQ(monitor.schema()->last_sample_index, 44);
+  EXPECT_EQ(monitor.schema()->utime, right.utime);
+  for (const auto& edge : monitor.schema()->edges) EXPECT_EQ(edge.state, schema_edge_t::EDGE_OK);
+
+  const model_health_t& health = monitor.health();
+  EXPECT_EQ(check(health), "");
+  EXPECT_EQ(health.schema_version, 45);
+  EXPECT_EQ(health.judged_sample, 44);
+  EXPECT_EQ(health.schema_complete, 1);
+  EXPECT_EQ(health.num_test_samples, 9);
+  EXPECT_EQ(health.num_edges, 4);
+  EXPECT_EQ(health.num_parts, 5);
+  EXPECT_GE(health.worst_position_m, 0);
+  EXPECT_LT(health.worst_position_m, 0.015);
+  ASSERT_EQ(health.num_events, 1);
+  EXPECT_EQ(health.events[0].event_kind, health_event_t::EVENT_SCHEMA_ACCEPTED);
+  EXPECT_EQ(health.events[0].event_sample, 44);
+}
+
+TEST_F(ModelMonitorTest, ARightSchemaOfAnyRobotIsAcceptedAndOneWrongEdgeIsNot) {
+  Rng rng(32);
+  for (int run = 0; run < 12; ++run) {
+    robot_ = test::chapter_robot(run % 2 ? "a" : "c", rng);
+    const test::ObservationOptions options{
+        .regime = test::Regime::kTag, .with_covariances = true, .with_other_hypothesis = true};
+    samples_ = test::babble(robot_, 60, options, rng);
+    for (ActionPoseSample& sample : samples_) {
+      if (sample.sample_index % 5 == 4) sample.purpose = Purpose::kTest;
+    }
+    const BodySchema right = learned(59);
+    if (!test::is_right(right, robot_)) continue;  // the learner's matter
+    ModelMonitor monitor = monitor_at(59);
+    monitor.on_learned_schema(to_message(right));
+    EXPECT_TRUE(monitor.schema()) << "run " << run << ": "
+                                  << (monitor.health().num_events
+                                          ? monitor.health().events.back().event_text
+                                          : "");
+
+    for (std::size_t i = 0; i < right.edges.size(); ++i) {
+      BodySchema wrong = right;
+      Vector6d error = 20 * Vector6d::Unit(static_cast<int>(test::uniform(rng, 0, 6)));
+      error.head<3>() *= 0.003;
+      error.tail<3>() *= 1 * kDegree;
+      wrong.edges[i].right = wrong.edges[i].right * exp(error);
+      ModelMonitor other = monitor_at(59);
+      EXPECT_TRUE(other.on_learned_schema(to_message(wrong)));
+      EXPECT_FALSE(other.schema()) << "run " << run << ", edge " << i;
+      ASSERT_EQ(other.health().num_events, 1);
+      const health_event_t& event = other.health().events[0];
+      EXPECT_EQ(event.event_kind, health_event_t::EVENT_SCHEMA_REFUSED);
+      const std::string edge = "edge " + std::to_string(wrong.edges[i].from) + "-" +
+                               std::to_string(wrong.edges[i].to) + " refuted";
+      EXPECT_EQ(event.event_text.rfind(edge, 0), 0U) << event.event_text;
+    }
+  }
+}
+
+TEST_F(ModelMonitorTest, AnEdgeWithTheWrongSignalIsRefused) {
+  BodySchema wrong = learned(44);
+  int changed = 0;
+  for (Edge& edge : wrong.edges) {
+    for (ScrewJoint& joint : edge.joints) {
+      if (joint.signal == 1) {
+        joint.signal = 0;
+        ++changed;
+      }
+    }
+  }
+  ASSERT_GT(changed, 0);
+  ModelMonitor monitor = monitor_at(44);
+  EXPECT_TRUE(monitor.on_learned_schema(to_message(wrong)));
+  EXPECT_FALSE(monitor.schema());
+}
+
+TEST_F(ModelMonitorTest, ARefusedProposalLeavesTheBodySchemaAsItIs) {
+  ModelMonitor monitor = monitor_at(44);
+  monitor.on_learned_schema(proposal(39));
+  const Bytes before = bytes_of(monitor);
+  BodySchema wrong = learned(44);
+  wrong.edges[0].right.translation().x() += 0.2;
+  EXPECT_TRUE(monitor.on_learned_schema(to_message(wrong)));
+  EXPECT_EQ(bytes_of(monitor), before);
+  EXPECT_EQ(monitor.health().schema_version, 40);
+  EXPECT_EQ(monitor.health().judged_sample, 44);
+  EXPECT_EQ(monitor.health().num_test_samples, 9);
+  EXPECT_EQ(monitor.health().utime, samples_[44].utime);
+  EXPECT_EQ(check(monitor.health()), "");
+}
+
+TEST_F(ModelMonitorTest, FlipsOfPlanarMarkersDoNotRefute) {
+  const BodySchema right = learned(44);
+  for (ActionPoseSample& sample : samples_) {
+    if (sample.purpose != Purpose::kTest) continue;
+    const auto truth = robot_.poses_in_camera(sample.action);
+    for (PartObservation& part : sample.parts) {
+      // The wrong hypothesis came first, the right one second.
+      part.X_CB_other = truth.at(part.part);
+      part.X_CB = truth.at(part.part);
+      part.X_CB.linear() *= exp_so3({60 * kDegree, 0, 0});
+      part.error_ratio = 1.1;
+    }
+  }
+  ModelMonitor monitor = monitor_at(44);
+  monitor.on_learned_schema(to_message(right));
+  EXPECT_TRUE(monitor.schema());
+
+  // Without the second hypothesis the same poses speak against it.
+  for (ActionPoseSample& sample : samples_) {
+    for (PartObservation& part : sample.parts) {
+      part.X_CB_other.reset();
+      part.error_ratio = 0;
+      part.X_CB.linear() *= exp_so3({0, 30 * kDegree, 0}).matrix();
+      part.X_CB.translation().x() += 0.1 * part.part;
+    }
+  }
+  ModelMonitor strict = monitor_at(44);
+  strict.on_learned_schema(to_message(right));
+  EXPECT_FALSE(strict.schema());
+}
+
+TEST_F(ModelMonitorTest, OneRefutingTestIsTakenForAnOutlierTwoOfNineAreNot) {
+  const BodySchema right = learned(44);
+  const int moved = right.edges.back().to;
+  for (const int num_refuting : {0, 1, 2}) {
+    int refuting = 0, num_tests = 0;
+    std::vector<ActionPoseSample> samples = samples_;
+    for (ActionPoseSample& sample : samples) {
+      if (sample.purpose != Purpose::kTest) continue;
+      const auto truth = robot_.poses_in_camera(sample.action);
+      sample.parts.clear();
+      for (const auto& [part, X_CB] : truth) {
+        PartObservation o = observation(part, X_CB, 0.002, 0.01);
+        if (part == moved && refuting < num_refuting) {
+          o.X_CB.translation().y() += 0.3;
+          ++refuting;
+        }
+        sample.parts.push_back(o);
+      }
+      ++num_tests;
+    }
+    ASSERT_EQ(num_tests, 9);
+    ModelMonitor monitor(test_config());
+    for (const ActionPoseSample& sample : samples) monitor.on_sample(to_message(sample));
+    monitor.on_learned_schema(to_message(right));
+    EXPECT_EQ(monitor.schema().has_value(), num_refuting < 2) << num_refuting;
+  }
+}
+
+TEST_F(ModelMonitorTest, AnEdgeThatNoTestCouldJudgeIsProvisional) {
+  const BodySchema right = learned(44);
+  const Edge& edge = right.edges.back();
+  for (ActionPoseSample& sample : samples_) {
+    if (sample.purpose != Purpose::kTest) continue;
+    std::erase_if(sample.parts, [&](const auto& part) { return part.part == edge.to; });
+  }
+  ModelMonitor monitor = monitor_at(44);
+  monitor.on_learned_schema(to_message(right));
+  ASSERT_TRUE(monitor.schema());
+  for (std::size_t i = 0; i < right.edges.size(); ++i) {
+    const bool is_tested = right.edges[i].from != edge.to && right.edges[i].to != edge.to;
+    const auto expected = is_tested ? schema_edge_t::EDGE_OK : schema_edge_t::EDGE_PROVISIONAL;
+    EXPECT_EQ(monitor.schema()->edges[i].state, expected);
+    EXPECT_EQ(monitor.health().edge_health[i].edge_state, expected);
+    EXPECT_EQ(monitor.health().edge_health[i].num_tests > 0, is_tested);
+    EXPECT_EQ(monitor.health().edge_health[i].median_mahalanobis2 >= 0, is_tested);
+  }
+}
+
+TEST_F(ModelMonitorTest, ThereIsNoStepBackFromCompleteToIncomplete) {
+  ModelMonitor monitor = monitor_at(44);
+  monitor.on_learned_schema(proposal(39));
+  ASSERT_EQ(monitor.health().schema_complete, 1);
+  const Bytes before = bytes_of(monitor);
+
+  BodySchema incomplete = learned(44);
+  const int lost = incomplete.edges.back().to;
+  incomplete.edges.pop_back();
+  incomplete.complete = false;
+  incomplete.unconnected = {{lost, Unconnected::kNotEnoughData, ""}};
+  EXPECT_TRUE(monitor.on_learned_schema(to_message(incomplete)));
+  EXPECT_EQ(bytes_of(monitor), before);
+  EXPECT_EQ(monitor.health().events.back().event_kind, health_event_t::EVENT_SCHEMA_REFUSED);
+  EXPECT_EQ(monitor.health().schema_complete, 1);
+
+  // An incomplete one is better than none.
+  ModelMonitor fresh = monitor_at(44);
+  EXPECT_TRUE(fresh.on_learned_schema(to_message(incomplete)));
+  ASSERT_TRUE(fresh.schema());
+  EXPECT_EQ(fresh.health().schema_complete, 0);
+}
+
+TEST_F(ModelMonitorTest, AProposalAheadOfTheSamplesWaitsForThem) {
+  ModelMonitor in_order = monitor_at(44);
+  in_order.on_learned_schema(proposal(44));
+
+  ModelMonitor monitor = monitor_at(30);
+  EXPECT_FALSE(monitor.on_learned_schema(proposal(44)));
+  EXPECT_FALSE(monitor.schema());
+  for (std::int64_t i = 31; i < 44; ++i) EXPECT_FALSE(monitor.on_sample(sample(i)));
+  EXPECT_TRUE(monitor.on_sample(sample(44)));
+  EXPECT_EQ(bytes_of(monitor), bytes_of(in_order));
+  EXPECT_EQ(judgement_of(monitor), judgement_of(in_order));
+}
+
+TEST_F(ModelMonitorTest, TheNewestOfSeveralWaitingProposalsCounts) {
+  ModelMonitor monitor = monitor_at(30);
+  EXPECT_FALSE(monitor.on_learned_schema(proposal(44)));
+  EXPECT_FALSE(monitor.on_learned_schema(proposal(39)));  // overtaken
+  for (std::int64_t i = 31; i <= 44; ++i) monitor.on_sample(sample(i));
+  ASSERT_TRUE(monitor.schema());
+  EXPECT_EQ(monitor.schema()->schema_version, 45);
+}
+
+TEST_F(ModelMonitorTest, AProposalIsJudgedOnce) {
+  ModelMonitor monitor = monitor_at(44);
+  EXPECT_TRUE(monitor.on_learned_schema(proposal(44)));
+  const Bytes bytes = bytes_of(monitor);
+  for (int i = 0; i < 10; ++i) {
+    EXPECT_FALSE(monitor.on_learned_schema(proposal(44)));
+    EXPECT_FALSE(monitor.on_learned_schema(proposal(30 + i)));
+  }
+  EXPECT_EQ(bytes_of(monitor), bytes);
+  EXPECT_EQ(monitor.health().num_events, 1);
+}
+
+TEST_F(ModelMonitorTest, TheSameBytesComeOutWhateverPrefixesWereSkipped) {
+  ModelMonitor only_last = monitor_at(44);
+  only_last.on_learned_schema(proposal(44));
+  const Bytes expected = bytes_of(only_last);
+  const Bytes judgement = judgement_of(only_last);
+  Rng rng(33);
+  for (int run = 0; run < 10; ++run) {
+    ModelMonitor monitor(test_config());
+    for (std::int64_t i = 0; i < kNumSamples; ++i) {
+      monitor.on_sample(sample(i));
+      if (i % 5 == 4 && (i == 44 || test::uniform(rng, 0, 1) < 0.5))
+        monitor.on_learned_schema(proposal(i));
+    }
+    EXPECT_EQ(bytes_of(monitor), expected);
+    EXPECT_EQ(judgement_of(monitor), judgement);
+  }
+}
+
+TEST_F(ModelMonitorTest, AnyOrderOfMessagesEndsInTheSameSchemaAndNeverRunsBackwards) {
+  ModelMonitor in_order = monitor_at(44);
+  in_order.on_learned_schema(proposal(44));
+  std::map<std::int64_t, body_schema_t> proposals;
+  for (std::int64_t i = 3; i < kNumSamples; ++i) proposals[i] = proposal(i);
+  Rng rng(34);
+  for (int run = 0; run < 50; ++run) {
+    ModelMonitor monitor(test_config());
+    std::int64_t next = 0, version = 0, judged = -1;
+    const auto look = [&] {
+      const model_health_t& health = monitor.health();
+      ASSERT_EQ(check(health), "");
+      ASSERT_GE(health.judged_sample, judged);
+      ASSERT_GE(health.schema_version, version);
+      judged = health.judged_sample;
+      version = health.schema_version;
+      if (monitor.schema()) {
+        ASSERT_EQ(check(*monitor.schema()), "");
+        ASSERT_EQ(monitor.schema()->schema_version, version);
+        ASSERT_EQ(version, monitor.schema()->last_sample_index + 1);
+      }
+    };
+    while (next < kNumSamples) {
+      const double what = test::uniform(rng, 0, 1);
+      if (what < 0.6) {
+        monitor.on_sample(sample(next++));
+      } else if (what < 0.7) {
+        monitor.on_sample(sample(static_cast<std::int64_t>(test::uniform(rng, 0, next))));
+      } else {
+        const auto i = static_cast<int>(test::uniform(rng, 0, double(proposals.size())));
+        monitor.on_learned_schema(std::next(proposals.begin(), i)->second);
+      }
+      look();
+      ASSERT_FALSE(HasFatalFailure()) << "run " << run;
+    }
+    monitor.on_learned_schema(proposals.at(44));
+    EXPECT_EQ(bytes_of(monitor), bytes_of(in_order)) << "run " << run;
+    EXPECT_EQ(judgement_of(monitor), judgement_of(in_order)) << "run " << run;
+  }
+}
+
+TEST_F(ModelMonitorTest, TheNewestThirtyTwoEventsAreKeptAndNumbered) {
+  ModelMonitor monitor = monitor_at(9);
+  BodySchema schema = learned(44);
+  for (std::int64_t n = 0; n < 100; ++n) {
+    ActionPoseSample later = samples_[9];
+    later.sample_index = 10 + n;
+    later.utime += 1'000'000 * (n + 1);
+    monitor.on_sample(to_message(later));
+    schema.last_sample_index = later.sample_index;
+    schema.utime = later.utime;
+    ASSERT_TRUE(monitor.on_learned_schema(to_message(schema)));
+    const model_health_t& health = monitor.health();
+    ASSERT_EQ(health.num_events, std::min<std::int64_t>(n + 1, 32));
+    EXPECT_EQ(health.events.back().event_number, n);
+    for (std::size_t i = 1; i < health.events.size(); ++i)
+      EXPECT_EQ(health.events[i].event_number, health.events[i - 1].event_number + 1);
+  }
+  EXPECT_EQ(check(monitor.health()), "");
+}
+
+TEST_F(ModelMonitorTest, AReloadedSchemaIsPublishedAgainAndStandsAgainstWorse) {
+  ModelMonitor before = monitor_at(39);
+  before.on_learned_schema(proposal(39));
+  ASSERT_TRUE(before.schema());
+
+  ModelMonitor monitor = monitor_at(39);
+  monitor.reload(*before.schema());
+  EXPECT_EQ(bytes_of(monitor), bytes_of(before));
+  EXPECT_EQ(judgement_of(monitor), judgement_of(before));
+  ASSERT_EQ(monitor.health().num_events, 1);
+  EXPECT_EQ(monitor.health().events[0].event_kind, health_event_t::EVENT_RELOADED);
+
+  EXPECT_FALSE(monitor.on_learned_schema(proposal(39)));
+  EXPECT_FALSE(monitor.on_learned_schema(proposal(14)));
+  BodySchema incomplete = learned(44);
+  incomplete.edges.pop_back();
+  incomplete.complete = false;
+  for (std::int64_t i = 40; i <= 44; ++i) monitor.on_sample(sample(i));
+  EXPECT_TRUE(monitor.on_learned_schema(to_message(incomplete)));
+  EXPECT_EQ(bytes_of(monitor), bytes_of(before));
+}
+
+TEST_F(ModelMonitorTest, AfterAReloadTheScheduleGoesOnAsIfNothingHadHappened) {
+  ModelMonitor undisturbed(test_config());
+  std::optional<body_schema_t> saved;
+  for (std::int64_t i = 0; i < kNumSamples; ++i) {
+    undisturbed.on_sample(sample(i));
+    if (i % 10 == 4) undisturbed.on_learned_schema(proposal(i));
+    if (i == 30) saved = undisturbed.schema();
+  }
+  ASSERT_TRUE(saved);
+  ModelMonitor restarted = monitor_at(30);
+  restarted.reload(*saved);
+  for (std::int64_t i = 31; i < kNumSamples; ++i) restarted.on_sample(sample(i));
+  restarted.on_learned_schema(proposal(44));
+  EXPECT_EQ(bytes_of(restarted), bytes_of(undisturbed));
+  EXPECT_EQ(judgement_of(restarted), judgement_of(undisturbed));
+}
+
+// Parts 1 (root, 2 m before the camera) and 2 (0.1 m beside it), no joint.
+BodySchema two_parts() {
+  BodySchema schema;
+  schema.complete = true;
+  schema.parts = {1, 2};
+  schema.root = 1;
+  schema.X_CR.translation() = Eigen::Vector3d(0, 0, 2);
+  schema.signals = {{"q1", -1, 1}};
+  Edge edge;
+  edge.from = 1;
+  edge.to = 2;
+  edge.right.translation() = Eigen::Vector3d(0.1, 0, 0);
+  schema.edges = {edge};
+  return schema;
+}
+
+sample_t two_parts_seen(std::int64_t index, double error_m, double error_rad, bool sees_2 = true) {
+  ActionPoseSample sample;
+  sample.sample_index = index;
+  sample.utime = index + 1;
+  sample.purpose = Purpose::kTest;
+  sample.action = Eigen::VectorXd::Constant(1, 0.5);
+  PartObservation one = observation(1, Pose::Identity(), 0.01, 0.1);
+  one.X_CB.translation() = Eigen::Vector3d(0, 0, 2);
+  PartObservation two = observation(2, Pose::Identity(), 0.01, 0.1);
+  two.X_CB.translation() = Eigen::Vector3d(0.1, error_m, 2);
+  two.X_CB.linear() = exp_so3({0, 0, error_rad});
+  sample.parts = {one};
+  if (sees_2) sample.parts.push_back(two);
+  return to_message(sample);
+}
+
+TEST(ModelMonitorByHandTest, ErrorsAndVisibilityAreAsComputedByHand) {
+  ModelMonitor monitor(test_config());
+  monitor.on_sample(two_parts_seen(0, 0.005, 0.03));
+  monitor.on_sample(two_parts_seen(1, 0.001, 0.01));
+  monitor.on_sample(two_parts_seen(2, 0, 0, false));
+  monitor.on_sample(two_parts_seen(3, 0.002, 0.02));
+  monitor.on_sample(two_parts_seen(4, 9, 1));  // beyond the proposal
+  BodySchema schema = two_parts();
+  schema.last_sample_index = 3;
+  EXPECT_TRUE(monitor.on_learned_schema(to_message(schema)));
+  ASSERT_TRUE(monitor.schema());
+  const model_health_t& health = monitor.health();
+  EXPECT_EQ(health.num_test_samples, 4);
+  ASSERT_EQ(health.num_parts, 2);
+  EXPECT_EQ(health.part_health[0].num_predicted, 4);
+  EXPECT_DOUBLE_EQ(health.part_health[0].visibility, 1);
+  EXPECT_NEAR(health.part_health[0].position_median_m, 0, 1e-12);
+  EXPECT_EQ(health.part_health[1].num_predicted, 3);
+  EXPECT_DOUBLE_EQ(health.part_health[1].visibility, 0.75);
+  EXPECT_NEAR(health.part_health[1].position_median_m, 0.002, 1e-12);
+  EXPECT_NEAR(health.part_health[1].rotation_median_rad, 0.02, 1e-9);
+  EXPECT_NEAR(health.worst_position_m, 0.002, 1e-12);
+  EXPECT_NEAR(health.worst_rotation_rad, 0.02, 1e-9);
+  // d² of sample 3: z = (0.1, 0.002, 0) turned by 0.02 about z. Σ_z = Σ_2 + Ad(z⁻¹) Σ_1 Ad(z⁻¹)ᵀ
+  // + model error; the lever arm of 0.1 m makes the root's turn about z a shift along y.
+  ASSERT_EQ(health.num_edges, 1);
+  EXPECT_EQ(health.edge_health[0].num_tests, 3);
+  const double var_p = 0.01 * 0.01, var_r = 0.1 * 0.1, model_r = 0.2 * kDegree;
+  const double yy = 2 * var_p + 0.1 * 0.1 * var_r + 1e-6, rr = 2 * var_r + model_r * model_r;
+  const double ry = 0.1 * var_r;
+  const double det = yy * rr - ry * ry;
+  const double y = 0.002, r = 0.02;
+  const double d2 = (rr * y * y - 2 * ry * y * r + yy * r * r) / det;
+  EXPECT_NEAR(health.edge_health[0].median_mahalanobis2, d2, 0.02 * d2);
+}
+
+TEST(ModelMonitorByHandTest, TheMedianOfAnEvenNumberIsTheMeanOfTheMiddleTwo) {
+  ModelMonitor monitor(test_config());
+  const double errors_m[] = {0.008, 0.001, 0.004, 0.002};
+  for (int i = 0; i < 4; ++i) monitor.on_sample(two_parts_seen(i, errors_m[i], 0));
+  BodySchema schema = two_parts();
+  schema.last_sample_index = 3;
+  monitor.on_learned_schema(to_message(schema));
+  EXPECT_NEAR(monitor.health().worst_position_m, 0.003, 1e-12);
+}
+
+TEST(ModelMonitorByHandTest, SamplesOfAnotherRigDoNotEndTheProcess) {
+  ModelMonitor monitor(test_config());
+  BodySchema schema = two_parts();
+  schema.signals.push_back({"q2", -1, 1});
+  schema.last_sample_index = 1;
+  schema.version = 2;
+  monitor.on_sample(two_parts_seen(0, 0, 0));
+  monitor.on_sample(two_parts_seen(1, 0, 0));
+  EXPECT_NO_THROW(monitor.reload(to_message(schema)));
+  EXPECT_EQ(monitor.health().worst_position_m, -1);
+  monitor.on_sample(two_parts_seen(2, 0, 0));
+  schema.last_sample_index = 2;
+  EXPECT_NO_THROW(monitor.on_learned_schema(to_message(schema)));
+  EXPECT_EQ(check(monitor.health()), "");
+}
+
+TEST(ModelMonitorByHandTest, AProposalWithoutPartsIsRefusedQuietly) {
+  ModelMonitor monitor(test_config());
+  monitor.on_sample(two_parts_seen(0, 0, 0));
+  BodySchema schema;
+  schema.signals = {{"q1", -1, 1}};
+  schema.last_sample_index = 0;
+  EXPECT_TRUE(monitor.on_learned_schema(to_message(schema)));
+  EXPECT_FALSE(monitor.schema());
+  EXPECT_EQ(check(monitor.health()), "");
+}
+
+TEST(ModelMonitorConfigTest, IsReadInSiUnits) {
+  const std::filesystem::path file = std::filesystem::path(testing::TempDir()) /
+                                     ("model_monitor_config_" + std::to_string(getpid()) + ".yaml");
+  std::ofstream(file) << "max_mahalanobis2: 16\nmax_outlier_share: 0.25\n"
+                         "model_error_position_m: 0.002\nmodel_error_rotation_deg: 90\n";
+  const ModelMonitorConfig config = ModelMonitorConfig::load(file);
+  EXPECT_EQ(config.max_mahalanobis2, 16);
+  EXPECT_EQ(config.max_outlier_share, 0.25);
+  EXPECT_EQ(config.model_error.position_m, 0.002);
+  EXPECT_DOUBLE_EQ(config.model_error.rotation_rad, M_PI / 2);
+  std::ofstream(file) << "max_mahalanobis2: 0.5\n";
+  EXPECT_THROW(ModelMonitorConfig::load(file), ConfigError);
+  std::filesystem::remove(file);
+}
+
+}  // namespace
+}  // namespace bodyschema

@@ -1,0 +1,675 @@
+#include "processes/motor_babbler/motor_babbler.h"
+
+#include <gtest/gtest.h>
+
+#include <random>
+#include <set>
+
+#include "common/bus/check.h"
+#include "common/bus/convert.h"
+
+namespace bodyschema {
+namespace {
+
+constexpr std::int64_t kSecond = 1'000'000;
+
+MotorBabblerConfig test_config() {
+  MotorBabblerConfig config;
+  config.signals = {{"q1", -1, 1}, {"q2", -60, 60}, {"q3", 0.2, 0.9}};
+  config.extreme_share = 0.5;
+  config.extreme_from = 0.7;
+  config.test_every = 5;
+  config.expiry_us = 60 * kSecond;
+  config.resend_us = 1 * kSecond;
+  config.sample_timeout_us = 30 * kSecond;
+  config.verdict_timeout_us = 10 * kSecond;
+  config.stop.min_samples = 10;
+  config.stop.max_samples = 40;
+  config.stop.min_test_samples = 3;
+  config.stop.position_m = 0.006;
+  config.stop.rotation_rad = 0.02;
+  return config;
+}
+
+motion_status_t idle_at_rest(std::int64_t utime) {
+  motion_status_t status{};
+  status.utime = utime;
+  status.action_id = -1;
+  status.state = motion_status_t::STATE_IDLE;
+  status.rest_since_utime = utime;
+  return status;
+}
+
+motion_status_t answer(const action_command_t& command, std::int8_t state, bool at_rest = true) {
+  motion_status_t status{};
+  status.utime = command.utime + kSecond;
+  status.source = command.source;
+  status.epoch = command.epoch;
+  status.action_id = command.action_id;
+  status.kind = command.kind;
+  status.purpose = command.purpose;
+  status.state = state;
+  status.rest_since_utime = at_rest ? status.utime : -1;
+  set_array(status.num_signals, status.commanded, command.action);
+  return status;
+}
+
+sample_t sample_of(const action_command_t& command, std::int64_t sample_index) {
+  sample_t sample{};
+  sample.utime = command.utime + kSecond;
+  sample.sample_index = sample_index;
+  sample.source = command.source;
+  sample.epoch = command.epoch;
+  sample.action_id = command.action_id;
+  sample.purpose = command.purpose;
+  set_array(sample.num_signals, sample.action, command.action);
+  return sample;
+}
+
+/// A verdict that fulfils every clause of test_config()'s stopping rule.
+model_health_t good_health(std::int64_t judged_sample) {
+  model_health_t health{};
+  health.judged_sample = judged_sample;
+  health.schema_complete = 1;
+  health.num_test_samples = static_cast<std::int32_t>((judged_sample + 1) / 5);
+  health.worst_position_m = 0.006;
+  health.worst_rotation_rad = 0.02;
+  return health;
+}
+model_health_t bad_health(std::int64_t judged_sample) {
+  model_health_t health = good_health(judged_sample);
+  health.schema_complete = 0;
+  return health;
+}
+
+/// Plays driver, observer and monitor.
+class Bench {
+ public:
+  explicit Bench(MotorBabblerConfig config = test_config(), std::int64_t seed = 1)
+      : babbler(config, seed) {}
+
+  /// The first command, as the driver hears it.
+  void start(std::int64_t utime = 5 * kSecond) {
+    const auto command = babbler.on_motion_status(idle_at_rest(utime));
+    ASSERT_TRUE(command);
+    last = *command;
+  }
+  /// The driver settles, the observer makes the sample; true if a command followed.
+  bool make_sample() {
+    EXPECT_FALSE(babbler.on_motion_status(answer(last, motion_status_t::STATE_SETTLED)));
+    return take(babbler.on_sample(sample_of(last, num_samples++)));
+  }
+  bool is_test() const { return last.purpose == action_command_t::PURPOSE_TEST; }
+  /// Up to the command that follows `count` samples, refusing every TEST.
+  void run(int count) {
+    for (int i = 0; i < count; ++i) {
+      const bool was_test = is_test();
+      const bool sent = make_sample();
+      ASSERT_EQ(sent, !was_test);
+      if (was_test) {
+        ASSERT_TRUE(take(babbler.on_model_health(bad_health(num_samples - 1))));
+      }
+    }
+  }
+  bool take(const std::optional<action_command_t>& command) {
+    if (command) last = *command;
+    return command.has_value();
+  }
+
+  MotorBabbler babbler;
+  action_command_t last{};
+  std::int64_t num_samples = 0;
+};
+
+TEST(MotorBabblerTest, StaysSilentUntilADriverIsHeard) {
+  MotorBabbler babbler(test_config(), 1);
+  action_command_t foreign{};
+  foreign.source = "motor_babbler";
+  for (std::int64_t t = 0; t < 100; ++t) {
+    EXPECT_FALSE(babbler.on_tick(t * kSecond));
+    EXPECT_FALSE(babbler.on_sample(sample_of(foreign, t)));
+    EXPECT_FALSE(babbler.on_model_health(good_health(t)));
+  }
+  EXPECT_FALSE(babbler.is_done());
+}
+
+TEST(MotorBabblerTest, WaitsUntilTheArmIsAtRestBeforeItsFirstAction) {
+  MotorBabbler babbler(test_config(), 1);
+  motion_status_t moving = idle_at_rest(5 * kSecond);
+  moving.rest_since_utime = -1;
+  EXPECT_FALSE(babbler.on_motion_status(moving));
+  EXPECT_FALSE(babbler.on_tick(100 * kSecond));
+  const auto command = babbler.on_motion_status(idle_at_rest(9 * kSecond));
+  ASSERT_TRUE(command);
+  EXPECT_EQ(command->action_id, 0);
+}
+
+TEST(MotorBabblerTest, ItsCommandsMakeSenseAndCarryTheDriversTime) {
+  Bench bench;
+  bench.start(5 * kSecond);
+  EXPECT_EQ(check(bench.last), "");
+  EXPECT_EQ(bench.last.source, "motor_babbler");
+  EXPECT_EQ(bench.last.epoch, 5 * kSecond);
+  EXPECT_EQ(bench.last.utime, 5 * kSecond);
+  EXPECT_EQ(bench.last.expiry_utime, 65 * kSecond);
+  EXPECT_EQ(bench.last.kind, action_command_t::KIND_MOVE);
+  EXPECT_EQ(bench.last.num_signals, 3);
+}
+
+TEST(MotorBabblerTest, AnActionIsAFunctionOfSeedAndIdOnly) {
+  const MotorBabblerConfig config = test_config();
+  std::set<std::vector<double>> all;
+  for (std::int64_t seed = 0; seed < 20; ++seed) {
+    for (std::int64_t id = 0; id < 50; ++id) {
+      const Eigen::VectorXd action = random_action(config, seed, id);
+      EXPECT_EQ(action, random_action(config, seed, id));
+      all.insert({action.begin(), action.end()});
+    }
+  }
+  EXPECT_EQ(all.size(), 1000U);
+  EXPECT_NE(random_action(config, std::int64_t{1} << 32, 0), random_action(config, 0, 0));
+  EXPECT_NE(random_action(config, 0, std::int64_t{1} << 32), random_action(config, 0, 0));
+}
+
+TEST(MotorBabblerTest, TheActionsSentAreThoseOfTheirIdsWhateverHappenedBetween) {
+  Bench smooth, rough;
+  smooth.start();
+  rough.start();
+  smooth.run(3);
+  rough.run(1);
+  rough.take(rough.babbler.on_tick(10 * kSecond));
+  rough.take(rough.babbler.on_tick(20 * kSecond));  // sent again
+  rough.run(1);
+  ASSERT_TRUE(rough.take(
+      rough.babbler.on_motion_status(answer(rough.last, motion_status_t::STATE_REJECTED))));
+  EXPECT_EQ(rough.last.action_id, 3);
+  EXPECT_EQ(smooth.last.action_id, 3);
+  EXPECT_EQ(rough.last.action, smooth.last.action);
+}
+
+TEST(MotorBabblerTest, ActionsStayWithinTheLimits) {
+  const MotorBabblerConfig config = test_config();
+  for (std::int64_t id = 0; id < 5000; ++id) {
+    const Eigen::VectorXd action = random_action(config, 3, id);
+    for (std::size_t i = 0; i < config.signals.size(); ++i) {
+      EXPECT_GE(action[i], config.signals[i].lower);
+      EXPECT_LE(action[i], config.signals[i].upper);
+    }
+  }
+}
+
+TEST(MotorBabblerTest, HalfOfTheActionsLieInTheOuterSeventyToHundredPercent) {
+  const MotorBabblerConfig config = test_config();
+  const int n = 5000;
+  int num_outer = 0;
+  Eigen::Vector3d num_upper = Eigen::Vector3d::Zero();
+  double least = 1, most = 0;
+  for (std::int64_t id = 0; id < n; ++id) {
+    const Eigen::VectorXd action = random_action(config, 4, id);
+    int outer = 0;
+    for (std::size_t i = 0; i < config.signals.size(); ++i) {
+      const Signal& s = config.signals[i];
+      const double x = (action[i] - 0.5 * (s.lower + s.upper)) / (0.5 * (s.upper - s.lower));
+      outer += std::abs(x) >= 0.7 - 1e-12;
+      num_upper[i] += x > 0;
+      if (std::abs(x) >= 0.7) least = std::min(least, std::abs(x));
+      most = std::max(most, std::abs(x));
+    }
+    num_outer += outer == 3;
+  }
+  // Half by decision, and 0.3^3 of the other half by chance; five standard deviations.
+  const double share = 0.5 + 0.5 * 0.027;
+  EXPECT_NEAR(num_outer, n * share, 5 * std::sqrt(n * share * (1 - share)));
+  for (int i = 0; i < 3; ++i) EXPECT_NEAR(num_upper[i], 0.5 * n, 5 * std::sqrt(0.25 * n));
+  EXPECT_LT(least, 0.701);
+  EXPECT_GT(most, 0.999);
+}
+
+TEST(MotorBabblerTest, EveryFifthSampleIsTest) {
+  MotorBabblerConfig config = test_config();
+  config.stop.max_samples = 1000;
+  Bench bench(config);
+  bench.start();
+  for (int i = 0; i < 40; ++i) {
+    EXPECT_EQ(bench.is_test(), i % 5 == 4) << i;
+    bench.run(1);
+  }
+}
+
+TEST(MotorBabblerTest, ARejectedTestIsReplacedByATest) {
+  Bench bench;
+  bench.start();
+  bench.run(4);
+  ASSERT_TRUE(bench.is_test());
+  for (int i = 0; i < 7; ++i) {
+    const std::int64_t id = bench.last.action_id;
+    ASSERT_TRUE(bench.take(
+        bench.babbler.on_motion_status(answer(bench.last, motion_status_t::STATE_REJECTED))));
+    EXPECT_EQ(bench.last.action_id, id + 1);
+    EXPECT_TRUE(bench.is_test());
+  }
+  EXPECT_EQ(bench.babbler.num_rejected(), 7);
+}
+
+// A driver refuses what comes while the arm moves; asking again at once would only burn ids.
+TEST(MotorBabblerTest, AfterARejectionItWaitsForRest) {
+  Bench bench;
+  bench.start();
+  EXPECT_FALSE(bench.babbler.on_motion_status(
+      answer(bench.last, motion_status_t::STATE_REJECTED, /*at_rest=*/false)));
+  EXPECT_TRUE(bench.babbler.on_motion_status(answer(bench.last, motion_status_t::STATE_REJECTED)));
+  EXPECT_EQ(bench.babbler.num_rejected(), 1);
+}
+
+TEST(MotorBabblerTest, ADriverThatRefusesEverythingIsAskedAtLeisure) {
+  Bench bench;
+  bench.start();
+  int num_sent = 0;
+  const auto refuse = [&] {
+    motion_status_t status = answer(bench.last, motion_status_t::STATE_REJECTED);
+    status.reason = "three signals expected";
+    return bench.take(bench.babbler.on_motion_status(status));
+  };
+  while (num_sent < 1000 && refuse()) ++num_sent;
+  EXPECT_GE(num_sent, 5);
+  EXPECT_LT(num_sent, 100);
+  EXPECT_NE(bench.babbler.activity().find("three signals expected"), std::string::npos);
+  // From here on one a second.
+  for (int i = 0; i < 5; ++i) {
+    const std::int64_t now = (1000 + 10 * i) * kSecond, id = bench.last.action_id;
+    EXPECT_FALSE(bench.take(bench.babbler.on_tick(now)));
+    EXPECT_FALSE(bench.take(bench.babbler.on_tick(now + kSecond / 2)));
+    ASSERT_TRUE(bench.take(bench.babbler.on_tick(now + kSecond)));
+    EXPECT_EQ(bench.last.action_id, id + 1);
+    EXPECT_FALSE(refuse());
+  }
+  // One that is accepted ends the caution.
+  ASSERT_FALSE(bench.take(bench.babbler.on_tick(2000 * kSecond)));
+  ASSERT_TRUE(bench.take(bench.babbler.on_tick(2001 * kSecond)));
+  ASSERT_TRUE(bench.make_sample());
+  EXPECT_TRUE(refuse());
+}
+
+TEST(MotorBabblerTest, SilenceIsAnsweredByTheSameCommandAgain) {
+  Bench bench;
+  bench.start();
+  EXPECT_FALSE(bench.babbler.on_tick(100 * kSecond));  // the clock is first seen here
+  EXPECT_FALSE(bench.babbler.on_tick(101 * kSecond - 1));
+  for (int i = 1; i <= 5; ++i) {
+    const auto again = bench.babbler.on_tick((100 + i) * kSecond);
+    ASSERT_TRUE(again) << i;
+    EXPECT_EQ(again->action_id, bench.last.action_id);
+    EXPECT_EQ(again->action, bench.last.action);
+    EXPECT_FALSE(bench.babbler.on_tick((100 + i) * kSecond + kSecond / 2));
+  }
+}
+
+TEST(MotorBabblerTest, ADriverThatAnswersIsNotAskedAgain) {
+  Bench bench;
+  bench.start();
+  for (int i = 0; i < 50; ++i) {
+    const std::int64_t now = 100 * kSecond + i * kSecond / 2;
+    EXPECT_FALSE(bench.babbler.on_motion_status(
+        answer(bench.last, i < 2 ? motion_status_t::STATE_ACCEPTED : motion_status_t::STATE_MOVING,
+               false)));
+    EXPECT_FALSE(bench.babbler.on_tick(now)) << i;
+  }
+  // Then it falls silent.
+  EXPECT_TRUE(bench.babbler.on_tick(130 * kSecond));
+}
+
+// Random events of a whole run: a new action comes only after the last one was settled or refused.
+TEST(MotorBabblerTest, TwoActionsAreNeverOutstanding) {
+  std::mt19937_64 rng(5);
+  std::int64_t num_actions = 0, num_done = 0;
+  for (int run = 0; run < 200; ++run) {
+    MotorBabbler babbler(test_config(), run);
+    std::int64_t now = 0, sample_index = 0;
+    std::optional<action_command_t> last;
+    bool is_open = false;
+    const auto take = [&](const std::optional<action_command_t>& command) {
+      if (!command) return;
+      ASSERT_EQ(check(*command), "");
+      if (last && command->action_id == last->action_id) {
+        ASSERT_TRUE(is_open);
+        ASSERT_EQ(command->action, last->action);
+        return;
+      }
+      ASSERT_FALSE(is_open);
+      ASSERT_EQ(command->action_id, last ? last->action_id + 1 : 0);
+      last = command;
+      is_open = true;
+      ++num_actions;
+    };
+    take(babbler.on_motion_status(idle_at_rest(1)));
+    for (int event = 0; event < 400 && !babbler.is_done() && !HasFatalFailure(); ++event) {
+      switch (rng() % 7) {
+        case 0:
+          now += static_cast<std::int64_t>(rng() % (2 * kSecond));
+          take(babbler.on_tick(now));
+          break;
+        case 1:
+          if (is_open)
+            take(babbler.on_motion_status(answer(*last, motion_status_t::STATE_MOVING, false)));
+          break;
+        case 2:
+          is_open = false;
+          take(babbler.on_motion_status(answer(*last, motion_status_t::STATE_SETTLED)));
+          break;
+        case 3:
+          if (!is_open) break;
+          is_open = false;
+          take(babbler.on_motion_status(answer(*last, motion_status_t::STATE_REJECTED)));
+          break;
+        case 4:
+          if (!is_open) take(babbler.on_sample(sample_of(*last, sample_index++)));
+          break;
+        case 5:
+          take(babbler.on_model_health(rng() % 4 ? bad_health(sample_index - 1)
+                                                 : good_health(sample_index - 1)));
+          break;
+        default:
+          now += 31 * kSecond;
+          take(babbler.on_tick(now));
+      }
+    }
+    ASSERT_FALSE(HasFatalFailure()) << "run " << run;
+    num_done += babbler.is_done();
+  }
+  EXPECT_GT(num_actions, 5000);
+  EXPECT_GT(num_done, 20);
+}
+
+TEST(MotorBabblerTest, ASampleThatOvertakesSettledIsTaken) {
+  Bench bench;
+  bench.start();
+  const action_command_t first = bench.last;
+  ASSERT_TRUE(bench.take(bench.babbler.on_sample(sample_of(first, 0))));
+  EXPECT_FALSE(bench.babbler.on_motion_status(answer(first, motion_status_t::STATE_SETTLED)));
+  // Still waiting for the answer to the second: silence repeats it.
+  bench.babbler.on_tick(100 * kSecond);
+  const auto again = bench.babbler.on_tick(102 * kSecond);
+  ASSERT_TRUE(again);
+  EXPECT_EQ(again->action_id, bench.last.action_id);
+}
+
+TEST(MotorBabblerTest, ASampleThatNeverComesIsGivenUp) {
+  Bench bench;
+  bench.start();
+  bench.babbler.on_motion_status(answer(bench.last, motion_status_t::STATE_SETTLED));
+  EXPECT_FALSE(bench.babbler.on_tick(100 * kSecond));
+  EXPECT_FALSE(bench.babbler.on_tick(130 * kSecond - 1));
+  const auto next = bench.babbler.on_tick(130 * kSecond);
+  ASSERT_TRUE(next);
+  EXPECT_EQ(next->action_id, 1);
+  EXPECT_EQ(bench.babbler.num_unseen(), 1);
+}
+
+TEST(MotorBabblerTest, AfterATestItWaitsForTheVerdictOnIt) {
+  Bench bench;
+  bench.start();
+  bench.run(4);
+  ASSERT_TRUE(bench.is_test());
+  EXPECT_FALSE(bench.make_sample());
+  EXPECT_FALSE(bench.babbler.on_model_health(bad_health(3)));
+  EXPECT_FALSE(bench.babbler.on_motion_status(idle_at_rest(50 * kSecond)));
+  const auto next = bench.babbler.on_model_health(bad_health(4));
+  ASSERT_TRUE(next);
+  EXPECT_EQ(next->action_id, 5);
+  EXPECT_FALSE(bench.babbler.on_model_health(bad_health(4)));
+}
+
+TEST(MotorBabblerTest, AVerdictThatCameFirstNeedsNoWaiting) {
+  Bench bench;
+  bench.start();
+  bench.run(4);
+  bench.babbler.on_motion_status(answer(bench.last, motion_status_t::STATE_SETTLED));
+  EXPECT_FALSE(bench.babbler.on_model_health(bad_health(4)));
+  EXPECT_TRUE(bench.babbler.on_sample(sample_of(bench.last, 4)));
+}
+
+TEST(MotorBabblerTest, AVerdictIsNotAwaitedForEver) {
+  Bench bench;
+  bench.start();
+  bench.run(4);
+  bench.make_sample();
+  EXPECT_FALSE(bench.babbler.on_tick(200 * kSecond));
+  EXPECT_FALSE(bench.babbler.on_tick(210 * kSecond - 1));
+  EXPECT_TRUE(bench.babbler.on_tick(210 * kSecond));
+}
+
+/// Whether the run ends if `verdict` is the monitor's on TEST sample 14, the first with three
+/// tests.
+bool stops_with(const model_health_t& verdict, MotorBabblerConfig config = test_config()) {
+  Bench bench(config);
+  bench.start();
+  bench.run(14);
+  EXPECT_TRUE(bench.is_test());
+  EXPECT_FALSE(bench.make_sample());
+  const bool sent = bench.babbler.on_model_health(verdict).has_value();
+  EXPECT_NE(sent, bench.babbler.is_done());
+  return bench.babbler.is_done();
+}
+
+TEST(MotorBabblerTest, StopsOnlyWhenEveryClauseOfTheRuleHolds) {
+  EXPECT_TRUE(stops_with(good_health(14)));
+
+  model_health_t health = good_health(14);
+  health.schema_complete = 0;
+  EXPECT_FALSE(stops_with(health));
+
+  health = good_health(14);
+  health.num_test_samples = 2;
+  EXPECT_FALSE(stops_with(health));
+
+  health = good_health(14);
+  health.worst_position_m = 0.0060001;
+  EXPECT_FALSE(stops_with(health));
+
+  health = good_health(14);
+  health.worst_rotation_rad = 0.0200001;
+  EXPECT_FALSE(stops_with(health));
+
+  // Nothing was tested.
+  health = good_health(14);
+  health.worst_position_m = health.worst_rotation_rad = -1;
+  EXPECT_FALSE(stops_with(health));
+  health = good_health(14);
+  health.worst_rotation_rad = -1;
+  EXPECT_FALSE(stops_with(health));
+
+  MotorBabblerConfig config = test_config();
+  config.stop.min_samples = 16;
+  EXPECT_FALSE(stops_with(good_health(14), config));
+}
+
+TEST(MotorBabblerTest, StopsAfterTheLargestNumberOfSamplesWhateverTheVerdict) {
+  MotorBabblerConfig config = test_config();
+  config.stop.min_samples = config.stop.max_samples = 7;
+  Bench bench(config);
+  bench.start();
+  bench.run(6);
+  EXPECT_FALSE(bench.make_sample());
+  EXPECT_TRUE(bench.babbler.is_done());
+  EXPECT_EQ(bench.babbler.num_samples(), 7);
+}
+
+// Verdicts on TRAIN samples come when the learner finds the time; the end must not depend on that.
+TEST(MotorBabblerTest, TheRunEndsAtTheSameSampleHoweverFastTheMonitorIs) {
+  for (int arrives_after = 15; arrives_after < 19; ++arrives_after) {
+    Bench bench;
+    bench.start();
+    bench.run(arrives_after);
+    bench.babbler.on_model_health(good_health(arrives_after - 1));
+    while (bench.num_samples < 19) {
+      ASSERT_TRUE(bench.make_sample()) << arrives_after;
+    }
+    ASSERT_TRUE(bench.is_test());
+    EXPECT_FALSE(bench.make_sample());
+    EXPECT_FALSE(bench.babbler.is_done());
+    EXPECT_FALSE(bench.babbler.on_model_health(good_health(19)));
+    EXPECT_TRUE(bench.babbler.is_done());
+  }
+}
+
+TEST(MotorBabblerTest, DoneIsFinal) {
+  Bench bench;
+  bench.start();
+  bench.run(14);
+  bench.make_sample();
+  bench.babbler.on_model_health(good_health(14));
+  ASSERT_TRUE(bench.babbler.is_done());
+  motion_status_t stopped = idle_at_rest(900 * kSecond);
+  stopped.stop_latched = 1;
+  for (std::int64_t i = 0; i < 50; ++i) {
+    EXPECT_FALSE(bench.babbler.on_motion_status(stopped));
+    EXPECT_FALSE(bench.babbler.on_motion_status(idle_at_rest((1000 + i) * kSecond)));
+    EXPECT_FALSE(
+        bench.babbler.on_motion_status(answer(bench.last, motion_status_t::STATE_SETTLED)));
+    EXPECT_FALSE(
+        bench.babbler.on_motion_status(answer(bench.last, motion_status_t::STATE_REJECTED)));
+    EXPECT_FALSE(bench.babbler.on_sample(sample_of(bench.last, 15 + i)));
+    EXPECT_FALSE(bench.babbler.on_model_health(bad_health(15 + i)));
+    EXPECT_FALSE(bench.babbler.on_tick(i * 100 * kSecond));
+    EXPECT_TRUE(bench.babbler.is_done());
+  }
+}
+
+TEST(MotorBabblerTest, AStopIsObeyedUntilResume) {
+  for (const bool after_settling : {false, true}) {
+    Bench bench;
+    bench.start();
+    bench.run(2);
+    if (after_settling)
+      bench.babbler.on_motion_status(answer(bench.last, motion_status_t::STATE_SETTLED));
+    motion_status_t stopped = answer(bench.last, motion_status_t::STATE_STOPPED);
+    stopped.source = "operator";
+    stopped.kind = action_command_t::KIND_STOP;
+    stopped.stop_latched = 1;
+    EXPECT_FALSE(bench.babbler.on_motion_status(stopped));
+    for (std::int64_t i = 0; i < 100; ++i) {
+      EXPECT_FALSE(bench.babbler.on_tick(i * 10 * kSecond));
+      EXPECT_FALSE(bench.babbler.on_motion_status(stopped));
+      EXPECT_FALSE(bench.babbler.on_model_health(good_health(1)));
+    }
+    motion_status_t resumed = stopped;
+    resumed.kind = action_command_t::KIND_RESUME;
+    resumed.stop_latched = 0;
+    resumed.rest_since_utime = -1;
+    EXPECT_FALSE(bench.babbler.on_motion_status(resumed));
+    resumed.rest_since_utime = resumed.utime;
+    const auto next = bench.babbler.on_motion_status(resumed);
+    ASSERT_TRUE(next);
+    EXPECT_EQ(next->action_id, 3);
+    EXPECT_EQ(next->epoch, bench.last.epoch);
+  }
+}
+
+TEST(MotorBabblerTest, AStopThatIsLatchedAtStartIsObeyedToo) {
+  MotorBabbler babbler(test_config(), 1);
+  motion_status_t stopped = idle_at_rest(5 * kSecond);
+  stopped.stop_latched = 1;
+  EXPECT_FALSE(babbler.on_motion_status(stopped));
+  EXPECT_FALSE(babbler.on_tick(50 * kSecond));
+  const auto command = babbler.on_motion_status(idle_at_rest(9 * kSecond));
+  ASSERT_TRUE(command);
+  EXPECT_EQ(command->action_id, 0);
+}
+
+TEST(MotorBabblerTest, AHoldEndsTheActionButNotTheBabbling) {
+  for (const auto state : {motion_status_t::STATE_HOLDING, motion_status_t::STATE_EXPIRED,
+                           motion_status_t::STATE_STOPPED}) {
+    Bench bench;
+    bench.start();
+    EXPECT_FALSE(bench.babbler.on_motion_status(answer(bench.last, state, false)));
+    const auto next = bench.babbler.on_motion_status(answer(bench.last, state, true));
+    ASSERT_TRUE(next);
+    EXPECT_EQ(next->action_id, 1);
+  }
+}
+
+TEST(MotorBabblerTest, ARestartGoesOnAfterTheLastActionOfItsPredecessor) {
+  Bench before;
+  before.start();
+  before.run(7);
+  MotorBabbler after(test_config(), 1);
+  const auto command = after.on_motion_status(answer(before.last, motion_status_t::STATE_SETTLED));
+  ASSERT_TRUE(command);
+  EXPECT_EQ(command->action_id, before.last.action_id + 1);
+  EXPECT_NE(command->epoch, before.last.epoch);
+  const Eigen::VectorXd expected = random_action(test_config(), 1, command->action_id);
+  EXPECT_EQ(command->action, std::vector<double>(expected.begin(), expected.end()));
+}
+
+TEST(MotorBabblerTest, ARestartKeepsEveryFifthSampleTest) {
+  Bench before;
+  before.start();
+  before.run(9);
+  ASSERT_TRUE(before.is_test());
+  MotorBabbler after(test_config(), 1);
+  // The monitor repeats its verdict at 1 Hz, so it may be heard before the driver is.
+  EXPECT_FALSE(after.on_model_health(bad_health(8)));
+  const auto command = after.on_motion_status(answer(before.last, motion_status_t::STATE_SETTLED));
+  ASSERT_TRUE(command);
+  EXPECT_EQ(command->purpose, action_command_t::PURPOSE_TEST);
+}
+
+TEST(MotorBabblerTest, AnswersAndSamplesOfOthersAreIgnored) {
+  Bench bench;
+  bench.start();
+  bench.run(1);
+  const auto foreign = [&](auto message) {
+    std::vector<decltype(message)> result(3, message);
+    result[0].source = "controller";
+    result[1].epoch -= 1;
+    result[2].action_id -= 1;
+    return result;
+  };
+  for (const auto& status : foreign(answer(bench.last, motion_status_t::STATE_REJECTED)))
+    EXPECT_FALSE(bench.babbler.on_motion_status(status));
+  for (const auto& status : foreign(answer(bench.last, motion_status_t::STATE_SETTLED)))
+    EXPECT_FALSE(bench.babbler.on_motion_status(status));
+  for (const auto& sample : foreign(sample_of(bench.last, 1)))
+    EXPECT_FALSE(bench.babbler.on_sample(sample));
+  EXPECT_EQ(bench.babbler.num_rejected(), 0);
+  // It still waits for its own answer.
+  bench.babbler.on_tick(100 * kSecond);
+  const auto again = bench.babbler.on_tick(101 * kSecond);
+  ASSERT_TRUE(again);
+  EXPECT_EQ(again->action_id, bench.last.action_id);
+}
+
+TEST(MotorBabblerTest, AnOldSampleThatIsReplayedDoesNotTurnTheCountBack) {
+  Bench bench;
+  bench.start();
+  bench.run(3);
+  action_command_t foreign = bench.last;
+  foreign.source = "controller";
+  bench.babbler.on_sample(sample_of(foreign, 0));
+  EXPECT_EQ(bench.babbler.num_samples(), 3);
+}
+
+TEST(MotorBabblerTest, SaysWhatItWaitsFor) {
+  Bench bench;
+  EXPECT_EQ(bench.babbler.activity(), "waiting for MOTION_STATUS of a driver");
+  bench.start();
+  EXPECT_EQ(bench.babbler.activity(), "0 samples, waiting for the driver's answer to action 0");
+  bench.run(4);
+  bench.babbler.on_motion_status(answer(bench.last, motion_status_t::STATE_SETTLED));
+  EXPECT_EQ(bench.babbler.activity(), "4 samples, waiting for the SAMPLE of action 4");
+  bench.babbler.on_sample(sample_of(bench.last, 4));
+  EXPECT_EQ(bench.babbler.activity(), "5 samples, waiting for MODEL_HEALTH of sample 4");
+}
+
+TEST(MotorBabblerTest, TheConfigurationIsReadInSiUnits) {
+  const MotorBabblerConfig config =
+      MotorBabblerConfig::load(std::string(BODYSCHEMA_CONFIG) + "/arm2/motor_babbler.yaml");
+  EXPECT_EQ(config.signals.size(), 2U);
+  EXPECT_EQ(config.resend_us, 1 * kSecond);
+  EXPECT_EQ(config.expiry_us, 60 * kSecond);
+  EXPECT_NEAR(config.stop.rotation_rad, M_PI / 180, 1e-12);
+  EXPECT_EQ(config.extreme_from, 0.7);
+}
+
+}  // namespace
+}  // namespace bodyschema
