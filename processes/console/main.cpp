@@ -1,0 +1,28 @@
+// bodyschema: the operator's command. It listens to everything on the bus and works on recordings.
+
+#include <CLI/CLI.hpp>
+#include <cstdio>
+#include <exception>
+#include <iostream>
+#include <stdexcept>
+
+#include "processes/console/offline.h"
+#include "processes/console/watch.h"
+
+int main(int argc, char** argv) {
+  CLI::App console("A robot arm's body schema: learn it, look at it, judge it", "bodyschema");
+  console.require_subcommand(1);
+  bodyschema::add_offline_commands(console);
+  bodyschema::add_watch_command(console);
+  try {
+    console.parse(argc, argv);
+    // A full disk must not look like a result.
+    if (!std::cout.flush()) throw std::runtime_error("stdout: the result could not be written");
+  } catch (const CLI::ParseError& error) {
+    return console.exit(error);
+  } catch (const std::exception& error) {
+    std::fprintf(stderr, "bodyschema: %s\n", error.what());
+    return 1;
+  }
+  return 0;
+}

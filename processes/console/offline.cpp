@@ -1,0 +1,156 @@
+#include "processes/console/offline.h"
+
+#include <CLI/CLI.hpp>
+#include <algorithm>
+#include <cmath>
+#include <iostream>
+#include <memory>
+#include <stdexcept>
+
+#include "common/bus/check.h"
+#include "common/bus/convert.h"
+#include "common/bus/event_log.h"
+#include "common/config/rig.h"
+#include "processes/console/evaluation.h"
+#include "processes/console/recording.h"
+#include "processes/console/schema_json.h"
+#include "processes/structure_learner/learn.h"
+
+namespace bodyschema {
+namespace {
+
+/// What real AprilTags add to their corner noise; see tests/experiments/README.md.
+constexpr Noise kTagModelError{.position_m = 0.001, .rotation_rad = 0.2 * M_PI / 180};
+
+struct LearnArguments {
+  std::string samples;
+  std::string out;
+  std::optional<int> root;
+  std::vector<double> noise;
+  bool json = false;
+};
+
+void run_learn(const LearnArguments& arguments) {
+  const Recording recording = load_recording(arguments.samples);
+  LearnOptions options;
+  options.root = arguments.root;
+  if (recording.is_log) options.model_error = kTagModelError;
+  if (!arguments.noise.empty()) {
+    options.noise = Noise{arguments.noise[0], arguments.noise[1] * M_PI / 180};
+    for (const double noise : arguments.noise) {
+      if (!std::isfinite(noise) || noise <= 0)
+        throw std::invalid_argument("--noise: expected two standard deviations above 0");
+    }
+  }
+  const std::vector<ActionPoseSample> training = recording.training();
+  if (options.root) {
+    bool is_seen = false;
+    for (const ActionPoseSample& sample : training)
+      is_seen |= sample.find(*options.root) != nullptr;
+    if (!is_seen) {
+      throw std::invalid_argument("--root: part " + std::to_string(*options.root) +
+                                  " is never seen in " + arguments.samples);
+    }
+  }
+  const LearnResult result = learn(recording.signals, training, options);
+  if (!arguments.out.empty()) {
+    BodySchema schema = result.schema;
+    schema.version = schema.last_sample_index + 1;
+    write_one_event_log(arguments.out, kBodySchema, to_message(schema));
+  }
+  if (arguments.json) {
+    std::cout << structure_json(result.schema, result.outliers).dump(2) << std::endl;
+  } else {
+    std::cout << structure_text(result.schema) << std::flush;
+  }
+}
+
+void run_predict(const std::string& schema_file, const std::string& samples_file, bool json) {
+  const BodySchema schema = load_schema(schema_file);
+  const Recording recording = load_recording(samples_file);
+  const auto errors = evaluate(schema, recording.samples);
+  if (json) {
+    std::cout << errors_json(static_cast<int>(recording.samples.size()), errors).dump(2)
+              << std::endl;
+  } else {
+    std::cout << errors_text(errors) << std::flush;
+  }
+}
+
+void run_show(const std::string& schema_file, bool json) {
+  const BodySchema schema = load_schema(schema_file);
+  if (json) {
+    std::cout << schema_json(schema).dump(2) << std::endl;
+  } else {
+    std::cout << structure_text(schema) << std::flush;
+  }
+}
+
+/// Reads what several processes of a rig share; the first line of ./run's launch.
+void run_rig(const std::string& folder, const std::optional<int>& hidden_part) {
+  const std::vector<int> parts = load_markers(folder).parts();
+  if (hidden_part && !std::binary_search(parts.begin(), parts.end(), *hidden_part)) {
+    throw std::invalid_argument("--hide: " + folder + " has no part " +
+                                std::to_string(*hidden_part));
+  }
+  load_signals(folder);
+  const Network network = load_network(folder);
+  std::cout << (network.is_private ? "private " : "host ") << network.bus_url() << ' '
+            << network.images_url() << std::endl;
+}
+
+}  // namespace
+
+BodySchema load_schema(const std::filesystem::path& file) {
+  const std::vector<body_schema_t> schemas = read_log(file, kBodySchema);
+  if (schemas.empty())
+    throw std::runtime_error(file.string() + ": expected a schema, found no BODY_SCHEMA");
+  const std::string problem = check(schemas.back());
+  if (!problem.empty()) throw std::runtime_error(file.string() + ": " + problem);
+  return from_message(schemas.back());
+}
+
+void add_offline_commands(CLI::App& console) {
+  const auto learning = std::make_shared<LearnArguments>();
+  CLI::App* learn =
+      console.add_subcommand("learn", "Learn a body schema from a recording (LCM log or CSV)");
+  learn->add_option("SAMPLES", learning->samples, "Recording")->required();
+  learn->add_option("--out", learning->out, "Write the schema to this file");
+  learn->add_option("--root", learning->root, "Root part; the lowest id if not given");
+  learn
+      ->add_option("--noise", learning->noise,
+                   "Standard deviation per axis and marker: position [m], rotation [deg]")
+      ->expected(2)
+      ->type_name("POS_M ROT_DEG");
+  learn->add_flag("--json", learning->json, "Print JSON");
+  learn->callback([learning] { run_learn(*learning); });
+
+  struct Files {
+    std::string schema, samples;
+    bool json = false;
+  };
+  const auto predicting = std::make_shared<Files>();
+  CLI::App* predict =
+      console.add_subcommand("predict", "Compare a schema's predictions with a recording");
+  predict->add_option("SCHEMA", predicting->schema, "Schema file")->required();
+  predict->add_option("SAMPLES", predicting->samples, "Recording")->required();
+  predict->add_flag("--json", predicting->json, "Print JSON");
+  predict->callback(
+      [predicting] { run_predict(predicting->schema, predicting->samples, predicting->json); });
+
+  const auto showing = std::make_shared<Files>();
+  CLI::App* show = console.add_subcommand("show", "Print a schema file");
+  show->add_option("SCHEMA", showing->schema, "Schema file")->required();
+  show->add_flag("--json", showing->json, "Print JSON");
+  show->callback([showing] { run_show(showing->schema, showing->json); });
+
+  const auto rig_folder = std::make_shared<std::string>();
+  CLI::App* rig =
+      console.add_subcommand("rig", "Check a rig's files and print its network: kind, bus, images");
+  rig->add_option("FOLDER", *rig_folder, "Rig, e.g. config/arm7")->required();
+  const auto hidden_part = std::make_shared<std::optional<int>>();
+  rig->add_option("--hide", *hidden_part, "A part that is to be hidden: is there such a one?");
+  rig->callback([rig_folder, hidden_part] { run_rig(*rig_folder, *hidden_part); });
+}
+
+}  // namespace bodyschema

@@ -1,0 +1,297 @@
+#include "processes/console/recording.h"
+
+#include <algorithm>
+#include <charconv>
+#include <cmath>
+#include <cstring>
+#include <fstream>
+#include <limits>
+#include <map>
+#include <set>
+#include <sstream>
+#include <string_view>
+
+#include "common/bus/check.h"
+#include "common/bus/convert.h"
+#include "common/bus/event_log.h"
+
+namespace bodyschema {
+namespace {
+
+constexpr double kUnitTolerance = 1e-3;
+/// Of any column. Squares, sums and microseconds of what is larger would overflow.
+constexpr double kLargest = 1e12;
+const std::vector<std::string> kPoseColumns = {"x", "y", "z", "qw", "qx", "qy", "qz"};
+
+/// One line of a CSV file, cut into fields, that can point at each of them.
+class Row {
+ public:
+  Row(std::string_view line, std::size_t number, const std::string& file)
+      : number_(number), file_(file) {
+    std::size_t begin = 0;
+    for (;;) {
+      const std::size_t comma = line.find(',', begin);
+      std::string_view field = line.substr(begin, comma - begin);
+      while (!field.empty() && field.front() == ' ') field.remove_prefix(1), ++begin;
+      while (!field.empty() && (field.back() == ' ' || field.back() == '\r'))
+        field.remove_suffix(1);
+      fields_.push_back(field);
+      columns_.push_back(begin + 1);
+      if (comma == std::string_view::npos) break;
+      begin = comma + 1;
+    }
+  }
+
+  std::size_t size() const { return fields_.size(); }
+  std::string_view operator[](std::size_t i) const { return fields_[i]; }
+
+  RecordingError error(std::size_t i, const std::string& expected) const {
+    const std::size_t column = i < columns_.size() ? columns_[i] : columns_.back();
+    return RecordingError(file_ + ":" + std::to_string(number_) + ":" + std::to_string(column) +
+                          ": " + expected);
+  }
+
+  double number(std::size_t i, const std::string& name) const {
+    double value = 0;
+    const std::string_view field = fields_[i];
+    const auto [end, problem] = std::from_chars(field.data(), field.data() + field.size(), value);
+    if (problem != std::errc() || end != field.data() + field.size() || !std::isfinite(value)) {
+      throw error(i, name + ": expected a finite number, found '" + std::string(field) + "'");
+    }
+    if (std::abs(value) > kLargest) {
+      throw error(i, name + ": expected a number within ±1e12, found '" + std::string(field) + "'");
+    }
+    return value;
+  }
+
+  int integer(std::size_t i, const std::string& name) const {
+    int value = 0;
+    const std::string_view field = fields_[i];
+    const auto [end, problem] = std::from_chars(field.data(), field.data() + field.size(), value);
+    if (problem != std::errc() || end != field.data() + field.size() || value < 0) {
+      throw error(i, name + ": expected a whole number from 0, found '" + std::string(field) + "'");
+    }
+    return value;
+  }
+
+ private:
+  std::size_t number_;
+  const std::string& file_;
+  std::vector<std::string_view> fields_;
+  std::vector<std::size_t> columns_;
+};
+
+/// Where the columns of a CSV recording stand.
+struct Header {
+  std::vector<std::string> signals;
+  std::size_t part = 0;  ///< column of `part`; the pose follows it
+  bool has_noise = false;
+
+  std::size_t size() const { return part + 1 + kPoseColumns.size() + (has_noise ? 2 : 0); }
+};
+
+Header parse_header(const Row& row) {
+  Header header;
+  if (row[0] != "t") {
+    throw row.error(
+        0, "expected the header t,q1,...,qm,part,x,y,z,qw,qx,qy,qz[,sp_m,sr_deg], found '" +
+               std::string(row[0]) + "'");
+  }
+  std::size_t i = 1;
+  std::set<std::string> names;
+  for (; i < row.size() && row[i] != "part"; ++i) {
+    if (row[i].empty()) throw row.error(i, "expected the name of an action signal");
+    if (as_text(std::string(row[i])) != row[i])
+      throw row.error(i, "expected the name of an action signal in UTF-8");
+    if (!names.insert(std::string(row[i])).second) {
+      throw row.error(i, "the name '" + std::string(row[i]) + "' stands twice");
+    }
+    header.signals.emplace_back(row[i]);
+  }
+  if (i == row.size()) throw row.error(i, "expected a column 'part' after the action signals");
+  header.part = i++;
+  for (const std::string& name : kPoseColumns) {
+    if (i == row.size() || row[i] != name) throw row.error(i, "expected the column '" + name + "'");
+    ++i;
+  }
+  if (i < row.size()) {
+    for (const char* name : {"sp_m", "sr_deg"}) {
+      if (i == row.size() || row[i] != name) {
+        throw row.error(i, std::string("expected the column '") + name + "' or nothing");
+      }
+      ++i;
+    }
+    header.has_noise = true;
+    if (i < row.size()) throw row.error(i, "expected no further column");
+  }
+  return header;
+}
+
+PartObservation parse_observation(const Row& row, const Header& header) {
+  PartObservation observation;
+  std::size_t i = header.part;
+  observation.part = row.integer(i++, "part");
+  double pose[7];
+  for (std::size_t k = 0; k < kPoseColumns.size(); ++k) pose[k] = row.number(i++, kPoseColumns[k]);
+  const Eigen::Quaterniond q(pose[3], pose[4], pose[5], pose[6]);
+  if (std::abs(q.norm() - 1) > kUnitTolerance) {
+    throw row.error(header.part + 4, "qw,qx,qy,qz: expected a unit quaternion, found norm " +
+                                         std::to_string(q.norm()));
+  }
+  observation.X_CB = make_pose(q, {pose[0], pose[1], pose[2]});
+  if (header.has_noise) {
+    const double position = row.number(i, "sp_m");
+    if (position <= 0) throw row.error(i, "sp_m: expected a standard deviation above 0");
+    const double rotation = row.number(++i, "sr_deg") * (M_PI / 180);
+    if (rotation <= 0) throw row.error(i, "sr_deg: expected a standard deviation above 0");
+    observation.covariance.diagonal() << Eigen::Vector3d::Constant(position * position),
+        Eigen::Vector3d::Constant(rotation * rotation);
+  }
+  return observation;
+}
+
+void set_observed_limits(Recording& recording) {
+  for (std::size_t i = 0; i < recording.signals.size(); ++i) {
+    double lower = std::numeric_limits<double>::infinity();
+    double upper = -lower;
+    for (const ActionPoseSample& sample : recording.samples) {
+      lower = std::min(lower, sample.action[i]);
+      upper = std::max(upper, sample.action[i]);
+    }
+    if (recording.samples.empty()) lower = upper = 0;
+    recording.signals[i].lower = lower;
+    recording.signals[i].upper = upper;
+  }
+}
+
+void sort_parts(Recording& recording) {
+  for (ActionPoseSample& sample : recording.samples) {
+    std::stable_sort(sample.parts.begin(), sample.parts.end(),
+                     [](const auto& a, const auto& b) { return a.part < b.part; });
+  }
+}
+
+Recording read_samples(const std::filesystem::path& file) {
+  Recording recording;
+  recording.is_log = true;
+  recording.has_noise = true;
+  LogReport report;
+  const std::vector<sample_t> messages = read_log(file, kSample, &report);
+  if (messages.empty()) {
+    throw RecordingError(file.string() + ": expected SAMPLE messages, found none in " +
+                         std::to_string(report.events) + " events");
+  }
+  std::int64_t last_index = -1;
+  for (const sample_t& message : messages) {
+    if (message.sample_index <= last_index) continue;  // a repetition
+    last_index = message.sample_index;
+    ActionPoseSample sample = from_message(message);
+    sample.sample_index = static_cast<std::int64_t>(recording.samples.size());
+    if (!recording.samples.empty() &&
+        sample.action.size() != recording.samples.front().action.size()) {
+      throw RecordingError(file.string() + ": sample " + std::to_string(message.sample_index) +
+                           " has " + std::to_string(sample.action.size()) +
+                           " action signals, the first one " +
+                           std::to_string(recording.samples.front().action.size()));
+    }
+    recording.samples.push_back(std::move(sample));
+  }
+  const auto num_signals = recording.samples.front().action.size();
+  const std::vector<body_schema_t> schemas = read_log(file, kBodySchema);
+  if (!schemas.empty() && schemas.back().num_signals == num_signals) {
+    recording.signals = from_message(schemas.back()).signals;
+  } else {
+    for (int i = 0; i < num_signals; ++i) {
+      recording.signals.push_back({.name = "q" + std::to_string(i + 1), .lower = 0, .upper = 0});
+    }
+    set_observed_limits(recording);
+  }
+  return recording;
+}
+
+}  // namespace
+
+std::vector<ActionPoseSample> Recording::training() const {
+  std::vector<ActionPoseSample> result;
+  std::copy_if(samples.begin(), samples.end(), std::back_inserter(result),
+               [](const ActionPoseSample& sample) {
+                 return sample.purpose == Purpose::kTrain || sample.purpose == Purpose::kProbe;
+               });
+  return result;
+}
+
+Recording parse_csv(const std::string& text, const std::string& name) {
+  Recording recording;
+  std::optional<Header> header;
+  std::string_view rest = text;
+  if (rest.starts_with("\xEF\xBB\xBF")) rest.remove_prefix(3);  // a byte order mark
+  // Rows may come part by part as well as instant by instant.
+  std::map<std::vector<double>, std::size_t> instants;  // signals and t
+  for (std::size_t number = 1; !rest.empty(); ++number) {
+    const std::size_t end = rest.find('\n');
+    const std::string_view line = rest.substr(0, end);
+    rest = end == std::string_view::npos ? std::string_view() : rest.substr(end + 1);
+    if (line.find_first_not_of(" \r") == std::string_view::npos) continue;
+    const Row row(line, number, name);
+    if (!header) {
+      header = parse_header(row);
+      for (const std::string& signal : header->signals)
+        recording.signals.push_back({.name = signal});
+      recording.has_noise = header->has_noise;
+      continue;
+    }
+    if (row.size() != header->size()) {
+      // At the first field too many, or at the last one there is.
+      throw row.error(header->size(), "expected " + std::to_string(header->size()) +
+                                          " fields, found " + std::to_string(row.size()));
+    }
+    const double t = row.number(0, "t");
+    Eigen::VectorXd action(header->signals.size());
+    for (std::size_t i = 0; i < header->signals.size(); ++i) {
+      action[i] = row.number(i + 1, header->signals[i]);
+    }
+    PartObservation observation = parse_observation(row, *header);
+    std::vector<double> key(action.data(), action.data() + action.size());
+    key.push_back(t);
+    const auto [instant, is_new] = instants.emplace(std::move(key), recording.samples.size());
+    if (is_new) {
+      ActionPoseSample sample;
+      sample.utime = std::llround(t * 1e6);
+      sample.sample_index = static_cast<std::int64_t>(recording.samples.size());
+      sample.action = action;
+      recording.samples.push_back(std::move(sample));
+    }
+    auto& parts = recording.samples[instant->second].parts;
+    if (std::any_of(parts.begin(), parts.end(),
+                    [&](const auto& other) { return other.part == observation.part; })) {
+      throw row.error(header->part,
+                      "part " + std::to_string(observation.part) + " stands twice at this instant");
+    }
+    parts.push_back(std::move(observation));
+  }
+  if (!header) throw RecordingError(name + ":1:1: expected a header line, found an empty file");
+  if (recording.samples.empty()) throw RecordingError(name + ":2:1: expected at least one row");
+  sort_parts(recording);
+  set_observed_limits(recording);
+  return recording;
+}
+
+Recording load_recording(const std::filesystem::path& file) {
+  if (std::filesystem::is_directory(file)) {
+    throw RecordingError(file.string() + ": expected a CSV file or an LCM log, found a folder");
+  }
+  std::ifstream stream(file, std::ios::binary);
+  if (!stream)
+    throw RecordingError(file.string() + ": cannot be read: no such file or no permission");
+  char magic[4] = {};
+  stream.read(magic, sizeof magic);
+  if (stream.gcount() == 4 && std::memcmp(magic, "\xED\xA1\xDA\x01", 4) == 0)
+    return read_samples(file);
+  stream.clear();
+  stream.seekg(0);
+  std::stringstream text;
+  text << stream.rdbuf();
+  return parse_csv(text.str(), file.string());
+}
+
+}  // namespace bodyschema

@@ -1,0 +1,48 @@
+#pragma once
+
+#include <filesystem>
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+#include "common/schema/body_schema.h"
+#include "common/schema/sample.h"
+
+namespace bodyschema {
+
+/// What is wrong with a recording: "FILE:LINE:COLUMN: what was expected".
+class RecordingError : public std::runtime_error {
+ public:
+  using std::runtime_error::runtime_error;
+};
+
+/// Action–pose samples from a file, anyone's.
+struct Recording {
+  /// Names from the header, limits from the data (CSV) or the recorded schema (log).
+  std::vector<Signal> signals;
+  /// sample_index counts the instants of the file from 0.
+  std::vector<ActionPoseSample> samples;
+  /// Whether the file says how noisy each observation is.
+  bool has_noise = false;
+  /// Whether the poses are those of camera markers, recorded by our observer.
+  bool is_log = false;
+
+  /// Samples that may be learned from, as the structure learner does: TRAIN and PROBE. A CSV has
+  /// TRAIN only.
+  std::vector<ActionPoseSample> training() const;
+};
+
+/// Reads SAMPLE from an LCM log, or a CSV with the header
+///
+///   t,q1,…,qm,part,x,y,z,qw,qx,qy,qz[,sp_m,sr_deg]
+///
+/// one row per instant and seen part: t [s], action signals, part id, position [m], unit quaternion
+/// of the part in the reference frame; optionally the standard deviations per axis of position [m]
+/// and rotation [deg]. Rows with equal t and signals are one instant, wherever they stand.
+/// @throws RecordingError.
+Recording load_recording(const std::filesystem::path& file);
+
+/// The CSV reader alone; `name` stands in errors.
+Recording parse_csv(const std::string& text, const std::string& name);
+
+}  // namespace bodyschema

@@ -1,0 +1,109 @@
+#include "processes/console/run_watch.h"
+
+#include <fmt/format.h>
+
+#include <algorithm>
+#include <cmath>
+
+#include "common/bus/convert.h"
+
+namespace bodyschema {
+namespace {
+
+constexpr double kDegrees = 180 / M_PI;
+constexpr std::int64_t kSilentUs = 3'000'000;
+
+}  // namespace
+
+void RunWatch::on_sample(const sample_t& message) {
+  if (!samples_.empty() && message.sample_index <= samples_.back().sample_index) return;
+  samples_.push_back(from_message(message));
+  action_ids_.push_back(message.action_id);
+}
+
+void RunWatch::on_body_schema(const body_schema_t& schema) { schema_ = from_message(schema); }
+
+void RunWatch::on_model_health(const model_health_t& health) { health_ = health; }
+
+void RunWatch::on_sim_state(const sim_state_t& state) {
+  const Pose X_CW = from_message(state.X_WC).inverse();
+  std::vector<PartObservation> parts;
+  for (std::size_t i = 0; i < state.true_part.size(); ++i) {
+    PartObservation part;
+    part.part = state.true_part[i];
+    part.X_CB = X_CW * from_message(state.X_WB[i]);
+    parts.push_back(part);
+  }
+  truth_[state.action_id] = std::move(parts);
+}
+
+void RunWatch::on_process_info(const process_info_t& info, std::int64_t now_us) {
+  processes_[info.process_name] = {info, now_us};
+}
+
+bool RunWatch::is_finished() const {
+  const auto babbler = processes_.find("motor_babbler");
+  if (babbler == processes_.end() || babbler->second.info.phase != process_info_t::PHASE_DONE) {
+    return false;
+  }
+  // The monitor judges at TEST samples; there need not have been one.
+  const auto last_test =
+      std::find_if(samples_.rbegin(), samples_.rend(),
+                   [](const ActionPoseSample& sample) { return sample.purpose == Purpose::kTest; });
+  if (last_test == samples_.rend()) return !samples_.empty();
+  return health_ && health_->judged_sample >= last_test->sample_index;
+}
+
+std::map<int, double> RunWatch::visibility() const {
+  std::map<int, double> seen;
+  for (const ActionPoseSample& sample : samples_) {
+    for (const PartObservation& part : sample.parts) ++seen[part.part];
+  }
+  for (auto& [part, share] : seen) share /= static_cast<double>(samples_.size());
+  return seen;
+}
+
+std::string RunWatch::progress() const {
+  const auto seen = visibility();
+  double mean = 0;
+  for (const auto& [part, share] : seen) mean += share / static_cast<double>(seen.size());
+  std::string line = fmt::format("{:4} samples · {:2} parts, each seen in {:3.0f} %", num_samples(),
+                                 seen.size(), mean * 100);
+  const std::size_t edges = schema_ ? schema_->edges.size() : 0;
+  line += fmt::format(" · {} of {} edges", edges, seen.empty() ? 0 : seen.size() - 1);
+  if (health_ && health_->worst_position_m >= 0) {
+    line += fmt::format(" · held-out error of the worst part {:.1f} mm {:.2f}°",
+                        health_->worst_position_m * 1e3, health_->worst_rotation_rad * kDegrees);
+  }
+  return line;
+}
+
+std::string RunWatch::diagnosis(const std::set<std::string>& expected, std::int64_t now_us) const {
+  std::string text;
+  for (const std::string& name : expected) {
+    const auto heard = processes_.find(name);
+    if (heard == processes_.end() || now_us - heard->second.at_us > kSilentUs) {
+      text += fmt::format("  {:<18} is silent\n", name);
+    } else {
+      text += fmt::format("  {:<18} {}\n", name, heard->second.info.activity);
+    }
+  }
+  return text;
+}
+
+std::vector<ActionPoseSample> RunWatch::held_out() const {
+  std::vector<ActionPoseSample> result;
+  for (std::size_t i = 0; i < samples_.size(); ++i) {
+    if (samples_[i].purpose != Purpose::kTest) continue;
+    ActionPoseSample sample = samples_[i];
+    if (has_truth()) {
+      const auto truth = truth_.find(action_ids_[i]);
+      if (truth == truth_.end()) continue;
+      sample.parts = truth->second;
+    }
+    result.push_back(std::move(sample));
+  }
+  return result;
+}
+
+}  // namespace bodyschema

@@ -1,0 +1,62 @@
+#pragma once
+
+#include <cstdint>
+#include <map>
+#include <optional>
+#include <set>
+#include <string>
+#include <vector>
+
+#include "common/bus/channels.h"
+#include "common/schema/body_schema.h"
+#include "common/schema/sample.h"
+
+namespace bodyschema {
+
+/// Follows a learning run from outside and sums it up. It alone compares the schema with the
+/// simulator's truth, and tells nobody.
+class RunWatch {
+ public:
+  void on_sample(const sample_t& sample);
+  void on_body_schema(const body_schema_t& schema);
+  void on_model_health(const model_health_t& health);
+  void on_sim_state(const sim_state_t& state);
+  /// `now_us`: the clock, for diagnosis().
+  void on_process_info(const process_info_t& info, std::int64_t now_us);
+
+  /// True when the babbler is done and the monitor has judged the last sample.
+  bool is_finished() const;
+  std::int64_t num_samples() const { return static_cast<std::int64_t>(samples_.size()); }
+
+  /// One line: samples, visibility, parts connected, held-out error.
+  std::string progress() const;
+  /// What every process does or waits for, and which one has not been heard of for 3 s; for the
+  /// moment when nothing goes on.
+  std::string diagnosis(const std::set<std::string>& expected, std::int64_t now_us) const;
+
+  const std::optional<BodySchema>& schema() const { return schema_; }
+  /// All samples so far, TEST included.
+  const std::vector<ActionPoseSample>& samples() const { return samples_; }
+  /// The TEST samples: with the noise-free poses of the simulator where there is one, else as the
+  /// camera saw them.
+  std::vector<ActionPoseSample> held_out() const;
+  bool has_truth() const { return !truth_.empty(); }
+  /// Share of the samples in which each part was seen.
+  std::map<int, double> visibility() const;
+
+ private:
+  struct Heard {
+    process_info_t info;
+    std::int64_t at_us = 0;
+  };
+
+  std::vector<ActionPoseSample> samples_;
+  std::vector<std::int64_t> action_ids_;  ///< of samples_
+  std::optional<BodySchema> schema_;
+  std::optional<model_health_t> health_;
+  /// action id → noise-free poses in the camera's frame
+  std::map<std::int64_t, std::vector<PartObservation>> truth_;
+  std::map<std::string, Heard> processes_;
+};
+
+}  // namespace bodyschema

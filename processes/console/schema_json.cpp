@@ -1,0 +1,162 @@
+#include "processes/console/schema_json.h"
+
+#include <fmt/format.h>
+
+#include <cmath>
+
+namespace bodyschema {
+namespace {
+
+using nlohmann::ordered_json;
+
+constexpr double kDegrees = 180 / M_PI;
+
+const char* reason_name(Unconnected reason) {
+  switch (reason) {
+    case Unconnected::kNeverSeen:
+      return "never seen";
+    case Unconnected::kNotEnoughData:
+      return "not enough data yet";
+    case Unconnected::kNoValidModel:
+      return "no valid model";
+  }
+  return "unknown";
+}
+
+std::string reason_text(const UnconnectedPart& part) {
+  const std::string name = reason_name(part.reason);
+  return part.detail.empty() || part.detail == name ? name : name + ": " + part.detail;
+}
+
+std::vector<std::string> signal_names(const BodySchema& schema, const std::vector<int>& indices) {
+  std::vector<std::string> names;
+  for (const int index : indices) names.push_back(schema.signals.at(index).name);
+  return names;
+}
+
+ordered_json edge_json(const BodySchema& schema, const Edge& edge) {
+  return {{"from", edge.from},
+          {"to", edge.to},
+          {"signals", signal_names(schema, edge.signals())},
+          {"kind", edge.kind()},
+          {"position_rms_m", edge.position_rms_m},
+          {"rotation_rms_deg", edge.rotation_rms_rad * kDegrees},
+          {"samples", edge.num_samples},
+          {"outliers", edge.num_outliers}};
+}
+
+ordered_json pose_json(const Pose& X) {
+  const Eigen::Quaterniond q(X.linear());
+  return {{"position_m", {X.translation().x(), X.translation().y(), X.translation().z()}},
+          {"rotation_wxyz", {q.w(), q.x(), q.y(), q.z()}}};
+}
+
+}  // namespace
+
+ordered_json structure_json(const BodySchema& schema, const std::vector<Outlier>& outliers) {
+  ordered_json json = {{"complete", schema.complete},
+                       {"samples", schema.num_samples},
+                       {"parts", schema.parts},
+                       {"root", schema.root < 0 ? ordered_json() : ordered_json(schema.root)},
+                       {"edges", ordered_json::array()},
+                       {"unconnected", ordered_json::array()},
+                       {"unused_signals", signal_names(schema, schema.unused_signals())},
+                       {"outliers", ordered_json::array()},
+                       {"noise",
+                        {{"position_m", schema.noise.position_m},
+                         {"rotation_deg", schema.noise.rotation_rad * kDegrees}}}};
+  for (const Edge& edge : schema.edges) json["edges"].push_back(edge_json(schema, edge));
+  for (const UnconnectedPart& part : schema.unconnected) {
+    json["unconnected"].push_back({{"part", part.part}, {"reason", reason_text(part)}});
+  }
+  for (const Outlier& outlier : outliers) {
+    json["outliers"].push_back({{"sample", outlier.sample_index}, {"part", outlier.part}});
+  }
+  return json;
+}
+
+ordered_json errors_json(int num_samples, const std::vector<PartErrors>& errors) {
+  ordered_json json = {{"samples", num_samples}, {"parts", ordered_json::array()}};
+  for (const PartErrors& part : errors) {
+    ordered_json item = {{"part", part.part}, {"count", part.count}};
+    // No number where nothing was measured.
+    const auto value = [&](double x) { return part.count > 0 ? ordered_json(x) : ordered_json(); };
+    item["position_median_m"] = value(part.position_median_m);
+    item["position_rms_m"] = value(part.position_rms_m);
+    item["position_max_m"] = value(part.position_max_m);
+    item["rotation_median_deg"] = value(part.rotation_median_rad * kDegrees);
+    item["rotation_rms_deg"] = value(part.rotation_rms_rad * kDegrees);
+    json["parts"].push_back(std::move(item));
+  }
+  return json;
+}
+
+ordered_json schema_json(const BodySchema& schema) {
+  ordered_json json = structure_json(schema, {});
+  json.erase("outliers");
+  json["version"] = schema.version;
+  json["base_version"] = schema.base_version;
+  json["last_sample"] = schema.last_sample_index;
+  json["X_CR"] = pose_json(schema.X_CR);
+  json["signals"] = ordered_json::array();
+  for (const Signal& signal : schema.signals) {
+    json["signals"].push_back(
+        {{"name", signal.name}, {"lower", signal.lower}, {"upper", signal.upper}});
+  }
+  static const char* const kStates[] = {"OK", "SUSPECT", "INVALID", "PROVISIONAL"};
+  for (std::size_t i = 0; i < schema.edges.size(); ++i) {
+    const Edge& edge = schema.edges[i];
+    ordered_json& item = json["edges"][i];
+    item["state"] = kStates[static_cast<int>(edge.state)];
+    item["confidence"] = edge.confidence;
+    item["valid_since_sample"] = edge.valid_since_sample;
+    item["left"] = pose_json(edge.left);
+    item["joints"] = ordered_json::array();
+    for (const ScrewJoint& joint : edge.joints) {
+      item["joints"].push_back({{"signal", schema.signals.at(joint.signal).name},
+                                {"gain", joint.gain},
+                                {"offset", joint.offset},
+                                {"slide_m", joint.slide},
+                                {"turn_rad", joint.turn},
+                                {"X_after", pose_json(joint.X_after)}});
+    }
+    item["right"] = pose_json(edge.right);
+  }
+  return json;
+}
+
+std::string structure_text(const BodySchema& schema) {
+  std::string text = fmt::format("{} structure of {} parts from {} samples\n",
+                                 schema.complete ? "Complete" : "Incomplete", schema.parts.size(),
+                                 schema.num_samples);
+  for (const Edge& edge : schema.edges) {
+    text += fmt::format("  {:>3} → {:<3} {:<6} {:<12} {:7.2f} mm {:6.2f}°\n", edge.from, edge.to,
+                        edge.kind(),
+                        fmt::format("{{{}}}", fmt::join(signal_names(schema, edge.signals()), ",")),
+                        edge.position_rms_m * 1e3, edge.rotation_rms_rad * kDegrees);
+  }
+  for (const UnconnectedPart& part : schema.unconnected) {
+    text += fmt::format("  {:>3}   not connected: {}\n", part.part, reason_text(part));
+  }
+  const auto unused = signal_names(schema, schema.unused_signals());
+  if (!unused.empty())
+    text += fmt::format("  signals without effect: {}\n", fmt::join(unused, ", "));
+  return text;
+}
+
+std::string errors_text(const std::vector<PartErrors>& errors) {
+  std::string text = "  part  count   median            rms               max\n";
+  for (const PartErrors& part : errors) {
+    if (part.count == 0) {
+      text += fmt::format("  {:>4}      0   never seen together with the root\n", part.part);
+      continue;
+    }
+    text += fmt::format("  {:>4} {:>6} {:7.2f} mm {:5.2f}° {:7.2f} mm {:5.2f}° {:7.2f} mm\n",
+                        part.part, part.count, part.position_median_m * 1e3,
+                        part.rotation_median_rad * kDegrees, part.position_rms_m * 1e3,
+                        part.rotation_rms_rad * kDegrees, part.position_max_m * 1e3);
+  }
+  return text;
+}
+
+}  // namespace bodyschema

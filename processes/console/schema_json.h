@@ -1,0 +1,30 @@
+#pragma once
+
+#include <nlohmann/json.hpp>
+#include <string>
+#include <vector>
+
+#include "common/schema/body_schema.h"
+#include "processes/console/evaluation.h"
+#include "processes/structure_learner/learn.h"
+
+namespace bodyschema {
+
+// What the console prints with --json. The README documents every key.
+
+/// `learn --json`, and `structure` in result.json.
+nlohmann::ordered_json structure_json(const BodySchema& schema,
+                                      const std::vector<Outlier>& outliers);
+
+/// `predict --json`, and `held_out` in result.json.
+nlohmann::ordered_json errors_json(int num_samples, const std::vector<PartErrors>& errors);
+
+/// `show --json`: structure_json without outliers, with every parameter of every edge.
+nlohmann::ordered_json schema_json(const BodySchema& schema);
+
+// The same for people.
+
+std::string structure_text(const BodySchema& schema);
+std::string errors_text(const std::vector<PartErrors>& errors);
+
+}  // namespace bodyschema

@@ -1,0 +1,266 @@
+#include "processes/console/watch.h"
+
+#include <fmt/format.h>
+#include <unistd.h>
+
+#include <CLI/CLI.hpp>
+#include <chrono>
+#include <csignal>
+#include <deque>
+#include <iostream>
+#include <memory>
+
+#include "common/bus/bus.h"
+#include "common/bus/event_log.h"
+#include "common/bus/images_url.h"
+#include "common/bus/sample_intake.h"
+#include "common/config/rig.h"
+#include "processes/console/picture.h"
+#include "processes/console/run_watch.h"
+#include "processes/console/schema_json.h"
+#include "processes/structure_learner/structure_learner.h"
+
+namespace bodyschema {
+namespace {
+
+using Clock = std::chrono::steady_clock;
+
+const std::set<std::string> kGroup = {"camera",           "marker_estimator", "model_monitor",
+                                      "motor_babbler",    "observer",         "robot_simulator",
+                                      "structure_learner"};
+
+volatile std::sig_atomic_t interrupted = 0;
+void on_signal(int) { interrupted = 1; }
+
+struct WatchArguments {
+  std::string in = default_url();
+  std::string images;
+  std::string rig_folder;
+  std::string rig;
+  std::string out;
+  std::int64_t seed = 0;
+  double patience_s = 120;
+};
+
+/// Keeps the picture with the most markers whose image and markers were both heard.
+class BestPicture {
+ public:
+  void on_image(const camera_image_t& image) {
+    images_.push_back(image);
+    if (images_.size() > 8) images_.pop_front();
+    match();
+  }
+  void on_markers(const marker_poses_t& markers) {
+    markers_.push_back(markers);
+    if (markers_.size() > 8) markers_.pop_front();
+    match();
+  }
+  void on_info(const camera_info_t& info) { info_ = info; }
+  bool write(const std::filesystem::path& png) const {
+    if (!best_image_ || !info_) return false;
+    write_detections(*best_image_, best_markers_, *info_, png);
+    return true;
+  }
+
+ private:
+  void match() {
+    for (const camera_image_t& image : images_) {
+      for (const marker_poses_t& markers : markers_) {
+        if (image.utime != markers.utime || markers.num_markers <= best_markers_.num_markers)
+          continue;
+        best_image_ = image;
+        best_markers_ = markers;
+      }
+    }
+  }
+
+  std::deque<camera_image_t> images_;
+  std::deque<marker_poses_t> markers_;
+  std::optional<camera_info_t> info_;
+  std::optional<camera_image_t> best_image_;
+  marker_poses_t best_markers_{};
+};
+
+class ProgressLine {
+ public:
+  void show(const std::string& line, bool now) {
+    const auto time = Clock::now();
+    const double age = std::chrono::duration<double>(time - shown_).count();
+    // A terminal gets a line that rewrites itself, a file one line every five seconds.
+    if (!now && age < (is_terminal_ ? 0.1 : 5.0)) return;
+    shown_ = time;
+    if (is_terminal_) {
+      std::cerr << "\r\x1b[2K" << line << std::flush;
+    } else {
+      std::cerr << line << std::endl;
+    }
+  }
+  void end() {
+    if (is_terminal_) std::cerr << std::endl;
+  }
+
+ private:
+  const bool is_terminal_ = isatty(STDERR_FILENO);
+  Clock::time_point shown_{};
+};
+
+/// What was learned from all samples. The body schema is the monitor's where it accepted one; a
+/// schema does not carry its outliers, so learning again from the same samples names them.
+struct Learned {
+  BodySchema schema;
+  std::vector<Outlier> outliers;
+  bool is_accepted = false;
+};
+
+Learned learn_again(const RunWatch& watch, const WatchArguments& arguments) {
+  const StructureLearnerConfig config = StructureLearnerConfig::load(
+      std::filesystem::path(arguments.rig_folder) / "structure_learner.yaml");
+  std::vector<ActionPoseSample> training;
+  for (const ActionPoseSample& sample : watch.samples()) {
+    if (sample.purpose == Purpose::kTrain || sample.purpose == Purpose::kProbe)
+      training.push_back(sample);
+  }
+  LearnOptions options = config.options;
+  if (std::none_of(training.begin(), training.end(), [&](const ActionPoseSample& sample) {
+        return options.root && sample.find(*options.root);
+      })) {
+    options.root.reset();
+  }
+  const LearnResult learned = learn(config.signals, training, options);
+  return {watch.schema().value_or(learned.schema), learned.outliers, watch.schema().has_value()};
+}
+
+nlohmann::ordered_json result_json(const RunWatch& watch, const Learned& learned,
+                                   const WatchArguments& arguments, double seconds) {
+  const Signals signals = load_signals(arguments.rig_folder);
+  const auto held_out = watch.held_out();
+  nlohmann::ordered_json json = {
+      {"rig", arguments.rig},
+      {"seed", arguments.seed},
+      {"samples", watch.num_samples()},
+      {"seconds", std::round(seconds * 10) / 10},
+      {"end_effector", signals.end_effector_part},
+      {"accepted", learned.is_accepted},
+      {"structure", structure_json(learned.schema, learned.outliers)},
+      {"held_out",
+       errors_json(static_cast<int>(held_out.size()), evaluate(learned.schema, held_out))},
+      {"held_out_against", watch.has_truth() ? "noise-free simulator" : "observations"},
+      {"visibility", nlohmann::ordered_json::object()}};
+  for (const auto& [part, share] : watch.visibility())
+    json["visibility"][std::to_string(part)] = share;
+  return json;
+}
+
+void report(const RunWatch& watch, const BestPicture& picture, const WatchArguments& arguments,
+            double seconds) {
+  const std::filesystem::path folder = arguments.out;
+  const Learned learned = learn_again(watch, arguments);
+  write_file_atomically(folder / "result.json",
+                        result_json(watch, learned, arguments, seconds).dump(2) + "\n");
+  const bool has_picture = picture.write(folder / "detections.png");
+
+  const auto held_out = watch.held_out();
+  std::cout << fmt::format("\n{} · seed {} · {} samples, {} of them held out · {:.0f} s\n\n",
+                           arguments.rig, arguments.seed, watch.num_samples(), held_out.size(),
+                           seconds);
+  if (!learned.is_accepted) {
+    std::cout << "The monitor accepted no body schema: too few samples, or each proposal was "
+                 "refuted. The newest proposal:\n";
+  }
+  std::cout << structure_text(learned.schema);
+  if (!held_out.empty()) {
+    std::cout << "\nHeld-out error of each part relative to the root, against "
+              << (watch.has_truth() ? "the simulator's noise-free truth" : "what the camera saw")
+              << "\n"
+              << errors_text(evaluate(learned.schema, held_out));
+  }
+  std::cout << "\nFiles in " << folder.string() << "\n  result.json        this table\n";
+  if (has_picture)
+    std::cout << "  detections.png     a camera frame with the markers found in it\n";
+  std::cout << "  schema.lcmlog      the body schema: ./run show FILE\n"
+               "  samples.lcmlog     the samples: ./run learn FILE\n"
+               "  run.lcmlog.00      everything on the bus but images\n"
+            << std::flush;
+}
+
+void run_watch(const WatchArguments& arguments) {
+  std::signal(SIGINT, on_signal);
+  std::signal(SIGTERM, on_signal);
+  RunWatch watch;
+  BestPicture picture;
+  const auto now_us = [] {
+    return std::chrono::duration_cast<std::chrono::microseconds>(
+               std::chrono::system_clock::now().time_since_epoch())
+        .count();
+  };
+  Bus bus(arguments.in, "");
+  Bus images(arguments.images.empty() ? images_url(arguments.in) : arguments.images, "");
+  SampleIntake intake((std::filesystem::path(arguments.out) / "samples.lcmlog").string(),
+                      [&](const sample_t& m) { watch.on_sample(m); });
+  bus.subscribe<sample_t>(kSample, [&](const sample_t& m) { intake.on_sample(m); });
+  bus.subscribe<body_schema_t>(kBodySchema,
+                               [&](const body_schema_t& m) { watch.on_body_schema(m); });
+  bus.subscribe<model_health_t>(kModelHealth,
+                                [&](const model_health_t& m) { watch.on_model_health(m); });
+  bus.subscribe<sim_state_t>(kSimState, [&](const sim_state_t& m) { watch.on_sim_state(m); });
+  bus.subscribe<process_info_t>(
+      kProcessInfo, [&](const process_info_t& m) { watch.on_process_info(m, now_us()); });
+  bus.subscribe<marker_poses_t>(kMarkerPoses,
+                                [&](const marker_poses_t& m) { picture.on_markers(m); });
+  bus.subscribe<camera_info_t>(kCameraInfo, [&](const camera_info_t& m) { picture.on_info(m); });
+  images.subscribe<camera_image_t>(kCameraImage,
+                                   [&](const camera_image_t& m) { picture.on_image(m); });
+
+  const auto start = Clock::now();
+  const auto seconds = [&start] {
+    return std::chrono::duration<double>(Clock::now() - start).count();
+  };
+  ProgressLine line;
+  std::int64_t last_samples = 0;
+  double progressed_s = 0, warned_s = 0;
+  while (!watch.is_finished() && !interrupted) {
+    images.handle(std::chrono::milliseconds(0));
+    bus.handle(std::chrono::milliseconds(50));
+    intake.on_tick(now_us());
+    if (watch.num_samples() != last_samples) {
+      last_samples = watch.num_samples();
+      progressed_s = seconds();
+    }
+    line.show(fmt::format("{} · {:.0f} s", watch.progress(), seconds()), false);
+    const double stalled_s = seconds() - std::max(progressed_s, warned_s);
+    if (stalled_s > 20) {
+      warned_s = seconds();
+      line.end();
+      std::cerr << fmt::format("no new sample for {:.0f} s:\n", seconds() - progressed_s)
+                << watch.diagnosis(kGroup, now_us());
+    }
+    if (seconds() - progressed_s > arguments.patience_s) {
+      throw std::runtime_error(fmt::format(
+          "no new sample for {:.0f} s, so I give up; the processes' own words are in {}",
+          arguments.patience_s, arguments.out));
+    }
+  }
+  line.show(fmt::format("{} · {:.0f} s", watch.progress(), seconds()), true);
+  line.end();
+  report(watch, picture, arguments, seconds());
+  if (interrupted) throw std::runtime_error("interrupted before the babbler was done");
+}
+
+}  // namespace
+
+void add_watch_command(CLI::App& console) {
+  const auto arguments = std::make_shared<WatchArguments>();
+  CLI::App* watch = console.add_subcommand("watch", "Follow a learning run and sum it up");
+  watch->add_option("--in", arguments->in, "URL of the bus");
+  watch->add_option("--images", arguments->images, "URL of the images' bus");
+  watch->add_option("--rig-folder", arguments->rig_folder, "The rig's configuration")->required();
+  watch->add_option("--rig", arguments->rig, "Name of the rig")->required();
+  watch->add_option("--out", arguments->out, "Folder for result.json and detections.png")
+      ->required();
+  watch->add_option("--seed", arguments->seed, "Seed of the run, for the record");
+  watch->add_option("--patience-s", arguments->patience_s,
+                    "Give up after so long without a new sample [s]");
+  watch->callback([arguments] { run_watch(*arguments); });
+}
+
+}  // namespace bodyschema

@@ -1,0 +1,491 @@
+#include "processes/console/recording.h"
+
+#include <gtest/gtest.h>
+#include <unistd.h>
+
+#include <cmath>
+#include <filesystem>
+#include <fstream>
+#include <functional>
+#include <random>
+#include <sstream>
+
+#include "common/bus/convert.h"
+#include "common/bus/event_log.h"
+#include "tests/support/synthetic_robot.h"
+
+namespace bodyschema {
+namespace {
+
+const std::string kHeader = "t,q1,q2,part,x,y,z,qw,qx,qy,qz\n";
+
+std::string error_of(const std::string& text) {
+  try {
+    parse_csv(text, "f.csv");
+  } catch (const RecordingError& error) {
+    return error.what();
+  } catch (const std::exception& error) {
+    ADD_FAILURE() << "not a RecordingError: " << error.what();
+    return "";
+  }
+  ADD_FAILURE() << "no error in " << text;
+  return "";
+}
+
+TEST(RecordingTest, ReadsInstantsSignalsPartsAndPoses) {
+  const Recording recording = parse_csv(kHeader +
+                                            "0,0.5,-1,1,0.1,0.2,0.3,1,0,0,0\n"
+                                            "0,0.5,-1,3,1,2,3,0,0,0,1\n"
+                                            "2.5,0.25,4,1,0,0,0,0.5,0.5,0.5,0.5\n",
+                                        "f");
+  ASSERT_EQ(recording.signals.size(), 2U);
+  EXPECT_EQ(recording.signals[0].name, "q1");
+  EXPECT_EQ(recording.signals[0].lower, 0.25);
+  EXPECT_EQ(recording.signals[0].upper, 0.5);
+  EXPECT_EQ(recording.signals[1].lower, -1);
+  EXPECT_EQ(recording.signals[1].upper, 4);
+  EXPECT_FALSE(recording.has_noise);
+  EXPECT_FALSE(recording.is_log);
+  ASSERT_EQ(recording.samples.size(), 2U);
+  EXPECT_EQ(recording.samples[0].sample_index, 0);
+  EXPECT_EQ(recording.samples[1].sample_index, 1);
+  EXPECT_EQ(recording.samples[1].utime, 2'500'000);
+  EXPECT_EQ(recording.samples[1].action, Eigen::Vector2d(0.25, 4));
+  ASSERT_EQ(recording.samples[0].parts.size(), 2U);
+  EXPECT_EQ(recording.samples[0].parts[0].X_CB.translation(), Eigen::Vector3d(0.1, 0.2, 0.3));
+  // Half a turn about z, scalar first.
+  const Pose& X = recording.samples[0].parts[1].X_CB;
+  EXPECT_LT((X * Eigen::Vector3d(1, 0, 0) - Eigen::Vector3d(0, 2, 3)).norm(), 1e-12);
+  EXPECT_TRUE(recording.samples[0].parts[0].covariance.isZero(0));
+  EXPECT_EQ(recording.training().size(), 2U);
+}
+
+TEST(RecordingTest, WhatCsvFilesOfTheWorldDoIsTolerated) {
+  const std::string plain = kHeader + "0,1,2,1,0,0,0,1,0,0,0\n1,2,3,1,0,0,1,1,0,0,0\n";
+  const auto with_line_end = [](std::string text, const std::string& end) {
+    std::string result;
+    for (const char c : text) result += c == '\n' ? end : std::string(1, c);
+    return result;
+  };
+  for (const std::string& text :
+       {plain, with_line_end(plain, "\r\n"), "\xEF\xBB\xBF" + plain, with_line_end(plain, "\n\n"),
+        with_line_end(plain, "  \n"), "\n \r\n" + plain, plain.substr(0, plain.size() - 1),
+        std::string("t , q1, q2 ,part,x,y,z,qw,qx,qy, qz\n 0,1 ,2,1,0,0,0,1,0,0,0\n"
+                    "1e0,2.0,0.3e1,1,-0,0,1, 1 ,0,0,0\n")}) {
+    const Recording recording = parse_csv(text, "f");
+    ASSERT_EQ(recording.samples.size(), 2U) << text;
+    EXPECT_EQ(recording.samples[1].action, Eigen::Vector2d(2, 3)) << text;
+    EXPECT_EQ(recording.samples[1].parts.at(0).X_CB.translation().z(), 1) << text;
+    EXPECT_EQ(recording.signals[1].name, "q2");
+  }
+}
+
+TEST(RecordingTest, PartZeroIsAPartLikeAnyOtherAndPartsAreSorted) {
+  const Recording recording = parse_csv(kHeader +
+                                            "0,1,2,7,0,0,7,1,0,0,0\n"
+                                            "0,1,2,0,0,0,0,1,0,0,0\n"
+                                            "0,1,2,3,0,0,3,1,0,0,0\n",
+                                        "f");
+  ASSERT_EQ(recording.samples.size(), 1U);
+  std::vector<int> ids;
+  for (const auto& part : recording.samples[0].parts) {
+    ids.push_back(part.part);
+    EXPECT_EQ(part.X_CB.translation().z(), part.part);
+  }
+  EXPECT_EQ(ids, (std::vector<int>{0, 3, 7}));
+}
+
+TEST(RecordingTest, AMissingRowIsAnUnseenPart) {
+  const Recording recording = parse_csv(kHeader +
+                                            "0,1,2,1,0,0,0,1,0,0,0\n"
+                                            "1,1,2,2,0,0,0,1,0,0,0\n"
+                                            "2,1,2,1,0,0,0,1,0,0,0\n"
+                                            "2,1,2,2,0,0,0,1,0,0,0\n",
+                                        "f");
+  ASSERT_EQ(recording.samples.size(), 3U);
+  EXPECT_EQ(recording.samples[0].find(2), nullptr);
+  EXPECT_EQ(recording.samples[1].find(1), nullptr);
+  EXPECT_NE(recording.samples[2].find(2), nullptr);
+}
+
+TEST(RecordingTest, AnInstantIsATimeWithAnActionWhereverItsRowsStand) {
+  EXPECT_EQ(
+      parse_csv(kHeader + "0,1,2,1,0,0,0,1,0,0,0\n0,1,3,1,0,0,0,1,0,0,0\n", "f").samples.size(),
+      2U);
+  // Part by part, and time may run backwards.
+  const Recording recording = parse_csv(kHeader +
+                                            "1,1,2,1,0,0,1,1,0,0,0\n"
+                                            "0,1,2,1,0,0,2,1,0,0,0\n"
+                                            "1,1,2,2,0,0,3,1,0,0,0\n"
+                                            "0,1,2,2,0,0,4,1,0,0,0\n",
+                                        "f");
+  ASSERT_EQ(recording.samples.size(), 2U);
+  EXPECT_EQ(recording.samples[0].utime, 1'000'000);
+  EXPECT_EQ(recording.samples[0].find(2)->X_CB.translation().z(), 3);
+  EXPECT_EQ(recording.samples[1].find(2)->X_CB.translation().z(), 4);
+}
+
+TEST(RecordingTest, NoiseColumnsAreStandardDeviationsPerAxis) {
+  const Recording recording =
+      parse_csv("t,q,part,x,y,z,qw,qx,qy,qz,sp_m,sr_deg\n0,1,1,0,0,0,1,0,0,0,0.003,2\n", "f");
+  EXPECT_TRUE(recording.has_noise);
+  const Matrix6d& covariance = recording.samples[0].parts[0].covariance;
+  const double rotation = 2 * M_PI / 180;
+  Vector6d expected;
+  expected << Eigen::Vector3d::Constant(9e-6), Eigen::Vector3d::Constant(rotation * rotation);
+  EXPECT_LT((covariance - Matrix6d(expected.asDiagonal())).norm(), 1e-15);
+}
+
+TEST(RecordingTest, ABodyWithoutSignalsAndSignalsOfAnyNameAreRead) {
+  EXPECT_EQ(parse_csv("t,part,x,y,z,qw,qx,qy,qz\n0,1,0,0,0,1,0,0,0\n", "f").signals.size(), 0U);
+  EXPECT_EQ(parse_csv("t,Schulter,\xC3\xBC,part,x,y,z,qw,qx,qy,qz\n0,0,0,1,0,0,0,1,0,0,0\n", "f")
+                .signals[1]
+                .name,
+            "\xC3\xBC");
+}
+
+TEST(RecordingTest, QuaternionsAreNormalised) {
+  const Recording recording =
+      parse_csv(kHeader + "0,1,2,1,0,0,0,0.5004,0.5004,-0.5004,0.5004\n", "f");
+  const Eigen::Matrix3d R = recording.samples[0].parts[0].X_CB.linear();
+  EXPECT_LT((R * R.transpose() - Eigen::Matrix3d::Identity()).norm(), 1e-14);
+}
+
+TEST(RecordingTest, WhatWasWrittenIsReadAgain) {
+  test::Rng rng(41);
+  for (const test::Regime regime : {test::Regime::kFree, test::Regime::kTag}) {
+    const auto robot = test::random_tree({}, rng);
+    const test::ObservationOptions options{.regime = regime};
+    auto samples = test::babble(robot, 30, options, rng);
+    std::erase_if(samples, [](const auto& sample) { return sample.parts.empty(); });
+    std::stringstream text;
+    test::write_csv(samples, text);
+    const Recording recording = parse_csv(text.str(), "f");
+    ASSERT_EQ(recording.samples.size(), samples.size());
+    for (std::size_t i = 0; i < samples.size(); ++i) {
+      EXPECT_LT((recording.samples[i].action - samples[i].action).norm(), 1e-9);
+      ASSERT_EQ(recording.samples[i].parts.size(), samples[i].parts.size());
+      for (std::size_t k = 0; k < samples[i].parts.size(); ++k) {
+        EXPECT_EQ(recording.samples[i].parts[k].part, samples[i].parts[k].part);
+        EXPECT_LT((recording.samples[i].parts[k].X_CB.matrix() - samples[i].parts[k].X_CB.matrix())
+                      .norm(),
+                  1e-9);
+      }
+    }
+  }
+}
+
+TEST(RecordingTest, AnEmptyFileIsRefused) {
+  EXPECT_EQ(error_of(""), "f.csv:1:1: expected a header line, found an empty file");
+  EXPECT_EQ(error_of("\n\r\n  \n"), "f.csv:1:1: expected a header line, found an empty file");
+  EXPECT_EQ(error_of(kHeader), "f.csv:2:1: expected at least one row");
+}
+
+TEST(RecordingTest, ABrokenHeaderIsPointedAt) {
+  EXPECT_EQ(error_of("time,q1,part\n"),
+            "f.csv:1:1: expected the header t,q1,...,qm,part,x,y,z,qw,qx,qy,qz[,sp_m,sr_deg], "
+            "found 'time'");
+  EXPECT_EQ(error_of("0,0.1,1,0,0,0,1,0,0,0\n").rfind("f.csv:1:1: expected the header", 0), 0U);
+  EXPECT_EQ(error_of("t,q1,,part,x,y,z,qw,qx,qy,qz\n"),
+            "f.csv:1:6: expected the name of an action signal");
+  EXPECT_EQ(error_of("t,q1,q1,part,x,y,z,qw,qx,qy,qz\n"), "f.csv:1:6: the name 'q1' stands twice");
+  EXPECT_EQ(error_of("t,q1,q2\n"), "f.csv:1:6: expected a column 'part' after the action signals");
+  EXPECT_EQ(error_of("t,q1,part,x,y,w,qw,qx,qy,qz\n"), "f.csv:1:15: expected the column 'z'");
+  EXPECT_EQ(error_of("t,q1,part,x,y,z,qx,qy,qz,qw\n"), "f.csv:1:17: expected the column 'qw'");
+  EXPECT_EQ(error_of("t,q1,part,x,y,z,qw,qx,qy\n"), "f.csv:1:23: expected the column 'qz'");
+  EXPECT_EQ(error_of("t,q1,part,x,y,z,qw,qx,qy,qz,noise\n"),
+            "f.csv:1:29: expected the column 'sp_m' or nothing");
+  EXPECT_EQ(error_of("t,q1,part,x,y,z,qw,qx,qy,qz,sp_m\n"),
+            "f.csv:1:29: expected the column 'sr_deg' or nothing");
+  EXPECT_EQ(error_of("t,q1,part,x,y,z,qw,qx,qy,qz,sp_m,sr_deg,more\n"),
+            "f.csv:1:41: expected no further column");
+  EXPECT_EQ(error_of("t,q\xFC,part,x,y,z,qw,qx,qy,qz\n"),
+            "f.csv:1:3: expected the name of an action signal in UTF-8");
+}
+
+TEST(RecordingTest, ABrokenRowIsPointedAtWithWhatWasExpected) {
+  const std::string row = "0,1,2,1,0,0,0,1,0,0,0\n";
+  EXPECT_EQ(error_of(kHeader + row + "1,1,2,1,0,0,zero,1,0,0,0\n"),
+            "f.csv:3:13: z: expected a finite number, found 'zero'");
+  EXPECT_EQ(error_of(kHeader + "soon,1,2,1,0,0,0,1,0,0,0\n"),
+            "f.csv:2:1: t: expected a finite number, found 'soon'");
+  EXPECT_EQ(error_of(kHeader + "0,1,,1,0,0,0,1,0,0,0\n"),
+            "f.csv:2:5: q2: expected a finite number, found ''");
+  EXPECT_EQ(error_of(kHeader + "0,1,2,1,0,0,0,1,0,0,0 0\n"),
+            "f.csv:2:21: qz: expected a finite number, found '0 0'");
+  EXPECT_EQ(error_of(kHeader + "0,  nan,2,1,0,0,0,1,0,0,0\n"),
+            "f.csv:2:5: q1: expected a finite number, found 'nan'");
+  EXPECT_EQ(error_of(kHeader + "0,1,2,1,inf,0,0,1,0,0,0\n"),
+            "f.csv:2:9: x: expected a finite number, found 'inf'");
+  EXPECT_EQ(error_of(kHeader + "0,1,2,1,1e999,0,0,1,0,0,0\n"),
+            "f.csv:2:9: x: expected a finite number, found '1e999'");
+  EXPECT_EQ(error_of(kHeader + "0,1,2,1.5,0,0,0,1,0,0,0\n"),
+            "f.csv:2:7: part: expected a whole number from 0, found '1.5'");
+  EXPECT_EQ(error_of(kHeader + "0,1,2,-1,0,0,0,1,0,0,0\n"),
+            "f.csv:2:7: part: expected a whole number from 0, found '-1'");
+  EXPECT_EQ(error_of(kHeader + "0,1,2,99999999999,0,0,0,1,0,0,0\n"),
+            "f.csv:2:7: part: expected a whole number from 0, found '99999999999'");
+  EXPECT_EQ(error_of(kHeader + row + "0,1,2,1,0,0,0,1,0,0,0\n"),
+            "f.csv:3:7: part 1 stands twice at this instant");
+  EXPECT_EQ(error_of(kHeader + "0,1,2,1,0,0,0,1,1,0,0\n"),
+            "f.csv:2:15: qw,qx,qy,qz: expected a unit quaternion, found norm 1.414214");
+  EXPECT_EQ(error_of(kHeader + "0,1,2,1,0,0,0,0,0,0,0\n"),
+            "f.csv:2:15: qw,qx,qy,qz: expected a unit quaternion, found norm 0.000000");
+}
+
+TEST(RecordingTest, ARowOfAnotherLengthIsPointedAtWhereItGoesWrong) {
+  EXPECT_EQ(error_of(kHeader + "0,1,2,1,0,0,0,1,0,0\n"),
+            "f.csv:2:19: expected 11 fields, found 10");
+  EXPECT_EQ(error_of(kHeader + "0,1,2,1,0,0,0,1,0,0,0,7,8\n"),
+            "f.csv:2:23: expected 11 fields, found 13");
+  EXPECT_EQ(error_of(kHeader + "0;1;2\n"), "f.csv:2:1: expected 11 fields, found 1");
+}
+
+TEST(RecordingTest, ANoiseThatIsNotPositiveIsRefused) {
+  const std::string header = "t,q,part,x,y,z,qw,qx,qy,qz,sp_m,sr_deg\n";
+  EXPECT_EQ(error_of(header + "0,1,1,0,0,0,1,0,0,0,0,1\n"),
+            "f.csv:2:21: sp_m: expected a standard deviation above 0");
+  EXPECT_EQ(error_of(header + "0,1,1,0,0,0,1,0,0,0,1,-1\n"),
+            "f.csv:2:23: sr_deg: expected a standard deviation above 0");
+}
+
+// What no robot has would overflow further on.
+TEST(RecordingTest, AbsurdlyLargeNumbersAreRefused) {
+  for (const std::string row :
+       {"1e300,1,2,1,0,0,0,1,0,0,0", "0,-1e300,2,1,0,0,0,1,0,0,0", "0,1,2,1,0,1e300,0,1,0,0,0"}) {
+    EXPECT_NE(error_of(kHeader + row + "\n").find("expected a number within ±1e12"),
+              std::string::npos);
+  }
+  // Nanoseconds since 1970 are no seconds, microseconds might be.
+  EXPECT_NE(error_of(kHeader + "1.7e18,1,2,1,0,0,0,1,0,0,0\n").find("f.csv:2:1: t: "),
+            std::string::npos);
+}
+
+TEST(RecordingTest, LinesAreCountedAsAnEditorDoes) {
+  const std::string text = "\xEF\xBB\xBF\r\n" + kHeader + "\n0,1,2,1,0,0,0,1,0,0,0\r\n\r\n0,1,x";
+  EXPECT_EQ(error_of(text).rfind("f.csv:6:5: expected 11 fields", 0), 0U) << error_of(text);
+}
+
+std::string valid_csv() {
+  test::Rng rng(42);
+  const auto robot = test::chapter_robot("a", rng);
+  std::stringstream text;
+  test::write_csv(test::babble(robot, 6, {}, rng), text);
+  return text.str();
+}
+
+// A file that was damaged on its way is read or refused, never anything else.
+TEST(RecordingTest, TwentyThousandDamagedFilesAreReadOrRefused) {
+  const std::string good = valid_csv();
+  const std::string likely = "0123456789,.-+eE \r\n\tnaifxq\xEF\xBB\xBF\"";
+  std::mt19937_64 rng(43);
+  const auto below = [&](std::size_t n) { return static_cast<std::size_t>(rng() % n); };
+  int num_read = 0, num_refused = 0;
+  for (int n = 0; n < 20'000; ++n) {
+    std::string text = good.substr(0, n % 3 == 0 ? below(good.size()) + 1 : good.size());
+    for (std::size_t k = 0, count = 1 + below(4); k < count; ++k) {
+      if (text.empty()) break;
+      const std::size_t at = below(text.size());
+      switch (below(5)) {
+        case 0:
+          text[at] = static_cast<char>(rng());
+          break;
+        case 1:
+          text[at] = likely[below(likely.size())];
+          break;
+        case 2:
+          text.insert(at, 1, likely[below(likely.size())]);
+          break;
+        case 3:
+          text.erase(at, 1 + below(10));
+          break;
+        default:
+          text.insert(at, text.substr(below(text.size()), below(80)));
+      }
+    }
+    try {
+      const Recording recording = parse_csv(text, "f.csv");
+      ++num_read;
+      ASSERT_FALSE(recording.samples.empty());
+      for (const ActionPoseSample& sample : recording.samples) {
+        ASSERT_EQ(sample.action.size(), static_cast<Eigen::Index>(recording.signals.size()));
+        ASSERT_TRUE(sample.action.allFinite());
+        ASSERT_FALSE(sample.parts.empty());
+        int last = -1;
+        for (const PartObservation& part : sample.parts) {
+          ASSERT_GT(part.part, last);
+          last = part.part;
+          ASSERT_TRUE(part.X_CB.matrix().allFinite());
+          ASSERT_LT(
+              (part.X_CB.linear() * part.X_CB.linear().transpose() - Eigen::Matrix3d::Identity())
+                  .norm(),
+              1e-9);
+        }
+      }
+    } catch (const RecordingError& error) {
+      ++num_refused;
+      // FILE:LINE:COLUMN: what
+      int line = 0, column = 0;
+      ASSERT_EQ(std::sscanf(error.what(), "f.csv:%d:%d: ", &line, &column), 2) << error.what();
+      ASSERT_GE(line, 1);
+      ASSERT_GE(column, 1);
+    }
+  }
+  EXPECT_GT(num_read, 100);
+  EXPECT_GT(num_refused, 1000);
+}
+
+/// A file of its own for every test.
+class RecordingFileTest : public testing::Test {
+ protected:
+  RecordingFileTest() {
+    const auto* test = testing::UnitTest::GetInstance()->current_test_info();
+    file_ = std::filesystem::path(testing::TempDir()) /
+            ("recording_" + std::to_string(getpid()) + test->name());
+    std::filesystem::remove(file_);
+    test::Rng rng(44);
+    robot_ = test::chapter_robot("a", rng);
+    const test::ObservationOptions options{
+        .regime = test::Regime::kTag, .with_covariances = true, .with_other_hypothesis = true};
+    for (ActionPoseSample& sample : test::babble(robot_, 12, options, rng)) {
+      sample.sample_index += 5;
+      sample.utime = 1000 * sample.sample_index;
+      if (sample.sample_index % 5 == 4) sample.purpose = Purpose::kTest;
+      samples_.push_back(sample);
+    }
+  }
+  ~RecordingFileTest() override { std::filesystem::remove(file_); }
+
+  std::string load_error() const {
+    try {
+      load_recording(file_);
+    } catch (const std::runtime_error& error) {
+      const std::string text = error.what();
+      EXPECT_EQ(text.rfind(file_.string() + ":", 0), 0U) << text;
+      return text.substr(std::min(text.size(), file_.string().size() + 1));
+    }
+    ADD_FAILURE() << "no error";
+    return "";
+  }
+
+  std::filesystem::path file_;
+  test::SyntheticRobot robot_;
+  std::vector<ActionPoseSample> samples_;
+};
+
+TEST_F(RecordingFileTest, ALogOfSamplesIsReadWithInstantsCountedFromZero) {
+  {
+    LogAppender log(file_);
+    for (const ActionPoseSample& sample : samples_) {
+      log.append(kSample, to_message(sample));
+      log.append(kSample, to_message(sample));  // repeated on the bus
+      log.append(kSample, to_message(samples_.front()));
+    }
+  }
+  const Recording recording = load_recording(file_);
+  EXPECT_TRUE(recording.is_log);
+  EXPECT_TRUE(recording.has_noise);
+  ASSERT_EQ(recording.samples.size(), 12U);
+  for (std::size_t i = 0; i < samples_.size(); ++i) {
+    const ActionPoseSample& read = recording.samples[i];
+    EXPECT_EQ(read.sample_index, static_cast<std::int64_t>(i));
+    EXPECT_EQ(read.utime, samples_[i].utime);
+    EXPECT_EQ(read.purpose, samples_[i].purpose);
+    EXPECT_EQ(read.action, samples_[i].action);
+    ASSERT_EQ(read.parts.size(), samples_[i].parts.size());
+    for (std::size_t k = 0; k < read.parts.size(); ++k) {
+      const PartObservation &a = read.parts[k], &b = samples_[i].parts[k];
+      EXPECT_EQ(a.part, b.part);
+      EXPECT_LT((a.X_CB.matrix() - b.X_CB.matrix()).norm(), 1e-12);
+      EXPECT_LT((a.covariance - b.covariance).norm(), 1e-15);
+      EXPECT_EQ(a.X_CB_other.has_value(), b.X_CB_other.has_value());
+      EXPECT_EQ(a.error_ratio, b.error_ratio);
+    }
+  }
+  ASSERT_EQ(recording.signals.size(), 2U);
+  EXPECT_EQ(recording.signals[0].name, "q1");
+}
+
+TEST_F(RecordingFileTest, OnlyTrainAndProbeAreLearnedFrom) {
+  {
+    LogAppender log(file_);
+    const Purpose purposes[] = {Purpose::kTrain, Purpose::kTest, Purpose::kProbe,
+                                Purpose::kControl};
+    for (std::size_t i = 0; i < samples_.size(); ++i) {
+      samples_[i].purpose = purposes[i % 4];
+      log.append(kSample, to_message(samples_[i]));
+    }
+  }
+  const Recording recording = load_recording(file_);
+  EXPECT_EQ(recording.samples.size(), 12U);
+  const auto training = recording.training();
+  ASSERT_EQ(training.size(), 6U);
+  for (const ActionPoseSample& sample : training) {
+    EXPECT_TRUE(sample.purpose == Purpose::kTrain || sample.purpose == Purpose::kProbe);
+    // Its number is that in the file, so that outliers can be found there.
+    EXPECT_EQ(sample.action, recording.samples.at(sample.sample_index).action);
+  }
+}
+
+TEST_F(RecordingFileTest, SignalNamesAndLimitsComeFromTheRecordedSchema) {
+  BodySchema schema;
+  schema.signals = {{"shoulder", -60, 60}, {"elbow", 0, 1}};
+  {
+    LogAppender log(file_);
+    for (const ActionPoseSample& sample : samples_) log.append(kSample, to_message(sample));
+    log.append(kBodySchema, to_message(schema));
+  }
+  const Recording recording = load_recording(file_);
+  EXPECT_EQ(recording.signals[1].name, "elbow");
+  EXPECT_EQ(recording.signals[0].lower, -60);
+}
+
+TEST_F(RecordingFileTest, ATornTailOfALogIsNoError) {
+  {
+    LogAppender log(file_);
+    for (const ActionPoseSample& sample : samples_) log.append(kSample, to_message(sample));
+  }
+  std::filesystem::resize_file(file_, std::filesystem::file_size(file_) - 11);
+  EXPECT_EQ(load_recording(file_).samples.size(), 11U);
+}
+
+TEST_F(RecordingFileTest, ALogThatIsOfNoUseIsRefused) {
+  BodySchema schema;
+  LogAppender(file_).append(kBodySchema, to_message(schema));
+  EXPECT_EQ(load_error(), " expected SAMPLE messages, found none in 1 events");
+
+  std::filesystem::remove(file_);
+  {
+    LogAppender log(file_);
+    log.append(kSample, to_message(samples_[0]));
+    sample_t longer = to_message(samples_[1]);
+    set_array(longer.num_signals, longer.action, {1, 2, 3});
+    log.append(kSample, longer);
+  }
+  EXPECT_EQ(load_error(), " sample 6 has 3 action signals, the first one 2");
+
+  std::filesystem::remove(file_);
+  {
+    LogAppender log(file_);
+    log.append(kSample, to_message(samples_[0]));
+    const std::vector<std::uint8_t> garbage(100, 7);
+    log.append_bytes("SAMPLE", garbage, 1);
+  }
+  EXPECT_EQ(load_error().rfind(" event 1 (SAMPLE): ", 0), 0U);
+}
+
+TEST_F(RecordingFileTest, AFileThatCannotBeReadIsNamed) {
+  EXPECT_EQ(load_error(), " cannot be read: no such file or no permission");
+  std::filesystem::create_directory(file_);
+  EXPECT_EQ(load_error(), " expected a CSV file or an LCM log, found a folder");
+}
+
+TEST_F(RecordingFileTest, FilesShorterThanALogsMarkAreReadAsCsv) {
+  for (const std::string text : {"", "t", "t,q", "\xED\xA1\xDA"}) {
+    std::ofstream(file_, std::ios::trunc) << text;
+    EXPECT_EQ(load_error().rfind("1:", 0), 0U);
+  }
+}
+
+}  // namespace
+}  // namespace bodyschema

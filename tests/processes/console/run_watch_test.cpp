@@ -1,0 +1,203 @@
+#include "processes/console/run_watch.h"
+
+#include <gtest/gtest.h>
+
+#include "common/bus/convert.h"
+
+namespace bodyschema {
+namespace {
+
+sample_t sample(std::int64_t index, const std::vector<int>& parts,
+                Purpose purpose = Purpose::kTrain) {
+  ActionPoseSample result;
+  result.sample_index = index;
+  result.purpose = purpose;
+  result.action = Eigen::VectorXd::Constant(1, 0.1 * static_cast<double>(index));
+  for (const int part : parts) {
+    PartObservation seen;
+    seen.part = part;
+    seen.X_CB.translation() = Eigen::Vector3d(part, 0, 0.01);  // 1 cm of noise
+    result.parts.push_back(seen);
+  }
+  sample_t message = to_message(result);
+  message.action_id = 100 + index;
+  return message;
+}
+
+sim_state_t truth(std::int64_t action_id, const std::vector<int>& parts) {
+  sim_state_t state{};
+  state.action_id = action_id;
+  // The camera stands at (0, 0, 5) in the world, without rotation.
+  Pose X_WC = Pose::Identity();
+  X_WC.translation().z() = 5;
+  state.X_WC = to_message(X_WC);
+  std::vector<pose_t> X_WB;
+  for (const int part : parts) {
+    Pose X = Pose::Identity();
+    X.translation() = Eigen::Vector3d(part, 0, 5);
+    X_WB.push_back(to_message(X));
+  }
+  state.num_parts = static_cast<std::int32_t>(parts.size());
+  state.true_part.assign(parts.begin(), parts.end());
+  state.X_WB = X_WB;
+  return state;
+}
+
+process_info_t info(const std::string& name, std::int8_t phase, const std::string& activity = "") {
+  process_info_t message{};
+  message.process_name = name;
+  message.phase = phase;
+  message.activity = activity;
+  return message;
+}
+
+model_health_t health(std::int64_t judged_sample) {
+  model_health_t message{};
+  message.judged_sample = judged_sample;
+  message.worst_position_m = 0.0042;
+  message.worst_rotation_rad = 0.01;
+  return message;
+}
+
+TEST(RunWatchTest, ARunIsFinishedWhenTheBabblerIsDoneAndTheLastSampleJudged) {
+  RunWatch watch;
+  EXPECT_FALSE(watch.is_finished());
+  watch.on_process_info(info("motor_babbler", process_info_t::PHASE_WORKING), 0);
+  watch.on_sample(sample(0, {1}));
+  watch.on_sample(sample(1, {1}, Purpose::kTest));
+  watch.on_model_health(health(1));
+  EXPECT_FALSE(watch.is_finished());
+  watch.on_process_info(info("robot_simulator", process_info_t::PHASE_DONE), 0);
+  EXPECT_FALSE(watch.is_finished());
+  watch.on_process_info(info("motor_babbler", process_info_t::PHASE_DONE), 0);
+  EXPECT_TRUE(watch.is_finished());
+  // The monitor judges at TEST samples: there is nothing to wait for after another.
+  watch.on_sample(sample(2, {1}));
+  EXPECT_TRUE(watch.is_finished());
+  watch.on_sample(sample(3, {1}, Purpose::kTest));
+  watch.on_sample(sample(4, {1}));
+  EXPECT_FALSE(watch.is_finished());
+  watch.on_model_health(health(3));
+  EXPECT_TRUE(watch.is_finished());
+}
+
+TEST(RunWatchTest, ARunWithoutSamplesOrVerdictIsNotFinished) {
+  RunWatch watch;
+  watch.on_process_info(info("motor_babbler", process_info_t::PHASE_DONE), 0);
+  EXPECT_FALSE(watch.is_finished());
+  watch.on_sample(sample(0, {1}, Purpose::kTest));
+  EXPECT_FALSE(watch.is_finished());
+}
+
+TEST(RunWatchTest, ABabblerThatWasEndedIsNotDone) {
+  RunWatch watch;
+  watch.on_sample(sample(0, {1}, Purpose::kTest));
+  watch.on_model_health(health(0));
+  watch.on_process_info(info("motor_babbler", process_info_t::PHASE_ENDED), 0);
+  EXPECT_FALSE(watch.is_finished());
+}
+
+TEST(RunWatchTest, ARunWithoutTestsIsFinishedWithTheBabbler) {
+  RunWatch watch;
+  watch.on_sample(sample(0, {1}));
+  EXPECT_FALSE(watch.is_finished());
+  watch.on_process_info(info("motor_babbler", process_info_t::PHASE_DONE), 0);
+  EXPECT_TRUE(watch.is_finished());
+}
+
+TEST(RunWatchTest, RepeatedSamplesAreCountedOnceAlsoAfterALoss) {
+  RunWatch watch;
+  for (const std::int64_t index : {0, 0, 1, 4, 4, 2, 5, 5}) watch.on_sample(sample(index, {1}));
+  ASSERT_EQ(watch.num_samples(), 4);
+  std::vector<std::int64_t> indices;
+  for (const auto& s : watch.samples()) indices.push_back(s.sample_index);
+  EXPECT_EQ(indices, (std::vector<std::int64_t>{0, 1, 4, 5}));
+}
+
+TEST(RunWatchTest, HeldOutAreTheTestSamplesAsTheCameraSawThem) {
+  RunWatch watch;
+  watch.on_sample(sample(0, {1, 2}));
+  watch.on_sample(sample(1, {1, 2}, Purpose::kTest));
+  watch.on_sample(sample(2, {1}, Purpose::kTest));
+  const auto held_out = watch.held_out();
+  EXPECT_FALSE(watch.has_truth());
+  ASSERT_EQ(held_out.size(), 2U);
+  EXPECT_EQ(held_out[0].sample_index, 1);
+  EXPECT_EQ(held_out[0].parts.size(), 2U);
+  EXPECT_EQ(held_out[1].parts.size(), 1U);
+  EXPECT_EQ(held_out[0].parts[0].X_CB.translation(), Eigen::Vector3d(1, 0, 0.01));
+}
+
+TEST(RunWatchTest, WithASimulatorTheyHoldTheTruthOfTheirAction) {
+  RunWatch watch;
+  watch.on_sim_state(truth(-1, {1, 2, 3}));
+  for (std::int64_t i = 0; i < 3; ++i) {
+    watch.on_sample(sample(i, {1}, Purpose::kTest));
+    if (i != 1) watch.on_sim_state(truth(100 + i, {1, 2, 3}));
+  }
+  EXPECT_TRUE(watch.has_truth());
+  const auto held_out = watch.held_out();
+  ASSERT_EQ(held_out.size(), 2U);  // nobody knows the truth of sample 1
+  EXPECT_EQ(held_out[1].sample_index, 2);
+  EXPECT_EQ(held_out[1].action[0], 0.2);
+  ASSERT_EQ(held_out[1].parts.size(), 3U);  // also what the camera did not see
+  const Pose& X_CB = held_out[1].parts[2].X_CB;
+  EXPECT_LT((X_CB.translation() - Eigen::Vector3d(3, 0, 0)).norm(), 1e-12);
+}
+
+TEST(RunWatchTest, VisibilityIsAShareOfAllSamples) {
+  RunWatch watch;
+  EXPECT_TRUE(watch.visibility().empty());
+  for (std::int64_t i = 0; i < 10; ++i)
+    watch.on_sample(sample(i, i % 5 == 0 ? std::vector<int>{1, 7} : std::vector<int>{1}));
+  const auto visibility = watch.visibility();
+  ASSERT_EQ(visibility.size(), 2U);
+  EXPECT_EQ(visibility.at(1), 1);  // exactly: it is printed
+  EXPECT_EQ(visibility.at(7), 0.2);
+}
+
+TEST(RunWatchTest, TheLineOfProgressSaysWhatIsKnown) {
+  RunWatch watch;
+  EXPECT_EQ(watch.progress(), "   0 samples ·  0 parts, each seen in   0 % · 0 of 0 edges");
+  watch.on_sample(sample(0, {1, 2, 3}));
+  watch.on_sample(sample(1, {1}));
+  EXPECT_EQ(watch.progress(), "   2 samples ·  3 parts, each seen in  67 % · 0 of 2 edges");
+  watch.on_model_health(health(1));
+  EXPECT_EQ(
+      watch.progress(),
+      "   2 samples ·  3 parts, each seen in  67 % · 0 of 2 edges · held-out error of the worst "
+      "part 4.2 mm 0.57°");
+  model_health_t untested = health(1);
+  untested.worst_position_m = -1;
+  watch.on_model_health(untested);
+  EXPECT_EQ(watch.progress().find("held-out"), std::string::npos);
+}
+
+TEST(RunWatchTest, TheDiagnosisNamesWhoIsSilent) {
+  RunWatch watch;
+  const std::int64_t s = 1'000'000;
+  watch.on_process_info(info("camera", process_info_t::PHASE_WORKING, "30 images/s"), 10 * s);
+  watch.on_process_info(info("observer", process_info_t::PHASE_WAITING, "waiting for rest"),
+                        10 * s);
+  watch.on_process_info(info("observer", process_info_t::PHASE_WAITING, "waiting for tags"),
+                        12 * s);
+  EXPECT_EQ(watch.diagnosis({"camera", "observer", "motor_babbler"}, 13 * s + 1),
+            "  camera             is silent\n"
+            "  motor_babbler      is silent\n"
+            "  observer           waiting for tags\n");
+}
+
+TEST(RunWatchTest, TheNewestSchemaStands) {
+  RunWatch watch;
+  EXPECT_FALSE(watch.schema());
+  BodySchema schema;
+  schema.version = 5;
+  watch.on_body_schema(to_message(schema));
+  schema.version = 10;
+  watch.on_body_schema(to_message(schema));
+  ASSERT_TRUE(watch.schema());
+  EXPECT_EQ(watch.schema()->version, 10);
+}
+
+}  // namespace
+}  // namespace bodyschema

@@ -1,0 +1,524 @@
+#include <gtest/gtest.h>
+#include <sys/wait.h>
+#include <unistd.h>
+
+#include <cstdlib>
+#include <filesystem>
+#include <fstream>
+#include <nlohmann/json.hpp>
+#include <sstream>
+
+#include "common/bus/convert.h"
+#include "common/bus/event_log.h"
+#include "tests/support/synthetic_robot.h"
+
+namespace bodyschema {
+namespace {
+
+using Json = nlohmann::json;
+
+std::string text_of(const std::filesystem::path& file) {
+  std::stringstream text;
+  text << std::ifstream(file, std::ios::binary).rdbuf();
+  return text.str();
+}
+
+struct Outcome {
+  int exit_code = 0;
+  std::string out;
+  std::string err;
+
+  Json json() const {
+    EXPECT_EQ(exit_code, 0) << err;
+    const Json parsed = Json::parse(out, nullptr, false);
+    EXPECT_FALSE(parsed.is_discarded()) << out;
+    return parsed;
+  }
+};
+
+/// The structure that `learn --json` printed, with what test::judge() looks at.
+BodySchema structure_of(const Json& json) {
+  BodySchema schema;
+  schema.complete = json.at("complete");
+  schema.parts = json.at("parts").get<std::vector<int>>();
+  for (const Json& printed : json.at("edges")) {
+    Edge edge;
+    edge.from = printed.at("from");
+    edge.to = printed.at("to");
+    for (const Json& name : printed.at("signals")) {
+      ScrewJoint joint;  // CSV columns are called q1, q2, …
+      joint.signal = std::stoi(name.get<std::string>().substr(1)) - 1;
+      edge.joints.push_back(joint);
+    }
+    schema.edges.push_back(edge);
+  }
+  return schema;
+}
+
+/// Runs the program in a folder of its own, whose name has a space.
+class BodyschemaProgramTest : public testing::Test {
+ protected:
+  BodyschemaProgramTest() {
+    const auto* test = testing::UnitTest::GetInstance()->current_test_info();
+    folder_ = std::filesystem::path(testing::TempDir()) /
+              ("bodyschema program " + std::to_string(getpid()) + test->name());
+    std::filesystem::remove_all(folder_);
+    std::filesystem::create_directories(folder_);
+  }
+  ~BodyschemaProgramTest() override { std::filesystem::remove_all(folder_); }
+
+  Outcome run(const std::vector<std::string>& arguments) const {
+    const auto out = folder_ / "stdout.txt", err = folder_ / "stderr.txt";
+    std::string command = "cd '" + folder_.string() + "' && '" + BODYSCHEMA_PROGRAM + "'";
+    for (const std::string& argument : arguments) command += " '" + argument + "'";
+    command += " >stdout.txt 2>stderr.txt </dev/null";
+    const int status = std::system(command.c_str());
+    EXPECT_TRUE(WIFEXITED(status)) << command << " was killed";
+    return {WIFEXITED(status) ? WEXITSTATUS(status) : -1, text_of(out), text_of(err)};
+  }
+  /// It failed with a message that contains `what`, and printed no result.
+  void expect_failure(const std::vector<std::string>& arguments, const std::string& what) const {
+    const Outcome outcome = run(arguments);
+    EXPECT_NE(outcome.exit_code, 0) << what;
+    EXPECT_EQ(outcome.out, "") << what;
+    EXPECT_NE(outcome.err.find(what), std::string::npos) << outcome.err;
+  }
+
+  std::string write(const std::string& name, const std::string& text) const {
+    std::ofstream(folder_ / name, std::ios::binary) << text;
+    return name;
+  }
+  std::string write(const std::string& name, const std::vector<ActionPoseSample>& samples) const {
+    std::stringstream text;
+    test::write_csv(samples, text);
+    return write(name, text.str());
+  }
+  /// 30 samples of a 2-DOF robot.
+  std::string write_robot(const std::string& name, test::Regime regime = test::Regime::kTagIso) {
+    test::Rng rng(71);
+    robot_ = test::chapter_robot("a", rng);
+    test::ObservationOptions options;
+    options.regime = regime;
+    return write(name, test::babble(robot_, 30, options, rng));
+  }
+  bool exists(const std::string& name) const { return std::filesystem::exists(folder_ / name); }
+
+  std::filesystem::path folder_;
+  test::SyntheticRobot robot_;
+};
+
+TEST_F(BodyschemaProgramTest, LearnFindsTheStructureOfTreesWithBranchesSlidersAndSharedSignals) {
+  test::Rng rng(72);
+  int num_prismatic = 0, num_branches = 0;
+  for (int run_index = 0; run_index < 10; ++run_index) {
+    test::RandomTreeOptions tree;
+    tree.num_parts = 6 + run_index % 4;
+    tree.share_prismatic = 0.3;
+    const auto robot = test::random_tree(tree, rng);
+    std::map<int, int> children;
+    for (const auto& link : robot.links) {
+      num_prismatic += link.slide != 0 && link.turn == 0;
+      num_branches += ++children[link.parent] == 2;
+    }
+    test::ObservationOptions options;
+    options.regime = run_index % 2 ? test::Regime::kTagIso : test::Regime::kFree;
+    const auto csv = write("tree.csv", test::babble(robot, 120, options, rng));
+    const Json json = run({"learn", csv, "--json"}).json();
+    EXPECT_TRUE(test::is_right(structure_of(json), robot)) << "tree " << run_index << "\n" << json;
+    EXPECT_EQ(json["samples"], 120);
+    EXPECT_EQ(json["root"], 1);
+    // The idle signal, whatever its number, and none that moves something.
+    std::string idle = "q";
+    idle += std::to_string(robot.signals.size());
+    EXPECT_EQ(json["unused_signals"], Json::array({idle}));
+  }
+  EXPECT_GT(num_prismatic, 2);
+  EXPECT_GT(num_branches, 2);
+}
+
+TEST_F(BodyschemaProgramTest, LearnPrintsTheKeysThatAreDocumented) {
+  const Outcome outcome = run({"learn", write_robot("s.csv"), "--json"});
+  EXPECT_EQ(outcome.err, "");
+  const Json json = outcome.json();
+  for (const char* key : {"complete", "samples", "parts", "root", "edges", "unconnected",
+                          "unused_signals", "outliers", "noise"}) {
+    EXPECT_TRUE(json.contains(key)) << key;
+  }
+  EXPECT_EQ(json.size(), 9U);
+  EXPECT_TRUE(json["complete"].get<bool>());
+  ASSERT_EQ(json["edges"].size(), 4U);
+  for (const Json& edge : json["edges"]) {
+    EXPECT_GT(edge.at("position_rms_m").get<double>(), 0);
+    EXPECT_LT(edge.at("position_rms_m").get<double>(), 0.05);
+    EXPECT_GT(edge.at("rotation_rms_deg").get<double>(), 0);
+  }
+  // 3 mm and 1° per axis were put in.
+  EXPECT_NEAR(json["noise"]["position_m"].get<double>(), 0.003, 0.0015);
+  EXPECT_NEAR(json["noise"]["rotation_deg"].get<double>(), 1, 0.5);
+}
+
+TEST_F(BodyschemaProgramTest, WithoutJsonPeopleReadIt) {
+  const Outcome outcome = run({"learn", write_robot("s.csv")});
+  EXPECT_EQ(outcome.exit_code, 0);
+  EXPECT_EQ(outcome.err, "");
+  EXPECT_EQ(outcome.out.rfind("Complete structure of 5 parts from 30 samples\n", 0), 0U);
+  EXPECT_FALSE(Json::accept(outcome.out));
+}
+
+TEST_F(BodyschemaProgramTest, TheSameRecordingGivesTheSameBytes) {
+  const auto csv = write_robot("s.csv");
+  const Outcome first = run({"learn", csv, "--out", "1.lcmlog", "--json"});
+  const Outcome second = run({"learn", csv, "--out", "2.lcmlog", "--json"});
+  EXPECT_EQ(first.out, second.out);
+  EXPECT_EQ(text_of(folder_ / "1.lcmlog"), text_of(folder_ / "2.lcmlog"));
+  EXPECT_FALSE(text_of(folder_ / "1.lcmlog").empty());
+}
+
+TEST_F(BodyschemaProgramTest, ALearnedSchemaPredictsWhatItHasNotSeen) {
+  const auto csv = write_robot("train.csv", test::Regime::kFree);
+  ASSERT_EQ(run({"learn", csv, "--out", "schema.lcmlog"}).exit_code, 0);
+  test::Rng rng(73);
+  const auto held_out = write("test.csv", test::babble(robot_, 11, {}, rng));
+  const Json json = run({"predict", "schema.lcmlog", held_out, "--json"}).json();
+  EXPECT_EQ(json["samples"], 11);
+  ASSERT_EQ(json["parts"].size(), 4U);
+  for (std::size_t i = 0; i < 4; ++i) {
+    const Json& part = json["parts"][i];
+    EXPECT_EQ(part.size(), 7U);
+    EXPECT_EQ(part.at("part"), i + 2);
+    EXPECT_EQ(part.at("count"), 11);
+    EXPECT_LT(part.at("position_max_m").get<double>(), 1e-4);
+    EXPECT_LE(part.at("position_median_m").get<double>(), part.at("position_max_m").get<double>());
+    EXPECT_LE(part.at("position_rms_m").get<double>(), part.at("position_max_m").get<double>());
+    EXPECT_LT(part.at("rotation_rms_deg").get<double>(), 0.01);
+    EXPECT_GE(part.at("rotation_median_deg").get<double>(), 0);
+  }
+  const Outcome text = run({"predict", "schema.lcmlog", held_out});
+  EXPECT_EQ(text.exit_code, 0);
+  EXPECT_NE(text.out.find("median"), std::string::npos);
+}
+
+TEST_F(BodyschemaProgramTest, PredictionErrorsAreThoseThatWerePutIn) {
+  ASSERT_EQ(run({"learn", write_robot("train.csv", test::Regime::kFree), "--out", "schema.lcmlog"})
+                .exit_code,
+            0);
+  test::Rng rng(74);
+  auto samples = test::babble(robot_, 9, {}, rng);
+  for (ActionPoseSample& sample : samples) {
+    for (PartObservation& part : sample.parts) {
+      if (part.part != 5) continue;
+      part.X_CB.translation() += Eigen::Vector3d(0, 0.03, 0.04);
+      part.X_CB.linear() *= exp_so3({0, 0, 0.1});
+    }
+  }
+  const Json json = run({"predict", "schema.lcmlog", write("s.csv", samples), "--json"}).json();
+  const Json& part = json["parts"].back();
+  EXPECT_EQ(part["part"], 5);
+  EXPECT_NEAR(part["position_median_m"].get<double>(), 0.05, 1e-4);
+  EXPECT_NEAR(part["position_rms_m"].get<double>(), 0.05, 1e-4);
+  EXPECT_NEAR(part["rotation_median_deg"].get<double>(), 0.1 * 180 / M_PI, 1e-2);
+}
+
+TEST_F(BodyschemaProgramTest, ShowPrintsASchemaFile) {
+  const Json learned =
+      run({"learn", write_robot("s.csv"), "--out", "schema.lcmlog", "--json"}).json();
+  const Json shown = run({"show", "schema.lcmlog", "--json"}).json();
+  EXPECT_EQ(shown["parts"], learned["parts"]);
+  EXPECT_EQ(shown["root"], learned["root"]);
+  EXPECT_EQ(shown["samples"], learned["samples"]);
+  EXPECT_EQ(shown["edges"].size(), learned["edges"].size());
+  EXPECT_EQ(shown["version"], 30);
+  for (const Json& edge : shown["edges"]) EXPECT_TRUE(edge.contains("joints"));
+  const Outcome text = run({"show", "schema.lcmlog"});
+  EXPECT_EQ(text.exit_code, 0);
+  EXPECT_EQ(text.out, run({"learn", "s.csv"}).out);
+}
+
+/// Samples of a 2-DOF robot of which `parts` fly about at random.
+std::vector<ActionPoseSample> with_flying_parts(const std::set<int>& parts) {
+  test::Rng rng(75);
+  auto samples = test::babble(test::chapter_robot("a", rng), 60, {}, rng);
+  for (ActionPoseSample& sample : samples) {
+    for (PartObservation& part : sample.parts)
+      if (parts.count(part.part)) part.X_CB = test::random_pose(rng, 0.5, 2);
+  }
+  return samples;
+}
+
+TEST_F(BodyschemaProgramTest, ABodyThatAdmitsNoValidModelIsIncompleteWithReasons) {
+  const auto csv = write("s.csv", with_flying_parts({1, 2, 3, 4, 5}));
+  const Json json =
+      run({"learn", csv, "--noise", "0.003", "1", "--json", "--out", "schema.lcmlog"}).json();
+  EXPECT_FALSE(json["complete"].get<bool>());
+  EXPECT_EQ(json["edges"], Json::array());
+  ASSERT_EQ(json["unconnected"].size(), 4U);
+  for (const Json& part : json["unconnected"]) {
+    EXPECT_GT(part.at("part").get<int>(), 1);
+    EXPECT_NE(part.at("reason").get<std::string>().find("no valid model"), std::string::npos);
+  }
+  EXPECT_EQ(json["unused_signals"], (Json{"q1", "q2"}));
+  // Such a schema can be kept, shown and applied as well.
+  EXPECT_FALSE(run({"show", "schema.lcmlog", "--json"}).json()["complete"].get<bool>());
+  EXPECT_EQ(run({"predict", "schema.lcmlog", csv, "--json"}).json()["parts"], Json::array());
+}
+
+TEST_F(BodyschemaProgramTest, APartThatNoModelExplainsIsNamedAndTheOthersAreConnected) {
+  const Json json = run({"learn", write("s.csv", with_flying_parts({4})), "--json"}).json();
+  EXPECT_FALSE(json["complete"].get<bool>());
+  EXPECT_EQ(json["edges"].size(), 3U) << json;
+  ASSERT_EQ(json["unconnected"].size(), 1U) << json;
+  EXPECT_EQ(json["unconnected"][0]["part"], 4);
+}
+
+TEST_F(BodyschemaProgramTest, NoiseIsNotBlamedForABodyThatMovesAtRandom) {
+  const Json json =
+      run({"learn", write("s.csv", with_flying_parts({1, 2, 3, 4, 5})), "--json"}).json();
+  EXPECT_FALSE(json["complete"].get<bool>()) << json;
+}
+
+TEST_F(BodyschemaProgramTest, AFewSamplesAreNoError) {
+  const std::string header = "t,q1,part,x,y,z,qw,qx,qy,qz\n";
+  const auto one = write("one.csv", header + "0,1,3,0,0,1,1,0,0,0\n");
+  const Json json = run({"learn", one, "--json", "--out", "schema.lcmlog"}).json();
+  EXPECT_EQ(json["parts"], Json::array({3}));
+  EXPECT_EQ(json["root"], 3);
+  const auto two = write("two.csv", header + "0,1,3,0,0,1,1,0,0,0\n0,1,4,0,0,2,1,0,0,0\n");
+  const Json both = run({"learn", two, "--json", "--out", "schema.lcmlog"}).json();
+  EXPECT_FALSE(both["complete"].get<bool>());
+  EXPECT_EQ(both["unconnected"].size(), 1U);
+}
+
+TEST_F(BodyschemaProgramTest, AnObviousOutlierIsNamed) {
+  write_robot("s.csv");
+  test::Rng rng(76);
+  auto samples = test::babble(robot_, 40, {}, rng);
+  for (PartObservation& part : samples[17].parts) {
+    if (part.part == 4) part.X_CB.translation().x() += 0.5;
+  }
+  const Json json =
+      run({"learn", write("o.csv", samples), "--noise", "0.003", "1", "--json"}).json();
+  EXPECT_TRUE(test::is_right(structure_of(json), robot_));
+  EXPECT_EQ(json["outliers"], Json::parse(R"([{"sample": 17, "part": 4}])"));
+  EXPECT_EQ(json["noise"], Json::parse(R"({"position_m": 0.003, "rotation_deg": 1.0})"));
+}
+
+TEST_F(BodyschemaProgramTest, TheRootIsTheLowestPartOrTheOneAskedFor) {
+  const auto csv = write_robot("s.csv");
+  for (const int root : {1, 3, 5}) {
+    const Json json = run({"learn", csv, "--root", std::to_string(root), "--json"}).json();
+    EXPECT_EQ(json["root"], root);
+    EXPECT_TRUE(test::is_right(structure_of(json), robot_));
+    // Every part but the root is led to once.
+    std::set<int> led_to;
+    for (const Json& edge : json["edges"]) EXPECT_TRUE(led_to.insert(edge["to"].get<int>()).second);
+    EXPECT_FALSE(led_to.count(root));
+    EXPECT_EQ(led_to.size(), 4U);
+  }
+}
+
+TEST_F(BodyschemaProgramTest, SenselessOptionsAreRefused) {
+  const auto csv = write_robot("s.csv");
+  expect_failure({"learn", csv, "--root", "9", "--out", "schema.lcmlog"},
+                 "--root: part 9 is never seen");
+  for (const std::string noise : {"0", "nan", "inf"}) {
+    expect_failure({"learn", csv, "--noise", noise, "1", "--out", "schema.lcmlog"}, "--noise");
+    expect_failure({"learn", csv, "--noise", "0.001", noise, "--out", "schema.lcmlog"}, "--noise");
+  }
+  expect_failure({"learn", csv, "--noise", "-0.001", "1", "--out", "schema.lcmlog"}, "--noise");
+  expect_failure({"learn", csv, "--noise", "0.001", "--out", "schema.lcmlog"}, "--noise");
+  expect_failure({"learn", csv, "--speed", "3"}, "--speed");
+  expect_failure({"learn"}, "SAMPLES");
+  expect_failure({"predict", csv}, "SAMPLES");
+  expect_failure({"forget", csv}, "subcommand is required");
+  expect_failure({}, "subcommand is required");
+  EXPECT_FALSE(exists("schema.lcmlog"));
+}
+
+TEST_F(BodyschemaProgramTest, HelpIsAResult) {
+  for (const auto& arguments : std::vector<std::vector<std::string>>{
+           {"--help"}, {"learn", "--help"}, {"predict", "--help"}, {"show", "--help"}}) {
+    const Outcome outcome = run(arguments);
+    EXPECT_EQ(outcome.exit_code, 0);
+    EXPECT_EQ(outcome.err, "");
+    EXPECT_GT(outcome.out.size(), 100U);
+  }
+}
+
+TEST_F(BodyschemaProgramTest, ABrokenFileIsPointedAtAndNothingIsWritten) {
+  const std::string header = "t,q1,part,x,y,z,qw,qx,qy,qz\n";
+  const std::string row = "0,1,1,0,0,0,1,0,0,0\n";
+  write("schema.lcmlog", "what was there before");
+  const auto expect = [&](const std::string& text, const std::string& what) {
+    write("broken.csv", text);
+    expect_failure({"learn", "broken.csv", "--out", "schema.lcmlog", "--json"}, what);
+    EXPECT_EQ(text_of(folder_ / "schema.lcmlog"), "what was there before");
+  };
+  expect(header + row + "1,1,1,0,0,zero,1,0,0,0\n",
+         "broken.csv:3:11: z: expected a finite number, found 'zero'");
+  expect(header + row + "1,1,1,0,0,0,1,1,0,0\n", "broken.csv:3:13: qw,qx,qy,qz: expected a unit");
+  expect("time,q1\n", "broken.csv:1:1: expected the header");
+  expect("", "broken.csv:1:1: expected a header line");
+  expect(header, "broken.csv:2:1: expected at least one row");
+  // A name that JSON could not hold, after everything was learned and written.
+  expect("t,\xE9paule,part,x,y,z,qw,qx,qy,qz\n" + row, "broken.csv:1:3: expected the name");
+  expect_failure({"learn", "no such.csv", "--out", "new.lcmlog"}, "no such.csv: cannot be read");
+  expect_failure({"learn", ".", "--out", "new.lcmlog"}, "found a folder");
+  EXPECT_FALSE(exists("new.lcmlog"));
+  for (const auto& entry : std::filesystem::directory_iterator(folder_)) {
+    const std::string name = entry.path().filename();
+    EXPECT_TRUE(name == "broken.csv" || name == "schema.lcmlog" || name == "stdout.txt" ||
+                name == "stderr.txt")
+        << name << " was left behind";
+  }
+}
+
+TEST_F(BodyschemaProgramTest, AResultThatCannotBeWrittenIsAFailure) {
+  const auto csv = write_robot("s.csv");
+  expect_failure({"learn", csv, "--out", "no such folder/schema.lcmlog", "--json"},
+                 "no such folder/schema.lcmlog");
+  std::filesystem::create_directory(folder_ / "taken");
+  expect_failure({"learn", csv, "--out", "taken", "--json"}, "taken");
+  // A full disk behind stdout.
+  const std::string command = "cd '" + folder_.string() + "' && '" + BODYSCHEMA_PROGRAM +
+                              "' learn s.csv --json >/dev/full 2>stderr.txt";
+  const int status = std::system(command.c_str());
+  ASSERT_TRUE(WIFEXITED(status));
+  EXPECT_NE(WEXITSTATUS(status), 0);
+  EXPECT_NE(text_of(folder_ / "stderr.txt").find("stdout"), std::string::npos);
+}
+
+TEST_F(BodyschemaProgramTest, FilesOfTheWrongKindAreRefused) {
+  const auto csv = write_robot("s.csv");
+  ASSERT_EQ(run({"learn", csv, "--out", "schema.lcmlog"}).exit_code, 0);
+  expect_failure({"learn", "schema.lcmlog"}, "schema.lcmlog: expected SAMPLE messages");
+  expect_failure({"show", csv}, "s.csv");
+  expect_failure({"show", "no such.lcmlog"}, "no such.lcmlog");
+  expect_failure({"predict", csv, csv}, "s.csv");
+  write("empty.lcmlog", "");
+  expect_failure({"show", "empty.lcmlog"}, "empty.lcmlog: expected a schema");
+  // Cut anywhere, a schema file is an error, never a crash.
+  const std::string whole = text_of(folder_ / "schema.lcmlog");
+  for (std::size_t size = 1; size < whole.size(); size += whole.size() / 12) {
+    write("cut.lcmlog", whole.substr(0, size));
+    expect_failure({"show", "cut.lcmlog"}, "cut.lcmlog");
+  }
+  // A recording of another robot.
+  const auto other = write("other.csv", "t,q1,part,x,y,z,qw,qx,qy,qz\n0,1,1,0,0,0,1,0,0,0\n");
+  expect_failure({"predict", "schema.lcmlog", other}, "1 action signals, the schema 2");
+}
+
+TEST_F(BodyschemaProgramTest, ALogOfARunIsLearnedFromWithoutItsTestSamples) {
+  test::Rng rng(77);
+  const auto robot = test::chapter_robot("a", rng);
+  const test::ObservationOptions options{
+      .regime = test::Regime::kTag, .with_covariances = true, .with_other_hypothesis = true};
+  auto samples = test::babble(robot, 40, options, rng);
+  {
+    LogAppender log(folder_ / "samples.lcmlog");
+    for (ActionPoseSample& sample : samples) {
+      if (sample.sample_index % 5 == 4) {
+        sample.purpose = Purpose::kTest;
+        for (PartObservation& part : sample.parts) {
+          part.X_CB = test::random_pose(rng, 0, 9);
+          part.X_CB_other.reset();
+          part.error_ratio = 0;
+        }
+      }
+      log.append(kSample, to_message(sample));
+    }
+  }
+  const Json json = run({"learn", "samples.lcmlog", "--json", "--out", "schema.lcmlog"}).json();
+  EXPECT_TRUE(test::is_right(structure_of(json), robot)) << json;
+  EXPECT_EQ(json["samples"], 32);
+  for (const Json& outlier : json["outliers"]) EXPECT_NE(outlier["sample"].get<int>() % 5, 4);
+  EXPECT_EQ(run({"predict", "schema.lcmlog", "samples.lcmlog", "--json"}).json()["samples"], 40);
+
+  // A part that only TEST samples show cannot be the root.
+  std::filesystem::remove(folder_ / "samples.lcmlog");
+  {
+    LogAppender log(folder_ / "samples.lcmlog");
+    for (ActionPoseSample& sample : samples) {
+      if (sample.purpose == Purpose::kTest) {
+        PartObservation phantom = PartObservation();
+        phantom.part = 9;
+        phantom.covariance.setIdentity();
+        sample.parts.push_back(phantom);
+      }
+      log.append(kSample, to_message(sample));
+    }
+  }
+  expect_failure({"learn", "samples.lcmlog", "--root", "9", "--out", "9.lcmlog"},
+                 "--root: part 9 is never seen");
+}
+
+TEST_F(BodyschemaProgramTest, ALogOfNothingButTestSamplesTeachesNothing) {
+  test::Rng rng(78);
+  const test::ObservationOptions options{.regime = test::Regime::kTag, .with_covariances = true};
+  {
+    LogAppender log(folder_ / "samples.lcmlog");
+    for (ActionPoseSample& sample : test::babble(test::chapter_robot("a", rng), 5, options, rng)) {
+      sample.purpose = Purpose::kTest;
+      log.append(kSample, to_message(sample));
+    }
+  }
+  const Json json = run({"learn", "samples.lcmlog", "--json", "--out", "schema.lcmlog"}).json();
+  EXPECT_FALSE(json["complete"].get<bool>());
+  EXPECT_EQ(json["samples"], 0);
+  EXPECT_TRUE(json["root"].is_null());
+  EXPECT_TRUE(run({"show", "schema.lcmlog", "--json"}).json()["root"].is_null());
+}
+
+TEST_F(BodyschemaProgramTest, NoiseColumnsWeighTheObservations) {
+  write_robot("s.csv", test::Regime::kTagIso);
+  std::stringstream lines(text_of(folder_ / "s.csv")), with_noise;
+  std::string line;
+  for (bool is_header = true; std::getline(lines, line); is_header = false)
+    with_noise << line << (is_header ? ",sp_m,sr_deg" : ",0.003,1") << "\n";
+  const Json json = run({"learn", write("n.csv", with_noise.str()), "--json"}).json();
+  EXPECT_TRUE(test::is_right(structure_of(json), robot_));
+  EXPECT_NEAR(json["noise"]["position_m"].get<double>(), 0.003, 1e-9);
+  EXPECT_NEAR(json["noise"]["rotation_deg"].get<double>(), 1, 1e-9);
+}
+
+TEST_F(BodyschemaProgramTest, RigPrintsTheNetworkOfAGoodRigOnly) {
+  const Outcome outcome = run({"rig", std::string(BODYSCHEMA_CONFIG) + "/arm2"});
+  EXPECT_EQ(outcome.exit_code, 0);
+  std::istringstream words(outcome.out);
+  std::string kind, bus, images;
+  words >> kind >> bus >> images;
+  EXPECT_TRUE(kind == "private" || kind == "host") << outcome.out;
+  EXPECT_EQ(bus.rfind("udpm://", 0), 0U);
+  EXPECT_EQ(images.rfind("udpm://", 0), 0U);
+  EXPECT_NE(bus, images);
+  expect_failure({"rig", "."}, "yaml: cannot be read");
+}
+
+/// Recordings of others, read where they lie; the project keeps no copy.
+class RealDataTest : public BodyschemaProgramTest {
+ protected:
+  void SetUp() override {
+    const char* folder = std::getenv("BODYSCHEMA_REAL_DATA");
+    data_ = folder ? folder : BODYSCHEMA_REAL_DATA;
+    if (!std::filesystem::is_directory(data_)) GTEST_SKIP() << data_ << " is not there";
+  }
+  std::filesystem::path data_;
+};
+
+TEST_F(RealDataTest, TheWeldingPositionerIsOneEdgeOfBothSignals) {
+  const auto csv = data_ / "positioner_2dof_metrology.csv";
+  if (!std::filesystem::exists(csv)) GTEST_SKIP() << csv << " is not there";
+  const Json json = run({"learn", csv, "--out", "schema.lcmlog", "--json"}).json();
+  EXPECT_TRUE(json["complete"].get<bool>()) << json;
+  EXPECT_EQ(json["samples"], 205);
+  EXPECT_EQ(json["parts"], (Json{0, 1}));
+  ASSERT_EQ(json["edges"].size(), 1U) << json;
+  const auto signals = json["edges"][0]["signals"].get<std::set<std::string>>();
+  EXPECT_EQ(signals, (std::set<std::string>{"q1", "q2"}));
+  EXPECT_EQ(json["edges"][0]["kind"], "screw");
+  const Json errors = run({"predict", "schema.lcmlog", csv, "--json"}).json();
+  EXPECT_EQ(errors["parts"][0]["count"], 205);
+  EXPECT_LT(errors["parts"][0]["position_median_m"].get<double>(), 0.002);
+}
+
+}  // namespace
+}  // namespace bodyschema
