@@ -1,0 +1,187 @@
+// How wrong are the poses that the pipeline sees? Samples of a simulated rig go from action to
+// SAMPLE and are compared with the simulator's truth: per part, by the tilt of its best tag, by
+// distance, and per pair of neighbours, where the learner's test statistic d² lives. From this the
+// corner noise (marker_estimator.yaml, observer.yaml) and the model error (structure_learner.yaml)
+// are set. Prints Markdown.
+//
+//   pose_error config/arm7 --samples 2000 --seed 1
+
+#include <CLI/CLI.hpp>
+#include <algorithm>
+#include <cmath>
+#include <cstdio>
+#include <functional>
+#include <map>
+#include <string>
+#include <vector>
+
+#include "common/bus/convert.h"
+#include "common/config/rig.h"
+#include "tests/support/rendered_run.h"
+
+using namespace bodyschema;
+
+namespace {
+
+constexpr double kDegrees = 180 / M_PI;
+constexpr double kChi2Median = 5.348;   // chi^2_6
+constexpr double kChi2Outlier = 20.06;  // chi^2_6(0.9973)
+constexpr double kFlipRad = 10 / kDegrees;
+
+double quantile(std::vector<double> values, double q) {
+  if (values.empty()) return NAN;
+  const auto at =
+      values.begin() + static_cast<std::ptrdiff_t>(q * static_cast<double>(values.size() - 1));
+  std::nth_element(values.begin(), at, values.end());
+  return *at;
+}
+
+double mahalanobis2(const Vector6d& residual, const Matrix6d& covariance) {
+  return residual.dot(covariance.ldlt().solve(residual));
+}
+
+/// Errors of one kind of observation.
+struct Errors {
+  std::vector<double> d2, lateral_m, depth_m, rotation_rad;
+  int flips = 0;
+  int ambiguous = 0;  ///< a second hypothesis was offered
+
+  void add(const PartObservation& part, const Pose& X_CB_true) {
+    const Pose error = X_CB_true.inverse() * part.X_CB;
+    const Eigen::Vector3d e_C = part.X_CB.translation() - X_CB_true.translation();
+    const Eigen::Vector3d ray = X_CB_true.translation().normalized();
+    d2.push_back(mahalanobis2(log(error), part.covariance));
+    depth_m.push_back(std::abs(e_C.dot(ray)));
+    lateral_m.push_back((e_C - ray * ray.dot(e_C)).norm());
+    rotation_rad.push_back(rotation_angle(error));
+    flips += rotation_angle(error) > kFlipRad;
+    ambiguous += part.X_CB_other.has_value();
+  }
+
+  void print(const std::string& name) const {
+    const auto share = [&](double count) { return 100 * count / static_cast<double>(d2.size()); };
+    const auto refuted =
+        std::count_if(d2.begin(), d2.end(), [](double x) { return x > kChi2Outlier; });
+    std::printf("| %s | %zu | %.2f | %.2f | %.2f | %.2f | %.1f | %.1f | %.1f | %.1f | %.1f |\n",
+                name.c_str(), d2.size(), quantile(lateral_m, .5) * 1e3, quantile(depth_m, .5) * 1e3,
+                quantile(rotation_rad, .5) * kDegrees, quantile(rotation_rad, .95) * kDegrees,
+                quantile(d2, .5), quantile(d2, .95), share(double(refuted)), share(flips),
+                share(ambiguous));
+  }
+};
+
+void print_header(const char* what) {
+  std::printf(
+      "\n| %s | n | lateral mm | depth mm | rotation ° | rotation 95 %% | d² median | d² 95 %% | "
+      "d² > 20.06, %% | flips %% | ambiguous %% |\n"
+      "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |\n",
+      what);
+}
+
+std::string bin(double value, const std::vector<double>& edges, const char* unit) {
+  const auto above = std::upper_bound(edges.begin(), edges.end(), value);
+  char text[64];
+  if (above == edges.end()) {
+    std::snprintf(text, sizeof text, "from %g %s", edges.back(), unit);
+  } else {
+    std::snprintf(text, sizeof text, "to %g %s", *above, unit);
+  }
+  return text;
+}
+
+/// Angle between the line of sight and the normal of the visible tag that faces the camera most.
+double best_tilt(const part_observation_t& part, const Pose& X_CB, const Markers& markers) {
+  double best = M_PI / 2;
+  for (const tag_corners_t& tag : part.tags) {
+    const TagPlacement* placement = markers.find(tag.tag_id);
+    if (!placement) continue;
+    const Pose X_CM = X_CB * placement->X_BM.value_or(Pose::Identity());
+    best = std::min(best, std::acos(std::clamp(
+                              X_CM.linear().col(2).dot(X_CM.translation().normalized()), -1., 1.)));
+  }
+  return best;
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+  std::string rig = "config/arm7";
+  int num_samples = 2000;
+  std::int64_t seed = 1;
+  CLI::App app("Errors of observed poses against the simulator's truth");
+  app.add_option("RIG", rig, "Rig folder");
+  app.add_option("--samples", num_samples)->check(CLI::PositiveNumber);
+  app.add_option("--seed", seed);
+  CLI11_PARSE(app, argc, argv);
+
+  const Markers markers = load_markers(rig);
+  test::RenderedRun run(rig, seed);
+  Errors all;
+  std::map<int, Errors> by_part;
+  std::map<std::string, Errors> by_tilt, by_distance, by_tags;
+  struct Pair {
+    Vector6d residual;
+    Matrix6d covariance;
+  };
+  std::vector<Pair> pairs;
+  std::map<int, int> seen;
+  for (int i = 0; i < num_samples; ++i) {
+    const auto step = run.next();
+    for (std::size_t k = 0; k < step.sample.parts.size(); ++k) {
+      const PartObservation& part = step.sample.parts[k];
+      const Pose& truth = step.truth.at(part.part);
+      ++seen[part.part];
+      all.add(part, truth);
+      by_part[part.part].add(part, truth);
+      const part_observation_t& message = step.message.parts[k];
+      by_tilt[bin(best_tilt(message, truth, markers) * kDegrees, {10, 20, 30, 40, 50, 60, 70}, "°")]
+          .add(part, truth);
+      by_distance[bin(truth.translation().norm(), {1.6, 1.8, 2.0, 2.2, 2.4}, "m")].add(part, truth);
+      by_tags[std::to_string(message.num_tags)].add(part, truth);
+      for (std::size_t j = 0; j < k; ++j) {
+        const PartObservation& other = step.sample.parts[j];
+        const Pose z = other.X_CB.inverse() * part.X_CB;
+        const Pose z_true = step.truth.at(other.part).inverse() * truth;
+        pairs.push_back(
+            {log(z_true.inverse() * z), relative_covariance(z, other.covariance, part.covariance)});
+      }
+    }
+  }
+
+  std::printf("%s, seed %lld, %d samples, %d actions refused\n", rig.c_str(),
+              static_cast<long long>(seed), num_samples, run.num_rejected());
+  print_header("part");
+  for (const auto& [part, errors] : by_part) {
+    char name[64];
+    std::snprintf(name, sizeof name, "%d, seen %.1f %%", part, 100.0 * seen[part] / num_samples);
+    errors.print(name);
+  }
+  all.print("all");
+  print_header("tilt of the best tag");
+  for (const auto& [name, errors] : by_tilt) errors.print(name);
+  print_header("distance");
+  for (const auto& [name, errors] : by_distance) errors.print(name);
+  print_header("tags of the part");
+  for (const auto& [name, errors] : by_tags) errors.print(name);
+
+  std::printf(
+      "\nAll pairs of parts, with a model error added to the covariance (chi^2_6: median %.2f, 95 "
+      "%% 12.59):\n\n"
+      "| model error | d² median | d² 95 %% | d² > 20.06, %% |\n| --- | --- | --- | --- |\n",
+      kChi2Median);
+  for (const auto& [position_mm, rotation_deg] : std::vector<std::pair<double, double>>{
+           {0, 0}, {.25, .05}, {.5, .1}, {1, .1}, {1, .2}, {1.5, .3}, {2, .4}}) {
+    Vector6d variances;
+    variances << Eigen::Vector3d::Constant(std::pow(position_mm * 1e-3, 2)),
+        Eigen::Vector3d::Constant(std::pow(rotation_deg / kDegrees, 2));
+    std::vector<double> d2;
+    for (const Pair& pair : pairs) {
+      d2.push_back(mahalanobis2(pair.residual, pair.covariance + Matrix6d(variances.asDiagonal())));
+    }
+    const auto refuted =
+        std::count_if(d2.begin(), d2.end(), [](double x) { return x > kChi2Outlier; });
+    std::printf("| %.2f mm, %.2f° | %.2f | %.1f | %.2f |\n", position_mm, rotation_deg,
+                quantile(d2, .5), quantile(d2, .95), 100.0 * double(refuted) / double(d2.size()));
+  }
+  return 0;
+}

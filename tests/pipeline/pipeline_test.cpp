@@ -1,0 +1,337 @@
+// The whole group on the simulated arm2: real processes, real bus, rendered images, launched as a
+// user would by ./run. One program, one run shared by all tests.
+
+#include <gtest/gtest.h>
+#include <signal.h>
+#include <sys/wait.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <chrono>
+#include <cstdlib>
+#include <filesystem>
+#include <fstream>
+#include <functional>
+#include <nlohmann/json.hpp>
+#include <set>
+#include <sstream>
+#include <string>
+#include <vector>
+
+#include "common/bus/convert.h"
+#include "common/bus/event_log.h"
+#include "tests/support/rig_truth.h"
+
+namespace bodyschema {
+namespace {
+
+namespace fs = std::filesystem;
+
+const fs::path kSource = BODYSCHEMA_SOURCE_FOLDER;
+const fs::path kBin = BODYSCHEMA_BIN_FOLDER;
+
+int shell(const std::string& command) {
+  const int status = std::system(command.c_str());
+  return WIFEXITED(status) ? WEXITSTATUS(status) : 128;
+}
+
+std::string in_quotes(const fs::path& path) { return "'" + path.string() + "'"; }
+
+std::string contents(const fs::path& file) {
+  std::ifstream stream(file, std::ios::binary);
+  std::stringstream text;
+  text << stream.rdbuf();
+  return text.str();
+}
+
+/// Raw payloads of one channel, one after the other.
+std::string payloads(const fs::path& log, const std::string& channel, bool only_last = false) {
+  std::string bytes;
+  for_each_event(log, [&](const LogEvent& event) {
+    if (event.channel != channel) return;
+    if (only_last) bytes.clear();
+    bytes.append(event.data.begin(), event.data.end());
+  });
+  return bytes;
+}
+
+/// The payloads of one channel that `is_wanted`, each once, in the order in which they first came:
+/// what is published again at 1 Hz is there as often as the clock says, in a replay otherwise than
+/// live. (The camera repeats all frames of an action in turn, so neighbours are not enough.)
+template <class Message>
+std::vector<std::string> distinct_payloads(
+    const fs::path& log, const Channel<Message>& channel,
+    const std::function<bool(const Message&)>& is_wanted = [](const Message&) { return true; }) {
+  std::vector<std::string> distinct;
+  std::set<std::string> seen;
+  for_each_event(log, [&](const LogEvent& event) {
+    if (event.channel != channel.name) return;
+    const auto decoded = decode<Message>(event.data.data(), event.data.size());
+    if (!decoded.message) throw std::runtime_error(decoded.problem);
+    const std::string payload(event.data.begin(), event.data.end());
+    if (is_wanted(*decoded.message) && seen.insert(payload).second) distinct.push_back(payload);
+  });
+  return distinct;
+}
+
+/// Not EXPECT_EQ, which would print megabytes.
+testing::AssertionResult are_equal(const std::vector<std::string>& replayed,
+                                   const std::vector<std::string>& live) {
+  if (live.empty()) return testing::AssertionFailure() << "nothing was recorded live";
+  const std::size_t n = std::min(replayed.size(), live.size());
+  for (std::size_t i = 0; i < n; ++i) {
+    if (replayed[i] != live[i]) return testing::AssertionFailure() << "payload " << i << " differs";
+  }
+  if (replayed.size() == live.size()) return testing::AssertionSuccess();
+  return testing::AssertionFailure()
+         << replayed.size() << " payloads replayed, " << live.size() << " live";
+}
+
+/// "pid command line" of every process that has the run folder in its environment; all that ./run
+/// starts inherit it.
+std::vector<std::string> processes_of(const fs::path& run_folder) {
+  const std::string mark = "BODYSCHEMA_RUN=" + run_folder.string() + '\0';
+  std::vector<std::string> found;
+  for (const auto& entry : fs::directory_iterator("/proc")) {
+    const std::string pid = entry.path().filename();
+    if (pid.find_first_not_of("0123456789") != std::string::npos) continue;
+    if (('\0' + contents(entry.path() / "environ")).find('\0' + mark) == std::string::npos)
+      continue;
+    std::string command = contents(entry.path() / "cmdline");
+    std::replace(command.begin(), command.end(), '\0', ' ');
+    found.push_back(pid + " " + command);
+  }
+  return found;
+}
+
+/// Asks every 50 ms, for at most `limit`.
+bool becomes_true(std::chrono::seconds limit, const std::function<bool()>& condition) {
+  const auto end = std::chrono::steady_clock::now() + limit;
+  while (!condition()) {
+    if (std::chrono::steady_clock::now() > end) return false;
+    ::usleep(50'000);
+  }
+  return true;
+}
+
+class Arm2 : public testing::Test {
+ protected:
+  static void SetUpTestSuite() {
+    // A path with a space, as users have them.
+    folder_ = fs::temp_directory_path() / ("bodyschema pipeline " + std::to_string(getpid()));
+    fs::create_directories(folder_);
+    exit_code_ = launch("first");
+    if (exit_code_ == 0) second_exit_code_ = launch("second");
+  }
+  static void TearDownTestSuite() {
+    if (!testing::UnitTest::GetInstance()->Failed()) fs::remove_all(folder_);
+  }
+  void SetUp() override { ASSERT_EQ(exit_code_, 0) << contents(folder_ / "first.err"); }
+
+  static int launch(const std::string& name) { return shell(command(name, 30)); }
+  static std::string command(const std::string& name, int samples) {
+    const fs::path logs = folder_ / name;
+    return "BODYSCHEMA_BUILD=" + in_quotes(kBin.parent_path()) +
+           " BODYSCHEMA_LOGS=" + in_quotes(logs) + " exec " + in_quotes(kSource / "run") +
+           " --rig arm2 --seed 3 --samples " + std::to_string(samples) + " >" +
+           in_quotes(logs.string() + ".out") + " 2>" + in_quotes(logs.string() + ".err") +
+           " </dev/null";
+  }
+  /// Runs a process from a log of the first run to a log, whose path is returned.
+  static fs::path replay(const std::string& process, const std::string& flags = "") {
+    const fs::path out = folder_ / ("replayed_" + process + ".lcmlog");
+    const fs::path err = out.string() + ".err";
+    EXPECT_EQ(shell(in_quotes(kBin / process) + " --config " +
+                    in_quotes(kSource / "config/arm2" / (process + ".yaml")) + " --in " +
+                    in_quotes(log_url(run("first") / "run.lcmlog.00")) + " --out " +
+                    in_quotes("file://" + out.string() + "?mode=w") + " " + flags + " 2>" +
+                    in_quotes(err)),
+              0)
+        << contents(err);
+    return out;
+  }
+  static std::string log_url(const fs::path& log) { return "file://" + log.string() + "?speed=0"; }
+  static fs::path run(const std::string& name) { return folder_ / name / "current"; }
+
+  static fs::path folder_;
+  static int exit_code_;
+  static int second_exit_code_;
+};
+
+fs::path Arm2::folder_;
+int Arm2::exit_code_ = -1;
+int Arm2::second_exit_code_ = -1;
+
+TEST_F(Arm2, TheStructureIsRightAfterThirtySamples) {
+  const test::RigTruth truth(kSource / "config/arm2");
+  const auto schemas = read_log(run("first") / "schema.lcmlog", kBodySchema);
+  ASSERT_EQ(schemas.size(), 1u);
+  EXPECT_EQ(truth.objection(from_message(schemas[0]), truth.parts()), "");
+}
+
+TEST_F(Arm2, TheResultSaysWhatWasLearnedAndHowWell) {
+  const auto result = nlohmann::json::parse(contents(run("first") / "result.json"));
+  EXPECT_EQ(result["rig"], "arm2");
+  EXPECT_EQ(result["seed"], 3);
+  EXPECT_EQ(result["samples"], 30);
+  EXPECT_GT(result["seconds"], 0);
+  EXPECT_EQ(result["structure"]["complete"], true);
+  EXPECT_EQ(result["structure"]["samples"], 24);  // every fifth is TEST
+  EXPECT_EQ(result["structure"]["edges"].size(), 4u);
+  EXPECT_EQ(result["held_out"]["samples"], 6);
+  EXPECT_EQ(result["held_out_against"], "noise-free simulator");
+  ASSERT_EQ(result["held_out"]["parts"].size(), 4u);
+  for (const auto& part : result["held_out"]["parts"]) {
+    EXPECT_EQ(part["count"], 6);
+    EXPECT_LT(part["position_median_m"], 0.008) << part;
+    EXPECT_LT(part["rotation_median_deg"], 1.5) << part;
+    EXPECT_GT(part["position_median_m"], 0.0)
+        << "the learned model cannot be exact: was it the truth?";
+  }
+}
+
+TEST_F(Arm2, ThePictureIsThere) {
+  EXPECT_EQ(contents(run("first") / "detections.png").substr(1, 3), "PNG");
+}
+
+TEST_F(Arm2, TheBusAndTheImagesAreRecordedApart) {
+  EXPECT_FALSE(payloads(run("first") / "images.lcmlog.00", "CAMERA_IMAGE").empty());
+  EXPECT_TRUE(payloads(run("first") / "images.lcmlog.00", "SAMPLE").empty());
+  EXPECT_TRUE(payloads(run("first") / "run.lcmlog.00", "CAMERA_IMAGE").empty());
+  EXPECT_EQ(payloads(run("first") / "run.lcmlog.00", "SAMPLE"),
+            payloads(run("first") / "samples.lcmlog", "SAMPLE"));
+}
+
+TEST_F(Arm2, TwoRunsWithOneSeedAreIdentical) {
+  ASSERT_EQ(second_exit_code_, 0) << contents(folder_ / "second.err");
+  EXPECT_EQ(payloads(run("first") / "samples.lcmlog", "SAMPLE"),
+            payloads(run("second") / "samples.lcmlog", "SAMPLE"));
+  EXPECT_EQ(payloads(run("first") / "schema.lcmlog", "BODY_SCHEMA"),
+            payloads(run("second") / "schema.lcmlog", "BODY_SCHEMA"));
+}
+
+TEST_F(Arm2, NoProcessIsLeftBehind) {
+  for (const char* name : {"first", "second"}) {
+    EXPECT_EQ(processes_of(fs::canonical(run(name))), std::vector<std::string>{}) << name;
+    // supervisord removes its pid file when it ends in order.
+    EXPECT_FALSE(fs::exists(run(name) / "supervisord.pid")) << name;
+  }
+}
+
+TEST_F(Arm2, NoProcessIsLeftBehindWhenTheScriptIsKilled) {
+  const std::string line = command("killed", 300);
+  const pid_t script = ::fork();
+  ASSERT_GE(script, 0);
+  if (script == 0) {
+    ::execl("/bin/sh", "sh", "-c", line.c_str(), nullptr);
+    ::_exit(127);
+  }
+  const bool is_running = becomes_true(std::chrono::seconds(60), [] {
+    std::error_code error;
+    return fs::file_size(run("killed") / "samples.lcmlog", error) > 0 && !error;
+  });
+  std::error_code no_run;
+  const fs::path folder = fs::canonical(run("killed"), no_run);
+  const std::size_t before = no_run ? 0 : processes_of(folder).size();
+  ::kill(script, SIGKILL);
+  ::waitpid(script, nullptr, 0);
+  ASSERT_TRUE(is_running) << contents(folder_ / "killed.err");
+  EXPECT_GE(before, 9u) << "the search for processes finds the group while it runs";
+  const bool has_ended =
+      becomes_true(std::chrono::seconds(20), [&] { return processes_of(folder).empty(); });
+  const std::vector<std::string> left = processes_of(folder);
+  EXPECT_TRUE(has_ended) << testing::PrintToString(left);
+  // This test must not leave them behind either.
+  for (const std::string& process : left) ::kill(std::stoi(process), SIGKILL);
+}
+
+TEST_F(Arm2, AReplayThroughTheObserverGivesTheSameSamples) {
+  EXPECT_TRUE(are_equal(distinct_payloads(replay("observer"), kSample),
+                        distinct_payloads(run("first") / "run.lcmlog.00", kSample)));
+}
+
+TEST_F(Arm2, AReplayThroughTheSimulatorGivesTheSameStates) {
+  // Live, the state before the first action is told at 1 Hz; no command causes it.
+  const auto states = [](const fs::path& log) {
+    return distinct_payloads<sim_state_t>(
+        log, kSimState, [](const sim_state_t& state) { return state.action_id >= 0; });
+  };
+  EXPECT_TRUE(are_equal(states(replay("robot_simulator", "--seed 3")),
+                        states(run("first") / "run.lcmlog.00")));
+}
+
+TEST_F(Arm2, AReplayThroughTheBabblerGivesTheSameActions) {
+  EXPECT_TRUE(
+      are_equal(distinct_payloads(replay("motor_babbler", "--seed 3 --samples 30"), kActionCommand),
+                distinct_payloads(run("first") / "run.lcmlog.00", kActionCommand)));
+}
+
+TEST_F(Arm2, AReplayThroughTheCameraGivesTheSameImages) {
+  // Those of the start pose, two, may have passed live before the logger listened.
+  const auto images = [](const fs::path& log) {
+    return distinct_payloads<camera_image_t>(
+        log, kCameraImage, [](const camera_image_t& image) { return image.image_seq >= 2; });
+  };
+  EXPECT_TRUE(are_equal(images(replay("camera")), images(run("first") / "images.lcmlog.00")));
+}
+
+TEST_F(Arm2, AReplayThroughTheMarkerEstimatorGivesTheSamePoses) {
+  const auto poses = [](const fs::path& log) {
+    return distinct_payloads<marker_poses_t>(
+        log, kMarkerPoses, [](const marker_poses_t& frame) { return frame.image_seq >= 2; });
+  };
+  const fs::path images = run("first") / "images.lcmlog.00";
+  EXPECT_TRUE(are_equal(poses(replay("marker_estimator", "--images " + in_quotes(log_url(images)))),
+                        poses(run("first") / "run.lcmlog.00")));
+}
+
+TEST_F(Arm2, AReplayFromTheLogGivesTheSameSchemaBytesTwice) {
+  const std::string live = payloads(run("first") / "run.lcmlog.00", "LEARNED_SCHEMA", true);
+  ASSERT_FALSE(live.empty());
+  for (const char* name : {"replay1.lcmlog", "replay2.lcmlog"}) {
+    const fs::path out = folder_ / name;
+    ASSERT_EQ(shell(in_quotes(kBin / "structure_learner") + " --config " +
+                    in_quotes(kSource / "config/arm2/structure_learner.yaml") + " --in " +
+                    in_quotes("file://" + (run("first") / "samples.lcmlog").string() + "?speed=0") +
+                    " --out " + in_quotes("file://" + out.string() + "?mode=w") + " 2>/dev/null"),
+              0);
+    EXPECT_EQ(payloads(out, "LEARNED_SCHEMA", true), live);
+  }
+}
+
+TEST_F(Arm2, AReplayThroughTheMonitorGivesTheSameBodySchemaBytes) {
+  const fs::path out = folder_ / "monitor.lcmlog";
+  ASSERT_EQ(shell(in_quotes(kBin / "model_monitor") + " --config " +
+                  in_quotes(kSource / "config/arm2/model_monitor.yaml") + " --in " +
+                  in_quotes("file://" + (run("first") / "run.lcmlog.00").string() + "?speed=0") +
+                  " --out " + in_quotes("file://" + out.string() + "?mode=w") + " 2>/dev/null"),
+            0);
+  EXPECT_EQ(payloads(out, "BODY_SCHEMA", true),
+            payloads(run("first") / "schema.lcmlog", "BODY_SCHEMA"));
+}
+
+TEST_F(Arm2, LogplayerOnALiveBusGivesTheSameSchemaBytes) {
+  const fs::path expected = folder_ / "expected";
+  std::ofstream(expected, std::ios::binary)
+      << payloads(run("first") / "run.lcmlog.00", "LEARNED_SCHEMA", true);
+  const int status = shell(in_quotes(kSource / "tests/private_bus.sh") + " " +
+                           in_quotes(kSource / "tests/pipeline/replay_live.sh") + " " +
+                           in_quotes(kBin) + " " + in_quotes(kSource / "config/arm2") + " " +
+                           in_quotes(run("first") / "samples.lcmlog") + " " + in_quotes(expected));
+  if (status == 77) GTEST_SKIP() << "no user namespaces";
+  EXPECT_EQ(status, 0);
+}
+
+TEST_F(Arm2, LearningFromTheSampleLogOfflineGivesTheStructureOfTheRun) {
+  const fs::path json = folder_ / "learned.json";
+  ASSERT_EQ(
+      shell(in_quotes(kBin / "bodyschema") + " learn " +
+            in_quotes(run("first") / "samples.lcmlog") + " --root 1 --json >" + in_quotes(json)),
+      0);
+  const auto learned = nlohmann::json::parse(contents(json));
+  const auto result = nlohmann::json::parse(contents(run("first") / "result.json"));
+  EXPECT_EQ(learned, result["structure"]);
+}
+
+}  // namespace
+}  // namespace bodyschema

@@ -1,0 +1,113 @@
+#include "tests/support/rendered_run.h"
+
+#include <stdexcept>
+
+#include "common/bus/convert.h"
+#include "common/scene/scene_renderer.h"
+#include "processes/camera/camera.h"
+#include "processes/marker_estimator/marker_estimator.h"
+#include "processes/motor_babbler/motor_babbler.h"
+#include "processes/observer/observer.h"
+#include "processes/robot_simulator/robot_simulator.h"
+
+namespace bodyschema::test {
+namespace {
+
+RobotSimulatorConfig simulator_config(const std::filesystem::path& rig_folder, std::int64_t seed,
+                                      const std::set<int>& hidden_parts) {
+  RobotSimulatorConfig config = RobotSimulatorConfig::load(rig_folder / "robot_simulator.yaml");
+  config.seed = seed;
+  config.hidden_parts = hidden_parts;
+  return config;
+}
+
+ImageEffects effects(const SimulationConfig& simulation) {
+  return {.blur_sd_px = simulation.blur_sd_px,
+          .noise_sd = simulation.noise_sd,
+          .msaa_samples = simulation.msaa_samples};
+}
+
+}  // namespace
+
+struct RenderedRun::Implementation {
+  Implementation(const std::filesystem::path& rig, std::int64_t seed,
+                 const std::set<int>& hidden_parts)
+      : camera_config(CameraConfig::load(rig / "camera.yaml")),
+        simulator(simulator_config(rig, seed, hidden_parts)),
+        renderer(rig, camera_config.calibration, effects(camera_config.simulation.value())),
+        camera(camera_config,
+               [this](const sim_state_t& state, int frame) { return renderer.render(state, frame); }),
+        estimator(MarkerEstimatorConfig::load(rig / "marker_estimator.yaml"), load_markers(rig)),
+        observer(ObserverConfig::load(rig / "observer.yaml"), load_markers(rig)),
+        babbler(with_enough_samples(MotorBabblerConfig::load(rig / "motor_babbler.yaml")), seed) {
+    const camera_info_t info = make_info(camera_config.calibration, 0);
+    estimator.on_camera_info(info);
+    observer.on_camera_info(info);
+  }
+
+  static MotorBabblerConfig with_enough_samples(MotorBabblerConfig config) {
+    config.stop.min_samples = config.stop.max_samples = 1'000'000'000;
+    return config;
+  }
+
+  const CameraConfig camera_config;
+  RobotSimulator simulator;
+  SceneRenderer renderer;
+  SimulatedCamera camera;
+  MarkerEstimator estimator;
+  Observer observer;
+  MotorBabbler babbler;
+  std::optional<action_command_t> command;
+};
+
+RenderedRun::RenderedRun(const std::filesystem::path& rig_folder, std::int64_t seed,
+                         const std::set<int>& hidden_parts)
+    : implementation_(std::make_unique<Implementation>(rig_folder, seed, hidden_parts)) {}
+
+RenderedRun::~RenderedRun() = default;
+
+int RenderedRun::num_rejected() const {
+  return static_cast<int>(implementation_->babbler.num_rejected());
+}
+
+RenderedRun::Step RenderedRun::next() {
+  Implementation& run = *implementation_;
+  if (!run.command) run.command = run.babbler.on_motion_status(run.simulator.status());
+  for (;;) {
+    if (!run.command) throw std::logic_error("the babbler gave no action");
+    const RobotSimulator::Answer answer = run.simulator.on_command(*run.command);
+    std::optional<sample_t> sample;
+    std::optional<action_command_t> next_command;
+    for (const motion_status_t& status : answer.statuses) {
+      if (auto command = run.babbler.on_motion_status(status)) next_command = command;
+      if (auto seen = run.observer.on_motion_status(status)) sample = seen;
+    }
+    if (!answer.state) {
+      run.command = next_command;
+      continue;
+    }
+    for (const camera_image_t& image : run.camera.on_sim_state(*answer.state)) {
+      const auto markers = run.estimator.on_camera_image(image);
+      if (!markers) throw std::logic_error("the marker estimator refused an image");
+      if (auto seen = run.observer.on_marker_poses(*markers)) sample = seen;
+    }
+    if (!sample) throw std::logic_error("a settled action gave no sample");
+
+    Step step{*sample, from_message(*sample), {}};
+    const Pose X_CW = from_message(answer.state->X_WC).inverse();
+    for (std::size_t i = 0; i < answer.state->true_part.size(); ++i) {
+      step.truth[answer.state->true_part[i]] = X_CW * from_message(answer.state->X_WB[i]);
+    }
+    run.command = run.babbler.on_sample(*sample);
+    if (!run.command) {
+      // After a TEST sample the babbler waits for a verdict; here nobody judges.
+      model_health_t verdict{};
+      verdict.judged_sample = sample->sample_index;
+      verdict.worst_position_m = verdict.worst_rotation_rad = -1;
+      run.command = run.babbler.on_model_health(verdict);
+    }
+    return step;
+  }
+}
+
+}  // namespace bodyschema::test

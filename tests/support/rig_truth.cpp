@@ -1,0 +1,104 @@
+#include "tests/support/rig_truth.h"
+
+#include <algorithm>
+#include <map>
+#include <stdexcept>
+
+namespace bodyschema::test {
+
+RigTruth::RigTruth(const std::filesystem::path& rig_folder)
+    : robot_(load_robot(rig_folder, load_signals(rig_folder), load_markers(rig_folder))) {}
+
+std::vector<int> RigTruth::parts() const {
+  std::vector<int> parts;
+  for (const PartPlacement& part : robot_.parts) parts.push_back(part.part);
+  return parts;
+}
+
+int RigTruth::link_of(int part) const {
+  for (const PartPlacement& placement : robot_.parts) {
+    if (placement.part == part) return placement.link;
+  }
+  throw std::out_of_range("no part " + std::to_string(part));
+}
+
+/// Links from `link` to the world, itself included.
+std::vector<int> RigTruth::ancestors(int link) const {
+  std::vector<int> chain;
+  for (;;) {
+    chain.push_back(link);
+    const std::string& parent = robot_.links[link].parent;
+    if (parent == "world") return chain;
+    link = static_cast<int>(std::find_if(robot_.links.begin(), robot_.links.end(),
+                                         [&](const Link& other) { return other.name == parent; }) -
+                            robot_.links.begin());
+  }
+}
+
+std::set<int> RigTruth::path_signals(int part_a, int part_b) const {
+  const std::vector<int> a = ancestors(link_of(part_a));
+  const std::vector<int> b = ancestors(link_of(part_b));
+  std::set<int> signals;
+  const auto add_unshared = [&](const std::vector<int>& chain, const std::vector<int>& other) {
+    for (const int link : chain) {
+      const bool is_shared = std::find(other.begin(), other.end(), link) != other.end();
+      const auto& joint = robot_.links[link].joint;
+      if (!is_shared && joint) signals.insert(robot_.joints[*joint].signal);
+    }
+  };
+  add_unshared(a, b);
+  add_unshared(b, a);
+  return signals;
+}
+
+std::string RigTruth::objection(const BodySchema& schema, const std::vector<int>& observed) const {
+  std::map<int, int> component;
+  for (const int part : observed) component[part] = part;
+  const auto join = [&](int a, int b) {
+    const int from = component.at(a), to = component.at(b);
+    for (auto& [part, c] : component) {
+      if (c == from) c = to;
+    }
+    return from != to;
+  };
+
+  std::size_t num_signals = 0;
+  std::size_t num_joined = 0;
+  for (const Edge& edge : schema.edges) {
+    const std::vector<int> used = edge.signals();
+    const std::string name = "edge " + std::to_string(edge.from) + "-" + std::to_string(edge.to);
+    if (!component.count(edge.from) || !component.count(edge.to))
+      return name + " names an unseen part";
+    if (std::set<int>(used.begin(), used.end()) != path_signals(edge.from, edge.to)) {
+      return name + " has the wrong signals";
+    }
+    num_signals += used.size();
+    if (!join(edge.from, edge.to)) return name + " closes a loop";
+    ++num_joined;
+  }
+  if (num_joined + 1 != observed.size()) {
+    return std::to_string(num_joined + 1) + " of " + std::to_string(observed.size()) +
+           " parts joined";
+  }
+
+  // The least number of signals: Kruskal over the true path lengths.
+  std::vector<std::tuple<std::size_t, int, int>> pairs;
+  for (const int a : observed) {
+    for (const int b : observed) {
+      if (a < b) pairs.emplace_back(path_signals(a, b).size(), a, b);
+    }
+  }
+  std::sort(pairs.begin(), pairs.end());
+  for (const int part : observed) component[part] = part;
+  std::size_t least = 0;
+  for (const auto& [length, a, b] : pairs) {
+    if (join(a, b)) least += length;
+  }
+  if (num_signals != least) {
+    return std::to_string(num_signals) + " signals on the edges where " + std::to_string(least) +
+           " suffice";
+  }
+  return "";
+}
+
+}  // namespace bodyschema::test
