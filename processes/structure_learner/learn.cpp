@@ -414,7 +414,10 @@ LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPo
     schema.unconnected.push_back(explain(part, seen == num_seen.end() ? 0 : seen->second,
                                          connected_to_root, search, options.max_signals));
   }
-  schema.complete = !schema.parts.empty() && schema.unconnected.empty();
+  // A part that was never seen is reported, but a tree over all the others is complete (Fig. 8, 11).
+  schema.complete = !schema.parts.empty() &&
+                    std::all_of(schema.parts.begin(), schema.parts.end(),
+                                [&](int part) { return connected_to_root.count(part) > 0; });
 
   estimate_root_pose(samples, measurement, &schema);
   result.outliers = OutlierAttribution(schema, fitted, samples, measurement).run();

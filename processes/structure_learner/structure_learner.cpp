@@ -56,11 +56,12 @@ std::function<body_schema_t()> StructureLearner::take_job() {
         samples.begin(), samples.end(),
         [&](const ActionPoseSample& sample) { return options.root && sample.find(*options.root); });
     if (options.root && !is_root_seen) {
-      // Nothing can hang on a root that nobody saw; that it is missing keeps the schema incomplete.
+      // Nothing can hang on a root that nobody saw: learn without it, and call that incomplete.
       options.expected_parts.push_back(*options.root);
       options.root.reset();
     }
     BodySchema schema = learn(config.signals, samples, options).schema;
+    schema.complete &= options.root == config.options.root;
     schema.last_sample_index = prefix.last_sample_index;
     schema.utime = prefix.utime;
     return to_message(schema);

@@ -175,6 +175,19 @@ TEST(Learn, TellsNeverSeenFromTooFewSamples) {
   EXPECT_EQ(schema.unconnected[1].reason, Unconnected::kNeverSeen);
 }
 
+TEST(Learn, AHiddenPartIsReportedButTheTreeOverTheOthersIsComplete) {
+  Rng rng(19);
+  const auto robot = test::chapter_robot("co", rng);
+  LearnOptions options;
+  options.expected_parts = {1, 2, 3, 4, 5};
+  const auto schema = learn(robot.signals, test::babble(robot, 20, {}, rng), options).schema;
+  EXPECT_TRUE(schema.complete);
+  EXPECT_TRUE(test::is_right(schema, robot));
+  ASSERT_EQ(schema.unconnected.size(), 1u);
+  EXPECT_EQ(schema.unconnected[0].part, 3);
+  EXPECT_EQ(schema.unconnected[0].reason, Unconnected::kNeverSeen);
+}
+
 TEST(Learn, SaysSoWhereNoModelIsValid) {
   Rng rng(18);
   const auto robot = test::chapter_robot("a", rng);
