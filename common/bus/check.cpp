@@ -17,6 +17,8 @@ namespace bodyschema {
 namespace {
 
 constexpr std::int64_t kMaxParts = 10'000;
+constexpr std::int64_t kMaxId = 1'000'000;
+constexpr double kMaxReach_m = 1'000;
 constexpr std::int64_t kMaxTags = 10'000;
 constexpr std::int64_t kMaxSignals = 1'000;
 constexpr std::int64_t kMaxJoints = 100;
@@ -331,6 +333,11 @@ std::string check(const sim_state_t& message) {
   Checker check;
   check.time("utime", message.utime);
   check.integer_at_least("action_id", message.action_id, -1);
+  check.time("fault_epoch", message.fault_epoch);
+  check.integer_at_least("fault_id", message.fault_id, -1);
+  check.text("fault_answer", message.fault_answer, kMaxText);
+  check.each("faults", message.num_faults, message.faults, kMaxGeoms,
+             [&](const std::string& fault) { check.name("fault", fault); });
   check.pose("X_WC", message.X_WC);
   check.each("X_WG", message.num_geoms, message.X_WG, kMaxGeoms,
              [&](const pose_t& X_WG) { check.pose("pose", X_WG); });
@@ -350,6 +357,7 @@ std::string check(const camera_image_t& message) {
   Checker check;
   check.time("utime", message.utime);
   check.integer_at_least("image_seq", message.image_seq, 0);
+  check.text("camera_name", message.camera_name, kMaxName);
   // AprilTag crashes on images below 32 px.
   check.integer_within("width", message.width, 32, 16'384);
   check.integer_within("height", message.height, 32, 16'384);
@@ -388,6 +396,7 @@ std::string check(const marker_poses_t& message) {
   Checker check;
   check.time("utime", message.utime);
   check.integer_at_least("image_seq", message.image_seq, 0);
+  check.text("camera_name", message.camera_name, kMaxName);
   std::int64_t previous = -1;
   check.each("markers", message.num_markers, message.markers, kMaxTags,
              [&](const marker_pose_t& marker) {
@@ -527,6 +536,64 @@ std::string check(const model_health_t& message) {
   return check.problem();
 }
 
+std::string check(const sample_request_t& message) {
+  Checker check;
+  check.time("utime", message.utime);
+  check.name("process_name", message.process_name);
+  check.integer_at_least("first_missing", message.first_missing, 0);
+  check.integer_at_least("last_missing", message.last_missing, message.first_missing);
+  return check.problem();
+}
+
+std::string check(const pose_target_t& message) {
+  Checker check;
+  check.time("utime", message.utime);
+  check.name("sender", message.sender);
+  check.time("epoch", message.epoch);
+  check.integer_at_least("target_id", message.target_id, 0);
+  check.constant("target_kind", message.target_kind, pose_target_t::KIND_RELEASE);
+  const bool has_position = message.target_kind == pose_target_t::KIND_POSITION;
+  check.integer_within("target_part", message.target_part, has_position ? 0 : -1,
+                       has_position ? kMaxId : -1);
+  for (const double coordinate : message.position_m) {
+    check.within("position_m", coordinate, -kMaxReach_m, kMaxReach_m);
+  }
+  check.finite("keep_s", message.keep_s);
+  check.require(message.keep_s >= 0 || message.keep_s == -1, "keep_s", "is neither ≥ 0 nor −1");
+  return check.problem();
+}
+
+std::string check(const control_status_t& message) {
+  Checker check;
+  check.time("utime", message.utime);
+  check.text("sender", message.sender, kMaxName);
+  check.time("target_epoch", message.target_epoch);
+  check.integer_at_least("target_id", message.target_id, -1);
+  check.constant("control_state", message.control_state, control_status_t::CONTROL_RELEASED);
+  check.flag("owns_arm", message.owns_arm);
+  check.text("why", message.why, kMaxText);
+  check.integer_at_least("schema_version", message.schema_version, -1);
+  check.integer_at_least("target_part", message.target_part, -1);
+  check.finite("target_position_m", message.target_position_m);
+  check.measured("predicted_error_m", message.predicted_error_m);
+  check.measured("observed_error_m", message.observed_error_m);
+  check.integer_at_least("num_moves", message.num_moves, 0);
+  return check.problem();
+}
+
+std::string check(const fault_command_t& message) {
+  Checker check;
+  check.time("utime", message.utime);
+  check.name("sender", message.sender);
+  check.time("epoch", message.epoch);
+  check.integer_at_least("fault_id", message.fault_id, 0);
+  check.constant("fault", message.fault, fault_command_t::FAULT_REPAIR);
+  check.text("place", message.place, kMaxName);
+  check.integer_at_least("number", message.number, -1);
+  check.within("amount_deg", message.amount_deg, -180, 180);
+  return check.problem();
+}
+
 std::string check(const process_info_t& message) {
   Checker check;
   check.time("utime", message.utime);
@@ -539,6 +606,8 @@ std::string check(const process_info_t& message) {
   check.constant("phase", message.phase, process_info_t::PHASE_ENDED);
   check.text("activity", message.activity, kMaxText);
   check.text("configuration", message.configuration, kMaxText);
+  check.integer_at_least("cpu_us", message.cpu_us, 0);
+  check.integer_at_least("resident_bytes", message.resident_bytes, 0);
   const std::string* previous = nullptr;
   check.each("counters", message.num_counters, message.counters, kMaxCounters,
              [&](const counter_t& counter) {

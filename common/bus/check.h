@@ -23,6 +23,10 @@ std::string check(const marker_poses_t& message);
 std::string check(const sample_t& message);
 std::string check(const body_schema_t& message);
 std::string check(const model_health_t& message);
+std::string check(const sample_request_t& message);
+std::string check(const pose_target_t& message);
+std::string check(const control_status_t& message);
+std::string check(const fault_command_t& message);
 std::string check(const process_info_t& message);
 
 /// `text` with every byte replaced by '?' that keeps it from being UTF-8 without zero bytes. For

@@ -1,6 +1,7 @@
 #include "common/bus/process.h"
 
 #include <signal.h>
+#include <sys/resource.h>
 #include <spdlog/sinks/stdout_color_sinks.h>
 #include <spdlog/spdlog.h>
 #include <unistd.h>
@@ -56,6 +57,23 @@ std::int64_t now_us() {
       .count();
 }
 
+/// Processor time since the start, user and system [us].
+std::int64_t processor_time_us() {
+  rusage usage{};
+  ::getrusage(RUSAGE_SELF, &usage);
+  const auto microseconds = [](const timeval& time) {
+    return std::int64_t{time.tv_sec} * 1'000'000 + time.tv_usec;
+  };
+  return microseconds(usage.ru_utime) + microseconds(usage.ru_stime);
+}
+
+/// Memory in use; 0 where /proc does not tell.
+std::int64_t resident_bytes() {
+  std::int64_t size_pages = 0, resident_pages = 0;
+  std::ifstream("/proc/self/statm") >> size_pages >> resident_pages;
+  return resident_pages * ::sysconf(_SC_PAGESIZE);
+}
+
 std::string host_name() {
   std::array<char, 256> name{};
   return ::gethostname(name.data(), name.size() - 1) == 0 ? name.data() : "";
@@ -108,6 +126,9 @@ struct Process::Impl {
 
   void publish_info() {
     info.utime = bus.is_replay() ? std::max<std::int64_t>(0, bus.last_utime()) : now_us();
+    // A replay writes the same bytes again.
+    info.cpu_us = bus.is_replay() ? 0 : processor_time_us();
+    info.resident_bytes = bus.is_replay() ? 0 : resident_bytes();
     // std::map: ascending names, as the message wants them.
     std::map<std::string, std::int64_t> all = bus.counters();
     for (const auto& [name, value] : counters) all[name] += value;

@@ -96,6 +96,7 @@ camera_image_t make_image(const cv::Mat& frame, const CameraCalibration& calibra
   camera_image_t image{};
   image.utime = utime;
   image.image_seq = image_seq;
+  image.camera_name = calibration.camera_name;
   image.width = grey.cols;
   image.height = grey.rows;
   image.encoding = encoding.format;

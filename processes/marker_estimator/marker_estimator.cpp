@@ -98,6 +98,7 @@ std::optional<marker_poses_t> MarkerEstimator::on_camera_image(const camera_imag
   marker_poses_t poses;
   poses.utime = image.utime;
   poses.image_seq = image.image_seq;
+  poses.camera_name = image.camera_name;
   set_array(poses.num_markers, poses.markers, std::move(markers));
   num_seen_ = poses.num_markers;
   return poses;

@@ -115,6 +115,10 @@ sim_state_t example_sim_state() {
   message.utime = 1'000'003;
   message.action_id = -1;
   message.seed = -42;
+  message.fault_epoch = 88;
+  message.fault_id = 2;
+  message.fault_answer = "no signal q9";
+  fill(message.num_faults, message.faults, {"stuck q3", "tool 1"});
   message.X_WC = pose(1);
   fill(message.num_geoms, message.X_WG, {pose(2), pose(3), pose(4)});
   message.geom_alpha = {0, 0.5F, 1};
@@ -127,6 +131,7 @@ camera_image_t example_camera_image() {
   camera_image_t message{};
   message.utime = 1'000'004;
   message.image_seq = 8;
+  message.camera_name = "ceiling";
   message.width = 40;
   message.height = 32;
   message.encoding = camera_image_t::ENCODING_GREY;
@@ -155,6 +160,7 @@ marker_poses_t example_marker_poses() {
   marker_poses_t message{};
   message.utime = 1'000'006;
   message.image_seq = 9;
+  message.camera_name = "ceiling";
   std::vector<marker_pose_t> markers;
   for (const int id : {4, 11}) {
     marker_pose_t& marker = markers.emplace_back();
@@ -268,6 +274,61 @@ model_health_t example_model_health() {
   return message;
 }
 
+sample_request_t example_sample_request() {
+  sample_request_t message{};
+  message.utime = 1'700'000'000'000'001;
+  message.process_name = "model_monitor";
+  message.first_missing = 3;
+  message.last_missing = 9;
+  return message;
+}
+
+pose_target_t example_pose_target() {
+  pose_target_t message{};
+  message.utime = 1'700'000'000'000'002;
+  message.sender = "console";
+  message.epoch = 1'700'000'000'000'000;
+  message.target_id = 4;
+  message.target_kind = pose_target_t::KIND_POSITION;
+  message.target_part = 9;
+  message.position_m[0] = 0.3;
+  message.position_m[1] = -0.1;
+  message.position_m[2] = 0.7;
+  message.keep_s = 2.5;
+  return message;
+}
+
+control_status_t example_control_status() {
+  control_status_t message{};
+  message.utime = 1'000'010;
+  message.sender = "console";
+  message.target_epoch = 1'700'000'000'000'000;
+  message.target_id = 4;
+  message.control_state = control_status_t::CONTROL_REACHED;
+  message.owns_arm = 1;
+  message.why = "part 9 is there";
+  message.schema_version = 50;
+  message.target_part = 9;
+  message.target_position_m[0] = 0.3;
+  message.predicted_error_m = 0.0001;
+  message.observed_error_m = -1;
+  message.num_moves = 2;
+  return message;
+}
+
+fault_command_t example_fault_command() {
+  fault_command_t message{};
+  message.utime = 1'700'000'000'000'003;
+  message.sender = "console";
+  message.epoch = 1'700'000'000'000'000;
+  message.fault_id = 2;
+  message.fault = fault_command_t::FAULT_BEND;
+  message.place = "link4";
+  message.number = -1;
+  message.amount_deg = 45;
+  return message;
+}
+
 process_info_t example_process_info() {
   process_info_t message{};
   message.utime = 1'700'000'000'000'000;
@@ -280,6 +341,8 @@ process_info_t example_process_info() {
   message.phase = process_info_t::PHASE_WORKING;
   message.activity = "fits 12 pairs";
   message.configuration = "max_k: 3\n";
+  message.cpu_us = 12'345'678;
+  message.resident_bytes = 40'000'000;
   std::vector<counter_t> counters(2);
   counters[0].counter_name = "malformed SAMPLE";
   counters[0].count = 1;

@@ -16,6 +16,10 @@ marker_poses_t example_marker_poses();
 sample_t example_sample();
 body_schema_t example_body_schema();
 model_health_t example_model_health();
+sample_request_t example_sample_request();
+pose_target_t example_pose_target();
+control_status_t example_control_status();
+fault_command_t example_fault_command();
 process_info_t example_process_info();
 
 /// Calls visit(channel, example message) for every channel.
@@ -31,6 +35,10 @@ void for_each_channel(Visit visit) {
   visit(kLearnedSchema, example_body_schema());
   visit(kBodySchema, example_body_schema());
   visit(kModelHealth, example_model_health());
+  visit(kSampleRequest, example_sample_request());
+  visit(kPoseTarget, example_pose_target());
+  visit(kControlStatus, example_control_status());
+  visit(kFaultCommand, example_fault_command());
   visit(kProcessInfo, example_process_info());
 }
 
