@@ -94,6 +94,7 @@ std::map<std::string, std::vector<std::string>> load_hosts(const Yaml& yaml,
   std::map<std::string, std::vector<std::string>> hosts;
   std::map<std::string, std::string> host_of;
   for (const std::string& host : section.keys()) {
+    if (host == "all") throw section.error(host, "no host may be called that");
     hosts[host] = section.texts(host);
     for (const std::string& process : hosts[host]) {
       const auto [other, is_first] = host_of.try_emplace(process, host);

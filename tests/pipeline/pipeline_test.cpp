@@ -377,6 +377,18 @@ TEST_F(Arm2, APlayedReplayLearnsTheSameAndNoCommandIsOnItsBus) {
     EXPECT_FALSE(fs::exists(run("played") / robot)) << robot;
 }
 
+TEST_F(Arm2, TheRecordingInLogsTeachesTheStructure) {
+  ASSERT_EQ(replay_group("example", kSource / "logs/arm2_example.lcmlog", "--rig arm2"), 0)
+      << contents(folder_ / "example.err");
+  EXPECT_EQ(contents(folder_ / "example.err").find("cannot be read"), std::string::npos)
+      << "make it again, as logs/README.md says: " << contents(folder_ / "example.err");
+  const test::RigTruth truth(kSource / "config/arm2");
+  const auto schemas = read_log(run("example") / "schema.lcmlog", kBodySchema);
+  ASSERT_EQ(schemas.size(), 1u);
+  EXPECT_EQ(truth.objection(from_message(schemas[0]), truth.parts()), "");
+  EXPECT_EQ(result("example")["samples"], 20);
+}
+
 TEST_F(Arm2, AReplayOfSamplesThatAreCutOffSaysWhereAndLearnsFromTheRest) {
   const fs::path whole = run("first") / "samples.lcmlog", cut = folder_ / "cut.lcmlog";
   fs::copy_file(whole, cut, fs::copy_options::overwrite_existing);

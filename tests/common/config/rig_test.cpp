@@ -197,6 +197,8 @@ TEST_F(RigTest, EveryProcessRunsOnExactlyOneHost) {
   EXPECT_EQ(
       error("hosts:\n  a: [log, observer]\n  b: [oberver]\n"),
       "network.yaml:6: hosts.b: 'oberver' is no process of this rig; there are: observer, log");
+  EXPECT_EQ(error("hosts:\n  all: [log, observer]\n"),
+            "network.yaml:5: hosts.all: no host may be called that");
   EXPECT_EQ(error("hosts: [a, b]\n"), "network.yaml:4: hosts: expected a mapping 'key: value'");
   EXPECT_EQ(error("hosts:\n  a: observer\n"), "network.yaml:5: hosts.a: expected a list of texts");
 }
