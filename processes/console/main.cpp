@@ -6,6 +6,7 @@
 #include <iostream>
 #include <stdexcept>
 
+#include "processes/console/log.h"
 #include "processes/console/offline.h"
 #include "processes/console/watch.h"
 
@@ -13,6 +14,7 @@ int main(int argc, char** argv) {
   CLI::App console("A robot arm's body schema: learn it, look at it, judge it", "bodyschema");
   console.require_subcommand(1);
   bodyschema::add_offline_commands(console);
+  bodyschema::add_log_command(console);
   bodyschema::add_watch_command(console);
   try {
     console.parse(argc, argv);

@@ -3,6 +3,7 @@
 #include <CLI/CLI.hpp>
 
 #include "common/bus/process.h"
+#include "common/bus/rig_door.h"
 #include "processes/motor_babbler/motor_babbler.h"
 
 using namespace bodyschema;
@@ -27,14 +28,13 @@ int main(int argc, char** argv) {
           babbler.is_done() ? process_info_t::PHASE_DONE : process_info_t::PHASE_WORKING;
       process.set_activity(phase, babbler.activity());
     };
-    Bus& bus = process.bus();
-    bus.subscribe<motion_status_t>(kMotionStatus, [&](const motion_status_t& status) {
-      send(babbler.on_motion_status(status));
-    });
-    bus.subscribe<sample_t>(kSample,
-                            [&](const sample_t& sample) { send(babbler.on_sample(sample)); });
-    bus.subscribe<model_health_t>(
-        kModelHealth, [&](const model_health_t& health) { send(babbler.on_model_health(health)); });
+    const RigDoor door(process.rig_folder());
+    door.subscribe(process, kMotionStatus,
+                   [&](const motion_status_t& status) { send(babbler.on_motion_status(status)); });
+    door.subscribe(process, kSample,
+                   [&](const sample_t& sample) { send(babbler.on_sample(sample)); });
+    door.subscribe(process, kModelHealth,
+                   [&](const model_health_t& health) { send(babbler.on_model_health(health)); });
     process.on_tick([&](std::int64_t now_us) { send(babbler.on_tick(now_us)); });
     process.run();
   };
