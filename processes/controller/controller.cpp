@@ -1,5 +1,6 @@
 #include "processes/controller/controller.h"
 
+#include <Eigen/Cholesky>
 #include <algorithm>
 #include <cmath>
 #include <sstream>
@@ -16,8 +17,10 @@ using S = control_status_t;
 
 constexpr char kSource[] = "controller";
 constexpr std::int64_t kRepeat_us = 1'000'000;
-constexpr int kMaxExpired = 3;     // in a row
-constexpr double kArrived = 1e-9;  // of a range
+constexpr int kMaxExpired = 3;         // in a row
+constexpr double kMovedCamera = 33.1;  // chi^2_6(0.99999): the camera is not where the schema says
+constexpr double kSurprise = 14.2;     // chi^2_3(0.9973): what is seen refutes the schema
+constexpr double kArrived = 1e-9;      // of a range
 
 std::int64_t microseconds(double seconds) { return std::llround(seconds * 1e6); }
 
@@ -257,10 +260,23 @@ void Controller::observe(const sample_t& message) {
   const PartObservation* part = sample.find(target_.target_part);
   observed_error_m_ = -1;
   if (part == nullptr || !schema_) return;
-  const PartObservation* root = sample.find(schema_->root);
-  const Pose X_CR = root != nullptr ? root->X_CB : schema_->X_CR;
+  // One view of the root is worse than the schema's mean over all: half a degree is 9 mm at 1 m.
+  // Unless the camera was moved since.
+  Pose X_CR = schema_->X_CR;
+  if (const PartObservation* root = sample.find(schema_->root)) {
+    const Vector6d off = log(X_CR.inverse() * root->X_CB);
+    const Matrix6d covariance = root->covariance + schema_->X_CR_covariance;
+    if (off.dot(covariance.ldlt().solve(off)) > kMovedCamera) X_CR = root->X_CB;
+  }
   observed_offset_ = position_of(target_) - X_CR.inverse() * part->X_CB.translation();
   observed_error_m_ = observed_offset_.norm();
+  const Eigen::Matrix3d R_RB = (X_CR.inverse() * part->X_CB).linear();
+  const Eigen::Matrix3d covariance =
+      R_RB * part->covariance.topLeftCorner<3, 3>() * R_RB.transpose();
+  // By the schema the part is at the aim.
+  const Eigen::Vector3d surprise = observed_offset_ - (position_of(target_) - aim_);
+  is_observation_sure_ =
+      !part->X_CB_other && surprise.dot(covariance.ldlt().solve(surprise)) > kSurprise;
 }
 
 EdgeState Controller::worst_edge(std::string* name) const {
@@ -458,7 +474,7 @@ Controller::Command Controller::arrive() {
   if (sample_ && sample_->rest_begin_utime == motion_->rest_since_utime) observe(*sample_);
   predicted_error_m_ = predicted_error_m();
   const bool is_off = observed_error_m_ > config_.reached_m;
-  if (is_off && num_corrections_ < config_.max_corrections &&
+  if (is_off && is_observation_sure_ && num_corrections_ < config_.max_corrections &&
       observed_error_m_ <= config_.max_correction_m) {
     ++num_corrections_;
     aim_ += observed_offset_;

@@ -173,6 +173,7 @@ class Controller {
   double predicted_error_m_ = -1;
   double observed_error_m_ = -1;
   Eigen::Vector3d observed_offset_ = Eigen::Vector3d::Zero();  ///< target minus seen position, in R
+  bool is_observation_sure_ = false;  ///< unambiguous, and not to be explained by its covariance
   Stopwatch guard_, taking_, quiet_, keep_;
 
   // What was sent.

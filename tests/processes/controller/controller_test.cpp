@@ -202,10 +202,13 @@ class Bench {
       if (hidden.count(part)) continue;
       part_observation_t seen{};
       seen.part_id = part;
-      Pose X_CB = planar().X_CR * X_RB;
+      Pose X_CB = X_CC_moved * planar().X_CR * X_RB;
       if (part == 4) X_CB.translation() += bend_m;
       seen.X_CB = seen.X_CB_other = to_message(X_CB);
-      to_message(Matrix6d(Matrix6d::Identity() * 1e-6), seen.covariance);
+      const double variance = part == 4 ? observation_sd_m * observation_sd_m : 1e-6;
+      to_message(Matrix6d(Matrix6d::Identity() * variance), seen.covariance);
+      seen.has_other = part == 4 && is_ambiguous;
+      seen.error_ratio = seen.has_other ? 2 : 0;
       parts.push_back(seen);
     }
     set_array(sample.num_parts, sample.parts, parts);
@@ -253,6 +256,9 @@ class Bench {
   std::function<std::string(const action_command_t&)> rejects = [](const auto&) { return ""; };
   std::set<int> hidden;
   Eigen::Vector3d bend_m = Eigen::Vector3d::Zero();
+  double observation_sd_m = 0.001;
+  bool is_ambiguous = false;
+  Pose X_CC_moved = Pose::Identity();
   std::int64_t now = 1000 * kSecond;
   std::int64_t num_samples = 0;
   std::vector<action_command_t> moves;  ///< as served, each once
@@ -1052,6 +1058,29 @@ TEST(ControllerTest, WhatIsSeenAtTheEndCorrectsOnce) {
   EXPECT_LT(bench.status.observed_error_m, 0.001);
   EXPECT_NEAR(bench.status.predicted_error_m, bench.bend_m.norm(), 0.001);
   EXPECT_TRUE(bench.has_why("seen there")) << bench.status.why;
+}
+
+TEST(ControllerTest, WhatIsSeenUnsurelyCorrectsNothing) {
+  for (const bool is_ambiguous : {false, true}) {
+    Bench bench;
+    bench.bend_m = Eigen::Vector3d(0.01, -0.005, 0);
+    bench.is_ambiguous = is_ambiguous;
+    if (!is_ambiguous) bench.observation_sd_m = 0.01;
+    bench.start();
+    bench.give(position_target(0, kNear));
+    ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED));
+    EXPECT_NEAR(bench.status.observed_error_m, bench.bend_m.norm(), 1e-3);
+    EXPECT_LT(bench.status.predicted_error_m, 1e-4);
+  }
+}
+
+TEST(ControllerTest, ACameraThatWasMovedIsSeenByTheRoot) {
+  Bench bench;
+  bench.X_CC_moved.translation() = Eigen::Vector3d(0.2, 0, 0.1);
+  bench.start();
+  bench.give(position_target(0, kNear));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED));
+  EXPECT_LT(bench.status.observed_error_m, 1e-4);
 }
 
 TEST(ControllerTest, WhatIsSeenTooFarOffIsToldButNotBelieved) {
