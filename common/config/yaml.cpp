@@ -5,6 +5,8 @@
 #include <algorithm>
 #include <cmath>
 #include <fstream>
+#include <iomanip>
+#include <limits>
 #include <sstream>
 
 namespace bodyschema {
@@ -269,6 +271,23 @@ void Yaml::finish() const {
     }
   }
   for (const Yaml& below : usage_->below) below.finish();
+}
+
+std::string yaml_quoted(const std::string& text) {
+  std::string result = "\"";
+  for (const char c : text) {
+    if (c == '"' || c == '\\') result += '\\';
+    result += static_cast<unsigned char>(c) < 0x20 ? ' ' : c;
+  }
+  return result + '"';
+}
+
+std::string yaml_list(const std::vector<double>& values) {
+  std::ostringstream result;
+  result << std::setprecision(std::numeric_limits<double>::max_digits10) << '[';
+  for (std::size_t i = 0; i < values.size(); ++i) result << (i ? ", " : "") << values[i];
+  result << ']';
+  return result.str();
 }
 
 }  // namespace bodyschema

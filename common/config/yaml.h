@@ -83,4 +83,9 @@ class Yaml {
   std::shared_ptr<Usage> usage_;
 };
 
+// For state files that a process writes and Yaml reads again: `text` in YAML's double quoted style
+// (control characters become spaces), and [a, b, …] with exact numbers.
+std::string yaml_quoted(const std::string& text);
+std::string yaml_list(const std::vector<double>& values);
+
 }  // namespace bodyschema

@@ -8,6 +8,7 @@
 
 #include "processes/console/log.h"
 #include "processes/console/offline.h"
+#include "processes/console/operate.h"
 #include "processes/console/watch.h"
 
 int main(int argc, char** argv) {
@@ -15,6 +16,7 @@ int main(int argc, char** argv) {
   console.require_subcommand(1);
   bodyschema::add_offline_commands(console);
   bodyschema::add_log_command(console);
+  bodyschema::add_operate_commands(console);
   bodyschema::add_watch_command(console);
   try {
     console.parse(argc, argv);
