@@ -46,8 +46,9 @@ int main(int argc, char** argv) {
                    [&](const sample_t& sample) { send(babbler.on_sample(sample)); });
     door.subscribe(process, kModelHealth,
                    [&](const model_health_t& health) { send(babbler.on_model_health(health)); });
-    door.subscribe(process, kControlStatus,
-                   [&](const control_status_t& status) { send(babbler.on_control_status(status)); });
+    process.bus().subscribe(kControlStatus, [&](const control_status_t& status) {
+      send(babbler.on_control_status(status));
+    });
     door.subscribe(process, kBodySchema,
                    [&](const body_schema_t& schema) { babbler.on_body_schema(schema); });
     std::map<std::string, std::int64_t> reported;
