@@ -43,8 +43,9 @@ struct LogReport {
 /// Reads a log from its beginning, event by event.
 class LogReader {
  public:
+  /// Begins at `from_byte`, where an event must begin: the position() of an earlier reader.
   /// @throws std::runtime_error if there is no such file, it cannot be read or is not an LCM log.
-  explicit LogReader(const std::filesystem::path& path);
+  explicit LogReader(const std::filesystem::path& path, std::int64_t from_byte = 0);
   ~LogReader();
   LogReader(const LogReader&) = delete;
   LogReader& operator=(const LogReader&) = delete;
