@@ -54,8 +54,11 @@ class RunWatch {
   std::vector<std::int64_t> action_ids_;  ///< of samples_
   std::optional<BodySchema> schema_;
   std::optional<model_health_t> health_;
-  /// action id → noise-free poses in the camera's frame
-  std::map<std::int64_t, std::vector<PartObservation>> truth_;
+  struct Truth {
+    std::int64_t action_id = 0;
+    std::vector<PartObservation> parts;  ///< noise-free poses in the camera's frame
+  };
+  std::map<std::int64_t, Truth> truth_;  ///< by the time at which the arm came to rest
   std::map<std::string, Heard> processes_;
 };
 
