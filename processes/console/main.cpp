@@ -6,7 +6,9 @@
 #include <iostream>
 #include <stdexcept>
 
+#include "processes/console/log.h"
 #include "processes/console/offline.h"
+#include "processes/console/status.h"
 #include "processes/console/watch.h"
 
 int main(int argc, char** argv) {
@@ -14,6 +16,8 @@ int main(int argc, char** argv) {
   console.require_subcommand(1);
   bodyschema::add_offline_commands(console);
   bodyschema::add_watch_command(console);
+  bodyschema::add_status_command(console);
+  bodyschema::add_log_command(console);
   try {
     console.parse(argc, argv);
     // A full disk must not look like a result.

@@ -15,6 +15,7 @@
 #include "common/bus/images_url.h"
 #include "common/bus/sample_intake.h"
 #include "common/config/rig.h"
+#include "processes/console/group.h"
 #include "processes/console/picture.h"
 #include "processes/console/run_watch.h"
 #include "processes/console/schema_json.h"
@@ -24,10 +25,6 @@ namespace bodyschema {
 namespace {
 
 using Clock = std::chrono::steady_clock;
-
-const std::set<std::string> kGroup = {"camera",           "marker_estimator", "model_monitor",
-                                      "motor_babbler",    "observer",         "robot_simulator",
-                                      "structure_learner"};
 
 volatile std::sig_atomic_t interrupted = 0;
 void on_signal(int) { interrupted = 1; }
