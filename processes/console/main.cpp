@@ -8,6 +8,7 @@
 
 #include "processes/console/log.h"
 #include "processes/console/offline.h"
+#include "processes/console/report.h"
 #include "processes/console/status.h"
 #include "processes/console/watch.h"
 
@@ -17,6 +18,7 @@ int main(int argc, char** argv) {
   bodyschema::add_offline_commands(console);
   bodyschema::add_watch_command(console);
   bodyschema::add_status_command(console);
+  bodyschema::add_report_command(console);
   bodyschema::add_log_command(console);
   try {
     console.parse(argc, argv);
