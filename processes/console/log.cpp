@@ -5,8 +5,15 @@
 
 #include <CLI/CLI.hpp>
 #include <iostream>
+#include <map>
 #include <memory>
+#include <set>
 #include <stdexcept>
+#include <tuple>
+#include <utility>
+#include <vector>
+
+#include "common/bus/all_channels.h"
 
 namespace bodyschema {
 namespace {
@@ -15,7 +22,11 @@ double seconds(std::int64_t from_us, std::int64_t to_us) {
   return static_cast<double>(to_us - from_us) * 1e-6;
 }
 
-void run_log(const std::string& file, bool json, bool check) {
+void run_log(const std::string& file, const std::string& copy, bool json, bool check) {
+  if (!copy.empty()) {
+    std::cout << thin_log(file, copy) << " events in " << copy << std::endl;
+    return;
+  }
   const LogSummary summary = summarize_log(file);
   if (json) {
     std::cout << log_json(summary).dump(2) << std::endl;
@@ -68,9 +79,47 @@ std::string log_text(const LogSummary& summary) {
   return text + (flaws.empty() ? "whole, and every message can be read\n" : flaws);
 }
 
+std::int64_t thin_log(const std::filesystem::path& file, const std::filesystem::path& copy) {
+  std::set<std::string> kept_channels;
+  for_each_channel([&](const auto& channel) { kept_channels.insert(channel.name); });
+  kept_channels.erase(kCameraImage.name);
+  kept_channels.erase(kSimState.name);
+  // Which PROCESS_INFO is a process' last is known at the end only.
+  std::map<std::tuple<std::string, std::string, int>, std::pair<std::int64_t, std::int64_t>> infos;
+  std::int64_t index = 0;
+  for_each_event(file, [&](const LogEvent& event) {
+    ++index;
+    if (event.channel != kProcessInfo.name) return;
+    const auto info = decode<process_info_t>(event.data.data(), event.data.size()).message;
+    if (!info) return;
+    const auto [place, is_first] =
+        infos.try_emplace({info->host, info->process_name, info->pid}, index, index);
+    place->second.second = index;
+  });
+  std::set<std::int64_t> kept_infos;
+  for (const auto& [process, first_last] : infos)
+    kept_infos.insert({first_last.first, first_last.second});
+
+  std::string bytes;
+  std::int64_t written = 0;
+  std::set<std::pair<std::string, std::vector<std::uint8_t>>> seen;
+  index = 0;
+  for_each_event(file, [&](const LogEvent& event) {
+    ++index;
+    if (!kept_channels.contains(event.channel)) return;
+    if (event.channel == kProcessInfo.name && !kept_infos.contains(index)) return;
+    if (!seen.emplace(event.channel, event.data).second) return;
+    const auto encoded = encode_event(event.channel, event.data, event.event_utime, written++);
+    bytes.append(encoded.begin(), encoded.end());
+  });
+  write_file_atomically(copy, bytes);
+  return written;
+}
+
 void add_log_command(CLI::App& console) {
   struct Arguments {
     std::string file;
+    std::string copy;
     bool json = false;
     bool check = false;
   };
@@ -80,7 +129,12 @@ void add_log_command(CLI::App& console) {
   log->add_flag("--json", arguments->json, "Print JSON");
   log->add_flag("--check", arguments->check,
                 "Fail unless it is whole and every message of ours can be read");
-  log->callback([arguments] { run_log(arguments->file, arguments->json, arguments->check); });
+  log->add_option("--thin", arguments->copy,
+                  "Write a small copy: no images, no ground truth, nothing twice")
+      ->type_name("FILE");
+  log->callback([arguments] {
+    run_log(arguments->file, arguments->copy, arguments->json, arguments->check);
+  });
 }
 
 }  // namespace bodyschema

@@ -1,5 +1,7 @@
 #pragma once
 
+#include <cstdint>
+#include <filesystem>
 #include <nlohmann/json.hpp>
 #include <string>
 
@@ -18,5 +20,11 @@ void add_log_command(CLI::App& console);
 nlohmann::ordered_json log_json(const LogSummary& summary);
 /// A table of the channels, and a line for every flaw.
 std::string log_text(const LogSummary& summary);
+
+/// Writes a small copy of a log, enough to replay and to report it: without images, ground truth
+/// (SIM_STATE) and channels that are not ours, every message once however often it was repeated, of
+/// PROCESS_INFO each process' first and last. Returns the number of events written.
+/// @throws std::runtime_error; nothing is left of the copy then.
+std::int64_t thin_log(const std::filesystem::path& file, const std::filesystem::path& copy);
 
 }  // namespace bodyschema

@@ -13,6 +13,7 @@
 #include <fstream>
 #include <functional>
 #include <nlohmann/json.hpp>
+#include <opencv2/imgcodecs.hpp>
 #include <set>
 #include <sstream>
 #include <string>
@@ -190,8 +191,19 @@ TEST_F(Arm2, TheResultSaysWhatWasLearnedAndHowWell) {
   }
 }
 
-TEST_F(Arm2, ThePictureIsThere) {
-  EXPECT_EQ(contents(run("first") / "detections.png").substr(1, 3), "PNG");
+TEST_F(Arm2, ThePictureIsAFrameWithMarkersDrawnIn) {
+  const cv::Mat picture = cv::imread((run("first") / "detections.png").string());
+  ASSERT_EQ(picture.size(), cv::Size(1280, 960));
+  // The frame is grey; what has colour was drawn: outlines (yellow) and the axes of each marker.
+  int num_yellow = 0, num_red = 0, num_blue = 0;
+  for (const cv::Vec3b& bgr : cv::Mat_<cv::Vec3b>(picture)) {
+    num_yellow += bgr[2] - bgr[0] > 100 && bgr[1] - bgr[0] > 60;
+    num_red += bgr[2] - bgr[1] > 100;
+    num_blue += bgr[0] - bgr[2] > 100;
+  }
+  EXPECT_GT(num_yellow, 500);
+  EXPECT_GT(num_red, 50);
+  EXPECT_GT(num_blue, 10);
 }
 
 TEST_F(Arm2, TheBusAndTheImagesAreRecordedApart) {
