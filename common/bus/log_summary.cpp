@@ -2,75 +2,108 @@
 
 #include <spdlog/fmt/fmt.h>
 
+#include <algorithm>
 #include <stdexcept>
-#include <utility>
+#include <system_error>
 
-#include "common/bus/channels.h"
+#include "common/bus/all_channels.h"
 
 namespace bodyschema {
 namespace {
 
-using Judge = std::string (*)(const LogEvent&);
+/// What is wrong with the event's bytes; "" if nothing is.
+using Check = std::string (*)(const LogEvent&, std::set<std::string>& versions);
 
 template <class Message>
-std::pair<std::string, Judge> judge_of(const Channel<Message>& channel) {
-  return {channel.name, [](const LogEvent& event) {
-            return decode<Message>(event.data.data(), event.data.size()).problem;
-          }};
+std::string check_event(const LogEvent& event, std::set<std::string>& versions) {
+  const Decoded<Message> decoded = decode<Message>(event.data.data(), event.data.size());
+  if constexpr (std::is_same_v<Message, process_info_t>) {
+    if (decoded.message) versions.insert(decoded.message->program_version);
+  }
+  return decoded.problem;
 }
 
-/// For every channel of ours, what is wrong with an event of it.
-const std::map<std::string, Judge>& judges() {
-  static const std::map<std::string, Judge> judges = {
-      judge_of(kActionCommand), judge_of(kMotionStatus),  judge_of(kSimState),
-      judge_of(kCameraImage),   judge_of(kCameraInfo),    judge_of(kMarkerPoses),
-      judge_of(kSample),        judge_of(kSampleRequest), judge_of(kLearnedSchema),
-      judge_of(kBodySchema),    judge_of(kModelHealth),   judge_of(kPoseTarget),
-      judge_of(kControlStatus), judge_of(kFaultCommand),  judge_of(kProcessInfo)};
-  return judges;
+const std::map<std::string, Check>& checks() {
+  static const std::map<std::string, Check> kChecks = [] {
+    std::map<std::string, Check> all;
+    for_each_channel([&]<class Message>(const Channel<Message>& channel) {
+      all[channel.name] = &check_event<Message>;
+    });
+    return all;
+  }();
+  return kChecks;
 }
 
 }  // namespace
 
-bool LogSummary::has_readable(const std::string& channel) const {
-  const auto found = channels.find(channel);
-  return found != channels.end() && found->second.is_readable();
+void LogSummary::add(const LogEvent& event) {
+  if (events++ == 0) first_utime = event.event_utime;
+  last_utime = std::max(last_utime, event.event_utime);
+  // A foreign name may hold any bytes.
+  ChannelSummary& channel = channels[as_text(event.channel)];
+  if (channel.events++ == 0) channel.first_utime = event.event_utime;
+  channel.last_utime = std::max(channel.last_utime, event.event_utime);
+  channel.bytes += static_cast<std::int64_t>(event.data.size());
+  const auto check = checks().find(event.channel);
+  channel.is_known = check != checks().end();
+  if (!channel.is_known) return;
+  const std::string problem = check->second(event, versions);
+  if (!problem.empty() && channel.unreadable++ == 0) channel.first_problem = as_text(problem);
+}
+
+std::int64_t LogSummary::unreadable() const {
+  std::int64_t sum = 0;
+  for (const auto& [name, channel] : channels) sum += channel.unreadable;
+  return sum;
+}
+
+LogSummary summarize_log(const std::filesystem::path& file) {
+  LogSummary summary;
+  LogReader reader(file);
+  try {
+    while (reader.next()) summary.add(reader.event());
+    if (reader.report().truncated_at_byte) {
+      summary.damage = fmt::format("is cut off in the middle of an event at byte {}",
+                                   *reader.report().truncated_at_byte);
+    }
+  } catch (const std::runtime_error&) {
+    if (reader.position() == 0) throw;
+    summary.damage = fmt::format("is damaged: no event begins at byte {}", reader.position());
+  }
+  std::error_code error;
+  const auto size = std::filesystem::file_size(file, error);
+  summary.file_bytes = error ? reader.position() : static_cast<std::int64_t>(size);
+  summary.unread_bytes = std::max<std::int64_t>(0, summary.file_bytes - reader.position());
+  return summary;
 }
 
 std::string problem_of(const LogEvent& event) {
-  const auto judge = judges().find(event.channel);
-  return judge == judges().end() ? "" : judge->second(event);
+  std::set<std::string> versions;
+  const auto check = checks().find(event.channel);
+  return check == checks().end() ? "" : check->second(event, versions);
 }
 
-LogSummary summarize_log(const std::filesystem::path& path) {
-  LogSummary summary;
-  LogReader reader(path);
-  std::int64_t first_utime = 0;
-  const auto next = [&] {
-    try {
-      return reader.next();
-    } catch (const std::runtime_error& error) {
-      if (reader.position() == 0) throw;
-      summary.ending =
-          fmt::format("{}; the {} events before it are good", error.what(), reader.report().events);
-      return false;
-    }
-  };
-  while (next()) {
-    const LogEvent& event = reader.event();
-    if (summary.num_events++ == 0) first_utime = event.event_utime;
-    summary.duration_s = static_cast<double>(event.event_utime - first_utime) * 1e-6;
-    LogSummary::Channel& channel = summary.channels[event.channel];
-    ++channel.num_events;
-    const std::string problem = problem_of(event);
-    if (!problem.empty() && channel.num_unreadable++ == 0) channel.problem = problem;
+std::string program_version() { return BODYSCHEMA_VERSION; }
+
+std::string flaws_text(const LogSummary& summary) {
+  std::string text;
+  if (summary.events == 0 && summary.damage.empty()) text += "holds no event\n";
+  if (!summary.damage.empty()) {
+    text += fmt::format("{}; the {} events before it are good, {} bytes after it are lost\n",
+                        summary.damage, summary.events, summary.unread_bytes);
   }
-  if (const auto byte = reader.report().truncated_at_byte) {
-    summary.ending =
-        fmt::format("{}: is cut off in the event at byte {}; the {} events before it are good",
-                    path.string(), *byte, summary.num_events);
+  for (const auto& [name, channel] : summary.channels) {
+    if (channel.unreadable == 0) continue;
+    text += fmt::format("{}: {} of {} messages cannot be read: {}\n", name, channel.unreadable,
+                        channel.events, channel.first_problem);
   }
-  return summary;
+  const std::string own = program_version();
+  for (const std::string& version : summary.versions) {
+    if (version == own) continue;
+    text += fmt::format("recorded with version {}, this is {}{}\n", version, own,
+                        summary.unreadable() > 0 ? ": read it with that version" : "");
+  }
+  return text;
 }
 
 }  // namespace bodyschema

@@ -4,6 +4,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <iterator>
 
 #include "common/bus/convert.h"
 
@@ -38,7 +39,7 @@ void RunWatch::on_sim_state(const sim_state_t& state) {
     part.X_CB = X_CW * from_message(state.X_WB[i]);
     parts.push_back(part);
   }
-  truth_[state.action_id] = std::move(parts);
+  truth_[state.utime] = {state.action_id, std::move(parts)};
 }
 
 void RunWatch::on_process_info(const process_info_t& info, std::int64_t now_us) {
@@ -114,9 +115,13 @@ std::vector<ActionPoseSample> RunWatch::held_out() const {
     if (samples_[i].purpose != Purpose::kTest) continue;
     ActionPoseSample sample = samples_[i];
     if (has_truth()) {
-      const auto truth = truth_.find(action_ids_[i]);
-      if (truth == truth_.end()) continue;
-      sample.parts = truth->second;
+      // Ids count within their source, so the time decides: the newest state before the sample's
+      // last frame.
+      const auto after = truth_.upper_bound(sample.utime);
+      if (after == truth_.begin()) continue;
+      const Truth& truth = std::prev(after)->second;
+      if (truth.action_id != action_ids_[i]) continue;
+      sample.parts = truth.parts;
     }
     result.push_back(std::move(sample));
   }

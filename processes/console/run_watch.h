@@ -65,8 +65,11 @@ class RunWatch {
   std::optional<BodySchema> schema_;
   std::int64_t learned_sample_ = -1;
   std::optional<model_health_t> health_;
-  /// action id → noise-free poses in the camera's frame
-  std::map<std::int64_t, std::vector<PartObservation>> truth_;
+  struct Truth {
+    std::int64_t action_id = 0;
+    std::vector<PartObservation> parts;  ///< noise-free poses in the camera's frame
+  };
+  std::map<std::int64_t, Truth> truth_;  ///< by the time at which the arm came to rest
   std::map<std::string, Heard> processes_;
 };
 

@@ -22,6 +22,7 @@
 #include "common/bus/rig_door.h"
 #include "common/bus/sample_intake.h"
 #include "common/config/rig.h"
+#include "processes/console/group.h"
 #include "processes/console/picture.h"
 #include "processes/console/run_watch.h"
 #include "processes/console/schema_json.h"

@@ -2,119 +2,163 @@
 
 #include <gtest/gtest.h>
 
-#include <filesystem>
-#include <fstream>
+#include <set>
 #include <stdexcept>
 #include <string>
 #include <vector>
 
-#include "common/bus/event_log.h"
+#include "common/bus/all_channels.h"
 #include "tests/common/bus/bus_test_support.h"
 #include "tests/lcmtypes/example_messages.h"
 
 namespace bodyschema::test {
 namespace {
 
-/// Two SAMPLEs, a MOTION_STATUS and an event of somebody else, 1 s apart.
-void write_log(const std::filesystem::path& file) {
+void write_every_channel(const std::filesystem::path& file) {
   LogAppender log(file);
-  const auto bytes = encode(kSample, example_sample());
-  log.append_bytes("SAMPLE", bytes, 1'000'000);
-  log.append_bytes("SAMPLE", bytes, 2'000'000);
-  log.append_bytes("MOTION_STATUS", encode(kMotionStatus, example_motion_status()), 3'000'000);
-  log.append_bytes("SOMEBODY_ELSES", std::vector<std::uint8_t>{1, 2, 3}, 4'000'000);
+  process_info_t info = example_process_info();
+  info.program_version = program_version();
+  log.append(kProcessInfo, info);
+  for_each_channel([&](const auto& channel, const auto& message) {
+    if constexpr (!std::is_same_v<decltype(message), const process_info_t&>)
+      log.append(channel, message);
+  });
 }
 
-TEST(LogSummary, CountsEventsPerChannelAndReadsWhoeversChannels) {
+TEST(LogSummary, AllChannelsAreThoseOfTheContract) {
+  std::set<std::string> visited, contract;
+  bodyschema::for_each_channel([&](const auto& channel) { visited.insert(channel.name); });
+  test::for_each_channel([&](const auto& channel, const auto&) { contract.insert(channel.name); });
+  EXPECT_EQ(visited, contract);
+}
+
+TEST(LogSummary, AWholeLogIsSound) {
   const TemporaryFolder folder;
-  write_log(folder / "log");
+  write_every_channel(folder / "log");
   const LogSummary summary = summarize_log(folder / "log");
-  EXPECT_EQ(summary.num_events, 4);
-  EXPECT_DOUBLE_EQ(summary.duration_s, 3);
-  EXPECT_EQ(summary.ending, "");
-  ASSERT_EQ(summary.channels.size(), 3U);
-  EXPECT_EQ(summary.channels.at("SAMPLE").num_events, 2);
-  for (const auto& [name, channel] : summary.channels) {
-    EXPECT_EQ(channel.num_unreadable, 0) << name << ": " << channel.problem;
-    EXPECT_TRUE(summary.has_readable(name));
-  }
-  EXPECT_FALSE(summary.has_readable("MARKER_POSES"));
+  EXPECT_TRUE(summary.is_sound()) << flaws_text(summary);
+  EXPECT_EQ(flaws_text(summary), "");
+  EXPECT_EQ(summary.events, 15);
+  EXPECT_EQ(summary.channels.size(), 15U);
+  EXPECT_EQ(summary.channels.at("SAMPLE").events, 1);
+  EXPECT_EQ(summary.unread_bytes, 0);
+  EXPECT_EQ(summary.file_bytes,
+            static_cast<std::int64_t>(std::filesystem::file_size(folder / "log")));
+  EXPECT_EQ(summary.versions, std::set<std::string>{program_version()});
 }
 
-TEST(LogSummary, ALogThatIsCutOffAnywhereSaysSoAndCountsWhatIsWhole) {
+TEST(LogSummary, ALogThatIsCutOffAnywhereSaysWhere) {
   const TemporaryFolder folder;
-  write_log(folder / "log");
-  std::vector<std::int64_t> event_ends;
+  write_every_channel(folder / "log");
+  const auto bytes = read_bytes(folder / "log");
+  std::set<std::size_t> boundaries;
   {
     LogReader reader(folder / "log");
-    while (reader.next()) event_ends.push_back(reader.position());
+    do boundaries.insert(static_cast<std::size_t>(reader.position()));
+    while (reader.next());
   }
-  const auto size = static_cast<std::int64_t>(std::filesystem::file_size(folder / "log"));
-  ASSERT_EQ(event_ends.back(), size);
-  for (std::int64_t cut = 0; cut < size; cut += cut < 40 ? 1 : 7) {
-    std::filesystem::copy_file(folder / "log", folder / "cut",
-                               std::filesystem::copy_options::overwrite_existing);
-    std::filesystem::resize_file(folder / "cut", static_cast<std::uintmax_t>(cut));
-    std::int64_t whole = 0, last_end = 0;
-    for (const std::int64_t end : event_ends) {
-      if (end > cut) continue;
-      ++whole;
-      last_end = end;
-    }
+  for (std::size_t size = 1; size < bytes.size(); size += 13) {
+    write_bytes(folder / "cut", {bytes.begin(), bytes.begin() + static_cast<std::ptrdiff_t>(size)});
     const LogSummary summary = summarize_log(folder / "cut");
-    EXPECT_EQ(summary.num_events, whole) << cut;
-    const std::string expected =
-        last_end == cut ? ""
-                        : (folder / "cut").string() + ": is cut off in the event at byte " +
-                              std::to_string(last_end) + "; the " + std::to_string(whole) +
-                              " events before it are good";
-    EXPECT_EQ(summary.ending, expected) << cut;
+    const std::size_t whole = *std::prev(boundaries.upper_bound(size));
+    EXPECT_EQ(summary.unread_bytes, static_cast<std::int64_t>(size - whole)) << size;
+    if (size == whole) continue;
+    EXPECT_FALSE(summary.is_sound());
+    EXPECT_NE(flaws_text(summary).find("cut off in the middle of an event at byte " +
+                                       std::to_string(whole)),
+              std::string::npos)
+        << flaws_text(summary);
   }
 }
 
-TEST(LogSummary, DamageInTheMiddleIsFoundWhereItIs) {
+TEST(LogSummary, ADamagedLogSaysWhereAndCountsWhatComesBefore) {
   const TemporaryFolder folder;
-  write_log(folder / "log");
-  std::int64_t second = 0;
-  {
-    LogReader reader(folder / "log");
-    reader.next();
-    second = reader.position();
-  }
-  std::fstream file(folder / "log", std::ios::binary | std::ios::in | std::ios::out);
-  file.seekp(second);
-  file << "xxxx";
-  file.close();
+  write_every_channel(folder / "log");
+  auto bytes = read_bytes(folder / "log");
+  LogReader reader(folder / "log");
+  reader.next();
+  reader.next();
+  const auto third = static_cast<std::size_t>(reader.position());
+  bytes[third] ^= 0xFF;
+  write_bytes(folder / "log", bytes);
   const LogSummary summary = summarize_log(folder / "log");
-  EXPECT_EQ(summary.num_events, 1);
-  EXPECT_EQ(summary.ending, (folder / "log").string() + ": is damaged: no event begins at byte " +
-                                std::to_string(second) + "; the 1 events before it are good");
+  EXPECT_EQ(summary.events, 2);
+  EXPECT_EQ(summary.unread_bytes, static_cast<std::int64_t>(bytes.size() - third));
+  EXPECT_NE(flaws_text(summary).find("no event begins at byte " + std::to_string(third)),
+            std::string::npos);
 }
 
-TEST(LogSummary, MessagesOfAnOlderVersionAreCountedAndTheFirstIsExplained) {
+// The fingerprint is the first thing in a message; any change of a type changes it.
+TEST(LogSummary, MessagesOfAnotherVersionAreCountedAndNamed) {
   const TemporaryFolder folder;
   {
     LogAppender log(folder / "log");
-    std::vector<std::uint8_t> older = encode(kSample, example_sample());
-    older[7] ^= 1;  // the fingerprint's last byte
-    log.append_bytes("SAMPLE", older, 1);
-    log.append_bytes("SAMPLE", older, 2);
-    log.append_bytes("MOTION_STATUS", encode(kMotionStatus, example_motion_status()), 3);
+    process_info_t info = example_process_info();
+    info.program_version = "0.0.7";
+    log.append(kProcessInfo, info);
+    auto bytes = encode(kSample, example_sample());
+    log.append_bytes(kSample.name, bytes, 1);
+    bytes[3] ^= 1;
+    log.append_bytes(kSample.name, bytes, 2);
+    log.append_bytes(kSample.name, bytes, 3);
   }
   const LogSummary summary = summarize_log(folder / "log");
-  const LogSummary::Channel& samples = summary.channels.at("SAMPLE");
-  EXPECT_EQ(samples.num_events, 2);
-  EXPECT_EQ(samples.num_unreadable, 2);
-  EXPECT_NE(samples.problem.find("is not sample_t's"), std::string::npos) << samples.problem;
-  EXPECT_FALSE(summary.has_readable("SAMPLE"));
-  EXPECT_TRUE(summary.has_readable("MOTION_STATUS"));
+  EXPECT_EQ(summary.channels.at("SAMPLE").events, 3);
+  EXPECT_EQ(summary.channels.at("SAMPLE").unreadable, 2);
+  EXPECT_FALSE(summary.is_sound());
+  const std::string flaws = flaws_text(summary);
+  EXPECT_NE(flaws.find("SAMPLE: 2 of 3 messages cannot be read: fingerprint"), std::string::npos)
+      << flaws;
+  EXPECT_NE(flaws.find("recorded with version 0.0.7, this is " + program_version()),
+            std::string::npos)
+      << flaws;
 }
 
-TEST(LogSummary, WhatIsNoLogIsRefused) {
+TEST(LogSummary, SenselessMessagesAreCounted) {
   const TemporaryFolder folder;
-  std::ofstream(folder / "text") << "t,q1,part,x,y,z,qw,qx,qy,qz and so on, more than a header\n";
+  sample_t sample = example_sample();
+  sample.action[0] = std::numeric_limits<double>::quiet_NaN();
+  std::vector<std::uint8_t> bytes(static_cast<std::size_t>(sample.getEncodedSize()));
+  sample.encode(bytes.data(), 0, static_cast<int>(bytes.size()));
+  LogAppender(folder / "log").append_bytes(kSample.name, bytes, 1);
+  EXPECT_EQ(summarize_log(folder / "log").unreadable(), 1);
+}
+
+TEST(LogSummary, ChannelsOfOthersAreNoFlaw) {
+  const TemporaryFolder folder;
+  write_every_channel(folder / "log");
+  LogAppender(folder / "log").append_bytes("OTHER\xFF", std::vector<std::uint8_t>{1, 2, 3}, 1);
+  const LogSummary summary = summarize_log(folder / "log");
+  EXPECT_TRUE(summary.is_sound());
+  ASSERT_TRUE(summary.channels.contains("OTHER?"));
+  EXPECT_FALSE(summary.channels.at("OTHER?").is_known);
+}
+
+TEST(LogSummary, AnEmptyLogIsNotSoundAndWhatIsNoLogAnError) {
+  const TemporaryFolder folder;
+  write_bytes(folder / "empty", {});
+  EXPECT_FALSE(summarize_log(folder / "empty").is_sound());
+  EXPECT_EQ(flaws_text(summarize_log(folder / "empty")), "holds no event\n");
+  write_bytes(folder / "text", {'h', 'e', 'l', 'l', 'o'});
   EXPECT_THROW(summarize_log(folder / "text"), std::runtime_error);
-  EXPECT_THROW(summarize_log(folder / "nothing"), std::runtime_error);
+  EXPECT_THROW(summarize_log(folder / "none"), std::runtime_error);
+}
+
+TEST(LogReader, ReadsOnWhereAnotherOneStopped) {
+  const TemporaryFolder folder;
+  write_every_channel(folder / "log");
+  LogReader first(folder / "log");
+  for (int i = 0; i < 4; ++i) ASSERT_TRUE(first.next());
+  LogReader second(folder / "log", first.position());
+  EXPECT_EQ(second.position(), first.position());
+  for (int i = 4; i < 15; ++i) {
+    ASSERT_TRUE(first.next());
+    ASSERT_TRUE(second.next());
+    EXPECT_EQ(second.event().event_number, first.event().event_number);
+    EXPECT_EQ(second.event().data, first.event().data);
+    EXPECT_EQ(second.position(), first.position());
+  }
+  EXPECT_FALSE(second.next());
 }
 
 }  // namespace

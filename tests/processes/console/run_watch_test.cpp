@@ -21,11 +21,13 @@ sample_t sample(std::int64_t index, const std::vector<int>& parts,
   }
   sample_t message = to_message(result);
   message.action_id = 100 + index;
+  message.utime = 1000 * (message.action_id + 1) + 500;  // a frame after the arm had come to rest
   return message;
 }
 
 sim_state_t truth(std::int64_t action_id, const std::vector<int>& parts) {
   sim_state_t state{};
+  state.utime = 1000 * (action_id + 1);
   state.action_id = action_id;
   // The camera stands at (0, 0, 5) in the world, without rotation.
   Pose X_WC = Pose::Identity();
@@ -170,6 +172,20 @@ TEST(RunWatchTest, WithASimulatorTheyHoldTheTruthOfTheirAction) {
   ASSERT_EQ(held_out[1].parts.size(), 3U);  // also what the camera did not see
   const Pose& X_CB = held_out[1].parts[2].X_CB;
   EXPECT_LT((X_CB.translation() - Eigen::Vector3d(3, 0, 0)).norm(), 1e-12);
+}
+
+// The controller counts its actions from 0 as the babbler does.
+TEST(RunWatchTest, AnActionOfTheSameNumberOfAnotherSourceDoesNotChangeTheTruth) {
+  RunWatch watch;
+  watch.on_sim_state(truth(100, {1}));
+  watch.on_sample(sample(0, {1}, Purpose::kTest));
+  sim_state_t other = truth(100, {1});
+  other.utime += 10'000;
+  other.X_WB[0].position_m[0] = 77;
+  watch.on_sim_state(other);
+  ASSERT_EQ(watch.held_out().size(), 1U);
+  EXPECT_LT((watch.held_out()[0].parts[0].X_CB.translation() - Eigen::Vector3d(1, 0, 0)).norm(),
+            1e-12);
 }
 
 TEST(RunWatchTest, VisibilityIsAShareOfAllSamples) {
