@@ -256,6 +256,7 @@ void report(const RunWatch& watch, const BestPicture& picture, const WatchArgume
   // On one of several hosts, or in a replay, not all of them are here.
   const std::vector<std::pair<std::string, std::string>> files = {
       {"result.json", "this table"},
+      {"report.html", "the same with pictures and plots, for a browser"},
       {"detections.png", "a camera frame with the markers found in it"},
       {"schema.lcmlog", "the body schema: ./run show FILE"},
       {"samples.lcmlog", "the samples: ./run learn FILE"},
