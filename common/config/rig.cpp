@@ -125,7 +125,7 @@ std::map<std::string, std::vector<std::string>> load_hosts(const Yaml& yaml,
 }  // namespace
 
 std::string Network::bus_url() const { return url(port, ttl); }
-std::string Network::images_url() const { return url(port + 1, ttl); }
+std::string Network::images_url() const { return url(port + 1, hosts.empty() ? ttl : 0); }
 
 std::vector<std::string> Network::share_of(const std::string& host) const {
   const auto share = hosts.find(host);

@@ -46,6 +46,9 @@ struct Network {
   std::map<std::string, std::vector<std::string>> hosts;
 
   std::string bus_url() const;
+  /// Of a group that is split over hosts images never leave their host: where frames are lost, the
+  /// pieces of theirs would fill every other host's memory for incomplete datagrams, for 30 s each
+  /// time, and small messages would be lost with them.
   std::string images_url() const;
   /// The processes of `host`, in the order of hosts.
   /// @throws std::invalid_argument if there is no such host.

@@ -176,6 +176,8 @@ TEST_F(RigTest, HostsHaveTheirSharesOfTheGroup) {
   EXPECT_EQ(read.share_of("eye"),
             (std::vector<std::string>{"camera", "marker_estimator", "log_images"}));
   EXPECT_EQ(read.share_of("desk"), (std::vector<std::string>{"observer", "log"}));
+  EXPECT_EQ(read.bus_url(), "udpm://239.255.76.67:7700?ttl=1");
+  EXPECT_EQ(read.images_url(), "udpm://239.255.76.67:7701?ttl=0") << "images leave their host";
   try {
     read.share_of("dsk");
     ADD_FAILURE() << "a host that there is not";
