@@ -6,6 +6,8 @@
 #include <iostream>
 #include <stdexcept>
 
+#include "processes/console/driver_test.h"
+#include "processes/console/fault.h"
 #include "processes/console/offline.h"
 #include "processes/console/watch.h"
 
@@ -14,6 +16,8 @@ int main(int argc, char** argv) {
   console.require_subcommand(1);
   bodyschema::add_offline_commands(console);
   bodyschema::add_watch_command(console);
+  bodyschema::add_driver_test_command(console);
+  bodyschema::add_fault_command(console);
   try {
     console.parse(argc, argv);
     // A full disk must not look like a result.
