@@ -294,13 +294,20 @@ ConformancePlan plan_conformance(const DriverLink& link, const ConformanceOption
     throw std::runtime_error(fmt::format("the arm does not come to rest within {} s; {}",
                                          options.motion_s, text_of(tester.newest())));
   }
+  // HOLD moves nothing and says where the arm is.
+  Command hold = tester.make(Command::KIND_HOLD);
+  hold.epoch -= 1;
+  link.send(hold);
+  const auto held = tester.await(0, options.answer_s, [&](const Status& s) {
+    return is_answer(s, hold) && s.rest_since_utime >= 0;
+  });
   const std::vector<Signal>& signals = options.signals.signals;
   ConformancePlan plan;
-  plan.is_from_middle = rest->commanded.size() != signals.size();
+  plan.is_from_middle = !held || held->commanded.size() != signals.size();
   for (std::size_t i = 0; i < signals.size(); ++i) {
     const double range = signals[i].upper - signals[i].lower;
     const double middle = 0.5 * (signals[i].lower + signals[i].upper);
-    const double here = plan.is_from_middle ? middle : rest->commanded[i];
+    const double here = plan.is_from_middle ? middle : held->commanded[i];
     plan.here.push_back(std::clamp(here, signals[i].lower, signals[i].upper));
     plan.there.push_back(plan.here[i] +
                          (plan.here[i] > middle ? -1 : 1) * options.step_share * range);
