@@ -76,14 +76,12 @@ void bend(Robot& robot, int link, double angle_rad) {
   // About an axis across the link, between its two transverse axes: seldom that of a joint.
   Eigen::Index least = 0;
   along.cwiseAbs().minCoeff(&least);
-  const Eigen::Vector3d across =
-      (Eigen::Vector3d::Unit(least) - along[least] * along).normalized();
+  const Eigen::Vector3d across = (Eigen::Vector3d::Unit(least) - along[least] * along).normalized();
   const Eigen::Vector3d axis = (across + along.cross(across)).normalized();
   const Pose X = Eigen::Translation3d(p_middle) * Eigen::AngleAxisd(angle_rad, axis) *
                  Eigen::Translation3d(-p_middle);
-  displace(robot, link, X, [&](const Eigen::Vector3d& p_L) {
-    return (p_L - p_middle).dot(along) > 0;
-  });
+  displace(robot, link, X,
+           [&](const Eigen::Vector3d& p_L) { return (p_L - p_middle).dot(along) > 0; });
 }
 
 Pose bump(std::int64_t seed, int count) {

@@ -51,7 +51,8 @@ void set_grey(XMLElement* element, double grey) {
   set(element, "rgba", text({grey, grey, grey, 1}));
 }
 
-/// Without a mass and contacts where `exists` is false: then it only keeps its place among the geoms.
+/// Without a mass and contacts where `exists` is false: then it only keeps its place among the
+/// geoms.
 void add_shape(XMLElement* body, const std::string& name, const Shape& shape, bool exists = true) {
   XMLElement* geom = child(body, "geom");
   set(geom, "name", name);
@@ -317,8 +318,7 @@ SceneDescription SceneDescription::load(const std::filesystem::path& rig_folder)
   return description;
 }
 
-Scene::Scene(const std::filesystem::path& rig_folder)
-    : Scene(SceneDescription::load(rig_folder)) {
+Scene::Scene(const std::filesystem::path& rig_folder) : Scene(SceneDescription::load(rig_folder)) {
   if (const auto problem = collision(*make_data())) {
     throw std::runtime_error(rig_folder.string() + ": at the start pose (home) " + *problem);
   }

@@ -74,7 +74,8 @@ class Scene {
   Pose part_pose(const mjData& data, int part_index) const;
   /// X_WM: the marker's frame as it is now, on its part or fallen. @throws std::out_of_range.
   Pose marker_pose(const mjData& data, int tag_id) const;
-  /// SIM_STATE of these poses, every geom but those of tools that are not mounted opaque, utime as in `data`, seed 0 and action_id -1.
+  /// SIM_STATE of these poses, every geom but those of tools that are not mounted opaque, utime as
+  /// in `data`, seed 0 and action_id -1.
   sim_state_t state(const mjData& data) const;
   /// SIM_STATE as it is when a perfect servo has carried out `action`; no physics, no limits.
   /// @throws std::invalid_argument on a wrong number of signals.

@@ -105,8 +105,8 @@ class Tester {
     sent_at_ = heard_.size();
     sent_s_ = link_.now_s();
     link_.send(command);
-    const auto answer = await(sent_at_, options_.answer_s,
-                              [&](const Status& s) { return is_answer(s, command); });
+    const auto answer =
+        await(sent_at_, options_.answer_s, [&](const Status& s) { return is_answer(s, command); });
     if (!answer) {
       throw Failed{fmt::format("no answer within {} s to id {} of {}", options_.answer_s,
                                command.action_id, command.source)};
@@ -146,9 +146,8 @@ class Tester {
   }
 
   Status await_rest(const std::function<bool(const Status&)>& also) {
-    const auto rest = await(heard_.size() - 1, options_.motion_s, [&](const Status& s) {
-      return s.rest_since_utime >= 0 && also(s);
-    });
+    const auto rest = await(heard_.size() - 1, options_.motion_s,
+                            [&](const Status& s) { return s.rest_since_utime >= 0 && also(s); });
     if (!rest) {
       throw Failed{fmt::format("not at rest within {} s; the newest status is {}",
                                options_.motion_s, text_of(newest()))};
@@ -191,9 +190,9 @@ class Tester {
   /// Ready for the next rule, whatever the last one left behind. False if the arm will not rest.
   bool recover() {
     if (newest().stop_latched) link_.send(make(Command::KIND_RESUME));
-    return await(heard_.size() - 1, options_.motion_s, [](const Status& s) {
-             return s.rest_since_utime >= 0 && !s.stop_latched;
-           }).has_value();
+    return await(heard_.size() - 1, options_.motion_s,
+                 [](const Status& s) { return s.rest_since_utime >= 0 && !s.stop_latched; })
+        .has_value();
   }
 
   const std::optional<std::string>& time_ran_backwards() const { return time_ran_backwards_; }
@@ -234,11 +233,9 @@ Command begin_motion(Tester& tester, const std::vector<double>& action) {
   });
   Tester::expect(next && next->state == Status::STATE_MOVING, "MOVING", next);
   // In lock-step everything has been said by now.
-  const auto end = tester.await(tester.sent_at(), kNoTime_s - (tester.now_s() - tester.sent_s()),
-                                [&](const Status& s) {
-                                  return is_answer(s, command) &&
-                                         s.state == Status::STATE_SETTLED;
-                                });
+  const auto end = tester.await(
+      tester.sent_at(), kNoTime_s - (tester.now_s() - tester.sent_s()),
+      [&](const Status& s) { return is_answer(s, command) && s.state == Status::STATE_SETTLED; });
   if (end) throw Skipped{"the motion took no time"};
   return command;
 }
@@ -288,8 +285,8 @@ ConformancePlan plan_conformance(const DriverLink& link, const ConformanceOption
   if (first->stop_latched) {
     throw std::runtime_error("the driver is stopped: RESUME it first, once the arm is clear");
   }
-  const auto rest = tester.await(0, options.motion_s,
-                                 [](const Status& s) { return s.rest_since_utime >= 0; });
+  const auto rest =
+      tester.await(0, options.motion_s, [](const Status& s) { return s.rest_since_utime >= 0; });
   if (!rest) {
     throw std::runtime_error(fmt::format("the arm does not come to rest within {} s; {}",
                                          options.motion_s, text_of(tester.newest())));
@@ -418,9 +415,9 @@ std::vector<RuleResult> test_conformance(const DriverLink& link, const Conforman
          Status end = t.life(first, t.sent_at()).back();
          expect(end.state == Status::STATE_SETTLED, "SETTLED", end);
          Status again = t.ask(first);
-         expect(again.state == Status::STATE_SETTLED &&
-                    again.rest_since_utime == end.rest_since_utime,
-                "SETTLED as before", again);
+         expect(
+             again.state == Status::STATE_SETTLED && again.rest_since_utime == end.rest_since_utime,
+             "SETTLED as before", again);
          end = t.settle(here);
          again = t.ask(first);
          expect(again.state == Status::STATE_STOPPED && !again.reason.empty(),
@@ -558,9 +555,9 @@ std::vector<RuleResult> test_conformance(const DriverLink& link, const Conforman
     if (!is_ready) {
       const bool is_blamed = blamed == rule.number;
       result.outcome = is_blamed ? RuleResult::Outcome::kFailed : RuleResult::Outcome::kSkipped;
-      result.note = (is_blamed ? "expected the arm at rest after RESUME, came "
-                               : "the arm is not ready: ") +
-                    text_of(t.newest());
+      result.note =
+          (is_blamed ? "expected the arm at rest after RESUME, came " : "the arm is not ready: ") +
+          text_of(t.newest());
       continue;
     }
     if (progress) progress(fmt::format("{:2} {}", rule.number, rule.name));

@@ -80,7 +80,8 @@ class LiveDriver {
 
  private:
   std::vector<motion_status_t> receive(double seconds) {
-    bus_.handle(std::chrono::milliseconds(static_cast<int>(std::clamp(seconds, 0.001, 60.0) * 1e3)));
+    bus_.handle(
+        std::chrono::milliseconds(static_cast<int>(std::clamp(seconds, 0.001, 60.0) * 1e3)));
     return std::exchange(statuses_, {});
   }
 
@@ -127,7 +128,8 @@ class LiveDriver {
 void confirm(const Arguments& arguments, const ConformanceOptions& options,
              const ConformancePlan& plan) {
   std::cerr << fmt::format(
-      "The test moves the arm on {} about 25 times between\n  {}\nand\n  {}\n(command units; {}).\n",
+      "The test moves the arm on {} about 25 times between\n  {}\nand\n  {}\n(command units; "
+      "{}).\n",
       arguments.in, list_of(plan.here), list_of(plan.there),
       plan.is_from_middle
           ? "the driver does not say where the arm is, so the FIRST MOTION GOES TO THE MIDDLE of "

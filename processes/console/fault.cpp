@@ -108,7 +108,8 @@ void add_fault_command(CLI::App& console) {
       ->required()
       ->check(CLI::Range(0, 9999));
   add("camera-bump", "The camera is knocked to another pose", Command::FAULT_CAMERA_BUMP);
-  CLI::App* drift = add("drift", "A link bends more with each action; 0 ends it", Command::FAULT_DRIFT);
+  CLI::App* drift =
+      add("drift", "A link bends more with each action; 0 ends it", Command::FAULT_DRIFT);
   drift->add_option("LINK", command.place, "Name in robot.yaml")->required();
   drift->add_option("DEG_PER_SAMPLE", command.amount_deg, "Angle an action [deg]")
       ->required()

@@ -95,7 +95,8 @@ int open_terminal(std::string* name) {
   // Open for as long as the robot lives: a driver that leaves must not look like a cable pulled.
   const int slave = ::open(name->c_str(), O_RDWR | O_NOCTTY | O_CLOEXEC);
   termios settings{};
-  if (slave < 0 || ::tcgetattr(slave, &settings) != 0) throw std::runtime_error("cannot open " + *name);
+  if (slave < 0 || ::tcgetattr(slave, &settings) != 0)
+    throw std::runtime_error("cannot open " + *name);
   ::cfmakeraw(&settings);
   ::tcsetattr(slave, TCSANOW, &settings);
   return master;

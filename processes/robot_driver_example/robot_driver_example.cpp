@@ -86,12 +86,12 @@ RobotDriver::RobotDriver(RobotDriverConfig config, std::optional<motion_status_t
 }
 
 std::string RobotDriver::refusal(const Command& command) const {
-  if (is_stopped_) return "stopped: RESUME first";                     // R12
+  if (is_stopped_) return "stopped: RESUME first";  // R12
   if (is_lost_) return "the robot does not answer";
-  if (motion_) return "the arm moves";                                 // R6
+  if (motion_) return "the arm moves";  // R6
   if (!is_at_rest()) return "the arm is being halted";
   const std::vector<Signal>& signals = config_.signals.signals;
-  if (command.action.size() != signals.size()) {                       // R5
+  if (command.action.size() != signals.size()) {  // R5
     return "the robot has " + std::to_string(signals.size()) + " signals, the action " +
            std::to_string(command.action.size());
   }

@@ -94,9 +94,9 @@ class RobotDriver {
 
   // The robot.
   bool is_lost_ = true;
-  std::int64_t halted_at_ = 0;    // since it was lost; 0: not yet
-  std::int64_t order_ = 0;       // N of the newest order
-  std::int64_t heard_at_ = 0;    // newest report
+  std::int64_t halted_at_ = 0;  // since it was lost; 0: not yet
+  std::int64_t order_ = 0;      // N of the newest order
+  std::int64_t heard_at_ = 0;   // newest report
   std::int64_t rest_since_ = -1;
   std::vector<double> position_;  // as reported, command units
   std::int64_t num_strange_lines_ = 0;
@@ -105,8 +105,8 @@ class RobotDriver {
   std::optional<action_command_t> motion_;  // under way
   std::int64_t motion_since_ = 0;
   bool is_stopped_ = false;
-  motion_status_t status_{};             // what is repeated
-  std::deque<motion_status_t> served_;   // the newest answers
+  motion_status_t status_{};            // what is repeated
+  std::deque<motion_status_t> served_;  // the newest answers
   std::int64_t said_at_ = 0;
 };
 

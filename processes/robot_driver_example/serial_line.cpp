@@ -18,7 +18,8 @@ constexpr std::size_t kMaxLine = 4096;
 
 bool SerialLine::open() {
   close();
-  // O_NOCTTY: a hang-up must not become a SIGHUP. O_NONBLOCK: a port without carrier must not block.
+  // O_NOCTTY: a hang-up must not become a SIGHUP. O_NONBLOCK: a port without carrier must not
+  // block.
   file_ = ::open(device_.c_str(), O_RDWR | O_NOCTTY | O_NONBLOCK | O_CLOEXEC);
   if (file_ < 0) {
     fail(std::strerror(errno));

@@ -81,8 +81,7 @@ motion_status_t load_status(const Yaml& yaml) {
   status.kind = static_cast<std::int8_t>(yaml.integer("kind", 0, action_command_t::KIND_RESUME));
   status.purpose =
       static_cast<std::int8_t>(yaml.integer("purpose", 0, action_command_t::PURPOSE_CONTROL));
-  status.state =
-      static_cast<std::int8_t>(yaml.integer("state", 0, motion_status_t::STATE_HOLDING));
+  status.state = static_cast<std::int8_t>(yaml.integer("state", 0, motion_status_t::STATE_HOLDING));
   status.reason = yaml.text("reason");
   set_array(status.num_signals, status.commanded, yaml.numbers("commanded"));
   return status;
@@ -345,8 +344,7 @@ RobotSimulator::Answer RobotSimulator::on_fault(const fault_command_t& command) 
       body_ = *std::move(body);
       faults_ = std::move(faults);
       body_.data->time += kFaultTakes_s;
-      rest_since_utime_ = status_.rest_since_utime = status_.utime =
-          microseconds(body_.data->time);
+      rest_since_utime_ = status_.rest_since_utime = status_.utime = microseconds(body_.data->time);
       answer.statuses.push_back(status_);
     } else {
       fault_answer_ = "here it would be in " + problem + ": move the arm elsewhere first";

@@ -56,9 +56,9 @@ class RobotSimulator {
 
   /// Answers every command as lcmtypes/DRIVER.md says: MOVE with ACCEPTED, MOVING, SETTLED, or
   /// REJECTED, or EXPIRED; HOLD with HOLDING; STOP with STOPPED, and from then on every MOVE is
-  /// rejected until RESUME, which is answered with IDLE. A command that was answered before (source,
-  /// epoch and action id) moves nothing: it gets its answer again, STOPPED where it had settled and
-  /// the arm has moved on since.
+  /// rejected until RESUME, which is answered with IDLE. A command that was answered before
+  /// (source, epoch and action id) moves nothing: it gets its answer again, STOPPED where it had
+  /// settled and the arm has moved on since.
   Answer on_command(const action_command_t& command);
 
   /// Breaks the arm, or says in the state's fault_answer why not; each (sender, epoch, fault_id)

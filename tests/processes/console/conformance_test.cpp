@@ -91,9 +91,9 @@ class FakeDriver {
     s.stop_latched = latched_;
     const bool is_move = c.kind == Command::KIND_MOVE && c.action_id >= 0;
     set_array(s.num_signals, s.commanded,
-              is_move                        ? c.action
+              is_move                      ? c.action
               : sin_ == Sin::kHoldsNowhere ? std::vector<double>()
-                                             : position());
+                                           : position());
     return s;
   }
 
@@ -107,8 +107,7 @@ class FakeDriver {
 
   void say(const Status& s) {
     out_.push_back(s);
-    const bool is_refusal =
-        s.state == Status::STATE_REJECTED || s.state == Status::STATE_EXPIRED;
+    const bool is_refusal = s.state == Status::STATE_REJECTED || s.state == Status::STATE_EXPIRED;
     if (!is_refusal || sin_ == Sin::kRepeatsRefusals) last_ = s;
     said_at_ = now_;
   }
@@ -354,8 +353,7 @@ INSTANTIATE_TEST_SUITE_P(
                     std::pair{Sin::kOneListOfIds, 9}, std::pair{Sin::kHoldsNowhere, 10},
                     std::pair{Sin::kHoldsLater, 11}, std::pair{Sin::kForgetsTheInterrupted, 11},
                     std::pair{Sin::kLatchIsForgotten, 12}, std::pair{Sin::kMovesWhileStopped, 12},
-                    std::pair{Sin::kResumesTheMotion, 13},
-                    std::pair{Sin::kResumeStaysLatched, 14},
+                    std::pair{Sin::kResumesTheMotion, 13}, std::pair{Sin::kResumeStaysLatched, 14},
                     std::pair{Sin::kGoesOnAfterRestart, 15}, std::pair{Sin::kNoStartGuard, 16},
                     std::pair{Sin::kStopDiesWithIt, 17}),
     [](const auto& info) {

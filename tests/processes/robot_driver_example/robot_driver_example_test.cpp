@@ -26,8 +26,9 @@ class Lab {
  public:
   explicit Lab(std::optional<Status> record = std::nullopt, std::int64_t now = kStart)
       : now_(now),
-        driver(RobotDriverConfig::load(std::string(EXAMPLE_RIG) + "/robot_driver_example.yaml"),
-               std::move(record), [this](const Status& s) { return save(s); }, now) {}
+        driver(
+            RobotDriverConfig::load(std::string(EXAMPLE_RIG) + "/robot_driver_example.yaml"),
+            std::move(record), [this](const Status& s) { return save(s); }, now) {}
 
   void connect() {
     take(driver.on_connect(now_));
@@ -63,7 +64,7 @@ class Lab {
   void take(const RobotDriver::Answer& answer) {
     for (const Status& status : answer.statuses) {
       EXPECT_EQ(check(status), "");
-      if (!heard.empty()) EXPECT_GE(status.utime, heard.back().utime);
+      EXPECT_GE(status.utime, heard.empty() ? 0 : heard.back().utime);
       heard.push_back(status);
     }
     for (const std::string& line : answer.lines) {
@@ -77,9 +78,8 @@ class Lab {
       if (verb != "?") {
         words >> order;
       } else {
-        take(driver.on_line("AT " + std::to_string(order) + (is_moving ? " MOVING" : " REST") +
-                                " 1 2 3",
-                            now_));
+        take(driver.on_line(
+            "AT " + std::to_string(order) + (is_moving ? " MOVING" : " REST") + " 1 2 3", now_));
       }
     }
   }
@@ -275,10 +275,9 @@ TEST(RobotDriver, CountsLinesThatAreNoReports) {
   Lab lab;
   lab.connect();
   const std::string n = std::to_string(lab.order);
-  for (const std::string& line :
-       {std::string("ERR GO"), std::string(""), "AT " + n + " REST 1 2",
-        "AT " + n + " REST 1 2 3 4", "AT " + n + " ASLEEP 1 2 3", "AT " + n + " REST 1 2 x",
-        std::string("AT x REST 1 2 3")}) {
+  for (const std::string& line : {std::string("ERR GO"), std::string(""), "AT " + n + " REST 1 2",
+                                  "AT " + n + " REST 1 2 3 4", "AT " + n + " ASLEEP 1 2 3",
+                                  "AT " + n + " REST 1 2 x", std::string("AT x REST 1 2 3")}) {
     lab.take(lab.driver.on_line(line, lab.now_));
   }
   EXPECT_EQ(lab.driver.num_strange_lines(), 7);

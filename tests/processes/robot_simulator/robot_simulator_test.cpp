@@ -1,7 +1,6 @@
 #include "processes/robot_simulator/robot_simulator.h"
 
 #include <gtest/gtest.h>
-
 #include <unistd.h>
 
 #include <algorithm>
@@ -12,7 +11,6 @@
 #include <sstream>
 
 #include "common/bus/convert.h"
-
 #include "common/config/yaml.h"
 
 namespace bodyschema {
@@ -469,8 +467,7 @@ TEST(RobotSimulator, ABentLinkMovesWhatIsBeyondItsMiddle) {
   RobotSimulator whole(config("arm7"));
   simulator.on_command(move_to(1, kElsewhere));
   whole.on_command(move_to(1, kElsewhere));
-  const Pose moved =
-      relative(whole.state(), 5, 6).inverse() * relative(simulator.state(), 5, 6);
+  const Pose moved = relative(whole.state(), 5, 6).inverse() * relative(simulator.state(), 5, 6);
   EXPECT_NEAR(rotation_angle(moved), 8 * M_PI / 180, 1e-4);
 }
 
@@ -491,8 +488,7 @@ TEST(RobotSimulator, ADriftBendsWithEveryActionAndSurvivesARestart) {
   // What is refused is no action.
   simulator.on_command(move_to(4, {9, 0, 0, 0, 0, 0, 40}));
   EXPECT_NEAR(bent_deg(simulator), 1, 1e-6);
-  EXPECT_EQ(simulator.state().faults.at(0),
-            "drift base 0.25 deg per action, 1 deg so far");
+  EXPECT_EQ(simulator.state().faults.at(0), "drift base 0.25 deg per action, 1 deg so far");
   simulator.save(file);
   RobotSimulator restarted(config("arm7"));
   restarted.restore(file);
@@ -593,7 +589,8 @@ TEST(RobotSimulator, AllFaultsTogetherSurviveARestartBitByBit) {
   EXPECT_EQ(bytes(restarted.state()), bytes(lasting.state()));
   EXPECT_EQ(bytes(restarted.status()), bytes(lasting.status()));
   // Known already.
-  EXPECT_TRUE(restarted.on_fault(fault(2, Broken::FAULT_BEND, "upper_arm", -1, -4)).statuses.empty());
+  EXPECT_TRUE(
+      restarted.on_fault(fault(2, Broken::FAULT_BEND, "upper_arm", -1, -4)).statuses.empty());
   action_command_t next = move_to(2, kSomewhere);
   next.utime = lasting.status().utime;
   lasting.on_command(next);
