@@ -158,7 +158,9 @@ RobotDriver::Answer RobotDriver::on_command(const Command& command, std::int64_t
     again.utime = time_;
     again.rest_since_utime = rest_since_;
     again.stop_latched = is_stopped_;
-    if (again.state == Status::STATE_SETTLED && !is_newest) {
+    const bool is_where =
+        again.state == Status::STATE_SETTLED || again.state == Status::STATE_HOLDING;
+    if (is_where && !is_newest) {
       again.state = Status::STATE_STOPPED;
       again.reason = "was carried out; the arm may have moved since";
     }

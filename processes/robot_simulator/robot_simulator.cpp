@@ -219,8 +219,10 @@ motion_status_t RobotSimulator::answer_again(const motion_status_t& served) cons
   again.utime = microseconds(body_.data->time);
   again.rest_since_utime = rest_since_utime_;
   again.stop_latched = stop_latched_;
-  // Who hears SETTLED may look at the arm: it must be there.
-  if (served.state == motion_status_t::STATE_SETTLED && served.commanded != at_) {
+  // Who hears SETTLED or HOLDING may look at the arm: it must be there.
+  const bool is_where = served.state == motion_status_t::STATE_SETTLED ||
+                        served.state == motion_status_t::STATE_HOLDING;
+  if (is_where && served.commanded != at_) {
     again.state = motion_status_t::STATE_STOPPED;
     again.reason = "was carried out; the arm has moved on since";
   }
