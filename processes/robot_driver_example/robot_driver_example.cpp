@@ -164,6 +164,9 @@ RobotDriver::Answer RobotDriver::on_command(const Command& command, std::int64_t
       again.state = Status::STATE_STOPPED;
       again.reason = "was carried out; the arm may have moved since";
     }
+    if (again.kind != Command::KIND_MOVE) {
+      set_array(again.num_signals, again.commanded, position_);  // where the arm is
+    }
     answer.statuses.push_back(again);
     return answer;
   }

@@ -226,6 +226,8 @@ motion_status_t RobotSimulator::answer_again(const motion_status_t& served) cons
     again.state = motion_status_t::STATE_STOPPED;
     again.reason = "was carried out; the arm has moved on since";
   }
+  // What is not the echo of an action says where the arm is.
+  if (served.kind != action_command_t::KIND_MOVE) again.commanded = at_;
   return again;
 }
 
@@ -261,6 +263,12 @@ RobotSimulator::Answer RobotSimulator::on_command(const action_command_t& comman
       return answer;
   }
 
+  if (command.action.size() != scene().signals().signals.size()) {
+    // Answered, not remembered: it is for another robot, whose ids may be the same as ours.
+    answer.statuses.push_back(
+        answer_to(command, motion_status_t::STATE_REJECTED, refusal(command)));
+    return answer;
+  }
   const std::int64_t now = microseconds(body_.data->time);
   if (command.utime < start_utime_) {
     conclude(motion_status_t::STATE_EXPIRED, "sent before this start of the driver");
