@@ -553,18 +553,22 @@ Controller::Answer Controller::on_motion_status(const motion_status_t& motion) {
   const bool is_mine = motion.source == kSource && motion.epoch == epoch_;
   // Where no state was kept, at least no id of a predecessor's is used again.
   if (is_mine && !previous) next_action_id_ = std::max(next_action_id_, motion.action_id + 1);
+  // A refusal is said once, or repeated until the next answer; what the arm does is repeated.
+  const bool is_refusal = motion.state == motion_status_t::STATE_REJECTED ||
+                          motion.state == motion_status_t::STATE_EXPIRED;
   const bool began_anew = (previous && motion.utime < previous->utime) ||
-                          (is_mine && motion.action_id < last_answered_id_);
+                          (is_mine && !is_refusal && motion.action_id < last_done_id_);
   if (began_anew) {
     seen_until_utime_ = position_rest_utime_ = -1;
     position_.reset();
   }
-  if (is_mine) last_answered_id_ = motion.action_id;
-  const bool is_news =
-      !previous ||
-      std::tie(motion.source, motion.epoch, motion.action_id, motion.state) !=
-          std::tie(previous->source, previous->epoch, previous->action_id, previous->state);
-  if (is_news) quiet_.restart();
+  bool is_news = false;
+  if (!is_refusal) {
+    if (is_mine) last_done_id_ = motion.action_id;
+    const Deed deed{motion.source, motion.epoch, motion.action_id, motion.state};
+    is_news = std::exchange(deed_, deed) != deed;
+    if (is_news) quiet_.restart();
+  }
   locate();
   if (hold_command_ && is_mine && motion.action_id == hold_command_->action_id) {
     hold_command_.reset();

@@ -6,6 +6,7 @@
 #include <map>
 #include <optional>
 #include <string>
+#include <tuple>
 #include <vector>
 
 #include "bodyschema/action_command_t.hpp"
@@ -92,6 +93,8 @@ class Controller {
 
  private:
   using Command = std::optional<action_command_t>;
+  /// Source, epoch, action id and state of an answer.
+  using Deed = std::tuple<std::string, std::int64_t, std::int64_t, std::int8_t>;
 
   /// Clock time since restart(), as ticks see it.
   class Stopwatch {
@@ -147,6 +150,7 @@ class Controller {
 
   // What was heard.
   std::optional<motion_status_t> motion_;
+  Deed deed_;  ///< newest answer that was no refusal
   std::optional<sample_t> sample_;
   std::optional<BodySchema> schema_;
   std::optional<model_health_t> health_;
@@ -179,7 +183,7 @@ class Controller {
   // What was sent.
   std::int64_t epoch_ = -1;
   std::int64_t next_action_id_ = 0;
-  std::int64_t last_answered_id_ = -1;
+  std::int64_t last_done_id_ = -1;                ///< of its own, newest that was not refused
   std::optional<action_command_t> command_;       ///< MOVE without a final answer
   std::optional<action_command_t> hold_command_;  ///< HOLD without an answer
   bool wants_hold_ = false;

@@ -650,6 +650,36 @@ TEST(ControllerTest, ARejectedWayIsReplacedByAnother) {
   EXPECT_EQ(bench.status.num_moves, static_cast<int>(bench.moves.size()) - 2);
 }
 
+// Many a driver says a refusal once and repeats what the arm does: a HOLD, its last move.
+TEST(ControllerTest, WhatADriverRepeatsAfterARefusalIsNoNews) {
+  for (const bool held_before : {false, true}) {
+    Bench bench;
+    bench.start();
+    bench.give(position_target(0, kNear));
+    ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED));
+    if (held_before) {
+      motion_status_t held = bench.motion;
+      held.source = "console";
+      held.kind = action_command_t::KIND_HOLD;
+      held.state = motion_status_t::STATE_HOLDING;
+      bench.say(held);
+      ASSERT_EQ(bench.status.control_state, S::CONTROL_HOLDING);
+    }
+    const motion_status_t doing = bench.motion;
+    int num_rejections = 0;
+    bench.rejects = [&](const auto&) -> std::string {
+      return num_rejections++ < 2 ? "link2 touches link4" : "";
+    };
+    bench.give(position_target(1, kFar));
+    ASSERT_TRUE(bench.run_until([&] { return num_rejections == 1; }));
+    bench.say(doing);
+    ASSERT_TRUE(bench.run_until([&] { return num_rejections == 2; }));
+    bench.say(doing);
+    EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+    EXPECT_EQ(bench.controller.counters().count("driver began anew"), 0U);
+  }
+}
+
 TEST(ControllerTest, ADriverThatRejectsEveryWayIsNotAskedForEver) {
   Bench bench;
   bench.start();
