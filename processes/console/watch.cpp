@@ -13,6 +13,8 @@
 #include "common/bus/bus.h"
 #include "common/bus/event_log.h"
 #include "common/bus/images_url.h"
+#include "common/bus/process.h"
+#include "common/bus/rig_door.h"
 #include "common/bus/sample_intake.h"
 #include "common/config/rig.h"
 #include "processes/console/picture.h"
@@ -66,7 +68,8 @@ class BestPicture {
   void match() {
     for (const camera_image_t& image : images_) {
       for (const marker_poses_t& markers : markers_) {
-        if (image.utime != markers.utime || markers.num_markers <= best_markers_.num_markers)
+        if (image.utime != markers.utime || image.camera_name != markers.camera_name ||
+            markers.num_markers <= best_markers_.num_markers)
           continue;
         best_image_ = image;
         best_markers_ = markers;
@@ -188,26 +191,31 @@ void run_watch(const WatchArguments& arguments) {
   std::signal(SIGTERM, on_signal);
   RunWatch watch;
   BestPicture picture;
-  const auto now_us = [] {
-    return std::chrono::duration_cast<std::chrono::microseconds>(
-               std::chrono::system_clock::now().time_since_epoch())
-        .count();
+  const auto microseconds = [](auto duration) {
+    return std::chrono::duration_cast<std::chrono::microseconds>(duration).count();
   };
+  const auto now_us = [&] { return microseconds(Clock::now().time_since_epoch()); };
   Bus bus(arguments.in, "");
   Bus images(arguments.images.empty() ? images_url(arguments.in) : arguments.images, "");
   SampleIntake intake((std::filesystem::path(arguments.out) / "samples.lcmlog").string(),
                       [&](const sample_t& m) { watch.on_sample(m); });
-  bus.subscribe<sample_t>(kSample, [&](const sample_t& m) { intake.on_sample(m); });
-  bus.subscribe<body_schema_t>(kBodySchema,
-                               [&](const body_schema_t& m) { watch.on_body_schema(m); });
-  bus.subscribe<model_health_t>(kModelHealth,
-                                [&](const model_health_t& m) { watch.on_model_health(m); });
-  bus.subscribe<sim_state_t>(kSimState, [&](const sim_state_t& m) { watch.on_sim_state(m); });
-  bus.subscribe<process_info_t>(
-      kProcessInfo, [&](const process_info_t& m) { watch.on_process_info(m, now_us()); });
-  bus.subscribe<marker_poses_t>(kMarkerPoses,
-                                [&](const marker_poses_t& m) { picture.on_markers(m); });
-  bus.subscribe<camera_info_t>(kCameraInfo, [&](const camera_info_t& m) { picture.on_info(m); });
+  // What another rig's group says, or a recording that is played, is none of this run.
+  const RigDoor door(arguments.rig_folder);
+  const auto hear = [&](const auto& channel, auto handler) {
+    bus.subscribe(channel, [&door, handler](const auto& m) {
+      if (door.objection(m).empty()) handler(m);
+    });
+  };
+  hear(kSample, [&](const sample_t& m) { intake.on_sample(m); });
+  hear(kBodySchema, [&](const body_schema_t& m) { watch.on_body_schema(m); });
+  hear(kModelHealth, [&](const model_health_t& m) { watch.on_model_health(m); });
+  hear(kSimState, [&](const sim_state_t& m) { watch.on_sim_state(m); });
+  hear(kMarkerPoses, [&](const marker_poses_t& m) { picture.on_markers(m); });
+  hear(kCameraInfo, [&](const camera_info_t& m) { picture.on_info(m); });
+  bus.subscribe(kProcessInfo, [&](const process_info_t& m) {
+    const auto wall_clock_us = microseconds(std::chrono::system_clock::now().time_since_epoch());
+    if (is_live(m, wall_clock_us)) watch.on_process_info(m, now_us());
+  });
   images.subscribe<camera_image_t>(kCameraImage,
                                    [&](const camera_image_t& m) { picture.on_image(m); });
 

@@ -541,12 +541,6 @@ Controller::Command Controller::on_own_answer(const motion_status_t& motion) {
 // ---- what is heard
 
 Controller::Answer Controller::on_motion_status(const motion_status_t& motion) {
-  // Answers to HOLD and the like carry no action; a rejected action may have had any size.
-  if (motion.num_signals != 0 && motion.state != motion_status_t::STATE_REJECTED &&
-      motion.commanded.size() != config_.signals.size()) {
-    ++counters_["refused MOTION_STATUS"];
-    return answer(std::nullopt);
-  }
   const std::optional<motion_status_t> previous = std::exchange(motion_, motion);
   motion_silence_.restart();
   if (epoch_ < 0) epoch_ = motion.utime;
@@ -611,10 +605,6 @@ Controller::Answer Controller::on_marker_poses(const marker_poses_t& poses) {
 }
 
 Controller::Answer Controller::on_sample(const sample_t& sample) {
-  if (sample.action.size() != config_.signals.size()) {
-    ++counters_["refused SAMPLE"];
-    return answer(std::nullopt);
-  }
   sample_ = sample;
   see(sample.utime);
   locate();
@@ -627,15 +617,9 @@ Controller::Answer Controller::on_sample(const sample_t& sample) {
 }
 
 Controller::Answer Controller::on_body_schema(const body_schema_t& message) {
-  const bool is_of_rig = std::equal(
-      message.signals.begin(), message.signals.end(), config_.signals.begin(),
-      config_.signals.end(), [](const signal_t& a, const Signal& b) {
-        return a.signal_name == b.name && a.lower_limit == b.lower && a.upper_limit == b.upper;
-      });
   // An older version counts only when the newer one has fallen silent.
-  const bool is_older = schema_ && message.schema_version < schema_->version;
-  if (!is_of_rig || is_older) {
-    ++counters_[is_of_rig ? "older BODY_SCHEMA" : "refused BODY_SCHEMA"];
+  if (schema_ && message.schema_version < schema_->version) {
+    ++counters_["older BODY_SCHEMA"];
     return answer(std::nullopt);
   }
   schema_silence_.restart();

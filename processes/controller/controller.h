@@ -61,6 +61,8 @@ struct ControllerConfig {
 /// eyes is not measured by the clock alone: in lock-step the driver's time stands still and so do
 /// the images. They are due when the driver's time has gone on.
 ///
+/// Messages must be of the rig (RigDoor): signals are not compared here.
+///
 /// After a restart a hold is held; a target in progress is not continued and no longer
 /// acknowledged.
 class Controller {
@@ -83,7 +85,7 @@ class Controller {
   Answer on_tick(std::int64_t now_us);
 
   control_status_t status() const;
-  /// Messages that were refused and what was sent in vain, since the start.
+  /// Messages that came too late and commands that were in vain, since the start.
   const std::map<std::string, std::int64_t>& counters() const { return counters_; }
 
   /// What a restart needs, as YAML; to be on disk before an Answer is sent.

@@ -7,6 +7,7 @@
 
 #include "common/bus/event_log.h"
 #include "common/bus/process.h"
+#include "common/bus/rig_door.h"
 #include "processes/controller/controller.h"
 
 using namespace bodyschema;
@@ -36,12 +37,13 @@ int main(int argc, char** argv) {
       }
       if (answer.command) process.bus().publish(kActionCommand, *answer.command);
     };
-    Bus& bus = process.bus();
+    const RigDoor door(process.rig_folder());
     const auto subscribe = [&](const auto& channel, auto handler) {
-      bus.subscribe(channel,
-                    [&, handler](const auto& message) { send((controller.*handler)(message)); });
+      door.subscribe(process, channel,
+                     [&, handler](const auto& message) { send((controller.*handler)(message)); });
     };
-    subscribe(kPoseTarget, &Controller::on_pose_target);
+    process.bus().subscribe<pose_target_t>(
+        kPoseTarget, [&](const pose_target_t& target) { send(controller.on_pose_target(target)); });
     subscribe(kMotionStatus, &Controller::on_motion_status);
     subscribe(kMarkerPoses, &Controller::on_marker_poses);
     subscribe(kSample, &Controller::on_sample);

@@ -1,4 +1,4 @@
-// motor_babbler: MOTION_STATUS, SAMPLE, MODEL_HEALTH, CONTROL_STATUS, BODY_SCHEMA -> ACTION_COMMAND
+// motor_babbler: MOTION_STATUS, SAMPLE, MODEL_HEALTH, CONTROL_STATUS -> ACTION_COMMAND
 
 #include <CLI/CLI.hpp>
 #include <filesystem>
@@ -6,6 +6,7 @@
 
 #include "common/bus/event_log.h"
 #include "common/bus/process.h"
+#include "common/bus/rig_door.h"
 #include "processes/motor_babbler/motor_babbler.h"
 
 using namespace bodyschema;
@@ -38,19 +39,16 @@ int main(int argc, char** argv) {
           babbler.is_done() ? process_info_t::PHASE_DONE : process_info_t::PHASE_WORKING;
       process.set_activity(phase, babbler.activity());
     };
-    Bus& bus = process.bus();
-    bus.subscribe<motion_status_t>(kMotionStatus, [&](const motion_status_t& status) {
-      send(babbler.on_motion_status(status));
-    });
-    bus.subscribe<sample_t>(kSample,
-                            [&](const sample_t& sample) { send(babbler.on_sample(sample)); });
-    bus.subscribe<model_health_t>(
-        kModelHealth, [&](const model_health_t& health) { send(babbler.on_model_health(health)); });
-    bus.subscribe<control_status_t>(kControlStatus, [&](const control_status_t& status) {
+    const RigDoor door(process.rig_folder());
+    door.subscribe(process, kMotionStatus,
+                   [&](const motion_status_t& status) { send(babbler.on_motion_status(status)); });
+    door.subscribe(process, kSample,
+                   [&](const sample_t& sample) { send(babbler.on_sample(sample)); });
+    door.subscribe(process, kModelHealth,
+                   [&](const model_health_t& health) { send(babbler.on_model_health(health)); });
+    process.bus().subscribe<control_status_t>(kControlStatus, [&](const control_status_t& status) {
       send(babbler.on_control_status(status));
     });
-    bus.subscribe<body_schema_t>(
-        kBodySchema, [&](const body_schema_t& schema) { babbler.on_body_schema(schema); });
     std::map<std::string, std::int64_t> reported;
     const auto count = [&](const std::string& name, std::int64_t total) {
       process.count(name, total - std::exchange(reported[name], total));
@@ -58,7 +56,6 @@ int main(int argc, char** argv) {
     process.on_idle([&] {
       count("action rejected", babbler.num_rejected());
       count("sample never seen", babbler.num_unseen());
-      for (const auto& [channel, total] : babbler.refused()) count("refused " + channel, total);
     });
     process.on_tick([&](std::int64_t now_us) { send(babbler.on_tick(now_us)); });
     process.run();

@@ -1040,32 +1040,6 @@ TEST(ControllerTest, APartThatIsLostInTheMiddleEndsTheTarget) {
   EXPECT_TRUE(bench.has_why("not connected")) << bench.status.why;
 }
 
-TEST(ControllerTest, MessagesOfAnotherRigAreRefusedAndCounted) {
-  Bench bench;
-  bench.start();
-  body_schema_t schema = to_message(planar(9));
-  schema.signals[1].signal_name = "q2";
-  bench.controller.on_body_schema(schema);
-  schema = to_message(planar(9));
-  schema.signals[1].upper_limit = 2;
-  bench.controller.on_body_schema(schema);
-  bench.controller.on_body_schema(to_message(planar(0)));
-  motion_status_t motion = bench.motion;
-  motion.rest_since_utime = -1;
-  motion.utime += kSecond;
-  set_array(motion.num_signals, motion.commanded, std::vector<double>{1, 2});
-  bench.controller.on_motion_status(motion);
-  sample_t sample{};
-  bench.controller.on_sample(sample);
-  EXPECT_EQ(bench.controller.counters().at("refused BODY_SCHEMA"), 2);
-  EXPECT_EQ(bench.controller.counters().at("older BODY_SCHEMA"), 1);
-  EXPECT_EQ(bench.controller.counters().at("refused MOTION_STATUS"), 1);
-  EXPECT_EQ(bench.controller.counters().at("refused SAMPLE"), 1);
-  bench.give(position_target(0, kNear));
-  EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED));
-  EXPECT_EQ(bench.status.schema_version, 1);
-}
-
 TEST(ControllerTest, AnOlderSchemaCountsOnlyAfterTheNewerFellSilent) {
   Bench bench;
   bench.schema = planar(7);
