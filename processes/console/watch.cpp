@@ -27,9 +27,9 @@ namespace {
 
 using Clock = std::chrono::steady_clock;
 
-const std::set<std::string> kGroup = {"camera",           "marker_estimator", "model_monitor",
-                                      "motor_babbler",    "observer",         "robot_simulator",
-                                      "structure_learner"};
+const std::set<std::string> kGroup = {"camera",          "controller",       "marker_estimator",
+                                      "model_monitor",   "motor_babbler",    "observer",
+                                      "robot_simulator", "structure_learner"};
 
 volatile std::sig_atomic_t interrupted = 0;
 void on_signal(int) { interrupted = 1; }
