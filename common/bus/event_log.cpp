@@ -100,12 +100,16 @@ std::string describe_malformed(const void* data, std::size_t size, const char* t
   return fmt::format("{} bytes do not decode as {}: cut off, too long or damaged", size, type_name);
 }
 
-LogReader::LogReader(const std::filesystem::path& path, OnDamage on_damage)
-    : path_(path), on_damage_(on_damage) {
+LogReader::LogReader(const std::filesystem::path& path, OnDamage on_damage, std::int64_t from_byte)
+    : path_(path), on_damage_(on_damage), position_(from_byte) {
   std::error_code error;
   if (std::filesystem::is_directory(path, error)) throw file_error(path, "is a folder, not a log");
   file_ = std::fopen(path.c_str(), "rbe");
   if (file_ == nullptr) throw system_error(path, "cannot read the log");
+  if (from_byte > 0 && ::fseeko(file_, from_byte, SEEK_SET) != 0) {
+    std::fclose(file_);
+    throw system_error(path, "cannot read the log");
+  }
 }
 
 LogReader::~LogReader() { std::fclose(file_); }

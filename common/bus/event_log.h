@@ -50,8 +50,10 @@ enum class OnDamage { kThrow, kSkip };
 /// Reads a log from its beginning, event by event.
 class LogReader {
  public:
+  /// Begins at `from_byte`, where an event must begin: the position() of an earlier reader.
   /// @throws std::runtime_error if there is no such file, it cannot be read or is not an LCM log.
-  explicit LogReader(const std::filesystem::path& path, OnDamage on_damage = OnDamage::kThrow);
+  explicit LogReader(const std::filesystem::path& path, OnDamage on_damage = OnDamage::kThrow,
+                     std::int64_t from_byte = 0);
   ~LogReader();
   LogReader(const LogReader&) = delete;
   LogReader& operator=(const LogReader&) = delete;

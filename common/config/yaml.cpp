@@ -108,6 +108,12 @@ bool Yaml::has(const std::string& key) const {
   return (*node_)[key].IsDefined();
 }
 
+std::vector<std::string> Yaml::keys() const {
+  std::vector<std::string> keys;
+  for (const auto& entry : *node_) keys.push_back(entry.first.as<std::string>());
+  return keys;
+}
+
 const YAML::Node Yaml::child(const std::string& key) const {
   if (has(key)) return (*node_)[key];
   // A key that nobody knows yet may be this one misspelt.
@@ -197,6 +203,14 @@ std::vector<std::int64_t> Yaml::integers(const std::string& key) const {
     return child(key).as<std::vector<std::int64_t>>();
   } catch (const YAML::Exception&) {
     throw error(key, "expected a list of integers");
+  }
+}
+
+std::vector<std::string> Yaml::texts(const std::string& key) const {
+  try {
+    return child(key).as<std::vector<std::string>>();
+  } catch (const YAML::Exception&) {
+    throw error(key, "expected a list of texts");
   }
 }
 

@@ -1,6 +1,7 @@
 #pragma once
 
 #include <filesystem>
+#include <string>
 
 #include "bodyschema/camera_image_t.hpp"
 #include "bodyschema/camera_info_t.hpp"
@@ -8,9 +9,15 @@
 
 namespace bodyschema {
 
-/// Writes `image` as a colour PNG with the outline, the id and the three axes (x red, y green, z
-/// blue, into the marker) of every marker drawn in. @throws std::runtime_error if the image cannot
-/// be decoded or the file not be written.
+enum class PictureFormat { kPng, kJpeg };
+
+/// `image` in colours with the outline, the id and the three axes (x red, y green, z blue, into the
+/// marker) of every marker drawn in, as the bytes of a PNG or JPEG file. @throws std::runtime_error
+/// if the image cannot be decoded.
+std::string draw_detections(const camera_image_t& image, const marker_poses_t& markers,
+                            const camera_info_t& camera, PictureFormat format);
+
+/// The same into a PNG file. @throws std::runtime_error, also if the file cannot be written.
 void write_detections(const camera_image_t& image, const marker_poses_t& markers,
                       const camera_info_t& camera, const std::filesystem::path& png);
 

@@ -150,20 +150,6 @@ PartObservation parse_observation(const Row& row, const Header& header) {
   return observation;
 }
 
-void set_observed_limits(Recording& recording) {
-  for (std::size_t i = 0; i < recording.signals.size(); ++i) {
-    double lower = std::numeric_limits<double>::infinity();
-    double upper = -lower;
-    for (const ActionPoseSample& sample : recording.samples) {
-      lower = std::min(lower, sample.action[i]);
-      upper = std::max(upper, sample.action[i]);
-    }
-    if (recording.samples.empty()) lower = upper = 0;
-    recording.signals[i].lower = lower;
-    recording.signals[i].upper = upper;
-  }
-}
-
 void sort_parts(Recording& recording) {
   for (ActionPoseSample& sample : recording.samples) {
     std::stable_sort(sample.parts.begin(), sample.parts.end(),
@@ -180,6 +166,11 @@ Recording read_samples(const std::filesystem::path& file) {
   if (messages.empty()) {
     throw RecordingError(file.string() + ": expected SAMPLE messages, found none in " +
                          std::to_string(report.events) + " events");
+  }
+  if (report.truncated_at_byte) {
+    recording.damage = file.string() + ": ends in the middle of an event at byte " +
+                       std::to_string(*report.truncated_at_byte) + "; the " +
+                       std::to_string(messages.size()) + " SAMPLEs before it are used";
   }
   // Samples are repeated, and sent again later where somebody missed them.
   std::map<std::int64_t, const sample_t*> by_index;
@@ -202,15 +193,28 @@ Recording read_samples(const std::filesystem::path& file) {
   if (!schemas.empty() && schemas.back().num_signals == num_signals) {
     recording.signals = from_message(schemas.back()).signals;
   } else {
-    for (int i = 0; i < num_signals; ++i) {
-      recording.signals.push_back({.name = "q" + std::to_string(i + 1), .lower = 0, .upper = 0});
-    }
-    set_observed_limits(recording);
+    recording.signals = observed_signals(recording.samples);
   }
   return recording;
 }
 
 }  // namespace
+
+std::vector<Signal> observed_signals(const std::vector<ActionPoseSample>& samples) {
+  std::vector<Signal> signals;
+  const Eigen::Index count = samples.empty() ? 0 : samples.front().action.size();
+  for (Eigen::Index i = 0; i < count; ++i) {
+    Signal& signal = signals.emplace_back();
+    signal.name = "q" + std::to_string(i + 1);
+    signal.lower = std::numeric_limits<double>::infinity();
+    signal.upper = -signal.lower;
+    for (const ActionPoseSample& sample : samples) {
+      signal.lower = std::min(signal.lower, sample.action[i]);
+      signal.upper = std::max(signal.upper, sample.action[i]);
+    }
+  }
+  return signals;
+}
 
 std::vector<ActionPoseSample> Recording::training() const {
   std::vector<ActionPoseSample> result;
@@ -273,7 +277,11 @@ Recording parse_csv(const std::string& text, const std::string& name) {
   if (!header) throw RecordingError(name + ":1:1: expected a header line, found an empty file");
   if (recording.samples.empty()) throw RecordingError(name + ":2:1: expected at least one row");
   sort_parts(recording);
-  set_observed_limits(recording);
+  const std::vector<Signal> observed = observed_signals(recording.samples);
+  for (std::size_t i = 0; i < observed.size(); ++i) {
+    recording.signals[i].lower = observed[i].lower;
+    recording.signals[i].upper = observed[i].upper;
+  }
   return recording;
 }
 

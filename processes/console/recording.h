@@ -26,6 +26,8 @@ struct Recording {
   bool has_noise = false;
   /// Whether the poses are those of camera markers, recorded by our observer.
   bool is_log = false;
+  /// What keeps a log from being whole, for people: "" if nothing does. What precedes it was read.
+  std::string damage;
 
   /// Samples that may be learned from, as the structure learner does: TRAIN and PROBE. A CSV has
   /// TRAIN only.
@@ -41,6 +43,10 @@ struct Recording {
 /// and rotation [deg]. Rows with equal t and signals are one instant, wherever they stand.
 /// @throws RecordingError.
 Recording load_recording(const std::filesystem::path& file);
+
+/// The signals of samples of which nothing is known but their numbers: called q1, q2, …, with the
+/// range that they were seen in as limits. All samples have as many signals as the first.
+std::vector<Signal> observed_signals(const std::vector<ActionPoseSample>& samples);
 
 /// The CSV reader alone; `name` stands in errors.
 Recording parse_csv(const std::string& text, const std::string& name);

@@ -4,6 +4,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <iterator>
 
 #include "common/bus/convert.h"
 
@@ -23,6 +24,10 @@ void RunWatch::on_sample(const sample_t& message) {
 
 void RunWatch::on_body_schema(const body_schema_t& schema) { schema_ = from_message(schema); }
 
+void RunWatch::on_learned_schema(const body_schema_t& schema) {
+  learned_sample_ = schema.last_sample_index;
+}
+
 void RunWatch::on_model_health(const model_health_t& health) { health_ = health; }
 
 void RunWatch::on_sim_state(const sim_state_t& state) {
@@ -34,7 +39,7 @@ void RunWatch::on_sim_state(const sim_state_t& state) {
     part.X_CB = X_CW * from_message(state.X_WB[i]);
     parts.push_back(part);
   }
-  truth_[state.action_id] = std::move(parts);
+  truth_[state.utime] = {state.action_id, std::move(parts)};
 }
 
 void RunWatch::on_process_info(const process_info_t& info, std::int64_t now_us) {
@@ -46,11 +51,18 @@ bool RunWatch::is_finished() const {
   if (babbler == processes_.end() || babbler->second.info.phase != process_info_t::PHASE_DONE) {
     return false;
   }
-  // The monitor judges at TEST samples; there need not have been one.
+  return !samples_.empty() && is_judged();
+}
+
+bool RunWatch::is_caught_up() const {
+  return !samples_.empty() && learned_sample_ >= samples_.back().sample_index && is_judged();
+}
+
+bool RunWatch::is_judged() const {
   const auto last_test =
       std::find_if(samples_.rbegin(), samples_.rend(),
                    [](const ActionPoseSample& sample) { return sample.purpose == Purpose::kTest; });
-  if (last_test == samples_.rend()) return !samples_.empty();
+  if (last_test == samples_.rend()) return true;
   return health_ && health_->judged_sample >= last_test->sample_index;
 }
 
@@ -78,15 +90,21 @@ std::string RunWatch::progress() const {
   return line;
 }
 
+std::set<std::string> RunWatch::silent(const std::set<std::string>& expected,
+                                       std::int64_t now_us) const {
+  std::set<std::string> silent = expected;
+  for (const auto& [name, heard] : processes_) {
+    if (now_us - heard.at_us <= kSilentUs) silent.erase(name);
+  }
+  return silent;
+}
+
 std::string RunWatch::diagnosis(const std::set<std::string>& expected, std::int64_t now_us) const {
+  const std::set<std::string> silent_ones = silent(expected, now_us);
   std::string text;
   for (const std::string& name : expected) {
-    const auto heard = processes_.find(name);
-    if (heard == processes_.end() || now_us - heard->second.at_us > kSilentUs) {
-      text += fmt::format("  {:<18} is silent\n", name);
-    } else {
-      text += fmt::format("  {:<18} {}\n", name, heard->second.info.activity);
-    }
+    text += fmt::format("  {:<18} {}\n", name,
+                        silent_ones.count(name) ? "is silent" : processes_.at(name).info.activity);
   }
   return text;
 }
@@ -97,9 +115,13 @@ std::vector<ActionPoseSample> RunWatch::held_out() const {
     if (samples_[i].purpose != Purpose::kTest) continue;
     ActionPoseSample sample = samples_[i];
     if (has_truth()) {
-      const auto truth = truth_.find(action_ids_[i]);
-      if (truth == truth_.end()) continue;
-      sample.parts = truth->second;
+      // Ids count within their source, so the time decides: the newest state before the sample's
+      // last frame.
+      const auto after = truth_.upper_bound(sample.utime);
+      if (after == truth_.begin()) continue;
+      const Truth& truth = std::prev(after)->second;
+      if (truth.action_id != action_ids_[i]) continue;
+      sample.parts = truth.parts;
     }
     result.push_back(std::move(sample));
   }

@@ -2,10 +2,10 @@
 
 #include <algorithm>
 #include <cmath>
-#include <opencv2/imgcodecs.hpp>
 #include <stdexcept>
 
 #include "common/bus/convert.h"
+#include "common/camera/decode_image.h"
 #include "common/config/yaml.h"
 #include "processes/marker_estimator/tag_pose.h"
 
@@ -67,21 +67,8 @@ void MarkerEstimator::on_camera_info(const camera_info_t& info) {
 }
 
 std::optional<cv::Mat> MarkerEstimator::decode(const camera_image_t& image) {
-  cv::Mat grey;
-  // The message holds bytes of no particular type; OpenCV does not write to what it decodes.
-  auto* bytes = const_cast<std::uint8_t*>(image.data.data());
-  if (image.encoding == camera_image_t::ENCODING_GREY) {
-    if (image.num_bytes == static_cast<std::int64_t>(image.width) * image.height) {
-      grey = cv::Mat(image.height, image.width, CV_8UC1, bytes);
-    }
-  } else if (image.num_bytes > 0) {
-    try {
-      grey = cv::imdecode(cv::Mat(1, image.num_bytes, CV_8UC1, bytes), cv::IMREAD_GRAYSCALE);
-    } catch (const cv::Exception&) {
-      grey.release();
-    }
-  }
-  if (grey.empty() || grey.cols != image.width || grey.rows != image.height) {
+  const cv::Mat grey = decode_image(image);
+  if (grey.empty()) {
     ++counters_["image unreadable"];
     refused_ = "the image cannot be decoded";
     return std::nullopt;

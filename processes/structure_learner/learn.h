@@ -1,5 +1,6 @@
 #pragma once
 
+#include <cmath>
 #include <cstdint>
 #include <optional>
 #include <vector>
@@ -8,6 +9,11 @@
 #include "common/schema/sample.h"
 
 namespace bodyschema {
+
+/// What the view adds to the noise of real tags, whatever the rig: measured in
+/// tests/experiments/README.md. The rigs' structure_learner.yaml says the same; recordings of camera
+/// markers without a rig are learned with this.
+inline constexpr Noise kTagModelError{.position_m = 0.001, .rotation_rad = 0.2 * M_PI / 180};
 
 struct LearnOptions {
   /// The root part; else the lowest part id seen.

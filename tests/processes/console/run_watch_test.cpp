@@ -21,11 +21,13 @@ sample_t sample(std::int64_t index, const std::vector<int>& parts,
   }
   sample_t message = to_message(result);
   message.action_id = 100 + index;
+  message.utime = 1000 * (message.action_id + 1) + 500;  // a frame after the arm had come to rest
   return message;
 }
 
 sim_state_t truth(std::int64_t action_id, const std::vector<int>& parts) {
   sim_state_t state{};
+  state.utime = 1000 * (action_id + 1);
   state.action_id = action_id;
   // The camera stands at (0, 0, 5) in the world, without rotation.
   Pose X_WC = Pose::Identity();
@@ -89,6 +91,33 @@ TEST(RunWatchTest, ARunWithoutSamplesOrVerdictIsNotFinished) {
   EXPECT_FALSE(watch.is_finished());
 }
 
+TEST(RunWatchTest, AReplayHasCaughtUpWhenItsSamplesAreLearnedAndJudged) {
+  RunWatch watch;
+  body_schema_t learned{};
+  learned.last_sample_index = 0;
+  watch.on_learned_schema(learned);
+  EXPECT_FALSE(watch.is_caught_up());  // nothing was replayed yet
+  watch.on_sample(sample(0, {1}));
+  EXPECT_TRUE(watch.is_caught_up());
+  watch.on_sample(sample(1, {1}, Purpose::kTest));
+  learned.last_sample_index = 1;
+  watch.on_learned_schema(learned);
+  EXPECT_FALSE(watch.is_caught_up());
+  watch.on_model_health(health(1));
+  EXPECT_TRUE(watch.is_caught_up());
+  watch.on_sample(sample(2, {1}));
+  EXPECT_FALSE(watch.is_caught_up());
+}
+
+TEST(RunWatchTest, SilentIsWhoWasNotHeardForThreeSeconds) {
+  RunWatch watch;
+  watch.on_process_info(info("camera", process_info_t::PHASE_WORKING), 1'000'000);
+  watch.on_process_info(info("observer", process_info_t::PHASE_WORKING), 3'000'000);
+  const std::set<std::string> all = {"camera", "log", "observer"};
+  EXPECT_EQ(watch.silent(all, 3'000'000), (std::set<std::string>{"log"}));
+  EXPECT_EQ(watch.silent(all, 5'000'000), (std::set<std::string>{"camera", "log"}));
+}
+
 TEST(RunWatchTest, ABabblerThatWasEndedIsNotDone) {
   RunWatch watch;
   watch.on_sample(sample(0, {1}, Purpose::kTest));
@@ -143,6 +172,20 @@ TEST(RunWatchTest, WithASimulatorTheyHoldTheTruthOfTheirAction) {
   ASSERT_EQ(held_out[1].parts.size(), 3U);  // also what the camera did not see
   const Pose& X_CB = held_out[1].parts[2].X_CB;
   EXPECT_LT((X_CB.translation() - Eigen::Vector3d(3, 0, 0)).norm(), 1e-12);
+}
+
+// The controller counts its actions from 0 as the babbler does.
+TEST(RunWatchTest, AnActionOfTheSameNumberOfAnotherSourceDoesNotChangeTheTruth) {
+  RunWatch watch;
+  watch.on_sim_state(truth(100, {1}));
+  watch.on_sample(sample(0, {1}, Purpose::kTest));
+  sim_state_t other = truth(100, {1});
+  other.utime += 10'000;
+  other.X_WB[0].position_m[0] = 77;
+  watch.on_sim_state(other);
+  ASSERT_EQ(watch.held_out().size(), 1U);
+  EXPECT_LT((watch.held_out()[0].parts[0].X_CB.translation() - Eigen::Vector3d(1, 0, 0)).norm(),
+            1e-12);
 }
 
 TEST(RunWatchTest, VisibilityIsAShareOfAllSamples) {

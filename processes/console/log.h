@@ -1,0 +1,30 @@
+#pragma once
+
+#include <cstdint>
+#include <filesystem>
+#include <nlohmann/json.hpp>
+#include <string>
+
+#include "common/bus/log_summary.h"
+
+namespace CLI {
+class App;
+}
+
+namespace bodyschema {
+
+/// Adds `log`: what an LCM log holds, and whether it is whole and of this version.
+void add_log_command(CLI::App& console);
+
+/// `log --json`.
+nlohmann::ordered_json log_json(const LogSummary& summary);
+/// A table of the channels, and a line for every flaw.
+std::string log_text(const LogSummary& summary);
+
+/// Writes a small copy of a log, enough to replay and to report it: without images, ground truth
+/// (SIM_STATE) and channels that are not ours, every message once however often it was repeated, of
+/// PROCESS_INFO each process' first and last. Returns the number of events written.
+/// @throws std::runtime_error; nothing is left of the copy then.
+std::int64_t thin_log(const std::filesystem::path& file, const std::filesystem::path& copy);
+
+}  // namespace bodyschema

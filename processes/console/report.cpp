@@ -1,0 +1,203 @@
+#include "processes/console/report.h"
+
+#include <fmt/format.h>
+#include <poll.h>
+#include <sys/resource.h>
+
+#include <CLI/CLI.hpp>
+#include <algorithm>
+#include <chrono>
+#include <csignal>
+#include <filesystem>
+#include <fstream>
+#include <iostream>
+#include <memory>
+#include <nlohmann/json.hpp>
+#include <stdexcept>
+#include <vector>
+
+#include "common/config/rig.h"
+#include "processes/console/log_follower.h"
+#include "processes/console/picture.h"
+#include "processes/console/report_page.h"
+#include "processes/console/run_record.h"
+
+namespace bodyschema {
+namespace {
+
+namespace fs = std::filesystem;
+using Clock = std::chrono::steady_clock;
+
+constexpr std::chrono::seconds kShortestPeriod{10};
+constexpr int kPoll_ms = 1000;
+
+volatile std::sig_atomic_t interrupted = 0;
+void on_signal(int) { interrupted = 1; }
+
+struct ReportArguments {
+  std::string source;
+  std::string out;
+  bool follow = false;
+};
+
+/// A run folder or a single log, read as it grows.
+class Source {
+ public:
+  explicit Source(const std::string& path) : path_(path) {
+    if (!fs::exists(path_)) throw std::runtime_error(path + ": no such run folder or log");
+    is_folder_ = fs::is_directory(path_);
+  }
+
+  fs::path default_out() const {
+    return is_folder_ ? path_ / "report.html" : fs::path(path_).concat(".html");
+  }
+
+  /// Returns whether there was anything new.
+  bool read() {
+    const auto visit = [this](const LogEvent& event, const fs::path& file, std::int64_t byte) {
+      record_.on_event(event, file, byte);
+    };
+    bool is_new = false;
+    for (const fs::path& log : logs()) is_new |= follower_.read(log, visit);
+    if (!is_folder_ && follower_.summaries().empty())
+      throw std::runtime_error(path_.string() + ": is empty");
+    return is_new;
+  }
+
+  /// What a page would be rewritten for: samples, versions, decisions, processes that come and go.
+  std::tuple<std::int64_t, std::size_t, std::size_t, std::size_t> state() const {
+    return {record_.watch().num_samples(), record_.versions().size(), record_.events().size(),
+            record_.faults().size() + record_.processes().size()};
+  }
+
+  /// Writes the page; returns what keeps it from having its plots, "" if nothing does.
+  std::string write(const fs::path& out, std::optional<int> reload_s) const {
+    Report report;
+    report.title = title();
+    report.record = &record_;
+    report.logs = follower_.summaries();
+    report.reload_s = reload_s;
+    report.picture = picture();
+    if (is_folder_ && fs::exists(path_ / "config" / "signals.yaml")) {
+      try {
+        report.end_effector = load_signals(path_ / "config").end_effector_part;
+      } catch (const std::exception&) {
+        // The report does without.
+      }
+    }
+    std::string problem;
+    write_file_atomically(out, report_page(report, &problem));
+    return problem;
+  }
+
+ private:
+  /// The samples first: they are whole, whatever a logger lost.
+  std::vector<fs::path> logs() const {
+    if (!is_folder_) return {path_};
+    std::vector<fs::path> found;
+    std::error_code error;
+    for (const auto& entry : fs::directory_iterator(path_, error)) {
+      const std::string name = entry.path().filename().string();
+      if (name.starts_with("run.lcmlog") || name.starts_with("images.lcmlog"))
+        found.push_back(entry.path());
+    }
+    // images.lcmlog.NN before run.lcmlog.NN; each in the order of its numbers.
+    std::sort(found.begin(), found.end());
+    found.insert(found.begin(), path_ / "samples.lcmlog");
+    return found;
+  }
+
+  std::string title() const {
+    std::string name = fs::canonical(path_).filename().string();
+    // Written at the end of a run; a report does without.
+    std::ifstream stream(path_ / "result.json");
+    const auto result = nlohmann::json::parse(stream, nullptr, false);
+    if (is_folder_ && result.is_object() && result.contains("rig") && result["rig"].is_string())
+      name = result["rig"].get<std::string>() + " · " + name;
+    return name;
+  }
+
+  std::optional<std::string> picture() const {
+    if (!record_.camera_info()) return std::nullopt;
+    for (const RunRecord::Picture& picture : record_.pictures()) {
+      try {
+        LogReader reader(picture.image.file, OnDamage::kThrow, picture.image.byte);
+        if (!reader.next()) continue;
+        const auto image =
+            decode<camera_image_t>(reader.event().data.data(), reader.event().data.size()).message;
+        if (!image) continue;
+        return draw_detections(*image, picture.markers, *record_.camera_info(),
+                               PictureFormat::kJpeg);
+      } catch (const std::exception&) {
+        // Another frame may do.
+      }
+    }
+    return std::nullopt;
+  }
+
+  const fs::path path_;
+  bool is_folder_ = false;
+  LogFollower follower_;
+  RunRecord record_;
+};
+
+void run_report(const ReportArguments& arguments) {
+  Source source(arguments.source);
+  const fs::path out = arguments.out.empty() ? source.default_out() : fs::path(arguments.out);
+  if (!arguments.follow) {
+    source.read();
+    const std::string problem = source.write(out, std::nullopt);
+    if (!problem.empty()) throw std::runtime_error(out.string() + " has no plots: " + problem);
+    std::cout << out.string() << std::endl;
+    return;
+  }
+
+  // No SA_RESTART: a wait ends early.
+  struct sigaction action {};
+  action.sa_handler = &on_signal;
+  ::sigaction(SIGTERM, &action, nullptr);
+  ::sigaction(SIGINT, &action, nullptr);
+  // What the arm does comes first.
+  ::setpriority(PRIO_PROCESS, 0, 10);
+  auto write = [&, last = std::string()](std::optional<int> reload_s) mutable {
+    std::string problem;
+    try {
+      problem = source.write(out, reload_s);
+    } catch (const std::exception& error) {
+      problem = error.what();  // a full disk, say: the next page may succeed
+    }
+    if (problem != last && !problem.empty()) std::cerr << "bodyschema: " << problem << std::endl;
+    last = problem;
+  };
+  constexpr auto kReload_s = static_cast<int>(kShortestPeriod.count());
+  source.read();
+  auto written_state = source.state();
+  auto written = Clock::now();
+  write(kReload_s);
+  while (!interrupted) {
+    ::poll(nullptr, 0, kPoll_ms);
+    source.read();
+    if (source.state() == written_state || Clock::now() - written < kShortestPeriod) continue;
+    written_state = source.state();
+    written = Clock::now();
+    write(kReload_s);
+  }
+  source.read();
+  write(std::nullopt);
+}
+
+}  // namespace
+
+void add_report_command(CLI::App& console) {
+  const auto arguments = std::make_shared<ReportArguments>();
+  CLI::App* report =
+      console.add_subcommand("report", "What a run tells, as one HTML file that needs no network");
+  report->add_option("RUN", arguments->source, "Run folder, or an LCM log with SAMPLEs")
+      ->required();
+  report->add_option("--out", arguments->out, "The file; default: report.html in the run folder");
+  report->add_flag("--follow", arguments->follow,
+                   "Write it again while the run goes on, until SIGTERM");
+  report->callback([arguments] { run_report(*arguments); });
+}
+
+}  // namespace bodyschema

@@ -1,0 +1,534 @@
+#include "processes/console/report_figures.h"
+
+#include <fmt/format.h>
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <set>
+
+#include "common/geometry/pose.h"
+#include "processes/console/evaluation.h"
+
+namespace bodyschema {
+namespace {
+
+constexpr double kDegrees = 180 / M_PI;
+constexpr std::size_t kMostDots = 150;
+/// Seen on white and on black.
+const char* const kBlue = "#4a86c5";
+const char* const kOrange = "#dd8a3a";
+const char* const kColours[] = {"#4a86c5", "#dd8a3a", "#5aa469", "#cf5f5f",
+                                "#9a77bd", "#4fa8a8", "#a3794f", "#b0a03c"};
+
+/// Numbers for a gnuplot data block: what is not finite becomes a gap.
+std::string number(double value) {
+  return std::isfinite(value) ? fmt::format("{:.6g}", value) : "NaN";
+}
+
+/// Components as EdgeSlice has them.
+Vector6d components(const Pose& X, const Pose& X_middle) {
+  Vector6d result;
+  result << X.translation() * 1e3, log_so3(X_middle.linear().transpose() * X.linear()) * kDegrees;
+  return result;
+}
+
+/// Standard deviations of components() from a covariance of X (right perturbation).
+Vector6d component_sigmas(const Pose& X, const Pose& X_middle, const Matrix6d& covariance) {
+  Vector6d turned = Vector6d::Zero();
+  turned.tail<3>() = log_so3(X_middle.linear().transpose() * X.linear());
+  Matrix6d J = Matrix6d::Zero();
+  J.topLeftCorner<3, 3>() = X.linear() * 1e3;
+  J.bottomRightCorner<3, 3>() = right_jacobian_inverse(turned).bottomRightCorner<3, 3>() * kDegrees;
+  return (J * covariance * J.transpose()).diagonal().cwiseMax(0).cwiseSqrt();
+}
+
+/// Mean covariance of the observed poses of edge.to in edge.from, right perturbation.
+Matrix6d observation_noise(const BodySchema& schema, const Edge& edge,
+                           const std::vector<ActionPoseSample>& samples) {
+  Matrix6d sum = Matrix6d::Zero();
+  int count = 0;
+  for (const ActionPoseSample& sample : samples) {
+    const PartObservation* from = sample.find(edge.from);
+    const PartObservation* to = sample.find(edge.to);
+    if (!from || !to) continue;
+    sum += relative_covariance(from->X_CB.inverse() * to->X_CB, from->covariance, to->covariance);
+    ++count;
+  }
+  if (count > 0 && !sum.isZero(0)) return sum / count;
+  Vector6d variance;
+  variance << Eigen::Vector3d::Constant(std::pow(schema.noise.position_m, 2)),
+      Eigen::Vector3d::Constant(std::pow(schema.noise.rotation_rad, 2));
+  return 2 * Matrix6d(variance.asDiagonal());
+}
+
+/// The largest round step that gives at least `least` intervals over `span`.
+double tic_step(double span, double least) {
+  const double widest = span / least;
+  const double power = std::pow(10, std::floor(std::log10(widest)));
+  return widest >= 5 * power ? 5 * power : widest >= 2 * power ? 2 * power : power;
+}
+
+std::string label(const BodySchema& schema, const Edge& edge) {
+  std::string names;
+  for (const int signal : edge.signals())
+    names += (names.empty() ? "" : ", ") + schema.signals.at(static_cast<std::size_t>(signal)).name;
+  return names.empty() ? "rigid" : names;
+}
+
+}  // namespace
+
+std::string escape_html(const std::string& text) {
+  std::string result;
+  for (const char c : text) {
+    switch (c) {
+      case '&':
+        result += "&amp;";
+        break;
+      case '<':
+        result += "&lt;";
+        break;
+      case '>':
+        result += "&gt;";
+        break;
+      case '"':
+        result += "&quot;";
+        break;
+      case '\'':
+        result += "&#39;";
+        break;
+      default:
+        result += static_cast<unsigned char>(c) < 0x20 && c != '\n' && c != '\t' ? ' ' : c;
+    }
+  }
+  return result;
+}
+
+std::string tree_svg(const BodySchema& schema, std::optional<int> end_effector) {
+  constexpr double kRadius = 17, kRow = 58, kTop = 46;
+  // Depth and row of every part that hangs on the root: leaves get rows of their own in order, a
+  // part stands beside its first child.
+  std::map<int, std::vector<const Edge*>> children;
+  for (const Edge& edge : schema.edges) children[edge.from].push_back(&edge);
+  struct Spot {
+    int depth = 0;
+    double row = 0;
+  };
+  std::map<int, Spot> spots;
+  double next_row = 0;
+  int deepest = 0;
+  const auto place = [&](const auto& self, int part, int depth) -> double {
+    if (spots.contains(part)) return spots[part].row;
+    spots[part] = {depth, next_row};
+    deepest = std::max(deepest, depth);
+    const auto below = children.find(part);
+    double row = next_row;
+    if (below == children.end()) {
+      next_row += 1;
+    } else {
+      // The longest branch first, so that the arm is a straight line.
+      bool is_first = true;
+      for (const Edge* edge : below->second) {
+        const double child_row = self(self, edge->to, depth + 1);
+        if (is_first) row = child_row;
+        is_first = false;
+      }
+    }
+    spots[part].row = row;
+    return row;
+  };
+  if (schema.root >= 0) place(place, schema.root, 0);
+  // What hangs together without reaching the root.
+  std::set<int> loose_roots;
+  for (const Edge& edge : schema.edges) {
+    if (spots.contains(edge.from)) continue;
+    place(place, edge.from, 0);
+    loose_roots.insert(edge.from);
+  }
+  std::vector<const UnconnectedPart*> lone;
+  for (const UnconnectedPart& part : schema.unconnected) {
+    if (!spots.contains(part.part)) lone.push_back(&part);
+  }
+  // Columns as wide as the page allows.
+  const double width = std::max(760.0, 2 * 30 + 78.0 * deepest);
+  const double column =
+      deepest > 0 ? std::min(120.0, (width - 60) / static_cast<double>(deepest)) : 0;
+  const double lone_top = kTop + next_row * kRow;
+  const double height = lone_top + (lone.empty() ? -12 : 24.0 * static_cast<double>(lone.size()));
+  const auto x = [&](const Spot& spot) { return 30 + column * spot.depth; };
+  const auto y = [&](const Spot& spot) { return kTop + kRow * spot.row; };
+
+  std::string svg = fmt::format(
+      "<svg class=\"tree\" viewBox=\"0 0 {:.0f} {:.0f}\" role=\"img\" aria-label=\"Tree of the "
+      "parts\">\n",
+      width, std::max(height, 60.0));
+  static const char* const kStates[] = {"ok", "suspect", "invalid", "provisional"};
+  for (const Edge& edge : schema.edges) {
+    const Spot& from = spots.at(edge.from);
+    const Spot& to = spots.at(edge.to);
+    const double middle = x(to) - 0.5 * column;
+    const std::string kind = edge.joints.empty() ? "rigid" : "screw";
+    const char* state = kStates[static_cast<int>(edge.state)];
+    if (from.row == to.row) {
+      svg += fmt::format("<path class=\"{} {}\" d=\"M{:.1f},{:.1f} H{:.1f}\"/>\n", kind, state,
+                         x(from) + kRadius, y(from), x(to) - kRadius);
+    } else {
+      svg += fmt::format(
+          "<path class=\"{} {}\" d=\"M{:.1f},{:.1f} C{:.1f},{:.1f} {:.1f},{:.1f} "
+          "{:.1f},{:.1f}\"/>\n",
+          kind, state, x(from) + kRadius * 0.6, y(from) + kRadius * 0.8, x(from) + 0.4 * column,
+          y(to), x(from) + 0.4 * column, y(to), x(to) - kRadius, y(to));
+    }
+    svg += fmt::format("<text class=\"signal\" x=\"{:.1f}\" y=\"{:.1f}\">{}</text>\n", middle,
+                       y(to) - 7, escape_html(label(schema, edge)));
+  }
+  for (const auto& [part, spot] : spots) {
+    const char* role = part == schema.root ? "root" : part == end_effector ? "effector" : "part";
+    svg += fmt::format(
+        "<circle class=\"{}\" cx=\"{:.1f}\" cy=\"{:.1f}\" r=\"{}\"/>"
+        "<text class=\"id\" x=\"{:.1f}\" y=\"{:.1f}\">{}</text>\n",
+        role, x(spot), y(spot), kRadius, x(spot), y(spot) + 4.5, part);
+    if (part == schema.root || part == end_effector || loose_roots.contains(part)) {
+      svg += fmt::format("<text class=\"role\" x=\"{:.1f}\" y=\"{:.1f}\">{}</text>\n", x(spot),
+                         y(spot) - 24,
+                         part == schema.root    ? "root"
+                         : part == end_effector ? "end effector"
+                                                : "no way to the root");
+    }
+  }
+  static const char* const kReasons[] = {"never seen", "not enough data yet", "no valid model"};
+  for (std::size_t i = 0; i < lone.size(); ++i) {
+    const double at = lone_top + 24 * static_cast<double>(i);
+    svg += fmt::format(
+        "<circle class=\"lone\" cx=\"30\" cy=\"{:.1f}\" r=\"10\"/><text class=\"id small\" "
+        "x=\"30\" "
+        "y=\"{:.1f}\">{}</text><text class=\"reason\" x=\"50\" y=\"{:.1f}\">not connected: "
+        "{}</text>\n",
+        at, at + 3.5, lone[i]->part, at + 4, kReasons[static_cast<int>(lone[i]->reason)]);
+  }
+  return svg + "</svg>\n";
+}
+
+std::string visibility_svg(const std::vector<Signal>& signals,
+                           const std::vector<ActionPoseSample>& samples,
+                           const std::vector<int>& parts) {
+  constexpr double kLabel = 52, kRow = 19, kTop = 42, kGap = 10, kWidth = 760;
+  if (signals.empty() || parts.empty()) return "";
+  const auto num_signals = static_cast<double>(signals.size());
+  const double column = (kWidth - kLabel - kGap * (num_signals - 1)) / num_signals;
+  const double bin_width = column / kVisibilityBins;
+  const double height = kTop + kRow * static_cast<double>(parts.size()) + 4;
+  std::string svg = fmt::format(
+      "<svg class=\"visibility\" viewBox=\"0 0 {:.0f} {:.0f}\" role=\"img\" "
+      "aria-label=\"Visibility "
+      "of the parts over the signals\">\n",
+      kWidth, height);
+  for (std::size_t p = 0; p < parts.size(); ++p) {
+    svg += fmt::format("<text class=\"row\" x=\"{:.1f}\" y=\"{:.1f}\">{}</text>\n", kLabel - 10,
+                       kTop + kRow * static_cast<double>(p) + 13, parts[p]);
+  }
+  svg += fmt::format("<text class=\"row\" x=\"{:.1f}\" y=\"{:.1f}\">part</text>\n", kLabel - 10,
+                     kTop - 22.0);
+  for (std::size_t s = 0; s < signals.size(); ++s) {
+    const double left = kLabel + static_cast<double>(s) * (column + kGap);
+    const double range = signals[s].upper - signals[s].lower;
+    svg += fmt::format(
+        "<text class=\"head\" x=\"{:.1f}\" y=\"14\">{}</text>"
+        "<text class=\"limit\" x=\"{:.1f}\" y=\"32\">{:g}</text>"
+        "<text class=\"limit end\" x=\"{:.1f}\" y=\"32\">{:g}</text>\n",
+        left + column / 2, escape_html(signals[s].name), left, signals[s].lower, left + column,
+        signals[s].upper);
+    std::vector<int> count(kVisibilityBins);
+    std::map<int, std::vector<int>> seen;
+    for (const ActionPoseSample& sample : samples) {
+      if (sample.action.size() <= static_cast<Eigen::Index>(s) || !(range > 0)) continue;
+      const double share = (sample.action[static_cast<Eigen::Index>(s)] - signals[s].lower) / range;
+      if (!std::isfinite(share)) continue;
+      const auto bin =
+          static_cast<std::size_t>(std::clamp(share * kVisibilityBins, 0.0, kVisibilityBins - 1.0));
+      ++count[bin];
+      for (const PartObservation& part : sample.parts) {
+        std::vector<int>& of_part = seen[part.part];
+        of_part.resize(kVisibilityBins);
+        ++of_part[bin];
+      }
+    }
+    for (std::size_t p = 0; p < parts.size(); ++p) {
+      const double top = kTop + kRow * static_cast<double>(p);
+      svg += fmt::format(
+          "<rect class=\"strip\" x=\"{:.1f}\" y=\"{:.1f}\" width=\"{:.1f}\" height=\"15\"/>", left,
+          top, column);
+      const auto of_part = seen.find(parts[p]);
+      for (std::size_t b = 0; b < kVisibilityBins; ++b) {
+        const double x = left + bin_width * static_cast<double>(b);
+        if (count[b] == 0) {
+          svg += fmt::format("<path class=\"unknown\" d=\"M{:.1f},{:.1f} l{:.1f},-15\"/>", x,
+                             top + 15, bin_width);
+          continue;
+        }
+        const int num_seen = of_part == seen.end() ? 0 : of_part->second[b];
+        if (num_seen == 0) continue;
+        svg += fmt::format(
+            "<rect class=\"seen\" x=\"{:.2f}\" y=\"{:.1f}\" width=\"{:.2f}\" height=\"15\" "
+            "fill-opacity=\"{:.2f}\"><title>part {}: seen in {} of {} samples</title></rect>",
+            x, top, bin_width, static_cast<double>(num_seen) / count[b], parts[p], num_seen,
+            count[b]);
+      }
+      svg += "\n";
+    }
+  }
+  return svg + "</svg>\n";
+}
+
+std::vector<VersionErrors> version_errors(const std::map<std::int64_t, BodySchema>& versions,
+                                          const std::vector<ActionPoseSample>& held_out,
+                                          std::optional<int> end_effector, int most) {
+  std::vector<const BodySchema*> all;
+  for (const auto& [version, schema] : versions) all.push_back(&schema);
+  std::vector<const BodySchema*> chosen;
+  const int num_chosen = std::min(most, static_cast<int>(all.size()));
+  for (int i = 0; i < num_chosen; ++i) {
+    // From the last one backwards, in equal steps.
+    const auto index = static_cast<std::size_t>(
+        std::lround((i + 1.0) * static_cast<double>(all.size()) / num_chosen) - 1);
+    chosen.push_back(all[index]);
+  }
+  std::vector<VersionErrors> result;
+  for (const BodySchema* schema : chosen) {
+    std::vector<ActionPoseSample> fitting;
+    for (const ActionPoseSample& sample : held_out) {
+      if (sample.action.size() == static_cast<Eigen::Index>(schema->signals.size()))
+        fitting.push_back(sample);
+    }
+    std::vector<double> medians;
+    VersionErrors errors;
+    errors.num_samples = schema->last_sample_index + 1;
+    errors.num_edges = static_cast<int>(schema->edges.size());
+    for (const PartErrors& part : evaluate(*schema, fitting)) {
+      if (part.count == 0) continue;
+      medians.push_back(part.position_median_m);
+      if (part.part == end_effector) errors.end_effector_m = part.position_median_m;
+    }
+    if (medians.empty()) continue;
+    errors.median_position_m = quantile(medians, 0.5);
+    errors.worst_position_m = *std::max_element(medians.begin(), medians.end());
+    result.push_back(errors);
+  }
+  return result;
+}
+
+std::optional<Plot> version_plot(const std::vector<VersionErrors>& versions) {
+  if (versions.size() < 2) return std::nullopt;
+  std::string data = "$errors << EOD\n";
+  bool has_effector = false;
+  int most_edges = 1;
+  double lowest = 1, highest = 1e-5;
+  for (const VersionErrors& version : versions) {
+    lowest = std::clamp(version.median_position_m, 1e-5, lowest);
+    lowest = std::clamp(version.end_effector_m.value_or(lowest), 1e-5, lowest);
+    highest = std::max(highest, version.worst_position_m);
+    has_effector |= version.end_effector_m.has_value();
+    most_edges = std::max(most_edges, version.num_edges);
+    data += fmt::format(
+        "{} {} {} {} {}\n", version.num_samples, number(version.median_position_m * 1e3),
+        number(version.worst_position_m * 1e3),
+        number(version.end_effector_m.value_or(std::numeric_limits<double>::quiet_NaN()) * 1e3),
+        version.num_edges);
+  }
+  data += "EOD\n";
+  const std::string dots = "with linespoints pt 7 ps 0.35 lw 1.6";
+  std::string script = data;
+  script += fmt::format(
+      "set xrange [0:{}]\nset multiplot\nset lmargin at screen 0.075\nset rmargin at screen 0.985\n"
+      "set tmargin at screen 0.90\nset bmargin at screen 0.42\n"
+      "set logscale y\nset yrange [{}:{}]\nset format x ''\n"
+      "set label 1 'error [mm]' at screen 0.014,0.66 rotate center\n"
+      "set ytics (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, "
+      "2000)\n"
+      "set key outside top right horizontal samplen 1.5 textcolor rgb 'black'\n",
+      versions.back().num_samples + 1, number(lowest * 0.7e3), number(highest * 1.4e3));
+  script += fmt::format(
+      "plot $errors using 1:3 {0} lc rgb '{1}' title 'worst part', "
+      "$errors using 1:2 {0} lc rgb '{2}' title 'median of the parts'",
+      dots, kOrange, kBlue);
+  if (has_effector)
+    script += fmt::format(", $errors using 1:4 {} lc rgb '#5aa469' title 'end effector'", dots);
+  script += fmt::format(
+      "\nset tmargin at screen 0.36\nset bmargin at screen 0.17\nunset logscale y\nset format x "
+      "'%g'\nset label 1 'edges' at screen 0.014,0.265 rotate center\nset xlabel 'samples' offset "
+      "0,0.3\n"
+      "set yrange [0:{0}]\nset ytics {1}\nunset key\n"
+      "plot $errors using 1:5 with steps lw 1.6 lc rgb 'black'\nunset multiplot\n",
+      most_edges + 1, std::max(1, (most_edges + 2) / 3));
+  return Plot{.height_px = 330, .script = script};
+}
+
+EdgeSlice edge_slice(const BodySchema& schema, const Edge& edge, int signal,
+                     const std::vector<ActionPoseSample>& samples) {
+  constexpr int kPoints = 60;
+  const auto num_signals = static_cast<Eigen::Index>(schema.signals.size());
+  Eigen::VectorXd middle(num_signals);
+  for (Eigen::Index s = 0; s < num_signals; ++s) {
+    const Signal& limits = schema.signals[static_cast<std::size_t>(s)];
+    middle[s] = 0.5 * (limits.lower + limits.upper);
+  }
+  const Pose X_middle = edge.predict(middle);
+  const Matrix6d noise = observation_noise(schema, edge, samples);
+  const auto point_at = [&](const Eigen::VectorXd& action) {
+    const Pose X = edge.predict(action);
+    const Matrix6d of_model = edge.prediction_covariance(action);
+    EdgeSlice::Point point;
+    point.q = action[signal];
+    point.mean = components(X, X_middle);
+    point.sigma_model = component_sigmas(X, X_middle, of_model);
+    point.sigma = component_sigmas(X, X_middle, of_model + noise);
+    return point;
+  };
+
+  EdgeSlice slice;
+  slice.signal = signal;
+  const Signal& range = schema.signals[static_cast<std::size_t>(signal)];
+  for (int i = 0; i <= kPoints; ++i) {
+    Eigen::VectorXd action = middle;
+    action[signal] = range.lower + (range.upper - range.lower) * i / kPoints;
+    slice.curve.push_back(point_at(action));
+  }
+  int num_within = 0, num_components = 0;
+  for (const ActionPoseSample& sample : samples) {
+    const PartObservation* from = sample.find(edge.from);
+    const PartObservation* to = sample.find(edge.to);
+    if (!from || !to || sample.action.size() != num_signals) continue;
+    const Pose observed = from->X_CB.inverse() * to->X_CB;
+    Eigen::VectorXd action = middle;
+    action[signal] = sample.action[signal];
+    EdgeSlice::Observation& observation = slice.observations.emplace_back();
+    observation.q = sample.action[signal];
+    observation.value = components(
+        edge.predict(action) * edge.predict(sample.action).inverse() * observed, X_middle);
+    observation.is_held_out = sample.purpose == Purpose::kTest;
+    const EdgeSlice::Point expected = point_at(action);
+    for (int c = 0; c < 6; ++c) {
+      ++num_components;
+      num_within += std::abs(observation.value[c] - expected.mean[c]) <= 2 * expected.sigma[c];
+    }
+  }
+  slice.coverage = num_components > 0 ? static_cast<double>(num_within) / num_components
+                                      : std::numeric_limits<double>::quiet_NaN();
+  return slice;
+}
+
+EdgePlot edge_plot(const BodySchema& schema, const EdgeSlice& slice) {
+  static const char* const kTitles[] = {"x [mm]",      "y [mm]",      "z [mm]",
+                                        "about x [°]", "about y [°]", "about z [°]"};
+  EdgePlot result;
+  result.plot.height_px = 320;
+  std::string& script = result.plot.script;
+  script = "$curve << EOD\n";
+  for (const EdgeSlice::Point& point : slice.curve) {
+    script += number(point.q);
+    for (int c = 0; c < 6; ++c) {
+      script += fmt::format(" {} {} {}", number(point.mean[c]), number(2 * point.sigma_model[c]),
+                            number(2 * point.sigma[c]));
+    }
+    script += "\n";
+  }
+  script += "EOD\n";
+  // Axes for the band, not for the wildest outlier.
+  std::vector<std::pair<double, double>> limits;
+  for (int c = 0; c < 6; ++c) {
+    double low = std::numeric_limits<double>::infinity(), high = -low;
+    for (const EdgeSlice::Point& point : slice.curve) {
+      low = std::min(low, point.mean[c] - 4 * point.sigma[c]);
+      high = std::max(high, point.mean[c] + 4 * point.sigma[c]);
+    }
+    if (!(high > low)) low -= 1, high += 1;
+    if (!std::isfinite(low) || !std::isfinite(high)) low = -1, high = 1;
+    limits.emplace_back(low, high);
+  }
+  std::string dots[2];
+  const std::size_t step = (slice.observations.size() + kMostDots - 1) / kMostDots;
+  int num_drawn = 0;
+  for (std::size_t i = 0; i < slice.observations.size(); i += std::max<std::size_t>(1, step)) {
+    const EdgeSlice::Observation& observation = slice.observations[i];
+    ++num_drawn;
+    std::string& row = dots[observation.is_held_out ? 1 : 0];
+    row += number(observation.q);
+    bool is_beyond = false;
+    for (int c = 0; c < 6; ++c) {
+      row += " " + number(observation.value[c]);
+      is_beyond |= observation.value[c] < limits[static_cast<std::size_t>(c)].first ||
+                   observation.value[c] > limits[static_cast<std::size_t>(c)].second;
+    }
+    row += "\n";
+    result.num_beyond += is_beyond ? 1 : 0;
+  }
+  result.num_left_out = static_cast<int>(slice.observations.size()) - num_drawn;
+  // A block without a row would be an error of gnuplot's.
+  const std::string none = "NaN NaN NaN NaN NaN NaN NaN\n";
+  script += "$learned << EOD\n" + (dots[0].empty() ? none : dots[0]) + "EOD\n";
+  script += "$held_out << EOD\n" + (dots[1].empty() ? none : dots[1]) + "EOD\n";
+  const Signal& signal = schema.signals.at(static_cast<std::size_t>(slice.signal));
+  script += fmt::format(
+      "set multiplot layout 2,3 margins 0.055,0.978,0.15,0.925 spacing 0.08,0.21\n"
+      "unset key\nset xrange [{}:{}]\nset xtics {}\n",
+      number(signal.lower), number(signal.upper), number(tic_step(signal.upper - signal.lower, 3)));
+  for (int c = 0; c < 6; ++c) {
+    const auto [low, high] = limits[static_cast<std::size_t>(c)];
+    script += fmt::format("set title {} offset 0,-0.6\nset yrange [{}:{}]\nset ytics {}\n",
+                          gnuplot_string(kTitles[c]), number(low), number(high),
+                          number(tic_step(high - low, 2.2)));
+    if (c == 4) {
+      script += fmt::format("set xlabel {} offset 0,0.6\n", gnuplot_string(signal.name));
+    } else {
+      script += "unset xlabel\n";
+    }
+    const int mean = 2 + 3 * c;
+    const auto band = [&](int column, double alpha) {
+      return fmt::format(
+          "$curve using 1:(${0}-${1}):(${0}+${1}) with filledcurves lc rgb '{2}' fs transparent "
+          "solid {3} noborder",
+          mean, column, kBlue, alpha);
+    };
+    script += fmt::format(
+        "plot {}, {}, $curve using 1:{} with lines lw 1.3 lc rgb '{}', "
+        "$learned using 1:{} with points pt 7 ps 0.26 lc rgb 'black', "
+        "$held_out using 1:{} with points pt 7 ps 0.32 lc rgb '{}'\n",
+        band(mean + 2, 0.18), band(mean + 1, 0.35), mean, kBlue, 2 + c, 2 + c, kOrange);
+  }
+  script += "unset multiplot\n";
+  return result;
+}
+
+std::vector<Plot> load_plots(const std::vector<RunRecord::Process>& processes) {
+  std::string data;
+  std::vector<std::string> names;
+  for (const RunRecord::Process& process : processes) {
+    if (process.load.size() < 2) continue;
+    data += fmt::format("$p{} << EOD\n", names.size());
+    for (const RunRecord::Load& load : process.load) {
+      data += fmt::format("{} {} {}\n", number(load.at_s), number(load.cpu_percent),
+                          number(load.memory_mb));
+    }
+    data += "EOD\n";
+    names.push_back(process.newest.process_name);
+  }
+  if (names.empty()) return {};
+  std::string script = data +
+                       "set xrange [0:*]\nset yrange [0:*]\nset xlabel 's' offset 0,0.5\n"
+                       "set lmargin 7\nset rmargin 22\n"
+                       "set key outside right top Left reverse samplen 1.2 textcolor rgb 'black'\n";
+  std::vector<Plot> plots;
+  for (int column = 2; column <= 3; ++column) {
+    std::string plot =
+        fmt::format("set ylabel '{}' offset 1\nplot ", column == 2 ? "% of a core" : "memory [MB]");
+    for (std::size_t i = 0; i < names.size(); ++i) {
+      plot += fmt::format("{}$p{} using 1:{} with lines lw 1.5 lc rgb '{}' dt {} title {}",
+                          i ? ", " : "", i, column, kColours[i % std::size(kColours)],
+                          i < std::size(kColours) ? 1 : 2, gnuplot_string(names[i]));
+    }
+    plots.push_back({.height_px = 220, .script = script + plot + "\n"});
+  }
+  return plots;
+}
+
+}  // namespace bodyschema

@@ -1,0 +1,296 @@
+#include "processes/console/status_board.h"
+
+#include <gtest/gtest.h>
+
+#include <sstream>
+
+#include "common/bus/convert.h"
+
+namespace bodyschema {
+namespace {
+
+constexpr std::int64_t kSecond = 1'000'000;
+
+process_info_t info(const std::string& name, std::int8_t phase = process_info_t::PHASE_WORKING,
+                    const std::string& activity = "", std::int32_t pid = 1) {
+  process_info_t message{};
+  message.utime = 100 * kSecond;
+  message.start_utime = 40 * kSecond;
+  message.process_name = name;
+  message.host = "lab";
+  message.pid = pid;
+  message.program_version = "1.2.3";
+  message.phase = phase;
+  message.activity = activity;
+  message.resident_bytes = 50'000'000;
+  return message;
+}
+
+motion_status_t at_rest() {
+  motion_status_t status{};
+  status.action_id = 7;
+  status.source = "motor_babbler";
+  status.state = motion_status_t::STATE_SETTLED;
+  status.rest_since_utime = 5;
+  return status;
+}
+
+/// A group of two in which all is well.
+StatusBoard board() {
+  StatusBoard board({"motor_babbler", "robot_simulator"}, "1.2.3");
+  board.begin(0);
+  for (const char* channel : {"PROCESS_INFO", "MOTION_STATUS"})
+    board.on_arrival(channel, kSecond / 2);
+  board.on_message(info("motor_babbler", process_info_t::PHASE_WORKING, "5 samples"));
+  board.on_message(info("robot_simulator"));
+  board.on_message(at_rest());
+  board.end(2 * kSecond);
+  return board;
+}
+
+BodySchema two_parts() {
+  BodySchema schema;
+  schema.version = 9;
+  schema.num_samples = 7;
+  schema.parts = {1, 2, 3};
+  schema.root = 1;
+  schema.signals = {{"q1", -1, 1}, {"q2", -1, 1}};
+  Edge edge;
+  edge.from = 1;
+  edge.to = 2;
+  edge.joints = {ScrewJoint{.signal = 1, .turn = 1}, ScrewJoint{.signal = 0, .turn = 1}};
+  edge.position_rms_m = 0.0012;
+  schema.edges = {edge};
+  schema.unconnected = {{3, Unconnected::kNotEnoughData, "seen once"}};
+  return schema;
+}
+
+TEST(StatusBoardTest, TheFirstLineSaysWhatIsDone) {
+  EXPECT_EQ(board().headline(), "Learning: 5 samples.");
+  EXPECT_TRUE(board().text(100).starts_with("Learning: 5 samples.\n"));
+  StatusBoard done = board();
+  done.on_message(info("motor_babbler", process_info_t::PHASE_DONE, "60 samples"));
+  EXPECT_EQ(done.headline(), "Done: 60 samples.");
+  StatusBoard waits = board();
+  waits.on_message(info("motor_babbler", process_info_t::PHASE_WAITING, "waiting for SAMPLE"));
+  EXPECT_EQ(waits.headline(), "Waits: waiting for SAMPLE.");
+}
+
+TEST(StatusBoardTest, AStopComesBeforeAllElseAndTheControllerBeforeTheBabbler) {
+  StatusBoard board_ = board();
+  control_status_t control{};
+  control.owns_arm = 1;
+  control.control_state = control_status_t::CONTROL_MOVING;
+  control.why = "12 mm to go";
+  board_.on_message(control);
+  EXPECT_EQ(board_.headline(), "The controller has the arm, moving: 12 mm to go.");
+  motion_status_t stopped = at_rest();
+  stopped.stop_latched = 1;
+  board_.on_message(stopped);
+  EXPECT_EQ(board_.headline(), "Stopped: nothing moves until `bodyschema resume`.");
+}
+
+TEST(StatusBoardTest, WhoIsMissingIsNamed) {
+  StatusBoard alone({"motor_babbler", "camera", "robot_simulator"}, "1.2.3");
+  alone.on_arrival("PROCESS_INFO", 1);
+  alone.on_message(info("motor_babbler"));
+  EXPECT_EQ(alone.headline(),
+            "Waits for a driver: nobody sends MOTION_STATUS. Not heard: camera, robot_simulator.");
+  EXPECT_NE(alone.text(100).find("! not heard: camera, robot_simulator\n"), std::string::npos);
+  // Any driver will do.
+  alone.on_message(at_rest());
+  EXPECT_TRUE(alone.headline().ends_with("Not heard: camera."));
+  // What has ended is as good as not there.
+  alone.on_message(info("camera"));
+  EXPECT_EQ(alone.headline().find("Not heard"), std::string::npos);
+  alone.on_message(info("camera", process_info_t::PHASE_ENDED));
+  EXPECT_TRUE(alone.headline().ends_with("Not heard: camera."));
+}
+
+TEST(StatusBoardTest, TwinsAndOtherVersionsAreNamed) {
+  StatusBoard board_ = board();
+  board_.on_message(info("motor_babbler", process_info_t::PHASE_WORKING, "", 22));
+  process_info_t old = info("camera");
+  old.program_version = "1.0.0";
+  board_.on_message(old);
+  const std::string text = board_.text(120);
+  EXPECT_NE(text.find("! motor_babbler runs more than once (pid 1 on lab, pid 22 on lab)"),
+            std::string::npos)
+      << text;
+  EXPECT_NE(text.find("! camera on lab is of version 1.0.0, this command of 1.2.3"),
+            std::string::npos)
+      << text;
+  EXPECT_EQ(board_.json()["twins"], nlohmann::ordered_json({"motor_babbler"}));
+  // One that was started again after it had ended is no twin.
+  board_.on_message(info("motor_babbler", process_info_t::PHASE_ENDED));
+  EXPECT_EQ(board_.json()["twins"], nlohmann::ordered_json::array());
+}
+
+TEST(StatusBoardTest, ProcessorTimeIsThatOfTheWindowWhereThereIsOne) {
+  StatusBoard board_ = board();
+  process_info_t first = info("camera");
+  first.cpu_us = 30 * kSecond;  // half of its minute
+  board_.on_message(first);
+  EXPECT_DOUBLE_EQ(board_.json()["processes"][0]["cpu_percent"].get<double>(), 50);
+  process_info_t second = first;
+  second.utime += kSecond;
+  second.cpu_us += kSecond / 4;
+  board_.on_message(second);
+  const auto json = board_.json()["processes"][0];
+  EXPECT_EQ(json["name"], "camera");
+  EXPECT_DOUBLE_EQ(json["cpu_percent"].get<double>(), 25);
+  EXPECT_DOUBLE_EQ(json["age_s"].get<double>(), 61);
+  EXPECT_EQ(json["resident_bytes"], 50'000'000);
+}
+
+TEST(StatusBoardTest, ChannelsHaveTheirRateAndAge) {
+  StatusBoard board_({}, "1.2.3");
+  board_.begin(0);
+  for (int i = 1; i <= 10; ++i) board_.on_arrival("SAMPLE", i * kSecond / 10);
+  board_.end(2 * kSecond);
+  const auto json = board_.json()["channels"]["SAMPLE"];
+  EXPECT_EQ(json["count"], 10);
+  EXPECT_DOUBLE_EQ(json["rate_hz"].get<double>(), 5);
+  EXPECT_DOUBLE_EQ(json["age_s"].get<double>(), 1);
+}
+
+TEST(StatusBoardTest, LossesAreThoseOfWhomTheyHitMost) {
+  StatusBoard board_ = board();
+  const auto with = [](process_info_t message, std::vector<std::pair<std::string, int>> counts) {
+    for (const auto& [name, count] : counts) {
+      counter_t counter{};
+      counter.counter_name = name;
+      counter.count = count;
+      message.counters.push_back(counter);
+    }
+    message.num_counters = static_cast<std::int32_t>(message.counters.size());
+    return message;
+  };
+  board_.on_message(with(info("motor_babbler"),
+                         {{"malformed SAMPLE", 3}, {"received SAMPLE", 99}, {"senseless SAMPLE", 0}}));
+  board_.on_message(with(info("robot_simulator"),
+                         {{"malformed SAMPLE", 5}, {"refused SAMPLE", 1}, {"tag too small", 4}}));
+  board_.on_arrival("SAMPLE", 1);
+  board_.on_own_counters({{"malformed SAMPLE", 2}, {"senseless CAMERA_INFO", 6}});
+  const auto json = board_.json();
+  EXPECT_EQ(json["channels"]["SAMPLE"]["dropped"],
+            nlohmann::ordered_json({{"malformed", 5}, {"refused", 1}}));
+  // Nothing but garbage came there.
+  EXPECT_EQ(json["channels"]["CAMERA_INFO"]["count"], 0);
+  EXPECT_TRUE(json["channels"]["CAMERA_INFO"]["age_s"].is_null());
+  const std::string text = board_.text(100);
+  EXPECT_NE(text.find("5 malformed, 1 refused"), std::string::npos) << text;
+  EXPECT_NE(text.find("6 senseless"), std::string::npos) << text;
+  EXPECT_NE(text.find("robot_simulator counted 4 tag too small"), std::string::npos) << text;
+  EXPECT_EQ(text.find("99"), std::string::npos) << text;
+}
+
+TEST(StatusBoardTest, TheBodySchemaStandsBeforeAProposal) {
+  StatusBoard board_ = board();
+  EXPECT_NE(board_.text(100).find("schema   none yet"), std::string::npos);
+  BodySchema proposal = two_parts();
+  proposal.version = 0;
+  board_.on_learned_schema(to_message(proposal));
+  EXPECT_NE(board_.text(100).find("none accepted yet; proposal, incomplete: 3 parts, 1 edges"),
+            std::string::npos)
+      << board_.text(100);
+  EXPECT_FALSE(board_.json()["schema"]["accepted"].get<bool>());
+  board_.on_body_schema(to_message(two_parts()));
+  board_.on_learned_schema(to_message(proposal));
+  EXPECT_EQ(board_.json()["schema"]["version"], 9);
+  EXPECT_TRUE(board_.json()["schema"]["accepted"].get<bool>());
+}
+
+TEST(StatusBoardTest, AnEdgeIsShownWithItsHealth) {
+  StatusBoard board_ = board();
+  board_.on_body_schema(to_message(two_parts()));
+  model_health_t health{};
+  edge_health_t of_edge{};
+  of_edge.health_from = 1;
+  of_edge.health_to = 2;
+  of_edge.edge_state = schema_edge_t::EDGE_SUSPECT;
+  of_edge.num_tests = 4;
+  of_edge.median_mahalanobis2 = 12.3;
+  set_array(health.num_edges, health.edge_health, {of_edge});
+  part_health_t part{};
+  part.health_part = 2;
+  part.visibility = 0.5;
+  part.position_median_m = -1;
+  set_array(health.num_parts, health.part_health, {part});
+  health_event_t event{};
+  event.event_sample = 14;
+  event.event_text = "version 9 accepted";
+  set_array(health.num_events, health.events, {event});
+  board_.on_message(health);
+  const auto edge = board_.json()["schema"]["edges"][0];
+  EXPECT_EQ(edge["signals"], nlohmann::ordered_json({"q2", "q1"}));
+  EXPECT_EQ(edge["state"], "SUSPECT");
+  EXPECT_EQ(edge["median_mahalanobis2"], 12.3);
+  const std::string text = board_.text(100);
+  EXPECT_NE(text.find("1 → 2   screw  {q2,q1}        1.20 mm   0.00°  SUSPECT         4      12.3"),
+            std::string::npos)
+      << text;
+  EXPECT_NE(text.find("not connected: not enough data yet: seen once"), std::string::npos) << text;
+  EXPECT_NE(text.find("version 9 accepted"), std::string::npos) << text;
+  EXPECT_TRUE(board_.json()["parts"][0]["position_median_m"].is_null());
+}
+
+TEST(StatusBoardTest, FaultsAreMarkedAsGroundTruth) {
+  StatusBoard board_ = board();
+  EXPECT_EQ(board_.text(100).find("faults"), std::string::npos);
+  EXPECT_TRUE(board_.json()["faults"].is_null());
+  sim_state_t state{};
+  set_array(state.num_faults, state.faults, {"stuck q3", "bend link2 10°"});
+  board_.on_message(state);
+  EXPECT_NE(
+      board_.text(100).find("faults   stuck q3, bend link2 10°   (ground truth of the simulation)"),
+      std::string::npos)
+      << board_.text(100);
+}
+
+TEST(StatusBoardTest, SilenceAndGarbageAreTold) {
+  StatusBoard board_({"camera"}, "1.2.3");
+  board_.begin(0);
+  board_.end(kSecond);
+  EXPECT_TRUE(board_.is_silent());
+  board_.on_own_counters({{"received SAMPLE", 0}, {"malformed SAMPLE", 0}});
+  EXPECT_TRUE(board_.is_silent());
+  board_.on_own_counters({{"malformed SAMPLE", 3}});
+  EXPECT_FALSE(board_.is_silent());
+  EXPECT_TRUE(board_.headline().starts_with("Nothing but garbage"));
+  EXPECT_NO_THROW(board_.json());
+}
+
+TEST(StatusBoardTest, NoLineIsWiderThanTheTerminalAndNoneObeysAMessage) {
+  StatusBoard board_ = board();
+  std::string hostile = "\x1b[2J\nmm·°→";
+  for (int i = 0; i < 6; ++i) hostile += hostile;
+  board_.on_message(info("motor_babbler", process_info_t::PHASE_WORKING, hostile));
+  board_.on_message(info(std::string(63, 'n'), process_info_t::PHASE_WAITING, hostile));
+  board_.on_body_schema(to_message(two_parts()));
+  const std::string text = board_.text(60);
+  EXPECT_EQ(text.find('\x1b'), std::string::npos);
+  std::istringstream lines(text);
+  std::string line;
+  std::getline(lines, line);  // the headline is never cut
+  int num_cut = 0;
+  while (std::getline(lines, line)) {
+    const auto is_first_byte = [](char c) { return (static_cast<unsigned char>(c) & 0xC0) != 0x80; };
+    EXPECT_LE(std::count_if(line.begin(), line.end(), is_first_byte), 60) << line;
+    num_cut += line.ends_with("…");
+  }
+  EXPECT_GT(num_cut, 2);
+}
+
+TEST(FitTest, CutsBetweenCharacters) {
+  EXPECT_EQ(fit("abc", 3), "abc");
+  EXPECT_EQ(fit("abcd", 3), "ab…");
+  EXPECT_EQ(fit("äöüß", 4), "äöüß");
+  EXPECT_EQ(fit("äöüßx", 4), "äöü…");
+  EXPECT_EQ(fit("a\tb\nc", 10), "a b c");
+  EXPECT_EQ(fit("a\xC2\x9B" "b", 10), "a b");  // a control character of two bytes
+  EXPECT_EQ(fit("", 0), "");
+}
+
+}  // namespace
+}  // namespace bodyschema

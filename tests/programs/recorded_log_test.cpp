@@ -1,0 +1,214 @@
+// logs/arm2_15.lcmlog, a run as a lab records it, through the programs that read logs. Record it
+// again when a message type changes; logs/README.md has the command.
+
+#include <gtest/gtest.h>
+#include <sys/wait.h>
+
+#include <csignal>
+#include <cstdlib>
+#include <filesystem>
+#include <set>
+#include <string>
+#include <thread>
+#include <utility>
+#include <vector>
+
+#include "common/bus/convert.h"
+#include "common/bus/event_log.h"
+#include "common/bus/log_summary.h"
+#include "processes/structure_learner/learn.h"
+#include "processes/structure_learner/structure_learner.h"
+#include "tests/common/bus/bus_test_support.h"
+#include "tests/support/rig_truth.h"
+
+namespace bodyschema {
+namespace {
+
+namespace fs = std::filesystem;
+
+const fs::path kLog = BODYSCHEMA_LOGS "/arm2_15.lcmlog";
+const fs::path kRig = BODYSCHEMA_CONFIG "/arm2";
+const std::string kBin = BODYSCHEMA_BIN "/";
+
+std::string text_of(const fs::path& file) {
+  const auto bytes = test::read_bytes(file);
+  return {bytes.begin(), bytes.end()};
+}
+
+class RecordedLogTest : public testing::Test {
+ protected:
+  /// Runs a process of the group from the log to a log; what it wrote.
+  fs::path replay(const std::string& process) {
+    const fs::path out = folder_ / (process + ".lcmlog");
+    test::Program program({kBin + process, "--config", kRig / (process + ".yaml"), "--in",
+                           "file://" + kLog.string() + "?speed=0", "--out",
+                           "file://" + out.string() + "?mode=w"});
+    EXPECT_EQ(program.wait(), 0) << program.err();
+    return out;
+  }
+  static std::string objection(const BodySchema& schema) {
+    const test::RigTruth truth(kRig);
+    return truth.objection(schema, truth.parts());
+  }
+
+  test::TemporaryFolder folder_;
+};
+
+TEST_F(RecordedLogTest, IsWholeAndOfThisVersion) {
+  const LogSummary summary = summarize_log(kLog);
+  EXPECT_TRUE(summary.is_sound()) << flaws_text(summary)
+                                  << "record it again with the command in logs/README.md";
+  EXPECT_EQ(summary.channels.count("SIM_STATE"), 0U);
+}
+
+TEST_F(RecordedLogTest, TheObserverMakesItsSamplesAgain) {
+  std::set<std::int64_t> recorded, replayed;
+  for (const sample_t& sample : read_log(kLog, kSample)) recorded.insert(sample.sample_index);
+  const auto samples = read_log(replay("observer"), kSample);
+  for (const sample_t& sample : samples) replayed.insert(sample.sample_index);
+  EXPECT_EQ(replayed, recorded);
+  EXPECT_EQ(recorded.size(), 15U);
+}
+
+TEST_F(RecordedLogTest, TheLearnerFindsTheBody) {
+  const auto learned = read_log(replay("structure_learner"), kLearnedSchema);
+  ASSERT_FALSE(learned.empty());
+  EXPECT_EQ(learned.back().num_samples_seen, 12);
+  EXPECT_EQ(objection(from_message(learned.back())), "");
+}
+
+TEST_F(RecordedLogTest, TheMonitorAcceptsWhatItAcceptedThen) {
+  const auto then = read_log(kLog, kBodySchema);
+  const auto now = read_log(replay("model_monitor"), kBodySchema);
+  ASSERT_FALSE(then.empty());
+  ASSERT_FALSE(now.empty());
+  EXPECT_EQ(now.back().schema_version, then.back().schema_version);
+  EXPECT_EQ(objection(from_message(now.back())), "");
+}
+
+TEST_F(RecordedLogTest, TheConsoleLearnsFromItAndKnowsItsSchema) {
+  test::Program learn({kBin + "bodyschema", "learn", kLog, "--out", folder_ / "schema.lcmlog"});
+  ASSERT_EQ(learn.wait(), 0) << learn.err();
+  const auto schemas = read_log(folder_ / "schema.lcmlog", kBodySchema);
+  ASSERT_EQ(schemas.size(), 1U);
+  EXPECT_EQ(objection(from_message(schemas[0])), "");
+}
+
+TEST_F(RecordedLogTest, ItsReportTellsTheRun) {
+  test::Program report({kBin + "bodyschema", "report", kLog, "--out", folder_ / "report.html"});
+  ASSERT_EQ(report.wait(), 0) << report.err();
+  const std::string html = text_of(folder_ / "report.html");
+  EXPECT_NE(html.find("The body is known: 5 parts hang together by 4 edges"), std::string::npos);
+  EXPECT_NE(html.find("accepted by the monitor"), std::string::npos);
+  EXPECT_NE(html.find("what the camera saw"), std::string::npos);
+  EXPECT_NE(html.find("max_signals"), std::string::npos);  // a configuration
+  EXPECT_EQ(html.find("cut off"), std::string::npos);
+}
+
+TEST_F(RecordedLogTest, CutOffAnywhereItIsReportedAndSaysSo) {
+  const auto bytes = test::read_bytes(kLog);
+  for (const double share : {0.001, 0.1, 0.35, 0.6, 0.999}) {
+    const auto size = static_cast<std::ptrdiff_t>(share * static_cast<double>(bytes.size())) + 1;
+    test::write_bytes(folder_ / "cut.lcmlog", {bytes.begin(), bytes.begin() + size});
+    test::Program report({kBin + "bodyschema", "report", folder_ / "cut.lcmlog"});
+    ASSERT_EQ(report.wait(), 0) << share << report.err();
+    EXPECT_NE(text_of(folder_ / "cut.lcmlog.html").find("is cut off in the middle of an event"),
+              std::string::npos)
+        << share;
+    test::Program check({kBin + "bodyschema", "log", "--check", folder_ / "cut.lcmlog"});
+    EXPECT_EQ(check.wait(), 1);
+    EXPECT_NE(check.err().find("is cut off"), std::string::npos) << check.err();
+  }
+  // A recording that is cut off is learned from, and that is said too.
+  test::Program learn({kBin + "bodyschema", "learn", folder_ / "cut.lcmlog"});
+  EXPECT_EQ(learn.wait(), 0);
+  EXPECT_NE(learn.err().find("ends in the middle of an event"), std::string::npos) << learn.err();
+}
+
+TEST_F(RecordedLogTest, RecordedWithOtherMessagesItSaysSo) {
+  {
+    LogAppender log(folder_ / "old.lcmlog");
+    for_each_event(kLog, [&](const LogEvent& event) {
+      auto data = event.data;
+      if (event.channel == "SAMPLE") data[0] ^= 1;  // of the fingerprint
+      log.append_bytes(event.channel, data, event.event_utime);
+    });
+  }
+  test::Program check({kBin + "bodyschema", "log", "--check", folder_ / "old.lcmlog"});
+  EXPECT_EQ(check.wait(), 1);
+  EXPECT_NE(check.out().find("SAMPLE: 15 of 15 messages cannot be read: fingerprint"),
+            std::string::npos)
+      << check.out();
+  test::Program report({kBin + "bodyschema", "report", folder_ / "old.lcmlog"});
+  EXPECT_EQ(report.wait(), 0) << report.err();
+  EXPECT_NE(text_of(folder_ / "old.lcmlog.html").find("15 of 15 messages cannot be read"),
+            std::string::npos);
+}
+
+TEST_F(RecordedLogTest, AThinCopyHoldsEveryMessageOnce) {
+  {
+    LogAppender log(folder_ / "twice.lcmlog");
+    for (int pass = 0; pass < 2; ++pass) {
+      for_each_event(kLog, [&](const LogEvent& event) {
+        log.append_bytes(event.channel, event.data, event.event_utime);
+      });
+      log.append_bytes("SIM_STATE", std::vector<std::uint8_t>{1}, 1);
+    }
+  }
+  test::Program thin(
+      {kBin + "bodyschema", "log", folder_ / "twice.lcmlog", "--thin", folder_ / "thin.lcmlog"});
+  ASSERT_EQ(thin.wait(), 0) << thin.err();
+  const auto messages = [](const fs::path& file) {
+    std::multiset<std::pair<std::string, std::vector<std::uint8_t>>> all;
+    for_each_event(file, [&](const LogEvent& event) { all.emplace(event.channel, event.data); });
+    return all;
+  };
+  EXPECT_TRUE(messages(folder_ / "thin.lcmlog") == messages(kLog));
+}
+
+TEST_F(RecordedLogTest, AReportFollowsARunUntilItIsEnded) {
+  const auto bytes = test::read_bytes(kLog);
+  const fs::path html = folder_ / "report.html";
+  test::Program follow({kBin + "bodyschema", "report", "--follow", folder_.path()});
+  const auto says = [&](const std::string& what) {
+    return test::ask_until([] { std::this_thread::yield(); },
+                           [&] {
+                             return fs::exists(html) &&
+                                    text_of(html).find(what) != std::string::npos;
+                           });
+  };
+  EXPECT_TRUE(says("Nothing was recorded yet"));
+  EXPECT_TRUE(says("http-equiv=\"refresh\""));
+  test::write_bytes(folder_ / "run.lcmlog.00",
+                    {bytes.begin(), bytes.begin() + static_cast<std::ptrdiff_t>(bytes.size() / 2)});
+  // Asked to end, it reads what is there and writes a last time.
+  test::write_bytes(folder_ / "run.lcmlog.00", bytes);
+  follow.send_signal(SIGTERM);
+  EXPECT_EQ(follow.wait(), 0) << follow.err();
+  EXPECT_TRUE(says("The body is known"));
+  EXPECT_EQ(text_of(html).find("http-equiv"), std::string::npos);
+}
+
+TEST_F(RecordedLogTest, WhatIsNoRunIsAClearError) {
+  test::Program report({kBin + "bodyschema", "report", folder_ / "none"});
+  EXPECT_EQ(report.wait(), 1);
+  EXPECT_NE(report.err().find("none: no such run folder or log"), std::string::npos);
+  test::write_bytes(folder_ / "empty", {});
+  test::Program empty({kBin + "bodyschema", "report", folder_ / "empty"});
+  EXPECT_EQ(empty.wait(), 1);
+  EXPECT_NE(empty.err().find("empty: is empty"), std::string::npos);
+}
+
+// What tags add to their noise is one number: the rigs' files and the console agree.
+TEST(TagModelErrorTest, IsTheRigs) {
+  for (const auto& rig : fs::directory_iterator(BODYSCHEMA_CONFIG)) {
+    if (!fs::exists(rig.path() / "structure_learner.yaml")) continue;
+    const Noise noise =
+        StructureLearnerConfig::load(rig.path() / "structure_learner.yaml").options.model_error;
+    EXPECT_DOUBLE_EQ(noise.position_m, kTagModelError.position_m) << rig.path();
+    EXPECT_DOUBLE_EQ(noise.rotation_rad, kTagModelError.rotation_rad) << rig.path();
+  }
+}
+
+}  // namespace
+}  // namespace bodyschema
