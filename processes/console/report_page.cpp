@@ -301,18 +301,18 @@ class Page {
                        std::max<std::ptrdiff_t>(0, std::ssize(schema.parts) - 1)));
     }
     item("Samples", std::to_string(record_.watch().num_samples()),
-         fmt::format("{} of them held out", held_out_.size()));
+         fmt::format("{} held out", held_out_.size()));
     if (const PartErrors* effector = errors_of(report_.end_effector)) {
       item("End effector", millimetres(effector->position_median_m),
            degrees(effector->rotation_median_rad) + ", held out");
     }
     if (const PartErrors* part = worst()) {
       item("Worst part", millimetres(part->position_median_m),
-           fmt::format("part {}, {}, held out", part->part, degrees(part->rotation_median_rad)));
+           fmt::format("part {}, {}", part->part, degrees(part->rotation_median_rad)));
     }
     if (const auto begin = record_.begin_utime()) {
       item("Recorded", duration(record_.duration_s()),
-           fmt::format("{:%Y-%m-%d %H:%M} UTC",
+           fmt::format("{:%Y-%m-%d %H:%M}",
                        fmt::gmtime(static_cast<std::time_t>(*begin / 1'000'000))));
     }
     return html + "</dl>\n";
