@@ -394,13 +394,14 @@ class Page {
           plot(*curve),
           fmt::format(
               "Every version of the body schema{} on the same {} of the whole run, from none of "
-              "which anything was ever learned: distance of the predicted from the true origin "
+              "which anything was ever learned: distance of the predicted from the {} origin "
               "of a part, relative to the root, median over the samples; against {}. A version "
               "is judged on the parts it connects, so a line may rise when a part is added.",
               versions.size() < record_.versions().size()
                   ? fmt::format(" ({} of {} shown)", versions.size(), record_.versions().size())
                   : "",
-              counted(std::ssize(held_out_), "held-out sample"), judge()));
+              counted(std::ssize(held_out_), "held-out sample"),
+              record_.watch().has_truth() ? "true" : "seen", judge()));
     }
     if (!record_.faults().empty()) {
       html +=

@@ -177,6 +177,7 @@ void report(const RunWatch& watch, const BestPicture& picture, const WatchArgume
   std::cout << "  schema.lcmlog      the body schema: ./run show FILE\n"
                "  samples.lcmlog     the samples: ./run learn FILE\n"
                "  run.lcmlog.00      everything on the bus but images\n"
+               "  report.html        all of this as one page, when the group has ended\n"
             << std::flush;
 }
 
