@@ -18,6 +18,7 @@ namespace bodyschema {
 namespace {
 
 constexpr std::uint32_t kSync = 0xEDA1DA01;
+constexpr std::array<std::uint8_t, 4> kSyncBytes = {0xED, 0xA1, 0xDA, 0x01};
 constexpr std::size_t kHeaderSize = 28;
 /// lcm-logplayer refuses longer names.
 constexpr std::int32_t kLongestChannel = 999;
@@ -99,8 +100,8 @@ std::string describe_malformed(const void* data, std::size_t size, const char* t
   return fmt::format("{} bytes do not decode as {}: cut off, too long or damaged", size, type_name);
 }
 
-LogReader::LogReader(const std::filesystem::path& path, std::int64_t from_byte)
-    : path_(path), position_(from_byte) {
+LogReader::LogReader(const std::filesystem::path& path, OnDamage on_damage, std::int64_t from_byte)
+    : path_(path), on_damage_(on_damage), position_(from_byte) {
   std::error_code error;
   if (std::filesystem::is_directory(path, error)) throw file_error(path, "is a folder, not a log");
   file_ = std::fopen(path.c_str(), "rbe");
@@ -113,49 +114,83 @@ LogReader::LogReader(const std::filesystem::path& path, std::int64_t from_byte)
 
 LogReader::~LogReader() { std::fclose(file_); }
 
+void LogReader::seek(std::int64_t position) {
+  if (::fseeko(file_, position, SEEK_SET) != 0) throw system_error(path_, "cannot read the log");
+  position_ = position;
+}
+
 bool LogReader::next() {
   if (report_.truncated_at_byte) return false;
+  for (;;) {
+    const Found found = read_event(true);
+    if (std::ferror(file_) != 0) throw system_error(path_, "cannot read the log");
+    if (found == Found::kEvent || found == Found::kEnd) return found == Found::kEvent;
+    // An event that reaches beyond the end is a torn tail, unless others follow: then its length is
+    // what is damaged.
+    const std::optional<std::int64_t> next = find_event(position_ + 1);
+    if (found == Found::kTruncated && !next) {
+      report_.truncated_at_byte = position_;
+      return false;
+    }
+    if (on_damage_ == OnDamage::kThrow || (!next && report_.events == 0)) {
+      throw file_error(
+          path_, position_ == 0 ? "is not an LCM log (its first bytes are no event)"
+                                : fmt::format("is damaged: no event begins at byte {}", position_));
+    }
+    std::error_code error;
+    const std::int64_t end =
+        next.value_or(static_cast<std::int64_t>(std::filesystem::file_size(path_, error)));
+    if (!report_.damaged_at_byte) report_.damaged_at_byte = position_;
+    report_.damaged_bytes += end - position_;
+    seek(end);
+  }
+}
 
+LogReader::Found LogReader::read_event(bool looks_behind) {
   std::array<std::uint8_t, kHeaderSize> header;
   const std::size_t header_read = std::fread(header.data(), 1, header.size(), file_);
-  if (std::ferror(file_) != 0) throw system_error(path_, "cannot read the log");
-  if (header_read == 0) return false;
-
-  const auto truncated = [&] {
-    report_.truncated_at_byte = position_;
-    return false;
-  };
-  const auto not_an_event = [&] {
-    return file_error(
-        path_, position_ == 0 ? "is not an LCM log (its first bytes are no event)"
-                              : fmt::format("is damaged: no event begins at byte {}", position_));
-  };
+  if (header_read == 0) return Found::kEnd;
 
   // Zeros up to the end are what a power cut leaves of an event that was never written back.
   if (std::all_of(header.begin(), header.begin() + header_read, [](auto b) { return b == 0; })) {
     int byte = 0;
     while ((byte = std::fgetc(file_)) == 0) {
     }
-    if (byte == EOF && position_ > 0) return truncated();
-    throw not_an_event();
+    return byte == EOF && position_ > 0 ? Found::kTruncated : Found::kDamaged;
   }
-  const std::array<std::uint8_t, 4> sync = {0xED, 0xA1, 0xDA, 0x01};
-  const std::size_t comparable = std::min(header_read, sync.size());
-  if (!std::equal(sync.begin(), sync.begin() + comparable, header.begin())) throw not_an_event();
-  if (header_read < header.size()) return truncated();
+  const std::size_t comparable = std::min(header_read, kSyncBytes.size());
+  if (!std::equal(kSyncBytes.begin(), kSyncBytes.begin() + comparable, header.begin())) {
+    return Found::kDamaged;
+  }
+  if (header_read < header.size()) return Found::kTruncated;
 
   const auto channel_size = read_big_endian<std::int32_t>(&header[20]);
   const auto data_size = read_big_endian<std::int32_t>(&header[24]);
   if (channel_size < 1 || channel_size > kLongestChannel || data_size < 0 ||
       static_cast<std::size_t>(data_size) > kLargestMessage) {
-    throw not_an_event();
+    return Found::kDamaged;
   }
   // A length that the file cannot hold must not be allocated before it is found out.
   std::error_code error;
   const auto file_size = static_cast<std::int64_t>(std::filesystem::file_size(path_, error));
   const std::int64_t end =
       position_ + static_cast<std::int64_t>(kHeaderSize) + channel_size + data_size;
-  if (!error && end > file_size) return truncated();
+  if (!error && end > file_size) return Found::kTruncated;
+
+  // Where no event follows either that one is damaged or the length of this one: then it would
+  // swallow what is whole.
+  if (looks_behind && end < file_size) {
+    std::array<std::uint8_t, 4> next{};
+    if (::fseeko(file_, end, SEEK_SET) != 0) return Found::kTruncated;
+    const std::size_t next_read = std::fread(next.data(), 1, next.size(), file_);
+    if (!std::equal(next.begin(), next.begin() + next_read, kSyncBytes.begin())) {
+      const auto inside = find_event(position_ + static_cast<std::int64_t>(kHeaderSize));
+      if (inside && *inside < end) return Found::kDamaged;
+    }
+    if (::fseeko(file_, position_ + static_cast<std::int64_t>(kHeaderSize), SEEK_SET) != 0) {
+      return Found::kTruncated;
+    }
+  }
 
   event_.event_number = read_big_endian<std::int64_t>(&header[4]);
   event_.event_utime = read_big_endian<std::int64_t>(&header[12]);
@@ -163,17 +198,43 @@ bool LogReader::next() {
   event_.data.resize(static_cast<std::size_t>(data_size));
   if (std::fread(event_.channel.data(), 1, event_.channel.size(), file_) != event_.channel.size() ||
       std::fread(event_.data.data(), 1, event_.data.size(), file_) != event_.data.size()) {
-    if (std::ferror(file_) != 0) throw system_error(path_, "cannot read the log");
-    return truncated();
+    return Found::kTruncated;
   }
   position_ = end;
   ++report_.events;
-  return true;
+  return Found::kEvent;
+}
+
+/// The next position at or after `from` where a whole event can be read.
+std::optional<std::int64_t> LogReader::find_event(std::int64_t from) {
+  const std::int64_t position = position_;
+  const std::int64_t events = report_.events;
+  std::optional<std::int64_t> found;
+  std::clearerr(file_);
+  seek(from);
+  std::size_t matched = 0;
+  for (int byte = 0; !found && (byte = std::fgetc(file_)) != EOF;) {
+    if (byte == kSyncBytes[matched]) {
+      ++matched;
+    } else {
+      matched = byte == kSyncBytes[0] ? 1 : 0;
+    }
+    if (matched < kSyncBytes.size()) continue;
+    matched = 0;
+    const std::int64_t after_sync = ::ftello(file_);
+    const std::int64_t candidate = after_sync - static_cast<std::int64_t>(kSyncBytes.size());
+    seek(candidate);
+    if (read_event(false) == Found::kEvent) found = candidate;
+    seek(after_sync);
+  }
+  report_.events = events;
+  seek(position);
+  return found;
 }
 
 LogReport for_each_event(const std::filesystem::path& path,
-                         const std::function<void(const LogEvent&)>& visit) {
-  LogReader reader(path);
+                         const std::function<void(const LogEvent&)>& visit, OnDamage on_damage) {
+  LogReader reader(path, on_damage);
   while (reader.next()) visit(reader.event());
   return reader.report();
 }
@@ -265,6 +326,19 @@ void write_file_atomically(const std::filesystem::path& path, const std::string&
     throw system_error(path, "cannot replace the file");
   }
   sync_folder(path);
+}
+
+std::filesystem::path copy_aside(const std::filesystem::path& path) {
+  for (int n = 1;; ++n) {
+    std::filesystem::path aside = path;
+    aside += fmt::format(".bad-{}", n);
+    std::error_code error;
+    if (std::filesystem::copy_file(path, aside, error)) return aside;
+    if (error != std::errc::file_exists) {
+      throw file_error(path, fmt::format("cannot be copied to {}: {}", aside.filename().string(),
+                                         error.message()));
+    }
+  }
 }
 
 }  // namespace bodyschema

@@ -38,28 +38,44 @@ struct LogReport {
   /// Where the last event begins, if the file ends before that event does: what a writer leaves
   /// that was killed or ran out of disk. Everything before it is good.
   std::optional<std::int64_t> truncated_at_byte;
+  /// Where the first damage begins that was skipped (OnDamage::kSkip), and how much was.
+  std::optional<std::int64_t> damaged_at_byte;
+  std::int64_t damaged_bytes = 0;
 };
+
+/// What to do about bytes in the middle of a log that are no event, or an event that cannot be
+/// decoded: throw, or go on at the next event there is.
+enum class OnDamage { kThrow, kSkip };
 
 /// Reads a log from its beginning, event by event.
 class LogReader {
  public:
   /// Begins at `from_byte`, where an event must begin: the position() of an earlier reader.
   /// @throws std::runtime_error if there is no such file, it cannot be read or is not an LCM log.
-  explicit LogReader(const std::filesystem::path& path, std::int64_t from_byte = 0);
+  explicit LogReader(const std::filesystem::path& path, OnDamage on_damage = OnDamage::kThrow,
+                     std::int64_t from_byte = 0);
   ~LogReader();
   LogReader(const LogReader&) = delete;
   LogReader& operator=(const LogReader&) = delete;
 
   /// Reads the next event into event(). False at the end, also where the tail is truncated.
-  /// @throws std::runtime_error naming the byte where something begins that is not an event.
+  /// @throws std::runtime_error naming the byte where something begins that is not an event (with
+  /// OnDamage::kSkip only if there is no event at all).
   bool next();
+  /// Goes to where an event begins, a position() of earlier.
+  void seek(std::int64_t position);
   const LogEvent& event() const { return event_; }
   const LogReport& report() const { return report_; }
   /// Where the next event begins [bytes].
   std::int64_t position() const { return position_; }
 
  private:
+  enum class Found { kEvent, kEnd, kTruncated, kDamaged };
+  Found read_event(bool looks_behind);
+  std::optional<std::int64_t> find_event(std::int64_t from);
+
   std::filesystem::path path_;
+  OnDamage on_damage_;
   std::FILE* file_ = nullptr;
   std::int64_t position_ = 0;
   LogEvent event_;
@@ -68,24 +84,34 @@ class LogReader {
 
 /// Calls `visit` with every event of the log. @throws as LogReader does.
 LogReport for_each_event(const std::filesystem::path& path,
-                         const std::function<void(const LogEvent&)>& visit);
+                         const std::function<void(const LogEvent&)>& visit,
+                         OnDamage on_damage = OnDamage::kThrow);
 
 /// All messages of one channel, in order. A truncated tail is no error but reported.
 /// @throws std::runtime_error as LogReader does, and if a message of that channel is malformed or
-/// makes no sense (naming the event).
+/// makes no sense (naming the event); with OnDamage::kSkip it is left out and its bytes are counted
+/// as damaged.
 template <class Message>
 std::vector<Message> read_log(const std::filesystem::path& path, const Channel<Message>& channel,
-                              LogReport* report = nullptr) {
+                              LogReport* report = nullptr, OnDamage on_damage = OnDamage::kThrow) {
   std::vector<Message> messages;
-  const LogReport found = for_each_event(path, [&](const LogEvent& event) {
-    if (event.channel != channel.name) return;
-    Decoded<Message> decoded = decode<Message>(event.data.data(), event.data.size());
-    if (!decoded.message) {
-      throw std::runtime_error(path.string() + ": event " + std::to_string(event.event_number) +
-                               " (" + event.channel + "): " + decoded.problem);
-    }
-    messages.push_back(*std::move(decoded.message));
-  });
+  std::int64_t undecoded_bytes = 0;
+  LogReport found = for_each_event(
+      path,
+      [&](const LogEvent& event) {
+        if (event.channel != channel.name) return;
+        Decoded<Message> decoded = decode<Message>(event.data.data(), event.data.size());
+        if (decoded.message) {
+          messages.push_back(*std::move(decoded.message));
+        } else if (on_damage == OnDamage::kSkip) {
+          undecoded_bytes += static_cast<std::int64_t>(event.data.size());
+        } else {
+          throw std::runtime_error(path.string() + ": event " + std::to_string(event.event_number) +
+                                   " (" + event.channel + "): " + decoded.problem);
+        }
+      },
+      on_damage);
+  found.damaged_bytes += undecoded_bytes;
   if (report != nullptr) *report = found;
   return messages;
 }
@@ -120,6 +146,8 @@ class LogAppender {
 
   /// What the log held when it was opened.
   const LogReport& found() const { return found_; }
+  /// Where the next event will begin [bytes].
+  std::int64_t position() const { return end_; }
 
  private:
   std::filesystem::path path_;
@@ -139,6 +167,10 @@ std::vector<std::uint8_t> encode_event(const std::string& channel,
 /// synced. Whoever reads `path` sees the old or the new text, also after a power cut.
 /// @throws std::runtime_error naming the file.
 void write_file_atomically(const std::filesystem::path& path, const std::string& text);
+
+/// Copies a file that cannot be used as it is to "PATH.bad-1" (-2, …, the first name that is free),
+/// before it is replaced. Returns the new name. @throws std::runtime_error naming the file.
+std::filesystem::path copy_aside(const std::filesystem::path& path);
 
 /// A log of one event, written atomically: the form of a schema file. Its event time is the
 /// message's utime, so equal messages make equal files.

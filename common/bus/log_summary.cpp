@@ -77,6 +77,12 @@ LogSummary summarize_log(const std::filesystem::path& file) {
   return summary;
 }
 
+std::string problem_of(const LogEvent& event) {
+  std::set<std::string> versions;
+  const auto check = checks().find(event.channel);
+  return check == checks().end() ? "" : check->second(event, versions);
+}
+
 std::string program_version() { return BODYSCHEMA_VERSION; }
 
 std::string flaws_text(const LogSummary& summary) {

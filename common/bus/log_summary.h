@@ -42,6 +42,9 @@ struct LogSummary {
 /// @throws std::runtime_error if there is no such file or it is not an LCM log.
 LogSummary summarize_log(const std::filesystem::path& file);
 
+/// Why this program cannot use the event; "" if it can, or the channel is none of ours.
+std::string problem_of(const LogEvent& event);
+
 /// Version of this program, as PROCESS_INFO carries it.
 std::string program_version();
 

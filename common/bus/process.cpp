@@ -1,9 +1,9 @@
 #include "common/bus/process.h"
 
 #include <signal.h>
-#include <sys/resource.h>
 #include <spdlog/sinks/stdout_color_sinks.h>
 #include <spdlog/spdlog.h>
+#include <sys/resource.h>
 #include <unistd.h>
 
 #include <CLI/CLI.hpp>
@@ -12,12 +12,14 @@
 #include <atomic>
 #include <chrono>
 #include <cstdio>
+#include <cstdlib>
 #include <exception>
 #include <fstream>
 #include <iterator>
 #include <map>
 #include <sstream>
 #include <stdexcept>
+#include <tuple>
 #include <utility>
 #include <vector>
 
@@ -31,6 +33,9 @@ using SteadyClock = std::chrono::steady_clock;
 constexpr std::chrono::milliseconds kTickPeriod{100};
 constexpr std::chrono::milliseconds kInfoPeriod{1000};
 constexpr std::chrono::milliseconds kShortestInfoPeriod{100};
+/// How long a process that starts listens for another of its name.
+constexpr std::chrono::milliseconds kListening{200};
+constexpr std::int64_t kLiveUs = 3'000'000;
 
 std::atomic<bool> stop_requested{false};
 static_assert(std::atomic<bool>::is_always_lock_free, "set by a signal handler");
@@ -111,18 +116,55 @@ struct Process::Impl {
     info.program_version = BODYSCHEMA_VERSION;
     info.seed = -1;
     info.configuration = as_text(read_text(config_file));
+    if (!bus.is_replay() && in_url == out_url) listen_for_twin();
   }
 
   std::filesystem::path config_file;
   Bus bus;
   process_info_t info{};
   bool info_changed = true;
+  bool is_listening = false;
+  const SteadyClock::time_point start = SteadyClock::now();
   SteadyClock::time_point last_info{};
   SteadyClock::time_point last_tick{};
   std::map<std::string, std::int64_t> counters;
   std::vector<std::function<void(std::int64_t)>> tick_handlers;
   std::vector<std::function<void()>> idle_handlers;
   std::vector<std::function<void()>> end_handlers;
+
+  /// Nothing but PROCESS_INFO is sent before it is known that nobody else does this work.
+  void listen_for_twin() {
+    bus.subscribe(kProcessInfo, [this](const process_info_t& other) { on_process_info(other); });
+    is_listening = true;
+    const auto end = SteadyClock::now() + kListening;
+    while (SteadyClock::now() < end && !stop_requested) {
+      publish_info_if_due();
+      bus.handle(std::chrono::milliseconds(20));
+    }
+    is_listening = false;
+  }
+
+  void on_process_info(const process_info_t& other) {
+    const auto identity = [](const process_info_t& process) {
+      return std::tie(process.start_utime, process.host, process.pid);
+    };
+    if (other.process_name != info.process_name || identity(other) == identity(info) ||
+        other.phase == process_info_t::PHASE_ENDED || !is_live(other, now_us())) {
+      return;
+    }
+    // One that starts gives way to one that runs, whatever the clock was when either began.
+    const bool is_other_starting = other.phase == process_info_t::PHASE_STARTING;
+    const bool is_other_first =
+        is_listening == is_other_starting ? identity(other) < identity(info) : is_listening;
+    if (!is_other_first) {
+      info_changed = true;  // answered at once
+      return;
+    }
+    throw std::runtime_error(fmt::format(
+        "another {} is on this bus: process {} on {}. End that one (./run stop), or give this "
+        "group a port of its own in network.yaml",
+        other.process_name, other.pid, other.host));
+  }
 
   void publish_info() {
     info.utime = bus.is_replay() ? std::max<std::int64_t>(0, bus.last_utime()) : now_us();
@@ -159,7 +201,9 @@ struct Process::Impl {
     const auto now = SteadyClock::now();
     if (now - last_tick < kTickPeriod) return;
     last_tick = now;
-    for (const auto& handler : tick_handlers) handler(now_us());
+    // Steady, so that no timeout depends on how the clock is set meanwhile.
+    const auto since_start = std::chrono::duration_cast<std::chrono::microseconds>(now - start);
+    for (const auto& handler : tick_handlers) handler(info.start_utime + since_start.count());
   }
 };
 
@@ -167,6 +211,8 @@ Process::Process(std::unique_ptr<Impl> impl) : impl_(std::move(impl)) {}
 Process::~Process() = default;
 
 Bus& Process::bus() { return impl_->bus; }
+
+const std::string& Process::name() const { return impl_->info.process_name; }
 
 const std::filesystem::path& Process::config_file() const { return impl_->config_file; }
 
@@ -186,8 +232,12 @@ void Process::set_activity(std::int8_t phase, std::string activity) {
 
 void Process::set_seed(std::int64_t seed) { impl_->info.seed = seed; }
 
-void Process::count(const std::string& name, std::int64_t increment) {
-  impl_->counters[name] += increment;
+std::int64_t Process::count(const std::string& name, std::int64_t increment) {
+  return impl_->counters[name] += increment;
+}
+
+void Process::set_counters(const std::map<std::string, std::int64_t>& counters) {
+  for (const auto& [name, value] : counters) impl_->counters[name] = value;
 }
 
 void Process::on_tick(std::function<void(std::int64_t)> handler) {
@@ -203,6 +253,9 @@ void Process::on_end(std::function<void()> handler) {
 }
 
 void Process::run() {
+  if (impl_->info.phase == process_info_t::PHASE_STARTING) {
+    impl_->info.phase = process_info_t::PHASE_WAITING;
+  }
   impl_->publish_info_if_due();
   bool has_more = true;
   while (has_more && !stop_requested) {
@@ -214,6 +267,10 @@ void Process::run() {
   for (const auto& handler : impl_->end_handlers) handler();
   impl_->info.phase = process_info_t::PHASE_ENDED;
   impl_->publish_info();
+}
+
+bool is_live(const process_info_t& info, std::int64_t now_us) {
+  return std::abs(now_us - info.utime) <= kLiveUs;
 }
 
 int run_process(const std::string& name, int argc, char** argv,

@@ -3,6 +3,7 @@
 #include <cstdint>
 #include <filesystem>
 #include <functional>
+#include <map>
 #include <memory>
 #include <string>
 
@@ -25,6 +26,11 @@ namespace bodyschema {
 ///     });
 ///   }
 ///
+/// Of two processes of one name on a bus the younger ends with exit code 1 and a line that says who
+/// is there: at its start it says who it is and listens for 0.2 s before it publishes anything
+/// else, and the elder answers at once. Only live PROCESS_INFO counts (is_live()), and a bus that
+/// is both heard and spoken to.
+///
 /// `--in` is default_url() unless given. `--out` is then the same bus, but nowhere where the input
 /// is a log: a replay must not reach a robot by accident.
 class Process {
@@ -34,6 +40,7 @@ class Process {
   Process& operator=(const Process&) = delete;
 
   Bus& bus();
+  const std::string& name() const;
   const std::filesystem::path& config_file() const;
   /// The folder of the configuration file: the rig.
   std::filesystem::path rig_folder() const;
@@ -45,11 +52,14 @@ class Process {
   /// UTF-8 are replaced by '?'.
   void set_activity(std::int8_t phase, std::string activity);
   void set_seed(std::int64_t seed);
-  /// A counter of the process's own beside those of the bus.
-  void count(const std::string& name, std::int64_t increment = 1);
+  /// A counter of the process's own beside those of the bus. Returns its value.
+  std::int64_t count(const std::string& name, std::int64_t increment = 1);
+  /// Counters that are kept elsewhere, as they stand now.
+  void set_counters(const std::map<std::string, std::int64_t>& counters);
 
-  /// Called about every 100 ms (every message in a replay) with the clock's time, or the newest
-  /// message's in a replay [µs].
+  /// Called about every 100 ms (every message in a replay) with the newest message's time in a
+  /// replay, else with a time that began as the wall clock's at the start of the process and went
+  /// on steadily since, however that clock is set [µs].
   void on_tick(std::function<void(std::int64_t now_us)> handler);
   /// Called after every batch of messages, and at least every 100 ms when live; may publish. The
   /// place to look whether a worker has finished.
@@ -70,6 +80,10 @@ class Process {
   explicit Process(std::unique_ptr<Impl> impl);
   std::unique_ptr<Impl> impl_;
 };
+
+/// Whether the message tells of a process that runs now and is no recording that is played: its
+/// time is within 3 s of `now_us`, the wall clock. Clocks of several machines must agree as far.
+bool is_live(const process_info_t& info, std::int64_t now_us);
 
 /// Parses the arguments, constructs a Process, calls `body`, and turns an exception into one line
 /// "name: what" on stderr and exit code 1. `add_options` adds a process's own flags. Logs go to

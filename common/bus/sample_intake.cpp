@@ -1,47 +1,129 @@
 #include "common/bus/sample_intake.h"
 
+#include <spdlog/spdlog.h>
+
 #include <filesystem>
+#include <utility>
 
 #include "common/bus/channels.h"
 #include "common/bus/event_log.h"
+#include "common/bus/process.h"
 
 namespace bodyschema {
 namespace {
 
-constexpr std::int64_t kQuietUs = 2'000'000;
+constexpr std::int64_t kAskPeriodUs = 500'000;
+constexpr int kMaxUnanswered = 10;
+/// At 1 Hz this is sooner than any gap is given up.
+constexpr int kMaxRepeats = 3;
+constexpr std::size_t kMaxAhead = 1'000;
+
+/// Which action it is a sample of, and when: two samples of one index that agree in that are one.
+std::size_t identity(const sample_t& sample) {
+  return std::hash<std::string>()(
+      fmt::format("{} {} {} {}", sample.source, sample.epoch, sample.action_id, sample.utime));
+}
 
 }  // namespace
 
-SampleIntake::SampleIntake(std::string samples_file, std::function<void(const sample_t&)> handler)
-    : samples_file_(std::move(samples_file)), handler_(std::move(handler)) {
-  read_log();
+SampleIntake::Ask SampleIntake::asking(Process& process) {
+  if (process.bus().is_replay()) return nullptr;
+  return [&process](sample_request_t request) {
+    request.process_name = process.name();
+    process.bus().publish(kSampleRequest, request);
+  };
 }
 
-void SampleIntake::read_log() {
-  if (samples_file_.empty() || !std::filesystem::exists(samples_file_)) return;
-  size_read_ = std::filesystem::file_size(samples_file_);
-  for (const sample_t& sample : bodyschema::read_log(samples_file_, kSample)) hand_on(sample);
+SampleIntake::SampleIntake(std::string samples_file, Handler handler, Ask ask)
+    : samples_file_(std::move(samples_file)), handler_(std::move(handler)), ask_(std::move(ask)) {
+  read_file();
+  hand_on();
 }
 
-void SampleIntake::on_tick(std::int64_t now_us) {
-  if (!is_quiet_) quiet_since_us_ = now_us;
-  is_quiet_ = true;
-  if (now_us - quiet_since_us_ < kQuietUs || samples_file_.empty()) return;
+void SampleIntake::read_file() {
   std::error_code none;
-  if (std::filesystem::file_size(samples_file_, none) != size_read_ && !none) read_log();
+  const std::uintmax_t size = std::filesystem::file_size(samples_file_, none);
+  if (none || size == size_read_) return;
+  size_read_ = size;
+  try {
+    const auto samples = read_log(samples_file_, kSample, nullptr, OnDamage::kSkip);
+    for (const sample_t& sample : samples) take(sample);
+  } catch (const std::runtime_error& error) {
+    spdlog::warn("{}; the observer is asked instead", error.what());
+  }
 }
 
 void SampleIntake::on_sample(const sample_t& sample) {
-  is_quiet_ = false;
-  if (sample.sample_index > next_index_) read_log();
-  hand_on(sample);
+  take(sample);
+  is_observer_heard_ |= !ahead_.empty() && sample.sample_index >= ahead_.begin()->first;
+  if (sample.sample_index > next_index_) read_file();
+  // The observer says again and again that this is its newest: what seemed to come after it is not
+  // the observer's.
+  if (sample.sample_index == next_index_ - 1 && !ahead_.empty() && ++num_repeats_ >= kMaxRepeats) {
+    counters_["conflicting SAMPLE"] += static_cast<std::int64_t>(ahead_.size());
+    ahead_.clear();
+    num_unanswered_ = num_repeats_ = 0;
+  }
+  hand_on();
+  if (ahead_.size() > kMaxAhead) ahead_.erase(std::prev(ahead_.end()));  // asked for in due course
 }
 
-void SampleIntake::hand_on(const sample_t& sample) {
-  if (sample.sample_index < next_index_) return;
-  num_lost_ += sample.sample_index - next_index_;
-  next_index_ = sample.sample_index + 1;
-  handler_(sample);
+void SampleIntake::take(const sample_t& sample) {
+  if (sample.sample_index >= next_index_) {
+    ahead_.try_emplace(sample.sample_index, sample);
+    return;
+  }
+  const auto known = known_.find(sample.sample_index);
+  if (known == known_.end() || known->second == identity(sample)) return;
+  is_begun_anew_ = true;
+  if (++counters_["conflicting SAMPLE"] > 1) return;
+  spdlog::warn("SAMPLE {} is not the one that was heard before", sample.sample_index);
+}
+
+void SampleIntake::hand_on() {
+  while (!ahead_.empty()) {
+    if (ahead_.begin()->first > next_index_) {
+      if (ask_) return;
+      counters_["lost SAMPLE"] += ahead_.begin()->first - next_index_;
+    }
+    const sample_t sample = std::move(ahead_.extract(ahead_.begin()).mapped());
+    if (sample.sample_index < next_index_) continue;  // the file had filled the gap
+    next_index_ = sample.sample_index + 1;
+    known_[sample.sample_index] = identity(sample);
+    num_unanswered_ = num_repeats_ = 0;
+    handler_(sample);
+  }
+}
+
+void SampleIntake::on_tick(std::int64_t now_us) {
+  if (ahead_.empty() || (asked_us_ >= 0 && now_us - asked_us_ < kAskPeriodUs)) return;
+  asked_us_ = now_us;
+  if (std::exchange(is_observer_heard_, false) && ++num_unanswered_ > kMaxUnanswered) {
+    const std::int64_t first = ahead_.begin()->first;
+    spdlog::warn("SAMPLE {} to {} are lost: the observer does not have them", next_index_,
+                 first - 1);
+    counters_["lost SAMPLE"] += first - next_index_;
+    next_index_ = first;
+    hand_on();
+    return;
+  }
+  sample_request_t request{};
+  request.utime = now_us;
+  request.first_missing = next_index_;
+  request.last_missing = ahead_.begin()->first - 1;
+  ask_(request);
+}
+
+std::string SampleIntake::activity() const {
+  if (!ahead_.empty()) {
+    return fmt::format("waits for SAMPLE {} to {}, which the observer is asked for", next_index_,
+                       ahead_.begin()->first - 1);
+  }
+  if (is_begun_anew_) {
+    return "hears of other samples than before: the observer has begun anew; start this process "
+           "again too";
+  }
+  return "";
 }
 
 }  // namespace bodyschema

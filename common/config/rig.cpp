@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <set>
+#include <stdexcept>
 
 #include "common/config/yaml.h"
 
@@ -84,17 +85,71 @@ std::string url(int port, int ttl) {
   return "udpm://239.255.76.67:" + std::to_string(port) + "?ttl=" + std::to_string(ttl);
 }
 
+/// One lost frame loses a whole image, so images stay on the host that makes them.
+const std::set<std::string> kImageProcesses = {"camera", "marker_estimator", "log_images"};
+
+std::map<std::string, std::vector<std::string>> load_hosts(const Yaml& yaml,
+                                                           const std::vector<std::string>& group) {
+  const Yaml section = yaml.section("hosts");
+  std::map<std::string, std::vector<std::string>> hosts;
+  std::map<std::string, std::string> host_of;
+  for (const std::string& host : section.keys()) {
+    if (host == "all") throw section.error(host, "no host may be called that");
+    hosts[host] = section.texts(host);
+    for (const std::string& process : hosts[host]) {
+      const auto [other, is_first] = host_of.try_emplace(process, host);
+      if (!is_first) {
+        throw section.error(host, "'" + process + "' runs on '" + other->second + "' already");
+      }
+      if (!group.empty() && std::find(group.begin(), group.end(), process) == group.end()) {
+        std::string all;
+        for (const std::string& name : group) all += (all.empty() ? "" : ", ") + name;
+        throw section.error(host, "'" + process + "' is no process of this rig; there are: " + all);
+      }
+    }
+  }
+  for (const std::string& process : group) {
+    if (!host_of.count(process)) {
+      throw yaml.error("hosts", "'" + process + "' runs on no host");
+    }
+  }
+  for (const auto& [process, host] : host_of) {
+    if (kImageProcesses.count(process) && host_of.count("camera") && host != host_of["camera"]) {
+      throw section.error(host, "'" + process + "' must run where the camera does, on '" +
+                                    host_of["camera"] + "': images do not survive a network");
+    }
+  }
+  return hosts;
+}
+
 }  // namespace
 
 std::string Network::bus_url() const { return url(port, ttl); }
 std::string Network::images_url() const { return url(port + 1, ttl); }
 
-Network load_network(const std::filesystem::path& rig_folder) {
+std::vector<std::string> Network::share_of(const std::string& host) const {
+  const auto share = hosts.find(host);
+  if (share != hosts.end()) return share->second;
+  std::string all;
+  for (const auto& [name, processes] : hosts) all += (all.empty() ? "" : ", ") + name;
+  throw std::invalid_argument("--host: network.yaml has no host '" + host + "'; " +
+                              (all.empty() ? "all runs on one machine" : "there are: " + all));
+}
+
+Network load_network(const std::filesystem::path& rig_folder,
+                     const std::vector<std::string>& group) {
   const Yaml yaml = Yaml::load(rig_folder / "network.yaml");
   Network network;
   network.is_private = yaml.choice("network", {"private", "host"}) == "private";
   network.port = static_cast<int>(yaml.integer("port", 1024, 65534));
   network.ttl = static_cast<int>(yaml.integer("ttl", 0, 255));
+  if (yaml.has("hosts")) {
+    network.hosts = load_hosts(yaml, group);
+    if (network.is_private) {
+      throw yaml.error("network", "several hosts share a network: expected 'host'");
+    }
+    if (network.ttl < 1) throw yaml.error("ttl", "must be 1 or more to reach another host");
+  }
   yaml.finish();
   return network;
 }

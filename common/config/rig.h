@@ -42,14 +42,21 @@ struct Network {
   bool is_private = true;  ///< in a network namespace of its own, else on the host's network
   int port = 0;            ///< UDP port of the bus; images use port + 1
   int ttl = 0;
+  /// Which processes run on which host, by the host's name; empty: all on one machine.
+  std::map<std::string, std::vector<std::string>> hosts;
 
   std::string bus_url() const;
   std::string images_url() const;
+  /// The processes of `host`, in the order of hosts.
+  /// @throws std::invalid_argument if there is no such host.
+  std::vector<std::string> share_of(const std::string& host) const;
 };
 
 /// @throws ConfigError.
 Markers load_markers(const std::filesystem::path& rig_folder);
 Signals load_signals(const std::filesystem::path& rig_folder);
-Network load_network(const std::filesystem::path& rig_folder);
+/// `group`: all processes of the rig's group. If there are any, each must run on exactly one host.
+Network load_network(const std::filesystem::path& rig_folder,
+                     const std::vector<std::string>& group = {});
 
 }  // namespace bodyschema

@@ -5,6 +5,8 @@
 #include <algorithm>
 #include <cmath>
 #include <fstream>
+#include <iomanip>
+#include <limits>
 #include <sstream>
 
 namespace bodyschema {
@@ -106,6 +108,12 @@ bool Yaml::has(const std::string& key) const {
   return (*node_)[key].IsDefined();
 }
 
+std::vector<std::string> Yaml::keys() const {
+  std::vector<std::string> keys;
+  for (const auto& entry : *node_) keys.push_back(entry.first.as<std::string>());
+  return keys;
+}
+
 const YAML::Node Yaml::child(const std::string& key) const {
   if (has(key)) return (*node_)[key];
   // A key that nobody knows yet may be this one misspelt.
@@ -198,6 +206,14 @@ std::vector<std::int64_t> Yaml::integers(const std::string& key) const {
   }
 }
 
+std::vector<std::string> Yaml::texts(const std::string& key) const {
+  try {
+    return child(key).as<std::vector<std::string>>();
+  } catch (const YAML::Exception&) {
+    throw error(key, "expected a list of texts");
+  }
+}
+
 Eigen::Vector3d Yaml::vector3(const std::string& key) const {
   return Eigen::Vector3d(numbers(key, 3).data());
 }
@@ -255,6 +271,23 @@ void Yaml::finish() const {
     }
   }
   for (const Yaml& below : usage_->below) below.finish();
+}
+
+std::string yaml_quoted(const std::string& text) {
+  std::string result = "\"";
+  for (const char c : text) {
+    if (c == '"' || c == '\\') result += '\\';
+    result += static_cast<unsigned char>(c) < 0x20 ? ' ' : c;
+  }
+  return result + '"';
+}
+
+std::string yaml_list(const std::vector<double>& values) {
+  std::ostringstream result;
+  result << std::setprecision(std::numeric_limits<double>::max_digits10) << '[';
+  for (std::size_t i = 0; i < values.size(); ++i) result << (i ? ", " : "") << values[i];
+  result << ']';
+  return result.str();
 }
 
 }  // namespace bodyschema

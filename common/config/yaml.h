@@ -37,6 +37,8 @@ class Yaml {
   static Yaml parse(const std::string& text, const std::string& name = "<text>");
 
   bool has(const std::string& key) const;
+  /// All keys, in the file's order, for a mapping whose keys are names of the user's own.
+  std::vector<std::string> keys() const;
 
   double number(const std::string& key, double lowest = std::numeric_limits<double>::lowest(),
                 double highest = std::numeric_limits<double>::max()) const;
@@ -50,6 +52,7 @@ class Yaml {
   /// A list of numbers; exactly `count` of them unless count < 0.
   std::vector<double> numbers(const std::string& key, int count = -1) const;
   std::vector<std::int64_t> integers(const std::string& key) const;
+  std::vector<std::string> texts(const std::string& key) const;
   Eigen::Vector3d vector3(const std::string& key) const;
   /// {position_m: [x, y, z], rotation_wxyz: [w, x, y, z]} or {position_m: …, rpy_deg: [r, p, y]}
   /// with R = Rz(y) Ry(p) Rx(r); a missing rotation is the identity.
@@ -79,5 +82,10 @@ class Yaml {
   struct Usage;
   std::shared_ptr<Usage> usage_;
 };
+
+// For state files that a process writes and Yaml reads again: `text` in YAML's double quoted style
+// (control characters become spaces), and [a, b, …] with exact numbers.
+std::string yaml_quoted(const std::string& text);
+std::string yaml_list(const std::vector<double>& values);
 
 }  // namespace bodyschema

@@ -17,6 +17,8 @@
 namespace bodyschema {
 namespace {
 
+constexpr int kStreamTimeout_ms = 5'000;
+
 std::int64_t clock_us() {
   const auto now = std::chrono::system_clock::now().time_since_epoch();
   return std::chrono::duration_cast<std::chrono::microseconds>(now).count();
@@ -129,6 +131,13 @@ struct Capture::Source {
         return true;
       }
       if (kind == SourceKind::kSequence) return video.open(config.device, cv::CAP_IMAGES);
+      // FFmpeg would wait half a minute for a stream whose cable was pulled.
+      if (kind == SourceKind::kStream && has_backend(cv::CAP_FFMPEG) &&
+          video.open(config.device, cv::CAP_FFMPEG,
+                     {cv::CAP_PROP_OPEN_TIMEOUT_MSEC, kStreamTimeout_ms,
+                      cv::CAP_PROP_READ_TIMEOUT_MSEC, kStreamTimeout_ms})) {
+        return true;
+      }
       return video.open(config.device);
     } catch (const cv::Exception&) {
       return false;
@@ -202,7 +211,16 @@ void Capture::run(const std::stop_token& stop) {
       }
       due_us = std::max(due_us + period_us, steady_us());
       retry_us = kFirstRetry_us;
-      on_frame_(frame, utime);
+      try {
+        on_frame_(frame, utime);
+      } catch (const std::invalid_argument& refusal) {
+        // A camera that came back with another mode may change it again.
+        const std::lock_guard lock(mutex_);
+        ++state_.num_refused;
+        state_.phase = Phase::kLost;
+        state_.text = "refuses the frames of " + config_.device + ": " + refusal.what();
+        continue;
+      }
       const std::lock_guard lock(mutex_);
       ++state_.num_frames;
       if (state_.phase != Phase::kRunning) state_.text = "captures " + config_.device;

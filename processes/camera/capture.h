@@ -24,11 +24,14 @@ std::string why_not_open(const std::string& device);
 /// Reads a camera, stream, video or image sequence in a thread of its own, so that nobody waits for
 /// a slow device, and hands on each frame with the clock's time at which it was grabbed.
 ///
-/// A device or stream that vanishes is opened again after 0.5, 1, 2 … 10 s, for ever. A file or
-/// sequence that is at its end stays there. state() says which.
+/// A device or stream that vanishes is opened again after 0.5, 1, 2 … 10 s, for ever; a stream that
+/// delivers nothing for 5 s (a V4L2 device: 10 s, OpenCV's own limit) has vanished. A file or
+/// sequence that is at its end stays there.
+/// state() says which.
 class Capture {
  public:
-  /// Called from the capture's thread. What it throws ends the capture and is rethrown by check().
+  /// Called from the capture's thread. A frame that it throws std::invalid_argument about is
+  /// refused and counted; anything else ends the capture and is rethrown by check().
   using OnFrame = std::function<void(const cv::Mat& frame, std::int64_t utime)>;
   enum class Phase { kRunning, kLost, kEnded };
   struct State {
@@ -36,6 +39,7 @@ class Capture {
     std::string text;  ///< for people
     std::int64_t num_frames = 0;
     std::int64_t num_losses = 0;
+    std::int64_t num_refused = 0;
   };
 
   /// @throws std::runtime_error with why_not_open() if the source cannot be opened now.

@@ -8,6 +8,7 @@
 
 #include "common/bus/images_url.h"
 #include "common/bus/process.h"
+#include "common/bus/rig_door.h"
 #include "common/scene/scene_renderer.h"
 #include "processes/camera/camera.h"
 #include "processes/camera/capture.h"
@@ -50,10 +51,10 @@ int main(int argc, char** argv) {
       send_info();
     });
 
+    std::optional<RigDoor> door;
     std::optional<SceneRenderer> renderer;
     std::optional<SimulatedCamera> simulated;
     std::optional<Capture> capture;
-    std::int64_t num_losses = 0;
     if (config.simulation) {
       const SimulationConfig& simulation = *config.simulation;
       renderer.emplace(process.rig_folder(), config.calibration,
@@ -63,25 +64,27 @@ int main(int argc, char** argv) {
       simulated.emplace(config, [&](const sim_state_t& state, int frame) {
         return renderer->render(state, frame);
       });
-      process.bus().subscribe(kSimState, [&, shown_utime = std::int64_t{-1},
-                                          num_repeats = 0](const sim_state_t& state) mutable {
-        // Repeated for who missed them, but not for ever: an arm that was left alone would fill the
-        // disk with the same images.
-        num_repeats = state.utime == shown_utime ? num_repeats + 1 : 0;
-        shown_utime = state.utime;
-        if (num_repeats > kMaxRepeats) return;
-        try {
-          for (const camera_image_t& image : simulated->on_sim_state(state)) {
-            images.publish(kCameraImage, image);
-            utime = image.utime;
-          }
-        } catch (const std::invalid_argument&) {
-          process.count("refused SIM_STATE");  // another rig's
-          return;
-        }
-        process.set_activity(process_info_t::PHASE_WORKING,
-                             "shows action " + std::to_string(state.action_id));
-      });
+      door.emplace(process.rig_folder());
+      door->subscribe(
+          process, kSimState,
+          [&, shown_utime = std::int64_t{-1}, num_repeats = 0](const sim_state_t& state) mutable {
+            // Repeated for who missed them, but not for ever: an arm that was left alone would fill
+            // the disk with the same images.
+            num_repeats = state.utime == shown_utime ? num_repeats + 1 : 0;
+            shown_utime = state.utime;
+            if (num_repeats > kMaxRepeats) return;
+            try {
+              for (const camera_image_t& image : simulated->on_sim_state(state)) {
+                images.publish(kCameraImage, image);
+                utime = image.utime;
+              }
+            } catch (const std::invalid_argument&) {
+              process.count("refused SIM_STATE");  // another rig's
+              return;
+            }
+            process.set_activity(process_info_t::PHASE_WORKING,
+                                 "shows action " + std::to_string(state.action_id));
+          });
       process.set_activity(process_info_t::PHASE_WAITING, "waits for SIM_STATE");
     } else {
       std::int64_t image_seq = 0;
@@ -94,8 +97,9 @@ int main(int argc, char** argv) {
       process.on_idle([&] {
         capture->check();
         const Capture::State state = capture->state();
-        process.count("camera lost",
-                      state.num_losses - std::exchange(num_losses, state.num_losses));
+        process.set_counters({{"camera lost", state.num_losses},
+                              {"frame", state.num_frames},
+                              {"frame refused", state.num_refused}});
         process.set_activity(state.phase == Capture::Phase::kRunning
                                  ? process_info_t::PHASE_WORKING
                                  : process_info_t::PHASE_WAITING,

@@ -4,6 +4,7 @@
 #include <fmt/format.h>
 
 #include <CLI/CLI.hpp>
+#include <algorithm>
 #include <iostream>
 #include <map>
 #include <memory>
@@ -22,19 +23,70 @@ double seconds(std::int64_t from_us, std::int64_t to_us) {
   return static_cast<double>(to_us - from_us) * 1e-6;
 }
 
-void run_log(const std::string& file, const std::string& copy, bool json, bool check) {
-  if (!copy.empty()) {
-    std::cout << thin_log(file, copy) << " events in " << copy << std::endl;
+struct Arguments {
+  std::string file;
+  bool json = false;
+  bool check = false;
+  bool replay_from = false;
+  std::string thin;
+  std::vector<std::string> channels;
+  std::string copy;
+};
+
+/// Where a replay starts: MARKER_POSES, from which the observer makes the samples again, or SAMPLE.
+std::string replay_start(const LogSummary& summary, const std::string& file) {
+  const auto has = [&](const std::string& channel) {
+    const auto found = summary.channels.find(channel);
+    return found != summary.channels.end() && found->second.events > found->second.unreadable;
+  };
+  if (has(kMarkerPoses.name) && has(kMotionStatus.name) && has(kCameraInfo.name))
+    return kMarkerPoses.name;
+  if (has(kSample.name)) return kSample.name;
+  throw std::runtime_error(file +
+                           ": holds nothing to learn from: neither SAMPLE, nor MARKER_POSES with "
+                           "MOTION_STATUS and CAMERA_INFO, that can be read");
+}
+
+/// The messages of these channels that can be read, up to where the log is damaged.
+void copy_channels(const std::string& file, const std::vector<std::string>& channels,
+                   const std::string& copy) {
+  std::error_code none;
+  if (std::filesystem::equivalent(file, copy, none))
+    throw std::invalid_argument("--to: " + copy + " is the log that is read");
+  std::string bytes;
+  std::int64_t written = 0;
+  const std::int64_t num_good = summarize_log(file).events;
+  LogReader reader(file);
+  for (std::int64_t i = 0; i < num_good && reader.next(); ++i) {
+    const LogEvent& event = reader.event();
+    if (std::find(channels.begin(), channels.end(), event.channel) == channels.end() ||
+        !problem_of(event).empty())
+      continue;
+    const auto encoded = encode_event(event.channel, event.data, event.event_utime, written++);
+    bytes.append(encoded.begin(), encoded.end());
+  }
+  write_file_atomically(copy, bytes);
+  std::cout << written << " events in " << copy << std::endl;
+}
+
+void run_log(const Arguments& arguments) {
+  const std::string& file = arguments.file;
+  if (!arguments.thin.empty()) {
+    std::cout << thin_log(file, arguments.thin) << " events in " << arguments.thin << std::endl;
     return;
   }
+  if (!arguments.copy.empty()) return copy_channels(file, arguments.channels, arguments.copy);
   const LogSummary summary = summarize_log(file);
-  if (json) {
+  const std::string flaws = flaws_text(summary);
+  if (arguments.replay_from) {
+    if (!flaws.empty()) std::cerr << file << ": " << flaws << std::flush;
+    std::cout << replay_start(summary, file) << std::endl;
+  } else if (arguments.json) {
     std::cout << log_json(summary).dump(2) << std::endl;
   } else {
     std::cout << log_text(summary) << std::flush;
   }
-  if (check && !summary.is_sound()) {
-    const std::string flaws = flaws_text(summary);
+  if (arguments.check && !summary.is_sound()) {
     throw std::runtime_error(file + ": " + flaws.substr(0, flaws.find('\n')));
   }
 }
@@ -117,24 +169,22 @@ std::int64_t thin_log(const std::filesystem::path& file, const std::filesystem::
 }
 
 void add_log_command(CLI::App& console) {
-  struct Arguments {
-    std::string file;
-    std::string copy;
-    bool json = false;
-    bool check = false;
-  };
   const auto arguments = std::make_shared<Arguments>();
   CLI::App* log = console.add_subcommand("log", "What an LCM log holds, and what is wrong with it");
   log->add_option("FILE", arguments->file, "LCM log")->required();
   log->add_flag("--json", arguments->json, "Print JSON");
   log->add_flag("--check", arguments->check,
                 "Fail unless it is whole and every message of ours can be read");
-  log->add_option("--thin", arguments->copy,
+  log->add_flag("--replay-from", arguments->replay_from,
+                "Print the channel from which a replay can learn: MARKER_POSES or SAMPLE");
+  log->add_option("--thin", arguments->thin,
                   "Write a small copy: no images, no ground truth, nothing twice")
       ->type_name("FILE");
-  log->callback([arguments] {
-    run_log(arguments->file, arguments->copy, arguments->json, arguments->check);
-  });
+  CLI::Option* to = log->add_option("--to", arguments->copy, "Copy to a new log …");
+  log->add_option("--copy", arguments->channels,
+                  "… the messages of these channels that can be read")
+      ->needs(to);
+  log->callback([arguments] { run_log(*arguments); });
 }
 
 }  // namespace bodyschema

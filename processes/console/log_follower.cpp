@@ -19,7 +19,7 @@ bool LogFollower::read(const std::filesystem::path& file, const Visit& visit) {
   const std::int64_t events_before = summary.events;
   summary.damage.clear();
   try {
-    LogReader reader(file, progress.position);
+    LogReader reader(file, OnDamage::kThrow, progress.position);
     try {
       while (reader.next()) {
         summary.add(reader.event());

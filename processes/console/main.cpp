@@ -8,6 +8,7 @@
 
 #include "processes/console/log.h"
 #include "processes/console/offline.h"
+#include "processes/console/operate.h"
 #include "processes/console/report.h"
 #include "processes/console/status.h"
 #include "processes/console/watch.h"
@@ -16,10 +17,11 @@ int main(int argc, char** argv) {
   CLI::App console("A robot arm's body schema: learn it, look at it, judge it", "bodyschema");
   console.require_subcommand(1);
   bodyschema::add_offline_commands(console);
+  bodyschema::add_log_command(console);
+  bodyschema::add_operate_commands(console);
   bodyschema::add_watch_command(console);
   bodyschema::add_status_command(console);
   bodyschema::add_report_command(console);
-  bodyschema::add_log_command(console);
   try {
     console.parse(argc, argv);
     // A full disk must not look like a result.

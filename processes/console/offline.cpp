@@ -1,7 +1,10 @@
 #include "processes/console/offline.h"
 
+#include <unistd.h>
+
 #include <CLI/CLI.hpp>
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <iostream>
 #include <memory>
@@ -88,17 +91,37 @@ void run_show(const std::string& schema_file, bool json) {
   }
 }
 
+struct RigArguments {
+  std::string folder;
+  std::optional<int> hidden_part;
+  std::vector<std::string> group;
+  std::string host;
+};
+
+/// This machine's name if the rig has a host of that name. Where the group is not split: "all".
+std::string own_host(const Network& network) {
+  std::array<char, 256> name{};
+  if (network.hosts.empty() || ::gethostname(name.data(), name.size() - 1) != 0) return "all";
+  return name.data();
+}
+
 /// Reads what several processes of a rig share; the first line of ./run's launch.
-void run_rig(const std::string& folder, const std::optional<int>& hidden_part) {
+void run_rig(const RigArguments& arguments) {
+  const std::string& folder = arguments.folder;
   const std::vector<int> parts = load_markers(folder).parts();
-  if (hidden_part && !std::binary_search(parts.begin(), parts.end(), *hidden_part)) {
+  if (arguments.hidden_part &&
+      !std::binary_search(parts.begin(), parts.end(), *arguments.hidden_part)) {
     throw std::invalid_argument("--hide: " + folder + " has no part " +
-                                std::to_string(*hidden_part));
+                                std::to_string(*arguments.hidden_part));
   }
   load_signals(folder);
-  const Network network = load_network(folder);
+  const Network network = load_network(folder, arguments.group);
+  const std::string host = arguments.host.empty() ? own_host(network) : arguments.host;
   std::cout << (network.is_private ? "private " : "host ") << network.bus_url() << ' '
-            << network.images_url() << std::endl;
+            << network.images_url() << ' ' << host;
+  for (const std::string& process : host == "all" ? arguments.group : network.share_of(host))
+    std::cout << ' ' << process;
+  std::cout << std::endl;
 }
 
 }  // namespace
@@ -144,13 +167,14 @@ void add_offline_commands(CLI::App& console) {
   show->add_flag("--json", showing->json, "Print JSON");
   show->callback([showing] { run_show(showing->schema, showing->json); });
 
-  const auto rig_folder = std::make_shared<std::string>();
-  CLI::App* rig =
-      console.add_subcommand("rig", "Check a rig's files and print its network: kind, bus, images");
-  rig->add_option("FOLDER", *rig_folder, "Rig, e.g. config/arm7")->required();
-  const auto hidden_part = std::make_shared<std::optional<int>>();
-  rig->add_option("--hide", *hidden_part, "A part that is to be hidden: is there such a one?");
-  rig->callback([rig_folder, hidden_part] { run_rig(*rig_folder, *hidden_part); });
+  const auto checking = std::make_shared<RigArguments>();
+  CLI::App* rig = console.add_subcommand(
+      "rig", "Check a rig's files; print its network: kind, bus, images, this host, its processes");
+  rig->add_option("FOLDER", checking->folder, "Rig, e.g. config/arm7")->required();
+  rig->add_option("--hide", checking->hidden_part, "A part that is to be hidden: is there one?");
+  rig->add_option("--group", checking->group, "All processes; each must run on exactly one host");
+  rig->add_option("--host", checking->host, "Host of network.yaml; this machine if not given");
+  rig->callback([checking] { run_rig(*checking); });
 }
 
 }  // namespace bodyschema

@@ -172,10 +172,11 @@ Recording read_samples(const std::filesystem::path& file) {
                        std::to_string(*report.truncated_at_byte) + "; the " +
                        std::to_string(messages.size()) + " SAMPLEs before it are used";
   }
-  std::int64_t last_index = -1;
-  for (const sample_t& message : messages) {
-    if (message.sample_index <= last_index) continue;  // a repetition
-    last_index = message.sample_index;
+  // Samples are repeated, and sent again later where somebody missed them.
+  std::map<std::int64_t, const sample_t*> by_index;
+  for (const sample_t& message : messages) by_index.try_emplace(message.sample_index, &message);
+  for (const auto& [index, first] : by_index) {
+    const sample_t& message = *first;
     ActionPoseSample sample = from_message(message);
     sample.sample_index = static_cast<std::int64_t>(recording.samples.size());
     if (!recording.samples.empty() &&

@@ -126,7 +126,7 @@ class Source {
     if (!record_.camera_info()) return std::nullopt;
     for (const RunRecord::Picture& picture : record_.pictures()) {
       try {
-        LogReader reader(picture.image.file, picture.image.byte);
+        LogReader reader(picture.image.file, OnDamage::kThrow, picture.image.byte);
         if (!reader.next()) continue;
         const auto image =
             decode<camera_image_t>(reader.event().data.data(), reader.event().data.size()).message;

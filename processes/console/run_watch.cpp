@@ -24,6 +24,10 @@ void RunWatch::on_sample(const sample_t& message) {
 
 void RunWatch::on_body_schema(const body_schema_t& schema) { schema_ = from_message(schema); }
 
+void RunWatch::on_learned_schema(const body_schema_t& schema) {
+  learned_sample_ = schema.last_sample_index;
+}
+
 void RunWatch::on_model_health(const model_health_t& health) { health_ = health; }
 
 void RunWatch::on_sim_state(const sim_state_t& state) {
@@ -47,11 +51,18 @@ bool RunWatch::is_finished() const {
   if (babbler == processes_.end() || babbler->second.info.phase != process_info_t::PHASE_DONE) {
     return false;
   }
-  // The monitor judges at TEST samples; there need not have been one.
+  return !samples_.empty() && is_judged();
+}
+
+bool RunWatch::is_caught_up() const {
+  return !samples_.empty() && learned_sample_ >= samples_.back().sample_index && is_judged();
+}
+
+bool RunWatch::is_judged() const {
   const auto last_test =
       std::find_if(samples_.rbegin(), samples_.rend(),
                    [](const ActionPoseSample& sample) { return sample.purpose == Purpose::kTest; });
-  if (last_test == samples_.rend()) return !samples_.empty();
+  if (last_test == samples_.rend()) return true;
   return health_ && health_->judged_sample >= last_test->sample_index;
 }
 
@@ -79,15 +90,21 @@ std::string RunWatch::progress() const {
   return line;
 }
 
+std::set<std::string> RunWatch::silent(const std::set<std::string>& expected,
+                                       std::int64_t now_us) const {
+  std::set<std::string> silent = expected;
+  for (const auto& [name, heard] : processes_) {
+    if (now_us - heard.at_us <= kSilentUs) silent.erase(name);
+  }
+  return silent;
+}
+
 std::string RunWatch::diagnosis(const std::set<std::string>& expected, std::int64_t now_us) const {
+  const std::set<std::string> silent_ones = silent(expected, now_us);
   std::string text;
   for (const std::string& name : expected) {
-    const auto heard = processes_.find(name);
-    if (heard == processes_.end() || now_us - heard->second.at_us > kSilentUs) {
-      text += fmt::format("  {:<18} is silent\n", name);
-    } else {
-      text += fmt::format("  {:<18} {}\n", name, heard->second.info.activity);
-    }
+    text += fmt::format("  {:<18} {}\n", name,
+                        silent_ones.count(name) ? "is silent" : processes_.at(name).info.activity);
   }
   return text;
 }

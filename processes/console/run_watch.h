@@ -19,6 +19,7 @@ class RunWatch {
  public:
   void on_sample(const sample_t& sample);
   void on_body_schema(const body_schema_t& schema);
+  void on_learned_schema(const body_schema_t& schema);
   void on_model_health(const model_health_t& health);
   void on_sim_state(const sim_state_t& state);
   /// `now_us`: the clock, for diagnosis().
@@ -26,12 +27,18 @@ class RunWatch {
 
   /// True when the babbler is done and the monitor has judged the last sample.
   bool is_finished() const;
+  /// The same for a replay that gives no further sample: all of them are learned from and judged.
+  bool is_caught_up() const;
   std::int64_t num_samples() const { return static_cast<std::int64_t>(samples_.size()); }
+  /// sample_index up to which the newest proposal goes; -1 before the first.
+  std::int64_t learned_sample() const { return learned_sample_; }
 
   /// One line: samples, visibility, parts connected, held-out error.
   std::string progress() const;
-  /// What every process does or waits for, and which one has not been heard of for 3 s; for the
-  /// moment when nothing goes on.
+  /// Those of `expected` that have not been heard of for 3 s.
+  std::set<std::string> silent(const std::set<std::string>& expected, std::int64_t now_us) const;
+  /// What every process does or waits for, and which one is silent; for the moment when nothing
+  /// goes on.
   std::string diagnosis(const std::set<std::string>& expected, std::int64_t now_us) const;
 
   const std::optional<BodySchema>& schema() const { return schema_; }
@@ -45,6 +52,9 @@ class RunWatch {
   std::map<int, double> visibility() const;
 
  private:
+  /// The monitor judges at TEST samples; there need not have been one.
+  bool is_judged() const;
+
   struct Heard {
     process_info_t info;
     std::int64_t at_us = 0;
@@ -53,6 +63,7 @@ class RunWatch {
   std::vector<ActionPoseSample> samples_;
   std::vector<std::int64_t> action_ids_;  ///< of samples_
   std::optional<BodySchema> schema_;
+  std::int64_t learned_sample_ = -1;
   std::optional<model_health_t> health_;
   struct Truth {
     std::int64_t action_id = 0;

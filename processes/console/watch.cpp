@@ -1,6 +1,9 @@
 #include "processes/console/watch.h"
 
+#include <fcntl.h>
 #include <fmt/format.h>
+#include <spawn.h>
+#include <sys/wait.h>
 #include <unistd.h>
 
 #include <CLI/CLI.hpp>
@@ -9,10 +12,14 @@
 #include <deque>
 #include <iostream>
 #include <memory>
+#include <system_error>
+#include <utility>
 
 #include "common/bus/bus.h"
 #include "common/bus/event_log.h"
 #include "common/bus/images_url.h"
+#include "common/bus/process.h"
+#include "common/bus/rig_door.h"
 #include "common/bus/sample_intake.h"
 #include "common/config/rig.h"
 #include "processes/console/group.h"
@@ -37,6 +44,10 @@ struct WatchArguments {
   std::string out;
   std::int64_t seed = 0;
   double patience_s = 120;
+  std::set<std::string> processes;
+  std::string replay;
+  std::string replay_from;
+  double speed = 0;
 };
 
 /// Keeps the picture with the most markers whose image and markers were both heard.
@@ -63,7 +74,8 @@ class BestPicture {
   void match() {
     for (const camera_image_t& image : images_) {
       for (const marker_poses_t& markers : markers_) {
-        if (image.utime != markers.utime || markers.num_markers <= best_markers_.num_markers)
+        if (image.utime != markers.utime || image.camera_name != markers.camera_name ||
+            markers.num_markers <= best_markers_.num_markers)
           continue;
         best_image_ = image;
         best_markers_ = markers;
@@ -101,6 +113,73 @@ class ProgressLine {
   Clock::time_point shown_{};
 };
 
+/// Plays a recording onto the bus with lcm-logplayer: what the learning half of the group needs,
+/// never a command.
+class Player {
+ public:
+  ~Player() {
+    if (pid_ <= 0 || has_ended_) return;
+    ::kill(pid_, SIGTERM);
+    ::waitpid(pid_, nullptr, 0);
+  }
+
+  bool has_started() const { return pid_ > 0; }
+  void start(const WatchArguments& arguments) {
+    const std::string channels =
+        arguments.replay_from == kSample.name
+            ? kSample.name
+            : fmt::format("({}|{}|{})", kMarkerPoses.name, kMotionStatus.name, kCameraInfo.name);
+    const std::vector<std::string> words = {"setpriv",
+                                            "--pdeathsig",
+                                            "TERM",
+                                            "lcm-logplayer",
+                                            "-s",
+                                            fmt::format("{}", arguments.speed),
+                                            "-e",
+                                            channels,
+                                            "--lcm-url=" + arguments.in,
+                                            arguments.replay};
+    std::vector<char*> argv;
+    for (const std::string& word : words) argv.push_back(const_cast<char*>(word.c_str()));
+    argv.push_back(nullptr);
+    posix_spawn_file_actions_t actions;
+    ::posix_spawn_file_actions_init(&actions);
+    ::posix_spawn_file_actions_addopen(&actions, STDOUT_FILENO, "/dev/null", O_WRONLY, 0);
+    const int error = ::posix_spawnp(&pid_, argv[0], &actions, nullptr, argv.data(), environ);
+    ::posix_spawn_file_actions_destroy(&actions);
+    if (error != 0) {
+      throw std::runtime_error(fmt::format("lcm-logplayer: {}; it is in Debian's liblcm-bin",
+                                           std::generic_category().message(error)));
+    }
+  }
+  /// @throws std::runtime_error if it failed.
+  bool is_running() {
+    if (pid_ <= 0 || has_ended_) return false;
+    int status = 0;
+    if (::waitpid(pid_, &status, WNOHANG) == 0) return true;
+    has_ended_ = true;
+    if (status != 0) throw std::runtime_error("lcm-logplayer failed");
+    return false;
+  }
+
+ private:
+  pid_t pid_ = -1;
+  bool has_ended_ = false;
+};
+
+/// The simulator's truth of a recorded run is read from the recording: it does not go on a bus.
+void read_truth(const std::string& log, RunWatch& watch) {
+  try {
+    for_each_event(log, [&](const LogEvent& event) {
+      if (event.channel != kSimState.name) return;
+      const auto state = decode<sim_state_t>(event.data.data(), event.data.size());
+      if (state.message) watch.on_sim_state(*state.message);
+    });
+  } catch (const std::runtime_error&) {
+    // Damaged in the middle: what stands before that is used, as everywhere.
+  }
+}
+
 /// What was learned from all samples. The body schema is the monitor's where it accepted one; a
 /// schema does not carry its outliers, so learning again from the same samples names them.
 struct Learned {
@@ -133,7 +212,7 @@ nlohmann::ordered_json result_json(const RunWatch& watch, const Learned& learned
   const auto held_out = watch.held_out();
   nlohmann::ordered_json json = {
       {"rig", arguments.rig},
-      {"seed", arguments.seed},
+      {"seed", arguments.replay.empty() ? nlohmann::ordered_json(arguments.seed) : nullptr},
       {"samples", watch.num_samples()},
       {"seconds", std::round(seconds * 10) / 10},
       {"end_effector", signals.end_effector_part},
@@ -143,6 +222,7 @@ nlohmann::ordered_json result_json(const RunWatch& watch, const Learned& learned
        errors_json(static_cast<int>(held_out.size()), evaluate(learned.schema, held_out))},
       {"held_out_against", watch.has_truth() ? "noise-free simulator" : "observations"},
       {"visibility", nlohmann::ordered_json::object()}};
+  if (!arguments.replay.empty()) json["replay_of"] = arguments.replay;
   for (const auto& [part, share] : watch.visibility())
     json["visibility"][std::to_string(part)] = share;
   return json;
@@ -154,12 +234,13 @@ void report(const RunWatch& watch, const BestPicture& picture, const WatchArgume
   const Learned learned = learn_again(watch, arguments);
   write_file_atomically(folder / "result.json",
                         result_json(watch, learned, arguments, seconds).dump(2) + "\n");
-  const bool has_picture = picture.write(folder / "detections.png");
+  picture.write(folder / "detections.png");
 
   const auto held_out = watch.held_out();
-  std::cout << fmt::format("\n{} · seed {} · {} samples, {} of them held out · {:.0f} s\n\n",
-                           arguments.rig, arguments.seed, watch.num_samples(), held_out.size(),
-                           seconds);
+  const std::string origin = arguments.replay.empty() ? fmt::format("seed {}", arguments.seed)
+                                                      : "replay of " + arguments.replay;
+  std::cout << fmt::format("\n{} · {} · {} samples, {} of them held out · {:.0f} s\n\n",
+                           arguments.rig, origin, watch.num_samples(), held_out.size(), seconds);
   if (!learned.is_accepted) {
     std::cout << "The monitor accepted no body schema: too few samples, or each proposal was "
                  "refuted. The newest proposal:\n";
@@ -171,14 +252,20 @@ void report(const RunWatch& watch, const BestPicture& picture, const WatchArgume
               << "\n"
               << errors_text(evaluate(learned.schema, held_out));
   }
-  std::cout << "\nFiles in " << folder.string() << "\n  result.json        this table\n";
-  if (has_picture)
-    std::cout << "  detections.png     a camera frame with the markers found in it\n";
-  std::cout << "  schema.lcmlog      the body schema: ./run show FILE\n"
-               "  samples.lcmlog     the samples: ./run learn FILE\n"
-               "  run.lcmlog.00      everything on the bus but images\n"
-               "  report.html        all of this as one page, when the group has ended\n"
-            << std::flush;
+  std::cout << "\nFiles in " << folder.string() << "\n";
+  // On one of several hosts, or in a replay, not all of them are here.
+  const std::vector<std::pair<std::string, std::string>> files = {
+      {"result.json", "this table"},
+      {"detections.png", "a camera frame with the markers found in it"},
+      {"schema.lcmlog", "the body schema: ./run show FILE"},
+      {"samples.lcmlog", "the samples: ./run learn FILE"},
+      {"run.lcmlog.00", "everything on the bus but images"},
+      {"report.html", "all of this as one page"}};
+  for (const auto& [name, what] : files) {
+    if (std::filesystem::exists(folder / name))
+      std::cout << fmt::format("  {:<18} {}\n", name, what);
+  }
+  std::cout << std::flush;
 }
 
 void run_watch(const WatchArguments& arguments) {
@@ -186,26 +273,39 @@ void run_watch(const WatchArguments& arguments) {
   std::signal(SIGTERM, on_signal);
   RunWatch watch;
   BestPicture picture;
-  const auto now_us = [] {
-    return std::chrono::duration_cast<std::chrono::microseconds>(
-               std::chrono::system_clock::now().time_since_epoch())
-        .count();
+  const auto microseconds = [](auto duration) {
+    return std::chrono::duration_cast<std::chrono::microseconds>(duration).count();
   };
-  Bus bus(arguments.in, "");
+  const auto now_us = [&] { return microseconds(Clock::now().time_since_epoch()); };
+  const bool is_replay = !arguments.replay.empty();
+  Bus bus(arguments.in, is_replay ? "" : arguments.in);
   Bus images(arguments.images.empty() ? images_url(arguments.in) : arguments.images, "");
-  SampleIntake intake((std::filesystem::path(arguments.out) / "samples.lcmlog").string(),
-                      [&](const sample_t& m) { watch.on_sample(m); });
-  bus.subscribe<sample_t>(kSample, [&](const sample_t& m) { intake.on_sample(m); });
-  bus.subscribe<body_schema_t>(kBodySchema,
-                               [&](const body_schema_t& m) { watch.on_body_schema(m); });
-  bus.subscribe<model_health_t>(kModelHealth,
-                                [&](const model_health_t& m) { watch.on_model_health(m); });
-  bus.subscribe<sim_state_t>(kSimState, [&](const sim_state_t& m) { watch.on_sim_state(m); });
-  bus.subscribe<process_info_t>(
-      kProcessInfo, [&](const process_info_t& m) { watch.on_process_info(m, now_us()); });
-  bus.subscribe<marker_poses_t>(kMarkerPoses,
-                                [&](const marker_poses_t& m) { picture.on_markers(m); });
-  bus.subscribe<camera_info_t>(kCameraInfo, [&](const camera_info_t& m) { picture.on_info(m); });
+  // Where the observer runs on another host, a sample that a lost frame took is asked for.
+  SampleIntake intake(
+      (std::filesystem::path(arguments.out) / "samples.lcmlog").string(),
+      [&](const sample_t& m) { watch.on_sample(m); },
+      [&](sample_request_t request) {
+        request.process_name = "watch";
+        bus.publish(kSampleRequest, request);
+      });
+  // What another rig's group says, or a recording that is played, is none of this run.
+  const RigDoor door(arguments.rig_folder);
+  const auto hear = [&](const auto& channel, auto handler) {
+    bus.subscribe(channel, [&door, handler](const auto& m) {
+      if (door.objection(m).empty()) handler(m);
+    });
+  };
+  hear(kSample, [&](const sample_t& m) { intake.on_sample(m); });
+  hear(kBodySchema, [&](const body_schema_t& m) { watch.on_body_schema(m); });
+  hear(kLearnedSchema, [&](const body_schema_t& m) { watch.on_learned_schema(m); });
+  hear(kModelHealth, [&](const model_health_t& m) { watch.on_model_health(m); });
+  hear(kSimState, [&](const sim_state_t& m) { watch.on_sim_state(m); });
+  hear(kMarkerPoses, [&](const marker_poses_t& m) { picture.on_markers(m); });
+  hear(kCameraInfo, [&](const camera_info_t& m) { picture.on_info(m); });
+  bus.subscribe(kProcessInfo, [&](const process_info_t& m) {
+    const auto wall_clock_us = microseconds(std::chrono::system_clock::now().time_since_epoch());
+    if (is_live(m, wall_clock_us)) watch.on_process_info(m, now_us());
+  });
   images.subscribe<camera_image_t>(kCameraImage,
                                    [&](const camera_image_t& m) { picture.on_image(m); });
 
@@ -214,34 +314,50 @@ void run_watch(const WatchArguments& arguments) {
     return std::chrono::duration<double>(Clock::now() - start).count();
   };
   ProgressLine line;
-  std::int64_t last_samples = 0;
-  double progressed_s = 0, warned_s = 0;
-  while (!watch.is_finished() && !interrupted) {
+  Player player;
+  if (is_replay) read_truth(arguments.replay, watch);
+  std::int64_t last_progress = 0;
+  double progressed_s = 0, warned_s = 0, played_s = 0;
+  const auto is_finished = [&] {
+    if (!is_replay) return watch.is_finished();
+    if (arguments.speed == 0) return watch.is_caught_up();
+    // What is played before somebody listens is lost.
+    if (!player.has_started() && watch.silent(arguments.processes, now_us()).empty())
+      player.start(arguments);
+    if (!player.has_started() || player.is_running()) {
+      played_s = seconds();
+      return false;
+    }
+    // The observer may still be at the last sample.
+    if (watch.num_samples() == 0 && seconds() - played_s > 10)
+      throw std::runtime_error(
+          "the recording gave no sample: it holds no settled action that was seen");
+    return seconds() - std::max(played_s, progressed_s) > 1 && watch.is_caught_up();
+  };
+  while (!is_finished() && !interrupted) {
     images.handle(std::chrono::milliseconds(0));
     bus.handle(std::chrono::milliseconds(50));
     intake.on_tick(now_us());
-    if (watch.num_samples() != last_samples) {
-      last_samples = watch.num_samples();
-      progressed_s = seconds();
-    }
+    const std::int64_t progress = watch.num_samples() + watch.learned_sample();
+    if (std::exchange(last_progress, progress) != progress) progressed_s = seconds();
     line.show(fmt::format("{} · {:.0f} s", watch.progress(), seconds()), false);
     const double stalled_s = seconds() - std::max(progressed_s, warned_s);
     if (stalled_s > 20) {
       warned_s = seconds();
       line.end();
-      std::cerr << fmt::format("no new sample for {:.0f} s:\n", seconds() - progressed_s)
-                << watch.diagnosis(kGroup, now_us());
+      std::cerr << fmt::format("nothing new for {:.0f} s:\n", seconds() - progressed_s)
+                << watch.diagnosis(arguments.processes, now_us());
     }
     if (seconds() - progressed_s > arguments.patience_s) {
-      throw std::runtime_error(fmt::format(
-          "no new sample for {:.0f} s, so I give up; the processes' own words are in {}",
-          arguments.patience_s, arguments.out));
+      throw std::runtime_error(
+          fmt::format("nothing new for {:.0f} s, so I give up; the processes' own words are in {}",
+                      arguments.patience_s, arguments.out));
     }
   }
   line.show(fmt::format("{} · {:.0f} s", watch.progress(), seconds()), true);
   line.end();
   report(watch, picture, arguments, seconds());
-  if (interrupted) throw std::runtime_error("interrupted before the babbler was done");
+  if (interrupted) throw std::runtime_error("interrupted before the end");
 }
 
 }  // namespace
@@ -257,7 +373,18 @@ void add_watch_command(CLI::App& console) {
       ->required();
   watch->add_option("--seed", arguments->seed, "Seed of the run, for the record");
   watch->add_option("--patience-s", arguments->patience_s,
-                    "Give up after so long without a new sample [s]");
+                    "Give up after so long without a new sample or proposal [s]");
+  watch->add_option("--processes", arguments->processes,
+                    "Processes that should be heard of; says who is silent when nothing goes on");
+  CLI::Option* replay = watch->add_option(
+      "--replay", arguments->replay, "The recording that is replayed; then there is no babbler");
+  watch
+      ->add_option("--speed", arguments->speed,
+                   "Play the recording so many times faster than it was; 0: somebody else does")
+      ->needs(replay);
+  watch->add_option("--replay-from", arguments->replay_from, "What is played, as `log` says")
+      ->check(CLI::IsMember({kMarkerPoses.name, kSample.name}))
+      ->needs(replay);
   watch->callback([arguments] { run_watch(*arguments); });
 }
 

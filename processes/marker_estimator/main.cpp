@@ -7,6 +7,7 @@
 
 #include "common/bus/images_url.h"
 #include "common/bus/process.h"
+#include "common/bus/rig_door.h"
 #include "processes/marker_estimator/marker_estimator.h"
 
 using namespace bodyschema;
@@ -29,7 +30,8 @@ int main(int argc, char** argv) {
         process.bus().publish(kMarkerPoses, *poses);
       }
     };
-    process.bus().subscribe(kCameraInfo, [&](const camera_info_t& info) {
+    const RigDoor door(process.rig_folder());
+    door.subscribe(process, kCameraInfo, [&](const camera_info_t& info) {
       const std::lock_guard lock(mutex);
       estimator.on_camera_info(info);
     });
@@ -68,13 +70,10 @@ int main(int argc, char** argv) {
         });
       }
     }
-    std::map<std::string, std::int64_t> reported;
     process.on_idle([&] {
       const std::lock_guard lock(mutex);
       if (failure) std::rethrow_exception(failure);
-      for (const auto& [name, count] : estimator.counters()) {
-        process.count(name, count - std::exchange(reported[name], count));
-      }
+      process.set_counters(estimator.counters());
       process.set_activity(
           estimator.is_working() ? process_info_t::PHASE_WORKING : process_info_t::PHASE_WAITING,
           estimator.activity());

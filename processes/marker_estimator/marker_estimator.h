@@ -1,16 +1,18 @@
 #pragma once
 
 #include <cstdint>
+#include <deque>
 #include <filesystem>
 #include <map>
 #include <optional>
 #include <string>
+#include <utility>
 
 #include "bodyschema/camera_image_t.hpp"
 #include "bodyschema/camera_info_t.hpp"
 #include "bodyschema/marker_poses_t.hpp"
-#include "common/config/rig.h"
 #include "common/camera/fit_pose.h"
+#include "common/config/rig.h"
 #include "processes/marker_estimator/tag_detector.h"
 
 namespace bodyschema {
@@ -36,8 +38,9 @@ struct MarkerEstimatorConfig {
 ///
 /// Before the first CAMERA_INFO it answers nothing, since pixels mean no poses yet. Afterwards it
 /// answers every readable image of the calibrated size, with no markers where none is seen. An
-/// image that cannot be read or has another size is refused and counted. When images stop, so do
-/// the answers.
+/// image that cannot be read, has another size or is another camera's is refused and counted. An
+/// image that is repeated gets the same answer again without being looked at. When images stop, so
+/// do the answers.
 class MarkerEstimator {
  public:
   MarkerEstimator(const MarkerEstimatorConfig& config, Markers markers);
@@ -61,6 +64,8 @@ class MarkerEstimator {
   const Markers markers_;
   TagDetector detector_;
   std::optional<Lens> lens_;
+  camera_info_t info_{};                                            ///< lens_ is made of it
+  std::deque<std::pair<camera_image_t, marker_poses_t>> answered_;  ///< the newest, under info_
   std::map<std::string, std::int64_t> counters_;
   std::string refused_;  ///< why the newest image was refused; empty: it was not
   std::int64_t num_images_ = 0;

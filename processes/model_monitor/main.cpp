@@ -1,64 +1,100 @@
-// model_monitor: SAMPLE, LEARNED_SCHEMA -> BODY_SCHEMA, MODEL_HEALTH
+// model_monitor: SAMPLE, LEARNED_SCHEMA -> BODY_SCHEMA, MODEL_HEALTH, SAMPLE_REQUEST
+
+#include <spdlog/spdlog.h>
 
 #include <CLI/CLI.hpp>
 #include <filesystem>
 
-#include "common/bus/event_log.h"
 #include "common/bus/process.h"
+#include "common/bus/rig_door.h"
 #include "common/bus/sample_intake.h"
 #include "processes/model_monitor/model_monitor.h"
+#include "processes/model_monitor/saved_message.h"
 
 using namespace bodyschema;
+
+namespace {
+
+/// "" where there is no file.
+std::filesystem::path beside(const std::filesystem::path& file, const char* name) {
+  return file.empty() ? file : std::filesystem::path(file).replace_filename(name);
+}
+
+}  // namespace
 
 int main(int argc, char** argv) {
   std::string samples_file;
   std::string schema_file;
   const auto add_options = [&](CLI::App& app) {
     app.add_option("--samples", samples_file, "The observer's samples.lcmlog, read at start");
-    app.add_option("--schema", schema_file, "Where the body schema is kept; reloaded at start");
+    app.add_option("--schema", schema_file,
+                   "Where the body schema is kept, and health.lcmlog beside it; reloaded at start");
   };
   const auto body = [&](Process& process) {
+    const RigDoor door(process.rig_folder());
     ModelMonitor monitor(ModelMonitorConfig::load(process.config_file()));
-    SampleIntake intake(samples_file, [&](const sample_t& sample) { monitor.on_sample(sample); });
-    if (!schema_file.empty() && std::filesystem::exists(schema_file)) {
-      const auto saved = read_log(schema_file, kBodySchema);
-      if (saved.empty()) throw std::runtime_error(schema_file + ": holds no BODY_SCHEMA");
-      monitor.reload(saved.back());
+    SampleIntake intake(
+        samples_file, [&](const sample_t& sample) { monitor.on_sample(sample); },
+        SampleIntake::asking(process));
+    SavedMessage saved_schema(schema_file, kBodySchema);
+    SavedMessage saved_health(beside(schema_file, "health.lcmlog"), kModelHealth);
+    {
+      const auto not_ours = [&](const auto& message) { return door.objection(message); };
+      const auto schema = saved_schema.load(not_ours);
+      const auto health = saved_health.load(not_ours);
+      if (schema || health) monitor.reload(schema, health);
     }
 
-    std::int64_t saved_version = monitor.schema() ? monitor.schema()->schema_version : 0;
+    std::string problem;
     const auto publish = [&] {
+      // The health first: ModelMonitor::reload() knows what it means if the process is killed here.
+      std::string not_saved = saved_health.save(monitor.health());
       if (monitor.schema()) {
-        if (monitor.schema()->schema_version != saved_version && !schema_file.empty()) {
-          write_one_event_log(schema_file, kBodySchema, *monitor.schema());
-        }
-        saved_version = monitor.schema()->schema_version;
+        if (not_saved.empty()) not_saved = saved_schema.save(*monitor.schema());
         process.bus().publish(kBodySchema, *monitor.schema());
       }
       process.bus().publish(kModelHealth, monitor.health());
-      process.set_activity(process_info_t::PHASE_WORKING,
-                           "schema version " + std::to_string(saved_version) +
-                               ", judged up to sample " +
-                               std::to_string(monitor.health().judged_sample));
+      if (!not_saved.empty() && problem.empty()) {
+        spdlog::warn("{}; tried again every second", not_saved);
+      }
+      if (!not_saved.empty()) process.count("schema not saved");
+      problem = not_saved;
+    };
+    const auto say = [&] {
+      if (!problem.empty() || !intake.activity().empty()) {
+        process.set_activity(process_info_t::PHASE_WAITING,
+                             problem.empty() ? intake.activity() : "cannot save: " + problem);
+      } else if (monitor.health().judged_sample < 0) {
+        process.set_activity(process_info_t::PHASE_WAITING, "waiting for LEARNED_SCHEMA");
+      } else {
+        process.set_activity(process_info_t::PHASE_WORKING,
+                             "schema version " + std::to_string(monitor.health().schema_version) +
+                                 ", judged up to sample " +
+                                 std::to_string(monitor.health().judged_sample));
+      }
     };
 
-    process.set_activity(process_info_t::PHASE_WAITING, "waiting for LEARNED_SCHEMA");
+    say();
     Bus& bus = process.bus();
-    bus.subscribe<sample_t>(kSample, [&](const sample_t& sample) {
+    door.subscribe(process, kSample, [&](const sample_t& sample) {
       const std::int64_t judged = monitor.health().judged_sample;
       intake.on_sample(sample);
       if (monitor.health().judged_sample != judged) publish();
     });
-    bus.subscribe<body_schema_t>(kLearnedSchema, [&](const body_schema_t& proposal) {
+    door.subscribe(process, kLearnedSchema, [&](const body_schema_t& proposal) {
       if (monitor.on_learned_schema(proposal)) publish();
     });
     std::int64_t sent_us = 0;
     process.on_tick([&](std::int64_t now_us) {
+      const std::int64_t judged = monitor.health().judged_sample;
       intake.on_tick(now_us);
+      if (monitor.health().judged_sample != judged) publish();
+      process.set_counters(intake.counters());
       if (bus.is_replay() || now_us - sent_us < 1'000'000) return;
       sent_us = now_us;
       publish();
     });
+    process.on_idle(say);
     process.run();
   };
   return run_process("model_monitor", argc, argv, body, add_options);

@@ -54,12 +54,28 @@ ModelMonitor::ModelMonitor(ModelMonitorConfig config) : config_(config) {
   health_.worst_rotation_rad = -1;
 }
 
-void ModelMonitor::reload(const body_schema_t& saved) {
-  schema_ = from_message(saved);
-  schema_message_ = saved;
-  add_event(health_event_t::EVENT_RELOADED, schema_.last_sample_index, schema_.utime,
-            "version " + std::to_string(schema_.version) + " reloaded");
-  assess(schema_.last_sample_index);
+void ModelMonitor::reload(const std::optional<body_schema_t>& schema,
+                          const std::optional<model_health_t>& health) {
+  std::int64_t judged = -1;
+  if (health) {
+    set_array(health_.num_events, health_.events, health->events);
+    if (health->num_events > 0) num_events_ = health->events.back().event_number + 1;
+  }
+  if (schema) {
+    schema_ = from_message(*schema);
+    schema_message_ = schema;
+    judged = schema_.last_sample_index;
+  }
+  // Whatever was judged after the schema was refused; if the health tells of a newer schema than
+  // there is, that one was accepted but not saved.
+  if (health && health->schema_version == schema_.version) {
+    judged = std::max(judged, health->judged_sample);
+  }
+  if (schema) {
+    add_event(health_event_t::EVENT_RELOADED, schema_.last_sample_index, schema_.utime,
+              "version " + std::to_string(schema_.version) + " reloaded");
+  }
+  assess(judged);
 }
 
 bool ModelMonitor::on_sample(const sample_t& message) {
@@ -70,20 +86,17 @@ bool ModelMonitor::on_sample(const sample_t& message) {
   if (sample.purpose == Purpose::kTest) tests_.push_back(std::move(sample));
 
   bool is_judged = false;
-  while (!waiting_.empty() && waiting_.front().last_sample_index <= last_sample_index_) {
-    const body_schema_t proposal = std::move(waiting_.front());
-    waiting_.pop_front();
-    is_judged |= on_learned_schema(proposal);
+  while (!waiting_.empty() && waiting_.begin()->first <= last_sample_index_) {
+    is_judged |= on_learned_schema(waiting_.extract(waiting_.begin()).mapped());
   }
   return is_judged;
 }
 
 bool ModelMonitor::on_learned_schema(const body_schema_t& proposal) {
   if (proposal.last_sample_index > last_sample_index_) {
-    if (waiting_.empty() || proposal.last_sample_index > waiting_.back().last_sample_index) {
-      waiting_.push_back(proposal);
-      if (waiting_.size() > kMaxWaiting) waiting_.pop_front();
-    }
+    // Those that will be judged first are kept: a proposal from nowhere cannot displace them.
+    waiting_.insert_or_assign(proposal.last_sample_index, proposal);
+    if (waiting_.size() > kMaxWaiting) waiting_.erase(std::prev(waiting_.end()));
     return false;
   }
   if (proposal.last_sample_index <= health_.judged_sample) return false;

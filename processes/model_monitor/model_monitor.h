@@ -1,7 +1,6 @@
 #pragma once
 
 #include <cstdint>
-#include <deque>
 #include <filesystem>
 #include <map>
 #include <optional>
@@ -36,8 +35,11 @@ class ModelMonitor {
  public:
   explicit ModelMonitor(ModelMonitorConfig config);
 
-  /// A schema saved by an earlier run of this process.
-  void reload(const body_schema_t& saved);
+  /// What an earlier run of this process saved: the schema, and the health with its history. Saved
+  /// one after the other, so the health may be one judgement ahead of the schema; that judgement is
+  /// then made again.
+  void reload(const std::optional<body_schema_t>& schema,
+              const std::optional<model_health_t>& health = std::nullopt);
 
   /// Returns true if a proposal that was waiting for this sample was judged: schema() and health()
   /// may have changed.
@@ -70,7 +72,8 @@ class ModelMonitor {
   std::vector<ActionPoseSample> tests_;
   std::map<int, std::vector<std::int64_t>> seen_in_;  ///< part → indices of samples that show it
   std::int64_t last_sample_index_ = -1;
-  std::deque<body_schema_t> waiting_;  ///< proposals that are ahead of the samples heard here
+  /// Proposals that are ahead of the samples heard here, by their last sample.
+  std::map<std::int64_t, body_schema_t> waiting_;
   BodySchema schema_;
   std::optional<body_schema_t> schema_message_;
   model_health_t health_{};

@@ -1,8 +1,12 @@
-// motor_babbler: MOTION_STATUS, SAMPLE, MODEL_HEALTH -> ACTION_COMMAND
+// motor_babbler: MOTION_STATUS, SAMPLE, MODEL_HEALTH, CONTROL_STATUS, BODY_SCHEMA -> ACTION_COMMAND
 
 #include <CLI/CLI.hpp>
+#include <filesystem>
+#include <utility>
 
+#include "common/bus/event_log.h"
 #include "common/bus/process.h"
+#include "common/bus/rig_door.h"
 #include "processes/motor_babbler/motor_babbler.h"
 
 using namespace bodyschema;
@@ -10,31 +14,52 @@ using namespace bodyschema;
 int main(int argc, char** argv) {
   std::int64_t seed = 1;
   std::int64_t samples = 0;
+  std::filesystem::path state_file;
   const auto add_options = [&](CLI::App& app) {
     app.add_option("--seed", seed, "Seed of the random actions");
     app.add_option("--samples", samples, "Stop after exactly this many samples")
         ->check(CLI::PositiveNumber);
+    app.add_option("--state", state_file, "Saved before each command, restored at the start");
   };
   const auto body = [&](Process& process) {
     MotorBabblerConfig config = MotorBabblerConfig::load(process.config_file());
     if (samples > 0) config.stop.min_samples = config.stop.max_samples = samples;
     MotorBabbler babbler(config, seed);
+    if (!state_file.empty() && std::filesystem::exists(state_file)) babbler.restore(state_file);
     process.set_seed(seed);
 
+    std::string saved = babbler.state_text();
     const auto send = [&](const std::optional<action_command_t>& command) {
+      if (const std::string text = babbler.state_text(); text != saved && !state_file.empty()) {
+        write_file_atomically(state_file, text);
+        saved = text;
+      }
       if (command) process.bus().publish(kActionCommand, *command);
       const std::int8_t phase =
           babbler.is_done() ? process_info_t::PHASE_DONE : process_info_t::PHASE_WORKING;
       process.set_activity(phase, babbler.activity());
     };
-    Bus& bus = process.bus();
-    bus.subscribe<motion_status_t>(kMotionStatus, [&](const motion_status_t& status) {
-      send(babbler.on_motion_status(status));
+    const RigDoor door(process.rig_folder());
+    door.subscribe(process, kMotionStatus,
+                   [&](const motion_status_t& status) { send(babbler.on_motion_status(status)); });
+    door.subscribe(process, kSample,
+                   [&](const sample_t& sample) { send(babbler.on_sample(sample)); });
+    door.subscribe(process, kModelHealth,
+                   [&](const model_health_t& health) { send(babbler.on_model_health(health)); });
+    process.bus().subscribe(kControlStatus, [&](const control_status_t& status) {
+      send(babbler.on_control_status(status));
     });
-    bus.subscribe<sample_t>(kSample,
-                            [&](const sample_t& sample) { send(babbler.on_sample(sample)); });
-    bus.subscribe<model_health_t>(
-        kModelHealth, [&](const model_health_t& health) { send(babbler.on_model_health(health)); });
+    door.subscribe(process, kBodySchema,
+                   [&](const body_schema_t& schema) { babbler.on_body_schema(schema); });
+    std::map<std::string, std::int64_t> reported;
+    const auto count = [&](const std::string& name, std::int64_t total) {
+      process.count(name, total - std::exchange(reported[name], total));
+    };
+    process.on_idle([&] {
+      count("action rejected", babbler.num_rejected());
+      count("sample never seen", babbler.num_unseen());
+      for (const auto& [channel, total] : babbler.refused()) count("refused " + channel, total);
+    });
     process.on_tick([&](std::int64_t now_us) { send(babbler.on_tick(now_us)); });
     process.run();
   };

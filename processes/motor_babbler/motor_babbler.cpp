@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <random>
+#include <sstream>
 
 #include "common/bus/convert.h"
 #include "common/config/yaml.h"
@@ -12,6 +13,8 @@ namespace {
 
 constexpr char kSource[] = "motor_babbler";
 constexpr int kMaxHastyRejections = 20;
+constexpr std::int64_t kListen_us = 1'500'000;  // CONTROL_STATUS repeats at 1 Hz
+constexpr std::int64_t kControlSilent_us = 3'000'000;
 
 std::int64_t microseconds(double seconds) { return std::llround(seconds * 1e6); }
 
@@ -73,28 +76,34 @@ bool MotorBabbler::is_mine(const motion_status_t& status) const {
 }
 
 std::optional<action_command_t> MotorBabbler::on_motion_status(const motion_status_t& status) {
-  driver_utime_ = status.utime;
-  if (done_) return std::nullopt;
-  if (wait_ == Wait::kDriver) {
-    // Driver's time makes the epoch the same in every simulated run of a seed. A babbler that was
-    // restarted goes on with the actions of its predecessor.
-    epoch_ = status.utime;
-    if (status.source == kSource) action_id_ = status.action_id + 1;
-  }
-  if (status.stop_latched) {
-    wait_ = Wait::kResume;
+  // Answers to HOLD and the like carry no action; a rejected action may have had any size.
+  if (status.num_signals != 0 && status.state != motion_status_t::STATE_REJECTED &&
+      status.commanded.size() != config_.signals.size()) {
+    ++refused_["MOTION_STATUS"];
     return std::nullopt;
   }
-  const bool at_rest = status.rest_since_utime >= 0;
-  if (wait_ == Wait::kDriver || wait_ == Wait::kResume) {
-    return at_rest ? act() : std::nullopt;
+  driver_utime_ = status.utime;
+  is_at_rest_ = status.rest_since_utime >= 0;
+  is_stopped_ = status.stop_latched == 1;
+  if (done_) return std::nullopt;
+  if (wait_ == Wait::kDriver && !is_restored_) {
+    // Driver's time makes the epoch the same in every simulated run of a seed. Where no state was
+    // kept, at least no id of a predecessor's is used again.
+    epoch_ = status.utime;
+    if (status.source == kSource) action_id_ = std::max(action_id_, status.action_id + 1);
   }
+  if (is_stopped_) {
+    wait_ = Wait::kRest;
+    return std::nullopt;
+  }
+  if (wait_ == Wait::kDriver) return begin();
+  if (wait_ == Wait::kRest) return may_move() ? act() : std::nullopt;
   if (wait_ != Wait::kAnswer || !is_mine(status)) return std::nullopt;
   wait_since_us_ = -1;  // the driver is not silent
   switch (status.state) {
     case motion_status_t::STATE_REJECTED:
       // Asking again while the arm moves would only be refused again.
-      if (!at_rest) return std::nullopt;
+      if (!is_at_rest_) return std::nullopt;
       ++num_rejected_;
       rejection_ = status.reason;
       if (++num_rejected_in_a_row_ <= kMaxHastyRejections) return act();
@@ -104,7 +113,7 @@ std::optional<action_command_t> MotorBabbler::on_motion_status(const motion_stat
     case motion_status_t::STATE_EXPIRED:
     case motion_status_t::STATE_STOPPED:
     case motion_status_t::STATE_HOLDING:
-      return at_rest ? act() : std::nullopt;
+      return is_at_rest_ ? act() : std::nullopt;
     case motion_status_t::STATE_SETTLED:
       num_rejected_in_a_row_ = 0;
       wait_ = Wait::kSample;
@@ -114,35 +123,107 @@ std::optional<action_command_t> MotorBabbler::on_motion_status(const motion_stat
   }
 }
 
-std::optional<action_command_t> MotorBabbler::on_sample(const sample_t& sample) {
-  num_samples_ = std::max(num_samples_, sample.sample_index + 1);
-  const bool is_answer = (wait_ == Wait::kSample || wait_ == Wait::kAnswer) &&
-                         sample.source == kSource && sample.epoch == epoch_ &&
-                         sample.action_id == command_.action_id;
-  if (!is_answer) return std::nullopt;
-  if (sample.purpose == action_command_t::PURPOSE_TEST) {
-    last_test_sample_ = sample.sample_index;
-    if (health_.judged_sample < last_test_sample_) {
-      wait_ = Wait::kVerdict;
-      wait_since_us_ = -1;
-      return std::nullopt;
-    }
+std::optional<action_command_t> MotorBabbler::begin() {
+  if (!may_move() || (is_restored_ && !has_heard_control_)) return std::nullopt;
+  if (!is_restored_) return act();
+  wait_since_us_ = -1;
+  if (!is_seen_) {
+    wait_ = Wait::kAnswer;
+    return command_;
+  }
+  if (last_test_sample_ == last_sample_ && health_.judged_sample < last_test_sample_) {
+    wait_ = Wait::kVerdict;
+    return std::nullopt;
   }
   return act();
 }
 
+std::optional<action_command_t> MotorBabbler::on_sample(const sample_t& sample) {
+  if (sample.action.size() != config_.signals.size()) {
+    ++refused_["SAMPLE"];
+    return std::nullopt;
+  }
+  if (wait_ == Wait::kDriver && !is_restored_) {
+    // All that tells a babbler without kept state about its predecessor.
+    num_samples_ = std::max(num_samples_, sample.sample_index + 1);
+    if (sample.source == kSource) action_id_ = std::max(action_id_, sample.action_id + 1);
+  }
+  const bool is_own = sample.source == kSource && sample.epoch == epoch_ &&
+                      sample.action_id < action_id_ && sample.sample_index > last_sample_;
+  if (!is_own) return std::nullopt;
+  ++num_samples_;
+  last_sample_ = sample.sample_index;
+  const bool is_test = sample.purpose == action_command_t::PURPOSE_TEST;
+  if (is_test) last_test_sample_ = last_sample_;
+  if (sample.action_id != command_.action_id) return std::nullopt;
+  is_seen_ = true;
+  if (wait_ != Wait::kSample && wait_ != Wait::kAnswer) return std::nullopt;
+  if (is_test && health_.judged_sample < last_test_sample_) {
+    wait_ = Wait::kVerdict;
+    wait_since_us_ = -1;
+    return std::nullopt;
+  }
+  return act();
+}
+
+void MotorBabbler::on_body_schema(const body_schema_t& schema) {
+  const bool is_of_rig = std::equal(
+      schema.signals.begin(), schema.signals.end(), config_.signals.begin(), config_.signals.end(),
+      [](const signal_t& a, const Signal& b) {
+        return a.signal_name == b.name && a.lower_limit == b.lower && a.upper_limit == b.upper;
+      });
+  if (!is_of_rig) {
+    ++refused_["BODY_SCHEMA"];
+    return;
+  }
+  schema_version_ = schema.schema_version;
+  schema_edges_.clear();
+  for (const schema_edge_t& edge : schema.edges) {
+    schema_edges_.emplace_back(edge.from_part, edge.to_part);
+  }
+}
+
 std::optional<action_command_t> MotorBabbler::on_model_health(const model_health_t& health) {
+  // Judges the body schema that was heard, or one that was not: then nothing speaks against it.
+  if (health.schema_version == schema_version_ &&
+      !std::equal(health.edge_health.begin(), health.edge_health.end(), schema_edges_.begin(),
+                  schema_edges_.end(), [](const edge_health_t& edge, const auto& parts) {
+                    return edge.health_from == parts.first && edge.health_to == parts.second;
+                  })) {
+    ++refused_["MODEL_HEALTH"];
+    return std::nullopt;
+  }
   health_ = health;
-  // What a babbler that was restarted did not hear of.
-  num_samples_ = std::max(num_samples_, health.judged_sample + 1);
+  if (last_sample_ < 0 && !is_restored_) {
+    num_samples_ = std::max(num_samples_, health.judged_sample + 1);
+  }
   if (wait_ == Wait::kVerdict && health_.judged_sample >= last_test_sample_) return act();
   return std::nullopt;
 }
 
+std::optional<action_command_t> MotorBabbler::on_control_status(const control_status_t& status) {
+  const bool was_lent = std::exchange(is_lent_, status.owns_arm == 1);
+  has_heard_control_ = true;
+  is_control_silent_ = false;
+  control_since_us_ = -1;
+  if (done_ || is_lent_) return std::nullopt;
+  if (wait_ == Wait::kDriver) return driver_utime_ > 0 && !is_stopped_ ? begin() : std::nullopt;
+  // What was not finished when the arm was taken is replaced.
+  if (was_lent && (wait_ == Wait::kAnswer || wait_ == Wait::kSample)) wait_ = Wait::kRest;
+  return wait_ == Wait::kRest && may_move() ? act() : std::nullopt;
+}
+
 std::optional<action_command_t> MotorBabbler::on_tick(std::int64_t now_us) {
+  if (started_us_ < 0) started_us_ = now_us;
+  if (control_since_us_ < 0) control_since_us_ = now_us;
+  is_control_silent_ = now_us - control_since_us_ > kControlSilent_us;
+  if (!has_heard_control_ && now_us - started_us_ >= kListen_us) {
+    has_heard_control_ = true;  // there is no controller
+    if (wait_ == Wait::kDriver && is_restored_) return begin();
+  }
   if (wait_since_us_ < 0) wait_since_us_ = now_us;
   const std::int64_t waited_us = now_us - wait_since_us_;
-  if (wait_ == Wait::kAnswer && waited_us >= config_.resend_us) {
+  if (wait_ == Wait::kAnswer && waited_us >= config_.resend_us && !is_lent_) {
     wait_since_us_ = now_us;
     return command_;
   }
@@ -159,8 +240,8 @@ bool MotorBabbler::should_stop() const {
   if (num_samples_ >= stop.max_samples) return true;
   // Only right after a TEST sample is a verdict waited for; which others arrive, and when, depends
   // on the speed of learner and monitor.
-  const bool has_verdict =
-      last_test_sample_ == num_samples_ - 1 && health_.judged_sample >= last_test_sample_;
+  const bool has_verdict = last_sample_ >= 0 && last_test_sample_ == last_sample_ &&
+                           health_.judged_sample >= last_test_sample_;
   return has_verdict && num_samples_ >= stop.min_samples && health_.schema_complete &&
          health_.num_test_samples >= stop.min_test_samples && health_.worst_position_m >= 0 &&
          health_.worst_position_m <= stop.position_m && health_.worst_rotation_rad >= 0 &&
@@ -174,6 +255,11 @@ std::optional<action_command_t> MotorBabbler::act() {
     wait_ = Wait::kDone;
     return std::nullopt;
   }
+  if (is_lent_) {
+    wait_ = Wait::kRest;
+    return std::nullopt;
+  }
+  is_seen_ = false;
   command_ = action_command_t{};
   command_.utime = driver_utime_;
   command_.source = kSource;
@@ -194,9 +280,15 @@ std::optional<action_command_t> MotorBabbler::act() {
 
 std::string MotorBabbler::activity() const {
   const std::string samples = std::to_string(num_samples_) + " samples";
+  if (is_lent_ && !done_) {
+    return samples + ", waiting: the controller has the arm" +
+           (is_control_silent_ ? " but is silent; start it again, it gives the arm back or holds it"
+                               : "");
+  }
   switch (wait_) {
     case Wait::kDriver:
-      return "waiting for MOTION_STATUS of a driver";
+      if (driver_utime_ == 0) return "waiting for MOTION_STATUS of a driver";
+      return samples + ", waiting until the arm is at rest and nobody else's";
     case Wait::kAnswer:
       return samples + ", waiting for the driver's answer to action " +
              std::to_string(command_.action_id) +
@@ -205,12 +297,55 @@ std::string MotorBabbler::activity() const {
       return samples + ", waiting for the SAMPLE of action " + std::to_string(command_.action_id);
     case Wait::kVerdict:
       return samples + ", waiting for MODEL_HEALTH of sample " + std::to_string(last_test_sample_);
-    case Wait::kResume:
-      return samples + ", stopped: waiting for RESUME";
+    case Wait::kRest:
+      return samples +
+             (is_stopped_ ? ", stopped: waiting for RESUME" : ", waiting for the arm to rest");
     case Wait::kDone:
       return samples + ", done";
   }
   return samples;
+}
+
+std::string MotorBabbler::state_text() const {
+  if (command_.source.empty()) return "";
+  std::ostringstream text;
+  text << "# motor_babbler: its samples, and the last command with whether its SAMPLE came.\n"
+       << "seed: " << seed_ << "\n"
+       << "samples: " << num_samples_ << "\n"
+       << "last_sample: " << last_sample_ << "\n"
+       << "last_test_sample: " << last_test_sample_ << "\n"
+       << "seen: " << (is_seen_ ? "true" : "false") << "\n"
+       << "command: {utime: " << command_.utime << ", epoch: " << command_.epoch
+       << ", action_id: " << command_.action_id << ", purpose: " << int{command_.purpose}
+       << ", expiry_utime: " << command_.expiry_utime << ", action: " << yaml_list(command_.action)
+       << "}\n";
+  return text.str();
+}
+
+void MotorBabbler::restore(const std::filesystem::path& file) {
+  const Yaml yaml = Yaml::load(file);
+  if (yaml.integer("seed") != seed_) {
+    throw yaml.error("seed",
+                     "this is the state of another run; begin with its seed, or without "
+                     "this file");
+  }
+  num_samples_ = yaml.integer("samples", 0);
+  last_sample_ = yaml.integer("last_sample", -1);
+  last_test_sample_ = yaml.integer("last_test_sample", -1);
+  is_seen_ = yaml.boolean("seen");
+  const Yaml last = yaml.section("command");
+  command_.utime = last.integer("utime", 0);
+  command_.source = kSource;
+  command_.epoch = epoch_ = last.integer("epoch", 0);
+  command_.action_id = last.integer("action_id", 0);
+  command_.kind = action_command_t::KIND_MOVE;
+  command_.purpose = static_cast<std::int8_t>(last.integer("purpose", 0, 3));
+  command_.expiry_utime = last.integer("expiry_utime", 0);
+  set_array(command_.num_signals, command_.action,
+            last.numbers("action", static_cast<int>(config_.signals.size())));
+  yaml.finish();
+  action_id_ = command_.action_id + 1;
+  is_restored_ = true;
 }
 
 }  // namespace bodyschema

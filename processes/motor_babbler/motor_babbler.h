@@ -3,11 +3,15 @@
 #include <Eigen/Core>
 #include <cstdint>
 #include <filesystem>
+#include <map>
 #include <optional>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "bodyschema/action_command_t.hpp"
+#include "bodyschema/body_schema_t.hpp"
+#include "bodyschema/control_status_t.hpp"
 #include "bodyschema/model_health_t.hpp"
 #include "bodyschema/motion_status_t.hpp"
 #include "bodyschema/sample_t.hpp"
@@ -52,8 +56,15 @@ Eigen::VectorXd random_action(const MotorBabblerConfig& config, std::int64_t see
 ///
 /// Before the first MOTION_STATUS it does nothing (start guard). When the driver falls silent it
 /// repeats its last command, which the driver answers without moving twice. While a STOP is latched
-/// it waits for RESUME. After each TEST sample it waits for the monitor's verdict, so that with a
-/// fast bus or a slow learner the run ends at the same sample.
+/// it waits for RESUME; while the controller owns the arm it sends nothing, however long the
+/// controller is silent. An action that was cut short by that is replaced by the next. After each
+/// TEST sample it waits for the monitor's verdict, so that with a fast bus or a slow learner the
+/// run ends at the same sample.
+///
+/// A restart with the kept state goes on as if nothing had happened: it listens until it knows
+/// whether the arm is lent out, 1.5 s at most, then sends the last command again, which the driver
+/// answers without moving twice, unless that command's SAMPLE has come. Samples are counted where
+/// they are its own, so that every test_every-th of them is TEST whatever others do in between.
 class MotorBabbler {
  public:
   MotorBabbler(MotorBabblerConfig config, std::int64_t seed);
@@ -61,21 +72,34 @@ class MotorBabbler {
   std::optional<action_command_t> on_motion_status(const motion_status_t& status);
   std::optional<action_command_t> on_sample(const sample_t& sample);
   std::optional<action_command_t> on_model_health(const model_health_t& health);
+  std::optional<action_command_t> on_control_status(const control_status_t& status);
+  /// Only tells which rig's MODEL_HEALTH to believe.
+  void on_body_schema(const body_schema_t& schema);
   /// `now_us`: the clock. Sees silence.
   std::optional<action_command_t> on_tick(std::int64_t now_us);
 
   bool is_done() const { return done_; }
   /// What it does or waits for, for people.
   std::string activity() const;
+  /// Of its own, those of predecessors included.
   std::int64_t num_samples() const { return num_samples_; }
   std::int64_t num_rejected() const { return num_rejected_; }
   /// Settled actions whose SAMPLE never came.
   std::int64_t num_unseen() const { return num_unseen_; }
+  /// Messages that were refused, by channel.
+  const std::map<std::string, std::int64_t>& refused() const { return refused_; }
+
+  /// What a restart needs, as YAML; to be on disk before a command is sent. "" before the first.
+  std::string state_text() const;
+  /// Continues from a file with state_text(). @throws ConfigError, also if it is of another seed.
+  void restore(const std::filesystem::path& file);
 
  private:
-  enum class Wait { kDriver, kAnswer, kSample, kVerdict, kResume, kDone };
+  enum class Wait { kDriver, kAnswer, kSample, kVerdict, kRest, kDone };
 
+  std::optional<action_command_t> begin();
   std::optional<action_command_t> act();
+  bool may_move() const { return is_at_rest_ && !is_stopped_ && !is_lent_; }
   bool is_mine(const motion_status_t& status) const;
   bool should_stop() const;
 
@@ -90,11 +114,23 @@ class MotorBabbler {
   std::string rejection_;  ///< why the driver refused the last action that it refused
   std::int64_t num_unseen_ = 0;
   std::int64_t driver_utime_ = 0;
-  std::int64_t last_test_sample_ = -1;
+  std::int64_t last_sample_ = -1;       ///< sample_index of its newest
+  std::int64_t last_test_sample_ = -1;  ///< the same of its newest TEST
+  bool is_seen_ = false;                ///< the SAMPLE of command_ came
+  bool is_restored_ = false;
+  bool is_at_rest_ = false, is_stopped_ = false;
+  bool is_lent_ = false;                ///< the controller owns the arm
+  bool has_heard_control_ = false;      ///< or listened long enough
+  std::int64_t started_us_ = -1;        ///< clock, as the first tick saw it
+  std::int64_t control_since_us_ = -1;  ///< clock; since when CONTROL_STATUS is silent
+  bool is_control_silent_ = false;
   std::int64_t wait_since_us_ = -1;  ///< clock; −1: not yet seen by a tick
   bool done_ = false;
   action_command_t command_{};
   model_health_t health_{};
+  std::int64_t schema_version_ = -1;
+  std::vector<std::pair<int, int>> schema_edges_;
+  std::map<std::string, std::int64_t> refused_;
 };
 
 }  // namespace bodyschema

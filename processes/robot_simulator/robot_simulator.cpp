@@ -204,6 +204,12 @@ RobotSimulator::Answer RobotSimulator::on_command(const action_command_t& comman
       return answer;
   }
 
+  if (command.action.size() != scene_.signals().signals.size()) {
+    // Answered, not remembered: it is for another robot, whose ids may be the same as ours.
+    answer.statuses.push_back(
+        answer_to(command, motion_status_t::STATE_REJECTED, refusal(command)));
+    return answer;
+  }
   const std::int64_t now = microseconds(data_->time);
   if (command.expiry_utime < now) {
     conclude(motion_status_t::STATE_EXPIRED,

@@ -1,10 +1,11 @@
-// structure_learner: SAMPLE -> LEARNED_SCHEMA
+// structure_learner: SAMPLE -> LEARNED_SCHEMA, SAMPLE_REQUEST
 
 #include <CLI/CLI.hpp>
 #include <future>
 #include <stdexcept>
 
 #include "common/bus/process.h"
+#include "common/bus/rig_door.h"
 #include "common/bus/sample_intake.h"
 #include "processes/structure_learner/structure_learner.h"
 
@@ -16,14 +17,16 @@ int main(int argc, char** argv) {
     app.add_option("--samples", samples_file, "The observer's samples.lcmlog, read at start");
   };
   const auto body = [&](Process& process) {
+    const RigDoor door(process.rig_folder());
     StructureLearner learner(StructureLearnerConfig::load(process.config_file()));
-    SampleIntake intake(samples_file, [&](const sample_t& sample) {
+    const auto learn_from = [&](const sample_t& sample) {
       try {
         learner.on_sample(sample);
       } catch (const std::invalid_argument&) {
-        process.count("refused SAMPLE");  // another rig's
+        process.count("refused SAMPLE");  // a samples file of another rig
       }
-    });
+    };
+    SampleIntake intake(samples_file, learn_from, SampleIntake::asking(process));
 
     // The fit runs beside the loop: listening never waits for learning.
     std::future<body_schema_t> fit;
@@ -59,15 +62,18 @@ int main(int argc, char** argv) {
     };
 
     process.set_activity(process_info_t::PHASE_WAITING, "waiting for SAMPLE");
-    process.bus().subscribe<sample_t>(kSample,
-                                      [&](const sample_t& sample) { intake.on_sample(sample); });
+    door.subscribe(process, kSample, [&](const sample_t& sample) { intake.on_sample(sample); });
     process.on_idle(work);
     process.on_tick([&](std::int64_t now_us) {
       intake.on_tick(now_us);
+      process.set_counters(intake.counters());
       work();
       if (has_learned && !process.bus().is_replay() && now_us - sent_us >= 1'000'000) {
         sent_us = now_us;
         publish();
+      }
+      if (!intake.activity().empty()) {
+        process.set_activity(process_info_t::PHASE_WAITING, intake.activity());
       }
     });
     process.on_end([&] {

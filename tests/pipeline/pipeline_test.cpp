@@ -3,6 +3,8 @@
 
 #include <gtest/gtest.h>
 #include <signal.h>
+#include <sys/socket.h>
+#include <sys/un.h>
 #include <sys/wait.h>
 #include <unistd.h>
 
@@ -131,12 +133,23 @@ class Arm2 : public testing::Test {
 
   static int launch(const std::string& name) { return shell(command(name, 30)); }
   static std::string command(const std::string& name, int samples) {
+    return run_command(name, "--rig arm2 --seed 3 --samples " + std::to_string(samples));
+  }
+  /// `./run ARGUMENTS`, with logs, stdout and stderr of that name in the test's folder.
+  static std::string run_command(const std::string& name, const std::string& arguments) {
     const fs::path logs = folder_ / name;
     return "BODYSCHEMA_BUILD=" + in_quotes(kBin.parent_path()) +
-           " BODYSCHEMA_LOGS=" + in_quotes(logs) + " exec " + in_quotes(kSource / "run") +
-           " --rig arm2 --seed 3 --samples " + std::to_string(samples) + " >" +
-           in_quotes(logs.string() + ".out") + " 2>" + in_quotes(logs.string() + ".err") +
-           " </dev/null";
+           " BODYSCHEMA_LOGS=" + in_quotes(logs) + " exec " + in_quotes(kSource / "run") + " " +
+           arguments + " >" + in_quotes(logs.string() + ".out") + " 2>" +
+           in_quotes(logs.string() + ".err") + " </dev/null";
+  }
+  /// Exit code of `./run --replay LOG FLAGS`.
+  static int replay_group(const std::string& name, const fs::path& log,
+                          const std::string& flags = "") {
+    return shell(run_command(name, "--replay " + in_quotes(log) + " " + flags));
+  }
+  static nlohmann::json result(const std::string& name) {
+    return nlohmann::json::parse(contents(run(name) / "result.json"));
   }
   /// Runs a process from a log of the first run to a log, whose path is returned.
   static fs::path replay(const std::string& process, const std::string& flags = "") {
@@ -225,8 +238,10 @@ TEST_F(Arm2, TheBusAndTheImagesAreRecordedApart) {
   EXPECT_FALSE(payloads(run("first") / "images.lcmlog.00", "CAMERA_IMAGE").empty());
   EXPECT_TRUE(payloads(run("first") / "images.lcmlog.00", "SAMPLE").empty());
   EXPECT_TRUE(payloads(run("first") / "run.lcmlog.00", "CAMERA_IMAGE").empty());
-  EXPECT_EQ(payloads(run("first") / "run.lcmlog.00", "SAMPLE"),
-            payloads(run("first") / "samples.lcmlog", "SAMPLE"));
+  // On the bus the newest sample is repeated; in the file each stands once.
+  EXPECT_TRUE(are_equal(distinct_payloads(run("first") / "run.lcmlog.00", kSample),
+                        distinct_payloads(run("first") / "samples.lcmlog", kSample)));
+  EXPECT_EQ(read_log(run("first") / "samples.lcmlog", kSample).size(), 30u);
 }
 
 TEST_F(Arm2, TwoRunsWithOneSeedAreIdentical) {
@@ -358,6 +373,122 @@ TEST_F(Arm2, LearningFromTheSampleLogOfflineGivesTheStructureOfTheRun) {
   const auto learned = nlohmann::json::parse(contents(json));
   const auto result = nlohmann::json::parse(contents(run("first") / "result.json"));
   EXPECT_EQ(learned, result["structure"]);
+}
+
+TEST_F(Arm2, AReplayOfTheGroupLearnsWhatTheRunLearned) {
+  ASSERT_EQ(replay_group("again", run("first") / "run.lcmlog.00"), 0)
+      << contents(folder_ / "again.err");
+  EXPECT_EQ(payloads(run("again") / "samples.lcmlog", "SAMPLE"),
+            payloads(run("first") / "samples.lcmlog", "SAMPLE"));
+  EXPECT_EQ(payloads(run("again") / "schema.lcmlog", "BODY_SCHEMA"),
+            payloads(run("first") / "schema.lcmlog", "BODY_SCHEMA"));
+  for (const char* key : {"rig", "samples", "structure", "held_out", "held_out_against"})
+    EXPECT_EQ(result("again")[key], result("first")[key]) << key;
+  EXPECT_EQ(result("again")["replay_of"], fs::canonical(run("first") / "run.lcmlog.00").string());
+  EXPECT_NE(contents(folder_ / "again.out").find("arm2 · replay of "), std::string::npos);
+  EXPECT_EQ(processes_of(fs::canonical(run("again"))), std::vector<std::string>{});
+}
+
+TEST_F(Arm2, APlayedReplayLearnsTheSameAndNoCommandIsOnItsBus) {
+  ASSERT_EQ(replay_group("played", run("first") / "run.lcmlog.00", "--speed 5"), 0)
+      << contents(folder_ / "played.err");
+  EXPECT_EQ(payloads(run("played") / "schema.lcmlog", "BODY_SCHEMA"),
+            payloads(run("first") / "schema.lcmlog", "BODY_SCHEMA"));
+  EXPECT_EQ(payloads(run("played") / "samples.lcmlog", "SAMPLE"),
+            payloads(run("first") / "samples.lcmlog", "SAMPLE"));
+  std::set<std::string> channels;
+  for_each_event(run("played") / "run.lcmlog.00",
+                 [&](const LogEvent& event) { channels.insert(event.channel); });
+  EXPECT_TRUE(channels.count("MARKER_POSES"));
+  EXPECT_FALSE(channels.count("ACTION_COMMAND"));
+  EXPECT_FALSE(channels.count("SIM_STATE")) << "the truth is on the bus";
+  for (const char* robot : {"robot_simulator.log", "motor_babbler.log", "camera.log"})
+    EXPECT_FALSE(fs::exists(run("played") / robot)) << robot;
+}
+
+TEST_F(Arm2, TheRecordingInLogsTeachesTheStructure) {
+  ASSERT_EQ(replay_group("example", kSource / "logs/arm2_15.lcmlog", "--rig arm2"), 0)
+      << contents(folder_ / "example.err");
+  EXPECT_EQ(contents(folder_ / "example.err").find("cannot be read"), std::string::npos)
+      << "make it again, as logs/README.md says: " << contents(folder_ / "example.err");
+  const test::RigTruth truth(kSource / "config/arm2");
+  const auto schemas = read_log(run("example") / "schema.lcmlog", kBodySchema);
+  ASSERT_EQ(schemas.size(), 1u);
+  EXPECT_EQ(truth.objection(from_message(schemas[0]), truth.parts()), "");
+  EXPECT_EQ(result("example")["samples"], 15);
+}
+
+TEST_F(Arm2, AReplayOfSamplesThatAreCutOffSaysWhereAndLearnsFromTheRest) {
+  const fs::path whole = run("first") / "samples.lcmlog", cut = folder_ / "cut.lcmlog";
+  fs::copy_file(whole, cut, fs::copy_options::overwrite_existing);
+  fs::resize_file(cut, fs::file_size(whole) * 9 / 10);
+  EXPECT_NE(replay_group("no rig", cut), 0) << "no rig was named, and none lies beside the log";
+  EXPECT_NE(contents(folder_ / "no rig.err").find("type --rig RIG"), std::string::npos);
+  ASSERT_EQ(replay_group("cut", cut, "--rig arm2"), 0) << contents(folder_ / "cut.err");
+  const int whole_samples = static_cast<int>(read_log(cut, kSample).size());
+  EXPECT_EQ(result("cut")["samples"], whole_samples);
+  EXPECT_EQ(result("cut")["structure"]["complete"], true);
+  EXPECT_EQ(result("cut")["held_out_against"], "observations");
+  const std::string said = contents(folder_ / "cut.err");
+  EXPECT_NE(said.find("is cut off in the event at byte "), std::string::npos) << said;
+  EXPECT_NE(said.find("the " + std::to_string(whole_samples) + " events before it"),
+            std::string::npos)
+      << said;
+}
+
+TEST_F(Arm2, AReplayOfAnOlderVersionsLogIsRefusedWithTheReason) {
+  const fs::path older = folder_ / "older.lcmlog";
+  {
+    LogAppender log(older, LogAppender::Mode::kOverwrite, LogAppender::Durability::kToKernel);
+    for_each_event(run("first") / "samples.lcmlog", [&](const LogEvent& event) {
+      std::vector<std::uint8_t> data = event.data;
+      data[0] ^= 1;  // the fingerprint
+      log.append_bytes(event.channel, data, event.event_utime);
+    });
+  }
+  EXPECT_NE(replay_group("older", older, "--rig arm2"), 0);
+  const std::string said = contents(folder_ / "older.err");
+  EXPECT_NE(said.find("30 of 30 SAMPLE cannot be read"), std::string::npos) << said;
+  EXPECT_NE(said.find("built from other message definitions"), std::string::npos) << said;
+  EXPECT_NE(said.find("holds nothing to learn from"), std::string::npos) << said;
+  EXPECT_FALSE(fs::exists(run("older"))) << "a run was begun";
+}
+
+TEST_F(Arm2, AMisspeltCommandNamesTheNearest) {
+  EXPECT_NE(shell(run_command("misspelt", "lern")), 0);
+  EXPECT_NE(contents(folder_ / "misspelt.err").find("did you mean 'learn'?"), std::string::npos)
+      << contents(folder_ / "misspelt.err");
+}
+
+TEST_F(Arm2, ASecondGroupInTheSameFolderIsRefusedAndTheFirstGoesOn) {
+  ASSERT_EQ(shell(run_command("twice", "--rig arm2 --seed 3 --samples 5 --keep")), 0)
+      << contents(folder_ / "twice.err");
+  const fs::path folder = fs::canonical(run("twice"));
+  const std::size_t before = processes_of(folder).size();
+  EXPECT_GE(before, 9u);
+  EXPECT_NE(shell(run_command("twice", "--rig arm2 --seed 3 --samples 5")), 0);
+  EXPECT_NE(contents(folder_ / "twice.err").find("a group runs already, from " + folder.string()),
+            std::string::npos);
+  EXPECT_EQ(processes_of(folder).size(), before);
+  EXPECT_EQ(shell(run_command("twice", "stop")), 0);
+  EXPECT_EQ(processes_of(folder), std::vector<std::string>{});
+}
+
+TEST_F(Arm2, TheSocketOfAKilledGroupIsRemovedByTheNext) {
+  const char* temporary = std::getenv("TMPDIR");
+  const fs::path socket = fs::path(temporary ? temporary : "/tmp") / "bodyschema-deadTEST.sock";
+  fs::remove(socket);
+  const int dead = ::socket(AF_UNIX, SOCK_STREAM, 0);
+  sockaddr_un address{};
+  address.sun_family = AF_UNIX;
+  socket.string().copy(address.sun_path, sizeof address.sun_path - 1);
+  ASSERT_EQ(::bind(dead, reinterpret_cast<const sockaddr*>(&address), sizeof address), 0);
+  ASSERT_EQ(::listen(dead, 1), 0);
+  EXPECT_EQ(replay_group("beside", run("first") / "samples.lcmlog"), 0);
+  EXPECT_TRUE(fs::exists(socket)) << "somebody still listens";
+  ::close(dead);
+  EXPECT_EQ(replay_group("after", run("first") / "samples.lcmlog"), 0);
+  EXPECT_FALSE(fs::exists(socket));
 }
 
 }  // namespace

@@ -16,6 +16,7 @@
 #include "common/config/yaml.h"
 #include "common/scene/robot.h"
 #include "processes/camera/camera.h"
+#include "processes/controller/controller.h"
 #include "processes/marker_estimator/marker_estimator.h"
 #include "processes/model_monitor/model_monitor.h"
 #include "processes/motor_babbler/motor_babbler.h"
@@ -31,6 +32,7 @@ using std::filesystem::path;
 const std::map<std::string, std::function<void(const path&)>> kReaders = {
     {"camera.yaml", [](const path& file) { CameraConfig::load(file); }},
     {"camera_info.yaml", [](const path& file) { load_camera_calibration(file); }},
+    {"controller.yaml", [](const path& file) { ControllerConfig::load(file); }},
     {"marker_estimator.yaml", [](const path& file) { MarkerEstimatorConfig::load(file); }},
     {"markers.yaml", [](const path& file) { load_markers(file.parent_path()); }},
     {"model_monitor.yaml", [](const path& file) { ModelMonitorConfig::load(file); }},

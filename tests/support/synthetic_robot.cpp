@@ -29,7 +29,9 @@ TrueLink random_link(int part, int parent, Rng& rng) {
 }
 
 Signal symmetric_signal(int index, double limit) {
-  return {"q" + std::to_string(index + 1), -limit, limit};
+  std::string name = "q";  // g++ 12 warns falsely (-Wrestrict) of "q" + std::to_string(…)
+  name += std::to_string(index + 1);
+  return {name, -limit, limit};
 }
 
 void place_camera(SyntheticRobot* robot, Rng& rng) {
@@ -295,7 +297,7 @@ SyntheticRobot random_tree(const RandomTreeOptions& options, Rng& rng) {
     } else {
       link.signal = static_cast<int>(robot.signals.size());
       const double limit = uniform(rng, 0.8, 1.6);
-      robot.signals.push_back({"q" + std::to_string(link.signal + 1), -limit, limit});
+      robot.signals.push_back(symmetric_signal(link.signal, limit));
     }
     const double sign = uniform(rng, 0, 1) < 0.5 ? -1 : 1;
     const double gain = sign * uniform(rng, 0.5, 2);

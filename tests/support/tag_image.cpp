@@ -79,6 +79,7 @@ camera_image_t grey_message(const cv::Mat& image, std::int64_t utime, std::int64
   camera_image_t message{};
   message.utime = utime;
   message.image_seq = seq;
+  message.camera_name = pinhole_camera().camera_name;
   message.width = image.cols;
   message.height = image.rows;
   message.encoding = camera_image_t::ENCODING_GREY;

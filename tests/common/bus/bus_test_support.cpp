@@ -6,6 +6,7 @@
 #include <sys/wait.h>
 #include <unistd.h>
 
+#include <algorithm>
 #include <cstdlib>
 #include <fstream>
 #include <iterator>
@@ -85,11 +86,14 @@ bool Program::read_some(int timeout_ms) {
   return pipes_[0] >= 0 || pipes_[1] >= 0;
 }
 
-bool Program::wait_for_output(const std::string& text) {
+bool Program::wait_for_output(const std::string& text, int timeout_ms) {
+  const auto end = std::chrono::steady_clock::now() + std::chrono::milliseconds(timeout_ms);
   bool is_open = true;
-  return ask_until([&] { is_open = read_some(100); },
-                   [&] { return !is_open || out().find(text) != std::string::npos; }) &&
-         out().find(text) != std::string::npos;
+  while (is_open && out().find(text) == std::string::npos) {
+    if (std::chrono::steady_clock::now() > end) return false;
+    is_open = read_some(std::min(100, timeout_ms));
+  }
+  return out().find(text) != std::string::npos;
 }
 
 void Program::send_signal(int number) const { ::kill(pid_, number); }

@@ -54,8 +54,8 @@ class Program {
   Program(const Program&) = delete;
   Program& operator=(const Program&) = delete;
 
-  /// Waits until stdout holds `text`; false after ten seconds or at its end.
-  bool wait_for_output(const std::string& text);
+  /// Waits until stdout holds `text`; false after the timeout or at its end.
+  bool wait_for_output(const std::string& text, int timeout_ms = 10'000);
   void send_signal(int number) const;
   /// Waits for the end. Exit code, or 128 + signal; −1 after thirty seconds.
   int wait();

@@ -188,6 +188,63 @@ TEST(EventLog, ALogDamagedInTheMiddleIsNotCutOff) {
   EXPECT_EQ(read_bytes(folder / "log"), bytes);
 }
 
+TEST(EventLog, WhateverIsDamagedInTheMiddleTheOtherEventsCanBeRead) {
+  const TemporaryFolder folder;
+  write_samples(folder / "log", 4);
+  const std::vector<std::uint8_t> good = read_bytes(folder / "log");
+  const std::size_t size = good.size() / 4;
+  // Every byte of the second event's header, among them its lengths: too large for the file, they
+  // would make it look like a torn tail, and what follows would be cut off.
+  for (std::size_t at = size; at < size + 28 + 6; ++at) {
+    std::vector<std::uint8_t> bytes = good;
+    bytes[at] ^= 0xFF;
+    write_bytes(folder / "log", bytes);
+    LogReport report;
+    const auto samples = read_log(folder / "log", kSample, &report, OnDamage::kSkip);
+    ASSERT_GE(samples.size(), 3U) << "byte " << at - size;
+    EXPECT_EQ(samples.front().sample_index, 0);
+    EXPECT_EQ(samples[samples.size() - 2].sample_index, 2);
+    EXPECT_EQ(samples.back().sample_index, 3);
+    EXPECT_FALSE(report.truncated_at_byte);
+    if (samples.size() == 3 && at < size + 28) {
+      EXPECT_GT(report.damaged_bytes, 0);
+      EXPECT_LE(report.damaged_bytes, static_cast<std::int64_t>(size));
+      EXPECT_THROW(LogAppender(folder / "log"), std::runtime_error);
+      EXPECT_EQ(read_bytes(folder / "log"), bytes);
+    }
+  }
+}
+
+TEST(EventLog, AnEventThatIsNoMessageIsSkippedAndCounted) {
+  const TemporaryFolder folder;
+  {
+    LogAppender log(folder / "log");
+    log.append(kSample, sample(0));
+    log.append_bytes("SAMPLE", std::vector<std::uint8_t>(50, 7), 1);
+    log.append(kSample, sample(1));
+  }
+  LogReport report;
+  EXPECT_EQ(read_log(folder / "log", kSample, &report, OnDamage::kSkip).size(), 2U);
+  EXPECT_EQ(report.damaged_bytes, 50);
+}
+
+TEST(EventLog, AFileThatIsNoLogIsNoneHoweverMuchIsForgiven) {
+  const TemporaryFolder folder;
+  write_bytes(folder / "text", {'h', 'e', 'l', 'l', 'o', ',', ' ', 'w', 'o', 'r', 'l', 'd'});
+  EXPECT_THROW(read_log(folder / "text", kSample, nullptr, OnDamage::kSkip), std::runtime_error);
+}
+
+TEST(EventLog, AFileIsCopiedAsideUnderTheFirstFreeName) {
+  const TemporaryFolder folder;
+  write_bytes(folder / "log", {1});
+  EXPECT_EQ(copy_aside(folder / "log"), folder / "log.bad-1");
+  write_bytes(folder / "log", {2});
+  EXPECT_EQ(copy_aside(folder / "log"), folder / "log.bad-2");
+  EXPECT_EQ(read_bytes(folder / "log.bad-1"), (std::vector<std::uint8_t>{1}));
+  EXPECT_EQ(read_bytes(folder / "log.bad-2"), (std::vector<std::uint8_t>{2}));
+  EXPECT_THROW(copy_aside(folder / "none"), std::runtime_error);
+}
+
 TEST(EventLog, ALogHasOneWriter) {
   const TemporaryFolder folder;
   LogAppender log(folder / "log");

@@ -149,7 +149,7 @@ TEST(LogReader, ReadsOnWhereAnotherOneStopped) {
   write_every_channel(folder / "log");
   LogReader first(folder / "log");
   for (int i = 0; i < 4; ++i) ASSERT_TRUE(first.next());
-  LogReader second(folder / "log", first.position());
+  LogReader second(folder / "log", OnDamage::kThrow, first.position());
   EXPECT_EQ(second.position(), first.position());
   for (int i = 4; i < 15; ++i) {
     ASSERT_TRUE(first.next());

@@ -7,6 +7,7 @@
 #include <cstdlib>
 #include <fstream>
 #include <map>
+#include <sstream>
 #include <string>
 #include <vector>
 
@@ -98,6 +99,52 @@ TEST_F(ProcessTest, SigtermAndSigintEndTheLoopInOrderWithExitCodeZero) {
     EXPECT_GT(infos.back().pid, 0);
     EXPECT_LE(infos.front().start_utime, infos.front().utime);
   }
+}
+
+TEST_F(ProcessTest, TicksGoOnSteadilyWhenTheClockIsSet) {
+  const auto set_clock_by = [&](int seconds) {
+    std::ofstream(folder_ / "next") << seconds << "\n";
+    std::filesystem::rename(folder_ / "next", folder_ / "offset");
+  };
+  set_clock_by(0);
+  ::setenv("CLOCK_OFFSET_FILE", (folder_ / "offset").c_str(), 1);
+  ::setenv("ASAN_OPTIONS", "verify_asan_link_order=0", 1);  // where that is built in
+  ::setenv("LD_PRELOAD", SET_CLOCK, 1);
+  Program program(relay({"--ticks", "--in", "memq://", "--out", url("out", "?mode=w")}));
+  ::unsetenv("LD_PRELOAD");
+  ::unsetenv("ASAN_OPTIONS");
+  const auto ticks = [&] {
+    std::vector<std::int64_t> times;
+    std::istringstream lines(program.out());
+    for (std::string line; std::getline(lines, line);) {
+      if (line.rfind("tick ", 0) == 0) times.push_back(std::stoll(line.substr(5)));
+    }
+    return times;
+  };
+  const auto wait_for_ticks = [&](std::size_t more) {
+    const std::size_t enough = ticks().size() + more;
+    return ask_until([&] { program.wait_for_output("\x01", 20); },
+                     [&] { return ticks().size() >= enough; });
+  };
+  ASSERT_TRUE(wait_for_ticks(3));
+  for (const int seconds : {7200, -86400, 0}) {
+    set_clock_by(seconds);
+    ASSERT_TRUE(wait_for_ticks(12))
+        << "ticks stopped when the clock was set by " << seconds << " s";
+  }
+  program.send_signal(SIGTERM);
+  EXPECT_EQ(program.wait(), 0);
+  const auto times = ticks();
+  for (std::size_t i = 1; i < times.size(); ++i) {
+    EXPECT_GT(times[i], times[i - 1]);
+    EXPECT_LT(times[i], times[i - 1] + 2'000'000);
+  }
+  // PROCESS_INFO tells the wall clock's time, and never paused either.
+  const std::vector<process_info_t> infos = read_log(folder_ / "out", kProcessInfo);
+  ASSERT_GE(infos.size(), 4U);
+  const auto [least, most] = std::minmax_element(
+      infos.begin(), infos.end(), [](const auto& a, const auto& b) { return a.utime < b.utime; });
+  EXPECT_GT(most->utime - least->utime, std::int64_t{86400 + 7200 - 60} * 1'000'000);
 }
 
 TEST_F(ProcessTest, AHandlersExceptionIsOneLineAndExitCodeOne) {

@@ -12,14 +12,17 @@
 int main(int argc, char** argv) {
   using namespace bodyschema;
   bool fails = false;
+  bool tells_ticks = false;
+  bool only_answers = false;
   const auto body = [&](Process& process) {
     std::int64_t num_ticks = 0;
-    process.bus().subscribe(kMotionStatus, [&](const motion_status_t& status) {
-      if (fails) throw std::runtime_error("the handler\nfailed");
-      process.set_activity(process_info_t::PHASE_WORKING, "relays");
-      process.count("relayed");
-      process.bus().publish(kMotionStatus, status);
-    });
+    if (!only_answers)
+      process.bus().subscribe(kMotionStatus, [&](const motion_status_t& status) {
+        if (fails) throw std::runtime_error("the handler\nfailed");
+        process.set_activity(process_info_t::PHASE_WORKING, "relays");
+        process.count("relayed");
+        process.bus().publish(kMotionStatus, status);
+      });
     process.bus().subscribe(kSample, [&](const sample_t& sample) {
       motion_status_t status{};
       status.utime = sample.utime;
@@ -27,7 +30,11 @@ int main(int argc, char** argv) {
       status.action_id = sample.action_id;
       process.bus().publish(kMotionStatus, status);
     });
-    process.on_tick([&](std::int64_t) {
+    process.on_tick([&](std::int64_t now_us) {
+      if (tells_ticks) {
+        std::printf("tick %lld\n", static_cast<long long>(now_us));
+        std::fflush(stdout);
+      }
       if (++num_ticks > 1) return;
       std::puts("ready");
       std::fflush(stdout);
@@ -37,6 +44,9 @@ int main(int argc, char** argv) {
     process.run();
     std::puts("ended");
   };
-  return run_process("relay", argc, argv, body,
-                     [&](CLI::App& app) { app.add_flag("--fail", fails, "throw in a handler"); });
+  return run_process("relay", argc, argv, body, [&](CLI::App& app) {
+    app.add_flag("--fail", fails, "throw in a handler");
+    app.add_flag("--only-answer", only_answers, "pass no MOTION_STATUS on");
+    app.add_flag("--ticks", tells_ticks, "print the time of every tick");
+  });
 }

@@ -48,7 +48,18 @@ class SampleIntakeTest : public testing::Test {
     for (const std::int64_t index : indices) intake_->on_sample(sample(index));
   }
 
+  SampleIntake& start_asking() {
+    intake_.emplace(
+        file_.string(), [this](const sample_t& message) { heard_.push_back(message.sample_index); },
+        [this](const sample_request_t& request) {
+          asked_.emplace_back(request.first_missing, request.last_missing);
+        });
+    return *intake_;
+  }
+
   using Indices = std::vector<std::int64_t>;
+  using Requests = std::vector<std::pair<std::int64_t, std::int64_t>>;
+  Requests asked_;
   std::filesystem::path file_;
   std::optional<SampleIntake> intake_;
   Indices heard_;
@@ -123,29 +134,110 @@ TEST_F(SampleIntakeTest, AHoleInTheLogCostsOnlyWhatIsMissing) {
   EXPECT_EQ(intake_->num_lost(), 4);
 }
 
-TEST_F(SampleIntakeTest, TheLastSampleOfARunIsFoundInTheLogWhenNoMoreComes) {
-  constexpr std::int64_t kSecond = 1'000'000;
-  start();
-  intake_->on_tick(10 * kSecond);  // there is no log yet
-  intake_->on_tick(20 * kSecond);
-  record({0, 1});
-  hear({0});
-  intake_->on_tick(30 * kSecond);
-  intake_->on_tick(32 * kSecond - 1);
-  EXPECT_EQ(heard_, (Indices{0}));
-  intake_->on_tick(32 * kSecond);
-  EXPECT_EQ(heard_, (Indices{0, 1}));
-  record({2});
-  hear({1});  // the bus is alive: no need to look
-  intake_->on_tick(40 * kSecond);
-  intake_->on_tick(41 * kSecond);
-  EXPECT_EQ(heard_, (Indices{0, 1}));
-  intake_->on_tick(42 * kSecond);
-  EXPECT_EQ(heard_, (Indices{0, 1, 2}));
+constexpr std::int64_t kSecond = 1'000'000;
 
-  start(false);
-  intake_->on_tick(50 * kSecond);
-  EXPECT_NO_THROW(intake_->on_tick(60 * kSecond));
+TEST_F(SampleIntakeTest, BehindAGapItWaitsAndAsksTwiceASecond) {
+  start_asking();
+  hear({0, 1, 4, 7});
+  EXPECT_EQ(heard_, (Indices{0, 1}));
+  for (std::int64_t t = 10 * kSecond; t < 12 * kSecond; t += kSecond / 10) intake_->on_tick(t);
+  EXPECT_EQ(asked_, (Requests{{2, 3}, {2, 3}, {2, 3}, {2, 3}}));
+  EXPECT_NE(intake_->activity().find("SAMPLE 2 to 3"), std::string::npos);
+  hear({2, 3});
+  EXPECT_EQ(heard_, (Indices{0, 1, 2, 3, 4}));
+  asked_.clear();
+  intake_->on_tick(13 * kSecond);
+  EXPECT_EQ(asked_, (Requests{{5, 6}}));
+  hear({6, 5});
+  EXPECT_EQ(heard_, (Indices{0, 1, 2, 3, 4, 5, 6, 7}));
+  asked_.clear();
+  intake_->on_tick(20 * kSecond);
+  EXPECT_TRUE(asked_.empty());
+  EXPECT_EQ(intake_->activity(), "");
+  EXPECT_EQ(intake_->num_lost(), 0);
+}
+
+TEST_F(SampleIntakeTest, AGapIsGivenUpOnlyWhenTheObserverIsThereAndDoesNotFillIt) {
+  start_asking();
+  hear({0, 3});
+  std::int64_t t = 0;
+  // An observer that is silent may come back with what is missing.
+  for (; t < 600 * kSecond; t += kSecond / 2) intake_->on_tick(t);
+  EXPECT_EQ(heard_, (Indices{0}));
+  for (int n = 0; heard_.size() == 1; ++n, t += kSecond / 2) {
+    ASSERT_LT(n, 60) << "it never gives up";
+    if (n % 2 == 0) hear({3});  // the newest, at 1 Hz
+    intake_->on_tick(t);
+    if (n < 18) {
+      ASSERT_EQ(heard_, (Indices{0})) << "given up after " << n / 2 << " s";
+    }
+  }
+  EXPECT_EQ(heard_, (Indices{0, 3}));
+  EXPECT_EQ(intake_->num_lost(), 2);
+  EXPECT_EQ(intake_->counters().at("lost SAMPLE"), 2);
+  hear({4});
+  EXPECT_EQ(heard_, (Indices{0, 3, 4}));
+}
+
+TEST_F(SampleIntakeTest, WhoJoinsLateWithoutALogGetsAllSamplesInOrder) {
+  start_asking();
+  hear({120});
+  std::int64_t t = 0;
+  while (heard_.size() < 121 && t < 600 * kSecond) {
+    asked_.clear();
+    intake_->on_tick(t += kSecond / 2);
+    if (asked_.empty()) continue;
+    // The observer answers with 50 at most, and every third datagram is lost.
+    for (std::int64_t i = asked_[0].first; i <= asked_[0].second && i < asked_[0].first + 50; ++i) {
+      if ((i + t / kSecond) % 3 != 0) hear({i});
+    }
+    hear({120});
+  }
+  Indices all(121);
+  std::iota(all.begin(), all.end(), 0);
+  EXPECT_EQ(heard_, all);
+  EXPECT_EQ(intake_->num_lost(), 0);
+}
+
+TEST_F(SampleIntakeTest, ASampleFromNowhereDoesNotEndTheRun) {
+  start_asking();
+  hear({0, 1});
+  std::int64_t t = 0;
+  for (int n = 0; n < 100; ++n) {
+    hear({1'000'000});
+    if (n % 2 == 0) hear({1});  // the observer says what its newest is
+    intake_->on_tick(t += kSecond / 2);
+  }
+  hear({2, 3});
+  EXPECT_EQ(heard_, (Indices{0, 1, 2, 3}));
+  EXPECT_GT(intake_->counters().at("conflicting SAMPLE"), 0);
+}
+
+TEST_F(SampleIntakeTest, TheFirstContentOfAnIndexCounts) {
+  start_asking();
+  hear({0, 1});
+  sample_t other = sample(1);
+  other.epoch = 77;
+  intake_->on_sample(other);
+  EXPECT_EQ(heard_, (Indices{0, 1}));
+  EXPECT_EQ(intake_->counters().at("conflicting SAMPLE"), 1);
+  EXPECT_NE(intake_->activity().find("begun anew"), std::string::npos);
+  hear({1, 0});  // repeats are no conflict
+  EXPECT_EQ(intake_->counters().at("conflicting SAMPLE"), 1);
+}
+
+TEST_F(SampleIntakeTest, OfADamagedLogWhatCanBeReadIsUsedAndTheRestAskedFor) {
+  record({0, 1, 2, 3});
+  const auto size = std::filesystem::file_size(file_) / 4;
+  std::fstream(file_, std::ios::in | std::ios::out | std::ios::binary)
+      .seekp(static_cast<std::streamoff>(size + 1))
+      .write("damage", 6);
+  start_asking();
+  EXPECT_EQ(heard_, (Indices{0}));
+  intake_->on_tick(kSecond);
+  EXPECT_EQ(asked_, (Requests{{1, 1}}));
+  hear({1});
+  EXPECT_EQ(heard_, (Indices{0, 1, 2, 3}));
 }
 
 TEST_F(SampleIntakeTest, ASampleIsHandedOnOnce) {

@@ -46,9 +46,9 @@ class RigTest : public testing::Test {
     write("signals.yaml", text);
     return load_signals(folder_);
   }
-  Network network(const std::string& text) const {
+  Network network(const std::string& text, const std::vector<std::string>& group = {}) const {
     write("network.yaml", text);
-    return load_network(folder_);
+    return load_network(folder_, group);
   }
 
   std::filesystem::path folder_;
@@ -163,6 +163,64 @@ TEST_F(RigTest, TheNetworkGivesTwoUrlsWithPortsNextToEachOther) {
             "network.yaml:2: port: 65535 is outside 1024 … 65534");
   EXPECT_EQ(error_of([&] { network("network: wifi\nport: 7667\nttl: 0\n"); }),
             "network.yaml:1: network: 'wifi' is none of: private, host");
+}
+
+const std::string kSeveralHosts = "network: host\nport: 7700\nttl: 1\n";
+
+TEST_F(RigTest, HostsHaveTheirSharesOfTheGroup) {
+  EXPECT_TRUE(network("network: host\nport: 7700\nttl: 0\n", {"camera"}).hosts.empty());
+  const Network read = network(
+      kSeveralHosts +
+          "hosts:\n  eye: [camera, marker_estimator, log_images]\n  desk: [observer, log]\n",
+      {"camera", "log", "log_images", "marker_estimator", "observer"});
+  EXPECT_EQ(read.share_of("eye"),
+            (std::vector<std::string>{"camera", "marker_estimator", "log_images"}));
+  EXPECT_EQ(read.share_of("desk"), (std::vector<std::string>{"observer", "log"}));
+  try {
+    read.share_of("dsk");
+    ADD_FAILURE() << "a host that there is not";
+  } catch (const std::invalid_argument& error) {
+    EXPECT_STREQ(error.what(), "--host: network.yaml has no host 'dsk'; there are: desk, eye");
+  }
+}
+
+TEST_F(RigTest, EveryProcessRunsOnExactlyOneHost) {
+  const auto error = [&](const std::string& hosts) {
+    return error_of([&] { network(kSeveralHosts + hosts, {"observer", "log"}); });
+  };
+  EXPECT_EQ(error("hosts:\n  a: [observer]\n  b: [log, observer]\n"),
+            "network.yaml:6: hosts.b: 'observer' runs on 'a' already");
+  EXPECT_EQ(error("hosts:\n  a: [log, log, observer]\n"),
+            "network.yaml:5: hosts.a: 'log' runs on 'a' already");
+  EXPECT_EQ(error("hosts:\n  a: [log]\n  b: []\n"),
+            "network.yaml:4: hosts: 'observer' runs on no host");
+  EXPECT_EQ(
+      error("hosts:\n  a: [log, observer]\n  b: [oberver]\n"),
+      "network.yaml:6: hosts.b: 'oberver' is no process of this rig; there are: observer, log");
+  EXPECT_EQ(error("hosts:\n  all: [log, observer]\n"),
+            "network.yaml:5: hosts.all: no host may be called that");
+  EXPECT_EQ(error("hosts: [a, b]\n"), "network.yaml:4: hosts: expected a mapping 'key: value'");
+  EXPECT_EQ(error("hosts:\n  a: observer\n"), "network.yaml:5: hosts.a: expected a list of texts");
+}
+
+TEST_F(RigTest, ImagesStayOnTheHostThatSeesThem) {
+  EXPECT_EQ(error_of([&] {
+              network(kSeveralHosts + "hosts:\n  a: [camera]\n  b: [marker_estimator]\n");
+            }),
+            "network.yaml:6: hosts.b: 'marker_estimator' must run where the camera does, on 'a': "
+            "images do not survive a network");
+  EXPECT_EQ(
+      error_of([&] { network(kSeveralHosts + "hosts:\n  a: [log_images]\n  b: [camera]\n"); }),
+      "network.yaml:5: hosts.a: 'log_images' must run where the camera does, on 'b': "
+      "images do not survive a network");
+}
+
+TEST_F(RigTest, SeveralHostsNeedANetworkBetweenThem) {
+  const std::string hosts = "hosts: {a: [observer], b: [log]}\n";
+  EXPECT_EQ(error_of([&] { network("network: host\nport: 7700\nttl: 0\n" + hosts); }),
+            "network.yaml:3: ttl: must be 1 or more to reach another host");
+  EXPECT_EQ(error_of([&] { network("network: private\nport: 7700\nttl: 1\n" + hosts); }),
+            "network.yaml:1: network: several hosts share a network: expected 'host'");
 }
 
 TEST_F(RigTest, AMissingFileIsNamed) {

@@ -1,6 +1,10 @@
 #include "processes/camera/capture.h"
 
+#include <arpa/inet.h>
 #include <gtest/gtest.h>
+#include <netinet/in.h>
+#include <sys/socket.h>
+#include <unistd.h>
 
 #include <atomic>
 #include <chrono>
@@ -8,7 +12,10 @@
 #include <fstream>
 #include <mutex>
 #include <opencv2/imgcodecs.hpp>
+#include <optional>
 #include <stdexcept>
+#include <string>
+#include <thread>
 #include <vector>
 
 namespace bodyschema {
@@ -56,16 +63,117 @@ TEST(Capture, ReadsAnImageSequenceInOrderToItsEnd) {
 
 TEST(Capture, HandsOnWhatTheFramesReceiverThrew) {
   Capture capture({sequence_of(3), 64, 48, 200}, [](const cv::Mat&, std::int64_t) {
-    throw std::invalid_argument("the frame has the wrong size");
+    throw std::runtime_error("the network is gone");
   });
   EXPECT_TRUE(eventually([&] {
     try {
       capture.check();
       return false;
-    } catch (const std::invalid_argument&) {
+    } catch (const std::runtime_error&) {
       return true;
     }
   }));
+}
+
+TEST(Capture, AFrameThatIsRefusedDoesNotEndIt) {
+  int num = 0;
+  Capture capture({sequence_of(5), 64, 48, 200}, [&](const cv::Mat&, std::int64_t) {
+    if (++num % 2 == 1) throw std::invalid_argument("the frame has the wrong size");
+  });
+  ASSERT_TRUE(eventually([&] { return capture.state().phase == Capture::Phase::kEnded; }));
+  EXPECT_EQ(capture.state().num_refused, 3);
+  EXPECT_EQ(capture.state().num_frames, 2);
+  EXPECT_NO_THROW(capture.check());
+}
+
+/// An IP camera: an MJPEG stream over HTTP that can be unplugged. Grey level 10 n in the n-th
+/// frame.
+class IpCamera {
+ public:
+  IpCamera() { plug_in(0); }
+  ~IpCamera() { unplug(); }
+
+  std::string url() const { return "http://127.0.0.1:" + std::to_string(port_) + "/video.mjpg"; }
+  /// The connection is cut and nobody answers any more.
+  void unplug() {
+    is_plugged_ = false;
+    ::shutdown(listener_, SHUT_RDWR);
+    server_.join();
+    ::close(listener_);
+  }
+  /// On the port that it had; 0: a free one.
+  void plug_in(int port) {
+    listener_ = ::socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0);
+    const int yes = 1;
+    ::setsockopt(listener_, SOL_SOCKET, SO_REUSEADDR, &yes, sizeof yes);
+    sockaddr_in address{};
+    address.sin_family = AF_INET;
+    address.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
+    address.sin_port = htons(static_cast<std::uint16_t>(port));
+    socklen_t size = sizeof address;
+    if (::bind(listener_, reinterpret_cast<sockaddr*>(&address), size) != 0 ||
+        ::listen(listener_, 4) != 0 ||
+        ::getsockname(listener_, reinterpret_cast<sockaddr*>(&address), &size) != 0) {
+      throw std::runtime_error("no port for the camera");
+    }
+    port_ = ntohs(address.sin_port);
+    is_plugged_ = true;
+    server_ = std::thread([this] { serve(); });
+  }
+  int port() const { return port_; }
+
+ private:
+  void serve() {
+    while (is_plugged_) {
+      const int client = ::accept4(listener_, nullptr, nullptr, SOCK_CLOEXEC);
+      if (client < 0) return;
+      const auto send = [&](const std::string& text) {
+        return ::send(client, text.data(), text.size(), MSG_NOSIGNAL) ==
+               static_cast<ssize_t>(text.size());
+      };
+      bool is_connected = send(
+          "HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace; boundary=frame\r\n\r\n");
+      for (int n = 0; is_connected && is_plugged_; ++n) {
+        std::vector<unsigned char> jpeg;
+        cv::imencode(".jpg", cv::Mat(48, 64, CV_8UC1, cv::Scalar(10 * (n % 20))), jpeg);
+        is_connected = send("--frame\r\nContent-Type: image/jpeg\r\nContent-Length: " +
+                            std::to_string(jpeg.size()) + "\r\n\r\n" +
+                            std::string(jpeg.begin(), jpeg.end()) + "\r\n");
+        std::this_thread::sleep_for(std::chrono::milliseconds(10));  // 100 Hz
+      }
+      ::close(client);
+    }
+  }
+
+  int listener_ = -1;
+  int port_ = 0;
+  std::atomic<bool> is_plugged_ = false;
+  std::thread server_;
+};
+
+TEST(Capture, ACameraThatIsUnpluggedIsLostAndComesBack) {
+  IpCamera camera;
+  std::optional<Capture> capture;
+  try {
+    capture.emplace(CaptureConfig{camera.url(), 64, 48, 100},
+                    [](const cv::Mat& frame, std::int64_t) { ASSERT_EQ(frame.cols, 64); });
+  } catch (const std::runtime_error& problem) {
+    GTEST_SKIP() << "this OpenCV reads no stream: " << problem.what();
+  }
+  ASSERT_TRUE(eventually([&] { return capture->state().num_frames > 5; }));
+  EXPECT_EQ(capture->state().phase, Capture::Phase::kRunning);
+  for (int round = 1; round <= 2; ++round) {
+    camera.unplug();
+    ASSERT_TRUE(eventually([&] { return capture->state().phase == Capture::Phase::kLost; }));
+    EXPECT_NE(capture->state().text.find("lost: tries again"), std::string::npos);
+    EXPECT_EQ(capture->state().num_losses, round);
+    const auto num_frames = capture->state().num_frames;
+    camera.plug_in(camera.port());
+    ASSERT_TRUE(eventually([&] { return capture->state().num_frames > num_frames + 5; }))
+        << capture->state().text;
+    EXPECT_EQ(capture->state().phase, Capture::Phase::kRunning);
+    EXPECT_NO_THROW(capture->check());
+  }
 }
 
 TEST(Capture, EndsAtOnceWhileItWaitsForTheNextFrame) {

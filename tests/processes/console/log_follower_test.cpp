@@ -22,7 +22,7 @@ struct Shown {
                                    std::int64_t byte) {
       EXPECT_EQ(from, file);
       // The event can be found again.
-      LogReader reader(file, byte);
+      LogReader reader(file, OnDamage::kThrow, byte);
       EXPECT_TRUE(reader.next());
       EXPECT_EQ(reader.event().data, event.data);
       channels.push_back(event.channel);

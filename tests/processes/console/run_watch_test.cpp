@@ -91,6 +91,33 @@ TEST(RunWatchTest, ARunWithoutSamplesOrVerdictIsNotFinished) {
   EXPECT_FALSE(watch.is_finished());
 }
 
+TEST(RunWatchTest, AReplayHasCaughtUpWhenItsSamplesAreLearnedAndJudged) {
+  RunWatch watch;
+  body_schema_t learned{};
+  learned.last_sample_index = 0;
+  watch.on_learned_schema(learned);
+  EXPECT_FALSE(watch.is_caught_up());  // nothing was replayed yet
+  watch.on_sample(sample(0, {1}));
+  EXPECT_TRUE(watch.is_caught_up());
+  watch.on_sample(sample(1, {1}, Purpose::kTest));
+  learned.last_sample_index = 1;
+  watch.on_learned_schema(learned);
+  EXPECT_FALSE(watch.is_caught_up());
+  watch.on_model_health(health(1));
+  EXPECT_TRUE(watch.is_caught_up());
+  watch.on_sample(sample(2, {1}));
+  EXPECT_FALSE(watch.is_caught_up());
+}
+
+TEST(RunWatchTest, SilentIsWhoWasNotHeardForThreeSeconds) {
+  RunWatch watch;
+  watch.on_process_info(info("camera", process_info_t::PHASE_WORKING), 1'000'000);
+  watch.on_process_info(info("observer", process_info_t::PHASE_WORKING), 3'000'000);
+  const std::set<std::string> all = {"camera", "log", "observer"};
+  EXPECT_EQ(watch.silent(all, 3'000'000), (std::set<std::string>{"log"}));
+  EXPECT_EQ(watch.silent(all, 5'000'000), (std::set<std::string>{"camera", "log"}));
+}
+
 TEST(RunWatchTest, ABabblerThatWasEndedIsNotDone) {
   RunWatch watch;
   watch.on_sample(sample(0, {1}, Purpose::kTest));

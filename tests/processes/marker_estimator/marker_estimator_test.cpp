@@ -280,6 +280,49 @@ TEST(MarkerEstimator, GivesTheSameBytesForTheSameImage) {
   EXPECT_EQ(bytes(), bytes());
 }
 
+TEST(MarkerEstimator, ARepeatedImageIsAnsweredWithoutBeingLookedAt) {
+  Estimator estimator;
+  std::vector<camera_image_t> images;
+  for (int n = 0; n < 3; ++n) {
+    const Plate plate{3, 0.08, marker_pose(0.8, 0.1 * n, 0, 0)};
+    images.push_back(grey_message(render_plates({plate}, pinhole_camera()), 100 * n, n));
+  }
+  std::vector<marker_poses_t> first;
+  for (const auto& image : images) first.push_back(estimator.on_camera_image(image).value());
+  EXPECT_EQ(estimator.counted("image repeated"), 0);
+  camera_info_t later = pinhole_camera();
+  later.utime = 77;  // the calibration is repeated too
+  estimator.on_camera_info(later);
+  for (int n = 2; n >= 0; --n) {
+    const auto again = estimator.on_camera_image(images[n]).value();
+    EXPECT_EQ(again.utime, first[n].utime);
+    EXPECT_EQ(again.image_seq, n);
+    ASSERT_EQ(again.num_markers, 1);
+    EXPECT_EQ(again.markers[0].X_CM[0].position_m[2], first[n].markers[0].X_CM[0].position_m[2]);
+  }
+  EXPECT_EQ(estimator.counted("image repeated"), 3);
+  // Another image under the same number is not the same image.
+  camera_image_t dark = images[1];
+  std::fill(dark.data.begin(), dark.data.end(), std::uint8_t{20});
+  EXPECT_EQ(estimator.on_camera_image(dark).value().num_markers, 0);
+  // Under another calibration the same pixels are another pose.
+  camera_info_t longer = pinhole_camera();
+  longer.fx *= 2;
+  longer.fy *= 2;
+  estimator.on_camera_info(longer);
+  const auto far = estimator.on_camera_image(images[1]).value();
+  ASSERT_EQ(far.num_markers, 1);
+  EXPECT_GT(far.markers[0].X_CM[0].position_m[2], 1.8 * first[1].markers[0].X_CM[0].position_m[2]);
+}
+
+TEST(MarkerEstimator, RefusesAnotherCamerasImages) {
+  Estimator estimator;
+  camera_image_t image = grey_message(cv::Mat(960, 1280, CV_8UC1, cv::Scalar(128)));
+  image.camera_name = "webcam";
+  EXPECT_FALSE(estimator.on_camera_image(image));
+  EXPECT_EQ(estimator.counted("image of another camera"), 1);
+}
+
 TEST(MarkerEstimator, FindsTheCornersInAJpegAsWellAsInTheRawImage) {
   Estimator estimator;
   const Plate plate{3, 0.08, marker_pose(0.9, 0.6, 1, 1)};

@@ -351,13 +351,28 @@ TEST_F(ModelMonitorTest, AProposalAheadOfTheSamplesWaitsForThem) {
   EXPECT_EQ(judgement_of(monitor), judgement_of(in_order));
 }
 
-TEST_F(ModelMonitorTest, TheNewestOfSeveralWaitingProposalsCounts) {
+TEST_F(ModelMonitorTest, WaitingProposalsAreJudgedInOrderHoweverTheyCame) {
   ModelMonitor monitor = monitor_at(30);
   EXPECT_FALSE(monitor.on_learned_schema(proposal(44)));
-  EXPECT_FALSE(monitor.on_learned_schema(proposal(39)));  // overtaken
-  for (std::int64_t i = 31; i <= 44; ++i) monitor.on_sample(sample(i));
+  EXPECT_FALSE(monitor.on_learned_schema(proposal(39)));
+  for (std::int64_t i = 31; i <= 39; ++i) monitor.on_sample(sample(i));
   ASSERT_TRUE(monitor.schema());
+  EXPECT_EQ(monitor.schema()->schema_version, 40);
+  for (std::int64_t i = 40; i <= 44; ++i) monitor.on_sample(sample(i));
   EXPECT_EQ(monitor.schema()->schema_version, 45);
+}
+
+TEST_F(ModelMonitorTest, ProposalsFromNowhereDoNotDisplaceTheNextOne) {
+  ModelMonitor monitor = monitor_at(30);
+  body_schema_t nowhere = proposal(44);
+  for (std::int64_t n = 0; n < 100; ++n) {
+    nowhere.last_sample_index = 1'000'000 + n;
+    EXPECT_FALSE(monitor.on_learned_schema(nowhere));
+  }
+  EXPECT_FALSE(monitor.on_learned_schema(proposal(34)));
+  for (std::int64_t i = 31; i <= 34; ++i) monitor.on_sample(sample(i));
+  ASSERT_TRUE(monitor.schema());
+  EXPECT_EQ(monitor.schema()->schema_version, 35);
 }
 
 TEST_F(ModelMonitorTest, AProposalIsJudgedOnce) {
@@ -488,6 +503,57 @@ TEST_F(ModelMonitorTest, AfterAReloadTheScheduleGoesOnAsIfNothingHadHappened) {
   restarted.on_learned_schema(proposal(44));
   EXPECT_EQ(bytes_of(restarted), bytes_of(undisturbed));
   EXPECT_EQ(judgement_of(restarted), judgement_of(undisturbed));
+}
+
+TEST_F(ModelMonitorTest, EventsGoOnAfterAReloadAndNoneIsLost) {
+  ModelMonitor before = monitor_at(39);
+  before.on_learned_schema(proposal(34));
+  before.on_learned_schema(proposal(39));
+  ASSERT_EQ(before.health().num_events, 2);
+
+  ModelMonitor monitor = monitor_at(39);
+  monitor.reload(before.schema(), before.health());
+  EXPECT_EQ(bytes_of(monitor), bytes_of(before));
+  EXPECT_EQ(judgement_of(monitor), judgement_of(before));
+  ASSERT_EQ(monitor.health().num_events, 3);
+  for (std::size_t i = 0; i < 3; ++i) {
+    EXPECT_EQ(monitor.health().events[i].event_number, static_cast<std::int64_t>(i));
+  }
+  EXPECT_EQ(monitor.health().events[1].event_text, before.health().events[1].event_text);
+  EXPECT_EQ(monitor.health().events[2].event_kind, health_event_t::EVENT_RELOADED);
+  EXPECT_EQ(check(monitor.health()), "");
+}
+
+TEST_F(ModelMonitorTest, ARefusalIsNotMadeAgainAfterAReload) {
+  ModelMonitor before = monitor_at(44);
+  before.on_learned_schema(proposal(39));
+  BodySchema incomplete = learned(44);
+  incomplete.edges.pop_back();
+  incomplete.complete = false;
+  ASSERT_TRUE(before.on_learned_schema(to_message(incomplete)));
+  ASSERT_EQ(before.health().judged_sample, 44);
+
+  ModelMonitor monitor = monitor_at(44);
+  monitor.reload(before.schema(), before.health());
+  EXPECT_EQ(monitor.health().judged_sample, 44);
+  EXPECT_FALSE(monitor.on_learned_schema(to_message(incomplete)));
+}
+
+TEST_F(ModelMonitorTest, ASchemaThatAKillKeptFromBeingSavedIsJudgedAgain) {
+  ModelMonitor before = monitor_at(44);
+  before.on_learned_schema(proposal(39));
+  const auto saved_schema = before.schema();
+  before.on_learned_schema(proposal(44));
+  const auto saved_health = before.health();  // the kill comes here
+
+  for (const auto& schema : {saved_schema, std::optional<body_schema_t>()}) {
+    ModelMonitor monitor = monitor_at(44);
+    monitor.reload(schema, saved_health);
+    EXPECT_TRUE(monitor.on_learned_schema(proposal(44)));
+    EXPECT_EQ(bytes_of(monitor), bytes_of(before));
+    EXPECT_EQ(judgement_of(monitor), judgement_of(before));
+    EXPECT_GT(monitor.health().events.back().event_number, saved_health.events.back().event_number);
+  }
 }
 
 // Parts 1 (root, 2 m before the camera) and 2 (0.1 m beside it), no joint.

@@ -2,11 +2,16 @@
 
 #include <gtest/gtest.h>
 
+#include <unistd.h>
+
+#include <fstream>
+#include <memory>
 #include <random>
 #include <set>
 
 #include "common/bus/check.h"
 #include "common/bus/convert.h"
+#include "common/config/yaml.h"
 
 namespace bodyschema {
 namespace {
@@ -612,6 +617,255 @@ TEST(MotorBabblerTest, ARestartKeepsEveryFifthSampleTest) {
   const auto command = after.on_motion_status(answer(before.last, motion_status_t::STATE_SETTLED));
   ASSERT_TRUE(command);
   EXPECT_EQ(command->purpose, action_command_t::PURPOSE_TEST);
+}
+
+control_status_t control(bool owns_arm) {
+  control_status_t status{};
+  status.control_state = owns_arm ? control_status_t::CONTROL_MOVING : control_status_t::CONTROL_IDLE;
+  status.owns_arm = owns_arm;
+  return status;
+}
+
+TEST(MotorBabblerTest, WhileTheControllerOwnsTheArmItSendsNothing) {
+  for (const int stage : {0, 1, 2, 3}) {
+    Bench bench;
+    if (stage > 0) {
+      bench.start();
+      bench.run(4);
+    }
+    const auto settled = [&] { return answer(bench.last, motion_status_t::STATE_SETTLED); };
+    if (stage == 2) bench.babbler.on_motion_status(settled());
+    if (stage == 3) bench.make_sample();  // a TEST: waits for the verdict
+    EXPECT_FALSE(bench.babbler.on_control_status(control(true)));
+    for (std::int64_t i = 0; i < 60; ++i) {
+      EXPECT_FALSE(bench.babbler.on_tick((100 + i) * kSecond)) << stage;
+      EXPECT_FALSE(bench.babbler.on_motion_status(stage == 0 ? idle_at_rest(kSecond) : settled()));
+      EXPECT_FALSE(bench.babbler.on_model_health(bad_health(stage == 0 ? -1 : i)));
+    }
+    EXPECT_NE(bench.babbler.activity().find("controller has the arm"), std::string::npos);
+    EXPECT_NE(bench.babbler.activity().find("silent"), std::string::npos);
+    EXPECT_FALSE(bench.babbler.on_control_status(control(true)));
+    EXPECT_EQ(bench.babbler.activity().find("silent"), std::string::npos);
+    // Given back, it goes on: what was not finished is replaced.
+    const auto next = bench.babbler.on_control_status(control(false));
+    ASSERT_TRUE(next) << stage;
+    EXPECT_EQ(next->action_id, stage == 0 ? 0 : 5);
+    EXPECT_EQ(next->purpose == action_command_t::PURPOSE_TEST, stage == 1 || stage == 2);
+  }
+}
+
+TEST(MotorBabblerTest, ASampleThatComesWhileTheArmIsLentIsCounted) {
+  Bench bench;
+  bench.start();
+  bench.run(2);
+  bench.babbler.on_motion_status(answer(bench.last, motion_status_t::STATE_SETTLED));
+  bench.babbler.on_control_status(control(true));
+  EXPECT_FALSE(bench.babbler.on_sample(sample_of(bench.last, 2)));
+  EXPECT_EQ(bench.babbler.num_samples(), 3);
+  motion_status_t moving = answer(bench.last, motion_status_t::STATE_MOVING, false);
+  moving.source = "controller";
+  EXPECT_FALSE(bench.babbler.on_motion_status(moving));
+  EXPECT_FALSE(bench.babbler.on_control_status(control(false)));  // not yet at rest
+  moving.rest_since_utime = moving.utime;
+  EXPECT_TRUE(bench.babbler.on_motion_status(moving));
+  EXPECT_EQ(bench.babbler.num_unseen(), 0);
+}
+
+TEST(MotorBabblerTest, EveryFifthOfItsOwnSamplesIsTestWhateverOthersDoInBetween) {
+  Bench bench;
+  bench.start();
+  std::int64_t own = 0;
+  for (int i = 0; i < 20; ++i) {
+    EXPECT_EQ(bench.is_test(), own % 5 == 4);
+    if (i % 3 == 0) {
+      action_command_t foreign = bench.last;
+      foreign.source = "controller";
+      bench.babbler.on_sample(sample_of(foreign, bench.num_samples++));
+    }
+    bench.run(1);
+    EXPECT_EQ(bench.babbler.num_samples(), ++own);
+  }
+}
+
+/// Driver, observer and monitor that outlive the babbler. Each answers and repeats as in a group.
+class World {
+ public:
+  explicit World(double kill_share, std::uint64_t seed) : kill_share_(kill_share), rng_(seed) {}
+  ~World() { std::filesystem::remove(file_); }
+
+  /// Until the babbler is done; every message may be the last that this babbler hears or sends.
+  void run() {
+    start();
+    for (int i = 0; i < 20'000 && !babbler_->is_done(); ++i) {
+      now_ += kSecond / 10;
+      tell(babbler_->on_tick(now_));
+      if (i % 10) continue;
+      tell(babbler_->on_motion_status(status_));
+      if (!samples.empty()) tell(babbler_->on_sample(samples.back()));
+      tell(babbler_->on_model_health(bad_health(samples.empty() ? -1 : newest_index())));
+    }
+  }
+
+  std::vector<action_command_t> served;
+  std::vector<sample_t> samples;
+  int num_kills = 0;
+
+ private:
+  void start() {
+    babbler_ = std::make_unique<MotorBabbler>(test_config(), 1);
+    if (kept_.empty()) return;
+    std::ofstream(file_) << kept_;
+    babbler_->restore(file_);
+  }
+  std::int64_t newest_index() const { return samples.back().sample_index; }
+  bool is_killed() {
+    if (std::uniform_real_distribution<double>(0, 1)(rng_) >= kill_share_) return false;
+    ++num_kills;
+    start();
+    return true;
+  }
+  /// As main.cpp does: saved, then sent.
+  void tell(const std::optional<action_command_t>& command) {
+    if (is_killed()) return;
+    kept_ = babbler_->state_text();
+    if (is_killed() || !command) return;
+    serve(*command);
+  }
+  void serve(const action_command_t& command) {
+    const bool is_new = std::none_of(served.begin(), served.end(), [&](const auto& before) {
+      return before.epoch == command.epoch && before.action_id == command.action_id;
+    });
+    if (is_new) served.push_back(command);
+    const bool is_refused = command.action_id % 7 == 3;
+    status_ = answer(command, is_refused ? motion_status_t::STATE_REJECTED
+                                         : motion_status_t::STATE_SETTLED);
+    if (!is_refused && is_new)
+      samples.push_back(sample_of(command, static_cast<std::int64_t>(samples.size())));
+    tell(babbler_->on_motion_status(status_));
+    if (is_refused || !is_new) return;
+    tell(babbler_->on_sample(samples.back()));
+    tell(babbler_->on_model_health(bad_health(newest_index())));
+  }
+
+  const std::filesystem::path file_ =
+      std::filesystem::path(testing::TempDir()) / ("babbler_state_" + std::to_string(getpid()));
+  std::string kept_;
+  const double kill_share_;
+  std::mt19937_64 rng_;
+  std::unique_ptr<MotorBabbler> babbler_;
+  motion_status_t status_ = idle_at_rest(5 * kSecond);
+  std::int64_t now_ = 100 * kSecond;
+};
+
+TEST(MotorBabblerTest, KilledAtAnyMomentItGoesOnAsIfNothingHadHappened) {
+  World undisturbed(0, 0);
+  undisturbed.run();
+  ASSERT_EQ(undisturbed.samples.size(), 40U);
+  int num_kills = 0;
+  for (std::uint64_t seed = 0; seed < 10; ++seed) {
+    World world(0.05, seed);
+    world.run();
+    ASSERT_EQ(world.served.size(), undisturbed.served.size()) << seed;
+    for (std::size_t i = 0; i < world.served.size(); ++i) {
+      const action_command_t &a = world.served[i], &b = undisturbed.served[i];
+      EXPECT_EQ(std::tie(a.epoch, a.action_id, a.purpose, a.utime, a.expiry_utime, a.action),
+                std::tie(b.epoch, b.action_id, b.purpose, b.utime, b.expiry_utime, b.action))
+          << seed << " " << i;
+    }
+    EXPECT_EQ(world.samples.size(), undisturbed.samples.size());
+    num_kills += world.num_kills;
+  }
+  EXPECT_GT(num_kills, 200);
+}
+
+TEST(MotorBabblerTest, ARestartListensFirstWhetherTheArmIsLent) {
+  Bench before;
+  before.start();
+  before.run(3);
+  const std::filesystem::path file =
+      std::filesystem::path(testing::TempDir()) / ("babbler_restart_" + std::to_string(getpid()));
+  std::ofstream(file) << before.babbler.state_text();
+  const auto restarted = [&] {
+    MotorBabbler babbler(test_config(), 1);
+    babbler.restore(file);
+    return babbler;
+  };
+  const motion_status_t status = answer(before.last, motion_status_t::STATE_SETTLED);
+
+  MotorBabbler alone = restarted();
+  EXPECT_FALSE(alone.on_tick(100 * kSecond));
+  EXPECT_FALSE(alone.on_motion_status(status));
+  EXPECT_FALSE(alone.on_tick(101 * kSecond));
+  const auto again = alone.on_tick(101 * kSecond + kSecond / 2);
+  ASSERT_TRUE(again);
+  EXPECT_EQ(again->action_id, before.last.action_id);
+  EXPECT_EQ(again->expiry_utime, before.last.expiry_utime);
+
+  MotorBabbler free = restarted();
+  EXPECT_FALSE(free.on_motion_status(status));
+  EXPECT_TRUE(free.on_control_status(control(false)));
+
+  MotorBabbler lent = restarted();
+  EXPECT_FALSE(lent.on_control_status(control(true)));
+  EXPECT_FALSE(lent.on_motion_status(status));
+  EXPECT_FALSE(lent.on_tick(100 * kSecond));
+  EXPECT_FALSE(lent.on_tick(200 * kSecond));
+  EXPECT_FALSE(lent.on_sample(sample_of(before.last, 3)));  // its SAMPLE is there
+  const auto next = lent.on_control_status(control(false));
+  ASSERT_TRUE(next);
+  EXPECT_EQ(next->action_id, before.last.action_id + 1);
+  EXPECT_EQ(next->purpose, action_command_t::PURPOSE_TEST);
+
+  EXPECT_THROW(MotorBabbler(test_config(), 2).restore(file), ConfigError);
+  MotorBabblerConfig other = test_config();
+  other.signals.pop_back();
+  EXPECT_THROW(MotorBabbler(other, 1).restore(file), ConfigError);
+  std::filesystem::remove(file);
+}
+
+TEST(MotorBabblerTest, BeforeItsFirstCommandThereIsNothingToKeep) {
+  MotorBabbler babbler(test_config(), 1);
+  babbler.on_model_health(bad_health(8));
+  EXPECT_EQ(babbler.state_text(), "");
+}
+
+TEST(MotorBabblerTest, MessagesOfAnotherRigAreRefusedAndCounted) {
+  Bench bench;
+  bench.start();
+  motion_status_t status = answer(bench.last, motion_status_t::STATE_SETTLED);
+  set_array(status.num_signals, status.commanded, std::vector<double>{1, 2});
+  EXPECT_FALSE(bench.babbler.on_motion_status(status));
+  sample_t sample = sample_of(bench.last, 0);
+  set_array(sample.num_signals, sample.action, std::vector<double>{1, 2});
+  EXPECT_FALSE(bench.babbler.on_sample(sample));
+  EXPECT_EQ(bench.babbler.num_samples(), 0);
+
+  BodySchema schema;
+  schema.version = 3;
+  schema.parts = {1, 2};
+  schema.root = 1;
+  schema.signals = test_config().signals;
+  schema.edges.resize(1);
+  schema.edges[0].from = 1;
+  schema.edges[0].to = 2;
+  bench.babbler.on_body_schema(to_message(schema));
+  schema.signals[0].name = "other";
+  schema.edges[0].to = 7;
+  bench.babbler.on_body_schema(to_message(schema));
+  model_health_t health = good_health(4);
+  health.schema_version = 3;
+  edge_health_t edge{};
+  edge.health_from = 1;
+  edge.health_to = 7;
+  set_array(health.num_edges, health.edge_health, {edge});
+  bench.run(4);
+  ASSERT_FALSE(bench.make_sample());
+  EXPECT_FALSE(bench.babbler.on_model_health(health));  // judges another schema
+  health.edge_health[0].health_to = 2;
+  EXPECT_TRUE(bench.babbler.on_model_health(health));
+  EXPECT_EQ(bench.babbler.refused(),
+            (std::map<std::string, std::int64_t>{
+                {"BODY_SCHEMA", 1}, {"MODEL_HEALTH", 1}, {"MOTION_STATUS", 1}, {"SAMPLE", 1}}));
 }
 
 TEST(MotorBabblerTest, AnswersAndSamplesOfOthersAreIgnored) {

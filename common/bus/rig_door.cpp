@@ -1,0 +1,125 @@
+#include "common/bus/rig_door.h"
+
+#include <spdlog/spdlog.h>
+
+#include <algorithm>
+#include <cmath>
+
+#include "common/config/yaml.h"
+
+namespace bodyschema {
+namespace {
+
+CameraCalibration calibration_of(const std::filesystem::path& rig_folder) {
+  std::filesystem::path file = Yaml::load(rig_folder / "camera.yaml").text("calibration");
+  if (file.is_relative()) file = rig_folder / file;
+  return load_camera_calibration(file);
+}
+
+}  // namespace
+
+RigDoor::RigDoor(const std::filesystem::path& rig_folder)
+    : signals_(load_signals(rig_folder)),
+      markers_(load_markers(rig_folder)),
+      camera_(calibration_of(rig_folder)) {}
+
+void RigDoor::refuse(Process& process, const std::string& channel, const std::string& why) {
+  if (process.count("refused " + channel) == 1) {
+    spdlog::warn("{}: refused, not of this rig: {} (further ones are only counted)", channel, why);
+  }
+}
+
+std::string RigDoor::objection_to_part(int part) const {
+  const bool is_known = std::any_of(markers_.tags.begin(), markers_.tags.end(),
+                                    [&](const TagPlacement& tag) { return tag.part == part; });
+  return is_known ? "" : fmt::format("part {} is not in markers.yaml", part);
+}
+
+std::string RigDoor::objection_to_signals(std::size_t num_signals) const {
+  if (num_signals == signals_.signals.size()) return "";
+  return fmt::format("it has {} action signals, signals.yaml names {}", num_signals,
+                     signals_.signals.size());
+}
+
+std::string RigDoor::objection(const camera_info_t& info) const {
+  if (info.camera_name != camera_.camera_name) {
+    return fmt::format("camera '{}' is not '{}'", info.camera_name, camera_.camera_name);
+  }
+  if (info.image_width != camera_.width || info.image_height != camera_.height) {
+    return fmt::format("it holds for {}×{} px, the rig's calibration for {}×{}", info.image_width,
+                       info.image_height, camera_.width, camera_.height);
+  }
+  return "";
+}
+
+std::string RigDoor::objection(const marker_poses_t& poses) const {
+  if (poses.camera_name != camera_.camera_name) {
+    return fmt::format("camera '{}' is not '{}'", poses.camera_name, camera_.camera_name);
+  }
+  for (const marker_pose_t& marker : poses.markers) {
+    const TagPlacement* tag = markers_.find(marker.marker_id);
+    if (!tag) return fmt::format("tag {} is not in markers.yaml", marker.marker_id);
+    if (std::abs(marker.size_m - tag->size_m) > 1e-6) {
+      return fmt::format("tag {} is {} m wide, in markers.yaml {} m", marker.marker_id,
+                         marker.size_m, tag->size_m);
+    }
+  }
+  return "";
+}
+
+std::string RigDoor::objection(const motion_status_t& status) const {
+  // Only a MOVE has an action to echo, and a driver that was never asked for anything has none.
+  const bool has_action = status.kind == action_command_t::KIND_MOVE && status.action_id >= 0;
+  if (!has_action && status.commanded.empty()) return "";
+  return objection_to_signals(status.commanded.size());
+}
+
+std::string RigDoor::objection(const sample_t& sample) const {
+  std::string why_not = objection_to_signals(sample.action.size());
+  for (const part_observation_t& part : sample.parts) {
+    if (why_not.empty()) why_not = objection_to_part(part.part_id);
+    for (const tag_corners_t& corners : part.tags) {
+      const TagPlacement* tag = markers_.find(corners.tag_id);
+      if (why_not.empty() && (!tag || tag->part != part.part_id)) {
+        why_not = fmt::format("tag {} does not belong to part {}", corners.tag_id, part.part_id);
+      }
+    }
+  }
+  return why_not;
+}
+
+std::string RigDoor::objection(const body_schema_t& schema) const {
+  std::string why_not = objection_to_signals(schema.signals.size());
+  if (!why_not.empty()) return why_not;
+  for (std::size_t i = 0; i < schema.signals.size(); ++i) {
+    const signal_t& theirs = schema.signals[i];
+    const Signal& ours = signals_.signals[i];
+    if (theirs.signal_name != ours.name || theirs.lower_limit != ours.lower ||
+        theirs.upper_limit != ours.upper) {
+      return fmt::format("signal '{}' {} … {} is '{}' {} … {} in signals.yaml", theirs.signal_name,
+                         theirs.lower_limit, theirs.upper_limit, ours.name, ours.lower, ours.upper);
+    }
+  }
+  for (const std::int32_t part : schema.part_ids) {
+    if (why_not.empty()) why_not = objection_to_part(part);
+  }
+  return why_not;
+}
+
+std::string RigDoor::objection(const model_health_t& health) const {
+  std::string why_not;
+  for (const part_health_t& part : health.part_health) {
+    if (why_not.empty()) why_not = objection_to_part(part.health_part);
+  }
+  return why_not;
+}
+
+std::string RigDoor::objection(const sim_state_t& state) const {
+  std::string why_not;
+  for (const std::int32_t part : state.true_part) {
+    if (why_not.empty()) why_not = objection_to_part(part);
+  }
+  return why_not;
+}
+
+}  // namespace bodyschema

@@ -1,0 +1,63 @@
+#pragma once
+
+#include <filesystem>
+#include <functional>
+#include <map>
+#include <string>
+#include <type_traits>
+#include <utility>
+
+#include "common/bus/process.h"
+#include "common/config/camera_calibration.h"
+#include "common/config/rig.h"
+
+namespace bodyschema {
+
+/// Keeps the messages of another rig out: of a second group on the same bus, of a recording that is
+/// played there. It knows this rig's signals.yaml, markers.yaml and the calibration that
+/// camera.yaml names. What agrees with all of them cannot be told from this rig's own: a bus is for
+/// one robot.
+class RigDoor {
+ public:
+  /// @throws ConfigError.
+  explicit RigDoor(const std::filesystem::path& rig_folder);
+
+  // "" if the message may be of this rig, else why not, for people.
+
+  /// Calibrated for this camera and image size.
+  std::string objection(const camera_info_t& info) const;
+  /// Of this camera; tags of markers.yaml with their sizes.
+  std::string objection(const marker_poses_t& poses) const;
+  /// One value per signal; none where no MOVE is answered.
+  std::string objection(const motion_status_t& status) const;
+  /// One value per signal; parts of markers.yaml, each with its own tags.
+  std::string objection(const sample_t& sample) const;
+  /// The rig's signals, by name and limits; parts of markers.yaml.
+  std::string objection(const body_schema_t& schema) const;
+  /// Parts of markers.yaml.
+  std::string objection(const model_health_t& health) const;
+  std::string objection(const sim_state_t& state) const;
+
+  /// Subscribes behind the door: what it objects to is counted as "refused CHANNEL", said once a
+  /// channel, and not handled. The door must outlive the bus's use of it.
+  template <class Message>
+  void subscribe(Process& process, const Channel<Message>& channel,
+                 std::type_identity_t<std::function<void(const Message&)>> handler) const {
+    process.bus().subscribe(channel, [this, &process, name = channel.name,
+                                      handler = std::move(handler)](const Message& message) {
+      const std::string why_not = objection(message);
+      why_not.empty() ? handler(message) : refuse(process, name, why_not);
+    });
+  }
+
+ private:
+  static void refuse(Process& process, const std::string& channel, const std::string& why);
+  std::string objection_to_part(int part) const;
+  std::string objection_to_signals(std::size_t num_signals) const;
+
+  const Signals signals_;
+  const Markers markers_;
+  const CameraCalibration camera_;
+};
+
+}  // namespace bodyschema

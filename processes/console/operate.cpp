@@ -1,0 +1,422 @@
+#include "processes/console/operate.h"
+
+#include <fmt/format.h>
+#include <unistd.h>
+
+#include <CLI/CLI.hpp>
+#include <algorithm>
+#include <array>
+#include <chrono>
+#include <csignal>
+#include <iostream>
+#include <limits>
+#include <memory>
+#include <nlohmann/json.hpp>
+#include <stdexcept>
+#include <tuple>
+#include <vector>
+
+#include "common/bus/bus.h"
+
+namespace bodyschema {
+namespace {
+
+using S = control_status_t;
+
+constexpr char kSource[] = "console";
+constexpr std::int64_t kTargetPeriod_us = 1'000'000;
+constexpr std::int64_t kCommandPeriod_us = 200'000;
+constexpr std::int64_t kSilent_us = 3'000'000;
+constexpr std::int64_t kPatience_us = 5'000'000;  // for what is answered at once
+
+volatile std::sig_atomic_t interrupted = 0;
+void on_signal(int) { interrupted = 1; }
+
+const char* name_of_state(std::int8_t state) {
+  constexpr std::array kNames = {"idle",    "waiting", "moving", "reached",
+                                 "refused", "holding", "lent",   "released"};
+  return kNames.at(static_cast<std::size_t>(state));
+}
+
+std::string millimetres(double error_m) {
+  return error_m < 0 ? "unknown" : fmt::format("{:.1f} mm", error_m * 1e3);
+}
+
+std::int64_t clock_us() {
+  return std::chrono::duration_cast<std::chrono::microseconds>(
+             std::chrono::steady_clock::now().time_since_epoch())
+      .count();
+}
+
+std::int64_t wall_clock_us() {
+  return std::chrono::duration_cast<std::chrono::microseconds>(
+             std::chrono::system_clock::now().time_since_epoch())
+      .count();
+}
+
+/// A terminal gets a line that rewrites itself, a file a line for each change.
+class ProgressLine {
+ public:
+  ~ProgressLine() {
+    if (is_terminal_ && !shown_.empty()) std::cerr << "\r\x1b[2K" << std::flush;
+  }
+  void show(const std::string& line) {
+    if (line == shown_) return;
+    shown_ = line;
+    std::cerr << (is_terminal_ ? "\r\x1b[2K" : "") << line << (is_terminal_ ? "" : "\n")
+              << std::flush;
+  }
+
+ private:
+  const bool is_terminal_ = isatty(STDERR_FILENO) == 1;
+  std::string shown_;
+};
+
+pose_target_t make_target(std::int8_t kind) {
+  pose_target_t target{};
+  target.utime = target.epoch = wall_clock_us();
+  target.sender = kSource;
+  target.target_kind = kind;
+  target.target_part = -1;
+  target.keep_s = -1;
+  return target;
+}
+
+}  // namespace
+
+action_command_t make_console_command(std::int8_t kind, std::int64_t epoch,
+                                      std::int64_t action_id) {
+  action_command_t command{};
+  command.source = kSource;
+  command.epoch = epoch;
+  command.action_id = action_id;
+  command.kind = kind;
+  command.purpose = action_command_t::PURPOSE_CONTROL;
+  // Whenever it comes, it is still meant.
+  command.expiry_utime = std::numeric_limits<std::int64_t>::max();
+  return command;
+}
+
+// ---- TargetFollower
+
+TargetFollower::TargetFollower(pose_target_t target, std::int64_t timeout_us)
+    : target_(std::move(target)), timeout_us_(timeout_us) {
+  status_.target_id = status_.schema_version = status_.target_part = -1;
+  status_.predicted_error_m = status_.observed_error_m = -1;
+}
+
+void TargetFollower::on_control_status(const control_status_t& status) {
+  has_controller_ = true;
+  if (end_ != End::kOpen) return;
+  const auto mine = std::tie(target_.epoch, target_.target_id);
+  const auto newest = std::tie(status.target_epoch, status.target_id);
+  if (newest != mine) {
+    // An older one: not heard yet, or the controller was restarted and does not go on by itself.
+    is_acknowledged_ = false;
+    if (newest > mine) {
+      status_ = status;
+      status_.why = "a newer target of " + status.sender + " took its place";
+      end_ = End::kRefused;
+    }
+    return;
+  }
+  is_acknowledged_ = true;
+  status_ = status;
+  const std::int8_t state = status.control_state;
+  switch (target_.target_kind) {
+    case pose_target_t::KIND_HOLD:
+      if (state == S::CONTROL_HOLDING) end_ = End::kAsked;
+      break;
+    case pose_target_t::KIND_RELEASE:
+      if (state == S::CONTROL_RELEASED) end_ = End::kAsked;
+      break;
+    default:
+      // It was kept for keep_s and given back.
+      if (state == S::CONTROL_REACHED || state == S::CONTROL_RELEASED) end_ = End::kAsked;
+      if (state == S::CONTROL_REFUSED || state == S::CONTROL_HOLDING) end_ = End::kRefused;
+  }
+}
+
+void TargetFollower::on_process_info(const process_info_t& info) {
+  processes_[info.process_name] = {info.activity, now_us_};
+}
+
+void TargetFollower::on_motion_status(const motion_status_t&) { motion_at_us_ = now_us_; }
+
+std::optional<pose_target_t> TargetFollower::on_tick(std::int64_t now_us) {
+  now_us_ = now_us;
+  if (started_us_ < 0) started_us_ = now_us;
+  if (end_ == End::kOpen && now_us - started_us_ >= timeout_us_) end_ = End::kTimedOut;
+  if (end_ != End::kOpen || is_acknowledged_) return std::nullopt;
+  if (sent_us_ >= 0 && now_us - sent_us_ < kTargetPeriod_us) return std::nullopt;
+  sent_us_ = now_us;
+  return target_;
+}
+
+std::string TargetFollower::progress() const {
+  if (!is_acknowledged_) {
+    return has_controller_ ? "waiting for the controller to take up the target"
+                           : "waiting for the controller";
+  }
+  return fmt::format("{} · {} moves · by the schema {} away, as seen {} · {}",
+                     name_of_state(status_.control_state), status_.num_moves,
+                     millimetres(status_.predicted_error_m), millimetres(status_.observed_error_m),
+                     status_.why);
+}
+
+bool TargetFollower::has_been_heard(const std::string& process) const {
+  const auto heard = processes_.find(process);
+  return heard != processes_.end() && now_us_ - heard->second.at_us <= kSilent_us;
+}
+
+std::string TargetFollower::diagnosis() const {
+  std::string text;
+  for (const char* process :
+       {"controller", "camera", "marker_estimator", "observer", "model_monitor"}) {
+    if (!has_been_heard(process)) text += fmt::format("{}{}", text.empty() ? "" : ", ", process);
+  }
+  if (!motion_at_us_ || now_us_ - *motion_at_us_ > kSilent_us) {
+    text += fmt::format("{}the driver", text.empty() ? "" : ", ");
+  }
+  if (!text.empty()) return "silent: " + text;
+  return is_acknowledged_ ? "the controller says: " + status_.why
+                          : "the controller does not acknowledge the target";
+}
+
+std::string target_json(const control_status_t& status, TargetFollower::End end) {
+  const auto metres = [](double value) {
+    return value < 0 ? nlohmann::ordered_json(nullptr) : nlohmann::ordered_json(value);
+  };
+  const nlohmann::ordered_json json = {
+      {"reached", end == TargetFollower::End::kAsked},
+      {"state",
+       end == TargetFollower::End::kTimedOut ? "timed out" : name_of_state(status.control_state)},
+      {"why", status.why},
+      {"predicted_error_m", metres(status.predicted_error_m)},
+      {"observed_error_m", metres(status.observed_error_m)},
+      {"moves", status.num_moves},
+      {"schema_version", status.schema_version}};
+  return json.dump();
+}
+
+// ---- LatchFollower
+
+LatchFollower::LatchFollower(std::int8_t kind, std::int64_t epoch)
+    : command_(make_console_command(kind, epoch, 0)) {}
+
+void LatchFollower::on_motion_status(const motion_status_t& motion) {
+  has_heard_driver_ = true;
+  if (sent_us_ < 0) return;
+  is_done_ = (motion.stop_latched == 1) == (command_.kind == action_command_t::KIND_STOP);
+}
+
+std::optional<action_command_t> LatchFollower::on_tick(std::int64_t now_us) {
+  if (is_done_ || (sent_us_ >= 0 && now_us - sent_us_ < kCommandPeriod_us)) return std::nullopt;
+  sent_us_ = now_us;
+  return command_;
+}
+
+// ---- the commands
+
+namespace {
+
+struct OperateArguments {
+  std::string in = default_url();
+  int part = -1;
+  std::vector<double> position_m;
+  double keep_s = -1;
+  double timeout_s = 120;
+  bool json = false;
+};
+
+/// The result is on stdout; exit code 1.
+[[noreturn]] void fail() {
+  if (!std::cout.flush()) throw std::runtime_error("stdout: the result could not be written");
+  throw CLI::RuntimeError(1);
+}
+
+void watch_signals() {
+  std::signal(SIGINT, on_signal);
+  std::signal(SIGTERM, on_signal);
+}
+
+/// Runs until the follower has come to an end; `also` on every turn.
+void follow(Bus& bus, TargetFollower& follower, ProgressLine& line,
+            const std::function<void(std::int64_t)>& also = nullptr) {
+  bus.subscribe<control_status_t>(
+      kControlStatus, [&](const control_status_t& m) { follower.on_control_status(m); });
+  bus.subscribe<process_info_t>(kProcessInfo,
+                                [&](const process_info_t& m) { follower.on_process_info(m); });
+  while (follower.end() == TargetFollower::End::kOpen && !interrupted) {
+    if (const auto target = follower.on_tick(clock_us())) bus.publish(kPoseTarget, *target);
+    if (also) also(clock_us());
+    line.show(follower.progress());
+    bus.handle(std::chrono::milliseconds(50));
+  }
+}
+
+void run_target(const OperateArguments& arguments) {
+  pose_target_t target = make_target(pose_target_t::KIND_POSITION);
+  target.target_part = arguments.part;
+  std::copy(arguments.position_m.begin(), arguments.position_m.end(), target.position_m);
+  target.keep_s = arguments.keep_s;
+  if (const std::string problem = check(target); !problem.empty()) {
+    throw std::runtime_error("target: " + problem);
+  }
+  watch_signals();
+  Bus bus(arguments.in, arguments.in);
+  TargetFollower follower(target, std::llround(arguments.timeout_s * 1e6));
+  bus.subscribe<motion_status_t>(kMotionStatus,
+                                 [&](const motion_status_t& m) { follower.on_motion_status(m); });
+  {
+    ProgressLine line;
+    follow(bus, follower, line);
+  }
+  control_status_t status = follower.status();
+  if (interrupted) status.why = "interrupted; the controller goes on: bodyschema release ends it";
+  if (follower.end() == TargetFollower::End::kTimedOut) {
+    status.why = fmt::format("no end within {} s; {}", arguments.timeout_s, follower.diagnosis());
+  }
+  const bool is_reached = follower.end() == TargetFollower::End::kAsked;
+  if (arguments.json) {
+    std::cout << target_json(status, follower.end()) << "\n";
+  } else {
+    std::cout << fmt::format("{}: {} (by the schema {} away, as seen {}; {} moves)\n",
+                             is_reached                                                  ? "reached"
+                             : status.control_state == control_status_t::CONTROL_HOLDING ? "held"
+                             : status.control_state == control_status_t::CONTROL_REFUSED
+                                 ? "refused"
+                                 : "not reached",
+                             status.why, millimetres(status.predicted_error_m),
+                             millimetres(status.observed_error_m), status.num_moves);
+  }
+  if (!is_reached) fail();
+  if (arguments.keep_s < 0) std::cerr << "The arm stays there until: bodyschema release\n";
+}
+
+void run_hold(const OperateArguments& arguments) {
+  watch_signals();
+  Bus bus(arguments.in, arguments.in);
+  const pose_target_t target = make_target(pose_target_t::KIND_HOLD);
+  TargetFollower follower(target, kPatience_us);
+  const action_command_t command =
+      make_console_command(action_command_t::KIND_HOLD, target.epoch, 0);
+  bool is_answered = false;
+  bus.subscribe<motion_status_t>(kMotionStatus, [&](const motion_status_t& motion) {
+    follower.on_motion_status(motion);
+    is_answered |= motion.source == command.source && motion.epoch == command.epoch;
+  });
+  std::int64_t sent_us = -1;
+  const auto tell_driver = [&](std::int64_t now_us) {
+    if (is_answered || (sent_us >= 0 && now_us - sent_us < kCommandPeriod_us)) return;
+    sent_us = now_us;
+    bus.publish(kActionCommand, command);
+  };
+  {
+    ProgressLine line;
+    follow(bus, follower, line, tell_driver);
+    const std::int64_t end_us = clock_us() + kPatience_us;
+    while (!is_answered && clock_us() < end_us && !interrupted) {
+      tell_driver(clock_us());
+      bus.handle(std::chrono::milliseconds(50));
+    }
+  }
+  const bool is_held = follower.end() == TargetFollower::End::kAsked;
+  std::cout << (is_answered ? "the driver holds" : "the driver does not answer") << "; "
+            << (is_held ? "the controller keeps the arm still until another target or: bodyschema "
+                          "release"
+                        : "no controller keeps the arm still: the babbler goes on with its next "
+                          "action; bodyschema stop latches")
+            << "\n";
+  if (!is_held || !is_answered) fail();
+}
+
+void run_release(const OperateArguments& arguments) {
+  watch_signals();
+  Bus bus(arguments.in, arguments.in);
+  TargetFollower follower(make_target(pose_target_t::KIND_RELEASE), kPatience_us);
+  bus.subscribe<motion_status_t>(kMotionStatus,
+                                 [&](const motion_status_t& m) { follower.on_motion_status(m); });
+  {
+    ProgressLine line;
+    follow(bus, follower, line);
+  }
+  if (follower.end() != TargetFollower::End::kAsked) {
+    throw std::runtime_error("release: " + follower.diagnosis());
+  }
+  std::cout << "released: the babbler may move the arm\n";
+}
+
+void run_latch(const OperateArguments& arguments, std::int8_t kind) {
+  watch_signals();
+  Bus bus(arguments.in, arguments.in);
+  LatchFollower follower(kind, wall_clock_us());
+  bool owns_arm = false;
+  bus.subscribe<motion_status_t>(kMotionStatus,
+                                 [&](const motion_status_t& m) { follower.on_motion_status(m); });
+  bus.subscribe<control_status_t>(kControlStatus,
+                                  [&](const control_status_t& m) { owns_arm = m.owns_arm == 1; });
+  const std::int64_t end_us = clock_us() + kPatience_us;
+  while (!follower.is_done() && clock_us() < end_us && !interrupted) {
+    if (const auto command = follower.on_tick(clock_us())) bus.publish(kActionCommand, *command);
+    bus.handle(std::chrono::milliseconds(50));
+  }
+  const bool is_stop = kind == action_command_t::KIND_STOP;
+  if (!follower.is_done()) {
+    throw std::runtime_error(
+        std::string(is_stop ? "stop" : "resume") +
+        (follower.has_heard_driver()
+             ? ": the driver was told for 5 s, but MOTION_STATUS does not say so"
+             : ": no MOTION_STATUS for 5 s: does the driver run, and on this bus?"));
+  }
+  if (is_stop) {
+    std::cout << "stopped, until: bodyschema resume\n";
+    return;
+  }
+  // Whether the arm is the controller's is repeated at 1 Hz.
+  const std::int64_t listen_us = clock_us() + 1'500'000;
+  while (!owns_arm && clock_us() < listen_us && !interrupted) {
+    bus.handle(std::chrono::milliseconds(50));
+  }
+  std::cout << "resumed; "
+            << (owns_arm ? "the controller holds the arm until another target or: bodyschema "
+                           "release"
+                         : "the babbler goes on if it is not done; a target that was dropped is "
+                           "not taken up again")
+            << "\n";
+}
+
+}  // namespace
+
+void add_operate_commands(CLI::App& console) {
+  const auto arguments = std::make_shared<OperateArguments>();
+  const auto add = [&](const char* name, const char* what, auto run) {
+    CLI::App* command = console.add_subcommand(name, what);
+    command->add_option("--in", arguments->in, "URL of the bus");
+    command->callback([arguments, run] { run(*arguments); });
+    return command;
+  };
+  CLI::App* target = add("target", "Bring a body part to a position", run_target);
+  target->add_option("--part", arguments->part, "Body part")
+      ->required()
+      ->check(CLI::NonNegativeNumber);
+  target
+      ->add_option("--position", arguments->position_m, "X Y Z of its origin in the root part [m]")
+      ->required()
+      ->expected(3);
+  target
+      ->add_option("--keep", arguments->keep_s,
+                   "Stay so long [s] before the babbler gets the arm; default: until released")
+      ->check(CLI::NonNegativeNumber);
+  target->add_option("--timeout", arguments->timeout_s, "Follow it for so long [s]")
+      ->check(CLI::PositiveNumber);
+  target->add_flag("--json", arguments->json, "The result as JSON");
+  add("hold", "Stop where the arm is; nothing moves it until another target", run_hold);
+  add("release", "Give the arm back to the babbler", run_release);
+  add("stop", "Stop the driver; latches until resume",
+      [](const OperateArguments& a) { run_latch(a, action_command_t::KIND_STOP); });
+  add("resume", "End a stop",
+      [](const OperateArguments& a) { run_latch(a, action_command_t::KIND_RESUME); });
+}
+
+}  // namespace bodyschema

@@ -1,0 +1,191 @@
+#pragma once
+
+#include <Eigen/Core>
+#include <cstdint>
+#include <filesystem>
+#include <map>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "bodyschema/action_command_t.hpp"
+#include "bodyschema/body_schema_t.hpp"
+#include "bodyschema/control_status_t.hpp"
+#include "bodyschema/marker_poses_t.hpp"
+#include "bodyschema/model_health_t.hpp"
+#include "bodyschema/motion_status_t.hpp"
+#include "bodyschema/pose_target_t.hpp"
+#include "bodyschema/sample_t.hpp"
+#include "common/config/rig.h"
+#include "processes/controller/inverse_kinematics.h"
+
+namespace bodyschema {
+
+struct ControllerConfig {
+  std::vector<Signal> signals;
+  InverseKinematicsOptions inverse_kinematics;
+  double reached_m = 0;  ///< a target is reached this near, and out of reach if none comes as near
+  double max_step = 0;   ///< of one action, share of each signal's range
+  double slow_step = 0;  ///< the same while an edge on the way is suspect or provisional
+  int max_corrections = 0;      ///< by what was seen at the end, if that is not within reached_m
+  double max_correction_m = 0;  ///< what is seen farther off is not believed
+  int max_solutions = 0;        ///< tried before a target that the driver rejects is refused
+  std::int64_t expiry_us = 0;   ///< of a command, driver's time
+  std::int64_t resend_us = 0;   ///< a command without an answer is sent again after this
+  std::int64_t take_us = 0;     ///< the arm is taken when MOTION_STATUS did not change for so long
+  std::int64_t sample_timeout_us = 0;  ///< a settled action's SAMPLE is awaited this long
+  std::int64_t max_motion_status_silence_us = 0;
+  std::int64_t max_marker_poses_silence_us = 0;
+  std::int64_t max_body_schema_silence_us = 0;
+
+  /// Reads controller.yaml and signals.yaml beside it. @throws ConfigError.
+  static ControllerConfig load(const std::filesystem::path& file);
+};
+
+/// Brings a body part to a target position by the body schema alone: a sequence of small MOVE
+/// actions towards a solution of inverse kinematics, each answered by the driver and followed by
+/// its SAMPLE before the next is sent, so no step is taken unseen and no sample is lost.
+///
+/// Of all targets the highest (epoch, target_id) counts; a repeated one does nothing. The arm is
+/// its own (owns_arm) from the moment that a target can be served until it was reached and kept,
+/// was refused or is released. Taking it waits until the arm rests and the last settled action has
+/// its SAMPLE. While an edge on the way to the part is INVALID the arm is lent to the babbler.
+///
+/// Start guard: nothing is sent before MOTION_STATUS, BODY_SCHEMA and MARKER_POSES of the present
+/// rest were heard, and no MOVE from a position that was not heard: the last settled action of this
+/// rest, as the driver or a SAMPLE echoes it. HOLD waits for MOTION_STATUS alone. When
+/// MOTION_STATUS, MARKER_POSES or BODY_SCHEMA falls silent while a target is served, when a SAMPLE
+/// does not come, when the driver begins anew or somebody says STOP or HOLD: the target is dropped
+/// and the arm held until another target or a release; nothing is resumed by itself. Silence of the
+/// eyes is not measured by the clock alone: in lock-step the driver's time stands still and so do
+/// the images. They are due when the driver's time has gone on.
+///
+/// After a restart a hold is held; a target in progress is not continued and no longer
+/// acknowledged.
+class Controller {
+ public:
+  /// What is to be sent. `status` on every change and at 1 Hz.
+  struct Answer {
+    std::optional<action_command_t> command;
+    std::optional<control_status_t> status;
+  };
+
+  explicit Controller(ControllerConfig config);
+
+  Answer on_pose_target(const pose_target_t& target);
+  Answer on_motion_status(const motion_status_t& motion);
+  Answer on_marker_poses(const marker_poses_t& poses);
+  Answer on_sample(const sample_t& sample);
+  Answer on_body_schema(const body_schema_t& schema);
+  Answer on_model_health(const model_health_t& health);
+  /// `now_us`: the clock. Sees silence.
+  Answer on_tick(std::int64_t now_us);
+
+  control_status_t status() const;
+  /// Messages that were refused and what was sent in vain, since the start.
+  const std::map<std::string, std::int64_t>& counters() const { return counters_; }
+
+  /// What a restart needs, as YAML; to be on disk before an Answer is sent.
+  std::string state_text() const;
+  /// Continues from a file with state_text(). @throws ConfigError.
+  void restore(const std::filesystem::path& file);
+
+ private:
+  using Command = std::optional<action_command_t>;
+
+  /// Clock time since restart(), as ticks see it.
+  class Stopwatch {
+   public:
+    void restart(std::int64_t now_us = -1) { begin_us_ = now_us; }
+    std::int64_t elapsed_us(std::int64_t now_us) {
+      if (begin_us_ < 0) begin_us_ = now_us;
+      return now_us - begin_us_;
+    }
+
+   private:
+    std::int64_t begin_us_ = -1;
+  };
+
+  /// `now_us` ≥ 0: the clock; then the status is repeated when it is due.
+  Answer answer(Command command, std::int64_t now_us = -1);
+  void enter(std::int8_t control_state, bool owns_arm, std::string why);
+  bool is_active() const;
+  bool is_at_rest() const { return motion_ && motion_->rest_since_utime >= 0; }
+  bool is_newer(const pose_target_t& target) const;
+  /// "" or which input was not heard yet.
+  std::string unheard() const;
+  /// "" or which input has been silent for too long.
+  std::string silence(std::int64_t now_us);
+  /// "" or why the schema cannot serve the target, whatever the arm does.
+  std::string objection() const;
+  /// Worst state of the edges between root and target part.
+  EdgeState worst_edge(std::string* name = nullptr) const;
+
+  void see(std::int64_t frame_utime);
+  void locate();
+  void forget_plan();
+  void observe(const sample_t& sample);
+  double predicted_error_m() const;
+
+  /// Whatever the target needs next, when no command is unanswered.
+  Command advance();
+  /// Waits until the arm is free, by the clock.
+  Command take(std::int64_t now_us);
+  Command step();
+  Command arrive();
+  Command on_own_answer(const motion_status_t& motion);
+  void refuse(const std::string& why);
+  /// Nothing moves until another target.
+  void halt(const std::string& why);
+  /// halt() and tell the driver.
+  Command hold(const std::string& why);
+  Command send_hold();
+  action_command_t make_command(std::int8_t kind);
+
+  const ControllerConfig config_;
+  std::map<std::string, std::int64_t> counters_;
+
+  // What was heard.
+  std::optional<motion_status_t> motion_;
+  std::optional<sample_t> sample_;
+  std::optional<BodySchema> schema_;
+  std::optional<model_health_t> health_;
+  std::int64_t seen_until_utime_ = -1;       ///< newest frame
+  std::optional<Eigen::VectorXd> position_;  ///< of the present rest, command units
+  std::int64_t position_rest_utime_ = -1;
+  Stopwatch motion_silence_, eyes_silence_, schema_silence_;
+  std::string silent_;  ///< input that was silent for too long at the last tick; "": none
+
+  // The newest target, and how far it is.
+  pose_target_t target_{};
+  std::int64_t floor_epoch_ = 0, floor_id_ = -1;  ///< older targets are ignored
+  std::int8_t state_ = control_status_t::CONTROL_IDLE;
+  bool owns_arm_ = false;
+  std::string why_ = "no target was given since the start";
+  bool is_taken_ = false;
+  Eigen::Vector3d aim_ = Eigen::Vector3d::Zero();  ///< target, corrected by what was seen
+  std::optional<Eigen::VectorXd> goal_;            ///< action that brings the part to aim_
+  std::vector<Eigen::VectorXd> rejected_;          ///< goals the driver would not go to
+  std::string rejection_;
+  int num_expired_ = 0;
+  int num_corrections_ = 0;
+  int num_moves_ = 0;
+  double predicted_error_m_ = -1;
+  double observed_error_m_ = -1;
+  Eigen::Vector3d observed_offset_ = Eigen::Vector3d::Zero();  ///< target minus seen position, in R
+  bool is_observation_sure_ = false;  ///< unambiguous, and not to be explained by its covariance
+  Stopwatch guard_, taking_, quiet_, keep_;
+
+  // What was sent.
+  std::int64_t epoch_ = -1;
+  std::int64_t next_action_id_ = 0;
+  std::int64_t last_answered_id_ = -1;
+  std::optional<action_command_t> command_;       ///< MOVE without a final answer
+  std::optional<action_command_t> hold_command_;  ///< HOLD without an answer
+  bool wants_hold_ = false;
+  std::optional<std::int64_t> awaited_;  ///< action whose SAMPLE has not come
+  Stopwatch answer_wait_, hold_wait_, sample_wait_, status_age_;
+  std::optional<control_status_t> told_;
+};
+
+}  // namespace bodyschema

@@ -1,0 +1,69 @@
+#pragma once
+
+#include <spdlog/spdlog.h>
+
+#include <filesystem>
+#include <functional>
+#include <optional>
+#include <stdexcept>
+#include <string>
+#include <utility>
+#include <vector>
+
+#include "common/bus/event_log.h"
+
+namespace bodyschema {
+
+/// A message that outlives its process: a log of one event, replaced atomically. Without a file
+/// nothing is kept.
+template <class Message>
+class SavedMessage {
+ public:
+  SavedMessage(std::filesystem::path file, Channel<Message> channel)
+      : file_(std::move(file)), channel_(channel) {}
+
+  /// What was saved; std::nullopt if nothing was. A file that cannot be used (damaged, empty, or
+  /// `objection` is not "") is set aside as FILE.bad-1 with a warning: what it held is found out
+  /// again from the samples, and nobody stumbles over it at each start.
+  std::optional<Message> load(const std::function<std::string(const Message&)>& objection) {
+    if (file_.empty() || !std::filesystem::exists(file_)) return std::nullopt;
+    std::string problem;
+    try {
+      std::vector<Message> messages = read_log(file_, channel_);
+      problem =
+          messages.empty() ? std::string("holds no ") + channel_.name : objection(messages.back());
+      if (problem.empty()) {
+        saved_ = encode(channel_, messages.back());
+        return std::move(messages.back());
+      }
+      problem = file_.string() + ": " + problem;
+    } catch (const std::runtime_error& error) {
+      problem = error.what();
+    }
+    const auto aside = copy_aside(file_);
+    std::filesystem::remove(file_);
+    spdlog::warn("{}; set aside as {}", problem, aside.filename().string());
+    return std::nullopt;
+  }
+
+  /// Writes the message unless it is what was written last. Returns "" or why it could not be
+  /// written, for people; the next call tries again.
+  std::string save(const Message& message) {
+    std::vector<std::uint8_t> bytes = encode(channel_, message);
+    if (file_.empty() || bytes == saved_) return "";
+    try {
+      write_one_event_log(file_, channel_, message);
+    } catch (const std::runtime_error& error) {
+      return error.what();
+    }
+    saved_ = std::move(bytes);
+    return "";
+  }
+
+ private:
+  const std::filesystem::path file_;
+  const Channel<Message> channel_;
+  std::vector<std::uint8_t> saved_;
+};
+
+}  // namespace bodyschema

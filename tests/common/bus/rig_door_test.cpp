@@ -1,0 +1,138 @@
+#include "common/bus/rig_door.h"
+
+#include <gtest/gtest.h>
+
+#include "common/bus/convert.h"
+
+namespace bodyschema {
+namespace {
+
+const std::filesystem::path kConfig = BODYSCHEMA_CONFIG;
+
+/// A sample of the rig: all parts, the first tag of each.
+sample_t sample_of(const std::filesystem::path& rig) {
+  sample_t sample{};
+  set_array(sample.num_signals, sample.action,
+            std::vector<double>(load_signals(rig).signals.size(), 0.1));
+  const Markers markers = load_markers(rig);
+  std::vector<part_observation_t> parts;
+  for (const int part : markers.parts()) {
+    part_observation_t& observation = parts.emplace_back();
+    observation.part_id = part;
+    for (const TagPlacement& tag : markers.tags) {
+      if (tag.part != part) continue;
+      tag_corners_t corners{};
+      corners.tag_id = tag.id;
+      set_array(observation.num_tags, observation.tags, {corners});
+      break;
+    }
+  }
+  set_array(sample.num_parts, sample.parts, std::move(parts));
+  return sample;
+}
+
+body_schema_t schema_of(const std::filesystem::path& rig) {
+  body_schema_t schema{};
+  std::vector<signal_t> signals;
+  for (const Signal& signal : load_signals(rig).signals) {
+    signal_t& message = signals.emplace_back();
+    message.signal_name = signal.name;
+    message.lower_limit = signal.lower;
+    message.upper_limit = signal.upper;
+  }
+  set_array(schema.num_signals, schema.signals, std::move(signals));
+  set_array(schema.num_parts, schema.part_ids, load_markers(rig).parts());
+  return schema;
+}
+
+marker_poses_t poses_of(const std::filesystem::path& rig) {
+  marker_poses_t poses{};
+  poses.camera_name = rig.filename().string() + "_camera";
+  std::vector<marker_pose_t> markers;
+  for (const TagPlacement& tag : load_markers(rig).tags) {
+    marker_pose_t& marker = markers.emplace_back();
+    marker.marker_id = tag.id;
+    marker.size_m = tag.size_m;
+  }
+  set_array(poses.num_markers, poses.markers, std::move(markers));
+  return poses;
+}
+
+motion_status_t status_with(std::size_t num_signals) {
+  motion_status_t status{};
+  set_array(status.num_signals, status.commanded, std::vector<double>(num_signals));
+  return status;
+}
+
+TEST(RigDoor, EveryRigsOwnMessagesComeInAndNoOthers) {
+  const std::vector<std::string> rigs = {"arm2", "arm4", "arm7"};
+  for (const std::string& host : rigs) {
+    const RigDoor door(kConfig / host);
+    for (const std::string& guest : rigs) {
+      const auto rig = kConfig / guest;
+      const bool is_own = host == guest;
+      EXPECT_EQ(door.objection(sample_of(rig)).empty(), is_own) << host << " " << guest;
+      EXPECT_EQ(door.objection(schema_of(rig)).empty(), is_own) << host << " " << guest;
+      EXPECT_EQ(door.objection(poses_of(rig)).empty(), is_own) << host << " " << guest;
+      EXPECT_EQ(door.objection(status_with(load_signals(rig).signals.size())).empty(), is_own)
+          << host << " " << guest;
+    }
+  }
+}
+
+TEST(RigDoor, ASmallDifferenceIsEnough) {
+  const auto rig = kConfig / "arm2";
+  const RigDoor door(rig);
+  sample_t sample = sample_of(rig);
+  sample.parts[1].tags[0].tag_id = sample.parts[0].tags[0].tag_id;
+  EXPECT_NE(door.objection(sample).find("does not belong to part"), std::string::npos);
+  sample = sample_of(rig);
+  sample.parts.back().part_id = 99;
+  EXPECT_NE(door.objection(sample).find("part 99"), std::string::npos);
+
+  body_schema_t schema = schema_of(rig);
+  schema.signals[0].signal_name += "x";
+  EXPECT_NE(door.objection(schema), "");
+  schema = schema_of(rig);
+  schema.signals[1].upper_limit += 0.001;
+  EXPECT_NE(door.objection(schema), "");
+  schema = schema_of(rig);
+  schema.part_ids.back() = 99;
+  EXPECT_NE(door.objection(schema), "");
+
+  marker_poses_t poses = poses_of(rig);
+  poses.markers[0].size_m *= 1.01;
+  EXPECT_NE(door.objection(poses), "");
+  poses = poses_of(rig);
+  poses.camera_name = "webcam";
+  EXPECT_NE(door.objection(poses), "");
+
+  camera_info_t info{};
+  info.camera_name = "arm2_camera";
+  info.image_width = 1280;
+  info.image_height = 960;
+  EXPECT_EQ(door.objection(info), "");
+  info.image_height = 720;
+  EXPECT_NE(door.objection(info), "");
+
+  model_health_t health{};
+  part_health_t part{};
+  part.health_part = 6;
+  set_array(health.num_parts, health.part_health, {part});
+  EXPECT_NE(door.objection(health), "");
+}
+
+TEST(RigDoor, AnAnswerToAHoldEchoesNoAction) {
+  const RigDoor door(kConfig / "arm2");
+  motion_status_t status = status_with(0);
+  status.action_id = 3;
+  status.kind = action_command_t::KIND_HOLD;
+  EXPECT_EQ(door.objection(status), "");
+  status.kind = action_command_t::KIND_MOVE;
+  EXPECT_NE(door.objection(status), "");
+  status.action_id = -1;  // nothing was asked of the driver yet
+  EXPECT_EQ(door.objection(status), "");
+}
+
+}  // namespace
+}  // namespace bodyschema

@@ -1,0 +1,139 @@
+// Two processes of one name on a bus. Runs in tests/private_bus.sh.
+
+#include <gtest/gtest.h>
+#include <signal.h>
+
+#include <algorithm>
+#include <chrono>
+#include <fstream>
+#include <memory>
+#include <string>
+#include <vector>
+
+#include "tests/common/bus/bus_test_support.h"
+#include "tests/lcmtypes/example_messages.h"
+
+namespace bodyschema::test {
+namespace {
+
+const char* const kUrl = "udpm://239.255.76.67:7667?ttl=0";
+
+std::int64_t now_us() {
+  return std::chrono::duration_cast<std::chrono::microseconds>(
+             std::chrono::system_clock::now().time_since_epoch())
+      .count();
+}
+
+class Twins : public testing::Test {
+ protected:
+  Twins() : bus_(kUrl, kUrl) {
+    std::ofstream(folder_ / "relay.yaml") << "a: 1\n";
+    bus_.subscribe(kProcessInfo, [this](const process_info_t& info) { infos_.push_back(info); });
+    bus_.subscribe(kMotionStatus, [this](const motion_status_t& s) { answers_.push_back(s); });
+  }
+  std::vector<std::string> relay() const {
+    return {RELAY, "--config", (folder_ / "relay.yaml").string(), "--in", kUrl, "--only-answer"};
+  }
+  /// Whether somebody answers a SAMPLE, and how many do.
+  std::size_t num_answering() {
+    answers_.clear();
+    if (!ask_until(
+            [&] {
+              bus_.publish(kSample, example_sample());
+              bus_.handle(std::chrono::milliseconds(50));
+            },
+            [&] { return !answers_.empty(); })) {
+      return 0;
+    }
+    std::vector<std::int64_t> epochs;
+    for (const auto& answer : answers_) epochs.push_back(answer.epoch);
+    std::sort(epochs.begin(), epochs.end());
+    return static_cast<std::size_t>(std::unique(epochs.begin(), epochs.end()) - epochs.begin());
+  }
+  process_info_t heard_of(pid_t pid) {
+    handle_until(bus_, [&] {
+      return std::any_of(infos_.begin(), infos_.end(), [&](const auto& i) { return i.pid == pid; });
+    });
+    const auto info =
+        std::find_if(infos_.rbegin(), infos_.rend(), [&](const auto& i) { return i.pid == pid; });
+    return info == infos_.rend() ? process_info_t{} : *info;
+  }
+
+  TemporaryFolder folder_;
+  Bus bus_;
+  std::vector<process_info_t> infos_;
+  std::vector<motion_status_t> answers_;
+};
+
+TEST_F(Twins, TheYoungerEndsBeforeItDidAnythingAndSaysWhoIsThere) {
+  Program elder(relay());
+  ASSERT_TRUE(elder.wait_for_output("ready"));
+  Program younger(relay());
+  EXPECT_EQ(younger.wait(), 1);
+  EXPECT_EQ(younger.out(), "") << "it came as far as its loop";
+  EXPECT_NE(
+      younger.err().find("another relay is on this bus: process " + std::to_string(elder.pid())),
+      std::string::npos)
+      << younger.err();
+  EXPECT_EQ(std::count(younger.err().begin(), younger.err().end(), '\n'), 1);
+  EXPECT_EQ(num_answering(), 1U);
+  elder.send_signal(SIGTERM);
+  EXPECT_EQ(elder.wait(), 0);
+}
+
+TEST_F(Twins, OfSeveralThatStartTogetherOneRemains) {
+  std::vector<std::unique_ptr<Program>> twins;
+  for (int n = 0; n < 4; ++n) twins.push_back(std::make_unique<Program>(relay()));
+  int num_left = 0;
+  for (const auto& twin : twins) {
+    if (twin->wait_for_output("ready", 3'000)) {
+      ++num_left;
+      continue;
+    }
+    EXPECT_EQ(twin->wait(), 1);
+  }
+  EXPECT_EQ(num_left, 1);
+  EXPECT_EQ(num_answering(), 1U);
+}
+
+TEST_F(Twins, AfterAKillTheNextOneStarts) {
+  for (int n = 0; n < 5; ++n) {
+    Program program(relay());
+    ASSERT_TRUE(program.wait_for_output("ready")) << program.err();
+    program.send_signal(SIGKILL);
+    EXPECT_EQ(program.wait(), 128 + SIGKILL);
+  }
+}
+
+TEST_F(Twins, OneOnAnotherNameOrARecordingOfItselfDoesNotDisturb) {
+  Program program(relay());
+  ASSERT_TRUE(program.wait_for_output("ready"));
+  process_info_t info = heard_of(program.pid());
+  ASSERT_EQ(info.process_name, "relay");
+  // An elder, as a recording of yesterday has it.
+  process_info_t recorded = info;
+  recorded.start_utime -= 86'400'000'000;
+  recorded.utime -= 86'400'000'000;
+  bus_.publish(kProcessInfo, recorded);
+  info.utime = now_us();
+  info.phase = process_info_t::PHASE_WORKING;
+  process_info_t other = info;
+  other.process_name = "observer";
+  --other.start_utime;
+  bus_.publish(kProcessInfo, other);
+  process_info_t ended = info;
+  ended.phase = process_info_t::PHASE_ENDED;
+  --ended.start_utime;
+  bus_.publish(kProcessInfo, ended);
+  EXPECT_EQ(num_answering(), 1U);
+  // The same without any of these reasons ends it.
+  process_info_t elder = info;
+  --elder.start_utime;
+  elder.phase = process_info_t::PHASE_WORKING;
+  elder.utime = now_us();
+  bus_.publish(kProcessInfo, elder);
+  EXPECT_EQ(program.wait(), 1);
+}
+
+}  // namespace
+}  // namespace bodyschema::test

@@ -1,0 +1,1275 @@
+#include "processes/controller/controller.h"
+
+#include <gtest/gtest.h>
+#include <unistd.h>
+
+#include <deque>
+#include <fstream>
+#include <functional>
+#include <random>
+#include <set>
+
+#include "common/bus/check.h"
+#include "common/bus/convert.h"
+#include "common/config/yaml.h"
+
+namespace bodyschema {
+namespace {
+
+using S = control_status_t;
+using Target = pose_target_t;
+
+constexpr std::int64_t kSecond = 1'000'000;
+constexpr std::int64_t kTick = kSecond / 10;
+
+ControllerConfig test_config() {
+  ControllerConfig config;
+  config.signals = {{"a", -90, 90}, {"b", -1, 1}, {"c", 0, 10}};
+  config.inverse_kinematics = {
+      .tolerance_m = 1e-5, .damping_m = 0.05, .max_iterations = 100, .max_starts = 20};
+  config.reached_m = 0.005;
+  config.max_step = 0.25;
+  config.slow_step = 0.05;
+  config.max_corrections = 1;
+  config.max_correction_m = 0.03;
+  config.max_solutions = 4;
+  config.expiry_us = 60 * kSecond;
+  config.resend_us = 1 * kSecond;
+  config.take_us = 3 * kTick;
+  config.sample_timeout_us = 5 * kSecond;
+  config.max_motion_status_silence_us = 3 * kSecond;
+  config.max_marker_poses_silence_us = 3 * kSecond;
+  config.max_body_schema_silence_us = 3 * kSecond;
+  return config;
+}
+
+/// Three links in a plane, 1, 0.7 and 0.4 m; part 5 is not connected.
+BodySchema planar(std::int64_t version = 1) {
+  BodySchema schema;
+  schema.version = version;
+  schema.parts = {1, 2, 3, 4, 5};
+  schema.root = 1;
+  schema.X_CR.translation() = Eigen::Vector3d(0.1, 0.2, 2);
+  schema.signals = test_config().signals;
+  const double lengths[] = {1, 0.7, 0.4}, turns[] = {M_PI / 180, M_PI / 2, -0.3};
+  for (int i = 0; i < 3; ++i) {
+    Edge edge;
+    edge.from = i + 1;
+    edge.to = i + 2;
+    ScrewJoint joint;
+    joint.signal = i;
+    joint.turn = turns[i];
+    edge.joints.push_back(joint);
+    edge.right.translation() = Eigen::Vector3d(lengths[i], 0, 0);
+    schema.edges.push_back(edge);
+  }
+  UnconnectedPart lonely;
+  lonely.part = 5;
+  schema.unconnected.push_back(lonely);
+  return schema;
+}
+
+model_health_t health_of(std::int64_t version, int from, int to, std::int8_t state) {
+  model_health_t health{};
+  health.schema_version = version;
+  health.worst_position_m = health.worst_rotation_rad = -1;
+  edge_health_t edge{};
+  edge.health_from = from;
+  edge.health_to = to;
+  edge.edge_state = state;
+  edge.median_mahalanobis2 = -1;
+  set_array(health.num_edges, health.edge_health, {edge});
+  return health;
+}
+
+Target position_target(std::int64_t id, const Eigen::Vector3d& p_RT, double keep_s = -1) {
+  Target target{};
+  target.sender = "operator";
+  target.epoch = 77;
+  target.target_id = id;
+  target.target_kind = Target::KIND_POSITION;
+  target.target_part = 4;
+  std::copy(p_RT.begin(), p_RT.end(), target.position_m);
+  target.keep_s = keep_s;
+  return target;
+}
+
+Target other_target(std::int64_t id, std::int8_t kind) {
+  Target target{};
+  target.sender = "operator";
+  target.epoch = 77;
+  target.target_id = id;
+  target.target_kind = kind;
+  target.target_part = -1;
+  return target;
+}
+
+const Eigen::Vector3d kNear(1.9, 0.3, 0), kFar(0.9, -1.2, 0), kBeyond(3, 0, 0);
+
+/// Plays driver, eyes, observer and monitor, and watches that what the controller sends is lawful.
+class Bench {
+ public:
+  explicit Bench(ControllerConfig config = test_config())
+      : config_(config), controller(std::move(config)) {
+    motion.utime = motion.rest_since_utime = 5 * kSecond;
+    motion.action_id = -1;
+    set_array(motion.num_signals, motion.commanded, std::vector<double>{-30, 0.2, 1});
+  }
+
+  /// Lets the clock run in ticks. Every second driver and monitor repeat themselves, as the
+  /// simulator does, whose time stands still at rest.
+  void run(double seconds) {
+    for (std::int64_t end = now + std::llround(seconds * 1e6); now < end; now += kTick) {
+      if (now % kSecond == 0) repeat();
+      serve();
+      take(controller.on_tick(now));
+    }
+  }
+  /// Ticks until `holds`, 30 s at most.
+  bool run_until(const std::function<bool()>& holds) {
+    for (int i = 0; i < 300 && !holds(); ++i) run(0.1);
+    return holds();
+  }
+  bool run_until_state(std::int8_t state) {
+    return run_until([&] { return status.control_state == state; });
+  }
+  void give(const Target& target) {
+    ASSERT_EQ(check(target), "");
+    take(controller.on_pose_target(target));
+  }
+  void say(const motion_status_t& message) {
+    motion = message;
+    if (driver_speaks) take(controller.on_motion_status(motion));
+  }
+  void show_schema() {
+    body_schema_t message = to_message(schema);
+    ASSERT_EQ(check(message), "");
+    take(controller.on_body_schema(message));
+  }
+  void show_frame() {
+    marker_poses_t poses{};
+    poses.utime = motion.utime + kTick;
+    take(controller.on_marker_poses(poses));
+  }
+  void repeat() {
+    say(motion);
+    if (monitor_speaks) show_schema();
+    if (health && monitor_speaks) take(controller.on_model_health(*health));
+  }
+  /// Everything heard, arm at rest at the start.
+  void start() {
+    repeat();
+    if (eyes_open) show_frame();
+    run(0.5);
+  }
+  /// A settled move of somebody; the arm is then at `action`.
+  void settle(const std::string& source, std::int64_t epoch, std::int64_t id,
+              const std::vector<double>& action, std::int8_t purpose = 0) {
+    motion_status_t moving = motion;
+    moving.utime = motion.utime;
+    moving.source = source;
+    moving.epoch = epoch;
+    moving.action_id = id;
+    moving.kind = action_command_t::KIND_MOVE;
+    moving.purpose = purpose;
+    moving.state = motion_status_t::STATE_MOVING;
+    moving.reason = "";
+    moving.rest_since_utime = -1;
+    set_array(moving.num_signals, moving.commanded, action);
+    say(moving);
+    moving.state = motion_status_t::STATE_SETTLED;
+    moving.utime += 4 * kSecond;  // longer than the eyes may be silent by the clock
+    moving.rest_since_utime = moving.utime - kSecond / 20;
+    say(moving);
+    if (eyes_open) show_frame();
+    if (eyes_open && observer_works) show_sample();
+  }
+  void show_sample() {
+    sample_t sample{};
+    sample.utime = motion.utime + kTick;
+    sample.sample_index = num_samples++;
+    sample.source = motion.source;
+    sample.epoch = motion.epoch;
+    sample.action_id = motion.action_id;
+    sample.purpose = motion.purpose;
+    sample.rest_begin_utime = motion.rest_since_utime;
+    sample.rest_end_utime = sample.utime;
+    set_array(sample.num_signals, sample.action, motion.commanded);
+    // The real arm: the schema's, but bent.
+    const Eigen::Vector3d action(motion.commanded.data());
+    std::vector<part_observation_t> parts;
+    for (const auto& [part, X_RB] : planar().predict_all(action)) {
+      if (hidden.count(part)) continue;
+      part_observation_t seen{};
+      seen.part_id = part;
+      Pose X_CB = X_CC_moved * planar().X_CR * X_RB;
+      if (part == 4) X_CB.translation() += bend_m;
+      seen.X_CB = seen.X_CB_other = to_message(X_CB);
+      const double variance = part == 4 ? observation_sd_m * observation_sd_m : 1e-6;
+      to_message(Matrix6d(Matrix6d::Identity() * variance), seen.covariance);
+      seen.has_other = part == 4 && is_ambiguous;
+      seen.error_ratio = seen.has_other ? 2 : 0;
+      parts.push_back(seen);
+    }
+    set_array(sample.num_parts, sample.parts, parts);
+    take(controller.on_sample(sample));
+  }
+  void answer_last_move(std::int8_t state, const std::string& reason = "") {
+    motion_status_t result = motion;
+    const action_command_t& command = moves.back();
+    result.source = command.source;
+    result.epoch = command.epoch;
+    result.action_id = command.action_id;
+    result.kind = command.kind;
+    result.purpose = command.purpose;
+    result.state = state;
+    result.reason = reason;
+    set_array(result.num_signals, result.commanded, command.action);
+    say(result);
+  }
+  void stop(bool latched = true) {
+    motion_status_t message = motion;
+    message.source = "operator";
+    message.epoch = 1;
+    ++message.action_id;
+    message.kind = latched ? action_command_t::KIND_STOP : action_command_t::KIND_RESUME;
+    message.state = latched ? motion_status_t::STATE_STOPPED : motion_status_t::STATE_IDLE;
+    message.reason = latched ? "STOP by operator" : "";
+    message.stop_latched = latched;
+    set_array(message.num_signals, message.commanded, std::vector<double>{});
+    say(message);
+  }
+  /// Where the schema says that the part is now.
+  Eigen::Vector3d part_position() const {
+    return planar().predict(1, 4, Eigen::Vector3d(arm.data()))->X_AB.translation();
+  }
+  bool has_why(const std::string& text) const { return status.why.find(text) != std::string::npos; }
+
+  const ControllerConfig config_;
+  Controller controller;
+  control_status_t status{};
+  motion_status_t motion{};
+  BodySchema schema = planar();
+  std::optional<model_health_t> health;
+  bool driver_speaks = true, eyes_open = true, monitor_speaks = true, observer_works = true;
+  bool driver_serves = true;
+  std::function<std::string(const action_command_t&)> rejects = [](const auto&) { return ""; };
+  std::set<int> hidden;
+  Eigen::Vector3d bend_m = Eigen::Vector3d::Zero();
+  double observation_sd_m = 0.001;
+  bool is_ambiguous = false;
+  Pose X_CC_moved = Pose::Identity();
+  std::int64_t now = 1000 * kSecond;
+  std::int64_t num_samples = 0;
+  std::vector<action_command_t> moves;  ///< as served, each once
+  int num_holds = 0, num_repeats = 0;
+  std::vector<double> arm = {-30, 0.2, 1};
+
+ private:
+  void take(const Controller::Answer& answer) {
+    if (answer.status) {
+      ASSERT_EQ(check(*answer.status), "");
+      status = *answer.status;
+    }
+    if (!answer.command) return;
+    const action_command_t& command = *answer.command;
+    ASSERT_EQ(check(command), "");
+    ASSERT_EQ(command.source, "controller");
+    ASSERT_EQ(command.purpose, action_command_t::PURPOSE_CONTROL);
+    ASSERT_EQ(status.owns_arm, 1) << "commands an arm that is not its own";
+    commands_.push_back(command);
+    if (command.kind == action_command_t::KIND_HOLD) {
+      ++num_holds;
+      return;
+    }
+    ASSERT_EQ(command.kind, action_command_t::KIND_MOVE);
+    ASSERT_EQ(motion.stop_latched, 0);
+    ASSERT_GT(command.expiry_utime, motion.utime);
+    if (!moves.empty() && moves.back().action_id == command.action_id) {
+      ASSERT_EQ(moves.back().action, command.action);
+      ++num_repeats;
+      return;
+    }
+    ASSERT_EQ(status.control_state, S::CONTROL_MOVING);
+    if (!moves.empty()) {
+      ASSERT_GT(command.action_id, moves.back().action_id);
+    }
+    for (std::size_t i = 0; i < arm.size(); ++i) {
+      const Signal& signal = config_.signals[i];
+      ASSERT_GE(command.action[i], signal.lower);
+      ASSERT_LE(command.action[i], signal.upper);
+      ASSERT_LE(std::abs(command.action[i] - arm[i]),
+                (config_.max_step + 1e-9) * (signal.upper - signal.lower));
+    }
+    moves.push_back(command);
+  }
+  /// The driver answers one command a tick.
+  void serve() {
+    if (commands_.empty()) return;
+    const action_command_t command = commands_.front();
+    commands_.pop_front();
+    if (!driver_speaks || !driver_serves) return;
+    if (command.kind == action_command_t::KIND_HOLD) {
+      motion_status_t held = motion;
+      held.source = command.source;
+      held.epoch = command.epoch;
+      held.action_id = command.action_id;
+      held.kind = command.kind;
+      held.state = motion_status_t::STATE_HOLDING;
+      set_array(held.num_signals, held.commanded, std::vector<double>{});
+      say(held);
+    } else if (const std::string reason =
+                   motion.stop_latched ? "stopped: RESUME first" : rejects(command);
+               !reason.empty()) {
+      answer_last_move(motion_status_t::STATE_REJECTED, reason);
+    } else {
+      arm = command.action;
+      settle(command.source, command.epoch, command.action_id, command.action, command.purpose);
+    }
+  }
+
+  std::deque<action_command_t> commands_;
+};
+
+// ---- a target's life
+
+TEST(ControllerTest, ATargetIsReachedInSmallStepsEachSeenAndKept) {
+  Bench bench;
+  bench.start();
+  EXPECT_EQ(bench.status.control_state, S::CONTROL_IDLE);
+  EXPECT_EQ(bench.status.owns_arm, 0);
+  EXPECT_EQ(bench.status.target_id, -1);
+  bench.give(position_target(3, kFar));
+  EXPECT_EQ(bench.status.target_epoch, 77);  // acknowledged at once
+  EXPECT_EQ(bench.status.target_id, 3);
+  EXPECT_EQ(bench.status.owns_arm, 1);
+  EXPECT_TRUE(bench.moves.empty());
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+  EXPECT_GT(bench.moves.size(), 1U);
+  EXPECT_EQ(bench.status.num_moves, static_cast<int>(bench.moves.size()));
+  EXPECT_EQ(bench.num_samples, static_cast<int>(bench.moves.size()));
+  EXPECT_LT((bench.part_position() - kFar).norm(), 1e-4);
+  EXPECT_LT(bench.status.predicted_error_m, 1e-4);
+  EXPECT_NEAR(bench.status.observed_error_m, bench.status.predicted_error_m, 1e-6);
+  EXPECT_EQ(bench.status.target_part, 4);
+  EXPECT_EQ(bench.status.schema_version, 1);
+  EXPECT_EQ(bench.moves.front().epoch, 5 * kSecond);
+  EXPECT_EQ(bench.moves.front().action_id, 0);
+  const std::size_t num_moves = bench.moves.size();
+  bench.run(100);
+  EXPECT_EQ(bench.status.control_state, S::CONTROL_REACHED);
+  EXPECT_EQ(bench.status.owns_arm, 1);
+  EXPECT_EQ(bench.moves.size(), num_moves);
+}
+
+TEST(ControllerTest, ATargetIsKeptSoLongAndTheArmGivenBack) {
+  Bench bench;
+  bench.start();
+  bench.give(position_target(0, kNear, 7));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED));
+  bench.run(6.5);
+  EXPECT_EQ(bench.status.owns_arm, 1);
+  bench.run(1);
+  EXPECT_EQ(bench.status.control_state, S::CONTROL_RELEASED);
+  EXPECT_EQ(bench.status.owns_arm, 0);
+  EXPECT_EQ(bench.num_holds, 0);
+}
+
+TEST(ControllerTest, ARepeatedTargetDoesNothingAndAnOlderOneIsIgnored) {
+  Bench bench;
+  bench.start();
+  bench.give(position_target(5, kNear, 0));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_RELEASED));
+  const std::size_t num_moves = bench.moves.size();
+  Target older = position_target(9, kFar);
+  older.epoch = 76;
+  for (const Target& target : {position_target(5, kNear), position_target(4, kFar), older,
+                               other_target(4, Target::KIND_HOLD)}) {
+    bench.give(target);
+    bench.run(2);
+    EXPECT_EQ(bench.status.target_id, 5);
+    EXPECT_EQ(bench.status.control_state, S::CONTROL_RELEASED);
+    EXPECT_EQ(bench.moves.size(), num_moves);
+  }
+  EXPECT_EQ(bench.num_holds, 0);
+  EXPECT_EQ(bench.controller.counters().at("older POSE_TARGET"), 3);
+}
+
+TEST(ControllerTest, ANewerTargetTakesOverInTheMiddle) {
+  Bench bench;
+  bench.start();
+  bench.give(position_target(0, kFar));
+  ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 1; }));
+  Target newer = position_target(0, kNear);
+  newer.epoch = 78;  // another sender, started later
+  newer.sender = "planner";
+  bench.give(newer);
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED));
+  EXPECT_EQ(bench.status.sender, "planner");
+  EXPECT_LT((bench.part_position() - kNear).norm(), 1e-4);
+}
+
+TEST(ControllerTest, ATargetThatComesWhileAnActionIsUnansweredWaitsForTheAnswer) {
+  Bench bench;
+  bench.start();
+  bench.driver_serves = false;
+  bench.give(position_target(0, kFar));
+  ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 1; }));
+  bench.give(position_target(1, kNear));
+  bench.run(0.5);
+  EXPECT_EQ(bench.moves.size(), 1U);
+  bench.driver_serves = true;
+  bench.answer_last_move(motion_status_t::STATE_REJECTED, "no");
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+  EXPECT_EQ(bench.status.target_id, 1);
+  EXPECT_LT((bench.part_position() - kNear).norm(), 1e-4);
+}
+
+TEST(ControllerTest, HoldStaysUntilAnotherTarget) {
+  Bench bench;
+  bench.start();
+  bench.give(other_target(0, Target::KIND_HOLD));
+  EXPECT_EQ(bench.num_holds, 1);
+  EXPECT_EQ(bench.status.control_state, S::CONTROL_HOLDING);
+  EXPECT_EQ(bench.status.owns_arm, 1);
+  EXPECT_TRUE(bench.has_why("operator"));
+  bench.run(100);
+  EXPECT_EQ(bench.num_holds, 1);  // it was answered
+  EXPECT_EQ(bench.status.control_state, S::CONTROL_HOLDING);
+  bench.give(position_target(1, kNear, 0));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_RELEASED)) << bench.status.why;
+  bench.give(other_target(2, Target::KIND_HOLD));
+  bench.give(other_target(3, Target::KIND_RELEASE));
+  EXPECT_EQ(bench.status.control_state, S::CONTROL_RELEASED);
+  EXPECT_EQ(bench.status.owns_arm, 0);
+}
+
+TEST(ControllerTest, AHoldThatTheDriverDoesNotAnswerIsSentAgainWithTheSameId) {
+  Bench bench;
+  bench.start();
+  bench.driver_serves = false;
+  bench.give(other_target(0, Target::KIND_HOLD));
+  bench.run(5.05);
+  EXPECT_EQ(bench.num_holds, 6);
+  bench.driver_serves = true;
+  bench.run(10);
+  EXPECT_EQ(bench.num_holds, 6);
+}
+
+TEST(ControllerTest, ReleaseInTheMiddleGivesTheArmBack) {
+  Bench bench;
+  bench.start();
+  bench.driver_serves = false;
+  bench.give(position_target(0, kFar));
+  ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 1; }));
+  bench.give(other_target(1, Target::KIND_RELEASE));
+  bench.driver_serves = true;
+  bench.run(10);
+  EXPECT_EQ(bench.moves.size(), 1U);
+  EXPECT_EQ(bench.status.owns_arm, 0);
+  EXPECT_EQ(bench.status.control_state, S::CONTROL_RELEASED);
+}
+
+// ---- start guard
+
+TEST(ControllerTest, NothingIsSentBeforeEveryInputWasHeard) {
+  const struct {
+    const char* input;
+    std::function<void(Bench&)> mute;
+  } cases[] = {{"MOTION_STATUS", [](Bench& b) { b.driver_speaks = false; }},
+               {"BODY_SCHEMA", [](Bench& b) { b.monitor_speaks = false; }},
+               {"MARKER_POSES", [](Bench& b) { b.eyes_open = false; }}};
+  for (const auto& c : cases) {
+    Bench bench;
+    c.mute(bench);
+    bench.start();
+    bench.give(position_target(0, kNear));
+    bench.run(2);
+    EXPECT_EQ(bench.status.control_state, S::CONTROL_WAITING) << c.input;
+    EXPECT_TRUE(bench.has_why(c.input)) << bench.status.why;
+    EXPECT_EQ(bench.status.owns_arm, 0) << "the babbler may be what is missing";
+    bench.run(2);
+    EXPECT_EQ(bench.status.control_state, S::CONTROL_REFUSED) << c.input;
+    EXPECT_TRUE(bench.has_why(c.input)) << bench.status.why;
+    // What comes later does not revive it.
+    bench.driver_speaks = bench.monitor_speaks = bench.eyes_open = true;
+    bench.start();
+    bench.run(10);
+    EXPECT_TRUE(bench.moves.empty());
+    EXPECT_EQ(bench.num_holds, 0);
+    EXPECT_EQ(bench.status.control_state, S::CONTROL_REFUSED);
+  }
+}
+
+TEST(ControllerTest, AnInputThatComesInTimeIsWaitedFor) {
+  Bench bench;
+  bench.monitor_speaks = false;
+  bench.start();
+  bench.give(position_target(0, kNear));
+  bench.run(2);
+  bench.monitor_speaks = true;
+  EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+}
+
+TEST(ControllerTest, AHoldBeforeTheDriverIsHeardIsSentAsSoonAsItIs) {
+  Bench bench;
+  bench.driver_speaks = false;
+  bench.run(2);
+  bench.give(other_target(0, Target::KIND_HOLD));
+  bench.run(5);
+  EXPECT_EQ(bench.num_holds, 0);
+  EXPECT_EQ(bench.status.owns_arm, 1);
+  bench.driver_speaks = true;
+  bench.repeat();
+  EXPECT_EQ(bench.num_holds, 1);
+}
+
+TEST(ControllerTest, FromAPositionThatWasNotHeardItDoesNotMove) {
+  // A restarted controller hears the answer to a rejection, which says nothing about the arm.
+  const auto rejected = [](Bench& bench) {
+    motion_status_t message = bench.motion;
+    message.source = "motor_babbler";
+    message.action_id = 12;
+    message.state = motion_status_t::STATE_REJECTED;
+    message.reason = "collision";
+    bench.motion = message;
+  };
+  Bench bench;
+  rejected(bench);
+  bench.start();
+  bench.give(position_target(0, kNear));
+  bench.run(20);
+  EXPECT_TRUE(bench.moves.empty());
+  EXPECT_EQ(bench.status.control_state, S::CONTROL_REFUSED);
+  EXPECT_TRUE(bench.has_why("where the arm is")) << bench.status.why;
+
+  // The SAMPLE of this rest tells it.
+  Bench second;
+  rejected(second);
+  second.motion.commanded = {-30, 0.2, 1};
+  second.start();
+  second.show_sample();
+  second.give(position_target(0, kNear));
+  EXPECT_TRUE(second.run_until_state(S::CONTROL_REACHED)) << second.status.why;
+}
+
+TEST(ControllerTest, TakingTheArmWaitsForRestAndForTheBabblersSample) {
+  Bench bench;
+  bench.start();
+  bench.observer_works = false;
+  bench.arm = {20, 0.1, 4};
+  bench.settle("motor_babbler", 1, 12, bench.arm);
+  motion_status_t moving = bench.motion;
+  moving.state = motion_status_t::STATE_MOVING;
+  moving.rest_since_utime = -1;
+  const motion_status_t settled = bench.motion;
+  bench.say(moving);
+  bench.give(position_target(0, kNear));
+  bench.run(2);
+  EXPECT_EQ(bench.status.owns_arm, 1);
+  EXPECT_TRUE(bench.has_why("rest")) << bench.status.why;
+  bench.say(settled);
+  bench.run(2);
+  EXPECT_TRUE(bench.has_why("SAMPLE of action 12 of motor_babbler")) << bench.status.why;
+  EXPECT_TRUE(bench.moves.empty());
+  bench.observer_works = true;
+  bench.show_sample();
+  EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+}
+
+TEST(ControllerTest, ASampleThatNeverComesDoesNotBlockTheArmForEver) {
+  Bench bench;
+  bench.start();
+  bench.observer_works = false;
+  bench.arm = {20, 0.1, 4};
+  bench.settle("motor_babbler", 1, 12, bench.arm);
+  bench.give(position_target(0, kNear));
+  bench.run(4.5);
+  EXPECT_TRUE(bench.moves.empty());
+  bench.observer_works = true;
+  EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+}
+
+TEST(ControllerTest, WhoMovesTheArmInBetweenIsFollowedFromWhereItIsThen) {
+  Bench bench;
+  bench.start();
+  bench.give(position_target(0, kFar));
+  ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 2; }));
+  bench.arm = {60, -0.5, 9};
+  bench.settle("motor_babbler", 1, 30, bench.arm);
+  // The bench insists on steps from there of at most max_step.
+  EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+}
+
+// ---- what cannot be served
+
+TEST(ControllerTest, WhatCannotBeServedIsRefusedAndTheArmIsNotMoved) {
+  Target unknown = position_target(0, kNear), unconnected = unknown;
+  unknown.target_part = 42;
+  unconnected.target_part = 5;
+  const struct {
+    Target target;
+    const char* why;
+  } cases[] = {{unknown, "no part 42"},
+               {unconnected, "not connected"},
+               {position_target(0, kBeyond), "no nearer than 900.0 mm"}};
+  for (const auto& c : cases) {
+    Bench bench;
+    bench.start();
+    bench.give(c.target);
+    bench.run(2);
+    EXPECT_EQ(bench.status.control_state, S::CONTROL_REFUSED);
+    EXPECT_TRUE(bench.has_why(c.why)) << bench.status.why;
+    EXPECT_EQ(bench.status.owns_arm, 0);
+    EXPECT_EQ(bench.status.num_moves, 0);
+    EXPECT_TRUE(bench.moves.empty());
+    EXPECT_EQ(bench.num_holds, 0);
+  }
+  Bench bench;
+  bench.start();
+  bench.give(position_target(0, kBeyond));
+  bench.run(2);
+  EXPECT_NEAR(bench.status.predicted_error_m, 0.9, 1e-3);
+}
+
+TEST(ControllerTest, ARejectedWayIsReplacedByAnother) {
+  Bench bench;
+  bench.start();
+  int num_rejections = 0;
+  std::optional<std::vector<double>> first;
+  bench.rejects = [&](const action_command_t& command) -> std::string {
+    if (!first) first = command.action;
+    return num_rejections++ < 2 ? "link2 touches link4" : "";
+  };
+  bench.give(position_target(0, kNear));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+  EXPECT_GT(num_rejections, 2);
+  EXPECT_NE(bench.arm, *first);
+  EXPECT_LT((bench.part_position() - kNear).norm(), 1e-4);
+  EXPECT_EQ(bench.controller.counters().at("action rejected"), 2);
+  EXPECT_EQ(bench.status.num_moves, static_cast<int>(bench.moves.size()) - 2);
+}
+
+TEST(ControllerTest, ADriverThatRejectsEveryWayIsNotAskedForEver) {
+  Bench bench;
+  bench.start();
+  bench.rejects = [](const auto&) { return "link2 touches link4"; };
+  bench.give(position_target(0, kNear));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REFUSED));
+  EXPECT_LE(bench.moves.size(), 4U);
+  EXPECT_GE(bench.moves.size(), 2U);
+  EXPECT_TRUE(bench.has_why("link2 touches link4")) << bench.status.why;
+  EXPECT_EQ(bench.status.owns_arm, 0);
+  EXPECT_EQ(bench.status.num_moves, 0);
+}
+
+TEST(ControllerTest, AnExpiredActionIsGivenAgainWithAnotherIdAFewTimes) {
+  Bench bench;
+  bench.start();
+  bench.driver_serves = false;
+  bench.give(position_target(0, kNear));
+  ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 1; }));
+  bench.answer_last_move(motion_status_t::STATE_EXPIRED, "expired 5 us ago");
+  ASSERT_EQ(bench.moves.size(), 2U);
+  bench.answer_last_move(motion_status_t::STATE_EXPIRED, "expired 5 us ago");
+  ASSERT_EQ(bench.moves.size(), 3U);
+  bench.answer_last_move(motion_status_t::STATE_EXPIRED, "expired 5 us ago");
+  EXPECT_EQ(bench.moves.size(), 3U);
+  EXPECT_EQ(bench.status.control_state, S::CONTROL_REFUSED);
+  EXPECT_TRUE(bench.has_why("expire")) << bench.status.why;
+}
+
+TEST(ControllerTest, AnActionWithoutAnAnswerIsSentAgainWithTheSameId) {
+  Bench bench;
+  bench.start();
+  bench.driver_serves = false;
+  bench.give(position_target(0, kNear));
+  ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 1; }));
+  bench.run(10);  // the driver goes on repeating its status
+  EXPECT_EQ(bench.moves.size(), 1U);
+  EXPECT_EQ(bench.num_repeats, 9);
+  bench.driver_serves = true;
+  EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED));
+}
+
+// ---- silence
+
+struct Silence {
+  const char* input;
+  std::function<void(Bench&, bool speaks)> set;
+};
+
+const Silence kSilences[] = {
+    {"MOTION_STATUS", [](Bench& b, bool speaks) { b.driver_speaks = speaks; }},
+    {"BODY_SCHEMA", [](Bench& b, bool speaks) { b.monitor_speaks = speaks; }},
+    {"MARKER_POSES", [](Bench& b, bool speaks) { b.eyes_open = speaks; }},
+    {"SAMPLE", [](Bench& b, bool speaks) { b.observer_works = speaks; }}};
+
+TEST(ControllerTest, WhenAnInputFallsSilentTheArmIsHeldAndStaysSo) {
+  for (const Silence& silence : kSilences) {
+    Bench bench;
+    bench.start();
+    bench.give(position_target(0, kFar));
+    ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 1; }));
+    // Without an answer or a sample of the next step it cannot go on anyway; for the schema the
+    // arm must be kept busy.
+    silence.set(bench, false);
+    const bool is_schema = std::string(silence.input) == "BODY_SCHEMA";
+    if (is_schema) bench.driver_serves = false;
+    const std::int64_t silent_since = bench.now;
+    ASSERT_TRUE(bench.run_until([&] { return bench.num_holds > 0; })) << silence.input;
+    const double waited_s = static_cast<double>(bench.now - silent_since) / kSecond;
+    EXPECT_GE(waited_s, 1.9) << silence.input;  // it was heard up to a second before
+    EXPECT_LE(waited_s, std::string(silence.input) == "SAMPLE" ? 5.3 : 3.3) << silence.input;
+    EXPECT_EQ(bench.status.control_state, S::CONTROL_HOLDING);
+    EXPECT_EQ(bench.status.owns_arm, 1);
+    EXPECT_TRUE(bench.has_why(silence.input)) << bench.status.why;
+    // No automatic resume.
+    const std::size_t num_moves = bench.moves.size();
+    silence.set(bench, true);
+    bench.driver_serves = true;
+    bench.repeat();
+    bench.show_frame();
+    bench.run(20);
+    EXPECT_EQ(bench.moves.size(), num_moves) << silence.input;
+    EXPECT_EQ(bench.status.control_state, S::CONTROL_HOLDING);
+    // The same target repeated does not resume it either; a new one does.
+    bench.give(position_target(0, kFar));
+    bench.run(5);
+    EXPECT_EQ(bench.moves.size(), num_moves) << silence.input;
+    bench.arm = bench.motion.commanded.size() == 3 ? bench.motion.commanded : bench.arm;
+    bench.give(position_target(1, kFar));
+    EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << silence.input << bench.status.why;
+  }
+}
+
+TEST(ControllerTest, SilenceWhileNothingIsServedDoesNothing) {
+  for (const Silence& silence : kSilences) {
+    Bench bench;
+    bench.start();
+    silence.set(bench, false);
+    bench.run(60);
+    EXPECT_EQ(bench.status.control_state, S::CONTROL_IDLE);
+    EXPECT_EQ(bench.num_holds, 0);
+    silence.set(bench, true);
+    bench.repeat();
+    bench.run(1);
+    bench.give(position_target(0, kFar));
+    EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << silence.input << bench.status.why;
+  }
+}
+
+TEST(ControllerTest, WhatFellSilentBeforeTheTargetCameIsNotMovedBy) {
+  for (const int which : {0, 1}) {
+    Bench bench;
+    bench.start();
+    bench.give(position_target(0, kNear));
+    ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED));
+    const std::size_t num_moves = bench.moves.size();
+    kSilences[which].set(bench, false);
+    bench.run(5);
+    bench.give(position_target(1, kFar));
+    bench.run(5);
+    EXPECT_EQ(bench.moves.size(), num_moves);
+    EXPECT_EQ(bench.status.control_state, S::CONTROL_HOLDING);
+    EXPECT_TRUE(bench.has_why(kSilences[which].input)) << bench.status.why;
+  }
+}
+
+// A live driver's time runs on at rest; frames must keep up with it.
+TEST(ControllerTest, InLiveTimeEyesThatLagOrCloseAreSeenByTheDriversTime) {
+  for (const bool lag : {false, true}) {
+    Bench bench;
+    bench.start();
+    bench.observer_works = false;  // keeps the target open: its sample does not come
+    bench.arm = {0, 0, 0};
+    bench.settle("motor_babbler", 1, 5, bench.arm);
+    bench.give(position_target(0, kFar));
+    const std::int64_t closed = bench.now;
+    std::int64_t num_frames = 0;
+    while (bench.num_holds == 0 && bench.now < closed + 10 * kSecond) {
+      bench.motion.utime += kTick;
+      bench.say(bench.motion);
+      if (lag) {
+        marker_poses_t poses{};
+        poses.utime = bench.motion.utime - 4 * kSecond;
+        poses.image_seq = num_frames++;
+        bench.controller.on_marker_poses(poses);
+      }
+      bench.run(0.1);
+    }
+    EXPECT_EQ(bench.num_holds, 1) << lag;
+    EXPECT_TRUE(bench.has_why("MARKER_POSES")) << bench.status.why;
+    EXPECT_LE(bench.now - closed, 35 * kTick);
+  }
+}
+
+TEST(ControllerTest, AFrameFromFarAheadDoesNotOpenTheEyes) {
+  Bench bench;
+  bench.start();
+  marker_poses_t poses{};
+  poses.utime = std::int64_t{1} << 60;
+  bench.controller.on_marker_poses(poses);
+  bench.give(position_target(0, kFar));
+  ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 1; }));
+  bench.eyes_open = false;
+  EXPECT_TRUE(bench.run_until_state(S::CONTROL_HOLDING));
+  EXPECT_TRUE(bench.has_why("MARKER_POSES")) << bench.status.why;
+}
+
+// ---- stop, hold and restarts of others
+
+TEST(ControllerTest, StopDropsTheTargetInEveryStateAndResumeDoesNotTakeItUp) {
+  for (const std::int8_t state :
+       {S::CONTROL_WAITING, S::CONTROL_MOVING, S::CONTROL_REACHED, S::CONTROL_LENT}) {
+    Bench bench;
+    bench.start();
+    if (state == S::CONTROL_MOVING) bench.driver_serves = false;
+    if (state == S::CONTROL_LENT) {
+      bench.health = health_of(1, 2, 3, schema_edge_t::EDGE_INVALID);
+      bench.repeat();
+    }
+    bench.give(position_target(0, kFar));
+    ASSERT_TRUE(bench.run_until_state(state));
+    const std::size_t num_moves = bench.moves.size();
+    bench.stop();
+    EXPECT_EQ(bench.status.control_state, S::CONTROL_HOLDING) << int{state};
+    EXPECT_EQ(bench.status.owns_arm, 1);
+    EXPECT_TRUE(bench.has_why("STOP by operator")) << bench.status.why;
+    bench.run(5);
+    bench.driver_serves = true;
+    bench.health.reset();
+    bench.stop(false);
+    bench.run(20);
+    EXPECT_EQ(bench.moves.size(), num_moves) << int{state};
+    EXPECT_EQ(bench.status.control_state, S::CONTROL_HOLDING);
+  }
+}
+
+TEST(ControllerTest, WhileStoppedATargetIsRefused) {
+  Bench bench;
+  bench.start();
+  bench.stop();
+  EXPECT_EQ(bench.status.control_state, S::CONTROL_IDLE);  // none of its business
+  bench.give(position_target(0, kNear));
+  EXPECT_EQ(bench.status.control_state, S::CONTROL_REFUSED);
+  EXPECT_TRUE(bench.has_why("resume")) << bench.status.why;
+  bench.stop(false);
+  bench.run(10);
+  EXPECT_TRUE(bench.moves.empty());
+}
+
+TEST(ControllerTest, WhoTellsTheDriverToHoldIsObeyed) {
+  Bench bench;
+  bench.start();
+  bench.give(position_target(0, kFar));
+  ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 1; }));
+  motion_status_t held = bench.motion;
+  held.source = "console";
+  held.kind = action_command_t::KIND_HOLD;
+  held.state = motion_status_t::STATE_HOLDING;
+  bench.say(held);
+  const std::size_t num_moves = bench.moves.size();
+  EXPECT_EQ(bench.status.control_state, S::CONTROL_HOLDING);
+  EXPECT_TRUE(bench.has_why("console")) << bench.status.why;
+  bench.run(10);
+  EXPECT_EQ(bench.moves.size(), num_moves);
+  // The driver goes on repeating that answer; it does not stand in a new target's way.
+  bench.give(position_target(1, kFar));
+  EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+}
+
+TEST(ControllerTest, ADriverThatBeginsAnewInTheMiddleIsHeld) {
+  const struct {
+    const char* what;
+    std::function<void(motion_status_t&)> go_back;
+  } cases[] = {{"its time goes back",
+                [](motion_status_t& m) {
+                  m.utime = m.rest_since_utime = kSecond;
+                  m.source = "";
+                  m.epoch = 0;
+                  m.action_id = -1;
+                  m.state = motion_status_t::STATE_IDLE;
+                }},
+               {"its answers go back", [](motion_status_t& m) { --m.action_id; }}};
+  for (const auto& c : cases) {
+    Bench bench;
+    bench.start();
+    bench.give(position_target(0, kFar));
+    ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 2; }));
+    bench.driver_serves = false;
+    bench.run(0.5);
+    motion_status_t back = bench.motion;
+    c.go_back(back);
+    bench.say(back);
+    EXPECT_EQ(bench.status.control_state, S::CONTROL_HOLDING) << c.what;
+    EXPECT_EQ(bench.num_holds, 1) << c.what;
+    EXPECT_TRUE(bench.has_why("began anew")) << bench.status.why;
+    const std::size_t num_moves = bench.moves.size();
+    bench.run(20);
+    EXPECT_EQ(bench.moves.size(), num_moves) << c.what;
+  }
+}
+
+// ---- the schema changes
+
+TEST(ControllerTest, WithAnInvalidEdgeOnTheWayTheArmIsLentAndTakenBack) {
+  for (const bool by_monitor : {false, true}) {
+    Bench bench;
+    bench.start();
+    bench.give(position_target(0, kFar));
+    ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 1; }));
+    if (by_monitor) {
+      bench.health = health_of(1, 2, 3, schema_edge_t::EDGE_INVALID);
+    } else {
+      bench.schema.version = 2;
+      bench.schema.edges[1].state = EdgeState::kInvalid;
+    }
+    bench.repeat();
+    ASSERT_TRUE(bench.run_until_state(S::CONTROL_LENT));  // the action under way is finished
+    const std::size_t num_moves = bench.moves.size();
+    EXPECT_LE(num_moves, 2U);
+    EXPECT_EQ(bench.status.owns_arm, 0);
+    EXPECT_TRUE(bench.has_why("2–3")) << bench.status.why;
+    // The babbler probes.
+    for (int i = 0; i < 3; ++i) {
+      bench.arm = {10.0 * i, 0.1 * i, 1.0 * i};
+      bench.settle("motor_babbler", 1, 20 + i, bench.arm);
+      bench.run(1);
+    }
+    EXPECT_EQ(bench.moves.size(), num_moves);
+    EXPECT_EQ(bench.num_holds, 0);
+    bench.health.reset();
+    bench.schema = planar(3);
+    bench.repeat();
+    EXPECT_EQ(bench.status.owns_arm, 1);
+    EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+    EXPECT_EQ(bench.status.target_id, 0);
+  }
+}
+
+TEST(ControllerTest, AnInvalidEdgeBesideTheWayDoesNotMatter) {
+  Bench bench;
+  bench.schema.edges[2].state = EdgeState::kInvalid;
+  bench.start();
+  Target target = position_target(
+      0, {0.7 * std::cos(0.4) + 1 * std::cos(0.1), 0.7 * std::sin(0.4) + 1 * std::sin(0.1), 0});
+  target.target_part = 3;
+  bench.give(target);
+  EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+}
+
+TEST(ControllerTest, WithADoubtfulEdgeItGoesInSmallSteps) {
+  for (const auto state : {EdgeState::kSuspect, EdgeState::kProvisional}) {
+    Bench bench;
+    bench.schema.edges[0].state = state;
+    bench.start();
+    bench.give(position_target(0, kFar));
+    std::vector<double> before = bench.arm;
+    ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED));
+    for (const action_command_t& move : bench.moves) {
+      for (std::size_t i = 0; i < 3; ++i) {
+        const Signal& signal = bench.config_.signals[i];
+        EXPECT_LE(std::abs(move.action[i] - before[i]), 0.0501 * (signal.upper - signal.lower));
+      }
+      before = move.action;
+    }
+  }
+}
+
+TEST(ControllerTest, ANewSchemaInTheMiddleIsPlannedWithAnew) {
+  Bench bench;
+  bench.start();
+  bench.give(position_target(0, kFar));
+  ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 1; }));
+  bench.schema.version = 2;
+  bench.schema.edges[2].right.translation().x() = 0.5;  // a longer tool
+  bench.hidden = {4};
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED));
+  EXPECT_EQ(bench.status.schema_version, 2);
+  const auto X_RB = bench.schema.predict(1, 4, Eigen::Vector3d(bench.arm.data()));
+  EXPECT_LT((X_RB->X_AB.translation() - kFar).norm(), 1e-4);
+  EXPECT_EQ(bench.status.observed_error_m, -1);
+  EXPECT_TRUE(bench.has_why("not seen")) << bench.status.why;
+}
+
+TEST(ControllerTest, APartThatIsLostInTheMiddleEndsTheTarget) {
+  Bench bench;
+  bench.start();
+  bench.give(position_target(0, kFar));
+  ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 1; }));
+  bench.schema.version = 2;
+  bench.schema.edges.pop_back();
+  UnconnectedPart lost;
+  lost.part = 4;
+  bench.schema.unconnected.push_back(lost);
+  bench.repeat();
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REFUSED));
+  EXPECT_LE(bench.moves.size(), 2U);
+  EXPECT_EQ(bench.status.owns_arm, 0);
+  EXPECT_TRUE(bench.has_why("not connected")) << bench.status.why;
+}
+
+TEST(ControllerTest, MessagesOfAnotherRigAreRefusedAndCounted) {
+  Bench bench;
+  bench.start();
+  body_schema_t schema = to_message(planar(9));
+  schema.signals[1].signal_name = "q2";
+  bench.controller.on_body_schema(schema);
+  schema = to_message(planar(9));
+  schema.signals[1].upper_limit = 2;
+  bench.controller.on_body_schema(schema);
+  bench.controller.on_body_schema(to_message(planar(0)));
+  motion_status_t motion = bench.motion;
+  motion.rest_since_utime = -1;
+  motion.utime += kSecond;
+  set_array(motion.num_signals, motion.commanded, std::vector<double>{1, 2});
+  bench.controller.on_motion_status(motion);
+  sample_t sample{};
+  bench.controller.on_sample(sample);
+  EXPECT_EQ(bench.controller.counters().at("refused BODY_SCHEMA"), 2);
+  EXPECT_EQ(bench.controller.counters().at("older BODY_SCHEMA"), 1);
+  EXPECT_EQ(bench.controller.counters().at("refused MOTION_STATUS"), 1);
+  EXPECT_EQ(bench.controller.counters().at("refused SAMPLE"), 1);
+  bench.give(position_target(0, kNear));
+  EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED));
+  EXPECT_EQ(bench.status.schema_version, 1);
+}
+
+TEST(ControllerTest, AnOlderSchemaCountsOnlyAfterTheNewerFellSilent) {
+  Bench bench;
+  bench.schema = planar(7);
+  bench.start();
+  bench.schema = planar(2);
+  bench.run(2);
+  EXPECT_EQ(bench.controller.status().schema_version, 7);
+  bench.run(5);
+  EXPECT_EQ(bench.controller.status().schema_version, 2);
+}
+
+// ---- what is seen at the end
+
+TEST(ControllerTest, WhatIsSeenAtTheEndCorrectsOnce) {
+  Bench bench;
+  bench.bend_m = Eigen::Vector3d(0.01, -0.005, 0);
+  bench.start();
+  bench.give(position_target(0, kNear));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED));
+  EXPECT_LT(bench.status.observed_error_m, 0.001);
+  EXPECT_NEAR(bench.status.predicted_error_m, bench.bend_m.norm(), 0.001);
+  EXPECT_TRUE(bench.has_why("seen there")) << bench.status.why;
+}
+
+TEST(ControllerTest, WhatIsSeenUnsurelyCorrectsNothing) {
+  for (const bool is_ambiguous : {false, true}) {
+    Bench bench;
+    bench.bend_m = Eigen::Vector3d(0.01, -0.005, 0);
+    bench.is_ambiguous = is_ambiguous;
+    if (!is_ambiguous) bench.observation_sd_m = 0.01;
+    bench.start();
+    bench.give(position_target(0, kNear));
+    ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED));
+    EXPECT_NEAR(bench.status.observed_error_m, bench.bend_m.norm(), 1e-3);
+    EXPECT_LT(bench.status.predicted_error_m, 1e-4);
+  }
+}
+
+TEST(ControllerTest, ACameraThatWasMovedIsSeenByTheRoot) {
+  Bench bench;
+  bench.X_CC_moved.translation() = Eigen::Vector3d(0.2, 0, 0.1);
+  bench.start();
+  bench.give(position_target(0, kNear));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED));
+  EXPECT_LT(bench.status.observed_error_m, 1e-4);
+}
+
+TEST(ControllerTest, WhatIsSeenTooFarOffIsToldButNotBelieved) {
+  Bench bench;
+  bench.bend_m = Eigen::Vector3d(0.3, 0, 0);
+  bench.start();
+  bench.give(position_target(0, kNear));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED));
+  EXPECT_NEAR(bench.status.observed_error_m, 0.3, 1e-4);
+  EXPECT_LT(bench.status.predicted_error_m, 1e-4);
+  EXPECT_TRUE(bench.has_why("300.0 mm away")) << bench.status.why;
+}
+
+// ---- restarts of its own
+
+/// The world goes on, the controller is killed and started again.
+Bench restarted(const Bench& before, const std::filesystem::path& file) {
+  std::ofstream(file) << before.controller.state_text();
+  Bench after;
+  after.motion = before.motion;
+  after.arm = before.arm;
+  after.moves = before.moves;
+  after.num_samples = before.num_samples;
+  after.controller.restore(file);
+  std::filesystem::remove(file);
+  return after;
+}
+
+std::filesystem::path state_file() {
+  return std::filesystem::path(testing::TempDir()) /
+         ("controller_state_" + std::to_string(getpid()) + ".yaml");
+}
+
+TEST(ControllerTest, AHoldSurvivesARestart) {
+  const auto in_hold = [](Bench& b) { b.give(other_target(4, Target::KIND_HOLD)); };
+  const auto in_fault = [](Bench& b) {
+    b.give(position_target(4, kFar));
+    b.run_until([&] { return b.moves.size() == 1; });
+    b.observer_works = false;
+    b.run_until_state(S::CONTROL_HOLDING);
+  };
+  const auto kept = [](Bench& b) {
+    b.give(position_target(4, kNear, -1));
+    b.run_until_state(S::CONTROL_REACHED);
+  };
+  for (const std::function<void(Bench&)>& bring :
+       {std::function<void(Bench&)>(in_hold), std::function<void(Bench&)>(in_fault),
+        std::function<void(Bench&)>(kept)}) {
+    Bench before;
+    before.start();
+    bring(before);
+    Bench after = restarted(before, state_file());
+    EXPECT_EQ(after.controller.status().control_state, S::CONTROL_HOLDING);
+    EXPECT_EQ(after.controller.status().owns_arm, 1);
+    EXPECT_EQ(after.controller.status().target_id, 4);  // still acknowledged
+    after.start();
+    EXPECT_EQ(after.num_holds, 1);
+    after.give(position_target(4, kNear));
+    after.run(10);
+    EXPECT_EQ(after.moves.size(), before.moves.size());
+    EXPECT_EQ(after.status.control_state, S::CONTROL_HOLDING);
+    after.show_sample();  // where the arm is; the bench insists on steps from there
+    if (before.motion.commanded.size() != 3) continue;
+    after.give(position_target(5, kFar));
+    EXPECT_TRUE(after.run_until_state(S::CONTROL_REACHED)) << after.status.why;
+  }
+}
+
+TEST(ControllerTest, ATargetInProgressIsNotContinuedByItselfAfterARestart) {
+  Bench before;
+  before.start();
+  before.give(position_target(4, kFar));
+  ASSERT_TRUE(before.run_until([&] { return before.moves.size() == 1; }));
+  Bench after = restarted(before, state_file());
+  after.start();
+  after.run(10);
+  EXPECT_EQ(after.moves.size(), before.moves.size());
+  EXPECT_EQ(after.num_holds, 0);
+  EXPECT_EQ(after.status.control_state, S::CONTROL_IDLE);
+  EXPECT_EQ(after.status.owns_arm, 0);
+  EXPECT_EQ(after.status.target_id, -1);  // so its sender repeats it
+  EXPECT_TRUE(after.has_why("target 4 of operator")) << after.status.why;
+  after.give(position_target(3, kNear));  // older
+  after.run(2);
+  EXPECT_EQ(after.status.control_state, S::CONTROL_IDLE);
+  after.give(position_target(4, kFar));
+  EXPECT_TRUE(after.run_until_state(S::CONTROL_REACHED)) << after.status.why;
+  // The bench insists on ids that were never used before.
+}
+
+TEST(ControllerTest, AStateFileOfSomethingElseIsRefused) {
+  std::ofstream(state_file()) << "epoch: 1\nnext_action_id: -3\n";
+  EXPECT_THROW(Controller(test_config()).restore(state_file()), ConfigError);
+  std::filesystem::remove(state_file());
+}
+
+TEST(ControllerTest, ItsStatusIsToldOnChangeAndOnceASecond) {
+  Controller controller(test_config());
+  int num_told = 0;
+  for (int i = 0; i < 100; ++i) num_told += controller.on_tick(i * kTick).status.has_value();
+  EXPECT_EQ(num_told, 10);
+}
+
+TEST(ControllerTest, TheConfigurationIsReadInSiUnits) {
+  const ControllerConfig config =
+      ControllerConfig::load(std::string(BODYSCHEMA_CONFIG) + "/arm7/controller.yaml");
+  EXPECT_EQ(config.signals.size(), 7U);
+  EXPECT_EQ(config.resend_us, 1 * kSecond);
+  EXPECT_EQ(config.max_marker_poses_silence_us, 3 * kSecond);
+  EXPECT_LT(config.slow_step, config.max_step);
+}
+
+// Anything in any order: Bench asserts that every message makes sense, that nothing moves an arm
+// that is not the controller's, that ids are new and steps small.
+TEST(ControllerTest, WhateverHappensItsCommandsAreLawful) {
+  std::mt19937_64 rng(8);
+  std::size_t num_moves = 0, num_holds = 0;
+  std::set<std::int8_t> states;
+  for (int run = 0; run < 400 && !testing::Test::HasFatalFailure(); ++run) {
+    Bench bench;
+    if (rng() % 4) bench.start();
+    std::int64_t target_id = 0, babble_id = 0;
+    for (int event = 0; event < 60 && !testing::Test::HasFatalFailure(); ++event) {
+      switch (rng() % 16) {
+        case 0:
+        case 1:
+          bench.give(position_target(target_id++,
+                                     rng() % 3   ? kFar
+                                     : rng() % 2 ? kNear
+                                                 : kBeyond,
+                                     rng() % 2 ? -1 : 1));
+          break;
+        case 2:
+          bench.give(other_target(target_id++, Target::KIND_HOLD));
+          break;
+        case 3:
+          bench.give(other_target(target_id++, Target::KIND_RELEASE));
+          break;
+        case 4:
+          bench.driver_speaks = rng() % 3;
+          break;
+        case 5:
+          bench.driver_serves = rng() % 3;
+          break;
+        case 6:
+          bench.eyes_open = rng() % 3;
+          break;
+        case 7:
+          bench.monitor_speaks = rng() % 3;
+          break;
+        case 8:
+          bench.observer_works = rng() % 3;
+          break;
+        case 9:
+          if (bench.driver_speaks) bench.stop(!bench.motion.stop_latched);
+          break;
+        case 10:
+          if (bench.motion.stop_latched || !bench.driver_speaks) break;
+          bench.arm = {bench.arm[1] * 50, -bench.arm[1], 3};
+          bench.settle("motor_babbler", 1, babble_id++, bench.arm);
+          break;
+        case 11:
+          bench.schema.version += rng() % 2;
+          break;
+        case 12:
+          bench.health = health_of(bench.schema.version, 2, 3, static_cast<std::int8_t>(rng() % 4));
+          break;
+        case 13:
+          if (rng() % 4 == 0) bench.motion.utime -= kSecond;
+          break;
+        case 14:
+          if (!bench.moves.empty() && !bench.motion.stop_latched)
+            bench.answer_last_move(
+                rng() % 2 ? motion_status_t::STATE_REJECTED : motion_status_t::STATE_EXPIRED,
+                "because");
+          break;
+        default:
+          bench.run(static_cast<double>(rng() % 40) / 10);
+      }
+      if (rng() % 3) bench.run(0.5);
+      states.insert(bench.status.control_state);
+    }
+    num_moves += bench.moves.size();
+    num_holds += bench.num_holds;
+  }
+  EXPECT_GT(num_moves, 200U);
+  EXPECT_GT(num_holds, 300U);
+  EXPECT_EQ(states.size(), 8U) << "every state was there";
+}
+
+}  // namespace
+}  // namespace bodyschema

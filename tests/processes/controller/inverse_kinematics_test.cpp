@@ -1,0 +1,250 @@
+#include "processes/controller/inverse_kinematics.h"
+
+#include <gtest/gtest.h>
+
+#include <random>
+
+#include "tests/support/synthetic_robot.h"
+
+namespace bodyschema {
+namespace {
+
+using test::Rng;
+
+const InverseKinematicsOptions kOptions{
+    .tolerance_m = 1e-4, .damping_m = 0.05, .max_iterations = 100, .max_starts = 20};
+
+/// A schema without noise, with gains and offsets as learned ones have them.
+BodySchema schema_of(const test::SyntheticRobot& robot) {
+  BodySchema schema;
+  schema.version = 1;
+  schema.complete = true;
+  schema.signals = robot.signals;
+  schema.root = robot.links.front().part;
+  schema.X_CR = robot.X_CR;
+  for (const test::TrueLink& link : robot.links) {
+    schema.parts.push_back(link.part);
+    if (link.parent < 0) continue;
+    Edge edge;
+    edge.from = link.parent;
+    edge.to = link.part;
+    edge.left = link.X_before;
+    if (link.signal >= 0) {
+      ScrewJoint joint;
+      joint.signal = link.signal;
+      joint.gain = 0.5;
+      joint.offset = -0.5 * link.zero;
+      joint.turn = 2 * link.turn;
+      joint.slide = 2 * link.slide;
+      joint.X_after = link.X_after;
+      edge.joints.push_back(joint);
+    } else {
+      edge.right = link.X_after;
+    }
+    schema.edges.push_back(edge);
+  }
+  return schema;
+}
+
+BodySchema seven_joints(std::uint64_t seed) {
+  Rng rng(seed);
+  return schema_of(test::chapter_robot("d", rng));
+}
+
+Eigen::VectorXd random_action(const BodySchema& schema, Rng& rng) {
+  Eigen::VectorXd action(schema.signals.size());
+  for (std::size_t i = 0; i < schema.signals.size(); ++i)
+    action[i] = test::uniform(rng, schema.signals[i].lower, schema.signals[i].upper);
+  return action;
+}
+
+Eigen::Vector3d position(const BodySchema& schema, int part, const Eigen::VectorXd& action) {
+  return schema.predict(schema.root, part, action)->X_AB.translation();
+}
+
+void expect_within_limits(const BodySchema& schema, const Eigen::VectorXd& action) {
+  ASSERT_EQ(action.size(), static_cast<Eigen::Index>(schema.signals.size()));
+  for (Eigen::Index i = 0; i < action.size(); ++i) {
+    const Signal& signal = schema.signals[i];
+    const double slack = 1e-12 * (signal.upper - signal.lower);
+    ASSERT_TRUE(std::isfinite(action[i]));
+    EXPECT_GE(action[i], signal.lower - slack);
+    EXPECT_LE(action[i], signal.upper + slack);
+  }
+}
+
+/// Two links of 1 m and 0.5 m in a plane, both turning ±90°: part 3 reaches from the root's origin
+/// sqrt(1.25) to 1.5 m.
+BodySchema planar() {
+  BodySchema schema;
+  schema.parts = {1, 2, 3};
+  schema.root = 1;
+  schema.signals = {{"a", -90, 90}, {"b", -1, 1}};
+  Edge upper, fore;
+  upper.from = 1;
+  upper.to = fore.from = 2;
+  fore.to = 3;
+  upper.joints.push_back({.signal = 0, .turn = M_PI / 180});
+  upper.right.translation() = Eigen::Vector3d(1, 0, 0);
+  fore.joints.push_back({.signal = 1, .turn = M_PI / 2});
+  fore.right.translation() = Eigen::Vector3d(0.5, 0, 0);
+  schema.edges = {upper, fore};
+  return schema;
+}
+
+TEST(InverseKinematicsTest, ItsJacobianIsTheDerivativeInTheRootsFrame) {
+  Rng rng(1);
+  for (int i = 0; i < 50; ++i) {
+    const BodySchema schema = seven_joints(i % 5);
+    const Eigen::VectorXd action = random_action(schema, rng);
+    for (const int part : schema.parts) {
+      const Eigen::MatrixXd J = position_jacobian(schema, part, action);
+      for (Eigen::Index s = 0; s < action.size(); ++s) {
+        const double h = 1e-6 * (schema.signals[s].upper - schema.signals[s].lower);
+        Eigen::VectorXd more = action, less = action;
+        more[s] += h;
+        less[s] -= h;
+        const Eigen::Vector3d numeric =
+            (position(schema, part, more) - position(schema, part, less)) / (2 * h);
+        EXPECT_LT((J.col(s) - numeric).norm(), 1e-7 * std::max(1.0, numeric.norm()));
+      }
+    }
+  }
+}
+
+TEST(InverseKinematicsTest, EveryPositionOfForwardKinematicsIsFoundFromElsewhere) {
+  Rng rng(2);
+  for (int i = 0; i < 200; ++i) {
+    const BodySchema schema = seven_joints(i % 10);
+    const int part = schema.parts[3 + rng() % (schema.parts.size() - 3)];
+    const Eigen::Vector3d p_RT = position(schema, part, random_action(schema, rng));
+    const auto solution =
+        solve_position(schema, part, p_RT, schema.signals, random_action(schema, rng), kOptions);
+    EXPECT_TRUE(solution.is_within_tolerance) << i << ": " << solution.error_m;
+    expect_within_limits(schema, solution.action);
+    EXPECT_NEAR((position(schema, part, solution.action) - p_RT).norm(), solution.error_m, 1e-9);
+    EXPECT_LE(solution.error_m, kOptions.tolerance_m);
+  }
+}
+
+TEST(InverseKinematicsTest, AtTheTargetNothingMoves) {
+  const BodySchema schema = seven_joints(3);
+  Rng rng(3);
+  const Eigen::VectorXd action = random_action(schema, rng);
+  const auto solution =
+      solve_position(schema, 10, position(schema, 10, action), schema.signals, action, kOptions);
+  EXPECT_LT((solution.action - action).norm(), 1e-9);
+  EXPECT_TRUE(solution.is_within_tolerance);
+}
+
+TEST(InverseKinematicsTest, SignalsThatDoNotMoveThePartStayWhereTheyAre) {
+  const BodySchema schema = planar();
+  const Eigen::Vector2d current(10, 0.3);
+  const Eigen::Vector3d p_RT(std::cos(0.5), std::sin(0.5), 0);
+  const auto solution = solve_position(schema, 2, p_RT, schema.signals, current, kOptions);
+  EXPECT_TRUE(solution.is_within_tolerance);
+  EXPECT_NEAR(solution.action[1], 0.3, 1e-15);
+  EXPECT_NEAR(solution.action[0], 0.5 * 180 / M_PI, 0.01);
+}
+
+TEST(InverseKinematicsTest, OutOfReachTheNearestApproachIsTold) {
+  const BodySchema schema = planar();
+  // Beyond the stretched arm, a singularity; before the folded one, a limit; beside the plane.
+  const struct {
+    Eigen::Vector3d p_RT;
+    double error_m;
+  } cases[] = {{{2, 0, 0}, 0.5},
+               {{1.9, 0.3, 0}, std::hypot(1.9, 0.3) - 1.5},
+               {{0.5, 0, 0}, std::sqrt(1.25) - 0.5},
+               {{1.5, 0, 0.2}, 0.2},
+               {{0, 0, 0}, std::sqrt(1.25)}};
+  Rng rng(4);
+  for (const auto& c : cases) {
+    for (int i = 0; i < 10; ++i) {
+      const auto solution =
+          solve_position(schema, 3, c.p_RT, schema.signals, random_action(schema, rng), kOptions);
+      EXPECT_FALSE(solution.is_within_tolerance);
+      EXPECT_NEAR(solution.error_m, c.error_m, 1e-3) << c.p_RT.transpose();
+      expect_within_limits(schema, solution.action);
+    }
+  }
+}
+
+TEST(InverseKinematicsTest, TheStretchedArmLeavesItsSingularity) {
+  const BodySchema schema = planar();
+  for (const double reach : {1.5, 1.4999, 1.3, 1.2}) {
+    const auto solution = solve_position(schema, 3, Eigen::Vector3d(reach, 0, 0), schema.signals,
+                                         Eigen::Vector2d(0, 0), kOptions);
+    EXPECT_TRUE(solution.is_within_tolerance) << reach << ": " << solution.error_m;
+    expect_within_limits(schema, solution.action);
+  }
+}
+
+TEST(InverseKinematicsTest, NothingIsEverNotANumber) {
+  Rng rng(5);
+  for (int i = 0; i < 100; ++i) {
+    BodySchema schema = seven_joints(i % 10);
+    // Stuck signals, a limit without a range to speak of, a current action beyond the limits.
+    for (Edge& edge : schema.edges)
+      for (ScrewJoint& joint : edge.joints)
+        if (rng() % 3 == 0) joint.gain = 0;
+    std::vector<Signal> limits = schema.signals;
+    limits[rng() % limits.size()].upper = limits[0].lower + 1e-9;
+    limits[0].upper = limits[0].lower + 1e-9;
+    for (Signal& limit : limits) limit.upper = std::max(limit.upper, limit.lower + 1e-9);
+    const Eigen::VectorXd beyond = 100 * random_action(schema, rng);
+    const Eigen::Vector3d p_RT(test::uniform(rng, -900, 900), test::uniform(rng, -1, 1), 0);
+    const auto solution = solve_position(schema, 10, p_RT, limits, beyond, kOptions);
+    schema.signals = limits;
+    expect_within_limits(schema, solution.action);
+    EXPECT_TRUE(std::isfinite(solution.error_m));
+  }
+}
+
+TEST(InverseKinematicsTest, OtherSolutionsDifferFromThoseAvoided) {
+  const BodySchema schema = seven_joints(6);
+  Rng rng(6);
+  const Eigen::VectorXd current = random_action(schema, rng);
+  const Eigen::Vector3d p_RT = position(schema, 10, random_action(schema, rng));
+  std::vector<Eigen::VectorXd> avoided;
+  for (int i = 0; i < 5; ++i) {
+    const auto solution =
+        solve_position(schema, 10, p_RT, schema.signals, current, kOptions, avoided);
+    ASSERT_TRUE(solution.is_within_tolerance) << i;
+    for (const Eigen::VectorXd& other : avoided) {
+      double farthest = 0;
+      for (Eigen::Index s = 0; s < current.size(); ++s)
+        farthest = std::max(farthest, std::abs(solution.action[s] - other[s]) /
+                                          (schema.signals[s].upper - schema.signals[s].lower));
+      EXPECT_GE(farthest, 0.1);
+    }
+    avoided.push_back(solution.action);
+  }
+}
+
+TEST(InverseKinematicsTest, TheSameQuestionGetsTheSameAnswer) {
+  const BodySchema schema = seven_joints(7);
+  Rng rng(7);
+  const Eigen::VectorXd current = random_action(schema, rng);
+  const auto ask = [&] {
+    return solve_position(schema, 10, {5, 5, 5}, schema.signals, current, kOptions).action;
+  };
+  EXPECT_EQ(ask(), ask());
+}
+
+TEST(InverseKinematicsTest, APartWithoutAWayToTheRootIsRefused) {
+  BodySchema schema = planar();
+  schema.edges.pop_back();
+  EXPECT_FALSE(chain_to(schema, 3));
+  EXPECT_TRUE(chain_to(schema, 2));
+  EXPECT_TRUE(chain_to(schema, 1));
+  EXPECT_THROW(
+      solve_position(schema, 3, {1, 0, 0}, schema.signals, Eigen::Vector2d(0, 0), kOptions),
+      std::invalid_argument);
+  EXPECT_THROW(
+      solve_position(schema, 2, {1, 0, 0}, schema.signals, Eigen::Vector3d(0, 0, 0), kOptions),
+      std::invalid_argument);
+}
+
+}  // namespace
+}  // namespace bodyschema
