@@ -1,16 +1,16 @@
 #include "common/scene/mujoco.h"
 
 #include <cstdio>
-#include <stdexcept>
-#include <string>
+#include <cstdlib>
 
 namespace bodyschema {
 namespace {
 
-// Unwinding through MuJoCo's C frames leaks what they hold, but a handler must not return, and the
-// only alternative is to end the process.
+// MuJoCo calls this in the middle of its C code, with its stack half used: it must not return, and
+// an exception must not unwind through C. What remains is to end.
 [[noreturn]] void on_error(const char* text) {
-  throw std::runtime_error(std::string("MuJoCo: ") + text);
+  std::fprintf(stderr, "MuJoCo cannot go on and ends the process: %s\n", text);
+  std::_Exit(1);
 }
 
 void on_warning(const char* text) { std::fprintf(stderr, "MuJoCo warning: %s\n", text); }

@@ -15,8 +15,9 @@ struct MjDataDeleter {
 using MjModelPtr = std::unique_ptr<mjModel, MjModelDeleter>;
 using MjDataPtr = std::unique_ptr<mjData, MjDataDeleter>;
 
-/// Makes MuJoCo's fatal errors a std::runtime_error and sends its warnings to stderr. Left alone it
-/// waits for the Enter key on an error and writes MUJOCO_LOG.TXT into the working directory.
+/// MuJoCo's fatal errors (no memory, a broken model) end the process with one line and exit code 1,
+/// its warnings go to stderr. Left alone it waits for the Enter key on an error and writes
+/// MUJOCO_LOG.TXT into the working directory.
 /// Everything in common/scene calls this before its first call of MuJoCo; again does no harm.
 void install_mujoco_handlers();
 

@@ -71,6 +71,23 @@ RobotJoint load_joint(const Yaml& yaml, const Servo& servo, const Signals& signa
   return joint;
 }
 
+ToolChanger load_tool_changer(const Yaml& yaml, const std::vector<std::string>& link_names) {
+  ToolChanger changer;
+  const std::string link = yaml.choice("link", link_names);
+  changer.link =
+      static_cast<int>(std::find(link_names.begin(), link_names.end(), link) - link_names.begin());
+  changer.X_LF = yaml.pose("X_LF");
+  changer.tools.push_back({yaml.text("mounted"), Pose::Identity(), {}});
+  for (const Yaml& item : yaml.list("others")) {
+    Tool tool;
+    tool.name = item.text("name");
+    tool.X_FT = item.pose("X_FT");
+    for (const Yaml& shape : item.list("shapes")) tool.shapes.push_back(load_shape(shape));
+    changer.tools.push_back(std::move(tool));
+  }
+  return changer;
+}
+
 }  // namespace
 
 Eigen::VectorXd Robot::joint_positions(const Eigen::VectorXd& action) const {
@@ -80,7 +97,8 @@ Eigen::VectorXd Robot::joint_positions(const Eigen::VectorXd& action) const {
   }
   Eigen::VectorXd positions(joints.size());
   for (std::size_t i = 0; i < joints.size(); ++i) {
-    positions[i] = joints[i].gain * action[joints[i].signal] + joints[i].offset;
+    const RobotJoint& joint = joints[i];
+    positions[i] = joint.stuck_at.value_or(joint.gain * action[joint.signal] + joint.offset);
   }
   return positions;
 }
@@ -90,6 +108,7 @@ std::optional<std::string> Robot::beyond_range(const Eigen::VectorXd& joint_posi
     const RobotJoint& joint = joints[i];
     const double position = joint_positions[i];
     // A nanometre of tolerance: limits that were converted from degrees must be reachable.
+    if (joint.stuck_at) continue;
     if (position >= joint.lower - 1e-9 && position <= joint.upper + 1e-9) continue;
     const bool is_revolute = joint.kind == RobotJoint::Kind::kRevolute;
     const double scale = is_revolute ? 1 / kDegree : 1;
@@ -172,6 +191,9 @@ Robot load_robot(const std::filesystem::path& rig_folder, const Signals& signals
 
   for (const Yaml& item : yaml.list("may_touch")) {
     robot.may_touch.emplace_back(item.choice("link", link_names), item.choice("other", link_names));
+  }
+  if (yaml.has("tools")) {
+    robot.tool_changer = load_tool_changer(yaml.section("tools"), link_names);
   }
   yaml.finish();
   if (const auto problem = robot.beyond_range(robot.joint_positions(robot.home))) {

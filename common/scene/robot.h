@@ -48,6 +48,8 @@ struct RobotJoint {
   int signal = 0;     ///< index into Signals::signals; joints may share a signal
   double gain = 1;    ///< [rad or m per command unit]
   double offset = 0;  ///< [rad] or [m]
+  /// Jammed at this position [rad or m], whatever is commanded; none: it moves.
+  std::optional<double> stuck_at;
 };
 
 struct Link {
@@ -65,6 +67,21 @@ struct PartPlacement {
   Pose X_LB = Pose::Identity();
 };
 
+/// What a link can carry beyond its flange. A tool displaces everything that the description puts
+/// there (solids, parts, further links) and adds solids of its own.
+struct Tool {
+  std::string name;
+  Pose X_FT = Pose::Identity();  ///< where the flange's frame F, and all beyond it, goes
+  std::vector<Shape> shapes;     ///< in L; there only while the tool is mounted
+};
+
+struct ToolChanger {
+  int link = 0;                  ///< index into Robot::links
+  Pose X_LF = Pose::Identity();  ///< the flange; beyond it is what has z > 0 in F
+  std::vector<Tool> tools;       ///< the first displaces nothing and has no shapes
+  int mounted = 0;               ///< index into tools
+};
+
 struct Robot {
   std::string name;
   Pose X_WC = Pose::Identity();      ///< camera, optical frame
@@ -74,8 +91,10 @@ struct Robot {
   /// Links that may touch beside parent and child, which always may.
   std::vector<std::pair<std::string, std::string>> may_touch;
   Eigen::VectorXd home;  ///< action of the start pose, command units
+  std::optional<ToolChanger> tool_changer;
 
-  /// Joint positions that `action` asks for. @throws std::invalid_argument on a wrong size.
+  /// Joint positions that `action` leads to: gain · command + offset, stuck joints where they are.
+  /// @throws std::invalid_argument on a wrong size.
   Eigen::VectorXd joint_positions(const Eigen::VectorXd& action) const;
   /// Why these positions cannot be: "joint 3 would turn to 101.2 deg, beyond -95 … 95".
   std::optional<std::string> beyond_range(const Eigen::VectorXd& joint_positions) const;

@@ -17,6 +17,8 @@ using tinyxml2::XMLElement;
 
 constexpr double kBackThickness_m = 0.004;
 constexpr double kContactMargin_m = 0.003;
+/// [N m s/rad or N s/m]: what a jammed joint yields is less than a microradian a motion.
+constexpr double kStuckDamping = 1e7;
 
 std::string text(std::initializer_list<double> values) {
   std::string result;
@@ -49,7 +51,9 @@ void set_grey(XMLElement* element, double grey) {
   set(element, "rgba", text({grey, grey, grey, 1}));
 }
 
-void add_shape(XMLElement* body, const std::string& name, const Shape& shape) {
+/// Without a mass and contacts where `exists` is false: then it only keeps its place among the
+/// geoms.
+void add_shape(XMLElement* body, const std::string& name, const Shape& shape, bool exists = true) {
   XMLElement* geom = child(body, "geom");
   set(geom, "name", name);
   set_pose(geom, shape.X_LS);
@@ -69,25 +73,30 @@ void add_shape(XMLElement* body, const std::string& name, const Shape& shape) {
       set(geom, "size", text({h.x()}));
       break;
   }
-  set(geom, "mass", text({shape.mass_kg}));
+  set(geom, "mass", text({exists ? shape.mass_kg : 0}));
   set(geom, "material", "solid");
   set_grey(geom, shape.grey);
-  if (!shape.collides) {
+  if (!shape.collides || !exists) {
     set(geom, "contype", "0");
     set(geom, "conaffinity", "0");
   }
 }
 
+/// From the marker's frame to the centre of a layer of its plate.
+Eigen::Translation3d plate_offset(double front_m, double thickness_m) {
+  return Eigen::Translation3d(0, 0, front_m + thickness_m / 2);
+}
+
 // A sheet with the tag, its front face in the marker's plane, and a board behind it that shows a
 // plain back: MuJoCo projects a 2-D texture through a box, so the sheet alone would show the tag
 // mirrored on its back.
-void add_plate(XMLElement* body, const TagPlacement& tag, const Pose& X_LM) {
+void add_plate(XMLElement* body, const TagPlacement& tag, const Pose& X_LM, bool has_fallen) {
   const double half_m = tag.size_m * 10 / 8 / 2;
   const auto add_box = [&](const std::string& name, double front_m, double thickness_m) {
     XMLElement* geom = child(body, "geom");
     set(geom, "name", name);
     set(geom, "type", "box");
-    set_pose(geom, X_LM * Eigen::Translation3d(0, 0, front_m + thickness_m / 2));
+    set_pose(geom, X_LM * plate_offset(front_m, thickness_m));
     set(geom, "size", text({half_m, half_m, thickness_m / 2}));
     set(geom, "mass", "0");
     return geom;
@@ -99,6 +108,14 @@ void add_plate(XMLElement* body, const TagPlacement& tag, const Pose& X_LM) {
   XMLElement* board = add_box(tag_name(tag.id) + "_board", kSheetThickness_m, kBackThickness_m);
   set(board, "material", "solid");
   set_grey(board, 0.35);
+  if (has_fallen) {
+    set(board, "contype", "0");
+    set(board, "conaffinity", "0");
+  }
+}
+
+std::string tool_shape_name(int tool, std::size_t shape) {
+  return "tool " + std::to_string(tool) + " shape " + std::to_string(shape);
 }
 
 void add_light(XMLElement* world, const Eigen::Vector3d& position, const Eigen::Vector3d& direction,
@@ -113,7 +130,9 @@ void add_light(XMLElement* world, const Eigen::Vector3d& position, const Eigen::
   set(light, "specular", "0.15 0.15 0.15");
 }
 
-std::string make_mjcf(const Robot& robot, const Markers& markers) {
+std::string make_mjcf(const SceneDescription& description) {
+  const Robot& robot = description.robot;
+  const Markers& markers = description.markers;
   XMLDocument document;
   XMLElement* mujoco = document.NewElement("mujoco");
   document.InsertEndChild(mujoco);
@@ -216,29 +235,39 @@ std::string make_mjcf(const Robot& robot, const Markers& markers) {
     set(body, "name", link.name);
     set_pose(body, link.X_PL);
     if (link.joint) {
-      const RobotJoint& description = robot.joints[*link.joint];
+      const RobotJoint& moving = robot.joints[*link.joint];
       XMLElement* joint = child(body, "joint");
-      set(joint, "name", description.name);
-      set(joint, "type", description.kind == RobotJoint::Kind::kRevolute ? "hinge" : "slide");
-      set(joint, "axis", text(description.axis));
-      set(joint, "armature", text({description.servo.armature}));
+      set(joint, "name", moving.name);
+      set(joint, "type", moving.kind == RobotJoint::Kind::kRevolute ? "hinge" : "slide");
+      set(joint, "axis", text(moving.axis));
+      set(joint, "armature", text({moving.servo.armature}));
+      if (moving.stuck_at) set(joint, "damping", text({kStuckDamping}));
       // <position> of this version has no velocity gain.
-      const double kp = description.servo.stiffness;
+      const double kp = moving.servo.stiffness;
       XMLElement* servo = child(actuator, "general");
-      set(servo, "joint", description.name);
+      set(servo, "joint", moving.name);
       set(servo, "gaintype", "fixed");
       set(servo, "biastype", "affine");
       set(servo, "gainprm", text({kp}));
-      set(servo, "biasprm", text({0, -kp, -description.servo.damping}));
+      set(servo, "biasprm", text({0, -kp, -moving.servo.damping}));
     }
     for (std::size_t k = 0; k < link.shapes.size(); ++k) {
       add_shape(body, link.name + " shape " + std::to_string(k), link.shapes[k]);
+    }
+    if (robot.tool_changer && robot.tool_changer->link == static_cast<int>(i)) {
+      const ToolChanger& changer = *robot.tool_changer;
+      for (int t = 0; t < static_cast<int>(changer.tools.size()); ++t) {
+        for (std::size_t k = 0; k < changer.tools[t].shapes.size(); ++k) {
+          add_shape(body, tool_shape_name(t, k), changer.tools[t].shapes[k], t == changer.mounted);
+        }
+      }
     }
     for (const PartPlacement& part : robot.parts) {
       if (part.link != static_cast<int>(i)) continue;
       for (const TagPlacement& tag : markers.tags) {
         if (tag.part == part.part) {
-          add_plate(body, tag, part.X_LB * tag.X_BM.value_or(Pose::Identity()));
+          add_plate(body, tag, part.X_LB * tag.X_BM.value_or(Pose::Identity()),
+                    description.fallen_tags.contains(tag.id));
         }
       }
     }
@@ -281,22 +310,32 @@ Pose pose_of(const mjtNum* position, const mjtNum* matrix) {
 
 std::string tag_name(int tag_id) { return "tag_" + std::to_string(tag_id); }
 
-Scene::Scene(const std::filesystem::path& rig_folder)
-    : markers_(load_markers(rig_folder)),
-      signals_(load_signals(rig_folder)),
-      robot_(load_robot(rig_folder, signals_, markers_)),
-      mjcf_(make_mjcf(robot_, markers_)),
-      model_(compile(mjcf_, rig_folder.string())) {
-  for (const RobotJoint& joint : robot_.joints) {
-    qpos_address_.push_back(
-        model_->jnt_qposadr[mj_name2id(model_.get(), mjOBJ_JOINT, joint.name.c_str())]);
-  }
-  for (const PartPlacement& part : robot_.parts) {
-    part_body_.push_back(
-        mj_name2id(model_.get(), mjOBJ_BODY, robot_.links[part.link].name.c_str()));
-  }
+SceneDescription SceneDescription::load(const std::filesystem::path& rig_folder) {
+  SceneDescription description;
+  description.markers = load_markers(rig_folder);
+  description.signals = load_signals(rig_folder);
+  description.robot = load_robot(rig_folder, description.signals, description.markers);
+  return description;
+}
+
+Scene::Scene(const std::filesystem::path& rig_folder) : Scene(SceneDescription::load(rig_folder)) {
   if (const auto problem = collision(*make_data())) {
     throw std::runtime_error(rig_folder.string() + ": at the start pose (home) " + *problem);
+  }
+}
+
+Scene::Scene(SceneDescription description)
+    : description_(std::move(description)),
+      mjcf_(make_mjcf(description_)),
+      model_(compile(mjcf_, description_.robot.name)) {
+  for (const RobotJoint& joint : robot().joints) {
+    const int id = mj_name2id(model_.get(), mjOBJ_JOINT, joint.name.c_str());
+    qpos_address_.push_back(model_->jnt_qposadr[id]);
+    dof_address_.push_back(model_->jnt_dofadr[id]);
+  }
+  for (const PartPlacement& part : robot().parts) {
+    part_body_.push_back(
+        mj_name2id(model_.get(), mjOBJ_BODY, robot().links[part.link].name.c_str()));
   }
 }
 
@@ -306,12 +345,16 @@ int Scene::tag_geom(int tag_id) const {
   return geom;
 }
 
+int Scene::board_geom(int tag_id) const {
+  return mj_name2id(model_.get(), mjOBJ_GEOM, (tag_name(tag_id) + "_board").c_str());
+}
+
 std::vector<int> Scene::plate_geoms(int part) const {
   std::vector<int> geoms;
-  for (const TagPlacement& tag : markers_.tags) {
+  for (const TagPlacement& tag : markers().tags) {
     if (tag.part != part) continue;
     geoms.push_back(tag_geom(tag.id));
-    geoms.push_back(mj_name2id(model_.get(), mjOBJ_GEOM, (tag_name(tag.id) + "_board").c_str()));
+    geoms.push_back(board_geom(tag.id));
   }
   return geoms;
 }
@@ -319,7 +362,7 @@ std::vector<int> Scene::plate_geoms(int part) const {
 MjDataPtr Scene::make_data() const {
   MjDataPtr data(mj_makeData(model_.get()));
   if (!data) throw std::runtime_error("MuJoCo: no memory for mjData");
-  set_joint_positions(*data, robot_.joint_positions(robot_.home));
+  set_joint_positions(*data, robot().joint_positions(robot().home));
   return data;
 }
 
@@ -345,6 +388,10 @@ Eigen::VectorXd Scene::joint_positions(const mjData& data) const {
   return positions;
 }
 
+double Scene::joint_speed(const mjData& data, int joint) const {
+  return data.qvel[dof_address_.at(joint)];
+}
+
 std::optional<std::string> Scene::collision(const mjData& data) const {
   if (data.ncon == 0) return std::nullopt;
   // Those that may touch are excluded in the model, so any contact is one too many.
@@ -363,23 +410,45 @@ std::optional<std::string> Scene::collision(const mjData& data) const {
 
 Pose Scene::part_pose(const mjData& data, int part_index) const {
   const int body = part_body_.at(part_index);
-  return pose_of(data.xpos + 3 * body, data.xmat + 9 * body) * robot_.parts[part_index].X_LB;
+  return pose_of(data.xpos + 3 * body, data.xmat + 9 * body) * robot().parts[part_index].X_LB;
+}
+
+Pose Scene::marker_pose(const mjData& data, int tag_id) const {
+  const auto fallen = description_.fallen_tags.find(tag_id);
+  if (fallen != description_.fallen_tags.end()) return fallen->second;
+  const int geom = tag_geom(tag_id);
+  return pose_of(data.geom_xpos + 3 * geom, data.geom_xmat + 9 * geom) *
+         Eigen::Translation3d(0, 0, -kSheetThickness_m / 2);
 }
 
 sim_state_t Scene::state(const mjData& data) const {
   sim_state_t state{};
   state.utime = std::llround(data.time * 1e6);
   state.action_id = -1;
-  state.X_WC = to_message(robot_.X_WC);
+  state.X_WC = to_message(robot().X_WC);
   std::vector<pose_t> geoms(model_->ngeom);
   for (int i = 0; i < model_->ngeom; ++i) {
     geoms[i] = to_message(pose_of(data.geom_xpos + 3 * i, data.geom_xmat + 9 * i));
   }
+  for (const auto& [tag, X_WM] : description_.fallen_tags) {
+    geoms[tag_geom(tag)] = to_message(Pose(X_WM * plate_offset(0, kSheetThickness_m)));
+    geoms[board_geom(tag)] =
+        to_message(Pose(X_WM * plate_offset(kSheetThickness_m, kBackThickness_m)));
+  }
   set_array(state.num_geoms, state.X_WG, std::move(geoms));
   state.geom_alpha.assign(model_->ngeom, 1.0F);
+  if (robot().tool_changer) {
+    const ToolChanger& changer = *robot().tool_changer;
+    for (int t = 0; t < static_cast<int>(changer.tools.size()); ++t) {
+      if (t == changer.mounted) continue;
+      for (std::size_t k = 0; k < changer.tools[t].shapes.size(); ++k) {
+        state.geom_alpha[mj_name2id(model_.get(), mjOBJ_GEOM, tool_shape_name(t, k).c_str())] = 0;
+      }
+    }
+  }
   std::vector<std::int32_t> parts;
-  for (std::size_t i = 0; i < robot_.parts.size(); ++i) {
-    parts.push_back(robot_.parts[i].part);
+  for (std::size_t i = 0; i < robot().parts.size(); ++i) {
+    parts.push_back(robot().parts[i].part);
     state.X_WB.push_back(to_message(part_pose(data, static_cast<int>(i))));
   }
   set_array(state.num_parts, state.true_part, std::move(parts));
@@ -389,7 +458,7 @@ sim_state_t Scene::state(const mjData& data) const {
 sim_state_t Scene::state_at(const Eigen::VectorXd& action, std::int64_t seed,
                             std::int64_t action_id) const {
   const MjDataPtr data = make_data();
-  set_joint_positions(*data, robot_.joint_positions(action));
+  set_joint_positions(*data, robot().joint_positions(action));
   sim_state_t result = state(*data);
   result.seed = seed;
   result.action_id = action_id;

@@ -3,6 +3,7 @@
 #include <Eigen/Core>
 #include <cstdint>
 #include <filesystem>
+#include <map>
 #include <optional>
 #include <string>
 #include <vector>
@@ -13,6 +14,19 @@
 #include "common/scene/robot.h"
 
 namespace bodyschema {
+
+/// What a scene is made of. Changed, it is another scene: a broken arm, an exchanged tool
+/// (common/scene/faults.h).
+struct SceneDescription {
+  Markers markers;
+  Signals signals;
+  Robot robot;
+  /// X_WM of tags that have fallen off their parts: their plates lie there and touch nothing.
+  std::map<int, Pose> fallen_tags;
+
+  /// The rig as built. @throws ConfigError.
+  static SceneDescription load(const std::filesystem::path& rig_folder);
+};
 
 /// A rig folder as a MuJoCo model: robot.yaml's links, joints, servos and solids, markers.yaml's
 /// plates, a floor and lights. The simulator steps it, SceneRenderer looks at it, and an experiment
@@ -28,10 +42,15 @@ class Scene {
   /// @throws ConfigError; std::runtime_error with MuJoCo's words if it refuses the model, or if the
   /// start pose collides.
   explicit Scene(const std::filesystem::path& rig_folder);
+  /// Any change of a rig's description. As many geoms, joints and parts, in the same order, as the
+  /// rig's own scene: its SIM_STATE can be rendered by a camera that knows the rig alone. The start
+  /// pose may collide. @throws std::runtime_error if MuJoCo refuses the model.
+  explicit Scene(SceneDescription description);
 
-  const Robot& robot() const { return robot_; }
-  const Markers& markers() const { return markers_; }
-  const Signals& signals() const { return signals_; }
+  const Robot& robot() const { return description_.robot; }
+  const Markers& markers() const { return description_.markers; }
+  const Signals& signals() const { return description_.signals; }
+  const SceneDescription& description() const { return description_; }
   const mjModel& model() const { return *model_; }
   /// The model's MJCF, for example to look at it in MuJoCo's own viewer (tags are plain white).
   const std::string& mjcf() const { return mjcf_; }
@@ -46,12 +65,17 @@ class Scene {
   /// Puts the joints there at once, at rest, and computes all poses and contacts.
   void set_joint_positions(mjData& data, const Eigen::VectorXd& positions) const;
   Eigen::VectorXd joint_positions(const mjData& data) const;
+  /// [rad/s or m/s]
+  double joint_speed(const mjData& data, int joint) const;
   /// The first contact that should not be: "link 3 would touch the floor". Reads data's contacts.
   std::optional<std::string> collision(const mjData& data) const;
 
   /// X_WB of a part.
   Pose part_pose(const mjData& data, int part_index) const;
-  /// SIM_STATE of these poses, every geom opaque, utime as in `data`, seed 0 and action_id -1.
+  /// X_WM: the marker's frame as it is now, on its part or fallen. @throws std::out_of_range.
+  Pose marker_pose(const mjData& data, int tag_id) const;
+  /// SIM_STATE of these poses, every geom but those of tools that are not mounted opaque, utime as
+  /// in `data`, seed 0 and action_id -1.
   sim_state_t state(const mjData& data) const;
   /// SIM_STATE as it is when a perfect servo has carried out `action`; no physics, no limits.
   /// @throws std::invalid_argument on a wrong number of signals.
@@ -59,12 +83,13 @@ class Scene {
                        std::int64_t action_id) const;
 
  private:
-  Markers markers_;
-  Signals signals_;
-  Robot robot_;
+  int board_geom(int tag_id) const;
+
+  SceneDescription description_;
   std::string mjcf_;
   MjModelPtr model_;
   std::vector<int> qpos_address_;  // of each joint
+  std::vector<int> dof_address_;   // of each joint
   std::vector<int> part_body_;     // MuJoCo body of each part's link
 };
 

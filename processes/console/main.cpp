@@ -6,6 +6,8 @@
 #include <iostream>
 #include <stdexcept>
 
+#include "processes/console/driver_test.h"
+#include "processes/console/fault.h"
 #include "processes/console/log.h"
 #include "processes/console/offline.h"
 #include "processes/console/operate.h"
@@ -20,6 +22,8 @@ int main(int argc, char** argv) {
   bodyschema::add_log_command(console);
   bodyschema::add_operate_commands(console);
   bodyschema::add_watch_command(console);
+  bodyschema::add_driver_test_command(console);
+  bodyschema::add_fault_command(console);
   bodyschema::add_status_command(console);
   bodyschema::add_report_command(console);
   try {

@@ -59,8 +59,13 @@ class Source {
     };
     bool is_new = false;
     for (const fs::path& log : logs()) is_new |= follower_.read(log, visit);
-    if (!is_folder_ && follower_.summaries().empty())
-      throw std::runtime_error(path_.string() + ": is empty");
+    if (!is_folder_) {
+      const auto summary = follower_.summaries().find(path_);
+      if (summary == follower_.summaries().end())
+        throw std::runtime_error(path_.string() + ": is empty");
+      if (summary->second.events == 0 && summary->second.damage.starts_with("is not"))
+        throw std::runtime_error(path_.string() + ": " + summary->second.damage);
+    }
     return is_new;
   }
 

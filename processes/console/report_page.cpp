@@ -301,18 +301,18 @@ class Page {
                        std::max<std::ptrdiff_t>(0, std::ssize(schema.parts) - 1)));
     }
     item("Samples", std::to_string(record_.watch().num_samples()),
-         fmt::format("{} of them held out", held_out_.size()));
+         fmt::format("{} held out", held_out_.size()));
     if (const PartErrors* effector = errors_of(report_.end_effector)) {
       item("End effector", millimetres(effector->position_median_m),
            degrees(effector->rotation_median_rad) + ", held out");
     }
     if (const PartErrors* part = worst()) {
       item("Worst part", millimetres(part->position_median_m),
-           fmt::format("part {}, {}, held out", part->part, degrees(part->rotation_median_rad)));
+           fmt::format("part {}, {}", part->part, degrees(part->rotation_median_rad)));
     }
     if (const auto begin = record_.begin_utime()) {
       item("Recorded", duration(record_.duration_s()),
-           fmt::format("{:%Y-%m-%d %H:%M} UTC",
+           fmt::format("{:%Y-%m-%d %H:%M}",
                        fmt::gmtime(static_cast<std::time_t>(*begin / 1'000'000))));
     }
     return html + "</dl>\n";
@@ -394,13 +394,14 @@ class Page {
           plot(*curve),
           fmt::format(
               "Every version of the body schema{} on the same {} of the whole run, from none of "
-              "which anything was ever learned: distance of the predicted from the true origin "
+              "which anything was ever learned: distance of the predicted from the {} origin "
               "of a part, relative to the root, median over the samples; against {}. A version "
               "is judged on the parts it connects, so a line may rise when a part is added.",
               versions.size() < record_.versions().size()
                   ? fmt::format(" ({} of {} shown)", versions.size(), record_.versions().size())
                   : "",
-              counted(std::ssize(held_out_), "held-out sample"), judge()));
+              counted(std::ssize(held_out_), "held-out sample"),
+              record_.watch().has_truth() ? "true" : "seen", judge()));
     }
     if (!record_.faults().empty()) {
       html +=

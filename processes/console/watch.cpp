@@ -260,7 +260,8 @@ void report(const RunWatch& watch, const BestPicture& picture, const WatchArgume
       {"detections.png", "a camera frame with the markers found in it"},
       {"schema.lcmlog", "the body schema: ./run show FILE"},
       {"samples.lcmlog", "the samples: ./run learn FILE"},
-      {"run.lcmlog.00", "everything on the bus but images"}};
+      {"run.lcmlog.00", "everything on the bus but images"},
+      {"report.html", "all of this as one page"}};
   for (const auto& [name, what] : files) {
     if (std::filesystem::exists(folder / name))
       std::cout << fmt::format("  {:<18} {}\n", name, what);

@@ -541,30 +541,28 @@ Controller::Command Controller::on_own_answer(const motion_status_t& motion) {
 // ---- what is heard
 
 Controller::Answer Controller::on_motion_status(const motion_status_t& motion) {
-  // Answers to HOLD and the like carry no action; a rejected action may have had any size.
-  if (motion.num_signals != 0 && motion.state != motion_status_t::STATE_REJECTED &&
-      motion.commanded.size() != config_.signals.size()) {
-    ++counters_["refused MOTION_STATUS"];
-    return answer(std::nullopt);
-  }
   const std::optional<motion_status_t> previous = std::exchange(motion_, motion);
   motion_silence_.restart();
   if (epoch_ < 0) epoch_ = motion.utime;
   const bool is_mine = motion.source == kSource && motion.epoch == epoch_;
   // Where no state was kept, at least no id of a predecessor's is used again.
   if (is_mine && !previous) next_action_id_ = std::max(next_action_id_, motion.action_id + 1);
+  // A refusal is said once, or repeated until the next answer; what the arm does is repeated.
+  const bool is_refusal = motion.state == motion_status_t::STATE_REJECTED ||
+                          motion.state == motion_status_t::STATE_EXPIRED;
   const bool began_anew = (previous && motion.utime < previous->utime) ||
-                          (is_mine && motion.action_id < last_answered_id_);
+                          (is_mine && !is_refusal && motion.action_id < last_done_id_);
   if (began_anew) {
     seen_until_utime_ = position_rest_utime_ = -1;
     position_.reset();
   }
-  if (is_mine) last_answered_id_ = motion.action_id;
-  const bool is_news =
-      !previous ||
-      std::tie(motion.source, motion.epoch, motion.action_id, motion.state) !=
-          std::tie(previous->source, previous->epoch, previous->action_id, previous->state);
-  if (is_news) quiet_.restart();
+  bool is_news = false;
+  if (!is_refusal) {
+    if (is_mine) last_done_id_ = motion.action_id;
+    const Deed deed{motion.source, motion.epoch, motion.action_id, motion.state};
+    is_news = std::exchange(deed_, deed) != deed;
+    if (is_news) quiet_.restart();
+  }
   locate();
   if (hold_command_ && is_mine && motion.action_id == hold_command_->action_id) {
     hold_command_.reset();
@@ -607,10 +605,6 @@ Controller::Answer Controller::on_marker_poses(const marker_poses_t& poses) {
 }
 
 Controller::Answer Controller::on_sample(const sample_t& sample) {
-  if (sample.action.size() != config_.signals.size()) {
-    ++counters_["refused SAMPLE"];
-    return answer(std::nullopt);
-  }
   sample_ = sample;
   see(sample.utime);
   locate();
@@ -623,15 +617,9 @@ Controller::Answer Controller::on_sample(const sample_t& sample) {
 }
 
 Controller::Answer Controller::on_body_schema(const body_schema_t& message) {
-  const bool is_of_rig = std::equal(
-      message.signals.begin(), message.signals.end(), config_.signals.begin(),
-      config_.signals.end(), [](const signal_t& a, const Signal& b) {
-        return a.signal_name == b.name && a.lower_limit == b.lower && a.upper_limit == b.upper;
-      });
   // An older version counts only when the newer one has fallen silent.
-  const bool is_older = schema_ && message.schema_version < schema_->version;
-  if (!is_of_rig || is_older) {
-    ++counters_[is_of_rig ? "older BODY_SCHEMA" : "refused BODY_SCHEMA"];
+  if (schema_ && message.schema_version < schema_->version) {
+    ++counters_["older BODY_SCHEMA"];
     return answer(std::nullopt);
   }
   schema_silence_.restart();

@@ -6,6 +6,7 @@
 #include <map>
 #include <optional>
 #include <string>
+#include <tuple>
 #include <vector>
 
 #include "bodyschema/action_command_t.hpp"
@@ -60,6 +61,8 @@ struct ControllerConfig {
 /// eyes is not measured by the clock alone: in lock-step the driver's time stands still and so do
 /// the images. They are due when the driver's time has gone on.
 ///
+/// Messages must be of the rig (RigDoor): signals are not compared here.
+///
 /// After a restart a hold is held; a target in progress is not continued and no longer
 /// acknowledged.
 class Controller {
@@ -82,7 +85,7 @@ class Controller {
   Answer on_tick(std::int64_t now_us);
 
   control_status_t status() const;
-  /// Messages that were refused and what was sent in vain, since the start.
+  /// Messages that came too late and commands that were in vain, since the start.
   const std::map<std::string, std::int64_t>& counters() const { return counters_; }
 
   /// What a restart needs, as YAML; to be on disk before an Answer is sent.
@@ -92,6 +95,8 @@ class Controller {
 
  private:
   using Command = std::optional<action_command_t>;
+  /// Source, epoch, action id and state of an answer.
+  using Deed = std::tuple<std::string, std::int64_t, std::int64_t, std::int8_t>;
 
   /// Clock time since restart(), as ticks see it.
   class Stopwatch {
@@ -147,6 +152,7 @@ class Controller {
 
   // What was heard.
   std::optional<motion_status_t> motion_;
+  Deed deed_;  ///< newest answer that was no refusal
   std::optional<sample_t> sample_;
   std::optional<BodySchema> schema_;
   std::optional<model_health_t> health_;
@@ -179,7 +185,7 @@ class Controller {
   // What was sent.
   std::int64_t epoch_ = -1;
   std::int64_t next_action_id_ = 0;
-  std::int64_t last_answered_id_ = -1;
+  std::int64_t last_done_id_ = -1;                ///< of its own, newest that was not refused
   std::optional<action_command_t> command_;       ///< MOVE without a final answer
   std::optional<action_command_t> hold_command_;  ///< HOLD without an answer
   bool wants_hold_ = false;

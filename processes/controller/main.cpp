@@ -42,9 +42,8 @@ int main(int argc, char** argv) {
       door.subscribe(process, channel,
                      [&, handler](const auto& message) { send((controller.*handler)(message)); });
     };
-    process.bus().subscribe(kPoseTarget, [&](const pose_target_t& target) {
-      send(controller.on_pose_target(target));
-    });
+    process.bus().subscribe<pose_target_t>(
+        kPoseTarget, [&](const pose_target_t& target) { send(controller.on_pose_target(target)); });
     subscribe(kMotionStatus, &Controller::on_motion_status);
     subscribe(kMarkerPoses, &Controller::on_marker_poses);
     subscribe(kSample, &Controller::on_sample);

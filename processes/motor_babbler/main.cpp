@@ -1,4 +1,4 @@
-// motor_babbler: MOTION_STATUS, SAMPLE, MODEL_HEALTH, CONTROL_STATUS, BODY_SCHEMA -> ACTION_COMMAND
+// motor_babbler: MOTION_STATUS, SAMPLE, MODEL_HEALTH, CONTROL_STATUS -> ACTION_COMMAND
 
 #include <CLI/CLI.hpp>
 #include <filesystem>
@@ -46,11 +46,9 @@ int main(int argc, char** argv) {
                    [&](const sample_t& sample) { send(babbler.on_sample(sample)); });
     door.subscribe(process, kModelHealth,
                    [&](const model_health_t& health) { send(babbler.on_model_health(health)); });
-    process.bus().subscribe(kControlStatus, [&](const control_status_t& status) {
+    process.bus().subscribe<control_status_t>(kControlStatus, [&](const control_status_t& status) {
       send(babbler.on_control_status(status));
     });
-    door.subscribe(process, kBodySchema,
-                   [&](const body_schema_t& schema) { babbler.on_body_schema(schema); });
     std::map<std::string, std::int64_t> reported;
     const auto count = [&](const std::string& name, std::int64_t total) {
       process.count(name, total - std::exchange(reported[name], total));
@@ -58,7 +56,6 @@ int main(int argc, char** argv) {
     process.on_idle([&] {
       count("action rejected", babbler.num_rejected());
       count("sample never seen", babbler.num_unseen());
-      for (const auto& [channel, total] : babbler.refused()) count("refused " + channel, total);
     });
     process.on_tick([&](std::int64_t now_us) { send(babbler.on_tick(now_us)); });
     process.run();

@@ -4,6 +4,7 @@
 #include <cmath>
 #include <random>
 #include <sstream>
+#include <utility>
 
 #include "common/bus/convert.h"
 #include "common/config/yaml.h"
@@ -76,12 +77,6 @@ bool MotorBabbler::is_mine(const motion_status_t& status) const {
 }
 
 std::optional<action_command_t> MotorBabbler::on_motion_status(const motion_status_t& status) {
-  // Answers to HOLD and the like carry no action; a rejected action may have had any size.
-  if (status.num_signals != 0 && status.state != motion_status_t::STATE_REJECTED &&
-      status.commanded.size() != config_.signals.size()) {
-    ++refused_["MOTION_STATUS"];
-    return std::nullopt;
-  }
   driver_utime_ = status.utime;
   is_at_rest_ = status.rest_since_utime >= 0;
   is_stopped_ = status.stop_latched == 1;
@@ -139,10 +134,6 @@ std::optional<action_command_t> MotorBabbler::begin() {
 }
 
 std::optional<action_command_t> MotorBabbler::on_sample(const sample_t& sample) {
-  if (sample.action.size() != config_.signals.size()) {
-    ++refused_["SAMPLE"];
-    return std::nullopt;
-  }
   if (wait_ == Wait::kDriver && !is_restored_) {
     // All that tells a babbler without kept state about its predecessor.
     num_samples_ = std::max(num_samples_, sample.sample_index + 1);
@@ -166,33 +157,7 @@ std::optional<action_command_t> MotorBabbler::on_sample(const sample_t& sample) 
   return act();
 }
 
-void MotorBabbler::on_body_schema(const body_schema_t& schema) {
-  const bool is_of_rig = std::equal(
-      schema.signals.begin(), schema.signals.end(), config_.signals.begin(), config_.signals.end(),
-      [](const signal_t& a, const Signal& b) {
-        return a.signal_name == b.name && a.lower_limit == b.lower && a.upper_limit == b.upper;
-      });
-  if (!is_of_rig) {
-    ++refused_["BODY_SCHEMA"];
-    return;
-  }
-  schema_version_ = schema.schema_version;
-  schema_edges_.clear();
-  for (const schema_edge_t& edge : schema.edges) {
-    schema_edges_.emplace_back(edge.from_part, edge.to_part);
-  }
-}
-
 std::optional<action_command_t> MotorBabbler::on_model_health(const model_health_t& health) {
-  // Judges the body schema that was heard, or one that was not: then nothing speaks against it.
-  if (health.schema_version == schema_version_ &&
-      !std::equal(health.edge_health.begin(), health.edge_health.end(), schema_edges_.begin(),
-                  schema_edges_.end(), [](const edge_health_t& edge, const auto& parts) {
-                    return edge.health_from == parts.first && edge.health_to == parts.second;
-                  })) {
-    ++refused_["MODEL_HEALTH"];
-    return std::nullopt;
-  }
   health_ = health;
   if (last_sample_ < 0 && !is_restored_) {
     num_samples_ = std::max(num_samples_, health.judged_sample + 1);

@@ -3,14 +3,11 @@
 #include <Eigen/Core>
 #include <cstdint>
 #include <filesystem>
-#include <map>
 #include <optional>
 #include <string>
-#include <utility>
 #include <vector>
 
 #include "bodyschema/action_command_t.hpp"
-#include "bodyschema/body_schema_t.hpp"
 #include "bodyschema/control_status_t.hpp"
 #include "bodyschema/model_health_t.hpp"
 #include "bodyschema/motion_status_t.hpp"
@@ -73,8 +70,6 @@ class MotorBabbler {
   std::optional<action_command_t> on_sample(const sample_t& sample);
   std::optional<action_command_t> on_model_health(const model_health_t& health);
   std::optional<action_command_t> on_control_status(const control_status_t& status);
-  /// Only tells which rig's MODEL_HEALTH to believe.
-  void on_body_schema(const body_schema_t& schema);
   /// `now_us`: the clock. Sees silence.
   std::optional<action_command_t> on_tick(std::int64_t now_us);
 
@@ -86,8 +81,6 @@ class MotorBabbler {
   std::int64_t num_rejected() const { return num_rejected_; }
   /// Settled actions whose SAMPLE never came.
   std::int64_t num_unseen() const { return num_unseen_; }
-  /// Messages that were refused, by channel.
-  const std::map<std::string, std::int64_t>& refused() const { return refused_; }
 
   /// What a restart needs, as YAML; to be on disk before a command is sent. "" before the first.
   std::string state_text() const;
@@ -128,9 +121,6 @@ class MotorBabbler {
   bool done_ = false;
   action_command_t command_{};
   model_health_t health_{};
-  std::int64_t schema_version_ = -1;
-  std::vector<std::pair<int, int>> schema_edges_;
-  std::map<std::string, std::int64_t> refused_;
 };
 
 }  // namespace bodyschema

@@ -103,10 +103,16 @@ std::optional<sample_t> Observer::on_motion_status(const motion_status_t& status
   const bool is_settled_move = status.state == motion_status_t::STATE_SETTLED &&
                                status.kind == action_command_t::KIND_MOVE &&
                                status.rest_since_utime >= 0 && !status.commanded.empty();
-  const auto is_same = [&](const Rest& rest) { return key_of(rest.status) == key_of(status); };
-  if (is_settled_move && !done_.count(key_of(status)) &&
-      std::none_of(rests_.begin(), rests_.end(), is_same)) {
-    rests_.push_back({status, kNotEnded, status.utime});
+  if (is_settled_move && !done_.count(key_of(status))) {
+    const auto same = std::find_if(rests_.begin(), rests_.end(), [&](const Rest& rest) {
+      return key_of(rest.status) == key_of(status);
+    });
+    if (same == rests_.end()) {
+      rests_.push_back({status, kNotEnded, status.utime});
+    } else if (status.rest_since_utime > same->status.rest_since_utime) {
+      // Something disturbed it before it was seen: it rests anew, where the action led.
+      *same = {status, kNotEnded, status.utime};
+    }
     if (rests_.size() > kMaxRests) {
       rests_.pop_front();
       ++counters_["action never seen"];

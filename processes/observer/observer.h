@@ -39,9 +39,10 @@ struct ObserverConfig {
 ///
 /// Times of frames and of MOTION_STATUS must come from one clock. Messages may arrive in either
 /// order: frames and rest intervals wait for each other in bounded buffers. A frame that was seen
-/// before (same utime) is ignored. A rest interval ends when a later motion begins; what was not
-/// seen by then never becomes a sample. Nothing is invented: without frames, status or calibration
-/// it waits, and activity() says for what. With the same messages the samples are the same bytes.
+/// before (same utime) is ignored. A rest interval ends when a later motion begins, or where the
+/// driver says that the arm rests anew; what was not seen by then never becomes a sample. Nothing
+/// is invented: without frames, status or calibration it waits, and activity() says for what. With
+/// the same messages the samples are the same bytes.
 class Observer {
  public:
   Observer(const ObserverConfig& config, Markers markers);

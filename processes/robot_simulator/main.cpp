@@ -1,4 +1,6 @@
-// robot_simulator: ACTION_COMMAND -> MOTION_STATUS, SIM_STATE
+// robot_simulator: ACTION_COMMAND, FAULT_COMMAND -> MOTION_STATUS, SIM_STATE
+
+#include <spdlog/spdlog.h>
 
 #include <CLI/CLI.hpp>
 
@@ -30,13 +32,30 @@ int main(int argc, char** argv) {
       }
       if (answer.state) process.bus().publish(kSimState, *answer.state);
     };
+    // A full disk must not end a run: what a restart would lose is said once.
+    bool has_warned = false;
+    const auto save = [&] {
+      if (state_file.empty()) return;
+      try {
+        simulator.save(state_file);
+      } catch (const std::runtime_error& error) {
+        process.count("state not saved");
+        if (!has_warned) spdlog::warn("a restart would not know this pose: {}", error.what());
+        has_warned = true;
+      }
+    };
     process.bus().subscribe<action_command_t>(kActionCommand, [&](const action_command_t& command) {
       const RobotSimulator::Answer answer = simulator.on_command(command);
       // Saved before it is told: who hears of a pose can rely on it after a crash.
-      if (!state_file.empty()) simulator.save(state_file);
+      save();
       send(answer);
       process.set_activity(process_info_t::PHASE_WORKING,
                            "action " + std::to_string(command.action_id) + " of " + command.source);
+    });
+    process.bus().subscribe<fault_command_t>(kFaultCommand, [&](const fault_command_t& command) {
+      const RobotSimulator::Answer answer = simulator.on_fault(command);
+      save();
+      send(answer);
     });
     process.on_tick([&](std::int64_t now_us) { send(simulator.on_tick(now_us)); });
     process.set_activity(process_info_t::PHASE_WAITING, "waits for the first action");

@@ -17,7 +17,10 @@ namespace bodyschema {
 namespace {
 
 constexpr double kStartTime_s = 1;
+/// Answers that are remembered, and of these the newest that a restart remembers.
 constexpr std::size_t kMaxServed = 4096;
+constexpr std::size_t kMaxSaved = 64;
+constexpr double kFaultTakes_s = 1;
 
 // Quintic from 0 to 1 with zero speed and acceleration at both ends; its top speed is 15/8.
 double smooth_step(double s) {
@@ -54,6 +57,36 @@ std::string list_of(const double* values, std::size_t count) {
   return result.str();
 }
 
+/// Who was served: what an id means.
+bool is_same_command(const motion_status_t& status, const std::string& source, std::int64_t epoch,
+                     std::int64_t action_id) {
+  return status.action_id == action_id && status.epoch == epoch && status.source == source;
+}
+
+std::string saved_status(const motion_status_t& status) {
+  std::ostringstream text;
+  text << "{source: " << quoted(status.source) << ", epoch: " << status.epoch
+       << ", action_id: " << status.action_id << ", kind: " << int{status.kind}
+       << ", purpose: " << int{status.purpose} << ", state: " << int{status.state}
+       << ", reason: " << quoted(status.reason)
+       << ", commanded: " << list_of(status.commanded.data(), status.commanded.size()) << "}";
+  return text.str();
+}
+
+motion_status_t load_status(const Yaml& yaml) {
+  motion_status_t status{};
+  status.source = yaml.text("source");
+  status.epoch = yaml.integer("epoch", 0);
+  status.action_id = yaml.integer("action_id", -1);
+  status.kind = static_cast<std::int8_t>(yaml.integer("kind", 0, action_command_t::KIND_RESUME));
+  status.purpose =
+      static_cast<std::int8_t>(yaml.integer("purpose", 0, action_command_t::PURPOSE_CONTROL));
+  status.state = static_cast<std::int8_t>(yaml.integer("state", 0, motion_status_t::STATE_HOLDING));
+  status.reason = yaml.text("reason");
+  set_array(status.num_signals, status.commanded, yaml.numbers("commanded"));
+  return status;
+}
+
 }  // namespace
 
 RobotSimulatorConfig RobotSimulatorConfig::load(const std::filesystem::path& file) {
@@ -62,7 +95,8 @@ RobotSimulatorConfig RobotSimulatorConfig::load(const std::filesystem::path& fil
   config.rig_folder = file.parent_path();
   config.speed_share = yaml.number("speed_share", 0.01, 1);
   const Yaml settled = yaml.section("settled");
-  config.settled_speed = settled.number("speed_deg_per_s", 1e-6, 10) * (M_PI / 180);
+  config.settled_speed_rad_per_s = settled.number("speed_deg_per_s", 1e-6, 10) * (M_PI / 180);
+  config.settled_speed_m_per_s = settled.number("speed_mm_per_s", 1e-6, 10) / 1000;
   config.settled_for_s = settled.number("for_s", 0.002, 10);
   config.settle_timeout_s = settled.number("timeout_s", 0.1, 1000);
   config.repeat_us = microseconds(yaml.number("repeat_s", 0.01, 60));
@@ -70,29 +104,31 @@ RobotSimulatorConfig RobotSimulatorConfig::load(const std::filesystem::path& fil
   return config;
 }
 
+RobotSimulator::Body::Body(SceneDescription description)
+    : scene(std::move(description)), data(scene.make_data()), trial(scene.make_data()) {}
+
 RobotSimulator::RobotSimulator(RobotSimulatorConfig config)
     : config_(std::move(config)),
-      scene_(config_.rig_folder),
-      data_(scene_.make_data()),
-      trial_(scene_.make_data()) {
+      as_built_(Scene(config_.rig_folder).description()),
+      body_(as_built_) {
   for (const int part : config_.hidden_parts) {
-    if (scene_.plate_geoms(part).empty()) {
+    if (scene().plate_geoms(part).empty()) {
       throw std::invalid_argument("the rig has no part " + std::to_string(part) + " to hide");
     }
   }
-  data_->time = kStartTime_s;
-  rest_since_utime_ = microseconds(kStartTime_s);
+  body_.data->time = kStartTime_s;
+  rest_since_utime_ = start_utime_ = microseconds(kStartTime_s);
+  const Eigen::VectorXd& home = as_built_.robot.home;
+  at_.assign(home.begin(), home.end());
   action_command_t none{};
   none.action_id = -1;
-  none.num_signals = static_cast<std::int32_t>(scene_.robot().home.size());
-  none.action.assign(scene_.robot().home.begin(), scene_.robot().home.end());
   status_ = answer_to(none, motion_status_t::STATE_IDLE, "");
   update_state(-1);
 }
 
 std::string RobotSimulator::refusal(const action_command_t& command) const {
   if (stop_latched_) return "stopped: RESUME first";
-  const std::vector<Signal>& signals = scene_.signals().signals;
+  const std::vector<Signal>& signals = scene().signals().signals;
   if (command.action.size() != signals.size()) {
     return "the robot has " + std::to_string(signals.size()) + " signals, the action " +
            std::to_string(command.action.size());
@@ -110,11 +146,12 @@ std::string RobotSimulator::refusal(const action_command_t& command) const {
   return "";
 }
 
-std::optional<std::string> RobotSimulator::move(mjData& trial,
-                                                const Eigen::VectorXd& target) const {
-  const mjModel& model = scene_.model();
-  const std::vector<RobotJoint>& joints = scene_.robot().joints;
-  const Eigen::VectorXd start = scene_.joint_positions(trial);
+std::optional<std::string> RobotSimulator::move(Body& body, const Eigen::VectorXd& target) const {
+  const mjModel& model = body.scene.model();
+  mj_copyData(body.trial.get(), &model, body.data.get());
+  mjData& trial = *body.trial;
+  const std::vector<RobotJoint>& joints = body.scene.robot().joints;
+  const Eigen::VectorXd start = body.scene.joint_positions(trial);
   // All joints start and stop together, the slowest at its top speed.
   double duration_s = 0.1;
   for (std::size_t i = 0; i < joints.size(); ++i) {
@@ -132,15 +169,23 @@ std::optional<std::string> RobotSimulator::move(mjData& trial,
       trial.ctrl[i] = start[i] + s * (target[i] - start[i]);
     }
     mj_step1(&model, &trial);
-    if (const auto problem = scene_.collision(trial)) return problem;
+    if (const auto problem = body.scene.collision(trial)) return problem;
     // Gravity and Coriolis forces are known to a real arm's controller as well; this version of
     // MuJoCo has no option for it.
     mju_copy(trial.qfrc_applied, trial.qfrc_bias, model.nv);
     mj_step2(&model, &trial);
 
-    const double fastest = mju_norm(trial.qvel, model.nv);
-    if (!std::isfinite(fastest)) return "the simulation became unstable";
-    quiet = step >= ramp_steps && fastest < config_.settled_speed ? quiet + 1 : 0;
+    // Each joint's speed as a multiple of its own limit: rad/s and m/s do not add up.
+    double speed2 = 0;
+    for (std::size_t i = 0; i < joints.size(); ++i) {
+      const double limit = joints[i].kind == RobotJoint::Kind::kRevolute
+                               ? config_.settled_speed_rad_per_s
+                               : config_.settled_speed_m_per_s;
+      const double speed = body.scene.joint_speed(trial, static_cast<int>(i)) / limit;
+      speed2 += speed * speed;
+    }
+    if (!std::isfinite(speed2)) return "the simulation became unstable";
+    quiet = step >= ramp_steps && speed2 < 1 ? quiet + 1 : 0;
     if (quiet >= quiet_needed) return std::nullopt;
   }
   return "the arm would not come to rest";
@@ -149,7 +194,7 @@ std::optional<std::string> RobotSimulator::move(mjData& trial,
 motion_status_t RobotSimulator::answer_to(const action_command_t& command, std::int8_t state,
                                           const std::string& reason) const {
   motion_status_t status{};
-  status.utime = microseconds(data_->time);
+  status.utime = microseconds(body_.data->time);
   status.source = command.source;
   status.epoch = command.epoch;
   status.action_id = command.action_id;
@@ -159,8 +204,9 @@ motion_status_t RobotSimulator::answer_to(const action_command_t& command, std::
   status.reason = reason;
   status.rest_since_utime = rest_since_utime_;
   status.stop_latched = stop_latched_;
+  std::vector<double> commanded =
+      command.kind == action_command_t::KIND_MOVE && command.action_id >= 0 ? command.action : at_;
   // What is not a number must not travel on.
-  std::vector<double> commanded = command.action;
   for (double& value : commanded) {
     if (!std::isfinite(value)) value = 0;
   }
@@ -168,22 +214,35 @@ motion_status_t RobotSimulator::answer_to(const action_command_t& command, std::
   return status;
 }
 
+motion_status_t RobotSimulator::answer_again(const motion_status_t& served) const {
+  motion_status_t again = served;
+  again.utime = microseconds(body_.data->time);
+  again.rest_since_utime = rest_since_utime_;
+  again.stop_latched = stop_latched_;
+  // Who hears SETTLED or HOLDING may look at the arm: it must be there.
+  const bool is_where = served.state == motion_status_t::STATE_SETTLED ||
+                        served.state == motion_status_t::STATE_HOLDING;
+  if (is_where && served.commanded != at_) {
+    again.state = motion_status_t::STATE_STOPPED;
+    again.reason = "was carried out; the arm has moved on since";
+  }
+  // What is not the echo of an action says where the arm is.
+  if (served.kind != action_command_t::KIND_MOVE) again.commanded = at_;
+  return again;
+}
+
 RobotSimulator::Answer RobotSimulator::on_command(const action_command_t& command) {
-  for (const Served& served : served_) {
-    if (served.action_id == command.action_id && served.epoch == command.epoch &&
-        served.source == command.source) {
-      // The answer was lost, or the command was sent twice: what holds now is what was said then,
-      // but for the latch, which may have changed since.
-      motion_status_t again = served.status;
-      again.stop_latched = stop_latched_;
-      return {{again}, std::nullopt};
+  for (const motion_status_t& served : served_) {
+    // The answer was lost, or the command was sent twice.
+    if (is_same_command(served, command.source, command.epoch, command.action_id)) {
+      return {{answer_again(served)}, std::nullopt};
     }
   }
 
   Answer answer;
   const auto conclude = [&](std::int8_t state, const std::string& reason) {
     answer.statuses.push_back(answer_to(command, state, reason));
-    finish(answer.statuses.back());
+    remember(answer.statuses.back());
   };
   switch (command.kind) {
     case action_command_t::KIND_HOLD:
@@ -204,13 +263,17 @@ RobotSimulator::Answer RobotSimulator::on_command(const action_command_t& comman
       return answer;
   }
 
-  if (command.action.size() != scene_.signals().signals.size()) {
+  if (command.action.size() != scene().signals().signals.size()) {
     // Answered, not remembered: it is for another robot, whose ids may be the same as ours.
     answer.statuses.push_back(
         answer_to(command, motion_status_t::STATE_REJECTED, refusal(command)));
     return answer;
   }
-  const std::int64_t now = microseconds(data_->time);
+  const std::int64_t now = microseconds(body_.data->time);
+  if (command.utime < start_utime_) {
+    conclude(motion_status_t::STATE_EXPIRED, "sent before this start of the driver");
+    return answer;
+  }
   if (command.expiry_utime < now) {
     conclude(motion_status_t::STATE_EXPIRED,
              "expired " + std::to_string(now - command.expiry_utime) + " us ago");
@@ -220,14 +283,20 @@ RobotSimulator::Answer RobotSimulator::on_command(const action_command_t& comman
     conclude(motion_status_t::STATE_REJECTED, reason);
     return answer;
   }
-  const Eigen::VectorXd target = scene_.robot().joint_positions(
+
+  // What drifts does so while the arm moves, unless an obstacle keeps it from bending further.
+  std::vector<Fault> faults = faults_;
+  std::optional<Body> drifted;
+  if (drift(faults)) drifted = body_with(faults, nullptr);
+  Body& body = drifted ? *drifted : body_;
+
+  const Eigen::VectorXd target = body.scene.robot().joint_positions(
       Eigen::Map<const Eigen::VectorXd>(command.action.data(), command.action.size()));
-  if (const auto reason = scene_.robot().beyond_range(target)) {
+  if (const auto reason = body.scene.robot().beyond_range(target)) {
     conclude(motion_status_t::STATE_REJECTED, *reason);
     return answer;
   }
-  mj_copyData(trial_.get(), &scene_.model(), data_.get());
-  if (const auto reason = move(*trial_, target)) {
+  if (const auto reason = move(body, target)) {
     conclude(motion_status_t::STATE_REJECTED, *reason);
     return answer;
   }
@@ -236,19 +305,73 @@ RobotSimulator::Answer RobotSimulator::on_command(const action_command_t& comman
   motion_status_t moving = answer_to(command, motion_status_t::STATE_MOVING, "");
   moving.rest_since_utime = -1;
   answer.statuses.push_back(moving);
-  std::swap(data_, trial_);
+  if (drifted) {
+    body_ = *std::move(drifted);
+    faults_ = faults;
+  }
+  std::swap(body_.data, body_.trial);
   // At rest the joints' positions are all there is: what a restart restores is then the same.
-  scene_.set_joint_positions(*data_, scene_.joint_positions(*data_));
-  rest_since_utime_ = microseconds(data_->time - config_.settled_for_s);
+  Eigen::VectorXd positions = scene().joint_positions(*body_.data);
+  for (std::size_t i = 0; i < scene().robot().joints.size(); ++i) {
+    positions[i] = scene().robot().joints[i].stuck_at.value_or(positions[i]);
+  }
+  scene().set_joint_positions(*body_.data, positions);
+  rest_since_utime_ = microseconds(body_.data->time - config_.settled_for_s);
+  at_ = command.action;
   conclude(motion_status_t::STATE_SETTLED, "");
   update_state(command.action_id);
   answer.state = state_;
   return answer;
 }
 
-void RobotSimulator::finish(const motion_status_t& status) {
-  status_ = status;
-  served_.push_back({status.source, status.epoch, status.action_id, status});
+std::optional<RobotSimulator::Body> RobotSimulator::body_with(const std::vector<Fault>& faults,
+                                                              std::string* problem) const {
+  const Eigen::VectorXd positions = joint_positions();
+  Body body(broken(as_built_, faults, positions, config_.seed));
+  body.data->time = body_.data->time;
+  body.scene.set_joint_positions(*body.data, positions);
+  if (const auto collision = body.scene.collision(*body.data)) {
+    if (problem) *problem = *collision;
+    return std::nullopt;
+  }
+  return body;
+}
+
+RobotSimulator::Answer RobotSimulator::on_fault(const fault_command_t& command) {
+  const FaultKey key{command.sender, command.epoch, command.fault_id};
+  if (std::find(served_faults_.begin(), served_faults_.end(), key) != served_faults_.end()) {
+    return {{}, state_};
+  }
+  served_faults_.push_back(key);
+  if (served_faults_.size() > kMaxSaved) served_faults_.pop_front();
+
+  std::vector<Fault> faults = faults_;
+  fault_answer_ = add_fault(command, scene(), *body_.data, faults);
+  Answer answer;
+  if (fault_answer_.empty()) {
+    std::string problem;
+    if (std::optional<Body> body = body_with(faults, &problem)) {
+      body_ = *std::move(body);
+      faults_ = std::move(faults);
+      body_.data->time += kFaultTakes_s;
+      rest_since_utime_ = status_.rest_since_utime = status_.utime = microseconds(body_.data->time);
+      answer.statuses.push_back(status_);
+    } else {
+      fault_answer_ = "here it would be in " + problem + ": move the arm elsewhere first";
+    }
+  }
+  update_state(state_.action_id);
+  answer.state = state_;
+  return answer;
+}
+
+void RobotSimulator::remember(const motion_status_t& status) {
+  // A refusal is told once and to whom it asks again; what the arm does is repeated.
+  if (status.state != motion_status_t::STATE_REJECTED &&
+      status.state != motion_status_t::STATE_EXPIRED) {
+    status_ = status;
+  }
+  served_.push_back(status);
   if (served_.size() > kMaxServed) served_.pop_front();
 }
 
@@ -259,67 +382,123 @@ RobotSimulator::Answer RobotSimulator::on_tick(std::int64_t now_us) {
 }
 
 void RobotSimulator::update_state(std::int64_t action_id) {
-  state_ = scene_.state(*data_);
+  state_ = scene().state(*body_.data);
   state_.action_id = action_id;
   state_.seed = config_.seed;
   for (const int part : config_.hidden_parts) {
-    for (const int geom : scene_.plate_geoms(part)) state_.geom_alpha[geom] = 0;
+    for (const int geom : scene().plate_geoms(part)) state_.geom_alpha[geom] = 0;
   }
+  state_.fault_epoch = served_faults_.empty() ? 0 : served_faults_.back().epoch;
+  state_.fault_id = served_faults_.empty() ? -1 : served_faults_.back().fault_id;
+  state_.fault_answer = fault_answer_;
+  std::vector<std::string> faults;
+  for (const Fault& fault : faults_) faults.push_back(describe(fault, as_built_));
+  set_array(state_.num_faults, state_.faults, std::move(faults));
 }
 
 void RobotSimulator::save(const std::filesystem::path& file) const {
-  const Eigen::VectorXd positions = scene_.joint_positions(*data_);
+  const Eigen::VectorXd positions = joint_positions();
   std::ostringstream text;
   text << "# robot_simulator at rest. Joint positions in rad or m, times in us.\n"
-       << "robot: " << quoted(scene_.robot().name) << "\n"
+       << "robot: " << quoted(as_built_.robot.name) << "\n"
        << "seed: " << config_.seed << "\n"
-       << "time_s: " << list_of(&data_->time, 1) << "\n"
+       << "time_s: " << list_of(&body_.data->time, 1) << "\n"
        << "rest_since_us: " << rest_since_utime_ << "\n"
        << "stop_latched: " << (stop_latched_ ? "true" : "false") << "\n"
        << "joint_positions: " << list_of(positions.data(), positions.size()) << "\n"
+       << "at: " << list_of(at_.data(), at_.size()) << "\n"
        << "state_action_id: " << state_.action_id << "\n"
-       << "last: {source: " << quoted(status_.source) << ", epoch: " << status_.epoch
-       << ", action_id: " << status_.action_id << ", kind: " << int{status_.kind}
-       << ", purpose: " << int{status_.purpose} << ", state: " << int{status_.state}
-       << ", reason: " << quoted(status_.reason)
-       << ", commanded: " << list_of(status_.commanded.data(), status_.commanded.size()) << "}\n";
+       << "last: " << saved_status(status_) << "\n"
+       << "served:" << (served_.empty() ? " []" : "") << "\n";
+  for (std::size_t i = served_.size() - std::min(served_.size(), kMaxSaved); i < served_.size();
+       ++i) {
+    text << "  - " << saved_status(served_[i]) << "\n";
+  }
+  text << "faults:" << (faults_.empty() ? " []" : "") << "\n";
+  for (const Fault& fault : faults_) {
+    text << "  - {kind: " << int{fault.kind} << ", place: " << quoted(fault.place)
+         << ", number: " << fault.number << ", amount_bent_deg: ["
+         << std::setprecision(std::numeric_limits<double>::max_digits10) << fault.amount_deg << ", "
+         << fault.bent_deg << "], fallen: " << list_of(fault.fallen.data(), 3) << "}\n";
+  }
+  text << "fault_answer: " << quoted(fault_answer_) << "\n"
+       << "served_faults:" << (served_faults_.empty() ? " []" : "") << "\n";
+  for (const FaultKey& key : served_faults_) {
+    text << "  - {sender: " << quoted(key.sender) << ", epoch: " << key.epoch
+         << ", fault_id: " << key.fault_id << "}\n";
+  }
   write_file_atomically(file, text.str());
 }
 
 void RobotSimulator::restore(const std::filesystem::path& file) {
-  const Yaml yaml = Yaml::load(file);
-  if (yaml.text("robot") != scene_.robot().name) {
-    throw yaml.error("robot", "this is the state of another robot than " + scene_.robot().name);
+  try {
+    restore_from(Yaml::load(file));
+  } catch (const ConfigError& error) {
+    throw ConfigError(std::string(error.what()) +
+                      "; the saved state cannot be continued: put a good copy in its place, or "
+                      "delete it to start anew at the start pose");
   }
+}
+
+void RobotSimulator::restore_from(const Yaml& yaml) {
+  if (yaml.text("robot") != as_built_.robot.name) {
+    throw yaml.error("robot", "this is the state of another robot than " + as_built_.robot.name);
+  }
+  const int num_joints = static_cast<int>(as_built_.robot.joints.size());
+  const int num_signals = static_cast<int>(as_built_.signals.signals.size());
   const std::int64_t seed = yaml.integer("seed");
   const double time_s = yaml.numbers("time_s", 1)[0];
   const std::int64_t rest_since = yaml.integer("rest_since_us", 0);
   const bool stop_latched = yaml.boolean("stop_latched");
-  const std::vector<double> positions =
-      yaml.numbers("joint_positions", static_cast<int>(scene_.robot().joints.size()));
-  const std::int64_t state_action_id = yaml.integer("state_action_id");
-  const Yaml last = yaml.section("last");
-  action_command_t command{};
-  command.source = last.text("source");
-  command.epoch = last.integer("epoch");
-  command.action_id = last.integer("action_id");
-  command.kind = static_cast<std::int8_t>(last.integer("kind", 0, 3));
-  command.purpose = static_cast<std::int8_t>(last.integer("purpose", 0, 3));
-  const auto state = static_cast<std::int8_t>(last.integer("state", 0, 7));
-  const std::string reason = last.text("reason");
-  command.action = last.numbers("commanded");
+  const std::vector<double> positions = yaml.numbers("joint_positions", num_joints);
+  const std::vector<double> at = yaml.numbers("at", num_signals);
+  const std::int64_t state_action_id = yaml.integer("state_action_id", -1);
+  const motion_status_t last = load_status(yaml.section("last"));
+  std::deque<motion_status_t> served;
+  for (const Yaml& item : yaml.list("served")) served.push_back(load_status(item));
+  std::vector<Fault> faults;
+  for (const Yaml& item : yaml.list("faults")) {
+    Fault fault;
+    fault.kind = static_cast<std::int8_t>(item.integer("kind", 0, fault_command_t::FAULT_DRIFT));
+    fault.place = item.text("place");
+    fault.number = static_cast<int>(item.integer("number", -1, 1'000'000));
+    const std::vector<double> amounts = item.numbers("amount_bent_deg", 2);
+    fault.amount_deg = amounts[0];
+    fault.bent_deg = amounts[1];
+    fault.fallen = item.vector3("fallen");
+    faults.push_back(fault);
+  }
+  const std::string fault_answer = yaml.text("fault_answer");
+  std::deque<FaultKey> served_faults;
+  for (const Yaml& item : yaml.list("served_faults")) {
+    served_faults.push_back(
+        {item.text("sender"), item.integer("epoch", 0), item.integer("fault_id", 0)});
+  }
   yaml.finish();
 
+  const Eigen::VectorXd joints = Eigen::Map<const Eigen::VectorXd>(positions.data(), num_joints);
+  std::optional<Body> body;
+  try {
+    body.emplace(broken(as_built_, faults, joints, seed));
+  } catch (const std::exception& error) {
+    throw yaml.error("faults", error.what());
+  }
+  body_ = *std::move(body);
+  faults_ = std::move(faults);
   config_.seed = seed;
+  at_ = at;
   rest_since_utime_ = rest_since;
   stop_latched_ = stop_latched;
-  data_->time = time_s;
-  scene_.set_joint_positions(*data_,
-                             Eigen::Map<const Eigen::VectorXd>(positions.data(), positions.size()));
-  const motion_status_t status = answer_to(command, state, reason);
-  served_.clear();
-  if (status.action_id >= 0) finish(status);
-  status_ = status;
+  body_.data->time = time_s;
+  start_utime_ = microseconds(time_s);
+  scene().set_joint_positions(*body_.data, joints);
+  served_ = std::move(served);
+  fault_answer_ = fault_answer;
+  served_faults_ = std::move(served_faults);
+  status_ = last;
+  status_.utime = start_utime_;
+  status_.rest_since_utime = rest_since_utime_;
+  status_.stop_latched = stop_latched_;
   update_state(state_action_id);
 }
 

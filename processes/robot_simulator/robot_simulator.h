@@ -9,8 +9,11 @@
 #include <vector>
 
 #include "bodyschema/action_command_t.hpp"
+#include "bodyschema/fault_command_t.hpp"
 #include "bodyschema/motion_status_t.hpp"
 #include "bodyschema/sim_state_t.hpp"
+#include "common/config/yaml.h"
+#include "common/scene/faults.h"
 #include "common/scene/scene.h"
 
 namespace bodyschema {
@@ -19,8 +22,10 @@ namespace bodyschema {
 struct RobotSimulatorConfig {
   std::filesystem::path rig_folder;
   double speed_share = 1;    ///< of the joints' max_speed, for the servo set points
-  double settled_speed = 0;  ///< [rad/s], prismatic [m/s]: slower is at rest …
-  double settled_for_s = 0;  ///< … if it lasts this long
+  // At rest is who is slower than this, each joint by its own unit, all together …
+  double settled_speed_rad_per_s = 0;  ///< of a revolute joint that moves alone
+  double settled_speed_m_per_s = 0;    ///< of a prismatic joint that moves alone
+  double settled_for_s = 0;            ///< … if it lasts this long
   double settle_timeout_s = 0;
   std::int64_t repeat_us = 1'000'000;  ///< of MOTION_STATUS and SIM_STATE
   /// Parts whose plates are invisible.
@@ -37,7 +42,7 @@ struct RobotSimulatorConfig {
 /// a copy first: one that would touch what it must not is rejected and changes nothing.
 ///
 /// Before the first command it is idle at the start pose; when commands stop it stays where it is.
-/// The same seed and the same commands give the same answers, bit by bit.
+/// The same seed, the same commands and faults give the same answers, bit by bit.
 class RobotSimulator {
  public:
   /// What a command leads to, in the order in which it is to be sent.
@@ -49,53 +54,76 @@ class RobotSimulator {
   /// @throws ConfigError, std::invalid_argument (a hidden part that the rig has not).
   explicit RobotSimulator(RobotSimulatorConfig config);
 
-  /// Answers every command: MOVE with ACCEPTED, MOVING, SETTLED, or REJECTED (with the reason), or
-  /// EXPIRED; HOLD with HOLDING; STOP with STOPPED, and from then on every MOVE is rejected until
-  /// RESUME, which is answered with IDLE. A command that was answered before (source, epoch and
-  /// action id) gets its last answer again and moves nothing.
+  /// Answers every command as lcmtypes/DRIVER.md says: MOVE with ACCEPTED, MOVING, SETTLED, or
+  /// REJECTED, or EXPIRED; HOLD with HOLDING; STOP with STOPPED, and from then on every MOVE is
+  /// rejected until RESUME, which is answered with IDLE. A command that was answered before
+  /// (source, epoch and action id) moves nothing: it gets its answer again, STOPPED where it had
+  /// settled and the arm has moved on since.
   Answer on_command(const action_command_t& command);
+
+  /// Breaks the arm, or says in the state's fault_answer why not; each (sender, epoch, fault_id)
+  /// once. It takes a second of simulated time, so that what was seen before and after is two
+  /// intervals of rest.
+  Answer on_fault(const fault_command_t& command);
 
   /// Status and state once each repeat_s, by the caller's clock [µs].
   Answer on_tick(std::int64_t now_us);
 
-  /// The answer to the last command.
+  /// What is repeated: the newest command that was not refused.
   const motion_status_t& status() const { return status_; }
   const sim_state_t& state() const { return state_; }
-  const Scene& scene() const { return scene_; }
+  /// The arm as it is now; another one after a fault.
+  const Scene& scene() const { return body_.scene; }
   /// True positions of the joints [rad or m]; for tests.
-  Eigen::VectorXd joint_positions() const { return scene_.joint_positions(*data_); }
+  Eigen::VectorXd joint_positions() const { return body_.scene.joint_positions(*body_.data); }
 
-  /// Everything that a restart needs: pose, time, seed, the last answer. Numbers are exact.
+  /// Everything that a restart needs: pose, time, seed, faults, the newest answers. Numbers are
+  /// exact. @throws std::runtime_error if the file cannot be written.
   void save(const std::filesystem::path& file) const;
-  /// Continues from a saved file; the seed becomes the saved one. @throws ConfigError if it is not
-  /// of this rig.
+  /// Continues from a saved file; the seed becomes the saved one. @throws ConfigError, which says
+  /// what to do, if it is damaged or not of this rig.
   void restore(const std::filesystem::path& file);
 
  private:
-  struct Served {
-    std::string source;
+  /// An arm, whole or broken, and its physics.
+  struct Body {
+    explicit Body(SceneDescription description);
+    Scene scene;
+    MjDataPtr data;   // at rest
+    MjDataPtr trial;  // scratch
+  };
+  struct FaultKey {
+    std::string sender;
     std::int64_t epoch;
-    std::int64_t action_id;
-    motion_status_t status;
+    std::int64_t fault_id;
+    bool operator==(const FaultKey&) const = default;
   };
 
   std::string refusal(const action_command_t& command) const;
-  /// Simulates on `trial` until rest; a reason if it must not be. `trial` is then worthless.
-  std::optional<std::string> move(mjData& trial, const Eigen::VectorXd& target) const;
+  /// Simulates body.trial until rest; a reason if it must not be. The trial is then worthless.
+  std::optional<std::string> move(Body& body, const Eigen::VectorXd& target) const;
+  /// The arm with these faults where it stands now, or why it cannot be.
+  std::optional<Body> body_with(const std::vector<Fault>& faults, std::string* problem) const;
   motion_status_t answer_to(const action_command_t& command, std::int8_t state,
                             const std::string& reason) const;
-  void finish(const motion_status_t& status);
+  motion_status_t answer_again(const motion_status_t& served) const;
+  void remember(const motion_status_t& status);
   void update_state(std::int64_t action_id);
+  void restore_from(const Yaml& yaml);
 
   RobotSimulatorConfig config_;
-  Scene scene_;
-  MjDataPtr data_;   // at rest
-  MjDataPtr trial_;  // scratch
+  SceneDescription as_built_;
+  Body body_;
+  std::vector<double> at_;  // the action that led here, or the start pose
   motion_status_t status_{};
   sim_state_t state_{};
   std::int64_t rest_since_utime_ = 0;
+  std::int64_t start_utime_ = 0;  // of this process, driver's time
   bool stop_latched_ = false;
-  std::deque<Served> served_;  // the newest, for commands that are sent again
+  std::deque<motion_status_t> served_;  // the newest answers, for commands that are sent again
+  std::vector<Fault> faults_;
+  std::deque<FaultKey> served_faults_;
+  std::string fault_answer_;
   std::int64_t last_repeat_us_ = 0;
 };
 

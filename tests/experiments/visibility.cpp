@@ -134,7 +134,7 @@ int main(int argc, char** argv) {
     action_command_t command{};
     command.source = "visibility";
     command.action_id = asked++;
-    command.expiry_utime = simulator.status().utime;
+    command.utime = command.expiry_utime = simulator.status().utime;
     const bool is_extreme = unit(engine) < 0.5;
     for (const Signal& signal : signals) {
       double x = 2 * unit(engine) - 1;

@@ -219,6 +219,21 @@ TEST_F(Arm2, ThePictureIsAFrameWithMarkersDrawnIn) {
   EXPECT_GT(num_blue, 10);
 }
 
+TEST_F(Arm2, TheReportTellsTheRunWithItsPictureAndAgainstTheTruth) {
+  const fs::path html = folder_ / "report.html";
+  ASSERT_EQ(shell(in_quotes(kBin / "bodyschema") + " report " + in_quotes(run("first")) + " --out " +
+                  in_quotes(html) + " >/dev/null"),
+            0);
+  const std::string page = contents(html);
+  for (const char* part : {"The body is known: 5 parts", "src=\"data:image/jpeg;base64,/9j/",
+                           "the simulator’s noise-free truth", "end effector",
+                           "frame → MARKER_POSES", "ACTION_COMMAND → SAMPLE", "<h2>Events</h2>",
+                           "Processor time", "<h2>Configuration</h2>"}) {
+    EXPECT_NE(page.find(part), std::string::npos) << part;
+  }
+  EXPECT_EQ(page.find("class=\"warn\""), std::string::npos);
+}
+
 TEST_F(Arm2, TheBusAndTheImagesAreRecordedApart) {
   EXPECT_FALSE(payloads(run("first") / "images.lcmlog.00", "CAMERA_IMAGE").empty());
   EXPECT_TRUE(payloads(run("first") / "images.lcmlog.00", "SAMPLE").empty());

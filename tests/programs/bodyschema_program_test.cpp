@@ -520,5 +520,26 @@ TEST_F(RealDataTest, TheWeldingPositionerIsOneEdgeOfBothSignals) {
   EXPECT_LT(errors["parts"][0]["position_median_m"].get<double>(), 0.002);
 }
 
+TEST_F(BodyschemaProgramTest, AFaultWithoutASimulatorSaysSo) {
+  expect_failure({"fault", "repair", "--in", "memq://"}, "no simulator is heard on memq://");
+}
+
+TEST_F(BodyschemaProgramTest, AFaultIsCheckedBeforeItIsSent) {
+  expect_failure({"fault"}, "subcommand is required");
+  expect_failure({"fault", "bend", "forearm"}, "DEG is required");
+  expect_failure({"fault", "bend", "forearm", "91"}, "not in range");
+  expect_failure({"fault", "tool", "-1"}, "not in range");
+  expect_failure({"fault", "marker-lost", "twelve"}, "not in range");
+  expect_failure({"fault", "melt"}, "subcommand is required");
+}
+
+TEST_F(BodyschemaProgramTest, ADriverTestWithoutADriverSaysSo) {
+  const std::string rig = std::string(BODYSCHEMA_CONFIG) + "/arm2";
+  expect_failure({"driver-test", "--rig-folder", rig, "--in", "memq://", "--yes"},
+                 "no MOTION_STATUS within 5 s");
+  expect_failure({"driver-test", "--yes"}, "--rig-folder is required");
+  expect_failure({"driver-test", "--rig-folder", rig, "--kill", "x", "--restart", "y"}, "excludes");
+}
+
 }  // namespace
 }  // namespace bodyschema

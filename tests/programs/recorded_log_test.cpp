@@ -197,6 +197,10 @@ TEST_F(RecordedLogTest, WhatIsNoRunIsAClearError) {
   test::Program empty({kBin + "bodyschema", "report", folder_ / "empty"});
   EXPECT_EQ(empty.wait(), 1);
   EXPECT_NE(empty.err().find("empty: is empty"), std::string::npos);
+  test::write_bytes(folder_ / "text", {'t', ',', 'q', '1', '\n'});
+  test::Program text({kBin + "bodyschema", "report", folder_ / "text"});
+  EXPECT_EQ(text.wait(), 1);
+  EXPECT_NE(text.err().find("text: is not an LCM log"), std::string::npos);
 }
 
 // What tags add to their noise is one number: the rigs' files and the console agree.

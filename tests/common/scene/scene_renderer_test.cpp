@@ -10,6 +10,7 @@
 #include <opencv2/calib3d.hpp>
 
 #include "common/bus/convert.h"
+#include "common/scene/faults.h"
 #include "common/scene/scene.h"
 
 namespace bodyschema {
@@ -229,6 +230,81 @@ TEST(SceneRenderer, DoesNotShowWhatHasAlphaZero) {
   EXPECT_FALSE(found.contains(4));
   EXPECT_FALSE(found.contains(5));
   EXPECT_TRUE(found.contains(0));
+}
+
+/// SIM_STATE of a broken arm at the start pose. Its camera knows the rig alone.
+sim_state_t broken_state(const std::string& rig, const std::vector<Fault>& faults) {
+  const SceneDescription as_built = SceneDescription::load(kConfig / rig);
+  const Eigen::VectorXd joints = as_built.robot.joint_positions(as_built.robot.home);
+  const Scene scene(broken(as_built, faults, joints, 1));
+  return scene.state_at(as_built.robot.home, 1, 0);
+}
+
+std::vector<Fault> one_fault(std::int8_t kind, const std::string& place, int number,
+                             double amount_deg = 0, double bent_deg = 0) {
+  Fault fault;
+  fault.kind = kind;
+  fault.place = place;
+  fault.number = number;
+  fault.amount_deg = amount_deg;
+  fault.bent_deg = bent_deg;
+  return {fault};
+}
+
+TEST(SceneRenderer, ShowsEveryFaultBySimStateAlone) {
+  using Command = fault_command_t;
+  const Scene whole(kConfig / "arm7");
+  SceneRenderer renderer(kConfig / "arm7");
+  const auto before = detect(renderer.render(broken_state("arm7", {}), 0));
+  ASSERT_TRUE(before.contains(12) && before.contains(15) && before.contains(28));
+  const std::vector<std::vector<Fault>> cases = {
+      one_fault(Command::FAULT_BEND, "upper_arm", -1, 6),
+      one_fault(Command::FAULT_DRIFT, "forearm", -1, 0.1, -7),
+      one_fault(Command::FAULT_TOOL, "", 1),
+      one_fault(Command::FAULT_MARKER_MOVED, "", 12),
+      one_fault(Command::FAULT_CAMERA_BUMP, "", -1),
+  };
+  for (const std::vector<Fault>& faults : cases) {
+    const sim_state_t state = broken_state("arm7", faults);
+    const cv::Mat image = renderer.render(state, 0);
+    // Where the state says that the tags are, the detector finds them …
+    const Comparison result = compare(whole, renderer.calibration(), state, image, 60);
+    const std::string what = describe(faults[0], whole.description());
+    EXPECT_GE(result.num_tags, 8) << what;
+    EXPECT_LT(result.mean_px, 0.25) << what;
+    EXPECT_LT(result.bias_px.norm(), 0.1) << what;
+    // … and some are not where they were.
+    double farthest_px = 0;
+    for (const auto& [id, corners] : detect(image)) {
+      if (!before.contains(id)) continue;
+      for (int k = 0; k < 4; ++k) {
+        farthest_px = std::max(farthest_px, (corners[k] - before.at(id)[k]).norm());
+      }
+    }
+    EXPECT_GT(farthest_px, 5) << what;
+  }
+}
+
+TEST(SceneRenderer, ShowsAFallenMarkerOnTheFloor) {
+  const Scene whole(kConfig / "arm7");
+  SceneRenderer renderer(kConfig / "arm7", no_noise());
+  sim_state_t state = broken_state("arm7", {});
+  ASSERT_TRUE(detect(renderer.render(state, 0)).contains(15));
+  std::vector<Fault> faults = one_fault(fault_command_t::FAULT_MARKER_LOST, "", 15);
+  faults[0].fallen = {0.5, 0.1, 0.4};
+  state = broken_state("arm7", faults);
+  const auto found = detect(renderer.render(state, 0));
+  EXPECT_TRUE(found.contains(12));
+  if (found.contains(15)) {
+    // Seen at a flat angle, below the base's tags.
+    EXPECT_GT(found.at(15)[0].y(), found.begin()->second[0].y());
+  }
+  // From above it is plain.
+  look_at(whole, 15, 0.6, 30, 20, state);
+  const Comparison from_above =
+      compare(whole, renderer.calibration(), state, renderer.render(state, 0), 45);
+  EXPECT_TRUE(detect(renderer.render(state, 0)).contains(15));
+  EXPECT_LT(from_above.worst_px, 0.5);
 }
 
 TEST(SceneRenderer, RefusesTheStateOfAnotherRig) {

@@ -2,6 +2,7 @@
 
 #include <gtest/gtest.h>
 
+#include <algorithm>
 #include <filesystem>
 #include <fstream>
 #include <sstream>
@@ -117,6 +118,41 @@ std::filesystem::path changed_rig(const std::string& name, const std::string& fi
 TEST(Scene, RefusesAnUnknownKeyOfRobotYaml) {
   const auto rig = changed_rig("unknown_key", "robot.yaml", "mass_kg:", "mass_g:");
   EXPECT_THROW(Scene{rig}, ConfigError);
+}
+
+TEST(Scene, RefusesAToolOnALinkThatIsNotThere) {
+  const auto rig = changed_rig("unknown_tool_link", "robot.yaml", "tools:\n  link: arm",
+                               "tools:\n  link: leg");
+  EXPECT_THROW(Scene{rig}, ConfigError);
+}
+
+TEST(Scene, AToolThatIsNotMountedHasNoMassAndIsNotSeen) {
+  const Scene with(kConfig / "arm2");
+  const auto rig = std::filesystem::path(testing::TempDir()) / "bodyschema_no_tools";
+  std::filesystem::remove_all(rig);
+  std::filesystem::copy(kConfig / "arm2", rig, std::filesystem::copy_options::recursive);
+  std::stringstream text;
+  text << std::ifstream(rig / "robot.yaml").rdbuf();
+  const std::string whole = text.str();
+  std::ofstream(rig / "robot.yaml") << whole.substr(0, whole.find("tools:"));
+  const Scene without(rig);
+  ASSERT_EQ(with.model().ngeom, without.model().ngeom + 1);
+  ASSERT_EQ(with.model().nbody, without.model().nbody);
+  for (int i = 0; i < with.model().nbody; ++i) {
+    EXPECT_EQ(with.model().body_mass[i], without.model().body_mass[i]);
+  }
+  const sim_state_t state = with.state_at(with.robot().home, 1, 0);
+  EXPECT_EQ(std::count(state.geom_alpha.begin(), state.geom_alpha.end(), 0.0F), 1);
+}
+
+TEST(SceneDeathTest, AFatalErrorOfMujocoEndsTheProcessWithOneLine) {
+  testing::FLAGS_gtest_death_test_style = "threadsafe";
+  EXPECT_EXIT(
+      {
+        install_mujoco_handlers();
+        mju_error("out of memory");
+      },
+      testing::ExitedWithCode(1), "MuJoCo cannot go on and ends the process: out of memory");
 }
 
 TEST(Scene, RefusesPartsThatMarkersYamlDoesNotKnow) {

@@ -829,45 +829,6 @@ TEST(MotorBabblerTest, BeforeItsFirstCommandThereIsNothingToKeep) {
   EXPECT_EQ(babbler.state_text(), "");
 }
 
-TEST(MotorBabblerTest, MessagesOfAnotherRigAreRefusedAndCounted) {
-  Bench bench;
-  bench.start();
-  motion_status_t status = answer(bench.last, motion_status_t::STATE_SETTLED);
-  set_array(status.num_signals, status.commanded, std::vector<double>{1, 2});
-  EXPECT_FALSE(bench.babbler.on_motion_status(status));
-  sample_t sample = sample_of(bench.last, 0);
-  set_array(sample.num_signals, sample.action, std::vector<double>{1, 2});
-  EXPECT_FALSE(bench.babbler.on_sample(sample));
-  EXPECT_EQ(bench.babbler.num_samples(), 0);
-
-  BodySchema schema;
-  schema.version = 3;
-  schema.parts = {1, 2};
-  schema.root = 1;
-  schema.signals = test_config().signals;
-  schema.edges.resize(1);
-  schema.edges[0].from = 1;
-  schema.edges[0].to = 2;
-  bench.babbler.on_body_schema(to_message(schema));
-  schema.signals[0].name = "other";
-  schema.edges[0].to = 7;
-  bench.babbler.on_body_schema(to_message(schema));
-  model_health_t health = good_health(4);
-  health.schema_version = 3;
-  edge_health_t edge{};
-  edge.health_from = 1;
-  edge.health_to = 7;
-  set_array(health.num_edges, health.edge_health, {edge});
-  bench.run(4);
-  ASSERT_FALSE(bench.make_sample());
-  EXPECT_FALSE(bench.babbler.on_model_health(health));  // judges another schema
-  health.edge_health[0].health_to = 2;
-  EXPECT_TRUE(bench.babbler.on_model_health(health));
-  EXPECT_EQ(bench.babbler.refused(),
-            (std::map<std::string, std::int64_t>{
-                {"BODY_SCHEMA", 1}, {"MODEL_HEALTH", 1}, {"MOTION_STATUS", 1}, {"SAMPLE", 1}}));
-}
-
 TEST(MotorBabblerTest, AnswersAndSamplesOfOthersAreIgnored) {
   Bench bench;
   bench.start();

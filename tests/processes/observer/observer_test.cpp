@@ -236,6 +236,27 @@ TEST(Observer, UsesNoFrameFromAfterTheNextMotionBegan) {
   EXPECT_TRUE(observer.on_marker_poses(scene.frame(kRest_us + 33'333)));
 }
 
+TEST(Observer, MixesNoFramesOfTwoRestsOfOneAction) {
+  // The driver says so when the arm was disturbed, the simulator when a fault came.
+  Observer observer = calibrated();
+  Scene scene;
+  observer.on_motion_status(settled(0));
+  observer.on_marker_poses(scene.frame(kRest_us + 50'000));
+  const std::int64_t anew = kRest_us + 1'000'000;
+  EXPECT_FALSE(observer.on_motion_status(settled(0, anew)));
+  EXPECT_FALSE(observer.on_marker_poses(scene.frame(kRest_us + 83'333)));
+  EXPECT_FALSE(observer.on_marker_poses(scene.frame(anew + 50'000)));
+  const auto sample = observer.on_marker_poses(scene.frame(anew + 83'333));
+  ASSERT_TRUE(sample);
+  EXPECT_EQ(sample->action_id, 0);
+  EXPECT_EQ(sample->rest_begin_utime, anew);
+  EXPECT_EQ(sample->parts.at(0).num_frames, 2);
+  // Once it was seen, a later rest of the same action makes no second sample.
+  observer.on_motion_status(settled(0, anew + 1'000'000));
+  observer.on_marker_poses(scene.frame(anew + 1'050'000));
+  EXPECT_FALSE(observer.on_marker_poses(scene.frame(anew + 1'083'333)));
+}
+
 TEST(Observer, GivesUpAnActionWhoseFramesNeverCameWhenALaterOneIsSeen) {
   Observer observer = calibrated();
   Scene scene;

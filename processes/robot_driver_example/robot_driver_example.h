@@ -1,0 +1,113 @@
+#pragma once
+
+#include <cstdint>
+#include <deque>
+#include <filesystem>
+#include <functional>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "bodyschema/action_command_t.hpp"
+#include "bodyschema/motion_status_t.hpp"
+#include "common/config/rig.h"
+
+namespace bodyschema {
+
+/// robot_driver_example.yaml, and signals.yaml beside it.
+struct RobotDriverConfig {
+  Signals signals;
+  std::string device;
+  std::int64_t silent_us = 0;
+  std::int64_t motion_timeout_us = 0;
+  std::int64_t repeat_us = 0;
+
+  /// @throws ConfigError.
+  static RobotDriverConfig load(const std::filesystem::path& file);
+};
+
+/// A driver that keeps lcmtypes/DRIVER.md (its rules are cited as R1 …), for the robot that
+/// imaginary_robot plays. To make it yours, replace what is under "The robot's protocol" and
+/// convert command units where your robot has others.
+///
+/// Before its first report the robot is lost: nothing moves, `rest_since_utime` is −1. A robot that
+/// was lost is halted before anything else, and nothing that was under way is taken up again. When
+/// commands stop, the arm ends its motion and stays there: one MOVE is one motion, known to be safe
+/// as a whole, so there is nothing to watch between two commands.
+class RobotDriver {
+ public:
+  /// To be done in this order: lines to the robot, then statuses to the bus.
+  struct Answer {
+    std::vector<std::string> lines;
+    std::vector<motion_status_t> statuses;
+  };
+  /// Keeps the newest status over a restart; "" or what went wrong.
+  using Save = std::function<std::string(const motion_status_t&)>;
+
+  /// `record`: what Save kept last. Times are the system clock's [µs].
+  RobotDriver(RobotDriverConfig config, std::optional<motion_status_t> record, Save save,
+              std::int64_t now_us);
+
+  Answer on_command(const action_command_t& command, std::int64_t now_us);
+  /// The port was opened.
+  Answer on_connect(std::int64_t now_us);
+  /// A line of the robot's.
+  Answer on_line(const std::string& line, std::int64_t now_us);
+  /// The port is gone.
+  Answer on_disconnect(const std::string& problem, std::int64_t now_us);
+  /// Every 0.1 s: asks the robot, sees silence, repeats.
+  Answer on_tick(std::int64_t now_us);
+  /// The driver is told to end.
+  Answer on_end(std::int64_t now_us);
+
+  const motion_status_t& status() const { return status_; }
+  bool is_at_rest() const { return rest_since_ >= 0; }
+  bool is_lost() const { return is_lost_; }
+  std::int64_t num_strange_lines() const { return num_strange_lines_; }
+
+ private:
+  struct Report {
+    std::int64_t order;
+    bool is_moving;
+    std::vector<double> position;
+  };
+
+  std::optional<Report> parse(const std::string& line) const;
+  std::string go(const std::vector<double>& action);
+  std::string halt();
+
+  std::string refusal(const action_command_t& command) const;
+  motion_status_t make_status(const action_command_t& command, std::int8_t state,
+                              const std::string& reason) const;
+  void conclude(const action_command_t& command, std::int8_t state, const std::string& reason,
+                Answer& answer);
+  /// The motion in hand, if there is one, ends here.
+  void interrupt(const std::string& reason, Answer& answer);
+  void lose(const std::string& reason, Answer& answer);
+  void refresh_status(Answer& answer);
+  void advance_time(std::int64_t now_us);
+
+  const RobotDriverConfig config_;
+  const Save save_;
+  std::int64_t time_ = 0;   // driver's time [µs]
+  std::int64_t start_ = 0;  // driver's time of the start
+
+  // The robot.
+  bool is_lost_ = true;
+  std::int64_t halted_at_ = 0;  // since it was lost; 0: not yet
+  std::int64_t order_ = 0;      // N of the newest order
+  std::int64_t heard_at_ = 0;   // newest report
+  std::int64_t rest_since_ = -1;
+  std::vector<double> position_;  // as reported, command units
+  std::int64_t num_strange_lines_ = 0;
+
+  // The commands.
+  std::optional<action_command_t> motion_;  // under way
+  std::int64_t motion_since_ = 0;
+  bool is_stopped_ = false;
+  motion_status_t status_{};            // what is repeated
+  std::deque<motion_status_t> served_;  // the newest answers
+  std::int64_t said_at_ = 0;
+};
+
+}  // namespace bodyschema
