@@ -135,7 +135,12 @@ TEST_F(HostileBus, NothingThatIsNotTheRigsOwnChangesAByteOfWhatIsLearned) {
       {"model_monitor",
        {"malformed LEARNED_SCHEMA", "senseless LEARNED_SCHEMA", "refused LEARNED_SCHEMA"}},
       {"motor_babbler", {"malformed SAMPLE", "refused SAMPLE", "refused MODEL_HEALTH"}},
-      {"robot_simulator", {"malformed ACTION_COMMAND", "senseless ACTION_COMMAND"}}};
+      {"controller",
+       {"malformed POSE_TARGET", "senseless POSE_TARGET", "malformed MOTION_STATUS",
+        "refused MOTION_STATUS", "refused BODY_SCHEMA"}},
+      {"robot_simulator",
+       {"malformed ACTION_COMMAND", "senseless ACTION_COMMAND", "malformed FAULT_COMMAND",
+        "senseless FAULT_COMMAND"}}};
   for (const auto& [process, names] : expected) {
     for (const std::string& name : names) {
       EXPECT_GT(counters[process][name], 0) << process << ": " << name;

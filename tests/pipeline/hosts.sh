@@ -96,6 +96,11 @@ has_result_or_ended() { grep -q "Runs on" "$folder/learning.err" || ! kill -0 "$
 until_ok $((60 + samples * 2)) has_result_or_ended || fail "no result"
 [ -f "$folder/learning/current/result.json" ] || fail "the learning host ended without a result"
 
+# Every host knows of every process.
+for host in "${hosts[@]}"; do
+  BODYSCHEMA_LOGS=$folder/$host nsenter -t "${holder[$host]}" -n "$source/run" status --json --seconds 4 \
+    >"$folder/$host/status.json" 2>"$folder/$host/status.err" || fail "no status on $host: $(cat "$folder/$host/status.err")"
+done
 : >"$folder/lost"
 for host in "${hosts[@]}"; do
   [ "$loss" = 0 ] || echo "$host $(nsenter -t "${holder[$host]}" -n nft list ruleset | sed -n 's/.*counter packets \([0-9]*\).*/\1/p')" >>"$folder/lost"

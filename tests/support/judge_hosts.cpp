@@ -96,6 +96,14 @@ void judge(const fs::path& folder, std::size_t num_samples) {
              name + ": " + counter.counter_name + " " + std::to_string(counter.count));
     }
   }
+  for (const char* host : {"robot", "eye", "learning"}) {
+    if (!fs::exists(folder / host)) continue;
+    std::ifstream file(folder / host / "status.json");
+    std::set<std::string> seen;
+    for (const auto& process : nlohmann::json::parse(file)["processes"]) seen.insert(process["name"]);
+    for (const auto& [name, info] : heard.processes)
+      expect(seen.count(name) > 0, std::string(host) + " does not see " + name);
+  }
   std::ifstream stream(folder / "learning/current/result.json");
   const auto result = nlohmann::json::parse(stream);
   std::int64_t num_frames = 0;
