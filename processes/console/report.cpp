@@ -43,7 +43,8 @@ struct ReportArguments {
 /// A run folder or a single log, read as it grows.
 class Source {
  public:
-  explicit Source(const std::string& path) : path_(path) {
+  /// `grows`: whoever writes it is still at it, so that a torn event at its end is no damage.
+  Source(const std::string& path, bool grows) : path_(path), grows_(grows) {
     if (!fs::exists(path_)) throw std::runtime_error(path + ": no such run folder or log");
     is_folder_ = fs::is_directory(path_);
   }
@@ -81,6 +82,9 @@ class Source {
     report.title = title();
     report.record = &record_;
     report.logs = follower_.summaries();
+    for (auto& [file, summary] : report.logs) {
+      if (grows_ && summary.damage.starts_with("is cut off")) summary.damage.clear();
+    }
     report.reload_s = reload_s;
     report.picture = picture();
     if (is_folder_ && fs::exists(path_ / "config" / "signals.yaml")) {
@@ -142,12 +146,13 @@ class Source {
 
   const fs::path path_;
   bool is_folder_ = false;
+  const bool grows_;
   LogFollower follower_;
   RunRecord record_;
 };
 
 void run_report(const ReportArguments& arguments) {
-  Source source(arguments.source);
+  Source source(arguments.source, arguments.follow);
   const fs::path out = arguments.out.empty() ? source.default_out() : fs::path(arguments.out);
   if (!arguments.follow) {
     source.read();
