@@ -3,6 +3,7 @@
 #include <Eigen/Cholesky>
 #include <algorithm>
 #include <cmath>
+#include <cstring>
 #include <sstream>
 #include <tuple>
 #include <utility>
@@ -16,6 +17,7 @@ namespace {
 using S = control_status_t;
 
 constexpr char kSource[] = "controller";
+constexpr char kHeldAsBefore[] = "held as before the restart: ";
 constexpr std::int64_t kRepeat_us = 1'000'000;
 constexpr int kMaxExpired = 3;         // in a row
 constexpr double kMovedCamera = 33.1;  // chi^2_6(0.99999): the camera is not where the schema says
@@ -54,6 +56,10 @@ bool is_same_action(const motion_status_t& motion, const sample_t& sample) {
          motion.action_id == sample.action_id;
 }
 
+bool is_same_action(const sample_t& a, const sample_t& b) {
+  return a.source == b.source && a.epoch == b.epoch && a.action_id == b.action_id;
+}
+
 bool is_same(const control_status_t& a, const control_status_t& b) {
   const auto fields = [](const control_status_t& s) {
     return std::tie(s.sender, s.target_epoch, s.target_id, s.control_state, s.owns_arm, s.why,
@@ -81,6 +87,8 @@ ControllerConfig ControllerConfig::load(const std::filesystem::path& file) {
   config.resend_us = microseconds(yaml.number("resend_s", 0.1, 3600));
   config.take_us = microseconds(yaml.number("take_s", 0, 60));
   config.sample_timeout_us = microseconds(yaml.number("sample_timeout_s", 0.1, 3600));
+  config.rest_timeout_us = microseconds(yaml.number("rest_timeout_s", 1, 3600));
+  config.lent_timeout_us = microseconds(yaml.number("lent_timeout_s", 1, 36'000));
   const Yaml silence = yaml.section("silence");
   const auto limit = [&](const char* key) { return microseconds(silence.number(key, 0.5, 60)); };
   config.max_motion_status_silence_us = limit("motion_status_s");
@@ -358,6 +366,7 @@ Controller::Answer Controller::on_pose_target(const pose_target_t& target) {
       // An action that is under way is waited for; the arm may be the controller's already.
       guard_.restart();
       taking_.restart();
+      idle_.restart();
       enter(S::CONTROL_WAITING, owns_arm_, "taking up the target");
       return answer(advance());
   }
@@ -376,6 +385,7 @@ Controller::Command Controller::advance() {
   if (std::string edge; worst_edge(&edge) == EdgeState::kInvalid) {
     goal_.reset();
     is_taken_ = false;
+    if (state_ != S::CONTROL_LENT) lent_.restart();
     enter(S::CONTROL_LENT, false,
           "edge " + edge + " is invalid: the babbler has the arm until it is mended");
     return std::nullopt;
@@ -392,14 +402,15 @@ Controller::Command Controller::advance() {
 
 Controller::Command Controller::take(std::int64_t now_us) {
   const std::int64_t waited_us = taking_.elapsed_us(now_us);
+  if (!is_at_rest()) {
+    why_ = "waiting for the arm to come to rest";
+    taking_.restart(now_us);
+    return std::nullopt;
+  }
   if (quiet_.elapsed_us(now_us) < config_.take_us || waited_us < config_.take_us) {
     return std::nullopt;
   }
   const bool has_patience = waited_us < config_.sample_timeout_us;
-  if (!is_at_rest()) {
-    why_ = "waiting for the arm to come to rest";
-    return std::nullopt;
-  }
   const bool is_settled = motion_->state == motion_status_t::STATE_SETTLED &&
                           motion_->kind == action_command_t::KIND_MOVE;
   if (is_settled && has_patience && !(sample_ && is_same_action(*motion_, *sample_))) {
@@ -605,6 +616,7 @@ Controller::Answer Controller::on_marker_poses(const marker_poses_t& poses) {
 }
 
 Controller::Answer Controller::on_sample(const sample_t& sample) {
+  if (!sample_ || !is_same_action(*sample_, sample)) lent_.restart();
   sample_ = sample;
   see(sample.utime);
   locate();
@@ -639,6 +651,9 @@ Controller::Answer Controller::on_model_health(const model_health_t& health) {
 Controller::Answer Controller::on_tick(std::int64_t now_us) {
   silent_ = silence(now_us);
   quiet_.elapsed_us(now_us);
+  const bool is_serving =
+      owns_arm_ && (state_ == S::CONTROL_WAITING || state_ == S::CONTROL_MOVING);
+  if (!is_serving || command_ || awaited_) idle_.restart(now_us);
   Command command;
   if (schema_ && !owns_arm_ &&
       schema_silence_.elapsed_us(now_us) > config_.max_body_schema_silence_us) {
@@ -646,7 +661,7 @@ Controller::Answer Controller::on_tick(std::int64_t now_us) {
     schema_.reset();
     goal_.reset();
   }
-  if (owns_arm_ && (state_ == S::CONTROL_WAITING || state_ == S::CONTROL_MOVING)) {
+  if (is_serving) {
     if (!silent_.empty()) {
       command = hold(silent_);
     } else if (command_) {
@@ -660,6 +675,8 @@ Controller::Answer Controller::on_tick(std::int64_t now_us) {
         command = hold("no SAMPLE of " + name_of(*awaited_, kSource) + " within " +
                        seconds(config_.sample_timeout_us) + ": is the observer alive?");
       }
+    } else if (idle_.elapsed_us(now_us) >= config_.rest_timeout_us) {
+      refuse("given up after " + seconds(config_.rest_timeout_us) + ": " + why_);
     } else if (!is_taken_) {
       command = take(now_us);
     }
@@ -668,6 +685,11 @@ Controller::Answer Controller::on_tick(std::int64_t now_us) {
         std::max({config_.max_motion_status_silence_us, config_.max_marker_poses_silence_us,
                   config_.max_body_schema_silence_us});
     if (guard_.elapsed_us(now_us) > patience_us) refuse("not heard: " + unheard());
+  } else if (state_ == S::CONTROL_LENT) {
+    if (lent_.elapsed_us(now_us) >= config_.lent_timeout_us) {
+      refuse("no new SAMPLE for " + seconds(config_.lent_timeout_us) + " while " + why_ +
+             "; does the babbler run, or is it done?");
+    }
   } else if (state_ == S::CONTROL_REACHED && target_.keep_s >= 0 &&
              keep_.elapsed_us(now_us) >= microseconds(target_.keep_s)) {
     enter(S::CONTROL_RELEASED, false, why_ + "; kept for " + seconds(microseconds(target_.keep_s)));
@@ -685,12 +707,13 @@ std::string Controller::state_text() const {
   const bool holds =
       state_ == S::CONTROL_HOLDING || (state_ == S::CONTROL_REACHED && target_.keep_s < 0);
   std::ostringstream text;
-  text << "# controller: its own action ids, the newest target, whether the arm is held.\n"
+  text << "# controller: its own action ids, the newest target, whether the arm is its own.\n"
        << "epoch: " << epoch_ << "\n"
        << "next_action_id: " << next_action_id_ << "\n"
        << "target: {sender: " << yaml_quoted(target_.sender) << ", epoch: " << floor_epoch_
        << ", target_id: " << floor_id_ << "}\n"
        << "was_served: " << (is_active() ? "false" : "true") << "\n"
+       << "owns_arm: " << (owns_arm_ ? "true" : "false") << "\n"
        << "holds: " << (holds ? "true" : "false") << "\n"
        << "why: " << yaml_quoted(holds ? why_ : "") << "\n";
   return text.str();
@@ -705,21 +728,24 @@ void Controller::restore(const std::filesystem::path& file) {
   const std::int64_t epoch = target.integer("epoch", 0);
   const std::int64_t id = target.integer("target_id", -1);
   const bool was_served = yaml.boolean("was_served");
+  const bool owns_arm = yaml.boolean("owns_arm");
   const bool holds = yaml.boolean("holds");
-  const std::string why = yaml.text("why");
+  std::string why = yaml.text("why");
   yaml.finish();
   floor_epoch_ = epoch;
   // A sender repeats what was not acknowledged: then the same target counts again.
-  floor_id_ = holds ? id : id - 1;
-  if (holds) {
+  floor_id_ = owns_arm ? id : id - 1;
+  const std::string name = "target " + std::to_string(id) + " of " + sender;
+  if (owns_arm) {
     target_.sender = sender;
     target_.epoch = epoch;
     target_.target_id = id;
-    hold("held as before the restart: " + why);
+    if (why.starts_with(kHeldAsBefore)) why.erase(0, std::strlen(kHeldAsBefore));
+    hold(holds ? kHeldAsBefore + why
+               : "restarted in the middle of " + name + ": give another, or release the arm");
   } else if (id >= 0) {
     why_ = was_served ? "restarted; no target is open"
-                      : "restarted: target " + std::to_string(id) + " of " + sender +
-                            " was not finished and is not continued; give it again";
+                      : "restarted: " + name + " was not begun; give it again";
   }
 }
 

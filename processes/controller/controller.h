@@ -35,6 +35,8 @@ struct ControllerConfig {
   std::int64_t resend_us = 0;   ///< a command without an answer is sent again after this
   std::int64_t take_us = 0;     ///< the arm is taken when MOTION_STATUS did not change for so long
   std::int64_t sample_timeout_us = 0;  ///< a settled action's SAMPLE is awaited this long
+  std::int64_t rest_timeout_us = 0;    ///< an arm that cannot be moved from is given up after this
+  std::int64_t lent_timeout_us = 0;    ///< lent so long without a new SAMPLE, a target is refused
   std::int64_t max_motion_status_silence_us = 0;
   std::int64_t max_marker_poses_silence_us = 0;
   std::int64_t max_body_schema_silence_us = 0;
@@ -50,7 +52,9 @@ struct ControllerConfig {
 /// Of all targets the highest (epoch, target_id) counts; a repeated one does nothing. The arm is
 /// its own (owns_arm) from the moment that a target can be served until it was reached and kept,
 /// was refused or is released. Taking it waits until the arm rests and the last settled action has
-/// its SAMPLE. While an edge on the way to the part is INVALID the arm is lent to the babbler.
+/// its SAMPLE. While an edge on the way to the part is INVALID the arm is lent to the babbler. Neither
+/// lasts for ever: an arm that does not come to rest within rest_timeout, or that is lent for
+/// lent_timeout without a new SAMPLE, ends in a refusal.
 ///
 /// Start guard: nothing is sent before MOTION_STATUS, BODY_SCHEMA and MARKER_POSES of the present
 /// rest were heard, and no MOVE from a position that was not heard: the last settled action of this
@@ -63,8 +67,9 @@ struct ControllerConfig {
 ///
 /// Messages must be of the rig (RigDoor): signals are not compared here.
 ///
-/// After a restart a hold is held; a target in progress is not continued and no longer
-/// acknowledged.
+/// After a restart that owned the arm it is held, and the target that was in progress is over: it
+/// stays acknowledged, a repetition does nothing. A target for which the arm was not taken yet is
+/// no longer acknowledged, so that its sender gives it again.
 class Controller {
  public:
   /// What is to be sent. `status` on every change and at 1 Hz.
@@ -88,7 +93,7 @@ class Controller {
   /// Messages that came too late and commands that were in vain, since the start.
   const std::map<std::string, std::int64_t>& counters() const { return counters_; }
 
-  /// What a restart needs, as YAML; to be on disk before an Answer is sent.
+  /// What a restart needs, as YAML; to be on disk before a MOVE is sent.
   std::string state_text() const;
   /// Continues from a file with state_text(). @throws ConfigError.
   void restore(const std::filesystem::path& file);
@@ -181,6 +186,8 @@ class Controller {
   Eigen::Vector3d observed_offset_ = Eigen::Vector3d::Zero();  ///< target minus seen position, in R
   bool is_observation_sure_ = false;  ///< unambiguous, and not to be explained by its covariance
   Stopwatch guard_, taking_, quiet_, keep_;
+  Stopwatch idle_;  ///< its own arm, but nothing is sent or awaited
+  Stopwatch lent_;  ///< without a new SAMPLE
 
   // What was sent.
   std::int64_t epoch_ = -1;

@@ -1,12 +1,13 @@
-// motor_babbler: MOTION_STATUS, SAMPLE, MODEL_HEALTH, CONTROL_STATUS -> ACTION_COMMAND
+// motor_babbler: MOTION_STATUS, SAMPLE, MARKER_POSES, MODEL_HEALTH, CONTROL_STATUS
+//                -> ACTION_COMMAND
 
 #include <CLI/CLI.hpp>
 #include <filesystem>
 #include <utility>
 
-#include "common/bus/event_log.h"
 #include "common/bus/process.h"
 #include "common/bus/rig_door.h"
+#include "common/bus/state_file.h"
 #include "processes/motor_babbler/motor_babbler.h"
 
 using namespace bodyschema;
@@ -28,22 +29,25 @@ int main(int argc, char** argv) {
     if (!state_file.empty() && std::filesystem::exists(state_file)) babbler.restore(state_file);
     process.set_seed(seed);
 
-    std::string saved = babbler.state_text();
+    StateFile state(state_file, babbler.state_text());
     const auto send = [&](const std::optional<action_command_t>& command) {
-      if (const std::string text = babbler.state_text(); text != saved && !state_file.empty()) {
-        write_file_atomically(state_file, text);
-        saved = text;
-      }
-      if (command) process.bus().publish(kActionCommand, *command);
-      const std::int8_t phase =
-          babbler.is_done() ? process_info_t::PHASE_DONE : process_info_t::PHASE_WORKING;
-      process.set_activity(phase, babbler.activity());
+      // A command that is not sent now is given again after resend_s.
+      const bool is_saved = state.save(babbler.state_text());
+      if (command && is_saved) process.bus().publish(kActionCommand, *command);
+      const std::int8_t phase = babbler.is_done() ? process_info_t::PHASE_DONE
+                                : is_saved        ? process_info_t::PHASE_WORKING
+                                                  : process_info_t::PHASE_WAITING;
+      process.set_activity(
+          phase, is_saved ? babbler.activity()
+                          : "no MOVE is sent: its state is not saved: " + state.problem());
     };
     const RigDoor door(process.rig_folder());
     door.subscribe(process, kMotionStatus,
                    [&](const motion_status_t& status) { send(babbler.on_motion_status(status)); });
     door.subscribe(process, kSample,
                    [&](const sample_t& sample) { send(babbler.on_sample(sample)); });
+    door.subscribe(process, kMarkerPoses,
+                   [&](const marker_poses_t& poses) { babbler.on_marker_poses(poses); });
     door.subscribe(process, kModelHealth,
                    [&](const model_health_t& health) { send(babbler.on_model_health(health)); });
     process.bus().subscribe<control_status_t>(kControlStatus, [&](const control_status_t& status) {
@@ -56,8 +60,12 @@ int main(int argc, char** argv) {
     process.on_idle([&] {
       count("action rejected", babbler.num_rejected());
       count("sample never seen", babbler.num_unseen());
+      if (state.num_failed() > 0) count("state not saved", state.num_failed());
     });
-    process.on_tick([&](std::int64_t now_us) { send(babbler.on_tick(now_us)); });
+    process.on_tick([&](std::int64_t now_us) {
+      if (!state.problem().empty()) state.retry();
+      send(babbler.on_tick(now_us));
+    });
     process.run();
   };
   return run_process("motor_babbler", argc, argv, body, add_options);

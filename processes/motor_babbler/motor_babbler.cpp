@@ -16,6 +16,7 @@ constexpr char kSource[] = "motor_babbler";
 constexpr int kMaxHastyRejections = 20;
 constexpr std::int64_t kListen_us = 1'500'000;  // CONTROL_STATUS repeats at 1 Hz
 constexpr std::int64_t kControlSilent_us = 3'000'000;
+constexpr std::int64_t kEyesSilent_us = 5'000'000;  // frames and SAMPLE repeat at 1 Hz at least
 
 std::int64_t microseconds(double seconds) { return std::llround(seconds * 1e6); }
 
@@ -79,6 +80,7 @@ bool MotorBabbler::is_mine(const motion_status_t& status) const {
 std::optional<action_command_t> MotorBabbler::on_motion_status(const motion_status_t& status) {
   driver_utime_ = status.utime;
   is_at_rest_ = status.rest_since_utime >= 0;
+  rest_utime_ = status.rest_since_utime;
   is_stopped_ = status.stop_latched == 1;
   if (done_) return std::nullopt;
   if (wait_ == Wait::kDriver && !is_restored_) {
@@ -88,7 +90,7 @@ std::optional<action_command_t> MotorBabbler::on_motion_status(const motion_stat
     if (status.source == kSource) action_id_ = std::max(action_id_, status.action_id + 1);
   }
   if (is_stopped_) {
-    wait_ = Wait::kRest;
+    if (wait_ != Wait::kDriver) wait_ = Wait::kRest;
     return std::nullopt;
   }
   if (wait_ == Wait::kDriver) return begin();
@@ -112,6 +114,8 @@ std::optional<action_command_t> MotorBabbler::on_motion_status(const motion_stat
     case motion_status_t::STATE_SETTLED:
       num_rejected_in_a_row_ = 0;
       wait_ = Wait::kSample;
+      frame_us_ = observer_us_ = 0;
+      has_seen_frame_ = has_heard_observer_ = false;
       return std::nullopt;
     default:
       return std::nullopt;
@@ -119,7 +123,7 @@ std::optional<action_command_t> MotorBabbler::on_motion_status(const motion_stat
 }
 
 std::optional<action_command_t> MotorBabbler::begin() {
-  if (!may_move() || (is_restored_ && !has_heard_control_)) return std::nullopt;
+  if (!may_move() || !has_heard_control_) return std::nullopt;
   if (!is_restored_) return act();
   wait_since_us_ = -1;
   if (!is_seen_) {
@@ -134,6 +138,7 @@ std::optional<action_command_t> MotorBabbler::begin() {
 }
 
 std::optional<action_command_t> MotorBabbler::on_sample(const sample_t& sample) {
+  has_heard_observer_ = has_ever_heard_observer_ = true;
   if (wait_ == Wait::kDriver && !is_restored_) {
     // All that tells a babbler without kept state about its predecessor.
     num_samples_ = std::max(num_samples_, sample.sample_index + 1);
@@ -148,6 +153,7 @@ std::optional<action_command_t> MotorBabbler::on_sample(const sample_t& sample) 
   if (is_test) last_test_sample_ = last_sample_;
   if (sample.action_id != command_.action_id) return std::nullopt;
   is_seen_ = true;
+  num_unseen_in_a_row_ = 0;
   if (wait_ != Wait::kSample && wait_ != Wait::kAnswer) return std::nullopt;
   if (is_test && health_.judged_sample < last_test_sample_) {
     wait_ = Wait::kVerdict;
@@ -155,6 +161,10 @@ std::optional<action_command_t> MotorBabbler::on_sample(const sample_t& sample) 
     return std::nullopt;
   }
   return act();
+}
+
+void MotorBabbler::on_marker_poses(const marker_poses_t& poses) {
+  if (is_at_rest_ && poses.utime >= rest_utime_) has_seen_frame_ = true;
 }
 
 std::optional<action_command_t> MotorBabbler::on_model_health(const model_health_t& health) {
@@ -172,7 +182,7 @@ std::optional<action_command_t> MotorBabbler::on_control_status(const control_st
   is_control_silent_ = false;
   control_since_us_ = -1;
   if (done_ || is_lent_) return std::nullopt;
-  if (wait_ == Wait::kDriver) return driver_utime_ > 0 && !is_stopped_ ? begin() : std::nullopt;
+  if (wait_ == Wait::kDriver) return begin();
   // What was not finished when the arm was taken is replaced.
   if (was_lent && (wait_ == Wait::kAnswer || wait_ == Wait::kSample)) wait_ = Wait::kRest;
   return wait_ == Wait::kRest && may_move() ? act() : std::nullopt;
@@ -184,20 +194,41 @@ std::optional<action_command_t> MotorBabbler::on_tick(std::int64_t now_us) {
   is_control_silent_ = now_us - control_since_us_ > kControlSilent_us;
   if (!has_heard_control_ && now_us - started_us_ >= kListen_us) {
     has_heard_control_ = true;  // there is no controller
-    if (wait_ == Wait::kDriver && is_restored_) return begin();
+    if (wait_ == Wait::kDriver) return begin();
   }
+  now_us_ = now_us;
+  if (std::exchange(has_seen_frame_, false)) frame_us_ = now_us;
+  if (std::exchange(has_heard_observer_, false)) observer_us_ = now_us;
   if (wait_since_us_ < 0) wait_since_us_ = now_us;
   const std::int64_t waited_us = now_us - wait_since_us_;
   if (wait_ == Wait::kAnswer && waited_us >= config_.resend_us && !is_lent_) {
     wait_since_us_ = now_us;
     return command_;
   }
+  // Only the time in which a SAMPLE could have come is counted.
+  if (wait_ == Wait::kSample && waited_us > kEyesSilent_us && !blindness().empty()) {
+    wait_since_us_ = now_us - kEyesSilent_us;
+    return std::nullopt;
+  }
   if (wait_ == Wait::kSample && waited_us >= config_.sample_timeout_us) {
     ++num_unseen_;
+    ++num_unseen_in_a_row_;
     return act();
   }
   if (wait_ == Wait::kVerdict && waited_us >= config_.verdict_timeout_us) return act();
   return std::nullopt;
+}
+
+std::string MotorBabbler::blindness() const {
+  const auto is_silent = [&](std::int64_t heard_us) {
+    return heard_us == 0 || now_us_ - heard_us > kEyesSilent_us;
+  };
+  if (is_silent(frame_us_)) {
+    return "no MARKER_POSES of this rest: are camera and marker_estimator running?";
+  }
+  const bool may_be_alive = !has_ever_heard_observer_ && num_unseen_in_a_row_ == 0;
+  if (is_silent(observer_us_) && !may_be_alive) return "is the observer running?";
+  return "";
 }
 
 bool MotorBabbler::should_stop() const {
@@ -253,13 +284,18 @@ std::string MotorBabbler::activity() const {
   switch (wait_) {
     case Wait::kDriver:
       if (driver_utime_ == 0) return "waiting for MOTION_STATUS of a driver";
-      return samples + ", waiting until the arm is at rest and nobody else's";
+      return samples + (is_stopped_ ? ", stopped: waiting for RESUME"
+                                    : ", waiting until the arm is at rest and nobody else's");
     case Wait::kAnswer:
       return samples + ", waiting for the driver's answer to action " +
              std::to_string(command_.action_id) +
              (num_rejected_in_a_row_ > 0 ? "; refused before: " + rejection_ : "");
-    case Wait::kSample:
-      return samples + ", waiting for the SAMPLE of action " + std::to_string(command_.action_id);
+    case Wait::kSample: {
+      const std::string text =
+          samples + ", waiting for the SAMPLE of action " + std::to_string(command_.action_id);
+      const bool is_late = wait_since_us_ >= 0 && now_us_ - wait_since_us_ >= kEyesSilent_us;
+      return is_late && !blindness().empty() ? text + "; " + blindness() : text;
+    }
     case Wait::kVerdict:
       return samples + ", waiting for MODEL_HEALTH of sample " + std::to_string(last_test_sample_);
     case Wait::kRest:

@@ -9,6 +9,7 @@
 
 #include "bodyschema/action_command_t.hpp"
 #include "bodyschema/control_status_t.hpp"
+#include "bodyschema/marker_poses_t.hpp"
 #include "bodyschema/model_health_t.hpp"
 #include "bodyschema/motion_status_t.hpp"
 #include "bodyschema/sample_t.hpp"
@@ -35,6 +36,7 @@ struct MotorBabblerConfig {
   std::int64_t expiry_us = 0;          ///< of a command, driver's time
   std::int64_t resend_us = 0;          ///< a command without an answer is sent again after this
   std::int64_t sample_timeout_us = 0;  ///< a settled action without a SAMPLE is given up after this
+                                       ///< with camera and observer alive
   std::int64_t verdict_timeout_us = 0;  ///< a TEST sample's MODEL_HEALTH is awaited this long
   StoppingRule stop;
 
@@ -51,23 +53,30 @@ Eigen::VectorXd random_action(const MotorBabblerConfig& config, std::int64_t see
 /// followed by its SAMPLE, until the stopping rule holds. Collisions are the driver's to refuse: a
 /// rejected action is replaced by the next.
 ///
-/// Before the first MOTION_STATUS it does nothing (start guard). When the driver falls silent it
-/// repeats its last command, which the driver answers without moving twice. While a STOP is latched
-/// it waits for RESUME; while the controller owns the arm it sends nothing, however long the
+/// Before the first MOTION_STATUS it does nothing (start guard), and it listens until it knows
+/// whether the arm is lent out, 1.5 s at most. When the driver falls silent it repeats its last
+/// command, which the driver answers without moving twice.
+///
+/// It does not move blind: a settled action whose SAMPLE does not come is replaced only after
+/// sample_timeout in which frames of that rest and the observer (which repeats its newest SAMPLE at
+/// 1 Hz) were heard. Otherwise it waits for them; when they are back that SAMPLE is made after all.
+/// Where no SAMPLE was ever heard nothing tells whether the observer lives: one action is replaced.
+///
+/// While a STOP is latched it waits for RESUME; while the controller owns the arm it sends nothing, however long the
 /// controller is silent. An action that was cut short by that is replaced by the next. After each
 /// TEST sample it waits for the monitor's verdict, so that with a fast bus or a slow learner the
 /// run ends at the same sample.
 ///
-/// A restart with the kept state goes on as if nothing had happened: it listens until it knows
-/// whether the arm is lent out, 1.5 s at most, then sends the last command again, which the driver
-/// answers without moving twice, unless that command's SAMPLE has come. Samples are counted where
-/// they are its own, so that every test_every-th of them is TEST whatever others do in between.
+/// A restart with the kept state goes on as if nothing had happened: it sends the last command
+/// again, unless that command's SAMPLE has come. Samples are counted where they are its own, so that every test_every-th of them is TEST whatever others do in between.
 class MotorBabbler {
  public:
   MotorBabbler(MotorBabblerConfig config, std::int64_t seed);
 
   std::optional<action_command_t> on_motion_status(const motion_status_t& status);
   std::optional<action_command_t> on_sample(const sample_t& sample);
+  /// Shows that camera and marker_estimator see the arm at rest.
+  void on_marker_poses(const marker_poses_t& poses);
   std::optional<action_command_t> on_model_health(const model_health_t& health);
   std::optional<action_command_t> on_control_status(const control_status_t& status);
   /// `now_us`: the clock. Sees silence.
@@ -95,6 +104,8 @@ class MotorBabbler {
   bool may_move() const { return is_at_rest_ && !is_stopped_ && !is_lent_; }
   bool is_mine(const motion_status_t& status) const;
   bool should_stop() const;
+  /// "" or who does not show that a SAMPLE can come.
+  std::string blindness() const;
 
   const MotorBabblerConfig config_;
   const std::int64_t seed_;
@@ -118,6 +129,12 @@ class MotorBabbler {
   std::int64_t control_since_us_ = -1;  ///< clock; since when CONTROL_STATUS is silent
   bool is_control_silent_ = false;
   std::int64_t wait_since_us_ = -1;  ///< clock; −1: not yet seen by a tick
+  std::int64_t rest_utime_ = -1;     ///< driver's time since when the arm rests
+  bool has_seen_frame_ = false, has_heard_observer_ = false;  ///< since the last tick
+  bool has_ever_heard_observer_ = false;
+  std::int64_t frame_us_ = 0, observer_us_ = 0;  ///< clock, when these were last so; 0: not yet
+  std::int64_t now_us_ = 0;                      ///< clock, as the last tick saw it
+  int num_unseen_in_a_row_ = 0;
   bool done_ = false;
   action_command_t command_{};
   model_health_t health_{};

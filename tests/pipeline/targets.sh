@@ -1,6 +1,6 @@
 #!/bin/bash
 # targets.sh SOURCE BUILD: a group learns arm2, then the end effector is sent to random positions; stop, resume,
-# hold and release are said by the console; the controller is killed with a hold and holds again.
+# hold and release are said by the console; the controller is killed with a hold and in the middle of a target and holds.
 set -euo pipefail
 source=$1 build=$2
 work=$(mktemp -d)
@@ -30,3 +30,23 @@ kill -KILL "$controller"
 console hold || fail "no hold after the restart"
 grep -q "held as before the restart" "$work/logs/current/run.lcmlog.00" || fail "the hold did not survive a kill"
 console release || fail "release"
+
+# Killed in the middle of a target, which stays open because its SAMPLE does not come: the one who follows it is
+# told, and it is not served again.
+position=$(awk -F'|' '/reached/ {print $3; exit}' "$work/targets.txt")
+observer=$("$source/run" exec pgrep -f "^$build/bin/observer ")
+kill -STOP "$observer"
+# shellcheck disable=SC2086
+"$source/run" exec bodyschema target --part 5 --position $position --timeout 60 >"$work/middle.txt" 2>&1 &
+follower=$!
+for _ in $(seq 100); do
+  grep -q "waiting for the SAMPLE of action" "$work/middle.txt" && break
+  read -rt 0.1 <> <(:) || true
+done
+kill -KILL "$("$source/run" exec pgrep -f "^$build/bin/controller ")"
+kill -CONT "$observer"
+status=0
+wait "$follower" || status=$?
+[ "$status" = 1 ] || fail "the follower of a target that was cut short ended with $status"
+grep -q "restarted in the middle of target" "$work/middle.txt" || fail "who follows is not told of the restart"
+console release || fail "release after the restart"

@@ -1,4 +1,4 @@
-// Observer and monitor on a full disk, as programs. Runs in tests/private_bus.sh and tiny_disk.sh.
+// Whoever keeps something, on a full disk, as programs. Runs in tests/private_bus.sh and tiny_disk.sh.
 
 #include <gtest/gtest.h>
 #include <signal.h>
@@ -25,6 +25,8 @@ class FullDisk : public testing::Test {
  protected:
   FullDisk() : disk_(std::getenv("TINY_DISK") ? std::getenv("TINY_DISK") : ""), bus_(kUrl, kUrl) {
     bus_.subscribe(kSample, [this](const sample_t& m) { ++heard_[m.sample_index]; });
+    bus_.subscribe(kActionCommand, [this](const action_command_t& m) { commands_.push_back(m); });
+    bus_.subscribe(kControlStatus, [this](const control_status_t& m) { control_ = m; });
     bus_.subscribe(kProcessInfo, [this](const process_info_t& m) { info_ = m; });
   }
   void SetUp() override { ASSERT_FALSE(disk_.empty()) << "runs in tests/programs/tiny_disk.sh"; }
@@ -82,6 +84,15 @@ class FullDisk : public testing::Test {
   bool says(const std::string& text) {
     return handle_until(bus_, [&] { return info_.activity.find(text) != std::string::npos; });
   }
+  /// An arm2 that rests since its driver began.
+  void rest() {
+    motion_status_t status{};
+    status.utime = status.rest_since_utime = 1'000'000;
+    status.action_id = -1;
+    set_array(status.num_signals, status.commanded, {0.1, 0.2});
+    bus_.publish(kMotionStatus, status);
+    bus_.handle(std::chrono::milliseconds(50));
+  }
   std::int64_t counter(const std::string& name) const {
     for (const counter_t& counter : info_.counters) {
       if (counter.counter_name == name) return counter.count;
@@ -92,6 +103,8 @@ class FullDisk : public testing::Test {
   const std::filesystem::path disk_;
   Bus bus_;
   std::map<std::int64_t, int> heard_;
+  std::vector<action_command_t> commands_;
+  control_status_t control_{};
   process_info_t info_{};
 };
 
@@ -141,6 +154,56 @@ TEST_F(FullDisk, TheMonitorSaysThatItCannotSaveAndSavesWhenItCan) {
   EXPECT_EQ(read_log(disk_ / "health.lcmlog", kModelHealth).size(), 1U);
   monitor.send_signal(SIGTERM);
   EXPECT_EQ(monitor.wait(), 0);
+}
+
+TEST_F(FullDisk, TheControllerHoldsAllTheSame) {
+  fill_disk();
+  const auto file = disk_ / "controller_state.yaml";
+  Program controller(program("controller", {"--state", file.string()}));
+  pose_target_t target{};
+  target.sender = "test";
+  target.target_kind = pose_target_t::KIND_HOLD;
+  target.target_part = -1;
+  target.keep_s = -1;
+  ASSERT_TRUE(ask_until(
+      [&] {
+        bus_.publish(kPoseTarget, target);
+        rest();
+      },
+      [&] { return control_.control_state == control_status_t::CONTROL_HOLDING; }))
+      << controller.err();
+  EXPECT_EQ(control_.owns_arm, 1);
+  ASSERT_TRUE(handle_until(bus_, [&] { return !commands_.empty(); }));
+  EXPECT_EQ(commands_.front().kind, action_command_t::KIND_HOLD);
+  ASSERT_TRUE(says("not saved")) << info_.activity;
+  EXPECT_NE(info_.activity.find("No space left"), std::string::npos) << info_.activity;
+  ASSERT_TRUE(handle_until(bus_, [&] { return counter("state not saved") > 0; }));
+  free_disk();
+  ASSERT_TRUE(handle_until(
+      bus_, [&] { return info_.activity.find("not saved") == std::string::npos; }))
+      << info_.activity;
+  EXPECT_TRUE(std::filesystem::exists(file));
+  controller.send_signal(SIGTERM);
+  EXPECT_EQ(controller.wait(), 0);
+}
+
+TEST_F(FullDisk, TheBabblerMovesNothingBeforeItsStateIsSaved) {
+  fill_disk();
+  const auto file = disk_ / "babbler_state.yaml";
+  Program babbler(program("motor_babbler", {"--state", file.string()}));
+  ASSERT_TRUE(ask_until([&] { rest(); },
+                        [&] { return info_.activity.find("not saved") != std::string::npos; }))
+      << babbler.err();
+  // Longer than it waits before it sends a command again.
+  const std::int64_t begin_utime = info_.utime;
+  ASSERT_TRUE(handle_until(bus_, [&] { return info_.utime > begin_utime + 2'500'000; }));
+  EXPECT_TRUE(commands_.empty());
+  free_disk();
+  ASSERT_TRUE(handle_until(bus_, [&] { return !commands_.empty(); })) << info_.activity;
+  EXPECT_EQ(commands_.front().action_id, 0);
+  EXPECT_TRUE(std::filesystem::exists(file));
+  babbler.send_signal(SIGTERM);
+  EXPECT_EQ(babbler.wait(), 0);
 }
 
 }  // namespace

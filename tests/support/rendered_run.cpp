@@ -43,6 +43,7 @@ struct RenderedRun::Implementation {
     const camera_info_t info = make_info(camera_config.calibration, 0);
     estimator.on_camera_info(info);
     observer.on_camera_info(info);
+    babbler.on_control_status(control_status_t{});  // nobody else wants the arm
   }
 
   static MotorBabblerConfig with_enough_samples(MotorBabblerConfig config) {

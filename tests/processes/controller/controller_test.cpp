@@ -37,6 +37,8 @@ ControllerConfig test_config() {
   config.resend_us = 1 * kSecond;
   config.take_us = 3 * kTick;
   config.sample_timeout_us = 5 * kSecond;
+  config.rest_timeout_us = 20 * kSecond;
+  config.lent_timeout_us = 50 * kSecond;
   config.max_motion_status_silence_us = 3 * kSecond;
   config.max_marker_poses_silence_us = 3 * kSecond;
   config.max_body_schema_silence_us = 3 * kSecond;
@@ -577,6 +579,39 @@ TEST(ControllerTest, TakingTheArmWaitsForRestAndForTheBabblersSample) {
   EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
 }
 
+TEST(ControllerTest, AnArmThatNeverRestsIsGivenBack) {
+  for (const bool in_the_middle : {false, true}) {
+    Bench bench;
+    bench.start();
+    bench.driver_serves = false;
+    if (in_the_middle) {
+      bench.give(position_target(0, kFar));
+      ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 1; }));
+    }
+    const std::size_t num_moves = bench.moves.size();
+    bench.motion.rest_since_utime = -1;
+    if (in_the_middle) {
+      bench.answer_last_move(motion_status_t::STATE_REJECTED, "the arm moves");
+    } else {
+      bench.motion.source = "motor_babbler";
+      bench.motion.action_id = 12;
+      bench.motion.kind = action_command_t::KIND_MOVE;
+      bench.motion.state = motion_status_t::STATE_MOVING;
+      bench.say(bench.motion);
+      bench.give(position_target(0, kFar));
+    }
+    bench.run(19.5);
+    EXPECT_EQ(bench.status.owns_arm, 1) << bench.status.why;
+    EXPECT_TRUE(bench.has_why("rest")) << bench.status.why;
+    bench.run(1);
+    EXPECT_EQ(bench.status.control_state, S::CONTROL_REFUSED);
+    EXPECT_EQ(bench.status.owns_arm, 0);
+    EXPECT_TRUE(bench.has_why("given up after 20 s: waiting for the arm to come to rest"))
+        << bench.status.why;
+    EXPECT_EQ(bench.moves.size(), num_moves);
+  }
+}
+
 TEST(ControllerTest, ASampleThatNeverComesDoesNotBlockTheArmForEver) {
   Bench bench;
   bench.start();
@@ -978,6 +1013,30 @@ TEST(ControllerTest, WithAnInvalidEdgeOnTheWayTheArmIsLentAndTakenBack) {
   }
 }
 
+TEST(ControllerTest, AnArmThatIsLentInVainEndsTheTarget) {
+  Bench bench;
+  bench.schema.edges[1].state = EdgeState::kInvalid;
+  bench.start();
+  bench.give(position_target(0, kFar));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_LENT));
+  // As long as there are new samples it may still be mended.
+  for (int i = 0; i < 3; ++i) {
+    bench.run(40);
+    bench.settle("motor_babbler", 1, i, {10.0 * i, 0.1 * i, 1.0 * i});
+  }
+  bench.run(25);
+  const std::int64_t newest = bench.num_samples - 1;
+  bench.num_samples = newest;
+  bench.show_sample();  // the same again
+  bench.run(24);
+  EXPECT_EQ(bench.status.control_state, S::CONTROL_LENT);
+  bench.run(2);
+  EXPECT_EQ(bench.status.control_state, S::CONTROL_REFUSED);
+  EXPECT_TRUE(bench.has_why("edge 2–3 is invalid")) << bench.status.why;
+  EXPECT_TRUE(bench.has_why("does the babbler run")) << bench.status.why;
+  EXPECT_TRUE(bench.moves.empty());
+}
+
 TEST(ControllerTest, AnInvalidEdgeBesideTheWayDoesNotMatter) {
   Bench bench;
   bench.schema.edges[2].state = EdgeState::kInvalid;
@@ -1153,15 +1212,55 @@ TEST(ControllerTest, AHoldSurvivesARestart) {
   }
 }
 
-TEST(ControllerTest, ATargetInProgressIsNotContinuedByItselfAfterARestart) {
+TEST(ControllerTest, ARestartInTheMiddleOfATargetHoldsAndTheSameTargetDoesNotResumeIt) {
+  for (const bool is_kept : {false, true}) {
+    Bench before;
+    before.start();
+    before.give(position_target(4, kFar, 100));
+    ASSERT_TRUE(before.run_until([&] {
+      return is_kept ? before.status.control_state == S::CONTROL_REACHED : before.moves.size() == 1;
+    }));
+    Bench after = restarted(before, state_file());
+    EXPECT_EQ(after.controller.status().control_state, S::CONTROL_HOLDING);
+    EXPECT_EQ(after.controller.status().owns_arm, 1);
+    EXPECT_EQ(after.controller.status().target_epoch, 77);
+    EXPECT_EQ(after.controller.status().target_id, 4);  // acknowledged: its sender is told
+    after.start();
+    EXPECT_EQ(after.num_holds, 1);
+    EXPECT_TRUE(after.has_why("restarted in the middle of target 4 of operator"))
+        << after.status.why;
+    for (const int id : {3, 4}) {
+      after.give(position_target(id, kFar));
+      after.run(5);
+      EXPECT_EQ(after.status.control_state, S::CONTROL_HOLDING);
+    }
+    EXPECT_EQ(after.moves.size(), before.moves.size());
+    // Killed again it says the same.
+    Bench again = restarted(after, state_file());
+    EXPECT_EQ(again.controller.status().why, "held as before the restart: " + after.status.why);
+    set_array(again.motion.num_signals, again.motion.commanded, again.arm);
+    again.start();
+    again.give(position_target(5, kNear, 0));
+    EXPECT_TRUE(again.run_until_state(S::CONTROL_RELEASED)) << again.status.why;
+    // The bench insists on ids that were never used before.
+
+    after.give(other_target(5, Target::KIND_RELEASE));
+    EXPECT_EQ(after.status.owns_arm, 0);
+  }
+}
+
+TEST(ControllerTest, ATargetThatWasNotBegunIsGivenAgainAfterARestart) {
   Bench before;
+  before.monitor_speaks = false;
   before.start();
   before.give(position_target(4, kFar));
-  ASSERT_TRUE(before.run_until([&] { return before.moves.size() == 1; }));
+  before.run(1);
+  ASSERT_EQ(before.status.control_state, S::CONTROL_WAITING);
+  ASSERT_EQ(before.status.owns_arm, 0);
   Bench after = restarted(before, state_file());
   after.start();
   after.run(10);
-  EXPECT_EQ(after.moves.size(), before.moves.size());
+  EXPECT_TRUE(after.moves.empty());
   EXPECT_EQ(after.num_holds, 0);
   EXPECT_EQ(after.status.control_state, S::CONTROL_IDLE);
   EXPECT_EQ(after.status.owns_arm, 0);
@@ -1172,7 +1271,6 @@ TEST(ControllerTest, ATargetInProgressIsNotContinuedByItselfAfterARestart) {
   EXPECT_EQ(after.status.control_state, S::CONTROL_IDLE);
   after.give(position_target(4, kFar));
   EXPECT_TRUE(after.run_until_state(S::CONTROL_REACHED)) << after.status.why;
-  // The bench insists on ids that were never used before.
 }
 
 TEST(ControllerTest, AStateFileOfSomethingElseIsRefused) {
@@ -1193,7 +1291,7 @@ TEST(ControllerTest, TheConfigurationIsReadInSiUnits) {
       ControllerConfig::load(std::string(BODYSCHEMA_CONFIG) + "/arm7/controller.yaml");
   EXPECT_EQ(config.signals.size(), 7U);
   EXPECT_EQ(config.resend_us, 1 * kSecond);
-  EXPECT_EQ(config.max_marker_poses_silence_us, 3 * kSecond);
+  EXPECT_EQ(config.max_marker_poses_silence_us, 2 * kSecond);
   EXPECT_LT(config.slow_step, config.max_step);
 }
 

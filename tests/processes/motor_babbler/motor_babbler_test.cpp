@@ -87,11 +87,25 @@ model_health_t bad_health(std::int64_t judged_sample) {
   return health;
 }
 
+control_status_t control(bool owns_arm) {
+  control_status_t status{};
+  status.control_state = owns_arm ? control_status_t::CONTROL_MOVING : control_status_t::CONTROL_IDLE;
+  status.owns_arm = owns_arm;
+  return status;
+}
+
+/// One that has heard that nobody else wants the arm.
+MotorBabbler free_babbler(MotorBabblerConfig config = test_config(), std::int64_t seed = 1) {
+  MotorBabbler babbler(std::move(config), seed);
+  babbler.on_control_status(control(false));
+  return babbler;
+}
+
 /// Plays driver, observer and monitor.
 class Bench {
  public:
   explicit Bench(MotorBabblerConfig config = test_config(), std::int64_t seed = 1)
-      : babbler(config, seed) {}
+      : babbler(free_babbler(std::move(config), seed)) {}
 
   /// The first command, as the driver hears it.
   void start(std::int64_t utime = 5 * kSecond) {
@@ -138,8 +152,32 @@ TEST(MotorBabblerTest, StaysSilentUntilADriverIsHeard) {
   EXPECT_FALSE(babbler.is_done());
 }
 
+TEST(MotorBabblerTest, BeforeItsFirstActionItListensWhetherTheArmIsLent) {
+  MotorBabbler alone(test_config(), 1);
+  EXPECT_FALSE(alone.on_tick(100 * kSecond));
+  EXPECT_FALSE(alone.on_motion_status(idle_at_rest(5 * kSecond)));
+  EXPECT_FALSE(alone.on_tick(101 * kSecond + kSecond / 2 - 1));
+  EXPECT_TRUE(alone.on_tick(101 * kSecond + kSecond / 2));
+
+  MotorBabbler lent(test_config(), 1);
+  EXPECT_FALSE(lent.on_motion_status(idle_at_rest(5 * kSecond)));
+  EXPECT_FALSE(lent.on_control_status(control(true)));
+  for (std::int64_t t = 100; t < 200; ++t) EXPECT_FALSE(lent.on_tick(t * kSecond));
+  const auto command = lent.on_control_status(control(false));
+  ASSERT_TRUE(command);
+  EXPECT_EQ(command->action_id, 0);
+
+  // A STOP at the start is no way around it.
+  MotorBabbler stopped(test_config(), 1);
+  motion_status_t latched = idle_at_rest(5 * kSecond);
+  latched.stop_latched = 1;
+  EXPECT_FALSE(stopped.on_motion_status(latched));
+  EXPECT_FALSE(stopped.on_motion_status(idle_at_rest(6 * kSecond)));
+  EXPECT_TRUE(stopped.on_control_status(control(false)));
+}
+
 TEST(MotorBabblerTest, WaitsUntilTheArmIsAtRestBeforeItsFirstAction) {
-  MotorBabbler babbler(test_config(), 1);
+  MotorBabbler babbler = free_babbler();
   motion_status_t moving = idle_at_rest(5 * kSecond);
   moving.rest_since_utime = -1;
   EXPECT_FALSE(babbler.on_motion_status(moving));
@@ -328,7 +366,7 @@ TEST(MotorBabblerTest, TwoActionsAreNeverOutstanding) {
   std::mt19937_64 rng(5);
   std::int64_t num_actions = 0, num_done = 0;
   for (int run = 0; run < 200; ++run) {
-    MotorBabbler babbler(test_config(), run);
+    MotorBabbler babbler = free_babbler(test_config(), run);
     std::int64_t now = 0, sample_index = 0;
     std::optional<action_command_t> last;
     bool is_open = false;
@@ -374,8 +412,16 @@ TEST(MotorBabblerTest, TwoActionsAreNeverOutstanding) {
                                                  : good_health(sample_index - 1)));
           break;
         default:
-          now += 31 * kSecond;
-          take(babbler.on_tick(now));
+          // Camera and observer live; the observer repeats its newest.
+          for (int i = 0; i < 31; ++i, now += kSecond) {
+            marker_poses_t poses{};
+            poses.utime = std::int64_t{1} << 50;
+            babbler.on_marker_poses(poses);
+            action_command_t foreign = *last;
+            foreign.source = "controller";
+            take(babbler.on_sample(sample_of(foreign, 0)));
+            take(babbler.on_tick(now));
+          }
       }
     }
     ASSERT_FALSE(HasFatalFailure()) << "run " << run;
@@ -398,16 +444,92 @@ TEST(MotorBabblerTest, ASampleThatOvertakesSettledIsTaken) {
   EXPECT_EQ(again->action_id, bench.last.action_id);
 }
 
-TEST(MotorBabblerTest, ASampleThatNeverComesIsGivenUp) {
+/// Seconds pass, in which a frame of the present rest and the observer are heard or not. Returns
+/// after how many a command came.
+struct Seconds {
+  bool frames = true, observer = true;
+
+  std::optional<int> pass(Bench& bench, int count) {
+    for (int i = 0; i < count; ++i, now += kSecond) {
+      if (frames) {
+        marker_poses_t poses{};
+        poses.utime = bench.last.utime + kSecond;
+        bench.babbler.on_marker_poses(poses);
+      }
+      // The observer repeats its newest; which it is does not matter.
+      action_command_t before = bench.last;
+      before.source = "controller";
+      if (observer) bench.babbler.on_sample(sample_of(before, 0));
+      if (bench.take(bench.babbler.on_tick(now))) return i;
+    }
+    return std::nullopt;
+  }
+  std::int64_t now = 100 * kSecond;
+};
+
+TEST(MotorBabblerTest, AnActionWithoutASampleIsReplacedWhereCameraAndObserverLive) {
   Bench bench;
   bench.start();
+  bench.run(1);
+  Seconds seconds;
+  for (int n = 1; n <= 3; ++n) {
+    bench.babbler.on_motion_status(answer(bench.last, motion_status_t::STATE_SETTLED));
+    EXPECT_EQ(seconds.pass(bench, 100), 30);
+    EXPECT_EQ(bench.last.action_id, 1 + n);
+    EXPECT_EQ(bench.babbler.num_unseen(), n);
+  }
+}
+
+TEST(MotorBabblerTest, WithoutCameraOrObserverItDoesNotMove) {
+  for (const bool is_camera : {true, false}) {
+    Bench bench;
+    bench.start();
+    bench.run(1);
+    bench.babbler.on_motion_status(answer(bench.last, motion_status_t::STATE_SETTLED));
+    Seconds seconds;
+    EXPECT_FALSE(seconds.pass(bench, 10));
+    (is_camera ? seconds.frames : seconds.observer) = false;
+    EXPECT_FALSE(seconds.pass(bench, 10'000));
+    const std::string activity = bench.babbler.activity();
+    EXPECT_NE(activity.find("SAMPLE of action 1"), std::string::npos) << activity;
+    EXPECT_NE(activity.find(is_camera ? "marker_estimator" : "observer"), std::string::npos);
+    // Frames of an earlier rest are no eyes.
+    marker_poses_t old{};
+    old.utime = bench.last.utime;
+    for (int i = 0; is_camera && i < 100; ++i, seconds.now += kSecond) {
+      bench.babbler.on_marker_poses(old);
+      EXPECT_FALSE(bench.babbler.on_tick(seconds.now));
+    }
+    // They are back: its SAMPLE may still come, but is not awaited for ever.
+    Bench other = bench;
+    EXPECT_TRUE(other.babbler.on_sample(sample_of(other.last, other.num_samples)));
+    EXPECT_EQ(other.babbler.num_unseen(), 0);
+    seconds.frames = seconds.observer = true;
+    const auto waited = seconds.pass(bench, 100);
+    ASSERT_TRUE(waited);
+    EXPECT_GT(*waited, 20);
+    EXPECT_EQ(bench.last.action_id, 2);
+    EXPECT_EQ(bench.babbler.num_unseen(), 1);
+  }
+}
+
+TEST(MotorBabblerTest, WhereNoSampleWasEverHeardOneActionIsReplaced) {
+  Bench bench;
+  bench.start();
+  Seconds seconds;
+  seconds.observer = false;
   bench.babbler.on_motion_status(answer(bench.last, motion_status_t::STATE_SETTLED));
-  EXPECT_FALSE(bench.babbler.on_tick(100 * kSecond));
-  EXPECT_FALSE(bench.babbler.on_tick(130 * kSecond - 1));
-  const auto next = bench.babbler.on_tick(130 * kSecond);
-  ASSERT_TRUE(next);
-  EXPECT_EQ(next->action_id, 1);
+  EXPECT_EQ(seconds.pass(bench, 100), 30);
+  bench.babbler.on_motion_status(answer(bench.last, motion_status_t::STATE_SETTLED));
+  EXPECT_FALSE(seconds.pass(bench, 10'000));
   EXPECT_EQ(bench.babbler.num_unseen(), 1);
+  EXPECT_TRUE(bench.babbler.on_sample(sample_of(bench.last, 0)));
+
+  Bench blind;
+  blind.start();
+  blind.babbler.on_motion_status(answer(blind.last, motion_status_t::STATE_SETTLED));
+  seconds.frames = false;
+  EXPECT_FALSE(seconds.pass(blind, 10'000));
 }
 
 TEST(MotorBabblerTest, AfterATestItWaitsForTheVerdictOnIt) {
@@ -571,7 +693,7 @@ TEST(MotorBabblerTest, AStopIsObeyedUntilResume) {
 }
 
 TEST(MotorBabblerTest, AStopThatIsLatchedAtStartIsObeyedToo) {
-  MotorBabbler babbler(test_config(), 1);
+  MotorBabbler babbler = free_babbler();
   motion_status_t stopped = idle_at_rest(5 * kSecond);
   stopped.stop_latched = 1;
   EXPECT_FALSE(babbler.on_motion_status(stopped));
@@ -597,7 +719,7 @@ TEST(MotorBabblerTest, ARestartGoesOnAfterTheLastActionOfItsPredecessor) {
   Bench before;
   before.start();
   before.run(7);
-  MotorBabbler after(test_config(), 1);
+  MotorBabbler after = free_babbler();
   const auto command = after.on_motion_status(answer(before.last, motion_status_t::STATE_SETTLED));
   ASSERT_TRUE(command);
   EXPECT_EQ(command->action_id, before.last.action_id + 1);
@@ -611,19 +733,12 @@ TEST(MotorBabblerTest, ARestartKeepsEveryFifthSampleTest) {
   before.start();
   before.run(9);
   ASSERT_TRUE(before.is_test());
-  MotorBabbler after(test_config(), 1);
+  MotorBabbler after = free_babbler();
   // The monitor repeats its verdict at 1 Hz, so it may be heard before the driver is.
   EXPECT_FALSE(after.on_model_health(bad_health(8)));
   const auto command = after.on_motion_status(answer(before.last, motion_status_t::STATE_SETTLED));
   ASSERT_TRUE(command);
   EXPECT_EQ(command->purpose, action_command_t::PURPOSE_TEST);
-}
-
-control_status_t control(bool owns_arm) {
-  control_status_t status{};
-  status.control_state = owns_arm ? control_status_t::CONTROL_MOVING : control_status_t::CONTROL_IDLE;
-  status.owns_arm = owns_arm;
-  return status;
 }
 
 TEST(MotorBabblerTest, WhileTheControllerOwnsTheArmItSendsNothing) {

@@ -1,0 +1,37 @@
+#pragma once
+
+#include <cstdint>
+#include <filesystem>
+#include <string>
+#include <utility>
+
+namespace bodyschema {
+
+/// The text that a process needs after a restart, kept in a file. A disk that is full is no reason
+/// to die: what could not be saved is said and tried again. Without a file nothing is kept, and
+/// everything counts as saved.
+class StateFile {
+ public:
+  /// `text`: what needs no saving because the file says it already, or nothing was done yet.
+  StateFile(std::filesystem::path file, std::string text)
+      : file_(std::move(file)), wanted_(text), saved_(std::move(text)) {}
+
+  /// Replaces the file as a whole unless it holds `text`; what failed before is tried again only by
+  /// retry(). True if the file holds `text`.
+  bool save(const std::string& text);
+  /// To be called now and then. True if the file holds the text of the last save().
+  bool retry();
+
+  /// "" or why the text of the last save() is not on disk, for people.
+  const std::string& problem() const { return problem_; }
+  /// Attempts that failed, since the start.
+  std::int64_t num_failed() const { return num_failed_; }
+
+ private:
+  const std::filesystem::path file_;
+  std::string wanted_, saved_;
+  std::string problem_;
+  std::int64_t num_failed_ = 0;
+};
+
+}  // namespace bodyschema
