@@ -13,6 +13,7 @@
 #include <chrono>
 #include <cstdlib>
 #include <cstring>
+#include <fstream>
 #include <iostream>
 #include <memory>
 #include <nlohmann/json.hpp>
@@ -27,6 +28,9 @@ namespace bodyschema {
 namespace {
 
 using SteadyClock = std::chrono::steady_clock;
+
+/// Linux cuts the name of a process.
+constexpr std::size_t kLongestComm = 15;
 
 struct Arguments {
   std::string in = default_url();
@@ -78,6 +82,27 @@ class LiveDriver {
     return link;
   }
 
+  /// What --kill would end. @throws std::runtime_error if that is not the driver: one in a
+  /// container tells a number that is another program's here, and numbers are used again.
+  void find_process() {
+    const auto end = SteadyClock::now() + std::chrono::seconds(5);
+    while (!process_ && SteadyClock::now() < end) bus_.handle(std::chrono::milliseconds(100));
+    if (!process_) {
+      throw std::runtime_error("--kill: no PROCESS_INFO of " + arguments_.kill + " within 5 s");
+    }
+    if (process_->host != host_name()) {
+      throw std::runtime_error("--kill: " + arguments_.kill + " runs on " + process_->host +
+                               "; use --restart COMMAND, or test there");
+    }
+    std::string name;
+    std::ifstream file(fmt::format("/proc/{}/comm", process_->pid));
+    std::getline(file, name);
+    if (process_->pid > 1 && name == arguments_.kill.substr(0, kLongestComm)) return;
+    throw std::runtime_error(
+        fmt::format("--kill: process {} is {} here, not {}; use --restart COMMAND", process_->pid,
+                    name.empty() ? "nothing" : "'" + name + "'", arguments_.kill));
+  }
+
  private:
   std::vector<motion_status_t> receive(double seconds) {
     bus_.handle(
@@ -94,20 +119,11 @@ class LiveDriver {
   }
 
   void restart_by_kill() {
-    const auto end = SteadyClock::now() + std::chrono::seconds(5);
-    while (!process_ && SteadyClock::now() < end) bus_.handle(std::chrono::milliseconds(100));
-    if (!process_) {
-      throw std::runtime_error("--kill: no PROCESS_INFO of " + arguments_.kill + " within 5 s");
-    }
-    if (process_->host != host_name()) {
-      throw std::runtime_error("--kill: " + arguments_.kill + " runs on " + process_->host +
-                               "; use --restart COMMAND, or test there");
-    }
+    find_process();
     if (::kill(process_->pid, SIGKILL) != 0) {
       throw std::runtime_error(fmt::format("--kill: process {} of {}: {}", process_->pid,
                                            arguments_.kill, std::strerror(errno)));
     }
-    process_.reset();
     drain();
   }
 
@@ -152,6 +168,7 @@ void run(const Arguments& arguments) {
                       std::chrono::system_clock::now().time_since_epoch())
                       .count();
   LiveDriver driver(arguments);
+  if (!arguments.kill.empty()) driver.find_process();  // before the arm moves
   const DriverLink link = driver.link();
   const ConformancePlan plan = plan_conformance(link, options);
   confirm(arguments, options, plan);

@@ -16,10 +16,15 @@ using namespace bodyschema;
 
 namespace {
 
-std::int64_t now_us() {
-  return std::chrono::duration_cast<std::chrono::microseconds>(
-             std::chrono::system_clock::now().time_since_epoch())
+template <class Clock>
+std::int64_t microseconds_of() {
+  return std::chrono::duration_cast<std::chrono::microseconds>(Clock::now().time_since_epoch())
       .count();
+}
+
+RobotDriver::Now now() {
+  return {microseconds_of<std::chrono::steady_clock>(),
+          microseconds_of<std::chrono::system_clock>()};
 }
 
 std::optional<motion_status_t> load_record(const std::filesystem::path& file) {
@@ -51,35 +56,35 @@ int main(int argc, char** argv) {
         return error.what();
       }
     };
-    RobotDriver driver(config, load_record(record), save, now_us());
+    RobotDriver driver(config, load_record(record), save, now());
 
-    const auto act = [&](const RobotDriver::Answer& answer) {
-      // The robot first: it must not wait for the network.
+    const auto act = [&](RobotDriver::Answer answer) {
       for (const std::string& line : answer.lines) port.write_line(line);
+      driver.save(answer);
       for (const motion_status_t& status : answer.statuses) {
         process.bus().publish(kMotionStatus, status);
       }
     };
     std::string last_problem;
     const auto serve_port = [&] {
-      while (const auto line = port.read_line()) act(driver.on_line(*line, now_us()));
+      while (const auto line = port.read_line()) act(driver.on_line(*line, now()));
       if (port.is_open()) return;
       if (port.problem() != last_problem) spdlog::warn("{}; I keep trying", port.problem());
       last_problem = port.problem();
-      act(driver.on_disconnect(port.problem(), now_us()));
+      act(driver.on_disconnect(port.problem(), now()));
     };
     process.bus().subscribe<action_command_t>(kActionCommand, [&](const action_command_t& command) {
       serve_port();  // so that the command meets the arm as it is
-      act(driver.on_command(command, now_us()));
+      act(driver.on_command(command, now()));
     });
     process.on_tick([&](std::int64_t) {
       if (!port.is_open() && port.open()) {
         spdlog::info("{} is open", config.device);
         last_problem.clear();
-        act(driver.on_connect(now_us()));
+        act(driver.on_connect(now()));
       }
       serve_port();
-      act(driver.on_tick(now_us()));
+      act(driver.on_tick(now()));
       process.set_activity(
           driver.is_lost() ? process_info_t::PHASE_WAITING : process_info_t::PHASE_WORKING,
           driver.is_lost()      ? "waits for the robot: " + port.problem()
@@ -88,11 +93,11 @@ int main(int argc, char** argv) {
     });
     process.on_idle(serve_port);
     process.on_end([&] {
-      act(driver.on_end(now_us()));
+      act(driver.on_end(now()));
       // A second is enough for an arm that was told to halt; after that it is up to its brakes.
       for (int i = 0; i < 100 && port.is_open() && !driver.is_at_rest(); ++i) {
         std::this_thread::sleep_for(std::chrono::milliseconds(10));
-        port.write_line("?");
+        act(driver.on_tick(now()));
         serve_port();
       }
     });

@@ -14,6 +14,13 @@ using Command = action_command_t;
 using Status = motion_status_t;
 
 constexpr std::size_t kMaxServed = 4096;
+/// How far ahead of driver's time the record reaches when it is written; a driver that is started
+/// again is ahead of the clock by no more than this. And what is left of it when it is renewed.
+constexpr std::int64_t kAheadUs = 5'000'000;
+constexpr std::int64_t kLeftUs = 1'000'000;
+/// Driver's time that is ahead of the clock by less than this goes at half speed until they meet;
+/// ahead by more, the clock was set back and is no guide.
+constexpr std::int64_t kMeetUs = 10'000'000;
 
 bool is_refusal(const Status& status) {
   return status.state == Status::STATE_REJECTED || status.state == Status::STATE_EXPIRED;
@@ -50,6 +57,7 @@ std::optional<RobotDriver::Report> RobotDriver::parse(const std::string& line) c
 }
 
 std::string RobotDriver::go(const std::vector<double>& action) {
+  unheard_halt_.clear();
   std::ostringstream line;
   line.precision(15);
   line << "GO " << ++order_;
@@ -57,15 +65,17 @@ std::string RobotDriver::go(const std::vector<double>& action) {
   return line.str();
 }
 
-std::string RobotDriver::halt() { return "HALT " + std::to_string(++order_); }
+std::string RobotDriver::halt() { return unheard_halt_ = "HALT " + std::to_string(++order_); }
 
 // --------------------------------------------------------------------------------------------
 
 RobotDriver::RobotDriver(RobotDriverConfig config, std::optional<motion_status_t> record, Save save,
-                         std::int64_t now_us)
+                         Now now)
     : config_(std::move(config)), save_(std::move(save)) {
   // R3: not even if the clock was set back meanwhile.
-  time_ = start_ = std::max(now_us, record ? record->utime + 1 : 0);
+  utime_ = start_ = std::max(now.clock_us, record ? record->utime + 1 : 0);
+  steady_ = now.steady_us;
+  said_at_ = tried_at_ = steady_ - config_.repeat_us;
   // A report that was on its way when the last driver died must not pass for an answer.
   order_ = start_ / 1000;
   if (record) {
@@ -75,13 +85,13 @@ RobotDriver::RobotDriver(RobotDriverConfig config, std::optional<motion_status_t
       record->state = Status::STATE_STOPPED;
       record->reason = "the driver was restarted during or after this motion";
     }
-    is_stopped_ = record->stop_latched != 0;  // R17
+    is_stopped_ = is_stop_recorded_ = record->stop_latched != 0;  // R17
     status_ = *record;
-    served_.push_back(status_);
+    if (status_.action_id >= 0) served_.push_back(status_);
   } else {
     status_.action_id = -1;
   }
-  status_.utime = time_;
+  status_.utime = utime_;
   status_.rest_since_utime = -1;
 }
 
@@ -112,7 +122,7 @@ std::string RobotDriver::refusal(const Command& command) const {
 Status RobotDriver::make_status(const Command& command, std::int8_t state,
                                 const std::string& reason) const {
   Status status{};
-  status.utime = time_;
+  status.utime = utime_;
   status.source = command.source;
   status.epoch = command.epoch;
   status.action_id = command.action_id;
@@ -120,7 +130,7 @@ Status RobotDriver::make_status(const Command& command, std::int8_t state,
   status.purpose = command.purpose;
   status.state = state;
   status.reason = reason;
-  status.rest_since_utime = rest_since_;
+  status.rest_since_utime = rest_since_utime_;
   status.stop_latched = is_stopped_;
   std::vector<double> commanded = command.kind == Command::KIND_MOVE ? command.action : position_;
   for (double& q : commanded) {
@@ -138,13 +148,38 @@ void RobotDriver::conclude(const Command& command, std::int8_t state, const std:
   if (served_.size() > kMaxServed) served_.pop_front();
   if (is_refusal(status)) return;  // R4: told, not repeated
   status_ = status;
-  said_at_ = time_;
-  // Best effort; what must be on disk before the arm moves was written by on_command.
-  if (state != Status::STATE_MOVING) save_(status_);
+  said_at_ = steady_;
+  // What must be on disk before the arm moves was written by on_command.
+  if (state != Status::STATE_MOVING) answer.must_save = true;
 }
 
-RobotDriver::Answer RobotDriver::on_command(const Command& command, std::int64_t now_us) {
-  advance_time(now_us);
+std::string RobotDriver::save_record(Status status) {
+  status.utime = utime_ + kAheadUs;
+  status.stop_latched = is_stopped_;
+  tried_at_ = steady_;
+  record_problem_ = save_(status);
+  if (record_problem_.empty()) {
+    record_utime_ = status.utime;
+    is_stop_recorded_ = is_stopped_;
+  }
+  return record_problem_;
+}
+
+void RobotDriver::save(Answer& answer) {
+  if (answer.must_save) {
+    const bool was_told = is_stopped_ && !is_stop_recorded_ && !record_problem_.empty();
+    if (save_record(status_).empty() && was_told) refresh_status(answer);
+  }
+  if (is_stop_recorded_ || record_problem_.empty()) return;
+  for (Status& status : answer.statuses) {  // R17
+    if (status.kind == Command::KIND_STOP && status.stop_latched) {
+      status.reason += "; a restart of the driver would forget it: " + record_problem_;
+    }
+  }
+}
+
+RobotDriver::Answer RobotDriver::on_command(const Command& command, Now now) {
+  advance_time(now);
   Answer answer;
   // R8. Backwards: a MOVE has several answers, the newest holds.
   for (auto served = served_.rbegin(); served != served_.rend(); ++served) {
@@ -155,8 +190,8 @@ RobotDriver::Answer RobotDriver::on_command(const Command& command, std::int64_t
     const bool is_newest = status_.source == command.source && status_.epoch == command.epoch &&
                            status_.action_id == command.action_id;
     Status again = is_newest ? status_ : *served;
-    again.utime = time_;
-    again.rest_since_utime = rest_since_;
+    again.utime = utime_;
+    again.rest_since_utime = rest_since_utime_;
     again.stop_latched = is_stopped_;
     const bool is_where =
         again.state == Status::STATE_SETTLED || again.state == Status::STATE_HOLDING;
@@ -198,9 +233,9 @@ RobotDriver::Answer RobotDriver::on_command(const Command& command, std::int64_t
     conclude(command, Status::STATE_EXPIRED, "sent before this start of the driver", answer);
     return answer;
   }
-  if (command.expiry_utime < time_) {  // R7
+  if (command.expiry_utime < utime_) {  // R7
     conclude(command, Status::STATE_EXPIRED,
-             "expired " + std::to_string(time_ - command.expiry_utime) + " us ago", answer);
+             "expired " + std::to_string(utime_ - command.expiry_utime) + " us ago", answer);
     return answer;
   }
   if (const std::string reason = refusal(command); !reason.empty()) {
@@ -209,15 +244,15 @@ RobotDriver::Answer RobotDriver::on_command(const Command& command, std::int64_t
   }
   // R15: a driver that is killed from here on must know what it had begun.
   const Status accepted = make_status(command, Status::STATE_ACCEPTED, "");
-  if (const std::string problem = save_(accepted); !problem.empty()) {
+  if (const std::string problem = save_record(accepted); !problem.empty()) {
     conclude(command, Status::STATE_REJECTED, "no record of the motion: " + problem, answer);
     return answer;
   }
   answer.statuses.push_back(accepted);
   answer.lines.push_back(go(command.action));
   motion_ = command;
-  motion_since_ = time_;
-  rest_since_ = -1;
+  motion_since_ = steady_;
+  rest_since_utime_ = -1;
   conclude(command, Status::STATE_MOVING, "", answer);  // R2
   return answer;
 }
@@ -232,8 +267,9 @@ void RobotDriver::interrupt(const std::string& reason, Answer& answer) {
 void RobotDriver::lose(const std::string& reason, Answer& answer) {
   if (is_lost_) return;
   is_lost_ = true;
-  halted_at_ = 0;
-  rest_since_ = -1;
+  rest_since_utime_ = -1;
+  // That nothing is heard of it does not mean that it hears nothing.
+  if (is_open_) answer.lines.push_back(halt());
   interrupt(reason, answer);
   // Where the arm is now nobody knows: it is neither settled nor holding.
   status_.state = Status::STATE_STOPPED;
@@ -242,51 +278,48 @@ void RobotDriver::lose(const std::string& reason, Answer& answer) {
 }
 
 void RobotDriver::refresh_status(Answer& answer) {
-  status_.utime = time_;
-  status_.rest_since_utime = rest_since_;
+  status_.utime = utime_;
+  status_.rest_since_utime = rest_since_utime_;
   status_.stop_latched = is_stopped_;
   if (status_.kind != Command::KIND_MOVE || status_.action_id < 0) {
     set_array(status_.num_signals, status_.commanded, position_);
   }
-  said_at_ = time_;
+  said_at_ = steady_;
   answer.statuses.push_back(status_);
 }
 
-RobotDriver::Answer RobotDriver::on_connect(std::int64_t now_us) {
-  advance_time(now_us);
-  halted_at_ = time_;
+RobotDriver::Answer RobotDriver::on_connect(Now now) {
+  advance_time(now);
+  is_open_ = true;
   return {{halt(), "?"}, {}};
 }
 
-RobotDriver::Answer RobotDriver::on_disconnect(const std::string& problem, std::int64_t now_us) {
-  advance_time(now_us);
+RobotDriver::Answer RobotDriver::on_disconnect(const std::string& problem, Now now) {
+  advance_time(now);
+  is_open_ = false;
   Answer answer;
   lose(problem, answer);
   return answer;
 }
 
-RobotDriver::Answer RobotDriver::on_line(const std::string& line, std::int64_t now_us) {
-  advance_time(now_us);
+RobotDriver::Answer RobotDriver::on_line(const std::string& line, Now now) {
+  advance_time(now);
   Answer answer;
   const std::optional<Report> report = parse(line);
   if (!report) {
     ++num_strange_lines_;
     return answer;
   }
-  if (is_lost_ && time_ - halted_at_ > config_.silent_us) {
-    // It was silent and is back, or our HALT was lost: who knows what it is doing.
-    halted_at_ = time_;
-    answer.lines.push_back(halt());
-    return answer;
-  }
-  if (report->order != order_) return answer;  // older than the newest order
-  heard_at_ = time_;
+  // Older than the newest order, which for a robot that was lost is a HALT.
+  if (report->order != order_) return answer;
+  heard_at_ = steady_;
+  unheard_halt_.clear();
   is_lost_ = false;
   position_ = report->position;
   if (report->is_moving) {
     if (!motion_ && is_at_rest()) {
       // By its pendant, or by hand.
-      rest_since_ = -1;
+      rest_since_utime_ = -1;
       status_.state = Status::STATE_STOPPED;
       status_.reason = "the robot moves without a command";
       answer.lines.push_back(halt());
@@ -295,7 +328,7 @@ RobotDriver::Answer RobotDriver::on_line(const std::string& line, std::int64_t n
     return answer;
   }
   if (is_at_rest()) return answer;
-  rest_since_ = time_;
+  rest_since_utime_ = utime_;
   if (motion_) {
     const Command motion = *motion_;
     motion_.reset();
@@ -306,31 +339,40 @@ RobotDriver::Answer RobotDriver::on_line(const std::string& line, std::int64_t n
   return answer;
 }
 
-RobotDriver::Answer RobotDriver::on_tick(std::int64_t now_us) {
-  advance_time(now_us);
+RobotDriver::Answer RobotDriver::on_tick(Now now) {
+  advance_time(now);
   Answer answer;
-  if (!is_lost_ && time_ - heard_at_ > config_.silent_us) {
-    lose("the robot has been silent for " + std::to_string(time_ - heard_at_) + " us", answer);
+  if (is_open_ && !unheard_halt_.empty()) {
+    answer.lines.push_back(unheard_halt_);  // under its number: a late echo of the first one counts
   }
-  if (motion_ && time_ - motion_since_ > config_.motion_timeout_us) {
+  if (!is_lost_ && steady_ - heard_at_ > config_.silent_us) {
+    lose("the robot has been silent for " + std::to_string(steady_ - heard_at_) + " us", answer);
+  }
+  if (motion_ && steady_ - motion_since_ > config_.motion_timeout_us) {
     answer.lines.push_back(halt());
     interrupt("the motion did not end in time", answer);
   }
-  answer.lines.push_back("?");
-  if (time_ - said_at_ >= config_.repeat_us) refresh_status(answer);
+  if (is_open_) answer.lines.push_back("?");
+  if (steady_ - said_at_ >= config_.repeat_us) refresh_status(answer);
+  const bool is_record_old = !record_problem_.empty() || record_utime_ - utime_ < kLeftUs;
+  if (is_record_old && steady_ - tried_at_ >= config_.repeat_us) answer.must_save = true;
   return answer;
 }
 
-RobotDriver::Answer RobotDriver::on_end(std::int64_t now_us) {
-  advance_time(now_us);
+RobotDriver::Answer RobotDriver::on_end(Now now) {
+  advance_time(now);
   Answer answer;
   answer.lines = {halt(), "?"};
   interrupt("the driver was told to end", answer);
   return answer;
 }
 
-void RobotDriver::advance_time(std::int64_t now_us) {
-  time_ = std::max(time_, now_us);  // R3: the clock may be set back
+void RobotDriver::advance_time(Now now) {
+  const std::int64_t elapsed = std::max<std::int64_t>(0, now.steady_us - steady_);
+  steady_ += elapsed;
+  // R3: the clock may be set back.
+  const bool is_guide = utime_ + elapsed - now.clock_us < kMeetUs;
+  utime_ = std::max(now.clock_us, utime_ + (is_guide ? elapsed / 2 : elapsed));
 }
 
 }  // namespace bodyschema

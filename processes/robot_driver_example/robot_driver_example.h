@@ -36,32 +36,43 @@ struct RobotDriverConfig {
 /// as a whole, so there is nothing to watch between two commands.
 class RobotDriver {
  public:
-  /// To be done in this order: lines to the robot, then statuses to the bus.
+  /// The watchdogs go by the steady clock, which nobody can set; `utime` goes by the system clock,
+  /// which stamps the camera's frames. Both [µs].
+  struct Now {
+    std::int64_t steady_us;
+    std::int64_t clock_us;
+  };
+  /// To be done in this order: lines to the robot, then save(), then statuses to the bus. A robot
+  /// that is to halt must not wait for a disk, nor for the network.
   struct Answer {
     std::vector<std::string> lines;
     std::vector<motion_status_t> statuses;
+    bool must_save = false;
   };
-  /// Keeps the newest status over a restart; "" or what went wrong.
+  /// Keeps the newest status over a restart; "" or what went wrong. The `utime` of what is kept is
+  /// a time that this driver has not reached yet: the next one begins there, or later.
   using Save = std::function<std::string(const motion_status_t&)>;
 
-  /// `record`: what Save kept last. Times are the system clock's [µs].
-  RobotDriver(RobotDriverConfig config, std::optional<motion_status_t> record, Save save,
-              std::int64_t now_us);
+  /// `record`: what Save kept last.
+  RobotDriver(RobotDriverConfig config, std::optional<motion_status_t> record, Save save, Now now);
 
-  Answer on_command(const action_command_t& command, std::int64_t now_us);
+  Answer on_command(const action_command_t& command, Now now);
   /// The port was opened.
-  Answer on_connect(std::int64_t now_us);
+  Answer on_connect(Now now);
   /// A line of the robot's.
-  Answer on_line(const std::string& line, std::int64_t now_us);
+  Answer on_line(const std::string& line, Now now);
   /// The port is gone.
-  Answer on_disconnect(const std::string& problem, std::int64_t now_us);
+  Answer on_disconnect(const std::string& problem, Now now);
   /// Every 0.1 s: asks the robot, sees silence, repeats.
-  Answer on_tick(std::int64_t now_us);
+  Answer on_tick(Now now);
   /// The driver is told to end.
-  Answer on_end(std::int64_t now_us);
+  Answer on_end(Now now);
+  /// Keeps the record if `answer` wants that. Where a STOP could not be kept the answer says so; it
+  /// is tried again with the ticks.
+  void save(Answer& answer);
 
   const motion_status_t& status() const { return status_; }
-  bool is_at_rest() const { return rest_since_ >= 0; }
+  bool is_at_rest() const { return rest_since_utime_ >= 0; }
   bool is_lost() const { return is_lost_; }
   std::int64_t num_strange_lines() const { return num_strange_lines_; }
 
@@ -85,19 +96,22 @@ class RobotDriver {
   void interrupt(const std::string& reason, Answer& answer);
   void lose(const std::string& reason, Answer& answer);
   void refresh_status(Answer& answer);
-  void advance_time(std::int64_t now_us);
+  void advance_time(Now now);
+  std::string save_record(motion_status_t status);
 
   const RobotDriverConfig config_;
   const Save save_;
-  std::int64_t time_ = 0;   // driver's time [µs]
-  std::int64_t start_ = 0;  // driver's time of the start
+  std::int64_t utime_ = 0;   // driver's time [µs]
+  std::int64_t start_ = 0;   // driver's time of the start
+  std::int64_t steady_ = 0;  // what is called …_at_ and …_since_ below is of this clock [µs]
 
   // The robot.
+  bool is_open_ = false;  // its port
   bool is_lost_ = true;
-  std::int64_t halted_at_ = 0;  // since it was lost; 0: not yet
-  std::int64_t order_ = 0;      // N of the newest order
-  std::int64_t heard_at_ = 0;   // newest report
-  std::int64_t rest_since_ = -1;
+  std::int64_t order_ = 0;     // N of the newest order
+  std::string unheard_halt_;   // the newest order, if it is a HALT without an echo; or ""
+  std::int64_t heard_at_ = 0;  // newest report
+  std::int64_t rest_since_utime_ = -1;
   std::vector<double> position_;  // as reported, command units
   std::int64_t num_strange_lines_ = 0;
 
@@ -108,6 +122,12 @@ class RobotDriver {
   motion_status_t status_{};            // what is repeated
   std::deque<motion_status_t> served_;  // the newest answers
   std::int64_t said_at_ = 0;
+
+  // The record.
+  std::int64_t record_utime_ = 0;  // its bound on driver's time
+  std::int64_t tried_at_ = 0;
+  std::string record_problem_;  // why what is on disk is old; ""
+  bool is_stop_recorded_ = false;
 };
 
 }  // namespace bodyschema

@@ -4,8 +4,6 @@
 #include <cerrno>
 #include <cmath>
 #include <cstring>
-#include <iomanip>
-#include <limits>
 #include <sstream>
 #include <stdexcept>
 
@@ -33,30 +31,6 @@ std::int64_t microseconds(double seconds) { return std::llround(seconds * 1e6); 
 
 std::string name_of(const std::string& text) { return text.empty() ? "''" : text; }
 
-// YAML's double quoted style.
-std::string quoted(const std::string& text) {
-  std::ostringstream result;
-  result << '"';
-  for (const char c : text) {
-    if (c == '"' || c == '\\')
-      result << '\\' << c;
-    else if (static_cast<unsigned char>(c) < 0x20)
-      result << ' ';
-    else
-      result << c;
-  }
-  result << '"';
-  return result.str();
-}
-
-std::string list_of(const double* values, std::size_t count) {
-  std::ostringstream result;
-  result << std::setprecision(std::numeric_limits<double>::max_digits10) << '[';
-  for (std::size_t i = 0; i < count; ++i) result << (i ? ", " : "") << values[i];
-  result << ']';
-  return result.str();
-}
-
 /// Who was served: what an id means.
 bool is_same_command(const motion_status_t& status, const std::string& source, std::int64_t epoch,
                      std::int64_t action_id) {
@@ -65,11 +39,11 @@ bool is_same_command(const motion_status_t& status, const std::string& source, s
 
 std::string saved_status(const motion_status_t& status) {
   std::ostringstream text;
-  text << "{source: " << quoted(status.source) << ", epoch: " << status.epoch
+  text << "{source: " << yaml_quoted(status.source) << ", epoch: " << status.epoch
        << ", action_id: " << status.action_id << ", kind: " << int{status.kind}
        << ", purpose: " << int{status.purpose} << ", state: " << int{status.state}
-       << ", reason: " << quoted(status.reason)
-       << ", commanded: " << list_of(status.commanded.data(), status.commanded.size()) << "}";
+       << ", reason: " << yaml_quoted(status.reason)
+       << ", commanded: " << yaml_list(status.commanded) << "}";
   return text.str();
 }
 
@@ -400,13 +374,13 @@ void RobotSimulator::save(const std::filesystem::path& file) const {
   const Eigen::VectorXd positions = joint_positions();
   std::ostringstream text;
   text << "# robot_simulator at rest. Joint positions in rad or m, times in us.\n"
-       << "robot: " << quoted(as_built_.robot.name) << "\n"
+       << "robot: " << yaml_quoted(as_built_.robot.name) << "\n"
        << "seed: " << config_.seed << "\n"
-       << "time_s: " << list_of(&body_.data->time, 1) << "\n"
+       << "time_s: " << yaml_list({body_.data->time}) << "\n"
        << "rest_since_us: " << rest_since_utime_ << "\n"
        << "stop_latched: " << (stop_latched_ ? "true" : "false") << "\n"
-       << "joint_positions: " << list_of(positions.data(), positions.size()) << "\n"
-       << "at: " << list_of(at_.data(), at_.size()) << "\n"
+       << "joint_positions: " << yaml_list({positions.begin(), positions.end()}) << "\n"
+       << "at: " << yaml_list(at_) << "\n"
        << "state_action_id: " << state_.action_id << "\n"
        << "last: " << saved_status(status_) << "\n"
        << "served:" << (served_.empty() ? " []" : "") << "\n";
@@ -416,15 +390,15 @@ void RobotSimulator::save(const std::filesystem::path& file) const {
   }
   text << "faults:" << (faults_.empty() ? " []" : "") << "\n";
   for (const Fault& fault : faults_) {
-    text << "  - {kind: " << int{fault.kind} << ", place: " << quoted(fault.place)
-         << ", number: " << fault.number << ", amount_bent_deg: ["
-         << std::setprecision(std::numeric_limits<double>::max_digits10) << fault.amount_deg << ", "
-         << fault.bent_deg << "], fallen: " << list_of(fault.fallen.data(), 3) << "}\n";
+    text << "  - {kind: " << int{fault.kind} << ", place: " << yaml_quoted(fault.place)
+         << ", number: " << fault.number
+         << ", amount_bent_deg: " << yaml_list({fault.amount_deg, fault.bent_deg})
+         << ", fallen: " << yaml_list({fault.fallen.begin(), fault.fallen.end()}) << "}\n";
   }
-  text << "fault_answer: " << quoted(fault_answer_) << "\n"
+  text << "fault_answer: " << yaml_quoted(fault_answer_) << "\n"
        << "served_faults:" << (served_faults_.empty() ? " []" : "") << "\n";
   for (const FaultKey& key : served_faults_) {
-    text << "  - {sender: " << quoted(key.sender) << ", epoch: " << key.epoch
+    text << "  - {sender: " << yaml_quoted(key.sender) << ", epoch: " << key.epoch
          << ", fault_id: " << key.fault_id << "}\n";
   }
   write_file_atomically(file, text.str());

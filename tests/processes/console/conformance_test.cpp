@@ -37,6 +37,8 @@ enum class Sin {
   kSettledForEver,
   kOneListOfIds,
   kHoldsNowhere,
+  kHoldsElsewhere,
+  kRounds,  // no sin: commanded is the action to seven digits
   kHoldsLater,
   kForgetsTheInterrupted,
   kLatchIsForgotten,
@@ -89,6 +91,10 @@ class FakeDriver {
     s.reason = sin_ == Sin::kRefusesWithoutReason ? "" : reason;
     s.rest_since_utime = rest_since_;
     s.stop_latched = latched_;
+    if (sin_ == Sin::kHoldsElsewhere && c.kind == Command::KIND_HOLD && c.epoch == 1'000) {
+      set_array(s.num_signals, s.commanded, std::vector<double>{0, 0});
+      return s;
+    }
     const bool is_move = c.kind == Command::KIND_MOVE && c.action_id >= 0;
     set_array(s.num_signals, s.commanded,
               is_move                      ? c.action
@@ -215,7 +221,8 @@ class FakeDriver {
       if (sin_ != Sin::kIgnoresCount) return conclude(c, Status::STATE_REJECTED, "count");
       accepted.action.resize(at_.size());
     }
-    for (const double q : accepted.action) {
+    for (double& q : accepted.action) {
+      if (sin_ == Sin::kRounds) q = static_cast<float>(q);
       if (std::abs(q) > 1 && sin_ != Sin::kIgnoresLimits) {
         return conclude(c, Status::STATE_REJECTED, "limits");
       }
@@ -317,6 +324,11 @@ TEST(Conformance, PassesADriverThatKeepsTheRules) {
   EXPECT_EQ(text_of(results), "");
 }
 
+TEST(Conformance, PassesADriverThatCountsInSingles) {
+  FakeDriver driver(Sin::kRounds);
+  EXPECT_EQ(text_of(results_of(driver)), "");
+}
+
 TEST(Conformance, SkipsWhatALockStepSimulatorHasNoMomentFor) {
   FakeDriver driver(Sin::kLockStep);
   const auto results = results_of(driver);
@@ -351,7 +363,8 @@ INSTANTIATE_TEST_SUITE_P(
                     std::pair{Sin::kTakesASecondMotion, 6}, std::pair{Sin::kIgnoresExpiry, 7},
                     std::pair{Sin::kMovesAgain, 8}, std::pair{Sin::kSettledForEver, 8},
                     std::pair{Sin::kOneListOfIds, 9}, std::pair{Sin::kHoldsNowhere, 10},
-                    std::pair{Sin::kHoldsLater, 11}, std::pair{Sin::kForgetsTheInterrupted, 11},
+                    std::pair{Sin::kHoldsElsewhere, 10}, std::pair{Sin::kHoldsLater, 11},
+                    std::pair{Sin::kForgetsTheInterrupted, 11},
                     std::pair{Sin::kLatchIsForgotten, 12}, std::pair{Sin::kMovesWhileStopped, 12},
                     std::pair{Sin::kResumesTheMotion, 13}, std::pair{Sin::kResumeStaysLatched, 14},
                     std::pair{Sin::kGoesOnAfterRestart, 15}, std::pair{Sin::kNoStartGuard, 16},

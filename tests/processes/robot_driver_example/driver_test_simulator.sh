@@ -6,6 +6,15 @@ bin=$1 rig=$2 here=$(dirname "$0")
 work=$(mktemp -d)
 trap 'kill $(jobs -p) 2>/dev/null || true; wait 2>/dev/null; rm -rf "$work"' EXIT
 
+# A process that is not named as its PROCESS_INFO says is not killed.
+ln -s "$bin/robot_simulator" "$work/stranger"
+"$work/stranger" --config "$rig/robot_simulator.yaml" --state "$work/state.yaml" 2>"$work/driver.log" &
+stranger=$!
+if "$bin/bodyschema" driver-test --rig-folder "$rig" --yes --kill robot_simulator 2>"$work/error"; then exit 1; fi
+grep -q "process $stranger is 'stranger' here, not robot_simulator" "$work/error" || { cat "$work/error"; exit 1; }
+kill "$stranger"
+wait "$stranger"
+
 "$here/supervise.sh" "$work/driver.log" \
   "$bin/robot_simulator" --config "$rig/robot_simulator.yaml" --state "$work/state.yaml" &
 status=0

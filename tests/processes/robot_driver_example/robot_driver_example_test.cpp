@@ -20,6 +20,8 @@ using Command = action_command_t;
 using Status = motion_status_t;
 
 constexpr std::int64_t kStart = 1'700'000'000'000'000;
+constexpr std::int64_t kBoot = kStart - 1'000'000;
+constexpr std::int64_t kHour = 3'600'000'000;
 
 /// A driver and a robot of three joints that does as it is told, in a time of its own.
 class Lab {
@@ -28,21 +30,23 @@ class Lab {
       : now_(now),
         driver(
             RobotDriverConfig::load(std::string(EXAMPLE_RIG) + "/robot_driver_example.yaml"),
-            std::move(record), [this](const Status& s) { return save(s); }, now) {}
+            std::move(record), [this](const Status& s) { return save(s); }, this->now()) {}
+
+  RobotDriver::Now now() const { return {now_ - kBoot, now_ + clock_error}; }
 
   void connect() {
-    take(driver.on_connect(now_));
+    take(driver.on_connect(now()));
     tick();
   }
   /// A tick later; the robot answers what it was asked, unless it is silent.
   void tick(int times = 1) {
     for (; times > 0; --times) {
       now_ += 100'000;
-      take(driver.on_tick(now_));
+      take(driver.on_tick(now()));
     }
   }
   Status send(const Command& command) {
-    take(driver.on_command(command, now_));
+    take(driver.on_command(command, now()));
     EXPECT_FALSE(heard.empty());
     return heard.back();
   }
@@ -61,29 +65,34 @@ class Lab {
     return make(Command::KIND_MOVE, std::move(action));
   }
 
-  void take(const RobotDriver::Answer& answer) {
-    for (const Status& status : answer.statuses) {
-      EXPECT_EQ(check(status), "");
-      EXPECT_GE(status.utime, heard.empty() ? 0 : heard.back().utime);
-      heard.push_back(status);
-    }
+  void take(RobotDriver::Answer answer) {
+    std::vector<std::string> reports;
     for (const std::string& line : answer.lines) {
       lines.push_back(line);
       std::istringstream words(line);
       std::string verb;
       words >> verb;
-      if (is_silent) continue;
+      if (verb != "?") deeds.push_back(verb);
+      if (is_silent || (is_deaf && verb == "HALT")) continue;
       if (verb == "HALT") is_moving = false;
       if (verb == "GO") is_moving = true;
       if (verb != "?") {
         words >> order;
       } else {
-        take(driver.on_line(
-            "AT " + std::to_string(order) + (is_moving ? " MOVING" : " REST") + " 1 2 3", now_));
+        reports.push_back("AT " + std::to_string(order) + (is_moving ? " MOVING" : " REST") +
+                          " 1 2 3");
       }
     }
+    driver.save(answer);
+    for (const Status& status : answer.statuses) {
+      EXPECT_EQ(check(status), "");
+      EXPECT_GE(status.utime, heard.empty() ? 0 : heard.back().utime);
+      heard.push_back(status);
+    }
+    for (const std::string& report : reports) take(driver.on_line(report, now()));
   }
   std::string save(const Status& status) {
+    deeds.push_back("save");
     if (disk_is_full) return "disk full";
     record = status;
     return "";
@@ -95,9 +104,11 @@ class Lab {
   }
 
   std::int64_t now_;
+  std::int64_t clock_error = 0;
   std::vector<Status> heard;
   std::vector<std::string> lines;
-  bool is_silent = false, is_moving = false, disk_is_full = false;
+  std::vector<std::string> deeds;  // orders and saves, in their order
+  bool is_silent = false, is_deaf = false, is_moving = false, disk_is_full = false;
   long order = 0;
   std::optional<Status> record;
   RobotDriver driver;
@@ -125,14 +136,14 @@ TEST(RobotDriver, TakesNoReportOfBeforeTheOrderForAnAnswer) {
   lab.connect();
   lab.send(lab.move());
   const long before = lab.order - 1;
-  lab.take(lab.driver.on_line("AT " + std::to_string(before) + " REST 1 2 3", lab.now_));
+  lab.take(lab.driver.on_line("AT " + std::to_string(before) + " REST 1 2 3", lab.now()));
   EXPECT_EQ(lab.driver.status().state, Status::STATE_MOVING);
   lab.tick();
   EXPECT_EQ(lab.driver.status().state, Status::STATE_MOVING);
   lab.is_moving = false;
   lab.tick();
   EXPECT_EQ(lab.driver.status().state, Status::STATE_SETTLED);
-  EXPECT_EQ(lab.driver.status().rest_since_utime, lab.now_);
+  EXPECT_EQ(lab.driver.status().rest_since_utime, lab.now().clock_us);
 }
 
 TEST(RobotDriver, LosesASilentRobotAndHaltsItWhenItIsBack) {
@@ -149,12 +160,18 @@ TEST(RobotDriver, LosesASilentRobotAndHaltsItWhenItIsBack) {
   EXPECT_EQ(lab.driver.status().rest_since_utime, -1);
   EXPECT_EQ(lab.send(lab.move()).state, Status::STATE_REJECTED);
 
+  // It may be the robot's voice only that is lost.
+  EXPECT_TRUE(lab.was_told("HALT"));
   lab.lines.clear();
-  lab.is_silent = false;  // and still moving
   lab.tick(1);
   EXPECT_TRUE(lab.was_told("HALT"));
-  EXPECT_FALSE(lab.driver.is_at_rest());
+
+  lab.lines.clear();
+  lab.take(lab.driver.on_line("AT " + std::to_string(lab.order) + " REST 1 2 3", lab.now()));
+  EXPECT_FALSE(lab.driver.is_at_rest());  // said before it heard the HALT
+  lab.is_silent = false;                  // and still moving
   lab.tick(1);
+  EXPECT_TRUE(lab.was_told("HALT"));
   EXPECT_TRUE(lab.driver.is_at_rest());
   EXPECT_FALSE(lab.was_told("GO"));
   EXPECT_EQ(lab.send(motion).state, Status::STATE_STOPPED);
@@ -168,7 +185,7 @@ TEST(RobotDriver, NoLongerVouchesForAnArmThatItLostAtRest) {
   lab.is_moving = false;
   lab.tick();
   ASSERT_EQ(lab.driver.status().state, Status::STATE_SETTLED);
-  lab.take(lab.driver.on_disconnect("unplugged", lab.now_));
+  lab.take(lab.driver.on_disconnect("unplugged", lab.now()));
   EXPECT_EQ(lab.driver.status().state, Status::STATE_STOPPED);
   EXPECT_EQ(lab.driver.status().reason, "unplugged");
   EXPECT_EQ(lab.driver.status().rest_since_utime, -1);
@@ -180,8 +197,103 @@ TEST(RobotDriver, HaltsAgainWhereAHaltWasLost) {
   lab.connect();
   lab.is_silent = false;
   lab.is_moving = true;
-  lab.tick(8);
+  lab.tick();
   EXPECT_TRUE(lab.driver.is_at_rest());
+
+  lab.send(lab.move());
+  lab.is_deaf = true;
+  lab.send(lab.make(Command::KIND_HOLD));
+  lab.tick();
+  EXPECT_TRUE(lab.is_moving);
+  lab.is_deaf = false;
+  lab.tick();
+  EXPECT_FALSE(lab.is_moving);
+  EXPECT_TRUE(lab.driver.is_at_rest());
+  lab.lines.clear();
+  lab.tick();
+  EXPECT_FALSE(lab.was_told("HALT"));
+}
+
+TEST(RobotDriver, NeverHaltsAMotionForAHaltOfBeforeIt) {
+  Lab lab;
+  lab.connect();
+  lab.is_deaf = true;
+  lab.send(lab.make(Command::KIND_HOLD));
+  lab.is_deaf = false;
+  EXPECT_EQ(lab.send(lab.move()).state, Status::STATE_MOVING);
+  lab.tick(3);
+  EXPECT_TRUE(lab.is_moving);
+}
+
+TEST(RobotDriver, WatchesTheRobotWhenTheClockIsSetBack) {
+  Lab lab;
+  lab.connect();
+  lab.clock_error = -kHour;
+  std::size_t num_heard = lab.heard.size();
+  std::int64_t utime = lab.driver.status().utime;
+  lab.tick(30);
+  EXPECT_GE(lab.heard.size(), num_heard + 3);
+  EXPECT_GE(lab.driver.status().utime, utime + 2'000'000);
+
+  lab.send(lab.move());
+  lab.tick(301);
+  EXPECT_NE(lab.driver.status().reason.find("in time"), std::string::npos);
+  EXPECT_FALSE(lab.is_moving);
+
+  ASSERT_EQ(lab.send(lab.move()).state, Status::STATE_MOVING);
+  lab.is_silent = true;
+  lab.tick(6);
+  EXPECT_NE(lab.driver.status().reason.find("silent"), std::string::npos);
+}
+
+TEST(RobotDriver, MeetsTheClockAgainWhenItIsALittleAhead) {
+  Lab lab;
+  lab.connect();
+  lab.clock_error = -2'000'000;
+  lab.tick(10);
+  EXPECT_GT(lab.driver.status().utime, lab.now().clock_us);
+  lab.tick(50);
+  EXPECT_LE(lab.driver.status().utime, lab.now().clock_us);
+}
+
+TEST(RobotDriver, HaltsBeforeItWritesToTheDisk) {
+  for (const std::int8_t kind : {Command::KIND_HOLD, Command::KIND_STOP}) {
+    Lab lab;
+    lab.connect();
+    lab.deeds.clear();
+    lab.send(lab.move());
+    lab.send(lab.make(kind));
+    EXPECT_EQ(lab.deeds, (std::vector<std::string>{"save", "GO", "HALT", "save"}));
+  }
+  Lab lab;
+  lab.connect();
+  lab.send(lab.move());
+  lab.deeds.clear();
+  lab.take(lab.driver.on_end(lab.now()));
+  EXPECT_EQ(lab.deeds, (std::vector<std::string>{"HALT", "save"}));
+}
+
+TEST(RobotDriver, SaysThatAStopCouldNotBeKeptAndTriesAgain) {
+  Lab lab;
+  lab.connect();
+  lab.disk_is_full = true;
+  const Command stop = lab.make(Command::KIND_STOP);
+  const Status answer = lab.send(stop);
+  EXPECT_EQ(answer.state, Status::STATE_STOPPED);
+  EXPECT_EQ(answer.stop_latched, 1);
+  EXPECT_NE(answer.reason.find("disk full"), std::string::npos) << answer.reason;
+  lab.tick(15);
+  EXPECT_NE(lab.heard.back().reason.find("disk full"), std::string::npos);
+  lab.disk_is_full = false;
+  lab.tick(11);
+  ASSERT_TRUE(lab.record.has_value());
+  EXPECT_EQ(lab.record->stop_latched, 1);
+  EXPECT_EQ(lab.record->action_id, stop.action_id);
+  EXPECT_EQ(lab.heard.back().reason.find("disk full"), std::string::npos);
+  // What is kept stays kept.
+  lab.disk_is_full = true;
+  lab.tick(100);
+  EXPECT_EQ(lab.heard.back().reason.find("disk full"), std::string::npos);
 }
 
 TEST(RobotDriver, SaysSoWhenTheRobotMovesByItself) {
@@ -229,7 +341,7 @@ TEST(RobotDriver, KnowsAfterARestartWhatItHadBegun) {
   EXPECT_EQ(lab.record->action_id, motion.action_id);
 
   // The clock was set back meanwhile.
-  Lab restarted(lab.record, kStart - 3'600'000'000);
+  Lab restarted(lab.record, kStart - kHour);
   EXPECT_GT(restarted.driver.status().utime, lab.record->utime);
   restarted.is_moving = true;
   restarted.connect();
@@ -243,12 +355,26 @@ TEST(RobotDriver, KnowsAfterARestartWhatItHadBegun) {
   EXPECT_FALSE(restarted.was_told("GO"));
 }
 
+TEST(RobotDriver, BeginsAfterTheLastWordOfTheOneBeforeWhateverTheClockSays) {
+  for (const int num_ticks : {1, 37, 200}) {
+    Lab lab;
+    lab.connect();
+    lab.tick(num_ticks);
+    ASSERT_TRUE(lab.record.has_value());
+    const Lab restarted(lab.record, kStart - kHour);
+    EXPECT_GT(restarted.driver.status().utime, lab.driver.status().utime);
+    // And not far ahead of a clock that is right.
+    const Lab soon(lab.record, lab.now_);
+    EXPECT_LE(soon.driver.status().utime, lab.now_ + 5'100'000);
+  }
+}
+
 TEST(RobotDriver, HaltsTheArmWhenItIsToldToEnd) {
   Lab lab;
   lab.connect();
   lab.send(lab.move());
   lab.lines.clear();
-  lab.take(lab.driver.on_end(lab.now_));
+  lab.take(lab.driver.on_end(lab.now()));
   EXPECT_TRUE(lab.was_told("HALT"));
   EXPECT_EQ(lab.driver.status().state, Status::STATE_STOPPED);
   EXPECT_TRUE(lab.driver.is_at_rest());
@@ -278,7 +404,7 @@ TEST(RobotDriver, CountsLinesThatAreNoReports) {
   for (const std::string& line : {std::string("ERR GO"), std::string(""), "AT " + n + " REST 1 2",
                                   "AT " + n + " REST 1 2 3 4", "AT " + n + " ASLEEP 1 2 3",
                                   "AT " + n + " REST 1 2 x", std::string("AT x REST 1 2 3")}) {
-    lab.take(lab.driver.on_line(line, lab.now_));
+    lab.take(lab.driver.on_line(line, lab.now()));
   }
   EXPECT_EQ(lab.driver.num_strange_lines(), 7);
 }
