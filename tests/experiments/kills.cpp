@@ -213,14 +213,15 @@ int main(int argc, char** argv) {
   }
   const Outcome undisturbed = judge(calm, rig, num_samples);
 
-  // All along the run: the k-th kill comes after a share k/num_kills of the samples.
+  // All along the run: the k-th kill comes after a share k/num_kills of the samples, but for the last
+  // twentieth, so that the run does not end before the last kill.
   std::mt19937_64 random(seed);
   std::map<std::string, int> killed;
   int num_killed = 0;
   Run run(folder / "killed", arguments);
   std::vector<std::string> victims;
   for (int k = 0; k < num_kills; ++k) {
-    const std::int64_t after = k * num_samples / num_kills;
+    const std::int64_t after = k * (num_samples - num_samples / 20) / num_kills;
     const bool is_due = becomes_true(std::chrono::seconds(120), [&] {
       return run.has_ended() || static_cast<std::int64_t>(run.samples().size()) >= after;
     });
