@@ -228,6 +228,8 @@ struct Bus::Impl {
   /// Counters are read and publish() is called by other threads as well.
   mutable std::mutex mutex;
   std::map<std::string, std::int64_t> published;
+  std::map<std::string, std::int64_t> failed;  ///< not sent, by channel
+  bool is_sending = true;
   std::int64_t truncated_logs = 0;
 
   void open_log(const Url& url) {
@@ -370,6 +372,12 @@ struct Bus::Impl {
     return true;
   }
 
+  /// A datagram that the system refused is lost like one that the network drops: an interface that
+  /// is down comes up again. Everything else (a dead relay, a message that is too large) stays.
+  bool may_send_later(int error) const {
+    return out_url.rfind("udpm://", 0) == 0 && error != 0 && error != EMSGSIZE && error != EBADF;
+  }
+
   /// Waits until the log's next event is due. False if that is later or a signal came.
   bool wait_until_due(std::chrono::milliseconds timeout) {
     if (log_speed <= 0) return true;
@@ -464,11 +472,21 @@ void Bus::publish_raw(const std::string& channel, std::span<const std::uint8_t> 
     impl_->output_log->append_bytes(channel, bytes,
                                     is_replay() ? impl_->log_event_utime : now.count());
   } else if (impl_->output != nullptr) {
+    errno = 0;
     if (lcm_publish(impl_->output.get(), channel.c_str(), bytes.data(),
                     static_cast<unsigned>(bytes.size())) < 0) {
-      throw url_error(impl_->out_url,
-                      fmt::format("cannot send {}: {}", channel, std::strerror(errno)));
+      const int error = errno;
+      const std::string problem =
+          fmt::format("{}: cannot send {}: {}", impl_->out_url, channel,
+                      error != 0 ? std::strerror(error) : "LCM refuses the message");
+      if (!impl_->may_send_later(error)) throw std::runtime_error(problem);
+      ++impl_->failed[channel];
+      if (std::exchange(impl_->is_sending, false)) {
+        spdlog::warn("{} (further ones are only counted)", problem);
+      }
+      return;
     }
+    if (!std::exchange(impl_->is_sending, true)) spdlog::info("{}: sends again", impl_->out_url);
   } else {
     return;
   }
@@ -497,6 +515,7 @@ std::map<std::string, std::int64_t> Bus::counters() const {
     counters["skipped " + channel->name] = channel->skipped;
   }
   for (const auto& [channel, count] : impl_->published) counters["published " + channel] = count;
+  for (const auto& [channel, count] : impl_->failed) counters["send failed " + channel] = count;
   if (impl_->truncated_logs > 0) counters["truncated log"] = impl_->truncated_logs;
   return counters;
 }

@@ -66,9 +66,10 @@ class Bus {
   }
 
   /// Encodes and sends. A message that does not pass check() is a bug: @throws std::logic_error.
-  /// @throws std::runtime_error if LCM refuses (disk full, network gone).
-  /// In a log the event time is now, in a replay that of the event in hand: a replayed log makes
-  /// the same bytes again.
+  /// @throws std::runtime_error if the disk is full or the relay gone. A datagram that cannot be
+  /// sent (the interface is down) is lost: counted as "send failed CHANNEL" and warned of once. In
+  /// a log the event time is now, in a replay that of the event in hand: a replayed log makes the
+  /// same bytes again.
   template <class Message>
   void publish(const Channel<Message>& channel, const Message& message) {
     publish_raw(channel.name, encode(channel, message));
@@ -93,7 +94,8 @@ class Bus {
   /// where the input is no log or an empty one.
   std::int64_t event_utime() const;
   /// "received CHANNEL" (all that arrived), "malformed CHANNEL", "senseless CHANNEL", "skipped
-  /// CHANNEL" for every channel subscribed to, "published CHANNEL", "truncated log" → count.
+  /// CHANNEL" for every channel subscribed to, "published CHANNEL", "send failed CHANNEL",
+  /// "truncated log" → count.
   std::map<std::string, std::int64_t> counters() const;
 
  private:

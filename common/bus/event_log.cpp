@@ -239,14 +239,36 @@ LogReport for_each_event(const std::filesystem::path& path,
   return reader.report();
 }
 
+LogLock::LogLock(const std::filesystem::path& path) {
+  for (;;) {
+    Descriptor file(::open(path.c_str(), O_RDWR | O_CREAT | O_CLOEXEC, 0666));
+    if (file.get() < 0) throw system_error(path, "cannot write the log");
+    // Released by the kernel when the process dies, however it dies.
+    if (::flock(file.get(), LOCK_EX | LOCK_NB) != 0) {
+      throw file_error(path, "is being written by another process");
+    }
+    // Somebody may have replaced the file between the two calls: then the lock is of no use.
+    struct stat locked {
+    }, named{};
+    if (::fstat(file.get(), &locked) != 0) throw system_error(path, "cannot write the log");
+    if (::stat(path.c_str(), &named) != 0 || locked.st_dev != named.st_dev ||
+        locked.st_ino != named.st_ino) {
+      continue;
+    }
+    file_ = file.release();
+    return;
+  }
+}
+
+LogLock::~LogLock() {
+  if (file_ >= 0) ::close(file_);
+}
+
+int LogLock::release() { return std::exchange(file_, -1); }
+
 LogAppender::LogAppender(const std::filesystem::path& path, Mode mode, Durability durability)
     : path_(path), durability_(durability) {
-  Descriptor file(::open(path.c_str(), O_RDWR | O_CREAT | O_CLOEXEC, 0666));
-  if (file.get() < 0) throw system_error(path, "cannot write the log");
-  // Released by the kernel when the process dies, however it dies.
-  if (::flock(file.get(), LOCK_EX | LOCK_NB) != 0) {
-    throw file_error(path, "is being written by another process");
-  }
+  Descriptor file(LogLock(path).release());
   if (mode == Mode::kAppend) {
     LogReader reader(path);
     while (reader.next()) next_number_ = reader.event().event_number + 1;

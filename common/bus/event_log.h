@@ -116,6 +116,23 @@ std::vector<Message> read_log(const std::filesystem::path& path, const Channel<M
   return messages;
 }
 
+/// While it lives no LogAppender can open the log: held while a damaged one is replaced.
+class LogLock {
+ public:
+  /// The file is created where there is none.
+  /// @throws std::runtime_error if it cannot be written or is being written by somebody else.
+  explicit LogLock(const std::filesystem::path& path);
+  ~LogLock();
+  LogLock(const LogLock&) = delete;
+  LogLock& operator=(const LogLock&) = delete;
+
+  /// The locked file, open for reading and writing; the caller closes it and so ends the lock.
+  int release();
+
+ private:
+  int file_ = -1;
+};
+
 /// Writes events at the end of a log, each in one write, so that a killed writer leaves at most one
 /// torn event behind. While it lives no other LogAppender can open the same file.
 class LogAppender {

@@ -256,17 +256,29 @@ void Process::run() {
   if (impl_->info.phase == process_info_t::PHASE_STARTING) {
     impl_->info.phase = process_info_t::PHASE_WAITING;
   }
-  impl_->publish_info_if_due();
-  bool has_more = true;
-  while (has_more && !stop_requested) {
-    has_more = impl_->bus.handle(kTickPeriod);
-    impl_->tick();
-    for (const auto& handler : impl_->idle_handlers) handler();
+  std::exception_ptr first_problem;
+  const auto guarded = [&](const auto& act) {
+    try {
+      act();
+    } catch (...) {
+      if (!first_problem) first_problem = std::current_exception();
+    }
+  };
+  guarded([&] {
     impl_->publish_info_if_due();
-  }
-  for (const auto& handler : impl_->end_handlers) handler();
+    bool has_more = true;
+    while (has_more && !stop_requested) {
+      has_more = impl_->bus.handle(kTickPeriod);
+      impl_->tick();
+      for (const auto& handler : impl_->idle_handlers) handler();
+      impl_->publish_info_if_due();
+    }
+  });
+  // However the loop ended: among them is the safe command of a driver.
+  for (const auto& handler : impl_->end_handlers) guarded(handler);
   impl_->info.phase = process_info_t::PHASE_ENDED;
-  impl_->publish_info();
+  guarded([&] { impl_->publish_info(); });
+  if (first_problem) std::rethrow_exception(first_problem);
 }
 
 bool is_live(const process_info_t& info, std::int64_t now_us) {

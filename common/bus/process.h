@@ -64,12 +64,14 @@ class Process {
   /// Called after every batch of messages, and at least every 100 ms when live; may publish. The
   /// place to look whether a worker has finished.
   void on_idle(std::function<void()> handler);
-  /// Called once when the loop ends, in order (SIGTERM, end of the log): the place for the last
-  /// answer and the safe command.
+  /// Called once when the loop ends, in order (SIGTERM, end of the log, an exception of another
+  /// handler): the place for the last answer and the safe command. One that throws does not keep
+  /// those after it from being called.
   void on_end(std::function<void()> handler);
 
   /// Returns after SIGTERM or SIGINT (the message in hand is finished first) or at the end of a
-  /// log. A second signal kills. Live, PROCESS_INFO is sent at 1 Hz and on change (at most 10 Hz);
+  /// log. A second signal kills. The first exception of a handler ends the loop and is thrown again
+  /// after the end handlers. Live, PROCESS_INFO is sent at 1 Hz and on change (at most 10 Hz);
   /// in a replay once, at the end.
   void run();
 

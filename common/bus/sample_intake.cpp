@@ -26,8 +26,8 @@ std::size_t identity(const sample_t& sample) {
 
 }  // namespace
 
-SampleIntake::Ask SampleIntake::asking(Process& process) {
-  if (process.bus().is_replay()) return nullptr;
+SampleIntake::Ask SampleIntake::asking(Process& process, bool has_observer) {
+  if (process.bus().is_replay() || !has_observer) return nullptr;
   return [&process](sample_request_t request) {
     request.process_name = process.name();
     process.bus().publish(kSampleRequest, request);
@@ -84,7 +84,7 @@ void SampleIntake::hand_on() {
   while (!ahead_.empty()) {
     if (ahead_.begin()->first > next_index_) {
       if (ask_) return;
-      counters_["lost SAMPLE"] += ahead_.begin()->first - next_index_;
+      give_up_gap();
     }
     const sample_t sample = std::move(ahead_.extract(ahead_.begin()).mapped());
     if (sample.sample_index < next_index_) continue;  // the file had filled the gap
@@ -95,15 +95,20 @@ void SampleIntake::hand_on() {
   }
 }
 
+void SampleIntake::give_up_gap() {
+  const std::int64_t first = ahead_.begin()->first;
+  spdlog::warn("lost SAMPLE {}…{}: {}", next_index_, first - 1,
+               ask_ ? "the observer does not have them" : "the recording does not have them");
+  counters_["lost SAMPLE"] += first - next_index_;
+  lost_.emplace_back(next_index_, first - 1);
+  next_index_ = first;
+}
+
 void SampleIntake::on_tick(std::int64_t now_us) {
   if (ahead_.empty() || (asked_us_ >= 0 && now_us - asked_us_ < kAskPeriodUs)) return;
   asked_us_ = now_us;
   if (std::exchange(is_observer_heard_, false) && ++num_unanswered_ > kMaxUnanswered) {
-    const std::int64_t first = ahead_.begin()->first;
-    spdlog::warn("SAMPLE {} to {} are lost: the observer does not have them", next_index_,
-                 first - 1);
-    counters_["lost SAMPLE"] += first - next_index_;
-    next_index_ = first;
+    give_up_gap();
     hand_on();
     return;
   }

@@ -5,6 +5,8 @@
 #include <map>
 #include <string>
 #include <unordered_map>
+#include <utility>
+#include <vector>
 
 #include "bodyschema/sample_request_t.hpp"
 #include "bodyschema/sample_t.hpp"
@@ -29,8 +31,9 @@ class SampleIntake {
   using Handler = std::function<void(const sample_t&)>;
   /// Publishes a SAMPLE_REQUEST.
   using Ask = std::function<void(sample_request_t request)>;
-  /// Publishes in the name of the process; nobody is asked in a replay, where nobody answers.
-  static Ask asking(Process& process);
+  /// Publishes in the name of the process; nobody is asked in a replay, where nobody answers, nor
+  /// where `has_observer` says that none runs.
+  static Ask asking(Process& process, bool has_observer = true);
 
   /// Hands on what `samples_file` holds already. An empty name, a file that does not exist yet or a
   /// damaged one is no error. Without `ask` what the file cannot fill is given up at once.
@@ -43,6 +46,8 @@ class SampleIntake {
   /// "lost SAMPLE", "conflicting SAMPLE" → count since the start.
   const std::map<std::string, std::int64_t>& counters() const { return counters_; }
   std::int64_t num_lost() const { return counters_.at("lost SAMPLE"); }
+  /// First and last index of every gap that was given up, in order.
+  const std::vector<std::pair<std::int64_t, std::int64_t>>& lost() const { return lost_; }
   /// What it waits for, for people; "" if for nothing.
   std::string activity() const;
 
@@ -50,6 +55,7 @@ class SampleIntake {
   void read_file();
   void take(const sample_t& sample);
   void hand_on();
+  void give_up_gap();
 
   const std::string samples_file_;
   const Handler handler_;
@@ -58,6 +64,7 @@ class SampleIntake {
   std::map<std::int64_t, sample_t> ahead_;               ///< behind a gap, by index
   std::unordered_map<std::int64_t, std::size_t> known_;  ///< index handed on → what it was
   std::map<std::string, std::int64_t> counters_ = {{"conflicting SAMPLE", 0}, {"lost SAMPLE", 0}};
+  std::vector<std::pair<std::int64_t, std::int64_t>> lost_;
   bool is_begun_anew_ = false;
   std::uintmax_t size_read_ = 0;  ///< of the file [bytes]
   std::int64_t asked_us_ = -1;

@@ -99,6 +99,22 @@ std::set<std::string> RunWatch::silent(const std::set<std::string>& expected,
   return silent;
 }
 
+bool RunWatch::are_listening(const std::set<std::string>& expected, std::int64_t now_us) const {
+  if (!silent(expected, now_us).empty()) return false;
+  return std::all_of(expected.begin(), expected.end(), [&](const std::string& name) {
+    return processes_.at(name).info.phase != process_info_t::PHASE_STARTING;
+  });
+}
+
+std::int64_t RunWatch::counter(const std::string& process, const std::string& counter) const {
+  const auto heard = processes_.find(process);
+  if (heard == processes_.end()) return 0;
+  for (const counter_t& item : heard->second.info.counters) {
+    if (item.counter_name == counter) return item.count;
+  }
+  return 0;
+}
+
 std::string RunWatch::diagnosis(const std::set<std::string>& expected, std::int64_t now_us) const {
   const std::set<std::string> silent_ones = silent(expected, now_us);
   std::string text;

@@ -37,6 +37,10 @@ class RunWatch {
   std::string progress() const;
   /// Those of `expected` that have not been heard of for 3 s.
   std::set<std::string> silent(const std::set<std::string>& expected, std::int64_t now_us) const;
+  /// Whether all of `expected` are heard and listen: one that is starting has not subscribed yet.
+  bool are_listening(const std::set<std::string>& expected, std::int64_t now_us) const;
+  /// What the process last said of this counter; 0 if it did not.
+  std::int64_t counter(const std::string& process, const std::string& counter) const;
   /// What every process does or waits for, and which one is silent; for the moment when nothing
   /// goes on.
   std::string diagnosis(const std::set<std::string>& expected, std::int64_t now_us) const;

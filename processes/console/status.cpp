@@ -9,13 +9,14 @@
 #include <chrono>
 #include <iostream>
 #include <memory>
+#include <set>
 #include <stdexcept>
+#include <string>
 
 #include "common/bus/all_channels.h"
 #include "common/bus/bus.h"
 #include "common/bus/images_url.h"
 #include "common/bus/log_summary.h"
-#include "processes/console/group.h"
 #include "processes/console/status_board.h"
 
 namespace bodyschema {
@@ -24,6 +25,7 @@ namespace {
 struct StatusArguments {
   std::string in = default_url();
   std::string images;
+  std::set<std::string> processes;
   double seconds = 2.1;
   bool json = false;
 };
@@ -46,7 +48,7 @@ int terminal_width() {
 void run_status(const StatusArguments& arguments) {
   // What is dropped stands in the result.
   spdlog::set_level(spdlog::level::err);
-  StatusBoard board(kGroup, program_version());
+  StatusBoard board(arguments.processes, program_version());
   Bus bus(arguments.in, "");
   Bus images(arguments.images.empty() ? images_url(arguments.in) : arguments.images, "");
   for_each_channel([&]<class Message>(const Channel<Message>& channel) {
@@ -91,6 +93,8 @@ void add_status_command(CLI::App& console) {
   status->add_option("--in", arguments->in, "URL of the bus")->capture_default_str();
   status->add_option("--images", arguments->images,
                      "URL of the images' bus; default: the next port of --in");
+  status->add_option("--processes", arguments->processes,
+                     "Processes that should be heard of; says which is not");
   status->add_option("--seconds", arguments->seconds, "How long to listen [s]")
       ->check(CLI::Range(0.1, 3600.0))
       ->capture_default_str();

@@ -3,6 +3,8 @@
 #include <fcntl.h>
 #include <fmt/format.h>
 #include <spawn.h>
+#include <spdlog/sinks/stdout_color_sinks.h>
+#include <spdlog/spdlog.h>
 #include <sys/wait.h>
 #include <unistd.h>
 
@@ -22,7 +24,6 @@
 #include "common/bus/rig_door.h"
 #include "common/bus/sample_intake.h"
 #include "common/config/rig.h"
-#include "processes/console/group.h"
 #include "processes/console/picture.h"
 #include "processes/console/run_watch.h"
 #include "processes/console/schema_json.h"
@@ -180,6 +181,23 @@ void read_truth(const std::string& log, RunWatch& watch) {
   }
 }
 
+/// Messages of a channel in a recording, as far as it can be read.
+std::int64_t count_messages(const std::string& log, const std::string& channel) {
+  std::int64_t count = 0;
+  try {
+    for_each_event(log, [&](const LogEvent& event) { count += event.channel == channel; });
+  } catch (const std::runtime_error&) {
+    // As above.
+  }
+  return count;
+}
+
+/// What a replay could not use.
+struct Lost {
+  std::vector<std::pair<std::int64_t, std::int64_t>> samples;  ///< first and last index
+  std::int64_t frames = 0;                                     ///< that were played and not heard
+};
+
 /// What was learned from all samples. The body schema is the monitor's where it accepted one; a
 /// schema does not carry its outliers, so learning again from the same samples names them.
 struct Learned {
@@ -207,7 +225,8 @@ Learned learn_again(const RunWatch& watch, const WatchArguments& arguments) {
 }
 
 nlohmann::ordered_json result_json(const RunWatch& watch, const Learned& learned,
-                                   const WatchArguments& arguments, double seconds) {
+                                   const WatchArguments& arguments, const Lost& lost,
+                                   double seconds) {
   const Signals signals = load_signals(arguments.rig_folder);
   const auto held_out = watch.held_out();
   nlohmann::ordered_json json = {
@@ -222,18 +241,22 @@ nlohmann::ordered_json result_json(const RunWatch& watch, const Learned& learned
        errors_json(static_cast<int>(held_out.size()), evaluate(learned.schema, held_out))},
       {"held_out_against", watch.has_truth() ? "noise-free simulator" : "observations"},
       {"visibility", nlohmann::ordered_json::object()}};
-  if (!arguments.replay.empty()) json["replay_of"] = arguments.replay;
+  if (!arguments.replay.empty()) {
+    json["replay_of"] = arguments.replay;
+    json["lost_frames"] = lost.frames;
+  }
+  json["lost_samples"] = lost.samples;
   for (const auto& [part, share] : watch.visibility())
     json["visibility"][std::to_string(part)] = share;
   return json;
 }
 
 void report(const RunWatch& watch, const BestPicture& picture, const WatchArguments& arguments,
-            double seconds) {
+            const Lost& lost, double seconds) {
   const std::filesystem::path folder = arguments.out;
   const Learned learned = learn_again(watch, arguments);
   write_file_atomically(folder / "result.json",
-                        result_json(watch, learned, arguments, seconds).dump(2) + "\n");
+                        result_json(watch, learned, arguments, lost, seconds).dump(2) + "\n");
   picture.write(folder / "detections.png");
 
   const auto held_out = watch.held_out();
@@ -241,6 +264,15 @@ void report(const RunWatch& watch, const BestPicture& picture, const WatchArgume
                                                       : "replay of " + arguments.replay;
   std::cout << fmt::format("\n{} · {} · {} samples, {} of them held out · {:.0f} s\n\n",
                            arguments.rig, origin, watch.num_samples(), held_out.size(), seconds);
+  for (const auto& [first, last] : lost.samples) {
+    std::cout << (first == last ? fmt::format("lost SAMPLE {}\n", first)
+                                : fmt::format("lost SAMPLE {}…{}\n", first, last));
+  }
+  if (lost.frames > 0) {
+    std::cout << fmt::format(
+        "{} of the played {} were not heard: play it slower, or at --speed 0\n", lost.frames,
+        arguments.replay_from);
+  }
   if (!learned.is_accepted) {
     std::cout << "The monitor accepted no body schema: too few samples, or each proposal was "
                  "refuted. The newest proposal:\n";
@@ -260,8 +292,7 @@ void report(const RunWatch& watch, const BestPicture& picture, const WatchArgume
       {"detections.png", "a camera frame with the markers found in it"},
       {"schema.lcmlog", "the body schema: ./run show FILE"},
       {"samples.lcmlog", "the samples: ./run learn FILE"},
-      {"run.lcmlog.00", "everything on the bus but images"},
-      {"report.html", "all of this as one page"}};
+      {"run.lcmlog.00", "everything on the bus but images"}};
   for (const auto& [name, what] : files) {
     if (std::filesystem::exists(folder / name))
       std::cout << fmt::format("  {:<18} {}\n", name, what);
@@ -270,6 +301,8 @@ void report(const RunWatch& watch, const BestPicture& picture, const WatchArgume
 }
 
 void run_watch(const WatchArguments& arguments) {
+  // stdout is for the result.
+  spdlog::set_default_logger(spdlog::stderr_color_mt("watch"));
   std::signal(SIGINT, on_signal);
   std::signal(SIGTERM, on_signal);
   RunWatch watch;
@@ -281,14 +314,17 @@ void run_watch(const WatchArguments& arguments) {
   const bool is_replay = !arguments.replay.empty();
   Bus bus(arguments.in, is_replay ? "" : arguments.in);
   Bus images(arguments.images.empty() ? images_url(arguments.in) : arguments.images, "");
+  const bool is_played = is_replay && arguments.speed > 0;
+  const std::string listener =
+      arguments.replay_from == kSample.name ? "structure_learner" : "observer";
   // Where the observer runs on another host, a sample that a lost frame took is asked for.
-  SampleIntake intake(
-      (std::filesystem::path(arguments.out) / "samples.lcmlog").string(),
-      [&](const sample_t& m) { watch.on_sample(m); },
-      [&](sample_request_t request) {
-        request.process_name = "watch";
-        bus.publish(kSampleRequest, request);
-      });
+  SampleIntake::Ask ask = [&](sample_request_t request) {
+    request.process_name = "watch";
+    bus.publish(kSampleRequest, request);
+  };
+  if (is_replay && !(is_played && listener == "observer")) ask = nullptr;
+  SampleIntake intake((std::filesystem::path(arguments.out) / "samples.lcmlog").string(),
+                      [&](const sample_t& m) { watch.on_sample(m); }, ask);
   // What another rig's group says, or a recording that is played, is none of this run.
   const RigDoor door(arguments.rig_folder);
   const auto hear = [&](const auto& channel, auto handler) {
@@ -319,27 +355,35 @@ void run_watch(const WatchArguments& arguments) {
   if (is_replay) read_truth(arguments.replay, watch);
   std::int64_t last_progress = 0;
   double progressed_s = 0, warned_s = 0, played_s = 0;
+  // Every message that is played is heard by who makes samples of it, or lost.
+  const std::int64_t num_played =
+      is_played ? count_messages(arguments.replay, arguments.replay_from) : 0;
+  const auto num_heard = [&] {
+    return watch.counter(listener, "received " + arguments.replay_from);
+  };
   const auto is_finished = [&] {
     if (!is_replay) return watch.is_finished();
     if (arguments.speed == 0) return watch.is_caught_up();
     // What is played before somebody listens is lost.
-    if (!player.has_started() && watch.silent(arguments.processes, now_us()).empty())
+    if (!player.has_started() && watch.are_listening(arguments.processes, now_us()))
       player.start(arguments);
     if (!player.has_started() || player.is_running()) {
       played_s = seconds();
       return false;
     }
-    // The observer may still be at the last sample.
+    // Whoever listens may have messages before it still; what is lost will not come.
+    const double waited_s = seconds() - std::max(played_s, progressed_s);
+    if (num_heard() < num_played && waited_s < 5) return false;
     if (watch.num_samples() == 0 && seconds() - played_s > 10)
       throw std::runtime_error(
           "the recording gave no sample: it holds no settled action that was seen");
-    return seconds() - std::max(played_s, progressed_s) > 1 && watch.is_caught_up();
+    return waited_s > 1 && watch.is_caught_up();
   };
   while (!is_finished() && !interrupted) {
     images.handle(std::chrono::milliseconds(0));
     bus.handle(std::chrono::milliseconds(50));
     intake.on_tick(now_us());
-    const std::int64_t progress = watch.num_samples() + watch.learned_sample();
+    const std::int64_t progress = watch.num_samples() + watch.learned_sample() + num_heard();
     if (std::exchange(last_progress, progress) != progress) progressed_s = seconds();
     line.show(fmt::format("{} · {:.0f} s", watch.progress(), seconds()), false);
     const double stalled_s = seconds() - std::max(progressed_s, warned_s);
@@ -357,7 +401,8 @@ void run_watch(const WatchArguments& arguments) {
   }
   line.show(fmt::format("{} · {:.0f} s", watch.progress(), seconds()), true);
   line.end();
-  report(watch, picture, arguments, seconds());
+  const Lost lost{intake.lost(), std::max<std::int64_t>(0, num_played - num_heard())};
+  report(watch, picture, arguments, lost, seconds());
   if (interrupted) throw std::runtime_error("interrupted before the end");
 }
 

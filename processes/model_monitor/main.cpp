@@ -24,9 +24,12 @@ std::filesystem::path beside(const std::filesystem::path& file, const char* name
 
 int main(int argc, char** argv) {
   std::string samples_file;
+  bool is_replayed = false;
   std::string schema_file;
   const auto add_options = [&](CLI::App& app) {
     app.add_option("--samples", samples_file, "The observer's samples.lcmlog, read at start");
+    app.add_flag("--replayed", is_replayed,
+                 "The samples are a recording's and no observer runs: what is missing is given up");
     app.add_option("--schema", schema_file,
                    "Where the body schema is kept, and health.lcmlog beside it; reloaded at start");
   };
@@ -35,7 +38,7 @@ int main(int argc, char** argv) {
     ModelMonitor monitor(ModelMonitorConfig::load(process.config_file()));
     SampleIntake intake(
         samples_file, [&](const sample_t& sample) { monitor.on_sample(sample); },
-        SampleIntake::asking(process));
+        SampleIntake::asking(process, !is_replayed));
     SavedMessage saved_schema(schema_file, kBodySchema);
     SavedMessage saved_health(beside(schema_file, "health.lcmlog"), kModelHealth);
     {

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <iterator>
 #include <limits>
 #include <stdexcept>
 
@@ -14,6 +15,8 @@ namespace {
 
 constexpr std::int64_t kNotEnded = std::numeric_limits<std::int64_t>::max();
 constexpr std::size_t kMaxRests = 16;
+/// Frames and the driver's statuses of one clock are never so far apart.
+constexpr std::int64_t kMaxApartUs = 10'000'000;
 constexpr double kDegree = M_PI / 180;
 
 std::string name_of(const motion_status_t& status) {
@@ -68,6 +71,15 @@ std::optional<sample_t> Observer::on_camera_info(const camera_info_t& info) {
 }
 
 std::optional<sample_t> Observer::on_marker_poses(const marker_poses_t& poses) {
+  if (driver_utime_ >= 0 && poses.utime - driver_utime_ > kMaxApartUs) {
+    ++counters_["frame far ahead of the driver"];
+    return std::nullopt;
+  }
+  if (!frames_.empty() && frames_.rbegin()->first - poses.utime > kMaxApartUs) {
+    // Each frame from now on would be the oldest and the first to leave the buffer.
+    frames_.clear();
+    ++counters_["camera time ran backwards"];
+  }
   if (!frames_.try_emplace(poses.utime, poses).second) {
     ++counters_["frame seen before"];
     return std::nullopt;
@@ -99,6 +111,11 @@ std::optional<sample_t> Observer::on_motion_status(const motion_status_t& status
     ++counters_["driver time ran backwards"];
   }
   driver_utime_ = status.utime;
+  const auto ahead = frames_.upper_bound(driver_utime_ + kMaxApartUs);
+  if (ahead != frames_.end()) {
+    counters_["frame far ahead of the driver"] += std::distance(ahead, frames_.end());
+    frames_.erase(ahead, frames_.end());
+  }
   end_rests(status);
   const bool is_settled_move = status.state == motion_status_t::STATE_SETTLED &&
                                status.kind == action_command_t::KIND_MOVE &&

@@ -14,8 +14,8 @@
 #include "bodyschema/marker_poses_t.hpp"
 #include "bodyschema/motion_status_t.hpp"
 #include "bodyschema/sample_t.hpp"
-#include "common/config/rig.h"
 #include "common/camera/lens.h"
+#include "common/config/rig.h"
 #include "processes/observer/part_pose.h"
 
 namespace bodyschema {
@@ -39,10 +39,12 @@ struct ObserverConfig {
 ///
 /// Times of frames and of MOTION_STATUS must come from one clock. Messages may arrive in either
 /// order: frames and rest intervals wait for each other in bounded buffers. A frame that was seen
-/// before (same utime) is ignored. A rest interval ends when a later motion begins, or where the
-/// driver says that the arm rests anew; what was not seen by then never becomes a sample. Nothing
-/// is invented: without frames, status or calibration it waits, and activity() says for what. With
-/// the same messages the samples are the same bytes.
+/// before (same utime) is ignored. A frame 10 s before the newest one says that the camera's clock
+/// was set back: the frames of before are forgotten. One 10 s ahead of the driver is dropped. A
+/// rest interval ends when a later motion begins, or where the driver says that the arm rests anew;
+/// what was not seen by then never becomes a sample. Nothing is invented: without frames, status or
+/// calibration it waits, and activity() says for what. With the same messages the samples are the
+/// same bytes.
 class Observer {
  public:
   Observer(const ObserverConfig& config, Markers markers);

@@ -15,6 +15,14 @@ constexpr std::size_t kMaxWanted = 50;
 /// A tick: 100 ms.
 constexpr std::size_t kMaxPerTick = 25;
 
+bool is_damaged(const std::filesystem::path& file) {
+  std::error_code none;
+  if (std::filesystem::file_size(file, none) == 0 || none) return false;
+  LogReport report;
+  read_log(file, kSample, &report, OnDamage::kSkip);
+  return report.damaged_bytes > 0;
+}
+
 }  // namespace
 
 SampleOutbox::SampleOutbox(std::filesystem::path file, Publish publish)
@@ -24,7 +32,11 @@ SampleOutbox::SampleOutbox(std::filesystem::path file, Publish publish)
 
 void SampleOutbox::open() {
   std::error_code none;
-  if (std::filesystem::file_size(file_, none) > 0 && !none) {
+  // A second observer, started by mistake, must not replace the file of the first. Held until the
+  // new file is locked itself.
+  std::optional<LogLock> repair;
+  if (is_damaged(file_)) repair.emplace(file_);
+  if (repair && std::filesystem::file_size(file_, none) > 0 && !none) {
     LogReport report;
     const auto readable = read_log(file_, kSample, &report, OnDamage::kSkip);
     if (report.damaged_bytes > 0) {

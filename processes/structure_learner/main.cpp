@@ -13,8 +13,11 @@ using namespace bodyschema;
 
 int main(int argc, char** argv) {
   std::string samples_file;
+  bool is_replayed = false;
   const auto add_options = [&](CLI::App& app) {
     app.add_option("--samples", samples_file, "The observer's samples.lcmlog, read at start");
+    app.add_flag("--replayed", is_replayed,
+                 "The samples are a recording's and no observer runs: what is missing is given up");
   };
   const auto body = [&](Process& process) {
     const RigDoor door(process.rig_folder());
@@ -26,7 +29,7 @@ int main(int argc, char** argv) {
         process.count("refused SAMPLE");  // a samples file of another rig
       }
     };
-    SampleIntake intake(samples_file, learn_from, SampleIntake::asking(process));
+    SampleIntake intake(samples_file, learn_from, SampleIntake::asking(process, !is_replayed));
 
     // The fit runs beside the loop: listening never waits for learning.
     std::future<body_schema_t> fit;

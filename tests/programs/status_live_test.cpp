@@ -3,8 +3,8 @@
 #include <gtest/gtest.h>
 #include <lcm/lcm.h>
 
-#include <csignal>
 #include <chrono>
+#include <csignal>
 #include <nlohmann/json.hpp>
 #include <random>
 #include <set>
@@ -54,7 +54,8 @@ TEST(StatusLive, ProcessesAreSeenThroughGarbageOnEveryChannel) {
   });
   ASSERT_TRUE(test::handle_until(bus, [&] { return has_simulator && has_observer; }));
 
-  test::Program listener({kBin + "bodyschema", "status", "--json", "--seconds", "3"});
+  test::Program listener({kBin + "bodyschema", "status", "--json", "--seconds", "3", "--processes",
+                          "camera", "observer"});
   std::mt19937 random(1);
   lcm_t* lcm = lcm_create(default_url().c_str());
   ASSERT_NE(lcm, nullptr);
@@ -88,10 +89,12 @@ TEST(StatusLive, ProcessesAreSeenThroughGarbageOnEveryChannel) {
   EXPECT_EQ(json["arm"]["at_rest"], true);
 
   // For people, the same.
-  const Outcome outcome = status({});
+  const Outcome outcome = status({"--processes", "camera", "observer"});
   EXPECT_EQ(outcome.exit_code, 0) << outcome.err;
-  EXPECT_NE(outcome.out.find("Not heard: camera,"), std::string::npos) << outcome.out;
+  EXPECT_NE(outcome.out.find("Not heard: camera."), std::string::npos) << outcome.out;
   EXPECT_EQ(outcome.out.find("\x1b"), std::string::npos);
+  // Nobody said who should be there.
+  EXPECT_EQ(status({}).out.find("Not heard"), std::string::npos);
 }
 
 }  // namespace

@@ -154,6 +154,18 @@ TEST_F(ProcessTest, AHandlersExceptionIsOneLineAndExitCodeOne) {
   EXPECT_EQ(program.err(), "relay: the handler failed\n");
 }
 
+TEST_F(ProcessTest, TheEndHandlersAreCalledAlsoWhenAHandlerThrew) {
+  write_statuses("in", 1);
+  Program program(relay(
+      {"--fail", "--fail-at-end", "--in", url("in", "?speed=0"), "--out", url("out", "?mode=w")}));
+  EXPECT_EQ(program.wait(), 1);
+  EXPECT_EQ(program.err(), "relay: the handler failed\n") << "the first exception is the cause";
+  EXPECT_EQ(program.out(), "first end\nsecond end\n");
+  const std::vector<process_info_t> infos = read_log(folder_ / "out", kProcessInfo);
+  ASSERT_EQ(infos.size(), 1U);
+  EXPECT_EQ(infos.back().phase, process_info_t::PHASE_ENDED);
+}
+
 TEST_F(ProcessTest, AReplayEndsByItselfAndWritesProcessInfoOnceAtTheEnd) {
   write_statuses("in", 30);
   Program program(relay({"--in", url("in", "?speed=0"), "--out", url("out", "?mode=w")}));

@@ -12,6 +12,7 @@
 int main(int argc, char** argv) {
   using namespace bodyschema;
   bool fails = false;
+  bool fails_at_end = false;
   bool tells_ticks = false;
   bool only_answers = false;
   const auto body = [&](Process& process) {
@@ -39,13 +40,17 @@ int main(int argc, char** argv) {
       std::puts("ready");
       std::fflush(stdout);
     });
-    process.on_end([] { std::puts("first end"); });
+    process.on_end([&] {
+      std::puts("first end");
+      if (fails_at_end) throw std::runtime_error("the end failed");
+    });
     process.on_end([] { std::puts("second end"); });
     process.run();
     std::puts("ended");
   };
   return run_process("relay", argc, argv, body, [&](CLI::App& app) {
     app.add_flag("--fail", fails, "throw in a handler");
+    app.add_flag("--fail-at-end", fails_at_end, "throw in the first end handler");
     app.add_flag("--only-answer", only_answers, "pass no MOTION_STATUS on");
     app.add_flag("--ticks", tells_ticks, "print the time of every tick");
   });

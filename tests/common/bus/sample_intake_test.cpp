@@ -136,6 +136,14 @@ TEST_F(SampleIntakeTest, AHoleInTheLogCostsOnlyWhatIsMissing) {
 
 constexpr std::int64_t kSecond = 1'000'000;
 
+TEST_F(SampleIntakeTest, SaysWhichSamplesNobodyHas) {
+  record({5, 6, 8});
+  start();
+  EXPECT_EQ(heard_, (Indices{5, 6, 8}));
+  EXPECT_EQ(intake_->lost(), (Requests{{0, 4}, {7, 7}}));
+  EXPECT_EQ(intake_->num_lost(), 6);
+}
+
 TEST_F(SampleIntakeTest, BehindAGapItWaitsAndAsksTwiceASecond) {
   start_asking();
   hear({0, 1, 4, 7});

@@ -189,5 +189,25 @@ TEST(BusOverUdp, AProcessAnswersSaysWhoItIsAndEndsOnSigterm) {
   EXPECT_TRUE(handle_until(bus, [&] { return infos.back().phase == process_info_t::PHASE_ENDED; }));
 }
 
+TEST(BusOverUdp, AnInterfaceThatIsDownCostsMessagesNotTheProcess) {
+  Bus sender("", kUrl);
+  Bus receiver(kUrl, "");
+  std::int64_t heard = -1;
+  receiver.subscribe(kMotionStatus, [&](const motion_status_t& m) { heard = m.utime; });
+  ASSERT_EQ(std::system("ip link set lo down"), 0);
+  for (std::int64_t utime = 1; utime <= 3; ++utime) {
+    EXPECT_NO_THROW(sender.publish(kMotionStatus, status(utime)));
+  }
+  EXPECT_EQ(sender.counters()["send failed MOTION_STATUS"], 3);
+  EXPECT_EQ(sender.counters()["published MOTION_STATUS"], 0);
+  ASSERT_EQ(std::system("ip link set lo up && ip route replace 224.0.0.0/4 dev lo"), 0);
+  EXPECT_TRUE(ask_until(
+      [&] {
+        sender.publish(kMotionStatus, status(4));
+        receiver.handle(milliseconds(20));
+      },
+      [&] { return heard == 4; }));
+}
+
 }  // namespace
 }  // namespace bodyschema::test

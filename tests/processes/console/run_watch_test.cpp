@@ -118,6 +118,24 @@ TEST(RunWatchTest, SilentIsWhoWasNotHeardForThreeSeconds) {
   EXPECT_EQ(watch.silent(all, 5'000'000), (std::set<std::string>{"camera", "log"}));
 }
 
+TEST(RunWatchTest, WhoIsStartingDoesNotListenYet) {
+  RunWatch watch;
+  watch.on_process_info(info("observer", process_info_t::PHASE_STARTING), 1'000'000);
+  EXPECT_TRUE(watch.silent({"observer"}, 2'000'000).empty());
+  EXPECT_FALSE(watch.are_listening({"observer"}, 2'000'000));
+  process_info_t observer = info("observer", process_info_t::PHASE_WAITING);
+  counter_t heard{};
+  heard.counter_name = "received MARKER_POSES";
+  heard.count = 7;
+  set_array(observer.num_counters, observer.counters, std::vector<counter_t>{heard});
+  watch.on_process_info(observer, 2'000'000);
+  EXPECT_TRUE(watch.are_listening({"observer"}, 3'000'000));
+  EXPECT_FALSE(watch.are_listening({"observer", "model_monitor"}, 3'000'000));
+  EXPECT_EQ(watch.counter("observer", "received MARKER_POSES"), 7);
+  EXPECT_EQ(watch.counter("observer", "received SAMPLE"), 0);
+  EXPECT_EQ(watch.counter("camera", "received MARKER_POSES"), 0);
+}
+
 TEST(RunWatchTest, ABabblerThatWasEndedIsNotDone) {
   RunWatch watch;
   watch.on_sample(sample(0, {1}, Purpose::kTest));

@@ -385,6 +385,34 @@ TEST(Observer, ForgetsTheFramesOfADriverWhoseTimeBeganAnew) {
   EXPECT_TRUE(observer.on_marker_poses(scene.frame(kRest_us + 33'333)));
 }
 
+TEST(Observer, GoesOnWhenTheCamerasClockIsSetBack) {
+  constexpr std::int64_t kLate_us = 28'000'000, kSetBack_us = 14'000'000;
+  Scene scene;
+  scene.tags = {1};
+  Observer observer = calibrated();
+  // A full buffer, in which each frame that comes now would be the oldest.
+  for (int n = 0; n < 8; ++n) observer.on_marker_poses(scene.frame(kLate_us + n * 33'333));
+  observer.on_marker_poses(scene.frame(kSetBack_us));
+  observer.on_marker_poses(scene.frame(kSetBack_us + 33'333));
+  EXPECT_EQ(observer.counters().at("camera time ran backwards"), 1);
+  const auto sample = observer.on_motion_status(settled(0, kSetBack_us));
+  ASSERT_TRUE(sample);
+  EXPECT_EQ(sample->utime, kSetBack_us + 33'333);
+}
+
+TEST(Observer, DropsFramesFarAheadOfTheDriver) {
+  Scene scene;
+  scene.tags = {1};
+  Observer observer = calibrated();
+  for (int n = 0; n < 8; ++n) observer.on_marker_poses(scene.frame(3'600'000'000 + n * 33'333));
+  EXPECT_FALSE(observer.on_motion_status(settled(0))) << "of frames that were not taken at rest";
+  EXPECT_FALSE(observer.on_marker_poses(scene.frame(3'600'000'000)));
+  EXPECT_EQ(observer.counters().at("frame far ahead of the driver"), 9);
+  EXPECT_FALSE(observer.on_marker_poses(scene.frame(kRest_us)));
+  EXPECT_TRUE(observer.on_marker_poses(scene.frame(kRest_us + 33'333)));
+  EXPECT_EQ(observer.counters().count("camera time ran backwards"), 0U);
+}
+
 TEST(ObserverConfig, OfEveryShippedRigIsReadable) {
   for (const char* rig : {"arm2", "arm4", "arm7"}) {
     EXPECT_NO_THROW(

@@ -167,6 +167,20 @@ TEST_F(SampleOutboxTest, OfADamagedLogAllThatCanBeReadIsKeptAndTheWholeSetAside)
   EXPECT_EQ(take_sent(), (Indices{5, 0, 1, 3, 4, 5}));
 }
 
+TEST_F(SampleOutboxTest, ASecondOneDoesNotRepairTheFileUnderTheFirst) {
+  start();
+  for (std::int64_t i = 0; i < 5; ++i) outbox_->send(sample(i));
+  const auto size = std::filesystem::file_size(file_);
+  std::fstream(file_, std::ios::in | std::ios::out | std::ios::binary)
+      .seekp(static_cast<std::streamoff>(size / 5 * 2 + 22))
+      .write("damage", 6);
+  EXPECT_THROW(SampleOutbox(file_, [](const sample_t&) {}), std::runtime_error);
+  EXPECT_FALSE(std::filesystem::exists(file_.string() + ".bad-1"));
+  EXPECT_EQ(std::filesystem::file_size(file_), size);
+  outbox_->send(sample(5));
+  EXPECT_EQ(std::filesystem::file_size(file_), size / 5 * 6) << "it writes another file";
+}
+
 TEST_F(SampleOutboxTest, WithoutAFileTheNewestIsRepeated) {
   file_.clear();
   start();
