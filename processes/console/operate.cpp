@@ -99,8 +99,8 @@ action_command_t make_console_command(std::int8_t kind, std::int64_t epoch,
 
 // ---- TargetFollower
 
-TargetFollower::TargetFollower(pose_target_t target, std::int64_t timeout_us)
-    : target_(std::move(target)), timeout_us_(timeout_us) {
+TargetFollower::TargetFollower(pose_target_t target, std::int64_t timeout_us, double tolerance_m)
+    : target_(std::move(target)), timeout_us_(timeout_us), tolerance_m_(tolerance_m) {
   status_.target_id = status_.schema_version = status_.target_part = -1;
   status_.predicted_error_m = status_.observed_error_m = -1;
 }
@@ -132,7 +132,8 @@ void TargetFollower::on_control_status(const control_status_t& status) {
       break;
     default:
       // It was kept for keep_s and given back.
-      if (state == S::CONTROL_REACHED || state == S::CONTROL_RELEASED) end_ = End::kAsked;
+      if (state == S::CONTROL_REACHED || state == S::CONTROL_RELEASED)
+        end_ = status.observed_error_m > tolerance_m_ ? End::kMissed : End::kAsked;
       if (state == S::CONTROL_REFUSED || state == S::CONTROL_HOLDING) end_ = End::kRefused;
   }
 }
@@ -190,7 +191,9 @@ std::string target_json(const control_status_t& status, TargetFollower::End end)
   const nlohmann::ordered_json json = {
       {"reached", end == TargetFollower::End::kAsked},
       {"state",
-       end == TargetFollower::End::kTimedOut ? "timed out" : name_of_state(status.control_state)},
+       end == TargetFollower::End::kTimedOut ? "timed out"
+       : end == TargetFollower::End::kMissed ? "missed"
+                                             : name_of_state(status.control_state)},
       {"why", status.why},
       {"predicted_error_m", metres(status.predicted_error_m)},
       {"observed_error_m", metres(status.observed_error_m)},
@@ -226,6 +229,7 @@ struct OperateArguments {
   std::vector<double> position_m;
   double keep_s = -1;
   double timeout_s = 120;
+  double tolerance_m = 0.02;
   bool json = false;
 };
 
@@ -265,7 +269,7 @@ void run_target(const OperateArguments& arguments) {
   }
   watch_signals();
   Bus bus(arguments.in, arguments.in);
-  TargetFollower follower(target, std::llround(arguments.timeout_s * 1e6));
+  TargetFollower follower(target, std::llround(arguments.timeout_s * 1e6), arguments.tolerance_m);
   bus.subscribe<motion_status_t>(kMotionStatus,
                                  [&](const motion_status_t& m) { follower.on_motion_status(m); });
   {
@@ -283,6 +287,7 @@ void run_target(const OperateArguments& arguments) {
   } else {
     std::cout << fmt::format("{}: {} (by the schema {} away, as seen {}; {} moves)\n",
                              is_reached                                                  ? "reached"
+                             : follower.end() == TargetFollower::End::kMissed            ? "missed"
                              : status.control_state == control_status_t::CONTROL_HOLDING ? "held"
                              : status.control_state == control_status_t::CONTROL_REFUSED
                                  ? "refused"
@@ -409,6 +414,10 @@ void add_operate_commands(CLI::App& console) {
                    "Stay so long [s] before the babbler gets the arm; default: until released")
       ->check(CLI::NonNegativeNumber);
   target->add_option("--timeout", arguments->timeout_s, "Follow it for so long [s]")
+      ->check(CLI::PositiveNumber);
+  target
+      ->add_option("--tolerance", arguments->tolerance_m,
+                   "Seen farther than this from the target [m], it was missed")
       ->check(CLI::PositiveNumber);
   target->add_flag("--json", arguments->json, "The result as JSON");
   add("hold", "Stop where the arm is; nothing moves it until another target", run_hold);

@@ -28,11 +28,12 @@ class TargetFollower {
     kOpen,
     kAsked,    ///< reached; for a hold: held; for a release: released
     kRefused,  ///< refused, held or given up for another target: see why()
+    kMissed,   ///< reached by the schema, but seen more than the tolerance away
     kTimedOut,
   };
 
   /// `timeout_us`: of the clock, from the first tick.
-  TargetFollower(pose_target_t target, std::int64_t timeout_us);
+  TargetFollower(pose_target_t target, std::int64_t timeout_us, double tolerance_m = 0.02);
 
   void on_control_status(const control_status_t& status);
   /// Remembered for diagnosis().
@@ -55,6 +56,7 @@ class TargetFollower {
 
   const pose_target_t target_;
   const std::int64_t timeout_us_;
+  const double tolerance_m_;
   std::int64_t now_us_ = -1;
   std::int64_t started_us_ = -1;
   std::int64_t sent_us_ = -1;

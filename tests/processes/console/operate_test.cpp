@@ -60,6 +60,17 @@ TEST(OperateTest, ATargetIsRepeatedUntilItIsAcknowledged) {
   EXPECT_EQ(follower.end(), End::kOpen);
 }
 
+TEST(OperateTest, ATargetThatIsSeenElsewhereIsMissed) {
+  for (const bool is_far : {false, true}) {
+    TargetFollower follower(target(), 60 * kSecond, 0.02);
+    follower.on_tick(0);
+    control_status_t reached = status(S::CONTROL_REACHED);
+    reached.observed_error_m = is_far ? 0.021 : 0.019;
+    follower.on_control_status(reached);
+    EXPECT_EQ(follower.end(), is_far ? End::kMissed : End::kAsked);
+  }
+}
+
 TEST(OperateTest, WhatATargetEndsWith) {
   const struct {
     std::int8_t kind, state;
