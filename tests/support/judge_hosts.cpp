@@ -100,7 +100,8 @@ void judge(const fs::path& folder, std::size_t num_samples) {
     if (!fs::exists(folder / host)) continue;
     std::ifstream file(folder / host / "status.json");
     std::set<std::string> seen;
-    for (const auto& process : nlohmann::json::parse(file)["processes"]) seen.insert(process["name"]);
+    const auto status = nlohmann::json::parse(file);
+    for (const auto& process : status["processes"]) seen.insert(process["name"]);
     for (const auto& [name, info] : heard.processes)
       expect(seen.count(name) > 0, std::string(host) + " does not see " + name);
   }
