@@ -186,6 +186,7 @@ body_schema_t to_message(const BodySchema& schema) {
     out.signal_name = signal.name;
     out.lower_limit = signal.lower;
     out.upper_limit = signal.upper;
+    set_array(out.num_warp, out.warp_weights, signal.warp);
   }
   set_array(message.num_signals, message.signals, std::move(signals));
   std::vector<schema_edge_t> edges;
@@ -217,7 +218,8 @@ BodySchema from_message(const body_schema_t& message) {
   schema.X_CR = from_message(message.X_CR);
   schema.X_CR_covariance = from_message(message.X_CR_covariance);
   for (const signal_t& signal : message.signals) {
-    schema.signals.push_back({signal.signal_name, signal.lower_limit, signal.upper_limit});
+    schema.signals.push_back(
+        {signal.signal_name, signal.lower_limit, signal.upper_limit, signal.warp_weights});
   }
   for (const schema_edge_t& edge : message.edges) schema.edges.push_back(from_message(edge));
   for (const unconnected_part_t& part : message.unconnected) {

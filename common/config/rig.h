@@ -7,7 +7,7 @@
 #include <vector>
 
 #include "common/geometry/pose.h"
-#include "common/schema/body_schema.h"
+#include "common/schema/signal.h"
 
 namespace bodyschema {
 

@@ -6,18 +6,19 @@
 namespace bodyschema {
 namespace {
 
-// Exp of the screw (0, 0, slide, 0, 0, turn) scaled by θ.
-Pose screw_motion(const ScrewJoint& joint, double theta) {
+// Exp of the screw (0, 0, slide, 0, 0, turn) scaled by the joint's displacement.
+Pose screw_motion(const ScrewJoint& joint, double displacement) {
   Pose X = Pose::Identity();
-  X.linear() = Eigen::AngleAxisd(joint.turn * theta, Eigen::Vector3d::UnitZ()).toRotationMatrix();
-  X.translation().z() = joint.slide * theta;
+  X.linear() =
+      Eigen::AngleAxisd(joint.turn * displacement, Eigen::Vector3d::UnitZ()).toRotationMatrix();
+  X.translation().z() = joint.slide * displacement;
   return X;
 }
 
-double displacement(const ScrewJoint& joint, const Eigen::VectorXd& action) {
-  if (joint.signal < 0 || joint.signal >= action.size())
+double screw_displacement(const ScrewJoint& joint, const Eigen::VectorXd& theta) {
+  if (joint.signal < 0 || joint.signal >= theta.size())
     throw std::invalid_argument("action has no signal " + std::to_string(joint.signal));
-  return joint.gain * action(joint.signal) + joint.offset;
+  return joint.gain * theta(joint.signal) + joint.offset;
 }
 
 // One step along a path: an edge, walked forwards or backwards.
@@ -65,27 +66,27 @@ std::vector<int> Edge::signals() const {
   return result;
 }
 
-Pose Edge::predict(const Eigen::VectorXd& action) const {
+Pose Edge::predict(const Eigen::VectorXd& theta) const {
   Pose X = left;
   for (const ScrewJoint& joint : joints)
-    X = X * screw_motion(joint, displacement(joint, action)) * joint.X_after;
+    X = X * screw_motion(joint, screw_displacement(joint, theta)) * joint.X_after;
   return X * right;
 }
 
-Eigen::MatrixXd Edge::jacobian(const Eigen::VectorXd& action) const {
-  Eigen::MatrixXd J = Eigen::MatrixXd::Zero(6, action.size());
+Eigen::MatrixXd Edge::jacobian(const Eigen::VectorXd& theta) const {
+  Eigen::MatrixXd J = Eigen::MatrixXd::Zero(6, theta.size());
   Pose suffix = right;  // what follows the joint's own motion, which commutes with its screw
   for (auto joint = joints.rbegin(); joint != joints.rend(); ++joint) {
-    const double theta = displacement(*joint, action);
+    const double displacement = screw_displacement(*joint, theta);
     suffix = joint->X_after * suffix;
     const Matrix6d A = adjoint(suffix.inverse());
     J.col(joint->signal) += joint->gain * (joint->slide * A.col(2) + joint->turn * A.col(5));
-    suffix = screw_motion(*joint, theta) * suffix;
+    suffix = screw_motion(*joint, displacement) * suffix;
   }
   return J;
 }
 
-Matrix6d Edge::prediction_covariance(const Eigen::VectorXd& action) const {
+Matrix6d Edge::prediction_covariance(const Eigen::VectorXd& theta) const {
   const Eigen::Index size = 6 + 8 * static_cast<Eigen::Index>(joints.size());
   if (parameter_covariance.rows() != size || parameter_covariance.cols() != size)
     return Matrix6d::Zero();
@@ -94,14 +95,14 @@ Matrix6d Edge::prediction_covariance(const Eigen::VectorXd& action) const {
   Pose suffix = right;
   for (std::size_t d = joints.size(); d-- > 0;) {
     const ScrewJoint& joint = joints[d];
-    const double theta = displacement(joint, action);
+    const double displacement = screw_displacement(joint, theta);
     const Eigen::Index column = 6 + 8 * static_cast<Eigen::Index>(d);
     G.middleCols<6>(column + 2) = adjoint(suffix.inverse());
     suffix = joint.X_after * suffix;
     const Matrix6d A = adjoint(suffix.inverse());
-    G.col(column) = theta * A.col(2);
-    G.col(column + 1) = theta * A.col(5);
-    suffix = screw_motion(joint, theta) * suffix;
+    G.col(column) = displacement * A.col(2);
+    G.col(column + 1) = displacement * A.col(5);
+    suffix = screw_motion(joint, displacement) * suffix;
   }
   G.leftCols<6>() = adjoint(suffix.inverse());
   return G * parameter_covariance * G.transpose();
@@ -122,25 +123,26 @@ std::vector<int> BodySchema::unused_signals() const {
   return result;
 }
 
-namespace {
-
-void check_action(const BodySchema& schema, const Eigen::VectorXd& action) {
-  if (action.size() != static_cast<Eigen::Index>(schema.signals.size()))
+Eigen::VectorXd BodySchema::displacements(const Eigen::VectorXd& action) const {
+  if (action.size() != static_cast<Eigen::Index>(signals.size()))
     throw std::invalid_argument("action has " + std::to_string(action.size()) + " values, not " +
-                                std::to_string(schema.signals.size()));
+                                std::to_string(signals.size()));
+  Eigen::VectorXd theta = action;
+  for (std::size_t s = 0; s < signals.size(); ++s) {
+    theta(static_cast<Eigen::Index>(s)) = signals[s].displacement(action(static_cast<Eigen::Index>(s)));
+  }
+  return theta;
 }
-
-}  // namespace
 
 std::optional<PosePrediction> BodySchema::predict(int from, int to,
                                                   const Eigen::VectorXd& action) const {
-  check_action(*this, action);
+  const Eigen::VectorXd theta = displacements(action);
   const auto path = path_between(edges, from, to);
   if (!path) return std::nullopt;
   PosePrediction result;
   for (const Step& step : *path) {
-    Pose X = step.edge->predict(action);
-    Matrix6d covariance = step.edge->prediction_covariance(action);
+    Pose X = step.edge->predict(theta);
+    Matrix6d covariance = step.edge->prediction_covariance(theta);
     if (!step.forward) {
       // (X exp ε)⁻¹ = X⁻¹ exp(−Ad(X) ε)
       const Matrix6d A = adjoint(X);
@@ -155,7 +157,7 @@ std::optional<PosePrediction> BodySchema::predict(int from, int to,
 }
 
 std::map<int, Pose> BodySchema::predict_all(const Eigen::VectorXd& action) const {
-  check_action(*this, action);
+  const Eigen::VectorXd theta = displacements(action);
   std::map<int, Pose> X_RB;
   if (root < 0) return X_RB;
   X_RB.emplace(root, Pose::Identity());
@@ -166,7 +168,7 @@ std::map<int, Pose> BodySchema::predict_all(const Eigen::VectorXd& action) const
       const auto from = X_RB.find(edge.from);
       const auto to = X_RB.find(edge.to);
       if ((from == X_RB.end()) == (to == X_RB.end())) continue;
-      const Pose X = edge.predict(action);
+      const Pose X = edge.predict(theta);
       if (to == X_RB.end())
         X_RB.emplace(edge.to, from->second * X);
       else
@@ -179,18 +181,22 @@ std::map<int, Pose> BodySchema::predict_all(const Eigen::VectorXd& action) const
 
 std::optional<Eigen::MatrixXd> BodySchema::jacobian(int from, int to,
                                                     const Eigen::VectorXd& action) const {
-  check_action(*this, action);
+  const Eigen::VectorXd theta = displacements(action);
   const auto path = path_between(edges, from, to);
   if (!path) return std::nullopt;
   Eigen::MatrixXd J = Eigen::MatrixXd::Zero(6, action.size());
   for (const Step& step : *path) {
-    Pose X = step.edge->predict(action);
-    Eigen::MatrixXd J_edge = step.edge->jacobian(action);
+    Pose X = step.edge->predict(theta);
+    Eigen::MatrixXd J_edge = step.edge->jacobian(theta);
     if (!step.forward) {
       J_edge = -adjoint(X) * J_edge;
       X = X.inverse();
     }
     J = adjoint(X.inverse()) * J + J_edge;
+  }
+  for (std::size_t s = 0; s < signals.size(); ++s) {
+    const auto column = static_cast<Eigen::Index>(s);
+    J.col(column) *= signals[s].displacement_rate(action(column));
   }
   return J;
 }

@@ -7,18 +7,11 @@
 #include <vector>
 
 #include "common/geometry/pose.h"
+#include "common/schema/signal.h"
 
 namespace bodyschema {
 
-/// An action signal as the learners know it.
-struct Signal {
-  std::string name;
-  /// Limits in command units.
-  double lower = 0;
-  double upper = 0;
-};
-
-/// One screw joint inside a local model: Exp(ŝ θ) · X_after with θ = gain·q + offset and
+/// One screw joint inside a local model: Exp(ŝ ϑ) · X_after with ϑ = gain·θ + offset and
 /// ŝ = (0, 0, slide, 0, 0, turn), that is a motion along and about the joint frame's z axis.
 /// Revolute: slide = 0. Prismatic: turn = 0. Helical: both.
 struct ScrewJoint {
@@ -32,9 +25,10 @@ struct ScrewJoint {
 
 enum class EdgeState : std::int8_t { kOk = 0, kSuspect = 1, kInvalid = 2, kProvisional = 3 };
 
-/// A local model Δ_ij(q) = X_ij between two body parts (Section 3.1 of the chapter):
-///   Δ(q) = left · ∏_d [Exp(ŝ_d (a_d q_d + b_d)) · X_after_d] · right.
-/// No joints: a rigid edge.
+/// A local model Δ_ij(θ) = X_ij between two body parts (Section 3.1 of the chapter):
+///   Δ(θ) = left · ∏_d [Exp(ŝ_d (a_d θ_d + b_d)) · X_after_d] · right.
+/// No joints: a rigid edge. θ holds the displacement of every signal: BodySchema::displacements() of
+/// the action, which is the action itself where commands are linear.
 struct Edge {
   int from = 0;
   int to = 0;
@@ -60,13 +54,13 @@ struct Edge {
   /// Distinct signal indices, in the order of the joints.
   std::vector<int> signals() const;
 
-  Pose predict(const Eigen::VectorXd& action) const;
-  /// ∂/∂action of the predicted pose: 6×m, right perturbation in the frame of `to`:
-  /// predict(q + δ) = predict(q) · exp(J δ + O(δ²)).
-  Eigen::MatrixXd jacobian(const Eigen::VectorXd& action) const;
+  Pose predict(const Eigen::VectorXd& theta) const;
+  /// ∂/∂θ of the predicted pose: 6×m, right perturbation in the frame of `to`:
+  /// predict(θ + δ) = predict(θ) · exp(J δ + O(δ²)).
+  Eigen::MatrixXd jacobian(const Eigen::VectorXd& theta) const;
   /// First-order covariance of the prediction from parameter_covariance (right perturbation in the
   /// frame of `to`).
-  Matrix6d prediction_covariance(const Eigen::VectorXd& action) const;
+  Matrix6d prediction_covariance(const Eigen::VectorXd& theta) const;
 };
 
 /// Why a part has no edge.
@@ -117,6 +111,10 @@ struct BodySchema {
   bool has_part(int part) const;
   /// Signals that no edge uses (indices).
   std::vector<int> unused_signals() const;
+
+  /// θ of every signal, in command units: what edges take.
+  /// @throws std::invalid_argument if `action` does not have one value per signal.
+  Eigen::VectorXd displacements(const Eigen::VectorXd& action) const;
 
   /// Pose of part `to` in part `from` along the tree, with first-order covariance (Section 3.3,
   /// eq. 17). std::nullopt if they are not connected.

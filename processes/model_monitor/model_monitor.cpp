@@ -124,8 +124,9 @@ ModelMonitor::EdgeTest ModelMonitor::test(const Edge& edge, std::int64_t up_to_s
     const PartObservation* from = sample.find(edge.from);
     const PartObservation* to = sample.find(edge.to);
     if (!from || !to || !fits(sample)) continue;
-    const Pose predicted = edge.predict(sample.action);
-    const Matrix6d model = edge.prediction_covariance(sample.action) + model_error;
+    const Eigen::VectorXd theta = schema_.displacements(sample.action);
+    const Pose predicted = edge.predict(theta);
+    const Matrix6d model = edge.prediction_covariance(theta) + model_error;
     // A planar marker has two poses; the likelier one under the model speaks.
     double smallest = std::numeric_limits<double>::infinity();
     for (const Pose& X_CF : hypotheses(*from)) {

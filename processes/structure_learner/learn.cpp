@@ -7,6 +7,7 @@
 #include <set>
 #include <stdexcept>
 
+#include "processes/structure_learner/command_warp.h"
 #include "processes/structure_learner/noise_estimate.h"
 #include "processes/structure_learner/structure_search.h"
 
@@ -348,7 +349,12 @@ LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPo
                   const LearnOptions& options) {
   if (options.max_signals < 0 || options.max_signals > kMaxJoints)
     throw std::invalid_argument("max_signals must be 0 to " + std::to_string(kMaxJoints));
-  const NormalizedActions actions(samples, static_cast<int>(signals.size()));
+  const int num_signals = static_cast<int>(signals.size());
+  for (const auto& sample : samples)
+    if (sample.action.size() != num_signals)
+      throw std::invalid_argument("sample " + std::to_string(sample.sample_index) + " has " +
+                                  std::to_string(sample.action.size()) + " action values, not " +
+                                  std::to_string(num_signals));
 
   LearnResult result;
   BodySchema& schema = result.schema;
@@ -369,19 +375,44 @@ LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPo
   MeasurementModel& measurement = search_options.measurement;
   measurement.model_error = options.model_error;
   measurement.max_error_ratio = options.max_error_ratio;
-  if (options.noise) {
-    measurement.noise = Noise{std::max(options.noise->position_m, kNoiseFloor.position_m),
-                              std::max(options.noise->rotation_rad, kNoiseFloor.rotation_rad)};
-  } else if (!has_covariances(samples)) {
-    measurement.noise =
-        estimate_noise(samples, static_cast<int>(signals.size()), options.max_signals)
-            .value_or(kNoiseFloor);
-  }
-  schema.noise = measurement.noise ? *measurement.noise : typical_noise(samples);
-
-  const SearchResult search = search_structure(samples, actions, schema.parts, search_options);
+  const auto set_noise = [&](const std::vector<ActionPoseSample>& of) {
+    if (options.noise) {
+      measurement.noise = Noise{std::max(options.noise->position_m, kNoiseFloor.position_m),
+                                std::max(options.noise->rotation_rad, kNoiseFloor.rotation_rad)};
+    } else if (!has_covariances(of)) {
+      measurement.noise = estimate_noise(of, num_signals, options.max_signals).value_or(kNoiseFloor);
+    }
+  };
+  // Everything that is fitted sees displacements; which commands are bent shows only by a model.
+  std::vector<ActionPoseSample> moved = samples;
+  set_noise(moved);
+  std::optional<NormalizedActions> actions(std::in_place, moved, num_signals);
+  SearchResult search = search_structure(moved, *actions, schema.parts, search_options);
   result.num_screens = search.num_screens;
   result.num_fits = search.num_fits;
+  constexpr int kMaxWarpRounds = 3;
+  for (int round = 0; round < kMaxWarpRounds; ++round) {
+    std::vector<Signal> bent = schema.signals;
+    if (!estimate_warps(samples, schema.parts, search, search_options, &bent)) break;
+    std::vector<ActionPoseSample> again = displaced(samples, bent);
+    const auto noise_before = measurement.noise;
+    set_noise(again);
+    const NormalizedActions actions_again(again, num_signals);
+    SearchResult found = search_structure(again, actions_again, schema.parts, search_options);
+    result.num_screens += found.num_screens;
+    result.num_fits += found.num_fits;
+    if (found.models.size() < search.models.size()) {
+      measurement.noise = noise_before;
+      break;
+    }
+    const bool was_spanning = search.models.size() + 1 >= schema.parts.size();
+    schema.signals = std::move(bent);
+    moved = std::move(again);
+    actions.emplace(actions_again);
+    search = std::move(found);
+    if (was_spanning) break;
+  }
+  schema.noise = measurement.noise ? *measurement.noise : typical_noise(samples);
   // Orient the forest outwards: breadth first from the root, then from the lowest part of every
   // other component.
   std::vector<FittedEdge> fitted;
@@ -394,7 +425,7 @@ LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPo
         if (m.part_i != queue[head] && m.part_j != queue[head]) continue;
         const int to = m.part_i == queue[head] ? m.part_j : m.part_i;
         if (!reached.insert(to).second) continue;
-        fitted.push_back(fit_edge(m, queue[head], to, samples, actions, measurement));
+        fitted.push_back(fit_edge(m, queue[head], to, moved, *actions, measurement));
         queue.push_back(to);
       }
     }

@@ -77,7 +77,10 @@ std::map<int, Pose> SyntheticRobot::poses_in_camera(const Eigen::VectorXd& actio
       X_CB[link.part] = X_CR;
       continue;
     }
-    const double q = link.signal < 0 ? 0 : action(link.signal) - link.zero;
+    double q = 0;
+    if (link.signal >= 0) {
+      q = action(link.signal) - link.zero + bend * std::sin(3 * action(link.signal));
+    }
     X_CB[link.part] = X_CB.at(link.parent) * link.X_before *
                       screw_motion(link.slide * q, link.turn * q) * link.X_after;
   }

@@ -40,6 +40,8 @@ struct SyntheticRobot {
   std::string name;
   std::vector<Signal> signals;
   std::vector<TrueLink> links;  ///< parents before children
+  /// Commands are bent: joints go to θ = q + bend · sin(3q) [command units].
+  double bend = 0;
   Pose X_CR = Pose::Identity();
 
   std::map<int, Pose> poses_in_camera(const Eigen::VectorXd& action) const;

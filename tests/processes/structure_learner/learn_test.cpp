@@ -44,6 +44,56 @@ TEST(Learn, FindsTheSevenAxisRobotDespiteFlipsAndMissingMarkers) {
   EXPECT_GE(count_right("d", Regime::kTag, 25, 6, false), 6);
 }
 
+// Mean error of the last part relative to the root over random actions [m, rad].
+std::pair<double, double> end_effector_error(const BodySchema& schema,
+                                             const test::SyntheticRobot& robot, Rng& rng) {
+  constexpr int kActions = 200;
+  double position = 0, rotation = 0;
+  const int part = robot.visible_parts().back();
+  for (int n = 0; n < kActions; ++n) {
+    const Eigen::VectorXd q = robot.random_action(rng);
+    const auto truth = robot.poses_in_camera(q);
+    const auto predicted = schema.predict(schema.root, part, q);
+    if (!predicted) return {1e9, 1e9};
+    const Pose X_true = truth.at(schema.root).inverse() * truth.at(part);
+    position += (predicted->X_AB.translation() - X_true.translation()).norm() / kActions;
+    rotation += rotation_angle(predicted->X_AB.inverse() * X_true) / kActions;
+  }
+  return {position, rotation};
+}
+
+TEST(Learn, UnbendsACommandThatIsNotLinearInTheJoint) {
+  double position = 0, rotation = 0;
+  constexpr int kRobots = 10;
+  for (int seed = 1; seed <= kRobots; ++seed) {
+    Rng rng(seed);
+    auto robot = test::chapter_robot("a", rng);
+    robot.bend = 0.1;
+    const auto result = learn(robot.signals, test::babble(robot, 20, {}, rng));
+    EXPECT_TRUE(is_right(result.schema, robot)) << seed;
+    const auto [m, rad] = end_effector_error(result.schema, robot, rng);
+    position += m / kRobots;
+    rotation += rad / kRobots;
+  }
+  EXPECT_LT(position, 1e-3);
+  EXPECT_LT(rotation, 0.2 * M_PI / 180);
+}
+
+TEST(Learn, LeavesAStraightCommandStraight) {
+  for (const Regime regime : {Regime::kFree, Regime::kChapter, Regime::kTag}) {
+    for (int seed = 1; seed <= 5; ++seed) {
+      Rng rng(seed);
+      const auto robot = test::chapter_robot("c", rng);
+      LearnOptions options;
+      options.noise = test::nominal_noise(regime);
+      const auto result = learn(robot.signals, test::babble(robot, 60, {regime}, rng), options);
+      for (const Signal& signal : result.schema.signals) {
+        EXPECT_TRUE(signal.warp.empty()) << test::name_of(regime) << " seed " << seed;
+      }
+    }
+  }
+}
+
 TEST(Learn, PredictsExactlyFromExactSamples) {
   Rng rng(11);
   const auto robot = test::chapter_robot("d", rng);

@@ -1,0 +1,35 @@
+#pragma once
+
+#include <Eigen/Core>
+#include <string>
+#include <vector>
+
+namespace bodyschema {
+
+/// An action signal as the learners know it.
+struct Signal {
+  std::string name;
+  /// Limits in command units.
+  double lower = 0;
+  double upper = 0;
+  /// What bends the command, w in θ(q) = q + φ(q)ᵀw [command units]; empty: linear. θ, and not q, is
+  /// what moves the joints on this signal. See warp_basis().
+  std::vector<double> warp;
+
+  /// Displacement θ(q) that belongs to the command q, both in command units.
+  double displacement(double q) const;
+  /// dθ/dq.
+  double displacement_rate(double q) const;
+};
+
+/// φ_n(q) = sin(½nπ (1 + x/kWarpReach)), n = 1 … size, with x = −1 … 1 over the signal's range: the
+/// sines that vanish kWarpReach half ranges from the middle. With variances that fall as a
+/// covariance function's spectral density does, they are a Gaussian process (Solin and Särkkä,
+/// Hilbert space methods for reduced-rank Gaussian process regression, 2020). Beyond the limits the
+/// warp stays what it is there.
+Eigen::VectorXd warp_basis(double x, int size);
+/// dφ/dx.
+Eigen::VectorXd warp_basis_rate(double x, int size);
+inline constexpr double kWarpReach = 1.3;
+
+}  // namespace bodyschema

@@ -1,0 +1,352 @@
+#include "processes/structure_learner/command_warp.h"
+
+#include <Eigen/Cholesky>
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <map>
+#include <set>
+
+#include "processes/structure_learner/screen.h"
+
+namespace bodyschema {
+namespace {
+
+constexpr int kBasis = 20;
+constexpr int kMaxFrames = 150;       // a pair, evenly chosen
+constexpr int kMaxModelsASignal = 4;  // the most precise ones
+constexpr int kMaxRounds = 12;
+/// Slack along the motion, in half ranges: far more than any warp, far less than the range.
+constexpr double kSlack = 0.3;
+/// A parameter of a model's own line is free within this many half ranges.
+constexpr double kFree = 10;
+
+/// ∂Δ/∂q_d of the normalised signal of joint d, right perturbation in frame j: 6 × num_joints.
+using MotionJacobian = Eigen::Matrix<double, 6, Eigen::Dynamic, 0, 6, kMaxJoints>;
+
+MotionJacobian motion_jacobian(const LocalModel& model, const NormalizedActions& actions,
+                               int sample) {
+  MotionJacobian J(6, model.num_joints);
+  Pose suffix = Pose::Identity();
+  for (int d = model.num_joints; d-- > 0;) {
+    suffix = model.A[d + 1] * suffix;
+    Vector6d screw = Vector6d::Zero();
+    screw(2) = model.slide[d];
+    screw(5) = model.turn[d];
+    J.col(d) = adjoint(suffix.inverse()) * screw;
+    suffix = exp(screw * actions(sample, model.signal[d])) * suffix;
+  }
+  return J;
+}
+
+/// The pair with Σ_z + J σ² Jᵀ in place of Σ_z.
+PairData with_slack(const PairData& pair, const LocalModel& model,
+                    const NormalizedActions& actions) {
+  PairData result = pair;
+  for (const PairFrame& frame : pair.frames) {
+    const MotionJacobian J = kSlack * motion_jacobian(model, actions, frame.sample);
+    for (int n = 0; n < frame.num_hypotheses; ++n) {
+      PairHypothesis& h = result.hypotheses[frame.first_hypothesis + n];
+      // Whitened, Σ_z is the identity: (1 + V Vᵀ) with V = L⁻¹ J.
+      const MotionJacobian V = h.whitening * J;
+      const Eigen::LLT<Matrix6d> llt(Matrix6d::Identity() + V * V.transpose());
+      h.whitening = llt.matrixL().solve(h.whitening);
+      h.log_det += 2 * llt.matrixLLT().diagonal().array().log().sum();
+    }
+  }
+  return result;
+}
+
+/// What one model says about θ of one of its signals at one instant.
+struct Reading {
+  int sample = 0;
+  double theta = 0;      ///< [half ranges], in the model's own line
+  double precision = 0;  ///< [1 / half range²]
+};
+
+/// A local model that is asked for the displacements of its signals.
+struct Witness {
+  PairData pair;
+  LocalModel model;
+  std::map<int, std::vector<Reading>> readings;  ///< by signal
+
+  /// Total information on a signal's displacement; 0: none.
+  double information(int signal) const {
+    const auto found = readings.find(signal);
+    if (found == readings.end()) return 0;
+    double sum = 0;
+    for (const Reading& r : found->second) sum += r.precision;
+    return sum;
+  }
+};
+
+/// Fits with slack and reads the displacements. False if the model is refuted even so.
+bool ask(const NormalizedActions& actions, Witness* witness) {
+  Fit fit;
+  for (int round = 0; round < 3; ++round) {
+    const PairData slack = with_slack(witness->pair, witness->model, actions);
+    fit = fit_local_model(witness->model, slack, actions, 30, 1e-6);
+    witness->model = fit.model;
+  }
+  const int n = witness->pair.size();
+  int num_outliers = 0;
+  double inlier_sum = 0;
+  for (const FrameFit& frame : fit.frames) {
+    if (frame.squared_distance > kOutlierThreshold)
+      ++num_outliers;
+    else
+      inlier_sum += frame.squared_distance;
+  }
+  if (3 * num_outliers > n || inlier_sum > 9.0 * (n - num_outliers)) return false;
+
+  witness->readings.clear();
+  const LocalModel& model = witness->model;
+  for (int t = 0; t < n; ++t) {
+    const int sample = witness->pair.frames[t].sample;
+    const PairHypothesis& h = witness->pair.hypotheses[fit.frames[t].hypothesis];
+    const MotionJacobian V = h.whitening * motion_jacobian(model, actions, sample);
+    const Vector6d r = h.whitening * log(model.predict(actions, sample).inverse() * h.z);
+    const Eigen::MatrixXd information = V.transpose() * V;
+    const Eigen::LDLT<Eigen::MatrixXd> ldlt(information);
+    if (!(ldlt.vectorD().minCoeff() > 1e-12 * ldlt.vectorD().maxCoeff())) continue;
+    const Eigen::VectorXd delta = ldlt.solve(V.transpose() * r);
+    const Eigen::MatrixXd covariance =
+        ldlt.solve(Eigen::MatrixXd::Identity(model.num_joints, model.num_joints));
+    const double weight = robust_weight(fit.frames[t].squared_distance);
+    for (int d = 0; d < model.num_joints; ++d) {
+      if (!(covariance(d, d) > 0)) continue;
+      witness->readings[model.signal[d]].push_back(
+          {sample, actions(sample, model.signal[d]) + delta(d), weight / covariance(d, d)});
+    }
+  }
+  return true;
+}
+
+struct Regression {
+  /// Of the basis, as a share of the models' mean slope b: what a model's own gain is drops out.
+  Eigen::VectorXd weights;
+  double evidence = 0;  ///< log marginal likelihood over that of lines alone [nats]
+};
+
+/// θ_m(q) = a_m + b_m q + φ(q)ᵀw over the readings of all models m: the amplitude and length of the
+/// process with the largest marginal likelihood.
+Regression regress(const std::vector<const std::vector<Reading>*>& models,
+                   const std::vector<double>& x_of_sample) {
+  const int num_lines = 2 * static_cast<int>(models.size());
+  const int size = num_lines + kBasis;
+  Eigen::MatrixXd A = Eigen::MatrixXd::Zero(size, size);
+  Eigen::VectorXd b = Eigen::VectorXd::Zero(size), row(size);
+  for (std::size_t m = 0; m < models.size(); ++m) {
+    for (const Reading& reading : *models[m]) {
+      const double x = x_of_sample[reading.sample];
+      row.setZero();
+      row(2 * static_cast<Eigen::Index>(m)) = 1;
+      row(2 * static_cast<Eigen::Index>(m) + 1) = x;
+      row.tail(kBasis) = warp_basis(x, kBasis);
+      A.selfadjointView<Eigen::Lower>().rankUpdate(row, reading.precision);
+      b += reading.precision * reading.theta * row;
+    }
+  }
+  A = A.selfadjointView<Eigen::Lower>();
+
+  const auto evidence = [&](const Eigen::VectorXd& prior_variance, Eigen::VectorXd* mean) {
+    const auto p = prior_variance.size();
+    const Eigen::VectorXd root = prior_variance.cwiseSqrt();
+    Eigen::MatrixXd H = root.asDiagonal() * A.topLeftCorner(p, p) * root.asDiagonal();
+    H.diagonal().array() += 1;
+    const Eigen::LLT<Eigen::MatrixXd> llt(H);
+    const Eigen::VectorXd c = root.cwiseProduct(b.head(p));
+    const Eigen::VectorXd solved = llt.solve(c);
+    *mean = root.cwiseProduct(solved);
+    return 0.5 * c.dot(solved) - llt.matrixLLT().diagonal().array().log().sum();
+  };
+  Regression best;
+  Eigen::VectorXd mean;
+  const double straight = evidence(Eigen::VectorXd::Constant(num_lines, kFree * kFree), &mean);
+  best.evidence = -std::numeric_limits<double>::infinity();
+  for (const double length : {0.25, 0.4, 0.7}) {
+    for (const double amplitude : {0.003, 0.01, 0.03, 0.1, 0.3}) {
+      Eigen::VectorXd variance = Eigen::VectorXd::Constant(size, kFree * kFree);
+      for (int n = 0; n < kBasis; ++n) {
+        const double omega = (n + 1) * M_PI / (2 * kWarpReach);
+        variance(num_lines + n) = amplitude * amplitude * std::sqrt(2 * M_PI) * length *
+                                  std::exp(-0.5 * std::pow(omega * length, 2)) / kWarpReach;
+      }
+      const double ratio = evidence(variance, &mean) - straight;
+      if (ratio <= best.evidence) continue;
+      double slope = 0;
+      for (int m = 0; m < num_lines / 2; ++m) slope += mean(2 * m + 1) / (num_lines / 2);
+      if (slope > 0) best = {mean.tail(kBasis) / slope, ratio};
+    }
+  }
+  return best;
+}
+
+class WarpEstimate {
+ public:
+  WarpEstimate(const std::vector<ActionPoseSample>& samples, const std::vector<int>& parts,
+               const SearchOptions& options, std::vector<Signal>* signals)
+      : samples_(samples), parts_(parts), options_(options), signals_(*signals) {}
+
+  bool run(const SearchResult& found) {
+    const std::vector<Signal> before = signals_;
+    const NormalizedActions actions = normalized();
+    std::vector<Witness> witnesses;
+    for (const AcceptedModel& m : found.models) {
+      if (m.model.num_joints == 0) continue;
+      Witness witness{pair_data(m.part_i, m.part_j), m.model, {}};
+      if (ask(actions, &witness)) witnesses.push_back(std::move(witness));
+    }
+    const bool spans = found.models.size() + 1 >= parts_.size();
+    if (!spans || any_bent(witnesses, actions)) {
+      add_single_joints(found, actions, &witnesses);
+      settle(&witnesses);
+    }
+    for (std::size_t s = 0; s < signals_.size(); ++s)
+      if (signals_[s].warp != before[s].warp) return true;
+    return false;
+  }
+
+ private:
+  NormalizedActions normalized() const {
+    return NormalizedActions(displaced(samples_, signals_), static_cast<int>(signals_.size()));
+  }
+
+  PairData pair_data(int part_i, int part_j) const {
+    return make_pair_data(samples_, part_i, part_j, options_.measurement, kMaxFrames);
+  }
+
+  /// Position of every sample within the signal's limits, −1 … 1.
+  std::vector<double> positions(int s) const {
+    const double half = 0.5 * (signals_[s].upper - signals_[s].lower);
+    std::vector<double> x;
+    for (const ActionPoseSample& sample : samples_)
+      x.push_back(std::clamp((sample.action(s) - signals_[s].lower) / half - 1, -1.0, 1.0));
+    return x;
+  }
+
+  /// The most precise witnesses of a signal, no two with a common part.
+  std::vector<const std::vector<Reading>*> witnesses_of(int signal,
+                                                        const std::vector<Witness>& all) const {
+    std::vector<const Witness*> order;
+    for (const Witness& witness : all)
+      if (witness.information(signal) > 0) order.push_back(&witness);
+    std::stable_sort(order.begin(), order.end(), [signal](const Witness* a, const Witness* b) {
+      return a->information(signal) > b->information(signal);
+    });
+    std::set<int> used;
+    std::vector<const std::vector<Reading>*> result;
+    for (const Witness* witness : order) {
+      if (used.count(witness->pair.part_i) || used.count(witness->pair.part_j)) continue;
+      used.insert({witness->pair.part_i, witness->pair.part_j});
+      result.push_back(&witness->readings.at(signal));
+      if (result.size() == kMaxModelsASignal) break;
+    }
+    return result;
+  }
+
+  std::map<int, Regression> regressions(const std::vector<Witness>& witnesses,
+                                        const NormalizedActions& actions) const {
+    std::map<int, Regression> result;
+    for (const int s : actions.moving()) {
+      if (!(signals_[s].upper > signals_[s].lower)) continue;
+      const auto models = witnesses_of(s, witnesses);
+      if (models.empty()) continue;
+      result[s] = regress(models, positions(s));
+    }
+    return result;
+  }
+
+  bool any_bent(const std::vector<Witness>& witnesses, const NormalizedActions& actions) const {
+    for (const auto& [s, regression] : regressions(witnesses, actions))
+      if (regression.evidence > kWarpEvidence) return true;
+    return false;
+  }
+
+  /// The best single joint of every pair that `found` does not connect rigidly.
+  void add_single_joints(const SearchResult& found, const NormalizedActions& actions,
+                         std::vector<Witness>* witnesses) const {
+    constexpr int kFewest = 6;  // frames, below which a bent command cannot be told from noise
+    std::set<std::pair<int, int>> known;
+    for (const AcceptedModel& m : found.models)
+      if (m.model.num_joints <= 1) known.insert(std::minmax(m.part_i, m.part_j));
+    struct Promise {
+      int i, j;
+      ScrewRegression regression;
+    };
+    std::vector<Promise> promises;
+    for (std::size_t i = 0; i < parts_.size(); ++i) {
+      for (std::size_t j = i + 1; j < parts_.size(); ++j) {
+        if (known.count(std::minmax(parts_[i], parts_[j]))) continue;
+        const PairData pair = pair_data(parts_[i], parts_[j]);
+        if (pair.size() < kFewest) continue;
+        const auto screened = screen_one_joint(relative_motions(pair, 150), actions);
+        if (!screened.empty()) promises.push_back({parts_[i], parts_[j], screened.front()});
+      }
+    }
+    constexpr std::size_t kMost = 100;
+    std::stable_sort(promises.begin(), promises.end(), [](const Promise& a, const Promise& b) {
+      return a.regression.score < b.regression.score;
+    });
+    if (promises.size() > kMost) promises.resize(kMost);
+    for (const Promise& promise : promises) {
+      Witness witness{pair_data(promise.i, promise.j), {}, {}};
+      const double sigma_rad = relative_motions(witness.pair, 1).sigma_rad;
+      witness.model =
+          one_joint_start(promise.regression, witness.pair, actions, sigma_rad).model;
+      if (ask(actions, &witness)) witnesses->push_back(std::move(witness));
+    }
+  }
+
+  /// Warps and models in turn until the warps stand still.
+  void settle(std::vector<Witness>* witnesses) {
+    for (int round = 0; round < kMaxRounds; ++round) {
+      const NormalizedActions actions = normalized();
+      std::vector<Witness> heard;
+      for (Witness& witness : *witnesses)
+        if (ask(actions, &witness)) heard.push_back(std::move(witness));
+      *witnesses = std::move(heard);
+      double largest_change = 0;
+      for (const auto& [s, regression] : regressions(*witnesses, actions)) {
+        if (regression.evidence <= kWarpEvidence) continue;
+        Signal bent = signals_[s];
+        const double half = 0.5 * (bent.upper - bent.lower);
+        const Eigen::VectorXd weights = half * regression.weights;
+        bent.warp.assign(weights.data(), weights.data() + weights.size());
+        for (const ActionPoseSample& sample : samples_) {
+          const double q = sample.action(s);
+          largest_change = std::max(
+              largest_change,
+              std::abs(bent.displacement(q) - signals_[s].displacement(q)) / half);
+        }
+        signals_[s] = bent;
+      }
+      if (largest_change < 1e-7) break;
+    }
+  }
+
+  const std::vector<ActionPoseSample>& samples_;
+  const std::vector<int>& parts_;
+  const SearchOptions& options_;
+  std::vector<Signal>& signals_;
+};
+
+}  // namespace
+
+std::vector<ActionPoseSample> displaced(std::vector<ActionPoseSample> samples,
+                                        const std::vector<Signal>& signals) {
+  for (ActionPoseSample& sample : samples)
+    for (std::size_t s = 0; s < signals.size(); ++s) {
+      double& q = sample.action(static_cast<Eigen::Index>(s));
+      q = signals[s].displacement(q);
+    }
+  return samples;
+}
+
+bool estimate_warps(const std::vector<ActionPoseSample>& samples, const std::vector<int>& parts,
+                    const SearchResult& found, const SearchOptions& options,
+                    std::vector<Signal>* signals) {
+  return WarpEstimate(samples, parts, options, signals).run(found);
+}
+
+}  // namespace bodyschema
