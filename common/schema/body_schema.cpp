@@ -55,9 +55,13 @@ std::optional<std::vector<Step>> path_between(const std::vector<Edge>& edges, in
 
 }  // namespace
 
-const char* Edge::kind() const { return joints.empty() ? "rigid" : "screw"; }
+const char* Edge::kind() const {
+  if (matrix_gp) return "matrix_gp";
+  return joints.empty() ? "rigid" : "screw";
+}
 
 std::vector<int> Edge::signals() const {
+  if (matrix_gp) return matrix_gp->signals();
   std::vector<int> result;
   for (const ScrewJoint& joint : joints)
     if (std::find(result.begin(), result.end(), joint.signal) == result.end())
@@ -66,6 +70,7 @@ std::vector<int> Edge::signals() const {
 }
 
 Pose Edge::predict(const Eigen::VectorXd& action) const {
+  if (matrix_gp) return left * matrix_gp->predict(action) * right;
   Pose X = left;
   for (const ScrewJoint& joint : joints)
     X = X * screw_motion(joint, displacement(joint, action)) * joint.X_after;
@@ -73,6 +78,7 @@ Pose Edge::predict(const Eigen::VectorXd& action) const {
 }
 
 Eigen::MatrixXd Edge::jacobian(const Eigen::VectorXd& action) const {
+  if (matrix_gp) return adjoint(right.inverse()) * matrix_gp->jacobian(action);
   Eigen::MatrixXd J = Eigen::MatrixXd::Zero(6, action.size());
   Pose suffix = right;  // what follows the joint's own motion, which commutes with its screw
   for (auto joint = joints.rbegin(); joint != joints.rend(); ++joint) {
@@ -86,6 +92,10 @@ Eigen::MatrixXd Edge::jacobian(const Eigen::VectorXd& action) const {
 }
 
 Matrix6d Edge::prediction_covariance(const Eigen::VectorXd& action) const {
+  if (matrix_gp) {
+    const Matrix6d A = adjoint(right.inverse());
+    return A * matrix_gp->prediction_covariance(action) * A.transpose();
+  }
   const Eigen::Index size = 6 + 8 * static_cast<Eigen::Index>(joints.size());
   if (parameter_covariance.rows() != size || parameter_covariance.cols() != size)
     return Matrix6d::Zero();

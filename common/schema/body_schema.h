@@ -2,11 +2,13 @@
 
 #include <cstdint>
 #include <map>
+#include <memory>
 #include <optional>
 #include <string>
 #include <vector>
 
 #include "common/geometry/pose.h"
+#include "common/schema/matrix_gp.h"
 
 namespace bodyschema {
 
@@ -34,12 +36,14 @@ enum class EdgeState : std::int8_t { kOk = 0, kSuspect = 1, kInvalid = 2, kProvi
 
 /// A local model Δ_ij(q) = X_ij between two body parts (Section 3.1 of the chapter):
 ///   Δ(q) = left · ∏_d [Exp(ŝ_d (a_d q_d + b_d)) · X_after_d] · right.
-/// No joints: a rigid edge.
+/// No joints: a rigid edge. Where there is a matrix GP it stands between left and right instead.
 struct Edge {
   int from = 0;
   int to = 0;
   Pose left = Pose::Identity();
   std::vector<ScrewJoint> joints;
+  /// The chapter's local model, or null. It never changes, so copies of the edge share it.
+  std::shared_ptr<const MatrixGp> matrix_gp;
   Pose right = Pose::Identity();
 
   /// Covariance of the parameters, order: left tangent (6); per joint: slide, turn, X_after tangent
@@ -55,7 +59,7 @@ struct Edge {
   double confidence = 1;
   EdgeState state = EdgeState::kOk;
 
-  /// "rigid" or "screw".
+  /// "rigid", "screw" or "matrix_gp".
   const char* kind() const;
   /// Distinct signal indices, in the order of the joints.
   std::vector<int> signals() const;
@@ -64,8 +68,8 @@ struct Edge {
   /// ∂/∂action of the predicted pose: 6×m, right perturbation in the frame of `to`:
   /// predict(q + δ) = predict(q) · exp(J δ + O(δ²)).
   Eigen::MatrixXd jacobian(const Eigen::VectorXd& action) const;
-  /// First-order covariance of the prediction from parameter_covariance (right perturbation in the
-  /// frame of `to`).
+  /// First-order covariance of the prediction (right perturbation in the frame of `to`): from
+  /// parameter_covariance, or from the matrix GP's own variances.
   Matrix6d prediction_covariance(const Eigen::VectorXd& action) const;
 };
 
