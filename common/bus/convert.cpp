@@ -93,6 +93,8 @@ static_assert(static_cast<int>(Unconnected::kNoValidModel) ==
               unconnected_part_t::REASON_NO_VALID_MODEL);
 
 schema_edge_t to_message(const Edge& edge) {
+  if (edge.matrix_gp)
+    throw std::invalid_argument("an edge that is a matrix GP cannot travel: no message holds it");
   schema_edge_t message{};
   message.from_part = edge.from;
   message.to_part = edge.to;

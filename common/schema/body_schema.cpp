@@ -56,9 +56,13 @@ std::optional<std::vector<Step>> path_between(const std::vector<Edge>& edges, in
 
 }  // namespace
 
-const char* Edge::kind() const { return joints.empty() ? "rigid" : "screw"; }
+const char* Edge::kind() const {
+  if (matrix_gp) return "matrix_gp";
+  return joints.empty() ? "rigid" : "screw";
+}
 
 std::vector<int> Edge::signals() const {
+  if (matrix_gp) return matrix_gp->signals();
   std::vector<int> result;
   for (const ScrewJoint& joint : joints)
     if (std::find(result.begin(), result.end(), joint.signal) == result.end())
@@ -67,6 +71,7 @@ std::vector<int> Edge::signals() const {
 }
 
 Pose Edge::predict(const Eigen::VectorXd& theta) const {
+  if (matrix_gp) return left * matrix_gp->predict(theta) * right;
   Pose X = left;
   for (const ScrewJoint& joint : joints)
     X = X * screw_motion(joint, screw_displacement(joint, theta)) * joint.X_after;
@@ -74,6 +79,7 @@ Pose Edge::predict(const Eigen::VectorXd& theta) const {
 }
 
 Eigen::MatrixXd Edge::jacobian(const Eigen::VectorXd& theta) const {
+  if (matrix_gp) return adjoint(right.inverse()) * matrix_gp->jacobian(theta);
   Eigen::MatrixXd J = Eigen::MatrixXd::Zero(6, theta.size());
   Pose suffix = right;  // what follows the joint's own motion, which commutes with its screw
   for (auto joint = joints.rbegin(); joint != joints.rend(); ++joint) {
@@ -87,6 +93,10 @@ Eigen::MatrixXd Edge::jacobian(const Eigen::VectorXd& theta) const {
 }
 
 Matrix6d Edge::prediction_covariance(const Eigen::VectorXd& theta) const {
+  if (matrix_gp) {
+    const Matrix6d A = adjoint(right.inverse());
+    return A * matrix_gp->prediction_covariance(theta) * A.transpose();
+  }
   const Eigen::Index size = 6 + 8 * static_cast<Eigen::Index>(joints.size());
   if (parameter_covariance.rows() != size || parameter_covariance.cols() != size)
     return Matrix6d::Zero();
@@ -129,7 +139,8 @@ Eigen::VectorXd BodySchema::displacements(const Eigen::VectorXd& action) const {
                                 std::to_string(signals.size()));
   Eigen::VectorXd theta = action;
   for (std::size_t s = 0; s < signals.size(); ++s) {
-    theta(static_cast<Eigen::Index>(s)) = signals[s].displacement(action(static_cast<Eigen::Index>(s)));
+    theta(static_cast<Eigen::Index>(s)) =
+        signals[s].displacement(action(static_cast<Eigen::Index>(s)));
   }
   return theta;
 }

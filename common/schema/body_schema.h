@@ -2,11 +2,13 @@
 
 #include <cstdint>
 #include <map>
+#include <memory>
 #include <optional>
 #include <string>
 #include <vector>
 
 #include "common/geometry/pose.h"
+#include "common/schema/matrix_gp.h"
 #include "common/schema/signal.h"
 
 namespace bodyschema {
@@ -27,13 +29,16 @@ enum class EdgeState : std::int8_t { kOk = 0, kSuspect = 1, kInvalid = 2, kProvi
 
 /// A local model Δ_ij(θ) = X_ij between two body parts (Section 3.1 of the chapter):
 ///   Δ(θ) = left · ∏_d [Exp(ŝ_d (a_d θ_d + b_d)) · X_after_d] · right.
-/// No joints: a rigid edge. θ holds the displacement of every signal: BodySchema::displacements() of
-/// the action, which is the action itself where commands are linear.
+/// No joints: a rigid edge. θ holds the displacement of every signal: BodySchema::displacements()
+/// of the action, which is the action itself where commands are linear. Where there is a matrix GP
+/// it stands between left and right instead.
 struct Edge {
   int from = 0;
   int to = 0;
   Pose left = Pose::Identity();
   std::vector<ScrewJoint> joints;
+  /// The chapter's local model, or null. It never changes, so copies of the edge share it.
+  std::shared_ptr<const MatrixGp> matrix_gp;
   Pose right = Pose::Identity();
 
   /// Covariance of the parameters, order: left tangent (6); per joint: slide, turn, X_after tangent
@@ -49,7 +54,7 @@ struct Edge {
   double confidence = 1;
   EdgeState state = EdgeState::kOk;
 
-  /// "rigid" or "screw".
+  /// "rigid", "screw" or "matrix_gp".
   const char* kind() const;
   /// Distinct signal indices, in the order of the joints.
   std::vector<int> signals() const;
@@ -58,8 +63,8 @@ struct Edge {
   /// ∂/∂θ of the predicted pose: 6×m, right perturbation in the frame of `to`:
   /// predict(θ + δ) = predict(θ) · exp(J δ + O(δ²)).
   Eigen::MatrixXd jacobian(const Eigen::VectorXd& theta) const;
-  /// First-order covariance of the prediction from parameter_covariance (right perturbation in the
-  /// frame of `to`).
+  /// First-order covariance of the prediction (right perturbation in the frame of `to`): from
+  /// parameter_covariance, or from the matrix GP's own variances.
   Matrix6d prediction_covariance(const Eigen::VectorXd& theta) const;
 };
 

@@ -16,6 +16,7 @@
 #include "processes/console/evaluation.h"
 #include "processes/console/recording.h"
 #include "processes/console/schema_json.h"
+#include "processes/structure_learner/baseline/learn_baseline.h"
 #include "processes/structure_learner/learn.h"
 
 namespace bodyschema {
@@ -32,8 +33,20 @@ struct LearnArguments {
   std::string out;
   std::optional<int> root;
   std::vector<double> noise;
+  std::string method = "screw";
   bool json = false;
 };
+
+/// The chapter's own method: a result to compare with, not a schema that a process could use.
+BodySchema learn_as_the_chapter(const Recording& recording, const LearnOptions& options) {
+  BaselineOptions baseline;
+  baseline.root = options.root;
+  if (options.noise) baseline.set_noise(*options.noise);
+  const BaselineResult result = learn_baseline(recording.signals, recording.training(), baseline);
+  std::cerr << result.num_fits << " local models learned, " << result.num_valid << " valid, "
+            << result.seconds << " s" << std::endl;
+  return result.schema;
+}
 
 void run_learn(const LearnArguments& arguments) {
   const Recording recording = load(arguments.samples);
@@ -57,7 +70,15 @@ void run_learn(const LearnArguments& arguments) {
                                   " is never seen in " + arguments.samples);
     }
   }
-  const LearnResult result = learn(recording.signals, training, options);
+  LearnResult result;
+  if (arguments.method == "chapter") {
+    if (!arguments.out.empty())
+      throw std::invalid_argument(
+          "--out: no message holds matrix GPs; print the result instead, or use --method screw");
+    result.schema = learn_as_the_chapter(recording, options);
+  } else {
+    result = learn(recording.signals, training, options);
+  }
   if (!arguments.out.empty()) {
     BodySchema schema = result.schema;
     schema.version = schema.last_sample_index + 1;
@@ -145,6 +166,11 @@ void add_offline_commands(CLI::App& console) {
                    "Standard deviation per axis and marker: position [m], rotation [deg]")
       ->expected(2)
       ->type_name("POS_M ROT_DEG");
+  learn
+      ->add_option("--method", learning->method,
+                   "screw, or chapter: matrix GPs and thresholds on mean errors, for comparison; "
+                   "without --noise it assumes the chapter's 0.050 m, 15 deg for a relative pose")
+      ->check(CLI::IsMember({"screw", "chapter"}));
   learn->add_flag("--json", learning->json, "Print JSON");
   learn->callback([learning] { run_learn(*learning); });
 

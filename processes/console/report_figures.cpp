@@ -372,11 +372,12 @@ EdgeSlice edge_slice(const BodySchema& schema, const Edge& edge, int signal,
     const Signal& limits = schema.signals[static_cast<std::size_t>(s)];
     middle[s] = 0.5 * (limits.lower + limits.upper);
   }
-  const Pose X_middle = edge.predict(middle);
+  const Pose X_middle = edge.predict(schema.displacements(middle));
   const Matrix6d noise = observation_noise(schema, edge, samples);
   const auto point_at = [&](const Eigen::VectorXd& action) {
-    const Pose X = edge.predict(action);
-    const Matrix6d of_model = edge.prediction_covariance(action);
+    const Eigen::VectorXd theta = schema.displacements(action);
+    const Pose X = edge.predict(theta);
+    const Matrix6d of_model = edge.prediction_covariance(theta);
     EdgeSlice::Point point;
     point.q = action[signal];
     point.mean = components(X, X_middle);
@@ -403,8 +404,9 @@ EdgeSlice edge_slice(const BodySchema& schema, const Edge& edge, int signal,
     action[signal] = sample.action[signal];
     EdgeSlice::Observation& observation = slice.observations.emplace_back();
     observation.q = sample.action[signal];
-    observation.value = components(
-        edge.predict(action) * edge.predict(sample.action).inverse() * observed, X_middle);
+    const Pose X = edge.predict(schema.displacements(action));
+    const Pose X_sample = edge.predict(schema.displacements(sample.action));
+    observation.value = components(X * X_sample.inverse() * observed, X_middle);
     observation.is_held_out = sample.purpose == Purpose::kTest;
     const EdgeSlice::Point expected = point_at(action);
     for (int c = 0; c < 6; ++c) {

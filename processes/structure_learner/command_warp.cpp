@@ -292,8 +292,7 @@ class WarpEstimate {
     for (const Promise& promise : promises) {
       Witness witness{pair_data(promise.i, promise.j), {}, {}};
       const double sigma_rad = relative_motions(witness.pair, 1).sigma_rad;
-      witness.model =
-          one_joint_start(promise.regression, witness.pair, actions, sigma_rad).model;
+      witness.model = one_joint_start(promise.regression, witness.pair, actions, sigma_rad).model;
       if (ask(actions, &witness)) witnesses->push_back(std::move(witness));
     }
   }
@@ -316,8 +315,7 @@ class WarpEstimate {
         for (const ActionPoseSample& sample : samples_) {
           const double q = sample.action(s);
           largest_change = std::max(
-              largest_change,
-              std::abs(bent.displacement(q) - signals_[s].displacement(q)) / half);
+              largest_change, std::abs(bent.displacement(q) - signals_[s].displacement(q)) / half);
         }
         signals_[s] = bent;
       }

@@ -19,7 +19,8 @@ namespace bodyschema {
 ///
 /// The models are those of `found`; where these leave parts unconnected, or where one of them
 /// already speaks for a bent command, the best single joint of every pair as well: a linear command
-/// may have kept it out. No two models on a signal share a part, so that their noise is independent.
+/// may have kept it out. No two models on a signal share a part, so that their noise is
+/// independent.
 ///
 /// `signals`: as known so far; `samples` have the commands, not the displacements.
 bool estimate_warps(const std::vector<ActionPoseSample>& samples, const std::vector<int>& parts,

@@ -380,7 +380,8 @@ LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPo
       measurement.noise = Noise{std::max(options.noise->position_m, kNoiseFloor.position_m),
                                 std::max(options.noise->rotation_rad, kNoiseFloor.rotation_rad)};
     } else if (!has_covariances(of)) {
-      measurement.noise = estimate_noise(of, num_signals, options.max_signals).value_or(kNoiseFloor);
+      measurement.noise =
+          estimate_noise(of, num_signals, options.max_signals).value_or(kNoiseFloor);
     }
   };
   // Everything that is fitted sees displacements; which commands are bent shows only by a model.
@@ -445,7 +446,8 @@ LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPo
     schema.unconnected.push_back(explain(part, seen == num_seen.end() ? 0 : seen->second,
                                          connected_to_root, search, options.max_signals));
   }
-  // A part that was never seen is reported, but a tree over all the others is complete (Fig. 8, 11).
+  // A part that was never seen is reported, but a tree over all the others is complete (Fig. 8,
+  // 11).
   schema.complete = !schema.parts.empty() &&
                     std::all_of(schema.parts.begin(), schema.parts.end(),
                                 [&](int part) { return connected_to_root.count(part) > 0; });

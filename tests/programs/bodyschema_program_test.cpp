@@ -157,6 +157,20 @@ TEST_F(BodyschemaProgramTest, LearnPrintsTheKeysThatAreDocumented) {
   EXPECT_NEAR(json["noise"]["rotation_deg"].get<double>(), 1, 0.5);
 }
 
+TEST_F(BodyschemaProgramTest, LearnsAsTheChapterDidForComparison) {
+  const auto csv = write_robot("s.csv", test::Regime::kFree);
+  const Outcome outcome =
+      run({"learn", csv, "--method", "chapter", "--noise", "0.001", "0.3", "--json"});
+  const Json json = outcome.json();
+  EXPECT_TRUE(test::is_right(structure_of(json), robot_)) << json;
+  for (const Json& edge : json["edges"]) EXPECT_EQ(edge["kind"], "matrix_gp");
+  EXPECT_NE(outcome.err.find("30 local models learned"), std::string::npos) << outcome.err;
+  // Nothing that a process would take for a schema.
+  expect_failure({"learn", csv, "--method", "chapter", "--out", "schema.lcmlog"}, "--out");
+  EXPECT_FALSE(exists("schema.lcmlog"));
+  expect_failure({"learn", csv, "--method", "magic"}, "--method");
+}
+
 TEST_F(BodyschemaProgramTest, WithoutJsonPeopleReadIt) {
   const Outcome outcome = run({"learn", write_robot("s.csv")});
   EXPECT_EQ(outcome.exit_code, 0);

@@ -103,6 +103,16 @@ TEST(Convert, AParameterCovarianceKeepsFloatPrecision) {
   EXPECT_TRUE(found.isApprox(schema.edges[0].parameter_covariance, 1e-6));
 }
 
+TEST(Convert, AnEdgeThatNoMessageHoldsIsRefused) {
+  const std::vector<GpPrior> priors(MatrixGp::kNumEntries,
+                                    {std::nullopt, SquaredExponential{1, {}}, 1});
+  BodySchema schema;
+  Edge& edge = schema.edges.emplace_back();
+  edge.matrix_gp = std::make_shared<const MatrixGp>(
+      std::vector<int>{}, Eigen::MatrixXd(0, 1), std::vector<Pose>{Pose::Identity()}, priors);
+  EXPECT_THROW(to_message(schema), std::invalid_argument);
+}
+
 TEST(Convert, AnEmptySchemaIsAMessageThatMakesSense) {
   EXPECT_EQ(check(to_message(BodySchema{})), "");
 }
