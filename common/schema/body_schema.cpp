@@ -3,6 +3,8 @@
 #include <algorithm>
 #include <stdexcept>
 
+#include "common/schema/kinematic_path.h"
+
 namespace bodyschema {
 namespace {
 
@@ -21,37 +23,10 @@ double screw_displacement(const ScrewJoint& joint, const Eigen::VectorXd& theta)
   return joint.gain * theta(joint.signal) + joint.offset;
 }
 
-// One step along a path: an edge, walked forwards or backwards.
-struct Step {
-  const Edge* edge;
-  bool forward;
-};
-
-// The path from part `from` to part `to`, or std::nullopt. Works for edges in any order.
-std::optional<std::vector<Step>> path_between(const std::vector<Edge>& edges, int from, int to) {
-  std::map<int, Step> reached_by;  // part → the step that reached it
-  std::vector<int> frontier{from};
-  std::map<int, int> predecessor{{from, from}};
-  while (!frontier.empty() && !predecessor.count(to)) {
-    std::vector<int> next;
-    for (const int part : frontier) {
-      for (const Edge& edge : edges) {
-        const bool forward = edge.from == part;
-        if (!forward && edge.to != part) continue;
-        const int other = forward ? edge.to : edge.from;
-        if (!predecessor.emplace(other, part).second) continue;
-        reached_by.emplace(other, Step{&edge, forward});
-        next.push_back(other);
-      }
-    }
-    frontier = std::move(next);
-  }
-  if (!predecessor.count(to)) return std::nullopt;
-  std::vector<Step> path;
-  for (int part = to; part != from; part = predecessor.at(part))
-    path.push_back(reached_by.at(part));
-  std::reverse(path.begin(), path.end());
-  return path;
+void check_size(const BodySchema& schema, const Eigen::VectorXd& action) {
+  if (action.size() != static_cast<Eigen::Index>(schema.signals.size()))
+    throw std::invalid_argument("action has " + std::to_string(action.size()) + " values, not " +
+                                std::to_string(schema.signals.size()));
 }
 
 }  // namespace
@@ -118,6 +93,13 @@ Matrix6d Edge::prediction_covariance(const Eigen::VectorXd& theta) const {
   return G * parameter_covariance * G.transpose();
 }
 
+Matrix6d Edge::empirical_covariance() const {
+  Vector6d variances;
+  variances.head<3>().setConstant(position_rms_m * position_rms_m / 3);
+  variances.tail<3>().setConstant(rotation_rms_rad * rotation_rms_rad / 3);
+  return variances.asDiagonal();
+}
+
 bool BodySchema::has_part(int part) const {
   return std::find(parts.begin(), parts.end(), part) != parts.end();
 }
@@ -134,9 +116,7 @@ std::vector<int> BodySchema::unused_signals() const {
 }
 
 Eigen::VectorXd BodySchema::displacements(const Eigen::VectorXd& action) const {
-  if (action.size() != static_cast<Eigen::Index>(signals.size()))
-    throw std::invalid_argument("action has " + std::to_string(action.size()) + " values, not " +
-                                std::to_string(signals.size()));
+  check_size(*this, action);
   Eigen::VectorXd theta = action;
   for (std::size_t s = 0; s < signals.size(); ++s) {
     theta(static_cast<Eigen::Index>(s)) =
@@ -145,26 +125,12 @@ Eigen::VectorXd BodySchema::displacements(const Eigen::VectorXd& action) const {
   return theta;
 }
 
-std::optional<PosePrediction> BodySchema::predict(int from, int to,
-                                                  const Eigen::VectorXd& action) const {
-  const Eigen::VectorXd theta = displacements(action);
-  const auto path = path_between(edges, from, to);
+std::optional<PosePrediction> BodySchema::predict(int from, int to, const Eigen::VectorXd& action,
+                                                  Variance variance) const {
+  check_size(*this, action);
+  const auto path = KinematicPath::between(*this, from, to);
   if (!path) return std::nullopt;
-  PosePrediction result;
-  for (const Step& step : *path) {
-    Pose X = step.edge->predict(theta);
-    Matrix6d covariance = step.edge->prediction_covariance(theta);
-    if (!step.forward) {
-      // (X exp ε)⁻¹ = X⁻¹ exp(−Ad(X) ε)
-      const Matrix6d A = adjoint(X);
-      covariance = A * covariance * A.transpose();
-      X = X.inverse();
-    }
-    const Matrix6d A = adjoint(X.inverse());
-    result.covariance = A * result.covariance * A.transpose() + covariance;
-    result.X_AB = result.X_AB * X;
-  }
-  return result;
+  return PosePrediction{path->predict(action), path->covariance(action, variance)};
 }
 
 std::map<int, Pose> BodySchema::predict_all(const Eigen::VectorXd& action) const {
@@ -192,23 +158,11 @@ std::map<int, Pose> BodySchema::predict_all(const Eigen::VectorXd& action) const
 
 std::optional<Eigen::MatrixXd> BodySchema::jacobian(int from, int to,
                                                     const Eigen::VectorXd& action) const {
-  const Eigen::VectorXd theta = displacements(action);
-  const auto path = path_between(edges, from, to);
+  check_size(*this, action);
+  const auto path = KinematicPath::between(*this, from, to);
   if (!path) return std::nullopt;
-  Eigen::MatrixXd J = Eigen::MatrixXd::Zero(6, action.size());
-  for (const Step& step : *path) {
-    Pose X = step.edge->predict(theta);
-    Eigen::MatrixXd J_edge = step.edge->jacobian(theta);
-    if (!step.forward) {
-      J_edge = -adjoint(X) * J_edge;
-      X = X.inverse();
-    }
-    J = adjoint(X.inverse()) * J + J_edge;
-  }
-  for (std::size_t s = 0; s < signals.size(); ++s) {
-    const auto column = static_cast<Eigen::Index>(s);
-    J.col(column) *= signals[s].displacement_rate(action(column));
-  }
+  PoseJacobian J;
+  path->predict(action, &J);
   return J;
 }
 

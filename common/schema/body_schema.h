@@ -25,6 +25,21 @@ struct ScrewJoint {
   Pose X_after = Pose::Identity();  ///< the constant transform that follows
 };
 
+/// Derivative of a pose by an action, 6×m: (translation [m], rotation [rad]) per command unit.
+using PoseJacobian = Eigen::Matrix<double, 6, Eigen::Dynamic>;
+
+/// What the covariance of a prediction is made from.
+enum class Variance {
+  /// Of the mean: what the samples left open about the parameters, to first order. Small where the
+  /// model is right, and too small where it is not.
+  kFirstOrder,
+  /// Of what will be seen: mean squares of the edges' leave-one-out residuals (the chapter prefers
+  /// variances estimated from the data, Section 3.3). The noise of two markers is in every edge, so
+  /// along a path this is an upper bound; see empirical_covariance() in kinematic_path.h for that
+  /// of a whole path.
+  kEmpirical,
+};
+
 enum class EdgeState : std::int8_t { kOk = 0, kSuspect = 1, kInvalid = 2, kProvisional = 3 };
 
 /// A local model Δ_ij(θ) = X_ij between two body parts (Section 3.1 of the chapter):
@@ -66,6 +81,9 @@ struct Edge {
   /// First-order covariance of the prediction (right perturbation in the frame of `to`): from
   /// parameter_covariance, or from the matrix GP's own variances.
   Matrix6d prediction_covariance(const Eigen::VectorXd& theta) const;
+  /// Covariance of an observed pose about the predicted one, from position_rms_m and
+  /// rotation_rms_rad, alike along all axes; the same everywhere.
+  Matrix6d empirical_covariance() const;
 };
 
 /// Why a part has no edge.
@@ -121,10 +139,11 @@ struct BodySchema {
   /// @throws std::invalid_argument if `action` does not have one value per signal.
   Eigen::VectorXd displacements(const Eigen::VectorXd& action) const;
 
-  /// Pose of part `to` in part `from` along the tree, with first-order covariance (Section 3.3,
-  /// eq. 17). std::nullopt if they are not connected.
+  /// Pose of part `to` in part `from` along the tree (Section 3.3, eq. 17). std::nullopt if they
+  /// are not connected. Finds the way anew each time: who asks often makes a KinematicPath.
   /// @throws std::invalid_argument if `action` does not have one value per signal.
-  std::optional<PosePrediction> predict(int from, int to, const Eigen::VectorXd& action) const;
+  std::optional<PosePrediction> predict(int from, int to, const Eigen::VectorXd& action,
+                                        Variance variance = Variance::kFirstOrder) const;
   /// All parts connected to the root, X_RB by part id.
   std::map<int, Pose> predict_all(const Eigen::VectorXd& action) const;
   /// 6×m Jacobian of the pose of `to` in `from`; right perturbation in the frame of `to`.

@@ -28,8 +28,6 @@ struct Signal {
 /// Hilbert space methods for reduced-rank Gaussian process regression, 2020). Beyond the limits the
 /// warp stays what it is there.
 Eigen::VectorXd warp_basis(double x, int size);
-/// dφ/dx.
-Eigen::VectorXd warp_basis_rate(double x, int size);
 inline constexpr double kWarpReach = 1.3;
 
 }  // namespace bodyschema

@@ -7,6 +7,7 @@
 #include <set>
 #include <stdexcept>
 
+#include "common/schema/kinematic_path.h"
 #include "processes/structure_learner/command_warp.h"
 #include "processes/structure_learner/noise_estimate.h"
 #include "processes/structure_learner/structure_search.h"
@@ -271,17 +272,23 @@ class OutlierAttribution {
     };
     for (const PartObservation& other : s.parts) {
       if (other.part == part || culprits.count(other.part)) continue;
-      const auto prediction = schema_.predict(other.part, part, s.action);
-      if (!prediction) continue;
+      const auto& path = path_between(other.part, part);
+      if (!path) continue;
       const Pose z = other.X_CB.inverse() * o->X_CB;
-      judge(
-          log(prediction->X_AB.inverse() * z),
-          prediction->covariance + relative_covariance(z, covariance_of(other), covariance_of(*o)));
+      judge(log(path->predict(s.action).inverse() * z),
+            path->covariance(s.action, Variance::kFirstOrder) +
+                relative_covariance(z, covariance_of(other), covariance_of(*o)));
     }
-    if (const auto prediction = schema_.predict(schema_.root, part, s.action))
-      judge(log((schema_.X_CR * prediction->X_AB).inverse() * o->X_CB),
-            prediction->covariance + covariance_of(*o));
+    if (const auto& path = path_between(schema_.root, part))
+      judge(log((schema_.X_CR * path->predict(s.action)).inverse() * o->X_CB),
+            path->covariance(s.action, Variance::kFirstOrder) + covariance_of(*o));
     return all > 0 ? static_cast<double>(bad) / all : 0;
+  }
+
+  const std::optional<KinematicPath>& path_between(int from, int to) const {
+    const auto [it, is_new] = paths_.try_emplace({from, to});
+    if (is_new) it->second = KinematicPath::between(schema_, from, to);
+    return it->second;
   }
 
   Matrix6d covariance_of(const PartObservation& o) const {
@@ -303,6 +310,7 @@ class OutlierAttribution {
   const std::vector<ActionPoseSample>& samples_;
   const MeasurementModel& measurement_;
   std::map<int, int> depth_;
+  mutable std::map<std::pair<int, int>, std::optional<KinematicPath>> paths_;  // found so far
 };
 
 // Why `part` is not connected to the root's component.
