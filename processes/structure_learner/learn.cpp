@@ -52,16 +52,33 @@ Edge to_edge(const LocalModel& model, const NormalizedActions& actions) {
   return edge;
 }
 
+// The model over actions that are scaled otherwise.
+LocalModel rescaled(LocalModel model, const NormalizedActions& from, const NormalizedActions& to) {
+  for (int d = 0; d < model.num_joints; ++d) {
+    const int s = model.signal[d];
+    const double ratio = to.half_range(s) / from.half_range(s);
+    const double shift = (to.centre(s) - from.centre(s)) / from.half_range(s);
+    Vector6d screw = Vector6d::Zero();
+    screw(2) = model.slide[d] * shift;
+    screw(5) = model.turn[d] * shift;
+    model.A[d] = model.A[d] * exp(screw);
+    model.slide[d] *= ratio;
+    model.turn[d] *= ratio;
+  }
+  return model;
+}
+
 struct FittedEdge {
   Edge edge;
   std::vector<int> frames;  // samples at which it was judged
   std::vector<bool> outlying;
+  bool is_valid = true;  // as far as that was asked
 };
 
 // The final fit of an edge in its direction, on all data, with everything the schema says about it.
 FittedEdge fit_edge(const AcceptedModel& accepted, int from, int to,
                     const std::vector<ActionPoseSample>& samples, const NormalizedActions& actions,
-                    const MeasurementModel& measurement) {
+                    const MeasurementModel& measurement, const ValidityOptions* must_be_valid) {
   const LocalModel start = accepted.part_i == from ? accepted.model : accepted.model.inverse();
   const PairData pair =
       make_pair_data(samples, from, to, measurement, std::numeric_limits<int>::max());
@@ -69,6 +86,11 @@ FittedEdge fit_edge(const AcceptedModel& accepted, int from, int to,
   const LeaveOneOut loo = leave_one_out(fit, pair, actions);
 
   FittedEdge result;
+  if (must_be_valid) {
+    result.is_valid =
+        check_validity(fit, loo, pair, actions, *must_be_valid).verdict == Verdict::kValid;
+    if (!result.is_valid) return result;
+  }
   result.edge = to_edge(fit.model, actions);
   result.edge.from = from;
   result.edge.to = to;
@@ -351,76 +373,63 @@ UnconnectedPart explain(int part, int num_seen, const std::set<int>& connected,
   return result;
 }
 
-}  // namespace
-
-LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPoseSample>& samples,
-                  const LearnOptions& options) {
-  if (options.max_signals < 0 || options.max_signals > kMaxJoints)
-    throw std::invalid_argument("max_signals must be 0 to " + std::to_string(kMaxJoints));
-  const int num_signals = static_cast<int>(signals.size());
+int check_actions(const std::vector<ActionPoseSample>& samples, std::size_t num_signals) {
   for (const auto& sample : samples)
-    if (sample.action.size() != num_signals)
+    if (sample.action.size() != static_cast<Eigen::Index>(num_signals))
       throw std::invalid_argument("sample " + std::to_string(sample.sample_index) + " has " +
                                   std::to_string(sample.action.size()) + " action values, not " +
                                   std::to_string(num_signals));
+  return static_cast<int>(num_signals);
+}
+
+std::map<int, int> count_seen(const std::vector<ActionPoseSample>& samples) {
+  std::map<int, int> num_seen;
+  for (const auto& sample : samples)
+    for (const auto& o : sample.parts) ++num_seen[o.part];
+  return num_seen;
+}
+
+std::vector<int> parts_of(const std::map<int, int>& num_seen) {
+  std::vector<int> parts;
+  for (const auto& [part, count] : num_seen) parts.push_back(part);
+  return parts;
+}
+
+SearchOptions search_options_of(const LearnOptions& options) {
+  SearchOptions result;
+  result.max_signals = options.max_signals;
+  result.validity.outlier_rate = options.outlier_rate;
+  result.measurement.model_error = options.model_error;
+  result.measurement.max_error_ratio = options.max_error_ratio;
+  return result;
+}
+
+// std::nullopt if the edges must be valid and one is not.
+std::optional<LearnResult> fit_tree(const LearnedStructure& structure,
+                                    const std::vector<ActionPoseSample>& samples,
+                                    const LearnOptions& options, bool must_be_valid) {
+  const int num_signals = check_actions(samples, structure.signals.size());
+  const SearchResult& search = structure.search;
+  const MeasurementModel& measurement = structure.measurement;
+  const ValidityOptions validity = search_options_of(options).validity;
 
   LearnResult result;
-  BodySchema& schema = result.schema;
-  schema.signals = signals;
-  schema.num_samples = static_cast<int>(samples.size());
-  std::map<int, int> num_seen;
-  for (const auto& sample : samples) {
-    schema.last_sample_index = std::max(schema.last_sample_index, sample.sample_index);
-    for (const auto& o : sample.parts) ++num_seen[o.part];
-  }
-  for (const auto& [part, count] : num_seen) schema.parts.push_back(part);
-  if (!schema.parts.empty()) schema.root = schema.parts.front();
-  if (options.root) schema.root = *options.root;
-
-  SearchOptions search_options;
-  search_options.max_signals = options.max_signals;
-  search_options.validity.outlier_rate = options.outlier_rate;
-  MeasurementModel& measurement = search_options.measurement;
-  measurement.model_error = options.model_error;
-  measurement.max_error_ratio = options.max_error_ratio;
-  const auto set_noise = [&](const std::vector<ActionPoseSample>& of) {
-    if (options.noise) {
-      measurement.noise = Noise{std::max(options.noise->position_m, kNoiseFloor.position_m),
-                                std::max(options.noise->rotation_rad, kNoiseFloor.rotation_rad)};
-    } else if (!has_covariances(of)) {
-      measurement.noise =
-          estimate_noise(of, num_signals, options.max_signals).value_or(kNoiseFloor);
-    }
-  };
-  // Everything that is fitted sees displacements; which commands are bent shows only by a model.
-  std::vector<ActionPoseSample> moved = samples;
-  set_noise(moved);
-  std::optional<NormalizedActions> actions(std::in_place, moved, num_signals);
-  SearchResult search = search_structure(moved, *actions, schema.parts, search_options);
   result.num_screens = search.num_screens;
   result.num_fits = search.num_fits;
-  constexpr int kMaxWarpRounds = 3;
-  for (int round = 0; round < kMaxWarpRounds; ++round) {
-    std::vector<Signal> bent = schema.signals;
-    if (!estimate_warps(samples, schema.parts, search, search_options, &bent)) break;
-    std::vector<ActionPoseSample> again = displaced(samples, bent);
-    const auto noise_before = measurement.noise;
-    set_noise(again);
-    const NormalizedActions actions_again(again, num_signals);
-    SearchResult found = search_structure(again, actions_again, schema.parts, search_options);
-    result.num_screens += found.num_screens;
-    result.num_fits += found.num_fits;
-    if (found.models.size() < search.models.size()) {
-      measurement.noise = noise_before;
-      break;
-    }
-    const bool was_spanning = search.models.size() + 1 >= schema.parts.size();
-    schema.signals = std::move(bent);
-    moved = std::move(again);
-    actions.emplace(actions_again);
-    search = std::move(found);
-    if (was_spanning) break;
-  }
+  BodySchema& schema = result.schema;
+  schema.signals = structure.signals;
+  schema.num_samples = static_cast<int>(samples.size());
+  for (const auto& sample : samples)
+    schema.last_sample_index = std::max(schema.last_sample_index, sample.sample_index);
+  const std::map<int, int> num_seen = count_seen(samples);
+  schema.parts = parts_of(num_seen);
+  if (!schema.parts.empty()) schema.root = schema.parts.front();
+  if (options.root) schema.root = *options.root;
+  if (must_be_valid && schema.parts != structure.parts) return std::nullopt;
+
+  // Everything that is fitted sees displacements.
+  const std::vector<ActionPoseSample> moved = displaced(samples, structure.signals);
+  const NormalizedActions actions(moved, num_signals);
   schema.noise = measurement.noise ? *measurement.noise : typical_noise(samples);
   // Orient the forest outwards: breadth first from the root, then from the lowest part of every
   // other component.
@@ -434,15 +443,20 @@ LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPo
         if (m.part_i != queue[head] && m.part_j != queue[head]) continue;
         const int to = m.part_i == queue[head] ? m.part_j : m.part_i;
         if (!reached.insert(to).second) continue;
-        fitted.push_back(fit_edge(m, queue[head], to, moved, *actions, measurement));
+        AcceptedModel start = m;
+        start.model = rescaled(m.model, structure.actions, actions);
+        fitted.push_back(fit_edge(start, queue[head], to, moved, actions, measurement,
+                                  must_be_valid ? &validity : nullptr));
+        if (!fitted.back().is_valid) return false;
         queue.push_back(to);
       }
     }
+    return true;
   };
-  if (schema.has_part(schema.root)) grow_from(schema.root);
+  if (schema.has_part(schema.root) && !grow_from(schema.root)) return std::nullopt;
   connected_to_root = reached;
   for (const int part : schema.parts)
-    if (!reached.count(part)) grow_from(part);
+    if (!reached.count(part) && !grow_from(part)) return std::nullopt;
   for (const FittedEdge& f : fitted) schema.edges.push_back(f.edge);
 
   std::set<int> expected(options.expected_parts.begin(), options.expected_parts.end());
@@ -463,6 +477,95 @@ LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPo
   estimate_root_pose(samples, measurement, &schema);
   result.outliers = OutlierAttribution(schema, fitted, samples, measurement).run();
   return result;
+}
+
+}  // namespace
+
+LearnedStructure find_structure(const std::vector<Signal>& signals,
+                                const std::vector<ActionPoseSample>& samples,
+                                const LearnOptions& options) {
+  if (options.max_signals < 0 || options.max_signals > kMaxJoints)
+    throw std::invalid_argument("max_signals must be 0 to " + std::to_string(kMaxJoints));
+  const int num_signals = check_actions(samples, signals.size());
+  const std::vector<int> parts = parts_of(count_seen(samples));
+  SearchOptions search_options = search_options_of(options);
+  MeasurementModel& measurement = search_options.measurement;
+  const auto set_noise = [&](const std::vector<ActionPoseSample>& of) {
+    if (options.noise) {
+      measurement.noise = Noise{std::max(options.noise->position_m, kNoiseFloor.position_m),
+                                std::max(options.noise->rotation_rad, kNoiseFloor.rotation_rad)};
+    } else if (!has_covariances(of)) {
+      measurement.noise =
+          estimate_noise(of, num_signals, options.max_signals).value_or(kNoiseFloor);
+    }
+  };
+  set_noise(samples);
+  NormalizedActions actions(samples, num_signals);
+  SearchResult search = search_structure(samples, actions, parts, search_options);
+  LearnedStructure result{signals, parts, measurement, std::move(actions), std::move(search)};
+  // Everything that is fitted sees displacements; which commands are bent shows only by a model.
+  constexpr int kMaxWarpRounds = 3;
+  for (int round = 0; round < kMaxWarpRounds; ++round) {
+    std::vector<Signal> bent = result.signals;
+    if (!estimate_warps(samples, parts, result.search, search_options, &bent)) break;
+    const std::vector<ActionPoseSample> again = displaced(samples, bent);
+    set_noise(again);
+    NormalizedActions actions_again(again, num_signals);
+    SearchResult found = search_structure(again, actions_again, parts, search_options);
+    found.num_screens += result.search.num_screens;
+    found.num_fits += result.search.num_fits;
+    if (found.models.size() < result.search.models.size()) {
+      result.search.num_screens = found.num_screens;
+      result.search.num_fits = found.num_fits;
+      break;
+    }
+    const bool was_spanning = result.spans();
+    result = {std::move(bent), parts, measurement, std::move(actions_again), std::move(found)};
+    if (was_spanning) break;
+  }
+  return result;
+}
+
+LearnResult fit_structure(const LearnedStructure& structure,
+                          const std::vector<ActionPoseSample>& samples,
+                          const LearnOptions& options) {
+  return *fit_tree(structure, samples, options, false);
+}
+
+std::optional<LearnResult> relearn(const LearnedStructure& structure,
+                                   const std::vector<ActionPoseSample>& samples,
+                                   const LearnOptions& options) {
+  return fit_tree(structure, samples, options, true);
+}
+
+bool is_refuted_by(const LearnedStructure& structure, const std::vector<ActionPoseSample>& later,
+                   const LearnOptions& options) {
+  check_actions(later, structure.signals.size());
+  for (const auto& [part, count] : count_seen(later))
+    if (!std::binary_search(structure.parts.begin(), structure.parts.end(), part)) return true;
+  ValidityOptions validity = search_options_of(options).validity;
+  validity.lenient = true;
+  const std::vector<ActionPoseSample> moved = displaced(later, structure.signals);
+  const NormalizedActions actions(moved, static_cast<int>(structure.signals.size()));
+  for (const AcceptedModel& m : structure.search.models) {
+    const PairData pair = make_pair_data(moved, m.part_i, m.part_j, structure.measurement,
+                                         std::numeric_limits<int>::max());
+    if (pair.size() < 2) continue;
+    const Fit fit = evaluate(rescaled(m.model, structure.actions, actions), pair, actions);
+    LeaveOneOut unseen;  // the model was fitted without any of them
+    for (const FrameFit& frame : fit.frames)
+      unseen.squared_distance.push_back(frame.squared_distance);
+    const Validity judged = check_validity(fit, unseen, pair, actions, validity);
+    if (judged.verdict == Verdict::kRefuted ||
+        judged.num_outliers > binomial_quantile(pair.size(), pair_outlier_rate(validity), 0.9997))
+      return true;
+  }
+  return false;
+}
+
+LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPoseSample>& samples,
+                  const LearnOptions& options) {
+  return fit_structure(find_structure(signals, samples, options), samples, options);
 }
 
 }  // namespace bodyschema

@@ -7,6 +7,7 @@
 
 #include "common/schema/body_schema.h"
 #include "common/schema/sample.h"
+#include "processes/structure_learner/structure_search.h"
 
 namespace bodyschema {
 
@@ -56,5 +57,40 @@ struct LearnResult {
 /// out of range.
 LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPoseSample>& samples,
                   const LearnOptions& options = {});
+
+/// The first half of learn(), slow: which part hangs on which by which signals. Everything that
+/// relearn() takes over.
+struct LearnedStructure {
+  std::vector<Signal> signals;  ///< with what bends their commands
+  std::vector<int> parts;       ///< seen, ascending
+  MeasurementModel measurement;
+  NormalizedActions actions;  ///< that the models are over
+  SearchResult search;
+
+  /// The edges span all parts seen.
+  bool spans() const { return search.models.size() + 1 >= parts.size(); }
+};
+/// @throws std::invalid_argument as learn().
+LearnedStructure find_structure(const std::vector<Signal>& signals,
+                                const std::vector<ActionPoseSample>& samples,
+                                const LearnOptions& options = {});
+
+/// The second half of learn(): the edges of `structure` fitted to `samples`, which need not be those
+/// that it was found from, and all else that is in a schema. learn() = fit_structure(find_structure).
+LearnResult fit_structure(const LearnedStructure& structure,
+                          const std::vector<ActionPoseSample>& samples,
+                          const LearnOptions& options = {});
+
+/// fit_structure() where the structure still holds: std::nullopt if `samples` show parts that it
+/// does not know, or if an edge, fitted to them, is not valid (check_validity()).
+std::optional<LearnResult> relearn(const LearnedStructure& structure,
+                                   const std::vector<ActionPoseSample>& samples,
+                                   const LearnOptions& options = {});
+
+/// Do samples that came later speak against the structure with its models as they are? Judged an
+/// edge at a time by the bounds of check_validity() for preselection, and like relearn() by parts
+/// that are new.
+bool is_refuted_by(const LearnedStructure& structure, const std::vector<ActionPoseSample>& later,
+                   const LearnOptions& options = {});
 
 }  // namespace bodyschema
