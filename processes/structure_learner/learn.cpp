@@ -404,10 +404,9 @@ SearchOptions search_options_of(const LearnOptions& options) {
   return result;
 }
 
-// std::nullopt if the edges must be valid and one is not.
-std::optional<LearnResult> fit_tree(const LearnedStructure& structure,
-                                    const std::vector<ActionPoseSample>& samples,
-                                    const LearnOptions& options, bool must_be_valid) {
+LearnResult fit_tree(const LearnedStructure& structure,
+                     const std::vector<ActionPoseSample>& samples, const LearnOptions& options,
+                     bool must_be_valid) {
   const int num_signals = check_actions(samples, structure.signals.size());
   const SearchResult& search = structure.search;
   const MeasurementModel& measurement = structure.measurement;
@@ -425,7 +424,6 @@ std::optional<LearnResult> fit_tree(const LearnedStructure& structure,
   schema.parts = parts_of(num_seen);
   if (!schema.parts.empty()) schema.root = schema.parts.front();
   if (options.root) schema.root = *options.root;
-  if (must_be_valid && schema.parts != structure.parts) return std::nullopt;
 
   // Everything that is fitted sees displacements.
   const std::vector<ActionPoseSample> moved = displaced(samples, structure.signals);
@@ -445,18 +443,22 @@ std::optional<LearnResult> fit_tree(const LearnedStructure& structure,
         if (!reached.insert(to).second) continue;
         AcceptedModel start = m;
         start.model = rescaled(m.model, structure.actions, actions);
-        fitted.push_back(fit_edge(start, queue[head], to, moved, actions, measurement,
-                                  must_be_valid ? &validity : nullptr));
-        if (!fitted.back().is_valid) return false;
+        FittedEdge edge = fit_edge(start, queue[head], to, moved, actions, measurement,
+                                   must_be_valid ? &validity : nullptr);
+        if (!edge.is_valid) {
+          result.refuted.emplace_back(m.part_i, m.part_j);
+          reached.erase(to);
+          continue;
+        }
+        fitted.push_back(std::move(edge));
         queue.push_back(to);
       }
     }
-    return true;
   };
-  if (schema.has_part(schema.root) && !grow_from(schema.root)) return std::nullopt;
+  if (schema.has_part(schema.root)) grow_from(schema.root);
   connected_to_root = reached;
   for (const int part : schema.parts)
-    if (!reached.count(part) && !grow_from(part)) return std::nullopt;
+    if (!reached.count(part)) grow_from(part);
   for (const FittedEdge& f : fitted) schema.edges.push_back(f.edge);
 
   std::set<int> expected(options.expected_parts.begin(), options.expected_parts.end());
@@ -529,20 +531,17 @@ LearnedStructure find_structure(const std::vector<Signal>& signals,
 LearnResult fit_structure(const LearnedStructure& structure,
                           const std::vector<ActionPoseSample>& samples,
                           const LearnOptions& options) {
-  return *fit_tree(structure, samples, options, false);
+  return fit_tree(structure, samples, options, false);
 }
 
-std::optional<LearnResult> relearn(const LearnedStructure& structure,
-                                   const std::vector<ActionPoseSample>& samples,
-                                   const LearnOptions& options) {
+LearnResult relearn(const LearnedStructure& structure, const std::vector<ActionPoseSample>& samples,
+                    const LearnOptions& options) {
   return fit_tree(structure, samples, options, true);
 }
 
 bool is_refuted_by(const LearnedStructure& structure, const std::vector<ActionPoseSample>& later,
                    const LearnOptions& options) {
   check_actions(later, structure.signals.size());
-  for (const auto& [part, count] : count_seen(later))
-    if (!std::binary_search(structure.parts.begin(), structure.parts.end(), part)) return true;
   ValidityOptions validity = search_options_of(options).validity;
   validity.lenient = true;
   const std::vector<ActionPoseSample> moved = displaced(later, structure.signals);
@@ -557,7 +556,7 @@ bool is_refuted_by(const LearnedStructure& structure, const std::vector<ActionPo
       unseen.squared_distance.push_back(frame.squared_distance);
     const Validity judged = check_validity(fit, unseen, pair, actions, validity);
     if (judged.verdict == Verdict::kRefuted ||
-        judged.num_outliers > binomial_quantile(pair.size(), pair_outlier_rate(validity), 0.9997))
+        judged.num_outliers > binomial_quantile(pair.size(), pair_outlier_rate(validity), 0.99999))
       return true;
   }
   return false;

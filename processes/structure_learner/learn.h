@@ -3,6 +3,7 @@
 #include <cmath>
 #include <cstdint>
 #include <optional>
+#include <utility>
 #include <vector>
 
 #include "common/schema/body_schema.h"
@@ -48,6 +49,8 @@ struct LearnResult {
   std::vector<Outlier> outliers;  ///< ascending by sample, then part
   int num_screens = 0;            ///< closed-form hypotheses looked at
   int num_fits = 0;               ///< Levenberg–Marquardt fits
+  /// Of relearn(): edges that were left out, as (part, part).
+  std::vector<std::pair<int, int>> refuted;
 };
 
 /// Learns the body schema from scratch: structure and local models (Sections 3.1 and 3.2). A pure
@@ -81,11 +84,11 @@ LearnResult fit_structure(const LearnedStructure& structure,
                           const std::vector<ActionPoseSample>& samples,
                           const LearnOptions& options = {});
 
-/// fit_structure() where the structure still holds: std::nullopt if `samples` show parts that it
-/// does not know, or if an edge, fitted to them, is not valid (check_validity()).
-std::optional<LearnResult> relearn(const LearnedStructure& structure,
-                                   const std::vector<ActionPoseSample>& samples,
-                                   const LearnOptions& options = {});
+/// fit_structure() without the edges that are not valid any more (check_validity()) when fitted to
+/// `samples`: these are in LearnResult::refuted. Parts that the structure does not know are
+/// unconnected.
+LearnResult relearn(const LearnedStructure& structure, const std::vector<ActionPoseSample>& samples,
+                    const LearnOptions& options = {});
 
 /// Do samples that came later speak against the structure with its models as they are? Judged an
 /// edge at a time by the bounds of check_validity() for preselection, and like relearn() by parts

@@ -25,25 +25,32 @@ bool are_few_enough_to_refit(const SharedSamples& samples) {
 OnlineLearner::OnlineLearner(std::vector<Signal> signals, LearnOptions options)
     : signals_(std::move(signals)), options_(std::move(options)) {}
 
-int OnlineLearner::checkpoint_before(int n) {
-  int c = std::min(n - 1, kEverySample);
-  while (c >= kEverySample && c + c / 20 < n) c += c / 20;
+int OnlineLearner::checkpoint_within(int n) {
+  int c = std::min(n, kEverySample);
+  while (c >= kEverySample && c + c / 20 <= n) c += c / 20;
   return c;
 }
 
-BodySchema OnlineLearner::learn(const SharedSamples& samples) {
+BodySchema OnlineLearner::learn(const SharedSamples& samples, int num_searched) {
   const std::lock_guard lock(mutex_);
   const int n = static_cast<int>(samples.size());
-  const int c = checkpoint_before(n);
-  if (c > 0) {
+  const int c = checkpoint_within(num_searched);
+  if (c > 0 && c < n) {
     Checkpoint& start = checkpoint(samples, c);
-    if (start.structure.spans() || n > kEverySample) {
+    const std::vector<int>& known = start.structure.parts;
+    const bool is_part_new = std::any_of(samples.begin() + c, samples.end(), [&](const auto& s) {
+      return std::any_of(s->parts.begin(), s->parts.end(), [&](const PartObservation& o) {
+        return !std::binary_search(known.begin(), known.end(), o.part);
+      });
+    });
+    if (!is_part_new || n <= kEverySample) {
       if (are_few_enough_to_refit(samples)) {
         const auto all = copied(samples, 0, n);
         const LearnOptions options = options_for(all);
-        if (auto refitted = relearn(start.structure, all, options)) {
-          refitted->schema.complete &= options.root == options_.root;
-          return std::move(refitted->schema);
+        LearnResult refitted = relearn(start.structure, all, options);
+        if (refitted.refuted.empty() || n <= kEverySample) {
+          refitted.schema.complete &= options.root == options_.root;
+          return std::move(refitted.schema);
         }
       } else if (!is_refuted_by(start.structure, copied(samples, c, n), options_)) {
         return schema_of(&start, samples, c);
@@ -55,7 +62,7 @@ BodySchema OnlineLearner::learn(const SharedSamples& samples) {
 
 void OnlineLearner::prepare(const SharedSamples& samples) {
   const std::lock_guard lock(mutex_);
-  const int c = checkpoint_before(static_cast<int>(samples.size()) + 1);
+  const int c = checkpoint_within(static_cast<int>(samples.size()));
   if (c == 0) return;
   Checkpoint& start = checkpoint(samples, c);
   if (!are_few_enough_to_refit(samples)) schema_of(&start, samples, c);

@@ -15,15 +15,17 @@ using SharedSamples = std::vector<std::shared_ptr<const ActionPoseSample>>;
 /// learn() for samples that come one by one: what a new sample costs does not grow with their
 /// number.
 ///
-/// The schema after n samples is a pure function of the samples 1..n. The search for the structure
-/// runs at checkpoints alone: after every sample while they are few, then whenever there are 5 %
-/// more. Let c < n be the last checkpoint before n. The schema after n is the structure of c fitted
-/// to 1..n; where these are too many for that, the schema of c, so that a twentieth of the data at
-/// most waits for the next checkpoint. But it is learn() of 1..n
-///   where a sample after c refutes an edge or shows a part that c had not seen,
-///   and where the structure of c spans too little, while samples are few.
-/// Since c < n, what the next sample will start from can be prepared before it comes. What is kept
-/// is a cache and no more: whatever was asked or prepared before, the answers are the same.
+/// The search for the structure runs at checkpoints alone: after every sample while they are few,
+/// then whenever there are 5 % more. The schema of samples 1..n is the structure of a checkpoint c
+/// fitted to all of them; where these are too many for that, the schema of c, so that a twentieth
+/// of the data at most waits for the next checkpoint. Where the samples after c refute an edge or
+/// show a part that c had not seen, it is learn() of 1..n; but while there is a checkpoint after
+/// every sample, the edge is left out and the part unconnected until then.
+///
+/// Which c is the caller's choice and not that of a clock, so that the schema is a pure function of
+/// the samples: with c < n the search is done before sample n comes, if there was time to prepare;
+/// with c = n it is learn(). What is kept is a cache and no more: whatever was asked or prepared
+/// before, the answers are the same.
 ///
 /// Any number of threads may ask; they wait for each other.
 class OnlineLearner {
@@ -35,14 +37,15 @@ class OnlineLearner {
 
   OnlineLearner(std::vector<Signal> signals, LearnOptions options);
 
-  /// The schema after `samples`. As learn() with the options, except that a root that
-  /// nobody saw is only expected and makes the schema incomplete: the rest is learned without it.
-  BodySchema learn(const SharedSamples& samples);
-  /// Finds what learn() will start from when one more sample comes, unless that is known.
+  /// The schema of `samples` by the structure of the last checkpoint within the first
+  /// `num_searched` of them. As learn() with the options, except that a root that nobody saw is only
+  /// expected and makes the schema incomplete: the rest is learned without it.
+  BodySchema learn(const SharedSamples& samples, int num_searched);
+  /// Makes learn() of these samples, or of more with the same checkpoint, free of searches.
   void prepare(const SharedSamples& samples);
 
-  /// The last checkpoint before n; 0: none.
-  static int checkpoint_before(int n);
+  /// The last checkpoint within the first n samples.
+  static int checkpoint_within(int n);
 
  private:
   struct Checkpoint {

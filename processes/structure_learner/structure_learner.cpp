@@ -52,7 +52,8 @@ std::function<body_schema_t()> StructureLearner::take_job() {
   pending_.pop_front();
   const auto end = samples_.begin() + static_cast<std::ptrdiff_t>(prefix.num_training);
   return [online = online_, samples = SharedSamples(samples_.begin(), end), prefix] {
-    BodySchema schema = online->learn(samples);
+    const int n = static_cast<int>(samples.size());
+    BodySchema schema = online->learn(samples, prefix.is_test ? n : n - 1);
     schema.last_sample_index = prefix.last_sample_index;
     schema.utime = prefix.utime;
     return to_message(schema);

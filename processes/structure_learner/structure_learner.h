@@ -28,6 +28,9 @@ struct StructureLearnerConfig {
 /// skipped while a fit was running, and what was prepared, does not matter. TEST samples are
 /// never learned from; they only advance last_sample_index, so that the monitor can judge.
 ///
+/// A training sample is answered by the structure found before it came, a TEST sample by one that
+/// the samples so far may change: in the time that the arm takes to move, both were prepared.
+///
 /// Before the first sample there is no proposal; when samples stop, the last proposal stands.
 class StructureLearner {
  public:
