@@ -63,6 +63,7 @@ std::string short_number(double value) {
 
 std::string mean_and_error(const Spread& spread, double unit) {
   if (spread.count == 0) return "–";
+  if (spread.count == 1) return short_number(spread.mean / unit);
   return short_number(spread.mean / unit) + " ± " + short_number(spread.standard_error() / unit);
 }
 

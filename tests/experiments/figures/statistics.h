@@ -24,7 +24,8 @@ double wilson_upper_bound(int successes, int trials, double z = 1.959964);
 
 /// "99.5 % (≥ 97.2)": share and Wilson lower bound.
 std::string percentage(int successes, int trials);
-/// "12.3 ± 0.4": mean and standard error, in units of `unit`, with three significant digits.
+/// "12.3 ± 0.4": mean and standard error, in units of `unit`, with three significant digits;
+/// of a single value the value alone.
 std::string mean_and_error(const Spread& spread, double unit);
 /// Three significant digits; "–" for NaN.
 std::string short_number(double value);
