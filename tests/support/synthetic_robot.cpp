@@ -34,6 +34,23 @@ Signal symmetric_signal(int index, double limit) {
   return {name, -limit, limit};
 }
 
+// Scales the links so that the longest way from the base to a part has this length.
+void stretch(SyntheticRobot* robot, double length_m) {
+  std::map<int, double> reach;
+  double longest = 0;
+  for (const TrueLink& link : robot->links) {
+    double& here = reach[link.part];
+    if (link.parent >= 0)
+      here = reach.at(link.parent) + link.X_before.translation().norm() +
+             link.X_after.translation().norm();
+    longest = std::max(longest, here);
+  }
+  for (TrueLink& link : robot->links) {
+    link.X_before.translation() *= length_m / longest;
+    link.X_after.translation() *= length_m / longest;
+  }
+}
+
 void place_camera(SyntheticRobot* robot, Rng& rng) {
   robot->X_CR.linear() = random_rotation(rng);
   robot->X_CR.translation() << 0, 0, 2;
@@ -240,7 +257,7 @@ SyntheticRobot chapter_robot(const std::string& name, Rng& rng) {
   if (name == "c" || name == "co") chain = {0, 1, 2, 3};
   const bool is_d = name == "d" || name == "dP";
   if (is_d) chain = {0, 1, 2, 3, 4, 5, -1};
-  if (chain.empty()) throw std::invalid_argument("no robot of the chapter is called " + name);
+  if (chain.empty() && name != "b") throw std::invalid_argument("no robot of the chapter is called " + name);
   robot.links.push_back({.part = 1});
   for (std::size_t n = 0; n < chain.size(); ++n) {
     TrueLink link = random_link(static_cast<int>(n) + 2, static_cast<int>(n) + 1, rng);
@@ -250,6 +267,20 @@ SyntheticRobot chapter_robot(const std::string& name, Rng& rng) {
       robot.signals.push_back(symmetric_signal(link.signal, uniform(rng, 60, 120) * kDegree));
     }
     robot.links.push_back(link);
+  }
+  if (name == "b") {
+    // The ring that carries the second axis across the first is no body part.
+    TrueLink ring = random_link(3, 1, rng), end = random_link(2, 3, rng);
+    ring.hidden = true;
+    ring.X_after.linear() = Eigen::AngleAxisd(M_PI / 2, Eigen::Vector3d::UnitX()).matrix();
+    ring.X_after.translation().setZero();
+    end.X_before = Pose::Identity();
+    for (TrueLink* link : {&ring, &end}) {
+      link->signal = static_cast<int>(robot.signals.size());
+      link->turn = 1;
+      robot.signals.push_back(symmetric_signal(link->signal, uniform(rng, 60, 120) * kDegree));
+      robot.links.push_back(*link);
+    }
   }
   if (name == "co") robot.links[2].hidden = true;
   if (is_d) {
@@ -266,6 +297,7 @@ SyntheticRobot chapter_robot(const std::string& name, Rng& rng) {
     }
     robot.signals.push_back(
         symmetric_signal(6, name == "d" ? uniform(rng, 40, 60) * kDegree : 1.0));
+    stretch(&robot, 1.3);
   }
   return robot;
 }
