@@ -78,7 +78,8 @@ struct FittedEdge {
 // The final fit of an edge in its direction, on all data, with everything the schema says about it.
 FittedEdge fit_edge(const AcceptedModel& accepted, int from, int to,
                     const std::vector<ActionPoseSample>& samples, const NormalizedActions& actions,
-                    const MeasurementModel& measurement, const ValidityOptions* must_be_valid) {
+                    const MeasurementModel& measurement, const ValidityOptions& validity,
+                    bool must_be_valid) {
   const LocalModel start = accepted.part_i == from ? accepted.model : accepted.model.inverse();
   const PairData pair =
       make_pair_data(samples, from, to, measurement, std::numeric_limits<int>::max());
@@ -88,7 +89,7 @@ FittedEdge fit_edge(const AcceptedModel& accepted, int from, int to,
   FittedEdge result;
   if (must_be_valid) {
     result.is_valid =
-        check_validity(fit, loo, pair, actions, *must_be_valid).verdict == Verdict::kValid;
+        check_validity(fit, loo, pair, actions, validity).verdict == Verdict::kValid;
     if (!result.is_valid) return result;
   }
   result.edge = to_edge(fit.model, actions);
@@ -444,7 +445,7 @@ LearnResult fit_tree(const LearnedStructure& structure,
         AcceptedModel start = m;
         start.model = rescaled(m.model, structure.actions, actions);
         FittedEdge edge = fit_edge(start, queue[head], to, moved, actions, measurement,
-                                   must_be_valid ? &validity : nullptr);
+                                   validity, must_be_valid);
         if (!edge.is_valid) {
           result.refuted.emplace_back(m.part_i, m.part_j);
           reached.erase(to);
@@ -555,8 +556,10 @@ bool is_refuted_by(const LearnedStructure& structure, const std::vector<ActionPo
     for (const FrameFit& frame : fit.frames)
       unseen.squared_distance.push_back(frame.squared_distance);
     const Validity judged = check_validity(fit, unseen, pair, actions, validity);
-    if (judged.verdict == Verdict::kRefuted ||
-        judged.num_outliers > binomial_quantile(pair.size(), pair_outlier_rate(validity), 0.99999))
+    // So few frames are often outliers in the majority by chance: their number decides.
+    const int most = binomial_quantile(pair.size(), pair_outlier_rate(validity), 0.99999);
+    const bool are_outliers_few = 2 * judged.num_outliers <= pair.size();
+    if (judged.num_outliers > most || (judged.verdict == Verdict::kRefuted && are_outliers_few))
       return true;
   }
   return false;

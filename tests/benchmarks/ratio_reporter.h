@@ -10,8 +10,8 @@
 namespace bodyschema::test {
 
 /// Google Benchmark's console table and, below it, each benchmark's median processor time over that
-/// of a peer: `{"ours", "peer"}`, with their arguments: `Learn/100`. Compares within one run on one machine, so the ratios hold where
-/// the times do not.
+/// of a peer: `{"ours", "peer"}`, with their arguments: `Learn/100`. Compares within one run on one
+/// machine, so the ratios hold where the times do not.
 class RatioReporter : public benchmark::ConsoleReporter {
  public:
   struct Ratio {
