@@ -4,7 +4,11 @@
 #include <cmath>
 #include <limits>
 #include <numeric>
+#include <cstdio>
+#include <cstdlib>
 #include <tuple>
+
+#include "processes/structure_learner/tree_fit.h"
 
 namespace bodyschema {
 namespace {
@@ -65,6 +69,7 @@ class Search {
     max_motions_ = num_pairs > 200 ? 150 : 300;
     pairs_.resize(static_cast<std::size_t>(n) * n);
     motions_.resize(pairs_.size());
+    rests_.assign(n, -1);
     for (int i = 0; i < n; ++i)
       for (int j = i + 1; j < n; ++j)
         record(i, j).num_common = count_common(samples, parts[i], parts[j]);
@@ -77,6 +82,7 @@ class Search {
       if (k == 2) layer_two_joints();
     }
     settle_doubtful();
+    settle_jointly();
     return std::move(result_);
   }
 
@@ -201,6 +207,135 @@ class Search {
         accept(c);
   }
 
+  struct Tree {
+    std::vector<TreeNode> nodes;
+    std::vector<int> accepted;  // of each node but the first: index into result_.models
+    std::vector<PairData> data;
+    bool root_rests = false;
+  };
+
+  // The accepted models of one component, outwards from a part that rests if there is one.
+  Tree tree_of(int component) {
+    std::vector<int> members;
+    for (int x = 0; x < static_cast<int>(parts_.size()); ++x)
+      if (forest_.connected(component, x)) members.push_back(x);
+    Tree tree;
+    int root = members.front();
+    for (const int x : members)
+      if (part_rests(x)) {
+        root = x;
+        tree.root_rests = true;
+        break;
+      }
+    tree.nodes.push_back({parts_[root], -1, {}});
+    tree.accepted.push_back(-1);
+    for (std::size_t head = 0; head < tree.nodes.size(); ++head) {
+      const int from = tree.nodes[head].part;
+      for (int m = 0; m < static_cast<int>(result_.models.size()); ++m) {
+        if (m == tree.accepted[head]) continue;
+        const AcceptedModel& model = result_.models[m];
+        if (model.part_i == from)
+          tree.nodes.push_back({model.part_j, static_cast<int>(head), model.model});
+        else if (model.part_j == from)
+          tree.nodes.push_back({model.part_i, static_cast<int>(head), model.model.inverse()});
+        else
+          continue;
+        tree.accepted.push_back(m);
+      }
+    }
+    for (const TreeNode& node : tree.nodes)
+      tree.data.push_back(make_part_data(samples_, node.part, options_.measurement, max_frames_));
+    return tree;
+  }
+
+  // Does a part keep its pose in the camera's frame?
+  bool part_rests(int x) {
+    if (rests_[x] < 0) {
+      const PairData data =
+          make_part_data(samples_, parts_[x], options_.measurement, max_frames_);
+      const Start start = screen_rigid(data, actions_);
+      rests_[x] = 0;
+      if (start.score < kMaxRigidStartCost) {
+        const Fit fit = fit_local_model(start.model, data, actions_, 20, 1e-4);
+        const Validity validity = check_validity(fit, leave_one_out(fit, data, actions_), data,
+                                                 actions_, options_.validity);
+        rests_[x] = validity.verdict == Verdict::kValid;
+      }
+    }
+    return rests_[x] == 1;
+  }
+
+  // Joints that only all markers together show: split what moves, until nothing is left to explain.
+  void settle_jointly() {
+    const int n = static_cast<int>(parts_.size());
+    constexpr int kMaxSplits = 12;
+    for (int x = 0; x < n; ++x) {
+      if (forest_.find(x) != x) continue;
+      for (int round = 0; round < kMaxSplits; ++round) {
+        Tree tree = tree_of(x);
+        if (tree.nodes.size() < 2) break;
+        TreeFit fit(tree.nodes, tree.data, actions_, tree.root_rests);
+        fit.fit(10, 0.05);
+        const auto missing = fit.missing_joints();
+        const MissingJoint* worst = most_significant(missing);
+        if (std::getenv("DBG"))
+          for (std::size_t k = 0; k < std::min<std::size_t>(3, missing.size()); ++k) {
+            const auto& j = missing[k];
+            std::printf("   rests %d cost/marker %.2f signal %d slides %d stat %.1f tail %.1f |xi| %.3f %.3f cluster %d m",
+                        tree.root_rests, fit.cost() / (tree.nodes.size() * fit.num_frames()),
+                        j.signal, j.slides, j.statistic, j.log_tail, j.xi.head<3>().norm(),
+                        j.xi.tail<3>().norm(), tree.nodes[j.top].part);
+            for (int k : j.members) std::printf(" %d", tree.nodes[k].part);
+            std::printf(" b");
+            for (int k : j.branches) std::printf(" %d", tree.nodes[k].part);
+            std::printf(worst == &j ? " <<<\n" : "\n");
+          }
+        if (!worst) break;
+        const auto edges = fit.with_joint(*worst);
+        if (!edges) break;
+        adopt(tree, *edges);
+      }
+    }
+  }
+
+  // Replaces the accepted models of a component by the edges of its new tree.
+  void adopt(const Tree& tree, const std::vector<TreeEdge>& edges) {
+    std::vector<int> old(tree.accepted.begin() + 1, tree.accepted.end());
+    std::sort(old.rbegin(), old.rend());
+    for (const int m : old) result_.models.erase(result_.models.begin() + m);
+    for (const TreeEdge& e : edges) {
+      AcceptedModel model{tree.nodes[e.a].part, tree.nodes[e.b].part, e.model, 0};
+      if (model.part_i > model.part_j) {
+        std::swap(model.part_i, model.part_j);
+        model.model = model.model.inverse();
+      }
+      result_.models.push_back(model);
+    }
+  }
+
+  // The one that chance explains least, if it is significant: a signal that moves nothing so far is
+  // probably somewhere, so nine tenths of the error rate are spent on those.
+  const MissingJoint* most_significant(const std::vector<MissingJoint>& joints) const {
+    constexpr double kErrorRate = 0.005;
+    std::set<int> used;
+    for (const AcceptedModel& m : result_.models)
+      for (int d = 0; d < m.model.num_joints; ++d) used.insert(m.model.signal[d]);
+    double ways[2] = {0, 0};
+    for (const MissingJoint& j : joints) ways[used.count(j.signal)] += std::exp(j.log_ways);
+    const MissingJoint* best = nullptr;
+    double best_margin = 0;
+    for (const MissingJoint& j : joints) {
+      const bool is_used = used.count(j.signal) > 0;
+      const double margin =
+          j.log_tail + std::log(2 * ways[is_used] / (kErrorRate * (is_used ? 0.1 : 0.9)));
+      if (margin < best_margin) {
+        best = &j;
+        best_margin = margin;
+      }
+    }
+    return best;
+  }
+
   static void sort_by_quality(std::vector<Candidate>* candidates) {
     std::stable_sort(candidates->begin(), candidates->end(), [](const auto& x, const auto& y) {
       return std::tie(x.model.num_joints, y.score, x.i, x.j) <
@@ -316,6 +451,7 @@ class Search {
   int max_motions_ = 0;
   std::vector<std::optional<PairData>> pairs_;
   std::vector<std::optional<RelativeMotions>> motions_;
+  std::vector<int> rests_;  // a part: 1 yes, 0 no, -1 not yet known
   std::vector<Candidate> doubtful_;
   int num_judged_ = 0;  // frames of the valid models found so far, and the outliers among them
   int num_outliers_ = 0;
