@@ -4,8 +4,6 @@
 #include <cmath>
 #include <limits>
 #include <numeric>
-#include <cstdio>
-#include <cstdlib>
 #include <tuple>
 
 #include "processes/structure_learner/tree_fit.h"
@@ -17,6 +15,13 @@ namespace {
 // at the squared distance d² costs 5 log(1 + d²/4).)
 constexpr double kMaxRigidStartCost = 20;
 constexpr double kMaxScrewStartCost = 26;
+// And starts whose median squared distance is above these (χ²₆ has 5.35), from kManyFrames on. The
+// valid models' stay below half of that in every noise regime, whatever the outliers.
+constexpr double kMaxRigidStartMedian = 20;
+constexpr double kMaxScrewStartMedian = 30;
+constexpr double kMaxFewFramesMedian = 100;  // from kSomeFrames on
+constexpr int kSomeFrames = 10;
+constexpr int kManyFrames = 20;
 // Two signal sets of one size whose likelihoods differ by less [nats] are not told apart.
 constexpr double kAmbiguityMargin = 3;
 
@@ -50,6 +55,12 @@ struct Candidate {
   bool on_all_data = false;
 };
 
+// Beyond what a local fit mends, by the bulk of the frames.
+bool is_hopeless(const Start& start, int num_frames, double max_median) {
+  return num_frames >= kSomeFrames &&
+         start.median > (num_frames >= kManyFrames ? max_median : kMaxFewFramesMedian);
+}
+
 std::set<int> signal_set(const LocalModel& model) {
   return {model.signal.begin(), model.signal.begin() + model.num_joints};
 }
@@ -76,13 +87,17 @@ class Search {
   }
 
   SearchResult run() {
-    for (int k = 0; k <= options_.max_signals && !forest_.spans(); ++k) {
-      if (k == 0) layer_rigid();
-      if (k == 1) layer_one_joint();
-      if (k == 2) layer_two_joints();
+    constexpr int kMaxRounds = 4;
+    for (int round = 0; round < kMaxRounds; ++round) {
+      for (int k = round == 0 ? 0 : 1; k <= options_.max_signals && !forest_.spans(); ++k) {
+        if (k == 0) layer_rigid();
+        if (k == 1) layer_one_joint();
+        if (k == 2) layer_two_joints();
+      }
+      settle_doubtful();
+      // What all markers together refute leaves a gap, which other models may fill.
+      if (!settle_jointly()) break;
     }
-    settle_doubtful();
-    settle_jointly();
     return std::move(result_);
   }
 
@@ -126,6 +141,7 @@ class Search {
 
   // Fits and tests a start on the pair's subset of the data.
   std::optional<Candidate> try_start(int i, int j, const LocalModel& start) {
+    if (refuted_.count({parts_[i], parts_[j], signal_set(start)})) return std::nullopt;
     const PairData& data = pair(i, j);
     const bool all = data.size() == record(i, j).num_common;
     Fit fit = fit_local_model(start, data, actions_, 40, 1e-4);
@@ -265,37 +281,51 @@ class Search {
     return rests_[x] == 1;
   }
 
-  // Joints that only all markers together show: split what moves, until nothing is left to explain.
-  void settle_jointly() {
+  // Joints that only all markers together show: part what moves, until nothing is left to explain.
+  // Models that cannot take up the joints they lack are removed: returns true then.
+  bool settle_jointly() {
     const int n = static_cast<int>(parts_.size());
     constexpr int kMaxSplits = 12;
+    std::vector<std::pair<int, int>> refuted;
+    result_.log_likelihood = 0;
     for (int x = 0; x < n; ++x) {
       if (forest_.find(x) != x) continue;
       for (int round = 0; round < kMaxSplits; ++round) {
         Tree tree = tree_of(x);
-        if (tree.nodes.size() < 2) break;
         TreeFit fit(tree.nodes, tree.data, actions_, tree.root_rests);
-        fit.fit(10, 0.05);
+        fit.fit(15, 0.05);
         const auto missing = fit.missing_joints();
-        const MissingJoint* worst = most_significant(missing);
-        if (std::getenv("DBG"))
-          for (std::size_t k = 0; k < std::min<std::size_t>(3, missing.size()); ++k) {
-            const auto& j = missing[k];
-            std::printf("   rests %d cost/marker %.2f signal %d slides %d stat %.1f tail %.1f |xi| %.3f %.3f cluster %d m",
-                        tree.root_rests, fit.cost() / (tree.nodes.size() * fit.num_frames()),
-                        j.signal, j.slides, j.statistic, j.log_tail, j.xi.head<3>().norm(),
-                        j.xi.tail<3>().norm(), tree.nodes[j.top].part);
-            for (int k : j.members) std::printf(" %d", tree.nodes[k].part);
-            std::printf(" b");
-            for (int k : j.branches) std::printf(" %d", tree.nodes[k].part);
-            std::printf(worst == &j ? " <<<\n" : "\n");
-          }
-        if (!worst) break;
-        const auto edges = fit.with_joint(*worst);
-        if (!edges) break;
-        adopt(tree, *edges);
+        const MissingJoint* worst =
+            tree.nodes.size() < 2 ? nullptr : most_significant(missing);
+        if (!worst || round + 1 == kMaxSplits) {
+          result_.log_likelihood += fit.log_likelihood();
+          break;
+        }
+        if (const auto edges = fit.with_joint(*worst)) {
+          adopt(tree, *edges);
+          continue;
+        }
+        for (const int node : fit.full_edges(*worst))
+          refuted.push_back({tree.nodes[node].part, tree.nodes[tree.nodes[node].parent].part});
+        result_.log_likelihood += fit.log_likelihood();
+        break;
       }
     }
+    if (refuted.empty()) return false;
+    for (const auto& [a, b] : refuted)
+      std::erase_if(result_.models, [&, a = a, b = b](const AcceptedModel& m) {
+        const bool is_it = std::minmax(a, b) == std::minmax(m.part_i, m.part_j);
+        if (is_it) refuted_.insert({m.part_i, m.part_j, signal_set(m.model)});
+        return is_it;
+      });
+    forest_ = Forest(n);
+    for (const AcceptedModel& m : result_.models) forest_.connect(index_of(m.part_i), index_of(m.part_j));
+    doubtful_.clear();
+    return true;
+  }
+
+  int index_of(int part) const {
+    return static_cast<int>(std::find(parts_.begin(), parts_.end(), part) - parts_.begin());
   }
 
   // Replaces the accepted models of a component by the edges of its new tree.
@@ -313,21 +343,22 @@ class Search {
     }
   }
 
-  // The one that chance explains least, if it is significant: a signal that moves nothing so far is
-  // probably somewhere, so nine tenths of the error rate are spent on those.
+  // The one that chance explains least, if it is significant (Bonferroni over all that was tried).
+  // A signal that moves nothing in a spanning forest is probably somewhere: it has an error rate of
+  // its own, spent on fewer hypotheses.
   const MissingJoint* most_significant(const std::vector<MissingJoint>& joints) const {
-    constexpr double kErrorRate = 0.005;
+    constexpr double kErrorRates[2] = {0.003, 0.002};
     std::set<int> used;
     for (const AcceptedModel& m : result_.models)
       for (int d = 0; d < m.model.num_joints; ++d) used.insert(m.model.signal[d]);
+    const auto is_used = [&](int signal) { return !forest_.spans() || used.count(signal) > 0; };
     double ways[2] = {0, 0};
-    for (const MissingJoint& j : joints) ways[used.count(j.signal)] += std::exp(j.log_ways);
+    for (const MissingJoint& j : joints) ways[is_used(j.signal)] += std::exp(j.log_ways);
     const MissingJoint* best = nullptr;
     double best_margin = 0;
     for (const MissingJoint& j : joints) {
-      const bool is_used = used.count(j.signal) > 0;
-      const double margin =
-          j.log_tail + std::log(2 * ways[is_used] / (kErrorRate * (is_used ? 0.1 : 0.9)));
+      const bool elsewhere = is_used(j.signal);
+      const double margin = j.log_tail + std::log(2 * ways[elsewhere] / kErrorRates[elsewhere]);
       if (margin < best_margin) {
         best = &j;
         best_margin = margin;
@@ -361,7 +392,9 @@ class Search {
     for_each_open_pair([&](int i, int j) {
       ++result_.num_screens;
       const Start start = screen_rigid(pair(i, j), actions_);
-      if (start.score > kMaxRigidStartCost) return;
+      if (start.score > kMaxRigidStartCost ||
+          is_hopeless(start, pair(i, j).size(), kMaxRigidStartMedian))
+        return;
       if (auto c = try_start(i, j, start.model)) candidates.push_back(std::move(*c));
     });
     connect(std::move(candidates));
@@ -378,7 +411,9 @@ class Search {
         if (n >= 2 && regressions[n].score > 1.5 * regressions[0].score) break;
         const Start start =
             one_joint_start(regressions[n], pair(i, j), actions_, motions(i, j).sigma_rad);
-        if (start.score > kMaxScrewStartCost) continue;
+        if (start.score > kMaxScrewStartCost ||
+            is_hopeless(start, pair(i, j).size(), kMaxScrewStartMedian))
+          continue;
         if (auto c = try_start(i, j, start.model)) valid.push_back(std::move(*c));
       }
       decide(i, j, std::move(valid), &candidates);
@@ -451,6 +486,7 @@ class Search {
   int max_motions_ = 0;
   std::vector<std::optional<PairData>> pairs_;
   std::vector<std::optional<RelativeMotions>> motions_;
+  std::set<std::tuple<int, int, std::set<int>>> refuted_;  // by all markers together
   std::vector<int> rests_;  // a part: 1 yes, 0 no, -1 not yet known
   std::vector<Candidate> doubtful_;
   int num_judged_ = 0;  // frames of the valid models found so far, and the outliers among them

@@ -283,6 +283,32 @@ void TreeFit::fit(int max_iterations, double tolerance) {
   }
 }
 
+double TreeFit::log_likelihood() const {
+  double sum = -cost_;
+  for (int t = 0; t < num_frames(); ++t)
+    for (std::size_t k = 0; k < nodes_.size(); ++k)
+      if (const int index = at(t, static_cast<int>(k)); frame_index_[index] >= 0)
+        sum -= 0.5 * data_[k].hypotheses[fits_[index].hypothesis].log_det;
+  return sum;
+}
+
+std::vector<int> TreeFit::full_edges(const MissingJoint& joint) const {
+  std::vector<int> result;
+  const bool is_full = nodes_[joint.top].model.num_joints == kMaxJoints;
+  const std::vector<int> cluster = cluster_of(joint.top);
+  const auto unmoved = static_cast<std::ptrdiff_t>(joint.members.size()) <
+                       std::ssize(cluster);
+  if (!unmoved && is_full && joint.top > 0) result.push_back(joint.top);
+  for (int k = 1; k < static_cast<int>(nodes_.size()); ++k) {
+    if (nodes_[k].model.num_joints < kMaxJoints ||
+        !std::count(cluster.begin(), cluster.end(), nodes_[k].parent))
+      continue;
+    const bool moves = std::count(joint.branches.begin(), joint.branches.end(), k) > 0;
+    if (moves ? joint.members.empty() : !unmoved) result.push_back(k);
+  }
+  return result;
+}
+
 // Nodes from `top` down that rigid edges connect.
 std::vector<int> TreeFit::cluster_of(int top) const {
   std::vector<bool> in(nodes_.size(), false);

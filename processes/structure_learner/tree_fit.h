@@ -60,6 +60,7 @@ class TreeFit {
 
   const std::vector<TreeNode>& nodes() const { return nodes_; }
   double cost() const { return cost_; }  ///< Σ (ν + 6)/2 · log(1 + d²/ν)
+  double log_likelihood() const;       ///< −cost − ½ Σ log|2πΣ|
   int num_frames() const { return static_cast<int>(samples_.size()); }
 
   /// Rao's score test of one more joint, for every rigid cluster and every moving signal: how much
@@ -73,6 +74,8 @@ class TreeFit {
   /// between the two sides are moved to the right one. std::nullopt if an edge had more than
   /// kMaxJoints.
   std::optional<std::vector<TreeEdge>> with_joint(const MissingJoint& joint) const;
+  /// Where with_joint() fails: the nodes whose edges to their parents have no room for the joint.
+  std::vector<int> full_edges(const MissingJoint& joint) const;
 
  private:
   double evaluate(const std::vector<TreeNode>& nodes, const std::vector<Pose>& roots,
