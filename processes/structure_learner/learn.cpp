@@ -83,7 +83,7 @@ FittedEdge fit_edge(const AcceptedModel& accepted, int from, int to,
   const LocalModel start = accepted.part_i == from ? accepted.model : accepted.model.inverse();
   const PairData pair =
       make_pair_data(samples, from, to, measurement, std::numeric_limits<int>::max());
-  const Fit fit = fit_local_model(start, pair, actions, 60);
+  const Fit fit = fit_local_model(start, pair, actions, 60, 1e-6);
   const LeaveOneOut loo = leave_one_out(fit, pair, actions);
 
   FittedEdge result;
@@ -517,12 +517,17 @@ LearnedStructure find_structure(const std::vector<Signal>& signals,
     SearchResult found = search_structure(again, actions_again, parts, search_options);
     found.num_screens += result.search.num_screens;
     found.num_fits += result.search.num_fits;
-    if (found.models.size() < result.search.models.size()) {
+    const bool was_spanning = result.spans();
+    // What bends a command must be worth it to all markers together, not only to the models that
+    // asked for it.
+    const bool is_worth_it =
+        found.models.size() >= result.search.models.size() &&
+        (!was_spanning || found.log_likelihood >= result.search.log_likelihood + kWarpEvidence);
+    if (!is_worth_it) {
       result.search.num_screens = found.num_screens;
       result.search.num_fits = found.num_fits;
       break;
     }
-    const bool was_spanning = result.spans();
     result = {std::move(bent), parts, measurement, std::move(actions_again), std::move(found)};
     if (was_spanning) break;
   }
