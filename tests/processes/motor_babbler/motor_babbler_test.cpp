@@ -1176,7 +1176,7 @@ TEST(MotorBabblerTest, SaysWhatItWaitsFor) {
 TEST(MotorBabblerTest, TheConfigurationIsReadInSiUnits) {
   const MotorBabblerConfig config =
       MotorBabblerConfig::load(std::string(BODYSCHEMA_CONFIG) + "/arm2/motor_babbler.yaml");
-  EXPECT_EQ(config.choice, Choice::kActive);
+  EXPECT_EQ(config.choice, Choice::kRandom);
   EXPECT_EQ(config.signals.size(), 2U);
   EXPECT_EQ(config.resend_us, 1 * kSecond);
   EXPECT_EQ(config.expiry_us, 60 * kSecond);
