@@ -67,16 +67,9 @@ Eigen::MatrixXd Edge::jacobian(const Eigen::VectorXd& theta) const {
   return J;
 }
 
-Matrix6d Edge::prediction_covariance(const Eigen::VectorXd& theta) const {
-  if (matrix_gp) {
-    const Matrix6d A = adjoint(right.inverse());
-    return A * matrix_gp->prediction_covariance(theta) * A.transpose();
-  }
-  const Eigen::Index size = 6 + 8 * static_cast<Eigen::Index>(joints.size());
-  if (parameter_covariance.rows() != size || parameter_covariance.cols() != size)
-    return Matrix6d::Zero();
-  // ∂(right perturbation of the prediction)/∂parameters, from the last parameter to the first.
-  Eigen::MatrixXd G(6, size);
+Eigen::MatrixXd Edge::parameter_jacobian(const Eigen::VectorXd& theta) const {
+  Eigen::MatrixXd G(6, 6 + 8 * static_cast<Eigen::Index>(joints.size()));
+  // From the last parameter to the first.
   Pose suffix = right;
   for (std::size_t d = joints.size(); d-- > 0;) {
     const ScrewJoint& joint = joints[d];
@@ -90,6 +83,17 @@ Matrix6d Edge::prediction_covariance(const Eigen::VectorXd& theta) const {
     suffix = screw_motion(joint, displacement) * suffix;
   }
   G.leftCols<6>() = adjoint(suffix.inverse());
+  return G;
+}
+
+Matrix6d Edge::prediction_covariance(const Eigen::VectorXd& theta) const {
+  if (matrix_gp) {
+    const Matrix6d A = adjoint(right.inverse());
+    return A * matrix_gp->prediction_covariance(theta) * A.transpose();
+  }
+  const Eigen::MatrixXd G = parameter_jacobian(theta);
+  if (parameter_covariance.rows() != G.cols() || parameter_covariance.cols() != G.cols())
+    return Matrix6d::Zero();
   return G * parameter_covariance * G.transpose();
 }
 

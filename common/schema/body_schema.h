@@ -78,6 +78,9 @@ struct Edge {
   /// ∂/∂θ of the predicted pose: 6×m, right perturbation in the frame of `to`:
   /// predict(θ + δ) = predict(θ) · exp(J δ + O(δ²)).
   Eigen::MatrixXd jacobian(const Eigen::VectorXd& theta) const;
+  /// ∂/∂parameters of the predicted pose, 6×(6 + 8·|joints|): right perturbation in the frame of
+  /// `to`, parameters in the order of parameter_covariance. Of the screws, not of a matrix GP.
+  Eigen::MatrixXd parameter_jacobian(const Eigen::VectorXd& theta) const;
   /// First-order covariance of the prediction (right perturbation in the frame of `to`): from
   /// parameter_covariance, or from the matrix GP's own variances.
   Matrix6d prediction_covariance(const Eigen::VectorXd& theta) const;

@@ -176,6 +176,24 @@ Noise nominal_noise(Regime regime) {
   return {};
 }
 
+std::set<int> facing_parts(const SyntheticRobot& robot, const Eigen::VectorXd& action,
+                           double max_view_angle_rad) {
+  const std::vector<int> visible = robot.visible_parts();
+  if (max_view_angle_rad >= M_PI) return {visible.begin(), visible.end()};
+  Eigen::VectorXd middle(robot.signals.size());
+  for (std::size_t s = 0; s < robot.signals.size(); ++s)
+    middle(s) = 0.5 * (robot.signals[s].lower + robot.signals[s].upper);
+  // From the part to the camera, in the part's frame.
+  const auto to_camera = [](const Pose& X_CB) { return X_CB.inverse().translation().normalized(); };
+  const auto before = robot.poses_in_camera(middle), now = robot.poses_in_camera(action);
+  std::set<int> result;
+  for (const int part : visible) {
+    const double cosine = to_camera(before.at(part)).dot(to_camera(now.at(part)));
+    if (cosine >= std::cos(max_view_angle_rad)) result.insert(part);
+  }
+  return result;
+}
+
 ActionPoseSample observe(const SyntheticRobot& robot, const Eigen::VectorXd& action,
                          const ObservationOptions& options, std::int64_t sample_index, Rng& rng) {
   ActionPoseSample sample;
@@ -193,8 +211,9 @@ ActionPoseSample observe(const SyntheticRobot& robot, const Eigen::VectorXd& act
   const Noise noise = nominal_noise(options.regime);
   const bool tags = options.regime == Regime::kTag;
   const auto poses = robot.poses_in_camera(action);
+  const std::set<int> facing = facing_parts(robot, action, options.max_view_angle_rad);
   for (const TrueLink& link : robot.links) {
-    if (link.hidden) continue;
+    if (!facing.count(link.part)) continue;
     if (tags && uniform(rng, 0, 1) < 0.15) continue;
     const Pose& X_true = poses.at(link.part);
     Matrix6d root = Matrix6d::Zero();  // covariance = root · rootᵀ

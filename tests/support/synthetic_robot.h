@@ -1,5 +1,6 @@
 #pragma once
 
+#include <cmath>
 #include <map>
 #include <ostream>
 #include <random>
@@ -67,7 +68,13 @@ struct ObservationOptions {
   Regime regime = Regime::kFree;
   bool with_covariances = false;  ///< else all zero
   bool with_other_hypothesis = false;
+  /// A part is seen only while its marker faces the camera within this angle [rad]. Each part has
+  /// one, turned to the camera when all signals are at mid-range. π: from everywhere.
+  double max_view_angle_rad = M_PI;
 };
+/// The observable parts whose marker faces the camera.
+std::set<int> facing_parts(const SyntheticRobot& robot, const Eigen::VectorXd& action,
+                           double max_view_angle_rad);
 
 ActionPoseSample observe(const SyntheticRobot& robot, const Eigen::VectorXd& action,
                          const ObservationOptions& options, std::int64_t sample_index, Rng& rng);
