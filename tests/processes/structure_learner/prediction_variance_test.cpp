@@ -22,8 +22,7 @@ double mean_distance(const KinematicPath& path, int from, int to,
   for (const ActionPoseSample& sample : samples) {
     const PartObservation *a = sample.find(from), *b = sample.find(to);
     if (!a || !b) continue;
-    const Vector6d r =
-        log(path.predict(sample.action).inverse() * a->X_CB.inverse() * b->X_CB);
+    const Vector6d r = log(path.predict(sample.action).inverse() * a->X_CB.inverse() * b->X_CB);
     sum += r.dot(covariance(sample.action).ldlt().solve(r));
     ++count;
   }
@@ -46,8 +45,7 @@ TEST(PredictionVariance, OfALearnedRobotIsWhatItSaysOnSamplesNotLearnedFrom) {
     // The whole path's, from half of the others for the other half. A mean of 250 χ²₆ scatters by
     // 0.22; the covariance of 250 residuals adds as much.
     const std::vector<ActionPoseSample> judges(others.begin() + 250, others.end());
-    const auto global =
-        empirical_covariance(*path, 1, 5, {others.begin(), others.begin() + 250});
+    const auto global = empirical_covariance(*path, 1, 5, {others.begin(), others.begin() + 250});
     ASSERT_TRUE(global);
     const double by_global =
         mean_distance(*path, 1, 5, judges, [&](const auto&) { return *global; });
