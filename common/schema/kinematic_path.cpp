@@ -204,9 +204,8 @@ Matrix6d KinematicPath::covariance(const Eigen::Ref<const Eigen::VectorXd>& acti
   Matrix6d sum = Matrix6d::Zero();
   for (const Leg& leg : legs_) {
     Pose X = leg.edge.predict(theta);
-    Matrix6d covariance = variance == Variance::kFirstOrder
-                              ? leg.edge.prediction_covariance(theta)
-                              : leg.edge.empirical_covariance();
+    Matrix6d covariance = variance == Variance::kFirstOrder ? leg.edge.prediction_covariance(theta)
+                                                            : leg.edge.empirical_covariance();
     if (!leg.is_forward) {
       covariance = turned(covariance, X);
       X = X.inverse();
@@ -243,7 +242,7 @@ std::vector<PoseJacobian> KinematicPath::jacobian_trajectory(const Eigen::Matrix
 
 std::optional<Matrix6d> empirical_covariance(const KinematicPath& path, int from, int to,
                                              const std::vector<ActionPoseSample>& samples) {
-  constexpr double kOutlier = 20.06;           // χ²₆(.9973)
+  constexpr double kOutlier = 20.06;             // χ²₆(.9973)
   constexpr double kDeviationOfMedian = 1.4826;  // of a normal distribution
   constexpr std::size_t kFewest = 7;
   std::vector<Vector6d> residuals;

@@ -227,7 +227,8 @@ void ModelMonitor::assess(std::int64_t up_to_sample) {
       if (!seen || !path || schema_.root < 0 || !fits(sample)) continue;
       // The camera and the root stand still, so the root's mean pose serves: its orientation noise
       // would otherwise be read as an error of every part far away.
-      const Pose error = path->predict(sample.action).inverse() * schema_.X_CR.inverse() * seen->X_CB;
+      const Pose error =
+          path->predict(sample.action).inverse() * schema_.X_CR.inverse() * seen->X_CB;
       position_errors.push_back(error.translation().norm());
       rotation_errors.push_back(rotation_angle(error));
     }

@@ -88,8 +88,7 @@ FittedEdge fit_edge(const AcceptedModel& accepted, int from, int to,
 
   FittedEdge result;
   if (must_be_valid) {
-    result.is_valid =
-        check_validity(fit, loo, pair, actions, validity).verdict == Verdict::kValid;
+    result.is_valid = check_validity(fit, loo, pair, actions, validity).verdict == Verdict::kValid;
     if (!result.is_valid) return result;
   }
   result.edge = to_edge(fit.model, actions);
@@ -444,8 +443,8 @@ LearnResult fit_tree(const LearnedStructure& structure,
         if (!reached.insert(to).second) continue;
         AcceptedModel start = m;
         start.model = rescaled(m.model, structure.actions, actions);
-        FittedEdge edge = fit_edge(start, queue[head], to, moved, actions, measurement,
-                                   validity, must_be_valid);
+        FittedEdge edge =
+            fit_edge(start, queue[head], to, moved, actions, measurement, validity, must_be_valid);
         if (!edge.is_valid) {
           result.refuted.emplace_back(m.part_i, m.part_j);
           reached.erase(to);

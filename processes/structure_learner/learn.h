@@ -78,8 +78,9 @@ LearnedStructure find_structure(const std::vector<Signal>& signals,
                                 const std::vector<ActionPoseSample>& samples,
                                 const LearnOptions& options = {});
 
-/// The second half of learn(): the edges of `structure` fitted to `samples`, which need not be those
-/// that it was found from, and all else that is in a schema. learn() = fit_structure(find_structure).
+/// The second half of learn(): the edges of `structure` fitted to `samples`, which need not be
+/// those that it was found from, and all else that is in a schema. learn() =
+/// fit_structure(find_structure).
 LearnResult fit_structure(const LearnedStructure& structure,
                           const std::vector<ActionPoseSample>& samples,
                           const LearnOptions& options = {});

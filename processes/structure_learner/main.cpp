@@ -71,8 +71,7 @@ int main(int argc, char** argv) {
         fit = std::async(std::launch::async, learner.take_job());
         if (is_ready(fit, kUsualFit)) collect();
       }
-      if (!fit.valid() && !learner.has_job() && !preparation.valid() &&
-          learner.has_preparation()) {
+      if (!fit.valid() && !learner.has_job() && !preparation.valid() && learner.has_preparation()) {
         preparation = std::async(std::launch::async, learner.take_preparation());
       }
     };

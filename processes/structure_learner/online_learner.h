@@ -38,8 +38,8 @@ class OnlineLearner {
   OnlineLearner(std::vector<Signal> signals, LearnOptions options);
 
   /// The schema of `samples` by the structure of the last checkpoint within the first
-  /// `num_searched` of them. As learn() with the options, except that a root that nobody saw is only
-  /// expected and makes the schema incomplete: the rest is learned without it.
+  /// `num_searched` of them. As learn() with the options, except that a root that nobody saw is
+  /// only expected and makes the schema incomplete: the rest is learned without it.
   BodySchema learn(const SharedSamples& samples, int num_searched);
   /// Makes learn() of these samples, or of more with the same checkpoint, free of searches.
   void prepare(const SharedSamples& samples);

@@ -143,7 +143,8 @@ struct KdlArm {
         for (int j = 0; j < 3; ++j)
           worst = std::max(worst, std::abs(frame.M(i, j) - X.linear()(i, j)));
       }
-      if (!(worst < 1e-8)) throw std::logic_error("KDL's arm is another: off by " + std::to_string(worst));
+      if (!(worst < 1e-8))
+        throw std::logic_error("KDL's arm is another: off by " + std::to_string(worst));
     }
   }
 };
@@ -179,7 +180,8 @@ void PredictAndJacobian(benchmark::State& state) {
   }
 }
 
-/// KDL's solver for the Jacobian walks the chain but gives no pose: pose and Jacobian are two calls.
+/// KDL's solver for the Jacobian walks the chain but gives no pose: pose and Jacobian are two
+/// calls.
 void PredictAndJacobianByKdl(benchmark::State& state) {
   KDL::ChainFkSolverPos_recursive kinematics(kdl_arm().chain);
   KDL::ChainJntToJacSolver derivative(kdl_arm().chain);
@@ -335,14 +337,13 @@ BENCHMARK(LearnFortyPartsAsTheChapter)  // at 25 samples it takes a quarter of a
 int main(int argc, char** argv) {
   benchmark::Initialize(&argc, argv);
   bodyschema::test::kdl_arm();  // or say that it is not the same arm
-  bodyschema::test::RatioReporter reporter(
-      {{"Predict", "PredictByKdl"},
-       {"PredictAndJacobian", "PredictAndJacobianByKdl"},
-       {"PredictAndJacobian", "JacobianByKdl"},
-       {"FitMatrixGp/25", "FitScrew/25"},
-       {"FitMatrixGp/100", "FitScrew/100"},
-       {"LearnAsTheChapter/25", "Learn/25"},
-       {"LearnFortyPartsAsTheChapter/5", "LearnFortyParts/5"},
-       {"Learn/100", "LearnOneMore/100"}});
+  bodyschema::test::RatioReporter reporter({{"Predict", "PredictByKdl"},
+                                            {"PredictAndJacobian", "PredictAndJacobianByKdl"},
+                                            {"PredictAndJacobian", "JacobianByKdl"},
+                                            {"FitMatrixGp/25", "FitScrew/25"},
+                                            {"FitMatrixGp/100", "FitScrew/100"},
+                                            {"LearnAsTheChapter/25", "Learn/25"},
+                                            {"LearnFortyPartsAsTheChapter/5", "LearnFortyParts/5"},
+                                            {"Learn/100", "LearnOneMore/100"}});
   benchmark::RunSpecifiedBenchmarks(&reporter);
 }

@@ -69,8 +69,9 @@ int main(int argc, char** argv) {
       row.right += is_right(from_message(schema), robot);
     }
   }
-  std::printf("| N | SAMPLE to LEARNED_SCHEMA, median | worst | over 20 ms | preparation, median | "
-              "worst | right |\n|---|---|---|---|---|---|---|\n");
+  std::printf(
+      "| N | SAMPLE to LEARNED_SCHEMA, median | worst | over 20 ms | preparation, median | "
+      "worst | right |\n|---|---|---|---|---|---|---|\n");
   for (std::size_t r = 0; r < rows.size(); ++r) {
     const Row& row = rows[r];
     if (row.learning_s.empty()) continue;

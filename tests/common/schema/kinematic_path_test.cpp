@@ -29,8 +29,8 @@ Edge random_edge(int from, int to, const std::vector<int>& signals, Rng& rng) {
     edge.joints.push_back(joint);
   }
   const Eigen::Index size = 6 + 8 * static_cast<Eigen::Index>(signals.size());
-  const Eigen::MatrixXd root = Eigen::MatrixXd::NullaryExpr(
-      size, size, [&] { return 1e-4 * test::gaussian(rng); });
+  const Eigen::MatrixXd root =
+      Eigen::MatrixXd::NullaryExpr(size, size, [&] { return 1e-4 * test::gaussian(rng); });
   edge.parameter_covariance = root * root.transpose();
   edge.position_rms_m = test::uniform(rng, 1e-4, 1e-3);
   edge.rotation_rms_rad = test::uniform(rng, 1e-4, 1e-3);
@@ -61,14 +61,14 @@ Signal bent_signal(const std::string& name, Rng& rng) {
   return signal;
 }
 
-// 1 → 2 → 3 → 6 (rigid), 2 → 4 → 7 (matrix GP); 5 alone. Signal 0 moves two edges and is bent, as is
-// signal 1.
+// 1 → 2 → 3 → 6 (rigid), 2 → 4 → 7 (matrix GP); 5 alone. Signal 0 moves two edges and is bent, as
+// is signal 1.
 BodySchema random_schema(Rng& rng) {
   BodySchema schema;
   schema.parts = {1, 2, 3, 4, 5, 6, 7};
   schema.root = 1;
-  schema.signals = {bent_signal("q1", rng), bent_signal("q2", rng), {"q3", -1, 1, {}},
-                    {"q4", -1, 1, {}}};
+  schema.signals = {
+      bent_signal("q1", rng), bent_signal("q2", rng), {"q3", -1, 1, {}}, {"q4", -1, 1, {}}};
   schema.edges = {random_edge(1, 2, {0}, rng), random_edge(2, 3, {1, 2}, rng),
                   random_edge(2, 4, {0}, rng), random_edge(3, 6, {}, rng),
                   matrix_gp_edge(4, 7, rng)};
@@ -143,8 +143,7 @@ TEST(KinematicPath, PredictsWhatItsEdgesPredictOneByOne) {
       EXPECT_TRUE(path->predict(q).isApprox(expected.X, 1e-12)) << from << " " << to;
       EXPECT_TRUE(path->predict(q, &J).isApprox(expected.X, 1e-12)) << from << " " << to;
       Eigen::MatrixXd by_action = expected.jacobian;
-      for (int s = 0; s < 4; ++s)
-        by_action.col(s) *= schema.signals[s].displacement_rate(q(s));
+      for (int s = 0; s < 4; ++s) by_action.col(s) *= schema.signals[s].displacement_rate(q(s));
       EXPECT_LT((J - by_action).norm(), 1e-11 * (1 + by_action.norm())) << from << " " << to;
       EXPECT_LT((path->covariance(q, Variance::kFirstOrder) - expected.first_order).norm(),
                 1e-10 * (1e-12 + expected.first_order.norm()));
@@ -194,8 +193,7 @@ TEST(KinematicPath, ATrajectoryIsItsInstants) {
       const Pose X = path->predict(actions.col(t), &J);
       EXPECT_TRUE(poses[t].isApprox(X, 1e-12));
       EXPECT_EQ(predictions[t].X_AB.matrix(), poses[t].matrix());
-      EXPECT_EQ(predictions[t].covariance,
-                path->covariance(actions.col(t), Variance::kEmpirical));
+      EXPECT_EQ(predictions[t].covariance, path->covariance(actions.col(t), Variance::kEmpirical));
       EXPECT_EQ(jacobians[t], J);
     }
     EXPECT_TRUE(path->predict_trajectory(Eigen::MatrixXd(4, 0)).empty());
@@ -220,9 +218,9 @@ TEST(KinematicPath, FirstOrderCovarianceIsThatOfDrawnParameters) {
     for (std::size_t e = 0; e < schema.edges.size(); ++e) {
       Edge& edge = robot.edges[e];
       edge = schema.edges[e];
-      const Eigen::VectorXd delta =
-          roots[e] * Eigen::VectorXd::NullaryExpr(roots[e].rows(),
-                                                  [&] { return test::gaussian(rng); });
+      const Eigen::VectorXd delta = roots[e] * Eigen::VectorXd::NullaryExpr(roots[e].rows(), [&] {
+                                      return test::gaussian(rng);
+                                    });
       edge.left = edge.left * exp(delta.head<6>());
       for (std::size_t d = 0; d < edge.joints.size(); ++d) {
         const auto first = 6 + 8 * static_cast<Eigen::Index>(d);
@@ -272,8 +270,7 @@ TEST(KinematicPath, EmpiricalCovarianceIsThatOfEdgesThatScatterAsTheySay) {
 TEST(KinematicPath, GlobalCovarianceIsTheNoiseOfTheSamplesWithoutItsOutliers) {
   Rng rng(6);
   const BodySchema schema = random_schema(rng);
-  const Matrix6d root =
-      Matrix6d::NullaryExpr([&] { return 1e-3 * test::gaussian(rng); });
+  const Matrix6d root = Matrix6d::NullaryExpr([&] { return 1e-3 * test::gaussian(rng); });
   const auto path = KinematicPath::between(schema, 6, 4);
   std::vector<ActionPoseSample> samples(20'000);
   for (std::size_t t = 0; t < samples.size(); ++t) {
@@ -289,8 +286,8 @@ TEST(KinematicPath, GlobalCovarianceIsTheNoiseOfTheSamplesWithoutItsOutliers) {
   }
   const auto covariance = empirical_covariance(*path, 6, 4, samples);
   ASSERT_TRUE(covariance);
-  const Eigen::GeneralizedSelfAdjointEigenSolver<Matrix6d> ratio(
-      *covariance, Matrix6d(root * root.transpose()));
+  const Eigen::GeneralizedSelfAdjointEigenSolver<Matrix6d> ratio(*covariance,
+                                                                 Matrix6d(root * root.transpose()));
   EXPECT_GT(ratio.eigenvalues().minCoeff(), 0.93);  // cut at χ²₆(.9973): 0.994 in the mean
   EXPECT_LT(ratio.eigenvalues().maxCoeff(), 1.05);
 
@@ -307,8 +304,7 @@ TEST(KinematicPath, AStuckJointIsAConstant) {
   moved(1) += 0.5;
   const auto path = KinematicPath::between(schema, 1, 3);
   EXPECT_EQ(path->predict(q).matrix(), path->predict(moved).matrix());
-  EXPECT_TRUE(path->predict(q).isApprox(
-      ByEdges(schema, 1, 3, schema.displacements(q)).X, 1e-12));
+  EXPECT_TRUE(path->predict(q).isApprox(ByEdges(schema, 1, 3, schema.displacements(q)).X, 1e-12));
   PoseJacobian J;
   path->predict(q, &J);
   EXPECT_TRUE(J.col(1).isZero(0));
@@ -320,8 +316,9 @@ TEST(KinematicPath, LeadsOnlyWhereEdgesLead) {
   const BodySchema schema = random_schema(rng);
   EXPECT_FALSE(KinematicPath::between(schema, 1, 5));
   EXPECT_FALSE(KinematicPath::between(schema, 5, 1));
-  EXPECT_TRUE(KinematicPath::between(schema, 5, 5)->predict(random_action(rng)).isApprox(
-      Pose::Identity(), 0));
+  EXPECT_TRUE(KinematicPath::between(schema, 5, 5)
+                  ->predict(random_action(rng))
+                  .isApprox(Pose::Identity(), 0));
 }
 
 TEST(KinematicPath, RefusesActionsOfTheWrongSizeAndSignalsThatAreNotThere) {

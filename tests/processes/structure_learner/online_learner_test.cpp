@@ -55,8 +55,8 @@ Recording tag_run(const std::string& name, int num_samples, int seed, double ben
   Rng rng(seed);
   Recording run{test::chapter_robot(name, rng), {}};
   run.robot.bend = bend;
-  run.samples = shared(test::babble(
-      run.robot, num_samples, {.regime = test::Regime::kTag, .with_covariances = true}, rng));
+  run.samples = shared(test::babble(run.robot, num_samples,
+                                    {.regime = test::Regime::kTag, .with_covariances = true}, rng));
   return run;
 }
 
@@ -127,7 +127,8 @@ TEST(OnlineLearner, ManySamplesAreLearnedFromAtCheckpoints) {
   expect_same(other.learn(run.samples, 469), schema);
 }
 
-// The newest sample counts, and as much as in learn(): between checkpoints only the structure waits.
+// The newest sample counts, and as much as in learn(): between checkpoints only the structure
+// waits.
 TEST(OnlineLearner, BetweenCheckpointsAllSamplesAreFittedTo) {
   const Recording run = tag_run("a", 64, 35);
   ASSERT_LT(OnlineLearner::checkpoint_within(64), 64);
@@ -176,9 +177,8 @@ Pose forty_degrees() {
 }
 
 bool connects_beyond(const BodySchema& schema, int part) {
-  return std::any_of(schema.edges.begin(), schema.edges.end(), [&](const Edge& edge) {
-    return edge.from <= part && edge.to > part;
-  });
+  return std::any_of(schema.edges.begin(), schema.edges.end(),
+                     [&](const Edge& edge) { return edge.from <= part && edge.to > part; });
 }
 
 std::vector<ActionPoseSample> plain(const SharedSamples& samples) {
