@@ -23,18 +23,23 @@ struct Cell {
   int false_complete = 0;  ///< wrong, and said to be complete
   long fits = 0;
   std::vector<double> position_m, angle_rad;
-  double worst_m = 0;
+
+  int num_robots = 0;
 
   void add(const std::optional<PoseErrors>& errors) {
+    ++num_robots;
     if (!errors) return;
     position_m.push_back(errors->position_mean_m);
     angle_rad.push_back(errors->rotation_mean_rad);
-    worst_m = std::max(worst_m, errors->position_mean_m);
   }
   std::string errors_text() const {
     if (position_m.empty()) return "–";
+    const std::string of =
+        num_robots > static_cast<int>(position_m.size())
+            ? fmt::format(" ({} of {} robots)", position_m.size(), num_robots)
+            : "";
     return mean_and_error(spread_of(position_m), kMillimetre) + " mm, " +
-           mean_and_error(spread_of(angle_rad), kDegree) + "°";
+           mean_and_error(spread_of(angle_rad), kDegree) + "°" + of;
   }
 };
 
@@ -155,7 +160,7 @@ Findings four_dof(const Setup& setup, const std::string& robot, const std::strin
   Panel structure{.title = title + ": structure",
                   .x_label = "samples N",
                   .y_label = "structure right [% of robots]",
-                  .references = {{"chapter: found (one robot, N not told)", 100}},
+                  .references = {{"chapter: found", 100}},
                   .log_x = true,
                   .y_range = {0, 105}};
   Panel accuracy{.title = title + ": accuracy",
@@ -232,13 +237,13 @@ Findings seven_dof(const Setup& setup) {
   Panel structure{.title = "Fig. 11: 7-DOF robot, 10 parts, x4 never seen: structure",
                   .x_label = "samples N",
                   .y_label = "structure right [% of robots]",
-                  .references = {{"chapter: right after about 10 (noise-free)", 100}},
+                  .references = {{"chapter: after about 10 (free)", 100}},
                   .log_x = true,
                   .y_range = {0, 105}};
   Panel position{.title = "position",
                  .x_label = "samples N",
                  .y_label = "mean position error of the end effector [mm]",
-                 .references = {{"chapter: 1 mm after about 100 (noise-free)", 1}},
+                 .references = {{"chapter: 1 mm after 100 (free)", 1}},
                  .log_x = true,
                  .log_y = true};
   Panel noisy = position;
@@ -282,7 +287,7 @@ Findings seven_dof(const Setup& setup) {
             {angle_deg > 0 ? fmt::format("7-DOF, {}, N = {}: ≤ {:g} mm, {:g}°", name, N,
                                          position_m * 1e3, angle_deg)
                            : fmt::format("7-DOF, {}, N = {}: ≤ {:g} mm", name, N, position_m * 1e3),
-             u.errors_text() + fmt::format(", {} of {} robots connect it", p.count, num_robots),
+             u.errors_text(),
              p.count > 0 && p.mean <= position_m &&
                  (angle_deg == 0 || a.mean <= angle_deg * kDegree)});
       };
@@ -314,12 +319,12 @@ Findings seven_dof(const Setup& setup) {
     also(structure, right_curve(found, "baseline, " + name, colour), true);
     if (regime == Regime::kFree) {
       also(position, position_curve(us, "ours, " + name, colour), false);
-      also(position, position_curve(models, "baseline (true structure), " + name, colour), true);
+      also(position, position_curve(models, "baseline, " + name, colour), true);
     } else {
       also(noisy, position_curve(us, "ours, " + name, colour), false);
-      also(noisy, position_curve(models, "baseline (true structure), " + name, colour), true);
+      also(noisy, position_curve(models, "baseline, " + name, colour), true);
       also(angle, angle_curve(us, "ours, " + name, colour), false);
-      also(angle, angle_curve(models, "baseline (true structure), " + name, colour), true);
+      also(angle, angle_curve(models, "baseline, " + name, colour), true);
     }
     ++colour;
   }

@@ -66,7 +66,7 @@ std::string script_of(const Panel& panel, int index) {
                      dash++, gnuplot_string(reference.title)));
   std::string result = data;
   result += "set title " + gnuplot_string(panel.title) + "\n";
-  result += "set xlabel " + gnuplot_string(panel.x_label) + "\n";
+  result += "set xlabel " + gnuplot_string(panel.x_label) + " offset 0,0.6\n";
   result += "set ylabel " + gnuplot_string(panel.y_label) + "\n";
   double low = INFINITY, high = -INFINITY;
   for (const Curve& curve : panel.curves) {
@@ -80,13 +80,11 @@ std::string script_of(const Panel& panel, int index) {
                         number(high * factor + margin));
   result += panel.log_x ? "set logscale x\nset xtics (3, 5, 8, 10, 15, 20, 30, 50, 100, 200)\n"
                         : "unset logscale x\nset xtics autofreq\n";
-  result += panel.log_y ? "set logscale y\nset format y '%.0e'\n" : "unset logscale y\nset format y '%g'\n";
-  if (panel.y_range.size() == 2) {
+  result += panel.log_y ? "set logscale y\n" : "unset logscale y\n";
+  if (panel.y_range.size() == 2)
     result += fmt::format("set yrange [{}:{}]\n", number(panel.y_range[0]), number(panel.y_range[1]));
-    if (panel.log_y && panel.y_range[0] > 1e-3) result += "set format y '%g'\n";
-  } else {
+  else
     result += "set yrange [*:*]\n";
-  }
   result += "set key " + panel.key + " spacing 1.1 samplen 3\n";
   return result + curves + "\n";
 }

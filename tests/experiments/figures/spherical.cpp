@@ -83,7 +83,7 @@ Findings spherical(const Setup& setup) {
     Panel panel{.title = "Fig. 6, " + name + fmt::format(": q2 moves from sample {} on", kResting + 1),
                 .x_label = "samples N",
                 .y_label = "robots [%]",
-                .references = {{"chapter: first {q1}, then {q1, q2}", 100}},
+                .references = {{"chapter: {q1}, then {q1, q2}", 100}},
                 .y_range = {0, 105}};
     for (const auto* side : {&baseline, &ours}) {
       for (const Said what : {Said::kOne, Said::kBoth}) {

@@ -78,10 +78,13 @@ test::Rightness rightness_of_baseline(const Trial& trial,
       trial.robot);
 }
 
-std::string errors_text(const std::vector<double>& position, const std::vector<double>& angle) {
-  if (position.empty()) return "–";
-  return mean_and_error(spread_of(position), kMillimetre) + " mm, " +
-         mean_and_error(spread_of(angle), kDegree) + "°";
+std::string errors_text(const Column& column, int num_robots) {
+  if (column.mean.empty()) return "–";
+  const std::string of = num_robots > static_cast<int>(column.mean.size())
+                             ? fmt::format(" ({} of {} robots)", column.mean.size(), num_robots)
+                             : "";
+  return mean_and_error(spread_of(column.mean), kMillimetre) + " mm, " +
+         mean_and_error(spread_of(column.angle), kDegree) + "°" + of;
 }
 
 }  // namespace
@@ -139,8 +142,8 @@ Findings two_dof_noise(const Setup& setup) {
                "ours over the bound"});
   Curve prediction{.title = "ours, prediction", .colour = 1},
       control{.title = "ours, control", .colour = 5},
-      base_prediction{.title = "baseline (true structure), prediction", .colour = 0},
-      base_control{.title = "baseline (true structure), control", .colour = 4},
+      base_prediction{.title = "baseline, prediction", .colour = 0},
+      base_control{.title = "baseline, control", .colour = 4},
       bound_curve{.title = "Cramér–Rao bound", .colour = 3};
   for (std::size_t s = 0; s < S; ++s) {
     const Column us = column(ours, s), them = column(baseline, s);
@@ -187,15 +190,15 @@ Findings two_dof_noise(const Setup& setup) {
          .x_label = "samples N",
          .y_label = "position error of the end effector, rms [mm]",
          .curves = {base_prediction, base_control, prediction, control, bound_curve},
-         .references = {{"chapter: marker noise, undercut after 15", 44},
-                        {"chapter: control, about 50 mm", 50}},
+         .references = {{"chapter: 44 mm, after 15", 44},
+                        {"chapter: control 50 mm", 50}},
          .log_x = true,
          .log_y = true,
          .y_range = {7, 250}}},
        1);
   findings.markdown = fmt::format(
       "{} robots (baseline {}), {} test poses each; per robot the rms of the end effector's position "
-      "error, then mean ± standard error over the robots. Control: the position that inverse "
+      "error, then mean ± standard error over the robots that connect it with the root. Control: the position that inverse "
       "kinematics on the learned model reaches by the robot's truth, {} targets a robot (baseline {}). "
       "Structure: right with its Wilson lower bound (95 %) / incomplete / wrong. The chapter's robot "
       "was a real one; its curve is known at the points named.\n\n{}",
@@ -236,7 +239,7 @@ Findings two_dof_free(const Setup& setup) {
       }
     });
     Curve us{.title = "ours", .colour = 1},
-        them{.title = "baseline (true structure)", .colour = 0};
+        them{.title = "baseline", .colour = 0};
     for (std::size_t s = 0; s < S; ++s) {
       Column our_column, their_column;
       for (const auto& robot : ours) {
@@ -253,17 +256,15 @@ Findings two_dof_free(const Setup& setup) {
                  : N == 100 ? "< 1 mm, 0.2°"
                             : "–",
                  their_column.right(),
-                 errors_text(their_column.mean, their_column.angle), our_column.structure.text(),
-                 errors_text(our_column.mean, our_column.angle)});
+                 errors_text(their_column, num_baseline), our_column.structure.text(),
+                 errors_text(our_column, num_robots)});
       const Spread position = spread_of(our_column.mean), angle = spread_of(our_column.angle);
       us.x.push_back(N);
       us.y.push_back(position.mean / kMillimetre);
       them.x.push_back(N);
       them.y.push_back(spread_of(their_column.mean).mean / kMillimetre);
       const bool all = position.count == num_robots;
-      const std::string measured =
-          errors_text(our_column.mean, our_column.angle) +
-          (all ? "" : fmt::format(" in {} of {} robots", position.count, num_robots));
+      const std::string measured = errors_text(our_column, num_robots);
       if (bend == 0 && N == 5) {
         const double worst = *std::max_element(our_column.mean.begin(), our_column.mean.end());
         findings.musts.push_back({"2-DOF, free, straight commands, N = 5: < 1e-9 m",
