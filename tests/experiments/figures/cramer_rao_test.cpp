@@ -50,9 +50,9 @@ TEST(CramerRao, OfARigidConnectionIsTheCovarianceOfTheMean) {
   const Eigen::VectorXd q(0);
   const auto X = robot.poses_in_camera(q);
   const Pose z = X.at(1).inverse() * X.at(2);
-  const Matrix6d expected = relative_covariance(z, samples[0].find(1)->covariance,
-                                                samples[0].find(2)->covariance) /
-                            kSamples;
+  const Matrix6d expected =
+      relative_covariance(z, samples[0].find(1)->covariance, samples[0].find(2)->covariance) /
+      kSamples;
   EXPECT_TRUE(bound.bound(1, 2, q).isApprox(expected, 1e-6));
 }
 
@@ -115,8 +115,7 @@ TEST(CramerRao, IsWhatMaximumLikelihoodReaches) {
     std::vector<std::map<int, Pose>> seen(kSamples);
     for (int t = 0; t < kSamples; ++t)
       for (const auto& [part, X] : robot.poses_in_camera(samples[t].action))
-        seen[t][part] =
-            X * exp(variances.cwiseSqrt().cwiseProduct(test::gaussian6(rng)));
+        seen[t][part] = X * exp(variances.cwiseSqrt().cwiseProduct(test::gaussian6(rng)));
     SyntheticRobot model = robot;
     for (int iteration = 0; iteration < 2; ++iteration) {
       const CramerRao parameters(model);

@@ -38,12 +38,14 @@ std::string script_of(const Panel& panel, int index) {
       data += fmt::format("{} {} {}\n", number(curve.x[n]), number(curve.y[n]),
                           number(curve.error.empty() ? 0 : curve.error[n]));
     data += "END\n";
-    const std::string title = curve.title.empty() ? "notitle" : "title " + gnuplot_string(curve.title);
+    const std::string title =
+        curve.title.empty() ? "notitle" : "title " + gnuplot_string(curve.title);
     switch (curve.kind) {
       case Curve::Kind::kBand:
-        also(fmt::format("{} using 1:($2-$3):($2+$3) with filledcurves fs transparent solid 0.18 "
-                         "noborder {} notitle",
-                         block, style(curve.colour)));
+        also(
+            fmt::format("{} using 1:($2-$3):($2+$3) with filledcurves fs transparent solid 0.18 "
+                        "noborder {} notitle",
+                        block, style(curve.colour)));
         also(fmt::format("{} using 1:2 with lines lw 2 {} {}", block, style(curve.colour), title));
         break;
       case Curve::Kind::kLine:
@@ -82,7 +84,8 @@ std::string script_of(const Panel& panel, int index) {
                         : "unset logscale x\nset xtics autofreq\n";
   result += panel.log_y ? "set logscale y\n" : "unset logscale y\n";
   if (panel.y_range.size() == 2)
-    result += fmt::format("set yrange [{}:{}]\n", number(panel.y_range[0]), number(panel.y_range[1]));
+    result +=
+        fmt::format("set yrange [{}:{}]\n", number(panel.y_range[0]), number(panel.y_range[1]));
   else
     result += "set yrange [*:*]\n";
   result += "set key " + panel.key + " spacing 1.1 samplen 3\n";
