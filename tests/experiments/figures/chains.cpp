@@ -23,18 +23,22 @@ struct Cell {
   int false_complete = 0;  ///< wrong, and said to be complete
   long fits = 0;
   std::vector<double> position_m, angle_rad;
-  double worst_m = 0;
+
+  int num_robots = 0;
 
   void add(const std::optional<PoseErrors>& errors) {
+    ++num_robots;
     if (!errors) return;
     position_m.push_back(errors->position_mean_m);
     angle_rad.push_back(errors->rotation_mean_rad);
-    worst_m = std::max(worst_m, errors->position_mean_m);
   }
   std::string errors_text() const {
     if (position_m.empty()) return "–";
+    const std::string of = num_robots > static_cast<int>(position_m.size())
+                               ? fmt::format(" ({} of {} robots)", position_m.size(), num_robots)
+                               : "";
     return mean_and_error(spread_of(position_m), kMillimetre) + " mm, " +
-           mean_and_error(spread_of(angle_rad), kDegree) + "°";
+           mean_and_error(spread_of(angle_rad), kDegree) + "°" + of;
   }
 };
 
@@ -155,7 +159,7 @@ Findings four_dof(const Setup& setup, const std::string& robot, const std::strin
   Panel structure{.title = title + ": structure",
                   .x_label = "samples N",
                   .y_label = "structure right [% of robots]",
-                  .references = {{"chapter: found (one robot, N not told)", 100}},
+                  .references = {{"chapter: found", 100}},
                   .log_x = true,
                   .y_range = {0, 105}};
   Panel accuracy{.title = title + ": accuracy",
@@ -166,8 +170,7 @@ Findings four_dof(const Setup& setup, const std::string& robot, const std::strin
   std::string examples;
   int colour = 1;
   for (const Regime regime : {Regime::kFree, Regime::kChapter, Regime::kTag}) {
-    const Measurement us =
-        measure(setup, "ours", robot, regime, sizes, num_robots, ask_ours);
+    const Measurement us = measure(setup, "ours", robot, regime, sizes, num_robots, ask_ours);
     const Measurement them =
         measure(setup, "baseline", robot, regime, sizes, num_baseline, ask_baseline);
     for (std::size_t s = 0; s < sizes.size(); ++s) {
@@ -177,13 +180,12 @@ Findings four_dof(const Setup& setup, const std::string& robot, const std::strin
                  t.structure.text(), std::to_string(t.fits / num_baseline), t.errors_text(),
                  u.structure.text(), std::to_string(u.fits / num_robots), u.errors_text()});
       if (regime == Regime::kFree && N >= 10)
-        findings.musts.push_back(
-            {fmt::format("{}, free, N = {}: structure right", title, N),
-             u.structure.text(), u.structure.right == num_robots});
+        findings.musts.push_back({fmt::format("{}, free, N = {}: structure right", title, N),
+                                  u.structure.text(), u.structure.right == num_robots});
     }
-    examples += fmt::format("- {}, seed 1, N = {}: ours {}; baseline {}\n", test::name_of(regime),
-                            sizes.back(), us.answers.back()[0].structure,
-                            them.answers.back()[0].structure);
+    examples +=
+        fmt::format("- {}, seed 1, N = {}: ours {}; baseline {}\n", test::name_of(regime),
+                    sizes.back(), us.answers.back()[0].structure, them.answers.back()[0].structure);
     structure.curves.push_back(
         right_curve(us, fmt::format("ours, {}", test::name_of(regime)), colour));
     Curve base = right_curve(them, fmt::format("baseline, {}", test::name_of(regime)), colour);
@@ -199,7 +201,8 @@ Findings four_dof(const Setup& setup, const std::string& robot, const std::strin
   draw(setup, file, {structure, accuracy}, 2);
   findings.markdown = fmt::format(
       "{} robots (baseline {}). Structure: right with its Wilson lower bound (95 %) / incomplete / "
-      "wrong; the local models learned until then (fits); mean error of the end effector over {} test "
+      "wrong; the local models learned until then (fits); mean error of the end effector over {} "
+      "test "
       "poses, mean ± standard error over the robots (baseline: on the true structure, whatever it "
       "found).\n\n{}\n{}",
       num_robots, num_baseline, kTestPoses, table.markdown(), examples);
@@ -217,8 +220,8 @@ Findings occluded(const Setup& setup) {
 }
 
 Findings seven_dof(const Setup& setup) {
-  const std::vector<int> sizes = setup.quick ? std::vector<int>{5, 10, 20}
-                                             : std::vector<int>{5, 10, 15, 20, 50, 100};
+  const std::vector<int> sizes =
+      setup.quick ? std::vector<int>{5, 10, 20} : std::vector<int>{5, 10, 15, 20, 50, 100};
   const std::vector<int> search_sizes =
       setup.quick ? std::vector<int>{10} : std::vector<int>{5, 10, 20};
   const std::vector<int> model_sizes =
@@ -227,18 +230,18 @@ Findings seven_dof(const Setup& setup) {
             num_models = setup.robots(20, 1);
   Findings findings;
   Table table({"regime", "N", "chapter", "baseline: structure right %", "fits",
-               "baseline on the true structure", "ours: structure right %",
-               "wrong but complete %", "fits", "ours"});
+               "baseline on the true structure", "ours: structure right %", "wrong but complete %",
+               "fits", "ours"});
   Panel structure{.title = "Fig. 11: 7-DOF robot, 10 parts, x4 never seen: structure",
                   .x_label = "samples N",
                   .y_label = "structure right [% of robots]",
-                  .references = {{"chapter: right after about 10 (noise-free)", 100}},
+                  .references = {{"chapter: after about 10 (free)", 100}},
                   .log_x = true,
                   .y_range = {0, 105}};
   Panel position{.title = "position",
                  .x_label = "samples N",
                  .y_label = "mean position error of the end effector [mm]",
-                 .references = {{"chapter: 1 mm after about 100 (noise-free)", 1}},
+                 .references = {{"chapter: 1 mm after 100 (free)", 1}},
                  .log_x = true,
                  .log_y = true};
   Panel noisy = position;
@@ -254,22 +257,21 @@ Findings seven_dof(const Setup& setup) {
   for (const Regime regime : kRegimes) {
     const std::string name = test::name_of(regime);
     const Measurement us = measure(setup, "ours", "d", regime, sizes, num_robots, ask_ours);
-    const Measurement found = measure(setup, "baseline, search", "d", regime, search_sizes,
-                                      num_search, ask_baseline);
+    const Measurement found =
+        measure(setup, "baseline, search", "d", regime, search_sizes, num_search, ask_baseline);
     const Measurement models = measure(setup, "baseline, local models", "d", regime, model_sizes,
                                        num_models, ask_baseline_models);
     for (const int N : sizes) {
       const Cell u = us.cell(N), f = found.cell(N), m = models.cell(N);
       const Spread p = spread_of(u.position_m), a = spread_of(u.angle_rad);
-      table.add({name, std::to_string(N),
-                 N == 10    ? "structure right (noise-free)"
-                 : N == 100 ? "< 1 mm (noise-free)"
-                            : "–",
-                 f.structure.text(),
-                 f.structure.total() > 0 ? std::to_string(f.fits / num_search) : "–",
-                 m.errors_text(), u.structure.text(),
-                 short_number(100.0 * u.false_complete / num_robots),
-                 std::to_string(u.fits / num_robots), u.errors_text()});
+      table.add(
+          {name, std::to_string(N),
+           N == 10    ? "structure right (noise-free)"
+           : N == 100 ? "< 1 mm (noise-free)"
+                      : "–",
+           f.structure.text(), f.structure.total() > 0 ? std::to_string(f.fits / num_search) : "–",
+           m.errors_text(), u.structure.text(), short_number(100.0 * u.false_complete / num_robots),
+           std::to_string(u.fits / num_robots), u.errors_text()});
       const auto must_be_right = [&](double share) {
         findings.musts.push_back(
             {fmt::format("7-DOF, {}, N = {}: structure right ≥ {:.0f} %", name, N, 100 * share),
@@ -282,7 +284,7 @@ Findings seven_dof(const Setup& setup) {
             {angle_deg > 0 ? fmt::format("7-DOF, {}, N = {}: ≤ {:g} mm, {:g}°", name, N,
                                          position_m * 1e3, angle_deg)
                            : fmt::format("7-DOF, {}, N = {}: ≤ {:g} mm", name, N, position_m * 1e3),
-             u.errors_text() + fmt::format(", {} of {} robots connect it", p.count, num_robots),
+             u.errors_text(),
              p.count > 0 && p.mean <= position_m &&
                  (angle_deg == 0 || a.mean <= angle_deg * kDegree)});
       };
@@ -314,12 +316,12 @@ Findings seven_dof(const Setup& setup) {
     also(structure, right_curve(found, "baseline, " + name, colour), true);
     if (regime == Regime::kFree) {
       also(position, position_curve(us, "ours, " + name, colour), false);
-      also(position, position_curve(models, "baseline (true structure), " + name, colour), true);
+      also(position, position_curve(models, "baseline, " + name, colour), true);
     } else {
       also(noisy, position_curve(us, "ours, " + name, colour), false);
-      also(noisy, position_curve(models, "baseline (true structure), " + name, colour), true);
+      also(noisy, position_curve(models, "baseline, " + name, colour), true);
       also(angle, angle_curve(us, "ours, " + name, colour), false);
-      also(angle, angle_curve(models, "baseline (true structure), " + name, colour), true);
+      also(angle, angle_curve(models, "baseline, " + name, colour), true);
     }
     ++colour;
   }
@@ -327,9 +329,12 @@ Findings seven_dof(const Setup& setup) {
   noisy.references.clear();
   draw(setup, "seven_dof.png", {structure, position, noisy, angle}, 2);
   findings.markdown = fmt::format(
-      "{} robots (baseline: search {}, local models on the true structure {}). Structure: right with "
-      "its Wilson lower bound (95 %) / incomplete / wrong. Mean error of the end effector (a finger) "
-      "over {} test poses, mean ± standard error over the robots that connect it with the root.\n\n{}",
+      "{} robots (baseline: search {}, local models on the true structure {}). Structure: right "
+      "with "
+      "its Wilson lower bound (95 %) / incomplete / wrong. Mean error of the end effector (a "
+      "finger) "
+      "over {} test poses, mean ± standard error over the robots that connect it with the "
+      "root.\n\n{}",
       num_robots, num_search, num_models, kTestPoses, table.markdown());
   return findings;
 }

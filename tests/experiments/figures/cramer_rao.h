@@ -14,8 +14,8 @@ namespace bodyschema::experiments {
 ///
 /// Unknown are the resting root's pose X_CR and, for every link, X_before, and of a joint slide and
 /// turn per command unit and X_after too: 6 + 6 or 14 a link; the structure, which joint hangs on
-/// which signal, is known, as are the markers' covariances. A marker's pose y = x · Exp(ε), ε ~ N(0,
-/// Σ) adds Jᵀ Σ⁻¹ J to the Fisher information, J = ∂x/∂parameters (right perturbation, marker
+/// which signal, is known, as are the markers' covariances. A marker's pose y = x · Exp(ε), ε ~
+/// N(0, Σ) adds Jᵀ Σ⁻¹ J to the Fisher information, J = ∂x/∂parameters (right perturbation, marker
 /// frame; terms of the second order in ε are left out). The pose of one part in another at some
 /// action has at least the covariance G F⁺ Gᵀ, G its derivative: what F lacks is gauge (where a
 /// screw's frame sits along and about its axis), which no pose depends on.

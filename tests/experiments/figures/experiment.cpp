@@ -38,12 +38,14 @@ std::string script_of(const Panel& panel, int index) {
       data += fmt::format("{} {} {}\n", number(curve.x[n]), number(curve.y[n]),
                           number(curve.error.empty() ? 0 : curve.error[n]));
     data += "END\n";
-    const std::string title = curve.title.empty() ? "notitle" : "title " + gnuplot_string(curve.title);
+    const std::string title =
+        curve.title.empty() ? "notitle" : "title " + gnuplot_string(curve.title);
     switch (curve.kind) {
       case Curve::Kind::kBand:
-        also(fmt::format("{} using 1:($2-$3):($2+$3) with filledcurves fs transparent solid 0.18 "
-                         "noborder {} notitle",
-                         block, style(curve.colour)));
+        also(
+            fmt::format("{} using 1:($2-$3):($2+$3) with filledcurves fs transparent solid 0.18 "
+                        "noborder {} notitle",
+                        block, style(curve.colour)));
         also(fmt::format("{} using 1:2 with lines lw 2 {} {}", block, style(curve.colour), title));
         break;
       case Curve::Kind::kLine:
@@ -66,7 +68,7 @@ std::string script_of(const Panel& panel, int index) {
                      dash++, gnuplot_string(reference.title)));
   std::string result = data;
   result += "set title " + gnuplot_string(panel.title) + "\n";
-  result += "set xlabel " + gnuplot_string(panel.x_label) + "\n";
+  result += "set xlabel " + gnuplot_string(panel.x_label) + " offset 0,0.6\n";
   result += "set ylabel " + gnuplot_string(panel.y_label) + "\n";
   double low = INFINITY, high = -INFINITY;
   for (const Curve& curve : panel.curves) {
@@ -80,13 +82,12 @@ std::string script_of(const Panel& panel, int index) {
                         number(high * factor + margin));
   result += panel.log_x ? "set logscale x\nset xtics (3, 5, 8, 10, 15, 20, 30, 50, 100, 200)\n"
                         : "unset logscale x\nset xtics autofreq\n";
-  result += panel.log_y ? "set logscale y\nset format y '%.0e'\n" : "unset logscale y\nset format y '%g'\n";
-  if (panel.y_range.size() == 2) {
-    result += fmt::format("set yrange [{}:{}]\n", number(panel.y_range[0]), number(panel.y_range[1]));
-    if (panel.log_y && panel.y_range[0] > 1e-3) result += "set format y '%g'\n";
-  } else {
+  result += panel.log_y ? "set logscale y\n" : "unset logscale y\n";
+  if (panel.y_range.size() == 2)
+    result +=
+        fmt::format("set yrange [{}:{}]\n", number(panel.y_range[0]), number(panel.y_range[1]));
+  else
     result += "set yrange [*:*]\n";
-  }
   result += "set key " + panel.key + " spacing 1.1 samplen 3\n";
   return result + curves + "\n";
 }

@@ -85,7 +85,7 @@ struct Panel {
   std::vector<Curve> curves = {};
   std::vector<Reference> references = {};
   bool log_x = false, log_y = false;
-  std::vector<double> y_range = {};  ///< {low, high}; empty: gnuplot's choice
+  std::vector<double> y_range = {};     ///< {low, high}; empty: gnuplot's choice
   std::string key = "below maxcols 2";  ///< where gnuplot puts the titles
 };
 

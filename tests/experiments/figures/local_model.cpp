@@ -120,16 +120,18 @@ Panel panel_of(const Learned& learned, const Trial& trial, int signal, const std
   const Signal& limits = trial.robot.signals[signal];
   const char* const names[] = {"x", "y", "z"};
   for (int axis = 0; axis < 3; ++axis) {
-    Curve curve{.title = std::string(names[axis]) + ", band 2 σ", .colour = axis == 0 ? 0 : axis == 1 ? 2 : 1,
+    Curve curve{.title = std::string(names[axis]) + ", band 2 σ",
+                .colour = axis == 0   ? 0
+                          : axis == 1 ? 2
+                                      : 1,
                 .kind = Curve::Kind::kBand};
     Curve dots{.title = "", .colour = curve.colour, .kind = Curve::Kind::kPoints};
     constexpr int kSteps = 120;
     for (int n = 0; n <= kSteps; ++n) {
       const double q = limits.lower + (limits.upper - limits.lower) * n / kSteps;
       const Pose X = learned.predict(q);
-      const Eigen::Matrix3d covariance = X.linear() *
-                                         learned.covariance(q).topLeftCorner<3, 3>() *
-                                         X.linear().transpose();
+      const Eigen::Matrix3d covariance =
+          X.linear() * learned.covariance(q).topLeftCorner<3, 3>() * X.linear().transpose();
       curve.x.push_back(q / kDegree);
       curve.y.push_back(X.translation()(axis) / kMillimetre);
       curve.error.push_back(2 * std::sqrt(std::max(0.0, covariance(axis, axis))) / kMillimetre);
@@ -187,9 +189,9 @@ Findings local_model(const Setup& setup) {
                  percentage(baseline.num_valid(), num_baseline), baseline.rms(),
                  percentage(ours.num_valid(), num_robots), ours.rms()});
       if (signal == kWrongSignal)
-        findings.musts.push_back({fmt::format("local model, {}: never valid on the wrong signal", name),
-                                  fmt::format("{} of {}", ours.num_valid(), num_robots),
-                                  ours.num_valid() == 0});
+        findings.musts.push_back(
+            {fmt::format("local model, {}: never valid on the wrong signal", name),
+             fmt::format("{} of {}", ours.num_valid(), num_robots), ours.num_valid() == 0});
       if (signal == kRightSignal && regime == Regime::kFree)
         findings.musts.push_back({"local model, free: always valid on the right signal",
                                   fmt::format("{} of {}", ours.num_valid(), num_robots),
@@ -208,8 +210,10 @@ Findings local_model(const Setup& setup) {
                  "ours (screw): the wrong signal, refuted")},
        2);
   findings.markdown = fmt::format(
-      "Pair {}–{} of the 2-DOF robot, {} samples, {} robots (baseline {}); leave-one-out residuals, "
-      "rms over the three axes together (ours: over what is no outlier), mean ± standard error over "
+      "Pair {}–{} of the 2-DOF robot, {} samples, {} robots (baseline {}); leave-one-out "
+      "residuals, "
+      "rms over the three axes together (ours: over what is no outlier), mean ± standard error "
+      "over "
       "the robots. Plot: seed 1, tag noise (3 % of the markers flipped), bands of two standard "
       "deviations of a new observation.\n\n{}",
       kFrom, kTo, kSamples, num_robots, num_baseline, table.markdown());

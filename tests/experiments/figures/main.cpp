@@ -1,17 +1,17 @@
-// experiments: the figures of the chapter's Sections 3 and 5.1, measured again: the chapter's value,
-// the chapter's own method (baseline) and ours beside each other, over many robots.
+// experiments: the figures of the chapter's Sections 3 and 5.1, measured again: the chapter's
+// value, the chapter's own method (baseline) and ours beside each other, over many robots.
 //
 //   experiments [NAME…] [--quick] [--out FOLDER] [--jobs N]
 //   experiments --list
 //
-// Tables on stdout and, with the plots, in FOLDER; progress on stderr. Ends with 1 if something that
-// must come out does not.
+// Tables on stdout and, with the plots, in FOLDER (all.md: all of them); progress on stderr. Ends
+// with 1 if something that must come out does not.
 
-#include <fmt/chrono.h>
 #include <fmt/format.h>
 #include <unistd.h>
 
 #include <CLI/CLI.hpp>
+#include <algorithm>
 #include <chrono>
 #include <cstdio>
 #include <fstream>
@@ -69,7 +69,7 @@ void show_progress(const std::string& name, const std::string& part, double shar
 
 int run(const std::vector<Experiment>& experiments, Setup setup) {
   std::filesystem::create_directories(setup.out);
-  std::string all;
+  std::string all = "# The chapter's figures, measured again\n";
   bool is_reached = true;
   for (const Experiment& experiment : experiments) {
     setup.progress = [&experiment](const std::string& part, double share) {
@@ -79,10 +79,10 @@ int run(const std::vector<Experiment>& experiments, Setup setup) {
     const Findings findings = experiment.run(setup);
     const std::chrono::duration<double> duration = std::chrono::steady_clock::now() - start;
     if (isatty(STDERR_FILENO)) fmt::print(stderr, "\r\033[K");
-    std::string text = fmt::format("## {}\n`./run experiments {}{}`, {:.0f} s with {} thread{}. {}",
-                                   experiment.title, experiment.name, setup.quick ? " --quick" : "",
-                                   duration.count(), setup.jobs, setup.jobs == 1 ? "" : "s",
-                                   findings.markdown);
+    std::string text =
+        fmt::format("## {}\n`./run experiments {}{}`, {:.0f} s with {} thread{}. {}",
+                    experiment.title, experiment.name, setup.quick ? " --quick" : "",
+                    duration.count(), setup.jobs, setup.jobs == 1 ? "" : "s", findings.markdown);
     if (!findings.musts.empty()) {
       Table table({"must", "measured", ""});
       for (const Must& must : findings.musts) {
@@ -92,6 +92,8 @@ int run(const std::vector<Experiment>& experiments, Setup setup) {
       text += "\n" + table.markdown();
     }
     write(setup.out / (std::string(experiment.name) + ".md"), text);
+    all += "\n" + text;
+    write(setup.out / "all.md", all);
     fmt::print("{}\n", text);
     std::fflush(stdout);
   }

@@ -60,8 +60,7 @@ Findings spherical(const Setup& setup) {
                   : std::vector<int>{5, 8, 10, 12, 15, 16, 17, 18, 20, 22, 25, 30, 35, 45};
   const int num_robots = setup.robots(200, 10), num_baseline = setup.robots(40, 3);
   Findings findings;
-  Table table({"regime", "N", "chapter",
-               "baseline: {q1} / {q1, q2} / nothing valid / other %",
+  Table table({"regime", "N", "chapter", "baseline: {q1} / {q1, q2} / nothing valid / other %",
                "ours: {q1} / {q1, q2} / nothing valid / other %"});
   std::vector<Panel> panels;
   for (const Regime regime : {Regime::kFree, Regime::kChapter, Regime::kTag}) {
@@ -80,11 +79,12 @@ Findings spherical(const Setup& setup) {
             learn_baseline(trial.robot.signals, trial.first(sizes[s]), baseline_options(regime))
                 .schema);
     });
-    Panel panel{.title = "Fig. 6, " + name + fmt::format(": q2 moves from sample {} on", kResting + 1),
-                .x_label = "samples N",
-                .y_label = "robots [%]",
-                .references = {{"chapter: first {q1}, then {q1, q2}", 100}},
-                .y_range = {0, 105}};
+    Panel panel{
+        .title = "Fig. 6, " + name + fmt::format(": q2 moves from sample {} on", kResting + 1),
+        .x_label = "samples N",
+        .y_label = "robots [%]",
+        .references = {{"chapter: {q1}, then {q1, q2}", 100}},
+        .y_range = {0, 105}};
     for (const auto* side : {&baseline, &ours}) {
       for (const Said what : {Said::kOne, Said::kBoth}) {
         Curve curve{.title = std::string(side == &ours ? "ours" : "baseline") +
@@ -111,14 +111,12 @@ Findings spherical(const Setup& setup) {
       const auto right = std::count(ours[s].begin(), ours[s].end(), expected);
       findings.musts.push_back({fmt::format("spherical, free, N = {}: {} in all robots", N,
                                             expected == Said::kOne ? "{q1}" : "{q1, q2}"),
-                                fmt::format("{} of {}", right, num_robots),
-                                right == num_robots});
+                                fmt::format("{} of {}", right, num_robots), right == num_robots});
     }
   }
   draw(setup, "spherical.png", panels, 3);
-  findings.markdown = fmt::format(
-      "{} robots (baseline {}); q2 = 0 for the first {} samples.\n\n{}", num_robots, num_baseline,
-      kResting, table.markdown());
+  findings.markdown = fmt::format("{} robots (baseline {}); q2 = 0 for the first {} samples.\n\n{}",
+                                  num_robots, num_baseline, kResting, table.markdown());
   return findings;
 }
 

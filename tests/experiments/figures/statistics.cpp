@@ -15,8 +15,7 @@ std::pair<double, double> wilson(int successes, int trials, double z) {
   if (trials <= 0 || successes < 0 || successes > trials)
     throw std::invalid_argument("Wilson bound: 0 <= successes <= trials, trials > 0");
   const double n = trials, p = successes / n, z2n = z * z / n;
-  return {(p + z2n / 2) / (1 + z2n),
-          z / (1 + z2n) * std::sqrt(p * (1 - p) / n + z2n / (4 * n))};
+  return {(p + z2n / 2) / (1 + z2n), z / (1 + z2n) * std::sqrt(p * (1 - p) / n + z2n / (4 * n))};
 }
 
 }  // namespace

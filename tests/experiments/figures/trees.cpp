@@ -76,19 +76,20 @@ Findings trees(const Setup& setup) {
       }
     });
     std::vector<test::Rightness> found(num_baseline);
-    for_each_robot(setup, fmt::format("baseline, {}, {}", line.kind, name), num_baseline,
-                   [&](int n) {
-                     const Trial trial = make_trial(line.kind, line.regime, kBaselineSize, n + 1);
-                     found[n] = test::judge(learn_baseline(trial.robot.signals, trial.samples,
-                                                           baseline_options(line.regime))
-                                                .schema,
-                                            trial.robot);
-                   });
+    for_each_robot(
+        setup, fmt::format("baseline, {}, {}", line.kind, name), num_baseline, [&](int n) {
+          const Trial trial = make_trial(line.kind, line.regime, kBaselineSize, n + 1);
+          found[n] = test::judge(
+              learn_baseline(trial.robot.signals, trial.samples, baseline_options(line.regime))
+                  .schema,
+              trial.robot);
+        });
     Curve curve{.title = "ours, " + name,
                 .colour = line.regime == Regime::kFree      ? 1
                           : line.regime == Regime::kChapter ? 2
                                                             : 3};
-    const bool is_tree = line.kind == std::string("tree"), is_tree3 = line.kind == std::string("tree3");
+    const bool is_tree = line.kind == std::string("tree"),
+               is_tree3 = line.kind == std::string("tree3");
     for (std::size_t s = 0; s < sizes.size(); ++s) {
       const int N = sizes[s];
       Judgements judgements, of_baseline;
@@ -127,8 +128,9 @@ Findings trees(const Setup& setup) {
              judgements.text(), judgements.wrong == 0});
       if (line.kind == std::string("tree40") && N == 25) {
         findings.musts.push_back(
-            {fmt::format("40 parts, 30 signals, 3 hidden, {}, N = {}: right ≥ 90 %, else incomplete",
-                         name, N),
+            {fmt::format(
+                 "40 parts, 30 signals, 3 hidden, {}, N = {}: right ≥ 90 %, else incomplete", name,
+                 N),
              judgements.text(), judgements.right >= 0.9 * num_robots && judgements.wrong == 0});
         findings.musts.push_back({fmt::format("40 parts, {}, N = {}: < 1 s on one core", name, N),
                                   short_number(seconds) + " s", seconds < 1});
@@ -139,8 +141,10 @@ Findings trees(const Setup& setup) {
   }
   draw(setup, "trees.png", {trees_panel, hidden_panel}, 2);
   findings.markdown = fmt::format(
-      "tree: 9 parts, one hidden; tree3: two hidden in a row; tree40: 40 parts, 3 hidden. Structure: "
-      "right with its Wilson lower bound (95 %) / incomplete / wrong. The baseline is asked once, at N "
+      "tree: 9 parts, one hidden; tree3: two hidden in a row; tree40: 40 parts, 3 hidden. "
+      "Structure: "
+      "right with its Wilson lower bound (95 %) / incomplete / wrong. The baseline is asked once, "
+      "at N "
       "= {}, of 4 robots; of 40 parts it would learn some 600 000 local models.\n\n{}",
       kBaselineSize, table.markdown());
   return findings;

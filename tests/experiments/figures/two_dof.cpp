@@ -32,8 +32,8 @@ double control_error_rms(const BodySchema& schema, const Trial& trial, int count
     const auto X = trial.robot.poses_in_camera(action);
     return Eigen::Vector3d((X.at(from).inverse() * X.at(to)).translation());
   };
-  const Eigen::VectorXd rest = Eigen::VectorXd::Zero(static_cast<Eigen::Index>(
-      trial.robot.signals.size()));
+  const Eigen::VectorXd rest =
+      Eigen::VectorXd::Zero(static_cast<Eigen::Index>(trial.robot.signals.size()));
   double sum = 0;
   for (int n = 0; n < count; ++n) {
     const Eigen::Vector3d target = position(trial.test_actions[n]);
@@ -78,10 +78,13 @@ test::Rightness rightness_of_baseline(const Trial& trial,
       trial.robot);
 }
 
-std::string errors_text(const std::vector<double>& position, const std::vector<double>& angle) {
-  if (position.empty()) return "–";
-  return mean_and_error(spread_of(position), kMillimetre) + " mm, " +
-         mean_and_error(spread_of(angle), kDegree) + "°";
+std::string errors_text(const Column& column, int num_robots) {
+  if (column.mean.empty()) return "–";
+  const std::string of = num_robots > static_cast<int>(column.mean.size())
+                             ? fmt::format(" ({} of {} robots)", column.mean.size(), num_robots)
+                             : "";
+  return mean_and_error(spread_of(column.mean), kMillimetre) + " mm, " +
+         mean_and_error(spread_of(column.angle), kDegree) + "°" + of;
 }
 
 }  // namespace
@@ -139,8 +142,8 @@ Findings two_dof_noise(const Setup& setup) {
                "ours over the bound"});
   Curve prediction{.title = "ours, prediction", .colour = 1},
       control{.title = "ours, control", .colour = 5},
-      base_prediction{.title = "baseline (true structure), prediction", .colour = 0},
-      base_control{.title = "baseline (true structure), control", .colour = 4},
+      base_prediction{.title = "baseline, prediction", .colour = 0},
+      base_control{.title = "baseline, control", .colour = 4},
       bound_curve{.title = "Cramér–Rao bound", .colour = 3};
   for (std::size_t s = 0; s < S; ++s) {
     const Column us = column(ours, s), them = column(baseline, s);
@@ -152,11 +155,9 @@ Findings two_dof_noise(const Setup& setup) {
                N < 15    ? "converges within 10"
                : N == 15 ? "below marker noise (44 mm)"
                          : "control about 50 mm",
-               them.right(),
-               mean_and_error(spread_of(them.rms), kMillimetre),
-               mean_and_error(spread_of(them.control), kMillimetre),
-               us.structure.text(), mean_and_error(rms, kMillimetre),
-               mean_and_error(spread_of(us.mean), kMillimetre),
+               them.right(), mean_and_error(spread_of(them.rms), kMillimetre),
+               mean_and_error(spread_of(them.control), kMillimetre), us.structure.text(),
+               mean_and_error(rms, kMillimetre), mean_and_error(spread_of(us.mean), kMillimetre),
                mean_and_error(spread_of(us.control), kMillimetre),
                mean_and_error(limit, kMillimetre), short_number(rms.mean / limit.mean)});
     const auto also = [N](Curve& curve, const std::vector<double>& values) {
@@ -175,29 +176,31 @@ Findings two_dof_noise(const Setup& setup) {
                                 short_number(rms.mean / kMillimetre) + " mm",
                                 rms.mean < kMarkerNoise});
     if (N == 100)
-      findings.musts.push_back({"2-DOF, chapter noise, N = 100: within 1.6 × the Cramér–Rao bound",
-                                fmt::format("rms {} mm, bound {} mm: {} ×",
-                                            short_number(rms.mean / kMillimetre),
-                                            short_number(limit.mean / kMillimetre),
-                                            short_number(rms.mean / limit.mean)),
-                                rms.mean < 1.6 * limit.mean});
+      findings.musts.push_back(
+          {"2-DOF, chapter noise, N = 100: within 1.6 × the Cramér–Rao bound",
+           fmt::format("rms {} mm, bound {} mm: {} ×", short_number(rms.mean / kMillimetre),
+                       short_number(limit.mean / kMillimetre), short_number(rms.mean / limit.mean)),
+           rms.mean < 1.6 * limit.mean});
   }
   draw(setup, "two_dof_noise.png",
        {{.title = "Fig. 10: 2-DOF robot, markers with 44 mm of noise",
          .x_label = "samples N",
          .y_label = "position error of the end effector, rms [mm]",
          .curves = {base_prediction, base_control, prediction, control, bound_curve},
-         .references = {{"chapter: marker noise, undercut after 15", 44},
-                        {"chapter: control, about 50 mm", 50}},
+         .references = {{"chapter: 44 mm, after 15", 44}, {"chapter: control 50 mm", 50}},
          .log_x = true,
          .log_y = true,
          .y_range = {7, 250}}},
        1);
   findings.markdown = fmt::format(
-      "{} robots (baseline {}), {} test poses each; per robot the rms of the end effector's position "
-      "error, then mean ± standard error over the robots. Control: the position that inverse "
-      "kinematics on the learned model reaches by the robot's truth, {} targets a robot (baseline {}). "
-      "Structure: right with its Wilson lower bound (95 %) / incomplete / wrong. The chapter's robot "
+      "{} robots (baseline {}), {} test poses each; per robot the rms of the end effector's "
+      "position "
+      "error, then mean ± standard error over the robots that connect it with the root. Control: "
+      "the position that inverse "
+      "kinematics on the learned model reaches by the robot's truth, {} targets a robot (baseline "
+      "{}). "
+      "Structure: right with its Wilson lower bound (95 %) / incomplete / wrong. The chapter's "
+      "robot "
       "was a real one; its curve is known at the points named.\n\n{}",
       num_robots, num_baseline, kTestPoses, num_targets, num_baseline_targets, table.markdown());
   return findings;
@@ -235,8 +238,7 @@ Findings two_dof_free(const Setup& setup) {
         result.errors = end_effector_errors(baseline_on_true_structure(trial, samples), trial);
       }
     });
-    Curve us{.title = "ours", .colour = 1},
-        them{.title = "baseline (true structure)", .colour = 0};
+    Curve us{.title = "ours", .colour = 1}, them{.title = "baseline", .colour = 0};
     for (std::size_t s = 0; s < S; ++s) {
       Column our_column, their_column;
       for (const auto& robot : ours) {
@@ -252,18 +254,15 @@ Findings two_dof_free(const Setup& setup) {
                  N == 20    ? "< 2 mm, 1°"
                  : N == 100 ? "< 1 mm, 0.2°"
                             : "–",
-                 their_column.right(),
-                 errors_text(their_column.mean, their_column.angle), our_column.structure.text(),
-                 errors_text(our_column.mean, our_column.angle)});
+                 their_column.right(), errors_text(their_column, num_baseline),
+                 our_column.structure.text(), errors_text(our_column, num_robots)});
       const Spread position = spread_of(our_column.mean), angle = spread_of(our_column.angle);
       us.x.push_back(N);
       us.y.push_back(position.mean / kMillimetre);
       them.x.push_back(N);
       them.y.push_back(spread_of(their_column.mean).mean / kMillimetre);
       const bool all = position.count == num_robots;
-      const std::string measured =
-          errors_text(our_column.mean, our_column.angle) +
-          (all ? "" : fmt::format(" in {} of {} robots", position.count, num_robots));
+      const std::string measured = errors_text(our_column, num_robots);
       if (bend == 0 && N == 5) {
         const double worst = *std::max_element(our_column.mean.begin(), our_column.mean.end());
         findings.musts.push_back({"2-DOF, free, straight commands, N = 5: < 1e-9 m",
@@ -271,9 +270,9 @@ Findings two_dof_free(const Setup& setup) {
                                   all && position.mean < 1e-9});
       }
       if (bend != 0 && N == 20)
-        findings.musts.push_back({"2-DOF, free, bent commands, N = 20: < 1 mm, 0.2°", measured,
-                                  all && position.mean < kMillimetre &&
-                                      angle.mean < 0.2 * kDegree});
+        findings.musts.push_back(
+            {"2-DOF, free, bent commands, N = 20: < 1 mm, 0.2°", measured,
+             all && position.mean < kMillimetre && angle.mean < 0.2 * kDegree});
     }
     panels.push_back({.title = std::string("2-DOF robot, noise-free, ") + command,
                       .x_label = "samples N",
