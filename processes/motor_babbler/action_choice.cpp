@@ -9,9 +9,9 @@ namespace bodyschema {
 namespace {
 
 constexpr double kViewWidth_rad = 15 * M_PI / 180;
-constexpr double kSignalWidth = 0.4;      // rms over the signals, of half ranges
-constexpr double kPriorCount = 1;         // past actions that the overall share counts for
-constexpr double kPotentialPrior = 0.1;   // Λ: a tenth of one sample
+constexpr double kSignalWidth = 0.4;     // rms over the signals, of half ranges
+constexpr double kPriorCount = 1;        // past actions that the overall share counts for
+constexpr double kPotentialPrior = 0.1;  // Λ: a tenth of one sample
 
 /// Signals, −1..1 over their ranges.
 Eigen::VectorXd normalized(const std::vector<Signal>& signals, const Eigen::VectorXd& action) {

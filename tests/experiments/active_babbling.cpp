@@ -1,8 +1,8 @@
-// What active babbling gains: end effector's error and share of right structures after N samples, with
-// actions drawn uniformly, near the ends of the ranges, half and half (what `choice: random` does),
-// and chosen. As in the motor_babbler the first four samples are drawn, uniformly or half and half, and the schema that a choice
-// rests on is learned again after every fourth; TEST samples, of which nothing is learned, do not
-// count here. Prints Markdown.
+// What active babbling gains: end effector's error and share of right structures after N samples,
+// with actions drawn uniformly, near the ends of the ranges, half and half (what `choice: random`
+// does), and chosen. As in the motor_babbler the first four samples are drawn, uniformly or half
+// and half, and the schema that a choice rests on is learned again after every fourth; TEST
+// samples, of which nothing is learned, do not count here. Prints Markdown.
 //
 //   active_babbling --seeds 20 --robots c d --regimes chapter tag --at 10 20 30
 
@@ -144,8 +144,9 @@ int main(int argc, char** argv) {
   CLI11_PARSE(app, argc, argv);
   std::sort(at.begin(), at.end());
 
-  std::printf("right / wrong structures; end effector rms, mean ± standard error (median) of the "
-              "right ones\n\n| robot | seen | N |");
+  std::printf(
+      "right / wrong structures; end effector rms, mean ± standard error (median) of the "
+      "right ones\n\n| robot | seen | N |");
   for (const Strategy& strategy : kStrategies) std::printf(" %s |", strategy.name);
   std::printf("\n| --- | --- | --- |");
   for (std::size_t s = 0; s < std::size(kStrategies); ++s) std::printf(" --- |");

@@ -82,8 +82,7 @@ TEST(VisibilityModelTest, PredictsTheSyntheticCameraBetterThanTheSharesDo) {
   for (std::uint64_t seed = 1; seed <= 5; ++seed) {
     test::Rng rng(seed);
     const test::SyntheticRobot robot = test::chapter_robot("d", rng);
-    const BodySchema schema =
-        learn(robot.signals, test::babble(robot, 20, {}, rng)).schema;
+    const BodySchema schema = learn(robot.signals, test::babble(robot, 20, {}, rng)).schema;
     ASSERT_TRUE(schema.complete);
     const double angle = 70 * M_PI / 180;
     std::vector<SeenAction> past;
