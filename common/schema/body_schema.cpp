@@ -21,6 +21,17 @@ double screw_displacement(const ScrewJoint& joint, const Eigen::VectorXd& theta)
   return joint.gain * theta(joint.signal) + joint.offset;
 }
 
+// Exp(ρ(θ)) · right, and how the pose moves with ρ: Exp(ρ + δ) = Exp(ρ) · Exp(J_r(ρ) δ).
+struct Residual {
+  Residual(const ResidualGp& gp, const Eigen::VectorXd& theta, const Pose& right) {
+    const Vector6d rho = gp.mean(theta);
+    suffix = exp(rho) * right;
+    by_mean = adjoint(right.inverse()) * right_jacobian_inverse(rho).inverse();
+  }
+  Pose suffix;
+  Matrix6d by_mean;
+};
+
 // One step along a path: an edge, walked forwards or backwards.
 struct Step {
   const Edge* edge;
@@ -58,6 +69,7 @@ std::optional<std::vector<Step>> path_between(const std::vector<Edge>& edges, in
 
 const char* Edge::kind() const {
   if (matrix_gp) return "matrix_gp";
+  if (residual_gp) return "screw_gp";
   return joints.empty() ? "rigid" : "screw";
 }
 
@@ -67,6 +79,9 @@ std::vector<int> Edge::signals() const {
   for (const ScrewJoint& joint : joints)
     if (std::find(result.begin(), result.end(), joint.signal) == result.end())
       result.push_back(joint.signal);
+  if (residual_gp)
+    for (const int signal : residual_gp->signals())
+      if (std::find(result.begin(), result.end(), signal) == result.end()) result.push_back(signal);
   return result;
 }
 
@@ -75,6 +90,7 @@ Pose Edge::predict(const Eigen::VectorXd& theta) const {
   Pose X = left;
   for (const ScrewJoint& joint : joints)
     X = X * screw_motion(joint, screw_displacement(joint, theta)) * joint.X_after;
+  if (residual_gp) X = X * exp(residual_gp->mean(theta));
   return X * right;
 }
 
@@ -82,6 +98,11 @@ Eigen::MatrixXd Edge::jacobian(const Eigen::VectorXd& theta) const {
   if (matrix_gp) return adjoint(right.inverse()) * matrix_gp->jacobian(theta);
   Eigen::MatrixXd J = Eigen::MatrixXd::Zero(6, theta.size());
   Pose suffix = right;  // what follows the joint's own motion, which commutes with its screw
+  if (residual_gp) {
+    const Residual residual(*residual_gp, theta, right);
+    J = residual.by_mean * residual_gp->mean_gradient(theta);
+    suffix = residual.suffix;
+  }
   for (auto joint = joints.rbegin(); joint != joints.rend(); ++joint) {
     const double displacement = screw_displacement(*joint, theta);
     suffix = joint->X_after * suffix;
@@ -97,12 +118,20 @@ Matrix6d Edge::prediction_covariance(const Eigen::VectorXd& theta) const {
     const Matrix6d A = adjoint(right.inverse());
     return A * matrix_gp->prediction_covariance(theta) * A.transpose();
   }
+  Matrix6d of_residual = Matrix6d::Zero();
+  Pose after_joints = right;
+  if (residual_gp) {
+    const Residual residual(*residual_gp, theta, right);
+    of_residual = residual.by_mean * residual_gp->variance(theta).asDiagonal() *
+                  residual.by_mean.transpose();
+    after_joints = residual.suffix;
+  }
   const Eigen::Index size = 6 + 8 * static_cast<Eigen::Index>(joints.size());
   if (parameter_covariance.rows() != size || parameter_covariance.cols() != size)
-    return Matrix6d::Zero();
+    return of_residual;
   // ∂(right perturbation of the prediction)/∂parameters, from the last parameter to the first.
   Eigen::MatrixXd G(6, size);
-  Pose suffix = right;
+  Pose suffix = after_joints;
   for (std::size_t d = joints.size(); d-- > 0;) {
     const ScrewJoint& joint = joints[d];
     const double displacement = screw_displacement(joint, theta);
@@ -115,7 +144,7 @@ Matrix6d Edge::prediction_covariance(const Eigen::VectorXd& theta) const {
     suffix = screw_motion(joint, displacement) * suffix;
   }
   G.leftCols<6>() = adjoint(suffix.inverse());
-  return G * parameter_covariance * G.transpose();
+  return G * parameter_covariance * G.transpose() + of_residual;
 }
 
 bool BodySchema::has_part(int part) const {
