@@ -9,6 +9,7 @@
 
 #include "processes/structure_learner/command_warp.h"
 #include "processes/structure_learner/noise_estimate.h"
+#include "processes/structure_learner/residual_fit.h"
 #include "processes/structure_learner/structure_search.h"
 
 namespace bodyschema {
@@ -57,13 +58,52 @@ struct FittedEdge {
   std::vector<bool> outlying;
 };
 
+// The final fit of a soft edge in its direction. The screws stay as they are: the process says what
+// they leave, and its variance is that of the whole.
+FittedEdge fit_soft_edge(const LocalModel& screws, const std::vector<int>& signals, int from, int to,
+                         const PairData& pair, const NormalizedActions& actions,
+                         const ValidityOptions& validity) {
+  const LocalModel start = fit_local_model(screws, pair, actions, 30, 1e-3).model;
+  const auto fit = fit_soft_model(start, pair, actions, validity, signals);
+  FittedEdge result;
+  result.edge = to_edge(start, actions);
+  result.edge.from = from;
+  result.edge.to = to;
+  result.edge.num_samples = pair.size();
+  if (!fit) {  // what the search's part of the data carried, all of them refuse
+    result.edge.num_outliers = pair.size();
+    result.edge.confidence = 0;
+    return result;
+  }
+  result.edge.residual_gp = fit->model.residual_gp;
+  double position = 0, rotation = 0;
+  for (int t = 0; t < pair.size(); ++t) {
+    const bool outlying = fit->squared_distance[t] > kOutlierThreshold;
+    result.frames.push_back(pair.frames[t].sample);
+    result.outlying.push_back(outlying);
+    result.edge.num_outliers += outlying;
+    if (outlying) continue;
+    position += fit->residual[t].head<3>().squaredNorm();
+    rotation += fit->residual[t].tail<3>().squaredNorm();
+  }
+  const int inliers = pair.size() - result.edge.num_outliers;
+  if (inliers > 0) {
+    result.edge.position_rms_m = std::sqrt(position / inliers);
+    result.edge.rotation_rms_rad = std::sqrt(rotation / inliers);
+    result.edge.confidence = static_cast<double>(inliers) / pair.size();
+  }
+  return result;
+}
+
 // The final fit of an edge in its direction, on all data, with everything the schema says about it.
 FittedEdge fit_edge(const AcceptedModel& accepted, int from, int to,
                     const std::vector<ActionPoseSample>& samples, const NormalizedActions& actions,
-                    const MeasurementModel& measurement) {
+                    const MeasurementModel& measurement, const ValidityOptions& validity) {
   const LocalModel start = accepted.part_i == from ? accepted.model : accepted.model.inverse();
   const PairData pair =
       make_pair_data(samples, from, to, measurement, std::numeric_limits<int>::max());
+  if (!accepted.soft_signals.empty())
+    return fit_soft_edge(start, accepted.soft_signals, from, to, pair, actions, validity);
   const Fit fit = fit_local_model(start, pair, actions, 60);
   const LeaveOneOut loo = leave_one_out(fit, pair, actions);
 
@@ -413,6 +453,9 @@ LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPo
     search = std::move(found);
     if (was_spanning) break;
   }
+  result.num_fits -= search.num_fits;
+  connect_soft_parts(moved, *actions, schema.parts, search_options, &search);
+  result.num_fits += search.num_fits;
   schema.noise = measurement.noise ? *measurement.noise : typical_noise(samples);
   // Orient the forest outwards: breadth first from the root, then from the lowest part of every
   // other component.
@@ -426,7 +469,8 @@ LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPo
         if (m.part_i != queue[head] && m.part_j != queue[head]) continue;
         const int to = m.part_i == queue[head] ? m.part_j : m.part_i;
         if (!reached.insert(to).second) continue;
-        fitted.push_back(fit_edge(m, queue[head], to, moved, *actions, measurement));
+        fitted.push_back(fit_edge(m, queue[head], to, moved, *actions, measurement,
+                                  search_options.validity));
         queue.push_back(to);
       }
     }
