@@ -328,8 +328,8 @@ void check_edge(Checker& check, const schema_edge_t& edge, const body_schema_t& 
     check.pose("X_after", joint.X_after);
   });
   const bool has_joints = edge.num_joints > 0;
-  const bool may_have_joints = edge.base_kind == schema_edge_t::EDGE_SCREW ||
-                               edge.base_kind == schema_edge_t::EDGE_SCREW_GP;
+  const bool may_have_joints =
+      edge.base_kind == schema_edge_t::EDGE_SCREW || edge.base_kind == schema_edge_t::EDGE_SCREW_GP;
   check.require(has_joints ? may_have_joints : edge.base_kind != schema_edge_t::EDGE_SCREW,
                 "base_kind", "does not go with num_joints");
   check.integer_within("num_residual_gp", edge.num_residual_gp,

@@ -163,12 +163,10 @@ matrix_gp_t to_message(const MatrixGp& gp) {
 
 std::shared_ptr<const MatrixGp> from_message(const matrix_gp_t& message) {
   const std::size_t D = message.matrix_signals.size(), N = message.matrix_poses.size();
-  const Eigen::MatrixXd lengths =
-      to_matrix(message.entry_length_scales, D, MatrixGp::kNumEntries);
+  const Eigen::MatrixXd lengths = to_matrix(message.entry_length_scales, D, MatrixGp::kNumEntries);
   std::vector<GpPrior> priors;
   for (int e = 0; e < MatrixGp::kNumEntries; ++e)
-    priors.push_back({std::nullopt,
-                      SquaredExponential{message.entry_variances[e], lengths.col(e)},
+    priors.push_back({std::nullopt, SquaredExponential{message.entry_variances[e], lengths.col(e)},
                       message.entry_noise_variances[e]});
   std::vector<Pose> poses;
   for (const pose_t& z : message.matrix_poses) poses.push_back(bodyschema::from_message(z));
@@ -236,8 +234,7 @@ Edge from_message(const schema_edge_t& message) {
     out.turn = joint.turn_rad;
     out.X_after = bodyschema::from_message(joint.X_after);
   }
-  if (!message.residual_gp.empty())
-    edge.residual_gp = from_message(message.residual_gp.front());
+  if (!message.residual_gp.empty()) edge.residual_gp = from_message(message.residual_gp.front());
   if (!message.matrix_gp.empty()) edge.matrix_gp = from_message(message.matrix_gp.front());
   edge.right = bodyschema::from_message(message.X_right);
   if (!message.parameter_covariance.empty()) {

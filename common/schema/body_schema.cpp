@@ -122,8 +122,8 @@ Matrix6d Edge::prediction_covariance(const Eigen::VectorXd& theta) const {
   Pose after_joints = right;
   if (residual_gp) {
     const Residual residual(*residual_gp, theta, right);
-    of_residual = residual.by_mean * residual_gp->variance(theta).asDiagonal() *
-                  residual.by_mean.transpose();
+    of_residual =
+        residual.by_mean * residual_gp->variance(theta).asDiagonal() * residual.by_mean.transpose();
     after_joints = residual.suffix;
   }
   const Eigen::Index size = 6 + 8 * static_cast<Eigen::Index>(joints.size());

@@ -84,10 +84,9 @@ void run_learn(const LearnArguments& arguments) {
     schema.version = schema.last_sample_index + 1;
     const body_schema_t message = to_message(schema);
     if (message.getEncodedSize() >= kLargestSchema)
-      throw std::runtime_error("--out: the schema takes " +
-                               std::to_string(message.getEncodedSize()) +
-                               " bytes, a message holds " + std::to_string(kLargestSchema) +
-                               "; use --method screw");
+      throw std::runtime_error(
+          "--out: the schema takes " + std::to_string(message.getEncodedSize()) +
+          " bytes, a message holds " + std::to_string(kLargestSchema) + "; use --method screw");
     write_one_event_log(arguments.out, kBodySchema, message);
   }
   if (arguments.json) {

@@ -63,10 +63,9 @@ ordered_json matrix_gp_json(const BodySchema& schema, const MatrixGp& gp) {
                        {"entries", ordered_json::array()}};
   for (int e = 0; e < MatrixGp::kNumEntries; ++e) {
     const GpPrior& prior = gp.prior(e);
-    json["entries"].push_back(
-        {{"length_scales", list(prior.kernel.terms().front().length_scales)},
-         {"variance", prior.kernel.variance()},
-         {"noise_variance", prior.noise_variance}});
+    json["entries"].push_back({{"length_scales", list(prior.kernel.terms().front().length_scales)},
+                               {"variance", prior.kernel.variance()},
+                               {"noise_variance", prior.noise_variance}});
   }
   return json;
 }

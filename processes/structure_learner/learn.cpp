@@ -60,8 +60,8 @@ struct FittedEdge {
 
 // The final fit of a soft edge in its direction. The screws stay as they are: the process says what
 // they leave, and its variance is that of the whole.
-FittedEdge fit_soft_edge(const LocalModel& screws, const std::vector<int>& signals, int from, int to,
-                         const PairData& pair, const NormalizedActions& actions,
+FittedEdge fit_soft_edge(const LocalModel& screws, const std::vector<int>& signals, int from,
+                         int to, const PairData& pair, const NormalizedActions& actions,
                          const ValidityOptions& validity) {
   const LocalModel start = fit_local_model(screws, pair, actions, 30, 1e-3).model;
   const auto fit = fit_soft_model(start, pair, actions, validity, signals);
@@ -469,8 +469,8 @@ LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPo
         if (m.part_i != queue[head] && m.part_j != queue[head]) continue;
         const int to = m.part_i == queue[head] ? m.part_j : m.part_i;
         if (!reached.insert(to).second) continue;
-        fitted.push_back(fit_edge(m, queue[head], to, moved, *actions, measurement,
-                                  search_options.validity));
+        fitted.push_back(
+            fit_edge(m, queue[head], to, moved, *actions, measurement, search_options.validity));
         queue.push_back(to);
       }
     }

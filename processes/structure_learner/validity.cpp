@@ -75,8 +75,8 @@ Validity check_validity(const Fit& fit, const LeaveOneOut& loo, const PairData& 
   // V1
   const double rate = pair_outlier_rate(options);
   const int max_outliers = std::min(
-      static_cast<int>(binomial_quantile(num_independent, rate, options.lenient ? 0.99999 : 0.9997) /
-                       share),
+      static_cast<int>(
+          binomial_quantile(num_independent, rate, options.lenient ? 0.99999 : 0.9997) / share),
       static_cast<int>(0.35 * n));
   // With few frames a true model may meet more outliers than the bound by bad luck: then it is not
   // refuted, only not to be trusted yet.
@@ -92,8 +92,8 @@ Validity check_validity(const Fit& fit, const LeaveOneOut& loo, const PairData& 
   }
   if (suspicious && (n >= kFewFrames || 2 * result.num_outliers > n)) return result;
   const double sampling =
-      (options.lenient ? 5 : 3) * std::sqrt(kInlierVariance / independent_inliers *
-                                       (6.0 * independent_inliers / dof));
+      (options.lenient ? 5 : 3) *
+      std::sqrt(kInlierVariance / independent_inliers * (6.0 * independent_inliers / dof));
   // A fifth of slack: the noise is known to some ten per cent at best.
   const double max_mean = std::min(1.2 * kInlierMean + sampling, 0.75 * kOutlierThreshold);
   if (result.mean_inlier > max_mean) return result;

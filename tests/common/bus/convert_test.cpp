@@ -119,9 +119,10 @@ TEST(Convert, GaussianProcessesSurviveTheWireToTheLastBit) {
 }
 
 MatrixGp matrix_gp_of(int num_samples, std::optional<double> mean) {
-  const std::vector<GpPrior> priors(MatrixGp::kNumEntries,
-                                    {mean, SquaredExponential{1, {}}, 1});
-  return {{}, Eigen::MatrixXd(0, num_samples), std::vector<Pose>(num_samples, Pose::Identity()),
+  const std::vector<GpPrior> priors(MatrixGp::kNumEntries, {mean, SquaredExponential{1, {}}, 1});
+  return {{},
+          Eigen::MatrixXd(0, num_samples),
+          std::vector<Pose>(num_samples, Pose::Identity()),
           priors};
 }
 
