@@ -29,10 +29,22 @@ void check_size(const BodySchema& schema, const Eigen::VectorXd& action) {
                                 std::to_string(schema.signals.size()));
 }
 
+// Exp(ρ(θ)) · right, and how the pose moves with ρ: Exp(ρ + δ) = Exp(ρ) · Exp(J_r(ρ) δ).
+struct Residual {
+  Residual(const ResidualGp& gp, const Eigen::VectorXd& theta, const Pose& right) {
+    const Vector6d rho = gp.mean(theta);
+    suffix = exp(rho) * right;
+    by_mean = adjoint(right.inverse()) * right_jacobian_inverse(rho).inverse();
+  }
+  Pose suffix;
+  Matrix6d by_mean;
+};
+
 }  // namespace
 
 const char* Edge::kind() const {
   if (matrix_gp) return "matrix_gp";
+  if (residual_gp) return "screw_gp";
   return joints.empty() ? "rigid" : "screw";
 }
 
@@ -42,6 +54,9 @@ std::vector<int> Edge::signals() const {
   for (const ScrewJoint& joint : joints)
     if (std::find(result.begin(), result.end(), joint.signal) == result.end())
       result.push_back(joint.signal);
+  if (residual_gp)
+    for (const int signal : residual_gp->signals())
+      if (std::find(result.begin(), result.end(), signal) == result.end()) result.push_back(signal);
   return result;
 }
 
@@ -50,6 +65,7 @@ Pose Edge::predict(const Eigen::VectorXd& theta) const {
   Pose X = left;
   for (const ScrewJoint& joint : joints)
     X = X * screw_motion(joint, screw_displacement(joint, theta)) * joint.X_after;
+  if (residual_gp) X = X * exp(residual_gp->mean(theta));
   return X * right;
 }
 
@@ -57,6 +73,11 @@ Eigen::MatrixXd Edge::jacobian(const Eigen::VectorXd& theta) const {
   if (matrix_gp) return adjoint(right.inverse()) * matrix_gp->jacobian(theta);
   Eigen::MatrixXd J = Eigen::MatrixXd::Zero(6, theta.size());
   Pose suffix = right;  // what follows the joint's own motion, which commutes with its screw
+  if (residual_gp) {
+    const Residual residual(*residual_gp, theta, right);
+    J = residual.by_mean * residual_gp->mean_gradient(theta);
+    suffix = residual.suffix;
+  }
   for (auto joint = joints.rbegin(); joint != joints.rend(); ++joint) {
     const double displacement = screw_displacement(*joint, theta);
     suffix = joint->X_after * suffix;
@@ -70,7 +91,7 @@ Eigen::MatrixXd Edge::jacobian(const Eigen::VectorXd& theta) const {
 Eigen::MatrixXd Edge::parameter_jacobian(const Eigen::VectorXd& theta) const {
   Eigen::MatrixXd G(6, 6 + 8 * static_cast<Eigen::Index>(joints.size()));
   // From the last parameter to the first.
-  Pose suffix = right;
+  Pose suffix = residual_gp ? Residual(*residual_gp, theta, right).suffix : right;
   for (std::size_t d = joints.size(); d-- > 0;) {
     const ScrewJoint& joint = joints[d];
     const double displacement = screw_displacement(joint, theta);
@@ -92,9 +113,14 @@ Matrix6d Edge::prediction_covariance(const Eigen::VectorXd& theta) const {
     return A * matrix_gp->prediction_covariance(theta) * A.transpose();
   }
   const Eigen::MatrixXd G = parameter_jacobian(theta);
-  if (parameter_covariance.rows() != G.cols() || parameter_covariance.cols() != G.cols())
-    return Matrix6d::Zero();
-  return G * parameter_covariance * G.transpose();
+  Matrix6d covariance = Matrix6d::Zero();
+  if (parameter_covariance.rows() == G.cols() && parameter_covariance.cols() == G.cols())
+    covariance = G * parameter_covariance * G.transpose();
+  if (residual_gp) {
+    const Matrix6d by_mean = Residual(*residual_gp, theta, right).by_mean;
+    covariance += by_mean * residual_gp->variance(theta).asDiagonal() * by_mean.transpose();
+  }
+  return covariance;
 }
 
 Matrix6d Edge::empirical_covariance() const {

@@ -9,6 +9,7 @@
 
 #include "common/geometry/pose.h"
 #include "common/schema/matrix_gp.h"
+#include "common/schema/residual_gp.h"
 #include "common/schema/signal.h"
 
 namespace bodyschema {
@@ -43,7 +44,8 @@ enum class Variance {
 enum class EdgeState : std::int8_t { kOk = 0, kSuspect = 1, kInvalid = 2, kProvisional = 3 };
 
 /// A local model Δ_ij(θ) = X_ij between two body parts (Section 3.1 of the chapter):
-///   Δ(θ) = left · ∏_d [Exp(ŝ_d (a_d θ_d + b_d)) · X_after_d] · right.
+///   Δ(θ) = left · ∏_d [Exp(ŝ_d (a_d θ_d + b_d)) · X_after_d] · Exp(ρ(θ)) · right,
+/// ρ = 0 unless there is a residual GP (soft bodies).
 /// No joints: a rigid edge. θ holds the displacement of every signal: BodySchema::displacements()
 /// of the action, which is the action itself where commands are linear. Where there is a matrix GP
 /// it stands between left and right instead.
@@ -54,6 +56,8 @@ struct Edge {
   std::vector<ScrewJoint> joints;
   /// The chapter's local model, or null. It never changes, so copies of the edge share it.
   std::shared_ptr<const MatrixGp> matrix_gp;
+  /// What the screws leave of a soft body, or null. It never changes either.
+  std::shared_ptr<const ResidualGp> residual_gp;
   Pose right = Pose::Identity();
 
   /// Covariance of the parameters, order: left tangent (6); per joint: slide, turn, X_after tangent
@@ -69,9 +73,9 @@ struct Edge {
   double confidence = 1;
   EdgeState state = EdgeState::kOk;
 
-  /// "rigid", "screw" or "matrix_gp".
+  /// "rigid", "screw", "screw_gp" (with a residual GP, also without any joint) or "matrix_gp".
   const char* kind() const;
-  /// Distinct signal indices, in the order of the joints.
+  /// Distinct signal indices, in the order of the joints; then those of the residual GP alone.
   std::vector<int> signals() const;
 
   Pose predict(const Eigen::VectorXd& theta) const;
@@ -82,7 +86,7 @@ struct Edge {
   /// `to`, parameters in the order of parameter_covariance. Of the screws, not of a matrix GP.
   Eigen::MatrixXd parameter_jacobian(const Eigen::VectorXd& theta) const;
   /// First-order covariance of the prediction (right perturbation in the frame of `to`): from
-  /// parameter_covariance, or from the matrix GP's own variances.
+  /// parameter_covariance and the residual GP's variances, or from the matrix GP's.
   Matrix6d prediction_covariance(const Eigen::VectorXd& theta) const;
   /// Covariance of an observed pose about the predicted one, from position_rms_m and
   /// rotation_rms_rad, alike along all axes; the same everywhere.

@@ -37,7 +37,7 @@ std::optional<std::vector<EdgeStep>> edges_between(const std::vector<Edge>& edge
 }
 
 /// Rigid or screws and nothing else.
-bool is_screw_chain(const Edge& edge) { return !edge.matrix_gp; }
+bool is_screw_chain(const Edge& edge) { return !edge.matrix_gp && !edge.residual_gp; }
 
 /// Covariance in the frame that `X` ends in, of the inverse: (X exp ε)⁻¹ = X⁻¹ exp(−Ad(X) ε).
 Matrix6d turned(const Matrix6d& covariance, const Pose& X) {

@@ -10,6 +10,7 @@
 #include "common/schema/kinematic_path.h"
 #include "processes/structure_learner/command_warp.h"
 #include "processes/structure_learner/noise_estimate.h"
+#include "processes/structure_learner/residual_fit.h"
 #include "processes/structure_learner/structure_search.h"
 
 namespace bodyschema {
@@ -75,6 +76,44 @@ struct FittedEdge {
   bool is_valid = true;  // as far as that was asked
 };
 
+// The final fit of a soft edge in its direction. The screws stay as they are: the process says what
+// they leave, and its variance is that of the whole.
+FittedEdge fit_soft_edge(const LocalModel& screws, const std::vector<int>& signals, int from,
+                         int to, const PairData& pair, const NormalizedActions& actions,
+                         const ValidityOptions& validity) {
+  const LocalModel start = fit_local_model(screws, pair, actions, 30, 1e-3).model;
+  const auto fit = fit_soft_model(start, pair, actions, validity, signals);
+  FittedEdge result;
+  result.edge = to_edge(start, actions);
+  result.edge.from = from;
+  result.edge.to = to;
+  result.edge.num_samples = pair.size();
+  if (!fit) {  // what the search's part of the data carried, all of them refuse
+    result.is_valid = false;
+    result.edge.num_outliers = pair.size();
+    result.edge.confidence = 0;
+    return result;
+  }
+  result.edge.residual_gp = fit->model.residual_gp;
+  double position = 0, rotation = 0;
+  for (int t = 0; t < pair.size(); ++t) {
+    const bool outlying = fit->squared_distance[t] > kOutlierThreshold;
+    result.frames.push_back(pair.frames[t].sample);
+    result.outlying.push_back(outlying);
+    result.edge.num_outliers += outlying;
+    if (outlying) continue;
+    position += fit->residual[t].head<3>().squaredNorm();
+    rotation += fit->residual[t].tail<3>().squaredNorm();
+  }
+  const int inliers = pair.size() - result.edge.num_outliers;
+  if (inliers > 0) {
+    result.edge.position_rms_m = std::sqrt(position / inliers);
+    result.edge.rotation_rms_rad = std::sqrt(rotation / inliers);
+    result.edge.confidence = static_cast<double>(inliers) / pair.size();
+  }
+  return result;
+}
+
 // The final fit of an edge in its direction, on all data, with everything the schema says about it.
 FittedEdge fit_edge(const AcceptedModel& accepted, int from, int to,
                     const std::vector<ActionPoseSample>& samples, const NormalizedActions& actions,
@@ -83,6 +122,8 @@ FittedEdge fit_edge(const AcceptedModel& accepted, int from, int to,
   const LocalModel start = accepted.part_i == from ? accepted.model : accepted.model.inverse();
   const PairData pair =
       make_pair_data(samples, from, to, measurement, std::numeric_limits<int>::max());
+  if (!accepted.soft_signals.empty())
+    return fit_soft_edge(start, accepted.soft_signals, from, to, pair, actions, validity);
   const Fit fit = fit_local_model(start, pair, actions, 60, 1e-6);
   const LeaveOneOut loo = leave_one_out(fit, pair, actions);
 
@@ -530,6 +571,8 @@ LearnedStructure find_structure(const std::vector<Signal>& signals,
     result = {std::move(bent), parts, measurement, std::move(actions_again), std::move(found)};
     if (was_spanning) break;
   }
+  connect_soft_parts(displaced(samples, result.signals), result.actions, parts, search_options,
+                     &result.search);
   return result;
 }
 
@@ -552,6 +595,7 @@ bool is_refuted_by(const LearnedStructure& structure, const std::vector<ActionPo
   const std::vector<ActionPoseSample> moved = displaced(later, structure.signals);
   const NormalizedActions actions(moved, static_cast<int>(structure.signals.size()));
   for (const AcceptedModel& m : structure.search.models) {
+    if (!m.soft_signals.empty()) continue;  // the screws alone never held
     const PairData pair = make_pair_data(moved, m.part_i, m.part_j, structure.measurement,
                                          std::numeric_limits<int>::max());
     if (pair.size() < 2) continue;

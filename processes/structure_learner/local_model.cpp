@@ -52,6 +52,50 @@ void normal_equations(const Fit& fit, const PairData& pair, const NormalizedActi
   *H = H->selfadjointView<Eigen::Lower>();
 }
 
+// Leave-one-out of whole blocks of time, `root` being that of (JᵀWJ)⁺. Without the block B the
+// parameters' covariance is root A⁻¹ rootᵀ with A = I − Σ_B w (J root)ᵀ(J root), which is as small
+// as the model; so r_B^T (I − H_BB)⁻¹ r_B never takes a matrix of the block's size.
+void leave_blocks_out(const Fit& fit, const PairData& pair, const NormalizedActions& actions,
+                      const ParameterMatrix& root, LeaveOneOut* result) {
+  const int p = fit.model.num_parameters();
+  const TimeBlocks& blocks = actions.blocks();
+  std::vector<ParameterJacobian> JR;
+  for (int first = 0, last = 0; first < pair.size(); first = last) {
+    const int block = blocks.block_of(pair.frames[first].sample);
+    ParameterMatrix A = ParameterMatrix::Identity(p, p);
+    ParameterVector g = ParameterVector::Zero(p);
+    JR.clear();
+    for (; last < pair.size() && blocks.block_of(pair.frames[last].sample) == block; ++last) {
+      const FrameFit& frame = fit.frames[last];
+      const PairHypothesis& h = pair.hypotheses[frame.hypothesis];
+      ParameterJacobian J;
+      const Pose prediction =
+          predict_with_jacobian(fit.model, actions, pair.frames[last].sample, &J);
+      whitened_jacobian(h, log(prediction.inverse() * h.z), &J);
+      JR.push_back(J * root);
+      const double w = robust_weight(frame.squared_distance);
+      A.noalias() -= w * JR.back().transpose() * JR.back();
+      g.noalias() += w * JR.back().transpose() * frame.residual;
+    }
+    // A block that alone decides a parameter has eigenvalue 0 here; the floor as for single frames.
+    const Eigen::SelfAdjointEigenSolver<Eigen::MatrixXd> e(A);
+    const Eigen::MatrixXd inverse = e.eigenvectors() *
+                                    e.eigenvalues().cwiseMax(1e-3).cwiseInverse().asDiagonal() *
+                                    e.eigenvectors().transpose();
+    const ParameterVector step = inverse * g;
+    for (int t = first; t < last; ++t) {
+      const ParameterJacobian& J = JR[t - first];
+      const Vector6d left_out = fit.frames[t].residual + J * step;
+      const Matrix6d S = Matrix6d::Identity() + robust_weight(fit.frames[t].squared_distance) * J *
+                                                    inverse * J.transpose();
+      result->squared_distance.push_back(left_out.dot(S.llt().solve(left_out)));
+      result->residual.push_back(
+          pair.hypotheses[fit.frames[t].hypothesis].whitening.triangularView<Eigen::Lower>().solve(
+              left_out));
+    }
+  }
+}
+
 }  // namespace
 
 bool LocalModel::uses(int s) const {
@@ -208,6 +252,10 @@ LeaveOneOut leave_one_out(const Fit& fit, const PairData& pair, const Normalized
 
   result.squared_distance.reserve(pair.size());
   result.residual.reserve(pair.size());
+  if (actions.blocks().is_dense()) {
+    leave_blocks_out(fit, pair, actions, root, &result);
+    return result;
+  }
   ParameterJacobian J;
   for (int t = 0; t < pair.size(); ++t) {
     const FrameFit& frame = fit.frames[t];

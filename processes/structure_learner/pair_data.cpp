@@ -114,6 +114,9 @@ NormalizedActions::NormalizedActions(const std::vector<ActionPoseSample>& sample
     }
     values_.row(s).array() = (values_.row(s).array() - centre_(s)) / half_range_(s);
   }
+  std::vector<std::int64_t> utimes;
+  for (const ActionPoseSample& sample : samples) utimes.push_back(sample.utime);
+  blocks_ = TimeBlocks(utimes, values_(moving_, Eigen::all));
 }
 
 int count_common(const std::vector<ActionPoseSample>& samples, int part_i, int part_j) {

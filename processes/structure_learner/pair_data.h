@@ -5,6 +5,7 @@
 #include "common/geometry/pose.h"
 #include "common/schema/body_schema.h"
 #include "common/schema/sample.h"
+#include "processes/structure_learner/time_blocks.h"
 
 namespace bodyschema {
 
@@ -23,11 +24,13 @@ class NormalizedActions {
   double half_range(int signal) const { return half_range_(signal); }
   /// The signals that took more than one value, ascending. The others can explain nothing.
   const std::vector<int>& moving() const { return moving_; }
+  const TimeBlocks& blocks() const { return blocks_; }
 
  private:
   Eigen::MatrixXd values_;  // signals × samples
   Eigen::VectorXd centre_, half_range_;
   std::vector<int> moving_;
+  TimeBlocks blocks_;
 };
 
 /// One reading of z_ij = y_i⁻¹ y_j.

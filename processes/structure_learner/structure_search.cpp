@@ -495,7 +495,7 @@ class Search {
 
   void accept(const Candidate& c) {
     forest_.connect(c.i, c.j);
-    result_.models.push_back({parts_[c.i], parts_[c.j], c.model, c.score});
+    result_.models.push_back({parts_[c.i], parts_[c.j], c.model, c.score, {}});
   }
 
   template <typename Visitor>

@@ -23,6 +23,8 @@ struct AcceptedModel {
   int part_j = 0;
   LocalModel model;
   double score = 0;
+  /// Q of a soft model (residual_fit.h), whose screws `model` then are; empty: screws alone.
+  std::vector<int> soft_signals;
 };
 
 /// What the search tried between two parts.
