@@ -407,6 +407,12 @@ LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPo
       break;
     }
     const bool was_spanning = search.models.size() + 1 >= schema.parts.size();
+    // What bends a command must be worth it to all markers together, not only to the models that
+    // asked for it.
+    if (was_spanning && found.log_likelihood < search.log_likelihood + kWarpEvidence) {
+      measurement.noise = noise_before;
+      break;
+    }
     schema.signals = std::move(bent);
     moved = std::move(again);
     actions.emplace(actions_again);

@@ -80,4 +80,9 @@ int count_common(const std::vector<ActionPoseSample>& samples, int part_i, int p
 PairData make_pair_data(const std::vector<ActionPoseSample>& samples, int part_i, int part_j,
                         const MeasurementModel& measurement, int max_frames);
 
+/// The poses of one part in the camera's frame, as if the camera were part i and known exactly:
+/// Σ_z is the covariance of the one marker and half the model error.
+PairData make_part_data(const std::vector<ActionPoseSample>& samples, int part,
+                        const MeasurementModel& measurement, int max_frames);
+
 }  // namespace bodyschema

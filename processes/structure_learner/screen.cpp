@@ -38,17 +38,21 @@ double median(std::vector<double> values) {
   return *middle;
 }
 
-// Mean robust cost a frame on an even subset of the frames.
-double mean_cost(const LocalModel& model, const PairData& pair, const NormalizedActions& actions) {
+// How well a start fits an even subset of the frames.
+Start judged(const LocalModel& model, const PairData& pair, const NormalizedActions& actions) {
+  Start start;
+  start.model = model;
   const int n = std::min(pair.size(), kScreenFrames);
-  double sum = 0;
+  if (n == 0) return start;
+  std::vector<double> squared(n);
   for (int k = 0; k < n; ++k) {
     const int t = static_cast<int>(static_cast<long>(k) * pair.size() / n);
-    const double d2 =
+    squared[k] =
         best_reading(pair, t, model.predict(actions, pair.frames[t].sample)).squared_distance;
-    sum += std::log1p(d2 / kStudentNu);
+    start.score += (kStudentNu + 6) / 2 * std::log1p(squared[k] / kStudentNu) / n;
   }
-  return n > 0 ? (kStudentNu + 6) / 2 * sum / n : 0;
+  start.median = median(std::move(squared));
+  return start;
 }
 
 // R_t u = C (1, cos α_t, sin α_t): smallest eigenvector and robust score.
@@ -273,8 +277,7 @@ Start complete_start(RotationHypothesis h, bool try_signs, const StartFrames& fr
     }
   }
 
-  Start start;
-  LocalModel& model = start.model;
+  LocalModel model;
   model.num_joints = 2;
   model.signal = {h.a, h.b};
   model.turn = {best_turn_a, best_turn_b};
@@ -300,8 +303,7 @@ Start complete_start(RotationHypothesis h, bool try_signs, const StartFrames& fr
   model.A[1].translation() = Za.transpose() * x.segment<3>(3);
   model.A[2].linear() = Zb.transpose() * R2;
   model.A[2].translation() = Zb.transpose() * x.segment<3>(6);
-  start.score = mean_cost(model, pair, actions);
-  return start;
+  return judged(model, pair, actions);
 }
 
 // Two turning joints with general axes, best sums of the two one-sided scores first.
@@ -521,8 +523,8 @@ Start screen_rigid(const PairData& pair, const NormalizedActions& actions) {
   for (int k = 0; k < n; ++k) {
     LocalModel model;
     model.A[0] = pair.primary(static_cast<int>(static_cast<long>(k) * pair.size() / n)).z;
-    const double score = mean_cost(model, pair, actions);
-    if (score < best.score) best = {model, score};
+    const Start start = judged(model, pair, actions);
+    if (start.score < best.score) best = start;
   }
   return best;
 }
@@ -605,8 +607,8 @@ Start one_joint_start(const ScrewRegression& regression, const PairData& pair,
     const int t = static_cast<int>(static_cast<long>(k) * pair.size() / n);
     const Vector6d back = -regression.xi * actions(pair.frames[t].sample, regression.signal);
     model.A[0] = pair.primary(t).z * exp(back) * X;
-    const double score = mean_cost(model, pair, actions);
-    if (score < best.score) best = {model, score};
+    const Start start = judged(model, pair, actions);
+    if (start.score < best.score) best = start;
   }
   return best;
 }

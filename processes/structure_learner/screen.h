@@ -24,10 +24,11 @@ struct RelativeMotions {
 /// logarithm is ambiguous at π).
 RelativeMotions relative_motions(const PairData& pair, int max_motions);
 
-/// A closed-form start and how well it already fits: mean robust cost a frame, smaller is better.
+/// A closed-form start and how well it already fits an even subset of the frames.
 struct Start {
   LocalModel model;
-  double score = 0;
+  double score = 0;   ///< mean robust cost a frame: smaller is better
+  double median = 0;  ///< of the squared distances: outliers do not count
 };
 
 /// k = 0: the best of a few single readings.

@@ -6,6 +6,8 @@
 #include <numeric>
 #include <tuple>
 
+#include "processes/structure_learner/tree_fit.h"
+
 namespace bodyschema {
 namespace {
 
@@ -13,6 +15,13 @@ namespace {
 // at the squared distance d² costs 5 log(1 + d²/4).)
 constexpr double kMaxRigidStartCost = 20;
 constexpr double kMaxScrewStartCost = 26;
+// And starts whose median squared distance is above these (χ²₆ has 5.35), from kManyFrames on. The
+// valid models' stay below half of that in every noise regime, whatever the outliers.
+constexpr double kMaxRigidStartMedian = 20;
+constexpr double kMaxScrewStartMedian = 30;
+constexpr double kMaxFewFramesMedian = 100;  // from kSomeFrames on
+constexpr int kSomeFrames = 10;
+constexpr int kManyFrames = 20;
 // Two signal sets of one size whose likelihoods differ by less [nats] are not told apart.
 constexpr double kAmbiguityMargin = 3;
 
@@ -46,6 +55,12 @@ struct Candidate {
   bool on_all_data = false;
 };
 
+// Beyond what a local fit mends, by the bulk of the frames.
+bool is_hopeless(const Start& start, int num_frames, double max_median) {
+  return num_frames >= kSomeFrames &&
+         start.median > (num_frames >= kManyFrames ? max_median : kMaxFewFramesMedian);
+}
+
 std::set<int> signal_set(const LocalModel& model) {
   return {model.signal.begin(), model.signal.begin() + model.num_joints};
 }
@@ -65,18 +80,24 @@ class Search {
     max_motions_ = num_pairs > 200 ? 150 : 300;
     pairs_.resize(static_cast<std::size_t>(n) * n);
     motions_.resize(pairs_.size());
+    rests_.assign(n, -1);
     for (int i = 0; i < n; ++i)
       for (int j = i + 1; j < n; ++j)
         record(i, j).num_common = count_common(samples, parts[i], parts[j]);
   }
 
   SearchResult run() {
-    for (int k = 0; k <= options_.max_signals && !forest_.spans(); ++k) {
-      if (k == 0) layer_rigid();
-      if (k == 1) layer_one_joint();
-      if (k == 2) layer_two_joints();
+    constexpr int kMaxRounds = 4;
+    for (int round = 0; round < kMaxRounds; ++round) {
+      for (int k = round == 0 ? 0 : 1; k <= options_.max_signals && !forest_.spans(); ++k) {
+        if (k == 0) layer_rigid();
+        if (k == 1) layer_one_joint();
+        if (k == 2) layer_two_joints();
+      }
+      settle_doubtful();
+      // What all markers together refute leaves a gap, which other models may fill.
+      if (!settle_jointly()) break;
     }
-    settle_doubtful();
     return std::move(result_);
   }
 
@@ -120,6 +141,7 @@ class Search {
 
   // Fits and tests a start on the pair's subset of the data.
   std::optional<Candidate> try_start(int i, int j, const LocalModel& start) {
+    if (refuted_.count({parts_[i], parts_[j], signal_set(start)})) return std::nullopt;
     const PairData& data = pair(i, j);
     const bool all = data.size() == record(i, j).num_common;
     Fit fit = fit_local_model(start, data, actions_, 40, 1e-4);
@@ -201,6 +223,150 @@ class Search {
         accept(c);
   }
 
+  struct Tree {
+    std::vector<TreeNode> nodes;
+    std::vector<int> accepted;  // of each node but the first: index into result_.models
+    std::vector<PairData> data;
+    bool root_rests = false;
+  };
+
+  // The accepted models of one component, outwards from a part that rests if there is one.
+  Tree tree_of(int component) {
+    std::vector<int> members;
+    for (int x = 0; x < static_cast<int>(parts_.size()); ++x)
+      if (forest_.connected(component, x)) members.push_back(x);
+    Tree tree;
+    int root = members.front();
+    for (const int x : members)
+      if (part_rests(x)) {
+        root = x;
+        tree.root_rests = true;
+        break;
+      }
+    tree.nodes.push_back({parts_[root], -1, {}});
+    tree.accepted.push_back(-1);
+    for (std::size_t head = 0; head < tree.nodes.size(); ++head) {
+      const int from = tree.nodes[head].part;
+      for (int m = 0; m < static_cast<int>(result_.models.size()); ++m) {
+        if (m == tree.accepted[head]) continue;
+        const AcceptedModel& model = result_.models[m];
+        if (model.part_i == from)
+          tree.nodes.push_back({model.part_j, static_cast<int>(head), model.model});
+        else if (model.part_j == from)
+          tree.nodes.push_back({model.part_i, static_cast<int>(head), model.model.inverse()});
+        else
+          continue;
+        tree.accepted.push_back(m);
+      }
+    }
+    for (const TreeNode& node : tree.nodes)
+      tree.data.push_back(make_part_data(samples_, node.part, options_.measurement, max_frames_));
+    return tree;
+  }
+
+  // Does a part keep its pose in the camera's frame?
+  bool part_rests(int x) {
+    if (rests_[x] < 0) {
+      const PairData data =
+          make_part_data(samples_, parts_[x], options_.measurement, max_frames_);
+      const Start start = screen_rigid(data, actions_);
+      rests_[x] = 0;
+      if (start.score < kMaxRigidStartCost) {
+        const Fit fit = fit_local_model(start.model, data, actions_, 20, 1e-4);
+        const Validity validity = check_validity(fit, leave_one_out(fit, data, actions_), data,
+                                                 actions_, options_.validity);
+        rests_[x] = validity.verdict == Verdict::kValid;
+      }
+    }
+    return rests_[x] == 1;
+  }
+
+  // Joints that only all markers together show: part what moves, until nothing is left to explain.
+  // Models that cannot take up the joints they lack are removed: returns true then.
+  bool settle_jointly() {
+    const int n = static_cast<int>(parts_.size());
+    constexpr int kMaxSplits = 12;
+    std::vector<std::pair<int, int>> refuted;
+    result_.log_likelihood = 0;
+    for (int x = 0; x < n; ++x) {
+      if (forest_.find(x) != x) continue;
+      for (int round = 0; round < kMaxSplits; ++round) {
+        Tree tree = tree_of(x);
+        TreeFit fit(tree.nodes, tree.data, actions_, tree.root_rests);
+        fit.fit(15, 0.05);
+        const auto missing = fit.missing_joints();
+        const MissingJoint* worst =
+            tree.nodes.size() < 2 ? nullptr : most_significant(missing);
+        if (!worst || round + 1 == kMaxSplits) {
+          result_.log_likelihood += fit.log_likelihood();
+          break;
+        }
+        if (const auto edges = fit.with_joint(*worst)) {
+          adopt(tree, *edges);
+          continue;
+        }
+        for (const int node : fit.full_edges(*worst))
+          refuted.push_back({tree.nodes[node].part, tree.nodes[tree.nodes[node].parent].part});
+        result_.log_likelihood += fit.log_likelihood();
+        break;
+      }
+    }
+    if (refuted.empty()) return false;
+    for (const auto& [a, b] : refuted)
+      std::erase_if(result_.models, [&, a = a, b = b](const AcceptedModel& m) {
+        const bool is_it = std::minmax(a, b) == std::minmax(m.part_i, m.part_j);
+        if (is_it) refuted_.insert({m.part_i, m.part_j, signal_set(m.model)});
+        return is_it;
+      });
+    forest_ = Forest(n);
+    for (const AcceptedModel& m : result_.models) forest_.connect(index_of(m.part_i), index_of(m.part_j));
+    doubtful_.clear();
+    return true;
+  }
+
+  int index_of(int part) const {
+    return static_cast<int>(std::find(parts_.begin(), parts_.end(), part) - parts_.begin());
+  }
+
+  // Replaces the accepted models of a component by the edges of its new tree.
+  void adopt(const Tree& tree, const std::vector<TreeEdge>& edges) {
+    std::vector<int> old(tree.accepted.begin() + 1, tree.accepted.end());
+    std::sort(old.rbegin(), old.rend());
+    for (const int m : old) result_.models.erase(result_.models.begin() + m);
+    for (const TreeEdge& e : edges) {
+      AcceptedModel model{tree.nodes[e.a].part, tree.nodes[e.b].part, e.model, 0};
+      if (model.part_i > model.part_j) {
+        std::swap(model.part_i, model.part_j);
+        model.model = model.model.inverse();
+      }
+      result_.models.push_back(model);
+    }
+  }
+
+  // The one that chance explains least, if it is significant (Bonferroni over all that was tried).
+  // A signal that moves nothing in a spanning forest is probably somewhere: it has an error rate of
+  // its own, spent on fewer hypotheses.
+  const MissingJoint* most_significant(const std::vector<MissingJoint>& joints) const {
+    constexpr double kErrorRates[2] = {0.003, 0.002};
+    std::set<int> used;
+    for (const AcceptedModel& m : result_.models)
+      for (int d = 0; d < m.model.num_joints; ++d) used.insert(m.model.signal[d]);
+    const auto is_used = [&](int signal) { return !forest_.spans() || used.count(signal) > 0; };
+    double ways[2] = {0, 0};
+    for (const MissingJoint& j : joints) ways[is_used(j.signal)] += std::exp(j.log_ways);
+    const MissingJoint* best = nullptr;
+    double best_margin = 0;
+    for (const MissingJoint& j : joints) {
+      const bool elsewhere = is_used(j.signal);
+      const double margin = j.log_tail + std::log(2 * ways[elsewhere] / kErrorRates[elsewhere]);
+      if (margin < best_margin) {
+        best = &j;
+        best_margin = margin;
+      }
+    }
+    return best;
+  }
+
   static void sort_by_quality(std::vector<Candidate>* candidates) {
     std::stable_sort(candidates->begin(), candidates->end(), [](const auto& x, const auto& y) {
       return std::tie(x.model.num_joints, y.score, x.i, x.j) <
@@ -226,7 +392,9 @@ class Search {
     for_each_open_pair([&](int i, int j) {
       ++result_.num_screens;
       const Start start = screen_rigid(pair(i, j), actions_);
-      if (start.score > kMaxRigidStartCost) return;
+      if (start.score > kMaxRigidStartCost ||
+          is_hopeless(start, pair(i, j).size(), kMaxRigidStartMedian))
+        return;
       if (auto c = try_start(i, j, start.model)) candidates.push_back(std::move(*c));
     });
     connect(std::move(candidates));
@@ -243,7 +411,9 @@ class Search {
         if (n >= 2 && regressions[n].score > 1.5 * regressions[0].score) break;
         const Start start =
             one_joint_start(regressions[n], pair(i, j), actions_, motions(i, j).sigma_rad);
-        if (start.score > kMaxScrewStartCost) continue;
+        if (start.score > kMaxScrewStartCost ||
+            is_hopeless(start, pair(i, j).size(), kMaxScrewStartMedian))
+          continue;
         if (auto c = try_start(i, j, start.model)) valid.push_back(std::move(*c));
       }
       decide(i, j, std::move(valid), &candidates);
@@ -316,6 +486,8 @@ class Search {
   int max_motions_ = 0;
   std::vector<std::optional<PairData>> pairs_;
   std::vector<std::optional<RelativeMotions>> motions_;
+  std::set<std::tuple<int, int, std::set<int>>> refuted_;  // by all markers together
+  std::vector<int> rests_;  // a part: 1 yes, 0 no, -1 not yet known
   std::vector<Candidate> doubtful_;
   int num_judged_ = 0;  // frames of the valid models found so far, and the outliers among them
   int num_outliers_ = 0;

@@ -36,6 +36,8 @@ struct PairRecord {
 struct SearchResult {
   std::vector<AcceptedModel> models;  ///< the forest, in the order of acceptance
   std::map<std::pair<int, int>, PairRecord> records;
+  /// Of all poses, each tree fitted as a whole, Student-t [nats]; up to a constant.
+  double log_likelihood = 0;
   int num_screens = 0;  ///< closed-form starts and regressions
   int num_fits = 0;     ///< Levenberg–Marquardt fits
 };
