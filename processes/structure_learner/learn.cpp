@@ -64,7 +64,7 @@ FittedEdge fit_edge(const AcceptedModel& accepted, int from, int to,
   const LocalModel start = accepted.part_i == from ? accepted.model : accepted.model.inverse();
   const PairData pair =
       make_pair_data(samples, from, to, measurement, std::numeric_limits<int>::max());
-  const Fit fit = fit_local_model(start, pair, actions, 60);
+  const Fit fit = fit_local_model(start, pair, actions, 60, 1e-6);
   const LeaveOneOut loo = leave_one_out(fit, pair, actions);
 
   FittedEdge result;

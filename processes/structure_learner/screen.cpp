@@ -13,7 +13,8 @@ using Eigen::Matrix3d;
 using Eigen::Vector3d;
 
 constexpr int kScreenFrames = 48;    // frames on which a start is judged
-constexpr int kRotationFrames = 80;  // frames of the eigenvector screen
+constexpr int kCoarseFrames = 16;    // frames on which a start is chosen among a few alike
+constexpr int kRotationFrames = 56;  // frames of the eigenvector screen
 
 Matrix3d rotation_z(double angle) {
   const double c = std::cos(angle), s = std::sin(angle);
@@ -39,10 +40,11 @@ double median(std::vector<double> values) {
 }
 
 // How well a start fits an even subset of the frames.
-Start judged(const LocalModel& model, const PairData& pair, const NormalizedActions& actions) {
+Start judged(const LocalModel& model, const PairData& pair, const NormalizedActions& actions,
+             int max_frames = kScreenFrames) {
   Start start;
   start.model = model;
-  const int n = std::min(pair.size(), kScreenFrames);
+  const int n = std::min(pair.size(), max_frames);
   if (n == 0) return start;
   std::vector<double> squared(n);
   for (int k = 0; k < n; ++k) {
@@ -523,10 +525,10 @@ Start screen_rigid(const PairData& pair, const NormalizedActions& actions) {
   for (int k = 0; k < n; ++k) {
     LocalModel model;
     model.A[0] = pair.primary(static_cast<int>(static_cast<long>(k) * pair.size() / n)).z;
-    const Start start = judged(model, pair, actions);
+    const Start start = judged(model, pair, actions, kCoarseFrames);
     if (start.score < best.score) best = start;
   }
-  return best;
+  return n > 0 ? judged(best.model, pair, actions) : best;
 }
 
 std::vector<ScrewRegression> screen_one_joint(const RelativeMotions& motions,
@@ -537,10 +539,12 @@ std::vector<ScrewRegression> screen_one_joint(const RelativeMotions& motions,
   std::vector<Vector6d> scaled;
   scaled.reserve(motions.motions.size());
   for (const auto& motion : motions.motions) scaled.push_back(scale.cwiseProduct(motion.log));
-  std::vector<ScrewRegression> result;
+  constexpr int kRounds = 6;
+  constexpr std::size_t kMaxSignals = 8;  // worth more than a least squares fit
   std::vector<double> dq;
   std::vector<int> used;
-  for (const int signal : actions.moving()) {
+  // `rounds` re-weightings, the first without weights.
+  const auto regress = [&](int signal, int rounds) {
     dq.clear();
     used.clear();
     for (std::size_t n = 0; n < scaled.size(); ++n) {
@@ -552,8 +556,9 @@ std::vector<ScrewRegression> screen_one_joint(const RelativeMotions& motions,
     }
     ScrewRegression regression;
     regression.signal = signal;
+    regression.score = std::numeric_limits<double>::infinity();
     Vector6d slope = Vector6d::Zero();
-    for (int round = 0; round < 7; ++round) {
+    for (int round = 0; round <= rounds; ++round) {
       double sxx = 1e-12, score = 0;
       Vector6d sxy = Vector6d::Zero();
       for (std::size_t n = 0; n < used.size(); ++n) {
@@ -564,18 +569,25 @@ std::vector<ScrewRegression> screen_one_joint(const RelativeMotions& motions,
         sxy += w * dq[n] * y;
         score += root;
       }
-      if (round == 6) {
-        regression.score = used.empty() ? std::numeric_limits<double>::infinity()
-                                        : score / static_cast<double>(used.size());
+      if (round == rounds) {
+        if (!used.empty()) regression.score = score / static_cast<double>(used.size());
         break;
       }
       slope = sxy / sxx;
     }
     regression.xi = slope.cwiseQuotient(scale);
-    result.push_back(regression);
+    return regression;
+  };
+  const auto best_first = [](const auto& x, const auto& y) { return x.score < y.score; };
+  std::vector<ScrewRegression> result;
+  const bool many = actions.moving().size() > kMaxSignals;
+  for (const int signal : actions.moving()) result.push_back(regress(signal, many ? 2 : kRounds));
+  std::stable_sort(result.begin(), result.end(), best_first);
+  if (many) {
+    result.resize(kMaxSignals);
+    for (ScrewRegression& r : result) r = regress(r.signal, kRounds);
+    std::stable_sort(result.begin(), result.end(), best_first);
   }
-  std::stable_sort(result.begin(), result.end(),
-                   [](const auto& x, const auto& y) { return x.score < y.score; });
   return result;
 }
 
@@ -607,10 +619,10 @@ Start one_joint_start(const ScrewRegression& regression, const PairData& pair,
     const int t = static_cast<int>(static_cast<long>(k) * pair.size() / n);
     const Vector6d back = -regression.xi * actions(pair.frames[t].sample, regression.signal);
     model.A[0] = pair.primary(t).z * exp(back) * X;
-    const Start start = judged(model, pair, actions);
+    const Start start = judged(model, pair, actions, kCoarseFrames);
     if (start.score < best.score) best = start;
   }
-  return best;
+  return n > 0 ? judged(best.model, pair, actions) : best;
 }
 
 std::vector<double> default_turns() { return {0.3, 0.55, 0.9, 1.4, 2.0, 2.8}; }

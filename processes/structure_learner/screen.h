@@ -35,8 +35,8 @@ struct Start {
 Start screen_rigid(const PairData& pair, const NormalizedActions& actions);
 
 /// k = 1, all signals: log(z_s⁻¹ z_t) = ξ (q_t − q_s) holds exactly for every screw, so ξ follows
-/// from an L1 regression. Best signal first; `score` is the mean regression error in standard
-/// deviations.
+/// from an L1 regression. Best signal first, of many signals the eight most promising; `score` is
+/// the mean regression error in standard deviations.
 struct ScrewRegression {
   int signal = 0;
   Vector6d xi = Vector6d::Zero();  ///< in frame j, per half range

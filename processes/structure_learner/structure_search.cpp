@@ -76,7 +76,7 @@ class Search {
         forest_(static_cast<int>(parts.size())) {
     const int n = static_cast<int>(parts.size());
     const int num_pairs = std::max(1, n * (n - 1) / 2);
-    max_frames_ = std::clamp(40000 / num_pairs, 60, 150);
+    max_frames_ = std::clamp(40000 / num_pairs, 60, 80);
     max_motions_ = num_pairs > 200 ? 150 : 300;
     pairs_.resize(static_cast<std::size_t>(n) * n);
     motions_.resize(pairs_.size());
@@ -144,7 +144,7 @@ class Search {
     if (refuted_.count({parts_[i], parts_[j], signal_set(start)})) return std::nullopt;
     const PairData& data = pair(i, j);
     const bool all = data.size() == record(i, j).num_common;
-    Fit fit = fit_local_model(start, data, actions_, 40, 1e-4);
+    Fit fit = fit_local_model(start, data, actions_, 40, 1e-2);
     ++result_.num_fits;
     ValidityOptions options = options_.validity;
     options.lenient = !all;
@@ -293,7 +293,7 @@ class Search {
       for (int round = 0; round < kMaxSplits; ++round) {
         Tree tree = tree_of(x);
         TreeFit fit(tree.nodes, tree.data, actions_, tree.root_rests);
-        fit.fit(15, 0.05);
+        fit.fit(15, 0.2);
         const auto missing = fit.missing_joints();
         const MissingJoint* worst =
             tree.nodes.size() < 2 ? nullptr : most_significant(missing);
@@ -408,7 +408,7 @@ class Search {
       result_.num_screens += static_cast<int>(regressions.size());
       std::vector<Candidate> valid;
       for (std::size_t n = 0; n < std::min(kMaxFits, regressions.size()); ++n) {
-        if (n >= 2 && regressions[n].score > 1.5 * regressions[0].score) break;
+        if (n >= 1 && regressions[n].score > 1.5 * regressions[0].score) break;
         const Start start =
             one_joint_start(regressions[n], pair(i, j), actions_, motions(i, j).sigma_rad);
         if (start.score > kMaxScrewStartCost ||

@@ -180,7 +180,7 @@ TreeFit::Normal TreeFit::normal_equations() const {
         const PairHypothesis& h = data_[k].hypotheses[fit.hypothesis];
         const Pose X_BC = poses_[index].inverse();
         const Matrix6d A =
-            -(h.whitening * right_jacobian_inverse(-log(X_BC * h.z))) * adjoint(X_BC);
+            -(h.whitening * right_jacobian_inverse(-fit.error)) * adjoint(X_BC);
         const double w = robust_weight(fit.squared_distance);
         result.own_I[index].noalias() = w * A.transpose() * A;
         result.own_gradient[index].noalias() = w * A.transpose() * fit.residual;
@@ -196,7 +196,7 @@ TreeFit::Normal TreeFit::normal_equations() const {
       }
       ParameterJacobian J;
       predict_with_jacobian(nodes_[k].model, actions_, samples_[t], &J);
-      result.S[index] = adjoint(poses_[index]) * J;
+      result.S[index].noalias() = adjoint(poses_[index]).lazyProduct(J);
       result.I[at(t, nodes_[k].parent)] += result.I[index];
       result.gradient[at(t, nodes_[k].parent)] += result.gradient[index];
     }
@@ -207,22 +207,23 @@ TreeFit::Normal TreeFit::normal_equations() const {
     }
     for (int k = root_rests_ ? 0 : 1; k < n; ++k) {
       const ParameterJacobian& S = result.S[at(t, k)];
-      const ParameterJacobian IS = result.I[at(t, k)] * S;
-      result.g.segment(result.offset[k], S.cols()) += S.transpose() * result.gradient[at(t, k)];
+      const ParameterJacobian IS = result.I[at(t, k)].lazyProduct(S);
+      result.g.segment(result.offset[k], S.cols()) +=
+          S.transpose().lazyProduct(result.gradient[at(t, k)]);
       for (int e = k;; e = nodes_[e].parent) {
         const ParameterJacobian& S_e = result.S[at(t, e)];
         if (e != 0 || root_rests_)
-          result.H.block(result.offset[k], result.offset[e], S.cols(), S_e.cols()).noalias() +=
-              IS.transpose() * S_e;
+          result.H.block(result.offset[k], result.offset[e], S.cols(), S_e.cols()) +=
+              IS.transpose().lazyProduct(S_e);
         if (nodes_[e].parent < 0) break;
       }
       if (root_rests_) continue;
-      const ParameterJacobian TIS = result.inverse_total[t] * IS;
+      const ParameterJacobian TIS = result.inverse_total[t].lazyProduct(IS);
       result.g.segment(result.offset[k], S.cols()) -= TIS.transpose() * result.gradient[at(t, 0)];
       for (int e = 1; e <= k; ++e) {
         const ParameterJacobian& S_e = result.S[at(t, e)];
-        result.H.block(result.offset[k], result.offset[e], S.cols(), S_e.cols()).noalias() -=
-            TIS.transpose() * (result.I[at(t, e)] * S_e);
+        result.H.block(result.offset[k], result.offset[e], S.cols(), S_e.cols()) -=
+            TIS.transpose().lazyProduct(result.I[at(t, e)].lazyProduct(S_e).eval());
       }
     }
   }
@@ -410,11 +411,12 @@ std::vector<MissingJoint> TreeFit::missing_joints() const {
           const ParameterJacobian& S = normal.S[at(t, e)];
           auto block = fj.middleCols(column, S.cols());
           if (items[i].is_branch && is_below(e, k))
-            block.noalias() = F.transpose() * (normal.I[at(t, e)] * S);
+            block = (F.transpose() * normal.I[at(t, e)]).lazyProduct(S);
           else if (is_below(k, e))
-            block.noalias() = FI[i] * S;
+            block = FI[i].lazyProduct(S);
           if (!root_rests_)
-            block -= FI[i] * (normal.inverse_total[t] * (normal.I[at(t, e)] * S));
+            block -=
+                (FI[i] * normal.inverse_total[t] * normal.I[at(t, e)]).lazyProduct(S);
           column += S.cols();
         }
       }
