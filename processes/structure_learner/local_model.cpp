@@ -179,7 +179,7 @@ Fit fit_local_model(const LocalModel& start, const PairData& pair, const Normali
     // Residuals far below the noise go on to the end of the arithmetic: it costs a step or two.
     if (!improved || (decrease < tolerance && fit.cost > 1e-3 * pair.size())) break;
     // Stuck where no model is valid (a valid one costs about 5 a frame, outliers 30).
-    if (iteration >= 12 && fit.cost > 16 * pair.size() && decrease < 0.01 * fit.cost) break;
+    if (iteration >= 8 && fit.cost > 16 * pair.size() && decrease < 0.01 * fit.cost) break;
   }
   return fit;
 }

@@ -74,7 +74,7 @@ class AxisScreen {
         phi_(rotations_.size()),
         weights_(rotations_.size()) {}
 
-  AxisFit fit(int signal, double turn) {
+  AxisFit fit(int signal, double turn, int rounds) {
     const std::size_t n = rotations_.size();
     for (std::size_t t = 0; t < n; ++t) {
       const double angle = turn * actions_(samples_[t], signal);
@@ -82,7 +82,7 @@ class AxisScreen {
     }
     weights_ = inverse_variances_;
     AxisFit result;
-    for (int round = 0; round < 4; ++round) {
+    for (int round = 0; round < rounds; ++round) {
       Matrix3d gram = Matrix3d::Zero();
       Eigen::Matrix<double, 3, 9> G = Eigen::Matrix<double, 3, 9>::Zero();
       double total = 0;
@@ -326,14 +326,27 @@ void general_hypotheses(const StartFrames& frames, const NormalizedActions& acti
   };
   const auto& moving = actions.moving();
   std::vector<Side> sides_a(moving.size()), sides_b(moving.size());
-  for (std::size_t s = 0; s < moving.size(); ++s) {
-    for (const double turn : turns[moving[s]]) {
-      const AxisFit a = screen_a.fit(moving[s], turn);
-      if (a.score < sides_a[s].fit.score) sides_a[s] = {a, turn};
-      const AxisFit b = screen_b.fit(moving[s], turn);
-      if (b.score < sides_b[s].fit.score) sides_b[s] = {b, turn};
+  // Of many signals only the promising ones are worth more than two rounds of re-weighting.
+  constexpr int kRounds = 4;
+  constexpr std::size_t kMaxSignals = 8;
+  const bool many = moving.size() > kMaxSignals;
+  const auto best_of_turns = [&](AxisScreen* screen, std::vector<Side>* sides) {
+    for (std::size_t s = 0; s < moving.size(); ++s) {
+      for (const double turn : turns[moving[s]]) {
+        const AxisFit fit = screen->fit(moving[s], turn, many ? 2 : kRounds);
+        if (fit.score < (*sides)[s].fit.score) (*sides)[s] = {fit, turn};
+      }
     }
-  }
+    if (!many) return;
+    std::vector<double> scores;
+    for (const Side& side : *sides) scores.push_back(side.fit.score);
+    std::nth_element(scores.begin(), scores.begin() + kMaxSignals - 1, scores.end());
+    for (std::size_t s = 0; s < moving.size(); ++s)
+      if ((*sides)[s].fit.score <= scores[kMaxSignals - 1])
+        (*sides)[s].fit = screen->fit(moving[s], (*sides)[s].turn, kRounds);
+  };
+  best_of_turns(&screen_a, &sides_a);
+  best_of_turns(&screen_b, &sides_b);
   std::vector<RotationHypothesis> found;
   for (std::size_t s = 0; s < moving.size(); ++s) {
     for (std::size_t r = 0; r < moving.size(); ++r) {

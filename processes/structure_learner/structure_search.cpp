@@ -22,6 +22,9 @@ constexpr double kMaxScrewStartMedian = 30;
 constexpr double kMaxFewFramesMedian = 100;  // from kSomeFrames on
 constexpr int kSomeFrames = 10;
 constexpr int kManyFrames = 20;
+// A refuted fit that costs less a frame may yet be right (a valid one costs 4 to 7).
+constexpr double kMaxHopefulCost = 9;
+constexpr double kMaxSmallHopefulCost = 14;
 // Two signal sets of one size whose likelihoods differ by less [nats] are not told apart.
 constexpr double kAmbiguityMargin = 3;
 
@@ -98,6 +101,7 @@ class Search {
       // What all markers together refute leaves a gap, which other models may fill.
       if (!settle_jointly()) break;
     }
+    if (!forest_.spans() && bridge()) settle_jointly();
     return std::move(result_);
   }
 
@@ -145,6 +149,7 @@ class Search {
     const PairData& data = pair(i, j);
     const bool all = data.size() == record(i, j).num_common;
     Fit fit = fit_local_model(start, data, actions_, 40, 1e-2);
+    last_cost_ = fit.cost / data.size();
     ++result_.num_fits;
     ValidityOptions options = options_.validity;
     options.lenient = !all;
@@ -152,7 +157,11 @@ class Search {
         check_validity(fit, leave_one_out(fit, data, actions_), data, actions_, options);
     if (validity.verdict == Verdict::kNotEnoughData)
       note_undecided(i, j, start.num_joints, validity.mean_capped);
-    if (validity.verdict != Verdict::kValid) return std::nullopt;
+    if (validity.verdict != Verdict::kValid) {
+      if (fit.cost < (start.num_joints < 2 ? kMaxSmallHopefulCost : kMaxHopefulCost) * data.size())
+        hopefuls_.push_back({i, j, fit.model, fit.cost / data.size()});
+      return std::nullopt;
+    }
     return Candidate{i,
                      j,
                      fit.model,
@@ -291,9 +300,8 @@ class Search {
     for (int x = 0; x < n; ++x) {
       if (forest_.find(x) != x) continue;
       for (int round = 0; round < kMaxSplits; ++round) {
-        Tree tree = tree_of(x);
-        TreeFit fit(tree.nodes, tree.data, actions_, tree.root_rests);
-        fit.fit(15, 0.2);
+        const Tree tree = tree_of(x);
+        const TreeFit fit = fit_tree(tree);
         const auto missing = fit.missing_joints();
         const MissingJoint* worst =
             tree.nodes.size() < 2 ? nullptr : most_significant(missing);
@@ -322,6 +330,117 @@ class Search {
     for (const AcceptedModel& m : result_.models) forest_.connect(index_of(m.part_i), index_of(m.part_j));
     doubtful_.clear();
     return true;
+  }
+
+  // Connects what is left by models that their own pair could not make valid, if all markers of both
+  // sides together find nothing wrong with one.
+  // A model that is too small grows by the joints it lacks.
+  bool bridge() {
+    constexpr int kMaxTried = 12;
+    std::stable_sort(hopefuls_.begin(), hopefuls_.end(), [](const Hopeful& x, const Hopeful& y) {
+      return std::forward_as_tuple(x.model.num_joints, x.cost) <
+             std::forward_as_tuple(y.model.num_joints, y.cost);
+    });
+    std::set<std::tuple<int, int, std::set<int>>> met;  // the best fit of each comes first
+    std::erase_if(hopefuls_, [&met](const Hopeful& h) {
+      return !met.insert({h.i, h.j, signal_set(h.model)}).second;
+    });
+    std::map<std::tuple<int, int, int>, int> tried;  // by components and k
+    std::map<int, double> cost_of;  // of a component's own tree
+    const auto own_cost = [&](int x) {
+      const auto [it, is_new] = cost_of.emplace(forest_.find(x), 0.0);
+      if (is_new) it->second = fit_tree(tree_of(x)).cost();
+      return it->second;
+    };
+    bool any = false;
+    for (const Hopeful& h : hopefuls_) {
+      if (forest_.connected(h.i, h.j)) continue;
+      if (refuted_.count({parts_[h.i], parts_[h.j], signal_set(h.model)})) continue;
+      const auto [x, y] = std::minmax({forest_.find(h.i), forest_.find(h.j)});
+      if (tried[{x, y, h.model.num_joints}]++ >= kMaxTried) continue;
+      const double apart = own_cost(h.i) + own_cost(h.j);
+      const Forest forest_before = forest_;
+      const std::vector<AcceptedModel> models_before = result_.models;
+      const auto cost = join(h, apart);
+      if (!cost) continue;
+      // Another signal set between the same parts that does as well leaves it open.
+      const Forest forest_joined = forest_;
+      const std::vector<AcceptedModel> models_joined = result_.models;
+      bool is_ambiguous = false;
+      for (const Hopeful& other : hopefuls_) {
+        if (other.i != h.i || other.j != h.j || other.model.num_joints != h.model.num_joints ||
+            signal_set(other.model) == signal_set(h.model))
+          continue;
+        forest_ = forest_before;
+        result_.models = models_before;
+        const auto other_cost = join(other, apart);
+        is_ambiguous |= other_cost && *other_cost < *cost + 2 * kAmbiguityMargin &&
+                        !same_signals(result_.models, models_joined);
+      }
+      forest_ = is_ambiguous ? forest_before : forest_joined;
+      result_.models = is_ambiguous ? models_before : models_joined;
+      if (is_ambiguous) continue;
+      cost_of.clear();
+      any = true;
+    }
+    return any;
+  }
+
+  struct Hopeful {
+    int i = 0, j = 0;
+    LocalModel model;
+    double cost = 0;  // a frame
+  };
+
+  static bool same_signals(const std::vector<AcceptedModel>& x,
+                           const std::vector<AcceptedModel>& y) {
+    const auto all = [](const std::vector<AcceptedModel>& models) {
+      std::set<std::tuple<int, int, std::set<int>>> result;
+      for (const AcceptedModel& m : models)
+        result.insert({m.part_i, m.part_j, signal_set(m.model)});
+      return result;
+    };
+    return all(x) == all(y);
+  }
+
+  static int count_joints(const std::vector<AcceptedModel>& models) {
+    int sum = 0;
+    for (const AcceptedModel& m : models) sum += m.model.num_joints;
+    return sum;
+  }
+
+  // Makes two components one tree, with the joints that all markers ask for. The tree's cost if
+  // that is no worse than noise makes it, else std::nullopt and everything as it was.
+  std::optional<double> join(const Hopeful& h, double apart) {
+    const Forest forest_before = forest_;
+    const std::vector<AcceptedModel> models_before = result_.models;
+    result_.models.push_back({parts_[h.i], parts_[h.j], h.model, 0});
+    forest_.connect(h.i, h.j);
+    for (int added = 0; added <= kMaxJoints; ++added) {
+      const Tree tree = tree_of(h.i);
+      const TreeFit fit = fit_tree(tree);
+      const auto missing = fit.missing_joints();
+      if (const MissingJoint* worst = most_significant(missing)) {
+        const auto edges = fit.with_joint(*worst);
+        if (!edges) break;
+        adopt(tree, *edges);
+        continue;
+      }
+      // Tying the one's pose to the other's at every frame costs half of χ².
+      const int joints = count_joints(result_.models) - count_joints(models_before);
+      const double dof = 6.0 * fit.num_frames() - 6 - 6 * joints;
+      if (dof < 12 || fit.cost() - apart > 0.5 * (dof + 4 * std::sqrt(2 * dof))) break;
+      return fit.cost();
+    }
+    forest_ = forest_before;
+    result_.models = models_before;
+    return std::nullopt;
+  }
+
+  TreeFit fit_tree(const Tree& tree) const {
+    TreeFit fit(tree.nodes, tree.data, actions_, tree.root_rests);
+    fit.fit(15, 0.2);
+    return fit;
   }
 
   int index_of(int part) const {
@@ -448,6 +567,10 @@ class Search {
     }
   }
 
+  // Fits of two components that stay above this cost a frame, in a row, before the rest is given up.
+  static constexpr double kHopelessCost = 16;
+  static constexpr int kMaxHopeless = 12;
+
   void two_joints_pass(const std::vector<std::vector<double>>& turns) {
     struct Screened {
       int i, j;
@@ -466,10 +589,12 @@ class Search {
                        [](const auto& x, const auto& y) { return x.start.score < y.start.score; });
       std::map<std::pair<int, int>, std::vector<Candidate>> valid;
       std::size_t num_tried = 0;
+      int num_hopeless = 0;  // in a row
       for (const Screened& s : list) {
         const std::size_t max_fits = std::clamp(1200 / std::max(pair(s.i, s.j).size(), 1), 8, 40);
-        if (num_tried++ >= max_fits) break;
+        if (num_tried++ >= max_fits || num_hopeless >= kMaxHopeless) break;
         if (auto c = try_start(s.i, s.j, s.start.model)) valid[{s.i, s.j}].push_back(*c);
+        num_hopeless = last_cost_ > kHopelessCost ? num_hopeless + 1 : 0;
       }
       for (auto& [ij, of_pair] : valid)
         decide(ij.first, ij.second, std::move(of_pair), &candidates);
@@ -488,6 +613,8 @@ class Search {
   std::vector<std::optional<RelativeMotions>> motions_;
   std::set<std::tuple<int, int, std::set<int>>> refuted_;  // by all markers together
   std::vector<int> rests_;  // a part: 1 yes, 0 no, -1 not yet known
+  double last_cost_ = 0;  // a frame, of the latest fit
+  std::vector<Hopeful> hopefuls_;
   std::vector<Candidate> doubtful_;
   int num_judged_ = 0;  // frames of the valid models found so far, and the outliers among them
   int num_outliers_ = 0;
