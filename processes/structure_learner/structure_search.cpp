@@ -594,7 +594,8 @@ class Search {
         const std::size_t max_fits = std::clamp(1200 / std::max(pair(s.i, s.j).size(), 1), 8, 40);
         if (num_tried++ >= max_fits || num_hopeless >= kMaxHopeless) break;
         if (auto c = try_start(s.i, s.j, s.start.model)) valid[{s.i, s.j}].push_back(*c);
-        num_hopeless = last_cost_ > kHopelessCost ? num_hopeless + 1 : 0;
+        const bool is_hopeless = last_cost_ > kHopelessCost && pair(s.i, s.j).size() >= kManyFrames;
+        num_hopeless = is_hopeless ? num_hopeless + 1 : 0;
       }
       for (auto& [ij, of_pair] : valid)
         decide(ij.first, ij.second, std::move(of_pair), &candidates);
