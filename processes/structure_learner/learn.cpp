@@ -12,6 +12,7 @@
 #include "processes/structure_learner/noise_estimate.h"
 #include "processes/structure_learner/residual_fit.h"
 #include "processes/structure_learner/structure_search.h"
+#include "processes/structure_learner/tree_fit.h"
 
 namespace bodyschema {
 namespace {
@@ -74,6 +75,7 @@ struct FittedEdge {
   std::vector<int> frames;  // samples at which it was judged
   std::vector<bool> outlying;
   bool is_valid = true;  // as far as that was asked
+  LocalModel model;      // what of the edge is screws
 };
 
 // The final fit of a soft edge in its direction. The screws stay as they are: the process says what
@@ -132,6 +134,7 @@ FittedEdge fit_edge(const AcceptedModel& accepted, int from, int to,
     result.is_valid = check_validity(fit, loo, pair, actions, validity).verdict == Verdict::kValid;
     if (!result.is_valid) return result;
   }
+  result.model = fit.model;
   result.edge = to_edge(fit.model, actions);
   result.edge.from = from;
   result.edge.to = to;
@@ -162,6 +165,39 @@ FittedEdge fit_edge(const AcceptedModel& accepted, int from, int to,
     result.edge.confidence = static_cast<double>(inliers) / pair.size();
   }
   return result;
+}
+
+// The edges of the root's component fitted to all of its markers at once: a root that rests and
+// everything on the way from it are witnesses too, which halves the errors of edges that were
+// fitted to two markers each. The covariances stay those of the pairs, an upper bound.
+void fit_jointly(const std::vector<ActionPoseSample>& samples, const NormalizedActions& actions,
+                 const MeasurementModel& measurement, const ValidityOptions& validity,
+                 std::vector<FittedEdge>* fitted, BodySchema* schema) {
+  constexpr int kMaxFrames = 300;
+  std::vector<TreeNode> nodes{{schema->root, -1, {}}};
+  std::vector<PairData> data{make_part_data(samples, schema->root, measurement, kMaxFrames)};
+  if (data[0].size() < 2 || !is_at_rest(data[0], actions, validity)) return;
+  for (const FittedEdge& f : *fitted) {
+    if (f.edge.residual_gp) return;
+    const auto parent = std::find_if(nodes.begin(), nodes.end(), [&](const TreeNode& node) {
+      return node.part == f.edge.from;
+    });
+    if (parent == nodes.end()) continue;  // another component
+    nodes.push_back({f.edge.to, static_cast<int>(parent - nodes.begin()), f.model});
+    data.push_back(make_part_data(samples, f.edge.to, measurement, kMaxFrames));
+  }
+  if (nodes.size() < 2) return;
+  TreeFit fit(std::move(nodes), std::move(data), actions, true);
+  fit.fit(20, 1e-6);
+  for (const TreeNode& node : fit.nodes()) {
+    for (FittedEdge& f : *fitted) {
+      if (node.parent < 0 || f.edge.to != node.part) continue;
+      const Edge moved = to_edge(node.model, actions);
+      f.edge.left = moved.left;
+      f.edge.joints = moved.joints;
+    }
+  }
+  schema->X_CR = fit.root_pose();
 }
 
 // Robust mean of the root's pose in the camera's frame, Student-t weights.
@@ -500,6 +536,9 @@ LearnResult fit_tree(const LearnedStructure& structure,
   connected_to_root = reached;
   for (const int part : schema.parts)
     if (!reached.count(part)) grow_from(part);
+  estimate_root_pose(samples, measurement, &schema);
+  if (schema.has_part(schema.root))
+    fit_jointly(moved, actions, measurement, validity, &fitted, &schema);
   for (const FittedEdge& f : fitted) schema.edges.push_back(f.edge);
 
   std::set<int> expected(options.expected_parts.begin(), options.expected_parts.end());
@@ -517,7 +556,6 @@ LearnResult fit_tree(const LearnedStructure& structure,
                     std::all_of(schema.parts.begin(), schema.parts.end(),
                                 [&](int part) { return connected_to_root.count(part) > 0; });
 
-  estimate_root_pose(samples, measurement, &schema);
   result.outliers = OutlierAttribution(schema, fitted, samples, measurement).run();
   return result;
 }

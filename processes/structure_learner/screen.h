@@ -31,6 +31,9 @@ struct Start {
   double median = 0;  ///< of the squared distances: outliers do not count
 };
 
+/// Score of a rigid start beyond which no rigid model is valid.
+inline constexpr double kMaxRigidStartCost = 20;
+
 /// k = 0: the best of a few single readings.
 Start screen_rigid(const PairData& pair, const NormalizedActions& actions);
 

@@ -13,7 +13,6 @@ namespace {
 
 // Starts whose mean robust cost a frame is above these are beyond repair by a local fit. (A frame
 // at the squared distance d² costs 5 log(1 + d²/4).)
-constexpr double kMaxRigidStartCost = 20;
 constexpr double kMaxScrewStartCost = 26;
 // And starts whose median squared distance is above these (χ²₆ has 5.35), from kManyFrames on. The
 // valid models' stay below half of that in every noise regime, whatever the outliers.
@@ -278,14 +277,7 @@ class Search {
     if (rests_[x] < 0) {
       const PairData data =
           make_part_data(samples_, parts_[x], options_.measurement, max_frames_);
-      const Start start = screen_rigid(data, actions_);
-      rests_[x] = 0;
-      if (start.score < kMaxRigidStartCost) {
-        const Fit fit = fit_local_model(start.model, data, actions_, 20, 1e-4);
-        const Validity validity = check_validity(fit, leave_one_out(fit, data, actions_), data,
-                                                 actions_, options_.validity);
-        rests_[x] = validity.verdict == Verdict::kValid;
-      }
+      rests_[x] = is_at_rest(data, actions_, options_.validity);
     }
     return rests_[x] == 1;
   }

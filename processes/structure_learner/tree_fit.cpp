@@ -9,6 +9,8 @@
 #include <set>
 #include <type_traits>
 
+#include "processes/structure_learner/screen.h"
+
 namespace bodyschema {
 namespace {
 
@@ -46,6 +48,15 @@ Screw screw_of(const Vector6d& xi, bool slides) {
 }
 
 }  // namespace
+
+bool is_at_rest(const PairData& data, const NormalizedActions& actions,
+                const ValidityOptions& options) {
+  const Start start = screen_rigid(data, actions);
+  if (!(start.score < kMaxRigidStartCost)) return false;
+  const Fit fit = fit_local_model(start.model, data, actions, 20, 1e-4);
+  return check_validity(fit, leave_one_out(fit, data, actions), data, actions, options).verdict ==
+         Verdict::kValid;
+}
 
 // Gauss–Newton quantities, all twists in the camera's frame.
 struct TreeFit::Normal {

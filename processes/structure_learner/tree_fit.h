@@ -5,6 +5,7 @@
 #include <vector>
 
 #include "processes/structure_learner/local_model.h"
+#include "processes/structure_learner/validity.h"
 
 namespace bodyschema {
 
@@ -38,6 +39,11 @@ struct TreeEdge {
   LocalModel model;  ///< Δ of b in a
 };
 
+/// Does a part keep its pose in the camera's frame? `data` are its make_part_data(); true if a rigid
+/// model of them is valid.
+bool is_at_rest(const PairData& data, const NormalizedActions& actions,
+                const ValidityOptions& options);
+
 /// All poses of a tree's parts fitted at once, to judge its edges by every marker and not only by
 /// the two they connect.
 ///
@@ -59,6 +65,8 @@ class TreeFit {
   void fit(int max_iterations, double tolerance);
 
   const std::vector<TreeNode>& nodes() const { return nodes_; }
+  /// Of a root that rests, in the camera's frame.
+  const Pose& root_pose() const { return roots_.front(); }
   double cost() const { return cost_; }  ///< Σ (ν + 6)/2 · log(1 + d²/ν)
   double log_likelihood() const;       ///< −cost − ½ Σ log|2πΣ|
   int num_frames() const { return static_cast<int>(samples_.size()); }
