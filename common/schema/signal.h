@@ -14,7 +14,7 @@ struct Signal {
   double upper = 0;
   /// What bends the command, w in θ(q) = q + φ(q)ᵀw [command units]; empty: linear. θ, and not q,
   /// is what moves the joints on this signal. See warp_basis().
-  std::vector<double> warp;
+  std::vector<double> warp = {};
 
   /// Displacement θ(q) that belongs to the command q, both in command units.
   double displacement(double q) const;

@@ -43,7 +43,8 @@ bool has_parameters(const Edge& edge) {
 class PotentialInformation {
  public:
   explicit PotentialInformation(Eigen::Index num_terms)
-      : information_(kPotentialPrior * Eigen::MatrixXd::Identity(num_terms, num_terms)) {}
+      : information_(kPotentialPrior * Eigen::MatrixXd::Identity(num_terms, num_terms)),
+        factors_(information_) {}
   void add(const Eigen::VectorXd& phi) { information_ += phi * phi.transpose(); }
   void factorize() { factors_.compute(information_); }
   double gain(const Eigen::VectorXd& phi) const {

@@ -33,7 +33,7 @@ class OnlineLearner {
   /// There is a checkpoint after each of so many samples.
   static constexpr int kEverySample = 30;
   /// Readings of parts (about 9 a sample of a 7-DOF arm) up to which all edges are fitted anew.
-  static constexpr int kMaxRefitReadings = 1500;
+  static constexpr int kMaxRefitReadings = 450;
 
   OnlineLearner(std::vector<Signal> signals, LearnOptions options);
 
