@@ -24,7 +24,7 @@ struct AcceptedModel {
   LocalModel model;
   double score = 0;
   /// Q of a soft model (residual_fit.h), whose screws `model` then are; empty: screws alone.
-  std::vector<int> soft_signals;
+  std::vector<int> soft_signals = {};
 };
 
 /// What the search tried between two parts.
