@@ -61,7 +61,8 @@ struct Edge {
   Pose right = Pose::Identity();
 
   /// Covariance of the parameters, order: left tangent (6); per joint: slide, turn, X_after tangent
-  /// (6). Right perturbations. Side 6 + 8·|joints|. Singular along the gauge of the screw frames.
+  /// (6). Right perturbations. Side 6 + 8·|joints|. Singular along the gauge of the screw frames. As
+  /// the two parts' own poses tell: an upper bound where the whole tree was fitted at once.
   Eigen::MatrixXd parameter_covariance;
 
   /// Root mean square of the leave-one-out residuals of the inliers: over the three axes together.

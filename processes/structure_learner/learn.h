@@ -53,7 +53,10 @@ struct LearnResult {
   std::vector<std::pair<int, int>> refuted;
 };
 
-/// Learns the body schema from scratch: structure and local models (Sections 3.1 and 3.2). A pure
+/// Learns the body schema from scratch: structure and local models (Sections 3.1 and 3.2). Where the
+/// root rests, the models are in the end fitted to all poses of its tree at once, and X_CR with
+/// them: that comes near the Cramér–Rao bound, which models fitted to two parts each miss by 1.6.
+/// Their covariances are those of the pairs, an upper bound. A pure
 /// function of its arguments. Poses must be finite rigid transforms (callers check what comes in
 /// from outside). `utime`, `version` and `base_version` of the schema are left to the caller.
 /// @throws std::invalid_argument if an action does not have one value per signal, or max_signals is

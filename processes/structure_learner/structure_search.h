@@ -59,6 +59,12 @@ struct SearchResult {
 /// layers are through, and a larger model takes their place if it explains the data better by more
 /// than its parameters are worth (6 log 6N a signal).
 ///
+/// When the layers are through, each tree is fitted to all its poses at once (TreeFit). A pair shows
+/// only what exceeds the noise of two markers; all markers beyond a joint together show far smaller
+/// motions. So joints that a score test finds missing are put in, models that have no room for them
+/// are dropped and the layers run again, and components that narrowly refuted models keep apart are
+/// joined if that costs no more than noise does.
+///
 /// Hypotheses are screened and fitted on an even subset of the instants; what is about to enter the
 /// forest must be valid on all of them.
 SearchResult search_structure(const std::vector<ActionPoseSample>& samples,
