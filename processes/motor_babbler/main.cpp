@@ -54,7 +54,14 @@ int main(int argc, char** argv) {
     std::optional<SampleIntake> intake;
     if (config.choice == Choice::kActive) {
       intake.emplace(
-          samples_file, [&](const sample_t& sample) { send(babbler.remember(sample)); },
+          samples_file,
+          [&](const sample_t& sample) {
+            try {
+              send(babbler.remember(sample));
+            } catch (const std::invalid_argument&) {
+              process.count("refused SAMPLE");  // a samples file of another rig
+            }
+          },
           SampleIntake::asking(process));
       door.subscribe(process, kBodySchema,
                      [&](const body_schema_t& schema) { send(babbler.on_body_schema(schema)); });

@@ -203,6 +203,10 @@ std::optional<action_command_t> MotorBabbler::on_body_schema(const body_schema_t
 
 std::optional<action_command_t> MotorBabbler::remember(const sample_t& sample) {
   if (config_.choice == Choice::kRandom) return std::nullopt;
+  // What comes from a samples file has not passed the rig's door.
+  if (sample.num_signals != static_cast<std::int32_t>(config_.signals.size()))
+    throw std::invalid_argument("a sample of another rig: " + std::to_string(sample.num_signals) +
+                                " signals");
   SeenAction seen;
   seen.sample_index = sample.sample_index;
   seen.is_learned_from = sample.purpose == action_command_t::PURPOSE_TRAIN ||

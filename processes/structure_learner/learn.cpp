@@ -82,7 +82,7 @@ struct FittedEdge {
 // they leave, and its variance is that of the whole.
 FittedEdge fit_soft_edge(const LocalModel& screws, const std::vector<int>& signals, int from,
                          int to, const PairData& pair, const NormalizedActions& actions,
-                         const ValidityOptions& validity) {
+                         const ValidityOptions& validity, bool must_be_valid) {
   const LocalModel start = fit_local_model(screws, pair, actions, 30, 1e-3).model;
   const auto fit = fit_soft_model(start, pair, actions, validity, signals);
   FittedEdge result;
@@ -90,8 +90,8 @@ FittedEdge fit_soft_edge(const LocalModel& screws, const std::vector<int>& signa
   result.edge.from = from;
   result.edge.to = to;
   result.edge.num_samples = pair.size();
+  result.is_valid = fit && (!must_be_valid || fit->verdict == Verdict::kValid);
   if (!fit) {  // what the search's part of the data carried, all of them refuse
-    result.is_valid = false;
     result.edge.num_outliers = pair.size();
     result.edge.confidence = 0;
     return result;
@@ -125,7 +125,8 @@ FittedEdge fit_edge(const AcceptedModel& accepted, int from, int to,
   const PairData pair =
       make_pair_data(samples, from, to, measurement, std::numeric_limits<int>::max());
   if (!accepted.soft_signals.empty())
-    return fit_soft_edge(start, accepted.soft_signals, from, to, pair, actions, validity);
+    return fit_soft_edge(start, accepted.soft_signals, from, to, pair, actions, validity,
+                         must_be_valid);
   const Fit fit = fit_local_model(start, pair, actions, 60, 1e-6);
   const LeaveOneOut loo = leave_one_out(fit, pair, actions);
 
@@ -168,21 +169,25 @@ FittedEdge fit_edge(const AcceptedModel& accepted, int from, int to,
 }
 
 // The edges of the root's component fitted to all of its markers at once: a root that rests and
-// everything on the way from it are witnesses too, which halves the errors of edges that were
-// fitted to two markers each. The covariances stay those of the pairs, an upper bound.
+// everything on the way from it are witnesses too, beside the two markers that each edge was fitted
+// to before. The covariances stay those of the pairs, an upper bound.
 void fit_jointly(const std::vector<ActionPoseSample>& samples, const NormalizedActions& actions,
                  const MeasurementModel& measurement, const ValidityOptions& validity,
                  std::vector<FittedEdge>* fitted, BodySchema* schema) {
-  constexpr int kMaxFrames = 300;
+  // More instants than this are thinned; so many more that thinning costs what the joint fit gains
+  // are left to the pairs.
+  constexpr int kMaxFrames = 2500;
+  constexpr std::size_t kTooMany = 6000;
+  if (samples.size() > kTooMany) return;
   std::vector<TreeNode> nodes{{schema->root, -1, {}}};
   std::vector<PairData> data{make_part_data(samples, schema->root, measurement, kMaxFrames)};
   if (data[0].size() < 2 || !is_at_rest(data[0], actions, validity)) return;
   for (const FittedEdge& f : *fitted) {
-    if (f.edge.residual_gp) return;
     const auto parent = std::find_if(nodes.begin(), nodes.end(), [&](const TreeNode& node) {
       return node.part == f.edge.from;
     });
     if (parent == nodes.end()) continue;  // another component
+    if (f.edge.residual_gp) return;       // no chain of screws
     nodes.push_back({f.edge.to, static_cast<int>(parent - nodes.begin()), f.model});
     data.push_back(make_part_data(samples, f.edge.to, measurement, kMaxFrames));
   }
@@ -609,6 +614,7 @@ LearnedStructure find_structure(const std::vector<Signal>& signals,
     result = {std::move(bent), parts, measurement, std::move(actions_again), std::move(found)};
     if (was_spanning) break;
   }
+  measurement = result.measurement;
   connect_soft_parts(displaced(samples, result.signals), result.actions, parts, search_options,
                      &result.search);
   return result;

@@ -49,7 +49,7 @@ struct LearnResult {
   std::vector<Outlier> outliers;  ///< ascending by sample, then part
   int num_screens = 0;            ///< closed-form hypotheses looked at
   int num_fits = 0;               ///< Levenberg–Marquardt fits
-  /// Of relearn(): edges that were left out, as (part, part).
+  /// Edges that were left out since they are not valid any more, as (part, part).
   std::vector<std::pair<int, int>> refuted;
 };
 
@@ -95,8 +95,7 @@ LearnResult relearn(const LearnedStructure& structure, const std::vector<ActionP
                     const LearnOptions& options = {});
 
 /// Do samples that came later speak against the structure with its models as they are? Judged an
-/// edge at a time by the bounds of check_validity() for preselection, and like relearn() by parts
-/// that are new.
+/// edge at a time by the bounds of check_validity() for preselection. Soft edges are not judged.
 bool is_refuted_by(const LearnedStructure& structure, const std::vector<ActionPoseSample>& later,
                    const LearnOptions& options = {});
 

@@ -44,7 +44,7 @@ BodySchema OnlineLearner::learn(const SharedSamples& samples, int num_searched) 
       });
     });
     if (!is_part_new || n <= kEverySample) {
-      if (are_few_enough_to_refit(samples)) {
+      if (is_part_new || are_few_enough_to_refit(samples)) {
         const auto all = copied(samples, 0, n);
         const LearnOptions options = options_for(all);
         LearnResult refitted = relearn(start.structure, all, options);
