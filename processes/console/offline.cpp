@@ -6,6 +6,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <filesystem>
 #include <iostream>
 #include <memory>
 #include <stdexcept>
@@ -63,6 +64,10 @@ void run_learn(const LearnArguments& arguments) {
         throw std::invalid_argument("--noise: expected two standard deviations above 0");
     }
   }
+  std::error_code is_new;
+  if (!arguments.out.empty() &&
+      std::filesystem::equivalent(arguments.out, arguments.samples, is_new) && !is_new)
+    throw std::invalid_argument("--out: " + arguments.out + " is the recording itself");
   const std::vector<ActionPoseSample> training = recording.training();
   if (options.root) {
     bool is_seen = false;

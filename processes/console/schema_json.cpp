@@ -126,7 +126,8 @@ ordered_json schema_json(const BodySchema& schema) {
   json["signals"] = ordered_json::array();
   for (const Signal& signal : schema.signals) {
     json["signals"].push_back(
-        {{"name", signal.name}, {"lower", signal.lower}, {"upper", signal.upper}});
+        {{"name", signal.name}, {"lower", signal.lower}, {"upper", signal.upper},
+         {"warp", signal.warp}});
   }
   static const char* const kStates[] = {"OK", "SUSPECT", "INVALID", "PROVISIONAL"};
   for (std::size_t i = 0; i < schema.edges.size(); ++i) {

@@ -252,6 +252,7 @@ void TreeFit::fit(int max_iterations, double tolerance) {
   const int n = static_cast<int>(nodes_.size());
   for (int iteration = 0; iteration < max_iterations; ++iteration) {
     const Normal normal = normal_equations();
+    if (normal.H.rows() == 0) return;  // one part that moves: each root is at its marker
     bool improved = false;
     double decrease = 0;
     for (int attempt = 0; attempt < 6 && !improved; ++attempt) {
@@ -344,6 +345,7 @@ std::vector<MissingJoint> TreeFit::missing_joints() const {
   const int T = num_frames();
   const Normal normal = normal_equations();
   const auto size = normal.H.rows();
+  if (size == 0) return {};
   // The gauge directions of the screws' frames have no information: a ridge leaves them at rest.
   const Eigen::VectorXd scale = normal.H.diagonal().cwiseMax(1e-300).cwiseSqrt().cwiseInverse();
   Eigen::MatrixXd H = scale.asDiagonal() * normal.H * scale.asDiagonal();

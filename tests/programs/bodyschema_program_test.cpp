@@ -160,6 +160,16 @@ TEST_F(BodyschemaProgramTest, LearnPrintsTheKeysThatAreDocumented) {
   EXPECT_NEAR(json["noise"]["rotation_deg"].get<double>(), 1, 0.5);
 }
 
+TEST_F(BodyschemaProgramTest, LearnDoesNotWriteOverItsRecording) {
+  const std::string recording = "t,q1,part,x,y,z,qw,qx,qy,qz\n0,0,1,0,0,1,1,0,0,0\n";
+  write("samples.csv", recording);
+  const Outcome outcome = run({"learn", "samples.csv", "--out", "./samples.csv"});
+  EXPECT_EQ(outcome.exit_code, 1);
+  EXPECT_NE(outcome.err.find("is the recording itself"), std::string::npos) << outcome.err;
+  std::ifstream file(folder_ / "samples.csv");
+  EXPECT_EQ(std::string(std::istreambuf_iterator<char>(file), {}), recording);
+}
+
 TEST_F(BodyschemaProgramTest, LearnsAsTheChapterDidForComparison) {
   const auto csv = write_robot("s.csv", test::Regime::kFree);
   const Outcome outcome =
