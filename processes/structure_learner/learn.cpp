@@ -528,7 +528,6 @@ LearnResult fit_tree(const LearnedStructure& structure,
         FittedEdge edge =
             fit_edge(start, queue[head], to, moved, actions, measurement, validity, must_be_valid);
         if (!edge.is_valid) {
-          result.refuted.emplace_back(m.part_i, m.part_j);
           reached.erase(to);
           continue;
         }
@@ -629,32 +628,6 @@ LearnResult fit_structure(const LearnedStructure& structure,
 LearnResult relearn(const LearnedStructure& structure, const std::vector<ActionPoseSample>& samples,
                     const LearnOptions& options) {
   return fit_tree(structure, samples, options, true);
-}
-
-bool is_refuted_by(const LearnedStructure& structure, const std::vector<ActionPoseSample>& later,
-                   const LearnOptions& options) {
-  check_actions(later, structure.signals.size());
-  ValidityOptions validity = search_options_of(options).validity;
-  validity.lenient = true;
-  const std::vector<ActionPoseSample> moved = displaced(later, structure.signals);
-  const NormalizedActions actions(moved, static_cast<int>(structure.signals.size()));
-  for (const AcceptedModel& m : structure.search.models) {
-    if (!m.soft_signals.empty()) continue;  // the screws alone never held
-    const PairData pair = make_pair_data(moved, m.part_i, m.part_j, structure.measurement,
-                                         std::numeric_limits<int>::max());
-    if (pair.size() < 2) continue;
-    const Fit fit = evaluate(rescaled(m.model, structure.actions, actions), pair, actions);
-    LeaveOneOut unseen;  // the model was fitted without any of them
-    for (const FrameFit& frame : fit.frames)
-      unseen.squared_distance.push_back(frame.squared_distance);
-    const Validity judged = check_validity(fit, unseen, pair, actions, validity);
-    // So few frames are often outliers in the majority by chance: their number decides.
-    const int most = binomial_quantile(pair.size(), pair_outlier_rate(validity), 0.99999);
-    const bool are_outliers_few = 2 * judged.num_outliers <= pair.size();
-    if (judged.num_outliers > most || (judged.verdict == Verdict::kRefuted && are_outliers_few))
-      return true;
-  }
-  return false;
 }
 
 LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPoseSample>& samples,

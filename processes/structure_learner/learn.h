@@ -3,7 +3,6 @@
 #include <cmath>
 #include <cstdint>
 #include <optional>
-#include <utility>
 #include <vector>
 
 #include "common/schema/body_schema.h"
@@ -49,8 +48,6 @@ struct LearnResult {
   std::vector<Outlier> outliers;  ///< ascending by sample, then part
   int num_screens = 0;            ///< closed-form hypotheses looked at
   int num_fits = 0;               ///< Levenberg–Marquardt fits
-  /// Edges that were left out since they are not valid any more, as (part, part).
-  std::vector<std::pair<int, int>> refuted;
 };
 
 /// Learns the body schema from scratch: structure and local models (Sections 3.1 and 3.2). Where the
@@ -89,14 +86,8 @@ LearnResult fit_structure(const LearnedStructure& structure,
                           const LearnOptions& options = {});
 
 /// fit_structure() without the edges that are not valid any more (check_validity()) when fitted to
-/// `samples`: these are in LearnResult::refuted. Parts that the structure does not know are
-/// unconnected.
+/// `samples`. Parts that the structure does not know are unconnected.
 LearnResult relearn(const LearnedStructure& structure, const std::vector<ActionPoseSample>& samples,
                     const LearnOptions& options = {});
-
-/// Do samples that came later speak against the structure with its models as they are? Judged an
-/// edge at a time by the bounds of check_validity() for preselection. Soft edges are not judged.
-bool is_refuted_by(const LearnedStructure& structure, const std::vector<ActionPoseSample>& later,
-                   const LearnOptions& options = {});
 
 }  // namespace bodyschema
