@@ -561,8 +561,9 @@ class Search {
       if (turns.empty() || forest_.spans()) continue;
       two_joints_pass(turns);
     }
-    // So few frames leave the fits narrow valleys: a finer grid of ranges.
-    if (samples_.size() < 12 && !forest_.spans()) {
+    // So few frames leave the fits narrow valleys: a finer grid of ranges, where pairs are few.
+    constexpr std::size_t kMaxPairs = 100;
+    if (samples_.size() < 12 && !forest_.spans() && pairs_.size() <= 2 * kMaxPairs) {
       std::vector<double> fine;
       for (double turn = 0.25; turn < 3.1; turn *= 1.15) fine.push_back(turn);
       two_joints_pass(std::vector<std::vector<double>>(actions_.num_signals(), fine));
