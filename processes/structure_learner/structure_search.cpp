@@ -294,22 +294,18 @@ class Search {
       for (int round = 0; round < kMaxSplits; ++round) {
         const Tree tree = tree_of(x);
         const TreeFit fit = fit_tree(tree);
-        auto missing = fit.missing_joints();
-        std::optional<std::vector<TreeEdge>> edges;
-        std::vector<int> full;
-        while (tree.nodes.size() > 1 && round + 1 < kMaxSplits && !edges && full.empty()) {
-          const MissingJoint* worst = most_significant(missing);
-          if (!worst) break;
-          edges = fit.with_joint(*worst);
-          if (!edges) full = fit.full_edges(*worst);
-          // An edge that has the signal already is a joint that is not quite a screw.
-          missing.erase(missing.begin() + (worst - missing.data()));
+        const auto missing = fit.missing_joints();
+        const MissingJoint* worst =
+            tree.nodes.size() < 2 ? nullptr : most_significant(missing);
+        if (!worst || round + 1 == kMaxSplits) {
+          result_.log_likelihood += fit.log_likelihood();
+          break;
         }
-        if (edges) {
+        if (const auto edges = fit.with_joint(*worst)) {
           adopt(tree, *edges);
           continue;
         }
-        for (const int node : full)
+        for (const int node : fit.full_edges(*worst))
           refuted.push_back({tree.nodes[node].part, tree.nodes[tree.nodes[node].parent].part});
         result_.log_likelihood += fit.log_likelihood();
         break;

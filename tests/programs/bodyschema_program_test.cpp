@@ -565,7 +565,8 @@ TEST_F(RealDataTest, TheWeldingPositionerIsOneEdgeOfBothSignals) {
   ASSERT_EQ(json["edges"].size(), 1U) << json;
   const auto signals = json["edges"][0]["signals"].get<std::set<std::string>>();
   EXPECT_EQ(signals, (std::set<std::string>{"q1", "q2"}));
-  EXPECT_EQ(json["edges"][0]["kind"], "screw");
+  // Its axes are no perfect screws: what they leave, 0.3 mm, is more than its noise.
+  EXPECT_EQ(json["edges"][0]["kind"], "screw_gp");
   const Json errors = run({"predict", "schema.lcmlog", csv, "--json"}).json();
   EXPECT_EQ(errors["parts"][0]["count"], 205);
   EXPECT_LT(errors["parts"][0]["position_median_m"].get<double>(), 0.0005);
