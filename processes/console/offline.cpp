@@ -104,7 +104,13 @@ void run_learn(const LearnArguments& arguments) {
 void run_predict(const std::string& schema_file, const std::string& samples_file, bool json) {
   const BodySchema schema = load_schema(schema_file);
   const Recording recording = load(samples_file);
-  const auto errors = evaluate(schema, recording.samples);
+  std::vector<ActionPoseSample> samples;
+  try {
+    samples = samples_by_signals(recording, schema.signals);
+  } catch (const std::invalid_argument& error) {
+    throw RecordingError(samples_file + ": " + error.what());
+  }
+  const auto errors = evaluate(schema, samples);
   if (json) {
     std::cout << errors_json(static_cast<int>(recording.samples.size()), errors).dump(2)
               << std::endl;

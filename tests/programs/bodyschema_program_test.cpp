@@ -437,7 +437,13 @@ TEST_F(BodyschemaProgramTest, FilesOfTheWrongKindAreRefused) {
   }
   // A recording of another robot.
   const auto other = write("other.csv", "t,q1,part,x,y,z,qw,qx,qy,qz\n0,1,1,0,0,0,1,0,0,0\n");
-  expect_failure({"predict", "schema.lcmlog", other}, "1 action signals, the schema 2");
+  expect_failure({"predict", "schema.lcmlog", other},
+                 "other.csv: the signals of the samples are q1; those of the schema q1, q2");
+  // The same one with other names.
+  std::string renamed = text_of(folder_ / csv);
+  renamed.replace(renamed.find("q1,q2"), 5, "q2,q3");
+  expect_failure({"predict", "schema.lcmlog", write("renamed.csv", renamed)},
+                 "renamed.csv: the signals of the samples are q2, q3");
 }
 
 TEST_F(BodyschemaProgramTest, ALogOfARunIsLearnedFromWithoutItsTestSamples) {
