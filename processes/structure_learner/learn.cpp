@@ -567,6 +567,15 @@ LearnResult fit_tree(const LearnedStructure& structure,
 
 }  // namespace
 
+Noise marker_noise(const std::vector<ActionPoseSample>& samples, int num_signals,
+                   const LearnOptions& options) {
+  if (options.noise)
+    return {std::max(options.noise->position_m, kNoiseFloor.position_m),
+            std::max(options.noise->rotation_rad, kNoiseFloor.rotation_rad)};
+  if (has_covariances(samples)) return typical_noise(samples);
+  return estimate_noise(samples, num_signals, options.max_signals).value_or(kNoiseFloor);
+}
+
 LearnedStructure find_structure(const std::vector<Signal>& signals,
                                 const std::vector<ActionPoseSample>& samples,
                                 const LearnOptions& options) {
@@ -577,13 +586,8 @@ LearnedStructure find_structure(const std::vector<Signal>& signals,
   SearchOptions search_options = search_options_of(options);
   MeasurementModel& measurement = search_options.measurement;
   const auto set_noise = [&](const std::vector<ActionPoseSample>& of) {
-    if (options.noise) {
-      measurement.noise = Noise{std::max(options.noise->position_m, kNoiseFloor.position_m),
-                                std::max(options.noise->rotation_rad, kNoiseFloor.rotation_rad)};
-    } else if (!has_covariances(of)) {
-      measurement.noise =
-          estimate_noise(of, num_signals, options.max_signals).value_or(kNoiseFloor);
-    }
+    if (options.noise || !has_covariances(of))
+      measurement.noise = marker_noise(of, num_signals, options);
   };
   set_noise(samples);
   NormalizedActions actions(samples, num_signals);

@@ -64,6 +64,11 @@ struct LearnResult {
 LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPoseSample>& samples,
                   const LearnOptions& options = {});
 
+/// Noise per axis of one marker that learn() goes by: `options.noise`; else the mean of the
+/// observations' covariances; where these are zero, the estimate of noise_estimate.h.
+Noise marker_noise(const std::vector<ActionPoseSample>& samples, int num_signals,
+                   const LearnOptions& options = {});
+
 /// The first half of learn(), slow: which part hangs on which by which signals. Everything that
 /// relearn() takes over.
 struct LearnedStructure {

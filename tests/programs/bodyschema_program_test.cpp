@@ -190,6 +190,16 @@ TEST_F(BodyschemaProgramTest, LearnsAsTheChapterDidForComparison) {
   expect_failure({"learn", csv, "--method", "magic"}, "--method");
 }
 
+// At the noise of its cameras, 50 mm and 15°, a joint that turns less than that is no joint.
+TEST_F(BodyschemaProgramTest, TheChaptersMethodGoesByTheNoiseOfTheData) {
+  const auto csv = write_robot("s.csv");
+  const Json json = run({"learn", csv, "--method", "chapter", "--json"}).json();
+  EXPECT_TRUE(test::is_right(structure_of(json), robot_)) << json;
+  const Json screw = run({"learn", csv, "--json"}).json();
+  for (const char* of : {"position_m", "rotation_deg"})
+    EXPECT_NEAR(json["noise"][of].get<double>(), screw["noise"][of].get<double>(), 1e-9);
+}
+
 TEST_F(BodyschemaProgramTest, WithoutJsonPeopleReadIt) {
   const Outcome outcome = run({"learn", write_robot("s.csv")});
   EXPECT_EQ(outcome.exit_code, 0);
