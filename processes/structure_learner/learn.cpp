@@ -428,12 +428,13 @@ UnconnectedPart explain(int part, int num_seen, const std::set<int>& connected,
     return result;
   }
   int common = 0, partner = -1;
-  bool undecided = false;
+  bool undecided = false, was_soft_tried = false;
   for (const auto& [pair, record] : search.records) {
     if (pair.first != part && pair.second != part) continue;
     const int other = pair.first == part ? pair.second : pair.first;
     if (!connected.count(other)) continue;
     undecided |= !record.undecided.empty();
+    was_soft_tried |= record.was_soft_tried;
     if (record.num_common > common) {
       common = record.num_common;
       partner = other;
@@ -450,7 +451,8 @@ UnconnectedPart explain(int part, int num_seen, const std::set<int>& connected,
   } else {
     result.reason = Unconnected::kNoValidModel;
     result.detail = seen + "; no model with up to " + std::to_string(max_signals) +
-                    " signals is valid to any connected part";
+                    " signals is valid to any connected part" +
+                    (was_soft_tried ? ", nor any with a Gaussian process beside its joints" : "");
   }
   return result;
 }

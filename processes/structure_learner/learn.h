@@ -48,7 +48,7 @@ struct LearnResult {
   BodySchema schema;
   std::vector<Outlier> outliers;  ///< ascending by sample, then part
   int num_screens = 0;            ///< closed-form hypotheses looked at
-  int num_fits = 0;               ///< Levenberg–Marquardt fits
+  int num_fits = 0;               ///< Levenberg–Marquardt fits of the search
   /// Edges that were left out since they are not valid any more, as (part, part).
   std::vector<std::pair<int, int>> refuted;
 };
