@@ -216,6 +216,73 @@ TEST(OnlineLearner, WhereSamplesAreManyNewOnesThatContradictAreNotIgnored) {
   EXPECT_EQ(num_learned(broken(first(run.samples, n), c, 3, forty_degrees())), n);
 }
 
+/// From sample `since` on the arm's signals are crossed over: what one moved the other moves.
+Recording crossed_run(int num_samples, int since, int seed) {
+  Rng rng(seed);
+  Recording run{test::chapter_robot("a", rng), {}};
+  std::vector<ActionPoseSample> samples =
+      test::babble(run.robot, num_samples,
+                   {.regime = test::Regime::kTag, .with_covariances = true}, rng);
+  for (int n = since; n < num_samples; ++n) samples[n].action.reverseInPlace();
+  run.samples = shared(samples);
+  return run;
+}
+
+// While there is a checkpoint after every sample: the first answer leaves out what is refuted, the
+// next is a new search.
+TEST(OnlineLearner, AnEdgeWhoseSignalsChangeIsLeftOutOfFewSamplesUntilTheNextSearch) {
+  const Recording run = crossed_run(30, 12, 40);
+  int num_refuted = 0;
+  for (int n = 13; n <= 30; ++n) {
+    const SharedSamples samples = first(run.samples, n);
+    const LearnedStructure before =
+        find_structure(run.robot.signals, plain(first(run.samples, n - 1)), {});
+    if (!before.spans()) break;
+    const LearnResult refitted = relearn(before, plain(samples));
+    OnlineLearner online(run.robot.signals, {});
+    const BodySchema answer = online.learn(samples, n - 1);
+    expect_same(answer, refitted.schema);
+    if (refitted.refuted.empty()) continue;
+    ++num_refuted;
+    EXPECT_LT(answer.edges.size(), before.search.models.size());
+    EXPECT_FALSE(answer.complete);
+    expect_same(online.learn(samples, n), learn(run.robot.signals, plain(samples)).schema);
+  }
+  EXPECT_GT(num_refuted, 0);
+}
+
+// Later an answer that waits for the next checkpoint would wait too long.
+TEST(OnlineLearner, AnEdgeWhoseSignalsChangeStartsANewSearchBetweenCheckpoints) {
+  const int c = OnlineLearner::checkpoint_within(90), n = c + c / 20 - 1;
+  int num_refuted = 0;
+  for (int since = c - 1; since > c - 20 && num_refuted < 3; --since) {
+    const Recording run = crossed_run(n, since, 42);
+    const LearnedStructure before =
+        find_structure(run.robot.signals, plain(first(run.samples, c)), {});
+    if (!before.spans()) break;
+    if (relearn(before, plain(run.samples)).refuted.empty()) continue;
+    ++num_refuted;
+    OnlineLearner online(run.robot.signals, {});
+    expect_same(online.learn(run.samples, n - 1),
+                learn(run.robot.signals, plain(run.samples)).schema);
+  }
+  EXPECT_GT(num_refuted, 0);
+}
+
+// Where samples are many, the answer itself is that of a new search.
+TEST(OnlineLearner, AnEdgeWhoseSignalsChangeStartsANewSearchOfManySamples) {
+  const int c = OnlineLearner::checkpoint_within(240), n = c + c / 20 - 1;
+  const Recording run = crossed_run(n, c, 41);
+  std::size_t readings = 0;
+  for (const auto& sample : run.samples) readings += sample->parts.size();
+  ASSERT_GT(readings, static_cast<std::size_t>(OnlineLearner::kMaxRefitReadings));
+  OnlineLearner online(run.robot.signals, {});
+  EXPECT_TRUE(test::is_right(online.learn(first(run.samples, c), c), run.robot));
+  const BodySchema answer = online.learn(run.samples, n - 1);
+  EXPECT_EQ(answer.num_samples, n);
+  expect_same(answer, learn(run.robot.signals, plain(run.samples)).schema);
+}
+
 TEST(OnlineLearner, APartThatAppearsBetweenCheckpointsIsConnectedAtOnceIfTheSamplesSuffice) {
   const Recording run = tag_run("a", 140, 38);
   const int c = OnlineLearner::checkpoint_within(120), n = c + c / 20 - 1;
