@@ -303,11 +303,10 @@ void report(const RunWatch& watch, const BestPicture& picture, const WatchArgume
   std::cout << std::flush;
 }
 
-/// Tells once of each process that ended instead of being heard. @throws std::runtime_error if the
+/// Tells once of each process that ended (it is heard again and again as it starts). @throws std::runtime_error if the
 /// rig's files are to blame: those do not mend themselves.
-void tell_of_failures(const RunWatch& watch, const WatchArguments& arguments, std::int64_t now_us,
-                      std::set<std::string>* told) {
-  for (const std::string& name : watch.silent(arguments.processes, now_us)) {
+void tell_of_failures(const WatchArguments& arguments, std::set<std::string>* told) {
+  for (const std::string& name : arguments.processes) {
     std::ifstream file(std::filesystem::path(arguments.out) / (name + ".log"));
     const std::string why = last_words({std::istreambuf_iterator<char>(file), {}}, name);
     if (why.empty()) continue;
@@ -406,9 +405,9 @@ void run_watch(const WatchArguments& arguments) {
     const std::int64_t progress = watch.num_samples() + watch.learned_sample() + num_heard();
     if (std::exchange(last_progress, progress) != progress) progressed_s = seconds();
     line.show(fmt::format("{} · {:.0f} s", watch.progress(), seconds()), false);
-    if (seconds() - looked_s > 3 && watch.num_samples() == 0) {
+    if (seconds() - looked_s > 2 && watch.num_samples() == 0) {
       looked_s = seconds();
-      tell_of_failures(watch, arguments, now_us(), &told);
+      tell_of_failures(arguments, &told);
     }
     const double stalled_s = seconds() - std::max(progressed_s, warned_s);
     if (stalled_s > 20) {
