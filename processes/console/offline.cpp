@@ -49,8 +49,7 @@ BodySchema learn_as_the_chapter(const Recording& recording,
   // The model error is one of relative poses, which have two markers.
   Noise noise = marker_noise(training, static_cast<int>(recording.signals.size()), options);
   noise.position_m = std::hypot(noise.position_m, options.model_error.position_m * M_SQRT1_2);
-  noise.rotation_rad =
-      std::hypot(noise.rotation_rad, options.model_error.rotation_rad * M_SQRT1_2);
+  noise.rotation_rad = std::hypot(noise.rotation_rad, options.model_error.rotation_rad * M_SQRT1_2);
   baseline.set_noise(noise);
   baseline.max_samples = std::min(baseline.max_samples, ResidualGp::kMaxSamples);  // to be written
   const BaselineResult result = learn_baseline(recording.signals, training, baseline);
@@ -191,9 +190,10 @@ void add_offline_commands(CLI::App& console) {
       ->expected(2)
       ->type_name("POS_M ROT_DEG");
   learn
-      ->add_option("--method", learning->method,
-                   "screw, or chapter: matrix GPs, and thresholds on mean errors at three times the "
-                   "noise, for comparison")
+      ->add_option(
+          "--method", learning->method,
+          "screw, or chapter: matrix GPs, and thresholds on mean errors at three times the "
+          "noise, for comparison")
       ->check(CLI::IsMember({"screw", "chapter"}));
   learn->add_flag("--json", learning->json, "Print JSON");
   learn->callback([learning] { run_learn(*learning); });

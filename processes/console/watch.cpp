@@ -303,8 +303,8 @@ void report(const RunWatch& watch, const BestPicture& picture, const WatchArgume
   std::cout << std::flush;
 }
 
-/// Tells once of each process that ended (it is heard again and again as it starts). @throws std::runtime_error if the
-/// rig's files are to blame: those do not mend themselves.
+/// Tells once of each process that ended (it is heard again and again as it starts). @throws
+/// std::runtime_error if the rig's files are to blame: those do not mend themselves.
 void tell_of_failures(const WatchArguments& arguments, std::set<std::string>* told) {
   for (const std::string& name : arguments.processes) {
     std::ifstream file(std::filesystem::path(arguments.out) / (name + ".log"));

@@ -4,8 +4,8 @@
 //   experiments [NAME…] [--quick] [--out FOLDER] [--jobs N]
 //   experiments --list
 //
-// Tables on stdout and, with the plots, in FOLDER (all.md: of all experiments, where all were run); progress on stderr. Ends
-// with 1 if something that must come out does not.
+// Tables on stdout and, with the plots, in FOLDER (all.md: of all experiments, where all were run);
+// progress on stderr. Ends with 1 if something that must come out does not.
 
 #include <fmt/format.h>
 #include <unistd.h>

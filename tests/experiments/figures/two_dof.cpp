@@ -273,13 +273,14 @@ Findings two_dof_free(const Setup& setup) {
             {"2-DOF, free, bent commands, N = 20: < 1 mm, 0.2°", measured,
              all && position.mean < kMillimetre && angle.mean < 0.2 * kDegree});
     }
-    panels.push_back({.title = std::string("2-DOF, noise-free, ") + command + "; baseline on the true structure",
-                      .x_label = "samples N",
-                      .y_label = "mean position error of the end effector [mm]",
-                      .curves = {them, us},
-                      .references = {{"chapter, N = 20: 2 mm", 2}, {"chapter, N = 100: 1 mm", 1}},
-                      .log_x = true,
-                      .log_y = true});
+    panels.push_back(
+        {.title = std::string("2-DOF, noise-free, ") + command + "; baseline on the true structure",
+         .x_label = "samples N",
+         .y_label = "mean position error of the end effector [mm]",
+         .curves = {them, us},
+         .references = {{"chapter, N = 20: 2 mm", 2}, {"chapter, N = 100: 1 mm", 1}},
+         .log_x = true,
+         .log_y = true});
   }
   draw(setup, "two_dof_free.png", panels, 2);
   findings.markdown = fmt::format(

@@ -261,8 +261,9 @@ TEST(RunWatchTest, TheNewestSchemaStands) {
 }
 
 TEST(LastWords, AreTheLineOfAProcessThatEnded) {
-  EXPECT_EQ(last_words("10:00:00.000 camera info: up\ncamera: c.yaml:1:1: fps is missing\n", "camera"),
-            "c.yaml:1:1: fps is missing");
+  EXPECT_EQ(
+      last_words("10:00:00.000 camera info: up\ncamera: c.yaml:1:1: fps is missing\n", "camera"),
+      "c.yaml:1:1: fps is missing");
   EXPECT_EQ(last_words("camera: one\ncamera: two", "camera"), "two");
   // Started again, and going on.
   EXPECT_EQ(last_words("camera: one\n10:00:00.000 camera info: up\n", "camera"), "");

@@ -252,9 +252,10 @@ TEST(Learn, SaysSoWhereNoModelIsValid) {
   EXPECT_EQ(schema.unconnected[0].part, 5);
   EXPECT_EQ(schema.unconnected[0].reason, Unconnected::kNoValidModel);
   const std::string& detail = schema.unconnected[0].detail;
-  EXPECT_NE(detail.find("no model with up to 2 signals is valid to any connected part, nor any with "
-                        "a Gaussian process beside its joints"),
-            std::string::npos)
+  EXPECT_NE(
+      detail.find("no model with up to 2 signals is valid to any connected part, nor any with "
+                  "a Gaussian process beside its joints"),
+      std::string::npos)
       << detail;
 }
 

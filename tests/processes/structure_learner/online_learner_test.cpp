@@ -220,9 +220,8 @@ TEST(OnlineLearner, WhereSamplesAreManyNewOnesThatContradictAreNotIgnored) {
 Recording crossed_run(int num_samples, int since, int seed) {
   Rng rng(seed);
   Recording run{test::chapter_robot("a", rng), {}};
-  std::vector<ActionPoseSample> samples =
-      test::babble(run.robot, num_samples,
-                   {.regime = test::Regime::kTag, .with_covariances = true}, rng);
+  std::vector<ActionPoseSample> samples = test::babble(
+      run.robot, num_samples, {.regime = test::Regime::kTag, .with_covariances = true}, rng);
   for (int n = since; n < num_samples; ++n) samples[n].action.reverseInPlace();
   run.samples = shared(samples);
   return run;
