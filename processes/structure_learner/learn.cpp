@@ -428,12 +428,13 @@ UnconnectedPart explain(int part, int num_seen, const std::set<int>& connected,
     return result;
   }
   int common = 0, partner = -1;
-  bool undecided = false;
+  bool undecided = false, was_soft_tried = false;
   for (const auto& [pair, record] : search.records) {
     if (pair.first != part && pair.second != part) continue;
     const int other = pair.first == part ? pair.second : pair.first;
     if (!connected.count(other)) continue;
     undecided |= !record.undecided.empty();
+    was_soft_tried |= record.was_soft_tried;
     if (record.num_common > common) {
       common = record.num_common;
       partner = other;
@@ -450,7 +451,8 @@ UnconnectedPart explain(int part, int num_seen, const std::set<int>& connected,
   } else {
     result.reason = Unconnected::kNoValidModel;
     result.detail = seen + "; no model with up to " + std::to_string(max_signals) +
-                    " signals is valid to any connected part";
+                    " signals is valid to any connected part" +
+                    (was_soft_tried ? ", nor any with a Gaussian process beside its joints" : "");
   }
   return result;
 }
@@ -566,6 +568,15 @@ LearnResult fit_tree(const LearnedStructure& structure,
 
 }  // namespace
 
+Noise marker_noise(const std::vector<ActionPoseSample>& samples, int num_signals,
+                   const LearnOptions& options) {
+  if (options.noise)
+    return {std::max(options.noise->position_m, kNoiseFloor.position_m),
+            std::max(options.noise->rotation_rad, kNoiseFloor.rotation_rad)};
+  if (has_covariances(samples)) return typical_noise(samples);
+  return estimate_noise(samples, num_signals, options.max_signals).value_or(kNoiseFloor);
+}
+
 LearnedStructure find_structure(const std::vector<Signal>& signals,
                                 const std::vector<ActionPoseSample>& samples,
                                 const LearnOptions& options) {
@@ -576,13 +587,8 @@ LearnedStructure find_structure(const std::vector<Signal>& signals,
   SearchOptions search_options = search_options_of(options);
   MeasurementModel& measurement = search_options.measurement;
   const auto set_noise = [&](const std::vector<ActionPoseSample>& of) {
-    if (options.noise) {
-      measurement.noise = Noise{std::max(options.noise->position_m, kNoiseFloor.position_m),
-                                std::max(options.noise->rotation_rad, kNoiseFloor.rotation_rad)};
-    } else if (!has_covariances(of)) {
-      measurement.noise =
-          estimate_noise(of, num_signals, options.max_signals).value_or(kNoiseFloor);
-    }
+    if (options.noise || !has_covariances(of))
+      measurement.noise = marker_noise(of, num_signals, options);
   };
   set_noise(samples);
   NormalizedActions actions(samples, num_signals);

@@ -47,7 +47,7 @@ struct LearnResult {
   BodySchema schema;
   std::vector<Outlier> outliers;  ///< ascending by sample, then part
   int num_screens = 0;            ///< closed-form hypotheses looked at
-  int num_fits = 0;               ///< Levenberg–Marquardt fits
+  int num_fits = 0;               ///< Levenberg–Marquardt fits of the search
 };
 
 /// Learns the body schema from scratch: structure and local models (Sections 3.1 and 3.2). Where the
@@ -60,6 +60,11 @@ struct LearnResult {
 /// out of range.
 LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPoseSample>& samples,
                   const LearnOptions& options = {});
+
+/// Noise per axis of one marker that learn() goes by: `options.noise`; else the mean of the
+/// observations' covariances; where these are zero, the estimate of noise_estimate.h.
+Noise marker_noise(const std::vector<ActionPoseSample>& samples, int num_signals,
+                   const LearnOptions& options = {});
 
 /// The first half of learn(), slow: which part hangs on which by which signals. Everything that
 /// relearn() takes over.

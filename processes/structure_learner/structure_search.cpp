@@ -418,9 +418,9 @@ class Search {
         adopt(tree, *edges);
         continue;
       }
-      // Tying the one's pose to the other's at every frame costs half of χ².
+      // Tying the one's pose to the other's costs half of χ².
       const int joints = count_joints(result_.models) - count_joints(models_before);
-      const double dof = 6.0 * fit.num_frames() - 6 - 6 * joints;
+      const double dof = 6.0 * count_ties(tree, forest_before) - 6 - 6 * joints;
       if (dof < 12 || fit.cost() - apart > 0.5 * (dof + 4 * std::sqrt(2 * dof))) break;
       return fit.cost();
     }
@@ -429,7 +429,25 @@ class Search {
     return std::nullopt;
   }
 
-  TreeFit fit_tree(const Tree& tree) const {
+  // Frames at which a tree of two components has a free pose less than they had apart: those at
+  // which both are seen; where the root rests, and with it all that hangs on it, those at which the
+  // other one is seen, if that did not rest too.
+  int count_ties(const Tree& tree, const Forest& apart) {
+    std::set<int> seen[2];
+    const int root = index_of(tree.nodes.front().part);
+    for (std::size_t k = 0; k < tree.nodes.size(); ++k) {
+      const int x = index_of(tree.nodes[k].part);
+      const bool is_other = !apart.connected(root, x);
+      if (is_other && part_rests(x)) return 0;
+      for (const PairFrame& frame : tree.data[k].frames) seen[is_other].insert(frame.sample);
+    }
+    if (tree.root_rests) return static_cast<int>(seen[1].size());
+    return static_cast<int>(std::count_if(seen[1].begin(), seen[1].end(),
+                                          [&](int sample) { return seen[0].count(sample); }));
+  }
+
+  TreeFit fit_tree(const Tree& tree) {
+    ++result_.num_fits;
     TreeFit fit(tree.nodes, tree.data, actions_, tree.root_rests);
     fit.fit(15, 0.2);
     return fit;

@@ -190,6 +190,16 @@ TEST_F(BodyschemaProgramTest, LearnsAsTheChapterDidForComparison) {
   expect_failure({"learn", csv, "--method", "magic"}, "--method");
 }
 
+// At the noise of its cameras, 50 mm and 15°, a joint that turns less than that is no joint.
+TEST_F(BodyschemaProgramTest, TheChaptersMethodGoesByTheNoiseOfTheData) {
+  const auto csv = write_robot("s.csv");
+  const Json json = run({"learn", csv, "--method", "chapter", "--json"}).json();
+  EXPECT_TRUE(test::is_right(structure_of(json), robot_)) << json;
+  const Json screw = run({"learn", csv, "--json"}).json();
+  for (const char* of : {"position_m", "rotation_deg"})
+    EXPECT_NEAR(json["noise"][of].get<double>(), screw["noise"][of].get<double>(), 1e-9);
+}
+
 TEST_F(BodyschemaProgramTest, WithoutJsonPeopleReadIt) {
   const Outcome outcome = run({"learn", write_robot("s.csv")});
   EXPECT_EQ(outcome.exit_code, 0);
@@ -437,7 +447,13 @@ TEST_F(BodyschemaProgramTest, FilesOfTheWrongKindAreRefused) {
   }
   // A recording of another robot.
   const auto other = write("other.csv", "t,q1,part,x,y,z,qw,qx,qy,qz\n0,1,1,0,0,0,1,0,0,0\n");
-  expect_failure({"predict", "schema.lcmlog", other}, "1 action signals, the schema 2");
+  expect_failure({"predict", "schema.lcmlog", other},
+                 "other.csv: the signals of the samples are q1; those of the schema q1, q2");
+  // The same one with other names.
+  std::string renamed = text_of(folder_ / csv);
+  renamed.replace(renamed.find("q1,q2"), 5, "q2,q3");
+  expect_failure({"predict", "schema.lcmlog", write("renamed.csv", renamed)},
+                 "renamed.csv: the signals of the samples are q2, q3");
 }
 
 TEST_F(BodyschemaProgramTest, ALogOfARunIsLearnedFromWithoutItsTestSamples) {

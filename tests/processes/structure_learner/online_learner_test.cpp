@@ -206,6 +206,37 @@ TEST(OnlineLearner, AnEdgeThatStopsBeingValidBetweenCheckpointsIsLeftOut) {
   EXPECT_GT(num_found, 0);
 }
 
+/// From sample `since` on the arm's signals are crossed over: what one moved the other moves.
+Recording crossed_run(int num_samples, int since, int seed) {
+  Rng rng(seed);
+  Recording run{test::chapter_robot("a", rng), {}};
+  std::vector<ActionPoseSample> samples = test::babble(
+      run.robot, num_samples, {.regime = test::Regime::kTag, .with_covariances = true}, rng);
+  for (int n = since; n < num_samples; ++n) samples[n].action.reverseInPlace();
+  run.samples = shared(samples);
+  return run;
+}
+
+// The first answer leaves out what is refuted, that of the next checkpoint is a new search.
+TEST(OnlineLearner, AnEdgeWhoseSignalsChangeIsLeftOutUntilTheNextSearch) {
+  const Recording run = crossed_run(30, 12, 40);
+  int num_refuted = 0;
+  for (int n = 13; n <= 30; ++n) {
+    const SharedSamples samples = first(run.samples, n);
+    const LearnedStructure before =
+        find_structure(run.robot.signals, plain(first(run.samples, n - 1)), {});
+    if (!before.spans()) break;
+    OnlineLearner online(run.robot.signals, {});
+    const BodySchema answer = online.learn(samples, n - 1);
+    expect_same(answer, relearn(before, plain(samples)).schema);
+    if (answer.edges.size() == before.search.models.size()) continue;
+    ++num_refuted;
+    EXPECT_FALSE(answer.complete);
+    expect_same(online.learn(samples, n), learn(run.robot.signals, plain(samples)).schema);
+  }
+  EXPECT_GT(num_refuted, 0);
+}
+
 TEST(OnlineLearner, APartThatAppearsBetweenCheckpointsIsUnconnectedUntilTheNext) {
   const Recording run = tag_run("a", 140, 38);
   const int c = OnlineLearner::checkpoint_within(120), n = c + c / 20 - 1;
