@@ -71,8 +71,9 @@ class FrameWriter {
     if (frame_.num_hypotheses > 0) pair_.frames.push_back(frame_);
   }
 
-  void add(const Pose& z, const Matrix6d& covariance, double penalty) {
-    const Eigen::LLT<Matrix6d> llt(covariance);
+  // Of a reading with that noise and model error.
+  void add(const Pose& z, const Matrix6d& noise, const Matrix6d& model_error, double penalty) {
+    const Eigen::LLT<Matrix6d> llt(noise + model_error);
     // A covariance that is not positive definite says nothing usable: leave the reading out.
     if (llt.info() != Eigen::Success || !(llt.matrixLLT().diagonal().minCoeff() > 0)) return;
     PairHypothesis h;
@@ -81,6 +82,7 @@ class FrameWriter {
     h.whitening = llt.matrixL().solve(Matrix6d::Identity());
     h.log_det =
         6 * std::log(2 * M_PI) + 2 * llt.matrixLLT().diagonal().array().log().sum();
+    h.model_error = (h.whitening * model_error * h.whitening.transpose()).trace();
     pair_.hypotheses.push_back(h);
   }
 
@@ -141,7 +143,7 @@ PairData make_pair_data(const std::vector<ActionPoseSample>& samples, int part_i
       for (int b = 0; b < num_j; ++b) {
         const Pose z = readings_i[a].X_CB.inverse() * readings_j[b].X_CB;
         frame.add(z,
-                  relative_covariance(z, readings_i[a].covariance, readings_j[b].covariance) + extra,
+                  relative_covariance(z, readings_i[a].covariance, readings_j[b].covariance), extra,
                   readings_i[a].penalty + readings_j[b].penalty);
       }
     }
@@ -159,7 +161,7 @@ PairData make_part_data(const std::vector<ActionPoseSample>& samples, int part,
     const int num = readings_of(*samples[sample].find(part), measurement, readings);
     FrameWriter frame(sample, &pair);
     for (int a = 0; a < num; ++a)
-      frame.add(readings[a].X_CB, readings[a].covariance + extra, readings[a].penalty);
+      frame.add(readings[a].X_CB, readings[a].covariance, extra, readings[a].penalty);
   });
   return pair;
 }

@@ -40,6 +40,8 @@ struct PairHypothesis {
   Matrix6d whitening = Matrix6d::Identity();
   /// log |2πΣ_z|
   double log_det = 0;
+  /// tr Σ_z⁻¹ M, of the model error's part M of Σ_z: what it is expected to make of d².
+  double model_error = 0;
   /// −2 log of the prior odds against this reading: 0 for the first hypotheses of both markers.
   double penalty = 0;
 };

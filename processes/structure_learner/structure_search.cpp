@@ -294,9 +294,9 @@ class Search {
       for (int round = 0; round < kMaxSplits; ++round) {
         const Tree tree = tree_of(x);
         const TreeFit fit = fit_tree(tree);
-        const auto missing = fit.missing_joints();
+        const auto missing = fit.missing_joints(options_.measurement.model_error);
         const MissingJoint* worst =
-            tree.nodes.size() < 2 ? nullptr : most_significant(missing);
+            tree.nodes.size() < 2 ? nullptr : most_significant(missing, fit.num_frames());
         if (!worst || round + 1 == kMaxSplits) {
           result_.log_likelihood += fit.log_likelihood();
           break;
@@ -411,8 +411,8 @@ class Search {
     for (int added = 0; added <= kMaxJoints; ++added) {
       const Tree tree = tree_of(h.i);
       const TreeFit fit = fit_tree(tree);
-      const auto missing = fit.missing_joints();
-      if (const MissingJoint* worst = most_significant(missing)) {
+      const auto missing = fit.missing_joints(options_.measurement.model_error);
+      if (const MissingJoint* worst = most_significant(missing, fit.num_frames())) {
         const auto edges = fit.with_joint(*worst);
         if (!edges) break;
         adopt(tree, *edges);
@@ -474,9 +474,13 @@ class Search {
 
   // The one that chance explains least, if it is significant (Bonferroni over all that was tried).
   // A signal that moves nothing in a spanning forest is probably somewhere: it has an error rate of
-  // its own, spent on fewer hypotheses.
-  const MissingJoint* most_significant(const std::vector<MissingJoint>& joints) const {
+  // its own, spent on fewer hypotheses. The rates are those of few frames; they fall with n^(−dof/2),
+  // as the odds do (Schwarz 1978), so that more samples end in fewer errors of both kinds.
+  const MissingJoint* most_significant(const std::vector<MissingJoint>& joints,
+                                       int num_frames) const {
     constexpr double kErrorRates[2] = {0.003, 0.002};
+    constexpr double kFewFrames = 20;
+    const double log_frames = std::log(std::max(num_frames / kFewFrames, 1.0));
     std::set<int> used;
     for (const AcceptedModel& m : result_.models)
       for (int d = 0; d < m.model.num_joints; ++d) used.insert(m.model.signal[d]);
@@ -487,7 +491,8 @@ class Search {
     double best_margin = 0;
     for (const MissingJoint& j : joints) {
       const bool elsewhere = is_used(j.signal);
-      const double margin = j.log_tail + std::log(2 * ways[elsewhere] / kErrorRates[elsewhere]);
+      const double margin = j.log_tail + std::log(2 * ways[elsewhere] / kErrorRates[elsewhere]) +
+                            0.5 * (j.slides ? 3 : 6) * log_frames;
       if (margin < best_margin) {
         best = &j;
         best_margin = margin;

@@ -340,7 +340,7 @@ bool TreeFit::is_below(int node, int ancestor) const {
   return node == ancestor;
 }
 
-std::vector<MissingJoint> TreeFit::missing_joints() const {
+std::vector<MissingJoint> TreeFit::missing_joints(const Noise& bias) const {
   const int n = static_cast<int>(nodes_.size());
   const int T = num_frames();
   const Normal normal = normal_equations();
@@ -363,6 +363,9 @@ std::vector<MissingJoint> TreeFit::missing_joints() const {
     for (int s = 0; s < m; ++s) q(t, s) = actions_(samples_[t], moving[s]);
   const Eigen::MatrixXd q2 = q.cwiseProduct(q);
   const double noise_scale = std::max(normal.scale, 0.25);
+  Vector6d bias_variances;
+  bias_variances << Eigen::Vector3d::Constant(std::pow(bias.position_m, 2)),
+      Eigen::Vector3d::Constant(std::pow(bias.rotation_rad, 2));
 
   std::vector<MissingJoint> result;
   for (int top = 0; top < n; ++top) {
@@ -381,6 +384,16 @@ std::vector<MissingJoint> TreeFit::missing_joints() const {
           std::count(members.begin(), members.end(), nodes_[k].parent))
         items.push_back({k, true});
     const int num_items = static_cast<int>(items.size());
+    // Of a bias about where the item is, as a twist in the cluster's frame.
+    std::vector<Matrix6d> bias_covariance;
+    for (const Item& item : items) {
+      Pose at_item = Pose::Identity();
+      for (int t = 0; t < T; ++t)
+        at_item.translation() +=
+            (poses_[at(t, top)].inverse() * poses_[at(t, item.node)]).translation() / T;
+      const Matrix6d F = adjoint(at_item);
+      bias_covariance.push_back(F * bias_variances.asDiagonal() * F.transpose());
+    }
 
     // Parameters that share a marker with the cluster.
     std::vector<int> blocks, columns;
@@ -463,11 +476,13 @@ std::vector<MissingJoint> TreeFit::missing_joints() const {
 
       const auto test = [&](const std::vector<bool>& moves) {
         Matrix6d C_S = Matrix6d::Zero(), all = Matrix6d::Zero();
+        Matrix6d bias_S = Matrix6d::Zero();
         Vector6d u_S = Vector6d::Zero();
         for (int i = 0; i < num_items; ++i) {
           if (!moves[i]) continue;
           u_S += u.segment<6>(6 * i);
           all += own.middleCols<6>(6 * i);
+          bias_S += bias_covariance[i];
           for (int j = 0; j < num_items; ++j)
             if (moves[j]) C_S += C.block<6, 6>(6 * i, 6 * j);
         }
@@ -475,31 +490,44 @@ std::vector<MissingJoint> TreeFit::missing_joints() const {
         joint.top = top;
         joint.signal = moving[s];
         joint.log_tail = 0;
+        bias_S /= static_cast<double>(std::count(moves.begin(), moves.end(), true));
         const Vector6d d = all.diagonal().cwiseMax(1e-300).cwiseSqrt().cwiseInverse();
         const Vector6d unit_u = d.cwiseProduct(u_S);
         const Matrix6d unit_C = d.asDiagonal() * C_S * d.asDiagonal();
-        const auto offer = [&](const auto& C_d, const auto& u_d, int dof) {
-          // Directions that the tree's other parameters take over are no evidence.
+        const Matrix6d unit_bias =
+            d.cwiseInverse().asDiagonal() * bias_S * d.cwiseInverse().asDiagonal();
+        const auto offer = [&](const auto& C_d, const auto& bias_d, const auto& u_d, int dof) {
           using Matrix = std::decay_t<decltype(C_d)>;
           const Eigen::SelfAdjointEigenSolver<Matrix> eigen(C_d);
-          const auto c = (eigen.eigenvectors().transpose() * u_d).eval();
-          auto solved = c;
-          double sum = 0;
+          const auto& V = eigen.eigenvectors();
+          // ξ along the eigenvectors, and its covariance: of the noise and of the bias. Directions
+          // that the tree's other parameters take over are no evidence.
+          auto xi = (V.transpose() * u_d).eval();
+          Matrix covariance = V.transpose() * bias_d * V;
           for (int i = 0; i < dof; ++i) {
-            solved(i) = eigen.eigenvalues()(i) < 1e-4 ? 0 : c(i) / eigen.eigenvalues()(i);
-            sum += c(i) * solved(i);
+            if (eigen.eigenvalues()(i) < 1e-4) {
+              xi(i) = 0;
+              covariance.row(i).setZero();
+              covariance.col(i).setZero();
+              covariance(i, i) = 1;
+            } else {
+              xi(i) /= eigen.eigenvalues()(i);
+              covariance(i, i) += noise_scale / eigen.eigenvalues()(i);
+            }
           }
-          sum /= noise_scale;
+          const double sum = xi.dot(covariance.ldlt().solve(xi));
           const double log_tail = log_chi_square_tail(sum, dof);
           if (log_tail >= joint.log_tail) return;
           joint.log_tail = log_tail;
           joint.statistic = sum;
           joint.slides = dof == 3;
           joint.xi.setZero();
-          joint.xi.head(dof) = -d.head(dof).cwiseProduct(eigen.eigenvectors() * solved);
+          joint.xi.head(dof) = -d.head(dof).cwiseProduct(V * xi);
         };
-        offer(Eigen::Matrix3d(unit_C.topLeftCorner<3, 3>()), Eigen::Vector3d(unit_u.head<3>()), 3);
-        offer(unit_C, unit_u, 6);
+        offer(Eigen::Matrix3d(unit_C.topLeftCorner<3, 3>()),
+              Eigen::Matrix3d(unit_bias.topLeftCorner<3, 3>()), Eigen::Vector3d(unit_u.head<3>()),
+              3);
+        offer(unit_C, unit_bias, unit_u, 6);
         return joint;
       };
       for (int first = 0; first < num_items; ++first) {

@@ -27,7 +27,7 @@ struct MissingJoint {
   /// Most likely screw in the frame of `top`, Exp(ξ q), per half range of the signal.
   Vector6d xi = Vector6d::Zero();
   bool slides = false;   ///< ξ is a translation, which explains the data as well as a general screw
-  double statistic = 0;  ///< score statistic: χ² without the joint
+  double statistic = 0;  ///< score statistic: χ² of ξ = 0
   double log_tail = 0;   ///< log of the χ² tail beyond the statistic
   /// log of the number of ways to part this cluster: for the significance of the best of them.
   double log_ways = 0;
@@ -75,8 +75,10 @@ class TreeFit {
   /// the residuals shrink, to second order, if Exp(ξ q_g) moves some of what is in or on the cluster
   /// and all other parameters of the tree adapt. The parting that explains most is found by greedy
   /// exchange; of a sliding (3 degrees of freedom) and a general joint (6), the less likely by
-  /// chance.
-  std::vector<MissingJoint> missing_joints() const;
+  /// chance. A marker's own bias, which turns with the signals that turn it to the camera, is no
+  /// joint: `bias`, standard deviations at half range of a signal, adds to the noise of ξ however
+  /// many samples there are.
+  std::vector<MissingJoint> missing_joints(const Noise& bias) const;
 
   /// The tree's edges with that joint. Where only branches move, each of their edges gets it. Edges
   /// between the two sides are moved to the right one. std::nullopt if an edge had more than

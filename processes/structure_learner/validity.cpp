@@ -102,7 +102,9 @@ Validity check_validity(const Fit& fit, const LeaveOneOut& loo, const PairData& 
   const int k = fit.model.num_joints;
   const int others = static_cast<int>(actions.moving().size()) - k;
   Eigen::Matrix<double, 6, Eigen::Dynamic> r(6, n);
+  double bias = 0;
   for (int t = 0; t < n; ++t) {
+    bias += pair.hypotheses[fit.frames[t].hypothesis].model_error;
     const double d2 = fit.frames[t].squared_distance;
     // Clipped, and fading where it is far beyond what a missed joint does to a frame or two: flips
     // must not find a signal that happens to go along with them.
@@ -116,8 +118,9 @@ Validity check_validity(const Fit& fit, const LeaveOneOut& loo, const PairData& 
       chi_square_quantile(6 * num_features,
                           (options.lenient ? 1e-6 : 1.35e-3) / std::max(others, 1)) *
           std::max(1.0, result.mean_inlier / 6) / share +
-      // What is far below the noise of every single frame is no joint but a bias.
-      0.05 * n;
+      // What is far below the noise of every single frame is no joint but a bias; and all of the
+      // model error may go along with one signal: its variance is ⅓ that of the ends of its range.
+      0.05 * n + bias / 3;
   for (const int g : actions.moving()) {
     if (fit.model.uses(g)) continue;
     double mean = 0;

@@ -118,7 +118,7 @@ TEST(TreeFit, ATrueTreeLacksNoJoint) {
       Case c(chain(0.2, rng), 25, Regime::kChapter, root_moves, rng);
       TreeFit fit(c.nodes, c.data, c.actions, !root_moves);
       fit.fit(20, 1e-3);
-      for (const MissingJoint& joint : fit.missing_joints()) {
+      for (const MissingJoint& joint : fit.missing_joints({})) {
         ++num_tests;
         const double corrected = joint.log_tail + std::log(2.0) + joint.log_ways;
         num_below += corrected < std::log(0.05);
@@ -144,7 +144,7 @@ TEST(TreeFit, AllMarkersTogetherShowAJointThatNoPairShows) {
                      .verdict == Verdict::kValid;
     TreeFit fit(c.without(3), c.data, c.actions, true);
     fit.fit(20, 1e-3);
-    const auto missing = fit.missing_joints();
+    const auto missing = fit.missing_joints({});
     ASSERT_FALSE(missing.empty());
     const MissingJoint& best = missing.front();
     if (best.log_tail > -13 || best.signal != 3) continue;
@@ -170,6 +170,35 @@ TEST(TreeFit, AllMarkersTogetherShowAJointThatNoPairShows) {
   }
   EXPECT_GE(num_rigid, kRobots / 2);
   EXPECT_GE(num_found, kRobots * 3 / 4);
+}
+
+TEST(TreeFit, AMarkersOwnBiasIsNoJoint) {
+  // Read 3 mm aside at the ends of the first signal's range: with samples enough that is significant.
+  Rng rng(1);
+  Case c(chain(0.2, rng), 400, Regime::kTagIso, false, rng);
+  for (ActionPoseSample& sample : c.samples)
+    for (PartObservation& o : sample.parts)
+      if (o.part == 4) o.X_CB = o.X_CB * Eigen::Translation3d(0, 0.003 * sample.action(0));
+  c.data[3] = make_part_data(c.samples, 4, c.measurement, std::numeric_limits<int>::max());
+  TreeFit fit(c.nodes, c.data, c.actions, true);
+  fit.fit(20, 1e-3);
+  const auto worst = [&](const Noise& bias) {
+    const auto missing = fit.missing_joints(bias);
+    return *std::min_element(missing.begin(), missing.end(), [](const auto& x, const auto& y) {
+      return x.log_tail < y.log_tail;
+    });
+  };
+  EXPECT_LT(worst({}).log_tail, -20);
+  EXPECT_EQ(worst({}).signal, 0);
+  EXPECT_EQ(worst({}).members, std::vector<int>{3});
+  EXPECT_GT(worst({0.003, 0.2 * M_PI / 180}).log_tail, -10);
+
+  // A true joint is far beyond the bias.
+  TreeFit lacking(c.without(3), c.data, c.actions, true);
+  lacking.fit(20, 1e-3);
+  const auto missing = lacking.missing_joints({0.003, 0.2 * M_PI / 180});
+  ASSERT_FALSE(missing.empty());
+  EXPECT_LT(missing.front().log_tail, -100);
 }
 
 TEST(TreeFit, AJointThatMovesBranchesOnlyIsPutIntoTheirEdges) {

@@ -13,9 +13,10 @@ namespace {
 using test::Regime;
 using test::Rng;
 
-Validity rigid_validity(const std::vector<ActionPoseSample>& samples, const Noise& noise) {
+Validity rigid_validity(const std::vector<ActionPoseSample>& samples, const Noise& noise,
+                        const Noise& model_error = {}) {
   const NormalizedActions actions(samples, static_cast<int>(samples[0].action.size()));
-  const PairData pair = make_pair_data(samples, 1, 2, {noise, {}}, 1000);
+  const PairData pair = make_pair_data(samples, 1, 2, {noise, model_error}, 2000);
   const Fit fit = fit_local_model(screen_rigid(pair, actions).model, pair, actions, 40);
   return check_validity(fit, leave_one_out(fit, pair, actions), pair, actions, {});
 }
@@ -57,6 +58,23 @@ TEST(Validity, AJointOfTwoDegreesIsFoundInTagNoise) {
     refuted += v.verdict == Verdict::kRefuted;
   }
   EXPECT_GE(refuted, 40);
+}
+
+TEST(Validity, WhatTheModelErrorMayBeIsNoJoint) {
+  int refuted = 0, refuted_as_bias = 0;
+  for (int seed = 1; seed <= 10; ++seed) {
+    Rng rng(seed);
+    auto samples = test::babble(hinge(0, rng), 1500, {Regime::kTagIso}, rng);
+    for (ActionPoseSample& sample : samples)
+      for (PartObservation& o : sample.parts)
+        if (o.part == 2) o.X_CB = o.X_CB * Eigen::Translation3d(0.003 * sample.action(0), 0, 0);
+    const Noise noise = test::nominal_noise(Regime::kTagIso);
+    refuted += rigid_validity(samples, noise).verdict == Verdict::kRefuted;
+    refuted_as_bias +=
+        rigid_validity(samples, noise, {0.003, 0.2 * M_PI / 180}).verdict == Verdict::kRefuted;
+  }
+  EXPECT_GE(refuted, 9);
+  EXPECT_EQ(refuted_as_bias, 0);
 }
 
 TEST(Validity, AHingeOfNinetyDegreesIsNotRigid) {
