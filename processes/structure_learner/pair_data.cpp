@@ -142,9 +142,8 @@ PairData make_pair_data(const std::vector<ActionPoseSample>& samples, int part_i
     for (int a = 0; a < num_i; ++a) {
       for (int b = 0; b < num_j; ++b) {
         const Pose z = readings_i[a].X_CB.inverse() * readings_j[b].X_CB;
-        frame.add(z,
-                  relative_covariance(z, readings_i[a].covariance, readings_j[b].covariance), extra,
-                  readings_i[a].penalty + readings_j[b].penalty);
+        frame.add(z, relative_covariance(z, readings_i[a].covariance, readings_j[b].covariance),
+                  extra, readings_i[a].penalty + readings_j[b].penalty);
       }
     }
   });

@@ -474,8 +474,9 @@ class Search {
 
   // The one that chance explains least, if it is significant (Bonferroni over all that was tried).
   // A signal that moves nothing in a spanning forest is probably somewhere: it has an error rate of
-  // its own, spent on fewer hypotheses. The rates are those of few frames; they fall with n^(−dof/2),
-  // as the odds do (Schwarz 1978), so that more samples end in fewer errors of both kinds.
+  // its own, spent on fewer hypotheses. The rates are those of few frames; they fall with
+  // n^(−dof/2), as the odds do (Schwarz 1978), so that more samples end in fewer errors of both
+  // kinds.
   const MissingJoint* most_significant(const std::vector<MissingJoint>& joints,
                                        int num_frames) const {
     constexpr double kErrorRates[2] = {0.003, 0.002};

@@ -72,10 +72,10 @@ class TreeFit {
   int num_frames() const { return static_cast<int>(samples_.size()); }
 
   /// Rao's score test of one more joint, for every rigid cluster and every moving signal: how much
-  /// the residuals shrink, to second order, if Exp(ξ q_g) moves some of what is in or on the cluster
-  /// and all other parameters of the tree adapt. The parting that explains most is found by greedy
-  /// exchange; of a sliding (3 degrees of freedom) and a general joint (6), the less likely by
-  /// chance. A marker's own bias, which turns with the signals that turn it to the camera, is no
+  /// the residuals shrink, to second order, if Exp(ξ q_g) moves some of what is in or on the
+  /// cluster and all other parameters of the tree adapt. The parting that explains most is found by
+  /// greedy exchange; of a sliding (3 degrees of freedom) and a general joint (6), the less likely
+  /// by chance. A marker's own bias, which turns with the signals that turn it to the camera, is no
   /// joint: `bias`, standard deviations at half range of a signal, adds to the noise of ξ however
   /// many samples there are.
   std::vector<MissingJoint> missing_joints(const Noise& bias) const;

@@ -173,7 +173,8 @@ TEST(TreeFit, AllMarkersTogetherShowAJointThatNoPairShows) {
 }
 
 TEST(TreeFit, AMarkersOwnBiasIsNoJoint) {
-  // Read 3 mm aside at the ends of the first signal's range: with samples enough that is significant.
+  // Read 3 mm aside at the ends of the first signal's range: with samples enough that is
+  // significant.
   Rng rng(1);
   Case c(chain(0.2, rng), 400, Regime::kTagIso, false, rng);
   for (ActionPoseSample& sample : c.samples)
@@ -184,9 +185,8 @@ TEST(TreeFit, AMarkersOwnBiasIsNoJoint) {
   fit.fit(20, 1e-3);
   const auto worst = [&](const Noise& bias) {
     const auto missing = fit.missing_joints(bias);
-    return *std::min_element(missing.begin(), missing.end(), [](const auto& x, const auto& y) {
-      return x.log_tail < y.log_tail;
-    });
+    return *std::min_element(missing.begin(), missing.end(),
+                             [](const auto& x, const auto& y) { return x.log_tail < y.log_tail; });
   };
   EXPECT_LT(worst({}).log_tail, -20);
   EXPECT_EQ(worst({}).signal, 0);
