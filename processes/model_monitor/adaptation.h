@@ -1,0 +1,106 @@
+#pragma once
+
+#include <cstdint>
+#include <deque>
+#include <map>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "processes/model_monitor/change_fit.h"
+#include "processes/model_monitor/tree_filter.h"
+
+namespace bodyschema {
+
+struct AdaptationOptions {
+  MarkerNoise noise;
+  /// Wished false alarms a sample, over all tests together.
+  double false_alarm_rate = 1e-5;
+  double suspicion = 1.5;    ///< CUSUM above which candidates are tried [nats]
+  double acceptance = 12;    ///< evidence over the schema that stands [nats]
+  double ambiguity = 6;      ///< a runner-up nearer than this asks for a probe [nats]
+  int longest_segment = 40;  ///< samples since a change that are looked at
+  int settled_after = 40;    ///< samples until a replacement is kept for good
+  std::size_t history = 8;   ///< schemas kept beside the first
+};
+
+/// Something that the adaptation decided at one sample.
+struct AdaptationEvent {
+  enum class Kind { kMismatch, kCandidate, kRefined, kRestored, kReverted, kRecovered, kDrift,
+                    kMissing, kProbeWanted };
+  Kind kind = Kind::kMismatch;
+  std::int64_t sample_index = 0;
+  int from = -1;  ///< parts of an edge; −1 for a part alone or the camera
+  int to = -1;
+  int part = -1;  ///< of a marker; −1 for an edge
+  std::string cause;
+  double margin = 0;  ///< evidence over the schema that stood before [nats]
+  int num_samples = 0;
+};
+const char* name_of(AdaptationEvent::Kind kind);
+
+/// Keeps a complete body schema true while the body changes (Section 4 of the chapter).
+///
+/// Every sample is judged by a tree filter under the schema and, for every edge and every marker,
+/// under the hypothesis that this one is wrong. The log-likelihood ratios are summed by one CUSUM
+/// each; since they are proper, ln(2n/α) is the threshold for α false alarms a sample. From a
+/// suspicion on, replacements are fitted to the samples since its beginning: what is in the history,
+/// then changes of the old model from simple to complex. The one with the most evidence replaces the
+/// old one as soon as it leads by `acceptance`; it is refitted as samples come, reverted if it falls
+/// behind, kept in the history once it has settled.
+class Adaptation {
+ public:
+  Adaptation(BodySchema schema, AdaptationOptions options);
+
+  /// The events of this sample. A pure function of the samples so far.
+  std::vector<AdaptationEvent> on_sample(const ActionPoseSample& sample);
+  const BodySchema& schema() const { return schema_; }
+  /// CUSUM of the edge to a part (root: the camera's) and of the part's marker [nats].
+  double edge_statistic(int part) const;
+  double marker_statistic(int part) const;
+  bool is_settled() const { return !provisional_ && !detected_; }
+
+ private:
+  struct Cusum {
+    double value = 0;
+    std::int64_t since = 0;  ///< first sample of the present rise
+  };
+  struct Place {
+    int part = 0;
+    bool marker = false;
+    auto operator<=>(const Place&) const = default;
+  };
+  struct Provisional {
+    BodySchema before;
+    FittedChange fitted;
+    Place place;
+    std::int64_t since = 0;
+    int num_samples = 0;
+    bool was_refuted = false;
+  };
+
+  void restart_tests();
+  void update_tests(const TreeFilter::Instant& instant, std::int64_t sample_index);
+  std::vector<const ActionPoseSample*> segment(std::int64_t since) const;
+  std::vector<Place> suspects() const;
+  std::optional<FittedChange> best_change(const BodySchema& standing, const std::vector<Place>& places,
+                                          std::int64_t since, double* null, double* runner_up,
+                                          Place* place) const;
+  void try_changes(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
+  void refit(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
+  void remember(const BodySchema& schema);
+  void install(const BodySchema& schema);
+  AdaptationEvent event(AdaptationEvent::Kind kind, std::int64_t sample_index,
+                        const Place& place) const;
+
+  const AdaptationOptions options_;
+  BodySchema schema_;
+  std::optional<TreeFilter> filter_;
+  std::deque<ActionPoseSample> recent_;
+  std::vector<Cusum> edges_, markers_;  ///< by node
+  std::optional<Provisional> provisional_;
+  std::optional<Place> detected_;
+  std::vector<BodySchema> history_;  ///< the first is pinned
+};
+
+}  // namespace bodyschema

@@ -1,0 +1,267 @@
+#include "processes/model_monitor/change_fit.h"
+
+#include <Eigen/Cholesky>
+#include <algorithm>
+#include <cmath>
+
+namespace bodyschema {
+namespace {
+
+using Form = BodyChange::Form;
+
+constexpr int kIterations = 16;
+constexpr double kLargestStep = 0.7;  // of θ, in prior standard deviations of a transform: m and rad
+constexpr double kStudentNu = 4;
+
+std::vector<int> nodes_of(const TreeFilter& filter, const std::vector<int>& parts) {
+  std::vector<int> nodes;
+  for (const int part : parts)
+    if (const int node = filter.node_of(part); node >= 0) nodes.push_back(node);
+  return nodes;
+}
+
+Vector6d coordinates(const Pose& T) {
+  Vector6d theta;
+  theta << T.translation(), log_so3(T.linear());
+  return theta;
+}
+
+}  // namespace
+
+double log_likelihood(const BodySchema& schema, const MarkerNoise& noise,
+                      const std::vector<const ActionPoseSample*>& samples,
+                      const std::vector<int>& cut_parts) {
+  const TreeFilter filter(schema, noise);
+  Alternative alternative;
+  alternative.cut_edges = nodes_of(filter, cut_parts);
+  double sum = 0;
+  for (const ActionPoseSample* sample : samples)
+    sum += filter.judge(filter.prepare(*sample), alternative).log_likelihood;
+  return sum;
+}
+
+PlaceEvidence::PlaceEvidence(const BodySchema& base, const MarkerNoise& noise, int part,
+                             bool marker, std::vector<const ActionPoseSample*> samples,
+                             std::vector<int> cut_parts)
+    : base_(base),
+      noise_(noise),
+      part_(part),
+      marker_(marker),
+      samples_(std::move(samples)),
+      cut_parts_(std::move(cut_parts)) {
+  const TreeFilter filter(base_, noise_);
+  const int node = filter.node_of(part_);
+  if (node < 0) return;
+  const std::vector<int> cut = nodes_of(filter, cut_parts_);
+  for (const ActionPoseSample* sample : samples_) {
+    const TreeFilter::Instant instant = filter.prepare(*sample);
+    const auto of = marker_ ? filter.measure_marker(instant, node, cut)
+                            : filter.measure_edge(instant, node, cut);
+    if (!of) continue;
+    const Eigen::LLT<Matrix6d> llt(of->covariance);
+    if (llt.info() != Eigen::Success) continue;
+    measurements_.push_back({sample, *of, llt.matrixL().solve(Matrix6d::Identity())});
+  }
+}
+
+Pose PlaceEvidence::predict(const BodyChange& change, const Eigen::VectorXd& theta,
+                            std::size_t n) const {
+  if (marker_) {
+    // measure_marker() gives T itself.
+    Pose T = Pose::Identity();
+    T.linear() = exp_so3(theta.tail<3>());
+    T.translation() = theta.head<3>();
+    return T;
+  }
+  const BodySchema with = changed(base_, change, theta);
+  const Edge* edge = edge_to(with, part_);
+  if (!edge) return with.X_CR;
+  return edge->predict(with.displacements(measurements_[n].sample->action));
+}
+
+std::vector<Eigen::VectorXd> PlaceEvidence::starts(const BodyChange& change) const {
+  std::vector<Eigen::VectorXd> result;
+  const Eigen::VectorXd mean = prior_mean(change, base_), sigma = prior_sigma(change, base_);
+  switch (change.form) {
+    case Form::kStuck:
+      for (int k = 0; k < 9; ++k)
+        result.push_back(mean + Eigen::VectorXd::Constant(1, std::sqrt(3.0) * (k - 4) / 4 * sigma(0)));
+      break;
+    case Form::kOffset:
+      for (int k = 0; k < 7; ++k)
+        result.push_back(Eigen::VectorXd::Constant(1, 0.6 * (k - 3) * sigma(0)));
+      break;
+    case Form::kGain:
+      for (const double a : {-0.6, -0.25, 0.0, 0.4})
+        for (const double b : {-0.5, 0.0, 0.5})
+          result.push_back(Eigen::Vector2d(a, b * sigma(1)));
+      break;
+    case Form::kOtherSignal:
+    case Form::kStored:
+      result.push_back(mean);
+      break;
+    default: {
+      // What each of the newest samples alone says.
+      const Eigen::VectorXd zero = Eigen::VectorXd::Zero(change.size());
+      const std::size_t count = measurements_.size();
+      for (std::size_t n = count > 3 ? count - 3 : 0; n < count; ++n) {
+        const Pose& z = measurements_[n].of.z;
+        const Pose before = predict(change, zero, n);
+        const Vector6d right = coordinates(before.inverse() * z);
+        const Vector6d left = coordinates(z * before.inverse());
+        if (change.form == Form::kLeft) {
+          result.push_back(left);
+        } else if (change.form == Form::kBoth) {
+          Eigen::VectorXd start = zero;
+          start.head<6>() = left;
+          result.push_back(start);
+          start.setZero();
+          start.tail<6>() = right;
+          result.push_back(start);
+          start.head<6>() = 0.5 * left;
+          start.tail<6>() = 0.5 * right;
+          result.push_back(start);
+        } else {
+          result.push_back(right);
+        }
+      }
+    }
+  }
+  return result;
+}
+
+PlaceEvidence::State PlaceEvidence::climb(const BodyChange& change, Eigen::VectorXd theta) const {
+  const Eigen::Index d = change.size();
+  const Eigen::VectorXd mean = prior_mean(change, base_), sigma = prior_sigma(change, base_);
+  const Eigen::VectorXd prior = sigma.cwiseAbs2().cwiseInverse();
+  const double flat = std::log(noise_.outlier_rate) + log_flat_density();
+  const auto cost_of = [&](const Eigen::VectorXd& t, bool robust) {
+    double sum = 0.5 * (t - mean).cwiseAbs2().dot(prior);
+    for (std::size_t n = 0; n < measurements_.size(); ++n) {
+      const double d2 = (measurements_[n].whitening *
+                         log(predict(change, t, n).inverse() * measurements_[n].of.z))
+                            .squaredNorm();
+      if (robust) {
+        sum += (kStudentNu + 6) / 2 * std::log1p(d2 / kStudentNu);
+      } else {
+        const double inlier = std::log1p(-noise_.outlier_rate) - 0.5 * d2 - 3 * std::log(2 * M_PI) +
+                              measurements_[n].whitening.diagonal().array().log().sum();
+        sum -= std::max(inlier, flat) + std::log1p(std::exp(-std::abs(inlier - flat)));
+      }
+    }
+    return sum;
+  };
+  State state;
+  double damping = 1e-3;
+  for (int iteration = 0; iteration < kIterations; ++iteration) {
+    const bool robust = iteration < kIterations / 2;
+    if (iteration == kIterations / 2) damping = 1e-3;
+    Eigen::MatrixXd H = prior.asDiagonal();
+    Eigen::VectorXd g = prior.cwiseProduct(theta - mean);
+    for (std::size_t n = 0; n < measurements_.size(); ++n) {
+      const Measured& m = measurements_[n];
+      const Vector6d r = m.whitening * log(predict(change, theta, n).inverse() * m.of.z);
+      const double d2 = r.squaredNorm();
+      double w = (kStudentNu + 6) / (kStudentNu + d2);
+      if (!robust) {
+        const double inlier = std::log1p(-noise_.outlier_rate) - 0.5 * d2 - 3 * std::log(2 * M_PI) +
+                              m.whitening.diagonal().array().log().sum();
+        w = 1 / (1 + std::exp(std::min(flat - inlier, 500.0)));
+      }
+      Eigen::MatrixXd J(6, d);
+      for (Eigen::Index p = 0; p < d; ++p) {
+        const double h = 1e-5 * std::max(1.0, sigma(p));
+        Eigen::VectorXd step = theta;
+        step(p) += h;
+        const Vector6d plus = m.whitening * log(predict(change, step, n).inverse() * m.of.z);
+        step(p) -= 2 * h;
+        const Vector6d minus = m.whitening * log(predict(change, step, n).inverse() * m.of.z);
+        J.col(p) = (plus - minus) / (2 * h);
+      }
+      H += w * J.transpose() * J;
+      g += w * J.transpose() * r;
+    }
+    state.H = H;
+    const double before = cost_of(theta, robust);
+    state.theta = theta;
+    state.cost = before;
+    bool improved = false;
+    double gain = 0;
+    for (int attempt = 0; attempt < 5 && !improved; ++attempt) {
+      Eigen::MatrixXd damped = H;
+      damped.diagonal() *= 1 + damping;
+      Eigen::VectorXd step = -damped.ldlt().solve(g);
+      const double longest = step.cwiseQuotient(sigma.cwiseMax(1e-9)).cwiseAbs().maxCoeff();
+      if (longest > 3 * kLargestStep) step *= 3 * kLargestStep / longest;
+      const double after = cost_of(theta + step, robust);
+      if (after < before) {
+        theta += step;
+        gain = before - after;
+        improved = true;
+        damping = std::max(damping / 10, 1e-9);
+      } else {
+        damping *= 10;
+      }
+    }
+    if (!improved || gain < 1e-4) {
+      if (!robust) break;
+      iteration = std::max(iteration, kIterations / 2 - 1);
+    }
+  }
+  state.cost = cost_of(theta, false);
+  state.theta = theta;
+  return state;
+}
+
+std::optional<FittedChange> PlaceEvidence::fit(const BodyChange& change) const {
+  if (num_usable() < change.fewest_samples()) return std::nullopt;
+  const Eigen::Index d = change.size();
+  FittedChange best;
+  best.change = change;
+  best.num_usable = num_usable();
+  best.theta = Eigen::VectorXd::Zero(d);
+  best.log_evidence = change.log_odds();
+  if (d > 0) {
+    std::optional<State> found;
+    // The most promising starts only: one cost each tells.
+    for (const Eigen::VectorXd& start : starts(change)) {
+      const State state = climb(change, start);
+      if (!state.theta.allFinite() || !std::isfinite(state.cost)) continue;
+      if (!found || state.cost < found->cost) found = state;
+    }
+    if (!found) return std::nullopt;
+    const Eigen::LLT<Eigen::MatrixXd> llt(found->H);
+    if (llt.info() != Eigen::Success) return std::nullopt;
+    best.theta = found->theta;
+    best.covariance = llt.solve(Eigen::MatrixXd::Identity(d, d));
+    const Eigen::VectorXd sigma = prior_sigma(change, base_);
+    // log prior + d/2 log 2π − ½ log|H|; a uniform prior has the density of its interval.
+    if (change.form == Form::kStuck) {
+      best.log_evidence += -std::log(sigma(0) * std::sqrt(12.0)) + 0.5 * std::log(2 * M_PI);
+    } else {
+      best.log_evidence -=
+          0.5 * (best.theta - prior_mean(change, base_)).cwiseQuotient(sigma).squaredNorm() +
+          sigma.array().log().sum();
+    }
+    best.log_evidence -= llt.matrixLLT().diagonal().array().log().sum();
+  }
+  // The likelihood at the most probable θ; the width of its peak is in the Laplace term, so the
+  // model's new uncertainty must not be in it as well.
+  best.log_evidence +=
+      log_likelihood(changed(base_, change, best.theta), noise_, samples_, cut_parts_);
+  best.schema = changed(base_, change, best.theta, best.covariance);
+  return best;
+}
+
+FittedChange PlaceEvidence::judge_stored(const BodySchema& schema) const {
+  FittedChange result;
+  result.change = {Form::kStored, part_};
+  result.theta.resize(0);
+  result.schema = schema;
+  result.num_usable = num_usable();
+  result.log_evidence =
+      result.change.log_odds() + log_likelihood(schema, noise_, samples_, cut_parts_);
+  return result;
+}
+
+}  // namespace bodyschema

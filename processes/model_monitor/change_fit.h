@@ -1,0 +1,68 @@
+#pragma once
+
+#include <optional>
+#include <vector>
+
+#include "common/schema/sample.h"
+#include "processes/model_monitor/body_change.h"
+#include "processes/model_monitor/tree_filter.h"
+
+namespace bodyschema {
+
+/// A change with the parameters that the samples since speak for.
+struct FittedChange {
+  BodyChange change;
+  Eigen::VectorXd theta;
+  Eigen::MatrixXd covariance;  ///< of θ, Laplace
+  BodySchema schema;           ///< with the change, and its uncertainty, in it
+  /// log ∫ p(observations | θ) p(θ) dθ by Laplace, plus the log prior odds [nats].
+  double log_evidence = 0;
+  int num_usable = 0;  ///< samples that say something of the place
+};
+
+/// Σ log p(observations) over the samples under a schema.
+double log_likelihood(const BodySchema& schema, const MarkerNoise& noise,
+                      const std::vector<const ActionPoseSample*>& samples,
+                      const std::vector<int>& cut_parts = {});
+
+/// What every sample says of one place, whatever the change there: made once for all its forms.
+class PlaceEvidence {
+ public:
+  /// `cut_parts`: parts whose edges say nothing. `marker`: the marker of `part`, not its edge.
+  PlaceEvidence(const BodySchema& base, const MarkerNoise& noise, int part, bool marker,
+                std::vector<const ActionPoseSample*> samples, std::vector<int> cut_parts = {});
+
+  int num_usable() const { return static_cast<int>(measurements_.size()); }
+
+  /// The most probable θ: Gauss-Newton on the virtual measurements from several starts, with
+  /// Student-t weights first and the outlier mixture's then. Its evidence is that of all observations
+  /// under the changed schema. std::nullopt if there are fewer usable samples than the form needs.
+  std::optional<FittedChange> fit(const BodyChange& change) const;
+  /// A schema of the history in this place.
+  FittedChange judge_stored(const BodySchema& schema) const;
+
+ private:
+  struct Measured {
+    const ActionPoseSample* sample;
+    VirtualMeasurement of;
+    Matrix6d whitening;
+  };
+  struct State {
+    Eigen::VectorXd theta;
+    double cost = 0;
+    Eigen::MatrixXd H;
+  };
+  Pose predict(const BodyChange& change, const Eigen::VectorXd& theta, std::size_t n) const;
+  std::vector<Eigen::VectorXd> starts(const BodyChange& change) const;
+  State climb(const BodyChange& change, Eigen::VectorXd theta) const;
+
+  const BodySchema base_;
+  const MarkerNoise noise_;
+  const int part_;
+  const bool marker_;
+  const std::vector<const ActionPoseSample*> samples_;
+  const std::vector<int> cut_parts_;
+  std::vector<Measured> measurements_;
+};
+
+}  // namespace bodyschema
