@@ -11,7 +11,10 @@ constexpr std::size_t kRing = 64;
 /// Squared distance of every marker below which a sample cannot raise a CUSUM that is at zero.
 constexpr double kClear = 14;
 constexpr double kInflations[] = {3, 10};
-constexpr double kSettledRefits[] = {2, 3, 4, 5, 6, 8, 12, 20};
+/// Samples after a replacement at which all forms are tried again.
+constexpr int kRefits[] = {1, 2, 3, 4, 5, 7, 11, 19, 30};
+/// Changes that begin within so many samples of each other are one event.
+constexpr std::int64_t kTogether = 12;
 
 bool differ(const Edge& a, const Edge& b) {
   if (!a.left.isApprox(b.left, 1e-9) || !a.right.isApprox(b.right, 1e-9) ||
@@ -24,6 +27,12 @@ bool differ(const Edge& a, const Edge& b) {
       return true;
   }
   return false;
+}
+
+bool differ_at(const BodySchema& a, const BodySchema& b, int part) {
+  if (part == a.root) return !a.X_CR.isApprox(b.X_CR, 1e-9);
+  const Edge *x = edge_to(a, part), *y = edge_to(b, part);
+  return x && y && differ(*x, *y);
 }
 
 }  // namespace
@@ -146,73 +155,69 @@ std::vector<Adaptation::Place> Adaptation::suspects() const {
   return places;
 }
 
-std::optional<FittedChange> Adaptation::best_change(const BodySchema& standing,
-                                                    const std::vector<Place>& places,
-                                                    std::int64_t since, double* null,
-                                                    double* runner_up, Place* place) const {
-  const auto samples = segment(since);
-  *null = log_likelihood(standing, options_.noise, samples);
-  *runner_up = -std::numeric_limits<double>::infinity();
-  std::optional<FittedChange> best;
+Adaptation::Choice Adaptation::choose(
+    const BodySchema& standing, const std::vector<Place>& places,
+    const std::vector<const ActionPoseSample*>& samples) const {
+  Choice choice;
+  choice.null = log_likelihood(standing, options_.noise, samples);
+  choice.runner_up = -std::numeric_limits<double>::infinity();
   const auto offer = [&](FittedChange candidate, const Place& at) {
-    if (best && candidate.log_evidence <= best->log_evidence) {
-      *runner_up = std::max(*runner_up, candidate.log_evidence);
+    if (choice.best && candidate.log_evidence <= choice.best->fitted.log_evidence) {
+      choice.runner_up = std::max(choice.runner_up, candidate.log_evidence);
       return;
     }
-    if (best) *runner_up = std::max(*runner_up, best->log_evidence);
-    best = std::move(candidate);
-    *place = at;
+    if (choice.best)
+      choice.runner_up = std::max(choice.runner_up, choice.best->fitted.log_evidence);
+    choice.best = Replacement{at, std::move(candidate)};
   };
   for (const Place& at : places) {
     // Bases: the model that stands, and what is stored of this place.
+    std::vector<const BodySchema*> origins{nullptr};
     std::vector<BodySchema> bases{standing};
     if (!at.marker) {
       for (const BodySchema& stored : history_) {
-        BodySchema with = standing;
-        if (at.part == standing.root) {
-          with.X_CR = stored.X_CR;
-          with.X_CR_covariance = stored.X_CR_covariance;
-          if (with.X_CR.isApprox(standing.X_CR, 1e-9)) continue;
-        } else {
-          const Edge* edge = edge_to(stored, at.part);
-          const Edge* now = edge_to(standing, at.part);
-          if (!edge || !now || edge->from != now->from || !differ(*edge, *now)) continue;
-          for (Edge& e : with.edges)
-            if (e.to == at.part) e = *edge;
-        }
-        bool known = false;
-        for (const BodySchema& base : bases) {
-          const Edge *a = edge_to(base, at.part), *b = edge_to(with, at.part);
-          known |= a && b ? !differ(*a, *b) : base.X_CR.isApprox(with.X_CR, 1e-9);
-        }
-        if (!known) bases.push_back(std::move(with));
+        BodySchema with = with_edge_of(standing, stored, at.part);
+        const bool known = std::any_of(bases.begin(), bases.end(), [&](const BodySchema& base) {
+          return !differ_at(base, with, at.part);
+        });
+        if (known) continue;
+        bases.push_back(std::move(with));
+        origins.push_back(&stored);
       }
     }
     for (std::size_t b = 0; b < bases.size(); ++b) {
       const PlaceEvidence evidence(bases[b], options_.noise, at.part, at.marker, samples);
-      if (b > 0 && evidence.num_usable() > 0) offer(evidence.judge_stored(bases[b]), at);
+      const auto offer_from = [&](FittedChange candidate) {
+        if (origins[b]) candidate.origin = *origins[b];
+        offer(std::move(candidate), at);
+      };
+      if (b > 0 && evidence.num_usable() > 0) offer_from(evidence.judge_stored(bases[b]));
       for (const BodyChange& change : possible_changes(bases[b], at.part, at.marker))
-        if (auto fitted = evidence.fit(change)) offer(std::move(*fitted), at);
+        if (auto fitted = evidence.fit(change)) offer_from(std::move(*fitted));
     }
   }
   // All that differs from a stored schema at once.
   for (const BodySchema& stored : history_) {
-    BodySchema with = standing;
-    int num_different = !with.X_CR.isApprox(stored.X_CR, 1e-9);
-    with.X_CR = stored.X_CR;
-    with.X_CR_covariance = stored.X_CR_covariance;
-    for (Edge& e : with.edges) {
-      const Edge* edge = edge_to(stored, e.to);
-      if (!edge || edge->from != e.from || !differ(*edge, e)) continue;
-      e = *edge;
-      ++num_different;
-    }
-    if (num_different < 2 || places.empty()) continue;
-    const PlaceEvidence evidence(standing, options_.noise, places.front().part,
-                                 places.front().marker, samples);
-    offer(evidence.judge_stored(with), places.front());
+    FittedChange all;
+    all.change = {BodyChange::Form::kStored, places.front().part};
+    all.origin = stored;
+    all.everywhere = true;
+    const BodySchema with = with_change(standing, all);
+    int num_different = differ_at(standing, with, standing.root);
+    for (const Edge& edge : with.edges) num_different += differ_at(standing, with, edge.to);
+    if (num_different < 2) continue;
+    all.log_evidence = all.change.log_odds() + log_likelihood(with, options_.noise, samples);
+    all.num_usable = 1;
+    offer(std::move(all), places.front());
   }
-  return best;
+  return choice;
+}
+
+BodySchema Adaptation::composed(int without) const {
+  BodySchema schema = before_;
+  for (int n = 0; n < static_cast<int>(replacements_.size()); ++n)
+    if (n != without) schema = with_change(schema, replacements_[n].fitted);
+  return schema;
 }
 
 AdaptationEvent Adaptation::event(AdaptationEvent::Kind kind, std::int64_t sample_index,
@@ -243,85 +248,112 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
       }
     }
   }
+  const auto samples = segment(since);
   const double alarm = std::log(2.0 * filter_->num_nodes() / options_.false_alarm_rate);
-  double null = 0, runner_up = 0;
-  Place place;
-  const auto best = best_change(schema_, places, since, &null, &runner_up, &place);
-  const bool accepted = best && best->log_evidence - null > options_.acceptance &&
-                        best->num_usable >= best->change.fewest_samples();
+  Choice choice = choose(schema_, places, samples);
+  const bool accepted = choice.best && choice.margin() > options_.acceptance;
   if ((accepted || highest > alarm) && !detected_) {
-    detected_ = accepted ? place : places.front();
+    detected_ = accepted ? choice.best->place : places.front();
     AdaptationEvent mismatch = event(AdaptationEvent::Kind::kMismatch, sample_index, *detected_);
     mismatch.margin = highest;
-    mismatch.num_samples = static_cast<int>(segment(since).size());
+    mismatch.num_samples = static_cast<int>(samples.size());
     events->push_back(mismatch);
   }
   if (!accepted) return;
-  AdaptationEvent candidate =
-      event(best->change.form == BodyChange::Form::kStored ? AdaptationEvent::Kind::kRestored
-                                                           : AdaptationEvent::Kind::kCandidate,
-            sample_index, place);
-  candidate.cause = best->change.cause(schema_);
-  candidate.margin = best->log_evidence - null;
-  candidate.num_samples = static_cast<int>(segment(since).size());
+  const FittedChange& fitted = choice.best->fitted;
+  AdaptationEvent candidate = event(fitted.change.form == BodyChange::Form::kStored
+                                        ? AdaptationEvent::Kind::kRestored
+                                        : AdaptationEvent::Kind::kCandidate,
+                                    sample_index, choice.best->place);
+  candidate.cause = fitted.change.cause(schema_);
+  candidate.margin = choice.margin();
+  candidate.num_samples = static_cast<int>(samples.size());
   events->push_back(candidate);
-  Provisional provisional;
-  provisional.before = schema_;
-  provisional.fitted = *best;
-  provisional.place = place;
-  provisional.since = since;
-  provisional.num_samples = candidate.num_samples;
-  // A second change on top of one that has not settled: the first is taken as it is.
-  provisional_ = std::move(provisional);
+  // Changes that came together are reconsidered together; an older one is taken as it is.
+  if (replacements_.empty() || since - since_ > kTogether || fitted.everywhere) {
+    before_ = schema_;
+    replacements_.clear();
+    since_ = since;
+  }
+  replacements_.push_back(std::move(*choice.best));
+  age_ = 0;
   detected_.reset();
-  install(provisional_->fitted.schema);
+  if (replacements_.size() > 1)
+    reconsider(sample_index, true, events);
+  else
+    install(composed());
 }
 
-void Adaptation::refit(std::int64_t sample_index, std::vector<AdaptationEvent>* events) {
-  Provisional& p = *provisional_;
-  ++p.num_samples;
-  if (p.num_samples >= options_.settled_after) {
-    AdaptationEvent recovered = event(AdaptationEvent::Kind::kRecovered, sample_index, p.place);
-    recovered.cause = p.fitted.change.cause(schema_);
-    recovered.num_samples = p.num_samples;
-    events->push_back(recovered);
+void Adaptation::reconsider(std::int64_t sample_index, bool all_forms,
+                            std::vector<AdaptationEvent>* events) {
+  const auto samples = segment(since_);
+  const int rounds = replacements_.size() > 1 ? 3 : 1;
+  for (int round = 0; round < rounds; ++round) {
+    bool is_changed = false;
+    for (int n = 0; n < static_cast<int>(replacements_.size());) {
+      Replacement& r = replacements_[static_cast<std::size_t>(n)];
+      const BodySchema others = composed(n);
+      if (!all_forms) {
+        if (r.fitted.change.size() > 0) {
+          const BodySchema base = r.fitted.origin
+                                      ? with_edge_of(others, *r.fitted.origin, r.place.part)
+                                      : others;
+          const PlaceEvidence evidence(base, options_.noise, r.place.part, r.place.marker, samples);
+          if (auto again = evidence.fit(r.fitted.change)) {
+            again->origin = r.fitted.origin;
+            r.fitted = *again;
+          }
+        }
+        ++n;
+        continue;
+      }
+      Choice choice = choose(others, {r.place}, samples);
+      if (!choice.best || choice.margin() < 0) {
+        AdaptationEvent reverted = event(AdaptationEvent::Kind::kReverted, sample_index, r.place);
+        reverted.cause = r.fitted.change.cause(others);
+        reverted.margin = choice.margin();
+        events->push_back(reverted);
+        replacements_.erase(replacements_.begin() + n);
+        is_changed = true;
+        continue;
+      }
+      if (choice.best->fitted.change != r.fitted.change) {
+        AdaptationEvent refined = event(AdaptationEvent::Kind::kRefined, sample_index, r.place);
+        refined.cause = choice.best->fitted.change.cause(others);
+        refined.margin = choice.margin();
+        refined.num_samples = static_cast<int>(samples.size());
+        events->push_back(refined);
+        is_changed = true;
+      }
+      r.fitted = choice.best->fitted;
+      ++n;
+    }
+    if (!is_changed) break;
+  }
+  const std::vector<Cusum> edges = edges_, markers = markers_;
+  install(composed());
+  if (age_ > 0) {
+    edges_ = edges;
+    markers_ = markers;
+  }
+}
+
+void Adaptation::follow(std::int64_t sample_index, std::vector<AdaptationEvent>* events) {
+  ++age_;
+  if (age_ >= options_.settled_after) {
+    for (const Replacement& r : replacements_) {
+      AdaptationEvent recovered = event(AdaptationEvent::Kind::kRecovered, sample_index, r.place);
+      recovered.cause = r.fitted.change.cause(schema_);
+      recovered.num_samples = age_;
+      events->push_back(recovered);
+    }
     remember(schema_);
-    provisional_.reset();
+    replacements_.clear();
     return;
   }
   const bool all_forms =
-      std::find(std::begin(kSettledRefits), std::end(kSettledRefits), p.num_samples) !=
-      std::end(kSettledRefits);
-  double null = 0, runner_up = 0;
-  Place place = p.place;
-  if (all_forms) {
-    std::vector<Place> places{p.place};
-    const auto best = best_change(p.before, places, p.since, &null, &runner_up, &place);
-    if (!best) return;
-    if (best->log_evidence < null) {
-      events->push_back(event(AdaptationEvent::Kind::kReverted, sample_index, p.place));
-      const BodySchema before = p.before;
-      provisional_.reset();
-      install(before);
-      return;
-    }
-    if (best->change != p.fitted.change) {
-      AdaptationEvent refined = event(AdaptationEvent::Kind::kRefined, sample_index, place);
-      refined.cause = best->change.cause(p.before);
-      refined.margin = best->log_evidence - null;
-      refined.num_samples = p.num_samples;
-      events->push_back(refined);
-    }
-    p.fitted = *best;
-  } else if (p.fitted.change.form != BodyChange::Form::kStored) {
-    const PlaceEvidence evidence(p.before, options_.noise, p.place.part, p.place.marker,
-                                 segment(p.since));
-    if (auto again = evidence.fit(p.fitted.change)) p.fitted = *again;
-  }
-  const std::vector<Cusum> edges = edges_, markers = markers_;
-  install(p.fitted.schema);
-  edges_ = edges;
-  markers_ = markers;
+      std::find(std::begin(kRefits), std::end(kRefits), age_) != std::end(kRefits);
+  reconsider(sample_index, all_forms, events);
 }
 
 void Adaptation::remember(const BodySchema& schema) {
@@ -340,7 +372,7 @@ std::vector<AdaptationEvent> Adaptation::on_sample(const ActionPoseSample& sampl
   recent_.push_back(sample);
   if (recent_.size() > kRing) recent_.pop_front();
   update_tests(filter_->prepare(sample), sample.sample_index);
-  if (provisional_) refit(sample.sample_index, &events);
+  if (!replacements_.empty()) follow(sample.sample_index, &events);
   try_changes(sample.sample_index, &events);
   if (detected_ && suspects().empty()) detected_.reset();
   return events;

@@ -58,7 +58,7 @@ class Adaptation {
   /// CUSUM of the edge to a part (root: the camera's) and of the part's marker [nats].
   double edge_statistic(int part) const;
   double marker_statistic(int part) const;
-  bool is_settled() const { return !provisional_ && !detected_; }
+  bool is_settled() const { return replacements_.empty() && !detected_; }
 
  private:
   struct Cusum {
@@ -70,24 +70,27 @@ class Adaptation {
     bool marker = false;
     auto operator<=>(const Place&) const = default;
   };
-  struct Provisional {
-    BodySchema before;
-    FittedChange fitted;
+  struct Replacement {
     Place place;
-    std::int64_t since = 0;
-    int num_samples = 0;
-    bool was_refuted = false;
+    FittedChange fitted;
   };
 
   void restart_tests();
   void update_tests(const TreeFilter::Instant& instant, std::int64_t sample_index);
   std::vector<const ActionPoseSample*> segment(std::int64_t since) const;
   std::vector<Place> suspects() const;
-  std::optional<FittedChange> best_change(const BodySchema& standing, const std::vector<Place>& places,
-                                          std::int64_t since, double* null, double* runner_up,
-                                          Place* place) const;
+  struct Choice {
+    std::optional<Replacement> best;
+    double null = 0;       ///< log-likelihood of the schema as it stands
+    double runner_up = 0;  ///< log evidence
+    double margin() const { return best ? best->fitted.log_evidence - null : 0; }
+  };
+  Choice choose(const BodySchema& standing, const std::vector<Place>& places,
+                const std::vector<const ActionPoseSample*>& samples) const;
+  BodySchema composed(int without = -1) const;
   void try_changes(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
-  void refit(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
+  void reconsider(std::int64_t sample_index, bool all_forms, std::vector<AdaptationEvent>* events);
+  void follow(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
   void remember(const BodySchema& schema);
   void install(const BodySchema& schema);
   AdaptationEvent event(AdaptationEvent::Kind kind, std::int64_t sample_index,
@@ -98,8 +101,11 @@ class Adaptation {
   std::optional<TreeFilter> filter_;
   std::deque<ActionPoseSample> recent_;
   std::vector<Cusum> edges_, markers_;  ///< by node
-  std::optional<Provisional> provisional_;
   std::optional<Place> detected_;
+  BodySchema before_;                      ///< what stood before the present replacements
+  std::vector<Replacement> replacements_;  ///< not settled yet, in the order they came
+  std::int64_t since_ = 0;                 ///< first sample with the changed body
+  int age_ = 0;                            ///< samples since the newest replacement
   std::vector<BodySchema> history_;  ///< the first is pinned
 };
 

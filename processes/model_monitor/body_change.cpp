@@ -201,6 +201,7 @@ BodySchema changed(const BodySchema& schema, const BodyChange& change, const Eig
                    const Eigen::MatrixXd& covariance) {
   if (theta.size() != change.size()) throw std::invalid_argument("wrong number of parameters");
   BodySchema result = schema;
+  if (change.form == Form::kStored) return result;
   const bool is_unsure = covariance.size() > 0;
   Matrix6d first, second;
   if (is_unsure && change.size() >= 6) first = covariance.topLeftCorner<6, 6>();
@@ -238,8 +239,6 @@ BodySchema changed(const BodySchema& schema, const BodyChange& change, const Eig
     return edge->joints.at(static_cast<std::size_t>(change.joint));
   };
   switch (change.form) {
-    case Form::kStored:
-      break;
     case Form::kStuck:
       joint().gain = 0;
       joint().offset = theta(0);

@@ -28,6 +28,32 @@ Vector6d coordinates(const Pose& T) {
 
 }  // namespace
 
+BodySchema with_edge_of(const BodySchema& schema, const BodySchema& other, int part) {
+  BodySchema result = schema;
+  if (part == schema.root) {
+    result.X_CR = other.X_CR;
+    result.X_CR_covariance = other.X_CR_covariance;
+  } else if (const Edge* edge = edge_to(other, part)) {
+    for (Edge& e : result.edges)
+      if (e.to == part && e.from == edge->from) e = *edge;
+  }
+  return result;
+}
+
+BodySchema with_change(const BodySchema& schema, const FittedChange& fitted) {
+  BodySchema result = schema;
+  if (fitted.origin) {
+    if (fitted.everywhere) {
+      result = with_edge_of(result, *fitted.origin, result.root);
+      for (const Edge& edge : fitted.origin->edges)
+        result = with_edge_of(result, *fitted.origin, edge.to);
+    } else {
+      result = with_edge_of(result, *fitted.origin, fitted.change.part);
+    }
+  }
+  return changed(result, fitted.change, fitted.theta, fitted.covariance);
+}
+
 double log_likelihood(const BodySchema& schema, const MarkerNoise& noise,
                       const std::vector<const ActionPoseSample*>& samples,
                       const std::vector<int>& cut_parts) {
@@ -60,23 +86,42 @@ PlaceEvidence::PlaceEvidence(const BodySchema& base, const MarkerNoise& noise, i
     if (!of) continue;
     const Eigen::LLT<Matrix6d> llt(of->covariance);
     if (llt.info() != Eigen::Success) continue;
-    measurements_.push_back({sample, *of, llt.matrixL().solve(Matrix6d::Identity())});
+    measurements_.push_back({base_.displacements(sample->action), *of,
+                             llt.matrixL().solve(Matrix6d::Identity()),
+                             -llt.matrixLLT().diagonal().array().log().sum() -
+                                 3 * std::log(2 * M_PI)});
   }
+  place_ = base_;
+  std::erase_if(place_.edges, [part](const Edge& edge) { return edge.to != part; });
 }
 
-Pose PlaceEvidence::predict(const BodyChange& change, const Eigen::VectorXd& theta,
-                            std::size_t n) const {
+std::vector<Pose> PlaceEvidence::predict(const BodyChange& change,
+                                         const Eigen::VectorXd& theta) const {
+  const std::size_t n = measurements_.size();
   if (marker_) {
     // measure_marker() gives T itself.
     Pose T = Pose::Identity();
     T.linear() = exp_so3(theta.tail<3>());
     T.translation() = theta.head<3>();
-    return T;
+    return std::vector<Pose>(n, T);
   }
-  const BodySchema with = changed(base_, change, theta);
+  const BodySchema with = changed(place_, change, theta);
   const Edge* edge = edge_to(with, part_);
-  if (!edge) return with.X_CR;
-  return edge->predict(with.displacements(measurements_[n].sample->action));
+  if (!edge) return std::vector<Pose>(n, with.X_CR);
+  std::vector<Pose> result;
+  result.reserve(n);
+  for (const Measured& m : measurements_) result.push_back(edge->predict(m.displacements));
+  return result;
+}
+
+Eigen::VectorXd PlaceEvidence::residuals(const BodyChange& change,
+                                         const Eigen::VectorXd& theta) const {
+  const std::vector<Pose> predicted = predict(change, theta);
+  Eigen::VectorXd r(6 * static_cast<Eigen::Index>(predicted.size()));
+  for (std::size_t n = 0; n < predicted.size(); ++n)
+    r.segment<6>(6 * static_cast<Eigen::Index>(n)) =
+        measurements_[n].whitening * log(predicted[n].inverse() * measurements_[n].of.z);
+  return r;
 }
 
 std::vector<Eigen::VectorXd> PlaceEvidence::starts(const BodyChange& change) const {
@@ -104,9 +149,10 @@ std::vector<Eigen::VectorXd> PlaceEvidence::starts(const BodyChange& change) con
       // What each of the newest samples alone says.
       const Eigen::VectorXd zero = Eigen::VectorXd::Zero(change.size());
       const std::size_t count = measurements_.size();
+      const std::vector<Pose> unchanged = predict(change, zero);
       for (std::size_t n = count > 3 ? count - 3 : 0; n < count; ++n) {
         const Pose& z = measurements_[n].of.z;
-        const Pose before = predict(change, zero, n);
+        const Pose& before = unchanged[n];
         const Vector6d right = coordinates(before.inverse() * z);
         const Vector6d left = coordinates(z * before.inverse());
         if (change.form == Form::kLeft) {
@@ -135,17 +181,20 @@ PlaceEvidence::State PlaceEvidence::climb(const BodyChange& change, Eigen::Vecto
   const Eigen::VectorXd mean = prior_mean(change, base_), sigma = prior_sigma(change, base_);
   const Eigen::VectorXd prior = sigma.cwiseAbs2().cwiseInverse();
   const double flat = std::log(noise_.outlier_rate) + log_flat_density();
+  const std::size_t count = measurements_.size();
+  // Share of the outliers' density at squared distance d2: the mixture's cost and weight.
+  const auto inlier_density = [&](std::size_t n, double d2) {
+    return std::log1p(-noise_.outlier_rate) - 0.5 * d2 + measurements_[n].log_norm;
+  };
   const auto cost_of = [&](const Eigen::VectorXd& t, bool robust) {
     double sum = 0.5 * (t - mean).cwiseAbs2().dot(prior);
-    for (std::size_t n = 0; n < measurements_.size(); ++n) {
-      const double d2 = (measurements_[n].whitening *
-                         log(predict(change, t, n).inverse() * measurements_[n].of.z))
-                            .squaredNorm();
+    const Eigen::VectorXd r = residuals(change, t);
+    for (std::size_t n = 0; n < count; ++n) {
+      const double d2 = r.segment<6>(6 * static_cast<Eigen::Index>(n)).squaredNorm();
       if (robust) {
         sum += (kStudentNu + 6) / 2 * std::log1p(d2 / kStudentNu);
       } else {
-        const double inlier = std::log1p(-noise_.outlier_rate) - 0.5 * d2 - 3 * std::log(2 * M_PI) +
-                              measurements_[n].whitening.diagonal().array().log().sum();
+        const double inlier = inlier_density(n, d2);
         sum -= std::max(inlier, flat) + std::log1p(std::exp(-std::abs(inlier - flat)));
       }
     }
@@ -156,30 +205,25 @@ PlaceEvidence::State PlaceEvidence::climb(const BodyChange& change, Eigen::Vecto
   for (int iteration = 0; iteration < kIterations; ++iteration) {
     const bool robust = iteration < kIterations / 2;
     if (iteration == kIterations / 2) damping = 1e-3;
+    const Eigen::VectorXd r = residuals(change, theta);
+    Eigen::MatrixXd J(r.size(), d);
+    for (Eigen::Index p = 0; p < d; ++p) {
+      const double h = 1e-5 * std::max(1.0, sigma(p));
+      Eigen::VectorXd plus = theta, minus = theta;
+      plus(p) += h;
+      minus(p) -= h;
+      J.col(p) = (residuals(change, plus) - residuals(change, minus)) / (2 * h);
+    }
     Eigen::MatrixXd H = prior.asDiagonal();
     Eigen::VectorXd g = prior.cwiseProduct(theta - mean);
-    for (std::size_t n = 0; n < measurements_.size(); ++n) {
-      const Measured& m = measurements_[n];
-      const Vector6d r = m.whitening * log(predict(change, theta, n).inverse() * m.of.z);
-      const double d2 = r.squaredNorm();
-      double w = (kStudentNu + 6) / (kStudentNu + d2);
-      if (!robust) {
-        const double inlier = std::log1p(-noise_.outlier_rate) - 0.5 * d2 - 3 * std::log(2 * M_PI) +
-                              m.whitening.diagonal().array().log().sum();
-        w = 1 / (1 + std::exp(std::min(flat - inlier, 500.0)));
-      }
-      Eigen::MatrixXd J(6, d);
-      for (Eigen::Index p = 0; p < d; ++p) {
-        const double h = 1e-5 * std::max(1.0, sigma(p));
-        Eigen::VectorXd step = theta;
-        step(p) += h;
-        const Vector6d plus = m.whitening * log(predict(change, step, n).inverse() * m.of.z);
-        step(p) -= 2 * h;
-        const Vector6d minus = m.whitening * log(predict(change, step, n).inverse() * m.of.z);
-        J.col(p) = (plus - minus) / (2 * h);
-      }
-      H += w * J.transpose() * J;
-      g += w * J.transpose() * r;
+    for (std::size_t n = 0; n < count; ++n) {
+      const auto at = 6 * static_cast<Eigen::Index>(n);
+      const double d2 = r.segment<6>(at).squaredNorm();
+      const double w =
+          robust ? (kStudentNu + 6) / (kStudentNu + d2)
+                 : 1 / (1 + std::exp(std::min(flat - inlier_density(n, d2), 500.0)));
+      H += w * J.middleRows<6>(at).transpose() * J.middleRows<6>(at);
+      g += w * J.middleRows<6>(at).transpose() * r.segment<6>(at);
     }
     state.H = H;
     const double before = cost_of(theta, robust);

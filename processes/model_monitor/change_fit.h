@@ -12,6 +12,9 @@ namespace bodyschema {
 /// A change with the parameters that the samples since speak for.
 struct FittedChange {
   BodyChange change;
+  /// A schema of the history that the change starts from, in its place (or, `everywhere`, whole).
+  std::optional<BodySchema> origin;
+  bool everywhere = false;
   Eigen::VectorXd theta;
   Eigen::MatrixXd covariance;  ///< of θ, Laplace
   BodySchema schema;           ///< with the change, and its uncertainty, in it
@@ -19,6 +22,11 @@ struct FittedChange {
   double log_evidence = 0;
   int num_usable = 0;  ///< samples that say something of the place
 };
+
+/// `schema` with the fitted change, and its uncertainty, in it.
+BodySchema with_change(const BodySchema& schema, const FittedChange& fitted);
+/// `schema` with the edge to `part` (root: the camera's pose) of another.
+BodySchema with_edge_of(const BodySchema& schema, const BodySchema& other, int part);
 
 /// Σ log p(observations) over the samples under a schema.
 double log_likelihood(const BodySchema& schema, const MarkerNoise& noise,
@@ -43,16 +51,20 @@ class PlaceEvidence {
 
  private:
   struct Measured {
-    const ActionPoseSample* sample;
+    Eigen::VectorXd displacements;
     VirtualMeasurement of;
     Matrix6d whitening;
+    double log_norm = 0;  ///< log |2πS|^(−½)
   };
   struct State {
     Eigen::VectorXd theta;
     double cost = 0;
     Eigen::MatrixXd H;
   };
-  Pose predict(const BodyChange& change, const Eigen::VectorXd& theta, std::size_t n) const;
+  /// What the place looks like with a change: its pose at every measurement.
+  std::vector<Pose> predict(const BodyChange& change, const Eigen::VectorXd& theta) const;
+  /// Whitened residuals of the measurements, one after the other: 6N.
+  Eigen::VectorXd residuals(const BodyChange& change, const Eigen::VectorXd& theta) const;
   std::vector<Eigen::VectorXd> starts(const BodyChange& change) const;
   State climb(const BodyChange& change, Eigen::VectorXd theta) const;
 
@@ -62,6 +74,7 @@ class PlaceEvidence {
   const bool marker_;
   const std::vector<const ActionPoseSample*> samples_;
   const std::vector<int> cut_parts_;
+  BodySchema place_;  ///< the base with the place's edge alone
   std::vector<Measured> measurements_;
 };
 

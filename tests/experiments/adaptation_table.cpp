@@ -84,12 +84,14 @@ double ee_error(const BodySchema& schema, const SyntheticRobot& robot, const std
 int main(int argc, char** argv) {
   const std::string regime_name = argc > 1 ? argv[1] : "tag_iso";
   const int seeds = argc > 2 ? std::stoi(argv[2]) : 5;
-  const bool verbose = argc > 3;
+  const std::string only = argc > 3 ? argv[3] : "";
+  const bool verbose = argc > 4;
   const Regime regime = regime_name == "chapter" ? Regime::kChapter : Regime::kTagIso;
   const double limit = regime == Regime::kChapter ? 0.075 : 0.030;
   struct Scenario { const char* name; double visible; };
   for (const Scenario sc : {Scenario{"stuck", 0.919}, Scenario{"tool", 0.79}, Scenario{"bend", 0.85}, Scenario{"offset", 0.85},
                             Scenario{"gain", 0.85}, Scenario{"two", 0.85}, Scenario{"adjacent", 0.85}, Scenario{"marker", 0.85}, Scenario{"camera", 0.85}, Scenario{"none", 0.85}}) {
+    if (!only.empty() && only.find(sc.name) == std::string::npos) continue;
     double recovery[4] = {}, worst[4] = {};
     double seconds = 0, slowest = 0;
     int num_events = 0, num = 0;
