@@ -16,6 +16,18 @@ constexpr int kRefits[] = {1, 2, 3, 4, 5, 7, 11, 19, 30};
 /// Changes that begin within so many samples of each other are one event.
 constexpr std::int64_t kTogether = 12;
 
+constexpr double kMedianChiSquare6 = 5.348;
+constexpr double kLeastScale = 0.2, kLargestScale = 5;
+constexpr std::size_t kFewestDistances = 20;
+/// Quiet samples after which the noise is looked at again.
+constexpr int kQuietSamples = 32;
+
+double median(std::vector<double> values) {
+  const auto middle = values.begin() + static_cast<std::ptrdiff_t>(values.size() / 2);
+  std::nth_element(values.begin(), middle, values.end());
+  return *middle;
+}
+
 bool differ(const Edge& a, const Edge& b) {
   if (!a.left.isApprox(b.left, 1e-9) || !a.right.isApprox(b.right, 1e-9) ||
       a.joints.size() != b.joints.size())
@@ -54,14 +66,14 @@ const char* name_of(AdaptationEvent::Kind kind) {
 }
 
 Adaptation::Adaptation(BodySchema schema, AdaptationOptions options)
-    : options_(options), schema_(std::move(schema)) {
+    : options_(options), noise_(options.noise), schema_(std::move(schema)) {
   history_.push_back(schema_);
   install(schema_);
 }
 
 void Adaptation::install(const BodySchema& schema) {
   schema_ = schema;
-  filter_.emplace(schema_, options_.noise);
+  filter_.emplace(schema_, noise_);
   restart_tests();
 }
 
@@ -80,14 +92,14 @@ double Adaptation::marker_statistic(int part) const {
   return node < 0 ? 0 : markers_[static_cast<std::size_t>(node)].value;
 }
 
-void Adaptation::update_tests(const TreeFilter::Instant& instant, std::int64_t sample_index) {
+TreeFilter::Judgement Adaptation::update_tests(const TreeFilter::Instant& instant, std::int64_t sample_index) {
   const TreeFilter::Judgement now = filter_->judge(instant);
   const auto is_zero = [](const Cusum& c) { return c.value == 0; };
   const bool clear = std::all_of(now.squared_distance.begin(), now.squared_distance.end(),
                                  [](double d2) { return d2 < kClear; });
   if (clear && std::all_of(edges_.begin(), edges_.end(), is_zero) &&
       std::all_of(markers_.begin(), markers_.end(), is_zero))
-    return;
+    return now;
   const auto add = [sample_index](Cusum* cusum, double ratio) {
     if (cusum->value == 0) cusum->since = sample_index;
     cusum->value = std::max(0.0, cusum->value + ratio);
@@ -112,6 +124,37 @@ void Adaptation::update_tests(const TreeFilter::Instant& instant, std::int64_t s
     add(&markers_[static_cast<std::size_t>(node)],
         filter_->judge(instant, detached).log_likelihood - now.log_likelihood);
   }
+  return now;
+}
+
+void Adaptation::calibrate() {
+  // The filter's own beliefs depend on the scale: a few rounds.
+  for (int round = 0; round < 4; ++round) {
+    std::vector<double> distances;
+    const TreeFilter filter(schema_, noise_);
+    for (const ActionPoseSample& sample : recent_) {
+      const TreeFilter::Judgement judgement = filter.judge(filter.prepare(sample));
+      for (const double d2 : judgement.squared_distance)
+        if (d2 >= 0) distances.push_back(d2);
+    }
+    if (distances.size() < kFewestDistances) return;
+    const double scale = std::sqrt(median(distances) / kMedianChiSquare6);
+    noise_.scale = std::clamp(noise_.scale * scale, kLeastScale, kLargestScale);
+  }
+  // A few samples tell no better than this.
+  if (std::abs(std::log(noise_.scale)) < 0.15) noise_.scale = options_.noise.scale;
+}
+
+void Adaptation::watch_noise(const TreeFilter::Judgement& judgement) {
+  for (std::size_t n = 0; n < judgement.believed.size(); ++n)
+    if (judgement.believed[n] == 1) quiet_distances_.push_back(judgement.squared_distance[n]);
+  if (++num_quiet_ < kQuietSamples || quiet_distances_.size() < kFewestDistances) return;
+  const double scale = std::sqrt(median(quiet_distances_) / kMedianChiSquare6);
+  quiet_distances_.clear();
+  num_quiet_ = 0;
+  if (std::abs(std::log(scale)) < 0.05) return;
+  noise_.scale = std::clamp(noise_.scale * std::sqrt(scale), kLeastScale, kLargestScale);
+  install(schema_);
 }
 
 std::vector<const ActionPoseSample*> Adaptation::segment(std::int64_t since) const {
@@ -159,7 +202,7 @@ Adaptation::Choice Adaptation::choose(
     const BodySchema& standing, const std::vector<Place>& places,
     const std::vector<const ActionPoseSample*>& samples) const {
   Choice choice;
-  choice.null = log_likelihood(standing, options_.noise, samples);
+  choice.null = log_likelihood(standing, noise_, samples);
   choice.runner_up = -std::numeric_limits<double>::infinity();
   const auto offer = [&](FittedChange candidate, const Place& at) {
     if (choice.best && candidate.log_evidence <= choice.best->fitted.log_evidence) {
@@ -186,7 +229,7 @@ Adaptation::Choice Adaptation::choose(
       }
     }
     for (std::size_t b = 0; b < bases.size(); ++b) {
-      const PlaceEvidence evidence(bases[b], options_.noise, at.part, at.marker, samples);
+      const PlaceEvidence evidence(bases[b], noise_, at.part, at.marker, samples);
       const auto offer_from = [&](FittedChange candidate) {
         if (origins[b]) candidate.origin = *origins[b];
         offer(std::move(candidate), at);
@@ -206,7 +249,7 @@ Adaptation::Choice Adaptation::choose(
     int num_different = differ_at(standing, with, standing.root);
     for (const Edge& edge : with.edges) num_different += differ_at(standing, with, edge.to);
     if (num_different < 2) continue;
-    all.log_evidence = all.change.log_odds() + log_likelihood(with, options_.noise, samples);
+    all.log_evidence = all.change.log_odds() + log_likelihood(with, noise_, samples);
     all.num_usable = 1;
     offer(std::move(all), places.front());
   }
@@ -298,7 +341,7 @@ void Adaptation::reconsider(std::int64_t sample_index, bool all_forms,
           const BodySchema base = r.fitted.origin
                                       ? with_edge_of(others, *r.fitted.origin, r.place.part)
                                       : others;
-          const PlaceEvidence evidence(base, options_.noise, r.place.part, r.place.marker, samples);
+          const PlaceEvidence evidence(base, noise_, r.place.part, r.place.marker, samples);
           if (auto again = evidence.fit(r.fitted.change)) {
             again->origin = r.fitted.origin;
             r.fitted = *again;
@@ -371,10 +414,19 @@ std::vector<AdaptationEvent> Adaptation::on_sample(const ActionPoseSample& sampl
   std::vector<AdaptationEvent> events;
   recent_.push_back(sample);
   if (recent_.size() > kRing) recent_.pop_front();
-  update_tests(filter_->prepare(sample), sample.sample_index);
+  if (++num_samples_ <= options_.calibration_samples) {
+    if (num_samples_ == options_.calibration_samples) {
+      calibrate();
+      install(schema_);
+    }
+    return events;
+  }
+  const TreeFilter::Judgement judgement =
+      update_tests(filter_->prepare(sample), sample.sample_index);
   if (!replacements_.empty()) follow(sample.sample_index, &events);
   try_changes(sample.sample_index, &events);
   if (detected_ && suspects().empty()) detected_.reset();
+  if (is_settled() && suspects().empty()) watch_noise(judgement);
   return events;
 }
 

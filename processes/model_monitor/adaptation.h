@@ -19,6 +19,8 @@ struct AdaptationOptions {
   double suspicion = 1.5;    ///< CUSUM above which candidates are tried [nats]
   double acceptance = 12;    ///< evidence over the schema that stands [nats]
   double ambiguity = 6;      ///< a runner-up nearer than this asks for a probe [nats]
+  /// Samples at the start from which the noise is estimated before anything is judged.
+  int calibration_samples = 8;
   int longest_segment = 40;  ///< samples since a change that are looked at
   int settled_after = 40;    ///< samples until a replacement is kept for good
   std::size_t history = 8;   ///< schemas kept beside the first
@@ -58,6 +60,8 @@ class Adaptation {
   /// CUSUM of the edge to a part (root: the camera's) and of the part's marker [nats].
   double edge_statistic(int part) const;
   double marker_statistic(int part) const;
+  /// True over assumed standard deviation of the markers, as the residuals of quiet samples show it.
+  double noise_scale() const { return noise_.scale; }
   bool is_settled() const { return replacements_.empty() && !detected_; }
 
  private:
@@ -75,8 +79,11 @@ class Adaptation {
     FittedChange fitted;
   };
 
+  void calibrate();
+  void watch_noise(const TreeFilter::Judgement& judgement);
   void restart_tests();
-  void update_tests(const TreeFilter::Instant& instant, std::int64_t sample_index);
+  /// Returns the judgement under the schema as it stands.
+  TreeFilter::Judgement update_tests(const TreeFilter::Instant& instant, std::int64_t sample_index);
   std::vector<const ActionPoseSample*> segment(std::int64_t since) const;
   std::vector<Place> suspects() const;
   struct Choice {
@@ -97,6 +104,10 @@ class Adaptation {
                         const Place& place) const;
 
   const AdaptationOptions options_;
+  MarkerNoise noise_;
+  int num_samples_ = 0;
+  std::vector<double> quiet_distances_;  ///< d² of believed markers since the noise was last set
+  int num_quiet_ = 0;
   BodySchema schema_;
   std::optional<TreeFilter> filter_;
   std::deque<ActionPoseSample> recent_;

@@ -85,7 +85,8 @@ int main(int argc, char** argv) {
   const std::string regime_name = argc > 1 ? argv[1] : "tag_iso";
   const int seeds = argc > 2 ? std::stoi(argv[2]) : 5;
   const std::string only = argc > 3 ? argv[3] : "";
-  const bool verbose = argc > 4;
+  const double factor = argc > 4 ? std::stod(argv[4]) : 1;
+  const bool verbose = argc > 5;
   const Regime regime = regime_name == "chapter" ? Regime::kChapter : Regime::kTagIso;
   const double limit = regime == Regime::kChapter ? 0.075 : 0.030;
   struct Scenario { const char* name; double visible; };
@@ -135,6 +136,8 @@ int main(int argc, char** argv) {
       BodySchema start = engineered(healthy, rng);
       AdaptationOptions options;
       options.noise.noise = nominal_noise(regime);
+      options.noise.noise->position_m *= factor;
+      options.noise.noise->rotation_rad *= factor;
       options.noise.outlier_rate = 0.04;
       if (regime == Regime::kChapter) options.noise.outlier_rate = 0.013;
       Adaptation adaptation(start, options);
