@@ -16,6 +16,9 @@ constexpr int kRefits[] = {1, 2, 3, 4, 5, 7, 11, 19, 30};
 /// Changes that begin within so many samples of each other are one event.
 constexpr std::int64_t kTogether = 12;
 
+/// χ²₆(0.99): below it a rate is none.
+constexpr double kSignificantRate = 16.8;
+constexpr std::int64_t kSoon = 150;
 constexpr double kMedianChiSquare6 = 5.348;
 constexpr double kLeastScale = 0.2, kLargestScale = 5;
 constexpr std::size_t kFewestDistances = 20;
@@ -66,7 +69,10 @@ const char* name_of(AdaptationEvent::Kind kind) {
 }
 
 Adaptation::Adaptation(BodySchema schema, AdaptationOptions options)
-    : options_(options), noise_(options.noise), schema_(std::move(schema)) {
+    : options_(options),
+      noise_(options.noise),
+      schema_(std::move(schema)),
+      drift_watch_(options.false_alarm_rate) {
   history_.push_back(schema_);
   install(schema_);
 }
@@ -312,6 +318,18 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
   candidate.margin = choice.margin();
   candidate.num_samples = static_cast<int>(samples.size());
   events->push_back(candidate);
+  if (fitted.change.small && !choice.best->place.marker) {
+    const int part = choice.best->place.part;
+    const bool again = last_small_ && last_small_->first == part &&
+                       sample_index - last_small_->second < kSoon;
+    last_small_ = {part, sample_index};
+    if (again && !drifting_) {
+      if (!replacements_.empty()) remember(schema_);
+      replacements_.clear();
+      begin_drift(part, sample_index, events);
+      return;
+    }
+  }
   // Changes that came together are reconsidered together; an older one is taken as it is.
   if (replacements_.empty() || since - since_ > kTogether || fitted.everywhere) {
     before_ = schema_;
@@ -399,6 +417,43 @@ void Adaptation::follow(std::int64_t sample_index, std::vector<AdaptationEvent>*
   reconsider(sample_index, all_forms, events);
 }
 
+void Adaptation::begin_drift(int part, std::int64_t sample_index,
+                             std::vector<AdaptationEvent>* events) {
+  drifting_ = part;
+  before_ = schema_;
+  num_still_ = 0;
+  detected_.reset();
+  AdaptationEvent drift = event(AdaptationEvent::Kind::kDrift, sample_index, {part, false});
+  drift.cause = "drift";
+  events->push_back(drift);
+}
+
+void Adaptation::watch_drift(std::int64_t sample_index, std::vector<AdaptationEvent>* events) {
+  if (!drifting_) {
+    if (!replacements_.empty() || detected_) return;
+    const auto moved = drift_watch_.moved_part(schema_);
+    if (!moved) return;
+    begin_drift(*moved, sample_index, events);
+  }
+  const auto drift = drift_watch_.follow(before_, *drifting_);
+  if (!drift) return;
+  const BodyChange change{drift->left ? BodyChange::Form::kLeft : BodyChange::Form::kRight,
+                          *drifting_};
+  Eigen::VectorXd theta(6);
+  theta << drift->T.translation(), log_so3(drift->T.linear());
+  // `covariance` is that of a right perturbation of T: near enough to that of θ.
+  install(changed(before_, change, theta, drift->covariance));
+  num_still_ = drift->significance > kSignificantRate ? 0 : num_still_ + 1;
+  if (num_still_ < options_.settled_after) return;
+  AdaptationEvent recovered =
+      event(AdaptationEvent::Kind::kRecovered, sample_index, {*drifting_, false});
+  recovered.cause = "drift";
+  events->push_back(recovered);
+  drift_watch_.forget(*drifting_, sample_index);
+  remember(schema_);
+  drifting_.reset();
+}
+
 void Adaptation::remember(const BodySchema& schema) {
   for (const BodySchema& stored : history_) {
     bool same = stored.X_CR.isApprox(schema.X_CR, 1e-9) && stored.edges.size() == schema.edges.size();
@@ -421,10 +476,18 @@ std::vector<AdaptationEvent> Adaptation::on_sample(const ActionPoseSample& sampl
     }
     return events;
   }
-  const TreeFilter::Judgement judgement =
-      update_tests(filter_->prepare(sample), sample.sample_index);
+  const TreeFilter::Instant instant = filter_->prepare(sample);
+  const TreeFilter::Judgement judgement = update_tests(instant, sample.sample_index);
+  drift_watch_.add(*filter_, instant, schema_.displacements(sample.action), sample.sample_index);
   if (!replacements_.empty()) follow(sample.sample_index, &events);
   try_changes(sample.sample_index, &events);
+  if (!replacements_.empty()) {
+    drifting_.reset();
+    for (const Replacement& r : replacements_)
+      if (!r.fitted.change.small) drift_watch_.forget_all();
+  } else {
+    watch_drift(sample.sample_index, &events);
+  }
   if (detected_ && suspects().empty()) detected_.reset();
   if (is_settled() && suspects().empty()) watch_noise(judgement);
   return events;

@@ -8,6 +8,7 @@
 #include <vector>
 
 #include "processes/model_monitor/change_fit.h"
+#include "processes/model_monitor/drift_watch.h"
 #include "processes/model_monitor/tree_filter.h"
 
 namespace bodyschema {
@@ -62,7 +63,7 @@ class Adaptation {
   double marker_statistic(int part) const;
   /// True over assumed standard deviation of the markers, as the residuals of quiet samples show it.
   double noise_scale() const { return noise_.scale; }
-  bool is_settled() const { return replacements_.empty() && !detected_; }
+  bool is_settled() const { return replacements_.empty() && !detected_ && !drifting_; }
 
  private:
   struct Cusum {
@@ -80,6 +81,8 @@ class Adaptation {
   };
 
   void calibrate();
+  void begin_drift(int part, std::int64_t sample_index, std::vector<AdaptationEvent>* events);
+  void watch_drift(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
   void watch_noise(const TreeFilter::Judgement& judgement);
   void restart_tests();
   /// Returns the judgement under the schema as it stands.
@@ -116,6 +119,11 @@ class Adaptation {
   BodySchema before_;                      ///< what stood before the present replacements
   std::vector<Replacement> replacements_;  ///< not settled yet, in the order they came
   std::int64_t since_ = 0;                 ///< first sample with the changed body
+  DriftWatch drift_watch_;
+  std::optional<int> drifting_;  ///< the edge to this part; before_ is the schema without the drift
+  /// The place of the last small change, and when: the same again soon after is a drift.
+  std::optional<std::pair<int, std::int64_t>> last_small_;
+  int num_still_ = 0;            ///< samples since the drift last moved
   int age_ = 0;                            ///< samples since the newest replacement
   std::vector<BodySchema> history_;  ///< the first is pinned
 };

@@ -105,6 +105,7 @@ int BodyChange::size() const {
 }
 
 double BodyChange::log_odds() const {
+  if (small) return -3.5;
   switch (form) {
     case Form::kStored:
       return -1;
@@ -183,6 +184,7 @@ Eigen::VectorXd prior_sigma(const BodyChange& change, const BodySchema& schema) 
     default:
       if (change.size() == 6) sigma << 0.3, 0.3, 0.3, 1, 1, 1;
   }
+  if (change.small) sigma *= 0.1;
   return sigma;
 }
 
@@ -296,26 +298,29 @@ BodySchema changed(const BodySchema& schema, const BodyChange& change, const Eig
 std::vector<BodyChange> possible_changes(const BodySchema& schema, int part, bool marker) {
   std::vector<BodyChange> result;
   if (marker) {
-    result.push_back({Form::kMarkerMoved, part});
+    for (const bool small : {false, true}) result.push_back({Form::kMarkerMoved, part, 0, 0, small});
     return result;
   }
   const Edge* edge = edge_to(schema, part);
   if (!edge) {
-    if (part == schema.root) result.push_back({Form::kRight, part});
+    if (part == schema.root)
+      for (const bool small : {false, true}) result.push_back({Form::kRight, part, 0, 0, small});
     return result;
   }
   for (int joint = 0; joint < static_cast<int>(edge->joints.size()); ++joint) {
     const ScrewJoint& j = edge->joints[static_cast<std::size_t>(joint)];
     result.push_back({Form::kStuck, part, joint});
-    result.push_back({Form::kOffset, part, joint});
+    for (const bool small : {false, true}) result.push_back({Form::kOffset, part, joint, 0, small});
     if (j.gain != 0) result.push_back({Form::kGain, part, joint});
     for (int s = 0; s < static_cast<int>(schema.signals.size()); ++s)
       if (s != j.signal && j.gain != 0)
         result.push_back({Form::kOtherSignal, part, joint, s});
   }
-  result.push_back({Form::kRight, part});
+  for (const bool small : {false, true}) {
+    result.push_back({Form::kRight, part, 0, 0, small});
+    if (!edge->joints.empty()) result.push_back({Form::kLeft, part, 0, 0, small});
+  }
   if (!edge->joints.empty()) {
-    result.push_back({Form::kLeft, part});
     result.push_back({Form::kBoth, part});
     result.push_back({Form::kRigid, part});
   }

@@ -26,6 +26,7 @@ struct BodyChange {
   int part = 0;
   int joint = 0;   ///< of the edge: for kStuck, kOffset, kGain, kOtherSignal
   int signal = 0;  ///< kOtherSignal
+  bool small = false;  ///< a tenth as wide a prior: what is bent a little is likelier than a break
 
   /// Number of parameters θ: displacements in command units, transforms as (translation [m],
   /// rotation vector [rad]) with T = (Exp(w), p).

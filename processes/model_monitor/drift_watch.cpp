@@ -1,0 +1,184 @@
+#include "processes/model_monitor/drift_watch.h"
+
+#include <Eigen/Cholesky>
+#include <cmath>
+
+#include "processes/model_monitor/body_change.h"
+
+namespace bodyschema {
+namespace {
+
+constexpr std::size_t kWindow = 36;
+constexpr std::size_t kFewest = 16;
+/// Of a straight line through the newest measurements.
+constexpr std::size_t kFollowed = 28;
+constexpr double kStudentNu = 4;
+
+double weight(double d2) { return (kStudentNu + 6) / (kStudentNu + d2); }
+
+struct Reading {
+  double time;  // samples, 0 is the newest
+  Vector6d xi;
+  Matrix6d information;
+};
+
+/// ξ(t) = a + b t by robust least squares.
+struct Line {
+  Eigen::Matrix<double, 12, 1> ab;
+  Eigen::Matrix<double, 12, 12> covariance;
+  double cost = 0;
+};
+
+Line fit_line(const std::vector<Reading>& readings) {
+  Line line;
+  line.ab.setZero();
+  for (int round = 0; round < 6; ++round) {
+    Eigen::Matrix<double, 12, 12> H = 1e-9 * Eigen::Matrix<double, 12, 12>::Identity();
+    Eigen::Matrix<double, 12, 1> g = Eigen::Matrix<double, 12, 1>::Zero();
+    line.cost = 0;
+    for (const Reading& r : readings) {
+      const Vector6d e = r.xi - line.ab.head<6>() - r.time * line.ab.tail<6>();
+      const double d2 = e.dot(r.information * e);
+      line.cost += (kStudentNu + 6) / 2 * std::log1p(d2 / kStudentNu);
+      const Matrix6d I = (round == 0 ? 1 : weight(d2)) * r.information;
+      H.topLeftCorner<6, 6>() += I;
+      H.topRightCorner<6, 6>() += r.time * I;
+      H.bottomRightCorner<6, 6>() += r.time * r.time * I;
+      const Vector6d Ix = I * r.xi;
+      g.head<6>() += Ix;
+      g.tail<6>() += r.time * Ix;
+    }
+    H.bottomLeftCorner<6, 6>() = H.topRightCorner<6, 6>().transpose();
+    const Eigen::LDLT<Eigen::Matrix<double, 12, 12>> ldlt(H);
+    line.ab = ldlt.solve(g);
+    line.covariance = ldlt.solve(Eigen::Matrix<double, 12, 12>::Identity());
+  }
+  return line;
+}
+
+}  // namespace
+
+DriftWatch::DriftWatch(double false_alarm_rate)
+    // Tail of χ²₆ beyond x: e^(−x/2) (1 + x/2 + x²/8); solved for a hundredth of the rate, since
+    // windows overlap and there are many edges.
+    : threshold_([&] {
+        const double tail = false_alarm_rate / 100;
+        double x = 20;
+        for (int n = 0; n < 100; ++n) x = 2 * (std::log1p(x / 2 + x * x / 8) - std::log(tail));
+        return x;
+      }()) {}
+
+void DriftWatch::add(const TreeFilter& filter, const TreeFilter::Instant& instant,
+                     const Eigen::VectorXd& displacements, std::int64_t sample_index) {
+  TreeFilter::Instant exact = instant;
+  for (Matrix6d& covariance : exact.edge_covariance) covariance = 1e-12 * Matrix6d::Identity();
+  for (int node = 0; node < filter.num_nodes(); ++node) {
+    const auto of = filter.measure_edge(instant, node);
+    const auto with_exact_models = filter.measure_edge(exact, node);
+    if (!of || !with_exact_models) continue;
+    const Matrix6d systematic = of->covariance - with_exact_models->covariance;
+    auto& queue = measured_[filter.part(node)];
+    queue.push_back({sample_index, displacements, *of, systematic});
+    if (queue.size() > kWindow) queue.pop_front();
+  }
+}
+
+void DriftWatch::forget(int part, std::int64_t before) {
+  auto& queue = measured_[part];
+  while (!queue.empty() && queue.front().sample_index < before) queue.pop_front();
+}
+
+void DriftWatch::forget_all() { measured_.clear(); }
+
+const std::deque<DriftWatch::Measured>* DriftWatch::find(int part) const {
+  const auto it = measured_.find(part);
+  return it == measured_.end() || it->second.size() < kFewest ? nullptr : &it->second;
+}
+
+std::optional<int> DriftWatch::moved_part(const BodySchema& schema) const {
+  std::optional<int> moved;
+  double most = threshold_;
+  for (const auto& [part, unused] : measured_) {
+    const auto* queue = find(part);
+    if (!queue) continue;
+    const Edge* edge = edge_to(schema, part);
+    if (!edge && part != schema.root) continue;
+    // Mean offset on the right side, as far as the model's own uncertainty does not explain it.
+    Matrix6d H = Matrix6d::Zero(), model = Matrix6d::Zero();
+    Vector6d g = Vector6d::Zero(), mean = Vector6d::Zero();
+    for (int round = 0; round < 4; ++round) {
+      H.setZero();
+      g.setZero();
+      model.setZero();
+      for (const Measured& m : *queue) {
+        const Pose X = edge ? edge->predict(m.displacements) : schema.X_CR;
+        const Vector6d xi = log(X.inverse() * m.of.z);
+        const Matrix6d information = m.of.covariance.inverse();
+        const Vector6d e = xi - mean;
+        const Matrix6d I = weight(e.dot(information * e)) * information;
+        H += I;
+        g += I * xi;
+        model += (m.systematic + (edge ? edge->prediction_covariance(m.displacements)
+                                       : schema.X_CR_covariance)) /
+                 static_cast<double>(queue->size());
+      }
+      mean = H.ldlt().solve(g);
+    }
+    const Matrix6d covariance = Matrix6d(H.inverse()) + model;
+    const double d2 = mean.dot(covariance.ldlt().solve(mean));
+    if (d2 > most) {
+      most = d2;
+      moved = part;
+    }
+  }
+  return moved;
+}
+
+std::optional<Drift> DriftWatch::follow(const BodySchema& schema, int part) const {
+  const auto* queue = find(part);
+  if (!queue) return std::nullopt;
+  const Edge* edge = edge_to(schema, part);
+  std::optional<Drift> best;
+  double least = 0;
+  const std::int64_t now = queue->back().sample_index;
+  for (const bool left : {false, true}) {
+    if (left && (!edge || edge->joints.empty())) continue;
+    std::vector<Pose> T;
+    std::vector<Reading> readings;
+    for (std::size_t n = queue->size() > kFollowed ? queue->size() - kFollowed : 0;
+         n < queue->size(); ++n) {
+      const Measured& m = (*queue)[n];
+      const Pose X = edge ? edge->predict(m.displacements) : schema.X_CR;
+      Matrix6d covariance = m.of.covariance;
+      if (left) {
+        const Matrix6d A = adjoint(X);
+        covariance = A * covariance * A.transpose();
+      }
+      T.push_back(left ? m.of.z * X.inverse() : X.inverse() * m.of.z);
+      readings.push_back({static_cast<double>(m.sample_index - now), Vector6d::Zero(),
+                          covariance.inverse()});
+    }
+    // About the reading nearest to all others, in the end about the line's own value of now.
+    Pose reference = T[T.size() / 2];
+    Line line;
+    for (int round = 0; round < 3; ++round) {
+      for (std::size_t n = 0; n < T.size(); ++n) readings[n].xi = log(reference.inverse() * T[n]);
+      line = fit_line(readings);
+      reference = reference * exp(line.ab.head<6>());
+    }
+    if (best && line.cost >= least) continue;
+    least = line.cost;
+    Drift drift;
+    drift.part = part;
+    drift.left = left;
+    drift.T = reference;
+    drift.covariance = line.covariance.topLeftCorner<6, 6>();
+    drift.rate = line.ab.tail<6>();
+    drift.significance =
+        drift.rate.dot(line.covariance.bottomRightCorner<6, 6>().ldlt().solve(drift.rate));
+    best = drift;
+  }
+  return best;
+}
+
+}  // namespace bodyschema
