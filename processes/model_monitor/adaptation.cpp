@@ -18,6 +18,9 @@ constexpr std::int64_t kTogether = 12;
 
 /// χ²₆(0.99): below it a rate is none.
 constexpr double kSignificantRate = 16.8;
+constexpr int kProbeCandidates = 200;
+/// Sightings below which a part's visibility is not known.
+constexpr int kFewestSightings = 10;
 constexpr std::int64_t kSoon = 150;
 constexpr double kMedianChiSquare6 = 5.348;
 constexpr double kLeastScale = 0.2, kLargestScale = 5;
@@ -55,15 +58,24 @@ bool differ_at(const BodySchema& a, const BodySchema& b, int part) {
 const char* name_of(AdaptationEvent::Kind kind) {
   using Kind = AdaptationEvent::Kind;
   switch (kind) {
-    case Kind::kMismatch: return "mismatch";
-    case Kind::kCandidate: return "candidate";
-    case Kind::kRefined: return "refined";
-    case Kind::kRestored: return "restored";
-    case Kind::kReverted: return "reverted";
-    case Kind::kRecovered: return "recovered";
-    case Kind::kDrift: return "drift";
-    case Kind::kMissing: return "missing";
-    case Kind::kProbeWanted: return "probe_wanted";
+    case Kind::kMismatch:
+      return "mismatch";
+    case Kind::kCandidate:
+      return "candidate";
+    case Kind::kRefined:
+      return "refined";
+    case Kind::kRestored:
+      return "restored";
+    case Kind::kReverted:
+      return "reverted";
+    case Kind::kRecovered:
+      return "recovered";
+    case Kind::kDrift:
+      return "drift";
+    case Kind::kMissing:
+      return "missing";
+    case Kind::kProbeWanted:
+      return "probe_wanted";
   }
   return "";
 }
@@ -98,7 +110,8 @@ double Adaptation::marker_statistic(int part) const {
   return node < 0 ? 0 : markers_[static_cast<std::size_t>(node)].value;
 }
 
-TreeFilter::Judgement Adaptation::update_tests(const TreeFilter::Instant& instant, std::int64_t sample_index) {
+TreeFilter::Judgement Adaptation::update_tests(const TreeFilter::Instant& instant,
+                                               std::int64_t sample_index) {
   const TreeFilter::Judgement now = filter_->judge(instant);
   const auto is_zero = [](const Cusum& c) { return c.value == 0; };
   const bool clear = std::all_of(now.squared_distance.begin(), now.squared_distance.end(),
@@ -121,8 +134,8 @@ TreeFilter::Judgement Adaptation::update_tests(const TreeFilter::Instant& instan
     }
     Alternative cut;
     cut.cut_edges = {node};
-    wrong += std::exp(
-        std::min(filter_->judge(instant, cut).log_likelihood - now.log_likelihood, 600.0));
+    wrong +=
+        std::exp(std::min(filter_->judge(instant, cut).log_likelihood - now.log_likelihood, 600.0));
     add(&edges_[static_cast<std::size_t>(node)], std::log(wrong / 3));
     if (!instant.seen[static_cast<std::size_t>(node)]) continue;
     Alternative detached;
@@ -168,7 +181,8 @@ std::vector<const ActionPoseSample*> Adaptation::segment(std::int64_t since) con
   for (const ActionPoseSample& sample : recent_)
     if (sample.sample_index >= since) result.push_back(&sample);
   const auto longest = static_cast<std::size_t>(options_.longest_segment);
-  if (result.size() > longest) result.erase(result.begin(), result.end() - options_.longest_segment);
+  if (result.size() > longest)
+    result.erase(result.begin(), result.end() - options_.longest_segment);
   return result;
 }
 
@@ -204,19 +218,20 @@ std::vector<Adaptation::Place> Adaptation::suspects() const {
   return places;
 }
 
-Adaptation::Choice Adaptation::choose(
-    const BodySchema& standing, const std::vector<Place>& places,
-    const std::vector<const ActionPoseSample*>& samples) const {
+Adaptation::Choice Adaptation::choose(const BodySchema& standing, const std::vector<Place>& places,
+                                      const std::vector<const ActionPoseSample*>& samples) const {
   Choice choice;
   choice.null = log_likelihood(standing, noise_, samples);
-  choice.runner_up = -std::numeric_limits<double>::infinity();
+  const auto second = [&](Replacement candidate) {
+    if (!choice.runner_up || candidate.fitted.log_evidence > choice.runner_up->fitted.log_evidence)
+      choice.runner_up = std::move(candidate);
+  };
   const auto offer = [&](FittedChange candidate, const Place& at) {
     if (choice.best && candidate.log_evidence <= choice.best->fitted.log_evidence) {
-      choice.runner_up = std::max(choice.runner_up, candidate.log_evidence);
+      second({at, std::move(candidate)});
       return;
     }
-    if (choice.best)
-      choice.runner_up = std::max(choice.runner_up, choice.best->fitted.log_evidence);
+    if (choice.best) second(std::move(*choice.best));
     choice.best = Replacement{at, std::move(candidate)};
   };
   for (const Place& at : places) {
@@ -310,18 +325,19 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
   }
   if (!accepted) return;
   const FittedChange& fitted = choice.best->fitted;
-  AdaptationEvent candidate = event(fitted.change.form == BodyChange::Form::kStored
-                                        ? AdaptationEvent::Kind::kRestored
-                                        : AdaptationEvent::Kind::kCandidate,
-                                    sample_index, choice.best->place);
+  AdaptationEvent candidate =
+      event(fitted.change.form == BodyChange::Form::kStored ? AdaptationEvent::Kind::kRestored
+                                                            : AdaptationEvent::Kind::kCandidate,
+            sample_index, choice.best->place);
   candidate.cause = fitted.change.cause(schema_);
   candidate.margin = choice.margin();
   candidate.num_samples = static_cast<int>(samples.size());
   events->push_back(candidate);
+  want_probe(schema_, choice, sample_index, events);
   if (fitted.change.small && !choice.best->place.marker) {
     const int part = choice.best->place.part;
-    const bool again = last_small_ && last_small_->first == part &&
-                       sample_index - last_small_->second < kSoon;
+    const bool again =
+        last_small_ && last_small_->first == part && sample_index - last_small_->second < kSoon;
     last_small_ = {part, sample_index};
     if (again && !drifting_) {
       if (!replacements_.empty()) remember(schema_);
@@ -356,9 +372,8 @@ void Adaptation::reconsider(std::int64_t sample_index, bool all_forms,
       const BodySchema others = composed(n);
       if (!all_forms) {
         if (r.fitted.change.size() > 0) {
-          const BodySchema base = r.fitted.origin
-                                      ? with_edge_of(others, *r.fitted.origin, r.place.part)
-                                      : others;
+          const BodySchema base =
+              r.fitted.origin ? with_edge_of(others, *r.fitted.origin, r.place.part) : others;
           const PlaceEvidence evidence(base, noise_, r.place.part, r.place.marker, samples);
           if (auto again = evidence.fit(r.fitted.change)) {
             again->origin = r.fitted.origin;
@@ -387,6 +402,7 @@ void Adaptation::reconsider(std::int64_t sample_index, bool all_forms,
         is_changed = true;
       }
       r.fitted = choice.best->fitted;
+      if (round == 0 && age_ > 0) want_probe(others, choice, sample_index, events);
       ++n;
     }
     if (!is_changed) break;
@@ -396,6 +412,93 @@ void Adaptation::reconsider(std::int64_t sample_index, bool all_forms,
   if (age_ > 0) {
     edges_ = edges;
     markers_ = markers;
+  }
+}
+
+void Adaptation::want_probe(const BodySchema& standing, const Choice& choice,
+                            std::int64_t sample_index, std::vector<AdaptationEvent>* events) {
+  if (!choice.runner_up ||
+      choice.best->fitted.log_evidence - choice.runner_up->fitted.log_evidence > options_.ambiguity)
+    return;
+  const BodySchema one = with_change(standing, choice.best->fitted);
+  const BodySchema other = with_change(standing, choice.runner_up->fitted);
+  double most = 1;
+  Eigen::VectorXd probe;
+  const auto m = static_cast<Eigen::Index>(standing.signals.size());
+  for (int n = 1; n <= kProbeCandidates; ++n) {
+    Eigen::VectorXd action(m);
+    for (Eigen::Index s = 0; s < m; ++s) {
+      // Evenly over the box: the additive recurrence of the golden ratio's generalisation to m
+      // dimensions (M. Roberts, 2018).
+      double phi = 2;
+      for (int k = 0; k < 30; ++k) phi = std::pow(1 + phi, 1.0 / static_cast<double>(m + 1));
+      const double u = std::fmod(0.5 + n * std::pow(phi, -static_cast<double>(s + 1)), 1.0);
+      const Signal& signal = standing.signals[static_cast<std::size_t>(s)];
+      action(s) = signal.lower + u * (signal.upper - signal.lower);
+    }
+    const auto X = one.predict_all(action), Y = other.predict_all(action);
+    for (const auto& [part, X_RB] : X) {
+      const auto it = Y.find(part);
+      if (it == Y.end()) continue;
+      const Pose difference = X_RB.inverse() * it->second;
+      const double size = difference.translation().norm() / options_.tolerance.position_m +
+                          rotation_angle(difference) / options_.tolerance.rotation_rad;
+      if (size > most) {
+        most = size;
+        probe = action;
+      }
+    }
+  }
+  if (probe.size() == 0) return;
+  AdaptationEvent wanted =
+      event(AdaptationEvent::Kind::kProbeWanted, sample_index, choice.best->place);
+  wanted.cause = choice.best->fitted.change.cause(standing) + " or " +
+                 choice.runner_up->fitted.change.cause(standing);
+  wanted.margin = choice.best->fitted.log_evidence - choice.runner_up->fitted.log_evidence;
+  wanted.probe = probe;
+  events->push_back(wanted);
+}
+
+std::vector<int> Adaptation::missing_parts() const {
+  std::vector<int> parts;
+  for (const auto& [part, v] : visibility_)
+    if (v.is_missing) parts.push_back(part);
+  return parts;
+}
+
+void Adaptation::watch_visibility(const ActionPoseSample& sample,
+                                  std::vector<AdaptationEvent>* events) {
+  for (const int part : schema_.parts) {
+    Visibility& v = visibility_[part];
+    if (sample.find(part)) {
+      if (v.is_missing) {
+        AdaptationEvent back =
+            event(AdaptationEvent::Kind::kRecovered, sample.sample_index, {part, true});
+        back.cause = "marker_missing";
+        back.num_samples = v.num_missed;
+        events->push_back(back);
+      } else {
+        v.num_asked += v.num_missed;
+      }
+      v.is_missing = false;
+      v.num_missed = 0;
+      ++v.num_seen;
+      ++v.num_asked;
+      continue;
+    }
+    ++v.num_missed;
+    if (v.is_missing || v.num_seen < kFewestSightings) continue;
+    // A run of m misses begins at any sample with probability v (1 − v)^m; n parts may.
+    const double share = (v.num_seen + 0.5) / (v.num_asked + 1.0);
+    const double chance =
+        share * std::pow(1 - share, v.num_missed) * static_cast<double>(schema_.parts.size());
+    if (chance > options_.false_alarm_rate) continue;
+    v.is_missing = true;
+    AdaptationEvent missing =
+        event(AdaptationEvent::Kind::kMissing, sample.sample_index, {part, true});
+    missing.cause = "marker_missing";
+    missing.num_samples = v.num_missed;
+    events->push_back(missing);
   }
 }
 
@@ -456,7 +559,8 @@ void Adaptation::watch_drift(std::int64_t sample_index, std::vector<AdaptationEv
 
 void Adaptation::remember(const BodySchema& schema) {
   for (const BodySchema& stored : history_) {
-    bool same = stored.X_CR.isApprox(schema.X_CR, 1e-9) && stored.edges.size() == schema.edges.size();
+    bool same =
+        stored.X_CR.isApprox(schema.X_CR, 1e-9) && stored.edges.size() == schema.edges.size();
     for (std::size_t e = 0; same && e < schema.edges.size(); ++e)
       same = !differ(stored.edges[e], schema.edges[e]);
     if (same) return;
@@ -469,6 +573,7 @@ std::vector<AdaptationEvent> Adaptation::on_sample(const ActionPoseSample& sampl
   std::vector<AdaptationEvent> events;
   recent_.push_back(sample);
   if (recent_.size() > kRing) recent_.pop_front();
+  watch_visibility(sample, &events);
   if (++num_samples_ <= options_.calibration_samples) {
     if (num_samples_ == options_.calibration_samples) {
       calibrate();

@@ -17,9 +17,11 @@ struct AdaptationOptions {
   MarkerNoise noise;
   /// Wished false alarms a sample, over all tests together.
   double false_alarm_rate = 1e-5;
-  double suspicion = 1.5;    ///< CUSUM above which candidates are tried [nats]
-  double acceptance = 12;    ///< evidence over the schema that stands [nats]
-  double ambiguity = 6;      ///< a runner-up nearer than this asks for a probe [nats]
+  double suspicion = 1.5;  ///< CUSUM above which candidates are tried [nats]
+  double acceptance = 12;  ///< evidence over the schema that stands [nats]
+  double ambiguity = 6;    ///< a runner-up nearer than this asks for a probe [nats]
+  /// Disagreement of two explanations, anywhere in reach, that is worth a motion.
+  Noise tolerance{0.02, 0.1};
   /// Samples at the start from which the noise is estimated before anything is judged.
   int calibration_samples = 8;
   int longest_segment = 40;  ///< samples since a change that are looked at
@@ -29,8 +31,17 @@ struct AdaptationOptions {
 
 /// Something that the adaptation decided at one sample.
 struct AdaptationEvent {
-  enum class Kind { kMismatch, kCandidate, kRefined, kRestored, kReverted, kRecovered, kDrift,
-                    kMissing, kProbeWanted };
+  enum class Kind {
+    kMismatch,
+    kCandidate,
+    kRefined,
+    kRestored,
+    kReverted,
+    kRecovered,
+    kDrift,
+    kMissing,
+    kProbeWanted
+  };
   Kind kind = Kind::kMismatch;
   std::int64_t sample_index = 0;
   int from = -1;  ///< parts of an edge; −1 for a part alone or the camera
@@ -39,6 +50,8 @@ struct AdaptationEvent {
   std::string cause;
   double margin = 0;  ///< evidence over the schema that stood before [nats]
   int num_samples = 0;
+  /// kProbeWanted: the action at which the two likeliest explanations disagree most; else empty.
+  Eigen::VectorXd probe;
 };
 const char* name_of(AdaptationEvent::Kind kind);
 
@@ -47,10 +60,10 @@ const char* name_of(AdaptationEvent::Kind kind);
 /// Every sample is judged by a tree filter under the schema and, for every edge and every marker,
 /// under the hypothesis that this one is wrong. The log-likelihood ratios are summed by one CUSUM
 /// each; since they are proper, ln(2n/α) is the threshold for α false alarms a sample. From a
-/// suspicion on, replacements are fitted to the samples since its beginning: what is in the history,
-/// then changes of the old model from simple to complex. The one with the most evidence replaces the
-/// old one as soon as it leads by `acceptance`; it is refitted as samples come, reverted if it falls
-/// behind, kept in the history once it has settled.
+/// suspicion on, replacements are fitted to the samples since its beginning: what is in the
+/// history, then changes of the old model from simple to complex. The one with the most evidence
+/// replaces the old one as soon as it leads by `acceptance`; it is refitted as samples come,
+/// reverted if it falls behind, kept in the history once it has settled.
 class Adaptation {
  public:
   Adaptation(BodySchema schema, AdaptationOptions options);
@@ -61,8 +74,11 @@ class Adaptation {
   /// CUSUM of the edge to a part (root: the camera's) and of the part's marker [nats].
   double edge_statistic(int part) const;
   double marker_statistic(int part) const;
-  /// True over assumed standard deviation of the markers, as the residuals of quiet samples show it.
+  /// True over assumed standard deviation of the markers, as the residuals of quiet samples show
+  /// it.
   double noise_scale() const { return noise_.scale; }
+  /// Parts whose markers have not been seen for longer than chance explains.
+  std::vector<int> missing_parts() const;
   bool is_settled() const { return replacements_.empty() && !detected_ && !drifting_; }
 
  private:
@@ -91,8 +107,9 @@ class Adaptation {
   std::vector<Place> suspects() const;
   struct Choice {
     std::optional<Replacement> best;
-    double null = 0;       ///< log-likelihood of the schema as it stands
-    double runner_up = 0;  ///< log evidence
+    double null = 0;  ///< log-likelihood of the schema as it stands
+    /// The best that is another form or place.
+    std::optional<Replacement> runner_up;
     double margin() const { return best ? best->fitted.log_evidence - null : 0; }
   };
   Choice choose(const BodySchema& standing, const std::vector<Place>& places,
@@ -100,6 +117,9 @@ class Adaptation {
   BodySchema composed(int without = -1) const;
   void try_changes(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
   void reconsider(std::int64_t sample_index, bool all_forms, std::vector<AdaptationEvent>* events);
+  void want_probe(const BodySchema& standing, const Choice& choice, std::int64_t sample_index,
+                  std::vector<AdaptationEvent>* events);
+  void watch_visibility(const ActionPoseSample& sample, std::vector<AdaptationEvent>* events);
   void follow(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
   void remember(const BodySchema& schema);
   void install(const BodySchema& schema);
@@ -114,6 +134,12 @@ class Adaptation {
   BodySchema schema_;
   std::optional<TreeFilter> filter_;
   std::deque<ActionPoseSample> recent_;
+  struct Visibility {
+    int num_seen = 0, num_asked = 0;  ///< before the present run of misses
+    int num_missed = 0;               ///< in a row
+    bool is_missing = false;
+  };
+  std::map<int, Visibility> visibility_;
   std::vector<Cusum> edges_, markers_;  ///< by node
   std::optional<Place> detected_;
   BodySchema before_;                      ///< what stood before the present replacements
@@ -123,8 +149,8 @@ class Adaptation {
   std::optional<int> drifting_;  ///< the edge to this part; before_ is the schema without the drift
   /// The place of the last small change, and when: the same again soon after is a drift.
   std::optional<std::pair<int, std::int64_t>> last_small_;
-  int num_still_ = 0;            ///< samples since the drift last moved
-  int age_ = 0;                            ///< samples since the newest replacement
+  int num_still_ = 0;                ///< samples since the drift last moved
+  int age_ = 0;                      ///< samples since the newest replacement
   std::vector<BodySchema> history_;  ///< the first is pinned
 };
 

@@ -43,9 +43,8 @@ void make_room(Edge* edge) {
 /// Adds a right perturbation of `left`, or of the last X_after (`last`).
 void add_uncertainty(Edge* edge, bool last, const Matrix6d& covariance) {
   make_room(edge);
-  const Eigen::Index at = last && !edge->joints.empty()
-                              ? 8 * static_cast<Eigen::Index>(edge->joints.size())
-                              : 0;
+  const Eigen::Index at =
+      last && !edge->joints.empty() ? 8 * static_cast<Eigen::Index>(edge->joints.size()) : 0;
   edge->parameter_covariance.block<6, 6>(at, at) += covariance;
 }
 
@@ -298,7 +297,8 @@ BodySchema changed(const BodySchema& schema, const BodyChange& change, const Eig
 std::vector<BodyChange> possible_changes(const BodySchema& schema, int part, bool marker) {
   std::vector<BodyChange> result;
   if (marker) {
-    for (const bool small : {false, true}) result.push_back({Form::kMarkerMoved, part, 0, 0, small});
+    for (const bool small : {false, true})
+      result.push_back({Form::kMarkerMoved, part, 0, 0, small});
     return result;
   }
   const Edge* edge = edge_to(schema, part);
@@ -313,8 +313,7 @@ std::vector<BodyChange> possible_changes(const BodySchema& schema, int part, boo
     for (const bool small : {false, true}) result.push_back({Form::kOffset, part, joint, 0, small});
     if (j.gain != 0) result.push_back({Form::kGain, part, joint});
     for (int s = 0; s < static_cast<int>(schema.signals.size()); ++s)
-      if (s != j.signal && j.gain != 0)
-        result.push_back({Form::kOtherSignal, part, joint, s});
+      if (s != j.signal && j.gain != 0) result.push_back({Form::kOtherSignal, part, joint, s});
   }
   for (const bool small : {false, true}) {
     result.push_back({Form::kRight, part, 0, 0, small});

@@ -24,8 +24,8 @@ struct BodyChange {
   };
   Form form = Form::kRight;
   int part = 0;
-  int joint = 0;   ///< of the edge: for kStuck, kOffset, kGain, kOtherSignal
-  int signal = 0;  ///< kOtherSignal
+  int joint = 0;       ///< of the edge: for kStuck, kOffset, kGain, kOtherSignal
+  int signal = 0;      ///< kOtherSignal
   bool small = false;  ///< a tenth as wide a prior: what is bent a little is likelier than a break
 
   /// Number of parameters θ: displacements in command units, transforms as (translation [m],
@@ -47,8 +47,8 @@ Eigen::VectorXd prior_sigma(const BodyChange& change, const BodySchema& schema);
 /// Centre of that prior.
 Eigen::VectorXd prior_mean(const BodyChange& change, const BodySchema& schema);
 
-/// The schema with the change in it. Edges stay flat: left, joints, right. `covariance` of θ, if not
-/// empty, adds to the covariances of the edges concerned.
+/// The schema with the change in it. Edges stay flat: left, joints, right. `covariance` of θ, if
+/// not empty, adds to the covariances of the edges concerned.
 /// @throws std::invalid_argument if the schema has no such place or θ has another size.
 BodySchema changed(const BodySchema& schema, const BodyChange& change, const Eigen::VectorXd& theta,
                    const Eigen::MatrixXd& covariance = {});

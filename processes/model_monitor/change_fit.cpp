@@ -10,7 +10,8 @@ namespace {
 using Form = BodyChange::Form;
 
 constexpr int kIterations = 16;
-constexpr double kLargestStep = 0.7;  // of θ, in prior standard deviations of a transform: m and rad
+constexpr double kLargestStep =
+    0.7;  // of θ, in prior standard deviations of a transform: m and rad
 constexpr double kStudentNu = 4;
 
 std::vector<int> nodes_of(const TreeFilter& filter, const std::vector<int>& parts) {
@@ -86,10 +87,9 @@ PlaceEvidence::PlaceEvidence(const BodySchema& base, const MarkerNoise& noise, i
     if (!of) continue;
     const Eigen::LLT<Matrix6d> llt(of->covariance);
     if (llt.info() != Eigen::Success) continue;
-    measurements_.push_back({base_.displacements(sample->action), *of,
-                             llt.matrixL().solve(Matrix6d::Identity()),
-                             -llt.matrixLLT().diagonal().array().log().sum() -
-                                 3 * std::log(2 * M_PI)});
+    measurements_.push_back(
+        {base_.displacements(sample->action), *of, llt.matrixL().solve(Matrix6d::Identity()),
+         -llt.matrixLLT().diagonal().array().log().sum() - 3 * std::log(2 * M_PI)});
   }
   place_ = base_;
   std::erase_if(place_.edges, [part](const Edge& edge) { return edge.to != part; });
@@ -130,7 +130,8 @@ std::vector<Eigen::VectorXd> PlaceEvidence::starts(const BodyChange& change) con
   switch (change.form) {
     case Form::kStuck:
       for (int k = 0; k < 9; ++k)
-        result.push_back(mean + Eigen::VectorXd::Constant(1, std::sqrt(3.0) * (k - 4) / 4 * sigma(0)));
+        result.push_back(mean +
+                         Eigen::VectorXd::Constant(1, std::sqrt(3.0) * (k - 4) / 4 * sigma(0)));
       break;
     case Form::kOffset:
       for (int k = 0; k < 7; ++k)
@@ -138,8 +139,7 @@ std::vector<Eigen::VectorXd> PlaceEvidence::starts(const BodyChange& change) con
       break;
     case Form::kGain:
       for (const double a : {-0.6, -0.25, 0.0, 0.4})
-        for (const double b : {-0.5, 0.0, 0.5})
-          result.push_back(Eigen::Vector2d(a, b * sigma(1)));
+        for (const double b : {-0.5, 0.0, 0.5}) result.push_back(Eigen::Vector2d(a, b * sigma(1)));
       break;
     case Form::kOtherSignal:
     case Form::kStored:
@@ -219,9 +219,8 @@ PlaceEvidence::State PlaceEvidence::climb(const BodyChange& change, Eigen::Vecto
     for (std::size_t n = 0; n < count; ++n) {
       const auto at = 6 * static_cast<Eigen::Index>(n);
       const double d2 = r.segment<6>(at).squaredNorm();
-      const double w =
-          robust ? (kStudentNu + 6) / (kStudentNu + d2)
-                 : 1 / (1 + std::exp(std::min(flat - inlier_density(n, d2), 500.0)));
+      const double w = robust ? (kStudentNu + 6) / (kStudentNu + d2)
+                              : 1 / (1 + std::exp(std::min(flat - inlier_density(n, d2), 500.0)));
       H += w * J.middleRows<6>(at).transpose() * J.middleRows<6>(at);
       g += w * J.middleRows<6>(at).transpose() * r.segment<6>(at);
     }

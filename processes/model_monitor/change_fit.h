@@ -43,8 +43,9 @@ class PlaceEvidence {
   int num_usable() const { return static_cast<int>(measurements_.size()); }
 
   /// The most probable θ: Gauss-Newton on the virtual measurements from several starts, with
-  /// Student-t weights first and the outlier mixture's then. Its evidence is that of all observations
-  /// under the changed schema. std::nullopt if there are fewer usable samples than the form needs.
+  /// Student-t weights first and the outlier mixture's then. Its evidence is that of all
+  /// observations under the changed schema. std::nullopt if there are fewer usable samples than the
+  /// form needs.
   std::optional<FittedChange> fit(const BodyChange& change) const;
   /// A schema of the history in this place.
   FittedChange judge_stored(const BodySchema& schema) const;

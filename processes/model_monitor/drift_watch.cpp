@@ -118,8 +118,8 @@ std::optional<int> DriftWatch::moved_part(const BodySchema& schema) const {
         const Matrix6d I = weight(e.dot(information * e)) * information;
         H += I;
         g += I * xi;
-        model += (m.systematic + (edge ? edge->prediction_covariance(m.displacements)
-                                       : schema.X_CR_covariance)) /
+        model += (m.systematic +
+                  (edge ? edge->prediction_covariance(m.displacements) : schema.X_CR_covariance)) /
                  static_cast<double>(queue->size());
       }
       mean = H.ldlt().solve(g);
@@ -155,8 +155,8 @@ std::optional<Drift> DriftWatch::follow(const BodySchema& schema, int part) cons
         covariance = A * covariance * A.transpose();
       }
       T.push_back(left ? m.of.z * X.inverse() : X.inverse() * m.of.z);
-      readings.push_back({static_cast<double>(m.sample_index - now), Vector6d::Zero(),
-                          covariance.inverse()});
+      readings.push_back(
+          {static_cast<double>(m.sample_index - now), Vector6d::Zero(), covariance.inverse()});
     }
     // About the reading nearest to all others, in the end about the line's own value of now.
     Pose reference = T[T.size() / 2];

@@ -13,11 +13,11 @@ namespace bodyschema {
 /// An edge that changes slowly: T(t) on one side of its model, linear in the number of samples.
 struct Drift {
   int part = 0;
-  bool left = false;               ///< T · Δ; else Δ · T
-  Pose T = Pose::Identity();       ///< now
+  bool left = false;                       ///< T · Δ; else Δ · T
+  Pose T = Pose::Identity();               ///< now
   Matrix6d covariance = Matrix6d::Zero();  ///< of T, right perturbation
   Vector6d rate = Vector6d::Zero();        ///< of log T a sample
-  double significance = 0;         ///< squared Mahalanobis distance of the rate from standing still
+  double significance = 0;  ///< squared Mahalanobis distance of the rate from standing still
 };
 
 /// Finds what changes too slowly for a CUSUM: means of the virtual measurements of every edge over

@@ -112,8 +112,11 @@ TreeFilter::TreeFilter(const BodySchema& schema, const MarkerNoise& noise)
       const Edge& edge = schema_.edges[e];
       if (edge.from != nodes_[n].part || !reached.insert(edge.to).second) continue;
       nodes_[n].children.push_back(static_cast<int>(nodes_.size()));
-      nodes_.push_back({edge.to, static_cast<int>(n), static_cast<int>(e),
-                        edge.state == EdgeState::kInvalid, {}});
+      nodes_.push_back({edge.to,
+                        static_cast<int>(n),
+                        static_cast<int>(e),
+                        edge.state == EdgeState::kInvalid,
+                        {}});
     }
   }
 }
@@ -225,8 +228,7 @@ class TreeFilter::Walk {
   std::vector<int> visible_below(int top) const {
     std::vector<int> queue{top}, visible;
     for (std::size_t n = 0; n < queue.size(); ++n) {
-      if (instant_.seen[queue[n]] && queue[n] != skipped_ &&
-          queue[n] != alternative_.detached_node)
+      if (instant_.seen[queue[n]] && queue[n] != skipped_ && queue[n] != alternative_.detached_node)
         visible.push_back(queue[n]);
       for (const int child : filter_.nodes_[queue[n]].children)
         if (!is_cut(child)) queue.push_back(child);
@@ -307,9 +309,9 @@ class TreeFilter::Walk {
     if (seen->X_CB_other && d2 > kClearInlier) {
       bool is_other_inlier = false;
       double other_d2 = 0;
-      const double other = kLogOtherReading + log_marker_density(belief->X, *seen->X_CB_other, S,
-                                                                 seen->covariance, rate,
-                                                                 &is_other_inlier, &other_d2);
+      const double other =
+          kLogOtherReading + log_marker_density(belief->X, *seen->X_CB_other, S, seen->covariance,
+                                                rate, &is_other_inlier, &other_d2);
       if (other > density && is_other_inlier) {
         density = other;
         X_CB = *seen->X_CB_other;

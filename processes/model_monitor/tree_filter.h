@@ -25,7 +25,8 @@ struct MarkerNoise {
 /// TreeFilter::parts(); "the edge of a node" is the one that leads to it from its parent, for the
 /// root the camera's.
 struct Alternative {
-  int inflated_edge = -1;  ///< this edge is uncertain by `inflation` standard deviations of a marker
+  int inflated_edge =
+      -1;  ///< this edge is uncertain by `inflation` standard deviations of a marker
   double inflation = 0;
   std::vector<int> cut_edges;  ///< these edges say nothing
   int detached_node = -1;      ///< the marker of this node is not where it was
@@ -70,8 +71,8 @@ class TreeFilter {
       std::optional<Pose> X_CB_other;
       Matrix6d covariance;
     };
-    std::vector<Pose> delta;               ///< by node: pose in the parent (root: in the camera)
-    std::vector<Matrix6d> transport;       ///< Ad(delta⁻¹)
+    std::vector<Pose> delta;          ///< by node: pose in the parent (root: in the camera)
+    std::vector<Matrix6d> transport;  ///< Ad(delta⁻¹)
     std::vector<Matrix6d> edge_covariance;
     std::vector<std::optional<Seen>> seen;
   };
