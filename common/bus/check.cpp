@@ -22,6 +22,11 @@ constexpr double kMaxReach_m = 1'000;
 constexpr std::int64_t kMaxTags = 10'000;
 constexpr std::int64_t kMaxSignals = 1'000;
 constexpr std::int64_t kMaxJoints = 100;
+constexpr std::int64_t kMaxGpSamples = 64;
+/// Variances, length scales and weights of Gaussian processes: wide enough for any unit, and what
+/// is made of them stays within what doubles hold.
+constexpr double kLeastHyperParameter = 1e-60;
+constexpr double kLargestHyperParameter = 1e60;
 constexpr std::int64_t kMaxGeoms = 100'000;
 constexpr std::int64_t kMaxCounters = 10'000;
 constexpr std::int64_t kMaxEvents = 32;
@@ -238,6 +243,67 @@ class Checker {
   std::vector<std::pair<const char*, std::int64_t>> path_;
 };
 
+/// Whatever passes can be factorised again.
+class GpChecker {
+ public:
+  explicit GpChecker(Checker& check) : check_(check) {}
+
+  void signals(const char* field, std::int64_t count, const std::vector<std::int32_t>& array,
+               std::int64_t least, const body_schema_t& schema) {
+    if (!check_.counted(field, count, array, kMaxSignals)) return;
+    check_.integer_at_least(field, count, least);
+    for (const std::int32_t signal : array)
+      check_.integer_within(field, signal, 0, schema.num_signals - 1);
+  }
+  void samples(const char* field, std::int64_t count) {
+    check_.integer_within(field, count, 1, kMaxGpSamples);
+  }
+  template <class Values>
+  void hyper_parameters(const char* field, const Values& values, double least) {
+    for (const double value : values) check_.within(field, value, least, kLargestHyperParameter);
+  }
+  void values(const char* field, std::int64_t count, const std::vector<double>& array,
+              std::int64_t expected, double largest = kLargestHyperParameter) {
+    if (!check_.counted(field, count, array, expected)) return;
+    check_.integer_at_least(field, count, expected);
+    for (const double value : array) check_.within(field, value, -largest, largest);
+  }
+
+ private:
+  Checker& check_;
+};
+
+void check_residual_gp(Checker& check, const residual_gp_t& gp, const body_schema_t& schema) {
+  GpChecker gp_check(check);
+  const std::int64_t D = gp.num_gp_signals, N = gp.num_gp_samples;
+  gp_check.signals("gp_signals", D, gp.gp_signals, 1, schema);
+  gp_check.samples("num_gp_samples", N);
+  if (!check.problem().empty()) return;
+  gp_check.values("gp_length_scales", D, gp.gp_length_scales, D);
+  gp_check.values("gp_noise_scales", N, gp.gp_noise_scales, N);
+  gp_check.values("gp_inputs", gp.num_gp_inputs, gp.gp_inputs, N * D);
+  gp_check.values("gp_residuals", gp.num_gp_residuals, gp.gp_residuals, 6 * N, kMaxReach_m);
+  gp_check.hyper_parameters("gp_length_scales", gp.gp_length_scales, kLeastHyperParameter);
+  gp_check.hyper_parameters("gp_variances", gp.gp_variances, kLeastHyperParameter);
+  gp_check.hyper_parameters("gp_noise_variances", gp.gp_noise_variances, kLeastHyperParameter);
+  gp_check.hyper_parameters("gp_noise_scales", gp.gp_noise_scales, kLeastHyperParameter);
+}
+
+void check_matrix_gp(Checker& check, const matrix_gp_t& gp, const body_schema_t& schema) {
+  GpChecker gp_check(check);
+  const std::int64_t D = gp.num_matrix_signals, N = gp.num_matrix_poses;
+  gp_check.signals("matrix_signals", D, gp.matrix_signals, 0, schema);
+  gp_check.samples("num_matrix_poses", N);
+  if (!check.problem().empty()) return;
+  gp_check.values("entry_length_scales", gp.num_entry_lengths, gp.entry_length_scales, 12 * D);
+  gp_check.values("matrix_inputs", gp.num_matrix_inputs, gp.matrix_inputs, N * D);
+  gp_check.hyper_parameters("entry_length_scales", gp.entry_length_scales, kLeastHyperParameter);
+  gp_check.hyper_parameters("entry_variances", gp.entry_variances, kLeastHyperParameter);
+  gp_check.hyper_parameters("entry_noise_variances", gp.entry_noise_variances, 0);
+  check.each("matrix_poses", N, gp.matrix_poses, kMaxGpSamples,
+             [&](const pose_t& z) { check.pose("z", z); });
+}
+
 void check_edge(Checker& check, const schema_edge_t& edge, const body_schema_t& schema,
                 const std::set<std::int32_t>& parts, std::set<std::int32_t>& placed) {
   check.require(parts.count(edge.from_part) == 1, "from_part", "is not in part_ids");
@@ -251,7 +317,7 @@ void check_edge(Checker& check, const schema_edge_t& edge, const body_schema_t& 
   placed.insert(edge.from_part);
   placed.insert(edge.to_part);
 
-  check.constant("base_kind", edge.base_kind, schema_edge_t::EDGE_SCREW);
+  check.constant("base_kind", edge.base_kind, schema_edge_t::EDGE_MATRIX_GP);
   check.pose("X_left", edge.X_left);
   check.each("joints", edge.num_joints, edge.joints, kMaxJoints, [&](const screw_joint_t& joint) {
     check.integer_within("signal_index", joint.signal_index, 0, schema.num_signals - 1);
@@ -261,8 +327,21 @@ void check_edge(Checker& check, const schema_edge_t& edge, const body_schema_t& 
     check.finite("turn_rad", joint.turn_rad);
     check.pose("X_after", joint.X_after);
   });
-  check.require((edge.base_kind == schema_edge_t::EDGE_RIGID) == (edge.num_joints == 0),
+  const bool has_joints = edge.num_joints > 0;
+  const bool may_have_joints =
+      edge.base_kind == schema_edge_t::EDGE_SCREW || edge.base_kind == schema_edge_t::EDGE_SCREW_GP;
+  check.require(has_joints ? may_have_joints : edge.base_kind != schema_edge_t::EDGE_SCREW,
                 "base_kind", "does not go with num_joints");
+  check.integer_within("num_residual_gp", edge.num_residual_gp,
+                       edge.base_kind == schema_edge_t::EDGE_SCREW_GP,
+                       edge.base_kind == schema_edge_t::EDGE_SCREW_GP);
+  check.each("residual_gp", edge.num_residual_gp, edge.residual_gp, 1,
+             [&](const residual_gp_t& gp) { check_residual_gp(check, gp, schema); });
+  check.integer_within("num_matrix_gp", edge.num_matrix_gp,
+                       edge.base_kind == schema_edge_t::EDGE_MATRIX_GP,
+                       edge.base_kind == schema_edge_t::EDGE_MATRIX_GP);
+  check.each("matrix_gp", edge.num_matrix_gp, edge.matrix_gp, 1,
+             [&](const matrix_gp_t& gp) { check_matrix_gp(check, gp, schema); });
   check.pose("X_right", edge.X_right);
 
   const std::int64_t side = 6 + 8 * std::int64_t{edge.num_joints};

@@ -1,7 +1,10 @@
 #include "common/bus/convert.h"
 
 #include <Eigen/Geometry>
+#include <algorithm>
+#include <memory>
 #include <stdexcept>
+#include <string>
 
 namespace bodyschema {
 
@@ -92,13 +95,97 @@ static_assert(static_cast<int>(Unconnected::kNotEnoughData) ==
 static_assert(static_cast<int>(Unconnected::kNoValidModel) ==
               unconnected_part_t::REASON_NO_VALID_MODEL);
 
+// Columns one after the other, as Eigen keeps them.
+std::vector<double> to_values(const Eigen::MatrixXd& matrix) {
+  return {matrix.data(), matrix.data() + matrix.size()};
+}
+
+Eigen::MatrixXd to_matrix(const std::vector<double>& values, std::size_t num_rows,
+                          std::size_t num_columns) {
+  if (values.size() != num_rows * num_columns)
+    throw std::invalid_argument("a Gaussian process does not go with its numbers of values");
+  return Eigen::Map<const Eigen::MatrixXd>(values.data(), static_cast<Eigen::Index>(num_rows),
+                                           static_cast<Eigen::Index>(num_columns));
+}
+
+residual_gp_t to_message(const ResidualGp& gp) {
+  residual_gp_t message{};
+  const ResidualGp::Prior& prior = gp.prior();
+  message.gp_length_scales = to_values(prior.length_scales);
+  set_array(message.num_gp_signals, message.gp_signals,
+            std::vector<std::int32_t>(gp.signals().begin(), gp.signals().end()));
+  std::copy(prior.variances.begin(), prior.variances.end(), message.gp_variances);
+  std::copy(prior.noise_variances.begin(), prior.noise_variances.end(), message.gp_noise_variances);
+  set_array(message.num_gp_samples, message.gp_noise_scales, to_values(gp.noise_scales()));
+  set_array(message.num_gp_inputs, message.gp_inputs, to_values(gp.inputs()));
+  set_array(message.num_gp_residuals, message.gp_residuals, to_values(gp.residuals()));
+  return message;
+}
+
+std::shared_ptr<const ResidualGp> from_message(const residual_gp_t& message) {
+  const std::size_t D = message.gp_signals.size(), N = message.gp_noise_scales.size();
+  ResidualGp::Prior prior;
+  prior.length_scales = to_matrix(message.gp_length_scales, D, 1);
+  prior.variances = Eigen::Map<const Vector6d>(message.gp_variances);
+  prior.noise_variances = Eigen::Map<const Vector6d>(message.gp_noise_variances);
+  return std::make_shared<const ResidualGp>(
+      std::vector<int>(message.gp_signals.begin(), message.gp_signals.end()),
+      to_matrix(message.gp_inputs, D, N), to_matrix(message.gp_residuals, 6, N),
+      to_matrix(message.gp_noise_scales, N, 1), std::move(prior));
+}
+
+matrix_gp_t to_message(const MatrixGp& gp) {
+  if (gp.num_samples() > ResidualGp::kMaxSamples)
+    throw std::invalid_argument("a matrix GP of " + std::to_string(gp.num_samples()) +
+                                " samples cannot travel: a message holds " +
+                                std::to_string(ResidualGp::kMaxSamples));
+  matrix_gp_t message{};
+  set_array(message.num_matrix_signals, message.matrix_signals,
+            std::vector<std::int32_t>(gp.signals().begin(), gp.signals().end()));
+  std::vector<double> lengths;
+  for (int e = 0; e < MatrixGp::kNumEntries; ++e) {
+    const GpPrior& prior = gp.prior(e);
+    if (prior.mean || prior.kernel.terms().size() != 1)
+      throw std::invalid_argument(
+          "a matrix GP travels about unknown means, with one squared exponential an entry");
+    const SquaredExponential& term = prior.kernel.terms().front();
+    lengths.insert(lengths.end(), term.length_scales.begin(), term.length_scales.end());
+    message.entry_variances[e] = term.variance;
+    message.entry_noise_variances[e] = prior.noise_variance;
+  }
+  set_array(message.num_entry_lengths, message.entry_length_scales, std::move(lengths));
+  std::vector<pose_t> poses;
+  for (const Pose& z : gp.poses()) poses.push_back(bodyschema::to_message(z));
+  set_array(message.num_matrix_poses, message.matrix_poses, std::move(poses));
+  set_array(message.num_matrix_inputs, message.matrix_inputs, to_values(gp.inputs()));
+  return message;
+}
+
+std::shared_ptr<const MatrixGp> from_message(const matrix_gp_t& message) {
+  const std::size_t D = message.matrix_signals.size(), N = message.matrix_poses.size();
+  const Eigen::MatrixXd lengths = to_matrix(message.entry_length_scales, D, MatrixGp::kNumEntries);
+  std::vector<GpPrior> priors;
+  for (int e = 0; e < MatrixGp::kNumEntries; ++e)
+    priors.push_back({std::nullopt, SquaredExponential{message.entry_variances[e], lengths.col(e)},
+                      message.entry_noise_variances[e]});
+  std::vector<Pose> poses;
+  for (const pose_t& z : message.matrix_poses) poses.push_back(bodyschema::from_message(z));
+  return std::make_shared<const MatrixGp>(
+      std::vector<int>(message.matrix_signals.begin(), message.matrix_signals.end()),
+      to_matrix(message.matrix_inputs, D, N), std::move(poses), std::move(priors));
+}
+
+std::int8_t base_kind_of(const Edge& edge) {
+  if (edge.matrix_gp) return schema_edge_t::EDGE_MATRIX_GP;
+  if (edge.residual_gp) return schema_edge_t::EDGE_SCREW_GP;
+  return edge.joints.empty() ? schema_edge_t::EDGE_RIGID : schema_edge_t::EDGE_SCREW;
+}
+
 schema_edge_t to_message(const Edge& edge) {
-  if (edge.matrix_gp)
-    throw std::invalid_argument("an edge that is a matrix GP cannot travel: no message holds it");
   schema_edge_t message{};
   message.from_part = edge.from;
   message.to_part = edge.to;
-  message.base_kind = edge.joints.empty() ? schema_edge_t::EDGE_RIGID : schema_edge_t::EDGE_SCREW;
+  message.base_kind = base_kind_of(edge);
   message.X_left = bodyschema::to_message(edge.left);
   std::vector<screw_joint_t> joints;
   for (const ScrewJoint& joint : edge.joints) {
@@ -111,6 +198,11 @@ schema_edge_t to_message(const Edge& edge) {
     out.X_after = bodyschema::to_message(joint.X_after);
   }
   set_array(message.num_joints, message.joints, std::move(joints));
+  if (edge.residual_gp)
+    set_array(message.num_residual_gp, message.residual_gp,
+              std::vector{to_message(*edge.residual_gp)});
+  if (edge.matrix_gp)
+    set_array(message.num_matrix_gp, message.matrix_gp, std::vector{to_message(*edge.matrix_gp)});
   message.X_right = bodyschema::to_message(edge.right);
   const Eigen::MatrixXd& covariance = edge.parameter_covariance;
   std::vector<float> packed;
@@ -142,6 +234,8 @@ Edge from_message(const schema_edge_t& message) {
     out.turn = joint.turn_rad;
     out.X_after = bodyschema::from_message(joint.X_after);
   }
+  if (!message.residual_gp.empty()) edge.residual_gp = from_message(message.residual_gp.front());
+  if (!message.matrix_gp.empty()) edge.matrix_gp = from_message(message.matrix_gp.front());
   edge.right = bodyschema::from_message(message.X_right);
   if (!message.parameter_covariance.empty()) {
     const auto side = static_cast<Eigen::Index>(6 + 8 * edge.joints.size());

@@ -12,7 +12,7 @@
 namespace bodyschema {
 namespace {
 
-/// Levenshtein distance: what turns an unknown key into "did you mean".
+/// Levenshtein distance: what turns an unknown word into "did you mean".
 std::size_t edit_distance(const std::string& a, const std::string& b) {
   std::vector<std::size_t> row(b.size() + 1);
   for (std::size_t j = 0; j <= b.size(); ++j) row[j] = j;
@@ -27,20 +27,20 @@ std::size_t edit_distance(const std::string& a, const std::string& b) {
   return row[b.size()];
 }
 
-std::string nearest(const std::string& key, const std::set<std::string>& known) {
-  const auto best = std::min_element(known.begin(), known.end(), [&](const auto& a, const auto& b) {
-    return edit_distance(key, a) < edit_distance(key, b);
-  });
-  if (best == known.end()) return "";
-  return "; did you mean '" + *best + "'?";
-}
-
 bool same_mapping(const YAML::Node& a, const YAML::Node& b) { return a.is(b); }
 
 /// Counted from 1. An empty file's node stands nowhere.
 int line_of(const YAML::Node& node) { return std::max(node.Mark().line, 0) + 1; }
 
 }  // namespace
+
+std::string did_you_mean(const std::string& word, const std::set<std::string>& known) {
+  const auto best = std::min_element(known.begin(), known.end(), [&](const auto& a, const auto& b) {
+    return edit_distance(word, a) < edit_distance(word, b);
+  });
+  if (best == known.end()) return "";
+  return "; did you mean '" + *best + "'?";
+}
 
 struct Yaml::File {
   std::filesystem::path name;
@@ -267,7 +267,7 @@ void Yaml::finish() const {
   for (const auto& entry : *node_) {
     const auto key = entry.first.as<std::string>();
     if (!usage_->asked.count(key)) {
-      throw error(key, "this key is unknown" + nearest(key, usage_->asked));
+      throw error(key, "this key is unknown" + did_you_mean(key, usage_->asked));
     }
   }
   for (const Yaml& below : usage_->below) below.finish();

@@ -3,6 +3,8 @@
 #include <algorithm>
 #include <stdexcept>
 
+#include "common/schema/kinematic_path.h"
+
 namespace bodyschema {
 namespace {
 
@@ -21,43 +23,28 @@ double screw_displacement(const ScrewJoint& joint, const Eigen::VectorXd& theta)
   return joint.gain * theta(joint.signal) + joint.offset;
 }
 
-// One step along a path: an edge, walked forwards or backwards.
-struct Step {
-  const Edge* edge;
-  bool forward;
-};
-
-// The path from part `from` to part `to`, or std::nullopt. Works for edges in any order.
-std::optional<std::vector<Step>> path_between(const std::vector<Edge>& edges, int from, int to) {
-  std::map<int, Step> reached_by;  // part → the step that reached it
-  std::vector<int> frontier{from};
-  std::map<int, int> predecessor{{from, from}};
-  while (!frontier.empty() && !predecessor.count(to)) {
-    std::vector<int> next;
-    for (const int part : frontier) {
-      for (const Edge& edge : edges) {
-        const bool forward = edge.from == part;
-        if (!forward && edge.to != part) continue;
-        const int other = forward ? edge.to : edge.from;
-        if (!predecessor.emplace(other, part).second) continue;
-        reached_by.emplace(other, Step{&edge, forward});
-        next.push_back(other);
-      }
-    }
-    frontier = std::move(next);
-  }
-  if (!predecessor.count(to)) return std::nullopt;
-  std::vector<Step> path;
-  for (int part = to; part != from; part = predecessor.at(part))
-    path.push_back(reached_by.at(part));
-  std::reverse(path.begin(), path.end());
-  return path;
+void check_size(const BodySchema& schema, const Eigen::VectorXd& action) {
+  if (action.size() != static_cast<Eigen::Index>(schema.signals.size()))
+    throw std::invalid_argument("action has " + std::to_string(action.size()) + " values, not " +
+                                std::to_string(schema.signals.size()));
 }
+
+// Exp(ρ(θ)) · right, and how the pose moves with ρ: Exp(ρ + δ) = Exp(ρ) · Exp(J_r(ρ) δ).
+struct Residual {
+  Residual(const ResidualGp& gp, const Eigen::VectorXd& theta, const Pose& right) {
+    const Vector6d rho = gp.mean(theta);
+    suffix = exp(rho) * right;
+    by_mean = adjoint(right.inverse()) * right_jacobian_inverse(rho).inverse();
+  }
+  Pose suffix;
+  Matrix6d by_mean;
+};
 
 }  // namespace
 
 const char* Edge::kind() const {
   if (matrix_gp) return "matrix_gp";
+  if (residual_gp) return "screw_gp";
   return joints.empty() ? "rigid" : "screw";
 }
 
@@ -67,6 +54,9 @@ std::vector<int> Edge::signals() const {
   for (const ScrewJoint& joint : joints)
     if (std::find(result.begin(), result.end(), joint.signal) == result.end())
       result.push_back(joint.signal);
+  if (residual_gp)
+    for (const int signal : residual_gp->signals())
+      if (std::find(result.begin(), result.end(), signal) == result.end()) result.push_back(signal);
   return result;
 }
 
@@ -75,6 +65,7 @@ Pose Edge::predict(const Eigen::VectorXd& theta) const {
   Pose X = left;
   for (const ScrewJoint& joint : joints)
     X = X * screw_motion(joint, screw_displacement(joint, theta)) * joint.X_after;
+  if (residual_gp) X = X * exp(residual_gp->mean(theta));
   return X * right;
 }
 
@@ -82,6 +73,11 @@ Eigen::MatrixXd Edge::jacobian(const Eigen::VectorXd& theta) const {
   if (matrix_gp) return adjoint(right.inverse()) * matrix_gp->jacobian(theta);
   Eigen::MatrixXd J = Eigen::MatrixXd::Zero(6, theta.size());
   Pose suffix = right;  // what follows the joint's own motion, which commutes with its screw
+  if (residual_gp) {
+    const Residual residual(*residual_gp, theta, right);
+    J = residual.by_mean * residual_gp->mean_gradient(theta);
+    suffix = residual.suffix;
+  }
   for (auto joint = joints.rbegin(); joint != joints.rend(); ++joint) {
     const double displacement = screw_displacement(*joint, theta);
     suffix = joint->X_after * suffix;
@@ -92,17 +88,10 @@ Eigen::MatrixXd Edge::jacobian(const Eigen::VectorXd& theta) const {
   return J;
 }
 
-Matrix6d Edge::prediction_covariance(const Eigen::VectorXd& theta) const {
-  if (matrix_gp) {
-    const Matrix6d A = adjoint(right.inverse());
-    return A * matrix_gp->prediction_covariance(theta) * A.transpose();
-  }
-  const Eigen::Index size = 6 + 8 * static_cast<Eigen::Index>(joints.size());
-  if (parameter_covariance.rows() != size || parameter_covariance.cols() != size)
-    return Matrix6d::Zero();
-  // ∂(right perturbation of the prediction)/∂parameters, from the last parameter to the first.
-  Eigen::MatrixXd G(6, size);
-  Pose suffix = right;
+Eigen::MatrixXd Edge::parameter_jacobian(const Eigen::VectorXd& theta) const {
+  Eigen::MatrixXd G(6, 6 + 8 * static_cast<Eigen::Index>(joints.size()));
+  // From the last parameter to the first.
+  Pose suffix = residual_gp ? Residual(*residual_gp, theta, right).suffix : right;
   for (std::size_t d = joints.size(); d-- > 0;) {
     const ScrewJoint& joint = joints[d];
     const double displacement = screw_displacement(joint, theta);
@@ -115,7 +104,30 @@ Matrix6d Edge::prediction_covariance(const Eigen::VectorXd& theta) const {
     suffix = screw_motion(joint, displacement) * suffix;
   }
   G.leftCols<6>() = adjoint(suffix.inverse());
-  return G * parameter_covariance * G.transpose();
+  return G;
+}
+
+Matrix6d Edge::prediction_covariance(const Eigen::VectorXd& theta) const {
+  if (matrix_gp) {
+    const Matrix6d A = adjoint(right.inverse());
+    return A * matrix_gp->prediction_covariance(theta) * A.transpose();
+  }
+  const Eigen::MatrixXd G = parameter_jacobian(theta);
+  Matrix6d covariance = Matrix6d::Zero();
+  if (parameter_covariance.rows() == G.cols() && parameter_covariance.cols() == G.cols())
+    covariance = G * parameter_covariance * G.transpose();
+  if (residual_gp) {
+    const Matrix6d by_mean = Residual(*residual_gp, theta, right).by_mean;
+    covariance += by_mean * residual_gp->variance(theta).asDiagonal() * by_mean.transpose();
+  }
+  return covariance;
+}
+
+Matrix6d Edge::empirical_covariance() const {
+  Vector6d variances;
+  variances.head<3>().setConstant(position_rms_m * position_rms_m / 3);
+  variances.tail<3>().setConstant(rotation_rms_rad * rotation_rms_rad / 3);
+  return variances.asDiagonal();
 }
 
 bool BodySchema::has_part(int part) const {
@@ -134,9 +146,7 @@ std::vector<int> BodySchema::unused_signals() const {
 }
 
 Eigen::VectorXd BodySchema::displacements(const Eigen::VectorXd& action) const {
-  if (action.size() != static_cast<Eigen::Index>(signals.size()))
-    throw std::invalid_argument("action has " + std::to_string(action.size()) + " values, not " +
-                                std::to_string(signals.size()));
+  check_size(*this, action);
   Eigen::VectorXd theta = action;
   for (std::size_t s = 0; s < signals.size(); ++s) {
     theta(static_cast<Eigen::Index>(s)) =
@@ -145,26 +155,12 @@ Eigen::VectorXd BodySchema::displacements(const Eigen::VectorXd& action) const {
   return theta;
 }
 
-std::optional<PosePrediction> BodySchema::predict(int from, int to,
-                                                  const Eigen::VectorXd& action) const {
-  const Eigen::VectorXd theta = displacements(action);
-  const auto path = path_between(edges, from, to);
+std::optional<PosePrediction> BodySchema::predict(int from, int to, const Eigen::VectorXd& action,
+                                                  Variance variance) const {
+  check_size(*this, action);
+  const auto path = KinematicPath::between(*this, from, to);
   if (!path) return std::nullopt;
-  PosePrediction result;
-  for (const Step& step : *path) {
-    Pose X = step.edge->predict(theta);
-    Matrix6d covariance = step.edge->prediction_covariance(theta);
-    if (!step.forward) {
-      // (X exp ε)⁻¹ = X⁻¹ exp(−Ad(X) ε)
-      const Matrix6d A = adjoint(X);
-      covariance = A * covariance * A.transpose();
-      X = X.inverse();
-    }
-    const Matrix6d A = adjoint(X.inverse());
-    result.covariance = A * result.covariance * A.transpose() + covariance;
-    result.X_AB = result.X_AB * X;
-  }
-  return result;
+  return PosePrediction{path->predict(action), path->covariance(action, variance)};
 }
 
 std::map<int, Pose> BodySchema::predict_all(const Eigen::VectorXd& action) const {
@@ -192,23 +188,11 @@ std::map<int, Pose> BodySchema::predict_all(const Eigen::VectorXd& action) const
 
 std::optional<Eigen::MatrixXd> BodySchema::jacobian(int from, int to,
                                                     const Eigen::VectorXd& action) const {
-  const Eigen::VectorXd theta = displacements(action);
-  const auto path = path_between(edges, from, to);
+  check_size(*this, action);
+  const auto path = KinematicPath::between(*this, from, to);
   if (!path) return std::nullopt;
-  Eigen::MatrixXd J = Eigen::MatrixXd::Zero(6, action.size());
-  for (const Step& step : *path) {
-    Pose X = step.edge->predict(theta);
-    Eigen::MatrixXd J_edge = step.edge->jacobian(theta);
-    if (!step.forward) {
-      J_edge = -adjoint(X) * J_edge;
-      X = X.inverse();
-    }
-    J = adjoint(X.inverse()) * J + J_edge;
-  }
-  for (std::size_t s = 0; s < signals.size(); ++s) {
-    const auto column = static_cast<Eigen::Index>(s);
-    J.col(column) *= signals[s].displacement_rate(action(column));
-  }
+  PoseJacobian J;
+  path->predict(action, &J);
   return J;
 }
 

@@ -9,6 +9,7 @@
 
 #include "common/geometry/pose.h"
 #include "common/schema/matrix_gp.h"
+#include "common/schema/residual_gp.h"
 #include "common/schema/signal.h"
 
 namespace bodyschema {
@@ -25,10 +26,26 @@ struct ScrewJoint {
   Pose X_after = Pose::Identity();  ///< the constant transform that follows
 };
 
+/// Derivative of a pose by an action, 6×m: (translation [m], rotation [rad]) per command unit.
+using PoseJacobian = Eigen::Matrix<double, 6, Eigen::Dynamic>;
+
+/// What the covariance of a prediction is made from.
+enum class Variance {
+  /// Of the mean: what the samples left open about the parameters, to first order. Small where the
+  /// model is right, and too small where it is not.
+  kFirstOrder,
+  /// Of what will be seen: mean squares of the edges' leave-one-out residuals (the chapter prefers
+  /// variances estimated from the data, Section 3.3). The noise of two markers is in every edge, so
+  /// along a path this is an upper bound; see empirical_covariance() in kinematic_path.h for that
+  /// of a whole path.
+  kEmpirical,
+};
+
 enum class EdgeState : std::int8_t { kOk = 0, kSuspect = 1, kInvalid = 2, kProvisional = 3 };
 
 /// A local model Δ_ij(θ) = X_ij between two body parts (Section 3.1 of the chapter):
-///   Δ(θ) = left · ∏_d [Exp(ŝ_d (a_d θ_d + b_d)) · X_after_d] · right.
+///   Δ(θ) = left · ∏_d [Exp(ŝ_d (a_d θ_d + b_d)) · X_after_d] · Exp(ρ(θ)) · right,
+/// ρ = 0 unless there is a residual GP (soft bodies).
 /// No joints: a rigid edge. θ holds the displacement of every signal: BodySchema::displacements()
 /// of the action, which is the action itself where commands are linear. Where there is a matrix GP
 /// it stands between left and right instead.
@@ -39,10 +56,13 @@ struct Edge {
   std::vector<ScrewJoint> joints;
   /// The chapter's local model, or null. It never changes, so copies of the edge share it.
   std::shared_ptr<const MatrixGp> matrix_gp;
+  /// What the screws leave of a soft body, or null. It never changes either.
+  std::shared_ptr<const ResidualGp> residual_gp;
   Pose right = Pose::Identity();
 
   /// Covariance of the parameters, order: left tangent (6); per joint: slide, turn, X_after tangent
-  /// (6). Right perturbations. Side 6 + 8·|joints|. Singular along the gauge of the screw frames.
+  /// (6). Right perturbations. Side 6 + 8·|joints|. Singular along the gauge of the screw frames. As
+  /// the two parts' own poses tell: an upper bound where the whole tree was fitted at once.
   Eigen::MatrixXd parameter_covariance;
 
   /// Root mean square of the leave-one-out residuals of the inliers: over the three axes together.
@@ -54,18 +74,24 @@ struct Edge {
   double confidence = 1;
   EdgeState state = EdgeState::kOk;
 
-  /// "rigid", "screw" or "matrix_gp".
+  /// "rigid", "screw", "screw_gp" (with a residual GP, also without any joint) or "matrix_gp".
   const char* kind() const;
-  /// Distinct signal indices, in the order of the joints.
+  /// Distinct signal indices, in the order of the joints; then those of the residual GP alone.
   std::vector<int> signals() const;
 
   Pose predict(const Eigen::VectorXd& theta) const;
   /// ∂/∂θ of the predicted pose: 6×m, right perturbation in the frame of `to`:
   /// predict(θ + δ) = predict(θ) · exp(J δ + O(δ²)).
   Eigen::MatrixXd jacobian(const Eigen::VectorXd& theta) const;
+  /// ∂/∂parameters of the predicted pose, 6×(6 + 8·|joints|): right perturbation in the frame of
+  /// `to`, parameters in the order of parameter_covariance. Of the screws, not of a matrix GP.
+  Eigen::MatrixXd parameter_jacobian(const Eigen::VectorXd& theta) const;
   /// First-order covariance of the prediction (right perturbation in the frame of `to`): from
-  /// parameter_covariance, or from the matrix GP's own variances.
+  /// parameter_covariance and the residual GP's variances, or from the matrix GP's.
   Matrix6d prediction_covariance(const Eigen::VectorXd& theta) const;
+  /// Covariance of an observed pose about the predicted one, from position_rms_m and
+  /// rotation_rms_rad, alike along all axes; the same everywhere.
+  Matrix6d empirical_covariance() const;
 };
 
 /// Why a part has no edge.
@@ -121,10 +147,11 @@ struct BodySchema {
   /// @throws std::invalid_argument if `action` does not have one value per signal.
   Eigen::VectorXd displacements(const Eigen::VectorXd& action) const;
 
-  /// Pose of part `to` in part `from` along the tree, with first-order covariance (Section 3.3,
-  /// eq. 17). std::nullopt if they are not connected.
+  /// Pose of part `to` in part `from` along the tree (Section 3.3, eq. 17). std::nullopt if they
+  /// are not connected. Finds the way anew each time: who asks often makes a KinematicPath.
   /// @throws std::invalid_argument if `action` does not have one value per signal.
-  std::optional<PosePrediction> predict(int from, int to, const Eigen::VectorXd& action) const;
+  std::optional<PosePrediction> predict(int from, int to, const Eigen::VectorXd& action,
+                                        Variance variance = Variance::kFirstOrder) const;
   /// All parts connected to the root, X_RB by part id.
   std::map<int, Pose> predict_all(const Eigen::VectorXd& action) const;
   /// 6×m Jacobian of the pose of `to` in `from`; right perturbation in the frame of `to`.

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <utility>
 
 namespace bodyschema {
 namespace {
@@ -12,36 +13,40 @@ double position_in(const Signal& signal, double q) {
   return half > 0 ? (q - signal.lower) / half - 1 : 0;
 }
 
+/// φ of the first sine.
+double phase_of(double x) { return 0.5 * M_PI * (1 + x / kWarpReach); }
+
 }  // namespace
 
 Eigen::VectorXd warp_basis(double x, int size) {
-  const double phase = 0.5 * M_PI * (1 + x / kWarpReach);
+  const double phase = phase_of(x);
   Eigen::VectorXd phi(size);
   for (int n = 0; n < size; ++n) phi(n) = std::sin((n + 1) * phase);
   return phi;
 }
 
-Eigen::VectorXd warp_basis_rate(double x, int size) {
-  const double phase = 0.5 * M_PI * (1 + x / kWarpReach);
-  Eigen::VectorXd rate(size);
-  for (int n = 0; n < size; ++n)
-    rate(n) = (n + 1) * 0.5 * M_PI / kWarpReach * std::cos((n + 1) * phase);
-  return rate;
-}
-
+// Both sums by Clenshaw's recurrence, without memory and with one sine and cosine: Σ wₙ sin((n+1)φ)
+// = b₁ sin φ and Σ wₙ cos((n+1)φ) = b₁ cos φ − b₂ with bₖ = wₖ + 2 cos φ bₖ₊₁ − bₖ₊₂. The phase
+// stays clear of 0 and π, where it would lose digits.
 double Signal::displacement(double q) const {
   if (warp.empty()) return q;
-  const double x = std::clamp(position_in(*this, q), -1.0, 1.0);
-  const Eigen::Map<const Eigen::VectorXd> w(warp.data(), static_cast<Eigen::Index>(warp.size()));
-  return q + warp_basis(x, static_cast<int>(warp.size())).dot(w);
+  const double phase = phase_of(std::clamp(position_in(*this, q), -1.0, 1.0));
+  const double twice_cosine = 2 * std::cos(phase);
+  double b1 = 0, b2 = 0;
+  for (std::size_t n = warp.size(); n-- > 0;)
+    b2 = std::exchange(b1, warp[n] + twice_cosine * b1 - b2);
+  return q + b1 * std::sin(phase);
 }
 
 double Signal::displacement_rate(double q) const {
   const double half = 0.5 * (upper - lower);
   const double x = position_in(*this, q);
   if (warp.empty() || half <= 0 || x < -1 || x > 1) return 1;
-  const Eigen::Map<const Eigen::VectorXd> w(warp.data(), static_cast<Eigen::Index>(warp.size()));
-  return 1 + warp_basis_rate(x, static_cast<int>(warp.size())).dot(w) / half;
+  const double phase = phase_of(x), cosine = std::cos(phase);
+  double b1 = 0, b2 = 0;
+  for (std::size_t n = warp.size(); n-- > 0;)
+    b2 = std::exchange(b1, static_cast<double>(n + 1) * warp[n] + 2 * cosine * b1 - b2);
+  return 1 + 0.5 * M_PI / kWarpReach * (b1 * cosine - b2) / half;
 }
 
 }  // namespace bodyschema

@@ -14,7 +14,7 @@ struct Signal {
   double upper = 0;
   /// What bends the command, w in θ(q) = q + φ(q)ᵀw [command units]; empty: linear. θ, and not q,
   /// is what moves the joints on this signal. See warp_basis().
-  std::vector<double> warp;
+  std::vector<double> warp = {};
 
   /// Displacement θ(q) that belongs to the command q, both in command units.
   double displacement(double q) const;
@@ -28,8 +28,6 @@ struct Signal {
 /// Hilbert space methods for reduced-rank Gaussian process regression, 2020). Beyond the limits the
 /// warp stays what it is there.
 Eigen::VectorXd warp_basis(double x, int size);
-/// dφ/dx.
-Eigen::VectorXd warp_basis_rate(double x, int size);
 inline constexpr double kWarpReach = 1.3;
 
 }  // namespace bodyschema

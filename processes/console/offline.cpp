@@ -6,6 +6,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <filesystem>
 #include <iostream>
 #include <memory>
 #include <stdexcept>
@@ -28,6 +29,8 @@ Recording load(const std::string& file) {
   return recording;
 }
 
+constexpr int kLargestSchema = 64'000;  // lcmtypes/README.md
+
 struct LearnArguments {
   std::string samples;
   std::string out;
@@ -37,11 +40,12 @@ struct LearnArguments {
   bool json = false;
 };
 
-/// The chapter's own method: a result to compare with, not a schema that a process could use.
+/// The chapter's own method: a result to compare with.
 BodySchema learn_as_the_chapter(const Recording& recording, const LearnOptions& options) {
   BaselineOptions baseline;
   baseline.root = options.root;
   if (options.noise) baseline.set_noise(*options.noise);
+  baseline.max_samples = std::min(baseline.max_samples, ResidualGp::kMaxSamples);  // to be written
   const BaselineResult result = learn_baseline(recording.signals, recording.training(), baseline);
   std::cerr << result.num_fits << " local models learned, " << result.num_valid << " valid, "
             << result.seconds << " s" << std::endl;
@@ -60,6 +64,10 @@ void run_learn(const LearnArguments& arguments) {
         throw std::invalid_argument("--noise: expected two standard deviations above 0");
     }
   }
+  std::error_code is_new;
+  if (!arguments.out.empty() &&
+      std::filesystem::equivalent(arguments.out, arguments.samples, is_new) && !is_new)
+    throw std::invalid_argument("--out: " + arguments.out + " is the recording itself");
   const std::vector<ActionPoseSample> training = recording.training();
   if (options.root) {
     bool is_seen = false;
@@ -72,9 +80,6 @@ void run_learn(const LearnArguments& arguments) {
   }
   LearnResult result;
   if (arguments.method == "chapter") {
-    if (!arguments.out.empty())
-      throw std::invalid_argument(
-          "--out: no message holds matrix GPs; print the result instead, or use --method screw");
     result.schema = learn_as_the_chapter(recording, options);
   } else {
     result = learn(recording.signals, training, options);
@@ -82,7 +87,12 @@ void run_learn(const LearnArguments& arguments) {
   if (!arguments.out.empty()) {
     BodySchema schema = result.schema;
     schema.version = schema.last_sample_index + 1;
-    write_one_event_log(arguments.out, kBodySchema, to_message(schema));
+    const body_schema_t message = to_message(schema);
+    if (message.getEncodedSize() >= kLargestSchema)
+      throw std::runtime_error(
+          "--out: the schema takes " + std::to_string(message.getEncodedSize()) +
+          " bytes, a message holds " + std::to_string(kLargestSchema) + "; use --method screw");
+    write_one_event_log(arguments.out, kBodySchema, message);
   }
   if (arguments.json) {
     std::cout << structure_json(result.schema, result.outliers).dump(2) << std::endl;

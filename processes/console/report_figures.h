@@ -7,7 +7,7 @@
 
 #include "common/schema/body_schema.h"
 #include "common/schema/sample.h"
-#include "processes/console/plot.h"
+#include "common/plot/plot.h"
 #include "processes/console/run_record.h"
 
 namespace bodyschema {

@@ -10,7 +10,7 @@
 #include <vector>
 
 #include "processes/console/evaluation.h"
-#include "processes/console/plot.h"
+#include "common/plot/plot.h"
 #include "processes/console/recording.h"
 #include "processes/console/report_figures.h"
 #include "processes/structure_learner/learn.h"

@@ -45,6 +45,31 @@ ordered_json edge_json(const BodySchema& schema, const Edge& edge) {
           {"outliers", edge.num_outliers}};
 }
 
+std::vector<double> list(const Eigen::VectorXd& values) { return {values.begin(), values.end()}; }
+
+/// The hyper-parameters; the samples stay in the file.
+ordered_json residual_gp_json(const BodySchema& schema, const ResidualGp& gp) {
+  const ResidualGp::Prior& prior = gp.prior();
+  return {{"signals", signal_names(schema, gp.signals())},
+          {"samples", gp.num_samples()},
+          {"length_scales", list(prior.length_scales)},
+          {"variances", list(prior.variances)},
+          {"noise_variances", list(prior.noise_variances)}};
+}
+
+ordered_json matrix_gp_json(const BodySchema& schema, const MatrixGp& gp) {
+  ordered_json json = {{"signals", signal_names(schema, gp.signals())},
+                       {"samples", gp.num_samples()},
+                       {"entries", ordered_json::array()}};
+  for (int e = 0; e < MatrixGp::kNumEntries; ++e) {
+    const GpPrior& prior = gp.prior(e);
+    json["entries"].push_back({{"length_scales", list(prior.kernel.terms().front().length_scales)},
+                               {"variance", prior.kernel.variance()},
+                               {"noise_variance", prior.noise_variance}});
+  }
+  return json;
+}
+
 ordered_json pose_json(const Pose& X) {
   const Eigen::Quaterniond q(X.linear());
   return {{"position_m", {X.translation().x(), X.translation().y(), X.translation().z()}},
@@ -101,7 +126,8 @@ ordered_json schema_json(const BodySchema& schema) {
   json["signals"] = ordered_json::array();
   for (const Signal& signal : schema.signals) {
     json["signals"].push_back(
-        {{"name", signal.name}, {"lower", signal.lower}, {"upper", signal.upper}});
+        {{"name", signal.name}, {"lower", signal.lower}, {"upper", signal.upper},
+         {"warp", signal.warp}});
   }
   static const char* const kStates[] = {"OK", "SUSPECT", "INVALID", "PROVISIONAL"};
   for (std::size_t i = 0; i < schema.edges.size(); ++i) {
@@ -120,6 +146,8 @@ ordered_json schema_json(const BodySchema& schema) {
                                 {"turn_rad", joint.turn},
                                 {"X_after", pose_json(joint.X_after)}});
     }
+    if (edge.residual_gp) item["residual_gp"] = residual_gp_json(schema, *edge.residual_gp);
+    if (edge.matrix_gp) item["matrix_gp"] = matrix_gp_json(schema, *edge.matrix_gp);
     item["right"] = pose_json(edge.right);
   }
   return json;
@@ -130,7 +158,7 @@ std::string structure_text(const BodySchema& schema) {
                                  schema.complete ? "Complete" : "Incomplete", schema.parts.size(),
                                  schema.num_samples);
   for (const Edge& edge : schema.edges) {
-    text += fmt::format("  {:>3} → {:<3} {:<6} {:<12} {:7.2f} mm {:6.2f}°\n", edge.from, edge.to,
+    text += fmt::format("  {:>3} → {:<3} {:<9} {:<12} {:7.2f} mm {:6.2f}°\n", edge.from, edge.to,
                         edge.kind(),
                         fmt::format("{{{}}}", fmt::join(signal_names(schema, edge.signals()), ",")),
                         edge.position_rms_m * 1e3, edge.rotation_rms_rad * kDegrees);

@@ -53,7 +53,8 @@ const edge_health_t* find_health(const std::optional<model_health_t>& health,
 }
 
 std::string kind_of(const schema_edge_t& edge) {
-  return edge.base_kind == schema_edge_t::EDGE_RIGID ? "rigid" : "screw";
+  static const char* const kKinds[] = {"rigid", "screw", "screw_gp", "matrix_gp"};
+  return kKinds[edge.base_kind];
 }
 
 /// A counter that tells of normal traffic.

@@ -76,12 +76,10 @@ std::optional<BodySchema> chain_to(const BodySchema& schema, int part) {
   return chain;
 }
 
-Eigen::MatrixXd position_jacobian(const BodySchema& schema, int part,
-                                  const Eigen::VectorXd& action) {
-  const auto X_RB = schema.predict(schema.root, part, action);
-  const auto J_B = schema.jacobian(schema.root, part, action);
-  if (!X_RB || !J_B) throw std::invalid_argument("the part has no way to the root");
-  return X_RB->X_AB.linear() * J_B->topRows<3>();
+Eigen::MatrixXd position_jacobian(const KinematicPath& path, const Eigen::VectorXd& action) {
+  PoseJacobian J_B;
+  const Pose X_RB = path.predict(action, &J_B);
+  return X_RB.linear() * J_B.topRows<3>();
 }
 
 InverseKinematicsSolution solve_position(const BodySchema& schema, int part,
@@ -90,15 +88,15 @@ InverseKinematicsSolution solve_position(const BodySchema& schema, int part,
                                          const Eigen::VectorXd& current,
                                          const InverseKinematicsOptions& options,
                                          const std::vector<Eigen::VectorXd>& avoided) {
-  const auto chain = chain_to(schema, part);
-  if (!chain) throw std::invalid_argument("the part has no way to the root");
+  const auto path = KinematicPath::between(schema, schema.root, part);
+  if (!path) throw std::invalid_argument("the part has no way to the root");
   if (limits.size() != schema.signals.size() ||
       current.size() != static_cast<Eigen::Index>(limits.size())) {
     throw std::invalid_argument("limits and action must have one value per signal");
   }
   const Scale scale(limits);
   const auto error_at = [&](const Eigen::VectorXd& u) -> Eigen::Vector3d {
-    return p_RT - chain->predict(chain->root, part, scale.action(u))->X_AB.translation();
+    return p_RT - path->predict(scale.action(u)).translation();
   };
   const auto is_avoided = [&](const Eigen::VectorXd& u) {
     return std::any_of(avoided.begin(), avoided.end(), [&](const Eigen::VectorXd& action) {
@@ -123,7 +121,7 @@ InverseKinematicsSolution solve_position(const BodySchema& schema, int part,
                     error.norm() > options.tolerance_m;
          ++i) {
       const Eigen::MatrixXd J =
-          position_jacobian(*chain, part, scale.action(u)) * scale.range.matrix().asDiagonal();
+          position_jacobian(*path, scale.action(u)) * scale.range.matrix().asDiagonal();
       const Eigen::VectorXd next = clamped(u + damped_step(J, error, damping_m, u));
       const Eigen::Vector3d next_error = error_at(next);
       if (next_error.norm() < error.norm() - kLeastProgress_m) {

@@ -4,7 +4,7 @@
 #include <optional>
 #include <vector>
 
-#include "common/schema/body_schema.h"
+#include "common/schema/kinematic_path.h"
 
 namespace bodyschema {
 
@@ -21,15 +21,14 @@ struct InverseKinematicsSolution {
   bool is_within_tolerance = false;
 };
 
-/// The edges from the root to one part and nothing else, without covariances: what inverse
-/// kinematics asks thousands of times. std::nullopt if the part has no way to the root.
+/// The edges from the root to one part and nothing else, without covariances. std::nullopt if the
+/// part has no way to the root.
 std::optional<BodySchema> chain_to(const BodySchema& schema, int part);
 
-/// 3×m derivative of the origin of `part` in the root's frame R [m per command unit]: the upper
-/// rows of the schema's Jacobian are in the part's frame (right perturbation), here turned by R_RB.
-/// @throws std::invalid_argument if the part has no way to the root.
-Eigen::MatrixXd position_jacobian(const BodySchema& schema, int part,
-                                  const Eigen::VectorXd& action);
+/// 3×m derivative of a part's origin in the root's frame R [m per command unit]: the upper rows of
+/// the Jacobian of the path from the root are in the part's frame (right perturbation), here turned
+/// by R_RB.
+Eigen::MatrixXd position_jacobian(const KinematicPath& path, const Eigen::VectorXd& action);
 
 /// An action that brings the origin of `part` to `p_RT` [m, root frame]: damped least squares
 /// (Nakamura and Hanafusa 1986; Buss 2004) in signals scaled by their ranges, the damping governed

@@ -7,6 +7,7 @@
 
 #include "common/bus/convert.h"
 #include "common/config/yaml.h"
+#include "common/schema/kinematic_path.h"
 
 namespace bodyschema {
 namespace {
@@ -219,15 +220,15 @@ void ModelMonitor::assess(std::int64_t up_to_sample) {
     const auto num_seen =
         std::upper_bound(indices.begin(), indices.end(), up_to_sample) - indices.begin();
     std::vector<double> position_errors, rotation_errors;
+    const auto path = KinematicPath::between(schema_, schema_.root, part);
     for (const ActionPoseSample& sample : tests_) {
       if (sample.sample_index > up_to_sample) break;
       const PartObservation* seen = sample.find(part);
-      if (!seen || schema_.root < 0 || !fits(sample)) continue;
-      const auto predicted = schema_.predict(schema_.root, part, sample.action);
-      if (!predicted) continue;
+      if (!seen || !path || schema_.root < 0 || !fits(sample)) continue;
       // The camera and the root stand still, so the root's mean pose serves: its orientation noise
       // would otherwise be read as an error of every part far away.
-      const Pose error = predicted->X_AB.inverse() * schema_.X_CR.inverse() * seen->X_CB;
+      const Pose error =
+          path->predict(sample.action).inverse() * schema_.X_CR.inverse() * seen->X_CB;
       position_errors.push_back(error.translation().norm());
       rotation_errors.push_back(rotation_angle(error));
     }

@@ -1,12 +1,16 @@
-// motor_babbler: MOTION_STATUS, SAMPLE, MARKER_POSES, MODEL_HEALTH, CONTROL_STATUS
-//                -> ACTION_COMMAND
+// motor_babbler: MOTION_STATUS, SAMPLE, MARKER_POSES, MODEL_HEALTH, BODY_SCHEMA, CONTROL_STATUS
+//                -> ACTION_COMMAND, SAMPLE_REQUEST
+
+#include <spdlog/spdlog.h>
 
 #include <CLI/CLI.hpp>
 #include <filesystem>
+#include <optional>
 #include <utility>
 
 #include "common/bus/process.h"
 #include "common/bus/rig_door.h"
+#include "common/bus/sample_intake.h"
 #include "common/bus/state_file.h"
 #include "processes/motor_babbler/motor_babbler.h"
 
@@ -16,10 +20,13 @@ int main(int argc, char** argv) {
   std::int64_t seed = 1;
   std::int64_t samples = 0;
   std::filesystem::path state_file;
+  std::string samples_file;
   const auto add_options = [&](CLI::App& app) {
     app.add_option("--seed", seed, "Seed of the random actions");
     app.add_option("--samples", samples, "Stop after exactly this many samples")
         ->check(CLI::PositiveNumber);
+    app.add_option("--samples-file", samples_file,
+                   "The observer's samples.lcmlog, read at start: what an action is chosen by");
     app.add_option("--state", state_file, "Saved before each command, restored at the start");
   };
   const auto body = [&](Process& process) {
@@ -44,8 +51,25 @@ int main(int argc, char** argv) {
     const RigDoor door(process.rig_folder());
     door.subscribe(process, kMotionStatus,
                    [&](const motion_status_t& status) { send(babbler.on_motion_status(status)); });
-    door.subscribe(process, kSample,
-                   [&](const sample_t& sample) { send(babbler.on_sample(sample)); });
+    std::optional<SampleIntake> intake;
+    if (config.choice == Choice::kActive) {
+      intake.emplace(
+          samples_file,
+          [&](const sample_t& sample) {
+            try {
+              send(babbler.remember(sample));
+            } catch (const std::invalid_argument&) {
+              process.count("refused SAMPLE");  // a samples file of another rig
+            }
+          },
+          SampleIntake::asking(process));
+      door.subscribe(process, kBodySchema,
+                     [&](const body_schema_t& schema) { send(babbler.on_body_schema(schema)); });
+    }
+    door.subscribe(process, kSample, [&](const sample_t& sample) {
+      if (intake) intake->on_sample(sample);
+      send(babbler.on_sample(sample));
+    });
     door.subscribe(process, kMarkerPoses,
                    [&](const marker_poses_t& poses) { babbler.on_marker_poses(poses); });
     door.subscribe(process, kModelHealth,
@@ -60,10 +84,16 @@ int main(int argc, char** argv) {
     process.on_idle([&] {
       count("action rejected", babbler.num_rejected());
       count("sample never seen", babbler.num_unseen());
+      const std::string late = "BODY_SCHEMA not in time";
+      if (babbler.num_without_schema() > reported[late])
+        spdlog::warn("no BODY_SCHEMA to choose by: drawn at random up to the next TEST; "
+                     "are structure_learner and model_monitor running?");
+      count(late, babbler.num_without_schema());
       if (state.num_failed() > 0) count("state not saved", state.num_failed());
     });
     process.on_tick([&](std::int64_t now_us) {
       if (!state.problem().empty()) state.retry();
+      if (intake) intake->on_tick(now_us);
       send(babbler.on_tick(now_us));
     });
     process.run();

@@ -18,7 +18,41 @@ constexpr std::int64_t kListen_us = 1'500'000;  // CONTROL_STATUS repeats at 1 H
 constexpr std::int64_t kControlSilent_us = 3'000'000;
 constexpr std::int64_t kEyesSilent_us = 5'000'000;  // frames and SAMPLE repeat at 1 Hz at least
 
+constexpr std::size_t kNumCandidates = 40;
+constexpr std::int64_t kCandidates = 1;  // another stream of random numbers than that of the draw
+// Of the memory: what the arm looked like long ago says little, and a choice takes time for each.
+constexpr std::size_t kMaxMemory = 500;
+
 std::int64_t microseconds(double seconds) { return std::llround(seconds * 1e6); }
+
+std::mt19937_64 engine_of(std::initializer_list<std::int64_t> numbers) {
+  std::vector<std::uint32_t> words;
+  for (const std::int64_t x : numbers) {
+    words.push_back(static_cast<std::uint32_t>(x));
+    words.push_back(static_cast<std::uint32_t>(x >> 32));
+  }
+  std::seed_seq sequence(words.begin(), words.end());
+  return std::mt19937_64(sequence);
+}
+
+Eigen::VectorXd draw(const MotorBabblerConfig& config, double extreme_share,
+                     std::mt19937_64& engine) {
+  std::uniform_real_distribution<double> unit(0, 1);
+  const bool is_extreme = unit(engine) < extreme_share;
+  Eigen::VectorXd action(config.signals.size());
+  for (std::size_t i = 0; i < config.signals.size(); ++i) {
+    const Signal& signal = config.signals[i];
+    const double u = unit(engine);
+    // Position within the range, −1..1.
+    double x = 2 * u - 1;
+    if (is_extreme) {
+      const double side = u < 0.5 ? -1 : 1;
+      x = side * (config.extreme_from + (1 - config.extreme_from) * std::abs(x));
+    }
+    action[i] = 0.5 * (signal.lower + signal.upper) + 0.5 * (signal.upper - signal.lower) * x;
+  }
+  return action;
+}
 
 }  // namespace
 
@@ -26,6 +60,8 @@ MotorBabblerConfig MotorBabblerConfig::load(const std::filesystem::path& file) {
   const Yaml yaml = Yaml::load(file);
   MotorBabblerConfig config;
   config.signals = load_signals(file.parent_path()).signals;
+  config.choice = yaml.choice("choice", {"active", "random"}) == "active" ? Choice::kActive
+                                                                          : Choice::kRandom;
   config.extreme_share = yaml.number("extreme_share", 0, 1);
   config.extreme_from = yaml.number("extreme_from", 0, 1);
   config.test_every = yaml.integer("test_every", 2, 1000);
@@ -45,26 +81,16 @@ MotorBabblerConfig MotorBabblerConfig::load(const std::filesystem::path& file) {
 
 Eigen::VectorXd random_action(const MotorBabblerConfig& config, std::int64_t seed,
                               std::int64_t action_id) {
-  const auto low = [](std::int64_t x) { return static_cast<std::uint32_t>(x); };
-  const auto high = [](std::int64_t x) { return static_cast<std::uint32_t>(x >> 32); };
-  std::seed_seq sequence{low(seed), high(seed), low(action_id), high(action_id)};
-  std::mt19937_64 engine(sequence);
-  std::uniform_real_distribution<double> unit(0, 1);
+  std::mt19937_64 engine = engine_of({seed, action_id});
+  return draw(config, config.extreme_share, engine);
+}
 
-  const bool is_extreme = unit(engine) < config.extreme_share;
-  Eigen::VectorXd action(config.signals.size());
-  for (std::size_t i = 0; i < config.signals.size(); ++i) {
-    const Signal& signal = config.signals[i];
-    const double u = unit(engine);
-    // Position within the range, −1..1.
-    double x = 2 * u - 1;
-    if (is_extreme) {
-      const double side = u < 0.5 ? -1 : 1;
-      x = side * (config.extreme_from + (1 - config.extreme_from) * std::abs(x));
-    }
-    action[i] = 0.5 * (signal.lower + signal.upper) + 0.5 * (signal.upper - signal.lower) * x;
-  }
-  return action;
+std::vector<Eigen::VectorXd> candidate_actions(const MotorBabblerConfig& config, std::int64_t seed,
+                                               std::int64_t action_id) {
+  std::mt19937_64 engine = engine_of({seed, action_id, kCandidates});
+  std::vector<Eigen::VectorXd> candidates;
+  while (candidates.size() < kNumCandidates) candidates.push_back(draw(config, 0, engine));
+  return candidates;
 }
 
 MotorBabbler::MotorBabbler(MotorBabblerConfig config, std::int64_t seed)
@@ -130,11 +156,66 @@ std::optional<action_command_t> MotorBabbler::begin() {
     wait_ = Wait::kAnswer;
     return command_;
   }
-  if (last_test_sample_ == last_sample_ && health_.judged_sample < last_test_sample_) {
-    wait_ = Wait::kVerdict;
-    return std::nullopt;
+  return go_on();
+}
+
+std::optional<action_command_t> MotorBabbler::go_on() {
+  const bool is_test_new = last_test_sample_ == last_sample_;
+  if ((!is_test_new || has_verdict()) && (!is_to_choose() || can_choose())) return act();
+  if (wait_ != Wait::kVerdict) wait_since_us_ = -1;
+  wait_ = Wait::kVerdict;
+  return std::nullopt;
+}
+
+std::int8_t MotorBabbler::next_purpose() const {
+  return num_samples_ % config_.test_every == config_.test_every - 1
+             ? action_command_t::PURPOSE_TEST
+             : action_command_t::PURPOSE_TRAIN;
+}
+
+bool MotorBabbler::is_to_choose() const {
+  return config_.choice == Choice::kActive && next_purpose() == action_command_t::PURPOSE_TRAIN &&
+         is_seen_ && last_test_sample_ >= 0 && without_schema_since_ != last_test_sample_ &&
+         !should_stop();
+}
+
+bool MotorBabbler::can_choose() const {
+  if (!has_verdict()) return false;
+  const bool has_memory = !memory_.empty() && memory_.back().sample_index >= last_sample_;
+  return health_.schema_version == 0 || (schema_version_ == health_.schema_version && has_memory);
+}
+
+Eigen::VectorXd MotorBabbler::next_action() const {
+  if (!is_to_choose() || !can_choose() || health_.schema_version == 0)
+    return random_action(config_, seed_, action_id_);
+  const auto candidates = candidate_actions(config_, seed_, action_id_);
+  return candidates[choose_action(schema_, {memory_.begin(), memory_.end()}, candidates)];
+}
+
+std::optional<action_command_t> MotorBabbler::on_body_schema(const body_schema_t& schema) {
+  if (config_.choice == Choice::kRandom) return std::nullopt;
+  if (schema.schema_version != schema_version_) {
+    schema_ = from_message(schema);
+    schema_version_ = schema.schema_version;
   }
-  return act();
+  return wait_ == Wait::kVerdict ? go_on() : std::nullopt;
+}
+
+std::optional<action_command_t> MotorBabbler::remember(const sample_t& sample) {
+  if (config_.choice == Choice::kRandom) return std::nullopt;
+  // What comes from a samples file has not passed the rig's door.
+  if (sample.num_signals != static_cast<std::int32_t>(config_.signals.size()))
+    throw std::invalid_argument("a sample of another rig: " + std::to_string(sample.num_signals) +
+                                " signals");
+  SeenAction seen;
+  seen.sample_index = sample.sample_index;
+  seen.is_learned_from = sample.purpose == action_command_t::PURPOSE_TRAIN ||
+                         sample.purpose == action_command_t::PURPOSE_PROBE;
+  seen.action = Eigen::Map<const Eigen::VectorXd>(sample.action.data(), sample.num_signals);
+  for (const part_observation_t& part : sample.parts) seen.parts.insert(part.part_id);
+  memory_.push_back(std::move(seen));
+  if (memory_.size() > kMaxMemory) memory_.pop_front();
+  return wait_ == Wait::kVerdict ? go_on() : std::nullopt;
 }
 
 std::optional<action_command_t> MotorBabbler::on_sample(const sample_t& sample) {
@@ -155,12 +236,7 @@ std::optional<action_command_t> MotorBabbler::on_sample(const sample_t& sample) 
   is_seen_ = true;
   num_unseen_in_a_row_ = 0;
   if (wait_ != Wait::kSample && wait_ != Wait::kAnswer) return std::nullopt;
-  if (is_test && health_.judged_sample < last_test_sample_) {
-    wait_ = Wait::kVerdict;
-    wait_since_us_ = -1;
-    return std::nullopt;
-  }
-  return act();
+  return go_on();
 }
 
 void MotorBabbler::on_marker_poses(const marker_poses_t& poses) {
@@ -172,7 +248,7 @@ std::optional<action_command_t> MotorBabbler::on_model_health(const model_health
   if (last_sample_ < 0 && !is_restored_) {
     num_samples_ = std::max(num_samples_, health.judged_sample + 1);
   }
-  if (wait_ == Wait::kVerdict && health_.judged_sample >= last_test_sample_) return act();
+  if (wait_ == Wait::kVerdict) return go_on();
   return std::nullopt;
 }
 
@@ -215,7 +291,13 @@ std::optional<action_command_t> MotorBabbler::on_tick(std::int64_t now_us) {
     ++num_unseen_in_a_row_;
     return act();
   }
-  if (wait_ == Wait::kVerdict && waited_us >= config_.verdict_timeout_us) return act();
+  if (wait_ == Wait::kVerdict && waited_us >= config_.verdict_timeout_us) {
+    if (is_to_choose()) {
+      without_schema_since_ = last_test_sample_;
+      ++num_without_schema_;
+    }
+    return act();
+  }
   return std::nullopt;
 }
 
@@ -236,9 +318,8 @@ bool MotorBabbler::should_stop() const {
   if (num_samples_ >= stop.max_samples) return true;
   // Only right after a TEST sample is a verdict waited for; which others arrive, and when, depends
   // on the speed of learner and monitor.
-  const bool has_verdict = last_sample_ >= 0 && last_test_sample_ == last_sample_ &&
-                           health_.judged_sample >= last_test_sample_;
-  return has_verdict && num_samples_ >= stop.min_samples && health_.schema_complete &&
+  const bool is_judged = last_sample_ >= 0 && last_test_sample_ == last_sample_ && has_verdict();
+  return is_judged && num_samples_ >= stop.min_samples && health_.schema_complete &&
          health_.num_test_samples >= stop.min_test_samples && health_.worst_position_m >= 0 &&
          health_.worst_position_m <= stop.position_m && health_.worst_rotation_rad >= 0 &&
          health_.worst_rotation_rad <= stop.rotation_rad;
@@ -255,6 +336,7 @@ std::optional<action_command_t> MotorBabbler::act() {
     wait_ = Wait::kRest;
     return std::nullopt;
   }
+  const Eigen::VectorXd action = next_action();
   is_seen_ = false;
   command_ = action_command_t{};
   command_.utime = driver_utime_;
@@ -262,11 +344,8 @@ std::optional<action_command_t> MotorBabbler::act() {
   command_.epoch = epoch_;
   command_.action_id = action_id_;
   command_.kind = action_command_t::KIND_MOVE;
-  command_.purpose = num_samples_ % config_.test_every == config_.test_every - 1
-                         ? action_command_t::PURPOSE_TEST
-                         : action_command_t::PURPOSE_TRAIN;
+  command_.purpose = next_purpose();
   command_.expiry_utime = driver_utime_ + config_.expiry_us;
-  const Eigen::VectorXd action = random_action(config_, seed_, action_id_);
   set_array(command_.num_signals, command_.action,
             std::vector<double>(action.data(), action.data() + action.size()));
   ++action_id_;
@@ -297,7 +376,11 @@ std::string MotorBabbler::activity() const {
       return is_late && !blindness().empty() ? text + "; " + blindness() : text;
     }
     case Wait::kVerdict:
-      return samples + ", waiting for MODEL_HEALTH of sample " + std::to_string(last_test_sample_);
+      if (!has_verdict())
+        return samples + ", waiting for MODEL_HEALTH of sample " + std::to_string(last_test_sample_);
+      if (schema_version_ != health_.schema_version)
+        return samples + ", waiting for BODY_SCHEMA version " + std::to_string(health_.schema_version);
+      return samples + ", waiting for the samples up to " + std::to_string(last_sample_);
     case Wait::kRest:
       return samples +
              (is_stopped_ ? ", stopped: waiting for RESUME" : ", waiting for the arm to rest");

@@ -2,18 +2,22 @@
 
 #include <Eigen/Core>
 #include <cstdint>
+#include <deque>
 #include <filesystem>
 #include <optional>
 #include <string>
 #include <vector>
 
 #include "bodyschema/action_command_t.hpp"
+#include "bodyschema/body_schema_t.hpp"
 #include "bodyschema/control_status_t.hpp"
 #include "bodyschema/marker_poses_t.hpp"
 #include "bodyschema/model_health_t.hpp"
 #include "bodyschema/motion_status_t.hpp"
 #include "bodyschema/sample_t.hpp"
 #include "common/config/rig.h"
+#include "common/schema/body_schema.h"
+#include "processes/motor_babbler/action_choice.h"
 
 namespace bodyschema {
 
@@ -28,8 +32,12 @@ struct StoppingRule {
   double rotation_rad = 0;
 };
 
+/// How the next action is found: drawn, or chosen by what the body schema expects to learn from it.
+enum class Choice { kRandom, kActive };
+
 struct MotorBabblerConfig {
   std::vector<Signal> signals;
+  Choice choice = Choice::kRandom;
   double extreme_share = 0;            ///< share of actions drawn from the ends of the ranges, 0..1
   double extreme_from = 0;             ///< these lie at extreme_from..1 of each half range
   std::int64_t test_every = 0;         ///< every n-th sample is TEST
@@ -48,8 +56,12 @@ struct MotorBabblerConfig {
 /// rejected action changes nothing about the others.
 Eigen::VectorXd random_action(const MotorBabblerConfig& config, std::int64_t seed,
                               std::int64_t action_id);
+/// What action `action_id` is chosen from: 40, uniform over the ranges. (With half of them near the
+/// ends fewer structures are right where the view is narrow: tests/experiments/README.md.)
+std::vector<Eigen::VectorXd> candidate_actions(const MotorBabblerConfig& config, std::int64_t seed,
+                                               std::int64_t action_id);
 
-/// Motor babbling: random actions within the limits, one at a time, each answered by the driver and
+/// Motor babbling: actions within the limits, one at a time, each answered by the driver and
 /// followed by its SAMPLE, until the stopping rule holds. Collisions are the driver's to refuse: a
 /// rejected action is replaced by the next.
 ///
@@ -67,6 +79,14 @@ Eigen::VectorXd random_action(const MotorBabblerConfig& config, std::int64_t see
 /// TEST sample it waits for the monitor's verdict, so that with a fast bus or a slow learner the
 /// run ends at the same sample.
 ///
+/// With Choice::kActive an action is chosen (choose_action) by the body schema that the monitor
+/// published with its verdict on the newest TEST sample, and by all samples so far: both are the same
+/// in every run of a seed, however fast learner and monitor are. Drawn at random are: what comes
+/// before the first schema; TEST actions, so that held-out data do not depend on what is judged by
+/// them; what replaces an action that was refused, cut short or not seen, so that no refusal is
+/// chosen again and again; and the actions up to the next TEST where schema or verdict did not come
+/// within verdict_timeout (counted).
+///
 /// A restart with the kept state goes on as if nothing had happened: it sends the last command
 /// again, unless that command's SAMPLE has come. Samples are counted where they are its own, so that every test_every-th of them is TEST whatever others do in between.
 class MotorBabbler {
@@ -78,6 +98,10 @@ class MotorBabbler {
   /// Shows that camera and marker_estimator see the arm at rest.
   void on_marker_poses(const marker_poses_t& poses);
   std::optional<action_command_t> on_model_health(const model_health_t& health);
+  std::optional<action_command_t> on_body_schema(const body_schema_t& schema);
+  /// Every SAMPLE, anybody's, once and in order of its index, as SampleIntake hands them on: what
+  /// a choice rests on. on_sample() hears of the newest when it comes, and of its repetitions.
+  std::optional<action_command_t> remember(const sample_t& sample);
   std::optional<action_command_t> on_control_status(const control_status_t& status);
   /// `now_us`: the clock. Sees silence.
   std::optional<action_command_t> on_tick(std::int64_t now_us);
@@ -90,6 +114,8 @@ class MotorBabbler {
   std::int64_t num_rejected() const { return num_rejected_; }
   /// Settled actions whose SAMPLE never came.
   std::int64_t num_unseen() const { return num_unseen_; }
+  /// TEST samples after which the body schema to choose by did not come in time.
+  std::int64_t num_without_schema() const { return num_without_schema_; }
 
   /// What a restart needs, as YAML; to be on disk before a command is sent. "" before the first.
   std::string state_text() const;
@@ -101,6 +127,15 @@ class MotorBabbler {
 
   std::optional<action_command_t> begin();
   std::optional<action_command_t> act();
+  /// act(), once all is there that the next action rests on.
+  std::optional<action_command_t> go_on();
+  bool has_verdict() const { return health_.judged_sample >= last_test_sample_; }
+  /// The next action is to be chosen, not drawn.
+  bool is_to_choose() const;
+  /// Verdict, its schema (if there is one at all) and every sample so far are there.
+  bool can_choose() const;
+  Eigen::VectorXd next_action() const;
+  std::int8_t next_purpose() const;
   bool may_move() const { return is_at_rest_ && !is_stopped_ && !is_lent_; }
   bool is_mine(const motion_status_t& status) const;
   bool should_stop() const;
@@ -138,6 +173,11 @@ class MotorBabbler {
   bool done_ = false;
   action_command_t command_{};
   model_health_t health_{};
+  std::int64_t schema_version_ = 0;  ///< 0: none was heard
+  BodySchema schema_;
+  std::deque<SeenAction> memory_;
+  std::int64_t without_schema_since_ = -1;  ///< TEST sample whose verdict or schema was given up
+  std::int64_t num_without_schema_ = 0;
 };
 
 }  // namespace bodyschema

@@ -7,9 +7,12 @@
 #include <set>
 #include <stdexcept>
 
+#include "common/schema/kinematic_path.h"
 #include "processes/structure_learner/command_warp.h"
 #include "processes/structure_learner/noise_estimate.h"
+#include "processes/structure_learner/residual_fit.h"
 #include "processes/structure_learner/structure_search.h"
+#include "processes/structure_learner/tree_fit.h"
 
 namespace bodyschema {
 namespace {
@@ -51,23 +54,88 @@ Edge to_edge(const LocalModel& model, const NormalizedActions& actions) {
   return edge;
 }
 
+// The model over actions that are scaled otherwise.
+LocalModel rescaled(LocalModel model, const NormalizedActions& from, const NormalizedActions& to) {
+  for (int d = 0; d < model.num_joints; ++d) {
+    const int s = model.signal[d];
+    const double ratio = to.half_range(s) / from.half_range(s);
+    const double shift = (to.centre(s) - from.centre(s)) / from.half_range(s);
+    Vector6d screw = Vector6d::Zero();
+    screw(2) = model.slide[d] * shift;
+    screw(5) = model.turn[d] * shift;
+    model.A[d] = model.A[d] * exp(screw);
+    model.slide[d] *= ratio;
+    model.turn[d] *= ratio;
+  }
+  return model;
+}
+
 struct FittedEdge {
   Edge edge;
   std::vector<int> frames;  // samples at which it was judged
   std::vector<bool> outlying;
+  bool is_valid = true;  // as far as that was asked
+  LocalModel model;      // what of the edge is screws
 };
+
+// The final fit of a soft edge in its direction. The screws stay as they are: the process says what
+// they leave, and its variance is that of the whole.
+FittedEdge fit_soft_edge(const LocalModel& screws, const std::vector<int>& signals, int from,
+                         int to, const PairData& pair, const NormalizedActions& actions,
+                         const ValidityOptions& validity, bool must_be_valid) {
+  const LocalModel start = fit_local_model(screws, pair, actions, 30, 1e-3).model;
+  const auto fit = fit_soft_model(start, pair, actions, validity, signals);
+  FittedEdge result;
+  result.edge = to_edge(start, actions);
+  result.edge.from = from;
+  result.edge.to = to;
+  result.edge.num_samples = pair.size();
+  result.is_valid = fit && (!must_be_valid || fit->verdict == Verdict::kValid);
+  if (!fit) {  // what the search's part of the data carried, all of them refuse
+    result.edge.num_outliers = pair.size();
+    result.edge.confidence = 0;
+    return result;
+  }
+  result.edge.residual_gp = fit->model.residual_gp;
+  double position = 0, rotation = 0;
+  for (int t = 0; t < pair.size(); ++t) {
+    const bool outlying = fit->squared_distance[t] > kOutlierThreshold;
+    result.frames.push_back(pair.frames[t].sample);
+    result.outlying.push_back(outlying);
+    result.edge.num_outliers += outlying;
+    if (outlying) continue;
+    position += fit->residual[t].head<3>().squaredNorm();
+    rotation += fit->residual[t].tail<3>().squaredNorm();
+  }
+  const int inliers = pair.size() - result.edge.num_outliers;
+  if (inliers > 0) {
+    result.edge.position_rms_m = std::sqrt(position / inliers);
+    result.edge.rotation_rms_rad = std::sqrt(rotation / inliers);
+    result.edge.confidence = static_cast<double>(inliers) / pair.size();
+  }
+  return result;
+}
 
 // The final fit of an edge in its direction, on all data, with everything the schema says about it.
 FittedEdge fit_edge(const AcceptedModel& accepted, int from, int to,
                     const std::vector<ActionPoseSample>& samples, const NormalizedActions& actions,
-                    const MeasurementModel& measurement) {
+                    const MeasurementModel& measurement, const ValidityOptions& validity,
+                    bool must_be_valid) {
   const LocalModel start = accepted.part_i == from ? accepted.model : accepted.model.inverse();
   const PairData pair =
       make_pair_data(samples, from, to, measurement, std::numeric_limits<int>::max());
-  const Fit fit = fit_local_model(start, pair, actions, 60);
+  if (!accepted.soft_signals.empty())
+    return fit_soft_edge(start, accepted.soft_signals, from, to, pair, actions, validity,
+                         must_be_valid);
+  const Fit fit = fit_local_model(start, pair, actions, 60, 1e-6);
   const LeaveOneOut loo = leave_one_out(fit, pair, actions);
 
   FittedEdge result;
+  if (must_be_valid) {
+    result.is_valid = check_validity(fit, loo, pair, actions, validity).verdict == Verdict::kValid;
+    if (!result.is_valid) return result;
+  }
+  result.model = fit.model;
   result.edge = to_edge(fit.model, actions);
   result.edge.from = from;
   result.edge.to = to;
@@ -98,6 +166,43 @@ FittedEdge fit_edge(const AcceptedModel& accepted, int from, int to,
     result.edge.confidence = static_cast<double>(inliers) / pair.size();
   }
   return result;
+}
+
+// The edges of the root's component fitted to all of its markers at once: a root that rests and
+// everything on the way from it are witnesses too, beside the two markers that each edge was fitted
+// to before. The covariances stay those of the pairs, an upper bound.
+void fit_jointly(const std::vector<ActionPoseSample>& samples, const NormalizedActions& actions,
+                 const MeasurementModel& measurement, const ValidityOptions& validity,
+                 std::vector<FittedEdge>* fitted, BodySchema* schema) {
+  // More instants than this are thinned; so many more that thinning costs what the joint fit gains
+  // are left to the pairs.
+  constexpr int kMaxFrames = 2500;
+  constexpr std::size_t kTooMany = 6000;
+  if (samples.size() > kTooMany) return;
+  std::vector<TreeNode> nodes{{schema->root, -1, {}}};
+  std::vector<PairData> data{make_part_data(samples, schema->root, measurement, kMaxFrames)};
+  if (data[0].size() < 2 || !is_at_rest(data[0], actions, validity)) return;
+  for (const FittedEdge& f : *fitted) {
+    const auto parent = std::find_if(nodes.begin(), nodes.end(), [&](const TreeNode& node) {
+      return node.part == f.edge.from;
+    });
+    if (parent == nodes.end()) continue;  // another component
+    if (f.edge.residual_gp) return;       // no chain of screws
+    nodes.push_back({f.edge.to, static_cast<int>(parent - nodes.begin()), f.model});
+    data.push_back(make_part_data(samples, f.edge.to, measurement, kMaxFrames));
+  }
+  if (nodes.size() < 2) return;
+  TreeFit fit(std::move(nodes), std::move(data), actions, true);
+  fit.fit(20, 1e-6);
+  for (const TreeNode& node : fit.nodes()) {
+    for (FittedEdge& f : *fitted) {
+      if (node.parent < 0 || f.edge.to != node.part) continue;
+      const Edge moved = to_edge(node.model, actions);
+      f.edge.left = moved.left;
+      f.edge.joints = moved.joints;
+    }
+  }
+  schema->X_CR = fit.root_pose();
 }
 
 // Robust mean of the root's pose in the camera's frame, Student-t weights.
@@ -271,17 +376,23 @@ class OutlierAttribution {
     };
     for (const PartObservation& other : s.parts) {
       if (other.part == part || culprits.count(other.part)) continue;
-      const auto prediction = schema_.predict(other.part, part, s.action);
-      if (!prediction) continue;
+      const auto& path = path_between(other.part, part);
+      if (!path) continue;
       const Pose z = other.X_CB.inverse() * o->X_CB;
-      judge(
-          log(prediction->X_AB.inverse() * z),
-          prediction->covariance + relative_covariance(z, covariance_of(other), covariance_of(*o)));
+      judge(log(path->predict(s.action).inverse() * z),
+            path->covariance(s.action, Variance::kFirstOrder) +
+                relative_covariance(z, covariance_of(other), covariance_of(*o)));
     }
-    if (const auto prediction = schema_.predict(schema_.root, part, s.action))
-      judge(log((schema_.X_CR * prediction->X_AB).inverse() * o->X_CB),
-            prediction->covariance + covariance_of(*o));
+    if (const auto& path = path_between(schema_.root, part))
+      judge(log((schema_.X_CR * path->predict(s.action)).inverse() * o->X_CB),
+            path->covariance(s.action, Variance::kFirstOrder) + covariance_of(*o));
     return all > 0 ? static_cast<double>(bad) / all : 0;
+  }
+
+  const std::optional<KinematicPath>& path_between(int from, int to) const {
+    const auto [it, is_new] = paths_.try_emplace({from, to});
+    if (is_new) it->second = KinematicPath::between(schema_, from, to);
+    return it->second;
   }
 
   Matrix6d covariance_of(const PartObservation& o) const {
@@ -303,6 +414,7 @@ class OutlierAttribution {
   const std::vector<ActionPoseSample>& samples_;
   const MeasurementModel& measurement_;
   std::map<int, int> depth_;
+  mutable std::map<std::pair<int, int>, std::optional<KinematicPath>> paths_;  // found so far
 };
 
 // Why `part` is not connected to the root's component.
@@ -343,76 +455,61 @@ UnconnectedPart explain(int part, int num_seen, const std::set<int>& connected,
   return result;
 }
 
-}  // namespace
-
-LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPoseSample>& samples,
-                  const LearnOptions& options) {
-  if (options.max_signals < 0 || options.max_signals > kMaxJoints)
-    throw std::invalid_argument("max_signals must be 0 to " + std::to_string(kMaxJoints));
-  const int num_signals = static_cast<int>(signals.size());
+int check_actions(const std::vector<ActionPoseSample>& samples, std::size_t num_signals) {
   for (const auto& sample : samples)
-    if (sample.action.size() != num_signals)
+    if (sample.action.size() != static_cast<Eigen::Index>(num_signals))
       throw std::invalid_argument("sample " + std::to_string(sample.sample_index) + " has " +
                                   std::to_string(sample.action.size()) + " action values, not " +
                                   std::to_string(num_signals));
+  return static_cast<int>(num_signals);
+}
+
+std::map<int, int> count_seen(const std::vector<ActionPoseSample>& samples) {
+  std::map<int, int> num_seen;
+  for (const auto& sample : samples)
+    for (const auto& o : sample.parts) ++num_seen[o.part];
+  return num_seen;
+}
+
+std::vector<int> parts_of(const std::map<int, int>& num_seen) {
+  std::vector<int> parts;
+  for (const auto& [part, count] : num_seen) parts.push_back(part);
+  return parts;
+}
+
+SearchOptions search_options_of(const LearnOptions& options) {
+  SearchOptions result;
+  result.max_signals = options.max_signals;
+  result.validity.outlier_rate = options.outlier_rate;
+  result.measurement.model_error = options.model_error;
+  result.measurement.max_error_ratio = options.max_error_ratio;
+  return result;
+}
+
+LearnResult fit_tree(const LearnedStructure& structure,
+                     const std::vector<ActionPoseSample>& samples, const LearnOptions& options,
+                     bool must_be_valid) {
+  const int num_signals = check_actions(samples, structure.signals.size());
+  const SearchResult& search = structure.search;
+  const MeasurementModel& measurement = structure.measurement;
+  const ValidityOptions validity = search_options_of(options).validity;
 
   LearnResult result;
+  result.num_screens = search.num_screens;
+  result.num_fits = search.num_fits;
   BodySchema& schema = result.schema;
-  schema.signals = signals;
+  schema.signals = structure.signals;
   schema.num_samples = static_cast<int>(samples.size());
-  std::map<int, int> num_seen;
-  for (const auto& sample : samples) {
+  for (const auto& sample : samples)
     schema.last_sample_index = std::max(schema.last_sample_index, sample.sample_index);
-    for (const auto& o : sample.parts) ++num_seen[o.part];
-  }
-  for (const auto& [part, count] : num_seen) schema.parts.push_back(part);
+  const std::map<int, int> num_seen = count_seen(samples);
+  schema.parts = parts_of(num_seen);
   if (!schema.parts.empty()) schema.root = schema.parts.front();
   if (options.root) schema.root = *options.root;
 
-  SearchOptions search_options;
-  search_options.max_signals = options.max_signals;
-  search_options.validity.outlier_rate = options.outlier_rate;
-  MeasurementModel& measurement = search_options.measurement;
-  measurement.model_error = options.model_error;
-  measurement.max_error_ratio = options.max_error_ratio;
-  const auto set_noise = [&](const std::vector<ActionPoseSample>& of) {
-    if (options.noise) {
-      measurement.noise = Noise{std::max(options.noise->position_m, kNoiseFloor.position_m),
-                                std::max(options.noise->rotation_rad, kNoiseFloor.rotation_rad)};
-    } else if (!has_covariances(of)) {
-      measurement.noise =
-          estimate_noise(of, num_signals, options.max_signals).value_or(kNoiseFloor);
-    }
-  };
-  // Everything that is fitted sees displacements; which commands are bent shows only by a model.
-  std::vector<ActionPoseSample> moved = samples;
-  set_noise(moved);
-  std::optional<NormalizedActions> actions(std::in_place, moved, num_signals);
-  SearchResult search = search_structure(moved, *actions, schema.parts, search_options);
-  result.num_screens = search.num_screens;
-  result.num_fits = search.num_fits;
-  constexpr int kMaxWarpRounds = 3;
-  for (int round = 0; round < kMaxWarpRounds; ++round) {
-    std::vector<Signal> bent = schema.signals;
-    if (!estimate_warps(samples, schema.parts, search, search_options, &bent)) break;
-    std::vector<ActionPoseSample> again = displaced(samples, bent);
-    const auto noise_before = measurement.noise;
-    set_noise(again);
-    const NormalizedActions actions_again(again, num_signals);
-    SearchResult found = search_structure(again, actions_again, schema.parts, search_options);
-    result.num_screens += found.num_screens;
-    result.num_fits += found.num_fits;
-    if (found.models.size() < search.models.size()) {
-      measurement.noise = noise_before;
-      break;
-    }
-    const bool was_spanning = search.models.size() + 1 >= schema.parts.size();
-    schema.signals = std::move(bent);
-    moved = std::move(again);
-    actions.emplace(actions_again);
-    search = std::move(found);
-    if (was_spanning) break;
-  }
+  // Everything that is fitted sees displacements.
+  const std::vector<ActionPoseSample> moved = displaced(samples, structure.signals);
+  const NormalizedActions actions(moved, num_signals);
   schema.noise = measurement.noise ? *measurement.noise : typical_noise(samples);
   // Orient the forest outwards: breadth first from the root, then from the lowest part of every
   // other component.
@@ -426,7 +523,16 @@ LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPo
         if (m.part_i != queue[head] && m.part_j != queue[head]) continue;
         const int to = m.part_i == queue[head] ? m.part_j : m.part_i;
         if (!reached.insert(to).second) continue;
-        fitted.push_back(fit_edge(m, queue[head], to, moved, *actions, measurement));
+        AcceptedModel start = m;
+        start.model = rescaled(m.model, structure.actions, actions);
+        FittedEdge edge =
+            fit_edge(start, queue[head], to, moved, actions, measurement, validity, must_be_valid);
+        if (!edge.is_valid) {
+          result.refuted.emplace_back(m.part_i, m.part_j);
+          reached.erase(to);
+          continue;
+        }
+        fitted.push_back(std::move(edge));
         queue.push_back(to);
       }
     }
@@ -435,6 +541,9 @@ LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPo
   connected_to_root = reached;
   for (const int part : schema.parts)
     if (!reached.count(part)) grow_from(part);
+  estimate_root_pose(samples, measurement, &schema);
+  if (schema.has_part(schema.root))
+    fit_jointly(moved, actions, measurement, validity, &fitted, &schema);
   for (const FittedEdge& f : fitted) schema.edges.push_back(f.edge);
 
   std::set<int> expected(options.expected_parts.begin(), options.expected_parts.end());
@@ -452,9 +561,105 @@ LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPo
                     std::all_of(schema.parts.begin(), schema.parts.end(),
                                 [&](int part) { return connected_to_root.count(part) > 0; });
 
-  estimate_root_pose(samples, measurement, &schema);
   result.outliers = OutlierAttribution(schema, fitted, samples, measurement).run();
   return result;
+}
+
+}  // namespace
+
+LearnedStructure find_structure(const std::vector<Signal>& signals,
+                                const std::vector<ActionPoseSample>& samples,
+                                const LearnOptions& options) {
+  if (options.max_signals < 0 || options.max_signals > kMaxJoints)
+    throw std::invalid_argument("max_signals must be 0 to " + std::to_string(kMaxJoints));
+  const int num_signals = check_actions(samples, signals.size());
+  const std::vector<int> parts = parts_of(count_seen(samples));
+  SearchOptions search_options = search_options_of(options);
+  MeasurementModel& measurement = search_options.measurement;
+  const auto set_noise = [&](const std::vector<ActionPoseSample>& of) {
+    if (options.noise) {
+      measurement.noise = Noise{std::max(options.noise->position_m, kNoiseFloor.position_m),
+                                std::max(options.noise->rotation_rad, kNoiseFloor.rotation_rad)};
+    } else if (!has_covariances(of)) {
+      measurement.noise =
+          estimate_noise(of, num_signals, options.max_signals).value_or(kNoiseFloor);
+    }
+  };
+  set_noise(samples);
+  NormalizedActions actions(samples, num_signals);
+  SearchResult search = search_structure(samples, actions, parts, search_options);
+  LearnedStructure result{signals, parts, measurement, std::move(actions), std::move(search)};
+  // Everything that is fitted sees displacements; which commands are bent shows only by a model.
+  constexpr int kMaxWarpRounds = 3;
+  for (int round = 0; round < kMaxWarpRounds; ++round) {
+    std::vector<Signal> bent = result.signals;
+    if (!estimate_warps(samples, parts, result.search, search_options, &bent)) break;
+    const std::vector<ActionPoseSample> again = displaced(samples, bent);
+    set_noise(again);
+    NormalizedActions actions_again(again, num_signals);
+    SearchResult found = search_structure(again, actions_again, parts, search_options);
+    found.num_screens += result.search.num_screens;
+    found.num_fits += result.search.num_fits;
+    const bool was_spanning = result.spans();
+    // What bends a command must be worth it to all markers together, not only to the models that
+    // asked for it.
+    const bool is_worth_it =
+        found.models.size() >= result.search.models.size() &&
+        (!was_spanning || found.log_likelihood >= result.search.log_likelihood + kWarpEvidence);
+    if (!is_worth_it) {
+      result.search.num_screens = found.num_screens;
+      result.search.num_fits = found.num_fits;
+      break;
+    }
+    result = {std::move(bent), parts, measurement, std::move(actions_again), std::move(found)};
+    if (was_spanning) break;
+  }
+  measurement = result.measurement;
+  connect_soft_parts(displaced(samples, result.signals), result.actions, parts, search_options,
+                     &result.search);
+  return result;
+}
+
+LearnResult fit_structure(const LearnedStructure& structure,
+                          const std::vector<ActionPoseSample>& samples,
+                          const LearnOptions& options) {
+  return fit_tree(structure, samples, options, false);
+}
+
+LearnResult relearn(const LearnedStructure& structure, const std::vector<ActionPoseSample>& samples,
+                    const LearnOptions& options) {
+  return fit_tree(structure, samples, options, true);
+}
+
+bool is_refuted_by(const LearnedStructure& structure, const std::vector<ActionPoseSample>& later,
+                   const LearnOptions& options) {
+  check_actions(later, structure.signals.size());
+  ValidityOptions validity = search_options_of(options).validity;
+  validity.lenient = true;
+  const std::vector<ActionPoseSample> moved = displaced(later, structure.signals);
+  const NormalizedActions actions(moved, static_cast<int>(structure.signals.size()));
+  for (const AcceptedModel& m : structure.search.models) {
+    if (!m.soft_signals.empty()) continue;  // the screws alone never held
+    const PairData pair = make_pair_data(moved, m.part_i, m.part_j, structure.measurement,
+                                         std::numeric_limits<int>::max());
+    if (pair.size() < 2) continue;
+    const Fit fit = evaluate(rescaled(m.model, structure.actions, actions), pair, actions);
+    LeaveOneOut unseen;  // the model was fitted without any of them
+    for (const FrameFit& frame : fit.frames)
+      unseen.squared_distance.push_back(frame.squared_distance);
+    const Validity judged = check_validity(fit, unseen, pair, actions, validity);
+    // So few frames are often outliers in the majority by chance: their number decides.
+    const int most = binomial_quantile(pair.size(), pair_outlier_rate(validity), 0.99999);
+    const bool are_outliers_few = 2 * judged.num_outliers <= pair.size();
+    if (judged.num_outliers > most || (judged.verdict == Verdict::kRefuted && are_outliers_few))
+      return true;
+  }
+  return false;
+}
+
+LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPoseSample>& samples,
+                  const LearnOptions& options) {
+  return fit_structure(find_structure(signals, samples, options), samples, options);
 }
 
 }  // namespace bodyschema

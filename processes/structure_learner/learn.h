@@ -3,10 +3,12 @@
 #include <cmath>
 #include <cstdint>
 #include <optional>
+#include <utility>
 #include <vector>
 
 #include "common/schema/body_schema.h"
 #include "common/schema/sample.h"
+#include "processes/structure_learner/structure_search.h"
 
 namespace bodyschema {
 
@@ -47,14 +49,54 @@ struct LearnResult {
   std::vector<Outlier> outliers;  ///< ascending by sample, then part
   int num_screens = 0;            ///< closed-form hypotheses looked at
   int num_fits = 0;               ///< Levenberg–Marquardt fits
+  /// Edges that were left out since they are not valid any more, as (part, part).
+  std::vector<std::pair<int, int>> refuted;
 };
 
-/// Learns the body schema from scratch: structure and local models (Sections 3.1 and 3.2). A pure
+/// Learns the body schema from scratch: structure and local models (Sections 3.1 and 3.2). Where the
+/// root rests, the models are in the end fitted to all poses of its tree at once, and X_CR with
+/// them: that comes near the Cramér–Rao bound, which models fitted to two parts each miss by 1.6.
+/// Their covariances are those of the pairs, an upper bound. A pure
 /// function of its arguments. Poses must be finite rigid transforms (callers check what comes in
 /// from outside). `utime`, `version` and `base_version` of the schema are left to the caller.
 /// @throws std::invalid_argument if an action does not have one value per signal, or max_signals is
 /// out of range.
 LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPoseSample>& samples,
                   const LearnOptions& options = {});
+
+/// The first half of learn(), slow: which part hangs on which by which signals. Everything that
+/// relearn() takes over.
+struct LearnedStructure {
+  std::vector<Signal> signals;  ///< with what bends their commands
+  std::vector<int> parts;       ///< seen, ascending
+  MeasurementModel measurement;
+  NormalizedActions actions;  ///< that the models are over
+  SearchResult search;
+
+  /// The edges span all parts seen.
+  bool spans() const { return search.models.size() + 1 >= parts.size(); }
+};
+/// @throws std::invalid_argument as learn().
+LearnedStructure find_structure(const std::vector<Signal>& signals,
+                                const std::vector<ActionPoseSample>& samples,
+                                const LearnOptions& options = {});
+
+/// The second half of learn(): the edges of `structure` fitted to `samples`, which need not be
+/// those that it was found from, and all else that is in a schema. learn() =
+/// fit_structure(find_structure).
+LearnResult fit_structure(const LearnedStructure& structure,
+                          const std::vector<ActionPoseSample>& samples,
+                          const LearnOptions& options = {});
+
+/// fit_structure() without the edges that are not valid any more (check_validity()) when fitted to
+/// `samples`: these are in LearnResult::refuted. Parts that the structure does not know are
+/// unconnected.
+LearnResult relearn(const LearnedStructure& structure, const std::vector<ActionPoseSample>& samples,
+                    const LearnOptions& options = {});
+
+/// Do samples that came later speak against the structure with its models as they are? Judged an
+/// edge at a time by the bounds of check_validity() for preselection. Soft edges are not judged.
+bool is_refuted_by(const LearnedStructure& structure, const std::vector<ActionPoseSample>& later,
+                   const LearnOptions& options = {});
 
 }  // namespace bodyschema

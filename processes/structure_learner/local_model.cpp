@@ -20,7 +20,7 @@ double robust_cost(double d2) { return (kStudentNu + 6) / 2 * std::log1p(d2 / kS
 // Whitened residual and its Jacobian: log((Δ̂ exp δ)⁻¹ z) = r − J_l⁻¹(r) δ + O(δ²).
 void whitened_jacobian(const PairHypothesis& h, const Vector6d& residual, ParameterJacobian* J) {
   const Matrix6d M = -h.whitening * right_jacobian_inverse(-residual);
-  for (Eigen::Index n = 0; n < J->cols(); ++n) J->col(n) = (M * J->col(n)).eval();
+  *J = M.lazyProduct(*J).eval();
 }
 
 // JᵀWJ and JᵀWr. Frames are stacked before they are multiplied: one product of a few hundred rows
@@ -39,9 +39,8 @@ void normal_equations(const Fit& fit, const PairData& pair, const NormalizedActi
     for (int n = 0; n < count; ++n) {
       const FrameFit& frame = fit.frames[first + n];
       const PairHypothesis& h = pair.hypotheses[frame.hypothesis];
-      const Pose prediction =
-          predict_with_jacobian(fit.model, actions, pair.frames[first + n].sample, &J);
-      whitened_jacobian(h, log(prediction.inverse() * h.z), &J);
+      predict_with_jacobian(fit.model, actions, pair.frames[first + n].sample, &J);
+      whitened_jacobian(h, frame.error, &J);
       const double root_w = std::sqrt(robust_weight(frame.squared_distance));
       rows.middleRows<6>(6 * n) = root_w * J;
       residuals.segment<6>(6 * n) = root_w * frame.residual;
@@ -51,6 +50,50 @@ void normal_equations(const Fit& fit, const PairData& pair, const NormalizedActi
     g->noalias() += block.transpose() * residuals.head(6 * count);
   }
   *H = H->selfadjointView<Eigen::Lower>();
+}
+
+// Leave-one-out of whole blocks of time, `root` being that of (JᵀWJ)⁺. Without the block B the
+// parameters' covariance is root A⁻¹ rootᵀ with A = I − Σ_B w (J root)ᵀ(J root), which is as small
+// as the model; so r_B^T (I − H_BB)⁻¹ r_B never takes a matrix of the block's size.
+void leave_blocks_out(const Fit& fit, const PairData& pair, const NormalizedActions& actions,
+                      const ParameterMatrix& root, LeaveOneOut* result) {
+  const int p = fit.model.num_parameters();
+  const TimeBlocks& blocks = actions.blocks();
+  std::vector<ParameterJacobian> JR;
+  for (int first = 0, last = 0; first < pair.size(); first = last) {
+    const int block = blocks.block_of(pair.frames[first].sample);
+    ParameterMatrix A = ParameterMatrix::Identity(p, p);
+    ParameterVector g = ParameterVector::Zero(p);
+    JR.clear();
+    for (; last < pair.size() && blocks.block_of(pair.frames[last].sample) == block; ++last) {
+      const FrameFit& frame = fit.frames[last];
+      const PairHypothesis& h = pair.hypotheses[frame.hypothesis];
+      ParameterJacobian J;
+      const Pose prediction =
+          predict_with_jacobian(fit.model, actions, pair.frames[last].sample, &J);
+      whitened_jacobian(h, log(prediction.inverse() * h.z), &J);
+      JR.push_back(J * root);
+      const double w = robust_weight(frame.squared_distance);
+      A.noalias() -= w * JR.back().transpose() * JR.back();
+      g.noalias() += w * JR.back().transpose() * frame.residual;
+    }
+    // A block that alone decides a parameter has eigenvalue 0 here; the floor as for single frames.
+    const Eigen::SelfAdjointEigenSolver<Eigen::MatrixXd> e(A);
+    const Eigen::MatrixXd inverse = e.eigenvectors() *
+                                    e.eigenvalues().cwiseMax(1e-3).cwiseInverse().asDiagonal() *
+                                    e.eigenvectors().transpose();
+    const ParameterVector step = inverse * g;
+    for (int t = first; t < last; ++t) {
+      const ParameterJacobian& J = JR[t - first];
+      const Vector6d left_out = fit.frames[t].residual + J * step;
+      const Matrix6d S = Matrix6d::Identity() + robust_weight(fit.frames[t].squared_distance) * J *
+                                                    inverse * J.transpose();
+      result->squared_distance.push_back(left_out.dot(S.llt().solve(left_out)));
+      result->residual.push_back(
+          pair.hypotheses[fit.frames[t].hypothesis].whitening.triangularView<Eigen::Lower>().solve(
+              left_out));
+    }
+  }
 }
 
 }  // namespace
@@ -123,14 +166,15 @@ FrameFit best_reading(const PairData& pair, int frame, const Pose& prediction) {
   double best_score = std::numeric_limits<double>::infinity();
   for (int n = 0; n < f.num_hypotheses; ++n) {
     const PairHypothesis& h = pair.hypotheses[f.first_hypothesis + n];
-    const Vector6d r = h.whitening * log(inverse * h.z);
+    const Vector6d error = log(inverse * h.z);
+    const Vector6d r = h.whitening * error;
     const double d2 = r.squaredNorm();
     // The readings' shares in a heavy-tailed likelihood: a reading far off by both hypotheses must
     // not be decided by their determinants.
     const double score = 2 * robust_cost(d2) + h.log_det + h.penalty;
     if (score < best_score) {
       best_score = score;
-      best = {f.first_hypothesis + n, r, d2};
+      best = {f.first_hypothesis + n, error, r, d2};
     }
   }
   return best;
@@ -179,7 +223,7 @@ Fit fit_local_model(const LocalModel& start, const PairData& pair, const Normali
     // Residuals far below the noise go on to the end of the arithmetic: it costs a step or two.
     if (!improved || (decrease < tolerance && fit.cost > 1e-3 * pair.size())) break;
     // Stuck where no model is valid (a valid one costs about 5 a frame, outliers 30).
-    if (iteration >= 12 && fit.cost > 16 * pair.size() && decrease < 0.01 * fit.cost) break;
+    if (iteration >= 8 && fit.cost > 16 * pair.size() && decrease < 0.01 * fit.cost) break;
   }
   return fit;
 }
@@ -208,23 +252,33 @@ LeaveOneOut leave_one_out(const Fit& fit, const PairData& pair, const Normalized
 
   result.squared_distance.reserve(pair.size());
   result.residual.reserve(pair.size());
+  if (actions.blocks().is_dense()) {
+    leave_blocks_out(fit, pair, actions, root, &result);
+    return result;
+  }
   ParameterJacobian J;
   for (int t = 0; t < pair.size(); ++t) {
     const FrameFit& frame = fit.frames[t];
     const PairHypothesis& h = pair.hypotheses[frame.hypothesis];
-    const Pose prediction = predict_with_jacobian(fit.model, actions, pair.frames[t].sample, &J);
-    whitened_jacobian(h, log(prediction.inverse() * h.z), &J);
-    const ParameterJacobian JR = J * root;
-    const Matrix6d I_minus_H =
-        Matrix6d::Identity() - robust_weight(frame.squared_distance) * (JR * JR.transpose());
+    predict_with_jacobian(fit.model, actions, pair.frames[t].sample, &J);
+    whitened_jacobian(h, frame.error, &J);
+    const ParameterJacobian JR = J.lazyProduct(root);
+    const Matrix6d I_minus_H = Matrix6d::Identity() - robust_weight(frame.squared_distance) *
+                                                          JR.lazyProduct(JR.transpose()).eval();
     // A frame that alone decides a parameter has eigenvalue 0 here: it cannot be predicted from the
-    // others, so its residual of 0 is no evidence. The floor keeps that finite.
-    const Eigen::SelfAdjointEigenSolver<Matrix6d> e(I_minus_H);
-    const Vector6d coordinates = e.eigenvectors().transpose() * frame.residual;
-    const Vector6d left_out = coordinates.cwiseQuotient(e.eigenvalues().cwiseMax(1e-3));
-    result.squared_distance.push_back(coordinates.dot(left_out));
-    result.residual.push_back(
-        h.whitening.triangularView<Eigen::Lower>().solve(e.eigenvectors() * left_out));
+    // others, so its residual of 0 is no evidence. The floor keeps that finite; away from it a
+    // Cholesky factor is enough.
+    Vector6d left_out;
+    const Eigen::LLT<Matrix6d> llt(I_minus_H);
+    if (llt.info() == Eigen::Success && llt.matrixLLT().diagonal().minCoeff() > 0.2) {
+      left_out = llt.solve(frame.residual);
+    } else {
+      const Eigen::SelfAdjointEigenSolver<Matrix6d> e(I_minus_H);
+      left_out = e.eigenvectors() * (e.eigenvectors().transpose() * frame.residual)
+                                        .cwiseQuotient(e.eigenvalues().cwiseMax(1e-3));
+    }
+    result.squared_distance.push_back(frame.residual.dot(left_out));
+    result.residual.push_back(h.whitening.triangularView<Eigen::Lower>().solve(left_out));
   }
   return result;
 }

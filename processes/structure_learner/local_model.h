@@ -52,6 +52,7 @@ inline double robust_weight(double squared_distance) {
 /// What one frame says about a model.
 struct FrameFit {
   int hypothesis = 0;                    ///< index into PairData::hypotheses: the likeliest reading
+  Vector6d error = Vector6d::Zero();     ///< log(Δ̂⁻¹ z): (translation [m], rotation [rad])
   Vector6d residual = Vector6d::Zero();  ///< whitened log(Δ̂⁻¹ z)
   double squared_distance = 0;           ///< |residual|²
 };

@@ -31,8 +31,11 @@ int main(int argc, char** argv) {
     };
     SampleIntake intake(samples_file, learn_from, SampleIntake::asking(process, !is_replayed));
 
-    // The fit runs beside the loop: listening never waits for learning.
+    // The fit runs beside the loop: listening does not wait for learning, or not longer than to
+    // publish at once what is learned in the usual time.
+    constexpr std::chrono::milliseconds kUsualFit{20};
     std::future<body_schema_t> fit;
+    std::future<void> preparation;
     body_schema_t learned;
     bool has_learned = false;
     std::int64_t sent_us = 0;
@@ -52,15 +55,24 @@ int main(int argc, char** argv) {
       fit = std::async(std::launch::deferred, learner.take_job());
       collect();
     };
+    const auto is_ready = [](const auto& future, std::chrono::milliseconds within) {
+      return future.wait_for(within) == std::future_status::ready;
+    };
     const auto work = [&] {
-      if (fit.valid() && fit.wait_for(std::chrono::seconds(0)) == std::future_status::ready)
-        collect();
+      if (fit.valid() && is_ready(fit, {})) collect();
+      if (preparation.valid() && is_ready(preparation, {})) preparation.get();
       if (process.bus().is_replay()) {
         // A log does not wait: what the monitor will judge is learned at once, the rest at the end,
         // so that a replay always writes the same messages.
         while (learner.has_test_job()) learn_now();
-      } else if (!fit.valid() && learner.has_job()) {
+        return;
+      }
+      if (!fit.valid() && learner.has_job()) {
         fit = std::async(std::launch::async, learner.take_job());
+        if (is_ready(fit, kUsualFit)) collect();
+      }
+      if (!fit.valid() && !learner.has_job() && !preparation.valid() && learner.has_preparation()) {
+        preparation = std::async(std::launch::async, learner.take_preparation());
       }
     };
 

@@ -16,6 +16,7 @@ constexpr double kMedianChi3 = 2.366;  // median of χ²₃
 constexpr double kSafety = 1.2;
 constexpr int kMaxFrames = 120;
 constexpr int kMinRepeats = 5;
+constexpr double kLargestBias = 4;  // of a stream, in standard deviations of its white noise
 
 double median(std::vector<double> values) {
   const auto middle = values.begin() + values.size() / 2;
@@ -124,6 +125,25 @@ std::optional<Noise> noise_from_repeats(const std::vector<ActionPoseSample>& sam
   return noise_from(residuals);
 }
 
+// Of a stream: from what is left of three successive poses of a part when its motion is taken to be
+// uniform. The white part of the noise, whatever the model.
+std::optional<Noise> noise_from_neighbours(const std::vector<ActionPoseSample>& samples,
+                                           const NormalizedActions& actions) {
+  if (!actions.blocks().is_dense()) return std::nullopt;
+  std::vector<NoiseResidual> residuals;
+  for (std::size_t t = 1; t + 1 < samples.size(); ++t)
+    for (const PartObservation& o : samples[t].parts) {
+      const PartObservation* before = samples[t - 1].find(o.part);
+      const PartObservation* after = samples[t + 1].find(o.part);
+      if (!before || !after) continue;
+      const Pose inverse = o.X_CB.inverse();
+      residuals.push_back({log(inverse * before->X_CB) + log(inverse * after->X_CB),
+                           Eigen::Vector3d::Zero(), 6.0});  // variance of (1, −2, 1)
+    }
+  if (residuals.size() < 10) return std::nullopt;
+  return noise_from(residuals);
+}
+
 // A model of a pair with its leave-one-out residuals and the noise that they speak of.
 struct ScaledFit {
   std::vector<NoiseResidual> residuals;
@@ -205,7 +225,17 @@ class ModelNoise {
 std::optional<Noise> estimate_noise(const std::vector<ActionPoseSample>& samples, int num_signals,
                                     int max_signals) {
   const NormalizedActions actions(samples, num_signals);
-  if (const auto noise = noise_from_repeats(samples, actions)) return believable(*noise);
+  // What moves under one command, or where no model holds, is no noise: that of a stream is not
+  // taken for more than what jumps from frame to frame and what a marker's bias may add to it.
+  const auto bounded = [&](Noise noise) {
+    if (const auto white = noise_from_neighbours(samples, actions)) {
+      const Noise most = floored(*white, kLargestBias);
+      noise.position_m = std::min(noise.position_m, most.position_m);
+      noise.rotation_rad = std::min(noise.rotation_rad, most.rotation_rad);
+    }
+    return believable(noise);
+  };
+  if (const auto noise = noise_from_repeats(samples, actions)) return bounded(*noise);
 
   std::set<int> seen;
   for (const auto& sample : samples)
@@ -260,7 +290,7 @@ std::optional<Noise> estimate_noise(const std::vector<ActionPoseSample>& samples
     if (fits[ij].scale <= limit)
       pooled.insert(pooled.end(), fits[ij].residuals.begin(), fits[ij].residuals.end());
   if (pooled.size() < 6) return std::nullopt;
-  return believable(noise_from(pooled));
+  return bounded(noise_from(pooled));
 }
 
 }  // namespace bodyschema

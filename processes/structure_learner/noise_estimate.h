@@ -21,8 +21,8 @@ inline constexpr Noise kNoiseCeiling{0.1, 0.41887902};
 /// over the parts: their pooled leave-one-out residuals. Both through medians, so that outliers do
 /// not count; position and rotation apart (the rotation noise of part i reaches the position of
 /// z_ij through the lever arm). The estimate is returned 1.2 × too large: too small a noise rejects
-/// true models, too large a noise by that factor costs nearly nothing. Never below kNoiseFloor or above
-/// kNoiseCeiling.
+/// true models, too large a noise by that factor costs nearly nothing. Never below kNoiseFloor or
+/// above kNoiseCeiling. Of a stream, never above a few times what jumps from frame to frame.
 /// std::nullopt: too few data.
 std::optional<Noise> estimate_noise(const std::vector<ActionPoseSample>& samples, int num_signals,
                                     int max_signals = 2);

@@ -1,6 +1,8 @@
 #include "processes/structure_learner/pair_data.h"
 
+#include <algorithm>
 #include <cmath>
+#include <initializer_list>
 #include <stdexcept>
 
 namespace bodyschema {
@@ -38,6 +40,55 @@ int readings_of(const PartObservation& observation, const MeasurementModel& meas
   return 2;
 }
 
+// The model error, as a multiple of its variance; the last term keeps exact measurements
+// factorisable.
+Matrix6d extra_covariance(const MeasurementModel& measurement, double share) {
+  return share * (isotropic(measurement.model_error) + 1e-10 * Matrix6d::Identity());
+}
+
+// Visits at most `max_frames` of the samples that show all of `parts`, evenly chosen.
+template <typename Visitor>
+void for_thinned(const std::vector<ActionPoseSample>& samples, int max_frames,
+                 std::initializer_list<int> parts, Visitor&& visit) {
+  std::vector<int> common;
+  for (std::size_t t = 0; t < samples.size(); ++t)
+    if (std::all_of(parts.begin(), parts.end(), [&](int p) { return samples[t].find(p); }))
+      common.push_back(static_cast<int>(t));
+  const std::size_t count = std::min<std::size_t>(common.size(), std::max(max_frames, 0));
+  for (std::size_t n = 0; n < count; ++n) visit(common[n * common.size() / count]);
+}
+
+// Collects the readings of one instant.
+class FrameWriter {
+ public:
+  FrameWriter(int sample, PairData* pair) : pair_(*pair) {
+    frame_.sample = sample;
+    frame_.first_hypothesis = static_cast<int>(pair_.hypotheses.size());
+  }
+  FrameWriter(const FrameWriter&) = delete;
+  ~FrameWriter() {
+    frame_.num_hypotheses = static_cast<int>(pair_.hypotheses.size()) - frame_.first_hypothesis;
+    if (frame_.num_hypotheses > 0) pair_.frames.push_back(frame_);
+  }
+
+  void add(const Pose& z, const Matrix6d& covariance, double penalty) {
+    const Eigen::LLT<Matrix6d> llt(covariance);
+    // A covariance that is not positive definite says nothing usable: leave the reading out.
+    if (llt.info() != Eigen::Success || !(llt.matrixLLT().diagonal().minCoeff() > 0)) return;
+    PairHypothesis h;
+    h.z = z;
+    h.penalty = penalty;
+    h.whitening = llt.matrixL().solve(Matrix6d::Identity());
+    h.log_det =
+        6 * std::log(2 * M_PI) + 2 * llt.matrixLLT().diagonal().array().log().sum();
+    pair_.hypotheses.push_back(h);
+  }
+
+ private:
+  PairData& pair_;
+  PairFrame frame_;
+};
+
 }  // namespace
 
 NormalizedActions::NormalizedActions(const std::vector<ActionPoseSample>& samples, int num_signals)
@@ -63,6 +114,9 @@ NormalizedActions::NormalizedActions(const std::vector<ActionPoseSample>& sample
     }
     values_.row(s).array() = (values_.row(s).array() - centre_(s)) / half_range_(s);
   }
+  std::vector<std::int64_t> utimes;
+  for (const ActionPoseSample& sample : samples) utimes.push_back(sample.utime);
+  blocks_ = TimeBlocks(utimes, values_(moving_, Eigen::all));
 }
 
 int count_common(const std::vector<ActionPoseSample>& samples, int part_i, int part_j) {
@@ -74,45 +128,39 @@ int count_common(const std::vector<ActionPoseSample>& samples, int part_i, int p
 
 PairData make_pair_data(const std::vector<ActionPoseSample>& samples, int part_i, int part_j,
                         const MeasurementModel& measurement, int max_frames) {
-  std::vector<int> common;
-  for (std::size_t t = 0; t < samples.size(); ++t)
-    if (samples[t].find(part_i) && samples[t].find(part_j)) common.push_back(static_cast<int>(t));
-
   PairData pair;
   pair.part_i = part_i;
   pair.part_j = part_j;
-  const std::size_t num_frames = std::min<std::size_t>(common.size(), std::max(max_frames, 0));
-  pair.frames.reserve(num_frames);
-  pair.hypotheses.reserve(num_frames);
-  // The last term keeps exact measurements factorisable.
-  const Matrix6d extra = isotropic(measurement.model_error) + 1e-10 * Matrix6d::Identity();
-  const double kLog2Pi = std::log(2 * M_PI);
+  const Matrix6d extra = extra_covariance(measurement, 1);
   MarkerReading readings_i[2], readings_j[2];
-  for (std::size_t n = 0; n < num_frames; ++n) {
-    PairFrame frame;
-    frame.sample = common[n * common.size() / num_frames];
-    frame.first_hypothesis = static_cast<int>(pair.hypotheses.size());
-    const ActionPoseSample& sample = samples[frame.sample];
-    const int num_i = readings_of(*sample.find(part_i), measurement, readings_i);
-    const int num_j = readings_of(*sample.find(part_j), measurement, readings_j);
+  for_thinned(samples, max_frames, {part_i, part_j}, [&](int sample) {
+    const int num_i = readings_of(*samples[sample].find(part_i), measurement, readings_i);
+    const int num_j = readings_of(*samples[sample].find(part_j), measurement, readings_j);
+    FrameWriter frame(sample, &pair);
     for (int a = 0; a < num_i; ++a) {
       for (int b = 0; b < num_j; ++b) {
-        PairHypothesis h;
-        h.z = readings_i[a].X_CB.inverse() * readings_j[b].X_CB;
-        h.penalty = readings_i[a].penalty + readings_j[b].penalty;
-        const Matrix6d covariance =
-            relative_covariance(h.z, readings_i[a].covariance, readings_j[b].covariance) + extra;
-        const Eigen::LLT<Matrix6d> llt(covariance);
-        // A covariance that is not positive definite says nothing usable: leave the instant out.
-        if (llt.info() != Eigen::Success || !(llt.matrixLLT().diagonal().minCoeff() > 0)) continue;
-        h.whitening = llt.matrixL().solve(Matrix6d::Identity());
-        h.log_det = 6 * kLog2Pi + 2 * llt.matrixLLT().diagonal().array().log().sum();
-        pair.hypotheses.push_back(h);
+        const Pose z = readings_i[a].X_CB.inverse() * readings_j[b].X_CB;
+        frame.add(z,
+                  relative_covariance(z, readings_i[a].covariance, readings_j[b].covariance) + extra,
+                  readings_i[a].penalty + readings_j[b].penalty);
       }
     }
-    frame.num_hypotheses = static_cast<int>(pair.hypotheses.size()) - frame.first_hypothesis;
-    if (frame.num_hypotheses > 0) pair.frames.push_back(frame);
-  }
+  });
+  return pair;
+}
+
+PairData make_part_data(const std::vector<ActionPoseSample>& samples, int part,
+                        const MeasurementModel& measurement, int max_frames) {
+  PairData pair;
+  pair.part_i = pair.part_j = part;
+  const Matrix6d extra = extra_covariance(measurement, 0.5);
+  MarkerReading readings[2];
+  for_thinned(samples, max_frames, {part}, [&](int sample) {
+    const int num = readings_of(*samples[sample].find(part), measurement, readings);
+    FrameWriter frame(sample, &pair);
+    for (int a = 0; a < num; ++a)
+      frame.add(readings[a].X_CB, readings[a].covariance + extra, readings[a].penalty);
+  });
   return pair;
 }
 

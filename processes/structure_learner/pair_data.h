@@ -5,6 +5,7 @@
 #include "common/geometry/pose.h"
 #include "common/schema/body_schema.h"
 #include "common/schema/sample.h"
+#include "processes/structure_learner/time_blocks.h"
 
 namespace bodyschema {
 
@@ -23,11 +24,13 @@ class NormalizedActions {
   double half_range(int signal) const { return half_range_(signal); }
   /// The signals that took more than one value, ascending. The others can explain nothing.
   const std::vector<int>& moving() const { return moving_; }
+  const TimeBlocks& blocks() const { return blocks_; }
 
  private:
   Eigen::MatrixXd values_;  // signals × samples
   Eigen::VectorXd centre_, half_range_;
   std::vector<int> moving_;
+  TimeBlocks blocks_;
 };
 
 /// One reading of z_ij = y_i⁻¹ y_j.
@@ -78,6 +81,11 @@ int count_common(const std::vector<ActionPoseSample>& samples, int part_i, int p
 
 /// The pair's data, thinned evenly to at most `max_frames` instants.
 PairData make_pair_data(const std::vector<ActionPoseSample>& samples, int part_i, int part_j,
+                        const MeasurementModel& measurement, int max_frames);
+
+/// The poses of one part in the camera's frame, as if the camera were part i and known exactly:
+/// Σ_z is the covariance of the one marker and half the model error.
+PairData make_part_data(const std::vector<ActionPoseSample>& samples, int part,
                         const MeasurementModel& measurement, int max_frames);
 
 }  // namespace bodyschema

@@ -13,7 +13,8 @@ using Eigen::Matrix3d;
 using Eigen::Vector3d;
 
 constexpr int kScreenFrames = 48;    // frames on which a start is judged
-constexpr int kRotationFrames = 80;  // frames of the eigenvector screen
+constexpr int kCoarseFrames = 16;    // frames on which a start is chosen among a few alike
+constexpr int kRotationFrames = 56;  // frames of the eigenvector screen
 
 Matrix3d rotation_z(double angle) {
   const double c = std::cos(angle), s = std::sin(angle);
@@ -38,17 +39,22 @@ double median(std::vector<double> values) {
   return *middle;
 }
 
-// Mean robust cost a frame on an even subset of the frames.
-double mean_cost(const LocalModel& model, const PairData& pair, const NormalizedActions& actions) {
-  const int n = std::min(pair.size(), kScreenFrames);
-  double sum = 0;
+// How well a start fits an even subset of the frames.
+Start judged(const LocalModel& model, const PairData& pair, const NormalizedActions& actions,
+             int max_frames = kScreenFrames) {
+  Start start;
+  start.model = model;
+  const int n = std::min(pair.size(), max_frames);
+  if (n == 0) return start;
+  std::vector<double> squared(n);
   for (int k = 0; k < n; ++k) {
     const int t = static_cast<int>(static_cast<long>(k) * pair.size() / n);
-    const double d2 =
+    squared[k] =
         best_reading(pair, t, model.predict(actions, pair.frames[t].sample)).squared_distance;
-    sum += std::log1p(d2 / kStudentNu);
+    start.score += (kStudentNu + 6) / 2 * std::log1p(squared[k] / kStudentNu) / n;
   }
-  return n > 0 ? (kStudentNu + 6) / 2 * sum / n : 0;
+  start.median = median(std::move(squared));
+  return start;
 }
 
 // R_t u = C (1, cos α_t, sin α_t): smallest eigenvector and robust score.
@@ -68,7 +74,7 @@ class AxisScreen {
         phi_(rotations_.size()),
         weights_(rotations_.size()) {}
 
-  AxisFit fit(int signal, double turn) {
+  AxisFit fit(int signal, double turn, int rounds) {
     const std::size_t n = rotations_.size();
     for (std::size_t t = 0; t < n; ++t) {
       const double angle = turn * actions_(samples_[t], signal);
@@ -76,7 +82,7 @@ class AxisScreen {
     }
     weights_ = inverse_variances_;
     AxisFit result;
-    for (int round = 0; round < 4; ++round) {
+    for (int round = 0; round < rounds; ++round) {
       Matrix3d gram = Matrix3d::Zero();
       Eigen::Matrix<double, 3, 9> G = Eigen::Matrix<double, 3, 9>::Zero();
       double total = 0;
@@ -273,8 +279,7 @@ Start complete_start(RotationHypothesis h, bool try_signs, const StartFrames& fr
     }
   }
 
-  Start start;
-  LocalModel& model = start.model;
+  LocalModel model;
   model.num_joints = 2;
   model.signal = {h.a, h.b};
   model.turn = {best_turn_a, best_turn_b};
@@ -300,8 +305,7 @@ Start complete_start(RotationHypothesis h, bool try_signs, const StartFrames& fr
   model.A[1].translation() = Za.transpose() * x.segment<3>(3);
   model.A[2].linear() = Zb.transpose() * R2;
   model.A[2].translation() = Zb.transpose() * x.segment<3>(6);
-  start.score = mean_cost(model, pair, actions);
-  return start;
+  return judged(model, pair, actions);
 }
 
 // Two turning joints with general axes, best sums of the two one-sided scores first.
@@ -322,14 +326,27 @@ void general_hypotheses(const StartFrames& frames, const NormalizedActions& acti
   };
   const auto& moving = actions.moving();
   std::vector<Side> sides_a(moving.size()), sides_b(moving.size());
-  for (std::size_t s = 0; s < moving.size(); ++s) {
-    for (const double turn : turns[moving[s]]) {
-      const AxisFit a = screen_a.fit(moving[s], turn);
-      if (a.score < sides_a[s].fit.score) sides_a[s] = {a, turn};
-      const AxisFit b = screen_b.fit(moving[s], turn);
-      if (b.score < sides_b[s].fit.score) sides_b[s] = {b, turn};
+  // Of many signals only the promising ones are worth more than two rounds of re-weighting.
+  constexpr int kRounds = 4;
+  constexpr std::size_t kMaxSignals = 8;
+  const bool many = moving.size() > kMaxSignals;
+  const auto best_of_turns = [&](AxisScreen* screen, std::vector<Side>* sides) {
+    for (std::size_t s = 0; s < moving.size(); ++s) {
+      for (const double turn : turns[moving[s]]) {
+        const AxisFit fit = screen->fit(moving[s], turn, many ? 2 : kRounds);
+        if (fit.score < (*sides)[s].fit.score) (*sides)[s] = {fit, turn};
+      }
     }
-  }
+    if (!many) return;
+    std::vector<double> scores;
+    for (const Side& side : *sides) scores.push_back(side.fit.score);
+    std::nth_element(scores.begin(), scores.begin() + kMaxSignals - 1, scores.end());
+    for (std::size_t s = 0; s < moving.size(); ++s)
+      if ((*sides)[s].fit.score <= scores[kMaxSignals - 1])
+        (*sides)[s].fit = screen->fit(moving[s], (*sides)[s].turn, kRounds);
+  };
+  best_of_turns(&screen_a, &sides_a);
+  best_of_turns(&screen_b, &sides_b);
   std::vector<RotationHypothesis> found;
   for (std::size_t s = 0; s < moving.size(); ++s) {
     for (std::size_t r = 0; r < moving.size(); ++r) {
@@ -521,10 +538,10 @@ Start screen_rigid(const PairData& pair, const NormalizedActions& actions) {
   for (int k = 0; k < n; ++k) {
     LocalModel model;
     model.A[0] = pair.primary(static_cast<int>(static_cast<long>(k) * pair.size() / n)).z;
-    const double score = mean_cost(model, pair, actions);
-    if (score < best.score) best = {model, score};
+    const Start start = judged(model, pair, actions, kCoarseFrames);
+    if (start.score < best.score) best = start;
   }
-  return best;
+  return n > 0 ? judged(best.model, pair, actions) : best;
 }
 
 std::vector<ScrewRegression> screen_one_joint(const RelativeMotions& motions,
@@ -535,10 +552,12 @@ std::vector<ScrewRegression> screen_one_joint(const RelativeMotions& motions,
   std::vector<Vector6d> scaled;
   scaled.reserve(motions.motions.size());
   for (const auto& motion : motions.motions) scaled.push_back(scale.cwiseProduct(motion.log));
-  std::vector<ScrewRegression> result;
+  constexpr int kRounds = 6;
+  constexpr std::size_t kMaxSignals = 8;  // worth more than a least squares fit
   std::vector<double> dq;
   std::vector<int> used;
-  for (const int signal : actions.moving()) {
+  // `rounds` re-weightings, the first without weights.
+  const auto regress = [&](int signal, int rounds) {
     dq.clear();
     used.clear();
     for (std::size_t n = 0; n < scaled.size(); ++n) {
@@ -550,8 +569,9 @@ std::vector<ScrewRegression> screen_one_joint(const RelativeMotions& motions,
     }
     ScrewRegression regression;
     regression.signal = signal;
+    regression.score = std::numeric_limits<double>::infinity();
     Vector6d slope = Vector6d::Zero();
-    for (int round = 0; round < 7; ++round) {
+    for (int round = 0; round <= rounds; ++round) {
       double sxx = 1e-12, score = 0;
       Vector6d sxy = Vector6d::Zero();
       for (std::size_t n = 0; n < used.size(); ++n) {
@@ -562,18 +582,25 @@ std::vector<ScrewRegression> screen_one_joint(const RelativeMotions& motions,
         sxy += w * dq[n] * y;
         score += root;
       }
-      if (round == 6) {
-        regression.score = used.empty() ? std::numeric_limits<double>::infinity()
-                                        : score / static_cast<double>(used.size());
+      if (round == rounds) {
+        if (!used.empty()) regression.score = score / static_cast<double>(used.size());
         break;
       }
       slope = sxy / sxx;
     }
     regression.xi = slope.cwiseQuotient(scale);
-    result.push_back(regression);
+    return regression;
+  };
+  const auto best_first = [](const auto& x, const auto& y) { return x.score < y.score; };
+  std::vector<ScrewRegression> result;
+  const bool many = actions.moving().size() > kMaxSignals;
+  for (const int signal : actions.moving()) result.push_back(regress(signal, many ? 2 : kRounds));
+  std::stable_sort(result.begin(), result.end(), best_first);
+  if (many) {
+    result.resize(kMaxSignals);
+    for (ScrewRegression& r : result) r = regress(r.signal, kRounds);
+    std::stable_sort(result.begin(), result.end(), best_first);
   }
-  std::stable_sort(result.begin(), result.end(),
-                   [](const auto& x, const auto& y) { return x.score < y.score; });
   return result;
 }
 
@@ -605,10 +632,10 @@ Start one_joint_start(const ScrewRegression& regression, const PairData& pair,
     const int t = static_cast<int>(static_cast<long>(k) * pair.size() / n);
     const Vector6d back = -regression.xi * actions(pair.frames[t].sample, regression.signal);
     model.A[0] = pair.primary(t).z * exp(back) * X;
-    const double score = mean_cost(model, pair, actions);
-    if (score < best.score) best = {model, score};
+    const Start start = judged(model, pair, actions, kCoarseFrames);
+    if (start.score < best.score) best = start;
   }
-  return best;
+  return n > 0 ? judged(best.model, pair, actions) : best;
 }
 
 std::vector<double> default_turns() { return {0.3, 0.55, 0.9, 1.4, 2.0, 2.8}; }

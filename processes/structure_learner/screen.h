@@ -24,18 +24,22 @@ struct RelativeMotions {
 /// logarithm is ambiguous at π).
 RelativeMotions relative_motions(const PairData& pair, int max_motions);
 
-/// A closed-form start and how well it already fits: mean robust cost a frame, smaller is better.
+/// A closed-form start and how well it already fits an even subset of the frames.
 struct Start {
   LocalModel model;
-  double score = 0;
+  double score = 0;   ///< mean robust cost a frame: smaller is better
+  double median = 0;  ///< of the squared distances: outliers do not count
 };
+
+/// Score of a rigid start beyond which no rigid model is valid.
+inline constexpr double kMaxRigidStartCost = 20;
 
 /// k = 0: the best of a few single readings.
 Start screen_rigid(const PairData& pair, const NormalizedActions& actions);
 
 /// k = 1, all signals: log(z_s⁻¹ z_t) = ξ (q_t − q_s) holds exactly for every screw, so ξ follows
-/// from an L1 regression. Best signal first; `score` is the mean regression error in standard
-/// deviations.
+/// from an L1 regression. Best signal first, of many signals the eight most promising; `score` is
+/// the mean regression error in standard deviations.
 struct ScrewRegression {
   int signal = 0;
   Vector6d xi = Vector6d::Zero();  ///< in frame j, per half range

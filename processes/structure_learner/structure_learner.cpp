@@ -26,7 +26,9 @@ StructureLearnerConfig StructureLearnerConfig::load(const std::filesystem::path&
   return config;
 }
 
-StructureLearner::StructureLearner(StructureLearnerConfig config) : config_(std::move(config)) {}
+StructureLearner::StructureLearner(StructureLearnerConfig config)
+    : config_(std::move(config)),
+      online_(std::make_shared<OnlineLearner>(config_.signals, config_.options)) {}
 
 void StructureLearner::on_sample(const sample_t& sample) {
   if (sample.sample_index <= last_sample_index_) return;
@@ -38,7 +40,7 @@ void StructureLearner::on_sample(const sample_t& sample) {
   last_sample_index_ = sample.sample_index;
   if (sample.purpose == action_command_t::PURPOSE_TRAIN ||
       sample.purpose == action_command_t::PURPOSE_PROBE) {
-    samples_.push_back(from_message(sample));
+    samples_.push_back(std::make_shared<const ActionPoseSample>(from_message(sample)));
   }
   if (!pending_.empty() && !pending_.back().is_test) pending_.pop_back();
   pending_.push_back({samples_.size(), sample.sample_index, sample.utime,
@@ -49,23 +51,18 @@ std::function<body_schema_t()> StructureLearner::take_job() {
   const Prefix prefix = pending_.front();
   pending_.pop_front();
   const auto end = samples_.begin() + static_cast<std::ptrdiff_t>(prefix.num_training);
-  return [config = config_, samples = std::vector<ActionPoseSample>(samples_.begin(), end),
-          prefix] {
-    LearnOptions options = config.options;
-    const bool is_root_seen = std::any_of(
-        samples.begin(), samples.end(),
-        [&](const ActionPoseSample& sample) { return options.root && sample.find(*options.root); });
-    if (options.root && !is_root_seen) {
-      // Nothing can hang on a root that nobody saw: learn without it, and call that incomplete.
-      options.expected_parts.push_back(*options.root);
-      options.root.reset();
-    }
-    BodySchema schema = learn(config.signals, samples, options).schema;
-    schema.complete &= options.root == config.options.root;
+  return [online = online_, samples = SharedSamples(samples_.begin(), end), prefix] {
+    const int n = static_cast<int>(samples.size());
+    BodySchema schema = online->learn(samples, prefix.is_test ? n : n - 1);
     schema.last_sample_index = prefix.last_sample_index;
     schema.utime = prefix.utime;
     return to_message(schema);
   };
+}
+
+std::function<void()> StructureLearner::take_preparation() {
+  num_prepared_ = samples_.size();
+  return [online = online_, samples = samples_] { online->prepare(samples); };
 }
 
 }  // namespace bodyschema

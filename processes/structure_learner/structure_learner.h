@@ -10,7 +10,7 @@
 #include "bodyschema/body_schema_t.hpp"
 #include "bodyschema/sample_t.hpp"
 #include "common/config/rig.h"
-#include "processes/structure_learner/learn.h"
+#include "processes/structure_learner/online_learner.h"
 
 namespace bodyschema {
 
@@ -24,9 +24,12 @@ struct StructureLearnerConfig {
 };
 
 /// Collects TRAIN and PROBE samples and turns them into a proposal, LEARNED_SCHEMA. The proposal
-/// after sample n is a pure function of the samples 0..n: nothing is carried over from an earlier
-/// one, and which prefixes were skipped while a fit was running does not matter. TEST samples are
+/// after sample n is a pure function of the samples 0..n (see OnlineLearner): which prefixes were
+/// skipped while a fit was running, and what was prepared, does not matter. TEST samples are
 /// never learned from; they only advance last_sample_index, so that the monitor can judge.
+///
+/// A training sample is answered by the structure found before it came, a TEST sample by one that
+/// the samples so far may change: in the time that the arm takes to move, both were prepared.
 ///
 /// Before the first sample there is no proposal; when samples stop, the last proposal stands.
 class StructureLearner {
@@ -47,6 +50,11 @@ class StructureLearner {
   /// the newest waits. There must be one.
   std::function<body_schema_t()> take_job();
 
+  /// Idle time can make the next job short: to be run, in any thread, when there is no job; asked
+  /// once a training sample.
+  std::function<void()> take_preparation();
+  bool has_preparation() const { return num_prepared_ < samples_.size(); }
+
  private:
   /// The samples 0..last_sample_index.
   struct Prefix {
@@ -57,7 +65,9 @@ class StructureLearner {
   };
 
   const StructureLearnerConfig config_;
-  std::vector<ActionPoseSample> samples_;
+  const std::shared_ptr<OnlineLearner> online_;
+  SharedSamples samples_;
+  std::size_t num_prepared_ = 0;
   std::int64_t last_sample_index_ = -1;
   std::deque<Prefix> pending_;
 };

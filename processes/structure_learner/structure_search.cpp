@@ -6,13 +6,24 @@
 #include <numeric>
 #include <tuple>
 
+#include "processes/structure_learner/tree_fit.h"
+
 namespace bodyschema {
 namespace {
 
 // Starts whose mean robust cost a frame is above these are beyond repair by a local fit. (A frame
 // at the squared distance d² costs 5 log(1 + d²/4).)
-constexpr double kMaxRigidStartCost = 20;
 constexpr double kMaxScrewStartCost = 26;
+// And starts whose median squared distance is above these (χ²₆ has 5.35), from kManyFrames on. The
+// valid models' stay below half of that in every noise regime, whatever the outliers.
+constexpr double kMaxRigidStartMedian = 20;
+constexpr double kMaxScrewStartMedian = 30;
+constexpr double kMaxFewFramesMedian = 100;  // from kSomeFrames on
+constexpr int kSomeFrames = 10;
+constexpr int kManyFrames = 20;
+// A refuted fit that costs less a frame may yet be right (a valid one costs 4 to 7).
+constexpr double kMaxHopefulCost = 9;
+constexpr double kMaxSmallHopefulCost = 14;
 // Two signal sets of one size whose likelihoods differ by less [nats] are not told apart.
 constexpr double kAmbiguityMargin = 3;
 
@@ -46,6 +57,12 @@ struct Candidate {
   bool on_all_data = false;
 };
 
+// Beyond what a local fit mends, by the bulk of the frames.
+bool is_hopeless(const Start& start, int num_frames, double max_median) {
+  return num_frames >= kSomeFrames &&
+         start.median > (num_frames >= kManyFrames ? max_median : kMaxFewFramesMedian);
+}
+
 std::set<int> signal_set(const LocalModel& model) {
   return {model.signal.begin(), model.signal.begin() + model.num_joints};
 }
@@ -61,22 +78,29 @@ class Search {
         forest_(static_cast<int>(parts.size())) {
     const int n = static_cast<int>(parts.size());
     const int num_pairs = std::max(1, n * (n - 1) / 2);
-    max_frames_ = std::clamp(40000 / num_pairs, 60, 150);
+    max_frames_ = std::clamp(40000 / num_pairs, 60, 80);
     max_motions_ = num_pairs > 200 ? 150 : 300;
     pairs_.resize(static_cast<std::size_t>(n) * n);
     motions_.resize(pairs_.size());
+    rests_.assign(n, -1);
     for (int i = 0; i < n; ++i)
       for (int j = i + 1; j < n; ++j)
         record(i, j).num_common = count_common(samples, parts[i], parts[j]);
   }
 
   SearchResult run() {
-    for (int k = 0; k <= options_.max_signals && !forest_.spans(); ++k) {
-      if (k == 0) layer_rigid();
-      if (k == 1) layer_one_joint();
-      if (k == 2) layer_two_joints();
+    constexpr int kMaxRounds = 4;
+    for (int round = 0; round < kMaxRounds; ++round) {
+      for (int k = round == 0 ? 0 : 1; k <= options_.max_signals && !forest_.spans(); ++k) {
+        if (k == 0) layer_rigid();
+        if (k == 1) layer_one_joint();
+        if (k == 2) layer_two_joints();
+      }
+      settle_doubtful();
+      // What all markers together refute leaves a gap, which other models may fill.
+      if (!settle_jointly()) break;
     }
-    settle_doubtful();
+    if (!forest_.spans() && bridge()) settle_jointly();
     return std::move(result_);
   }
 
@@ -120,9 +144,11 @@ class Search {
 
   // Fits and tests a start on the pair's subset of the data.
   std::optional<Candidate> try_start(int i, int j, const LocalModel& start) {
+    if (refuted_.count({parts_[i], parts_[j], signal_set(start)})) return std::nullopt;
     const PairData& data = pair(i, j);
     const bool all = data.size() == record(i, j).num_common;
-    Fit fit = fit_local_model(start, data, actions_, 40, 1e-4);
+    Fit fit = fit_local_model(start, data, actions_, 40, 1e-2);
+    last_cost_ = fit.cost / data.size();
     ++result_.num_fits;
     ValidityOptions options = options_.validity;
     options.lenient = !all;
@@ -130,7 +156,11 @@ class Search {
         check_validity(fit, leave_one_out(fit, data, actions_), data, actions_, options);
     if (validity.verdict == Verdict::kNotEnoughData)
       note_undecided(i, j, start.num_joints, validity.mean_capped);
-    if (validity.verdict != Verdict::kValid) return std::nullopt;
+    if (validity.verdict != Verdict::kValid) {
+      if (fit.cost < (start.num_joints < 2 ? kMaxSmallHopefulCost : kMaxHopefulCost) * data.size())
+        hopefuls_.push_back({i, j, fit.model, fit.cost / data.size()});
+      return std::nullopt;
+    }
     return Candidate{i,
                      j,
                      fit.model,
@@ -201,6 +231,257 @@ class Search {
         accept(c);
   }
 
+  struct Tree {
+    std::vector<TreeNode> nodes;
+    std::vector<int> accepted;  // of each node but the first: index into result_.models
+    std::vector<PairData> data;
+    bool root_rests = false;
+  };
+
+  // The accepted models of one component, outwards from a part that rests if there is one.
+  Tree tree_of(int component) {
+    std::vector<int> members;
+    for (int x = 0; x < static_cast<int>(parts_.size()); ++x)
+      if (forest_.connected(component, x)) members.push_back(x);
+    Tree tree;
+    int root = members.front();
+    for (const int x : members)
+      if (part_rests(x)) {
+        root = x;
+        tree.root_rests = true;
+        break;
+      }
+    tree.nodes.push_back({parts_[root], -1, {}});
+    tree.accepted.push_back(-1);
+    for (std::size_t head = 0; head < tree.nodes.size(); ++head) {
+      const int from = tree.nodes[head].part;
+      for (int m = 0; m < static_cast<int>(result_.models.size()); ++m) {
+        if (m == tree.accepted[head]) continue;
+        const AcceptedModel& model = result_.models[m];
+        if (model.part_i == from)
+          tree.nodes.push_back({model.part_j, static_cast<int>(head), model.model});
+        else if (model.part_j == from)
+          tree.nodes.push_back({model.part_i, static_cast<int>(head), model.model.inverse()});
+        else
+          continue;
+        tree.accepted.push_back(m);
+      }
+    }
+    for (const TreeNode& node : tree.nodes)
+      tree.data.push_back(make_part_data(samples_, node.part, options_.measurement, max_frames_));
+    return tree;
+  }
+
+  // Does a part keep its pose in the camera's frame?
+  bool part_rests(int x) {
+    if (rests_[x] < 0) {
+      const PairData data =
+          make_part_data(samples_, parts_[x], options_.measurement, max_frames_);
+      rests_[x] = is_at_rest(data, actions_, options_.validity);
+    }
+    return rests_[x] == 1;
+  }
+
+  // Joints that only all markers together show: part what moves, until nothing is left to explain.
+  // Models that cannot take up the joints they lack are removed: returns true then.
+  bool settle_jointly() {
+    const int n = static_cast<int>(parts_.size());
+    constexpr int kMaxSplits = 12;
+    std::vector<std::pair<int, int>> refuted;
+    result_.log_likelihood = 0;
+    for (int x = 0; x < n; ++x) {
+      if (forest_.find(x) != x) continue;
+      for (int round = 0; round < kMaxSplits; ++round) {
+        const Tree tree = tree_of(x);
+        const TreeFit fit = fit_tree(tree);
+        auto missing = fit.missing_joints();
+        std::optional<std::vector<TreeEdge>> edges;
+        std::vector<int> full;
+        while (tree.nodes.size() > 1 && round + 1 < kMaxSplits && !edges && full.empty()) {
+          const MissingJoint* worst = most_significant(missing);
+          if (!worst) break;
+          edges = fit.with_joint(*worst);
+          if (!edges) full = fit.full_edges(*worst);
+          // An edge that has the signal already is a joint that is not quite a screw.
+          missing.erase(missing.begin() + (worst - missing.data()));
+        }
+        if (edges) {
+          adopt(tree, *edges);
+          continue;
+        }
+        for (const int node : full)
+          refuted.push_back({tree.nodes[node].part, tree.nodes[tree.nodes[node].parent].part});
+        result_.log_likelihood += fit.log_likelihood();
+        break;
+      }
+    }
+    if (refuted.empty()) return false;
+    for (const auto& [a, b] : refuted)
+      std::erase_if(result_.models, [&, a = a, b = b](const AcceptedModel& m) {
+        const bool is_it = std::minmax(a, b) == std::minmax(m.part_i, m.part_j);
+        if (is_it) refuted_.insert({m.part_i, m.part_j, signal_set(m.model)});
+        return is_it;
+      });
+    forest_ = Forest(n);
+    for (const AcceptedModel& m : result_.models) forest_.connect(index_of(m.part_i), index_of(m.part_j));
+    doubtful_.clear();
+    return true;
+  }
+
+  // Connects what is left by models that their own pair could not make valid, if all markers of both
+  // sides together find nothing wrong with one.
+  // A model that is too small grows by the joints it lacks.
+  bool bridge() {
+    constexpr int kMaxTried = 12;
+    std::stable_sort(hopefuls_.begin(), hopefuls_.end(), [](const Hopeful& x, const Hopeful& y) {
+      return std::forward_as_tuple(x.model.num_joints, x.cost) <
+             std::forward_as_tuple(y.model.num_joints, y.cost);
+    });
+    std::set<std::tuple<int, int, std::set<int>>> met;  // the best fit of each comes first
+    std::erase_if(hopefuls_, [&met](const Hopeful& h) {
+      return !met.insert({h.i, h.j, signal_set(h.model)}).second;
+    });
+    std::map<std::tuple<int, int, int>, int> tried;  // by components and k
+    std::map<int, double> cost_of;  // of a component's own tree
+    const auto own_cost = [&](int x) {
+      const auto [it, is_new] = cost_of.emplace(forest_.find(x), 0.0);
+      if (is_new) it->second = fit_tree(tree_of(x)).cost();
+      return it->second;
+    };
+    bool any = false;
+    for (const Hopeful& h : hopefuls_) {
+      if (forest_.connected(h.i, h.j)) continue;
+      if (refuted_.count({parts_[h.i], parts_[h.j], signal_set(h.model)})) continue;
+      const auto [x, y] = std::minmax({forest_.find(h.i), forest_.find(h.j)});
+      if (tried[{x, y, h.model.num_joints}]++ >= kMaxTried) continue;
+      const double apart = own_cost(h.i) + own_cost(h.j);
+      const Forest forest_before = forest_;
+      const std::vector<AcceptedModel> models_before = result_.models;
+      const auto cost = join(h, apart);
+      if (!cost) continue;
+      // Another signal set between the same parts that does as well leaves it open.
+      const Forest forest_joined = forest_;
+      const std::vector<AcceptedModel> models_joined = result_.models;
+      bool is_ambiguous = false;
+      for (const Hopeful& other : hopefuls_) {
+        if (other.i != h.i || other.j != h.j || other.model.num_joints != h.model.num_joints ||
+            signal_set(other.model) == signal_set(h.model))
+          continue;
+        forest_ = forest_before;
+        result_.models = models_before;
+        const auto other_cost = join(other, apart);
+        is_ambiguous |= other_cost && *other_cost < *cost + 2 * kAmbiguityMargin &&
+                        !same_signals(result_.models, models_joined);
+      }
+      forest_ = is_ambiguous ? forest_before : forest_joined;
+      result_.models = is_ambiguous ? models_before : models_joined;
+      if (is_ambiguous) continue;
+      cost_of.clear();
+      any = true;
+    }
+    return any;
+  }
+
+  struct Hopeful {
+    int i = 0, j = 0;
+    LocalModel model;
+    double cost = 0;  // a frame
+  };
+
+  static bool same_signals(const std::vector<AcceptedModel>& x,
+                           const std::vector<AcceptedModel>& y) {
+    const auto all = [](const std::vector<AcceptedModel>& models) {
+      std::set<std::tuple<int, int, std::set<int>>> result;
+      for (const AcceptedModel& m : models)
+        result.insert({m.part_i, m.part_j, signal_set(m.model)});
+      return result;
+    };
+    return all(x) == all(y);
+  }
+
+  static int count_joints(const std::vector<AcceptedModel>& models) {
+    int sum = 0;
+    for (const AcceptedModel& m : models) sum += m.model.num_joints;
+    return sum;
+  }
+
+  // Makes two components one tree, with the joints that all markers ask for. The tree's cost if
+  // that is no worse than noise makes it, else std::nullopt and everything as it was.
+  std::optional<double> join(const Hopeful& h, double apart) {
+    const Forest forest_before = forest_;
+    const std::vector<AcceptedModel> models_before = result_.models;
+    result_.models.push_back({parts_[h.i], parts_[h.j], h.model, 0});
+    forest_.connect(h.i, h.j);
+    for (int added = 0; added <= kMaxJoints; ++added) {
+      const Tree tree = tree_of(h.i);
+      const TreeFit fit = fit_tree(tree);
+      const auto missing = fit.missing_joints();
+      if (const MissingJoint* worst = most_significant(missing)) {
+        const auto edges = fit.with_joint(*worst);
+        if (!edges) break;
+        adopt(tree, *edges);
+        continue;
+      }
+      // Tying the one's pose to the other's at every frame costs half of χ².
+      const int joints = count_joints(result_.models) - count_joints(models_before);
+      const double dof = 6.0 * fit.num_frames() - 6 - 6 * joints;
+      if (dof < 12 || fit.cost() - apart > 0.5 * (dof + 4 * std::sqrt(2 * dof))) break;
+      return fit.cost();
+    }
+    forest_ = forest_before;
+    result_.models = models_before;
+    return std::nullopt;
+  }
+
+  TreeFit fit_tree(const Tree& tree) const {
+    TreeFit fit(tree.nodes, tree.data, actions_, tree.root_rests);
+    fit.fit(15, 0.2);
+    return fit;
+  }
+
+  int index_of(int part) const {
+    return static_cast<int>(std::find(parts_.begin(), parts_.end(), part) - parts_.begin());
+  }
+
+  // Replaces the accepted models of a component by the edges of its new tree.
+  void adopt(const Tree& tree, const std::vector<TreeEdge>& edges) {
+    std::vector<int> old(tree.accepted.begin() + 1, tree.accepted.end());
+    std::sort(old.rbegin(), old.rend());
+    for (const int m : old) result_.models.erase(result_.models.begin() + m);
+    for (const TreeEdge& e : edges) {
+      AcceptedModel model{tree.nodes[e.a].part, tree.nodes[e.b].part, e.model, 0};
+      if (model.part_i > model.part_j) {
+        std::swap(model.part_i, model.part_j);
+        model.model = model.model.inverse();
+      }
+      result_.models.push_back(model);
+    }
+  }
+
+  // The one that chance explains least, if it is significant (Bonferroni over all that was tried).
+  // A signal that moves nothing in a spanning forest is probably somewhere: it has an error rate of
+  // its own, spent on fewer hypotheses.
+  const MissingJoint* most_significant(const std::vector<MissingJoint>& joints) const {
+    constexpr double kErrorRates[2] = {0.003, 0.002};
+    std::set<int> used;
+    for (const AcceptedModel& m : result_.models)
+      for (int d = 0; d < m.model.num_joints; ++d) used.insert(m.model.signal[d]);
+    const auto is_used = [&](int signal) { return !forest_.spans() || used.count(signal) > 0; };
+    double ways[2] = {0, 0};
+    for (const MissingJoint& j : joints) ways[is_used(j.signal)] += std::exp(j.log_ways);
+    const MissingJoint* best = nullptr;
+    double best_margin = 0;
+    for (const MissingJoint& j : joints) {
+      const bool elsewhere = is_used(j.signal);
+      const double margin = j.log_tail + std::log(2 * ways[elsewhere] / kErrorRates[elsewhere]);
+      if (margin < best_margin) {
+        best = &j;
+        best_margin = margin;
+      }
+    }
+    return best;
+  }
+
   static void sort_by_quality(std::vector<Candidate>* candidates) {
     std::stable_sort(candidates->begin(), candidates->end(), [](const auto& x, const auto& y) {
       return std::tie(x.model.num_joints, y.score, x.i, x.j) <
@@ -210,7 +491,7 @@ class Search {
 
   void accept(const Candidate& c) {
     forest_.connect(c.i, c.j);
-    result_.models.push_back({parts_[c.i], parts_[c.j], c.model, c.score});
+    result_.models.push_back({parts_[c.i], parts_[c.j], c.model, c.score, {}});
   }
 
   template <typename Visitor>
@@ -226,7 +507,9 @@ class Search {
     for_each_open_pair([&](int i, int j) {
       ++result_.num_screens;
       const Start start = screen_rigid(pair(i, j), actions_);
-      if (start.score > kMaxRigidStartCost) return;
+      if (start.score > kMaxRigidStartCost ||
+          is_hopeless(start, pair(i, j).size(), kMaxRigidStartMedian))
+        return;
       if (auto c = try_start(i, j, start.model)) candidates.push_back(std::move(*c));
     });
     connect(std::move(candidates));
@@ -240,10 +523,12 @@ class Search {
       result_.num_screens += static_cast<int>(regressions.size());
       std::vector<Candidate> valid;
       for (std::size_t n = 0; n < std::min(kMaxFits, regressions.size()); ++n) {
-        if (n >= 2 && regressions[n].score > 1.5 * regressions[0].score) break;
+        if (n >= 1 && regressions[n].score > 1.5 * regressions[0].score) break;
         const Start start =
             one_joint_start(regressions[n], pair(i, j), actions_, motions(i, j).sigma_rad);
-        if (start.score > kMaxScrewStartCost) continue;
+        if (start.score > kMaxScrewStartCost ||
+            is_hopeless(start, pair(i, j).size(), kMaxScrewStartMedian))
+          continue;
         if (auto c = try_start(i, j, start.model)) valid.push_back(std::move(*c));
       }
       decide(i, j, std::move(valid), &candidates);
@@ -276,7 +561,17 @@ class Search {
       if (turns.empty() || forest_.spans()) continue;
       two_joints_pass(turns);
     }
+    // So few frames leave the fits narrow valleys: a finer grid of ranges.
+    if (samples_.size() < 12 && !forest_.spans()) {
+      std::vector<double> fine;
+      for (double turn = 0.25; turn < 3.1; turn *= 1.15) fine.push_back(turn);
+      two_joints_pass(std::vector<std::vector<double>>(actions_.num_signals(), fine));
+    }
   }
+
+  // Fits of two components that stay above this cost a frame, in a row, before the rest is given up.
+  static constexpr double kHopelessCost = 16;
+  static constexpr int kMaxHopeless = 12;
 
   void two_joints_pass(const std::vector<std::vector<double>>& turns) {
     struct Screened {
@@ -296,10 +591,13 @@ class Search {
                        [](const auto& x, const auto& y) { return x.start.score < y.start.score; });
       std::map<std::pair<int, int>, std::vector<Candidate>> valid;
       std::size_t num_tried = 0;
+      int num_hopeless = 0;  // in a row
       for (const Screened& s : list) {
         const std::size_t max_fits = std::clamp(1200 / std::max(pair(s.i, s.j).size(), 1), 8, 40);
-        if (num_tried++ >= max_fits) break;
+        if (num_tried++ >= max_fits || num_hopeless >= kMaxHopeless) break;
         if (auto c = try_start(s.i, s.j, s.start.model)) valid[{s.i, s.j}].push_back(*c);
+        const bool is_hopeless = last_cost_ > kHopelessCost && pair(s.i, s.j).size() >= kManyFrames;
+        num_hopeless = is_hopeless ? num_hopeless + 1 : 0;
       }
       for (auto& [ij, of_pair] : valid)
         decide(ij.first, ij.second, std::move(of_pair), &candidates);
@@ -316,6 +614,10 @@ class Search {
   int max_motions_ = 0;
   std::vector<std::optional<PairData>> pairs_;
   std::vector<std::optional<RelativeMotions>> motions_;
+  std::set<std::tuple<int, int, std::set<int>>> refuted_;  // by all markers together
+  std::vector<int> rests_;  // a part: 1 yes, 0 no, -1 not yet known
+  double last_cost_ = 0;  // a frame, of the latest fit
+  std::vector<Hopeful> hopefuls_;
   std::vector<Candidate> doubtful_;
   int num_judged_ = 0;  // frames of the valid models found so far, and the outliers among them
   int num_outliers_ = 0;

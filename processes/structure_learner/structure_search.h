@@ -23,6 +23,8 @@ struct AcceptedModel {
   int part_j = 0;
   LocalModel model;
   double score = 0;
+  /// Q of a soft model (residual_fit.h), whose screws `model` then are; empty: screws alone.
+  std::vector<int> soft_signals = {};
 };
 
 /// What the search tried between two parts.
@@ -36,6 +38,8 @@ struct PairRecord {
 struct SearchResult {
   std::vector<AcceptedModel> models;  ///< the forest, in the order of acceptance
   std::map<std::pair<int, int>, PairRecord> records;
+  /// Of all poses, each tree fitted as a whole, Student-t [nats]; up to a constant.
+  double log_likelihood = 0;
   int num_screens = 0;  ///< closed-form starts and regressions
   int num_fits = 0;     ///< Levenberg–Marquardt fits
 };
@@ -54,6 +58,12 @@ struct SearchResult {
 /// where the data as a whole show fewer outliers than assumed, models with many wait until the
 /// layers are through, and a larger model takes their place if it explains the data better by more
 /// than its parameters are worth (6 log 6N a signal).
+///
+/// When the layers are through, each tree is fitted to all its poses at once (TreeFit). A pair shows
+/// only what exceeds the noise of two markers; all markers beyond a joint together show far smaller
+/// motions. So joints that a score test finds missing are put in, models that have no room for them
+/// are dropped and the layers run again, and components that narrowly refuted models keep apart are
+/// joined if that costs no more than noise does.
 ///
 /// Hypotheses are screened and fitted on an even subset of the instants; what is about to enter the
 /// forest must be valid on all of them.

@@ -66,17 +66,25 @@ Validity check_validity(const Fit& fit, const LeaveOneOut& loo, const PairData& 
   }
   const int inliers = n - result.num_outliers;
   const int p = loo.rank;
+  // Of a stream a block of time counts as one frame. `share`: independent frames per frame.
+  const int num_independent =
+      actions.blocks().count(pair.frames, [](const PairFrame& f) { return f.sample; });
+  const double share = static_cast<double>(num_independent) / n;
   if (inliers > 0) result.mean_inlier = inlier_sum / inliers;
 
   // V1
   const double rate = pair_outlier_rate(options);
-  const int max_outliers = std::min(binomial_quantile(n, rate, options.lenient ? 0.99999 : 0.9997),
-                                    static_cast<int>(0.35 * n));
+  const int max_outliers = std::min(
+      static_cast<int>(
+          binomial_quantile(num_independent, rate, options.lenient ? 0.99999 : 0.9997) / share),
+      static_cast<int>(0.35 * n));
   // With few frames a true model may meet more outliers than the bound by bad luck: then it is not
   // refuted, only not to be trusted yet.
   const bool suspicious = result.num_outliers > max_outliers;
-  result.doubtful = n < kFewFrames && result.num_outliers > binomial_quantile(n, rate, 0.8);
-  const int dof = 6 * inliers - p;
+  result.doubtful = num_independent < kFewFrames &&
+                    result.num_outliers > binomial_quantile(num_independent, rate, 0.8) / share;
+  const double independent_inliers = share * inliers;
+  const double dof = 6 * independent_inliers - p;
   if (dof < 6) {
     // So few frames fit that nothing is left over to test with.
     result.verdict = suspicious ? Verdict::kRefuted : Verdict::kNotEnoughData;
@@ -84,7 +92,8 @@ Validity check_validity(const Fit& fit, const LeaveOneOut& loo, const PairData& 
   }
   if (suspicious && (n >= kFewFrames || 2 * result.num_outliers > n)) return result;
   const double sampling =
-      (options.lenient ? 5 : 3) * std::sqrt(kInlierVariance / inliers * (6.0 * inliers / dof));
+      (options.lenient ? 5 : 3) *
+      std::sqrt(kInlierVariance / independent_inliers * (6.0 * independent_inliers / dof));
   // A fifth of slack: the noise is known to some ten per cent at best.
   const double max_mean = std::min(1.2 * kInlierMean + sampling, 0.75 * kOutlierThreshold);
   if (result.mean_inlier > max_mean) return result;
@@ -106,7 +115,7 @@ Validity check_validity(const Fit& fit, const LeaveOneOut& loo, const PairData& 
   const double threshold =
       chi_square_quantile(6 * num_features,
                           (options.lenient ? 1e-6 : 1.35e-3) / std::max(others, 1)) *
-          std::max(1.0, result.mean_inlier / 6) +
+          std::max(1.0, result.mean_inlier / 6) / share +
       // What is far below the noise of every single frame is no joint but a bias.
       0.05 * n;
   for (const int g : actions.moving()) {
@@ -143,7 +152,8 @@ Validity check_validity(const Fit& fit, const LeaveOneOut& loo, const PairData& 
   if (suspicious) result.verdict = Verdict::kNotEnoughData;
   // Few readings of a joint that happened to move little look rigid, the more so with some set
   // aside.
-  if (k == 0 && inliers < 4 + result.num_outliers) result.verdict = Verdict::kNotEnoughData;
+  if (k == 0 && independent_inliers < 4 + share * result.num_outliers)
+    result.verdict = Verdict::kNotEnoughData;
   const bool improbable_by_chance = dof * log_lambda > std::log(num_candidates) + 7;
   if (k > 0 && dof < 2 * p && !improbable_by_chance) result.verdict = Verdict::kNotEnoughData;
   return result;

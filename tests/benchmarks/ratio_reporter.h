@@ -10,8 +10,8 @@
 namespace bodyschema::test {
 
 /// Google Benchmark's console table and, below it, each benchmark's median processor time over that
-/// of a peer: `{"ours", "peer"}`. Compares within one run on one machine, so the ratios hold where
-/// the times do not.
+/// of a peer: `{"ours", "peer"}`, with their arguments: `Learn/100`. Compares within one run on one
+/// machine, so the ratios hold where the times do not.
 class RatioReporter : public benchmark::ConsoleReporter {
  public:
   struct Ratio {
@@ -27,7 +27,10 @@ class RatioReporter : public benchmark::ConsoleReporter {
     for (const Run& run : runs) {
       const bool is_median = run.run_type == Run::RT_Aggregate && run.aggregate_name == "median";
       const bool is_only = run.run_type == Run::RT_Iteration && run.repetitions <= 1;
-      if (is_median || is_only) time_[run.run_name.function_name] = run.GetAdjustedCPUTime();
+      const std::string& args = run.run_name.args;
+      if (is_median || is_only)
+        time_[run.run_name.function_name + (args.empty() ? "" : "/" + args)] =
+            run.GetAdjustedCPUTime();
     }
   }
 

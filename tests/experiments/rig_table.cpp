@@ -11,6 +11,7 @@
 #include <cmath>
 #include <cstdio>
 #include <filesystem>
+#include <optional>
 #include <string>
 #include <vector>
 
@@ -53,9 +54,14 @@ int main(int argc, char** argv) {
   app.add_option("--seeds", num_seeds)->check(CLI::PositiveNumber);
   app.add_option("--first-seed", first_seed);
   app.add_option("--hide", hidden, "Parts that are hidden");
+  std::string choice;
+  app.add_option("--choice", choice, "How actions are found; else as motor_babbler.yaml says")
+      ->check(CLI::IsMember({"active", "random"}));
   CLI11_PARSE(app, argc, argv);
   std::sort(at.begin(), at.end());
 
+  std::optional<Choice> forced;
+  if (!choice.empty()) forced = choice == "active" ? Choice::kActive : Choice::kRandom;
   std::printf(
       "| rig | samples | right | incomplete | end effector, median | worst seed | learning |\n"
       "| --- | --- | --- | --- | --- | --- | --- |\n");
@@ -68,7 +74,7 @@ int main(int argc, char** argv) {
     for (const int part : hidden) std::erase(observed, part);
     std::vector<Row> rows(at.size());
     for (std::int64_t seed = first_seed; seed < first_seed + num_seeds; ++seed) {
-      test::RenderedRun run(rig, seed, {hidden.begin(), hidden.end()});
+      test::RenderedRun run(rig, seed, {hidden.begin(), hidden.end()}, forced);
       // Held out for judging: the TEST samples of the whole run, with their true poses.
       std::vector<ActionPoseSample> training, held_out;
       std::vector<std::vector<ActionPoseSample>> trained;
@@ -89,6 +95,8 @@ int main(int argc, char** argv) {
         }
         if (std::find(at.begin(), at.end(), n) != at.end()) trained.push_back(training);
       }
+      std::fprintf(stderr, "%s seed %d: %d actions refused\n", rig.filename().c_str(),
+                   static_cast<int>(seed), run.num_rejected());
       for (std::size_t i = 0; i < at.size(); ++i) {
         const auto start = std::chrono::steady_clock::now();
         const BodySchema schema = learn(config.signals, trained[i], config.options).schema;

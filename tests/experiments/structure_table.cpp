@@ -1,13 +1,18 @@
 // structure_table: how often is the learned structure right? Prints a Markdown table
-//   robot | regime | noise | N | right / incomplete / wrong % | mean CPU ms | fits
+//   robot | regime | noise | N | right / incomplete / wrong % | detectable, right of these % |
+//   mean CPU ms | fits
+// "Detectable": every joint shows in the two markers next to it, r/√3 · √N > 5 σ with r its half
+// range and σ the noise of their relative pose, in translation or in rotation.
 //
 // structure_table ROBOTS REGIMES NOISE NS FIRST_SEED NUM_SEEDS [verbose]
-//   ROBOTS   comma-separated: a, c, co, d, dP, tree, tree3 (adjacent hidden parts), tree12
+//   ROBOTS   comma-separated: a, c, co, d, dP, tree, tree3 (adjacent hidden parts), tree12, tree40
 //   REGIMES  free, chapter, tag, tag_iso
 //   NOISE    covariance (in the observations), given (isotropic), estimated, other (covariances and
 //            second hypotheses)
 //   NS       numbers of samples
 
+#include <algorithm>
+#include <cmath>
 #include <cstdio>
 #include <ctime>
 #include <iostream>
@@ -44,6 +49,21 @@ SyntheticRobot make_robot(const std::string& name, Rng& rng) {
   return chapter_robot(name, rng);
 }
 
+bool is_detectable(const SyntheticRobot& robot, Regime regime, int num_samples) {
+  if (regime == Regime::kFree) return true;
+  const Noise noise = nominal_noise(regime);
+  for (const TrueLink& link : robot.links) {
+    if (link.signal < 0) continue;
+    const Signal& signal = robot.signals[link.signal];
+    const double half = 0.5 * (signal.upper - signal.lower);
+    const double in_sigmas =
+        half * std::max(std::abs(link.slide) / (std::sqrt(2.0) * noise.position_m),
+                        std::abs(link.turn) / (std::sqrt(2.0) * noise.rotation_rad));
+    if (in_sigmas * std::sqrt(num_samples / 3.0) < 5) return false;
+  }
+  return true;
+}
+
 void describe(const BodySchema& schema, const SyntheticRobot& robot) {
   for (const Edge& e : schema.edges) {
     std::printf("    %d-%d {", e.from, e.to);
@@ -68,15 +88,18 @@ int main(int argc, char** argv) {
   }
   const int first_seed = std::stoi(argv[5]), num_seeds = std::stoi(argv[6]);
   const bool verbose = argc > 7;
-  std::printf("| robot | regime | noise | N | right / incomplete / wrong %% | ms | fits |\n");
-  std::printf("|---|---|---|---|---|---|---|\n");
+  std::printf(
+      "| robot | regime | noise | N | right / incomplete / wrong %% | detectable, right of these %% | "
+      "search, ms | learning, ms | fits |\n");
+  std::printf("|---|---|---|---|---|---|---|---|---|\n");
   for (const std::string& robot_name : split(argv[1])) {
     for (const std::string& regime_name : split(argv[2])) {
       for (const std::string& noise : split(argv[3])) {
         for (const std::string& n_text : split(argv[4])) {
           const int n = std::stoi(n_text);
           int counts[3] = {0, 0, 0};
-          double seconds = 0;
+          int num_detectable = 0, num_right = 0;  // and right
+          double search_seconds = 0, learn_seconds = 0;
           long fits = 0;
           for (int seed = first_seed; seed < first_seed + num_seeds; ++seed) {
             Rng rng(seed);
@@ -90,21 +113,30 @@ int main(int argc, char** argv) {
             if (noise == "given") options.noise = nominal_noise(observation.regime);
             const auto samples = babble(robot, n, observation, rng);
             const std::clock_t start = std::clock();
-            const LearnResult result = learn(robot.signals, samples, options);
-            seconds += static_cast<double>(std::clock() - start) / CLOCKS_PER_SEC;
+            const LearnedStructure structure = find_structure(robot.signals, samples, options);
+            search_seconds += static_cast<double>(std::clock() - start) / CLOCKS_PER_SEC;
+            const LearnResult result = fit_structure(structure, samples, options);
+            learn_seconds += static_cast<double>(std::clock() - start) / CLOCKS_PER_SEC;
             fits += result.num_fits;
             const Rightness rightness = judge(result.schema, robot);
             ++counts[static_cast<int>(rightness)];
+            if (is_detectable(robot, observation.regime, n)) {
+              ++num_detectable;
+              num_right += rightness == Rightness::kRight;
+            }
             if (verbose && rightness != Rightness::kRight) {
               std::printf("  seed %d: %s\n", seed,
                           rightness == Rightness::kWrong ? "wrong" : "incomplete");
               describe(result.schema, robot);
             }
           }
-          std::printf("| %s | %s | %s | %d | %.0f / %.0f / %.0f | %.1f | %.0f |\n",
+          std::printf("| %s | %s | %s | %d | %.1f / %.1f / %.1f | %.0f, %.1f | %.0f | %.0f | "
+                      "%.0f |\n",
                       robot_name.c_str(), regime_name.c_str(), noise.c_str(), n,
                       100.0 * counts[0] / num_seeds, 100.0 * counts[1] / num_seeds,
-                      100.0 * counts[2] / num_seeds, 1e3 * seconds / num_seeds,
+                      100.0 * counts[2] / num_seeds, 100.0 * num_detectable / num_seeds,
+                      100.0 * num_right / std::max(num_detectable, 1),
+                      1e3 * search_seconds / num_seeds, 1e3 * learn_seconds / num_seeds,
                       static_cast<double>(fits) / num_seeds);
           std::fflush(stdout);
         }

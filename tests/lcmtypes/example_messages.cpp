@@ -79,6 +79,43 @@ schema_edge_t edge(int from, int to, int num_joints) {
   return edge;
 }
 
+schema_edge_t screw_gp_edge(int from, int to) {
+  schema_edge_t message = edge(from, to, 1);
+  message.base_kind = schema_edge_t::EDGE_SCREW_GP;
+  residual_gp_t gp{};
+  fill(gp.num_gp_signals, gp.gp_signals, {1, 0});
+  gp.gp_length_scales = {0.8, 1.7};
+  for (int c = 0; c < 6; ++c) {
+    gp.gp_variances[c] = 1e-4 * (c + 1);
+    gp.gp_noise_variances[c] = 1e-6 * (c + 1);
+  }
+  fill(gp.num_gp_samples, gp.gp_noise_scales, {1, 0.4, 12});
+  fill(gp.num_gp_inputs, gp.gp_inputs, {-1, 0.5, 0.2, 0.1, 0.9, -0.7});
+  std::vector<double> residuals;
+  for (int n = 0; n < 18; ++n) residuals.push_back(0.001 * (n - 9));
+  fill(gp.num_gp_residuals, gp.gp_residuals, residuals);
+  fill(message.num_residual_gp, message.residual_gp, {gp});
+  return message;
+}
+
+schema_edge_t matrix_gp_edge(int from, int to) {
+  schema_edge_t message = edge(from, to, 0);
+  message.base_kind = schema_edge_t::EDGE_MATRIX_GP;
+  matrix_gp_t gp{};
+  fill(gp.num_matrix_signals, gp.matrix_signals, {1});
+  std::vector<double> lengths;
+  for (int e = 0; e < 12; ++e) {
+    lengths.push_back(0.7 + e);
+    gp.entry_variances[e] = 0.1 * (e + 1);
+    gp.entry_noise_variances[e] = 1e-5 * e;
+  }
+  fill(gp.num_entry_lengths, gp.entry_length_scales, lengths);
+  fill(gp.num_matrix_poses, gp.matrix_poses, {pose(31), pose(32), pose(33)});
+  fill(gp.num_matrix_inputs, gp.matrix_inputs, {-0.8, 0.1, 0.9});
+  fill(message.num_matrix_gp, message.matrix_gp, {gp});
+  return message;
+}
+
 }  // namespace
 
 action_command_t example_action_command() {
@@ -218,7 +255,7 @@ body_schema_t example_body_schema() {
   message.last_sample_index = 50;
   message.num_samples_seen = 40;
   message.is_complete = 0;
-  fill(message.num_parts, message.part_ids, {1, 2, 4, 9});
+  fill(message.num_parts, message.part_ids, {1, 2, 4, 5, 6, 9});
   message.root_part = 2;
   message.X_CR = pose(2);
   covariance(message.X_CR_covariance);
@@ -230,7 +267,8 @@ body_schema_t example_body_schema() {
     fill(signals[n].num_warp, signals[n].warp_weights, {0.1, -0.1});
   }
   fill(message.num_signals, message.signals, signals);
-  fill(message.num_edges, message.edges, {edge(2, 4, 2), edge(4, 1, 0)});
+  fill(message.num_edges, message.edges,
+       {edge(2, 4, 2), edge(4, 1, 0), screw_gp_edge(4, 5), matrix_gp_edge(1, 6)});
   unconnected_part_t lost{};
   lost.unconnected_part = 9;
   lost.reason = unconnected_part_t::REASON_NO_VALID_MODEL;

@@ -6,9 +6,10 @@
 #include "common/scene/scene_renderer.h"
 #include "processes/camera/camera.h"
 #include "processes/marker_estimator/marker_estimator.h"
-#include "processes/motor_babbler/motor_babbler.h"
+#include "processes/model_monitor/model_monitor.h"
 #include "processes/observer/observer.h"
 #include "processes/robot_simulator/robot_simulator.h"
+#include "processes/structure_learner/structure_learner.h"
 
 namespace bodyschema::test {
 namespace {
@@ -31,7 +32,7 @@ ImageEffects effects(const SimulationConfig& simulation) {
 
 struct RenderedRun::Implementation {
   Implementation(const std::filesystem::path& rig, std::int64_t seed,
-                 const std::set<int>& hidden_parts)
+                 const std::set<int>& hidden_parts, std::optional<Choice> choice)
       : camera_config(CameraConfig::load(rig / "camera.yaml")),
         simulator(simulator_config(rig, seed, hidden_parts)),
         renderer(rig, camera_config.calibration, effects(camera_config.simulation.value())),
@@ -39,16 +40,42 @@ struct RenderedRun::Implementation {
                [this](const sim_state_t& state, int frame) { return renderer.render(state, frame); }),
         estimator(MarkerEstimatorConfig::load(rig / "marker_estimator.yaml"), load_markers(rig)),
         observer(ObserverConfig::load(rig / "observer.yaml"), load_markers(rig)),
-        babbler(with_enough_samples(MotorBabblerConfig::load(rig / "motor_babbler.yaml")), seed) {
+        babbler_config(endless(MotorBabblerConfig::load(rig / "motor_babbler.yaml"), choice)),
+        babbler(babbler_config, seed),
+        learner(StructureLearnerConfig::load(rig / "structure_learner.yaml")),
+        monitor(ModelMonitorConfig::load(rig / "model_monitor.yaml")) {
     const camera_info_t info = make_info(camera_config.calibration, 0);
     estimator.on_camera_info(info);
     observer.on_camera_info(info);
     babbler.on_control_status(control_status_t{});  // nobody else wants the arm
   }
 
-  static MotorBabblerConfig with_enough_samples(MotorBabblerConfig config) {
+  static MotorBabblerConfig endless(MotorBabblerConfig config, std::optional<Choice> choice) {
     config.stop.min_samples = config.stop.max_samples = 1'000'000'000;
+    config.choice = choice.value_or(config.choice);
     return config;
+  }
+
+  /// What the babbler hears after a sample, up to its next command.
+  std::optional<action_command_t> answer_to(const sample_t& sample) {
+    babbler.remember(sample);
+    auto next = babbler.on_sample(sample);
+    const bool is_active = babbler_config.choice == Choice::kActive;
+    if (is_active) {
+      learner.on_sample(sample);
+      monitor.on_sample(sample);
+    }
+    if (next) return next;
+    // It waits for the verdict on a TEST sample.
+    if (!is_active) {
+      model_health_t verdict{};
+      verdict.judged_sample = sample.sample_index;
+      verdict.worst_position_m = verdict.worst_rotation_rad = -1;
+      return babbler.on_model_health(verdict);
+    }
+    while (learner.has_test_job()) monitor.on_learned_schema(learner.take_job()());
+    if (monitor.schema()) babbler.on_body_schema(*monitor.schema());
+    return babbler.on_model_health(monitor.health());
   }
 
   const CameraConfig camera_config;
@@ -57,13 +84,16 @@ struct RenderedRun::Implementation {
   SimulatedCamera camera;
   MarkerEstimator estimator;
   Observer observer;
+  const MotorBabblerConfig babbler_config;
   MotorBabbler babbler;
+  StructureLearner learner;
+  ModelMonitor monitor;
   std::optional<action_command_t> command;
 };
 
 RenderedRun::RenderedRun(const std::filesystem::path& rig_folder, std::int64_t seed,
-                         const std::set<int>& hidden_parts)
-    : implementation_(std::make_unique<Implementation>(rig_folder, seed, hidden_parts)) {}
+                         const std::set<int>& hidden_parts, std::optional<Choice> choice)
+    : implementation_(std::make_unique<Implementation>(rig_folder, seed, hidden_parts, choice)) {}
 
 RenderedRun::~RenderedRun() = default;
 
@@ -99,14 +129,7 @@ RenderedRun::Step RenderedRun::next() {
     for (std::size_t i = 0; i < answer.state->true_part.size(); ++i) {
       step.truth[answer.state->true_part[i]] = X_CW * from_message(answer.state->X_WB[i]);
     }
-    run.command = run.babbler.on_sample(*sample);
-    if (!run.command) {
-      // After a TEST sample the babbler waits for a verdict; here nobody judges.
-      model_health_t verdict{};
-      verdict.judged_sample = sample->sample_index;
-      verdict.worst_position_m = verdict.worst_rotation_rad = -1;
-      run.command = run.babbler.on_model_health(verdict);
-    }
+    run.command = run.answer_to(*sample);
     return step;
   }
 }

@@ -34,6 +34,23 @@ Signal symmetric_signal(int index, double limit) {
   return {name, -limit, limit};
 }
 
+// Scales the links so that the longest way from the base to a part has this length.
+void stretch(SyntheticRobot* robot, double length_m) {
+  std::map<int, double> reach;
+  double longest = 0;
+  for (const TrueLink& link : robot->links) {
+    double& here = reach[link.part];
+    if (link.parent >= 0)
+      here = reach.at(link.parent) + link.X_before.translation().norm() +
+             link.X_after.translation().norm();
+    longest = std::max(longest, here);
+  }
+  for (TrueLink& link : robot->links) {
+    link.X_before.translation() *= length_m / longest;
+    link.X_after.translation() *= length_m / longest;
+  }
+}
+
 void place_camera(SyntheticRobot* robot, Rng& rng) {
   robot->X_CR.linear() = random_rotation(rng);
   robot->X_CR.translation() << 0, 0, 2;
@@ -159,6 +176,24 @@ Noise nominal_noise(Regime regime) {
   return {};
 }
 
+std::set<int> facing_parts(const SyntheticRobot& robot, const Eigen::VectorXd& action,
+                           double max_view_angle_rad) {
+  const std::vector<int> visible = robot.visible_parts();
+  if (max_view_angle_rad >= M_PI) return {visible.begin(), visible.end()};
+  Eigen::VectorXd middle(robot.signals.size());
+  for (std::size_t s = 0; s < robot.signals.size(); ++s)
+    middle(s) = 0.5 * (robot.signals[s].lower + robot.signals[s].upper);
+  // From the part to the camera, in the part's frame.
+  const auto to_camera = [](const Pose& X_CB) { return X_CB.inverse().translation().normalized(); };
+  const auto before = robot.poses_in_camera(middle), now = robot.poses_in_camera(action);
+  std::set<int> result;
+  for (const int part : visible) {
+    const double cosine = to_camera(before.at(part)).dot(to_camera(now.at(part)));
+    if (cosine >= std::cos(max_view_angle_rad)) result.insert(part);
+  }
+  return result;
+}
+
 ActionPoseSample observe(const SyntheticRobot& robot, const Eigen::VectorXd& action,
                          const ObservationOptions& options, std::int64_t sample_index, Rng& rng) {
   ActionPoseSample sample;
@@ -176,8 +211,9 @@ ActionPoseSample observe(const SyntheticRobot& robot, const Eigen::VectorXd& act
   const Noise noise = nominal_noise(options.regime);
   const bool tags = options.regime == Regime::kTag;
   const auto poses = robot.poses_in_camera(action);
+  const std::set<int> facing = facing_parts(robot, action, options.max_view_angle_rad);
   for (const TrueLink& link : robot.links) {
-    if (link.hidden) continue;
+    if (!facing.count(link.part)) continue;
     if (tags && uniform(rng, 0, 1) < 0.15) continue;
     const Pose& X_true = poses.at(link.part);
     Matrix6d root = Matrix6d::Zero();  // covariance = root · rootᵀ
@@ -240,7 +276,7 @@ SyntheticRobot chapter_robot(const std::string& name, Rng& rng) {
   if (name == "c" || name == "co") chain = {0, 1, 2, 3};
   const bool is_d = name == "d" || name == "dP";
   if (is_d) chain = {0, 1, 2, 3, 4, 5, -1};
-  if (chain.empty()) throw std::invalid_argument("no robot of the chapter is called " + name);
+  if (chain.empty() && name != "b") throw std::invalid_argument("no robot of the chapter is called " + name);
   robot.links.push_back({.part = 1});
   for (std::size_t n = 0; n < chain.size(); ++n) {
     TrueLink link = random_link(static_cast<int>(n) + 2, static_cast<int>(n) + 1, rng);
@@ -250,6 +286,20 @@ SyntheticRobot chapter_robot(const std::string& name, Rng& rng) {
       robot.signals.push_back(symmetric_signal(link.signal, uniform(rng, 60, 120) * kDegree));
     }
     robot.links.push_back(link);
+  }
+  if (name == "b") {
+    // The ring that carries the second axis across the first is no body part.
+    TrueLink ring = random_link(3, 1, rng), end = random_link(2, 3, rng);
+    ring.hidden = true;
+    ring.X_after.linear() = Eigen::AngleAxisd(M_PI / 2, Eigen::Vector3d::UnitX()).matrix();
+    ring.X_after.translation().setZero();
+    end.X_before = Pose::Identity();
+    for (TrueLink* link : {&ring, &end}) {
+      link->signal = static_cast<int>(robot.signals.size());
+      link->turn = 1;
+      robot.signals.push_back(symmetric_signal(link->signal, uniform(rng, 60, 120) * kDegree));
+      robot.links.push_back(*link);
+    }
   }
   if (name == "co") robot.links[2].hidden = true;
   if (is_d) {
@@ -266,6 +316,7 @@ SyntheticRobot chapter_robot(const std::string& name, Rng& rng) {
     }
     robot.signals.push_back(
         symmetric_signal(6, name == "d" ? uniform(rng, 40, 60) * kDegree : 1.0));
+    stretch(&robot, 1.3);
   }
   return robot;
 }

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <cmath>
 #include <map>
 #include <ostream>
 #include <random>
@@ -67,16 +68,24 @@ struct ObservationOptions {
   Regime regime = Regime::kFree;
   bool with_covariances = false;  ///< else all zero
   bool with_other_hypothesis = false;
+  /// A part is seen only while its marker faces the camera within this angle [rad]. Each part has
+  /// one, turned to the camera when all signals are at mid-range. π: from everywhere.
+  double max_view_angle_rad = M_PI;
 };
+/// The observable parts whose marker faces the camera.
+std::set<int> facing_parts(const SyntheticRobot& robot, const Eigen::VectorXd& action,
+                           double max_view_angle_rad);
 
 ActionPoseSample observe(const SyntheticRobot& robot, const Eigen::VectorXd& action,
                          const ObservationOptions& options, std::int64_t sample_index, Rng& rng);
 std::vector<ActionPoseSample> babble(const SyntheticRobot& robot, int num_samples,
                                      const ObservationOptions& options, Rng& rng);
 
-/// The chapter's robots, random geometry. 'a': 2-DOF, 5 parts (Fig. 3); 'c': 4-DOF, 5 parts (Fig.
-/// 7); "co": c with part 3 hidden (Fig. 8); "d": 7-DOF, 10 parts, part 4 hidden, two hinged fingers
-/// on one signal; "dP": d with sliding fingers.
+/// The chapter's robots, random geometry. "a": 2-DOF, 5 parts (Fig. 3); "b": two parts on a joint
+/// of two axes that cross at a right angle (Fig. 6); "c": 4-DOF, 5 parts (Fig. 7); "co": c with part
+/// 3 hidden (Fig. 8); "d": 7-DOF, 10 parts, part 4 hidden, 1.3 m long, two hinged fingers on
+/// one signal (Fig. 11); "dP": d with sliding fingers.
+/// @throws std::invalid_argument of another name.
 SyntheticRobot chapter_robot(const std::string& name, Rng& rng);
 
 struct RandomTreeOptions {

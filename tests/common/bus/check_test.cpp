@@ -2,6 +2,7 @@
 
 #include <gtest/gtest.h>
 
+#include <cmath>
 #include <functional>
 #include <string>
 #include <type_traits>
@@ -134,9 +135,9 @@ TEST(Check, RefusesAnImageThatItsBytesCannotBe) {
 
 TEST(Check, RefusesASchemaThatIsNoTreeOfItsOwnPartsAndSignals) {
   expect_refused(example_body_schema(), "edges[0].to_part",
-                 [](auto& m) { m.edges[0].to_part = 5; });
+                 [](auto& m) { m.edges[0].to_part = 7; });
   expect_refused(example_body_schema(), "edges[0].from_part",
-                 [](auto& m) { m.edges[0].from_part = 5; });
+                 [](auto& m) { m.edges[0].from_part = 7; });
   expect_refused(example_body_schema(), "edges[1].to_part",
                  [](auto& m) { m.edges[1].to_part = 2; });
   expect_refused(example_body_schema(), "edges[1].to_part",
@@ -151,6 +152,55 @@ TEST(Check, RefusesASchemaThatIsNoTreeOfItsOwnPartsAndSignals) {
     m.edges[0].parameter_covariance.resize(21);
     m.edges[0].num_covariance = 21;
   });
+}
+
+TEST(Check, RefusesAGaussianProcessThatCannotBeFactorisedAgain) {
+  const auto residual = [](const std::string& field, const auto& spoil) {
+    expect_refused(example_body_schema(), "edges[2].residual_gp[0]." + field,
+                   [&](auto& m) { spoil(m.edges[2].residual_gp[0]); });
+  };
+  residual("gp_signals", [](auto& gp) { gp.gp_signals[1] = 2; });
+  residual("gp_length_scales", [](auto& gp) { gp.gp_length_scales[0] = 0; });
+  residual("gp_length_scales", [](auto& gp) { gp.gp_length_scales.pop_back(); });
+  residual("gp_variances", [](auto& gp) { gp.gp_variances[5] = -1; });
+  residual("gp_variances", [](auto& gp) { gp.gp_variances[0] = 1e200; });
+  residual("gp_noise_variances", [](auto& gp) { gp.gp_noise_variances[3] = NAN; });
+  residual("gp_noise_scales", [](auto& gp) { gp.gp_noise_scales[2] = 0; });
+  residual("gp_inputs", [](auto& gp) { gp.gp_inputs[4] = INFINITY; });
+  residual("gp_inputs", [](auto& gp) {
+    gp.gp_inputs.resize(3);
+    gp.num_gp_inputs = 3;
+  });
+  residual("gp_residuals", [](auto& gp) { gp.gp_residuals[7] = 1e4; });
+  residual("num_gp_samples", [](auto& gp) {
+    gp.num_gp_samples = 65;
+    gp.gp_noise_scales.assign(65, 1);
+    gp.num_gp_inputs = 130;
+    gp.gp_inputs.assign(130, 0);
+    gp.num_gp_residuals = 390;
+    gp.gp_residuals.assign(390, 0);
+  });
+  const auto matrix = [](const std::string& field, const auto& spoil) {
+    expect_refused(example_body_schema(), "edges[3].matrix_gp[0]." + field,
+                   [&](auto& m) { spoil(m.edges[3].matrix_gp[0]); });
+  };
+  matrix("matrix_signals", [](auto& gp) { gp.matrix_signals[0] = -1; });
+  matrix("entry_length_scales", [](auto& gp) { gp.entry_length_scales[11] = -2; });
+  matrix("entry_variances", [](auto& gp) { gp.entry_variances[2] = 0; });
+  matrix("entry_noise_variances", [](auto& gp) { gp.entry_noise_variances[4] = -1e-9; });
+  matrix("matrix_poses[1].z.rotation_wxyz",
+         [](auto& gp) { gp.matrix_poses[1].rotation_wxyz[0] += 0.5; });
+  matrix("num_matrix_poses", [](auto& gp) {
+    gp.matrix_poses.clear();
+    gp.num_matrix_poses = 0;
+  });
+  // Each kind of edge has what its name says, and nothing else.
+  expect_refused(example_body_schema(), "edges[2].num_residual_gp",
+                 [](auto& m) { m.edges[2].base_kind = schema_edge_t::EDGE_SCREW; });
+  expect_refused(example_body_schema(), "edges[3].num_matrix_gp",
+                 [](auto& m) { m.edges[3].base_kind = schema_edge_t::EDGE_RIGID; });
+  expect_refused(example_body_schema(), "edges[0].base_kind",
+                 [](auto& m) { m.edges[0].base_kind = schema_edge_t::EDGE_MATRIX_GP; });
 }
 
 TEST(Check, KnowsMinusOneOnlyWhereItMeansNotMeasured) {

@@ -103,14 +103,39 @@ TEST(Convert, AParameterCovarianceKeepsFloatPrecision) {
   EXPECT_TRUE(found.isApprox(schema.edges[0].parameter_covariance, 1e-6));
 }
 
-TEST(Convert, AnEdgeThatNoMessageHoldsIsRefused) {
-  const std::vector<GpPrior> priors(MatrixGp::kNumEntries,
-                                    {std::nullopt, SquaredExponential{1, {}}, 1});
+TEST(Convert, GaussianProcessesSurviveTheWireToTheLastBit) {
+  const BodySchema schema = from_message(example_body_schema());
+  EXPECT_STREQ(schema.edges[2].kind(), "screw_gp");
+  EXPECT_STREQ(schema.edges[3].kind(), "matrix_gp");
+  EXPECT_EQ(schema.edges[2].signals(), (std::vector<int>{0, 1}));
+  const BodySchema again = from_message(to_message(schema));
+  const Eigen::Vector2d action(0.3, -0.7);
+  EXPECT_EQ(again.edges[2].residual_gp->mean(action), schema.edges[2].residual_gp->mean(action));
+  EXPECT_EQ(again.edges[2].residual_gp->variance(action),
+            schema.edges[2].residual_gp->variance(action));
+  EXPECT_GT(schema.edges[2].residual_gp->mean(action).norm(), 0);
+  EXPECT_TRUE(again.edges[3].matrix_gp->prediction_covariance(action).isApprox(
+      schema.edges[3].matrix_gp->prediction_covariance(action), 1e-9));
+}
+
+MatrixGp matrix_gp_of(int num_samples, std::optional<double> mean) {
+  const std::vector<GpPrior> priors(MatrixGp::kNumEntries, {mean, SquaredExponential{1, {}}, 1});
+  return {{},
+          Eigen::MatrixXd(0, num_samples),
+          std::vector<Pose>(num_samples, Pose::Identity()),
+          priors};
+}
+
+TEST(Convert, AMatrixGpThatNoMessageHoldsIsRefused) {
   BodySchema schema;
   Edge& edge = schema.edges.emplace_back();
-  edge.matrix_gp = std::make_shared<const MatrixGp>(
-      std::vector<int>{}, Eigen::MatrixXd(0, 1), std::vector<Pose>{Pose::Identity()}, priors);
-  EXPECT_THROW(to_message(schema), std::invalid_argument);
+  const auto holds = [&](MatrixGp gp) {
+    edge.matrix_gp = std::make_shared<const MatrixGp>(std::move(gp));
+    to_message(schema);
+  };
+  EXPECT_NO_THROW(holds(matrix_gp_of(64, std::nullopt)));
+  EXPECT_THROW(holds(matrix_gp_of(65, std::nullopt)), std::invalid_argument);
+  EXPECT_THROW(holds(matrix_gp_of(3, 0.5)), std::invalid_argument);
 }
 
 TEST(Convert, AnEmptySchemaIsAMessageThatMakesSense) {

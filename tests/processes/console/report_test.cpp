@@ -2,10 +2,12 @@
 
 #include <cmath>
 #include <cstdlib>
+#include <filesystem>
+#include <fstream>
 #include <regex>
 
 #include "common/bus/convert.h"
-#include "processes/console/plot.h"
+#include "common/plot/plot.h"
 #include "processes/console/report_figures.h"
 #include "processes/console/report_page.h"
 #include "processes/structure_learner/learn.h"
@@ -205,6 +207,18 @@ TEST(PlotTest, ANameIsOnlyAString) {
 
 TEST(PlotTest, AScriptThatGnuplotRefusesIsAnError) {
   EXPECT_THROW(draw_plots({{.script = "no such command\n"}}), PlotError);
+}
+
+TEST(PlotTest, APictureOfItsOwnIsAPngAndNeedsAFolder) {
+  const std::filesystem::path folder = testing::TempDir();
+  const Plot plot{.width_px = 320, .height_px = 200, .script = "plot x\n"};
+  draw_png(plot, folder / "plot.png");
+  std::ifstream stream(folder / "plot.png", std::ios::binary);
+  std::string start(24, 0);
+  stream.read(start.data(), 24);
+  EXPECT_EQ(start.substr(1, 3), "PNG");
+  EXPECT_EQ(start.substr(16, 8), std::string("\0\0\x01\x40\0\0\0\xc8", 8));  // 320 × 200
+  EXPECT_THROW(draw_png(plot, folder / "no_such_folder" / "plot.png"), PlotError);
 }
 
 /// A record of `samples` as the bus carries them, and of a schema.

@@ -140,7 +140,7 @@ TEST(SchemaJsonTest, ShowHasEveryParameterOfEveryEdge) {
             (Keys{"complete", "samples", "parts", "root", "edges", "unconnected", "unused_signals",
                   "noise", "version", "base_version", "last_sample", "X_CR", "signals"}));
   EXPECT_EQ(json["signals"].size(), 3U);
-  EXPECT_EQ(keys_of(json["signals"][0]), (Keys{"name", "lower", "upper"}));
+  EXPECT_EQ(keys_of(json["signals"][0]), (Keys{"name", "lower", "upper", "warp"}));
   EXPECT_EQ(json["last_sample"], 29);
 
   // The model can be built again from what is printed.

@@ -98,7 +98,8 @@ TEST(InverseKinematicsTest, ItsJacobianIsTheDerivativeInTheRootsFrame) {
     const BodySchema schema = seven_joints(i % 5);
     const Eigen::VectorXd action = random_action(schema, rng);
     for (const int part : schema.parts) {
-      const Eigen::MatrixXd J = position_jacobian(schema, part, action);
+      const auto path = KinematicPath::between(schema, schema.root, part);
+      const Eigen::MatrixXd J = position_jacobian(*path, action);
       for (Eigen::Index s = 0; s < action.size(); ++s) {
         const double h = 1e-6 * (schema.signals[s].upper - schema.signals[s].lower);
         Eigen::VectorXd more = action, less = action;

@@ -87,6 +87,37 @@ model_health_t bad_health(std::int64_t judged_sample) {
   return health;
 }
 
+MotorBabblerConfig active_config() {
+  MotorBabblerConfig config = test_config();
+  config.choice = Choice::kActive;
+  return config;
+}
+
+/// A schema of two parts and the first signal.
+body_schema_t schema_of(std::int64_t version) {
+  BodySchema schema;
+  schema.version = version;
+  schema.last_sample_index = version - 1;
+  schema.signals = test_config().signals;
+  schema.parts = {1, 2};
+  schema.root = 1;
+  schema.noise = {0.001, 0.005};
+  Edge edge;
+  edge.from = 1;
+  edge.to = 2;
+  edge.joints.resize(1);
+  edge.joints[0].turn = 1;
+  edge.joints[0].X_after.translation() << 0.1 * double(version), 0.2, 0;
+  edge.parameter_covariance = 1e-4 * Eigen::MatrixXd::Identity(14, 14);
+  schema.edges = {edge};
+  return to_message(schema);
+}
+model_health_t verdict(std::int64_t judged_sample, std::int64_t schema_version) {
+  model_health_t health = bad_health(judged_sample);
+  health.schema_version = schema_version;
+  return health;
+}
+
 control_status_t control(bool owns_arm) {
   control_status_t status{};
   status.control_state = owns_arm ? control_status_t::CONTROL_MOVING : control_status_t::CONTROL_IDLE;
@@ -116,6 +147,7 @@ class Bench {
   /// The driver settles, the observer makes the sample; true if a command followed.
   bool make_sample() {
     EXPECT_FALSE(babbler.on_motion_status(answer(last, motion_status_t::STATE_SETTLED)));
+    babbler.remember(sample_of(last, num_samples));
     return take(babbler.on_sample(sample_of(last, num_samples++)));
   }
   bool is_test() const { return last.purpose == action_command_t::PURPOSE_TEST; }
@@ -802,10 +834,137 @@ TEST(MotorBabblerTest, EveryFifthOfItsOwnSamplesIsTestWhateverOthersDoInBetween)
   }
 }
 
+bool is_drawn(const action_command_t& command, const MotorBabblerConfig& config = active_config()) {
+  const Eigen::VectorXd drawn = random_action(config, 1, command.action_id);
+  return command.action == std::vector<double>(drawn.begin(), drawn.end());
+}
+/// After the first TEST sample, which is not judged yet.
+Bench after_first_test() {
+  Bench bench(active_config());
+  bench.start();
+  bench.run(4);
+  EXPECT_FALSE(bench.make_sample());
+  return bench;
+}
+
+TEST(MotorBabblerTest, CandidatesAreAFunctionOfSeedAndIdWithinTheLimits) {
+  const MotorBabblerConfig config = test_config();
+  std::set<std::vector<double>> all;
+  for (std::int64_t id = 0; id < 50; ++id) {
+    const auto candidates = candidate_actions(config, 3, id);
+    EXPECT_EQ(candidates, candidate_actions(config, 3, id));
+    EXPECT_EQ(candidates.size(), 40U);
+    for (const Eigen::VectorXd& action : candidates) {
+      all.insert({action.begin(), action.end()});
+      for (std::size_t i = 0; i < config.signals.size(); ++i) {
+        EXPECT_GE(action[i], config.signals[i].lower);
+        EXPECT_LE(action[i], config.signals[i].upper);
+      }
+    }
+  }
+  EXPECT_EQ(all.size(), 2000U);
+}
+
+TEST(MotorBabblerTest, AnActionIsChosenByTheSchemaOfTheNewestVerdictAndAllSamples) {
+  Bench bench = after_first_test();
+  ASSERT_FALSE(bench.take(bench.babbler.on_body_schema(schema_of(5))));
+  ASSERT_TRUE(bench.take(bench.babbler.on_model_health(verdict(4, 5))));
+  std::vector<SeenAction> memory;
+  for (int n = 0; n < 5; ++n) {
+    memory.push_back({n, n != 4, random_action(active_config(), 1, n), {}});
+  }
+  const auto candidates = candidate_actions(active_config(), 1, 5);
+  const Eigen::VectorXd expected =
+      candidates[choose_action(from_message(schema_of(5)), memory, candidates)];
+  EXPECT_EQ(bench.last.action, std::vector<double>(expected.begin(), expected.end()));
+}
+
+TEST(MotorBabblerTest, WhichOfSampleVerdictAndSchemaComesFirstDoesNotMatter) {
+  Bench straight = after_first_test();
+  straight.babbler.on_body_schema(schema_of(5));
+  ASSERT_TRUE(straight.take(straight.babbler.on_model_health(verdict(4, 5))));
+
+  Bench late = after_first_test();
+  EXPECT_FALSE(late.take(late.babbler.on_model_health(verdict(4, 5))));
+  EXPECT_NE(late.babbler.activity().find("BODY_SCHEMA version 5"), std::string::npos);
+  EXPECT_FALSE(late.take(late.babbler.on_body_schema(schema_of(4))));
+  ASSERT_TRUE(late.take(late.babbler.on_body_schema(schema_of(5))));
+  EXPECT_EQ(late.last.action, straight.last.action);
+
+  Bench early(active_config());
+  early.start();
+  early.run(4);
+  early.babbler.on_motion_status(answer(early.last, motion_status_t::STATE_SETTLED));
+  early.babbler.on_body_schema(schema_of(5));
+  EXPECT_FALSE(early.take(early.babbler.on_model_health(verdict(4, 5))));
+  // Of the sample it hears before it is its turn: there is a gap before it.
+  EXPECT_FALSE(early.take(early.babbler.on_sample(sample_of(early.last, 4))));
+  EXPECT_NE(early.babbler.activity().find("samples up to 4"), std::string::npos);
+  ASSERT_TRUE(early.take(early.babbler.remember(sample_of(early.last, 4))));
+  EXPECT_EQ(early.last.action, straight.last.action);
+}
+
+TEST(MotorBabblerTest, TestActionsAndWhatReplacesARefusedOneAreDrawn) {
+  Bench bench = after_first_test();
+  bench.babbler.on_body_schema(schema_of(5));
+  ASSERT_TRUE(bench.take(bench.babbler.on_model_health(verdict(4, 5))));
+  for (int n = 5; n < 9; ++n) {
+    EXPECT_FALSE(is_drawn(bench.last)) << n;
+    if (n == 6) {
+      ASSERT_TRUE(bench.take(
+          bench.babbler.on_motion_status(answer(bench.last, motion_status_t::STATE_REJECTED))));
+      EXPECT_TRUE(is_drawn(bench.last));
+    }
+    ASSERT_TRUE(bench.make_sample());
+  }
+  ASSERT_TRUE(bench.is_test());
+  EXPECT_TRUE(is_drawn(bench.last));
+}
+
+TEST(MotorBabblerTest, WithoutASchemaActionsAreDrawn) {
+  Bench bench = after_first_test();
+  ASSERT_TRUE(bench.take(bench.babbler.on_model_health(verdict(4, 0))));
+  EXPECT_TRUE(is_drawn(bench.last));
+  EXPECT_EQ(bench.babbler.num_without_schema(), 0);
+}
+
+TEST(MotorBabblerTest, ASchemaThatDoesNotComeIsGivenUpUntilTheNextTest) {
+  Bench bench = after_first_test();
+  EXPECT_FALSE(bench.take(bench.babbler.on_model_health(verdict(4, 5))));
+  EXPECT_FALSE(bench.take(bench.babbler.on_tick(200 * kSecond)));
+  EXPECT_FALSE(bench.take(bench.babbler.on_tick(210 * kSecond - 1)));
+  ASSERT_TRUE(bench.take(bench.babbler.on_tick(210 * kSecond)));
+  EXPECT_EQ(bench.babbler.num_without_schema(), 1);
+  // Late is not in between.
+  bench.babbler.on_body_schema(schema_of(5));
+  for (int n = 5; n < 9; ++n) {
+    EXPECT_TRUE(is_drawn(bench.last)) << n;
+    ASSERT_TRUE(bench.make_sample());
+  }
+  ASSERT_FALSE(bench.make_sample());
+  bench.babbler.on_body_schema(schema_of(10));
+  ASSERT_TRUE(bench.take(bench.babbler.on_model_health(verdict(9, 10))));
+  EXPECT_FALSE(is_drawn(bench.last));
+  EXPECT_EQ(bench.babbler.num_without_schema(), 1);
+}
+
+TEST(MotorBabblerTest, ARunThatIsOverWaitsForNoSchema) {
+  MotorBabblerConfig config = active_config();
+  config.stop.min_samples = config.stop.max_samples = 10;
+  Bench bench(config);
+  bench.start();
+  bench.run(9);
+  ASSERT_TRUE(bench.is_test());
+  bench.make_sample();
+  bench.babbler.on_model_health(verdict(9, 10));
+  EXPECT_TRUE(bench.babbler.is_done());
+}
+
 /// Driver, observer and monitor that outlive the babbler. Each answers and repeats as in a group.
 class World {
  public:
-  explicit World(double kill_share, std::uint64_t seed) : kill_share_(kill_share), rng_(seed) {}
+  World(double kill_share, std::uint64_t seed, MotorBabblerConfig config = test_config())
+      : config_(std::move(config)), kill_share_(kill_share), rng_(seed) {}
   ~World() { std::filesystem::remove(file_); }
 
   /// Until the babbler is done; every message may be the last that this babbler hears or sends.
@@ -817,7 +976,7 @@ class World {
       if (i % 10) continue;
       tell(babbler_->on_motion_status(status_));
       if (!samples.empty()) tell(babbler_->on_sample(samples.back()));
-      tell(babbler_->on_model_health(bad_health(samples.empty() ? -1 : newest_index())));
+      tell_verdict();
     }
   }
 
@@ -827,10 +986,22 @@ class World {
 
  private:
   void start() {
-    babbler_ = std::make_unique<MotorBabbler>(test_config(), 1);
-    if (kept_.empty()) return;
-    std::ofstream(file_) << kept_;
-    babbler_->restore(file_);
+    babbler_ = std::make_unique<MotorBabbler>(config_, 1);
+    if (!kept_.empty()) {
+      std::ofstream(file_) << kept_;
+      babbler_->restore(file_);
+    }
+    num_remembered_ = 0;
+    while (num_remembered_ < samples.size()) babbler_->remember(samples[num_remembered_++]);
+  }
+  /// The schema after sample n is version n + 1; every TEST sample makes one.
+  void tell_verdict() {
+    std::int64_t version = 0;
+    for (const sample_t& sample : samples) {
+      if (sample.purpose == action_command_t::PURPOSE_TEST) version = sample.sample_index + 1;
+    }
+    if (version > 0) tell(babbler_->on_body_schema(schema_of(version)));
+    tell(babbler_->on_model_health(verdict(samples.empty() ? -1 : newest_index(), version)));
   }
   std::int64_t newest_index() const { return samples.back().sample_index; }
   bool is_killed() {
@@ -858,12 +1029,15 @@ class World {
       samples.push_back(sample_of(command, static_cast<std::int64_t>(samples.size())));
     tell(babbler_->on_motion_status(status_));
     if (is_refused || !is_new) return;
+    if (num_remembered_ < samples.size()) tell(babbler_->remember(samples[num_remembered_++]));
     tell(babbler_->on_sample(samples.back()));
-    tell(babbler_->on_model_health(bad_health(newest_index())));
+    tell_verdict();
   }
 
   const std::filesystem::path file_ =
       std::filesystem::path(testing::TempDir()) / ("babbler_state_" + std::to_string(getpid()));
+  const MotorBabblerConfig config_;
+  std::size_t num_remembered_ = 0;  ///< by this babbler
   std::string kept_;
   const double kill_share_;
   std::mt19937_64 rng_;
@@ -872,13 +1046,13 @@ class World {
   std::int64_t now_ = 100 * kSecond;
 };
 
-TEST(MotorBabblerTest, KilledAtAnyMomentItGoesOnAsIfNothingHadHappened) {
-  World undisturbed(0, 0);
+void kill_and_compare(const MotorBabblerConfig& config) {
+  World undisturbed(0, 0, config);
   undisturbed.run();
   ASSERT_EQ(undisturbed.samples.size(), 40U);
   int num_kills = 0;
   for (std::uint64_t seed = 0; seed < 10; ++seed) {
-    World world(0.05, seed);
+    World world(0.05, seed, config);
     world.run();
     ASSERT_EQ(world.served.size(), undisturbed.served.size()) << seed;
     for (std::size_t i = 0; i < world.served.size(); ++i) {
@@ -891,6 +1065,14 @@ TEST(MotorBabblerTest, KilledAtAnyMomentItGoesOnAsIfNothingHadHappened) {
     num_kills += world.num_kills;
   }
   EXPECT_GT(num_kills, 200);
+}
+
+TEST(MotorBabblerTest, KilledAtAnyMomentItGoesOnAsIfNothingHadHappened) {
+  kill_and_compare(test_config());
+}
+
+TEST(MotorBabblerTest, KilledAtAnyMomentItChoosesTheSameActions) {
+  kill_and_compare(active_config());
 }
 
 TEST(MotorBabblerTest, ARestartListensFirstWhetherTheArmIsLent) {
@@ -994,6 +1176,7 @@ TEST(MotorBabblerTest, SaysWhatItWaitsFor) {
 TEST(MotorBabblerTest, TheConfigurationIsReadInSiUnits) {
   const MotorBabblerConfig config =
       MotorBabblerConfig::load(std::string(BODYSCHEMA_CONFIG) + "/arm2/motor_babbler.yaml");
+  EXPECT_EQ(config.choice, Choice::kRandom);
   EXPECT_EQ(config.signals.size(), 2U);
   EXPECT_EQ(config.resend_us, 1 * kSecond);
   EXPECT_EQ(config.expiry_us, 60 * kSecond);

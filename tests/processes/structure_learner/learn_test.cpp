@@ -318,4 +318,47 @@ TEST(SyntheticRobot, CsvRoundTripKeepsThePoses) {
 }
 
 }  // namespace
+double mean_error_m(const BodySchema& schema, const test::SyntheticRobot& robot, int part,
+                    test::Rng& rng) {
+  constexpr int kPoses = 50;
+  double sum = 0;
+  for (int n = 0; n < kPoses; ++n) {
+    const Eigen::VectorXd action = robot.random_action(rng);
+    const auto X_CB = robot.poses_in_camera(action);
+    const auto predicted = schema.predict(1, part, action);
+    if (!predicted) return std::numeric_limits<double>::infinity();
+    const Pose truth = X_CB.at(1).inverse() * X_CB.at(part);
+    sum += (predicted->X_AB.translation() - truth.translation()).norm() / kPoses;
+  }
+  return sum;
+}
+
+// Edges that are fitted to two markers each end 1.5 times as far off (ALGORITHM: columns P and G).
+TEST(Learn, FitsTheWholeTreeToAllMarkersWhereTheRootRests) {
+  double resting = 0, moving = 0;
+  for (int seed = 1; seed <= 8; ++seed) {
+    test::Rng rng(seed);
+    const test::SyntheticRobot robot = test::chapter_robot("c", rng);
+    test::ObservationOptions observation;
+    observation.regime = test::Regime::kTagIso;
+    observation.with_covariances = true;
+    auto samples = test::babble(robot, 30, observation, rng);
+    const LearnResult still = learn(robot.signals, samples);
+    ASSERT_TRUE(test::is_right(still.schema, robot)) << seed;
+    EXPECT_LT((still.schema.X_CR.translation() - robot.X_CR.translation()).norm(), 0.003);
+    // The same relative poses, seen by a camera that somebody carries about.
+    for (ActionPoseSample& sample : samples) {
+      const Pose X = test::random_pose(rng, 0, 0.5);
+      for (PartObservation& o : sample.parts) o.X_CB = X * o.X_CB;
+    }
+    const LearnResult carried = learn(robot.signals, samples);
+    ASSERT_TRUE(test::is_right(carried.schema, robot)) << seed;
+    test::Rng poses(100 + seed);
+    resting += mean_error_m(still.schema, robot, 5, poses) / 8;
+    poses = test::Rng(100 + seed);
+    moving += mean_error_m(carried.schema, robot, 5, poses) / 8;
+  }
+  EXPECT_LT(resting, 0.8 * moving);
+}
+
 }  // namespace bodyschema

@@ -48,6 +48,7 @@ class StructureLearnerTest : public testing::Test {
     for (std::size_t i = 0; i < samples.size(); ++i) {
       learner.on_sample(samples[i]);
       if (jobs_after.count(i) && learner.has_job()) result.push_back(learner.take_job()());
+      if (jobs_after.count(i) && i % 2 == 0) learner.take_preparation()();
     }
     while (learner.has_job()) result.push_back(learner.take_job()());
     return result;

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <filesystem>
 #include <stdexcept>
 #include <string>
 #include <vector>
@@ -12,7 +13,7 @@ class PlotError : public std::runtime_error {
   using std::runtime_error::runtime_error;
 };
 
-/// What gnuplot is to draw into an SVG of its own: commands that follow `set terminal`.
+/// What gnuplot is to draw into a picture of its own: commands that follow `set terminal`.
 struct Plot {
   int width_px = 760;
   int height_px = 240;
@@ -24,6 +25,10 @@ struct Plot {
 /// refer to the symbols in plot_symbols(), which the page must hold once.
 /// @throws PlotError with what to install.
 std::vector<std::string> draw_plots(const std::vector<Plot>& plots);
+
+/// Draws `plot` into `file`, a PNG on white.
+/// @throws PlotError with what to install, or if the file cannot be written.
+void draw_png(const Plot& plot, const std::filesystem::path& file);
 
 /// The shapes of gnuplot's points.
 std::string plot_symbols();

@@ -1,4 +1,4 @@
-#include "processes/console/plot.h"
+#include "common/plot/plot.h"
 
 #include <fcntl.h>
 #include <fmt/format.h>
@@ -95,6 +95,32 @@ std::string without_empty_groups(const std::string& svg) {
   return result;
 }
 
+/// What draws `plot` into `file`, after whatever was drawn before.
+std::string commands(const Plot& plot, const std::string& terminal,
+                     const std::filesystem::path& file) {
+  return fmt::format(
+      "reset\nset encoding utf8\n"
+      "set terminal {} size {},{}\n"
+      "set output {}\n"
+      "set border 3 lw 0.7\n"
+      "set tics out nomirror scale 0.4\n"
+      "set grid lw 0.5 lt 1 lc rgb '#99888888'\n"
+      "{}\n"
+      "unset output\n",
+      terminal, plot.width_px, plot.height_px, gnuplot_string(file.string()), plot.script);
+}
+
+void draw(const std::string& commands, const ScratchFolder& folder) {
+  std::ofstream script(folder / "script.gp");
+  script << commands;
+  script.close();
+  if (!script) throw PlotError("cannot write into " + (folder / "").string());
+  if (run_gnuplot(folder / "script.gp", folder / "errors") == 0) return;
+  std::string errors = text_of(folder / "errors");
+  replace_all(errors, "\n", " ");
+  throw PlotError("gnuplot refused a plot: " + errors);
+}
+
 /// The element alone, without what several of them in one page would say twice.
 std::string inline_svg(std::string svg) {
   svg.erase(0, svg.find("<svg"));
@@ -127,32 +153,23 @@ std::string gnuplot_string(const std::string& text) {
 std::vector<std::string> draw_plots(const std::vector<Plot>& plots) {
   if (plots.empty()) return {};
   const ScratchFolder folder;
-  std::ofstream script(folder / "script.gp");
-  for (std::size_t i = 0; i < plots.size(); ++i) {
-    script << fmt::format(
-        "reset\nset encoding utf8\n"
-        "set terminal svg size {},{} dynamic noenhanced font 'system-ui,12' butt\n"
-        "set output {}\n"
-        "set border 3 lw 0.7\n"
-        "set tics out nomirror scale 0.4\n"
-        "set grid lw 0.5 lt 1 lc rgb '#99888888'\n"
-        "{}\n"
-        "unset output\n",
-        plots[i].width_px, plots[i].height_px,
-        gnuplot_string((folder / std::to_string(i)).string()), plots[i].script);
-  }
-  script.close();
-  if (!script) throw PlotError("cannot write into " + (folder / "").string());
-  const int status = run_gnuplot(folder / "script.gp", folder / "errors");
-  if (status != 0) {
-    std::string errors = text_of(folder / "errors");
-    replace_all(errors, "\n", " ");
-    throw PlotError("gnuplot refused a plot: " + errors);
-  }
+  std::string script;
+  for (std::size_t i = 0; i < plots.size(); ++i)
+    script += commands(plots[i], "svg dynamic noenhanced font 'system-ui,12' butt",
+                       folder / std::to_string(i));
+  draw(script, folder);
   std::vector<std::string> result;
   for (std::size_t i = 0; i < plots.size(); ++i)
     result.push_back(inline_svg(text_of(folder / std::to_string(i))));
   return result;
+}
+
+void draw_png(const Plot& plot, const std::filesystem::path& file) {
+  draw(commands(plot, "pngcairo noenhanced font 'DejaVu Sans,10' background 'white'", file),
+       ScratchFolder());
+  std::error_code missing;
+  if (!(std::filesystem::file_size(file, missing) > 0) || missing)
+    throw PlotError(file.string() + ": gnuplot could not write it");
 }
 
 std::string plot_symbols() {

@@ -1,0 +1,58 @@
+#pragma once
+
+#include <memory>
+#include <optional>
+#include <vector>
+
+#include "common/schema/residual_gp.h"
+#include "processes/structure_learner/structure_search.h"
+
+namespace bodyschema {
+
+/// A chain of screws and what it leaves, as a Gaussian process of the signals in Q.
+struct SoftModel {
+  LocalModel screws;  ///< none, one or two joints: whatever explains most
+  std::shared_ptr<const ResidualGp> residual_gp;
+  std::vector<int> signals;  ///< Q: of the screws and of the process
+};
+
+/// A soft model's judgement on every frame of a pair, without that frame's block of time.
+struct SoftFit {
+  SoftModel model;
+  std::vector<FrameFit> frames;  ///< reading and whitened residual log(Δ̂₋B⁻¹ z)
+  /// d² = rᵀ(I + S)⁻¹r with S the whitened covariance of the prediction: χ²₆ under a true model.
+  std::vector<double> squared_distance;
+  std::vector<Vector6d> residual;  ///< not whitened: (translation [m], rotation [rad])
+  Verdict verdict = Verdict::kRefuted;
+  double mean_inlier = 0;       ///< of d²
+  double mean_uncertainty = 0;  ///< trace S over the inliers: 6 is as large as the noise
+  int num_outliers = 0;
+  double score = 0;  ///< mean of −½[|r|² + log|2πΣ_z|] over the inliers
+  /// Sum over the independent frames of −½[min(d², 2c) + log|I + S|]: what the data say of two
+  /// models of one pair [nats].
+  double log_density = 0;
+};
+
+/// Fits the model to a pair: Log(f_screw(q)⁻¹ z) by processes with shared length scales of largest
+/// marginal likelihood, Student-t weights throughout, at most ResidualGp::kMaxSamples instants that
+/// cover the actions evenly (farthest-point sampling). Signals without which the blocks that were
+/// left out are predicted no worse are dropped, unless `signals` says which to keep. std::nullopt:
+/// too few data.
+///
+/// Valid: as few outliers and as small a mean d² as V1 asks of screws, and the model must know what
+/// it says: where its own uncertainty in the left-out blocks exceeds that of a measurement, a wide
+/// process would agree with anything (kNotEnoughData).
+std::optional<SoftFit> fit_soft_model(const LocalModel& screws, const PairData& pair,
+                                      const NormalizedActions& actions,
+                                      const ValidityOptions& options,
+                                      const std::vector<int>& signals = {});
+
+/// The fallback of the search: between components of the forest where every screw model was refuted
+/// on enough data, soft models; those with fewer signals first, then by score. What outliers cost
+/// does not enter the score: a marker that flips says nothing about its neighbours. Rigid robots
+/// never come here once their tree spans.
+void connect_soft_parts(const std::vector<ActionPoseSample>& samples,
+                        const NormalizedActions& actions, const std::vector<int>& parts,
+                        const SearchOptions& options, SearchResult* found);
+
+}  // namespace bodyschema

@@ -1,0 +1,37 @@
+#include "processes/structure_learner/time_blocks.h"
+
+#include <algorithm>
+
+namespace bodyschema {
+namespace {
+
+constexpr std::int64_t kLongestInterval_us = 1'000'000;
+constexpr Eigen::Index kLeastInstants = 50;
+constexpr Eigen::Index kLeastLag = 3;
+
+}  // namespace
+
+TimeBlocks::TimeBlocks(const std::vector<std::int64_t>& utimes, const Eigen::MatrixXd& actions) {
+  const Eigen::Index N = actions.cols();
+  if (N < kLeastInstants || static_cast<Eigen::Index>(utimes.size()) != N) return;
+  std::vector<std::int64_t> intervals;
+  for (std::size_t t = 1; t < utimes.size(); ++t) intervals.push_back(utimes[t] - utimes[t - 1]);
+  if (*std::min_element(intervals.begin(), intervals.end()) <= 0) return;
+  const auto middle = intervals.begin() + static_cast<std::ptrdiff_t>(intervals.size() / 2);
+  std::nth_element(intervals.begin(), middle, intervals.end());
+  if (*middle > kLongestInterval_us) return;
+
+  const double random =
+      2 * (actions.colwise() - actions.rowwise().mean()).squaredNorm() / static_cast<double>(N);
+  if (!(random > 0)) return;
+  Eigen::Index lag = 1;
+  const auto mean_square = [&](Eigen::Index l) {
+    return (actions.rightCols(N - l) - actions.leftCols(N - l)).squaredNorm() /
+           static_cast<double>(N - l);
+  };
+  while (lag < N / 4 && mean_square(lag) < 0.5 * random) ++lag;
+  if (lag < kLeastLag) return;
+  length_ = static_cast<int>(2 * lag);
+}
+
+}  // namespace bodyschema

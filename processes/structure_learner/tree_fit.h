@@ -1,0 +1,111 @@
+#pragma once
+
+#include <optional>
+#include <utility>
+#include <vector>
+
+#include "processes/structure_learner/local_model.h"
+#include "processes/structure_learner/validity.h"
+
+namespace bodyschema {
+
+/// One part of a kinematic tree with the local model that carries it.
+struct TreeNode {
+  int part = 0;
+  int parent = -1;   ///< index into the nodes, below the node's own; −1: the tree's root
+  LocalModel model;  ///< Δ of this part in its parent; unused at the root
+};
+
+/// A joint that the tree lacks: part of a rigid cluster (and of what hangs on it) moves with a signal
+/// relative to the rest of it.
+struct MissingJoint {
+  int top = 0;  ///< the cluster's node next to the tree's root
+  int signal = 0;
+  /// Nodes of the cluster, and nodes joined to it by their own edges, that move. What the cluster
+  /// itself hangs on does not.
+  std::vector<int> members, branches;
+  /// Most likely screw in the frame of `top`, Exp(ξ q), per half range of the signal.
+  Vector6d xi = Vector6d::Zero();
+  bool slides = false;   ///< ξ is a translation, which explains the data as well as a general screw
+  double statistic = 0;  ///< score statistic: χ² without the joint
+  double log_tail = 0;   ///< log of the χ² tail beyond the statistic
+  /// log of the number of ways to part this cluster: for the significance of the best of them.
+  double log_ways = 0;
+};
+
+/// An edge between two nodes of a tree.
+struct TreeEdge {
+  int a = 0, b = 0;
+  LocalModel model;  ///< Δ of b in a
+};
+
+/// Does a part keep its pose in the camera's frame? `data` are its make_part_data(); true if a rigid
+/// model of them is valid.
+bool is_at_rest(const PairData& data, const NormalizedActions& actions,
+                const ValidityOptions& options);
+
+/// All poses of a tree's parts fitted at once, to judge its edges by every marker and not only by
+/// the two they connect.
+///
+/// x_y(t) = X_C,root(t) ∏ Δ_e(q_t) along the path to y, residual Log(x_y⁻¹ y) in the marker's own
+/// noise: no lever arm, and all parts beyond a joint are its witnesses. The root rests (one pose),
+/// or has a free pose at each instant, which is eliminated (Schur complement) and costs a good part
+/// of the evidence near it.
+///
+/// Gauss–Newton on the tree: with all twists in the camera's frame the normal matrix of edges e
+/// above e' is Σ_t S_eᵀ I_e'(t) S_e', where I_e' is the information of all markers beyond e' (the
+/// composite inertias of the rigid-body algorithms, Featherstone 2008, ch. 6).
+class TreeFit {
+ public:
+  /// `data`: make_part_data() of each node, in their order. `nodes`: parents before children.
+  TreeFit(std::vector<TreeNode> nodes, std::vector<PairData> data,
+          const NormalizedActions& actions, bool root_rests);
+
+  /// Levenberg–Marquardt with Student-t weights until a step gains less than `tolerance` [nats].
+  void fit(int max_iterations, double tolerance);
+
+  const std::vector<TreeNode>& nodes() const { return nodes_; }
+  /// Of a root that rests, in the camera's frame.
+  const Pose& root_pose() const { return roots_.front(); }
+  double cost() const { return cost_; }  ///< Σ (ν + 6)/2 · log(1 + d²/ν)
+  double log_likelihood() const;       ///< −cost − ½ Σ log|2πΣ|
+  int num_frames() const { return static_cast<int>(samples_.size()); }
+
+  /// Rao's score test of one more joint, for every rigid cluster and every moving signal: how much
+  /// the residuals shrink, to second order, if Exp(ξ q_g) moves some of what is in or on the cluster
+  /// and all other parameters of the tree adapt. The parting that explains most is found by greedy
+  /// exchange; of a sliding (3 degrees of freedom) and a general joint (6), the less likely by
+  /// chance.
+  std::vector<MissingJoint> missing_joints() const;
+
+  /// The tree's edges with that joint. Where only branches move, each of their edges gets it. Edges
+  /// between the two sides are moved to the right one. std::nullopt if an edge had more than
+  /// kMaxJoints.
+  std::optional<std::vector<TreeEdge>> with_joint(const MissingJoint& joint) const;
+  /// Where with_joint() fails: the nodes whose edges to their parents have no room for the joint, and
+  /// none of its signal yet.
+  std::vector<int> full_edges(const MissingJoint& joint) const;
+
+ private:
+  double evaluate(const std::vector<TreeNode>& nodes, const std::vector<Pose>& roots,
+                  std::vector<Pose>* poses, std::vector<FrameFit>* fits) const;
+  void start_roots();
+  struct Normal;
+  Normal normal_equations() const;
+  std::vector<int> cluster_of(int top) const;
+  bool is_below(int node, int ancestor) const;  // or the same
+  int at(int frame, int node) const { return frame * static_cast<int>(nodes_.size()) + node; }
+
+  std::vector<TreeNode> nodes_;
+  std::vector<PairData> data_;
+  const NormalizedActions& actions_;
+  bool root_rests_;
+  std::vector<int> samples_;      // of the frames
+  std::vector<int> frame_index_;  // at(frame, node) → index into data_[node].frames, −1: not seen
+  std::vector<Pose> roots_;       // one, or one a frame
+  std::vector<Pose> poses_;       // at(frame, node), in the camera's frame
+  std::vector<FrameFit> fits_;    // at(frame, node)
+  double cost_ = 0;
+};
+
+}  // namespace bodyschema

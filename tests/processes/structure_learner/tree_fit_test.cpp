@@ -1,0 +1,200 @@
+#include "processes/structure_learner/tree_fit.h"
+
+#include <gtest/gtest.h>
+
+#include <algorithm>
+#include <limits>
+
+#include "processes/structure_learner/screen.h"
+#include "processes/structure_learner/validity.h"
+#include "tests/support/synthetic_robot.h"
+
+namespace bodyschema {
+namespace {
+
+using test::Regime;
+using test::Rng;
+using test::SyntheticRobot;
+using test::TrueLink;
+
+// A chain of seven parts: 5 and 6 are rigid, between 3 and 4 slides q4 by ± slide_m, the other
+// joints turn by ± 1 rad.
+SyntheticRobot chain(double slide_m, Rng& rng) {
+  SyntheticRobot robot;
+  robot.X_CR.translation() << 0, 0, 2;
+  robot.links.push_back({.part = 1});
+  const int signals[] = {0, 1, 3, 2, -1, 4};
+  for (int n = 0; n < 6; ++n) {
+    TrueLink link;
+    link.part = n + 2;
+    link.parent = n + 1;
+    link.X_before = test::random_pose(rng, 0.06, 0.16);
+    link.X_after = test::random_pose(rng, 0.06, 0.16);
+    link.signal = signals[n];
+    if (n == 2)
+      link.slide = slide_m;
+    else if (link.signal >= 0)
+      link.turn = 1;
+    robot.links.push_back(link);
+  }
+  for (int s = 0; s < 5; ++s) robot.signals.push_back({.name = "q", .lower = -1, .upper = 1, .warp = {}});
+  return robot;
+}
+
+struct Case {
+  Case(const SyntheticRobot& robot, int num_samples, Regime regime, bool root_moves, Rng& rng)
+      : samples(test::babble(robot, num_samples, {.regime = regime, .with_covariances = true}, rng)),
+        actions(samples, static_cast<int>(robot.signals.size())) {
+    if (root_moves)
+      for (ActionPoseSample& sample : samples) {
+        const Pose X = test::random_pose(rng, 0, 0.5);
+        for (PartObservation& o : sample.parts) o.X_CB = X * o.X_CB;
+      }
+    for (const TrueLink& link : robot.links) {
+      TreeNode node;
+      node.part = link.part;
+      node.parent = link.parent - 1 < 0 ? -1 : link.parent - 1;
+      const double q =
+          link.signal < 0 ? 0 : actions.centre(link.signal) - link.zero;
+      Pose X = Pose::Identity();
+      X.linear() = Eigen::AngleAxisd(link.turn * q, Eigen::Vector3d::UnitZ()).toRotationMatrix();
+      X.translation().z() = link.slide * q;
+      node.model.A[0] = link.X_before * X;
+      if (link.signal < 0) {
+        node.model.A[0] = node.model.A[0] * link.X_after;
+      } else {
+        node.model.num_joints = 1;
+        node.model.signal[0] = link.signal;
+        node.model.turn[0] = link.turn * actions.half_range(link.signal);
+        node.model.slide[0] = link.slide * actions.half_range(link.signal);
+        node.model.A[1] = link.X_after;
+      }
+      nodes.push_back(node);
+      data.push_back(
+          make_part_data(samples, link.part, measurement, std::numeric_limits<int>::max()));
+    }
+  }
+
+  // The tree without the joint of one node.
+  std::vector<TreeNode> without(int node) const {
+    std::vector<TreeNode> result = nodes;
+    LocalModel rigid;
+    rigid.A[0] = nodes[node].model.A[0] * nodes[node].model.A[1];
+    result[node].model = rigid;
+    return result;
+  }
+
+  MeasurementModel measurement;
+  std::vector<ActionPoseSample> samples;
+  NormalizedActions actions;
+  std::vector<TreeNode> nodes;
+  std::vector<PairData> data;
+};
+
+TEST(TreeFit, FindsTheTruthFromAPerturbedStart) {
+  for (const bool root_moves : {false, true}) {
+    Rng rng(1);
+    Case c(chain(0.2, rng), 12, Regime::kFree, root_moves, rng);
+    std::vector<TreeNode> nodes = c.nodes;
+    for (std::size_t n = 1; n < nodes.size(); ++n)
+      for (int d = 0; d <= nodes[n].model.num_joints; ++d)
+        nodes[n].model.A[d] = nodes[n].model.A[d] * exp(Vector6d(0.02 * test::gaussian6(rng)));
+    TreeFit fit(nodes, c.data, c.actions, !root_moves);
+    const double before = fit.cost();
+    fit.fit(30, 1e-12);
+    EXPECT_GT(before, 1000);
+    EXPECT_LT(fit.cost(), 1e-9);
+  }
+}
+
+TEST(TreeFit, ATrueTreeLacksNoJoint) {
+  // 7 clusters × 5 signals in 25 robots: under a true tree the log tails are those of uniform
+  // numbers, apart from the choice of the best parting and of the better of two tests.
+  for (const bool root_moves : {false, true}) {
+    int num_tests = 0, num_below = 0;
+    double least = 0;
+    for (int seed = 0; seed < 25; ++seed) {
+      Rng rng(seed);
+      Case c(chain(0.2, rng), 25, Regime::kChapter, root_moves, rng);
+      TreeFit fit(c.nodes, c.data, c.actions, !root_moves);
+      fit.fit(20, 1e-3);
+      for (const MissingJoint& joint : fit.missing_joints()) {
+        ++num_tests;
+        const double corrected = joint.log_tail + std::log(2.0) + joint.log_ways;
+        num_below += corrected < std::log(0.05);
+        least = std::min(least, corrected);
+      }
+    }
+    EXPECT_GT(num_tests, 500);
+    EXPECT_LT(num_below, 0.05 * num_tests);
+    EXPECT_GT(least, std::log(0.1 / num_tests));
+  }
+}
+
+TEST(TreeFit, AllMarkersTogetherShowAJointThatNoPairShows) {
+  int num_rigid = 0, num_found = 0;
+  constexpr int kRobots = 20;
+  for (int seed = 0; seed < kRobots; ++seed) {
+    Rng rng(seed);
+    Case c(chain(0.04, rng), 30, Regime::kChapter, false, rng);
+    // Part 4 rigid on part 3: the two markers have nothing against it.
+    const PairData pair = make_pair_data(c.samples, 3, 4, c.measurement, 1000);
+    const Fit rigid = fit_local_model(screen_rigid(pair, c.actions).model, pair, c.actions, 30);
+    num_rigid += check_validity(rigid, leave_one_out(rigid, pair, c.actions), pair, c.actions, {})
+                     .verdict == Verdict::kValid;
+    TreeFit fit(c.without(3), c.data, c.actions, true);
+    fit.fit(20, 1e-3);
+    const auto missing = fit.missing_joints();
+    ASSERT_FALSE(missing.empty());
+    const MissingJoint& best = missing.front();
+    if (best.log_tail > -13 || best.signal != 3) continue;
+    // Part 4 and what hangs on it against part 3 and what that hangs on.
+    if (best.members != std::vector<int>{3} || best.branches != std::vector<int>{4}) continue;
+    ++num_found;
+    EXPECT_NEAR(best.xi.head<3>().norm(), 0.04, 0.02);
+
+    const auto edges = fit.with_joint(best);
+    ASSERT_TRUE(edges.has_value());
+    std::vector<TreeNode> grown = c.nodes;
+    ASSERT_EQ(edges->size(), grown.size() - 1);
+    for (const TreeEdge& e : *edges) {
+      const int child = std::max(e.a, e.b);
+      EXPECT_EQ(std::min(e.a, e.b), grown[child].parent);
+      grown[child].model = e.a < e.b ? e.model : e.model.inverse();
+    }
+    EXPECT_EQ(grown[3].model.signal[0], 3);
+    TreeFit with(grown, c.data, c.actions, true);
+    with.fit(20, 1e-3);
+    // The score statistic is twice the gain in log likelihood, to second order.
+    EXPECT_NEAR(fit.cost() - with.cost(), 0.5 * best.statistic, 0.35 * best.statistic);
+  }
+  EXPECT_GE(num_rigid, kRobots / 2);
+  EXPECT_GE(num_found, kRobots * 3 / 4);
+}
+
+TEST(TreeFit, AJointThatMovesBranchesOnlyIsPutIntoTheirEdges) {
+  Rng rng(1);
+  Case c(chain(0.2, rng), 5, Regime::kFree, false, rng);
+  const TreeFit fit(c.nodes, c.data, c.actions, true);
+  MissingJoint joint;
+  joint.top = 1;
+  joint.signal = 4;
+  joint.branches = {2};
+  joint.xi << 0, 0, 0, 0, 0.5, 0;
+  const auto edges = fit.with_joint(joint);
+  ASSERT_TRUE(edges.has_value());
+  int num_joints = 0;
+  for (const TreeEdge& e : *edges) num_joints += e.model.num_joints;
+  EXPECT_EQ(num_joints, 6);  // five of the chain and the new one
+  // Twice is too much for one edge.
+  std::vector<TreeNode> nodes = c.nodes;
+  for (const TreeEdge& e : *edges)
+    if (std::max(e.a, e.b) == 2) nodes[2].model = e.a < e.b ? e.model : e.model.inverse();
+  joint.signal = 3;
+  const TreeFit full(nodes, c.data, c.actions, true);
+  EXPECT_FALSE(full.with_joint(joint).has_value());
+  EXPECT_EQ(full.full_edges(joint), std::vector<int>{2});
+}
+
+}  // namespace
+}  // namespace bodyschema
