@@ -110,6 +110,15 @@ double Adaptation::marker_statistic(int part) const {
   return node < 0 ? 0 : markers_[static_cast<std::size_t>(node)].value;
 }
 
+EdgeState Adaptation::state(const Place& place) const {
+  if (detected_ == place) return EdgeState::kInvalid;
+  const bool is_replaced = std::any_of(replacements_.begin(), replacements_.end(),
+                                       [&place](const Replacement& r) { return r.place == place; });
+  if (is_replaced || (drifting_ == place.part && !place.marker)) return EdgeState::kProvisional;
+  const double statistic = place.marker ? marker_statistic(place.part) : edge_statistic(place.part);
+  return statistic > options_.suspicion ? EdgeState::kSuspect : EdgeState::kOk;
+}
+
 TreeFilter::Judgement Adaptation::update_tests(const TreeFilter::Instant& instant,
                                                std::int64_t sample_index) {
   const TreeFilter::Judgement now = filter_->judge(instant);

@@ -74,6 +74,11 @@ class Adaptation {
   /// CUSUM of the edge to a part (root: the camera's) and of the part's marker [nats].
   double edge_statistic(int part) const;
   double marker_statistic(int part) const;
+  /// State of the edge to a part (root: of the camera's pose) and of the part's marker. kInvalid:
+  /// found wrong, and nothing accepted in its place yet. kProvisional: replaced, or drifting, and
+  /// not settled.
+  EdgeState edge_state(int part) const { return state({part, false}); }
+  EdgeState marker_state(int part) const { return state({part, true}); }
   /// True over assumed standard deviation of the markers, as the residuals of quiet samples show
   /// it.
   double noise_scale() const { return noise_.scale; }
@@ -96,6 +101,7 @@ class Adaptation {
     FittedChange fitted;
   };
 
+  EdgeState state(const Place& place) const;
   void calibrate();
   void begin_drift(int part, std::int64_t sample_index, std::vector<AdaptationEvent>* events);
   void watch_drift(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
