@@ -104,23 +104,25 @@ std::optional<int> DriftWatch::moved_part(const BodySchema& schema) const {
     const Edge* edge = edge_to(schema, part);
     if (!edge && part != schema.root) continue;
     // Mean offset on the right side, as far as the model's own uncertainty does not explain it.
-    Matrix6d H = Matrix6d::Zero(), model = Matrix6d::Zero();
-    Vector6d g = Vector6d::Zero(), mean = Vector6d::Zero();
+    std::vector<Reading> readings;
+    Matrix6d model = Matrix6d::Zero();
+    for (const Measured& m : *queue) {
+      const Pose X = edge ? edge->predict(m.displacements) : schema.X_CR;
+      readings.push_back({0, log(X.inverse() * m.of.z), m.of.covariance.inverse()});
+      model += m.systematic +
+               (edge ? edge->prediction_covariance(m.displacements) : schema.X_CR_covariance);
+    }
+    model /= static_cast<double>(queue->size());
+    Matrix6d H;
+    Vector6d mean = Vector6d::Zero();
     for (int round = 0; round < 4; ++round) {
       H.setZero();
-      g.setZero();
-      model.setZero();
-      for (const Measured& m : *queue) {
-        const Pose X = edge ? edge->predict(m.displacements) : schema.X_CR;
-        const Vector6d xi = log(X.inverse() * m.of.z);
-        const Matrix6d information = m.of.covariance.inverse();
-        const Vector6d e = xi - mean;
-        const Matrix6d I = weight(e.dot(information * e)) * information;
+      Vector6d g = Vector6d::Zero();
+      for (const Reading& r : readings) {
+        const Vector6d e = r.xi - mean;
+        const Matrix6d I = weight(e.dot(r.information * e)) * r.information;
         H += I;
-        g += I * xi;
-        model += (m.systematic +
-                  (edge ? edge->prediction_covariance(m.displacements) : schema.X_CR_covariance)) /
-                 static_cast<double>(queue->size());
+        g += I * r.xi;
       }
       mean = H.ldlt().solve(g);
     }
