@@ -2,7 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
-#include <set>
+#include <stdexcept>
 
 namespace bodyschema {
 namespace {
@@ -15,6 +15,11 @@ constexpr double kInflations[] = {3, 10};
 constexpr int kRefits[] = {1, 2, 3, 4, 5, 7, 11, 19, 30};
 /// Changes that begin within so many samples of each other are one event.
 constexpr std::int64_t kTogether = 12;
+
+/// From so many samples on a change keeps its form unless another explains clearly more of the
+/// evidence.
+constexpr int kManySamples = 8;
+constexpr double kSystematicShare = 0.03;
 
 /// χ²₆(0.99): below it a rate is none.
 constexpr double kSignificantRate = 16.8;
@@ -51,6 +56,17 @@ bool differ_at(const BodySchema& a, const BodySchema& b, int part) {
   if (part == a.root) return !a.X_CR.isApprox(b.X_CR, 1e-9);
   const Edge *x = edge_to(a, part), *y = edge_to(b, part);
   return x && y && differ(*x, *y);
+}
+
+void check(const ActionPoseSample& sample, const BodySchema& schema) {
+  if (!schema.displacements(sample.action).allFinite())
+    throw std::invalid_argument("sample " + std::to_string(sample.sample_index) +
+                                ": the action is not finite");
+  for (const PartObservation& o : sample.parts)
+    if (!o.X_CB.matrix().allFinite() || !o.covariance.allFinite() ||
+        (o.X_CB_other && !o.X_CB_other->matrix().allFinite()))
+      throw std::invalid_argument("sample " + std::to_string(sample.sample_index) + ", part " +
+                                  std::to_string(o.part) + ": the pose is not finite");
 }
 
 }  // namespace
@@ -228,14 +244,19 @@ std::vector<Adaptation::Place> Adaptation::suspects() const {
 }
 
 Adaptation::Choice Adaptation::choose(const BodySchema& standing, const std::vector<Place>& places,
-                                      const std::vector<const ActionPoseSample*>& samples) const {
+                                      const std::vector<const ActionPoseSample*>& samples,
+                                      const BodyChange* standing_form) const {
   Choice choice;
+  std::optional<Replacement> same_form;
   choice.null = log_likelihood(standing, noise_, samples);
   const auto second = [&](Replacement candidate) {
     if (!choice.runner_up || candidate.fitted.log_evidence > choice.runner_up->fitted.log_evidence)
       choice.runner_up = std::move(candidate);
   };
   const auto offer = [&](FittedChange candidate, const Place& at) {
+    if (standing_form && candidate.change == *standing_form &&
+        (!same_form || candidate.log_evidence > same_form->fitted.log_evidence))
+      same_form = Replacement{at, candidate};
     if (choice.best && candidate.log_evidence <= choice.best->fitted.log_evidence) {
       second({at, std::move(candidate)});
       return;
@@ -265,8 +286,9 @@ Adaptation::Choice Adaptation::choose(const BodySchema& standing, const std::vec
         offer(std::move(candidate), at);
       };
       if (b > 0 && evidence.num_usable() > 0) offer_from(evidence.judge_stored(bases[b]));
-      for (const BodyChange& change : possible_changes(bases[b], at.part, at.marker))
-        if (auto fitted = evidence.fit(change)) offer_from(std::move(*fitted));
+      for (FittedChange& fitted :
+           evidence.fit_likely(possible_changes(bases[b], at.part, at.marker)))
+        offer_from(std::move(fitted));
     }
   }
   // All that differs from a stored schema at once.
@@ -282,6 +304,15 @@ Adaptation::Choice Adaptation::choose(const BodySchema& standing, const std::vec
     all.log_evidence = all.change.log_odds() + log_likelihood(with, noise_, samples);
     all.num_usable = 1;
     offer(std::move(all), places.front());
+  }
+  // With many samples what the schema was wrong about before the change is found out too, and
+  // dressed up as a richer form of it.
+  if (same_form && choice.best->fitted.change != *standing_form &&
+      static_cast<int>(samples.size()) >= kManySamples &&
+      choice.best->fitted.log_evidence - same_form->fitted.log_evidence <
+          options_.ambiguity + kSystematicShare * choice.margin()) {
+    choice.runner_up = std::move(choice.best);
+    choice.best = std::move(same_form);
   }
   return choice;
 }
@@ -392,7 +423,7 @@ void Adaptation::reconsider(std::int64_t sample_index, bool all_forms,
         ++n;
         continue;
       }
-      Choice choice = choose(others, {r.place}, samples);
+      Choice choice = choose(others, {r.place}, samples, &r.fitted.change);
       if (!choice.best || choice.margin() < 0) {
         AdaptationEvent reverted = event(AdaptationEvent::Kind::kReverted, sample_index, r.place);
         reverted.cause = r.fitted.change.cause(others);
@@ -579,6 +610,7 @@ void Adaptation::remember(const BodySchema& schema) {
 }
 
 std::vector<AdaptationEvent> Adaptation::on_sample(const ActionPoseSample& sample) {
+  check(sample, schema_);
   std::vector<AdaptationEvent> events;
   recent_.push_back(sample);
   if (recent_.size() > kRing) recent_.pop_front();

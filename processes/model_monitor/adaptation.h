@@ -68,7 +68,10 @@ class Adaptation {
  public:
   Adaptation(BodySchema schema, AdaptationOptions options);
 
-  /// The events of this sample. A pure function of the samples so far.
+  /// The events of this sample. A pure function of the samples so far. Parts that the schema does
+  /// not know are ignored.
+  /// @throws std::invalid_argument, and is as it was, if the action does not have one value per
+  /// signal or a number is not finite.
   std::vector<AdaptationEvent> on_sample(const ActionPoseSample& sample);
   const BodySchema& schema() const { return schema_; }
   /// CUSUM of the edge to a part (root: the camera's) and of the part's marker [nats].
@@ -118,8 +121,10 @@ class Adaptation {
     std::optional<Replacement> runner_up;
     double margin() const { return best ? best->fitted.log_evidence - null : 0; }
   };
+  /// `standing_form`: what explains the samples so far.
   Choice choose(const BodySchema& standing, const std::vector<Place>& places,
-                const std::vector<const ActionPoseSample*>& samples) const;
+                const std::vector<const ActionPoseSample*>& samples,
+                const BodyChange* standing_form = nullptr) const;
   BodySchema composed(int without = -1) const;
   void try_changes(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
   void reconsider(std::int64_t sample_index, bool all_forms, std::vector<AdaptationEvent>* events);

@@ -3,6 +3,7 @@
 #include <Eigen/Cholesky>
 #include <algorithm>
 #include <cmath>
+#include <limits>
 
 namespace bodyschema {
 namespace {
@@ -13,6 +14,11 @@ constexpr int kIterations = 16;
 constexpr double kLargestStep =
     0.7;  // of θ, in prior standard deviations of a transform: m and rad
 constexpr double kStudentNu = 4;
+/// Starts that are followed up.
+constexpr std::size_t kClimbs = 4;
+/// Evidence behind the best change of a place, by the place's measurements, that all observations
+/// do not make up for [nats].
+constexpr double kHopeless = 25;
 
 std::vector<int> nodes_of(const TreeFilter& filter, const std::vector<int>& parts) {
   std::vector<int> nodes;
@@ -176,30 +182,38 @@ std::vector<Eigen::VectorXd> PlaceEvidence::starts(const BodyChange& change) con
   return result;
 }
 
+double PlaceEvidence::log_flat_outlier() const {
+  return std::log(noise_.outlier_rate) + log_flat_density();
+}
+
+double PlaceEvidence::log_inlier(std::size_t n, double d2) const {
+  return std::log1p(-noise_.outlier_rate) - 0.5 * d2 + measurements_[n].log_norm;
+}
+
+double PlaceEvidence::cost(const BodyChange& change, const Eigen::VectorXd& theta,
+                           bool robust) const {
+  const double flat = log_flat_outlier();
+  const Eigen::VectorXd mean = prior_mean(change, base_), sigma = prior_sigma(change, base_);
+  double sum = 0.5 * (theta - mean).cwiseQuotient(sigma).squaredNorm();
+  const Eigen::VectorXd r = residuals(change, theta);
+  for (std::size_t n = 0; n < measurements_.size(); ++n) {
+    const double d2 = r.segment<6>(6 * static_cast<Eigen::Index>(n)).squaredNorm();
+    if (robust) {
+      sum += (kStudentNu + 6) / 2 * std::log1p(d2 / kStudentNu);
+    } else {
+      const double inlier = log_inlier(n, d2);
+      sum -= std::max(inlier, flat) + std::log1p(std::exp(-std::abs(inlier - flat)));
+    }
+  }
+  return sum;
+}
+
 PlaceEvidence::State PlaceEvidence::climb(const BodyChange& change, Eigen::VectorXd theta) const {
   const Eigen::Index d = change.size();
   const Eigen::VectorXd mean = prior_mean(change, base_), sigma = prior_sigma(change, base_);
   const Eigen::VectorXd prior = sigma.cwiseAbs2().cwiseInverse();
-  const double flat = std::log(noise_.outlier_rate) + log_flat_density();
+  const double flat = log_flat_outlier();
   const std::size_t count = measurements_.size();
-  // Share of the outliers' density at squared distance d2: the mixture's cost and weight.
-  const auto inlier_density = [&](std::size_t n, double d2) {
-    return std::log1p(-noise_.outlier_rate) - 0.5 * d2 + measurements_[n].log_norm;
-  };
-  const auto cost_of = [&](const Eigen::VectorXd& t, bool robust) {
-    double sum = 0.5 * (t - mean).cwiseAbs2().dot(prior);
-    const Eigen::VectorXd r = residuals(change, t);
-    for (std::size_t n = 0; n < count; ++n) {
-      const double d2 = r.segment<6>(6 * static_cast<Eigen::Index>(n)).squaredNorm();
-      if (robust) {
-        sum += (kStudentNu + 6) / 2 * std::log1p(d2 / kStudentNu);
-      } else {
-        const double inlier = inlier_density(n, d2);
-        sum -= std::max(inlier, flat) + std::log1p(std::exp(-std::abs(inlier - flat)));
-      }
-    }
-    return sum;
-  };
   State state;
   double damping = 1e-3;
   for (int iteration = 0; iteration < kIterations; ++iteration) {
@@ -220,12 +234,12 @@ PlaceEvidence::State PlaceEvidence::climb(const BodyChange& change, Eigen::Vecto
       const auto at = 6 * static_cast<Eigen::Index>(n);
       const double d2 = r.segment<6>(at).squaredNorm();
       const double w = robust ? (kStudentNu + 6) / (kStudentNu + d2)
-                              : 1 / (1 + std::exp(std::min(flat - inlier_density(n, d2), 500.0)));
+                              : 1 / (1 + std::exp(std::min(flat - log_inlier(n, d2), 500.0)));
       H += w * J.middleRows<6>(at).transpose() * J.middleRows<6>(at);
       g += w * J.middleRows<6>(at).transpose() * r.segment<6>(at);
     }
     state.H = H;
-    const double before = cost_of(theta, robust);
+    const double before = cost(change, theta, robust);
     state.theta = theta;
     state.cost = before;
     bool improved = false;
@@ -236,7 +250,7 @@ PlaceEvidence::State PlaceEvidence::climb(const BodyChange& change, Eigen::Vecto
       Eigen::VectorXd step = -damped.ldlt().solve(g);
       const double longest = step.cwiseQuotient(sigma.cwiseMax(1e-9)).cwiseAbs().maxCoeff();
       if (longest > 3 * kLargestStep) step *= 3 * kLargestStep / longest;
-      const double after = cost_of(theta + step, robust);
+      const double after = cost(change, theta + step, robust);
       if (after < before) {
         theta += step;
         gain = before - after;
@@ -251,49 +265,81 @@ PlaceEvidence::State PlaceEvidence::climb(const BodyChange& change, Eigen::Vecto
       iteration = std::max(iteration, kIterations / 2 - 1);
     }
   }
-  state.cost = cost_of(theta, false);
+  state.cost = cost(change, theta, false);
   state.theta = theta;
   return state;
 }
 
-std::optional<FittedChange> PlaceEvidence::fit(const BodyChange& change) const {
+std::optional<FittedChange> PlaceEvidence::fit_place(const BodyChange& change) const {
   if (num_usable() < change.fewest_samples()) return std::nullopt;
   const Eigen::Index d = change.size();
   FittedChange best;
   best.change = change;
   best.num_usable = num_usable();
   best.theta = Eigen::VectorXd::Zero(d);
-  best.log_evidence = change.log_odds();
-  if (d > 0) {
-    std::optional<State> found;
-    // The most promising starts only: one cost each tells.
-    for (const Eigen::VectorXd& start : starts(change)) {
-      const State state = climb(change, start);
-      if (!state.theta.allFinite() || !std::isfinite(state.cost)) continue;
-      if (!found || state.cost < found->cost) found = state;
-    }
-    if (!found) return std::nullopt;
-    const Eigen::LLT<Eigen::MatrixXd> llt(found->H);
-    if (llt.info() != Eigen::Success) return std::nullopt;
-    best.theta = found->theta;
-    best.covariance = llt.solve(Eigen::MatrixXd::Identity(d, d));
-    const Eigen::VectorXd sigma = prior_sigma(change, base_);
-    // log prior + d/2 log 2π − ½ log|H|; a uniform prior has the density of its interval.
-    if (change.form == Form::kStuck) {
-      best.log_evidence += -std::log(sigma(0) * std::sqrt(12.0)) + 0.5 * std::log(2 * M_PI);
-    } else {
-      best.log_evidence -=
-          0.5 * (best.theta - prior_mean(change, base_)).cwiseQuotient(sigma).squaredNorm() +
-          sigma.array().log().sum();
-    }
-    best.log_evidence -= llt.matrixLLT().diagonal().array().log().sum();
+  best.log_prior = change.log_odds();
+  if (d == 0) {
+    best.log_evidence = change.log_odds() - cost(change, best.theta, false);
+    return best;
   }
+  // The most promising starts.
+  std::vector<std::pair<double, Eigen::VectorXd>> promising;
+  for (Eigen::VectorXd& start : starts(change))
+    promising.emplace_back(cost(change, start, true), std::move(start));
+  std::stable_sort(promising.begin(), promising.end(),
+                   [](const auto& a, const auto& b) { return a.first < b.first; });
+  if (promising.size() > kClimbs) promising.resize(kClimbs);
+  std::optional<State> found;
+  for (const auto& [unused, start] : promising) {
+    const State state = climb(change, start);
+    if (!state.theta.allFinite() || !std::isfinite(state.cost)) continue;
+    if (!found || state.cost < found->cost) found = state;
+  }
+  if (!found) return std::nullopt;
+  const Eigen::LLT<Eigen::MatrixXd> llt(found->H);
+  if (llt.info() != Eigen::Success) return std::nullopt;
+  best.theta = found->theta;
+  best.covariance = llt.solve(Eigen::MatrixXd::Identity(d, d));
+  const Eigen::VectorXd sigma = prior_sigma(change, base_);
+  const double distance =
+      0.5 * (best.theta - prior_mean(change, base_)).cwiseQuotient(sigma).squaredNorm();
+  // log prior + d/2 log 2π − ½ log|H|; a uniform prior has the density of its interval.
+  best.log_prior += change.form == Form::kStuck
+                        ? 0.5 * std::log(2 * M_PI) - std::log(sigma(0) * std::sqrt(12.0))
+                        : -distance - sigma.array().log().sum();
+  best.log_prior -= llt.matrixLLT().diagonal().array().log().sum();
+  best.log_evidence = best.log_prior + distance - found->cost;
+  return best;
+}
+
+void PlaceEvidence::judge(FittedChange* fitted) const {
   // The likelihood at the most probable θ; the width of its peak is in the Laplace term, so the
   // model's new uncertainty must not be in it as well.
-  best.log_evidence +=
-      log_likelihood(changed(base_, change, best.theta), noise_, samples_, cut_parts_);
-  best.schema = changed(base_, change, best.theta, best.covariance);
-  return best;
+  fitted->log_evidence =
+      fitted->log_prior +
+      log_likelihood(changed(base_, fitted->change, fitted->theta), noise_, samples_, cut_parts_);
+  fitted->schema = changed(base_, fitted->change, fitted->theta, fitted->covariance);
+}
+
+std::optional<FittedChange> PlaceEvidence::fit(const BodyChange& change) const {
+  auto fitted = fit_place(change);
+  if (fitted) judge(&*fitted);
+  return fitted;
+}
+
+std::vector<FittedChange> PlaceEvidence::fit_likely(const std::vector<BodyChange>& changes) const {
+  std::vector<FittedChange> fitted;
+  double best = -std::numeric_limits<double>::infinity();
+  for (const BodyChange& change : changes) {
+    auto one = fit_place(change);
+    if (!one) continue;
+    best = std::max(best, one->log_evidence);
+    fitted.push_back(std::move(*one));
+  }
+  std::erase_if(fitted,
+                [best](const FittedChange& f) { return f.log_evidence < best - kHopeless; });
+  for (FittedChange& f : fitted) judge(&f);
+  return fitted;
 }
 
 FittedChange PlaceEvidence::judge_stored(const BodySchema& schema) const {

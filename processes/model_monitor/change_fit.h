@@ -20,7 +20,8 @@ struct FittedChange {
   BodySchema schema;           ///< with the change, and its uncertainty, in it
   /// log ∫ p(observations | θ) p(θ) dθ by Laplace, plus the log prior odds [nats].
   double log_evidence = 0;
-  int num_usable = 0;  ///< samples that say something of the place
+  double log_prior = 0;  ///< its share that is not the likelihood at θ
+  int num_usable = 0;    ///< samples that say something of the place
 };
 
 /// `schema` with the fitted change, and its uncertainty, in it.
@@ -47,6 +48,9 @@ class PlaceEvidence {
   /// observations under the changed schema. std::nullopt if there are fewer usable samples than the
   /// form needs.
   std::optional<FittedChange> fit(const BodyChange& change) const;
+  /// Those of the changes that may be the best one: what the place's own measurements speak clearly
+  /// against is not held against all the observations.
+  std::vector<FittedChange> fit_likely(const std::vector<BodyChange>& changes) const;
   /// A schema of the history in this place.
   FittedChange judge_stored(const BodySchema& schema) const;
 
@@ -67,6 +71,14 @@ class PlaceEvidence {
   /// Whitened residuals of the measurements, one after the other: 6N.
   Eigen::VectorXd residuals(const BodyChange& change, const Eigen::VectorXd& theta) const;
   std::vector<Eigen::VectorXd> starts(const BodyChange& change) const;
+  double log_flat_outlier() const;
+  double log_inlier(std::size_t n, double squared_distance) const;
+  /// −log of prior times likelihood of the place's measurements; `robust`: Student-t.
+  double cost(const BodyChange& change, const Eigen::VectorXd& theta, bool robust) const;
+  /// θ and the evidence of the place's measurements alone.
+  std::optional<FittedChange> fit_place(const BodyChange& change) const;
+  /// The evidence of all observations in its stead.
+  void judge(FittedChange* fitted) const;
   State climb(const BodyChange& change, Eigen::VectorXd theta) const;
 
   const BodySchema base_;

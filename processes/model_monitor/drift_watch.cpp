@@ -56,6 +56,24 @@ Line fit_line(const std::vector<Reading>& readings) {
   return line;
 }
 
+/// Squared Mahalanobis distance of the readings' robust mean from 0; `model` is common to them all.
+double mean_offset(const std::vector<Reading>& readings, const Matrix6d& model) {
+  Matrix6d H;
+  Vector6d mean = Vector6d::Zero();
+  for (int round = 0; round < 4; ++round) {
+    H.setZero();
+    Vector6d g = Vector6d::Zero();
+    for (const Reading& r : readings) {
+      const Vector6d e = r.xi - mean;
+      const Matrix6d I = weight(e.dot(r.information * e)) * r.information;
+      H += I;
+      g += I * r.xi;
+    }
+    mean = H.ldlt().solve(g);
+  }
+  return mean.dot(Matrix6d(H.inverse() + model).ldlt().solve(mean));
+}
+
 }  // namespace
 
 DriftWatch::DriftWatch(double false_alarm_rate)
@@ -103,32 +121,28 @@ std::optional<int> DriftWatch::moved_part(const BodySchema& schema) const {
     if (!queue) continue;
     const Edge* edge = edge_to(schema, part);
     if (!edge && part != schema.root) continue;
-    // Mean offset on the right side, as far as the model's own uncertainty does not explain it.
-    std::vector<Reading> readings;
-    Matrix6d model = Matrix6d::Zero();
+    // Mean offset on either side, as far as the model's own uncertainty does not explain it.
+    std::vector<Reading> right, left;
+    Matrix6d model_right = Matrix6d::Zero(), model_left = Matrix6d::Zero();
+    const double share = 1 / static_cast<double>(queue->size());
     for (const Measured& m : *queue) {
       const Pose X = edge ? edge->predict(m.displacements) : schema.X_CR;
-      readings.push_back({0, log(X.inverse() * m.of.z), m.of.covariance.inverse()});
-      model += m.systematic +
-               (edge ? edge->prediction_covariance(m.displacements) : schema.X_CR_covariance);
+      const Matrix6d model = m.systematic + (edge ? edge->prediction_covariance(m.displacements)
+                                                  : schema.X_CR_covariance);
+      const Vector6d xi = log(X.inverse() * m.of.z);
+      const Matrix6d information = m.of.covariance.inverse();
+      right.push_back({0, xi, information});
+      model_right += share * model;
+      if (!edge || edge->joints.empty()) continue;
+      const Matrix6d A = adjoint(X), B = adjoint(X.inverse());
+      left.push_back({0, A * xi, B.transpose() * information * B});
+      model_left += share * A * model * A.transpose();
     }
-    model /= static_cast<double>(queue->size());
-    Matrix6d H;
-    Vector6d mean = Vector6d::Zero();
-    for (int round = 0; round < 4; ++round) {
-      H.setZero();
-      Vector6d g = Vector6d::Zero();
-      for (const Reading& r : readings) {
-        const Vector6d e = r.xi - mean;
-        const Matrix6d I = weight(e.dot(r.information * e)) * r.information;
-        H += I;
-        g += I * r.xi;
-      }
-      mean = H.ldlt().solve(g);
-    }
-    const Matrix6d covariance = Matrix6d(H.inverse()) + model;
-    const double d2 = mean.dot(covariance.ldlt().solve(mean));
-    if (d2 > most) {
+    for (const bool is_left : {false, true}) {
+      const std::vector<Reading>& readings = is_left ? left : right;
+      if (readings.empty()) continue;
+      const double d2 = mean_offset(readings, is_left ? model_left : model_right);
+      if (d2 <= most) continue;
       most = d2;
       moved = part;
     }

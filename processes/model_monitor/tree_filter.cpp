@@ -19,6 +19,9 @@ constexpr double kClearInlier = 10;
 constexpr double kLogOtherReading = -2.3;
 /// Markers from which the belief behind a cut edge is begun anew.
 constexpr std::size_t kMaxStarters = 3;
+/// A beginning farther away is taken if it is likelier by this much: what lies on its way is
+/// counted twice [nats].
+constexpr double kMuchLikelier = 3;
 
 Matrix6d diagonal(const Noise& noise) {
   Vector6d variances;
@@ -248,7 +251,7 @@ class TreeFilter::Walk {
   }
 
   /// A subtree whose edge says nothing: begun anew from one of its markers, each with equal odds.
-  /// The belief of the likeliest beginning; std::nullopt if nothing was seen there.
+  /// The belief of the nearest beginning that is likely; std::nullopt if nothing was seen there.
   std::optional<Belief> behind_cut(int top) {
     std::vector<int> starters = visible_below(top);
     if (starters.size() > kMaxStarters) starters.resize(kMaxStarters);
@@ -261,6 +264,7 @@ class TreeFilter::Walk {
     std::vector<double> scores;
     std::optional<Walk> best;
     Belief best_belief;
+    double best_score = 0;
     for (const int starter : starters) {
       Walk walk = *this;
       walk.judgement.log_likelihood = log_flat_density();
@@ -271,9 +275,10 @@ class TreeFilter::Walk {
       walk.subtree(top, &belief);
       walk.skipped_ = skipped_;
       scores.push_back(walk.judgement.log_likelihood);
-      if (scores.back() == *std::max_element(scores.begin(), scores.end())) {
+      if (!best || scores.back() > best_score + kMuchLikelier) {
         best.emplace(walk);
         best_belief = belief;
+        best_score = scores.back();
       }
     }
     const double so_far = judgement.log_likelihood;

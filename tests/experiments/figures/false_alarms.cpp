@@ -9,15 +9,19 @@
 
 #include "processes/model_monitor/adaptation.h"
 #include "processes/model_monitor/chapter_adaptation.h"
-#include "tests/experiments/figures/broken_arm.h"
 #include "tests/experiments/figures/experiment.h"
 #include "tests/experiments/figures/robots.h"
 #include "tests/experiments/figures/statistics.h"
+#include "tests/support/broken_arm.h"
 
 namespace bodyschema::experiments {
 namespace {
 
+using test::adaptation_options;
+using test::BrokenArm;
+using test::Fault;
 using test::Regime;
+using test::thread_seconds;
 using Kind = AdaptationEvent::Kind;
 
 constexpr double kVisible = 0.85;

@@ -8,7 +8,7 @@
 #include "processes/model_monitor/adaptation.h"
 #include "tests/support/synthetic_robot.h"
 
-namespace bodyschema::experiments {
+namespace bodyschema::test {
 
 enum class Fault {
   kNone,
@@ -48,7 +48,7 @@ class BrokenArm {
   static constexpr int kNumBlocks = 4;
   static constexpr int kRoot = 1, kEndEffector = 7;
 
-  BrokenArm(const Scenario& scenario, test::Regime regime, int block_length, int seed);
+  BrokenArm(const Scenario& scenario, Regime regime, int block_length, int seed);
 
   const BodySchema& engineered() const { return engineered_; }
   int num_samples() const { return kNumBlocks * block_length_; }
@@ -64,13 +64,13 @@ class BrokenArm {
   bool is_near(int part) const;
 
  private:
-  test::SyntheticRobot robot_at(int index) const;
+  SyntheticRobot robot_at(int index) const;
 
   const Scenario scenario_;
-  const test::Regime regime_;
+  const Regime regime_;
   const int block_length_;
-  test::Rng rng_;
-  test::SyntheticRobot healthy_, broken_;
+  Rng rng_;
+  SyntheticRobot healthy_, broken_;
   Eigen::Vector3d drift_axis_;
   BodySchema engineered_;
   std::vector<Eigen::VectorXd> test_actions_;
@@ -79,9 +79,9 @@ class BrokenArm {
 
 /// Assumed noise is `noise_factor` times the true one. In tag noise it comes with the observations
 /// (and the factor must be 1).
-AdaptationOptions adaptation_options(test::Regime regime, double noise_factor = 1);
+AdaptationOptions adaptation_options(Regime regime, double noise_factor = 1);
 
 /// Processor time of this thread [s].
 double thread_seconds();
 
-}  // namespace bodyschema::experiments
+}  // namespace bodyschema::test

@@ -1,15 +1,11 @@
-#include "tests/experiments/figures/broken_arm.h"
+#include "tests/support/broken_arm.h"
 
 #include <algorithm>
 #include <cmath>
 #include <ctime>
 
-namespace bodyschema::experiments {
+namespace bodyschema::test {
 namespace {
-
-using test::Rng;
-using test::SyntheticRobot;
-using test::TrueLink;
 
 constexpr double kDegree = M_PI / 180;
 constexpr int kTestActions = 60;
@@ -17,15 +13,15 @@ constexpr double kRange_rad = 1.35;
 
 SyntheticRobot chain(Rng& rng) {
   SyntheticRobot robot;
-  robot.X_CR.linear() = test::random_rotation(rng);
+  robot.X_CR.linear() = random_rotation(rng);
   robot.X_CR.translation() << 0, 0, 2;
   robot.links.push_back({.part = 1});
   for (int part = 2; part <= BrokenArm::kEndEffector; ++part) {
     TrueLink link;
     link.part = part;
     link.parent = part - 1;
-    link.X_before = test::random_pose(rng, 0.06, 0.16);
-    link.X_after = test::random_pose(rng, 0.06, 0.16);
+    link.X_before = random_pose(rng, 0.06, 0.16);
+    link.X_after = random_pose(rng, 0.06, 0.16);
     link.signal = part - 2;
     link.turn = 1;
     robot.links.push_back(link);
@@ -53,7 +49,7 @@ BodySchema engineered_model(const SyntheticRobot& robot, Rng& rng) {
     ScrewJoint joint;
     joint.signal = link.signal;
     joint.turn = link.turn;
-    joint.X_after = link.X_after * exp(sigma.cwiseProduct(test::gaussian6(rng)));
+    joint.X_after = link.X_after * exp(sigma.cwiseProduct(gaussian6(rng)));
     edge.joints.push_back(joint);
     edge.parameter_covariance = Eigen::MatrixXd::Zero(14, 14);
     edge.parameter_covariance.block<6, 6>(8, 8) = sigma.cwiseAbs2().asDiagonal();
@@ -66,14 +62,14 @@ BodySchema engineered_model(const SyntheticRobot& robot, Rng& rng) {
 /// A displacement of given size, in a random direction.
 Pose displacement(Rng& rng, double position_m, double rotation_rad) {
   Pose T = Pose::Identity();
-  T.linear() = exp_so3(test::random_rotation(rng).col(0) * rotation_rad);
-  T.translation() = test::random_rotation(rng).col(0) * position_m;
+  T.linear() = exp_so3(random_rotation(rng).col(0) * rotation_rad);
+  T.translation() = random_rotation(rng).col(0) * position_m;
   return T;
 }
 
 }  // namespace
 
-BrokenArm::BrokenArm(const Scenario& scenario, test::Regime regime, int block_length, int seed)
+BrokenArm::BrokenArm(const Scenario& scenario, Regime regime, int block_length, int seed)
     : scenario_(scenario),
       regime_(regime),
       block_length_(block_length),
@@ -83,7 +79,7 @@ BrokenArm::BrokenArm(const Scenario& scenario, test::Regime regime, int block_le
   const auto link = [this](int part) -> TrueLink& { return broken_.links[part - 1]; };
   const auto stick = [&](int part) {
     Vector6d at = Vector6d::Zero();
-    at(5) = test::uniform(rng_, -0.8, 0.8);
+    at(5) = uniform(rng_, -0.8, 0.8);
     link(part).X_before = link(part).X_before * exp(at);
     link(part).signal = -1;
     changes_.push_back({part, true, false, {"joint_stuck"}});
@@ -137,7 +133,7 @@ BrokenArm::BrokenArm(const Scenario& scenario, test::Regime regime, int block_le
       changes_.push_back({4, true, false, {"drift"}});
       break;
   }
-  drift_axis_ = test::random_rotation(rng_).col(0);
+  drift_axis_ = random_rotation(rng_).col(0);
   engineered_ = engineered_model(healthy_, rng_);
   for (int n = 0; n < kTestActions; ++n) test_actions_.push_back(healthy_.random_action(rng_));
 }
@@ -156,13 +152,13 @@ SyntheticRobot BrokenArm::robot_at(int index) const {
 
 ActionPoseSample BrokenArm::observe(int index) {
   const SyntheticRobot robot = robot_at(index);
-  test::ObservationOptions options;
+  ObservationOptions options;
   options.regime = regime_;
   options.with_covariances = true;
   const Eigen::VectorXd action = healthy_.random_action(rng_);
   ActionPoseSample sample = test::observe(robot, action, options, index, rng_);
   std::erase_if(sample.parts,
-                [this](const auto&) { return test::uniform(rng_, 0, 1) > scenario_.visible; });
+                [this](const auto&) { return uniform(rng_, 0, 1) > scenario_.visible; });
   return sample;
 }
 
@@ -187,15 +183,15 @@ bool BrokenArm::is_near(int part) const {
                      [part](const TrueChange& c) { return std::abs(c.part - part) <= 1; });
 }
 
-AdaptationOptions adaptation_options(test::Regime regime, double noise_factor) {
+AdaptationOptions adaptation_options(Regime regime, double noise_factor) {
   AdaptationOptions options;
-  if (regime != test::Regime::kTag) {
-    options.noise.noise = test::nominal_noise(regime);
+  if (regime != Regime::kTag) {
+    options.noise.noise = nominal_noise(regime);
     options.noise.noise->position_m *= noise_factor;
     options.noise.noise->rotation_rad *= noise_factor;
   }
   // A third more than there are; never none.
-  const bool has_outliers = regime == test::Regime::kTag || regime == test::Regime::kTagIso;
+  const bool has_outliers = regime == Regime::kTag || regime == Regime::kTagIso;
   options.noise.outlier_rate = has_outliers ? 0.04 : 0.013;
   return options;
 }
@@ -206,4 +202,4 @@ double thread_seconds() {
   return static_cast<double>(time.tv_sec) + 1e-9 * static_cast<double>(time.tv_nsec);
 }
 
-}  // namespace bodyschema::experiments
+}  // namespace bodyschema::test
