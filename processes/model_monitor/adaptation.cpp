@@ -376,8 +376,10 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
   want_probe(schema_, choice, sample_index, events);
   if (fitted.change.small && !choice.best->place.marker) {
     const int part = choice.best->place.part;
-    const bool again =
-        last_small_ && last_small_->first == part && sample_index - last_small_->second < kSoon;
+    // At once again is a change that was not understood yet.
+    const bool again = last_small_ && last_small_->first == part &&
+                       sample_index - last_small_->second < kSoon &&
+                       sample_index - last_small_->second > kTogether;
     last_small_ = {part, sample_index};
     if (again && !drifting_) {
       if (!replacements_.empty()) remember(schema_);
