@@ -376,13 +376,26 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
   want_probe(schema_, choice, sample_index, events);
   if (fitted.change.small && !choice.best->place.marker) {
     const int part = choice.best->place.part;
-    // At once again is a change that was not understood yet.
-    const bool again = last_small_ && last_small_->first == part &&
-                       sample_index - last_small_->second < kSoon &&
-                       sample_index - last_small_->second > kTogether;
+    // At once again is a change that was not understood yet. What is next to it may have been held
+    // to be the place.
+    const auto is_next = [this](int a, int b) {
+      const Edge* edge = edge_to(schema_, a);
+      return edge && edge->from == b;
+    };
+    const bool again = last_small_ && sample_index - last_small_->second < kSoon &&
+                       sample_index - last_small_->second > kTogether &&
+                       (last_small_->first == part || is_next(part, last_small_->first) ||
+                        is_next(last_small_->first, part));
     last_small_ = {part, sample_index};
     if (again && !drifting_) {
-      if (!replacements_.empty()) remember(schema_);
+      // Small changes that have not settled were this drift as well.
+      const bool all_small =
+          std::all_of(replacements_.begin(), replacements_.end(),
+                      [](const Replacement& r) { return r.fitted.change.small; });
+      if (!replacements_.empty() && all_small)
+        install(before_);
+      else if (!replacements_.empty())
+        remember(schema_);
       replacements_.clear();
       begin_drift(part, sample_index, events);
       return;

@@ -8,10 +8,12 @@
 namespace bodyschema {
 namespace {
 
-constexpr std::size_t kWindow = 36;
+constexpr std::size_t kWindow = 44;
+/// Of the mean that tells whether an edge moved.
+constexpr std::size_t kMean = 36;
 constexpr std::size_t kFewest = 16;
 /// Of a straight line through the newest measurements.
-constexpr std::size_t kFollowed = 28;
+constexpr std::size_t kFollowed = 40;
 constexpr double kStudentNu = 4;
 
 double weight(double d2) { return (kStudentNu + 6) / (kStudentNu + d2); }
@@ -124,8 +126,10 @@ std::optional<int> DriftWatch::moved_part(const BodySchema& schema) const {
     // Mean offset on either side, as far as the model's own uncertainty does not explain it.
     std::vector<Reading> right, left;
     Matrix6d model_right = Matrix6d::Zero(), model_left = Matrix6d::Zero();
-    const double share = 1 / static_cast<double>(queue->size());
-    for (const Measured& m : *queue) {
+    const std::size_t begin = queue->size() > kMean ? queue->size() - kMean : 0;
+    const double share = 1 / static_cast<double>(queue->size() - begin);
+    for (std::size_t n = begin; n < queue->size(); ++n) {
+      const Measured& m = (*queue)[n];
       const Pose X = edge ? edge->predict(m.displacements) : schema.X_CR;
       const Matrix6d model = m.systematic + (edge ? edge->prediction_covariance(m.displacements)
                                                   : schema.X_CR_covariance);
