@@ -1,4 +1,4 @@
-// experiments: the figures of the chapter's Sections 3 and 5.1, measured again: the chapter's
+// experiments: the figures of the chapter's Sections 3 to 5, measured again: the chapter's
 // value, the chapter's own method (baseline) and ours beside each other, over many robots.
 //
 //   experiments [NAME…] [--quick] [--out FOLDER] [--jobs N]
@@ -36,6 +36,9 @@ const std::vector<Experiment> kExperiments = {
     {"two_dof_free", "Section 5.1: 2-DOF robot without noise", two_dof_free},
     {"seven_dof", "Fig. 11: 7-DOF robot, ten parts, x4 never seen", seven_dof},
     {"trees", "Beyond the chapter: random trees", trees},
+    {"adaptation", "Table 1, Figs. 9, 12 and 13: a body that breaks, is repaired, breaks again",
+     adaptation},
+    {"false_alarms", "Section 4: how often a healthy body is found broken", false_alarms},
 };
 
 std::vector<Experiment> chosen(const std::vector<std::string>& names) {

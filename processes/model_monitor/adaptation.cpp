@@ -1,0 +1,657 @@
+#include "processes/model_monitor/adaptation.h"
+
+#include <algorithm>
+#include <cmath>
+#include <stdexcept>
+
+namespace bodyschema {
+namespace {
+
+constexpr std::size_t kRing = 64;
+/// Squared distance of every marker below which a sample cannot raise a CUSUM that is at zero.
+constexpr double kClear = 14;
+constexpr double kInflations[] = {3, 10};
+/// Samples after a replacement at which all forms are tried again.
+constexpr int kRefits[] = {1, 2, 3, 4, 5, 7, 11, 19, 30};
+/// Changes that begin within so many samples of each other are one event.
+constexpr std::int64_t kTogether = 12;
+
+/// From so many samples on a change keeps its form unless another explains clearly more of the
+/// evidence.
+constexpr int kManySamples = 8;
+constexpr double kSystematicShare = 0.03;
+
+/// χ²₆(0.99): below it a rate is none.
+constexpr double kSignificantRate = 16.8;
+constexpr int kProbeCandidates = 200;
+/// Sightings below which a part's visibility is not known.
+constexpr int kFewestSightings = 10;
+constexpr std::int64_t kSoon = 150;
+constexpr double kMedianChiSquare6 = 5.348;
+constexpr double kLeastScale = 0.2, kLargestScale = 5;
+constexpr std::size_t kFewestDistances = 20;
+/// Quiet samples after which the noise is looked at again.
+constexpr int kQuietSamples = 32;
+
+double median(std::vector<double> values) {
+  const auto middle = values.begin() + static_cast<std::ptrdiff_t>(values.size() / 2);
+  std::nth_element(values.begin(), middle, values.end());
+  return *middle;
+}
+
+bool differ(const Edge& a, const Edge& b) {
+  if (!a.left.isApprox(b.left, 1e-9) || !a.right.isApprox(b.right, 1e-9) ||
+      a.joints.size() != b.joints.size())
+    return true;
+  for (std::size_t d = 0; d < a.joints.size(); ++d) {
+    const ScrewJoint &x = a.joints[d], &y = b.joints[d];
+    if (x.signal != y.signal || x.gain != y.gain || x.offset != y.offset || x.turn != y.turn ||
+        x.slide != y.slide || !x.X_after.isApprox(y.X_after, 1e-9))
+      return true;
+  }
+  return false;
+}
+
+bool differ_at(const BodySchema& a, const BodySchema& b, int part) {
+  if (part == a.root) return !a.X_CR.isApprox(b.X_CR, 1e-9);
+  const Edge *x = edge_to(a, part), *y = edge_to(b, part);
+  return x && y && differ(*x, *y);
+}
+
+void check(const ActionPoseSample& sample, const BodySchema& schema) {
+  if (!schema.displacements(sample.action).allFinite())
+    throw std::invalid_argument("sample " + std::to_string(sample.sample_index) +
+                                ": the action is not finite");
+  for (const PartObservation& o : sample.parts)
+    if (!o.X_CB.matrix().allFinite() || !o.covariance.allFinite() ||
+        (o.X_CB_other && !o.X_CB_other->matrix().allFinite()))
+      throw std::invalid_argument("sample " + std::to_string(sample.sample_index) + ", part " +
+                                  std::to_string(o.part) + ": the pose is not finite");
+}
+
+}  // namespace
+
+const char* name_of(AdaptationEvent::Kind kind) {
+  using Kind = AdaptationEvent::Kind;
+  switch (kind) {
+    case Kind::kMismatch:
+      return "mismatch";
+    case Kind::kCandidate:
+      return "candidate";
+    case Kind::kRefined:
+      return "refined";
+    case Kind::kRestored:
+      return "restored";
+    case Kind::kReverted:
+      return "reverted";
+    case Kind::kRecovered:
+      return "recovered";
+    case Kind::kDrift:
+      return "drift";
+    case Kind::kMissing:
+      return "missing";
+    case Kind::kProbeWanted:
+      return "probe_wanted";
+  }
+  return "";
+}
+
+Adaptation::Adaptation(BodySchema schema, AdaptationOptions options)
+    : options_(options),
+      noise_(options.noise),
+      schema_(std::move(schema)),
+      drift_watch_(options.false_alarm_rate) {
+  history_.push_back(schema_);
+  install(schema_);
+}
+
+void Adaptation::install(const BodySchema& schema) {
+  schema_ = schema;
+  filter_.emplace(schema_, noise_);
+  restart_tests();
+}
+
+void Adaptation::restart_tests() {
+  edges_.assign(static_cast<std::size_t>(filter_->num_nodes()), {});
+  markers_ = edges_;
+}
+
+double Adaptation::edge_statistic(int part) const {
+  const int node = filter_->node_of(part);
+  return node < 0 ? 0 : edges_[static_cast<std::size_t>(node)].value;
+}
+
+double Adaptation::marker_statistic(int part) const {
+  const int node = filter_->node_of(part);
+  return node < 0 ? 0 : markers_[static_cast<std::size_t>(node)].value;
+}
+
+EdgeState Adaptation::state(const Place& place) const {
+  if (detected_ == place) return EdgeState::kInvalid;
+  const bool is_replaced = std::any_of(replacements_.begin(), replacements_.end(),
+                                       [&place](const Replacement& r) { return r.place == place; });
+  if (is_replaced || (drifting_ == place.part && !place.marker)) return EdgeState::kProvisional;
+  const double statistic = place.marker ? marker_statistic(place.part) : edge_statistic(place.part);
+  return statistic > options_.suspicion ? EdgeState::kSuspect : EdgeState::kOk;
+}
+
+TreeFilter::Judgement Adaptation::update_tests(const TreeFilter::Instant& instant,
+                                               std::int64_t sample_index) {
+  const TreeFilter::Judgement now = filter_->judge(instant);
+  const auto is_zero = [](const Cusum& c) { return c.value == 0; };
+  const bool clear = std::all_of(now.squared_distance.begin(), now.squared_distance.end(),
+                                 [](double d2) { return d2 < kClear; });
+  if (clear && std::all_of(edges_.begin(), edges_.end(), is_zero) &&
+      std::all_of(markers_.begin(), markers_.end(), is_zero))
+    return now;
+  const auto add = [sample_index](Cusum* cusum, double ratio) {
+    if (cusum->value == 0) cusum->since = sample_index;
+    cusum->value = std::max(0.0, cusum->value + ratio);
+  };
+  for (int node = 0; node < filter_->num_nodes(); ++node) {
+    double wrong = 0;
+    for (const double inflation : kInflations) {
+      Alternative alternative;
+      alternative.inflated_edge = node;
+      alternative.inflation = inflation;
+      wrong += std::exp(std::min(
+          filter_->judge(instant, alternative).log_likelihood - now.log_likelihood, 600.0));
+    }
+    Alternative cut;
+    cut.cut_edges = {node};
+    wrong +=
+        std::exp(std::min(filter_->judge(instant, cut).log_likelihood - now.log_likelihood, 600.0));
+    add(&edges_[static_cast<std::size_t>(node)], std::log(wrong / 3));
+    if (!instant.seen[static_cast<std::size_t>(node)]) continue;
+    Alternative detached;
+    detached.detached_node = node;
+    add(&markers_[static_cast<std::size_t>(node)],
+        filter_->judge(instant, detached).log_likelihood - now.log_likelihood);
+  }
+  return now;
+}
+
+void Adaptation::calibrate() {
+  // The filter's own beliefs depend on the scale: a few rounds.
+  for (int round = 0; round < 4; ++round) {
+    std::vector<double> distances;
+    const TreeFilter filter(schema_, noise_);
+    for (const ActionPoseSample& sample : recent_) {
+      const TreeFilter::Judgement judgement = filter.judge(filter.prepare(sample));
+      for (const double d2 : judgement.squared_distance)
+        if (d2 >= 0) distances.push_back(d2);
+    }
+    if (distances.size() < kFewestDistances) return;
+    const double scale = std::sqrt(median(distances) / kMedianChiSquare6);
+    noise_.scale = std::clamp(noise_.scale * scale, kLeastScale, kLargestScale);
+  }
+  // A few samples tell no better than this.
+  if (std::abs(std::log(noise_.scale)) < 0.15) noise_.scale = options_.noise.scale;
+}
+
+void Adaptation::watch_noise(const TreeFilter::Judgement& judgement) {
+  for (std::size_t n = 0; n < judgement.believed.size(); ++n)
+    if (judgement.believed[n] == 1) quiet_distances_.push_back(judgement.squared_distance[n]);
+  if (++num_quiet_ < kQuietSamples || quiet_distances_.size() < kFewestDistances) return;
+  const double scale = std::sqrt(median(quiet_distances_) / kMedianChiSquare6);
+  quiet_distances_.clear();
+  num_quiet_ = 0;
+  if (std::abs(std::log(scale)) < 0.05) return;
+  noise_.scale = std::clamp(noise_.scale * std::sqrt(scale), kLeastScale, kLargestScale);
+  install(schema_);
+}
+
+std::vector<const ActionPoseSample*> Adaptation::segment(std::int64_t since) const {
+  std::vector<const ActionPoseSample*> result;
+  for (const ActionPoseSample& sample : recent_)
+    if (sample.sample_index >= since) result.push_back(&sample);
+  const auto longest = static_cast<std::size_t>(options_.longest_segment);
+  if (result.size() > longest)
+    result.erase(result.begin(), result.end() - options_.longest_segment);
+  return result;
+}
+
+std::vector<Adaptation::Place> Adaptation::suspects() const {
+  // The most suspicious elements and what is next to them.
+  struct Scored {
+    double value;
+    Place place;
+  };
+  std::vector<Scored> scored;
+  for (int node = 0; node < filter_->num_nodes(); ++node) {
+    scored.push_back({edges_[static_cast<std::size_t>(node)].value, {filter_->part(node), false}});
+    scored.push_back({markers_[static_cast<std::size_t>(node)].value, {filter_->part(node), true}});
+  }
+  std::stable_sort(scored.begin(), scored.end(),
+                   [](const Scored& a, const Scored& b) { return a.value > b.value; });
+  std::vector<Place> places;
+  const auto add = [&places](const Place& place) {
+    if (std::find(places.begin(), places.end(), place) == places.end()) places.push_back(place);
+  };
+  for (std::size_t n = 0; n < scored.size() && n < 4; ++n)
+    if (scored[n].value > options_.suspicion) add(scored[n].place);
+  if (!scored.empty() && scored[0].value > options_.suspicion) {
+    const int node = filter_->node_of(scored[0].place.part);
+    add({scored[0].place.part, false});
+    add({scored[0].place.part, true});
+    if (filter_->parent(node) >= 0) {
+      add({filter_->part(filter_->parent(node)), false});
+      add({filter_->part(filter_->parent(node)), true});
+    }
+    for (const int child : filter_->children(node)) add({filter_->part(child), false});
+  }
+  return places;
+}
+
+Adaptation::Choice Adaptation::choose(const BodySchema& standing, const std::vector<Place>& places,
+                                      const std::vector<const ActionPoseSample*>& samples,
+                                      const BodyChange* standing_form) const {
+  Choice choice;
+  std::optional<Replacement> same_form;
+  choice.null = log_likelihood(standing, noise_, samples);
+  const auto second = [&](Replacement candidate) {
+    if (!choice.runner_up || candidate.fitted.log_evidence > choice.runner_up->fitted.log_evidence)
+      choice.runner_up = std::move(candidate);
+  };
+  const auto offer = [&](FittedChange candidate, const Place& at) {
+    if (standing_form && candidate.change == *standing_form &&
+        (!same_form || candidate.log_evidence > same_form->fitted.log_evidence))
+      same_form = Replacement{at, candidate};
+    if (choice.best && candidate.log_evidence <= choice.best->fitted.log_evidence) {
+      second({at, std::move(candidate)});
+      return;
+    }
+    if (choice.best) second(std::move(*choice.best));
+    choice.best = Replacement{at, std::move(candidate)};
+  };
+  for (const Place& at : places) {
+    // Bases: the model that stands, and what is stored of this place.
+    std::vector<const BodySchema*> origins{nullptr};
+    std::vector<BodySchema> bases{standing};
+    if (!at.marker) {
+      for (const BodySchema& stored : history_) {
+        BodySchema with = with_edge_of(standing, stored, at.part);
+        const bool known = std::any_of(bases.begin(), bases.end(), [&](const BodySchema& base) {
+          return !differ_at(base, with, at.part);
+        });
+        if (known) continue;
+        bases.push_back(std::move(with));
+        origins.push_back(&stored);
+      }
+    }
+    for (std::size_t b = 0; b < bases.size(); ++b) {
+      const PlaceEvidence evidence(bases[b], noise_, at.part, at.marker, samples);
+      const auto offer_from = [&](FittedChange candidate) {
+        if (origins[b]) candidate.origin = *origins[b];
+        offer(std::move(candidate), at);
+      };
+      if (b > 0 && evidence.num_usable() > 0) offer_from(evidence.judge_stored(bases[b]));
+      for (FittedChange& fitted :
+           evidence.fit_likely(possible_changes(bases[b], at.part, at.marker)))
+        offer_from(std::move(fitted));
+    }
+  }
+  // All that differs from a stored schema at once.
+  for (const BodySchema& stored : history_) {
+    FittedChange all;
+    all.change = {BodyChange::Form::kStored, places.front().part};
+    all.origin = stored;
+    all.everywhere = true;
+    const BodySchema with = with_change(standing, all);
+    int num_different = differ_at(standing, with, standing.root);
+    for (const Edge& edge : with.edges) num_different += differ_at(standing, with, edge.to);
+    if (num_different < 2) continue;
+    all.log_evidence = all.change.log_odds() + log_likelihood(with, noise_, samples);
+    all.num_usable = 1;
+    offer(std::move(all), places.front());
+  }
+  // With many samples what the schema was wrong about before the change is found out too, and
+  // dressed up as a richer form of it.
+  if (same_form && choice.best->fitted.change != *standing_form &&
+      static_cast<int>(samples.size()) >= kManySamples &&
+      choice.best->fitted.log_evidence - same_form->fitted.log_evidence <
+          options_.ambiguity + kSystematicShare * choice.margin()) {
+    choice.runner_up = std::move(choice.best);
+    choice.best = std::move(same_form);
+  }
+  return choice;
+}
+
+BodySchema Adaptation::composed(int without) const {
+  BodySchema schema = before_;
+  for (int n = 0; n < static_cast<int>(replacements_.size()); ++n)
+    if (n != without) schema = with_change(schema, replacements_[n].fitted);
+  return schema;
+}
+
+AdaptationEvent Adaptation::event(AdaptationEvent::Kind kind, std::int64_t sample_index,
+                                  const Place& place) const {
+  AdaptationEvent result;
+  result.kind = kind;
+  result.sample_index = sample_index;
+  const Edge* edge = edge_to(schema_, place.part);
+  if (place.marker || !edge) {
+    result.part = place.part;
+  } else {
+    result.from = edge->from;
+    result.to = edge->to;
+  }
+  return result;
+}
+
+void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEvent>* events) {
+  const std::vector<Place> places = suspects();
+  if (places.empty()) return;
+  std::int64_t since = sample_index;
+  double highest = 0;
+  for (std::size_t n = 0; n < edges_.size(); ++n) {
+    for (const Cusum* c : {&edges_[n], &markers_[n]}) {
+      if (c->value > highest) {
+        highest = c->value;
+        since = c->since;
+      }
+    }
+  }
+  const auto samples = segment(since);
+  const double alarm = std::log(2.0 * filter_->num_nodes() / options_.false_alarm_rate);
+  Choice choice = choose(schema_, places, samples);
+  const bool accepted = choice.best && choice.margin() > options_.acceptance;
+  if ((accepted || highest > alarm) && !detected_) {
+    detected_ = accepted ? choice.best->place : places.front();
+    AdaptationEvent mismatch = event(AdaptationEvent::Kind::kMismatch, sample_index, *detected_);
+    mismatch.margin = highest;
+    mismatch.num_samples = static_cast<int>(samples.size());
+    events->push_back(mismatch);
+  }
+  if (!accepted) return;
+  const FittedChange& fitted = choice.best->fitted;
+  AdaptationEvent candidate =
+      event(fitted.change.form == BodyChange::Form::kStored ? AdaptationEvent::Kind::kRestored
+                                                            : AdaptationEvent::Kind::kCandidate,
+            sample_index, choice.best->place);
+  candidate.cause = fitted.change.cause(schema_);
+  candidate.margin = choice.margin();
+  candidate.num_samples = static_cast<int>(samples.size());
+  events->push_back(candidate);
+  want_probe(schema_, choice, sample_index, events);
+  if (fitted.change.small && !choice.best->place.marker) {
+    const int part = choice.best->place.part;
+    // At once again is a change that was not understood yet. What is next to it may have been held
+    // to be the place.
+    const auto is_next = [this](int a, int b) {
+      const Edge* edge = edge_to(schema_, a);
+      return edge && edge->from == b;
+    };
+    const bool again = last_small_ && sample_index - last_small_->second < kSoon &&
+                       sample_index - last_small_->second > kTogether &&
+                       (last_small_->first == part || is_next(part, last_small_->first) ||
+                        is_next(last_small_->first, part));
+    last_small_ = {part, sample_index};
+    if (again && !drifting_) {
+      // Small changes that have not settled were this drift as well.
+      const bool all_small =
+          std::all_of(replacements_.begin(), replacements_.end(),
+                      [](const Replacement& r) { return r.fitted.change.small; });
+      if (!replacements_.empty() && all_small)
+        install(before_);
+      else if (!replacements_.empty())
+        remember(schema_);
+      replacements_.clear();
+      begin_drift(part, sample_index, events);
+      return;
+    }
+  }
+  // Changes that came together are reconsidered together; an older one is taken as it is.
+  if (replacements_.empty() || since - since_ > kTogether || fitted.everywhere) {
+    before_ = schema_;
+    replacements_.clear();
+    since_ = since;
+  }
+  replacements_.push_back(std::move(*choice.best));
+  age_ = 0;
+  detected_.reset();
+  if (replacements_.size() > 1)
+    reconsider(sample_index, true, events);
+  else
+    install(composed());
+}
+
+void Adaptation::reconsider(std::int64_t sample_index, bool all_forms,
+                            std::vector<AdaptationEvent>* events) {
+  const auto samples = segment(since_);
+  const int rounds = replacements_.size() > 1 ? 3 : 1;
+  for (int round = 0; round < rounds; ++round) {
+    bool is_changed = false;
+    for (int n = 0; n < static_cast<int>(replacements_.size());) {
+      Replacement& r = replacements_[static_cast<std::size_t>(n)];
+      const BodySchema others = composed(n);
+      if (!all_forms) {
+        if (r.fitted.change.size() > 0) {
+          const BodySchema base =
+              r.fitted.origin ? with_edge_of(others, *r.fitted.origin, r.place.part) : others;
+          const PlaceEvidence evidence(base, noise_, r.place.part, r.place.marker, samples);
+          if (auto again = evidence.fit(r.fitted.change)) {
+            again->origin = r.fitted.origin;
+            r.fitted = *again;
+          }
+        }
+        ++n;
+        continue;
+      }
+      Choice choice = choose(others, {r.place}, samples, &r.fitted.change);
+      if (!choice.best || choice.margin() < 0) {
+        AdaptationEvent reverted = event(AdaptationEvent::Kind::kReverted, sample_index, r.place);
+        reverted.cause = r.fitted.change.cause(others);
+        reverted.margin = choice.margin();
+        events->push_back(reverted);
+        replacements_.erase(replacements_.begin() + n);
+        is_changed = true;
+        continue;
+      }
+      if (choice.best->fitted.change != r.fitted.change) {
+        AdaptationEvent refined = event(AdaptationEvent::Kind::kRefined, sample_index, r.place);
+        refined.cause = choice.best->fitted.change.cause(others);
+        refined.margin = choice.margin();
+        refined.num_samples = static_cast<int>(samples.size());
+        events->push_back(refined);
+        is_changed = true;
+      }
+      r.fitted = choice.best->fitted;
+      if (round == 0 && age_ > 0) want_probe(others, choice, sample_index, events);
+      ++n;
+    }
+    if (!is_changed) break;
+  }
+  const std::vector<Cusum> edges = edges_, markers = markers_;
+  install(composed());
+  if (age_ > 0) {
+    edges_ = edges;
+    markers_ = markers;
+  }
+}
+
+void Adaptation::want_probe(const BodySchema& standing, const Choice& choice,
+                            std::int64_t sample_index, std::vector<AdaptationEvent>* events) {
+  if (!choice.runner_up ||
+      choice.best->fitted.log_evidence - choice.runner_up->fitted.log_evidence > options_.ambiguity)
+    return;
+  const BodySchema one = with_change(standing, choice.best->fitted);
+  const BodySchema other = with_change(standing, choice.runner_up->fitted);
+  double most = 1;
+  Eigen::VectorXd probe;
+  const auto m = static_cast<Eigen::Index>(standing.signals.size());
+  for (int n = 1; n <= kProbeCandidates; ++n) {
+    Eigen::VectorXd action(m);
+    for (Eigen::Index s = 0; s < m; ++s) {
+      // Evenly over the box: the additive recurrence of the golden ratio's generalisation to m
+      // dimensions (M. Roberts, 2018).
+      double phi = 2;
+      for (int k = 0; k < 30; ++k) phi = std::pow(1 + phi, 1.0 / static_cast<double>(m + 1));
+      const double u = std::fmod(0.5 + n * std::pow(phi, -static_cast<double>(s + 1)), 1.0);
+      const Signal& signal = standing.signals[static_cast<std::size_t>(s)];
+      action(s) = signal.lower + u * (signal.upper - signal.lower);
+    }
+    const auto X = one.predict_all(action), Y = other.predict_all(action);
+    for (const auto& [part, X_RB] : X) {
+      const auto it = Y.find(part);
+      if (it == Y.end()) continue;
+      const Pose difference = X_RB.inverse() * it->second;
+      const double size = difference.translation().norm() / options_.tolerance.position_m +
+                          rotation_angle(difference) / options_.tolerance.rotation_rad;
+      if (size > most) {
+        most = size;
+        probe = action;
+      }
+    }
+  }
+  if (probe.size() == 0) return;
+  AdaptationEvent wanted =
+      event(AdaptationEvent::Kind::kProbeWanted, sample_index, choice.best->place);
+  wanted.cause = choice.best->fitted.change.cause(standing) + " or " +
+                 choice.runner_up->fitted.change.cause(standing);
+  wanted.margin = choice.best->fitted.log_evidence - choice.runner_up->fitted.log_evidence;
+  wanted.probe = probe;
+  events->push_back(wanted);
+}
+
+std::vector<int> Adaptation::missing_parts() const {
+  std::vector<int> parts;
+  for (const auto& [part, v] : visibility_)
+    if (v.is_missing) parts.push_back(part);
+  return parts;
+}
+
+void Adaptation::watch_visibility(const ActionPoseSample& sample,
+                                  std::vector<AdaptationEvent>* events) {
+  for (const int part : schema_.parts) {
+    Visibility& v = visibility_[part];
+    if (sample.find(part)) {
+      if (v.is_missing) {
+        AdaptationEvent back =
+            event(AdaptationEvent::Kind::kRecovered, sample.sample_index, {part, true});
+        back.cause = "marker_missing";
+        back.num_samples = v.num_missed;
+        events->push_back(back);
+      } else {
+        v.num_asked += v.num_missed;
+      }
+      v.is_missing = false;
+      v.num_missed = 0;
+      ++v.num_seen;
+      ++v.num_asked;
+      continue;
+    }
+    ++v.num_missed;
+    if (v.is_missing || v.num_seen < kFewestSightings) continue;
+    // A run of m misses begins at any sample with probability v (1 − v)^m; n parts may.
+    const double share = (v.num_seen + 0.5) / (v.num_asked + 1.0);
+    const double chance =
+        share * std::pow(1 - share, v.num_missed) * static_cast<double>(schema_.parts.size());
+    if (chance > options_.false_alarm_rate) continue;
+    v.is_missing = true;
+    AdaptationEvent missing =
+        event(AdaptationEvent::Kind::kMissing, sample.sample_index, {part, true});
+    missing.cause = "marker_missing";
+    missing.num_samples = v.num_missed;
+    events->push_back(missing);
+  }
+}
+
+void Adaptation::follow(std::int64_t sample_index, std::vector<AdaptationEvent>* events) {
+  ++age_;
+  if (age_ >= options_.settled_after) {
+    for (const Replacement& r : replacements_) {
+      AdaptationEvent recovered = event(AdaptationEvent::Kind::kRecovered, sample_index, r.place);
+      recovered.cause = r.fitted.change.cause(schema_);
+      recovered.num_samples = age_;
+      events->push_back(recovered);
+    }
+    remember(schema_);
+    replacements_.clear();
+    return;
+  }
+  const bool all_forms =
+      std::find(std::begin(kRefits), std::end(kRefits), age_) != std::end(kRefits);
+  reconsider(sample_index, all_forms, events);
+}
+
+void Adaptation::begin_drift(int part, std::int64_t sample_index,
+                             std::vector<AdaptationEvent>* events) {
+  drifting_ = part;
+  before_ = schema_;
+  num_still_ = 0;
+  detected_.reset();
+  AdaptationEvent drift = event(AdaptationEvent::Kind::kDrift, sample_index, {part, false});
+  drift.cause = "drift";
+  events->push_back(drift);
+}
+
+void Adaptation::watch_drift(std::int64_t sample_index, std::vector<AdaptationEvent>* events) {
+  if (!drifting_) {
+    if (!replacements_.empty() || detected_) return;
+    const auto moved = drift_watch_.moved_part(schema_);
+    if (!moved) return;
+    begin_drift(*moved, sample_index, events);
+  }
+  const auto drift = drift_watch_.follow(before_, *drifting_);
+  if (!drift) return;
+  const BodyChange change{drift->left ? BodyChange::Form::kLeft : BodyChange::Form::kRight,
+                          *drifting_};
+  Eigen::VectorXd theta(6);
+  theta << drift->T.translation(), log_so3(drift->T.linear());
+  // `covariance` is that of a right perturbation of T: near enough to that of θ.
+  install(changed(before_, change, theta, drift->covariance));
+  num_still_ = drift->significance > kSignificantRate ? 0 : num_still_ + 1;
+  if (num_still_ < options_.settled_after) return;
+  AdaptationEvent recovered =
+      event(AdaptationEvent::Kind::kRecovered, sample_index, {*drifting_, false});
+  recovered.cause = "drift";
+  events->push_back(recovered);
+  drift_watch_.forget(*drifting_, sample_index);
+  remember(schema_);
+  drifting_.reset();
+}
+
+void Adaptation::remember(const BodySchema& schema) {
+  for (const BodySchema& stored : history_) {
+    bool same =
+        stored.X_CR.isApprox(schema.X_CR, 1e-9) && stored.edges.size() == schema.edges.size();
+    for (std::size_t e = 0; same && e < schema.edges.size(); ++e)
+      same = !differ(stored.edges[e], schema.edges[e]);
+    if (same) return;
+  }
+  if (history_.size() > options_.history) history_.erase(history_.begin() + 1);
+  history_.push_back(schema);
+}
+
+std::vector<AdaptationEvent> Adaptation::on_sample(const ActionPoseSample& sample) {
+  check(sample, schema_);
+  std::vector<AdaptationEvent> events;
+  recent_.push_back(sample);
+  if (recent_.size() > kRing) recent_.pop_front();
+  watch_visibility(sample, &events);
+  if (++num_samples_ <= options_.calibration_samples) {
+    if (num_samples_ == options_.calibration_samples) {
+      calibrate();
+      install(schema_);
+    }
+    return events;
+  }
+  const TreeFilter::Instant instant = filter_->prepare(sample);
+  const TreeFilter::Judgement judgement = update_tests(instant, sample.sample_index);
+  drift_watch_.add(*filter_, instant, schema_.displacements(sample.action), sample.sample_index);
+  if (!replacements_.empty()) follow(sample.sample_index, &events);
+  try_changes(sample.sample_index, &events);
+  if (!replacements_.empty()) {
+    drifting_.reset();
+    for (const Replacement& r : replacements_)
+      if (!r.fitted.change.small) drift_watch_.forget_all();
+  } else {
+    watch_drift(sample.sample_index, &events);
+  }
+  if (detected_ && suspects().empty()) detected_.reset();
+  if (is_settled() && suspects().empty()) watch_noise(judgement);
+  return events;
+}
+
+}  // namespace bodyschema

@@ -1,0 +1,168 @@
+#pragma once
+
+#include <cstdint>
+#include <deque>
+#include <map>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "processes/model_monitor/change_fit.h"
+#include "processes/model_monitor/drift_watch.h"
+#include "processes/model_monitor/tree_filter.h"
+
+namespace bodyschema {
+
+struct AdaptationOptions {
+  MarkerNoise noise;
+  /// Wished false alarms a sample, over all tests together.
+  double false_alarm_rate = 1e-5;
+  double suspicion = 1.5;  ///< CUSUM above which candidates are tried [nats]
+  double acceptance = 12;  ///< evidence over the schema that stands [nats]
+  double ambiguity = 6;    ///< a runner-up nearer than this asks for a probe [nats]
+  /// Disagreement of two explanations, anywhere in reach, that is worth a motion.
+  Noise tolerance{0.02, 0.1};
+  /// Samples at the start from which the noise is estimated before anything is judged.
+  int calibration_samples = 8;
+  int longest_segment = 40;  ///< samples since a change that are looked at
+  int settled_after = 40;    ///< samples until a replacement is kept for good
+  std::size_t history = 8;   ///< schemas kept beside the first
+};
+
+/// Something that the adaptation decided at one sample.
+struct AdaptationEvent {
+  enum class Kind {
+    kMismatch,
+    kCandidate,
+    kRefined,
+    kRestored,
+    kReverted,
+    kRecovered,
+    kDrift,
+    kMissing,
+    kProbeWanted
+  };
+  Kind kind = Kind::kMismatch;
+  std::int64_t sample_index = 0;
+  int from = -1;  ///< parts of an edge; −1 for a part alone or the camera
+  int to = -1;
+  int part = -1;  ///< of a marker; −1 for an edge
+  std::string cause;
+  double margin = 0;  ///< evidence over the schema that stood before [nats]
+  int num_samples = 0;
+  /// kProbeWanted: the action at which the two likeliest explanations disagree most; else empty.
+  Eigen::VectorXd probe;
+};
+const char* name_of(AdaptationEvent::Kind kind);
+
+/// Keeps a complete body schema true while the body changes (Section 4 of the chapter).
+///
+/// Every sample is judged by a tree filter under the schema and, for every edge and every marker,
+/// under the hypothesis that this one is wrong. The log-likelihood ratios are summed by one CUSUM
+/// each; since they are proper, ln(2n/α) is the threshold for α false alarms a sample. From a
+/// suspicion on, replacements are fitted to the samples since its beginning: what is in the
+/// history, then changes of the old model from simple to complex. The one with the most evidence
+/// replaces the old one as soon as it leads by `acceptance`; it is refitted as samples come,
+/// reverted if it falls behind, kept in the history once it has settled.
+class Adaptation {
+ public:
+  Adaptation(BodySchema schema, AdaptationOptions options);
+
+  /// The events of this sample. A pure function of the samples so far. Parts that the schema does
+  /// not know are ignored.
+  /// @throws std::invalid_argument, and is as it was, if the action does not have one value per
+  /// signal or a number is not finite.
+  std::vector<AdaptationEvent> on_sample(const ActionPoseSample& sample);
+  const BodySchema& schema() const { return schema_; }
+  /// CUSUM of the edge to a part (root: the camera's) and of the part's marker [nats].
+  double edge_statistic(int part) const;
+  double marker_statistic(int part) const;
+  /// State of the edge to a part (root: of the camera's pose) and of the part's marker. kInvalid:
+  /// found wrong, and nothing accepted in its place yet. kProvisional: replaced, or drifting, and
+  /// not settled.
+  EdgeState edge_state(int part) const { return state({part, false}); }
+  EdgeState marker_state(int part) const { return state({part, true}); }
+  /// True over assumed standard deviation of the markers, as the residuals of quiet samples show
+  /// it.
+  double noise_scale() const { return noise_.scale; }
+  /// Parts whose markers have not been seen for longer than chance explains.
+  std::vector<int> missing_parts() const;
+  bool is_settled() const { return replacements_.empty() && !detected_ && !drifting_; }
+
+ private:
+  struct Cusum {
+    double value = 0;
+    std::int64_t since = 0;  ///< first sample of the present rise
+  };
+  struct Place {
+    int part = 0;
+    bool marker = false;
+    auto operator<=>(const Place&) const = default;
+  };
+  struct Replacement {
+    Place place;
+    FittedChange fitted;
+  };
+
+  EdgeState state(const Place& place) const;
+  void calibrate();
+  void begin_drift(int part, std::int64_t sample_index, std::vector<AdaptationEvent>* events);
+  void watch_drift(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
+  void watch_noise(const TreeFilter::Judgement& judgement);
+  void restart_tests();
+  /// Returns the judgement under the schema as it stands.
+  TreeFilter::Judgement update_tests(const TreeFilter::Instant& instant, std::int64_t sample_index);
+  std::vector<const ActionPoseSample*> segment(std::int64_t since) const;
+  std::vector<Place> suspects() const;
+  struct Choice {
+    std::optional<Replacement> best;
+    double null = 0;  ///< log-likelihood of the schema as it stands
+    /// The best that is another form or place.
+    std::optional<Replacement> runner_up;
+    double margin() const { return best ? best->fitted.log_evidence - null : 0; }
+  };
+  /// `standing_form`: what explains the samples so far.
+  Choice choose(const BodySchema& standing, const std::vector<Place>& places,
+                const std::vector<const ActionPoseSample*>& samples,
+                const BodyChange* standing_form = nullptr) const;
+  BodySchema composed(int without = -1) const;
+  void try_changes(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
+  void reconsider(std::int64_t sample_index, bool all_forms, std::vector<AdaptationEvent>* events);
+  void want_probe(const BodySchema& standing, const Choice& choice, std::int64_t sample_index,
+                  std::vector<AdaptationEvent>* events);
+  void watch_visibility(const ActionPoseSample& sample, std::vector<AdaptationEvent>* events);
+  void follow(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
+  void remember(const BodySchema& schema);
+  void install(const BodySchema& schema);
+  AdaptationEvent event(AdaptationEvent::Kind kind, std::int64_t sample_index,
+                        const Place& place) const;
+
+  const AdaptationOptions options_;
+  MarkerNoise noise_;
+  int num_samples_ = 0;
+  std::vector<double> quiet_distances_;  ///< d² of believed markers since the noise was last set
+  int num_quiet_ = 0;
+  BodySchema schema_;
+  std::optional<TreeFilter> filter_;
+  std::deque<ActionPoseSample> recent_;
+  struct Visibility {
+    int num_seen = 0, num_asked = 0;  ///< before the present run of misses
+    int num_missed = 0;               ///< in a row
+    bool is_missing = false;
+  };
+  std::map<int, Visibility> visibility_;
+  std::vector<Cusum> edges_, markers_;  ///< by node
+  std::optional<Place> detected_;
+  BodySchema before_;                      ///< what stood before the present replacements
+  std::vector<Replacement> replacements_;  ///< not settled yet, in the order they came
+  std::int64_t since_ = 0;                 ///< first sample with the changed body
+  DriftWatch drift_watch_;
+  std::optional<int> drifting_;  ///< the edge to this part; before_ is the schema without the drift
+  /// The place of the last small change, and when: the same again soon after is a drift.
+  std::optional<std::pair<int, std::int64_t>> last_small_;
+  int num_still_ = 0;                ///< samples since the drift last moved
+  int age_ = 0;                      ///< samples since the newest replacement
+  std::vector<BodySchema> history_;  ///< the first is pinned
+};
+
+}  // namespace bodyschema

@@ -1,0 +1,356 @@
+#include "processes/model_monitor/change_fit.h"
+
+#include <Eigen/Cholesky>
+#include <algorithm>
+#include <cmath>
+#include <limits>
+
+namespace bodyschema {
+namespace {
+
+using Form = BodyChange::Form;
+
+constexpr int kIterations = 16;
+constexpr double kLargestStep =
+    0.7;  // of θ, in prior standard deviations of a transform: m and rad
+constexpr double kStudentNu = 4;
+/// Starts that are followed up.
+constexpr std::size_t kClimbs = 4;
+/// Evidence behind the best change of a place, by the place's measurements, that all observations
+/// do not make up for [nats].
+constexpr double kHopeless = 25;
+
+std::vector<int> nodes_of(const TreeFilter& filter, const std::vector<int>& parts) {
+  std::vector<int> nodes;
+  for (const int part : parts)
+    if (const int node = filter.node_of(part); node >= 0) nodes.push_back(node);
+  return nodes;
+}
+
+Vector6d coordinates(const Pose& T) {
+  Vector6d theta;
+  theta << T.translation(), log_so3(T.linear());
+  return theta;
+}
+
+}  // namespace
+
+BodySchema with_edge_of(const BodySchema& schema, const BodySchema& other, int part) {
+  BodySchema result = schema;
+  if (part == schema.root) {
+    result.X_CR = other.X_CR;
+    result.X_CR_covariance = other.X_CR_covariance;
+  } else if (const Edge* edge = edge_to(other, part)) {
+    for (Edge& e : result.edges)
+      if (e.to == part && e.from == edge->from) e = *edge;
+  }
+  return result;
+}
+
+BodySchema with_change(const BodySchema& schema, const FittedChange& fitted) {
+  BodySchema result = schema;
+  if (fitted.origin) {
+    if (fitted.everywhere) {
+      result = with_edge_of(result, *fitted.origin, result.root);
+      for (const Edge& edge : fitted.origin->edges)
+        result = with_edge_of(result, *fitted.origin, edge.to);
+    } else {
+      result = with_edge_of(result, *fitted.origin, fitted.change.part);
+    }
+  }
+  return changed(result, fitted.change, fitted.theta, fitted.covariance);
+}
+
+double log_likelihood(const BodySchema& schema, const MarkerNoise& noise,
+                      const std::vector<const ActionPoseSample*>& samples,
+                      const std::vector<int>& cut_parts) {
+  const TreeFilter filter(schema, noise);
+  Alternative alternative;
+  alternative.cut_edges = nodes_of(filter, cut_parts);
+  double sum = 0;
+  for (const ActionPoseSample* sample : samples)
+    sum += filter.judge(filter.prepare(*sample), alternative).log_likelihood;
+  return sum;
+}
+
+PlaceEvidence::PlaceEvidence(const BodySchema& base, const MarkerNoise& noise, int part,
+                             bool marker, std::vector<const ActionPoseSample*> samples,
+                             std::vector<int> cut_parts)
+    : base_(base),
+      noise_(noise),
+      part_(part),
+      marker_(marker),
+      samples_(std::move(samples)),
+      cut_parts_(std::move(cut_parts)) {
+  const TreeFilter filter(base_, noise_);
+  const int node = filter.node_of(part_);
+  if (node < 0) return;
+  const std::vector<int> cut = nodes_of(filter, cut_parts_);
+  for (const ActionPoseSample* sample : samples_) {
+    const TreeFilter::Instant instant = filter.prepare(*sample);
+    const auto of = marker_ ? filter.measure_marker(instant, node, cut)
+                            : filter.measure_edge(instant, node, cut);
+    if (!of) continue;
+    const Eigen::LLT<Matrix6d> llt(of->covariance);
+    if (llt.info() != Eigen::Success) continue;
+    measurements_.push_back(
+        {base_.displacements(sample->action), *of, llt.matrixL().solve(Matrix6d::Identity()),
+         -llt.matrixLLT().diagonal().array().log().sum() - 3 * std::log(2 * M_PI)});
+  }
+  place_ = base_;
+  std::erase_if(place_.edges, [part](const Edge& edge) { return edge.to != part; });
+}
+
+std::vector<Pose> PlaceEvidence::predict(const BodyChange& change,
+                                         const Eigen::VectorXd& theta) const {
+  const std::size_t n = measurements_.size();
+  if (marker_) {
+    // measure_marker() gives T itself.
+    Pose T = Pose::Identity();
+    T.linear() = exp_so3(theta.tail<3>());
+    T.translation() = theta.head<3>();
+    return std::vector<Pose>(n, T);
+  }
+  const BodySchema with = changed(place_, change, theta);
+  const Edge* edge = edge_to(with, part_);
+  if (!edge) return std::vector<Pose>(n, with.X_CR);
+  std::vector<Pose> result;
+  result.reserve(n);
+  for (const Measured& m : measurements_) result.push_back(edge->predict(m.displacements));
+  return result;
+}
+
+Eigen::VectorXd PlaceEvidence::residuals(const BodyChange& change,
+                                         const Eigen::VectorXd& theta) const {
+  const std::vector<Pose> predicted = predict(change, theta);
+  Eigen::VectorXd r(6 * static_cast<Eigen::Index>(predicted.size()));
+  for (std::size_t n = 0; n < predicted.size(); ++n)
+    r.segment<6>(6 * static_cast<Eigen::Index>(n)) =
+        measurements_[n].whitening * log(predicted[n].inverse() * measurements_[n].of.z);
+  return r;
+}
+
+std::vector<Eigen::VectorXd> PlaceEvidence::starts(const BodyChange& change) const {
+  std::vector<Eigen::VectorXd> result;
+  const Eigen::VectorXd mean = prior_mean(change, base_), sigma = prior_sigma(change, base_);
+  switch (change.form) {
+    case Form::kStuck:
+      for (int k = 0; k < 9; ++k)
+        result.push_back(mean +
+                         Eigen::VectorXd::Constant(1, std::sqrt(3.0) * (k - 4) / 4 * sigma(0)));
+      break;
+    case Form::kOffset:
+      for (int k = 0; k < 7; ++k)
+        result.push_back(Eigen::VectorXd::Constant(1, 0.6 * (k - 3) * sigma(0)));
+      break;
+    case Form::kGain:
+      for (const double a : {-0.6, -0.25, 0.0, 0.4})
+        for (const double b : {-0.5, 0.0, 0.5}) result.push_back(Eigen::Vector2d(a, b * sigma(1)));
+      break;
+    case Form::kOtherSignal:
+    case Form::kStored:
+      result.push_back(mean);
+      break;
+    default: {
+      // What each of the newest samples alone says.
+      const Eigen::VectorXd zero = Eigen::VectorXd::Zero(change.size());
+      const std::size_t count = measurements_.size();
+      const std::vector<Pose> unchanged = predict(change, zero);
+      for (std::size_t n = count > 3 ? count - 3 : 0; n < count; ++n) {
+        const Pose& z = measurements_[n].of.z;
+        const Pose& before = unchanged[n];
+        const Vector6d right = coordinates(before.inverse() * z);
+        const Vector6d left = coordinates(z * before.inverse());
+        if (change.form == Form::kLeft) {
+          result.push_back(left);
+        } else if (change.form == Form::kBoth) {
+          Eigen::VectorXd start = zero;
+          start.head<6>() = left;
+          result.push_back(start);
+          start.setZero();
+          start.tail<6>() = right;
+          result.push_back(start);
+          start.head<6>() = 0.5 * left;
+          start.tail<6>() = 0.5 * right;
+          result.push_back(start);
+        } else {
+          result.push_back(right);
+        }
+      }
+    }
+  }
+  return result;
+}
+
+double PlaceEvidence::log_flat_outlier() const {
+  return std::log(noise_.outlier_rate) + log_flat_density();
+}
+
+double PlaceEvidence::log_inlier(std::size_t n, double d2) const {
+  return std::log1p(-noise_.outlier_rate) - 0.5 * d2 + measurements_[n].log_norm;
+}
+
+double PlaceEvidence::cost(const BodyChange& change, const Eigen::VectorXd& theta,
+                           bool robust) const {
+  const double flat = log_flat_outlier();
+  const Eigen::VectorXd mean = prior_mean(change, base_), sigma = prior_sigma(change, base_);
+  double sum = 0.5 * (theta - mean).cwiseQuotient(sigma).squaredNorm();
+  const Eigen::VectorXd r = residuals(change, theta);
+  for (std::size_t n = 0; n < measurements_.size(); ++n) {
+    const double d2 = r.segment<6>(6 * static_cast<Eigen::Index>(n)).squaredNorm();
+    if (robust) {
+      sum += (kStudentNu + 6) / 2 * std::log1p(d2 / kStudentNu);
+    } else {
+      const double inlier = log_inlier(n, d2);
+      sum -= std::max(inlier, flat) + std::log1p(std::exp(-std::abs(inlier - flat)));
+    }
+  }
+  return sum;
+}
+
+PlaceEvidence::State PlaceEvidence::climb(const BodyChange& change, Eigen::VectorXd theta) const {
+  const Eigen::Index d = change.size();
+  const Eigen::VectorXd mean = prior_mean(change, base_), sigma = prior_sigma(change, base_);
+  const Eigen::VectorXd prior = sigma.cwiseAbs2().cwiseInverse();
+  const double flat = log_flat_outlier();
+  const std::size_t count = measurements_.size();
+  State state;
+  double damping = 1e-3;
+  for (int iteration = 0; iteration < kIterations; ++iteration) {
+    const bool robust = iteration < kIterations / 2;
+    if (iteration == kIterations / 2) damping = 1e-3;
+    const Eigen::VectorXd r = residuals(change, theta);
+    Eigen::MatrixXd J(r.size(), d);
+    for (Eigen::Index p = 0; p < d; ++p) {
+      const double h = 1e-5 * std::max(1.0, sigma(p));
+      Eigen::VectorXd plus = theta, minus = theta;
+      plus(p) += h;
+      minus(p) -= h;
+      J.col(p) = (residuals(change, plus) - residuals(change, minus)) / (2 * h);
+    }
+    Eigen::MatrixXd H = prior.asDiagonal();
+    Eigen::VectorXd g = prior.cwiseProduct(theta - mean);
+    for (std::size_t n = 0; n < count; ++n) {
+      const auto at = 6 * static_cast<Eigen::Index>(n);
+      const double d2 = r.segment<6>(at).squaredNorm();
+      const double w = robust ? (kStudentNu + 6) / (kStudentNu + d2)
+                              : 1 / (1 + std::exp(std::min(flat - log_inlier(n, d2), 500.0)));
+      H += w * J.middleRows<6>(at).transpose() * J.middleRows<6>(at);
+      g += w * J.middleRows<6>(at).transpose() * r.segment<6>(at);
+    }
+    state.H = H;
+    const double before = cost(change, theta, robust);
+    state.theta = theta;
+    state.cost = before;
+    bool improved = false;
+    double gain = 0;
+    for (int attempt = 0; attempt < 5 && !improved; ++attempt) {
+      Eigen::MatrixXd damped = H;
+      damped.diagonal() *= 1 + damping;
+      Eigen::VectorXd step = -damped.ldlt().solve(g);
+      const double longest = step.cwiseQuotient(sigma.cwiseMax(1e-9)).cwiseAbs().maxCoeff();
+      if (longest > 3 * kLargestStep) step *= 3 * kLargestStep / longest;
+      const double after = cost(change, theta + step, robust);
+      if (after < before) {
+        theta += step;
+        gain = before - after;
+        improved = true;
+        damping = std::max(damping / 10, 1e-9);
+      } else {
+        damping *= 10;
+      }
+    }
+    if (!improved || gain < 1e-4) {
+      if (!robust) break;
+      iteration = std::max(iteration, kIterations / 2 - 1);
+    }
+  }
+  state.cost = cost(change, theta, false);
+  state.theta = theta;
+  return state;
+}
+
+std::optional<FittedChange> PlaceEvidence::fit_place(const BodyChange& change) const {
+  if (num_usable() < change.fewest_samples()) return std::nullopt;
+  const Eigen::Index d = change.size();
+  FittedChange best;
+  best.change = change;
+  best.num_usable = num_usable();
+  best.theta = Eigen::VectorXd::Zero(d);
+  best.log_prior = change.log_odds();
+  if (d == 0) {
+    best.log_evidence = change.log_odds() - cost(change, best.theta, false);
+    return best;
+  }
+  // The most promising starts.
+  std::vector<std::pair<double, Eigen::VectorXd>> promising;
+  for (Eigen::VectorXd& start : starts(change))
+    promising.emplace_back(cost(change, start, true), std::move(start));
+  std::stable_sort(promising.begin(), promising.end(),
+                   [](const auto& a, const auto& b) { return a.first < b.first; });
+  if (promising.size() > kClimbs) promising.resize(kClimbs);
+  std::optional<State> found;
+  for (const auto& [unused, start] : promising) {
+    const State state = climb(change, start);
+    if (!state.theta.allFinite() || !std::isfinite(state.cost)) continue;
+    if (!found || state.cost < found->cost) found = state;
+  }
+  if (!found) return std::nullopt;
+  const Eigen::LLT<Eigen::MatrixXd> llt(found->H);
+  if (llt.info() != Eigen::Success) return std::nullopt;
+  best.theta = found->theta;
+  best.covariance = llt.solve(Eigen::MatrixXd::Identity(d, d));
+  const Eigen::VectorXd sigma = prior_sigma(change, base_);
+  const double distance =
+      0.5 * (best.theta - prior_mean(change, base_)).cwiseQuotient(sigma).squaredNorm();
+  // log prior + d/2 log 2π − ½ log|H|; a uniform prior has the density of its interval.
+  best.log_prior += change.form == Form::kStuck
+                        ? 0.5 * std::log(2 * M_PI) - std::log(sigma(0) * std::sqrt(12.0))
+                        : -distance - sigma.array().log().sum();
+  best.log_prior -= llt.matrixLLT().diagonal().array().log().sum();
+  best.log_evidence = best.log_prior + distance - found->cost;
+  return best;
+}
+
+void PlaceEvidence::judge(FittedChange* fitted) const {
+  // The likelihood at the most probable θ; the width of its peak is in the Laplace term, so the
+  // model's new uncertainty must not be in it as well.
+  fitted->log_evidence =
+      fitted->log_prior +
+      log_likelihood(changed(base_, fitted->change, fitted->theta), noise_, samples_, cut_parts_);
+  fitted->schema = changed(base_, fitted->change, fitted->theta, fitted->covariance);
+}
+
+std::optional<FittedChange> PlaceEvidence::fit(const BodyChange& change) const {
+  auto fitted = fit_place(change);
+  if (fitted) judge(&*fitted);
+  return fitted;
+}
+
+std::vector<FittedChange> PlaceEvidence::fit_likely(const std::vector<BodyChange>& changes) const {
+  std::vector<FittedChange> fitted;
+  double best = -std::numeric_limits<double>::infinity();
+  for (const BodyChange& change : changes) {
+    auto one = fit_place(change);
+    if (!one) continue;
+    best = std::max(best, one->log_evidence);
+    fitted.push_back(std::move(*one));
+  }
+  std::erase_if(fitted,
+                [best](const FittedChange& f) { return f.log_evidence < best - kHopeless; });
+  for (FittedChange& f : fitted) judge(&f);
+  return fitted;
+}
+
+FittedChange PlaceEvidence::judge_stored(const BodySchema& schema) const {
+  FittedChange result;
+  result.change = {Form::kStored, part_};
+  result.theta.resize(0);
+  result.schema = schema;
+  result.num_usable = num_usable();
+  result.log_evidence =
+      result.change.log_odds() + log_likelihood(schema, noise_, samples_, cut_parts_);
+  return result;
+}
+
+}  // namespace bodyschema

@@ -1,0 +1,94 @@
+#pragma once
+
+#include <optional>
+#include <vector>
+
+#include "common/schema/sample.h"
+#include "processes/model_monitor/body_change.h"
+#include "processes/model_monitor/tree_filter.h"
+
+namespace bodyschema {
+
+/// A change with the parameters that the samples since speak for.
+struct FittedChange {
+  BodyChange change;
+  /// A schema of the history that the change starts from, in its place (or, `everywhere`, whole).
+  std::optional<BodySchema> origin;
+  bool everywhere = false;
+  Eigen::VectorXd theta;
+  Eigen::MatrixXd covariance;  ///< of θ, Laplace
+  BodySchema schema;           ///< with the change, and its uncertainty, in it
+  /// log ∫ p(observations | θ) p(θ) dθ by Laplace, plus the log prior odds [nats].
+  double log_evidence = 0;
+  double log_prior = 0;  ///< its share that is not the likelihood at θ
+  int num_usable = 0;    ///< samples that say something of the place
+};
+
+/// `schema` with the fitted change, and its uncertainty, in it.
+BodySchema with_change(const BodySchema& schema, const FittedChange& fitted);
+/// `schema` with the edge to `part` (root: the camera's pose) of another.
+BodySchema with_edge_of(const BodySchema& schema, const BodySchema& other, int part);
+
+/// Σ log p(observations) over the samples under a schema.
+double log_likelihood(const BodySchema& schema, const MarkerNoise& noise,
+                      const std::vector<const ActionPoseSample*>& samples,
+                      const std::vector<int>& cut_parts = {});
+
+/// What every sample says of one place, whatever the change there: made once for all its forms.
+class PlaceEvidence {
+ public:
+  /// `cut_parts`: parts whose edges say nothing. `marker`: the marker of `part`, not its edge.
+  PlaceEvidence(const BodySchema& base, const MarkerNoise& noise, int part, bool marker,
+                std::vector<const ActionPoseSample*> samples, std::vector<int> cut_parts = {});
+
+  int num_usable() const { return static_cast<int>(measurements_.size()); }
+
+  /// The most probable θ: Gauss-Newton on the virtual measurements from several starts, with
+  /// Student-t weights first and the outlier mixture's then. Its evidence is that of all
+  /// observations under the changed schema. std::nullopt if there are fewer usable samples than the
+  /// form needs.
+  std::optional<FittedChange> fit(const BodyChange& change) const;
+  /// Those of the changes that may be the best one: what the place's own measurements speak clearly
+  /// against is not held against all the observations.
+  std::vector<FittedChange> fit_likely(const std::vector<BodyChange>& changes) const;
+  /// A schema of the history in this place.
+  FittedChange judge_stored(const BodySchema& schema) const;
+
+ private:
+  struct Measured {
+    Eigen::VectorXd displacements;
+    VirtualMeasurement of;
+    Matrix6d whitening;
+    double log_norm = 0;  ///< log |2πS|^(−½)
+  };
+  struct State {
+    Eigen::VectorXd theta;
+    double cost = 0;
+    Eigen::MatrixXd H;
+  };
+  /// What the place looks like with a change: its pose at every measurement.
+  std::vector<Pose> predict(const BodyChange& change, const Eigen::VectorXd& theta) const;
+  /// Whitened residuals of the measurements, one after the other: 6N.
+  Eigen::VectorXd residuals(const BodyChange& change, const Eigen::VectorXd& theta) const;
+  std::vector<Eigen::VectorXd> starts(const BodyChange& change) const;
+  double log_flat_outlier() const;
+  double log_inlier(std::size_t n, double squared_distance) const;
+  /// −log of prior times likelihood of the place's measurements; `robust`: Student-t.
+  double cost(const BodyChange& change, const Eigen::VectorXd& theta, bool robust) const;
+  /// θ and the evidence of the place's measurements alone.
+  std::optional<FittedChange> fit_place(const BodyChange& change) const;
+  /// The evidence of all observations in its stead.
+  void judge(FittedChange* fitted) const;
+  State climb(const BodyChange& change, Eigen::VectorXd theta) const;
+
+  const BodySchema base_;
+  const MarkerNoise noise_;
+  const int part_;
+  const bool marker_;
+  const std::vector<const ActionPoseSample*> samples_;
+  const std::vector<int> cut_parts_;
+  BodySchema place_;  ///< the base with the place's edge alone
+  std::vector<Measured> measurements_;
+};
+
+}  // namespace bodyschema

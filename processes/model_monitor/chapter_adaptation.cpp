@@ -1,0 +1,144 @@
+#include "processes/model_monitor/chapter_adaptation.h"
+
+#include <algorithm>
+#include <cmath>
+#include <set>
+
+namespace bodyschema {
+namespace {
+
+/// A model needs that many to be learned, and as many to be tested.
+constexpr std::size_t kFewest = 2;
+
+std::vector<std::vector<int>> signal_sets(int num_signals, int size) {
+  std::vector<std::vector<int>> sets{{}};
+  for (int k = 0; k < size; ++k) {
+    std::vector<std::vector<int>> longer;
+    for (const auto& set : sets) {
+      for (int s = set.empty() ? 0 : set.back() + 1; s < num_signals; ++s) {
+        longer.push_back(set);
+        longer.back().push_back(s);
+      }
+    }
+    sets = std::move(longer);
+  }
+  return sets;
+}
+
+}  // namespace
+
+double structural_proximity(const std::vector<int>& signals, const std::vector<int>& other) {
+  const std::set<int> a(signals.begin(), signals.end()), b(other.begin(), other.end());
+  std::set<int> all = a;
+  all.insert(b.begin(), b.end());
+  const double num_shared = static_cast<double>(a.size() + b.size() - all.size());
+  return (2 + num_shared) / (2 + static_cast<double>(all.size()));
+}
+
+ChapterAdaptation::ChapterAdaptation(BodySchema schema, ChapterAdaptationOptions options,
+                                     LearnEdge learn_edge)
+    : options_(options), learn_edge_(std::move(learn_edge)), schema_(std::move(schema)) {
+  for (const Edge& edge : schema_.edges) {
+    Pair pair;
+    Model given;
+    given.edge = edge;
+    given.signals = edge.signals();
+    pair.models.push_back(std::move(given));
+    for (int k = 0; k <= options_.max_signals; ++k) {
+      auto sets = signal_sets(static_cast<int>(schema_.signals.size()), k);
+      std::stable_sort(sets.begin(), sets.end(), [&](const auto& a, const auto& b) {
+        return structural_proximity(a, edge.signals()) > structural_proximity(b, edge.signals());
+      });
+      pair.candidates.insert(pair.candidates.end(), sets.begin(), sets.end());
+    }
+    pairs_.push_back(std::move(pair));
+  }
+}
+
+bool ChapterAdaptation::has_valid_tree() const {
+  return std::all_of(pairs_.begin(), pairs_.end(), [](const Pair& pair) { return pair.is_valid; });
+}
+
+void ChapterAdaptation::learn(Model* model, const ActionPoseSample& sample) const {
+  if (!model->is_learning || model->num_offered >= options_.training) return;
+  ++model->num_offered;
+  const Edge edge = model->edge;
+  if (!sample.find(edge.from) || !sample.find(edge.to)) return;
+  model->training.push_back(sample);
+  if (model->training.size() < kFewest) return;
+  std::vector<const ActionPoseSample*> samples;
+  for (const ActionPoseSample& s : model->training) samples.push_back(&s);
+  model->edge = learn_edge_(edge.from, edge.to, model->signals, samples);
+  model->residuals.clear();
+}
+
+void ChapterAdaptation::test(Model* model, const std::deque<ActionPoseSample>& window) const {
+  // A model that has not learned anything yet is neither valid nor refuted.
+  model->is_tested = !window.empty() && (!model->is_learning || model->training.size() >= kFewest);
+  if (!model->is_tested) return;
+  for (std::size_t n = model->residuals.size(); n < window.size(); ++n) {
+    const ActionPoseSample& sample = window[n];
+    const Edge& edge = model->edge;
+    const Pose z = sample.find(edge.from)->X_CB.inverse() * sample.find(edge.to)->X_CB;
+    const Pose difference = edge.predict(schema_.displacements(sample.action)).inverse() * z;
+    model->residuals.push_back({difference.translation().norm(), rotation_angle(difference)});
+  }
+  double position = 0, rotation = 0;
+  for (const Model::Residual& r : model->residuals) {
+    position += r.position_m * r.position_m;
+    rotation += r.rotation_rad * r.rotation_rad;
+  }
+  const auto count = static_cast<double>(window.size());
+  model->error = std::max(std::sqrt(position / count) / (3 * options_.sigma_position_m),
+                          std::sqrt(rotation / count) / (3 * options_.sigma_rotation_rad));
+}
+
+void ChapterAdaptation::on_sample(const ActionPoseSample& sample) {
+  schema_.displacements(sample.action);  // throws on a wrong number of signals
+  for (std::size_t e = 0; e < pairs_.size(); ++e) {
+    Pair& pair = pairs_[e];
+    Edge& serving = schema_.edges[e];
+    if (sample.find(serving.from) && sample.find(serving.to)) {
+      pair.window.push_back(sample);
+      if (pair.window.size() > static_cast<std::size_t>(options_.window)) {
+        pair.window.pop_front();
+        for (Model& model : pair.models)
+          if (!model.residuals.empty()) model.residuals.pop_front();
+      }
+    }
+    pair.is_valid = false;
+    double least = 1;
+    for (std::size_t n = 0; n < pair.models.size(); ++n) {
+      Model& model = pair.models[n];
+      learn(&model, sample);
+      test(&model, pair.window);
+      // Nothing speaks against the first model before anything was seen.
+      const double error = model.is_tested ? model.error : n == 0 ? 0 : INFINITY;
+      if (error >= least) continue;
+      least = error;
+      pair.is_valid = true;
+      pair.serving = n;
+    }
+    serving = pair.models[pair.serving].edge;
+    serving.confidence = pair.is_valid ? 1 : 0;
+    serving.state = pair.is_valid ? EdgeState::kOk : EdgeState::kInvalid;
+  }
+  num_without_tree_ = has_valid_tree() ? 0 : num_without_tree_ + 1;
+  if (num_without_tree_ < options_.wait) return;
+  for (Pair& pair : pairs_) {
+    // The newest one gets its chance first.
+    const Model& newest = pair.models.back();
+    const bool has_learned = !newest.is_learning || newest.num_offered >= options_.training;
+    if (pair.is_valid || (!newest.is_tested && !has_learned)) continue;
+    if (pair.next_candidate == pair.candidates.size()) pair.next_candidate = 0;
+    Model model;
+    model.edge.from = newest.edge.from;
+    model.edge.to = newest.edge.to;
+    model.signals = pair.candidates[pair.next_candidate++];
+    model.is_learning = true;
+    pair.models.push_back(std::move(model));
+    ++num_sampled_;
+  }
+}
+
+}  // namespace bodyschema

@@ -1,0 +1,318 @@
+#include "processes/model_monitor/adaptation.h"
+
+#include <gtest/gtest.h>
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <memory>
+#include <random>
+
+#include "tests/support/broken_arm.h"
+
+namespace bodyschema {
+namespace {
+
+using Kind = AdaptationEvent::Kind;
+using test::adaptation_options;
+using test::BrokenArm;
+using test::Fault;
+using test::Regime;
+using test::TrueChange;
+
+constexpr int kBlock = 60;
+
+int part_of(const AdaptationEvent& event) { return event.part >= 0 ? event.part : event.to; }
+
+std::string text(const AdaptationEvent& e) {
+  return std::to_string(e.sample_index) + " " + name_of(e.kind) + " " + std::to_string(e.from) +
+         "-" + std::to_string(e.to) + " part " + std::to_string(e.part) + " " + e.cause + " " +
+         std::to_string(e.margin);
+}
+
+struct Life {
+  std::vector<AdaptationEvent> events;
+  std::vector<double> error;
+  bool has(Kind kind) const {
+    return std::any_of(events.begin(), events.end(),
+                       [kind](const AdaptationEvent& e) { return e.kind == kind; });
+  }
+  std::string log() const {
+    std::string result;
+    for (const AdaptationEvent& e : events) result += "  " + text(e) + "\n";
+    return result;
+  }
+};
+
+Life live(BrokenArm& arm, Adaptation& adaptation, int end) {
+  Life life;
+  for (int t = 0; t < end; ++t) {
+    for (const AdaptationEvent& e : adaptation.on_sample(arm.observe(t))) life.events.push_back(e);
+    life.error.push_back(arm.error(adaptation.schema(), t));
+  }
+  return life;
+}
+
+class EveryFault : public testing::TestWithParam<test::Scenario> {};
+
+/// One seed each, tag_iso: 3 mm, 1°, 3 % of the markers flipped or anywhere.
+TEST_P(EveryFault, IsFoundNamedAndRepairedAndBothBodiesAreRemembered) {
+  BrokenArm arm(GetParam(), Regime::kTagIso, kBlock, 3);
+  Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kTagIso));
+  const Life life = live(arm, adaptation, arm.num_samples());
+  SCOPED_TRACE("events:\n" + life.log());
+  for (const AdaptationEvent& e : life.events) {
+    EXPECT_GE(e.sample_index, kBlock) << "before the fault";
+    EXPECT_TRUE(arm.is_near(part_of(e))) << text(e);
+  }
+  EXPECT_TRUE(life.has(Kind::kMismatch));
+  EXPECT_TRUE(life.has(Kind::kRestored));
+  // Named in the end of the first fault.
+  for (const TrueChange& change : arm.changes()) {
+    EXPECT_TRUE(std::any_of(life.events.begin(), life.events.end(),
+                            [&](const AdaptationEvent& e) {
+                              return e.kind == Kind::kRecovered && e.sample_index < 2 * kBlock &&
+                                     part_of(e) == change.part && change.causes.contains(e.cause) &&
+                                     (e.part >= 0 ? change.at_marker : change.at_edge);
+                            }))
+        << "part " << change.part;
+  }
+  const double healthy = life.error[kBlock - 1];
+  for (int block = 1; block < 4; ++block)
+    for (int t = block * kBlock + 15; t < (block + 1) * kBlock; ++t)
+      ASSERT_LT(life.error[static_cast<std::size_t>(t)], healthy + 0.01) << "sample " << t;
+}
+
+INSTANTIATE_TEST_SUITE_P(AdaptationTest, EveryFault,
+                         testing::Values(test::Scenario{Fault::kStuck, "stuck", 0.919},
+                                         test::Scenario{Fault::kTool, "tool", 0.79},
+                                         test::Scenario{Fault::kBend, "bend", 0.85},
+                                         test::Scenario{Fault::kOffset, "offset", 0.85},
+                                         test::Scenario{Fault::kGain, "gain", 0.85},
+                                         test::Scenario{Fault::kTwo, "two", 0.85},
+                                         test::Scenario{Fault::kAdjacent, "adjacent", 0.85},
+                                         test::Scenario{Fault::kMarker, "marker", 0.85},
+                                         test::Scenario{Fault::kCamera, "camera", 0.85}),
+                         [](const auto& info) { return std::string(info.param.name); });
+
+TEST(AdaptationTest, AHealthyArmIsLeftInPeace) {
+  for (const Regime regime : {Regime::kChapter, Regime::kTag, Regime::kTagIso}) {
+    BrokenArm arm({Fault::kNone, "", 0.85}, regime, 50, 1);
+    Adaptation adaptation(arm.engineered(), adaptation_options(regime));
+    const Life life = live(arm, adaptation, 200);
+    EXPECT_TRUE(life.events.empty()) << test::name_of(regime) << ":\n" << life.log();
+    EXPECT_TRUE(adaptation.is_settled());
+    for (const int part : adaptation.schema().parts)
+      EXPECT_NE(adaptation.edge_state(part), EdgeState::kInvalid);
+  }
+}
+
+TEST(AdaptationTest, MisjudgedNoiseIsEstimatedAndTheFaultIsFoundAllTheSame) {
+  for (const double factor : {0.5, 2.0}) {
+    BrokenArm arm({Fault::kTool, "", 0.85}, Regime::kTagIso, kBlock, 4);
+    Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kTagIso, factor));
+    Life life = live(arm, adaptation, 2 * kBlock);
+    EXPECT_NEAR(adaptation.noise_scale() * factor, 1, 0.25);
+    ASSERT_FALSE(life.events.empty());
+    EXPECT_GE(life.events.front().sample_index, kBlock) << life.log();
+    EXPECT_LT(life.error.back(), 0.03);
+  }
+}
+
+TEST(AdaptationTest, ASlowDriftIsNamedAndFollowed) {
+  BrokenArm arm({Fault::kDrift, "", 0.85}, Regime::kTagIso, 100, 2);
+  Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kTagIso));
+  const Life life = live(arm, adaptation, 400);
+  EXPECT_TRUE(std::any_of(life.events.begin(), life.events.end(), [](const AdaptationEvent& e) {
+    return e.kind == Kind::kDrift && e.to == 4 && e.cause == "drift";
+  })) << life.log();
+  EXPECT_LT(*std::max_element(life.error.begin(), life.error.end()), 0.020);
+  EXPECT_LT(life.error.back(), 0.006);
+  EXPECT_GT(arm.error(arm.engineered(), 399), 0.03);
+}
+
+TEST(AdaptationTest, AMarkerThatIsMissingIsToldAndComesBack) {
+  BrokenArm arm({Fault::kNone, "", 1}, Regime::kTagIso, 50, 1);
+  Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kTagIso));
+  std::vector<AdaptationEvent> events;
+  for (int t = 0; t < 120; ++t) {
+    ActionPoseSample sample = arm.observe(t);
+    if (t >= 50 && t < 80)
+      std::erase_if(sample.parts, [](const PartObservation& o) { return o.part == 5; });
+    for (const auto& e : adaptation.on_sample(sample)) events.push_back(e);
+    if (t == 79) {
+      EXPECT_EQ(adaptation.missing_parts(), std::vector<int>{5});
+    }
+  }
+  ASSERT_EQ(events.size(), 2U);
+  EXPECT_EQ(events[0].kind, Kind::kMissing);
+  EXPECT_EQ(events[0].part, 5);
+  EXPECT_LT(events[0].sample_index, 60);
+  EXPECT_EQ(events[1].kind, Kind::kRecovered);
+  EXPECT_EQ(events[1].sample_index, 80);
+  EXPECT_TRUE(adaptation.missing_parts().empty());
+}
+
+TEST(AdaptationTest, WhatIsNeverSeenIsNotSuspected) {
+  BrokenArm arm({Fault::kStuck, "", 0.919}, Regime::kTagIso, kBlock, 3);
+  Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kTagIso));
+  Life life;
+  for (int t = 0; t < 2 * kBlock; ++t) {
+    ActionPoseSample sample = arm.observe(t);
+    std::erase_if(sample.parts,
+                  [](const PartObservation& o) { return o.part == 4 || o.part == 7; });
+    for (const auto& e : adaptation.on_sample(sample)) life.events.push_back(e);
+  }
+  EXPECT_TRUE(life.has(Kind::kCandidate));
+  for (const AdaptationEvent& e : life.events) {
+    EXPECT_GE(e.sample_index, kBlock);
+    EXPECT_TRUE(arm.is_near(part_of(e))) << text(e);
+  }
+  EXPECT_TRUE(std::any_of(life.events.begin(), life.events.end(), [](const AdaptationEvent& e) {
+    return e.kind == Kind::kRecovered && e.to == 5 && e.cause == "joint_stuck";
+  })) << life.log();
+}
+
+TEST(AdaptationTest, TheSameSamplesGiveTheSameEventsAndSchema) {
+  const auto once = [] {
+    BrokenArm arm({Fault::kGain, "", 0.85}, Regime::kTagIso, 40, 5);
+    Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kTagIso));
+    const Life life = live(arm, adaptation, 160);
+    return std::pair{life.log(), life.error};
+  };
+  const auto first = once(), second = once();
+  EXPECT_FALSE(first.first.empty());
+  EXPECT_EQ(first.first, second.first);
+  EXPECT_EQ(first.second, second.second);
+}
+
+/// One finger of two bends; the other, on the same palm and the same signal, does not.
+TEST(AdaptationTest, OfTwoFingersTheBentOneIsFound) {
+  test::Rng rng(8);
+  test::SyntheticRobot robot;
+  robot.X_CR.translation() << 0, 0, 2;
+  robot.links.push_back({.part = 1});
+  BodySchema schema;
+  schema.root = 1;
+  schema.X_CR = robot.X_CR;
+  schema.parts = {1};
+  for (const auto& [part, parent, signal] :
+       {std::tuple{2, 1, 0}, {3, 2, 1}, {4, 3, 2}, {5, 3, 2}}) {
+    test::TrueLink link;
+    link.part = part;
+    link.parent = parent;
+    link.signal = signal;
+    link.turn = part == 5 ? -1 : 1;
+    link.X_before = test::random_pose(rng, 0.06, 0.16);
+    link.X_after = test::random_pose(rng, 0.06, 0.16);
+    robot.links.push_back(link);
+    Edge edge;
+    edge.from = parent;
+    edge.to = part;
+    edge.left = link.X_before;
+    ScrewJoint joint;
+    joint.signal = signal;
+    joint.turn = link.turn;
+    joint.X_after = link.X_after;
+    edge.joints.push_back(joint);
+    edge.parameter_covariance = 1e-6 * Eigen::MatrixXd::Identity(14, 14);
+    schema.edges.push_back(edge);
+    schema.parts.push_back(part);
+  }
+  for (int s = 0; s < 3; ++s) robot.signals.push_back({"q" + std::to_string(s + 1), -1.3, 1.3});
+  schema.signals = robot.signals;
+  schema.complete = true;
+  test::SyntheticRobot bent = robot;
+  Vector6d bend;
+  bend << 0.02, 0, 0, 0.4, 0, 0.3;
+  bent.links[4].X_after = bent.links[4].X_after * exp(bend);
+
+  Adaptation adaptation(schema, adaptation_options(Regime::kTagIso));
+  test::ObservationOptions options;
+  options.regime = Regime::kTagIso;
+  std::vector<AdaptationEvent> events;
+  for (int t = 0; t < 120; ++t) {
+    const test::SyntheticRobot& now = t < 60 ? robot : bent;
+    const ActionPoseSample sample = test::observe(now, robot.random_action(rng), options, t, rng);
+    for (const auto& e : adaptation.on_sample(sample)) events.push_back(e);
+  }
+  ASSERT_FALSE(events.empty());
+  for (const AdaptationEvent& e : events) {
+    EXPECT_GE(e.sample_index, 60) << text(e);
+    EXPECT_EQ(part_of(e), 5) << text(e);
+  }
+  const Eigen::VectorXd action = Eigen::Vector3d(0.3, -0.5, 0.7);
+  const auto X = bent.poses_in_camera(action);
+  for (const int finger : {4, 5}) {
+    const Pose believed = adaptation.schema().predict(1, finger, action)->X_AB;
+    const Pose truth = X.at(1).inverse() * X.at(finger);
+    EXPECT_LT((believed.translation() - truth.translation()).norm(), 0.01) << finger;
+  }
+}
+
+/// The same arm with one edge as a soft body's, one as the chapter's.
+TEST(AdaptationTest, EdgesThatAreGaussianProcessesAreMonitoredToo) {
+  BrokenArm arm({Fault::kTool, "", 0.85}, Regime::kTagIso, kBlock, 3);
+  BodySchema schema = arm.engineered();
+  test::Rng rng(4);
+  constexpr int kSamples = 40;
+  Eigen::MatrixXd inputs(1, kSamples);
+  std::vector<Pose> poses;
+  for (int n = 0; n < kSamples; ++n) {
+    Eigen::VectorXd theta = Eigen::VectorXd::Zero(7);
+    inputs(0, n) = theta(1) = -1.35 + 2.7 * n / (kSamples - 1);
+    poses.push_back(schema.edges[1].predict(theta));
+  }
+  const GpPrior prior{std::nullopt, SquaredExponential{0.5, Eigen::VectorXd::Constant(1, 1.5)},
+                      1e-7};
+  Edge& chapter = schema.edges[1];
+  chapter.matrix_gp = std::make_shared<const MatrixGp>(
+      std::vector<int>{1}, inputs, poses, std::vector<GpPrior>(MatrixGp::kNumEntries, prior));
+  chapter.left = Pose::Identity();
+  chapter.joints.clear();
+  chapter.parameter_covariance.resize(0, 0);
+  ResidualGp::Prior of_residual{Eigen::VectorXd::Constant(1, 1.0), Vector6d::Constant(1e-6),
+                                Vector6d::Constant(1e-6)};
+  schema.edges[5].residual_gp = std::make_shared<const ResidualGp>(
+      std::vector<int>{5}, Eigen::MatrixXd(inputs), ResidualGp::Residuals::Zero(6, kSamples),
+      Eigen::VectorXd::Ones(kSamples), of_residual);
+
+  Adaptation adaptation(schema, adaptation_options(Regime::kTagIso));
+  const Life life = live(arm, adaptation, 2 * kBlock);
+  ASSERT_FALSE(life.events.empty());
+  for (const AdaptationEvent& e : life.events) EXPECT_GE(e.sample_index, kBlock) << text(e);
+  EXPECT_LT(life.error[kBlock - 1], 0.02);
+  EXPECT_LT(life.error.back(), 0.03) << life.log();
+}
+
+TEST(AdaptationTest, AMalformedSampleIsRefusedAndChangesNothing) {
+  BrokenArm arm({Fault::kStuck, "", 0.919}, Regime::kTagIso, 40, 3);
+  BrokenArm same({Fault::kStuck, "", 0.919}, Regime::kTagIso, 40, 3);
+  Adaptation disturbed(arm.engineered(), adaptation_options(Regime::kTagIso));
+  Adaptation calm(arm.engineered(), adaptation_options(Regime::kTagIso));
+  Life one, other;
+  for (int t = 0; t < 80; ++t) {
+    const ActionPoseSample sample = arm.observe(t);
+    ActionPoseSample bad = sample;
+    bad.action.conservativeResize(6);
+    EXPECT_THROW(disturbed.on_sample(bad), std::invalid_argument);
+    bad = sample;
+    bad.action(0) = std::numeric_limits<double>::quiet_NaN();
+    EXPECT_THROW(disturbed.on_sample(bad), std::invalid_argument);
+    bad = sample;
+    if (!bad.parts.empty()) {
+      bad.parts[0].X_CB.translation().x() = std::numeric_limits<double>::infinity();
+      EXPECT_THROW(disturbed.on_sample(bad), std::invalid_argument);
+    }
+    // A part that nobody knows is no error.
+    ActionPoseSample more = sample;
+    more.parts.push_back({99, Pose::Identity(), Matrix6d::Identity(), std::nullopt, 0});
+    for (const auto& e : disturbed.on_sample(more)) one.events.push_back(e);
+    for (const auto& e : calm.on_sample(same.observe(t))) other.events.push_back(e);
+  }
+  EXPECT_FALSE(one.events.empty());
+  EXPECT_EQ(one.log(), other.log());
+}
+
+}  // namespace
+}  // namespace bodyschema

@@ -1,0 +1,180 @@
+#include "processes/model_monitor/change_fit.h"
+
+#include <gtest/gtest.h>
+
+#include <cmath>
+
+#include "tests/support/broken_arm.h"
+
+namespace bodyschema {
+namespace {
+
+using Form = BodyChange::Form;
+using test::Rng;
+
+constexpr int kPart = 4;
+
+/// The engineered arm, seen after a change of it: 3 mm and 1°, no outliers.
+class ChangeFitTest : public testing::Test {
+ protected:
+  std::vector<ActionPoseSample> observe(const BodySchema& body, int count) {
+    std::vector<ActionPoseSample> samples;
+    const Noise noise = test::nominal_noise(test::Regime::kTagIso);
+    Vector6d sigma;
+    sigma << Eigen::Vector3d::Constant(noise.position_m),
+        Eigen::Vector3d::Constant(noise.rotation_rad);
+    for (int t = 0; t < count; ++t) {
+      ActionPoseSample sample;
+      sample.sample_index = t;
+      sample.action.resize(7);
+      for (double& q : sample.action) q = test::uniform(rng_, -1.3, 1.3);
+      for (const auto& [part, X_RB] : body.predict_all(sample.action)) {
+        PartObservation o;
+        o.part = part;
+        o.X_CB = body.X_CR * X_RB * exp(sigma.cwiseProduct(test::gaussian6(rng_)));
+        o.covariance = sigma.cwiseAbs2().asDiagonal();
+        sample.parts.push_back(o);
+      }
+      samples.push_back(std::move(sample));
+    }
+    return samples;
+  }
+  static std::vector<const ActionPoseSample*> pointers(
+      const std::vector<ActionPoseSample>& samples) {
+    std::vector<const ActionPoseSample*> result;
+    for (const ActionPoseSample& s : samples) result.push_back(&s);
+    return result;
+  }
+
+  Rng rng_{11};
+  MarkerNoise noise_;
+  BodySchema schema_ =
+      test::BrokenArm({test::Fault::kNone, "", 1}, test::Regime::kTagIso, 1, 3).engineered();
+};
+
+struct Case {
+  BodyChange change;
+  Eigen::VectorXd theta;
+};
+
+std::vector<Case> cases() {
+  const auto values = [](std::initializer_list<double> list) {
+    Eigen::VectorXd theta(static_cast<Eigen::Index>(list.size()));
+    std::copy(list.begin(), list.end(), theta.data());
+    return theta;
+  };
+  const Eigen::VectorXd bend = values({0.05, -0.03, 0.02, 0.5, -0.4, 0.3});
+  return {{{Form::kStuck, kPart}, values({0.4})},
+          {{Form::kOffset, kPart}, values({0.35})},
+          {{Form::kGain, kPart}, values({-0.3, 0.0})},
+          {{Form::kLeft, kPart}, bend},
+          {{Form::kRight, kPart}, bend},
+          {{Form::kBoth, kPart},
+           values({0.05, -0.03, 0.02, 0.5, -0.4, 0.3, -0.04, 0.02, 0.03, -0.3, 0.2, 0.6})}};
+}
+
+TEST_F(ChangeFitTest, EveryChangeIsFoundAgainAndPreferred) {
+  for (const Case& c : cases()) {
+    SCOPED_TRACE("form " + std::to_string(static_cast<int>(c.change.form)));
+    const BodySchema truth = changed(schema_, c.change, c.theta);
+    const auto samples = observe(truth, 12);
+    const PlaceEvidence evidence(schema_, noise_, kPart, false, pointers(samples));
+    EXPECT_EQ(evidence.num_usable(), 12);
+    std::optional<FittedChange> best;
+    for (const BodyChange& change : possible_changes(schema_, kPart, false)) {
+      auto fitted = evidence.fit(change);
+      ASSERT_TRUE(fitted);
+      if (!best || fitted->log_evidence > best->log_evidence) best = std::move(fitted);
+    }
+    EXPECT_EQ(best->change.form, c.change.form);
+    EXPECT_GT(best->log_evidence, log_likelihood(schema_, noise_, pointers(samples)) + 12);
+    if (c.change.form == Form::kBoth) continue;  // its two sides share the turn about the axis
+    const Eigen::VectorXd error = best->theta - c.theta;
+    EXPECT_LT(error.dot(best->covariance.ldlt().solve(error)), 25);
+  }
+}
+
+TEST_F(ChangeFitTest, AMovedMarkerIsFoundAgain) {
+  Eigen::VectorXd theta(6);
+  theta << 0.05, 0, 0, 0, 1, 0;
+  const BodyChange change{Form::kMarkerMoved, kPart};
+  const auto samples = observe(changed(schema_, change, theta), 6);
+  const auto fitted = PlaceEvidence(schema_, noise_, kPart, true, pointers(samples)).fit(change);
+  ASSERT_TRUE(fitted);
+  const Eigen::VectorXd error = fitted->theta - theta;
+  EXPECT_LT(error.dot(fitted->covariance.ldlt().solve(error)), 25);
+  const auto edge =
+      PlaceEvidence(schema_, noise_, kPart, false, pointers(samples)).fit({Form::kRight, kPart});
+  EXPECT_GT(fitted->log_evidence, edge->log_evidence + 12);
+}
+
+TEST_F(ChangeFitTest, LaplaceEvidenceIsTheIntegralOverTheParameter) {
+  const BodyChange change{Form::kOffset, kPart};
+  const auto samples = observe(changed(schema_, change, Eigen::VectorXd::Constant(1, 0.35)), 4);
+  const auto fitted = PlaceEvidence(schema_, noise_, kPart, false, pointers(samples)).fit(change);
+  ASSERT_TRUE(fitted);
+  const double sigma = prior_sigma(change, schema_)(0);
+  const double peak = fitted->theta(0), width = std::sqrt(fitted->covariance(0, 0));
+  const double at_peak =
+      log_likelihood(changed(schema_, change, fitted->theta), noise_, pointers(samples));
+  double integral = 0;
+  const double h = width / 10;
+  for (double t = peak - 8 * width; t <= peak + 8 * width; t += h) {
+    const BodySchema with = changed(schema_, change, Eigen::VectorXd::Constant(1, t));
+    integral += h *
+                std::exp(log_likelihood(with, noise_, pointers(samples)) - at_peak -
+                         0.5 * t * t / (sigma * sigma)) /
+                (sigma * std::sqrt(2 * M_PI));
+  }
+  EXPECT_NEAR(fitted->log_evidence, change.log_odds() + at_peak + std::log(integral), 0.3);
+}
+
+TEST_F(ChangeFitTest, AHealthyBodyIsBetterThanAnyChange) {
+  const auto samples = observe(schema_, 12);
+  const double null = log_likelihood(schema_, noise_, pointers(samples));
+  for (const bool marker : {false, true}) {
+    const PlaceEvidence evidence(schema_, noise_, kPart, marker, pointers(samples));
+    for (const BodyChange& change : possible_changes(schema_, kPart, marker))
+      EXPECT_LT(evidence.fit(change)->log_evidence, null);
+  }
+}
+
+TEST_F(ChangeFitTest, AnOutlierDoesNotTurnTheFit) {
+  Eigen::VectorXd theta(6);
+  theta << 0.2, 0, 0.1, 0.8, -0.5, 0.3;
+  const BodyChange change{Form::kRight, 7};
+  auto samples = observe(changed(schema_, change, theta), 6);
+  for (PartObservation& o : samples.back().parts)
+    if (o.part == 7) o.X_CB = o.X_CB * exp((Vector6d() << 0, 0, 0, 1, 0, 0).finished());
+  const auto fitted = PlaceEvidence(schema_, noise_, 7, false, pointers(samples)).fit(change);
+  ASSERT_TRUE(fitted);
+  const Eigen::VectorXd error = fitted->theta - theta;
+  EXPECT_LT(error.head<3>().norm(), 0.01);
+  EXPECT_LT(error.tail<3>().norm(), 0.05);
+}
+
+TEST_F(ChangeFitTest, TooFewSamplesFitNothing) {
+  auto samples = observe(schema_, 1);
+  const PlaceEvidence one(schema_, noise_, kPart, false, pointers(samples));
+  EXPECT_TRUE(one.fit({Form::kStuck, kPart}));
+  EXPECT_FALSE(one.fit({Form::kRight, kPart}));
+  // Nothing beyond the edge was seen: the sample says nothing of it.
+  std::erase_if(samples[0].parts, [](const PartObservation& o) { return o.part >= kPart; });
+  const PlaceEvidence none(schema_, noise_, kPart, false, pointers(samples));
+  EXPECT_EQ(none.num_usable(), 0);
+  EXPECT_FALSE(none.fit({Form::kStuck, kPart}));
+}
+
+TEST_F(ChangeFitTest, AStoredEdgeComesBackAsItWas) {
+  const BodySchema bent =
+      changed(schema_, {Form::kStuck, kPart}, Eigen::VectorXd::Constant(1, 0.5));
+  FittedChange stored;
+  stored.change = {Form::kStored, kPart};
+  stored.origin = schema_;
+  const BodySchema back = with_change(bent, stored);
+  EXPECT_EQ(edge_to(back, kPart)->joints[0].gain, 1);
+  EXPECT_EQ(edge_to(with_edge_of(bent, schema_, 5), kPart)->joints[0].gain, 0);
+}
+
+}  // namespace
+}  // namespace bodyschema
