@@ -225,13 +225,44 @@ std::vector<ActionPoseSample> Recording::training() const {
   return result;
 }
 
+std::vector<ActionPoseSample> samples_by_signals(const Recording& recording,
+                                                 const std::vector<Signal>& signals) {
+  const auto names = [](const std::vector<Signal>& of) {
+    std::string text;
+    for (const Signal& signal : of) text += (text.empty() ? "" : ", ") + signal.name;
+    return of.empty() ? "none" : text;
+  };
+  std::vector<ActionPoseSample> samples = recording.samples;
+  if (recording.is_log) {
+    if (recording.signals.size() == signals.size()) return samples;
+    throw std::invalid_argument("the samples have " + std::to_string(recording.signals.size()) +
+                                " action signals, the schema " + std::to_string(signals.size()));
+  }
+  std::vector<Eigen::Index> columns;
+  for (const Signal& signal : signals) {
+    const auto column = std::find_if(recording.signals.begin(), recording.signals.end(),
+                                     [&](const Signal& s) { return s.name == signal.name; });
+    if (column != recording.signals.end()) columns.push_back(column - recording.signals.begin());
+  }
+  if (columns.size() != signals.size() || signals.size() != recording.signals.size()) {
+    throw std::invalid_argument("the signals of the samples are " + names(recording.signals) +
+                                "; those of the schema " + names(signals) +
+                                ": name the columns as the schema does");
+  }
+  for (ActionPoseSample& sample : samples) sample.action = sample.action(columns).eval();
+  return samples;
+}
+
 Recording parse_csv(const std::string& text, const std::string& name) {
   Recording recording;
   std::optional<Header> header;
   std::string_view rest = text;
   if (rest.starts_with("\xEF\xBB\xBF")) rest.remove_prefix(3);  // a byte order mark
   // Rows may come part by part as well as instant by instant.
-  std::map<std::vector<double>, std::size_t> instants;  // signals and t
+  struct Instant {
+    std::size_t sample = 0, line = 0;
+  };
+  std::map<double, Instant> instants;  // by t
   for (std::size_t number = 1; !rest.empty(); ++number) {
     const std::size_t end = rest.find('\n');
     const std::string_view line = rest.substr(0, end);
@@ -256,9 +287,8 @@ Recording parse_csv(const std::string& text, const std::string& name) {
       action[i] = row.number(i + 1, header->signals[i]);
     }
     PartObservation observation = parse_observation(row, *header);
-    std::vector<double> key(action.data(), action.data() + action.size());
-    key.push_back(t);
-    const auto [instant, is_new] = instants.emplace(std::move(key), recording.samples.size());
+    const auto [known, is_new] = instants.try_emplace(t, recording.samples.size(), number);
+    const Instant& instant = known->second;
     if (is_new) {
       ActionPoseSample sample;
       sample.utime = std::llround(t * 1e6);
@@ -266,7 +296,14 @@ Recording parse_csv(const std::string& text, const std::string& name) {
       sample.action = action;
       recording.samples.push_back(std::move(sample));
     }
-    auto& parts = recording.samples[instant->second].parts;
+    const Eigen::VectorXd& first = recording.samples[instant.sample].action;
+    for (std::size_t i = 0; i < header->signals.size(); ++i) {
+      if (action[i] == first[i]) continue;
+      throw row.error(i + 1, header->signals[i] + ": expected the value of line " +
+                                 std::to_string(instant.line) +
+                                 ", which has the same t: one instant has one action");
+    }
+    auto& parts = recording.samples[instant.sample].parts;
     if (std::any_of(parts.begin(), parts.end(),
                     [&](const auto& other) { return other.part == observation.part; })) {
       throw row.error(header->part,

@@ -40,13 +40,19 @@ struct Recording {
 ///
 /// one row per instant and seen part: t [s], action signals, part id, position [m], unit quaternion
 /// of the part in the reference frame; optionally the standard deviations per axis of position [m]
-/// and rotation [deg]. Rows with equal t and signals are one instant, wherever they stand.
+/// and rotation [deg]. Rows with equal t are one instant, wherever they stand, and have one action.
 /// @throws RecordingError.
 Recording load_recording(const std::filesystem::path& file);
 
 /// The signals of samples of which nothing is known but their numbers: called q1, q2, …, with the
 /// range that they were seen in as limits. All samples have as many signals as the first.
 std::vector<Signal> observed_signals(const std::vector<ActionPoseSample>& samples);
+
+/// The samples with their actions in the order of a schema's `signals`: of a CSV by the columns'
+/// names, which must be the same; a log has values alone, of which there must be as many.
+/// @throws std::invalid_argument.
+std::vector<ActionPoseSample> samples_by_signals(const Recording& recording,
+                                                 const std::vector<Signal>& signals);
 
 /// The CSV reader alone; `name` stands in errors.
 Recording parse_csv(const std::string& text, const std::string& name);

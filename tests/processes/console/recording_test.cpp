@@ -108,10 +108,7 @@ TEST(RecordingTest, AMissingRowIsAnUnseenPart) {
   EXPECT_NE(recording.samples[2].find(2), nullptr);
 }
 
-TEST(RecordingTest, AnInstantIsATimeWithAnActionWhereverItsRowsStand) {
-  EXPECT_EQ(
-      parse_csv(kHeader + "0,1,2,1,0,0,0,1,0,0,0\n0,1,3,1,0,0,0,1,0,0,0\n", "f").samples.size(),
-      2U);
+TEST(RecordingTest, AnInstantIsATimeWhereverItsRowsStand) {
   // Part by part, and time may run backwards.
   const Recording recording = parse_csv(kHeader +
                                             "1,1,2,1,0,0,1,1,0,0,0\n"
@@ -123,6 +120,44 @@ TEST(RecordingTest, AnInstantIsATimeWithAnActionWhereverItsRowsStand) {
   EXPECT_EQ(recording.samples[0].utime, 1'000'000);
   EXPECT_EQ(recording.samples[0].find(2)->X_CB.translation().z(), 3);
   EXPECT_EQ(recording.samples[1].find(2)->X_CB.translation().z(), 4);
+}
+
+// Slightly different ones would make two instants with half of the parts each.
+TEST(RecordingTest, OneInstantHasOneAction) {
+  EXPECT_EQ(error_of(kHeader + "0,1,2,1,0,0,0,1,0,0,0\n\n0,1,2.000001,2,0,0,0,1,0,0,0\n"),
+            "f.csv:4:5: q2: expected the value of line 2, which has the same t: one instant has "
+            "one action");
+}
+
+Recording with_columns(const std::string& names) {
+  return parse_csv("t," + names + ",part,x,y,z,qw,qx,qy,qz\n0,1,2,1,0,0,0,1,0,0,0\n", "f");
+}
+
+TEST(RecordingTest, ColumnsAreGivenToTheSignalsOfASchemaByTheirNames) {
+  const std::vector<Signal> signals = {{.name = "lift"}, {.name = "turn"}};
+  EXPECT_EQ(samples_by_signals(with_columns("lift,turn"), signals).at(0).action,
+            Eigen::Vector2d(1, 2));
+  EXPECT_EQ(samples_by_signals(with_columns("turn,lift"), signals).at(0).action,
+            Eigen::Vector2d(2, 1));
+  const auto error_with = [&](const Recording& recording, const std::vector<Signal>& of) {
+    try {
+      samples_by_signals(recording, of);
+    } catch (const std::invalid_argument& error) {
+      return std::string(error.what());
+    }
+    return std::string();
+  };
+  EXPECT_EQ(error_with(with_columns("lift,q2"), signals),
+            "the signals of the samples are lift, q2; those of the schema lift, turn: name the "
+            "columns as the schema does");
+  EXPECT_NE(error_with(with_columns("lift,turn"), {{.name = "lift"}}), "");
+  EXPECT_NE(error_with(with_columns("lift,turn"), {}), "");
+  // A log has no names of its own.
+  Recording log = with_columns("q1,q2");
+  log.is_log = true;
+  EXPECT_EQ(samples_by_signals(log, signals).at(0).action, Eigen::Vector2d(1, 2));
+  EXPECT_EQ(error_with(log, {{.name = "lift"}}),
+            "the samples have 2 action signals, the schema 1");
 }
 
 TEST(RecordingTest, NoiseColumnsAreStandardDeviationsPerAxis) {
