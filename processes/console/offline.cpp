@@ -41,12 +41,18 @@ struct LearnArguments {
 };
 
 /// The chapter's own method: a result to compare with.
-BodySchema learn_as_the_chapter(const Recording& recording, const LearnOptions& options) {
+BodySchema learn_as_the_chapter(const Recording& recording,
+                                const std::vector<ActionPoseSample>& training,
+                                const LearnOptions& options) {
   BaselineOptions baseline;
   baseline.root = options.root;
-  if (options.noise) baseline.set_noise(*options.noise);
+  // The model error is one of relative poses, which have two markers.
+  Noise noise = marker_noise(training, static_cast<int>(recording.signals.size()), options);
+  noise.position_m = std::hypot(noise.position_m, options.model_error.position_m * M_SQRT1_2);
+  noise.rotation_rad = std::hypot(noise.rotation_rad, options.model_error.rotation_rad * M_SQRT1_2);
+  baseline.set_noise(noise);
   baseline.max_samples = std::min(baseline.max_samples, ResidualGp::kMaxSamples);  // to be written
-  const BaselineResult result = learn_baseline(recording.signals, recording.training(), baseline);
+  const BaselineResult result = learn_baseline(recording.signals, training, baseline);
   std::cerr << result.num_fits << " local models learned, " << result.num_valid << " valid, "
             << result.seconds << " s" << std::endl;
   return result.schema;
@@ -77,7 +83,7 @@ void run_learn(const LearnArguments& arguments) {
   }
   LearnResult result;
   if (arguments.method == "chapter") {
-    result.schema = learn_as_the_chapter(recording, options);
+    result.schema = learn_as_the_chapter(recording, training, options);
   } else {
     result = learn(recording.signals, training, options);
   }
@@ -188,13 +194,15 @@ void add_offline_commands(CLI::App& console) {
   learn->add_option("--root", learning->root, "Root part; the lowest id if not given");
   learn
       ->add_option("--noise", learning->noise,
-                   "Standard deviation per axis and marker: position [m], rotation [deg]")
+                   "Standard deviation per axis and marker: position [m], rotation [deg]; "
+                   "estimated if neither this nor the recording says it")
       ->expected(2)
       ->type_name("POS_M ROT_DEG");
   learn
-      ->add_option("--method", learning->method,
-                   "screw, or chapter: matrix GPs and thresholds on mean errors, for comparison; "
-                   "without --noise it assumes the chapter's 0.050 m, 15 deg for a relative pose")
+      ->add_option(
+          "--method", learning->method,
+          "screw, or chapter: matrix GPs, and thresholds on mean errors at three times the "
+          "noise, for comparison")
       ->check(CLI::IsMember({"screw", "chapter"}));
   learn->add_flag("--json", learning->json, "Print JSON");
   learn->callback([learning] { run_learn(*learning); });

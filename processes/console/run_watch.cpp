@@ -16,6 +16,16 @@ constexpr std::int64_t kSilentUs = 3'000'000;
 
 }  // namespace
 
+std::string last_words(const std::string& log, const std::string& process) {
+  const std::size_t end = log.find_last_not_of("\r\n");
+  if (end == std::string::npos) return "";
+  const std::size_t before = log.rfind('\n', end);
+  const std::size_t begin = before == std::string::npos ? 0 : before + 1;
+  const std::string line = log.substr(begin, end + 1 - begin);
+  const std::string name = process + ": ";
+  return line.starts_with(name) ? line.substr(name.size()) : "";
+}
+
 void RunWatch::on_sample(const sample_t& message) {
   if (!samples_.empty() && message.sample_index <= samples_.back().sample_index) return;
   samples_.push_back(from_message(message));

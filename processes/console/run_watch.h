@@ -13,6 +13,10 @@
 
 namespace bodyschema {
 
+/// Why a process ended, by its log (stderr): what its last line says after "NAME: "; "" where that
+/// is no such line, as in a process that runs.
+std::string last_words(const std::string& log, const std::string& process);
+
 /// Follows a learning run from outside and sums it up. It alone compares the schema with the
 /// simulator's truth, and tells nobody.
 class RunWatch {

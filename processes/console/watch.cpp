@@ -12,8 +12,11 @@
 #include <chrono>
 #include <csignal>
 #include <deque>
+#include <fstream>
 #include <iostream>
+#include <iterator>
 #include <memory>
+#include <set>
 #include <system_error>
 #include <utility>
 
@@ -300,6 +303,21 @@ void report(const RunWatch& watch, const BestPicture& picture, const WatchArgume
   std::cout << std::flush;
 }
 
+/// Tells once of each process that ended (it is heard again and again as it starts). @throws
+/// std::runtime_error if the rig's files are to blame: those do not mend themselves.
+void tell_of_failures(const WatchArguments& arguments, std::set<std::string>* told) {
+  for (const std::string& name : arguments.processes) {
+    std::ifstream file(std::filesystem::path(arguments.out) / (name + ".log"));
+    const std::string why = last_words({std::istreambuf_iterator<char>(file), {}}, name);
+    if (why.empty()) continue;
+    const std::string text = name + " does not start: " + why;
+    if (why.find(arguments.rig_folder) != std::string::npos)
+      throw std::runtime_error(text + "\nThat is this run's copy of the rig: mend the rig's own " +
+                               "file and start again.");
+    if (told->insert(text).second) std::cerr << "\n" << text << "; it is tried again" << std::endl;
+  }
+}
+
 void run_watch(const WatchArguments& arguments) {
   // stdout is for the result.
   spdlog::set_default_logger(spdlog::stderr_color_mt("watch"));
@@ -354,7 +372,8 @@ void run_watch(const WatchArguments& arguments) {
   Player player;
   if (is_replay) read_truth(arguments.replay, watch);
   std::int64_t last_progress = 0;
-  double progressed_s = 0, warned_s = 0, played_s = 0;
+  double progressed_s = 0, warned_s = 0, played_s = 0, looked_s = 0;
+  std::set<std::string> told;
   // Every message that is played is heard by who makes samples of it, or lost.
   const std::int64_t num_played =
       is_played ? count_messages(arguments.replay, arguments.replay_from) : 0;
@@ -386,6 +405,10 @@ void run_watch(const WatchArguments& arguments) {
     const std::int64_t progress = watch.num_samples() + watch.learned_sample() + num_heard();
     if (std::exchange(last_progress, progress) != progress) progressed_s = seconds();
     line.show(fmt::format("{} · {:.0f} s", watch.progress(), seconds()), false);
+    if (seconds() - looked_s > 2 && watch.num_samples() == 0) {
+      looked_s = seconds();
+      tell_of_failures(arguments, &told);
+    }
     const double stalled_s = seconds() - std::max(progressed_s, warned_s);
     if (stalled_s > 20) {
       warned_s = seconds();

@@ -74,21 +74,22 @@ std::vector<Eigen::VectorXd> candidate_actions(const MotorBabblerConfig& config,
 /// 1 Hz) were heard. Otherwise it waits for them; when they are back that SAMPLE is made after all.
 /// Where no SAMPLE was ever heard nothing tells whether the observer lives: one action is replaced.
 ///
-/// While a STOP is latched it waits for RESUME; while the controller owns the arm it sends nothing, however long the
-/// controller is silent. An action that was cut short by that is replaced by the next. After each
-/// TEST sample it waits for the monitor's verdict, so that with a fast bus or a slow learner the
-/// run ends at the same sample.
+/// While a STOP is latched it waits for RESUME; while the controller owns the arm it sends nothing,
+/// however long the controller is silent. An action that was cut short by that is replaced by the
+/// next. After each TEST sample it waits for the monitor's verdict, so that with a fast bus or a
+/// slow learner the run ends at the same sample.
 ///
 /// With Choice::kActive an action is chosen (choose_action) by the body schema that the monitor
-/// published with its verdict on the newest TEST sample, and by all samples so far: both are the same
-/// in every run of a seed, however fast learner and monitor are. Drawn at random are: what comes
-/// before the first schema; TEST actions, so that held-out data do not depend on what is judged by
-/// them; what replaces an action that was refused, cut short or not seen, so that no refusal is
-/// chosen again and again; and the actions up to the next TEST where schema or verdict did not come
-/// within verdict_timeout (counted).
+/// published with its verdict on the newest TEST sample, and by the 500 newest samples: both are
+/// the same in every run of a seed, however fast learner and monitor are. Drawn at random are:
+/// what comes before the first schema; TEST actions, so that held-out data do not depend on what
+/// is judged by them; what replaces an action that was refused, cut short or not seen, so that no
+/// refusal is chosen again and again; and the actions up to the next TEST where schema or verdict
+/// did not come within verdict_timeout (counted).
 ///
 /// A restart with the kept state goes on as if nothing had happened: it sends the last command
-/// again, unless that command's SAMPLE has come. Samples are counted where they are its own, so that every test_every-th of them is TEST whatever others do in between.
+/// again, unless that command's SAMPLE has come. Samples are counted where they are its own, so
+/// that every test_every-th of them is TEST whatever others do in between.
 class MotorBabbler {
  public:
   MotorBabbler(MotorBabblerConfig config, std::int64_t seed);

@@ -357,12 +357,13 @@ UnconnectedPart explain(int part, int num_seen, const std::set<int>& connected,
     return result;
   }
   int common = 0, partner = -1;
-  bool undecided = false;
+  bool undecided = false, was_soft_tried = false;
   for (const auto& [pair, record] : search.records) {
     if (pair.first != part && pair.second != part) continue;
     const int other = pair.first == part ? pair.second : pair.first;
     if (!connected.count(other)) continue;
     undecided |= !record.undecided.empty();
+    was_soft_tried |= record.was_soft_tried;
     if (record.num_common > common) {
       common = record.num_common;
       partner = other;
@@ -379,7 +380,8 @@ UnconnectedPart explain(int part, int num_seen, const std::set<int>& connected,
   } else {
     result.reason = Unconnected::kNoValidModel;
     result.detail = seen + "; no model with up to " + std::to_string(max_signals) +
-                    " signals is valid to any connected part";
+                    " signals is valid to any connected part" +
+                    (was_soft_tried ? ", nor any with a Gaussian process beside its joints" : "");
   }
   return result;
 }
@@ -457,7 +459,6 @@ LearnResult fit_tree(const LearnedStructure& structure,
         FittedEdge edge =
             fit_edge(start, queue[head], to, moved, actions, measurement, validity, must_be_valid);
         if (!edge.is_valid) {
-          result.refuted.emplace_back(m.part_i, m.part_j);
           reached.erase(to);
           continue;
         }
@@ -566,6 +567,15 @@ void estimate_root_pose(const std::vector<ActionPoseSample>& samples,
   schema->X_CR_covariance = weight * H.inverse();
 }
 
+Noise marker_noise(const std::vector<ActionPoseSample>& samples, int num_signals,
+                   const LearnOptions& options) {
+  if (options.noise)
+    return {std::max(options.noise->position_m, kNoiseFloor.position_m),
+            std::max(options.noise->rotation_rad, kNoiseFloor.rotation_rad)};
+  if (has_covariances(samples)) return typical_noise(samples);
+  return estimate_noise(samples, num_signals, options.max_signals).value_or(kNoiseFloor);
+}
+
 LearnedStructure find_structure(const std::vector<Signal>& signals,
                                 const std::vector<ActionPoseSample>& samples,
                                 const LearnOptions& options) {
@@ -576,13 +586,8 @@ LearnedStructure find_structure(const std::vector<Signal>& signals,
   SearchOptions search_options = search_options_of(options);
   MeasurementModel& measurement = search_options.measurement;
   const auto set_noise = [&](const std::vector<ActionPoseSample>& of) {
-    if (options.noise) {
-      measurement.noise = Noise{std::max(options.noise->position_m, kNoiseFloor.position_m),
-                                std::max(options.noise->rotation_rad, kNoiseFloor.rotation_rad)};
-    } else if (!has_covariances(of)) {
-      measurement.noise =
-          estimate_noise(of, num_signals, options.max_signals).value_or(kNoiseFloor);
-    }
+    if (options.noise || !has_covariances(of))
+      measurement.noise = marker_noise(of, num_signals, options);
   };
   set_noise(samples);
   NormalizedActions actions(samples, num_signals);
@@ -628,32 +633,6 @@ LearnResult fit_structure(const LearnedStructure& structure,
 LearnResult relearn(const LearnedStructure& structure, const std::vector<ActionPoseSample>& samples,
                     const LearnOptions& options) {
   return fit_tree(structure, samples, options, true);
-}
-
-bool is_refuted_by(const LearnedStructure& structure, const std::vector<ActionPoseSample>& later,
-                   const LearnOptions& options) {
-  check_actions(later, structure.signals.size());
-  ValidityOptions validity = search_options_of(options).validity;
-  validity.lenient = true;
-  const std::vector<ActionPoseSample> moved = displaced(later, structure.signals);
-  const NormalizedActions actions(moved, static_cast<int>(structure.signals.size()));
-  for (const AcceptedModel& m : structure.search.models) {
-    if (!m.soft_signals.empty()) continue;  // the screws alone never held
-    const PairData pair = make_pair_data(moved, m.part_i, m.part_j, structure.measurement,
-                                         std::numeric_limits<int>::max());
-    if (pair.size() < 2) continue;
-    const Fit fit = evaluate(rescaled(m.model, structure.actions, actions), pair, actions);
-    LeaveOneOut unseen;  // the model was fitted without any of them
-    for (const FrameFit& frame : fit.frames)
-      unseen.squared_distance.push_back(frame.squared_distance);
-    const Validity judged = check_validity(fit, unseen, pair, actions, validity);
-    // So few frames are often outliers in the majority by chance: their number decides.
-    const int most = binomial_quantile(pair.size(), pair_outlier_rate(validity), 0.99999);
-    const bool are_outliers_few = 2 * judged.num_outliers <= pair.size();
-    if (judged.num_outliers > most || (judged.verdict == Verdict::kRefuted && are_outliers_few))
-      return true;
-  }
-  return false;
 }
 
 LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPoseSample>& samples,

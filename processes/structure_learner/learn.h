@@ -3,7 +3,6 @@
 #include <cmath>
 #include <cstdint>
 #include <optional>
-#include <utility>
 #include <vector>
 
 #include "common/schema/body_schema.h"
@@ -53,9 +52,7 @@ struct LearnResult {
   BodySchema schema;
   std::vector<Outlier> outliers;  ///< ascending by sample, then part
   int num_screens = 0;            ///< closed-form hypotheses looked at
-  int num_fits = 0;               ///< Levenberg–Marquardt fits
-  /// Edges that were left out since they are not valid any more, as (part, part).
-  std::vector<std::pair<int, int>> refuted;
+  int num_fits = 0;               ///< Levenberg–Marquardt fits of the search
 };
 
 /// Learns the body schema from scratch: structure and local models (Sections 3.1 and 3.2). Where the
@@ -68,6 +65,11 @@ struct LearnResult {
 /// out of range.
 LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPoseSample>& samples,
                   const LearnOptions& options = {});
+
+/// Noise per axis of one marker that learn() goes by: `options.noise`; else the mean of the
+/// observations' covariances; where these are zero, the estimate of noise_estimate.h.
+Noise marker_noise(const std::vector<ActionPoseSample>& samples, int num_signals,
+                   const LearnOptions& options = {});
 
 /// The first half of learn(), slow: which part hangs on which by which signals. Everything that
 /// relearn() takes over.
@@ -94,14 +96,8 @@ LearnResult fit_structure(const LearnedStructure& structure,
                           const LearnOptions& options = {});
 
 /// fit_structure() without the edges that are not valid any more (check_validity()) when fitted to
-/// `samples`: these are in LearnResult::refuted. Parts that the structure does not know are
-/// unconnected.
+/// `samples`. Parts that the structure does not know are unconnected.
 LearnResult relearn(const LearnedStructure& structure, const std::vector<ActionPoseSample>& samples,
                     const LearnOptions& options = {});
-
-/// Do samples that came later speak against the structure with its models as they are? Judged an
-/// edge at a time by the bounds of check_validity() for preselection. Soft edges are not judged.
-bool is_refuted_by(const LearnedStructure& structure, const std::vector<ActionPoseSample>& later,
-                   const LearnOptions& options = {});
 
 }  // namespace bodyschema

@@ -35,29 +35,20 @@ BodySchema OnlineLearner::learn(const SharedSamples& samples, int num_searched) 
   const std::lock_guard lock(mutex_);
   const int n = static_cast<int>(samples.size());
   const int c = checkpoint_within(num_searched);
-  if (c > 0 && c < n) {
-    Checkpoint& start = checkpoint(samples, c);
-    const std::vector<int>& known = start.structure.parts;
-    const bool is_part_new = std::any_of(samples.begin() + c, samples.end(), [&](const auto& s) {
-      return std::any_of(s->parts.begin(), s->parts.end(), [&](const PartObservation& o) {
-        return !std::binary_search(known.begin(), known.end(), o.part);
-      });
+  if (c == 0 || c == n) return schema_of(&checkpoint(samples, n), samples, n);
+  Checkpoint& start = checkpoint(samples, c);
+  const std::vector<int>& known = start.structure.parts;
+  const bool is_part_new = std::any_of(samples.begin() + c, samples.end(), [&](const auto& s) {
+    return std::any_of(s->parts.begin(), s->parts.end(), [&](const PartObservation& o) {
+      return !std::binary_search(known.begin(), known.end(), o.part);
     });
-    if (!is_part_new || n <= kEverySample) {
-      if (is_part_new || are_few_enough_to_refit(samples)) {
-        const auto all = copied(samples, 0, n);
-        const LearnOptions options = options_for(all);
-        LearnResult refitted = relearn(start.structure, all, options);
-        if (refitted.refuted.empty() || n <= kEverySample) {
-          refitted.schema.complete &= options.root == options_.root;
-          return std::move(refitted.schema);
-        }
-      } else if (!is_refuted_by(start.structure, copied(samples, c, n), options_)) {
-        return schema_of(&start, samples, c);
-      }
-    }
-  }
-  return schema_of(&checkpoint(samples, n), samples, n);
+  });
+  if (!is_part_new && !are_few_enough_to_refit(samples)) return schema_of(&start, samples, c);
+  const auto all = copied(samples, 0, n);
+  const LearnOptions options = options_for(all);
+  BodySchema schema = relearn(start.structure, all, options).schema;
+  schema.complete &= options.root == options_.root;
+  return schema;
 }
 
 void OnlineLearner::prepare(const SharedSamples& samples) {

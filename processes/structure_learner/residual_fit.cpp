@@ -493,6 +493,7 @@ void connect_soft_parts(const std::vector<ActionPoseSample>& samples,
         const auto fit = fit_soft_model(fit_local_model(base, data, actions, 30, 1e-3).model, data,
                                         actions, options.validity);
         ++found->num_fits;
+        found->records[{o.i, o.j}].was_soft_tried |= fit.has_value();
         if (fit && (!best || fit->log_density > best->log_density)) best = fit;
       }
       if (!best || best->verdict != Verdict::kValid) continue;

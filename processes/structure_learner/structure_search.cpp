@@ -294,22 +294,18 @@ class Search {
       for (int round = 0; round < kMaxSplits; ++round) {
         const Tree tree = tree_of(x);
         const TreeFit fit = fit_tree(tree);
-        auto missing = fit.missing_joints();
-        std::optional<std::vector<TreeEdge>> edges;
-        std::vector<int> full;
-        while (tree.nodes.size() > 1 && round + 1 < kMaxSplits && !edges && full.empty()) {
-          const MissingJoint* worst = most_significant(missing);
-          if (!worst) break;
-          edges = fit.with_joint(*worst);
-          if (!edges) full = fit.full_edges(*worst);
-          // An edge that has the signal already is a joint that is not quite a screw.
-          missing.erase(missing.begin() + (worst - missing.data()));
+        const auto missing = fit.missing_joints();
+        const MissingJoint* worst =
+            tree.nodes.size() < 2 ? nullptr : most_significant(missing);
+        if (!worst || round + 1 == kMaxSplits) {
+          result_.log_likelihood += fit.log_likelihood();
+          break;
         }
-        if (edges) {
+        if (const auto edges = fit.with_joint(*worst)) {
           adopt(tree, *edges);
           continue;
         }
-        for (const int node : full)
+        for (const int node : fit.full_edges(*worst))
           refuted.push_back({tree.nodes[node].part, tree.nodes[tree.nodes[node].parent].part});
         result_.log_likelihood += fit.log_likelihood();
         break;
@@ -422,9 +418,9 @@ class Search {
         adopt(tree, *edges);
         continue;
       }
-      // Tying the one's pose to the other's at every frame costs half of χ².
+      // Tying the one's pose to the other's costs half of χ².
       const int joints = count_joints(result_.models) - count_joints(models_before);
-      const double dof = 6.0 * fit.num_frames() - 6 - 6 * joints;
+      const double dof = 6.0 * count_ties(tree, forest_before) - 6 - 6 * joints;
       if (dof < 12 || fit.cost() - apart > 0.5 * (dof + 4 * std::sqrt(2 * dof))) break;
       return fit.cost();
     }
@@ -433,7 +429,25 @@ class Search {
     return std::nullopt;
   }
 
-  TreeFit fit_tree(const Tree& tree) const {
+  // Frames at which a tree of two components has a free pose less than they had apart: those at
+  // which both are seen; where the root rests, and with it all that hangs on it, those at which the
+  // other one is seen, if that did not rest too.
+  int count_ties(const Tree& tree, const Forest& apart) {
+    std::set<int> seen[2];
+    const int root = index_of(tree.nodes.front().part);
+    for (std::size_t k = 0; k < tree.nodes.size(); ++k) {
+      const int x = index_of(tree.nodes[k].part);
+      const bool is_other = !apart.connected(root, x);
+      if (is_other && part_rests(x)) return 0;
+      for (const PairFrame& frame : tree.data[k].frames) seen[is_other].insert(frame.sample);
+    }
+    if (tree.root_rests) return static_cast<int>(seen[1].size());
+    return static_cast<int>(std::count_if(seen[1].begin(), seen[1].end(),
+                                          [&](int sample) { return seen[0].count(sample); }));
+  }
+
+  TreeFit fit_tree(const Tree& tree) {
+    ++result_.num_fits;
     TreeFit fit(tree.nodes, tree.data, actions_, tree.root_rests);
     fit.fit(15, 0.2);
     return fit;
@@ -561,8 +575,9 @@ class Search {
       if (turns.empty() || forest_.spans()) continue;
       two_joints_pass(turns);
     }
-    // So few frames leave the fits narrow valleys: a finer grid of ranges.
-    if (samples_.size() < 12 && !forest_.spans()) {
+    // So few frames leave the fits narrow valleys: a finer grid of ranges, where pairs are few.
+    constexpr std::size_t kMaxPairs = 100;
+    if (samples_.size() < 12 && !forest_.spans() && pairs_.size() <= 2 * kMaxPairs) {
       std::vector<double> fine;
       for (double turn = 0.25; turn < 3.1; turn *= 1.15) fine.push_back(turn);
       two_joints_pass(std::vector<std::vector<double>>(actions_.num_signals(), fine));

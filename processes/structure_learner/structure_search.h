@@ -33,15 +33,17 @@ struct PairRecord {
   /// The models that were not refuted but that the data are too few to trust: mean of min(d², 2c)
   /// of the best, by k.
   std::map<int, double> undecided;
+  bool was_soft_tried = false;  ///< a Gaussian process on the screws' rest was fitted too
 };
 
 struct SearchResult {
   std::vector<AcceptedModel> models;  ///< the forest, in the order of acceptance
   std::map<std::pair<int, int>, PairRecord> records;
-  /// Of all poses, each tree fitted as a whole, Student-t [nats]; up to a constant.
+  /// Of all poses, each tree fitted as a whole, Student-t [nats]; up to a constant. Of a forest
+  /// that spans: from one with gaps models may have been taken since.
   double log_likelihood = 0;
   int num_screens = 0;  ///< closed-form starts and regressions
-  int num_fits = 0;     ///< Levenberg–Marquardt fits
+  int num_fits = 0;     ///< Levenberg–Marquardt fits, of pairs and of whole trees
 };
 
 /// Layered search for the minimum spanning forest of valid local models (Section 3.2.1, Algorithm
@@ -59,14 +61,15 @@ struct SearchResult {
 /// layers are through, and a larger model takes their place if it explains the data better by more
 /// than its parameters are worth (6 log 6N a signal).
 ///
-/// When the layers are through, each tree is fitted to all its poses at once (TreeFit). A pair shows
-/// only what exceeds the noise of two markers; all markers beyond a joint together show far smaller
-/// motions. So joints that a score test finds missing are put in, models that have no room for them
-/// are dropped and the layers run again, and components that narrowly refuted models keep apart are
-/// joined if that costs no more than noise does.
+/// When the layers are through, each tree is fitted to all its poses at once (TreeFit). A pair
+/// shows only what exceeds the noise of two markers; all markers beyond a joint together show far
+/// smaller motions. So joints that a score test finds missing are put in, models that have no room
+/// for them are dropped and the layers run again, and components that narrowly refuted models keep
+/// apart are joined if that costs no more than noise does.
 ///
-/// Hypotheses are screened and fitted on an even subset of the instants; what is about to enter the
-/// forest must be valid on all of them.
+/// Hypotheses are screened and fitted on an even subset of the instants, and so are trees. What a
+/// layer is about to accept must be valid on all of them; what the fits of trees put in or join is
+/// judged by all markers of the subset instead.
 SearchResult search_structure(const std::vector<ActionPoseSample>& samples,
                               const NormalizedActions& actions, const std::vector<int>& parts,
                               const SearchOptions& options);

@@ -307,16 +307,15 @@ double TreeFit::log_likelihood() const {
 
 std::vector<int> TreeFit::full_edges(const MissingJoint& joint) const {
   std::vector<int> result;
-  const auto is_full = [&](int node) {
-    const LocalModel& model = nodes_[node].model;
-    return model.num_joints == kMaxJoints && !model.uses(joint.signal);
-  };
+  const bool is_full = nodes_[joint.top].model.num_joints == kMaxJoints;
   const std::vector<int> cluster = cluster_of(joint.top);
   const auto unmoved = static_cast<std::ptrdiff_t>(joint.members.size()) <
                        std::ssize(cluster);
-  if (!unmoved && joint.top > 0 && is_full(joint.top)) result.push_back(joint.top);
+  if (!unmoved && is_full && joint.top > 0) result.push_back(joint.top);
   for (int k = 1; k < static_cast<int>(nodes_.size()); ++k) {
-    if (!is_full(k) || !std::count(cluster.begin(), cluster.end(), nodes_[k].parent)) continue;
+    if (nodes_[k].model.num_joints < kMaxJoints ||
+        !std::count(cluster.begin(), cluster.end(), nodes_[k].parent))
+      continue;
     const bool moves = std::count(joint.branches.begin(), joint.branches.end(), k) > 0;
     if (moves ? joint.members.empty() : !unmoved) result.push_back(k);
   }

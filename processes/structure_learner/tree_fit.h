@@ -82,8 +82,7 @@ class TreeFit {
   /// between the two sides are moved to the right one. std::nullopt if an edge had more than
   /// kMaxJoints.
   std::optional<std::vector<TreeEdge>> with_joint(const MissingJoint& joint) const;
-  /// Where with_joint() fails: the nodes whose edges to their parents have no room for the joint, and
-  /// none of its signal yet.
+  /// Where with_joint() fails: the nodes whose edges to their parents have no room for the joint.
   std::vector<int> full_edges(const MissingJoint& joint) const;
 
  private:

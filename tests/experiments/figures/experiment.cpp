@@ -15,7 +15,7 @@
 namespace bodyschema::experiments {
 namespace {
 
-constexpr int kPanelWidth = 560, kPanelHeight = 440;
+constexpr int kPanelWidth = 560, kPanelHeight = 460;
 const char* const kColours[] = {"#c0504d", "#2f6db3", "#4a9a5a", "#8a63b0", "#d08a2e", "#3f9c9c"};
 
 std::string number(double value) {
@@ -23,6 +23,18 @@ std::string number(double value) {
 }
 
 std::string script_of(const Panel& panel, int index) {
+  double low = INFINITY, high = -INFINITY;
+  for (const Curve& curve : panel.curves) {
+    for (const double x : curve.x) {
+      low = std::min(low, x);
+      high = std::max(high, x);
+    }
+  }
+  const auto shifted = [&](double x, std::size_t curve) {
+    const double by = panel.shift * (static_cast<double>(curve) -
+                                     0.5 * (static_cast<double>(panel.curves.size()) - 1));
+    return panel.log_x ? x * std::pow(high / low, by) : x + (high - low) * by;
+  };
   std::string data, curves;
   const auto also = [&curves](const std::string& what) {
     curves += (curves.empty() ? "plot " : ", \\\n     ") + what;
@@ -35,7 +47,7 @@ std::string script_of(const Panel& panel, int index) {
     const std::string block = fmt::format("$data_{}_{}", index, c);
     data += block + " << END\n";
     for (std::size_t n = 0; n < curve.x.size(); ++n)
-      data += fmt::format("{} {} {}\n", number(curve.x[n]), number(curve.y[n]),
+      data += fmt::format("{} {} {}\n", number(shifted(curve.x[n], c)), number(curve.y[n]),
                           number(curve.error.empty() ? 0 : curve.error[n]));
     data += "END\n";
     const std::string title =
@@ -52,9 +64,10 @@ std::string script_of(const Panel& panel, int index) {
         if (!curve.error.empty())
           also(fmt::format("{} using 1:2:3 with yerrorbars pt 7 ps 0.1 lw 1 {} notitle", block,
                            style(curve.colour)));
-        also(fmt::format("{} using 1:2 with linespoints pt {} ps 0.7 lw 2 dt {} {} {}", block,
-                         curve.is_dashed ? 6 : 7, curve.is_dashed ? 3 : 1, style(curve.colour),
-                         title));
+        // The rings of the dashed are seen around the dots of the others.
+        also(fmt::format("{} using 1:2 with linespoints pt {} ps {} lw 2 dt {} {} {}", block,
+                         curve.is_dashed ? 6 : 7, curve.is_dashed ? 1.2 : 0.7,
+                         curve.is_dashed ? 3 : 1, style(curve.colour), title));
         break;
       case Curve::Kind::kPoints:
         also(fmt::format("{} using 1:2 with points pt 7 ps 0.6 {} {}", block, style(curve.colour),
@@ -68,15 +81,8 @@ std::string script_of(const Panel& panel, int index) {
                      dash++, gnuplot_string(reference.title)));
   std::string result = data;
   result += "set title " + gnuplot_string(panel.title) + "\n";
-  result += "set xlabel " + gnuplot_string(panel.x_label) + " offset 0,0.6\n";
+  result += "set xlabel " + gnuplot_string(panel.x_label) + " offset 0,0.75\n";
   result += "set ylabel " + gnuplot_string(panel.y_label) + "\n";
-  double low = INFINITY, high = -INFINITY;
-  for (const Curve& curve : panel.curves) {
-    for (const double x : curve.x) {
-      low = std::min(low, x);
-      high = std::max(high, x);
-    }
-  }
   const double margin = panel.log_x ? 0 : 0.03 * (high - low), factor = panel.log_x ? 1.1 : 1;
   result += fmt::format("set xrange [{}:{}]\n", number(low / factor - margin),
                         number(high * factor + margin));
@@ -88,7 +94,7 @@ std::string script_of(const Panel& panel, int index) {
         fmt::format("set yrange [{}:{}]\n", number(panel.y_range[0]), number(panel.y_range[1]));
   else
     result += "set yrange [*:*]\n";
-  result += "set key " + panel.key + " spacing 1.1 samplen 3\n";
+  result += "set key below maxcols 2 spacing 1.1 samplen 3\n";
   return result + curves + "\n";
 }
 

@@ -86,7 +86,8 @@ struct Panel {
   std::vector<Reference> references = {};
   bool log_x = false, log_y = false;
   std::vector<double> y_range = {};     ///< {low, high}; empty: gnuplot's choice
-  std::string key = "below maxcols 2";  ///< where gnuplot puts the titles
+  /// Curves of equal values are drawn beside each other: each by this share of the width.
+  double shift = 0;
 };
 
 /// Draws the panels, `columns` beside each other, into setup.out / file.

@@ -32,7 +32,13 @@ refused() { # EXPECTED ARGS…
   [ ! -e "$out/none" ] || fail "${*:2}: began to work"
 }
 refused "did you mean 'two_dof_noise'" two_dof_nose
+refused "There are: local_model, spherical, chain," help
 refused "--quik" --quik
 refused "--jobs" chain --jobs 0
+[ -f "$out/all/all.md" ] && [ ! -e "$out/again/all.md" ] || fail "all.md is not of all experiments"
+# Found before the work, not after it: nothing was said of its progress.
+mkdir -p "$out/full/.probe"
+if said=$("$program" chain --quick --out "$out/full" 2>&1); then fail "wrote where it cannot"; fi
+grep -q 'cannot be written' <<<"$said" && ! grep -q 'chain: ' <<<"$said" || fail "an unwritable folder: $said"
 if said=$("$program" chain --quick --out "$program/x" 2>&1); then fail "wrote into a program"; fi
 echo passed

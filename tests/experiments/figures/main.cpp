@@ -4,8 +4,8 @@
 //   experiments [NAME…] [--quick] [--out FOLDER] [--jobs N]
 //   experiments --list
 //
-// Tables on stdout and, with the plots, in FOLDER (all.md: all of them); progress on stderr. Ends
-// with 1 if something that must come out does not.
+// Tables on stdout and, with the plots, in FOLDER (all.md: of all experiments, where all were run);
+// progress on stderr. Ends with 1 if something that must come out does not.
 
 #include <fmt/format.h>
 #include <unistd.h>
@@ -42,11 +42,15 @@ std::vector<Experiment> chosen(const std::vector<std::string>& names) {
   if (names.empty()) return kExperiments;
   std::vector<Experiment> result;
   std::set<std::string> known;
-  for (const Experiment& e : kExperiments) known.insert(e.name);
+  std::string list;
+  for (const Experiment& e : kExperiments) {
+    known.insert(e.name);
+    list += (list.empty() ? "" : ", ") + std::string(e.name);
+  }
   for (const std::string& name : names) {
     if (!known.contains(name))
       throw std::invalid_argument("there is no experiment '" + name + "'" +
-                                  did_you_mean(name, known) + " --list lists them");
+                                  did_you_mean(name, known) + " There are: " + list);
     for (const Experiment& e : kExperiments)
       if (e.name == name) result.push_back(e);
   }
@@ -69,6 +73,9 @@ void show_progress(const std::string& name, const std::string& part, double shar
 
 int run(const std::vector<Experiment>& experiments, Setup setup) {
   std::filesystem::create_directories(setup.out);
+  // A folder that cannot be written into is to be found now, not after minutes.
+  write(setup.out / ".probe", "");
+  std::filesystem::remove(setup.out / ".probe");
   std::string all = "# The chapter's figures, measured again\n";
   bool is_reached = true;
   for (const Experiment& experiment : experiments) {
@@ -93,10 +100,10 @@ int run(const std::vector<Experiment>& experiments, Setup setup) {
     }
     write(setup.out / (std::string(experiment.name) + ".md"), text);
     all += "\n" + text;
-    write(setup.out / "all.md", all);
     fmt::print("{}\n", text);
     std::fflush(stdout);
   }
+  if (experiments.size() == kExperiments.size()) write(setup.out / "all.md", all);
   fmt::print(stderr, "tables and plots are in {}\n", setup.out.string());
   if (!is_reached) fmt::print(stderr, "experiments: something that must come out did not\n");
   return is_reached ? 0 : 1;

@@ -83,8 +83,9 @@ Findings spherical(const Setup& setup) {
         .title = "Fig. 6, " + name + fmt::format(": q2 moves from sample {} on", kResting + 1),
         .x_label = "samples N",
         .y_label = "robots [%]",
-        .references = {{"chapter: {q1}, then {q1, q2}", 100}},
-        .y_range = {0, 105}};
+        .references = {{"chapter: {q1}, then both", 100}},
+        .y_range = {-5, 105},
+        .shift = 0.008};
     for (const auto* side : {&baseline, &ours}) {
       for (const Said what : {Said::kOne, Said::kBoth}) {
         Curve curve{.title = std::string(side == &ours ? "ours" : "baseline") +

@@ -49,11 +49,12 @@ Findings trees(const Setup& setup) {
   Panel trees_panel{.title = "random trees",
                     .x_label = "samples N",
                     .y_label = "structure right [% of robots]",
-                    .y_range = {0, 105}};
+                    .y_range = {-5, 105},
+                    .shift = 0.01};
   Panel hidden_panel = trees_panel;
   hidden_panel.title = "two hidden parts in a row: wrong (k = 3: incomplete is the best answer)";
   hidden_panel.y_label = "structure wrong [% of robots]";
-  hidden_panel.y_range = {0, 50};
+  hidden_panel.y_range = {-5, 105};
   for (const Line& line : lines) {
     const int num_robots = setup.robots(line.robots, line.quick_robots);
     const int num_baseline = setup.robots(line.baseline_robots, 0);

@@ -156,8 +156,7 @@ TEST(RecordingTest, ColumnsAreGivenToTheSignalsOfASchemaByTheirNames) {
   Recording log = with_columns("q1,q2");
   log.is_log = true;
   EXPECT_EQ(samples_by_signals(log, signals).at(0).action, Eigen::Vector2d(1, 2));
-  EXPECT_EQ(error_with(log, {{.name = "lift"}}),
-            "the samples have 2 action signals, the schema 1");
+  EXPECT_EQ(error_with(log, {{.name = "lift"}}), "the samples have 2 action signals, the schema 1");
 }
 
 TEST(RecordingTest, NoiseColumnsAreStandardDeviationsPerAxis) {

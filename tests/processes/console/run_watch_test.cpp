@@ -260,5 +260,16 @@ TEST(RunWatchTest, TheNewestSchemaStands) {
   EXPECT_EQ(watch.schema()->version, 10);
 }
 
+TEST(LastWords, AreTheLineOfAProcessThatEnded) {
+  EXPECT_EQ(
+      last_words("10:00:00.000 camera info: up\ncamera: c.yaml:1:1: fps is missing\n", "camera"),
+      "c.yaml:1:1: fps is missing");
+  EXPECT_EQ(last_words("camera: one\ncamera: two", "camera"), "two");
+  // Started again, and going on.
+  EXPECT_EQ(last_words("camera: one\n10:00:00.000 camera info: up\n", "camera"), "");
+  EXPECT_EQ(last_words("", "camera"), "");
+  EXPECT_EQ(last_words("\n\n", "camera"), "");
+}
+
 }  // namespace
 }  // namespace bodyschema

@@ -251,6 +251,43 @@ TEST(Learn, SaysSoWhereNoModelIsValid) {
   ASSERT_EQ(schema.unconnected.size(), 1u);
   EXPECT_EQ(schema.unconnected[0].part, 5);
   EXPECT_EQ(schema.unconnected[0].reason, Unconnected::kNoValidModel);
+  const std::string& detail = schema.unconnected[0].detail;
+  EXPECT_NE(
+      detail.find("no model with up to 2 signals is valid to any connected part, nor any with "
+                  "a Gaussian process beside its joints"),
+      std::string::npos)
+      << detail;
+}
+
+// A part that swings freely, seen at a tenth of the instants: what all the others say of themselves
+// is no evidence that it is fixed to one of them.
+TEST(Learn, InstantsAtWhichOnlyOneOfTwoComponentsIsSeenDoNotSpeakForJoiningThem) {
+  int num_joined = 0;
+  for (int seed = 1; seed <= 10; ++seed) {
+    Rng rng(seed);
+    std::vector<ActionPoseSample> samples;
+    for (int t = 0; t < 80; ++t) {
+      ActionPoseSample& sample = samples.emplace_back();
+      sample.sample_index = t;
+      sample.action = Eigen::VectorXd::Constant(1, test::uniform(rng, -1, 1));
+      const auto see = [&](int part, const Pose& X, double scale) {
+        Vector6d e = scale * test::gaussian6(rng);
+        e.head<3>() *= 0.003;
+        e.tail<3>() *= 0.02;
+        PartObservation& seen = sample.parts.emplace_back();
+        seen.part = part;
+        seen.X_CB = X * exp(e);
+      };
+      Pose X = Pose::Identity();
+      X.translation().z() = 1;
+      see(1, X, 1);
+      if (t % 10 == 0) see(2, X, 4);
+    }
+    LearnOptions options;
+    options.noise = Noise{0.003, 0.02};
+    num_joined += learn({{"q", -1, 1, {}}}, samples, options).schema.complete;
+  }
+  EXPECT_EQ(num_joined, 0);
 }
 
 TEST(Learn, AConstantSignalExplainsNothing) {
