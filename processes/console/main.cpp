@@ -7,8 +7,10 @@
 #include <stdexcept>
 
 #include "processes/console/driver_test.h"
+#include "processes/console/engineered_model.h"
 #include "processes/console/fault.h"
 #include "processes/console/log.h"
+#include "processes/console/monitor.h"
 #include "processes/console/offline.h"
 #include "processes/console/operate.h"
 #include "processes/console/report.h"
@@ -19,6 +21,8 @@ int main(int argc, char** argv) {
   CLI::App console("A robot arm's body schema: learn it, look at it, judge it", "bodyschema");
   console.require_subcommand(1);
   bodyschema::add_offline_commands(console);
+  bodyschema::add_monitor_command(console);
+  bodyschema::add_engineer_command(console);
   bodyschema::add_log_command(console);
   bodyschema::add_operate_commands(console);
   bodyschema::add_watch_command(console);

@@ -70,10 +70,7 @@ void run_learn(const LearnArguments& arguments) {
         throw std::invalid_argument("--noise: expected two standard deviations above 0");
     }
   }
-  std::error_code is_new;
-  if (!arguments.out.empty() &&
-      std::filesystem::equivalent(arguments.out, arguments.samples, is_new) && !is_new)
-    throw std::invalid_argument("--out: " + arguments.out + " is the recording itself");
+  check_out(arguments.out, {arguments.samples});
   const std::vector<ActionPoseSample> training = recording.training();
   if (options.root) {
     bool is_seen = false;
@@ -109,14 +106,8 @@ void run_learn(const LearnArguments& arguments) {
 
 void run_predict(const std::string& schema_file, const std::string& samples_file, bool json) {
   const BodySchema schema = load_schema(schema_file);
-  const Recording recording = load(samples_file);
-  std::vector<ActionPoseSample> samples;
-  try {
-    samples = samples_by_signals(recording, schema.signals);
-  } catch (const std::invalid_argument& error) {
-    throw RecordingError(samples_file + ": " + error.what());
-  }
-  const auto errors = evaluate(schema, samples);
+  const Recording recording = load_for(samples_file, schema);
+  const auto errors = evaluate(schema, recording.samples);
   if (json) {
     std::cout << errors_json(static_cast<int>(recording.samples.size()), errors).dump(2)
               << std::endl;
@@ -174,6 +165,24 @@ BodySchema load_schema(const std::filesystem::path& file) {
   if (schemas.empty())
     throw std::runtime_error(file.string() + ": expected a schema, found no BODY_SCHEMA");
   return from_message(schemas.back());
+}
+
+Recording load_for(const std::string& file, const BodySchema& schema) {
+  Recording recording = load(file);
+  try {
+    recording.samples = samples_by_signals(recording, schema.signals);
+  } catch (const std::invalid_argument& error) {
+    throw RecordingError(file + ": " + error.what());
+  }
+  recording.signals = schema.signals;
+  return recording;
+}
+
+void check_out(const std::string& out, const std::vector<std::string>& inputs) {
+  std::error_code is_new;
+  for (const std::string& input : inputs)
+    if (!out.empty() && std::filesystem::equivalent(out, input, is_new) && !is_new)
+      throw std::invalid_argument("--out: " + out + " is an input itself: " + input);
 }
 
 void add_offline_commands(CLI::App& console) {

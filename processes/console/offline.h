@@ -1,10 +1,11 @@
 #pragma once
 
 #include <filesystem>
-#include <optional>
 #include <string>
+#include <vector>
 
 #include "common/schema/body_schema.h"
+#include "processes/console/recording.h"
 
 namespace CLI {
 class App;
@@ -19,5 +20,12 @@ void add_offline_commands(CLI::App& console);
 /// Reads a schema file: a log with one BODY_SCHEMA; of several the last counts.
 /// @throws std::runtime_error.
 BodySchema load_schema(const std::filesystem::path& file);
+
+/// Reads a recording whose actions are those of the schema, in its order. What keeps it from being
+/// whole is said on stderr. @throws std::runtime_error.
+Recording load_for(const std::string& file, const BodySchema& schema);
+
+/// @throws std::invalid_argument if `out` would be written over one of `inputs`.
+void check_out(const std::string& out, const std::vector<std::string>& inputs);
 
 }  // namespace bodyschema

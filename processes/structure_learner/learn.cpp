@@ -205,77 +205,6 @@ void fit_jointly(const std::vector<ActionPoseSample>& samples, const NormalizedA
   schema->X_CR = fit.root_pose();
 }
 
-// Robust mean of the root's pose in the camera's frame, Student-t weights.
-void estimate_root_pose(const std::vector<ActionPoseSample>& samples,
-                        const MeasurementModel& measurement, BodySchema* schema) {
-  struct Reading {
-    Pose X;
-    Matrix6d information;
-  };
-  std::vector<Reading> readings;
-  Vector6d floor;
-  floor.head<3>().setConstant(std::pow(measurement.model_error.position_m, 2) + 1e-10);
-  floor.tail<3>().setConstant(std::pow(measurement.model_error.rotation_rad, 2) + 1e-10);
-  Vector6d variances = Vector6d::Zero();
-  if (measurement.noise) {
-    variances.head<3>().setConstant(std::pow(measurement.noise->position_m, 2));
-    variances.tail<3>().setConstant(std::pow(measurement.noise->rotation_rad, 2));
-  }
-  for (const auto& sample : samples) {
-    const PartObservation* o = sample.find(schema->root);
-    if (!o) continue;
-    Matrix6d covariance = measurement.noise ? Matrix6d(variances.asDiagonal()) : o->covariance;
-    covariance.diagonal() += floor;
-    readings.push_back({o->X_CB, covariance.inverse()});
-  }
-  if (readings.empty()) return;
-  const auto cost = [&](const Pose& X) {
-    double sum = 0;
-    for (const Reading& r : readings) {
-      const Vector6d e = log(X.inverse() * r.X);
-      sum += std::log1p(e.dot(r.information * e) / kStudentNu);
-    }
-    return sum;
-  };
-  Pose mean = readings.front().X;
-  double best = std::numeric_limits<double>::infinity();
-  const std::size_t candidates = std::min<std::size_t>(readings.size(), 16);
-  for (std::size_t n = 0; n < candidates; ++n) {
-    const Pose& X = readings[n * readings.size() / candidates].X;
-    const double c = cost(X);
-    if (c < best) {
-      best = c;
-      mean = X;
-    }
-  }
-  Matrix6d H;
-  double weight = 1;  // mean of the inliers'
-  for (int iteration = 0; iteration < 30; ++iteration) {
-    H.setZero();
-    Vector6d g = Vector6d::Zero();
-    double sum = 0;
-    int inliers = 0;
-    for (const Reading& r : readings) {
-      const Vector6d e = log(mean.inverse() * r.X);
-      const Vector6d Ie = r.information * e;
-      const double d2 = e.dot(Ie), w = robust_weight(d2);
-      if (d2 < kOutlierThreshold) {
-        sum += w;
-        ++inliers;
-      }
-      H += w * r.information;
-      g += w * Ie;
-    }
-    if (inliers > 0) weight = sum / inliers;
-    const Vector6d step = H.llt().solve(g);
-    if (!step.allFinite()) break;
-    mean = mean * exp(step);
-    if (step.norm() < 1e-13) break;
-  }
-  schema->X_CR = mean;
-  schema->X_CR_covariance = weight * H.inverse();
-}
-
 // Which part is to blame where edges disagree with the data at one instant.
 //
 // A part that is outlying in most of its edges is the culprit; its edges then speak no longer. Ties
@@ -567,6 +496,76 @@ LearnResult fit_tree(const LearnedStructure& structure,
 }
 
 }  // namespace
+
+void estimate_root_pose(const std::vector<ActionPoseSample>& samples,
+                        const MeasurementModel& measurement, BodySchema* schema) {
+  struct Reading {
+    Pose X;
+    Matrix6d information;
+  };
+  std::vector<Reading> readings;
+  Vector6d floor;
+  floor.head<3>().setConstant(std::pow(measurement.model_error.position_m, 2) + 1e-10);
+  floor.tail<3>().setConstant(std::pow(measurement.model_error.rotation_rad, 2) + 1e-10);
+  Vector6d variances = Vector6d::Zero();
+  if (measurement.noise) {
+    variances.head<3>().setConstant(std::pow(measurement.noise->position_m, 2));
+    variances.tail<3>().setConstant(std::pow(measurement.noise->rotation_rad, 2));
+  }
+  for (const auto& sample : samples) {
+    const PartObservation* o = sample.find(schema->root);
+    if (!o) continue;
+    Matrix6d covariance = measurement.noise ? Matrix6d(variances.asDiagonal()) : o->covariance;
+    covariance.diagonal() += floor;
+    readings.push_back({o->X_CB, covariance.inverse()});
+  }
+  if (readings.empty()) return;
+  const auto cost = [&](const Pose& X) {
+    double sum = 0;
+    for (const Reading& r : readings) {
+      const Vector6d e = log(X.inverse() * r.X);
+      sum += std::log1p(e.dot(r.information * e) / kStudentNu);
+    }
+    return sum;
+  };
+  Pose mean = readings.front().X;
+  double best = std::numeric_limits<double>::infinity();
+  const std::size_t candidates = std::min<std::size_t>(readings.size(), 16);
+  for (std::size_t n = 0; n < candidates; ++n) {
+    const Pose& X = readings[n * readings.size() / candidates].X;
+    const double c = cost(X);
+    if (c < best) {
+      best = c;
+      mean = X;
+    }
+  }
+  Matrix6d H;
+  double weight = 1;  // mean of the inliers'
+  for (int iteration = 0; iteration < 30; ++iteration) {
+    H.setZero();
+    Vector6d g = Vector6d::Zero();
+    double sum = 0;
+    int inliers = 0;
+    for (const Reading& r : readings) {
+      const Vector6d e = log(mean.inverse() * r.X);
+      const Vector6d Ie = r.information * e;
+      const double d2 = e.dot(Ie), w = robust_weight(d2);
+      if (d2 < kOutlierThreshold) {
+        sum += w;
+        ++inliers;
+      }
+      H += w * r.information;
+      g += w * Ie;
+    }
+    if (inliers > 0) weight = sum / inliers;
+    const Vector6d step = H.llt().solve(g);
+    if (!step.allFinite()) break;
+    mean = mean * exp(step);
+    if (step.norm() < 1e-13) break;
+  }
+  schema->X_CR = mean;
+  schema->X_CR_covariance = weight * H.inverse();
+}
 
 Noise marker_noise(const std::vector<ActionPoseSample>& samples, int num_signals,
                    const LearnOptions& options) {

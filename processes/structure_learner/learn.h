@@ -16,6 +16,11 @@ namespace bodyschema {
 /// markers without a rig are learned with this.
 inline constexpr Noise kTagModelError{.position_m = 0.001, .rotation_rad = 0.2 * M_PI / 180};
 
+/// X_CR of `schema` with its covariance: the robust mean of the poses of its root, Student-t weights.
+/// Left alone if the root is never seen.
+void estimate_root_pose(const std::vector<ActionPoseSample>& samples,
+                        const MeasurementModel& measurement, BodySchema* schema);
+
 struct LearnOptions {
   /// The root part; else the lowest part id seen.
   std::optional<int> root;

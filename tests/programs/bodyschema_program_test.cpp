@@ -650,6 +650,126 @@ TEST_F(RealDataTest, TheSoftTrunkIsAChainOfScrewsWithResidualProcesses) {
     EXPECT_LT(parts[n]["position_median_m"].get<double>(), position_m[n]) << parts[n];
 }
 
+std::vector<Json> lines_of(const std::string& text) {
+  std::vector<Json> lines;
+  std::stringstream stream(text);
+  for (std::string line; std::getline(stream, line);) lines.push_back(Json::parse(line));
+  return lines;
+}
+
+TEST_F(BodyschemaProgramTest, MonitorFindsAStuckJointNamesItAndWritesTheRepairedSchema) {
+  test::Rng rng(73);
+  const test::SyntheticRobot robot = test::chapter_robot("a", rng);
+  test::SyntheticRobot stuck = robot;
+  for (test::TrueLink& link : stuck.links) {
+    if (link.signal != 1) continue;
+    Vector6d turned = Vector6d::Zero();
+    turned(5) = link.turn * 0.4;
+    link.X_before = link.X_before * exp(turned);
+    link.signal = -1;
+  }
+  test::ObservationOptions options;
+  options.regime = test::Regime::kTagIso;
+  const auto learned = write("learned.csv", test::babble(robot, 60, options, rng));
+  std::vector<ActionPoseSample> samples;
+  for (int n = 0; n < 80; ++n)
+    samples.push_back(
+        test::observe(n < 40 ? robot : stuck, robot.random_action(rng), options, n, rng));
+  const auto changing = write("changing.csv", samples);
+  options.regime = test::Regime::kFree;
+  const auto truth = write("truth.csv", test::babble(stuck, 20, options, rng));
+  run({"learn", learned, "--noise", "0.003", "1", "--out", "schema.lcmlog"});
+
+  const Outcome outcome = run({"monitor", "schema.lcmlog", changing, "--noise", "0.003", "1",
+                               "--evaluate", truth, "--out", "repaired.lcmlog", "--json"});
+  ASSERT_EQ(outcome.exit_code, 0) << outcome.err;
+  const std::vector<Json> lines = lines_of(outcome.out);
+  int num_judged = 0;
+  std::vector<std::string> causes;
+  for (const Json& line : lines) {
+    if (line.contains("event")) {
+      EXPECT_GE(line["sample"], 40) << line;
+      if (line["event"] == "candidate" || line["event"] == "refined")
+        causes.push_back(line["cause"]);
+      EXPECT_TRUE(line.contains("margin") && line.contains("samples_used") && line.contains("t"));
+      EXPECT_TRUE(line.contains("part") != (line.contains("from") && line.contains("to"))) << line;
+      continue;
+    }
+    EXPECT_EQ(line["sample"], num_judged++);
+    for (const Json& part : line["parts"]) {
+      const double error = part["position_rms_m"];
+      if (line["sample"] >= 50) {
+        EXPECT_LT(error, 0.02) << line;
+      }
+    }
+  }
+  EXPECT_EQ(num_judged, 80);
+  ASSERT_FALSE(causes.empty());
+  EXPECT_EQ(causes.back(), "joint_stuck");
+  const Json errors = run({"predict", "repaired.lcmlog", truth, "--json"}).json();
+  for (const Json& part : errors["parts"]) EXPECT_LT(part["position_rms_m"], 0.02) << part;
+
+  // The same again gives the same bytes; people get a line an event.
+  EXPECT_EQ(run({"monitor", "schema.lcmlog", changing, "--noise", "0.003", "1", "--evaluate", truth,
+                 "--json"})
+                .out,
+            outcome.out);
+  const Outcome text = run({"monitor", "schema.lcmlog", changing, "--noise", "0.003", "1"});
+  EXPECT_NE(text.out.find("joint_stuck"), std::string::npos) << text.out;
+  EXPECT_NE(text.out.find("80 samples, "), std::string::npos) << text.out;
+}
+
+TEST_F(BodyschemaProgramTest, MonitorSaysNothingOfAHealthyBody) {
+  const auto csv = write_robot("robot.csv");
+  run({"learn", csv, "--out", "schema.lcmlog"});
+  test::Rng rng(74);
+  test::ObservationOptions options;
+  options.regime = test::Regime::kTagIso;
+  const auto later = write("later.csv", test::babble(robot_, 200, options, rng));
+  const Outcome outcome = run({"monitor", "schema.lcmlog", later, "--json"});
+  EXPECT_EQ(outcome.exit_code, 0) << outcome.err;
+  EXPECT_EQ(outcome.out, "");
+}
+
+TEST_F(BodyschemaProgramTest, MonitorRefusesWhatDoesNotBelongTogether) {
+  const auto csv = write_robot("robot.csv");
+  run({"learn", csv, "--out", "schema.lcmlog"});
+  test::Rng rng(75);
+  const auto other = write("other.csv", test::babble(test::chapter_robot("c", rng), 5, {}, rng));
+  expect_failure({"monitor", "schema.lcmlog", other}, "other.csv: the signals of the samples are");
+  expect_failure({"monitor", "schema.lcmlog", csv, "--evaluate", other}, "other.csv");
+  expect_failure({"monitor", "schema.lcmlog", csv, "--out", csv}, "--out");
+  expect_failure({"monitor", csv, csv}, "robot.csv");
+}
+
+TEST_F(BodyschemaProgramTest, AnEngineeredModelPredictsTheRobotItDescribes) {
+  write("robot.urdf", R"(<robot name="r"><link name="base"/><link name="arm"/>
+    <joint name="j" type="revolute"><parent link="base"/><child link="arm"/>
+      <origin xyz="0 0 0.5" rpy="0 0 0"/><axis xyz="0 0 1"/>
+      <limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>)");
+  write("placement.yaml", R"(root: 1
+uncertainty: {position_m: 0.002, rotation_deg: 0.5}
+signals: [{name: q, joint: j, gain: 0.5, offset: 0, lower: -2, upper: 2}]
+parts:
+  - {part: 1, link: base, X_LB: {position_m: [0, 0, 0]}}
+  - {part: 2, link: arm, X_LB: {position_m: [0.2, 0, 0]}}
+)");
+  // At q = π the arm has turned by 90 degrees; the root stands 2 m in front of the camera.
+  write("samples.csv",
+        "t,q,part,x,y,z,qw,qx,qy,qz\n"
+        "0,0,1,0,0,2,1,0,0,0\n0,0,2,0.2,0,2.5,1,0,0,0\n"
+        "1,3.14159265358979,1,0,0,2,1,0,0,0\n"
+        "1,3.14159265358979,2,0,0.2,2.5,0.707106781186547,0,0,0.707106781186547\n");
+  const Json json = run({"engineer", "robot.urdf", "placement.yaml", "--samples", "samples.csv",
+                         "--out", "schema.lcmlog", "--json"})
+                        .json();
+  EXPECT_NEAR(json["X_CR"]["position_m"][2].get<double>(), 2, 1e-9);
+  const Json errors = run({"predict", "schema.lcmlog", "samples.csv", "--json"}).json();
+  EXPECT_EQ(errors["parts"][0]["count"], 2);
+  EXPECT_LT(errors["parts"][0]["position_max_m"], 1e-9);
+  EXPECT_LT(errors["parts"][0]["rotation_rms_deg"], 1e-6);
+}
+
 TEST_F(BodyschemaProgramTest, AFaultWithoutASimulatorSaysSo) {
   expect_failure({"fault", "repair", "--in", "memq://"}, "no simulator is heard on memq://");
 }

@@ -1,0 +1,265 @@
+#include "processes/console/engineered_model.h"
+
+#include <urdf_model/model.h>
+#include <urdf_parser/urdf_parser.h>
+
+#include <CLI/CLI.hpp>
+#include <algorithm>
+#include <fstream>
+#include <iostream>
+#include <map>
+#include <memory>
+#include <set>
+#include <sstream>
+#include <stdexcept>
+#include <utility>
+#include <vector>
+
+#include "common/bus/convert.h"
+#include "common/bus/event_log.h"
+#include "common/config/yaml.h"
+#include "processes/console/offline.h"
+#include "processes/console/recording.h"
+#include "processes/console/schema_json.h"
+#include "processes/structure_learner/learn.h"
+
+namespace bodyschema {
+namespace {
+
+Pose from_urdf(const urdf::Pose& X) {
+  return make_pose({X.rotation.w, X.rotation.x, X.rotation.y, X.rotation.z},
+                   {X.position.x, X.position.y, X.position.z});
+}
+
+urdf::ModelInterfaceSharedPtr read_urdf(const std::filesystem::path& file) {
+  std::ifstream stream(file);
+  if (!stream) throw std::runtime_error(file.string() + ": cannot be read");
+  std::stringstream text;
+  text << stream.rdbuf();
+  const auto model = urdf::parseURDF(text.str());
+  if (!model) throw std::runtime_error(file.string() + ": expected a URDF, see the lines above");
+  return model;
+}
+
+/// An action signal and the joint that it moves.
+struct Drive {
+  int signal = 0;
+  double gain = 1;    ///< [rad or m per command unit]
+  double offset = 0;  ///< [rad or m]
+};
+
+/// What lies between the last part and the place where a walk over the links stands.
+struct Way {
+  Pose left = Pose::Identity();
+  std::vector<ScrewJoint> joints;
+
+  void move(const Pose& X) {
+    Pose& last = joints.empty() ? left : joints.back().X_after;
+    last = last * X;
+  }
+};
+
+class Walk {
+ public:
+  Walk(const urdf::ModelInterface& model, const std::filesystem::path& urdf, const Yaml& yaml)
+      : model_(model), urdf_(urdf) {
+    for (const Yaml& entry : yaml.list("signals")) read_signal(entry);
+    std::set<int> parts;
+    for (const Yaml& entry : yaml.list("parts")) {
+      const int part = static_cast<int>(entry.integer("part", 0, 1'000'000));
+      const std::string link = entry.text("link");
+      if (!model.getLink(link)) throw entry.error("link", "the URDF has no link " + link);
+      if (!parts.insert(part).second)
+        throw entry.error("part", "part " + std::to_string(part) + " stands twice");
+      parts_on_[link].emplace_back(part, entry.pose("X_LB"));
+    }
+    schema_.parts.assign(parts.begin(), parts.end());
+    schema_.root = static_cast<int>(yaml.integer("root"));
+    if (!parts.count(schema_.root)) throw yaml.error("root", "expected one of the parts");
+    const Yaml uncertainty = yaml.section("uncertainty");
+    const double position = uncertainty.number("position_m", 0, 1);
+    const double rotation = uncertainty.number("rotation_deg", 0, 180) * (M_PI / 180);
+    variances_ << Eigen::Vector3d::Constant(position * position),
+        Eigen::Vector3d::Constant(rotation * rotation);
+  }
+
+  BodySchema run() {
+    for (const auto& [link, parts] : parts_on_) {
+      for (const auto& [part, X_LB] : parts) {
+        if (part != schema_.root) continue;
+        Way way;
+        way.move(X_LB.inverse());
+        visit(*model_.getLink(link), nullptr, schema_.root, std::move(way));
+      }
+    }
+    schema_.complete = schema_.edges.size() + 1 == schema_.parts.size();
+    return schema_;
+  }
+
+ private:
+  void read_signal(const Yaml& entry) {
+    Signal signal;
+    signal.name = entry.text("name");
+    const std::string joint = entry.text("joint");
+    const auto known = model_.getJoint(joint);
+    if (!known) throw entry.error("joint", "the URDF has no joint " + joint);
+    if (known->type == urdf::Joint::FIXED)
+      throw entry.error("joint", "joint " + joint + " is fixed");
+    Drive drive;
+    drive.signal = static_cast<int>(schema_.signals.size());
+    drive.gain = entry.number("gain");
+    if (drive.gain == 0) throw entry.error("gain", "expected another number than 0");
+    drive.offset = entry.number("offset");
+    if (!drives_.emplace(joint, drive).second)
+      throw entry.error("joint", "joint " + joint + " has a signal already");
+    signal.lower = entry.number("lower");
+    signal.upper = entry.number("upper", signal.lower);
+    schema_.signals.push_back(std::move(signal));
+  }
+
+  /// From `link` to all its neighbours but the one that the walk came by. `from` is the last part.
+  void visit(const urdf::Link& link, const urdf::Joint* came_by, int from, Way way) {
+    if (const auto on = parts_on_.find(link.name); on != parts_on_.end()) {
+      // The first part that the walk meets carries what follows; others on its link hang on it.
+      bool is_first = came_by != nullptr;
+      for (const auto& [part, X_LB] : on->second) {
+        if (part == schema_.root) continue;
+        Way there = way;
+        there.move(X_LB);
+        add_edge(from, part, there);
+        if (!std::exchange(is_first, false)) continue;
+        from = part;
+        way = Way();
+        way.move(X_LB.inverse());
+      }
+    }
+    if (link.parent_joint && link.parent_joint.get() != came_by) {
+      const urdf::Joint& joint = *link.parent_joint;
+      Way there = way;
+      cross(joint, -1, &there);
+      there.move(from_urdf(joint.parent_to_joint_origin_transform).inverse());
+      visit(*model_.getLink(joint.parent_link_name), &joint, from, std::move(there));
+    }
+    for (const auto& joint : link.child_joints) {
+      if (joint.get() == came_by) continue;
+      Way there = way;
+      there.move(from_urdf(joint->parent_to_joint_origin_transform));
+      cross(*joint, 1, &there);
+      visit(*model_.getLink(joint->child_link_name), joint.get(), from, std::move(there));
+    }
+  }
+
+  void cross(const urdf::Joint& joint, double sense, Way* way) const {
+    if (joint.type == urdf::Joint::FIXED) return;
+    const bool slides = joint.type == urdf::Joint::PRISMATIC;
+    if (!slides && joint.type != urdf::Joint::REVOLUTE && joint.type != urdf::Joint::CONTINUOUS)
+      throw std::runtime_error(urdf_.string() + ": joint " + joint.name +
+                               ": expected revolute, continuous, prismatic or fixed");
+    const Eigen::Vector3d axis(joint.axis.x, joint.axis.y, joint.axis.z);
+    if (!(axis.norm() > 1e-9))
+      throw std::runtime_error(urdf_.string() + ": joint " + joint.name + ": its axis is 0");
+    // The joint that a mimic follows, and how.
+    const urdf::Joint* leader = &joint;
+    double gain = 1, offset = 0;
+    for (int hops = 0; leader->mimic; ++hops) {
+      const auto next = model_.getJoint(leader->mimic->joint_name);
+      if (!next || hops > 100)
+        throw std::runtime_error(urdf_.string() + ": joint " + joint.name + ": mimics nothing");
+      offset += gain * leader->mimic->offset;
+      gain *= leader->mimic->multiplier;
+      leader = next.get();
+    }
+    Pose X_JZ = Pose::Identity();  // z along the axis
+    X_JZ.linear() = Eigen::Quaterniond::FromTwoVectors(Eigen::Vector3d::UnitZ(), axis).matrix();
+    const auto drive = drives_.find(leader->name);
+    if (drive != drives_.end()) {
+      offset += gain * drive->second.offset;
+      gain *= drive->second.gain;
+    }
+    way->move(X_JZ);
+    if (drive == drives_.end() || gain == 0) {  // stands still
+      Vector6d twist = Vector6d::Zero();
+      twist(slides ? 2 : 5) = sense * offset;
+      way->move(exp(twist) * X_JZ.inverse());
+      return;
+    }
+    ScrewJoint screw;
+    screw.signal = drive->second.signal;
+    screw.offset = offset / gain;
+    (slides ? screw.slide : screw.turn) = sense * gain;
+    screw.X_after = X_JZ.inverse();
+    way->joints.push_back(screw);
+  }
+
+  void add_edge(int from, int to, const Way& way) {
+    Edge edge;
+    edge.from = from;
+    edge.to = to;
+    edge.left = way.left;
+    edge.joints = way.joints;
+    const auto size = static_cast<Eigen::Index>(6 + 8 * way.joints.size());
+    edge.parameter_covariance = Eigen::MatrixXd::Zero(size, size);
+    edge.parameter_covariance.diagonal().tail<6>() = variances_;
+    schema_.edges.push_back(std::move(edge));
+  }
+
+  const urdf::ModelInterface& model_;
+  const std::filesystem::path urdf_;
+  BodySchema schema_;
+  std::map<std::string, Drive> drives_;                                // by joint
+  std::map<std::string, std::vector<std::pair<int, Pose>>> parts_on_;  // by link
+  Vector6d variances_ = Vector6d::Zero();
+};
+
+struct EngineerArguments {
+  std::string urdf, placement, samples, out;
+  bool json = false;
+};
+
+void run_engineer(const EngineerArguments& arguments) {
+  BodySchema schema = engineered_model(arguments.urdf, arguments.placement);
+  const Recording recording = load_for(arguments.samples, schema);
+  MeasurementModel measurement;
+  if (recording.is_log) measurement.model_error = kTagModelError;
+  if (!recording.has_noise) measurement.noise = Noise{0.001, 0.2 * M_PI / 180};  // weights alone
+  estimate_root_pose(recording.samples, measurement, &schema);
+  if (schema.X_CR_covariance.isZero(0))
+    throw std::runtime_error(arguments.samples + ": the root, part " + std::to_string(schema.root) +
+                             ", is never seen");
+  check_out(arguments.out, {arguments.samples, arguments.urdf, arguments.placement});
+  write_one_event_log(arguments.out, kBodySchema, to_message(schema));
+  if (arguments.json) {
+    std::cout << schema_json(schema).dump(2) << std::endl;
+  } else {
+    std::cout << structure_text(schema) << std::flush;
+  }
+}
+
+}  // namespace
+
+BodySchema engineered_model(const std::filesystem::path& urdf,
+                            const std::filesystem::path& placement) {
+  const auto model = read_urdf(urdf);
+  const Yaml yaml = Yaml::load(placement);
+  Walk walk(*model, urdf, yaml);
+  yaml.finish();
+  return walk.run();
+}
+
+void add_engineer_command(CLI::App& console) {
+  const auto arguments = std::make_shared<EngineerArguments>();
+  CLI::App* engineer = console.add_subcommand(
+      "engineer", "A schema from a URDF and where the parts are on its links");
+  engineer->add_option("URDF", arguments->urdf, "The robot")->required();
+  engineer->add_option("PLACEMENT", arguments->placement, "YAML: root, signals, parts on links")
+      ->required();
+  engineer
+      ->add_option("--samples", arguments->samples,
+                   "A recording that shows where the root stands in the camera's frame")
+      ->required();
+  engineer->add_option("--out", arguments->out, "Write the schema to this file")->required();
+  engineer->add_flag("--json", arguments->json, "Print JSON");
+  engineer->callback([arguments] { run_engineer(*arguments); });
+}
+
+}  // namespace bodyschema

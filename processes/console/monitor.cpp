@@ -1,0 +1,148 @@
+#include "processes/console/monitor.h"
+
+#include <fmt/format.h>
+
+#include <CLI/CLI.hpp>
+#include <cmath>
+#include <iostream>
+#include <memory>
+#include <nlohmann/json.hpp>
+#include <optional>
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+#include "common/bus/convert.h"
+#include "common/bus/event_log.h"
+#include "processes/console/evaluation.h"
+#include "processes/console/offline.h"
+#include "processes/console/recording.h"
+#include "processes/console/schema_json.h"
+#include "processes/model_monitor/adaptation.h"
+#include "processes/structure_learner/learn.h"
+
+namespace bodyschema {
+namespace {
+
+using Json = nlohmann::ordered_json;
+
+struct MonitorArguments {
+  std::string schema;
+  std::string samples;
+  std::string out;
+  std::string evaluate;
+  std::vector<double> noise;
+  bool json = false;
+};
+
+double seconds(const ActionPoseSample& sample) { return 1e-6 * static_cast<double>(sample.utime); }
+
+Json event_json(const AdaptationEvent& event, const ActionPoseSample& sample) {
+  Json json;
+  json["sample"] = event.sample_index;
+  json["t"] = seconds(sample);
+  json["event"] = name_of(event.kind);
+  if (event.part >= 0) {
+    json["part"] = event.part;
+  } else {
+    json["from"] = event.from;
+    json["to"] = event.to;
+  }
+  if (!event.cause.empty()) json["cause"] = event.cause;
+  json["margin"] = event.margin;
+  json["samples_used"] = event.num_samples;
+  if (event.probe.size() > 0)
+    json["action"] =
+        std::vector<double>(event.probe.data(), event.probe.data() + event.probe.size());
+  return json;
+}
+
+std::string event_text(const AdaptationEvent& event) {
+  const std::string place = event.part >= 0 ? fmt::format("part {}", event.part)
+                                            : fmt::format("edge {}-{}", event.from, event.to);
+  return fmt::format("sample {:5}  {:<12}  {:<10}  {:<16}  {:6.1f} nats  {} samples\n",
+                     event.sample_index, name_of(event.kind), place, event.cause, event.margin,
+                     event.num_samples);
+}
+
+AdaptationOptions options_of(const MonitorArguments& arguments, const Recording& recording,
+                             const BodySchema& schema) {
+  AdaptationOptions options;
+  if (recording.is_log) options.noise.model_error = kTagModelError;
+  if (!arguments.noise.empty()) {
+    for (const double noise : arguments.noise)
+      if (!std::isfinite(noise) || noise <= 0)
+        throw std::invalid_argument("--noise: expected two standard deviations above 0");
+    options.noise.noise = Noise{arguments.noise[0], arguments.noise[1] * M_PI / 180};
+  } else if (!recording.has_noise) {
+    if (!(schema.noise.position_m > 0 && schema.noise.rotation_rad > 0))
+      throw std::invalid_argument(arguments.samples + " and " + arguments.schema +
+                                  " do not say how noisy the markers are: give --noise");
+    options.noise.noise = schema.noise;
+  }
+  return options;
+}
+
+void run_monitor(const MonitorArguments& arguments) {
+  BodySchema schema = load_schema(arguments.schema);
+  const Recording recording = load_for(arguments.samples, schema);
+  std::optional<Recording> evaluation;
+  if (!arguments.evaluate.empty()) evaluation = load_for(arguments.evaluate, schema);
+  if (schema.edges.empty())
+    throw std::invalid_argument(arguments.schema + ": expected a schema with edges, found none");
+  check_out(arguments.out, {arguments.samples, arguments.schema, arguments.evaluate});
+
+  Adaptation adaptation(schema, options_of(arguments, recording, schema));
+  int num_events = 0;
+  for (const ActionPoseSample& sample : recording.samples) {
+    for (const AdaptationEvent& event : adaptation.on_sample(sample)) {
+      ++num_events;
+      if (arguments.json)
+        std::cout << event_json(event, sample).dump() << '\n';
+      else
+        std::cout << event_text(event);
+    }
+    if (!evaluation) continue;
+    const auto errors = evaluate(adaptation.schema(), evaluation->samples);
+    Json line;
+    line["sample"] = sample.sample_index;
+    line["t"] = seconds(sample);
+    line.update(errors_json(static_cast<int>(evaluation->samples.size()), errors));
+    if (arguments.json) {
+      std::cout << line.dump() << '\n';
+    } else if (sample.sample_index + 1 == std::ssize(recording.samples)) {
+      std::cout << errors_text(errors);
+    }
+  }
+  if (!arguments.json)
+    std::cout << fmt::format("{} samples, {} events\n", recording.samples.size(), num_events);
+  std::cout << std::flush;
+  if (arguments.out.empty()) return;
+  schema = adaptation.schema();
+  schema.base_version = schema.version;
+  schema.last_sample_index = recording.samples.back().sample_index;
+  schema.version = schema.last_sample_index + 1;
+  write_one_event_log(arguments.out, kBodySchema, to_message(schema));
+}
+
+}  // namespace
+
+void add_monitor_command(CLI::App& console) {
+  const auto arguments = std::make_shared<MonitorArguments>();
+  CLI::App* monitor = console.add_subcommand(
+      "monitor", "Keep a schema true over a recording in which the body changes");
+  monitor->add_option("SCHEMA", arguments->schema, "Schema file to start from")->required();
+  monitor->add_option("SAMPLES", arguments->samples, "Recording (LCM log or CSV)")->required();
+  monitor->add_option("--out", arguments->out, "Write the schema as it is in the end to this file");
+  monitor->add_option("--evaluate", arguments->evaluate,
+                      "Compare the schema with this recording after every sample");
+  monitor
+      ->add_option("--noise", arguments->noise,
+                   "Standard deviation per axis and marker: position [m], rotation [deg]")
+      ->expected(2)
+      ->type_name("POS_M ROT_DEG");
+  monitor->add_flag("--json", arguments->json, "Print one JSON line an event (and a sample)");
+  monitor->callback([arguments] { run_monitor(*arguments); });
+}
+
+}  // namespace bodyschema
