@@ -586,11 +586,16 @@ std::string check(const model_health_t& message) {
   check.integer_at_least("num_test_samples", message.num_test_samples, 0);
   check.measured("worst_position_m", message.worst_position_m);
   check.measured("worst_rotation_rad", message.worst_rotation_rad);
+  check.measured("noise_scale", message.noise_scale);
+  check.integer_at_least("probe_sample", message.probe_sample, -1);
+  check.numbers("probe_action", message.num_probe, message.probe_action, kMaxSignals);
   check.each("edge_health", message.num_edges, message.edge_health, kMaxParts,
              [&](const edge_health_t& edge) {
                check.integer_at_least("health_from", edge.health_from, 0);
                check.integer_at_least("health_to", edge.health_to, 0);
                check.constant("edge_state", edge.edge_state, schema_edge_t::EDGE_PROVISIONAL);
+               check.flag("edge_is_drifting", edge.edge_is_drifting);
+               check.measured("edge_cusum", edge.edge_cusum);
                check.integer_at_least("num_tests", edge.num_tests, 0);
                check.measured("median_mahalanobis2", edge.median_mahalanobis2);
              });
@@ -598,6 +603,11 @@ std::string check(const model_health_t& message) {
   check.each("part_health", message.num_parts, message.part_health, kMaxParts,
              [&](const part_health_t& part) {
                check.ascending("health_part", part.health_part, previous_part);
+               check.constant("part_state", part.part_state, schema_edge_t::EDGE_PROVISIONAL);
+               check.flag("is_unseen", part.is_unseen);
+               check.flag("is_flipping", part.is_flipping);
+               check.measured("marker_cusum", part.marker_cusum);
+               check.measured("camera_cusum", part.camera_cusum);
                check.integer_at_least("num_predicted", part.num_predicted, 0);
                check.within("visibility", part.visibility, 0, 1);
                check.measured("position_median_m", part.position_median_m);
@@ -609,7 +619,13 @@ std::string check(const model_health_t& message) {
                check.ascending("event_number", event.event_number, previous_event);
                check.time("utime", event.utime);
                check.integer_at_least("event_sample", event.event_sample, -1);
-               check.constant("event_kind", event.event_kind, health_event_t::EVENT_RELOADED);
+               check.constant("event_kind", event.event_kind, health_event_t::EVENT_PROBE_WANTED);
+               check.integer_within("event_from", event.event_from, -1, kMaxId);
+               check.integer_within("event_to", event.event_to, -1, kMaxId);
+               check.integer_within("event_part", event.event_part, -1, kMaxId);
+               check.text("event_cause", event.event_cause, kMaxText);
+               check.finite("event_margin", event.event_margin);
+               check.integer_at_least("samples_used", event.samples_used, 0);
                check.text("event_text", event.event_text, kMaxText);
              });
   return check.problem();

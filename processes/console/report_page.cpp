@@ -352,6 +352,7 @@ class Page {
         for (const edge_health_t& item : record_.health()->edge_health) {
           if (item.health_from != edge.from || item.health_to != edge.to) continue;
           health = kStates[item.edge_state];
+          if (item.edge_is_drifting == 1) health += ", drifting";
           if (item.median_mahalanobis2 >= 0)
             distance = fmt::format("{:.1f}", item.median_mahalanobis2);
         }
@@ -545,9 +546,21 @@ class Page {
     html += faults.html();
     constexpr std::size_t kMost = 40;
     const std::vector<health_event_t> all = record_.events();
-    Table table({"#sample", "what the monitor decided"});
-    for (std::size_t i = all.size() - std::min(all.size(), kMost); i < all.size(); ++i)
-      table.row({std::to_string(all[i].event_sample), escape_html(all[i].event_text)});
+    Table table({"#sample", "what the monitor decided", "where", "cause", "#margin", "#samples"});
+    for (std::size_t i = all.size() - std::min(all.size(), kMost); i < all.size(); ++i) {
+      const health_event_t& event = all[i];
+      const bool is_proposal = event.event_kind <= health_event_t::EVENT_SCHEMA_REFUSED;
+      std::string where;
+      if (event.event_from >= 0)
+        where = fmt::format("{} → {}", event.event_from, event.event_to);
+      else if (event.event_part >= 0)
+        where = fmt::format("part {}", event.event_part);
+      table.row({std::to_string(event.event_sample),
+                 is_proposal ? escape_html(event.event_text) : name_of_event(event.event_kind),
+                 where, escape_html(event.event_cause),
+                 event.event_margin != 0 ? fmt::format("{:.1f} nats", event.event_margin) : "",
+                 event.samples_used > 0 ? std::to_string(event.samples_used) : ""});
+    }
     html += table.html();
     if (all.size() > kMost)
       html += fmt::format("<p class=\"note\">The newest {} of {}.</p>\n", kMost, all.size());

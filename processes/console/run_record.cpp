@@ -141,6 +141,13 @@ void RunRecord::on_markers(const marker_poses_t& markers) {
   if (best_markers_.size() > kMostPictures) best_markers_.pop_back();
 }
 
+const char* name_of_event(std::int8_t kind) {
+  static const char* const kNames[] = {"accepted", "refused",   "mismatch", "candidate",
+                                       "refined",  "restored",  "reverted", "recovered",
+                                       "drift",    "missing",   "probe_wanted"};
+  return kind >= 0 && kind <= health_event_t::EVENT_PROBE_WANTED ? kNames[kind] : "";
+}
+
 std::vector<health_event_t> RunRecord::events() const {
   std::vector<health_event_t> result;
   for (const auto& [key, event] : events_) result.push_back(event);

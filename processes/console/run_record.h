@@ -14,6 +14,9 @@
 
 namespace bodyschema {
 
+/// "mismatch", "candidate", … of a health_event_t's event_kind.
+const char* name_of_event(std::int8_t kind);
+
 /// What the logs of a run say, kept so that it can be told at any time. Bounded memory but for the
 /// samples: of images only their places are kept, long series are thinned.
 class RunRecord {

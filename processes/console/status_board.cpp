@@ -7,6 +7,8 @@
 #include <set>
 #include <utility>
 
+#include "processes/console/run_record.h"
+
 namespace bodyschema {
 namespace {
 
@@ -41,6 +43,13 @@ std::vector<std::string> signals_of(const body_schema_t& schema, const schema_ed
     if (std::find(names.begin(), names.end(), name) == names.end()) names.push_back(name);
   }
   return names;
+}
+
+std::vector<std::string> flags_of(const part_health_t& part) {
+  std::vector<std::string> flags;
+  if (part.is_unseen == 1) flags.push_back("unseen");
+  if (part.is_flipping == 1) flags.push_back("flipping");
+  return flags;
 }
 
 const edge_health_t* find_health(const std::optional<model_health_t>& health,
@@ -371,6 +380,8 @@ std::string StatusBoard::text(int width) const {
                            health->median_mahalanobis2 < 0
                                ? "–"
                                : fmt::format("{:.1f}", health->median_mahalanobis2));
+        if (health->edge_is_drifting == 1) row += "  drifting";
+        if (health->edge_cusum > 0) row += fmt::format("  {:.1f} nats against", health->edge_cusum);
       }
       line(row);
     }
@@ -384,11 +395,15 @@ std::string StatusBoard::text(int width) const {
     line("");
     line(fmt::format("  {:<9} {:>5}  {:>18}", "part", "seen", "held-out error"));
     for (const part_health_t& part : health_->part_health) {
-      line(fmt::format("  {:<9} {:>3.0f} %  {:>18}", part.health_part, part.visibility * 100,
-                       part.position_median_m < 0
-                           ? "–"
-                           : fmt::format("{:.2f} mm {:.2f}°", part.position_median_m * 1e3,
-                                         part.rotation_median_rad * kDegrees)));
+      std::string row = fmt::format(
+          "  {:<9} {:>3.0f} %  {:>18}", part.health_part, part.visibility * 100,
+          part.position_median_m < 0 ? "–"
+                                     : fmt::format("{:.2f} mm {:.2f}°", part.position_median_m * 1e3,
+                                                   part.rotation_median_rad * kDegrees));
+      if (part.part_state != schema_edge_t::EDGE_OK)
+        row += fmt::format("  {}", kEdgeStates[part.part_state]);
+      for (const std::string& flag : flags_of(part)) row += "  " + flag;
+      line(row);
     }
   }
   if (health_ && !health_->events.empty()) {
@@ -474,6 +489,8 @@ ordered_json StatusBoard::json() const {
            {"position_rms_m", edge.position_rms_m},
            {"rotation_rms_deg", edge.rotation_rms_rad * kDegrees},
            {"state", kEdgeStates[health ? health->edge_state : edge.state]},
+           {"drifting", health && health->edge_is_drifting == 1},
+           {"cusum", health && health->edge_cusum >= 0 ? ordered_json(health->edge_cusum) : nullptr},
            {"tests", health ? health->num_tests : 0},
            {"median_mahalanobis2", health && health->median_mahalanobis2 >= 0
                                        ? ordered_json(health->median_mahalanobis2)
@@ -493,14 +510,24 @@ ordered_json StatusBoard::json() const {
       json["parts"].push_back(
           {{"part", part.health_part},
            {"visibility", part.visibility},
+           {"state", kEdgeStates[part.part_state]},
+           {"flags", flags_of(part)},
            {"tests", part.num_predicted},
            {"position_median_m", is_tested ? ordered_json(part.position_median_m) : nullptr},
            {"rotation_median_deg",
             is_tested ? ordered_json(part.rotation_median_rad * kDegrees) : nullptr}});
     }
     for (const health_event_t& event : health_->events) {
+      const auto id = [](std::int32_t part) { return part < 0 ? ordered_json() : ordered_json(part); };
       json["events"].push_back({{"number", event.event_number},
                                 {"sample", event.event_sample},
+                                {"event", name_of_event(event.event_kind)},
+                                {"from", id(event.event_from)},
+                                {"to", id(event.event_to)},
+                                {"part", id(event.event_part)},
+                                {"cause", event.event_cause},
+                                {"margin", event.event_margin},
+                                {"samples_used", event.samples_used},
                                 {"text", event.event_text}});
     }
   }

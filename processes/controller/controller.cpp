@@ -306,7 +306,18 @@ EdgeState Controller::worst_edge(std::string* name) const {
     }
     if (severity(state) <= severity(worst)) continue;
     worst = state;
-    if (name) *name = std::to_string(edge.from) + "–" + std::to_string(edge.to);
+    if (name) *name = "edge " + std::to_string(edge.from) + "–" + std::to_string(edge.to);
+  }
+  // The marker by which the part is seen, and that of the root or the camera.
+  if (health_ && health_->schema_version == schema_->version && worst != EdgeState::kInvalid) {
+    for (const part_health_t& health : health_->part_health) {
+      if (health.part_state != schema_edge_t::EDGE_INVALID ||
+          (health.health_part != target_.target_part && health.health_part != schema_->root))
+        continue;
+      worst = EdgeState::kInvalid;
+      if (name) *name = "the marker of part " + std::to_string(health.health_part);
+      break;
+    }
   }
   return worst;
 }
@@ -387,7 +398,7 @@ Controller::Command Controller::advance() {
     is_taken_ = false;
     if (state_ != S::CONTROL_LENT) lent_.restart();
     enter(S::CONTROL_LENT, false,
-          "edge " + edge + " is invalid: the babbler has the arm until it is mended");
+          edge + " is invalid: the babbler has the arm until it is mended");
     return std::nullopt;
   }
   if (!owns_arm_ || state_ == S::CONTROL_LENT) {
@@ -477,7 +488,7 @@ Controller::Command Controller::step() {
   answer_wait_.restart();
   ++num_moves_;
   enter(S::CONTROL_MOVING, true,
-        is_slow ? "in small steps: edge " + doubtful + " is in doubt" : "towards the target");
+        is_slow ? "in small steps: " + doubtful + " is in doubt" : "towards the target");
   return command_;
 }
 

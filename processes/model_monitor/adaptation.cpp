@@ -28,7 +28,7 @@ constexpr int kProbeCandidates = 200;
 constexpr int kFewestSightings = 10;
 constexpr std::int64_t kSoon = 150;
 constexpr double kMedianChiSquare6 = 5.348;
-constexpr double kLeastScale = 0.2, kLargestScale = 5;
+constexpr double kLargestScale = 5;
 constexpr std::size_t kFewestDistances = 20;
 /// Quiet samples after which the noise is looked at again.
 constexpr int kQuietSamples = 32;
@@ -105,6 +105,32 @@ Adaptation::Adaptation(BodySchema schema, AdaptationOptions options)
   install(schema_);
 }
 
+Adaptation::Adaptation(BodySchema schema, AdaptationOptions options,
+                       std::vector<BodySchema> history, const std::vector<ActionPoseSample>& past)
+    : Adaptation(std::move(schema), options) {
+  num_samples_ = options_.calibration_samples;
+  std::vector<AdaptationEvent> old_news;
+  for (const ActionPoseSample& sample : past) {
+    watch_visibility(sample, &old_news);
+    if (sample.purpose == Purpose::kTest) recent_.push_back(sample);
+  }
+  calibrate();
+  recent_.clear();
+  install(schema_);
+  if (history.empty()) return;
+  history_ = std::move(history);
+  remember(schema_);
+}
+
+EdgeState Adaptation::state_of(const Place& place) const {
+  if (detected_ == place) return EdgeState::kInvalid;
+  for (const Replacement& r : replacements_)
+    if (r.place == place) return EdgeState::kProvisional;
+  if (!place.marker && drifting_ == place.part) return EdgeState::kProvisional;
+  const double statistic = place.marker ? marker_statistic(place.part) : edge_statistic(place.part);
+  return statistic > options_.suspicion ? EdgeState::kSuspect : EdgeState::kOk;
+}
+
 void Adaptation::install(const BodySchema& schema) {
   schema_ = schema;
   filter_.emplace(schema_, noise_);
@@ -124,15 +150,6 @@ double Adaptation::edge_statistic(int part) const {
 double Adaptation::marker_statistic(int part) const {
   const int node = filter_->node_of(part);
   return node < 0 ? 0 : markers_[static_cast<std::size_t>(node)].value;
-}
-
-EdgeState Adaptation::state(const Place& place) const {
-  if (detected_ == place) return EdgeState::kInvalid;
-  const bool is_replaced = std::any_of(replacements_.begin(), replacements_.end(),
-                                       [&place](const Replacement& r) { return r.place == place; });
-  if (is_replaced || (drifting_ == place.part && !place.marker)) return EdgeState::kProvisional;
-  const double statistic = place.marker ? marker_statistic(place.part) : edge_statistic(place.part);
-  return statistic > options_.suspicion ? EdgeState::kSuspect : EdgeState::kOk;
 }
 
 TreeFilter::Judgement Adaptation::update_tests(const TreeFilter::Instant& instant,
@@ -183,7 +200,7 @@ void Adaptation::calibrate() {
     }
     if (distances.size() < kFewestDistances) return;
     const double scale = std::sqrt(median(distances) / kMedianChiSquare6);
-    noise_.scale = std::clamp(noise_.scale * scale, kLeastScale, kLargestScale);
+    noise_.scale = std::clamp(noise_.scale * scale, options_.least_noise_scale, kLargestScale);
   }
   // A few samples tell no better than this.
   if (std::abs(std::log(noise_.scale)) < 0.15) noise_.scale = options_.noise.scale;
@@ -197,7 +214,8 @@ void Adaptation::watch_noise(const TreeFilter::Judgement& judgement) {
   quiet_distances_.clear();
   num_quiet_ = 0;
   if (std::abs(std::log(scale)) < 0.05) return;
-  noise_.scale = std::clamp(noise_.scale * std::sqrt(scale), kLeastScale, kLargestScale);
+  noise_.scale =
+      std::clamp(noise_.scale * std::sqrt(scale), options_.least_noise_scale, kLargestScale);
   install(schema_);
 }
 

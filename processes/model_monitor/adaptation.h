@@ -17,6 +17,9 @@ struct AdaptationOptions {
   MarkerNoise noise;
   /// Wished false alarms a sample, over all tests together.
   double false_alarm_rate = 1e-5;
+  /// Below it noise_scale() does not go. 1 where the assumed noise has room for rare errors that a
+  /// median does not see, as the view-dependent bias of real markers.
+  double least_noise_scale = 0.2;
   double suspicion = 1.5;  ///< CUSUM above which candidates are tried [nats]
   double acceptance = 12;  ///< evidence over the schema that stands [nats]
   double ambiguity = 6;    ///< a runner-up nearer than this asks for a probe [nats]
@@ -67,6 +70,11 @@ const char* name_of(AdaptationEvent::Kind kind);
 class Adaptation {
  public:
   Adaptation(BodySchema schema, AdaptationOptions options);
+  /// Begins with what is remembered: schemas of an earlier time, the first pinned, and samples from
+  /// before, of which those that are TEST tell the noise and all tell how often a part is seen. No
+  /// sample is then spent on calibration.
+  Adaptation(BodySchema schema, AdaptationOptions options, std::vector<BodySchema> history,
+             const std::vector<ActionPoseSample>& past);
 
   /// The events of this sample. A pure function of the samples so far. Parts that the schema does
   /// not know are ignored.
@@ -77,16 +85,21 @@ class Adaptation {
   /// CUSUM of the edge to a part (root: the camera's) and of the part's marker [nats].
   double edge_statistic(int part) const;
   double marker_statistic(int part) const;
-  /// State of the edge to a part (root: of the camera's pose) and of the part's marker. kInvalid:
-  /// found wrong, and nothing accepted in its place yet. kProvisional: replaced, or drifting, and
-  /// not settled.
-  EdgeState edge_state(int part) const { return state({part, false}); }
-  EdgeState marker_state(int part) const { return state({part, true}); }
+  /// Of the edge to a part (root: of the camera's pose) and of the part's marker: kSuspect while a
+  /// CUSUM is up, kInvalid from detection to replacement, kProvisional until that has settled, or
+  /// while it drifts.
+  EdgeState edge_state(int part) const { return state_of({part, false}); }
+  EdgeState marker_state(int part) const { return state_of({part, true}); }
   /// True over assumed standard deviation of the markers, as the residuals of quiet samples show
   /// it.
   double noise_scale() const { return noise_.scale; }
   /// Parts whose markers have not been seen for longer than chance explains.
   std::vector<int> missing_parts() const;
+  bool is_drifting(int part) const { return drifting_ == part; }
+  /// First sample with the body as changed by the replacements that have not settled.
+  std::int64_t since() const { return since_; }
+  const std::vector<BodySchema>& history() const { return history_; }
+  const AdaptationOptions& options() const { return options_; }
   bool is_settled() const { return replacements_.empty() && !detected_ && !drifting_; }
 
  private:
@@ -104,7 +117,7 @@ class Adaptation {
     FittedChange fitted;
   };
 
-  EdgeState state(const Place& place) const;
+  EdgeState state_of(const Place& place) const;
   void calibrate();
   void begin_drift(int part, std::int64_t sample_index, std::vector<AdaptationEvent>* events);
   void watch_drift(std::int64_t sample_index, std::vector<AdaptationEvent>* events);

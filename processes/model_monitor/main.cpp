@@ -4,11 +4,13 @@
 
 #include <CLI/CLI.hpp>
 #include <filesystem>
+#include <utility>
 
 #include "common/bus/process.h"
 #include "common/bus/rig_door.h"
 #include "common/bus/sample_intake.h"
 #include "processes/model_monitor/model_monitor.h"
+#include "processes/model_monitor/monitor_memory.h"
 #include "processes/model_monitor/saved_message.h"
 
 using namespace bodyschema;
@@ -30,28 +32,33 @@ int main(int argc, char** argv) {
     app.add_option("--samples", samples_file, "The observer's samples.lcmlog, read at start");
     app.add_flag("--replayed", is_replayed,
                  "The samples are a recording's and no observer runs: what is missing is given up");
-    app.add_option("--schema", schema_file,
-                   "Where the body schema is kept, and health.lcmlog beside it; reloaded at start");
+    app.add_option(
+        "--schema", schema_file,
+        "Where the body schema is kept, and history.lcmlog beside it; reloaded at start");
   };
   const auto body = [&](Process& process) {
     const RigDoor door(process.rig_folder());
     ModelMonitor monitor(ModelMonitorConfig::load(process.config_file()));
-    SampleIntake intake(
-        samples_file, [&](const sample_t& sample) { monitor.on_sample(sample); },
-        SampleIntake::asking(process, !is_replayed));
     SavedMessage saved_schema(schema_file, kBodySchema);
-    SavedMessage saved_health(beside(schema_file, "health.lcmlog"), kModelHealth);
+    MemoryFile saved_memory(beside(schema_file, "history.lcmlog"));
     {
-      const auto not_ours = [&](const auto& message) { return door.objection(message); };
+      const auto not_ours = [&](const body_schema_t& schema) { return door.objection(schema); };
       const auto schema = saved_schema.load(not_ours);
-      const auto health = saved_health.load(not_ours);
-      if (schema || health) monitor.reload(schema, health);
+      if (const auto memory = saved_memory.load(not_ours)) {
+        monitor.restore(*memory);
+      } else if (schema) {
+        monitor.start_from(*schema);
+      }
     }
+    bool is_news = false;
+    SampleIntake intake(
+        samples_file, [&](const sample_t& sample) { is_news |= monitor.on_sample(sample); },
+        SampleIntake::asking(process, !is_replayed));
 
     std::string problem;
     const auto publish = [&] {
-      // The health first: ModelMonitor::reload() knows what it means if the process is killed here.
-      std::string not_saved = saved_health.save(monitor.health());
+      // The memory first: the schema is found again from it and the samples.
+      std::string not_saved = saved_memory.save(monitor.memory());
       if (monitor.schema()) {
         if (not_saved.empty()) not_saved = saved_schema.save(*monitor.schema());
         process.bus().publish(kBodySchema, *monitor.schema());
@@ -80,18 +87,16 @@ int main(int argc, char** argv) {
     say();
     Bus& bus = process.bus();
     door.subscribe(process, kSample, [&](const sample_t& sample) {
-      const std::int64_t judged = monitor.health().judged_sample;
       intake.on_sample(sample);
-      if (monitor.health().judged_sample != judged) publish();
+      if (std::exchange(is_news, false)) publish();
     });
     door.subscribe(process, kLearnedSchema, [&](const body_schema_t& proposal) {
       if (monitor.on_learned_schema(proposal)) publish();
     });
     std::int64_t sent_us = 0;
     process.on_tick([&](std::int64_t now_us) {
-      const std::int64_t judged = monitor.health().judged_sample;
       intake.on_tick(now_us);
-      if (monitor.health().judged_sample != judged) publish();
+      if (std::exchange(is_news, false)) publish();
       process.set_counters(intake.counters());
       if (bus.is_replay() || now_us - sent_us < 1'000'000) return;
       sent_us = now_us;

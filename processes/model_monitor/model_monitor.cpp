@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <stdexcept>
 #include <utility>
 
 #include "common/bus/convert.h"
@@ -14,6 +15,13 @@ namespace {
 
 constexpr std::size_t kMaxEvents = 32;
 constexpr std::size_t kMaxWaiting = 32;
+/// Samples before a base that tell its noise and how often parts are seen.
+constexpr std::size_t kPast = 64;
+/// States kept for proposals that did not come yet; what is between them is gone through again.
+constexpr std::size_t kMaxKept = 12;
+/// Samples after which a schema that stands undoubted is the base itself, so that a restart has few
+/// to go through again.
+constexpr std::int64_t kRenewal = 500;
 
 /// Mean of the two middle values where their number is even; −1 if there is none.
 double median(std::vector<double> values) {
@@ -45,38 +53,64 @@ ModelMonitorConfig ModelMonitorConfig::load(const std::filesystem::path& file) {
   config.max_outlier_share = yaml.number("max_outlier_share", 0, 1);
   config.model_error.position_m = yaml.number("model_error_position_m", 0, 1);
   config.model_error.rotation_rad = yaml.number("model_error_rotation_deg", 0, 90) * (M_PI / 180);
+  config.false_alarm_rate = yaml.number("false_alarm_rate", 0, 0.01);
+  config.outlier_rate = yaml.number("outlier_rate", 0, 0.5);
   yaml.finish();
   return config;
 }
 
 ModelMonitor::ModelMonitor(ModelMonitorConfig config) : config_(config) {
-  health_.judged_sample = -1;
-  health_.worst_position_m = -1;
-  health_.worst_rotation_rad = -1;
+  // model_error is that of a pair of markers.
+  options_.noise.model_error = {config_.model_error.position_m / std::sqrt(2.0),
+                                config_.model_error.rotation_rad / std::sqrt(2.0)};
+  options_.least_noise_scale = 1;
+  options_.noise.outlier_rate = config_.outlier_rate;
+  if (config_.false_alarm_rate > 0) options_.false_alarm_rate = config_.false_alarm_rate;
+  for (model_health_t* health : {&health_, &memory_.at_base, &memory_.verdicts}) {
+    health->judged_sample = -1;
+    health->worst_position_m = health->worst_rotation_rad = -1;
+    health->noise_scale = -1;
+    health->probe_sample = -1;
+  }
 }
 
-void ModelMonitor::reload(const std::optional<body_schema_t>& schema,
-                          const std::optional<model_health_t>& health) {
-  std::int64_t judged = -1;
-  if (health) {
-    set_array(health_.num_events, health_.events, health->events);
-    if (health->num_events > 0) num_events_ = health->events.back().event_number + 1;
+void ModelMonitor::Standing::add(health_event_t event) {
+  event.event_number = num_events++;
+  if (events.size() == kMaxEvents) events.erase(events.begin());
+  events.push_back(std::move(event));
+}
+
+void ModelMonitor::start_from(const body_schema_t& schema) {
+  MonitorMemory memory = memory_;
+  memory.schemas = {schema};
+  memory.at_base.utime = memory.verdicts.utime = schema.utime;
+  memory.at_base.judged_sample = memory.verdicts.judged_sample = schema.last_sample_index;
+  restore(memory);
+}
+
+void ModelMonitor::restore(const MonitorMemory& memory) {
+  memory_ = memory;
+  judged_sample_ = memory.verdicts.judged_sample;
+  judged_utime_ = memory.verdicts.utime;
+  restored_sample_ = memory.at_base.judged_sample;
+  now_ = {};
+  kept_.clear();
+  now_.sample_index = restored_sample_;
+  now_.events = memory.at_base.events;
+  if (!now_.events.empty()) now_.num_events = now_.events.back().event_number + 1;
+  if (!memory.schemas.empty()) {
+    BodySchema base = from_message(memory.schemas.back());
+    if (base.complete && config_.false_alarm_rate > 0) {
+      std::vector<BodySchema> history;
+      for (const body_schema_t& schema : memory.schemas) history.push_back(from_message(schema));
+      history.pop_back();
+      now_.live = begin(std::move(base), std::move(history), restored_sample_);
+    } else {
+      now_.proposed = std::move(base);
+    }
   }
-  if (schema) {
-    schema_ = from_message(*schema);
-    schema_message_ = schema;
-    judged = schema_.last_sample_index;
-  }
-  // Whatever was judged after the schema was refused; if the health tells of a newer schema than
-  // there is, that one was accepted but not saved.
-  if (health && health->schema_version == schema_.version) {
-    judged = std::max(judged, health->judged_sample);
-  }
-  if (schema) {
-    add_event(health_event_t::EVENT_RELOADED, schema_.last_sample_index, schema_.utime,
-              "version " + std::to_string(schema_.version) + " reloaded");
-  }
-  assess(judged);
+  kept_.emplace(now_.sample_index, now_);
+  publish();
 }
 
 bool ModelMonitor::on_sample(const sample_t& message) {
@@ -84,13 +118,30 @@ bool ModelMonitor::on_sample(const sample_t& message) {
   last_sample_index_ = message.sample_index;
   for (const auto& part : message.parts) seen_in_[part.part_id].push_back(message.sample_index);
   ActionPoseSample sample = from_message(message);
-  if (sample.purpose == Purpose::kTest) tests_.push_back(std::move(sample));
+  if (sample.purpose == Purpose::kTest) tests_.push_back(sample);
+  samples_.push_back(std::move(sample));
+  is_assessed_ = false;
+  if (last_sample_index_ < restored_sample_) {
+    if (samples_.size() > kPast) samples_.pop_front();
+    return false;
+  }
+  if (last_sample_index_ == restored_sample_) {
+    // What came before it is there now.
+    restore(MonitorMemory(memory_));
+    return true;
+  }
+  const std::int64_t version = schema_message_ ? schema_message_->schema_version : 0;
+  const std::int64_t num_events = now_.num_events;
+  advance(&now_, samples_.back());
+  if (samples_.back().purpose == Purpose::kTest) keep(now_);
+  publish();
 
   bool is_judged = false;
   while (!waiting_.empty() && waiting_.begin()->first <= last_sample_index_) {
     is_judged |= on_learned_schema(waiting_.extract(waiting_.begin()).mapped());
   }
-  return is_judged;
+  return is_judged || now_.num_events != num_events ||
+         (schema_message_ && schema_message_->schema_version != version);
 }
 
 bool ModelMonitor::on_learned_schema(const body_schema_t& proposal) {
@@ -100,7 +151,7 @@ bool ModelMonitor::on_learned_schema(const body_schema_t& proposal) {
     if (waiting_.size() > kMaxWaiting) waiting_.erase(std::prev(waiting_.end()));
     return false;
   }
-  if (proposal.last_sample_index <= health_.judged_sample) return false;
+  if (proposal.last_sample_index <= judged_sample_) return false;
   if (!is_test(proposal.last_sample_index)) return false;
   judge(proposal);
   return true;
@@ -112,20 +163,92 @@ bool ModelMonitor::is_test(std::int64_t sample_index) const {
   });
 }
 
-bool ModelMonitor::fits(const ActionPoseSample& sample) const {
-  return sample.action.size() == static_cast<Eigen::Index>(schema_.signals.size());
+bool ModelMonitor::fits(const BodySchema& schema, const ActionPoseSample& sample) {
+  return sample.action.size() == static_cast<Eigen::Index>(schema.signals.size());
 }
 
-ModelMonitor::EdgeTest ModelMonitor::test(const Edge& edge, std::int64_t up_to_sample) const {
+void ModelMonitor::keep(const Standing& standing) {
+  kept_.insert_or_assign(standing.sample_index, standing);
+  // The first is where all others can be found again from.
+  if (kept_.size() > kMaxKept) kept_.erase(std::next(kept_.begin()));
+}
+
+void ModelMonitor::advance(Standing* standing, const ActionPoseSample& sample) const {
+  standing->sample_index = sample.sample_index;
+  if (standing->live && fits(standing->live->schema(), sample)) {
+    const auto live = std::make_shared<LiveSchema>(*standing->live);
+    for (health_event_t& event : live->on_sample(sample)) standing->add(std::move(event));
+    standing->live = live;
+  }
+  for (const health_event_t& verdict : memory_.verdicts.events)
+    if (verdict.event_sample == sample.sample_index) standing->add(verdict);
+}
+
+ModelMonitor::Standing ModelMonitor::standing_after(std::int64_t sample_index) const {
+  Standing standing;
+  if (const auto after = kept_.upper_bound(sample_index); after != kept_.begin())
+    standing = std::prev(after)->second;
+  for (const ActionPoseSample& sample : samples_)
+    if (sample.sample_index > standing.sample_index && sample.sample_index <= sample_index)
+      advance(&standing, sample);
+  return standing;
+}
+
+void ModelMonitor::go_on_from(Standing standing) {
+  kept_.clear();
+  kept_.emplace(standing.sample_index, standing);
+  // Nothing begins before it any more.
+  const auto later = std::find_if(samples_.begin(), samples_.end(), [&](const auto& sample) {
+    return sample.sample_index > standing.sample_index;
+  });
+  const auto num_before = static_cast<std::size_t>(later - samples_.begin());
+  if (num_before > kPast)
+    samples_.erase(samples_.begin(),
+                   samples_.begin() + static_cast<std::ptrdiff_t>(num_before - kPast));
+  now_ = std::move(standing);
+  for (const ActionPoseSample& sample : samples_) {
+    if (sample.sample_index <= now_.sample_index) continue;
+    advance(&now_, sample);
+    if (sample.purpose == Purpose::kTest) keep(now_);
+  }
+  publish();
+}
+
+void ModelMonitor::publish() {
+  is_assessed_ = false;
+  const BodySchema* schema = now_.schema();
+  if (!schema)
+    schema_message_.reset();
+  else if (!schema_message_ || is_rewound_ || schema_message_->schema_version != schema->version)
+    // The base as it was accepted: what goes to and fro is not the same to the last bit.
+    schema_message_ = schema->version == memory_.schemas.back().schema_version
+                          ? memory_.schemas.back()
+                          : to_message(*schema);
+}
+
+std::shared_ptr<const LiveSchema> ModelMonitor::begin(BodySchema base,
+                                                      std::vector<BodySchema> history,
+                                                      std::int64_t up_to_sample) const {
+  std::vector<ActionPoseSample> past;
+  for (const ActionPoseSample& sample : samples_)
+    if (sample.sample_index <= up_to_sample && fits(base, sample)) past.push_back(sample);
+  if (past.size() > kPast)
+    past.erase(past.begin(), past.end() - static_cast<std::ptrdiff_t>(kPast));
+  return std::make_shared<LiveSchema>(std::move(base), options_, std::move(history), past);
+}
+
+ModelMonitor::EdgeTest ModelMonitor::test(const BodySchema& schema, const Edge& edge,
+                                          std::int64_t first, std::int64_t last) const {
   const Matrix6d model_error = diagonal(config_.model_error);
   EdgeTest result;
   std::vector<double> distances;
   for (const ActionPoseSample& sample : tests_) {
-    if (sample.sample_index > up_to_sample) break;
+    if (sample.sample_index > last) break;
+    if (sample.sample_index < first) continue;
     const PartObservation* from = sample.find(edge.from);
     const PartObservation* to = sample.find(edge.to);
-    if (!from || !to || !fits(sample)) continue;
-    const Eigen::VectorXd theta = schema_.displacements(sample.action);
+    if (!from || !to || !fits(schema, sample)) continue;
+    const Eigen::VectorXd theta = schema.displacements(sample.action);
     const Pose predicted = edge.predict(theta);
     const Matrix6d model = edge.prediction_covariance(theta) + model_error;
     // A planar marker has two poses; the likelier one under the model speaks.
@@ -147,16 +270,13 @@ ModelMonitor::EdgeTest ModelMonitor::test(const Edge& edge, std::int64_t up_to_s
   return result;
 }
 
-void ModelMonitor::judge(const body_schema_t& message) {
-  BodySchema proposal = from_message(message);
-  const std::int64_t index = proposal.last_sample_index;
-  const BodySchema previous = std::exchange(schema_, proposal);
-
+std::string ModelMonitor::objection(BodySchema* proposal, const Standing& standing,
+                                    bool* was_tested) const {
+  const std::int64_t index = proposal->last_sample_index;
   std::string objection;
-  bool was_tested = false;
-  for (Edge& edge : schema_.edges) {
-    const EdgeTest edge_test = test(edge, index);
-    was_tested |= edge_test.num_tests > 0;
+  for (Edge& edge : proposal->edges) {
+    const EdgeTest edge_test = test(*proposal, edge, edge.valid_since_sample, index);
+    *was_tested |= edge_test.num_tests > 0;
     edge.state = edge_test.num_tests > 0 ? EdgeState::kOk : EdgeState::kProvisional;
     // One refuting test may be an outlier however small the share that is tolerated.
     const double tolerated = std::max(1.0, config_.max_outlier_share * edge_test.num_tests);
@@ -166,49 +286,125 @@ void ModelMonitor::judge(const body_schema_t& message) {
                   std::to_string(edge_test.num_tests) + " tests";
     }
   }
-  if (objection.empty() && !was_tested) objection = "no test sample yet";
-  if (objection.empty() && schema_message_ && previous.complete && !schema_.complete) {
-    objection = "incomplete, where version " + std::to_string(previous.version) + " is complete";
+  const BodySchema* previous = standing.schema();
+  if (objection.empty() && !*was_tested) objection = "no test sample yet";
+  if (objection.empty() && previous && previous->complete && !proposal->complete) {
+    objection = "incomplete, where version " + std::to_string(previous->version) + " is complete";
   }
-
-  if (!objection.empty()) {
-    schema_ = previous;
-    if (was_tested) {
-      add_event(health_event_t::EVENT_SCHEMA_REFUSED, index, proposal.utime, objection);
-    }
-  } else {
-    // base_version stays the proposal's: which version stood here before depends on the speed of
-    // the learner.
-    schema_.version = index + 1;
-    schema_message_ = to_message(schema_);
-    schema_ = from_message(*schema_message_);  // judged as published, and as it will be reloaded
-    add_event(health_event_t::EVENT_SCHEMA_ACCEPTED, index, schema_.utime,
-              "version " + std::to_string(schema_.version) + ": " +
-                  std::to_string(schema_.edges.size()) + " edges, " +
-                  (schema_.complete ? "complete" : "incomplete"));
-  }
-  assess(index);
-  health_.utime = proposal.utime;
+  return objection;
 }
 
-void ModelMonitor::assess(std::int64_t up_to_sample) {
-  health_.utime = schema_.utime;
-  health_.schema_version = schema_.version;
-  health_.judged_sample = up_to_sample;
-  health_.schema_complete = schema_.complete;
-  health_.worst_position_m = -1;
-  health_.worst_rotation_rad = -1;
+void ModelMonitor::judge(const body_schema_t& message) {
+  BodySchema proposal = from_message(message);
+  const std::int64_t index = proposal.last_sample_index;
+  Standing standing = standing_after(index);
+  std::int64_t since = 0;
+  for (const Edge& edge : proposal.edges) since = std::max(since, edge.valid_since_sample);
+  judged_sample_ = index;
+  judged_utime_ = proposal.utime;
+
+  health_event_t event{};
+  event.utime = proposal.utime;
+  event.event_sample = index;
+  event.event_from = event.event_to = event.event_part = -1;
+  bool is_new_base = false;
+  // It rests on samples of a body that is no more; or it hides that it may be so.
+  const bool is_passed_over =
+      standing.live && (standing.live->is_in_doubt() || standing.live->holds_since() > since ||
+                        standing.live->schema().version > index);
+  if (!is_passed_over) {
+    bool was_tested = false;
+    const std::string why_not = objection(&proposal, standing, &was_tested);
+    if (why_not.empty()) {
+      // base_version stays the proposal's: which version stood here before depends on the speed of
+      // the learner.
+      proposal.version = index + 1;
+      event.event_kind = health_event_t::EVENT_SCHEMA_ACCEPTED;
+      event.event_text = "version " + std::to_string(proposal.version) + ": " +
+                         std::to_string(proposal.edges.size()) + " edges, " +
+                         (proposal.complete ? "complete" : "incomplete");
+      standing.add(event);
+      set_base(&standing, std::move(proposal));
+      is_new_base = true;
+    } else if (was_tested) {
+      event.event_kind = health_event_t::EVENT_SCHEMA_REFUSED;
+      event.event_text = why_not;
+      standing.add(event);
+      std::vector<health_event_t> verdicts = std::move(memory_.verdicts.events);
+      if (verdicts.size() == kMaxEvents) verdicts.erase(verdicts.begin());
+      verdicts.push_back(event);
+      verdicts.back().event_number =
+          verdicts.size() > 1 ? verdicts[verdicts.size() - 2].event_number + 1 : 0;
+      set_array(memory_.verdicts.num_events, memory_.verdicts.events, std::move(verdicts));
+    }
+  }
+  if (!is_new_base && standing.live && !standing.live->is_in_doubt() &&
+      index - standing.live->base().last_sample_index >= kRenewal &&
+      standing.live->is_camera_as_base()) {
+    BodySchema renewed = standing.live->schema();
+    renewed.last_sample_index = index;
+    set_base(&standing, std::move(renewed));
+  }
+  memory_.verdicts.utime = judged_utime_;
+  memory_.verdicts.judged_sample = judged_sample_;
+  is_rewound_ = true;
+  go_on_from(std::move(standing));
+  is_rewound_ = false;
+}
+
+void ModelMonitor::set_base(Standing* standing, BodySchema base) {
+  std::vector<BodySchema> history;
+  // As long as the body was one, earlier schemas are only worse.
+  if (standing->live && standing->live->holds_since() > 0) history = standing->live->history();
+  memory_.schemas.clear();
+  // As it will be restored.
+  for (BodySchema& schema : history) {
+    memory_.schemas.push_back(to_message(schema));
+    schema = from_message(memory_.schemas.back());
+  }
+  memory_.schemas.push_back(to_message(base));
+  base = from_message(memory_.schemas.back());
+  memory_.at_base.utime = base.utime;
+  memory_.at_base.judged_sample = standing->sample_index;
+  set_array(memory_.at_base.num_events, memory_.at_base.events, standing->events);
+  set_array(memory_.verdicts.num_events, memory_.verdicts.events, {});
+  standing->proposed.reset();
+  standing->live.reset();
+  if (base.complete && config_.false_alarm_rate > 0)
+    standing->live = begin(std::move(base), std::move(history), standing->sample_index);
+  else
+    standing->proposed = std::move(base);
+}
+
+const model_health_t& ModelMonitor::health() const {
+  if (is_assessed_) return health_;
+  is_assessed_ = true;
+  set_array(health_.num_events, health_.events, now_.events);
+  const BodySchema* schema = now_.schema();
+  health_.utime = judged_utime_;
+  health_.judged_sample = judged_sample_;
+  if (judged_sample_ < 0) return health_;
+  assess(schema ? *schema : BodySchema());
+  if (now_.live) now_.live->describe(&health_);
+  return health_;
+}
+
+void ModelMonitor::assess(const BodySchema& schema) const {
+  health_.schema_version = schema.version;
+  health_.schema_complete = schema.complete;
+  health_.worst_position_m = health_.worst_rotation_rad = -1;
   health_.num_test_samples = static_cast<std::int32_t>(
       std::count_if(tests_.begin(), tests_.end(),
-                    [&](const auto& sample) { return sample.sample_index <= up_to_sample; }));
+                    [&](const auto& sample) { return sample.sample_index <= judged_sample_; }));
 
   std::vector<edge_health_t> edges;
-  for (const Edge& edge : schema_.edges) {
-    const EdgeTest edge_test = test(edge, up_to_sample);
-    edge_health_t health;
+  for (const Edge& edge : schema.edges) {
+    const EdgeTest edge_test = test(schema, edge, edge.valid_since_sample, judged_sample_);
+    edge_health_t health{};
     health.health_from = edge.from;
     health.health_to = edge.to;
     health.edge_state = static_cast<std::int8_t>(edge.state);
+    health.edge_cusum = -1;
     health.num_tests = edge_test.num_tests;
     health.median_mahalanobis2 = edge_test.median_mahalanobis2;
     edges.push_back(health);
@@ -218,24 +414,27 @@ void ModelMonitor::assess(std::int64_t up_to_sample) {
   std::vector<part_health_t> parts;
   for (const auto& [part, indices] : seen_in_) {
     const auto num_seen =
-        std::upper_bound(indices.begin(), indices.end(), up_to_sample) - indices.begin();
+        std::upper_bound(indices.begin(), indices.end(), judged_sample_) - indices.begin();
     std::vector<double> position_errors, rotation_errors;
-    const auto path = KinematicPath::between(schema_, schema_.root, part);
+    const auto path = KinematicPath::between(schema, schema.root, part);
+    const std::int64_t since = now_.live ? now_.live->holds_since(part) : 0;
     for (const ActionPoseSample& sample : tests_) {
-      if (sample.sample_index > up_to_sample) break;
+      if (sample.sample_index > judged_sample_) break;
       const PartObservation* seen = sample.find(part);
-      if (!seen || !path || schema_.root < 0 || !fits(sample)) continue;
+      if (!seen || !path || schema.root < 0 || sample.sample_index < since || !fits(schema, sample))
+        continue;
       // The camera and the root stand still, so the root's mean pose serves: its orientation noise
       // would otherwise be read as an error of every part far away.
       const Pose error =
-          path->predict(sample.action).inverse() * schema_.X_CR.inverse() * seen->X_CB;
+          path->predict(sample.action).inverse() * schema.X_CR.inverse() * seen->X_CB;
       position_errors.push_back(error.translation().norm());
       rotation_errors.push_back(rotation_angle(error));
     }
-    part_health_t health;
+    part_health_t health{};
     health.health_part = part;
+    health.marker_cusum = health.camera_cusum = -1;
     health.num_predicted = static_cast<std::int32_t>(position_errors.size());
-    health.visibility = up_to_sample < 0 ? 0 : double(num_seen) / double(up_to_sample + 1);
+    health.visibility = double(num_seen) / double(judged_sample_ + 1);
     health.position_median_m = median(position_errors);
     health.rotation_median_rad = median(rotation_errors);
     health_.worst_position_m = std::max(health_.worst_position_m, health.position_median_m);
@@ -243,20 +442,6 @@ void ModelMonitor::assess(std::int64_t up_to_sample) {
     parts.push_back(health);
   }
   set_array(health_.num_parts, health_.part_health, std::move(parts));
-}
-
-void ModelMonitor::add_event(std::int8_t kind, std::int64_t sample_index, std::int64_t utime,
-                             std::string text) {
-  health_event_t event;
-  event.event_number = num_events_++;
-  event.utime = utime;
-  event.event_sample = sample_index;
-  event.event_kind = kind;
-  event.event_text = std::move(text);
-  std::vector<health_event_t> events = std::move(health_.events);
-  if (events.size() == kMaxEvents) events.erase(events.begin());
-  events.push_back(std::move(event));
-  set_array(health_.num_events, health_.events, std::move(events));
 }
 
 }  // namespace bodyschema

@@ -1,8 +1,10 @@
 #pragma once
 
 #include <cstdint>
+#include <deque>
 #include <filesystem>
 #include <map>
+#include <memory>
 #include <optional>
 #include <string>
 #include <vector>
@@ -12,6 +14,8 @@
 #include "bodyschema/sample_t.hpp"
 #include "common/schema/body_schema.h"
 #include "common/schema/sample.h"
+#include "processes/model_monitor/live_schema.h"
+#include "processes/model_monitor/monitor_memory.h"
 
 namespace bodyschema {
 
@@ -19,38 +23,58 @@ struct ModelMonitorConfig {
   double max_mahalanobis2 = 0;   ///< d² above which a TEST observation counts as refuting
   double max_outlier_share = 0;  ///< an edge is refuted if more than this share of its tests refute
   Noise model_error;             ///< added to every Σ_z: the view-dependent bias of real markers
+  /// Wished false alarms a sample once a complete schema stands; 0: nothing is adapted.
+  double false_alarm_rate = 1e-5;
+  /// Expected share of a part's observations that are flips or false detections.
+  double outlier_rate = 0.03;
 
   /// Reads model_monitor.yaml. @throws ConfigError.
   static ModelMonitorConfig load(const std::filesystem::path& file);
 };
 
-/// The only publisher of BODY_SCHEMA. A proposal of the learner becomes the body schema when none
-/// of its edges is refuted by the TEST samples up to the proposal's last sample, data that it was
-/// not trained on, and when it is not a step back from a complete schema to an incomplete one. An
-/// edge that no TEST sample could judge yet is marked provisional.
+/// The only publisher of BODY_SCHEMA.
 ///
-/// Version n+1 rests on the samples 0..n, so that a replay gives the same bytes. Before the first
-/// accepted proposal nothing is published; when inputs stop, the last schema stands.
+/// A proposal of the learner becomes the body schema when none of its edges is refuted by the TEST
+/// samples up to the proposal's last sample, data that it was not trained on, and when it is not a
+/// step back from a complete schema to an incomplete one. An edge that no TEST sample could judge
+/// yet is marked provisional.
+///
+/// The first complete one is the end of the learner's lead: from then on every sample is judged at
+/// once (LiveSchema), and a change of the body changes the schema. As long as none was found nor is
+/// suspected, later proposals go on to replace the schema, which is judged from there on. What the
+/// learner proposes after a change rests on samples of two bodies and is passed over.
+///
+/// The schema after sample n is a pure function of the samples 0..n. A proposal is one of its last
+/// sample t, a TEST sample (the learner leaves none of these out), and is judged by the state after
+/// t, which is kept until then: a proposal that comes when t+1..n were heard already is judged as
+/// if it had been there in time, and these samples are gone through again. So it is the same
+/// however fast the learner is; only what was published for t+1..n in between was provisional.
+/// Version n+1 changed last at sample n.
+///
+/// Before the first accepted proposal nothing is published; when inputs stop, the last schema
+/// stands.
 class ModelMonitor {
  public:
   explicit ModelMonitor(ModelMonitorConfig config);
 
-  /// What an earlier run of this process saved: the schema, and the health with its history. Saved
-  /// one after the other, so the health may be one judgement ahead of the schema; that judgement is
-  /// then made again.
-  void reload(const std::optional<body_schema_t>& schema,
-              const std::optional<model_health_t>& health = std::nullopt);
+  /// What an earlier run of this process remembered, before the samples are gone through again: the
+  /// state after them is then as if nothing had happened.
+  void restore(const MonitorMemory& memory);
+  /// Begins with a schema that nothing else is known of: an engineered model, or another run's.
+  /// It holds for the samples after its last.
+  void start_from(const body_schema_t& schema);
 
-  /// Returns true if a proposal that was waiting for this sample was judged: schema() and health()
-  /// may have changed.
+  /// Returns true if schema() or memory() may have changed.
   bool on_sample(const sample_t& sample);
-  /// Returns true if the proposal was judged: only those whose last sample is a TEST sample are. The
-  /// learner leaves none of them out, so the body schema does not depend on its speed.
+  /// Returns true if the proposal was judged: only those whose last sample is a TEST sample are.
   bool on_learned_schema(const body_schema_t& proposal);
 
   /// The body schema; std::nullopt before the first.
   const std::optional<body_schema_t>& schema() const { return schema_message_; }
-  const model_health_t& health() const { return health_; }
+  /// As of the newest sample; what TEST samples say is as of the newest judged one.
+  const model_health_t& health() const;
+  /// What a restart needs beside the samples.
+  const MonitorMemory& memory() const { return memory_; }
 
  private:
   struct EdgeTest {
@@ -58,26 +82,58 @@ class ModelMonitor {
     int num_refuting = 0;
     double median_mahalanobis2 = -1;
   };
+  /// All there is after a sample. A value: copies share what none of them changes.
+  struct Standing {
+    std::int64_t sample_index = -1;
+    std::optional<BodySchema> proposed;      ///< accepted, while the learner leads
+    std::shared_ptr<const LiveSchema> live;  ///< afterwards
+    std::vector<health_event_t> events;      ///< the newest
+    std::int64_t num_events = 0;
 
-  /// Whether the sample has one value per signal of the schema: a reloaded one may be another
-  /// rig's.
-  bool fits(const ActionPoseSample& sample) const;
+    const BodySchema* schema() const {
+      return live ? &live->schema() : proposed ? &*proposed : nullptr;
+    }
+    void add(health_event_t event);
+  };
+
+  static bool fits(const BodySchema& schema, const ActionPoseSample& sample);
   bool is_test(std::int64_t sample_index) const;
-  EdgeTest test(const Edge& edge, std::int64_t up_to_sample) const;
+  EdgeTest test(const BodySchema& schema, const Edge& edge, std::int64_t first,
+                std::int64_t last) const;
+  /// `standing` one sample later. Verdicts that a restart remembers are spoken again.
+  void advance(Standing* standing, const ActionPoseSample& sample) const;
+  Standing standing_after(std::int64_t sample_index) const;
+  /// Everything from a state on that is final: that after a judged sample.
+  void go_on_from(Standing standing);
+  void keep(const Standing& standing);
+  std::shared_ptr<const LiveSchema> begin(BodySchema base, std::vector<BodySchema> history,
+                                          std::int64_t up_to_sample) const;
+  /// "" or why the proposal is not better than what stands; sets the states of its edges.
+  std::string objection(BodySchema* proposal, const Standing& standing, bool* was_tested) const;
   void judge(const body_schema_t& proposal);
-  void assess(std::int64_t up_to_sample);
-  void add_event(std::int8_t kind, std::int64_t sample_index, std::int64_t utime, std::string text);
+  void set_base(Standing* standing, BodySchema base);
+  void publish();
+  void assess(const BodySchema& schema) const;
 
   const ModelMonitorConfig config_;
+  AdaptationOptions options_;
   std::vector<ActionPoseSample> tests_;
+  std::deque<ActionPoseSample> samples_;  ///< the newest, back to where anything may begin again
   std::map<int, std::vector<std::int64_t>> seen_in_;  ///< part → indices of samples that show it
   std::int64_t last_sample_index_ = -1;
+  std::int64_t judged_sample_ = -1;
+  std::int64_t judged_utime_ = 0;
+  std::int64_t restored_sample_ = -1;  ///< where what was restored begins
   /// Proposals that are ahead of the samples heard here, by their last sample.
   std::map<std::int64_t, body_schema_t> waiting_;
-  BodySchema schema_;
+  Standing now_;
+  /// After TEST samples: the newest judged one and those that wait for a verdict.
+  std::map<std::int64_t, Standing> kept_;
   std::optional<body_schema_t> schema_message_;
-  model_health_t health_{};
-  std::int64_t num_events_ = 0;
+  MonitorMemory memory_;
+  bool is_rewound_ = false;  ///< versions may come again with another content
+  mutable model_health_t health_{};
+  mutable bool is_assessed_ = false;
 };
 
 }  // namespace bodyschema

@@ -186,18 +186,39 @@ bool MotorBabbler::can_choose() const {
 }
 
 Eigen::VectorXd MotorBabbler::next_action() const {
+  if (is_to_probe())
+    return Eigen::Map<const Eigen::VectorXd>(health_.probe_action.data(), health_.num_probe);
   if (!is_to_choose() || !can_choose() || health_.schema_version == 0)
     return random_action(config_, seed_, action_id_);
   const auto candidates = candidate_actions(config_, seed_, action_id_);
   return candidates[choose_action(schema_, {memory_.begin(), memory_.end()}, candidates)];
 }
 
+bool MotorBabbler::is_to_probe() const {
+  if (next_purpose() != action_command_t::PURPOSE_TRAIN || !is_seen_ || last_test_sample_ < 0 ||
+      last_sample_ != last_test_sample_ || !has_verdict() || should_stop() ||
+      health_.probe_action.size() != config_.signals.size())
+    return false;
+  for (std::size_t i = 0; i < config_.signals.size(); ++i) {
+    const Signal& signal = config_.signals[i];
+    const double value = health_.probe_action[i];
+    if (!(value >= signal.lower && value <= signal.upper)) return false;
+  }
+  return true;
+}
+
+void MotorBabbler::take_schema() {
+  if (heard_schema_.schema_version != health_.schema_version ||
+      heard_schema_.schema_version == schema_version_)
+    return;
+  schema_ = from_message(heard_schema_);
+  schema_version_ = heard_schema_.schema_version;
+}
+
 std::optional<action_command_t> MotorBabbler::on_body_schema(const body_schema_t& schema) {
   if (config_.choice == Choice::kRandom) return std::nullopt;
-  if (schema.schema_version != schema_version_) {
-    schema_ = from_message(schema);
-    schema_version_ = schema.schema_version;
-  }
+  heard_schema_ = schema;
+  take_schema();
   return wait_ == Wait::kVerdict ? go_on() : std::nullopt;
 }
 
@@ -244,7 +265,12 @@ void MotorBabbler::on_marker_poses(const marker_poses_t& poses) {
 }
 
 std::optional<action_command_t> MotorBabbler::on_model_health(const model_health_t& health) {
-  health_ = health;
+  // The first verdict on a TEST sample counts until the next: what the monitor finds in between it
+  // may find before or after the next action is chosen.
+  if (last_test_sample_ < 0 || !has_verdict() || health.judged_sample != health_.judged_sample) {
+    health_ = health;
+    take_schema();
+  }
   if (last_sample_ < 0 && !is_restored_) {
     num_samples_ = std::max(num_samples_, health.judged_sample + 1);
   }
@@ -337,6 +363,8 @@ std::optional<action_command_t> MotorBabbler::act() {
     return std::nullopt;
   }
   const Eigen::VectorXd action = next_action();
+  const std::int8_t purpose =
+      is_to_probe() ? std::int8_t{action_command_t::PURPOSE_PROBE} : next_purpose();
   is_seen_ = false;
   command_ = action_command_t{};
   command_.utime = driver_utime_;
@@ -344,7 +372,7 @@ std::optional<action_command_t> MotorBabbler::act() {
   command_.epoch = epoch_;
   command_.action_id = action_id_;
   command_.kind = action_command_t::KIND_MOVE;
-  command_.purpose = next_purpose();
+  command_.purpose = purpose;
   command_.expiry_utime = driver_utime_ + config_.expiry_us;
   set_array(command_.num_signals, command_.action,
             std::vector<double>(action.data(), action.data() + action.size()));

@@ -87,6 +87,10 @@ std::vector<Eigen::VectorXd> candidate_actions(const MotorBabblerConfig& config,
 /// refusal is chosen again and again; and the actions up to the next TEST where schema or verdict
 /// did not come within verdict_timeout (counted).
 ///
+/// Where the verdict on a TEST sample comes with a probe (MODEL_HEALTH), the action that tells two
+/// explanations of a change apart, the next action is that one, with purpose PROBE. Refused, it is
+/// replaced as any other; still wanted after the next TEST sample, it is made again.
+///
 /// A restart with the kept state goes on as if nothing had happened: it sends the last command
 /// again, unless that command's SAMPLE has come. Samples are counted where they are its own, so
 /// that every test_every-th of them is TEST whatever others do in between.
@@ -135,6 +139,10 @@ class MotorBabbler {
   bool is_to_choose() const;
   /// Verdict, its schema (if there is one at all) and every sample so far are there.
   bool can_choose() const;
+  /// Takes the schema of the verdict once both are there.
+  void take_schema();
+  /// After the verdict on a TEST sample that wants a probe, the next action is that.
+  bool is_to_probe() const;
   Eigen::VectorXd next_action() const;
   std::int8_t next_purpose() const;
   bool may_move() const { return is_at_rest_ && !is_stopped_ && !is_lent_; }
@@ -174,7 +182,8 @@ class MotorBabbler {
   bool done_ = false;
   action_command_t command_{};
   model_health_t health_{};
-  std::int64_t schema_version_ = 0;  ///< 0: none was heard
+  body_schema_t heard_schema_{};     ///< the newest
+  std::int64_t schema_version_ = 0;  ///< of schema_, by which is chosen; 0: none was heard
   BodySchema schema_;
   std::deque<SeenAction> memory_;
   std::int64_t without_schema_since_ = -1;  ///< TEST sample whose verdict or schema was given up

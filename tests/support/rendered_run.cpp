@@ -89,6 +89,7 @@ struct RenderedRun::Implementation {
   StructureLearner learner;
   ModelMonitor monitor;
   std::optional<action_command_t> command;
+  std::int64_t num_faults = 0;
 };
 
 RenderedRun::RenderedRun(const std::filesystem::path& rig_folder, std::int64_t seed,
@@ -99,6 +100,25 @@ RenderedRun::~RenderedRun() = default;
 
 int RenderedRun::num_rejected() const {
   return static_cast<int>(implementation_->babbler.num_rejected());
+}
+
+const ModelMonitor& RenderedRun::monitor() const { return implementation_->monitor; }
+
+void RenderedRun::break_body(std::int8_t fault, const std::string& place, int number,
+                             double amount_deg) {
+  Implementation& run = *implementation_;
+  fault_command_t command{};
+  command.sender = "test";
+  command.epoch = 1;
+  command.fault_id = run.num_faults++;
+  command.fault = fault;
+  command.place = place;
+  command.number = number;
+  command.amount_deg = amount_deg;
+  const RobotSimulator::Answer answer = run.simulator.on_fault(command);
+  if (answer.state && !answer.state->fault_answer.empty())
+    throw std::runtime_error(answer.state->fault_answer);
+  for (const motion_status_t& status : answer.statuses) run.observer.on_motion_status(status);
 }
 
 RenderedRun::Step RenderedRun::next() {

@@ -5,12 +5,14 @@
 #include <memory>
 #include <optional>
 #include <set>
+#include <string>
 #include <vector>
 
 #include "bodyschema/sample_t.hpp"
 #include "common/geometry/pose.h"
 #include "common/schema/body_schema.h"
 #include "common/schema/sample.h"
+#include "processes/model_monitor/model_monitor.h"
 #include "processes/motor_babbler/motor_babbler.h"
 
 namespace bodyschema::test {
@@ -36,6 +38,13 @@ class RenderedRun {
   Step next();
 
   int num_rejected() const;
+
+  /// Breaks the arm before the next action, as FAULT_COMMAND does (common/scene/faults.h).
+  /// @throws std::runtime_error with the simulator's words if it refuses.
+  void break_body(std::int8_t fault, const std::string& place = "", int number = -1,
+                  double amount_deg = 0);
+  /// The monitor that the babbler chooses by (Choice::kActive).
+  const ModelMonitor& monitor() const;
 
  private:
   struct Implementation;

@@ -46,7 +46,13 @@ TEST(Check, RefusesConstantsThatNobodyDefined) {
   expect_refused(example_body_schema(), "edges[0].state", [](auto& m) { m.edges[0].state = 4; });
   expect_refused(example_process_info(), "phase", [](auto& m) { m.phase = 9; });
   expect_refused(example_model_health(), "events[0].event_kind",
-                 [](auto& m) { m.events[0].event_kind = 4; });
+                 [](auto& m) { m.events[0].event_kind = 11; });
+  expect_refused(example_model_health(), "part_health[0].part_state",
+                 [](auto& m) { m.part_health[0].part_state = 4; });
+  expect_refused(example_model_health(), "part_health[0].is_unseen",
+                 [](auto& m) { m.part_health[0].is_unseen = 2; });
+  expect_refused(example_model_health(), "edge_health[0].edge_is_drifting",
+                 [](auto& m) { m.edge_health[0].edge_is_drifting = -1; });
   expect_refused(example_sample(), "parts[0].has_other", [](auto& m) { m.parts[0].has_other = 2; });
 }
 
@@ -204,6 +210,12 @@ TEST(Check, RefusesAGaussianProcessThatCannotBeFactorisedAgain) {
 }
 
 TEST(Check, KnowsMinusOneOnlyWhereItMeansNotMeasured) {
+  expect_refused(example_model_health(), "events[0].event_margin",
+                 [](auto& m) { m.events[0].event_margin = std::nan(""); });
+  expect_refused(example_model_health(), "edge_health[0].edge_cusum",
+                 [](auto& m) { m.edge_health[0].edge_cusum = -2; });
+  expect_refused(example_model_health(), "probe_action",
+                 [](auto& m) { m.probe_action[1] = std::nan(""); });
   expect_refused(example_model_health(), "worst_position_m",
                  [](auto& m) { m.worst_position_m = -0.5; });
   expect_refused(example_body_schema(), "noise_position_m",

@@ -882,6 +882,28 @@ TEST(ControllerTest, AFrameFromFarAheadDoesNotOpenTheEyes) {
   EXPECT_TRUE(bench.has_why("MARKER_POSES")) << bench.status.why;
 }
 
+TEST(ControllerTest, WhileTheMarkerOfThePartOrTheCameraMovedTheArmIsLentAndOthersDoNotMatter) {
+  for (const int part : {1, 2, 4}) {
+    Bench bench;
+    bench.start();
+    model_health_t health = health_of(bench.schema.version, 2, 3, schema_edge_t::EDGE_OK);
+    part_health_t moved{};
+    moved.health_part = part;
+    moved.part_state = schema_edge_t::EDGE_INVALID;
+    moved.position_median_m = moved.rotation_median_rad = -1;
+    set_array(health.num_parts, health.part_health, {moved});
+    bench.health = health;
+    bench.repeat();
+    bench.give(position_target(0, kFar));
+    const bool concerns = part != 2;
+    EXPECT_EQ(bench.run_until_state(S::CONTROL_LENT), concerns) << part;
+    if (!concerns) continue;
+    EXPECT_EQ(bench.status.owns_arm, 0);
+    EXPECT_TRUE(bench.has_why("the marker of part " + std::to_string(part) + " is invalid"))
+        << bench.status.why;
+  }
+}
+
 // ---- stop, hold and restarts of others
 
 TEST(ControllerTest, StopDropsTheTargetInEveryStateAndResumeDoesNotTakeItUp) {

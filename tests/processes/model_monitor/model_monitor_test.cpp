@@ -87,6 +87,42 @@ class ModelMonitorTest : public testing::Test {
   }
   body_schema_t proposal(std::int64_t index) const { return to_message(learned(index)); }
   sample_t sample(std::int64_t index) const { return to_message(samples_.at(index)); }
+  /// The proposal of `index` as if it were one of the TEST sample `last`.
+  body_schema_t proposal(std::int64_t index, std::int64_t last) const {
+    BodySchema schema = learned(index);
+    schema.last_sample_index = last;
+    schema.utime = samples_.at(last).utime;
+    return to_message(schema);
+  }
+  body_schema_t wrong(std::int64_t index) const {
+    BodySchema schema = learned(index);
+    for (Edge& edge : schema.edges) edge.right.translation().x() += 0.3;
+    return to_message(schema);
+  }
+  /// From sample `since` on the joint farthest from the root stands still. Returns its edge.
+  Edge break_last_joint(std::int64_t since) {
+    const BodySchema schema = learned(kNumSamples - 1);
+    const Edge* edge = nullptr;
+    for (const Edge& e : schema.edges)
+      if (!e.joints.empty()) edge = &e;
+    const int signal = edge->joints.front().signal;
+    for (ActionPoseSample& sample : samples_) {
+      if (sample.sample_index < since) continue;
+      Eigen::VectorXd action = sample.action;
+      action(signal) = 0.4;
+      const auto healthy = robot_.poses_in_camera(sample.action);
+      const auto poses = robot_.poses_in_camera(action);
+      for (PartObservation& part : sample.parts) {
+        // The same noise about another pose.
+        const Pose noise = healthy.at(part.part).inverse() * part.X_CB;
+        if (part.X_CB_other)
+          part.X_CB_other =
+              poses.at(part.part) * (healthy.at(part.part).inverse() * *part.X_CB_other);
+        part.X_CB = poses.at(part.part) * noise;
+      }
+    }
+    return *edge;
+  }
   /// A monitor that has heard the samples 0..index.
   ModelMonitor monitor_at(std::int64_t index) const {
     ModelMonitor monitor(test_config());
@@ -466,17 +502,17 @@ TEST_F(ModelMonitorTest, TheNewestThirtyTwoEventsAreKeptAndNumbered) {
   EXPECT_EQ(check(monitor.health()), "");
 }
 
-TEST_F(ModelMonitorTest, AReloadedSchemaIsPublishedAgainAndStandsAgainstWorse) {
+TEST_F(ModelMonitorTest, ASchemaToStartFromIsPublishedAndStandsAgainstWorse) {
   ModelMonitor before = monitor_at(39);
   before.on_learned_schema(proposal(39));
   ASSERT_TRUE(before.schema());
 
-  ModelMonitor monitor = monitor_at(39);
-  monitor.reload(*before.schema());
+  ModelMonitor monitor(test_config());
+  monitor.start_from(*before.schema());
+  EXPECT_EQ(bytes_of(monitor), bytes_of(before));
+  for (std::int64_t i = 0; i <= 39; ++i) monitor.on_sample(sample(i));
   EXPECT_EQ(bytes_of(monitor), bytes_of(before));
   EXPECT_EQ(judgement_of(monitor), judgement_of(before));
-  ASSERT_EQ(monitor.health().num_events, 1);
-  EXPECT_EQ(monitor.health().events[0].event_kind, health_event_t::EVENT_RELOADED);
 
   EXPECT_FALSE(monitor.on_learned_schema(proposal(39)));
   EXPECT_FALSE(monitor.on_learned_schema(proposal(14)));
@@ -488,72 +524,95 @@ TEST_F(ModelMonitorTest, AReloadedSchemaIsPublishedAgainAndStandsAgainstWorse) {
   EXPECT_EQ(bytes_of(monitor), bytes_of(before));
 }
 
-TEST_F(ModelMonitorTest, AfterAReloadTheScheduleGoesOnAsIfNothingHadHappened) {
+TEST_F(ModelMonitorTest, ARestartAtAnyMomentIsAsIfNothingHadHappened) {
+  // The joint of the last edge sticks from sample 27 on; the learner proposes nothing right then.
+  break_last_joint(27);
+  const auto hear = [&](ModelMonitor* monitor, std::int64_t i) {
+    monitor->on_sample(sample(i));
+    if (i % 5 == 4)
+      monitor->on_learned_schema(i == 9 ? wrong(9) : proposal(std::min<int64_t>(i, 24), i));
+  };
   ModelMonitor undisturbed(test_config());
-  std::optional<body_schema_t> saved;
+  for (std::int64_t i = 0; i < kNumSamples; ++i) hear(&undisturbed, i);
+  ASSERT_GT(undisturbed.health().num_events, 2);
+  for (std::int64_t killed_after = 0; killed_after < kNumSamples; ++killed_after) {
+    ModelMonitor before(test_config());
+    for (std::int64_t i = 0; i <= killed_after; ++i) hear(&before, i);
+    ModelMonitor monitor(test_config());
+    monitor.restore(before.memory());
+    for (std::int64_t i = 0; i <= killed_after; ++i) monitor.on_sample(sample(i));
+    EXPECT_EQ(monitor.schema().has_value(), before.schema().has_value());
+    if (before.schema()) {
+      EXPECT_EQ(bytes_of(monitor), bytes_of(before)) << killed_after;
+    }
+    EXPECT_EQ(encode(kModelHealth, monitor.health()), encode(kModelHealth, before.health()))
+        << killed_after;
+    for (std::int64_t i = killed_after + 1; i < kNumSamples; ++i) hear(&monitor, i);
+    EXPECT_EQ(bytes_of(monitor), bytes_of(undisturbed)) << killed_after;
+    EXPECT_EQ(encode(kModelHealth, monitor.health()), encode(kModelHealth, undisturbed.health()))
+        << killed_after;
+  }
+}
+
+TEST_F(ModelMonitorTest, HoweverSlowTheLearnerIsTheSchemaIsTheSame) {
+  break_last_joint(27);
+  const auto proposed = [&](std::int64_t i) { return proposal(std::min<int64_t>(i, 24), i); };
+  ModelMonitor in_time(test_config());
   for (std::int64_t i = 0; i < kNumSamples; ++i) {
-    undisturbed.on_sample(sample(i));
-    if (i % 10 == 4) undisturbed.on_learned_schema(proposal(i));
-    if (i == 30) saved = undisturbed.schema();
+    in_time.on_sample(sample(i));
+    if (i % 5 == 4) in_time.on_learned_schema(proposed(i));
   }
-  ASSERT_TRUE(saved);
-  ModelMonitor restarted = monitor_at(30);
-  restarted.reload(*saved);
-  for (std::int64_t i = 31; i < kNumSamples; ++i) restarted.on_sample(sample(i));
-  restarted.on_learned_schema(proposal(44));
-  EXPECT_EQ(bytes_of(restarted), bytes_of(undisturbed));
-  EXPECT_EQ(judgement_of(restarted), judgement_of(undisturbed));
+  for (const int delay : {1, 3, 7, 20, 45}) {
+    ModelMonitor late(test_config());
+    for (std::int64_t i = 0; i < kNumSamples + delay; ++i) {
+      if (i < kNumSamples) late.on_sample(sample(i));
+      if ((i - delay) % 5 == 4 && i >= delay) late.on_learned_schema(proposed(i - delay));
+    }
+    EXPECT_EQ(bytes_of(late), bytes_of(in_time)) << delay;
+    EXPECT_EQ(encode(kModelHealth, late.health()), encode(kModelHealth, in_time.health())) << delay;
+  }
 }
 
-TEST_F(ModelMonitorTest, EventsGoOnAfterAReloadAndNoneIsLost) {
-  ModelMonitor before = monitor_at(39);
-  before.on_learned_schema(proposal(34));
-  before.on_learned_schema(proposal(39));
-  ASSERT_EQ(before.health().num_events, 2);
-
-  ModelMonitor monitor = monitor_at(39);
-  monitor.reload(before.schema(), before.health());
-  EXPECT_EQ(bytes_of(monitor), bytes_of(before));
-  EXPECT_EQ(judgement_of(monitor), judgement_of(before));
-  ASSERT_EQ(monitor.health().num_events, 3);
-  for (std::size_t i = 0; i < 3; ++i) {
-    EXPECT_EQ(monitor.health().events[i].event_number, static_cast<std::int64_t>(i));
+TEST_F(ModelMonitorTest, AStuckJointIsFoundPublishedAtOnceAndWhatTheLearnerSaysLaterIsPassedOver) {
+  const Edge broken = break_last_joint(30);
+  ModelMonitor monitor(test_config());
+  std::int64_t found = -1;
+  for (std::int64_t i = 0; i < kNumSamples; ++i) {
+    monitor.on_sample(sample(i));
+    if (i % 5 == 4) monitor.on_learned_schema(proposal(std::min<int64_t>(i, 29), i));
+    ASSERT_EQ(check(monitor.health()), "");
+    if (i == 29) {
+      ASSERT_TRUE(monitor.schema());
+      ASSERT_EQ(monitor.schema()->is_complete, 1);
+      EXPECT_EQ(monitor.schema()->schema_version, 30);
+    }
+    for (const auto& event : monitor.health().events)
+      if (event.event_kind == health_event_t::EVENT_CANDIDATE && found < 0) {
+        found = i;
+        EXPECT_EQ(event.event_sample, i);
+        EXPECT_EQ(monitor.schema()->schema_version, i + 1);
+        EXPECT_EQ(monitor.schema()->base_version, 30);
+      }
   }
-  EXPECT_EQ(monitor.health().events[1].event_text, before.health().events[1].event_text);
-  EXPECT_EQ(monitor.health().events[2].event_kind, health_event_t::EVENT_RELOADED);
-  EXPECT_EQ(check(monitor.health()), "");
-}
-
-TEST_F(ModelMonitorTest, ARefusalIsNotMadeAgainAfterAReload) {
-  ModelMonitor before = monitor_at(44);
-  before.on_learned_schema(proposal(39));
-  BodySchema incomplete = learned(44);
-  incomplete.edges.pop_back();
-  incomplete.complete = false;
-  ASSERT_TRUE(before.on_learned_schema(to_message(incomplete)));
-  ASSERT_EQ(before.health().judged_sample, 44);
-
-  ModelMonitor monitor = monitor_at(44);
-  monitor.reload(before.schema(), before.health());
+  EXPECT_GE(found, 30);
+  EXPECT_LE(found, 35);
+  // The last decision on it names the joint.
+  std::string cause;
+  for (const auto& event : monitor.health().events) {
+    if (event.event_from < 0) continue;
+    EXPECT_EQ(event.event_from, broken.from);
+    EXPECT_EQ(event.event_to, broken.to);
+    if (event.event_kind != health_event_t::EVENT_PROBE_WANTED && !event.event_cause.empty())
+      cause = event.event_cause;
+  }
+  EXPECT_EQ(cause, "joint_stuck");
+  for (const auto& edge : monitor.schema()->edges) {
+    const bool is_broken = edge.to_part == broken.to;
+    EXPECT_EQ(edge.state == schema_edge_t::EDGE_PROVISIONAL, is_broken);
+    EXPECT_EQ(edge.valid_since_sample >= 30, is_broken);
+    EXPECT_LE(edge.valid_since_sample, found);
+  }
   EXPECT_EQ(monitor.health().judged_sample, 44);
-  EXPECT_FALSE(monitor.on_learned_schema(to_message(incomplete)));
-}
-
-TEST_F(ModelMonitorTest, ASchemaThatAKillKeptFromBeingSavedIsJudgedAgain) {
-  ModelMonitor before = monitor_at(44);
-  before.on_learned_schema(proposal(39));
-  const auto saved_schema = before.schema();
-  before.on_learned_schema(proposal(44));
-  const auto saved_health = before.health();  // the kill comes here
-
-  for (const auto& schema : {saved_schema, std::optional<body_schema_t>()}) {
-    ModelMonitor monitor = monitor_at(44);
-    monitor.reload(schema, saved_health);
-    EXPECT_TRUE(monitor.on_learned_schema(proposal(44)));
-    EXPECT_EQ(bytes_of(monitor), bytes_of(before));
-    EXPECT_EQ(judgement_of(monitor), judgement_of(before));
-    EXPECT_GT(monitor.health().events.back().event_number, saved_health.events.back().event_number);
-  }
 }
 
 // Parts 1 (root, 2 m before the camera) and 2 (0.1 m beside it), no joint.
@@ -640,9 +699,9 @@ TEST(ModelMonitorByHandTest, SamplesOfAnotherRigDoNotEndTheProcess) {
   schema.signals.push_back({"q2", -1, 1});
   schema.last_sample_index = 1;
   schema.version = 2;
+  EXPECT_NO_THROW(monitor.start_from(to_message(schema)));
   monitor.on_sample(two_parts_seen(0, 0, 0));
   monitor.on_sample(two_parts_seen(1, 0, 0));
-  EXPECT_NO_THROW(monitor.reload(to_message(schema)));
   EXPECT_EQ(monitor.health().worst_position_m, -1);
   monitor.on_sample(two_parts_seen(2, 0, 0));
   schema.last_sample_index = 2;
@@ -665,12 +724,15 @@ TEST(ModelMonitorConfigTest, IsReadInSiUnits) {
   const std::filesystem::path file = std::filesystem::path(testing::TempDir()) /
                                      ("model_monitor_config_" + std::to_string(getpid()) + ".yaml");
   std::ofstream(file) << "max_mahalanobis2: 16\nmax_outlier_share: 0.25\n"
-                         "model_error_position_m: 0.002\nmodel_error_rotation_deg: 90\n";
+                         "model_error_position_m: 0.002\nmodel_error_rotation_deg: 90\n"
+                         "false_alarm_rate: 1e-6\noutlier_rate: 0.05\n";
   const ModelMonitorConfig config = ModelMonitorConfig::load(file);
   EXPECT_EQ(config.max_mahalanobis2, 16);
   EXPECT_EQ(config.max_outlier_share, 0.25);
   EXPECT_EQ(config.model_error.position_m, 0.002);
   EXPECT_DOUBLE_EQ(config.model_error.rotation_rad, M_PI / 2);
+  EXPECT_EQ(config.false_alarm_rate, 1e-6);
+  EXPECT_EQ(config.outlier_rate, 0.05);
   std::ofstream(file) << "max_mahalanobis2: 0.5\n";
   EXPECT_THROW(ModelMonitorConfig::load(file), ConfigError);
   std::filesystem::remove(file);

@@ -921,6 +921,72 @@ TEST(MotorBabblerTest, TestActionsAndWhatReplacesARefusedOneAreDrawn) {
   EXPECT_TRUE(is_drawn(bench.last));
 }
 
+TEST(MotorBabblerTest, WhatTheMonitorFindsBetweenTwoVerdictsDoesNotChangeWhatIsChosen) {
+  Bench undisturbed = after_first_test(), bench = after_first_test();
+  for (Bench* each : {&undisturbed, &bench}) {
+    each->babbler.on_body_schema(schema_of(5));
+    ASSERT_TRUE(each->take(each->babbler.on_model_health(verdict(4, 5))));
+  }
+  for (int n = 5; n < 8; ++n) {
+    bench.babbler.on_body_schema(schema_of(n + 1));
+    bench.babbler.on_model_health(verdict(4, n + 1));
+    ASSERT_TRUE(undisturbed.make_sample());
+    ASSERT_TRUE(bench.make_sample());
+    EXPECT_FALSE(is_drawn(bench.last));
+    EXPECT_EQ(bench.last.action, undisturbed.last.action) << n;
+  }
+  // By the next verdict it counts, also if its schema was heard before.
+  ASSERT_TRUE(bench.make_sample());
+  ASSERT_FALSE(bench.make_sample());
+  EXPECT_TRUE(bench.take(bench.babbler.on_model_health(verdict(9, 8))));
+}
+
+TEST(MotorBabblerTest, AProbeThatIsWantedIsTheFirstActionAfterTheVerdict) {
+  for (const Choice choice : {Choice::kActive, Choice::kRandom}) {
+    MotorBabblerConfig config = active_config();
+    config.choice = choice;
+    Bench bench(config);
+    bench.start();
+    bench.run(4);
+    ASSERT_TRUE(bench.is_test());
+    ASSERT_FALSE(bench.make_sample());
+    model_health_t wants = verdict(4, 5);
+    wants.probe_sample = 3;
+    std::vector<double> probe;
+    for (const Signal& signal : config.signals)
+      probe.push_back(0.3 * signal.lower + 0.7 * signal.upper);
+    set_array(wants.num_probe, wants.probe_action, probe);
+    bench.babbler.on_body_schema(schema_of(5));
+    ASSERT_TRUE(bench.take(bench.babbler.on_model_health(wants)));
+    EXPECT_EQ(bench.last.action, wants.probe_action);
+    EXPECT_EQ(bench.last.purpose, action_command_t::PURPOSE_PROBE);
+    // Refused it is not tried again and again.
+    Bench refused = bench;
+    ASSERT_TRUE(refused.take(
+        refused.babbler.on_motion_status(answer(refused.last, motion_status_t::STATE_REJECTED))));
+    EXPECT_EQ(refused.last.purpose, action_command_t::PURPOSE_TRAIN);
+    EXPECT_NE(refused.last.action, wants.probe_action);
+    // It takes the place of a TRAIN action: the rhythm of the TEST ones stays.
+    for (int n = 5; n < 9; ++n) {
+      EXPECT_FALSE(bench.is_test()) << n;
+      ASSERT_TRUE(bench.make_sample());
+      EXPECT_NE(bench.last.purpose, action_command_t::PURPOSE_PROBE);
+    }
+    EXPECT_TRUE(bench.is_test());
+  }
+}
+
+TEST(MotorBabblerTest, AProbeBeyondTheLimitsIsNotMade) {
+  Bench bench = after_first_test();
+  model_health_t wants = verdict(4, 5);
+  wants.probe_sample = 3;
+  set_array(wants.num_probe, wants.probe_action,
+            std::vector<double>(active_config().signals.size(), 1e3));
+  bench.babbler.on_body_schema(schema_of(5));
+  ASSERT_TRUE(bench.take(bench.babbler.on_model_health(wants)));
+  EXPECT_EQ(bench.last.purpose, action_command_t::PURPOSE_TRAIN);
+}
+
 TEST(MotorBabblerTest, WithoutASchemaActionsAreDrawn) {
   Bench bench = after_first_test();
   ASSERT_TRUE(bench.take(bench.babbler.on_model_health(verdict(4, 0))));

@@ -1,0 +1,245 @@
+#include "processes/model_monitor/live_schema.h"
+
+#include <algorithm>
+#include <cmath>
+#include <cstdio>
+
+#include "common/bus/codec.h"
+#include "common/bus/convert.h"
+
+namespace bodyschema {
+namespace {
+
+/// Of so many newest sightings so many are flips where a part is said to be flipping.
+constexpr std::size_t kFlipWindow = 20;
+constexpr std::ptrdiff_t kManyFlips = 5;
+
+using Kind = AdaptationEvent::Kind;
+
+std::int8_t wire(Kind kind) {
+  switch (kind) {
+    case Kind::kMismatch:
+      return health_event_t::EVENT_MISMATCH;
+    case Kind::kCandidate:
+      return health_event_t::EVENT_CANDIDATE;
+    case Kind::kRefined:
+      return health_event_t::EVENT_REFINED;
+    case Kind::kRestored:
+      return health_event_t::EVENT_RESTORED;
+    case Kind::kReverted:
+      return health_event_t::EVENT_REVERTED;
+    case Kind::kRecovered:
+      return health_event_t::EVENT_RECOVERED;
+    case Kind::kDrift:
+      return health_event_t::EVENT_DRIFT;
+    case Kind::kMissing:
+      return health_event_t::EVENT_MISSING;
+    case Kind::kProbeWanted:
+      return health_event_t::EVENT_PROBE_WANTED;
+  }
+  return health_event_t::EVENT_MISMATCH;
+}
+
+/// Whether two local models say the same, bit by bit.
+bool is_same_model(const Edge& a, const Edge& b) {
+  const auto is_same = [](const Pose& x, const Pose& y) { return x.matrix() == y.matrix(); };
+  const auto is_same_joint = [&](const ScrewJoint& x, const ScrewJoint& y) {
+    return x.signal == y.signal && x.gain == y.gain && x.offset == y.offset && x.slide == y.slide &&
+           x.turn == y.turn && is_same(x.X_after, y.X_after);
+  };
+  return is_same(a.left, b.left) && is_same(a.right, b.right) && a.matrix_gp == b.matrix_gp &&
+         a.residual_gp == b.residual_gp &&
+         std::equal(a.joints.begin(), a.joints.end(), b.joints.begin(), b.joints.end(),
+                    is_same_joint);
+}
+
+/// What a receiver sees, its stamps apart.
+std::vector<std::uint8_t> contents_of(BodySchema schema) {
+  schema.utime = schema.version = schema.base_version = schema.last_sample_index = 0;
+  return encode(kBodySchema, to_message(schema));
+}
+
+}  // namespace
+
+std::string text_of(const AdaptationEvent& event) {
+  std::string text = event.from >= 0
+                         ? "edge " + std::to_string(event.from) + "–" + std::to_string(event.to)
+                     : event.cause == "camera_moved" ? "camera"
+                                                     : "part " + std::to_string(event.part);
+  text += std::string(": ") + name_of(event.kind);
+  if (!event.cause.empty()) text += " " + event.cause;
+  char number[64];
+  if (event.margin != 0) {
+    std::snprintf(number, sizeof number, ", by %.1f nats", event.margin);
+    text += number;
+  }
+  if (event.num_samples > 0) {
+    text += " after " + std::to_string(event.num_samples) +
+            (event.num_samples == 1 ? " sample" : " samples");
+  }
+  return text;
+}
+
+LiveSchema::LiveSchema(BodySchema base, AdaptationOptions options, std::vector<BodySchema> history,
+                       const std::vector<ActionPoseSample>& past)
+    : base_(std::move(base)),
+      adaptation_(base_, options, std::move(history), past),
+      schema_(base_),
+      base_since_(holds_since()) {
+  camera_since_ = base_since_;
+}
+
+std::int64_t LiveSchema::holds_since() const {
+  std::int64_t since = camera_since_;
+  for (const Edge& edge : schema_.edges) since = std::max(since, edge.valid_since_sample);
+  return since;
+}
+
+std::int64_t LiveSchema::holds_since(int part) const {
+  std::int64_t since = camera_since_;
+  for (const Edge* edge = edge_to(schema_, part); edge; edge = edge_to(schema_, edge->from))
+    since = std::max(since, edge->valid_since_sample);
+  return since;
+}
+
+bool LiveSchema::is_in_doubt() const {
+  return !adaptation_.is_settled() ||
+         std::any_of(schema_.parts.begin(), schema_.parts.end(), [&](int part) {
+           return adaptation_.edge_state(part) != EdgeState::kOk ||
+                  adaptation_.marker_state(part) != EdgeState::kOk;
+         });
+}
+
+std::vector<health_event_t> LiveSchema::on_sample(const ActionPoseSample& sample) {
+  std::vector<health_event_t> result;
+  std::optional<std::int64_t> changed_since;
+  for (const AdaptationEvent& event : adaptation_.on_sample(sample)) {
+    health_event_t message;
+    message.event_number = 0;
+    message.utime = sample.utime;
+    message.event_sample = event.sample_index;
+    message.event_kind = wire(event.kind);
+    message.event_from = event.from;
+    message.event_to = event.to;
+    message.event_part = event.part;
+    message.event_cause = event.cause;
+    message.event_margin = std::isfinite(event.margin) ? event.margin : 0;
+    message.samples_used = event.num_samples;
+    message.event_text = text_of(event);
+    result.push_back(std::move(message));
+    if (event.kind == Kind::kCandidate || event.kind == Kind::kRestored)
+      changed_since = adaptation_.since();
+    if (event.kind == Kind::kDrift) changed_since = sample.sample_index;
+    if (event.kind == Kind::kProbeWanted) {
+      probe_sample_ = event.sample_index;
+      probe_ = event.probe;
+    }
+  }
+  if (adaptation_.is_settled()) probe_sample_ = -1;
+  watch_flips(sample);
+  update(sample, changed_since);
+  return result;
+}
+
+void LiveSchema::watch_flips(const ActionPoseSample& sample) {
+  const auto X_RB = schema_.predict_all(sample.action);
+  for (const PartObservation& seen : sample.parts) {
+    const auto predicted = X_RB.find(seen.part);
+    if (predicted == X_RB.end()) continue;
+    const auto error = [&](const Pose& X_CB) {
+      return rotation_angle((schema_.X_CR * predicted->second).inverse() * X_CB);
+    };
+    std::deque<bool>& flipped = flipped_[seen.part];
+    flipped.push_back(seen.X_CB_other && error(*seen.X_CB_other) < error(seen.X_CB));
+    if (flipped.size() > kFlipWindow) flipped.pop_front();
+  }
+}
+
+void LiveSchema::update(const ActionPoseSample& sample, std::optional<std::int64_t> changed_since) {
+  BodySchema next = adaptation_.schema();
+  for (std::size_t e = 0; e < next.edges.size(); ++e) {
+    Edge& edge = next.edges[e];
+    const Edge &before = schema_.edges[e], &original = base_.edges[e];
+    edge.valid_since_sample = before.valid_since_sample;
+    if (!is_same_model(edge, before)) {
+      // Without a new change: the same one fitted better, or taken back.
+      if (changed_since)
+        edge.valid_since_sample = *changed_since;
+      else if (is_same_model(edge, original))
+        edge.valid_since_sample = original.valid_since_sample;
+    }
+    edge.state = original.state;
+    edge.confidence = original.confidence;
+    const EdgeState state = state_of(edge);
+    if (state == EdgeState::kInvalid) {
+      edge.state = state;
+      edge.confidence = 0;
+    } else if (state == EdgeState::kProvisional) {
+      // As sure as it is old.
+      edge.state = state;
+      const double age = static_cast<double>(sample.sample_index - edge.valid_since_sample + 1);
+      edge.confidence = std::clamp(age / adaptation_.options().settled_after, 0.0, 1.0);
+    }
+  }
+  if (next.X_CR.matrix() != schema_.X_CR.matrix()) {
+    if (changed_since)
+      camera_since_ = *changed_since;
+    else if (next.X_CR.matrix() == base_.X_CR.matrix())
+      camera_since_ = base_since_;
+  }
+  next.utime = schema_.utime;
+  next.version = schema_.version;
+  next.base_version = schema_.base_version;
+  next.last_sample_index = schema_.last_sample_index;
+  if (contents_of(next) != contents_of(schema_)) {
+    next.utime = sample.utime;
+    next.version = sample.sample_index + 1;
+    next.base_version = base_.version;
+    next.last_sample_index = sample.sample_index;
+  }
+  schema_ = std::move(next);
+}
+
+EdgeState LiveSchema::state_of(const Edge& edge) const {
+  // A part's frame is that of its marker: while that is not where it was, neither is the part.
+  const EdgeState states[] = {adaptation_.edge_state(edge.to), adaptation_.marker_state(edge.to),
+                              adaptation_.marker_state(edge.from)};
+  for (const EdgeState worst : {EdgeState::kInvalid, EdgeState::kProvisional})
+    if (std::find(std::begin(states), std::end(states), worst) != std::end(states)) return worst;
+  return adaptation_.edge_state(edge.to);
+}
+
+void LiveSchema::describe(model_health_t* health) const {
+  health->noise_scale = adaptation_.noise_scale();
+  health->probe_sample = probe_sample_;
+  std::vector<double> probe;
+  if (probe_sample_ >= 0) probe.assign(probe_.data(), probe_.data() + probe_.size());
+  set_array(health->num_probe, health->probe_action, std::move(probe));
+  for (edge_health_t& item : health->edge_health) {
+    const Edge* edge = edge_to(schema_, item.health_to);
+    if (!edge) continue;
+    const EdgeState state = state_of(*edge);
+    item.edge_state = static_cast<std::int8_t>(state == EdgeState::kOk ? edge->state : state);
+    item.edge_is_drifting = adaptation_.is_drifting(item.health_to);
+    item.edge_cusum = adaptation_.edge_statistic(item.health_to);
+  }
+  const std::vector<int> missing = adaptation_.missing_parts();
+  for (part_health_t& item : health->part_health) {
+    const int part = item.health_part;
+    EdgeState state = adaptation_.marker_state(part);
+    if (part == schema_.root && state != EdgeState::kInvalid) {
+      const EdgeState camera = adaptation_.edge_state(part);
+      if (camera != EdgeState::kOk) state = camera;
+      item.camera_cusum = adaptation_.edge_statistic(part);
+    }
+    item.part_state = static_cast<std::int8_t>(state);
+    item.marker_cusum = adaptation_.marker_statistic(part);
+    item.is_unseen = std::find(missing.begin(), missing.end(), part) != missing.end();
+    const auto flipped = flipped_.find(part);
+    item.is_flipping =
+        flipped != flipped_.end() &&
+        std::count(flipped->second.begin(), flipped->second.end(), true) >= kManyFlips;
+  }
+}
+
+}  // namespace bodyschema

@@ -1,0 +1,66 @@
+#pragma once
+
+#include <cstdint>
+#include <deque>
+#include <map>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "bodyschema/health_event_t.hpp"
+#include "bodyschema/model_health_t.hpp"
+#include "common/schema/body_schema.h"
+#include "common/schema/sample.h"
+#include "processes/model_monitor/adaptation.h"
+
+namespace bodyschema {
+
+/// The body schema from a complete one on, the base, that the held-out samples had confirmed: what
+/// Adaptation finds, with what the wire says of it: versions, states, since when an edge holds.
+///
+/// A pure function of the base, the history and the samples, those of `past` included.
+class LiveSchema {
+ public:
+  /// `past`: the newest samples up to the base's last.
+  LiveSchema(BodySchema base, AdaptationOptions options, std::vector<BodySchema> history,
+             const std::vector<ActionPoseSample>& past);
+
+  /// What was decided at this sample; events are not numbered yet.
+  /// @throws std::invalid_argument if the action does not have one value per signal.
+  std::vector<health_event_t> on_sample(const ActionPoseSample& sample);
+
+  /// Version s + 1 if it changed last at sample s; base_version is that of the base.
+  const BodySchema& schema() const { return schema_; }
+  const BodySchema& base() const { return base_; }
+  const std::vector<BodySchema>& history() const { return adaptation_.history(); }
+  /// A change of the body is suspected, or found and not settled.
+  bool is_in_doubt() const;
+  bool is_camera_as_base() const { return camera_since_ == base_since_; }
+  /// The first sample that all edges hold for.
+  std::int64_t holds_since() const;
+  /// The same for the way from the root to a part.
+  std::int64_t holds_since(int part) const;
+
+  /// States, flags and statistics of health->edge_health and part_health, whose ids are set; noise
+  /// and probe.
+  void describe(model_health_t* health) const;
+
+ private:
+  void watch_flips(const ActionPoseSample& sample);
+  EdgeState state_of(const Edge& edge) const;
+  void update(const ActionPoseSample& sample, std::optional<std::int64_t> changed_since);
+
+  const BodySchema base_;
+  Adaptation adaptation_;
+  BodySchema schema_;
+  std::int64_t camera_since_ = 0;  ///< first sample that X_CR holds for
+  const std::int64_t base_since_;
+  std::int64_t probe_sample_ = -1;
+  Eigen::VectorXd probe_;
+  std::map<int, std::deque<bool>> flipped_;  ///< part → newest sightings: the other pose was right
+};
+
+/// For people: "edge 3–4: joint_stuck, by 31 nats after 2 samples".
+std::string text_of(const AdaptationEvent& event);
+
+}  // namespace bodyschema

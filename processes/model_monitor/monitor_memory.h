@@ -1,0 +1,50 @@
+#pragma once
+
+#include <cstdint>
+#include <filesystem>
+#include <functional>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "bodyschema/body_schema_t.hpp"
+#include "bodyschema/health_event_t.hpp"
+#include "bodyschema/model_health_t.hpp"
+
+namespace bodyschema {
+
+/// What the monitor cannot find again from the samples: which of the learner's proposals became the
+/// body schema, the schemas before it, and what was decided on others.
+struct MonitorMemory {
+  /// Of the history, oldest first; the last one is the base, that the samples after its
+  /// last_sample_index changed since. Empty before the first accepted proposal.
+  std::vector<body_schema_t> schemas;
+  /// After that sample: with the newest events.
+  model_health_t at_base{};
+  /// The newest judged sample, and what was decided on proposals after the base's: events.
+  model_health_t verdicts{};
+
+  bool operator==(const MonitorMemory& other) const;
+};
+
+/// The memory as a file, history.lcmlog: BODY_SCHEMA messages and two MODEL_HEALTH, replaced
+/// atomically (temporary name, sync, rename).
+class MemoryFile {
+ public:
+  /// Without a name nothing is kept.
+  explicit MemoryFile(std::filesystem::path file) : file_(std::move(file)) {}
+
+  using Objection = std::function<std::string(const body_schema_t&)>;
+  /// std::nullopt if there is none. One that cannot be used (damaged, or `objection` to a schema is
+  /// not "") is set aside as FILE.bad-1 with a warning: it is found out again from the samples.
+  std::optional<MonitorMemory> load(const Objection& objection);
+  /// Writes it unless it is what was written last. Returns "" or why it could not be written, for
+  /// people; the next call tries again.
+  std::string save(const MonitorMemory& memory);
+
+ private:
+  const std::filesystem::path file_;
+  std::string saved_;
+};
+
+}  // namespace bodyschema

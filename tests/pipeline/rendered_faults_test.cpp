@@ -1,0 +1,137 @@
+// The simulated arm breaks while it babbles and is repaired again: from rendered images to the body
+// schema, with the configuration of the rig, in one thread. When it breaks is told by the sample,
+// so every run is the same.
+
+#include <gtest/gtest.h>
+
+#include <algorithm>
+#include <filesystem>
+#include <set>
+#include <string>
+#include <vector>
+
+#include "bodyschema/fault_command_t.hpp"
+#include "common/bus/check.h"
+#include "common/bus/convert.h"
+#include "tests/support/rendered_run.h"
+
+namespace bodyschema::test {
+namespace {
+
+constexpr std::int64_t kBrokenAt = 30, kRepairedAt = 45, kEnd = 60;
+/// Samples until the monitor has decided, and after which the schema must be right.
+constexpr std::int64_t kSoon = 5;
+
+struct Case {
+  std::string name;
+  std::int8_t fault;
+  std::string place;
+  std::vector<int> numbers{-1};
+  double amount_deg = 0;
+  /// The edge that leads to this part, for a marker or the camera the part itself.
+  int part = 0;
+  std::set<std::string> causes;
+};
+
+void PrintTo(const Case& c, std::ostream* out) { *out << c.name; }
+
+class AdaptationTest : public testing::TestWithParam<Case> {
+ protected:
+  AdaptationTest() : run_(BODYSCHEMA_SOURCE_FOLDER "/config/arm7", 1, {}, Choice::kActive) {}
+
+  /// One more sample. Keeps what the monitor says.
+  void step() {
+    const RenderedRun::Step step = run_.next();
+    const model_health_t& health = run_.monitor().health();
+    ASSERT_EQ(check(health), "");
+    if (run_.monitor().schema()) {
+      ASSERT_EQ(check(*run_.monitor().schema()), "");
+    }
+    for (const health_event_t& event : health.events)
+      if (event.event_number >= static_cast<std::int64_t>(events_.size())) events_.push_back(event);
+    error_m_ = -1;
+    if (!run_.monitor().schema()) return;
+    const BodySchema schema = from_message(*run_.monitor().schema());
+    for (const auto& [part, X_RB] : schema.predict_all(step.sample.action)) {
+      const Pose X_CB = schema.X_CR * X_RB;
+      error_m_ =
+          std::max(error_m_, (X_CB.translation() - step.truth.at(part).translation()).norm());
+    }
+  }
+
+  /// The first decision on a change at sample `since` or later.
+  const health_event_t* decision(std::int64_t since) const {
+    for (const health_event_t& event : events_) {
+      if (event.event_sample >= since && (event.event_kind == health_event_t::EVENT_CANDIDATE ||
+                                          event.event_kind == health_event_t::EVENT_RESTORED ||
+                                          event.event_kind == health_event_t::EVENT_MISSING))
+        return &event;
+    }
+    return nullptr;
+  }
+  std::string told() const {
+    std::string text;
+    for (const health_event_t& event : events_)
+      text += std::to_string(event.event_sample) + "  " + event.event_text + "\n";
+    return text;
+  }
+
+  RenderedRun run_;
+  std::vector<health_event_t> events_;
+  double error_m_ = -1;  ///< of the worst part, camera included, against the truth
+};
+
+TEST_P(AdaptationTest, IsFoundNamedAndMendedAndSoIsTheRepair) {
+  const Case& c = GetParam();
+  double healthy_m = 0;
+  for (std::int64_t n = 0; n < kBrokenAt; ++n) {
+    ASSERT_NO_FATAL_FAILURE(step());
+    if (n >= kBrokenAt - kSoon) healthy_m = std::max(healthy_m, error_m_);
+  }
+  ASSERT_TRUE(run_.monitor().schema());
+  ASSERT_EQ(run_.monitor().schema()->is_complete, 1);
+  for (const health_event_t& event : events_)
+    ASSERT_LE(event.event_kind, health_event_t::EVENT_SCHEMA_REFUSED) << told();
+
+  for (const int number : c.numbers) run_.break_body(c.fault, c.place, number, c.amount_deg);
+  // A part that is gone takes some samples to be missed.
+  const std::int64_t soon = c.fault == fault_command_t::FAULT_MARKER_LOST ? 12 : kSoon;
+  for (std::int64_t n = kBrokenAt; n < kRepairedAt; ++n) {
+    ASSERT_NO_FATAL_FAILURE(step());
+    if (n >= kBrokenAt + kSoon) {
+      EXPECT_LT(error_m_, 2 * healthy_m) << n << "\n" << told();
+    }
+  }
+  const health_event_t* found = decision(kBrokenAt);
+  ASSERT_TRUE(found) << told();
+  EXPECT_LT(found->event_sample, kBrokenAt + soon) << told();
+  EXPECT_EQ(found->event_from >= 0 ? found->event_to : found->event_part, c.part) << told();
+  EXPECT_TRUE(c.causes.count(found->event_cause)) << told();
+
+  run_.break_body(fault_command_t::FAULT_REPAIR);
+  for (std::int64_t n = kRepairedAt; n < kEnd; ++n) {
+    ASSERT_NO_FATAL_FAILURE(step());
+    if (n >= kRepairedAt + kSoon) {
+      EXPECT_LT(error_m_, 2 * healthy_m) << n << "\n" << told();
+    }
+  }
+}
+
+INSTANTIATE_TEST_SUITE_P(
+    Faults, AdaptationTest,
+    testing::Values(
+        Case{"stuck", fault_command_t::FAULT_STUCK, "q3", {-1}, 0, 5, {"joint_stuck"}},
+        Case{"bend", fault_command_t::FAULT_BEND, "forearm", {-1}, 10, 6, {"geometry"}},
+        Case{"tool", fault_command_t::FAULT_TOOL, "", {1}, 0, 8, {"geometry"}},
+        Case{"camera_bump", fault_command_t::FAULT_CAMERA_BUMP, "", {-1}, 0, 1, {"camera_moved"}},
+        Case{"marker_lost",
+             fault_command_t::FAULT_MARKER_LOST,
+             "",
+             {32, 33, 34, 35},
+             0,
+             9,
+             {"marker_missing"}}),
+    [](const auto& info) { return info.param.name; });
+
+}  // namespace
+}  // namespace bodyschema::test
