@@ -19,6 +19,7 @@ constexpr double kMaxScrewStartCost = 26;
 constexpr double kMaxRigidStartMedian = 20;
 constexpr double kMaxScrewStartMedian = 30;
 constexpr double kMaxFewFramesMedian = 100;  // from kSomeFrames on
+constexpr double kGoodStartCost = 12;         // below it none of this holds
 constexpr int kSomeFrames = 10;
 constexpr int kManyFrames = 20;
 // A refuted fit that costs less a frame may yet be right (a valid one costs 4 to 7).
@@ -59,7 +60,7 @@ struct Candidate {
 
 // Beyond what a local fit mends, by the bulk of the frames.
 bool is_hopeless(const Start& start, int num_frames, double max_median) {
-  return num_frames >= kSomeFrames &&
+  return num_frames >= kSomeFrames && start.score > kGoodStartCost &&
          start.median > (num_frames >= kManyFrames ? max_median : kMaxFewFramesMedian);
 }
 
