@@ -5,7 +5,8 @@
 #include <gtest/gtest.h>
 
 #include <algorithm>
-#include <filesystem>
+#include <cmath>
+#include <map>
 #include <set>
 #include <string>
 #include <vector>
@@ -21,6 +22,7 @@ namespace {
 constexpr std::int64_t kBrokenAt = 30, kRepairedAt = 45, kEnd = 60;
 /// Samples until the monitor has decided, and after which the schema must be right.
 constexpr std::int64_t kSoon = 5;
+constexpr double kFalseAlarmRate = 1e-5;  // as the rig says
 
 struct Case {
   std::string name;
@@ -42,6 +44,7 @@ class AdaptationTest : public testing::TestWithParam<Case> {
   /// One more sample. Keeps what the monitor says.
   void step() {
     const RenderedRun::Step step = run_.next();
+    for (const PartObservation& o : step.sample.parts) ++num_seen_[o.part];
     const model_health_t& health = run_.monitor().health();
     ASSERT_EQ(check(health), "");
     if (run_.monitor().schema()) {
@@ -78,6 +81,7 @@ class AdaptationTest : public testing::TestWithParam<Case> {
 
   RenderedRun run_;
   std::vector<health_event_t> events_;
+  std::map<int, int> num_seen_;  // of a part: samples
   double error_m_ = -1;  ///< of the worst part, camera included, against the truth
 };
 
@@ -94,8 +98,12 @@ TEST_P(AdaptationTest, IsFoundNamedAndMendedAndSoIsTheRepair) {
     ASSERT_LE(event.event_kind, health_event_t::EVENT_SCHEMA_REFUSED) << told();
 
   for (const int number : c.numbers) run_.break_body(c.fault, c.place, number, c.amount_deg);
-  // A part that is gone takes some samples to be missed.
-  const std::int64_t soon = c.fault == fault_command_t::FAULT_MARKER_LOST ? 12 : kSoon;
+  // A part that is gone is missed when so long a run of misses is rarer than the false alarms that
+  // are allowed, given how often it was seen.
+  std::int64_t soon = kSoon;
+  if (c.fault == fault_command_t::FAULT_MARKER_LOST)
+    soon = std::llround(std::ceil(std::log(kFalseAlarmRate / 10) /
+                                  std::log(1 - num_seen_[c.part] / double{kBrokenAt}))) + 2;
   for (std::int64_t n = kBrokenAt; n < kRepairedAt; ++n) {
     ASSERT_NO_FATAL_FAILURE(step());
     if (n >= kBrokenAt + kSoon) {

@@ -165,7 +165,7 @@ TEST_F(BodyschemaProgramTest, LearnDoesNotWriteOverItsRecording) {
   write("samples.csv", recording);
   const Outcome outcome = run({"learn", "samples.csv", "--out", "./samples.csv"});
   EXPECT_EQ(outcome.exit_code, 1);
-  EXPECT_NE(outcome.err.find("is the recording itself"), std::string::npos) << outcome.err;
+  EXPECT_NE(outcome.err.find("is an input itself"), std::string::npos) << outcome.err;
   std::ifstream file(folder_ / "samples.csv");
   EXPECT_EQ(std::string(std::istreambuf_iterator<char>(file), {}), recording);
 }

@@ -148,10 +148,10 @@ TEST_F(FullDisk, TheMonitorSaysThatItCannotSaveAndSavesWhenItCan) {
   fill_disk();
   Program monitor(program("model_monitor", {"--schema", (disk_ / "schema.lcmlog").string()}));
   ASSERT_TRUE(says("cannot save")) << info_.activity;
-  EXPECT_FALSE(std::filesystem::exists(disk_ / "health.lcmlog"));
+  EXPECT_FALSE(std::filesystem::exists(disk_ / "history.lcmlog"));
   free_disk();
   ASSERT_TRUE(says("waiting for LEARNED_SCHEMA")) << info_.activity;
-  EXPECT_EQ(read_log(disk_ / "health.lcmlog", kModelHealth).size(), 1U);
+  EXPECT_EQ(read_log(disk_ / "history.lcmlog", kModelHealth).size(), 2U);
   monitor.send_signal(SIGTERM);
   EXPECT_EQ(monitor.wait(), 0);
 }
