@@ -68,7 +68,12 @@ std::string event_text(const AdaptationEvent& event) {
 AdaptationOptions options_of(const MonitorArguments& arguments, const Recording& recording,
                              const BodySchema& schema) {
   AdaptationOptions options;
-  if (recording.is_log) options.noise.model_error = kTagModelError;
+  if (recording.is_log) {
+    // As model_monitor has it: the error is that of a pair of markers, and has room for rare errors.
+    options.noise.model_error = {kTagModelError.position_m * M_SQRT1_2,
+                                 kTagModelError.rotation_rad * M_SQRT1_2};
+    options.least_noise_scale = 1;
+  }
   if (!arguments.noise.empty()) {
     for (const double noise : arguments.noise)
       if (!std::isfinite(noise) || noise <= 0)

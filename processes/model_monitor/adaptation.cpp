@@ -575,6 +575,46 @@ void Adaptation::watch_visibility(const ActionPoseSample& sample,
   }
 }
 
+void Adaptation::drop_fallen(ActionPoseSample* sample, std::vector<AdaptationEvent>* events) {
+  const auto drop = [](int part, ActionPoseSample* from) {
+    std::erase_if(from->parts, [part](const PartObservation& o) { return o.part == part; });
+  };
+  for (const auto& [part, X_RB] : schema_.predict_all(sample->action)) {
+    const auto since = fallen_.look(*sample, part, schema_.X_CR * X_RB, noise_);
+    if (!since) continue;
+    drop(part, sample);
+    Visibility& v = visibility_[part];
+    if (v.is_missing) continue;
+    v.is_missing = true;
+    for (ActionPoseSample& earlier : recent_) {
+      if (earlier.sample_index < *since) continue;
+      drop(part, &earlier);
+      ++v.num_missed;
+    }
+    AdaptationEvent missing =
+        event(AdaptationEvent::Kind::kMissing, sample->sample_index, {part, true});
+    missing.cause = "marker_missing";
+    missing.num_samples = v.num_missed + 1;
+    events->push_back(missing);
+    // What it was taken for meanwhile is taken back.
+    const auto about_it = [this, part](const Place& place) {
+      return place.part == part && (place.marker || part != schema_.root);
+    };
+    if (detected_ && about_it(*detected_)) detected_.reset();
+    for (const Replacement& r : replacements_) {
+      if (!about_it(r.place) || since_ < *since) continue;
+      AdaptationEvent reverted =
+          event(AdaptationEvent::Kind::kReverted, sample->sample_index, r.place);
+      reverted.cause = r.fitted.change.cause(schema_);
+      events->push_back(reverted);
+    }
+    if (since_ >= *since &&
+        std::erase_if(replacements_, [&](const Replacement& r) { return about_it(r.place); }) > 0)
+      schema_ = composed();
+    install(schema_);
+  }
+}
+
 void Adaptation::follow(std::int64_t sample_index, std::vector<AdaptationEvent>* events) {
   ++age_;
   if (age_ >= options_.settled_after) {
@@ -642,9 +682,11 @@ void Adaptation::remember(const BodySchema& schema) {
   history_.push_back(schema);
 }
 
-std::vector<AdaptationEvent> Adaptation::on_sample(const ActionPoseSample& sample) {
-  check(sample, schema_);
+std::vector<AdaptationEvent> Adaptation::on_sample(const ActionPoseSample& seen) {
+  check(seen, schema_);
   std::vector<AdaptationEvent> events;
+  ActionPoseSample sample = seen;
+  if (num_samples_ >= options_.calibration_samples) drop_fallen(&sample, &events);
   recent_.push_back(sample);
   if (recent_.size() > kRing) recent_.pop_front();
   watch_visibility(sample, &events);

@@ -9,6 +9,7 @@
 
 #include "processes/model_monitor/change_fit.h"
 #include "processes/model_monitor/drift_watch.h"
+#include "processes/model_monitor/fallen_markers.h"
 #include "processes/model_monitor/tree_filter.h"
 
 namespace bodyschema {
@@ -143,6 +144,7 @@ class Adaptation {
   void reconsider(std::int64_t sample_index, bool all_forms, std::vector<AdaptationEvent>* events);
   void want_probe(const BodySchema& standing, const Choice& choice, std::int64_t sample_index,
                   std::vector<AdaptationEvent>* events);
+  void drop_fallen(ActionPoseSample* sample, std::vector<AdaptationEvent>* events);
   void watch_visibility(const ActionPoseSample& sample, std::vector<AdaptationEvent>* events);
   void follow(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
   void remember(const BodySchema& schema);
@@ -164,6 +166,7 @@ class Adaptation {
     bool is_missing = false;
   };
   std::map<int, Visibility> visibility_;
+  FallenMarkers fallen_;
   std::vector<Cusum> edges_, markers_;  ///< by node
   std::optional<Place> detected_;
   BodySchema before_;                      ///< what stood before the present replacements

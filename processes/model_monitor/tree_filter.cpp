@@ -53,6 +53,12 @@ Pose flipped(const Pose& X) {
 
 }  // namespace
 
+Matrix6d covariance_of(const PartObservation& observation, const MarkerNoise& noise) {
+  return noise.scale * noise.scale *
+             (noise.noise ? diagonal(*noise.noise) : observation.covariance) +
+         diagonal(noise.model_error) + 1e-12 * Matrix6d::Identity();
+}
+
 double log_flat_density() { return -std::log(8 * M_PI * M_PI * kRoom_m3); }
 
 double log_normal_density(const Vector6d& xi, const Matrix6d& S) {
@@ -138,7 +144,6 @@ TreeFilter::Instant TreeFilter::prepare(const ActionPoseSample& sample) const {
   instant.transport.resize(n);
   instant.edge_covariance.resize(n);
   instant.seen.resize(n);
-  const double variance_scale = noise_.scale * noise_.scale;
   for (std::size_t k = 0; k < n; ++k) {
     const Node& node = nodes_[k];
     if (node.edge < 0) {
@@ -152,10 +157,9 @@ TreeFilter::Instant TreeFilter::prepare(const ActionPoseSample& sample) const {
     instant.edge_covariance[k].diagonal().array() += 1e-12;  // what is exact can still be inverted
     instant.transport[k] = adjoint(instant.delta[k].inverse());
     if (const PartObservation* o = sample.find(node.part)) {
-      const Matrix6d covariance =
-          variance_scale * (noise_.noise ? diagonal(*noise_.noise) : o->covariance) +
-          diagonal(noise_.model_error) + 1e-12 * Matrix6d::Identity();
-      instant.seen[k] = Instant::Seen{o->X_CB, o->X_CB_other, covariance};
+      const Matrix6d covariance = covariance_of(*o, noise_);
+      instant.seen[k] = Instant::Seen{o->X_CB, covariance, o->X_CB_other, covariance};
+      if (o->X_CB_other) instant.seen[k]->covariance_other = covariance_of_other(*o, covariance);
     }
   }
   return instant;
@@ -300,27 +304,39 @@ class TreeFilter::Walk {
   void marker(int node, Belief* belief) {
     const auto& seen = instant_.seen[node];
     if (!seen) return;
-    const Matrix6d S = belief->P + seen->covariance;
+    Matrix6d S = belief->P + seen->covariance;
+    if (node == alternative_.detached_node) {
+      double detached = log_outlier_density(belief->X, seen->X_CB, S, seen->covariance);
+      if (seen->X_CB_other)
+        detached = std::max(detached,
+                            kLogOtherReading +
+                                log_outlier_density(belief->X, *seen->X_CB_other,
+                                                    belief->P + seen->covariance_other,
+                                                    seen->covariance_other));
+      judgement.log_likelihood += detached;
+      return;
+    }
     const double rate = filter_.noise_.outlier_rate;
     Pose X_CB = seen->X_CB;
     bool is_inlier = true;
     double d2 = 0;
     double density =
         log_marker_density(belief->X, X_CB, S, seen->covariance, rate, &is_inlier, &d2);
-    if (node == alternative_.detached_node) {
-      judgement.log_likelihood += log_outlier_density(belief->X, X_CB, S, seen->covariance);
-      return;
-    }
+    // Where the marker does not sit at the part's origin only its other reading knows where a
+    // flip's part is; and that may be an outlier in turn.
     if (seen->X_CB_other && d2 > kClearInlier) {
+      const Matrix6d S_other = belief->P + seen->covariance_other;
       bool is_other_inlier = false;
       double other_d2 = 0;
       const double other =
-          kLogOtherReading + log_marker_density(belief->X, *seen->X_CB_other, S, seen->covariance,
-                                                rate, &is_other_inlier, &other_d2);
-      if (other > density && is_other_inlier) {
+          kLogOtherReading + log_marker_density(belief->X, *seen->X_CB_other, S_other,
+                                                seen->covariance_other, rate, &is_other_inlier,
+                                                &other_d2);
+      if (other > density) {
         density = other;
+        S = S_other;
         X_CB = *seen->X_CB_other;
-        is_inlier = true;
+        is_inlier = is_other_inlier;
         d2 = other_d2;
       }
     }

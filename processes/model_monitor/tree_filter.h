@@ -21,6 +21,9 @@ struct MarkerNoise {
   double outlier_rate = 0.03;
 };
 
+/// Covariance of an observed pose X_CB: 6 × 6, right perturbation.
+Matrix6d covariance_of(const PartObservation& observation, const MarkerNoise& noise);
+
 /// What may be wrong with the schema at one instant. Nodes are the places of parts in
 /// TreeFilter::parts(); "the edge of a node" is the one that leads to it from its parent, for the
 /// root the camera's.
@@ -46,7 +49,7 @@ struct VirtualMeasurement {
 ///   (1 − ρ) N(ξ; 0, S) + ρ g(ξ),   ξ = log(X⁻¹ y), S = P + Σ_y,
 /// with an outlier density g that is shaped as the outliers of planar markers are: flips, tilts of
 /// unknown direction, wide errors and a floor. (A uniform g makes every flip of a leaf's marker
-/// speak for a broken edge.) Where the first term is the larger one the marker corrects the belief.
+/// speak for a broken edge.) A second reading y' of a planar marker counts as one in ten. Where the first term is the larger one the marker corrects the belief.
 /// What a branch learns goes back to its parent by the smoother's gain P Fᵀ P_child⁻¹, so that
 /// siblings profit from each other.
 class TreeFilter {
@@ -68,8 +71,9 @@ class TreeFilter {
   struct Instant {
     struct Seen {
       Pose X_CB;
-      std::optional<Pose> X_CB_other;
       Matrix6d covariance;
+      std::optional<Pose> X_CB_other;
+      Matrix6d covariance_other;  ///< of X_CB_other, where there is one
     };
     std::vector<Pose> delta;          ///< by node: pose in the parent (root: in the camera)
     std::vector<Matrix6d> transport;  ///< Ad(delta⁻¹)

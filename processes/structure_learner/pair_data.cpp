@@ -31,12 +31,8 @@ int readings_of(const PartObservation& observation, const MeasurementModel& meas
       measurement.noise ? isotropic(*measurement.noise) : observation.covariance;
   readings[0] = {observation.X_CB, covariance, 0};
   if (!observation.X_CB_other || observation.error_ratio > measurement.max_error_ratio) return 1;
-  // The position's covariance is a fact of the camera (depth is not lateral): carry it over into
-  // the other frame. Tilt and in-plane rotation belong to the marker's axes in both readings.
-  Matrix6d T = Matrix6d::Identity();
-  T.topLeftCorner<3, 3>() =
-      observation.X_CB_other->linear().transpose() * observation.X_CB.linear();
-  readings[1] = {*observation.X_CB_other, T * covariance * T.transpose(), kOtherHypothesisPenalty};
+  readings[1] = {*observation.X_CB_other, covariance_of_other(observation, covariance),
+                 kOtherHypothesisPenalty};
   return 2;
 }
 

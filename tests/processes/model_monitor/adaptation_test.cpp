@@ -9,6 +9,7 @@
 #include <random>
 
 #include "tests/support/broken_arm.h"
+#include "tests/support/synthetic_robot.h"
 
 namespace bodyschema {
 namespace {
@@ -151,6 +152,48 @@ TEST(AdaptationTest, AMarkerThatIsMissingIsToldAndComesBack) {
   EXPECT_EQ(events[1].kind, Kind::kRecovered);
   EXPECT_EQ(events[1].sample_index, 80);
   EXPECT_TRUE(adaptation.missing_parts().empty());
+}
+
+TEST(AdaptationTest, AMarkerThatFellAndLiesInSightIsMissingAndNoFault) {
+  for (const int part : {3, 5, 7}) {
+    BrokenArm arm({Fault::kNone, "", 1}, Regime::kTagIso, 50, 1);
+    Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kTagIso));
+    Life life;
+    Pose X_CM;
+    X_CM.translation() << 0.4, 0.3, 1.5;
+    const Noise noise = test::nominal_noise(Regime::kTagIso);
+    test::Rng rng(1);
+    for (int t = 0; t < 120; ++t) {
+      ActionPoseSample sample = arm.observe(t);
+      for (PartObservation& o : sample.parts) {
+        if (o.part != part || t < 50 || t >= 80) continue;
+        Vector6d error = test::gaussian6(rng);
+        error.head<3>() *= noise.position_m;
+        error.tail<3>() *= noise.rotation_rad;
+        o.X_CB = X_CM * exp(error);
+        o.X_CB_other.reset();
+      }
+      for (const auto& e : adaptation.on_sample(sample)) life.events.push_back(e);
+      life.error.push_back(arm.error(adaptation.schema(), t));
+      if (t == 79) {
+        EXPECT_EQ(adaptation.missing_parts(), std::vector<int>{part}) << life.log();
+      }
+    }
+    SCOPED_TRACE("part " + std::to_string(part) + ", events:\n" + life.log());
+    const auto missing = std::find_if(life.events.begin(), life.events.end(), [](const auto& e) {
+      return e.kind == Kind::kMissing;
+    });
+    ASSERT_NE(missing, life.events.end());
+    EXPECT_EQ(missing->part, part);
+    EXPECT_LE(missing->sample_index, 55);
+    for (auto e = missing + 1; e != life.events.end(); ++e) {
+      EXPECT_TRUE(e->kind == Kind::kReverted || e->kind == Kind::kRecovered) << text(*e);
+    }
+    EXPECT_EQ(life.events.back().kind, Kind::kRecovered);
+    EXPECT_EQ(life.events.back().sample_index, 80);
+    EXPECT_TRUE(adaptation.is_settled());
+    EXPECT_NEAR(life.error.back(), life.error[49], 1e-9);
+  }
 }
 
 TEST(AdaptationTest, WhatIsNeverSeenIsNotSuspected) {

@@ -249,6 +249,26 @@ TEST_F(TreeFilterTest, AFlippedMarkerIsReadInItsOtherPoseOrNotBelieved) {
   EXPECT_LT(refused.log_likelihood, healthy - 5);
 }
 
+TEST_F(TreeFilterTest, AFlippedTagBesideThePartsOriginSpeaksForNoBrokenEdge) {
+  // The tag sits 5 cm beside the part's origin: the flip moves the part. Its other reading is near
+  // the truth, not quite.
+  noise_.outlier_rate = 0.03;
+  const TreeFilter filter(schema_, noise_);
+  Vector6d tilt = Vector6d::Zero();
+  tilt(4) = 40 * kDegree;
+  Pose X_BM = Pose::Identity();
+  X_BM.translation().x() = 0.05;
+  for (PartObservation& o : sample_.parts) {
+    if (o.part != 4) continue;
+    o.X_CB_other = o.X_CB * Eigen::Translation3d(8 * std::sqrt(o.covariance(0, 0)), 0, 0);
+    o.X_CB = o.X_CB * X_BM * exp(tilt) * X_BM.inverse();
+  }
+  const TreeFilter::Instant instant = filter.prepare(sample_);
+  Alternative cut;
+  cut.cut_edges = {filter.node_of(4)};
+  EXPECT_LT(filter.judge(instant, cut).log_likelihood - filter.judge(instant).log_likelihood, 3);
+}
+
 TEST_F(TreeFilterTest, NothingCrossesAnInvalidEdge) {
   const int node = TreeFilter(schema_, noise_).node_of(2);
   schema_.edges[0].state = EdgeState::kInvalid;
