@@ -377,6 +377,7 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
   if ((accepted || highest > alarm) && !detected_) {
     detected_ = accepted ? choice.best->place : places.front();
     AdaptationEvent mismatch = event(AdaptationEvent::Kind::kMismatch, sample_index, *detected_);
+    if (!detected_->marker && detected_->part == schema_.root) mismatch.cause = "camera_moved";
     mismatch.margin = highest;
     mismatch.num_samples = static_cast<int>(samples.size());
     events->push_back(mismatch);
@@ -419,8 +420,12 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
       return;
     }
   }
-  // Changes that came together are reconsidered together; an older one is taken as it is.
-  if (replacements_.empty() || since - since_ > kTogether || fitted.everywhere) {
+  // Changes that came together are reconsidered together; an older one is taken as it is, and so is
+  // one that ends: what stood before it, again.
+  const bool ends =
+      fitted.change.form == BodyChange::Form::kStored && since > since_ &&
+      !differ_at(with_change(schema_, fitted), before_, choice.best->place.part);
+  if (replacements_.empty() || since - since_ > kTogether || fitted.everywhere || ends) {
     before_ = schema_;
     replacements_.clear();
     since_ = since;

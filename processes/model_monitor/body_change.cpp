@@ -140,7 +140,7 @@ int BodyChange::fewest_samples() const {
 std::string BodyChange::cause(const BodySchema& schema) const {
   switch (form) {
     case Form::kStored:
-      return "stored";
+      return part == schema.root ? "camera_moved" : "stored";
     case Form::kStuck:
       return "joint_stuck";
     case Form::kOffset:

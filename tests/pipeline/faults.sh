@@ -1,0 +1,72 @@
+#!/bin/bash
+# faults.sh SOURCE BUILD: while arm7 babbles it is broken in six ways and repaired each time, by the console; each change
+# is found, named and mended by processes that are killed in between. In the end the schema is right and the report
+# shows it all.
+set -euo pipefail
+source=$1 build=$2
+work=$(mktemp -d)
+export BODYSCHEMA_BUILD=$build BODYSCHEMA_LOGS=$work/logs
+run=
+trap '"$source/run" stop >/dev/null 2>&1 || true; [ -z "$run" ] || kill "$run" 2>/dev/null || true; wait; rm -rf "$work"' EXIT
+unshare --user --map-root-user --net true 2>/dev/null || { echo "SKIP: no user namespaces" >&2; exit 77; }
+fail() {
+  echo "faults: $*" >&2
+  tail -n 15 "$work"/*.txt >&2 || true
+  exit 1
+}
+status() { "$source/run" exec bodyschema status --seconds 1.2 >"$work/status.txt" 2>&1 || true; }
+# until WHAT COMMAND…: within a minute or two, however slow the machine.
+until_true() {
+  local what=$1
+  shift
+  for _ in $(seq 60); do
+    status
+    "$@" && return
+  done
+  fail "$what"
+}
+told() { grep -qE "^  sample .*$1" "$work/status.txt"; }
+is_learned() {
+  local newest
+  newest=$(sed -n "s/^sample *\([0-9]*\):.*/\1/p" "$work/status.txt")
+  [ "${newest:-0}" -ge 40 ] && is_sound
+}
+is_sound() { grep -q "^schema .*complete" "$work/status.txt" && ! grep -qE "INVALID|SUSPECT" "$work/status.txt"; }
+fault() { "$source/run" fault "$@" >>"$work/console.txt" 2>&1 || fail "fault $*"; }
+# The program itself, not the setpriv that became it: its command line begins with its path.
+kill_process() { kill -KILL "$("$source/run" exec pgrep -f "^$build/bin/$1 .*$work")" || fail "no $1 to kill"; }
+
+"$source/run" --rig arm7 --seed 1 --samples 100000 --keep >"$work/run.txt" 2>&1 &
+run=$!
+until_true "the arm was not learned" is_learned
+
+# break_and_repair PLACE CAUSE VICTIM FAULT…
+break_and_repair() {
+  local place=$1 cause=$2 victim=$3
+  shift 3
+  local one
+  for one in "$@"; do
+    # shellcheck disable=SC2086
+    fault $one
+  done
+  until_true "$*: not found" told "$place: (candidate|refined|missing) $cause"
+  kill_process "$victim"
+  fault repair
+  until_true "$*: the repair was not found" told "$place: (restored|reverted|recovered)"
+  until_true "$*: not sound again" is_sound
+}
+break_and_repair "edge 4–5" joint_stuck model_monitor "stuck q3"
+break_and_repair "edge 5–6" geometry observer "bend forearm 20"
+break_and_repair "edge 7–8" geometry structure_learner "tool 1"
+break_and_repair camera camera_moved marker_estimator "camera-bump"
+break_and_repair "part 9" marker_missing model_monitor "marker-lost 32" "marker-lost 33" "marker-lost 34" "marker-lost 35"
+break_and_repair "part 8" marker_moved robot_simulator "marker-moved 28"
+
+"$source/run" stop >>"$work/console.txt" 2>&1 || fail "stop"
+wait
+"$build/bin/judge_schema" "$work/logs/current/config" "$work/logs/current/schema.lcmlog" >"$work/judge.txt" 2>&1 ||
+  fail "the schema is wrong in the end"
+"$source/run" report "$work/logs/current" >>"$work/console.txt" 2>&1 || fail "report"
+for cause in joint_stuck geometry camera_moved marker_missing marker_moved; do
+  grep -q "$cause" "$work/logs/current/report.html" || fail "the report does not tell of $cause"
+done
