@@ -22,6 +22,7 @@ constexpr std::int64_t kRepeat_us = 1'000'000;
 constexpr int kMaxExpired = 3;         // in a row
 constexpr double kMovedCamera = 33.1;  // chi^2_6(0.99999): the camera is not where the schema says
 constexpr double kSurprise = 14.2;     // chi^2_3(0.9973): what is seen refutes the schema
+constexpr int kLentForProbe = 8;       // samples: the babbler probes after a TEST sample, every fifth
 constexpr double kArrived = 1e-9;      // of a range
 
 std::int64_t microseconds(double seconds) { return std::llround(seconds * 1e6); }
@@ -393,12 +394,21 @@ Controller::Command Controller::advance() {
     refuse(why);
     return std::nullopt;
   }
-  if (std::string edge; worst_edge(&edge) == EdgeState::kInvalid) {
+  std::string edge;
+  const EdgeState worst = worst_edge(&edge);
+  const bool is_probe = worst != EdgeState::kOk && health_ && health_->probe_sample > probed_;
+  if (worst == EdgeState::kInvalid || is_probe) {
     goal_.reset();
     is_taken_ = false;
-    if (state_ != S::CONTROL_LENT) lent_.restart();
+    if (state_ != S::CONTROL_LENT) {
+      lent_.restart();
+      num_lent_samples_ = 0;
+    }
+    is_lent_for_probe_ = worst != EdgeState::kInvalid;
     enter(S::CONTROL_LENT, false,
-          edge + " is invalid: the babbler has the arm until it is mended");
+          is_lent_for_probe_
+              ? edge + " can be told two ways: the babbler has the arm for a probe"
+              : edge + " is invalid: the babbler has the arm until it is mended");
     return std::nullopt;
   }
   if (!owns_arm_ || state_ == S::CONTROL_LENT) {
@@ -627,8 +637,15 @@ Controller::Answer Controller::on_marker_poses(const marker_poses_t& poses) {
 }
 
 Controller::Answer Controller::on_sample(const sample_t& sample) {
-  if (!sample_ || !is_same_action(*sample_, sample)) lent_.restart();
+  if (!sample_ || !is_same_action(*sample_, sample)) {
+    lent_.restart();
+    ++num_lent_samples_;
+  }
   sample_ = sample;
+  // A babbler that may probe does so after its next TEST sample.
+  if (state_ == S::CONTROL_LENT &&
+      (sample.purpose == action_command_t::PURPOSE_PROBE || num_lent_samples_ >= kLentForProbe))
+    probed_ = std::max(probed_, sample.sample_index);
   see(sample.utime);
   locate();
   if (awaited_ && sample.source == kSource && sample.epoch == epoch_ &&
@@ -697,7 +714,11 @@ Controller::Answer Controller::on_tick(std::int64_t now_us) {
                   config_.max_body_schema_silence_us});
     if (guard_.elapsed_us(now_us) > patience_us) refuse("not heard: " + unheard());
   } else if (state_ == S::CONTROL_LENT) {
-    if (lent_.elapsed_us(now_us) >= config_.lent_timeout_us) {
+    if (is_lent_for_probe_ && lent_.elapsed_us(now_us) >= config_.rest_timeout_us) {
+      // Nobody probes: go on with what is known.
+      if (health_) probed_ = std::max(probed_, health_->probe_sample);
+      command = advance();
+    } else if (lent_.elapsed_us(now_us) >= config_.lent_timeout_us) {
       refuse("no new SAMPLE for " + seconds(config_.lent_timeout_us) + " while " + why_ +
              "; does the babbler run, or is it done?");
     }

@@ -52,8 +52,8 @@ struct ControllerConfig {
 /// Of all targets the highest (epoch, target_id) counts; a repeated one does nothing. The arm is
 /// its own (owns_arm) from the moment that a target can be served until it was reached and kept,
 /// was refused or is released. Taking it waits until the arm rests and the last settled action has
-/// its SAMPLE. While an edge on the way to the part is INVALID the arm is lent to the babbler. Neither
-/// lasts for ever: an arm that does not come to rest within rest_timeout, or that is lent for
+/// its SAMPLE. While an edge on the way to the part is INVALID, and for a probe that the monitor wants
+/// while one is PROVISIONAL, the arm is lent to the babbler. Neither lasts for ever: an arm that does not come to rest within rest_timeout, or that is lent for
 /// lent_timeout without a new SAMPLE, ends in a refusal.
 ///
 /// Start guard: nothing is sent before MOTION_STATUS, BODY_SCHEMA and MARKER_POSES of the present
@@ -188,6 +188,9 @@ class Controller {
   Stopwatch guard_, taking_, quiet_, keep_;
   Stopwatch idle_;  ///< its own arm, but nothing is sent or awaited
   Stopwatch lent_;  ///< without a new SAMPLE
+  bool is_lent_for_probe_ = false;  ///< not because an edge is INVALID
+  int num_lent_samples_ = 0;
+  std::int64_t probed_ = -1;  ///< probes wanted up to this sample are made, or given up
 
   // What was sent.
   std::int64_t epoch_ = -1;

@@ -11,6 +11,7 @@ constexpr std::size_t kRing = 64;
 /// Squared distance of every marker below which a sample cannot raise a CUSUM that is at zero.
 constexpr double kClear = 14;
 constexpr double kInflations[] = {3, 10};
+constexpr double kHighestOverAlarm = 2;
 /// Samples after a replacement at which all forms are tried again.
 constexpr int kRefits[] = {1, 2, 3, 4, 5, 7, 11, 19, 30};
 /// Changes that begin within so many samples of each other are one event.
@@ -142,6 +143,10 @@ void Adaptation::restart_tests() {
   markers_ = edges_;
 }
 
+double Adaptation::alarm() const {
+  return std::log(2.0 * filter_->num_nodes() / options_.false_alarm_rate);
+}
+
 double Adaptation::edge_statistic(int part) const {
   const int node = filter_->node_of(part);
   return node < 0 ? 0 : edges_[static_cast<std::size_t>(node)].value;
@@ -161,9 +166,11 @@ TreeFilter::Judgement Adaptation::update_tests(const TreeFilter::Instant& instan
   if (clear && std::all_of(edges_.begin(), edges_.end(), is_zero) &&
       std::all_of(markers_.begin(), markers_.end(), is_zero))
     return now;
-  const auto add = [sample_index](Cusum* cusum, double ratio) {
+  // What is not explained is not suspected for as long again once it is over.
+  const double highest = kHighestOverAlarm * alarm();
+  const auto add = [sample_index, highest](Cusum* cusum, double ratio) {
     if (cusum->value == 0) cusum->since = sample_index;
-    cusum->value = std::max(0.0, cusum->value + ratio);
+    cusum->value = std::clamp(cusum->value + ratio, 0.0, highest);
   };
   for (int node = 0; node < filter_->num_nodes(); ++node) {
     double wrong = 0;
@@ -371,10 +378,9 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
     }
   }
   const auto samples = segment(since);
-  const double alarm = std::log(2.0 * filter_->num_nodes() / options_.false_alarm_rate);
   Choice choice = choose(schema_, places, samples);
   const bool accepted = choice.best && choice.margin() > options_.acceptance;
-  if ((accepted || highest > alarm) && !detected_) {
+  if ((accepted || highest > alarm()) && !detected_) {
     detected_ = accepted ? choice.best->place : places.front();
     AdaptationEvent mismatch = event(AdaptationEvent::Kind::kMismatch, sample_index, *detected_);
     if (!detected_->marker && detected_->part == schema_.root) mismatch.cause = "camera_moved";
@@ -662,8 +668,14 @@ void Adaptation::watch_drift(std::int64_t sample_index, std::vector<AdaptationEv
                           *drifting_};
   Eigen::VectorXd theta(6);
   theta << drift->T.translation(), log_so3(drift->T.linear());
-  // `covariance` is that of a right perturbation of T: near enough to that of θ.
+  // `covariance` is that of a right perturbation of T: near enough to that of θ. What is suspected
+  // elsewhere meanwhile stays so.
+  std::vector<Cusum> edges = edges_, markers = markers_;
   install(changed(before_, change, theta, drift->covariance));
+  const auto node = static_cast<std::size_t>(filter_->node_of(*drifting_));
+  edges[node] = markers[node] = {};
+  edges_ = std::move(edges);
+  markers_ = std::move(markers);
   num_still_ = drift->significance > kSignificantRate ? 0 : num_still_ + 1;
   if (num_still_ < options_.settled_after) return;
   AdaptationEvent recovered =
@@ -714,7 +726,11 @@ std::vector<AdaptationEvent> Adaptation::on_sample(const ActionPoseSample& seen)
   } else {
     watch_drift(sample.sample_index, &events);
   }
-  if (detected_ && suspects().empty()) detected_.reset();
+  if (detected_ && suspects().empty()) {
+    events.push_back(event(AdaptationEvent::Kind::kRecovered, sample.sample_index, *detected_));
+    events.back().cause = "unexplained";
+    detected_.reset();
+  }
   if (is_settled() && suspects().empty()) watch_noise(judgement);
   return events;
 }

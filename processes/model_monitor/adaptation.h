@@ -124,6 +124,8 @@ class Adaptation {
   void watch_drift(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
   void watch_noise(const TreeFilter::Judgement& judgement);
   void restart_tests();
+  /// CUSUM above which something is wrong even if nothing explains it [nats].
+  double alarm() const;
   /// Returns the judgement under the schema as it stands.
   TreeFilter::Judgement update_tests(const TreeFilter::Instant& instant, std::int64_t sample_index);
   std::vector<const ActionPoseSample*> segment(std::int64_t since) const;

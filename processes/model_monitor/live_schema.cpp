@@ -103,7 +103,7 @@ std::int64_t LiveSchema::holds_since(int part) const {
 }
 
 bool LiveSchema::is_in_doubt() const {
-  return !adaptation_.is_settled() ||
+  return !adaptation_.is_settled() || !adaptation_.missing_parts().empty() ||
          std::any_of(schema_.parts.begin(), schema_.parts.end(), [&](int part) {
            return adaptation_.edge_state(part) != EdgeState::kOk ||
                   adaptation_.marker_state(part) != EdgeState::kOk;

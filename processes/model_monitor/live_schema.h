@@ -33,7 +33,7 @@ class LiveSchema {
   const BodySchema& schema() const { return schema_; }
   const BodySchema& base() const { return base_; }
   const std::vector<BodySchema>& history() const { return adaptation_.history(); }
-  /// A change of the body is suspected, or found and not settled.
+  /// A change of the body is suspected, or found and not settled, or a marker is missing.
   bool is_in_doubt() const;
   bool is_camera_as_base() const { return camera_since_ == base_since_; }
   /// The first sample that all edges hold for.

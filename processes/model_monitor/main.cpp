@@ -4,8 +4,11 @@
 
 #include <CLI/CLI.hpp>
 #include <filesystem>
+#include <stdexcept>
 #include <utility>
+#include <vector>
 
+#include "common/bus/event_log.h"
 #include "common/bus/process.h"
 #include "common/bus/rig_door.h"
 #include "common/bus/sample_intake.h"
@@ -27,7 +30,7 @@ std::filesystem::path beside(const std::filesystem::path& file, const char* name
 int main(int argc, char** argv) {
   std::string samples_file;
   bool is_replayed = false;
-  std::string schema_file;
+  std::string schema_file, initial_file;
   const auto add_options = [&](CLI::App& app) {
     app.add_option("--samples", samples_file, "The observer's samples.lcmlog, read at start");
     app.add_flag("--replayed", is_replayed,
@@ -35,6 +38,9 @@ int main(int argc, char** argv) {
     app.add_option(
         "--schema", schema_file,
         "Where the body schema is kept, and history.lcmlog beside it; reloaded at start");
+    app.add_option("--initial", initial_file,
+                   "Body schema to begin with where none is kept: engineered, or another run's")
+        ->check(CLI::ExistingFile);
   };
   const auto body = [&](Process& process) {
     const RigDoor door(process.rig_folder());
@@ -48,6 +54,14 @@ int main(int argc, char** argv) {
         monitor.restore(*memory);
       } else if (schema) {
         monitor.start_from(*schema);
+      } else if (!initial_file.empty()) {
+        std::vector<body_schema_t> initial = read_log(initial_file, kBodySchema);
+        if (initial.empty()) throw std::runtime_error(initial_file + ": no BODY_SCHEMA in the file");
+        if (const std::string why = door.objection(initial.back()); !why.empty())
+          throw std::runtime_error(initial_file + ": " + why);
+        initial.back().last_sample_index = -1;
+        initial.back().schema_version = 0;
+        monitor.start_from(initial.back());
       }
     }
     bool is_news = false;
@@ -74,7 +88,7 @@ int main(int argc, char** argv) {
       if (!problem.empty() || !intake.activity().empty()) {
         process.set_activity(process_info_t::PHASE_WAITING,
                              problem.empty() ? intake.activity() : "cannot save: " + problem);
-      } else if (monitor.health().judged_sample < 0) {
+      } else if (!monitor.schema() && monitor.health().judged_sample < 0) {
         process.set_activity(process_info_t::PHASE_WAITING, "waiting for LEARNED_SCHEMA");
       } else {
         process.set_activity(process_info_t::PHASE_WORKING,

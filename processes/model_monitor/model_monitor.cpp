@@ -15,6 +15,9 @@ namespace {
 
 constexpr std::size_t kMaxEvents = 32;
 constexpr std::size_t kMaxWaiting = 32;
+/// TEST samples that judge an edge and a part: the newest. Twice as many are kept, for proposals that
+/// come late.
+constexpr std::size_t kTests = 200;
 /// Samples before a base that tell its noise and how often parts are seen.
 constexpr std::size_t kPast = 64;
 /// States kept for proposals that did not come yet; what is between them is gone through again.
@@ -98,6 +101,9 @@ void ModelMonitor::restore(const MonitorMemory& memory) {
   now_.sample_index = restored_sample_;
   now_.events = memory.at_base.events;
   if (!now_.events.empty()) now_.num_events = now_.events.back().event_number + 1;
+  // Verdicts since that were too many to remember.
+  if (!memory.verdicts.events.empty())
+    now_.num_events += memory.verdicts.events.front().event_number;
   if (!memory.schemas.empty()) {
     BodySchema base = from_message(memory.schemas.back());
     if (base.complete && config_.false_alarm_rate > 0) {
@@ -118,7 +124,11 @@ bool ModelMonitor::on_sample(const sample_t& message) {
   last_sample_index_ = message.sample_index;
   for (const auto& part : message.parts) seen_in_[part.part_id].push_back(message.sample_index);
   ActionPoseSample sample = from_message(message);
-  if (sample.purpose == Purpose::kTest) tests_.push_back(sample);
+  if (sample.purpose == Purpose::kTest) {
+    test_indices_.push_back(sample.sample_index);
+    tests_.push_back(sample);
+    if (tests_.size() > 2 * kTests) tests_.pop_front();
+  }
   samples_.push_back(std::move(sample));
   is_assessed_ = false;
   if (last_sample_index_ < restored_sample_) {
@@ -158,9 +168,16 @@ bool ModelMonitor::on_learned_schema(const body_schema_t& proposal) {
 }
 
 bool ModelMonitor::is_test(std::int64_t sample_index) const {
-  return std::any_of(tests_.rbegin(), tests_.rend(), [&](const ActionPoseSample& sample) {
-    return sample.sample_index == sample_index;
-  });
+  return std::binary_search(test_indices_.begin(), test_indices_.end(), sample_index);
+}
+
+std::vector<const ActionPoseSample*> ModelMonitor::tests_up_to(std::int64_t sample_index) const {
+  std::vector<const ActionPoseSample*> result;
+  for (const ActionPoseSample& sample : tests_)
+    if (sample.sample_index <= sample_index) result.push_back(&sample);
+  if (result.size() > kTests)
+    result.erase(result.begin(), result.end() - static_cast<std::ptrdiff_t>(kTests));
+  return result;
 }
 
 bool ModelMonitor::fits(const BodySchema& schema, const ActionPoseSample& sample) {
@@ -242,13 +259,12 @@ ModelMonitor::EdgeTest ModelMonitor::test(const BodySchema& schema, const Edge& 
   const Matrix6d model_error = diagonal(config_.model_error);
   EdgeTest result;
   std::vector<double> distances;
-  for (const ActionPoseSample& sample : tests_) {
-    if (sample.sample_index > last) break;
-    if (sample.sample_index < first) continue;
-    const PartObservation* from = sample.find(edge.from);
-    const PartObservation* to = sample.find(edge.to);
-    if (!from || !to || !fits(schema, sample)) continue;
-    const Eigen::VectorXd theta = schema.displacements(sample.action);
+  for (const ActionPoseSample* sample : tests_up_to(last)) {
+    if (sample->sample_index < first) continue;
+    const PartObservation* from = sample->find(edge.from);
+    const PartObservation* to = sample->find(edge.to);
+    if (!from || !to || !fits(schema, *sample)) continue;
+    const Eigen::VectorXd theta = schema.displacements(sample->action);
     const Pose predicted = edge.predict(theta);
     const Matrix6d model = edge.prediction_covariance(theta) + model_error;
     // A planar marker has two poses; the likelier one under the model speaks.
@@ -383,7 +399,7 @@ const model_health_t& ModelMonitor::health() const {
   const BodySchema* schema = now_.schema();
   health_.utime = judged_utime_;
   health_.judged_sample = judged_sample_;
-  if (judged_sample_ < 0) return health_;
+  if (judged_sample_ < 0 && !now_.live) return health_;
   assess(schema ? *schema : BodySchema());
   if (now_.live) now_.live->describe(&health_);
   return health_;
@@ -394,8 +410,8 @@ void ModelMonitor::assess(const BodySchema& schema) const {
   health_.schema_complete = schema.complete;
   health_.worst_position_m = health_.worst_rotation_rad = -1;
   health_.num_test_samples = static_cast<std::int32_t>(
-      std::count_if(tests_.begin(), tests_.end(),
-                    [&](const auto& sample) { return sample.sample_index <= judged_sample_; }));
+      std::upper_bound(test_indices_.begin(), test_indices_.end(), judged_sample_) -
+      test_indices_.begin());
 
   std::vector<edge_health_t> edges;
   for (const Edge& edge : schema.edges) {
@@ -411,6 +427,7 @@ void ModelMonitor::assess(const BodySchema& schema) const {
   }
   set_array(health_.num_edges, health_.edge_health, std::move(edges));
 
+  const auto tests = tests_up_to(judged_sample_);
   std::vector<part_health_t> parts;
   for (const auto& [part, indices] : seen_in_) {
     const auto num_seen =
@@ -418,15 +435,15 @@ void ModelMonitor::assess(const BodySchema& schema) const {
     std::vector<double> position_errors, rotation_errors;
     const auto path = KinematicPath::between(schema, schema.root, part);
     const std::int64_t since = now_.live ? now_.live->holds_since(part) : 0;
-    for (const ActionPoseSample& sample : tests_) {
-      if (sample.sample_index > judged_sample_) break;
-      const PartObservation* seen = sample.find(part);
-      if (!seen || !path || schema.root < 0 || sample.sample_index < since || !fits(schema, sample))
+    for (const ActionPoseSample* sample : tests) {
+      const PartObservation* seen = sample->find(part);
+      if (!seen || !path || schema.root < 0 || sample->sample_index < since ||
+          !fits(schema, *sample))
         continue;
       // The camera and the root stand still, so the root's mean pose serves: its orientation noise
       // would otherwise be read as an error of every part far away.
       const Pose error =
-          path->predict(sample.action).inverse() * schema.X_CR.inverse() * seen->X_CB;
+          path->predict(sample->action).inverse() * schema.X_CR.inverse() * seen->X_CB;
       position_errors.push_back(error.translation().norm());
       rotation_errors.push_back(rotation_angle(error));
     }
@@ -434,7 +451,7 @@ void ModelMonitor::assess(const BodySchema& schema) const {
     health.health_part = part;
     health.marker_cusum = health.camera_cusum = -1;
     health.num_predicted = static_cast<std::int32_t>(position_errors.size());
-    health.visibility = double(num_seen) / double(judged_sample_ + 1);
+    health.visibility = double(num_seen) / double(std::max<std::int64_t>(judged_sample_ + 1, 1));
     health.position_median_m = median(position_errors);
     health.rotation_median_rad = median(rotation_errors);
     health_.worst_position_m = std::max(health_.worst_position_m, health.position_median_m);

@@ -60,8 +60,8 @@ class ModelMonitor {
   /// What an earlier run of this process remembered, before the samples are gone through again: the
   /// state after them is then as if nothing had happened.
   void restore(const MonitorMemory& memory);
-  /// Begins with a schema that nothing else is known of: an engineered model, or another run's.
-  /// It holds for the samples after its last.
+  /// Begins with a schema of this run whose memory was lost: it holds for the samples after its last.
+  /// Of another run's, or an engineered one, last_sample_index must be −1.
   void start_from(const body_schema_t& schema);
 
   /// Returns true if schema() or memory() may have changed.
@@ -98,6 +98,8 @@ class ModelMonitor {
 
   static bool fits(const BodySchema& schema, const ActionPoseSample& sample);
   bool is_test(std::int64_t sample_index) const;
+  /// The newest of these TEST samples, oldest first.
+  std::vector<const ActionPoseSample*> tests_up_to(std::int64_t sample_index) const;
   EdgeTest test(const BodySchema& schema, const Edge& edge, std::int64_t first,
                 std::int64_t last) const;
   /// `standing` one sample later. Verdicts that a restart remembers are spoken again.
@@ -117,7 +119,8 @@ class ModelMonitor {
 
   const ModelMonitorConfig config_;
   AdaptationOptions options_;
-  std::vector<ActionPoseSample> tests_;
+  std::vector<std::int64_t> test_indices_;  ///< of all TEST samples
+  std::deque<ActionPoseSample> tests_;      ///< the newest
   std::deque<ActionPoseSample> samples_;  ///< the newest, back to where anything may begin again
   std::map<int, std::vector<std::int64_t>> seen_in_;  ///< part → indices of samples that show it
   std::int64_t last_sample_index_ = -1;

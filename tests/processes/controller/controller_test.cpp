@@ -1035,6 +1035,31 @@ TEST(ControllerTest, WithAnInvalidEdgeOnTheWayTheArmIsLentAndTakenBack) {
   }
 }
 
+TEST(ControllerTest, ForAProbeTheArmIsLentUntilItIsMadeOrNobodyMakesIt) {
+  for (const bool is_made : {true, false}) {
+    Bench bench;
+    bench.start();
+    bench.give(position_target(0, kFar));
+    ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 1; }));
+    bench.health = health_of(1, 2, 3, schema_edge_t::EDGE_PROVISIONAL);
+    bench.health->probe_sample = bench.num_samples;
+    set_array(bench.health->num_probe, bench.health->probe_action, {5.0, 0.1, 1.0});
+    bench.repeat();
+    ASSERT_TRUE(bench.run_until_state(S::CONTROL_LENT));
+    EXPECT_EQ(bench.status.owns_arm, 0);
+    EXPECT_TRUE(bench.has_why("for a probe")) << bench.status.why;
+    const std::size_t num_moves = bench.moves.size();
+    bench.settle("motor_babbler", 1, 20, {10, 0.1, 1});
+    bench.run(1);
+    EXPECT_EQ(bench.status.control_state, S::CONTROL_LENT);
+    EXPECT_EQ(bench.moves.size(), num_moves);
+    if (is_made)
+      bench.settle("motor_babbler", 1, 21, {5, 0.1, 1}, action_command_t::PURPOSE_PROBE);
+    // Else the babbler is silent.
+    EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+  }
+}
+
 TEST(ControllerTest, AnArmThatIsLentInVainEndsTheTarget) {
   Bench bench;
   bench.schema.edges[1].state = EdgeState::kInvalid;

@@ -132,6 +132,71 @@ TEST(AdaptationTest, ASlowDriftIsNamedAndFollowed) {
   EXPECT_GT(arm.error(arm.engineered(), 399), 0.03);
 }
 
+TEST(AdaptationTest, WhatBreaksWhileALinkDriftsIsFoundAllTheSame) {
+  BrokenArm arm({Fault::kDrift, "", 1}, Regime::kTagIso, 60, 2);
+  Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kTagIso));
+  Pose tool = Pose::Identity();
+  tool.translation() << 0.1, 0, 0.05;
+  tool.linear() = exp_so3(Eigen::Vector3d(0.5, 0, 0));
+  Life life;
+  std::vector<double> distances;  // of what is seen from what is predicted, in the end
+  for (int t = 0; t < 240; ++t) {
+    ActionPoseSample sample = arm.observe(t);
+    if (t >= 180)
+      for (PartObservation& o : sample.parts) {
+        if (o.part != 7) continue;
+        o.X_CB = o.X_CB * tool;
+        if (o.X_CB_other) *o.X_CB_other = *o.X_CB_other * tool;
+      }
+    for (const auto& e : adaptation.on_sample(sample)) life.events.push_back(e);
+    const PartObservation* seen = sample.find(7);
+    if (t < 220 || !seen) continue;
+    const Pose X_CB = adaptation.schema().X_CR * adaptation.schema().predict_all(sample.action).at(7);
+    distances.push_back((X_CB.translation() - seen->X_CB.translation()).norm());
+  }
+  SCOPED_TRACE("events:\n" + life.log());
+  EXPECT_TRUE(std::any_of(life.events.begin(), life.events.end(), [](const AdaptationEvent& e) {
+    return e.kind == Kind::kDrift && e.sample_index < 180;
+  }));
+  EXPECT_TRUE(std::any_of(life.events.begin(), life.events.end(), [](const AdaptationEvent& e) {
+    return e.kind == Kind::kCandidate && part_of(e) == 7 && e.sample_index >= 180 &&
+           e.sample_index < 186;
+  }));
+  std::nth_element(distances.begin(), distances.begin() + std::ssize(distances) / 2,
+                   distances.end());
+  EXPECT_LT(distances[distances.size() / 2], 0.015);
+}
+
+TEST(AdaptationTest, WhatNothingExplainsIsOverSoonAfterItEnds) {
+  // A part is a hand's breadth beside where it was, elsewhere at each sample, for forty samples.
+  BrokenArm arm({Fault::kNone, "", 1}, Regime::kTagIso, 50, 1);
+  Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kTagIso));
+  test::Rng rng(1);
+  Life life;
+  double highest = 0;
+  for (int t = 0; t < 140; ++t) {
+    ActionPoseSample sample = arm.observe(t);
+    for (PartObservation& o : sample.parts) {
+      if (o.part != 4 || t < 50 || t >= 90) continue;
+      Vector6d error = test::gaussian6(rng);
+      error.head<3>() *= 0.06;
+      error.tail<3>() *= 0.4;
+      o.X_CB = o.X_CB * exp(error);
+      o.X_CB_other.reset();
+    }
+    for (const auto& e : adaptation.on_sample(sample)) life.events.push_back(e);
+    for (const int part : {2, 3, 4, 5})
+      highest = std::max({highest, adaptation.edge_statistic(part), adaptation.marker_statistic(part)});
+  }
+  // Else it took as long again.
+  EXPECT_LE(highest, 2 * std::log(2 * 7 / adaptation.options().false_alarm_rate) + 1e-9);
+  EXPECT_TRUE(adaptation.is_settled()) << life.log();
+  for (const int part : {2, 3, 4, 5}) {
+    EXPECT_EQ(adaptation.edge_state(part), EdgeState::kOk) << part << life.log();
+    EXPECT_EQ(adaptation.marker_state(part), EdgeState::kOk) << part << life.log();
+  }
+}
+
 TEST(AdaptationTest, AMarkerThatIsMissingIsToldAndComesBack) {
   BrokenArm arm({Fault::kNone, "", 1}, Regime::kTagIso, 50, 1);
   Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kTagIso));
