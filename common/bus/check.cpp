@@ -589,6 +589,8 @@ std::string check(const model_health_t& message) {
   check.measured("noise_scale", message.noise_scale);
   check.integer_at_least("probe_sample", message.probe_sample, -1);
   check.numbers("probe_action", message.num_probe, message.probe_action, kMaxSignals);
+  check.require(message.probe_sample < 0 || message.num_probe > 0, "probe_sample",
+                "wants a probe without an action");
   check.each("edge_health", message.num_edges, message.edge_health, kMaxParts,
              [&](const edge_health_t& edge) {
                check.integer_at_least("health_from", edge.health_from, 0);

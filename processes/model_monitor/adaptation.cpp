@@ -34,6 +34,13 @@ constexpr std::size_t kFewestDistances = 20;
 /// Quiet samples after which the noise is looked at again.
 constexpr int kQuietSamples = 32;
 
+/// Of a suspicion so many samples old: growing steps bound the work of one that lasts.
+bool is_worth_a_fit(std::int64_t age) {
+  constexpr std::int64_t kAges[] = {10, 12, 15, 19, 24};
+  return age <= 8 || age % 30 == 0 ||
+         std::find(std::begin(kAges), std::end(kAges), age) != std::end(kAges);
+}
+
 double median(std::vector<double> values) {
   const auto middle = values.begin() + static_cast<std::ptrdiff_t>(values.size() / 2);
   std::nth_element(values.begin(), middle, values.end());
@@ -166,11 +173,12 @@ TreeFilter::Judgement Adaptation::update_tests(const TreeFilter::Instant& instan
   if (clear && std::all_of(edges_.begin(), edges_.end(), is_zero) &&
       std::all_of(markers_.begin(), markers_.end(), is_zero))
     return now;
-  // What is not explained is not suspected for as long again once it is over.
+  // What is not explained is not suspected for as long again once it is over: earlier samples count
+  // up to a ceiling.
   const double highest = kHighestOverAlarm * alarm();
   const auto add = [sample_index, highest](Cusum* cusum, double ratio) {
     if (cusum->value == 0) cusum->since = sample_index;
-    cusum->value = std::clamp(cusum->value + ratio, 0.0, highest);
+    cusum->value = std::max(0.0, std::min(cusum->value, highest) + ratio);
   };
   for (int node = 0; node < filter_->num_nodes(); ++node) {
     double wrong = 0;
@@ -364,6 +372,12 @@ AdaptationEvent Adaptation::event(AdaptationEvent::Kind kind, std::int64_t sampl
   return result;
 }
 
+double Adaptation::required_margin(const Place& place, std::int64_t sample_index) const {
+  const auto it = reversions_.find(place);
+  const bool is_recent = it != reversions_.end() && it->second.last + kSoon >= sample_index;
+  return options_.acceptance * (is_recent ? 1 + it->second.num : 1);
+}
+
 void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEvent>* events) {
   const std::vector<Place> places = suspects();
   if (places.empty()) return;
@@ -377,9 +391,12 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
       }
     }
   }
+  // What nothing explained so far is looked at again when there is clearly more of it.
+  if (detected_ && !is_worth_a_fit(sample_index - since + 1)) return;
   const auto samples = segment(since);
   Choice choice = choose(schema_, places, samples);
-  const bool accepted = choice.best && choice.margin() > options_.acceptance;
+  const bool accepted =
+      choice.best && choice.margin() > required_margin(choice.best->place, sample_index);
   if ((accepted || highest > alarm()) && !detected_) {
     detected_ = accepted ? choice.best->place : places.front();
     AdaptationEvent mismatch = event(AdaptationEvent::Kind::kMismatch, sample_index, *detected_);
@@ -473,6 +490,9 @@ void Adaptation::reconsider(std::int64_t sample_index, bool all_forms,
         reverted.cause = r.fitted.change.cause(others);
         reverted.margin = choice.margin();
         events->push_back(reverted);
+        Reversions& reversions = reversions_[r.place];
+        reversions.num = reversions.last + kSoon < sample_index ? 1 : reversions.num + 1;
+        reversions.last = sample_index;
         replacements_.erase(replacements_.begin() + n);
         is_changed = true;
         continue;

@@ -142,6 +142,9 @@ class Adaptation {
                 const std::vector<const ActionPoseSample*>& samples,
                 const BodyChange* standing_form = nullptr) const;
   BodySchema composed(int without = -1) const;
+  /// Evidence that a change must have over the schema that stands [nats]: more where changes were
+  /// taken back lately.
+  double required_margin(const Place& place, std::int64_t sample_index) const;
   void try_changes(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
   void reconsider(std::int64_t sample_index, bool all_forms, std::vector<AdaptationEvent>* events);
   void want_probe(const BodySchema& standing, const Choice& choice, std::int64_t sample_index,
@@ -171,6 +174,11 @@ class Adaptation {
   FallenMarkers fallen_;
   std::vector<Cusum> edges_, markers_;  ///< by node
   std::optional<Place> detected_;
+  struct Reversions {
+    int num = 0;
+    std::int64_t last = 0;
+  };
+  std::map<Place, Reversions> reversions_;  ///< changes that were taken back
   BodySchema before_;                      ///< what stood before the present replacements
   std::vector<Replacement> replacements_;  ///< not settled yet, in the order they came
   std::int64_t since_ = 0;                 ///< first sample with the changed body

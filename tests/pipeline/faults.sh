@@ -25,12 +25,17 @@ until_true() {
   done
   fail "$what"
 }
-told() { grep -qE "^  sample .*$1" "$work/status.txt"; }
-is_learned() {
-  local newest
-  newest=$(sed -n "s/^sample *\([0-9]*\):.*/\1/p" "$work/status.txt")
-  [ "${newest:-0}" -ge 40 ] && is_sound
+newest() {
+  local sample
+  sample=$(sed -n 's/^sample *\([0-9]*\):.*/\1/p' "$work/status.txt")
+  echo "${sample:-0}"
 }
+# told SINCE PATTERN: an event of that sample or a later one.
+told() {
+  awk -v since="$1" -v pattern="$2" '$1 == "sample" && $2 + 0 >= since && $0 ~ pattern {found = 1} END {exit !found}' \
+    "$work/status.txt"
+}
+is_learned() { [ "$(newest)" -ge 40 ] && is_sound; }
 is_sound() { grep -q "^schema .*complete" "$work/status.txt" && ! grep -qE "INVALID|SUSPECT" "$work/status.txt"; }
 fault() { "$source/run" fault "$@" >>"$work/console.txt" 2>&1 || fail "fault $*"; }
 # The program itself, not the setpriv that became it: its command line begins with its path.
@@ -44,15 +49,17 @@ until_true "the arm was not learned" is_learned
 break_and_repair() {
   local place=$1 cause=$2 victim=$3
   shift 3
-  local one
+  local one since
+  since=$(newest)
   for one in "$@"; do
     # shellcheck disable=SC2086
     fault $one
   done
-  until_true "$*: not found" told "$place: (candidate|refined|missing) $cause"
+  until_true "$*: not found" told "$since" "$place: (candidate|refined|missing) $cause"
   kill_process "$victim"
+  since=$(newest)
   fault repair
-  until_true "$*: the repair was not found" told "$place: (restored|reverted|recovered)"
+  until_true "$*: the repair was not found" told $((since + 1)) "$place: (restored|reverted|recovered)"
   until_true "$*: not sound again" is_sound
 }
 break_and_repair "edge 4–5" joint_stuck model_monitor "stuck q3"

@@ -374,6 +374,46 @@ TEST_F(ModelMonitorTest, ThereIsNoStepBackFromCompleteToIncomplete) {
   EXPECT_EQ(fresh.health().schema_complete, 0);
 }
 
+TEST_F(ModelMonitorTest, BeginsWithASchemaOfBeforeAndIsHeardOfItAtOnce) {
+  body_schema_t schema = proposal(44);
+  schema.schema_version = 0;
+  schema.last_sample_index = -1;
+  ModelMonitor monitor(test_config());
+  monitor.start_from(schema);
+  ASSERT_TRUE(monitor.schema());
+  EXPECT_EQ(monitor.health().edge_health.size(), schema.edges.size());
+  EXPECT_EQ(check(monitor.health()), "");
+  const Edge broken = break_last_joint(30);
+  for (std::int64_t i = 0; i < kNumSamples; ++i) monitor.on_sample(sample(i));
+  EXPECT_EQ(check(monitor.health()), "");
+  const auto& events = monitor.health().events;
+  EXPECT_TRUE(std::any_of(events.begin(), events.end(), [&](const health_event_t& e) {
+    return e.event_kind == health_event_t::EVENT_CANDIDATE && e.event_to == broken.to &&
+           e.event_cause == "joint_stuck";
+  }));
+}
+
+TEST_F(ModelMonitorTest, AMarkerIsMissedAsLongAsItIsGoneWhateverIsProposed) {
+  int part = 0;
+  for (const PartObservation& o : samples_.front().parts) part = std::max(part, o.part);
+  for (ActionPoseSample& sample : samples_)
+    if (sample.sample_index >= 20)
+      std::erase_if(sample.parts, [part](const PartObservation& o) { return o.part == part; });
+  ModelMonitor monitor(test_config());
+  bool is_told = false;
+  for (std::int64_t i = 0; i < kNumSamples; ++i) {
+    monitor.on_sample(sample(i));
+    if (i % 5 == 4) monitor.on_learned_schema(proposal(i));
+    const auto& parts = monitor.health().part_health;
+    const bool is_unseen = std::any_of(parts.begin(), parts.end(), [part](const auto& health) {
+      return health.health_part == part && health.is_unseen != 0;
+    });
+    EXPECT_TRUE(is_unseen || !is_told) << i;
+    is_told |= is_unseen;
+  }
+  EXPECT_TRUE(is_told);
+}
+
 TEST_F(ModelMonitorTest, AProposalAheadOfTheSamplesWaitsForThem) {
   ModelMonitor in_order = monitor_at(44);
   in_order.on_learned_schema(proposal(44));
@@ -707,6 +747,26 @@ TEST(ModelMonitorByHandTest, SamplesOfAnotherRigDoNotEndTheProcess) {
   schema.last_sample_index = 2;
   EXPECT_NO_THROW(monitor.on_learned_schema(to_message(schema)));
   EXPECT_EQ(check(monitor.health()), "");
+}
+
+TEST(ModelMonitorByHandTest, VerdictsThatWereTooManyToRememberAreCountedAfterARestart) {
+  MonitorMemory memory;
+  memory.at_base.judged_sample = -1;
+  std::vector<health_event_t> verdicts;
+  for (int n = 8; n < 40; ++n) {
+    health_event_t event{};
+    event.event_number = n;
+    event.event_sample = n - 8;
+    event.event_from = event.event_to = event.event_part = -1;
+    event.event_kind = health_event_t::EVENT_SCHEMA_REFUSED;
+    verdicts.push_back(event);
+  }
+  set_array(memory.verdicts.num_events, memory.verdicts.events, std::move(verdicts));
+  memory.verdicts.judged_sample = 31;
+  ModelMonitor monitor(test_config());
+  monitor.restore(memory);
+  for (int i = 0; i < 32; ++i) monitor.on_sample(two_parts_seen(i, 0, 0));
+  EXPECT_EQ(monitor.health().events.back().event_number, 39);
 }
 
 TEST(ModelMonitorByHandTest, AProposalWithoutPartsIsRefusedQuietly) {
