@@ -294,10 +294,8 @@ class Search {
       if (forest_.find(x) != x) continue;
       for (int round = 0; round < kMaxSplits; ++round) {
         const Tree tree = tree_of(x);
-        const TreeFit fit = fit_tree(tree);
-        const auto missing = fit.missing_joints(options_.measurement.model_error);
-        const MissingJoint* worst =
-            tree.nodes.size() < 2 ? nullptr : most_significant(missing, fit.num_frames());
+        TreeFit fit = fit_tree(tree);
+        const auto worst = tree.nodes.size() < 2 ? std::nullopt : missing_joint(&fit);
         if (!worst || round + 1 == kMaxSplits) {
           result_.log_likelihood += fit.log_likelihood();
           break;
@@ -411,9 +409,8 @@ class Search {
     forest_.connect(h.i, h.j);
     for (int added = 0; added <= kMaxJoints; ++added) {
       const Tree tree = tree_of(h.i);
-      const TreeFit fit = fit_tree(tree);
-      const auto missing = fit.missing_joints(options_.measurement.model_error);
-      if (const MissingJoint* worst = most_significant(missing, fit.num_frames())) {
+      TreeFit fit = fit_tree(tree);
+      if (const auto worst = missing_joint(&fit)) {
         const auto edges = fit.with_joint(*worst);
         if (!edges) break;
         adopt(tree, *edges);
@@ -470,6 +467,18 @@ class Search {
         model.model = model.model.inverse();
       }
       result_.models.push_back(model);
+    }
+  }
+
+  // The joint that the tree lacks most. What a fit has not settled yet looks like one: only if it
+  // remains after more steps.
+  std::optional<MissingJoint> missing_joint(TreeFit* fit) const {
+    for (bool is_settled = false;; is_settled = true) {
+      const auto joints = fit->missing_joints(options_.measurement.model_error);
+      const MissingJoint* worst = most_significant(joints, fit->num_frames());
+      if (!worst) return std::nullopt;
+      if (is_settled) return *worst;
+      fit->fit(60, 1e-5);
     }
   }
 
