@@ -49,7 +49,8 @@ double median(std::vector<double> values) {
 
 bool differ(const Edge& a, const Edge& b) {
   if (!a.left.isApprox(b.left, 1e-9) || !a.right.isApprox(b.right, 1e-9) ||
-      a.joints.size() != b.joints.size())
+      a.joints.size() != b.joints.size() || a.matrix_gp != b.matrix_gp ||
+      a.residual_gp != b.residual_gp)
     return true;
   for (std::size_t d = 0; d < a.joints.size(); ++d) {
     const ScrewJoint &x = a.joints[d], &y = b.joints[d];

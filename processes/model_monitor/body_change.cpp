@@ -284,6 +284,8 @@ BodySchema changed(const BodySchema& schema, const BodyChange& change, const Eig
       edge->left = edge->predict(schema.displacements(middle));
       edge->right = Pose::Identity();
       edge->joints.clear();
+      edge->matrix_gp.reset();
+      edge->residual_gp.reset();
       edge->parameter_covariance = Eigen::MatrixXd::Zero(6, 6);
       multiply_right(edge, theta, of_first);
       break;
