@@ -179,7 +179,7 @@ TEST(TreeFit, AMarkersOwnBiasIsNoJoint) {
   Case c(chain(0.2, rng), 400, Regime::kTagIso, false, rng);
   for (ActionPoseSample& sample : c.samples)
     for (PartObservation& o : sample.parts)
-      if (o.part == 4) o.X_CB = o.X_CB * Eigen::Translation3d(0, 0.003 * sample.action(0));
+      if (o.part == 4) o.X_CB = o.X_CB * Eigen::Translation3d(0, 0.003 * sample.action(0), 0);
   c.data[3] = make_part_data(c.samples, 4, c.measurement, std::numeric_limits<int>::max());
   TreeFit fit(c.nodes, c.data, c.actions, true);
   fit.fit(20, 1e-3);
