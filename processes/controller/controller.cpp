@@ -22,7 +22,7 @@ constexpr std::int64_t kRepeat_us = 1'000'000;
 constexpr int kMaxExpired = 3;         // in a row
 constexpr double kMovedCamera = 33.1;  // chi^2_6(0.99999): the camera is not where the schema says
 constexpr double kSurprise = 14.2;     // chi^2_3(0.9973): what is seen refutes the schema
-constexpr int kLentForProbe = 8;       // samples: the babbler probes after a TEST sample, every fifth
+constexpr int kLentForProbe = 8;       // samples: the babbler probes after every fifth, a TEST
 constexpr double kArrived = 1e-9;      // of a range
 
 std::int64_t microseconds(double seconds) { return std::llround(seconds * 1e6); }

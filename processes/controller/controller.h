@@ -52,9 +52,10 @@ struct ControllerConfig {
 /// Of all targets the highest (epoch, target_id) counts; a repeated one does nothing. The arm is
 /// its own (owns_arm) from the moment that a target can be served until it was reached and kept,
 /// was refused or is released. Taking it waits until the arm rests and the last settled action has
-/// its SAMPLE. While an edge on the way to the part is INVALID, and for a probe that the monitor wants
-/// while one is PROVISIONAL, the arm is lent to the babbler. Neither lasts for ever: an arm that does not come to rest within rest_timeout, or that is lent for
-/// lent_timeout without a new SAMPLE, ends in a refusal.
+/// its SAMPLE. While an edge on the way to the part is INVALID, and for a probe that the monitor
+/// wants while one is PROVISIONAL, the arm is lent to the babbler. Neither lasts for ever: an arm
+/// that does not come to rest within rest_timeout, or that is lent for lent_timeout without a new
+/// SAMPLE, ends in a refusal; a probe that nobody makes is done without.
 ///
 /// Start guard: nothing is sent before MOTION_STATUS, BODY_SCHEMA and MARKER_POSES of the present
 /// rest were heard, and no MOVE from a position that was not heard: the last settled action of this

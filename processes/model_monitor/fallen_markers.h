@@ -10,14 +10,14 @@
 
 namespace bodyschema {
 
-/// Finds markers that fell off their parts and lie in sight: read at one place again and again while
-/// the part that they were on moves. No change of the body explains them, so they are told apart
-/// before anything is judged. A joint that is stuck holds a part still as well, but where the schema
-/// has it at some action, and all parts beyond; that is found from the first sample on.
+/// Finds markers that fell off their parts and lie in sight: read at one place again and again
+/// while the part that they were on moves. No change of the body explains them, so they are told
+/// apart before anything is judged. A joint that is stuck holds a part still as well, but where the
+/// schema has it at some action, and all parts beyond; that is found from the first sample on.
 class FallenMarkers {
  public:
-  /// Looks at what the sample shows of `part`. Returns the first sample that showed its marker where
-  /// it lies; std::nullopt while it does not. `X_CB` is where the schema has the part.
+  /// Looks at what the sample shows of `part`. Returns the first sample that showed its marker
+  /// where it lies; std::nullopt while it does not. `X_CB` is where the schema has the part.
   std::optional<std::int64_t> look(const ActionPoseSample& sample, int part, const Pose& X_CB,
                                    const MarkerNoise& noise);
 

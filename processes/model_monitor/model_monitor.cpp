@@ -15,8 +15,8 @@ namespace {
 
 constexpr std::size_t kMaxEvents = 32;
 constexpr std::size_t kMaxWaiting = 32;
-/// TEST samples that judge an edge and a part: the newest. Twice as many are kept, for proposals that
-/// come late.
+/// TEST samples that judge an edge and a part: the newest. Twice as many are kept, for proposals
+/// that come late.
 constexpr std::size_t kTests = 200;
 /// Samples before a base that tell its noise and how often parts are seen.
 constexpr std::size_t kPast = 64;

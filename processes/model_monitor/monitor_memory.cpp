@@ -1,10 +1,9 @@
 #include "processes/model_monitor/monitor_memory.h"
 
-#include <spdlog/spdlog.h>
-
 #include <stdexcept>
 
 #include "common/bus/event_log.h"
+#include "processes/model_monitor/saved_message.h"
 
 namespace bodyschema {
 namespace {
@@ -49,9 +48,7 @@ std::optional<MonitorMemory> MemoryFile::load(const Objection& objection) {
   } catch (const std::runtime_error& error) {
     problem = error.what();
   }
-  const auto aside = copy_aside(file_);
-  std::filesystem::remove(file_);
-  spdlog::warn("{}; set aside as {}", problem, aside.filename().string());
+  set_aside(file_, problem);
   return std::nullopt;
 }
 

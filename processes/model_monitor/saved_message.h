@@ -14,6 +14,13 @@
 
 namespace bodyschema {
 
+/// Moves a file that cannot be used out of the way, to FILE.bad-1, with a warning.
+inline void set_aside(const std::filesystem::path& file, const std::string& problem) {
+  const auto aside = copy_aside(file);
+  std::filesystem::remove(file);
+  spdlog::warn("{}; set aside as {}", problem, aside.filename().string());
+}
+
 /// A message that outlives its process: a log of one event, replaced atomically. Without a file
 /// nothing is kept.
 template <class Message>
@@ -40,9 +47,7 @@ class SavedMessage {
     } catch (const std::runtime_error& error) {
       problem = error.what();
     }
-    const auto aside = copy_aside(file_);
-    std::filesystem::remove(file_);
-    spdlog::warn("{}; set aside as {}", problem, aside.filename().string());
+    set_aside(file_, problem);
     return std::nullopt;
   }
 

@@ -49,7 +49,8 @@ struct VirtualMeasurement {
 ///   (1 − ρ) N(ξ; 0, S) + ρ g(ξ),   ξ = log(X⁻¹ y), S = P + Σ_y,
 /// with an outlier density g that is shaped as the outliers of planar markers are: flips, tilts of
 /// unknown direction, wide errors and a floor. (A uniform g makes every flip of a leaf's marker
-/// speak for a broken edge.) A second reading y' of a planar marker counts as one in ten. Where the first term is the larger one the marker corrects the belief.
+/// speak for a broken edge.) A second reading of a planar marker counts as one in ten. Where the
+/// first term is the larger one the marker corrects the belief.
 /// What a branch learns goes back to its parent by the smoother's gain P Fᵀ P_child⁻¹, so that
 /// siblings profit from each other.
 class TreeFilter {
