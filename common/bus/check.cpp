@@ -21,6 +21,7 @@ constexpr std::int64_t kMaxId = 1'000'000;
 constexpr double kMaxReach_m = 1'000;
 constexpr std::int64_t kMaxTags = 10'000;
 constexpr std::int64_t kMaxSignals = 1'000;
+constexpr std::int64_t kMaxChanges = 1'000;
 constexpr std::int64_t kMaxJoints = 100;
 constexpr std::int64_t kMaxGpSamples = 64;
 /// Variances, length scales and weights of Gaussian processes: wide enough for any unit, and what
@@ -571,6 +572,14 @@ std::string check(const body_schema_t& message) {
                              "repeats");
                check.constant("reason", part.reason, unconnected_part_t::REASON_NO_VALID_MODEL);
                check.text("detail", part.detail, kMaxText);
+             });
+  std::int64_t found = -1;
+  check.each("changes", message.num_changes, message.changes, kMaxChanges,
+             [&](const body_change_t& change) {
+               check.ascending("found_sample", change.found_sample, found);
+               check.integer_at_least("since_sample", change.since_sample, 0);
+               check.require(change.since_sample <= change.found_sample, "since_sample",
+                             "is after found_sample");
              });
   check.at_least("noise_position_m", message.noise_position_m, 0);
   check.at_least("noise_rotation_rad", message.noise_rotation_rad, 0);

@@ -296,6 +296,13 @@ body_schema_t to_message(const BodySchema& schema) {
     out.detail = part.detail;
   }
   set_array(message.num_unconnected, message.unconnected, std::move(unconnected));
+  std::vector<body_change_t> changes;
+  for (const KnownChange& change : schema.changes) {
+    body_change_t& out = changes.emplace_back();
+    out.found_sample = change.found;
+    out.since_sample = change.since;
+  }
+  set_array(message.num_changes, message.changes, std::move(changes));
   message.noise_position_m = schema.noise.position_m;
   message.noise_rotation_rad = schema.noise.rotation_rad;
   return message;
@@ -322,6 +329,8 @@ BodySchema from_message(const body_schema_t& message) {
     schema.unconnected.push_back(
         {part.unconnected_part, static_cast<Unconnected>(part.reason), part.detail});
   }
+  for (const body_change_t& change : message.changes)
+    schema.changes.push_back({change.found_sample, change.since_sample});
   schema.noise = {message.noise_position_m, message.noise_rotation_rad};
   return schema;
 }

@@ -130,6 +130,13 @@ Matrix6d Edge::empirical_covariance() const {
   return variances.asDiagonal();
 }
 
+std::int64_t BodySchema::body_since(std::int64_t sample_index) const {
+  std::int64_t since = 0;
+  for (const KnownChange& change : changes)
+    if (change.found <= sample_index) since = change.since;
+  return since;
+}
+
 bool BodySchema::has_part(int part) const {
   return std::find(parts.begin(), parts.end(), part) != parts.end();
 }

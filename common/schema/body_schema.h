@@ -61,8 +61,8 @@ struct Edge {
   Pose right = Pose::Identity();
 
   /// Covariance of the parameters, order: left tangent (6); per joint: slide, turn, X_after tangent
-  /// (6). Right perturbations. Side 6 + 8·|joints|. Singular along the gauge of the screw frames. As
-  /// the two parts' own poses tell: an upper bound where the whole tree was fitted at once.
+  /// (6). Right perturbations. Side 6 + 8·|joints|. Singular along the gauge of the screw frames.
+  /// As the two parts' own poses tell: an upper bound where the whole tree was fitted at once.
   Eigen::MatrixXd parameter_covariance;
 
   /// Root mean square of the leave-one-out residuals of the inliers: over the three axes together.
@@ -114,6 +114,12 @@ struct Noise {
   double rotation_rad = 0;
 };
 
+/// From sample `found` on it was known that the body is as it is since `since` only.
+struct KnownChange {
+  std::int64_t found = 0;
+  std::int64_t since = 0;
+};
+
 struct PosePrediction {
   Pose X_AB = Pose::Identity();
   Matrix6d covariance = Matrix6d::Zero();  ///< right perturbation in frame B
@@ -138,8 +144,12 @@ struct BodySchema {
   std::vector<Edge> edges;  ///< ordered from the root outwards; `from` is nearer to the root
   std::vector<UnconnectedPart> unconnected;
   Noise noise;
+  std::vector<KnownChange> changes;  ///< of the body, the newest kMaxChanges, ascending by `found`
+  static constexpr std::size_t kMaxChanges = 32;
 
   bool has_part(int part) const;
+  /// The first sample of the body as it was known after sample `sample_index`; 0 before any change.
+  std::int64_t body_since(std::int64_t sample_index) const;
   /// Signals that no edge uses (indices).
   std::vector<int> unused_signals() const;
 

@@ -94,6 +94,7 @@ class Adaptation {
   /// True over assumed standard deviation of the markers, as the residuals of quiet samples show
   /// it.
   double noise_scale() const { return noise_.scale; }
+  const MarkerNoise& noise() const { return noise_; }
   /// Parts whose markers have not been seen for longer than chance explains.
   std::vector<int> missing_parts() const;
   bool is_drifting(int part) const { return drifting_ == part; }
@@ -179,9 +180,9 @@ class Adaptation {
     std::int64_t last = 0;
   };
   std::map<Place, Reversions> reversions_;  ///< changes that were taken back
-  BodySchema before_;                      ///< what stood before the present replacements
-  std::vector<Replacement> replacements_;  ///< not settled yet, in the order they came
-  std::int64_t since_ = 0;                 ///< first sample with the changed body
+  BodySchema before_;                       ///< what stood before the present replacements
+  std::vector<Replacement> replacements_;   ///< not settled yet, in the order they came
+  std::int64_t since_ = 0;                  ///< first sample with the changed body
   DriftWatch drift_watch_;
   std::optional<int> drifting_;  ///< the edge to this part; before_ is the schema without the drift
   /// The place of the last small change, and when: the same again soon after is a drift.

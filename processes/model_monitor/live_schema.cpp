@@ -85,14 +85,10 @@ LiveSchema::LiveSchema(BodySchema base, AdaptationOptions options, std::vector<B
     : base_(std::move(base)),
       adaptation_(base_, options, std::move(history), past),
       schema_(base_),
-      base_since_(holds_since()) {
-  camera_since_ = base_since_;
-}
+      camera_since_(body_since()) {}
 
-std::int64_t LiveSchema::holds_since() const {
-  std::int64_t since = camera_since_;
-  for (const Edge& edge : schema_.edges) since = std::max(since, edge.valid_since_sample);
-  return since;
+std::int64_t LiveSchema::body_since() const {
+  return schema_.changes.empty() ? 0 : schema_.changes.back().since;
 }
 
 std::int64_t LiveSchema::holds_since(int part) const {
@@ -100,6 +96,12 @@ std::int64_t LiveSchema::holds_since(int part) const {
   for (const Edge* edge = edge_to(schema_, part); edge; edge = edge_to(schema_, edge->from))
     since = std::max(since, edge->valid_since_sample);
   return since;
+}
+
+double LiveSchema::log_likelihood_ratio(const BodySchema& other,
+                                        const std::vector<const ActionPoseSample*>& samples) const {
+  return log_likelihood(other, adaptation_.noise(), samples) -
+         log_likelihood(schema_, adaptation_.noise(), samples);
 }
 
 bool LiveSchema::is_in_doubt() const {
@@ -185,7 +187,14 @@ void LiveSchema::update(const ActionPoseSample& sample, std::optional<std::int64
     if (changed_since)
       camera_since_ = *changed_since;
     else if (next.X_CR.matrix() == base_.X_CR.matrix())
-      camera_since_ = base_since_;
+      camera_since_ = base_.changes.empty() ? 0 : base_.changes.back().since;
+  }
+  std::int64_t since = camera_since_;
+  for (const Edge& edge : next.edges) since = std::max(since, edge.valid_since_sample);
+  next.changes = schema_.changes;
+  if (since != body_since()) {
+    if (next.changes.size() == BodySchema::kMaxChanges) next.changes.erase(next.changes.begin());
+    next.changes.push_back({sample.sample_index, since});
   }
   next.utime = schema_.utime;
   next.version = schema_.version;

@@ -35,11 +35,13 @@ class LiveSchema {
   const std::vector<BodySchema>& history() const { return adaptation_.history(); }
   /// A change of the body is suspected, or found and not settled, or a marker is missing.
   bool is_in_doubt() const;
-  bool is_camera_as_base() const { return camera_since_ == base_since_; }
-  /// The first sample that all edges hold for.
-  std::int64_t holds_since() const;
-  /// The same for the way from the root to a part.
+  /// The first sample that all of the schema holds for.
+  std::int64_t body_since() const;
+  /// The same for the way from the camera to a part.
   std::int64_t holds_since(int part) const;
+  /// Of these samples another schema over this one [nats].
+  double log_likelihood_ratio(const BodySchema& other,
+                              const std::vector<const ActionPoseSample*>& samples) const;
 
   /// States, flags and statistics of health->edge_health and part_health, whose ids are set; noise
   /// and probe.
@@ -54,7 +56,6 @@ class LiveSchema {
   Adaptation adaptation_;
   BodySchema schema_;
   std::int64_t camera_since_ = 0;  ///< first sample that X_CR holds for
-  const std::int64_t base_since_;
   std::int64_t probe_sample_ = -1;
   Eigen::VectorXd probe_;
   std::map<int, std::deque<bool>> flipped_;  ///< part → newest sightings: the other pose was right

@@ -86,6 +86,12 @@ void ModelMonitor::Standing::add(health_event_t event) {
 void ModelMonitor::start_from(const body_schema_t& schema) {
   MonitorMemory memory = memory_;
   memory.schemas = {schema};
+  if (schema.last_sample_index < 0) {
+    // Its changes were those of another run.
+    body_schema_t& base = memory.schemas.back();
+    for (schema_edge_t& edge : base.edges) edge.valid_since_sample = 0;
+    set_array(base.num_changes, base.changes, {});
+  }
   memory.at_base.utime = memory.verdicts.utime = schema.utime;
   memory.at_base.judged_sample = memory.verdicts.judged_sample = schema.last_sample_index;
   restore(memory);
@@ -171,10 +177,11 @@ bool ModelMonitor::is_test(std::int64_t sample_index) const {
   return std::binary_search(test_indices_.begin(), test_indices_.end(), sample_index);
 }
 
-std::vector<const ActionPoseSample*> ModelMonitor::tests_up_to(std::int64_t sample_index) const {
+std::vector<const ActionPoseSample*> ModelMonitor::tests_between(std::int64_t first,
+                                                                 std::int64_t last) const {
   std::vector<const ActionPoseSample*> result;
   for (const ActionPoseSample& sample : tests_)
-    if (sample.sample_index <= sample_index) result.push_back(&sample);
+    if (sample.sample_index >= first && sample.sample_index <= last) result.push_back(&sample);
   if (result.size() > kTests)
     result.erase(result.begin(), result.end() - static_cast<std::ptrdiff_t>(kTests));
   return result;
@@ -259,8 +266,7 @@ ModelMonitor::EdgeTest ModelMonitor::test(const BodySchema& schema, const Edge& 
   const Matrix6d model_error = diagonal(config_.model_error);
   EdgeTest result;
   std::vector<double> distances;
-  for (const ActionPoseSample* sample : tests_up_to(last)) {
-    if (sample->sample_index < first) continue;
+  for (const ActionPoseSample* sample : tests_between(first, last)) {
     const PartObservation* from = sample->find(edge.from);
     const PartObservation* to = sample->find(edge.to);
     if (!from || !to || !fits(schema, *sample)) continue;
@@ -324,10 +330,16 @@ void ModelMonitor::judge(const body_schema_t& message) {
   event.event_sample = index;
   event.event_from = event.event_to = event.event_part = -1;
   bool is_new_base = false;
+  const LiveSchema* live = standing.live.get();
   // It rests on samples of a body that is no more; or it hides that it may be so.
-  const bool is_passed_over =
-      standing.live && (standing.live->is_in_doubt() || standing.live->holds_since() > since ||
-                        standing.live->schema().version > index);
+  bool is_passed_over = live && (live->is_in_doubt() || live->body_since() != since ||
+                                 live->schema().version > index);
+  // What the body was like before it changed is in the schema too, as far as that stayed so.
+  if (!is_passed_over && live && since > 0) {
+    auto tests = tests_between(since, index);
+    std::erase_if(tests, [&](const auto* sample) { return !fits(proposal, *sample); });
+    is_passed_over = live->log_likelihood_ratio(proposal, tests) <= 0;
+  }
   if (!is_passed_over) {
     bool was_tested = false;
     const std::string why_not = objection(&proposal, standing, &was_tested);
@@ -335,6 +347,7 @@ void ModelMonitor::judge(const body_schema_t& message) {
       // base_version stays the proposal's: which version stood here before depends on the speed of
       // the learner.
       proposal.version = index + 1;
+      if (live) proposal.changes = live->schema().changes;
       event.event_kind = health_event_t::EVENT_SCHEMA_ACCEPTED;
       event.event_text = "version " + std::to_string(proposal.version) + ": " +
                          std::to_string(proposal.edges.size()) + " edges, " +
@@ -354,10 +367,9 @@ void ModelMonitor::judge(const body_schema_t& message) {
       set_array(memory_.verdicts.num_events, memory_.verdicts.events, std::move(verdicts));
     }
   }
-  if (!is_new_base && standing.live && !standing.live->is_in_doubt() &&
-      index - standing.live->base().last_sample_index >= kRenewal &&
-      standing.live->is_camera_as_base()) {
-    BodySchema renewed = standing.live->schema();
+  if (!is_new_base && live && !live->is_in_doubt() &&
+      index - live->base().last_sample_index >= kRenewal) {
+    BodySchema renewed = live->schema();
     renewed.last_sample_index = index;
     set_base(&standing, std::move(renewed));
   }
@@ -371,7 +383,8 @@ void ModelMonitor::judge(const body_schema_t& message) {
 void ModelMonitor::set_base(Standing* standing, BodySchema base) {
   std::vector<BodySchema> history;
   // As long as the body was one, earlier schemas are only worse.
-  if (standing->live && standing->live->holds_since() > 0) history = standing->live->history();
+  if (standing->live && !standing->live->schema().changes.empty())
+    history = standing->live->history();
   memory_.schemas.clear();
   // As it will be restored.
   for (BodySchema& schema : history) {
@@ -427,7 +440,7 @@ void ModelMonitor::assess(const BodySchema& schema) const {
   }
   set_array(health_.num_edges, health_.edge_health, std::move(edges));
 
-  const auto tests = tests_up_to(judged_sample_);
+  const auto tests = tests_between(0, judged_sample_);
   std::vector<part_health_t> parts;
   for (const auto& [part, indices] : seen_in_) {
     const auto num_seen =

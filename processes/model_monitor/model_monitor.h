@@ -41,8 +41,9 @@ struct ModelMonitorConfig {
 ///
 /// The first complete one is the end of the learner's lead: from then on every sample is judged at
 /// once (LiveSchema), and a change of the body changes the schema. As long as none was found nor is
-/// suspected, later proposals go on to replace the schema, which is judged from there on. What the
-/// learner proposes after a change rests on samples of two bodies and is passed over.
+/// suspected, later proposals go on to replace the schema, which is judged from there on. After a
+/// change those that rest on the samples since it alone may do so, where they predict its TEST
+/// samples better; what rests on samples of two bodies is passed over.
 ///
 /// The schema after sample n is a pure function of the samples 0..n. A proposal is one of its last
 /// sample t, a TEST sample (the learner leaves none of these out), and is judged by the state after
@@ -60,8 +61,8 @@ class ModelMonitor {
   /// What an earlier run of this process remembered, before the samples are gone through again: the
   /// state after them is then as if nothing had happened.
   void restore(const MonitorMemory& memory);
-  /// Begins with a schema of this run whose memory was lost: it holds for the samples after its last.
-  /// Of another run's, or an engineered one, last_sample_index must be −1.
+  /// Begins with a schema of this run whose memory was lost: it holds for the samples after its
+  /// last. Of another run's, or an engineered one, last_sample_index must be −1.
   void start_from(const body_schema_t& schema);
 
   /// Returns true if schema() or memory() may have changed.
@@ -98,8 +99,8 @@ class ModelMonitor {
 
   static bool fits(const BodySchema& schema, const ActionPoseSample& sample);
   bool is_test(std::int64_t sample_index) const;
-  /// The newest of these TEST samples, oldest first.
-  std::vector<const ActionPoseSample*> tests_up_to(std::int64_t sample_index) const;
+  /// The newest of these TEST samples, oldest first; both ends included.
+  std::vector<const ActionPoseSample*> tests_between(std::int64_t first, std::int64_t last) const;
   EdgeTest test(const BodySchema& schema, const Edge& edge, std::int64_t first,
                 std::int64_t last) const;
   /// `standing` one sample later. Verdicts that a restart remembers are spoken again.
@@ -121,7 +122,7 @@ class ModelMonitor {
   AdaptationOptions options_;
   std::vector<std::int64_t> test_indices_;  ///< of all TEST samples
   std::deque<ActionPoseSample> tests_;      ///< the newest
-  std::deque<ActionPoseSample> samples_;  ///< the newest, back to where anything may begin again
+  std::deque<ActionPoseSample> samples_;    ///< the newest, back to where anything may begin again
   std::map<int, std::vector<std::int64_t>> seen_in_;  ///< part → indices of samples that show it
   std::int64_t last_sample_index_ = -1;
   std::int64_t judged_sample_ = -1;

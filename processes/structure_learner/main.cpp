@@ -1,4 +1,6 @@
-// structure_learner: SAMPLE -> LEARNED_SCHEMA, SAMPLE_REQUEST
+// structure_learner: SAMPLE, BODY_SCHEMA, MODEL_HEALTH -> LEARNED_SCHEMA, SAMPLE_REQUEST
+
+#include <spdlog/spdlog.h>
 
 #include <CLI/CLI.hpp>
 #include <future>
@@ -39,6 +41,20 @@ int main(int argc, char** argv) {
     body_schema_t learned;
     bool has_learned = false;
     std::int64_t sent_us = 0;
+    // A babbler waits for the monitor's verdict on every TEST sample; so does, where there is none,
+    // the learner, or it would learn from a body of which the monitor knows already that it is no
+    // more. Not for ever.
+    constexpr std::int64_t kVerdictTimeout_us = 10'000'000;
+    bool awaits_verdicts = is_replayed;
+    std::int64_t proposed_sample = -1, judged_sample = -1, proposed_us = 0, tick_us = 0;
+    const auto awaits_verdict = [&] {
+      if (awaits_verdicts && judged_sample < proposed_sample &&
+          tick_us - proposed_us > kVerdictTimeout_us) {
+        spdlog::warn("no verdict of model_monitor on sample {}: goes on without", proposed_sample);
+        awaits_verdicts = false;
+      }
+      return awaits_verdicts && judged_sample < proposed_sample;
+    };
     const auto publish = [&] {
       process.bus().publish(kLearnedSchema, learned);
       process.set_activity(process_info_t::PHASE_WORKING,
@@ -67,7 +83,11 @@ int main(int argc, char** argv) {
         while (learner.has_test_job()) learn_now();
         return;
       }
-      if (!fit.valid() && learner.has_job()) {
+      if (!fit.valid() && learner.has_job() && !(learner.has_test_job() && awaits_verdict())) {
+        if (learner.has_test_job()) {
+          proposed_sample = learner.next_sample_index();
+          proposed_us = tick_us;
+        }
         fit = std::async(std::launch::async, learner.take_job());
         if (is_ready(fit, kUsualFit)) collect();
       }
@@ -78,8 +98,13 @@ int main(int argc, char** argv) {
 
     process.set_activity(process_info_t::PHASE_WAITING, "waiting for SAMPLE");
     door.subscribe(process, kSample, [&](const sample_t& sample) { intake.on_sample(sample); });
+    door.subscribe(process, kBodySchema,
+                   [&](const body_schema_t& schema) { learner.on_body_schema(schema); });
+    door.subscribe(process, kModelHealth,
+                   [&](const model_health_t& health) { judged_sample = health.judged_sample; });
     process.on_idle(work);
     process.on_tick([&](std::int64_t now_us) {
+      tick_us = now_us;
       intake.on_tick(now_us);
       process.set_counters(intake.counters());
       work();

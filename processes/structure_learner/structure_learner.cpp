@@ -47,13 +47,30 @@ void StructureLearner::on_sample(const sample_t& sample) {
                       sample.purpose == action_command_t::PURPOSE_TEST});
 }
 
+void StructureLearner::on_body_schema(const body_schema_t& schema) {
+  known_.changes = from_message(schema).changes;
+}
+
+SharedSamples StructureLearner::of_this_body(std::size_t num_training, std::int64_t sample_index) {
+  const std::int64_t since = known_.body_since(sample_index);
+  if (since != online_since_) {
+    online_ = std::make_shared<OnlineLearner>(config_.signals, config_.options);
+    online_since_ = since;
+  }
+  const auto end = samples_.begin() + static_cast<std::ptrdiff_t>(num_training);
+  return {std::find_if(samples_.begin(), end,
+                       [&](const auto& sample) { return sample->sample_index >= since; }),
+          end};
+}
+
 std::function<body_schema_t()> StructureLearner::take_job() {
   const Prefix prefix = pending_.front();
   pending_.pop_front();
-  const auto end = samples_.begin() + static_cast<std::ptrdiff_t>(prefix.num_training);
-  return [online = online_, samples = SharedSamples(samples_.begin(), end), prefix] {
+  SharedSamples samples = of_this_body(prefix.num_training, prefix.last_sample_index);
+  return [online = online_, since = online_since_, samples = std::move(samples), prefix] {
     const int n = static_cast<int>(samples.size());
-    BodySchema schema = online->learn(samples, prefix.is_test ? n : n - 1);
+    BodySchema schema = online->learn(samples, prefix.is_test ? n : std::max(n - 1, 0));
+    for (Edge& edge : schema.edges) edge.valid_since_sample = since;
     schema.last_sample_index = prefix.last_sample_index;
     schema.utime = prefix.utime;
     return to_message(schema);
@@ -62,7 +79,8 @@ std::function<body_schema_t()> StructureLearner::take_job() {
 
 std::function<void()> StructureLearner::take_preparation() {
   num_prepared_ = samples_.size();
-  return [online = online_, samples = samples_] { online->prepare(samples); };
+  SharedSamples samples = of_this_body(samples_.size(), last_sample_index_);
+  return [online = online_, samples = std::move(samples)] { online->prepare(samples); };
 }
 
 }  // namespace bodyschema

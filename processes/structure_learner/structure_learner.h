@@ -28,6 +28,9 @@ struct StructureLearnerConfig {
 /// skipped while a fit was running, and what was prepared, does not matter. TEST samples are
 /// never learned from; they only advance last_sample_index, so that the monitor can judge.
 ///
+/// Where the monitor found that the body changed, the samples of the body before are left out: the
+/// proposal after sample n rests on those since the change that was known at sample n.
+///
 /// A training sample is answered by the structure found before it came, a TEST sample by one that
 /// the samples so far may change: in the time that the arm takes to move, both were prepared.
 ///
@@ -40,11 +43,16 @@ class StructureLearner {
   /// @throws std::invalid_argument if the action does not have one value per signal.
   void on_sample(const sample_t& sample);
 
+  /// BODY_SCHEMA, for the changes of the body that the monitor found.
+  void on_body_schema(const body_schema_t& schema);
+
   std::int64_t last_sample_index() const { return last_sample_index_; }
   /// True if there is a prefix of the samples to learn from that was not given out yet.
   bool has_job() const { return !pending_.empty(); }
   /// The same for a prefix that ends with a TEST sample.
   bool has_test_job() const { return has_job() && pending_.front().is_test; }
+  /// The last sample of that prefix.
+  std::int64_t next_sample_index() const { return pending_.front().last_sample_index; }
   /// The fit of the next prefix, on a copy, to be run in any thread. Prefixes that end with a TEST
   /// sample come in order and none is left out, since the monitor judges these; of the others only
   /// the newest waits. There must be one.
@@ -64,8 +72,14 @@ class StructureLearner {
     bool is_test = false;
   };
 
+  /// Of the first `num_training` samples those of the body as it was known after a sample; online_
+  /// is for them.
+  SharedSamples of_this_body(std::size_t num_training, std::int64_t sample_index);
+
   const StructureLearnerConfig config_;
-  const std::shared_ptr<OnlineLearner> online_;
+  std::shared_ptr<OnlineLearner> online_;
+  std::int64_t online_since_ = 0;
+  BodySchema known_;  ///< for its changes
   SharedSamples samples_;
   std::size_t num_prepared_ = 0;
   std::int64_t last_sample_index_ = -1;

@@ -274,6 +274,10 @@ body_schema_t example_body_schema() {
   lost.reason = unconnected_part_t::REASON_NO_VALID_MODEL;
   lost.detail = "refuted up to 3 signals";
   fill(message.num_unconnected, message.unconnected, {lost});
+  body_change_t change{};
+  change.found_sample = 32;
+  change.since_sample = 30;
+  fill(message.num_changes, message.changes, {change});
   message.noise_position_m = 0.003;
   message.noise_rotation_rad = 0.017;
   return message;

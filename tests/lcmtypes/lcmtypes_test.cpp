@@ -42,6 +42,7 @@ std::string hash_of() {
 /// By type, the parts of messages included.
 std::map<std::string, std::string> fingerprints() {
   return {{"action_command_t", hash_of<action_command_t>()},
+          {"body_change_t", hash_of<body_change_t>()},
           {"body_schema_t", hash_of<body_schema_t>()},
           {"camera_image_t", hash_of<camera_image_t>()},
           {"camera_info_t", hash_of<camera_info_t>()},
