@@ -19,6 +19,9 @@
 #include "processes/console/recording.h"
 #include "processes/console/schema_json.h"
 #include "processes/model_monitor/adaptation.h"
+#include "processes/model_monitor/chapter_adaptation.h"
+#include "processes/structure_learner/baseline/fit_matrix_gp.h"
+#include "processes/structure_learner/baseline/learn_baseline.h"
 #include "processes/structure_learner/learn.h"
 
 namespace bodyschema {
@@ -32,6 +35,7 @@ struct MonitorArguments {
   std::string out;
   std::string evaluate;
   std::vector<double> noise;
+  std::string method = "evidence";
   bool json = false;
 };
 
@@ -69,7 +73,8 @@ AdaptationOptions options_of(const MonitorArguments& arguments, const Recording&
                              const BodySchema& schema) {
   AdaptationOptions options;
   if (recording.is_log) {
-    // As model_monitor has it: the error is that of a pair of markers, and has room for rare errors.
+    // As model_monitor has it: the error is that of a pair of markers, and has room for rare
+    // errors.
     options.noise.model_error = {kTagModelError.position_m * M_SQRT1_2,
                                  kTagModelError.rotation_rad * M_SQRT1_2};
     options.least_noise_scale = 1;
@@ -88,6 +93,43 @@ AdaptationOptions options_of(const MonitorArguments& arguments, const Recording&
   return options;
 }
 
+/// What keeps the schema true.
+class Method {
+ public:
+  virtual ~Method() = default;
+  virtual std::vector<AdaptationEvent> on_sample(const ActionPoseSample& sample) = 0;
+  virtual const BodySchema& schema() const = 0;
+};
+
+template <class Adapting>
+class MethodOf : public Method {
+ public:
+  explicit MethodOf(Adapting adapting) : adapting_(std::move(adapting)) {}
+  std::vector<AdaptationEvent> on_sample(const ActionPoseSample& sample) override {
+    return adapting_.on_sample(sample);
+  }
+  const BodySchema& schema() const override { return adapting_.schema(); }
+
+ private:
+  Adapting adapting_;
+};
+
+std::unique_ptr<Method> method_of(const MonitorArguments& arguments, const Recording& recording,
+                                  const BodySchema& schema) {
+  const AdaptationOptions options = options_of(arguments, recording, schema);
+  if (arguments.method == "evidence")
+    return std::make_unique<MethodOf<Adaptation>>(Adaptation(schema, options));
+  ChapterAdaptationOptions chapter;
+  if (options.noise.noise) {
+    BaselineOptions baseline;
+    baseline.set_noise(*options.noise.noise);
+    chapter.sigma_position_m = baseline.sigma_position_m;
+    chapter.sigma_rotation_rad = baseline.sigma_rotation_rad;
+  }
+  return std::make_unique<MethodOf<ChapterAdaptation>>(
+      ChapterAdaptation(schema, chapter, fit_matrix_gp_edge));
+}
+
 void run_monitor(const MonitorArguments& arguments) {
   BodySchema schema = load_schema(arguments.schema);
   const Recording recording = load_for(arguments.samples, schema);
@@ -97,10 +139,10 @@ void run_monitor(const MonitorArguments& arguments) {
     throw std::invalid_argument(arguments.schema + ": expected a schema with edges, found none");
   check_out(arguments.out, {arguments.samples, arguments.schema, arguments.evaluate});
 
-  Adaptation adaptation(schema, options_of(arguments, recording, schema));
+  const std::unique_ptr<Method> method = method_of(arguments, recording, schema);
   int num_events = 0;
   for (const ActionPoseSample& sample : recording.samples) {
-    for (const AdaptationEvent& event : adaptation.on_sample(sample)) {
+    for (const AdaptationEvent& event : method->on_sample(sample)) {
       ++num_events;
       if (arguments.json)
         std::cout << event_json(event, sample).dump() << '\n';
@@ -108,7 +150,7 @@ void run_monitor(const MonitorArguments& arguments) {
         std::cout << event_text(event);
     }
     if (!evaluation) continue;
-    const auto errors = evaluate(adaptation.schema(), evaluation->samples);
+    const auto errors = evaluate(method->schema(), evaluation->samples);
     Json line;
     line["sample"] = sample.sample_index;
     line["t"] = seconds(sample);
@@ -123,7 +165,7 @@ void run_monitor(const MonitorArguments& arguments) {
     std::cout << fmt::format("{} samples, {} events\n", recording.samples.size(), num_events);
   std::cout << std::flush;
   if (arguments.out.empty()) return;
-  schema = adaptation.schema();
+  schema = method->schema();
   schema.base_version = schema.version;
   schema.last_sample_index = recording.samples.back().sample_index;
   schema.version = schema.last_sample_index + 1;
@@ -146,6 +188,12 @@ void add_monitor_command(CLI::App& console) {
                    "Standard deviation per axis and marker: position [m], rotation [deg]")
       ->expected(2)
       ->type_name("POS_M ROT_DEG");
+  monitor
+      ->add_option(
+          "--method", arguments->method,
+          "evidence, or the chapter's procedure: a window of 15, 3 sigma (its own, or --noise)")
+      ->check(CLI::IsMember({"evidence", "chapter"}))
+      ->capture_default_str();
   monitor->add_flag("--json", arguments->json, "Print one JSON line an event (and a sample)");
   monitor->callback([arguments] { run_monitor(*arguments); });
 }

@@ -3,12 +3,15 @@
 #include <algorithm>
 #include <cmath>
 #include <set>
+#include <utility>
 
 namespace bodyschema {
 namespace {
 
 /// A model needs that many to be learned, and as many to be tested.
 constexpr std::size_t kFewest = 2;
+/// Of one pair of parts.
+constexpr std::size_t kMaxModels = 64;
 
 std::vector<std::vector<int>> signal_sets(int num_signals, int size) {
   std::vector<std::vector<int>> sets{{}};
@@ -59,6 +62,12 @@ bool ChapterAdaptation::has_valid_tree() const {
   return std::all_of(pairs_.begin(), pairs_.end(), [](const Pair& pair) { return pair.is_valid; });
 }
 
+std::size_t ChapterAdaptation::num_models() const {
+  std::size_t sum = 0;
+  for (const Pair& pair : pairs_) sum += pair.models.size();
+  return sum;
+}
+
 void ChapterAdaptation::learn(Model* model, const ActionPoseSample& sample) const {
   if (!model->is_learning || model->num_offered >= options_.training) return;
   ++model->num_offered;
@@ -93,8 +102,37 @@ void ChapterAdaptation::test(Model* model, const std::deque<ActionPoseSample>& w
                           std::sqrt(rotation / count) / (3 * options_.sigma_rotation_rad));
 }
 
-void ChapterAdaptation::on_sample(const ActionPoseSample& sample) {
+void ChapterAdaptation::add_model(Pair* pair) {
+  if (pair->models.size() >= kMaxModels) {
+    const auto oldest = std::find_if(pair->models.begin() + 1, pair->models.end(),
+                                     [](const Model& model) { return !model.has_served; });
+    if (oldest == pair->models.end()) return;
+    const auto index = static_cast<std::size_t>(oldest - pair->models.begin());
+    if (pair->serving > index) --pair->serving;
+    pair->models.erase(oldest);
+  }
+  if (pair->next_candidate == pair->candidates.size()) pair->next_candidate = 0;
+  Model model;
+  model.edge.from = pair->models.back().edge.from;
+  model.edge.to = pair->models.back().edge.to;
+  model.signals = pair->candidates[pair->next_candidate++];
+  model.is_learning = true;
+  pair->models.push_back(std::move(model));
+  ++num_sampled_;
+}
+
+std::vector<AdaptationEvent> ChapterAdaptation::on_sample(const ActionPoseSample& sample) {
   schema_.displacements(sample.action);  // throws on a wrong number of signals
+  std::vector<AdaptationEvent> events;
+  const auto tell = [&](AdaptationEvent::Kind kind, const Edge& edge, std::size_t num_samples) {
+    AdaptationEvent event;
+    event.kind = kind;
+    event.sample_index = sample.sample_index;
+    event.from = edge.from;
+    event.to = edge.to;
+    event.num_samples = static_cast<int>(num_samples);
+    events.push_back(std::move(event));
+  };
   for (std::size_t e = 0; e < pairs_.size(); ++e) {
     Pair& pair = pairs_[e];
     Edge& serving = schema_.edges[e];
@@ -106,6 +144,8 @@ void ChapterAdaptation::on_sample(const ActionPoseSample& sample) {
           if (!model.residuals.empty()) model.residuals.pop_front();
       }
     }
+    const bool was_valid = pair.is_valid;
+    const std::size_t served = pair.serving;
     pair.is_valid = false;
     double least = 1;
     for (std::size_t n = 0; n < pair.models.size(); ++n) {
@@ -119,26 +159,27 @@ void ChapterAdaptation::on_sample(const ActionPoseSample& sample) {
       pair.is_valid = true;
       pair.serving = n;
     }
-    serving = pair.models[pair.serving].edge;
+    Model& model = pair.models[pair.serving];
+    if (was_valid && !pair.is_valid)
+      tell(AdaptationEvent::Kind::kMismatch, serving, pair.window.size());
+    if (pair.is_valid && pair.serving != served)
+      tell(model.has_served || !model.is_learning ? AdaptationEvent::Kind::kRestored
+                                                  : AdaptationEvent::Kind::kCandidate,
+           model.edge, model.training.size());
+    model.has_served |= pair.is_valid;
+    serving = model.edge;
     serving.confidence = pair.is_valid ? 1 : 0;
     serving.state = pair.is_valid ? EdgeState::kOk : EdgeState::kInvalid;
   }
   num_without_tree_ = has_valid_tree() ? 0 : num_without_tree_ + 1;
-  if (num_without_tree_ < options_.wait) return;
+  if (num_without_tree_ < options_.wait) return events;
   for (Pair& pair : pairs_) {
     // The newest one gets its chance first.
     const Model& newest = pair.models.back();
     const bool has_learned = !newest.is_learning || newest.num_offered >= options_.training;
-    if (pair.is_valid || (!newest.is_tested && !has_learned)) continue;
-    if (pair.next_candidate == pair.candidates.size()) pair.next_candidate = 0;
-    Model model;
-    model.edge.from = newest.edge.from;
-    model.edge.to = newest.edge.to;
-    model.signals = pair.candidates[pair.next_candidate++];
-    model.is_learning = true;
-    pair.models.push_back(std::move(model));
-    ++num_sampled_;
+    if (!pair.is_valid && (newest.is_tested || has_learned)) add_model(&pair);
   }
+  return events;
 }
 
 }  // namespace bodyschema

@@ -6,6 +6,7 @@
 
 #include "common/schema/body_schema.h"
 #include "common/schema/sample.h"
+#include "processes/model_monitor/adaptation.h"
 
 namespace bodyschema {
 
@@ -21,7 +22,7 @@ struct ChapterAdaptationOptions {
 };
 
 /// Keeps a body schema true as the chapter does (Section 4, with the settings of 5.2 and 5.3), for
-/// comparison: what Adaptation is measured against. It forgets no model.
+/// comparison: what Adaptation is measured against.
 ///
 /// A model is valid while the root mean squares of its position and rotation errors over the newest
 /// `window` observations are within 3 σ_z. For every edge the valid model with the smallest error
@@ -32,7 +33,8 @@ struct ChapterAdaptationOptions {
 ///
 /// What the chapter leaves open was chosen so that its Table 1 comes out: the windows hold samples
 /// from before a model was sampled, and those that it learned from; the count of samples without a
-/// tree goes on while models are being tried; errors are root mean squares.
+/// tree goes on while models are being tried; errors are root mean squares. Of models that never
+/// served the oldest is forgotten where there are too many.
 class ChapterAdaptation {
  public:
   /// Learns a local model of Δ_from,to on the signals (indices) from samples in which both parts
@@ -42,19 +44,25 @@ class ChapterAdaptation {
 
   ChapterAdaptation(BodySchema schema, ChapterAdaptationOptions options, LearnEdge learn_edge);
 
+  /// Edges that lost their valid model (kMismatch) or have another one: one that was sampled
+  /// (kCandidate) or that was there before (kRestored). The chapter knows neither causes nor
+  /// evidence.
   /// @throws std::invalid_argument if the action does not have one value per signal.
-  void on_sample(const ActionPoseSample& sample);
+  std::vector<AdaptationEvent> on_sample(const ActionPoseSample& sample);
   /// The best valid model of every edge; where none is, the last that was, of confidence 0.
   const BodySchema& schema() const { return schema_; }
   bool has_valid_tree() const;
   /// Models sampled so far.
   int num_sampled() const { return num_sampled_; }
+  /// Models kept, over all edges.
+  std::size_t num_models() const;
 
  private:
   struct Model {
     Edge edge;
     std::vector<int> signals;
     bool is_learning = false;
+    bool has_served = false;
     int num_offered = 0;  ///< samples since it was sampled
     std::deque<ActionPoseSample> training;
     struct Residual {
@@ -75,6 +83,8 @@ class ChapterAdaptation {
     bool is_valid = true;
   };
 
+  /// A new model, in place of the oldest that never served where there are too many.
+  void add_model(Pair* pair);
   void learn(Model* model, const ActionPoseSample& sample) const;
   void test(Model* model, const std::deque<ActionPoseSample>& window) const;
 

@@ -36,4 +36,19 @@ MatrixGp fit_matrix_gp(const std::vector<int>& signals, const Eigen::MatrixXd& i
           signals.empty() ? constants(targets) : maximize_marginal_likelihood(inputs, targets)};
 }
 
+Edge fit_matrix_gp_edge(int from, int to, const std::vector<int>& signals,
+                        const std::vector<const ActionPoseSample*>& samples) {
+  Edge edge;
+  edge.from = from;
+  edge.to = to;
+  Eigen::MatrixXd inputs(signals.size(), samples.size());
+  std::vector<Pose> poses;
+  for (std::size_t n = 0; n < samples.size(); ++n) {
+    inputs.col(static_cast<Eigen::Index>(n)) = samples[n]->action(signals);
+    poses.push_back(samples[n]->find(from)->X_CB.inverse() * samples[n]->find(to)->X_CB);
+  }
+  edge.matrix_gp = std::make_shared<const MatrixGp>(fit_matrix_gp(signals, inputs, poses));
+  return edge;
+}
+
 }  // namespace bodyschema

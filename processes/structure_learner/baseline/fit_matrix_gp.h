@@ -2,7 +2,9 @@
 
 #include <vector>
 
+#include "common/schema/body_schema.h"
 #include "common/schema/matrix_gp.h"
+#include "common/schema/sample.h"
 
 namespace bodyschema {
 
@@ -16,5 +18,9 @@ namespace bodyschema {
 /// that are not finite.
 MatrixGp fit_matrix_gp(const std::vector<int>& signals, const Eigen::MatrixXd& inputs,
                        const std::vector<Pose>& poses);
+
+/// The same of Δ_from,to from samples in which both parts were seen, as an edge.
+Edge fit_matrix_gp_edge(int from, int to, const std::vector<int>& signals,
+                        const std::vector<const ActionPoseSample*>& samples);
 
 }  // namespace bodyschema

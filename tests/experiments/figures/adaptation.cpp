@@ -174,21 +174,7 @@ Life live_as_the_chapter(const Scenario& scenario, Regime regime, int length, in
   ChapterAdaptationOptions options;
   options.sigma_position_m = noise.sigma_position_m;
   options.sigma_rotation_rad = noise.sigma_rotation_rad;
-  const auto learn_edge = [](int from, int to, const std::vector<int>& signals,
-                             const std::vector<const ActionPoseSample*>& samples) {
-    Edge edge;
-    edge.from = from;
-    edge.to = to;
-    Eigen::MatrixXd inputs(signals.size(), samples.size());
-    std::vector<Pose> poses;
-    for (std::size_t n = 0; n < samples.size(); ++n) {
-      inputs.col(static_cast<Eigen::Index>(n)) = samples[n]->action(signals);
-      poses.push_back(samples[n]->find(from)->X_CB.inverse() * samples[n]->find(to)->X_CB);
-    }
-    edge.matrix_gp = std::make_shared<const MatrixGp>(fit_matrix_gp(signals, inputs, poses));
-    return edge;
-  };
-  ChapterAdaptation adaptation(arm.engineered(), options, learn_edge);
+  ChapterAdaptation adaptation(arm.engineered(), options, fit_matrix_gp_edge);
   Life life;
   for (int t = 0; t < arm.num_samples(); ++t) {
     const ActionPoseSample sample = arm.observe(t);

@@ -39,8 +39,13 @@ TEST(ChapterAdaptationTest, WaitsThenSamplesOneModelAndRemembersBothBodies) {
   BrokenArm arm({Fault::kStuck, "", 1}, Regime::kFree, kLength, 2);
   ChapterAdaptation adaptation(arm.engineered(), options(), newest_pose);
   int invalid[4] = {};
+  std::vector<AdaptationEvent::Kind> told;
   for (int t = 0; t < arm.num_samples(); ++t) {
-    adaptation.on_sample(arm.observe(t));
+    for (const AdaptationEvent& event : adaptation.on_sample(arm.observe(t))) {
+      EXPECT_EQ(event.sample_index, t);
+      EXPECT_EQ(event.to, adaptation.schema().edges[3].to);
+      told.push_back(event.kind);
+    }
     invalid[t / kLength] += !adaptation.has_valid_tree();
     if (t == kLength + 13) {
       EXPECT_EQ(adaptation.num_sampled(), 0);
@@ -53,6 +58,9 @@ TEST(ChapterAdaptationTest, WaitsThenSamplesOneModelAndRemembersBothBodies) {
   EXPECT_LE(invalid[1], 30);
   EXPECT_LE(invalid[2], 15);
   EXPECT_LE(invalid[3], 15);
+  using Kind = AdaptationEvent::Kind;
+  std::erase(told, Kind::kMismatch);
+  EXPECT_EQ(told, (std::vector{Kind::kCandidate, Kind::kRestored, Kind::kRestored}));
   EXPECT_LT(arm.error(adaptation.schema(), arm.num_samples() - 1), 0.02);
   EXPECT_EQ(adaptation.schema().edges[3].joints.size(), 0);
 }
@@ -85,6 +93,29 @@ TEST(ChapterAdaptationTest, TriesFewerSignalsFirstAndTheOldOneFirstAmongThem) {
   EXPECT_FALSE(adaptation.has_valid_tree());
   EXPECT_EQ(adaptation.schema().edges[5].state, EdgeState::kInvalid);
   EXPECT_EQ(adaptation.schema().edges[5].confidence, 0);
+}
+
+TEST(ChapterAdaptationTest, ModelsThatNeverServedDoNotAddUp) {
+  constexpr int kLength = 1000;
+  BrokenArm arm({Fault::kTool, "", 1}, Regime::kFree, kLength, 2);
+  ChapterAdaptationOptions impatient = options();
+  impatient.training = 2;
+  std::size_t num_models = 0;
+  ChapterAdaptation adaptation(
+      arm.engineered(), impatient,
+      [&](int from, int to, const std::vector<int>&, const std::vector<const ActionPoseSample*>&) {
+        Edge useless;
+        useless.from = from;
+        useless.to = to;
+        useless.left.translation().setConstant(9);
+        return useless;
+      });
+  for (int t = 0; t < 2 * kLength; ++t) {
+    adaptation.on_sample(arm.observe(t));
+    num_models = std::max(num_models, adaptation.num_models());
+  }
+  EXPECT_GT(adaptation.num_sampled(), 200);
+  EXPECT_LE(num_models, 100U);
 }
 
 TEST(ChapterAdaptationTest, RefusesAnActionOfAnotherLength) {
