@@ -108,6 +108,14 @@ TEST(AdaptationTest, AHealthyArmIsLeftInPeace) {
   }
 }
 
+TEST(AdaptationTest, AMarkerThatOnlyUncertainModelsBelieveIsNoDrift) {
+  // This arm's window of drift watching has one such by sample 74, of the edge to part 6.
+  BrokenArm arm({Fault::kNone, "", 0.85}, Regime::kChapter, 25, 14);
+  Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kChapter));
+  const Life life = live(arm, adaptation, 100);
+  EXPECT_TRUE(life.events.empty()) << life.log();
+}
+
 TEST(AdaptationTest, MisjudgedNoiseIsEstimatedAndTheFaultIsFoundAllTheSame) {
   for (const double factor : {0.5, 2.0}) {
     BrokenArm arm({Fault::kTool, "", 0.85}, Regime::kTagIso, kBlock, 4);
