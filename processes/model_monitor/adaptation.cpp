@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <set>
 #include <stdexcept>
 
 namespace bodyschema {
@@ -134,7 +135,8 @@ Adaptation::Adaptation(BodySchema schema, AdaptationOptions options,
 EdgeState Adaptation::state_of(const Place& place) const {
   if (detected_ == place) return EdgeState::kInvalid;
   for (const Replacement& r : replacements_)
-    if (r.place == place) return EdgeState::kProvisional;
+    if (r.place == place || std::find(r.also.begin(), r.also.end(), place) != r.also.end())
+      return EdgeState::kProvisional;
   if (!place.marker && drifting_ == place.part) return EdgeState::kProvisional;
   const double statistic = place.marker ? marker_statistic(place.part) : edge_statistic(place.part);
   return statistic > options_.suspicion ? EdgeState::kSuspect : EdgeState::kOk;
@@ -287,16 +289,17 @@ Adaptation::Choice Adaptation::choose(const BodySchema& standing, const std::vec
     if (!choice.runner_up || candidate.fitted.log_evidence > choice.runner_up->fitted.log_evidence)
       choice.runner_up = std::move(candidate);
   };
-  const auto offer = [&](FittedChange candidate, const Place& at) {
-    if (standing_form && candidate.change == *standing_form &&
-        (!same_form || candidate.log_evidence > same_form->fitted.log_evidence))
-      same_form = Replacement{at, candidate};
-    if (choice.best && candidate.log_evidence <= choice.best->fitted.log_evidence) {
-      second({at, std::move(candidate)});
+  const auto offer = [&](Replacement candidate) {
+    const FittedChange& fitted = candidate.fitted;
+    if (standing_form && fitted.change == *standing_form &&
+        (!same_form || fitted.log_evidence > same_form->fitted.log_evidence))
+      same_form = candidate;
+    if (choice.best && fitted.log_evidence <= choice.best->fitted.log_evidence) {
+      second(std::move(candidate));
       return;
     }
     if (choice.best) second(std::move(*choice.best));
-    choice.best = Replacement{at, std::move(candidate)};
+    choice.best = std::move(candidate);
   };
   for (const Place& at : places) {
     // Bases: the model that stands, and what is stored of this place.
@@ -317,7 +320,7 @@ Adaptation::Choice Adaptation::choose(const BodySchema& standing, const std::vec
       const PlaceEvidence evidence(bases[b], noise_, at.part, at.marker, samples);
       const auto offer_from = [&](FittedChange candidate) {
         if (origins[b]) candidate.origin = *origins[b];
-        offer(std::move(candidate), at);
+        offer({at, std::move(candidate)});
       };
       if (b > 0 && evidence.num_usable() > 0) offer_from(evidence.judge_stored(bases[b]));
       for (FittedChange& fitted :
@@ -337,7 +340,15 @@ Adaptation::Choice Adaptation::choose(const BodySchema& standing, const std::vec
     if (num_different < 2) continue;
     all.log_evidence = all.change.log_odds() + log_likelihood(with, noise_, samples);
     all.num_usable = 1;
-    offer(std::move(all), places.front());
+    // It is wherever it makes a difference, first where that was suspected: an outlier elsewhere
+    // may be the greatest suspicion.
+    std::vector<Place> at = differences(standing, with);
+    std::stable_sort(at.begin(), at.end(), [&places](const Place& a, const Place& b) {
+      return std::find(places.begin(), places.end(), a) <
+             std::find(places.begin(), places.end(), b);
+    });
+    all.change.part = at.front().part;
+    offer({at.front(), std::move(all), {at.begin() + 1, at.end()}});
   }
   // With many samples what the schema was wrong about before the change is found out too, and
   // dressed up as a richer form of it.
@@ -371,6 +382,57 @@ AdaptationEvent Adaptation::event(AdaptationEvent::Kind kind, std::int64_t sampl
     result.to = edge->to;
   }
   return result;
+}
+
+void Adaptation::tell(AdaptationEvent::Kind kind, std::int64_t sample_index,
+                      const Replacement& replacement, double margin, int num_samples,
+                      std::vector<AdaptationEvent>* events) const {
+  std::vector<Place> places{replacement.place};
+  places.insert(places.end(), replacement.also.begin(), replacement.also.end());
+  for (const Place& place : places) {
+    AdaptationEvent told = event(kind, sample_index, place);
+    BodyChange there = replacement.fitted.change;
+    there.part = place.part;
+    told.cause = there.cause(schema_);
+    told.margin = margin;
+    told.num_samples = num_samples;
+    events->push_back(std::move(told));
+  }
+}
+
+/// The places in which two schemas of the same tree differ: markers first, of parts that lie
+/// elsewhere between edges which together lead to where they led, then edges.
+std::vector<Adaptation::Place> Adaptation::differences(const BodySchema& a, const BodySchema& b) {
+  Eigen::VectorXd action(static_cast<Eigen::Index>(a.signals.size()));
+  for (Eigen::Index s = 0; s < action.size(); ++s) {
+    const Signal& signal = a.signals[static_cast<std::size_t>(s)];
+    action(s) = 0.25 * signal.lower + 0.75 * signal.upper;  // nothing special about it
+  }
+  const auto pose_in_parent = [&action](const BodySchema& schema, int part) {
+    const Edge* edge = edge_to(schema, part);
+    return edge ? edge->predict(schema.displacements(action)) : schema.X_CR;
+  };
+  std::set<int> edges;
+  for (const int part : a.parts)
+    if (differ_at(a, b, part)) edges.insert(part);
+  std::vector<Place> places;
+  for (const int part : a.parts) {
+    std::vector<int> children;
+    for (const Edge& edge : a.edges)
+      if (edge.from == part) children.push_back(edge.to);
+    if (!edges.contains(part) || children.empty()) continue;
+    const Pose X_a = pose_in_parent(a, part), X_b = pose_in_parent(b, part);
+    const bool only_the_marker = std::all_of(children.begin(), children.end(), [&](int child) {
+      return edges.contains(child) &&
+             (X_a * pose_in_parent(a, child)).isApprox(X_b * pose_in_parent(b, child), 1e-6);
+    });
+    if (!only_the_marker) continue;
+    places.push_back({part, true});
+    edges.erase(part);
+    for (const int child : children) edges.erase(child);
+  }
+  for (const int part : edges) places.push_back({part, false});
+  return places;
 }
 
 double Adaptation::required_margin(const Place& place, std::int64_t sample_index) const {
@@ -408,14 +470,9 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
   }
   if (!accepted) return;
   const FittedChange& fitted = choice.best->fitted;
-  AdaptationEvent candidate =
-      event(fitted.change.form == BodyChange::Form::kStored ? AdaptationEvent::Kind::kRestored
-                                                            : AdaptationEvent::Kind::kCandidate,
-            sample_index, choice.best->place);
-  candidate.cause = fitted.change.cause(schema_);
-  candidate.margin = choice.margin();
-  candidate.num_samples = static_cast<int>(samples.size());
-  events->push_back(candidate);
+  tell(fitted.change.form == BodyChange::Form::kStored ? AdaptationEvent::Kind::kRestored
+                                                       : AdaptationEvent::Kind::kCandidate,
+       sample_index, *choice.best, choice.margin(), static_cast<int>(samples.size()), events);
   want_probe(schema_, choice, sample_index, events);
   if (fitted.change.small && !choice.best->place.marker) {
     const int part = choice.best->place.part;
@@ -487,10 +544,7 @@ void Adaptation::reconsider(std::int64_t sample_index, bool all_forms,
       }
       Choice choice = choose(others, {r.place}, samples, &r.fitted.change);
       if (!choice.best || choice.margin() < 0) {
-        AdaptationEvent reverted = event(AdaptationEvent::Kind::kReverted, sample_index, r.place);
-        reverted.cause = r.fitted.change.cause(others);
-        reverted.margin = choice.margin();
-        events->push_back(reverted);
+        tell(AdaptationEvent::Kind::kReverted, sample_index, r, choice.margin(), 0, events);
         Reversions& reversions = reversions_[r.place];
         reversions.num = reversions.last + kSoon < sample_index ? 1 : reversions.num + 1;
         reversions.last = sample_index;
@@ -499,14 +553,13 @@ void Adaptation::reconsider(std::int64_t sample_index, bool all_forms,
         continue;
       }
       if (choice.best->fitted.change != r.fitted.change) {
-        AdaptationEvent refined = event(AdaptationEvent::Kind::kRefined, sample_index, r.place);
-        refined.cause = choice.best->fitted.change.cause(others);
-        refined.margin = choice.margin();
-        refined.num_samples = static_cast<int>(samples.size());
-        events->push_back(refined);
+        if (choice.best->place != r.place)
+          tell(AdaptationEvent::Kind::kReverted, sample_index, r, choice.margin(), 0, events);
+        tell(AdaptationEvent::Kind::kRefined, sample_index, *choice.best, choice.margin(),
+             static_cast<int>(samples.size()), events);
         is_changed = true;
       }
-      r.fitted = choice.best->fitted;
+      r = *choice.best;
       if (round == 0 && age_ > 0) want_probe(others, choice, sample_index, events);
       ++n;
     }
@@ -650,12 +703,8 @@ void Adaptation::drop_fallen(ActionPoseSample* sample, std::vector<AdaptationEve
 void Adaptation::follow(std::int64_t sample_index, std::vector<AdaptationEvent>* events) {
   ++age_;
   if (age_ >= options_.settled_after) {
-    for (const Replacement& r : replacements_) {
-      AdaptationEvent recovered = event(AdaptationEvent::Kind::kRecovered, sample_index, r.place);
-      recovered.cause = r.fitted.change.cause(schema_);
-      recovered.num_samples = age_;
-      events->push_back(recovered);
-    }
+    for (const Replacement& r : replacements_)
+      tell(AdaptationEvent::Kind::kRecovered, sample_index, r, 0, age_, events);
     remember(schema_);
     replacements_.clear();
     return;

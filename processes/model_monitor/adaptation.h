@@ -116,6 +116,7 @@ class Adaptation {
   struct Replacement {
     Place place;
     FittedChange fitted;
+    std::vector<Place> also = {};  ///< what else a whole schema of the history changes
   };
 
   EdgeState state_of(const Place& place) const;
@@ -156,6 +157,10 @@ class Adaptation {
   void install(const BodySchema& schema);
   AdaptationEvent event(AdaptationEvent::Kind kind, std::int64_t sample_index,
                         const Place& place) const;
+  /// Tells the same of every place of a replacement.
+  void tell(AdaptationEvent::Kind kind, std::int64_t sample_index, const Replacement& replacement,
+            double margin, int num_samples, std::vector<AdaptationEvent>* events) const;
+  static std::vector<Place> differences(const BodySchema& a, const BodySchema& b);
 
   const AdaptationOptions options_;
   MarkerNoise noise_;

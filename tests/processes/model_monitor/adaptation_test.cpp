@@ -7,6 +7,7 @@
 #include <limits>
 #include <memory>
 #include <random>
+#include <set>
 
 #include "tests/support/broken_arm.h"
 #include "tests/support/synthetic_robot.h"
@@ -125,6 +126,43 @@ TEST(AdaptationTest, MisjudgedNoiseIsEstimatedAndTheFaultIsFoundAllTheSame) {
     ASSERT_FALSE(life.events.empty());
     EXPECT_GE(life.events.front().sample_index, kBlock) << life.log();
     EXPECT_LT(life.error.back(), 0.03);
+  }
+}
+
+TEST(AdaptationTest, WhatIsRestoredIsToldInAllItsPlacesAndNotWhereAMarkerIsAnOutlier) {
+  using Place = std::pair<int, bool>;  // part, marker
+  const std::vector<std::pair<Fault, std::set<Place>>> cases = {
+      {Fault::kMarker, {{3, true}}}, {Fault::kTwo, {{3, false}, {7, false}}}};
+  for (const auto& [fault, changed] : cases) {
+    BrokenArm arm({fault, "", 1}, Regime::kTagIso, kBlock, 3);
+    Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kTagIso));
+    Life life = live(arm, adaptation, 2 * kBlock);
+    ASSERT_TRUE(adaptation.is_settled()) << life.log();
+    // From the repair until it is found the root's marker is seen tilted, now so, now so.
+    life.events.clear();
+    for (int t = 2 * kBlock; t < 2 * kBlock + 3 && life.events.empty(); ++t) {
+      ActionPoseSample sample = arm.observe(t);
+      for (PartObservation& o : sample.parts) {
+        if (o.part != 1) continue;
+        o.X_CB.linear() *= exp_so3(1.2 * Eigen::Vector3d::Unit(t % 3));
+        o.X_CB_other.reset();
+      }
+      life.events = adaptation.on_sample(sample);
+    }
+    SCOPED_TRACE("events:\n" + life.log());
+    std::set<Place> told;
+    for (const AdaptationEvent& e : life.events) {
+      EXPECT_TRUE(arm.is_near(part_of(e))) << text(e);
+      if (e.kind == Kind::kRestored) told.insert({part_of(e), e.part >= 0});
+    }
+    EXPECT_EQ(told, changed);
+    std::set<Place> provisional;
+    for (const int part : adaptation.schema().parts) {
+      if (adaptation.edge_state(part) == EdgeState::kProvisional) provisional.insert({part, false});
+      if (adaptation.marker_state(part) == EdgeState::kProvisional)
+        provisional.insert({part, true});
+    }
+    EXPECT_EQ(provisional, changed);
   }
 }
 
