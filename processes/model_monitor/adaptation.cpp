@@ -8,13 +8,15 @@
 namespace bodyschema {
 namespace {
 
-constexpr std::size_t kRing = 64;
+constexpr std::size_t kRing = 96;
 /// Squared distance of every marker below which a sample cannot raise a CUSUM that is at zero.
 constexpr double kClear = 14;
 constexpr double kInflations[] = {3, 10};
 constexpr double kHighestOverAlarm = 2;
 /// Samples after a replacement at which all forms are tried again.
 constexpr int kRefits[] = {1, 2, 3, 4, 5, 7, 11, 19, 30};
+/// Samples from one fit of what has settled to the next.
+constexpr int kMaturing = 10;
 /// Changes that begin within so many samples of each other are one event.
 constexpr std::int64_t kTogether = 12;
 
@@ -66,6 +68,12 @@ bool differ_at(const BodySchema& a, const BodySchema& b, int part) {
   if (part == a.root) return !a.X_CR.isApprox(b.X_CR, 1e-9);
   const Edge *x = edge_to(a, part), *y = edge_to(b, part);
   return x && y && differ(*x, *y);
+}
+
+bool is_same(const BodySchema& a, const BodySchema& b) {
+  return a.X_CR.isApprox(b.X_CR, 1e-9) &&
+         std::equal(a.edges.begin(), a.edges.end(), b.edges.begin(), b.edges.end(),
+                    [](const Edge& x, const Edge& y) { return !differ(x, y); });
 }
 
 void check(const ActionPoseSample& sample, const BodySchema& schema) {
@@ -237,13 +245,12 @@ void Adaptation::watch_noise(const TreeFilter::Judgement& judgement) {
   install(schema_);
 }
 
-std::vector<const ActionPoseSample*> Adaptation::segment(std::int64_t since) const {
+std::vector<const ActionPoseSample*> Adaptation::segment(std::int64_t since, int longest) const {
   std::vector<const ActionPoseSample*> result;
   for (const ActionPoseSample& sample : recent_)
     if (sample.sample_index >= since) result.push_back(&sample);
-  const auto longest = static_cast<std::size_t>(options_.longest_segment);
-  if (result.size() > longest)
-    result.erase(result.begin(), result.end() - options_.longest_segment);
+  if (result.size() > static_cast<std::size_t>(longest))
+    result.erase(result.begin(), result.end() - longest);
   return result;
 }
 
@@ -456,7 +463,7 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
   }
   // What nothing explained so far is looked at again when there is clearly more of it.
   if (detected_ && !is_worth_a_fit(sample_index - since + 1)) return;
-  const auto samples = segment(since);
+  const auto samples = segment(since, options_.longest_segment);
   Choice choice = choose(schema_, places, samples);
   const bool accepted =
       choice.best && choice.margin() > required_margin(choice.best->place, sample_index);
@@ -509,6 +516,7 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
   if (replacements_.empty() || since - since_ > kTogether || fitted.everywhere || ends) {
     before_ = schema_;
     replacements_.clear();
+    maturing_.clear();
     since_ = since;
   }
   replacements_.push_back(std::move(*choice.best));
@@ -522,7 +530,8 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
 
 void Adaptation::reconsider(std::int64_t sample_index, bool all_forms,
                             std::vector<AdaptationEvent>* events) {
-  const auto samples = segment(since_);
+  const auto samples = segment(since_, age_ > options_.settled_after ? options_.matured_after
+                                                                     : options_.longest_segment);
   const int rounds = replacements_.size() > 1 ? 3 : 1;
   for (int round = 0; round < rounds; ++round) {
     bool is_changed = false;
@@ -706,6 +715,11 @@ void Adaptation::follow(std::int64_t sample_index, std::vector<AdaptationEvent>*
     for (const Replacement& r : replacements_)
       tell(AdaptationEvent::Kind::kRecovered, sample_index, r, 0, age_, events);
     remember(schema_);
+    // Of a drift, which may look like small changes, the mean of many samples is not what is now.
+    const bool any_small =
+        std::any_of(replacements_.begin(), replacements_.end(),
+                    [](const Replacement& r) { return r.fitted.change.small; });
+    if (!any_small) maturing_ = replacements_;
     replacements_.clear();
     return;
   }
@@ -714,9 +728,24 @@ void Adaptation::follow(std::int64_t sample_index, std::vector<AdaptationEvent>*
   reconsider(sample_index, all_forms, events);
 }
 
+void Adaptation::mature(std::int64_t sample_index) {
+  if (++age_ > options_.matured_after) {
+    maturing_.clear();
+    return;
+  }
+  if (age_ % kMaturing != 0 || !suspects().empty()) return;
+  const BodySchema settled = schema_;
+  std::swap(replacements_, maturing_);
+  reconsider(sample_index, false, nullptr);
+  std::swap(replacements_, maturing_);
+  for (BodySchema& stored : history_)
+    if (is_same(stored, settled)) stored = schema_;
+}
+
 void Adaptation::begin_drift(int part, std::int64_t sample_index,
                              std::vector<AdaptationEvent>* events) {
   drifting_ = part;
+  maturing_.clear();
   before_ = schema_;
   num_still_ = 0;
   detected_.reset();
@@ -758,13 +787,9 @@ void Adaptation::watch_drift(std::int64_t sample_index, std::vector<AdaptationEv
 }
 
 void Adaptation::remember(const BodySchema& schema) {
-  for (const BodySchema& stored : history_) {
-    bool same =
-        stored.X_CR.isApprox(schema.X_CR, 1e-9) && stored.edges.size() == schema.edges.size();
-    for (std::size_t e = 0; same && e < schema.edges.size(); ++e)
-      same = !differ(stored.edges[e], schema.edges[e]);
-    if (same) return;
-  }
+  if (std::any_of(history_.begin(), history_.end(),
+                  [&](const BodySchema& stored) { return is_same(stored, schema); }))
+    return;
   if (history_.size() > options_.history) history_.erase(history_.begin() + 1);
   history_.push_back(schema);
 }
@@ -787,7 +812,10 @@ std::vector<AdaptationEvent> Adaptation::on_sample(const ActionPoseSample& seen)
   const TreeFilter::Instant instant = filter_->prepare(sample);
   const TreeFilter::Judgement judgement = update_tests(instant, sample.sample_index);
   drift_watch_.add(*filter_, instant, schema_.displacements(sample.action), sample.sample_index);
-  if (!replacements_.empty()) follow(sample.sample_index, &events);
+  if (!replacements_.empty())
+    follow(sample.sample_index, &events);
+  else if (!maturing_.empty())
+    mature(sample.sample_index);
   try_changes(sample.sample_index, &events);
   if (!replacements_.empty()) {
     drifting_.reset();

@@ -30,7 +30,10 @@ struct AdaptationOptions {
   int calibration_samples = 8;
   int longest_segment = 40;  ///< samples since a change that are looked at
   int settled_after = 40;    ///< samples until a replacement is kept for good
-  std::size_t history = 8;   ///< schemas kept beside the first
+  /// Samples of the changed body from which its parameters are estimated in the end: what has
+  /// settled is still fitted anew now and then. (96 samples are remembered.)
+  int matured_after = 90;
+  std::size_t history = 8;  ///< schemas kept beside the first
 };
 
 /// Something that the adaptation decided at one sample.
@@ -129,7 +132,7 @@ class Adaptation {
   double alarm() const;
   /// Returns the judgement under the schema as it stands.
   TreeFilter::Judgement update_tests(const TreeFilter::Instant& instant, std::int64_t sample_index);
-  std::vector<const ActionPoseSample*> segment(std::int64_t since) const;
+  std::vector<const ActionPoseSample*> segment(std::int64_t since, int longest) const;
   std::vector<Place> suspects() const;
   struct Choice {
     std::optional<Replacement> best;
@@ -153,6 +156,7 @@ class Adaptation {
   void drop_fallen(ActionPoseSample* sample, std::vector<AdaptationEvent>* events);
   void watch_visibility(const ActionPoseSample& sample, std::vector<AdaptationEvent>* events);
   void follow(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
+  void mature(std::int64_t sample_index);
   void remember(const BodySchema& schema);
   void install(const BodySchema& schema);
   AdaptationEvent event(AdaptationEvent::Kind kind, std::int64_t sample_index,
@@ -186,6 +190,7 @@ class Adaptation {
   std::map<Place, Reversions> reversions_;  ///< changes that were taken back
   BodySchema before_;                      ///< what stood before the present replacements
   std::vector<Replacement> replacements_;  ///< not settled yet, in the order they came
+  std::vector<Replacement> maturing_;      ///< settled, on before_, and fitted anew now and then
   std::int64_t since_ = 0;                 ///< first sample with the changed body
   DriftWatch drift_watch_;
   std::optional<int> drifting_;  ///< the edge to this part; before_ is the schema without the drift

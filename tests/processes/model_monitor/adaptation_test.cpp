@@ -166,6 +166,26 @@ TEST(AdaptationTest, WhatIsRestoredIsToldInAllItsPlacesAndNotWhereAMarkerIsAnOut
   }
 }
 
+TEST(AdaptationTest, WhatHasSettledIsStillFittedToMoreSamplesForAWhileAndKeptSo) {
+  double settled = 0, matured = 0;
+  for (const int seed : {1, 2, 3}) {
+    BrokenArm arm({Fault::kTool, "", 0.79}, Regime::kChapter, 110, seed);
+    Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kChapter));
+    const Life life = live(arm, adaptation, 220);
+    SCOPED_TRACE("events:\n" + life.log());
+    for (const AdaptationEvent& e : life.events) EXPECT_LT(e.sample_index, 160) << text(e);
+    settled += life.error[159];
+    matured += life.error[219];
+    EXPECT_EQ(life.error[219], life.error[209]) << "for ever";
+    // Both bodies are remembered, the new one as it became.
+    ASSERT_EQ(adaptation.history().size(), 2);
+    EXPECT_EQ(arm.error(adaptation.history()[0], 0), arm.error(arm.engineered(), 0));
+    EXPECT_EQ(arm.error(adaptation.history()[1], 219), life.error[219]);
+  }
+  // Twice the samples: a third less of the tool's part of the error.
+  EXPECT_LT(matured, 0.9 * settled);
+}
+
 TEST(AdaptationTest, ASlowDriftIsNamedAndFollowed) {
   BrokenArm arm({Fault::kDrift, "", 0.85}, Regime::kTagIso, 100, 2);
   Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kTagIso));
