@@ -480,7 +480,6 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
   tell(fitted.change.form == BodyChange::Form::kStored ? AdaptationEvent::Kind::kRestored
                                                        : AdaptationEvent::Kind::kCandidate,
        sample_index, *choice.best, choice.margin(), static_cast<int>(samples.size()), events);
-  want_probe(schema_, choice, sample_index, events);
   if (fitted.change.small && !choice.best->place.marker) {
     const int part = choice.best->place.part;
     // At once again is a change that was not understood yet. What is next to it may have been held
@@ -517,8 +516,10 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
     before_ = schema_;
     replacements_.clear();
     maturing_.clear();
+    asked_.clear();
     since_ = since;
   }
+  want_probe(schema_, choice, sample_index, events);
   replacements_.push_back(std::move(*choice.best));
   age_ = 0;
   detected_.reset();
@@ -584,21 +585,28 @@ void Adaptation::reconsider(std::int64_t sample_index, bool all_forms,
 
 void Adaptation::want_probe(const BodySchema& standing, const Choice& choice,
                             std::int64_t sample_index, std::vector<AdaptationEvent>* events) {
-  if (!choice.runner_up ||
-      choice.best->fitted.log_evidence - choice.runner_up->fitted.log_evidence > options_.ambiguity)
+  if (!choice.runner_up) return;
+  // The runner-up may be ahead of a form that is kept.
+  const double lead =
+      std::abs(choice.best->fitted.log_evidence - choice.runner_up->fitted.log_evidence);
+  if (lead > options_.ambiguity) return;
+  const Ambiguity ambiguity{choice.best->place, choice.best->fitted.change,
+                            choice.runner_up->fitted.change};
+  if (std::any_of(asked_.begin(), asked_.end(),
+                  [&](const Ambiguity& asked) { return asked.is(ambiguity); }))
     return;
   const BodySchema one = with_change(standing, choice.best->fitted);
   const BodySchema other = with_change(standing, choice.runner_up->fitted);
   double most = 1;
   Eigen::VectorXd probe;
   const auto m = static_cast<Eigen::Index>(standing.signals.size());
+  // Evenly over the box: the additive recurrence of the golden ratio's generalisation to m
+  // dimensions (M. Roberts, 2018).
+  double phi = 2;
+  for (int k = 0; k < 30; ++k) phi = std::pow(1 + phi, 1.0 / static_cast<double>(m + 1));
   for (int n = 1; n <= kProbeCandidates; ++n) {
     Eigen::VectorXd action(m);
     for (Eigen::Index s = 0; s < m; ++s) {
-      // Evenly over the box: the additive recurrence of the golden ratio's generalisation to m
-      // dimensions (M. Roberts, 2018).
-      double phi = 2;
-      for (int k = 0; k < 30; ++k) phi = std::pow(1 + phi, 1.0 / static_cast<double>(m + 1));
       const double u = std::fmod(0.5 + n * std::pow(phi, -static_cast<double>(s + 1)), 1.0);
       const Signal& signal = standing.signals[static_cast<std::size_t>(s)];
       action(s) = signal.lower + u * (signal.upper - signal.lower);
@@ -621,8 +629,9 @@ void Adaptation::want_probe(const BodySchema& standing, const Choice& choice,
       event(AdaptationEvent::Kind::kProbeWanted, sample_index, choice.best->place);
   wanted.cause = choice.best->fitted.change.cause(standing) + " or " +
                  choice.runner_up->fitted.change.cause(standing);
-  wanted.margin = choice.best->fitted.log_evidence - choice.runner_up->fitted.log_evidence;
+  wanted.margin = lead;
   wanted.probe = probe;
+  asked_.push_back(ambiguity);
   events->push_back(wanted);
 }
 

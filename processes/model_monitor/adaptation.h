@@ -55,7 +55,8 @@ struct AdaptationEvent {
   int to = -1;
   int part = -1;  ///< of a marker; −1 for an edge
   std::string cause;
-  double margin = 0;  ///< evidence over the schema that stood before [nats]
+  /// Evidence over the schema that stood before; kProbeWanted: between the explanations [nats].
+  double margin = 0;
   int num_samples = 0;
   /// kProbeWanted: the action at which the two likeliest explanations disagree most; else empty.
   Eigen::VectorXd probe;
@@ -192,6 +193,15 @@ class Adaptation {
   std::vector<Replacement> replacements_;  ///< not settled yet, in the order they came
   std::vector<Replacement> maturing_;      ///< settled, on before_, and fitted anew now and then
   std::int64_t since_ = 0;                 ///< first sample with the changed body
+  struct Ambiguity {
+    Place place;
+    BodyChange one, other;
+    bool is(const Ambiguity& a) const {
+      return place == a.place &&
+             ((one == a.one && other == a.other) || (one == a.other && other == a.one));
+    }
+  };
+  std::vector<Ambiguity> asked_;  ///< for which a probe was wanted since since_
   DriftWatch drift_watch_;
   std::optional<int> drifting_;  ///< the edge to this part; before_ is the schema without the drift
   /// The place of the last small change, and when: the same again soon after is a drift.

@@ -5,6 +5,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <map>
 #include <memory>
 #include <random>
 #include <set>
@@ -163,6 +164,28 @@ TEST(AdaptationTest, WhatIsRestoredIsToldInAllItsPlacesAndNotWhereAMarkerIsAnOut
         provisional.insert({part, true});
     }
     EXPECT_EQ(provisional, changed);
+  }
+}
+
+TEST(AdaptationTest, AProbeIsWantedOncePerAmbiguity) {
+  for (const auto& [fault, seed] : {std::pair{Fault::kOffset, 14}, {Fault::kAdjacent, 3}}) {
+    BrokenArm arm({fault, "", 0.85}, Regime::kChapter, 90, seed);
+    Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kChapter));
+    const Life life = live(arm, adaptation, 180);
+    SCOPED_TRACE("events:\n" + life.log());
+    std::map<std::pair<int, std::string>, int> asked;  // part, the two explanations
+    for (const AdaptationEvent& e : life.events) {
+      if (e.kind != Kind::kProbeWanted) continue;
+      EXPECT_GE(e.margin, 0) << text(e);
+      EXPECT_LE(e.margin, adaptation.options().ambiguity) << text(e);
+      const std::size_t middle = e.cause.find(" or ");
+      const std::string one = e.cause.substr(0, middle), other = e.cause.substr(middle + 4);
+      // "geometry" is several forms, and each of two may be a small one.
+      if (one != "geometry" && other != "geometry")
+        ++asked[{part_of(e), std::min(one, other) + "," + std::max(one, other)}];
+    }
+    for (const auto& [what, count] : asked) EXPECT_LE(count, 2) << what.first << what.second;
+    EXPECT_TRUE(life.has(Kind::kProbeWanted));
   }
 }
 
