@@ -13,6 +13,10 @@ constexpr std::size_t kRing = 96;
 constexpr double kClear = 14;
 constexpr double kInflations[] = {3, 10};
 constexpr double kHighestOverAlarm = 2;
+/// Of a CUSUM, from which on it is told which place is wrong, although nothing explains it [nats];
+/// or after so many samples.
+constexpr double kClearLead = 1;
+constexpr std::size_t kLongestUnclear = 4;
 /// Samples after a replacement at which all forms are tried again.
 constexpr int kRefits[] = {1, 2, 3, 4, 5, 7, 11, 19, 30};
 /// Samples from one fit of what has settled to the next.
@@ -452,9 +456,10 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
   const std::vector<Place> places = suspects();
   if (places.empty()) return;
   std::int64_t since = sample_index;
-  double highest = 0;
+  double highest = 0, second = 0;
   for (std::size_t n = 0; n < edges_.size(); ++n) {
     for (const Cusum* c : {&edges_[n], &markers_[n]}) {
+      second = std::max(second, std::min(c->value, highest));
       if (c->value > highest) {
         highest = c->value;
         since = c->since;
@@ -467,8 +472,13 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
   Choice choice = choose(schema_, places, samples);
   const bool accepted =
       choice.best && choice.margin() > required_margin(choice.best->place, sample_index);
-  if ((accepted || highest > alarm()) && !detected_) {
+  // Edges between which nothing was seen are suspected alike: which one it is is told later.
+  const bool is_clear =
+      accepted || highest - second > kClearLead || samples.size() >= kLongestUnclear;
+  if (detected_ ? !is_told_ : accepted || highest > alarm()) {
     detected_ = accepted ? choice.best->place : places.front();
+    is_told_ = is_clear;
+    if (!is_clear) return;
     AdaptationEvent mismatch = event(AdaptationEvent::Kind::kMismatch, sample_index, *detected_);
     if (!detected_->marker && detected_->part == schema_.root) mismatch.cause = "camera_moved";
     mismatch.margin = highest;
@@ -531,8 +541,8 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
 
 void Adaptation::reconsider(std::int64_t sample_index, bool all_forms,
                             std::vector<AdaptationEvent>* events) {
-  const auto samples = segment(since_, age_ > options_.settled_after ? options_.matured_after
-                                                                     : options_.longest_segment);
+  const auto samples = segment(
+      since_, age_ > options_.settled_after ? options_.matured_after : options_.longest_segment);
   const int rounds = replacements_.size() > 1 ? 3 : 1;
   for (int round = 0; round < rounds; ++round) {
     bool is_changed = false;
@@ -725,9 +735,8 @@ void Adaptation::follow(std::int64_t sample_index, std::vector<AdaptationEvent>*
       tell(AdaptationEvent::Kind::kRecovered, sample_index, r, 0, age_, events);
     remember(schema_);
     // Of a drift, which may look like small changes, the mean of many samples is not what is now.
-    const bool any_small =
-        std::any_of(replacements_.begin(), replacements_.end(),
-                    [](const Replacement& r) { return r.fitted.change.small; });
+    const bool any_small = std::any_of(replacements_.begin(), replacements_.end(),
+                                       [](const Replacement& r) { return r.fitted.change.small; });
     if (!any_small) maturing_ = replacements_;
     replacements_.clear();
     return;
@@ -834,8 +843,10 @@ std::vector<AdaptationEvent> Adaptation::on_sample(const ActionPoseSample& seen)
     watch_drift(sample.sample_index, &events);
   }
   if (detected_ && suspects().empty()) {
-    events.push_back(event(AdaptationEvent::Kind::kRecovered, sample.sample_index, *detected_));
-    events.back().cause = "unexplained";
+    if (is_told_) {
+      events.push_back(event(AdaptationEvent::Kind::kRecovered, sample.sample_index, *detected_));
+      events.back().cause = "unexplained";
+    }
     detected_.reset();
   }
   if (is_settled() && suspects().empty()) watch_noise(judgement);

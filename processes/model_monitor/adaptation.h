@@ -184,15 +184,16 @@ class Adaptation {
   FallenMarkers fallen_;
   std::vector<Cusum> edges_, markers_;  ///< by node
   std::optional<Place> detected_;
+  bool is_told_ = false;  ///< that and where something was detected
   struct Reversions {
     int num = 0;
     std::int64_t last = 0;
   };
   std::map<Place, Reversions> reversions_;  ///< changes that were taken back
-  BodySchema before_;                      ///< what stood before the present replacements
-  std::vector<Replacement> replacements_;  ///< not settled yet, in the order they came
-  std::vector<Replacement> maturing_;      ///< settled, on before_, and fitted anew now and then
-  std::int64_t since_ = 0;                 ///< first sample with the changed body
+  BodySchema before_;                       ///< what stood before the present replacements
+  std::vector<Replacement> replacements_;   ///< not settled yet, in the order they came
+  std::vector<Replacement> maturing_;       ///< settled, on before_, and fitted anew now and then
+  std::int64_t since_ = 0;                  ///< first sample with the changed body
   struct Ambiguity {
     Place place;
     BodyChange one, other;

@@ -167,6 +167,30 @@ TEST(AdaptationTest, WhatIsRestoredIsToldInAllItsPlacesAndNotWhereAMarkerIsAnOut
   }
 }
 
+TEST(AdaptationTest, WhichOfTheEdgesBetweenWhichNothingWasSeenIsWrongIsToldWhenItIsKnown) {
+  for (const int seed : {1, 2, 3}) {
+    BrokenArm arm({Fault::kCamera, "", 1}, Regime::kTagIso, 20, seed);
+    Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kTagIso));
+    Life life = live(arm, adaptation, 20);
+    ASSERT_TRUE(life.events.empty()) << life.log();
+    // The camera is bumped, and the first three parts are out of its sight.
+    ActionPoseSample sample = arm.observe(20);
+    std::erase_if(sample.parts, [](const PartObservation& o) { return o.part <= 3; });
+    life.events = adaptation.on_sample(sample);
+    EXPECT_TRUE(life.events.empty()) << life.log();
+    int num_invalid = 0;
+    for (const int part : adaptation.schema().parts)
+      num_invalid += adaptation.edge_state(part) == EdgeState::kInvalid;
+    EXPECT_EQ(num_invalid, 1) << "the arm is not to be relied upon";
+    for (int t = 21; t < 24; ++t)
+      for (const AdaptationEvent& e : adaptation.on_sample(arm.observe(t))) life.events.push_back(e);
+    SCOPED_TRACE("events:\n" + life.log());
+    ASSERT_TRUE(life.has(Kind::kMismatch));
+    EXPECT_TRUE(life.has(Kind::kCandidate));
+    for (const AdaptationEvent& e : life.events) EXPECT_EQ(part_of(e), 1) << text(e);
+  }
+}
+
 TEST(AdaptationTest, AProbeIsWantedOncePerAmbiguity) {
   for (const auto& [fault, seed] : {std::pair{Fault::kOffset, 14}, {Fault::kAdjacent, 3}}) {
     BrokenArm arm({fault, "", 0.85}, Regime::kChapter, 90, seed);
