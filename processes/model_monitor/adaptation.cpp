@@ -2,18 +2,25 @@
 
 #include <algorithm>
 #include <cmath>
+#include <set>
 #include <stdexcept>
 
 namespace bodyschema {
 namespace {
 
-constexpr std::size_t kRing = 64;
+constexpr std::size_t kRing = 96;
 /// Squared distance of every marker below which a sample cannot raise a CUSUM that is at zero.
 constexpr double kClear = 14;
 constexpr double kInflations[] = {3, 10};
 constexpr double kHighestOverAlarm = 2;
+/// Of a CUSUM, from which on it is told which place is wrong, although nothing explains it [nats];
+/// or after so many samples.
+constexpr double kClearLead = 1;
+constexpr std::size_t kLongestUnclear = 4;
 /// Samples after a replacement at which all forms are tried again.
 constexpr int kRefits[] = {1, 2, 3, 4, 5, 7, 11, 19, 30};
+/// Samples from one fit of what has settled to the next.
+constexpr int kMaturing = 10;
 /// Changes that begin within so many samples of each other are one event.
 constexpr std::int64_t kTogether = 12;
 
@@ -65,6 +72,12 @@ bool differ_at(const BodySchema& a, const BodySchema& b, int part) {
   if (part == a.root) return !a.X_CR.isApprox(b.X_CR, 1e-9);
   const Edge *x = edge_to(a, part), *y = edge_to(b, part);
   return x && y && differ(*x, *y);
+}
+
+bool is_same(const BodySchema& a, const BodySchema& b) {
+  return a.X_CR.isApprox(b.X_CR, 1e-9) &&
+         std::equal(a.edges.begin(), a.edges.end(), b.edges.begin(), b.edges.end(),
+                    [](const Edge& x, const Edge& y) { return !differ(x, y); });
 }
 
 void check(const ActionPoseSample& sample, const BodySchema& schema) {
@@ -134,7 +147,8 @@ Adaptation::Adaptation(BodySchema schema, AdaptationOptions options,
 EdgeState Adaptation::state_of(const Place& place) const {
   if (detected_ == place) return EdgeState::kInvalid;
   for (const Replacement& r : replacements_)
-    if (r.place == place) return EdgeState::kProvisional;
+    if (r.place == place || std::find(r.also.begin(), r.also.end(), place) != r.also.end())
+      return EdgeState::kProvisional;
   if (!place.marker && drifting_ == place.part) return EdgeState::kProvisional;
   const double statistic = place.marker ? marker_statistic(place.part) : edge_statistic(place.part);
   return statistic > options_.suspicion ? EdgeState::kSuspect : EdgeState::kOk;
@@ -235,13 +249,12 @@ void Adaptation::watch_noise(const TreeFilter::Judgement& judgement) {
   install(schema_);
 }
 
-std::vector<const ActionPoseSample*> Adaptation::segment(std::int64_t since) const {
+std::vector<const ActionPoseSample*> Adaptation::segment(std::int64_t since, int longest) const {
   std::vector<const ActionPoseSample*> result;
   for (const ActionPoseSample& sample : recent_)
     if (sample.sample_index >= since) result.push_back(&sample);
-  const auto longest = static_cast<std::size_t>(options_.longest_segment);
-  if (result.size() > longest)
-    result.erase(result.begin(), result.end() - options_.longest_segment);
+  if (result.size() > static_cast<std::size_t>(longest))
+    result.erase(result.begin(), result.end() - longest);
   return result;
 }
 
@@ -287,16 +300,17 @@ Adaptation::Choice Adaptation::choose(const BodySchema& standing, const std::vec
     if (!choice.runner_up || candidate.fitted.log_evidence > choice.runner_up->fitted.log_evidence)
       choice.runner_up = std::move(candidate);
   };
-  const auto offer = [&](FittedChange candidate, const Place& at) {
-    if (standing_form && candidate.change == *standing_form &&
-        (!same_form || candidate.log_evidence > same_form->fitted.log_evidence))
-      same_form = Replacement{at, candidate};
-    if (choice.best && candidate.log_evidence <= choice.best->fitted.log_evidence) {
-      second({at, std::move(candidate)});
+  const auto offer = [&](Replacement candidate) {
+    const FittedChange& fitted = candidate.fitted;
+    if (standing_form && fitted.change == *standing_form &&
+        (!same_form || fitted.log_evidence > same_form->fitted.log_evidence))
+      same_form = candidate;
+    if (choice.best && fitted.log_evidence <= choice.best->fitted.log_evidence) {
+      second(std::move(candidate));
       return;
     }
     if (choice.best) second(std::move(*choice.best));
-    choice.best = Replacement{at, std::move(candidate)};
+    choice.best = std::move(candidate);
   };
   for (const Place& at : places) {
     // Bases: the model that stands, and what is stored of this place.
@@ -317,7 +331,7 @@ Adaptation::Choice Adaptation::choose(const BodySchema& standing, const std::vec
       const PlaceEvidence evidence(bases[b], noise_, at.part, at.marker, samples);
       const auto offer_from = [&](FittedChange candidate) {
         if (origins[b]) candidate.origin = *origins[b];
-        offer(std::move(candidate), at);
+        offer({at, std::move(candidate)});
       };
       if (b > 0 && evidence.num_usable() > 0) offer_from(evidence.judge_stored(bases[b]));
       for (FittedChange& fitted :
@@ -337,7 +351,15 @@ Adaptation::Choice Adaptation::choose(const BodySchema& standing, const std::vec
     if (num_different < 2) continue;
     all.log_evidence = all.change.log_odds() + log_likelihood(with, noise_, samples);
     all.num_usable = 1;
-    offer(std::move(all), places.front());
+    // It is wherever it makes a difference, first where that was suspected: an outlier elsewhere
+    // may be the greatest suspicion.
+    std::vector<Place> at = differences(standing, with);
+    std::stable_sort(at.begin(), at.end(), [&places](const Place& a, const Place& b) {
+      return std::find(places.begin(), places.end(), a) <
+             std::find(places.begin(), places.end(), b);
+    });
+    all.change.part = at.front().part;
+    offer({at.front(), std::move(all), {at.begin() + 1, at.end()}});
   }
   // With many samples what the schema was wrong about before the change is found out too, and
   // dressed up as a richer form of it.
@@ -373,6 +395,57 @@ AdaptationEvent Adaptation::event(AdaptationEvent::Kind kind, std::int64_t sampl
   return result;
 }
 
+void Adaptation::tell(AdaptationEvent::Kind kind, std::int64_t sample_index,
+                      const Replacement& replacement, double margin, int num_samples,
+                      std::vector<AdaptationEvent>* events) const {
+  std::vector<Place> places{replacement.place};
+  places.insert(places.end(), replacement.also.begin(), replacement.also.end());
+  for (const Place& place : places) {
+    AdaptationEvent told = event(kind, sample_index, place);
+    BodyChange there = replacement.fitted.change;
+    there.part = place.part;
+    told.cause = there.cause(schema_);
+    told.margin = margin;
+    told.num_samples = num_samples;
+    events->push_back(std::move(told));
+  }
+}
+
+/// The places in which two schemas of the same tree differ: markers first, of parts that lie
+/// elsewhere between edges which together lead to where they led, then edges.
+std::vector<Adaptation::Place> Adaptation::differences(const BodySchema& a, const BodySchema& b) {
+  Eigen::VectorXd action(static_cast<Eigen::Index>(a.signals.size()));
+  for (Eigen::Index s = 0; s < action.size(); ++s) {
+    const Signal& signal = a.signals[static_cast<std::size_t>(s)];
+    action(s) = 0.25 * signal.lower + 0.75 * signal.upper;  // nothing special about it
+  }
+  const auto pose_in_parent = [&action](const BodySchema& schema, int part) {
+    const Edge* edge = edge_to(schema, part);
+    return edge ? edge->predict(schema.displacements(action)) : schema.X_CR;
+  };
+  std::set<int> edges;
+  for (const int part : a.parts)
+    if (differ_at(a, b, part)) edges.insert(part);
+  std::vector<Place> places;
+  for (const int part : a.parts) {
+    std::vector<int> children;
+    for (const Edge& edge : a.edges)
+      if (edge.from == part) children.push_back(edge.to);
+    if (!edges.contains(part) || children.empty()) continue;
+    const Pose X_a = pose_in_parent(a, part), X_b = pose_in_parent(b, part);
+    const bool only_the_marker = std::all_of(children.begin(), children.end(), [&](int child) {
+      return edges.contains(child) &&
+             (X_a * pose_in_parent(a, child)).isApprox(X_b * pose_in_parent(b, child), 1e-6);
+    });
+    if (!only_the_marker) continue;
+    places.push_back({part, true});
+    edges.erase(part);
+    for (const int child : children) edges.erase(child);
+  }
+  for (const int part : edges) places.push_back({part, false});
+  return places;
+}
+
 double Adaptation::required_margin(const Place& place, std::int64_t sample_index) const {
   const auto it = reversions_.find(place);
   const bool is_recent = it != reversions_.end() && it->second.last + kSoon >= sample_index;
@@ -383,9 +456,10 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
   const std::vector<Place> places = suspects();
   if (places.empty()) return;
   std::int64_t since = sample_index;
-  double highest = 0;
+  double highest = 0, second = 0;
   for (std::size_t n = 0; n < edges_.size(); ++n) {
     for (const Cusum* c : {&edges_[n], &markers_[n]}) {
+      second = std::max(second, std::min(c->value, highest));
       if (c->value > highest) {
         highest = c->value;
         since = c->since;
@@ -394,12 +468,17 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
   }
   // What nothing explained so far is looked at again when there is clearly more of it.
   if (detected_ && !is_worth_a_fit(sample_index - since + 1)) return;
-  const auto samples = segment(since);
+  const auto samples = segment(since, options_.longest_segment);
   Choice choice = choose(schema_, places, samples);
   const bool accepted =
       choice.best && choice.margin() > required_margin(choice.best->place, sample_index);
-  if ((accepted || highest > alarm()) && !detected_) {
+  // Edges between which nothing was seen are suspected alike: which one it is is told later.
+  const bool is_clear =
+      accepted || highest - second > kClearLead || samples.size() >= kLongestUnclear;
+  if (detected_ ? !is_told_ : accepted || highest > alarm()) {
     detected_ = accepted ? choice.best->place : places.front();
+    is_told_ = is_clear;
+    if (!is_clear) return;
     AdaptationEvent mismatch = event(AdaptationEvent::Kind::kMismatch, sample_index, *detected_);
     if (!detected_->marker && detected_->part == schema_.root) mismatch.cause = "camera_moved";
     mismatch.margin = highest;
@@ -408,15 +487,9 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
   }
   if (!accepted) return;
   const FittedChange& fitted = choice.best->fitted;
-  AdaptationEvent candidate =
-      event(fitted.change.form == BodyChange::Form::kStored ? AdaptationEvent::Kind::kRestored
-                                                            : AdaptationEvent::Kind::kCandidate,
-            sample_index, choice.best->place);
-  candidate.cause = fitted.change.cause(schema_);
-  candidate.margin = choice.margin();
-  candidate.num_samples = static_cast<int>(samples.size());
-  events->push_back(candidate);
-  want_probe(schema_, choice, sample_index, events);
+  tell(fitted.change.form == BodyChange::Form::kStored ? AdaptationEvent::Kind::kRestored
+                                                       : AdaptationEvent::Kind::kCandidate,
+       sample_index, *choice.best, choice.margin(), static_cast<int>(samples.size()), events);
   if (fitted.change.small && !choice.best->place.marker) {
     const int part = choice.best->place.part;
     // At once again is a change that was not understood yet. What is next to it may have been held
@@ -452,8 +525,11 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
   if (replacements_.empty() || since - since_ > kTogether || fitted.everywhere || ends) {
     before_ = schema_;
     replacements_.clear();
+    maturing_.clear();
+    asked_.clear();
     since_ = since;
   }
+  want_probe(schema_, choice, sample_index, events);
   replacements_.push_back(std::move(*choice.best));
   age_ = 0;
   detected_.reset();
@@ -465,7 +541,8 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
 
 void Adaptation::reconsider(std::int64_t sample_index, bool all_forms,
                             std::vector<AdaptationEvent>* events) {
-  const auto samples = segment(since_);
+  const auto samples = segment(
+      since_, age_ > options_.settled_after ? options_.matured_after : options_.longest_segment);
   const int rounds = replacements_.size() > 1 ? 3 : 1;
   for (int round = 0; round < rounds; ++round) {
     bool is_changed = false;
@@ -487,10 +564,7 @@ void Adaptation::reconsider(std::int64_t sample_index, bool all_forms,
       }
       Choice choice = choose(others, {r.place}, samples, &r.fitted.change);
       if (!choice.best || choice.margin() < 0) {
-        AdaptationEvent reverted = event(AdaptationEvent::Kind::kReverted, sample_index, r.place);
-        reverted.cause = r.fitted.change.cause(others);
-        reverted.margin = choice.margin();
-        events->push_back(reverted);
+        tell(AdaptationEvent::Kind::kReverted, sample_index, r, choice.margin(), 0, events);
         Reversions& reversions = reversions_[r.place];
         reversions.num = reversions.last + kSoon < sample_index ? 1 : reversions.num + 1;
         reversions.last = sample_index;
@@ -499,14 +573,13 @@ void Adaptation::reconsider(std::int64_t sample_index, bool all_forms,
         continue;
       }
       if (choice.best->fitted.change != r.fitted.change) {
-        AdaptationEvent refined = event(AdaptationEvent::Kind::kRefined, sample_index, r.place);
-        refined.cause = choice.best->fitted.change.cause(others);
-        refined.margin = choice.margin();
-        refined.num_samples = static_cast<int>(samples.size());
-        events->push_back(refined);
+        if (choice.best->place != r.place)
+          tell(AdaptationEvent::Kind::kReverted, sample_index, r, choice.margin(), 0, events);
+        tell(AdaptationEvent::Kind::kRefined, sample_index, *choice.best, choice.margin(),
+             static_cast<int>(samples.size()), events);
         is_changed = true;
       }
-      r.fitted = choice.best->fitted;
+      r = *choice.best;
       if (round == 0 && age_ > 0) want_probe(others, choice, sample_index, events);
       ++n;
     }
@@ -522,21 +595,28 @@ void Adaptation::reconsider(std::int64_t sample_index, bool all_forms,
 
 void Adaptation::want_probe(const BodySchema& standing, const Choice& choice,
                             std::int64_t sample_index, std::vector<AdaptationEvent>* events) {
-  if (!choice.runner_up ||
-      choice.best->fitted.log_evidence - choice.runner_up->fitted.log_evidence > options_.ambiguity)
+  if (!choice.runner_up) return;
+  // The runner-up may be ahead of a form that is kept.
+  const double lead =
+      std::abs(choice.best->fitted.log_evidence - choice.runner_up->fitted.log_evidence);
+  if (lead > options_.ambiguity) return;
+  const Ambiguity ambiguity{choice.best->place, choice.best->fitted.change,
+                            choice.runner_up->fitted.change};
+  if (std::any_of(asked_.begin(), asked_.end(),
+                  [&](const Ambiguity& asked) { return asked.is(ambiguity); }))
     return;
   const BodySchema one = with_change(standing, choice.best->fitted);
   const BodySchema other = with_change(standing, choice.runner_up->fitted);
   double most = 1;
   Eigen::VectorXd probe;
   const auto m = static_cast<Eigen::Index>(standing.signals.size());
+  // Evenly over the box: the additive recurrence of the golden ratio's generalisation to m
+  // dimensions (M. Roberts, 2018).
+  double phi = 2;
+  for (int k = 0; k < 30; ++k) phi = std::pow(1 + phi, 1.0 / static_cast<double>(m + 1));
   for (int n = 1; n <= kProbeCandidates; ++n) {
     Eigen::VectorXd action(m);
     for (Eigen::Index s = 0; s < m; ++s) {
-      // Evenly over the box: the additive recurrence of the golden ratio's generalisation to m
-      // dimensions (M. Roberts, 2018).
-      double phi = 2;
-      for (int k = 0; k < 30; ++k) phi = std::pow(1 + phi, 1.0 / static_cast<double>(m + 1));
       const double u = std::fmod(0.5 + n * std::pow(phi, -static_cast<double>(s + 1)), 1.0);
       const Signal& signal = standing.signals[static_cast<std::size_t>(s)];
       action(s) = signal.lower + u * (signal.upper - signal.lower);
@@ -559,8 +639,9 @@ void Adaptation::want_probe(const BodySchema& standing, const Choice& choice,
       event(AdaptationEvent::Kind::kProbeWanted, sample_index, choice.best->place);
   wanted.cause = choice.best->fitted.change.cause(standing) + " or " +
                  choice.runner_up->fitted.change.cause(standing);
-  wanted.margin = choice.best->fitted.log_evidence - choice.runner_up->fitted.log_evidence;
+  wanted.margin = lead;
   wanted.probe = probe;
+  asked_.push_back(ambiguity);
   events->push_back(wanted);
 }
 
@@ -650,13 +731,13 @@ void Adaptation::drop_fallen(ActionPoseSample* sample, std::vector<AdaptationEve
 void Adaptation::follow(std::int64_t sample_index, std::vector<AdaptationEvent>* events) {
   ++age_;
   if (age_ >= options_.settled_after) {
-    for (const Replacement& r : replacements_) {
-      AdaptationEvent recovered = event(AdaptationEvent::Kind::kRecovered, sample_index, r.place);
-      recovered.cause = r.fitted.change.cause(schema_);
-      recovered.num_samples = age_;
-      events->push_back(recovered);
-    }
+    for (const Replacement& r : replacements_)
+      tell(AdaptationEvent::Kind::kRecovered, sample_index, r, 0, age_, events);
     remember(schema_);
+    // Of a drift, which may look like small changes, the mean of many samples is not what is now.
+    const bool any_small = std::any_of(replacements_.begin(), replacements_.end(),
+                                       [](const Replacement& r) { return r.fitted.change.small; });
+    if (!any_small) maturing_ = replacements_;
     replacements_.clear();
     return;
   }
@@ -665,9 +746,24 @@ void Adaptation::follow(std::int64_t sample_index, std::vector<AdaptationEvent>*
   reconsider(sample_index, all_forms, events);
 }
 
+void Adaptation::mature(std::int64_t sample_index) {
+  if (++age_ > options_.matured_after) {
+    maturing_.clear();
+    return;
+  }
+  if (age_ % kMaturing != 0 || !suspects().empty()) return;
+  const BodySchema settled = schema_;
+  std::swap(replacements_, maturing_);
+  reconsider(sample_index, false, nullptr);
+  std::swap(replacements_, maturing_);
+  for (BodySchema& stored : history_)
+    if (is_same(stored, settled)) stored = schema_;
+}
+
 void Adaptation::begin_drift(int part, std::int64_t sample_index,
                              std::vector<AdaptationEvent>* events) {
   drifting_ = part;
+  maturing_.clear();
   before_ = schema_;
   num_still_ = 0;
   detected_.reset();
@@ -709,13 +805,9 @@ void Adaptation::watch_drift(std::int64_t sample_index, std::vector<AdaptationEv
 }
 
 void Adaptation::remember(const BodySchema& schema) {
-  for (const BodySchema& stored : history_) {
-    bool same =
-        stored.X_CR.isApprox(schema.X_CR, 1e-9) && stored.edges.size() == schema.edges.size();
-    for (std::size_t e = 0; same && e < schema.edges.size(); ++e)
-      same = !differ(stored.edges[e], schema.edges[e]);
-    if (same) return;
-  }
+  if (std::any_of(history_.begin(), history_.end(),
+                  [&](const BodySchema& stored) { return is_same(stored, schema); }))
+    return;
   if (history_.size() > options_.history) history_.erase(history_.begin() + 1);
   history_.push_back(schema);
 }
@@ -738,7 +830,10 @@ std::vector<AdaptationEvent> Adaptation::on_sample(const ActionPoseSample& seen)
   const TreeFilter::Instant instant = filter_->prepare(sample);
   const TreeFilter::Judgement judgement = update_tests(instant, sample.sample_index);
   drift_watch_.add(*filter_, instant, schema_.displacements(sample.action), sample.sample_index);
-  if (!replacements_.empty()) follow(sample.sample_index, &events);
+  if (!replacements_.empty())
+    follow(sample.sample_index, &events);
+  else if (!maturing_.empty())
+    mature(sample.sample_index);
   try_changes(sample.sample_index, &events);
   if (!replacements_.empty()) {
     drifting_.reset();
@@ -748,8 +843,10 @@ std::vector<AdaptationEvent> Adaptation::on_sample(const ActionPoseSample& seen)
     watch_drift(sample.sample_index, &events);
   }
   if (detected_ && suspects().empty()) {
-    events.push_back(event(AdaptationEvent::Kind::kRecovered, sample.sample_index, *detected_));
-    events.back().cause = "unexplained";
+    if (is_told_) {
+      events.push_back(event(AdaptationEvent::Kind::kRecovered, sample.sample_index, *detected_));
+      events.back().cause = "unexplained";
+    }
     detected_.reset();
   }
   if (is_settled() && suspects().empty()) watch_noise(judgement);

@@ -30,7 +30,10 @@ struct AdaptationOptions {
   int calibration_samples = 8;
   int longest_segment = 40;  ///< samples since a change that are looked at
   int settled_after = 40;    ///< samples until a replacement is kept for good
-  std::size_t history = 8;   ///< schemas kept beside the first
+  /// Samples of the changed body from which its parameters are estimated in the end: what has
+  /// settled is still fitted anew now and then. (96 samples are remembered.)
+  int matured_after = 90;
+  std::size_t history = 8;  ///< schemas kept beside the first
 };
 
 /// Something that the adaptation decided at one sample.
@@ -52,7 +55,8 @@ struct AdaptationEvent {
   int to = -1;
   int part = -1;  ///< of a marker; −1 for an edge
   std::string cause;
-  double margin = 0;  ///< evidence over the schema that stood before [nats]
+  /// Evidence over the schema that stood before; kProbeWanted: between the explanations [nats].
+  double margin = 0;
   int num_samples = 0;
   /// kProbeWanted: the action at which the two likeliest explanations disagree most; else empty.
   Eigen::VectorXd probe;
@@ -117,6 +121,7 @@ class Adaptation {
   struct Replacement {
     Place place;
     FittedChange fitted;
+    std::vector<Place> also = {};  ///< what else a whole schema of the history changes
   };
 
   EdgeState state_of(const Place& place) const;
@@ -129,7 +134,7 @@ class Adaptation {
   double alarm() const;
   /// Returns the judgement under the schema as it stands.
   TreeFilter::Judgement update_tests(const TreeFilter::Instant& instant, std::int64_t sample_index);
-  std::vector<const ActionPoseSample*> segment(std::int64_t since) const;
+  std::vector<const ActionPoseSample*> segment(std::int64_t since, int longest) const;
   std::vector<Place> suspects() const;
   struct Choice {
     std::optional<Replacement> best;
@@ -153,10 +158,15 @@ class Adaptation {
   void drop_fallen(ActionPoseSample* sample, std::vector<AdaptationEvent>* events);
   void watch_visibility(const ActionPoseSample& sample, std::vector<AdaptationEvent>* events);
   void follow(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
+  void mature(std::int64_t sample_index);
   void remember(const BodySchema& schema);
   void install(const BodySchema& schema);
   AdaptationEvent event(AdaptationEvent::Kind kind, std::int64_t sample_index,
                         const Place& place) const;
+  /// Tells the same of every place of a replacement.
+  void tell(AdaptationEvent::Kind kind, std::int64_t sample_index, const Replacement& replacement,
+            double margin, int num_samples, std::vector<AdaptationEvent>* events) const;
+  static std::vector<Place> differences(const BodySchema& a, const BodySchema& b);
 
   const AdaptationOptions options_;
   MarkerNoise noise_;
@@ -175,6 +185,7 @@ class Adaptation {
   FallenMarkers fallen_;
   std::vector<Cusum> edges_, markers_;  ///< by node
   std::optional<Place> detected_;
+  bool is_told_ = false;  ///< that and where something was detected
   struct Reversions {
     int num = 0;
     std::int64_t last = 0;
@@ -182,7 +193,17 @@ class Adaptation {
   std::map<Place, Reversions> reversions_;  ///< changes that were taken back
   BodySchema before_;                       ///< what stood before the present replacements
   std::vector<Replacement> replacements_;   ///< not settled yet, in the order they came
+  std::vector<Replacement> maturing_;       ///< settled, on before_, and fitted anew now and then
   std::int64_t since_ = 0;                  ///< first sample with the changed body
+  struct Ambiguity {
+    Place place;
+    BodyChange one, other;
+    bool is(const Ambiguity& a) const {
+      return place == a.place &&
+             ((one == a.one && other == a.other) || (one == a.other && other == a.one));
+    }
+  };
+  std::vector<Ambiguity> asked_;  ///< for which a probe was wanted since since_
   DriftWatch drift_watch_;
   std::optional<int> drifting_;  ///< the edge to this part; before_ is the schema without the drift
   /// The place of the last small change, and when: the same again soon after is a drift.

@@ -161,8 +161,10 @@ std::string BodyChange::cause(const BodySchema& schema) const {
 Eigen::VectorXd prior_sigma(const BodyChange& change, const BodySchema& schema) {
   Eigen::VectorXd sigma(change.size());
   const Edge* edge = edge_to(schema, change.part);
+  // Of the displacement a q + b; what a stuck joint's was is not known.
   const auto joint_range = [&] {
-    return range(schema, edge->joints.at(static_cast<std::size_t>(change.joint)).signal);
+    const ScrewJoint& joint = edge->joints.at(static_cast<std::size_t>(change.joint));
+    return range(schema, joint.signal) * (joint.gain != 0 ? std::abs(joint.gain) : 1);
   };
   switch (change.form) {
     case Form::kStuck:

@@ -28,7 +28,7 @@ struct BodyChange {
   int signal = 0;      ///< kOtherSignal
   bool small = false;  ///< a tenth as wide a prior: what is bent a little is likelier than a break
 
-  /// Number of parameters θ: displacements in command units, transforms as (translation [m],
+  /// Number of parameters θ: displacements (as a q + b is), transforms as (translation [m],
   /// rotation vector [rad]) with T = (Exp(w), p).
   int size() const;
   /// log of the prior odds of this form against no change, before any data.

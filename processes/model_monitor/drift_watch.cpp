@@ -1,6 +1,7 @@
 #include "processes/model_monitor/drift_watch.h"
 
 #include <Eigen/Cholesky>
+#include <Eigen/Eigenvalues>
 #include <cmath>
 
 #include "processes/model_monitor/body_change.h"
@@ -76,6 +77,13 @@ double mean_offset(const std::vector<Reading>& readings, const Matrix6d& model) 
   return mean.dot(Matrix6d(H.inverse() + model).ldlt().solve(mean));
 }
 
+/// A symmetric matrix without its negative eigenvalues.
+Matrix6d positive_part(const Matrix6d& symmetric) {
+  const Eigen::SelfAdjointEigenSolver<Matrix6d> solver(symmetric);
+  return solver.eigenvectors() * solver.eigenvalues().cwiseMax(0).asDiagonal() *
+         solver.eigenvectors().transpose();
+}
+
 }  // namespace
 
 DriftWatch::DriftWatch(double false_alarm_rate)
@@ -96,7 +104,8 @@ void DriftWatch::add(const TreeFilter& filter, const TreeFilter::Instant& instan
     const auto of = filter.measure_edge(instant, node);
     const auto with_exact_models = filter.measure_edge(exact, node);
     if (!of || !with_exact_models) continue;
-    const Matrix6d systematic = of->covariance - with_exact_models->covariance;
+    // Exact models believe fewer markers: what they know less does not make the others surer.
+    const Matrix6d systematic = positive_part(of->covariance - with_exact_models->covariance);
     auto& queue = measured_[filter.part(node)];
     queue.push_back({sample_index, displacements, *of, systematic});
     if (queue.size() > kWindow) queue.pop_front();

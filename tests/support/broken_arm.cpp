@@ -150,6 +150,18 @@ SyntheticRobot BrokenArm::robot_at(int index) const {
   return block % 2 == 1 ? broken_ : healthy_;
 }
 
+BodySchema BrokenArm::engineered_but_exact(int part, int index) const {
+  BodySchema schema = engineered_;
+  const SyntheticRobot robot = robot_at(index);
+  const TrueLink& link = robot.links.at(static_cast<std::size_t>(part - kRoot));
+  for (Edge& edge : schema.edges) {
+    if (edge.to != part) continue;
+    edge.left = link.X_before;
+    edge.joints.front().X_after = link.X_after;
+  }
+  return schema;
+}
+
 ActionPoseSample BrokenArm::observe(int index) {
   const SyntheticRobot robot = robot_at(index);
   ObservationOptions options;

@@ -53,6 +53,8 @@ class BrokenArm {
   const BodySchema& engineered() const { return engineered_; }
   int num_samples() const { return kNumBlocks * block_length_; }
   int block_length() const { return block_length_; }
+  /// The engineered model with the edge to `part` exactly as it is at `index`.
+  BodySchema engineered_but_exact(int part, int index) const;
   /// Must be called for 0, 1, 2, … in this order.
   ActionPoseSample observe(int index);
   /// Mean distance of what is judged from where the schema believes it at `index`, over 60 actions

@@ -5,8 +5,10 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <map>
 #include <memory>
 #include <random>
+#include <set>
 
 #include "tests/support/broken_arm.h"
 #include "tests/support/synthetic_robot.h"
@@ -108,6 +110,14 @@ TEST(AdaptationTest, AHealthyArmIsLeftInPeace) {
   }
 }
 
+TEST(AdaptationTest, AMarkerThatOnlyUncertainModelsBelieveIsNoDrift) {
+  // This arm's window of drift watching has one such by sample 74, of the edge to part 6.
+  BrokenArm arm({Fault::kNone, "", 0.85}, Regime::kChapter, 25, 14);
+  Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kChapter));
+  const Life life = live(arm, adaptation, 100);
+  EXPECT_TRUE(life.events.empty()) << life.log();
+}
+
 TEST(AdaptationTest, MisjudgedNoiseIsEstimatedAndTheFaultIsFoundAllTheSame) {
   for (const double factor : {0.5, 2.0}) {
     BrokenArm arm({Fault::kTool, "", 0.85}, Regime::kTagIso, kBlock, 4);
@@ -118,6 +128,109 @@ TEST(AdaptationTest, MisjudgedNoiseIsEstimatedAndTheFaultIsFoundAllTheSame) {
     EXPECT_GE(life.events.front().sample_index, kBlock) << life.log();
     EXPECT_LT(life.error.back(), 0.03);
   }
+}
+
+TEST(AdaptationTest, WhatIsRestoredIsToldInAllItsPlacesAndNotWhereAMarkerIsAnOutlier) {
+  using Place = std::pair<int, bool>;  // part, marker
+  const std::vector<std::pair<Fault, std::set<Place>>> cases = {
+      {Fault::kMarker, {{3, true}}}, {Fault::kTwo, {{3, false}, {7, false}}}};
+  for (const auto& [fault, changed] : cases) {
+    BrokenArm arm({fault, "", 1}, Regime::kTagIso, kBlock, 3);
+    Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kTagIso));
+    Life life = live(arm, adaptation, 2 * kBlock);
+    ASSERT_TRUE(adaptation.is_settled()) << life.log();
+    // From the repair until it is found the root's marker is seen tilted, now so, now so.
+    life.events.clear();
+    for (int t = 2 * kBlock; t < 2 * kBlock + 3 && life.events.empty(); ++t) {
+      ActionPoseSample sample = arm.observe(t);
+      for (PartObservation& o : sample.parts) {
+        if (o.part != 1) continue;
+        o.X_CB.linear() *= exp_so3(1.2 * Eigen::Vector3d::Unit(t % 3));
+        o.X_CB_other.reset();
+      }
+      life.events = adaptation.on_sample(sample);
+    }
+    SCOPED_TRACE("events:\n" + life.log());
+    std::set<Place> told;
+    for (const AdaptationEvent& e : life.events) {
+      EXPECT_TRUE(arm.is_near(part_of(e))) << text(e);
+      if (e.kind == Kind::kRestored) told.insert({part_of(e), e.part >= 0});
+    }
+    EXPECT_EQ(told, changed);
+    std::set<Place> provisional;
+    for (const int part : adaptation.schema().parts) {
+      if (adaptation.edge_state(part) == EdgeState::kProvisional) provisional.insert({part, false});
+      if (adaptation.marker_state(part) == EdgeState::kProvisional)
+        provisional.insert({part, true});
+    }
+    EXPECT_EQ(provisional, changed);
+  }
+}
+
+TEST(AdaptationTest, WhichOfTheEdgesBetweenWhichNothingWasSeenIsWrongIsToldWhenItIsKnown) {
+  for (const int seed : {1, 2, 3}) {
+    BrokenArm arm({Fault::kCamera, "", 1}, Regime::kTagIso, 20, seed);
+    Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kTagIso));
+    Life life = live(arm, adaptation, 20);
+    ASSERT_TRUE(life.events.empty()) << life.log();
+    // The camera is bumped, and the first three parts are out of its sight.
+    ActionPoseSample sample = arm.observe(20);
+    std::erase_if(sample.parts, [](const PartObservation& o) { return o.part <= 3; });
+    life.events = adaptation.on_sample(sample);
+    EXPECT_TRUE(life.events.empty()) << life.log();
+    int num_invalid = 0;
+    for (const int part : adaptation.schema().parts)
+      num_invalid += adaptation.edge_state(part) == EdgeState::kInvalid;
+    EXPECT_EQ(num_invalid, 1) << "the arm is not to be relied upon";
+    for (int t = 21; t < 24; ++t)
+      for (const AdaptationEvent& e : adaptation.on_sample(arm.observe(t))) life.events.push_back(e);
+    SCOPED_TRACE("events:\n" + life.log());
+    ASSERT_TRUE(life.has(Kind::kMismatch));
+    EXPECT_TRUE(life.has(Kind::kCandidate));
+    for (const AdaptationEvent& e : life.events) EXPECT_EQ(part_of(e), 1) << text(e);
+  }
+}
+
+TEST(AdaptationTest, AProbeIsWantedOncePerAmbiguity) {
+  for (const auto& [fault, seed] : {std::pair{Fault::kOffset, 14}, {Fault::kAdjacent, 3}}) {
+    BrokenArm arm({fault, "", 0.85}, Regime::kChapter, 90, seed);
+    Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kChapter));
+    const Life life = live(arm, adaptation, 180);
+    SCOPED_TRACE("events:\n" + life.log());
+    std::map<std::pair<int, std::string>, int> asked;  // part, the two explanations
+    for (const AdaptationEvent& e : life.events) {
+      if (e.kind != Kind::kProbeWanted) continue;
+      EXPECT_GE(e.margin, 0) << text(e);
+      EXPECT_LE(e.margin, adaptation.options().ambiguity) << text(e);
+      const std::size_t middle = e.cause.find(" or ");
+      const std::string one = e.cause.substr(0, middle), other = e.cause.substr(middle + 4);
+      // "geometry" is several forms, and each of two may be a small one.
+      if (one != "geometry" && other != "geometry")
+        ++asked[{part_of(e), std::min(one, other) + "," + std::max(one, other)}];
+    }
+    for (const auto& [what, count] : asked) EXPECT_LE(count, 2) << what.first << what.second;
+    EXPECT_TRUE(life.has(Kind::kProbeWanted));
+  }
+}
+
+TEST(AdaptationTest, WhatHasSettledIsStillFittedToMoreSamplesForAWhileAndKeptSo) {
+  double settled = 0, matured = 0;
+  for (const int seed : {1, 2, 3}) {
+    BrokenArm arm({Fault::kTool, "", 0.79}, Regime::kChapter, 110, seed);
+    Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kChapter));
+    const Life life = live(arm, adaptation, 220);
+    SCOPED_TRACE("events:\n" + life.log());
+    for (const AdaptationEvent& e : life.events) EXPECT_LT(e.sample_index, 160) << text(e);
+    settled += life.error[159];
+    matured += life.error[219];
+    EXPECT_EQ(life.error[219], life.error[209]) << "for ever";
+    // Both bodies are remembered, the new one as it became.
+    ASSERT_EQ(adaptation.history().size(), 2);
+    EXPECT_EQ(arm.error(adaptation.history()[0], 0), arm.error(arm.engineered(), 0));
+    EXPECT_EQ(arm.error(adaptation.history()[1], 219), life.error[219]);
+  }
+  // Twice the samples: a third less of the tool's part of the error.
+  EXPECT_LT(matured, 0.9 * settled);
 }
 
 TEST(AdaptationTest, ASlowDriftIsNamedAndFollowed) {

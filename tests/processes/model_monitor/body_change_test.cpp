@@ -80,6 +80,25 @@ TEST_F(BodyChangeTest, EveryFormIsWhatItSays) {
                   .isApprox(by_hand(1.2 * action_(5)), 1e-12));
 }
 
+TEST_F(BodyChangeTest, ADisplacementMayBeAsLargeAsTheJointsGainMakesIt) {
+  const BodyChange stuck{Form::kStuck, kPart}, offset{Form::kOffset, kPart},
+      gain{Form::kGain, kPart};
+  ScrewJoint& joint = schema_.edges[2].joints[0];
+  joint.gain = 1;
+  const auto displacement = [&](const BodyChange& change) {
+    const Eigen::VectorXd sigma = prior_sigma(change, schema_);
+    return sigma(sigma.size() - 1);
+  };
+  const std::vector<double> before{displacement(stuck), displacement(offset), displacement(gain)};
+  joint.gain = -20;  // a gear: 20 times the command
+  EXPECT_NEAR(displacement(stuck), 20 * before[0], 1e-12);
+  EXPECT_NEAR(displacement(offset), 20 * before[1], 1e-12);
+  EXPECT_NEAR(displacement(gain), 20 * before[2], 1e-12);
+  EXPECT_EQ(prior_sigma(gain, schema_)(0), 1);
+  joint.gain = 0;  // stuck already: it may be moved by hand
+  EXPECT_NEAR(displacement(stuck), before[0], 1e-12);
+}
+
 TEST_F(BodyChangeTest, AMovedMarkerMovesItsPartAndNothingElse) {
   for (const int part : {1, kPart, 7}) {
     const Eigen::VectorXd theta = random_theta({Form::kMarkerMoved, part});
