@@ -12,6 +12,7 @@
 #include "common/bus/process.h"
 #include "common/bus/rig_door.h"
 #include "common/bus/sample_intake.h"
+#include "common/config/rig.h"
 #include "processes/model_monitor/model_monitor.h"
 #include "processes/model_monitor/monitor_memory.h"
 #include "processes/model_monitor/saved_message.h"
@@ -23,6 +24,17 @@ namespace {
 /// "" where there is no file.
 std::filesystem::path beside(const std::filesystem::path& file, const char* name) {
   return file.empty() ? file : std::filesystem::path(file).replace_filename(name);
+}
+
+/// What was learned from a recording has that recording's limits: the rig's replace them, unless
+/// something is said in their terms (a warp).
+void take_limits(const Signals& rig, body_schema_t* schema) {
+  if (schema->signals.size() != rig.signals.size()) return;
+  for (std::size_t s = 0; s < rig.signals.size(); ++s) {
+    if (!schema->signals[s].warp_weights.empty()) continue;
+    schema->signals[s].lower_limit = rig.signals[s].lower;
+    schema->signals[s].upper_limit = rig.signals[s].upper;
+  }
 }
 
 }  // namespace
@@ -39,7 +51,7 @@ int main(int argc, char** argv) {
         "--schema", schema_file,
         "Where the body schema is kept, and history.lcmlog beside it; reloaded at start");
     app.add_option("--initial", initial_file,
-                   "Body schema to begin with where none is kept: engineered, or another run's")
+                   "Body schema to begin with where none is kept: engineered, learned, another run's")
         ->check(CLI::ExistingFile);
   };
   const auto body = [&](Process& process) {
@@ -57,6 +69,7 @@ int main(int argc, char** argv) {
       } else if (!initial_file.empty()) {
         std::vector<body_schema_t> initial = read_log(initial_file, kBodySchema);
         if (initial.empty()) throw std::runtime_error(initial_file + ": no BODY_SCHEMA in the file");
+        take_limits(load_signals(process.rig_folder()), &initial.back());
         if (const std::string why = door.objection(initial.back()); !why.empty())
           throw std::runtime_error(initial_file + ": " + why);
         initial.back().last_sample_index = -1;

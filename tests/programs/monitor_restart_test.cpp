@@ -174,5 +174,32 @@ TEST_F(MonitorRestartTest, KilledInTheMiddleOfItAllItEndsWithTheSameFiles) {
   }
 }
 
+TEST_F(MonitorRestartTest, BeginsWithAnInitialSchemaWhateverLimitsItsRecordingHad) {
+  body_schema_t initial = proposals_[4];
+  initial.schema_version = 7;
+  for (signal_t& signal : initial.signals) signal.upper_limit -= 0.01;
+  const fs::path file = folder_ / "initial.lcmlog";
+  const auto begin = [&](const std::string& name) {
+    write_one_event_log(file, kBodySchema, initial);
+    fs::create_directories(folder_ / name);
+    auto with = arguments(log_up_to(kNumSamples - 1, false), name, folder_ / "none");
+    with.insert(with.end(), {"--initial", file});
+    test::Program program(with);
+    const int code = program.wait();
+    return std::pair(code, program.err());
+  };
+  EXPECT_EQ(begin("begun").first, 0);
+  const std::vector<body_schema_t> schemas = read_log(out("begun"), kBodySchema);
+  ASSERT_FALSE(schemas.empty());
+  EXPECT_EQ(schemas[0].num_edges, initial.num_edges);
+  for (std::size_t s = 0; s < robot_.signals.size(); ++s)
+    EXPECT_EQ(schemas[0].signals[s].upper_limit, robot_.signals[s].upper);
+
+  initial.signals[0].signal_name = "another";
+  const auto [code, err] = begin("refused");
+  EXPECT_NE(code, 0);
+  EXPECT_NE(err.find("initial.lcmlog: signal 'another'"), std::string::npos) << err;
+}
+
 }  // namespace
 }  // namespace bodyschema
