@@ -754,7 +754,7 @@ void Adaptation::mature(std::int64_t sample_index) {
   if (age_ % kMaturing != 0 || !suspects().empty()) return;
   const BodySchema settled = schema_;
   std::swap(replacements_, maturing_);
-  reconsider(sample_index, false, nullptr);
+  reconsider(sample_index, false, nullptr);  // the forms stay: nothing to tell
   std::swap(replacements_, maturing_);
   for (BodySchema& stored : history_)
     if (is_same(stored, settled)) stored = schema_;

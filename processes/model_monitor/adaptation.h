@@ -71,7 +71,9 @@ const char* name_of(AdaptationEvent::Kind kind);
 /// suspicion on, replacements are fitted to the samples since its beginning: what is in the
 /// history, then changes of the old model from simple to complex. The one with the most evidence
 /// replaces the old one as soon as it leads by `acceptance`; it is refitted as samples come,
-/// reverted if it falls behind, kept in the history once it has settled.
+/// reverted if it falls behind, kept in the history once it has settled, and its parameters (those
+/// of small changes apart, which may be drifts) are estimated anew until there are `matured_after`
+/// samples.
 class Adaptation {
  public:
   Adaptation(BodySchema schema, AdaptationOptions options);
