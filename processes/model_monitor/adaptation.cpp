@@ -32,6 +32,10 @@ constexpr double kSystematicShare = 0.03;
 /// χ²₆(0.99): below it a rate is none.
 constexpr double kSignificantRate = 16.8;
 constexpr int kProbeCandidates = 200;
+/// Two schemas of the history are one body where no local model differs at so many actions by more
+/// than χ²₆(0.99) of what is uncertain about it.
+constexpr int kAlikeActions = 16;
+constexpr double kAlike = 16.8;
 /// Sightings below which a part's visibility is not known.
 constexpr int kFewestSightings = 10;
 constexpr std::int64_t kSoon = 150;
@@ -78,6 +82,43 @@ bool is_same(const BodySchema& a, const BodySchema& b) {
   return a.X_CR.isApprox(b.X_CR, 1e-9) &&
          std::equal(a.edges.begin(), a.edges.end(), b.edges.begin(), b.edges.end(),
                     [](const Edge& x, const Edge& y) { return !differ(x, y); });
+}
+
+/// The n-th of actions that lie evenly in the box of the limits: the additive recurrence of the
+/// golden ratio's generalisation to m dimensions (M. Roberts, 2018).
+Eigen::VectorXd spread_action(const std::vector<Signal>& signals, int n) {
+  const auto m = static_cast<Eigen::Index>(signals.size());
+  double phi = 2;
+  for (int k = 0; k < 30; ++k) phi = std::pow(1 + phi, 1.0 / static_cast<double>(m + 1));
+  Eigen::VectorXd action(m);
+  for (Eigen::Index s = 0; s < m; ++s) {
+    const double u = std::fmod(0.5 + n * std::pow(phi, -static_cast<double>(s + 1)), 1.0);
+    const Signal& signal = signals[static_cast<std::size_t>(s)];
+    action(s) = signal.lower + u * (signal.upper - signal.lower);
+  }
+  return action;
+}
+
+bool is_alike(const BodySchema& a, const BodySchema& b) {
+  const auto is_near = [](const Pose& x, const Matrix6d& of_x, const Pose& y,
+                          const Matrix6d& of_y) {
+    const Vector6d difference = log(x.inverse() * y);
+    const Matrix6d S = of_x + of_y + 1e-12 * Matrix6d::Identity();
+    return difference.dot(S.ldlt().solve(difference)) < kAlike;
+  };
+  if (!is_near(a.X_CR, a.X_CR_covariance, b.X_CR, b.X_CR_covariance)) return false;
+  for (int n = 1; n <= kAlikeActions; ++n) {
+    const Eigen::VectorXd theta = a.displacements(spread_action(a.signals, n));
+    const bool is_alike_here =
+        std::equal(a.edges.begin(), a.edges.end(), b.edges.begin(), b.edges.end(),
+                   [&](const Edge& x, const Edge& y) {
+                     return x.from == y.from && x.to == y.to &&
+                            is_near(x.predict(theta), x.prediction_covariance(theta),
+                                    y.predict(theta), y.prediction_covariance(theta));
+                   });
+    if (!is_alike_here) return false;
+  }
+  return true;
 }
 
 void check(const ActionPoseSample& sample, const BodySchema& schema) {
@@ -519,9 +560,8 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
   }
   // Changes that came together are reconsidered together; an older one is taken as it is, and so is
   // one that ends: what stood before it, again.
-  const bool ends =
-      fitted.change.form == BodyChange::Form::kStored && since > since_ &&
-      !differ_at(with_change(schema_, fitted), before_, choice.best->place.part);
+  const bool ends = fitted.change.form == BodyChange::Form::kStored && since > since_ &&
+                    !differ_at(with_change(schema_, fitted), before_, choice.best->place.part);
   if (replacements_.empty() || since - since_ > kTogether || fitted.everywhere || ends) {
     before_ = schema_;
     replacements_.clear();
@@ -609,18 +649,8 @@ void Adaptation::want_probe(const BodySchema& standing, const Choice& choice,
   const BodySchema other = with_change(standing, choice.runner_up->fitted);
   double most = 1;
   Eigen::VectorXd probe;
-  const auto m = static_cast<Eigen::Index>(standing.signals.size());
-  // Evenly over the box: the additive recurrence of the golden ratio's generalisation to m
-  // dimensions (M. Roberts, 2018).
-  double phi = 2;
-  for (int k = 0; k < 30; ++k) phi = std::pow(1 + phi, 1.0 / static_cast<double>(m + 1));
   for (int n = 1; n <= kProbeCandidates; ++n) {
-    Eigen::VectorXd action(m);
-    for (Eigen::Index s = 0; s < m; ++s) {
-      const double u = std::fmod(0.5 + n * std::pow(phi, -static_cast<double>(s + 1)), 1.0);
-      const Signal& signal = standing.signals[static_cast<std::size_t>(s)];
-      action(s) = signal.lower + u * (signal.upper - signal.lower);
-    }
+    const Eigen::VectorXd action = spread_action(standing.signals, n);
     const auto X = one.predict_all(action), Y = other.predict_all(action);
     for (const auto& [part, X_RB] : X) {
       const auto it = Y.find(part);
@@ -805,9 +835,14 @@ void Adaptation::watch_drift(std::int64_t sample_index, std::vector<AdaptationEv
 }
 
 void Adaptation::remember(const BodySchema& schema) {
-  if (std::any_of(history_.begin(), history_.end(),
-                  [&](const BodySchema& stored) { return is_same(stored, schema); }))
-    return;
+  const auto alike = std::find_if(history_.begin(), history_.end(), [&](const BodySchema& stored) {
+    return is_alike(stored, schema);
+  });
+  if (alike != history_.end()) {
+    // One body: the newest of its schemas, unless it is the one to begin with.
+    if (alike == history_.begin()) return;
+    history_.erase(alike);
+  }
   if (history_.size() > options_.history) history_.erase(history_.begin() + 1);
   history_.push_back(schema);
 }

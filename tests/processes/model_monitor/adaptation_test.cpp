@@ -233,6 +233,31 @@ TEST(AdaptationTest, WhatHasSettledIsStillFittedToMoreSamplesForAWhileAndKeptSo)
   EXPECT_LT(matured, 0.9 * settled);
 }
 
+TEST(AdaptationTest, TwoSchemasOfOneBodyAreRememberedAsOne) {
+  BrokenArm arm({Fault::kTool, "", 0.85}, Regime::kTagIso, 100, 2);
+  const AdaptationOptions options = adaptation_options(Regime::kTagIso);
+  Adaptation adaptation(arm.engineered(), options);
+  live(arm, adaptation, 145);
+  const BodySchema of_45 = adaptation.schema();
+  for (int t = 145; t < 195; ++t) adaptation.on_sample(arm.observe(t));
+  const BodySchema of_95 = adaptation.schema();
+  ASSERT_NE(of_45.edges.back().right.matrix(), of_95.edges.back().right.matrix());
+  const auto remembered = [&](const BodySchema& stored, const BodySchema& now) {
+    return Adaptation(now, options, {arm.engineered(), stored}, {}).history();
+  };
+  // The newest stands for both.
+  ASSERT_EQ(remembered(of_45, of_95).size(), 2U);
+  EXPECT_EQ(remembered(of_45, of_95)[1].edges.back().right.matrix(),
+            of_95.edges.back().right.matrix());
+  BodySchema another = of_95;
+  another.edges.back().right.translation().x() += 0.02;
+  EXPECT_EQ(remembered(of_95, another).size(), 3U);
+  // The first is kept as it is.
+  BodySchema first = arm.engineered();
+  first.edges.back().right.translation().x() += 1e-7;
+  EXPECT_EQ(remembered(of_95, first).size(), 2U);
+}
+
 TEST(AdaptationTest, ASlowDriftIsNamedAndFollowed) {
   BrokenArm arm({Fault::kDrift, "", 0.85}, Regime::kTagIso, 100, 2);
   Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kTagIso));
