@@ -10,6 +10,7 @@
 #include "processes/model_monitor/change_fit.h"
 #include "processes/model_monitor/drift_watch.h"
 #include "processes/model_monitor/fallen_markers.h"
+#include "processes/model_monitor/sample_stream.h"
 #include "processes/model_monitor/tree_filter.h"
 
 namespace bodyschema {
@@ -68,6 +69,11 @@ const char* name_of(AdaptationEvent::Kind kind);
 /// history, then changes of the old model from simple to complex. The one with the most evidence
 /// replaces the old one as soon as it leads by `acceptance`; it is refitted as samples come,
 /// reverted if it falls behind, kept in the history once it has settled.
+///
+/// What repeats another sample (SampleStream) is neither looked at nor counted. Where an edge is
+/// soft the assumed noise has room for what its model leaves, so noise_scale() stays at 1 or above,
+/// and nothing is found out from fewer than three samples, however loud: a bend that was never
+/// shown may be wrong by many standard deviations.
 class Adaptation {
  public:
   Adaptation(BodySchema schema, AdaptationOptions options);
@@ -98,7 +104,7 @@ class Adaptation {
   std::vector<int> missing_parts() const;
   bool is_drifting(int part) const { return drifting_ == part; }
   /// First sample with the body as changed by the replacements that have not settled.
-  std::int64_t since() const { return since_; }
+  std::int64_t since() const { return stream_.sample_index_of(since_); }
   const std::vector<BodySchema>& history() const { return history_; }
   const AdaptationOptions& options() const { return options_; }
   bool is_settled() const { return replacements_.empty() && !detected_ && !drifting_; }
@@ -118,6 +124,8 @@ class Adaptation {
     FittedChange fitted;
   };
 
+  /// Of what is no repetition; its index is SampleStream::count().
+  std::vector<AdaptationEvent> on_new_sample(ActionPoseSample sample);
   EdgeState state_of(const Place& place) const;
   void calibrate();
   void begin_drift(int part, std::int64_t sample_index, std::vector<AdaptationEvent>* events);
@@ -149,6 +157,7 @@ class Adaptation {
   void reconsider(std::int64_t sample_index, bool all_forms, std::vector<AdaptationEvent>* events);
   void want_probe(const BodySchema& standing, const Choice& choice, std::int64_t sample_index,
                   std::vector<AdaptationEvent>* events);
+  void drop_turned_over(ActionPoseSample* sample) const;
   void drop_fallen(ActionPoseSample* sample, std::vector<AdaptationEvent>* events);
   void watch_visibility(const ActionPoseSample& sample, std::vector<AdaptationEvent>* events);
   void follow(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
@@ -157,6 +166,7 @@ class Adaptation {
   AdaptationEvent event(AdaptationEvent::Kind kind, std::int64_t sample_index,
                         const Place& place) const;
 
+  const bool is_soft_;  ///< some edge has a residual GP
   const AdaptationOptions options_;
   MarkerNoise noise_;
   int num_samples_ = 0;
@@ -172,6 +182,7 @@ class Adaptation {
   };
   std::map<int, Visibility> visibility_;
   FallenMarkers fallen_;
+  SampleStream stream_;
   std::vector<Cusum> edges_, markers_;  ///< by node
   std::optional<Place> detected_;
   struct Reversions {
@@ -181,7 +192,7 @@ class Adaptation {
   std::map<Place, Reversions> reversions_;  ///< changes that were taken back
   BodySchema before_;                      ///< what stood before the present replacements
   std::vector<Replacement> replacements_;  ///< not settled yet, in the order they came
-  std::int64_t since_ = 0;                 ///< first sample with the changed body
+  std::int64_t since_ = 0;                 ///< first sample with the changed body, as counted
   DriftWatch drift_watch_;
   std::optional<int> drifting_;  ///< the edge to this part; before_ is the schema without the drift
   /// The place of the last small change, and when: the same again soon after is a drift.
