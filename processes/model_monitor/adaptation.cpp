@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <set>
 #include <stdexcept>
 
@@ -17,6 +18,10 @@ constexpr double kHighestOverAlarm = 2;
 /// or after so many samples.
 constexpr double kClearLead = 1;
 constexpr std::size_t kLongestUnclear = 4;
+/// Samples below which nothing is found out where an edge is soft.
+constexpr int kFewestSoft = 3;
+/// In a stream a marker that is read farther than this from where it should be is turned over.
+constexpr double kTurnedOver_rad = 120 * M_PI / 180;
 /// Samples after a replacement at which all forms are tried again.
 constexpr int kRefits[] = {1, 2, 3, 4, 5, 7, 11, 19, 30};
 /// Samples from one fit of what has settled to the next.
@@ -160,7 +165,12 @@ const char* name_of(AdaptationEvent::Kind kind) {
 }
 
 Adaptation::Adaptation(BodySchema schema, AdaptationOptions options)
-    : options_(options),
+    : is_soft_(std::any_of(schema.edges.begin(), schema.edges.end(),
+                           [](const Edge& edge) { return edge.residual_gp != nullptr; })),
+      options_([&] {
+        if (is_soft_) options.least_noise_scale = std::max(options.least_noise_scale, 1.0);
+        return options;
+      }()),
       noise_(options.noise),
       schema_(std::move(schema)),
       drift_watch_(options.false_alarm_rate) {
@@ -174,6 +184,7 @@ Adaptation::Adaptation(BodySchema schema, AdaptationOptions options,
   num_samples_ = options_.calibration_samples;
   std::vector<AdaptationEvent> old_news;
   for (const ActionPoseSample& sample : past) {
+    if (stream_.repeats(sample, schema_.signals)) continue;
     watch_visibility(sample, &old_news);
     if (sample.purpose == Purpose::kTest) recent_.push_back(sample);
   }
@@ -232,6 +243,7 @@ TreeFilter::Judgement Adaptation::update_tests(const TreeFilter::Instant& instan
   // What is not explained is not suspected for as long again once it is over: earlier samples count
   // up to a ceiling.
   const double highest = kHighestOverAlarm * alarm();
+  const double loudest = is_soft_ ? alarm() / kFewestSoft : std::numeric_limits<double>::infinity();
   const auto add = [sample_index, highest](Cusum* cusum, double ratio) {
     if (cusum->value == 0) cusum->since = sample_index;
     cusum->value = std::max(0.0, std::min(cusum->value, highest) + ratio);
@@ -249,7 +261,7 @@ TreeFilter::Judgement Adaptation::update_tests(const TreeFilter::Instant& instan
     cut.cut_edges = {node};
     wrong +=
         std::exp(std::min(filter_->judge(instant, cut).log_likelihood - now.log_likelihood, 600.0));
-    add(&edges_[static_cast<std::size_t>(node)], std::log(wrong / 3));
+    add(&edges_[static_cast<std::size_t>(node)], std::min(std::log(wrong / 3), loudest));
     if (!instant.seen[static_cast<std::size_t>(node)]) continue;
     Alternative detached;
     detached.detached_node = node;
@@ -511,8 +523,9 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
   if (detected_ && !is_worth_a_fit(sample_index - since + 1)) return;
   const auto samples = segment(since, options_.longest_segment);
   Choice choice = choose(schema_, places, samples);
-  const bool accepted =
-      choice.best && choice.margin() > required_margin(choice.best->place, sample_index);
+  const bool accepted = choice.best &&
+                        choice.margin() > required_margin(choice.best->place, sample_index) &&
+                        (!is_soft_ || static_cast<int>(samples.size()) >= kFewestSoft);
   // Edges between which nothing was seen are suspected alike: which one it is is told later.
   const bool is_clear =
       accepted || highest - second > kClearLead || samples.size() >= kLongestUnclear;
@@ -718,6 +731,16 @@ void Adaptation::watch_visibility(const ActionPoseSample& sample,
   }
 }
 
+// A flip stays for many frames, longer than a block. It says nothing of where the part is.
+void Adaptation::drop_turned_over(ActionPoseSample* sample) const {
+  const auto X_RB = schema_.predict_all(sample->action);
+  std::erase_if(sample->parts, [&](const PartObservation& o) {
+    const auto expected = X_RB.find(o.part);
+    return expected != X_RB.end() &&
+           rotation_angle((schema_.X_CR * expected->second).inverse() * o.X_CB) > kTurnedOver_rad;
+  });
+}
+
 void Adaptation::drop_fallen(ActionPoseSample* sample, std::vector<AdaptationEvent>* events) {
   const auto drop = [](int part, ActionPoseSample* from) {
     std::erase_if(from->parts, [part](const PartObservation& o) { return o.part == part; });
@@ -849,8 +872,17 @@ void Adaptation::remember(const BodySchema& schema) {
 
 std::vector<AdaptationEvent> Adaptation::on_sample(const ActionPoseSample& seen) {
   check(seen, schema_);
-  std::vector<AdaptationEvent> events;
+  if (stream_.repeats(seen, schema_.signals)) return {};
   ActionPoseSample sample = seen;
+  sample.sample_index = stream_.count();
+  if (stream_.is_dense()) drop_turned_over(&sample);
+  std::vector<AdaptationEvent> events = on_new_sample(std::move(sample));
+  for (AdaptationEvent& event : events) event.sample_index = seen.sample_index;
+  return events;
+}
+
+std::vector<AdaptationEvent> Adaptation::on_new_sample(ActionPoseSample sample) {
+  std::vector<AdaptationEvent> events;
   if (num_samples_ >= options_.calibration_samples) drop_fallen(&sample, &events);
   recent_.push_back(sample);
   if (recent_.size() > kRing) recent_.pop_front();

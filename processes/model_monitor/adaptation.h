@@ -10,6 +10,7 @@
 #include "processes/model_monitor/change_fit.h"
 #include "processes/model_monitor/drift_watch.h"
 #include "processes/model_monitor/fallen_markers.h"
+#include "processes/model_monitor/sample_stream.h"
 #include "processes/model_monitor/tree_filter.h"
 
 namespace bodyschema {
@@ -74,6 +75,11 @@ const char* name_of(AdaptationEvent::Kind kind);
 /// reverted if it falls behind, kept in the history once it has settled, and its parameters (those
 /// of small changes apart, which may be drifts) are estimated anew until there are `matured_after`
 /// samples.
+///
+/// What repeats another sample (SampleStream) is neither looked at nor counted. Where an edge is
+/// soft the assumed noise has room for what its model leaves, so noise_scale() stays at 1 or above,
+/// and nothing is found out from fewer than three samples, however loud: a bend that was never
+/// shown may be wrong by many standard deviations.
 class Adaptation {
  public:
   Adaptation(BodySchema schema, AdaptationOptions options);
@@ -105,7 +111,7 @@ class Adaptation {
   std::vector<int> missing_parts() const;
   bool is_drifting(int part) const { return drifting_ == part; }
   /// First sample with the body as changed by the replacements that have not settled.
-  std::int64_t since() const { return since_; }
+  std::int64_t since() const { return stream_.sample_index_of(since_); }
   const std::vector<BodySchema>& history() const { return history_; }
   const AdaptationOptions& options() const { return options_; }
   bool is_settled() const { return replacements_.empty() && !detected_ && !drifting_; }
@@ -126,6 +132,8 @@ class Adaptation {
     std::vector<Place> also = {};  ///< what else a whole schema of the history changes
   };
 
+  /// Of what is no repetition; its index is SampleStream::count().
+  std::vector<AdaptationEvent> on_new_sample(ActionPoseSample sample);
   EdgeState state_of(const Place& place) const;
   void calibrate();
   void begin_drift(int part, std::int64_t sample_index, std::vector<AdaptationEvent>* events);
@@ -157,6 +165,7 @@ class Adaptation {
   void reconsider(std::int64_t sample_index, bool all_forms, std::vector<AdaptationEvent>* events);
   void want_probe(const BodySchema& standing, const Choice& choice, std::int64_t sample_index,
                   std::vector<AdaptationEvent>* events);
+  void drop_turned_over(ActionPoseSample* sample) const;
   void drop_fallen(ActionPoseSample* sample, std::vector<AdaptationEvent>* events);
   void watch_visibility(const ActionPoseSample& sample, std::vector<AdaptationEvent>* events);
   void follow(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
@@ -170,6 +179,7 @@ class Adaptation {
             double margin, int num_samples, std::vector<AdaptationEvent>* events) const;
   static std::vector<Place> differences(const BodySchema& a, const BodySchema& b);
 
+  const bool is_soft_;  ///< some edge has a residual GP
   const AdaptationOptions options_;
   MarkerNoise noise_;
   int num_samples_ = 0;
@@ -185,6 +195,7 @@ class Adaptation {
   };
   std::map<int, Visibility> visibility_;
   FallenMarkers fallen_;
+  SampleStream stream_;
   std::vector<Cusum> edges_, markers_;  ///< by node
   std::optional<Place> detected_;
   bool is_told_ = false;  ///< that and where something was detected
@@ -196,7 +207,7 @@ class Adaptation {
   BodySchema before_;                       ///< what stood before the present replacements
   std::vector<Replacement> replacements_;   ///< not settled yet, in the order they came
   std::vector<Replacement> maturing_;       ///< settled, on before_, and fitted anew now and then
-  std::int64_t since_ = 0;                  ///< first sample with the changed body
+  std::int64_t since_ = 0;                  ///< first sample with the changed body, as counted
   struct Ambiguity {
     Place place;
     BodyChange one, other;

@@ -140,8 +140,8 @@ std::optional<int> DriftWatch::moved_part(const BodySchema& schema) const {
     for (std::size_t n = begin; n < queue->size(); ++n) {
       const Measured& m = (*queue)[n];
       const Pose X = edge ? edge->predict(m.displacements) : schema.X_CR;
-      const Matrix6d model = m.systematic + (edge ? edge->prediction_covariance(m.displacements)
-                                                  : schema.X_CR_covariance);
+      const Matrix6d model =
+          m.systematic + (edge ? model_covariance(*edge, m.displacements) : schema.X_CR_covariance);
       const Vector6d xi = log(X.inverse() * m.of.z);
       const Matrix6d information = m.of.covariance.inverse();
       right.push_back({0, xi, information});

@@ -59,6 +59,12 @@ Matrix6d covariance_of(const PartObservation& observation, const MarkerNoise& no
          diagonal(noise.model_error) + 1e-12 * Matrix6d::Identity();
 }
 
+Matrix6d model_covariance(const Edge& edge, const Eigen::VectorXd& theta) {
+  Matrix6d covariance = edge.prediction_covariance(theta);
+  if (edge.residual_gp) covariance += edge.empirical_covariance();
+  return covariance;
+}
+
 double log_flat_density() { return -std::log(8 * M_PI * M_PI * kRoom_m3); }
 
 double log_normal_density(const Vector6d& xi, const Matrix6d& S) {
@@ -152,7 +158,7 @@ TreeFilter::Instant TreeFilter::prepare(const ActionPoseSample& sample) const {
     } else {
       const Edge& edge = schema_.edges[static_cast<std::size_t>(node.edge)];
       instant.delta[k] = edge.predict(theta);
-      instant.edge_covariance[k] = edge.prediction_covariance(theta);
+      instant.edge_covariance[k] = model_covariance(edge, theta);
     }
     instant.edge_covariance[k].diagonal().array() += 1e-12;  // what is exact can still be inverted
     instant.transport[k] = adjoint(instant.delta[k].inverse());

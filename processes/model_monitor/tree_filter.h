@@ -24,6 +24,10 @@ struct MarkerNoise {
 /// Covariance of an observed pose X_CB: 6 × 6, right perturbation.
 Matrix6d covariance_of(const PartObservation& observation, const MarkerNoise& noise);
 
+/// Covariance of an edge's prediction, right perturbation: to first order; where it has a residual
+/// GP, which is too sure of itself where it was not trained, plus what its left-out blocks showed.
+Matrix6d model_covariance(const Edge& edge, const Eigen::VectorXd& theta);
+
 /// What may be wrong with the schema at one instant. Nodes are the places of parts in
 /// TreeFilter::parts(); "the edge of a node" is the one that leads to it from its parent, for the
 /// root the camera's.
@@ -45,7 +49,7 @@ struct VirtualMeasurement {
 ///
 /// The belief on a part's pose in the camera's frame (mean X, covariance P, right perturbation)
 /// starts at the root with X_CR and goes outwards: X ← X·Δ_e(q), P ← F P Fᵀ + Σ_e(q) with F =
-/// Ad(Δ⁻¹) and Σ_e the covariance of the local model. A visible marker y has the density
+/// Ad(Δ⁻¹) and Σ_e = model_covariance(). A visible marker y has the density
 ///   (1 − ρ) N(ξ; 0, S) + ρ g(ξ),   ξ = log(X⁻¹ y), S = P + Σ_y,
 /// with an outlier density g that is shaped as the outliers of planar markers are: flips, tilts of
 /// unknown direction, wide errors and a floor. (A uniform g makes every flip of a leaf's marker

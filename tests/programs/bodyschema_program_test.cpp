@@ -2,14 +2,18 @@
 #include <sys/wait.h>
 #include <unistd.h>
 
+#include <cmath>
 #include <cstdlib>
 #include <filesystem>
 #include <fstream>
+#include <iomanip>
 #include <map>
 #include <nlohmann/json.hpp>
 #include <set>
 #include <sstream>
+#include <string>
 #include <utility>
+#include <vector>
 
 #include "common/bus/convert.h"
 #include "common/bus/event_log.h"
@@ -655,6 +659,100 @@ std::vector<Json> lines_of(const std::string& text) {
   std::stringstream stream(text);
   for (std::string line; std::getline(stream, line);) lines.push_back(Json::parse(line));
   return lines;
+}
+
+/// Learned from every other block of time (1.28 s), monitored on the blocks between.
+class TrunkMonitorTest : public RealDataTest {
+ protected:
+  void SetUp() override {
+    RealDataTest::SetUp();
+    if (IsSkipped()) return;
+    csv_ = data_ / "trunk_c11.csv";
+    if (!std::filesystem::exists(csv_)) GTEST_SKIP() << csv_ << " is not there";
+    odd_ = split(csv_, 128).second;
+    ASSERT_EQ(
+        run({"learn", "even.csv", "--noise", "0.003", "1.5", "--out", "schema.lcmlog"}).exit_code,
+        0);
+  }
+  std::vector<Json> events(const std::string& file) const {
+    const Outcome outcome = run({"monitor", "schema.lcmlog", file, "--noise", "0.003", "1.5",
+                                 "--json", "--out", "monitored.lcmlog"});
+    EXPECT_EQ(outcome.exit_code, 0) << outcome.err;
+    return lines_of(outcome.out);
+  }
+  /// The rows of a recording, what `change` makes of each.
+  template <class Change>
+  std::string rewritten(const std::string& name, const std::string& file, Change change) const {
+    std::ifstream in(folder_ / file);
+    std::string line, text;
+    std::getline(in, line);
+    text = line + "\n";
+    while (std::getline(in, line)) text += change(line);
+    return write(name, text);
+  }
+
+  std::filesystem::path csv_;
+  std::string odd_;
+};
+
+TEST_F(TrunkMonitorTest, NoAlarmOnTheHeldOutHalfOfTheTrunk) {
+  EXPECT_EQ(events(odd_), std::vector<Json>{});
+  // Which instants of a stream are judged is chance: the whole recording from other instants on.
+  const std::string whole = write("whole.csv", text_of(csv_));
+  for (const double from_s : {0.0, 0.21, 0.42, 0.63, 0.84}) {
+    const std::string later = rewritten("later.csv", whole, [&](const std::string& row) {
+      return std::stod(row) < from_s ? "" : row + "\n";
+    });
+    EXPECT_EQ(events(later), std::vector<Json>{}) << "from " << from_s << " s on";
+  }
+}
+
+// By 3 cm and 20° on its part, from the middle of the recording on.
+TEST_F(TrunkMonitorTest, AMarkerMovedOnTheTrunkIsFound) {
+  constexpr double kChange_s = 30;
+  Vector6d by = Vector6d::Zero();
+  by(0) = 0.03;
+  by(5) = 20 * M_PI / 180;
+  const std::string moved = rewritten("moved.csv", odd_, [&](const std::string& row) {
+    std::vector<double> v;
+    std::stringstream fields(row);
+    for (std::string field; std::getline(fields, field, ',');) v.push_back(std::stod(field));
+    if (v[0] < kChange_s || v[7] != 3) return row + "\n";
+    Pose X = Pose::Identity();
+    X.translation() = Eigen::Vector3d(v[8], v[9], v[10]);
+    X.linear() = Eigen::Quaterniond(v[11], v[12], v[13], v[14]).normalized().toRotationMatrix();
+    X = X * exp(by);
+    const Eigen::Quaterniond q(X.linear());
+    std::ostringstream out;
+    out << std::setprecision(9);
+    for (int n = 0; n < 8; ++n) out << v[static_cast<std::size_t>(n)] << ",";
+    out << X.translation().x() << "," << X.translation().y() << "," << X.translation().z() << ","
+        << q.w() << "," << q.x() << "," << q.y() << "," << q.z() << "\n";
+    return out.str();
+  });
+  const std::vector<Json> found = events(moved);
+  ASSERT_EQ(found.size(), 2U) << Json(found);
+  EXPECT_EQ(found[0]["event"], "mismatch");
+  EXPECT_EQ(found[1]["event"], "candidate");
+  EXPECT_EQ(found[1]["cause"], "marker_moved");
+  for (const Json& event : found) {
+    EXPECT_EQ(event["part"], 3);
+    EXPECT_GE(event["t"], kChange_s);
+    EXPECT_LE(event["samples_used"], 4);
+    // Every other block is missing.
+    EXPECT_LT(event["t"], kChange_s + 6);
+  }
+  // And mended: part 3 is predicted as well as it was before.
+  const std::string after = rewritten("after.csv", moved, [&](const std::string& row) {
+    return std::stod(row) < kChange_s ? "" : row + "\n";
+  });
+  const auto error_m = [&](const char* schema) {
+    return run({"predict", schema, after, "--json"})
+        .json()["parts"][2]["position_median_m"]
+        .get<double>();
+  };
+  EXPECT_GT(error_m("schema.lcmlog"), 0.025);
+  EXPECT_LT(error_m("monitored.lcmlog"), 0.010);
 }
 
 TEST_F(BodyschemaProgramTest, MonitorFindsAStuckJointNamesItAndWritesTheRepairedSchema) {
