@@ -472,12 +472,16 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
   Choice choice = choose(schema_, places, samples);
   const bool accepted =
       choice.best && choice.margin() > required_margin(choice.best->place, sample_index);
-  // Edges between which nothing was seen are suspected alike: which one it is is told later.
+  // Edges between which nothing was seen are suspected alike: which one it is is told later, if
+  // there is more evidence of it. (A lead may also come from evidence against all of them.)
+  const bool is_rising = !detected_ || highest > std::min(untold_, kHighestOverAlarm * alarm());
   const bool is_clear =
-      accepted || highest - second > kClearLead || samples.size() >= kLongestUnclear;
+      accepted || (is_rising && highest > alarm() &&
+                   (highest - second > kClearLead || samples.size() >= kLongestUnclear));
   if (detected_ ? !is_told_ : accepted || highest > alarm()) {
     detected_ = accepted ? choice.best->place : places.front();
     is_told_ = is_clear;
+    untold_ = highest;
     if (!is_clear) return;
     AdaptationEvent mismatch = event(AdaptationEvent::Kind::kMismatch, sample_index, *detected_);
     if (!detected_->marker && detected_->part == schema_.root) mismatch.cause = "camera_moved";
