@@ -576,7 +576,7 @@ void Adaptation::reconsider(std::int64_t sample_index, bool all_forms,
         is_changed = true;
         continue;
       }
-      if (choice.best->fitted.change != r.fitted.change) {
+      if (choice.best->fitted.change != r.fitted.change || choice.best->also != r.also) {
         if (choice.best->place != r.place)
           tell(AdaptationEvent::Kind::kReverted, sample_index, r, choice.margin(), 0, events);
         tell(AdaptationEvent::Kind::kRefined, sample_index, *choice.best, choice.margin(),
