@@ -526,12 +526,16 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
   const bool accepted = choice.best &&
                         choice.margin() > required_margin(choice.best->place, sample_index) &&
                         (!is_soft_ || static_cast<int>(samples.size()) >= kFewestSoft);
-  // Edges between which nothing was seen are suspected alike: which one it is is told later.
+  // Edges between which nothing was seen are suspected alike: which one it is is told later, if
+  // there is more evidence of it. (A lead may also come from evidence against all of them.)
+  const bool is_rising = !detected_ || highest > std::min(untold_, kHighestOverAlarm * alarm());
   const bool is_clear =
-      accepted || highest - second > kClearLead || samples.size() >= kLongestUnclear;
+      accepted || (is_rising && highest > alarm() &&
+                   (highest - second > kClearLead || samples.size() >= kLongestUnclear));
   if (detected_ ? !is_told_ : accepted || highest > alarm()) {
     detected_ = accepted ? choice.best->place : places.front();
     is_told_ = is_clear;
+    untold_ = highest;
     if (!is_clear) return;
     AdaptationEvent mismatch = event(AdaptationEvent::Kind::kMismatch, sample_index, *detected_);
     if (!detected_->marker && detected_->part == schema_.root) mismatch.cause = "camera_moved";
@@ -625,7 +629,7 @@ void Adaptation::reconsider(std::int64_t sample_index, bool all_forms,
         is_changed = true;
         continue;
       }
-      if (choice.best->fitted.change != r.fitted.change) {
+      if (choice.best->fitted.change != r.fitted.change || choice.best->also != r.also) {
         if (choice.best->place != r.place)
           tell(AdaptationEvent::Kind::kReverted, sample_index, r, choice.margin(), 0, events);
         tell(AdaptationEvent::Kind::kRefined, sample_index, *choice.best, choice.margin(),

@@ -199,6 +199,7 @@ class Adaptation {
   std::vector<Cusum> edges_, markers_;  ///< by node
   std::optional<Place> detected_;
   bool is_told_ = false;  ///< that and where something was detected
+  double untold_ = 0;     ///< the highest CUSUM when it was not told yet
   struct Reversions {
     int num = 0;
     std::int64_t last = 0;

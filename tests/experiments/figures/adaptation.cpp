@@ -92,8 +92,7 @@ class Explanations {
   }
 
  private:
-  /// Each affected place is named, and no other. What is stored may be several changes at once, of
-  /// which one is named.
+  /// Each affected place is named, and no other.
   bool places_right(const std::vector<TrueChange>& changes) const {
     const auto is_right = [](const auto& explanation, const TrueChange& change) {
       const Place& place = explanation.first;
@@ -107,7 +106,7 @@ class Explanations {
       return std::any_of(causes_.begin(), causes_.end(),
                          [&](const auto& e) { return is_right(e, c); });
     });
-    return all_true && !causes_.empty() && (all_found || has_stored());
+    return all_true && !causes_.empty() && all_found;
   }
   bool causes_right(const std::vector<TrueChange>& changes) const {
     return places_right(changes) &&
@@ -120,10 +119,6 @@ class Explanations {
            });
   }
 
-  bool has_stored() const {
-    return std::any_of(causes_.begin(), causes_.end(),
-                       [](const auto& e) { return e.second == "stored"; });
-  }
   std::map<Place, std::string> causes_;
 };
 

@@ -191,6 +191,32 @@ TEST(AdaptationTest, WhichOfTheEdgesBetweenWhichNothingWasSeenIsWrongIsToldWhenI
   }
 }
 
+TEST(AdaptationTest, WhatIsOverBeforeItsPlaceIsKnownIsNotTold) {
+  for (const int seed : {1, 2, 3}) {
+    BrokenArm arm({Fault::kNone, "", 1}, Regime::kTagIso, 20, seed);
+    Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kTagIso));
+    Life life;
+    for (int t = 0; t < 40; ++t) {
+      ActionPoseSample sample = arm.observe(t);
+      if (t == 20) {  // for one sample the table is knocked, and only half the arm is in sight
+        Pose T = Pose::Identity();
+        T.linear() = exp_so3(Eigen::Vector3d(0.02, 0.03, 0));
+        std::erase_if(sample.parts, [](const PartObservation& o) { return o.part <= 3; });
+        for (PartObservation& o : sample.parts) {
+          o.X_CB = T * o.X_CB;
+          o.X_CB_other.reset();
+        }
+      }
+      for (const AdaptationEvent& e : adaptation.on_sample(sample)) life.events.push_back(e);
+      if (t == 20) {
+        EXPECT_FALSE(adaptation.is_settled());
+      }
+    }
+    EXPECT_TRUE(life.events.empty()) << life.log();
+    EXPECT_TRUE(adaptation.is_settled());
+  }
+}
+
 TEST(AdaptationTest, AProbeIsWantedOncePerAmbiguity) {
   for (const auto& [fault, seed] : {std::pair{Fault::kOffset, 14}, {Fault::kAdjacent, 3}}) {
     BrokenArm arm({fault, "", 0.85}, Regime::kChapter, 90, seed);
