@@ -41,9 +41,8 @@ bool is_worth_a_fit(std::int64_t age) {
          std::find(std::begin(kAges), std::end(kAges), age) != std::end(kAges);
 }
 
-/// Samples that all forms of change in one place are fitted to (0.2 to 0.4 ms each) are counted: so
-/// many are free a sample, and so many are saved up at most. A fault of which every explanation is
-/// refuted by the next sample would else cost ten times that for as long as it stands.
+/// Samples that all forms of change in one place are fitted to are counted: so many are free a
+/// sample, and so many are saved up at most. Less would be done than a fault of two places needs.
 constexpr int kWorkPerSample = 6;
 constexpr int kMostWork = 2000;
 
