@@ -57,16 +57,44 @@ bool is_worth_a_fit(std::int64_t age) {
          std::find(std::begin(kAges), std::end(kAges), age) != std::end(kAges);
 }
 
+/// Samples that all forms of change in one place are fitted to are counted: so many are free a
+/// sample, and so many are saved up at most. Less would be done than a fault of two places needs.
+constexpr int kWorkPerSample = 6;
+constexpr int kMostWork = 2000;
+
+/// Samples without an explanation, and explanations that did not hold, after which an edge is
+/// learned.
+constexpr std::int64_t kUnexplained = 8;
+constexpr int kManyMismatches = 3;
+/// Newest samples that must be explained no worse.
+constexpr std::ptrdiff_t kNewest = 5;
+
+bool is_worth_learning(std::int64_t age) {
+  constexpr std::int64_t kAges[] = {8, 10, 13, 16, 20, 25, 32};
+  return age % 40 == 0 || std::find(std::begin(kAges), std::end(kAges), age) != std::end(kAges);
+}
+
 double median(std::vector<double> values) {
   const auto middle = values.begin() + static_cast<std::ptrdiff_t>(values.size() / 2);
   std::nth_element(values.begin(), middle, values.end());
   return *middle;
 }
 
+/// A process that was learned here is another object once it was saved and loaded.
+bool is_same(const ResidualGp* a, const ResidualGp* b) {
+  if (a == b || !a || !b) return a == b;
+  return a->signals() == b->signals() && a->num_samples() == b->num_samples() &&
+         a->inputs() == b->inputs() && a->residuals() == b->residuals() &&
+         a->noise_scales() == b->noise_scales() &&
+         a->prior().length_scales == b->prior().length_scales &&
+         a->prior().variances == b->prior().variances &&
+         a->prior().noise_variances == b->prior().noise_variances;
+}
+
 bool differ(const Edge& a, const Edge& b) {
   if (!a.left.isApprox(b.left, 1e-9) || !a.right.isApprox(b.right, 1e-9) ||
       a.joints.size() != b.joints.size() || a.matrix_gp != b.matrix_gp ||
-      a.residual_gp != b.residual_gp)
+      !is_same(a.residual_gp.get(), b.residual_gp.get()))
     return true;
   for (std::size_t d = 0; d < a.joints.size(); ++d) {
     const ScrewJoint &x = a.joints[d], &y = b.joints[d];
@@ -172,6 +200,7 @@ Adaptation::Adaptation(BodySchema schema, AdaptationOptions options)
         return options;
       }()),
       noise_(options.noise),
+      credit_(kMostWork),
       schema_(std::move(schema)),
       drift_watch_(options.false_alarm_rate) {
   history_.push_back(schema_);
@@ -345,7 +374,7 @@ std::vector<Adaptation::Place> Adaptation::suspects() const {
 
 Adaptation::Choice Adaptation::choose(const BodySchema& standing, const std::vector<Place>& places,
                                       const std::vector<const ActionPoseSample*>& samples,
-                                      const BodyChange* standing_form) const {
+                                      const BodyChange* standing_form, bool learn) const {
   Choice choice;
   std::optional<Replacement> same_form;
   choice.null = log_likelihood(standing, noise_, samples);
@@ -382,6 +411,7 @@ Adaptation::Choice Adaptation::choose(const BodySchema& standing, const std::vec
     }
     for (std::size_t b = 0; b < bases.size(); ++b) {
       const PlaceEvidence evidence(bases[b], noise_, at.part, at.marker, samples);
+      choice.work += static_cast<int>(samples.size());
       const auto offer_from = [&](FittedChange candidate) {
         if (origins[b]) candidate.origin = *origins[b];
         offer({at, std::move(candidate)});
@@ -390,6 +420,8 @@ Adaptation::Choice Adaptation::choose(const BodySchema& standing, const std::vec
       for (FittedChange& fitted :
            evidence.fit_likely(possible_changes(bases[b], at.part, at.marker)))
         offer_from(std::move(fitted));
+      if (!learn || b > 0) continue;
+      for (FittedChange& learned : evidence.learn()) offer(std::move(learned), at);
     }
   }
   // All that differs from a stored schema at once.
@@ -522,7 +554,9 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
   // What nothing explained so far is looked at again when there is clearly more of it.
   if (detected_ && !is_worth_a_fit(sample_index - since + 1)) return;
   const auto samples = segment(since, options_.longest_segment);
-  Choice choice = choose(schema_, places, samples);
+  Choice choice;
+  if (credit_ > 0) choice = choose(schema_, places, samples);
+  credit_ -= choice.work;
   const bool accepted = choice.best &&
                         choice.margin() > required_margin(choice.best->place, sample_index) &&
                         (!is_soft_ || static_cast<int>(samples.size()) >= kFewestSoft);
@@ -542,6 +576,7 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
     mismatch.margin = highest;
     mismatch.num_samples = static_cast<int>(samples.size());
     events->push_back(mismatch);
+    note_trouble(mismatch, since);
   }
   if (!accepted) return;
   const FittedChange& fitted = choice.best->fitted;
@@ -586,6 +621,7 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
     asked_.clear();
     since_ = since;
   }
+  if (ends) trouble_.reset();
   want_probe(schema_, choice, sample_index, events);
   replacements_.push_back(std::move(*choice.best));
   age_ = 0;
@@ -594,6 +630,75 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
     reconsider(sample_index, true, events);
   else
     install(composed());
+}
+
+void Adaptation::note_trouble(const AdaptationEvent& mismatch, std::int64_t since) {
+  if (!trouble_) {
+    trouble_.emplace();
+    trouble_->since = since;
+    trouble_->before = schema_;
+  }
+  trouble_->last = mismatch.sample_index;
+  const int part = mismatch.part >= 0 ? mismatch.part : mismatch.to;
+  trouble_->last_part = part;
+  if (!edge_to(schema_, part)) return;
+  Trouble::Edge& edge = trouble_->edges[part];
+  if (edge.num_mismatches++ == 0) edge.since = since;
+}
+
+void Adaptation::try_learning(std::int64_t sample_index, std::vector<AdaptationEvent>* events) {
+  if (!trouble_ || !is_worth_learning(sample_index - trouble_->since + 1) ||
+      !(detected_ || sample_index - trouble_->last < kUnexplained))
+    return;
+  // Where most mismatches were; what has just begun elsewhere is for the families first.
+  int part = -1, most = 0;
+  for (const auto& [to, edge] : trouble_->edges) {
+    const bool is_ripe = edge.num_mismatches >= kManyMismatches ||
+                         (detected_ && sample_index - edge.since + 1 >= kUnexplained);
+    if (!is_ripe || edge.num_mismatches <= most) continue;
+    part = to;
+    most = edge.num_mismatches;
+  }
+  if (part < 0 || (trouble_->last_part != part && trouble_->last == sample_index)) return;
+  const auto samples = segment(trouble_->since, options_.longest_segment);
+  const double standing = log_likelihood(schema_, noise_, samples);
+  std::optional<Replacement> best;
+  BodySchema before;
+  // This edge as it was, the others too or as they are now.
+  std::vector<BodySchema> bases{trouble_->before};
+  for (const int other : schema_.parts)
+    if (other != part && bases.size() < 2 && differ_at(schema_, trouble_->before, other))
+      bases.push_back(with_edge_of(schema_, trouble_->before, part));
+  for (const BodySchema& base : bases) {
+    const PlaceEvidence evidence(base, noise_, part, false, samples);
+    for (FittedChange& learned : evidence.learn()) {
+      if (best && learned.log_evidence <= best->fitted.log_evidence) continue;
+      best = Replacement{{part, false}, std::move(learned)};
+      before = base;
+    }
+  }
+  if (!best) return;
+  const double margin = best->fitted.log_evidence - standing;
+  const BodySchema with = with_change(before, best->fitted);
+  // What the body has changed back from meanwhile explains many samples, too.
+  const std::vector<const ActionPoseSample*> newest(
+      samples.end() - std::min<std::ptrdiff_t>(kNewest, std::ssize(samples)), samples.end());
+  if (margin <= required_margin(best->place, sample_index) ||
+      log_likelihood(with, noise_, newest) < log_likelihood(schema_, noise_, newest))
+    return;
+  AdaptationEvent candidate = event(AdaptationEvent::Kind::kCandidate, sample_index, best->place);
+  candidate.cause = best->fitted.change.cause(schema_);
+  candidate.margin = margin;
+  candidate.num_samples = static_cast<int>(samples.size());
+  events->push_back(candidate);
+  before_ = std::move(before);
+  since_ = trouble_->since;
+  replacements_ = {std::move(*best)};
+  maturing_.clear();
+  asked_.clear();
+  age_ = 0;
+  detected_.reset();
+  install(composed());
 }
 
 void Adaptation::reconsider(std::int64_t sample_index, bool all_forms,
@@ -619,7 +724,9 @@ void Adaptation::reconsider(std::int64_t sample_index, bool all_forms,
         ++n;
         continue;
       }
-      Choice choice = choose(others, {r.place}, samples, &r.fitted.change);
+      Choice choice =
+          choose(others, {r.place}, samples, &r.fitted.change, r.fitted.change.is_learned());
+      credit_ -= choice.work;
       if (!choice.best || choice.margin() < 0) {
         tell(AdaptationEvent::Kind::kReverted, sample_index, r, choice.margin(), 0, events);
         Reversions& reversions = reversions_[r.place];
@@ -652,7 +759,8 @@ void Adaptation::reconsider(std::int64_t sample_index, bool all_forms,
 
 void Adaptation::want_probe(const BodySchema& standing, const Choice& choice,
                             std::int64_t sample_index, std::vector<AdaptationEvent>* events) {
-  if (!choice.runner_up) return;
+  // Of two functions the samples to come decide.
+  if (!choice.runner_up || choice.best->fitted.change.is_learned()) return;
   // The runner-up may be ahead of a form that is kept.
   const double lead =
       std::abs(choice.best->fitted.log_evidence - choice.runner_up->fitted.log_evidence);
@@ -796,10 +904,11 @@ void Adaptation::follow(std::int64_t sample_index, std::vector<AdaptationEvent>*
                                        [](const Replacement& r) { return r.fitted.change.small; });
     if (!any_small) maturing_ = replacements_;
     replacements_.clear();
+    trouble_.reset();
     return;
   }
   const bool all_forms =
-      std::find(std::begin(kRefits), std::end(kRefits), age_) != std::end(kRefits);
+      credit_ > 0 && std::find(std::begin(kRefits), std::end(kRefits), age_) != std::end(kRefits);
   reconsider(sample_index, all_forms, events);
 }
 
@@ -877,6 +986,7 @@ void Adaptation::remember(const BodySchema& schema) {
 std::vector<AdaptationEvent> Adaptation::on_sample(const ActionPoseSample& seen) {
   check(seen, schema_);
   if (stream_.repeats(seen, schema_.signals)) return {};
+  credit_ = std::min(credit_ + kWorkPerSample, kMostWork);
   ActionPoseSample sample = seen;
   sample.sample_index = stream_.count();
   if (stream_.is_dense()) drop_turned_over(&sample);
@@ -906,6 +1016,7 @@ std::vector<AdaptationEvent> Adaptation::on_new_sample(ActionPoseSample sample) 
   else if (!maturing_.empty())
     mature(sample.sample_index);
   try_changes(sample.sample_index, &events);
+  try_learning(sample.sample_index, &events);
   if (!replacements_.empty()) {
     drifting_.reset();
     for (const Replacement& r : replacements_)
@@ -919,6 +1030,7 @@ std::vector<AdaptationEvent> Adaptation::on_new_sample(ActionPoseSample sample) 
       events.back().cause = "unexplained";
     }
     detected_.reset();
+    trouble_.reset();
   }
   if (is_settled() && suspects().empty()) watch_noise(judgement);
   return events;

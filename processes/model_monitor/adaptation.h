@@ -151,17 +151,21 @@ class Adaptation {
     double null = 0;  ///< log-likelihood of the schema as it stands
     /// The best that is another form or place.
     std::optional<Replacement> runner_up;
+    int work = 0;  ///< samples looked at, over all places and bases
     double margin() const { return best ? best->fitted.log_evidence - null : 0; }
   };
-  /// `standing_form`: what explains the samples so far.
+  /// `standing_form`: what explains the samples so far. `learn`: also what is none of the families.
   Choice choose(const BodySchema& standing, const std::vector<Place>& places,
                 const std::vector<const ActionPoseSample*>& samples,
-                const BodyChange* standing_form = nullptr) const;
+                const BodyChange* standing_form = nullptr, bool learn = false) const;
   BodySchema composed(int without = -1) const;
   /// Evidence that a change must have over the schema that stands [nats]: more where changes were
   /// taken back lately.
   double required_margin(const Place& place, std::int64_t sample_index) const;
   void try_changes(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
+  void note_trouble(const AdaptationEvent& mismatch, std::int64_t since);
+  /// Learns an edge anew of which no family of changes was right.
+  void try_learning(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
   void reconsider(std::int64_t sample_index, bool all_forms, std::vector<AdaptationEvent>* events);
   void want_probe(const BodySchema& standing, const Choice& choice, std::int64_t sample_index,
                   std::vector<AdaptationEvent>* events);
@@ -183,6 +187,7 @@ class Adaptation {
   const AdaptationOptions options_;
   MarkerNoise noise_;
   int num_samples_ = 0;
+  int credit_;                           ///< work that may be done now; see kWork in the .cpp
   std::vector<double> quiet_distances_;  ///< d² of believed markers since the noise was last set
   int num_quiet_ = 0;
   BodySchema schema_;
@@ -205,10 +210,22 @@ class Adaptation {
     std::int64_t last = 0;
   };
   std::map<Place, Reversions> reversions_;  ///< changes that were taken back
-  BodySchema before_;                       ///< what stood before the present replacements
-  std::vector<Replacement> replacements_;   ///< not settled yet, in the order they came
-  std::vector<Replacement> maturing_;       ///< settled, on before_, and fitted anew now and then
-  std::int64_t since_ = 0;                  ///< first sample with the changed body, as counted
+  /// A mismatch that came up again and again, or that nothing was accepted for.
+  struct Trouble {
+    std::int64_t since = 0, last = 0;  ///< first sample; newest mismatch
+    int last_part = -1;                ///< of that
+    struct Edge {
+      int num_mismatches = 0;
+      std::int64_t since = 0;  ///< the first
+    };
+    std::map<int, Edge> edges;  ///< by the part that they lead to
+    BodySchema before;          ///< what stood when it began
+  };
+  std::optional<Trouble> trouble_;
+  BodySchema before_;                      ///< what stood before the present replacements
+  std::vector<Replacement> replacements_;  ///< not settled yet, in the order they came
+  std::vector<Replacement> maturing_;      ///< settled, on before_, and fitted anew now and then
+  std::int64_t since_ = 0;                 ///< first sample with the changed body, as counted
   struct Ambiguity {
     Place place;
     BodyChange one, other;

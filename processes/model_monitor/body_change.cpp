@@ -90,6 +90,9 @@ int BodyChange::size() const {
   switch (form) {
     case Form::kStored:
     case Form::kOtherSignal:
+    case Form::kNonlinear:
+    case Form::kResidual:
+    case Form::kFresh:
       return 0;
     case Form::kStuck:
     case Form::kOffset:
@@ -105,6 +108,7 @@ int BodyChange::size() const {
 
 double BodyChange::log_odds() const {
   if (small) return -3.5;
+  const double complexity = second_signal >= 0 ? 6 : 3;
   switch (form) {
     case Form::kStored:
       return -1;
@@ -119,6 +123,11 @@ double BodyChange::log_odds() const {
     case Form::kBoth:
     case Form::kOtherSignal:
       return -6;
+    case Form::kNonlinear:
+    case Form::kResidual:
+      return -5 - complexity + std::log(proximity);
+    case Form::kFresh:
+      return -10 - complexity + std::log(proximity);
     default:
       return -2.5;
   }
@@ -132,6 +141,11 @@ int BodyChange::fewest_samples() const {
       return 1;
     case Form::kBoth:
       return 3;
+    case Form::kNonlinear:
+    case Form::kResidual:
+      return 5;
+    case Form::kFresh:
+      return 8;
     default:
       return 2;
   }
@@ -153,6 +167,11 @@ std::string BodyChange::cause(const BodySchema& schema) const {
       return "marker_moved";
     case Form::kOtherSignal:
       return "other_signal";
+    case Form::kNonlinear:
+      return "joint_nonlinear";
+    case Form::kResidual:
+    case Form::kFresh:
+      return "new_model";
     default:
       return part == schema.root ? "camera_moved" : "geometry";
   }
@@ -204,7 +223,7 @@ BodySchema changed(const BodySchema& schema, const BodyChange& change, const Eig
                    const Eigen::MatrixXd& covariance) {
   if (theta.size() != change.size()) throw std::invalid_argument("wrong number of parameters");
   BodySchema result = schema;
-  if (change.form == Form::kStored) return result;
+  if (change.form == Form::kStored || change.is_learned()) return result;
   const bool is_unsure = covariance.size() > 0;
   Matrix6d first, second;
   if (is_unsure && change.size() >= 6) first = covariance.topLeftCorner<6, 6>();

@@ -20,13 +20,21 @@ struct BodyChange {
     kBoth,         ///< T(θ_1) · Δ · T(θ_2)
     kRigid,        ///< no joint any more: T(θ) times the pose in mid-range
     kMarkerMoved,  ///< the marker of `part` is elsewhere on it by T(θ)
-    kOtherSignal   ///< the joint follows another signal
+    kOtherSignal,  ///< the joint follows another signal
+    kNonlinear,    ///< a Gaussian process of `signals` adds to the joint's displacement
+    kResidual,     ///< Δ · Exp(ρ) with a Gaussian process ρ of `signals`
+    kFresh         ///< a constant pose and such a ρ: the edge is learned anew
   };
   Form form = Form::kRight;
   int part = 0;
   int joint = 0;       ///< of the edge: for kStuck, kOffset, kGain, kOtherSignal
   int signal = 0;      ///< kOtherSignal
   bool small = false;  ///< a tenth as wide a prior: what is bent a little is likelier than a break
+  int second_signal = -1;  ///< kNonlinear, kResidual, kFresh: the other input, if not −1
+  double proximity = 1;    ///< of the model's signals to those of the edge that stood, 0 … 1
+
+  /// The last three forms: functions and no parameters, so that FittedChange::origin holds the edge.
+  bool is_learned() const { return form >= Form::kNonlinear; }
 
   /// Number of parameters θ: displacements (as a q + b is), transforms as (translation [m],
   /// rotation vector [rad]) with T = (Exp(w), p).
@@ -35,7 +43,8 @@ struct BodyChange {
   double log_odds() const;
   /// Samples below which a form is not told from another.
   int fewest_samples() const;
-  /// "joint_stuck", "joint_offset", "joint_gain", "geometry", "marker_moved", "camera_moved", …
+  /// "joint_stuck", "joint_offset", "joint_gain", "joint_nonlinear", "geometry", "new_model",
+  /// "marker_moved", "camera_moved", …
   std::string cause(const BodySchema& schema) const;
 
   bool operator==(const BodyChange&) const = default;
@@ -56,7 +65,7 @@ BodySchema changed(const BodySchema& schema, const BodyChange& change, const Eig
 /// The edge that leads to `part`; nullptr for the root and for unconnected parts.
 const Edge* edge_to(const BodySchema& schema, int part);
 
-/// All forms that a change of the place may have (kStored apart).
+/// All forms that a change of the place may have (kStored and what is learned apart).
 std::vector<BodyChange> possible_changes(const BodySchema& schema, int part, bool marker);
 
 }  // namespace bodyschema

@@ -5,6 +5,8 @@
 #include <cmath>
 #include <limits>
 
+#include "processes/model_monitor/learned_edge.h"
+
 namespace bodyschema {
 namespace {
 
@@ -19,6 +21,8 @@ constexpr std::size_t kClimbs = 4;
 /// Evidence behind the best change of a place, by the place's measurements, that all observations
 /// do not make up for [nats].
 constexpr double kHopeless = 25;
+/// Learned models that are held against all the observations.
+constexpr std::size_t kLearnedJudged = 3;
 
 std::vector<int> nodes_of(const TreeFilter& filter, const std::vector<int>& parts) {
   std::vector<int> nodes;
@@ -99,6 +103,12 @@ PlaceEvidence::PlaceEvidence(const BodySchema& base, const MarkerNoise& noise, i
   }
   place_ = base_;
   std::erase_if(place_.edges, [part](const Edge& edge) { return edge.to != part; });
+  const Edge* edge = edge_to(place_, part);
+  if (!edge || marker) return;
+  for (Measured& m : measurements_) {
+    if (edge->matrix_gp) m.process = edge->matrix_gp->predict(m.displacements);
+    if (edge->residual_gp) m.process = exp(edge->residual_gp->mean(m.displacements));
+  }
 }
 
 std::vector<Pose> PlaceEvidence::predict(const BodyChange& change,
@@ -116,7 +126,16 @@ std::vector<Pose> PlaceEvidence::predict(const BodyChange& change,
   if (!edge) return std::vector<Pose>(n, with.X_CR);
   std::vector<Pose> result;
   result.reserve(n);
-  for (const Measured& m : measurements_) result.push_back(edge->predict(m.displacements));
+  if (!edge->matrix_gp && !edge->residual_gp) {
+    for (const Measured& m : measurements_) result.push_back(edge->predict(m.displacements));
+    return result;
+  }
+  Edge without = *edge;
+  without.right = Pose::Identity();
+  without.matrix_gp.reset();
+  without.residual_gp.reset();
+  for (const Measured& m : measurements_)
+    result.push_back(without.predict(m.displacements) * m.process * edge->right);
   return result;
 }
 
@@ -340,6 +359,38 @@ std::vector<FittedChange> PlaceEvidence::fit_likely(const std::vector<BodyChange
                 [best](const FittedChange& f) { return f.log_evidence < best - kHopeless; });
   for (FittedChange& f : fitted) judge(&f);
   return fitted;
+}
+
+std::vector<FittedChange> PlaceEvidence::learn() const {
+  std::vector<FittedChange> result;
+  if (marker_ || measurements_.empty()) return result;
+  std::vector<EdgeMeasurement> of_edge;
+  for (const Measured& m : measurements_)
+    of_edge.push_back({m.displacements, m.of.z, m.of.covariance});
+  const auto with_edge = [this](const Edge& edge) {
+    BodySchema schema = base_;
+    for (Edge& e : schema.edges)
+      if (e.to == part_) e = edge;
+    return schema;
+  };
+  const std::vector<LearnedEdge> learned =
+      learn_edge(base_, part_, of_edge, noise_.outlier_rate);
+  for (const LearnedEdge& one : learned) {
+    if (one.log_evidence < learned.front().log_evidence - kHopeless ||
+        result.size() == kLearnedJudged)
+      break;
+    FittedChange fitted;
+    fitted.change = one.change;
+    fitted.theta.resize(0);
+    fitted.num_usable = num_usable();
+    fitted.log_prior = one.log_prior;
+    fitted.log_evidence = one.log_prior + log_likelihood(with_edge(one.certain), noise_, samples_,
+                                                         cut_parts_);
+    fitted.schema = with_edge(one.edge);
+    fitted.origin = fitted.schema;
+    result.push_back(std::move(fitted));
+  }
+  return result;
 }
 
 FittedChange PlaceEvidence::judge_stored(const BodySchema& schema) const {

@@ -12,7 +12,8 @@ namespace bodyschema {
 /// A change with the parameters that the samples since speak for.
 struct FittedChange {
   BodyChange change;
-  /// A schema of the history that the change starts from, in its place (or, `everywhere`, whole).
+  /// A schema of the history that the change starts from, in its place (or, `everywhere`, whole);
+  /// of what is learned, one with the learned edge.
   std::optional<BodySchema> origin;
   bool everywhere = false;
   Eigen::VectorXd theta;
@@ -51,6 +52,8 @@ class PlaceEvidence {
   /// Those of the changes that may be the best one: what the place's own measurements speak clearly
   /// against is not held against all the observations.
   std::vector<FittedChange> fit_likely(const std::vector<BodyChange>& changes) const;
+  /// What learn_edge() makes of an edge's place, those of it that may be the best one. Of no others.
+  std::vector<FittedChange> learn() const;
   /// A schema of the history in this place.
   FittedChange judge_stored(const BodySchema& schema) const;
 
@@ -60,6 +63,8 @@ class PlaceEvidence {
     VirtualMeasurement of;
     Matrix6d whitening;
     double log_norm = 0;  ///< log |2πS|^(−½)
+    /// What the Gaussian process of the place's edge says here: no change of a form moves it.
+    Pose process = Pose::Identity();
   };
   struct State {
     Eigen::VectorXd theta;

@@ -132,6 +132,19 @@ BrokenArm::BrokenArm(const Scenario& scenario, Regime regime, int block_length, 
     case Fault::kDrift:
       changes_.push_back({4, true, false, {"drift"}});
       break;
+    case Fault::kWorn:
+      link(4).wear = 0.6;
+      changes_.push_back({4, true, false, {"joint_nonlinear"}});
+      break;
+    case Fault::kCoupled:
+      link(4).also = 5;
+      link(4).also_gain = 0.5;
+      changes_.push_back({4, true, false, {"joint_nonlinear"}});
+      break;
+    case Fault::kElastic:
+      link(4).sag << 0.04 * random_rotation(rng_).col(0), 0.3 * random_rotation(rng_).col(0);
+      changes_.push_back({4, true, false, {"new_model"}});
+      break;
   }
   drift_axis_ = random_rotation(rng_).col(0);
   engineered_ = engineered_model(healthy_, rng_);

@@ -21,7 +21,10 @@ enum class Fault {
   kAdjacent,  ///< a stuck joint, and the link after the next joint bent by 40° and 10 cm
   kMarker,    ///< a marker in the middle moves on its part: 5 cm, 1 rad
   kCamera,    ///< bumped: 10 cm, 15°
-  kDrift      ///< a link bends by 0.05° a sample, for ever
+  kDrift,     ///< a link bends by 0.05° a sample, for ever
+  kWorn,      ///< a joint's transmission: it goes to q + 0.6 sin 3q
+  kCoupled,   ///< a joint is moved by another signal too, half as far
+  kElastic    ///< what a joint carries bends with the angle: 17° and 4 cm at 1 rad
 };
 
 /// What a fault is, as a monitor may name it.

@@ -96,10 +96,12 @@ std::map<int, Pose> SyntheticRobot::poses_in_camera(const Eigen::VectorXd& actio
     }
     double q = 0;
     if (link.signal >= 0) {
-      q = action(link.signal) - link.zero + bend * std::sin(3 * action(link.signal));
+      q = action(link.signal) - link.zero + (bend + link.wear) * std::sin(3 * action(link.signal));
     }
+    if (link.also >= 0) q += link.also_gain * action(link.also);
     X_CB[link.part] = X_CB.at(link.parent) * link.X_before *
-                      screw_motion(link.slide * q, link.turn * q) * link.X_after;
+                      screw_motion(link.slide * q, link.turn * q) * link.X_after *
+                      exp(q * q * link.sag);
   }
   return X_CB;
 }

@@ -33,6 +33,10 @@ struct TrueLink {
   double turn = 0;   ///< [rad per command unit] about the joint's z axis
   double slide = 0;  ///< [m per command unit] along it
   double zero = 0;   ///< command at which the joint is at rest [command units]
+  double wear = 0;   ///< the joint goes by wear · sin(3q) farther [command units]
+  int also = -1;     ///< another signal that moves the joint: also_gain times as far
+  double also_gain = 0;
+  Vector6d sag = Vector6d::Zero();  ///< what it carries is bent by Exp(sag · q²)
   bool hidden = false;
 };
 

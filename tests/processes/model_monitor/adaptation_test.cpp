@@ -98,6 +98,68 @@ INSTANTIATE_TEST_SUITE_P(AdaptationTest, EveryFault,
                                          test::Scenario{Fault::kCamera, "camera", 0.85}),
                          [](const auto& info) { return std::string(info.param.name); });
 
+class NoFamily : public testing::TestWithParam<test::Scenario> {};
+
+/// What none of the simple changes explains: the edge is learned, and kept like any other.
+TEST_P(NoFamily, IsLearnedAndBothBodiesAreRemembered) {
+  BrokenArm arm(GetParam(), Regime::kTagIso, kBlock, 3);
+  Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kTagIso));
+  const Life life = live(arm, adaptation, arm.num_samples());
+  SCOPED_TRACE("events:\n" + life.log());
+  for (const AdaptationEvent& e : life.events) {
+    EXPECT_GE(e.sample_index, kBlock) << "before the fault";
+    EXPECT_TRUE(arm.is_near(part_of(e))) << text(e);
+  }
+  const TrueChange& change = arm.changes().front();
+  EXPECT_TRUE(std::any_of(life.events.begin(), life.events.end(), [&](const AdaptationEvent& e) {
+    return e.kind == Kind::kCandidate && e.sample_index < kBlock + 25 && e.to == change.part &&
+           change.causes.contains(e.cause);
+  }));
+  const double healthy = life.error[kBlock - 1], unrepaired = arm.error(arm.engineered(), kBlock);
+  ASSERT_GT(unrepaired, 0.04);
+  const auto stays_below = [&](int begin, int end, double most) {
+    for (int t = begin; t < end; ++t)
+      ASSERT_LT(life.error[static_cast<std::size_t>(t)], most) << "sample " << t;
+  };
+  stays_below(kBlock + 25, 2 * kBlock, unrepaired / 4);
+  stays_below(2 * kBlock - 5, 2 * kBlock, healthy + 0.005);
+  stays_below(2 * kBlock + 8, 3 * kBlock, healthy + 0.001);
+  stays_below(3 * kBlock + 8, 4 * kBlock, healthy + 0.005);
+}
+
+INSTANTIATE_TEST_SUITE_P(AdaptationTest, NoFamily,
+                         testing::Values(test::Scenario{Fault::kWorn, "worn", 0.85},
+                                         test::Scenario{Fault::kCoupled, "coupled", 0.85},
+                                         test::Scenario{Fault::kElastic, "elastic", 0.85}),
+                         [](const auto& info) { return std::string(info.param.name); });
+
+TEST(AdaptationTest, AnEdgeThatIsElsewhereAtEverySampleIsNotLearned) {
+  BrokenArm arm({Fault::kNone, "", 1}, Regime::kTagIso, 50, 1);
+  Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kTagIso));
+  test::Rng rng(1);
+  Life life;
+  for (int t = 0; t < 150; ++t) {
+    ActionPoseSample sample = arm.observe(t);
+    Vector6d wobble = Vector6d::Zero();
+    for (int c = 3; c < 6; ++c) wobble(c) = t < 50 || t >= 110 ? 0 : test::uniform(rng, -1, 1);
+    const PartObservation* joint = sample.find(4);
+    if (!joint) continue;
+    // Part 4 and all that it carries, about its origin.
+    const Pose T = joint->X_CB * exp(wobble) * joint->X_CB.inverse();
+    for (PartObservation& o : sample.parts) {
+      if (o.part < 4) continue;
+      o.X_CB = T * o.X_CB;
+      o.X_CB_other.reset();
+    }
+    for (const auto& e : adaptation.on_sample(sample)) life.events.push_back(e);
+  }
+  EXPECT_TRUE(life.has(Kind::kMismatch));
+  for (const AdaptationEvent& e : life.events) {
+    EXPECT_NE(e.cause, "joint_nonlinear") << text(e);
+    EXPECT_NE(e.cause, "new_model") << text(e);
+  }
+}
+
 TEST(AdaptationTest, AHealthyArmIsLeftInPeace) {
   for (const Regime regime : {Regime::kChapter, Regime::kTag, Regime::kTagIso}) {
     BrokenArm arm({Fault::kNone, "", 0.85}, regime, 50, 1);
@@ -447,16 +509,18 @@ TEST(AdaptationTest, WhatIsNeverSeenIsNotSuspected) {
 }
 
 TEST(AdaptationTest, TheSameSamplesGiveTheSameEventsAndSchema) {
-  const auto once = [] {
-    BrokenArm arm({Fault::kGain, "", 0.85}, Regime::kTagIso, 40, 5);
-    Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kTagIso));
-    const Life life = live(arm, adaptation, 160);
-    return std::pair{life.log(), life.error};
-  };
-  const auto first = once(), second = once();
-  EXPECT_FALSE(first.first.empty());
-  EXPECT_EQ(first.first, second.first);
-  EXPECT_EQ(first.second, second.second);
+  for (const Fault fault : {Fault::kGain, Fault::kWorn}) {
+    const auto once = [fault] {
+      BrokenArm arm({fault, "", 0.85}, Regime::kTagIso, 40, 5);
+      Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kTagIso));
+      const Life life = live(arm, adaptation, 160);
+      return std::pair{life.log(), life.error};
+    };
+    const auto first = once(), second = once();
+    EXPECT_FALSE(first.first.empty());
+    EXPECT_EQ(first.first, second.first);
+    EXPECT_EQ(first.second, second.second);
+  }
 }
 
 /// One finger of two bends; the other, on the same palm and the same signal, does not.

@@ -10,7 +10,9 @@
 #include "common/bus/codec.h"
 #include "common/bus/convert.h"
 #include "common/config/yaml.h"
+#include "processes/model_monitor/adaptation.h"
 #include "processes/structure_learner/learn.h"
+#include "tests/support/broken_arm.h"
 #include "tests/support/synthetic_robot.h"
 
 namespace bodyschema {
@@ -778,6 +780,32 @@ TEST(ModelMonitorByHandTest, AProposalWithoutPartsIsRefusedQuietly) {
   EXPECT_TRUE(monitor.on_learned_schema(to_message(schema)));
   EXPECT_FALSE(monitor.schema());
   EXPECT_EQ(check(monitor.health()), "");
+}
+
+TEST(ModelMonitorByHandTest, ALearnedEdgeTravelsAndIsKnownAgainInTheHistory) {
+  constexpr int kSamples = 100;
+  test::BrokenArm arm({test::Fault::kWorn, "", 1}, test::Regime::kTagIso, kSamples / 2, 3);
+  const AdaptationOptions options = test::adaptation_options(test::Regime::kTagIso);
+  Adaptation adaptation(arm.engineered(), options);
+  for (int t = 0; t < kSamples; ++t) adaptation.on_sample(arm.observe(t));
+  const BodySchema& schema = adaptation.schema();
+  const Edge* learned = edge_to(schema, 4);
+  ASSERT_TRUE(learned->residual_gp);
+  EXPECT_STREQ(learned->kind(), "screw_gp");
+  const body_schema_t message = to_message(schema);
+  EXPECT_EQ(check(message), "");
+  EXPECT_LT(encode(kBodySchema, message).size(), 64000U);
+  const BodySchema again = from_message(message);
+  const Edge* back = edge_to(again, 4);
+  ASSERT_TRUE(back && back->residual_gp);
+  EXPECT_EQ(back->signals(), learned->signals());
+  for (double q = -1.3; q <= 1.3; q += 0.26) {
+    const Eigen::VectorXd theta = Eigen::VectorXd::Constant(7, q);
+    EXPECT_LT(log(back->predict(theta).inverse() * learned->predict(theta)).norm(), 1e-9);
+    EXPECT_LT((back->prediction_covariance(theta) - learned->prediction_covariance(theta)).norm(),
+              1e-12);
+  }
+  EXPECT_EQ(Adaptation(again, options, {arm.engineered(), schema}, {}).history().size(), 2U);
 }
 
 TEST(ModelMonitorConfigTest, IsReadInSiUnits) {

@@ -1,0 +1,50 @@
+#pragma once
+
+#include <vector>
+
+#include "common/schema/body_schema.h"
+#include "processes/model_monitor/body_change.h"
+
+namespace bodyschema {
+
+/// The pose of one edge at one instant, as everything but its own model knows it.
+struct EdgeMeasurement {
+  Eigen::VectorXd displacements;  ///< of all signals
+  Pose z = Pose::Identity();
+  Matrix6d covariance = Matrix6d::Zero();  ///< right perturbation
+};
+
+/// A model of an edge that has a Gaussian process in it.
+struct LearnedEdge {
+  BodyChange change;  ///< kNonlinear, kResidual or kFresh, with its signals
+  Edge edge;
+  /// The same predictions without the process's uncertainty: at the peak of the posterior.
+  Edge certain;
+  /// log of prior odds, of the density of the function at that peak and of the peak's width
+  /// (Laplace; exact here): with Σ log p(observations | certain) it is the evidence [nats].
+  double log_prior = 0;
+  double log_evidence = 0;  ///< by the measurements alone
+};
+
+/// What an edge may be if it is none of the families of body_change.h, by its measurements alone:
+///   kNonlinear: a joint goes farther by g(Q),
+///   kResidual:  Δ(θ) · Exp(ρ(Q)) with the model Δ that stood (refined prior),
+///   kFresh:     X · Exp(ρ(Q)) with a constant X;
+/// g and ρ are Gaussian processes of one or two signals. g too becomes a residual GP: of a screw at
+/// the end of the chain, Exp(ŝ(θ + g)) X_after = Exp(ŝθ) X_after · Exp(Ad(X_after⁻¹) ŝ g).
+///
+/// All signal sets are screened by one factorisation each, fewer signals first and, of as many,
+/// those nearest to the edge's own (structural_proximity()), which are the prior odds. The
+/// likeliest are fitted: length scales and variances by marginal likelihood on a small grid, whose
+/// number of cells is paid for. A measurement that the others make less likely (leave-one-out) than
+/// an outlier is one, and is not trained on. A model must halve, by leave-one-out, what the old one
+/// is off by (Student-t); else it is none.
+///
+/// `measurements`: at most ResidualGp::kMaxSamples. The best of every kind, most evidence first;
+/// none if there are fewer measurements than BodyChange::fewest_samples(). An edge that has a
+/// process already is only learned afresh.
+std::vector<LearnedEdge> learn_edge(const BodySchema& base, int part,
+                                    const std::vector<EdgeMeasurement>& measurements,
+                                    double outlier_rate);
+
+}  // namespace bodyschema
