@@ -394,6 +394,8 @@ Adaptation::Choice Adaptation::choose(const BodySchema& standing, const std::vec
     if (choice.best) second(std::move(*choice.best));
     choice.best = std::move(candidate);
   };
+  // What could not be explained for so long is not explained by a change of a body of the past.
+  const bool is_old = !standing_form && static_cast<int>(samples.size()) > kManySamples;
   for (const Place& at : places) {
     // Bases: the model that stands, and what is stored of this place.
     std::vector<const BodySchema*> origins{nullptr};
@@ -411,17 +413,18 @@ Adaptation::Choice Adaptation::choose(const BodySchema& standing, const std::vec
     }
     for (std::size_t b = 0; b < bases.size(); ++b) {
       const PlaceEvidence evidence(bases[b], noise_, at.part, at.marker, samples);
-      choice.work += static_cast<int>(samples.size());
       const auto offer_from = [&](FittedChange candidate) {
         if (origins[b]) candidate.origin = *origins[b];
         offer({at, std::move(candidate)});
       };
       if (b > 0 && evidence.num_usable() > 0) offer_from(evidence.judge_stored(bases[b]));
+      if (b > 0 && is_old) continue;
+      choice.work += static_cast<int>(samples.size());
       for (FittedChange& fitted :
            evidence.fit_likely(possible_changes(bases[b], at.part, at.marker)))
         offer_from(std::move(fitted));
       if (!learn || b > 0) continue;
-      for (FittedChange& learned : evidence.learn()) offer(std::move(learned), at);
+      for (FittedChange& learned : evidence.learn()) offer({at, std::move(learned)});
     }
   }
   // All that differs from a stored schema at once.
