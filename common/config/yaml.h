@@ -23,7 +23,8 @@ class ConfigError : public std::runtime_error {
   using std::runtime_error::runtime_error;
 };
 
-/// "; did you mean 'X'?" with the one of `known` that `word` differs least from; "" if there is none.
+/// "; did you mean 'X'?" with the one of `known` that `word` differs least from; "" if there is
+/// none.
 std::string did_you_mean(const std::string& word, const std::set<std::string>& known);
 
 /// A mapping of a strict YAML file: a key that is missing, of the wrong type or out of range is an

@@ -21,8 +21,8 @@ struct PartObservation {
   double error_ratio = 0;
 };
 
-/// What `covariance` of X_CB, from the observation or assumed, is for X_CB_other. The position's is a
-/// fact of the camera (depth is not lateral): it is carried over into the other frame. Tilt and
+/// What `covariance` of X_CB, from the observation or assumed, is for X_CB_other. The position's is
+/// a fact of the camera (depth is not lateral): it is carried over into the other frame. Tilt and
 /// in-plane rotation belong to the marker's axes in both readings. Requires X_CB_other.
 Matrix6d covariance_of_other(const PartObservation& observation, const Matrix6d& covariance);
 

@@ -33,7 +33,8 @@ struct BodyChange {
   int second_signal = -1;  ///< kNonlinear, kResidual, kFresh: the other input, if not −1
   double proximity = 1;    ///< of the model's signals to those of the edge that stood, 0 … 1
 
-  /// The last three forms: functions and no parameters, so that FittedChange::origin holds the edge.
+  /// The last three forms: functions and no parameters, so that FittedChange::origin holds the
+  /// edge.
   bool is_learned() const { return form >= Form::kNonlinear; }
 
   /// Number of parameters θ: displacements (as a q + b is), transforms as (translation [m],

@@ -373,8 +373,7 @@ std::vector<FittedChange> PlaceEvidence::learn() const {
       if (e.to == part_) e = edge;
     return schema;
   };
-  const std::vector<LearnedEdge> learned =
-      learn_edge(base_, part_, of_edge, noise_.outlier_rate);
+  const std::vector<LearnedEdge> learned = learn_edge(base_, part_, of_edge, noise_.outlier_rate);
   for (const LearnedEdge& one : learned) {
     if (one.log_evidence < learned.front().log_evidence - kHopeless ||
         result.size() == kLearnedJudged)
@@ -384,8 +383,8 @@ std::vector<FittedChange> PlaceEvidence::learn() const {
     fitted.theta.resize(0);
     fitted.num_usable = num_usable();
     fitted.log_prior = one.log_prior;
-    fitted.log_evidence = one.log_prior + log_likelihood(with_edge(one.certain), noise_, samples_,
-                                                         cut_parts_);
+    fitted.log_evidence =
+        one.log_prior + log_likelihood(with_edge(one.certain), noise_, samples_, cut_parts_);
     fitted.schema = with_edge(one.edge);
     fitted.origin = fitted.schema;
     result.push_back(std::move(fitted));

@@ -52,7 +52,8 @@ class PlaceEvidence {
   /// Those of the changes that may be the best one: what the place's own measurements speak clearly
   /// against is not held against all the observations.
   std::vector<FittedChange> fit_likely(const std::vector<BodyChange>& changes) const;
-  /// What learn_edge() makes of an edge's place, those of it that may be the best one. Of no others.
+  /// What learn_edge() makes of an edge's place, those of it that may be the best one. Of no
+  /// others.
   std::vector<FittedChange> learn() const;
   /// A schema of the history in this place.
   FittedChange judge_stored(const BodySchema& schema) const;

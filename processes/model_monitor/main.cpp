@@ -50,8 +50,9 @@ int main(int argc, char** argv) {
     app.add_option(
         "--schema", schema_file,
         "Where the body schema is kept, and history.lcmlog beside it; reloaded at start");
-    app.add_option("--initial", initial_file,
-                   "Body schema to begin with where none is kept: engineered, learned, another run's")
+    app.add_option(
+           "--initial", initial_file,
+           "Body schema to begin with where none is kept: engineered, learned, another run's")
         ->check(CLI::ExistingFile);
   };
   const auto body = [&](Process& process) {
@@ -68,7 +69,8 @@ int main(int argc, char** argv) {
         monitor.start_from(*schema);
       } else if (!initial_file.empty()) {
         std::vector<body_schema_t> initial = read_log(initial_file, kBodySchema);
-        if (initial.empty()) throw std::runtime_error(initial_file + ": no BODY_SCHEMA in the file");
+        if (initial.empty())
+          throw std::runtime_error(initial_file + ": no BODY_SCHEMA in the file");
         take_limits(load_signals(process.rig_folder()), &initial.back());
         if (const std::string why = door.objection(initial.back()); !why.empty())
           throw std::runtime_error(initial_file + ": " + why);

@@ -314,11 +314,10 @@ class TreeFilter::Walk {
     if (node == alternative_.detached_node) {
       double detached = log_outlier_density(belief->X, seen->X_CB, S, seen->covariance);
       if (seen->X_CB_other)
-        detached = std::max(detached,
-                            kLogOtherReading +
-                                log_outlier_density(belief->X, *seen->X_CB_other,
-                                                    belief->P + seen->covariance_other,
-                                                    seen->covariance_other));
+        detached = std::max(
+            detached, kLogOtherReading + log_outlier_density(belief->X, *seen->X_CB_other,
+                                                             belief->P + seen->covariance_other,
+                                                             seen->covariance_other));
       judgement.log_likelihood += detached;
       return;
     }
@@ -334,10 +333,9 @@ class TreeFilter::Walk {
       const Matrix6d S_other = belief->P + seen->covariance_other;
       bool is_other_inlier = false;
       double other_d2 = 0;
-      const double other =
-          kLogOtherReading + log_marker_density(belief->X, *seen->X_CB_other, S_other,
-                                                seen->covariance_other, rate, &is_other_inlier,
-                                                &other_d2);
+      const double other = kLogOtherReading + log_marker_density(belief->X, *seen->X_CB_other,
+                                                                 S_other, seen->covariance_other,
+                                                                 rate, &is_other_inlier, &other_d2);
       if (other > density) {
         density = other;
         S = S_other;

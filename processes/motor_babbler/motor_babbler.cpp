@@ -60,8 +60,8 @@ MotorBabblerConfig MotorBabblerConfig::load(const std::filesystem::path& file) {
   const Yaml yaml = Yaml::load(file);
   MotorBabblerConfig config;
   config.signals = load_signals(file.parent_path()).signals;
-  config.choice = yaml.choice("choice", {"active", "random"}) == "active" ? Choice::kActive
-                                                                          : Choice::kRandom;
+  config.choice =
+      yaml.choice("choice", {"active", "random"}) == "active" ? Choice::kActive : Choice::kRandom;
   config.extreme_share = yaml.number("extreme_share", 0, 1);
   config.extreme_from = yaml.number("extreme_from", 0, 1);
   config.test_every = yaml.integer("test_every", 2, 1000);
@@ -405,9 +405,11 @@ std::string MotorBabbler::activity() const {
     }
     case Wait::kVerdict:
       if (!has_verdict())
-        return samples + ", waiting for MODEL_HEALTH of sample " + std::to_string(last_test_sample_);
+        return samples + ", waiting for MODEL_HEALTH of sample " +
+               std::to_string(last_test_sample_);
       if (schema_version_ != health_.schema_version)
-        return samples + ", waiting for BODY_SCHEMA version " + std::to_string(health_.schema_version);
+        return samples + ", waiting for BODY_SCHEMA version " +
+               std::to_string(health_.schema_version);
       return samples + ", waiting for the samples up to " + std::to_string(last_sample_);
     case Wait::kRest:
       return samples +

@@ -183,9 +183,8 @@ void fit_jointly(const std::vector<ActionPoseSample>& samples, const NormalizedA
   std::vector<PairData> data{make_part_data(samples, schema->root, measurement, kMaxFrames)};
   if (data[0].size() < 2 || !is_at_rest(data[0], actions, validity)) return;
   for (const FittedEdge& f : *fitted) {
-    const auto parent = std::find_if(nodes.begin(), nodes.end(), [&](const TreeNode& node) {
-      return node.part == f.edge.from;
-    });
+    const auto parent = std::find_if(
+        nodes.begin(), nodes.end(), [&](const TreeNode& node) { return node.part == f.edge.from; });
     if (parent == nodes.end()) continue;  // another component
     if (f.edge.residual_gp) return;       // no chain of screws
     nodes.push_back({f.edge.to, static_cast<int>(parent - nodes.begin()), f.model});

@@ -12,12 +12,12 @@
 namespace bodyschema {
 
 /// What the view adds to the noise of real tags, whatever the rig: measured in
-/// tests/experiments/README.md. The rigs' structure_learner.yaml says the same; recordings of camera
-/// markers without a rig are learned with this.
+/// tests/experiments/README.md. The rigs' structure_learner.yaml says the same; recordings of
+/// camera markers without a rig are learned with this.
 inline constexpr Noise kTagModelError{.position_m = 0.001, .rotation_rad = 0.2 * M_PI / 180};
 
-/// X_CR of `schema` with its covariance: the robust mean of the poses of its root, Student-t weights.
-/// Left alone if the root is never seen.
+/// X_CR of `schema` with its covariance: the robust mean of the poses of its root, Student-t
+/// weights. Left alone if the root is never seen.
 void estimate_root_pose(const std::vector<ActionPoseSample>& samples,
                         const MeasurementModel& measurement, BodySchema* schema);
 
@@ -55,8 +55,8 @@ struct LearnResult {
   int num_fits = 0;               ///< Levenberg–Marquardt fits of the search
 };
 
-/// Learns the body schema from scratch: structure and local models (Sections 3.1 and 3.2). Where the
-/// root rests, the models are in the end fitted to all poses of its tree at once, and X_CR with
+/// Learns the body schema from scratch: structure and local models (Sections 3.1 and 3.2). Where
+/// the root rests, the models are in the end fitted to all poses of its tree at once, and X_CR with
 /// them: that comes near the Cramér–Rao bound, which models fitted to two parts each miss by 1.6.
 /// Their covariances are those of the pairs, an upper bound. A pure
 /// function of its arguments. Poses must be finite rigid transforms (callers check what comes in

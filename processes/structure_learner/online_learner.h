@@ -18,8 +18,8 @@ using SharedSamples = std::vector<std::shared_ptr<const ActionPoseSample>>;
 /// The search for the structure runs at checkpoints alone: after every sample while they are few,
 /// then whenever there are 5 % more. The schema of samples 1..n is the structure of a checkpoint c
 /// fitted to all of them: an edge that they refute is left out, a part that c had not seen is
-/// unconnected until the next checkpoint. Where samples are too many for that, the schema is that of
-/// c: a twentieth of the data at most waits for the next.
+/// unconnected until the next checkpoint. Where samples are too many for that, the schema is that
+/// of c: a twentieth of the data at most waits for the next.
 ///
 /// Which c is the caller's choice and not that of a clock, so that the schema is a pure function of
 /// the samples: with c < n the search is done before sample n comes, if there was time to prepare;

@@ -76,8 +76,7 @@ class FrameWriter {
     h.z = z;
     h.penalty = penalty;
     h.whitening = llt.matrixL().solve(Matrix6d::Identity());
-    h.log_det =
-        6 * std::log(2 * M_PI) + 2 * llt.matrixLLT().diagonal().array().log().sum();
+    h.log_det = 6 * std::log(2 * M_PI) + 2 * llt.matrixLLT().diagonal().array().log().sum();
     h.model_error = (h.whitening * model_error * h.whitening.transpose()).trace();
     pair_.hypotheses.push_back(h);
   }

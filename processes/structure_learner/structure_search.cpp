@@ -19,7 +19,7 @@ constexpr double kMaxScrewStartCost = 26;
 constexpr double kMaxRigidStartMedian = 20;
 constexpr double kMaxScrewStartMedian = 30;
 constexpr double kMaxFewFramesMedian = 100;  // from kSomeFrames on
-constexpr double kGoodStartCost = 12;         // below it none of this holds
+constexpr double kGoodStartCost = 12;        // below it none of this holds
 constexpr int kSomeFrames = 10;
 constexpr int kManyFrames = 20;
 // A refuted fit that costs less a frame may yet be right (a valid one costs 4 to 7).
@@ -276,8 +276,7 @@ class Search {
   // Does a part keep its pose in the camera's frame?
   bool part_rests(int x) {
     if (rests_[x] < 0) {
-      const PairData data =
-          make_part_data(samples_, parts_[x], options_.measurement, max_frames_);
+      const PairData data = make_part_data(samples_, parts_[x], options_.measurement, max_frames_);
       rests_[x] = is_at_rest(data, actions_, options_.validity);
     }
     return rests_[x] == 1;
@@ -318,14 +317,15 @@ class Search {
         return is_it;
       });
     forest_ = Forest(n);
-    for (const AcceptedModel& m : result_.models) forest_.connect(index_of(m.part_i), index_of(m.part_j));
+    for (const AcceptedModel& m : result_.models)
+      forest_.connect(index_of(m.part_i), index_of(m.part_j));
     doubtful_.clear();
     return true;
   }
 
-  // Connects what is left by models that their own pair could not make valid, if all markers of both
-  // sides together find nothing wrong with one.
-  // A model that is too small grows by the joints it lacks.
+  // Connects what is left by models that their own pair could not make valid, if all markers of
+  // both sides together find nothing wrong with one. A model that is too small grows by the joints
+  // it lacks.
   bool bridge() {
     constexpr int kMaxTried = 12;
     std::stable_sort(hopefuls_.begin(), hopefuls_.end(), [](const Hopeful& x, const Hopeful& y) {
@@ -337,7 +337,7 @@ class Search {
       return !met.insert({h.i, h.j, signal_set(h.model)}).second;
     });
     std::map<std::tuple<int, int, int>, int> tried;  // by components and k
-    std::map<int, double> cost_of;  // of a component's own tree
+    std::map<int, double> cost_of;                   // of a component's own tree
     const auto own_cost = [&](int x) {
       const auto [it, is_new] = cost_of.emplace(forest_.find(x), 0.0);
       if (is_new) it->second = fit_tree(tree_of(x)).cost();
@@ -600,7 +600,8 @@ class Search {
     }
   }
 
-  // Fits of two components that stay above this cost a frame, in a row, before the rest is given up.
+  // Fits of two components that stay above this cost a frame, in a row, before the rest is given
+  // up.
   static constexpr double kHopelessCost = 16;
   static constexpr int kMaxHopeless = 12;
 
@@ -646,8 +647,8 @@ class Search {
   std::vector<std::optional<PairData>> pairs_;
   std::vector<std::optional<RelativeMotions>> motions_;
   std::set<std::tuple<int, int, std::set<int>>> refuted_;  // by all markers together
-  std::vector<int> rests_;  // a part: 1 yes, 0 no, -1 not yet known
-  double last_cost_ = 0;  // a frame, of the latest fit
+  std::vector<int> rests_;                                 // a part: 1 yes, 0 no, -1 not yet known
+  double last_cost_ = 0;                                   // a frame, of the latest fit
   std::vector<Hopeful> hopefuls_;
   std::vector<Candidate> doubtful_;
   int num_judged_ = 0;  // frames of the valid models found so far, and the outliers among them

@@ -62,22 +62,19 @@ bool is_at_rest(const PairData& data, const NormalizedActions& actions,
 struct TreeFit::Normal {
   Eigen::MatrixXd H;
   Eigen::VectorXd g;
-  std::vector<int> offset;       // of a node's parameters; the root's 6 come first if it rests
+  std::vector<int> offset;           // of a node's parameters; the root's 6 come first if it rests
   std::vector<ParameterJacobian> S;  // at(frame, node): 6 × parameters of its edge
-  std::vector<Matrix6d> I;       // at(frame, node): information of the markers from there on
+  std::vector<Matrix6d> I;           // at(frame, node): information of the markers from there on
   std::vector<Vector6d> gradient;
   std::vector<Matrix6d> own_I;  // of the node's own marker
   std::vector<Vector6d> own_gradient;
   std::vector<Matrix6d> inverse_total;  // a frame: I of the root, inverted
-  double scale = 1;              // variance of the weighted residuals over what the weights say
+  double scale = 1;  // variance of the weighted residuals over what the weights say
 };
 
 TreeFit::TreeFit(std::vector<TreeNode> nodes, std::vector<PairData> data,
                  const NormalizedActions& actions, bool root_rests)
-    : nodes_(std::move(nodes)),
-      data_(std::move(data)),
-      actions_(actions),
-      root_rests_(root_rests) {
+    : nodes_(std::move(nodes)), data_(std::move(data)), actions_(actions), root_rests_(root_rests) {
   std::set<int> seen;
   for (const PairData& d : data_)
     for (const PairFrame& f : d.frames) seen.insert(f.sample);
@@ -85,8 +82,7 @@ TreeFit::TreeFit(std::vector<TreeNode> nodes, std::vector<PairData> data,
   frame_index_.assign(samples_.size() * nodes_.size(), -1);
   for (std::size_t n = 0; n < nodes_.size(); ++n) {
     for (int t = 0; t < data_[n].size(); ++t) {
-      const auto it =
-          std::lower_bound(samples_.begin(), samples_.end(), data_[n].frames[t].sample);
+      const auto it = std::lower_bound(samples_.begin(), samples_.end(), data_[n].frames[t].sample);
       frame_index_[at(static_cast<int>(it - samples_.begin()), static_cast<int>(n))] = t;
     }
   }
@@ -128,8 +124,7 @@ void TreeFit::start_roots() {
     double cost = 0;
     for (int k = 0; k < n; ++k)
       if (const int frame = frame_index_[at(t, k)]; frame >= 0)
-        cost += robust_cost(
-            best_reading(data_[k], frame, root * X_RB[at(t, k)]).squared_distance);
+        cost += robust_cost(best_reading(data_[k], frame, root * X_RB[at(t, k)]).squared_distance);
     return cost;
   };
   if (root_rests_) {
@@ -190,8 +185,7 @@ TreeFit::Normal TreeFit::normal_equations() const {
         const FrameFit& fit = fits_[index];
         const PairHypothesis& h = data_[k].hypotheses[fit.hypothesis];
         const Pose X_BC = poses_[index].inverse();
-        const Matrix6d A =
-            -(h.whitening * right_jacobian_inverse(-fit.error)) * adjoint(X_BC);
+        const Matrix6d A = -(h.whitening * right_jacobian_inverse(-fit.error)) * adjoint(X_BC);
         const double w = robust_weight(fit.squared_distance);
         result.own_I[index].noalias() = w * A.transpose() * A;
         result.own_gradient[index].noalias() = w * A.transpose() * fit.residual;
@@ -267,8 +261,8 @@ void TreeFit::fit(int max_iterations, double tolerance) {
       std::vector<TreeNode> nodes = nodes_;
       std::vector<Pose> roots = roots_;
       for (int k = 1; k < n; ++k)
-        nodes[k].model = perturbed(nodes_[k].model,
-                                   step.segment(normal.offset[k], nodes_[k].model.num_parameters()));
+        nodes[k].model = perturbed(
+            nodes_[k].model, step.segment(normal.offset[k], nodes_[k].model.num_parameters()));
       if (root_rests_) {
         roots[0] = roots_[0] * exp(step.head<6>());
       } else {
@@ -309,8 +303,7 @@ std::vector<int> TreeFit::full_edges(const MissingJoint& joint) const {
   std::vector<int> result;
   const bool is_full = nodes_[joint.top].model.num_joints == kMaxJoints;
   const std::vector<int> cluster = cluster_of(joint.top);
-  const auto unmoved = static_cast<std::ptrdiff_t>(joint.members.size()) <
-                       std::ssize(cluster);
+  const auto unmoved = static_cast<std::ptrdiff_t>(joint.members.size()) < std::ssize(cluster);
   if (!unmoved && is_full && joint.top > 0) result.push_back(joint.top);
   for (int k = 1; k < static_cast<int>(nodes_.size()); ++k) {
     if (nodes_[k].model.num_joints < kMaxJoints ||
@@ -441,8 +434,7 @@ std::vector<MissingJoint> TreeFit::missing_joints(const Noise& bias) const {
           else if (is_below(k, e))
             block = FI[i].lazyProduct(S);
           if (!root_rests_)
-            block -=
-                (FI[i] * normal.inverse_total[t] * normal.I[at(t, e)]).lazyProduct(S);
+            block -= (FI[i] * normal.inverse_total[t] * normal.I[at(t, e)]).lazyProduct(S);
           column += S.cols();
         }
       }
@@ -572,8 +564,7 @@ std::optional<std::vector<TreeEdge>> TreeFit::with_joint(const MissingJoint& joi
   std::vector<int> side(n, -1);                 // 1 moves, 0 rests
   for (const int k : cluster) {
     if (k != joint.top) X_TN[k] = X_TN[nodes_[k].parent] * nodes_[k].model.A[0];
-    side[k] = static_cast<int>(
-        std::count(joint.members.begin(), joint.members.end(), k));
+    side[k] = static_cast<int>(std::count(joint.members.begin(), joint.members.end(), k));
   }
   const auto rigid = [](const Pose& X) {
     LocalModel model;
@@ -611,9 +602,9 @@ std::optional<std::vector<TreeEdge>> TreeFit::with_joint(const MissingJoint& joi
       edges.push_back({b, k, rigid(X_TN[b].inverse() * X_TN[k])});
   }
   if (base[0] >= 0 && base[1] >= 0)
-    edges.push_back({base[0], base[1],
-                     in_front(X_TN[base[0]].inverse(), 1, rigid(X_TN[base[0]].inverse() *
-                                                                X_TN[base[1]]))});
+    edges.push_back(
+        {base[0], base[1],
+         in_front(X_TN[base[0]].inverse(), 1, rigid(X_TN[base[0]].inverse() * X_TN[base[1]]))});
   // A branch goes to its own side; where that has no part, its edge gets the joint.
   const auto attach = [&](int node, LocalModel model, int parent, bool moves) {
     const int own = base[moves];
@@ -624,8 +615,7 @@ std::optional<std::vector<TreeEdge>> TreeFit::with_joint(const MissingJoint& joi
       return true;
     }
     if (model.num_joints == kMaxJoints) return false;
-    edges.push_back(
-        {parent, node, in_front(X_TN[parent].inverse(), moves ? 1 : -1, model)});
+    edges.push_back({parent, node, in_front(X_TN[parent].inverse(), moves ? 1 : -1, model)});
     return true;
   };
   for (int k = 1; k < n; ++k) {

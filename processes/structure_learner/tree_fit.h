@@ -16,8 +16,8 @@ struct TreeNode {
   LocalModel model;  ///< Δ of this part in its parent; unused at the root
 };
 
-/// A joint that the tree lacks: part of a rigid cluster (and of what hangs on it) moves with a signal
-/// relative to the rest of it.
+/// A joint that the tree lacks: part of a rigid cluster (and of what hangs on it) moves with a
+/// signal relative to the rest of it.
 struct MissingJoint {
   int top = 0;  ///< the cluster's node next to the tree's root
   int signal = 0;
@@ -26,7 +26,7 @@ struct MissingJoint {
   std::vector<int> members, branches;
   /// Most likely screw in the frame of `top`, Exp(ξ q), per half range of the signal.
   Vector6d xi = Vector6d::Zero();
-  bool slides = false;   ///< ξ is a translation, which explains the data as well as a general screw
+  bool slides = false;  ///< ξ is a translation, which explains the data as well as a general screw
   double statistic = 0;  ///< score statistic: χ² of ξ = 0
   double log_tail = 0;   ///< log of the χ² tail beyond the statistic
   /// log of the number of ways to part this cluster: for the significance of the best of them.
@@ -39,8 +39,8 @@ struct TreeEdge {
   LocalModel model;  ///< Δ of b in a
 };
 
-/// Does a part keep its pose in the camera's frame? `data` are its make_part_data(); true if a rigid
-/// model of them is valid.
+/// Does a part keep its pose in the camera's frame? `data` are its make_part_data(); true if a
+/// rigid model of them is valid.
 bool is_at_rest(const PairData& data, const NormalizedActions& actions,
                 const ValidityOptions& options);
 
@@ -58,8 +58,8 @@ bool is_at_rest(const PairData& data, const NormalizedActions& actions,
 class TreeFit {
  public:
   /// `data`: make_part_data() of each node, in their order. `nodes`: parents before children.
-  TreeFit(std::vector<TreeNode> nodes, std::vector<PairData> data,
-          const NormalizedActions& actions, bool root_rests);
+  TreeFit(std::vector<TreeNode> nodes, std::vector<PairData> data, const NormalizedActions& actions,
+          bool root_rests);
 
   /// Levenberg–Marquardt with Student-t weights until a step gains less than `tolerance` [nats].
   void fit(int max_iterations, double tolerance);
@@ -68,7 +68,7 @@ class TreeFit {
   /// Of a root that rests, in the camera's frame.
   const Pose& root_pose() const { return roots_.front(); }
   double cost() const { return cost_; }  ///< Σ (ν + 6)/2 · log(1 + d²/ν)
-  double log_likelihood() const;       ///< −cost − ½ Σ log|2πΣ|
+  double log_likelihood() const;         ///< −cost − ½ Σ log|2πΣ|
   int num_frames() const { return static_cast<int>(samples_.size()); }
 
   /// Rao's score test of one more joint, for every rigid cluster and every moving signal: how much

@@ -41,8 +41,8 @@ double pair_outlier_rate(const ValidityOptions& options) {
 int binomial_quantile(int trials, double rate, double p) {
   using namespace boost::math::policies;
   using RoundUp = policy<discrete_quantile<integer_round_up>>;
-  return static_cast<int>(boost::math::quantile(
-      boost::math::binomial_distribution<double, RoundUp>(trials, rate), p));
+  return static_cast<int>(
+      boost::math::quantile(boost::math::binomial_distribution<double, RoundUp>(trials, rate), p));
 }
 
 Validity check_validity(const Fit& fit, const LeaveOneOut& loo, const PairData& pair,

@@ -89,7 +89,8 @@ int main(int argc, char** argv) {
   const int first_seed = std::stoi(argv[5]), num_seeds = std::stoi(argv[6]);
   const bool verbose = argc > 7;
   std::printf(
-      "| robot | regime | noise | N | right / incomplete / wrong %% | detectable, right of these %% | "
+      "| robot | regime | noise | N | right / incomplete / wrong %% | detectable, right of these "
+      "%% | "
       "search, ms | learning, ms | fits |\n");
   std::printf("|---|---|---|---|---|---|---|---|---|\n");
   for (const std::string& robot_name : split(argv[1])) {
@@ -130,14 +131,14 @@ int main(int argc, char** argv) {
               describe(result.schema, robot);
             }
           }
-          std::printf("| %s | %s | %s | %d | %.1f / %.1f / %.1f | %.0f, %.1f | %.0f | %.0f | "
-                      "%.0f |\n",
-                      robot_name.c_str(), regime_name.c_str(), noise.c_str(), n,
-                      100.0 * counts[0] / num_seeds, 100.0 * counts[1] / num_seeds,
-                      100.0 * counts[2] / num_seeds, 100.0 * num_detectable / num_seeds,
-                      100.0 * num_right / std::max(num_detectable, 1),
-                      1e3 * search_seconds / num_seeds, 1e3 * learn_seconds / num_seeds,
-                      static_cast<double>(fits) / num_seeds);
+          std::printf(
+              "| %s | %s | %s | %d | %.1f / %.1f / %.1f | %.0f, %.1f | %.0f | %.0f | "
+              "%.0f |\n",
+              robot_name.c_str(), regime_name.c_str(), noise.c_str(), n,
+              100.0 * counts[0] / num_seeds, 100.0 * counts[1] / num_seeds,
+              100.0 * counts[2] / num_seeds, 100.0 * num_detectable / num_seeds,
+              100.0 * num_right / std::max(num_detectable, 1), 1e3 * search_seconds / num_seeds,
+              1e3 * learn_seconds / num_seeds, static_cast<double>(fits) / num_seeds);
           std::fflush(stdout);
         }
       }

@@ -1,4 +1,5 @@
-// Whoever keeps something, on a full disk, as programs. Runs in tests/private_bus.sh and tiny_disk.sh.
+// Whoever keeps something, on a full disk, as programs. Runs in tests/private_bus.sh and
+// tiny_disk.sh.
 
 #include <gtest/gtest.h>
 #include <signal.h>
@@ -179,9 +180,9 @@ TEST_F(FullDisk, TheControllerHoldsAllTheSame) {
   EXPECT_NE(info_.activity.find("No space left"), std::string::npos) << info_.activity;
   ASSERT_TRUE(handle_until(bus_, [&] { return counter("state not saved") > 0; }));
   free_disk();
-  ASSERT_TRUE(handle_until(
-      bus_, [&] { return info_.activity.find("not saved") == std::string::npos; }))
-      << info_.activity;
+  ASSERT_TRUE(handle_until(bus_, [&] {
+    return info_.activity.find("not saved") == std::string::npos;
+  })) << info_.activity;
   EXPECT_TRUE(std::filesystem::exists(file));
   controller.send_signal(SIGTERM);
   EXPECT_EQ(controller.wait(), 0);

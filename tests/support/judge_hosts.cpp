@@ -83,8 +83,7 @@ void judge(const fs::path& folder, std::size_t num_samples) {
   });
   expect(samples.size() == num_samples && samples.begin()->first == 0 &&
              samples.rbegin()->first == static_cast<std::int64_t>(num_samples) - 1,
-         std::to_string(samples.size()) + " samples were made, not " +
-             std::to_string(num_samples));
+         std::to_string(samples.size()) + " samples were made, not " + std::to_string(num_samples));
 
   const Heard heard = listen(folder / "learning/current/run.lcmlog.00", samples);
   std::int64_t num_lost_samples = 0;
@@ -111,10 +110,9 @@ void judge(const fs::path& folder, std::size_t num_samples) {
   std::ifstream lost(folder / "lost");
   std::string host;
   for (std::int64_t frames = 0; lost >> host >> frames;) num_frames += frames;
-  num_lost_samples =
-      static_cast<std::int64_t>(num_samples) - result["samples"].get<std::int64_t>();
-  expect(num_lost_samples == 0, "the learning host lacks " + std::to_string(num_lost_samples) +
-                                    " of the samples");
+  num_lost_samples = static_cast<std::int64_t>(num_samples) - result["samples"].get<std::int64_t>();
+  expect(num_lost_samples == 0,
+         "the learning host lacks " + std::to_string(num_lost_samples) + " of the samples");
   std::printf("| %d | right | %zu | %.1f | %lld | %lld | %lld |\n", has_eye ? 3 : 2, samples.size(),
               result["seconds"].get<double>(), static_cast<long long>(num_frames),
               static_cast<long long>(heard.num_commands),
@@ -126,7 +124,8 @@ void judge(const fs::path& folder, std::size_t num_samples) {
 int main(int argc, char** argv) {
   if (argc == 2 && std::strcmp(argv[1], "--head") == 0) {
     std::printf(
-        "| hosts | structure | samples | s | frames lost | commands repeated | samples asked for |\n"
+        "| hosts | structure | samples | s | frames lost | commands repeated | samples asked for "
+        "|\n"
         "| --- | --- | --- | --- | --- | --- | --- |\n");
     return 0;
   }

@@ -19,7 +19,8 @@ namespace bodyschema::test {
 
 /// A rig's whole way from action to sample in one thread without a bus: simulator, rendered images,
 /// marker estimator, observer, and learner and monitor where actions are chosen by what they found,
-/// all with the rig's own configuration. The samples are those that ./run records with the same seed.
+/// all with the rig's own configuration. The samples are those that ./run records with the same
+/// seed.
 class RenderedRun {
  public:
   struct Step {

@@ -278,7 +278,8 @@ SyntheticRobot chapter_robot(const std::string& name, Rng& rng) {
   if (name == "c" || name == "co") chain = {0, 1, 2, 3};
   const bool is_d = name == "d" || name == "dP";
   if (is_d) chain = {0, 1, 2, 3, 4, 5, -1};
-  if (chain.empty() && name != "b") throw std::invalid_argument("no robot of the chapter is called " + name);
+  if (chain.empty() && name != "b")
+    throw std::invalid_argument("no robot of the chapter is called " + name);
   robot.links.push_back({.part = 1});
   for (std::size_t n = 0; n < chain.size(); ++n) {
     TrueLink link = random_link(static_cast<int>(n) + 2, static_cast<int>(n) + 1, rng);

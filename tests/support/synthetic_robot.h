@@ -86,8 +86,8 @@ std::vector<ActionPoseSample> babble(const SyntheticRobot& robot, int num_sample
                                      const ObservationOptions& options, Rng& rng);
 
 /// The chapter's robots, random geometry. "a": 2-DOF, 5 parts (Fig. 3); "b": two parts on a joint
-/// of two axes that cross at a right angle (Fig. 6); "c": 4-DOF, 5 parts (Fig. 7); "co": c with part
-/// 3 hidden (Fig. 8); "d": 7-DOF, 10 parts, part 4 hidden, 1.3 m long, two hinged fingers on
+/// of two axes that cross at a right angle (Fig. 6); "c": 4-DOF, 5 parts (Fig. 7); "co": c with
+/// part 3 hidden (Fig. 8); "d": 7-DOF, 10 parts, part 4 hidden, 1.3 m long, two hinged fingers on
 /// one signal (Fig. 11); "dP": d with sliding fingers.
 /// @throws std::invalid_argument of another name.
 SyntheticRobot chapter_robot(const std::string& name, Rng& rng);

@@ -5,8 +5,8 @@
 #include <opencv2/imgproc.hpp>
 
 #include "common/bus/convert.h"
-#include "common/scene/tag_bitmap.h"
 #include "common/camera/lens.h"
+#include "common/scene/tag_bitmap.h"
 
 namespace bodyschema {
 

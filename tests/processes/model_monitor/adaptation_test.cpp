@@ -245,7 +245,8 @@ TEST(AdaptationTest, WhichOfTheEdgesBetweenWhichNothingWasSeenIsWrongIsToldWhenI
       num_invalid += adaptation.edge_state(part) == EdgeState::kInvalid;
     EXPECT_EQ(num_invalid, 1) << "the arm is not to be relied upon";
     for (int t = 21; t < 24; ++t)
-      for (const AdaptationEvent& e : adaptation.on_sample(arm.observe(t))) life.events.push_back(e);
+      for (const AdaptationEvent& e : adaptation.on_sample(arm.observe(t)))
+        life.events.push_back(e);
     SCOPED_TRACE("events:\n" + life.log());
     ASSERT_TRUE(life.has(Kind::kMismatch));
     EXPECT_TRUE(life.has(Kind::kCandidate));
@@ -377,7 +378,8 @@ TEST(AdaptationTest, WhatBreaksWhileALinkDriftsIsFoundAllTheSame) {
     for (const auto& e : adaptation.on_sample(sample)) life.events.push_back(e);
     const PartObservation* seen = sample.find(7);
     if (t < 220 || !seen) continue;
-    const Pose X_CB = adaptation.schema().X_CR * adaptation.schema().predict_all(sample.action).at(7);
+    const Pose X_CB =
+        adaptation.schema().X_CR * adaptation.schema().predict_all(sample.action).at(7);
     distances.push_back((X_CB.translation() - seen->X_CB.translation()).norm());
   }
   SCOPED_TRACE("events:\n" + life.log());
@@ -413,7 +415,8 @@ TEST(AdaptationTest, WhatNothingExplainsIsOverSoonAfterItEnds) {
     for (const auto& e : adaptation.on_sample(sample)) life.events.push_back(e);
     if (t < 90) continue;
     for (const int part : {2, 3, 4, 5})
-      highest = std::max({highest, adaptation.edge_statistic(part), adaptation.marker_statistic(part)});
+      highest =
+          std::max({highest, adaptation.edge_statistic(part), adaptation.marker_statistic(part)});
   }
   // Else it took as long again.
   EXPECT_LE(highest, 2 * std::log(2 * 7 / adaptation.options().false_alarm_rate) + 1e-9);
@@ -472,9 +475,8 @@ TEST(AdaptationTest, AMarkerThatFellAndLiesInSightIsMissingAndNoFault) {
       }
     }
     SCOPED_TRACE("part " + std::to_string(part) + ", events:\n" + life.log());
-    const auto missing = std::find_if(life.events.begin(), life.events.end(), [](const auto& e) {
-      return e.kind == Kind::kMissing;
-    });
+    const auto missing = std::find_if(life.events.begin(), life.events.end(),
+                                      [](const auto& e) { return e.kind == Kind::kMissing; });
     ASSERT_NE(missing, life.events.end());
     EXPECT_EQ(missing->part, part);
     EXPECT_LE(missing->sample_index, 55);

@@ -37,13 +37,15 @@ SyntheticRobot chain(double slide_m, Rng& rng) {
       link.turn = 1;
     robot.links.push_back(link);
   }
-  for (int s = 0; s < 5; ++s) robot.signals.push_back({.name = "q", .lower = -1, .upper = 1, .warp = {}});
+  for (int s = 0; s < 5; ++s)
+    robot.signals.push_back({.name = "q", .lower = -1, .upper = 1, .warp = {}});
   return robot;
 }
 
 struct Case {
   Case(const SyntheticRobot& robot, int num_samples, Regime regime, bool root_moves, Rng& rng)
-      : samples(test::babble(robot, num_samples, {.regime = regime, .with_covariances = true}, rng)),
+      : samples(
+            test::babble(robot, num_samples, {.regime = regime, .with_covariances = true}, rng)),
         actions(samples, static_cast<int>(robot.signals.size())) {
     if (root_moves)
       for (ActionPoseSample& sample : samples) {
@@ -54,8 +56,7 @@ struct Case {
       TreeNode node;
       node.part = link.part;
       node.parent = link.parent - 1 < 0 ? -1 : link.parent - 1;
-      const double q =
-          link.signal < 0 ? 0 : actions.centre(link.signal) - link.zero;
+      const double q = link.signal < 0 ? 0 : actions.centre(link.signal) - link.zero;
       Pose X = Pose::Identity();
       X.linear() = Eigen::AngleAxisd(link.turn * q, Eigen::Vector3d::UnitZ()).toRotationMatrix();
       X.translation().z() = link.slide * q;
@@ -140,8 +141,9 @@ TEST(TreeFit, AllMarkersTogetherShowAJointThatNoPairShows) {
     // Part 4 rigid on part 3: the two markers have nothing against it.
     const PairData pair = make_pair_data(c.samples, 3, 4, c.measurement, 1000);
     const Fit rigid = fit_local_model(screen_rigid(pair, c.actions).model, pair, c.actions, 30);
-    num_rigid += check_validity(rigid, leave_one_out(rigid, pair, c.actions), pair, c.actions, {})
-                     .verdict == Verdict::kValid;
+    num_rigid +=
+        check_validity(rigid, leave_one_out(rigid, pair, c.actions), pair, c.actions, {}).verdict ==
+        Verdict::kValid;
     TreeFit fit(c.without(3), c.data, c.actions, true);
     fit.fit(20, 1e-3);
     const auto missing = fit.missing_joints({});
