@@ -145,7 +145,7 @@ struct BodySchema {
   std::vector<UnconnectedPart> unconnected;
   Noise noise;
   std::vector<KnownChange> changes;  ///< of the body, the newest kMaxChanges, ascending by `found`
-  static constexpr std::size_t kMaxChanges = 32;
+  static constexpr std::size_t kMaxChanges = 128;
 
   bool has_part(int part) const;
   /// The first sample of the body as it was known after sample `sample_index`; 0 before any change.

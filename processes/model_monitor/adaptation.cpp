@@ -636,7 +636,7 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
 }
 
 void Adaptation::note_trouble(const AdaptationEvent& mismatch, std::int64_t since) {
-  if (!trouble_) {
+  if (!trouble_ || mismatch.sample_index - trouble_->last > options_.settled_after) {
     trouble_.emplace();
     trouble_->since = since;
     trouble_->before = schema_;
@@ -669,9 +669,10 @@ void Adaptation::try_learning(std::int64_t sample_index, std::vector<AdaptationE
   BodySchema before;
   // This edge as it was, the others too or as they are now.
   std::vector<BodySchema> bases{trouble_->before};
-  for (const int other : schema_.parts)
-    if (other != part && bases.size() < 2 && differ_at(schema_, trouble_->before, other))
-      bases.push_back(with_edge_of(schema_, trouble_->before, part));
+  if (std::any_of(schema_.parts.begin(), schema_.parts.end(), [&](int other) {
+        return other != part && differ_at(schema_, trouble_->before, other);
+      }))
+    bases.push_back(with_edge_of(schema_, trouble_->before, part));
   for (const BodySchema& base : bases) {
     const PlaceEvidence evidence(base, noise_, part, false, samples);
     for (FittedChange& learned : evidence.learn()) {
@@ -694,6 +695,8 @@ void Adaptation::try_learning(std::int64_t sample_index, std::vector<AdaptationE
   candidate.margin = margin;
   candidate.num_samples = static_cast<int>(samples.size());
   events->push_back(candidate);
+  for (const Replacement& r : replacements_)
+    tell(AdaptationEvent::Kind::kReverted, sample_index, r, 0, 0, events);
   before_ = std::move(before);
   since_ = trouble_->since;
   replacements_ = {std::move(*best)};
@@ -878,20 +881,15 @@ void Adaptation::drop_fallen(ActionPoseSample* sample, std::vector<AdaptationEve
     missing.num_samples = v.num_missed + 1;
     events->push_back(missing);
     // What it was taken for meanwhile is taken back.
-    const auto about_it = [this, part](const Place& place) {
+    const auto is_at_it = [this, part](const Place& place) {
       return place.part == part && (place.marker || part != schema_.root);
     };
-    if (detected_ && about_it(*detected_)) detected_.reset();
-    for (const Replacement& r : replacements_) {
-      if (!about_it(r.place) || since_ < *since) continue;
-      AdaptationEvent reverted =
-          event(AdaptationEvent::Kind::kReverted, sample->sample_index, r.place);
-      reverted.cause = r.fitted.change.cause(schema_);
-      events->push_back(reverted);
-    }
-    if (since_ >= *since &&
-        std::erase_if(replacements_, [&](const Replacement& r) { return about_it(r.place); }) > 0)
-      schema_ = composed();
+    if (detected_ && is_at_it(*detected_)) detected_.reset();
+    const auto is_about_it = [&](const Replacement& r) { return is_at_it(r.place); };
+    for (const Replacement& r : replacements_)
+      if (is_about_it(r) && since_ >= *since)
+        tell(AdaptationEvent::Kind::kReverted, sample->sample_index, r, 0, 0, events);
+    if (since_ >= *since && std::erase_if(replacements_, is_about_it) > 0) schema_ = composed();
     install(schema_);
   }
 }
@@ -933,6 +931,7 @@ void Adaptation::begin_drift(int part, std::int64_t sample_index,
                              std::vector<AdaptationEvent>* events) {
   drifting_ = part;
   maturing_.clear();
+  trouble_.reset();
   before_ = schema_;
   num_still_ = 0;
   detected_.reset();

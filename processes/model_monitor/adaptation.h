@@ -187,7 +187,7 @@ class Adaptation {
   const AdaptationOptions options_;
   MarkerNoise noise_;
   int num_samples_ = 0;
-  int credit_;                           ///< work that may be done now; see kWork in the .cpp
+  int credit_;                           ///< work that may be done now; see kWorkPerSample
   std::vector<double> quiet_distances_;  ///< d² of believed markers since the noise was last set
   int num_quiet_ = 0;
   BodySchema schema_;

@@ -355,7 +355,8 @@ class Fitter {
         static_cast<double>(targets_.num_samples()) - static_cast<double>(inliers_.size());
     learned.log_evidence =
         targets_.change.log_odds() - std::log(num_cells()) + cell_.log_likelihood +
-        (targets_.log_rest(inliers_).array() + log_inlier_).sum() + num_out * log_outlier_;
+        (targets_.log_rest(inliers_).array() + log_inlier_).sum();
+    if (num_out > 0) learned.log_evidence += num_out * log_outlier_;
     learned.edge = learned.certain = targets_.edge;
     learned.edge.residual_gp = process(1);
     learned.certain.residual_gp = process(kCertain);

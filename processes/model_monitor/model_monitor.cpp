@@ -40,6 +40,17 @@ Matrix6d diagonal(const Noise& noise) {
   return variances.asDiagonal();
 }
 
+/// Edges between the same parts, by the same signals.
+bool has_same_tree(const BodySchema& a, const BodySchema& b) {
+  return a.edges.size() == b.edges.size() &&
+         std::all_of(a.edges.begin(), a.edges.end(), [&b](const Edge& edge) {
+           return std::any_of(b.edges.begin(), b.edges.end(), [&edge](const Edge& other) {
+             return edge.from == other.from && edge.to == other.to &&
+                    edge.signals() == other.signals();
+           });
+         });
+}
+
 /// What the observer saw of `part`: the likelier pose and, of a planar marker, the other one.
 std::vector<Pose> hypotheses(const PartObservation& part) {
   std::vector<Pose> poses{part.X_CB};
@@ -218,8 +229,11 @@ ModelMonitor::Standing ModelMonitor::standing_after(std::int64_t sample_index) c
   return standing;
 }
 
-void ModelMonitor::go_on_from(Standing standing) {
-  kept_.clear();
+void ModelMonitor::go_on_from(Standing standing, bool is_changed) {
+  if (is_changed)
+    kept_.clear();
+  else
+    kept_.erase(kept_.begin(), kept_.upper_bound(standing.sample_index));
   kept_.emplace(standing.sample_index, standing);
   // Nothing begins before it any more.
   const auto later = std::find_if(samples_.begin(), samples_.end(), [&](const auto& sample) {
@@ -229,9 +243,9 @@ void ModelMonitor::go_on_from(Standing standing) {
   if (num_before > kPast)
     samples_.erase(samples_.begin(),
                    samples_.begin() + static_cast<std::ptrdiff_t>(num_before - kPast));
-  now_ = std::move(standing);
+  if (is_changed) now_ = std::move(standing);
   for (const ActionPoseSample& sample : samples_) {
-    if (sample.sample_index <= now_.sample_index) continue;
+    if (!is_changed || sample.sample_index <= now_.sample_index) continue;
     advance(&now_, sample);
     if (sample.purpose == Purpose::kTest) keep(now_);
   }
@@ -329,11 +343,15 @@ void ModelMonitor::judge(const body_schema_t& message) {
   event.utime = proposal.utime;
   event.event_sample = index;
   event.event_from = event.event_to = event.event_part = -1;
-  bool is_new_base = false;
+  bool is_new_base = false, is_changed = false;
   const LiveSchema* live = standing.live.get();
   // It rests on samples of a body that is no more; or it hides that it may be so.
   bool is_passed_over = live && (live->is_in_doubt() || live->body_since() != since ||
                                  live->schema().version > index);
+  // A body that changed keeps its tree, or what is stored of it could not be put back: that of a
+  // stuck joint lacks the signal by which it will move again.
+  if (!is_passed_over && live && !live->schema().changes.empty())
+    is_passed_over = !has_same_tree(proposal, live->schema());
   // What the body was like before it changed is in the schema too, as far as that stayed so.
   if (!is_passed_over && live && since > 0) {
     auto tests = tests_between(since, index);
@@ -354,11 +372,12 @@ void ModelMonitor::judge(const body_schema_t& message) {
                          (proposal.complete ? "complete" : "incomplete");
       standing.add(event);
       set_base(&standing, std::move(proposal));
-      is_new_base = true;
+      is_new_base = is_changed = true;
     } else if (was_tested) {
       event.event_kind = health_event_t::EVENT_SCHEMA_REFUSED;
       event.event_text = why_not;
       standing.add(event);
+      is_changed = true;
       std::vector<health_event_t> verdicts = std::move(memory_.verdicts.events);
       if (verdicts.size() == kMaxEvents) verdicts.erase(verdicts.begin());
       verdicts.push_back(event);
@@ -372,11 +391,12 @@ void ModelMonitor::judge(const body_schema_t& message) {
     BodySchema renewed = live->schema();
     renewed.last_sample_index = index;
     set_base(&standing, std::move(renewed));
+    is_changed = true;
   }
   memory_.verdicts.utime = judged_utime_;
   memory_.verdicts.judged_sample = judged_sample_;
   is_rewound_ = true;
-  go_on_from(std::move(standing));
+  go_on_from(std::move(standing), is_changed);
   is_rewound_ = false;
 }
 

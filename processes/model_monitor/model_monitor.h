@@ -42,8 +42,8 @@ struct ModelMonitorConfig {
 /// The first complete one is the end of the learner's lead: from then on every sample is judged at
 /// once (LiveSchema), and a change of the body changes the schema. As long as none was found nor is
 /// suspected, later proposals go on to replace the schema, which is judged from there on. After a
-/// change those that rest on the samples since it alone may do so, where they predict its TEST
-/// samples better; what rests on samples of two bodies is passed over.
+/// change those that rest on the samples since it alone may do so, where their tree is the same and
+/// they predict its TEST samples better; what rests on samples of two bodies is passed over.
 ///
 /// The schema after sample n is a pure function of the samples 0..n. A proposal is one of its last
 /// sample t, a TEST sample (the learner leaves none of these out), and is judged by the state after
@@ -106,8 +106,9 @@ class ModelMonitor {
   /// `standing` one sample later. Verdicts that a restart remembers are spoken again.
   void advance(Standing* standing, const ActionPoseSample& sample) const;
   Standing standing_after(std::int64_t sample_index) const;
-  /// Everything from a state on that is final: that after a judged sample.
-  void go_on_from(Standing standing);
+  /// Everything from a state on that is final: that after a judged sample. `is_changed`: the
+  /// verdict made it another than it was, so that later samples are gone through again.
+  void go_on_from(Standing standing, bool is_changed);
   void keep(const Standing& standing);
   std::shared_ptr<const LiveSchema> begin(BodySchema base, std::vector<BodySchema> history,
                                           std::int64_t up_to_sample) const;

@@ -65,6 +65,7 @@ int main(int argc, char** argv) {
     const auto collect = [&] {
       learned = fit.get();
       has_learned = true;
+      proposed_us = tick_us;
       publish();
     };
     const auto learn_now = [&] {
@@ -84,10 +85,7 @@ int main(int argc, char** argv) {
         return;
       }
       if (!fit.valid() && learner.has_job() && !(learner.has_test_job() && awaits_verdict())) {
-        if (learner.has_test_job()) {
-          proposed_sample = learner.next_sample_index();
-          proposed_us = tick_us;
-        }
+        if (learner.has_test_job()) proposed_sample = learner.next_sample_index();
         fit = std::async(std::launch::async, learner.take_job());
         if (is_ready(fit, kUsualFit)) collect();
       }

@@ -45,14 +45,16 @@ class RelearningTest : public testing::Test {
     config_.options.root = 1;
   }
 
-  /// The monitor after samples 0..end-1; the learner's answers come `late` samples late.
-  ModelMonitor run(std::int64_t late = 0, std::int64_t end = kEnd) {
+  /// The monitor after samples 0..end-1; the learner's answers come `late` samples late, and what
+  /// it hears of the body schema `heard_late`.
+  ModelMonitor run(std::int64_t late = 0, std::int64_t end = kEnd, std::size_t heard_late = 0) {
     ModelMonitor monitor({.max_mahalanobis2 = 20.06,
                           .max_outlier_share = 0.2,
                           .model_error = {.position_m = 0.001, .rotation_rad = 0.0035}});
     StructureLearner learner(config_);
     proposals_.clear();
     std::deque<std::pair<std::int64_t, body_schema_t>> on_the_way;
+    std::deque<body_schema_t> published;
     for (std::int64_t n = 0; n < end + late; ++n) {
       if (n < end) {
         const sample_t& sample = samples_[static_cast<std::size_t>(n)];
@@ -73,7 +75,11 @@ class RelearningTest : public testing::Test {
       }
       if (monitor.schema()) {
         EXPECT_EQ(check(*monitor.schema()), "");
-        learner.on_body_schema(*monitor.schema());
+        published.push_back(*monitor.schema());
+        if (published.size() > heard_late) {
+          learner.on_body_schema(published.front());
+          published.pop_front();
+        }
       }
     }
     return monitor;
@@ -128,6 +134,9 @@ TEST_F(RelearningTest, ALearnerThatIsLateEndsWithTheSameSchema) {
   const auto expected = encode(kBodySchema, *run().schema());
   for (const int late : {1, 4, 13})
     EXPECT_EQ(encode(kBodySchema, *run(late).schema()), expected) << late;
+  // A change has settled long after it was published.
+  for (const std::size_t heard_late : {1, 5, 30})
+    EXPECT_EQ(encode(kBodySchema, *run(0, kEnd, heard_late).schema()), expected) << heard_late;
 }
 
 TEST_F(RelearningTest, WhatWasLearnedFromFewSamplesSinceDoesNotReplaceWhatPredictsBetter) {
