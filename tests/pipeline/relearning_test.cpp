@@ -26,16 +26,25 @@ class RelearningTest : public testing::Test {
     Rng rng(7);
     healthy_ = test::chapter_robot("a", rng);
     broken_ = healthy_;
+    test::TrueLink& link = second_moving(&broken_);
+    link.X_before.linear() = link.X_before.linear() * exp_so3({0.5, 0, 0.3});
+    link.X_before.translation() += Eigen::Vector3d(0.02, 0.01, 0);
+    babble(rng, kEnd);
+  }
+
+  static test::TrueLink& second_moving(test::SyntheticRobot* robot) {
     int num_moving = 0;
-    for (test::TrueLink& link : broken_.links) {
-      if (link.signal < 0 || ++num_moving != 2) continue;
-      link.X_before.linear() = link.X_before.linear() * exp_so3({0.5, 0, 0.3});
-      link.X_before.translation() += Eigen::Vector3d(0.02, 0.01, 0);
-    }
+    return *std::find_if(robot->links.begin(), robot->links.end(),
+                         [&](const auto& link) { return link.signal >= 0 && ++num_moving == 2; });
+  }
+
+  /// Broken from kBrokenAt on, until it is repaired.
+  void babble(Rng& rng, std::int64_t repaired_at) {
+    samples_.clear();
     const test::ObservationOptions options{
         .regime = test::Regime::kTag, .with_covariances = true, .with_other_hypothesis = true};
     for (std::int64_t n = 0; n < kEnd; ++n) {
-      const test::SyntheticRobot& robot = n < kBrokenAt ? healthy_ : broken_;
+      const test::SyntheticRobot& robot = n < kBrokenAt || n >= repaired_at ? healthy_ : broken_;
       ActionPoseSample sample = observe(robot, robot.random_action(rng), options, n, rng);
       sample.utime = 1'000'000 * (n + 1);
       if (n % 5 == 4) sample.purpose = Purpose::kTest;
@@ -43,6 +52,7 @@ class RelearningTest : public testing::Test {
     }
     config_.signals = healthy_.signals;
     config_.options.root = 1;
+    for (sample_t& sample : samples_) EXPECT_EQ(check(sample), "");
   }
 
   /// The monitor after samples 0..end-1; the learner's answers come `late` samples late, and what
@@ -86,13 +96,14 @@ class RelearningTest : public testing::Test {
   }
 
   /// Mean over random actions and parts [m].
-  double error(const BodySchema& schema) const {
+  double error(const BodySchema& schema) const { return error(schema, broken_); }
+  static double error(const BodySchema& schema, const test::SyntheticRobot& robot) {
     Rng rng(9);
     double sum = 0;
     int count = 0;
     for (int n = 0; n < 50; ++n) {
-      const Eigen::VectorXd action = broken_.random_action(rng);
-      const auto truth = broken_.poses_in_camera(action);
+      const Eigen::VectorXd action = robot.random_action(rng);
+      const auto truth = robot.poses_in_camera(action);
       for (const auto& [part, X_RB] : schema.predict_all(action)) {
         sum += (schema.X_CR * X_RB.translation() - truth.at(part).translation()).norm();
         ++count;
@@ -153,6 +164,24 @@ TEST_F(RelearningTest, WhatWasLearnedFromFewSamplesSinceDoesNotReplaceWhatPredic
   monitor.on_sample(samples_.back());
   EXPECT_TRUE(monitor.on_learned_schema(proposal));
   EXPECT_EQ(encode(kBodySchema, *monitor.schema()), before);
+}
+
+TEST_F(RelearningTest, AJointThatWasStuckForLongMovesAgainWhenItIsRepaired) {
+  broken_ = healthy_;
+  test::TrueLink& link = second_moving(&broken_);
+  link.turn = link.slide = 0;
+  Rng rng(8);
+  babble(rng, 140);
+  const ModelMonitor monitor = run();
+  ASSERT_TRUE(monitor.schema());
+  const BodySchema schema = from_message(*monitor.schema());
+  EXPECT_TRUE(schema.complete);
+  EXPECT_TRUE(test::is_right(schema, healthy_));
+  EXPECT_LT(error(schema, healthy_), 0.003);
+  // Meanwhile the learner had found a body without that joint.
+  EXPECT_TRUE(std::any_of(proposals_.begin(), proposals_.end(), [](const auto& proposal) {
+    return proposal.is_complete && from_message(proposal).unused_signals().size() == 1;
+  }));
 }
 
 }  // namespace
