@@ -7,6 +7,7 @@
 #include <numeric>
 #include <set>
 
+#include "common/statistics/median.h"
 #include "processes/structure_learner/screen.h"
 
 namespace bodyschema {
@@ -17,12 +18,6 @@ constexpr double kSafety = 1.2;
 constexpr int kMaxFrames = 120;
 constexpr int kMinRepeats = 5;
 constexpr double kLargestBias = 4;  // of a stream, in standard deviations of its white noise
-
-double median(std::vector<double> values) {
-  const auto middle = values.begin() + values.size() / 2;
-  std::nth_element(values.begin(), middle, values.end());
-  return *middle;
-}
 
 // A residual log(Δ̂⁻¹ z) of a relative pose with the lever arm that carries the rotation noise of
 // part i into its position. For a single marker the lever is 0 and `markers` 1.

@@ -9,6 +9,7 @@
 #include <tuple>
 
 #include "common/gp/minimize_in_box.h"
+#include "common/statistics/median.h"
 
 namespace bodyschema {
 namespace {
@@ -50,12 +51,6 @@ struct Targets {
   Eigen::VectorXd weights;    // n
   Vector6d noise;             // mean variance of a reading, per coordinate
 };
-
-double median(std::vector<double> values) {
-  const auto middle = values.begin() + static_cast<std::ptrdiff_t>(values.size() / 2);
-  std::nth_element(values.begin(), middle, values.end());
-  return *middle;
-}
 
 // Instants that cover the inputs (D×n) evenly: each the one farthest from all before.
 std::vector<int> spread_evenly(const Eigen::MatrixXd& inputs, const std::vector<int>& candidates) {
