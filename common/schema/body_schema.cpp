@@ -42,6 +42,11 @@ struct Residual {
 
 }  // namespace
 
+bool Edge::has_process_of(const Edge& other) const {
+  const auto is_same = [](const auto& a, const auto& b) { return a == b || (a && b && *a == *b); };
+  return is_same(matrix_gp, other.matrix_gp) && is_same(residual_gp, other.residual_gp);
+}
+
 const char* Edge::kind() const {
   if (matrix_gp) return "matrix_gp";
   if (residual_gp) return "screw_gp";

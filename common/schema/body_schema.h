@@ -74,6 +74,8 @@ struct Edge {
   double confidence = 1;
   EdgeState state = EdgeState::kOk;
 
+  /// By value: has the same Gaussian process in it, or none as the other.
+  bool has_process_of(const Edge& other) const;
   /// "rigid", "screw", "screw_gp" (with a residual GP, also without any joint) or "matrix_gp".
   const char* kind() const;
   /// Distinct signal indices, in the order of the joints; then those of the residual GP alone.

@@ -164,4 +164,16 @@ Matrix6d empirical_covariance(const std::vector<Vector6d>& residuals) {
   return sum / static_cast<double>(residuals.size());
 }
 
+bool MatrixGp::operator==(const MatrixGp& other) const {
+  const auto is_same_pose = [](const Pose& x, const Pose& y) { return x.matrix() == y.matrix(); };
+  const auto is_same_entry = [](const FittedGp& x, const FittedGp& y) {
+    return x.prior().mean == y.prior().mean &&
+           x.prior().log_parameters() == y.prior().log_parameters();
+  };
+  return signals_ == other.signals_ && num_samples() == other.num_samples() &&
+         inputs_ == other.inputs_ &&
+         std::equal(poses_.begin(), poses_.end(), other.poses_.begin(), is_same_pose) &&
+         std::equal(entries_.begin(), entries_.end(), other.entries_.begin(), is_same_entry);
+}
+
 }  // namespace bodyschema

@@ -64,4 +64,13 @@ Vector6d ResidualGp::variance(const Eigen::VectorXd& theta) const {
   return result;
 }
 
+bool ResidualGp::operator==(const ResidualGp& other) const {
+  return signals_ == other.signals_ && num_samples() == other.num_samples() &&
+         inputs_ == other.inputs_ && residuals_ == other.residuals_ &&
+         noise_scales_ == other.noise_scales_ &&
+         prior_.length_scales == other.prior_.length_scales &&
+         prior_.variances == other.prior_.variances &&
+         prior_.noise_variances == other.prior_.noise_variances;
+}
+
 }  // namespace bodyschema

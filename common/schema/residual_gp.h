@@ -38,6 +38,8 @@ class ResidualGp {
   const Residuals& residuals() const { return residuals_; }
   const Eigen::VectorXd& noise_scales() const { return noise_scales_; }
   const Prior& prior() const { return prior_; }
+  /// By value, to the last bit: what was written and read again is the same.
+  bool operator==(const ResidualGp& other) const;
   int num_samples() const { return static_cast<int>(inputs_.cols()); }
 
   /// All of these take the displacements of all signals (m values). @throws std::invalid_argument

@@ -6,6 +6,8 @@
 #include <set>
 #include <stdexcept>
 
+#include "common/statistics/median.h"
+
 namespace bodyschema {
 namespace {
 
@@ -74,27 +76,9 @@ bool is_worth_learning(std::int64_t age) {
   return age % 40 == 0 || std::find(std::begin(kAges), std::end(kAges), age) != std::end(kAges);
 }
 
-double median(std::vector<double> values) {
-  const auto middle = values.begin() + static_cast<std::ptrdiff_t>(values.size() / 2);
-  std::nth_element(values.begin(), middle, values.end());
-  return *middle;
-}
-
-/// A process that was learned here is another object once it was saved and loaded.
-bool is_same(const ResidualGp* a, const ResidualGp* b) {
-  if (a == b || !a || !b) return a == b;
-  return a->signals() == b->signals() && a->num_samples() == b->num_samples() &&
-         a->inputs() == b->inputs() && a->residuals() == b->residuals() &&
-         a->noise_scales() == b->noise_scales() &&
-         a->prior().length_scales == b->prior().length_scales &&
-         a->prior().variances == b->prior().variances &&
-         a->prior().noise_variances == b->prior().noise_variances;
-}
-
 bool differ(const Edge& a, const Edge& b) {
   if (!a.left.isApprox(b.left, 1e-9) || !a.right.isApprox(b.right, 1e-9) ||
-      a.joints.size() != b.joints.size() || a.matrix_gp != b.matrix_gp ||
-      !is_same(a.residual_gp.get(), b.residual_gp.get()))
+      a.joints.size() != b.joints.size() || !a.has_process_of(b))
     return true;
   for (std::size_t d = 0; d < a.joints.size(); ++d) {
     const ScrewJoint &x = a.joints[d], &y = b.joints[d];

@@ -47,8 +47,7 @@ bool is_same_model(const Edge& a, const Edge& b) {
     return x.signal == y.signal && x.gain == y.gain && x.offset == y.offset && x.slide == y.slide &&
            x.turn == y.turn && is_same(x.X_after, y.X_after);
   };
-  return is_same(a.left, b.left) && is_same(a.right, b.right) && a.matrix_gp == b.matrix_gp &&
-         a.residual_gp == b.residual_gp &&
+  return is_same(a.left, b.left) && is_same(a.right, b.right) && a.has_process_of(b) &&
          std::equal(a.joints.begin(), a.joints.end(), b.joints.begin(), b.joints.end(),
                     is_same_joint);
 }
