@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <set>
 #include <stdexcept>
 
 namespace bodyschema {
@@ -347,6 +348,14 @@ std::vector<BodyChange> possible_changes(const BodySchema& schema, int part, boo
     result.push_back({Form::kRigid, part});
   }
   return result;
+}
+
+double structural_proximity(const std::vector<int>& signals, const std::vector<int>& other) {
+  const std::set<int> a(signals.begin(), signals.end()), b(other.begin(), other.end());
+  std::set<int> all = a;
+  all.insert(b.begin(), b.end());
+  const double num_shared = static_cast<double>(a.size() + b.size() - all.size());
+  return (2 + num_shared) / (2 + static_cast<double>(all.size()));
 }
 
 }  // namespace bodyschema

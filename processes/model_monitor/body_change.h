@@ -21,16 +21,16 @@ struct BodyChange {
     kRigid,        ///< no joint any more: T(θ) times the pose in mid-range
     kMarkerMoved,  ///< the marker of `part` is elsewhere on it by T(θ)
     kOtherSignal,  ///< the joint follows another signal
-    kNonlinear,    ///< a Gaussian process of `signals` adds to the joint's displacement
-    kResidual,     ///< Δ · Exp(ρ) with a Gaussian process ρ of `signals`
+    kNonlinear,    ///< a Gaussian process of one or two signals adds to the joint's displacement
+    kResidual,     ///< Δ · Exp(ρ) with a Gaussian process ρ of one or two signals
     kFresh         ///< a constant pose and such a ρ: the edge is learned anew
   };
   Form form = Form::kRight;
   int part = 0;
   int joint = 0;       ///< of the edge: for kStuck, kOffset, kGain, kOtherSignal
-  int signal = 0;      ///< kOtherSignal
+  int signal = 0;      ///< kOtherSignal; of what is learned the first input
   bool small = false;  ///< a tenth as wide a prior: what is bent a little is likelier than a break
-  int second_signal = -1;  ///< kNonlinear, kResidual, kFresh: the other input, if not −1
+  int second_signal = -1;  ///< of what is learned the other input, if not −1
   double proximity = 1;    ///< of the model's signals to those of the edge that stood, 0 … 1
 
   /// The last three forms: functions and no parameters, so that FittedChange::origin holds the
@@ -68,5 +68,9 @@ const Edge* edge_to(const BodySchema& schema, int part);
 
 /// All forms that a change of the place may have (kStored and what is learned apart).
 std::vector<BodyChange> possible_changes(const BodySchema& schema, int part, bool marker);
+
+/// The ratio of shared to all nodes of the Bayesian networks of two local models of one pair of
+/// parts: (2 + |Q₁ ∩ Q₂|) / (2 + |Q₁ ∪ Q₂|).
+double structural_proximity(const std::vector<int>& signals, const std::vector<int>& other);
 
 }  // namespace bodyschema

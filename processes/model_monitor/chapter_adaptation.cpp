@@ -2,8 +2,9 @@
 
 #include <algorithm>
 #include <cmath>
-#include <set>
 #include <utility>
+
+#include "processes/model_monitor/body_change.h"
 
 namespace bodyschema {
 namespace {
@@ -29,14 +30,6 @@ std::vector<std::vector<int>> signal_sets(int num_signals, int size) {
 }
 
 }  // namespace
-
-double structural_proximity(const std::vector<int>& signals, const std::vector<int>& other) {
-  const std::set<int> a(signals.begin(), signals.end()), b(other.begin(), other.end());
-  std::set<int> all = a;
-  all.insert(b.begin(), b.end());
-  const double num_shared = static_cast<double>(a.size() + b.size() - all.size());
-  return (2 + num_shared) / (2 + static_cast<double>(all.size()));
-}
 
 ChapterAdaptation::ChapterAdaptation(BodySchema schema, ChapterAdaptationOptions options,
                                      LearnEdge learn_edge)

@@ -96,8 +96,4 @@ class ChapterAdaptation {
   int num_sampled_ = 0;
 };
 
-/// The ratio of shared to all nodes of the Bayesian networks of two local models of one pair of
-/// parts: (2 + |Q₁ ∩ Q₂|) / (2 + |Q₁ ∪ Q₂|).
-double structural_proximity(const std::vector<int>& signals, const std::vector<int>& other);
-
 }  // namespace bodyschema

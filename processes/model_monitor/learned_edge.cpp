@@ -7,7 +7,7 @@
 #include <memory>
 #include <optional>
 
-#include "processes/model_monitor/chapter_adaptation.h"
+#include "common/statistics/median.h"
 #include "processes/model_monitor/tree_filter.h"
 
 namespace bodyschema {
@@ -40,12 +40,6 @@ std::vector<int> signals_of(const BodyChange& change) {
   std::vector<int> signals{change.signal};
   if (change.second_signal >= 0) signals.push_back(change.second_signal);
   return signals;
-}
-
-double median(std::vector<double> values) {
-  const auto middle = values.begin() + static_cast<std::ptrdiff_t>(values.size() / 2);
-  std::nth_element(values.begin(), middle, values.end());
-  return *middle;
 }
 
 /// What one form makes of the measurements: k functions of the signals, seen n times.
@@ -353,9 +347,9 @@ class Fitter {
     }
     const auto num_out =
         static_cast<double>(targets_.num_samples()) - static_cast<double>(inliers_.size());
-    learned.log_evidence =
-        targets_.change.log_odds() - std::log(num_cells()) + cell_.log_likelihood +
-        (targets_.log_rest(inliers_).array() + log_inlier_).sum();
+    learned.log_evidence = targets_.change.log_odds() - std::log(num_cells()) +
+                           cell_.log_likelihood +
+                           (targets_.log_rest(inliers_).array() + log_inlier_).sum();
     if (num_out > 0) learned.log_evidence += num_out * log_outlier_;
     learned.edge = learned.certain = targets_.edge;
     learned.edge.residual_gp = process(1);

@@ -38,7 +38,8 @@ bool SampleStream::repeats(const ActionPoseSample& sample, const std::vector<Sig
 }
 
 std::int64_t SampleStream::sample_index_of(std::int64_t count) const {
-  std::int64_t repetitions = repetitions_before_.size() < kRemembered ? 0 : repetitions_before_.front().second;
+  std::int64_t repetitions =
+      repetitions_before_.size() < kRemembered ? 0 : repetitions_before_.front().second;
   for (const auto& [first, before] : repetitions_before_)
     if (first <= count) repetitions = before;
   return count + repetitions;

@@ -56,18 +56,25 @@ Life live(BrokenArm& arm, Adaptation& adaptation, int end) {
   return life;
 }
 
-class EveryFault : public testing::TestWithParam<test::Scenario> {};
-
 /// One seed each, tag_iso: 3 mm, 1°, 3 % of the markers flipped or anywhere.
-TEST_P(EveryFault, IsFoundNamedAndRepairedAndBothBodiesAreRemembered) {
-  BrokenArm arm(GetParam(), Regime::kTagIso, kBlock, 3);
-  Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kTagIso));
-  const Life life = live(arm, adaptation, arm.num_samples());
-  SCOPED_TRACE("events:\n" + life.log());
-  for (const AdaptationEvent& e : life.events) {
-    EXPECT_GE(e.sample_index, kBlock) << "before the fault";
-    EXPECT_TRUE(arm.is_near(part_of(e))) << text(e);
+class WholeLife : public testing::TestWithParam<test::Scenario> {
+ protected:
+  WholeLife() {
+    for (const AdaptationEvent& e : life.events) {
+      EXPECT_GE(e.sample_index, kBlock) << "before the fault\n" << life.log();
+      EXPECT_TRUE(arm.is_near(part_of(e))) << text(e) << "\n" << life.log();
+    }
   }
+
+  BrokenArm arm{GetParam(), Regime::kTagIso, kBlock, 3};
+  Adaptation adaptation{arm.engineered(), adaptation_options(Regime::kTagIso)};
+  const Life life = live(arm, adaptation, arm.num_samples());
+};
+
+class EveryFault : public WholeLife {};
+
+TEST_P(EveryFault, IsFoundNamedAndRepairedAndBothBodiesAreRemembered) {
+  SCOPED_TRACE("events:\n" + life.log());
   EXPECT_TRUE(life.has(Kind::kMismatch));
   EXPECT_TRUE(life.has(Kind::kRestored));
   // Named in the end of the first fault.
@@ -98,18 +105,11 @@ INSTANTIATE_TEST_SUITE_P(AdaptationTest, EveryFault,
                                          test::Scenario{Fault::kCamera, "camera", 0.85}),
                          [](const auto& info) { return std::string(info.param.name); });
 
-class NoFamily : public testing::TestWithParam<test::Scenario> {};
+class NoFamily : public WholeLife {};
 
 /// What none of the simple changes explains: the edge is learned, and kept like any other.
 TEST_P(NoFamily, IsLearnedAndBothBodiesAreRemembered) {
-  BrokenArm arm(GetParam(), Regime::kTagIso, kBlock, 3);
-  Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kTagIso));
-  const Life life = live(arm, adaptation, arm.num_samples());
   SCOPED_TRACE("events:\n" + life.log());
-  for (const AdaptationEvent& e : life.events) {
-    EXPECT_GE(e.sample_index, kBlock) << "before the fault";
-    EXPECT_TRUE(arm.is_near(part_of(e))) << text(e);
-  }
   const TrueChange& change = arm.changes().front();
   EXPECT_TRUE(std::any_of(life.events.begin(), life.events.end(), [&](const AdaptationEvent& e) {
     return e.kind == Kind::kCandidate && e.sample_index < kBlock + 25 && e.to == change.part &&
