@@ -544,7 +544,7 @@ class Page {
                   list.empty() ? "nothing: repaired" : list});
     }
     html += faults.html();
-    constexpr std::size_t kMost = 40;
+    constexpr std::size_t kMost = 200;
     const std::vector<health_event_t> all = record_.events();
     Table table({"#sample", "what the monitor decided", "where", "cause", "#margin", "#samples"});
     for (std::size_t i = all.size() - std::min(all.size(), kMost); i < all.size(); ++i) {

@@ -142,15 +142,21 @@ void RunRecord::on_markers(const marker_poses_t& markers) {
 }
 
 const char* name_of_event(std::int8_t kind) {
-  static const char* const kNames[] = {"accepted", "refused",   "mismatch", "candidate",
-                                       "refined",  "restored",  "reverted", "recovered",
-                                       "drift",    "missing",   "probe_wanted"};
+  static const char* const kNames[] = {"accepted", "refused",  "mismatch",    "candidate",
+                                       "refined",  "restored", "reverted",    "recovered",
+                                       "drift",    "missing",  "probe_wanted"};
   return kind >= 0 && kind <= health_event_t::EVENT_PROBE_WANTED ? kNames[kind] : "";
 }
 
 std::vector<health_event_t> RunRecord::events() const {
   std::vector<health_event_t> result;
-  for (const auto& [key, event] : events_) result.push_back(event);
+  const auto is_acceptance = [](const health_event_t& event) {
+    return event.event_kind == health_event_t::EVENT_SCHEMA_ACCEPTED;
+  };
+  for (const auto& [key, event] : events_) {
+    if (!result.empty() && is_acceptance(result.back()) && is_acceptance(event)) result.pop_back();
+    result.push_back(event);
+  }
   return result;
 }
 

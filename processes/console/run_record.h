@@ -56,7 +56,7 @@ class RunRecord {
   /// Every version of the body schema, ascending.
   const std::map<std::int64_t, BodySchema>& versions() const { return versions_; }
   const std::optional<model_health_t>& health() const { return health_; }
-  /// What the monitor decided, in order.
+  /// What the monitor decided, in order; of acceptances in a row the newest.
   std::vector<health_event_t> events() const;
   /// Ordered by name, host, pid.
   std::vector<Process> processes() const;

@@ -408,7 +408,7 @@ std::string StatusBoard::text(int width) const {
   }
   if (health_ && !health_->events.empty()) {
     line("");
-    constexpr std::size_t kShown = 5;
+    constexpr std::size_t kShown = 8;
     const std::size_t first = health_->events.size() - std::min(kShown, health_->events.size());
     for (std::size_t i = health_->events.size(); i-- > first;) {
       const health_event_t& event = health_->events[i];

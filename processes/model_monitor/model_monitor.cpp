@@ -90,6 +90,11 @@ ModelMonitor::ModelMonitor(ModelMonitorConfig config) : config_(config) {
 
 void ModelMonitor::Standing::add(health_event_t event) {
   event.event_number = num_events++;
+  // A healthy body's schema is replaced again and again: of those the newest says it all.
+  const auto is_acceptance = [](const health_event_t& e) {
+    return e.event_kind == health_event_t::EVENT_SCHEMA_ACCEPTED;
+  };
+  if (!events.empty() && is_acceptance(events.back()) && is_acceptance(event)) events.pop_back();
   if (events.size() == kMaxEvents) events.erase(events.begin());
   events.push_back(std::move(event));
 }

@@ -14,7 +14,10 @@ fail() {
   tail -n 15 "$work"/*.txt >&2 || true
   exit 1
 }
-status() { "$source/run" exec bodyschema status --seconds 1.2 >"$work/status.txt" 2>&1 || true; }
+status() {
+  "$source/run" exec bodyschema status --seconds 1.2 >"$work/status.txt" 2>&1 || true
+  "$source/run" exec bodyschema status --seconds 1.2 --json >"$work/status.json" 2>&1 || true
+}
 # until WHAT COMMAND…: within a minute or two, however slow the machine.
 until_true() {
   local what=$1
@@ -30,10 +33,10 @@ newest() {
   sample=$(sed -n 's/^sample *\([0-9]*\):.*/\1/p' "$work/status.txt")
   echo "${sample:-0}"
 }
-# told SINCE PATTERN: an event of that sample or a later one.
+# told SINCE PATTERN: one of the newest 32 events, of that sample or a later one.
 told() {
-  awk -v since="$1" -v pattern="$2" '$1 == "sample" && $2 + 0 >= since && $0 ~ pattern {found = 1} END {exit !found}' \
-    "$work/status.txt"
+  awk -v since="$1" -v pattern="$2" '/"sample":/ {sample = $2 + 0} /"text":/ && sample >= since && $0 ~ pattern {found = 1}
+    END {exit !found}' "$work/status.json"
 }
 is_learned() { [ "$(newest)" -ge 40 ] && is_sound; }
 is_sound() { grep -q "^schema .*complete" "$work/status.txt" && ! grep -qE "INVALID|SUSPECT" "$work/status.txt"; }

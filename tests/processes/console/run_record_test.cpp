@@ -159,6 +159,7 @@ TEST(RunRecordTest, EventsOutliveTheNewest32AndARestartOfTheMonitor) {
   const auto event = [](std::int64_t number, std::int64_t sample) {
     health_event_t event{};
     event.event_number = number;
+    event.event_kind = health_event_t::EVENT_MISMATCH;
     event.event_sample = sample;
     event.event_text = "sample " + std::to_string(sample);
     return event;
@@ -174,6 +175,28 @@ TEST(RunRecordTest, EventsOutliveTheNewest32AndARestartOfTheMonitor) {
   ASSERT_EQ(events.size(), 51U);
   EXPECT_EQ(events.front().event_sample, 0);
   EXPECT_EQ(events.back().event_sample, 1000);
+}
+
+TEST(RunRecordTest, OfAcceptancesInARowTheNewestIsAnEvent) {
+  Recorded run;
+  model_health_t health = example_model_health();
+  const auto tell = [&](std::int64_t number, std::int8_t kind) {
+    health_event_t event{};
+    event.event_number = number;
+    event.event_kind = kind;
+    event.event_sample = 5 * number;
+    set_array(health.num_events, health.events, {event});
+    run.hear(kModelHealth, health, number);
+  };
+  std::int64_t number = 0;
+  for (; number < 10; ++number) tell(number, health_event_t::EVENT_SCHEMA_ACCEPTED);
+  tell(number++, health_event_t::EVENT_CANDIDATE);
+  for (; number < 20; ++number) tell(number, health_event_t::EVENT_SCHEMA_ACCEPTED);
+  const auto events = run.record.events();
+  ASSERT_EQ(events.size(), 3U);
+  EXPECT_EQ(events[0].event_number, 9);
+  EXPECT_EQ(events[1].event_number, 10);
+  EXPECT_EQ(events[2].event_number, 19);
 }
 
 TEST(RunRecordTest, FaultsAreTheirChanges) {

@@ -333,6 +333,16 @@ TEST_F(ModelMonitorTest, OneRefutingTestIsTakenForAnOutlierTwoOfNineAreNot) {
   }
 }
 
+TEST_F(ModelMonitorTest, OfAcceptancesInARowTheNewestIsAnEvent) {
+  ModelMonitor monitor = monitor_at(44);
+  for (const int last : {34, 39, 44}) {
+    monitor.on_learned_schema(proposal(last));
+    ASSERT_EQ(monitor.health().num_events, 1);
+    EXPECT_EQ(monitor.health().events[0].event_sample, last);
+  }
+  EXPECT_EQ(monitor.health().events[0].event_number, 2);
+}
+
 TEST_F(ModelMonitorTest, AnEdgeThatNoTestCouldJudgeIsProvisional) {
   const BodySchema right = learned(44);
   const Edge& edge = right.edges.back();
@@ -526,8 +536,13 @@ TEST_F(ModelMonitorTest, AnyOrderOfMessagesEndsInTheSameSchemaAndNeverRunsBackwa
 
 TEST_F(ModelMonitorTest, TheNewestThirtyTwoEventsAreKeptAndNumbered) {
   ModelMonitor monitor = monitor_at(9);
-  BodySchema schema = learned(44);
+  const BodySchema complete = learned(44);
+  BodySchema incomplete = complete;
+  incomplete.unconnected = {{incomplete.edges.back().to, Unconnected::kNotEnoughData, ""}};
+  incomplete.edges.pop_back();
+  incomplete.complete = false;
   for (std::int64_t n = 0; n < 100; ++n) {
+    BodySchema schema = n % 2 ? incomplete : complete;
     ActionPoseSample later = samples_[9];
     later.sample_index = 10 + n;
     later.utime += 1'000'000 * (n + 1);
