@@ -581,6 +581,19 @@ std::string check(const body_schema_t& message) {
                check.require(change.since_sample <= change.found_sample, "since_sample",
                              "is after found_sample");
              });
+  std::int64_t tag_found = -1;
+  check.each("moved_tags", message.num_moved_tags, message.moved_tags, kMaxTags,
+             [&](const moved_tag_t& tag) {
+               check.integer_within("moved_tag_id", tag.moved_tag_id, 0, kMaxId);
+               check.require(tag.moved_found_sample >= tag_found, "moved_found_sample", "descends");
+               tag_found = tag.moved_found_sample;
+               check.integer_at_least("moved_since_sample", tag.moved_since_sample, 0);
+               check.require(tag.moved_since_sample <= tag.moved_found_sample, "moved_since_sample",
+                             "is after moved_found_sample");
+               check.require(
+                   tag.moved_until_sample == -1 || tag.moved_until_sample > tag.moved_found_sample,
+                   "moved_until_sample", "is not after moved_found_sample");
+             });
   check.at_least("noise_position_m", message.noise_position_m, 0);
   check.at_least("noise_rotation_rad", message.noise_rotation_rad, 0);
   return check.problem();
@@ -634,6 +647,7 @@ std::string check(const model_health_t& message) {
                check.integer_within("event_from", event.event_from, -1, kMaxId);
                check.integer_within("event_to", event.event_to, -1, kMaxId);
                check.integer_within("event_part", event.event_part, -1, kMaxId);
+               check.integer_within("event_tag", event.event_tag, -1, kMaxId);
                check.text("event_cause", event.event_cause, kMaxText);
                check.finite("event_margin", event.event_margin);
                check.integer_at_least("samples_used", event.samples_used, 0);

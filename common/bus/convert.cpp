@@ -57,6 +57,7 @@ ActionPoseSample from_message(const sample_t& message) {
     observation.covariance = from_message(part.covariance);
     if (part.has_other == 1) observation.X_CB_other = from_message(part.X_CB_other);
     observation.error_ratio = part.error_ratio;
+    for (const tag_corners_t& tag : part.tags) observation.tags.push_back(tag.tag_id);
   }
   return sample;
 }
@@ -78,6 +79,9 @@ sample_t to_message(const ActionPoseSample& sample) {
     part.X_CB_other = to_message(observation.X_CB_other.value_or(observation.X_CB));
     part.error_ratio = observation.X_CB_other ? observation.error_ratio : 0;
     part.num_frames = 1;
+    std::vector<tag_corners_t> tags;
+    for (const int id : observation.tags) tags.emplace_back().tag_id = id;
+    set_array(part.num_tags, part.tags, std::move(tags));
   }
   set_array(message.num_parts, message.parts, std::move(parts));
   return message;
@@ -303,6 +307,15 @@ body_schema_t to_message(const BodySchema& schema) {
     out.since_sample = change.since;
   }
   set_array(message.num_changes, message.changes, std::move(changes));
+  std::vector<moved_tag_t> moved_tags;
+  for (const MovedTag& tag : schema.moved_tags) {
+    moved_tag_t& out = moved_tags.emplace_back();
+    out.moved_tag_id = tag.tag;
+    out.moved_found_sample = tag.found;
+    out.moved_since_sample = tag.since;
+    out.moved_until_sample = tag.until;
+  }
+  set_array(message.num_moved_tags, message.moved_tags, std::move(moved_tags));
   message.noise_position_m = schema.noise.position_m;
   message.noise_rotation_rad = schema.noise.rotation_rad;
   return message;
@@ -331,6 +344,9 @@ BodySchema from_message(const body_schema_t& message) {
   }
   for (const body_change_t& change : message.changes)
     schema.changes.push_back({change.found_sample, change.since_sample});
+  for (const moved_tag_t& tag : message.moved_tags)
+    schema.moved_tags.push_back(
+        {tag.moved_tag_id, tag.moved_found_sample, tag.moved_since_sample, tag.moved_until_sample});
   schema.noise = {message.noise_position_m, message.noise_rotation_rad};
   return schema;
 }

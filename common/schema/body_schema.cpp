@@ -142,6 +142,33 @@ std::int64_t BodySchema::body_since(std::int64_t sample_index) const {
   return since;
 }
 
+std::vector<MovedTag> BodySchema::moved_tags_known(std::int64_t sample_index) const {
+  std::vector<MovedTag> known;
+  for (MovedTag tag : moved_tags) {
+    if (tag.found > sample_index) continue;
+    if (tag.until > sample_index) tag.until = -1;
+    known.push_back(tag);
+  }
+  return known;
+}
+
+bool rests_on_moved_tags(const PartObservation& observation, std::int64_t sample_index,
+                         const std::vector<MovedTag>& moved) {
+  const auto has_moved = [&](int id) {
+    return std::any_of(moved.begin(), moved.end(), [&](const MovedTag& tag) {
+      return tag.tag == id && tag.since <= sample_index &&
+             (tag.until < 0 || sample_index < tag.until);
+    });
+  };
+  return std::any_of(observation.tags.begin(), observation.tags.end(), has_moved);
+}
+
+void drop_moved_tags(const std::vector<MovedTag>& moved, ActionPoseSample* sample) {
+  std::erase_if(sample->parts, [&](const PartObservation& observation) {
+    return rests_on_moved_tags(observation, sample->sample_index, moved);
+  });
+}
+
 bool BodySchema::has_part(int part) const {
   return std::find(parts.begin(), parts.end(), part) != parts.end();
 }

@@ -10,6 +10,7 @@
 #include "common/geometry/pose.h"
 #include "common/schema/matrix_gp.h"
 #include "common/schema/residual_gp.h"
+#include "common/schema/sample.h"
 #include "common/schema/signal.h"
 
 namespace bodyschema {
@@ -122,6 +123,16 @@ struct KnownChange {
   std::int64_t since = 0;
 };
 
+/// A tag that moved on its part, or fell off it: what rests on it says nothing of the part.
+struct MovedTag {
+  int tag = 0;
+  std::int64_t found = 0;   ///< known from this sample on
+  std::int64_t since = 0;   ///< first sample that showed it
+  std::int64_t until = -1;  ///< known to be where it was from this sample on; −1: it is not
+
+  bool operator==(const MovedTag&) const = default;
+};
+
 struct PosePrediction {
   Pose X_AB = Pose::Identity();
   Matrix6d covariance = Matrix6d::Zero();  ///< right perturbation in frame B
@@ -148,10 +159,14 @@ struct BodySchema {
   Noise noise;
   std::vector<KnownChange> changes;  ///< of the body, the newest kMaxChanges, ascending by `found`
   static constexpr std::size_t kMaxChanges = 128;
+  std::vector<MovedTag> moved_tags;  ///< the newest kMaxMovedTags, ascending by `found`
+  static constexpr std::size_t kMaxMovedTags = 64;
 
   bool has_part(int part) const;
   /// The first sample of the body as it was known after sample `sample_index`; 0 before any change.
   std::int64_t body_since(std::int64_t sample_index) const;
+  /// The moved tags as they were known after sample `sample_index`.
+  std::vector<MovedTag> moved_tags_known(std::int64_t sample_index) const;
   /// Signals that no edge uses (indices).
   std::vector<int> unused_signals() const;
 
@@ -169,5 +184,11 @@ struct BodySchema {
   /// 6×m Jacobian of the pose of `to` in `from`; right perturbation in the frame of `to`.
   std::optional<Eigen::MatrixXd> jacobian(int from, int to, const Eigen::VectorXd& action) const;
 };
+
+/// Whether what a sample says of a part rests on a tag that had moved by then.
+bool rests_on_moved_tags(const PartObservation& observation, std::int64_t sample_index,
+                         const std::vector<MovedTag>& moved);
+/// Leaves out what rests on them.
+void drop_moved_tags(const std::vector<MovedTag>& moved, ActionPoseSample* sample);
 
 }  // namespace bodyschema

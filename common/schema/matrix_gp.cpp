@@ -165,7 +165,8 @@ Matrix6d empirical_covariance(const std::vector<Vector6d>& residuals) {
 }
 
 bool MatrixGp::operator==(const MatrixGp& other) const {
-  const auto is_same_pose = [](const Pose& x, const Pose& y) { return x.matrix() == y.matrix(); };
+  // Quaternions on the wire round.
+  const auto is_same_pose = [](const Pose& x, const Pose& y) { return x.isApprox(y, 1e-12); };
   const auto is_same_entry = [](const FittedGp& x, const FittedGp& y) {
     return x.prior().mean == y.prior().mean &&
            x.prior().log_parameters() == y.prior().log_parameters();

@@ -33,7 +33,7 @@ class MatrixGp {
   const std::vector<int>& signals() const { return signals_; }
   const Eigen::MatrixXd& inputs() const { return inputs_; }
   const std::vector<Pose>& poses() const { return poses_; }
-  /// By value, to the last bit: what was written and read again is the same.
+  /// By value: what was written and read again is the same.
   bool operator==(const MatrixGp& other) const;
   int num_samples() const { return static_cast<int>(poses_.size()); }
   const GpPrior& prior(int entry) const { return entries_.at(entry).prior(); }

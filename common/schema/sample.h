@@ -19,6 +19,8 @@ struct PartObservation {
   std::optional<Pose> X_CB_other;
   /// Reprojection error of the other hypothesis over that of X_CB; ≥ 1. 0 when there is no other.
   double error_ratio = 0;
+  /// Ids of the tags that the pose rests on, ascending; empty where that is not known.
+  std::vector<int> tags;
 };
 
 /// What `covariance` of X_CB, from the observation or assumed, is for X_CB_other. The position's is

@@ -48,6 +48,7 @@ Json event_json(const AdaptationEvent& event, const ActionPoseSample& sample) {
   json["event"] = name_of(event.kind);
   if (event.part >= 0) {
     json["part"] = event.part;
+    if (event.tag >= 0) json["tag"] = event.tag;
   } else {
     json["from"] = event.from;
     json["to"] = event.to;

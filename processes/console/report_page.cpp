@@ -555,6 +555,7 @@ class Page {
         where = fmt::format("{} → {}", event.event_from, event.event_to);
       else if (event.event_part >= 0)
         where = fmt::format("part {}", event.event_part);
+      if (event.event_tag >= 0) where += fmt::format(", tag {}", event.event_tag);
       table.row({std::to_string(event.event_sample),
                  is_proposal ? escape_html(event.event_text) : name_of_event(event.event_kind),
                  where, escape_html(event.event_cause),

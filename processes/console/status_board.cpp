@@ -525,6 +525,7 @@ ordered_json StatusBoard::json() const {
                                 {"from", id(event.event_from)},
                                 {"to", id(event.event_to)},
                                 {"part", id(event.event_part)},
+                                {"tag", id(event.event_tag)},
                                 {"cause", event.event_cause},
                                 {"margin", event.event_margin},
                                 {"samples_used", event.samples_used},

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <numeric>
 #include <set>
 #include <stdexcept>
 
@@ -45,6 +46,7 @@ constexpr int kAlikeActions = 16;
 constexpr double kAlike = 16.8;
 /// Sightings below which a part's visibility is not known.
 constexpr int kFewestSightings = 10;
+constexpr int kAnyTag = -1;
 constexpr std::int64_t kSoon = 150;
 constexpr double kMedianChiSquare6 = 5.348;
 constexpr double kLargestScale = 5;
@@ -186,6 +188,9 @@ Adaptation::Adaptation(BodySchema schema, AdaptationOptions options)
       noise_(options.noise),
       credit_(kMostWork),
       schema_(std::move(schema)),
+      tags_(schema_.moved_tags),
+      moved_tags_(schema_.moved_tags),
+      trusted_(schema_),
       drift_watch_(options.false_alarm_rate) {
   history_.push_back(schema_);
   install(schema_);
@@ -198,9 +203,16 @@ Adaptation::Adaptation(BodySchema schema, AdaptationOptions options,
   std::vector<AdaptationEvent> old_news;
   for (const ActionPoseSample& sample : past) {
     if (stream_.repeats(sample, schema_.signals)) continue;
-    watch_visibility(sample, &old_news);
-    if (sample.purpose == Purpose::kTest) recent_.push_back(sample);
+    watch_visibility(sample, sample, &old_news);
+    tags_.look_back(sample, schema_, noise_);
+    if (sample.purpose != Purpose::kTest) continue;
+    recent_.push_back(sample);
+    drop_moved_tags(moved_tags_, &recent_.back());
   }
+  // News of them is for the next sample.
+  for (auto& [part, tags] : visibility_)
+    for (auto& [tag, visibility] : tags)
+      if (tag != kAnyTag) visibility.is_missing = false;
   calibrate();
   recent_.clear();
   install(schema_);
@@ -792,45 +804,129 @@ void Adaptation::want_probe(const BodySchema& standing, const Choice& choice,
 
 std::vector<int> Adaptation::missing_parts() const {
   std::vector<int> parts;
-  for (const auto& [part, v] : visibility_)
-    if (v.is_missing) parts.push_back(part);
+  for (const auto& [part, tags] : visibility_)
+    if (tags.at(kAnyTag).is_missing) parts.push_back(part);
   return parts;
 }
 
-void Adaptation::watch_visibility(const ActionPoseSample& sample,
+void Adaptation::watch_visibility(const ActionPoseSample& sample, const ActionPoseSample& used,
                                   std::vector<AdaptationEvent>* events) {
   for (const int part : schema_.parts) {
-    Visibility& v = visibility_[part];
-    if (sample.find(part)) {
-      if (v.is_missing) {
-        AdaptationEvent back =
-            event(AdaptationEvent::Kind::kRecovered, sample.sample_index, {part, true});
-        back.cause = "marker_missing";
-        back.num_samples = v.num_missed;
-        events->push_back(back);
-      } else {
-        v.num_asked += v.num_missed;
-      }
-      v.is_missing = false;
-      v.num_missed = 0;
-      ++v.num_seen;
-      ++v.num_asked;
-      continue;
+    const PartObservation* seen = sample.find(part);
+    // A marker that lies somewhere is none; a tag that moved is still one.
+    if (seen && !used.find(part) && !rests_on_moved_tag(*seen)) seen = nullptr;
+    watch_visibility_of(part, kAnyTag, seen, sample.sample_index, events);
+    // An arm that holds still or is led shows one side of its parts for as long.
+    if (!seen || sample.purpose == Purpose::kControl) continue;
+    for (const int tag : seen->tags) visibility_[part][tag];
+    if (visibility_[part].size() < 3) continue;  // its only tag is the part's marker
+    for (const auto& [tag, visibility] : visibility_[part]) {
+      if (tag == kAnyTag || tags_.has_moved(tag)) continue;
+      const bool is_seen = std::find(seen->tags.begin(), seen->tags.end(), tag) != seen->tags.end();
+      watch_visibility_of(part, tag, is_seen, sample.sample_index, events);
     }
-    ++v.num_missed;
-    if (v.is_missing || v.num_seen < kFewestSightings) continue;
-    // A run of m misses begins at any sample with probability v (1 − v)^m; n parts may.
-    const double share = (v.num_seen + 0.5) / (v.num_asked + 1.0);
-    const double chance =
-        share * std::pow(1 - share, v.num_missed) * static_cast<double>(schema_.parts.size());
-    if (chance > options_.false_alarm_rate) continue;
-    v.is_missing = true;
-    AdaptationEvent missing =
-        event(AdaptationEvent::Kind::kMissing, sample.sample_index, {part, true});
-    missing.cause = "marker_missing";
-    missing.num_samples = v.num_missed;
-    events->push_back(missing);
   }
+}
+
+/// From sample `since` on, as is known at sample `found`.
+void Adaptation::set_aside(int tag, std::int64_t since, std::int64_t found) {
+  if (moved_tags_.size() == BodySchema::kMaxMovedTags) moved_tags_.erase(moved_tags_.begin());
+  moved_tags_.push_back({tag, stream_.sample_index_of(found), stream_.sample_index_of(since)});
+}
+
+void Adaptation::watch_visibility_of(int part, int tag, bool is_seen, std::int64_t sample_index,
+                                     std::vector<AdaptationEvent>* events) {
+  Visibility& v = visibility_[part][tag];
+  const auto tell = [&](AdaptationEvent::Kind kind) {
+    AdaptationEvent told = event(kind, sample_index, {part, true});
+    told.tag = tag;
+    told.cause = "marker_missing";
+    told.num_samples = v.num_missed;
+    events->push_back(std::move(told));
+  };
+  if (is_seen) {
+    // What is seen again need not be seen as often as before.
+    if (v.is_missing) {
+      tell(AdaptationEvent::Kind::kRecovered);
+      v = {};
+    }
+    v.num_asked += v.num_missed + 1;
+    v.num_missed = 0;
+    ++v.num_seen;
+    return;
+  }
+  ++v.num_missed;
+  if (v.is_missing || v.num_seen < kFewestSightings) return;
+  // A run of m misses begins at any sample with probability v (1 − v)^m; n parts and tags may.
+  const auto num = std::accumulate(
+      visibility_.begin(), visibility_.end(), std::size_t{0},
+      [](std::size_t sum, const auto& of_part) { return sum + of_part.second.size(); });
+  const double share = (v.num_seen + 0.5) / (v.num_asked + 1.0);
+  const double chance = share * std::pow(1 - share, v.num_missed) * static_cast<double>(num);
+  if (chance > options_.false_alarm_rate) return;
+  v.is_missing = true;
+  tell(AdaptationEvent::Kind::kMissing);
+}
+
+void Adaptation::watch_tags(ActionPoseSample* sample, std::vector<AdaptationEvent>* events) {
+  if (num_samples_ >= options_.calibration_samples) {
+    for (const MovedTags::Finding& finding : tags_.look(*sample, trusted_, noise_)) {
+      using Kind = AdaptationEvent::Kind;
+      const Kind back = finding.was_seen ? Kind::kRestored : Kind::kRecovered;
+      AdaptationEvent told = event(finding.is_back ? back : Kind::kCandidate, sample->sample_index,
+                                   {finding.part, true});
+      told.tag = finding.tag;
+      told.cause = finding.was_seen ? "marker_moved" : "marker_missing";
+      told.num_samples = finding.num_sightings;
+      events->push_back(std::move(told));
+      if (finding.is_back) {
+        for (MovedTag& moved : moved_tags_)
+          if (moved.tag == finding.tag && moved.until < 0)
+            moved.until = stream_.sample_index_of(sample->sample_index);
+        visibility_[finding.part][finding.tag] = {};
+      } else {
+        set_aside(finding.tag, finding.since, sample->sample_index);
+        take_back(finding, sample->sample_index, events);
+      }
+    }
+  }
+  std::erase_if(sample->parts, [this](const PartObservation& o) { return rests_on_moved_tag(o); });
+}
+
+bool Adaptation::rests_on_moved_tag(const PartObservation& observation) const {
+  return std::any_of(observation.tags.begin(), observation.tags.end(),
+                     [this](int tag) { return tags_.has_moved(tag); });
+}
+
+/// What a moved tag was taken for meanwhile.
+void Adaptation::take_back(const MovedTags::Finding& moved, std::int64_t sample_index,
+                           std::vector<AdaptationEvent>* events) {
+  for (ActionPoseSample& earlier : recent_)
+    if (earlier.sample_index >= moved.since)
+      std::erase_if(earlier.parts, [&](const PartObservation& o) {
+        return std::find(o.tags.begin(), o.tags.end(), moved.tag) != o.tags.end();
+      });
+  const auto is_at_it = [&](const Place& place) {
+    if (place.part == moved.part) return true;
+    const Edge* edge = edge_to(schema_, place.part);
+    return !place.marker && edge && edge->from == moved.part;
+  };
+  if (detected_ && is_at_it(*detected_)) detected_.reset();
+  if (since_ >= moved.since)
+    for (auto r = replacements_.begin(); r != replacements_.end();) {
+      if (is_at_it(r->place)) {
+        tell(AdaptationEvent::Kind::kReverted, sample_index, *r, 0, 0, events);
+        r = replacements_.erase(r);
+      } else {
+        ++r;
+      }
+    }
+  // Of what went to and fro something may have been kept.
+  BodySchema& standing = replacements_.empty() ? schema_ : before_;
+  for (const int part : schema_.parts)
+    if (is_at_it({part, false})) standing = with_edge_of(standing, trusted_, part);
+  trouble_.reset();
+  install(replacements_.empty() ? BodySchema(schema_) : composed());
 }
 
 // A flip stays for many frames, longer than a block. It says nothing of where the part is.
@@ -851,7 +947,7 @@ void Adaptation::drop_fallen(ActionPoseSample* sample, std::vector<AdaptationEve
     const auto since = fallen_.look(*sample, part, schema_.X_CR * X_RB, noise_);
     if (!since) continue;
     drop(part, sample);
-    Visibility& v = visibility_[part];
+    Visibility& v = visibility_[part][kAnyTag];
     if (v.is_missing) continue;
     v.is_missing = true;
     for (ActionPoseSample& earlier : recent_) {
@@ -884,6 +980,7 @@ void Adaptation::follow(std::int64_t sample_index, std::vector<AdaptationEvent>*
     for (const Replacement& r : replacements_)
       tell(AdaptationEvent::Kind::kRecovered, sample_index, r, 0, age_, events);
     remember(schema_);
+    trusted_ = schema_;
     // Of a drift, which may look like small changes, the mean of many samples is not what is now.
     const bool any_small = std::any_of(replacements_.begin(), replacements_.end(),
                                        [](const Replacement& r) { return r.fitted.change.small; });
@@ -907,6 +1004,7 @@ void Adaptation::mature(std::int64_t sample_index) {
   std::swap(replacements_, maturing_);
   reconsider(sample_index, false, nullptr);  // the forms stay: nothing to tell
   std::swap(replacements_, maturing_);
+  trusted_ = schema_;
   for (BodySchema& stored : history_)
     if (is_same(stored, settled)) stored = schema_;
 }
@@ -953,6 +1051,7 @@ void Adaptation::watch_drift(std::int64_t sample_index, std::vector<AdaptationEv
   events->push_back(recovered);
   drift_watch_.forget(*drifting_, sample_index);
   remember(schema_);
+  trusted_ = schema_;
   drifting_.reset();
 }
 
@@ -983,10 +1082,17 @@ std::vector<AdaptationEvent> Adaptation::on_sample(const ActionPoseSample& seen)
 
 std::vector<AdaptationEvent> Adaptation::on_new_sample(ActionPoseSample sample) {
   std::vector<AdaptationEvent> events;
+  const ActionPoseSample seen = sample;
+  watch_tags(&sample, &events);
   if (num_samples_ >= options_.calibration_samples) drop_fallen(&sample, &events);
+  watch_visibility(seen, sample, &events);
+  for (const AdaptationEvent& event : events) {
+    if (event.kind != AdaptationEvent::Kind::kMissing || event.tag < 0) continue;
+    tags_.lose(event.tag);
+    set_aside(event.tag, event.sample_index - event.num_samples + 1, event.sample_index);
+  }
   recent_.push_back(sample);
   if (recent_.size() > kRing) recent_.pop_front();
-  watch_visibility(sample, &events);
   if (++num_samples_ <= options_.calibration_samples) {
     if (num_samples_ == options_.calibration_samples) {
       calibrate();

@@ -10,6 +10,7 @@
 #include "processes/model_monitor/change_fit.h"
 #include "processes/model_monitor/drift_watch.h"
 #include "processes/model_monitor/fallen_markers.h"
+#include "processes/model_monitor/moved_tags.h"
 #include "processes/model_monitor/sample_stream.h"
 #include "processes/model_monitor/tree_filter.h"
 
@@ -55,6 +56,7 @@ struct AdaptationEvent {
   int from = -1;  ///< parts of an edge; −1 for a part alone or the camera
   int to = -1;
   int part = -1;  ///< of a marker; −1 for an edge
+  int tag = -1;   ///< the one of the part's tags that it is about; −1: all
   std::string cause;
   /// Evidence over the schema that stood before; kProbeWanted: between the explanations [nats].
   double margin = 0;
@@ -109,6 +111,9 @@ class Adaptation {
   const MarkerNoise& noise() const { return noise_; }
   /// Parts whose markers have not been seen for longer than chance explains.
   std::vector<int> missing_parts() const;
+  /// Tags that moved, or were lost, where others of their part stayed: what rests on them is left
+  /// out until they are seen in their places again.
+  const std::vector<MovedTag>& moved_tags() const { return moved_tags_; }
   bool is_drifting(int part) const { return drifting_ == part; }
   /// First sample with the body as changed by the replacements that have not settled.
   std::int64_t since() const { return stream_.sample_index_of(since_); }
@@ -171,7 +176,17 @@ class Adaptation {
                   std::vector<AdaptationEvent>* events);
   void drop_turned_over(ActionPoseSample* sample) const;
   void drop_fallen(ActionPoseSample* sample, std::vector<AdaptationEvent>* events);
-  void watch_visibility(const ActionPoseSample& sample, std::vector<AdaptationEvent>* events);
+  struct Visibility;
+  /// `used`: without what is not believed.
+  void watch_visibility(const ActionPoseSample& sample, const ActionPoseSample& used,
+                        std::vector<AdaptationEvent>* events);
+  void watch_visibility_of(int part, int tag, bool is_seen, std::int64_t sample_index,
+                           std::vector<AdaptationEvent>* events);
+  void set_aside(int tag, std::int64_t since, std::int64_t found);
+  bool rests_on_moved_tag(const PartObservation& observation) const;
+  void watch_tags(ActionPoseSample* sample, std::vector<AdaptationEvent>* events);
+  void take_back(const MovedTags::Finding& moved, std::int64_t sample_index,
+                 std::vector<AdaptationEvent>* events);
   void follow(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
   void mature(std::int64_t sample_index);
   void remember(const BodySchema& schema);
@@ -198,8 +213,11 @@ class Adaptation {
     int num_missed = 0;               ///< in a row
     bool is_missing = false;
   };
-  std::map<int, Visibility> visibility_;
+  std::map<int, std::map<int, Visibility>> visibility_;  ///< by part and tag; −1: any tag of it
   FallenMarkers fallen_;
+  MovedTags tags_;
+  std::vector<MovedTag> moved_tags_;
+  BodySchema trusted_;  ///< what settled last
   SampleStream stream_;
   std::vector<Cusum> edges_, markers_;  ///< by node
   std::optional<Place> detected_;

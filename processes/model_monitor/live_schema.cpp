@@ -65,6 +65,7 @@ std::string text_of(const AdaptationEvent& event) {
                          ? "edge " + std::to_string(event.from) + "–" + std::to_string(event.to)
                      : event.cause == "camera_moved" ? "camera"
                                                      : "part " + std::to_string(event.part);
+  if (event.tag >= 0) text += ", tag " + std::to_string(event.tag);
   text += std::string(": ") + name_of(event.kind);
   if (!event.cause.empty()) text += " " + event.cause;
   char number[64];
@@ -99,8 +100,13 @@ std::int64_t LiveSchema::holds_since(int part) const {
 
 double LiveSchema::log_likelihood_ratio(const BodySchema& other,
                                         const std::vector<const ActionPoseSample*>& samples) const {
-  return log_likelihood(other, adaptation_.noise(), samples) -
-         log_likelihood(schema_, adaptation_.noise(), samples);
+  std::vector<ActionPoseSample> usable;
+  for (const ActionPoseSample* sample : samples)
+    drop_moved_tags(schema_.moved_tags, &usable.emplace_back(*sample));
+  std::vector<const ActionPoseSample*> all;
+  for (const ActionPoseSample& sample : usable) all.push_back(&sample);
+  return log_likelihood(other, adaptation_.noise(), all) -
+         log_likelihood(schema_, adaptation_.noise(), all);
 }
 
 bool LiveSchema::is_in_doubt() const {
@@ -114,6 +120,7 @@ bool LiveSchema::is_in_doubt() const {
 std::vector<health_event_t> LiveSchema::on_sample(const ActionPoseSample& sample) {
   std::vector<health_event_t> result;
   std::optional<std::int64_t> changed_since;
+  std::optional<int> unchanged_part;
   for (const AdaptationEvent& event : adaptation_.on_sample(sample)) {
     health_event_t message;
     message.event_number = 0;
@@ -123,13 +130,16 @@ std::vector<health_event_t> LiveSchema::on_sample(const ActionPoseSample& sample
     message.event_from = event.from;
     message.event_to = event.to;
     message.event_part = event.part;
+    message.event_tag = event.tag;
     message.event_cause = event.cause;
     message.event_margin = std::isfinite(event.margin) ? event.margin : 0;
     message.samples_used = event.num_samples;
     message.event_text = text_of(event);
     result.push_back(std::move(message));
-    if (event.kind == Kind::kCandidate || event.kind == Kind::kRestored)
+    if ((event.kind == Kind::kCandidate || event.kind == Kind::kRestored) && event.tag < 0)
       changed_since = adaptation_.since();
+    // What the tag was taken for was no change.
+    if (event.kind == Kind::kCandidate && event.tag >= 0) unchanged_part = event.part;
     if (event.kind == Kind::kDrift) changed_since = sample.sample_index;
     if (event.kind == Kind::kProbeWanted) {
       probe_sample_ = event.sample_index;
@@ -138,7 +148,7 @@ std::vector<health_event_t> LiveSchema::on_sample(const ActionPoseSample& sample
   }
   if (adaptation_.is_settled()) probe_sample_ = -1;
   watch_flips(sample);
-  update(sample, changed_since);
+  update(sample, changed_since, unchanged_part);
   return result;
 }
 
@@ -156,19 +166,21 @@ void LiveSchema::watch_flips(const ActionPoseSample& sample) {
   }
 }
 
-void LiveSchema::update(const ActionPoseSample& sample, std::optional<std::int64_t> changed_since) {
+void LiveSchema::update(const ActionPoseSample& sample, std::optional<std::int64_t> changed_since,
+                        std::optional<int> unchanged_part) {
   BodySchema next = adaptation_.schema();
+  next.moved_tags = adaptation_.moved_tags();
   for (std::size_t e = 0; e < next.edges.size(); ++e) {
     Edge& edge = next.edges[e];
     const Edge &before = schema_.edges[e], &original = base_.edges[e];
     edge.valid_since_sample = before.valid_since_sample;
-    if (!is_same_model(edge, before)) {
-      // Without a new change: the same one fitted better, or taken back.
-      if (changed_since)
-        edge.valid_since_sample = *changed_since;
-      else if (is_same_model(edge, original))
-        edge.valid_since_sample = original.valid_since_sample;
-    }
+    const bool is_other = !is_same_model(edge, before);
+    const bool is_taken_back = unchanged_part == edge.from || unchanged_part == edge.to;
+    // Without a new change: the same one fitted better, or taken back.
+    if (is_other && changed_since)
+      edge.valid_since_sample = *changed_since;
+    else if ((is_other || is_taken_back) && is_same_model(edge, original))
+      edge.valid_since_sample = original.valid_since_sample;
     edge.state = original.state;
     edge.confidence = original.confidence;
     const EdgeState state = state_of(edge);

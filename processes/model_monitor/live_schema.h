@@ -50,7 +50,8 @@ class LiveSchema {
  private:
   void watch_flips(const ActionPoseSample& sample);
   EdgeState state_of(const Edge& edge) const;
-  void update(const ActionPoseSample& sample, std::optional<std::int64_t> changed_since);
+  void update(const ActionPoseSample& sample, std::optional<std::int64_t> changed_since,
+              std::optional<int> unchanged_part);
 
   const BodySchema base_;
   Adaptation adaptation_;

@@ -58,6 +58,13 @@ std::vector<Pose> hypotheses(const PartObservation& part) {
   return poses;
 }
 
+/// What a sample shows of a part, unless it rests on tags that had moved.
+const PartObservation* sighting(const ActionPoseSample& sample, int part,
+                                const std::vector<MovedTag>& moved) {
+  const PartObservation* seen = sample.find(part);
+  return seen && !rests_on_moved_tags(*seen, sample.sample_index, moved) ? seen : nullptr;
+}
+
 }  // namespace
 
 ModelMonitorConfig ModelMonitorConfig::load(const std::filesystem::path& file) {
@@ -107,6 +114,13 @@ void ModelMonitor::start_from(const body_schema_t& schema) {
     body_schema_t& base = memory.schemas.back();
     for (schema_edge_t& edge : base.edges) edge.valid_since_sample = 0;
     set_array(base.num_changes, base.changes, {});
+    std::vector<moved_tag_t> moved;
+    for (moved_tag_t tag : base.moved_tags) {
+      if (tag.moved_until_sample >= 0) continue;
+      tag.moved_found_sample = tag.moved_since_sample = 0;
+      moved.push_back(tag);
+    }
+    set_array(base.num_moved_tags, base.moved_tags, std::move(moved));
   }
   memory.at_base.utime = memory.verdicts.utime = schema.utime;
   memory.at_base.judged_sample = memory.verdicts.judged_sample = schema.last_sample_index;
@@ -286,8 +300,8 @@ ModelMonitor::EdgeTest ModelMonitor::test(const BodySchema& schema, const Edge& 
   EdgeTest result;
   std::vector<double> distances;
   for (const ActionPoseSample* sample : tests_between(first, last)) {
-    const PartObservation* from = sample->find(edge.from);
-    const PartObservation* to = sample->find(edge.to);
+    const PartObservation* from = sighting(*sample, edge.from, schema.moved_tags);
+    const PartObservation* to = sighting(*sample, edge.to, schema.moved_tags);
     if (!from || !to || !fits(schema, *sample)) continue;
     const Eigen::VectorXd theta = schema.displacements(sample->action);
     const Pose predicted = edge.predict(theta);
@@ -347,12 +361,13 @@ void ModelMonitor::judge(const body_schema_t& message) {
   health_event_t event{};
   event.utime = proposal.utime;
   event.event_sample = index;
-  event.event_from = event.event_to = event.event_part = -1;
+  event.event_from = event.event_to = event.event_part = event.event_tag = -1;
   bool is_new_base = false, is_changed = false;
   const LiveSchema* live = standing.live.get();
   // It rests on samples of a body that is no more; or it hides that it may be so.
-  bool is_passed_over = live && (live->is_in_doubt() || live->body_since() != since ||
-                                 live->schema().version > index);
+  bool is_passed_over =
+      live && (live->is_in_doubt() || live->body_since() != since ||
+               live->schema().version > index || live->schema().moved_tags != proposal.moved_tags);
   // A body that changed keeps its tree, or what is stored of it could not be put back: that of a
   // stuck joint lacks the signal by which it will move again.
   if (!is_passed_over && live && !live->schema().changes.empty())
@@ -474,7 +489,7 @@ void ModelMonitor::assess(const BodySchema& schema) const {
     const auto path = KinematicPath::between(schema, schema.root, part);
     const std::int64_t since = now_.live ? now_.live->holds_since(part) : 0;
     for (const ActionPoseSample* sample : tests) {
-      const PartObservation* seen = sample->find(part);
+      const PartObservation* seen = sighting(*sample, part, schema.moved_tags);
       if (!seen || !path || schema.root < 0 || sample->sample_index < since ||
           !fits(schema, *sample))
         continue;

@@ -48,17 +48,31 @@ void StructureLearner::on_sample(const sample_t& sample) {
 }
 
 void StructureLearner::on_body_schema(const body_schema_t& schema) {
-  known_.changes = from_message(schema).changes;
+  known_ = from_message(schema);
 }
 
 SharedSamples StructureLearner::of_this_body(std::size_t num_training, std::int64_t sample_index) {
   const std::int64_t since = known_.body_since(sample_index);
-  if (since != online_since_) {
+  std::vector<MovedTag> moved = known_.moved_tags_known(sample_index);
+  if (since != online_since_ || moved != online_moved_) {
     online_ = std::make_shared<OnlineLearner>(config_.signals, config_.options);
     online_since_ = since;
+    online_moved_ = std::move(moved);
+    usable_.clear();
   }
-  const auto end = samples_.begin() + static_cast<std::ptrdiff_t>(num_training);
-  return {std::find_if(samples_.begin(), end,
+  while (usable_.size() < num_training) {
+    const auto& sample = usable_.emplace_back(samples_[usable_.size()]);
+    const bool is_touched =
+        std::any_of(sample->parts.begin(), sample->parts.end(), [&](const PartObservation& o) {
+          return rests_on_moved_tags(o, sample->sample_index, online_moved_);
+        });
+    if (!is_touched) continue;
+    auto clean = std::make_shared<ActionPoseSample>(*sample);
+    drop_moved_tags(online_moved_, clean.get());
+    usable_.back() = std::move(clean);
+  }
+  const auto end = usable_.begin() + static_cast<std::ptrdiff_t>(num_training);
+  return {std::find_if(usable_.begin(), end,
                        [&](const auto& sample) { return sample->sample_index >= since; }),
           end};
 }
@@ -67,10 +81,12 @@ std::function<body_schema_t()> StructureLearner::take_job() {
   const Prefix prefix = pending_.front();
   pending_.pop_front();
   SharedSamples samples = of_this_body(prefix.num_training, prefix.last_sample_index);
-  return [online = online_, since = online_since_, samples = std::move(samples), prefix] {
+  return [online = online_, since = online_since_, moved = online_moved_,
+          samples = std::move(samples), prefix] {
     const int n = static_cast<int>(samples.size());
     BodySchema schema = online->learn(samples, prefix.is_test ? n : std::max(n - 1, 0));
     for (Edge& edge : schema.edges) edge.valid_since_sample = since;
+    schema.moved_tags = moved;
     schema.last_sample_index = prefix.last_sample_index;
     schema.utime = prefix.utime;
     return to_message(schema);

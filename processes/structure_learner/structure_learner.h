@@ -29,7 +29,8 @@ struct StructureLearnerConfig {
 /// never learned from; they only advance last_sample_index, so that the monitor can judge.
 ///
 /// Where the monitor found that the body changed, the samples of the body before are left out: the
-/// proposal after sample n rests on those since the change that was known at sample n.
+/// proposal after sample n rests on those since the change that was known at sample n. What rests
+/// on tags that had moved on their parts is left out likewise.
 ///
 /// A training sample is answered by the structure found before it came, a TEST sample by one that
 /// the samples so far may change: in the time that the arm takes to move, both were prepared.
@@ -79,8 +80,10 @@ class StructureLearner {
   const StructureLearnerConfig config_;
   std::shared_ptr<OnlineLearner> online_;
   std::int64_t online_since_ = 0;
-  BodySchema known_;  ///< for its changes
+  std::vector<MovedTag> online_moved_;
+  BodySchema known_;  ///< for its changes and moved tags
   SharedSamples samples_;
+  SharedSamples usable_;  ///< the first of them without what rests on online_moved_
   std::size_t num_prepared_ = 0;
   std::int64_t last_sample_index_ = -1;
   std::deque<Prefix> pending_;

@@ -278,6 +278,12 @@ body_schema_t example_body_schema() {
   change.found_sample = 32;
   change.since_sample = 30;
   fill(message.num_changes, message.changes, {change});
+  moved_tag_t tag{};
+  tag.moved_tag_id = 11;
+  tag.moved_found_sample = 34;
+  tag.moved_since_sample = 31;
+  tag.moved_until_sample = 45;
+  fill(message.num_moved_tags, message.moved_tags, {tag});
   message.noise_position_m = 0.003;
   message.noise_rotation_rad = 0.017;
   return message;
@@ -322,7 +328,7 @@ model_health_t example_model_health() {
   event.event_kind = health_event_t::EVENT_CANDIDATE;
   event.event_from = 2;
   event.event_to = 4;
-  event.event_part = -1;
+  event.event_part = event.event_tag = -1;
   event.event_cause = "joint_stuck";
   event.event_margin = 31.5;
   event.samples_used = 2;

@@ -1,5 +1,5 @@
 #!/bin/bash
-# faults.sh SOURCE BUILD: while arm7 babbles it is broken in six ways and repaired each time, by the console; each change
+# faults.sh SOURCE BUILD: while arm7 babbles it is broken in seven ways and repaired each time, by the console; each change
 # is found, named and mended by processes that are killed in between. In the end the schema is right and the report
 # shows it all.
 set -euo pipefail
@@ -70,7 +70,8 @@ break_and_repair "edge 5–6" geometry observer "bend forearm 20"
 break_and_repair "edge 7–8" geometry structure_learner "tool 1"
 break_and_repair camera camera_moved marker_estimator "camera-bump"
 break_and_repair "part 9" marker_missing model_monitor "marker-lost 32" "marker-lost 33" "marker-lost 34" "marker-lost 35"
-break_and_repair "part 8" marker_moved robot_simulator "marker-moved 28"
+break_and_repair "part 6, tag 20" marker_missing structure_learner "marker-lost 20"
+break_and_repair "part 8, tag 28" marker_moved robot_simulator "marker-moved 28"
 
 "$source/run" stop >>"$work/console.txt" 2>&1 || fail "stop"
 wait

@@ -83,8 +83,8 @@ class AdaptationTest : public testing::TestWithParam<Case> {
   RenderedRun run_;
   std::vector<health_event_t> events_;
   std::map<int, int> num_seen_;  // of a part: samples
-  int moved_marker_ = -1;  // its part is where its tags are, and these disagree
-  double error_m_ = -1;    // of the worst part, camera included, against the truth
+  int moved_marker_ = -1;        // its part is where its tags are, and these disagree
+  double error_m_ = -1;          // of the worst part, camera included, against the truth
 };
 
 TEST_P(AdaptationTest, IsFoundNamedAndMendedAndSoIsTheRepair) {
@@ -105,7 +105,8 @@ TEST_P(AdaptationTest, IsFoundNamedAndMendedAndSoIsTheRepair) {
   std::int64_t soon = kSoon;
   if (c.fault == fault_command_t::FAULT_MARKER_LOST)
     soon = std::llround(std::ceil(std::log(kFalseAlarmRate / 10) /
-                                  std::log(1 - num_seen_[c.part] / double{kBrokenAt}))) + 2;
+                                  std::log(1 - num_seen_[c.part] / double{kBrokenAt}))) +
+           2;
   if (c.fault == fault_command_t::FAULT_MARKER_MOVED) {
     soon = kRepairedAt - kBrokenAt;  // when the tag is in sight
     moved_marker_ = c.part;
@@ -130,6 +131,65 @@ TEST_P(AdaptationTest, IsFoundNamedAndMendedAndSoIsTheRepair) {
       EXPECT_LT(error_m_, 2 * healthy_m) << n << "\n" << told();
     }
   }
+}
+
+/// One of the four tags of a part, as real ones come off one by one.
+class OneTag : public AdaptationTest {
+ protected:
+  static constexpr std::int64_t kRepaired = 90, kLast = 120;
+
+  void live(std::int8_t fault, int tag) {
+    for (std::int64_t n = 0; n < kLast; ++n) {
+      if (n == kBrokenAt) run_.break_body(fault, "", tag);
+      if (n == kRepaired) run_.break_body(fault_command_t::FAULT_REPAIR);
+      ASSERT_NO_FATAL_FAILURE(step());
+      errors_m_.push_back(error_m_);
+    }
+  }
+  std::vector<const health_event_t*> events_of(int tag) const {
+    std::vector<const health_event_t*> result;
+    for (const health_event_t& event : events_)
+      if (event.event_tag == tag) result.push_back(&event);
+    return result;
+  }
+
+  std::vector<double> errors_m_;
+};
+
+TEST_F(OneTag, ThatMovedIsNamedAndLeftOutUntilItIsBack) {
+  ASSERT_NO_FATAL_FAILURE(live(fault_command_t::FAULT_MARKER_MOVED, 28));
+  const auto of_tag = events_of(28);
+  ASSERT_EQ(of_tag.size(), 2U) << told();
+  EXPECT_EQ(of_tag[0]->event_kind, health_event_t::EVENT_CANDIDATE);
+  EXPECT_EQ(of_tag[0]->event_part, 8);
+  EXPECT_EQ(of_tag[0]->event_cause, "marker_moved");
+  EXPECT_LT(of_tag[0]->event_sample, kBrokenAt + 30) << told();
+  EXPECT_EQ(of_tag[1]->event_kind, health_event_t::EVENT_RESTORED);
+  EXPECT_GE(of_tag[1]->event_sample, kRepaired);
+  const double healthy_m =
+      *std::max_element(errors_m_.begin() + kBrokenAt - kSoon, errors_m_.begin() + kBrokenAt);
+  for (std::int64_t n = of_tag[0]->event_sample; n < kLast; ++n) {
+    EXPECT_LT(errors_m_[static_cast<std::size_t>(n)], 2 * healthy_m) << n << "\n" << told();
+  }
+  for (const health_event_t& event : events_) {
+    EXPECT_TRUE(event.event_sample <= of_tag[0]->event_sample || &event == of_tag[1] ||
+                event.event_kind <= health_event_t::EVENT_SCHEMA_REFUSED)
+        << event.event_text << "\n"
+        << told();
+  }
+}
+
+TEST_F(OneTag, ThatIsLostIsNamedAndThePartIsSeenByTheOthers) {
+  ASSERT_NO_FATAL_FAILURE(live(fault_command_t::FAULT_MARKER_LOST, 28));
+  const auto of_tag = events_of(28);
+  ASSERT_EQ(of_tag.size(), 2U) << told();
+  EXPECT_EQ(of_tag[0]->event_kind, health_event_t::EVENT_MISSING);
+  EXPECT_LT(of_tag[0]->event_sample, kRepaired) << told();
+  EXPECT_EQ(of_tag[1]->event_kind, health_event_t::EVENT_RECOVERED);
+  EXPECT_GE(of_tag[1]->event_sample, kRepaired);
+  int num_of_part = 0;
+  for (const health_event_t& event : events_) num_of_part += event.event_part == 8;
+  EXPECT_LE(num_of_part, 6) << told();
 }
 
 INSTANTIATE_TEST_SUITE_P(

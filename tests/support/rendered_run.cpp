@@ -64,6 +64,7 @@ struct RenderedRun::Implementation {
     if (is_active) {
       learner.on_sample(sample);
       monitor.on_sample(sample);
+      if (monitor.schema()) learner.on_body_schema(*monitor.schema());
     }
     if (next) return next;
     // It waits for the verdict on a TEST sample.

@@ -64,6 +64,7 @@ TEST(Convert, ASampleSurvivesTheWire) {
     EXPECT_EQ(again.parts[i].covariance, sample.parts[i].covariance);
     EXPECT_EQ(again.parts[i].X_CB_other.has_value(), sample.parts[i].X_CB_other.has_value());
     EXPECT_EQ(again.parts[i].error_ratio, sample.parts[i].error_ratio);
+    EXPECT_EQ(again.parts[i].tags, sample.parts[i].tags);
   }
 }
 
@@ -88,6 +89,9 @@ TEST(Convert, ABodySchemaSurvivesTheWire) {
   }
   EXPECT_EQ(twice.parts, schema.parts);
   EXPECT_EQ(twice.noise.position_m, schema.noise.position_m);
+  ASSERT_EQ(schema.moved_tags.size(), 1U);
+  EXPECT_EQ(schema.moved_tags[0], (MovedTag{11, 34, 31, 45}));
+  EXPECT_EQ(twice.moved_tags, schema.moved_tags);
 }
 
 TEST(Convert, AParameterCovarianceKeepsFloatPrecision) {
@@ -114,6 +118,10 @@ TEST(Convert, GaussianProcessesSurviveTheWireToTheLastBit) {
   EXPECT_EQ(again.edges[2].residual_gp->variance(action),
             schema.edges[2].residual_gp->variance(action));
   EXPECT_GT(schema.edges[2].residual_gp->mean(action).norm(), 0);
+  for (const std::size_t edge : {2, 3}) {
+    EXPECT_TRUE(again.edges[edge].has_process_of(schema.edges[edge]));
+    EXPECT_FALSE(again.edges[edge].has_process_of(schema.edges[5 - edge]));
+  }
   EXPECT_TRUE(again.edges[3].matrix_gp->prediction_covariance(action).isApprox(
       schema.edges[3].matrix_gp->prediction_covariance(action), 1e-9));
 }

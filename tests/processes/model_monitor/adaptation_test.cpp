@@ -4,6 +4,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <functional>
 #include <limits>
 #include <map>
 #include <memory>
@@ -490,6 +491,102 @@ TEST(AdaptationTest, AMarkerThatFellAndLiesInSightIsMissingAndNoFault) {
   }
 }
 
+/// Every part carries four tags, one of which is in sight at a time.
+class FourTagsAPart : public testing::TestWithParam<int> {
+ protected:
+  static constexpr int kPart = 4, kTag = 41, kBroken = 100, kRepaired = 220, kEnd = 320;
+
+  /// `change` of what is seen of kTag while it is broken; false: it is not seen.
+  Life live_with(const std::function<bool(PartObservation*)>& change) {
+    Life life;
+    for (int t = 0; t < kEnd; ++t) {
+      ActionPoseSample sample = arm_.observe(t);
+      std::erase_if(sample.parts, [&](PartObservation& o) {
+        o.tags = {10 * o.part + static_cast<int>(test::uniform(rng_, 0, 4))};
+        return o.tags.front() == kTag && t >= kBroken && t < kRepaired && !change(&o);
+      });
+      for (const auto& e : adaptation_.on_sample(sample)) life.events.push_back(e);
+      life.error.push_back(arm_.error(adaptation_.schema(), t));
+    }
+    return life;
+  }
+
+  BrokenArm arm_{{Fault::kNone, "", 1}, Regime::kTagIso, 200, 1};
+  Adaptation adaptation_{arm_.engineered(), adaptation_options(Regime::kTagIso)};
+  test::Rng rng_{static_cast<std::uint64_t>(GetParam())};
+};
+
+TEST_P(FourTagsAPart, OneThatMovesIsNamedAndLeftOutUntilItIsBack) {
+  const bool has_fallen = GetParam() % 2;
+  Pose X_BS = Pose::Identity(), X_CS = Pose::Identity();
+  X_BS.translation() << 0.03, 0.04, 0;
+  X_BS.linear() = exp_so3({0, 0, 0.5});
+  X_CS.translation() << 0.4, 0.3, 1.5;
+  const Noise noise = test::nominal_noise(Regime::kTagIso);
+  const Life life = live_with([&](PartObservation* o) {
+    Vector6d error = test::gaussian6(rng_);
+    error.head<3>() *= noise.position_m;
+    error.tail<3>() *= noise.rotation_rad;
+    o->X_CB = has_fallen ? X_CS * exp(error) : o->X_CB * X_BS;
+    o->X_CB_other.reset();
+    return true;
+  });
+  SCOPED_TRACE("events:\n" + life.log());
+  const auto is_of_tag = [](const AdaptationEvent& e) { return e.tag == kTag; };
+  const auto moved = std::find_if(life.events.begin(), life.events.end(), is_of_tag);
+  ASSERT_NE(moved, life.events.end());
+  EXPECT_EQ(moved->kind, Kind::kCandidate);
+  EXPECT_EQ(moved->part, kPart);
+  EXPECT_EQ(moved->cause, "marker_moved");
+  EXPECT_LT(moved->sample_index, kBroken + 40);
+  const auto back = std::find_if(moved + 1, life.events.end(), is_of_tag);
+  ASSERT_NE(back, life.events.end());
+  EXPECT_EQ(back->kind, Kind::kRestored);
+  EXPECT_GT(back->sample_index, kRepaired);
+  EXPECT_LT(back->sample_index, kRepaired + 40);
+  // Once it is known there is peace, and the body is as it was.
+  for (auto e = moved + 1; e != life.events.end(); ++e) {
+    EXPECT_TRUE(e == back || e->sample_index == moved->sample_index) << text(*e);
+  }
+  for (const AdaptationEvent& e : life.events) {
+    EXPECT_GE(e.sample_index, kBroken) << text(e);
+  }
+  for (std::int64_t t = moved->sample_index; t < kEnd; ++t) {
+    EXPECT_NEAR(life.error[static_cast<std::size_t>(t)], life.error[kBroken - 1], 1e-3) << t;
+  }
+  ASSERT_EQ(adaptation_.moved_tags().size(), 1U);
+  const MovedTag& tag = adaptation_.moved_tags().front();
+  EXPECT_EQ(tag.tag, kTag);
+  EXPECT_GE(tag.since, kBroken);
+  EXPECT_EQ(tag.found, moved->sample_index);
+  EXPECT_EQ(tag.until, back->sample_index);
+}
+
+TEST_P(FourTagsAPart, OneThatIsLostIsNamedAndThePartIsNotMissedForLong) {
+  const Life life = live_with([](PartObservation*) { return false; });
+  SCOPED_TRACE("events:\n" + life.log());
+  int num_part_events = 0;
+  std::vector<AdaptationEvent> of_tag;
+  for (const AdaptationEvent& e : life.events) {
+    EXPECT_EQ(e.part, kPart);
+    EXPECT_EQ(e.cause, "marker_missing");
+    if (e.tag >= 0)
+      of_tag.push_back(e);
+    else
+      ++num_part_events;
+  }
+  EXPECT_LE(num_part_events, 4);  // missing and back, twice
+  ASSERT_EQ(of_tag.size(), 2U);
+  EXPECT_EQ(of_tag[0].tag, kTag);
+  EXPECT_EQ(of_tag[0].kind, Kind::kMissing);
+  EXPECT_GE(of_tag[0].sample_index, kBroken);
+  EXPECT_LT(of_tag[0].sample_index, kRepaired);
+  EXPECT_EQ(of_tag[1].kind, Kind::kRecovered);
+  EXPECT_GE(of_tag[1].sample_index, kRepaired);
+}
+
+INSTANTIATE_TEST_SUITE_P(AdaptationTest, FourTagsAPart, testing::Range(1, 9));
+
 TEST(AdaptationTest, WhatIsNeverSeenIsNotSuspected) {
   BrokenArm arm({Fault::kStuck, "", 0.919}, Regime::kTagIso, kBlock, 3);
   Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kTagIso));
@@ -645,7 +742,7 @@ TEST(AdaptationTest, AMalformedSampleIsRefusedAndChangesNothing) {
     }
     // A part that nobody knows is no error.
     ActionPoseSample more = sample;
-    more.parts.push_back({99, Pose::Identity(), Matrix6d::Identity(), std::nullopt, 0});
+    more.parts.push_back({99, Pose::Identity(), Matrix6d::Identity(), std::nullopt, 0, {}});
     for (const auto& e : disturbed.on_sample(more)) one.events.push_back(e);
     for (const auto& e : calm.on_sample(same.observe(t))) other.events.push_back(e);
   }

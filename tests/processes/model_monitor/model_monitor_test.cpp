@@ -774,7 +774,7 @@ TEST(ModelMonitorByHandTest, VerdictsThatWereTooManyToRememberAreCountedAfterARe
     health_event_t event{};
     event.event_number = n;
     event.event_sample = n - 8;
-    event.event_from = event.event_to = event.event_part = -1;
+    event.event_from = event.event_to = event.event_part = event.event_tag = -1;
     event.event_kind = health_event_t::EVENT_SCHEMA_REFUSED;
     verdicts.push_back(event);
   }

@@ -154,6 +154,45 @@ TEST_F(StructureLearnerTest, AJobIsACopyThatLaterSamplesDoNotChange) {
   EXPECT_EQ(bytes_of(first), bytes_of(learn_all({samples_.begin(), samples_.begin() + 20})));
 }
 
+TEST_F(StructureLearnerTest, WhatRestsOnAMovedTagIsLeftOutWhereThatWasKnown) {
+  constexpr int kTag = 21;
+  BodySchema known;
+  known.moved_tags = {{.tag = kTag, .found = 13, .since = 8, .until = 24}};
+  std::vector<sample_t> moved = samples_, without = samples_;
+  for (std::size_t i = 0; i < moved.size(); ++i) {
+    ActionPoseSample sample = from_message(moved[i]);
+    for (PartObservation& o : sample.parts) {
+      o.tags = {o.part == 2 && i % 2 ? kTag : 10 * o.part};
+      if (o.tags.front() == kTag && i >= 8 && i < 20) o.X_CB.translation().y() += 0.1;
+    }
+    moved[i] = to_message(sample);
+    if (i < 24) drop_moved_tags(known.moved_tags, &sample);
+    without[i] = to_message(sample);
+  }
+  StructureLearner learner(config_);
+  learner.on_body_schema(to_message(known));
+  const auto last_of = [&](std::size_t end) {
+    while (learner.last_sample_index() + 1 < static_cast<std::int64_t>(end))
+      learner.on_sample(moved[static_cast<std::size_t>(learner.last_sample_index() + 1)]);
+    body_schema_t last;
+    while (learner.has_job()) last = learner.take_job()();
+    return last;
+  };
+  const auto first = [](const std::vector<sample_t>& samples, std::ptrdiff_t n) {
+    return std::vector<sample_t>(samples.begin(), samples.begin() + n);
+  };
+  // Not known yet; known; and that it is back.
+  EXPECT_EQ(bytes_of(last_of(10)), bytes_of(learn_all(first(moved, 10))));
+  for (const int end : {20, 30}) {
+    const body_schema_t proposal = last_of(static_cast<std::size_t>(end));
+    ASSERT_EQ(proposal.num_moved_tags, 1);
+    EXPECT_EQ(proposal.moved_tags[0].moved_until_sample, end == 20 ? -1 : 24);
+    BodySchema expected = from_message(learn_all(first(without, end)));
+    expected.moved_tags = known.moved_tags_known(end - 1);
+    EXPECT_EQ(bytes_of(to_message(from_message(proposal))), bytes_of(to_message(expected)));
+  }
+}
+
 TEST_F(StructureLearnerTest, ThereIsAJobWheneverThereIsANewSampleAlsoATest) {
   StructureLearner learner(config_);
   EXPECT_FALSE(learner.has_job());

@@ -1,0 +1,100 @@
+#include "processes/model_monitor/moved_tags.h"
+
+#include <Eigen/Cholesky>
+#include <algorithm>
+
+namespace bodyschema {
+namespace {
+
+/// Squared Mahalanobis distances in six dimensions: below the one two readings are of one pose,
+/// above the other they are not (χ²₆(0.9999) = 27.9).
+constexpr double kSame = 28;
+constexpr double kOther = 100;
+/// Of the tag in the wrong place, and of others in the right one: an outlier repeats itself rarely.
+constexpr int kSightings = 3;
+
+}  // namespace
+
+MovedTags::MovedTags(const std::vector<MovedTag>& moved) {
+  for (const MovedTag& tag : moved)
+    if (tag.until < 0) lose(tag.tag);
+}
+
+bool MovedTags::has_moved(int tag) const {
+  const auto track = tracks_.find(tag);
+  return track != tracks_.end() && track->second.has_moved;
+}
+
+void MovedTags::look_back(const ActionPoseSample& sample, const BodySchema& schema,
+                          const MarkerNoise& noise) {
+  // They were not back by then, whatever the noise is now thought to be, and no other had moved.
+  for (const Finding& finding : look(sample, schema, noise))
+    if (finding.is_back)
+      tracks_[finding.tag] = {
+          .num_alike = kSightings - 1, .has_moved = true, .was_seen = finding.was_seen};
+  std::erase_if(tracks_, [](const auto& track) { return !track.second.has_moved; });
+}
+
+std::vector<MovedTags::Finding> MovedTags::look(const ActionPoseSample& sample,
+                                                const BodySchema& schema,
+                                                const MarkerNoise& noise) {
+  std::vector<Finding> findings;
+  const auto X_RB = schema.predict_all(sample.action);
+  for (const PartObservation& seen : sample.parts) {
+    const auto predicted = X_RB.find(seen.part);
+    if (seen.tags.empty() || predicted == X_RB.end()) continue;
+    const Pose X_CB = schema.X_CR * predicted->second;
+    // Of the difference of two readings.
+    const Eigen::LLT<Matrix6d> llt(2 * covariance_of(seen, noise));
+    const auto distance = [&llt](const Pose& a, const Pose& b) {
+      return llt.matrixL().solve(log(a.inverse() * b)).squaredNorm();
+    };
+    double far_off = distance(X_CB, seen.X_CB);
+    if (seen.X_CB_other) far_off = std::min(far_off, distance(X_CB, *seen.X_CB_other));
+
+    std::vector<int>& siblings = of_[seen.part];
+    for (const int tag : seen.tags)
+      if (std::find(siblings.begin(), siblings.end(), tag) == siblings.end())
+        siblings.push_back(tag);
+    if (far_off < kSame) {
+      for (const int tag : siblings) {
+        const auto track = tracks_.find(tag);
+        if (track == tracks_.end()) continue;
+        const bool is_seen = std::find(seen.tags.begin(), seen.tags.end(), tag) != seen.tags.end();
+        if (!is_seen) {
+          ++track->second.num_others;
+        } else if (!track->second.has_moved) {
+          tracks_.erase(track);
+        } else if (++track->second.num_alike == kSightings) {
+          findings.push_back(
+              {seen.part, tag, sample.sample_index, kSightings, true, track->second.was_seen});
+          tracks_.erase(track);
+        }
+      }
+    } else if (far_off > kOther && seen.tags.size() == 1) {
+      Track& track = tracks_[seen.tags.front()];
+      const Pose X_BS = X_CB.inverse() * seen.X_CB;
+      if (track.has_moved) {
+        track.num_alike = 0;
+        track.was_seen = true;
+      } else if (track.num_alike == 0 ||
+                 (distance(track.X_BS, X_BS) > kSame && distance(track.X_CB, seen.X_CB) > kSame)) {
+        track = {sample.sample_index, 1, 0, seen.X_CB, X_BS};
+      } else {
+        ++track.num_alike;
+      }
+    }
+    for (const int tag : siblings) {
+      const auto track = tracks_.find(tag);
+      if (track == tracks_.end() || track->second.has_moved ||
+          track->second.num_alike < kSightings || track->second.num_others < kSightings)
+        continue;
+      findings.push_back({seen.part, tag, track->second.since, track->second.num_alike, false});
+      track->second = {};
+      track->second.has_moved = true;
+    }
+  }
+  return findings;
+}
+
+}  // namespace bodyschema

@@ -1,0 +1,56 @@
+#pragma once
+
+#include <cstdint>
+#include <map>
+#include <vector>
+
+#include "common/schema/body_schema.h"
+#include "common/schema/sample.h"
+#include "processes/model_monitor/tree_filter.h"
+
+namespace bodyschema {
+
+/// Finds tags that moved on their part, or fell off it and lie in sight, where others of the part
+/// stayed. The part is then seen now here and now there, by which of them the camera sees; no
+/// change of the body explains that. A tag has moved once it was seen in one wrong place again and
+/// again (on the part, or lying in the room), never in the right one, and other tags of the part
+/// meanwhile in theirs. Once it is seen there again, it is back; so with a tag that was lost, which
+/// may have been put elsewhere.
+class MovedTags {
+ public:
+  /// `moved`: those known already.
+  explicit MovedTags(const std::vector<MovedTag>& moved);
+
+  struct Finding {
+    int part = 0;
+    int tag = 0;
+    std::int64_t since = 0;  ///< first sample that showed it there
+    int num_sightings = 0;
+    bool is_back = false;  ///< it is where it was
+    bool was_seen = true;  ///< in the wrong place; else it was lost
+  };
+  /// `schema`: the body before anything was wrong.
+  std::vector<Finding> look(const ActionPoseSample& sample, const BodySchema& schema,
+                            const MarkerNoise& noise);
+  /// Samples of the past: what they say of those known.
+  void look_back(const ActionPoseSample& sample, const BodySchema& schema,
+                 const MarkerNoise& noise);
+  /// It is not seen any more.
+  void lose(int tag) { tracks_[tag] = {.has_moved = true}; }
+  bool has_moved(int tag) const;
+
+ private:
+  struct Track {
+    std::int64_t since = 0;  ///< of the present run of sightings alike
+    int num_alike = 0;       ///< in the wrong place or, once moved, in the right one
+    int num_others = 0;      ///< sightings of the part by its other tags, in the right place
+    /// The first of that run: the part as seen; and in its own frame.
+    Pose X_CB = Pose::Identity(), X_BS = Pose::Identity();
+    bool has_moved = false;
+    bool was_seen = false;  ///< since then, in the wrong place
+  };
+  std::map<int, Track> tracks_;         ///< by tag
+  std::map<int, std::vector<int>> of_;  ///< the tags of every part that were seen
+};
+
+}  // namespace bodyschema
