@@ -27,6 +27,8 @@ constexpr int kFewestSoft = 3;
 constexpr double kTurnedOver_rad = 120 * M_PI / 180;
 /// Samples after a replacement at which all forms are tried again.
 constexpr int kRefits[] = {1, 2, 3, 4, 5, 7, 11, 19, 30};
+/// Samples up to which a change may turn out to be one of what is next to its place.
+constexpr int kUnsure = 5;
 /// Samples from one fit of what has settled to the next.
 constexpr int kMaturing = 10;
 /// Changes that begin within so many samples of each other are one event.
@@ -355,16 +357,19 @@ std::vector<Adaptation::Place> Adaptation::suspects() const {
   };
   for (std::size_t n = 0; n < scored.size() && n < 4; ++n)
     if (scored[n].value > options_.suspicion) add(scored[n].place);
-  if (!scored.empty() && scored[0].value > options_.suspicion) {
-    const int node = filter_->node_of(scored[0].place.part);
-    add({scored[0].place.part, false});
-    add({scored[0].place.part, true});
-    if (filter_->parent(node) >= 0) {
-      add({filter_->part(filter_->parent(node)), false});
-      add({filter_->part(filter_->parent(node)), true});
-    }
-    for (const int child : filter_->children(node)) add({filter_->part(child), false});
+  if (!scored.empty() && scored[0].value > options_.suspicion)
+    for (const Place& place : around(scored[0].place.part)) add(place);
+  return places;
+}
+
+std::vector<Adaptation::Place> Adaptation::around(int part) const {
+  std::vector<Place> places{{part, false}, {part, true}};
+  const int node = filter_->node_of(part);
+  if (const int parent = filter_->parent(node); parent >= 0) {
+    places.push_back({filter_->part(parent), false});
+    places.push_back({filter_->part(parent), true});
   }
+  for (const int child : filter_->children(node)) places.push_back({filter_->part(child), false});
   return places;
 }
 
@@ -433,7 +438,8 @@ Adaptation::Choice Adaptation::choose(const BodySchema& standing, const std::vec
     int num_different = differ_at(standing, with, standing.root);
     for (const Edge& edge : with.edges) num_different += differ_at(standing, with, edge.to);
     if (num_different < 2) continue;
-    all.log_evidence = all.change.log_odds() + log_likelihood(with, noise_, samples);
+    all.log_prior = all.change.log_odds();
+    all.log_evidence = all.log_prior + log_likelihood(with, noise_, samples);
     all.num_usable = 1;
     // It is wherever it makes a difference, first where that was suspected: an outlier elsewhere
     // may be the greatest suspicion.
@@ -613,7 +619,14 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
   // one that ends: what stood before it, again.
   const bool ends = fitted.change.form == BodyChange::Form::kStored && since > since_ &&
                     !differ_at(with_change(schema_, fitted), before_, choice.best->place.part);
-  if (replacements_.empty() || since - since_ > kTogether || fitted.everywhere || ends) {
+  // So is one that stood alone for a while: samples from then speak against the new one.
+  std::vector<const ActionPoseSample*> earlier = segment(since_, options_.longest_segment);
+  std::erase_if(earlier, [&](const auto* sample) { return sample->sample_index >= since; });
+  const bool began_later =
+      !replacements_.empty() && log_likelihood(with_change(schema_, fitted), noise_, earlier) <
+                                    log_likelihood(schema_, noise_, earlier) - options_.ambiguity;
+  if (replacements_.empty() || since - since_ > kTogether || fitted.everywhere || ends ||
+      began_later) {
     before_ = schema_;
     replacements_.clear();
     maturing_.clear();
@@ -703,10 +716,39 @@ void Adaptation::try_learning(std::int64_t sample_index, std::vector<AdaptationE
   install(composed());
 }
 
+bool Adaptation::reconsider_as_one(const std::vector<const ActionPoseSample*>& samples,
+                                   std::int64_t sample_index,
+                                   std::vector<AdaptationEvent>* events) {
+  const auto is_kept = [](const Replacement& r) {
+    return !r.also.empty() || r.fitted.everywhere || r.fitted.change.is_learned();
+  };
+  if (replacements_.empty() || std::any_of(replacements_.begin(), replacements_.end(), is_kept) ||
+      (replacements_.size() == 1 && age_ > kUnsure))
+    return false;
+  std::vector<Place> places;
+  double standing = log_likelihood(composed(), noise_, samples);
+  for (const Replacement& r : replacements_) {
+    standing += r.fitted.log_prior;
+    for (const Place& place : around(r.place.part))
+      if (std::find(places.begin(), places.end(), place) == places.end()) places.push_back(place);
+  }
+  if (replacements_.size() == 1) std::erase(places, replacements_.front().place);
+  Choice one = choose(before_, places, samples);
+  credit_ -= one.work;
+  if (!one.best || one.best->fitted.log_evidence < standing + options_.ambiguity) return false;
+  for (const Replacement& r : replacements_)
+    tell(AdaptationEvent::Kind::kReverted, sample_index, r, 0, 0, events);
+  tell(AdaptationEvent::Kind::kRefined, sample_index, *one.best, one.margin(),
+       static_cast<int>(samples.size()), events);
+  replacements_ = {std::move(*one.best)};
+  return true;
+}
+
 void Adaptation::reconsider(std::int64_t sample_index, bool all_forms,
                             std::vector<AdaptationEvent>* events) {
   const auto samples = segment(
       since_, age_ > options_.settled_after ? options_.matured_after : options_.longest_segment);
+  const bool is_another = all_forms && reconsider_as_one(samples, sample_index, events);
   const int rounds = replacements_.size() > 1 ? 3 : 1;
   for (int round = 0; round < rounds; ++round) {
     bool is_changed = false;
@@ -753,7 +795,7 @@ void Adaptation::reconsider(std::int64_t sample_index, bool all_forms,
   }
   const std::vector<Cusum> edges = edges_, markers = markers_;
   install(composed());
-  if (age_ > 0) {
+  if (age_ > 0 && !is_another) {
     edges_ = edges;
     markers_ = markers;
   }
@@ -872,11 +914,11 @@ void Adaptation::watch_tags(ActionPoseSample* sample, std::vector<AdaptationEven
   if (num_samples_ >= options_.calibration_samples) {
     for (const MovedTags::Finding& finding : tags_.look(*sample, trusted_, noise_)) {
       using Kind = AdaptationEvent::Kind;
-      const Kind back = finding.was_seen ? Kind::kRestored : Kind::kRecovered;
-      AdaptationEvent told = event(finding.is_back ? back : Kind::kCandidate, sample->sample_index,
-                                   {finding.part, true});
+      const Kind kind = finding.is_back ? (finding.is_on_part ? Kind::kRestored : Kind::kRecovered)
+                                        : (finding.is_on_part ? Kind::kCandidate : Kind::kMissing);
+      AdaptationEvent told = event(kind, sample->sample_index, {finding.part, true});
       told.tag = finding.tag;
-      told.cause = finding.was_seen ? "marker_moved" : "marker_missing";
+      told.cause = finding.is_on_part ? "marker_moved" : "marker_missing";
       told.num_samples = finding.num_sightings;
       events->push_back(std::move(told));
       if (finding.is_back) {
@@ -981,6 +1023,7 @@ void Adaptation::follow(std::int64_t sample_index, std::vector<AdaptationEvent>*
       tell(AdaptationEvent::Kind::kRecovered, sample_index, r, 0, age_, events);
     remember(schema_);
     trusted_ = schema_;
+    tags_.begin_anew();
     // Of a drift, which may look like small changes, the mean of many samples is not what is now.
     const bool any_small = std::any_of(replacements_.begin(), replacements_.end(),
                                        [](const Replacement& r) { return r.fitted.change.small; });
@@ -1052,6 +1095,7 @@ void Adaptation::watch_drift(std::int64_t sample_index, std::vector<AdaptationEv
   drift_watch_.forget(*drifting_, sample_index);
   remember(schema_);
   trusted_ = schema_;
+  tags_.begin_anew();
   drifting_.reset();
 }
 
@@ -1087,7 +1131,9 @@ std::vector<AdaptationEvent> Adaptation::on_new_sample(ActionPoseSample sample) 
   if (num_samples_ >= options_.calibration_samples) drop_fallen(&sample, &events);
   watch_visibility(seen, sample, &events);
   for (const AdaptationEvent& event : events) {
-    if (event.kind != AdaptationEvent::Kind::kMissing || event.tag < 0) continue;
+    if (event.kind != AdaptationEvent::Kind::kMissing || event.tag < 0 ||
+        tags_.has_moved(event.tag))
+      continue;
     tags_.lose(event.tag);
     set_aside(event.tag, event.sample_index - event.num_samples + 1, event.sample_index);
   }
@@ -1109,6 +1155,14 @@ std::vector<AdaptationEvent> Adaptation::on_new_sample(ActionPoseSample sample) 
     mature(sample.sample_index);
   try_changes(sample.sample_index, &events);
   try_learning(sample.sample_index, &events);
+  // A body that moves otherwise shows other sides of its parts.
+  const auto is_change = [](const AdaptationEvent& e) {
+    return e.tag < 0 && (e.kind == AdaptationEvent::Kind::kCandidate ||
+                         e.kind == AdaptationEvent::Kind::kRestored);
+  };
+  if (std::any_of(events.begin(), events.end(), is_change))
+    for (auto& [part, tags] : visibility_)
+      std::erase_if(tags, [](const auto& of_tag) { return of_tag.first != kAnyTag; });
   if (!replacements_.empty()) {
     drifting_.reset();
     for (const Replacement& r : replacements_)

@@ -151,6 +151,8 @@ class Adaptation {
   TreeFilter::Judgement update_tests(const TreeFilter::Instant& instant, std::int64_t sample_index);
   std::vector<const ActionPoseSample*> segment(std::int64_t since, int longest) const;
   std::vector<Place> suspects() const;
+  /// A part's places and those next to it.
+  std::vector<Place> around(int part) const;
   struct Choice {
     std::optional<Replacement> best;
     double null = 0;  ///< log-likelihood of the schema as it stands
@@ -172,6 +174,9 @@ class Adaptation {
   /// Learns an edge anew of which no family of changes was right.
   void try_learning(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
   void reconsider(std::int64_t sample_index, bool all_forms, std::vector<AdaptationEvent>* events);
+  /// One change, in the places of those that stand or next to them, may explain more.
+  bool reconsider_as_one(const std::vector<const ActionPoseSample*>& samples,
+                         std::int64_t sample_index, std::vector<AdaptationEvent>* events);
   void want_probe(const BodySchema& standing, const Choice& choice, std::int64_t sample_index,
                   std::vector<AdaptationEvent>* events);
   void drop_turned_over(ActionPoseSample* sample) const;

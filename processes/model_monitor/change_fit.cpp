@@ -398,8 +398,8 @@ FittedChange PlaceEvidence::judge_stored(const BodySchema& schema) const {
   result.theta.resize(0);
   result.schema = schema;
   result.num_usable = num_usable();
-  result.log_evidence =
-      result.change.log_odds() + log_likelihood(schema, noise_, samples_, cut_parts_);
+  result.log_prior = result.change.log_odds();
+  result.log_evidence = result.log_prior + log_likelihood(schema, noise_, samples_, cut_parts_);
   return result;
 }
 

@@ -139,7 +139,8 @@ std::vector<health_event_t> LiveSchema::on_sample(const ActionPoseSample& sample
     if ((event.kind == Kind::kCandidate || event.kind == Kind::kRestored) && event.tag < 0)
       changed_since = adaptation_.since();
     // What the tag was taken for was no change.
-    if (event.kind == Kind::kCandidate && event.tag >= 0) unchanged_part = event.part;
+    if ((event.kind == Kind::kCandidate || event.kind == Kind::kMissing) && event.tag >= 0)
+      unchanged_part = event.part;
     if (event.kind == Kind::kDrift) changed_since = sample.sample_index;
     if (event.kind == Kind::kProbeWanted) {
       probe_sample_ = event.sample_index;

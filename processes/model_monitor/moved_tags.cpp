@@ -31,7 +31,11 @@ void MovedTags::look_back(const ActionPoseSample& sample, const BodySchema& sche
   for (const Finding& finding : look(sample, schema, noise))
     if (finding.is_back)
       tracks_[finding.tag] = {
-          .num_alike = kSightings - 1, .has_moved = true, .was_seen = finding.was_seen};
+          .num_alike = kSightings - 1, .has_moved = true, .is_on_part = finding.is_on_part};
+  begin_anew();
+}
+
+void MovedTags::begin_anew() {
   std::erase_if(tracks_, [](const auto& track) { return !track.second.has_moved; });
 }
 
@@ -67,31 +71,29 @@ std::vector<MovedTags::Finding> MovedTags::look(const ActionPoseSample& sample,
           tracks_.erase(track);
         } else if (++track->second.num_alike == kSightings) {
           findings.push_back(
-              {seen.part, tag, sample.sample_index, kSightings, true, track->second.was_seen});
+              {seen.part, tag, sample.sample_index, kSightings, track->second.is_on_part, true});
           tracks_.erase(track);
         }
       }
     } else if (far_off > kOther && seen.tags.size() == 1) {
       Track& track = tracks_[seen.tags.front()];
       const Pose X_BS = X_CB.inverse() * seen.X_CB;
+      const bool is_alike_on_part = distance(track.X_BS, X_BS) < kSame;
+      const bool is_alike_in_room = distance(track.X_CB, seen.X_CB) < kSame;
       if (track.has_moved) {
         track.num_alike = 0;
-        track.was_seen = true;
-      } else if (track.num_alike == 0 ||
-                 (distance(track.X_BS, X_BS) > kSame && distance(track.X_CB, seen.X_CB) > kSame)) {
+        track.is_on_part |= is_alike_on_part && !is_alike_in_room;
+        track.X_BS = X_BS;
+        track.X_CB = seen.X_CB;
+      } else if (track.num_alike == 0 || !(is_alike_on_part || is_alike_in_room)) {
         track = {sample.sample_index, 1, 0, seen.X_CB, X_BS};
-      } else {
-        ++track.num_alike;
+      } else if (++track.num_alike >= kSightings && track.num_others >= kSightings) {
+        findings.push_back(
+            {seen.part, seen.tags.front(), track.since, track.num_alike, is_alike_on_part});
+        track.has_moved = true;
+        track.is_on_part = is_alike_on_part;
+        track.num_alike = 0;
       }
-    }
-    for (const int tag : siblings) {
-      const auto track = tracks_.find(tag);
-      if (track == tracks_.end() || track->second.has_moved ||
-          track->second.num_alike < kSightings || track->second.num_others < kSightings)
-        continue;
-      findings.push_back({seen.part, tag, track->second.since, track->second.num_alike, false});
-      track->second = {};
-      track->second.has_moved = true;
     }
   }
   return findings;

@@ -14,8 +14,8 @@ namespace bodyschema {
 /// stayed. The part is then seen now here and now there, by which of them the camera sees; no
 /// change of the body explains that. A tag has moved once it was seen in one wrong place again and
 /// again (on the part, or lying in the room), never in the right one, and other tags of the part
-/// meanwhile in theirs. Once it is seen there again, it is back; so with a tag that was lost, which
-/// may have been put elsewhere.
+/// in between in theirs. Once it is seen there again, it is back; so with a tag that was lost,
+/// which may have been put elsewhere.
 class MovedTags {
  public:
   /// `moved`: those known already.
@@ -26,8 +26,8 @@ class MovedTags {
     int tag = 0;
     std::int64_t since = 0;  ///< first sample that showed it there
     int num_sightings = 0;
-    bool is_back = false;  ///< it is where it was
-    bool was_seen = true;  ///< in the wrong place; else it was lost
+    bool is_on_part = false;  ///< moved on it; else it was lost, and maybe lies in sight
+    bool is_back = false;     ///< it is where it was
   };
   /// `schema`: the body before anything was wrong.
   std::vector<Finding> look(const ActionPoseSample& sample, const BodySchema& schema,
@@ -35,6 +35,8 @@ class MovedTags {
   /// Samples of the past: what they say of those known.
   void look_back(const ActionPoseSample& sample, const BodySchema& schema,
                  const MarkerNoise& noise);
+  /// Another schema than before is right: of those that are in their places nothing is known.
+  void begin_anew();
   /// It is not seen any more.
   void lose(int tag) { tracks_[tag] = {.has_moved = true}; }
   bool has_moved(int tag) const;
@@ -47,7 +49,7 @@ class MovedTags {
     /// The first of that run: the part as seen; and in its own frame.
     Pose X_CB = Pose::Identity(), X_BS = Pose::Identity();
     bool has_moved = false;
-    bool was_seen = false;  ///< since then, in the wrong place
+    bool is_on_part = false;  ///< and moves with it
   };
   std::map<int, Track> tracks_;         ///< by tag
   std::map<int, std::vector<int>> of_;  ///< the tags of every part that were seen

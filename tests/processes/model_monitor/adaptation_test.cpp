@@ -535,13 +535,14 @@ TEST_P(FourTagsAPart, OneThatMovesIsNamedAndLeftOutUntilItIsBack) {
   const auto is_of_tag = [](const AdaptationEvent& e) { return e.tag == kTag; };
   const auto moved = std::find_if(life.events.begin(), life.events.end(), is_of_tag);
   ASSERT_NE(moved, life.events.end());
-  EXPECT_EQ(moved->kind, Kind::kCandidate);
+  EXPECT_EQ(moved->kind, has_fallen ? Kind::kMissing : Kind::kCandidate);
   EXPECT_EQ(moved->part, kPart);
-  EXPECT_EQ(moved->cause, "marker_moved");
+  EXPECT_EQ(moved->cause, has_fallen ? "marker_missing" : "marker_moved");
   EXPECT_LT(moved->sample_index, kBroken + 40);
   const auto back = std::find_if(moved + 1, life.events.end(), is_of_tag);
   ASSERT_NE(back, life.events.end());
-  EXPECT_EQ(back->kind, Kind::kRestored);
+  EXPECT_EQ(back->kind, has_fallen ? Kind::kRecovered : Kind::kRestored);
+  EXPECT_EQ(back->cause, moved->cause);
   EXPECT_GT(back->sample_index, kRepaired);
   EXPECT_LT(back->sample_index, kRepaired + 40);
   // Once it is known there is peace, and the body is as it was.
