@@ -4,7 +4,9 @@
 
 #include <algorithm>
 #include <cmath>
+#include <stdexcept>
 
+#include "common/bus/event_log.h"
 #include "common/config/yaml.h"
 
 namespace bodyschema {
@@ -112,6 +114,22 @@ std::string RigDoor::objection(const model_health_t& health) const {
     if (why_not.empty()) why_not = objection_to_part(part.health_part);
   }
   return why_not;
+}
+
+body_schema_t RigDoor::load_initial_schema(const std::filesystem::path& file) const {
+  std::vector<body_schema_t> schemas = read_log(file, kBodySchema);
+  if (schemas.empty()) throw std::runtime_error(file.string() + ": no BODY_SCHEMA in the file");
+  body_schema_t schema = std::move(schemas.back());
+  if (schema.signals.size() == signals_.signals.size()) {
+    for (std::size_t s = 0; s < schema.signals.size(); ++s) {
+      if (!schema.signals[s].warp_weights.empty()) continue;
+      schema.signals[s].lower_limit = signals_.signals[s].lower;
+      schema.signals[s].upper_limit = signals_.signals[s].upper;
+    }
+  }
+  if (const std::string why = objection(schema); !why.empty())
+    throw std::runtime_error(file.string() + ": " + why);
+  return schema;
 }
 
 std::string RigDoor::objection(const sim_state_t& state) const {

@@ -38,6 +38,12 @@ class RigDoor {
   std::string objection(const model_health_t& health) const;
   std::string objection(const sim_state_t& state) const;
 
+  /// The newest BODY_SCHEMA of a file, to begin with. What was learned from a recording has that
+  /// recording's limits of the signals: the rig's replace them, unless something is said in their
+  /// terms (a warp).
+  /// @throws std::runtime_error if there is none or it is of another rig.
+  body_schema_t load_initial_schema(const std::filesystem::path& file) const;
+
   /// Subscribes behind the door: what it objects to is counted as "refused CHANNEL", said once a
   /// channel, and not handled. The door must outlive the bus's use of it.
   template <class Message>

@@ -5,7 +5,9 @@
 #include <CLI/CLI.hpp>
 #include <algorithm>
 #include <array>
+#include <cerrno>
 #include <cmath>
+#include <cstring>
 #include <filesystem>
 #include <iostream>
 #include <memory>
@@ -13,6 +15,7 @@
 
 #include "common/bus/convert.h"
 #include "common/bus/event_log.h"
+#include "common/bus/rig_door.h"
 #include "common/config/rig.h"
 #include "processes/console/evaluation.h"
 #include "processes/console/recording.h"
@@ -130,6 +133,7 @@ struct RigArguments {
   std::optional<int> hidden_part;
   std::vector<std::string> group;
   std::string host;
+  std::string initial;
 };
 
 /// This machine's name if the rig has a host of that name. Where the group is not split: "all".
@@ -149,6 +153,7 @@ void run_rig(const RigArguments& arguments) {
                                 std::to_string(*arguments.hidden_part));
   }
   load_signals(folder);
+  if (!arguments.initial.empty()) RigDoor(folder).load_initial_schema(arguments.initial);
   const Network network = load_network(folder, arguments.group);
   const std::string host = arguments.host.empty() ? own_host(network) : arguments.host;
   std::cout << (network.is_private ? "private " : "host ") << network.bus_url() << ' '
@@ -183,6 +188,10 @@ void check_out(const std::string& out, const std::vector<std::string>& inputs) {
   for (const std::string& input : inputs)
     if (!out.empty() && std::filesystem::equivalent(out, input, is_new) && !is_new)
       throw std::invalid_argument("--out: " + out + " is an input itself: " + input);
+  if (out.empty()) return;
+  const std::filesystem::path folder = std::filesystem::absolute(out).parent_path();
+  if (::access(folder.c_str(), W_OK | X_OK) != 0)
+    throw std::invalid_argument("--out: cannot write " + out + ": " + std::strerror(errno));
 }
 
 void add_offline_commands(CLI::App& console) {
@@ -233,6 +242,7 @@ void add_offline_commands(CLI::App& console) {
   rig->add_option("--hide", checking->hidden_part, "A part that is to be hidden: is there one?");
   rig->add_option("--group", checking->group, "All processes; each must run on exactly one host");
   rig->add_option("--host", checking->host, "Host of network.yaml; this machine if not given");
+  rig->add_option("--initial", checking->initial, "A schema to begin with: is it of this rig?");
   rig->callback([checking] { run_rig(*checking); });
 }
 

@@ -1179,6 +1179,7 @@ std::vector<AdaptationEvent> Adaptation::on_new_sample(ActionPoseSample sample) 
     trouble_.reset();
   }
   if (is_settled() && suspects().empty()) watch_noise(judgement);
+  schema_.moved_tags = moved_tags_;
   return events;
 }
 

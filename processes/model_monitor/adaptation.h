@@ -111,9 +111,6 @@ class Adaptation {
   const MarkerNoise& noise() const { return noise_; }
   /// Parts whose markers have not been seen for longer than chance explains.
   std::vector<int> missing_parts() const;
-  /// Tags that moved, or were lost, where others of their part stayed: what rests on them is left
-  /// out until they are seen in their places again.
-  const std::vector<MovedTag>& moved_tags() const { return moved_tags_; }
   bool is_drifting(int part) const { return drifting_ == part; }
   /// First sample with the body as changed by the replacements that have not settled.
   std::int64_t since() const { return stream_.sample_index_of(since_); }
@@ -221,6 +218,8 @@ class Adaptation {
   std::map<int, std::map<int, Visibility>> visibility_;  ///< by part and tag; −1: any tag of it
   FallenMarkers fallen_;
   MovedTags tags_;
+  /// Tags that moved, or were lost, where others of their part stayed: what rests on them is left
+  /// out until they are seen in their places again. schema_ has them, too.
   std::vector<MovedTag> moved_tags_;
   BodySchema trusted_;  ///< what settled last
   SampleStream stream_;

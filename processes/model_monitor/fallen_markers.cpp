@@ -1,14 +1,11 @@
 #include "processes/model_monitor/fallen_markers.h"
 
-#include <Eigen/Cholesky>
+#include "processes/model_monitor/reading_distance.h"
 
 namespace bodyschema {
 namespace {
 
-/// Squared Mahalanobis distances in six dimensions: below the one two readings are of one pose,
-/// above the other they are not (χ²₆(0.9999) = 27.9).
-constexpr double kSame = 28;
-constexpr double kOther = 100;
+constexpr double kSame = ReadingDistance::kSame, kOther = ReadingDistance::kOther;
 /// Two readings of a wrong pose may agree by chance or by a bias of the view.
 constexpr int kRepetitions = 2;
 
@@ -19,11 +16,7 @@ std::optional<std::int64_t> FallenMarkers::look(const ActionPoseSample& sample, 
   const PartObservation* seen = sample.find(part);
   const auto known = far_off_.find(part);
   if (seen) {
-    // Of the difference of two readings.
-    const Eigen::LLT<Matrix6d> llt(2 * covariance_of(*seen, noise));
-    const auto distance = [&llt](const Pose& a, const Pose& b) {
-      return llt.matrixL().solve(log(a.inverse() * b)).squaredNorm();
-    };
+    const ReadingDistance distance(covariance_of(*seen, noise));
     if (distance(X_CB, seen->X_CB) < kOther) {
       if (known != far_off_.end()) far_off_.erase(known);
       return std::nullopt;

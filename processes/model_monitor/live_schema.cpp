@@ -170,7 +170,6 @@ void LiveSchema::watch_flips(const ActionPoseSample& sample) {
 void LiveSchema::update(const ActionPoseSample& sample, std::optional<std::int64_t> changed_since,
                         std::optional<int> unchanged_part) {
   BodySchema next = adaptation_.schema();
-  next.moved_tags = adaptation_.moved_tags();
   for (std::size_t e = 0; e < next.edges.size(); ++e) {
     Edge& edge = next.edges[e];
     const Edge &before = schema_.edges[e], &original = base_.edges[e];

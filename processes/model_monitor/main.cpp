@@ -8,11 +8,9 @@
 #include <utility>
 #include <vector>
 
-#include "common/bus/event_log.h"
 #include "common/bus/process.h"
 #include "common/bus/rig_door.h"
 #include "common/bus/sample_intake.h"
-#include "common/config/rig.h"
 #include "processes/model_monitor/model_monitor.h"
 #include "processes/model_monitor/monitor_memory.h"
 #include "processes/model_monitor/saved_message.h"
@@ -24,17 +22,6 @@ namespace {
 /// "" where there is no file.
 std::filesystem::path beside(const std::filesystem::path& file, const char* name) {
   return file.empty() ? file : std::filesystem::path(file).replace_filename(name);
-}
-
-/// What was learned from a recording has that recording's limits: the rig's replace them, unless
-/// something is said in their terms (a warp).
-void take_limits(const Signals& rig, body_schema_t* schema) {
-  if (schema->signals.size() != rig.signals.size()) return;
-  for (std::size_t s = 0; s < rig.signals.size(); ++s) {
-    if (!schema->signals[s].warp_weights.empty()) continue;
-    schema->signals[s].lower_limit = rig.signals[s].lower;
-    schema->signals[s].upper_limit = rig.signals[s].upper;
-  }
 }
 
 }  // namespace
@@ -68,15 +55,10 @@ int main(int argc, char** argv) {
       } else if (schema) {
         monitor.start_from(*schema);
       } else if (!initial_file.empty()) {
-        std::vector<body_schema_t> initial = read_log(initial_file, kBodySchema);
-        if (initial.empty())
-          throw std::runtime_error(initial_file + ": no BODY_SCHEMA in the file");
-        take_limits(load_signals(process.rig_folder()), &initial.back());
-        if (const std::string why = door.objection(initial.back()); !why.empty())
-          throw std::runtime_error(initial_file + ": " + why);
-        initial.back().last_sample_index = -1;
-        initial.back().schema_version = 0;
-        monitor.start_from(initial.back());
+        body_schema_t initial = door.load_initial_schema(initial_file);
+        initial.last_sample_index = -1;
+        initial.schema_version = 0;
+        monitor.start_from(initial);
       }
     }
     bool is_news = false;

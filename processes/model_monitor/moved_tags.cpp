@@ -1,15 +1,13 @@
 #include "processes/model_monitor/moved_tags.h"
 
-#include <Eigen/Cholesky>
 #include <algorithm>
+
+#include "processes/model_monitor/reading_distance.h"
 
 namespace bodyschema {
 namespace {
 
-/// Squared Mahalanobis distances in six dimensions: below the one two readings are of one pose,
-/// above the other they are not (χ²₆(0.9999) = 27.9).
-constexpr double kSame = 28;
-constexpr double kOther = 100;
+constexpr double kSame = ReadingDistance::kSame, kOther = ReadingDistance::kOther;
 /// Of the tag in the wrong place, and of others in the right one: an outlier repeats itself rarely.
 constexpr int kSightings = 3;
 
@@ -48,11 +46,7 @@ std::vector<MovedTags::Finding> MovedTags::look(const ActionPoseSample& sample,
     const auto predicted = X_RB.find(seen.part);
     if (seen.tags.empty() || predicted == X_RB.end()) continue;
     const Pose X_CB = schema.X_CR * predicted->second;
-    // Of the difference of two readings.
-    const Eigen::LLT<Matrix6d> llt(2 * covariance_of(seen, noise));
-    const auto distance = [&llt](const Pose& a, const Pose& b) {
-      return llt.matrixL().solve(log(a.inverse() * b)).squaredNorm();
-    };
+    const ReadingDistance distance(covariance_of(seen, noise));
     double far_off = distance(X_CB, seen.X_CB);
     if (seen.X_CB_other) far_off = std::min(far_off, distance(X_CB, *seen.X_CB_other));
 

@@ -544,6 +544,12 @@ TEST_F(BodyschemaProgramTest, RigPrintsTheNetworkOfAGoodRigOnly) {
   EXPECT_EQ(images.rfind("udpm://", 0), 0U);
   EXPECT_NE(bus, images);
   expect_failure({"rig", "."}, "yaml: cannot be read");
+  run({"learn", write_robot("robot.csv"), "--out", "schema.lcmlog"});
+  EXPECT_EQ(run({"rig", std::string(BODYSCHEMA_CONFIG) + "/arm2", "--initial", "schema.lcmlog"})
+                .exit_code,
+            0);
+  expect_failure({"rig", std::string(BODYSCHEMA_CONFIG) + "/arm7", "--initial", "schema.lcmlog"},
+                 "schema.lcmlog: it has 2 action signals");
 }
 
 /// Recordings of others, read where they lie; the project keeps no copy.
@@ -837,6 +843,8 @@ TEST_F(BodyschemaProgramTest, MonitorRefusesWhatDoesNotBelongTogether) {
   expect_failure({"monitor", "schema.lcmlog", other}, "other.csv: the signals of the samples are");
   expect_failure({"monitor", "schema.lcmlog", csv, "--evaluate", other}, "other.csv");
   expect_failure({"monitor", "schema.lcmlog", csv, "--out", csv}, "--out");
+  expect_failure({"monitor", "schema.lcmlog", csv, "--out", "no such folder/out.lcmlog"},
+                 "cannot write no such");
   expect_failure({"monitor", csv, csv}, "robot.csv");
 }
 

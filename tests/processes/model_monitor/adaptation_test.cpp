@@ -555,8 +555,8 @@ TEST_P(FourTagsAPart, OneThatMovesIsNamedAndLeftOutUntilItIsBack) {
   for (std::int64_t t = moved->sample_index; t < kEnd; ++t) {
     EXPECT_NEAR(life.error[static_cast<std::size_t>(t)], life.error[kBroken - 1], 1e-3) << t;
   }
-  ASSERT_EQ(adaptation_.moved_tags().size(), 1U);
-  const MovedTag& tag = adaptation_.moved_tags().front();
+  ASSERT_EQ(adaptation_.schema().moved_tags.size(), 1U);
+  const MovedTag& tag = adaptation_.schema().moved_tags.front();
   EXPECT_EQ(tag.tag, kTag);
   EXPECT_GE(tag.since, kBroken);
   EXPECT_EQ(tag.found, moved->sample_index);
