@@ -31,8 +31,10 @@ constexpr int kRefits[] = {1, 2, 3, 4, 5, 7, 11, 19, 30};
 constexpr int kUnsure = 5;
 /// Samples from one fit of what has settled to the next.
 constexpr int kMaturing = 10;
-/// Changes that begin within so many samples of each other are one event.
+/// Changes that begin within so many samples of each other are one event …
 constexpr std::int64_t kTogether = 12;
+/// … unless so many samples, which the first explains, speak against the second.
+constexpr std::size_t kStoodAlone = 4;
 
 /// From so many samples on a change keeps its form unless another explains clearly more of the
 /// evidence.
@@ -622,9 +624,9 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
   // So is one that stood alone for a while: samples from then speak against the new one.
   std::vector<const ActionPoseSample*> earlier = segment(since_, options_.longest_segment);
   std::erase_if(earlier, [&](const auto* sample) { return sample->sample_index >= since; });
-  const bool began_later =
-      !replacements_.empty() && log_likelihood(with_change(schema_, fitted), noise_, earlier) <
-                                    log_likelihood(schema_, noise_, earlier) - options_.ambiguity;
+  const bool began_later = !replacements_.empty() && earlier.size() >= kStoodAlone &&
+                           log_likelihood(with_change(schema_, fitted), noise_, earlier) <
+                               log_likelihood(schema_, noise_, earlier) - 4 * options_.acceptance;
   if (replacements_.empty() || since - since_ > kTogether || fitted.everywhere || ends ||
       began_later) {
     before_ = schema_;
@@ -716,31 +718,22 @@ void Adaptation::try_learning(std::int64_t sample_index, std::vector<AdaptationE
   install(composed());
 }
 
-bool Adaptation::reconsider_as_one(const std::vector<const ActionPoseSample*>& samples,
-                                   std::int64_t sample_index,
-                                   std::vector<AdaptationEvent>* events) {
-  const auto is_kept = [](const Replacement& r) {
-    return !r.also.empty() || r.fitted.everywhere || r.fitted.change.is_learned();
-  };
-  if (replacements_.empty() || std::any_of(replacements_.begin(), replacements_.end(), is_kept) ||
-      (replacements_.size() == 1 && age_ > kUnsure))
+bool Adaptation::reconsider_place(const std::vector<const ActionPoseSample*>& samples,
+                                  std::int64_t sample_index, std::vector<AdaptationEvent>* events) {
+  if (replacements_.size() != 1 || age_ > kUnsure) return false;
+  const Replacement& here = replacements_.front();
+  if (!here.also.empty() || here.fitted.everywhere || here.fitted.change.is_learned()) return false;
+  std::vector<Place> places = around(here.place.part);
+  std::erase(places, here.place);
+  Choice there = choose(before_, places, samples);
+  credit_ -= there.work;
+  const double standing = log_likelihood(composed(), noise_, samples) + here.fitted.log_prior;
+  if (!there.best || there.best->fitted.log_evidence < standing + 2 * options_.acceptance)
     return false;
-  std::vector<Place> places;
-  double standing = log_likelihood(composed(), noise_, samples);
-  for (const Replacement& r : replacements_) {
-    standing += r.fitted.log_prior;
-    for (const Place& place : around(r.place.part))
-      if (std::find(places.begin(), places.end(), place) == places.end()) places.push_back(place);
-  }
-  if (replacements_.size() == 1) std::erase(places, replacements_.front().place);
-  Choice one = choose(before_, places, samples);
-  credit_ -= one.work;
-  if (!one.best || one.best->fitted.log_evidence < standing + options_.ambiguity) return false;
-  for (const Replacement& r : replacements_)
-    tell(AdaptationEvent::Kind::kReverted, sample_index, r, 0, 0, events);
-  tell(AdaptationEvent::Kind::kRefined, sample_index, *one.best, one.margin(),
+  tell(AdaptationEvent::Kind::kReverted, sample_index, here, 0, 0, events);
+  tell(AdaptationEvent::Kind::kRefined, sample_index, *there.best, there.margin(),
        static_cast<int>(samples.size()), events);
-  replacements_ = {std::move(*one.best)};
+  replacements_ = {std::move(*there.best)};
   return true;
 }
 
@@ -748,7 +741,6 @@ void Adaptation::reconsider(std::int64_t sample_index, bool all_forms,
                             std::vector<AdaptationEvent>* events) {
   const auto samples = segment(
       since_, age_ > options_.settled_after ? options_.matured_after : options_.longest_segment);
-  const bool is_another = all_forms && reconsider_as_one(samples, sample_index, events);
   const int rounds = replacements_.size() > 1 ? 3 : 1;
   for (int round = 0; round < rounds; ++round) {
     bool is_changed = false;
@@ -793,6 +785,7 @@ void Adaptation::reconsider(std::int64_t sample_index, bool all_forms,
     }
     if (!is_changed) break;
   }
+  const bool is_another = all_forms && reconsider_place(samples, sample_index, events);
   const std::vector<Cusum> edges = edges_, markers = markers_;
   install(composed());
   if (age_ > 0 && !is_another) {

@@ -171,9 +171,9 @@ class Adaptation {
   /// Learns an edge anew of which no family of changes was right.
   void try_learning(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
   void reconsider(std::int64_t sample_index, bool all_forms, std::vector<AdaptationEvent>* events);
-  /// One change, in the places of those that stand or next to them, may explain more.
-  bool reconsider_as_one(const std::vector<const ActionPoseSample*>& samples,
-                         std::int64_t sample_index, std::vector<AdaptationEvent>* events);
+  /// In its first samples a change may turn out to be one of what is next to its place.
+  bool reconsider_place(const std::vector<const ActionPoseSample*>& samples,
+                        std::int64_t sample_index, std::vector<AdaptationEvent>* events);
   void want_probe(const BodySchema& standing, const Choice& choice, std::int64_t sample_index,
                   std::vector<AdaptationEvent>* events);
   void drop_turned_over(ActionPoseSample* sample) const;
