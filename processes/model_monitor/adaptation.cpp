@@ -958,7 +958,7 @@ void Adaptation::take_back(const MovedTags::Finding& moved, std::int64_t sample_
     }
   // Of what went to and fro something may have been kept.
   BodySchema& standing = replacements_.empty() ? schema_ : before_;
-  for (const int part : schema_.parts)
+  for (const int part : trusted_.parts)
     if (is_at_it({part, false})) standing = with_edge_of(standing, trusted_, part);
   trouble_.reset();
   install(replacements_.empty() ? BodySchema(schema_) : composed());
