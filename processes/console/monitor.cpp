@@ -63,8 +63,9 @@ Json event_json(const AdaptationEvent& event, const ActionPoseSample& sample) {
 }
 
 std::string event_text(const AdaptationEvent& event) {
-  const std::string place = event.part >= 0 ? fmt::format("part {}", event.part)
-                                            : fmt::format("edge {}-{}", event.from, event.to);
+  std::string place = event.part >= 0 ? fmt::format("part {}", event.part)
+                                      : fmt::format("edge {}-{}", event.from, event.to);
+  if (event.tag >= 0) place += fmt::format(", tag {}", event.tag);
   return fmt::format("sample {:5}  {:<12}  {:<10}  {:<16}  {:6.1f} nats  {} samples\n",
                      event.sample_index, name_of(event.kind), place, event.cause, event.margin,
                      event.num_samples);

@@ -178,7 +178,6 @@ class Adaptation {
                   std::vector<AdaptationEvent>* events);
   void drop_turned_over(ActionPoseSample* sample) const;
   void drop_fallen(ActionPoseSample* sample, std::vector<AdaptationEvent>* events);
-  struct Visibility;
   /// `used`: without what is not believed.
   void watch_visibility(const ActionPoseSample& sample, const ActionPoseSample& used,
                         std::vector<AdaptationEvent>* events);
