@@ -3,20 +3,15 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
-#include <numeric>
-#include <set>
 #include <stdexcept>
 
 #include "common/statistics/median.h"
+#include "processes/model_monitor/schema_difference.h"
 
 namespace bodyschema {
 namespace {
 
 constexpr std::size_t kRing = 96;
-/// Squared distance of every marker below which a sample cannot raise a CUSUM that is at zero.
-constexpr double kClear = 14;
-constexpr double kInflations[] = {3, 10};
-constexpr double kHighestOverAlarm = 2;
 /// Of a CUSUM, from which on it is told which place is wrong, although nothing explains it [nats];
 /// or after so many samples.
 constexpr double kClearLead = 1;
@@ -36,21 +31,8 @@ constexpr std::int64_t kTogether = 12;
 /// … unless so many samples, which the first explains, speak against the second.
 constexpr std::size_t kStoodAlone = 4;
 
-/// From so many samples on a change keeps its form unless another explains clearly more of the
-/// evidence.
-constexpr int kManySamples = 8;
-constexpr double kSystematicShare = 0.03;
-
 /// χ²₆(0.99): below it a rate is none.
 constexpr double kSignificantRate = 16.8;
-constexpr int kProbeCandidates = 200;
-/// Two schemas of the history are one body where no local model differs at so many actions by more
-/// than χ²₆(0.99) of what is uncertain about it.
-constexpr int kAlikeActions = 16;
-constexpr double kAlike = 16.8;
-/// Sightings below which a part's visibility is not known.
-constexpr int kFewestSightings = 10;
-constexpr int kAnyTag = -1;
 constexpr std::int64_t kSoon = 150;
 constexpr double kMedianChiSquare6 = 5.348;
 constexpr double kLargestScale = 5;
@@ -80,68 +62,6 @@ constexpr std::ptrdiff_t kNewest = 5;
 bool is_worth_learning(std::int64_t age) {
   constexpr std::int64_t kAges[] = {8, 10, 13, 16, 20, 25, 32};
   return age % 40 == 0 || std::find(std::begin(kAges), std::end(kAges), age) != std::end(kAges);
-}
-
-bool differ(const Edge& a, const Edge& b) {
-  if (!a.left.isApprox(b.left, 1e-9) || !a.right.isApprox(b.right, 1e-9) ||
-      a.joints.size() != b.joints.size() || !a.has_process_of(b))
-    return true;
-  for (std::size_t d = 0; d < a.joints.size(); ++d) {
-    const ScrewJoint &x = a.joints[d], &y = b.joints[d];
-    if (x.signal != y.signal || x.gain != y.gain || x.offset != y.offset || x.turn != y.turn ||
-        x.slide != y.slide || !x.X_after.isApprox(y.X_after, 1e-9))
-      return true;
-  }
-  return false;
-}
-
-bool differ_at(const BodySchema& a, const BodySchema& b, int part) {
-  if (part == a.root) return !a.X_CR.isApprox(b.X_CR, 1e-9);
-  const Edge *x = edge_to(a, part), *y = edge_to(b, part);
-  return x && y && differ(*x, *y);
-}
-
-bool is_same(const BodySchema& a, const BodySchema& b) {
-  return a.X_CR.isApprox(b.X_CR, 1e-9) &&
-         std::equal(a.edges.begin(), a.edges.end(), b.edges.begin(), b.edges.end(),
-                    [](const Edge& x, const Edge& y) { return !differ(x, y); });
-}
-
-/// The n-th of actions that lie evenly in the box of the limits: the additive recurrence of the
-/// golden ratio's generalisation to m dimensions (M. Roberts, 2018).
-Eigen::VectorXd spread_action(const std::vector<Signal>& signals, int n) {
-  const auto m = static_cast<Eigen::Index>(signals.size());
-  double phi = 2;
-  for (int k = 0; k < 30; ++k) phi = std::pow(1 + phi, 1.0 / static_cast<double>(m + 1));
-  Eigen::VectorXd action(m);
-  for (Eigen::Index s = 0; s < m; ++s) {
-    const double u = std::fmod(0.5 + n * std::pow(phi, -static_cast<double>(s + 1)), 1.0);
-    const Signal& signal = signals[static_cast<std::size_t>(s)];
-    action(s) = signal.lower + u * (signal.upper - signal.lower);
-  }
-  return action;
-}
-
-bool is_alike(const BodySchema& a, const BodySchema& b) {
-  const auto is_near = [](const Pose& x, const Matrix6d& of_x, const Pose& y,
-                          const Matrix6d& of_y) {
-    const Vector6d difference = log(x.inverse() * y);
-    const Matrix6d S = of_x + of_y + 1e-12 * Matrix6d::Identity();
-    return difference.dot(S.ldlt().solve(difference)) < kAlike;
-  };
-  if (!is_near(a.X_CR, a.X_CR_covariance, b.X_CR, b.X_CR_covariance)) return false;
-  for (int n = 1; n <= kAlikeActions; ++n) {
-    const Eigen::VectorXd theta = a.displacements(spread_action(a.signals, n));
-    const bool is_alike_here =
-        std::equal(a.edges.begin(), a.edges.end(), b.edges.begin(), b.edges.end(),
-                   [&](const Edge& x, const Edge& y) {
-                     return x.from == y.from && x.to == y.to &&
-                            is_near(x.predict(theta), x.prediction_covariance(theta),
-                                    y.predict(theta), y.prediction_covariance(theta));
-                   });
-    if (!is_alike_here) return false;
-  }
-  return true;
 }
 
 void check(const ActionPoseSample& sample, const BodySchema& schema) {
@@ -192,6 +112,7 @@ Adaptation::Adaptation(BodySchema schema, AdaptationOptions options)
       noise_(options.noise),
       credit_(kMostWork),
       schema_(std::move(schema)),
+      visibility_(options.false_alarm_rate),
       tags_(schema_.moved_tags),
       moved_tags_(schema_.moved_tags),
       trusted_(schema_),
@@ -204,19 +125,15 @@ Adaptation::Adaptation(BodySchema schema, AdaptationOptions options,
                        std::vector<BodySchema> history, const std::vector<ActionPoseSample>& past)
     : Adaptation(std::move(schema), options) {
   num_samples_ = options_.calibration_samples;
-  std::vector<AdaptationEvent> old_news;
   for (const ActionPoseSample& sample : past) {
     if (stream_.repeats(sample, schema_.signals)) continue;
-    watch_visibility(sample, sample, &old_news);
+    visibility_.look(schema_.parts, sample, sample, tags_);
     tags_.look_back(sample, schema_, noise_);
     if (sample.purpose != Purpose::kTest) continue;
     recent_.push_back(sample);
     drop_moved_tags(moved_tags_, &recent_.back());
   }
-  // News of them is for the next sample.
-  for (auto& [part, tags] : visibility_)
-    for (auto& [tag, visibility] : tags)
-      if (tag != kAnyTag) visibility.is_missing = false;
+  visibility_.tell_tags_again();  // news of them is for the next sample
   calibrate();
   recent_.clear();
   install(schema_);
@@ -238,66 +155,21 @@ EdgeState Adaptation::state_of(const Place& place) const {
 void Adaptation::install(const BodySchema& schema) {
   schema_ = schema;
   filter_.emplace(schema_, noise_);
-  restart_tests();
-}
-
-void Adaptation::restart_tests() {
-  edges_.assign(static_cast<std::size_t>(filter_->num_nodes()), {});
-  markers_ = edges_;
-}
-
-double Adaptation::alarm() const {
-  return std::log(2.0 * filter_->num_nodes() / options_.false_alarm_rate);
+  // However loud, one sample finds nothing out where a model is soft.
+  const double loudest =
+      is_soft_ ? alarm_threshold(filter_->num_nodes(), options_.false_alarm_rate) / kFewestSoft
+               : std::numeric_limits<double>::infinity();
+  tests_.emplace(*filter_, options_.false_alarm_rate, loudest);
 }
 
 double Adaptation::edge_statistic(int part) const {
   const int node = filter_->node_of(part);
-  return node < 0 ? 0 : edges_[static_cast<std::size_t>(node)].value;
+  return node < 0 ? 0 : tests_->edge(node).value;
 }
 
 double Adaptation::marker_statistic(int part) const {
   const int node = filter_->node_of(part);
-  return node < 0 ? 0 : markers_[static_cast<std::size_t>(node)].value;
-}
-
-TreeFilter::Judgement Adaptation::update_tests(const TreeFilter::Instant& instant,
-                                               std::int64_t sample_index) {
-  const TreeFilter::Judgement now = filter_->judge(instant);
-  const auto is_zero = [](const Cusum& c) { return c.value == 0; };
-  const bool clear = std::all_of(now.squared_distance.begin(), now.squared_distance.end(),
-                                 [](double d2) { return d2 < kClear; });
-  if (clear && std::all_of(edges_.begin(), edges_.end(), is_zero) &&
-      std::all_of(markers_.begin(), markers_.end(), is_zero))
-    return now;
-  // What is not explained is not suspected for as long again once it is over: earlier samples count
-  // up to a ceiling.
-  const double highest = kHighestOverAlarm * alarm();
-  const double loudest = is_soft_ ? alarm() / kFewestSoft : std::numeric_limits<double>::infinity();
-  const auto add = [sample_index, highest](Cusum* cusum, double ratio) {
-    if (cusum->value == 0) cusum->since = sample_index;
-    cusum->value = std::max(0.0, std::min(cusum->value, highest) + ratio);
-  };
-  for (int node = 0; node < filter_->num_nodes(); ++node) {
-    double wrong = 0;
-    for (const double inflation : kInflations) {
-      Alternative alternative;
-      alternative.inflated_edge = node;
-      alternative.inflation = inflation;
-      wrong += std::exp(std::min(
-          filter_->judge(instant, alternative).log_likelihood - now.log_likelihood, 600.0));
-    }
-    Alternative cut;
-    cut.cut_edges = {node};
-    wrong +=
-        std::exp(std::min(filter_->judge(instant, cut).log_likelihood - now.log_likelihood, 600.0));
-    add(&edges_[static_cast<std::size_t>(node)], std::min(std::log(wrong / 3), loudest));
-    if (!instant.seen[static_cast<std::size_t>(node)]) continue;
-    Alternative detached;
-    detached.detached_node = node;
-    add(&markers_[static_cast<std::size_t>(node)],
-        filter_->judge(instant, detached).log_likelihood - now.log_likelihood);
-  }
-  return now;
+  return node < 0 ? 0 : tests_->marker(node).value;
 }
 
 void Adaptation::calibrate() {
@@ -340,129 +212,17 @@ std::vector<const ActionPoseSample*> Adaptation::segment(std::int64_t since, int
   return result;
 }
 
-std::vector<Adaptation::Place> Adaptation::suspects() const {
-  // The most suspicious elements and what is next to them.
-  struct Scored {
-    double value;
-    Place place;
-  };
-  std::vector<Scored> scored;
-  for (int node = 0; node < filter_->num_nodes(); ++node) {
-    scored.push_back({edges_[static_cast<std::size_t>(node)].value, {filter_->part(node), false}});
-    scored.push_back({markers_[static_cast<std::size_t>(node)].value, {filter_->part(node), true}});
+FoundChanges Adaptation::search(const BodySchema& standing, const std::vector<Place>& places,
+                                const std::vector<const ActionPoseSample*>& samples,
+                                const BodyChange* standing_form) {
+  ChangeSearch search{noise_, options_.ambiguity};
+  if (standing_form) {
+    search.standing_form = *standing_form;
+    search.learn = standing_form->is_learned();
   }
-  std::stable_sort(scored.begin(), scored.end(),
-                   [](const Scored& a, const Scored& b) { return a.value > b.value; });
-  std::vector<Place> places;
-  const auto add = [&places](const Place& place) {
-    if (std::find(places.begin(), places.end(), place) == places.end()) places.push_back(place);
-  };
-  for (std::size_t n = 0; n < scored.size() && n < 4; ++n)
-    if (scored[n].value > options_.suspicion) add(scored[n].place);
-  if (!scored.empty() && scored[0].value > options_.suspicion)
-    for (const Place& place : around(scored[0].place.part)) add(place);
-  return places;
-}
-
-std::vector<Adaptation::Place> Adaptation::around(int part) const {
-  std::vector<Place> places{{part, false}, {part, true}};
-  const int node = filter_->node_of(part);
-  if (const int parent = filter_->parent(node); parent >= 0) {
-    places.push_back({filter_->part(parent), false});
-    places.push_back({filter_->part(parent), true});
-  }
-  for (const int child : filter_->children(node)) places.push_back({filter_->part(child), false});
-  return places;
-}
-
-Adaptation::Choice Adaptation::choose(const BodySchema& standing, const std::vector<Place>& places,
-                                      const std::vector<const ActionPoseSample*>& samples,
-                                      const BodyChange* standing_form, bool learn) const {
-  Choice choice;
-  std::optional<Replacement> same_form;
-  choice.null = log_likelihood(standing, noise_, samples);
-  const auto second = [&](Replacement candidate) {
-    if (!choice.runner_up || candidate.fitted.log_evidence > choice.runner_up->fitted.log_evidence)
-      choice.runner_up = std::move(candidate);
-  };
-  const auto offer = [&](Replacement candidate) {
-    const FittedChange& fitted = candidate.fitted;
-    if (standing_form && fitted.change == *standing_form &&
-        (!same_form || fitted.log_evidence > same_form->fitted.log_evidence))
-      same_form = candidate;
-    if (choice.best && fitted.log_evidence <= choice.best->fitted.log_evidence) {
-      second(std::move(candidate));
-      return;
-    }
-    if (choice.best) second(std::move(*choice.best));
-    choice.best = std::move(candidate);
-  };
-  // What could not be explained for so long is not explained by a change of a body of the past.
-  const bool is_old = !standing_form && static_cast<int>(samples.size()) > kManySamples;
-  for (const Place& at : places) {
-    // Bases: the model that stands, and what is stored of this place.
-    std::vector<const BodySchema*> origins{nullptr};
-    std::vector<BodySchema> bases{standing};
-    if (!at.marker) {
-      for (const BodySchema& stored : history_) {
-        BodySchema with = with_edge_of(standing, stored, at.part);
-        const bool known = std::any_of(bases.begin(), bases.end(), [&](const BodySchema& base) {
-          return !differ_at(base, with, at.part);
-        });
-        if (known) continue;
-        bases.push_back(std::move(with));
-        origins.push_back(&stored);
-      }
-    }
-    for (std::size_t b = 0; b < bases.size(); ++b) {
-      const PlaceEvidence evidence(bases[b], noise_, at.part, at.marker, samples);
-      const auto offer_from = [&](FittedChange candidate) {
-        if (origins[b]) candidate.origin = *origins[b];
-        offer({at, std::move(candidate)});
-      };
-      if (b > 0 && evidence.num_usable() > 0) offer_from(evidence.judge_stored(bases[b]));
-      if (b > 0 && is_old) continue;
-      choice.work += static_cast<int>(samples.size());
-      for (FittedChange& fitted :
-           evidence.fit_likely(possible_changes(bases[b], at.part, at.marker)))
-        offer_from(std::move(fitted));
-      if (!learn || b > 0) continue;
-      for (FittedChange& learned : evidence.learn()) offer({at, std::move(learned)});
-    }
-  }
-  // All that differs from a stored schema at once.
-  for (const BodySchema& stored : history_) {
-    FittedChange all;
-    all.change = {BodyChange::Form::kStored, places.front().part};
-    all.origin = stored;
-    all.everywhere = true;
-    const BodySchema with = with_change(standing, all);
-    int num_different = differ_at(standing, with, standing.root);
-    for (const Edge& edge : with.edges) num_different += differ_at(standing, with, edge.to);
-    if (num_different < 2) continue;
-    all.log_prior = all.change.log_odds();
-    all.log_evidence = all.log_prior + log_likelihood(with, noise_, samples);
-    all.num_usable = 1;
-    // It is wherever it makes a difference, first where that was suspected: an outlier elsewhere
-    // may be the greatest suspicion.
-    std::vector<Place> at = differences(standing, with);
-    std::stable_sort(at.begin(), at.end(), [&places](const Place& a, const Place& b) {
-      return std::find(places.begin(), places.end(), a) <
-             std::find(places.begin(), places.end(), b);
-    });
-    all.change.part = at.front().part;
-    offer({at.front(), std::move(all), {at.begin() + 1, at.end()}});
-  }
-  // With many samples what the schema was wrong about before the change is found out too, and
-  // dressed up as a richer form of it.
-  if (same_form && choice.best->fitted.change != *standing_form &&
-      static_cast<int>(samples.size()) >= kManySamples &&
-      choice.best->fitted.log_evidence - same_form->fitted.log_evidence <
-          options_.ambiguity + kSystematicShare * choice.margin()) {
-    choice.runner_up = std::move(choice.best);
-    choice.best = std::move(same_form);
-  }
-  return choice;
+  FoundChanges found = find_changes(standing, history_, places, samples, search);
+  credit_ -= found.work;
+  return found;
 }
 
 BodySchema Adaptation::composed(int without) const {
@@ -503,41 +263,6 @@ void Adaptation::tell(AdaptationEvent::Kind kind, std::int64_t sample_index,
   }
 }
 
-/// The places in which two schemas of the same tree differ: markers first, of parts that lie
-/// elsewhere between edges which together lead to where they led, then edges.
-std::vector<Adaptation::Place> Adaptation::differences(const BodySchema& a, const BodySchema& b) {
-  Eigen::VectorXd action(static_cast<Eigen::Index>(a.signals.size()));
-  for (Eigen::Index s = 0; s < action.size(); ++s) {
-    const Signal& signal = a.signals[static_cast<std::size_t>(s)];
-    action(s) = 0.25 * signal.lower + 0.75 * signal.upper;  // nothing special about it
-  }
-  const auto pose_in_parent = [&action](const BodySchema& schema, int part) {
-    const Edge* edge = edge_to(schema, part);
-    return edge ? edge->predict(schema.displacements(action)) : schema.X_CR;
-  };
-  std::set<int> edges;
-  for (const int part : a.parts)
-    if (differ_at(a, b, part)) edges.insert(part);
-  std::vector<Place> places;
-  for (const int part : a.parts) {
-    std::vector<int> children;
-    for (const Edge& edge : a.edges)
-      if (edge.from == part) children.push_back(edge.to);
-    if (!edges.contains(part) || children.empty()) continue;
-    const Pose X_a = pose_in_parent(a, part), X_b = pose_in_parent(b, part);
-    const bool only_the_marker = std::all_of(children.begin(), children.end(), [&](int child) {
-      return edges.contains(child) &&
-             (X_a * pose_in_parent(a, child)).isApprox(X_b * pose_in_parent(b, child), 1e-6);
-    });
-    if (!only_the_marker) continue;
-    places.push_back({part, true});
-    edges.erase(part);
-    for (const int child : children) edges.erase(child);
-  }
-  for (const int part : edges) places.push_back({part, false});
-  return places;
-}
-
 double Adaptation::required_margin(const Place& place, std::int64_t sample_index) const {
   const auto it = reversions_.find(place);
   const bool is_recent = it != reversions_.end() && it->second.last + kSoon >= sample_index;
@@ -547,33 +272,24 @@ double Adaptation::required_margin(const Place& place, std::int64_t sample_index
 void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEvent>* events) {
   const std::vector<Place> places = suspects();
   if (places.empty()) return;
-  std::int64_t since = sample_index;
-  double highest = 0, second = 0;
-  for (std::size_t n = 0; n < edges_.size(); ++n) {
-    for (const Cusum* c : {&edges_[n], &markers_[n]}) {
-      second = std::max(second, std::min(c->value, highest));
-      if (c->value > highest) {
-        highest = c->value;
-        since = c->since;
-      }
-    }
-  }
+  const auto [cusum, second] = tests_->highest();
+  const std::int64_t since = cusum.since;
+  const double highest = cusum.value;
   // What nothing explained so far is looked at again when there is clearly more of it.
   if (detected_ && !is_worth_a_fit(sample_index - since + 1)) return;
   const auto samples = segment(since, options_.longest_segment);
-  Choice choice;
-  if (credit_ > 0) choice = choose(schema_, places, samples);
-  credit_ -= choice.work;
+  FoundChanges choice;
+  if (credit_ > 0) choice = search(schema_, places, samples);
   const bool accepted = choice.best &&
                         choice.margin() > required_margin(choice.best->place, sample_index) &&
                         (!is_soft_ || static_cast<int>(samples.size()) >= kFewestSoft);
   // Edges between which nothing was seen are suspected alike: which one it is is told later, if
   // there is more evidence of it. (A lead may also come from evidence against all of them.)
-  const bool is_rising = !detected_ || highest > std::min(untold_, kHighestOverAlarm * alarm());
+  const bool is_rising = !detected_ || highest > std::min(untold_, tests_->ceiling());
   const bool is_clear =
-      accepted || (is_rising && highest > alarm() &&
+      accepted || (is_rising && highest > tests_->alarm() &&
                    (highest - second > kClearLead || samples.size() >= kLongestUnclear));
-  if (detected_ ? !is_told_ : accepted || highest > alarm()) {
+  if (detected_ ? !is_told_ : accepted || highest > tests_->alarm()) {
     detected_ = accepted ? choice.best->place : places.front();
     is_told_ = is_clear;
     untold_ = highest;
@@ -705,9 +421,9 @@ void Adaptation::try_learning(std::int64_t sample_index, std::vector<AdaptationE
   candidate.cause = best->fitted.change.cause(schema_);
   candidate.margin = margin;
   candidate.num_samples = static_cast<int>(samples.size());
-  events->push_back(candidate);
   for (const Replacement& r : replacements_)
     tell(AdaptationEvent::Kind::kReverted, sample_index, r, 0, 0, events);
+  events->push_back(candidate);
   before_ = std::move(before);
   since_ = trouble_->since;
   replacements_ = {std::move(*best)};
@@ -723,10 +439,9 @@ bool Adaptation::reconsider_place(const std::vector<const ActionPoseSample*>& sa
   if (replacements_.size() != 1 || age_ > kUnsure) return false;
   const Replacement& here = replacements_.front();
   if (!here.also.empty() || here.fitted.everywhere || here.fitted.change.is_learned()) return false;
-  std::vector<Place> places = around(here.place.part);
+  std::vector<Place> places = places_around(*filter_, here.place.part);
   std::erase(places, here.place);
-  Choice there = choose(before_, places, samples);
-  credit_ -= there.work;
+  FoundChanges there = search(before_, places, samples);
   const double standing = log_likelihood(composed(), noise_, samples) + here.fitted.log_prior;
   if (!there.best || there.best->fitted.log_evidence < standing + 2 * options_.acceptance)
     return false;
@@ -760,9 +475,7 @@ void Adaptation::reconsider(std::int64_t sample_index, bool all_forms,
         ++n;
         continue;
       }
-      Choice choice =
-          choose(others, {r.place}, samples, &r.fitted.change, r.fitted.change.is_learned());
-      credit_ -= choice.work;
+      FoundChanges choice = search(others, {r.place}, samples, &r.fitted.change);
       if (!choice.best || choice.margin() < 0) {
         tell(AdaptationEvent::Kind::kReverted, sample_index, r, choice.margin(), 0, events);
         Reversions& reversions = reversions_[r.place];
@@ -786,15 +499,12 @@ void Adaptation::reconsider(std::int64_t sample_index, bool all_forms,
     if (!is_changed) break;
   }
   const bool is_another = all_forms && reconsider_place(samples, sample_index, events);
-  const std::vector<Cusum> edges = edges_, markers = markers_;
+  const SequentialTests tests = *tests_;
   install(composed());
-  if (age_ > 0 && !is_another) {
-    edges_ = edges;
-    markers_ = markers;
-  }
+  if (age_ > 0 && !is_another) tests_ = tests;
 }
 
-void Adaptation::want_probe(const BodySchema& standing, const Choice& choice,
+void Adaptation::want_probe(const BodySchema& standing, const FoundChanges& choice,
                             std::int64_t sample_index, std::vector<AdaptationEvent>* events) {
   // Of two functions the samples to come decide.
   if (!choice.runner_up || choice.best->fitted.change.is_learned()) return;
@@ -809,23 +519,7 @@ void Adaptation::want_probe(const BodySchema& standing, const Choice& choice,
     return;
   const BodySchema one = with_change(standing, choice.best->fitted);
   const BodySchema other = with_change(standing, choice.runner_up->fitted);
-  double most = 1;
-  Eigen::VectorXd probe;
-  for (int n = 1; n <= kProbeCandidates; ++n) {
-    const Eigen::VectorXd action = spread_action(standing.signals, n);
-    const auto X = one.predict_all(action), Y = other.predict_all(action);
-    for (const auto& [part, X_RB] : X) {
-      const auto it = Y.find(part);
-      if (it == Y.end()) continue;
-      const Pose difference = X_RB.inverse() * it->second;
-      const double size = difference.translation().norm() / options_.tolerance.position_m +
-                          rotation_angle(difference) / options_.tolerance.rotation_rad;
-      if (size > most) {
-        most = size;
-        probe = action;
-      }
-    }
-  }
+  const Eigen::VectorXd probe = most_telling_action(one, other, options_.tolerance);
   if (probe.size() == 0) return;
   AdaptationEvent wanted =
       event(AdaptationEvent::Kind::kProbeWanted, sample_index, choice.best->place);
@@ -837,29 +531,20 @@ void Adaptation::want_probe(const BodySchema& standing, const Choice& choice,
   events->push_back(wanted);
 }
 
-std::vector<int> Adaptation::missing_parts() const {
-  std::vector<int> parts;
-  for (const auto& [part, tags] : visibility_)
-    if (tags.at(kAnyTag).is_missing) parts.push_back(part);
-  return parts;
-}
-
 void Adaptation::watch_visibility(const ActionPoseSample& sample, const ActionPoseSample& used,
                                   std::vector<AdaptationEvent>* events) {
-  for (const int part : schema_.parts) {
-    const PartObservation* seen = sample.find(part);
-    // A marker that lies somewhere is none; a tag that moved is still one.
-    if (seen && !used.find(part) && !rests_on_moved_tag(*seen)) seen = nullptr;
-    watch_visibility_of(part, kAnyTag, seen, sample.sample_index, events);
-    // An arm that holds still or is led shows one side of its parts for as long.
-    if (!seen || sample.purpose == Purpose::kControl) continue;
-    for (const int tag : seen->tags) visibility_[part][tag];
-    if (visibility_[part].size() < 3) continue;  // its only tag is the part's marker
-    for (const auto& [tag, visibility] : visibility_[part]) {
-      if (tag == kAnyTag || tags_.has_moved(tag)) continue;
-      const bool is_seen = std::find(seen->tags.begin(), seen->tags.end(), tag) != seen->tags.end();
-      watch_visibility_of(part, tag, is_seen, sample.sample_index, events);
-    }
+  for (const auto& finding : visibility_.look(schema_.parts, sample, used, tags_)) {
+    const auto [part, tag, is_missing, num_missed] = finding;
+    AdaptationEvent told =
+        event(is_missing ? AdaptationEvent::Kind::kMissing : AdaptationEvent::Kind::kRecovered,
+              sample.sample_index, {part, true});
+    told.tag = tag;
+    told.cause = "marker_missing";
+    told.num_samples = num_missed;
+    events->push_back(std::move(told));
+    if (!is_missing || tag == VisibilityWatch::kAnyTag) continue;
+    tags_.lose(tag);
+    set_aside(tag, sample.sample_index - num_missed + 1, sample.sample_index);
   }
 }
 
@@ -867,40 +552,6 @@ void Adaptation::watch_visibility(const ActionPoseSample& sample, const ActionPo
 void Adaptation::set_aside(int tag, std::int64_t since, std::int64_t found) {
   if (moved_tags_.size() == BodySchema::kMaxMovedTags) moved_tags_.erase(moved_tags_.begin());
   moved_tags_.push_back({tag, stream_.sample_index_of(found), stream_.sample_index_of(since)});
-}
-
-void Adaptation::watch_visibility_of(int part, int tag, bool is_seen, std::int64_t sample_index,
-                                     std::vector<AdaptationEvent>* events) {
-  Visibility& v = visibility_[part][tag];
-  const auto tell = [&](AdaptationEvent::Kind kind) {
-    AdaptationEvent told = event(kind, sample_index, {part, true});
-    told.tag = tag;
-    told.cause = "marker_missing";
-    told.num_samples = v.num_missed;
-    events->push_back(std::move(told));
-  };
-  if (is_seen) {
-    // What is seen again need not be seen as often as before.
-    if (v.is_missing) {
-      tell(AdaptationEvent::Kind::kRecovered);
-      v = {};
-    }
-    v.num_asked += v.num_missed + 1;
-    v.num_missed = 0;
-    ++v.num_seen;
-    return;
-  }
-  ++v.num_missed;
-  if (v.is_missing || v.num_seen < kFewestSightings) return;
-  // A run of m misses begins at any sample with probability v (1 − v)^m; n parts and tags may.
-  const auto num = std::accumulate(
-      visibility_.begin(), visibility_.end(), std::size_t{0},
-      [](std::size_t sum, const auto& of_part) { return sum + of_part.second.size(); });
-  const double share = (v.num_seen + 0.5) / (v.num_asked + 1.0);
-  const double chance = share * std::pow(1 - share, v.num_missed) * static_cast<double>(num);
-  if (chance > options_.false_alarm_rate) return;
-  v.is_missing = true;
-  tell(AdaptationEvent::Kind::kMissing);
 }
 
 void Adaptation::watch_tags(ActionPoseSample* sample, std::vector<AdaptationEvent>* events) {
@@ -918,19 +569,14 @@ void Adaptation::watch_tags(ActionPoseSample* sample, std::vector<AdaptationEven
         for (MovedTag& moved : moved_tags_)
           if (moved.tag == finding.tag && moved.until < 0)
             moved.until = stream_.sample_index_of(sample->sample_index);
-        visibility_[finding.part][finding.tag] = {};
+        visibility_.forget(finding.part, finding.tag);
       } else {
         set_aside(finding.tag, finding.since, sample->sample_index);
         take_back(finding, sample->sample_index, events);
       }
     }
   }
-  std::erase_if(sample->parts, [this](const PartObservation& o) { return rests_on_moved_tag(o); });
-}
-
-bool Adaptation::rests_on_moved_tag(const PartObservation& observation) const {
-  return std::any_of(observation.tags.begin(), observation.tags.end(),
-                     [this](int tag) { return tags_.has_moved(tag); });
+  std::erase_if(sample->parts, [this](const PartObservation& o) { return tags_.affects(o); });
 }
 
 /// What a moved tag was taken for meanwhile.
@@ -982,18 +628,17 @@ void Adaptation::drop_fallen(ActionPoseSample* sample, std::vector<AdaptationEve
     const auto since = fallen_.look(*sample, part, schema_.X_CR * X_RB, noise_);
     if (!since) continue;
     drop(part, sample);
-    Visibility& v = visibility_[part][kAnyTag];
-    if (v.is_missing) continue;
-    v.is_missing = true;
+    if (visibility_.is_missing(part)) continue;
+    int num_missed = 0;
     for (ActionPoseSample& earlier : recent_) {
       if (earlier.sample_index < *since) continue;
       drop(part, &earlier);
-      ++v.num_missed;
+      ++num_missed;
     }
     AdaptationEvent missing =
         event(AdaptationEvent::Kind::kMissing, sample->sample_index, {part, true});
     missing.cause = "marker_missing";
-    missing.num_samples = v.num_missed + 1;
+    missing.num_samples = visibility_.lose(part, num_missed) + 1;
     events->push_back(missing);
     // What it was taken for meanwhile is taken back.
     const auto is_at_it = [this, part](const Place& place) {
@@ -1073,12 +718,10 @@ void Adaptation::watch_drift(std::int64_t sample_index, std::vector<AdaptationEv
   theta << drift->T.translation(), log_so3(drift->T.linear());
   // `covariance` is that of a right perturbation of T: near enough to that of θ. What is suspected
   // elsewhere meanwhile stays so.
-  std::vector<Cusum> edges = edges_, markers = markers_;
+  SequentialTests tests = *tests_;
   install(changed(before_, change, theta, drift->covariance));
-  const auto node = static_cast<std::size_t>(filter_->node_of(*drifting_));
-  edges[node] = markers[node] = {};
-  edges_ = std::move(edges);
-  markers_ = std::move(markers);
+  tests.clear(filter_->node_of(*drifting_));
+  tests_ = std::move(tests);
   num_still_ = drift->significance > kSignificantRate ? 0 : num_still_ + 1;
   if (num_still_ < options_.settled_after) return;
   AdaptationEvent recovered =
@@ -1123,13 +766,6 @@ std::vector<AdaptationEvent> Adaptation::on_new_sample(ActionPoseSample sample) 
   watch_tags(&sample, &events);
   if (num_samples_ >= options_.calibration_samples) drop_fallen(&sample, &events);
   watch_visibility(seen, sample, &events);
-  for (const AdaptationEvent& event : events) {
-    if (event.kind != AdaptationEvent::Kind::kMissing || event.tag < 0 ||
-        tags_.has_moved(event.tag))
-      continue;
-    tags_.lose(event.tag);
-    set_aside(event.tag, event.sample_index - event.num_samples + 1, event.sample_index);
-  }
   recent_.push_back(sample);
   if (recent_.size() > kRing) recent_.pop_front();
   if (++num_samples_ <= options_.calibration_samples) {
@@ -1140,7 +776,7 @@ std::vector<AdaptationEvent> Adaptation::on_new_sample(ActionPoseSample sample) 
     return events;
   }
   const TreeFilter::Instant instant = filter_->prepare(sample);
-  const TreeFilter::Judgement judgement = update_tests(instant, sample.sample_index);
+  const TreeFilter::Judgement judgement = tests_->update(*filter_, instant, sample.sample_index);
   drift_watch_.add(*filter_, instant, schema_.displacements(sample.action), sample.sample_index);
   if (!replacements_.empty())
     follow(sample.sample_index, &events);
@@ -1153,9 +789,7 @@ std::vector<AdaptationEvent> Adaptation::on_new_sample(ActionPoseSample sample) 
     return e.tag < 0 && (e.kind == AdaptationEvent::Kind::kCandidate ||
                          e.kind == AdaptationEvent::Kind::kRestored);
   };
-  if (std::any_of(events.begin(), events.end(), is_change))
-    for (auto& [part, tags] : visibility_)
-      std::erase_if(tags, [](const auto& of_tag) { return of_tag.first != kAnyTag; });
+  if (std::any_of(events.begin(), events.end(), is_change)) visibility_.forget_tags();
   if (!replacements_.empty()) {
     drifting_.reset();
     for (const Replacement& r : replacements_)

@@ -7,12 +7,14 @@
 #include <string>
 #include <vector>
 
-#include "processes/model_monitor/change_fit.h"
+#include "processes/model_monitor/change_search.h"
 #include "processes/model_monitor/drift_watch.h"
 #include "processes/model_monitor/fallen_markers.h"
 #include "processes/model_monitor/moved_tags.h"
 #include "processes/model_monitor/sample_stream.h"
+#include "processes/model_monitor/sequential_tests.h"
 #include "processes/model_monitor/tree_filter.h"
+#include "processes/model_monitor/visibility_watch.h"
 
 namespace bodyschema {
 
@@ -110,7 +112,7 @@ class Adaptation {
   double noise_scale() const { return noise_.scale; }
   const MarkerNoise& noise() const { return noise_; }
   /// Parts whose markers have not been seen for longer than chance explains.
-  std::vector<int> missing_parts() const;
+  std::vector<int> missing_parts() const { return visibility_.missing_parts(); }
   bool is_drifting(int part) const { return drifting_ == part; }
   /// First sample with the body as changed by the replacements that have not settled.
   std::int64_t since() const { return stream_.sample_index_of(since_); }
@@ -119,21 +121,6 @@ class Adaptation {
   bool is_settled() const { return replacements_.empty() && !detected_ && !drifting_; }
 
  private:
-  struct Cusum {
-    double value = 0;
-    std::int64_t since = 0;  ///< first sample of the present rise
-  };
-  struct Place {
-    int part = 0;
-    bool marker = false;
-    auto operator<=>(const Place&) const = default;
-  };
-  struct Replacement {
-    Place place;
-    FittedChange fitted;
-    std::vector<Place> also = {};  ///< what else a whole schema of the history changes
-  };
-
   /// Of what is no repetition; its index is SampleStream::count().
   std::vector<AdaptationEvent> on_new_sample(ActionPoseSample sample);
   EdgeState state_of(const Place& place) const;
@@ -141,27 +128,11 @@ class Adaptation {
   void begin_drift(int part, std::int64_t sample_index, std::vector<AdaptationEvent>* events);
   void watch_drift(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
   void watch_noise(const TreeFilter::Judgement& judgement);
-  void restart_tests();
-  /// CUSUM above which something is wrong even if nothing explains it [nats].
-  double alarm() const;
-  /// Returns the judgement under the schema as it stands.
-  TreeFilter::Judgement update_tests(const TreeFilter::Instant& instant, std::int64_t sample_index);
   std::vector<const ActionPoseSample*> segment(std::int64_t since, int longest) const;
-  std::vector<Place> suspects() const;
-  /// A part's places and those next to it.
-  std::vector<Place> around(int part) const;
-  struct Choice {
-    std::optional<Replacement> best;
-    double null = 0;  ///< log-likelihood of the schema as it stands
-    /// The best that is another form or place.
-    std::optional<Replacement> runner_up;
-    int work = 0;  ///< samples looked at, over all places and bases
-    double margin() const { return best ? best->fitted.log_evidence - null : 0; }
-  };
-  /// `standing_form`: what explains the samples so far. `learn`: also what is none of the families.
-  Choice choose(const BodySchema& standing, const std::vector<Place>& places,
-                const std::vector<const ActionPoseSample*>& samples,
-                const BodyChange* standing_form = nullptr, bool learn = false) const;
+  std::vector<Place> suspects() const { return tests_->suspects(*filter_, options_.suspicion); }
+  FoundChanges search(const BodySchema& standing, const std::vector<Place>& places,
+                      const std::vector<const ActionPoseSample*>& samples,
+                      const BodyChange* standing_form = nullptr);
   BodySchema composed(int without = -1) const;
   /// Evidence that a change must have over the schema that stands [nats]: more where changes were
   /// taken back lately.
@@ -174,17 +145,14 @@ class Adaptation {
   /// In its first samples a change may turn out to be one of what is next to its place.
   bool reconsider_place(const std::vector<const ActionPoseSample*>& samples,
                         std::int64_t sample_index, std::vector<AdaptationEvent>* events);
-  void want_probe(const BodySchema& standing, const Choice& choice, std::int64_t sample_index,
+  void want_probe(const BodySchema& standing, const FoundChanges& choice, std::int64_t sample_index,
                   std::vector<AdaptationEvent>* events);
   void drop_turned_over(ActionPoseSample* sample) const;
   void drop_fallen(ActionPoseSample* sample, std::vector<AdaptationEvent>* events);
   /// `used`: without what is not believed.
   void watch_visibility(const ActionPoseSample& sample, const ActionPoseSample& used,
                         std::vector<AdaptationEvent>* events);
-  void watch_visibility_of(int part, int tag, bool is_seen, std::int64_t sample_index,
-                           std::vector<AdaptationEvent>* events);
   void set_aside(int tag, std::int64_t since, std::int64_t found);
-  bool rests_on_moved_tag(const PartObservation& observation) const;
   void watch_tags(ActionPoseSample* sample, std::vector<AdaptationEvent>* events);
   void take_back(const MovedTags::Finding& moved, std::int64_t sample_index,
                  std::vector<AdaptationEvent>* events);
@@ -197,7 +165,6 @@ class Adaptation {
   /// Tells the same of every place of a replacement.
   void tell(AdaptationEvent::Kind kind, std::int64_t sample_index, const Replacement& replacement,
             double margin, int num_samples, std::vector<AdaptationEvent>* events) const;
-  static std::vector<Place> differences(const BodySchema& a, const BodySchema& b);
 
   const bool is_soft_;  ///< some edge has a residual GP
   const AdaptationOptions options_;
@@ -209,12 +176,7 @@ class Adaptation {
   BodySchema schema_;
   std::optional<TreeFilter> filter_;
   std::deque<ActionPoseSample> recent_;
-  struct Visibility {
-    int num_seen = 0, num_asked = 0;  ///< before the present run of misses
-    int num_missed = 0;               ///< in a row
-    bool is_missing = false;
-  };
-  std::map<int, std::map<int, Visibility>> visibility_;  ///< by part and tag; −1: any tag of it
+  VisibilityWatch visibility_;
   FallenMarkers fallen_;
   MovedTags tags_;
   /// Tags that moved, or were lost, where others of their part stayed: what rests on them is left
@@ -222,7 +184,7 @@ class Adaptation {
   std::vector<MovedTag> moved_tags_;
   BodySchema trusted_;  ///< what settled last
   SampleStream stream_;
-  std::vector<Cusum> edges_, markers_;  ///< by node
+  std::optional<SequentialTests> tests_;
   std::optional<Place> detected_;
   bool is_told_ = false;  ///< that and where something was detected
   double untold_ = 0;     ///< the highest CUSUM when it was not told yet

@@ -7,8 +7,15 @@
 
 namespace bodyschema {
 
-/// How a body may differ from its schema in one place. The place is the edge that leads to `part`
-/// (for the root the camera's), or the part's marker.
+/// Where a body may differ from its schema: the edge that leads to `part` (for the root the
+/// camera's), or the part's marker.
+struct Place {
+  int part = 0;
+  bool marker = false;
+  auto operator<=>(const Place&) const = default;
+};
+
+/// How a body may differ from its schema in one place.
 struct BodyChange {
   enum class Form {
     kStored,       ///< a model of the history
@@ -62,6 +69,16 @@ Eigen::VectorXd prior_mean(const BodyChange& change, const BodySchema& schema);
 /// @throws std::invalid_argument if the schema has no such place or θ has another size.
 BodySchema changed(const BodySchema& schema, const BodyChange& change, const Eigen::VectorXd& theta,
                    const Eigen::MatrixXd& covariance = {});
+
+/// T(θ) = (Exp(w), p) for θ = (p, w): independent of where the origin of rotation lies.
+Pose transform(const Vector6d& theta);
+/// ∂(right perturbation of T)/∂θ.
+Matrix6d transform_jacobian(const Vector6d& theta);
+/// θ of T.
+Vector6d coordinates(const Pose& T);
+
+/// What a joint's displacement does to its X_after, as a right perturbation of that.
+Vector6d displacement_twist(const ScrewJoint& joint);
 
 /// The edge that leads to `part`; nullptr for the root and for unconnected parts.
 const Edge* edge_to(const BodySchema& schema, int part);

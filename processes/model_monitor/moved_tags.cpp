@@ -23,6 +23,11 @@ bool MovedTags::has_moved(int tag) const {
   return track != tracks_.end() && track->second.has_moved;
 }
 
+bool MovedTags::affects(const PartObservation& observation) const {
+  return std::any_of(observation.tags.begin(), observation.tags.end(),
+                     [this](int tag) { return has_moved(tag); });
+}
+
 void MovedTags::look_back(const ActionPoseSample& sample, const BodySchema& schema,
                           const MarkerNoise& noise) {
   // They were not back by then, whatever the noise is now thought to be, and no other had moved.

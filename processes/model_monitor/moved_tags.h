@@ -40,6 +40,8 @@ class MovedTags {
   /// It is not seen any more.
   void lose(int tag) { tracks_[tag] = {.has_moved = true}; }
   bool has_moved(int tag) const;
+  /// It rests on a tag that has moved.
+  bool affects(const PartObservation& observation) const;
 
  private:
   struct Track {

@@ -35,7 +35,7 @@ struct Alternative {
   int inflated_edge =
       -1;  ///< this edge is uncertain by `inflation` standard deviations of a marker
   double inflation = 0;
-  std::vector<int> cut_edges;  ///< these edges say nothing
+  std::vector<int> cut_edges = {};  ///< these edges say nothing
   int detached_node = -1;      ///< the marker of this node is not where it was
 };
 

@@ -1,0 +1,128 @@
+#include "processes/model_monitor/change_search.h"
+
+#include <algorithm>
+
+#include "processes/model_monitor/schema_difference.h"
+
+namespace bodyschema {
+namespace {
+
+/// From so many samples on a change keeps its form unless another explains clearly more of the
+/// evidence.
+constexpr int kManySamples = 8;
+constexpr double kSystematicShare = 0.03;
+
+bool is_better(const Replacement& candidate, const std::optional<Replacement>& other) {
+  return !other || candidate.fitted.log_evidence > other->fitted.log_evidence;
+}
+
+/// The best, the best but one, and the best of the form that stands.
+struct Ranking {
+  std::optional<BodyChange> standing_form;
+  std::optional<Replacement> best = std::nullopt, second = std::nullopt, same_form = std::nullopt;
+
+  void offer(Replacement candidate) {
+    if (candidate.fitted.change == standing_form && is_better(candidate, same_form))
+      same_form = candidate;
+    std::optional<Replacement> other = std::move(candidate);
+    if (is_better(*other, best)) std::swap(other, best);
+    if (other && is_better(*other, second)) second = std::move(other);
+  }
+};
+
+/// What a change of the edge to `part` may start from.
+struct Base {
+  BodySchema schema;
+  const BodySchema* origin = nullptr;  ///< of the history; nullptr: the model that stands
+};
+
+std::vector<Base> bases_of(const Place& place, const BodySchema& standing,
+                           const std::vector<BodySchema>& history) {
+  std::vector<Base> bases{{standing}};
+  if (place.marker) return bases;
+  for (const BodySchema& stored : history) {
+    BodySchema with = with_edge_of(standing, stored, place.part);
+    const bool is_known = std::any_of(bases.begin(), bases.end(), [&](const Base& base) {
+      return !differ_at(base.schema, with, place.part);
+    });
+    if (!is_known) bases.push_back({std::move(with), &stored});
+  }
+  return bases;
+}
+
+/// All that differs from a stored schema at once, where that is more than one place: it is wherever
+/// it makes a difference, first where that was suspected; an outlier elsewhere may be the greatest
+/// suspicion.
+std::optional<Replacement> whole(const BodySchema& stored, const BodySchema& standing,
+                                 const std::vector<Place>& places,
+                                 const std::vector<const ActionPoseSample*>& samples,
+                                 const MarkerNoise& noise) {
+  Replacement all;
+  FittedChange& fitted = all.fitted;
+  fitted.change.form = BodyChange::Form::kStored;
+  fitted.origin = stored;
+  fitted.everywhere = true;
+  const BodySchema with = with_change(standing, fitted);
+  const auto num_different =
+      std::count_if(standing.parts.begin(), standing.parts.end(),
+                    [&](int part) { return differ_at(standing, with, part); });
+  if (num_different < 2) return std::nullopt;
+  std::vector<Place> at = differences(standing, with);
+  std::stable_sort(at.begin(), at.end(), [&places](const Place& a, const Place& b) {
+    return std::find(places.begin(), places.end(), a) < std::find(places.begin(), places.end(), b);
+  });
+  all.place = at.front();
+  all.also = {at.begin() + 1, at.end()};
+  fitted.change.part = all.place.part;
+  fitted.log_prior = fitted.change.log_odds();
+  fitted.log_evidence = fitted.log_prior + log_likelihood(with, noise, samples);
+  fitted.num_usable = 1;
+  return all;
+}
+
+}  // namespace
+
+FoundChanges find_changes(const BodySchema& standing, const std::vector<BodySchema>& history,
+                          const std::vector<Place>& places,
+                          const std::vector<const ActionPoseSample*>& samples,
+                          const ChangeSearch& search) {
+  FoundChanges found;
+  found.null = log_likelihood(standing, search.noise, samples);
+  Ranking ranking{search.standing_form};
+  const bool are_many = static_cast<int>(samples.size()) >= kManySamples;
+  // What could not be explained for so long is not explained by a change of a body of the past.
+  const bool is_old = !search.standing_form && static_cast<int>(samples.size()) > kManySamples;
+  for (const Place& place : places) {
+    for (const Base& base : bases_of(place, standing, history)) {
+      const PlaceEvidence evidence(base.schema, search.noise, place.part, place.marker, samples);
+      const auto offer = [&](FittedChange fitted) {
+        if (base.origin) fitted.origin = *base.origin;
+        ranking.offer({place, std::move(fitted)});
+      };
+      if (base.origin && evidence.num_usable() > 0) offer(evidence.judge_stored(base.schema));
+      if (base.origin && is_old) continue;
+      found.work += static_cast<int>(samples.size());
+      for (FittedChange& fitted :
+           evidence.fit_likely(possible_changes(base.schema, place.part, place.marker)))
+        offer(std::move(fitted));
+      if (!search.learn || base.origin) continue;
+      for (FittedChange& learned : evidence.learn()) offer(std::move(learned));
+    }
+  }
+  for (const BodySchema& stored : history)
+    if (auto all = whole(stored, standing, places, samples, search.noise))
+      ranking.offer(std::move(*all));
+  found.best = std::move(ranking.best);
+  found.runner_up = std::move(ranking.second);
+  // With many samples what the schema was wrong about before the change is found out too, and
+  // dressed up as a richer form of it.
+  if (ranking.same_form && are_many && found.best->fitted.change != *search.standing_form &&
+      found.best->fitted.log_evidence - ranking.same_form->fitted.log_evidence <
+          search.ambiguity + kSystematicShare * found.margin()) {
+    found.runner_up = std::move(found.best);
+    found.best = std::move(ranking.same_form);
+  }
+  return found;
+}
+
+}  // namespace bodyschema

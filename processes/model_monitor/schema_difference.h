@@ -1,0 +1,27 @@
+#pragma once
+
+#include <vector>
+
+#include "common/schema/body_schema.h"
+#include "processes/model_monitor/body_change.h"
+
+namespace bodyschema {
+
+/// How two schemas of one tree (the same parts, signals and pairs of parts) differ.
+
+/// The edge to `part` (root: the camera's pose).
+bool differ_at(const BodySchema& a, const BodySchema& b, int part);
+/// All that predicts is the same.
+bool is_same(const BodySchema& a, const BodySchema& b);
+/// One body: at actions all over the box of the limits no local model differs by more than is
+/// uncertain about it (χ²₆ at 99 %).
+bool is_alike(const BodySchema& a, const BodySchema& b);
+/// The places in which they differ: markers first, of parts that lie elsewhere between edges which
+/// together lead to where they led, then edges.
+std::vector<Place> differences(const BodySchema& a, const BodySchema& b);
+/// The action, of 200 in the box of the limits, at which the poses of a part in the root differ
+/// most, in units of `tolerance`; empty if nowhere by more than one.
+Eigen::VectorXd most_telling_action(const BodySchema& a, const BodySchema& b,
+                                    const Noise& tolerance);
+
+}  // namespace bodyschema

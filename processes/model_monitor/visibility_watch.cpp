@@ -1,0 +1,94 @@
+#include "processes/model_monitor/visibility_watch.h"
+
+#include <algorithm>
+#include <cmath>
+#include <numeric>
+
+namespace bodyschema {
+namespace {
+
+/// Sightings below which a part's visibility is not known.
+constexpr int kFewestSightings = 10;
+
+}  // namespace
+
+std::vector<VisibilityWatch::Finding> VisibilityWatch::look(const std::vector<int>& parts,
+                                                            const ActionPoseSample& seen,
+                                                            const ActionPoseSample& used,
+                                                            const MovedTags& moved) {
+  std::vector<Finding> findings;
+  for (const int part : parts) {
+    const PartObservation* observation = seen.find(part);
+    // A marker that lies somewhere is none; a tag that moved is still one.
+    if (observation && !used.find(part) && !moved.affects(*observation)) observation = nullptr;
+    count(part, kAnyTag, observation, &findings);
+    // An arm that holds still or is led shows one side of its parts for as long.
+    if (!observation || seen.purpose == Purpose::kControl) continue;
+    const std::vector<int>& tags = observation->tags;
+    auto& of_part = counts_[part];
+    for (const int tag : tags) of_part[tag];
+    if (of_part.size() < 3) continue;  // its only tag is the part's marker
+    for (const auto& [tag, _] : of_part)
+      if (tag != kAnyTag && !moved.has_moved(tag))
+        count(part, tag, std::find(tags.begin(), tags.end(), tag) != tags.end(), &findings);
+  }
+  return findings;
+}
+
+void VisibilityWatch::count(int part, int tag, bool is_seen, std::vector<Finding>* findings) {
+  Count& c = counts_[part][tag];
+  if (is_seen) {
+    // What is seen again need not be seen as often as before.
+    if (c.is_missing) {
+      findings->push_back({part, tag, false, c.num_missed});
+      c = {};
+    }
+    c.num_asked += c.num_missed + 1;
+    c.num_missed = 0;
+    ++c.num_seen;
+    return;
+  }
+  ++c.num_missed;
+  if (c.is_missing || c.num_seen < kFewestSightings) return;
+  const auto num = std::accumulate(
+      counts_.begin(), counts_.end(), std::size_t{0},
+      [](std::size_t sum, const auto& of_part) { return sum + of_part.second.size(); });
+  const double share = (c.num_seen + 0.5) / (c.num_asked + 1.0);
+  const double chance = share * std::pow(1 - share, c.num_missed) * static_cast<double>(num);
+  if (chance > false_alarm_rate_) return;
+  c.is_missing = true;
+  findings->push_back({part, tag, true, c.num_missed});
+}
+
+int VisibilityWatch::lose(int part, int num_missed) {
+  Count& c = counts_[part][kAnyTag];
+  c.is_missing = true;
+  return c.num_missed += num_missed;
+}
+
+bool VisibilityWatch::is_missing(int part) const {
+  const auto it = counts_.find(part);
+  if (it == counts_.end()) return false;
+  const auto any = it->second.find(kAnyTag);
+  return any != it->second.end() && any->second.is_missing;
+}
+
+std::vector<int> VisibilityWatch::missing_parts() const {
+  std::vector<int> parts;
+  for (const auto& [part, _] : counts_)
+    if (is_missing(part)) parts.push_back(part);
+  return parts;
+}
+
+void VisibilityWatch::forget_tags() {
+  for (auto& [part, tags] : counts_)
+    std::erase_if(tags, [](const auto& of_tag) { return of_tag.first != kAnyTag; });
+}
+
+void VisibilityWatch::tell_tags_again() {
+  for (auto& [part, tags] : counts_)
+    for (auto& [tag, of_tag] : tags)
+      if (tag != kAnyTag) of_tag.is_missing = false;
+}
+
+}  // namespace bodyschema
