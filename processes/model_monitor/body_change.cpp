@@ -16,25 +16,6 @@ Edge* edge_to(BodySchema* schema, int part) {
   return nullptr;
 }
 
-/// T = (Exp(w), p): independent of where the origin of rotation lies.
-Pose transform(const Vector6d& theta) {
-  Pose T = Pose::Identity();
-  T.linear() = exp_so3(theta.tail<3>());
-  T.translation() = theta.head<3>();
-  return T;
-}
-
-/// ∂(right perturbation of T)/∂θ.
-Matrix6d transform_jacobian(const Vector6d& theta) {
-  Vector6d rotation = Vector6d::Zero();
-  rotation.tail<3>() = theta.tail<3>();
-  Matrix6d J = Matrix6d::Zero();
-  J.topLeftCorner<3, 3>() = exp_so3(theta.tail<3>()).transpose();
-  J.bottomRightCorner<3, 3>() =
-      right_jacobian_inverse(rotation).bottomRightCorner<3, 3>().inverse();
-  return J;
-}
-
 void make_room(Edge* edge) {
   const auto size = 6 + 8 * static_cast<Eigen::Index>(edge->joints.size());
   if (edge->parameter_covariance.rows() != size)
@@ -68,10 +49,7 @@ void multiply_left(Edge* edge, const Vector6d& theta, const Matrix6d* covariance
 void add_displacement_variance(Edge* edge, int joint, double variance) {
   make_room(edge);
   const ScrewJoint& j = edge->joints[static_cast<std::size_t>(joint)];
-  Vector6d screw = Vector6d::Zero();
-  screw(2) = j.slide;
-  screw(5) = j.turn;
-  const Vector6d along = adjoint(j.X_after.inverse()) * screw;
+  const Vector6d along = displacement_twist(j);
   const Eigen::Index at = 8 + 8 * static_cast<Eigen::Index>(joint);
   edge->parameter_covariance.block<6, 6>(at, at) += variance * along * along.transpose();
 }
@@ -82,6 +60,36 @@ double range(const BodySchema& schema, int signal) {
 }
 
 }  // namespace
+
+Pose transform(const Vector6d& theta) {
+  Pose T = Pose::Identity();
+  T.linear() = exp_so3(theta.tail<3>());
+  T.translation() = theta.head<3>();
+  return T;
+}
+
+Matrix6d transform_jacobian(const Vector6d& theta) {
+  Vector6d rotation = Vector6d::Zero();
+  rotation.tail<3>() = theta.tail<3>();
+  Matrix6d J = Matrix6d::Zero();
+  J.topLeftCorner<3, 3>() = exp_so3(theta.tail<3>()).transpose();
+  J.bottomRightCorner<3, 3>() =
+      right_jacobian_inverse(rotation).bottomRightCorner<3, 3>().inverse();
+  return J;
+}
+
+Vector6d coordinates(const Pose& T) {
+  Vector6d theta;
+  theta << T.translation(), log_so3(T.linear());
+  return theta;
+}
+
+Vector6d displacement_twist(const ScrewJoint& joint) {
+  Vector6d screw = Vector6d::Zero();
+  screw(2) = joint.slide;
+  screw(5) = joint.turn;
+  return adjoint(joint.X_after.inverse()) * screw;
+}
 
 const Edge* edge_to(const BodySchema& schema, int part) {
   return edge_to(const_cast<BodySchema*>(&schema), part);

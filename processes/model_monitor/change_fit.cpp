@@ -31,12 +31,6 @@ std::vector<int> nodes_of(const TreeFilter& filter, const std::vector<int>& part
   return nodes;
 }
 
-Vector6d coordinates(const Pose& T) {
-  Vector6d theta;
-  theta << T.translation(), log_so3(T.linear());
-  return theta;
-}
-
 }  // namespace
 
 BodySchema with_edge_of(const BodySchema& schema, const BodySchema& other, int part) {
@@ -103,49 +97,87 @@ PlaceEvidence::PlaceEvidence(const BodySchema& base, const MarkerNoise& noise, i
   }
   place_ = base_;
   std::erase_if(place_.edges, [part](const Edge& edge) { return edge.to != part; });
+  if (marker) return;
   const Edge* edge = edge_to(place_, part);
-  if (!edge || marker) return;
   for (Measured& m : measurements_) {
-    if (edge->matrix_gp) m.process = edge->matrix_gp->predict(m.displacements);
-    if (edge->residual_gp) m.process = exp(edge->residual_gp->mean(m.displacements));
+    m.unchanged = edge ? edge->predict(m.displacements) : place_.X_CR;
+    if (edge && edge->matrix_gp) m.process = edge->matrix_gp->predict(m.displacements);
+    if (edge && edge->residual_gp) m.process = exp(edge->residual_gp->mean(m.displacements));
   }
+  if (edge) rigid_ = edge_to(changed(place_, {Form::kRigid, part}, Vector6d::Zero()), part)->left;
 }
 
-std::vector<Pose> PlaceEvidence::predict(const BodyChange& change,
-                                         const Eigen::VectorXd& theta) const {
-  const std::size_t n = measurements_.size();
-  if (marker_) {
-    // measure_marker() gives T itself.
-    Pose T = Pose::Identity();
-    T.linear() = exp_so3(theta.tail<3>());
-    T.translation() = theta.head<3>();
-    return std::vector<Pose>(n, T);
-  }
-  const BodySchema with = changed(place_, change, theta);
-  const Edge* edge = edge_to(with, part_);
-  if (!edge) return std::vector<Pose>(n, with.X_CR);
+std::vector<Pose> PlaceEvidence::predict(const BodyChange& change, const Eigen::VectorXd& theta,
+                                         std::vector<Jacobian>* jacobians) const {
   std::vector<Pose> result;
-  result.reserve(n);
-  if (!edge->matrix_gp && !edge->residual_gp) {
-    for (const Measured& m : measurements_) result.push_back(edge->predict(m.displacements));
+  result.reserve(measurements_.size());
+  if (jacobians) jacobians->assign(measurements_.size(), Jacobian(6, change.size()));
+  const Edge* base = edge_to(place_, part_);
+  if (change.size() >= 6) {
+    const Pose T = transform(theta.head<6>()), last = transform(theta.tail<6>());
+    const Matrix6d J = transform_jacobian(theta.head<6>());
+    for (const Measured& m : measurements_) {
+      const Pose& X = m.unchanged;
+      Jacobian* out = jacobians ? &(*jacobians)[result.size()] : nullptr;
+      switch (change.form) {
+        case Form::kLeft:
+          result.push_back(T * X);
+          if (out) *out = adjoint(X.inverse()) * J;
+          break;
+        case Form::kBoth:
+          result.push_back(T * X * last);
+          if (out) *out << adjoint((X * last).inverse()) * J, transform_jacobian(theta.tail<6>());
+          break;
+        default:
+          result.push_back((change.form == Form::kRigid ? rigid_ : X) * T);
+          if (out) *out = J;
+      }
+    }
     return result;
   }
-  Edge without = *edge;
-  without.right = Pose::Identity();
-  without.matrix_gp.reset();
-  without.residual_gp.reset();
-  for (const Measured& m : measurements_)
-    result.push_back(without.predict(m.displacements) * m.process * edge->right);
+  if (!base) {
+    for (const Measured& m : measurements_) result.push_back(m.unchanged);
+    return result;
+  }
+  const BodySchema with = changed(place_, change, theta);
+  Edge screws = *edge_to(with, part_);
+  const Pose right = screws.right;
+  screws.right = Pose::Identity();
+  screws.matrix_gp.reset();
+  screws.residual_gp.reset();
+  for (const Measured& m : measurements_) {
+    const Pose suffix = m.process * right;
+    if (jacobians && change.size() > 0) {
+      const auto joint = static_cast<std::size_t>(change.joint);
+      const ScrewJoint& old = base->joints[joint];
+      Jacobian& out = (*jacobians)[result.size()];
+      // The last parameter is a displacement, that of a gain before it multiplies one.
+      out.rightCols<1>() = adjoint(suffix.inverse()) *
+                           screws.parameter_jacobian(m.displacements)
+                               .middleCols<6>(8 + 8 * static_cast<Eigen::Index>(joint)) *
+                           displacement_twist(old);
+      if (change.form == Form::kGain)
+        out.col(0) = old.gain * m.displacements(old.signal) * out.col(1);
+    }
+    result.push_back(screws.predict(m.displacements) * suffix);
+  }
   return result;
 }
 
-Eigen::VectorXd PlaceEvidence::residuals(const BodyChange& change,
-                                         const Eigen::VectorXd& theta) const {
-  const std::vector<Pose> predicted = predict(change, theta);
+Eigen::VectorXd PlaceEvidence::residuals(const BodyChange& change, const Eigen::VectorXd& theta,
+                                         Eigen::MatrixXd* jacobian) const {
+  std::vector<Jacobian> moves;
+  const std::vector<Pose> predicted = predict(change, theta, jacobian ? &moves : nullptr);
   Eigen::VectorXd r(6 * static_cast<Eigen::Index>(predicted.size()));
-  for (std::size_t n = 0; n < predicted.size(); ++n)
-    r.segment<6>(6 * static_cast<Eigen::Index>(n)) =
-        measurements_[n].whitening * log(predicted[n].inverse() * measurements_[n].of.z);
+  if (jacobian) jacobian->resize(r.size(), change.size());
+  for (std::size_t n = 0; n < predicted.size(); ++n) {
+    const Eigen::Index at = 6 * static_cast<Eigen::Index>(n);
+    const Matrix6d& W = measurements_[n].whitening;
+    const Vector6d xi = log(predicted[n].inverse() * measurements_[n].of.z);
+    r.segment<6>(at) = W * xi;
+    // log(Exp(−δ) Exp(ξ)) = ξ − J_l⁻¹(ξ) δ, and J_l(ξ) = J_r(−ξ).
+    if (jacobian) jacobian->middleRows<6>(at) = -W * right_jacobian_inverse(-xi) * moves[n];
+  }
   return r;
 }
 
@@ -174,10 +206,9 @@ std::vector<Eigen::VectorXd> PlaceEvidence::starts(const BodyChange& change) con
       // What each of the newest samples alone says.
       const Eigen::VectorXd zero = Eigen::VectorXd::Zero(change.size());
       const std::size_t count = measurements_.size();
-      const std::vector<Pose> unchanged = predict(change, zero);
       for (std::size_t n = count > 3 ? count - 3 : 0; n < count; ++n) {
         const Pose& z = measurements_[n].of.z;
-        const Pose& before = unchanged[n];
+        const Pose& before = change.form == Form::kRigid ? rigid_ : measurements_[n].unchanged;
         const Vector6d right = coordinates(before.inverse() * z);
         const Vector6d left = coordinates(z * before.inverse());
         if (change.form == Form::kLeft) {
@@ -228,7 +259,6 @@ double PlaceEvidence::cost(const BodyChange& change, const Eigen::VectorXd& thet
 }
 
 PlaceEvidence::State PlaceEvidence::climb(const BodyChange& change, Eigen::VectorXd theta) const {
-  const Eigen::Index d = change.size();
   const Eigen::VectorXd mean = prior_mean(change, base_), sigma = prior_sigma(change, base_);
   const Eigen::VectorXd prior = sigma.cwiseAbs2().cwiseInverse();
   const double flat = log_flat_outlier();
@@ -238,15 +268,8 @@ PlaceEvidence::State PlaceEvidence::climb(const BodyChange& change, Eigen::Vecto
   for (int iteration = 0; iteration < kIterations; ++iteration) {
     const bool robust = iteration < kIterations / 2;
     if (iteration == kIterations / 2) damping = 1e-3;
-    const Eigen::VectorXd r = residuals(change, theta);
-    Eigen::MatrixXd J(r.size(), d);
-    for (Eigen::Index p = 0; p < d; ++p) {
-      const double h = 1e-5 * std::max(1.0, sigma(p));
-      Eigen::VectorXd plus = theta, minus = theta;
-      plus(p) += h;
-      minus(p) -= h;
-      J.col(p) = (residuals(change, plus) - residuals(change, minus)) / (2 * h);
-    }
+    Eigen::MatrixXd J;
+    const Eigen::VectorXd r = residuals(change, theta, &J);
     Eigen::MatrixXd H = prior.asDiagonal();
     Eigen::VectorXd g = prior.cwiseProduct(theta - mean);
     for (std::size_t n = 0; n < count; ++n) {

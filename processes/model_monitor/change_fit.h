@@ -63,7 +63,8 @@ class PlaceEvidence {
     Eigen::VectorXd displacements;
     VirtualMeasurement of;
     Matrix6d whitening;
-    double log_norm = 0;  ///< log |2πS|^(−½)
+    double log_norm = 0;                ///< log |2πS|^(−½)
+    Pose unchanged = Pose::Identity();  ///< the place as the base has it; of a marker the identity
     /// What the Gaussian process of the place's edge says here: no change of a form moves it.
     Pose process = Pose::Identity();
   };
@@ -72,10 +73,14 @@ class PlaceEvidence {
     double cost = 0;
     Eigen::MatrixXd H;
   };
-  /// What the place looks like with a change: its pose at every measurement.
-  std::vector<Pose> predict(const BodyChange& change, const Eigen::VectorXd& theta) const;
-  /// Whitened residuals of the measurements, one after the other: 6N.
-  Eigen::VectorXd residuals(const BodyChange& change, const Eigen::VectorXd& theta) const;
+  using Jacobian = Eigen::Matrix<double, 6, Eigen::Dynamic>;
+  /// What the place looks like with a change: its pose at every measurement. With `jacobians` also
+  /// how it moves with θ: X ← X · Exp(J dθ), 6×d.
+  std::vector<Pose> predict(const BodyChange& change, const Eigen::VectorXd& theta,
+                            std::vector<Jacobian>* jacobians = nullptr) const;
+  /// Whitened residuals of the measurements, one after the other: 6N; and ∂/∂θ: 6N×d.
+  Eigen::VectorXd residuals(const BodyChange& change, const Eigen::VectorXd& theta,
+                            Eigen::MatrixXd* jacobian = nullptr) const;
   std::vector<Eigen::VectorXd> starts(const BodyChange& change) const;
   double log_flat_outlier() const;
   double log_inlier(std::size_t n, double squared_distance) const;
@@ -93,7 +98,8 @@ class PlaceEvidence {
   const bool marker_;
   const std::vector<const ActionPoseSample*> samples_;
   const std::vector<int> cut_parts_;
-  BodySchema place_;  ///< the base with the place's edge alone
+  BodySchema place_;               ///< the base with the place's edge alone
+  Pose rigid_ = Pose::Identity();  ///< the edge in mid-range
   std::vector<Measured> measurements_;
 };
 
