@@ -49,8 +49,8 @@ bool is_worth_a_fit(std::int64_t age) {
 
 /// Samples that all forms of change in one place are fitted to are counted: so many are free a
 /// sample, and so many are saved up at most. Less would be done than a fault of two places needs.
-constexpr int kWorkPerSample = 6;
-constexpr int kMostWork = 2000;
+constexpr int kWorkPerSample = 4;
+constexpr int kMostWork = 1000;
 
 /// Samples without an explanation, and explanations that did not hold, after which an edge is
 /// learned.
@@ -227,9 +227,23 @@ FoundChanges Adaptation::search(const BodySchema& standing, const std::vector<Pl
 
 BodySchema Adaptation::composed(int without) const {
   BodySchema schema = before_;
-  for (int n = 0; n < static_cast<int>(replacements_.size()); ++n)
-    if (n != without) schema = with_change(schema, replacements_[n].fitted);
+  for (int n = 0; n < static_cast<int>(replacements_.size()); ++n) {
+    const FittedChange& fitted = replacements_[static_cast<std::size_t>(n)].fitted;
+    if (n != without && is_possible(fitted, schema)) schema = with_change(schema, fitted);
+  }
   return schema;
+}
+
+void Adaptation::drop_impossible(std::int64_t sample_index, std::vector<AdaptationEvent>* events) {
+  BodySchema schema = before_;
+  std::erase_if(replacements_, [&](const Replacement& r) {
+    if (!is_possible(r.fitted, schema)) {
+      tell(AdaptationEvent::Kind::kReverted, sample_index, r, 0, 0, events);
+      return true;
+    }
+    schema = with_change(schema, r.fitted);
+    return false;
+  });
 }
 
 AdaptationEvent Adaptation::event(AdaptationEvent::Kind kind, std::int64_t sample_index,
@@ -463,7 +477,7 @@ void Adaptation::reconsider(std::int64_t sample_index, bool all_forms,
       Replacement& r = replacements_[static_cast<std::size_t>(n)];
       const BodySchema others = composed(n);
       if (!all_forms) {
-        if (r.fitted.change.size() > 0) {
+        if (r.fitted.change.size() > 0 && is_possible(r.fitted, others)) {
           const BodySchema base =
               r.fitted.origin ? with_edge_of(others, *r.fitted.origin, r.place.part) : others;
           const PlaceEvidence evidence(base, noise_, r.place.part, r.place.marker, samples);
@@ -498,6 +512,7 @@ void Adaptation::reconsider(std::int64_t sample_index, bool all_forms,
     }
     if (!is_changed) break;
   }
+  drop_impossible(sample_index, events);
   const bool is_another = all_forms && reconsider_place(samples, sample_index, events);
   const SequentialTests tests = *tests_;
   install(composed());

@@ -133,7 +133,10 @@ class Adaptation {
   FoundChanges search(const BodySchema& standing, const std::vector<Place>& places,
                       const std::vector<const ActionPoseSample*>& samples,
                       const BodyChange* standing_form = nullptr);
+  /// before_ with the replacements; of those in one place one may have taken the joint of another,
+  /// which is then left out.
   BodySchema composed(int without = -1) const;
+  void drop_impossible(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
   /// Evidence that a change must have over the schema that stands [nats]: more where changes were
   /// taken back lately.
   double required_margin(const Place& place, std::int64_t sample_index) const;

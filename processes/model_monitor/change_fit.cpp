@@ -45,6 +45,15 @@ BodySchema with_edge_of(const BodySchema& schema, const BodySchema& other, int p
   return result;
 }
 
+bool is_possible(const FittedChange& fitted, const BodySchema& schema) {
+  const BodyChange& change = fitted.change;
+  if (change.form != Form::kStuck && change.form != Form::kOffset && change.form != Form::kGain &&
+      change.form != Form::kOtherSignal)
+    return true;
+  const Edge* edge = edge_to(fitted.origin ? *fitted.origin : schema, change.part);
+  return edge && change.joint < static_cast<int>(edge->joints.size());
+}
+
 BodySchema with_change(const BodySchema& schema, const FittedChange& fitted) {
   BodySchema result = schema;
   if (fitted.origin) {

@@ -25,7 +25,10 @@ struct FittedChange {
   int num_usable = 0;    ///< samples that say something of the place
 };
 
+/// Whether the schema, or what the change starts from, has the joint that changed.
+bool is_possible(const FittedChange& fitted, const BodySchema& schema);
 /// `schema` with the fitted change, and its uncertainty, in it.
+/// @throws std::invalid_argument, std::out_of_range if it is not possible.
 BodySchema with_change(const BodySchema& schema, const FittedChange& fitted);
 /// `schema` with the edge to `part` (root: the camera's pose) of another.
 BodySchema with_edge_of(const BodySchema& schema, const BodySchema& other, int part);

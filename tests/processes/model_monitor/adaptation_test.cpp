@@ -396,6 +396,27 @@ TEST(AdaptationTest, WhatBreaksWhileALinkDriftsIsFoundAllTheSame) {
   EXPECT_LT(distances[distances.size() / 2], 0.015);
 }
 
+/// A joint that follows nothing looks stuck, offset, rigid … by turns: changes of one place follow
+/// upon each other, and one takes away the joint that another was about (with this seed).
+TEST(AdaptationTest, AJointThatFollowsNothingIsFoundAndSoIsItsRepair) {
+  BrokenArm arm({Fault::kNone, "", 0.85}, Regime::kChapter, 75, 6);
+  Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kChapter));
+  test::Rng rng(6);
+  Life life;
+  for (int t = 0; t < arm.num_samples(); ++t) {
+    ActionPoseSample sample = arm.observe(t);
+    if (t >= 50 && t < 150) sample.action(4) = test::uniform(rng, -1, 1);
+    for (const auto& e : adaptation.on_sample(sample)) life.events.push_back(e);
+  }
+  EXPECT_TRUE(std::any_of(life.events.begin(), life.events.end(),
+                          [](const AdaptationEvent& e) {
+                            return e.kind == Kind::kMismatch && e.sample_index < 60 &&
+                                   std::abs(part_of(e) - 6) <= 1;
+                          }))
+      << life.log();
+  EXPECT_LT(arm.error(adaptation.schema(), 0), 0.05) << life.log();
+}
+
 TEST(AdaptationTest, WhatNothingExplainsIsOverSoonAfterItEnds) {
   // A part is a hand's breadth beside where it was, elsewhere at each sample, for forty samples.
   BrokenArm arm({Fault::kNone, "", 1}, Regime::kTagIso, 50, 1);
