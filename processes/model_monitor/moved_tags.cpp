@@ -10,6 +10,7 @@ namespace {
 constexpr double kSame = ReadingDistance::kSame, kOther = ReadingDistance::kOther;
 /// Of the tag in the wrong place, and of others in the right one: an outlier repeats itself rarely.
 constexpr int kSightings = 3;
+constexpr int kAlone = 30;
 
 }  // namespace
 
@@ -55,6 +56,19 @@ std::vector<MovedTags::Finding> MovedTags::look(const ActionPoseSample& sample,
     double far_off = distance(X_CB, seen.X_CB);
     if (seen.X_CB_other) far_off = std::min(far_off, distance(X_CB, *seen.X_CB_other));
 
+    if (int& num = num_affected_[seen.part]; !affects(seen)) {
+      num = 0;
+    } else if (sample.purpose != Purpose::kControl && ++num == kAlone) {
+      num = 0;
+      for (const int tag : seen.tags) {
+        const auto track = tracks_.find(tag);
+        if (track == tracks_.end() || !track->second.has_moved) continue;
+        findings.push_back(
+            {seen.part, tag, sample.sample_index, kAlone, track->second.is_on_part, true});
+        tracks_.erase(track);
+      }
+      continue;
+    }
     std::vector<int>& siblings = of_[seen.part];
     for (const int tag : seen.tags)
       if (std::find(siblings.begin(), siblings.end(), tag) == siblings.end())

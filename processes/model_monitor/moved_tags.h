@@ -15,7 +15,8 @@ namespace bodyschema {
 /// change of the body explains that. A tag has moved once it was seen in one wrong place again and
 /// again (on the part, or lying in the room), never in the right one, and other tags of the part
 /// in between in theirs. Once it is seen there again, it is back; so with a tag that was lost,
-/// which may have been put elsewhere.
+/// which may have been put elsewhere. Where a babbling arm shows a part by such tags alone for
+/// long, they are what there is of it: they are taken for back.
 class MovedTags {
  public:
   /// `moved`: those known already.
@@ -55,6 +56,7 @@ class MovedTags {
   };
   std::map<int, Track> tracks_;         ///< by tag
   std::map<int, std::vector<int>> of_;  ///< the tags of every part that were seen
+  std::map<int, int> num_affected_;     ///< sightings of every part in a row that moved tags affect
 };
 
 }  // namespace bodyschema

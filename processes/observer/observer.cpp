@@ -223,7 +223,7 @@ sample_t Observer::sample_from(const Rest& rest, const std::vector<const marker_
 
   std::vector<part_observation_t> parts;
   for (auto& [part, tags] : tags_of_part) {
-    const auto pose = solve_part_pose(std::move(tags), config_.part_pose);
+    const auto pose = solve_part_pose(std::move(tags), config_.part_pose, next_index_);
     if (!pose) {
       ++counters_["part without a pose"];
       continue;

@@ -54,7 +54,8 @@ double worst_tag_error(const Pose& X_CB, const std::vector<SeenTag>& tags) {
 
 }  // namespace
 
-std::optional<PartPose> solve_part_pose(std::vector<SeenTag> tags, const PartPoseOptions& options) {
+std::optional<PartPose> solve_part_pose(std::vector<SeenTag> tags, const PartPoseOptions& options,
+                                        std::int64_t turn) {
   PartPose result;
   std::vector<PoseFit> minima = minima_of(tags);
   while (!minima.empty() && worst_tag_error(minima[0].X_CB, tags) > options.max_tag_error_px) {
@@ -62,20 +63,22 @@ std::optional<PartPose> solve_part_pose(std::vector<SeenTag> tags, const PartPos
     // The tag with the largest residual need not be the wrong one: it may be the only right one far
     // from the others. So each is left out in turn.
     double best_error = std::numeric_limits<double>::infinity();
-    std::size_t culprit = 0;
-    std::vector<PoseFit> best_minima;
+    std::size_t culprit = 0, num_fitting = 0;
+    std::vector<std::vector<PoseFit>> without;
     for (std::size_t i = 0; i < tags.size(); ++i) {
       std::vector<SeenTag> others = tags;
       others.erase(others.begin() + static_cast<std::ptrdiff_t>(i));
-      std::vector<PoseFit> without = minima_of(others);
-      if (without.empty() || without[0].rms_sigma >= best_error) continue;
-      best_error = without[0].rms_sigma;
-      best_minima = std::move(without);
+      without.push_back(minima_of(others));
+      if (without[i].empty()) continue;
+      num_fitting += worst_tag_error(without[i][0].X_CB, others) <= options.max_tag_error_px;
+      if (without[i][0].rms_sigma >= best_error) continue;
+      best_error = without[i][0].rms_sigma;
       culprit = i;
     }
+    if (tags.size() == 2 && num_fitting == 2) culprit = turn % 2 == 0 ? 0 : 1;
     result.dropped.push_back(tags[culprit].id);
     tags.erase(tags.begin() + static_cast<std::ptrdiff_t>(culprit));
-    minima = std::move(best_minima);
+    minima = std::move(without[culprit]);
   }
   if (minima.empty()) return std::nullopt;
   const auto covariance = covariance_from(minima[0].information);

@@ -1,10 +1,11 @@
 #pragma once
 
+#include <cstdint>
 #include <optional>
 #include <vector>
 
-#include "common/config/rig.h"
 #include "common/camera/fit_pose.h"
+#include "common/config/rig.h"
 
 namespace bodyschema {
 
@@ -37,7 +38,10 @@ struct PartPose {
 /// The pose of a part over all its tags at once: the minimum of the reprojection error of all
 /// corners, searched from every hypothesis of every tag. Tags in different planes leave one
 /// minimum; a single tag seen from afar has two. While a tag disagrees with the common pose the one
-/// whose absence helps most is dropped. std::nullopt if nothing is left that fits.
-std::optional<PartPose> solve_part_pose(std::vector<SeenTag> tags, const PartPoseOptions& options);
+/// whose absence helps most is dropped; of two that fit each alone, either may be the wrong one:
+/// the one or the other by turns, so that who knows the body can tell. std::nullopt if nothing is
+/// left that fits.
+std::optional<PartPose> solve_part_pose(std::vector<SeenTag> tags, const PartPoseOptions& options,
+                                        std::int64_t turn = 0);
 
 }  // namespace bodyschema

@@ -609,6 +609,70 @@ TEST_P(FourTagsAPart, OneThatIsLostIsNamedAndThePartIsNotMissedForLong) {
 
 INSTANTIATE_TEST_SUITE_P(AdaptationTest, FourTagsAPart, testing::Range(1, 9));
 
+/// The root does not turn: both its tags are always in sight.
+class TwoTagsOnTheRoot : public testing::Test {
+ protected:
+  static constexpr int kTag = 10, kOther = 11, kBroken = 100, kRepaired = 220, kEnd = 320;
+
+  /// `tags_of`: those that the root's pose rests on, not both. kTag sits elsewhere from `moved` on.
+  Life live_with(int moved, const std::function<std::vector<int>(int)>& tags_of) {
+    Pose X_BS = Pose::Identity();
+    X_BS.translation() << 0.03, 0.04, 0;
+    Life life;
+    for (int t = 0; t < kEnd; ++t) {
+      ActionPoseSample sample = arm_.observe(t);
+      for (PartObservation& o : sample.parts) {
+        if (o.part != BrokenArm::kRoot) continue;
+        o.tags = {kTag, kOther};
+        if (t < kBroken || t >= kRepaired) continue;
+        o.tags = tags_of(t);
+        if (o.tags == std::vector<int>{kTag} && t >= moved) o.X_CB = o.X_CB * X_BS;
+        o.X_CB_other.reset();
+      }
+      for (const auto& e : adaptation_.on_sample(sample)) life.events.push_back(e);
+    }
+    return life;
+  }
+  /// Of the root's marker from where it was, as the schema has it [m].
+  double error() const {
+    const BodySchema now = adaptation_.schema(), then = arm_.engineered();
+    return (now.X_CR.translation() - then.X_CR.translation()).norm();
+  }
+
+  BrokenArm arm_{{Fault::kNone, "", 1}, Regime::kTagIso, 200, 1};
+  Adaptation adaptation_{arm_.engineered(), adaptation_options(Regime::kTagIso)};
+};
+
+/// The observer gives the one or the other by turns.
+TEST_F(TwoTagsOnTheRoot, TheOneThatMovesIsNamedAndNotTheOther) {
+  const Life life = live_with(
+      kBroken, [](int t) { return std::vector<int>{t % 2 == 0 ? kTag : kOther}; });
+  SCOPED_TRACE("events:\n" + life.log());
+  std::vector<AdaptationEvent> of_tag;
+  for (const AdaptationEvent& e : life.events)
+    if (e.tag >= 0) of_tag.push_back(e);
+  ASSERT_EQ(of_tag.size(), 2U);
+  EXPECT_EQ(of_tag[0].tag, kTag);
+  EXPECT_EQ(of_tag[0].kind, Kind::kCandidate);
+  EXPECT_LT(of_tag[0].sample_index, kBroken + 10);
+  EXPECT_EQ(of_tag[1].tag, kTag);
+  EXPECT_EQ(of_tag[1].kind, Kind::kRestored);
+  EXPECT_LT(of_tag[1].sample_index, kRepaired + 10);
+  EXPECT_LT(error(), 0.003);
+}
+
+TEST_F(TwoTagsOnTheRoot, WhatWasTakenForLostIsBelievedAgainWhereThereIsNothingElse) {
+  const Life life = live_with(kBroken + 20, [](int) { return std::vector<int>{kTag}; });
+  SCOPED_TRACE("events:\n" + life.log());
+  EXPECT_TRUE(std::any_of(life.events.begin(), life.events.end(), [](const AdaptationEvent& e) {
+    return e.kind == Kind::kCandidate && e.part == BrokenArm::kRoot && e.tag < 0;
+  }));
+  EXPECT_TRUE(std::any_of(life.events.begin(), life.events.end(), [](const AdaptationEvent& e) {
+    return e.kind == Kind::kRecovered && e.tag == kOther && e.sample_index > kRepaired;
+  }));
+  EXPECT_LT(error(), 0.003);
+}
+
 TEST(AdaptationTest, WhatIsNeverSeenIsNotSuspected) {
   BrokenArm arm({Fault::kStuck, "", 0.919}, Regime::kTagIso, kBlock, 3);
   Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kTagIso));

@@ -146,6 +146,28 @@ TEST(SolvePartPose, DropsTheTagThatDisagrees) {
   }
 }
 
+TEST(SolvePartPose, OfTwoTagsThatDisagreeGivesTheOneOrTheOtherByTurns) {
+  std::mt19937 random(7);
+  const Pose X_CB = X_CB_of(random);
+  std::vector<SeenTag> tags = seen_box(X_CB, 2, 0.1, random);
+  Pose moved = X_CB;
+  moved.translation().x() += 0.02;
+  tags[0] = seen(0, moved, box()[0], 0.1, random);
+  for (int turn = 0; turn < 4; ++turn) {
+    const auto pose = solve_part_pose(tags, options(), turn);
+    ASSERT_TRUE(pose);
+    EXPECT_EQ(pose->dropped, std::vector<int>{turn % 2});
+    EXPECT_EQ(pose->used, std::vector<int>{1 - turn % 2});
+  }
+  // One that fits no pose is the wrong one.
+  tags[0].corners[0].ray.x() += 20 / kFocal_px;
+  for (int turn = 0; turn < 2; ++turn) {
+    const auto pose = solve_part_pose(tags, options(), turn);
+    ASSERT_TRUE(pose);
+    EXPECT_EQ(pose->dropped, std::vector<int>{0});
+  }
+}
+
 TEST(SolvePartPose, WidensItsCovarianceByTheFloor) {
   std::mt19937 random(5);
   const auto tags = seen_box(X_CB_of(random), 3, 0.1, random);
