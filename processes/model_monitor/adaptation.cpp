@@ -15,7 +15,7 @@ constexpr std::size_t kRing = 96;
 /// Of a CUSUM, from which on it is told which place is wrong, although nothing explains it [nats];
 /// or after so many samples.
 constexpr double kClearLead = 1;
-constexpr std::size_t kLongestUnclear = 4;
+constexpr std::int64_t kLongestUnclear = 3;
 /// Samples below which nothing is found out where an edge is soft.
 constexpr int kFewestSoft = 3;
 /// In a stream a marker that is read farther than this from where it should be is turned over.
@@ -302,8 +302,19 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
   const bool is_rising = !detected_ || highest > std::min(untold_, tests_->ceiling());
   const bool is_clear =
       accepted || (is_rising && highest > tests_->alarm() &&
-                   (highest - second > kClearLead || samples.size() >= kLongestUnclear));
-  if (detected_ ? !is_told_ : accepted || highest > tests_->alarm()) {
+                   (highest - second > kClearLead ||
+                    sample_index - std::max(since, reformed_at_) >= kLongestUnclear));
+  // A form of its first samples may be another in the next: what it does not explain elsewhere may
+  // be its own fault.
+  const auto is_beside = [&](const Replacement& r) {
+    const std::vector<Place> near = places_around(*filter_, r.place.part);
+    return std::find(near.begin(), near.end(), places.front()) != near.end();
+  };
+  const bool may_be_its_own = reformed_at_ == sample_index ||
+                              (age_ <= kUnsure && !replacements_.empty() &&
+                               std::none_of(replacements_.begin(), replacements_.end(), is_beside));
+  const bool is_alarm = highest > tests_->alarm() && !may_be_its_own;
+  if (detected_ ? !is_told_ : accepted || is_alarm) {
     detected_ = accepted ? choice.best->place : places.front();
     is_told_ = is_clear;
     untold_ = highest;
@@ -471,6 +482,7 @@ void Adaptation::reconsider(std::int64_t sample_index, bool all_forms,
   const auto samples = segment(
       since_, age_ > options_.settled_after ? options_.matured_after : options_.longest_segment);
   const int rounds = replacements_.size() > 1 ? 3 : 1;
+  bool has_changed = false;
   for (int round = 0; round < rounds; ++round) {
     bool is_changed = false;
     for (int n = 0; n < static_cast<int>(replacements_.size());) {
@@ -510,13 +522,22 @@ void Adaptation::reconsider(std::int64_t sample_index, bool all_forms,
       if (round == 0 && age_ > 0) want_probe(others, choice, sample_index, events);
       ++n;
     }
+    has_changed |= is_changed;
     if (!is_changed) break;
   }
   drop_impossible(sample_index, events);
   const bool is_another = all_forms && reconsider_place(samples, sample_index, events);
   const SequentialTests tests = *tests_;
   install(composed());
-  if (age_ > 0 && !is_another) tests_ = tests;
+  if (age_ == 0 || is_another) return;
+  if (!has_changed) {
+    tests_ = tests;
+    return;
+  }
+  // What the form that was taken back was wrong about is nobody's fault.
+  for (const ActionPoseSample* sample : samples)
+    tests_->update(*filter_, filter_->prepare(*sample), sample->sample_index);
+  reformed_at_ = sample_index;
 }
 
 void Adaptation::want_probe(const BodySchema& standing, const FoundChanges& choice,

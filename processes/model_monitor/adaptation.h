@@ -212,6 +212,7 @@ class Adaptation {
   std::vector<Replacement> replacements_;  ///< not settled yet, in the order they came
   std::vector<Replacement> maturing_;      ///< settled, on before_, and fitted anew now and then
   std::int64_t since_ = 0;                 ///< first sample with the changed body, as counted
+  std::int64_t reformed_at_ = -1;          ///< sample in which one of them took another form
   struct Ambiguity {
     Place place;
     BodyChange one, other;

@@ -342,10 +342,11 @@ std::vector<BodyChange> possible_changes(const BodySchema& schema, int part, boo
   for (int joint = 0; joint < static_cast<int>(edge->joints.size()); ++joint) {
     const ScrewJoint& j = edge->joints[static_cast<std::size_t>(joint)];
     result.push_back({Form::kStuck, part, joint});
+    if (j.gain == 0) continue;  // it is stuck: elsewhere is all that it can be
     for (const bool small : {false, true}) result.push_back({Form::kOffset, part, joint, 0, small});
-    if (j.gain != 0) result.push_back({Form::kGain, part, joint});
+    result.push_back({Form::kGain, part, joint});
     for (int s = 0; s < static_cast<int>(schema.signals.size()); ++s)
-      if (s != j.signal && j.gain != 0) result.push_back({Form::kOtherSignal, part, joint, s});
+      if (s != j.signal) result.push_back({Form::kOtherSignal, part, joint, s});
   }
   for (const bool small : {false, true}) {
     result.push_back({Form::kRight, part, 0, 0, small});

@@ -50,13 +50,13 @@ std::vector<Base> bases_of(const Place& place, const BodySchema& standing,
   return bases;
 }
 
-/// All that differs from a stored schema at once, where that is more than one place: it is wherever
-/// it makes a difference, first where that was suspected; an outlier elsewhere may be the greatest
-/// suspicion.
+/// All that differs from a stored schema at once, where that is more than one place and the samples
+/// speak for it. It is wherever it makes a difference that is more than uncertain, first where that
+/// was suspected; an outlier elsewhere may be the greatest suspicion.
 std::optional<Replacement> whole(const BodySchema& stored, const BodySchema& standing,
                                  const std::vector<Place>& places,
                                  const std::vector<const ActionPoseSample*>& samples,
-                                 const MarkerNoise& noise) {
+                                 const MarkerNoise& noise, double null) {
   Replacement all;
   FittedChange& fitted = all.fitted;
   fitted.change.form = BodyChange::Form::kStored;
@@ -67,16 +67,21 @@ std::optional<Replacement> whole(const BodySchema& stored, const BodySchema& sta
       std::count_if(standing.parts.begin(), standing.parts.end(),
                     [&](int part) { return differ_at(standing, with, part); });
   if (num_different < 2) return std::nullopt;
+  fitted.log_prior = fitted.change.log_odds();
+  fitted.log_evidence = fitted.log_prior + log_likelihood(with, noise, samples);
+  fitted.num_usable = 1;
+  if (fitted.log_evidence <= null) return std::nullopt;
   std::vector<Place> at = differences(standing, with);
+  std::erase_if(at, [&](const Place& place) {
+    return !place.marker && is_alike_at(standing, with, place.part);
+  });
+  if (at.size() < 2) return std::nullopt;
   std::stable_sort(at.begin(), at.end(), [&places](const Place& a, const Place& b) {
     return std::find(places.begin(), places.end(), a) < std::find(places.begin(), places.end(), b);
   });
   all.place = at.front();
   all.also = {at.begin() + 1, at.end()};
   fitted.change.part = all.place.part;
-  fitted.log_prior = fitted.change.log_odds();
-  fitted.log_evidence = fitted.log_prior + log_likelihood(with, noise, samples);
-  fitted.num_usable = 1;
   return all;
 }
 
@@ -110,7 +115,7 @@ FoundChanges find_changes(const BodySchema& standing, const std::vector<BodySche
     }
   }
   for (const BodySchema& stored : history)
-    if (auto all = whole(stored, standing, places, samples, search.noise))
+    if (auto all = whole(stored, standing, places, samples, search.noise, found.null))
       ranking.offer(std::move(*all));
   found.best = std::move(ranking.best);
   found.runner_up = std::move(ranking.second);

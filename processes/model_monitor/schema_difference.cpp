@@ -42,6 +42,12 @@ Eigen::VectorXd spread_action(const std::vector<Signal>& signals, int n) {
   return action;
 }
 
+bool is_near(const Pose& x, const Matrix6d& of_x, const Pose& y, const Matrix6d& of_y) {
+  const Vector6d difference = log(x.inverse() * y);
+  const Matrix6d S = of_x + of_y + 1e-12 * Matrix6d::Identity();
+  return difference.dot(S.ldlt().solve(difference)) < kAlike;
+}
+
 }  // namespace
 
 bool differ_at(const BodySchema& a, const BodySchema& b, int part) {
@@ -56,26 +62,23 @@ bool is_same(const BodySchema& a, const BodySchema& b) {
                     [](const Edge& x, const Edge& y) { return !differ(x, y); });
 }
 
-bool is_alike(const BodySchema& a, const BodySchema& b) {
-  const auto is_near = [](const Pose& x, const Matrix6d& of_x, const Pose& y,
-                          const Matrix6d& of_y) {
-    const Vector6d difference = log(x.inverse() * y);
-    const Matrix6d S = of_x + of_y + 1e-12 * Matrix6d::Identity();
-    return difference.dot(S.ldlt().solve(difference)) < kAlike;
-  };
-  if (!is_near(a.X_CR, a.X_CR_covariance, b.X_CR, b.X_CR_covariance)) return false;
+bool is_alike_at(const BodySchema& a, const BodySchema& b, int part) {
+  if (part == a.root) return is_near(a.X_CR, a.X_CR_covariance, b.X_CR, b.X_CR_covariance);
+  const Edge *x = edge_to(a, part), *y = edge_to(b, part);
+  if (!x || !y) return !x && !y;
+  if (x->from != y->from) return false;
   for (int n = 1; n <= kAlikeActions; ++n) {
     const Eigen::VectorXd theta = a.displacements(spread_action(a.signals, n));
-    const bool is_alike_here =
-        std::equal(a.edges.begin(), a.edges.end(), b.edges.begin(), b.edges.end(),
-                   [&](const Edge& x, const Edge& y) {
-                     return x.from == y.from && x.to == y.to &&
-                            is_near(x.predict(theta), x.prediction_covariance(theta),
-                                    y.predict(theta), y.prediction_covariance(theta));
-                   });
-    if (!is_alike_here) return false;
+    if (!is_near(x->predict(theta), x->prediction_covariance(theta), y->predict(theta),
+                 y->prediction_covariance(theta)))
+      return false;
   }
   return true;
+}
+
+bool is_alike(const BodySchema& a, const BodySchema& b) {
+  return std::all_of(a.parts.begin(), a.parts.end(),
+                     [&](int part) { return is_alike_at(a, b, part); });
 }
 
 std::vector<Place> differences(const BodySchema& a, const BodySchema& b) {

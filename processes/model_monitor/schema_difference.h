@@ -13,8 +13,10 @@ namespace bodyschema {
 bool differ_at(const BodySchema& a, const BodySchema& b, int part);
 /// All that predicts is the same.
 bool is_same(const BodySchema& a, const BodySchema& b);
-/// One body: at actions all over the box of the limits no local model differs by more than is
-/// uncertain about it (χ²₆ at 99 %).
+/// One local model of the edge to `part` (root: of the camera's pose): at actions all over the box
+/// of the limits it differs by no more than is uncertain about it (χ²₆ at 99 %).
+bool is_alike_at(const BodySchema& a, const BodySchema& b, int part);
+/// One body: so everywhere.
 bool is_alike(const BodySchema& a, const BodySchema& b);
 /// The places in which they differ: markers first, of parts that lie elsewhere between edges which
 /// together lead to where they led, then edges.
