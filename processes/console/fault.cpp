@@ -4,6 +4,8 @@
 
 #include <CLI/CLI.hpp>
 #include <chrono>
+#include <cmath>
+#include <cstdlib>
 #include <iostream>
 #include <memory>
 #include <nlohmann/json.hpp>
@@ -87,6 +89,9 @@ void add_fault_command(CLI::App& console) {
   using Command = fault_command_t;
   Command& command = arguments->command;
   command.number = -1;
+  const auto a_number = [](const std::string& text) {
+    return std::isnan(std::strtod(text.c_str(), nullptr)) ? "expected a number" : std::string();
+  };
   add("stuck", "The joints of a signal no longer move", Command::FAULT_STUCK)
       ->add_option("SIGNAL", command.place, "Name in signals.yaml")
       ->required();
@@ -94,7 +99,8 @@ void add_fault_command(CLI::App& console) {
   bend->add_option("LINK", command.place, "Name in robot.yaml")->required();
   bend->add_option("DEG", command.amount_deg, "Angle [deg]")
       ->required()
-      ->check(CLI::Range(-90.0, 90.0));
+      ->check(CLI::Range(-90.0, 90.0))
+      ->check(a_number);
   add("tool", "Another tool", Command::FAULT_TOOL)
       ->add_option("N", command.number, "Of robot.yaml's tools; 0 is the first")
       ->required()
@@ -113,7 +119,8 @@ void add_fault_command(CLI::App& console) {
   drift->add_option("LINK", command.place, "Name in robot.yaml")->required();
   drift->add_option("DEG_PER_SAMPLE", command.amount_deg, "Angle an action [deg]")
       ->required()
-      ->check(CLI::Range(-90.0, 90.0));
+      ->check(CLI::Range(-90.0, 90.0))
+      ->check(a_number);
   add("repair", "As built", Command::FAULT_REPAIR);
 }
 

@@ -3,6 +3,7 @@
 #include <fmt/format.h>
 
 #include <CLI/CLI.hpp>
+#include <algorithm>
 #include <cmath>
 #include <iostream>
 #include <memory>
@@ -139,6 +140,15 @@ void run_monitor(const MonitorArguments& arguments) {
   if (!arguments.evaluate.empty()) evaluation = load_for(arguments.evaluate, schema);
   if (schema.edges.empty())
     throw std::invalid_argument(arguments.schema + ": expected a schema with edges, found none");
+  const bool is_seen = std::any_of(
+      recording.samples.begin(), recording.samples.end(), [&](const ActionPoseSample& sample) {
+        return std::any_of(sample.parts.begin(), sample.parts.end(), [&](const auto& o) {
+          return std::find(schema.parts.begin(), schema.parts.end(), o.part) != schema.parts.end();
+        });
+      });
+  if (!is_seen)
+    throw std::invalid_argument(arguments.samples + ": none of the parts of " + arguments.schema +
+                                " is seen in it; is it of another body?");
   check_out(arguments.out, {arguments.samples, arguments.schema, arguments.evaluate});
 
   const std::unique_ptr<Method> method = method_of(arguments, recording, schema);

@@ -9,8 +9,8 @@
 #include <utility>
 #include <vector>
 
-#include "processes/console/evaluation.h"
 #include "common/plot/plot.h"
+#include "processes/console/evaluation.h"
 #include "processes/console/recording.h"
 #include "processes/console/report_figures.h"
 #include "processes/structure_learner/learn.h"
@@ -184,7 +184,9 @@ class Page {
   explicit Page(const Report& report)
       : report_(report), record_(*report.record), body_(body_of(*report.record)) {
     if (body_) {
-      held_out_ = fitting(record_.watch().held_out(), body_->schema);
+      held_out_ = fitting(
+          record_.watch().held_out(body_->schema.body_since(body_->schema.last_sample_index)),
+          body_->schema);
       errors_ = evaluate(body_->schema, held_out_);
     }
   }
@@ -387,9 +389,10 @@ class Page {
   std::string held_out() {
     std::string html = "<section><h2>Held-out error</h2>\n";
     if (held_out_.empty())
-      return html + "<p>No held-out sample yet, so nothing to judge by.</p></section>\n";
-    const auto versions =
-        version_errors(record_.versions(), record_.watch().held_out(), report_.end_effector);
+      return html +
+             "<p>No held-out sample of the body as it is, so nothing to judge by.</p></section>\n";
+    const auto all = record_.watch().held_out();
+    const auto versions = version_errors(record_.versions(), all, report_.end_effector);
     if (const auto curve = version_plot(versions)) {
       html += figure(
           plot(*curve),
@@ -401,13 +404,14 @@ class Page {
               versions.size() < record_.versions().size()
                   ? fmt::format(" ({} of {} shown)", versions.size(), record_.versions().size())
                   : "",
-              counted(std::ssize(held_out_), "held-out sample"),
+              counted(std::ssize(all), "held-out sample"),
               record_.watch().has_truth() ? "true" : "seen", judge()));
     }
     if (!record_.faults().empty()) {
       html +=
-          "<p class=\"warn\">The body was changed during the run (see Events): these errors mix "
-          "samples from before and after.</p>\n";
+          "<p class=\"warn\">The body was changed during the run (see Events): the lines mix "
+          "samples "
+          "from before and after, the table has those since the last change that was found.</p>\n";
     }
     Table table({"part", "#seen in", "#median", "#", "#rms", "#", "#largest"});
     for (const PartErrors& part : errors_) {
@@ -502,7 +506,7 @@ class Page {
       const double used_s = static_cast<double>(info.cpu_us) * 1e-6;
       table.row({escape_html(info.process_name), escape_html(info.host), std::to_string(info.pid),
                  fmt::format("{:.1f} s", used_s),
-                 age_s > 0 ? fmt::format("{:.0f} %", 100 * used_s / age_s) : "–",
+                 age_s > 0.1 ? fmt::format("{:.0f} %", 100 * used_s / age_s) : "–",
                  fmt::format("{:.0f} MB", static_cast<double>(info.resident_bytes) * 1e-6),
                  fmt::format("{}: {}", kPhases[info.phase], escape_html(info.activity))});
     }

@@ -135,10 +135,14 @@ std::string RunWatch::diagnosis(const std::set<std::string>& expected, std::int6
   return text;
 }
 
-std::vector<ActionPoseSample> RunWatch::held_out() const {
+std::int64_t RunWatch::body_since() const {
+  return schema_ ? schema_->body_since(schema_->last_sample_index) : 0;
+}
+
+std::vector<ActionPoseSample> RunWatch::held_out(std::int64_t since) const {
   std::vector<ActionPoseSample> result;
   for (std::size_t i = 0; i < samples_.size(); ++i) {
-    if (samples_[i].purpose != Purpose::kTest) continue;
+    if (samples_[i].purpose != Purpose::kTest || samples_[i].sample_index < since) continue;
     ActionPoseSample sample = samples_[i];
     if (has_truth()) {
       // Ids count within their source, so the time decides: the newest state before the sample's

@@ -52,9 +52,11 @@ class RunWatch {
   const std::optional<BodySchema>& schema() const { return schema_; }
   /// All samples so far, TEST included.
   const std::vector<ActionPoseSample>& samples() const { return samples_; }
-  /// The TEST samples: with the noise-free poses of the simulator where there is one, else as the
-  /// camera saw them.
-  std::vector<ActionPoseSample> held_out() const;
+  /// The TEST samples from `since` on: with the noise-free poses of the simulator where there is
+  /// one, else as the camera saw them.
+  std::vector<ActionPoseSample> held_out(std::int64_t since = 0) const;
+  /// First sample of the body as it is now, as far as the monitor knows; 0: it never changed.
+  std::int64_t body_since() const;
   bool has_truth() const { return !truth_.empty(); }
   /// Share of the samples in which each part was seen.
   std::map<int, double> visibility() const;

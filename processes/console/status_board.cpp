@@ -106,7 +106,8 @@ double StatusBoard::Heard::cpu_percent() const {
   const bool has_window = newest.utime - first.utime >= 500'000;
   const double used_us = static_cast<double>(newest.cpu_us - (has_window ? first.cpu_us : 0));
   const double of_us = has_window ? static_cast<double>(newest.utime - first.utime) : age_s() * 1e6;
-  return of_us > 0 ? 100 * std::max(0.0, used_us) / of_us : 0;
+  // One that began just now used its time before it said so.
+  return of_us > 1e5 ? 100 * std::max(0.0, used_us) / of_us : 0;
 }
 
 StatusBoard::StatusBoard(std::set<std::string> expected, std::string own_version)
@@ -365,6 +366,10 @@ std::string StatusBoard::text(int width) const {
           health_->worst_position_m * 1e3, health_->worst_rotation_rad * kDegrees,
           health_->num_test_samples));
     }
+    for (const moved_tag_t& tag : schema->moved_tags)
+      if (tag.moved_until_sample < 0)
+        line(fmt::format("         tag {} is set aside since sample {}: not where it was, or lost",
+                         tag.moved_tag_id, tag.moved_found_sample));
     line("");
     line(fmt::format("  {:<9} {:<6} {:<12} {:>9} {:>7}  {:<11} {:>5} {:>9}", "edge", "kind",
                      "signals", "residual", "", "health", "tests", "median d²"));
@@ -395,11 +400,12 @@ std::string StatusBoard::text(int width) const {
     line("");
     line(fmt::format("  {:<9} {:>5}  {:>18}", "part", "seen", "held-out error"));
     for (const part_health_t& part : health_->part_health) {
-      std::string row = fmt::format(
-          "  {:<9} {:>3.0f} %  {:>18}", part.health_part, part.visibility * 100,
-          part.position_median_m < 0 ? "–"
-                                     : fmt::format("{:.2f} mm {:.2f}°", part.position_median_m * 1e3,
-                                                   part.rotation_median_rad * kDegrees));
+      std::string row =
+          fmt::format("  {:<9} {:>3.0f} %  {:>18}", part.health_part, part.visibility * 100,
+                      part.position_median_m < 0
+                          ? "–"
+                          : fmt::format("{:.2f} mm {:.2f}°", part.position_median_m * 1e3,
+                                        part.rotation_median_rad * kDegrees));
       if (part.part_state != schema_edge_t::EDGE_OK)
         row += fmt::format("  {}", kEdgeStates[part.part_state]);
       for (const std::string& flag : flags_of(part)) row += "  " + flag;
@@ -490,7 +496,8 @@ ordered_json StatusBoard::json() const {
            {"rotation_rms_deg", edge.rotation_rms_rad * kDegrees},
            {"state", kEdgeStates[health ? health->edge_state : edge.state]},
            {"drifting", health && health->edge_is_drifting == 1},
-           {"cusum", health && health->edge_cusum >= 0 ? ordered_json(health->edge_cusum) : nullptr},
+           {"cusum",
+            health && health->edge_cusum >= 0 ? ordered_json(health->edge_cusum) : nullptr},
            {"tests", health ? health->num_tests : 0},
            {"median_mahalanobis2", health && health->median_mahalanobis2 >= 0
                                        ? ordered_json(health->median_mahalanobis2)
@@ -518,7 +525,9 @@ ordered_json StatusBoard::json() const {
             is_tested ? ordered_json(part.rotation_median_rad * kDegrees) : nullptr}});
     }
     for (const health_event_t& event : health_->events) {
-      const auto id = [](std::int32_t part) { return part < 0 ? ordered_json() : ordered_json(part); };
+      const auto id = [](std::int32_t part) {
+        return part < 0 ? ordered_json() : ordered_json(part);
+      };
       json["events"].push_back({{"number", event.event_number},
                                 {"sample", event.event_sample},
                                 {"event", name_of_event(event.event_kind)},

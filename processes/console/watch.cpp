@@ -231,7 +231,7 @@ nlohmann::ordered_json result_json(const RunWatch& watch, const Learned& learned
                                    const WatchArguments& arguments, const Lost& lost,
                                    double seconds) {
   const Signals signals = load_signals(arguments.rig_folder);
-  const auto held_out = watch.held_out();
+  const auto held_out = watch.held_out(watch.body_since());
   nlohmann::ordered_json json = {
       {"rig", arguments.rig},
       {"seed", arguments.replay.empty() ? nlohmann::ordered_json(arguments.seed) : nullptr},
@@ -242,6 +242,7 @@ nlohmann::ordered_json result_json(const RunWatch& watch, const Learned& learned
       {"structure", structure_json(learned.schema, learned.outliers)},
       {"held_out",
        errors_json(static_cast<int>(held_out.size()), evaluate(learned.schema, held_out))},
+      {"held_out_since", watch.body_since()},
       {"held_out_against", watch.has_truth() ? "noise-free simulator" : "observations"},
       {"visibility", nlohmann::ordered_json::object()}};
   if (!arguments.replay.empty()) {
@@ -262,7 +263,7 @@ void report(const RunWatch& watch, const BestPicture& picture, const WatchArgume
                         result_json(watch, learned, arguments, lost, seconds).dump(2) + "\n");
   picture.write(folder / "detections.png");
 
-  const auto held_out = watch.held_out();
+  const auto held_out = watch.held_out(watch.body_since());
   const std::string origin = arguments.replay.empty() ? fmt::format("seed {}", arguments.seed)
                                                       : "replay of " + arguments.replay;
   std::cout << fmt::format("\n{} · {} · {} samples, {} of them held out · {:.0f} s\n\n",
@@ -284,6 +285,9 @@ void report(const RunWatch& watch, const BestPicture& picture, const WatchArgume
   if (!held_out.empty()) {
     std::cout << "\nHeld-out error of each part relative to the root, against "
               << (watch.has_truth() ? "the simulator's noise-free truth" : "what the camera saw")
+              << (watch.body_since() > 0
+                      ? fmt::format(", since the body last changed (sample {})", watch.body_since())
+                      : "")
               << "\n"
               << errors_text(evaluate(learned.schema, held_out));
   }

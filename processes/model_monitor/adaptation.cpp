@@ -559,8 +559,9 @@ void Adaptation::want_probe(const BodySchema& standing, const FoundChanges& choi
   if (probe.size() == 0) return;
   AdaptationEvent wanted =
       event(AdaptationEvent::Kind::kProbeWanted, sample_index, choice.best->place);
-  wanted.cause = choice.best->fitted.change.cause(standing) + " or " +
-                 choice.runner_up->fitted.change.cause(standing);
+  const std::string cause = choice.best->fitted.change.cause(standing),
+                    other_cause = choice.runner_up->fitted.change.cause(standing);
+  wanted.cause = cause == other_cause ? cause : cause + " or " + other_cause;
   wanted.margin = lead;
   wanted.probe = probe;
   asked_.push_back(ambiguity);

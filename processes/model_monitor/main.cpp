@@ -3,6 +3,7 @@
 #include <spdlog/spdlog.h>
 
 #include <CLI/CLI.hpp>
+#include <deque>
 #include <filesystem>
 #include <stdexcept>
 #include <utility>
@@ -62,8 +63,37 @@ int main(int argc, char** argv) {
       }
     }
     bool is_news = false;
+    std::int64_t tick_us = 0;
+    // A recording's samples are there all at once, and what was judged ahead of a proposal is
+    // judged again: so each TEST sample waits for the learner's, which in turn waits for the
+    // verdict. Not for ever.
+    constexpr std::int64_t kProposalTimeout_us = 30'000'000;
+    std::deque<sample_t> ahead;
+    bool awaits_proposals = is_replayed;
+    std::int64_t awaited_sample = -1, awaited_us = 0;
+    const auto go_on = [&] {
+      const std::int64_t judged = monitor.memory().verdicts.judged_sample;
+      if (awaits_proposals && awaited_sample > judged &&
+          tick_us - awaited_us > kProposalTimeout_us) {
+        spdlog::warn("no proposal of structure_learner after sample {}: goes on without",
+                     awaited_sample);
+        awaits_proposals = false;
+      }
+      while (!ahead.empty() && !(awaits_proposals && awaited_sample > judged)) {
+        if (ahead.front().purpose == action_command_t::PURPOSE_TEST) {
+          awaited_sample = ahead.front().sample_index;
+          awaited_us = tick_us;
+        }
+        is_news |= monitor.on_sample(ahead.front());
+        ahead.pop_front();
+      }
+    };
     SampleIntake intake(
-        samples_file, [&](const sample_t& sample) { is_news |= monitor.on_sample(sample); },
+        samples_file,
+        [&](const sample_t& sample) {
+          ahead.push_back(sample);
+          go_on();
+        },
         SampleIntake::asking(process, !is_replayed));
 
     std::string problem;
@@ -102,11 +132,17 @@ int main(int argc, char** argv) {
       if (std::exchange(is_news, false)) publish();
     });
     door.subscribe(process, kLearnedSchema, [&](const body_schema_t& proposal) {
-      if (monitor.on_learned_schema(proposal)) publish();
+      if (!monitor.on_learned_schema(proposal)) return;
+      go_on();
+      is_news = false;
+      publish();
     });
     std::int64_t sent_us = 0;
     process.on_tick([&](std::int64_t now_us) {
+      if (tick_us == 0) awaited_us = now_us;
+      tick_us = now_us;
       intake.on_tick(now_us);
+      go_on();
       if (std::exchange(is_news, false)) publish();
       process.set_counters(intake.counters());
       if (bus.is_replay() || now_us - sent_us < 1'000'000) return;

@@ -3,6 +3,7 @@
 #include <spdlog/spdlog.h>
 
 #include <CLI/CLI.hpp>
+#include <algorithm>
 #include <future>
 #include <stdexcept>
 
@@ -32,6 +33,7 @@ int main(int argc, char** argv) {
       }
     };
     SampleIntake intake(samples_file, learn_from, SampleIntake::asking(process, !is_replayed));
+    const std::int64_t resumed_after = learner.last_sample_index();
 
     // The fit runs beside the loop: listening does not wait for learning, or not longer than to
     // publish at once what is learned in the usual time.
@@ -98,8 +100,10 @@ int main(int argc, char** argv) {
     door.subscribe(process, kSample, [&](const sample_t& sample) { intake.on_sample(sample); });
     door.subscribe(process, kBodySchema,
                    [&](const body_schema_t& schema) { learner.on_body_schema(schema); });
-    door.subscribe(process, kModelHealth,
-                   [&](const model_health_t& health) { judged_sample = health.judged_sample; });
+    door.subscribe(process, kModelHealth, [&](const model_health_t& health) {
+      judged_sample = health.judged_sample;
+      if (!is_replayed) learner.skip_judged(std::min(judged_sample, resumed_after));
+    });
     process.on_idle(work);
     process.on_tick([&](std::int64_t now_us) {
       tick_us = now_us;

@@ -77,6 +77,11 @@ SharedSamples StructureLearner::of_this_body(std::size_t num_training, std::int6
           end};
 }
 
+void StructureLearner::skip_judged(std::int64_t judged_sample) {
+  while (pending_.size() > 1 && pending_.front().last_sample_index <= judged_sample)
+    pending_.pop_front();
+}
+
 std::function<body_schema_t()> StructureLearner::take_job() {
   const Prefix prefix = pending_.front();
   pending_.pop_front();

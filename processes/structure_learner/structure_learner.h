@@ -58,6 +58,9 @@ class StructureLearner {
   /// sample come in order and none is left out, since the monitor judges these; of the others only
   /// the newest waits. There must be one.
   std::function<body_schema_t()> take_job();
+  /// Leaves out what the monitor judged already (after a restart: all but the newest samples),
+  /// since no proposal depends on one before it.
+  void skip_judged(std::int64_t judged_sample);
 
   /// Idle time can make the next job short: to be run, in any thread, when there is no job; asked
   /// once a training sample.

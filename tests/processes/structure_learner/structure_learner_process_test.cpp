@@ -141,6 +141,24 @@ TEST_F(StructureLearnerTest, OfPrefixesThatNobodyJudgesOnlyTheNewestWaits) {
   EXPECT_FALSE(learner.has_test_job());
 }
 
+TEST_F(StructureLearnerTest, WhatWasJudgedBeforeARestartIsNotLearnedAgainAndTheRestIsTheSame) {
+  const std::vector<body_schema_t> all = proposals(samples_);
+  StructureLearner learner(config_);
+  for (const sample_t& sample : samples_) learner.on_sample(sample);
+  learner.skip_judged(19);
+  for (std::size_t n = 4; n < all.size(); ++n) {
+    ASSERT_TRUE(learner.has_job());
+    EXPECT_EQ(bytes_of(learner.take_job()()), bytes_of(all[n]));
+  }
+  EXPECT_FALSE(learner.has_job());
+  // The newest proposal is repeated: there is always one.
+  StructureLearner other(config_);
+  for (const sample_t& sample : samples_) other.on_sample(sample);
+  other.skip_judged(29);
+  ASSERT_TRUE(other.has_job());
+  EXPECT_EQ(bytes_of(other.take_job()()), bytes_of(all.back()));
+}
+
 TEST_F(StructureLearnerTest, AJobIsACopyThatLaterSamplesDoNotChange) {
   StructureLearner learner(config_);
   for (int i = 0; i < 20; ++i) learner.on_sample(samples_[i]);
