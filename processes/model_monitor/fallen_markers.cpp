@@ -1,5 +1,7 @@
 #include "processes/model_monitor/fallen_markers.h"
 
+#include <algorithm>
+
 #include "processes/model_monitor/reading_distance.h"
 
 namespace bodyschema {
@@ -13,25 +15,32 @@ constexpr int kRepetitions = 2;
 
 std::optional<std::int64_t> FallenMarkers::look(const ActionPoseSample& sample, int part,
                                                 const Pose& X_CB, const MarkerNoise& noise) {
-  const PartObservation* seen = sample.find(part);
-  const auto known = far_off_.find(part);
-  if (seen) {
+  if (const PartObservation* seen = sample.find(part)) {
     const ReadingDistance distance(covariance_of(*seen, noise));
     if (distance(X_CB, seen->X_CB) < kOther) {
-      if (known != far_off_.end()) far_off_.erase(known);
+      far_off_.erase(part);
       return std::nullopt;
     }
-    if (known == far_off_.end() || distance(known->second.seen, seen->X_CB) > kSame) {
-      far_off_[part] = {sample.sample_index, 0, seen->X_CB, X_CB};
+    const Sighting first{sample.sample_index, 0, seen->X_CB, X_CB};
+    const int tag = seen->tags.empty() ? -1 : seen->tags.front();
+    Sighting& sighting = far_off_[part].emplace(tag, first).first->second;
+    if (distance(sighting.seen, seen->X_CB) > kSame) {
+      sighting = first;
       return std::nullopt;
     }
-    if (distance(known->second.predicted, X_CB) > kOther) {
-      ++known->second.num_repeated;
-      known->second.predicted = X_CB;
+    if (distance(sighting.predicted, X_CB) > kOther) {
+      ++sighting.num_repeated;
+      sighting.predicted = X_CB;
     }
   }
-  if (known == far_off_.end() || known->second.num_repeated < kRepetitions) return std::nullopt;
-  return known->second.since;
+  const auto known = far_off_.find(part);
+  if (known == far_off_.end()) return std::nullopt;
+  // Where one of its tags lies, another is believed to as long as it does not move.
+  std::optional<std::int64_t> since;
+  for (const auto& [tag, sighting] : known->second)
+    if (sighting.num_repeated >= kRepetitions)
+      since = std::min(since.value_or(sighting.since), sighting.since);
+  return since;
 }
 
 }  // namespace bodyschema

@@ -11,9 +11,10 @@
 namespace bodyschema {
 
 /// Finds markers that fell off their parts and lie in sight: read at one place again and again
-/// while the part that they were on moves. No change of the body explains them, so they are told
-/// apart before anything is judged. A joint that is stuck holds a part still as well, but where the
-/// schema has it at some action, and all parts beyond; that is found from the first sample on.
+/// while the part that they were on moves; of several tags of a part each at its own. No change of
+/// the body explains them, so they are told apart before anything is judged. A joint that is stuck
+/// holds a part still as well, but where the schema has it at some action, and all parts beyond;
+/// that is found from the first sample on.
 class FallenMarkers {
  public:
   /// Looks at what the sample shows of `part`. Returns the first sample that showed its marker
@@ -27,7 +28,8 @@ class FallenMarkers {
     int num_repeated = 0;  ///< readings of the same pose after a motion of the part
     Pose seen, predicted;
   };
-  std::map<int, Sighting> far_off_;  ///< by part: seen where it should not be
+  /// By part and tag (−1: not known): seen where it should not be.
+  std::map<int, std::map<int, Sighting>> far_off_;
 };
 
 }  // namespace bodyschema

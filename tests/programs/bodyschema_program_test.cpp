@@ -846,6 +846,11 @@ TEST_F(BodyschemaProgramTest, MonitorRefusesWhatDoesNotBelongTogether) {
   expect_failure({"monitor", "schema.lcmlog", csv, "--out", "no such folder/out.lcmlog"},
                  "cannot write no such");
   expect_failure({"monitor", csv, csv}, "robot.csv");
+  auto samples = test::babble(robot_, 5, {}, rng);
+  for (ActionPoseSample& sample : samples)
+    for (PartObservation& o : sample.parts) o.part += 100;
+  expect_failure({"monitor", "schema.lcmlog", write("elsewhere.csv", samples)},
+                 "none of the parts of schema.lcmlog");
 }
 
 TEST_F(BodyschemaProgramTest, AnEngineeredModelPredictsTheRobotItDescribes) {

@@ -432,8 +432,8 @@ Findings adaptation(const Setup& setup) {
         places.of += place.of;
         causes.right += cause.right;
         causes.of += cause.of;
+        num_wrong += wrong;
       }
-      num_wrong += wrong;
       seconds += row_seconds;
       num_samples += static_cast<double>(num_runs) * BrokenArm::kNumBlocks * length;
       const double ratio = spread_of(after).mean / spread_of(healthy).mean;
@@ -559,10 +559,11 @@ Findings adaptation(const Setup& setup) {
       "some edge is found wrong, and nothing is accepted in its place). *Until right*: until the "
       "end effector's mean error stays below 75 mm (chapter noise) or 30 mm (tag_iso) by the "
       "noise-free truth; the part of a moved marker, and a bumped camera's end effector in the "
-      "camera, alike. The last three faults are none of the forms of change that the monitor knows: "
-      "it learns the edge anew. Place and cause: of the first, second and third change, against what "
-      "was broken; a leaf's marker or edge alike (the musts: without the last three faults). Errors after recovery: of the last 10 samples of "
-      "blocks 2 and 4.\n\n{}\n{}{}{}",
+      "camera, alike. The last three faults are none of the forms of change that the monitor "
+      "knows: it learns the edge anew. Place and cause: of the first, second and third change, "
+      "against what was broken; a leaf's marker or edge alike. The musts of places, causes and "
+      "wrong events are without the last three faults. Errors after recovery: of the last 10 "
+      "samples of blocks 2 and 4.\n\n{}\n{}{}{}",
       num_runs, length, counts.markdown(), quality.markdown(), misjudged_text, drift_text);
   return findings;
 }

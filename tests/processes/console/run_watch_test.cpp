@@ -175,6 +175,22 @@ TEST(RunWatchTest, HeldOutAreTheTestSamplesAsTheCameraSawThem) {
   EXPECT_EQ(held_out[0].parts[0].X_CB.translation(), Eigen::Vector3d(1, 0, 0.01));
 }
 
+TEST(RunWatchTest, OfABodyThatChangedTheyMayBeThoseSince) {
+  RunWatch watch;
+  for (int n = 0; n < 6; ++n) watch.on_sample(sample(n, {1, 2}, Purpose::kTest));
+  EXPECT_EQ(watch.body_since(), 0);
+  BodySchema schema;
+  schema.version = 6;
+  schema.last_sample_index = 5;
+  schema.changes = {{2, 1}, {5, 4}};
+  watch.on_body_schema(to_message(schema));
+  EXPECT_EQ(watch.body_since(), 4);
+  const auto held_out = watch.held_out(watch.body_since());
+  ASSERT_EQ(held_out.size(), 2U);
+  EXPECT_EQ(held_out[0].sample_index, 4);
+  EXPECT_EQ(watch.held_out().size(), 6U);
+}
+
 TEST(RunWatchTest, WithASimulatorTheyHoldTheTruthOfTheirAction) {
   RunWatch watch;
   watch.on_sim_state(truth(-1, {1, 2, 3}));

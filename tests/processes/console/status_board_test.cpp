@@ -201,6 +201,16 @@ TEST(StatusBoardTest, TheBodySchemaStandsBeforeAProposal) {
   EXPECT_TRUE(board_.json()["schema"]["accepted"].get<bool>());
 }
 
+TEST(StatusBoardTest, TagsThatAreSetAsideAreNamedUntilTheyAreBack) {
+  StatusBoard board_ = board();
+  BodySchema schema = two_parts();
+  schema.moved_tags = {{20, 40, 38, -1}, {21, 41, 39, 60}};
+  board_.on_body_schema(to_message(schema));
+  EXPECT_NE(board_.text(200).find("tag 20 is set aside since sample 40"), std::string::npos)
+      << board_.text(200);
+  EXPECT_EQ(board_.text(200).find("tag 21"), std::string::npos);
+}
+
 TEST(StatusBoardTest, AnEdgeIsShownWithItsHealth) {
   StatusBoard board_ = board();
   board_.on_body_schema(to_message(two_parts()));
