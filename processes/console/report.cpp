@@ -203,6 +203,7 @@ void add_report_command(CLI::App& console) {
   CLI::App* report =
       console.add_subcommand("report", "What a run tells, as one HTML file that needs no network");
   report->add_option("RUN", arguments->source, "Run folder, or an LCM log with SAMPLEs")
+      ->envname("BODYSCHEMA_RUN")
       ->required();
   report->add_option("--out", arguments->out, "The file; default: report.html in the run folder");
   report->add_flag("--follow", arguments->follow,

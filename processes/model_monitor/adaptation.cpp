@@ -696,6 +696,7 @@ void Adaptation::follow(std::int64_t sample_index, std::vector<AdaptationEvent>*
   if (age_ >= options_.settled_after) {
     for (const Replacement& r : replacements_)
       tell(AdaptationEvent::Kind::kRecovered, sample_index, r, 0, age_, events);
+    drop_impossible(sample_index, events);
     remember(schema_);
     trusted_ = schema_;
     tags_.begin_anew();
@@ -712,7 +713,7 @@ void Adaptation::follow(std::int64_t sample_index, std::vector<AdaptationEvent>*
   reconsider(sample_index, all_forms, events);
 }
 
-void Adaptation::mature(std::int64_t sample_index) {
+void Adaptation::mature(std::int64_t sample_index, std::vector<AdaptationEvent>* events) {
   if (++age_ > options_.matured_after) {
     maturing_.clear();
     return;
@@ -720,7 +721,7 @@ void Adaptation::mature(std::int64_t sample_index) {
   if (age_ % kMaturing != 0 || !suspects().empty()) return;
   const BodySchema settled = schema_;
   std::swap(replacements_, maturing_);
-  reconsider(sample_index, false, nullptr);  // the forms stay: nothing to tell
+  reconsider(sample_index, false, events);  // the forms stay
   std::swap(replacements_, maturing_);
   trusted_ = schema_;
   for (BodySchema& stored : history_)
@@ -818,7 +819,7 @@ std::vector<AdaptationEvent> Adaptation::on_new_sample(ActionPoseSample sample) 
   if (!replacements_.empty())
     follow(sample.sample_index, &events);
   else if (!maturing_.empty())
-    mature(sample.sample_index);
+    mature(sample.sample_index, &events);
   try_changes(sample.sample_index, &events);
   try_learning(sample.sample_index, &events);
   // A body that moves otherwise shows other sides of its parts.

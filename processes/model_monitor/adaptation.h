@@ -5,8 +5,10 @@
 #include <map>
 #include <optional>
 #include <string>
+#include <utility>
 #include <vector>
 
+#include "processes/model_monitor/body_change.h"
 #include "processes/model_monitor/change_search.h"
 #include "processes/model_monitor/drift_watch.h"
 #include "processes/model_monitor/fallen_markers.h"
@@ -160,7 +162,7 @@ class Adaptation {
   void take_back(const MovedTags::Finding& moved, std::int64_t sample_index,
                  std::vector<AdaptationEvent>* events);
   void follow(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
-  void mature(std::int64_t sample_index);
+  void mature(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
   void remember(const BodySchema& schema);
   void install(const BodySchema& schema);
   AdaptationEvent event(AdaptationEvent::Kind kind, std::int64_t sample_index,

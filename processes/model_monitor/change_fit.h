@@ -46,6 +46,9 @@ class PlaceEvidence {
                 std::vector<const ActionPoseSample*> samples, std::vector<int> cut_parts = {});
 
   int num_usable() const { return static_cast<int>(measurements_.size()); }
+  /// Whitened residuals of the measurements, one after the other: 6N; and ∂/∂θ: 6N×d.
+  Eigen::VectorXd residuals(const BodyChange& change, const Eigen::VectorXd& theta,
+                            Eigen::MatrixXd* jacobian = nullptr) const;
 
   /// The most probable θ: Gauss-Newton on the virtual measurements from several starts, with
   /// Student-t weights first and the outlier mixture's then. Its evidence is that of all
@@ -81,9 +84,6 @@ class PlaceEvidence {
   /// how it moves with θ: X ← X · Exp(J dθ), 6×d.
   std::vector<Pose> predict(const BodyChange& change, const Eigen::VectorXd& theta,
                             std::vector<Jacobian>* jacobians = nullptr) const;
-  /// Whitened residuals of the measurements, one after the other: 6N; and ∂/∂θ: 6N×d.
-  Eigen::VectorXd residuals(const BodyChange& change, const Eigen::VectorXd& theta,
-                            Eigen::MatrixXd* jacobian = nullptr) const;
   std::vector<Eigen::VectorXd> starts(const BodyChange& change) const;
   double log_flat_outlier() const;
   double log_inlier(std::size_t n, double squared_distance) const;

@@ -1,6 +1,9 @@
 #include "processes/model_monitor/change_search.h"
 
 #include <algorithm>
+#include <optional>
+#include <utility>
+#include <vector>
 
 #include "processes/model_monitor/schema_difference.h"
 
@@ -50,9 +53,9 @@ std::vector<Base> bases_of(const Place& place, const BodySchema& standing,
   return bases;
 }
 
-/// All that differs from a stored schema at once, where that is more than one place and the samples
-/// speak for it. It is wherever it makes a difference that is more than uncertain, first where that
-/// was suspected; an outlier elsewhere may be the greatest suspicion.
+/// All that differs from a stored schema by more than is uncertain at once, where that is more than
+/// one place and the samples speak for it: first where that was suspected; an outlier elsewhere may
+/// be the greatest suspicion.
 std::optional<Replacement> whole(const BodySchema& stored, const BodySchema& standing,
                                  const std::vector<Place>& places,
                                  const std::vector<const ActionPoseSample*>& samples,
@@ -62,19 +65,24 @@ std::optional<Replacement> whole(const BodySchema& stored, const BodySchema& sta
   fitted.change.form = BodyChange::Form::kStored;
   fitted.origin = stored;
   fitted.everywhere = true;
-  const BodySchema with = with_change(standing, fitted);
+  fitted.log_prior = fitted.change.log_odds();
+  fitted.num_usable = 1;
+  const auto judge = [&] {
+    const BodySchema with = with_change(standing, fitted);
+    fitted.log_evidence = fitted.log_prior + log_likelihood(with, noise, samples);
+    return with;
+  };
   const auto num_different =
       std::count_if(standing.parts.begin(), standing.parts.end(),
-                    [&](int part) { return differ_at(standing, with, part); });
+                    [&](int part) { return differ_at(standing, stored, part); });
   if (num_different < 2) return std::nullopt;
-  fitted.log_prior = fitted.change.log_odds();
-  fitted.log_evidence = fitted.log_prior + log_likelihood(with, noise, samples);
-  fitted.num_usable = 1;
+  judge();
   if (fitted.log_evidence <= null) return std::nullopt;
-  std::vector<Place> at = differences(standing, with);
-  std::erase_if(at, [&](const Place& place) {
-    return !place.marker && is_alike_at(standing, with, place.part);
-  });
+  BodySchema different = standing;
+  for (const int part : standing.parts)
+    if (!is_alike_at(standing, stored, part)) different = with_edge_of(different, stored, part);
+  fitted.origin = std::move(different);
+  std::vector<Place> at = differences(standing, judge());
   if (at.size() < 2) return std::nullopt;
   std::stable_sort(at.begin(), at.end(), [&places](const Place& a, const Place& b) {
     return std::find(places.begin(), places.end(), a) < std::find(places.begin(), places.end(), b);

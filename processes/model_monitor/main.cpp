@@ -9,6 +9,7 @@
 #include <utility>
 #include <vector>
 
+#include "common/bus/awaited_answer.h"
 #include "common/bus/process.h"
 #include "common/bus/rig_door.h"
 #include "common/bus/sample_intake.h"
@@ -63,27 +64,16 @@ int main(int argc, char** argv) {
       }
     }
     bool is_news = false;
-    std::int64_t tick_us = 0;
     // A recording's samples are there all at once, and what was judged ahead of a proposal is
     // judged again: so each TEST sample waits for the learner's, which in turn waits for the
-    // verdict. Not for ever.
-    constexpr std::int64_t kProposalTimeout_us = 30'000'000;
+    // verdict.
+    AwaitedAnswer proposals(is_replayed, 30'000'000);
+    constexpr int kMostAtOnce = 100;
     std::deque<sample_t> ahead;
-    bool awaits_proposals = is_replayed;
-    std::int64_t awaited_sample = -1, awaited_us = 0;
     const auto go_on = [&] {
-      const std::int64_t judged = monitor.memory().verdicts.judged_sample;
-      if (awaits_proposals && awaited_sample > judged &&
-          tick_us - awaited_us > kProposalTimeout_us) {
-        spdlog::warn("no proposal of structure_learner after sample {}: goes on without",
-                     awaited_sample);
-        awaits_proposals = false;
-      }
-      while (!ahead.empty() && !(awaits_proposals && awaited_sample > judged)) {
-        if (ahead.front().purpose == action_command_t::PURPOSE_TEST) {
-          awaited_sample = ahead.front().sample_index;
-          awaited_us = tick_us;
-        }
+      for (int n = 0; n < kMostAtOnce && !ahead.empty() && !proposals.is_waiting(); ++n) {
+        if (ahead.front().purpose == action_command_t::PURPOSE_TEST)
+          proposals.ask(ahead.front().sample_index);
         is_news |= monitor.on_sample(ahead.front());
         ahead.pop_front();
       }
@@ -132,16 +122,17 @@ int main(int argc, char** argv) {
       if (std::exchange(is_news, false)) publish();
     });
     door.subscribe(process, kLearnedSchema, [&](const body_schema_t& proposal) {
-      if (!monitor.on_learned_schema(proposal)) return;
+      is_news |= monitor.on_learned_schema(proposal);
+      proposals.answer(proposal.last_sample_index);
       go_on();
-      is_news = false;
-      publish();
+      if (std::exchange(is_news, false)) publish();
     });
     std::int64_t sent_us = 0;
     process.on_tick([&](std::int64_t now_us) {
-      if (tick_us == 0) awaited_us = now_us;
-      tick_us = now_us;
       intake.on_tick(now_us);
+      if (proposals.on_tick(now_us))
+        spdlog::warn("no proposal of structure_learner on sample {}: goes on without",
+                     proposals.question());
       go_on();
       if (std::exchange(is_news, false)) publish();
       process.set_counters(intake.counters());

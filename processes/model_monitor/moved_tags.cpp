@@ -10,13 +10,14 @@ namespace {
 constexpr double kSame = ReadingDistance::kSame, kOther = ReadingDistance::kOther;
 /// Of the tag in the wrong place, and of others in the right one: an outlier repeats itself rarely.
 constexpr int kSightings = 3;
+/// Sightings of a part in a row, all by tags set aside, after which they are what there is of it.
 constexpr int kAlone = 30;
 
 }  // namespace
 
 MovedTags::MovedTags(const std::vector<MovedTag>& moved) {
   for (const MovedTag& tag : moved)
-    if (tag.until < 0) lose(tag.tag);
+    if (tag.until < 0) tracks_[tag.tag] = {.since = tag.since, .has_moved = true};
 }
 
 bool MovedTags::has_moved(int tag) const {
@@ -31,8 +32,17 @@ bool MovedTags::affects(const PartObservation& observation) const {
 
 void MovedTags::look_back(const ActionPoseSample& sample, const BodySchema& schema,
                           const MarkerNoise& noise) {
+  // Before they moved they were where they should be.
+  ActionPoseSample after = sample;
+  std::erase_if(after.parts, [&](const PartObservation& o) {
+    return std::any_of(o.tags.begin(), o.tags.end(), [&](int tag) {
+      const auto track = tracks_.find(tag);
+      return track != tracks_.end() && track->second.has_moved &&
+             sample.sample_index < track->second.since;
+    });
+  });
   // They were not back by then, whatever the noise is now thought to be, and no other had moved.
-  for (const Finding& finding : look(sample, schema, noise))
+  for (const Finding& finding : look(after, schema, noise, true))
     if (finding.is_back)
       tracks_[finding.tag] = {
           .num_alike = kSightings - 1, .has_moved = true, .is_on_part = finding.is_on_part};
@@ -46,6 +56,12 @@ void MovedTags::begin_anew() {
 std::vector<MovedTags::Finding> MovedTags::look(const ActionPoseSample& sample,
                                                 const BodySchema& schema,
                                                 const MarkerNoise& noise) {
+  return look(sample, schema, noise, false);
+}
+
+std::vector<MovedTags::Finding> MovedTags::look(const ActionPoseSample& sample,
+                                                const BodySchema& schema, const MarkerNoise& noise,
+                                                bool is_past) {
   std::vector<Finding> findings;
   const auto X_RB = schema.predict_all(sample.action);
   for (const PartObservation& seen : sample.parts) {
@@ -58,13 +74,14 @@ std::vector<MovedTags::Finding> MovedTags::look(const ActionPoseSample& sample,
 
     if (int& num = num_affected_[seen.part]; !affects(seen)) {
       num = 0;
-    } else if (sample.purpose != Purpose::kControl && ++num == kAlone) {
+    } else if (sample.purpose != Purpose::kControl && ++num >= kAlone && is_past) {
+      num = kAlone - 1;  // it was not given up by then
+    } else if (num >= kAlone) {
       num = 0;
       for (const int tag : seen.tags) {
         const auto track = tracks_.find(tag);
         if (track == tracks_.end() || !track->second.has_moved) continue;
-        findings.push_back(
-            {seen.part, tag, sample.sample_index, kAlone, track->second.is_on_part, true});
+        findings.push_back({seen.part, tag, sample.sample_index, kAlone, false, true});
         tracks_.erase(track);
       }
       continue;

@@ -28,7 +28,7 @@ class MovedTags {
     std::int64_t since = 0;  ///< first sample that showed it there
     int num_sightings = 0;
     bool is_on_part = false;  ///< moved on it; else it was lost, and maybe lies in sight
-    bool is_back = false;     ///< it is where it was
+    bool is_back = false;     ///< it is where it was, or all that there is
   };
   /// `schema`: the body before anything was wrong.
   std::vector<Finding> look(const ActionPoseSample& sample, const BodySchema& schema,
@@ -54,6 +54,9 @@ class MovedTags {
     bool has_moved = false;
     bool is_on_part = false;  ///< and moves with it
   };
+  std::vector<Finding> look(const ActionPoseSample& sample, const BodySchema& schema,
+                            const MarkerNoise& noise, bool is_past);
+
   std::map<int, Track> tracks_;         ///< by tag
   std::map<int, std::vector<int>> of_;  ///< the tags of every part that were seen
   std::map<int, int> num_affected_;     ///< sightings of every part in a row that moved tags affect

@@ -4,8 +4,6 @@
 #include <cmath>
 #include <set>
 
-#include "processes/model_monitor/change_fit.h"
-
 namespace bodyschema {
 namespace {
 

@@ -36,7 +36,7 @@ struct Alternative {
       -1;  ///< this edge is uncertain by `inflation` standard deviations of a marker
   double inflation = 0;
   std::vector<int> cut_edges = {};  ///< these edges say nothing
-  int detached_node = -1;      ///< the marker of this node is not where it was
+  int detached_node = -1;           ///< the marker of this node is not where it was
 };
 
 /// The pose of a part as everything but one element of the schema knows it, as if measured.

@@ -7,6 +7,7 @@
 #include <future>
 #include <stdexcept>
 
+#include "common/bus/awaited_answer.h"
 #include "common/bus/process.h"
 #include "common/bus/rig_door.h"
 #include "common/bus/sample_intake.h"
@@ -45,18 +46,8 @@ int main(int argc, char** argv) {
     std::int64_t sent_us = 0;
     // A babbler waits for the monitor's verdict on every TEST sample; so does, where there is none,
     // the learner, or it would learn from a body of which the monitor knows already that it is no
-    // more. Not for ever.
-    constexpr std::int64_t kVerdictTimeout_us = 10'000'000;
-    bool awaits_verdicts = is_replayed;
-    std::int64_t proposed_sample = -1, judged_sample = -1, proposed_us = 0, tick_us = 0;
-    const auto awaits_verdict = [&] {
-      if (awaits_verdicts && judged_sample < proposed_sample &&
-          tick_us - proposed_us > kVerdictTimeout_us) {
-        spdlog::warn("no verdict of model_monitor on sample {}: goes on without", proposed_sample);
-        awaits_verdicts = false;
-      }
-      return awaits_verdicts && judged_sample < proposed_sample;
-    };
+    // more.
+    AwaitedAnswer verdicts(is_replayed, 10'000'000);
     const auto publish = [&] {
       process.bus().publish(kLearnedSchema, learned);
       process.set_activity(process_info_t::PHASE_WORKING,
@@ -67,7 +58,6 @@ int main(int argc, char** argv) {
     const auto collect = [&] {
       learned = fit.get();
       has_learned = true;
-      proposed_us = tick_us;
       publish();
     };
     const auto learn_now = [&] {
@@ -86,8 +76,8 @@ int main(int argc, char** argv) {
         while (learner.has_test_job()) learn_now();
         return;
       }
-      if (!fit.valid() && learner.has_job() && !(learner.has_test_job() && awaits_verdict())) {
-        if (learner.has_test_job()) proposed_sample = learner.next_sample_index();
+      if (!fit.valid() && learner.has_job() && !(learner.has_test_job() && verdicts.is_waiting())) {
+        if (learner.has_test_job()) verdicts.ask(learner.next_sample_index());
         fit = std::async(std::launch::async, learner.take_job());
         if (is_ready(fit, kUsualFit)) collect();
       }
@@ -101,13 +91,15 @@ int main(int argc, char** argv) {
     door.subscribe(process, kBodySchema,
                    [&](const body_schema_t& schema) { learner.on_body_schema(schema); });
     door.subscribe(process, kModelHealth, [&](const model_health_t& health) {
-      judged_sample = health.judged_sample;
-      if (!is_replayed) learner.skip_judged(std::min(judged_sample, resumed_after));
+      verdicts.answer(health.judged_sample);
+      learner.skip_judged(std::min(health.judged_sample, resumed_after));
     });
     process.on_idle(work);
     process.on_tick([&](std::int64_t now_us) {
-      tick_us = now_us;
       intake.on_tick(now_us);
+      if (!fit.valid() && verdicts.on_tick(now_us))
+        spdlog::warn("no verdict of model_monitor on sample {}: goes on without",
+                     verdicts.question());
       process.set_counters(intake.counters());
       work();
       if (has_learned && !process.bus().is_replay() && now_us - sent_us >= 1'000'000) {

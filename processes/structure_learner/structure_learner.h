@@ -55,11 +55,11 @@ class StructureLearner {
   /// The last sample of that prefix.
   std::int64_t next_sample_index() const { return pending_.front().last_sample_index; }
   /// The fit of the next prefix, on a copy, to be run in any thread. Prefixes that end with a TEST
-  /// sample come in order and none is left out, since the monitor judges these; of the others only
-  /// the newest waits. There must be one.
+  /// sample come in order and none is left out that was not judged; of the others only the newest
+  /// waits. There must be one.
   std::function<body_schema_t()> take_job();
-  /// Leaves out what the monitor judged already (after a restart: all but the newest samples),
-  /// since no proposal depends on one before it.
+  /// Leaves out the prefixes that the monitor judged already, as there are after a restart; no
+  /// proposal depends on one before it. Never the newest, which is repeated.
   void skip_judged(std::int64_t judged_sample);
 
   /// Idle time can make the next job short: to be run, in any thread, when there is no job; asked

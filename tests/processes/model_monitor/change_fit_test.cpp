@@ -73,6 +73,51 @@ std::vector<Case> cases() {
            values({0.05, -0.03, 0.02, 0.5, -0.4, 0.3, -0.04, 0.02, 0.03, -0.3, 0.2, 0.6})}};
 }
 
+/// Also of an edge with something behind its joint, of one that no joint moves any more, of a
+/// marker and of the camera.
+TEST_F(ChangeFitTest, TheResidualsJacobianIsThatOfCentralDifferences) {
+  for (Edge& edge : schema_.edges) edge.right = test::random_pose(rng_, 0.05, 0.3);
+  schema_.edges[2].joints[0].gain = 1.2;
+  schema_.edges[2].joints[0].slide = 0.05;
+  const auto samples = observe(schema_, 5);
+  for (const auto& [part, is_marker] :
+       {std::pair{kPart, false}, {kPart, true}, {schema_.root, false}}) {
+    const PlaceEvidence evidence(schema_, noise_, part, is_marker, pointers(samples));
+    for (const BodyChange& change : possible_changes(schema_, part, is_marker)) {
+      SCOPED_TRACE("form " + std::to_string(static_cast<int>(change.form)));
+      Eigen::VectorXd theta(change.size());
+      for (double& t : theta) t = 0.3 * test::gaussian(rng_);
+      Eigen::MatrixXd J;
+      const Eigen::VectorXd r = evidence.residuals(change, theta, &J);
+      ASSERT_EQ(r.size(), 30);
+      ASSERT_EQ(J.cols(), theta.size());
+      for (Eigen::Index p = 0; p < theta.size(); ++p) {
+        constexpr double kStep = 1e-6;
+        Eigen::VectorXd plus = theta, minus = theta;
+        plus(p) += kStep;
+        minus(p) -= kStep;
+        const Eigen::VectorXd expected =
+            (evidence.residuals(change, plus) - evidence.residuals(change, minus)) / (2 * kStep);
+        EXPECT_LT((J.col(p) - expected).norm(), 1e-5 * (1 + expected.norm())) << p;
+      }
+    }
+  }
+}
+
+TEST_F(ChangeFitTest, AJointThatIsNoMoreCannotHaveChanged) {
+  FittedChange rigid, offset;
+  rigid.change = {Form::kRigid, kPart};
+  rigid.theta = Eigen::VectorXd::Zero(6);
+  offset.change = {Form::kOffset, kPart};
+  offset.theta = Eigen::VectorXd::Constant(1, 0.1);
+  const BodySchema without = with_change(schema_, rigid);
+  EXPECT_TRUE(is_possible(offset, schema_));
+  EXPECT_FALSE(is_possible(offset, without));
+  EXPECT_TRUE(is_possible(rigid, without));
+  offset.origin = schema_;  // which has it
+  EXPECT_TRUE(is_possible(offset, without));
+}
+
 TEST_F(ChangeFitTest, EveryChangeIsFoundAgainAndPreferred) {
   for (const Case& c : cases()) {
     SCOPED_TRACE("form " + std::to_string(static_cast<int>(c.change.form)));
