@@ -1,0 +1,69 @@
+#include "processes/model_monitor/moved_tags.h"
+
+#include <gtest/gtest.h>
+
+#include "tests/support/broken_arm.h"
+
+namespace bodyschema {
+namespace {
+
+constexpr int kPart = 4, kTag = 41, kOther = 42;
+
+/// An engineered arm of which one part is seen, without noise.
+class MovedTagsTest : public testing::Test {
+ protected:
+  ActionPoseSample seen(std::int64_t index, int tag, bool is_in_place) const {
+    ActionPoseSample sample;
+    sample.sample_index = index;
+    sample.action = Eigen::VectorXd::Constant(7, 0.1 * static_cast<double>(index % 10));
+    PartObservation& o = sample.parts.emplace_back();
+    o.part = kPart;
+    o.tags = {tag};
+    o.X_CB = schema_.X_CR * schema_.predict_all(sample.action).at(kPart);
+    if (!is_in_place) o.X_CB.translation().x() += 0.1;
+    o.covariance = 1e-6 * Matrix6d::Identity();
+    return sample;
+  }
+  std::vector<MovedTags::Finding> look(MovedTags* tags, const ActionPoseSample& sample) const {
+    return tags->look(sample, schema_, {});
+  }
+
+  const BodySchema schema_ =
+      test::BrokenArm({test::Fault::kNone, "", 1}, test::Regime::kTagIso, 1, 3).engineered();
+};
+
+TEST_F(MovedTagsTest, WhatAloneShowsAPartForLongIsBelievedAgainAlsoOverARestart) {
+  for (const int num_before : {0, 20, 29, 100}) {
+    MovedTags tags({{kTag, 0, 0, -1}});
+    for (int n = 0; n < num_before; ++n) tags.look_back(seen(n, kTag, false), schema_, {});
+    EXPECT_TRUE(tags.has_moved(kTag));
+    int num = 0;
+    while (tags.has_moved(kTag) && num < 100) {
+      const auto findings = look(&tags, seen(num_before + num, kTag, false));
+      ++num;
+      if (findings.empty()) continue;
+      ASSERT_EQ(findings.size(), 1U);
+      EXPECT_TRUE(findings[0].is_back);
+      EXPECT_EQ(findings[0].tag, kTag);
+    }
+    EXPECT_EQ(num, std::max(1, 30 - num_before));
+  }
+  // Another tag shows it now and then.
+  MovedTags tags({{kTag, 0, 0, -1}});
+  for (int n = 0; n < 200; ++n)
+    EXPECT_TRUE(look(&tags, seen(n, n % 10 == 9 ? kOther : kTag, n % 10 == 9)).empty());
+}
+
+TEST_F(MovedTagsTest, WhereATagWasBeforeItMovedDoesNotBringItBack) {
+  MovedTags tags({{kTag, 60, 50, -1}});
+  for (int n = 0; n < 50; ++n) tags.look_back(seen(n, kTag, true), schema_, {});
+  for (int n = 50; n < 60; ++n) tags.look_back(seen(n, kTag, false), schema_, {});
+  for (int n = 60; n < 63; ++n) {
+    const auto findings = look(&tags, seen(n, kTag, true));
+    EXPECT_EQ(findings.size(), n == 62 ? 1U : 0U) << n;
+  }
+  EXPECT_FALSE(tags.has_moved(kTag));
+}
+
+}  // namespace
+}  // namespace bodyschema
