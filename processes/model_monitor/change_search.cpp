@@ -54,7 +54,7 @@ std::vector<Base> bases_of(const Place& place, const BodySchema& standing,
 }
 
 /// All that differs from a stored schema by more than is uncertain at once, where that is more than
-/// one place and the samples speak for it: first where that was suspected; an outlier elsewhere may
+/// one edge and the samples speak for it: first where that was suspected; an outlier elsewhere may
 /// be the greatest suspicion.
 std::optional<Replacement> whole(const BodySchema& stored, const BodySchema& standing,
                                  const std::vector<Place>& places,
@@ -79,11 +79,15 @@ std::optional<Replacement> whole(const BodySchema& stored, const BodySchema& sta
   judge();
   if (fitted.log_evidence <= null) return std::nullopt;
   BodySchema different = standing;
-  for (const int part : standing.parts)
-    if (!is_alike_at(standing, stored, part)) different = with_edge_of(different, stored, part);
+  int num_clear = 0;
+  for (const int part : standing.parts) {
+    if (is_alike_at(standing, stored, part)) continue;
+    different = with_edge_of(different, stored, part);
+    ++num_clear;
+  }
+  if (num_clear < 2) return std::nullopt;
   fitted.origin = std::move(different);
   std::vector<Place> at = differences(standing, judge());
-  if (at.size() < 2) return std::nullopt;
   std::stable_sort(at.begin(), at.end(), [&places](const Place& a, const Place& b) {
     return std::find(places.begin(), places.end(), a) < std::find(places.begin(), places.end(), b);
   });

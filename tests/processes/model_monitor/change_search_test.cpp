@@ -92,5 +92,20 @@ TEST_F(ChangeSearchTest, OfTwoPlacesThatChangedBackBothAreRestoredAndNothingElse
     EXPECT_EQ(differ_at(schema_, with, part), part == kBent || part == kOther) << part;
 }
 
+TEST_F(ChangeSearchTest, AMarkerThatIsBackIsOnePlaceThoughBothEdgesChange) {
+  Eigen::VectorXd move(6);
+  move << 0.03, 0, 0.01, 0, 0, 0.3;
+  stored_ = changed(schema_, {Form::kMarkerMoved, kAlmost}, move);
+  const auto samples = observe(stored_, 3);
+  std::vector<const ActionPoseSample*> pointers;
+  for (const ActionPoseSample& sample : samples) pointers.push_back(&sample);
+  const FoundChanges found =
+      find_changes(schema_, {stored_}, {{kAlmost, false}}, pointers, ChangeSearch{MarkerNoise{}});
+  ASSERT_TRUE(found.best);
+  EXPECT_EQ(found.best->fitted.change.form, Form::kStored);
+  EXPECT_EQ(found.best->place, (Place{kAlmost, true}));
+  EXPECT_TRUE(found.best->also.empty());
+}
+
 }  // namespace
 }  // namespace bodyschema
