@@ -313,8 +313,8 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
   const bool may_be_its_own = reformed_at_ == sample_index ||
                               (age_ <= kUnsure && !replacements_.empty() &&
                                std::none_of(replacements_.begin(), replacements_.end(), is_beside));
-  const bool is_alarm = highest > tests_->alarm() && !may_be_its_own;
-  if (detected_ ? !is_told_ : accepted || is_alarm) {
+  const bool is_wrong = detected_ ? !is_told_ : highest > tests_->alarm();
+  if ((is_wrong && !may_be_its_own) || (accepted && !(detected_ && is_told_))) {
     detected_ = accepted ? choice.best->place : places.front();
     is_told_ = is_clear;
     untold_ = highest;
