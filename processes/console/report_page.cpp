@@ -390,7 +390,7 @@ class Page {
     std::string html = "<section><h2>Held-out error</h2>\n";
     if (held_out_.empty())
       return html +
-             "<p>No held-out sample of the body as it is, so nothing to judge by.</p></section>\n";
+             "<p>No held-out sample yet of the body as it is, so nothing to judge by.</p></section>\n";
     const auto all = record_.watch().held_out();
     const auto versions = version_errors(record_.versions(), all, report_.end_effector);
     if (const auto curve = version_plot(versions)) {
