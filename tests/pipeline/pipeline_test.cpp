@@ -3,8 +3,6 @@
 
 #include <gtest/gtest.h>
 #include <signal.h>
-#include <sys/socket.h>
-#include <sys/un.h>
 #include <sys/wait.h>
 #include <unistd.h>
 
@@ -301,8 +299,11 @@ TEST_F(Arm2, TwoRunsWithOneSeedAreIdentical) {
 TEST_F(Arm2, NoProcessIsLeftBehind) {
   for (const char* name : {"first", "second"}) {
     EXPECT_EQ(processes_of(fs::canonical(run(name))), std::vector<std::string>{}) << name;
-    // supervisord removes its pid file when it ends in order.
-    EXPECT_FALSE(fs::exists(run(name) / "supervisord.pid")) << name;
+    std::string socket = contents(run(name) / "socket");
+    ASSERT_FALSE(socket.empty());
+    EXPECT_FALSE(fs::exists(fs::path(socket).parent_path())) << "supervisord's private folder";
+    const std::string log = contents(run(name) / "supervisord.log");
+    EXPECT_NE(log.find("stopped: robot_simulator (exit status 0)"), std::string::npos) << log;
   }
 }
 
@@ -561,23 +562,6 @@ TEST_F(Arm2, ASecondGroupInTheSameFolderIsRefusedAndTheFirstGoesOn) {
   EXPECT_EQ(processes_of(folder).size(), before);
   EXPECT_EQ(shell(run_command("twice", "stop")), 0);
   EXPECT_EQ(processes_of(folder), std::vector<std::string>{});
-}
-
-TEST_F(Arm2, TheSocketOfAKilledGroupIsRemovedByTheNext) {
-  const char* temporary = std::getenv("TMPDIR");
-  const fs::path socket = fs::path(temporary ? temporary : "/tmp") / "bodyschema-deadTEST.sock";
-  fs::remove(socket);
-  const int dead = ::socket(AF_UNIX, SOCK_STREAM, 0);
-  sockaddr_un address{};
-  address.sun_family = AF_UNIX;
-  socket.string().copy(address.sun_path, sizeof address.sun_path - 1);
-  ASSERT_EQ(::bind(dead, reinterpret_cast<const sockaddr*>(&address), sizeof address), 0);
-  ASSERT_EQ(::listen(dead, 1), 0);
-  EXPECT_EQ(replay_group("beside", run("first") / "samples.lcmlog"), 0);
-  EXPECT_TRUE(fs::exists(socket)) << "somebody still listens";
-  ::close(dead);
-  EXPECT_EQ(replay_group("after", run("first") / "samples.lcmlog"), 0);
-  EXPECT_FALSE(fs::exists(socket));
 }
 
 }  // namespace

@@ -1,0 +1,38 @@
+"""The build tree."""
+
+import os
+import shutil
+import subprocess
+import sys
+
+from launcher import packages
+from launcher.words import Failure
+
+
+def num_processors():
+    return len(os.sched_getaffinity(0))
+
+
+def build(place, *targets, preset="release"):
+    """Sets up, configures and builds, unless the build is given."""
+    if place.is_build_given:
+        return
+    configure(place, preset)
+    if targets:
+        cmake("--build", place.build, "--target", *targets, "-j", num_processors())
+
+
+def configure(place, preset="release"):
+    packages.install(place.source / "config" / "packages.txt")
+    # A build folder that was configured elsewhere (a copied or moved checkout) is of no use.
+    cache = place.build / "CMakeCache.txt"
+    if cache.exists() and f"CMAKE_HOME_DIRECTORY:INTERNAL={place.source}" not in cache.read_text().splitlines():
+        shutil.rmtree(place.build)
+    if not (place.build / "build.ninja").exists():
+        cmake("-S", place.source, "--preset", preset)
+
+
+def cmake(*arguments):
+    # stdout is for the result.
+    if subprocess.run(["cmake", *map(str, arguments)], stdout=sys.stderr).returncode != 0:
+        raise Failure("the build failed")

@@ -1,0 +1,37 @@
+"""Debian packages."""
+
+import os
+import shutil
+import subprocess
+import sys
+
+from launcher.words import Failure, say
+
+
+def listed(file):
+    """Names in a packages*.txt."""
+    names = (line.split("#")[0].strip() for line in file.read_text().splitlines())
+    return [name for name in names if name]
+
+
+def is_installed(package):
+    query = ["dpkg-query", "-W", "-f", "${db:Status-Status}", package]
+    return subprocess.run(query, capture_output=True, text=True).stdout == "installed"
+
+
+def install(file):
+    """Installs what is missing of a packages*.txt."""
+    missing = [package for package in listed(file) if not is_installed(package)]
+    if not missing:
+        return
+    say("installing from Debian:", *missing)
+    sudo = []
+    if os.getuid() != 0:
+        if not shutil.which("sudo"):
+            raise Failure("these packages are missing and there is no sudo; as root: apt-get install " + " ".join(missing))
+        sudo = ["sudo"]
+    if subprocess.run([*sudo, "apt-get", "update", "-qq"], stdout=sys.stderr).returncode != 0:
+        say("apt-get update failed; trying with the old lists")
+    command = ["env", "DEBIAN_FRONTEND=noninteractive", "apt-get", "install", "-y", "-qq", "--no-install-recommends"]
+    if subprocess.run([*sudo, *command, *missing], stdout=sys.stderr).returncode != 0:
+        raise Failure("apt-get could not install: " + " ".join(missing))

@@ -1,0 +1,60 @@
+"""A folder for a run, in the folder of all runs, from which one group runs at a time."""
+
+import contextlib
+import fcntl
+import os
+import shutil
+import time
+
+from launcher.group import Group
+from launcher.words import Failure
+
+
+def lock(logs):
+    """Takes the lock of a folder of runs; None if somebody has it. The group inherits it and holds it as long as it lives."""
+    file = os.open(logs / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(file)
+        return None
+    return file
+
+
+def is_locked(logs):
+    """Whether a group runs from there, be it another user's."""
+    with contextlib.suppress(FileNotFoundError), open(logs / ".lock", "rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
+
+
+def begin(place, rig):
+    """A new run with a copy of the rig, and the lock; nothing else may run from there."""
+    logs = place.logs
+    try:
+        logs.mkdir(parents=True, exist_ok=True)
+        held = lock(logs)
+    except OSError as error:
+        raise Failure(f"cannot write into {logs}: {error.strerror}") from None
+    # The lock may have been deleted with the folder.
+    group = Group.find(logs)
+    if held is None or group:
+        running = group.run if group else "a run of another user"
+        raise Failure(f"a group runs already, from {running}; stop it with ./run stop")
+    while True:
+        run = logs / time.strftime("%Y%m%d-%H%M%S")
+        try:
+            run.mkdir()
+            break
+        except FileExistsError:
+            time.sleep(1)
+    shutil.copytree(rig, run / "config")
+    link = logs / ".current"
+    with contextlib.suppress(FileNotFoundError):
+        link.unlink()
+    link.symlink_to(run)
+    link.rename(place.current)
+    return run, held

@@ -1,0 +1,15 @@
+"""What is told to the user, on stderr."""
+
+import sys
+
+
+class Failure(Exception):
+    """Ends `./run` with this message and exit code 1."""
+
+
+class UsageError(Failure):
+    """The same with exit code 2: what was typed cannot be meant."""
+
+
+def say(*words):
+    print(*words, file=sys.stderr, flush=True)
