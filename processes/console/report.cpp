@@ -38,6 +38,7 @@ struct ReportArguments {
   std::string source;
   std::string out;
   bool follow = false;
+  bool grows = false;
 };
 
 /// A run folder or a single log, read as it grows.
@@ -152,7 +153,7 @@ class Source {
 };
 
 void run_report(const ReportArguments& arguments) {
-  Source source(arguments.source, arguments.follow);
+  Source source(arguments.source, arguments.follow || arguments.grows);
   const fs::path out = arguments.out.empty() ? source.default_out() : fs::path(arguments.out);
   if (!arguments.follow) {
     source.read();
@@ -176,6 +177,8 @@ void run_report(const ReportArguments& arguments) {
     } catch (const std::exception& error) {
       problem = error.what();  // a full disk, say: the next page may succeed
     }
+    // A full disk may have taken the words before: std::cerr would be silent from then on.
+    std::cerr.clear();
     if (problem != last && !problem.empty()) std::cerr << "bodyschema: " << problem << std::endl;
     last = problem;
   };
@@ -208,6 +211,8 @@ void add_report_command(CLI::App& console) {
   report->add_option("--out", arguments->out, "The file; default: report.html in the run folder");
   report->add_flag("--follow", arguments->follow,
                    "Write it again while the run goes on, until SIGTERM");
+  report->add_flag("--growing", arguments->grows,
+                   "The run goes on: an event that is cut off at the end is still being written");
   report->callback([arguments] { run_report(*arguments); });
 }
 

@@ -54,6 +54,21 @@ class RecordedLogTest : public testing::Test {
   test::TemporaryFolder folder_;
 };
 
+TEST_F(RecordedLogTest, CutOffIsDamageInAReportUnlessItIsStillWritten) {
+  const fs::path log = folder_ / "cut.lcmlog", page = folder_ / "page.html";
+  fs::copy_file(kLog, log);
+  fs::resize_file(log, fs::file_size(log) - 10);
+  const auto report = [&](std::vector<std::string> flags) {
+    std::vector<std::string> command = {kBin + "bodyschema", "report", log, "--out", page};
+    command.insert(command.end(), flags.begin(), flags.end());
+    test::Program program(command);
+    EXPECT_EQ(program.wait(), 0) << program.err();
+    return text_of(page);
+  };
+  EXPECT_NE(report({}).find("bytes after it are lost"), std::string::npos);
+  EXPECT_EQ(report({"--growing"}).find("bytes after it are lost"), std::string::npos);
+}
+
 TEST_F(RecordedLogTest, IsWholeAndOfThisVersion) {
   const LogSummary summary = summarize_log(kLog);
   EXPECT_TRUE(summary.is_sound()) << flaws_text(summary)
