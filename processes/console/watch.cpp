@@ -375,6 +375,12 @@ void run_watch(const WatchArguments& arguments) {
   ProgressLine line;
   Player player;
   if (is_replay) read_truth(arguments.replay, watch);
+  // ./run starts this again after a crash: what went over the bus before is in the run's logs.
+  for (int part = 0; !is_replay; ++part) {
+    const std::string log = fmt::format("{}/run.lcmlog.{:02}", arguments.out, part);
+    if (!std::filesystem::exists(log)) break;
+    read_truth(log, watch);
+  }
   std::int64_t last_progress = 0;
   double progressed_s = 0, warned_s = 0, played_s = 0, looked_s = 0;
   std::set<std::string> told;
