@@ -20,6 +20,8 @@ constexpr std::int64_t kMaxParts = 10'000;
 constexpr std::int64_t kMaxId = 1'000'000;
 constexpr double kMaxReach_m = 1'000;
 constexpr std::int64_t kMaxTags = 10'000;
+/// A sample a millisecond for thirty years; what is computed with indices does not overflow.
+constexpr std::int64_t kMaxSampleIndex = 1'000'000'000'000;
 constexpr std::int64_t kMaxSignals = 1'000;
 constexpr std::int64_t kMaxChanges = 1'000;
 constexpr std::int64_t kMaxJoints = 100;
@@ -501,7 +503,7 @@ std::string check(const marker_poses_t& message) {
 std::string check(const sample_t& message) {
   Checker check;
   check.time("utime", message.utime);
-  check.integer_at_least("sample_index", message.sample_index, 0);
+  check.integer_within("sample_index", message.sample_index, 0, kMaxSampleIndex);
   check.text("source", message.source, kMaxName);
   check.time("epoch", message.epoch);
   check.integer_at_least("action_id", message.action_id, -1);

@@ -8,6 +8,7 @@
 
 #include <algorithm>
 #include <array>
+#include <boost/crc.hpp>
 #include <cerrno>
 #include <cstring>
 #include <random>
@@ -20,6 +21,8 @@ namespace {
 constexpr std::uint32_t kSync = 0xEDA1DA01;
 constexpr std::array<std::uint8_t, 4> kSyncBytes = {0xED, 0xA1, 0xDA, 0x01};
 constexpr std::size_t kHeaderSize = 28;
+/// Where the checksum stands, and where what it covers begins.
+constexpr std::size_t kChecksum = 4, kChecked = 8;
 /// lcm-logplayer refuses longer names.
 constexpr std::int32_t kLongestChannel = 999;
 
@@ -37,6 +40,18 @@ void append_big_endian(std::vector<std::uint8_t>& bytes, Integer value) {
   for (int shift = 8 * (static_cast<int>(sizeof(Integer)) - 1); shift >= 0; shift -= 8) {
     bytes.push_back(static_cast<std::uint8_t>(static_cast<std::uint64_t>(value) >> shift));
   }
+}
+
+using Crc32c = boost::crc_optimal<32, 0x1EDC6F41, 0xFFFFFFFF, 0xFFFFFFFF, true, true>;
+
+/// Never 0, which says that there is none.
+std::uint32_t checksum_of(std::span<const std::uint8_t> header, const std::string& channel,
+                          std::span<const std::uint8_t> data) {
+  Crc32c crc;
+  crc.process_bytes(header.data() + kChecked, kHeaderSize - kChecked);
+  crc.process_bytes(channel.data(), channel.size());
+  crc.process_bytes(data.data(), data.size());
+  return crc.checksum() == 0 ? 0xFFFFFFFF : crc.checksum();
 }
 
 std::runtime_error file_error(const std::filesystem::path& path, const std::string& what) {
@@ -132,11 +147,16 @@ bool LogReader::next() {
       report_.truncated_at_byte = position_;
       return false;
     }
-    if (on_damage_ == OnDamage::kThrow || (!next && report_.events == 0)) {
-      throw file_error(
-          path_, position_ == 0 ? "is not an LCM log (its first bytes are no event)"
-                                : fmt::format("is damaged: no event begins at byte {}", position_));
-    }
+    // A wrong checksum says that it is a log all the same.
+    const bool is_log = position_ > 0 || next || found == Found::kWrongChecksum;
+    const std::string damage =
+        found == Found::kWrongChecksum
+            ? fmt::format("is damaged: the event at byte {} is not what was written (its checksum)",
+                          position_)
+        : is_log ? fmt::format("is damaged: no event begins at byte {}", position_)
+                 : "is not an LCM log (its first bytes are no event)";
+    if (!report_.damaged_at_byte) report_.damage = damage;
+    if (on_damage_ == OnDamage::kThrow || !is_log) throw file_error(path_, damage);
     std::error_code error;
     const std::int64_t end =
         next.value_or(static_cast<std::int64_t>(std::filesystem::file_size(path_, error)));
@@ -177,9 +197,11 @@ LogReader::Found LogReader::read_event(bool looks_behind) {
       position_ + static_cast<std::int64_t>(kHeaderSize) + channel_size + data_size;
   if (!error && end > file_size) return Found::kTruncated;
 
+  const auto event_number = read_big_endian<std::uint64_t>(&header[kChecksum]);
+  const auto checksum = static_cast<std::uint32_t>(event_number >> 32);
   // Where no event follows either that one is damaged or the length of this one: then it would
-  // swallow what is whole.
-  if (looks_behind && end < file_size) {
+  // swallow what is whole. A checksum decides it better.
+  if (looks_behind && checksum == 0 && end < file_size) {
     std::array<std::uint8_t, 4> next{};
     if (::fseeko(file_, end, SEEK_SET) != 0) return Found::kTruncated;
     const std::size_t next_read = std::fread(next.data(), 1, next.size(), file_);
@@ -192,13 +214,16 @@ LogReader::Found LogReader::read_event(bool looks_behind) {
     }
   }
 
-  event_.event_number = read_big_endian<std::int64_t>(&header[4]);
+  event_.event_number = static_cast<std::uint32_t>(event_number);
   event_.event_utime = read_big_endian<std::int64_t>(&header[12]);
   event_.channel.resize(static_cast<std::size_t>(channel_size));
   event_.data.resize(static_cast<std::size_t>(data_size));
   if (std::fread(event_.channel.data(), 1, event_.channel.size(), file_) != event_.channel.size() ||
       std::fread(event_.data.data(), 1, event_.data.size(), file_) != event_.data.size()) {
     return Found::kTruncated;
+  }
+  if (checksum != 0 && checksum != checksum_of(header, event_.channel, event_.data)) {
+    return Found::kWrongChecksum;
   }
   position_ = end;
   ++report_.events;
@@ -305,6 +330,12 @@ void LogAppender::append_bytes(const std::string& channel, std::span<const std::
   ++next_number_;
 }
 
+std::uint32_t crc32c(std::span<const std::uint8_t> bytes) {
+  Crc32c crc;
+  crc.process_bytes(bytes.data(), bytes.size());
+  return crc.checksum();
+}
+
 std::vector<std::uint8_t> encode_event(const std::string& channel,
                                        std::span<const std::uint8_t> data, std::int64_t event_utime,
                                        std::int64_t event_number) {
@@ -316,10 +347,15 @@ std::vector<std::uint8_t> encode_event(const std::string& channel,
   std::vector<std::uint8_t> bytes;
   bytes.reserve(kHeaderSize + channel.size() + data.size());
   append_big_endian(bytes, kSync);
-  append_big_endian(bytes, event_number);
+  append_big_endian(bytes, std::uint32_t{0});  // the checksum's place
+  append_big_endian(bytes, static_cast<std::uint32_t>(event_number));
   append_big_endian(bytes, event_utime);
   append_big_endian(bytes, static_cast<std::int32_t>(channel.size()));
   append_big_endian(bytes, static_cast<std::int32_t>(data.size()));
+  const std::uint32_t checksum = checksum_of(bytes, channel, data);
+  for (std::size_t i = 0; i < sizeof checksum; ++i) {
+    bytes[kChecksum + i] = static_cast<std::uint8_t>(checksum >> (24 - 8 * i));
+  }
   bytes.insert(bytes.end(), channel.begin(), channel.end());
   bytes.insert(bytes.end(), data.begin(), data.end());
   return bytes;

@@ -19,6 +19,12 @@ namespace bodyschema {
 // bytes, all big-endian: 0xEDA1DA01, int64 event number, int64 event time [µs since 1970], int32
 // length of the channel's name, int32 length of the data; then the name and the data.
 //
+// An event written here has a checksum in the upper half of its event number, which LCM's tools
+// carry along unused: the CRC-32C of all that follows (the lower half, a count, up to the data),
+// 0xFFFFFFFF in place of 0. An upper half of 0 is an event without one, as lcm-logger writes it.
+// Every reader here checks it: it finds any three flipped bits and any damage within 32 adjacent
+// bits, and misses one of 2^32 others.
+//
 // LCM's own reader is not used: it stops silently at the first damaged byte, drops the whole event
 // before it, cannot say where it was and does not open an empty log.
 
@@ -28,7 +34,7 @@ struct LogEvent {
   std::vector<std::uint8_t> data;
   /// When it was recorded, or the message's own utime in files that must be reproducible [µs].
   std::int64_t event_utime = 0;
-  std::int64_t event_number = 0;
+  std::int64_t event_number = 0;  ///< modulo 2^32
 };
 
 /// What a log was found to hold.
@@ -41,10 +47,12 @@ struct LogReport {
   /// Where the first damage begins that was skipped (OnDamage::kSkip), and how much was.
   std::optional<std::int64_t> damaged_at_byte;
   std::int64_t damaged_bytes = 0;
+  /// What was found there, for people: "is damaged: …"; "" if nothing.
+  std::string damage;
 };
 
-/// What to do about bytes in the middle of a log that are no event, or an event that cannot be
-/// decoded: throw, or go on at the next event there is.
+/// What to do about bytes in the middle of a log that are no event, an event whose checksum is
+/// wrong, or one that cannot be decoded: throw, or go on at the next event there is.
 enum class OnDamage { kThrow, kSkip };
 
 /// Reads a log from its beginning, event by event.
@@ -59,8 +67,8 @@ class LogReader {
   LogReader& operator=(const LogReader&) = delete;
 
   /// Reads the next event into event(). False at the end, also where the tail is truncated.
-  /// @throws std::runtime_error naming the byte where something begins that is not an event (with
-  /// OnDamage::kSkip only if there is no event at all).
+  /// @throws std::runtime_error naming the byte where something begins that is not an event, or one
+  /// that is not as it was written (with OnDamage::kSkip only if there is no event at all).
   bool next();
   /// Goes to where an event begins, a position() of earlier.
   void seek(std::int64_t position);
@@ -70,7 +78,7 @@ class LogReader {
   std::int64_t position() const { return position_; }
 
  private:
-  enum class Found { kEvent, kEnd, kTruncated, kDamaged };
+  enum class Found { kEvent, kEnd, kTruncated, kDamaged, kWrongChecksum };
   Found read_event(bool looks_behind);
   std::optional<std::int64_t> find_event(std::int64_t from);
 
@@ -175,7 +183,10 @@ class LogAppender {
   LogReport found_;
 };
 
-/// The bytes of one event as they stand in a log.
+/// CRC-32C (Castagnoli), as iSCSI and ext4 use it.
+std::uint32_t crc32c(std::span<const std::uint8_t> bytes);
+
+/// The bytes of one event as they stand in a log, with their checksum.
 std::vector<std::uint8_t> encode_event(const std::string& channel,
                                        std::span<const std::uint8_t> data, std::int64_t event_utime,
                                        std::int64_t event_number);

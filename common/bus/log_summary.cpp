@@ -66,9 +66,10 @@ LogSummary summarize_log(const std::filesystem::path& file) {
       summary.damage = fmt::format("is cut off in the middle of an event at byte {}",
                                    *reader.report().truncated_at_byte);
     }
-  } catch (const std::runtime_error&) {
+  } catch (const std::runtime_error& error) {
     if (reader.position() == 0) throw;
-    summary.damage = fmt::format("is damaged: no event begins at byte {}", reader.position());
+    const std::string& damage = reader.report().damage;
+    summary.damage = damage.empty() ? as_text(error.what()) : damage;
   }
   std::error_code error;
   const auto size = std::filesystem::file_size(file, error);

@@ -28,8 +28,10 @@ namespace bodyschema {
 ///
 /// Of two processes of one name on a bus the younger ends with exit code 1 and a line that says who
 /// is there: at its start it says who it is and listens for 0.2 s before it publishes anything
-/// else, and the elder answers at once. Only live PROCESS_INFO counts (is_live()), and a bus that
-/// is both heard and spoken to.
+/// else; the elder answers at once, and must be heard again within 1.2 s, with a newer time. One
+/// that has begun to work never ends because of what others say: two that meet later both tell it
+/// (set_notice). Only live PROCESS_INFO counts (is_live()), and a bus that is both heard and spoken
+/// to.
 ///
 /// `--in` is default_url() unless given. `--out` is then the same bus, but nowhere where the input
 /// is a log: a replay must not reach a robot by accident.
@@ -47,10 +49,16 @@ class Process {
   /// Start of this process, µs since 1970; in a replay the event time of the log's first event, so
   /// that a replay gives the same bytes again.
   std::int64_t epoch() const;
+  /// The wall clock, µs since 1970; −1 in a replay, which does not ask it.
+  std::int64_t wall_clock_us() const;
 
   /// What PROCESS_INFO says. `phase` is process_info_t::PHASE_*. Bytes of `activity` that are not
   /// UTF-8 are replaced by '?'.
   void set_activity(std::int8_t phase, std::string activity);
+  /// What people must know that is not this process's own doing, such as messages that it refuses:
+  /// told before the activity until it was not repeated for 5 s, in a replay to the end. One text
+  /// a subject.
+  void set_notice(const std::string& subject, std::string text);
   void set_seed(std::int64_t seed);
   /// A counter of the process's own beside those of the bus. Returns its value.
   std::int64_t count(const std::string& name, std::int64_t increment = 1);
@@ -83,8 +91,11 @@ class Process {
   std::unique_ptr<Impl> impl_;
 };
 
+/// As far the clocks of several machines must agree.
+inline constexpr std::int64_t kClockTolerance_us = 3'000'000;
+
 /// Whether the message tells of a process that runs now and is no recording that is played: its
-/// time is within 3 s of `now_us`, the wall clock. Clocks of several machines must agree as far.
+/// time is within kClockTolerance_us of `now_us`, the wall clock.
 bool is_live(const process_info_t& info, std::int64_t now_us);
 
 /// Parses the arguments, constructs a Process, calls `body`, and turns an exception into one line

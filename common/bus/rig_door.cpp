@@ -5,6 +5,8 @@
 #include <algorithm>
 #include <cmath>
 #include <stdexcept>
+#include <tuple>
+#include <vector>
 
 #include "common/bus/event_log.h"
 #include "common/config/yaml.h"
@@ -12,23 +14,49 @@
 namespace bodyschema {
 namespace {
 
-CameraCalibration calibration_of(const std::filesystem::path& rig_folder) {
-  std::filesystem::path file = Yaml::load(rig_folder / "camera.yaml").text("calibration");
-  if (file.is_relative()) file = rig_folder / file;
-  return load_camera_calibration(file);
+/// What rewriting a calibration as text may change [px, or no unit].
+constexpr double kSameNumber = 1e-6;
+
+bool is_same(double a, double b) { return std::abs(a - b) <= kSameNumber; }
+
+/// Without the zeros at its end, which say nothing.
+std::vector<double> significant(std::vector<double> distortion) {
+  while (!distortion.empty() && distortion.back() == 0) distortion.pop_back();
+  return distortion;
+}
+
+std::string text_of(std::int8_t model, const std::vector<double>& distortion) {
+  static const char* const kModels[] = {"plumb_bob", "rational_polynomial", "fisheye"};
+  return fmt::format("{} [{}]", kModels[model], fmt::join(distortion, ", "));
+}
+
+/// Plumb bob is the rational model whose last three coefficients are 0.
+bool is_same_distortion(std::int8_t model, const std::vector<double>& distortion,
+                        std::int8_t other_model, const std::vector<double>& other_distortion) {
+  const bool is_fisheye = model == camera_info_t::MODEL_FISHEYE;
+  if (is_fisheye != (other_model == camera_info_t::MODEL_FISHEYE)) return false;
+  const auto a = significant(distortion), b = significant(other_distortion);
+  return std::equal(a.begin(), a.end(), b.begin(), b.end(), is_same);
 }
 
 }  // namespace
 
-RigDoor::RigDoor(const std::filesystem::path& rig_folder)
+std::filesystem::path RigDoor::calibration_of(const std::filesystem::path& rig_folder) {
+  const std::filesystem::path file = Yaml::load(rig_folder / "camera.yaml").text("calibration");
+  return file.is_relative() ? rig_folder / file : file;
+}
+
+RigDoor::RigDoor(const std::filesystem::path& rig_folder, const std::filesystem::path& calibration)
     : signals_(load_signals(rig_folder)),
       markers_(load_markers(rig_folder)),
-      camera_(calibration_of(rig_folder)) {}
+      calibration_file_(calibration.filename().string()),
+      camera_(load_camera_calibration(calibration)) {}
 
 void RigDoor::refuse(Process& process, const std::string& channel, const std::string& why) {
   if (process.count("refused " + channel) == 1) {
     spdlog::warn("{}: refused, not of this rig: {} (further ones are only counted)", channel, why);
   }
+  process.set_notice(channel, channel + " refused: " + why);
 }
 
 std::string RigDoor::objection_to_part(int part) const {
@@ -50,6 +78,20 @@ std::string RigDoor::objection(const camera_info_t& info) const {
   if (info.image_width != camera_.width || info.image_height != camera_.height) {
     return fmt::format("it holds for {}×{} px, the rig's calibration for {}×{}", info.image_width,
                        info.image_height, camera_.width, camera_.height);
+  }
+  const std::tuple<const char*, double, double> numbers[] = {{"fx", info.fx, camera_.fx},
+                                                             {"fy", info.fy, camera_.fy},
+                                                             {"cx", info.cx, camera_.cx},
+                                                             {"cy", info.cy, camera_.cy}};
+  for (const auto& [name, theirs, ours] : numbers) {
+    if (is_same(theirs, ours)) continue;
+    return fmt::format("{} {} px, the rig's {} says {}", name, theirs, calibration_file_, ours);
+  }
+  const auto model = static_cast<std::int8_t>(camera_.model);
+  if (!is_same_distortion(info.distortion_model, info.distortion, model, camera_.distortion)) {
+    return fmt::format("distortion {}, the rig's {} says {}",
+                       text_of(info.distortion_model, info.distortion), calibration_file_,
+                       text_of(model, camera_.distortion));
   }
   return "";
 }

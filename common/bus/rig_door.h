@@ -20,13 +20,15 @@ namespace bodyschema {
 class RigDoor {
  public:
   /// @throws ConfigError.
-  explicit RigDoor(const std::filesystem::path& rig_folder);
+  explicit RigDoor(const std::filesystem::path& rig_folder)
+      : RigDoor(rig_folder, calibration_of(rig_folder)) {}
 
   // "" if the message may be of this rig, else why not, for people.
 
-  /// Calibrated for this camera and image size.
+  /// The rig's own calibration: of this camera, this image size, these intrinsics.
   std::string objection(const camera_info_t& info) const;
-  /// Of this camera; tags of markers.yaml with their sizes.
+  /// Of this camera, by name: which calibration its poses were found with is not told. Tags of
+  /// markers.yaml with their sizes.
   std::string objection(const marker_poses_t& poses) const;
   /// One value per signal; none where no MOVE is answered.
   std::string objection(const motion_status_t& status) const;
@@ -44,8 +46,9 @@ class RigDoor {
   /// @throws std::runtime_error if there is none or it is of another rig.
   body_schema_t load_initial_schema(const std::filesystem::path& file) const;
 
-  /// Subscribes behind the door: what it objects to is counted as "refused CHANNEL", said once a
-  /// channel, and not handled. The door must outlive the bus's use of it.
+  /// Subscribes behind the door: what it objects to is counted as "refused CHANNEL", logged once a
+  /// channel, told with the process's activity while it comes, and not handled. The door must
+  /// outlive the bus's use of it.
   template <class Message>
   void subscribe(Process& process, const Channel<Message>& channel,
                  std::type_identity_t<std::function<void(const Message&)>> handler) const {
@@ -57,12 +60,15 @@ class RigDoor {
   }
 
  private:
+  static std::filesystem::path calibration_of(const std::filesystem::path& rig_folder);
+  RigDoor(const std::filesystem::path& rig_folder, const std::filesystem::path& calibration);
   static void refuse(Process& process, const std::string& channel, const std::string& why);
   std::string objection_to_part(int part) const;
   std::string objection_to_signals(std::size_t num_signals) const;
 
   const Signals signals_;
   const Markers markers_;
+  const std::string calibration_file_;  ///< its name
   const CameraCalibration camera_;
 };
 

@@ -25,7 +25,12 @@ class Process;
 /// observer there is no hurry.
 ///
 /// The first content of an index counts. Another one ("conflicting SAMPLE") comes from an observer
-/// that began anew, and whoever learned from the first must do so too.
+/// that began anew, and whoever learned from the first must do so too; or from somebody who is no
+/// observer.
+///
+/// Where somebody can be asked and the file exists, the observer is on this machine and writes each
+/// sample before it sends it: what is not in the file is not the observer's ("unrecorded SAMPLE")
+/// and is refused. On other machines that cannot be told.
 class SampleIntake {
  public:
   using Handler = std::function<void(const sample_t&)>;
@@ -39,11 +44,13 @@ class SampleIntake {
   /// damaged one is no error. Without `ask` what the file cannot fill is given up at once.
   SampleIntake(std::string samples_file, Handler handler, Ask ask = nullptr);
 
-  void on_sample(const sample_t& sample);
+  /// Returns false for what is refused: unrecorded or conflicting.
+  bool on_sample(const sample_t& sample);
   /// Asks at 2 Hz. `now_us`: Process::on_tick's.
   void on_tick(std::int64_t now_us);
 
-  /// "lost SAMPLE", "conflicting SAMPLE" → count since the start.
+  /// "lost SAMPLE", "conflicting SAMPLE", "unrecorded SAMPLE", "damaged bytes of samples.lcmlog" →
+  /// count since the start.
   const std::map<std::string, std::int64_t>& counters() const { return counters_; }
   std::int64_t num_lost() const { return counters_.at("lost SAMPLE"); }
   /// First and last index of every gap that was given up, in order.
@@ -52,9 +59,11 @@ class SampleIntake {
   std::string activity() const;
 
  private:
+  enum class Taken { kNew, kRepeated, kConflicting, kTooLate };
   void read_file();
-  void take(const sample_t& sample);
-  void hand_on();
+  bool is_recorded_here() const;
+  Taken take(const sample_t& sample);
+  void hand_on(bool over_gaps);
   void give_up_gap();
 
   const std::string samples_file_;
@@ -66,7 +75,10 @@ class SampleIntake {
   std::map<std::string, std::int64_t> counters_ = {{"conflicting SAMPLE", 0}, {"lost SAMPLE", 0}};
   std::vector<std::pair<std::int64_t, std::int64_t>> lost_;
   bool is_begun_anew_ = false;
-  std::uintmax_t size_read_ = 0;  ///< of the file [bytes]
+  // Of the file: what it was when it was read last, and how far.
+  std::uintmax_t file_id_ = 0;
+  std::int64_t size_read_ = 0, position_ = 0;
+  std::int64_t newest_recorded_ = -1;
   std::int64_t asked_us_ = -1;
   bool is_observer_heard_ = false;  ///< since the last request
   int num_unanswered_ = 0;

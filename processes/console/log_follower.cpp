@@ -30,12 +30,10 @@ bool LogFollower::read(const std::filesystem::path& file, const Visit& visit) {
         summary.damage =
             fmt::format("is cut off in the middle of an event at byte {}", progress.position);
       }
-    } catch (const std::runtime_error&) {
+    } catch (const std::runtime_error& error) {
       progress.is_damaged = true;
-      summary.damage =
-          progress.position == 0
-              ? "is not an LCM log"
-              : fmt::format("is damaged: no event begins at byte {}", progress.position);
+      const std::string& damage = reader.report().damage;
+      summary.damage = damage.empty() ? as_text(error.what()) : damage;
     }
   } catch (const std::runtime_error& unreadable) {
     summary.damage = as_text(unreadable.what());

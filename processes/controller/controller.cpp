@@ -9,6 +9,7 @@
 #include <utility>
 
 #include "common/bus/convert.h"
+#include "common/bus/process.h"
 #include "common/config/yaml.h"
 
 namespace bodyschema {
@@ -343,6 +344,10 @@ bool Controller::is_newer(const pose_target_t& target) const {
   return std::tie(target.epoch, target.target_id) > std::tie(floor_epoch_, floor_id_);
 }
 
+bool Controller::is_from_ahead(std::int64_t epoch, std::int64_t wall_clock_us) {
+  return wall_clock_us >= 0 && epoch > wall_clock_us + kClockTolerance_us;
+}
+
 void Controller::forget_plan() {
   goal_.reset();
   rejected_.clear();
@@ -350,7 +355,12 @@ void Controller::forget_plan() {
   num_expired_ = 0;
 }
 
-Controller::Answer Controller::on_pose_target(const pose_target_t& target) {
+Controller::Answer Controller::on_pose_target(const pose_target_t& target,
+                                              std::int64_t wall_clock_us) {
+  if (is_from_ahead(target.epoch, wall_clock_us)) {
+    ++counters_["POSE_TARGET from a clock ahead"];
+    return answer(std::nullopt);
+  }
   if (!is_newer(target)) {
     const bool is_repeated = target.epoch == floor_epoch_ && target.target_id == floor_id_;
     if (!is_repeated) ++counters_["older POSE_TARGET"];
@@ -751,23 +761,28 @@ std::string Controller::state_text() const {
   return text.str();
 }
 
-void Controller::restore(const std::filesystem::path& file) {
+void Controller::restore(const std::filesystem::path& file, std::int64_t wall_clock_us) {
   const Yaml yaml = Yaml::load(file);
   epoch_ = yaml.integer("epoch", -1);
   next_action_id_ = yaml.integer("next_action_id", 0);
   const Yaml target = yaml.section("target");
   const std::string sender = target.text("sender");
-  const std::int64_t epoch = target.integer("epoch", 0);
-  const std::int64_t id = target.integer("target_id", -1);
+  std::int64_t epoch = target.integer("epoch", 0);
+  std::int64_t id = target.integer("target_id", -1);
   const bool was_served = yaml.boolean("was_served");
   const bool owns_arm = yaml.boolean("owns_arm");
   const bool holds = yaml.boolean("holds");
   std::string why = yaml.text("why");
   yaml.finish();
+  const std::string name = "target " + std::to_string(id) + " of " + sender;
+  if (is_from_ahead(epoch, wall_clock_us)) {
+    epoch = 0;
+    id = -1;
+    ++counters_["POSE_TARGET from a clock ahead"];
+  }
   floor_epoch_ = epoch;
   // A sender repeats what was not acknowledged: then the same target counts again.
   floor_id_ = owns_arm ? id : id - 1;
-  const std::string name = "target " + std::to_string(id) + " of " + sender;
   if (owns_arm) {
     target_.sender = sender;
     target_.epoch = epoch;

@@ -49,7 +49,9 @@ struct ControllerConfig {
 /// actions towards a solution of inverse kinematics, each answered by the driver and followed by
 /// its SAMPLE before the next is sent, so no step is taken unseen and no sample is lost.
 ///
-/// Of all targets the highest (epoch, target_id) counts; a repeated one does nothing. The arm is
+/// Of all targets the highest (epoch, target_id) counts; a repeated one does nothing. One whose
+/// epoch is more than kClockTolerance_us ahead of the clock is refused: every later one would count
+/// for less than it. The arm is
 /// its own (owns_arm) from the moment that a target can be served until it was reached and kept,
 /// was refused or is released. Taking it waits until the arm rests and the last settled action has
 /// its SAMPLE. While an edge on the way to the part is INVALID, and for a probe that the monitor
@@ -81,7 +83,8 @@ class Controller {
 
   explicit Controller(ControllerConfig config);
 
-  Answer on_pose_target(const pose_target_t& target);
+  /// `wall_clock_us`: since 1970; -1 where there is none (a replay).
+  Answer on_pose_target(const pose_target_t& target, std::int64_t wall_clock_us = -1);
   Answer on_motion_status(const motion_status_t& motion);
   Answer on_marker_poses(const marker_poses_t& poses);
   Answer on_sample(const sample_t& sample);
@@ -96,8 +99,9 @@ class Controller {
 
   /// What a restart needs, as YAML; to be on disk before a MOVE is sent.
   std::string state_text() const;
-  /// Continues from a file with state_text(). @throws ConfigError.
-  void restore(const std::filesystem::path& file);
+  /// Continues from a file with state_text(). A target in it from a clock ahead is forgotten (the
+  /// arm stays held if it was). @throws ConfigError.
+  void restore(const std::filesystem::path& file, std::int64_t wall_clock_us = -1);
 
  private:
   using Command = std::optional<action_command_t>;
@@ -123,6 +127,7 @@ class Controller {
   bool is_active() const;
   bool is_at_rest() const { return motion_ && motion_->rest_since_utime >= 0; }
   bool is_newer(const pose_target_t& target) const;
+  static bool is_from_ahead(std::int64_t epoch, std::int64_t wall_clock_us);
   /// "" or which input was not heard yet.
   std::string unheard() const;
   /// "" or which input has been silent for too long.

@@ -1,6 +1,8 @@
 // controller: POSE_TARGET, MOTION_STATUS, MARKER_POSES, SAMPLE, BODY_SCHEMA, MODEL_HEALTH
 //             -> ACTION_COMMAND, CONTROL_STATUS
 
+#include <spdlog/fmt/fmt.h>
+
 #include <CLI/CLI.hpp>
 #include <filesystem>
 #include <utility>
@@ -19,7 +21,8 @@ int main(int argc, char** argv) {
   };
   const auto body = [&](Process& process) {
     Controller controller(ControllerConfig::load(process.config_file()));
-    if (!state_file.empty() && std::filesystem::exists(state_file)) controller.restore(state_file);
+    if (!state_file.empty() && std::filesystem::exists(state_file))
+      controller.restore(state_file, process.wall_clock_us());
 
     StateFile state(state_file, controller.state_text());
     const auto say = [&] {
@@ -48,8 +51,16 @@ int main(int argc, char** argv) {
       door.subscribe(process, channel,
                      [&, handler](const auto& message) { send((controller.*handler)(message)); });
     };
-    process.bus().subscribe<pose_target_t>(
-        kPoseTarget, [&](const pose_target_t& target) { send(controller.on_pose_target(target)); });
+    process.bus().subscribe<pose_target_t>(kPoseTarget, [&](const pose_target_t& target) {
+      const std::int64_t wall_clock_us = process.wall_clock_us();
+      const std::int64_t ahead_us = target.epoch - wall_clock_us;
+      if (wall_clock_us >= 0 && ahead_us > kClockTolerance_us)
+        process.set_notice(kPoseTarget.name,
+                           fmt::format("POSE_TARGET of {} refused: it began {:.0f} s ahead of this "
+                                       "machine's clock",
+                                       target.sender, static_cast<double>(ahead_us) / 1e6));
+      send(controller.on_pose_target(target, wall_clock_us));
+    });
     subscribe(kMotionStatus, &Controller::on_motion_status);
     subscribe(kMarkerPoses, &Controller::on_marker_poses);
     subscribe(kSample, &Controller::on_sample);

@@ -15,6 +15,7 @@
 #include "common/bus/sample_intake.h"
 #include "processes/model_monitor/model_monitor.h"
 #include "processes/model_monitor/monitor_memory.h"
+#include "processes/model_monitor/sample_trail.h"
 #include "processes/model_monitor/saved_message.h"
 
 using namespace bodyschema;
@@ -48,11 +49,19 @@ int main(int argc, char** argv) {
     const RigDoor door(process.rig_folder());
     ModelMonitor monitor(ModelMonitorConfig::load(process.config_file()));
     SavedMessage saved_schema(schema_file, kBodySchema);
-    MemoryFile saved_memory(beside(schema_file, "history.lcmlog"));
+    const std::filesystem::path history_file = beside(schema_file, "history.lcmlog");
+    MemoryFile saved_memory(history_file);
+    SampleTrail trail;
     {
       const auto not_ours = [&](const body_schema_t& schema) { return door.objection(schema); };
-      const auto schema = saved_schema.load(not_ours);
-      if (const auto memory = saved_memory.load(not_ours)) {
+      const auto memory = saved_memory.load(not_ours, samples_file);
+      const auto schema = saved_schema.load([&](const body_schema_t& schema) -> std::string {
+        if (const std::string why = not_ours(schema); !why.empty() || memory) return why;
+        if (saved_memory.rests_on_other_samples()) return "goes with that history";
+        return contradiction(samples_file, schema.last_sample_index, {});
+      });
+      if (memory) {
+        trail = SampleTrail(saved_memory.marks());
         monitor.restore(*memory);
       } else if (schema) {
         monitor.start_from(*schema);
@@ -70,10 +79,22 @@ int main(int argc, char** argv) {
     AwaitedAnswer proposals(is_replayed, 30'000'000);
     constexpr int kMostAtOnce = 100;
     std::deque<sample_t> ahead;
+    const auto follow = [&](const sample_t& sample) {
+      const std::string problem = trail.add(sample);
+      if (problem.empty()) return;
+      // Where the samples come by the bus alone it is found out only now. Its next start begins
+      // anew.
+      const std::string why = history_file.string() + ": " + problem;
+      set_aside(history_file, why);
+      if (std::filesystem::exists(schema_file))
+        set_aside(schema_file, schema_file + ": goes with that history");
+      throw std::runtime_error(why);
+    };
     const auto go_on = [&] {
       for (int n = 0; n < kMostAtOnce && !ahead.empty() && !proposals.is_waiting(); ++n) {
         if (ahead.front().purpose == action_command_t::PURPOSE_TEST)
           proposals.ask(ahead.front().sample_index);
+        follow(ahead.front());
         is_news |= monitor.on_sample(ahead.front());
         ahead.pop_front();
       }
@@ -89,7 +110,7 @@ int main(int argc, char** argv) {
     std::string problem;
     const auto publish = [&] {
       // The memory first: the schema is found again from it and the samples.
-      std::string not_saved = saved_memory.save(monitor.memory());
+      std::string not_saved = saved_memory.save(monitor.memory(), trail.marks());
       if (monitor.schema()) {
         if (not_saved.empty()) not_saved = saved_schema.save(*monitor.schema());
         process.bus().publish(kBodySchema, *monitor.schema());

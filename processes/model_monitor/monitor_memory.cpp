@@ -1,5 +1,6 @@
 #include "processes/model_monitor/monitor_memory.h"
 
+#include <sstream>
 #include <stdexcept>
 
 #include "common/bus/event_log.h"
@@ -8,7 +9,9 @@
 namespace bodyschema {
 namespace {
 
-std::string text_of(const MonitorMemory& memory) {
+constexpr char kMarksChannel[] = "SAMPLES_CHECKSUM";
+
+std::string text_of(const MonitorMemory& memory, const std::vector<SampleMark>& marks) {
   std::string text;
   std::int64_t number = 0;
   const auto add = [&](const auto& channel, const auto& message) {
@@ -19,29 +22,57 @@ std::string text_of(const MonitorMemory& memory) {
   for (const body_schema_t& schema : memory.schemas) add(kBodySchema, schema);
   add(kModelHealth, memory.at_base);
   add(kModelHealth, memory.verdicts);
-  return text;
+  std::string lines;
+  for (const SampleMark& mark : marks) {
+    lines += fmt::format("{} {:08x}\n", mark.sample_index, mark.checksum);
+  }
+  const auto* bytes = reinterpret_cast<const std::uint8_t*>(lines.data());
+  const auto event =
+      encode_event(kMarksChannel, {bytes, lines.size()}, memory.verdicts.utime, number);
+  return text.append(event.begin(), event.end());
+}
+
+std::vector<SampleMark> marks_in(const std::filesystem::path& file) {
+  std::vector<SampleMark> marks;
+  for_each_event(file, [&](const LogEvent& event) {
+    if (event.channel != kMarksChannel) return;
+    std::istringstream lines(std::string(event.data.begin(), event.data.end()));
+    SampleMark mark;
+    while (lines >> std::dec >> mark.sample_index >> std::hex >> mark.checksum)
+      marks.push_back(mark);
+  });
+  return marks;
 }
 
 }  // namespace
 
 bool MonitorMemory::operator==(const MonitorMemory& other) const {
-  return text_of(*this) == text_of(other);
+  return text_of(*this, {}) == text_of(other, {});
 }
 
-std::optional<MonitorMemory> MemoryFile::load(const Objection& objection) {
+std::optional<MonitorMemory> MemoryFile::load(const Objection& objection,
+                                              const std::filesystem::path& samples_file) {
   if (file_.empty() || !std::filesystem::exists(file_)) return std::nullopt;
   std::string problem;
   try {
     MonitorMemory memory;
-    memory.schemas = read_log(file_, kBodySchema);
+    LogReport report;
+    memory.schemas = read_log(file_, kBodySchema, &report);
     const std::vector<model_health_t> health = read_log(file_, kModelHealth);
-    if (health.size() != 2) problem = "is not whole";
+    // It is replaced as a whole, so no writer tears its tail.
+    if (report.truncated_at_byte || health.size() != 2) problem = "is not whole";
     for (const body_schema_t& schema : memory.schemas)
       if (problem.empty()) problem = objection(schema);
+    std::vector<SampleMark> marks = marks_in(file_);
+    if (problem.empty()) {
+      problem = contradiction(samples_file, health[1].judged_sample, marks);
+      rests_on_other_samples_ = !problem.empty();
+    }
     if (problem.empty()) {
       memory.at_base = health[0];
       memory.verdicts = health[1];
-      saved_ = text_of(memory);
+      marks_ = std::move(marks);
+      saved_ = text_of(memory, marks_);
       return memory;
     }
     problem = file_.string() + ": " + problem;
@@ -52,9 +83,9 @@ std::optional<MonitorMemory> MemoryFile::load(const Objection& objection) {
   return std::nullopt;
 }
 
-std::string MemoryFile::save(const MonitorMemory& memory) {
+std::string MemoryFile::save(const MonitorMemory& memory, const std::vector<SampleMark>& marks) {
   if (file_.empty()) return "";
-  std::string text = text_of(memory);
+  std::string text = text_of(memory, marks);
   if (text == saved_) return "";
   try {
     write_file_atomically(file_, text);

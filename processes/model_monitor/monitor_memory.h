@@ -10,6 +10,7 @@
 #include "bodyschema/body_schema_t.hpp"
 #include "bodyschema/health_event_t.hpp"
 #include "bodyschema/model_health_t.hpp"
+#include "processes/model_monitor/sample_trail.h"
 
 namespace bodyschema {
 
@@ -27,24 +28,33 @@ struct MonitorMemory {
   bool operator==(const MonitorMemory& other) const;
 };
 
-/// The memory as a file, history.lcmlog: BODY_SCHEMA messages and two MODEL_HEALTH, replaced
-/// atomically (temporary name, sync, rename).
+/// The memory as a file, history.lcmlog: BODY_SCHEMA messages, two MODEL_HEALTH, and on
+/// SAMPLES_CHECKSUM, as text, the marks of the samples that it rests on; replaced atomically
+/// (temporary name, sync, rename).
 class MemoryFile {
  public:
   /// Without a name nothing is kept.
   explicit MemoryFile(std::filesystem::path file) : file_(std::move(file)) {}
 
   using Objection = std::function<std::string(const body_schema_t&)>;
-  /// std::nullopt if there is none. One that cannot be used (damaged, or `objection` to a schema is
-  /// not "") is set aside as FILE.bad-1 with a warning: it is found out again from the samples.
-  std::optional<MonitorMemory> load(const Objection& objection);
+  /// std::nullopt if there is none. One that cannot be used (damaged, `objection` to a schema is
+  /// not
+  /// "", or it does not rest on the samples in `samples_file`) is set aside as FILE.bad-1 with a
+  /// warning: it is found out again from the samples.
+  std::optional<MonitorMemory> load(const Objection& objection,
+                                    const std::filesystem::path& samples_file);
+  bool rests_on_other_samples() const { return rests_on_other_samples_; }
+  /// Of the samples that what was loaded rests on; none in a file from before there were any.
+  const std::vector<SampleMark>& marks() const { return marks_; }
   /// Writes it unless it is what was written last. Returns "" or why it could not be written, for
   /// people; the next call tries again.
-  std::string save(const MonitorMemory& memory);
+  std::string save(const MonitorMemory& memory, const std::vector<SampleMark>& marks);
 
  private:
   const std::filesystem::path file_;
   std::string saved_;
+  std::vector<SampleMark> marks_;
+  bool rests_on_other_samples_ = false;
 };
 
 }  // namespace bodyschema

@@ -5,7 +5,6 @@
 
 #include <CLI/CLI.hpp>
 #include <filesystem>
-#include <optional>
 #include <utility>
 
 #include "common/bus/process.h"
@@ -51,24 +50,22 @@ int main(int argc, char** argv) {
     const RigDoor door(process.rig_folder());
     door.subscribe(process, kMotionStatus,
                    [&](const motion_status_t& status) { send(babbler.on_motion_status(status)); });
-    std::optional<SampleIntake> intake;
+    SampleIntake intake(
+        samples_file,
+        [&](const sample_t& sample) {
+          try {
+            send(babbler.remember(sample));
+          } catch (const std::invalid_argument&) {
+            process.count("refused SAMPLE");  // a samples file of another rig
+          }
+        },
+        SampleIntake::asking(process));
     if (config.choice == Choice::kActive) {
-      intake.emplace(
-          samples_file,
-          [&](const sample_t& sample) {
-            try {
-              send(babbler.remember(sample));
-            } catch (const std::invalid_argument&) {
-              process.count("refused SAMPLE");  // a samples file of another rig
-            }
-          },
-          SampleIntake::asking(process));
       door.subscribe(process, kBodySchema,
                      [&](const body_schema_t& schema) { send(babbler.on_body_schema(schema)); });
     }
     door.subscribe(process, kSample, [&](const sample_t& sample) {
-      if (intake) intake->on_sample(sample);
-      send(babbler.on_sample(sample));
+      if (intake.on_sample(sample)) send(babbler.on_sample(sample));
     });
     door.subscribe(process, kMarkerPoses,
                    [&](const marker_poses_t& poses) { babbler.on_marker_poses(poses); });
@@ -93,7 +90,8 @@ int main(int argc, char** argv) {
     });
     process.on_tick([&](std::int64_t now_us) {
       if (!state.problem().empty()) state.retry();
-      if (intake) intake->on_tick(now_us);
+      intake.on_tick(now_us);
+      process.set_counters(intake.counters());
       send(babbler.on_tick(now_us));
     });
     process.run();

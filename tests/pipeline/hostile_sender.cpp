@@ -9,16 +9,19 @@
 #include <lcm/lcm.h>
 
 #include <CLI/CLI.hpp>
+#include <algorithm>
 #include <chrono>
 #include <cmath>
 #include <cstdint>
 #include <filesystem>
 #include <limits>
+#include <map>
 #include <memory>
 #include <random>
 #include <set>
 #include <string>
 #include <thread>
+#include <utility>
 #include <vector>
 
 #include "common/bus/bus.h"
@@ -116,6 +119,8 @@ void add_nonsense(std::vector<Hostile>& all) {
   add(kCameraInfo, example_camera_info(), [](auto&) {});
   add(kCameraImage, example_camera_image(), [](auto&) {});
   add(kSimState, example_sim_state(), [](auto&) {});
+  add(kModelHealth, example_model_health(),
+      [](auto& m) { m.part_health.back().health_part = 999; });
 }
 
 /// What another rig's group said, commands included: they are for another number of signals.
@@ -143,6 +148,18 @@ int main(int argc, char** argv) {
   add_garbage(kinds[0], random);
   add_nonsense(kinds[1]);
   add_foreign(kinds[2], foreign);
+  // By turns, so that each channel gets something of each kind however long it lasts: of what a
+  // group says little is MODEL_HEALTH.
+  struct Turn {
+    std::vector<Hostile> all;
+    std::size_t next = 0;
+  };
+  std::map<std::pair<int, std::string>, Turn> turns;
+  for (int kind = 0; kind < 3; ++kind) {
+    std::shuffle(kinds[kind].begin(), kinds[kind].end(), random);
+    for (Hostile& hostile : kinds[kind])
+      turns[{kind, hostile.channel}].all.push_back(std::move(hostile));
+  }
 
   const std::unique_ptr<lcm_t, void (*)(lcm_t*)> bus(lcm_create(default_url().c_str()),
                                                      &lcm_destroy);
@@ -152,13 +169,16 @@ int main(int argc, char** argv) {
   // Some 300 a second, and no longer than two minutes.
   const auto end = std::chrono::steady_clock::now() + std::chrono::minutes(2);
   std::uint64_t num_sent = 0;
-  while (!std::filesystem::exists(until) && std::chrono::steady_clock::now() < end) {
-    const std::vector<Hostile>& kind = kinds[random() % 3];
-    const Hostile& hostile = kind[random() % kind.size()];
+  for (auto turn = turns.begin();
+       !std::filesystem::exists(until) && std::chrono::steady_clock::now() < end;) {
+    Turn& now = turn->second;
+    const Hostile& hostile = now.all[now.next++ % now.all.size()];
     // Images on both ports: there they are expected, here they are not.
-    lcm_t* to = hostile.channel == kCameraImage.name && num_sent % 2 ? images.get() : bus.get();
+    lcm_t* to =
+        hostile.channel == kCameraImage.name && now.next % 2 == 0 ? images.get() : bus.get();
     lcm_publish(to, hostile.channel.c_str(), hostile.bytes.data(),
                 static_cast<unsigned>(hostile.bytes.size()));
+    if (++turn == turns.end()) turn = turns.begin();
     if (++num_sent % 30 == 0) std::this_thread::sleep_for(std::chrono::milliseconds(100));
   }
   std::printf("%llu\n", static_cast<unsigned long long>(num_sent));

@@ -57,7 +57,10 @@ class FullDisk : public testing::Test {
     info.camera_name = "arm2_camera";
     info.image_width = 1280;
     info.image_height = 960;
-    info.fx = info.fy = 1100;
+    info.fx = 1104.6;  // as in the rig's camera_info.yaml
+    info.fy = 1098.9;
+    info.cx = 645.2;
+    info.cy = 470.8;
     bus_.publish(kCameraInfo, info);
     const std::int64_t begin = 1'000'000 * (id + 1);
     motion_status_t status{};

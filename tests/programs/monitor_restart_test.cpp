@@ -8,6 +8,7 @@
 #include <csignal>
 #include <filesystem>
 #include <fstream>
+#include <random>
 #include <string>
 #include <vector>
 
@@ -172,6 +173,51 @@ TEST_F(MonitorRestartTest, KilledInTheMiddleOfItAllItEndsWithTheSameFiles) {
           << name << " " << file;
     }
   }
+}
+
+// A bit that a disk lost is no reason for a wrong body schema: the end is the same, or the monitor
+// says what it could not use.
+TEST_F(MonitorRestartTest, AFlippedBitIsHarmlessOrNoticed) {
+  constexpr std::int64_t kEndedAfter = 38;
+  ASSERT_NO_FATAL_FAILURE(run(kNumSamples - 1, "undisturbed", folder_ / "none"));
+  ASSERT_NO_FATAL_FAILURE(run(kEndedAfter, "ended", folder_ / "none"));
+  const fs::path bus = log_up_to(kNumSamples - 1, true);
+  std::mt19937_64 random(13);
+  for (const char* file : {"history.lcmlog", "schema.lcmlog", "samples.lcmlog"}) {
+    for (int n = 0; n < 6; ++n) {
+      const std::string name = std::string(file) + std::to_string(n);
+      fs::copy(folder_ / "ended", folder_ / name);
+      fs::copy_file(log_up_to(kEndedAfter, false), folder_ / name / "samples.lcmlog");
+      auto bytes = test::read_bytes(folder_ / name / file);
+      const std::size_t bit = random() % (8 * bytes.size());
+      bytes[bit / 8] ^= static_cast<std::uint8_t>(1U << bit % 8);
+      test::write_bytes(folder_ / name / file, bytes);
+      test::Program program(arguments(bus, name, folder_ / name / "samples.lcmlog"));
+      ASSERT_EQ(program.wait(), 0) << program.err();
+      EXPECT_NE(program.err().find(file), std::string::npos)
+          << "bit " << bit << " of " << file << ": " << program.err();
+      if (std::string(file) != "schema.lcmlog") continue;
+      // It is found again from the history and the samples.
+      EXPECT_EQ(last_of(name, kBodySchema), last_of("undisturbed", kBodySchema)) << "bit " << bit;
+      EXPECT_EQ(last_of(name, kModelHealth), last_of("undisturbed", kModelHealth)) << "bit " << bit;
+    }
+  }
+}
+
+TEST_F(MonitorRestartTest, AHistoryOfOtherSamplesIsSetAside) {
+  ASSERT_NO_FATAL_FAILURE(run(38, "ended", folder_ / "none"));
+  const fs::path fewer = folder_ / "fewer.lcmlog";
+  fs::copy_file(log_up_to(20, false), fewer);
+  test::Program program(arguments(log_up_to(kNumSamples - 1, true), "ended", fewer));
+  ASSERT_EQ(program.wait(), 0) << program.err();
+  EXPECT_NE(program.err().find("rests on samples up to 38, the newest in fewer.lcmlog is 20"),
+            std::string::npos)
+      << program.err();
+  EXPECT_TRUE(fs::exists(folder_ / "ended" / "history.lcmlog.bad-1"));
+  EXPECT_TRUE(fs::exists(folder_ / "ended" / "schema.lcmlog.bad-1"));
+  // From the samples alone, as if there had been nothing.
+  ASSERT_NO_FATAL_FAILURE(run(kNumSamples - 1, "undisturbed", folder_ / "none"));
+  EXPECT_EQ(last_of("ended", kBodySchema), last_of("undisturbed", kBodySchema));
 }
 
 TEST_F(MonitorRestartTest, BeginsWithAnInitialSchemaWhateverLimitsItsRecordingHad) {

@@ -34,6 +34,7 @@ TEST(Check, RefusesTimesBeforeZero) {
   expect_refused(example_action_command(), "expiry_utime", [](auto& m) { m.expiry_utime = -1; });
   expect_refused(example_motion_status(), "rest_since_utime",
                  [](auto& m) { m.rest_since_utime = -2; });
+  expect_refused(example_sample(), "sample_index", [](auto& m) { m.sample_index = INT64_MAX; });
   expect_refused(example_sample(), "rest_end_utime",
                  [](auto& m) { m.rest_end_utime = m.rest_begin_utime - 1; });
 }

@@ -234,6 +234,46 @@ TEST_F(SampleIntakeTest, TheFirstContentOfAnIndexCounts) {
   EXPECT_EQ(intake_->counters().at("conflicting SAMPLE"), 1);
 }
 
+// On the observer's machine a sample that was not written cannot be the observer's: whatever index
+// a stranger chooses, nobody waits for it and none of the observer's is displaced.
+TEST_F(SampleIntakeTest, WhatTheObserverDidNotWriteIsRefused) {
+  record({0, 1});
+  start_asking();
+  sample_t forged = sample(2);
+  forged.epoch = 77;
+  for (const std::int64_t index : {2, 3, 1'000'000}) {
+    forged.sample_index = index;
+    EXPECT_FALSE(intake_->on_sample(forged));
+    EXPECT_EQ(intake_->activity(), "");
+  }
+  EXPECT_EQ(intake_->counters().at("unrecorded SAMPLE"), 3);
+  // Nor one that comes with the observer's own index, before or after it.
+  record({2});
+  forged.sample_index = 2;
+  EXPECT_FALSE(intake_->on_sample(forged));
+  EXPECT_TRUE(intake_->on_sample(sample(2)));
+  EXPECT_FALSE(intake_->on_sample(forged));
+  EXPECT_EQ(intake_->counters().at("conflicting SAMPLE"), 2);
+  EXPECT_EQ(intake_->activity(), "") << "the observer has not begun anew";
+  EXPECT_EQ(heard_, (Indices{0, 1, 2}));
+  intake_->on_tick(kSecond);
+  EXPECT_TRUE(asked_.empty());
+}
+
+TEST_F(SampleIntakeTest, AnObserverThatBeganAnewIsNoticedInItsFile) {
+  record({0, 1, 2});
+  start_asking();
+  std::filesystem::remove(file_);
+  {
+    LogAppender log(file_);
+    sample_t other = sample(0);
+    other.epoch = 77;
+    log.append(kSample, other);
+    intake_->on_sample(sample(3));
+  }
+  EXPECT_NE(intake_->activity().find("begun anew"), std::string::npos);
+}
+
 TEST_F(SampleIntakeTest, OfADamagedLogWhatCanBeReadIsUsedAndTheRestAskedFor) {
   record({0, 1, 2, 3});
   const auto size = std::filesystem::file_size(file_) / 4;

@@ -126,13 +126,64 @@ TEST_F(Twins, OneOnAnotherNameOrARecordingOfItselfDoesNotDisturb) {
   --ended.start_utime;
   bus_.publish(kProcessInfo, ended);
   EXPECT_EQ(num_answering(), 1U);
-  // The same without any of these reasons ends it.
-  process_info_t elder = info;
-  --elder.start_utime;
+}
+
+// One forged message a process once ended eight of them.
+TEST_F(Twins, OneThatWorksNeverEndsBecauseOfWhatOthersSayButTellsIt) {
+  Program program(relay());
+  ASSERT_TRUE(program.wait_for_output("ready"));
+  process_info_t elder = heard_of(program.pid());
+  elder.pid = 77;
+  elder.start_utime = 0;
   elder.phase = process_info_t::PHASE_WORKING;
-  elder.utime = now_us();
-  bus_.publish(kProcessInfo, elder);
+  const auto forge = [&] {
+    elder.utime = now_us();
+    bus_.publish(kProcessInfo, elder);
+    bus_.handle(std::chrono::milliseconds(20));
+  };
+  const auto tells = [&] {
+    const process_info_t info = heard_of(program.pid());
+    return info.activity.find("another relay is on this bus: process 77") != std::string::npos;
+  };
+  ASSERT_TRUE(ask_until(forge, tells));
+  for (int n = 0; n < 30; ++n) forge();
+  EXPECT_EQ(num_answering(), 1U);
+  const auto counters = heard_of(program.pid()).counters;
+  EXPECT_TRUE(std::any_of(counters.begin(), counters.end(), [](const counter_t& counter) {
+    return counter.counter_name == "twin PROCESS_INFO" && counter.count > 0;
+  }));
+  // When it is not heard any more it is forgotten.
+  EXPECT_TRUE(handle_until(bus_, [&] { return !tells(); }));
+  program.send_signal(SIGTERM);
+  EXPECT_EQ(program.wait(), 0);
+}
+
+TEST_F(Twins, AStartIsNotPreventedByOneMessageButByOneThatGoesOn) {
+  process_info_t elder = example_process_info();
+  elder.process_name = "relay";
+  elder.start_utime = 0;
+  elder.phase = process_info_t::PHASE_WORKING;
+  {
+    Program program(relay());
+    // The same message again and again is one.
+    elder.utime = now_us();
+    ASSERT_TRUE(ask_until(
+        [&] {
+          bus_.publish(kProcessInfo, elder);
+          bus_.handle(std::chrono::milliseconds(20));
+        },
+        [&] { return program.wait_for_output("ready", 1); }));
+  }
+  Program program(relay());
+  ask_until(
+      [&] {
+        elder.utime = now_us();
+        bus_.publish(kProcessInfo, elder);
+        bus_.handle(std::chrono::milliseconds(20));
+      },
+      [&] { return program.wait_for_output("ready", 1) || !program.err().empty(); });
   EXPECT_EQ(program.wait(), 1);
+  EXPECT_NE(program.err().find("another relay is on this bus"), std::string::npos) << program.err();
 }
 
 }  // namespace

@@ -89,7 +89,8 @@ TEST(LogFollower, ADamagedLogIsReadUpToThereAndSaysSo) {
 
   write_bytes(folder / "text", {'n', 'o', ' ', 'l', 'o', 'g'});
   EXPECT_FALSE(shown.read(folder / "text"));
-  EXPECT_EQ(shown.follower.summaries().at(folder / "text").damage, "is not an LCM log");
+  EXPECT_EQ(shown.follower.summaries().at(folder / "text").damage,
+            "is not an LCM log (its first bytes are no event)");
 }
 
 }  // namespace

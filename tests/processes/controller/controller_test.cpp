@@ -6,6 +6,7 @@
 #include <deque>
 #include <fstream>
 #include <functional>
+#include <limits>
 #include <random>
 #include <set>
 
@@ -395,6 +396,30 @@ TEST(ControllerTest, ARepeatedTargetDoesNothingAndAnOlderOneIsIgnored) {
   }
   EXPECT_EQ(bench.num_holds, 0);
   EXPECT_EQ(bench.controller.counters().at("older POSE_TARGET"), 3);
+}
+
+// One message, forged or from a machine whose clock is ahead, would else be the newest for ever.
+TEST(ControllerTest, ATargetFromAClockAheadIsRefusedAndBlocksNoOther) {
+  const std::int64_t kNow = 1'700'000'000 * kSecond;
+  Bench bench;
+  bench.start();
+  for (const std::int64_t epoch :
+       {std::numeric_limits<std::int64_t>::max(), kNow + 3'600 * kSecond, kNow + 4 * kSecond}) {
+    Target ahead = position_target(0, kFar);
+    ahead.epoch = epoch;
+    bench.controller.on_pose_target(ahead, kNow);
+  }
+  EXPECT_EQ(bench.controller.status().control_state, S::CONTROL_IDLE);
+  EXPECT_EQ(bench.controller.status().target_id, -1);
+  EXPECT_EQ(bench.controller.counters().at("POSE_TARGET from a clock ahead"), 3);
+  Target target = position_target(0, kNear);
+  target.epoch = kNow - kSecond;
+  bench.controller.on_pose_target(target, kNow);
+  EXPECT_EQ(bench.controller.status().target_epoch, target.epoch);
+  // Clocks need not agree better than the rest of the group asks.
+  target.epoch = kNow + 2 * kSecond;
+  bench.controller.on_pose_target(target, kNow);
+  EXPECT_EQ(bench.controller.status().target_epoch, target.epoch);
 }
 
 TEST(ControllerTest, ANewerTargetTakesOverInTheMiddle) {
@@ -1318,6 +1343,33 @@ TEST(ControllerTest, ATargetThatWasNotBegunIsGivenAgainAfterARestart) {
   EXPECT_EQ(after.status.control_state, S::CONTROL_IDLE);
   after.give(position_target(4, kFar));
   EXPECT_TRUE(after.run_until_state(S::CONTROL_REACHED)) << after.status.why;
+}
+
+TEST(ControllerTest, AKeptTargetFromAClockAheadIsForgottenAndTheArmStaysHeld) {
+  const std::int64_t kNow = 1'700'000'000 * kSecond;
+  Target hold = other_target(7, Target::KIND_HOLD);
+  hold.epoch = std::numeric_limits<std::int64_t>::max();
+  Bench before;
+  before.start();
+  before.give(hold);
+  ASSERT_EQ(before.status.control_state, S::CONTROL_HOLDING);
+  std::ofstream(state_file()) << before.controller.state_text();
+  Controller after(test_config());
+  after.restore(state_file(), kNow);
+  EXPECT_EQ(after.status().control_state, S::CONTROL_HOLDING);
+  EXPECT_EQ(after.status().owns_arm, 1);
+  // A console that compares with its own must not believe that there is a newer one.
+  EXPECT_EQ(after.status().target_epoch, 0);
+  EXPECT_EQ(after.status().target_id, -1);
+  Target release = other_target(0, Target::KIND_RELEASE);
+  release.epoch = kNow;
+  after.on_pose_target(release, kNow);
+  EXPECT_EQ(after.status().control_state, S::CONTROL_RELEASED);
+  Controller other(test_config());
+  std::ofstream(state_file()) << after.state_text();
+  other.restore(state_file(), kNow + kSecond);
+  EXPECT_EQ(other.counters().count("POSE_TARGET from a clock ahead"), 0U);
+  std::filesystem::remove(state_file());
 }
 
 TEST(ControllerTest, AStateFileOfSomethingElseIsRefused) {
