@@ -120,6 +120,8 @@ class Adaptation {
   std::int64_t since() const { return stream_.sample_index_of(since_); }
   const std::vector<BodySchema>& history() const { return history_; }
   const AdaptationOptions& options() const { return options_; }
+  /// Samples that were judged, and those that the noise was estimated from.
+  std::int64_t num_samples() const { return num_samples_; }
   bool is_settled() const { return replacements_.empty() && !detected_ && !drifting_; }
 
  private:

@@ -99,14 +99,43 @@ std::int64_t LiveSchema::holds_since(int part) const {
 }
 
 double LiveSchema::log_likelihood_ratio(const BodySchema& other,
-                                        const std::vector<const ActionPoseSample*>& samples) const {
+                                        const std::vector<const ActionPoseSample*>& samples,
+                                        std::int64_t since) const {
   std::vector<ActionPoseSample> usable;
   for (const ActionPoseSample* sample : samples)
     drop_moved_tags(schema_.moved_tags, &usable.emplace_back(*sample));
-  std::vector<const ActionPoseSample*> all;
-  for (const ActionPoseSample& sample : usable) all.push_back(&sample);
+  std::vector<const ActionPoseSample*> all, before, after;
+  for (const ActionPoseSample& sample : usable) {
+    all.push_back(&sample);
+    (sample.sample_index < since ? before : after).push_back(&sample);
+  }
   return log_likelihood(other, adaptation_.noise(), all) -
-         log_likelihood(schema_, adaptation_.noise(), all);
+         log_likelihood(base_, adaptation_.noise(), before) -
+         log_likelihood(schema_, adaptation_.noise(), after);
+}
+
+void LiveSchema::tell(std::int64_t sample_index, std::int64_t utime) {
+  known_from_ = sample_index + 1;
+  stamp(&schema_);
+  schema_.utime = utime;
+  schema_.version = sample_index + 1;
+  schema_.base_version = base_.version;
+  schema_.last_sample_index = sample_index;
+}
+
+void LiveSchema::stamp(BodySchema* schema) const {
+  std::vector<KnownChange>& changes = schema->changes;
+  for (KnownChange& change : changes) change.found = std::max(change.found, known_from_);
+  // Of those that became known together the last says since when the body is as it is.
+  for (std::size_t n = 1; n < changes.size();)
+    if (changes[n - 1].found == changes[n].found)
+      changes.erase(changes.begin() + static_cast<std::ptrdiff_t>(n) - 1);
+    else
+      ++n;
+  for (MovedTag& tag : schema->moved_tags) {
+    tag.found = std::max(tag.found, known_from_);
+    if (tag.until >= 0) tag.until = std::max(tag.until, tag.found + 1);
+  }
 }
 
 bool LiveSchema::is_in_doubt() const {
@@ -207,6 +236,7 @@ void LiveSchema::update(const ActionPoseSample& sample, std::optional<std::int64
     if (next.changes.size() == BodySchema::kMaxChanges) next.changes.erase(next.changes.begin());
     next.changes.push_back({sample.sample_index, since});
   }
+  stamp(&next);
   next.utime = schema_.utime;
   next.version = schema_.version;
   next.base_version = schema_.base_version;

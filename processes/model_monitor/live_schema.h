@@ -39,15 +39,22 @@ class LiveSchema {
   std::int64_t body_since() const;
   /// The same for the way from the camera to a part.
   std::int64_t holds_since(int part) const;
-  /// Of these samples another schema over this one [nats].
+  /// Samples judged that were no repetitions of others.
+  std::int64_t num_judged() const { return adaptation_.num_samples(); }
+  /// Of these samples another schema over this one, and over the base before `since` [nats].
   double log_likelihood_ratio(const BodySchema& other,
-                              const std::vector<const ActionPoseSample*>& samples) const;
+                              const std::vector<const ActionPoseSample*>& samples,
+                              std::int64_t since = 0) const;
+  /// What was decided up to this sample was held back, and is known from the next one on.
+  void tell(std::int64_t sample_index, std::int64_t utime);
 
   /// States, flags and statistics of health->edge_health and part_health, whose ids are set; noise
   /// and probe.
   void describe(model_health_t* health) const;
 
  private:
+  /// Nothing that is in the schema was known before known_from_.
+  void stamp(BodySchema* schema) const;
   void watch_flips(const ActionPoseSample& sample);
   EdgeState state_of(const Edge& edge) const;
   void update(const ActionPoseSample& sample, std::optional<std::int64_t> changed_since,
@@ -57,6 +64,7 @@ class LiveSchema {
   Adaptation adaptation_;
   BodySchema schema_;
   std::int64_t camera_since_ = 0;  ///< first sample that X_CR holds for
+  std::int64_t known_from_ = 0;
   std::int64_t probe_sample_ = -1;
   Eigen::VectorXd probe_;
   std::map<int, std::deque<bool>> flipped_;  ///< part → newest sightings: the other pose was right

@@ -106,9 +106,17 @@ void ModelMonitor::Standing::add(health_event_t event) {
   events.push_back(std::move(event));
 }
 
+void ModelMonitor::Standing::tell(std::int64_t utime) {
+  const auto told = std::make_shared<LiveSchema>(*live);
+  told->tell(sample_index, utime);
+  live = told;
+  for (health_event_t& event : youth.end()) add(std::move(event));
+}
+
 void ModelMonitor::start_from(const body_schema_t& schema) {
   MonitorMemory memory = memory_;
   memory.schemas = {schema};
+  memory.at_base.num_test_samples = MonitorMemory::kOld;
   if (schema.last_sample_index < 0) {
     // Its changes were those of another run.
     body_schema_t& base = memory.schemas.back();
@@ -132,7 +140,7 @@ void ModelMonitor::restore(const MonitorMemory& memory) {
   judged_sample_ = memory.verdicts.judged_sample;
   judged_utime_ = memory.verdicts.utime;
   restored_sample_ = memory.at_base.judged_sample;
-  now_ = {};
+  now_ = Standing();
   kept_.clear();
   now_.sample_index = restored_sample_;
   now_.events = memory.at_base.events;
@@ -147,6 +155,7 @@ void ModelMonitor::restore(const MonitorMemory& memory) {
       for (const body_schema_t& schema : memory.schemas) history.push_back(from_message(schema));
       history.pop_back();
       now_.live = begin(std::move(base), std::move(history), restored_sample_);
+      now_.youth = BaselineYouth(memory.at_base.num_test_samples);
     } else {
       now_.proposed = std::move(base);
     }
@@ -203,6 +212,10 @@ bool ModelMonitor::on_learned_schema(const body_schema_t& proposal) {
   return true;
 }
 
+std::int64_t ModelMonitor::num_tests(std::int64_t last) const {
+  return std::upper_bound(test_indices_.begin(), test_indices_.end(), last) - test_indices_.begin();
+}
+
 bool ModelMonitor::is_test(std::int64_t sample_index) const {
   return std::binary_search(test_indices_.begin(), test_indices_.end(), sample_index);
 }
@@ -231,11 +244,16 @@ void ModelMonitor::advance(Standing* standing, const ActionPoseSample& sample) c
   standing->sample_index = sample.sample_index;
   if (standing->live && fits(standing->live->schema(), sample)) {
     const auto live = std::make_shared<LiveSchema>(*standing->live);
-    for (health_event_t& event : live->on_sample(sample)) standing->add(std::move(event));
+    std::vector<health_event_t> events = live->on_sample(sample);
+    const bool is_confirming =
+        live->num_judged() > standing->live->num_judged() && sample.parts.size() > 1;
+    for (health_event_t& event : standing->youth.on_sample(std::move(events), is_confirming))
+      standing->add(std::move(event));
     standing->live = live;
   }
   for (const health_event_t& verdict : memory_.verdicts.events)
     if (verdict.event_sample == sample.sample_index) standing->add(verdict);
+  if (memory_.verdicts.schema_version == sample.sample_index + 1) standing->tell(sample.utime);
 }
 
 ModelMonitor::Standing ModelMonitor::standing_after(std::int64_t sample_index) const {
@@ -349,12 +367,35 @@ std::string ModelMonitor::objection(BodySchema* proposal, const Standing& standi
   return objection;
 }
 
+bool ModelMonitor::is_passed_over(const BodySchema& proposal, const Standing& standing) const {
+  const LiveSchema* live = standing.live.get();
+  if (!live) return false;
+  const std::int64_t index = proposal.last_sample_index;
+  const BodySchema& known = *standing.schema();
+  const std::int64_t body_since = known.changes.empty() ? 0 : known.changes.back().since;
+  std::int64_t since = 0;
+  for (const Edge& edge : proposal.edges) since = std::max(since, edge.valid_since_sample);
+  if (body_since != since || known.moved_tags != proposal.moved_tags) return true;
+  const auto gain_since = [&](std::int64_t first, std::int64_t story_since) {
+    auto tests = tests_between(first, index);
+    std::erase_if(tests, [&](const auto* sample) { return !fits(proposal, *sample); });
+    return live->log_likelihood_ratio(proposal, tests, story_since);
+  };
+  if (!standing.youth.is_over())
+    return standing.is_holding_back() &&
+           gain_since(0, standing.youth.story_since()) + standing.youth.log_odds_wrong() <= 0;
+  if (live->is_in_doubt() || known.version > index) return true;
+  // A body that changed keeps its tree, or what is stored of it could not be put back: that of a
+  // stuck joint lacks the signal by which it will move again.
+  if (!known.changes.empty() && !has_same_tree(proposal, known)) return true;
+  // What the body was like before it changed is in the schema too, as far as that stayed so.
+  return since > 0 && gain_since(since, 0) <= 0;
+}
+
 void ModelMonitor::judge(const body_schema_t& message) {
   BodySchema proposal = from_message(message);
   const std::int64_t index = proposal.last_sample_index;
   Standing standing = standing_after(index);
-  std::int64_t since = 0;
-  for (const Edge& edge : proposal.edges) since = std::max(since, edge.valid_since_sample);
   judged_sample_ = index;
   judged_utime_ = proposal.utime;
 
@@ -364,28 +405,14 @@ void ModelMonitor::judge(const body_schema_t& message) {
   event.event_from = event.event_to = event.event_part = event.event_tag = -1;
   bool is_new_base = false, is_changed = false;
   const LiveSchema* live = standing.live.get();
-  // It rests on samples of a body that is no more; or it hides that it may be so.
-  bool is_passed_over =
-      live && (live->is_in_doubt() || live->body_since() != since ||
-               live->schema().version > index || live->schema().moved_tags != proposal.moved_tags);
-  // A body that changed keeps its tree, or what is stored of it could not be put back: that of a
-  // stuck joint lacks the signal by which it will move again.
-  if (!is_passed_over && live && !live->schema().changes.empty())
-    is_passed_over = !has_same_tree(proposal, live->schema());
-  // What the body was like before it changed is in the schema too, as far as that stayed so.
-  if (!is_passed_over && live && since > 0) {
-    auto tests = tests_between(since, index);
-    std::erase_if(tests, [&](const auto* sample) { return !fits(proposal, *sample); });
-    is_passed_over = live->log_likelihood_ratio(proposal, tests) <= 0;
-  }
-  if (!is_passed_over) {
+  if (!is_passed_over(proposal, standing)) {
     bool was_tested = false;
     const std::string why_not = objection(&proposal, standing, &was_tested);
     if (why_not.empty()) {
       // base_version stays the proposal's: which version stood here before depends on the speed of
       // the learner.
       proposal.version = index + 1;
-      if (live) proposal.changes = live->schema().changes;
+      if (live) proposal.changes = standing.schema()->changes;
       event.event_kind = health_event_t::EVENT_SCHEMA_ACCEPTED;
       event.event_text = "version " + std::to_string(proposal.version) + ": " +
                          std::to_string(proposal.edges.size()) + " edges, " +
@@ -406,9 +433,14 @@ void ModelMonitor::judge(const body_schema_t& message) {
       set_array(memory_.verdicts.num_events, memory_.verdicts.events, std::move(verdicts));
     }
   }
-  if (!is_new_base && live && !live->is_in_doubt() &&
-      index - live->base().last_sample_index >= kRenewal) {
-    BodySchema renewed = live->schema();
+  if (!is_new_base && standing.is_holding_back() && standing.youth.is_story_believed()) {
+    standing.tell(judged_utime_);
+    memory_.verdicts.schema_version = index + 1;
+    is_changed = true;
+  }
+  if (!is_new_base && standing.live && standing.youth.is_over() && !standing.live->is_in_doubt() &&
+      index - standing.live->base().last_sample_index >= kRenewal) {
+    BodySchema renewed = standing.live->schema();
     renewed.last_sample_index = index;
     set_base(&standing, std::move(renewed));
     is_changed = true;
@@ -423,8 +455,7 @@ void ModelMonitor::judge(const body_schema_t& message) {
 void ModelMonitor::set_base(Standing* standing, BodySchema base) {
   std::vector<BodySchema> history;
   // As long as the body was one, earlier schemas are only worse.
-  if (standing->live && !standing->live->schema().changes.empty())
-    history = standing->live->history();
+  if (standing->live && !standing->schema()->changes.empty()) history = standing->live->history();
   memory_.schemas.clear();
   // As it will be restored.
   for (BodySchema& schema : history) {
@@ -435,6 +466,14 @@ void ModelMonitor::set_base(Standing* standing, BodySchema base) {
   base = from_message(memory_.schemas.back());
   memory_.at_base.utime = base.utime;
   memory_.at_base.judged_sample = standing->sample_index;
+  // What confirmed a tree confirms it still.
+  if (!standing->live || standing->is_holding_back() ||
+      !has_same_tree(base, standing->live->base()))
+    standing->youth = BaselineYouth(num_tests(standing->sample_index));
+  memory_.at_base.num_test_samples =
+      standing->youth.is_over() ? MonitorMemory::kOld
+                                : static_cast<std::int32_t>(standing->youth.num_confirming());
+  memory_.verdicts.schema_version = 0;
   set_array(memory_.at_base.num_events, memory_.at_base.events, standing->events);
   set_array(memory_.verdicts.num_events, memory_.verdicts.events, {});
   standing->proposed.reset();
@@ -454,7 +493,19 @@ const model_health_t& ModelMonitor::health() const {
   health_.judged_sample = judged_sample_;
   if (judged_sample_ < 0 && !now_.live) return health_;
   assess(schema ? *schema : BodySchema());
-  if (now_.live) now_.live->describe(&health_);
+  if (!now_.live) return health_;
+  now_.live->describe(&health_);
+  if (!now_.is_holding_back()) return health_;
+  // Nothing is decided yet.
+  for (std::size_t e = 0; e < schema->edges.size(); ++e) {
+    std::int8_t& state = health_.edge_health[e].edge_state;
+    if (state != static_cast<std::int8_t>(schema->edges[e].state))
+      state = schema_edge_t::EDGE_SUSPECT;
+  }
+  for (part_health_t& part : health_.part_health)
+    if (part.part_state != schema_edge_t::EDGE_OK) part.part_state = schema_edge_t::EDGE_SUSPECT;
+  health_.probe_sample = -1;
+  set_array(health_.num_probe, health_.probe_action, {});
   return health_;
 }
 
@@ -462,9 +513,7 @@ void ModelMonitor::assess(const BodySchema& schema) const {
   health_.schema_version = schema.version;
   health_.schema_complete = schema.complete;
   health_.worst_position_m = health_.worst_rotation_rad = -1;
-  health_.num_test_samples = static_cast<std::int32_t>(
-      std::upper_bound(test_indices_.begin(), test_indices_.end(), judged_sample_) -
-      test_indices_.begin());
+  health_.num_test_samples = static_cast<std::int32_t>(num_tests(judged_sample_));
 
   std::vector<edge_health_t> edges;
   for (const Edge& edge : schema.edges) {
@@ -487,7 +536,8 @@ void ModelMonitor::assess(const BodySchema& schema) const {
         std::upper_bound(indices.begin(), indices.end(), judged_sample_) - indices.begin();
     std::vector<double> position_errors, rotation_errors;
     const auto path = KinematicPath::between(schema, schema.root, part);
-    const std::int64_t since = now_.live ? now_.live->holds_since(part) : 0;
+    const std::int64_t since =
+        now_.live && !now_.is_holding_back() ? now_.live->holds_since(part) : 0;
     for (const ActionPoseSample* sample : tests) {
       const PartObservation* seen = sighting(*sample, part, schema.moved_tags);
       if (!seen || !path || schema.root < 0 || sample->sample_index < since ||

@@ -14,6 +14,7 @@
 #include "bodyschema/sample_t.hpp"
 #include "common/schema/body_schema.h"
 #include "common/schema/sample.h"
+#include "processes/model_monitor/baseline_youth.h"
 #include "processes/model_monitor/live_schema.h"
 #include "processes/model_monitor/monitor_memory.h"
 
@@ -44,6 +45,11 @@ struct ModelMonitorConfig {
 /// suspected, later proposals go on to replace the schema, which is judged from there on. After a
 /// change those that rest on the samples since it alone may do so, where their tree is the same and
 /// they predict its TEST samples better; what rests on samples of two bodies is passed over.
+///
+/// As long as it is young (BaselineYouth), that it was wrong from the start is likelier than that
+/// the body changed. What is found then is held back, so that the learner goes on with all samples,
+/// and competes with each of its proposals: the proposal becomes the base, or the change is told,
+/// or both wait.
 ///
 /// The schema after sample n is a pure function of the samples 0..n. A proposal is one of its last
 /// sample t, a TEST sample (the learner leaves none of these out), and is judged by the state after
@@ -88,17 +94,25 @@ class ModelMonitor {
     std::int64_t sample_index = -1;
     std::optional<BodySchema> proposed;      ///< accepted, while the learner leads
     std::shared_ptr<const LiveSchema> live;  ///< afterwards
+    BaselineYouth youth;                     ///< of live's base
     std::vector<health_event_t> events;      ///< the newest
     std::int64_t num_events = 0;
 
+    /// Changes are found and held back.
+    bool is_holding_back() const { return live && youth.has_story(); }
     const BodySchema* schema() const {
-      return live ? &live->schema() : proposed ? &*proposed : nullptr;
+      if (live) return is_holding_back() ? &live->base() : &live->schema();
+      return proposed ? &*proposed : nullptr;
     }
     void add(health_event_t event);
+    /// The body did change.
+    void tell(std::int64_t utime);
   };
 
   static bool fits(const BodySchema& schema, const ActionPoseSample& sample);
   bool is_test(std::int64_t sample_index) const;
+  /// TEST samples up to this one.
+  std::int64_t num_tests(std::int64_t last) const;
   /// The newest of these TEST samples, oldest first; both ends included.
   std::vector<const ActionPoseSample*> tests_between(std::int64_t first, std::int64_t last) const;
   EdgeTest test(const BodySchema& schema, const Edge& edge, std::int64_t first,
@@ -114,6 +128,9 @@ class ModelMonitor {
                                           std::int64_t up_to_sample) const;
   /// "" or why the proposal is not better than what stands; sets the states of its edges.
   std::string objection(BodySchema* proposal, const Standing& standing, bool* was_tested) const;
+  /// It rests on samples of a body that is no more, or hides that it may be so, or explains less
+  /// than what stands.
+  bool is_passed_over(const BodySchema& proposal, const Standing& standing) const;
   void judge(const body_schema_t& proposal);
   void set_base(Standing* standing, BodySchema base);
   void publish();

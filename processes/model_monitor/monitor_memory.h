@@ -3,6 +3,7 @@
 #include <cstdint>
 #include <filesystem>
 #include <functional>
+#include <limits>
 #include <optional>
 #include <string>
 #include <vector>
@@ -20,9 +21,12 @@ struct MonitorMemory {
   /// Of the history, oldest first; the last one is the base, that the samples after its
   /// last_sample_index changed since. Empty before the first accepted proposal.
   std::vector<body_schema_t> schemas;
-  /// After that sample: with the newest events.
+  /// After that sample: with the newest events. num_test_samples: those that had confirmed the
+  /// base's tree (BaselineYouth); kOld of a base that is not young.
   model_health_t at_base{};
+  static constexpr std::int32_t kOld = std::numeric_limits<std::int32_t>::max();
   /// The newest judged sample, and what was decided on proposals after the base's: events.
+  /// schema_version: the first that told of changes that had been held back; 0: none.
   model_health_t verdicts{};
 
   bool operator==(const MonitorMemory& other) const;

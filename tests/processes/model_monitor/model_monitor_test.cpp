@@ -611,6 +611,67 @@ TEST_F(ModelMonitorTest, ARestartAtAnyMomentIsAsIfNothingHadHappened) {
   }
 }
 
+TEST_F(ModelMonitorTest, AChangeInTheYouthIsHeldBackThenToldWheneverItIsKilledOrLate) {
+  // The first structure is one of sample 9, the joint sticks from 13 on; the learner goes on with
+  // the samples of both bodies.
+  break_last_joint(13);
+  std::map<std::int64_t, body_schema_t> proposals;
+  for (std::int64_t i = 9; i < kNumSamples; i += 5) proposals[i] = proposal(i);
+  const auto is_about = [](const health_event_t& e) {
+    return e.event_kind == health_event_t::EVENT_CANDIDATE && e.event_cause == "joint_stuck";
+  };
+  ModelMonitor undisturbed(test_config());
+  std::vector<MonitorMemory> memories;
+  std::vector<model_health_t> healths;
+  std::int64_t told_at = -1, found_at = -1;
+  for (std::int64_t i = 0; i < kNumSamples; ++i) {
+    undisturbed.on_sample(sample(i));
+    if (proposals.contains(i)) undisturbed.on_learned_schema(proposals.at(i));
+    memories.push_back(undisturbed.memory());
+    healths.push_back(undisturbed.health());
+    EXPECT_EQ(check(undisturbed.health()), "");
+    const auto& events = undisturbed.health().events;
+    const auto told = std::find_if(events.begin(), events.end(), is_about);
+    if (told == events.end() || told_at >= 0) continue;
+    told_at = i;
+    found_at = told->event_sample;
+    ASSERT_EQ(undisturbed.schema()->schema_version, i + 1);
+    ASSERT_EQ(undisturbed.schema()->changes.size(), 1U);
+    // A proposal of sample i could not rest on it.
+    EXPECT_EQ(undisturbed.schema()->changes[0].found_sample, i + 1);
+    EXPECT_GE(undisturbed.schema()->changes[0].since_sample, 12);
+    EXPECT_EQ(check(*undisturbed.schema()), "");
+  }
+  EXPECT_GE(found_at, 13);
+  EXPECT_LE(found_at, 18);
+  EXPECT_GT(told_at, found_at);
+  EXPECT_LE(told_at, 34);
+  for (std::int64_t killed_after = 0; killed_after < kNumSamples; killed_after += 3) {
+    const auto at = static_cast<std::size_t>(killed_after);
+    ModelMonitor monitor(test_config());
+    monitor.restore(memories[at]);
+    for (std::int64_t i = 0; i <= killed_after; ++i) monitor.on_sample(sample(i));
+    EXPECT_EQ(encode(kModelHealth, monitor.health()), encode(kModelHealth, healths[at]))
+        << killed_after;
+    for (std::int64_t i = killed_after + 1; i < kNumSamples; ++i) {
+      monitor.on_sample(sample(i));
+      if (proposals.contains(i)) monitor.on_learned_schema(proposals.at(i));
+    }
+    EXPECT_EQ(bytes_of(monitor), bytes_of(undisturbed)) << killed_after;
+    EXPECT_EQ(encode(kModelHealth, monitor.health()), encode(kModelHealth, healths.back()))
+        << killed_after;
+  }
+  for (const int delay : {1, 7, 20}) {
+    ModelMonitor late(test_config());
+    for (std::int64_t i = 0; i < kNumSamples + delay; ++i) {
+      if (i < kNumSamples) late.on_sample(sample(i));
+      if (proposals.contains(i - delay)) late.on_learned_schema(proposals.at(i - delay));
+    }
+    EXPECT_EQ(bytes_of(late), bytes_of(undisturbed)) << delay;
+    EXPECT_EQ(encode(kModelHealth, late.health()), encode(kModelHealth, healths.back())) << delay;
+  }
+}
+
 TEST_F(ModelMonitorTest, HoweverSlowTheLearnerIsTheSchemaIsTheSame) {
   break_last_joint(27);
   const auto proposed = [&](std::int64_t i) { return proposal(std::min<int64_t>(i, 24), i); };

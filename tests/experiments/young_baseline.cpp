@@ -1,0 +1,141 @@
+// A body that nothing happens to: what the learner and the monitor tell of it live, and what they
+// hold in the end beside learn() on the same samples. One run a rig and seed is rendered; each part
+// is hidden in it in turn. Prints Markdown.
+//
+//   young_baseline [config/arm2 config/arm4 config/arm7] --seeds 50 --samples 60
+
+#include <CLI/CLI.hpp>
+#include <algorithm>
+#include <cstdio>
+#include <filesystem>
+#include <map>
+#include <optional>
+#include <set>
+#include <string>
+#include <vector>
+
+#include "common/bus/channels.h"
+#include "common/bus/convert.h"
+#include "common/bus/event_log.h"
+#include "common/config/rig.h"
+#include "tests/support/live_run.h"
+#include "tests/support/rendered_run.h"
+#include "tests/support/rig_truth.h"
+#include "tests/support/synthetic_robot.h"
+
+using namespace bodyschema;
+using test::Rightness;
+
+namespace {
+
+/// Rendered, or as an earlier call left it in `folder`.
+std::vector<sample_t> samples_of(const std::filesystem::path& rig, std::int64_t seed,
+                                 const std::set<int>& hidden, std::size_t num_samples,
+                                 const std::filesystem::path& folder) {
+  std::string name = rig.filename().string() + "_" + std::to_string(seed);
+  for (const int part : hidden) name += "_" + std::to_string(part);
+  const auto file = folder / (name + ".lcmlog");
+  std::vector<sample_t> samples;
+  if (!folder.empty() && std::filesystem::exists(file)) samples = read_log(file, kSample);
+  if (samples.size() >= num_samples) {
+    samples.resize(num_samples);
+    return samples;
+  }
+  samples.clear();
+  test::RenderedRun run(rig, seed, hidden);
+  while (samples.size() < num_samples) samples.push_back(run.next().message);
+  if (!folder.empty()) {
+    LogAppender log(file, LogAppender::Mode::kOverwrite, LogAppender::Durability::kToKernel);
+    for (const sample_t& sample : samples) log.append(kSample, sample);
+  }
+  return samples;
+}
+
+Rightness judge(const std::optional<BodySchema>& schema, const test::RigTruth& truth,
+                const std::vector<int>& observed) {
+  if (!schema) return Rightness::kIncomplete;
+  if (truth.objection(*schema, observed).empty()) return Rightness::kRight;
+  const bool is_wrong =
+      schema->complete ||
+      std::any_of(schema->edges.begin(), schema->edges.end(), [&](const Edge& edge) {
+        const std::vector<int> signals = edge.signals();
+        return std::set<int>(signals.begin(), signals.end()) !=
+               truth.path_signals(edge.from, edge.to);
+      });
+  return is_wrong ? Rightness::kWrong : Rightness::kIncomplete;
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+  std::vector<std::string> rigs;
+  int num_seeds = 50;
+  std::int64_t first_seed = 1;
+  std::size_t num_samples = 60;
+  std::optional<int> hide;
+  std::string folder;
+  CLI::App app("A young baseline of a body that nothing happens to");
+  app.add_option("RIGS", rigs, "Rig folders");
+  app.add_option("--seeds", num_seeds)->check(CLI::PositiveNumber);
+  app.add_option("--first-seed", first_seed);
+  app.add_option("--samples", num_samples)->check(CLI::PositiveNumber);
+  app.add_option("--hide", hide, "This part alone is hidden, in the images, as ./run --hide does");
+  app.add_option("--keep", folder, "Rendered samples are kept here and used again")
+      ->check(CLI::ExistingDirectory);
+  CLI11_PARSE(app, argc, argv);
+  if (rigs.empty())
+    for (const char* name : {"arm2", "arm4", "arm7"})
+      rigs.push_back(std::string(BODYSCHEMA_SOURCE_FOLDER "/config/") + name);
+
+  std::printf(
+      "| rig | runs | with events | events | live: right / incomplete / wrong | offline: right / "
+      "incomplete / wrong | live worse than offline |\n| --- | --- | --- | --- | --- | --- | --- "
+      "|\n");
+  for (const std::filesystem::path rig : rigs) {
+    const StructureLearnerConfig learner =
+        StructureLearnerConfig::load(rig / "structure_learner.yaml");
+    const ModelMonitorConfig monitor = ModelMonitorConfig::load(rig / "model_monitor.yaml");
+    const test::RigTruth truth(rig);
+    int num_runs = 0, num_eventful = 0, num_worse = 0;
+    std::size_t num_events = 0;
+    std::map<Rightness, int> live, offline;
+    for (std::int64_t seed = first_seed; seed < first_seed + num_seeds; ++seed) {
+      const std::set<int> in_images = hide ? std::set<int>{*hide} : std::set<int>{};
+      const auto rendered = samples_of(rig, seed, in_images, num_samples, folder);
+      std::vector<int> hidden = truth.parts();
+      hidden.insert(hidden.begin(), -1);  // none
+      if (hide) hidden = {*hide};
+      for (const int part : hidden) {
+        // Nothing can hang on a root that is never seen.
+        if (part == learner.options.root) continue;
+        const auto samples = part < 0 ? rendered : test::without_part(rendered, part);
+        std::vector<int> observed = truth.parts();
+        std::erase(observed, part);
+        const test::LiveRun run = test::live_run(samples, learner, monitor);
+        const Rightness held = judge(run.schema, truth, observed),
+                        learned = judge(test::learned_offline(samples, learner), truth, observed);
+        ++num_runs;
+        num_eventful += !run.events.empty();
+        num_events += run.events.size();
+        num_worse += held > learned;
+        ++live[held];
+        ++offline[learned];
+        if (run.events.empty() && held <= learned) continue;
+        std::fprintf(stderr, "%s seed %lld, part %d hidden: live %d, offline %d\n",
+                     rig.filename().c_str(), static_cast<long long>(seed), part,
+                     static_cast<int>(held), static_cast<int>(learned));
+        for (const health_event_t& event : run.events)
+          std::fprintf(stderr, "  %lld  %s\n", static_cast<long long>(event.event_sample),
+                       event.event_text.c_str());
+      }
+    }
+    const auto counts = [](std::map<Rightness, int>& of) {
+      return std::to_string(of[Rightness::kRight]) + " / " +
+             std::to_string(of[Rightness::kIncomplete]) + " / " +
+             std::to_string(of[Rightness::kWrong]);
+    };
+    std::printf("| %s | %d | %d | %zu | %s | %s | %d |\n", rig.filename().c_str(), num_runs,
+                num_eventful, num_events, counts(live).c_str(), counts(offline).c_str(), num_worse);
+    std::fflush(stdout);
+  }
+}

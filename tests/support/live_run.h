@@ -1,0 +1,31 @@
+#pragma once
+
+#include <optional>
+#include <vector>
+
+#include "bodyschema/health_event_t.hpp"
+#include "bodyschema/sample_t.hpp"
+#include "common/schema/body_schema.h"
+#include "processes/model_monitor/model_monitor.h"
+#include "processes/structure_learner/structure_learner.h"
+
+namespace bodyschema::test {
+
+/// What learner and monitor end with.
+struct LiveRun {
+  std::optional<BodySchema> schema;    ///< BODY_SCHEMA
+  std::vector<health_event_t> events;  ///< told, verdicts on proposals apart
+};
+
+/// The learner and the monitor on the samples of one run, in one thread, message by message.
+LiveRun live_run(const std::vector<sample_t>& samples, const StructureLearnerConfig& learner,
+                 const ModelMonitorConfig& monitor);
+
+/// learn() on those of the samples that the learner may use.
+BodySchema learned_offline(const std::vector<sample_t>& samples,
+                           const StructureLearnerConfig& learner);
+
+/// The run as it is where the part bears no marker.
+std::vector<sample_t> without_part(std::vector<sample_t> samples, int part);
+
+}  // namespace bodyschema::test
