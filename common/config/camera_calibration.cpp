@@ -31,11 +31,7 @@ class CalibrationFile {
     if (content.starts_with("%YAML:")) {
       std::fill_n(content.begin(), std::min(content.find('\n'), content.size()), ' ');
     }
-    try {
-      root_ = YAML::Load(content);
-    } catch (const YAML::Exception& problem) {
-      throw ConfigError(name_ + ":" + std::to_string(problem.mark.line + 1) + ": " + problem.msg);
-    }
+    root_ = only_document(content, name_);
     if (!root_.IsMap()) throw ConfigError(name_ + ":1: expected a mapping 'key: value'");
   }
 
@@ -97,6 +93,10 @@ class CalibrationFile {
 
 using Model = CameraCalibration::Model;
 
+// Chosen far beyond any lens: a number that was damaged, not one that was measured.
+constexpr double kLongestFocalLength_px = 1e6;
+constexpr double kLargestDistortion = 1e4;
+
 Model distortion_model(const CalibrationFile& file, std::size_t num_coefficients) {
   if (file.has("distortion_model")) {
     const std::string name = file.text("distortion_model");
@@ -126,7 +126,9 @@ CameraCalibration load_camera_calibration(const std::filesystem::path& path) {
     file.fail("camera_matrix", "expected [fx, 0, cx, 0, fy, cy, 0, 0, 1]");
   }
   if (K[1] != 0) file.fail("camera_matrix", "a skew is not supported, element 2 must be 0");
-  if (K[0] <= 0 || K[4] <= 0) file.fail("camera_matrix", "focal lengths must be above 0");
+  if (std::min(K[0], K[4]) <= 0 || std::max(K[0], K[4]) > kLongestFocalLength_px) {
+    file.fail("camera_matrix", "focal lengths must be above 0 and below 1e6 px");
+  }
   calibration.fx = K[0];
   calibration.cx = K[2];
   calibration.fy = K[4];
@@ -140,6 +142,10 @@ CameraCalibration load_camera_calibration(const std::filesystem::path& path) {
   calibration.distortion = file.matrix("distortion_coefficients", {0, 1, 4, 5, 8, 12, 14});
   std::vector<double>& distortion = calibration.distortion;
   calibration.model = distortion_model(file, distortion.size());
+  for (const double value : distortion) {
+    if (std::abs(value) > kLargestDistortion)
+      file.fail("distortion_coefficients", "expected numbers within ±1e4");
+  }
   const auto is_zero = [](double value) { return value == 0; };
   // OpenCV pads with thin-prism and tilt terms that its plain models leave at 0.
   if (distortion.size() > 8) {

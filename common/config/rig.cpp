@@ -8,6 +8,13 @@
 
 namespace bodyschema {
 
+namespace {
+
+/// Chosen: encoder ticks of many turns fit, squares and sums of it are far from overflow.
+constexpr double kLargestCommand = 1e9;
+
+}  // namespace
+
 std::vector<int> Markers::parts() const {
   std::set<int> parts;
   for (const TagPlacement& tag : tags) parts.insert(tag.part);
@@ -66,8 +73,8 @@ Signals load_signals(const std::filesystem::path& rig_folder) {
     Signal signal;
     signal.name = item.text("name");
     if (signal.name.empty()) throw item.error("name", "expected a name");
-    signal.lower = item.number("lower");
-    signal.upper = item.number("upper");
+    signal.lower = item.number("lower", -kLargestCommand, kLargestCommand);
+    signal.upper = item.number("upper", -kLargestCommand, kLargestCommand);
     if (signal.upper <= signal.lower) throw item.error("upper", "must be above lower");
     if (!names.insert(signal.name).second) throw item.error("name", "this name stands twice");
     result.signals.push_back(signal);

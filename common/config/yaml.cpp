@@ -1,5 +1,6 @@
 #include "common/config/yaml.h"
 
+#include <yaml-cpp/eventhandler.h>
 #include <yaml-cpp/yaml.h>
 
 #include <algorithm>
@@ -32,6 +33,34 @@ bool same_mapping(const YAML::Node& a, const YAML::Node& b) { return a.is(b); }
 /// Counted from 1. An empty file's node stands nowhere.
 int line_of(const YAML::Node& node) { return std::max(node.Mark().line, 0) + 1; }
 
+/// Where the newest document begins.
+class DocumentMark : public YAML::EventHandler {
+ public:
+  int line() const { return line_; }
+
+  void OnDocumentStart(const YAML::Mark& mark) override { line_ = mark.line; }
+  void OnDocumentEnd() override {}
+  void OnNull(const YAML::Mark&, YAML::anchor_t) override {}
+  void OnAlias(const YAML::Mark&, YAML::anchor_t) override {}
+  void OnScalar(const YAML::Mark&, const std::string&, YAML::anchor_t,
+                const std::string&) override {}
+  void OnSequenceStart(const YAML::Mark&, const std::string&, YAML::anchor_t,
+                       YAML::EmitterStyle::value) override {}
+  void OnSequenceEnd() override {}
+  void OnMapStart(const YAML::Mark&, const std::string&, YAML::anchor_t,
+                  YAML::EmitterStyle::value) override {}
+  void OnMapEnd() override {}
+
+ private:
+  int line_ = 0;
+};
+
+std::string outside(double value, double lowest, double highest) {
+  std::ostringstream text;
+  text << value << " is outside " << lowest << " … " << highest;
+  return text.str();
+}
+
 }  // namespace
 
 std::string did_you_mean(const std::string& word, const std::set<std::string>& known) {
@@ -40,6 +69,24 @@ std::string did_you_mean(const std::string& word, const std::set<std::string>& k
   });
   if (best == known.end()) return "";
   return "; did you mean '" + *best + "'?";
+}
+
+YAML::Node only_document(const std::string& text, const std::string& name) {
+  try {
+    const YAML::Node document = YAML::Load(text);
+    // Not YAML::LoadAll(), which takes some damaged files for endlessly many documents.
+    std::istringstream stream(text);
+    YAML::Parser parser(stream);
+    DocumentMark mark;
+    if (parser.HandleNextDocument(mark) && parser.HandleNextDocument(mark)) {
+      throw ConfigError(name + ":" + std::to_string(mark.line() + 1) +
+                        ": expected one YAML document, found a second one");
+    }
+    return document;
+  } catch (const YAML::Exception& problem) {
+    throw ConfigError(name + ":" + std::to_string(problem.mark.line + 1) + ":" +
+                      std::to_string(problem.mark.column + 1) + ": " + problem.msg);
+  }
 }
 
 struct Yaml::File {
@@ -83,12 +130,7 @@ Yaml Yaml::load(const std::filesystem::path& file) {
 
 Yaml Yaml::parse(const std::string& text, const std::string& name) {
   auto file = std::make_shared<File>(File{name, text});
-  try {
-    return Yaml(file, YAML::Load(text), "");
-  } catch (const YAML::Exception& problem) {
-    throw ConfigError(name + ":" + std::to_string(problem.mark.line + 1) + ":" +
-                      std::to_string(problem.mark.column + 1) + ": " + problem.msg);
-  }
+  return Yaml(file, only_document(text, name), "");
 }
 
 ConfigError Yaml::error(const std::string& key, const std::string& what) const {
@@ -136,11 +178,7 @@ double Yaml::number(const std::string& key, double lowest, double highest) const
     throw error(key, "expected a number");
   }
   if (!std::isfinite(value)) throw error(key, "expected a finite number");
-  if (value < lowest || value > highest) {
-    std::ostringstream range;
-    range << value << " is outside " << lowest << " … " << highest;
-    throw error(key, range.str());
-  }
+  if (value < lowest || value > highest) throw error(key, outside(value, lowest, highest));
   return value;
 }
 
@@ -181,7 +219,8 @@ std::string Yaml::choice(const std::string& key, const std::vector<std::string>&
   throw error(key, "'" + value + "' is none of: " + all);
 }
 
-std::vector<double> Yaml::numbers(const std::string& key, int count) const {
+std::vector<double> Yaml::numbers(const std::string& key, int count, double lowest,
+                                  double highest) const {
   std::vector<double> values;
   try {
     values = child(key).as<std::vector<double>>();
@@ -194,6 +233,7 @@ std::vector<double> Yaml::numbers(const std::string& key, int count) const {
   }
   for (const double value : values) {
     if (!std::isfinite(value)) throw error(key, "expected finite numbers");
+    if (value < lowest || value > highest) throw error(key, outside(value, lowest, highest));
   }
   return values;
 }
@@ -220,7 +260,7 @@ Eigen::Vector3d Yaml::vector3(const std::string& key) const {
 
 Pose Yaml::pose(const std::string& key) const {
   const Yaml yaml = section(key);
-  const Eigen::Vector3d position = yaml.vector3("position_m");
+  const Eigen::Vector3d position(yaml.numbers("position_m", 3, -1000, 1000).data());
   if (yaml.has("rotation_wxyz")) {
     const auto wxyz = yaml.numbers("rotation_wxyz", 4);
     const Eigen::Quaterniond q(wxyz[0], wxyz[1], wxyz[2], wxyz[3]);
@@ -229,7 +269,8 @@ Pose Yaml::pose(const std::string& key) const {
     return make_pose(q, position);
   }
   if (!yaml.has("rpy_deg")) return make_pose(Eigen::Quaterniond::Identity(), position);
-  const Eigen::Vector3d rpy = yaml.vector3("rpy_deg") * (M_PI / 180);
+  const Eigen::Vector3d rpy =
+      Eigen::Vector3d(yaml.numbers("rpy_deg", 3, -3600, 3600).data()) * (M_PI / 180);
   using Eigen::AngleAxisd;
   using Eigen::Vector3d;
   return make_pose(AngleAxisd(rpy.z(), Vector3d::UnitZ()) * AngleAxisd(rpy.y(), Vector3d::UnitY()) *

@@ -54,12 +54,14 @@ class Yaml {
   /// One of `choices`.
   std::string choice(const std::string& key, const std::vector<std::string>& choices) const;
   /// A list of numbers; exactly `count` of them unless count < 0.
-  std::vector<double> numbers(const std::string& key, int count = -1) const;
+  std::vector<double> numbers(const std::string& key, int count = -1,
+                              double lowest = std::numeric_limits<double>::lowest(),
+                              double highest = std::numeric_limits<double>::max()) const;
   std::vector<std::int64_t> integers(const std::string& key) const;
   std::vector<std::string> texts(const std::string& key) const;
   Eigen::Vector3d vector3(const std::string& key) const;
   /// {position_m: [x, y, z], rotation_wxyz: [w, x, y, z]} or {position_m: …, rpy_deg: [r, p, y]}
-  /// with R = Rz(y) Ry(p) Rx(r); a missing rotation is the identity.
+  /// with R = Rz(y) Ry(p) Rx(r); a missing rotation is the identity. Positions are within 1 km.
   Pose pose(const std::string& key) const;
 
   Yaml section(const std::string& key) const;
@@ -86,6 +88,10 @@ class Yaml {
   struct Usage;
   std::shared_ptr<Usage> usage_;
 };
+
+/// The only YAML document of `text`; null if it is empty. `name` stands in errors.
+/// @throws ConfigError also where a second document begins, which a reader would pass over.
+YAML::Node only_document(const std::string& text, const std::string& name);
 
 // For state files that a process writes and Yaml reads again: `text` in YAML's double quoted style
 // (control characters become spaces), and [a, b, …] with exact numbers.

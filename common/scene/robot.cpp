@@ -21,8 +21,7 @@ Shape load_shape(const Yaml& yaml) {
   const std::string kind = yaml.choice("shape", {"box", "cylinder", "capsule", "sphere"});
   if (kind == "box") {
     shape.kind = Shape::Kind::kBox;
-    shape.half_size_m = yaml.vector3("size_m") / 2;
-    if (shape.half_size_m.minCoeff() <= 0) throw yaml.error("size_m", "sides must be positive");
+    shape.half_size_m = Eigen::Vector3d(yaml.numbers("size_m", 3, 1e-4, 10).data()) / 2;
   } else {
     shape.half_size_m.x() = yaml.number("radius_m", 1e-4, 10);
     if (kind != "sphere") shape.half_size_m.y() = yaml.number("length_m", 1e-4, 10) / 2;
@@ -54,20 +53,21 @@ RobotJoint load_joint(const Yaml& yaml, const Servo& servo, const Signals& signa
   joint.name = yaml.text("name");
   const bool is_revolute = yaml.choice("type", {"revolute", "prismatic"}) == "revolute";
   joint.kind = is_revolute ? RobotJoint::Kind::kRevolute : RobotJoint::Kind::kPrismatic;
-  joint.axis = yaml.vector3("axis");
+  joint.axis = Eigen::Vector3d(yaml.numbers("axis", 3, -1e6, 1e6).data());
   if (joint.axis.norm() < 1e-9) throw yaml.error("axis", "must not be zero");
   joint.axis.normalize();
   const std::string unit = is_revolute ? "_deg" : "_m";
   const double scale = is_revolute ? kDegree : 1;
-  const std::vector<double> range = yaml.numbers("range" + unit, 2);
+  const std::vector<double> range = yaml.numbers("range" + unit, 2, -1e6, 1e6);
   if (range[0] >= range[1]) throw yaml.error("range" + unit, "must ascend");
   joint.lower = range[0] * scale;
   joint.upper = range[1] * scale;
   joint.max_speed = yaml.number("max_speed" + unit + "_per_s", 1e-3, 1e4) * scale;
   joint.servo = yaml.has("servo") ? load_servo(yaml.section("servo")) : servo;
   joint.signal = signal_index(signals, yaml, "signal");
-  joint.gain = yaml.number("gain" + unit + "_per_unit") * scale;
-  joint.offset = yaml.number("offset" + unit) * scale;
+  // A joint may need very small or large commands; what it does is bounded by its range.
+  joint.gain = yaml.number("gain" + unit + "_per_unit", -1e9, 1e9) * scale;
+  joint.offset = yaml.number("offset" + unit, -1e6, 1e6) * scale;
   return joint;
 }
 

@@ -6,6 +6,7 @@
 #include <CLI/CLI.hpp>
 #include <algorithm>
 #include <iostream>
+#include <list>
 #include <map>
 #include <memory>
 #include <set>
@@ -15,6 +16,7 @@
 #include <vector>
 
 #include "common/bus/all_channels.h"
+#include "common/bus/rig_door.h"
 
 namespace bodyschema {
 namespace {
@@ -28,6 +30,7 @@ struct Arguments {
   bool json = false;
   bool check = false;
   bool replay_from = false;
+  std::string rigs;
   std::string thin;
   std::vector<std::string> channels;
   std::string copy;
@@ -75,6 +78,10 @@ void run_log(const Arguments& arguments) {
     std::cout << thin_log(file, arguments.thin) << " events in " << arguments.thin << std::endl;
     return;
   }
+  if (!arguments.rigs.empty()) {
+    std::cout << rig_of(file, arguments.rigs).filename().string() << std::endl;
+    return;
+  }
   if (!arguments.copy.empty()) return copy_channels(file, arguments.channels, arguments.copy);
   const LogSummary summary = summarize_log(file);
   const std::string flaws = flaws_text(summary);
@@ -92,6 +99,67 @@ void run_log(const Arguments& arguments) {
 }
 
 }  // namespace
+
+std::filesystem::path rig_of(const std::filesystem::path& log, const std::filesystem::path& rigs) {
+  struct Candidate {
+    std::filesystem::path folder;
+    RigDoor door;
+  };
+  std::list<Candidate> candidates;
+  std::string against;  // one line for each rig that it is not
+  const auto rule_out = [&](const std::filesystem::path& folder, const std::string& why) {
+    against += fmt::format("\n  {}: {}", folder.filename().string(), why);
+  };
+  std::vector<std::filesystem::path> folders;
+  for (const auto& entry : std::filesystem::directory_iterator(rigs))
+    if (entry.is_directory()) folders.push_back(entry.path());
+  std::sort(folders.begin(), folders.end());
+  for (const std::filesystem::path& folder : folders) {
+    try {
+      candidates.push_back({folder, RigDoor(folder)});
+    } catch (const std::exception& error) {
+      rule_out(folder, error.what());
+    }
+  }
+  // What is repeated says nothing new, and a log may be long.
+  constexpr int kEnough = 1000;
+  int num_judged = 0;
+  LogReader reader(log, OnDamage::kSkip);
+  while (num_judged < kEnough && reader.next()) {
+    const LogEvent& event = reader.event();
+    const auto judge_by = [&]<class Message>(const Channel<Message>& channel) {
+      if (event.channel != channel.name) return;
+      const auto message = decode<Message>(event.data.data(), event.data.size()).message;
+      if (!message) return;
+      ++num_judged;
+      std::erase_if(candidates, [&](const Candidate& candidate) {
+        const std::string why_not = candidate.door.objection(*message);
+        if (!why_not.empty())
+          rule_out(candidate.folder, std::string(channel.name) + ": " + why_not);
+        return !why_not.empty();
+      });
+    };
+    judge_by(kCameraInfo);
+    judge_by(kMarkerPoses);
+    judge_by(kMotionStatus);
+    judge_by(kSample);
+    judge_by(kBodySchema);
+  }
+  if (num_judged == 0)
+    throw std::runtime_error(log.string() + ": says nothing of its rig; type --rig RIG");
+  if (candidates.empty()) {
+    throw std::runtime_error(fmt::format("{}: of none of the rigs in {}; type --rig RIG{}",
+                                         log.string(), rigs.string(), against));
+  }
+  if (candidates.size() > 1) {
+    std::string names;
+    for (const Candidate& candidate : candidates)
+      names += (names.empty() ? "" : ", ") + candidate.folder.filename().string();
+    throw std::runtime_error(log.string() + ": may be of several rigs: " + names +
+                             "; type --rig RIG");
+  }
+  return candidates.front().folder;
+}
 
 nlohmann::ordered_json log_json(const LogSummary& summary) {
   nlohmann::ordered_json json = {
@@ -177,6 +245,9 @@ void add_log_command(CLI::App& console) {
                 "Fail unless it is whole and every message of ours can be read");
   log->add_flag("--replay-from", arguments->replay_from,
                 "Print the channel from which a replay can learn: MARKER_POSES or SAMPLE");
+  log->add_option("--rig-of", arguments->rigs,
+                  "Print the name of the rig in this folder that was recorded")
+      ->type_name("FOLDER");
   log->add_option("--thin", arguments->thin,
                   "Write a small copy: no images, no ground truth, nothing twice")
       ->type_name("FILE");

@@ -16,6 +16,10 @@ namespace bodyschema {
 /// Adds `log`: what an LCM log holds, and whether it is whole and of this version.
 void add_log_command(CLI::App& console);
 
+/// The one rig folder below `rigs` to which all that the log tells may belong: cameras, tags,
+/// signals, parts. @throws std::runtime_error if there is none or several.
+std::filesystem::path rig_of(const std::filesystem::path& log, const std::filesystem::path& rigs);
+
 /// `log --json`.
 nlohmann::ordered_json log_json(const LogSummary& summary);
 /// A table of the channels, and a line for every flaw.

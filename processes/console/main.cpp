@@ -6,6 +6,7 @@
 #include <iostream>
 #include <stdexcept>
 
+#include "common/bus/log_summary.h"
 #include "processes/console/driver_test.h"
 #include "processes/console/engineered_model.h"
 #include "processes/console/fault.h"
@@ -17,9 +18,17 @@
 #include "processes/console/status.h"
 #include "processes/console/watch.h"
 
+namespace {
+constexpr int kWrongUsage = 2;
+}
+
 int main(int argc, char** argv) {
   CLI::App console("A robot arm's body schema: learn it, look at it, judge it", "bodyschema");
   console.require_subcommand(1);
+  console.set_version_flag("--version", "bodyschema " + bodyschema::program_version());
+  console.footer(
+      "Exit codes: 0 a result; 1 the input, the bus or a file is at fault, or the arm did not do "
+      "it; 2 wrong usage.");
   bodyschema::add_offline_commands(console);
   bodyschema::add_monitor_command(console);
   bodyschema::add_engineer_command(console);
@@ -34,8 +43,10 @@ int main(int argc, char** argv) {
     console.parse(argc, argv);
     // A full disk must not look like a result.
     if (!std::cout.flush()) throw std::runtime_error("stdout: the result could not be written");
+  } catch (const CLI::RuntimeError& error) {
+    return console.exit(error);  // the result was printed
   } catch (const CLI::ParseError& error) {
-    return console.exit(error);
+    return console.exit(error) == 0 ? 0 : kWrongUsage;
   } catch (const std::exception& error) {
     std::fprintf(stderr, "bodyschema: %s\n", error.what());
     return 1;

@@ -83,10 +83,7 @@ AdaptationOptions options_of(const MonitorArguments& arguments, const Recording&
     options.least_noise_scale = 1;
   }
   if (!arguments.noise.empty()) {
-    for (const double noise : arguments.noise)
-      if (!std::isfinite(noise) || noise <= 0)
-        throw std::invalid_argument("--noise: expected two standard deviations above 0");
-    options.noise.noise = Noise{arguments.noise[0], arguments.noise[1] * M_PI / 180};
+    options.noise.noise = noise_given(arguments.noise);
   } else if (!recording.has_noise) {
     if (!(schema.noise.position_m > 0 && schema.noise.rotation_rad > 0))
       throw std::invalid_argument(arguments.samples + " and " + arguments.schema +
@@ -94,6 +91,19 @@ AdaptationOptions options_of(const MonitorArguments& arguments, const Recording&
     options.noise.noise = schema.noise;
   }
   return options;
+}
+
+void tell_noise(const MonitorArguments& arguments, const Recording& recording,
+                const BodySchema& schema) {
+  if (arguments.noise.empty() && recording.has_noise) {
+    std::cerr << "noise: the covariances of " << arguments.samples << "\n";
+    return;
+  }
+  const bool is_given = !arguments.noise.empty();
+  const Noise noise = is_given ? noise_given(arguments.noise) : schema.noise;
+  std::cerr << fmt::format("noise per axis and marker: {:.2f} mm {:.2f}°, {}\n",
+                           noise.position_m * 1e3, noise.rotation_rad * 180 / M_PI,
+                           is_given ? "given" : "that of " + arguments.schema);
 }
 
 /// What keeps the schema true.
@@ -152,6 +162,7 @@ void run_monitor(const MonitorArguments& arguments) {
   check_out(arguments.out, {arguments.samples, arguments.schema, arguments.evaluate});
 
   const std::unique_ptr<Method> method = method_of(arguments, recording, schema);
+  tell_noise(arguments, recording, schema);
   int num_events = 0;
   for (const ActionPoseSample& sample : recording.samples) {
     for (const AdaptationEvent& event : method->on_sample(sample)) {

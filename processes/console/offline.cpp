@@ -1,5 +1,6 @@
 #include "processes/console/offline.h"
 
+#include <fmt/format.h>
 #include <unistd.h>
 
 #include <CLI/CLI.hpp>
@@ -19,6 +20,7 @@
 #include "common/config/rig.h"
 #include "processes/console/evaluation.h"
 #include "processes/console/recording.h"
+#include "processes/console/rig_check.h"
 #include "processes/console/schema_json.h"
 #include "processes/structure_learner/baseline/learn_baseline.h"
 #include "processes/structure_learner/learn.h"
@@ -29,6 +31,8 @@ namespace {
 Recording load(const std::string& file) {
   Recording recording = load_recording(file);
   if (!recording.damage.empty()) std::cerr << "bodyschema: " << recording.damage << std::endl;
+  for (const std::string& hint : recording.hints)
+    std::cerr << "bodyschema: " << file << ": " << hint << std::endl;
   return recording;
 }
 
@@ -44,13 +48,13 @@ struct LearnArguments {
 };
 
 /// The chapter's own method: a result to compare with.
-BodySchema learn_as_the_chapter(const Recording& recording,
-                                const std::vector<ActionPoseSample>& training,
-                                const LearnOptions& options) {
+LearnResult learn_as_the_chapter(const Recording& recording,
+                                 const std::vector<ActionPoseSample>& training,
+                                 const LearnOptions& options) {
   BaselineOptions baseline;
   baseline.root = options.root;
   // The model error is one of relative poses, which have two markers.
-  Noise noise = marker_noise(training, static_cast<int>(recording.signals.size()), options);
+  SourcedNoise noise = marker_noise(training, static_cast<int>(recording.signals.size()), options);
   noise.position_m = std::hypot(noise.position_m, options.model_error.position_m * M_SQRT1_2);
   noise.rotation_rad = std::hypot(noise.rotation_rad, options.model_error.rotation_rad * M_SQRT1_2);
   baseline.set_noise(noise);
@@ -58,21 +62,18 @@ BodySchema learn_as_the_chapter(const Recording& recording,
   const BaselineResult result = learn_baseline(recording.signals, training, baseline);
   std::cerr << result.num_fits << " local models learned, " << result.num_valid << " valid, "
             << result.seconds << " s" << std::endl;
-  return result.schema;
+  LearnResult learned;
+  learned.schema = result.schema;
+  learned.noise_source = noise.source;
+  return learned;
 }
 
 void run_learn(const LearnArguments& arguments) {
-  const Recording recording = load(arguments.samples);
   LearnOptions options;
+  if (!arguments.noise.empty()) options.noise = noise_given(arguments.noise);
+  const Recording recording = load(arguments.samples);
   options.root = arguments.root;
   if (recording.is_log) options.model_error = kTagModelError;
-  if (!arguments.noise.empty()) {
-    options.noise = Noise{arguments.noise[0], arguments.noise[1] * M_PI / 180};
-    for (const double noise : arguments.noise) {
-      if (!std::isfinite(noise) || noise <= 0)
-        throw std::invalid_argument("--noise: expected two standard deviations above 0");
-    }
-  }
   check_out(arguments.out, {arguments.samples});
   const std::vector<ActionPoseSample> training = recording.training();
   if (options.root) {
@@ -86,7 +87,7 @@ void run_learn(const LearnArguments& arguments) {
   }
   LearnResult result;
   if (arguments.method == "chapter") {
-    result.schema = learn_as_the_chapter(recording, training, options);
+    result = learn_as_the_chapter(recording, training, options);
   } else {
     result = learn(recording.signals, training, options);
   }
@@ -101,9 +102,10 @@ void run_learn(const LearnArguments& arguments) {
     write_one_event_log(arguments.out, kBodySchema, message);
   }
   if (arguments.json) {
-    std::cout << structure_json(result.schema, result.outliers).dump(2) << std::endl;
+    std::cout << structure_json(result.schema, result.outliers, result.noise_source).dump(2)
+              << std::endl;
   } else {
-    std::cout << structure_text(result.schema) << std::flush;
+    std::cout << structure_text(result.schema, result.noise_source) << std::flush;
   }
 }
 
@@ -129,7 +131,7 @@ void run_show(const std::string& schema_file, bool json) {
 }
 
 struct RigArguments {
-  std::string folder;
+  std::string rig;
   std::optional<int> hidden_part;
   std::vector<std::string> group;
   std::string host;
@@ -143,16 +145,20 @@ std::string own_host(const Network& network) {
   return name.data();
 }
 
-/// Reads what several processes of a rig share; the first line of ./run's launch.
+/// Checks a rig and prints where its group would run: the line that ./run's launch reads.
 void run_rig(const RigArguments& arguments) {
-  const std::string& folder = arguments.folder;
+  const std::filesystem::path folder = find_rig(arguments.rig);
+  const RigCheck check = check_rig(folder);
+  for (const std::string& remark : check.remarks) std::cerr << "bodyschema: " << remark << "\n";
+  if (!check.problems.empty()) {
+    throw std::runtime_error(fmt::format("{}", fmt::join(check.problems, "\n")));
+  }
   const std::vector<int> parts = load_markers(folder).parts();
   if (arguments.hidden_part &&
       !std::binary_search(parts.begin(), parts.end(), *arguments.hidden_part)) {
-    throw std::invalid_argument("--hide: " + folder + " has no part " +
+    throw std::invalid_argument("--hide: " + folder.string() + " has no part " +
                                 std::to_string(*arguments.hidden_part));
   }
-  load_signals(folder);
   if (!arguments.initial.empty()) RigDoor(folder).load_initial_schema(arguments.initial);
   const Network network = load_network(folder, arguments.group);
   const std::string host = arguments.host.empty() ? own_host(network) : arguments.host;
@@ -160,7 +166,9 @@ void run_rig(const RigArguments& arguments) {
             << network.images_url() << ' ' << host;
   for (const std::string& process : host == "all" ? arguments.group : network.share_of(host))
     std::cout << ' ' << process;
-  std::cout << std::endl;
+  std::cout << fmt::format("\nOK: {} parts, {} signals, {} tags\n", check.num_parts,
+                           check.num_signals, check.num_tags)
+            << std::flush;
 }
 
 }  // namespace
@@ -183,6 +191,22 @@ Recording load_for(const std::string& file, const BodySchema& schema) {
   return recording;
 }
 
+Noise noise_given(const std::vector<double>& numbers) {
+  const auto refuse = [](const std::string& why) { throw CLI::ValidationError("--noise", why); };
+  for (const double number : numbers)
+    if (!std::isfinite(number) || number <= 0) refuse("expected two standard deviations above 0");
+  const Noise noise{numbers[0], numbers[1] * M_PI / 180};
+  if (noise.position_m > kNoiseCeiling.position_m) {
+    refuse(fmt::format("{} m is no noise of a marker; did you mean: --noise {} {}", numbers[0],
+                       numbers[0] / 1000, numbers[1]));
+  }
+  if (noise.rotation_rad > kNoiseCeiling.rotation_rad) {
+    refuse(fmt::format("{} degrees are no noise of a marker; at most {:.0f} are", numbers[1],
+                       kNoiseCeiling.rotation_rad * 180 / M_PI));
+  }
+  return noise;
+}
+
 void check_out(const std::string& out, const std::vector<std::string>& inputs) {
   std::error_code is_new;
   for (const std::string& input : inputs)
@@ -198,7 +222,7 @@ void add_offline_commands(CLI::App& console) {
   const auto learning = std::make_shared<LearnArguments>();
   CLI::App* learn =
       console.add_subcommand("learn", "Learn a body schema from a recording (LCM log or CSV)");
-  learn->add_option("SAMPLES", learning->samples, "Recording")->required();
+  learn->add_option("SAMPLES", learning->samples, "Recording; - reads stdin")->required();
   learn->add_option("--out", learning->out, "Write the schema to this file");
   learn->add_option("--root", learning->root, "Root part; the lowest id if not given");
   learn
@@ -237,8 +261,10 @@ void add_offline_commands(CLI::App& console) {
 
   const auto checking = std::make_shared<RigArguments>();
   CLI::App* rig = console.add_subcommand(
-      "rig", "Check a rig's files; print its network: kind, bus, images, this host, its processes");
-  rig->add_option("FOLDER", checking->folder, "Rig, e.g. config/arm7")->required();
+      "rig",
+      "Check every file of a rig by its process's own reader, and against the others; print its "
+      "network (kind, bus, images, this host, its processes) and what it has");
+  rig->add_option("RIG", checking->rig, "Folder, or name of one in config/")->required();
   rig->add_option("--hide", checking->hidden_part, "A part that is to be hidden: is there one?");
   rig->add_option("--group", checking->group, "All processes; each must run on exactly one host");
   rig->add_option("--host", checking->host, "Host of network.yaml; this machine if not given");

@@ -25,6 +25,10 @@ BodySchema load_schema(const std::filesystem::path& file);
 /// whole is said on stderr. @throws std::runtime_error.
 Recording load_for(const std::string& file, const BodySchema& schema);
 
+/// The two numbers of `--noise POS_M ROT_DEG`. @throws CLI::ValidationError where they are not
+/// above 0 or no noise of a marker, and may be in another unit.
+Noise noise_given(const std::vector<double>& numbers);
+
 /// @throws std::invalid_argument if `out` would be written over one of `inputs`.
 void check_out(const std::string& out, const std::vector<std::string>& inputs);
 

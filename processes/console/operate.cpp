@@ -17,6 +17,7 @@
 #include <vector>
 
 #include "common/bus/bus.h"
+#include "processes/console/hint.h"
 
 namespace bodyschema {
 namespace {
@@ -28,6 +29,7 @@ constexpr std::int64_t kTargetPeriod_us = 1'000'000;
 constexpr std::int64_t kCommandPeriod_us = 200'000;
 constexpr std::int64_t kSilent_us = 3'000'000;
 constexpr std::int64_t kPatience_us = 5'000'000;  // for what is answered at once
+constexpr std::int64_t kAlone_us = 2'500'000;     // twice what the processes of a group repeat in
 
 volatile std::sig_atomic_t interrupted = 0;
 void on_signal(int) { interrupted = 1; }
@@ -154,6 +156,24 @@ std::optional<pose_target_t> TargetFollower::on_tick(std::int64_t now_us) {
   return target_;
 }
 
+void TargetFollower::interrupt() {
+  if (end_ == End::kOpen) end_ = End::kInterrupted;
+}
+
+pose_target_t TargetFollower::withdrawal() const {
+  pose_target_t target{};
+  target.utime = target_.utime;
+  target.sender = target_.sender;
+  target.epoch = target_.epoch;
+  target.target_id = target_.target_id + 1;
+  target.target_part = -1;
+  target.keep_s = -1;
+  // A controller that did not acknowledge may have the arm, and the target in its queue.
+  const bool is_babblers = is_acknowledged_ && status_.owns_arm == 0;
+  target.target_kind = is_babblers ? pose_target_t::KIND_RELEASE : pose_target_t::KIND_HOLD;
+  return target;
+}
+
 std::string TargetFollower::progress() const {
   if (!is_acknowledged_) {
     return has_controller_ ? "waiting for the controller to take up the target"
@@ -190,10 +210,10 @@ std::string target_json(const control_status_t& status, TargetFollower::End end)
   };
   const nlohmann::ordered_json json = {
       {"reached", end == TargetFollower::End::kAsked},
-      {"state",
-       end == TargetFollower::End::kTimedOut ? "timed out"
-       : end == TargetFollower::End::kMissed ? "missed"
-                                             : name_of_state(status.control_state)},
+      {"state", end == TargetFollower::End::kTimedOut      ? "timed out"
+                : end == TargetFollower::End::kInterrupted ? "interrupted"
+                : end == TargetFollower::End::kMissed      ? "missed"
+                                                           : name_of_state(status.control_state)},
       {"why", status.why},
       {"predicted_error_m", metres(status.predicted_error_m)},
       {"observed_error_m", metres(status.observed_error_m)},
@@ -233,6 +253,23 @@ struct OperateArguments {
   bool json = false;
 };
 
+/// Nobody waits longer; microseconds of it are far from overflow [s].
+constexpr double kLongest_s = 1e7;
+
+/// CLI::Range lets "nan" pass.
+CLI::Validator within(double lowest, double highest) {
+  return CLI::Validator(
+      [=](std::string& text) {
+        double value = NAN;
+        const bool is_number = CLI::detail::lexical_cast(text, value);
+        return is_number && value >= lowest && value <= highest
+                   ? std::string()
+                   : fmt::format("expected a number within {} … {}, found '{}'", lowest, highest,
+                                 abbreviated(text));
+      },
+      "NUMBER");
+}
+
 /// The result is on stdout; exit code 1.
 [[noreturn]] void fail() {
   if (!std::cout.flush()) throw std::runtime_error("stdout: the result could not be written");
@@ -244,18 +281,67 @@ void watch_signals() {
   std::signal(SIGTERM, on_signal);
 }
 
+/// Whether anybody is on the bus: whoever lives there says so once a second.
+class Company {
+ public:
+  Company(Bus& bus, std::string url) : url_(std::move(url)) {
+    bus.subscribe<process_info_t>(kProcessInfo, [this](const auto&) { is_heard_ = true; });
+    bus.subscribe<motion_status_t>(kMotionStatus, [this](const auto&) { is_heard_ = true; });
+    bus.subscribe<control_status_t>(kControlStatus, [this](const auto&) { is_heard_ = true; });
+  }
+  /// @throws std::runtime_error with what to type once nobody can be there.
+  void expect() const {
+    if (is_heard_ || clock_us() - start_us_ < kAlone_us) return;
+    throw std::runtime_error(
+        "nothing is heard on " + url_ +
+        ": no group runs there. ./run --keep starts one, ./run exec bodyschema "
+        "… speaks to one that runs");
+  }
+
+ private:
+  const std::string url_;
+  const std::int64_t start_us_ = clock_us();
+  bool is_heard_ = false;
+};
+
 /// Runs until the follower has come to an end; `also` on every turn.
-void follow(Bus& bus, TargetFollower& follower, ProgressLine& line,
+void follow(Bus& bus, const Company& company, TargetFollower& follower, ProgressLine& line,
             const std::function<void(std::int64_t)>& also = nullptr) {
   bus.subscribe<control_status_t>(
       kControlStatus, [&](const control_status_t& m) { follower.on_control_status(m); });
   bus.subscribe<process_info_t>(kProcessInfo,
                                 [&](const process_info_t& m) { follower.on_process_info(m); });
-  while (follower.end() == TargetFollower::End::kOpen && !interrupted) {
+  while (follower.end() == TargetFollower::End::kOpen) {
+    company.expect();
+    if (interrupted) follower.interrupt();
     if (const auto target = follower.on_tick(clock_us())) bus.publish(kPoseTarget, *target);
     if (also) also(clock_us());
     line.show(follower.progress());
     bus.handle(std::chrono::milliseconds(50));
+  }
+}
+
+/// Makes the controller drop what `follower` follows no longer; says what became of it.
+std::string withdraw(Bus& bus, const Company& company, const TargetFollower& follower) {
+  interrupted = 0;  // a second Ctrl-C ends this too
+  const pose_target_t withdrawal = follower.withdrawal();
+  TargetFollower dropped(withdrawal, kPatience_us);
+  {
+    ProgressLine line;
+    follow(bus, company, dropped, line);
+  }
+  switch (dropped.end()) {
+    case TargetFollower::End::kAsked:
+      return withdrawal.target_kind == pose_target_t::KIND_HOLD
+                 ? "the target was dropped: the arm is held until another target or: " +
+                       to_type("release")
+                 : "the target was dropped: the arm is the babbler's";
+    case TargetFollower::End::kRefused:
+      return dropped.status().why;
+    default:
+      return "the controller does not say that it dropped the target, so the arm may move; it is "
+             "stopped by: " +
+             to_type("halt");
   }
 }
 
@@ -269,17 +355,21 @@ void run_target(const OperateArguments& arguments) {
   }
   watch_signals();
   Bus bus(arguments.in, arguments.in);
+  const Company company(bus, arguments.in);
   TargetFollower follower(target, std::llround(arguments.timeout_s * 1e6), arguments.tolerance_m);
   bus.subscribe<motion_status_t>(kMotionStatus,
                                  [&](const motion_status_t& m) { follower.on_motion_status(m); });
   {
     ProgressLine line;
-    follow(bus, follower, line);
+    follow(bus, company, follower, line);
   }
   control_status_t status = follower.status();
-  if (interrupted) status.why = "interrupted; the controller goes on: bodyschema release ends it";
+  if (follower.end() == TargetFollower::End::kInterrupted) {
+    status.why = "interrupted; " + withdraw(bus, company, follower);
+  }
   if (follower.end() == TargetFollower::End::kTimedOut) {
-    status.why = fmt::format("no end within {} s; {}", arguments.timeout_s, follower.diagnosis());
+    status.why = fmt::format("no end within {} s; {}; {}", arguments.timeout_s,
+                             follower.diagnosis(), withdraw(bus, company, follower));
   }
   const bool is_reached = follower.end() == TargetFollower::End::kAsked;
   if (arguments.json) {
@@ -296,12 +386,14 @@ void run_target(const OperateArguments& arguments) {
                              millimetres(status.observed_error_m), status.num_moves);
   }
   if (!is_reached) fail();
-  if (arguments.keep_s < 0) std::cerr << "The arm stays there until: bodyschema release\n";
+  if (arguments.keep_s < 0)
+    std::cerr << "The arm stays there until: " << to_type("release") << "\n";
 }
 
 void run_hold(const OperateArguments& arguments) {
   watch_signals();
   Bus bus(arguments.in, arguments.in);
+  const Company company(bus, arguments.in);
   const pose_target_t target = make_target(pose_target_t::KIND_HOLD);
   TargetFollower follower(target, kPatience_us);
   const action_command_t command =
@@ -319,7 +411,7 @@ void run_hold(const OperateArguments& arguments) {
   };
   {
     ProgressLine line;
-    follow(bus, follower, line, tell_driver);
+    follow(bus, company, follower, line, tell_driver);
     const std::int64_t end_us = clock_us() + kPatience_us;
     while (!is_answered && clock_us() < end_us && !interrupted) {
       tell_driver(clock_us());
@@ -328,10 +420,11 @@ void run_hold(const OperateArguments& arguments) {
   }
   const bool is_held = follower.end() == TargetFollower::End::kAsked;
   std::cout << (is_answered ? "the driver holds" : "the driver does not answer") << "; "
-            << (is_held ? "the controller keeps the arm still until another target or: bodyschema "
-                          "release"
+            << (is_held ? "the controller keeps the arm still until another target or: " +
+                              to_type("release")
                         : "no controller keeps the arm still: the babbler goes on with its next "
-                          "action; bodyschema stop latches")
+                          "action; what latches is: " +
+                              to_type("halt"))
             << "\n";
   if (!is_held || !is_answered) fail();
 }
@@ -339,12 +432,13 @@ void run_hold(const OperateArguments& arguments) {
 void run_release(const OperateArguments& arguments) {
   watch_signals();
   Bus bus(arguments.in, arguments.in);
+  const Company company(bus, arguments.in);
   TargetFollower follower(make_target(pose_target_t::KIND_RELEASE), kPatience_us);
   bus.subscribe<motion_status_t>(kMotionStatus,
                                  [&](const motion_status_t& m) { follower.on_motion_status(m); });
   {
     ProgressLine line;
-    follow(bus, follower, line);
+    follow(bus, company, follower, line);
   }
   if (follower.end() != TargetFollower::End::kAsked) {
     throw std::runtime_error("release: " + follower.diagnosis());
@@ -355,6 +449,7 @@ void run_release(const OperateArguments& arguments) {
 void run_latch(const OperateArguments& arguments, std::int8_t kind) {
   watch_signals();
   Bus bus(arguments.in, arguments.in);
+  const Company company(bus, arguments.in);
   LatchFollower follower(kind, wall_clock_us());
   bool owns_arm = false;
   bus.subscribe<motion_status_t>(kMotionStatus,
@@ -363,19 +458,20 @@ void run_latch(const OperateArguments& arguments, std::int8_t kind) {
                                   [&](const control_status_t& m) { owns_arm = m.owns_arm == 1; });
   const std::int64_t end_us = clock_us() + kPatience_us;
   while (!follower.is_done() && clock_us() < end_us && !interrupted) {
+    company.expect();
     if (const auto command = follower.on_tick(clock_us())) bus.publish(kActionCommand, *command);
     bus.handle(std::chrono::milliseconds(50));
   }
-  const bool is_stop = kind == action_command_t::KIND_STOP;
+  const bool is_halt = kind == action_command_t::KIND_STOP;
   if (!follower.is_done()) {
     throw std::runtime_error(
-        std::string(is_stop ? "stop" : "resume") +
+        std::string(is_halt ? "halt" : "resume") +
         (follower.has_heard_driver()
              ? ": the driver was told for 5 s, but MOTION_STATUS does not say so"
              : ": no MOTION_STATUS for 5 s: does the driver run, and on this bus?"));
   }
-  if (is_stop) {
-    std::cout << "stopped, until: bodyschema resume\n";
+  if (is_halt) {
+    std::cout << "halted, until: " << to_type("resume") << "\n";
     return;
   }
   // Whether the arm is the controller's is repeated at 1 Hz.
@@ -384,10 +480,10 @@ void run_latch(const OperateArguments& arguments, std::int8_t kind) {
     bus.handle(std::chrono::milliseconds(50));
   }
   std::cout << "resumed; "
-            << (owns_arm ? "the controller holds the arm until another target or: bodyschema "
-                           "release"
-                         : "the babbler goes on if it is not done; a target that was dropped is "
-                           "not taken up again")
+            << (owns_arm
+                    ? "the controller holds the arm until another target or: " + to_type("release")
+                    : "the babbler goes on if it is not done; a target that was dropped is "
+                      "not taken up again")
             << "\n";
 }
 
@@ -404,28 +500,38 @@ void add_operate_commands(CLI::App& console) {
   CLI::App* target = add("target", "Bring a body part to a position", run_target);
   target->add_option("--part", arguments->part, "Body part")
       ->required()
-      ->check(CLI::NonNegativeNumber);
+      ->check(CLI::Range(0, 9999));
   target
       ->add_option("--position", arguments->position_m, "X Y Z of its origin in the root part [m]")
       ->required()
-      ->expected(3);
+      ->expected(3)
+      ->check(within(-1000, 1000));
   target
       ->add_option("--keep", arguments->keep_s,
                    "Stay so long [s] before the babbler gets the arm; default: until released")
-      ->check(CLI::NonNegativeNumber);
-  target->add_option("--timeout", arguments->timeout_s, "Follow it for so long [s]")
-      ->check(CLI::PositiveNumber);
+      ->check(within(0, kLongest_s));
+  target
+      ->add_option("--timeout", arguments->timeout_s,
+                   "Follow it for so long [s]; then it is dropped and the arm held")
+      ->check(within(1e-3, kLongest_s));
   target
       ->add_option("--tolerance", arguments->tolerance_m,
                    "Seen farther than this from the target [m], it was missed")
-      ->check(CLI::PositiveNumber);
+      ->check(within(1e-6, 1000));
   target->add_flag("--json", arguments->json, "The result as JSON");
   add("hold", "Stop where the arm is; nothing moves it until another target", run_hold);
   add("release", "Give the arm back to the babbler", run_release);
-  add("stop", "Stop the driver; latches until resume",
+  add("halt", "Stop the arm at once; latches until resume",
       [](const OperateArguments& a) { run_latch(a, action_command_t::KIND_STOP); });
-  add("resume", "End a stop",
+  add("resume", "End a halt",
       [](const OperateArguments& a) { run_latch(a, action_command_t::KIND_RESUME); });
+  // Both meanings were once typed so, and one of them ends everything.
+  CLI::App* stop = console.add_subcommand("stop", "Nothing: see halt, and ./run stop")->group("");
+  stop->allow_extras();
+  stop->callback([] {
+    throw CLI::ValidationError(
+        "stop", "`" + to_type("halt") + "` stops the arm; a group is ended by `./run stop`");
+  });
 }
 
 }  // namespace bodyschema

@@ -17,8 +17,9 @@ class App;
 
 namespace bodyschema {
 
-/// Adds `target`, `hold`, `release`, `stop` and `resume`: they talk on the bus, show progress on
-/// stderr, the result on stdout, and exit with 0 only where it is what was asked for.
+/// Adds `target`, `hold`, `release`, `halt` and `resume`: they talk on the bus, show progress on
+/// stderr, the result on stdout, and exit with 0 only where it is what was asked for. `stop` does
+/// nothing but say which of `halt` and `./run stop` may be meant.
 void add_operate_commands(CLI::App& console);
 
 /// Repeats one POSE_TARGET until CONTROL_STATUS acknowledges it, and follows it to its end.
@@ -30,6 +31,7 @@ class TargetFollower {
     kRefused,  ///< refused, held or given up for another target: see why()
     kMissed,   ///< reached by the schema, but seen more than the tolerance away
     kTimedOut,
+    kInterrupted,  ///< by the user
   };
 
   /// `timeout_us`: of the clock, from the first tick.
@@ -41,6 +43,12 @@ class TargetFollower {
   void on_motion_status(const motion_status_t& motion);
   /// The target when it is due: at 1 Hz until it is acknowledged. `now_us`: the clock.
   std::optional<pose_target_t> on_tick(std::int64_t now_us);
+  /// Ends what is open.
+  void interrupt();
+  /// What makes the controller drop the target when nobody follows it any longer: a hold, or a
+  /// release where the arm is the babbler's meanwhile. It is newer than this target only, so that
+  /// another sender's stays.
+  pose_target_t withdrawal() const;
 
   End end() const { return end_; }
   bool is_acknowledged() const { return is_acknowledged_; }

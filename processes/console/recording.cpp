@@ -1,19 +1,25 @@
 #include "processes/console/recording.h"
 
+#include <sys/mman.h>
+#include <unistd.h>
+#include <zlib.h>
+
 #include <algorithm>
+#include <cctype>
+#include <cerrno>
 #include <charconv>
 #include <cmath>
 #include <cstring>
-#include <fstream>
 #include <limits>
 #include <map>
+#include <memory>
 #include <set>
-#include <sstream>
 #include <string_view>
 
 #include "common/bus/check.h"
 #include "common/bus/convert.h"
 #include "common/bus/event_log.h"
+#include "processes/console/hint.h"
 
 namespace bodyschema {
 namespace {
@@ -21,7 +27,77 @@ namespace {
 constexpr double kUnitTolerance = 1e-3;
 /// Of any column. Squares, sums and microseconds of what is larger would overflow.
 constexpr double kLargest = 1e12;
+/// [bytes] Unpacked, and of what has to be in memory: more is no recording of an arm.
+constexpr std::size_t kLargestFile = 2'000'000'000;
+/// Every event of an LCM log begins so.
+constexpr std::string_view kLogMark = "\xED\xA1\xDA\x01";
 const std::vector<std::string> kPoseColumns = {"x", "y", "z", "qw", "qx", "qy", "qz"};
+
+/// A file or stdin ("-"), unpacked where gzip packed it.
+class Input {
+ public:
+  Input(const std::filesystem::path& file, std::string name)
+      : name_(std::move(name)),
+        is_stdin_(file == "-"),
+        file_(is_stdin_ ? gzdopen(dup(STDIN_FILENO), "rb") : gzopen(file.c_str(), "rb"), gzclose) {
+    if (!file_) throw RecordingError(name_ + ": cannot be read: no such file or no permission");
+  }
+
+  /// At most `size` bytes, fewer only at the end. @throws RecordingError also where more than
+  /// kLargestFile follow.
+  std::string read(std::size_t size) {
+    std::string content;
+    std::vector<char> buffer(std::min<std::size_t>(size, 1 << 20));
+    while (content.size() < size) {
+      const std::size_t wanted = std::min(buffer.size(), size - content.size());
+      const int count = gzread(file_.get(), buffer.data(), static_cast<unsigned>(wanted));
+      int problem = Z_OK;
+      const char* what = gzerror(file_.get(), &problem);
+      if (count < 0 || (problem != Z_OK && problem != Z_STREAM_END)) {
+        throw RecordingError(
+            name_ + ": cannot be read: " + (problem == Z_ERRNO ? std::strerror(errno) : what));
+      }
+      if (count == 0) return content;
+      content.append(buffer.data(), static_cast<std::size_t>(count));
+    }
+    if (size == kLargestFile) throw RecordingError(name_ + ": larger than 2 GB");
+    return content;
+  }
+
+  /// Neither packed nor stdin. To be asked after the first read().
+  bool is_plain_file() const { return !is_stdin_ && gzdirect(file_.get()) == 1; }
+
+ private:
+  const std::string name_;
+  const bool is_stdin_;
+  const std::unique_ptr<gzFile_s, int (*)(gzFile)> file_;
+};
+
+/// A file that is nowhere but in memory, for readers that want a path.
+class InMemory {
+ public:
+  explicit InMemory(const std::string& content) : file_(memfd_create("recording", MFD_CLOEXEC)) {
+    std::size_t written = 0;
+    while (file_ >= 0 && written < content.size()) {
+      const ssize_t count = ::write(file_, content.data() + written, content.size() - written);
+      if (count < 0 && errno == EINTR) continue;
+      if (count < 0) break;
+      written += static_cast<std::size_t>(count);
+    }
+    if (written == content.size()) return;
+    const std::string why = std::strerror(errno);
+    if (file_ >= 0) ::close(file_);
+    throw RecordingError("the recording cannot be unpacked: " + why);
+  }
+  ~InMemory() { ::close(file_); }
+  InMemory(const InMemory&) = delete;
+  InMemory& operator=(const InMemory&) = delete;
+
+  std::string path() const { return "/proc/self/fd/" + std::to_string(file_); }
+
+ private:
+  const int file_;
+};
 
 /// One line of a CSV file, cut into fields, that can point at each of them.
 class Row {
@@ -56,10 +132,10 @@ class Row {
     const std::string_view field = fields_[i];
     const auto [end, problem] = std::from_chars(field.data(), field.data() + field.size(), value);
     if (problem != std::errc() || end != field.data() + field.size() || !std::isfinite(value)) {
-      throw error(i, name + ": expected a finite number, found '" + std::string(field) + "'");
+      throw error(i, name + ": expected a finite number, found '" + abbreviated(field) + "'");
     }
     if (std::abs(value) > kLargest) {
-      throw error(i, name + ": expected a number within ±1e12, found '" + std::string(field) + "'");
+      throw error(i, name + ": expected a number within ±1e12, found '" + abbreviated(field) + "'");
     }
     return value;
   }
@@ -69,7 +145,7 @@ class Row {
     const std::string_view field = fields_[i];
     const auto [end, problem] = std::from_chars(field.data(), field.data() + field.size(), value);
     if (problem != std::errc() || end != field.data() + field.size() || value < 0) {
-      throw error(i, name + ": expected a whole number from 0, found '" + std::string(field) + "'");
+      throw error(i, name + ": expected a whole number from 0, found '" + abbreviated(field) + "'");
     }
     return value;
   }
@@ -90,12 +166,39 @@ struct Header {
   std::size_t size() const { return part + 1 + kPoseColumns.size() + (has_noise ? 2 : 0); }
 };
 
-Header parse_header(const Row& row) {
+/// "" or what another separator than ',' the fields of a line seem to have.
+std::string separator_hint(std::string_view line) {
+  for (const auto& [separator, name] :
+       {std::pair{';', "';'"}, std::pair{'\t', "tabs"}, std::pair{' ', "blanks"}}) {
+    if (std::count(line.begin(), line.end(), separator) >= 7)
+      return std::string("; fields look separated by ") + name + ", expected ','";
+  }
+  return "";
+}
+
+/// "" or that numbers of a line look like 0,125: commas between digits, nowhere a point.
+std::string decimal_comma_hint(std::string_view line) {
+  const auto is_digit = [&](std::size_t i) {
+    return i < line.size() && std::isdigit(static_cast<unsigned char>(line[i])) != 0;
+  };
+  int num_between_digits = 0;
+  bool has_fraction = false;
+  for (std::size_t i = 1; i < line.size(); ++i) {
+    if (line[i] != ',' || !is_digit(i - 1) || !is_digit(i + 1)) continue;
+    ++num_between_digits;
+    has_fraction |= is_digit(i + 2);
+  }
+  const bool is_likely =
+      num_between_digits > 2 && has_fraction && line.find('.') == std::string_view::npos;
+  return is_likely ? "; numbers look as if they had decimal commas, expected points" : "";
+}
+
+Header parse_header(const Row& row, const std::string& hint) {
   Header header;
   if (row[0] != "t") {
     throw row.error(
         0, "expected the header t,q1,...,qm,part,x,y,z,qw,qx,qy,qz[,sp_m,sr_deg], found '" +
-               std::string(row[0]) + "'");
+               abbreviated(row[0]) + "'" + hint);
   }
   std::size_t i = 1;
   std::set<std::string> names;
@@ -111,7 +214,14 @@ Header parse_header(const Row& row) {
   if (i == row.size()) throw row.error(i, "expected a column 'part' after the action signals");
   header.part = i++;
   for (const std::string& name : kPoseColumns) {
-    if (i == row.size() || row[i] != name) throw row.error(i, "expected the column '" + name + "'");
+    if (i == row.size() || row[i] != name) {
+      std::string what = "expected the column '" + name + "'";
+      if (i < row.size() && name == "qw" && row[i] == "qx")
+        what += "; quaternions are w x y z: put qw first";
+      if (i < row.size() && row[i].find("mm") != std::string_view::npos)
+        what += "; positions are in metres";
+      throw row.error(i, what);
+    }
     ++i;
   }
   if (i < row.size()) {
@@ -157,18 +267,18 @@ void sort_parts(Recording& recording) {
   }
 }
 
-Recording read_samples(const std::filesystem::path& file) {
+Recording read_samples(const std::filesystem::path& file, const std::string& name) {
   Recording recording;
   recording.is_log = true;
   recording.has_noise = true;
   LogReport report;
   const std::vector<sample_t> messages = read_log(file, kSample, &report);
   if (messages.empty()) {
-    throw RecordingError(file.string() + ": expected SAMPLE messages, found none in " +
+    throw RecordingError(name + ": expected SAMPLE messages, found none in " +
                          std::to_string(report.events) + " events");
   }
   if (report.truncated_at_byte) {
-    recording.damage = file.string() + ": ends in the middle of an event at byte " +
+    recording.damage = name + ": ends in the middle of an event at byte " +
                        std::to_string(*report.truncated_at_byte) + "; the " +
                        std::to_string(messages.size()) + " SAMPLEs before it are used";
   }
@@ -181,8 +291,8 @@ Recording read_samples(const std::filesystem::path& file) {
     sample.sample_index = static_cast<std::int64_t>(recording.samples.size());
     if (!recording.samples.empty() &&
         sample.action.size() != recording.samples.front().action.size()) {
-      throw RecordingError(file.string() + ": sample " + std::to_string(message.sample_index) +
-                           " has " + std::to_string(sample.action.size()) +
+      throw RecordingError(name + ": sample " + std::to_string(message.sample_index) + " has " +
+                           std::to_string(sample.action.size()) +
                            " action signals, the first one " +
                            std::to_string(recording.samples.front().action.size()));
     }
@@ -270,7 +380,9 @@ Recording parse_csv(const std::string& text, const std::string& name) {
     if (line.find_first_not_of(" \r") == std::string_view::npos) continue;
     const Row row(line, number, name);
     if (!header) {
-      header = parse_header(row);
+      std::string hint = separator_hint(line);
+      if (!hint.empty()) hint += decimal_comma_hint(rest.substr(0, rest.find('\n')));
+      header = parse_header(row, hint);
       for (const std::string& signal : header->signals)
         recording.signals.push_back({.name = signal});
       recording.has_noise = header->has_noise;
@@ -278,8 +390,10 @@ Recording parse_csv(const std::string& text, const std::string& name) {
     }
     if (row.size() != header->size()) {
       // At the first field too many, or at the last one there is.
-      throw row.error(header->size(), "expected " + std::to_string(header->size()) +
-                                          " fields, found " + std::to_string(row.size()));
+      throw row.error(header->size(),
+                      "expected " + std::to_string(header->size()) + " fields, found " +
+                          std::to_string(row.size()) + separator_hint(line) +
+                          (row.size() > header->size() ? decimal_comma_hint(line) : ""));
     }
     const double t = row.number(0, "t");
     Eigen::VectorXd action(header->signals.size());
@@ -319,25 +433,30 @@ Recording parse_csv(const std::string& text, const std::string& name) {
     recording.signals[i].lower = observed[i].lower;
     recording.signals[i].upper = observed[i].upper;
   }
+  recording.hints = hints_of(recording);
   return recording;
 }
 
 Recording load_recording(const std::filesystem::path& file) {
-  if (std::filesystem::is_directory(file)) {
-    throw RecordingError(file.string() + ": expected a CSV file or an LCM log, found a folder");
+  const std::string name = file == "-" ? "stdin" : file.string();
+  if (std::filesystem::is_directory(file))
+    throw RecordingError(name + ": expected a CSV file or an LCM log, found a folder");
+  Input input(file, name);
+  std::string content = input.read(kLogMark.size());
+  if (content == kLogMark && input.is_plain_file()) return read_samples(file, name);
+  content += input.read(kLargestFile);
+  if (!content.starts_with(kLogMark)) return parse_csv(content, name);
+  const InMemory unpacked(content);
+  try {
+    return read_samples(unpacked.path(), name);
+  } catch (const RecordingError&) {
+    throw;
+  } catch (const std::runtime_error& error) {
+    std::string what = error.what();
+    const std::string path = unpacked.path();
+    if (what.starts_with(path)) what.replace(0, path.size(), name);
+    throw RecordingError(what);
   }
-  std::ifstream stream(file, std::ios::binary);
-  if (!stream)
-    throw RecordingError(file.string() + ": cannot be read: no such file or no permission");
-  char magic[4] = {};
-  stream.read(magic, sizeof magic);
-  if (stream.gcount() == 4 && std::memcmp(magic, "\xED\xA1\xDA\x01", 4) == 0)
-    return read_samples(file);
-  stream.clear();
-  stream.seekg(0);
-  std::stringstream text;
-  text << stream.rdbuf();
-  return parse_csv(text.str(), file.string());
 }
 
 }  // namespace bodyschema

@@ -28,6 +28,8 @@ struct Recording {
   bool is_log = false;
   /// What keeps a log from being whole, for people: "" if nothing does. What precedes it was read.
   std::string damage;
+  /// Of a CSV, for people: what is read as it stands but looks like another unit or order.
+  std::vector<std::string> hints;
 
   /// Samples that may be learned from, as the structure learner does: TRAIN and PROBE. A CSV has
   /// TRAIN only.
@@ -41,6 +43,7 @@ struct Recording {
 /// one row per instant and seen part: t [s], action signals, part id, position [m], unit quaternion
 /// of the part in the reference frame; optionally the standard deviations per axis of position [m]
 /// and rotation [deg]. Rows with equal t are one instant, wherever they stand, and have one action.
+/// Either may be packed by gzip; "-" is stdin.
 /// @throws RecordingError.
 Recording load_recording(const std::filesystem::path& file);
 
@@ -56,5 +59,10 @@ std::vector<ActionPoseSample> samples_by_signals(const Recording& recording,
 
 /// The CSV reader alone; `name` stands in errors.
 Recording parse_csv(const std::string& text, const std::string& name);
+
+/// What speaks for other units or another order than a CSV's: positions that spread over more than
+/// 10 m, standard deviations above 0.1 m, rotations that make a body of the parts only when read
+/// as x y z w. No evidence, no hint; none changes what is read.
+std::vector<std::string> hints_of(const Recording& recording);
 
 }  // namespace bodyschema

@@ -28,6 +28,25 @@ std::string reason_text(const UnconnectedPart& part) {
   return part.detail.empty() || part.detail == name ? name : name + ": " + part.detail;
 }
 
+/// Its key in JSON, and for people.
+std::pair<const char*, const char*> name_of(NoiseSource source) {
+  switch (source) {
+    case NoiseSource::kGiven:
+      return {"given", "given"};
+    case NoiseSource::kCovariances:
+      return {"covariances", "mean of the observations' covariances"};
+    case NoiseSource::kRepeats:
+      return {"repeats", "estimated from repeated actions"};
+    case NoiseSource::kFrames:
+      return {"frames", "estimated from what jumps between frames"};
+    case NoiseSource::kResiduals:
+      return {"residuals", "estimated from what the best models leave"};
+    case NoiseSource::kAssumed:
+      return {"assumed", "assumed: too few samples to estimate it"};
+  }
+  return {"unknown", "unknown"};
+}
+
 std::vector<std::string> signal_names(const BodySchema& schema, const std::vector<int>& indices) {
   std::vector<std::string> names;
   for (const int index : indices) names.push_back(schema.signals.at(index).name);
@@ -78,7 +97,8 @@ ordered_json pose_json(const Pose& X) {
 
 }  // namespace
 
-ordered_json structure_json(const BodySchema& schema, const std::vector<Outlier>& outliers) {
+ordered_json structure_json(const BodySchema& schema, const std::vector<Outlier>& outliers,
+                            std::optional<NoiseSource> source) {
   ordered_json json = {{"complete", schema.complete},
                        {"samples", schema.num_samples},
                        {"parts", schema.parts},
@@ -90,6 +110,7 @@ ordered_json structure_json(const BodySchema& schema, const std::vector<Outlier>
                        {"noise",
                         {{"position_m", schema.noise.position_m},
                          {"rotation_deg", schema.noise.rotation_rad * kDegrees}}}};
+  if (source) json["noise"]["from"] = name_of(*source).first;
   for (const Edge& edge : schema.edges) json["edges"].push_back(edge_json(schema, edge));
   for (const UnconnectedPart& part : schema.unconnected) {
     json["unconnected"].push_back({{"part", part.part}, {"reason", reason_text(part)}});
@@ -153,7 +174,7 @@ ordered_json schema_json(const BodySchema& schema) {
   return json;
 }
 
-std::string structure_text(const BodySchema& schema) {
+std::string structure_text(const BodySchema& schema, std::optional<NoiseSource> source) {
   std::string text = fmt::format("{} structure of {} parts from {} samples\n",
                                  schema.complete ? "Complete" : "Incomplete", schema.parts.size(),
                                  schema.num_samples);
@@ -169,6 +190,11 @@ std::string structure_text(const BodySchema& schema) {
   const auto unused = signal_names(schema, schema.unused_signals());
   if (!unused.empty())
     text += fmt::format("  signals without effect: {}\n", fmt::join(unused, ", "));
+  if (schema.noise.position_m > 0) {
+    text += fmt::format("  noise per axis and marker: {:.2f} mm {:.2f}°{}\n",
+                        schema.noise.position_m * 1e3, schema.noise.rotation_rad * kDegrees,
+                        source ? std::string(", ") + name_of(*source).second : "");
+  }
   return text;
 }
 

@@ -1,6 +1,7 @@
 #pragma once
 
 #include <nlohmann/json.hpp>
+#include <optional>
 #include <string>
 #include <vector>
 
@@ -14,7 +15,8 @@ namespace bodyschema {
 
 /// `learn --json`, and `structure` in result.json.
 nlohmann::ordered_json structure_json(const BodySchema& schema,
-                                      const std::vector<Outlier>& outliers);
+                                      const std::vector<Outlier>& outliers,
+                                      std::optional<NoiseSource> source = {});
 
 /// `predict --json`, and `held_out` in result.json.
 nlohmann::ordered_json errors_json(int num_samples, const std::vector<PartErrors>& errors);
@@ -24,7 +26,8 @@ nlohmann::ordered_json schema_json(const BodySchema& schema);
 
 // The same for people.
 
-std::string structure_text(const BodySchema& schema);
+/// With the noise that it was learned with, and where that is known from.
+std::string structure_text(const BodySchema& schema, std::optional<NoiseSource> source = {});
 std::string errors_text(const std::vector<PartErrors>& errors);
 
 }  // namespace bodyschema

@@ -7,6 +7,7 @@
 #include <set>
 #include <utility>
 
+#include "processes/console/hint.h"
 #include "processes/console/run_record.h"
 
 namespace bodyschema {
@@ -228,7 +229,7 @@ std::string StatusBoard::headline() const {
   if (!motion_) {
     line = "Waits for a driver: nobody sends MOTION_STATUS.";
   } else if (motion_->stop_latched == 1) {
-    line = "Stopped: nothing moves until `bodyschema resume`.";
+    line = "Halted: nothing moves until `" + to_type("resume") + "`.";
   } else if (control_ && control_->owns_arm == 1) {
     line = fmt::format("The controller has the arm, {}: {}", kControls[control_->control_state],
                        control_->why);
@@ -424,6 +425,16 @@ std::string StatusBoard::text(int width) const {
   return text;
 }
 
+namespace {
+
+/// -1 on the wire says that nothing is known.
+template <class Number>
+ordered_json known(Number value) {
+  return value < 0 ? ordered_json() : ordered_json(value);
+}
+
+}  // namespace
+
 ordered_json StatusBoard::json() const {
   const double window_s = std::max(1e-3, seconds(begin_us_, end_us_));
   ordered_json json = {{"headline", headline()},
@@ -462,7 +473,7 @@ ordered_json StatusBoard::json() const {
   if (motion_) {
     json["arm"] = {
         {"state", kMotions[motion_->state]},         {"source", motion_->source},
-        {"action_id", motion_->action_id},           {"reason", motion_->reason},
+        {"action_id", known(motion_->action_id)},    {"reason", motion_->reason},
         {"at_rest", motion_->rest_since_utime >= 0}, {"stop_latched", motion_->stop_latched == 1}};
   }
   json["control"] = nullptr;
@@ -470,9 +481,9 @@ ordered_json StatusBoard::json() const {
     json["control"] = {{"state", kControls[control_->control_state]},
                        {"owns_arm", control_->owns_arm == 1},
                        {"why", control_->why},
-                       {"target_part", control_->target_part},
-                       {"predicted_error_m", control_->predicted_error_m},
-                       {"observed_error_m", control_->observed_error_m}};
+                       {"target_part", known(control_->target_part)},
+                       {"predicted_error_m", known(control_->predicted_error_m)},
+                       {"observed_error_m", known(control_->observed_error_m)}};
   }
   json["newest_sample"] = sample_ ? ordered_json(sample_->sample_index) : nullptr;
   // Ground truth: the simulator alone knows.
@@ -509,9 +520,11 @@ ordered_json StatusBoard::json() const {
                                      {"detail", part.detail}});
     }
   }
-  json["parts"] = ordered_json::array();
-  json["events"] = ordered_json::array();
+  json["parts"] = nullptr;
+  json["events"] = nullptr;
   if (health_) {
+    json["parts"] = ordered_json::array();
+    json["events"] = ordered_json::array();
     for (const part_health_t& part : health_->part_health) {
       const bool is_tested = part.position_median_m >= 0;
       json["parts"].push_back(
@@ -525,16 +538,13 @@ ordered_json StatusBoard::json() const {
             is_tested ? ordered_json(part.rotation_median_rad * kDegrees) : nullptr}});
     }
     for (const health_event_t& event : health_->events) {
-      const auto id = [](std::int32_t part) {
-        return part < 0 ? ordered_json() : ordered_json(part);
-      };
       json["events"].push_back({{"number", event.event_number},
                                 {"sample", event.event_sample},
                                 {"event", name_of_event(event.event_kind)},
-                                {"from", id(event.event_from)},
-                                {"to", id(event.event_to)},
-                                {"part", id(event.event_part)},
-                                {"tag", id(event.event_tag)},
+                                {"from", known(event.event_from)},
+                                {"to", known(event.event_to)},
+                                {"part", known(event.event_part)},
+                                {"tag", known(event.event_tag)},
                                 {"cause", event.event_cause},
                                 {"margin", event.event_margin},
                                 {"samples_used", event.samples_used},

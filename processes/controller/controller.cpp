@@ -18,6 +18,7 @@ namespace {
 using S = control_status_t;
 
 constexpr char kSource[] = "controller";
+constexpr char kHalted[] = "the arm is halted; first: ./run resume (or bodyschema resume)";
 constexpr char kHeldAsBefore[] = "held as before the restart: ";
 constexpr std::int64_t kRepeat_us = 1'000'000;
 constexpr int kMaxExpired = 3;         // in a row
@@ -326,9 +327,9 @@ EdgeState Controller::worst_edge(std::string* name) const {
 
 std::string Controller::objection() const {
   const int part = target_.target_part;
-  if (motion_->stop_latched) return "the driver is stopped; first: bodyschema resume";
+  if (motion_->stop_latched) return kHalted;
   if (!schema_->has_part(part)) {
-    return "the body schema has no part " + std::to_string(part) + "; see: bodyschema status";
+    return "the body schema has no part " + std::to_string(part) + "; see: ./run status";
   }
   if (!chain_to(*schema_, part)) {
     return "part " + std::to_string(part) + " is not connected to the root " +
@@ -614,7 +615,7 @@ Controller::Answer Controller::on_motion_status(const motion_status_t& motion) {
 
   if (motion.stop_latched) {
     if (state_ == S::CONTROL_WAITING && !owns_arm_) {
-      refuse("the driver is stopped; first: bodyschema resume");
+      refuse(kHalted);
     } else {
       halt(motion.reason + "; after RESUME give another target, or release the arm");
     }

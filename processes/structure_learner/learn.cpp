@@ -425,6 +425,7 @@ LearnResult fit_tree(const LearnedStructure& structure,
   const ValidityOptions validity = search_options_of(options).validity;
 
   LearnResult result;
+  result.noise_source = structure.noise_source;
   result.num_screens = search.num_screens;
   result.num_fits = search.num_fits;
   BodySchema& schema = result.schema;
@@ -566,13 +567,15 @@ void estimate_root_pose(const std::vector<ActionPoseSample>& samples,
   schema->X_CR_covariance = weight * H.inverse();
 }
 
-Noise marker_noise(const std::vector<ActionPoseSample>& samples, int num_signals,
-                   const LearnOptions& options) {
+SourcedNoise marker_noise(const std::vector<ActionPoseSample>& samples, int num_signals,
+                          const LearnOptions& options) {
   if (options.noise)
-    return {std::max(options.noise->position_m, kNoiseFloor.position_m),
-            std::max(options.noise->rotation_rad, kNoiseFloor.rotation_rad)};
-  if (has_covariances(samples)) return typical_noise(samples);
-  return estimate_noise(samples, num_signals, options.max_signals).value_or(kNoiseFloor);
+    return {{std::max(options.noise->position_m, kNoiseFloor.position_m),
+             std::max(options.noise->rotation_rad, kNoiseFloor.rotation_rad)},
+            NoiseSource::kGiven};
+  if (has_covariances(samples)) return {typical_noise(samples), NoiseSource::kCovariances};
+  return estimate_noise(samples, num_signals, options.max_signals)
+      .value_or(SourcedNoise{kNoiseFloor, NoiseSource::kAssumed});
 }
 
 LearnedStructure find_structure(const std::vector<Signal>& signals,
@@ -584,14 +587,18 @@ LearnedStructure find_structure(const std::vector<Signal>& signals,
   const std::vector<int> parts = parts_of(count_seen(samples));
   SearchOptions search_options = search_options_of(options);
   MeasurementModel& measurement = search_options.measurement;
+  NoiseSource noise_source = NoiseSource::kCovariances;
   const auto set_noise = [&](const std::vector<ActionPoseSample>& of) {
-    if (options.noise || !has_covariances(of))
-      measurement.noise = marker_noise(of, num_signals, options);
+    if (!options.noise && has_covariances(of)) return;
+    const SourcedNoise noise = marker_noise(of, num_signals, options);
+    measurement.noise = noise;
+    noise_source = noise.source;
   };
   set_noise(samples);
   NormalizedActions actions(samples, num_signals);
   SearchResult search = search_structure(samples, actions, parts, search_options);
-  LearnedStructure result{signals, parts, measurement, std::move(actions), std::move(search)};
+  LearnedStructure result{signals,           parts,       measurement, std::move(actions),
+                          std::move(search), noise_source};
   // Everything that is fitted sees displacements; which commands are bent shows only by a model.
   constexpr int kMaxWarpRounds = 3;
   for (int round = 0; round < kMaxWarpRounds; ++round) {
@@ -614,7 +621,8 @@ LearnedStructure find_structure(const std::vector<Signal>& signals,
       result.search.num_fits = found.num_fits;
       break;
     }
-    result = {std::move(bent), parts, measurement, std::move(actions_again), std::move(found)};
+    result = {std::move(bent),  parts,       measurement, std::move(actions_again),
+              std::move(found), noise_source};
     if (was_spanning) break;
   }
   measurement = result.measurement;

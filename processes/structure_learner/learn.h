@@ -7,6 +7,7 @@
 
 #include "common/schema/body_schema.h"
 #include "common/schema/sample.h"
+#include "processes/structure_learner/noise_estimate.h"
 #include "processes/structure_learner/structure_search.h"
 
 namespace bodyschema {
@@ -51,6 +52,7 @@ struct Outlier {
 struct LearnResult {
   BodySchema schema;
   std::vector<Outlier> outliers;  ///< ascending by sample, then part
+  NoiseSource noise_source = NoiseSource::kAssumed;
   int num_screens = 0;            ///< closed-form hypotheses looked at
   int num_fits = 0;               ///< Levenberg–Marquardt fits of the search
 };
@@ -68,8 +70,8 @@ LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPo
 
 /// Noise per axis of one marker that learn() goes by: `options.noise`; else the mean of the
 /// observations' covariances; where these are zero, the estimate of noise_estimate.h.
-Noise marker_noise(const std::vector<ActionPoseSample>& samples, int num_signals,
-                   const LearnOptions& options = {});
+SourcedNoise marker_noise(const std::vector<ActionPoseSample>& samples, int num_signals,
+                          const LearnOptions& options = {});
 
 /// The first half of learn(), slow: which part hangs on which by which signals. Everything that
 /// relearn() takes over.
@@ -79,6 +81,7 @@ struct LearnedStructure {
   MeasurementModel measurement;
   NormalizedActions actions;  ///< that the models are over
   SearchResult search;
+  NoiseSource noise_source = NoiseSource::kAssumed;
 
   /// The edges span all parts seen.
   bool spans() const { return search.models.size() + 1 >= parts.size(); }

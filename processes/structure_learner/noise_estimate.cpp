@@ -217,20 +217,23 @@ class ModelNoise {
 
 }  // namespace
 
-std::optional<Noise> estimate_noise(const std::vector<ActionPoseSample>& samples, int num_signals,
-                                    int max_signals) {
+std::optional<SourcedNoise> estimate_noise(const std::vector<ActionPoseSample>& samples,
+                                           int num_signals, int max_signals) {
   const NormalizedActions actions(samples, num_signals);
   // What moves under one command, or where no model holds, is no noise: that of a stream is not
   // taken for more than what jumps from frame to frame and what a marker's bias may add to it.
-  const auto bounded = [&](Noise noise) {
+  const auto bounded = [&](Noise noise, NoiseSource source) {
     if (const auto white = noise_from_neighbours(samples, actions)) {
       const Noise most = floored(*white, kLargestBias);
+      if (most.position_m < noise.position_m || most.rotation_rad < noise.rotation_rad)
+        source = NoiseSource::kFrames;
       noise.position_m = std::min(noise.position_m, most.position_m);
       noise.rotation_rad = std::min(noise.rotation_rad, most.rotation_rad);
     }
-    return believable(noise);
+    return SourcedNoise{believable(noise), source};
   };
-  if (const auto noise = noise_from_repeats(samples, actions)) return bounded(*noise);
+  if (const auto noise = noise_from_repeats(samples, actions))
+    return bounded(*noise, NoiseSource::kRepeats);
 
   std::set<int> seen;
   for (const auto& sample : samples)
@@ -285,7 +288,7 @@ std::optional<Noise> estimate_noise(const std::vector<ActionPoseSample>& samples
     if (fits[ij].scale <= limit)
       pooled.insert(pooled.end(), fits[ij].residuals.begin(), fits[ij].residuals.end());
   if (pooled.size() < 6) return std::nullopt;
-  return bounded(noise_from(pooled));
+  return bounded(noise_from(pooled), NoiseSource::kResiduals);
 }
 
 }  // namespace bodyschema

@@ -14,6 +14,20 @@ inline constexpr Noise kNoiseFloor{1e-4, 3.4906585e-4};
 /// chapter's markers. Without a ceiling, poses at random would pass for a rigid body badly seen.
 inline constexpr Noise kNoiseCeiling{0.1, 0.41887902};
 
+/// Where the noise of a marker is known from.
+enum class NoiseSource {
+  kGiven,        ///< told by the user
+  kCovariances,  ///< of the observations, their mean
+  kRepeats,      ///< estimated from poses seen again under the same action
+  kFrames,       ///< of a stream: bounded by what jumps from frame to frame
+  kResiduals,    ///< estimated from what the best models leave
+  kAssumed,      ///< too few data: the floor
+};
+
+struct SourcedNoise : Noise {
+  NoiseSource source = NoiseSource::kAssumed;
+};
+
 /// Noise per axis of one marker, for data that bring neither noise nor covariances.
 ///
 /// From repeats where an action recurs at least five times: residuals of each part's pose to its
@@ -24,7 +38,7 @@ inline constexpr Noise kNoiseCeiling{0.1, 0.41887902};
 /// true models, too large a noise by that factor costs nearly nothing. Never below kNoiseFloor or
 /// above kNoiseCeiling. Of a stream, never above a few times what jumps from frame to frame.
 /// std::nullopt: too few data.
-std::optional<Noise> estimate_noise(const std::vector<ActionPoseSample>& samples, int num_signals,
-                                    int max_signals = 2);
+std::optional<SourcedNoise> estimate_noise(const std::vector<ActionPoseSample>& samples,
+                                           int num_signals, int max_signals = 2);
 
 }  // namespace bodyschema

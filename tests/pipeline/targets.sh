@@ -1,6 +1,6 @@
 #!/bin/bash
-# targets.sh SOURCE BUILD: a group learns arm2, then the end effector is sent to random positions; stop, resume,
-# hold and release are said by the console; the controller is killed with a hold and in the middle of a target and holds.
+# targets.sh SOURCE BUILD: a group learns arm2, then the end effector is sent to random positions; halt, resume,
+# hold and release are said by the console; a target that times out or is interrupted is dropped; the controller is killed with a hold and in the middle of a target and holds.
 set -euo pipefail
 source=$1 build=$2
 work=$(mktemp -d)
@@ -19,9 +19,11 @@ console() { "$source/run" exec bodyschema "$@" >>"$work/console.txt" 2>&1; }
   fail "the targets were not reached"
 console target --part 5 --position 9 9 9 --timeout 30 && fail "a target out of reach was reached"
 grep -q "refused: out of reach" "$work/console.txt" || fail "a target out of reach is not refused"
-console stop || fail "stop"
+console stop && fail "stop did something"
+grep -q "stops the arm; a group is ended by" "$work/console.txt" || fail "stop does not say what may be meant"
+console halt || fail "halt"
 console target --part 5 --position 0.1 0.1 0.1 --timeout 30 && fail "a stopped arm was moved"
-grep -q "first: bodyschema resume" "$work/console.txt" || fail "a stop is not said"
+grep -q "first: ./run resume" "$work/console.txt" || fail "a halt is not said"
 console resume || fail "resume"
 console hold || fail "hold"
 # The program itself, not the setpriv that became it: its command line begins with its path.
@@ -35,6 +37,32 @@ console release || fail "release"
 # told, and it is not served again.
 position=$(awk -F'|' '/reached/ {print $3; exit}' "$work/targets.txt")
 observer=$("$source/run" exec pgrep -f "^$build/bin/observer ")
+
+# Nobody follows it any longer: it is dropped and the arm held, also once its SAMPLE has come.
+state() { "$source/run" exec bodyschema status --json | python3 -c 'import json, sys
+status = json.load(sys.stdin)
+print(status["control"]["state"], status["newest_sample"], status["arm"]["action_id"])'; }
+for end in timeout interrupt; do
+  kill -STOP "$observer"
+  if [ "$end" = timeout ]; then
+    # shellcheck disable=SC2086
+    console target --part 5 --position $position --timeout 3 && fail "a target without its SAMPLE was reached"
+  else
+    # shellcheck disable=SC2086
+    "$source/run" exec timeout --signal INT 3 bodyschema target --part 5 --position $position >"$work/interrupt.txt" 2>&1 || true
+    cat "$work/interrupt.txt" >>"$work/console.txt"
+  fi
+  kill -CONT "$observer"
+  tail -n 1 "$work/console.txt" | grep -q "the target was dropped: the arm is held until" || fail "$end: the target is not dropped"
+  before=$(state)
+  [[ $before = "holding "* ]] || fail "$end: the arm is not held but $before"
+  # Two status take 4 s, in which the next step would come.
+  state >/dev/null
+  after=$(state)
+  [ "${before##* }" = "${after##* }" ] && [[ $after = "holding "* ]] || fail "$end: it goes on, from $before to $after"
+  console release || fail "release after $end"
+done
+
 kill -STOP "$observer"
 # shellcheck disable=SC2086
 "$source/run" exec bodyschema target --part 5 --position $position --timeout 60 >"$work/middle.txt" 2>&1 &

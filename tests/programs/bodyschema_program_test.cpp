@@ -2,6 +2,7 @@
 #include <sys/wait.h>
 #include <unistd.h>
 
+#include <algorithm>
 #include <cmath>
 #include <cstdlib>
 #include <filesystem>
@@ -74,19 +75,24 @@ class BodyschemaProgramTest : public testing::Test {
   }
   ~BodyschemaProgramTest() override { std::filesystem::remove_all(folder_); }
 
-  Outcome run(const std::vector<std::string>& arguments) const {
+  /// `before`: what the shell does before the program, e.g. "cat s.csv | ".
+  Outcome run(const std::vector<std::string>& arguments, const std::string& before = "") const {
     const auto out = folder_ / "stdout.txt", err = folder_ / "stderr.txt";
-    std::string command = "cd '" + folder_.string() + "' && '" + BODYSCHEMA_PROGRAM + "'";
+    std::string command =
+        "cd '" + folder_.string() + "' && " + before + "'" + BODYSCHEMA_PROGRAM + "'";
     for (const std::string& argument : arguments) command += " '" + argument + "'";
-    command += " >stdout.txt 2>stderr.txt </dev/null";
+    command += " >stdout.txt 2>stderr.txt";
+    if (before.find('|') == std::string::npos) command += " </dev/null";
     const int status = std::system(command.c_str());
     EXPECT_TRUE(WIFEXITED(status)) << command << " was killed";
     return {WIFEXITED(status) ? WEXITSTATUS(status) : -1, text_of(out), text_of(err)};
   }
   /// It failed with a message that contains `what`, and printed no result.
-  void expect_failure(const std::vector<std::string>& arguments, const std::string& what) const {
+  void expect_failure(const std::vector<std::string>& arguments, const std::string& what,
+                      int exit_code = 0) const {
     const Outcome outcome = run(arguments);
-    EXPECT_NE(outcome.exit_code, 0) << what;
+    if (exit_code != 0) EXPECT_EQ(outcome.exit_code, exit_code) << what;
+    EXPECT_TRUE(outcome.exit_code == 1 || outcome.exit_code == 2) << outcome.exit_code << what;
     EXPECT_EQ(outcome.out, "") << what;
     EXPECT_NE(outcome.err.find(what), std::string::npos) << outcome.err;
   }
@@ -162,6 +168,7 @@ TEST_F(BodyschemaProgramTest, LearnPrintsTheKeysThatAreDocumented) {
   // 3 mm and 1° per axis were put in.
   EXPECT_NEAR(json["noise"]["position_m"].get<double>(), 0.003, 0.0015);
   EXPECT_NEAR(json["noise"]["rotation_deg"].get<double>(), 1, 0.5);
+  EXPECT_EQ(json["noise"]["from"], "residuals");
 }
 
 TEST_F(BodyschemaProgramTest, LearnDoesNotWriteOverItsRecording) {
@@ -278,7 +285,11 @@ TEST_F(BodyschemaProgramTest, ShowPrintsASchemaFile) {
   for (const Json& edge : shown["edges"]) EXPECT_TRUE(edge.contains("joints"));
   const Outcome text = run({"show", "schema.lcmlog"});
   EXPECT_EQ(text.exit_code, 0);
-  EXPECT_EQ(text.out, run({"learn", "s.csv"}).out);
+  // Only who learned knows where the noise is known from.
+  std::string learned_text = run({"learn", "s.csv"}).out;
+  const std::string source = ", estimated from what the best models leave";
+  ASSERT_NE(learned_text.find(source), std::string::npos) << learned_text;
+  EXPECT_EQ(text.out, learned_text.erase(learned_text.find(source), source.size()));
 }
 
 /// Samples of a 2-DOF robot of which `parts` fly about at random.
@@ -346,7 +357,8 @@ TEST_F(BodyschemaProgramTest, AnObviousOutlierIsNamed) {
       run({"learn", write("o.csv", samples), "--noise", "0.003", "1", "--json"}).json();
   EXPECT_TRUE(test::is_right(structure_of(json), robot_));
   EXPECT_EQ(json["outliers"], Json::parse(R"([{"sample": 17, "part": 4}])"));
-  EXPECT_EQ(json["noise"], Json::parse(R"({"position_m": 0.003, "rotation_deg": 1.0})"));
+  EXPECT_EQ(json["noise"],
+            Json::parse(R"({"position_m": 0.003, "rotation_deg": 1.0, "from": "given"})"));
 }
 
 TEST_F(BodyschemaProgramTest, TheRootIsTheLowestPartOrTheOneAskedFor) {
@@ -379,6 +391,157 @@ TEST_F(BodyschemaProgramTest, SenselessOptionsAreRefused) {
   expect_failure({"forget", csv}, "subcommand is required");
   expect_failure({}, "subcommand is required");
   EXPECT_FALSE(exists("schema.lcmlog"));
+}
+
+TEST_F(BodyschemaProgramTest, ExitCodesTellWrongUsageFromABadInput) {
+  const auto csv = write_robot("s.csv");
+  for (const std::vector<std::string>& wrong : std::vector<std::vector<std::string>>{
+           {},
+           {"forget"},
+           {"learn"},
+           {"learn", csv, "--speed", "3"},
+           {"learn", csv, "--noise", "1"},
+           {"learn", csv, "--noise", "x", "1"},
+           {"learn", csv, "--noise", "0", "1"},
+           {"learn", csv, "--root", "1e3"},
+           {"learn", csv, "--method", "magic"},
+           {"target"},
+           {"target", "--part", "-1", "--position", "0", "0", "0"},
+           {"target", "--part", "1", "--position", "0", "0"},
+           {"target", "--part", "1", "--position", "0", "0", std::string(309, '9')},
+           {"target", "--part", "1", "--position", "nan", "0", "0"},
+           {"target", "--part", "1", "--position", "0", "0", "0", "--timeout", "1e300"},
+           {"target", "--part", "1", "--position", "0", "0", "0", "--timeout", "nan"},
+           {"target", "--part", "1", "--position", "0", "0", "0", "--keep", "inf"},
+           {"log"},
+           {"status", "--seconds", "0"},
+           {"fault", "melt"}}) {
+    const Outcome outcome = run(wrong);
+    EXPECT_EQ(outcome.exit_code, 2) << Json(wrong) << outcome.err;
+    EXPECT_EQ(outcome.out, "");
+    EXPECT_LT(outcome.err.size(), 300U) << outcome.err;
+  }
+  for (const std::vector<std::string>& bad :
+       std::vector<std::vector<std::string>>{{"learn", "none.csv"},
+                                             {"learn", csv, "--root", "9"},
+                                             {"show", csv},
+                                             {"log", "none.lcmlog"},
+                                             {"rig", "nonesuch"},
+                                             {"learn", csv, "--out", "no/where"}}) {
+    EXPECT_EQ(run(bad).exit_code, 1) << Json(bad);
+  }
+  EXPECT_NE(run({"--help"}).out.find("2 wrong usage"), std::string::npos);
+}
+
+TEST_F(BodyschemaProgramTest, ItsVersionIsAResult) {
+  const Outcome outcome = run({"--version"});
+  EXPECT_EQ(outcome.exit_code, 0);
+  EXPECT_EQ(outcome.out.rfind("bodyschema 0.", 0), 0U) << outcome.out;
+}
+
+// It once latched the arm, and ./run stop ends the group.
+TEST_F(BodyschemaProgramTest, StopDoesNothingButSayWhichIsMeant) {
+  for (const std::vector<std::string>& arguments :
+       {std::vector<std::string>{"stop"}, {"stop", "--in", "memq://"}}) {
+    const Outcome outcome = run(arguments);
+    EXPECT_EQ(outcome.exit_code, 2);
+    EXPECT_EQ(outcome.out, "");
+    EXPECT_NE(outcome.err.find("`bodyschema halt` stops the arm; a group is ended by `./run stop`"),
+              std::string::npos)
+        << outcome.err;
+  }
+  EXPECT_NE(run({"stop"}, "BODYSCHEMA_COMMAND=./run ").err.find("`./run halt`"), std::string::npos);
+  const std::string help = run({"--help"}).out;
+  EXPECT_NE(help.find("\n  halt "), std::string::npos) << help;
+  EXPECT_EQ(help.find("\n  stop "), std::string::npos) << help;
+}
+
+// Today's time-out of a target is 120 s.
+TEST_F(BodyschemaProgramTest, WhereNobodyIsOnTheBusEveryCommandEndsAtOnceAndSaysWhatToType) {
+  for (const std::vector<std::string>& command :
+       std::vector<std::vector<std::string>>{{"target", "--part", "1", "--position", "0", "0", "0"},
+                                             {"hold"},
+                                             {"release"},
+                                             {"halt"},
+                                             {"resume"}}) {
+    std::vector<std::string> arguments = command;
+    arguments.insert(arguments.end(), {"--in", "memq://"});
+    expect_failure(arguments, "nothing is heard on memq://: no group runs there. ./run --keep", 1);
+  }
+}
+
+TEST_F(BodyschemaProgramTest, ANoiseThatIsNoneIsAskedBack) {
+  const auto csv = write_robot("s.csv");
+  ASSERT_EQ(run({"learn", csv, "--out", "schema.lcmlog"}).exit_code, 0);
+  for (const std::vector<std::string>& command :
+       std::vector<std::vector<std::string>>{{"learn", csv}, {"monitor", "schema.lcmlog", csv}}) {
+    const auto expect = [&](const std::string& position, const std::string& rotation,
+                            const std::string& what) {
+      std::vector<std::string> arguments = command;
+      arguments.insert(arguments.end(), {"--noise", position, rotation});
+      expect_failure(arguments, what, 2);
+    };
+    expect("3", "1", "3 m is no noise of a marker; did you mean: --noise 0.003 1");
+    expect("0.003", "57", "57 degrees are no noise of a marker");
+    expect(std::string(309, '9'), "1", "--noise");
+  }
+  EXPECT_EQ(run({"learn", csv, "--noise", "0.0254", "6.1"}).exit_code, 0);
+}
+
+TEST_F(BodyschemaProgramTest, TheNoiseIsAlwaysToldWithWhereItIsKnownFrom) {
+  const auto csv = write_robot("s.csv");
+  const auto from = [&](const std::vector<std::string>& arguments) {
+    std::vector<std::string> json = arguments;
+    json.emplace_back("--json");
+    const Json noise = run(json).json()["noise"];
+    EXPECT_GT(noise["position_m"].get<double>(), 0);
+    EXPECT_NE(run(arguments).out.find("noise per axis and marker: "), std::string::npos);
+    return noise["from"].get<std::string>();
+  };
+  EXPECT_EQ(from({"learn", csv}), "residuals");
+  EXPECT_EQ(from({"learn", csv, "--noise", "0.003", "1"}), "given");
+  EXPECT_EQ(from({"learn", csv, "--method", "chapter"}), "residuals");
+  const std::string header = "t,q1,part,x,y,z,qw,qx,qy,qz\n";
+  EXPECT_EQ(from({"learn", write("one.csv", header + "0,1,3,0,0,1,1,0,0,0\n")}), "assumed");
+  test::Rng rng(79);
+  std::vector<ActionPoseSample> repeats;
+  for (int n = 0; n < 40; ++n) {
+    Eigen::VectorXd action(2);
+    action << 0.1 * (n % 4), 0.2 * (n % 4);
+    repeats.push_back(test::observe(robot_, action, {.regime = test::Regime::kTagIso}, n, rng));
+  }
+  EXPECT_EQ(from({"learn", write("repeats.csv", repeats)}), "repeats");
+  ASSERT_EQ(run({"learn", csv, "--out", "schema.lcmlog"}).exit_code, 0);
+  EXPECT_NE(run({"monitor", "schema.lcmlog", csv}).err.find("mm"), std::string::npos);
+  EXPECT_NE(run({"monitor", "schema.lcmlog", csv}).err.find("that of schema.lcmlog"),
+            std::string::npos);
+}
+
+TEST_F(BodyschemaProgramTest, StdinAndPackedFilesAreReadLikeFiles) {
+  const auto csv = write_robot("s.csv");
+  const std::string expected = run({"learn", csv, "--json"}).out;
+  ASSERT_EQ(run({"learn", csv, "--out", "schema.lcmlog"}).exit_code, 0);
+  EXPECT_EQ(run({"learn", "-", "--json"}, "cat s.csv | ").out, expected);
+  EXPECT_EQ(run({"learn", "-", "--json"}, "gzip -c s.csv | ").out, expected);
+  ASSERT_EQ(run({"show", "schema.lcmlog"}, "gzip -k s.csv && ").exit_code, 0);
+  EXPECT_EQ(run({"learn", "s.csv.gz", "--json"}).out, expected);
+  EXPECT_EQ(run({"predict", "schema.lcmlog", "-", "--json"}, "cat s.csv | ").out,
+            run({"predict", "schema.lcmlog", csv, "--json"}).out);
+  const Outcome broken = run({"learn", "-"}, "head -c 90 s.csv | ");
+  EXPECT_EQ(broken.exit_code, 1);
+  EXPECT_EQ(broken.err.rfind("bodyschema: stdin:", 0), 0U) << broken.err;
+}
+
+TEST_F(BodyschemaProgramTest, AHintIsGivenBesideTheResultAndChangesNothing) {
+  write_robot("s.csv");
+  test::Rng rng(80);
+  auto samples = test::babble(robot_, 30, {}, rng);
+  for (ActionPoseSample& sample : samples)
+    for (PartObservation& part : sample.parts) part.X_CB.translation() *= 1000;
+  const Outcome outcome = run({"learn", write("mm.csv", samples), "--json"});
+  EXPECT_EQ(outcome.exit_code, 0);
+  EXPECT_NE(outcome.err.find("mm.csv: positions look like millimetres"), std::string::npos);
+  EXPECT_EQ(outcome.json()["samples"], 30);
 }
 
 TEST_F(BodyschemaProgramTest, HelpIsAResult) {
@@ -529,6 +692,7 @@ TEST_F(BodyschemaProgramTest, NoiseColumnsWeighTheObservations) {
     with_noise << line << (is_header ? ",sp_m,sr_deg" : ",0.003,1") << "\n";
   const Json json = run({"learn", write("n.csv", with_noise.str()), "--json"}).json();
   EXPECT_TRUE(test::is_right(structure_of(json), robot_));
+  EXPECT_EQ(json["noise"]["from"], "covariances");
   EXPECT_NEAR(json["noise"]["position_m"].get<double>(), 0.003, 1e-9);
   EXPECT_NEAR(json["noise"]["rotation_deg"].get<double>(), 1, 1e-9);
 }
@@ -543,13 +707,55 @@ TEST_F(BodyschemaProgramTest, RigPrintsTheNetworkOfAGoodRigOnly) {
   EXPECT_EQ(bus.rfind("udpm://", 0), 0U);
   EXPECT_EQ(images.rfind("udpm://", 0), 0U);
   EXPECT_NE(bus, images);
-  expect_failure({"rig", "."}, "yaml: cannot be read");
+  EXPECT_TRUE(outcome.out.ends_with("\nOK: 5 parts, 2 signals, 16 tags\n")) << outcome.out;
+  EXPECT_EQ(outcome.err, "");
+  expect_failure({"rig", "."}, "yaml: cannot be read", 1);
   run({"learn", write_robot("robot.csv"), "--out", "schema.lcmlog"});
   EXPECT_EQ(run({"rig", std::string(BODYSCHEMA_CONFIG) + "/arm2", "--initial", "schema.lcmlog"})
                 .exit_code,
             0);
   expect_failure({"rig", std::string(BODYSCHEMA_CONFIG) + "/arm7", "--initial", "schema.lcmlog"},
                  "schema.lcmlog: it has 2 action signals");
+}
+
+TEST_F(BodyschemaProgramTest, ARigIsFoundByItsName) {
+  std::filesystem::create_directory(folder_ / "config");
+  std::filesystem::copy(std::string(BODYSCHEMA_CONFIG) + "/arm2", folder_ / "config" / "myarm");
+  EXPECT_EQ(run({"rig", "myarm"}).exit_code, 0);
+  EXPECT_EQ(run({"rig", "config/myarm"}).exit_code, 0);
+  EXPECT_EQ(run({"rig", "../config/myarm"}, "cd config && ").exit_code, 0);
+  expect_failure({"rig", "myram"},
+                 "there is no rig 'myram'; there are: myarm; did you mean 'myarm'?", 1);
+  expect_failure({"rig", "config/myram"}, "config/myram: expected the folder of a rig", 1);
+  // Every problem at once, each with its place.
+  write("config/myarm/motor_babbler.yaml", "choice: smart\n");
+  write("config/myarm/network.yaml", "network: wifi\n");
+  const Outcome outcome = run({"rig", "myarm"});
+  EXPECT_EQ(outcome.exit_code, 1);
+  EXPECT_EQ(outcome.out, "");
+  EXPECT_NE(outcome.err.find("motor_babbler.yaml:1: choice: 'smart' is none of: active, random"),
+            std::string::npos)
+      << outcome.err;
+  EXPECT_NE(outcome.err.find("network.yaml:1: network: 'wifi'"), std::string::npos) << outcome.err;
+}
+
+TEST_F(BodyschemaProgramTest, ALogTellsItsRig) {
+  const std::string log = std::string(BODYSCHEMA_LOGS) + "/arm2_15.lcmlog";
+  const Outcome outcome = run({"log", log, "--rig-of", BODYSCHEMA_CONFIG});
+  EXPECT_EQ(outcome.exit_code, 0) << outcome.err;
+  EXPECT_EQ(outcome.out, "arm2\n");
+  std::filesystem::create_directory(folder_ / "rigs");
+  const auto copy = [&](const std::string& from, const std::string& to) {
+    std::filesystem::copy(BODYSCHEMA_CONFIG + from, folder_ / "rigs" / to);
+  };
+  copy("/arm7", "arm7");
+  expect_failure({"log", log, "--rig-of", "rigs"}, "arm7: ", 1);
+  copy("/arm2", "here");
+  EXPECT_EQ(run({"log", log, "--rig-of", "rigs"}).out, "here\n");
+  copy("/arm2", "there");
+  expect_failure({"log", log, "--rig-of", "rigs"}, "may be of several rigs: here, there", 1);
+  run({"learn", write_robot("s.csv"), "--out", "schema.lcmlog"});
+  expect_failure({"log", "schema.lcmlog", "--rig-of", "nowhere"}, "nowhere", 1);
 }
 
 /// Recordings of others, read where they lie; the project keeps no copy.
@@ -580,6 +786,21 @@ class RealDataTest : public BodyschemaProgramTest {
 
   std::filesystem::path data_;
 };
+
+// In metres, w x y z, by commas: what is right gets no hint.
+TEST_F(RealDataTest, NoneOfThemGetsAHint) {
+  int num_recordings = 0;
+  for (const auto& entry : std::filesystem::directory_iterator(data_)) {
+    if (entry.path().extension() != ".csv") continue;
+    // Refused as soon as it was read: what it would learn is not asked here.
+    const Outcome outcome = run({"learn", entry.path().string(), "--root", "99"});
+    EXPECT_EQ(outcome.exit_code, 1);
+    EXPECT_NE(outcome.err.find("--root: part 99 is never seen"), std::string::npos) << outcome.err;
+    EXPECT_EQ(std::count(outcome.err.begin(), outcome.err.end(), '\n'), 1) << outcome.err;
+    ++num_recordings;
+  }
+  EXPECT_GT(num_recordings, 0);
+}
 
 TEST_F(RealDataTest, TheWeldingPositionerIsOneEdgeOfBothSignals) {
   const auto csv = data_ / "positioner_2dof_metrology.csv";

@@ -9,6 +9,7 @@
 #include <fstream>
 #include <functional>
 #include <map>
+#include <regex>
 #include <sstream>
 
 #include "common/config/camera_calibration.h"
@@ -16,6 +17,7 @@
 #include "common/config/yaml.h"
 #include "common/scene/robot.h"
 #include "processes/camera/camera.h"
+#include "processes/console/rig_check.h"
 #include "processes/controller/controller.h"
 #include "processes/marker_estimator/marker_estimator.h"
 #include "processes/model_monitor/model_monitor.h"
@@ -151,6 +153,156 @@ TEST_P(RigFilesTest, AFileWithALineLessIsRefusedWithAConfigErrorOrRead) {
   }
   EXPECT_GT(num_refused, 40);
   std::filesystem::remove_all(copy);
+}
+
+TEST_P(RigFilesTest, TheCheckFindsItGood) {
+  const RigCheck check = check_rig(GetParam());
+  EXPECT_EQ(check.problems, std::vector<std::string>{});
+  EXPECT_EQ(check.remarks, std::vector<std::string>{});
+  EXPECT_EQ(check.num_signals, static_cast<int>(load_signals(GetParam()).signals.size()));
+  EXPECT_EQ(check.num_parts, static_cast<int>(load_markers(GetParam()).parts().size()));
+  EXPECT_EQ(check.num_tags, static_cast<int>(load_markers(GetParam()).tags.size()));
+}
+
+/// A rig that is damaged in one place.
+class RigCheckTest : public testing::Test {
+ protected:
+  RigCheckTest()
+      : copy_(path(testing::TempDir()) /
+              ("rig_check_" + std::to_string(getpid()) +
+               testing::UnitTest::GetInstance()->current_test_info()->name())) {
+    restore();
+  }
+  ~RigCheckTest() override { std::filesystem::remove_all(copy_); }
+
+  void restore() {
+    std::filesystem::remove_all(copy_);
+    std::filesystem::copy(path(BODYSCHEMA_CONFIG) / "arm2", copy_);
+  }
+  std::string text(const std::string& name) const {
+    std::stringstream text;
+    text << std::ifstream(copy_ / name).rdbuf();
+    return text.str();
+  }
+  void write(const std::string& name, const std::string& text) const {
+    std::ofstream(copy_ / name, std::ios::trunc) << text;
+  }
+  /// The only problem after `from` was replaced by `to` in a file of the good rig.
+  std::string problem_with(const std::string& name, const std::string& from,
+                           const std::string& to) {
+    restore();
+    std::string changed = text(name);
+    const std::size_t at = changed.find(from);
+    EXPECT_NE(at, std::string::npos) << name << " has no " << from;
+    write(name, changed.replace(at, from.size(), to));
+    const RigCheck check = check_rig(copy_);
+    EXPECT_EQ(check.problems.size(), 1U) << from;
+    if (check.problems.empty()) return "";
+    const std::string& problem = check.problems.front();
+    EXPECT_EQ(problem.rfind(copy_.string(), 0), 0U) << problem;
+    return problem.substr(copy_.string().size() + 1);
+  }
+
+  const path copy_;
+};
+
+TEST_F(RigCheckTest, WhatOneFileSaysOfAnotherMustBeThere) {
+  EXPECT_EQ(problem_with("signals.yaml", "end_effector_part: 5", "end_effector_part: 9"),
+            "signals.yaml:6: end_effector_part: part 9 has no tag in markers.yaml");
+  EXPECT_EQ(problem_with("signals.yaml", "root_part: 1", "root_part: 7"),
+            "signals.yaml:5: root_part: part 7 has no tag in markers.yaml");
+  EXPECT_EQ(problem_with("signals.yaml", "root_part: 1", "root_part: 5"),
+            "signals.yaml:6: end_effector_part: is the root part, which never moves");
+  EXPECT_EQ(problem_with("robot.yaml", "part: 5, link: arm", "part: 5, link: leg"),
+            "robot.yaml:55: parts[4].link: 'leg' is none of: base, turret, arm");
+  EXPECT_EQ(problem_with("robot.yaml", "signal: q2", "signal: q9"),
+            "robot.yaml:41: links[2].joint.signal: 'q9' is none of: q1, q2");
+  EXPECT_NE(
+      problem_with("robot.yaml", "parent: turret", "parent: torso").find("'torso' is none of"),
+      std::string::npos);
+  EXPECT_NE(problem_with("camera.yaml", "camera_info.yaml", "none.yaml").find("none.yaml"),
+            std::string::npos);
+}
+
+// The camera would wait for the next action, the babbler for the SAMPLE.
+TEST_F(RigCheckTest, AsManyFramesMustBeTakenAsASampleNeeds) {
+  EXPECT_EQ(problem_with("camera.yaml", "frames_per_action: 2", "frames_per_action: 1"),
+            "camera.yaml:10: simulation.frames_per_action: 1 is below frames_per_sample of "
+            "observer.yaml, 2: no sample would be made");
+  EXPECT_NE(problem_with("observer.yaml", "frames_per_sample: 2", "frames_per_sample: 3"), "");
+}
+
+TEST_F(RigCheckTest, EveryFileIsReadByItsOwnProcess) {
+  EXPECT_EQ(problem_with("motor_babbler.yaml", "choice: random", "choice: smart"),
+            "motor_babbler.yaml:1: choice: 'smart' is none of: active, random");
+  for (const auto& [name, reader] : kReaders) {
+    restore();
+    write(name, text(name) + "\n---\nno_such_key: 1\n");
+    std::vector<std::string> problems = check_rig(copy_).problems;
+    ASSERT_EQ(problems.size(), 1U) << name;
+    EXPECT_NE(problems[0].find(name + ":"), std::string::npos) << problems[0];
+    EXPECT_NE(problems[0].find("expected one YAML document"), std::string::npos) << problems[0];
+    restore();
+    std::filesystem::remove(copy_ / name);
+    problems = check_rig(copy_).problems;
+    EXPECT_EQ(problems.size(), name == "controller.yaml" ? 0U : 1U) << name;
+  }
+}
+
+TEST_F(RigCheckTest, FilesThatNobodyReadsAreNamed) {
+  std::filesystem::rename(copy_ / "controller.yaml", copy_ / "contoller.yaml");
+  write("notes.txt", "");
+  const RigCheck check = check_rig(copy_);
+  EXPECT_EQ(check.problems, std::vector<std::string>{});
+  ASSERT_EQ(check.remarks.size(), 2U);
+  EXPECT_TRUE(check.remarks[0].ends_with(
+      "contoller.yaml: no process reads this file; did you mean 'controller.yaml'?"))
+      << check.remarks[0];
+  EXPECT_TRUE(check.remarks[1].ends_with("notes.txt: no process reads this file"));
+}
+
+TEST_F(RigCheckTest, ALabsRigIsNotSimulated) {
+  std::filesystem::remove(copy_ / "robot.yaml");
+  std::filesystem::remove(copy_ / "robot_simulator.yaml");
+  EXPECT_EQ(check_rig(copy_).problems.size(), 2U);
+  std::string camera = text("camera.yaml");
+  camera.erase(camera.find("simulation:"));
+  write("camera.yaml", camera +
+                           "capture: {device: /dev/video0, width_px: 1280, height_px: 960, "
+                           "max_rate_hz: 15}\n");
+  EXPECT_EQ(check_rig(copy_).problems, std::vector<std::string>{});
+}
+
+// Whatever number of a rig is damaged so that squares of it overflow.
+TEST_F(RigCheckTest, NoNumberMayBe1e308) {
+  const std::regex number(R"([-+]?\b[0-9]+(\.[0-9]+)?(e[-+]?[0-9]+)?\b)");
+  int num_numbers = 0;
+  for (const auto& [name, reader] : kReaders) {
+    const std::string good = text(name);
+    std::size_t line_begin = 0;
+    for (std::size_t line_end; line_begin < good.size(); line_begin = line_end + 1) {
+      line_end = std::min(good.find('\n', line_begin), good.size());
+      std::string line = good.substr(line_begin, line_end - line_begin);
+      line = line.substr(0, line.find('#'));
+      for (std::sregex_iterator match(line.begin(), line.end(), number), end; match != end;
+           ++match) {
+        // A name or a path; numbers of a calibration that nobody reads.
+        const std::size_t at = static_cast<std::size_t>(match->position());
+        const char before = at > 0 ? line[at - 1] : ' ';
+        if (std::string(" [{:,").find(before) == std::string::npos) continue;
+        std::string damaged = good;
+        damaged.replace(line_begin + at, static_cast<std::size_t>(match->length()), "1e308");
+        write(name, damaged);
+        const std::vector<std::string> problems = check_rig(copy_).problems;
+        const bool is_read =
+            name != "camera_info.yaml" || good.find("rectification_matrix") > line_begin;
+        ASSERT_EQ(problems.empty(), !is_read) << name << ": " << line;
+        ++num_numbers;
+      }
+    }
+    write(name, good);
+  }
+  EXPECT_GT(num_numbers, 300);
 }
 
 INSTANTIATE_TEST_SUITE_P(Shipped, RigFilesTest, testing::ValuesIn(rigs()),

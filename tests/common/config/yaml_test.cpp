@@ -172,6 +172,10 @@ TEST(YamlTest, ADuplicateKeyIsRefusedAtAnyDepth) {
 
 TEST(YamlTest, WhatIsNoMappingIsRefused) {
   EXPECT_CONFIG_ERROR(Yaml::parse("- 1\n- 2\n", "f"), "f:1: expected a mapping 'key: value'");
+  // A reader of the first document would pass over all that follows.
+  EXPECT_CONFIG_ERROR(Yaml::parse("a: 1\n---\na: 2\n", "f"),
+                      "f:2: expected one YAML document, found a second one");
+  EXPECT_EQ(Yaml::parse("---\na: 1\n", "f").integer("a"), 1);
   EXPECT_CONFIG_ERROR(Yaml::parse("just words", "f"), "f:1: expected a mapping 'key: value'");
   EXPECT_CONFIG_ERROR(Yaml::parse("", "f"), "f:1: expected a mapping 'key: value'");
   EXPECT_CONFIG_ERROR(Yaml::parse("# only a comment\n", "f"),

@@ -115,6 +115,49 @@ TEST(OperateTest, AfterATimeoutItSaysWhoIsSilent) {
   EXPECT_EQ(follower.diagnosis(), "the controller does not acknowledge the target");
 }
 
+TEST(OperateTest, ATargetThatNobodyFollowsIsWithdrawn) {
+  // Never acknowledged: it may wait in the controller's queue.
+  TargetFollower follower(target(), 5 * kSecond);
+  follower.on_tick(0);
+  const auto expect = [&](std::int8_t kind) {
+    const pose_target_t withdrawal = follower.withdrawal();
+    EXPECT_EQ(check(withdrawal), "");
+    EXPECT_EQ(withdrawal.target_kind, kind);
+    EXPECT_EQ(withdrawal.sender, "console");
+    // Newer than its own target, older than whatever another sender gives.
+    EXPECT_EQ(withdrawal.epoch, 50);
+    EXPECT_EQ(withdrawal.target_id, 1);
+  };
+  expect(pose_target_t::KIND_HOLD);
+  control_status_t moving = status(S::CONTROL_MOVING);
+  moving.owns_arm = 1;
+  follower.on_control_status(moving);
+  follower.on_tick(5 * kSecond);
+  EXPECT_EQ(follower.end(), End::kTimedOut);
+  expect(pose_target_t::KIND_HOLD);
+  // What is lent to the babbler stays its own.
+  TargetFollower lent(target(), 5 * kSecond);
+  lent.on_tick(0);
+  lent.on_control_status(status(S::CONTROL_LENT));
+  EXPECT_EQ(lent.withdrawal().target_kind, pose_target_t::KIND_RELEASE);
+}
+
+TEST(OperateTest, AnInterruptEndsWhatIsOpenOnly) {
+  TargetFollower follower(target(), 5 * kSecond);
+  follower.on_tick(0);
+  follower.interrupt();
+  EXPECT_EQ(follower.end(), End::kInterrupted);
+  EXPECT_FALSE(follower.on_tick(kSecond));
+  EXPECT_EQ(
+      nlohmann::json::parse(target_json(status(S::CONTROL_MOVING), End::kInterrupted))["state"],
+      "interrupted");
+  TargetFollower reached(target(), 5 * kSecond);
+  reached.on_tick(0);
+  reached.on_control_status(status(S::CONTROL_REACHED));
+  reached.interrupt();
+  EXPECT_EQ(reached.end(), End::kAsked);
+}
+
 TEST(OperateTest, TheResultAsJsonHasNullForWhatIsUnknown) {
   const auto json = nlohmann::json::parse(target_json(status(S::CONTROL_REACHED), End::kAsked));
   EXPECT_EQ(json["reached"], true);
@@ -125,21 +168,21 @@ TEST(OperateTest, TheResultAsJsonHasNullForWhatIsUnknown) {
             "timed out");
 }
 
-TEST(OperateTest, StopAndResumeAreRepeatedUntilTheDriverSaysSo) {
-  for (const bool stop : {true, false}) {
-    LatchFollower follower(stop ? action_command_t::KIND_STOP : action_command_t::KIND_RESUME, 50);
+TEST(OperateTest, HaltAndResumeAreRepeatedUntilTheDriverSaysSo) {
+  for (const bool halt : {true, false}) {
+    LatchFollower follower(halt ? action_command_t::KIND_STOP : action_command_t::KIND_RESUME, 50);
     const auto command = follower.on_tick(0);
     ASSERT_TRUE(command);  // at once, whatever was heard
     EXPECT_EQ(check(*command), "");
     motion_status_t motion{};
-    motion.stop_latched = stop ? 0 : 1;
+    motion.stop_latched = halt ? 0 : 1;
     follower.on_motion_status(motion);
     EXPECT_FALSE(follower.is_done());
     EXPECT_FALSE(follower.on_tick(kSecond / 10));
     const auto again = follower.on_tick(kSecond / 2);
     ASSERT_TRUE(again);
     EXPECT_EQ(again->action_id, command->action_id);  // the driver serves it once
-    motion.stop_latched = stop ? 1 : 0;
+    motion.stop_latched = halt ? 1 : 0;
     follower.on_motion_status(motion);
     EXPECT_TRUE(follower.is_done());
     EXPECT_FALSE(follower.on_tick(kSecond));

@@ -3,6 +3,7 @@
 #include <gtest/gtest.h>
 
 #include <cmath>
+#include <set>
 
 #include "processes/structure_learner/learn.h"
 #include "tests/support/synthetic_robot.h"
@@ -76,6 +77,22 @@ TEST(SchemaJsonTest, ASchemaOfNothingIsPrintedToo) {
                             "noise": {"position_m": 0, "rotation_deg": 0}})"));
   EXPECT_NO_THROW(schema_json(BodySchema{}).dump());
   EXPECT_EQ(structure_text(BodySchema{}), "Incomplete structure of 0 parts from 0 samples\n");
+}
+
+TEST(SchemaJsonTest, TheNoiseIsPrintedWithWhereItIsKnownFrom) {
+  BodySchema schema;
+  schema.noise = {0.0031, 1.2 * M_PI / 180};
+  EXPECT_NE(structure_text(schema).find("noise per axis and marker: 3.10 mm 1.20°\n"),
+            std::string::npos);
+  std::set<std::string> words;
+  for (const NoiseSource source :
+       {NoiseSource::kGiven, NoiseSource::kCovariances, NoiseSource::kRepeats, NoiseSource::kFrames,
+        NoiseSource::kResiduals, NoiseSource::kAssumed}) {
+    words.insert(structure_json(schema, {}, source)["noise"]["from"]);
+    EXPECT_NE(structure_text(schema, source).find("3.10 mm 1.20°, "), std::string::npos);
+  }
+  EXPECT_EQ(words, (std::set<std::string>{"given", "covariances", "repeats", "frames", "residuals",
+                                          "assumed"}));
 }
 
 TEST(SchemaJsonTest, AnUnconnectedPartComesWithItsReason) {

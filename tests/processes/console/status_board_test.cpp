@@ -87,7 +87,7 @@ TEST(StatusBoardTest, AStopComesBeforeAllElseAndTheControllerBeforeTheBabbler) {
   motion_status_t stopped = at_rest();
   stopped.stop_latched = 1;
   board_.on_message(stopped);
-  EXPECT_EQ(board_.headline(), "Stopped: nothing moves until `bodyschema resume`.");
+  EXPECT_EQ(board_.headline(), "Halted: nothing moves until `bodyschema resume`.");
 }
 
 TEST(StatusBoardTest, WhoIsMissingIsNamed) {
@@ -256,6 +256,29 @@ TEST(StatusBoardTest, FaultsAreMarkedAsGroundTruth) {
       board_.text(100).find("faults   stuck q3, bend link2 10°   (ground truth of the simulation)"),
       std::string::npos)
       << board_.text(100);
+}
+
+TEST(StatusBoardTest, WhatWasNotHeardIsNull) {
+  StatusBoard board_({}, "1.2.3");
+  board_.begin(0);
+  for (const char* key : {"arm", "control", "newest_sample", "faults", "schema", "parts", "events"})
+    EXPECT_TRUE(board_.json().at(key).is_null()) << key;
+  control_status_t control{};
+  control.target_part = -1;
+  control.predicted_error_m = control.observed_error_m = -1;
+  board_.on_message(control);
+  motion_status_t motion{};
+  motion.action_id = -1;
+  board_.on_message(motion);
+  board_.on_message(model_health_t{});
+  const auto json = board_.json();
+  for (const char* key : {"target_part", "predicted_error_m", "observed_error_m"})
+    EXPECT_TRUE(json["control"].at(key).is_null()) << key;
+  EXPECT_TRUE(json["arm"]["action_id"].is_null());
+  EXPECT_EQ(json["parts"], nlohmann::ordered_json::array());
+  control.observed_error_m = 0.25;
+  board_.on_message(control);
+  EXPECT_EQ(board_.json()["control"]["observed_error_m"], 0.25);
 }
 
 TEST(StatusBoardTest, SilenceAndGarbageAreTold) {

@@ -471,6 +471,27 @@ TEST(ControllerTest, HoldStaysUntilAnotherTarget) {
   EXPECT_EQ(bench.status.owns_arm, 0);
 }
 
+// As the console does when nobody follows the target any longer: of the same sender and epoch.
+TEST(ControllerTest, AWithdrawnTargetMovesTheArmNoFartherButNotAnothersTarget) {
+  Bench bench;
+  bench.start();
+  bench.give(position_target(0, kFar));
+  ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 1; }));
+  bench.give(other_target(1, Target::KIND_HOLD));
+  EXPECT_EQ(bench.status.control_state, S::CONTROL_HOLDING);
+  bench.run(60);
+  EXPECT_EQ(bench.moves.size(), 1U);
+  EXPECT_EQ(bench.num_holds, 1);
+  EXPECT_EQ(bench.status.control_state, S::CONTROL_HOLDING);
+  Target planners = position_target(0, kNear);
+  planners.epoch = 78;
+  planners.sender = "planner";
+  bench.give(planners);
+  bench.give(other_target(2, Target::KIND_HOLD));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED));
+  EXPECT_EQ(bench.status.sender, "planner");
+}
+
 TEST(ControllerTest, AHoldThatTheDriverDoesNotAnswerIsSentAgainWithTheSameId) {
   Bench bench;
   bench.start();

@@ -1,0 +1,145 @@
+#include <algorithm>
+#include <cmath>
+#include <map>
+#include <utility>
+
+#include "common/statistics/median.h"
+#include "processes/console/recording.h"
+
+namespace bodyschema {
+namespace {
+
+/// No arm with markers on it moves farther [m].
+constexpr double kLargestBody_m = 10;
+/// Largest believable standard deviation of a marker [m], kNoiseCeiling of the learner.
+constexpr double kLargestNoise_m = 0.1;
+
+/// Positions of one part, or poses of one relative to another, in the order of the samples.
+using Track = std::vector<Pose>;
+
+std::map<int, Track> tracks_of(const std::vector<ActionPoseSample>& samples) {
+  std::map<int, Track> tracks;
+  for (const ActionPoseSample& sample : samples)
+    for (const PartObservation& o : sample.parts) tracks[o.part].push_back(o.X_CB);
+  return tracks;
+}
+
+Eigen::Vector3d median_position(const Track& track) {
+  Eigen::Vector3d result;
+  for (int axis = 0; axis < 3; ++axis) {
+    std::vector<double> values;
+    for (const Pose& X : track) values.push_back(X.translation()[axis]);
+    result[axis] = median(values);
+  }
+  return result;
+}
+
+/// Median distance of a track from its middle [m].
+double spread_m(const Track& track) {
+  const Eigen::Vector3d middle = median_position(track);
+  std::vector<double> distances;
+  for (const Pose& X : track) distances.push_back((X.translation() - middle).norm());
+  return median(distances);
+}
+
+/// The pose whose x, y, z, w was read as w, x, y, z.
+Pose reordered(const Pose& X) {
+  const Eigen::Quaterniond read(X.linear());
+  return make_pose(Eigen::Quaterniond(read.z(), read.w(), read.x(), read.y()), X.translation());
+}
+
+/// How far the poses of a part relative to another are from those of one joint: the sum of what the
+/// relative position moves, per distance, and of what the relative rotation turns beside its main
+/// axis [rad]. 0: rigid, or turning about a fixed axis through the part's origin.
+double disorder(const Track& relative) {
+  const Pose first = relative[relative.size() / 2];
+  std::vector<double> distances;
+  Eigen::Matrix3d scatter = Eigen::Matrix3d::Zero();
+  std::vector<Eigen::Vector3d> turns;
+  for (const Pose& z : relative) {
+    distances.push_back(z.translation().norm());
+    turns.push_back(log_so3(first.linear().transpose() * z.linear()));
+    scatter += turns.back() * turns.back().transpose();
+  }
+  const Eigen::Vector3d axis =
+      Eigen::SelfAdjointEigenSolver<Eigen::Matrix3d>(scatter).eigenvectors().col(2);
+  std::vector<double> beside;
+  for (const Eigen::Vector3d& turn : turns) beside.push_back((turn - axis * axis.dot(turn)).norm());
+  return spread_m(relative) / std::max(median(distances), 1e-9) + median(beside);
+}
+
+/// Whether the rotations fit together as those of a body only when they are read in the other
+/// order. Read in the wrong order rotations are inverted (and turned by constants), so that what is
+/// rigid tumbles: each part's best partner tells.
+bool is_order_x_y_z_w(const std::vector<ActionPoseSample>& samples,
+                      const std::map<int, Track>& tracks) {
+  // The reference frame's own pose is no rotation.
+  for (const auto& [part, track] : tracks) {
+    const bool is_reference = std::all_of(track.begin(), track.end(), [](const Pose& X) {
+      return X.translation().isZero(0) &&
+             (X.linear().diagonal() - Eigen::Vector3d(-1, -1, 1)).norm() < 1e-12;
+    });
+    if (is_reference) return true;
+  }
+  // Enough to tell by; few enough to be done at once.
+  constexpr std::size_t kFewest = 8, kMost = 200;
+  constexpr std::size_t kMostParts = 12;
+  // Noise, and joints beside the origin, make disorder of about this size in either order.
+  constexpr double kUnremarkable = 0.1;
+  // Evidence of all parts, in nats of disorder; tests/processes/console/recording_test.cpp.
+  constexpr double kEvidence = 2;
+  const std::size_t stride = std::max<std::size_t>(1, samples.size() / kMost);
+  std::map<int, std::pair<double, double>> least;  // disorder of each part as read, reordered
+  std::size_t num_parts = 0;
+  for (auto i = tracks.begin(); i != tracks.end() && num_parts < kMostParts; ++i, ++num_parts) {
+    for (auto j = tracks.begin(); j != tracks.end(); ++j) {
+      if (i == j) continue;
+      Track as_read, other;
+      for (std::size_t t = 0; t < samples.size(); t += stride) {
+        const PartObservation* a = samples[t].find(i->first);
+        const PartObservation* b = samples[t].find(j->first);
+        if (!a || !b) continue;
+        as_read.push_back(a->X_CB.inverse() * b->X_CB);
+        other.push_back(reordered(a->X_CB).inverse() * reordered(b->X_CB));
+      }
+      if (as_read.size() < kFewest) continue;
+      const auto [known, is_new] =
+          least.try_emplace(j->first, std::pair(disorder(as_read), disorder(other)));
+      if (is_new) continue;
+      known->second.first = std::min(known->second.first, disorder(as_read));
+      known->second.second = std::min(known->second.second, disorder(other));
+    }
+  }
+  double evidence = 0;
+  for (const auto& [part, both] : least)
+    evidence += std::log((both.first + kUnremarkable) / (both.second + kUnremarkable));
+  return evidence > kEvidence;
+}
+
+}  // namespace
+
+std::vector<std::string> hints_of(const Recording& recording) {
+  std::vector<std::string> hints;
+  const std::map<int, Track> tracks = tracks_of(recording.samples);
+  double largest_m = 0;
+  Track middles;
+  for (const auto& [part, track] : tracks) {
+    largest_m = std::max(largest_m, spread_m(track));
+    middles.emplace_back(Eigen::Translation3d(median_position(track)));
+  }
+  if (std::max(largest_m, spread_m(middles)) > kLargestBody_m)
+    hints.emplace_back("positions look like millimetres; expected metres");
+  if (recording.has_noise) {
+    std::vector<double> noise_m;
+    for (const ActionPoseSample& sample : recording.samples)
+      for (const PartObservation& o : sample.parts)
+        noise_m.push_back(std::sqrt(o.covariance(0, 0)));
+    if (median(noise_m) > kLargestNoise_m)
+      hints.emplace_back("sp_m looks like millimetres; expected metres");
+  }
+  if (is_order_x_y_z_w(recording.samples, tracks))
+    hints.emplace_back("the quaternion column order looks like x y z w; expected qw,qx,qy,qz");
+  return hints;
+}
+
+}  // namespace bodyschema
