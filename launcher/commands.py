@@ -288,8 +288,9 @@ def console(place, word, arguments):
         group = Group.find(place.logs)
         if group:
             exec_in_group(place, group, ["bodyschema", word, *arguments])
-        bus = os.environ.get("LCM_DEFAULT_URL", "the default of LCM")
-        say(f"no group runs here: speaking on this machine's own bus, {bus}")
+        # A lab's own group has a bus that is named.
+        if "LCM_DEFAULT_URL" not in os.environ and "--in" not in arguments:
+            raise Failure(f"no group runs here; start one with ./run --keep, or name a bus: LCM_DEFAULT_URL=URL ./run {word} …")
     if not asks_for_help(arguments):
         build(place, "programs")
     words = [*WORDS, *console_words(place)]

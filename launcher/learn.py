@@ -35,15 +35,20 @@ def pick(commands, names):
     return {name: command for name, command in commands.items() if name in names}
 
 
+def asked_of_console(place, *words):
+    """What it answers; where it cannot it says why, and this program ends as it did."""
+    asked = subprocess.run(list(map(str, [place.console, *words])), stdout=subprocess.PIPE, text=True)
+    if asked.returncode != 0:
+        raise SystemExit(asked.returncode)
+    return asked.stdout.strip()
+
+
 class Settings:
     """What `bodyschema rig` says of the group."""
 
     def __init__(self, place, folder, *flags):
-        command = [place.console, "rig", folder, *flags]
-        asked = subprocess.run(list(map(str, command)), stdout=subprocess.PIPE, text=True)
-        if asked.returncode != 0:
-            raise SystemExit(asked.returncode)
-        self.network, self.bus, self.images, self.host, *self.share = asked.stdout.split()
+        answer = asked_of_console(place, "rig", folder, *flags)
+        self.network, self.bus, self.images, self.host, *self.share = answer.splitlines()[0].split()
 
 
 def watch_command(place, run, rig, images, names, *flags):
@@ -107,15 +112,14 @@ def replay(place, log, rig, speed):
         folder = rig_folder(place, rig)
         rig = folder.name
     else:
-        # A run's folder says which rig it was.
+        # A run's folder says which rig it was; of another recording its messages do.
         folder = log.parent / "config"
-        if not (folder / "signals.yaml").exists():
-            raise Failure(f"which rig was recorded? There is no config/ beside {log}: type --rig RIG")
-        rig = rig_of_result(log.parent / "result.json") or log.name
-    asked = subprocess.run([place.console, "log", log, "--replay-from"], stdout=subprocess.PIPE, text=True)
-    if asked.returncode != 0:
-        return asked.returncode
-    source = asked.stdout.strip()
+        if (folder / "signals.yaml").exists():
+            rig = rig_of_result(log.parent / "result.json") or log.name
+        else:
+            rig = asked_of_console(place, "log", log, "--rig-of", place.source / "config")
+            folder = rig_folder(place, rig)
+    source = asked_of_console(place, "log", log, "--replay-from")
     run, lock = run_folder.begin(place, folder)
     names = ["structure_learner", "model_monitor", "report", "log"]
     is_played = float(speed) > 0
