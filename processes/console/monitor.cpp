@@ -163,8 +163,8 @@ void run_monitor(const MonitorArguments& arguments) {
       if (arguments.json)
         std::cout << event_json(event, sample, schema.signals).dump() << '\n';
       else
-        std::cout << fmt::format("sample {:5} {:9.2f} s  {}\n", event.sample_index,
-                                 seconds(sample), text_of(event, schema.signals));
+        std::cout << fmt::format("sample {:5} {:9.2f} s  {}\n", event.sample_index, seconds(sample),
+                                 text_of(event, schema.signals));
     }
     if (!evaluation) continue;
     const auto errors = evaluate(method->schema(), evaluation->samples);

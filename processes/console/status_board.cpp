@@ -455,9 +455,10 @@ std::string StatusBoard::text(int width) const {
       const health_event_t& event = health_->events[i];
       // By the arm's clock: the newest sample is now.
       const std::string age =
-          sample_ ? ", " + duration(std::max(0.0, seconds(event.utime, sample_->utime))) + " ago" : "";
-      text += wrap(fmt::format("sample {}{}: {}", event.event_sample, age, event.event_text),
-                   width, 2);
+          sample_ ? ", " + duration(std::max(0.0, seconds(event.utime, sample_->utime))) + " ago"
+                  : "";
+      text +=
+          wrap(fmt::format("sample {}{}: {}", event.event_sample, age, event.event_text), width, 2);
     }
   }
   return text;
