@@ -14,16 +14,17 @@ constexpr double kDegrees = 180 / M_PI;
 
 ordered_json id(std::int32_t part) { return part < 0 ? ordered_json() : ordered_json(part); }
 
-ordered_json amounts_json(std::int8_t kind, const std::vector<double>& amounts) {
-  const auto known = [](double amount, double unit) {
-    return amount == -1 ? ordered_json() : ordered_json(amount * unit);
+/// `are_sds`: −1 is not known. A joint may well stand at −1.
+ordered_json amounts_json(std::int8_t kind, const std::vector<double>& amounts, bool are_sds) {
+  const auto known = [&](std::size_t i, double unit = 1) {
+    return are_sds && amounts.at(i) == -1 ? ordered_json() : ordered_json(amounts.at(i) * unit);
   };
   const bool is_rate = kind == change_size_t::SIZE_RATE;
-  if (kind == change_size_t::SIZE_COMMAND) return {{"command", amounts.at(0)}};
-  if (kind == change_size_t::SIZE_FACTOR) return {{"factor", amounts.at(0)}};
+  if (kind == change_size_t::SIZE_COMMAND) return {{"command", known(0)}};
+  if (kind == change_size_t::SIZE_FACTOR) return {{"factor", known(0)}};
   if (kind == change_size_t::SIZE_UNKNOWN) return nullptr;
-  return {{is_rate ? "position_m_per_sample" : "position_m", known(amounts.at(0), 1)},
-          {is_rate ? "rotation_deg_per_sample" : "rotation_deg", known(amounts.at(1), kDegrees)}};
+  return {{is_rate ? "position_m_per_sample" : "position_m", known(0)},
+          {is_rate ? "rotation_deg_per_sample" : "rotation_deg", known(1, kDegrees)}};
 }
 
 }  // namespace
@@ -40,8 +41,8 @@ void add_size(const change_size_t& size, std::int64_t since,
   const bool has_signal = size.size_signal >= 0 && size.size_signal < std::ssize(signals);
   (*json)["signal"] = has_signal ? ordered_json(signals[static_cast<std::size_t>(size.size_signal)])
                                  : ordered_json();
-  (*json)["amount"] = amounts_json(size.size_kind, size.amount);
-  (*json)["amount_sd"] = amounts_json(size.size_kind, size.amount_sd);
+  (*json)["amount"] = amounts_json(size.size_kind, size.amount, false);
+  (*json)["amount_sd"] = amounts_json(size.size_kind, size.amount_sd, true);
   (*json)["since"] = since < 0 ? ordered_json() : ordered_json(since);
 }
 

@@ -346,6 +346,7 @@ TEST_F(ReportPageTest, WhatIsWrongStandsFirst) {
   EXPECT_EQ(count(page(), "The body is known: 3 parts"), 1);
   model_health_t health{};
   health.judged_sample = 49;
+  health.probe_sample = -1;
   finding_t finding{};
   finding.finding_text = "q1 (1→2) stuck at <b>";
   set_array(health.num_findings, health.findings, {finding});
@@ -377,6 +378,7 @@ TEST_F(ReportPageTest, TheBodyChangesWhereTheSimulationBrokeIt) {
   const auto broken = [&](std::int64_t utime, std::vector<std::string> faults) {
     sim_state_t state{};
     state.utime = utime;
+    state.X_WC = to_message(Pose::Identity());
     set_array(state.num_faults, state.faults, std::move(faults));
     hear(kSimState, state);
   };
