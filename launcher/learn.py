@@ -76,9 +76,10 @@ def learn(place, options):
     if is_share:
         network.check_route()
     run, lock = run_folder.begin(place, folder)
+    samples = ["--samples", options.samples] if options.samples else []
     variables = {
         "SIMULATOR_FLAGS": shlex.join(["--seed", options.seed, *hide]),
-        "BABBLER_FLAGS": shlex.join(["--seed", options.seed, *(["--samples", options.samples] if options.samples else [])]),
+        "BABBLER_FLAGS": shlex.join(["--seed", options.seed, *samples]),
     }
     if options.initial:
         variables["INITIAL"] = str(run / "initial.lcmlog")
@@ -92,7 +93,7 @@ def learn(place, options):
         if not is_share or "motor_babbler" in share or options.watch:
             # The others may start whenever they like.
             patience = ["--patience-s", "1e9"] if is_share else []
-            flags = ["--seed", options.seed, *patience]
+            flags = ["--seed", options.seed, *samples, *patience]
             status = session.watch(watch_command(place, run, folder.name, settings.images, commands, *flags))
         if options.keep and session.is_running():
             say("The group keeps running: ./run exec CMD… works on its bus, ./run stop ends it.")

@@ -33,6 +33,7 @@ constexpr double kLargestHyperParameter = 1e60;
 constexpr std::int64_t kMaxGeoms = 100'000;
 constexpr std::int64_t kMaxCounters = 10'000;
 constexpr std::int64_t kMaxEvents = 32;
+constexpr std::int64_t kMaxFindings = 64;
 constexpr std::int64_t kMaxImageBytes = std::int64_t{1} << 28;
 constexpr std::size_t kMaxName = 1'000;
 constexpr std::size_t kMaxText = 1'000'000;
@@ -639,6 +640,33 @@ std::string check(const model_health_t& message) {
                check.measured("position_median_m", part.position_median_m);
                check.measured("rotation_median_rad", part.rotation_median_rad);
              });
+  const auto check_size = [&](const change_size_t& size) {
+    check.constant("size_kind", size.size_kind, change_size_t::SIZE_RATE);
+    check.integer_within("size_signal", size.size_signal, -1, kMaxSignals - 1);
+    const bool is_pose = size.size_kind >= change_size_t::SIZE_POSE;
+    check.require(size.num_amounts == (size.size_kind == 0 ? 0
+                                       : is_pose           ? 2
+                                                           : 1),
+                  "num_amounts", "does not fit size_kind");
+    check.numbers("amount", size.num_amounts, size.amount, 2);
+    check.each("amount_sd", size.num_amounts, size.amount_sd, 2,
+               [&](double sd) { check.measured("amount_sd", sd); });
+  };
+  check.each("findings", message.num_findings, message.findings, kMaxFindings,
+             [&](const finding_t& finding) {
+               check.constant("finding_state", finding.finding_state, finding_t::FINDING_ASIDE);
+               check.integer_within("finding_from", finding.finding_from, -1, kMaxId);
+               check.integer_within("finding_to", finding.finding_to, -1, kMaxId);
+               check.integer_within("finding_part", finding.finding_part, -1, kMaxId);
+               check.integer_within("finding_tag", finding.finding_tag, -1, kMaxId);
+               check.text("finding_cause", finding.finding_cause, kMaxText);
+               check_size(finding.finding_size);
+               check.integer_at_least("finding_since", finding.finding_since, 0);
+               check.integer_at_least("finding_found", finding.finding_found, 0);
+               check.integer_at_least("finding_adopted", finding.finding_adopted, -1);
+               check.integer_at_least("num_confirming", finding.num_confirming, 0);
+               check.text("finding_text", finding.finding_text, kMaxText);
+             });
   std::int64_t previous_event = -1;
   check.each("events", message.num_events, message.events, kMaxEvents,
              [&](const health_event_t& event) {
@@ -651,6 +679,8 @@ std::string check(const model_health_t& message) {
                check.integer_within("event_part", event.event_part, -1, kMaxId);
                check.integer_within("event_tag", event.event_tag, -1, kMaxId);
                check.text("event_cause", event.event_cause, kMaxText);
+               check.integer_at_least("event_since", event.event_since, -1);
+               check_size(event.event_size);
                check.finite("event_margin", event.event_margin);
                check.integer_at_least("samples_used", event.samples_used, 0);
                check.text("event_text", event.event_text, kMaxText);

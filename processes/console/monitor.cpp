@@ -16,11 +16,14 @@
 #include "common/bus/convert.h"
 #include "common/bus/event_log.h"
 #include "processes/console/evaluation.h"
+#include "processes/console/health_view.h"
 #include "processes/console/offline.h"
 #include "processes/console/recording.h"
 #include "processes/console/schema_json.h"
 #include "processes/model_monitor/adaptation.h"
 #include "processes/model_monitor/chapter_adaptation.h"
+#include "processes/model_monitor/health_words.h"
+#include "processes/model_monitor/live_schema.h"
 #include "processes/structure_learner/baseline/fit_matrix_gp.h"
 #include "processes/structure_learner/baseline/learn_baseline.h"
 #include "processes/structure_learner/learn.h"
@@ -42,7 +45,15 @@ struct MonitorArguments {
 
 double seconds(const ActionPoseSample& sample) { return 1e-6 * static_cast<double>(sample.utime); }
 
-Json event_json(const AdaptationEvent& event, const ActionPoseSample& sample) {
+std::vector<std::string> names_of(const std::vector<Signal>& signals) {
+  std::vector<std::string> names;
+  for (const Signal& signal : signals) names.push_back(signal.name);
+  return names;
+}
+
+Json event_json(const AdaptationEvent& event, const ActionPoseSample& sample,
+                const std::vector<Signal>& signals) {
+  const health_event_t message = to_message(event, signals, sample.utime);
   Json json;
   json["sample"] = event.sample_index;
   json["t"] = seconds(sample);
@@ -55,21 +66,14 @@ Json event_json(const AdaptationEvent& event, const ActionPoseSample& sample) {
     json["to"] = event.to;
   }
   if (!event.cause.empty()) json["cause"] = event.cause;
+  add_size(message.event_size, message.event_since, names_of(signals), &json);
   json["margin"] = event.margin;
   json["samples_used"] = event.num_samples;
+  json["text"] = message.event_text;
   if (event.probe.size() > 0)
     json["action"] =
         std::vector<double>(event.probe.data(), event.probe.data() + event.probe.size());
   return json;
-}
-
-std::string event_text(const AdaptationEvent& event) {
-  std::string place = event.part >= 0 ? fmt::format("part {}", event.part)
-                                      : fmt::format("edge {}-{}", event.from, event.to);
-  if (event.tag >= 0) place += fmt::format(", tag {}", event.tag);
-  return fmt::format("sample {:5}  {:<12}  {:<10}  {:<16}  {:6.1f} nats  {} samples\n",
-                     event.sample_index, name_of(event.kind), place, event.cause, event.margin,
-                     event.num_samples);
 }
 
 AdaptationOptions options_of(const MonitorArguments& arguments, const Recording& recording,
@@ -168,9 +172,10 @@ void run_monitor(const MonitorArguments& arguments) {
     for (const AdaptationEvent& event : method->on_sample(sample)) {
       ++num_events;
       if (arguments.json)
-        std::cout << event_json(event, sample).dump() << '\n';
+        std::cout << event_json(event, sample, schema.signals).dump() << '\n';
       else
-        std::cout << event_text(event);
+        std::cout << fmt::format("sample {:5} {:9.2f} s  {}\n", event.sample_index, seconds(sample),
+                                 text_of(event, schema.signals));
     }
     if (!evaluation) continue;
     const auto errors = evaluate(method->schema(), evaluation->samples);

@@ -6,6 +6,7 @@
 #include <cmath>
 #include <limits>
 #include <set>
+#include <utility>
 
 #include "common/geometry/pose.h"
 #include "processes/console/evaluation.h"
@@ -18,6 +19,7 @@ constexpr std::size_t kMostDots = 150;
 /// Seen on white and on black.
 const char* const kBlue = "#4a86c5";
 const char* const kOrange = "#dd8a3a";
+const char* const kRed = "#cf5f5f";
 const char* const kColours[] = {"#4a86c5", "#dd8a3a", "#5aa469", "#cf5f5f",
                                 "#9a77bd", "#4fa8a8", "#a3794f", "#b0a03c"};
 
@@ -280,50 +282,97 @@ std::string visibility_svg(const std::vector<Signal>& signals,
   return svg + "</svg>\n";
 }
 
+std::vector<BodyMark> body_marks(const RunRecord& record) {
+  std::vector<BodyMark> marks;
+  const auto add = [&](std::int64_t sample, const std::string& label) {
+    while (!marks.empty() && marks.back().sample >= sample) marks.pop_back();
+    if (sample > 0) marks.push_back({sample, label});
+  };
+  if (!record.faults().empty()) {
+    std::vector<std::string> before;
+    for (const RunRecord::FaultChange& change : record.faults()) {
+      for (const ActionPoseSample& sample : record.watch().samples()) {
+        if (sample.utime < change.utime) continue;
+        std::string label;
+        for (const std::string& fault : change.faults) {
+          if (std::find(before.begin(), before.end(), fault) == before.end())
+            label += (label.empty() ? "" : ", ") + fault;
+        }
+        add(sample.sample_index, label.empty() ? "repair" : label);
+        break;
+      }
+      before = change.faults;
+    }
+  } else if (record.watch().schema()) {
+    // One that was taken back, or is told better, is known from an earlier sample on.
+    for (const KnownChange& change : record.watch().schema()->changes) add(change.since, "found");
+  }
+  return marks;
+}
+
 std::vector<VersionErrors> version_errors(const std::map<std::int64_t, BodySchema>& versions,
                                           const std::vector<ActionPoseSample>& held_out,
+                                          const std::vector<BodyMark>& marks,
                                           std::optional<int> end_effector, int most) {
-  std::vector<const BodySchema*> all;
-  for (const auto& [version, schema] : versions) all.push_back(&schema);
-  std::vector<const BodySchema*> chosen;
-  const int num_chosen = std::min(most, static_cast<int>(all.size()));
-  for (int i = 0; i < num_chosen; ++i) {
-    // From the last one backwards, in equal steps.
-    const auto index = static_cast<std::size_t>(
-        std::lround((i + 1.0) * static_cast<double>(all.size()) / num_chosen) - 1);
-    chosen.push_back(all[index]);
-  }
   std::vector<VersionErrors> result;
-  for (const BodySchema* schema : chosen) {
-    std::vector<ActionPoseSample> fitting;
-    for (const ActionPoseSample& sample : held_out) {
-      if (sample.action.size() == static_cast<Eigen::Index>(schema->signals.size()))
-        fitting.push_back(sample);
+  for (std::size_t body = 0; body <= marks.size(); ++body) {
+    const std::int64_t begin = body == 0 ? 0 : marks[body - 1].sample;
+    const std::int64_t end =
+        body == marks.size() ? std::numeric_limits<std::int64_t>::max() : marks[body].sample;
+    const BodySchema* standing = nullptr;
+    std::vector<const BodySchema*> all;
+    for (const auto& [version, schema] : versions) {
+      if (schema.last_sample_index < begin)
+        standing = &schema;
+      else if (schema.last_sample_index < end)
+        all.push_back(&schema);
     }
-    std::vector<double> medians;
-    VersionErrors errors;
-    errors.num_samples = schema->last_sample_index + 1;
-    errors.num_edges = static_cast<int>(schema->edges.size());
-    for (const PartErrors& part : evaluate(*schema, fitting)) {
-      if (part.count == 0) continue;
-      medians.push_back(part.position_median_m);
-      if (part.part == end_effector) errors.end_effector_m = part.position_median_m;
+    std::vector<const BodySchema*> chosen;
+    if (standing) chosen.push_back(standing);
+    const int num_chosen = std::min(most, static_cast<int>(all.size()));
+    for (int i = 0; i < num_chosen; ++i) {
+      // From the last one backwards, in equal steps.
+      const auto index = static_cast<std::size_t>(
+          std::lround((i + 1.0) * static_cast<double>(all.size()) / num_chosen) - 1);
+      chosen.push_back(all[index]);
     }
-    if (medians.empty()) continue;
-    errors.median_position_m = quantile(medians, 0.5);
-    errors.worst_position_m = *std::max_element(medians.begin(), medians.end());
-    result.push_back(errors);
+    for (const BodySchema* schema : chosen) {
+      std::vector<ActionPoseSample> fitting;
+      for (const ActionPoseSample& sample : held_out) {
+        if (sample.sample_index >= begin && sample.sample_index < end &&
+            sample.action.size() == static_cast<Eigen::Index>(schema->signals.size()))
+          fitting.push_back(sample);
+      }
+      std::vector<double> medians;
+      VersionErrors errors;
+      errors.body = body;
+      errors.num_samples = std::max(begin, schema->last_sample_index + 1);
+      errors.num_edges = static_cast<int>(schema->edges.size());
+      for (const PartErrors& part : evaluate(*schema, fitting)) {
+        if (part.count == 0) continue;
+        medians.push_back(part.position_median_m);
+        if (part.part == end_effector) errors.end_effector_m = part.position_median_m;
+      }
+      if (medians.empty()) continue;
+      errors.median_position_m = quantile(medians, 0.5);
+      errors.worst_position_m = *std::max_element(medians.begin(), medians.end());
+      result.push_back(errors);
+    }
   }
   return result;
 }
 
-std::optional<Plot> version_plot(const std::vector<VersionErrors>& versions) {
+std::optional<Plot> version_plot(const std::vector<VersionErrors>& versions,
+                                 const std::vector<BodyMark>& marks) {
   if (versions.size() < 2) return std::nullopt;
   std::string data = "$errors << EOD\n";
   bool has_effector = false;
   int most_edges = 1;
   double lowest = 1, highest = 1e-5;
+  std::size_t body = versions.front().body;
   for (const VersionErrors& version : versions) {
+    // An empty line ends a curve.
+    if (std::exchange(body, version.body) != version.body) data += "\n";
     lowest = std::clamp(version.median_position_m, 1e-5, lowest);
     lowest = std::clamp(version.end_effector_m.value_or(lowest), 1e-5, lowest);
     highest = std::max(highest, version.worst_position_m);
@@ -347,6 +396,13 @@ std::optional<Plot> version_plot(const std::vector<VersionErrors>& versions) {
       "2000)\n"
       "set key outside top right horizontal samplen 1.5 textcolor rgb 'black'\n",
       versions.back().num_samples + 1, number(lowest * 0.7e3), number(highest * 1.4e3));
+  for (std::size_t i = 0; i < marks.size(); ++i) {
+    script += fmt::format(
+        "set arrow {0} from {1}, graph 0 to {1}, graph 1 nohead lw 0.8 dt 2 lc rgb '{2}'\n"
+        "set label {3} {4} at {1}, graph 0.97 right rotate by 90 offset 0.6,0 font ',8' "
+        "textcolor rgb '{2}'\n",
+        i + 1, marks[i].sample, kRed, i + 2, gnuplot_string(marks[i].label));
+  }
   script += fmt::format(
       "plot $errors using 1:3 {0} lc rgb '{1}' title 'worst part', "
       "$errors using 1:2 {0} lc rgb '{2}' title 'median of the parts'",
@@ -354,7 +410,8 @@ std::optional<Plot> version_plot(const std::vector<VersionErrors>& versions) {
   if (has_effector)
     script += fmt::format(", $errors using 1:4 {} lc rgb '#5aa469' title 'end effector'", dots);
   script += fmt::format(
-      "\nset tmargin at screen 0.36\nset bmargin at screen 0.17\nunset logscale y\nset format x "
+      "\nunset label\nset tmargin at screen 0.36\nset bmargin at screen 0.17\nunset logscale "
+      "y\nset format x "
       "'%g'\nset label 1 'edges' at screen 0.014,0.265 rotate center\nset xlabel 'samples' offset "
       "0,0.3\n"
       "set yrange [0:{0}]\nset ytics {1}\nunset key\n"

@@ -26,22 +26,34 @@ std::string visibility_svg(const std::vector<Signal>& signals,
                            const std::vector<ActionPoseSample>& samples,
                            const std::vector<int>& parts);
 
-/// How one version of the body schema does on held-out samples.
+/// Where the body became another one.
+struct BodyMark {
+  std::int64_t sample = 0;  ///< the first of the new body
+  std::string label;        ///< what became of it
+};
+/// By the simulation's truth where it was recorded, else as the monitor found it; ascending.
+std::vector<BodyMark> body_marks(const RunRecord& record);
+
+/// How one version of the body schema does on held-out samples of the body that it was for.
 struct VersionErrors {
-  std::int64_t num_samples = 0;  ///< that it rests on
+  std::size_t body = 0;          ///< so many marks came before
+  std::int64_t num_samples = 0;  ///< that it rests on; at least those before its body
   int num_edges = 0;
   double median_position_m = 0;          ///< median of the parts' medians
   double worst_position_m = 0;           ///< largest of the parts' medians
   std::optional<double> end_effector_m;  ///< median of the end effector
 };
 
-/// At most `most` of the versions, the last one included, each on all of `held_out`. A version that
-/// connects no part, or whose signals are others, is left out.
+/// Of each body at most `most` versions, the last one included, each on all held-out samples of
+/// that body; of one that changed also the version which stood when it did. A version that connects
+/// no part, or whose signals are others, is left out.
 std::vector<VersionErrors> version_errors(const std::map<std::int64_t, BodySchema>& versions,
                                           const std::vector<ActionPoseSample>& held_out,
+                                          const std::vector<BodyMark>& marks,
                                           std::optional<int> end_effector, int most = 30);
-/// Their plot; std::nullopt where there is nothing to draw.
-std::optional<Plot> version_plot(const std::vector<VersionErrors>& versions);
+/// Their plot, a curve for each body; std::nullopt where there is nothing to draw.
+std::optional<Plot> version_plot(const std::vector<VersionErrors>& versions,
+                                 const std::vector<BodyMark>& marks);
 
 /// A local model over one of its signals (the chapter's Fig. 5). The other signal of an edge of two
 /// is held in the middle of its range; observations are carried there by the model, which keeps

@@ -11,6 +11,7 @@
 
 #include "common/plot/plot.h"
 #include "processes/console/evaluation.h"
+#include "processes/console/health_view.h"
 #include "processes/console/recording.h"
 #include "processes/console/report_figures.h"
 #include "processes/structure_learner/learn.h"
@@ -35,6 +36,9 @@ p{margin:.5rem 0 .8rem}
 .over,.quiet,figcaption,.note{color:var(--muted);font-size:.875rem}
 .over{margin:0}.lead{font-size:1.08rem}
 .warn{color:var(--red)}
+.wrong{border-left:4px solid var(--orange);background:var(--soft);padding:.7rem 1rem;margin:1rem 0}
+.wrong.open{border-color:var(--red)}
+.wrong h2{margin:0;padding:0;border:0}.wrong ul{margin:.4rem 0;padding-left:1.2rem}.wrong p{margin:.3rem 0 0}
 dl.numbers{display:flex;flex-wrap:wrap;gap:1px;margin:1.4rem 0;
 background:var(--line);border:1px solid var(--line);border-radius:6px;overflow:hidden}
 dl.numbers div{flex:1 1 8rem;background:var(--paper);padding:.65rem .8rem}
@@ -230,6 +234,16 @@ class Page {
   std::string judge() const {
     return record_.watch().has_truth() ? "the simulator’s noise-free truth" : "what the camera saw";
   }
+  /// What the monitor can know, where the table knows better.
+  std::string as_seen() const {
+    if (!record_.watch().has_truth() || !record_.health() || record_.health()->worst_position_m < 0)
+      return "";
+    return fmt::format(
+        " Progress and <code>status</code> go by what the camera sees, noise and bias of the "
+        "markers included: worst part {}, {}.",
+        millimetres(record_.health()->worst_position_m),
+        degrees(record_.health()->worst_rotation_rad));
+  }
   const PartErrors* errors_of(std::optional<int> part) const {
     for (const PartErrors& errors : errors_) {
       if (errors.part == part && errors.count > 0) return &errors;
@@ -255,21 +269,40 @@ class Page {
                         escape_html(report_.title), kStyle, plot_symbols());
     html += fmt::format("<header><p class=\"over\">Body schema report{}</p><h1>{}</h1>",
                         report_.reload_s ? " · the run goes on" : "", escape_html(report_.title));
+    html += wrong();
     if (body_) {
       const BodySchema& schema = body_->schema;
       html += fmt::format(
           "<p class=\"lead\">{}</p>",
-          schema.complete
-              ? fmt::format("The body is known: {} hang together by {}, learned from {}.",
-                            counted(std::ssize(schema.parts), "part"),
-                            counted(std::ssize(schema.edges), "edge"),
-                            counted(schema.num_samples, "sample"))
-              : fmt::format("The body is not known yet: {} of {} after {}.",
-                            counted(std::ssize(schema.edges), "edge"),
-                            std::max<std::ptrdiff_t>(0, std::ssize(schema.parts) - 1),
-                            counted(schema.num_samples, "sample")));
+          schema.complete ? fmt::format("{} {} hang together by {}, learned from {}.", headline(),
+                                        counted(std::ssize(schema.parts), "part"),
+                                        counted(std::ssize(schema.edges), "edge"),
+                                        counted(schema.num_samples, "sample"))
+                          : fmt::format("The body is not known yet: {} of {} after {}.",
+                                        counted(std::ssize(schema.edges), "edge"),
+                                        std::max<std::ptrdiff_t>(0, std::ssize(schema.parts) - 1),
+                                        counted(schema.num_samples, "sample")));
     }
     return html + "</header>\n";
+  }
+
+  std::string headline() const {
+    if (!record_.health() || record_.health()->findings.empty()) return "The body is known:";
+    return verdict_of(record_.health()->findings).sentence;
+  }
+
+  std::string wrong() const {
+    if (!record_.health()) return "";
+    const BodyVerdict verdict = verdict_of(record_.health()->findings);
+    if (verdict.wrong.empty()) return "";
+    std::string html = fmt::format("<section class=\"wrong{}\"><h2>{}</h2><ul>",
+                                   verdict.is_schema_wrong ? " open" : "", kWhatIsWrong);
+    for (const std::string& line : verdict.wrong) html += "<li>" + escape_html(line) + "</li>";
+    html += "</ul>";
+    if (!report_.reload_s && record_.watch().num_samples() > 0)
+      html += fmt::format("<p class=\"quiet\">As of sample {}, the last. {}</p>",
+                          record_.watch().samples().back().sample_index, kNobodyWatches);
+    return html + "</section>\n";
   }
 
   /// What is wrong with the logs stands first: the rest may be told from half of them.
@@ -304,13 +337,15 @@ class Page {
     }
     item("Samples", std::to_string(record_.watch().num_samples()),
          fmt::format("{} held out", held_out_.size()));
+    const std::string against =
+        record_.watch().has_truth() ? ", against the truth" : ", against what was seen";
     if (const PartErrors* effector = errors_of(report_.end_effector)) {
       item("End effector", millimetres(effector->position_median_m),
-           degrees(effector->rotation_median_rad) + ", held out");
+           degrees(effector->rotation_median_rad) + against);
     }
     if (const PartErrors* part = worst()) {
       item("Worst part", millimetres(part->position_median_m),
-           fmt::format("part {}, {}", part->part, degrees(part->rotation_median_rad)));
+           fmt::format("part {}, {}{}", part->part, degrees(part->rotation_median_rad), against));
     }
     if (const auto begin = record_.begin_utime()) {
       item("Recorded", duration(record_.duration_s()),
@@ -367,8 +402,11 @@ class Page {
     html += table.html();
     html +=
         "<p class=\"note\">Residual: root mean square, each observation predicted without itself, "
-        "outliers left out. Health and d²: the monitor’s, on held-out samples; d² of a right "
-        "model is χ² with 6 degrees of freedom, median 5.3.</p>\n";
+        "outliers left out. Health and d²: the monitor’s, on held-out samples, d² in units of the "
+        "assumed covariance. That is wide enough for the views that tags are worst in, so that "
+        "most residuals are far within it: the median of a right model is about 0.8 (0.3 to 2; "
+        "<code>./run experiment pose_error</code>), and 5.3, that of χ² with 6 degrees of freedom, "
+        "only where the noise is as it is assumed. Above that the edge is wrong.</p>\n";
     static const char* const kReasons[] = {"never seen", "not enough data yet", "no valid model"};
     Table lone({"not connected", "why", "detail"});
     for (const UnconnectedPart& part : schema.unconnected) {
@@ -392,26 +430,26 @@ class Page {
       return html +
              "<p>No held-out sample yet of the body as it is, so nothing to judge by.</p></section>\n";
     const auto all = record_.watch().held_out();
-    const auto versions = version_errors(record_.versions(), all, report_.end_effector);
-    if (const auto curve = version_plot(versions)) {
+    const std::vector<BodyMark> marks = body_marks(record_);
+    const auto versions = version_errors(record_.versions(), all, marks, report_.end_effector);
+    if (const auto curve = version_plot(versions, marks)) {
       html += figure(
           plot(*curve),
           fmt::format(
-              "Every version of the body schema{} on the same {} of the whole run, from none of "
-              "which anything was ever learned: distance of the predicted from the {} origin "
-              "of a part, relative to the root, median over the samples; against {}. A version "
-              "is judged on the parts it connects, so a line may rise when a part is added.",
-              versions.size() < record_.versions().size()
-                  ? fmt::format(" ({} of {} shown)", versions.size(), record_.versions().size())
-                  : "",
+              "Versions of the body schema ({} of {}) on the {}, from none of which anything was "
+              "ever learned: distance of the predicted from the {} origin of a part, relative to "
+              "the root, median over the samples; against {}. {}A version is judged on the parts "
+              "it connects, so a line may rise when a part is added.",
+              versions.size(), record_.versions().size(),
               counted(std::ssize(all), "held-out sample"),
-              record_.watch().has_truth() ? "true" : "seen", judge()));
-    }
-    if (!record_.faults().empty()) {
-      html +=
-          "<p class=\"warn\">The body was changed during the run (see Events): the lines mix "
-          "samples "
-          "from before and after, the table has those since the last change that was found.</p>\n";
+              record_.watch().has_truth() ? "true" : "seen", judge(),
+              marks.empty()
+                  ? ""
+                  : fmt::format("Where the body became another (dashed; {}) a new curve begins: "
+                                "every version is judged on samples of the body that it was for, "
+                                "the first point is the schema that stood before. ",
+                                record_.faults().empty() ? "as the monitor found it"
+                                                         : "the simulation’s ground truth")));
     }
     Table table({"part", "#seen in", "#median", "#", "#rms", "#", "#largest"});
     for (const PartErrors& part : errors_) {
@@ -428,8 +466,8 @@ class Page {
     html += table.html();
     return html + fmt::format(
                       "<p class=\"note\">The schema above on the held-out samples, each part "
-                      "relative to the root, against {}.</p></section>\n",
-                      judge());
+                      "relative to the root, against {}.{}</p></section>\n",
+                      judge(), as_seen());
   }
 
   std::string local_models() {
@@ -539,37 +577,38 @@ class Page {
 
   std::string events() const {
     std::string html;
-    Table faults({"#time", "#action", "broken from then on: ground truth of the simulation"});
+    const auto& samples = record_.watch().samples();
+    // Of the arm: simulated where it is.
+    const auto time = [&](std::int64_t utime) {
+      if (samples.empty()) return std::string("–");
+      return fmt::format("{:.1f} s", static_cast<double>(utime - samples.front().utime) * 1e-6);
+    };
+    Table faults({"#from sample", "#time", "broken from then on: ground truth of the simulation"});
     for (const RunRecord::FaultChange& change : record_.faults()) {
       std::string list;
       for (const std::string& fault : change.faults)
         list += (list.empty() ? "" : ", ") + escape_html(fault);
-      faults.row({fmt::format("{:.1f} s", change.at_s), std::to_string(change.action_id),
-                  list.empty() ? "nothing: repaired" : list});
+      const auto first = std::find_if(samples.begin(), samples.end(), [&](const auto& sample) {
+        return sample.utime >= change.utime;
+      });
+      faults.row({first == samples.end() ? "–" : std::to_string(first->sample_index),
+                  time(change.utime), list.empty() ? "nothing: repaired" : list});
     }
     html += faults.html();
     constexpr std::size_t kMost = 200;
     const std::vector<health_event_t> all = record_.events();
-    Table table({"#sample", "what the monitor decided", "where", "cause", "#margin", "#samples"});
+    Table table({"#sample", "#time", "what the monitor decided"});
     for (std::size_t i = all.size() - std::min(all.size(), kMost); i < all.size(); ++i) {
-      const health_event_t& event = all[i];
-      const bool is_proposal = event.event_kind <= health_event_t::EVENT_SCHEMA_REFUSED;
-      std::string where;
-      if (event.event_from >= 0)
-        where = fmt::format("{} → {}", event.event_from, event.event_to);
-      else if (event.event_part >= 0)
-        where = fmt::format("part {}", event.event_part);
-      if (event.event_tag >= 0) where += fmt::format(", tag {}", event.event_tag);
-      table.row({std::to_string(event.event_sample),
-                 is_proposal ? escape_html(event.event_text) : name_of_event(event.event_kind),
-                 where, escape_html(event.event_cause),
-                 event.event_margin != 0 ? fmt::format("{:.1f} nats", event.event_margin) : "",
-                 event.samples_used > 0 ? std::to_string(event.samples_used) : ""});
+      table.row({std::to_string(all[i].event_sample), time(all[i].utime),
+                 escape_html(all[i].event_text)});
     }
     html += table.html();
     if (all.size() > kMost)
       html += fmt::format("<p class=\"note\">The newest {} of {}.</p>\n", kMost, all.size());
-    return html.empty() ? "" : "<section><h2>Events</h2>\n" + html + "</section>\n";
+    return html.empty() ? ""
+                        : "<section><h2>Events</h2>\n" + html +
+                              "<p class=\"note\">Times are those of the arm, from its first "
+                              "sample on.</p></section>\n";
   }
 
   std::string messages() const {

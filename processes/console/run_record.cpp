@@ -18,6 +18,11 @@ std::optional<Message> read_as(const Channel<Message>& channel, const LogEvent& 
   return decode<Message>(event.data.data(), event.data.size()).message;
 }
 
+/// Without how far one has come that goes on: "drift arm 0.5 deg per action, 3 deg so far".
+std::string name_of_fault(const std::string& fault) {
+  return fault.ends_with(" so far") ? fault.substr(0, fault.rfind(", ")) : fault;
+}
+
 bool has(const std::map<std::int64_t, std::int64_t>& times, std::int64_t utime) {
   return times.contains(utime);
 }
@@ -83,9 +88,11 @@ void RunRecord::on_event(const LogEvent& event, const std::filesystem::path& fil
     watch_.on_sim_state(*state);
     const std::vector<std::string>& before =
         faults_.empty() ? std::vector<std::string>() : faults_.back().faults;
-    if (state->faults != before) {
-      faults_.push_back({seconds(event.event_utime), state->action_id, state->faults});
-    }
+    std::vector<std::string> faults;
+    for (const std::string& fault : state->faults) faults.push_back(name_of_fault(fault));
+    if (faults != before)
+      faults_.push_back(
+          {seconds(event.event_utime), state->utime, state->action_id, std::move(faults)});
   } else if (const auto schema = read_as(kBodySchema, event)) {
     note_receipt(schema->utime);
     watch_.on_body_schema(*schema);
@@ -139,13 +146,6 @@ void RunRecord::on_markers(const marker_poses_t& markers) {
   best_markers_.insert(
       std::upper_bound(best_markers_.begin(), best_markers_.end(), markers, has_more), markers);
   if (best_markers_.size() > kMostPictures) best_markers_.pop_back();
-}
-
-const char* name_of_event(std::int8_t kind) {
-  static const char* const kNames[] = {"accepted", "refused",  "mismatch",    "candidate",
-                                       "refined",  "restored", "reverted",    "recovered",
-                                       "drift",    "missing",  "probe_wanted"};
-  return kind >= 0 && kind <= health_event_t::EVENT_PROBE_WANTED ? kNames[kind] : "";
 }
 
 std::vector<health_event_t> RunRecord::events() const {

@@ -14,9 +14,6 @@
 
 namespace bodyschema {
 
-/// "mismatch", "candidate", … of a health_event_t's event_kind.
-const char* name_of_event(std::int8_t kind);
-
 /// What the logs of a run say, kept so that it can be told at any time. Bounded memory but for the
 /// samples: of images only their places are kept, long series are thinned.
 class RunRecord {
@@ -45,6 +42,7 @@ class RunRecord {
   };
   struct FaultChange {
     double at_s = 0;
+    std::int64_t utime = 0;  ///< samples from then on show it
     std::int64_t action_id = 0;
     std::vector<std::string> faults;  ///< what was broken from then on
   };

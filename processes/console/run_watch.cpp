@@ -7,6 +7,7 @@
 #include <iterator>
 
 #include "common/bus/convert.h"
+#include "processes/console/health_view.h"
 
 namespace bodyschema {
 namespace {
@@ -36,6 +37,7 @@ void RunWatch::on_body_schema(const body_schema_t& schema) { schema_ = from_mess
 
 void RunWatch::on_learned_schema(const body_schema_t& schema) {
   learned_sample_ = schema.last_sample_index;
+  unconnected_ = schema.unconnected;
 }
 
 void RunWatch::on_model_health(const model_health_t& health) { health_ = health; }
@@ -85,17 +87,54 @@ std::map<int, double> RunWatch::visibility() const {
   return seen;
 }
 
-std::string RunWatch::progress() const {
+void Pace::note(double now_s, std::int64_t count) {
+  constexpr double kWindow_s = 60;
+  if (!points_.empty() && points_.back().second == count) return;
+  points_.emplace_back(now_s, count);
+  while (points_.size() > 2 && now_s - points_.front().first > kWindow_s) points_.pop_front();
+}
+
+std::optional<double> Pace::seconds_for(std::int64_t more) const {
+  if (points_.size() < 2) return std::nullopt;
+  const auto [from_s, from] = points_.front();
+  const auto [to_s, to] = points_.back();
+  if (to <= from || to_s <= from_s) return std::nullopt;
+  return static_cast<double>(more) * (to_s - from_s) / static_cast<double>(to - from);
+}
+
+std::string RunWatch::progress(const std::optional<SampleGoal>& goal,
+                               std::optional<double> remaining_s) const {
   const auto seen = visibility();
   double mean = 0;
   for (const auto& [part, share] : seen) mean += share / static_cast<double>(seen.size());
-  std::string line = fmt::format("{:4} samples · {:2} parts, each seen in {:3.0f} %", num_samples(),
-                                 seen.size(), mean * 100);
+  std::string line = fmt::format("{:4}", num_samples());
+  if (goal) line += fmt::format(" of {}{}", goal->is_exact ? "" : "at most ", goal->most);
+  line += " samples";
+  if (goal && remaining_s && num_samples() < goal->most)
+    line += fmt::format(" · {}{:.0f} s left", goal->is_exact ? "" : "at most ", *remaining_s);
+  line += fmt::format(" · {:2} parts, each seen in {:3.0f} %", seen.size(), mean * 100);
   const std::size_t edges = schema_ ? schema_->edges.size() : 0;
   line += fmt::format(" · {} of {} edges", edges, seen.empty() ? 0 : seen.size() - 1);
+  if (!schema_ || !schema_->complete) {
+    constexpr std::size_t kMost = 3;
+    static const char* const kReasons[] = {"never seen", "not enough data yet", "no valid model"};
+    std::string missing;
+    for (std::size_t i = 0; i < std::min(unconnected_.size(), kMost); ++i) {
+      missing += fmt::format("{}part {} ({})", i == 0 ? "" : ", ", unconnected_[i].unconnected_part,
+                             kReasons[unconnected_[i].reason]);
+    }
+    if (unconnected_.size() > kMost)
+      missing += fmt::format(", {} more", unconnected_.size() - kMost);
+    line += missing.empty() ? learned_sample_ < 0 ? ", no proposal yet" : ", not judged yet"
+                            : ", missing: " + missing;
+  }
   if (health_ && health_->worst_position_m >= 0) {
-    line += fmt::format(" · held-out error of the worst part {:.1f} mm {:.2f}°",
+    line += fmt::format(" · worst part {:.1f} mm {:.2f}° off, as the camera sees it, held out",
                         health_->worst_position_m * 1e3, health_->worst_rotation_rad * kDegrees);
+  }
+  if (health_) {
+    if (const auto verdict = verdict_of(health_->findings); !verdict.wrong.empty())
+      line += " · " + verdict.sentence;
   }
   return line;
 }

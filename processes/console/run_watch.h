@@ -1,10 +1,12 @@
 #pragma once
 
 #include <cstdint>
+#include <deque>
 #include <map>
 #include <optional>
 #include <set>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "common/bus/channels.h"
@@ -16,6 +18,23 @@ namespace bodyschema {
 /// Why a process ended, by its log (stderr): what its last line says after "NAME: "; "" where that
 /// is no such line, as in a process that runs.
 std::string last_words(const std::string& log, const std::string& process);
+
+/// How long what is counted will take, by the last minute of it.
+class Pace {
+ public:
+  void note(double now_s, std::int64_t count);
+  /// For `more` of it [s]; std::nullopt before anything can be told.
+  std::optional<double> seconds_for(std::int64_t more) const;
+
+ private:
+  std::deque<std::pair<double, std::int64_t>> points_;
+};
+
+/// The samples that a run is to have: so many, or fewer where the errors are small before.
+struct SampleGoal {
+  std::int64_t most = 0;
+  bool is_exact = false;
+};
 
 /// Follows a learning run from outside and sums it up. It alone compares the schema with the
 /// simulator's truth, and tells nobody.
@@ -37,8 +56,10 @@ class RunWatch {
   /// sample_index up to which the newest proposal goes; -1 before the first.
   std::int64_t learned_sample() const { return learned_sample_; }
 
-  /// One line: samples, visibility, parts connected, held-out error.
-  std::string progress() const;
+  /// One line: samples of how many, time that is left, visibility, what is not connected yet, the
+  /// held-out error as the camera sees it.
+  std::string progress(const std::optional<SampleGoal>& goal = std::nullopt,
+                       std::optional<double> remaining_s = std::nullopt) const;
   /// Those of `expected` that have not been heard of for 3 s.
   std::set<std::string> silent(const std::set<std::string>& expected, std::int64_t now_us) const;
   /// Whether all of `expected` are heard and listen: one that is starting has not subscribed yet.
@@ -50,6 +71,7 @@ class RunWatch {
   std::string diagnosis(const std::set<std::string>& expected, std::int64_t now_us) const;
 
   const std::optional<BodySchema>& schema() const { return schema_; }
+  const std::optional<model_health_t>& health() const { return health_; }
   /// All samples so far, TEST included.
   const std::vector<ActionPoseSample>& samples() const { return samples_; }
   /// The TEST samples from `since` on: with the noise-free poses of the simulator where there is
@@ -74,6 +96,7 @@ class RunWatch {
   std::vector<std::int64_t> action_ids_;  ///< of samples_
   std::optional<BodySchema> schema_;
   std::int64_t learned_sample_ = -1;
+  std::vector<unconnected_part_t> unconnected_;  ///< of the newest proposal
   std::optional<model_health_t> health_;
   struct Truth {
     std::int64_t action_id = 0;

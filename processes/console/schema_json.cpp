@@ -178,6 +178,9 @@ std::string structure_text(const BodySchema& schema, std::optional<NoiseSource> 
   std::string text = fmt::format("{} structure of {} parts from {} samples\n",
                                  schema.complete ? "Complete" : "Incomplete", schema.parts.size(),
                                  schema.num_samples);
+  if (!schema.edges.empty())
+    text += fmt::format("  {:<9} {:<9} {:<12} {:>10} {:>7}\n", "edge", "kind", "signals",
+                        "residual", "(rms)");
   for (const Edge& edge : schema.edges) {
     text += fmt::format("  {:>3} → {:<3} {:<9} {:<12} {:7.2f} mm {:6.2f}°\n", edge.from, edge.to,
                         edge.kind(),

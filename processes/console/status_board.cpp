@@ -5,8 +5,10 @@
 #include <algorithm>
 #include <cmath>
 #include <set>
+#include <sstream>
 #include <utility>
 
+#include "processes/console/health_view.h"
 #include "processes/console/hint.h"
 #include "processes/console/run_record.h"
 
@@ -97,6 +99,27 @@ std::string fit(const std::string& text, int width) {
     i += size;
   }
   return line;
+}
+
+std::string wrap(const std::string& text, int width, int indent) {
+  const auto columns = [](const std::string& word) {
+    return static_cast<int>(std::count_if(word.begin(), word.end(), [](char c) {
+      return (static_cast<unsigned char>(c) & 0xC0) != 0x80;
+    }));
+  };
+  std::string result, line(static_cast<std::size_t>(indent), ' ');
+  bool is_begun = false;
+  std::istringstream words(text);
+  for (std::string word; words >> word;) {
+    if (is_begun && columns(line) + 1 + columns(word) > width) {
+      result += fit(line, width) + "\n";
+      line = std::string(static_cast<std::size_t>(indent) + 2, ' ');
+      is_begun = false;
+    }
+    line += (is_begun ? " " : "") + word;
+    is_begun = true;
+  }
+  return result + fit(line, width) + "\n";
 }
 
 double StatusBoard::Heard::age_s() const {
@@ -252,6 +275,8 @@ std::string StatusBoard::headline() const {
                         : "No babbler moves the arm; " + line;
   }
   if (!line.ends_with('.')) line += '.';
+  if (babbler && babbler->newest.phase == process_info_t::PHASE_DONE && line.starts_with("Done"))
+    line += std::string(" ") + kNobodyWatches;
   if (const auto silent = missing(); !silent.empty())
     line += fmt::format(" Not heard: {}.", fmt::join(silent, ", "));
   return line;
@@ -265,8 +290,18 @@ std::string StatusBoard::text(int width) const {
     text += fit(content, width) + "\n";
   };
 
-  // The headline is not cut: it is what one came for.
-  text += fit(headline(), 1 << 20) + "\n\n";
+  // These are not cut: they are what one came for.
+  const std::optional<BodyVerdict> verdict = health_ && schema_ && schema_->is_complete == 1
+                                                 ? std::optional(verdict_of(health_->findings))
+                                                 : std::nullopt;
+  if (verdict && !verdict->wrong.empty()) {
+    text += std::string(kWhatIsWrong) + "\n";
+    for (const std::string& wrong : verdict->wrong) text += wrap(wrong, width, 2);
+    text += "\n";
+  }
+  text += fit(headline(), 1 << 20) + "\n";
+  if (verdict) text += wrap(verdict->sentence, width, 0);
+  text += "\n";
   std::size_t host_width = 4;
   for (const auto& [key, heard] : processes_)
     host_width = std::clamp(heard.newest.host.size(), host_width, std::size_t{12});
@@ -363,7 +398,8 @@ std::string StatusBoard::text(int width) const {
         schema->num_samples_seen));
     if (health_ && health_->worst_position_m >= 0) {
       line(fmt::format(
-          "         worst part off by {:.1f} mm {:.2f}° (median) in {} held-out samples",
+          "         worst part off by {:.1f} mm {:.2f}° (median, as the camera sees it) in {} "
+          "held-out samples",
           health_->worst_position_m * 1e3, health_->worst_rotation_rad * kDegrees,
           health_->num_test_samples));
     }
@@ -372,15 +408,16 @@ std::string StatusBoard::text(int width) const {
         line(fmt::format("         tag {} is set aside since sample {}: not where it was, or lost",
                          tag.moved_tag_id, tag.moved_found_sample));
     line("");
-    line(fmt::format("  {:<9} {:<6} {:<12} {:>9} {:>7}  {:<11} {:>5} {:>9}", "edge", "kind",
-                     "signals", "residual", "", "health", "tests", "median d²"));
+    // Health comes first: a narrow terminal cuts what stands last.
+    line(fmt::format("  {:<9} {:<11}  {:<6} {:<12} {:>9} {:>7} {:>5} {:>9}", "edge", "health",
+                     "kind", "signals", "residual", "", "tests", "median d²"));
     for (const schema_edge_t& edge : schema->edges) {
       const edge_health_t* health = find_health(health_, edge);
       std::string row = fmt::format(
-          "  {:>3} → {:<3} {:<6} {:<12} {:6.2f} mm {:6.2f}°", edge.from_part, edge.to_part,
-          kind_of(edge), fmt::format("{{{}}}", fmt::join(signals_of(*schema, edge), ",")),
+          "  {:>3} → {:<3} {:<11}  {:<6} {:<12} {:6.2f} mm {:6.2f}°", edge.from_part, edge.to_part,
+          kEdgeStates[health ? health->edge_state : edge.state], kind_of(edge),
+          fmt::format("{{{}}}", fmt::join(signals_of(*schema, edge), ",")),
           edge.position_rms_m * 1e3, edge.rotation_rms_rad * kDegrees);
-      row += fmt::format("  {:<11}", kEdgeStates[health ? health->edge_state : edge.state]);
       if (health) {
         row += fmt::format(" {:>5} {:>9}", health->num_tests,
                            health->median_mahalanobis2 < 0
@@ -399,16 +436,15 @@ std::string StatusBoard::text(int width) const {
   }
   if (health_ && !health_->part_health.empty()) {
     line("");
-    line(fmt::format("  {:<9} {:>5}  {:>18}", "part", "seen", "held-out error"));
+    line(fmt::format("  {:<9} {:<11}  {:>5}  {:>18}", "part", "health", "seen", "held-out error"));
     for (const part_health_t& part : health_->part_health) {
       std::string row =
-          fmt::format("  {:<9} {:>3.0f} %  {:>18}", part.health_part, part.visibility * 100,
+          fmt::format("  {:<9} {:<11}  {:>3.0f} %  {:>18}", part.health_part,
+                      kEdgeStates[part.part_state], part.visibility * 100,
                       part.position_median_m < 0
                           ? "–"
                           : fmt::format("{:.2f} mm {:.2f}°", part.position_median_m * 1e3,
                                         part.rotation_median_rad * kDegrees));
-      if (part.part_state != schema_edge_t::EDGE_OK)
-        row += fmt::format("  {}", kEdgeStates[part.part_state]);
       for (const std::string& flag : flags_of(part)) row += "  " + flag;
       line(row);
     }
@@ -419,7 +455,12 @@ std::string StatusBoard::text(int width) const {
     const std::size_t first = health_->events.size() - std::min(kShown, health_->events.size());
     for (std::size_t i = health_->events.size(); i-- > first;) {
       const health_event_t& event = health_->events[i];
-      line(fmt::format("  sample {:>5}  {}", event.event_sample, event.event_text));
+      // By the arm's clock: the newest sample is now.
+      const std::string age =
+          sample_ ? ", " + duration(std::max(0.0, seconds(event.utime, sample_->utime))) + " ago"
+                  : "";
+      text +=
+          wrap(fmt::format("sample {}{}: {}", event.event_sample, age, event.event_text), width, 2);
     }
   }
   return text;
@@ -520,11 +561,12 @@ ordered_json StatusBoard::json() const {
                                      {"detail", part.detail}});
     }
   }
-  json["parts"] = nullptr;
-  json["events"] = nullptr;
+  json["parts"] = json["events"] = json["wrong"] = nullptr;
   if (health_) {
-    json["parts"] = ordered_json::array();
-    json["events"] = ordered_json::array();
+    json["parts"] = json["events"] = json["wrong"] = ordered_json::array();
+    std::vector<std::string> signals;
+    if (schema_)
+      for (const signal_t& signal : schema_->signals) signals.push_back(signal.signal_name);
     for (const part_health_t& part : health_->part_health) {
       const bool is_tested = part.position_median_m >= 0;
       json["parts"].push_back(
@@ -537,19 +579,10 @@ ordered_json StatusBoard::json() const {
            {"rotation_median_deg",
             is_tested ? ordered_json(part.rotation_median_rad * kDegrees) : nullptr}});
     }
-    for (const health_event_t& event : health_->events) {
-      json["events"].push_back({{"number", event.event_number},
-                                {"sample", event.event_sample},
-                                {"event", name_of_event(event.event_kind)},
-                                {"from", known(event.event_from)},
-                                {"to", known(event.event_to)},
-                                {"part", known(event.event_part)},
-                                {"tag", known(event.event_tag)},
-                                {"cause", event.event_cause},
-                                {"margin", event.event_margin},
-                                {"samples_used", event.samples_used},
-                                {"text", event.event_text}});
-    }
+    for (const health_event_t& event : health_->events)
+      json["events"].push_back(event_json(event, signals));
+    for (const finding_t& finding : health_->findings)
+      json["wrong"].push_back(finding_json(finding, signals));
   }
   return json;
 }

@@ -42,7 +42,7 @@ class StatusBoard {
   bool is_silent() const { return arrivals_.empty() && num_dropped_here() == 0; }
   /// One sentence: what the system is doing, what it waits for.
   std::string headline() const;
-  /// One screen of lines of at most `width` characters, the headline first.
+  /// One screen of lines of at most `width` characters: what is wrong, the headline, all else.
   std::string text(int width) const;
   nlohmann::ordered_json json() const;
 
@@ -89,6 +89,10 @@ class StatusBoard {
   std::optional<model_health_t> health_;
   std::optional<sim_state_t> sim_state_;
 };
+
+/// `text` as lines of at most `width` characters, broken between words where there are any; the
+/// first begins with `indent` spaces, the others with two more.
+std::string wrap(const std::string& text, int width, int indent);
 
 /// `text` as one line of at most `width` characters: longer ones end in "…", control characters
 /// (a terminal would obey them) become spaces.

@@ -27,9 +27,11 @@
 #include "common/bus/rig_door.h"
 #include "common/bus/sample_intake.h"
 #include "common/config/rig.h"
+#include "processes/console/health_view.h"
 #include "processes/console/picture.h"
 #include "processes/console/run_watch.h"
 #include "processes/console/schema_json.h"
+#include "processes/motor_babbler/motor_babbler.h"
 #include "processes/structure_learner/structure_learner.h"
 
 namespace bodyschema {
@@ -47,6 +49,7 @@ struct WatchArguments {
   std::string rig;
   std::string out;
   std::int64_t seed = 0;
+  std::int64_t samples = 0;
   double patience_s = 120;
   std::set<std::string> processes;
   std::string replay;
@@ -227,6 +230,21 @@ Learned learn_again(const RunWatch& watch, const WatchArguments& arguments) {
   return {watch.schema().value_or(learned.schema), learned.outliers, watch.schema().has_value()};
 }
 
+/// What MODEL_HEALTH last said is wrong; of a schema that the monitor accepted.
+std::vector<finding_t> findings_of(const RunWatch& watch) {
+  return watch.health() ? watch.health()->findings : std::vector<finding_t>();
+}
+
+/// How many samples there will be; std::nullopt in a replay, which has what it has.
+std::optional<SampleGoal> goal_of(const WatchArguments& arguments) {
+  if (!arguments.replay.empty()) return std::nullopt;
+  if (arguments.samples > 0) return SampleGoal{arguments.samples, true};
+  const auto file = std::filesystem::path(arguments.rig_folder) / "motor_babbler.yaml";
+  // A rig that is moved by somebody else has none.
+  if (!std::filesystem::exists(file)) return std::nullopt;
+  return SampleGoal{MotorBabblerConfig::load(file).stop.max_samples, false};
+}
+
 nlohmann::ordered_json result_json(const RunWatch& watch, const Learned& learned,
                                    const WatchArguments& arguments, const Lost& lost,
                                    double seconds) {
@@ -250,6 +268,11 @@ nlohmann::ordered_json result_json(const RunWatch& watch, const Learned& learned
     json["lost_frames"] = lost.frames;
   }
   json["lost_samples"] = lost.samples;
+  std::vector<std::string> names;
+  for (const Signal& signal : learned.schema.signals) names.push_back(signal.name);
+  json["wrong"] = nlohmann::ordered_json::array();
+  for (const finding_t& finding : findings_of(watch))
+    json["wrong"].push_back(finding_json(finding, names));
   for (const auto& [part, share] : watch.visibility())
     json["visibility"][std::to_string(part)] = share;
   return json;
@@ -268,6 +291,11 @@ void report(const RunWatch& watch, const BestPicture& picture, const WatchArgume
                                                       : "replay of " + arguments.replay;
   std::cout << fmt::format("\n{} · {} · {} samples, {} of them held out · {:.0f} s\n\n",
                            arguments.rig, origin, watch.num_samples(), held_out.size(), seconds);
+  if (const BodyVerdict verdict = verdict_of(findings_of(watch)); !verdict.wrong.empty()) {
+    std::cout << kWhatIsWrong << "\n";
+    for (const std::string& wrong : verdict.wrong) std::cout << "  " << wrong << "\n";
+    std::cout << verdict.sentence << "\n" << kNobodyWatches << "\n\n";
+  }
   for (const auto& [first, last] : lost.samples) {
     std::cout << (first == last ? fmt::format("lost SAMPLE {}\n", first)
                                 : fmt::format("lost SAMPLE {}…{}\n", first, last));
@@ -290,6 +318,12 @@ void report(const RunWatch& watch, const BestPicture& picture, const WatchArgume
                       : "")
               << "\n"
               << errors_text(evaluate(learned.schema, held_out));
+    if (watch.has_truth() && watch.health() && watch.health()->worst_position_m >= 0) {
+      std::cout << fmt::format(
+          "(The line of progress and `status` go by what the camera sees, noise and bias of the "
+          "markers included: worst part {:.1f} mm {:.2f}°.)\n",
+          watch.health()->worst_position_m * 1e3, watch.health()->worst_rotation_rad * 180 / M_PI);
+    }
   }
   std::cout << "\nFiles in " << folder.string() << "\n";
   // On one of several hosts, or in a replay, not all of them are here.
@@ -383,6 +417,13 @@ void run_watch(const WatchArguments& arguments) {
   }
   std::int64_t last_progress = 0;
   double progressed_s = 0, warned_s = 0, played_s = 0, looked_s = 0;
+  const std::optional<SampleGoal> goal = goal_of(arguments);
+  Pace pace;
+  const auto progress_line = [&] {
+    const auto left_s =
+        goal ? pace.seconds_for(goal->most - watch.num_samples()) : std::optional<double>();
+    return fmt::format("{} · {:.0f} s", watch.progress(goal, left_s), seconds());
+  };
   std::set<std::string> told;
   // Every message that is played is heard by who makes samples of it, or lost.
   const std::int64_t num_played =
@@ -414,7 +455,8 @@ void run_watch(const WatchArguments& arguments) {
     intake.on_tick(now_us());
     const std::int64_t progress = watch.num_samples() + watch.learned_sample() + num_heard();
     if (std::exchange(last_progress, progress) != progress) progressed_s = seconds();
-    line.show(fmt::format("{} · {:.0f} s", watch.progress(), seconds()), false);
+    pace.note(seconds(), watch.num_samples());
+    line.show(progress_line(), false);
     if (seconds() - looked_s > 2 && watch.num_samples() == 0) {
       looked_s = seconds();
       tell_of_failures(arguments, &told);
@@ -432,7 +474,7 @@ void run_watch(const WatchArguments& arguments) {
                       arguments.patience_s, arguments.out));
     }
   }
-  line.show(fmt::format("{} · {:.0f} s", watch.progress(), seconds()), true);
+  line.show(progress_line(), true);
   line.end();
   const Lost lost{intake.lost(), std::max<std::int64_t>(0, num_played - num_heard())};
   report(watch, picture, arguments, lost, seconds());
@@ -451,6 +493,9 @@ void add_watch_command(CLI::App& console) {
   watch->add_option("--out", arguments->out, "Folder for result.json and detections.png")
       ->required();
   watch->add_option("--seed", arguments->seed, "Seed of the run, for the record");
+  watch->add_option("--samples", arguments->samples,
+                    "How many samples the run is to have; default: at most as many as the rig's "
+                    "motor_babbler.yaml says");
   watch->add_option("--patience-s", arguments->patience_s,
                     "Give up after so long without a new sample or proposal [s]");
   watch->add_option("--processes", arguments->processes,

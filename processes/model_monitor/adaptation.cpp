@@ -40,6 +40,11 @@ constexpr std::size_t kFewestDistances = 20;
 /// Quiet samples after which the noise is looked at again.
 constexpr int kQuietSamples = 32;
 
+/// What two fits of one edge to tags may differ by, anywhere in its range: a body of the history
+/// that is as near to the first is the first, learned again. Chosen: an order of magnitude above
+/// the residuals of rendered tags (0.3 mm, 0.1°), below any fault of the experiments.
+constexpr Noise kSameBody{0.005, 1 * M_PI / 180};
+
 /// Of a suspicion so many samples old: growing steps bound the work of one that lasts.
 bool is_worth_a_fit(std::int64_t age) {
   constexpr std::int64_t kAges[] = {10, 12, 15, 19, 24};
@@ -271,10 +276,41 @@ void Adaptation::tell(AdaptationEvent::Kind kind, std::int64_t sample_index,
     BodyChange there = replacement.fitted.change;
     there.part = place.part;
     told.cause = there.cause(schema_);
+    if (place == replacement.place) told.size = size_of(replacement);
     told.margin = margin;
     told.num_samples = num_samples;
     events->push_back(std::move(told));
   }
+}
+
+ChangeSize Adaptation::size_of(const Replacement& replacement) const {
+  BodySchema base = schema_;
+  for (int n = 0; n < static_cast<int>(replacements_.size()); ++n)
+    if (replacements_[static_cast<std::size_t>(n)].place == replacement.place) base = composed(n);
+  const FittedChange& fitted = replacement.fitted;
+  if (fitted.origin) base = with_edge_of(base, *fitted.origin, replacement.place.part);
+  return bodyschema::size_of(base, fitted.change, fitted.theta, fitted.covariance);
+}
+
+void Adaptation::complete(std::int64_t sample_index, AdaptationEvent* event) const {
+  using Kind = AdaptationEvent::Kind;
+  event->sample_index = sample_index;
+  const bool is_of_replacement = event->tag < 0 && event->cause != "marker_missing" &&
+                                 event->cause != "drift" && event->cause != "unexplained" &&
+                                 event->kind != Kind::kMismatch &&
+                                 event->kind != Kind::kProbeWanted;
+  if (is_of_replacement)
+    event->since = since();
+  else if (event->since >= 0)
+    event->since = stream_.sample_index_of(event->since);
+  const bool may_be_normal = event->kind == Kind::kRestored || event->kind == Kind::kRefined ||
+                             (event->kind == Kind::kRecovered && event->cause == "stored");
+  if (!may_be_normal) return;
+  const int part = event->to >= 0 ? event->to : event->part;
+  const BodySchema& first = history_.front();
+  event->is_normal =
+      event->tag >= 0 || is_alike_at(schema_, first, part) ||
+      (event->kind != Kind::kRefined && is_close_at(schema_, first, part, kSameBody));
 }
 
 double Adaptation::required_margin(const Place& place, std::int64_t sample_index) const {
@@ -321,6 +357,7 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
     if (!is_clear) return;
     AdaptationEvent mismatch = event(AdaptationEvent::Kind::kMismatch, sample_index, *detected_);
     if (!detected_->marker && detected_->part == schema_.root) mismatch.cause = "camera_moved";
+    mismatch.since = since;
     mismatch.margin = highest;
     mismatch.num_samples = static_cast<int>(samples.size());
     events->push_back(mismatch);
@@ -578,6 +615,7 @@ void Adaptation::watch_visibility(const ActionPoseSample& sample, const ActionPo
     told.tag = tag;
     told.cause = "marker_missing";
     told.num_samples = num_missed;
+    if (is_missing) told.since = std::max<std::int64_t>(0, sample.sample_index - num_missed + 1);
     events->push_back(std::move(told));
     if (!is_missing || tag == VisibilityWatch::kAnyTag) continue;
     tags_.lose(tag);
@@ -601,6 +639,7 @@ void Adaptation::watch_tags(ActionPoseSample* sample, std::vector<AdaptationEven
       told.tag = finding.tag;
       told.cause = finding.is_on_part ? "marker_moved" : "marker_missing";
       told.num_samples = finding.num_sightings;
+      if (!finding.is_back) told.since = finding.since;
       events->push_back(std::move(told));
       if (finding.is_back) {
         for (MovedTag& moved : moved_tags_)
@@ -676,6 +715,7 @@ void Adaptation::drop_fallen(ActionPoseSample* sample, std::vector<AdaptationEve
         event(AdaptationEvent::Kind::kMissing, sample->sample_index, {part, true});
     missing.cause = "marker_missing";
     missing.num_samples = visibility_.lose(part, num_missed) + 1;
+    missing.since = *since;
     events->push_back(missing);
     // What it was taken for meanwhile is taken back.
     const auto is_at_it = [this, part](const Place& place) {
@@ -738,6 +778,7 @@ void Adaptation::begin_drift(int part, std::int64_t sample_index,
   detected_.reset();
   AdaptationEvent drift = event(AdaptationEvent::Kind::kDrift, sample_index, {part, false});
   drift.cause = "drift";
+  drift.since = sample_index;
   events->push_back(drift);
 }
 
@@ -750,6 +791,10 @@ void Adaptation::watch_drift(std::int64_t sample_index, std::vector<AdaptationEv
   }
   const auto drift = drift_watch_.follow(before_, *drifting_);
   if (!drift) return;
+  for (AdaptationEvent& event : *events)
+    if (event.kind == AdaptationEvent::Kind::kDrift)
+      event.size =
+          size_of_rate(before_, *drifting_, drift->left, drift->rate, drift->rate_covariance);
   const BodyChange change{drift->left ? BodyChange::Form::kLeft : BodyChange::Form::kRight,
                           *drifting_};
   Eigen::VectorXd theta(6);
@@ -794,7 +839,7 @@ std::vector<AdaptationEvent> Adaptation::on_sample(const ActionPoseSample& seen)
   sample.sample_index = stream_.count();
   if (stream_.is_dense()) drop_turned_over(&sample);
   std::vector<AdaptationEvent> events = on_new_sample(std::move(sample));
-  for (AdaptationEvent& event : events) event.sample_index = seen.sample_index;
+  for (AdaptationEvent& event : events) complete(seen.sample_index, &event);
   return events;
 }
 

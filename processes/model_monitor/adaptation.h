@@ -10,6 +10,7 @@
 
 #include "processes/model_monitor/body_change.h"
 #include "processes/model_monitor/change_search.h"
+#include "processes/model_monitor/change_size.h"
 #include "processes/model_monitor/drift_watch.h"
 #include "processes/model_monitor/fallen_markers.h"
 #include "processes/model_monitor/moved_tags.h"
@@ -62,6 +63,9 @@ struct AdaptationEvent {
   int part = -1;  ///< of a marker; −1 for an edge
   int tag = -1;   ///< the one of the part's tags that it is about; −1: all
   std::string cause;
+  ChangeSize size;
+  std::int64_t since = -1;  ///< first sample that shows it; −1: not told
+  bool is_normal = false;   ///< of what was stored: the place is as in the first schema again
   /// Evidence over the schema that stood before; kProbeWanted: between the explanations [nats].
   double margin = 0;
   int num_samples = 0;
@@ -169,6 +173,10 @@ class Adaptation {
   void install(const BodySchema& schema);
   AdaptationEvent event(AdaptationEvent::Kind kind, std::int64_t sample_index,
                         const Place& place) const;
+  /// Against what stands without it.
+  ChangeSize size_of(const Replacement& replacement) const;
+  /// What an event says of the samples as they are numbered outside, and of what stands after it.
+  void complete(std::int64_t sample_index, AdaptationEvent* event) const;
   /// Tells the same of every place of a replacement.
   void tell(AdaptationEvent::Kind kind, std::int64_t sample_index, const Replacement& replacement,
             double margin, int num_samples, std::vector<AdaptationEvent>* events) const;

@@ -203,8 +203,8 @@ std::optional<Drift> DriftWatch::follow(const BodySchema& schema, int part) cons
     drift.T = reference;
     drift.covariance = line.covariance.topLeftCorner<6, 6>();
     drift.rate = line.ab.tail<6>();
-    drift.significance =
-        drift.rate.dot(line.covariance.bottomRightCorner<6, 6>().ldlt().solve(drift.rate));
+    drift.rate_covariance = line.covariance.bottomRightCorner<6, 6>();
+    drift.significance = drift.rate.dot(drift.rate_covariance.ldlt().solve(drift.rate));
     best = drift;
   }
   return best;

@@ -17,6 +17,7 @@ struct Drift {
   Pose T = Pose::Identity();               ///< now
   Matrix6d covariance = Matrix6d::Zero();  ///< of T, right perturbation
   Vector6d rate = Vector6d::Zero();        ///< of log T a sample
+  Matrix6d rate_covariance = Matrix6d::Zero();
   double significance = 0;  ///< squared Mahalanobis distance of the rate from standing still
 };
 

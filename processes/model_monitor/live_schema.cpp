@@ -2,10 +2,10 @@
 
 #include <algorithm>
 #include <cmath>
-#include <cstdio>
 
 #include "common/bus/codec.h"
 #include "common/bus/convert.h"
+#include "processes/model_monitor/health_words.h"
 
 namespace bodyschema {
 namespace {
@@ -40,6 +40,53 @@ std::int8_t wire(Kind kind) {
   return health_event_t::EVENT_MISMATCH;
 }
 
+change_size_t to_message(const ChangeSize& size) {
+  change_size_t message{};
+  message.size_kind = static_cast<std::int8_t>(size.kind);
+  message.size_signal = size.signal;
+  message.num_amounts = static_cast<std::int32_t>(size.amounts.size());
+  message.amount = size.amounts;
+  message.amount_sd = size.sds;
+  return message;
+}
+
+finding_t to_message(const Finding& finding, const std::vector<Signal>& signals) {
+  finding_t message{};
+  message.finding_state = static_cast<std::int8_t>(finding.state);
+  message.finding_from = finding.from;
+  message.finding_to = finding.to;
+  message.finding_part = finding.part;
+  message.finding_tag = finding.tag;
+  message.finding_cause = finding.cause;
+  message.finding_size = to_message(finding.size);
+  message.finding_since = finding.since;
+  message.finding_found = finding.found;
+  message.finding_adopted = finding.adopted;
+  message.num_confirming = finding.num_confirming;
+  message.finding_text = text_of(finding, signals);
+  return message;
+}
+
+Findings from_message(const std::vector<finding_t>& messages) {
+  std::vector<Finding> findings;
+  for (const finding_t& message : messages) {
+    const change_size_t& size = message.finding_size;
+    findings.push_back({.state = static_cast<Finding::State>(message.finding_state),
+                        .from = message.finding_from,
+                        .to = message.finding_to,
+                        .part = message.finding_part,
+                        .tag = message.finding_tag,
+                        .cause = message.finding_cause,
+                        .size = {static_cast<ChangeSize::Kind>(size.size_kind), size.size_signal,
+                                 size.amount, size.amount_sd},
+                        .since = message.finding_since,
+                        .found = message.finding_found,
+                        .adopted = message.finding_adopted,
+                        .num_confirming = message.num_confirming});
+  }
+  return Findings(std::move(findings));
+}
+
 /// Whether two local models say the same, bit by bit.
 bool is_same_model(const Edge& a, const Edge& b) {
   const auto is_same = [](const Pose& x, const Pose& y) { return x.matrix() == y.matrix(); };
@@ -60,30 +107,31 @@ std::vector<std::uint8_t> contents_of(BodySchema schema) {
 
 }  // namespace
 
-std::string text_of(const AdaptationEvent& event) {
-  std::string text = event.from >= 0
-                         ? "edge " + std::to_string(event.from) + "–" + std::to_string(event.to)
-                     : event.cause == "camera_moved" ? "camera"
-                                                     : "part " + std::to_string(event.part);
-  if (event.tag >= 0) text += ", tag " + std::to_string(event.tag);
-  text += std::string(": ") + name_of(event.kind);
-  if (!event.cause.empty()) text += " " + event.cause;
-  char number[64];
-  if (event.margin != 0) {
-    std::snprintf(number, sizeof number, ", by %.1f nats", event.margin);
-    text += number;
-  }
-  if (event.num_samples > 0) {
-    text += " after " + std::to_string(event.num_samples) +
-            (event.num_samples == 1 ? " sample" : " samples");
-  }
-  return text;
+health_event_t to_message(const AdaptationEvent& event, const std::vector<Signal>& signals,
+                          std::int64_t utime) {
+  health_event_t message{};
+  message.utime = utime;
+  message.event_sample = event.sample_index;
+  message.event_kind = wire(event.kind);
+  message.event_from = event.from;
+  message.event_to = event.to;
+  message.event_part = event.part;
+  message.event_tag = event.tag;
+  message.event_cause = event.cause;
+  message.event_since = event.since;
+  message.event_size = to_message(event.size);
+  message.event_margin = std::isfinite(event.margin) ? event.margin : 0;
+  message.samples_used = event.num_samples;
+  message.event_text = text_of(event, signals);
+  return message;
 }
 
 LiveSchema::LiveSchema(BodySchema base, AdaptationOptions options, std::vector<BodySchema> history,
-                       const std::vector<ActionPoseSample>& past)
+                       const std::vector<ActionPoseSample>& past,
+                       const std::vector<finding_t>& findings)
     : base_(std::move(base)),
       adaptation_(base_, options, std::move(history), past),
+      findings_(from_message(findings)),
       schema_(base_),
       camera_since_(body_since()) {}
 
@@ -150,21 +198,9 @@ std::vector<health_event_t> LiveSchema::on_sample(const ActionPoseSample& sample
   std::vector<health_event_t> result;
   std::optional<std::int64_t> changed_since;
   std::optional<int> unchanged_part;
-  for (const AdaptationEvent& event : adaptation_.on_sample(sample)) {
-    health_event_t message;
-    message.event_number = 0;
-    message.utime = sample.utime;
-    message.event_sample = event.sample_index;
-    message.event_kind = wire(event.kind);
-    message.event_from = event.from;
-    message.event_to = event.to;
-    message.event_part = event.part;
-    message.event_tag = event.tag;
-    message.event_cause = event.cause;
-    message.event_margin = std::isfinite(event.margin) ? event.margin : 0;
-    message.samples_used = event.num_samples;
-    message.event_text = text_of(event);
-    result.push_back(std::move(message));
+  const std::vector<AdaptationEvent> events = adaptation_.on_sample(sample);
+  for (const AdaptationEvent& event : events) {
+    result.push_back(to_message(event, schema_.signals, sample.utime));
     if ((event.kind == Kind::kCandidate || event.kind == Kind::kRestored) && event.tag < 0)
       changed_since = adaptation_.since();
     // What the tag was taken for was no change.
@@ -176,6 +212,7 @@ std::vector<health_event_t> LiveSchema::on_sample(const ActionPoseSample& sample
       probe_ = event.probe;
     }
   }
+  findings_.update(adaptation_, events, sample.sample_index);
   if (adaptation_.is_settled()) probe_sample_ = -1;
   watch_flips(sample);
   update(sample, changed_since, unchanged_part);
@@ -259,7 +296,15 @@ EdgeState LiveSchema::state_of(const Edge& edge) const {
   return adaptation_.edge_state(edge.to);
 }
 
+std::vector<finding_t> LiveSchema::findings() const {
+  std::vector<finding_t> messages;
+  for (const Finding& finding : findings_.all())
+    messages.push_back(to_message(finding, schema_.signals));
+  return messages;
+}
+
 void LiveSchema::describe(model_health_t* health) const {
+  set_array(health->num_findings, health->findings, findings());
   health->noise_scale = adaptation_.noise_scale();
   health->probe_sample = probe_sample_;
   std::vector<double> probe;

@@ -7,23 +7,27 @@
 #include <string>
 #include <vector>
 
+#include "bodyschema/finding_t.hpp"
 #include "bodyschema/health_event_t.hpp"
 #include "bodyschema/model_health_t.hpp"
 #include "common/schema/body_schema.h"
 #include "common/schema/sample.h"
 #include "processes/model_monitor/adaptation.h"
+#include "processes/model_monitor/findings.h"
 
 namespace bodyschema {
 
 /// The body schema from a complete one on, the base, that the held-out samples had confirmed: what
 /// Adaptation finds, with what the wire says of it: versions, states, since when an edge holds.
 ///
-/// A pure function of the base, the history and the samples, those of `past` included.
+/// A pure function of the base, the history, what was found before, and the samples, those of
+/// `past` included.
 class LiveSchema {
  public:
-  /// `past`: the newest samples up to the base's last.
+  /// `past`: the newest samples up to the base's last. `findings`: what was wrong by then.
   LiveSchema(BodySchema base, AdaptationOptions options, std::vector<BodySchema> history,
-             const std::vector<ActionPoseSample>& past);
+             const std::vector<ActionPoseSample>& past,
+             const std::vector<finding_t>& findings = {});
 
   /// What was decided at this sample; events are not numbered yet.
   /// @throws std::invalid_argument if the action does not have one value per signal.
@@ -33,6 +37,8 @@ class LiveSchema {
   const BodySchema& schema() const { return schema_; }
   const BodySchema& base() const { return base_; }
   const std::vector<BodySchema>& history() const { return adaptation_.history(); }
+  /// What is wrong with the body now.
+  std::vector<finding_t> findings() const;
   /// A change of the body is suspected, or found and not settled, or a marker is missing.
   bool is_in_doubt() const;
   /// The first sample that all of the schema holds for.
@@ -48,8 +54,8 @@ class LiveSchema {
   /// What was decided up to this sample was held back, and is known from the next one on.
   void tell(std::int64_t sample_index, std::int64_t utime);
 
-  /// States, flags and statistics of health->edge_health and part_health, whose ids are set; noise
-  /// and probe.
+  /// States, flags and statistics of health->edge_health and part_health, whose ids are set; noise,
+  /// probe and findings.
   void describe(model_health_t* health) const;
 
  private:
@@ -62,6 +68,7 @@ class LiveSchema {
 
   const BodySchema base_;
   Adaptation adaptation_;
+  Findings findings_;
   BodySchema schema_;
   std::int64_t camera_since_ = 0;  ///< first sample that X_CR holds for
   std::int64_t known_from_ = 0;
@@ -70,7 +77,8 @@ class LiveSchema {
   std::map<int, std::deque<bool>> flipped_;  ///< part → newest sightings: the other pose was right
 };
 
-/// For people: "edge 3–4: joint_stuck, by 31 nats after 2 samples".
-std::string text_of(const AdaptationEvent& event);
+/// As the wire has it, without its number.
+health_event_t to_message(const AdaptationEvent& event, const std::vector<Signal>& signals,
+                          std::int64_t utime);
 
 }  // namespace bodyschema

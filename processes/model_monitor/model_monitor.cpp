@@ -309,7 +309,8 @@ std::shared_ptr<const LiveSchema> ModelMonitor::begin(BodySchema base,
     if (sample.sample_index <= up_to_sample && fits(base, sample)) past.push_back(sample);
   if (past.size() > kPast)
     past.erase(past.begin(), past.end() - static_cast<std::ptrdiff_t>(kPast));
-  return std::make_shared<LiveSchema>(std::move(base), options_, std::move(history), past);
+  return std::make_shared<LiveSchema>(std::move(base), options_, std::move(history), past,
+                                      memory_.at_base.findings);
 }
 
 ModelMonitor::EdgeTest ModelMonitor::test(const BodySchema& schema, const Edge& edge,
@@ -403,6 +404,7 @@ void ModelMonitor::judge(const body_schema_t& message) {
   event.utime = proposal.utime;
   event.event_sample = index;
   event.event_from = event.event_to = event.event_part = event.event_tag = -1;
+  event.event_since = event.event_size.size_signal = -1;
   bool is_new_base = false, is_changed = false;
   const LiveSchema* live = standing.live.get();
   if (!is_passed_over(proposal, standing)) {
@@ -475,6 +477,8 @@ void ModelMonitor::set_base(Standing* standing, BodySchema base) {
                                 : static_cast<std::int32_t>(standing->youth.num_confirming());
   memory_.verdicts.schema_version = 0;
   set_array(memory_.at_base.num_events, memory_.at_base.events, standing->events);
+  set_array(memory_.at_base.num_findings, memory_.at_base.findings,
+            standing->live ? standing->live->findings() : std::vector<finding_t>());
   set_array(memory_.verdicts.num_events, memory_.verdicts.events, {});
   standing->proposed.reset();
   standing->live.reset();
@@ -488,6 +492,7 @@ const model_health_t& ModelMonitor::health() const {
   if (is_assessed_) return health_;
   is_assessed_ = true;
   set_array(health_.num_events, health_.events, now_.events);
+  set_array(health_.num_findings, health_.findings, {});
   const BodySchema* schema = now_.schema();
   health_.utime = judged_utime_;
   health_.judged_sample = judged_sample_;

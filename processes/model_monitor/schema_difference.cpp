@@ -74,6 +74,23 @@ bool is_alike_at(const BodySchema& a, const BodySchema& b, int part) {
   return true;
 }
 
+bool is_close_at(const BodySchema& a, const BodySchema& b, int part, const Noise& tolerance) {
+  const auto is_close = [&](const Pose& X, const Pose& Y) {
+    const Pose difference = X.inverse() * Y;
+    return difference.translation().norm() < tolerance.position_m &&
+           rotation_angle(difference) < tolerance.rotation_rad;
+  };
+  if (part == a.root) return is_close(a.X_CR, b.X_CR);
+  const Edge *x = edge_to(a, part), *y = edge_to(b, part);
+  if (!x || !y || x->from != y->from) return false;
+  for (int n = 1; n <= kAlikeActions; ++n) {
+    const Eigen::VectorXd action = spread_action(a.signals, n);
+    if (!is_close(x->predict(a.displacements(action)), y->predict(b.displacements(action))))
+      return false;
+  }
+  return true;
+}
+
 bool is_alike(const BodySchema& a, const BodySchema& b) {
   return std::all_of(a.parts.begin(), a.parts.end(),
                      [&](int part) { return is_alike_at(a, b, part); });

@@ -16,7 +16,9 @@ bool is_same(const BodySchema& a, const BodySchema& b);
 /// One local model of the edge to `part` (root: of the camera's pose): at actions all over the box
 /// of the limits it differs by no more than is uncertain about it (χ²₆ at 99 %).
 bool is_alike_at(const BodySchema& a, const BodySchema& b, int part);
-/// One body: so everywhere.
+/// At the same actions it differs by no more than `tolerance`, whatever is certain about it.
+bool is_close_at(const BodySchema& a, const BodySchema& b, int part, const Noise& tolerance);
+/// One body: alike everywhere.
 bool is_alike(const BodySchema& a, const BodySchema& b);
 /// The places in which they differ: markers first, of parts that lie elsewhere between edges which
 /// together lead to where they led, then edges.

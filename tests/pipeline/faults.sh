@@ -48,9 +48,12 @@ kill_process() { kill -KILL "$("$source/run" exec pgrep -f "^$build/bin/$1 .*$wo
 run=$!
 until_true "the arm was not learned" is_learned
 
-# break_and_repair PLACE CAUSE VICTIM FAULT…
+# nothing_wrong: the list of what is wrong is there and empty.
+nothing_wrong() { grep -q '^  "wrong": \[\]' "$work/status.json"; }
+
+# break_and_repair PLACE WHAT VICTIM FAULT…: patterns of what the events and the list of what is wrong say.
 break_and_repair() {
-  local place=$1 cause=$2 victim=$3
+  local place=$1 what=$2 victim=$3
   shift 3
   local one since
   since=$(newest)
@@ -58,26 +61,28 @@ break_and_repair() {
     # shellcheck disable=SC2086
     fault $one
   done
-  until_true "$*: not found" told "$since" "$place: (candidate|refined|missing) $cause"
+  until_true "$*: not found" told "$since" "$what.*: (found|adopted)"
+  until_true "$*: not listed" grep -q -A 9 "^What is wrong now" "$work/status.txt"
   kill_process "$victim"
   since=$(newest)
   fault repair
-  until_true "$*: the repair was not found" told $((since + 1)) "$place: (restored|reverted|recovered)"
+  until_true "$*: the repair was not found" told $((since + 1)) "$place.*(back to normal|undone)"
   until_true "$*: not sound again" is_sound
+  until_true "$*: still listed as wrong" nothing_wrong
 }
-break_and_repair "edge 4–5" joint_stuck model_monitor "stuck q3"
-break_and_repair "edge 5–6" geometry observer "bend forearm 20"
-break_and_repair "edge 7–8" geometry structure_learner "tool 1"
-break_and_repair camera camera_moved marker_estimator "camera-bump"
-break_and_repair "part 9" marker_missing model_monitor "marker-lost 32" "marker-lost 33" "marker-lost 34" "marker-lost 35"
-break_and_repair "part 6, tag 20" marker_missing structure_learner "marker-lost 20"
-break_and_repair "part 8, tag 28" marker_moved robot_simulator "marker-moved 28"
+break_and_repair "4→5" "q3 .4→5. stuck at" model_monitor "stuck q3"
+break_and_repair "5→6" "5→6 bent or exchanged by" observer "bend forearm 20"
+break_and_repair "7→8" "7→8 bent or exchanged by" structure_learner "tool 1"
+break_and_repair camera "camera moved by" marker_estimator "camera-bump"
+break_and_repair "part 9" "marker of part 9 not seen" model_monitor "marker-lost 32" "marker-lost 33" "marker-lost 34" "marker-lost 35"
+break_and_repair "tag 20 of part 6" "tag 20 of part 6 not where it was" structure_learner "marker-lost 20"
+break_and_repair "tag 28 of part 8" "tag 28 of part 8 elsewhere" robot_simulator "marker-moved 28"
 
 "$source/run" stop >>"$work/console.txt" 2>&1 || fail "stop"
 wait
 "$build/bin/judge_schema" "$work/logs/current/config" "$work/logs/current/schema.lcmlog" >"$work/judge.txt" 2>&1 ||
   fail "the schema is wrong in the end"
 "$source/run" report "$work/logs/current" >>"$work/console.txt" 2>&1 || fail "report"
-for cause in joint_stuck geometry camera_moved marker_missing marker_moved; do
-  grep -q "$cause" "$work/logs/current/report.html" || fail "the report does not tell of $cause"
+for what in "q3 (4→5) stuck at" "5→6 bent or exchanged by" "camera moved by" "marker of part 9 not seen" "tag 28 of part 8 elsewhere"; do
+  grep -q "$what" "$work/logs/current/report.html" || fail "the report does not tell: $what"
 done

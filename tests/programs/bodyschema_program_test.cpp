@@ -1016,6 +1016,12 @@ TEST_F(BodyschemaProgramTest, MonitorFindsAStuckJointNamesItAndWritesTheRepaired
       EXPECT_GE(line["sample"], 40) << line;
       if (line["event"] == "candidate" || line["event"] == "refined")
         causes.push_back(line["cause"]);
+      if (line["event"] == "candidate") {
+        EXPECT_TRUE(line["signal"].is_string()) << line;
+        EXPECT_NEAR(line["amount"]["command"].get<double>(), 0.4, 0.05) << line;
+        EXPECT_GT(line["amount_sd"]["command"], 0) << line;
+        EXPECT_EQ(line["since"], 40) << line;
+      }
       EXPECT_TRUE(line.contains("margin") && line.contains("samples_used") && line.contains("t"));
       EXPECT_TRUE(line.contains("part") != (line.contains("from") && line.contains("to"))) << line;
       continue;
@@ -1040,7 +1046,8 @@ TEST_F(BodyschemaProgramTest, MonitorFindsAStuckJointNamesItAndWritesTheRepaired
                 .out,
             outcome.out);
   const Outcome text = run({"monitor", "schema.lcmlog", changing, "--noise", "0.003", "1"});
-  EXPECT_NE(text.out.find("joint_stuck"), std::string::npos) << text.out;
+  EXPECT_NE(text.out.find(" stuck at 0.4"), std::string::npos) << text.out;
+  EXPECT_NE(text.out.find("since sample 40: adopted"), std::string::npos) << text.out;
   EXPECT_NE(text.out.find("80 samples, "), std::string::npos) << text.out;
 }
 

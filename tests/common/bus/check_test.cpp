@@ -215,6 +215,18 @@ TEST(Check, KnowsMinusOneOnlyWhereItMeansNotMeasured) {
                  [](auto& m) { m.events[0].event_margin = std::nan(""); });
   expect_refused(example_model_health(), "edge_health[0].edge_cusum",
                  [](auto& m) { m.edge_health[0].edge_cusum = -2; });
+  expect_refused(example_model_health(), "findings[0].amount_sd[0].amount_sd",
+                 [](auto& m) { m.findings[0].finding_size.amount_sd[0] = -0.5; });
+  expect_refused(example_model_health(), "findings[0].num_amounts", [](auto& m) {
+    change_size_t& size = m.findings[0].finding_size;
+    size.num_amounts = 1;
+    size.amount.resize(1);
+    size.amount_sd.resize(1);
+  });
+  expect_refused(example_model_health(), "events[0].amount[0]",
+                 [](auto& m) { m.events[0].event_size.amount[0] = std::nan(""); });
+  expect_refused(example_model_health(), "findings[0].finding_since",
+                 [](auto& m) { m.findings[0].finding_since = -1; });
   expect_refused(example_model_health(), "probe_action",
                  [](auto& m) { m.probe_action[1] = std::nan(""); });
   expect_refused(example_model_health(), "worst_position_m",

@@ -145,7 +145,7 @@ TEST(VersionErrorsTest, EveryVersionIsJudgedOnTheSameSamples) {
     if (v < 50) schema.edges.pop_back();
     versions[v] = schema;
   }
-  const auto errors = version_errors(versions, held_out, 3, 10);
+  const auto errors = version_errors(versions, held_out, {}, 3, 10);
   ASSERT_EQ(errors.size(), 10U);
   EXPECT_EQ(errors.front().num_samples, 10);
   EXPECT_EQ(errors.front().num_edges, 1);
@@ -157,7 +157,41 @@ TEST(VersionErrorsTest, EveryVersionIsJudgedOnTheSameSamples) {
   // Samples of another rig are not its business.
   ActionPoseSample other = held_out[0];
   other.action.resize(5);
-  EXPECT_TRUE(version_errors(versions, {other}, 3).empty());
+  EXPECT_TRUE(version_errors(versions, {other}, {}, 3).empty());
+}
+
+TEST(VersionErrorsTest, AVersionIsJudgedByTheBodyThatItWasFor) {
+  test::Rng rng(8);
+  const BodySchema first = three_parts();
+  BodySchema second = first;
+  second.edges[0].right.translation().x() += 0.2;
+  auto held_out = samples_of(first, 60, 1e-20 * Matrix6d::Identity(), rng);
+  const auto later = samples_of(second, 60, 1e-20 * Matrix6d::Identity(), rng);
+  std::copy(later.begin() + 30, later.end(), held_out.begin() + 30);  // it broke at sample 30
+  std::map<std::int64_t, BodySchema> versions;
+  const auto add = [&](std::int64_t last_sample, BodySchema schema) {
+    schema.last_sample_index = last_sample;
+    versions[last_sample + 1] = std::move(schema);
+  };
+  add(10, first);
+  add(20, first);
+  add(34, second);
+  const auto errors = version_errors(versions, held_out, {{30, "tool 1"}}, 3);
+  ASSERT_EQ(errors.size(), 4U);
+  EXPECT_EQ(errors[1].body, 0U);
+  EXPECT_NEAR(errors[1].worst_position_m, 0, 1e-9);
+  // What stood when it broke, on the broken body.
+  EXPECT_EQ(errors[2].body, 1U);
+  EXPECT_EQ(errors[2].num_samples, 30);
+  EXPECT_NEAR(errors[2].worst_position_m, 0.2, 0.05);
+  EXPECT_EQ(errors[3].num_samples, 35);
+  EXPECT_NEAR(errors[3].worst_position_m, 0, 1e-9);
+  const auto plot = version_plot(errors, {{30, "tool 1"}});
+  ASSERT_TRUE(plot);
+  EXPECT_NE(plot->script.find("from 30, graph 0 to 30, graph 1"), std::string::npos);
+  EXPECT_NE(plot->script.find("'tool 1'"), std::string::npos);
+  const auto svg = draw_plots({*plot});
+  EXPECT_NE(svg[0].find("tool 1"), std::string::npos);
 }
 
 TEST(TreeTest, EveryPartStandsThereOnce) {
@@ -304,6 +338,75 @@ TEST_F(ReportPageTest, ARunIsToldInOneFileThatNeedsNoOther) {
   // Errors are against what was observed: no simulator was heard.
   EXPECT_GT(count(html, "what the camera saw"), 0);
   EXPECT_EQ(count(html, "noise-free truth"), 0);
+}
+
+TEST_F(ReportPageTest, WhatIsWrongStandsFirst) {
+  hear_run();
+  EXPECT_EQ(count(page(), "What is wrong now"), 0);
+  EXPECT_EQ(count(page(), "The body is known: 3 parts"), 1);
+  model_health_t health{};
+  health.judged_sample = 49;
+  health.probe_sample = -1;
+  finding_t finding{};
+  finding.finding_text = "q1 (1→2) stuck at <b>";
+  set_array(health.num_findings, health.findings, {finding});
+  health_event_t event{};
+  event.utime = 5'000'000;
+  event.event_sample = 30;
+  event.event_text = "q1 (1→2) stuck at 0.20 ± 0.01 since sample 29: adopted";
+  set_array(health.num_events, health.events, {event});
+  hear(kModelHealth, health);
+  const std::string html = page();
+  EXPECT_LT(html.find("What is wrong now"), html.find("The body is not as the schema says in 1 "
+                                                      "place. 3 parts hang together"));
+  EXPECT_EQ(count(html, "<li>q1 (1→2) stuck at &lt;b&gt;</li>"), 1);
+  EXPECT_EQ(count(html, "The body is known"), 0);
+  EXPECT_EQ(count(html, "q1 (1→2) stuck at 0.20 ± 0.01 since sample 29: adopted"), 1);
+  EXPECT_EQ(count(html, "As of sample 49, the last. No sample comes any more"), 1);
+  // While the run goes on somebody watches.
+  report_.reload_s = 10;
+  EXPECT_EQ(count(page(), "No sample comes any more"), 0);
+}
+
+TEST_F(ReportPageTest, TheBodyChangesWhereTheSimulationBrokeIt) {
+  test::Rng rng(4);
+  auto samples = samples_of(three_parts(), 50, uneven_noise(), rng);
+  for (ActionPoseSample& sample : samples) {
+    sample.utime = 1'000'000 * (sample.sample_index + 1);
+    hear(kSample, to_message(sample));
+  }
+  const auto broken = [&](std::int64_t utime, std::vector<std::string> faults) {
+    sim_state_t state{};
+    state.utime = utime;
+    state.X_WC = to_message(Pose::Identity());
+    set_array(state.num_faults, state.faults, std::move(faults));
+    hear(kSimState, state);
+  };
+  broken(0, {});
+  broken(20'500'000, {"stuck q1"});
+  // One that goes on is one fault.
+  for (int n = 0; n < 5; ++n)
+    broken(30'500'000 + n * 1'000'000,
+           {"stuck q1", "drift arm 0.5 deg per action, " + std::to_string(n) + " deg so far"});
+  broken(40'500'000, {});
+  const auto marks = body_marks(record_);
+  ASSERT_EQ(marks.size(), 3U);
+  EXPECT_EQ(marks[0].sample, 20);
+  EXPECT_EQ(marks[0].label, "stuck q1");
+  EXPECT_EQ(marks[1].sample, 30);
+  EXPECT_EQ(marks[1].label, "drift arm 0.5 deg per action");
+  EXPECT_EQ(marks[2].sample, 40);
+  EXPECT_EQ(marks[2].label, "repair");
+}
+
+TEST_F(ReportPageTest, WithoutASimulationTheBodyChangesWhereTheMonitorFoundIt) {
+  BodySchema schema = three_parts();
+  schema.changes = {{12, 10}, {31, 30}, {33, 28}};  // the last is the second, told better
+  hear(kBodySchema, to_message(schema));
+  const auto marks = body_marks(record_);
+  ASSERT_EQ(marks.size(), 2U);
+  EXPECT_EQ(marks[0].sample, 10);
+  EXPECT_EQ(marks[1].sample, 28);
 }
 
 TEST_F(ReportPageTest, WhatMessagesSayIsTextAndNeverMarkup) {

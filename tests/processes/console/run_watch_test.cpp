@@ -233,21 +233,59 @@ TEST(RunWatchTest, VisibilityIsAShareOfAllSamples) {
   EXPECT_EQ(visibility.at(7), 0.2);
 }
 
-TEST(RunWatchTest, TheLineOfProgressSaysWhatIsKnown) {
+TEST(RunWatchTest, TheLineOfProgressSaysWhatIsKnownAndWhatIsMissing) {
   RunWatch watch;
-  EXPECT_EQ(watch.progress(), "   0 samples ·  0 parts, each seen in   0 % · 0 of 0 edges");
+  EXPECT_EQ(watch.progress(),
+            "   0 samples ·  0 parts, each seen in   0 % · 0 of 0 edges, no proposal yet");
   watch.on_sample(sample(0, {1, 2, 3}));
   watch.on_sample(sample(1, {1}));
-  EXPECT_EQ(watch.progress(), "   2 samples ·  3 parts, each seen in  67 % · 0 of 2 edges");
+  body_schema_t proposal{};
+  unconnected_part_t two{}, three{};
+  two.unconnected_part = 2;
+  two.reason = unconnected_part_t::REASON_NOT_ENOUGH_DATA;
+  three.unconnected_part = 3;
+  three.reason = unconnected_part_t::REASON_NO_VALID_MODEL;
+  set_array(proposal.num_unconnected, proposal.unconnected, {two, three});
+  watch.on_learned_schema(proposal);
+  EXPECT_EQ(watch.progress(),
+            "   2 samples ·  3 parts, each seen in  67 % · 0 of 2 edges, missing: part 2 (not "
+            "enough data yet), part 3 (no valid model)");
+  set_array(proposal.num_unconnected, proposal.unconnected, {});
+  watch.on_learned_schema(proposal);
   watch.on_model_health(health(1));
-  EXPECT_EQ(
-      watch.progress(),
-      "   2 samples ·  3 parts, each seen in  67 % · 0 of 2 edges · held-out error of the worst "
-      "part 4.2 mm 0.57°");
+  EXPECT_EQ(watch.progress(),
+            "   2 samples ·  3 parts, each seen in  67 % · 0 of 2 edges, not judged yet · worst "
+            "part 4.2 mm 0.57° off, as the camera sees it, held out");
   model_health_t untested = health(1);
   untested.worst_position_m = -1;
   watch.on_model_health(untested);
-  EXPECT_EQ(watch.progress().find("held-out"), std::string::npos);
+  EXPECT_EQ(watch.progress().find("held out"), std::string::npos);
+}
+
+TEST(RunWatchTest, TheLineOfProgressSaysHowManyThereWillBeAndWhenAndWhatIsWrong) {
+  RunWatch watch;
+  watch.on_sample(sample(0, {1}));
+  EXPECT_TRUE(
+      watch.progress(SampleGoal{60, true}, 14.4).starts_with("   1 of 60 samples · 14 s left · "));
+  EXPECT_TRUE(watch.progress(SampleGoal{60, true}).starts_with("   1 of 60 samples ·  1 parts"));
+  EXPECT_TRUE(watch.progress(SampleGoal{300, false}, 70)
+                  .starts_with("   1 of at most 300 samples · at most 70 s left · "));
+  EXPECT_EQ(watch.progress(SampleGoal{1, true}, 0.).find("left"), std::string::npos);
+  model_health_t broken = health(1);
+  finding_t finding{};
+  set_array(broken.num_findings, broken.findings, {finding});
+  watch.on_model_health(broken);
+  EXPECT_TRUE(watch.progress().ends_with("The body is not as the schema says in 1 place."));
+}
+
+TEST(PaceTest, IsThatOfTheLastMinute) {
+  Pace pace;
+  EXPECT_FALSE(pace.seconds_for(10));
+  pace.note(0, 0);
+  EXPECT_FALSE(pace.seconds_for(10));
+  for (int n = 1; n <= 100; ++n) pace.note(10 * n, n);  // slow at first
+  for (int n = 1; n <= 100; ++n) pace.note(1000 + n, 100 + n);
+  EXPECT_NEAR(pace.seconds_for(10).value(), 10, 0.2);
 }
 
 TEST(RunWatchTest, TheDiagnosisNamesWhoIsSilent) {

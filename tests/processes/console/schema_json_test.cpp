@@ -195,7 +195,11 @@ TEST(SchemaJsonTest, ShowHasEveryParameterOfEveryEdge) {
 TEST(SchemaJsonTest, TheTextNamesEdgesSignalsAndIdleOnes) {
   test::SyntheticRobot robot;
   const std::string text = structure_text(learned(robot).schema);
-  EXPECT_EQ(text.rfind("Complete structure of 5 parts from 30 samples\n", 0), 0U) << text;
+  EXPECT_EQ(text.rfind("Complete structure of 5 parts from 30 samples\n"
+                       "  edge      kind      signals        residual   (rms)\n",
+                       0),
+            0U)
+      << text;
   EXPECT_NE(text.find("{q1}"), std::string::npos) << text;
   EXPECT_NE(text.find("rigid"), std::string::npos) << text;
   EXPECT_NE(text.find("signals without effect: idle\n"), std::string::npos) << text;

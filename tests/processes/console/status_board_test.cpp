@@ -70,7 +70,8 @@ TEST(StatusBoardTest, TheFirstLineSaysWhatIsDone) {
   EXPECT_TRUE(board().text(100).starts_with("Learning: 5 samples.\n"));
   StatusBoard done = board();
   done.on_message(info("motor_babbler", process_info_t::PHASE_DONE, "60 samples"));
-  EXPECT_EQ(done.headline(), "Done: 60 samples.");
+  EXPECT_EQ(done.headline(),
+            "Done: 60 samples. No sample comes any more: what breaks from now on is not noticed.");
   StatusBoard waits = board();
   waits.on_message(info("motor_babbler", process_info_t::PHASE_WAITING, "waiting for SAMPLE"));
   EXPECT_EQ(waits.headline(), "Waits: waiting for SAMPLE.");
@@ -237,12 +238,102 @@ TEST(StatusBoardTest, AnEdgeIsShownWithItsHealth) {
   EXPECT_EQ(edge["state"], "SUSPECT");
   EXPECT_EQ(edge["median_mahalanobis2"], 12.3);
   const std::string text = board_.text(100);
-  EXPECT_NE(text.find("1 → 2   screw  {q2,q1}        1.20 mm   0.00°  SUSPECT         4      12.3"),
+  EXPECT_NE(text.find("1 → 2   SUSPECT      screw  {q2,q1}        1.20 mm   0.00°     4      12.3"),
             std::string::npos)
       << text;
   EXPECT_NE(text.find("not connected: not enough data yet: seen once"), std::string::npos) << text;
   EXPECT_NE(text.find("version 9 accepted"), std::string::npos) << text;
   EXPECT_TRUE(board_.json()["parts"][0]["position_median_m"].is_null());
+}
+
+/// A joint that is stuck and mended, and another place that nothing explains.
+model_health_t wrong_in_two_places() {
+  model_health_t health{};
+  finding_t stuck{};
+  stuck.finding_state = finding_t::FINDING_CONFIRMED;
+  stuck.finding_from = 1;
+  stuck.finding_to = 2;
+  stuck.finding_part = stuck.finding_tag = -1;
+  stuck.finding_cause = "joint_stuck";
+  stuck.finding_size.size_kind = change_size_t::SIZE_COMMAND;
+  stuck.finding_size.size_signal = 1;
+  set_array(stuck.finding_size.num_amounts, stuck.finding_size.amount, {-0.25});
+  stuck.finding_size.amount_sd = {-1};
+  stuck.finding_since = stuck.finding_found = 290;
+  stuck.finding_adopted = 291;
+  stuck.num_confirming = 40;
+  stuck.finding_text =
+      "q2 (1→2) stuck at −0.25 since sample 290, mended at 291, confirmed by 40 samples";
+  finding_t open{};
+  open.finding_from = open.finding_to = open.finding_tag = -1;
+  open.finding_part = 3;
+  open.finding_size.size_signal = -1;
+  open.finding_since = 300;
+  open.finding_found = 301;
+  open.finding_adopted = -1;
+  open.finding_text = "marker of part 3 not as known since sample 300, found at 301";
+  set_array(health.num_findings, health.findings, {stuck, open});
+  return health;
+}
+
+TEST(StatusBoardTest, WhatIsWrongStandsFirstAndNoTerminalIsTooNarrowForIt) {
+  StatusBoard board_ = board();
+  BodySchema schema = two_parts();
+  schema.complete = true;
+  board_.on_body_schema(to_message(schema));
+  board_.on_message(model_health_t{});
+  EXPECT_TRUE(board_.text(100).starts_with(
+      "Learning: 5 samples.\nNothing is known to be wrong with the body.\n"))
+      << board_.text(100);
+  EXPECT_TRUE(board_.json()["wrong"].empty());
+  board_.on_message(wrong_in_two_places());
+  EXPECT_TRUE(board_.text(100).starts_with(
+      "What is wrong now\n"
+      "  q2 (1→2) stuck at −0.25 since sample 290, mended at 291, confirmed by 40 samples\n"
+      "  marker of part 3 not as known since sample 300, found at 301\n\n"
+      "Learning: 5 samples.\nThe body is not as the schema says in 1 place.\n"))
+      << board_.text(100);
+  const std::string narrow = board_.text(40);
+  EXPECT_TRUE(
+      narrow.starts_with("What is wrong now\n"
+                         "  q2 (1→2) stuck at −0.25 since sample\n"
+                         "    290, mended at 291, confirmed by 40\n"
+                         "    samples\n"))
+      << narrow;
+  const auto wrong = board_.json()["wrong"];
+  ASSERT_EQ(wrong.size(), 2U);
+  EXPECT_EQ(wrong[0]["state"], "confirmed");
+  EXPECT_EQ(wrong[0]["signal"], "q2");
+  EXPECT_EQ(wrong[0]["amount"]["command"], -0.25);
+  EXPECT_TRUE(wrong[0]["amount_sd"]["command"].is_null());
+  EXPECT_EQ(wrong[0]["since"], 290);
+  EXPECT_EQ(wrong[0]["adopted"], 291);
+  EXPECT_TRUE(wrong[1]["amount"].is_null());
+  EXPECT_TRUE(wrong[1]["signal"].is_null());
+  EXPECT_TRUE(wrong[1]["adopted"].is_null());
+  // Before the body is known nothing can be said of it.
+  schema.complete = false;
+  board_.on_body_schema(to_message(schema));
+  EXPECT_TRUE(board_.text(100).starts_with("Learning: 5 samples.\n\n")) << board_.text(100);
+}
+
+TEST(StatusBoardTest, ANarrowTerminalKeepsTheHealthOfAnEdge) {
+  StatusBoard board_ = board();
+  board_.on_body_schema(to_message(two_parts()));
+  model_health_t health{};
+  edge_health_t of_edge{};
+  of_edge.health_from = 1;
+  of_edge.health_to = 2;
+  of_edge.edge_state = schema_edge_t::EDGE_PROVISIONAL;
+  set_array(health.num_edges, health.edge_health, {of_edge});
+  part_health_t part{};
+  part.health_part = 2;
+  part.part_state = schema_edge_t::EDGE_INVALID;
+  set_array(health.num_parts, health.part_health, {part});
+  board_.on_message(health);
+  const std::string text = board_.text(30);
+  EXPECT_NE(text.find("1 → 2   PROVISIONAL"), std::string::npos) << text;
+  EXPECT_NE(text.find("2         INVALID"), std::string::npos) << text;
 }
 
 TEST(StatusBoardTest, FaultsAreMarkedAsGroundTruth) {
@@ -313,6 +404,13 @@ TEST(StatusBoardTest, NoLineIsWiderThanTheTerminalAndNoneObeysAMessage) {
     num_cut += line.ends_with("…");
   }
   EXPECT_GT(num_cut, 2);
+}
+
+TEST(WrapTest, BreaksBetweenWords) {
+  EXPECT_EQ(wrap("one two three", 9, 0), "one two\n  three\n");
+  EXPECT_EQ(wrap("one two three", 100, 4), "    one two three\n");
+  EXPECT_EQ(wrap("äöü äöü", 3, 0), "äöü\n  …\n");
+  EXPECT_EQ(wrap("", 5, 2), "  \n");
 }
 
 TEST(FitTest, CutsBetweenCharacters) {

@@ -733,6 +733,52 @@ TEST_F(ModelMonitorTest, AStuckJointIsFoundPublishedAtOnceAndWhatTheLearnerSaysL
   EXPECT_EQ(monitor.health().judged_sample, 44);
 }
 
+TEST_F(ModelMonitorTest, WhatIsWrongOutlivesItsEventsANewBaseAndARestart) {
+  const Edge broken = break_last_joint(30);
+  const auto endless = [&](std::int64_t i) {
+    ActionPoseSample sample = samples_.at(i < 30 ? i : 30 + i % 15);
+    sample.sample_index = i;
+    sample.utime = 1'000'000 * (i + 1);
+    sample.purpose = i % 5 == 4 ? Purpose::kTest : Purpose::kTrain;
+    return to_message(sample);
+  };
+  const auto proposed = [&](std::int64_t i) {
+    BodySchema schema = learned(29);
+    schema.last_sample_index = i;
+    schema.utime = endless(i).utime;
+    return to_message(schema);
+  };
+  constexpr std::int64_t kLast = 574;  // more than 500 after the base: it is renewed
+  ModelMonitor monitor(test_config());
+  for (std::int64_t i = 0; i <= kLast; ++i) {
+    monitor.on_sample(endless(i));
+    if (i == 29 || i == kLast) monitor.on_learned_schema(proposed(i));
+    ASSERT_EQ(check(monitor.health()), "");
+    if (i <= 29) {
+      ASSERT_EQ(monitor.health().num_findings, 0) << i;
+    }
+  }
+  MonitorMemory memory = monitor.memory();
+  ASSERT_EQ(memory.schemas.back().last_sample_index, kLast);
+  set_array(memory.at_base.num_events, memory.at_base.events, {});
+  ModelMonitor again(test_config());
+  again.restore(memory);
+  for (std::int64_t i = 0; i <= kLast + 5; ++i) again.on_sample(endless(i));
+  for (const model_health_t& health : {monitor.health(), again.health()}) {
+    ASSERT_EQ(health.num_findings, 1);
+    const finding_t& finding = health.findings[0];
+    EXPECT_EQ(finding.finding_state, finding_t::FINDING_CONFIRMED);
+    EXPECT_EQ(finding.finding_from, broken.from);
+    EXPECT_EQ(finding.finding_to, broken.to);
+    EXPECT_EQ(finding.finding_cause, "joint_stuck");
+    EXPECT_EQ(finding.finding_size.size_signal, broken.joints.front().signal);
+    ASSERT_EQ(finding.finding_size.num_amounts, 1);
+    EXPECT_NEAR(finding.finding_size.amount[0], 0.4, 0.02);
+    EXPECT_GE(finding.finding_since, 30);
+    EXPECT_LE(finding.finding_adopted, 35);
+  }
+}
+
 // Parts 1 (root, 2 m before the camera) and 2 (0.1 m beside it), no joint.
 BodySchema two_parts() {
   BodySchema schema;

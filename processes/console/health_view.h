@@ -1,0 +1,42 @@
+#pragma once
+
+#include <nlohmann/json.hpp>
+#include <string>
+#include <vector>
+
+#include "bodyschema/body_schema_t.hpp"
+#include "bodyschema/model_health_t.hpp"
+
+namespace bodyschema {
+
+/// What status, report, watch and `monitor` tell of MODEL_HEALTH, in one way.
+
+/// "mismatch", "candidate", … of a health_event_t's event_kind.
+const char* name_of_event(std::int8_t kind);
+
+/// `signal`, `amount`, `amount_sd`, `since`: null where not told. `signals`: names.
+void add_size(const change_size_t& size, std::int64_t since,
+              const std::vector<std::string>& signals, nlohmann::ordered_json* json);
+nlohmann::ordered_json event_json(const health_event_t& event,
+                                  const std::vector<std::string>& signals);
+nlohmann::ordered_json finding_json(const finding_t& finding,
+                                    const std::vector<std::string>& signals);
+
+inline constexpr const char* kWhatIsWrong = "What is wrong now";
+
+/// What MODEL_HEALTH says of the body as a whole.
+struct BodyVerdict {
+  /// "The body is known: …", "The body has changed in 1 place, and the schema with it.", …
+  std::string sentence;
+  /// The lines under kWhatIsWrong; empty: nothing is known to be wrong.
+  std::vector<std::string> wrong;
+  bool is_schema_wrong = false;  ///< something is found that the schema does not have yet
+};
+/// Of findings that were heard, empty ones too.
+BodyVerdict verdict_of(const std::vector<finding_t>& findings);
+
+/// Said where a run is over or its babbler done.
+inline constexpr const char* kNobodyWatches =
+    "No sample comes any more: what breaks from now on is not noticed.";
+
+}  // namespace bodyschema

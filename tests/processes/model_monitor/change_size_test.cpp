@@ -1,0 +1,161 @@
+#include "processes/model_monitor/change_size.h"
+
+#include <gtest/gtest.h>
+
+#include <cmath>
+
+#include "tests/support/broken_arm.h"
+
+namespace bodyschema {
+namespace {
+
+using Form = BodyChange::Form;
+using Kind = ChangeSize::Kind;
+using test::Rng;
+
+class ChangeSizeTest : public testing::Test {
+ protected:
+  static constexpr int kPart = 4;  // q3 moves the edge 3→4
+
+  ChangeSizeTest() {
+    for (Edge& edge : schema_.edges) edge.right = test::random_pose(rng_, 0.05, 0.1);
+    schema_.signals[2] = {"q3", -1, 3, {0.2, -0.1}};
+    schema_.edges[2].joints[0].gain = 1.2;
+    schema_.edges[2].joints[0].offset = 0.3;
+  }
+  ChangeSize size(const BodyChange& change, const Eigen::VectorXd& theta) const {
+    return size_of(schema_, change, theta, {});
+  }
+  static Eigen::VectorXd vector(std::vector<double> values) {
+    return Eigen::Map<Eigen::VectorXd>(values.data(), static_cast<Eigen::Index>(values.size()));
+  }
+
+  Rng rng_{3};
+  BodySchema schema_ =
+      test::BrokenArm({test::Fault::kNone, "", 1}, test::Regime::kTagIso, 1, 3).engineered();
+};
+
+TEST_F(ChangeSizeTest, AStuckJointStandsAtTheCommandThatLedThere) {
+  for (const double command : {-1.0, -0.4, 0.7, 2.9}) {
+    const double displacement = 1.2 * schema_.signals[2].displacement(command) + 0.3;
+    const ChangeSize size = this->size({Form::kStuck, kPart}, vector({displacement}));
+    EXPECT_EQ(size.kind, Kind::kCommand);
+    EXPECT_EQ(size.signal, 2);
+    ASSERT_EQ(size.amounts.size(), 1U);
+    EXPECT_NEAR(size.amounts[0], command, 1e-9);
+    EXPECT_EQ(size.sds, std::vector<double>{-1});
+    // The schema with it agrees with the healthy one there.
+    const BodySchema stuck = changed(schema_, {Form::kStuck, kPart}, vector({displacement}));
+    Eigen::VectorXd action = Eigen::VectorXd::Zero(7);
+    const Pose stands = edge_to(stuck, kPart)->predict(stuck.displacements(action));
+    action(2) = size.amounts[0];
+    EXPECT_TRUE(
+        stands.isApprox(edge_to(schema_, kPart)->predict(schema_.displacements(action)), 1e-9));
+  }
+}
+
+TEST_F(ChangeSizeTest, OffsetAndGainAreThoseOfTheCommand) {
+  EXPECT_NEAR(size({Form::kOffset, kPart}, vector({0.6})).amounts[0], 0.5, 1e-12);
+  const ChangeSize gain = size({Form::kGain, kPart}, vector({-0.3, 0.1}));
+  EXPECT_EQ(gain.kind, Kind::kFactor);
+  EXPECT_NEAR(gain.amounts[0], 0.7, 1e-12);
+}
+
+TEST_F(ChangeSizeTest, AToolIsAsFarAwayAsItIs) {
+  Vector6d theta;
+  theta << 0.03, 0, 0.04, 0, 0.5, 0;
+  const ChangeSize tool = size({Form::kRight, kPart}, theta);
+  EXPECT_EQ(tool.kind, Kind::kPose);
+  EXPECT_NEAR(tool.amounts[0], 0.05, 1e-9);
+  EXPECT_NEAR(tool.amounts[1], 0.5, 1e-9);
+  // Bent before the joint: the part goes as far as its lever says, the angle is the same.
+  Vector6d bend = Vector6d::Zero();
+  bend(4) = 0.5;
+  const ChangeSize bent = size({Form::kLeft, kPart}, bend);
+  Eigen::VectorXd middle = Eigen::VectorXd::Zero(7);
+  middle(2) = 1;
+  const Pose X = edge_to(schema_, kPart)->predict(schema_.displacements(middle));
+  EXPECT_NEAR(bent.amounts[0], (transform(bend) * X.translation() - X.translation()).norm(), 1e-9);
+  EXPECT_NEAR(bent.amounts[1], 0.5, 1e-9);
+}
+
+TEST_F(ChangeSizeTest, ACameraWasKnockedAsFarAsItsOwnFrameMoved) {
+  Rng rng(5);
+  Pose knock = Pose::Identity();  // of the camera, in its frame of before
+  knock.linear() = exp_so3({0.1, 0, 0});
+  knock.translation() << 0.02, 0.01, 0;
+  const Pose T = schema_.X_CR.inverse() * knock.inverse() * schema_.X_CR;
+  const ChangeSize size = this->size({Form::kRight, schema_.root}, coordinates(T));
+  EXPECT_NEAR(size.amounts[0], knock.translation().norm(), 1e-9);
+  EXPECT_NEAR(size.amounts[1], 0.1, 1e-9);
+}
+
+// A standard deviation is one if θ that scatters by its covariance makes amounts that scatter so.
+TEST_F(ChangeSizeTest, StandardDeviationsAreThoseOfTheAmounts) {
+  struct Case {
+    BodyChange change;
+    Eigen::VectorXd theta;
+  };
+  Vector6d pose, other;
+  pose << 0.1, -0.2, 0.05, 0.3, -0.2, 0.6;
+  other << -0.05, 0.02, 0.2, 0.1, 0.5, -0.3;
+  Eigen::VectorXd both(12);
+  both << pose, other;
+  for (const Case& c :
+       {Case{{Form::kStuck, kPart}, vector({0.9})}, Case{{Form::kOffset, kPart}, vector({0.3})},
+        Case{{Form::kGain, kPart}, vector({-0.3, 0.1})}, Case{{Form::kLeft, kPart}, pose},
+        Case{{Form::kRight, kPart}, pose}, Case{{Form::kBoth, kPart}, both},
+        Case{{Form::kMarkerMoved, kPart}, pose}, Case{{Form::kRight, schema_.root}, pose}}) {
+    SCOPED_TRACE(static_cast<int>(c.change.form));
+    const Eigen::Index d = c.theta.size();
+    const Eigen::MatrixXd A =
+        0.001 * Eigen::MatrixXd::NullaryExpr(d, d, [&] { return test::gaussian(rng_); });
+    const ChangeSize size = size_of(schema_, c.change, c.theta, A * A.transpose());
+    constexpr int kDraws = 4000;
+    std::vector<double> sum(size.amounts.size()), squares(size.amounts.size());
+    for (int n = 0; n < kDraws; ++n) {
+      const Eigen::VectorXd noise =
+          Eigen::VectorXd::NullaryExpr(d, [&] { return test::gaussian(rng_); });
+      const ChangeSize drawn = this->size(c.change, c.theta + A * noise);
+      for (std::size_t i = 0; i < sum.size(); ++i) {
+        const double error = drawn.amounts[i] - size.amounts[i];
+        sum[i] += error;
+        squares[i] += error * error;
+      }
+    }
+    for (std::size_t i = 0; i < sum.size(); ++i) {
+      const double sd = std::sqrt(squares[i] / kDraws);
+      EXPECT_NEAR(size.sds[i], sd, 0.06 * sd) << i;  // 1/√8000 is 1.1 %
+    }
+  }
+}
+
+TEST_F(ChangeSizeTest, WhatHasNoParametersHasNoSize) {
+  for (const Form form : {Form::kStored, Form::kNonlinear, Form::kFresh})
+    EXPECT_EQ(size({form, kPart}, {}).kind, Kind::kUnknown);
+  const ChangeSize other = size({Form::kOtherSignal, kPart, 0, 5}, {});
+  EXPECT_EQ(other.kind, Kind::kUnknown);
+  EXPECT_EQ(other.signal, 5);
+  // A joint that is not there, an edge that is not there.
+  EXPECT_EQ(size({Form::kStuck, kPart, 3}, vector({1})).kind, Kind::kUnknown);
+  EXPECT_EQ(size({Form::kRight, 99}, Vector6d::Zero()).kind, Kind::kUnknown);
+}
+
+TEST_F(ChangeSizeTest, WhatTwoModelsDifferByIsTheChangeBetweenThem) {
+  const auto between = [&](const BodyChange& change, const Eigen::VectorXd& theta) {
+    return difference_at(schema_, changed(schema_, change, theta), {kPart, false});
+  };
+  const FoundDifference stuck = between({Form::kStuck, kPart}, vector({0.9}));
+  EXPECT_EQ(stuck.cause, "joint_stuck");
+  EXPECT_NEAR(stuck.size.amounts[0], size({Form::kStuck, kPart}, vector({0.9})).amounts[0], 1e-9);
+  EXPECT_EQ(between({Form::kOffset, kPart}, vector({0.6})).cause, "joint_offset");
+  EXPECT_NEAR(between({Form::kGain, kPart}, vector({-0.3, 0.1})).size.amounts[0], 0.7, 1e-12);
+  Vector6d theta;
+  theta << 0.03, 0, 0.04, 0, 0.5, 0;
+  const FoundDifference tool = between({Form::kRight, kPart}, theta);
+  EXPECT_EQ(tool.cause, "geometry");
+  EXPECT_NEAR(tool.size.amounts[0], 0.05, 1e-9);
+}
+
+}  // namespace
+}  // namespace bodyschema
