@@ -86,6 +86,7 @@ ordered_json structure_json(const BodySchema& schema, const std::vector<Outlier>
                        {"edges", ordered_json::array()},
                        {"unconnected", ordered_json::array()},
                        {"unused_signals", signal_names(schema, schema.unused_signals())},
+                       {"undecided_signals", signal_names(schema, schema.undecided_signals)},
                        {"outliers", ordered_json::array()},
                        {"noise",
                         {{"position_m", schema.noise.position_m},
@@ -169,6 +170,9 @@ std::string structure_text(const BodySchema& schema) {
   const auto unused = signal_names(schema, schema.unused_signals());
   if (!unused.empty())
     text += fmt::format("  signals without effect: {}\n", fmt::join(unused, ", "));
+  const auto undecided = signal_names(schema, schema.undecided_signals);
+  if (!undecided.empty())
+    text += fmt::format("  signals whose effect is not told yet: {}\n", fmt::join(undecided, ", "));
   return text;
 }
 
