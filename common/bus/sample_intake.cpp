@@ -36,27 +36,46 @@ SampleIntake::Ask SampleIntake::asking(Process& process, bool has_observer) {
 
 SampleIntake::SampleIntake(std::string samples_file, Handler handler, Ask ask)
     : samples_file_(std::move(samples_file)), handler_(std::move(handler)), ask_(std::move(ask)) {
-  read_file();
-  hand_on();
+  catch_up();
 }
 
-void SampleIntake::read_file() {
+void SampleIntake::catch_up() {
+  bool is_read = false;
+  while (!is_read && ahead_.size() < kMaxAhead) {
+    is_read = read_file();
+    hand_on();
+  }
+}
+
+/// Goes on where it ended the last time. False: there is more, for which there is no room yet.
+bool SampleIntake::read_file() {
   std::error_code none;
-  const std::uintmax_t size = std::filesystem::file_size(samples_file_, none);
-  if (none || size == size_read_) return;
+  const auto size = static_cast<std::int64_t>(std::filesystem::file_size(samples_file_, none));
+  if (none || size == size_read_) return true;
+  if (size < position_) position_ = 0;  // it was replaced
   size_read_ = size;
   try {
-    const auto samples = read_log(samples_file_, kSample, nullptr, OnDamage::kSkip);
-    for (const sample_t& sample : samples) take(sample);
+    LogReader reader(samples_file_, OnDamage::kSkip, position_);
+    while (reader.next()) {
+      position_ = reader.position();
+      if (reader.event().channel != kSample.name) continue;
+      const auto& data = reader.event().data;
+      if (const auto sample = decode<sample_t>(data.data(), data.size()).message) take(*sample);
+      while (hand_on_next()) continue;
+      if (ahead_.size() < kMaxAhead) continue;
+      size_read_ = 0;
+      return false;
+    }
   } catch (const std::runtime_error& error) {
     spdlog::warn("{}; the observer is asked instead", error.what());
   }
+  return true;
 }
 
 void SampleIntake::on_sample(const sample_t& sample) {
   take(sample);
   is_observer_heard_ |= !ahead_.empty() && sample.sample_index >= ahead_.begin()->first;
-  if (sample.sample_index > next_index_) read_file();
+  if (sample.sample_index > next_index_) catch_up();
   // The observer says again and again that this is its newest: what seemed to come after it is not
   // the observer's.
   if (sample.sample_index == next_index_ - 1 && !ahead_.empty() && ++num_repeats_ >= kMaxRepeats) {
@@ -80,18 +99,22 @@ void SampleIntake::take(const sample_t& sample) {
   spdlog::warn("SAMPLE {} is not the one that was heard before", sample.sample_index);
 }
 
+bool SampleIntake::hand_on_next() {
+  if (ahead_.empty() || ahead_.begin()->first > next_index_) return false;
+  const sample_t sample = std::move(ahead_.extract(ahead_.begin()).mapped());
+  if (sample.sample_index < next_index_) return true;  // the file had filled the gap
+  next_index_ = sample.sample_index + 1;
+  known_[sample.sample_index] = identity(sample);
+  num_unanswered_ = num_repeats_ = 0;
+  handler_(sample);
+  return true;
+}
+
 void SampleIntake::hand_on() {
-  while (!ahead_.empty()) {
-    if (ahead_.begin()->first > next_index_) {
-      if (ask_) return;
-      give_up_gap();
-    }
-    const sample_t sample = std::move(ahead_.extract(ahead_.begin()).mapped());
-    if (sample.sample_index < next_index_) continue;  // the file had filled the gap
-    next_index_ = sample.sample_index + 1;
-    known_[sample.sample_index] = identity(sample);
-    num_unanswered_ = num_repeats_ = 0;
-    handler_(sample);
+  while (true) {
+    while (hand_on_next()) continue;
+    if (ahead_.empty() || ask_) return;
+    give_up_gap();
   }
 }
 
@@ -110,6 +133,7 @@ void SampleIntake::on_tick(std::int64_t now_us) {
   if (std::exchange(is_observer_heard_, false) && ++num_unanswered_ > kMaxUnanswered) {
     give_up_gap();
     hand_on();
+    catch_up();
     return;
   }
   sample_request_t request{};

@@ -52,8 +52,10 @@ class SampleIntake {
   std::string activity() const;
 
  private:
-  void read_file();
+  void catch_up();
+  bool read_file();
   void take(const sample_t& sample);
+  bool hand_on_next();
   void hand_on();
   void give_up_gap();
 
@@ -66,7 +68,8 @@ class SampleIntake {
   std::map<std::string, std::int64_t> counters_ = {{"conflicting SAMPLE", 0}, {"lost SAMPLE", 0}};
   std::vector<std::pair<std::int64_t, std::int64_t>> lost_;
   bool is_begun_anew_ = false;
-  std::uintmax_t size_read_ = 0;  ///< of the file [bytes]
+  std::int64_t size_read_ = 0;    ///< of the file, when it was last read [bytes]
+  std::int64_t position_ = 0;     ///< up to where, in whole events
   std::int64_t asked_us_ = -1;
   bool is_observer_heard_ = false;  ///< since the last request
   int num_unanswered_ = 0;
