@@ -29,8 +29,8 @@ struct Recording {
   /// What keeps a log from being whole, for people: "" if nothing does. What precedes it was read.
   std::string damage;
 
-  /// Samples that may be learned from, as the structure learner does: TRAIN and PROBE. A CSV has
-  /// TRAIN only.
+  /// Samples that are learned from, as the structure learner does: TRAIN and PROBE of the retained
+  /// set (retained_samples.h). A CSV has TRAIN only.
   std::vector<ActionPoseSample> training() const;
 };
 
