@@ -576,6 +576,14 @@ std::string check(const body_schema_t& message) {
                check.constant("reason", part.reason, unconnected_part_t::REASON_NO_VALID_MODEL);
                check.text("detail", part.detail, kMaxText);
              });
+  if (check.counted("undecided_signals", message.num_undecided, message.undecided_signals,
+                    kMaxSignals)) {
+    std::int64_t previous = -1;
+    for (const std::int32_t signal : message.undecided_signals) {
+      check.ascending("undecided_signals", signal, previous);
+      check.require(signal < message.num_signals, "undecided_signals", "is no index of signals");
+    }
+  }
   std::int64_t found = -1;
   check.each("changes", message.num_changes, message.changes, kMaxChanges,
              [&](const body_change_t& change) {

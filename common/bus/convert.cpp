@@ -300,6 +300,9 @@ body_schema_t to_message(const BodySchema& schema) {
     out.detail = part.detail;
   }
   set_array(message.num_unconnected, message.unconnected, std::move(unconnected));
+  set_array(
+      message.num_undecided, message.undecided_signals,
+      std::vector<std::int32_t>(schema.undecided_signals.begin(), schema.undecided_signals.end()));
   std::vector<body_change_t> changes;
   for (const KnownChange& change : schema.changes) {
     body_change_t& out = changes.emplace_back();
@@ -342,6 +345,8 @@ BodySchema from_message(const body_schema_t& message) {
     schema.unconnected.push_back(
         {part.unconnected_part, static_cast<Unconnected>(part.reason), part.detail});
   }
+  schema.undecided_signals.assign(message.undecided_signals.begin(),
+                                  message.undecided_signals.end());
   for (const body_change_t& change : message.changes)
     schema.changes.push_back({change.found_sample, change.since_sample});
   for (const moved_tag_t& tag : message.moved_tags)

@@ -175,6 +175,7 @@ bool BodySchema::has_part(int part) const {
 
 std::vector<int> BodySchema::unused_signals() const {
   std::vector<bool> used(signals.size(), false);
+  for (const int signal : undecided_signals) used.at(static_cast<std::size_t>(signal)) = true;
   for (const Edge& edge : edges)
     for (const int signal : edge.signals())
       if (signal >= 0 && signal < static_cast<int>(used.size())) used[signal] = true;

@@ -104,6 +104,9 @@ enum class Unconnected : std::int8_t {
   kNoValidModel = 2,   ///< enough data, and every model up to the largest k was refuted
 };
 
+/// Detail of a part that was alone: nothing can be said of how it moves.
+inline constexpr const char* kOnlyPart = "the only part that was seen: nothing to connect it with";
+
 struct UnconnectedPart {
   int part = 0;
   Unconnected reason = Unconnected::kNotEnoughData;
@@ -156,6 +159,8 @@ struct BodySchema {
   std::vector<Signal> signals;
   std::vector<Edge> edges;  ///< ordered from the root outwards; `from` is nearer to the root
   std::vector<UnconnectedPart> unconnected;
+  /// Signals of which the samples do not tell yet whether they move anything (indices, ascending).
+  std::vector<int> undecided_signals;
   Noise noise;
   std::vector<KnownChange> changes;  ///< of the body, the newest kMaxChanges, ascending by `found`
   static constexpr std::size_t kMaxChanges = 128;
@@ -167,7 +172,7 @@ struct BodySchema {
   std::int64_t body_since(std::int64_t sample_index) const;
   /// The moved tags as they were known after sample `sample_index`.
   std::vector<MovedTag> moved_tags_known(std::int64_t sample_index) const;
-  /// Signals that no edge uses (indices).
+  /// Signals that no edge uses, and none would: what is undecided is not among them (indices).
   std::vector<int> unused_signals() const;
 
   /// θ of every signal, in command units: what edges take.

@@ -20,6 +20,7 @@
 #include "common/bus/convert.h"
 #include "common/bus/event_log.h"
 #include "processes/console/hint.h"
+#include "common/schema/retained_samples.h"
 
 namespace bodyschema {
 namespace {
@@ -327,11 +328,10 @@ std::vector<Signal> observed_signals(const std::vector<ActionPoseSample>& sample
 }
 
 std::vector<ActionPoseSample> Recording::training() const {
-  std::vector<ActionPoseSample> result;
-  std::copy_if(samples.begin(), samples.end(), std::back_inserter(result),
-               [](const ActionPoseSample& sample) {
-                 return sample.purpose == Purpose::kTrain || sample.purpose == Purpose::kProbe;
-               });
+  std::vector<ActionPoseSample> result = retained(samples);
+  std::erase_if(result, [](const ActionPoseSample& sample) {
+    return sample.purpose != Purpose::kTrain && sample.purpose != Purpose::kProbe;
+  });
   return result;
 }
 

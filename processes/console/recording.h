@@ -31,8 +31,8 @@ struct Recording {
   /// Of a CSV, for people: what is read as it stands but looks like another unit or order.
   std::vector<std::string> hints;
 
-  /// Samples that may be learned from, as the structure learner does: TRAIN and PROBE. A CSV has
-  /// TRAIN only.
+  /// Samples that are learned from, as the structure learner does: TRAIN and PROBE of the retained
+  /// set (retained_samples.h). A CSV has TRAIN only.
   std::vector<ActionPoseSample> training() const;
 };
 

@@ -72,8 +72,8 @@ class Source {
   }
 
   /// What a page would be rewritten for: samples, versions, decisions, processes that come and go.
-  std::tuple<std::int64_t, std::size_t, std::size_t, std::size_t> state() const {
-    return {record_.watch().num_samples(), record_.versions().size(), record_.events().size(),
+  std::tuple<std::int64_t, std::int64_t, std::size_t, std::size_t> state() const {
+    return {record_.watch().num_samples(), record_.num_versions(), record_.events().size(),
             record_.faults().size() + record_.processes().size()};
   }
 

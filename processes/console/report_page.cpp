@@ -414,13 +414,18 @@ class Page {
                 escape_html(part.detail)});
     }
     html += lone.html();
-    std::string unused;
-    for (const int signal : schema.unused_signals()) {
-      unused += (unused.empty() ? "" : ", ") +
+    const auto names = [&](const std::vector<int>& signals) {
+      std::string text;
+      for (const int signal : signals) {
+        text += (text.empty() ? "" : ", ") +
                 escape_html(schema.signals.at(static_cast<std::size_t>(signal)).name);
-    }
-    if (!unused.empty())
+      }
+      return text;
+    };
+    if (const std::string unused = names(schema.unused_signals()); !unused.empty())
       html += fmt::format("<p>Signals that no edge depends on: {}.</p>\n", unused);
+    if (const std::string undecided = names(schema.undecided_signals); !undecided.empty())
+      html += fmt::format("<p>Signals whose effect is not told yet: {}.</p>\n", undecided);
     return html + "</section>\n";
   }
 
@@ -440,7 +445,7 @@ class Page {
               "ever learned: distance of the predicted from the {} origin of a part, relative to "
               "the root, median over the samples; against {}. {}A version is judged on the parts "
               "it connects, so a line may rise when a part is added.",
-              versions.size(), record_.versions().size(),
+              versions.size(), record_.num_versions(),
               counted(std::ssize(all), "held-out sample"),
               record_.watch().has_truth() ? "true" : "seen", judge(),
               marks.empty()

@@ -11,6 +11,8 @@ namespace {
 
 constexpr std::size_t kMostPoints = 800;
 constexpr std::size_t kMostPictures = 8;
+constexpr std::size_t kMostVersions = 256;
+constexpr std::size_t kMostEvents = 2000;
 
 template <class Message>
 std::optional<Message> read_as(const Channel<Message>& channel, const LogEvent& event) {
@@ -23,8 +25,17 @@ std::string name_of_fault(const std::string& fault) {
   return fault.ends_with(" so far") ? fault.substr(0, fault.rfind(", ")) : fault;
 }
 
-bool has(const std::map<std::int64_t, std::int64_t>& times, std::int64_t utime) {
-  return times.contains(utime);
+bool is_acceptance(const health_event_t& event) {
+  return event.event_kind == health_event_t::EVENT_SCHEMA_ACCEPTED;
+}
+
+void add(std::vector<RunRecord::Picture>* pictures, const RunRecord::Picture& picture) {
+  const auto has_more = [](const auto& a, const auto& b) {
+    return a.markers.num_markers > b.markers.num_markers;
+  };
+  pictures->insert(std::upper_bound(pictures->begin(), pictures->end(), picture, has_more),
+                   picture);
+  if (pictures->size() > kMostPictures) pictures->pop_back();
 }
 
 }  // namespace
@@ -54,11 +65,11 @@ void RunRecord::on_event(const LogEvent& event, const std::filesystem::path& fil
     note_receipt(-1);
     on_process_info(*info, event.event_utime);
   } else if (const auto image = read_as(kCameraImage, event)) {
-    image_places_.insert_or_assign(image->utime, Place{file, byte});
-    if (note_receipt(image->utime)) image_received_.try_emplace(image->utime, event.event_utime);
+    on_image(image->utime, {file, byte});
+    if (note_receipt(image->utime)) image_received_.insert(image->utime, event.event_utime);
   } else if (const auto markers = read_as(kMarkerPoses, event)) {
     if (note_receipt(markers->utime))
-      markers_received_.try_emplace(markers->utime, event.event_utime);
+      markers_received_.insert(markers->utime, event.event_utime);
     on_markers(*markers);
   } else if (const auto camera = read_as(kCameraInfo, event)) {
     note_receipt(camera->utime);
@@ -66,23 +77,22 @@ void RunRecord::on_event(const LogEvent& event, const std::filesystem::path& fil
   } else if (const auto sample = read_as(kSample, event)) {
     watch_.on_sample(*sample);
     if (!note_receipt(sample->utime)) return;
-    sample_received_.try_emplace(sample->utime, event.event_utime);
-    const auto action = actions_.find({sample->source, sample->epoch, sample->action_id});
-    if (action != actions_.end() && !action->second.sampled)
-      action->second.sampled = event.event_utime;
+    sample_received_.insert(sample->utime, event.event_utime);
+    Action* action = action_of({sample->source, sample->epoch, sample->action_id});
+    if (action != nullptr && !action->sampled) action->sampled = event.event_utime;
   } else if (const auto command = read_as(kActionCommand, event)) {
     note_receipt(command->utime);
     if (command->kind == action_command_t::KIND_MOVE) {
-      actions_.try_emplace({command->source, command->epoch, command->action_id},
-                           Action{.sent = event.event_utime});
+      const ActionKey key{command->source, command->epoch, command->action_id};
+      actions_.insert(hash_of(key), {.key = key, .sent = event.event_utime});
     }
   } else if (const auto status = read_as(kMotionStatus, event)) {
     note_receipt(status->utime);
-    const auto action = actions_.find({status->source, status->epoch, status->action_id});
-    if (action == actions_.end()) return;
-    if (!action->second.answered) action->second.answered = event.event_utime;
-    if (!action->second.settled && status->state == motion_status_t::STATE_SETTLED)
-      action->second.settled = event.event_utime;
+    Action* action = action_of({status->source, status->epoch, status->action_id});
+    if (action == nullptr) return;
+    if (!action->answered) action->answered = event.event_utime;
+    if (!action->settled && status->state == motion_status_t::STATE_SETTLED)
+      action->settled = event.event_utime;
   } else if (const auto state = read_as(kSimState, event)) {
     note_receipt(state->utime);
     watch_.on_sim_state(*state);
@@ -96,7 +106,7 @@ void RunRecord::on_event(const LogEvent& event, const std::filesystem::path& fil
   } else if (const auto schema = read_as(kBodySchema, event)) {
     note_receipt(schema->utime);
     watch_.on_body_schema(*schema);
-    versions_.try_emplace(schema->schema_version, from_message(*schema));
+    on_version(*schema);
   } else if (const auto proposal = read_as(kLearnedSchema, event)) {
     note_receipt(proposal->utime);
     learned_ = from_message(*proposal);
@@ -104,10 +114,60 @@ void RunRecord::on_event(const LogEvent& event, const std::filesystem::path& fil
     note_receipt(health->utime);
     watch_.on_model_health(*health);
     health_ = health;
-    // After a restart of the monitor the numbers begin again.
-    for (const health_event_t& item : health->events)
-      events_.try_emplace({item.event_sample, item.event_number, item.event_text}, item);
+    for (const health_event_t& item : health->events) on_health_event(item);
   }
+}
+
+std::int64_t RunRecord::hash_of(const ActionKey& key) {
+  const auto& [source, epoch, action_id] = key;
+  return static_cast<std::int64_t>(std::hash<std::string>()(source)) ^ (epoch << 20) ^ action_id;
+}
+
+RunRecord::Action* RunRecord::action_of(const ActionKey& key) {
+  Action* action = actions_.find(hash_of(key));
+  return action != nullptr && action->key == key ? action : nullptr;
+}
+
+void RunRecord::on_version(const body_schema_t& schema) {
+  if (!versions_.try_emplace(schema.schema_version, from_message(schema)).second) return;
+  ++num_versions_;
+  if (versions_.size() <= kMostVersions) return;
+  // Every other one goes, but for the first and the last of each body.
+  const auto body_of = [](const auto& version) { return version->second.changes.size(); };
+  bool is_kept = true;
+  for (auto version = std::next(versions_.begin()); std::next(version) != versions_.end();) {
+    is_kept = !is_kept || body_of(version) != body_of(std::prev(version)) ||
+              body_of(version) != body_of(std::next(version));
+    version = is_kept ? std::next(version) : versions_.erase(version);
+  }
+  if (versions_.size() > kMostVersions) versions_.erase(versions_.begin());
+}
+
+void RunRecord::on_health_event(const health_event_t& event) {
+  // After a restart of the monitor the numbers begin again.
+  const auto [added, is_new] =
+      events_.try_emplace({event.event_sample, event.event_number, event.event_text}, event);
+  if (!is_new) return;
+  // Of acceptances in a row the newest says it all.
+  if (is_acceptance(event)) {
+    const auto next = std::next(added);
+    if (added != events_.begin() && is_acceptance(std::prev(added)->second))
+      events_.erase(std::prev(added));
+    if (next != events_.end() && is_acceptance(next->second)) events_.erase(added);
+  }
+  if (events_.size() > kMostEvents) events_.erase(events_.begin());
+}
+
+void RunRecord::on_image(std::int64_t utime, const Place& place) {
+  const auto awaited =
+      std::find_if(awaited_.begin(), awaited_.end(),
+                   [&](const Picture& picture) { return picture.markers.utime == utime; });
+  if (awaited == awaited_.end()) {
+    image_places_.insert(utime, place);
+    return;
+  }
+  add(&pictures_, {awaited->markers, place});
+  awaited_.erase(awaited);
 }
 
 void RunRecord::on_process_info(const process_info_t& info, std::int64_t received_us) {
@@ -136,27 +196,19 @@ void RunRecord::on_process_info(const process_info_t& info, std::int64_t receive
 }
 
 void RunRecord::on_markers(const marker_poses_t& markers) {
-  const auto has_more = [](const marker_poses_t& a, const marker_poses_t& b) {
-    return a.num_markers > b.num_markers;
-  };
   if (markers.num_markers == 0) return;
-  for (const marker_poses_t& kept : best_markers_) {
-    if (kept.utime == markers.utime) return;
+  for (const auto* known : {&pictures_, &awaited_}) {
+    for (const Picture& picture : *known)
+      if (picture.markers.utime == markers.utime) return;
   }
-  best_markers_.insert(
-      std::upper_bound(best_markers_.begin(), best_markers_.end(), markers, has_more), markers);
-  if (best_markers_.size() > kMostPictures) best_markers_.pop_back();
+  const Place* place = image_places_.find(markers.utime);
+  add(place != nullptr ? &pictures_ : &awaited_,
+      {markers, place != nullptr ? *place : Place{}});
 }
 
 std::vector<health_event_t> RunRecord::events() const {
   std::vector<health_event_t> result;
-  const auto is_acceptance = [](const health_event_t& event) {
-    return event.event_kind == health_event_t::EVENT_SCHEMA_ACCEPTED;
-  };
-  for (const auto& [key, event] : events_) {
-    if (!result.empty() && is_acceptance(result.back()) && is_acceptance(event)) result.pop_back();
-    result.push_back(event);
-  }
+  for (const auto& [key, event] : events_) result.push_back(event);
   return result;
 }
 
@@ -174,8 +226,8 @@ std::vector<RunRecord::Latency> RunRecord::latencies() const {
     latency.seconds.push_back(static_cast<double>(to - from) * 1e-6);
   };
   for (const auto& [utime, received] : image_received_) {
-    if (has(markers_received_, utime)) add(seen, received, markers_received_.at(utime));
-    if (has(sample_received_, utime)) add(sampled, received, sample_received_.at(utime));
+    if (const auto* markers = markers_received_.find(utime)) add(seen, received, *markers);
+    if (const auto* sample = sample_received_.find(utime)) add(sampled, received, *sample);
   }
   for (const auto& [key, action] : actions_) {
     if (action.answered) add(answered, action.sent, *action.answered);
@@ -190,14 +242,5 @@ std::vector<RunRecord::Latency> RunRecord::latencies() const {
 }
 
 double RunRecord::duration_s() const { return seconds(end_us_); }
-
-std::vector<RunRecord::Picture> RunRecord::pictures() const {
-  std::vector<Picture> result;
-  for (const marker_poses_t& markers : best_markers_) {
-    const auto place = image_places_.find(markers.utime);
-    if (place != image_places_.end()) result.push_back({markers, place->second});
-  }
-  return result;
-}
 
 }  // namespace bodyschema

@@ -11,11 +11,12 @@
 
 #include "common/bus/event_log.h"
 #include "processes/console/run_watch.h"
+#include "processes/console/thinned_map.h"
 
 namespace bodyschema {
 
-/// What the logs of a run say, kept so that it can be told at any time. Bounded memory but for the
-/// samples: of images only their places are kept, long series are thinned.
+/// What the logs of a run say, kept so that it can be told at any time. Memory is bounded: of images
+/// only their places are kept, long series are thinned.
 class RunRecord {
  public:
   /// One event of any log of the run, in any order of files; what cannot be decoded or is of
@@ -51,8 +52,10 @@ class RunRecord {
   const RunWatch& watch() const { return watch_; }
   /// The newest proposal of the learner.
   const std::optional<BodySchema>& learned() const { return learned_; }
-  /// Every version of the body schema, ascending.
+  /// Versions of the body schema, ascending: every one, or of many an even choice with the first and
+  /// the last of each body.
   const std::map<std::int64_t, BodySchema>& versions() const { return versions_; }
+  std::int64_t num_versions() const { return num_versions_; }
   const std::optional<model_health_t>& health() const { return health_; }
   /// What the monitor decided, in order; of acceptances in a row the newest.
   std::vector<health_event_t> events() const;
@@ -71,24 +74,31 @@ class RunRecord {
     marker_poses_t markers;
     Place image;
   };
-  std::vector<Picture> pictures() const;
+  const std::vector<Picture>& pictures() const { return pictures_; }
   const std::optional<camera_info_t>& camera_info() const { return camera_info_; }
 
  private:
   using ActionKey = std::tuple<std::string, std::int64_t, std::int64_t>;
   /// Event times [us].
   struct Action {
+    ActionKey key;
     std::int64_t sent = 0;
     std::optional<std::int64_t> answered = {}, settled = {}, sampled = {};
   };
 
+  void on_version(const body_schema_t& schema);
+  void on_health_event(const health_event_t& event);
+  static std::int64_t hash_of(const ActionKey& key);
+  Action* action_of(const ActionKey& key);
   void on_process_info(const process_info_t& info, std::int64_t received_us);
+  void on_image(std::int64_t utime, const Place& place);
   void on_markers(const marker_poses_t& markers);
   double seconds(std::int64_t received_us) const;
 
   RunWatch watch_;
   std::optional<BodySchema> learned_;
   std::map<std::int64_t, BodySchema> versions_;
+  std::int64_t num_versions_ = 0;
   std::optional<model_health_t> health_;
   std::map<std::tuple<std::int64_t, std::int64_t, std::string>, health_event_t> events_;
   struct Track {
@@ -98,10 +108,11 @@ class RunRecord {
   };
   std::map<std::tuple<std::string, std::string, std::int32_t>, Track> tracks_;
   std::vector<FaultChange> faults_;
-  std::map<ActionKey, Action> actions_;
-  std::map<std::int64_t, std::int64_t> image_received_, markers_received_, sample_received_;
-  std::map<std::int64_t, Place> image_places_;
-  std::vector<marker_poses_t> best_markers_;  ///< most markers first
+  ThinnedMap<Action> actions_;  ///< by a hash of the key
+  ThinnedMap<std::int64_t> image_received_, markers_received_, sample_received_;
+  ThinnedMap<Place> image_places_;
+  std::vector<Picture> pictures_;
+  std::vector<Picture> awaited_;  ///< the same of frames whose image was not read so far
   std::optional<camera_info_t> camera_info_;
   std::optional<std::int64_t> begin_us_;
   std::int64_t end_us_ = 0;

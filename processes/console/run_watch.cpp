@@ -28,9 +28,28 @@ std::string last_words(const std::string& log, const std::string& process) {
 }
 
 void RunWatch::on_sample(const sample_t& message) {
-  if (!samples_.empty() && message.sample_index <= samples_.back().sample_index) return;
-  samples_.push_back(from_message(message));
-  action_ids_.push_back(message.action_id);
+  if (num_samples_ > 0 && message.sample_index <= last_index_) return;
+  if (num_samples_++ == 0) first_index_ = message.sample_index;
+  last_index_ = message.sample_index;
+  auto sample = std::make_shared<const ActionPoseSample>(from_message(message));
+  for (const PartObservation& part : sample->parts) ++num_seen_[part.part];
+  if (sample->purpose == Purpose::kTest) {
+    last_test_index_ = last_index_;
+    action_ids_[last_index_] = message.action_id;
+  }
+  samples_.add(std::move(sample));
+  if (action_ids_.size() > most_truths_) forget_truths();
+}
+
+SharedSamples RunWatch::retained_since(std::int64_t first) const {
+  if (num_samples_ == 0) return {};
+  return samples_.between(std::max(first, first_index_), last_index_);
+}
+
+std::vector<ActionPoseSample> RunWatch::samples() const {
+  std::vector<ActionPoseSample> result;
+  for (const auto& sample : retained_since(0)) result.push_back(*sample);
+  return result;
 }
 
 void RunWatch::on_body_schema(const body_schema_t& schema) { schema_ = from_message(schema); }
@@ -44,14 +63,39 @@ void RunWatch::on_model_health(const model_health_t& health) { health_ = health;
 
 void RunWatch::on_sim_state(const sim_state_t& state) {
   const Pose X_CW = from_message(state.X_WC).inverse();
-  std::vector<PartObservation> parts;
-  for (std::size_t i = 0; i < state.true_part.size(); ++i) {
-    PartObservation part;
-    part.part = state.true_part[i];
-    part.X_CB = X_CW * from_message(state.X_WB[i]);
-    parts.push_back(part);
-  }
-  truth_[state.utime] = {state.action_id, std::move(parts)};
+  Truth truth{state.action_id, {}};
+  for (std::size_t i = 0; i < state.true_part.size(); ++i)
+    truth.parts.emplace_back(state.true_part[i], X_CW * from_message(state.X_WB[i]));
+  truth_[state.utime] = std::move(truth);
+  if (truth_.size() > most_truths_) forget_truths();
+}
+
+const RunWatch::Truth* RunWatch::truth_of(const ActionPoseSample& sample) const {
+  // Ids count within their source, so the time decides: the newest state before the sample's last
+  // frame.
+  const auto after = truth_.upper_bound(sample.utime);
+  const auto action_id = action_ids_.find(sample.sample_index);
+  if (after == truth_.begin() || action_id == action_ids_.end()) return nullptr;
+  const Truth& truth = std::prev(after)->second;
+  return truth.action_id == action_id->second ? &truth : nullptr;
+}
+
+void RunWatch::forget_truths() {
+  std::set<const Truth*> needed;
+  std::map<std::int64_t, std::int64_t> action_ids;
+  std::int64_t newest_utime = 0;
+  samples_.for_each([&](const ActionPoseSample& sample) {
+    newest_utime = std::max(newest_utime, sample.utime);
+    if (const auto id = action_ids_.find(sample.sample_index); id != action_ids_.end())
+      action_ids.insert(*id);
+    if (const Truth* truth = truth_of(sample)) needed.insert(truth);
+  });
+  action_ids_ = std::move(action_ids);
+  std::erase_if(truth_, [&](const auto& entry) {
+    return entry.first <= newest_utime && !needed.count(&entry.second);
+  });
+  // So that each of them costs the same, however many stay.
+  most_truths_ = std::max(most_truths_, 2 * std::max(truth_.size(), action_ids_.size()));
 }
 
 void RunWatch::on_process_info(const process_info_t& info, std::int64_t now_us) {
@@ -63,27 +107,21 @@ bool RunWatch::is_finished() const {
   if (babbler == processes_.end() || babbler->second.info.phase != process_info_t::PHASE_DONE) {
     return false;
   }
-  return !samples_.empty() && is_judged();
+  return num_samples_ > 0 && is_judged();
 }
 
 bool RunWatch::is_caught_up() const {
-  return !samples_.empty() && learned_sample_ >= samples_.back().sample_index && is_judged();
+  return num_samples_ > 0 && learned_sample_ >= last_index_ && is_judged();
 }
 
 bool RunWatch::is_judged() const {
-  const auto last_test =
-      std::find_if(samples_.rbegin(), samples_.rend(),
-                   [](const ActionPoseSample& sample) { return sample.purpose == Purpose::kTest; });
-  if (last_test == samples_.rend()) return true;
-  return health_ && health_->judged_sample >= last_test->sample_index;
+  return last_test_index_ < 0 || (health_ && health_->judged_sample >= last_test_index_);
 }
 
 std::map<int, double> RunWatch::visibility() const {
   std::map<int, double> seen;
-  for (const ActionPoseSample& sample : samples_) {
-    for (const PartObservation& part : sample.parts) ++seen[part.part];
-  }
-  for (auto& [part, share] : seen) share /= static_cast<double>(samples_.size());
+  for (const auto& [part, count] : num_seen_)
+    seen[part] = static_cast<double>(count) / static_cast<double>(num_samples_);
   return seen;
 }
 
@@ -180,17 +218,15 @@ std::int64_t RunWatch::body_since() const {
 
 std::vector<ActionPoseSample> RunWatch::held_out(std::int64_t since) const {
   std::vector<ActionPoseSample> result;
-  for (std::size_t i = 0; i < samples_.size(); ++i) {
-    if (samples_[i].purpose != Purpose::kTest || samples_[i].sample_index < since) continue;
-    ActionPoseSample sample = samples_[i];
+  for (const auto& retained : retained_since(since)) {
+    if (retained->purpose != Purpose::kTest) continue;
+    ActionPoseSample sample = *retained;
     if (has_truth()) {
-      // Ids count within their source, so the time decides: the newest state before the sample's
-      // last frame.
-      const auto after = truth_.upper_bound(sample.utime);
-      if (after == truth_.begin()) continue;
-      const Truth& truth = std::prev(after)->second;
-      if (truth.action_id != action_ids_[i]) continue;
-      sample.parts = truth.parts;
+      const Truth* truth = truth_of(sample);
+      if (truth == nullptr) continue;
+      sample.parts.clear();
+      for (const auto& [part, X_CB] : truth->parts)
+        sample.parts.push_back({.part = part, .X_CB = X_CB});
     }
     result.push_back(std::move(sample));
   }

@@ -11,7 +11,7 @@
 
 #include "common/bus/channels.h"
 #include "common/schema/body_schema.h"
-#include "common/schema/sample.h"
+#include "common/schema/retained_samples.h"
 
 namespace bodyschema {
 
@@ -37,7 +37,8 @@ struct SampleGoal {
 };
 
 /// Follows a learning run from outside and sums it up. It alone compares the schema with the
-/// simulator's truth, and tells nobody.
+/// simulator's truth, and tells nobody. Memory is bounded: of the samples it keeps the retained set,
+/// as the learner does.
 class RunWatch {
  public:
   void on_sample(const sample_t& sample);
@@ -52,7 +53,7 @@ class RunWatch {
   bool is_finished() const;
   /// The same for a replay that gives no further sample: all of them are learned from and judged.
   bool is_caught_up() const;
-  std::int64_t num_samples() const { return static_cast<std::int64_t>(samples_.size()); }
+  std::int64_t num_samples() const { return num_samples_; }
   /// sample_index up to which the newest proposal goes; -1 before the first.
   std::int64_t learned_sample() const { return learned_sample_; }
 
@@ -72,37 +73,48 @@ class RunWatch {
 
   const std::optional<BodySchema>& schema() const { return schema_; }
   const std::optional<model_health_t>& health() const { return health_; }
-  /// All samples so far, TEST included.
-  const std::vector<ActionPoseSample>& samples() const { return samples_; }
-  /// The TEST samples from `since` on: with the noise-free poses of the simulator where there is
+  /// The retained samples, TEST included.
+  std::vector<ActionPoseSample> samples() const;
+  /// The TEST samples among those retained of the ones from `since` on: with the noise-free poses
+  /// of the simulator where there is
   /// one, else as the camera saw them.
   std::vector<ActionPoseSample> held_out(std::int64_t since = 0) const;
   /// First sample of the body as it is now, as far as the monitor knows; 0: it never changed.
   std::int64_t body_since() const;
   bool has_truth() const { return !truth_.empty(); }
-  /// Share of the samples in which each part was seen.
+  /// Share of all samples in which each part was seen.
   std::map<int, double> visibility() const;
 
  private:
   /// The monitor judges at TEST samples; there need not have been one.
   bool is_judged() const;
 
+  struct Truth {
+    std::int64_t action_id = 0;
+    std::vector<std::pair<int, Pose>> parts;  ///< noise-free poses in the camera's frame
+  };
   struct Heard {
     process_info_t info;
     std::int64_t at_us = 0;
   };
 
-  std::vector<ActionPoseSample> samples_;
-  std::vector<std::int64_t> action_ids_;  ///< of samples_
+  SharedSamples retained_since(std::int64_t first) const;
+  /// The truth of a TEST sample; nullptr where it was not heard.
+  const Truth* truth_of(const ActionPoseSample& sample) const;
+  void forget_truths();
+
+  RetainedSamples samples_;
+  std::int64_t num_samples_ = 0;
+  std::int64_t first_index_ = 0, last_index_ = -1;
+  std::int64_t last_test_index_ = -1;
+  std::map<int, std::int64_t> num_seen_;             ///< part → samples that show it
+  std::map<std::int64_t, std::int64_t> action_ids_;  ///< of TEST samples, by index
   std::optional<BodySchema> schema_;
   std::int64_t learned_sample_ = -1;
   std::vector<unconnected_part_t> unconnected_;  ///< of the newest proposal
   std::optional<model_health_t> health_;
-  struct Truth {
-    std::int64_t action_id = 0;
-    std::vector<PartObservation> parts;  ///< noise-free poses in the camera's frame
-  };
   std::map<std::int64_t, Truth> truth_;  ///< by the time at which the arm came to rest
+  std::size_t most_truths_ = 4000;       ///< then those that nothing needs any more go
   std::map<std::string, Heard> processes_;
 };
 

@@ -106,6 +106,7 @@ ordered_json structure_json(const BodySchema& schema, const std::vector<Outlier>
                        {"edges", ordered_json::array()},
                        {"unconnected", ordered_json::array()},
                        {"unused_signals", signal_names(schema, schema.unused_signals())},
+                       {"undecided_signals", signal_names(schema, schema.undecided_signals)},
                        {"outliers", ordered_json::array()},
                        {"noise",
                         {{"position_m", schema.noise.position_m},
@@ -198,6 +199,9 @@ std::string structure_text(const BodySchema& schema, std::optional<NoiseSource> 
                         schema.noise.position_m * 1e3, schema.noise.rotation_rad * kDegrees,
                         source ? std::string(", ") + name_of(*source).second : "");
   }
+  const auto undecided = signal_names(schema, schema.undecided_signals);
+  if (!undecided.empty())
+    text += fmt::format("  signals whose effect is not told yet: {}\n", fmt::join(undecided, ", "));
   return text;
 }
 

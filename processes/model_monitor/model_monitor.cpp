@@ -95,6 +95,14 @@ ModelMonitor::ModelMonitor(ModelMonitorConfig config) : config_(config) {
   }
 }
 
+std::int64_t ModelMonitor::Tally::up_to(std::int64_t judged_sample) {
+  while (!later.empty() && later.front() <= judged_sample) {
+    later.pop_front();
+    ++num_judged;
+  }
+  return num_judged;
+}
+
 void ModelMonitor::Standing::add(health_event_t event) {
   event.event_number = num_events++;
   // A healthy body's schema is replaced again and again: of those the newest says it all.
@@ -167,10 +175,10 @@ void ModelMonitor::restore(const MonitorMemory& memory) {
 bool ModelMonitor::on_sample(const sample_t& message) {
   if (message.sample_index <= last_sample_index_) return false;
   last_sample_index_ = message.sample_index;
-  for (const auto& part : message.parts) seen_in_[part.part_id].push_back(message.sample_index);
+  for (const auto& part : message.parts) seen_in_[part.part_id].later.push_back(message.sample_index);
   ActionPoseSample sample = from_message(message);
   if (sample.purpose == Purpose::kTest) {
-    test_indices_.push_back(sample.sample_index);
+    test_indices_.later.push_back(sample.sample_index);
     tests_.push_back(sample);
     if (tests_.size() > 2 * kTests) tests_.pop_front();
   }
@@ -213,11 +221,11 @@ bool ModelMonitor::on_learned_schema(const body_schema_t& proposal) {
 }
 
 std::int64_t ModelMonitor::num_tests(std::int64_t last) const {
-  return std::upper_bound(test_indices_.begin(), test_indices_.end(), last) - test_indices_.begin();
+  return test_indices_.up_to(last);
 }
 
 bool ModelMonitor::is_test(std::int64_t sample_index) const {
-  return std::binary_search(test_indices_.begin(), test_indices_.end(), sample_index);
+  return std::binary_search(test_indices_.later.begin(), test_indices_.later.end(), sample_index);
 }
 
 std::vector<const ActionPoseSample*> ModelMonitor::tests_between(std::int64_t first,
@@ -536,9 +544,8 @@ void ModelMonitor::assess(const BodySchema& schema) const {
 
   const auto tests = tests_between(0, judged_sample_);
   std::vector<part_health_t> parts;
-  for (const auto& [part, indices] : seen_in_) {
-    const auto num_seen =
-        std::upper_bound(indices.begin(), indices.end(), judged_sample_) - indices.begin();
+  for (auto& [part, indices] : seen_in_) {
+    const std::int64_t num_seen = indices.up_to(judged_sample_);
     std::vector<double> position_errors, rotation_errors;
     const auto path = KinematicPath::between(schema, schema.root, part);
     const std::int64_t since =

@@ -138,10 +138,17 @@ class ModelMonitor {
 
   const ModelMonitorConfig config_;
   AdaptationOptions options_;
-  std::vector<std::int64_t> test_indices_;  ///< of all TEST samples
+  /// Indices of samples, of which those up to the judged one are only counted.
+  struct Tally {
+    std::int64_t num_judged = 0;
+    std::deque<std::int64_t> later;
+
+    std::int64_t up_to(std::int64_t judged_sample);
+  };
+  mutable Tally test_indices_;  ///< of TEST samples
   std::deque<ActionPoseSample> tests_;      ///< the newest
   std::deque<ActionPoseSample> samples_;    ///< the newest, back to where anything may begin again
-  std::map<int, std::vector<std::int64_t>> seen_in_;  ///< part → indices of samples that show it
+  mutable std::map<int, Tally> seen_in_;    ///< part → samples that show it
   std::int64_t last_sample_index_ = -1;
   std::int64_t judged_sample_ = -1;
   std::int64_t judged_utime_ = 0;

@@ -25,7 +25,7 @@ int main(int argc, char** argv) {
     Bus& bus = process.bus();
     SampleOutbox outbox(samples_file,
                         [&](const sample_t& sample) { bus.publish(kSample, sample); });
-    observer.restore(outbox.recorded());
+    outbox.for_each_recorded([&](const sample_t& sample) { observer.restore(sample); });
     const auto send = [&](const std::optional<sample_t>& sample) {
       if (sample) outbox.send(*sample);
     };

@@ -15,6 +15,8 @@ namespace {
 
 constexpr std::int64_t kNotEnded = std::numeric_limits<std::int64_t>::max();
 constexpr std::size_t kMaxRests = 16;
+/// Actions that are known to have their sample; MOTION_STATUS repeats the last one alone.
+constexpr std::size_t kMaxDone = 64;
 /// Frames and the driver's statuses of one clock are never so far apart.
 constexpr std::int64_t kMaxApartUs = 10'000'000;
 constexpr double kDegree = M_PI / 180;
@@ -50,11 +52,14 @@ ObserverConfig ObserverConfig::load(const std::filesystem::path& file) {
 Observer::Observer(const ObserverConfig& config, Markers markers)
     : config_(config), markers_(std::move(markers)) {}
 
-void Observer::restore(const std::vector<sample_t>& samples) {
-  for (const sample_t& sample : samples) {
-    done_.emplace(sample.source, sample.epoch, sample.action_id);
-    next_index_ = std::max(next_index_, sample.sample_index + 1);
-  }
+void Observer::restore(const sample_t& sample) {
+  remember({sample.source, sample.epoch, sample.action_id});
+  next_index_ = std::max(next_index_, sample.sample_index + 1);
+}
+
+void Observer::remember(ActionKey done) {
+  done_.push_back(std::move(done));
+  if (done_.size() > kMaxDone) done_.pop_front();
 }
 
 Observer::ActionKey Observer::key_of(const motion_status_t& status) {
@@ -120,7 +125,8 @@ std::optional<sample_t> Observer::on_motion_status(const motion_status_t& status
   const bool is_settled_move = status.state == motion_status_t::STATE_SETTLED &&
                                status.kind == action_command_t::KIND_MOVE &&
                                status.rest_since_utime >= 0 && !status.commanded.empty();
-  if (is_settled_move && !done_.count(key_of(status))) {
+  if (is_settled_move && 
+      std::find(done_.begin(), done_.end(), key_of(status)) == done_.end()) {
     const auto same = std::find_if(rests_.begin(), rests_.end(), [&](const Rest& rest) {
       return key_of(rest.status) == key_of(status);
     });
@@ -158,7 +164,7 @@ std::optional<sample_t> Observer::make_sample() {
     // Those before it were overtaken; nothing more will be seen of them.
     counters_["action never seen"] += rest - rests_.begin();
     rests_.erase(rests_.begin(), rest + 1);
-    done_.insert(key_of(complete.status));
+    remember(key_of(complete.status));
     return sample_from(complete, frames);
   }
   return std::nullopt;

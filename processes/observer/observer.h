@@ -49,8 +49,8 @@ class Observer {
  public:
   Observer(const ObserverConfig& config, Markers markers);
 
-  /// Continues after samples of earlier runs, in the order of their indices.
-  void restore(const std::vector<sample_t>& samples);
+  /// Continues after a sample of an earlier run; called for each, in the order of their indices.
+  void restore(const sample_t& sample);
 
   std::optional<sample_t> on_marker_poses(const marker_poses_t& poses);
   std::optional<sample_t> on_motion_status(const motion_status_t& status);
@@ -87,7 +87,9 @@ class Observer {
   std::optional<Lens> lens_;
   std::map<std::int64_t, marker_poses_t> frames_;  // by utime
   std::deque<Rest> rests_;                         // oldest first
-  std::set<ActionKey> done_;
+  void remember(ActionKey done);
+
+  std::deque<ActionKey> done_;  ///< the newest: a driver repeats its last action
   std::int64_t next_index_ = 0;
   std::int64_t driver_utime_ = -1;
   std::map<std::string, std::int64_t> counters_;

@@ -70,13 +70,15 @@ void SampleOutbox::open() {
   }
 }
 
-std::vector<sample_t> SampleOutbox::recorded() const {
-  if (!log_) return {};
-  std::vector<sample_t> samples = read_log(file_, kSample);
-  std::stable_sort(samples.begin(), samples.end(), [](const sample_t& a, const sample_t& b) {
-    return a.sample_index < b.sample_index;
-  });
-  return samples;
+void SampleOutbox::for_each_recorded(const std::function<void(const sample_t&)>& visit) const {
+  if (!log_) return;
+  LogReader reader(file_);
+  for (const auto& [index, position] : positions_) {
+    if (reader.position() != position) reader.seek(position);
+    if (!reader.next()) continue;
+    const auto& data = reader.event().data;
+    if (const auto sample = decode<sample_t>(data.data(), data.size()).message) visit(*sample);
+  }
 }
 
 void SampleOutbox::send(const sample_t& sample) {

@@ -30,8 +30,8 @@ class SampleOutbox {
   /// @throws std::runtime_error if the file cannot be opened or another process writes it.
   SampleOutbox(std::filesystem::path file, Publish publish);
 
-  /// What the file held at the start, in order of the indices.
-  std::vector<sample_t> recorded() const;
+  /// What the file held at the start, in order of the indices, one at a time.
+  void for_each_recorded(const std::function<void(const sample_t&)>& visit) const;
 
   void send(const sample_t& sample);
   void on_request(const sample_request_t& request);

@@ -347,7 +347,7 @@ class OutlierAttribution {
 
 // Why `part` is not connected to the root's component.
 UnconnectedPart explain(int part, int num_seen, const std::set<int>& connected,
-                        const SearchResult& search, int max_signals) {
+                        const LearnedStructure& structure, int max_signals) {
   UnconnectedPart result;
   result.part = part;
   if (num_seen == 0) {
@@ -357,11 +357,13 @@ UnconnectedPart explain(int part, int num_seen, const std::set<int>& connected,
   }
   int common = 0, partner = -1;
   bool undecided = false, was_soft_tried = false;
-  for (const auto& [pair, record] : search.records) {
+  std::set<int> untold;
+  for (const auto& [pair, record] : structure.search.records) {
     if (pair.first != part && pair.second != part) continue;
     const int other = pair.first == part ? pair.second : pair.first;
     if (!connected.count(other)) continue;
     undecided |= !record.undecided.empty();
+    untold.insert(record.untold_signals.begin(), record.untold_signals.end());
     was_soft_tried |= record.was_soft_tried;
     if (record.num_common > common) {
       common = record.num_common;
@@ -376,11 +378,34 @@ UnconnectedPart explain(int part, int num_seen, const std::set<int>& connected,
   if (undecided || 6 * common < 5 * parameters) {
     result.reason = Unconnected::kNotEnoughData;
     result.detail = seen + "; more samples are needed to trust a model";
+    for (const int s : untold) {
+      const char* before = s == *untold.begin() ? ": too few yet to tell what moves with " : ", ";
+      result.detail += before + structure.signals[static_cast<std::size_t>(s)].name;
+    }
   } else {
     result.reason = Unconnected::kNoValidModel;
     result.detail = seen + "; no model with up to " + std::to_string(max_signals) +
                     " signals is valid to any connected part" +
                     (was_soft_tried ? ", nor any with a Gaussian process beside its joints" : "");
+  }
+  return result;
+}
+
+// Signals that no edge uses although one may have to: they moved too little for a joint of
+// kLeastTurn (over their limits, where these are known) to show, or a part waits for its edge.
+std::vector<int> undecided_signals(const BodySchema& schema, const LearnedStructure& structure) {
+  std::vector<int> result;
+  for (const int s : schema.unused_signals()) {
+    const auto information = structure.search.joint_information.find(s);
+    if (schema.complete && information != structure.search.joint_information.end()) {
+      const Signal& signal = schema.signals[static_cast<std::size_t>(s)];
+      const double range = signal.upper - signal.lower;
+      const double share =
+          range > 0 ? std::min(1.0, 2 * structure.actions.half_range(s) / range) : 1;
+      const double turn = share * kLeastTurn;
+      if (turn * turn * information->second >= kNoticed) continue;
+    }
+    result.push_back(s);
   }
   return result;
 }
@@ -483,13 +508,18 @@ LearnResult fit_tree(const LearnedStructure& structure,
     if (connected_to_root.count(part)) continue;
     const auto seen = num_seen.find(part);
     schema.unconnected.push_back(explain(part, seen == num_seen.end() ? 0 : seen->second,
-                                         connected_to_root, search, options.max_signals));
+                                         connected_to_root, structure, options.max_signals));
   }
+  if (schema.parts.size() == 1 && connected_to_root.count(schema.parts.front()))
+    schema.unconnected.push_back({schema.parts.front(), Unconnected::kNotEnoughData,
+                                  kOnlyPart});
   // A part that was never seen is reported, but a tree over all the others is complete (Fig. 8,
   // 11).
-  schema.complete = !schema.parts.empty() &&
+  schema.complete = schema.parts.size() > 1 &&
                     std::all_of(schema.parts.begin(), schema.parts.end(),
                                 [&](int part) { return connected_to_root.count(part) > 0; });
+
+  schema.undecided_signals = undecided_signals(schema, structure);
 
   result.outliers = OutlierAttribution(schema, fitted, samples, measurement).run();
   return result;

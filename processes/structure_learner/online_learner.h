@@ -5,12 +5,10 @@
 #include <mutex>
 #include <vector>
 
+#include "common/schema/retained_samples.h"
 #include "processes/structure_learner/learn.h"
 
 namespace bodyschema {
-
-/// The samples so far, of which later ones take nothing away.
-using SharedSamples = std::vector<std::shared_ptr<const ActionPoseSample>>;
 
 /// learn() for samples that come one by one: what a new sample costs does not grow with their
 /// number.

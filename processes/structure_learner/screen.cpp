@@ -638,7 +638,7 @@ Start one_joint_start(const ScrewRegression& regression, const PairData& pair,
   return n > 0 ? judged(best.model, pair, actions) : best;
 }
 
-std::vector<double> default_turns() { return {0.3, 0.55, 0.9, 1.4, 2.0, 2.8}; }
+std::vector<double> default_turns() { return {kLeastTurn, 0.55, 0.9, 1.4, 2.0, 2.8}; }
 
 std::vector<Start> screen_two_joints(const PairData& pair, const NormalizedActions& actions,
                                      const RelativeMotions& motions,

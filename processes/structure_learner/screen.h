@@ -66,7 +66,10 @@ std::vector<Start> screen_two_joints(const PairData& pair, const NormalizedActio
                                      const RelativeMotions& motions,
                                      const std::vector<std::vector<double>>& turns, int max_starts);
 
-/// Ranges that cover joints of 30° to 360° where nothing is known of a signal.
+/// The smallest joint that is looked for [rad per half range]: about 35° over the range that a
+/// signal took. (The smallest of the rigs, arm7's fingers, turn by 46°.)
+inline constexpr double kLeastTurn = 0.3;
+/// Ranges that cover joints from there to 320° where nothing is known of a signal.
 std::vector<double> default_turns();
 
 }  // namespace bodyschema

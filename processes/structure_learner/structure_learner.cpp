@@ -40,28 +40,32 @@ void StructureLearner::on_sample(const sample_t& sample) {
   last_sample_index_ = sample.sample_index;
   if (sample.purpose == action_command_t::PURPOSE_TRAIN ||
       sample.purpose == action_command_t::PURPOSE_PROBE) {
-    samples_.push_back(std::make_shared<const ActionPoseSample>(from_message(sample)));
+    samples_.add(std::make_shared<const ActionPoseSample>(from_message(sample)));
+    has_new_ = true;
   }
   if (!pending_.empty() && !pending_.back().is_test) pending_.pop_back();
-  pending_.push_back({samples_.size(), sample.sample_index, sample.utime,
+  pending_.push_back({sample.sample_index, sample.utime,
                       sample.purpose == action_command_t::PURPOSE_TEST});
+  while (pending_.front().last_sample_index < last_sample_index_ - RetainedSamples::kMaxLag)
+    pending_.pop_front();
 }
 
 void StructureLearner::on_body_schema(const body_schema_t& schema) {
   known_ = from_message(schema);
 }
 
-SharedSamples StructureLearner::of_this_body(std::size_t num_training, std::int64_t sample_index) {
+SharedSamples StructureLearner::of_this_body(std::int64_t sample_index) {
   const std::int64_t since = known_.body_since(sample_index);
+  const std::int64_t stride = retained_stride(since, sample_index);
   std::vector<MovedTag> moved = known_.moved_tags_known(sample_index);
-  if (since != online_since_ || moved != online_moved_) {
+  if (since != online_since_ || stride != online_stride_ || moved != online_moved_) {
     online_ = std::make_shared<OnlineLearner>(config_.signals, config_.options);
     online_since_ = since;
+    online_stride_ = stride;
     online_moved_ = std::move(moved);
-    usable_.clear();
   }
-  while (usable_.size() < num_training) {
-    const auto& sample = usable_.emplace_back(samples_[usable_.size()]);
+  SharedSamples samples = samples_.between(since, sample_index);
+  for (auto& sample : samples) {
     const bool is_touched =
         std::any_of(sample->parts.begin(), sample->parts.end(), [&](const PartObservation& o) {
           return rests_on_moved_tags(o, sample->sample_index, online_moved_);
@@ -69,12 +73,9 @@ SharedSamples StructureLearner::of_this_body(std::size_t num_training, std::int6
     if (!is_touched) continue;
     auto clean = std::make_shared<ActionPoseSample>(*sample);
     drop_moved_tags(online_moved_, clean.get());
-    usable_.back() = std::move(clean);
+    sample = std::move(clean);
   }
-  const auto end = usable_.begin() + static_cast<std::ptrdiff_t>(num_training);
-  return {std::find_if(usable_.begin(), end,
-                       [&](const auto& sample) { return sample->sample_index >= since; }),
-          end};
+  return samples;
 }
 
 void StructureLearner::skip_judged(std::int64_t judged_sample) {
@@ -85,7 +86,7 @@ void StructureLearner::skip_judged(std::int64_t judged_sample) {
 std::function<body_schema_t()> StructureLearner::take_job() {
   const Prefix prefix = pending_.front();
   pending_.pop_front();
-  SharedSamples samples = of_this_body(prefix.num_training, prefix.last_sample_index);
+  SharedSamples samples = of_this_body(prefix.last_sample_index);
   return [online = online_, since = online_since_, moved = online_moved_,
           samples = std::move(samples), prefix] {
     const int n = static_cast<int>(samples.size());
@@ -99,8 +100,8 @@ std::function<body_schema_t()> StructureLearner::take_job() {
 }
 
 std::function<void()> StructureLearner::take_preparation() {
-  num_prepared_ = samples_.size();
-  SharedSamples samples = of_this_body(samples_.size(), last_sample_index_);
+  has_new_ = false;
+  SharedSamples samples = of_this_body(last_sample_index_);
   return [online = online_, samples = std::move(samples)] { online->prepare(samples); };
 }
 

@@ -35,6 +35,10 @@ struct StructureLearnerConfig {
 /// A training sample is answered by the structure found before it came, a TEST sample by one that
 /// the samples so far may change: in the time that the arm takes to move, both were prepared.
 ///
+/// It learns from the retained set of the body's samples (RetainedSamples): memory, and what a
+/// sample costs, stay the same however long the run. A prefix that waited while kMaxLag more
+/// samples came is given up, which no fit is slow enough for.
+///
 /// Before the first sample there is no proposal; when samples stop, the last proposal stands.
 class StructureLearner {
  public:
@@ -65,29 +69,27 @@ class StructureLearner {
   /// Idle time can make the next job short: to be run, in any thread, when there is no job; asked
   /// once a training sample.
   std::function<void()> take_preparation();
-  bool has_preparation() const { return num_prepared_ < samples_.size(); }
+  bool has_preparation() const { return has_new_; }
 
  private:
   /// The samples 0..last_sample_index.
   struct Prefix {
-    std::size_t num_training = 0;
     std::int64_t last_sample_index = 0;
     std::int64_t utime = 0;
     bool is_test = false;
   };
 
-  /// Of the first `num_training` samples those of the body as it was known after a sample; online_
-  /// is for them.
-  SharedSamples of_this_body(std::size_t num_training, std::int64_t sample_index);
+  /// The retained training samples up to this one, of the body as it was known after it, without
+  /// what rests on moved tags; online_ is for them.
+  SharedSamples of_this_body(std::int64_t sample_index);
 
   const StructureLearnerConfig config_;
   std::shared_ptr<OnlineLearner> online_;
-  std::int64_t online_since_ = 0;
+  std::int64_t online_since_ = 0, online_stride_ = 1;
   std::vector<MovedTag> online_moved_;
   BodySchema known_;  ///< for its changes and moved tags
-  SharedSamples samples_;
-  SharedSamples usable_;  ///< the first of them without what rests on online_moved_
-  std::size_t num_prepared_ = 0;
+  RetainedSamples samples_;  ///< TRAIN and PROBE
+  bool has_new_ = false;     ///< since the last preparation
   std::int64_t last_sample_index_ = -1;
   std::deque<Prefix> pending_;
 };

@@ -11,6 +11,10 @@
 
 namespace bodyschema {
 
+/// χ² that a joint must put into the residuals to be noticed: against χ²₆ beyond 25, the threshold
+/// of V2 (check_validity()), a noncentrality of 48 has a power of 97.7 %.
+inline constexpr double kNoticed = 48;
+
 struct SearchOptions {
   MeasurementModel measurement;
   ValidityOptions validity;
@@ -34,6 +38,9 @@ struct PairRecord {
   /// of the best, by k.
   std::map<int, double> undecided;
   bool was_soft_tried = false;  ///< a Gaussian process on the screws' rest was fitted too
+  /// Signals that moved too little while both were seen to tell whether they move the one against
+  /// the other: why a model was taken back.
+  std::set<int> untold_signals = {};
 };
 
 struct SearchResult {
@@ -42,6 +49,10 @@ struct SearchResult {
   /// Of all poses, each tree fitted as a whole, Student-t [nats]; up to a constant. Of a forest
   /// that spans: from one with gaps models may have been taken since.
   double log_likelihood = 0;
+  /// Of each signal that moved: how clearly a joint on it would show in that edge which would show
+  /// it least (TreeFit::joint_information() [per (rad per half range)²]); of edges that have it
+  /// already, nothing. Infinite where there is no edge to judge.
+  std::map<int, double> joint_information;
   int num_screens = 0;  ///< closed-form starts and regressions
   int num_fits = 0;     ///< Levenberg–Marquardt fits, of pairs and of whole trees
 };
@@ -66,6 +77,10 @@ struct SearchResult {
 /// smaller motions. So joints that a score test finds missing are put in, models that have no room
 /// for them are dropped and the layers run again, and components that narrowly refuted models keep
 /// apart are joined if that costs no more than noise does.
+///
+/// In the end an edge stands only if its data could have refuted it: if a joint on any other signal
+/// that moved would have been noticed (kNoticed). Else it is taken back, and more samples are
+/// needed.
 ///
 /// Hypotheses are screened and fitted on an even subset of the instants, and so are trees. What a
 /// layer is about to accept must be valid on all of them; what the fits of trees put in or join is

@@ -70,6 +70,21 @@ struct TreeFit::Normal {
   std::vector<Vector6d> own_gradient;
   std::vector<Matrix6d> inverse_total;  // a frame: I of the root, inverted
   double scale = 1;  // variance of the weighted residuals over what the weights say
+
+  double noise_scale() const { return std::max(scale, 0.25); }
+
+  // H⁻¹; std::nullopt where there is nothing to invert. The gauge directions of the screws' frames
+  // have no information: a ridge leaves them at rest.
+  std::optional<Eigen::MatrixXd> inverse() const {
+    if (H.rows() == 0) return std::nullopt;
+    const Eigen::VectorXd unit = H.diagonal().cwiseMax(1e-300).cwiseSqrt().cwiseInverse();
+    Eigen::MatrixXd scaled = unit.asDiagonal() * H * unit.asDiagonal();
+    scaled.diagonal().array() += 1e-9;
+    const Eigen::LLT<Eigen::MatrixXd> llt(scaled);
+    if (llt.info() != Eigen::Success) return std::nullopt;
+    return unit.asDiagonal() * llt.solve(Eigen::MatrixXd::Identity(H.rows(), H.rows())) *
+           unit.asDiagonal();
+  }
 };
 
 TreeFit::TreeFit(std::vector<TreeNode> nodes, std::vector<PairData> data,
@@ -337,17 +352,9 @@ std::vector<MissingJoint> TreeFit::missing_joints(const Noise& bias) const {
   const int n = static_cast<int>(nodes_.size());
   const int T = num_frames();
   const Normal normal = normal_equations();
-  const auto size = normal.H.rows();
-  if (size == 0) return {};
-  // The gauge directions of the screws' frames have no information: a ridge leaves them at rest.
-  const Eigen::VectorXd scale = normal.H.diagonal().cwiseMax(1e-300).cwiseSqrt().cwiseInverse();
-  Eigen::MatrixXd H = scale.asDiagonal() * normal.H * scale.asDiagonal();
-  H.diagonal().array() += 1e-9;
-  const Eigen::LLT<Eigen::MatrixXd> llt(H);
-  if (llt.info() != Eigen::Success) return {};
-  const Eigen::MatrixXd inverse =
-      scale.asDiagonal() * llt.solve(Eigen::MatrixXd::Identity(size, size)) * scale.asDiagonal();
-  const Eigen::VectorXd newton = inverse * normal.g;
+  const std::optional<Eigen::MatrixXd> inverse = normal.inverse();
+  if (!inverse) return {};
+  const Eigen::VectorXd newton = *inverse * normal.g;
 
   const auto& moving = actions_.moving();
   const int m = static_cast<int>(moving.size());
@@ -355,7 +362,7 @@ std::vector<MissingJoint> TreeFit::missing_joints(const Noise& bias) const {
   for (int t = 0; t < T; ++t)
     for (int s = 0; s < m; ++s) q(t, s) = actions_(samples_[t], moving[s]);
   const Eigen::MatrixXd q2 = q.cwiseProduct(q);
-  const double noise_scale = std::max(normal.scale, 0.25);
+  const double noise_scale = normal.noise_scale();
   Vector6d bias_variances;
   bias_variances << Eigen::Vector3d::Constant(std::pow(bias.position_m, 2)),
       Eigen::Vector3d::Constant(std::pow(bias.rotation_rad, 2));
@@ -397,7 +404,7 @@ std::vector<MissingJoint> TreeFit::missing_joints(const Noise& bias) const {
       for (int c = 0; c < p; ++c) columns.push_back(normal.offset[k] + c);
     }
     const auto p = static_cast<Eigen::Index>(columns.size());
-    const Eigen::MatrixXd inverse_related = inverse(columns, columns);
+    const Eigen::MatrixXd inverse_related = (*inverse)(columns, columns);
     const Eigen::VectorXd newton_related = newton(columns);
 
     // Stacked over the frames, for q = 1 and F = Ad(X_top): F_tᵀJ_t, F_tᵀr_t, F_tᵀF_t of each item.
@@ -554,6 +561,54 @@ std::vector<MissingJoint> TreeFit::missing_joints(const Noise& bias) const {
   }
   std::stable_sort(result.begin(), result.end(),
                    [](const auto& x, const auto& y) { return x.log_tail < y.log_tail; });
+  return result;
+}
+
+Eigen::MatrixXd TreeFit::joint_information() const {
+  const int n = static_cast<int>(nodes_.size());
+  const int T = num_frames();
+  const auto& moving = actions_.moving();
+  const auto m = static_cast<Eigen::Index>(moving.size());
+  Eigen::MatrixXd result = Eigen::MatrixXd::Zero(n, m);
+  const Normal normal = normal_equations();
+  const auto size = normal.H.rows();
+  const std::optional<Eigen::MatrixXd> inverse = normal.inverse();
+  if (!inverse) return result;
+  Eigen::MatrixXd q(T, m);
+  for (int t = 0; t < T; ++t)
+    for (Eigen::Index s = 0; s < m; ++s) q(t, s) = actions_(samples_[t], moving[s]);
+  const Eigen::MatrixXd q2 = q.cwiseProduct(q);
+  for (int k = 1; k < n; ++k) {
+    // Stacked over the frames, for q = 1: what the three axes share with each other and with the
+    // tree's parameters.
+    Eigen::MatrixXd own(9, T);
+    Eigen::MatrixXd shared = Eigen::MatrixXd::Zero(3 * size, T);
+    for (int t = 0; t < T; ++t) {
+      const Eigen::Matrix<double, 6, 3> axes = adjoint(poses_[at(t, k)]).rightCols<3>();
+      const Eigen::Matrix<double, 3, 6> AI = axes.transpose() * normal.I[at(t, k)];
+      const Eigen::Matrix<double, 3, 6> AIT =
+          root_rests_ ? Eigen::Matrix<double, 3, 6>::Zero() : (AI * normal.inverse_total[t]).eval();
+      Eigen::Map<Eigen::Matrix3d>(own.col(t).data()) = AI * axes - AIT * AI.transpose();
+      Eigen::Map<Eigen::MatrixXd> row(shared.col(t).data(), 3, size);
+      for (int e = root_rests_ ? 0 : 1; e < n; ++e) {
+        const ParameterJacobian& S = normal.S[at(t, e)];
+        auto block = row.middleCols(normal.offset[e], S.cols());
+        if (is_below(e, k))
+          block = (axes.transpose() * normal.I[at(t, e)]).lazyProduct(S);
+        else if (is_below(k, e))
+          block = AI.lazyProduct(S);
+        if (!root_rests_) block -= (AIT * normal.I[at(t, e)]).lazyProduct(S);
+      }
+    }
+    const Eigen::MatrixXd owns = own * q2, shares = shared * q;
+    for (Eigen::Index s = 0; s < m; ++s) {
+      const Eigen::Map<const Eigen::MatrixXd> B(shares.col(s).data(), 3, size);
+      const Eigen::Matrix3d C =
+          Eigen::Map<const Eigen::Matrix3d>(owns.col(s).data()) - B * *inverse * B.transpose();
+      const Eigen::SelfAdjointEigenSolver<Eigen::Matrix3d> eigen(C, Eigen::EigenvaluesOnly);
+      result(k, s) = std::max(eigen.eigenvalues()(0), 0.0) / normal.noise_scale();
+    }
+  }
   return result;
 }
 

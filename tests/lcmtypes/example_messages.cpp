@@ -274,6 +274,7 @@ body_schema_t example_body_schema() {
   lost.reason = unconnected_part_t::REASON_NO_VALID_MODEL;
   lost.detail = "refuted up to 3 signals";
   fill(message.num_unconnected, message.unconnected, {lost});
+  fill(message.num_undecided, message.undecided_signals, {0, 1});
   body_change_t change{};
   change.found_sample = 32;
   change.since_sample = 30;

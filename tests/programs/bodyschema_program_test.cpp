@@ -154,10 +154,10 @@ TEST_F(BodyschemaProgramTest, LearnPrintsTheKeysThatAreDocumented) {
   EXPECT_EQ(outcome.err, "");
   const Json json = outcome.json();
   for (const char* key : {"complete", "samples", "parts", "root", "edges", "unconnected",
-                          "unused_signals", "outliers", "noise"}) {
+                          "unused_signals", "undecided_signals", "outliers", "noise"}) {
     EXPECT_TRUE(json.contains(key)) << key;
   }
-  EXPECT_EQ(json.size(), 9U);
+  EXPECT_EQ(json.size(), 10U);
   EXPECT_TRUE(json["complete"].get<bool>());
   ASSERT_EQ(json["edges"].size(), 4U);
   for (const Json& edge : json["edges"]) {
@@ -314,7 +314,8 @@ TEST_F(BodyschemaProgramTest, ABodyThatAdmitsNoValidModelIsIncompleteWithReasons
     EXPECT_GT(part.at("part").get<int>(), 1);
     EXPECT_NE(part.at("reason").get<std::string>().find("no valid model"), std::string::npos);
   }
-  EXPECT_EQ(json["unused_signals"], (Json{"q1", "q2"}));
+  EXPECT_EQ(json["unused_signals"], Json::array());
+  EXPECT_EQ(json["undecided_signals"], (Json{"q1", "q2"}));
   // Such a schema can be kept, shown and applied as well.
   EXPECT_FALSE(run({"show", "schema.lcmlog", "--json"}).json()["complete"].get<bool>());
   EXPECT_EQ(run({"predict", "schema.lcmlog", csv, "--json"}).json()["parts"], Json::array());

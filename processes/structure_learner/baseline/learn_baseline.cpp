@@ -234,7 +234,10 @@ class BaselineSearch {
                                           " signals is valid to any connected part"});
       }
     }
-    schema.complete = !schema.parts.empty() &&
+    if (schema.parts.size() == 1 && connected_to_root_.count(schema.parts.front()))
+      schema.unconnected.push_back(
+          {schema.parts.front(), Unconnected::kNotEnoughData, kOnlyPart});
+    schema.complete = schema.parts.size() > 1 &&
                       std::all_of(schema.parts.begin(), schema.parts.end(),
                                   [&](int part) { return connected_to_root_.count(part) > 0; });
   }

@@ -151,6 +151,10 @@ TEST(Check, RefusesASchemaThatIsNoTreeOfItsOwnPartsAndSignals) {
                  [](auto& m) { std::swap(m.edges[0], m.edges[1]); });
   expect_refused(example_body_schema(), "edges[0].joints[1].signal_index",
                  [](auto& m) { m.edges[0].joints[1].signal_index = 2; });
+  expect_refused(example_body_schema(), "undecided_signals",
+                 [](auto& m) { m.undecided_signals[1] = m.num_signals; });
+  expect_refused(example_body_schema(), "undecided_signals",
+                 [](auto& m) { m.undecided_signals[1] = 0; });
   expect_refused(example_body_schema(), "root_part", [](auto& m) { m.root_part = -1; });
   expect_refused(example_body_schema(), "is_complete", [](auto& m) { m.is_complete = 1; });
   expect_refused(example_body_schema(), "edges[1].base_kind",

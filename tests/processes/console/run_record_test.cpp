@@ -199,6 +199,60 @@ TEST(RunRecordTest, OfAcceptancesInARowTheNewestIsAnEvent) {
   EXPECT_EQ(events[2].event_number, 19);
 }
 
+TEST(RunRecordTest, OfManyVersionsAnEvenChoiceIsKeptWithBothEndsOfEachBody) {
+  Recorded run;
+  body_schema_t schema = example_body_schema();
+  const auto version = [&](std::int64_t number, std::int64_t num_changes) {
+    schema.schema_version = number;
+    std::vector<body_change_t> changes(static_cast<std::size_t>(num_changes));
+    for (std::int64_t c = 0; c < num_changes; ++c)
+      changes[static_cast<std::size_t>(c)].found_sample = c;
+    set_array(schema.num_changes, schema.changes, std::move(changes));
+    run.hear(kBodySchema, schema, number);
+    run.hear(kBodySchema, schema, number);  // repeated at 1 Hz
+  };
+  for (std::int64_t n = 1; n <= 3000; ++n) version(n, n < 1000 ? 0 : n < 1010 ? 1 : 2);
+  EXPECT_EQ(run.record.num_versions(), 3000);
+  EXPECT_LE(run.record.versions().size(), 256U);
+  EXPECT_GT(run.record.versions().size(), 100U);
+  for (const std::int64_t kept : {1, 999, 1000, 1009, 1010, 3000})
+    EXPECT_TRUE(run.record.versions().count(kept)) << kept;
+}
+
+// Images are read before the markers found in them.
+TEST(RunRecordTest, OfManyFramesTheLatenciesAreThinnedAndOneWithAnImageIsThePicture) {
+  Recorded run;
+  constexpr std::int64_t kMany = 20'000;
+  camera_image_t image = example_camera_image();
+  marker_poses_t markers = example_marker_poses();
+  action_command_t command = example_action_command();
+  command.kind = action_command_t::KIND_MOVE;
+  motion_status_t status = example_motion_status();
+  status.source = command.source;
+  status.epoch = command.epoch;
+  status.state = motion_status_t::STATE_SETTLED;
+  for (std::int64_t i = 0; i < kMany; ++i) {
+    image.utime = 100'000 * (i + 1);
+    run.hear(kCameraImage, image, image.utime, i);
+  }
+  for (std::int64_t i = 0; i < kMany; ++i) {
+    markers.utime = 100'000 * (i + 1);
+    run.hear(kMarkerPoses, markers, markers.utime + 20'000);
+    command.action_id = status.action_id = i;
+    run.hear(kActionCommand, command, markers.utime);
+    run.hear(kMotionStatus, status, markers.utime + 30'000);
+  }
+  for (const char* name : {"frame → MARKER_POSES", "ACTION_COMMAND → settled"}) {
+    const auto seconds = run.latency(name);
+    EXPECT_LE(seconds.size(), 4096U);
+    EXPECT_GT(seconds.size(), 1500U);
+    EXPECT_NEAR(quantile(seconds, 0.5), name[0] == 'f' ? 0.02 : 0.03, 1e-12);
+  }
+  ASSERT_FALSE(run.record.pictures().empty());
+  const auto& picture = run.record.pictures().front();
+  EXPECT_EQ(100'000 * (picture.image.byte + 1), picture.markers.utime);
+}
+
 TEST(RunRecordTest, FaultsAreTheirChanges) {
   Recorded run;
   sim_state_t state = example_sim_state();

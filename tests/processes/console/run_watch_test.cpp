@@ -222,6 +222,30 @@ TEST(RunWatchTest, AnActionOfTheSameNumberOfAnotherSourceDoesNotChangeTheTruth) 
             1e-12);
 }
 
+// Of a long run the retained samples are kept, with their truths, in whatever order logs are read.
+TEST(RunWatchTest, OfManySamplesTheRetainedOnesAndTheirTruthsAreKept) {
+  constexpr std::int64_t kMany = 12'000;
+  for (const bool has_truth_first : {true, false}) {
+    RunWatch watch;
+    if (has_truth_first)
+      for (std::int64_t i = 0; i < kMany; ++i) watch.on_sim_state(truth(100 + i, {1}));
+    for (std::int64_t i = 0; i < kMany; ++i)
+      watch.on_sample(sample(i, {1}, i % 5 == 4 ? Purpose::kTest : Purpose::kTrain));
+    if (!has_truth_first)
+      for (std::int64_t i = 0; i < kMany; ++i) watch.on_sim_state(truth(100 + i, {1}));
+    EXPECT_EQ(watch.num_samples(), kMany);
+    EXPECT_EQ(watch.visibility().at(1), 1);
+    EXPECT_EQ(watch.samples().size(), 1500U);
+    const auto held_out = watch.held_out();
+    ASSERT_EQ(held_out.size(), 300U);
+    for (const ActionPoseSample& s : held_out) {
+      EXPECT_EQ(s.sample_index % 8, 0);
+      EXPECT_EQ(s.parts.at(0).X_CB.translation().z(), 0);  // the truth, not what was seen
+    }
+    EXPECT_EQ(watch.held_out(kMany - 100).size(), 20U);
+  }
+}
+
 TEST(RunWatchTest, VisibilityIsAShareOfAllSamples) {
   RunWatch watch;
   EXPECT_TRUE(watch.visibility().empty());

@@ -41,7 +41,7 @@ TEST(SchemaJsonTest, LearnHasExactlyTheDocumentedKeysAndTypes) {
   const LearnResult result = learned(robot);
   const auto json = structure_json(result.schema, {{3, 2}, {5, 4}});
   EXPECT_EQ(keys_of(json), (Keys{"complete", "samples", "parts", "root", "edges", "unconnected",
-                                 "unused_signals", "outliers", "noise"}));
+                                 "unused_signals", "undecided_signals", "outliers", "noise"}));
   EXPECT_TRUE(json["complete"].is_boolean());
   EXPECT_TRUE(json["samples"].is_number_integer());
   EXPECT_EQ(json["samples"], 30);
@@ -62,6 +62,7 @@ TEST(SchemaJsonTest, LearnHasExactlyTheDocumentedKeysAndTypes) {
   }
   EXPECT_TRUE(json["unconnected"].is_array());
   EXPECT_EQ(json["unused_signals"], (nlohmann::ordered_json{"idle"}));
+  EXPECT_TRUE(json["undecided_signals"].empty());
   EXPECT_EQ(Json::parse(json["outliers"].dump()),
             Json::parse(R"([{"sample": 3, "part": 2}, {"sample": 5, "part": 4}])"));
   EXPECT_EQ(keys_of(json["noise"]), (Keys{"position_m", "rotation_deg"}));
@@ -73,7 +74,8 @@ TEST(SchemaJsonTest, ASchemaOfNothingIsPrintedToo) {
   const auto json = structure_json(BodySchema{}, {});
   EXPECT_EQ(Json::parse(json.dump()),
             Json::parse(R"({"complete": false, "samples": 0, "parts": [], "root": null,
-                            "edges": [], "unconnected": [], "unused_signals": [], "outliers": [],
+                            "edges": [], "unconnected": [], "unused_signals": [],
+                            "undecided_signals": [], "outliers": [],
                             "noise": {"position_m": 0, "rotation_deg": 0}})"));
   EXPECT_NO_THROW(schema_json(BodySchema{}).dump());
   EXPECT_EQ(structure_text(BodySchema{}), "Incomplete structure of 0 parts from 0 samples\n");
@@ -155,7 +157,7 @@ TEST(SchemaJsonTest, ShowHasEveryParameterOfEveryEdge) {
   const auto json = schema_json(schema);
   EXPECT_EQ(keys_of(json),
             (Keys{"complete", "samples", "parts", "root", "edges", "unconnected", "unused_signals",
-                  "noise", "version", "base_version", "last_sample", "X_CR", "signals"}));
+                  "undecided_signals", "noise", "version", "base_version", "last_sample", "X_CR", "signals"}));
   EXPECT_EQ(json["signals"].size(), 3U);
   EXPECT_EQ(keys_of(json["signals"][0]), (Keys{"name", "lower", "upper", "warp"}));
   EXPECT_EQ(json["last_sample"], 29);
@@ -190,6 +192,17 @@ TEST(SchemaJsonTest, ShowHasEveryParameterOfEveryEdge) {
                 1e-9);
     }
   }
+}
+
+TEST(SchemaJsonTest, ASignalThatDidNotMoveEnoughToTellIsNotCalledWithoutEffect) {
+  BodySchema schema;
+  schema.signals = {{"idle", -1, 1, {}}, {"held", -1, 1, {}}};
+  schema.undecided_signals = {1};
+  EXPECT_EQ(structure_json(schema, {})["unused_signals"], (nlohmann::ordered_json{"idle"}));
+  EXPECT_EQ(structure_json(schema, {})["undecided_signals"], (nlohmann::ordered_json{"held"}));
+  const std::string text = structure_text(schema);
+  EXPECT_NE(text.find("signals without effect: idle\n"), std::string::npos) << text;
+  EXPECT_NE(text.find("signals whose effect is not told yet: held\n"), std::string::npos) << text;
 }
 
 TEST(SchemaJsonTest, TheTextNamesEdgesSignalsAndIdleOnes) {

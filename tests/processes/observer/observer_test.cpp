@@ -361,7 +361,7 @@ TEST(Observer, ContinuesTheIndicesAfterARestartAndRepeatsNoAction) {
   const auto sample = first.on_marker_poses(scene.frame(kRest_us + 33'333)).value();
 
   Observer second = calibrated();
-  second.restore({sample});
+  second.restore(sample);
   second.on_marker_poses(scene.frame(kRest_us));
   second.on_marker_poses(scene.frame(kRest_us + 33'333));
   EXPECT_FALSE(second.on_motion_status(settled(0)));

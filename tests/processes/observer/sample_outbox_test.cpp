@@ -57,6 +57,13 @@ class SampleOutboxTest : public testing::Test {
       indices.push_back(message.sample_index);
     return indices;
   }
+  /// What a restart hands on.
+  Indices kept() const {
+    Indices indices;
+    outbox_->for_each_recorded(
+        [&](const sample_t& message) { indices.push_back(message.sample_index); });
+    return indices;
+  }
   Indices take_sent() { return std::exchange(sent_, {}); }
   /// Ticks of 100 ms over `seconds`.
   void tick_for(double seconds) {
@@ -97,7 +104,7 @@ TEST_F(SampleOutboxTest, TheNewestIsRepeatedAtOneHertzAlsoAfterARestart) {
   start();
   tick_for(0.1);
   EXPECT_EQ(take_sent(), (Indices{1}));
-  EXPECT_EQ(outbox_->recorded().size(), 2U);
+  EXPECT_EQ(kept(), (Indices{0, 1}));
 }
 
 TEST_F(SampleOutboxTest, WhatIsAskedForIsSentAgainALittleAtATime) {
@@ -142,7 +149,7 @@ TEST_F(SampleOutboxTest, ATornTailIsCutOffAtAnyByteAndWhatFollowsCanBeRead) {
     outbox_.reset();
     std::filesystem::resize_file(file_, size);
     start();
-    EXPECT_EQ(outbox_->recorded().size(), 1U);
+    EXPECT_EQ(kept(), Indices{0});
     outbox_->send(sample(1));
     ASSERT_EQ(recorded(), (Indices{0, 1})) << "cut at byte " << size;
   }
@@ -188,7 +195,7 @@ TEST_F(SampleOutboxTest, WithoutAFileTheNewestIsRepeated) {
   outbox_->on_request(request(0, 0));
   tick_for(1.5);
   EXPECT_EQ(take_sent(), (Indices{0, 0}));
-  EXPECT_TRUE(outbox_->recorded().empty());
+  EXPECT_TRUE(kept().empty());
 }
 
 }  // namespace

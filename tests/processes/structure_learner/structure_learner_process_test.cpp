@@ -313,5 +313,56 @@ TEST(StructureLearnerConfigTest, IsReadInSiUnitsWithTheRootOfTheRig) {
   std::filesystem::remove_all(folder);
 }
 
+// The retained set, whenever it is asked: after a restart, with prefixes left out, or since a change
+// that was found long after it.
+TEST_F(StructureLearnerTest, ManySamplesAreLearnedFromTheRetainedOnes) {
+  constexpr std::int64_t kMany = 5'000, kSince = 400, kFound = 4'500;
+  std::vector<sample_t> samples;
+  for (std::int64_t i = 0; i < kMany; ++i) {
+    sample_t sample = samples_[static_cast<std::size_t>(i) % samples_.size()];
+    sample.sample_index = i;
+    sample.utime = 1'000'000 * (i + 1);
+    samples.push_back(sample);
+  }
+  const auto expected = [&](std::int64_t since) {
+    std::vector<ActionPoseSample> training;
+    const std::int64_t stride = retained_stride(since, kMany - 1);
+    for (const sample_t& sample : samples)
+      if (sample.sample_index >= since && sample.sample_index % stride == 0 &&
+          sample.purpose != action_command_t::PURPOSE_TEST)
+        training.push_back(from_message(sample));
+    return training.size();
+  };
+  const auto last = [](StructureLearner* learner) {
+    // What waited too long was given up: no more jobs than there are TEST samples in kMaxLag.
+    std::function<body_schema_t()> job;
+    int num_jobs = 0;
+    for (; learner->has_job(); ++num_jobs) job = learner->take_job();
+    EXPECT_LE(num_jobs, RetainedSamples::kMaxLag / 5 + 1);
+    return job();
+  };
+  StructureLearner at_once(config_), in_steps(config_), told(config_);
+  body_schema_t stepped;
+  BodySchema known;
+  known.signals = robot_.signals;
+  known.changes = {{kFound, kSince}};
+  for (const sample_t& sample : samples) {
+    at_once.on_sample(sample);
+    in_steps.on_sample(sample);
+    told.on_sample(sample);
+    if (sample.sample_index % 1'000 == 999) stepped = last(&in_steps);
+  }
+  told.on_body_schema(to_message(known));
+  const body_schema_t of_all = last(&at_once);
+  // 1250 multiples of 4 … of which a fifth are TEST; the last twentieth may wait for a checkpoint.
+  EXPECT_LE(of_all.num_samples_seen, static_cast<std::int32_t>(expected(0)));
+  EXPECT_GT(of_all.num_samples_seen, 0.94 * static_cast<double>(expected(0)));
+  EXPECT_EQ(bytes_of(stepped), bytes_of(of_all));
+  const body_schema_t since = last(&told);
+  EXPECT_LE(since.num_samples_seen, static_cast<std::int32_t>(expected(kSince)));
+  EXPECT_GT(since.num_samples_seen, 0.94 * static_cast<double>(expected(kSince)));
+  EXPECT_EQ(since.edges.at(0).valid_since_sample, kSince);
+}
+
 }  // namespace
 }  // namespace bodyschema
