@@ -225,8 +225,11 @@ std::vector<ActionPoseSample> RunWatch::held_out(std::int64_t since) const {
       const Truth* truth = truth_of(sample);
       if (truth == nullptr) continue;
       sample.parts.clear();
-      for (const auto& [part, X_CB] : truth->parts)
-        sample.parts.push_back({.part = part, .X_CB = X_CB});
+      for (const auto& [part, X_CB] : truth->parts) {
+        PartObservation& seen = sample.parts.emplace_back();
+        seen.part = part;
+        seen.X_CB = X_CB;
+      }
     }
     result.push_back(std::move(sample));
   }

@@ -304,7 +304,8 @@ void Adaptation::complete(std::int64_t sample_index, AdaptationEvent* event) con
   else if (event->since >= 0)
     event->since = stream_.sample_index_of(event->since);
   const bool may_be_normal = event->kind == Kind::kRestored || event->kind == Kind::kRefined ||
-                             (event->kind == Kind::kRecovered && event->cause == "stored");
+                             (event->kind == Kind::kRecovered &&
+                              (event->cause == "stored" || event->cause == "camera_moved"));
   if (!may_be_normal) return;
   const int part = event->to >= 0 ? event->to : event->part;
   const BodySchema& first = history_.front();

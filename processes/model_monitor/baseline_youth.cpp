@@ -7,11 +7,11 @@
 namespace bodyschema {
 namespace {
 
-/// Share of first complete structures that are wrong: measured by ./run experiment young_baseline.
+/// Share of first complete structures that are wrong: chosen.
 constexpr double kWrongShare = 0.1;
 /// Changes of the body a sample: chosen, one in a thousand.
 constexpr double kChangeRate = 1e-3;
-/// Odds at which a change is believed. With them a baseline is young for 16 samples.
+/// Odds at which a change is believed: chosen. With these three a baseline is young for 16 samples.
 constexpr double kClearOdds = 3;
 
 double log_odds(std::int64_t num_mismatches, std::int64_t num_confirming) {

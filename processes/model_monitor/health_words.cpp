@@ -125,7 +125,7 @@ std::string text_of(const AdaptationEvent& event, const std::vector<Signal>& sig
       if (event.cause == "marker_missing" || event.tag >= 0)
         return place() + " is " + (event.tag >= 0 ? "where it was" : "seen") +
                " again: back to normal";
-      return (event.cause == "stored"
+      return (event.is_normal || event.cause == "stored"
                   ? place() + (event.is_normal ? " normal" : " as once before") +
                         since_text(event.since)
                   : subject) +

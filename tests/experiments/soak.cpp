@@ -166,7 +166,7 @@ class Soak {
   const fs::path folder_;
   test::Rng rng_;
   test::SyntheticRobot robot_;
-  Bus bus_{default_url()};
+  Bus bus_{default_url(), default_url()};
   std::unique_ptr<LogAppender> samples_, log_;
   std::map<std::string, std::unique_ptr<test::Program>> programs_;
   std::map<std::string, bool> heard_;

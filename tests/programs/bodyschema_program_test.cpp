@@ -91,7 +91,9 @@ class BodyschemaProgramTest : public testing::Test {
   void expect_failure(const std::vector<std::string>& arguments, const std::string& what,
                       int exit_code = 0) const {
     const Outcome outcome = run(arguments);
-    if (exit_code != 0) EXPECT_EQ(outcome.exit_code, exit_code) << what;
+    if (exit_code != 0) {
+      EXPECT_EQ(outcome.exit_code, exit_code) << what;
+    }
     EXPECT_TRUE(outcome.exit_code == 1 || outcome.exit_code == 2) << outcome.exit_code << what;
     EXPECT_EQ(outcome.out, "") << what;
     EXPECT_NE(outcome.err.find(what), std::string::npos) << outcome.err;
