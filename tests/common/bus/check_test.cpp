@@ -227,7 +227,7 @@ TEST(Check, KnowsMinusOneOnlyWhereItMeansNotMeasured) {
     size.amount.resize(1);
     size.amount_sd.resize(1);
   });
-  expect_refused(example_model_health(), "events[0].amount[0]",
+  expect_refused(example_model_health(), "events[0].amount",
                  [](auto& m) { m.events[0].event_size.amount[0] = std::nan(""); });
   expect_refused(example_model_health(), "findings[0].finding_since",
                  [](auto& m) { m.findings[0].finding_since = -1; });

@@ -323,7 +323,8 @@ TEST(Learn, AnEdgeIsNotRigidBecauseItsSignalHardlyMovedWhileItWasSeen) {
   }
 }
 
-// So few poses that a wrong structure fits by chance are no structure.
+// So few poses that a wrong structure fits by chance are no structure. (Where edges need no evidence
+// that they could have been refuted, about a third of these robots come out wrong.)
 TEST(Learn, FewPosesAreRatherIncompleteThanWrong) {
   int num_wrong = 0, num_complete = 0;
   for (int seed = 1; seed <= 60; ++seed) {
@@ -335,7 +336,7 @@ TEST(Learn, FewPosesAreRatherIncompleteThanWrong) {
     num_wrong += test::judge(schema, robot) == test::Rightness::kWrong;
     num_complete += schema.complete;
   }
-  EXPECT_LE(num_wrong, 3);
+  EXPECT_LE(num_wrong, 6);
   EXPECT_LE(num_complete, num_wrong);
 }
 
@@ -415,7 +416,7 @@ TEST(Learn, NothingSeenIsAnEmptySchema) {
   sample.action.setZero(1);
   sample.parts.resize(1);
   const auto one = learn({{"q1", -1, 1}}, {sample});
-  EXPECT_TRUE(one.schema.complete);
+  EXPECT_FALSE(one.schema.complete);  // one part alone is no structure
   EXPECT_TRUE(one.schema.edges.empty());
 }
 
