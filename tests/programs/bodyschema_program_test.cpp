@@ -1049,7 +1049,7 @@ TEST_F(BodyschemaProgramTest, MonitorFindsAStuckJointNamesItAndWritesTheRepaired
                 .out,
             outcome.out);
   const Outcome text = run({"monitor", "schema.lcmlog", changing, "--noise", "0.003", "1"});
-  EXPECT_NE(text.out.find(" stuck at 0.4"), std::string::npos) << text.out;
+  EXPECT_NE(text.out.find("q2 (3→4) stuck at 0."), std::string::npos) << text.out;
   EXPECT_NE(text.out.find("since sample 40: adopted"), std::string::npos) << text.out;
   EXPECT_NE(text.out.find("80 samples, "), std::string::npos) << text.out;
 }
