@@ -33,8 +33,9 @@ using SteadyClock = std::chrono::steady_clock;
 constexpr std::chrono::milliseconds kTickPeriod{100};
 constexpr std::chrono::milliseconds kInfoPeriod{1000};
 constexpr std::chrono::milliseconds kShortestInfoPeriod{100};
-/// How long a process that starts listens for another of its name.
-constexpr std::chrono::milliseconds kListening{200};
+/// How long a process that starts listens for another of its name, which answers at its next tick
+/// (kTickPeriod), on a busy machine later.
+constexpr std::chrono::milliseconds kListening{500};
 /// And for what was heard once to be heard again: repeated at 1 Hz, also by who is too busy to
 /// answer.
 constexpr std::chrono::milliseconds kListeningAgain{1200};

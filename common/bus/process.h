@@ -27,7 +27,7 @@ namespace bodyschema {
 ///   }
 ///
 /// Of two processes of one name on a bus the younger ends with exit code 1 and a line that says who
-/// is there: at its start it says who it is and listens for 0.2 s before it publishes anything
+/// is there: at its start it says who it is and listens for 0.5 s before it publishes anything
 /// else; the elder answers at once, and must be heard again within 1.2 s, with a newer time. One
 /// that has begun to work never ends because of what others say: two that meet later both tell it
 /// (set_notice). Only live PROCESS_INFO counts (is_live()), and a bus that is both heard and spoken
