@@ -1,6 +1,7 @@
 #!/bin/bash
 # targets.sh SOURCE BUILD: a group learns arm2, then the end effector is sent to random positions; halt, resume,
-# hold and release are said by the console; a target that times out or is interrupted is dropped; the controller is killed with a hold and in the middle of a target and holds.
+# hold and release are said by the console; a target that times out or is interrupted is dropped; the controller is
+# killed with a hold and in the middle of a target and holds.
 set -euo pipefail
 source=$1 build=$2
 work=$(mktemp -d)
@@ -33,9 +34,8 @@ console hold || fail "no hold after the restart"
 grep -q "held as before the restart" "$work/logs/current/run.lcmlog.00" || fail "the hold did not survive a kill"
 console release || fail "release"
 
-# Killed in the middle of a target, which stays open because its SAMPLE does not come: the one who follows it is
-# told, and it is not served again.
 position=$(awk -F'|' '/reached/ {print $3; exit}' "$work/targets.txt")
+elsewhere=$(awk -F'|' '/reached/ && ++n == 2 {print $3; exit}' "$work/targets.txt")
 observer=$("$source/run" exec pgrep -f "^$build/bin/observer ")
 
 # Nobody follows it any longer: it is dropped and the arm held, also once its SAMPLE has come.
@@ -63,9 +63,11 @@ for end in timeout interrupt; do
   console release || fail "release after $end"
 done
 
+# Killed in the middle of a target, which stays open because its SAMPLE does not come: the one who follows it is
+# told, and it is not served again.
 kill -STOP "$observer"
 # shellcheck disable=SC2086
-"$source/run" exec bodyschema target --part 5 --position $position --timeout 60 >"$work/middle.txt" 2>&1 &
+"$source/run" exec bodyschema target --part 5 --position $elsewhere --timeout 60 >"$work/middle.txt" 2>&1 &
 follower=$!
 for _ in $(seq 100); do
   grep -q "waiting for the SAMPLE of action" "$work/middle.txt" && break
