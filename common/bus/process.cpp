@@ -17,6 +17,7 @@
 #include <fstream>
 #include <iterator>
 #include <map>
+#include <optional>
 #include <sstream>
 #include <stdexcept>
 #include <tuple>
@@ -39,6 +40,8 @@ constexpr std::chrono::milliseconds kListening{500};
 /// And for what was heard once to be heard again: repeated at 1 Hz, also by who is too busy to
 /// answer.
 constexpr std::chrono::milliseconds kListeningAgain{1200};
+/// An elder that was busy with its own start is heard twice within this time, at 1 Hz.
+constexpr std::chrono::seconds kYouth{3};
 /// What is repeated at 1 Hz may be lost four times in a row.
 constexpr std::chrono::seconds kNoticeAge{5};
 
@@ -135,7 +138,8 @@ struct Process::Impl {
   std::map<std::string, Notice> notices;  ///< by subject
   bool info_changed = true;
   bool is_listening = false;
-  /// Of the same name, heard while listening → its time.
+  std::optional<SteadyClock::time_point> running_since;
+  /// Of the same name, heard while listening or young → its time.
   std::map<std::tuple<std::int64_t, std::string, std::int32_t>, std::int64_t> elders;
   const SteadyClock::time_point start = SteadyClock::now();
   SteadyClock::time_point last_info{};
@@ -180,15 +184,16 @@ struct Process::Impl {
         "another {} is on this bus: process {} on {}. End that one (./run stop), or give this "
         "group a port of its own in network.yaml",
         other.process_name, other.pid, other.host);
-    if (is_listening) {
+    const bool is_young = !running_since || SteadyClock::now() - *running_since < kYouth;
+    if (is_listening || (is_young && identity(other) < identity(info))) {
       // As many as a test of many twins starts, not as many as a stranger can invent.
       constexpr std::size_t kMostElders = 16;
       const auto elder = elders.find(identity(other));
       if (elder != elders.end() && other.utime > elder->second) throw std::runtime_error(who);
       if (elder == elders.end() && elders.size() < kMostElders)
         elders.emplace(identity(other), other.utime);
-      return;
     }
+    if (is_listening) return;
     if (++counters["twin PROCESS_INFO"] == 1) spdlog::warn("{}", who);
     set_notice("twin", who);
   }
@@ -304,6 +309,7 @@ void Process::run() {
   if (impl_->info.phase == process_info_t::PHASE_STARTING) {
     impl_->info.phase = process_info_t::PHASE_WAITING;
   }
+  impl_->running_since = SteadyClock::now();
   std::exception_ptr first_problem;
   const auto guarded = [&](const auto& act) {
     try {

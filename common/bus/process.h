@@ -28,10 +28,10 @@ namespace bodyschema {
 ///
 /// Of two processes of one name on a bus the younger ends with exit code 1 and a line that says who
 /// is there: at its start it says who it is and listens for 0.5 s before it publishes anything
-/// else; the elder answers at once, and must be heard again within 1.2 s, with a newer time. One
-/// that has begun to work never ends because of what others say: two that meet later both tell it
-/// (set_notice). Only live PROCESS_INFO counts (is_live()), and a bus that is both heard and spoken
-/// to.
+/// else; the elder answers at once, and must be heard again within 1.2 s, with a newer time. An
+/// elder that was busy then may still be heard in the first 3 s of the loop. After that none ends
+/// because of what others say: two that meet later both tell it (set_notice). Only live PROCESS_INFO
+/// counts (is_live()), and a bus that is both heard and spoken to.
 ///
 /// `--in` is default_url() unless given. `--out` is then the same bus, but nowhere where the input
 /// is a log: a replay must not reach a robot by accident.
