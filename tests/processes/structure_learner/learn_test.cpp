@@ -323,8 +323,8 @@ TEST(Learn, AnEdgeIsNotRigidBecauseItsSignalHardlyMovedWhileItWasSeen) {
   }
 }
 
-// So few poses that a wrong structure fits by chance are no structure. (Where edges need no evidence
-// that they could have been refuted, about a third of these robots come out wrong.)
+// So few poses that a wrong structure fits by chance are no structure. Some
+// wrong ones have evidence enough all the same.
 TEST(Learn, FewPosesAreRatherIncompleteThanWrong) {
   int num_wrong = 0, num_complete = 0;
   for (int seed = 1; seed <= 60; ++seed) {
