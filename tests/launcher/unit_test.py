@@ -6,11 +6,13 @@ import socket
 import subprocess
 import tempfile
 import unittest
+from dataclasses import replace
 from pathlib import Path
+from unittest import mock
 
 from support import SOURCE
 
-from launcher import group_file, supervisor, test_selection
+from launcher import commands, group_file, supervisor, test_selection
 from launcher.place import Place
 
 
@@ -176,6 +178,13 @@ class TheTestsThatAreSelected(Folder):
 
     def test_that_are_scripts_want_the_programs_and_what_they_name(self):
         self.assertEqual(self.of("-R", "whole", listed=["whole_group"]), ["judge", "programs"])
+
+    def test_see_the_environment_of_a_console_that_run_did_not_start(self):
+        with mock.patch.object(commands, "become") as become, mock.patch.dict(os.environ, BODYSCHEMA_COMMAND="./run"):
+            become.side_effect = lambda _: self.assertNotIn("BODYSCHEMA_COMMAND", os.environ)
+            self.addCleanup(os.chdir, os.getcwd())
+            commands.test(replace(self.place, is_build_given=True), ["-R", "alone"])
+            become.assert_called_once()
 
     def test_are_all_wanted_if_the_name_is_no_regular_expression_of_ours(self):
         self.assertIsNone(self.of("-R", "(["))
