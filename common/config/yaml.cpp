@@ -10,6 +10,8 @@
 #include <limits>
 #include <sstream>
 
+#include "common/geometry/angle.h"
+
 namespace bodyschema {
 namespace {
 
@@ -270,7 +272,7 @@ Pose Yaml::pose(const std::string& key) const {
   }
   if (!yaml.has("rpy_deg")) return make_pose(Eigen::Quaterniond::Identity(), position);
   const Eigen::Vector3d rpy =
-      Eigen::Vector3d(yaml.numbers("rpy_deg", 3, -3600, 3600).data()) * (M_PI / 180);
+      Eigen::Vector3d(yaml.numbers("rpy_deg", 3, -3600, 3600).data()) * kDegree;
   using Eigen::AngleAxisd;
   using Eigen::Vector3d;
   return make_pose(AngleAxisd(rpy.z(), Vector3d::UnitZ()) * AngleAxisd(rpy.y(), Vector3d::UnitY()) *

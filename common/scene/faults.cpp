@@ -6,12 +6,13 @@
 #include <random>
 #include <sstream>
 
+#include "common/geometry/angle.h"
+
 namespace bodyschema {
 namespace {
 
 using Command = fault_command_t;
 
-constexpr double kDegree = M_PI / 180;
 /// Where a marker that falls comes to lie: not under the base [m].
 constexpr double kFallenRadius_m = 0.3;
 constexpr double kPlateThickness_m = 0.006;

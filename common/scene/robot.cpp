@@ -6,11 +6,10 @@
 #include <sstream>
 
 #include "common/config/yaml.h"
+#include "common/geometry/angle.h"
 
 namespace bodyschema {
 namespace {
-
-constexpr double kDegree = M_PI / 180;
 
 Pose pose_or_identity(const Yaml& yaml, const std::string& key) {
   return yaml.has(key) ? yaml.pose(key) : Pose::Identity();

@@ -32,7 +32,7 @@ using SteadyClock = std::chrono::steady_clock;
 /// Linux cuts the name of a process.
 constexpr std::size_t kLongestComm = 15;
 
-struct Arguments {
+struct DriverTestArguments {
   std::string in = default_url();
   std::string rig_folder;
   double step_share = 0.05;
@@ -60,7 +60,7 @@ std::string outcome_text(RuleResult::Outcome outcome) {
 /// The driver on a live bus.
 class LiveDriver {
  public:
-  explicit LiveDriver(const Arguments& arguments)
+  explicit LiveDriver(const DriverTestArguments& arguments)
       : arguments_(arguments), bus_(arguments.in, arguments.in) {
     if (bus_.is_replay()) throw std::runtime_error("a log has no driver: --in wants a bus");
     bus_.subscribe<motion_status_t>(kMotionStatus,
@@ -135,13 +135,13 @@ class LiveDriver {
     process_.reset();
   }
 
-  const Arguments& arguments_;
+  const DriverTestArguments& arguments_;
   Bus bus_;
   std::vector<motion_status_t> statuses_;
   std::optional<process_info_t> process_;
 };
 
-void confirm(const Arguments& arguments, const ConformanceOptions& options,
+void confirm(const DriverTestArguments& arguments, const ConformanceOptions& options,
              const ConformancePlan& plan) {
   std::cerr << fmt::format(
       "The test moves the arm on {} about 25 times between\n  {}\nand\n  {}\n(command units; "
@@ -160,7 +160,7 @@ void confirm(const Arguments& arguments, const ConformanceOptions& options,
   }
 }
 
-void run(const Arguments& arguments) {
+void run_driver_test(const DriverTestArguments& arguments) {
   ConformanceOptions options;
   options.signals = load_signals(arguments.rig_folder);
   options.step_share = arguments.step_share;
@@ -204,7 +204,7 @@ void run(const Arguments& arguments) {
 }  // namespace
 
 void add_driver_test_command(CLI::App& console) {
-  const auto arguments = std::make_shared<Arguments>();
+  const auto arguments = std::make_shared<DriverTestArguments>();
   CLI::App* test = console.add_subcommand(
       "driver-test", "Does the driver on the bus keep lcmtypes/DRIVER.md? Moves the arm gently");
   test->add_option("--in", arguments->in, "URL of the bus")->capture_default_str();
@@ -220,7 +220,7 @@ void add_driver_test_command(CLI::App& console) {
   test->add_option("--kill", arguments->kill,
                    "Process name of the driver: kill -9; its supervisor starts it again")
       ->excludes(restart);
-  test->callback([arguments] { run(*arguments); });
+  test->callback([arguments] { run_driver_test(*arguments); });
 }
 
 }  // namespace bodyschema

@@ -18,6 +18,7 @@
 #include "common/bus/convert.h"
 #include "common/bus/event_log.h"
 #include "common/config/yaml.h"
+#include "common/geometry/angle.h"
 #include "processes/console/offline.h"
 #include "processes/console/recording.h"
 #include "processes/console/schema_json.h"
@@ -78,7 +79,7 @@ class Walk {
     if (!parts.count(schema_.root)) throw yaml.error("root", "expected one of the parts");
     const Yaml uncertainty = yaml.section("uncertainty");
     const double position = uncertainty.number("position_m", 0, 1);
-    const double rotation = uncertainty.number("rotation_deg", 0, 180) * (M_PI / 180);
+    const double rotation = uncertainty.number("rotation_deg", 0, 180) * kDegree;
     variances_ << Eigen::Vector3d::Constant(position * position),
         Eigen::Vector3d::Constant(rotation * rotation);
   }
@@ -221,7 +222,7 @@ void run_engineer(const EngineerArguments& arguments) {
   const Recording recording = load_for(arguments.samples, schema);
   MeasurementModel measurement;
   if (recording.is_log) measurement.model_error = kTagModelError;
-  if (!recording.has_noise) measurement.noise = Noise{0.001, 0.2 * M_PI / 180};  // weights alone
+  if (!recording.has_noise) measurement.noise = Noise{0.001, 0.2 * kDegree};  // weights alone
   estimate_root_pose(recording.samples, measurement, &schema);
   if (schema.X_CR_covariance.isZero(0))
     throw std::runtime_error(arguments.samples + ": the root, part " + std::to_string(schema.root) +

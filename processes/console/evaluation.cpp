@@ -6,6 +6,8 @@
 #include <stdexcept>
 #include <string>
 
+#include "common/statistics/median.h"
+
 namespace bodyschema {
 namespace {
 
@@ -18,13 +20,6 @@ double rms(const std::vector<double>& values) {
   double sum = 0;
   for (const double value : values) sum += value * value;
   return std::sqrt(sum / static_cast<double>(values.size()));
-}
-
-/// Mean of the two middle values where their number is even.
-double median(std::vector<double> values) {
-  std::sort(values.begin(), values.end());
-  const std::size_t n = values.size();
-  return 0.5 * (values[(n - 1) / 2] + values[n / 2]);
 }
 
 }  // namespace

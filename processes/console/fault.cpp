@@ -19,13 +19,13 @@ namespace {
 
 using SteadyClock = std::chrono::steady_clock;
 
-struct Arguments {
+struct FaultArguments {
   std::string in = default_url();
   bool json = false;
   fault_command_t command{};
 };
 
-void run(Arguments& arguments) {
+void inject(FaultArguments& arguments) {
   const std::int64_t now_us = std::chrono::duration_cast<std::chrono::microseconds>(
                                   std::chrono::system_clock::now().time_since_epoch())
                                   .count();
@@ -71,7 +71,7 @@ void run(Arguments& arguments) {
 }  // namespace
 
 void add_fault_command(CLI::App& console) {
-  const auto arguments = std::make_shared<Arguments>();
+  const auto arguments = std::make_shared<FaultArguments>();
   CLI::App* fault =
       console.add_subcommand("fault", "Break the simulated arm, or repair it; the simulator alone");
   fault->add_option("--in", arguments->in, "URL of the bus")->capture_default_str();
@@ -82,7 +82,7 @@ void add_fault_command(CLI::App& console) {
     sub->fallthrough();  // options of `fault` may come last
     sub->callback([arguments, kind] {
       arguments->command.fault = kind;
-      run(*arguments);
+      inject(*arguments);
     });
     return sub;
   };

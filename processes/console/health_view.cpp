@@ -5,12 +5,12 @@
 #include <algorithm>
 #include <cmath>
 
+#include "common/geometry/angle.h"
+
 namespace bodyschema {
 namespace {
 
 using nlohmann::ordered_json;
-
-constexpr double kDegrees = 180 / M_PI;
 
 ordered_json id(std::int32_t part) { return part < 0 ? ordered_json() : ordered_json(part); }
 
@@ -24,7 +24,7 @@ ordered_json amounts_json(std::int8_t kind, const std::vector<double>& amounts, 
   if (kind == change_size_t::SIZE_FACTOR) return {{"factor", known(0)}};
   if (kind == change_size_t::SIZE_UNKNOWN) return nullptr;
   return {{is_rate ? "position_m_per_sample" : "position_m", known(0)},
-          {is_rate ? "rotation_deg_per_sample" : "rotation_deg", known(1, kDegrees)}};
+          {is_rate ? "rotation_deg_per_sample" : "rotation_deg", known(1, 1 / kDegree)}};
 }
 
 }  // namespace

@@ -1,5 +1,7 @@
 #include "processes/console/hint.h"
 
+#include <fmt/format.h>
+
 #include <cstdlib>
 
 namespace bodyschema {
@@ -7,6 +9,12 @@ namespace bodyschema {
 std::string to_type(const std::string& words) {
   const char* command = std::getenv("BODYSCHEMA_COMMAND");
   return std::string(command != nullptr && *command != '\0' ? command : "bodyschema") + " " + words;
+}
+
+std::string duration(double s) {
+  if (s < 100) return fmt::format("{:.0f} s", s);
+  if (s < 6000) return fmt::format("{:.0f} min", s / 60);
+  return fmt::format("{:.1f} h", s / 3600);
 }
 
 std::string abbreviated(std::string_view text) {

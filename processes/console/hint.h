@@ -9,6 +9,9 @@ namespace bodyschema {
 /// (BODYSCHEMA_COMMAND), else "bodyschema WORDS".
 std::string to_type(const std::string& words);
 
+/// A time for people: "95 s", "12 min", "2.5 h".
+std::string duration(double seconds);
+
 /// `text` for an error: of more than 40 bytes the first ones and "…".
 std::string abbreviated(std::string_view text);
 

@@ -25,7 +25,7 @@ double seconds(std::int64_t from_us, std::int64_t to_us) {
   return static_cast<double>(to_us - from_us) * 1e-6;
 }
 
-struct Arguments {
+struct LogArguments {
   std::string file;
   bool json = false;
   bool check = false;
@@ -72,7 +72,7 @@ void copy_channels(const std::string& file, const std::vector<std::string>& chan
   std::cout << written << " events in " << copy << std::endl;
 }
 
-void run_log(const Arguments& arguments) {
+void run_log(const LogArguments& arguments) {
   const std::string& file = arguments.file;
   if (!arguments.thin.empty()) {
     std::cout << thin_log(file, arguments.thin) << " events in " << arguments.thin << std::endl;
@@ -237,7 +237,7 @@ std::int64_t thin_log(const std::filesystem::path& file, const std::filesystem::
 }
 
 void add_log_command(CLI::App& console) {
-  const auto arguments = std::make_shared<Arguments>();
+  const auto arguments = std::make_shared<LogArguments>();
   CLI::App* log = console.add_subcommand("log", "What an LCM log holds, and what is wrong with it");
   log->add_option("FILE", arguments->file, "LCM log")->required();
   log->add_flag("--json", arguments->json, "Print JSON");

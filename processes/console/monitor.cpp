@@ -15,6 +15,7 @@
 
 #include "common/bus/convert.h"
 #include "common/bus/event_log.h"
+#include "common/geometry/angle.h"
 #include "processes/console/evaluation.h"
 #include "processes/console/health_view.h"
 #include "processes/console/offline.h"
@@ -106,7 +107,7 @@ void tell_noise(const MonitorArguments& arguments, const Recording& recording,
   const bool is_given = !arguments.noise.empty();
   const Noise noise = is_given ? noise_given(arguments.noise) : schema.noise;
   std::cerr << fmt::format("noise per axis and marker: {:.2f} mm {:.2f}°, {}\n",
-                           noise.position_m * 1e3, noise.rotation_rad * 180 / M_PI,
+                           noise.position_m * 1e3, noise.rotation_rad / kDegree,
                            is_given ? "given" : "that of " + arguments.schema);
 }
 

@@ -18,6 +18,7 @@
 #include "common/bus/event_log.h"
 #include "common/bus/rig_door.h"
 #include "common/config/rig.h"
+#include "common/geometry/angle.h"
 #include "processes/console/evaluation.h"
 #include "processes/console/recording.h"
 #include "processes/console/rig_check.h"
@@ -195,14 +196,14 @@ Noise noise_given(const std::vector<double>& numbers) {
   const auto refuse = [](const std::string& why) { throw CLI::ValidationError("--noise", why); };
   for (const double number : numbers)
     if (!std::isfinite(number) || number <= 0) refuse("expected two standard deviations above 0");
-  const Noise noise{numbers[0], numbers[1] * M_PI / 180};
+  const Noise noise{numbers[0], numbers[1] * kDegree};
   if (noise.position_m > kNoiseCeiling.position_m) {
     refuse(fmt::format("{} m is no noise of a marker; did you mean: --noise {} {}", numbers[0],
                        numbers[0] / 1000, numbers[1]));
   }
   if (noise.rotation_rad > kNoiseCeiling.rotation_rad) {
     refuse(fmt::format("{} degrees are no noise of a marker; at most {:.0f} are", numbers[1],
-                       kNoiseCeiling.rotation_rad * 180 / M_PI));
+                       kNoiseCeiling.rotation_rad / kDegree));
   }
   return noise;
 }

@@ -7,7 +7,6 @@
 #include <algorithm>
 #include <array>
 #include <chrono>
-#include <csignal>
 #include <iostream>
 #include <limits>
 #include <memory>
@@ -18,6 +17,7 @@
 
 #include "common/bus/bus.h"
 #include "processes/console/hint.h"
+#include "processes/console/interruption.h"
 
 namespace bodyschema {
 namespace {
@@ -30,9 +30,6 @@ constexpr std::int64_t kCommandPeriod_us = 200'000;
 constexpr std::int64_t kSilent_us = 3'000'000;
 constexpr std::int64_t kPatience_us = 5'000'000;  // for what is answered at once
 constexpr std::int64_t kAlone_us = 2'500'000;     // twice what the processes of a group repeat in
-
-volatile std::sig_atomic_t interrupted = 0;
-void on_signal(int) { interrupted = 1; }
 
 const char* name_of_state(std::int8_t state) {
   constexpr std::array kNames = {"idle",    "waiting", "moving", "reached",
@@ -276,11 +273,6 @@ CLI::Validator within(double lowest, double highest) {
   throw CLI::RuntimeError(1);
 }
 
-void watch_signals() {
-  std::signal(SIGINT, on_signal);
-  std::signal(SIGTERM, on_signal);
-}
-
 /// Whether anybody is on the bus: whoever lives there says so once a second.
 class Company {
  public:
@@ -313,7 +305,7 @@ void follow(Bus& bus, const Company& company, TargetFollower& follower, Progress
                                 [&](const process_info_t& m) { follower.on_process_info(m); });
   while (follower.end() == TargetFollower::End::kOpen) {
     company.expect();
-    if (interrupted) follower.interrupt();
+    if (is_interrupted()) follower.interrupt();
     if (const auto target = follower.on_tick(clock_us())) bus.publish(kPoseTarget, *target);
     if (also) also(clock_us());
     line.show(follower.progress());
@@ -323,7 +315,7 @@ void follow(Bus& bus, const Company& company, TargetFollower& follower, Progress
 
 /// Makes the controller drop what `follower` follows no longer; says what became of it.
 std::string withdraw(Bus& bus, const Company& company, const TargetFollower& follower) {
-  interrupted = 0;  // a second Ctrl-C ends this too
+  clear_interruption();  // a second Ctrl-C ends this too
   const pose_target_t withdrawal = follower.withdrawal();
   TargetFollower dropped(withdrawal, kPatience_us);
   {
@@ -353,7 +345,7 @@ void run_target(const OperateArguments& arguments) {
   if (const std::string problem = check(target); !problem.empty()) {
     throw std::runtime_error("target: " + problem);
   }
-  watch_signals();
+  catch_interruption();
   Bus bus(arguments.in, arguments.in);
   const Company company(bus, arguments.in);
   TargetFollower follower(target, std::llround(arguments.timeout_s * 1e6), arguments.tolerance_m);
@@ -391,7 +383,7 @@ void run_target(const OperateArguments& arguments) {
 }
 
 void run_hold(const OperateArguments& arguments) {
-  watch_signals();
+  catch_interruption();
   Bus bus(arguments.in, arguments.in);
   const Company company(bus, arguments.in);
   const pose_target_t target = make_target(pose_target_t::KIND_HOLD);
@@ -413,7 +405,7 @@ void run_hold(const OperateArguments& arguments) {
     ProgressLine line;
     follow(bus, company, follower, line, tell_driver);
     const std::int64_t end_us = clock_us() + kPatience_us;
-    while (!is_answered && clock_us() < end_us && !interrupted) {
+    while (!is_answered && clock_us() < end_us && !is_interrupted()) {
       tell_driver(clock_us());
       bus.handle(std::chrono::milliseconds(50));
     }
@@ -430,7 +422,7 @@ void run_hold(const OperateArguments& arguments) {
 }
 
 void run_release(const OperateArguments& arguments) {
-  watch_signals();
+  catch_interruption();
   Bus bus(arguments.in, arguments.in);
   const Company company(bus, arguments.in);
   TargetFollower follower(make_target(pose_target_t::KIND_RELEASE), kPatience_us);
@@ -447,7 +439,7 @@ void run_release(const OperateArguments& arguments) {
 }
 
 void run_latch(const OperateArguments& arguments, std::int8_t kind) {
-  watch_signals();
+  catch_interruption();
   Bus bus(arguments.in, arguments.in);
   const Company company(bus, arguments.in);
   LatchFollower follower(kind, wall_clock_us());
@@ -457,7 +449,7 @@ void run_latch(const OperateArguments& arguments, std::int8_t kind) {
   bus.subscribe<control_status_t>(kControlStatus,
                                   [&](const control_status_t& m) { owns_arm = m.owns_arm == 1; });
   const std::int64_t end_us = clock_us() + kPatience_us;
-  while (!follower.is_done() && clock_us() < end_us && !interrupted) {
+  while (!follower.is_done() && clock_us() < end_us && !is_interrupted()) {
     company.expect();
     if (const auto command = follower.on_tick(clock_us())) bus.publish(kActionCommand, *command);
     bus.handle(std::chrono::milliseconds(50));
@@ -476,7 +468,7 @@ void run_latch(const OperateArguments& arguments, std::int8_t kind) {
   }
   // Whether the arm is the controller's is repeated at 1 Hz.
   const std::int64_t listen_us = clock_us() + 1'500'000;
-  while (!owns_arm && clock_us() < listen_us && !interrupted) {
+  while (!owns_arm && clock_us() < listen_us && !is_interrupted()) {
     bus.handle(std::chrono::milliseconds(50));
   }
   std::cout << "resumed; "

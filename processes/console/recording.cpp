@@ -19,8 +19,9 @@
 #include "common/bus/check.h"
 #include "common/bus/convert.h"
 #include "common/bus/event_log.h"
-#include "processes/console/hint.h"
+#include "common/geometry/angle.h"
 #include "common/schema/retained_samples.h"
+#include "processes/console/hint.h"
 
 namespace bodyschema {
 namespace {
@@ -253,7 +254,7 @@ PartObservation parse_observation(const Row& row, const Header& header) {
   if (header.has_noise) {
     const double position = row.number(i, "sp_m");
     if (position <= 0) throw row.error(i, "sp_m: expected a standard deviation above 0");
-    const double rotation = row.number(++i, "sr_deg") * (M_PI / 180);
+    const double rotation = row.number(++i, "sr_deg") * kDegree;
     if (rotation <= 0) throw row.error(i, "sr_deg: expected a standard deviation above 0");
     observation.covariance.diagonal() << Eigen::Vector3d::Constant(position * position),
         Eigen::Vector3d::Constant(rotation * rotation);

@@ -29,7 +29,7 @@ Eigen::Vector3d median_position(const Track& track) {
   for (int axis = 0; axis < 3; ++axis) {
     std::vector<double> values;
     for (const Pose& X : track) values.push_back(X.translation()[axis]);
-    result[axis] = median(values);
+    result[axis] = upper_median(values);
   }
   return result;
 }
@@ -39,7 +39,7 @@ double spread_m(const Track& track) {
   const Eigen::Vector3d middle = median_position(track);
   std::vector<double> distances;
   for (const Pose& X : track) distances.push_back((X.translation() - middle).norm());
-  return median(distances);
+  return upper_median(distances);
 }
 
 /// The pose whose x, y, z, w was read as w, x, y, z.
@@ -65,7 +65,7 @@ double disorder(const Track& relative) {
       Eigen::SelfAdjointEigenSolver<Eigen::Matrix3d>(scatter).eigenvectors().col(2);
   std::vector<double> beside;
   for (const Eigen::Vector3d& turn : turns) beside.push_back((turn - axis * axis.dot(turn)).norm());
-  return spread_m(relative) / std::max(median(distances), 1e-9) + median(beside);
+  return spread_m(relative) / std::max(upper_median(distances), 1e-9) + upper_median(beside);
 }
 
 /// Whether the rotations fit together as those of a body only when they are read in the other
@@ -134,7 +134,7 @@ std::vector<std::string> hints_of(const Recording& recording) {
     for (const ActionPoseSample& sample : recording.samples)
       for (const PartObservation& o : sample.parts)
         noise_m.push_back(std::sqrt(o.covariance(0, 0)));
-    if (median(noise_m) > kLargestNoise_m)
+    if (upper_median(noise_m) > kLargestNoise_m)
       hints.emplace_back("sp_m looks like millimetres; expected metres");
   }
   if (is_order_x_y_z_w(recording.samples, tracks))

@@ -7,7 +7,6 @@
 #include <CLI/CLI.hpp>
 #include <algorithm>
 #include <chrono>
-#include <csignal>
 #include <filesystem>
 #include <fstream>
 #include <iostream>
@@ -17,6 +16,7 @@
 #include <vector>
 
 #include "common/config/rig.h"
+#include "processes/console/interruption.h"
 #include "processes/console/log_follower.h"
 #include "processes/console/picture.h"
 #include "processes/console/report_page.h"
@@ -30,9 +30,6 @@ using Clock = std::chrono::steady_clock;
 
 constexpr std::chrono::seconds kShortestPeriod{10};
 constexpr int kPoll_ms = 1000;
-
-volatile std::sig_atomic_t interrupted = 0;
-void on_signal(int) { interrupted = 1; }
 
 struct ReportArguments {
   std::string source;
@@ -163,11 +160,7 @@ void run_report(const ReportArguments& arguments) {
     return;
   }
 
-  // No SA_RESTART: a wait ends early.
-  struct sigaction action {};
-  action.sa_handler = &on_signal;
-  ::sigaction(SIGTERM, &action, nullptr);
-  ::sigaction(SIGINT, &action, nullptr);
+  catch_interruption();
   // What the arm does comes first.
   ::setpriority(PRIO_PROCESS, 0, 10);
   auto write = [&, last = std::string()](std::optional<int> reload_s) mutable {
@@ -187,7 +180,7 @@ void run_report(const ReportArguments& arguments) {
   auto written_state = source.state();
   auto written = Clock::now();
   write(kReload_s);
-  while (!interrupted) {
+  while (!is_interrupted()) {
     ::poll(nullptr, 0, kPoll_ms);
     source.read();
     if (source.state() == written_state || Clock::now() - written < kShortestPeriod) continue;

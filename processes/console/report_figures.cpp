@@ -8,13 +8,13 @@
 #include <set>
 #include <utility>
 
+#include "common/geometry/angle.h"
 #include "common/geometry/pose.h"
 #include "processes/console/evaluation.h"
 
 namespace bodyschema {
 namespace {
 
-constexpr double kDegrees = 180 / M_PI;
 constexpr std::size_t kMostDots = 150;
 /// Seen on white and on black.
 const char* const kBlue = "#4a86c5";
@@ -31,7 +31,7 @@ std::string number(double value) {
 /// Components as EdgeSlice has them.
 Vector6d components(const Pose& X, const Pose& X_middle) {
   Vector6d result;
-  result << X.translation() * 1e3, log_so3(X_middle.linear().transpose() * X.linear()) * kDegrees;
+  result << X.translation() * 1e3, log_so3(X_middle.linear().transpose() * X.linear()) / kDegree;
   return result;
 }
 
@@ -41,7 +41,7 @@ Vector6d component_sigmas(const Pose& X, const Pose& X_middle, const Matrix6d& c
   turned.tail<3>() = log_so3(X_middle.linear().transpose() * X.linear());
   Matrix6d J = Matrix6d::Zero();
   J.topLeftCorner<3, 3>() = X.linear() * 1e3;
-  J.bottomRightCorner<3, 3>() = right_jacobian_inverse(turned).bottomRightCorner<3, 3>() * kDegrees;
+  J.bottomRightCorner<3, 3>() = right_jacobian_inverse(turned).bottomRightCorner<3, 3>() / kDegree;
   return (J * covariance * J.transpose()).diagonal().cwiseMax(0).cwiseSqrt();
 }
 

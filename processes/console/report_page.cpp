@@ -9,17 +9,17 @@
 #include <utility>
 #include <vector>
 
+#include "common/geometry/angle.h"
 #include "common/plot/plot.h"
 #include "processes/console/evaluation.h"
 #include "processes/console/health_view.h"
+#include "processes/console/hint.h"
 #include "processes/console/recording.h"
 #include "processes/console/report_figures.h"
 #include "processes/structure_learner/learn.h"
 
 namespace bodyschema {
 namespace {
-
-constexpr double kDegrees = 180 / M_PI;
 
 const char* const kStyle = R"(
 :root{color-scheme:light dark;--ink:#1d2125;--paper:#fff;--muted:#626b75;--line:#dfe3e8;--soft:#f4f6f8;
@@ -128,12 +128,7 @@ class Table {
 };
 
 std::string millimetres(double m) { return fmt::format("{:.2f} mm", m * 1e3); }
-std::string degrees(double rad) { return fmt::format("{:.2f}°", rad * kDegrees); }
-
-std::string duration(double s) {
-  if (s < 120) return fmt::format("{:.0f} s", s);
-  return s < 7200 ? fmt::format("{:.0f} min", s / 60) : fmt::format("{:.1f} h", s / 3600);
-}
+std::string degrees(double rad) { return fmt::format("{:.2f}°", rad / kDegree); }
 
 /// "1 sample", "2 samples"
 std::string counted(std::int64_t count, const std::string& noun) {
@@ -433,7 +428,8 @@ class Page {
     std::string html = "<section><h2>Held-out error</h2>\n";
     if (held_out_.empty())
       return html +
-             "<p>No held-out sample yet of the body as it is, so nothing to judge by.</p></section>\n";
+             "<p>No held-out sample yet of the body as it is, so nothing to judge "
+             "by.</p></section>\n";
     const auto all = record_.watch().held_out();
     const std::vector<BodyMark> marks = body_marks(record_);
     const auto versions = version_errors(record_.versions(), all, marks, report_.end_effector);
@@ -445,8 +441,7 @@ class Page {
               "ever learned: distance of the predicted from the {} origin of a part, relative to "
               "the root, median over the samples; against {}. {}A version is judged on the parts "
               "it connects, so a line may rise when a part is added.",
-              versions.size(), record_.num_versions(),
-              counted(std::ssize(all), "held-out sample"),
+              versions.size(), record_.num_versions(), counted(std::ssize(all), "held-out sample"),
               record_.watch().has_truth() ? "true" : "seen", judge(),
               marks.empty()
                   ? ""

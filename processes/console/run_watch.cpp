@@ -7,12 +7,12 @@
 #include <iterator>
 
 #include "common/bus/convert.h"
+#include "common/geometry/angle.h"
 #include "processes/console/health_view.h"
 
 namespace bodyschema {
 namespace {
 
-constexpr double kDegrees = 180 / M_PI;
 constexpr std::int64_t kSilentUs = 3'000'000;
 
 }  // namespace
@@ -168,7 +168,7 @@ std::string RunWatch::progress(const std::optional<SampleGoal>& goal,
   }
   if (health_ && health_->worst_position_m >= 0) {
     line += fmt::format(" · worst part {:.1f} mm {:.2f}° off, as the camera sees it, held out",
-                        health_->worst_position_m * 1e3, health_->worst_rotation_rad * kDegrees);
+                        health_->worst_position_m * 1e3, health_->worst_rotation_rad / kDegree);
   }
   if (health_) {
     if (const auto verdict = verdict_of(health_->findings); !verdict.wrong.empty())

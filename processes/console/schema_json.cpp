@@ -4,12 +4,12 @@
 
 #include <cmath>
 
+#include "common/geometry/angle.h"
+
 namespace bodyschema {
 namespace {
 
 using nlohmann::ordered_json;
-
-constexpr double kDegrees = 180 / M_PI;
 
 const char* reason_name(Unconnected reason) {
   switch (reason) {
@@ -59,7 +59,7 @@ ordered_json edge_json(const BodySchema& schema, const Edge& edge) {
           {"signals", signal_names(schema, edge.signals())},
           {"kind", edge.kind()},
           {"position_rms_m", edge.position_rms_m},
-          {"rotation_rms_deg", edge.rotation_rms_rad * kDegrees},
+          {"rotation_rms_deg", edge.rotation_rms_rad / kDegree},
           {"samples", edge.num_samples},
           {"outliers", edge.num_outliers}};
 }
@@ -110,7 +110,7 @@ ordered_json structure_json(const BodySchema& schema, const std::vector<Outlier>
                        {"outliers", ordered_json::array()},
                        {"noise",
                         {{"position_m", schema.noise.position_m},
-                         {"rotation_deg", schema.noise.rotation_rad * kDegrees}}}};
+                         {"rotation_deg", schema.noise.rotation_rad / kDegree}}}};
   if (source) json["noise"]["from"] = name_of(*source).first;
   for (const Edge& edge : schema.edges) json["edges"].push_back(edge_json(schema, edge));
   for (const UnconnectedPart& part : schema.unconnected) {
@@ -131,8 +131,8 @@ ordered_json errors_json(int num_samples, const std::vector<PartErrors>& errors)
     item["position_median_m"] = value(part.position_median_m);
     item["position_rms_m"] = value(part.position_rms_m);
     item["position_max_m"] = value(part.position_max_m);
-    item["rotation_median_deg"] = value(part.rotation_median_rad * kDegrees);
-    item["rotation_rms_deg"] = value(part.rotation_rms_rad * kDegrees);
+    item["rotation_median_deg"] = value(part.rotation_median_rad / kDegree);
+    item["rotation_rms_deg"] = value(part.rotation_rms_rad / kDegree);
     json["parts"].push_back(std::move(item));
   }
   return json;
@@ -147,9 +147,10 @@ ordered_json schema_json(const BodySchema& schema) {
   json["X_CR"] = pose_json(schema.X_CR);
   json["signals"] = ordered_json::array();
   for (const Signal& signal : schema.signals) {
-    json["signals"].push_back(
-        {{"name", signal.name}, {"lower", signal.lower}, {"upper", signal.upper},
-         {"warp", signal.warp}});
+    json["signals"].push_back({{"name", signal.name},
+                               {"lower", signal.lower},
+                               {"upper", signal.upper},
+                               {"warp", signal.warp}});
   }
   static const char* const kStates[] = {"OK", "SUSPECT", "INVALID", "PROVISIONAL"};
   for (std::size_t i = 0; i < schema.edges.size(); ++i) {
@@ -186,7 +187,7 @@ std::string structure_text(const BodySchema& schema, std::optional<NoiseSource> 
     text += fmt::format("  {:>3} → {:<3} {:<9} {:<12} {:7.2f} mm {:6.2f}°\n", edge.from, edge.to,
                         edge.kind(),
                         fmt::format("{{{}}}", fmt::join(signal_names(schema, edge.signals()), ",")),
-                        edge.position_rms_m * 1e3, edge.rotation_rms_rad * kDegrees);
+                        edge.position_rms_m * 1e3, edge.rotation_rms_rad / kDegree);
   }
   for (const UnconnectedPart& part : schema.unconnected) {
     text += fmt::format("  {:>3}   not connected: {}\n", part.part, reason_text(part));
@@ -196,7 +197,7 @@ std::string structure_text(const BodySchema& schema, std::optional<NoiseSource> 
     text += fmt::format("  signals without effect: {}\n", fmt::join(unused, ", "));
   if (schema.noise.position_m > 0) {
     text += fmt::format("  noise per axis and marker: {:.2f} mm {:.2f}°{}\n",
-                        schema.noise.position_m * 1e3, schema.noise.rotation_rad * kDegrees,
+                        schema.noise.position_m * 1e3, schema.noise.rotation_rad / kDegree,
                         source ? std::string(", ") + name_of(*source).second : "");
   }
   const auto undecided = signal_names(schema, schema.undecided_signals);
@@ -214,8 +215,8 @@ std::string errors_text(const std::vector<PartErrors>& errors) {
     }
     text += fmt::format("  {:>4} {:>6} {:7.2f} mm {:5.2f}° {:7.2f} mm {:5.2f}° {:7.2f} mm\n",
                         part.part, part.count, part.position_median_m * 1e3,
-                        part.rotation_median_rad * kDegrees, part.position_rms_m * 1e3,
-                        part.rotation_rms_rad * kDegrees, part.position_max_m * 1e3);
+                        part.rotation_median_rad / kDegree, part.position_rms_m * 1e3,
+                        part.rotation_rms_rad / kDegree, part.position_max_m * 1e3);
   }
   return text;
 }

@@ -8,6 +8,7 @@
 #include <sstream>
 #include <utility>
 
+#include "common/geometry/angle.h"
 #include "processes/console/health_view.h"
 #include "processes/console/hint.h"
 #include "processes/console/run_record.h"
@@ -17,7 +18,6 @@ namespace {
 
 using nlohmann::ordered_json;
 
-constexpr double kDegrees = 180 / M_PI;
 const char* const kPhases[] = {"starting", "waiting", "working", "done", "ended"};
 const char* const kMotions[] = {"idle",     "accepted", "moving",  "settled",
                                 "rejected", "stopped",  "expired", "holding"};
@@ -27,12 +27,6 @@ const char* const kEdgeStates[] = {"OK", "SUSPECT", "INVALID", "PROVISIONAL"};
 const char* const kReasons[] = {"never seen", "not enough data yet", "no valid model"};
 /// Counters of a bus that say that something did not get through.
 const char* const kLosses[] = {"malformed", "senseless", "skipped", "refused", "dropped", "lost"};
-
-std::string duration(double s) {
-  if (s < 100) return fmt::format("{:.0f} s", s);
-  if (s < 6000) return fmt::format("{:.0f} min", s / 60);
-  return fmt::format("{:.1f} h", s / 3600);
-}
 
 double seconds(std::int64_t from_us, std::int64_t to_us) {
   return static_cast<double>(to_us - from_us) * 1e-6;
@@ -400,7 +394,7 @@ std::string StatusBoard::text(int width) const {
       line(fmt::format(
           "         worst part off by {:.1f} mm {:.2f}° (median, as the camera sees it) in {} "
           "held-out samples",
-          health_->worst_position_m * 1e3, health_->worst_rotation_rad * kDegrees,
+          health_->worst_position_m * 1e3, health_->worst_rotation_rad / kDegree,
           health_->num_test_samples));
     }
     for (const moved_tag_t& tag : schema->moved_tags)
@@ -417,7 +411,7 @@ std::string StatusBoard::text(int width) const {
           "  {:>3} → {:<3} {:<11}  {:<6} {:<12} {:6.2f} mm {:6.2f}°", edge.from_part, edge.to_part,
           kEdgeStates[health ? health->edge_state : edge.state], kind_of(edge),
           fmt::format("{{{}}}", fmt::join(signals_of(*schema, edge), ",")),
-          edge.position_rms_m * 1e3, edge.rotation_rms_rad * kDegrees);
+          edge.position_rms_m * 1e3, edge.rotation_rms_rad / kDegree);
       if (health) {
         row += fmt::format(" {:>5} {:>9}", health->num_tests,
                            health->median_mahalanobis2 < 0
@@ -444,7 +438,7 @@ std::string StatusBoard::text(int width) const {
                       part.position_median_m < 0
                           ? "–"
                           : fmt::format("{:.2f} mm {:.2f}°", part.position_median_m * 1e3,
-                                        part.rotation_median_rad * kDegrees));
+                                        part.rotation_median_rad / kDegree));
       for (const std::string& flag : flags_of(part)) row += "  " + flag;
       line(row);
     }
@@ -545,7 +539,7 @@ ordered_json StatusBoard::json() const {
            {"kind", kind_of(edge)},
            {"signals", signals_of(*schema, edge)},
            {"position_rms_m", edge.position_rms_m},
-           {"rotation_rms_deg", edge.rotation_rms_rad * kDegrees},
+           {"rotation_rms_deg", edge.rotation_rms_rad / kDegree},
            {"state", kEdgeStates[health ? health->edge_state : edge.state]},
            {"drifting", health && health->edge_is_drifting == 1},
            {"cusum",
@@ -577,7 +571,7 @@ ordered_json StatusBoard::json() const {
            {"tests", part.num_predicted},
            {"position_median_m", is_tested ? ordered_json(part.position_median_m) : nullptr},
            {"rotation_median_deg",
-            is_tested ? ordered_json(part.rotation_median_rad * kDegrees) : nullptr}});
+            is_tested ? ordered_json(part.rotation_median_rad / kDegree) : nullptr}});
     }
     for (const health_event_t& event : health_->events)
       json["events"].push_back(event_json(event, signals));

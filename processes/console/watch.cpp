@@ -10,7 +10,6 @@
 
 #include <CLI/CLI.hpp>
 #include <chrono>
-#include <csignal>
 #include <deque>
 #include <fstream>
 #include <iostream>
@@ -27,7 +26,9 @@
 #include "common/bus/rig_door.h"
 #include "common/bus/sample_intake.h"
 #include "common/config/rig.h"
+#include "common/geometry/angle.h"
 #include "processes/console/health_view.h"
+#include "processes/console/interruption.h"
 #include "processes/console/picture.h"
 #include "processes/console/run_watch.h"
 #include "processes/console/schema_json.h"
@@ -38,9 +39,6 @@ namespace bodyschema {
 namespace {
 
 using Clock = std::chrono::steady_clock;
-
-volatile std::sig_atomic_t interrupted = 0;
-void on_signal(int) { interrupted = 1; }
 
 struct WatchArguments {
   std::string in = default_url();
@@ -322,7 +320,7 @@ void report(const RunWatch& watch, const BestPicture& picture, const WatchArgume
       std::cout << fmt::format(
           "(The line of progress and `status` go by what the camera sees, noise and bias of the "
           "markers included: worst part {:.1f} mm {:.2f}°.)\n",
-          watch.health()->worst_position_m * 1e3, watch.health()->worst_rotation_rad * 180 / M_PI);
+          watch.health()->worst_position_m * 1e3, watch.health()->worst_rotation_rad / kDegree);
     }
   }
   std::cout << "\nFiles in " << folder.string() << "\n";
@@ -359,8 +357,7 @@ void tell_of_failures(const WatchArguments& arguments, std::set<std::string>* to
 void run_watch(const WatchArguments& arguments) {
   // stdout is for the result.
   spdlog::set_default_logger(spdlog::stderr_color_mt("watch"));
-  std::signal(SIGINT, on_signal);
-  std::signal(SIGTERM, on_signal);
+  catch_interruption();
   RunWatch watch;
   BestPicture picture;
   const auto microseconds = [](auto duration) {
@@ -449,7 +446,7 @@ void run_watch(const WatchArguments& arguments) {
           "the recording gave no sample: it holds no settled action that was seen");
     return waited_s > 1 && watch.is_caught_up();
   };
-  while (!is_finished() && !interrupted) {
+  while (!is_finished() && !is_interrupted()) {
     images.handle(std::chrono::milliseconds(0));
     bus.handle(std::chrono::milliseconds(50));
     intake.on_tick(now_us());
@@ -478,7 +475,7 @@ void run_watch(const WatchArguments& arguments) {
   line.end();
   const Lost lost{intake.lost(), std::max<std::int64_t>(0, num_played - num_heard())};
   report(watch, picture, arguments, lost, seconds());
-  if (interrupted) throw std::runtime_error("interrupted before the end");
+  if (is_interrupted()) throw std::runtime_error("interrupted before the end");
 }
 
 }  // namespace

@@ -7,6 +7,7 @@
 #include "common/bus/convert.h"
 #include "common/camera/decode_image.h"
 #include "common/config/yaml.h"
+#include "common/geometry/angle.h"
 #include "processes/marker_estimator/tag_pose.h"
 
 namespace bodyschema {
@@ -42,7 +43,7 @@ MarkerEstimatorConfig MarkerEstimatorConfig::load(const std::filesystem::path& f
   config.min_border_contrast = yaml.number("min_border_contrast", 0, 1);
   config.min_side_px = yaml.number("min_side_px", 0, 10000);
   config.max_reprojection_error_px = yaml.number("max_reprojection_error_px", 1e-3, 100);
-  config.max_tilt_rad = yaml.number("max_tilt_deg", 0, 90) * M_PI / 180;
+  config.max_tilt_rad = yaml.number("max_tilt_deg", 0, 90) * kDegree;
   yaml.finish();
   return config;
 }

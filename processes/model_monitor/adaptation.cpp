@@ -5,6 +5,7 @@
 #include <limits>
 #include <stdexcept>
 
+#include "common/geometry/angle.h"
 #include "common/statistics/median.h"
 #include "processes/model_monitor/schema_difference.h"
 
@@ -19,7 +20,7 @@ constexpr std::int64_t kLongestUnclear = 3;
 /// Samples below which nothing is found out where an edge is soft.
 constexpr int kFewestSoft = 3;
 /// In a stream a marker that is read farther than this from where it should be is turned over.
-constexpr double kTurnedOver_rad = 120 * M_PI / 180;
+constexpr double kTurnedOver_rad = 120 * kDegree;
 /// Samples after a replacement at which all forms are tried again.
 constexpr int kRefits[] = {1, 2, 3, 4, 5, 7, 11, 19, 30};
 /// Samples up to which a change may turn out to be one of what is next to its place.
@@ -43,7 +44,7 @@ constexpr int kQuietSamples = 32;
 /// What two fits of one edge to tags may differ by, anywhere in its range: a body of the history
 /// that is as near to the first is the first, learned again. Chosen: an order of magnitude above
 /// the residuals of rendered tags (0.3 mm, 0.1°), below any fault of the experiments.
-constexpr Noise kSameBody{0.005, 1 * M_PI / 180};
+constexpr Noise kSameBody{0.005, 1 * kDegree};
 
 /// Of a suspicion so many samples old: growing steps bound the work of one that lasts.
 bool is_worth_a_fit(std::int64_t age) {
@@ -188,7 +189,7 @@ void Adaptation::calibrate() {
         if (d2 >= 0) distances.push_back(d2);
     }
     if (distances.size() < kFewestDistances) return;
-    const double scale = std::sqrt(median(distances) / kMedianChiSquare6);
+    const double scale = std::sqrt(upper_median(distances) / kMedianChiSquare6);
     noise_.scale = std::clamp(noise_.scale * scale, options_.least_noise_scale, kLargestScale);
   }
   // A few samples tell no better than this.
@@ -199,7 +200,7 @@ void Adaptation::watch_noise(const TreeFilter::Judgement& judgement) {
   for (std::size_t n = 0; n < judgement.believed.size(); ++n)
     if (judgement.believed[n] == 1) quiet_distances_.push_back(judgement.squared_distance[n]);
   if (++num_quiet_ < kQuietSamples || quiet_distances_.size() < kFewestDistances) return;
-  const double scale = std::sqrt(median(quiet_distances_) / kMedianChiSquare6);
+  const double scale = std::sqrt(upper_median(quiet_distances_) / kMedianChiSquare6);
   quiet_distances_.clear();
   num_quiet_ = 0;
   if (std::abs(std::log(scale)) < 0.05) return;

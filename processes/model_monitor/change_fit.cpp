@@ -5,6 +5,7 @@
 #include <cmath>
 #include <limits>
 
+#include "common/statistics/student_t.h"
 #include "processes/model_monitor/learned_edge.h"
 
 namespace bodyschema {
@@ -15,7 +16,6 @@ using Form = BodyChange::Form;
 constexpr int kIterations = 16;
 constexpr double kLargestStep =
     0.7;  // of θ, in prior standard deviations of a transform: m and rad
-constexpr double kStudentNu = 4;
 /// Starts that are followed up.
 constexpr std::size_t kClimbs = 4;
 /// Evidence behind the best change of a place, by the place's measurements, that all observations

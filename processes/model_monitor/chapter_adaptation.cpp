@@ -10,7 +10,7 @@ namespace bodyschema {
 namespace {
 
 /// A model needs that many to be learned, and as many to be tested.
-constexpr std::size_t kFewest = 2;
+constexpr std::size_t kFewestSamples = 2;
 /// Of one pair of parts.
 constexpr std::size_t kMaxModels = 64;
 
@@ -67,7 +67,7 @@ void ChapterAdaptation::learn(Model* model, const ActionPoseSample& sample) cons
   const Edge edge = model->edge;
   if (!sample.find(edge.from) || !sample.find(edge.to)) return;
   model->training.push_back(sample);
-  if (model->training.size() < kFewest) return;
+  if (model->training.size() < kFewestSamples) return;
   std::vector<const ActionPoseSample*> samples;
   for (const ActionPoseSample& s : model->training) samples.push_back(&s);
   model->edge = learn_edge_(edge.from, edge.to, model->signals, samples);
@@ -76,7 +76,8 @@ void ChapterAdaptation::learn(Model* model, const ActionPoseSample& sample) cons
 
 void ChapterAdaptation::test(Model* model, const std::deque<ActionPoseSample>& window) const {
   // A model that has not learned anything yet is neither valid nor refuted.
-  model->is_tested = !window.empty() && (!model->is_learning || model->training.size() >= kFewest);
+  model->is_tested =
+      !window.empty() && (!model->is_learning || model->training.size() >= kFewestSamples);
   if (!model->is_tested) return;
   for (std::size_t n = model->residuals.size(); n < window.size(); ++n) {
     const ActionPoseSample& sample = window[n];

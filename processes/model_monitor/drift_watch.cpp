@@ -4,6 +4,7 @@
 #include <Eigen/Eigenvalues>
 #include <cmath>
 
+#include "common/statistics/student_t.h"
 #include "processes/model_monitor/body_change.h"
 
 namespace bodyschema {
@@ -15,9 +16,6 @@ constexpr std::size_t kMean = 36;
 constexpr std::size_t kFewest = 16;
 /// Of a straight line through the newest measurements.
 constexpr std::size_t kFollowed = 40;
-constexpr double kStudentNu = 4;
-
-double weight(double d2) { return (kStudentNu + 6) / (kStudentNu + d2); }
 
 struct Reading {
   double time;  // samples, 0 is the newest
@@ -43,7 +41,7 @@ Line fit_line(const std::vector<Reading>& readings) {
       const Vector6d e = r.xi - line.ab.head<6>() - r.time * line.ab.tail<6>();
       const double d2 = e.dot(r.information * e);
       line.cost += (kStudentNu + 6) / 2 * std::log1p(d2 / kStudentNu);
-      const Matrix6d I = (round == 0 ? 1 : weight(d2)) * r.information;
+      const Matrix6d I = (round == 0 ? 1 : robust_weight(d2)) * r.information;
       H.topLeftCorner<6, 6>() += I;
       H.topRightCorner<6, 6>() += r.time * I;
       H.bottomRightCorner<6, 6>() += r.time * r.time * I;
@@ -68,7 +66,7 @@ double mean_offset(const std::vector<Reading>& readings, const Matrix6d& model) 
     Vector6d g = Vector6d::Zero();
     for (const Reading& r : readings) {
       const Vector6d e = r.xi - mean;
-      const Matrix6d I = weight(e.dot(r.information * e)) * r.information;
+      const Matrix6d I = robust_weight(e.dot(r.information * e)) * r.information;
       H += I;
       g += I * r.xi;
     }

@@ -4,10 +4,10 @@
 #include <cmath>
 #include <cstdio>
 
+#include "common/geometry/angle.h"
+
 namespace bodyschema {
 namespace {
-
-constexpr double kDegrees = 180 / M_PI;
 
 /// With a true minus sign.
 std::string number(double value, int decimals) {
@@ -26,7 +26,7 @@ std::string measured(double value, double sd, const std::string& unit) {
 
 std::string distance_and_angle(const ChangeSize& size) {
   return measured(size.amounts[0] * 1e3, size.sds[0] < 0 ? -1 : size.sds[0] * 1e3, " mm") + ", " +
-         measured(size.amounts[1] * kDegrees, size.sds[1] < 0 ? -1 : size.sds[1] * kDegrees, "°");
+         measured(size.amounts[1] / kDegree, size.sds[1] < 0 ? -1 : size.sds[1] / kDegree, "°");
 }
 
 std::string counted(int count, const char* noun) {

@@ -8,6 +8,7 @@
 #include <optional>
 
 #include "common/statistics/median.h"
+#include "common/statistics/student_t.h"
 #include "processes/model_monitor/tree_filter.h"
 
 namespace bodyschema {
@@ -30,7 +31,6 @@ constexpr int kRounds = 5;
 constexpr double kMostOutliers = 0.25;
 /// Cells that the samples do not tell apart [nats].
 constexpr double kAsLikely = 2;
-constexpr double kStudentNu = 4;
 /// Of the old model's cost on measurements that were left out.
 constexpr double kForeseen = 0.5;
 /// Makes a process certain without a change of its mean.
@@ -159,7 +159,7 @@ Eigen::VectorXd typical_variances(const Targets& targets) {
     std::vector<double> squares;
     for (Eigen::Index t = 0; t < targets.num_samples(); ++t)
       squares.push_back(targets.y(c, t) * targets.y(c, t));
-    result(c) = std::max(median(std::move(squares)) / 0.455 - targets.noise(c),
+    result(c) = std::max(upper_median(std::move(squares)) / 0.455 - targets.noise(c),
                          kLeastVariance * targets.noise(c));
   }
   return result;

@@ -8,7 +8,9 @@
 
 #include "common/bus/convert.h"
 #include "common/config/yaml.h"
+#include "common/geometry/angle.h"
 #include "common/schema/kinematic_path.h"
+#include "common/statistics/median.h"
 
 namespace bodyschema {
 namespace {
@@ -26,11 +28,9 @@ constexpr std::size_t kMaxKept = 12;
 /// to go through again.
 constexpr std::int64_t kRenewal = 500;
 
-/// Mean of the two middle values where their number is even; −1 if there is none.
-double median(std::vector<double> values) {
-  if (values.empty()) return -1;
-  std::sort(values.begin(), values.end());
-  return 0.5 * (values[(values.size() - 1) / 2] + values[values.size() / 2]);
+/// −1 if there is no value.
+double median_or_none(std::vector<double> values) {
+  return values.empty() ? -1 : median(std::move(values));
 }
 
 Matrix6d diagonal(const Noise& noise) {
@@ -73,7 +73,7 @@ ModelMonitorConfig ModelMonitorConfig::load(const std::filesystem::path& file) {
   config.max_mahalanobis2 = yaml.number("max_mahalanobis2", 1, 1e6);
   config.max_outlier_share = yaml.number("max_outlier_share", 0, 1);
   config.model_error.position_m = yaml.number("model_error_position_m", 0, 1);
-  config.model_error.rotation_rad = yaml.number("model_error_rotation_deg", 0, 90) * (M_PI / 180);
+  config.model_error.rotation_rad = yaml.number("model_error_rotation_deg", 0, 90) * kDegree;
   config.false_alarm_rate = yaml.number("false_alarm_rate", 0, 0.01);
   config.outlier_rate = yaml.number("outlier_rate", 0, 0.5);
   yaml.finish();
@@ -175,7 +175,8 @@ void ModelMonitor::restore(const MonitorMemory& memory) {
 bool ModelMonitor::on_sample(const sample_t& message) {
   if (message.sample_index <= last_sample_index_) return false;
   last_sample_index_ = message.sample_index;
-  for (const auto& part : message.parts) seen_in_[part.part_id].later.push_back(message.sample_index);
+  for (const auto& part : message.parts)
+    seen_in_[part.part_id].later.push_back(message.sample_index);
   ActionPoseSample sample = from_message(message);
   if (sample.purpose == Purpose::kTest) {
     test_indices_.later.push_back(sample.sample_index);
@@ -220,9 +221,7 @@ bool ModelMonitor::on_learned_schema(const body_schema_t& proposal) {
   return true;
 }
 
-std::int64_t ModelMonitor::num_tests(std::int64_t last) const {
-  return test_indices_.up_to(last);
-}
+std::int64_t ModelMonitor::num_tests(std::int64_t last) const { return test_indices_.up_to(last); }
 
 bool ModelMonitor::is_test(std::int64_t sample_index) const {
   return std::binary_search(test_indices_.later.begin(), test_indices_.later.end(), sample_index);
@@ -348,7 +347,7 @@ ModelMonitor::EdgeTest ModelMonitor::test(const BodySchema& schema, const Edge& 
     result.num_refuting += smallest > config_.max_mahalanobis2;
     distances.push_back(smallest);
   }
-  result.median_mahalanobis2 = median(distances);
+  result.median_mahalanobis2 = median_or_none(distances);
   return result;
 }
 
@@ -567,8 +566,8 @@ void ModelMonitor::assess(const BodySchema& schema) const {
     health.marker_cusum = health.camera_cusum = -1;
     health.num_predicted = static_cast<std::int32_t>(position_errors.size());
     health.visibility = double(num_seen) / double(std::max<std::int64_t>(judged_sample_ + 1, 1));
-    health.position_median_m = median(position_errors);
-    health.rotation_median_rad = median(rotation_errors);
+    health.position_median_m = median_or_none(position_errors);
+    health.rotation_median_rad = median_or_none(rotation_errors);
     health_.worst_position_m = std::max(health_.worst_position_m, health.position_median_m);
     health_.worst_rotation_rad = std::max(health_.worst_rotation_rad, health.rotation_median_rad);
     parts.push_back(health);

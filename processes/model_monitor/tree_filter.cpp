@@ -6,11 +6,12 @@
 #include <map>
 #include <set>
 
+#include "common/geometry/angle.h"
+
 namespace bodyschema {
 namespace {
 
 constexpr double kRoom_m3 = 8;
-constexpr double kDegree = M_PI / 180;
 /// Tilt of a marker that was read in its other way, standard deviation about x and y.
 constexpr double kTilt_rad = 35 * kDegree;
 /// Below this squared distance an outlier density cannot matter.

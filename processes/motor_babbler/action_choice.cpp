@@ -5,10 +5,12 @@
 #include <cmath>
 #include <stdexcept>
 
+#include "common/geometry/angle.h"
+
 namespace bodyschema {
 namespace {
 
-constexpr double kViewWidth_rad = 15 * M_PI / 180;
+constexpr double kViewWidth_rad = 15 * kDegree;
 constexpr double kSignalWidth = 0.4;     // rms over the signals, of half ranges
 constexpr double kPriorCount = 1;        // past actions that the overall share counts for
 constexpr double kPotentialPrior = 0.1;  // Λ: a tenth of one sample

@@ -8,6 +8,7 @@
 
 #include "common/bus/convert.h"
 #include "common/config/yaml.h"
+#include "common/geometry/angle.h"
 
 namespace bodyschema {
 namespace {
@@ -74,7 +75,7 @@ MotorBabblerConfig MotorBabblerConfig::load(const std::filesystem::path& file) {
   config.stop.min_samples = stop.integer("min_samples", 1, config.stop.max_samples);
   config.stop.min_test_samples = stop.integer("min_test_samples", 1, config.stop.max_samples);
   config.stop.position_m = stop.number("position_m", 0, 10);
-  config.stop.rotation_rad = stop.number("rotation_deg", 0, 180) * (M_PI / 180);
+  config.stop.rotation_rad = stop.number("rotation_deg", 0, 180) * kDegree;
   yaml.finish();
   return config;
 }

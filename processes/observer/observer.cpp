@@ -9,6 +9,7 @@
 #include "bodyschema/action_command_t.hpp"
 #include "common/bus/convert.h"
 #include "common/config/yaml.h"
+#include "common/geometry/angle.h"
 
 namespace bodyschema {
 namespace {
@@ -19,7 +20,6 @@ constexpr std::size_t kMaxRests = 16;
 constexpr std::size_t kMaxDone = 64;
 /// Frames and the driver's statuses of one clock are never so far apart.
 constexpr std::int64_t kMaxApartUs = 10'000'000;
-constexpr double kDegree = M_PI / 180;
 
 std::string name_of(const motion_status_t& status) {
   return "action " + std::to_string(status.action_id) + " of " + status.source;
@@ -125,8 +125,7 @@ std::optional<sample_t> Observer::on_motion_status(const motion_status_t& status
   const bool is_settled_move = status.state == motion_status_t::STATE_SETTLED &&
                                status.kind == action_command_t::KIND_MOVE &&
                                status.rest_since_utime >= 0 && !status.commanded.empty();
-  if (is_settled_move && 
-      std::find(done_.begin(), done_.end(), key_of(status)) == done_.end()) {
+  if (is_settled_move && std::find(done_.begin(), done_.end(), key_of(status)) == done_.end()) {
     const auto same = std::find_if(rests_.begin(), rests_.end(), [&](const Rest& rest) {
       return key_of(rest.status) == key_of(status);
     });

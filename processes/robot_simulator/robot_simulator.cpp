@@ -10,6 +10,7 @@
 #include "common/bus/convert.h"
 #include "common/bus/event_log.h"
 #include "common/config/yaml.h"
+#include "common/geometry/angle.h"
 
 namespace bodyschema {
 namespace {
@@ -69,7 +70,7 @@ RobotSimulatorConfig RobotSimulatorConfig::load(const std::filesystem::path& fil
   config.rig_folder = file.parent_path();
   config.speed_share = yaml.number("speed_share", 0.01, 1);
   const Yaml settled = yaml.section("settled");
-  config.settled_speed_rad_per_s = settled.number("speed_deg_per_s", 1e-6, 10) * (M_PI / 180);
+  config.settled_speed_rad_per_s = settled.number("speed_deg_per_s", 1e-6, 10) * kDegree;
   config.settled_speed_m_per_s = settled.number("speed_mm_per_s", 1e-6, 10) / 1000;
   config.settled_for_s = settled.number("for_s", 0.002, 10);
   config.settle_timeout_s = settled.number("timeout_s", 0.1, 1000);

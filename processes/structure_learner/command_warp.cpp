@@ -13,7 +13,7 @@ namespace bodyschema {
 namespace {
 
 constexpr int kBasis = 20;
-constexpr int kMaxFrames = 150;       // a pair, evenly chosen
+constexpr int kWarpFrames = 150;      // a pair, evenly chosen
 constexpr int kMaxModelsASignal = 4;  // the most precise ones
 constexpr int kMaxRounds = 12;
 /// Slack along the motion, in half ranges: far more than any warp, far less than the range.
@@ -213,7 +213,7 @@ class WarpEstimate {
   }
 
   PairData pair_data(int part_i, int part_j) const {
-    return make_pair_data(samples_, part_i, part_j, options_.measurement, kMaxFrames);
+    return make_pair_data(samples_, part_i, part_j, options_.measurement, kWarpFrames);
   }
 
   /// Position of every sample within the signal's limits, −1 … 1.

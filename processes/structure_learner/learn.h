@@ -5,6 +5,7 @@
 #include <optional>
 #include <vector>
 
+#include "common/geometry/angle.h"
 #include "common/schema/body_schema.h"
 #include "common/schema/sample.h"
 #include "processes/structure_learner/noise_estimate.h"
@@ -15,7 +16,7 @@ namespace bodyschema {
 /// What the view adds to the noise of real tags, whatever the rig: measured in
 /// tests/experiments/README.md. The rigs' structure_learner.yaml says the same; recordings of
 /// camera markers without a rig are learned with this.
-inline constexpr Noise kTagModelError{.position_m = 0.001, .rotation_rad = 0.2 * M_PI / 180};
+inline constexpr Noise kTagModelError{.position_m = 0.001, .rotation_rad = 0.2 * kDegree};
 
 /// X_CR of `schema` with its covariance: the robust mean of the poses of its root, Student-t
 /// weights. Left alone if the root is never seen.
@@ -53,8 +54,8 @@ struct LearnResult {
   BodySchema schema;
   std::vector<Outlier> outliers;  ///< ascending by sample, then part
   NoiseSource noise_source = NoiseSource::kAssumed;
-  int num_screens = 0;            ///< closed-form hypotheses looked at
-  int num_fits = 0;               ///< Levenberg–Marquardt fits of the search
+  int num_screens = 0;  ///< closed-form hypotheses looked at
+  int num_fits = 0;     ///< Levenberg–Marquardt fits of the search
 };
 
 /// Learns the body schema from scratch: structure and local models (Sections 3.1 and 3.2). Where

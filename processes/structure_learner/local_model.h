@@ -3,6 +3,7 @@
 #include <array>
 #include <vector>
 
+#include "common/statistics/student_t.h"
 #include "processes/structure_learner/pair_data.h"
 
 namespace bodyschema {
@@ -42,12 +43,6 @@ Pose predict_with_jacobian(const LocalModel& model, const NormalizedActions& act
 
 /// The model moved by a parameter step.
 LocalModel perturbed(const LocalModel& model, const ParameterVector& step);
-
-/// Student-t degrees of freedom of the robust fits: weight (ν + 6)/(ν + d²).
-inline constexpr double kStudentNu = 4;
-inline double robust_weight(double squared_distance) {
-  return (kStudentNu + 6) / (kStudentNu + squared_distance);
-}
 
 /// What one frame says about a model.
 struct FrameFit {

@@ -15,7 +15,7 @@ namespace {
 
 constexpr double kMedianChi3 = 2.366;  // median of χ²₃
 constexpr double kSafety = 1.2;
-constexpr int kMaxFrames = 120;
+constexpr int kFramesOfAPair = 120;
 constexpr int kMinRepeats = 5;
 constexpr double kLargestBias = 4;  // of a stream, in standard deviations of its white noise
 
@@ -33,7 +33,7 @@ Noise noise_from(const std::vector<NoiseResidual>& residuals) {
   Noise noise;
   std::vector<double> values;
   for (const auto& r : residuals) values.push_back(r.residual.tail<3>().squaredNorm() / r.markers);
-  noise.rotation_rad = std::sqrt(median(values) / kMedianChi3);
+  noise.rotation_rad = std::sqrt(upper_median(values) / kMedianChi3);
   const double rotation_variance = noise.rotation_rad * noise.rotation_rad;
   // The position variance that brings the median of the whitened position residuals to that of χ²₃:
   // the covariance is v·m along the lever and v·m + |lever|²σ_r² across it.
@@ -46,7 +46,7 @@ Noise noise_from(const std::vector<NoiseResidual>& residuals) {
       values.push_back(along2 / (v * r.markers) +
                        across2 / (v * r.markers + l2 * rotation_variance));
     }
-    return median(values);
+    return upper_median(values);
   };
   double low = 1e-20, high = 1e2;  // [m²]
   for (int n = 0; n < 60; ++n) {
@@ -208,7 +208,7 @@ class ModelNoise {
   PairData pair_data(int part_i, int part_j, const Noise& noise) const {
     MeasurementModel measurement;
     measurement.noise = noise;
-    return make_pair_data(samples_, part_i, part_j, measurement, kMaxFrames);
+    return make_pair_data(samples_, part_i, part_j, measurement, kFramesOfAPair);
   }
 
   const std::vector<ActionPoseSample>& samples_;

@@ -94,7 +94,7 @@ class Fitter {
     std::vector<double> distances;
     for (const FrameFit& f : fit.frames) distances.push_back(f.squared_distance);
     // Against the model's own errors, not the noise: what it cannot explain is no outlier yet.
-    const double scale = std::max(1.0, median(distances) / kMedianChi6);
+    const double scale = std::max(1.0, upper_median(distances) / kMedianChi6);
     targets_.frames = fit.frames;
     set_targets();
     for (int t = 0; t < pair.size(); ++t) targets_.weights(t) = robust_weight(distances[t] / scale);

@@ -6,13 +6,15 @@
 #include <limits>
 #include <tuple>
 
+#include "common/statistics/median.h"
+
 namespace bodyschema {
 namespace {
 
 using Eigen::Matrix3d;
 using Eigen::Vector3d;
 
-constexpr int kScreenFrames = 48;    // frames on which a start is judged
+constexpr int kStartFrames = 48;     // frames on which a start is judged
 constexpr int kCoarseFrames = 16;    // frames on which a start is chosen among a few alike
 constexpr int kRotationFrames = 56;  // frames of the eigenvector screen
 
@@ -32,16 +34,13 @@ Matrix3d frame_with_z(const Vector3d& axis) {
   return R;
 }
 
-double median(std::vector<double> values) {
-  if (values.empty()) return 0;
-  const auto middle = values.begin() + values.size() / 2;
-  std::nth_element(values.begin(), middle, values.end());
-  return *middle;
+double median_or_zero(std::vector<double> values) {
+  return values.empty() ? 0 : upper_median(std::move(values));
 }
 
 // How well a start fits an even subset of the frames.
 Start judged(const LocalModel& model, const PairData& pair, const NormalizedActions& actions,
-             int max_frames = kScreenFrames) {
+             int max_frames = kStartFrames) {
   Start start;
   start.model = model;
   const int n = std::min(pair.size(), max_frames);
@@ -53,7 +52,7 @@ Start judged(const LocalModel& model, const PairData& pair, const NormalizedActi
         best_reading(pair, t, model.predict(actions, pair.frames[t].sample)).squared_distance;
     start.score += (kStudentNu + 6) / 2 * std::log1p(squared[k] / kStudentNu) / n;
   }
-  start.median = median(std::move(squared));
+  start.median = median_or_zero(std::move(squared));
   return start;
 }
 
@@ -398,12 +397,12 @@ void single_axis_hypotheses(const StartFrames& frames, const NormalizedActions& 
       weights[n] = 1 / (1 + across[n] / 2);
     }
   }
-  if (median(across) > kGate) return;
+  if (median_or_zero(across) > kGate) return;
   const auto& moving = actions.moving();
 
   std::vector<double> squares;
   for (const double psi : along) squares.push_back(psi * psi / variance);
-  if (median(squares) < kGate) {
+  if (median_or_zero(squares) < kGate) {
     for (std::size_t s = 0; s < moving.size(); ++s)
       for (std::size_t r = s + 1; r < moving.size(); ++r) {
         RotationHypothesis h;
@@ -450,7 +449,7 @@ void single_axis_hypotheses(const StartFrames& frames, const NormalizedActions& 
     }
     *turn_a = wa;
     *turn_b = wb;
-    return squared.size() < 3 ? std::numeric_limits<double>::infinity() : median(squared);
+    return squared.size() < 3 ? std::numeric_limits<double>::infinity() : median_or_zero(squared);
   };
 
   for (const int a : moving) {
@@ -509,11 +508,11 @@ RelativeMotions relative_motions(const PairData& pair, int max_motions) {
         pair.primary(t).whitening.triangularView<Eigen::Lower>().solve(Matrix6d::Identity());
     variance_m.push_back(L.topRows<3>().squaredNorm() / 3);
     variance_rad.push_back(L.bottomRows<3>().squaredNorm() / 3);
-    if (t >= kScreenFrames) break;
+    if (t >= kStartFrames) break;
   }
   if (n > 0) {
-    result.sigma_m = std::sqrt(median(variance_m));
-    result.sigma_rad = std::sqrt(median(variance_rad));
+    result.sigma_m = std::sqrt(median_or_zero(variance_m));
+    result.sigma_rad = std::sqrt(median_or_zero(variance_rad));
   }
   const long total = n * (n - 1) / 2;
   const long count = std::min<long>(total, max_motions);

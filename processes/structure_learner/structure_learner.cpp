@@ -6,11 +6,12 @@
 #include "bodyschema/action_command_t.hpp"
 #include "common/bus/convert.h"
 #include "common/config/yaml.h"
+#include "common/geometry/angle.h"
 
 namespace bodyschema {
 
 StructureLearnerConfig StructureLearnerConfig::load(const std::filesystem::path& file) {
-  constexpr double kRadians = M_PI / 180;
+  constexpr double kRadians = kDegree;
   const Yaml yaml = Yaml::load(file);
   const Signals signals = load_signals(file.parent_path());
   StructureLearnerConfig config;
@@ -44,8 +45,8 @@ void StructureLearner::on_sample(const sample_t& sample) {
     has_new_ = true;
   }
   if (!pending_.empty() && !pending_.back().is_test) pending_.pop_back();
-  pending_.push_back({sample.sample_index, sample.utime,
-                      sample.purpose == action_command_t::PURPOSE_TEST});
+  pending_.push_back(
+      {sample.sample_index, sample.utime, sample.purpose == action_command_t::PURPOSE_TEST});
   while (pending_.front().last_sample_index < last_sample_index_ - RetainedSamples::kMaxLag)
     pending_.pop_front();
 }

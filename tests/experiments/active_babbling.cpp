@@ -15,6 +15,7 @@
 #include <string>
 #include <vector>
 
+#include "common/geometry/angle.h"
 #include "processes/motor_babbler/action_choice.h"
 #include "processes/motor_babbler/motor_babbler.h"
 #include "processes/structure_learner/learn.h"
@@ -26,7 +27,7 @@ using namespace bodyschema::test;
 namespace {
 
 constexpr int kSamplesABlock = 4;
-constexpr double kViewAngle = 70 * M_PI / 180;
+constexpr double kViewAngle = 70 * kDegree;
 
 struct Strategy {
   const char* name;

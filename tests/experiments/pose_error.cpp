@@ -17,16 +17,16 @@
 
 #include "common/bus/convert.h"
 #include "common/config/rig.h"
+#include "common/geometry/angle.h"
 #include "tests/support/rendered_run.h"
 
 using namespace bodyschema;
 
 namespace {
 
-constexpr double kDegrees = 180 / M_PI;
 constexpr double kChi2Median = 5.348;   // chi^2_6
 constexpr double kChi2Outlier = 20.06;  // chi^2_6(0.9973)
-constexpr double kFlipRad = 10 / kDegrees;
+constexpr double kFlipRad = 10 * kDegree;
 
 double quantile(std::vector<double> values, double q) {
   if (values.empty()) return NAN;
@@ -64,7 +64,7 @@ struct Errors {
         std::count_if(d2.begin(), d2.end(), [](double x) { return x > kChi2Outlier; });
     std::printf("| %s | %zu | %.2f | %.2f | %.2f | %.2f | %.1f | %.1f | %.1f | %.1f | %.1f |\n",
                 name.c_str(), d2.size(), quantile(lateral_m, .5) * 1e3, quantile(depth_m, .5) * 1e3,
-                quantile(rotation_rad, .5) * kDegrees, quantile(rotation_rad, .95) * kDegrees,
+                quantile(rotation_rad, .5) / kDegree, quantile(rotation_rad, .95) / kDegree,
                 quantile(d2, .5), quantile(d2, .95), share(double(refuted)), share(flips),
                 share(ambiguous));
   }
@@ -134,7 +134,7 @@ int main(int argc, char** argv) {
       all.add(part, truth);
       by_part[part.part].add(part, truth);
       const part_observation_t& message = step.message.parts[k];
-      by_tilt[bin(best_tilt(message, truth, markers) * kDegrees, {10, 20, 30, 40, 50, 60, 70}, "°")]
+      by_tilt[bin(best_tilt(message, truth, markers) / kDegree, {10, 20, 30, 40, 50, 60, 70}, "°")]
           .add(part, truth);
       by_distance[bin(truth.translation().norm(), {1.6, 1.8, 2.0, 2.2, 2.4}, "m")].add(part, truth);
       by_tags[std::to_string(message.num_tags)].add(part, truth);
@@ -173,7 +173,7 @@ int main(int argc, char** argv) {
            {0, 0}, {.25, .05}, {.5, .1}, {1, .1}, {1, .2}, {1.5, .3}, {2, .4}}) {
     Vector6d variances;
     variances << Eigen::Vector3d::Constant(std::pow(position_mm * 1e-3, 2)),
-        Eigen::Vector3d::Constant(std::pow(rotation_deg / kDegrees, 2));
+        Eigen::Vector3d::Constant(std::pow(rotation_deg * kDegree, 2));
     std::vector<double> d2;
     for (const Pair& pair : pairs) {
       d2.push_back(mahalanobis2(pair.residual, pair.covariance + Matrix6d(variances.asDiagonal())));

@@ -16,6 +16,7 @@
 #include <vector>
 
 #include "common/config/rig.h"
+#include "common/geometry/angle.h"
 #include "processes/console/evaluation.h"
 #include "processes/structure_learner/structure_learner.h"
 #include "tests/support/rendered_run.h"
@@ -24,8 +25,6 @@
 using namespace bodyschema;
 
 namespace {
-
-constexpr double kDegrees = 180 / M_PI;
 
 struct Row {
   int right = 0;
@@ -121,8 +120,8 @@ int main(int argc, char** argv) {
       };
       std::printf("| %s | %d | %d of %d | %d | %.2f mm, %.2f° | %.2f mm, %.2f° | %.0f ms |\n",
                   rig.filename().c_str(), at[i], row.right, num_seeds, row.incomplete,
-                  median(row.position_m) * 1e3, median(row.rotation_rad) * kDegrees,
-                  worst(row.position_m) * 1e3, worst(row.rotation_rad) * kDegrees,
+                  median(row.position_m) * 1e3, median(row.rotation_rad) / kDegree,
+                  worst(row.position_m) * 1e3, worst(row.rotation_rad) / kDegree,
                   median(row.seconds) * 1e3);
       if (!row.objections.empty())
         std::fprintf(stderr, "%s at %d:%s\n", rig.filename().c_str(), at[i],

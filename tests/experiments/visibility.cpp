@@ -19,6 +19,7 @@
 #include <vector>
 
 #include "common/bus/convert.h"
+#include "common/geometry/angle.h"
 #include "common/scene/scene_renderer.h"
 #include "processes/robot_simulator/robot_simulator.h"
 
@@ -175,7 +176,7 @@ int main(int argc, char** argv) {
       const double tilt_deg =
           std::acos(
               std::clamp(X_CM.translation().normalized().dot(X_CM.linear().col(2)), -1.0, 1.0)) *
-          (180 / M_PI);
+          (1 / kDegree);
       tallies[tag->part].tilt_deg += tilt_deg;
       Errors& errors = errors_of[tilt_deg < 60];
       errors.sum += squared_error(renderer.calibration(), X_CM, tag->size_m, corners);

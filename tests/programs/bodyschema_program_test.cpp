@@ -18,6 +18,7 @@
 
 #include "common/bus/convert.h"
 #include "common/bus/event_log.h"
+#include "common/geometry/angle.h"
 #include "tests/support/synthetic_robot.h"
 
 namespace bodyschema {
@@ -272,7 +273,7 @@ TEST_F(BodyschemaProgramTest, PredictionErrorsAreThoseThatWerePutIn) {
   EXPECT_EQ(part["part"], 5);
   EXPECT_NEAR(part["position_median_m"].get<double>(), 0.05, 1e-4);
   EXPECT_NEAR(part["position_rms_m"].get<double>(), 0.05, 1e-4);
-  EXPECT_NEAR(part["rotation_median_deg"].get<double>(), 0.1 * 180 / M_PI, 1e-2);
+  EXPECT_NEAR(part["rotation_median_deg"].get<double>(), 0.1 / kDegree, 1e-2);
 }
 
 TEST_F(BodyschemaProgramTest, ShowPrintsASchemaFile) {
@@ -942,7 +943,7 @@ TEST_F(TrunkMonitorTest, AMarkerMovedOnTheTrunkIsFound) {
   constexpr double kChange_s = 30;
   Vector6d by = Vector6d::Zero();
   by(0) = 0.03;
-  by(5) = 20 * M_PI / 180;
+  by(5) = 20 * kDegree;
   const std::string moved = rewritten("moved.csv", odd_, [&](const std::string& row) {
     std::vector<double> v;
     std::stringstream fields(row);

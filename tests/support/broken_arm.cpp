@@ -4,10 +4,11 @@
 #include <cmath>
 #include <ctime>
 
+#include "common/geometry/angle.h"
+
 namespace bodyschema::test {
 namespace {
 
-constexpr double kDegree = M_PI / 180;
 constexpr int kTestActions = 60;
 constexpr double kRange_rad = 1.35;
 

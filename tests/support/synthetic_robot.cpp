@@ -6,10 +6,10 @@
 #include <numeric>
 #include <sstream>
 
+#include "common/geometry/angle.h"
+
 namespace bodyschema::test {
 namespace {
-
-constexpr double kDegree = M_PI / 180;
 
 Pose screw_motion(double slide, double turn) {
   Pose X = Pose::Identity();

@@ -9,6 +9,8 @@
 #include <functional>
 #include <random>
 
+#include "common/geometry/angle.h"
+
 namespace bodyschema {
 namespace {
 
@@ -257,7 +259,7 @@ TEST(YamlTest, AQuaternionAndRollPitchYawDescribeTheSameRotation) {
     EXPECT_NEAR(from_rpy.linear().determinant(), 1, 1e-12);
     // The angles can be read off the matrix again.
     const Eigen::Matrix3d R = from_rpy.linear();
-    EXPECT_NEAR(std::asin(-R(2, 0)) * 180 / M_PI, rpy.y(), 1e-5);
+    EXPECT_NEAR(std::asin(-R(2, 0)) / kDegree, rpy.y(), 1e-5);
   }
 }
 

@@ -10,6 +10,7 @@
 #include <opencv2/calib3d.hpp>
 
 #include "common/bus/convert.h"
+#include "common/geometry/angle.h"
 #include "common/scene/faults.h"
 #include "common/scene/scene.h"
 
@@ -83,7 +84,7 @@ Comparison compare(const Scene& scene, const CameraCalibration& calibration,
     const Pose X_CM = X_CW * from_message(state.X_WG[scene.tag_geom(id)]) *
                       Eigen::Translation3d(0, 0, -kSheetThickness_m / 2);
     const double cosine = X_CM.translation().normalized().dot(X_CM.linear().col(2));
-    if (cosine < std::cos(max_tilt_deg * M_PI / 180)) continue;
+    if (cosine < std::cos(max_tilt_deg * kDegree)) continue;
     const Corners expected = project(calibration, X_CM, tag->size_m);
     for (int k = 0; k < 4; ++k) {
       const Eigen::Vector2d error = corners[k] - expected[k];
@@ -105,8 +106,8 @@ void look_at(const Scene& scene, int id, double distance_m, double tilt_deg, dou
                     Eigen::Translation3d(0, 0, -kSheetThickness_m / 2);
   Pose X_CM = Pose::Identity();
   X_CM.translation() = Eigen::Vector3d(0.03, -0.02, distance_m);
-  X_CM.linear() = (Eigen::AngleAxisd(roll_deg * M_PI / 180, Eigen::Vector3d::UnitZ()) *
-                   Eigen::AngleAxisd(tilt_deg * M_PI / 180, Eigen::Vector3d(0.6, 0.8, 0)))
+  X_CM.linear() = (Eigen::AngleAxisd(roll_deg * kDegree, Eigen::Vector3d::UnitZ()) *
+                   Eigen::AngleAxisd(tilt_deg * kDegree, Eigen::Vector3d(0.6, 0.8, 0)))
                       .toRotationMatrix();
   state.X_WC = to_message(Pose(X_WM * X_CM.inverse()));
 }

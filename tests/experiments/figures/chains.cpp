@@ -5,6 +5,7 @@
 #include <algorithm>
 #include <cmath>
 
+#include "common/geometry/angle.h"
 #include "tests/experiments/figures/experiment.h"
 #include "tests/experiments/figures/robots.h"
 #include "tests/experiments/figures/statistics.h"
@@ -14,7 +15,6 @@ namespace {
 
 using test::Regime;
 
-constexpr double kDegree = M_PI / 180;
 constexpr double kMillimetre = 1e-3;
 
 /// One way to learn at one N, over all robots.

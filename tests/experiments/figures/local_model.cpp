@@ -5,6 +5,7 @@
 #include <algorithm>
 #include <cmath>
 
+#include "common/geometry/angle.h"
 #include "processes/structure_learner/baseline/fit_matrix_gp.h"
 #include "processes/structure_learner/screen.h"
 #include "processes/structure_learner/validity.h"
@@ -17,7 +18,6 @@ namespace {
 
 using test::Regime;
 
-constexpr double kDegree = M_PI / 180;
 constexpr double kMillimetre = 1e-3;
 /// The pair that q1 moves on robot a; q2 has nothing to do with it.
 constexpr int kFrom = 2, kTo = 3;

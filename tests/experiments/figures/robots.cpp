@@ -7,6 +7,7 @@
 #include <memory>
 #include <numeric>
 
+#include "common/geometry/angle.h"
 #include "processes/structure_learner/baseline/fit_matrix_gp.h"
 #include "tests/experiments/figures/statistics.h"
 
@@ -70,7 +71,7 @@ BaselineOptions baseline_options(Regime regime) {
   if (regime == Regime::kChapter) return options;
   Noise noise = test::nominal_noise(regime);
   noise.position_m = std::max(noise.position_m, 0.001);
-  noise.rotation_rad = std::max(noise.rotation_rad, 0.3 * M_PI / 180);
+  noise.rotation_rad = std::max(noise.rotation_rad, 0.3 * kDegree);
   options.set_noise(noise);
   return options;
 }

@@ -6,6 +6,7 @@
 #include <cmath>
 #include <map>
 
+#include "common/geometry/angle.h"
 #include "processes/controller/inverse_kinematics.h"
 #include "tests/experiments/figures/cramer_rao.h"
 #include "tests/experiments/figures/experiment.h"
@@ -17,7 +18,6 @@ namespace {
 
 using test::Regime;
 
-constexpr double kDegree = M_PI / 180;
 constexpr double kMillimetre = 1e-3;
 /// σ_markers of the chapter, rms over the three axes.
 constexpr double kMarkerNoise = 0.044;

@@ -7,6 +7,7 @@
 #include <string>
 
 #include "common/config/yaml.h"
+#include "common/geometry/angle.h"
 
 namespace bodyschema {
 namespace {
@@ -130,7 +131,7 @@ TEST_F(EngineeredModelTest, EdgesAreAsUncertainAsThePlacementSays) {
   const BodySchema schema = model(kRobot, kPlacement);
   for (const Edge& edge : schema.edges) {
     const Matrix6d covariance = edge.prediction_covariance(Eigen::Vector2d(0.3, 2));
-    EXPECT_NEAR(covariance(5, 5), std::pow(0.5 * M_PI / 180, 2), 1e-12);
+    EXPECT_NEAR(covariance(5, 5), std::pow(0.5 * kDegree, 2), 1e-12);
     EXPECT_NEAR(covariance(0, 0), 4e-6, 1e-12);
   }
 }

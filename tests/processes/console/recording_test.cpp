@@ -14,6 +14,7 @@
 
 #include "common/bus/convert.h"
 #include "common/bus/event_log.h"
+#include "common/geometry/angle.h"
 #include "tests/support/synthetic_robot.h"
 
 namespace bodyschema {
@@ -166,7 +167,7 @@ TEST(RecordingTest, NoiseColumnsAreStandardDeviationsPerAxis) {
       parse_csv("t,q,part,x,y,z,qw,qx,qy,qz,sp_m,sr_deg\n0,1,1,0,0,0,1,0,0,0,0.003,2\n", "f");
   EXPECT_TRUE(recording.has_noise);
   const Matrix6d& covariance = recording.samples[0].parts[0].covariance;
-  const double rotation = 2 * M_PI / 180;
+  const double rotation = 2 * kDegree;
   Vector6d expected;
   expected << Eigen::Vector3d::Constant(9e-6), Eigen::Vector3d::Constant(rotation * rotation);
   EXPECT_LT((covariance - Matrix6d(expected.asDiagonal())).norm(), 1e-15);

@@ -7,6 +7,7 @@
 #include <regex>
 
 #include "common/bus/convert.h"
+#include "common/geometry/angle.h"
 #include "common/plot/plot.h"
 #include "processes/console/report_figures.h"
 #include "processes/console/report_page.h"
@@ -77,8 +78,8 @@ Matrix6d uneven_noise() {
   return sigma.cwiseAbs2().asDiagonal();
 }
 
-// The bands are right if they hold what a normal distribution puts within two sigma: with noise that
-// differs by axis, levers and rotations of up to 70° a wrong frame or Jacobian would show.
+// The bands are right if they hold what a normal distribution puts within two sigma: with noise
+// that differs by axis, levers and rotations of up to 70° a wrong frame or Jacobian would show.
 TEST(EdgeSliceTest, TheBandHoldsTheShareOfObservationsThatItShould) {
   test::Rng rng(1);
   const BodySchema schema = three_parts();
@@ -110,7 +111,7 @@ TEST(EdgeSliceTest, ObservationsWithoutNoiseLieOnTheCurveOfTheirSlice) {
       const Pose X = edge.predict(action);
       EXPECT_LT((observation.value.head<3>() - 1e3 * X.translation()).norm(), 1e-4);
       EXPECT_NEAR(observation.value.tail<3>().norm(),
-                  rotation_angle(X_middle.inverse() * X) * 180 / M_PI, 1e-4);
+                  rotation_angle(X_middle.inverse() * X) / kDegree, 1e-4);
     }
     EXPECT_TRUE(slice.observations[4].is_held_out);
     EXPECT_FALSE(slice.observations[3].is_held_out);
@@ -128,9 +129,9 @@ TEST(EdgeSliceTest, TheParametersBandIsThatOfTheirCovariance) {
   const auto turn_sigma = [](const EdgeSlice::Point& point) {
     return point.sigma_model.tail<3>().norm();
   };
-  EXPECT_NEAR(turn_sigma(slice.curve.front()), 0.01 * 180 / M_PI, 1e-6);
+  EXPECT_NEAR(turn_sigma(slice.curve.front()), 0.01 / kDegree, 1e-6);
   EXPECT_NEAR(turn_sigma(slice.curve[slice.curve.size() / 2]), 0, 1e-9);
-  EXPECT_NEAR(turn_sigma(slice.curve.back()), 0.01 * 180 / M_PI, 1e-6);
+  EXPECT_NEAR(turn_sigma(slice.curve.back()), 0.01 / kDegree, 1e-6);
 }
 
 TEST(VersionErrorsTest, EveryVersionIsJudgedOnTheSameSamples) {
@@ -200,7 +201,8 @@ TEST(TreeTest, EveryPartStandsThereOnce) {
   schema.unconnected = {{77, Unconnected::kNeverSeen, ""}, {88, Unconnected::kNoValidModel, ""}};
   schema.signals[1].name = "<q&2>";
   const std::string svg = tree_svg(schema, 3);
-  for (const char* part : {">1<", ">2<", ">3<", ">77<", ">88<"}) EXPECT_EQ(count(svg, part), 1) << part;
+  for (const char* part : {">1<", ">2<", ">3<", ">77<", ">88<"})
+    EXPECT_EQ(count(svg, part), 1) << part;
   EXPECT_EQ(count(svg, "class=\"root\""), 1);
   EXPECT_EQ(count(svg, "class=\"effector\""), 1);
   EXPECT_EQ(count(svg, "&lt;q&amp;2&gt;"), 1);
@@ -479,7 +481,8 @@ TEST_F(ReportPageTest, ALogThatIsCutOffIsToldAtTheTop) {
 }
 
 TEST(EscapeTest, LeavesNoMarkup) {
-  EXPECT_EQ(escape_html("<a href='x'>\"&\x01</a>"), "&lt;a href=&#39;x&#39;&gt;&quot;&amp; &lt;/a&gt;");
+  EXPECT_EQ(escape_html("<a href='x'>\"&\x01</a>"),
+            "&lt;a href=&#39;x&#39;&gt;&quot;&amp; &lt;/a&gt;");
 }
 
 }  // namespace

@@ -5,6 +5,7 @@
 #include <cmath>
 #include <set>
 
+#include "common/geometry/angle.h"
 #include "processes/structure_learner/learn.h"
 #include "tests/support/synthetic_robot.h"
 
@@ -57,7 +58,7 @@ TEST(SchemaJsonTest, LearnHasExactlyTheDocumentedKeysAndTypes) {
     EXPECT_EQ(edge["kind"], edge["signals"].empty() ? "rigid" : "screw");
     EXPECT_TRUE(edge["position_rms_m"].is_number_float());
     EXPECT_NEAR(edge["rotation_rms_deg"].get<double>(),
-                result.schema.edges[i].rotation_rms_rad * 180 / M_PI, 1e-12);
+                result.schema.edges[i].rotation_rms_rad / kDegree, 1e-12);
     for (const auto& signal : edge["signals"]) EXPECT_TRUE(signal.is_string());
   }
   EXPECT_TRUE(json["unconnected"].is_array());
@@ -83,7 +84,7 @@ TEST(SchemaJsonTest, ASchemaOfNothingIsPrintedToo) {
 
 TEST(SchemaJsonTest, TheNoiseIsPrintedWithWhereItIsKnownFrom) {
   BodySchema schema;
-  schema.noise = {0.0031, 1.2 * M_PI / 180};
+  schema.noise = {0.0031, 1.2 * kDegree};
   EXPECT_NE(structure_text(schema).find("noise per axis and marker: 3.10 mm 1.20°\n"),
             std::string::npos);
   std::set<std::string> words;
@@ -121,7 +122,7 @@ TEST(SchemaJsonTest, PredictHasExactlyTheDocumentedKeysAndDegrees) {
   errors.position_median_m = 0.001;
   errors.position_rms_m = 0.002;
   errors.position_max_m = 0.003;
-  errors.rotation_median_rad = M_PI / 180;
+  errors.rotation_median_rad = kDegree;
   errors.rotation_rms_rad = M_PI / 90;
   const auto json = errors_json(11, {errors});
   EXPECT_EQ(keys_of(json), (Keys{"samples", "parts"}));
@@ -155,9 +156,9 @@ TEST(SchemaJsonTest, ShowHasEveryParameterOfEveryEdge) {
   test::SyntheticRobot robot;
   const BodySchema schema = learned(robot).schema;
   const auto json = schema_json(schema);
-  EXPECT_EQ(keys_of(json),
-            (Keys{"complete", "samples", "parts", "root", "edges", "unconnected", "unused_signals",
-                  "undecided_signals", "noise", "version", "base_version", "last_sample", "X_CR", "signals"}));
+  EXPECT_EQ(keys_of(json), (Keys{"complete", "samples", "parts", "root", "edges", "unconnected",
+                                 "unused_signals", "undecided_signals", "noise", "version",
+                                 "base_version", "last_sample", "X_CR", "signals"}));
   EXPECT_EQ(json["signals"].size(), 3U);
   EXPECT_EQ(keys_of(json["signals"][0]), (Keys{"name", "lower", "upper", "warp"}));
   EXPECT_EQ(json["last_sample"], 29);

@@ -13,6 +13,7 @@
 #include "common/bus/check.h"
 #include "common/bus/convert.h"
 #include "common/config/yaml.h"
+#include "common/geometry/angle.h"
 
 namespace bodyschema {
 namespace {
@@ -54,7 +55,7 @@ BodySchema planar(std::int64_t version = 1) {
   schema.root = 1;
   schema.X_CR.translation() = Eigen::Vector3d(0.1, 0.2, 2);
   schema.signals = test_config().signals;
-  const double lengths[] = {1, 0.7, 0.4}, turns[] = {M_PI / 180, M_PI / 2, -0.3};
+  const double lengths[] = {1, 0.7, 0.4}, turns[] = {kDegree, M_PI / 2, -0.3};
   for (int i = 0; i < 3; ++i) {
     Edge edge;
     edge.from = i + 1;
@@ -1099,8 +1100,7 @@ TEST(ControllerTest, ForAProbeTheArmIsLentUntilItIsMadeOrNobodyMakesIt) {
     bench.run(1);
     EXPECT_EQ(bench.status.control_state, S::CONTROL_LENT);
     EXPECT_EQ(bench.moves.size(), num_moves);
-    if (is_made)
-      bench.settle("motor_babbler", 1, 21, {5, 0.1, 1}, action_command_t::PURPOSE_PROBE);
+    if (is_made) bench.settle("motor_babbler", 1, 21, {5, 0.1, 1}, action_command_t::PURPOSE_PROBE);
     // Else the babbler is silent.
     EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
   }

@@ -4,6 +4,7 @@
 
 #include <random>
 
+#include "common/geometry/angle.h"
 #include "tests/support/synthetic_robot.h"
 
 namespace bodyschema {
@@ -84,7 +85,7 @@ BodySchema planar() {
   upper.from = 1;
   upper.to = fore.from = 2;
   fore.to = 3;
-  upper.joints.push_back({.signal = 0, .turn = M_PI / 180});
+  upper.joints.push_back({.signal = 0, .turn = kDegree});
   upper.right.translation() = Eigen::Vector3d(1, 0, 0);
   fore.joints.push_back({.signal = 1, .turn = M_PI / 2});
   fore.right.translation() = Eigen::Vector3d(0.5, 0, 0);
@@ -145,7 +146,7 @@ TEST(InverseKinematicsTest, SignalsThatDoNotMoveThePartStayWhereTheyAre) {
   const auto solution = solve_position(schema, 2, p_RT, schema.signals, current, kOptions);
   EXPECT_TRUE(solution.is_within_tolerance);
   EXPECT_NEAR(solution.action[1], 0.3, 1e-15);
-  EXPECT_NEAR(solution.action[0], 0.5 * 180 / M_PI, 0.01);
+  EXPECT_NEAR(solution.action[0], 0.5 / kDegree, 0.01);
 }
 
 TEST(InverseKinematicsTest, OutOfReachTheNearestApproachIsTold) {

@@ -8,13 +8,12 @@
 
 #include "common/bus/check.h"
 #include "common/bus/convert.h"
+#include "common/geometry/angle.h"
 #include "processes/marker_estimator/tag_pose.h"
 #include "tests/support/tag_image.h"
 
 namespace bodyschema {
 namespace {
-
-constexpr double kDegree = M_PI / 180;
 
 MarkerEstimatorConfig config() {
   MarkerEstimatorConfig config;

@@ -5,12 +5,12 @@
 #include <Eigen/LU>
 #include <random>
 
+#include "common/geometry/angle.h"
 #include "tests/support/tag_image.h"
 
 namespace bodyschema {
 namespace {
 
-constexpr double kDegree = M_PI / 180;
 constexpr double kSize_m = 0.08;
 
 std::vector<ImagePoint> view(const Pose& X_CM, double sigma_px, std::mt19937& random) {

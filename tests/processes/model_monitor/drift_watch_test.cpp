@@ -4,6 +4,7 @@
 
 #include <cmath>
 
+#include "common/geometry/angle.h"
 #include "processes/model_monitor/body_change.h"
 #include "tests/support/broken_arm.h"
 
@@ -13,8 +14,6 @@ namespace {
 using test::BrokenArm;
 using test::Fault;
 using test::Regime;
-
-constexpr double kDegree = M_PI / 180;
 
 /// Feeds an arm's samples; until `stop` says so. Returns how many there were.
 template <typename Stop>

@@ -4,6 +4,7 @@
 
 #include <cmath>
 
+#include "common/geometry/angle.h"
 #include "processes/model_monitor/health_words.h"
 #include "tests/support/broken_arm.h"
 
@@ -15,7 +16,6 @@ using test::BrokenArm;
 using test::Fault;
 using test::Regime;
 
-constexpr double kDegree = M_PI / 180;
 constexpr int kBlock = 60;  // what is adopted within its first samples settles in it
 
 struct Case {

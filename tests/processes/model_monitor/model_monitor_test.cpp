@@ -10,6 +10,7 @@
 #include "common/bus/codec.h"
 #include "common/bus/convert.h"
 #include "common/config/yaml.h"
+#include "common/geometry/angle.h"
 #include "processes/model_monitor/adaptation.h"
 #include "processes/structure_learner/learn.h"
 #include "tests/support/broken_arm.h"
@@ -20,8 +21,6 @@ namespace {
 
 using test::Rng;
 using Bytes = std::vector<std::uint8_t>;
-
-constexpr double kDegree = M_PI / 180;
 
 ModelMonitorConfig test_config() {
   return {.max_mahalanobis2 = 20.06,

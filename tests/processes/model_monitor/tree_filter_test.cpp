@@ -4,14 +4,13 @@
 
 #include <cmath>
 
+#include "common/geometry/angle.h"
 #include "tests/support/synthetic_robot.h"
 
 namespace bodyschema {
 namespace {
 
 using test::Rng;
-
-constexpr double kDegree = M_PI / 180;
 
 Matrix6d random_covariance(Rng& rng, double position_m, double rotation_rad) {
   Matrix6d A;

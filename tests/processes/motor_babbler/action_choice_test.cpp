@@ -4,6 +4,7 @@
 
 #include <cmath>
 
+#include "common/geometry/angle.h"
 #include "processes/structure_learner/learn.h"
 #include "tests/support/synthetic_robot.h"
 
@@ -84,7 +85,7 @@ TEST(VisibilityModelTest, PredictsTheSyntheticCameraBetterThanTheSharesDo) {
     const test::SyntheticRobot robot = test::chapter_robot("d", rng);
     const BodySchema schema = learn(robot.signals, test::babble(robot, 20, {}, rng)).schema;
     ASSERT_TRUE(schema.complete);
-    const double angle = 70 * M_PI / 180;
+    const double angle = 70 * kDegree;
     std::vector<SeenAction> past;
     for (int n = 0; n < 60; ++n) {
       const Eigen::VectorXd action = robot.random_action(rng);

@@ -1,7 +1,6 @@
 #include "processes/motor_babbler/motor_babbler.h"
 
 #include <gtest/gtest.h>
-
 #include <unistd.h>
 
 #include <fstream>
@@ -12,6 +11,7 @@
 #include "common/bus/check.h"
 #include "common/bus/convert.h"
 #include "common/config/yaml.h"
+#include "common/geometry/angle.h"
 
 namespace bodyschema {
 namespace {
@@ -120,7 +120,8 @@ model_health_t verdict(std::int64_t judged_sample, std::int64_t schema_version) 
 
 control_status_t control(bool owns_arm) {
   control_status_t status{};
-  status.control_state = owns_arm ? control_status_t::CONTROL_MOVING : control_status_t::CONTROL_IDLE;
+  status.control_state =
+      owns_arm ? control_status_t::CONTROL_MOVING : control_status_t::CONTROL_IDLE;
   status.owns_arm = owns_arm;
   return status;
 }
@@ -1089,8 +1090,8 @@ class World {
     });
     if (is_new) served.push_back(command);
     const bool is_refused = command.action_id % 7 == 3;
-    status_ = answer(command, is_refused ? motion_status_t::STATE_REJECTED
-                                         : motion_status_t::STATE_SETTLED);
+    status_ = answer(command,
+                     is_refused ? motion_status_t::STATE_REJECTED : motion_status_t::STATE_SETTLED);
     if (!is_refused && is_new)
       samples.push_back(sample_of(command, static_cast<std::int64_t>(samples.size())));
     tell(babbler_->on_motion_status(status_));
@@ -1246,7 +1247,7 @@ TEST(MotorBabblerTest, TheConfigurationIsReadInSiUnits) {
   EXPECT_EQ(config.signals.size(), 2U);
   EXPECT_EQ(config.resend_us, 1 * kSecond);
   EXPECT_EQ(config.expiry_us, 60 * kSecond);
-  EXPECT_NEAR(config.stop.rotation_rad, M_PI / 180, 1e-12);
+  EXPECT_NEAR(config.stop.rotation_rad, kDegree, 1e-12);
   EXPECT_EQ(config.extreme_from, 0.7);
 }
 

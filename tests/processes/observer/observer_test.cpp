@@ -7,12 +7,12 @@
 #include "bodyschema/action_command_t.hpp"
 #include "common/bus/check.h"
 #include "common/bus/convert.h"
+#include "common/geometry/angle.h"
 #include "processes/marker_estimator/tag_pose.h"
 
 namespace bodyschema {
 namespace {
 
-constexpr double kDegree = M_PI / 180;
 constexpr std::int64_t kRest_us = 2'000'000;
 
 camera_info_t camera() {

@@ -12,6 +12,7 @@
 
 #include "common/bus/convert.h"
 #include "common/config/yaml.h"
+#include "common/geometry/angle.h"
 
 namespace bodyschema {
 namespace {
@@ -462,13 +463,13 @@ TEST(RobotSimulator, ABentLinkMovesWhatIsBeyondItsMiddle) {
   EXPECT_TRUE(relative(after, 1, 5).isApprox(relative(before, 1, 5), 1e-12));
   EXPECT_TRUE(relative(after, 6, 8).isApprox(relative(before, 6, 8), 1e-12));
   const Pose change = relative(before, 5, 6).inverse() * relative(after, 5, 6);
-  EXPECT_NEAR(rotation_angle(change), 8 * M_PI / 180, 1e-9);
+  EXPECT_NEAR(rotation_angle(change), 8 * kDegree, 1e-9);
   // It stays bent wherever the arm moves.
   RobotSimulator whole(config("arm7"));
   simulator.on_command(move_to(1, kElsewhere));
   whole.on_command(move_to(1, kElsewhere));
   const Pose moved = relative(whole.state(), 5, 6).inverse() * relative(simulator.state(), 5, 6);
-  EXPECT_NEAR(rotation_angle(moved), 8 * M_PI / 180, 1e-4);
+  EXPECT_NEAR(rotation_angle(moved), 8 * kDegree, 1e-4);
 }
 
 TEST(RobotSimulator, ADriftBendsWithEveryActionAndSurvivesARestart) {
@@ -478,7 +479,7 @@ TEST(RobotSimulator, ADriftBendsWithEveryActionAndSurvivesARestart) {
   const auto bent_deg = [&](const RobotSimulator& arm) {
     // Part 2 sits on the base beyond its middle, part 1 before it.
     const Pose straight = relative(RobotSimulator(config("arm7")).state(), 1, 2);
-    return rotation_angle(straight.inverse() * relative(arm.state(), 1, 2)) * 180 / M_PI;
+    return rotation_angle(straight.inverse() * relative(arm.state(), 1, 2)) / kDegree;
   };
   EXPECT_NEAR(bent_deg(simulator), 0, 1e-6);
   for (int id = 0; id < 4; ++id) {
@@ -541,7 +542,7 @@ TEST(RobotSimulator, MarkersFallAndShiftButPartsStayWhereTheyAre) {
   EXPECT_NEAR(X_WG.linear()(2, 2), -1, 1e-12);
   const Pose X_WM = from_message(before.X_WG[moved]), X_WM2 = from_message(after.X_WG[moved]);
   EXPECT_NEAR((X_WM.inverse() * X_WM2.translation()).norm(), 0.25 * 0.076, 1e-9);
-  EXPECT_NEAR(rotation_angle(X_WM.inverse() * X_WM2), 15 * M_PI / 180, 1e-9);
+  EXPECT_NEAR(rotation_angle(X_WM.inverse() * X_WM2), 15 * kDegree, 1e-9);
   simulator.on_command(move_to(1, kElsewhere));
   EXPECT_TRUE(from_message(simulator.state().X_WG[lost]).isApprox(X_WG, 1e-12));
   simulator.on_fault(fault(2, Broken::FAULT_MARKER_MOVED, "", 24));
@@ -557,8 +558,8 @@ TEST(RobotSimulator, ABumpedCameraIsElsewhereTheSameForASeed) {
   const Pose bump = X_WC.inverse() * from_message(one.state().X_WC);
   EXPECT_GE(bump.translation().norm(), 0.02);
   EXPECT_LE(bump.translation().norm(), 0.03);
-  EXPECT_GE(rotation_angle(bump), 1.5 * M_PI / 180);
-  EXPECT_LE(rotation_angle(bump), 2.5 * M_PI / 180);
+  EXPECT_GE(rotation_angle(bump), 1.5 * kDegree);
+  EXPECT_LE(rotation_angle(bump), 2.5 * kDegree);
   EXPECT_EQ(bytes(one.state()), bytes(other.state()));
   EXPECT_FALSE(from_message(third.state().X_WC).isApprox(from_message(one.state().X_WC), 1e-6));
   one.on_fault(fault(1, Broken::FAULT_CAMERA_BUMP));

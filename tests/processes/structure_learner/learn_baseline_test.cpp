@@ -2,6 +2,7 @@
 
 #include <gtest/gtest.h>
 
+#include "common/geometry/angle.h"
 #include "processes/structure_learner/baseline/fit_matrix_gp.h"
 #include "tests/support/synthetic_robot.h"
 
@@ -13,7 +14,6 @@ using test::Regime;
 using test::Rightness;
 using test::Rng;
 
-constexpr double kDegree = M_PI / 180;
 // What the prototype assumed of exact data.
 constexpr Noise kFloor{.position_m = 0.001, .rotation_rad = 0.3 * kDegree};
 

@@ -4,6 +4,7 @@
 
 #include <sstream>
 
+#include "common/geometry/angle.h"
 #include "tests/support/synthetic_robot.h"
 
 namespace bodyschema {
@@ -76,7 +77,7 @@ TEST(Learn, UnbendsACommandThatIsNotLinearInTheJoint) {
     rotation += rad / kRobots;
   }
   EXPECT_LT(position, 1e-3);
-  EXPECT_LT(rotation, 0.2 * M_PI / 180);
+  EXPECT_LT(rotation, 0.2 * kDegree);
 }
 
 TEST(Learn, LeavesAStraightCommandStraight) {
@@ -302,8 +303,8 @@ TEST(Learn, AnEdgeIsNotRigidBecauseItsSignalHardlyMovedWhileItWasSeen) {
         Eigen::VectorXd q = robot.random_action(rng);
         const bool is_seen = t >= 10;  // the hand, parts 4 and 5, on signal 1
         if (is_seen) q(1) *= spread;
-        samples.push_back(test::observe(
-            robot, q, {.regime = Regime::kTagIso, .with_covariances = true}, t, rng));
+        samples.push_back(
+            test::observe(robot, q, {.regime = Regime::kTagIso, .with_covariances = true}, t, rng));
         if (!is_seen)
           std::erase_if(samples.back().parts, [](const auto& o) { return o.part >= 4; });
       }

@@ -2,6 +2,7 @@
 
 #include <gtest/gtest.h>
 
+#include "common/geometry/angle.h"
 #include "tests/support/synthetic_robot.h"
 
 namespace bodyschema {
@@ -37,7 +38,7 @@ TEST(NoiseEstimate, RepeatsAtOnePoseDecideWhereThereAreAny) {
   const auto noise = estimate_noise(samples, 4);
   ASSERT_TRUE(noise);
   EXPECT_NEAR(noise->position_m, 1.2 * 0.003, 0.001);
-  EXPECT_NEAR(noise->rotation_rad, 1.2 * M_PI / 180, 0.005);
+  EXPECT_NEAR(noise->rotation_rad, 1.2 * kDegree, 0.005);
 }
 
 TEST(NoiseEstimate, OfExactDataIsTheFloor) {

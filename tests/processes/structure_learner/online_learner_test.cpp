@@ -2,6 +2,7 @@
 
 #include <gtest/gtest.h>
 
+#include "common/geometry/angle.h"
 #include "common/schema/kinematic_path.h"
 #include "tests/support/synthetic_robot.h"
 
@@ -172,7 +173,7 @@ SharedSamples broken(const SharedSamples& samples, std::size_t since, int from_p
 
 Pose forty_degrees() {
   Vector6d bend = Vector6d::Zero();
-  bend(4) = 40 * M_PI / 180;
+  bend(4) = 40 * kDegree;
   return exp(bend);
 }
 

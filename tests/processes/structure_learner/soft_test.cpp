@@ -5,6 +5,7 @@
 #include <limits>
 #include <set>
 
+#include "common/geometry/angle.h"
 #include "processes/structure_learner/learn.h"
 #include "processes/structure_learner/local_model.h"
 #include "processes/structure_learner/noise_estimate.h"
@@ -77,7 +78,7 @@ void observe(std::vector<ActionPoseSample>* samples, int num_parts, const PoseOf
 // Bursts in which a marker is seen turned over.
 int flip_in_bursts(int part, double share, std::vector<ActionPoseSample>* samples, Rng& rng) {
   Vector6d half_turn = Vector6d::Zero();
-  half_turn(4) = 178 * M_PI / 180;
+  half_turn(4) = 178 * kDegree;
   std::vector<bool> is_flipped(samples->size());
   int flipped = 0;
   while (flipped < share * samples->size()) {

@@ -5,6 +5,7 @@
 #include <algorithm>
 #include <limits>
 
+#include "common/geometry/angle.h"
 #include "processes/structure_learner/screen.h"
 #include "processes/structure_learner/validity.h"
 #include "tests/support/synthetic_robot.h"
@@ -193,12 +194,12 @@ TEST(TreeFit, AMarkersOwnBiasIsNoJoint) {
   EXPECT_LT(worst({}).log_tail, -20);
   EXPECT_EQ(worst({}).signal, 0);
   EXPECT_EQ(worst({}).members, std::vector<int>{3});
-  EXPECT_GT(worst({0.003, 0.2 * M_PI / 180}).log_tail, -10);
+  EXPECT_GT(worst({0.003, 0.2 * kDegree}).log_tail, -10);
 
   // A true joint is far beyond the bias.
   TreeFit lacking(c.without(3), c.data, c.actions, true);
   lacking.fit(20, 1e-3);
-  const auto missing = lacking.missing_joints({0.003, 0.2 * M_PI / 180});
+  const auto missing = lacking.missing_joints({0.003, 0.2 * kDegree});
   ASSERT_FALSE(missing.empty());
   EXPECT_LT(missing.front().log_tail, -100);
 }

@@ -4,6 +4,7 @@
 
 #include <numeric>
 
+#include "common/geometry/angle.h"
 #include "processes/structure_learner/screen.h"
 #include "tests/support/synthetic_robot.h"
 
@@ -53,8 +54,8 @@ TEST(Validity, AJointOfTwoDegreesIsFoundInTagNoise) {
   int refuted = 0;
   for (int seed = 1; seed <= 50; ++seed) {
     Rng rng(seed);
-    const auto samples = test::babble(hinge(2 * M_PI / 180, rng), 40, {Regime::kTagIso}, rng);
-    const Validity v = rigid_validity(samples, {0.001, 0.6 * M_PI / 180});
+    const auto samples = test::babble(hinge(2 * kDegree, rng), 40, {Regime::kTagIso}, rng);
+    const Validity v = rigid_validity(samples, {0.001, 0.6 * kDegree});
     refuted += v.verdict == Verdict::kRefuted;
   }
   EXPECT_GE(refuted, 40);
@@ -71,7 +72,7 @@ TEST(Validity, WhatTheModelErrorMayBeIsNoJoint) {
     const Noise noise = test::nominal_noise(Regime::kTagIso);
     refuted += rigid_validity(samples, noise).verdict == Verdict::kRefuted;
     refuted_as_bias +=
-        rigid_validity(samples, noise, {0.003, 0.2 * M_PI / 180}).verdict == Verdict::kRefuted;
+        rigid_validity(samples, noise, {0.003, 0.2 * kDegree}).verdict == Verdict::kRefuted;
   }
   EXPECT_GE(refuted, 9);
   EXPECT_EQ(refuted_as_bias, 0);

@@ -1,0 +1,13 @@
+#pragma once
+
+namespace bodyschema {
+
+/// From now on SIGINT and SIGTERM end no program and no wait of Bus::handle; poll() and the like
+/// return early.
+void catch_interruption();
+/// Whether such a signal came since then.
+bool is_interrupted();
+/// What came so far is dealt with.
+void clear_interruption();
+
+}  // namespace bodyschema
