@@ -133,7 +133,15 @@ class Adaptation {
   std::vector<AdaptationEvent> on_new_sample(ActionPoseSample sample);
   EdgeState state_of(const Place& place) const;
   void calibrate();
-  void begin_drift(int part, std::int64_t sample_index, std::vector<AdaptationEvent>* events);
+  /// What changes all the time looks like one step after another: an edge in trouble may drift.
+  void try_drift(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
+  /// Evidence of what stands for these samples: of the present replacements, and before them of
+  /// what was there.
+  double standing_evidence(const std::vector<const ActionPoseSample*>& samples) const;
+  void begin_drift(int part, std::int64_t since, std::int64_t sample_index,
+                   std::vector<AdaptationEvent>* events);
+  void end_drift(std::int64_t since, const Drift& drift, std::int64_t sample_index,
+                 std::vector<AdaptationEvent>* events);
   void watch_drift(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
   void watch_noise(const TreeFilter::Judgement& judgement);
   std::vector<const ActionPoseSample*> segment(std::int64_t since, int longest) const;
