@@ -802,9 +802,10 @@ double Adaptation::standing_evidence(const std::vector<const ActionPoseSample*>&
 }
 
 void Adaptation::try_drift(std::int64_t sample_index, std::vector<AdaptationEvent>* events) {
-  if (drifting_ || !trouble_ || credit_ <= 0 || (!detected_ && suspects().empty()) ||
-      !is_worth_a_fit(sample_index - trouble_->since + 1))
-    return;
+  if (drifting_ || !trouble_ || credit_ <= 0) return;
+  const std::vector<Place> places = suspects();
+  const std::int64_t suspected = tests_->highest().cusum.since;
+  if (places.empty() || !is_worth_a_fit(sample_index - suspected + 1)) return;
   const auto samples = segment(trouble_->since - kBeforeDrift, static_cast<int>(kRing));
   std::set<int> parts;
   const auto add_around = [&](int part) {
@@ -813,6 +814,11 @@ void Adaptation::try_drift(std::int64_t sample_index, std::vector<AdaptationEven
   };
   for (const auto& [part, unused] : trouble_->edges) add_around(part);
   for (const Replacement& r : replacements_) add_around(r.place.part);
+  // A step that is about to be accepted is as good as one that stands.
+  const auto standing = [&] {
+    const FoundChanges step = search(schema_, places, segment(suspected, options_.longest_segment));
+    return standing_evidence(samples) + std::max(0.0, step.margin());
+  };
   credit_ -= static_cast<int>(samples.size());
   // Edges beside each other explain a bend nearly alike: until one leads, nothing is told.
   std::optional<BegunDrift> best;
@@ -828,7 +834,7 @@ void Adaptation::try_drift(std::int64_t sample_index, std::vector<AdaptationEven
     best = std::move(drift);
   }
   if (!best || !best->is_good || most - second < options_.ambiguity ||
-      most - standing_evidence(samples) < options_.acceptance)
+      most - standing() < options_.acceptance)
     return;
   for (const Replacement& r : replacements_)
     tell(AdaptationEvent::Kind::kReverted, sample_index, r, 0, 0, events);

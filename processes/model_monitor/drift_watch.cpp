@@ -133,8 +133,9 @@ struct BegunLine {
   bool is_good = false;
 };
 
-/// std::nullopt if too little of it was seen.
-std::optional<BegunLine> fit_begun(const std::vector<Reading>& readings, double begin) {
+/// std::nullopt if too little of it was seen. From time `since` on it is to explain the readings.
+std::optional<BegunLine> fit_begun(const std::vector<Reading>& readings, double begin,
+                                   double since) {
   int num_moved = 0;
   for (const Reading& r : readings) num_moved += r.time > begin;
   if (num_moved < kFewestMoved) return std::nullopt;
@@ -163,7 +164,7 @@ std::optional<BegunLine> fit_begun(const std::vector<Reading>& readings, double 
                    llt.matrixLLT().diagonal().array().log().sum() -
                    std::log(static_cast<double>(kLongestUnseen));
   line.gain = line.log_prior;
-  int num_explained = 0;
+  int num = 0, num_explained = 0;
   bool is_newest_explained = false;
   for (const Reading& r : readings) {
     const double elapsed = r.time - begin;
@@ -171,10 +172,12 @@ std::optional<BegunLine> fit_begun(const std::vector<Reading>& readings, double 
     const Vector6d e = log(exp(-elapsed * line.rate) * exp(r.xi));
     const double d2 = e.dot(r.information * e);
     line.gain += robust_cost(r.xi.dot(r.information * r.xi)) - robust_cost(d2);
+    if (r.time < since) continue;
     is_newest_explained = d2 < kExplained;
     num_explained += is_newest_explained;
+    ++num;
   }
-  line.is_good = is_newest_explained && num_explained >= kMostlyExplained * num_moved;
+  line.is_good = is_newest_explained && num_explained >= kMostlyExplained * num;
   return line;
 }
 
@@ -431,7 +434,8 @@ std::vector<BegunDrift> begun_drifts(const BodySchema& before, const MarkerNoise
       const std::vector<Reading>& readings = left ? place.left : place.right;
       if (readings.empty()) continue;
       const auto try_begin = [&](std::int64_t begin) -> std::optional<double> {
-        const auto line = fit_begun(readings, static_cast<double>(begin));
+        const auto line =
+            fit_begun(readings, static_cast<double>(begin), static_cast<double>(since));
         if (!line) return std::nullopt;
         if (best && line->gain <= best->gain) return line->gain;
         best.emplace();

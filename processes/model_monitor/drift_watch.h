@@ -39,7 +39,7 @@ struct BegunDrift {
   double log_prior = 0;
   /// Of the place's measurements over no change at all, log_prior included [nats].
   double gain = 0;
-  /// Nearly all measurements since its begin, and the newest, are as it says.
+  /// Of the measurements that were found wrong most, and the newest, are as it says.
   bool is_good = false;
 
   /// Σ log p(observations) over the samples under `before` with the drift.
