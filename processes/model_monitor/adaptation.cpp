@@ -415,6 +415,8 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
                                log_likelihood(schema_, noise_, earlier) - 4 * options_.acceptance;
   if (replacements_.empty() || since - since_ > kTogether || fitted.everywhere || ends ||
       began_later) {
+    if (trouble_ && since_ >= trouble_->since)
+      trouble_->adopted.insert(trouble_->adopted.end(), replacements_.begin(), replacements_.end());
     before_ = schema_;
     replacements_.clear();
     maturing_.clear();
@@ -836,7 +838,11 @@ void Adaptation::try_drift(std::int64_t sample_index, std::vector<AdaptationEven
   if (!best || !best->is_good || most - second < options_.ambiguity ||
       most - standing() < options_.acceptance)
     return;
-  for (const Replacement& r : replacements_)
+  // All that was adopted since the trouble began was this drift.
+  std::vector<Replacement> undone = std::move(trouble_->adopted);
+  if (since_ >= trouble_->since)
+    undone.insert(undone.end(), replacements_.begin(), replacements_.end());
+  for (const Replacement& r : undone)
     tell(AdaptationEvent::Kind::kReverted, sample_index, r, 0, 0, events);
   replacements_.clear();
   install(BodySchema(trouble_->before));
@@ -876,12 +882,14 @@ void Adaptation::watch_drift(std::int64_t sample_index, std::vector<AdaptationEv
   }
 }
 
-/// `since`: the first sample with the body as it is now.
+/// `since`: the first sample with the body as it is now; `sample_index` where that is not known.
 void Adaptation::end_drift(std::int64_t since, const Drift& drift, std::int64_t sample_index,
                            std::vector<AdaptationEvent>* events) {
   AdaptationEvent recovered =
       event(AdaptationEvent::Kind::kRecovered, sample_index, {*drifting_, false});
   recovered.cause = "drift";
+  recovered.num_samples =
+      since < sample_index ? static_cast<int>(sample_index - since) : num_still_;
   events->push_back(recovered);
   drift_watch_.forget(*drifting_, since);
   remember(schema_);
