@@ -736,9 +736,9 @@ TEST(AdaptationTest, WhatIsNeverSeenIsNotSuspected) {
 }
 
 TEST(AdaptationTest, TheSameSamplesGiveTheSameEventsAndSchema) {
-  for (const Fault fault : {Fault::kGain, Fault::kWorn}) {
+  for (const Fault fault : {Fault::kGain, Fault::kWorn, Fault::kDrift}) {
     const auto once = [fault] {
-      BrokenArm arm({fault, "", 0.85}, Regime::kTagIso, 40, 5);
+      BrokenArm arm({fault, "", 0.85, 0.5, 25}, Regime::kTagIso, 40, 5);
       Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kTagIso));
       const Life life = live(arm, adaptation, 160);
       return std::pair{life.log(), life.error};
