@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <set>
 #include <stdexcept>
 
 #include "common/geometry/angle.h"
@@ -64,6 +65,12 @@ constexpr std::int64_t kUnexplained = 8;
 constexpr int kManyMismatches = 3;
 /// Newest samples that must be explained no worse.
 constexpr std::ptrdiff_t kNewest = 5;
+
+/// Samples from before a mismatch that bound the begin of a drift.
+constexpr std::int64_t kBeforeDrift = 30;
+/// A drift has ended: so probable, and so many samples ago.
+constexpr double kSurelyEnded = 0.999;
+constexpr std::int64_t kEndedFor = 6;
 
 bool is_worth_learning(std::int64_t age) {
   constexpr std::int64_t kAges[] = {8, 10, 13, 16, 20, 25, 32};
@@ -393,7 +400,7 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
       else if (!replacements_.empty())
         remember(schema_);
       replacements_.clear();
-      begin_drift(part, sample_index, events);
+      begin_drift(part, sample_index, sample_index, events);
       return;
     }
   }
@@ -409,6 +416,8 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
                                log_likelihood(schema_, noise_, earlier) - 4 * options_.acceptance;
   if (replacements_.empty() || since - since_ > kTogether || fitted.everywhere || ends ||
       began_later) {
+    if (trouble_ && since_ >= trouble_->since)
+      trouble_->adopted.insert(trouble_->adopted.end(), replacements_.begin(), replacements_.end());
     before_ = schema_;
     replacements_.clear();
     maturing_.clear();
@@ -770,7 +779,7 @@ void Adaptation::mature(std::int64_t sample_index, std::vector<AdaptationEvent>*
     if (is_same(stored, settled)) stored = schema_;
 }
 
-void Adaptation::begin_drift(int part, std::int64_t sample_index,
+void Adaptation::begin_drift(int part, std::int64_t since, std::int64_t sample_index,
                              std::vector<AdaptationEvent>* events) {
   drifting_ = part;
   maturing_.clear();
@@ -780,8 +789,68 @@ void Adaptation::begin_drift(int part, std::int64_t sample_index,
   detected_.reset();
   AdaptationEvent drift = event(AdaptationEvent::Kind::kDrift, sample_index, {part, false});
   drift.cause = "drift";
-  drift.since = sample_index;
+  drift.since = since;
   events->push_back(drift);
+}
+
+double Adaptation::standing_evidence(const std::vector<const ActionPoseSample*>& samples) const {
+  if (replacements_.empty()) return log_likelihood(schema_, noise_, samples);
+  const auto changed = std::find_if(samples.begin(), samples.end(), [this](const auto* sample) {
+    return sample->sample_index >= since_;
+  });
+  double evidence = log_likelihood(before_, noise_, {samples.begin(), changed}) +
+                    log_likelihood(schema_, noise_, {changed, samples.end()});
+  for (const Replacement& r : replacements_) evidence += r.fitted.log_prior;
+  return evidence;
+}
+
+void Adaptation::try_drift(std::int64_t sample_index, std::vector<AdaptationEvent>* events) {
+  if (drifting_ || !trouble_ || credit_ <= 0) return;
+  const std::vector<Place> places = suspects();
+  const std::int64_t suspected = tests_->highest().cusum.since;
+  if (places.empty() || !is_worth_a_fit(sample_index - suspected + 1)) return;
+  const auto samples = segment(trouble_->since - kBeforeDrift, static_cast<int>(kRing));
+  std::set<int> parts;
+  const auto add_around = [&](int part) {
+    for (const Place& place : places_around(*filter_, part))
+      if (!place.marker) parts.insert(place.part);
+  };
+  for (const auto& [part, unused] : trouble_->edges) add_around(part);
+  for (const Replacement& r : replacements_) add_around(r.place.part);
+  // A step that is about to be accepted is as good as one that stands.
+  const auto standing = [&] {
+    const FoundChanges step = search(schema_, places, segment(suspected, options_.longest_segment));
+    return standing_evidence(samples) + std::max(0.0, step.margin());
+  };
+  credit_ -= static_cast<int>(samples.size());
+  // Edges beside each other explain a bend nearly alike: until one leads, nothing is told.
+  std::optional<BegunDrift> best;
+  double most = -std::numeric_limits<double>::infinity(), second = most;
+  for (BegunDrift& drift : begun_drifts(trouble_->before, noise_, {parts.begin(), parts.end()},
+                                        samples, trouble_->since)) {
+    if (drift.gain < options_.acceptance) continue;
+    const double evidence =
+        drift.log_prior + drift.log_likelihood(trouble_->before, noise_, samples);
+    second = std::max(second, std::min(most, evidence));
+    if (evidence <= most) continue;
+    most = evidence;
+    best = std::move(drift);
+  }
+  if (!best || !best->is_good || most - second < options_.ambiguity ||
+      most - standing() < options_.acceptance)
+    return;
+  // All that was adopted since the trouble began was this drift.
+  std::vector<Replacement> undone = std::move(trouble_->adopted);
+  if (since_ >= trouble_->since)
+    undone.insert(undone.end(), replacements_.begin(), replacements_.end());
+  for (const Replacement& r : undone)
+    tell(AdaptationEvent::Kind::kReverted, sample_index, r, 0, 0, events);
+  replacements_.clear();
+  install(BodySchema(trouble_->before));
+  begin_drift(best->drift.part, best->begin + 1, sample_index, events);
+  drift_watch_.look_again(before_, noise_, *drifting_,
+                          segment(best->begin, static_cast<int>(kRing)));
+  install(best->drift.applied_to(before_));
 }
 
 void Adaptation::watch_drift(std::int64_t sample_index, std::vector<AdaptationEvent>* events) {
@@ -789,7 +858,7 @@ void Adaptation::watch_drift(std::int64_t sample_index, std::vector<AdaptationEv
     if (!replacements_.empty() || detected_) return;
     const auto moved = drift_watch_.moved_part(schema_);
     if (!moved) return;
-    begin_drift(*moved, sample_index, events);
+    begin_drift(*moved, sample_index, sample_index, events);
   }
   const auto drift = drift_watch_.follow(before_, *drifting_);
   if (!drift) return;
@@ -797,26 +866,47 @@ void Adaptation::watch_drift(std::int64_t sample_index, std::vector<AdaptationEv
     if (event.kind == AdaptationEvent::Kind::kDrift)
       event.size =
           size_of_rate(before_, *drifting_, drift->left, drift->rate, drift->rate_covariance);
-  const BodyChange change{drift->left ? BodyChange::Form::kLeft : BodyChange::Form::kRight,
-                          *drifting_};
-  Eigen::VectorXd theta(6);
-  theta << drift->T.translation(), log_so3(drift->T.linear());
-  // `covariance` is that of a right perturbation of T: near enough to that of θ. What is suspected
-  // elsewhere meanwhile stays so.
+  // What is suspected elsewhere meanwhile stays so.
   SequentialTests tests = *tests_;
-  install(changed(before_, change, theta, drift->covariance));
+  install(drift->applied_to(before_));
   tests.clear(filter_->node_of(*drifting_));
   tests_ = std::move(tests);
   num_still_ = drift->significance > kSignificantRate ? 0 : num_still_ + 1;
-  if (num_still_ < options_.settled_after) return;
+  if (num_still_ >= options_.settled_after) {
+    end_drift(sample_index, *drift, sample_index, events);
+  } else if (drift->has_ended > kSurelyEnded && sample_index - drift->last_moved >= kEndedFor) {
+    // What goes on, only slower, is no end.
+    drift_watch_.forget(*drifting_, drift->last_moved);
+    const auto rest = drift_watch_.follow(before_, *drifting_);
+    if (rest && rest->significance < kSignificantRate)
+      end_drift(drift->last_moved, *drift, sample_index, events);
+  }
+}
+
+/// `since`: the first sample with the body as it is now; `sample_index` where that is not known.
+void Adaptation::end_drift(std::int64_t since, const Drift& drift, std::int64_t sample_index,
+                           std::vector<AdaptationEvent>* events) {
   AdaptationEvent recovered =
       event(AdaptationEvent::Kind::kRecovered, sample_index, {*drifting_, false});
   recovered.cause = "drift";
+  recovered.num_samples =
+      since < sample_index ? static_cast<int>(sample_index - since) : num_still_;
   events->push_back(recovered);
-  drift_watch_.forget(*drifting_, sample_index);
+  drift_watch_.forget(*drifting_, since);
   remember(schema_);
   trusted_ = schema_;
   tags_.begin_anew();
+  // What it is now is estimated from more samples as they come.
+  if (since < sample_index) {
+    Replacement there{{*drifting_, false}, {}};
+    there.fitted.change = {drift.left ? BodyChange::Form::kLeft : BodyChange::Form::kRight,
+                           *drifting_};
+    there.fitted.theta = coordinates(drift.T);
+    there.fitted.covariance = drift.covariance;
+    maturing_ = {std::move(there)};
+    since_ = since;
+    age_ = static_cast<int>(sample_index - since);
+  }
   drifting_.reset();
 }
 
@@ -868,6 +958,7 @@ std::vector<AdaptationEvent> Adaptation::on_new_sample(ActionPoseSample sample) 
   else if (!maturing_.empty())
     mature(sample.sample_index, &events);
   try_changes(sample.sample_index, &events);
+  try_drift(sample.sample_index, &events);
   try_learning(sample.sample_index, &events);
   // A body that moves otherwise shows other sides of its parts.
   const auto is_change = [](const AdaptationEvent& e) {

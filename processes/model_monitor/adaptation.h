@@ -86,6 +86,12 @@ const char* name_of(AdaptationEvent::Kind kind);
 /// of small changes apart, which may be drifts) are estimated anew until there are `matured_after`
 /// samples.
 ///
+/// What changes all the time looks like one step after another. An edge that stays suspicious, or
+/// one beside it, may therefore have drifted since the first of them: at a constant rate, from
+/// nothing (begun_drifts). If that has `acceptance` more evidence than the steps, they are undone
+/// and the edge is followed by DriftWatch until it moves no more. A drift too slow for the CUSUMs is
+/// found by DriftWatch itself.
+///
 /// What repeats another sample (SampleStream) is neither looked at nor counted. Where an edge is
 /// soft the assumed noise has room for what its model leaves, so noise_scale() stays at 1 or above,
 /// and nothing is found out from fewer than three samples, however loud: a bend that was never
@@ -133,7 +139,15 @@ class Adaptation {
   std::vector<AdaptationEvent> on_new_sample(ActionPoseSample sample);
   EdgeState state_of(const Place& place) const;
   void calibrate();
-  void begin_drift(int part, std::int64_t sample_index, std::vector<AdaptationEvent>* events);
+  /// What changes all the time looks like one step after another: an edge in trouble may drift.
+  void try_drift(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
+  /// Evidence of what stands for these samples: of the present replacements, and before them of
+  /// what was there.
+  double standing_evidence(const std::vector<const ActionPoseSample*>& samples) const;
+  void begin_drift(int part, std::int64_t since, std::int64_t sample_index,
+                   std::vector<AdaptationEvent>* events);
+  void end_drift(std::int64_t since, const Drift& drift, std::int64_t sample_index,
+                 std::vector<AdaptationEvent>* events);
   void watch_drift(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
   void watch_noise(const TreeFilter::Judgement& judgement);
   std::vector<const ActionPoseSample*> segment(std::int64_t since, int longest) const;
@@ -216,8 +230,9 @@ class Adaptation {
       int num_mismatches = 0;
       std::int64_t since = 0;  ///< the first
     };
-    std::map<int, Edge> edges;  ///< by the part that they lead to
-    BodySchema before;          ///< what stood when it began
+    std::map<int, Edge> edges;         ///< by the part that they lead to
+    BodySchema before;                 ///< what stood when it began
+    std::vector<Replacement> adopted;  ///< since, and taken as they are
   };
   std::optional<Trouble> trouble_;
   BodySchema before_;                      ///< what stood before the present replacements

@@ -134,7 +134,7 @@ void Findings::hear(const Adaptation& adaptation, const AdaptationEvent& event) 
         followed->cause = difference.cause;
         followed->size = difference.size;
         followed->adopted = event.sample_index;
-        followed->num_confirming = adaptation.options().settled_after;
+        followed->num_confirming = event.num_samples;
       } else if (Finding* adopted = newest(event, State::kAdopted)) {
         adopted->state = State::kConfirmed;
         adopted->num_confirming = event.num_samples;

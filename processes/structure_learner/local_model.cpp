@@ -15,8 +15,6 @@ Pose screw_motion(double slide, double turn, double q) {
   return X;
 }
 
-double robust_cost(double d2) { return (kStudentNu + 6) / 2 * std::log1p(d2 / kStudentNu); }
-
 // Whitened residual and its Jacobian: log((Δ̂ exp δ)⁻¹ z) = r − J_l⁻¹(r) δ + O(δ²).
 void whitened_jacobian(const PairHypothesis& h, const Vector6d& residual, ParameterJacobian* J) {
   const Matrix6d M = -h.whitening * right_jacobian_inverse(-residual);

@@ -14,8 +14,6 @@
 namespace bodyschema {
 namespace {
 
-double robust_cost(double d2) { return (kStudentNu + 6) / 2 * std::log1p(d2 / kStudentNu); }
-
 double log_chi_square_tail(double x, int dof) {
   const double tail = boost::math::gamma_q(0.5 * dof, 0.5 * x);
   // Far out the tail underflows; its logarithm is −x/2 to leading order.

@@ -157,7 +157,9 @@ SyntheticRobot BrokenArm::robot_at(int index) const {
   if (scenario_.fault == Fault::kDrift) {
     SyntheticRobot robot = healthy_;
     Pose T = Pose::Identity();
-    T.linear() = exp_so3(drift_axis_ * 0.05 * kDegree * std::max(0, index - block_length_));
+    const double bend_deg = std::min(scenario_.drift_deg * std::max(0, index - block_length_),
+                                     scenario_.most_drift_deg);
+    T.linear() = exp_so3(drift_axis_ * bend_deg * kDegree);
     robot.links[3].X_before = robot.links[3].X_before * T;
     return robot;
   }

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <limits>
 #include <set>
 #include <string>
 #include <vector>
@@ -21,7 +22,7 @@ enum class Fault {
   kAdjacent,  ///< a stuck joint, and the link after the next joint bent by 40° and 10 cm
   kMarker,    ///< a marker in the middle moves on its part: 5 cm, 1 rad
   kCamera,    ///< bumped: 10 cm, 15°
-  kDrift,     ///< a link bends by 0.05° a sample, for ever
+  kDrift,     ///< a link bends by drift_deg a sample
   kWorn,      ///< a joint's transmission: it goes to q + 0.6 sin 3q
   kCoupled,   ///< a joint is moved by another signal too, half as far
   kElastic    ///< what a joint carries bends with the angle: 17° and 4 cm at 1 rad
@@ -39,6 +40,9 @@ struct Scenario {
   Fault fault = Fault::kNone;
   const char* name = "";
   double visible = 1;  ///< share of the markers seen, each on its own
+  double drift_deg = 0.05;  ///< kDrift: a sample, from the second block on …
+  /// … until it has come so far.
+  double most_drift_deg = std::numeric_limits<double>::infinity();
 };
 
 /// The chapter's arm of Sections 5.2 and 5.3: a chain of seven parts x1 … x7, the edge i–(i+1)

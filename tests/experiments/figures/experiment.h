@@ -47,6 +47,7 @@ Findings two_dof_free(const Setup& setup);
 Findings seven_dof(const Setup& setup);
 Findings trees(const Setup& setup);
 Findings adaptation(const Setup& setup);
+Findings drift(const Setup& setup);
 Findings false_alarms(const Setup& setup);
 
 /// Calls work(0) … work(count − 1), on `setup.jobs` threads, in any order. What `work` throws first

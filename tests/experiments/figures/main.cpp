@@ -38,6 +38,7 @@ const std::vector<Experiment> kExperiments = {
     {"trees", "Beyond the chapter: random trees", trees},
     {"adaptation", "Table 1, Figs. 9, 12 and 13: a body that breaks, is repaired, breaks again",
      adaptation},
+    {"drift", "Beyond the chapter: a link that bends all the time", drift},
     {"false_alarms", "Section 4: how often a healthy body is found broken", false_alarms},
 };
 

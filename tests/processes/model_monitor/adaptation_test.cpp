@@ -11,6 +11,7 @@
 #include <random>
 #include <set>
 
+#include "common/geometry/angle.h"
 #include "tests/support/broken_arm.h"
 #include "tests/support/synthetic_robot.h"
 
@@ -361,6 +362,46 @@ TEST(AdaptationTest, ASlowDriftIsNamedAndFollowed) {
   EXPECT_GT(arm.error(arm.engineered(), 399), 0.03);
 }
 
+/// Faster than the step tests are slow: at first it looks like a step, and is taken for one until
+/// samples tell.
+TEST(AdaptationTest, AFastDriftIsADrift) {
+  constexpr double kMost_deg = 25;
+  constexpr int kAfter = 30;
+  for (const double rate_deg : {0.1, 0.3, 0.5, 1.0})
+    for (const int seed : {1, 2, 3}) {
+      BrokenArm arm({Fault::kDrift, "", 0.85, rate_deg, kMost_deg}, Regime::kTagIso, kBlock, seed);
+      Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kTagIso));
+      const int end = kBlock + static_cast<int>(std::ceil(kMost_deg / rate_deg));
+      const Life life = live(arm, adaptation, end + kAfter);
+      SCOPED_TRACE("by " + std::to_string(rate_deg) + "° a sample, seed " + std::to_string(seed) +
+                   ", over at " + std::to_string(end) + ":\n" + life.log());
+      std::vector<AdaptationEvent> drifts, ends;
+      for (const AdaptationEvent& e : life.events) {
+        EXPECT_TRUE(e.sample_index >= kBlock && arm.is_near(part_of(e))) << text(e);
+        if (e.kind == Kind::kDrift) drifts.push_back(e);
+        if (e.kind == Kind::kRecovered) ends.push_back(e);
+      }
+      // Told once, at its edge, before it has gone far; and its end soon after that.
+      ASSERT_EQ(drifts.size(), 1U);
+      EXPECT_EQ(drifts[0].to, 4);
+      EXPECT_EQ(drifts[0].cause, "drift");
+      EXPECT_LT((static_cast<double>(drifts[0].sample_index) - kBlock) * rate_deg, 12);
+      EXPECT_NEAR(static_cast<double>(drifts[0].since), kBlock, 12);
+      ASSERT_EQ(drifts[0].size.amounts.size(), 2U);
+      EXPECT_NEAR(drifts[0].size.amounts[1], rate_deg * kDegree, 0.6 * rate_deg * kDegree);
+      if (rate_deg > 0.2) {
+        ASSERT_EQ(ends.size(), 1U);
+        EXPECT_EQ(ends[0].cause, "drift");
+        EXPECT_LT(ends[0].sample_index, end + 15);
+        EXPECT_TRUE(adaptation.is_settled());
+      }
+      const double healthy = life.error[kBlock - 1];
+      EXPECT_LT(*std::max_element(life.error.begin(), life.error.end()), healthy + 0.025);
+      for (int t = end + 10; t < end + kAfter; ++t)
+        EXPECT_LT(life.error[static_cast<std::size_t>(t)], healthy + 0.006) << "sample " << t;
+    }
+}
+
 TEST(AdaptationTest, WhatBreaksWhileALinkDriftsIsFoundAllTheSame) {
   BrokenArm arm({Fault::kDrift, "", 1}, Regime::kTagIso, 60, 2);
   Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kTagIso));
@@ -696,9 +737,9 @@ TEST(AdaptationTest, WhatIsNeverSeenIsNotSuspected) {
 }
 
 TEST(AdaptationTest, TheSameSamplesGiveTheSameEventsAndSchema) {
-  for (const Fault fault : {Fault::kGain, Fault::kWorn}) {
+  for (const Fault fault : {Fault::kGain, Fault::kWorn, Fault::kDrift}) {
     const auto once = [fault] {
-      BrokenArm arm({fault, "", 0.85}, Regime::kTagIso, 40, 5);
+      BrokenArm arm({fault, "", 0.85, 0.5, 25}, Regime::kTagIso, 40, 5);
       Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kTagIso));
       const Life life = live(arm, adaptation, 160);
       return std::pair{life.log(), life.error};

@@ -6,6 +6,7 @@
 
 #include "common/geometry/angle.h"
 #include "processes/model_monitor/body_change.h"
+#include "processes/model_monitor/change_fit.h"
 #include "tests/support/broken_arm.h"
 
 namespace bodyschema {
@@ -56,6 +57,59 @@ TEST(DriftWatchTest, ASlowBendIsFoundAtItsEdgeWhileItIsSmallAndThenFollowed) {
     EXPECT_NEAR(rotation_angle(drift->T) / kDegree, 0.05 * (end - 1 - kHealthy), 1);
     EXPECT_NEAR(drift->rate.tail<3>().norm() / kDegree, 0.05, 0.03);
     EXPECT_GT(drift->significance, 12.6);  // χ²₆(0.95)
+  }
+}
+
+TEST(DriftWatchTest, AFastBendIsFoundSinceItsBeginAndItsEndIsSeen) {
+  constexpr int kHealthy = 30, kBent = 10, kStill = 10;
+  for (const int seed : {1, 2, 3}) {
+    BrokenArm arm({Fault::kDrift, "", 0.85, 1, kBent}, Regime::kTagIso, kHealthy, seed);
+    const BodySchema& schema = arm.engineered();
+    const MarkerNoise noise = test::adaptation_options(Regime::kTagIso).noise;
+    std::vector<ActionPoseSample> life;
+    for (int t = 0; t < kHealthy + kBent + kStill; ++t) life.push_back(arm.observe(t));
+    const auto between = [&life](int begin, int end) {
+      std::vector<const ActionPoseSample*> samples;
+      for (int t = begin; t < end; ++t) samples.push_back(&life[static_cast<std::size_t>(t)]);
+      return samples;
+    };
+    const auto samples = between(0, kHealthy + kBent);
+    const auto found = begun_drifts(schema, noise, {3, 4, 5}, samples, kHealthy + 2);
+    ASSERT_FALSE(found.empty());
+    EXPECT_EQ(found[0].drift.part, 4);
+    EXPECT_TRUE(found[0].is_good);
+    EXPECT_NEAR(static_cast<double>(found[0].begin), kHealthy, 2);
+    EXPECT_NEAR(found[0].drift.rate.tail<3>().norm() / kDegree, 1, 0.4);
+    EXPECT_NEAR(rotation_angle(found[0].drift.T) / kDegree, kBent - 1, 2);
+    EXPECT_GT(found[0].log_likelihood(schema, noise, samples) + found[0].log_prior,
+              log_likelihood(schema, noise, samples) + 50);
+
+    DriftWatch watch(1e-5);
+    watch.look_again(schema, noise, 4, between(kHealthy, kHealthy + kBent));
+    const auto going_on = watch.follow(schema, 4);
+    ASSERT_TRUE(going_on);
+    EXPECT_LT(going_on->has_ended, 0.5);
+    watch.look_again(schema, noise, 4, between(kHealthy, kHealthy + kBent + kStill));
+    const auto ended = watch.follow(schema, 4);
+    ASSERT_TRUE(ended);
+    EXPECT_GT(ended->has_ended, 0.99);
+    EXPECT_NEAR(static_cast<double>(ended->last_moved), kHealthy + kBent, 2);
+    EXPECT_NEAR(rotation_angle(ended->T) / kDegree, kBent, 1.5);
+  }
+}
+
+TEST(DriftWatchTest, ABentLinkHasNotDriftedWell) {
+  constexpr int kHealthy = 30;
+  for (const int seed : {1, 2, 3}) {
+    BrokenArm arm({Fault::kBend, "", 0.85}, Regime::kTagIso, kHealthy, seed);
+    const BodySchema& schema = arm.engineered();
+    const MarkerNoise noise = test::adaptation_options(Regime::kTagIso).noise;
+    std::vector<ActionPoseSample> life;
+    for (int t = 0; t < kHealthy + 8; ++t) life.push_back(arm.observe(t));
+    std::vector<const ActionPoseSample*> samples;
+    for (const ActionPoseSample& sample : life) samples.push_back(&sample);
+    for (const BegunDrift& drift : begun_drifts(schema, noise, {5}, samples, kHealthy))
+      EXPECT_FALSE(drift.is_good);
   }
 }
 
