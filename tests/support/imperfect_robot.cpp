@@ -88,8 +88,7 @@ ImperfectRobot::ImperfectRobot(int num_joints, bool is_chain, const Imperfection
   X_CR_.translation() << 0, 0, 2;
   down_ = random_rotation(rng_).col(0);
   for (int n = 0; n <= num_joints; ++n) {
-    Link link{.before = random_side(rng_), .after = random_side(rng_), .noise = {}};
-    link.noise.setZero();
+    Link link{.before = random_side(rng_), .after = random_side(rng_)};
     link.parent = n == 0 ? -1
                   : is_chain || n == 1 || uniform(rng_, 0, 1) < 0.6
                       ? n - 1

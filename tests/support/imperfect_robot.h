@@ -63,9 +63,10 @@ class ImperfectRobot {
   struct Link {
     int parent = -1;
     Eigen::Isometry3d before, after;  ///< of the joint, which turns about z
-    std::vector<Tag> tags;
-    double angle = 0;                   ///< of the joint, now
-    Eigen::Matrix<double, 6, 1> noise;  ///< of the marker, now
+    std::vector<Tag> tags = {};
+    double angle = 0;  ///< of the joint, now
+    Eigen::Matrix<double, 6, 1> noise =
+        Eigen::Matrix<double, 6, 1>::Zero();  ///< of the marker, now
   };
   void move(const Eigen::VectorXd& action);
   std::vector<Eigen::Isometry3d> poses_at(const std::vector<double>& angles) const;

@@ -173,8 +173,8 @@ TEST(ImperfectRobotTest, MiscalibrationMovesWhatIsSeenByWhatItSays) {
 }
 
 TEST(ImperfectRobotTest, ARangeIsThatOfEveryJoint) {
-  for (const Signal& signal :
-       ImperfectRobot(7, false, with(&Imperfection::range_deg, 30), 1).signals())
+  const ImperfectRobot robot(7, false, with(&Imperfection::range_deg, 30), 1);
+  for (const Signal& signal : robot.signals())
     EXPECT_NEAR(signal.upper - signal.lower, 30 * kDegree, 1e-12);
 }
 
