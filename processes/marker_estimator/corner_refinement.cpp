@@ -486,13 +486,61 @@ void Refiner::make_lattice(const cv::Rect& region, int block_px) {
   origin_ = {region.x / block_px * block_px, region.y / block_px * block_px};
   num_u_ = (region.x + region.width - origin_.x + block_px - 1) / block_px;
   num_v_ = (region.y + region.height - origin_.y + block_px - 1) / block_px;
-  lattice_.resize(static_cast<std::size_t>(2 * num_u_ + 1) * (2 * num_v_ + 1));
-  for (int j = 0; j <= 2 * num_v_; ++j) {
-    for (int i = 0; i <= 2 * num_u_; ++i) {
-      const Eigen::Vector2d p_px(origin_.x - 0.5 + 0.5 * block_px * i,
-                                 origin_.y - 0.5 + 0.5 * block_px * j);
-      const auto point = lens_.straighten(p_px);
-      lattice_[j * (2 * num_u_ + 1) + i] = point ? point->ray : Eigen::Vector2d(NAN, NAN);
+  const int cols = 2 * num_u_ + 1, rows = 2 * num_v_ + 1;
+  lattice_.resize(static_cast<std::size_t>(cols) * rows);
+  const auto pixel = [&](double i, double j) {
+    return Eigen::Vector2d(origin_.x - 0.5 + 0.5 * block_px * i,
+                           origin_.y - 0.5 + 0.5 * block_px * j);
+  };
+  // To invert a lens takes iterations, but over a tag it is smooth: a polynomial of the fifth
+  // degree in either direction, through Chebyshev's points.
+  constexpr int n = 6;
+  Eigen::Matrix<double, n, n> x, y;
+  const auto node = [](int k, int size) {
+    return 0.5 * (size - 1) * (1 - std::cos((k + 0.5) * M_PI / n));
+  };
+  bool is_smooth = true;
+  for (int j = 0; j < n; ++j) {
+    for (int i = 0; i < n; ++i) {
+      const auto point = lens_.straighten(pixel(node(i, cols), node(j, rows)));
+      is_smooth = is_smooth && point;
+      if (point) {
+        x(j, i) = point->ray.x();
+        y(j, i) = point->ray.y();
+      }
+    }
+  }
+  // Row p: Lagrange's polynomials at the p-th point of the lattice.
+  const auto weights = [&](int size) {
+    Eigen::Matrix<double, Eigen::Dynamic, n> W(size, n);
+    for (int p = 0; p < size; ++p) {
+      for (int k = 0; k < n; ++k) {
+        W(p, k) = 1;
+        for (int m = 0; m < n; ++m) {
+          if (m != k) W(p, k) *= (p - node(m, size)) / (node(k, size) - node(m, size));
+        }
+      }
+    }
+    return W;
+  };
+  if (is_smooth) {
+    const Eigen::Matrix<double, Eigen::Dynamic, n> along_u = weights(cols), along_v = weights(rows);
+    const Eigen::MatrixXd all_x = along_v * x * along_u.transpose();
+    const Eigen::MatrixXd all_y = along_v * y * along_u.transpose();
+    // In a corner of the lattice, where it is worst.
+    constexpr double kAccuracy_px = 2e-3;
+    const Eigen::Vector2d corner(all_x(0, 0), all_y(0, 0));
+    if ((lens_.project(corner) - pixel(0, 0)).norm() < kAccuracy_px) {
+      for (int j = 0; j < rows; ++j) {
+        for (int i = 0; i < cols; ++i) lattice_[j * cols + i] = {all_x(j, i), all_y(j, i)};
+      }
+      return;
+    }
+  }
+  for (int j = 0; j < rows; ++j) {
+    for (int i = 0; i < cols; ++i) {
+      const auto point = lens_.straighten(pixel(i, j));
+      lattice_[j * cols + i] = point ? point->ray : Eigen::Vector2d(NAN, NAN);
     }
   }
 }
