@@ -39,8 +39,9 @@ std::optional<PoseFit> fit_pose(const Pose& start, const std::vector<Eigen::Vect
   const auto residual_at = [&](const Pose& X, Jacobian* jacobian) {
     auto r = reprojection_residual(X, p_BP, measured, jacobian);
     if (!r || !whitener) return r;
-    r = *whitener * *r;
-    if (jacobian) *jacobian = *whitener * *jacobian;
+    // Few numbers: without the blocking of a large product.
+    r = Eigen::VectorXd(whitener->lazyProduct(*r));
+    if (jacobian) *jacobian = Jacobian(whitener->lazyProduct(*jacobian));
     return r;
   };
   Pose X_CB = start;
