@@ -91,7 +91,7 @@ const NormalTable kNormal;
 
 /// A step from 0 to 1, smoothed by a Gaussian and seen `distance` behind it: value and first three
 /// derivatives.
-Lane smoothed_step(float distance, float per_sd) {
+[[gnu::always_inline]] inline Lane smoothed_step(float distance, float per_sd) {
   const float t = distance * per_sd;
   const NormalTable::Value v = kNormal(t);
   const float d1 = v.density * per_sd;
@@ -451,7 +451,7 @@ CornerRefusal Refiner::begin(const std::vector<Eigen::Vector2d>& corners_px) {
     rays[k] = point->ray;
     px_per_ray_[k] = point->px_per_ray;
   }
-  constexpr double kMany_px = 32;     // of a side: a quarter are some 400 pixels
+  constexpr double kMany_px = 22;     // of a side: a quarter are some 200 pixels
   constexpr double kPlenty_px = 300;  // corners are known to 2e-3 px from a quarter of the pixels
   if (shortest > kMany_px) first_look_ = Pixels::kQuarter;
   if (shortest > kPlenty_px) all_looks_ = Pixels::kQuarter;
@@ -572,21 +572,35 @@ bool Refiner::guess_light() {
 }
 
 void sum_products(const std::vector<Row>& rows, BlockSums& sums) {
+  static_assert(kLanes == 4);
   auto* block = sums.lines;
   for (int i = 0; i < kLanes; ++i) {
-    for (int j = i; j < kLanes; ++j, ++block) {
-      Lane a0{}, a1{}, a2{}, a3{};
+    // Two blocks at a time: as many sums as fit into registers.
+    for (int j = i; j < kLanes; j += 2) {
+      const int other = std::min(j + 1, kLanes - 1);
+      Lane a0{}, a1{}, a2{}, a3{}, b0{}, b1{}, b2{}, b3{};
       for (const Row& row : rows) {
-        const Lane left = row[i], right = row[j];
-        a0 += left[0] * right;
-        a1 += left[1] * right;
-        a2 += left[2] * right;
-        a3 += left[3] * right;
+        const Lane left = row[i], first = row[j], second = row[other];
+        a0 += left[0] * first;
+        a1 += left[1] * first;
+        a2 += left[2] * first;
+        a3 += left[3] * first;
+        b0 += left[0] * second;
+        b1 += left[1] * second;
+        b2 += left[2] * second;
+        b3 += left[3] * second;
       }
       (*block)[0] = a0;
       (*block)[1] = a1;
       (*block)[2] = a2;
       (*block)[3] = a3;
+      ++block;
+      if (other == j) continue;
+      (*block)[0] = b0;
+      (*block)[1] = b1;
+      (*block)[2] = b2;
+      (*block)[3] = b3;
+      ++block;
     }
   }
 }
