@@ -33,10 +33,20 @@ std::optional<Eigen::VectorXd> reprojection_residual(
 }
 
 std::optional<PoseFit> fit_pose(const Pose& start, const std::vector<Eigen::Vector3d>& p_BP,
-                                const std::vector<ImagePoint>& measured) {
+                                const std::vector<ImagePoint>& measured,
+                                const Eigen::MatrixXd* whitener) {
+  using Jacobian = Eigen::Matrix<double, Eigen::Dynamic, 6>;
+  const auto residual_at = [&](const Pose& X, Jacobian* jacobian) {
+    auto r = reprojection_residual(X, p_BP, measured, jacobian);
+    if (!r || !whitener) return r;
+    // Few numbers: without the blocking of a large product.
+    r = Eigen::VectorXd(whitener->lazyProduct(*r));
+    if (jacobian) *jacobian = Jacobian(whitener->lazyProduct(*jacobian));
+    return r;
+  };
   Pose X_CB = start;
-  Eigen::Matrix<double, Eigen::Dynamic, 6> J;
-  auto residual = reprojection_residual(X_CB, p_BP, measured, &J);
+  Jacobian J;
+  auto residual = residual_at(X_CB, &J);
   if (!residual || !residual->allFinite() || p_BP.size() < 3) return std::nullopt;
   double cost = residual->squaredNorm();
   // Damping is relative to the diagonal, so that metres and radians need no common unit.
@@ -50,11 +60,11 @@ std::optional<PoseFit> fit_pose(const Pose& start, const std::vector<Eigen::Vect
     const Vector6d step = -damped.ldlt().solve(gradient);
     if (!step.allFinite()) return std::nullopt;
     const Pose candidate = X_CB * exp(step);
-    const auto candidate_residual = reprojection_residual(candidate, p_BP, measured, nullptr);
+    const auto candidate_residual = residual_at(candidate, nullptr);
     if (candidate_residual && candidate_residual->squaredNorm() <= cost) {
       X_CB = candidate;
       X_CB.linear() = nearest_rotation(X_CB.linear());
-      residual = reprojection_residual(X_CB, p_BP, measured, &J);
+      residual = residual_at(X_CB, &J);
       if (!residual) return std::nullopt;
       cost = residual->squaredNorm();
       damping = std::max(damping / 10, 1e-12);

@@ -4,8 +4,8 @@
 #include <optional>
 #include <vector>
 
-#include "common/geometry/pose.h"
 #include "common/camera/lens.h"
+#include "common/geometry/pose.h"
 
 namespace bodyschema {
 
@@ -26,10 +26,12 @@ std::optional<Eigen::VectorXd> reprojection_residual(
     const std::vector<ImagePoint>& measured, Eigen::Matrix<double, Eigen::Dynamic, 6>* jacobian);
 
 /// Levenberg–Marquardt from `start` down to the local minimum of the reprojection error of at least
-/// 3 points. std::nullopt if the start has a point behind the camera or the points do not determine
-/// the pose.
+/// 3 points. Where the errors of the n points are correlated, `whitener` (2n × 2n) is the inverse
+/// of the Cholesky factor of their covariance, in units of the points' sigma_px. std::nullopt if
+/// the start has a point behind the camera or the points do not determine the pose.
 std::optional<PoseFit> fit_pose(const Pose& start, const std::vector<Eigen::Vector3d>& p_BP,
-                                const std::vector<ImagePoint>& measured);
+                                const std::vector<ImagePoint>& measured,
+                                const Eigen::MatrixXd* whitener = nullptr);
 
 /// (JᵀJ)⁻¹, exactly symmetric. std::nullopt if the information is singular.
 std::optional<Matrix6d> covariance_from(const Matrix6d& information);

@@ -14,7 +14,7 @@ Lens::Lens(const camera_info_t& info)
       focal_px_(info.fx, info.fy),
       centre_px_(info.cx, info.cy),
       model_(info.distortion_model),
-      is_distorted_(info.num_coefficients > 0) {
+      is_distorted_(false) {
   const int n = info.num_coefficients;
   const bool fits = n == 0 || (model_ == camera_info_t::MODEL_PLUMB_BOB && (n == 4 || n == 5)) ||
                     (model_ == camera_info_t::MODEL_RATIONAL && n == 8) ||
@@ -25,6 +25,8 @@ Lens::Lens(const camera_info_t& info)
   }
   if (!(info.fx > 0 && info.fy > 0)) throw std::invalid_argument("focal length not above 0");
   std::copy_n(info.distortion.begin(), n, k_);
+  // Coefficients of zero are a pinhole's, and a pinhole needs no iteration.
+  is_distorted_ = std::any_of(k_, k_ + n, [](double k) { return k != 0; });
   // Without coefficients a fisheye lens is still not a pinhole.
   if (model_ == camera_info_t::MODEL_FISHEYE) is_distorted_ = true;
 }

@@ -1,5 +1,6 @@
 #include "processes/marker_estimator/marker_estimator.h"
 
+#include <Eigen/Cholesky>
 #include <algorithm>
 #include <cmath>
 #include <stdexcept>
@@ -116,7 +117,7 @@ std::optional<marker_poses_t> MarkerEstimator::on_camera_image(const camera_imag
       ++counters_["tag not in markers.yaml"];
       continue;
     }
-    if (const auto marker = estimate(detection, tag->size_m)) markers.push_back(*marker);
+    if (const auto marker = estimate(*grey, detection, tag->size_m)) markers.push_back(*marker);
   }
   marker_poses_t poses;
   poses.utime = image.utime;
@@ -129,7 +130,8 @@ std::optional<marker_poses_t> MarkerEstimator::on_camera_image(const camera_imag
   return poses;
 }
 
-std::optional<marker_pose_t> MarkerEstimator::estimate(const TagDetection& detection,
+std::optional<marker_pose_t> MarkerEstimator::estimate(const cv::Mat& grey,
+                                                       const TagDetection& detection,
                                                        double size_m) {
   const auto refuse = [&](const char* why) {
     ++counters_[why];
@@ -139,14 +141,27 @@ std::optional<marker_pose_t> MarkerEstimator::estimate(const TagDetection& detec
   if (detection.border_contrast < config_.min_border_contrast) return refuse("tag half covered");
   std::vector<ImagePoint> corners;
   if (shortest_side_px(detection.corners_px) < config_.min_side_px) return refuse("tag too small");
-  const double sigma_px = config_.noise.sigma_px(detection.corners_px);
-  for (const Eigen::Vector2d& p_px : detection.corners_px) {
+  std::vector<Eigen::Vector2d> corners_px = detection.corners_px;
+  double sigma_px = config_.noise.sigma_px(corners_px);
+  Eigen::MatrixXd whitener;  // empty: the corners' errors are independent
+  const CornerRefinement refinement =
+      refine_corners(grey, *lens_, detector_.cells(detection.id), corners_px);
+  if (refinement.corners) {
+    corners_px = refinement.corners->corners_px;
+    const Matrix8d& S = refinement.corners->covariance_px2;
+    sigma_px = std::sqrt(S.trace() / 8);
+    whitener = (S / (sigma_px * sigma_px)).llt().matrixL().solve(Matrix8d::Identity());
+  } else {
+    ++counters_[std::string("corners not refined: ") + name_of(refinement.refusal)];
+  }
+  for (const Eigen::Vector2d& p_px : corners_px) {
     const auto corner = lens_->straighten(p_px);
     if (!corner) return refuse("tag outside of the lens model");
     corners.push_back(*corner);
     corners.back().sigma_px = sigma_px;
   }
-  const std::vector<PoseFit> minima = solve_tag_pose(size_m, corners);
+  const std::vector<PoseFit> minima =
+      solve_tag_pose(size_m, corners, whitener.size() ? &whitener : nullptr);
   if (minima.empty()) return refuse("tag without a pose");
   if (minima[0].rms_sigma * sigma_px > config_.max_reprojection_error_px)
     return refuse("tag not square");
@@ -158,8 +173,8 @@ std::optional<marker_pose_t> MarkerEstimator::estimate(const TagDetection& detec
   marker.marker_id = detection.id;
   marker.size_m = size_m;
   for (int i = 0; i < 4; ++i) {
-    marker.corner_px[i][0] = detection.corners_px[i].x();
-    marker.corner_px[i][1] = detection.corners_px[i].y();
+    marker.corner_px[i][0] = corners_px[i].x();
+    marker.corner_px[i][1] = corners_px[i].y();
   }
   marker.num_hypotheses = static_cast<std::int8_t>(minima.size());
   for (int h = 0; h < 2; ++h) {

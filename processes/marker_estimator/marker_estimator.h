@@ -19,8 +19,8 @@ namespace bodyschema {
 
 struct MarkerEstimatorConfig {
   bool every_image = true;  ///< false: only the newest image waiting (a live camera faster than we)
-  CornerNoise noise;
-  int max_hamming = 0;                   ///< corrected bits
+  CornerNoise noise;        ///< of AprilTag's corners, where they cannot be refined
+  int max_hamming = 0;      ///< corrected bits
   double min_decision_margin = 0;        ///< AprilTag's, grey levels
   int min_white_black_difference = 0;    ///< grey levels
   double min_border_contrast = 0;        ///< see TagDetection::border_contrast
@@ -34,7 +34,9 @@ struct MarkerEstimatorConfig {
 
 /// Finds the rig's tags in an image and estimates their poses X_CM in the camera's frame: both
 /// hypotheses of a planar marker, each refined to its local minimum, and the covariance of the
-/// better one from the corner noise. It knows ids and sizes, not what carries the markers.
+/// better one. Corners are fitted to the grey values of the tag (refine_corners()), whose residuals
+/// give their noise; where that is refused, AprilTag's corners with the configured noise take their
+/// place. It knows ids and sizes, not what carries the markers.
 ///
 /// Before the first CAMERA_INFO it answers nothing, since pixels mean no poses yet. Afterwards it
 /// answers every readable image of the calibrated size, with no markers where none is seen. An
@@ -58,7 +60,8 @@ class MarkerEstimator {
 
  private:
   std::optional<cv::Mat> decode(const camera_image_t& image);
-  std::optional<marker_pose_t> estimate(const TagDetection& detection, double size_m);
+  std::optional<marker_pose_t> estimate(const cv::Mat& grey, const TagDetection& detection,
+                                        double size_m);
 
   const MarkerEstimatorConfig config_;
   const Markers markers_;

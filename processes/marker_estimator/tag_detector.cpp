@@ -6,6 +6,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <cstdlib>
 #include <limits>
 #include <opencv2/imgproc.hpp>
 #include <optional>
@@ -123,6 +124,26 @@ std::vector<TagDetection> TagDetector::detect(const cv::Mat& grey) {
   const auto same_id = [](const auto& a, const auto& b) { return a.id == b.id; };
   detections.erase(std::unique(detections.begin(), detections.end(), same_id), detections.end());
   return detections;
+}
+
+const TagCells& TagDetector::cells(int id) {
+  const auto known = cells_.find(id);
+  if (known != cells_.end()) return known->second;
+  apriltag_family_t* family = april_tag_->family.get();
+  if (id < 0 || id >= static_cast<int>(family->ncodes)) {
+    throw std::out_of_range("the family has no tag " + std::to_string(id));
+  }
+  // image_u8_destroy is in another library; the buffer was made by calloc.
+  image_u8_t* picture = apriltag_to_image(family, id);
+  TagCells cells{picture->width, family->width_at_border, {}};
+  for (int row = 0; row < picture->height; ++row) {
+    for (int column = 0; column < picture->width; ++column) {
+      cells.is_white.push_back(picture->buf[row * picture->stride + column] > 127);
+    }
+  }
+  free(picture->buf);
+  free(picture);
+  return cells_.emplace(id, std::move(cells)).first->second;
 }
 
 }  // namespace bodyschema

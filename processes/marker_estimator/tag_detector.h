@@ -1,10 +1,13 @@
 #pragma once
 
 #include <Eigen/Core>
+#include <map>
 #include <memory>
 #include <opencv2/core.hpp>
 #include <string>
 #include <vector>
+
+#include "processes/marker_estimator/corner_refinement.h"
 
 namespace bodyschema {
 
@@ -38,11 +41,15 @@ class TagDetector {
   /// shorter than kMinSide_px (AprilTag reads outside of smaller images).
   std::vector<TagDetection> detect(const cv::Mat& grey);
 
+  /// The tag as it is printed. @throws std::out_of_range if the family has no such tag.
+  const TagCells& cells(int id);
+
   static constexpr int kMinSide_px = 32;
 
  private:
   struct AprilTag;
   std::unique_ptr<AprilTag> april_tag_;
+  std::map<int, TagCells> cells_;  ///< those asked for so far
 };
 
 }  // namespace bodyschema

@@ -47,7 +47,8 @@ Pose mirrored(const Pose& X_CM) {
 
 }  // namespace
 
-std::vector<PoseFit> solve_tag_pose(double size_m, const std::vector<ImagePoint>& corners) {
+std::vector<PoseFit> solve_tag_pose(double size_m, const std::vector<ImagePoint>& corners,
+                                    const Eigen::MatrixXd* whitener) {
   const std::vector<Eigen::Vector3d> p_MP = tag_corners(size_m);
   std::vector<cv::Point3d> object;
   std::vector<cv::Point2d> rays;
@@ -70,7 +71,7 @@ std::vector<PoseFit> solve_tag_pose(double size_m, const std::vector<ImagePoint>
   std::vector<PoseFit> minima;
   const auto descend = [&](const Pose& start) {
     if (!start.matrix().allFinite()) return;  // IPPE's closed form is NaN for some exact views
-    const auto fit = fit_pose(start, p_MP, corners);
+    const auto fit = fit_pose(start, p_MP, corners, whitener);
     if (!fit || tilt_rad(fit->X_CB) >= M_PI / 2) return;
     const auto is_known = [&](const PoseFit& m) { return is_same_minimum(m.X_CB, fit->X_CB); };
     if (std::none_of(minima.begin(), minima.end(), is_known)) minima.push_back(*fit);
