@@ -369,9 +369,7 @@ std::string ModelMonitor::objection(BodySchema* proposal, const Standing& standi
   }
   const BodySchema* previous = standing.schema();
   if (objection.empty() && !*was_tested) objection = "no test sample yet";
-  // A young baseline stands as long as the learner stands by it.
-  if (objection.empty() && previous && previous->complete && !proposal->complete &&
-      standing.youth.is_over()) {
+  if (objection.empty() && previous && previous->complete && !proposal->complete) {
     objection = "incomplete, where version " + std::to_string(previous->version) + " is complete";
   }
   return objection;

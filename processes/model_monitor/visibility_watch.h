@@ -10,10 +10,8 @@
 namespace bodyschema {
 
 /// Counts how often every part, and every tag of a part that has several, is seen, and finds what
-/// has not been seen for longer than chance explains. A run of m misses begins at any sample with
-/// probability v (1 − v)^m, where v is the share of samples that show it; of v is known what s
-/// sightings and f misses before say, with Jeffreys' prior: B(s + 3/2, f + 1/2 + m) /
-/// B(s + 1/2, f + 1/2).
+/// has not been seen for longer than chance explains: a run of m misses begins at any sample with
+/// probability v (1 − v)^m, where v is the share of samples that show it.
 class VisibilityWatch {
  public:
   /// `false_alarm_rate`: a sample, over all parts and tags together.
