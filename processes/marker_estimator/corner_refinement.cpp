@@ -355,7 +355,8 @@ struct Sums {
   double num_pixels = 0;              ///< by weight
   std::vector<BlockSums> blocks;      ///< JᵀJ with the residual as the last column
   int num_edge = 0, num_covered = 0;  ///< pixels near an edge; down-weighted ones
-  std::array<int, 4> side_covered{};  ///< those within half a cell of the outline's sides
+  std::array<int, 4> side_seen{};     ///< pixels within half a cell of the outline's sides
+  std::array<int, 4> side_covered{};  ///< of these
   int num_white = 0, num_black = 0, num_saturated_white = 0, num_saturated_black = 0;
   float widest_blur = 0;  ///< standard deviation along an axis of the tag [cells]
 };
@@ -470,8 +471,9 @@ CornerRefusal Refiner::begin(const std::vector<Eigen::Vector2d>& corners_px) {
     low = low.cwiseMin(p_px);
     high = high.cwiseMax(p_px);
   }
-  low = low.cwiseMax(Eigen::Vector2d::Zero());
-  high = high.cwiseMin(Eigen::Vector2d(grey_.cols - 1, grey_.rows - 1));
+  const Eigen::Vector2d last(grey_.cols - 1, grey_.rows - 1);
+  low = low.cwiseMax(Eigen::Vector2d::Zero()).cwiseMin(last);
+  high = high.cwiseMax(Eigen::Vector2d::Zero()).cwiseMin(last);
   // Blocks of large tags are larger, so that their number stays bounded.
   const int block_px = 8 * std::max(1, static_cast<int>(std::lround(longest / 128)));
   make_lattice(cv::Rect(cv::Point(low.x(), low.y()),
@@ -700,12 +702,14 @@ void Refiner::look_at_block(int bu, int bv, const Eigen::Matrix3d& to_tag, doubl
       const float r = static_cast<float>(pixel) - std::clamp(expected, 0.0F, 255.0F);
       float weight = 1;
       sums.num_edge += !is_flat;
-      if (std::abs(r) > cut) {
-        weight = cut / std::abs(r);
-        sums.num_covered += !is_flat;
-        const float sides[4] = {std::abs(y - border_high), std::abs(x - border_high),
-                                std::abs(y - border_low), std::abs(x - border_low)};
-        for (int side = 0; side < 4; ++side) sums.side_covered[side] += sides[side] < 0.5F;
+      const bool is_covered = std::abs(r) > cut;
+      if (is_covered) weight = cut / std::abs(r);
+      sums.num_covered += is_covered && !is_flat;
+      const float sides[4] = {std::abs(y - border_high), std::abs(x - border_high),
+                              std::abs(y - border_low), std::abs(x - border_low)};
+      for (int side = 0; side < 4; ++side) {
+        sums.side_seen[side] += sides[side] < 0.5F;
+        sums.side_covered[side] += sides[side] < 0.5F && is_covered;
       }
       if (expected < 0 || expected > 255) continue;
       sums.num_pixels += weight * weight;
@@ -862,13 +866,9 @@ CornerRefinement Refiner::run(const std::vector<Eigen::Vector2d>& corners_px) {
     return refuse(CornerRefusal::kBlurred);
   }
   if (sums.num_covered > 0.08 * sums.num_edge) return refuse(CornerRefusal::kCovered);
-  for (int side = 0; side < 4; ++side) {
-    const Eigen::Vector2d along = corners_px[(side + 1) % 4] - corners_px[side];
-    const Eigen::Vector2d across =
-        (corners_px[(side + 2) % 4] - corners_px[(side + 1) % 4]) / cells_.border;
-    const double strip_px2 = std::abs(along.x() * across.y() - along.y() * across.x());
-    if (sums.side_covered[side] > 0.1 * strip_px2) return refuse(CornerRefusal::kCovered);
-  }
+  for (int side = 0; side < 4; ++side)
+    if (sums.side_covered[side] > 0.1 * sums.side_seen[side])
+      return refuse(CornerRefusal::kCovered);
 
   // The noise, and how much the blocks pull more in common than independent pixels would.
   const double freedom = sums.num_pixels - kParameters;
@@ -896,6 +896,8 @@ CornerRefinement Refiner::run(const std::vector<Eigen::Vector2d>& corners_px) {
     pulled += share.lazyProduct(after).squaredNorm();
     expected -= Wide(share.lazyProduct(R)).squaredNorm();
   }
+  // One block has it all: nothing to compare.
+  if (!(expected > 0.01)) return refuse(CornerRefusal::kTooSmall);
   const double inflation =
       expected > 1 ? std::max(1.0, pulled / (variance * expected)) : 8 / expected;
   covariance *= variance * inflation;

@@ -810,6 +810,11 @@ void Adaptation::try_drift(std::int64_t sample_index, std::vector<AdaptationEven
   const std::int64_t suspected = tests_->highest().cusum.since;
   if (places.empty() || !is_worth_a_fit(sample_index - suspected + 1)) return;
   const auto samples = segment(trouble_->since - kBeforeDrift, static_cast<int>(kRing));
+  // When it began is no longer known.
+  if (samples.empty() || samples.front()->sample_index > trouble_->since) {
+    trouble_->adopted.clear();
+    return;
+  }
   std::set<int> parts;
   const auto add_around = [&](int part) {
     for (const Place& place : places_around(*filter_, part))
@@ -843,6 +848,8 @@ void Adaptation::try_drift(std::int64_t sample_index, std::vector<AdaptationEven
   std::vector<Replacement> undone = std::move(trouble_->adopted);
   if (since_ >= trouble_->since)
     undone.insert(undone.end(), replacements_.begin(), replacements_.end());
+  else if (!replacements_.empty())
+    remember(trouble_->before);
   for (const Replacement& r : undone)
     tell(AdaptationEvent::Kind::kReverted, sample_index, r, 0, 0, events);
   replacements_.clear();
@@ -876,8 +883,9 @@ void Adaptation::watch_drift(std::int64_t sample_index, std::vector<AdaptationEv
     end_drift(sample_index, *drift, sample_index, events);
   } else if (drift->has_ended > kSurelyEnded && sample_index - drift->last_moved >= kEndedFor) {
     // What goes on, only slower, is no end.
-    drift_watch_.forget(*drifting_, drift->last_moved);
-    const auto rest = drift_watch_.follow(before_, *drifting_);
+    DriftWatch since_then = drift_watch_;
+    since_then.forget(*drifting_, drift->last_moved);
+    const auto rest = since_then.follow(before_, *drifting_);
     if (rest && rest->significance < kSignificantRate)
       end_drift(drift->last_moved, *drift, sample_index, events);
   }
@@ -889,6 +897,7 @@ void Adaptation::end_drift(std::int64_t since, const Drift& drift, std::int64_t 
   AdaptationEvent recovered =
       event(AdaptationEvent::Kind::kRecovered, sample_index, {*drifting_, false});
   recovered.cause = "drift";
+  if (since < sample_index) recovered.since = since;
   recovered.num_samples =
       since < sample_index ? static_cast<int>(sample_index - since) : num_still_;
   events->push_back(recovered);

@@ -197,7 +197,7 @@ bool LiveSchema::is_in_doubt() const {
 std::vector<health_event_t> LiveSchema::on_sample(const ActionPoseSample& sample) {
   std::vector<health_event_t> result;
   std::optional<std::int64_t> changed_since;
-  std::optional<int> unchanged_part;
+  std::optional<int> unchanged_part, drifting_part;
   const std::vector<AdaptationEvent> events = adaptation_.on_sample(sample);
   for (const AdaptationEvent& event : events) {
     result.push_back(to_message(event, schema_.signals, sample.utime));
@@ -206,7 +206,13 @@ std::vector<health_event_t> LiveSchema::on_sample(const ActionPoseSample& sample
     // What the tag was taken for was no change.
     if ((event.kind == Kind::kCandidate || event.kind == Kind::kMissing) && event.tag >= 0)
       unchanged_part = event.part;
-    if (event.kind == Kind::kDrift) changed_since = sample.sample_index;
+    if (event.kind == Kind::kDrift) {
+      changed_since = sample.sample_index;
+      drifting_part = event.to;
+    }
+    // It moved until then, each sample another body.
+    if (event.kind == Kind::kRecovered && event.cause == "drift" && event.since >= 0)
+      changed_since = event.since;
     if (event.kind == Kind::kProbeWanted) {
       probe_sample_ = event.sample_index;
       probe_ = event.probe;
@@ -215,7 +221,7 @@ std::vector<health_event_t> LiveSchema::on_sample(const ActionPoseSample& sample
   findings_.update(adaptation_, events, sample.sample_index);
   if (adaptation_.is_settled()) probe_sample_ = -1;
   watch_flips(sample);
-  update(sample, changed_since, unchanged_part);
+  update(sample, changed_since, unchanged_part, drifting_part);
   return result;
 }
 
@@ -234,7 +240,7 @@ void LiveSchema::watch_flips(const ActionPoseSample& sample) {
 }
 
 void LiveSchema::update(const ActionPoseSample& sample, std::optional<std::int64_t> changed_since,
-                        std::optional<int> unchanged_part) {
+                        std::optional<int> unchanged_part, std::optional<int> drifting_part) {
   BodySchema next = adaptation_.schema();
   for (std::size_t e = 0; e < next.edges.size(); ++e) {
     Edge& edge = next.edges[e];
@@ -242,8 +248,12 @@ void LiveSchema::update(const ActionPoseSample& sample, std::optional<std::int64
     edge.valid_since_sample = before.valid_since_sample;
     const bool is_other = !is_same_model(edge, before);
     const bool is_taken_back = unchanged_part == edge.from || unchanged_part == edge.to;
+    // Of what a drift was taken for, nothing changed.
+    const bool is_drift_elsewhere = drifting_part && *drifting_part != edge.to;
     // Without a new change: the same one fitted better, or taken back.
-    if (is_other && changed_since)
+    if (is_other && is_drift_elsewhere && is_same_model(edge, original))
+      edge.valid_since_sample = original.valid_since_sample;
+    else if (is_other && changed_since)
       edge.valid_since_sample = *changed_since;
     else if ((is_other || is_taken_back) && is_same_model(edge, original))
       edge.valid_since_sample = original.valid_since_sample;
@@ -261,7 +271,8 @@ void LiveSchema::update(const ActionPoseSample& sample, std::optional<std::int64
     }
   }
   if (next.X_CR.matrix() != schema_.X_CR.matrix()) {
-    if (changed_since)
+    const bool is_drift_elsewhere = drifting_part && *drifting_part != next.root;
+    if (changed_since && !(is_drift_elsewhere && next.X_CR.matrix() == base_.X_CR.matrix()))
       camera_since_ = *changed_since;
     else if (next.X_CR.matrix() == base_.X_CR.matrix())
       camera_since_ = base_.changes.empty() ? 0 : base_.changes.back().since;

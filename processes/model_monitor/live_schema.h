@@ -64,7 +64,7 @@ class LiveSchema {
   void watch_flips(const ActionPoseSample& sample);
   EdgeState state_of(const Edge& edge) const;
   void update(const ActionPoseSample& sample, std::optional<std::int64_t> changed_since,
-              std::optional<int> unchanged_part);
+              std::optional<int> unchanged_part, std::optional<int> drifting_part);
 
   const BodySchema base_;
   Adaptation adaptation_;

@@ -11,6 +11,7 @@
 #include <map>
 #include <optional>
 #include <set>
+#include <stdexcept>
 #include <string>
 #include <vector>
 
@@ -29,9 +30,10 @@ using test::Rightness;
 namespace {
 
 /// Rendered, or as an earlier call left it in `folder`.
+/// @throws std::runtime_error if it is not there and must be.
 std::vector<sample_t> samples_of(const std::filesystem::path& rig, std::int64_t seed,
                                  const std::set<int>& hidden, std::size_t num_samples,
-                                 const std::filesystem::path& folder) {
+                                 const std::filesystem::path& folder, bool must_be_there) {
   std::string name = rig.filename().string() + "_" + std::to_string(seed);
   for (const int part : hidden) name += "_" + std::to_string(part);
   const auto file = folder / (name + ".lcmlog");
@@ -41,6 +43,9 @@ std::vector<sample_t> samples_of(const std::filesystem::path& rig, std::int64_t 
     samples.resize(num_samples);
     return samples;
   }
+  if (must_be_there)
+    throw std::runtime_error(file.string() +
+                             " is no run of so many samples; render it with --keep alone");
   samples.clear();
   test::RenderedRun run(rig, seed, hidden);
   while (samples.size() < num_samples) samples.push_back(run.next().message);
@@ -74,6 +79,7 @@ int main(int argc, char** argv) {
   std::size_t num_samples = 60;
   std::optional<int> hide;
   std::string folder;
+  bool must_be_there = false;
   CLI::App app("A young baseline of a body that nothing happens to");
   app.add_option("RIGS", rigs, "Rig folders");
   app.add_option("--seeds", num_seeds)->check(CLI::PositiveNumber);
@@ -82,6 +88,7 @@ int main(int argc, char** argv) {
   app.add_option("--hide", hide, "This part alone is hidden, in the images, as ./run --hide does");
   app.add_option("--keep", folder, "Rendered samples are kept here and used again")
       ->check(CLI::ExistingDirectory);
+  app.add_flag("--recorded", must_be_there, "Nothing is rendered: all is in --keep's folder");
   CLI11_PARSE(app, argc, argv);
   if (rigs.empty())
     for (const char* name : {"arm2", "arm4", "arm7"})
@@ -102,7 +109,7 @@ int main(int argc, char** argv) {
     std::map<Rightness, int> live, offline;
     for (std::int64_t seed = first_seed; seed < first_seed + num_seeds; ++seed) {
       const std::set<int> in_images = hide ? std::set<int>{*hide} : std::set<int>{};
-      const auto rendered = samples_of(rig, seed, in_images, num_samples, folder);
+      const auto rendered = samples_of(rig, seed, in_images, num_samples, folder, must_be_there);
       std::vector<int> hidden = truth.parts();
       hidden.insert(hidden.begin(), -1);  // none
       if (hide) hidden = {*hide};

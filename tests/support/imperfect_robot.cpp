@@ -187,10 +187,9 @@ ActionPoseSample ImperfectRobot::go(const Eigen::VectorXd& action) {
     Eigen::Matrix<double, 6, 1> white;
     white << kNoise_m * gaussian3(rng_), kNoise_rad * gaussian3(rng_);
     if (is_.student_nu > 0) {
-      // t = z / √(χ²/ν), its variance as the Gaussian's; χ² of an even number as a sum of logs.
+      // t = z / √(χ²/ν), its variance as the Gaussian's.
       double chi2 = 0;
-      for (int k = 0; k < static_cast<int>(is_.student_nu); ++k)
-        chi2 += std::pow(gaussian(rng_), 2);
+      for (int k = 0; k < is_.student_nu; ++k) chi2 += std::pow(gaussian(rng_), 2);
       white *= std::sqrt((is_.student_nu - 2) / chi2);
     }
     const double rho = is_.correlation;

@@ -20,7 +20,7 @@ struct Imperfection {
   double view_bias_m = 0;       ///< rms over all views of a tag, a smooth function of the view
   double view_bias_deg = 0;     ///< likewise
   double correlation = 0;       ///< of the noise from one sample to the next: AR(1)
-  double student_nu = 0;        ///< degrees of freedom of t-distributed noise; 0: Gaussian
+  int student_nu = 0;           ///< degrees of freedom of t-distributed noise, above 2; 0: Gaussian
   double outlier_share = 0;     ///< anywhere within 1 m
   double flip_share = 0;        ///< the tag's normal mirrored at the line of sight
   double missing_share = 0;
