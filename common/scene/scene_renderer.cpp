@@ -284,7 +284,9 @@ cv::Mat SceneRenderer::render(const sim_state_t& state, int frame) {
   cv::Mat image = self.draw(state);
   if (!self.map_u.empty()) {
     cv::Mat distorted;
-    cv::remap(image, distorted, self.map_u, self.map_v, cv::INTER_LINEAR, cv::BORDER_REPLICATE);
+    // Cubic: bilinear look-up blurs by where between the pixels it falls, which moves corners by
+    // hundredths of a pixel.
+    cv::remap(image, distorted, self.map_u, self.map_v, cv::INTER_CUBIC, cv::BORDER_REPLICATE);
     image = distorted;
   }
   if (self.effects.blur_sd_px > 0) {
