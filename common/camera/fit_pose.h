@@ -12,7 +12,8 @@ namespace bodyschema {
 /// A local minimum of the reprojection error of a body B's points.
 struct PoseFit {
   Pose X_CB = Pose::Identity();
-  double rms_sigma = 0;  ///< root mean square of the residual over the 2n coordinates [sigmas]
+  double rms_sigma =
+      0;  ///< root mean square of the (whitened) residual over the 2n coordinates [sigmas]
   /// JᵀJ of the residual, right perturbation in B, order (translation [m], rotation [rad]): its
   /// inverse is the covariance of X_CB.
   Matrix6d information = Matrix6d::Zero();

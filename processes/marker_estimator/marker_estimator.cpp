@@ -3,6 +3,7 @@
 #include <Eigen/Cholesky>
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <stdexcept>
 
 #include "common/bus/convert.h"
@@ -163,8 +164,14 @@ std::optional<marker_pose_t> MarkerEstimator::estimate(const cv::Mat& grey,
   const std::vector<PoseFit> minima =
       solve_tag_pose(size_m, corners, whitener.size() ? &whitener : nullptr);
   if (minima.empty()) return refuse("tag without a pose");
-  if (minima[0].rms_sigma * sigma_px > config_.max_reprojection_error_px)
-    return refuse("tag not square");
+  // In pixels, whatever the poses were weighted by.
+  const auto error_px = [&](const PoseFit& fit) {
+    const auto residual = reprojection_residual(fit.X_CB, tag_corners(size_m), corners, nullptr);
+    return residual ? sigma_px * residual->norm() / std::sqrt(8.0)
+                    : std::numeric_limits<double>::infinity();
+  };
+  const double least_error_px = error_px(minima[0]);
+  if (!(least_error_px <= config_.max_reprojection_error_px)) return refuse("tag not square");
   if (tilt_rad(minima[0].X_CB) > config_.max_tilt_rad) return refuse("tag too steep");
   const auto covariance = covariance_from(minima[0].information);
   if (!covariance) return refuse("tag without a pose");
@@ -180,7 +187,9 @@ std::optional<marker_pose_t> MarkerEstimator::estimate(const cv::Mat& grey,
   for (int h = 0; h < 2; ++h) {
     const PoseFit& fit = minima[std::min<std::size_t>(h, minima.size() - 1)];
     marker.X_CM[h] = to_message(fit.X_CB);
-    marker.reprojection_error_px[h] = fit.rms_sigma * sigma_px;
+    // The likelier pose is the first, though correlated corners may lie nearer to the other.
+    marker.reprojection_error_px[h] =
+        h == 0 ? least_error_px : std::max(least_error_px, error_px(fit));
   }
   to_message(*covariance, marker.covariance);
   marker.decision_margin = detection.decision_margin;

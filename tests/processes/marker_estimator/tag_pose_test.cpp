@@ -2,6 +2,7 @@
 
 #include <gtest/gtest.h>
 
+#include <Eigen/Cholesky>
 #include <Eigen/LU>
 #include <random>
 
@@ -56,6 +57,49 @@ TEST(SolveTagPose, FindsTheExactPoseOfExactCornersAmongItsHypotheses) {
       }
     }
   }
+}
+
+TEST(SolveTagPose, OfCorrelatedCornersHasATrueCovarianceIfTheyAreWhitened) {
+  std::mt19937 random(5);
+  std::normal_distribution<double> normal(0, 1);
+  const Lens lens(pinhole_camera());
+  const Pose X_CM = marker_pose(0.6, 0.7, 0.5, 1.2, 0.1, 0);
+  // Two sides that a reflection pulls, each its two corners alike, and little else.
+  Eigen::MatrixXd S = 0.03 * 0.03 * Eigen::MatrixXd::Identity(8, 8);
+  for (const auto& [a, b] : {std::pair{0, 2}, {1, 3}, {4, 7}})
+    for (const int i : {a, b})
+      for (const int j : {a, b}) S(i, j) += 0.2 * 0.2;
+  constexpr double kSigma_px = 0.1;
+  const Eigen::LLT<Eigen::MatrixXd> root(S / (kSigma_px * kSigma_px));
+  const Eigen::MatrixXd whitener = root.matrixL().solve(Eigen::MatrixXd::Identity(8, 8));
+  constexpr int kNum = 400;
+  double whitened = 0, plain = 0;
+  for (int n = 0; n < kNum; ++n) {
+    Eigen::VectorXd z(8);
+    for (double& x : z) x = normal(random);
+    const Eigen::VectorXd correlated = root.matrixL() * z;
+    const Eigen::VectorXd error_px = kSigma_px * correlated;
+    std::vector<ImagePoint> points;
+    for (const Eigen::Vector3d& p_MP : tag_corners(kSize_m)) {
+      const Eigen::Vector3d p_C = X_CM * p_MP;
+      const auto k = static_cast<Eigen::Index>(points.size());
+      points.push_back(
+          *lens.straighten(lens.project(p_C.head<2>() / p_C.z()) + error_px.segment<2>(2 * k)));
+      points.back().sigma_px = kSigma_px;
+    }
+    const auto d2 = [&](const std::vector<PoseFit>& minima) {
+      const Vector6d e = log(minima[0].X_CB.inverse() * X_CM);
+      return e.dot(minima[0].information * e) / kNum;
+    };
+    whitened += d2(solve_tag_pose(kSize_m, points, &whitener));
+    plain += d2(solve_tag_pose(kSize_m, points));
+    if (n > 0) continue;
+    const Eigen::MatrixXd none = Eigen::MatrixXd::Identity(8, 8);
+    EXPECT_EQ(solve_tag_pose(kSize_m, points, &none)[0].X_CB.matrix(),
+              solve_tag_pose(kSize_m, points)[0].X_CB.matrix());
+  }
+  EXPECT_NEAR(whitened, 6, 0.7);  // χ²₆, four standard deviations of the mean
+  EXPECT_GT(std::abs(plain - 6), 2);
 }
 
 TEST(SolveTagPose, GivesLocalMinimaInAscendingOrder) {
