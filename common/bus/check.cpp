@@ -2,6 +2,7 @@
 
 #include <spdlog/fmt/fmt.h>
 
+#include <Eigen/Cholesky>
 #include <Eigen/Eigenvalues>
 #include <algorithm>
 #include <cmath>
@@ -12,6 +13,8 @@
 #include <string_view>
 #include <utility>
 #include <vector>
+
+#include "common/bus/convert.h"
 
 namespace bodyschema {
 namespace {
@@ -199,6 +202,13 @@ class Checker {
       complain("rotation_wxyz", fmt::format("has norm {}, not 1", norm));
     }
     path_.pop_back();
+  }
+
+  /// Finite and positive definite, so that it can be inverted.
+  void covariance(const char* field, const float (&triangle)[36]) {
+    for (const float value : triangle) finite(field, double{value});
+    if (problem_.empty() && from_message(triangle).llt().info() != Eigen::Success)
+      complain(field, "is not positive definite");
   }
 
   /// Finite, symmetric, positive semidefinite. `is_required`: with a positive diagonal.
@@ -486,6 +496,7 @@ std::string check(const marker_poses_t& message) {
                check.ascending("marker_id", marker.marker_id, previous);
                check.positive("size_m", marker.size_m);
                check.finite("corner_px", marker.corner_px);
+               check.covariance("corner_covariance", marker.corner_covariance);
                check.integer_within("num_hypotheses", marker.num_hypotheses, 1, 2);
                check.pose("X_CM[0]", marker.X_CM[0]);
                check.pose("X_CM[1]", marker.X_CM[1]);

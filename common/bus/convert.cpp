@@ -43,6 +43,18 @@ Matrix6d from_message(const double (&message)[6][6]) {
   return matrix;
 }
 
+void to_message(const Matrix8d& covariance, float (&message)[36]) {
+  for (int i = 0, k = 0; i < 8; ++i)
+    for (int j = 0; j <= i; ++j, ++k) message[k] = static_cast<float>(covariance(i, j));
+}
+
+Matrix8d from_message(const float (&message)[36]) {
+  Matrix8d covariance;
+  for (int i = 0, k = 0; i < 8; ++i)
+    for (int j = 0; j <= i; ++j, ++k) covariance(i, j) = covariance(j, i) = double{message[k]};
+  return covariance;
+}
+
 ActionPoseSample from_message(const sample_t& message) {
   ActionPoseSample sample;
   sample.utime = message.utime;

@@ -8,6 +8,7 @@
 #include "bodyschema/marker_poses_t.hpp"
 #include "bodyschema/pose_t.hpp"
 #include "bodyschema/sample_t.hpp"
+#include "common/camera/fit_pose.h"
 #include "common/geometry/pose.h"
 #include "common/schema/body_schema.h"
 #include "common/schema/sample.h"
@@ -22,6 +23,10 @@ Pose from_message(const pose_t& message);
 
 void to_message(const Matrix6d& matrix, double (&message)[6][6]);
 Matrix6d from_message(const double (&message)[6][6]);
+
+/// Lower triangle, row by row.
+void to_message(const Matrix8d& covariance, float (&message)[36]);
+Matrix8d from_message(const float (&message)[36]);
 
 /// `corners` are left out: sample_t carries them, ActionPoseSample does not.
 ActionPoseSample from_message(const sample_t& message);

@@ -7,6 +7,17 @@
 
 namespace bodyschema {
 
+double sigma_px(const Matrix8d& corner_covariance_px2) {
+  return std::sqrt(corner_covariance_px2.trace() / 8);
+}
+
+Matrix8d whitener_of(const Matrix8d& corner_covariance_px2) {
+  return (corner_covariance_px2 / (corner_covariance_px2.trace() / 8))
+      .llt()
+      .matrixL()
+      .solve(Matrix8d::Identity());
+}
+
 std::optional<Eigen::VectorXd> reprojection_residual(
     const Pose& X_CB, const std::vector<Eigen::Vector3d>& p_BP,
     const std::vector<ImagePoint>& measured, Eigen::Matrix<double, Eigen::Dynamic, 6>* jacobian) {

@@ -19,6 +19,14 @@ struct PoseFit {
   Matrix6d information = Matrix6d::Zero();
 };
 
+/// Covariance of a tag's corners (x0, y0, …, x3, y3) [px²].
+using Matrix8d = Eigen::Matrix<double, 8, 8>;
+
+/// One standard deviation for all coordinates of corners with that covariance [px] …
+double sigma_px(const Matrix8d& corner_covariance_px2);
+/// … and fit_pose()'s whitener for points with that sigma_px. The covariance is positive definite.
+Matrix8d whitener_of(const Matrix8d& corner_covariance_px2);
+
 /// Where the points `p_BP` of body B, posed at X_CB, are seen, minus where they were measured:
 /// 2n values in units of their standard deviations. `jacobian`, if given, receives the 2n×6
 /// derivative with respect to ξ in X_CB · exp(ξ). std::nullopt if a point lies behind the camera.

@@ -5,6 +5,7 @@
 #include <stdexcept>
 
 #include "common/config/yaml.h"
+#include "common/geometry/angle.h"
 
 namespace bodyschema {
 
@@ -141,6 +142,19 @@ std::vector<std::string> Network::share_of(const std::string& host) const {
   for (const auto& [name, processes] : hosts) all += (all.empty() ? "" : ", ") + name;
   throw std::invalid_argument("--host: network.yaml has no host '" + host + "'; " +
                               (all.empty() ? "all runs on one machine" : "there are: " + all));
+}
+
+RigNoise load_noise(const std::filesystem::path& rig_folder) {
+  const Yaml yaml = Yaml::load(rig_folder / "noise.yaml");
+  RigNoise noise;
+  noise.corner_noise_px = yaml.number("corner_noise_px", 1e-3, 10);
+  noise.small_tag_noise_px = yaml.number("small_tag_noise_px", 0, 10);
+  noise.measurement.systematic.position_m = yaml.number("systematic_position_m", 0, 1);
+  noise.measurement.systematic.rotation_rad =
+      yaml.number("systematic_rotation_deg", 0, 90) * kDegree;
+  noise.measurement.outlier_rate = yaml.number("outlier_rate", 0, 0.5);
+  yaml.finish();
+  return noise;
 }
 
 Network load_network(const std::filesystem::path& rig_folder,

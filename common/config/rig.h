@@ -6,6 +6,7 @@
 #include <string>
 #include <vector>
 
+#include "common/estimation/measurement_model.h"
 #include "common/geometry/pose.h"
 #include "common/schema/signal.h"
 
@@ -23,7 +24,7 @@ struct TagPlacement {
 
 /// markers.yaml: which tags there are and which body part each belongs to.
 struct Markers {
-  std::string family;  ///< AprilTag family, e.g. "tag36h11"
+  std::string family;              ///< AprilTag family, e.g. "tag36h11"
   std::vector<TagPlacement> tags;  ///< ascending id
   std::vector<int> parts() const;  ///< ascending, each once
   const TagPlacement* find(int tag_id) const;
@@ -35,6 +36,13 @@ struct Signals {
   std::vector<Signal> signals;
   std::optional<int> root_part;
   int end_effector_part = 0;
+};
+
+/// noise.yaml: how far what is seen is off, told once for all who reckon with it.
+struct RigNoise {
+  double corner_noise_px = 0;     ///< AprilTag's own corners: see CornerNoise
+  double small_tag_noise_px = 0;  ///< see CornerNoise
+  MeasurementModel measurement;   ///< of poses of parts
 };
 
 /// network.yaml: where the bus of a rig's process group lives.
@@ -58,6 +66,7 @@ struct Network {
 /// @throws ConfigError.
 Markers load_markers(const std::filesystem::path& rig_folder);
 Signals load_signals(const std::filesystem::path& rig_folder);
+RigNoise load_noise(const std::filesystem::path& rig_folder);
 /// `group`: all processes of the rig's group. If there are any, each must run on exactly one host.
 Network load_network(const std::filesystem::path& rig_folder,
                      const std::vector<std::string>& group = {});

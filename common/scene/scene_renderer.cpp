@@ -9,6 +9,7 @@
 #include <vector>
 
 #include "common/bus/convert.h"
+#include "common/scene/image_lookup.h"
 #include "common/scene/egl_context.h"
 #include "common/scene/scene.h"
 #include "common/scene/tag_bitmap.h"
@@ -102,10 +103,10 @@ struct SceneRenderer::Implementation {
     cv::split(rays, xy);
     double lower[2], upper[2];
     for (int i = 0; i < 2; ++i) cv::minMaxLoc(xy[i], &lower[i], &upper[i]);
-    const int left = static_cast<int>(std::floor(lower[0] * calibration.fx)) - 2;
-    const int right = static_cast<int>(std::ceil(upper[0] * calibration.fx)) + 2;
-    const int top = static_cast<int>(std::floor(lower[1] * calibration.fy)) - 2;
-    const int bottom = static_cast<int>(std::ceil(upper[1] * calibration.fy)) + 2;
+    const int left = static_cast<int>(std::floor(lower[0] * calibration.fx)) - 5;
+    const int right = static_cast<int>(std::ceil(upper[0] * calibration.fx)) + 5;
+    const int top = static_cast<int>(std::floor(lower[1] * calibration.fy)) - 5;
+    const int bottom = static_cast<int>(std::ceil(upper[1] * calibration.fy)) + 5;
     if (!(upper[0] < 5 && upper[1] < 5 && lower[0] > -5 && lower[1] > -5) ||
         right - left > kMaxSide_px || bottom - top > kMaxSide_px) {
       throw std::runtime_error("camera " + calibration.camera_name +
@@ -115,8 +116,8 @@ struct SceneRenderer::Implementation {
     pinhole.height = bottom - top + 1;
     pinhole.cx = -left;
     pinhole.cy = -top;
-    xy[0].convertTo(map_u, CV_32F, pinhole.fx, pinhole.cx);
-    xy[1].convertTo(map_v, CV_32F, pinhole.fy, pinhole.cy);
+    distort = ImageLookup(xy[0] * pinhole.fx + pinhole.cx, xy[1] * pinhole.fy + pinhole.cy,
+                          pinhole.width, pinhole.height);
   }
 
   void paint_tags() {
@@ -246,7 +247,7 @@ struct SceneRenderer::Implementation {
   ImageEffects effects;
   SensorNoise noise;
   Pinhole pinhole{};
-  cv::Mat map_u, map_v;  // empty without distortion
+  ImageLookup distort;  // empty without distortion
   MjModelPtr model;
   EglContext egl;
   mjvScene abstract_scene{};
@@ -282,16 +283,11 @@ cv::Mat SceneRenderer::render(const sim_state_t& state, int frame) {
   }
   self.egl.make_current();
   cv::Mat image = self.draw(state);
-  if (!self.map_u.empty()) {
-    cv::Mat distorted;
-    // Cubic: bilinear look-up blurs by where between the pixels it falls, which moves corners by
-    // hundredths of a pixel.
-    cv::remap(image, distorted, self.map_u, self.map_v, cv::INTER_CUBIC, cv::BORDER_REPLICATE);
-    image = distorted;
-  }
   if (self.effects.blur_sd_px > 0) {
     cv::GaussianBlur(image, image, {}, self.effects.blur_sd_px);
   }
+  // After the blur: what is looked up between pixels must not have finer detail than they have.
+  if (!self.distort.empty()) image = self.distort(image);
   self.noise.add(image, state.seed, state.action_id, frame);
   return image;
 }

@@ -81,10 +81,7 @@ AdaptationOptions options_of(const MonitorArguments& arguments, const Recording&
                              const BodySchema& schema) {
   AdaptationOptions options;
   if (recording.is_log) {
-    // As model_monitor has it: the error is that of a pair of markers, and has room for rare
-    // errors.
-    options.noise.model_error = {kTagModelError.position_m * M_SQRT1_2,
-                                 kTagModelError.rotation_rad * M_SQRT1_2};
+    options.noise.systematic = kTagSystematic;  // as model_monitor has it
     options.least_noise_scale = 1;
   }
   if (!arguments.noise.empty()) {

@@ -54,10 +54,9 @@ LearnResult learn_as_the_chapter(const Recording& recording,
                                  const LearnOptions& options) {
   BaselineOptions baseline;
   baseline.root = options.root;
-  // The model error is one of relative poses, which have two markers.
   SourcedNoise noise = marker_noise(training, static_cast<int>(recording.signals.size()), options);
-  noise.position_m = std::hypot(noise.position_m, options.model_error.position_m * M_SQRT1_2);
-  noise.rotation_rad = std::hypot(noise.rotation_rad, options.model_error.rotation_rad * M_SQRT1_2);
+  noise.position_m = std::hypot(noise.position_m, options.systematic.position_m);
+  noise.rotation_rad = std::hypot(noise.rotation_rad, options.systematic.rotation_rad);
   baseline.set_noise(noise);
   baseline.max_samples = std::min(baseline.max_samples, ResidualGp::kMaxSamples);  // to be written
   const BaselineResult result = learn_baseline(recording.signals, training, baseline);
@@ -74,7 +73,7 @@ void run_learn(const LearnArguments& arguments) {
   if (!arguments.noise.empty()) options.noise = noise_given(arguments.noise);
   const Recording recording = load(arguments.samples);
   options.root = arguments.root;
-  if (recording.is_log) options.model_error = kTagModelError;
+  if (recording.is_log) options.systematic = kTagSystematic;
   check_out(arguments.out, {arguments.samples});
   const std::vector<ActionPoseSample> training = recording.training();
   if (options.root) {

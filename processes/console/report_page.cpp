@@ -162,7 +162,7 @@ std::optional<Body> body_of(const RunRecord& record) {
   if (recording.samples.empty()) return std::nullopt;
   recording.signals = observed_signals(recording.samples);
   LearnOptions options;
-  options.model_error = kTagModelError;
+  options.systematic = kTagSystematic;
   return Body{learn(recording.signals, recording.training(), options).schema,
               "learned for this report: the log holds no body schema"};
 }

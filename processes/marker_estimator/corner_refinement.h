@@ -6,6 +6,7 @@
 #include <optional>
 #include <vector>
 
+#include "common/camera/fit_pose.h"
 #include "common/camera/lens.h"
 
 namespace bodyschema {
@@ -17,8 +18,6 @@ struct TagCells {
   int border = 0;
   std::vector<std::uint8_t> is_white;  ///< row by row, the first is the tag's upper edge
 };
-
-using Matrix8d = Eigen::Matrix<double, 8, 8>;
 
 /// Corners of the black square, fitted to the grey values of the whole tag.
 struct RefinedCorners {

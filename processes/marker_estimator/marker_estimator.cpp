@@ -36,8 +36,8 @@ MarkerEstimatorConfig MarkerEstimatorConfig::load(const std::filesystem::path& f
   const Yaml yaml = Yaml::load(file);
   MarkerEstimatorConfig config;
   config.every_image = yaml.boolean("every_image");
-  config.noise.corner_noise_px = yaml.number("corner_noise_px", 1e-3, 10);
-  config.noise.small_tag_noise_px = yaml.number("small_tag_noise_px", 0, 10);
+  const RigNoise noise = load_noise(file.parent_path());
+  config.noise = {noise.corner_noise_px, noise.small_tag_noise_px};
   config.max_hamming = static_cast<int>(yaml.integer("max_hamming", 0, 2));
   config.min_decision_margin = yaml.number("min_decision_margin", 0, 255);
   config.min_white_black_difference =
@@ -143,31 +143,29 @@ std::optional<marker_pose_t> MarkerEstimator::estimate(const cv::Mat& grey,
   std::vector<ImagePoint> corners;
   if (shortest_side_px(detection.corners_px) < config_.min_side_px) return refuse("tag too small");
   std::vector<Eigen::Vector2d> corners_px = detection.corners_px;
-  double sigma_px = config_.noise.sigma_px(corners_px);
-  Eigen::MatrixXd whitener;  // empty: the corners' errors are independent
+  Matrix8d covariance_px2 = std::pow(config_.noise.sigma_px(corners_px), 2) * Matrix8d::Identity();
   const CornerRefinement refinement =
       refine_corners(grey, *lens_, detector_.cells(detection.id), corners_px);
   if (refinement.corners) {
     corners_px = refinement.corners->corners_px;
-    const Matrix8d& S = refinement.corners->covariance_px2;
-    sigma_px = std::sqrt(S.trace() / 8);
-    whitener = (S / (sigma_px * sigma_px)).llt().matrixL().solve(Matrix8d::Identity());
+    covariance_px2 = refinement.corners->covariance_px2;
   } else {
     ++counters_[std::string("corners not refined: ") + name_of(refinement.refusal)];
   }
+  const double sigma = sigma_px(covariance_px2);
+  const Eigen::MatrixXd whitener = whitener_of(covariance_px2);
   for (const Eigen::Vector2d& p_px : corners_px) {
     const auto corner = lens_->straighten(p_px);
     if (!corner) return refuse("tag outside of the lens model");
     corners.push_back(*corner);
-    corners.back().sigma_px = sigma_px;
+    corners.back().sigma_px = sigma;
   }
-  const std::vector<PoseFit> minima =
-      solve_tag_pose(size_m, corners, whitener.size() ? &whitener : nullptr);
+  const std::vector<PoseFit> minima = solve_tag_pose(size_m, corners, &whitener);
   if (minima.empty()) return refuse("tag without a pose");
   // In pixels, whatever the poses were weighted by.
   const auto error_px = [&](const PoseFit& fit) {
     const auto residual = reprojection_residual(fit.X_CB, tag_corners(size_m), corners, nullptr);
-    return residual ? sigma_px * residual->norm() / std::sqrt(8.0)
+    return residual ? sigma * residual->norm() / std::sqrt(8.0)
                     : std::numeric_limits<double>::infinity();
   };
   const double least_error_px = error_px(minima[0]);
@@ -183,6 +181,7 @@ std::optional<marker_pose_t> MarkerEstimator::estimate(const cv::Mat& grey,
     marker.corner_px[i][0] = corners_px[i].x();
     marker.corner_px[i][1] = corners_px[i].y();
   }
+  to_message(covariance_px2, marker.corner_covariance);
   marker.num_hypotheses = static_cast<std::int8_t>(minima.size());
   for (int h = 0; h < 2; ++h) {
     const PoseFit& fit = minima[std::min<std::size_t>(h, minima.size() - 1)];

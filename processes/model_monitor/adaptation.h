@@ -22,7 +22,7 @@
 namespace bodyschema {
 
 struct AdaptationOptions {
-  MarkerNoise noise;
+  MeasurementModel noise;
   /// Wished false alarms a sample, over all tests together.
   double false_alarm_rate = 1e-5;
   /// Below it noise_scale() does not go. 1 where the assumed noise has room for rare errors that a
@@ -89,8 +89,8 @@ const char* name_of(AdaptationEvent::Kind kind);
 /// What changes all the time looks like one step after another. An edge that stays suspicious, or
 /// one beside it, may therefore have drifted since the first of them: at a constant rate, from
 /// nothing (begun_drifts). If that has `acceptance` more evidence than the steps, they are undone
-/// and the edge is followed by DriftWatch until it moves no more. A drift too slow for the CUSUMs is
-/// found by DriftWatch itself.
+/// and the edge is followed by DriftWatch until it moves no more. A drift too slow for the CUSUMs
+/// is found by DriftWatch itself.
 ///
 /// What repeats another sample (SampleStream) is neither looked at nor counted. Where an edge is
 /// soft the assumed noise has room for what its model leaves, so noise_scale() stays at 1 or above,
@@ -122,7 +122,7 @@ class Adaptation {
   /// True over assumed standard deviation of the markers, as the residuals of quiet samples show
   /// it.
   double noise_scale() const { return noise_.scale; }
-  const MarkerNoise& noise() const { return noise_; }
+  const MeasurementModel& noise() const { return noise_; }
   /// Parts whose markers have not been seen for longer than chance explains.
   std::vector<int> missing_parts() const { return visibility_.missing_parts(); }
   bool is_drifting(int part) const { return drifting_ == part; }
@@ -197,7 +197,7 @@ class Adaptation {
 
   const bool is_soft_;  ///< some edge has a residual GP
   const AdaptationOptions options_;
-  MarkerNoise noise_;
+  MeasurementModel noise_;
   int num_samples_ = 0;
   int credit_;                           ///< work that may be done now; see kWorkPerSample
   std::vector<double> quiet_distances_;  ///< d² of believed markers since the noise was last set

@@ -68,7 +68,7 @@ BodySchema with_change(const BodySchema& schema, const FittedChange& fitted) {
   return changed(result, fitted.change, fitted.theta, fitted.covariance);
 }
 
-double log_likelihood(const BodySchema& schema, const MarkerNoise& noise,
+double log_likelihood(const BodySchema& schema, const MeasurementModel& noise,
                       const std::vector<const ActionPoseSample*>& samples,
                       const std::vector<int>& cut_parts) {
   const TreeFilter filter(schema, noise);
@@ -80,7 +80,7 @@ double log_likelihood(const BodySchema& schema, const MarkerNoise& noise,
   return sum;
 }
 
-PlaceEvidence::PlaceEvidence(const BodySchema& base, const MarkerNoise& noise, int part,
+PlaceEvidence::PlaceEvidence(const BodySchema& base, const MeasurementModel& noise, int part,
                              bool marker, std::vector<const ActionPoseSample*> samples,
                              std::vector<int> cut_parts)
     : base_(base),

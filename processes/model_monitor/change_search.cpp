@@ -59,7 +59,7 @@ std::vector<Base> bases_of(const Place& place, const BodySchema& standing,
 std::optional<Replacement> whole(const BodySchema& stored, const BodySchema& standing,
                                  const std::vector<Place>& places,
                                  const std::vector<const ActionPoseSample*>& samples,
-                                 const MarkerNoise& noise, double null) {
+                                 const MeasurementModel& noise, double null) {
   Replacement all;
   FittedChange& fitted = all.fitted;
   fitted.change.form = BodyChange::Form::kStored;

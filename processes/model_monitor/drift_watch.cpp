@@ -221,7 +221,7 @@ void DriftWatch::add(const TreeFilter& filter, const TreeFilter::Instant& instan
   }
 }
 
-void DriftWatch::look_again(const BodySchema& schema, const MarkerNoise& noise, int part,
+void DriftWatch::look_again(const BodySchema& schema, const MeasurementModel& noise, int part,
                             const std::vector<const ActionPoseSample*>& samples) {
   forget_all();
   const TreeFilter filter(schema, noise);
@@ -373,7 +373,7 @@ BodySchema Drift::applied_to(const BodySchema& before) const {
                  covariance + (1 - has_ended) * rate * rate.transpose());
 }
 
-double BegunDrift::log_likelihood(const BodySchema& before, const MarkerNoise& noise,
+double BegunDrift::log_likelihood(const BodySchema& before, const MeasurementModel& noise,
                                   const std::vector<const ActionPoseSample*>& samples) const {
   const BodyChange change{drift.left ? BodyChange::Form::kLeft : BodyChange::Form::kRight,
                           drift.part};
@@ -391,7 +391,7 @@ double BegunDrift::log_likelihood(const BodySchema& before, const MarkerNoise& n
   return sum + bodyschema::log_likelihood(before, noise, unmoved);
 }
 
-std::vector<BegunDrift> begun_drifts(const BodySchema& before, const MarkerNoise& noise,
+std::vector<BegunDrift> begun_drifts(const BodySchema& before, const MeasurementModel& noise,
                                      const std::vector<int>& parts,
                                      const std::vector<const ActionPoseSample*>& samples,
                                      std::int64_t since) {

@@ -7,6 +7,7 @@
 #include <utility>
 
 #include "common/bus/convert.h"
+#include "common/config/rig.h"
 #include "common/config/yaml.h"
 #include "common/geometry/angle.h"
 #include "common/schema/kinematic_path.h"
@@ -31,13 +32,6 @@ constexpr std::int64_t kRenewal = 500;
 /// −1 if there is no value.
 double median_or_none(std::vector<double> values) {
   return values.empty() ? -1 : median(std::move(values));
-}
-
-Matrix6d diagonal(const Noise& noise) {
-  Vector6d variances;
-  variances << Eigen::Vector3d::Constant(noise.position_m * noise.position_m),
-      Eigen::Vector3d::Constant(noise.rotation_rad * noise.rotation_rad);
-  return variances.asDiagonal();
 }
 
 /// Edges between the same parts, by the same signals.
@@ -72,20 +66,15 @@ ModelMonitorConfig ModelMonitorConfig::load(const std::filesystem::path& file) {
   ModelMonitorConfig config;
   config.max_mahalanobis2 = yaml.number("max_mahalanobis2", 1, 1e6);
   config.max_outlier_share = yaml.number("max_outlier_share", 0, 1);
-  config.model_error.position_m = yaml.number("model_error_position_m", 0, 1);
-  config.model_error.rotation_rad = yaml.number("model_error_rotation_deg", 0, 90) * kDegree;
   config.false_alarm_rate = yaml.number("false_alarm_rate", 0, 0.01);
-  config.outlier_rate = yaml.number("outlier_rate", 0, 0.5);
   yaml.finish();
+  config.measurement = load_noise(file.parent_path()).measurement;
   return config;
 }
 
 ModelMonitor::ModelMonitor(ModelMonitorConfig config) : config_(config) {
-  // model_error is that of a pair of markers.
-  options_.noise.model_error = {config_.model_error.position_m / std::sqrt(2.0),
-                                config_.model_error.rotation_rad / std::sqrt(2.0)};
+  options_.noise = config_.measurement;
   options_.least_noise_scale = 1;
-  options_.noise.outlier_rate = config_.outlier_rate;
   if (config_.false_alarm_rate > 0) options_.false_alarm_rate = config_.false_alarm_rate;
   for (model_health_t* health : {&health_, &memory_.at_base, &memory_.verdicts}) {
     health->judged_sample = -1;
@@ -322,7 +311,6 @@ std::shared_ptr<const LiveSchema> ModelMonitor::begin(BodySchema base,
 
 ModelMonitor::EdgeTest ModelMonitor::test(const BodySchema& schema, const Edge& edge,
                                           std::int64_t first, std::int64_t last) const {
-  const Matrix6d model_error = diagonal(config_.model_error);
   EdgeTest result;
   std::vector<double> distances;
   for (const ActionPoseSample* sample : tests_between(first, last)) {
@@ -331,13 +319,15 @@ ModelMonitor::EdgeTest ModelMonitor::test(const BodySchema& schema, const Edge& 
     if (!from || !to || !fits(schema, *sample)) continue;
     const Eigen::VectorXd theta = schema.displacements(sample->action);
     const Pose predicted = edge.predict(theta);
-    const Matrix6d model = edge.prediction_covariance(theta) + model_error;
+    const Matrix6d model = edge.prediction_covariance(theta);
     // A planar marker has two poses; the likelier one under the model speaks.
     double smallest = std::numeric_limits<double>::infinity();
     for (const Pose& X_CF : hypotheses(*from)) {
       for (const Pose& X_CT : hypotheses(*to)) {
         const Pose z = X_CF.inverse() * X_CT;
-        const Matrix6d S = relative_covariance(z, from->covariance, to->covariance) + model;
+        const Matrix6d S = relative_covariance(z, config_.measurement.covariance(*from),
+                                               config_.measurement.covariance(*to)) +
+                           model;
         const Vector6d residual = log(predicted.inverse() * z);
         smallest = std::min(smallest, residual.dot(S.ldlt().solve(residual)));
       }

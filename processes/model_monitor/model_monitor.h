@@ -23,13 +23,11 @@ namespace bodyschema {
 struct ModelMonitorConfig {
   double max_mahalanobis2 = 0;   ///< d² above which a TEST observation counts as refuting
   double max_outlier_share = 0;  ///< an edge is refuted if more than this share of its tests refute
-  Noise model_error;             ///< added to every Σ_z: the view-dependent bias of real markers
+  MeasurementModel measurement;  ///< of noise.yaml
   /// Wished false alarms a sample once a complete schema stands; 0: nothing is adapted.
   double false_alarm_rate = 1e-5;
-  /// Expected share of a part's observations that are flips or false detections.
-  double outlier_rate = 0.03;
 
-  /// Reads model_monitor.yaml. @throws ConfigError.
+  /// Reads model_monitor.yaml and the noise.yaml beside it. @throws ConfigError.
   static ModelMonitorConfig load(const std::filesystem::path& file);
 };
 
@@ -145,10 +143,10 @@ class ModelMonitor {
 
     std::int64_t up_to(std::int64_t judged_sample);
   };
-  mutable Tally test_indices_;  ///< of TEST samples
-  std::deque<ActionPoseSample> tests_;      ///< the newest
-  std::deque<ActionPoseSample> samples_;    ///< the newest, back to where anything may begin again
-  mutable std::map<int, Tally> seen_in_;    ///< part → samples that show it
+  mutable Tally test_indices_;            ///< of TEST samples
+  std::deque<ActionPoseSample> tests_;    ///< the newest
+  std::deque<ActionPoseSample> samples_;  ///< the newest, back to where anything may begin again
+  mutable std::map<int, Tally> seen_in_;  ///< part → samples that show it
   std::int64_t last_sample_index_ = -1;
   std::int64_t judged_sample_ = -1;
   std::int64_t judged_utime_ = 0;

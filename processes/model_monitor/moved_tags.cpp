@@ -31,7 +31,7 @@ bool MovedTags::affects(const PartObservation& observation) const {
 }
 
 void MovedTags::look_back(const ActionPoseSample& sample, const BodySchema& schema,
-                          const MarkerNoise& noise) {
+                          const MeasurementModel& noise) {
   // Before they moved they were where they should be.
   ActionPoseSample after = sample;
   std::erase_if(after.parts, [&](const PartObservation& o) {
@@ -55,20 +55,20 @@ void MovedTags::begin_anew() {
 
 std::vector<MovedTags::Finding> MovedTags::look(const ActionPoseSample& sample,
                                                 const BodySchema& schema,
-                                                const MarkerNoise& noise) {
+                                                const MeasurementModel& noise) {
   return look(sample, schema, noise, false);
 }
 
 std::vector<MovedTags::Finding> MovedTags::look(const ActionPoseSample& sample,
-                                                const BodySchema& schema, const MarkerNoise& noise,
-                                                bool is_past) {
+                                                const BodySchema& schema,
+                                                const MeasurementModel& noise, bool is_past) {
   std::vector<Finding> findings;
   const auto X_RB = schema.predict_all(sample.action);
   for (const PartObservation& seen : sample.parts) {
     const auto predicted = X_RB.find(seen.part);
     if (seen.tags.empty() || predicted == X_RB.end()) continue;
     const Pose X_CB = schema.X_CR * predicted->second;
-    const ReadingDistance distance(covariance_of(seen, noise));
+    const ReadingDistance distance(noise.covariance(seen));
     double far_off = distance(X_CB, seen.X_CB);
     if (seen.X_CB_other) far_off = std::min(far_off, distance(X_CB, *seen.X_CB_other));
 

@@ -32,10 +32,10 @@ class MovedTags {
   };
   /// `schema`: the body before anything was wrong.
   std::vector<Finding> look(const ActionPoseSample& sample, const BodySchema& schema,
-                            const MarkerNoise& noise);
+                            const MeasurementModel& noise);
   /// Samples of the past: what they say of those known.
   void look_back(const ActionPoseSample& sample, const BodySchema& schema,
-                 const MarkerNoise& noise);
+                 const MeasurementModel& noise);
   /// Another schema than before is right: of those that are in their places nothing is known.
   void begin_anew();
   /// It is not seen any more.
@@ -55,7 +55,7 @@ class MovedTags {
     bool is_on_part = false;  ///< and moves with it
   };
   std::vector<Finding> look(const ActionPoseSample& sample, const BodySchema& schema,
-                            const MarkerNoise& noise, bool is_past);
+                            const MeasurementModel& noise, bool is_past);
 
   std::map<int, Track> tracks_;         ///< by tag
   std::map<int, std::vector<int>> of_;  ///< the tags of every part that were seen

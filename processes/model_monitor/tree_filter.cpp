@@ -24,13 +24,6 @@ constexpr std::size_t kMaxStarters = 3;
 /// counted twice [nats].
 constexpr double kMuchLikelier = 3;
 
-Matrix6d diagonal(const Noise& noise) {
-  Vector6d variances;
-  variances << Eigen::Vector3d::Constant(noise.position_m * noise.position_m),
-      Eigen::Vector3d::Constant(noise.rotation_rad * noise.rotation_rad);
-  return variances.asDiagonal();
-}
-
 double log_sum_exp(const std::vector<double>& terms) {
   const double largest = *std::max_element(terms.begin(), terms.end());
   if (!std::isfinite(largest)) return largest;
@@ -53,12 +46,6 @@ Pose flipped(const Pose& X) {
 }
 
 }  // namespace
-
-Matrix6d covariance_of(const PartObservation& observation, const MarkerNoise& noise) {
-  return noise.scale * noise.scale *
-             (noise.noise ? diagonal(*noise.noise) : observation.covariance) +
-         diagonal(noise.model_error) + 1e-12 * Matrix6d::Identity();
-}
 
 Matrix6d model_covariance(const Edge& edge, const Eigen::VectorXd& theta) {
   Matrix6d covariance = edge.prediction_covariance(theta);
@@ -118,7 +105,7 @@ double log_marker_density(const Pose& X, const Pose& X_CB, const Matrix6d& S,
   return log_sum_exp({inlier, outlier});
 }
 
-TreeFilter::TreeFilter(const BodySchema& schema, const MarkerNoise& noise)
+TreeFilter::TreeFilter(const BodySchema& schema, const MeasurementModel& noise)
     : schema_(schema), noise_(noise) {
   if (schema_.root < 0) return;
   nodes_.push_back({schema_.root, -1, -1, false, {}});
@@ -164,7 +151,7 @@ TreeFilter::Instant TreeFilter::prepare(const ActionPoseSample& sample) const {
     instant.edge_covariance[k].diagonal().array() += 1e-12;  // what is exact can still be inverted
     instant.transport[k] = adjoint(instant.delta[k].inverse());
     if (const PartObservation* o = sample.find(node.part)) {
-      const Matrix6d covariance = covariance_of(*o, noise_);
+      const Matrix6d covariance = noise_.covariance(*o);
       instant.seen[k] = Instant::Seen{o->X_CB, covariance, o->X_CB_other, covariance};
       if (o->X_CB_other) instant.seen[k]->covariance_other = covariance_of_other(*o, covariance);
     }

@@ -4,25 +4,11 @@
 #include <optional>
 #include <vector>
 
+#include "common/estimation/measurement_model.h"
 #include "common/schema/body_schema.h"
 #include "common/schema/sample.h"
 
 namespace bodyschema {
-
-/// What is assumed of a marker's measurements.
-struct MarkerNoise {
-  /// Replaces the covariances of the observations where given.
-  std::optional<Noise> noise;
-  /// Added to every covariance: the view-dependent bias of real markers.
-  Noise model_error;
-  /// Multiplies all standard deviations: 1 where the assumed noise is the true one.
-  double scale = 1;
-  /// Share of a part's observations that are flips of a planar marker or false detections.
-  double outlier_rate = 0.03;
-};
-
-/// Covariance of an observed pose X_CB: 6 × 6, right perturbation.
-Matrix6d covariance_of(const PartObservation& observation, const MarkerNoise& noise);
 
 /// Covariance of an edge's prediction, right perturbation: to first order; where it has a residual
 /// GP, which is too sure of itself where it was not trained, plus what its left-out blocks showed.
@@ -60,7 +46,7 @@ struct VirtualMeasurement {
 class TreeFilter {
  public:
   /// Parts that are not connected to the root take no part. Edges that are kInvalid are cut.
-  TreeFilter(const BodySchema& schema, const MarkerNoise& noise);
+  TreeFilter(const BodySchema& schema, const MeasurementModel& noise);
 
   int num_nodes() const { return static_cast<int>(nodes_.size()); }
   /// Part id by node; node 0 is the root, parents come before children.
@@ -120,7 +106,7 @@ class TreeFilter {
   class Walk;
 
   const BodySchema schema_;
-  const MarkerNoise noise_;
+  const MeasurementModel noise_;
   std::vector<Node> nodes_;
 };
 

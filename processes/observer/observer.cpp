@@ -38,10 +38,6 @@ ObserverConfig ObserverConfig::load(const std::filesystem::path& file) {
     throw yaml.error("max_buffered_frames", "must not be below frames_per_sample");
   }
   config.max_motion_px = yaml.number("max_motion_px", 0, 100);
-  config.noise.corner_noise_px = yaml.number("corner_noise_px", 1e-3, 10);
-  config.noise.small_tag_noise_px = yaml.number("small_tag_noise_px", 0, 10);
-  config.part_pose.floor_position_m = yaml.number("floor_position_m", 0, 1);
-  config.part_pose.floor_rotation_rad = yaml.number("floor_rotation_deg", 0, 45) * kDegree;
   config.part_pose.max_tag_error_px = yaml.number("max_tag_error_px", 1e-3, 100);
   config.part_pose.min_other_rotation_rad = yaml.number("min_other_rotation_deg", 0, 90) * kDegree;
   config.part_pose.max_error_ratio = yaml.number("max_error_ratio", 1, 1e6);
@@ -189,8 +185,11 @@ sample_t Observer::sample_from(const Rest& rest, const std::vector<const marker_
   for (const auto& [id, seen] : sightings) {
     tag_corners_t mean{};
     mean.tag_id = id;
+    Matrix8d covariance_px2 = Matrix8d::Zero();
     double motion_px = 0;
     for (const marker_pose_t* marker : seen) {
+      // Not divided by their number: what a corner is off is mostly the same in all frames.
+      covariance_px2 += from_message(marker->corner_covariance) / static_cast<double>(seen.size());
       for (int c = 0; c < 4; ++c) {
         for (int axis = 0; axis < 2; ++axis) {
           mean.mean_corner_px[c][axis] +=
@@ -206,12 +205,15 @@ sample_t Observer::sample_from(const Rest& rest, const std::vector<const marker_
       continue;
     }
     const TagPlacement& placement = *markers_.find(id);
-    SeenTag tag{id, placement.size_m, placement.X_BM.value_or(Pose::Identity()), {}, {}};
-    std::vector<Eigen::Vector2d> corners_px;
-    for (const auto& corner : mean.mean_corner_px) corners_px.emplace_back(corner[0], corner[1]);
-    for (const Eigen::Vector2d& p_px : corners_px) {
-      if (auto point = lens_->straighten(p_px)) {
-        point->sigma_px = config_.noise.sigma_px(corners_px);
+    SeenTag tag{id,
+                placement.size_m,
+                placement.X_BM.value_or(Pose::Identity()),
+                {},
+                whitener_of(covariance_px2),
+                {}};
+    for (const auto& corner : mean.mean_corner_px) {
+      if (auto point = lens_->straighten({corner[0], corner[1]})) {
+        point->sigma_px = sigma_px(covariance_px2);
         tag.corners.push_back(*point);
       }
     }
@@ -237,7 +239,6 @@ sample_t Observer::sample_from(const Rest& rest, const std::vector<const marker_
     part_observation_t observation{};
     observation.part_id = part;
     observation.X_CB = to_message(pose->X_CB);
-    // Not divided by the number of frames: what a corner is off is mostly the same in all of them.
     to_message(pose->covariance, observation.covariance);
     observation.has_other = pose->X_CB_other ? 1 : 0;
     observation.X_CB_other = to_message(pose->X_CB_other.value_or(pose->X_CB));

@@ -25,7 +25,6 @@ struct ObserverConfig {
   std::int64_t settle_margin_us = 0;  ///< frames earlier than this after the arm came to rest wait
   std::size_t max_buffered_frames = 0;
   double max_motion_px = 0;  ///< a tag whose corners move more between the frames is not used
-  CornerNoise noise;
   PartPoseOptions part_pose;
 
   /// Reads observer.yaml. @throws ConfigError.

@@ -10,14 +10,19 @@ namespace {
 struct Points {
   std::vector<Eigen::Vector3d> p_BP;
   std::vector<ImagePoint> measured;
+  Eigen::MatrixXd whitener;
 };
 
 Points points_of(const std::vector<SeenTag>& tags) {
   Points points;
+  const auto size = static_cast<Eigen::Index>(8 * tags.size());
+  points.whitener = Eigen::MatrixXd::Zero(size, size);
   for (const SeenTag& tag : tags) {
     for (const Eigen::Vector3d& p_MP : tag_corners(tag.size_m)) {
       points.p_BP.push_back(tag.X_BM * p_MP);
     }
+    const auto row = static_cast<Eigen::Index>(2 * points.measured.size());
+    points.whitener.block<8, 8>(row, row) = tag.whitener;
     points.measured.insert(points.measured.end(), tag.corners.begin(), tag.corners.end());
   }
   return points;
@@ -29,7 +34,8 @@ std::vector<PoseFit> minima_of(const std::vector<SeenTag>& tags) {
   std::vector<PoseFit> minima;
   for (const SeenTag& tag : tags) {
     for (const Pose& X_CM : tag.X_CM) {
-      const auto fit = fit_pose(X_CM * tag.X_BM.inverse(), points.p_BP, points.measured);
+      const auto fit =
+          fit_pose(X_CM * tag.X_BM.inverse(), points.p_BP, points.measured, &points.whitener);
       if (!fit) continue;
       const auto same = [&](const PoseFit& m) { return is_same_minimum(m.X_CB, fit->X_CB); };
       if (std::none_of(minima.begin(), minima.end(), same)) minima.push_back(*fit);
@@ -85,8 +91,6 @@ std::optional<PartPose> solve_part_pose(std::vector<SeenTag> tags, const PartPos
   if (!covariance) return std::nullopt;
   result.X_CB = minima[0].X_CB;
   result.covariance = *covariance;
-  result.covariance.diagonal().head<3>().array() += std::pow(options.floor_position_m, 2);
-  result.covariance.diagonal().tail<3>().array() += std::pow(options.floor_rotation_rad, 2);
   for (std::size_t i = 1; i < minima.size(); ++i) {
     if (rotation_angle(result.X_CB.inverse() * minima[i].X_CB) < options.min_other_rotation_rad) {
       continue;

@@ -14,13 +14,12 @@ struct SeenTag {
   int id = 0;
   double size_m = 0;
   Pose X_BM = Pose::Identity();
-  std::vector<ImagePoint> corners;  ///< four, AprilTag's order
-  std::vector<Pose> X_CM;           ///< hypotheses of its pose: the starts of the fit
+  std::vector<ImagePoint> corners;           ///< four, AprilTag's order
+  Matrix8d whitener = Matrix8d::Identity();  ///< fit_pose()'s, of this tag's corners
+  std::vector<Pose> X_CM;                    ///< hypotheses of its pose: the starts of the fit
 };
 
 struct PartPoseOptions {
-  double floor_position_m = 0;  ///< added to the covariance: what calibration and plates are off
-  double floor_rotation_rad = 0;
   double max_tag_error_px = 0;        ///< a tag with a larger rms in the common fit disagrees
   double min_other_rotation_rad = 0;  ///< a second minimum closer than this is the same pose
   double max_error_ratio = 0;         ///< a second minimum worse than this is no hypothesis

@@ -54,6 +54,15 @@ Edge to_edge(const LocalModel& model, const NormalizedActions& actions) {
   return edge;
 }
 
+// The covariance of a model's parameters, for to_edge().
+Eigen::MatrixXd in_command_units(const ParameterMatrix& covariance, const LocalModel& model,
+                                 const NormalizedActions& actions) {
+  Eigen::VectorXd units = Eigen::VectorXd::Ones(model.num_parameters());
+  for (int d = 0; d < model.num_joints; ++d)
+    units.segment<2>(6 + 8 * d).setConstant(1 / actions.half_range(model.signal[d]));
+  return units.asDiagonal() * covariance * units.asDiagonal();
+}
+
 // The model over actions that are scaled otherwise.
 LocalModel rescaled(LocalModel model, const NormalizedActions& from, const NormalizedActions& to) {
   for (int d = 0; d < model.num_joints; ++d) {
@@ -139,9 +148,6 @@ FittedEdge fit_edge(const AcceptedModel& accepted, int from, int to,
   result.edge = to_edge(fit.model, actions);
   result.edge.from = from;
   result.edge.to = to;
-  Eigen::VectorXd units = Eigen::VectorXd::Ones(fit.model.num_parameters());
-  for (int d = 0; d < fit.model.num_joints; ++d)
-    units.segment<2>(6 + 8 * d).setConstant(1 / actions.half_range(fit.model.signal[d]));
   result.edge.num_samples = pair.size();
   double position = 0, rotation = 0, weight = 0;
   for (int t = 0; t < pair.size(); ++t) {
@@ -162,7 +168,7 @@ FittedEdge fit_edge(const AcceptedModel& accepted, int from, int to,
     result.edge.rotation_rms_rad = std::sqrt(rotation / inliers);
     // The robust weights are relative: an inlier counts as one measurement, on the average.
     result.edge.parameter_covariance =
-        weight / inliers * (units.asDiagonal() * loo.parameter_covariance * units.asDiagonal());
+        weight / inliers * in_command_units(loo.parameter_covariance, fit.model, actions);
     result.edge.confidence = static_cast<double>(inliers) / pair.size();
   }
   return result;
@@ -170,7 +176,7 @@ FittedEdge fit_edge(const AcceptedModel& accepted, int from, int to,
 
 // The edges of the root's component fitted to all of its markers at once: a root that rests and
 // everything on the way from it are witnesses too, beside the two markers that each edge was fitted
-// to before. The covariances stay those of the pairs, an upper bound.
+// to before.
 void fit_jointly(const std::vector<ActionPoseSample>& samples, const NormalizedActions& actions,
                  const MeasurementModel& measurement, const ValidityOptions& validity,
                  std::vector<FittedEdge>* fitted, BodySchema* schema) {
@@ -193,15 +199,20 @@ void fit_jointly(const std::vector<ActionPoseSample>& samples, const NormalizedA
   if (nodes.size() < 2) return;
   TreeFit fit(std::move(nodes), std::move(data), actions, true);
   fit.fit(20, 1e-6);
-  for (const TreeNode& node : fit.nodes()) {
+  const auto covariance = fit.covariance(measurement.systematic_covariance());
+  for (std::size_t k = 1; k < fit.nodes().size(); ++k) {
+    const TreeNode& node = fit.nodes()[k];
     for (FittedEdge& f : *fitted) {
-      if (node.parent < 0 || f.edge.to != node.part) continue;
+      if (f.edge.to != node.part) continue;
       const Edge moved = to_edge(node.model, actions);
       f.edge.left = moved.left;
       f.edge.joints = moved.joints;
+      if (covariance)
+        f.edge.parameter_covariance = in_command_units(covariance->models[k], node.model, actions);
     }
   }
   schema->X_CR = fit.root_pose();
+  if (covariance) schema->X_CR_covariance = covariance->root;
 }
 
 // Which part is to blame where edges disagree with the data at one instant.
@@ -307,13 +318,14 @@ class OutlierAttribution {
       const auto& path = path_between(other.part, part);
       if (!path) continue;
       const Pose z = other.X_CB.inverse() * o->X_CB;
-      judge(log(path->predict(s.action).inverse() * z),
-            path->covariance(s.action, Variance::kFirstOrder) +
-                relative_covariance(z, covariance_of(other), covariance_of(*o)));
+      judge(
+          log(path->predict(s.action).inverse() * z),
+          path->covariance(s.action, Variance::kFirstOrder) +
+              relative_covariance(z, measurement_.covariance(other), measurement_.covariance(*o)));
     }
     if (const auto& path = path_between(schema_.root, part))
       judge(log((schema_.X_CR * path->predict(s.action)).inverse() * o->X_CB),
-            path->covariance(s.action, Variance::kFirstOrder) + covariance_of(*o));
+            path->covariance(s.action, Variance::kFirstOrder) + measurement_.covariance(*o));
     return all > 0 ? static_cast<double>(bad) / all : 0;
   }
 
@@ -321,20 +333,6 @@ class OutlierAttribution {
     const auto [it, is_new] = paths_.try_emplace({from, to});
     if (is_new) it->second = KinematicPath::between(schema_, from, to);
     return it->second;
-  }
-
-  Matrix6d covariance_of(const PartObservation& o) const {
-    Matrix6d covariance = o.covariance;
-    Vector6d extra;
-    extra.head<3>().setConstant(std::pow(measurement_.model_error.position_m, 2) + 1e-10);
-    extra.tail<3>().setConstant(std::pow(measurement_.model_error.rotation_rad, 2) + 1e-10);
-    if (measurement_.noise) {
-      covariance.setZero();
-      extra.head<3>().array() += std::pow(measurement_.noise->position_m, 2);
-      extra.tail<3>().array() += std::pow(measurement_.noise->rotation_rad, 2);
-    }
-    covariance.diagonal() += extra;
-    return covariance;
   }
 
   const BodySchema& schema_;
@@ -436,7 +434,7 @@ SearchOptions search_options_of(const LearnOptions& options) {
   SearchOptions result;
   result.max_signals = options.max_signals;
   result.validity.outlier_rate = options.outlier_rate;
-  result.measurement.model_error = options.model_error;
+  result.measurement.systematic = options.systematic;
   result.measurement.max_error_ratio = options.max_error_ratio;
   return result;
 }
@@ -511,8 +509,7 @@ LearnResult fit_tree(const LearnedStructure& structure,
                                          connected_to_root, structure, options.max_signals));
   }
   if (schema.parts.size() == 1 && connected_to_root.count(schema.parts.front()))
-    schema.unconnected.push_back({schema.parts.front(), Unconnected::kNotEnoughData,
-                                  kOnlyPart});
+    schema.unconnected.push_back({schema.parts.front(), Unconnected::kNotEnoughData, kOnlyPart});
   // A part that was never seen is reported, but a tree over all the others is complete (Fig. 8,
   // 11).
   schema.complete = schema.parts.size() > 1 &&
@@ -534,20 +531,10 @@ void estimate_root_pose(const std::vector<ActionPoseSample>& samples,
     Matrix6d information;
   };
   std::vector<Reading> readings;
-  Vector6d floor;
-  floor.head<3>().setConstant(std::pow(measurement.model_error.position_m, 2) + 1e-10);
-  floor.tail<3>().setConstant(std::pow(measurement.model_error.rotation_rad, 2) + 1e-10);
-  Vector6d variances = Vector6d::Zero();
-  if (measurement.noise) {
-    variances.head<3>().setConstant(std::pow(measurement.noise->position_m, 2));
-    variances.tail<3>().setConstant(std::pow(measurement.noise->rotation_rad, 2));
-  }
   for (const auto& sample : samples) {
     const PartObservation* o = sample.find(schema->root);
     if (!o) continue;
-    Matrix6d covariance = measurement.noise ? Matrix6d(variances.asDiagonal()) : o->covariance;
-    covariance.diagonal() += floor;
-    readings.push_back({o->X_CB, covariance.inverse()});
+    readings.push_back({o->X_CB, measurement.covariance(*o).inverse()});
   }
   if (readings.empty()) return;
   const auto cost = [&](const Pose& X) {

@@ -13,10 +13,9 @@
 
 namespace bodyschema {
 
-/// What the view adds to the noise of real tags, whatever the rig: measured in
-/// tests/experiments/README.md. The rigs' structure_learner.yaml says the same; recordings of
-/// camera markers without a rig are learned with this.
-inline constexpr Noise kTagModelError{.position_m = 0.001, .rotation_rad = 0.2 * kDegree};
+/// MeasurementModel::systematic of tags, where no rig's noise.yaml says it: recordings of camera
+/// markers are learned with this. The rigs say the same.
+inline constexpr Noise kTagSystematic{.position_m = 0.0007, .rotation_rad = 0.14 * kDegree};
 
 /// X_CR of `schema` with its covariance: the robust mean of the poses of its root, Student-t
 /// weights. Left alone if the root is never seen.
@@ -31,10 +30,8 @@ struct LearnOptions {
   /// Standard deviations per axis per marker: replace the covariances of the observations. Without
   /// them and with all covariances zero, the noise is estimated (see noise_estimate.h).
   std::optional<Noise> noise;
-  /// Added to the covariance of every relative pose: the view-dependent bias of real tags, which no
-  /// number of samples averages out (about 1 mm and 0.2°). Under-stating it rejects true models in
-  /// the end; over-stating it hides joints that move less.
-  Noise model_error;
+  /// MeasurementModel::systematic of each part.
+  Noise systematic;
   /// Largest number of joints in one local model (0 to 2).
   int max_signals = 2;
   /// Expected share of outliers per marker: flips of planar tags, false detections.
@@ -61,9 +58,9 @@ struct LearnResult {
 /// Learns the body schema from scratch: structure and local models (Sections 3.1 and 3.2). Where
 /// the root rests, the models are in the end fitted to all poses of its tree at once, and X_CR with
 /// them: that comes near the Cramér–Rao bound, which models fitted to two parts each miss by 1.6.
-/// Their covariances are those of the pairs, an upper bound. A pure
-/// function of its arguments. Poses must be finite rigid transforms (callers check what comes in
-/// from outside). `utime`, `version` and `base_version` of the schema are left to the caller.
+/// Their covariances are those of that fit. A pure function of its arguments. Poses must be finite
+/// rigid transforms (callers check what comes in from outside). `utime`, `version` and
+/// `base_version` of the schema are left to the caller.
 /// @throws std::invalid_argument if an action does not have one value per signal, or max_signals is
 /// out of range.
 LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPoseSample>& samples,

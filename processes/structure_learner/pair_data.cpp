@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <initializer_list>
+#include <map>
 #include <stdexcept>
 
 namespace bodyschema {
@@ -18,28 +19,14 @@ struct MarkerReading {
   double penalty;
 };
 
-Matrix6d isotropic(const Noise& noise) {
-  Vector6d variances;
-  variances.head<3>().setConstant(noise.position_m * noise.position_m);
-  variances.tail<3>().setConstant(noise.rotation_rad * noise.rotation_rad);
-  return variances.asDiagonal();
-}
-
 int readings_of(const PartObservation& observation, const MeasurementModel& measurement,
                 MarkerReading* readings) {
-  const Matrix6d covariance =
-      measurement.noise ? isotropic(*measurement.noise) : observation.covariance;
+  const Matrix6d covariance = measurement.noise_covariance(observation);
   readings[0] = {observation.X_CB, covariance, 0};
   if (!observation.X_CB_other || observation.error_ratio > measurement.max_error_ratio) return 1;
   readings[1] = {*observation.X_CB_other, covariance_of_other(observation, covariance),
                  kOtherHypothesisPenalty};
   return 2;
-}
-
-// The model error, as a multiple of its variance; the last term keeps exact measurements
-// factorisable.
-Matrix6d extra_covariance(const MeasurementModel& measurement, double share) {
-  return share * (isotropic(measurement.model_error) + 1e-10 * Matrix6d::Identity());
 }
 
 // Visits at most `max_frames` of the samples that show all of `parts`, evenly chosen.
@@ -57,8 +44,9 @@ void for_thinned(const std::vector<ActionPoseSample>& samples, int max_frames,
 // Collects the readings of one instant.
 class FrameWriter {
  public:
-  FrameWriter(int sample, PairData* pair) : pair_(*pair) {
+  FrameWriter(int sample, PairData* pair, int view = 0) : pair_(*pair) {
     frame_.sample = sample;
+    frame_.view = view;
     frame_.first_hypothesis = static_cast<int>(pair_.hypotheses.size());
   }
   FrameWriter(const FrameWriter&) = delete;
@@ -67,9 +55,8 @@ class FrameWriter {
     if (frame_.num_hypotheses > 0) pair_.frames.push_back(frame_);
   }
 
-  // Of a reading with that noise and model error.
-  void add(const Pose& z, const Matrix6d& noise, const Matrix6d& model_error, double penalty) {
-    const Eigen::LLT<Matrix6d> llt(noise + model_error);
+  void add(const Pose& z, const Matrix6d& noise, const Matrix6d& systematic, double penalty) {
+    const Eigen::LLT<Matrix6d> llt(noise + systematic);
     // A covariance that is not positive definite says nothing usable: leave the reading out.
     if (llt.info() != Eigen::Success || !(llt.matrixLLT().diagonal().minCoeff() > 0)) return;
     PairHypothesis h;
@@ -77,7 +64,7 @@ class FrameWriter {
     h.penalty = penalty;
     h.whitening = llt.matrixL().solve(Matrix6d::Identity());
     h.log_det = 6 * std::log(2 * M_PI) + 2 * llt.matrixLLT().diagonal().array().log().sum();
-    h.model_error = (h.whitening * model_error * h.whitening.transpose()).trace();
+    h.systematic = (h.whitening * systematic * h.whitening.transpose()).trace();
     pair_.hypotheses.push_back(h);
   }
 
@@ -128,7 +115,7 @@ PairData make_pair_data(const std::vector<ActionPoseSample>& samples, int part_i
   PairData pair;
   pair.part_i = part_i;
   pair.part_j = part_j;
-  const Matrix6d extra = extra_covariance(measurement, 1);
+  const Matrix6d systematic = measurement.systematic_covariance();
   MarkerReading readings_i[2], readings_j[2];
   for_thinned(samples, max_frames, {part_i, part_j}, [&](int sample) {
     const int num_i = readings_of(*samples[sample].find(part_i), measurement, readings_i);
@@ -138,7 +125,8 @@ PairData make_pair_data(const std::vector<ActionPoseSample>& samples, int part_i
       for (int b = 0; b < num_j; ++b) {
         const Pose z = readings_i[a].X_CB.inverse() * readings_j[b].X_CB;
         frame.add(z, relative_covariance(z, readings_i[a].covariance, readings_j[b].covariance),
-                  extra, readings_i[a].penalty + readings_j[b].penalty);
+                  relative_covariance(z, systematic, systematic),
+                  readings_i[a].penalty + readings_j[b].penalty);
       }
     }
   });
@@ -149,13 +137,16 @@ PairData make_part_data(const std::vector<ActionPoseSample>& samples, int part,
                         const MeasurementModel& measurement, int max_frames) {
   PairData pair;
   pair.part_i = pair.part_j = part;
-  const Matrix6d extra = extra_covariance(measurement, 0.5);
+  const Matrix6d systematic = measurement.systematic_covariance();
   MarkerReading readings[2];
+  std::map<std::vector<int>, int> views;
   for_thinned(samples, max_frames, {part}, [&](int sample) {
-    const int num = readings_of(*samples[sample].find(part), measurement, readings);
-    FrameWriter frame(sample, &pair);
+    const PartObservation& seen = *samples[sample].find(part);
+    const int num = readings_of(seen, measurement, readings);
+    const auto view = views.try_emplace(seen.tags, static_cast<int>(views.size())).first;
+    FrameWriter frame(sample, &pair, view->second);
     for (int a = 0; a < num; ++a)
-      frame.add(readings[a].X_CB, readings[a].covariance, extra, readings[a].penalty);
+      frame.add(readings[a].X_CB, readings[a].covariance, systematic, readings[a].penalty);
   });
   return pair;
 }

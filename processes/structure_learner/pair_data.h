@@ -2,6 +2,7 @@
 
 #include <vector>
 
+#include "common/estimation/measurement_model.h"
 #include "common/geometry/pose.h"
 #include "common/schema/body_schema.h"
 #include "common/schema/sample.h"
@@ -40,8 +41,8 @@ struct PairHypothesis {
   Matrix6d whitening = Matrix6d::Identity();
   /// log |2πΣ_z|
   double log_det = 0;
-  /// tr Σ_z⁻¹ M, of the model error's part M of Σ_z: what it is expected to make of d².
-  double model_error = 0;
+  /// tr Σ_z⁻¹ M, of the systematic part M of Σ_z: what it is expected to make of d².
+  double systematic = 0;
   /// −2 log of the prior odds against this reading: 0 for the first hypotheses of both markers.
   double penalty = 0;
 };
@@ -52,6 +53,9 @@ struct PairFrame {
   int sample = 0;
   int first_hypothesis = 0;
   int num_hypotheses = 0;
+  /// Of make_part_data(): frames of one view rest on the same tags, and share their systematic
+  /// error. Counts from 0.
+  int view = 0;
 };
 
 struct PairData {
@@ -67,17 +71,6 @@ struct PairData {
   }
 };
 
-/// What is assumed about the measurements.
-struct MeasurementModel {
-  /// Replaces the covariances of the observations where given.
-  std::optional<Noise> noise;
-  /// Added to every Σ_z: what no noise model of a marker knows (view-dependent bias).
-  Noise model_error;
-  /// A second hypothesis whose reprojection error exceeds the first's by more than this factor is
-  /// not offered.
-  double max_error_ratio = 10;
-};
-
 /// Instants at which both parts were seen, as (sample, observation of i, observation of j).
 int count_common(const std::vector<ActionPoseSample>& samples, int part_i, int part_j);
 
@@ -85,8 +78,7 @@ int count_common(const std::vector<ActionPoseSample>& samples, int part_i, int p
 PairData make_pair_data(const std::vector<ActionPoseSample>& samples, int part_i, int part_j,
                         const MeasurementModel& measurement, int max_frames);
 
-/// The poses of one part in the camera's frame, as if the camera were part i and known exactly:
-/// Σ_z is the covariance of the one marker and half the model error.
+/// The poses of one part in the camera's frame, as if the camera were part i and known exactly.
 PairData make_part_data(const std::vector<ActionPoseSample>& samples, int part,
                         const MeasurementModel& measurement, int max_frames);
 

@@ -6,12 +6,10 @@
 #include "bodyschema/action_command_t.hpp"
 #include "common/bus/convert.h"
 #include "common/config/yaml.h"
-#include "common/geometry/angle.h"
 
 namespace bodyschema {
 
 StructureLearnerConfig StructureLearnerConfig::load(const std::filesystem::path& file) {
-  constexpr double kRadians = kDegree;
   const Yaml yaml = Yaml::load(file);
   const Signals signals = load_signals(file.parent_path());
   StructureLearnerConfig config;
@@ -19,10 +17,9 @@ StructureLearnerConfig StructureLearnerConfig::load(const std::filesystem::path&
   config.options.root = signals.root_part;
   config.options.expected_parts = load_markers(file.parent_path()).parts();
   config.options.max_signals = static_cast<int>(yaml.integer("max_signals", 0, 2));
-  config.options.outlier_rate = yaml.number("outlier_rate", 0, 0.5);
-  config.options.model_error.position_m = yaml.number("model_error_position_m", 0, 1);
-  config.options.model_error.rotation_rad =
-      yaml.number("model_error_rotation_deg", 0, 90) * kRadians;
+  const MeasurementModel measurement = load_noise(file.parent_path()).measurement;
+  config.options.outlier_rate = measurement.outlier_rate;
+  config.options.systematic = measurement.systematic;
   yaml.finish();
   return config;
 }

@@ -29,8 +29,8 @@ constexpr double kMaxSmallHopefulCost = 14;
 constexpr double kAmbiguityMargin = 3;
 
 // The joint that an edge's data must have shown [rad per half range]. Of few sightings the smallest
-// there is, of more one that shows after 10 samples in the chapter's noise. Chosen on 30 robots of 2,
-// 4 and 7 joints each: with the smallest one for all, most right structures of chapter noise are
+// there is, of more one that shows after 10 samples in the chapter's noise. Chosen on 30 robots of
+// 2, 4 and 7 joints each: with the smallest one for all, most right structures of chapter noise are
 // taken back at 10 and 15 samples.
 constexpr int kFewSightings = 6;
 constexpr double kCommonTurn = 0.65;
@@ -527,7 +527,7 @@ class Search {
   // remains after more steps.
   std::optional<MissingJoint> missing_joint(TreeFit* fit) const {
     for (bool is_settled = false;; is_settled = true) {
-      const auto joints = fit->missing_joints(options_.measurement.model_error);
+      const auto joints = fit->missing_joints(options_.measurement.systematic);
       const MissingJoint* worst = most_significant(joints, fit->num_frames());
       if (!worst) return std::nullopt;
       if (is_settled) return *worst;

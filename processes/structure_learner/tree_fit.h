@@ -71,6 +71,18 @@ class TreeFit {
   double log_likelihood() const;         ///< −cost − ½ Σ log|2πΣ|
   int num_frames() const { return static_cast<int>(samples_.size()); }
 
+  /// Of root_pose() (zero if the root moves) and of each node's model, by node; right
+  /// perturbations, over normalised parameters. The noise averages out as H⁻¹; the systematic
+  /// error, of covariance `systematic` at each part, is common to all frames of a view and does
+  /// not: it is a consider parameter (Schmidt 1966; Bierman 1977, ch. VIII),
+  ///   H⁻¹ + H⁻¹ (Σ_view G M Gᵀ) H⁻¹,  G = Σ_t∈view J_tᵀ W_t.
+  /// std::nullopt if the data do not determine the tree.
+  struct Covariance {
+    Matrix6d root = Matrix6d::Zero();
+    std::vector<ParameterMatrix> models;
+  };
+  std::optional<Covariance> covariance(const Matrix6d& systematic) const;
+
   /// Rao's score test of one more joint, for every rigid cluster and every moving signal: how much
   /// the residuals shrink, to second order, if Exp(ξ q_g) moves some of what is in or on the
   /// cluster and all other parameters of the tree adapt. The parting that explains most is found by
@@ -80,10 +92,10 @@ class TreeFit {
   /// many samples there are.
   std::vector<MissingJoint> missing_joints(const Noise& bias) const;
 
-  /// How clearly one more joint would show: χ² that Exp(turn · q) puts into the residuals, about the
-  /// least visible axis through a node's origin, where that node and all beyond it move and every
-  /// other parameter of the tree adapts [per (rad per half range)²]. Nodes × moving signals; 0 at
-  /// the tree's root.
+  /// How clearly one more joint would show: χ² that Exp(turn · q) puts into the residuals, about
+  /// the least visible axis through a node's origin, where that node and all beyond it move and
+  /// every other parameter of the tree adapts [per (rad per half range)²]. Nodes × moving signals;
+  /// 0 at the tree's root.
   Eigen::MatrixXd joint_information() const;
 
   /// The tree's edges with that joint. Where only branches move, each of their edges gets it. Edges

@@ -104,7 +104,7 @@ Validity check_validity(const Fit& fit, const LeaveOneOut& loo, const PairData& 
   Eigen::Matrix<double, 6, Eigen::Dynamic> r(6, n);
   double bias = 0;
   for (int t = 0; t < n; ++t) {
-    bias += pair.hypotheses[fit.frames[t].hypothesis].model_error;
+    bias += pair.hypotheses[fit.frames[t].hypothesis].systematic;
     const double d2 = fit.frames[t].squared_distance;
     // Clipped, and fading where it is far beyond what a missed joint does to a frame or two: flips
     // must not find a signal that happens to go along with them.

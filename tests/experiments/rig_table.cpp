@@ -17,6 +17,7 @@
 
 #include "common/config/rig.h"
 #include "common/geometry/angle.h"
+#include "common/schema/kinematic_path.h"
 #include "processes/console/evaluation.h"
 #include "processes/structure_learner/structure_learner.h"
 #include "tests/support/rendered_run.h"
@@ -30,8 +31,28 @@ struct Row {
   int right = 0;
   int incomplete = 0;
   std::vector<double> position_m, rotation_rad, seconds;
+  /// Squared Mahalanobis distance of the truth from the end effector's pose in the root, and from
+  /// X_CR, by the schema's covariances: χ²₆ if they are true.
+  std::vector<double> end_effector_d2, root_d2;
   std::string objections;
 };
+
+double squared_distance(const Pose& estimate, const Matrix6d& covariance, const Pose& truth) {
+  const Vector6d error = log(estimate.inverse() * truth);
+  return error.dot(covariance.ldlt().solve(error));
+}
+
+/// "mean (95 % quantile)".
+std::string of_distances(std::vector<double> values) {
+  if (values.empty()) return "–";
+  std::sort(values.begin(), values.end());
+  double sum = 0;
+  for (const double value : values) sum += value;
+  char text[64];
+  std::snprintf(text, sizeof text, "%.1f (%.1f)", sum / static_cast<double>(values.size()),
+                values[values.size() * 95 / 100]);
+  return text;
+}
 
 double median(std::vector<double> values) {
   if (values.empty()) return NAN;
@@ -62,8 +83,9 @@ int main(int argc, char** argv) {
   std::optional<Choice> forced;
   if (!choice.empty()) forced = choice == "active" ? Choice::kActive : Choice::kRandom;
   std::printf(
-      "| rig | samples | right | incomplete | end effector, median | worst seed | learning |\n"
-      "| --- | --- | --- | --- | --- | --- | --- |\n");
+      "| rig | samples | right | incomplete | end effector, median | worst seed | d² end effector, "
+      "mean (95 %%) | d² X_CR | learning |\n"
+      "| --- | --- | --- | --- | --- | --- | --- | --- | --- |\n");
   for (const std::filesystem::path rig : rigs) {
     const StructureLearnerConfig config =
         StructureLearnerConfig::load(rig / "structure_learner.yaml");
@@ -106,6 +128,20 @@ int main(int argc, char** argv) {
         rows[i].incomplete += !schema.complete;
         if (!objection.empty())
           rows[i].objections += " seed " + std::to_string(seed) + ": " + objection + ";";
+        if (objection.empty()) {
+          const auto path = KinematicPath::between(schema, schema.root, signals.end_effector_part);
+          for (const ActionPoseSample& exact : held_out) {
+            const PartObservation* root = exact.find(schema.root);
+            const PartObservation* end = exact.find(signals.end_effector_part);
+            if (!path || !root || !end) continue;
+            rows[i].end_effector_d2.push_back(squared_distance(
+                path->predict(exact.action), path->covariance(exact.action, Variance::kFirstOrder),
+                root->X_CB.inverse() * end->X_CB));
+          }
+          if (const PartObservation* root = held_out.front().find(schema.root))
+            rows[i].root_d2.push_back(
+                squared_distance(schema.X_CR, schema.X_CR_covariance, root->X_CB));
+        }
         for (const PartErrors& part : evaluate(schema, held_out)) {
           if (part.part != signals.end_effector_part || part.count == 0) continue;
           rows[i].position_m.push_back(part.position_median_m);
@@ -118,11 +154,13 @@ int main(int argc, char** argv) {
       const auto worst = [](const std::vector<double>& v) {
         return v.empty() ? NAN : *std::max_element(v.begin(), v.end());
       };
-      std::printf("| %s | %d | %d of %d | %d | %.2f mm, %.2f° | %.2f mm, %.2f° | %.0f ms |\n",
-                  rig.filename().c_str(), at[i], row.right, num_seeds, row.incomplete,
-                  median(row.position_m) * 1e3, median(row.rotation_rad) / kDegree,
-                  worst(row.position_m) * 1e3, worst(row.rotation_rad) / kDegree,
-                  median(row.seconds) * 1e3);
+      std::printf(
+          "| %s | %d | %d of %d | %d | %.2f mm, %.2f° | %.2f mm, %.2f° | %s | %s | %.0f ms |\n",
+          rig.filename().c_str(), at[i], row.right, num_seeds, row.incomplete,
+          median(row.position_m) * 1e3, median(row.rotation_rad) / kDegree,
+          worst(row.position_m) * 1e3, worst(row.rotation_rad) / kDegree,
+          of_distances(row.end_effector_d2).c_str(), of_distances(row.root_d2).c_str(),
+          median(row.seconds) * 1e3);
       if (!row.objections.empty())
         std::fprintf(stderr, "%s at %d:%s\n", rig.filename().c_str(), at[i],
                      row.objections.c_str());

@@ -204,6 +204,7 @@ marker_poses_t example_marker_poses() {
     marker.marker_id = id;
     marker.size_m = 0.05;
     corners(marker.corner_px, id);
+    for (int i = 0; i < 8; ++i) marker.corner_covariance[i * (i + 3) / 2] = 0.0025F;
     marker.num_hypotheses = 2;
     marker.X_CM[0] = pose(id);
     marker.X_CM[1] = pose(id + 1);

@@ -58,9 +58,10 @@ class RelearningTest : public testing::Test {
   /// The monitor after samples 0..end-1; the learner's answers come `late` samples late, and what
   /// it hears of the body schema `heard_late`.
   ModelMonitor run(std::int64_t late = 0, std::int64_t end = kEnd, std::size_t heard_late = 0) {
-    ModelMonitor monitor({.max_mahalanobis2 = 20.06,
-                          .max_outlier_share = 0.2,
-                          .model_error = {.position_m = 0.001, .rotation_rad = 0.0035}});
+    ModelMonitor monitor(
+        {.max_mahalanobis2 = 20.06,
+         .max_outlier_share = 0.2,
+         .measurement = {.systematic = {.position_m = 0.0007, .rotation_rad = 0.0025}}});
     StructureLearner learner(config_);
     proposals_.clear();
     std::deque<std::pair<std::int64_t, body_schema_t>> on_the_way;

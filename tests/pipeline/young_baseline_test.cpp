@@ -19,9 +19,10 @@ namespace {
 
 using test::Rng;
 
-const ModelMonitorConfig kMonitor{.max_mahalanobis2 = 20.06,
-                                  .max_outlier_share = 0.2,
-                                  .model_error = {.position_m = 0.001, .rotation_rad = 0.0035}};
+const ModelMonitorConfig kMonitor{
+    .max_mahalanobis2 = 20.06,
+    .max_outlier_share = 0.2,
+    .measurement = {.systematic = {.position_m = 0.0007, .rotation_rad = 0.0025}}};
 
 /// Babbling, every fifth sample TEST; from `broken_at` on another robot.
 std::vector<sample_t> babble(const test::SyntheticRobot& robot, std::int64_t num_samples, Rng& rng,
@@ -44,7 +45,7 @@ StructureLearnerConfig learner_of(const test::SyntheticRobot& robot) {
   StructureLearnerConfig config;
   config.signals = robot.signals;
   config.options.root = 1;
-  config.options.model_error = kTagModelError;
+  config.options.systematic = kTagSystematic;
   return config;
 }
 

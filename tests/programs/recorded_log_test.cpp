@@ -16,6 +16,7 @@
 #include "common/bus/convert.h"
 #include "common/bus/event_log.h"
 #include "common/bus/log_summary.h"
+#include "common/config/rig.h"
 #include "processes/structure_learner/learn.h"
 #include "processes/structure_learner/structure_learner.h"
 #include "tests/common/bus/bus_test_support.h"
@@ -186,11 +187,9 @@ TEST_F(RecordedLogTest, AReportFollowsARunUntilItIsEnded) {
   const fs::path html = folder_ / "report.html";
   test::Program follow({kBin + "bodyschema", "report", "--follow", folder_.path()});
   const auto says = [&](const std::string& what) {
-    return test::ask_until([] { std::this_thread::yield(); },
-                           [&] {
-                             return fs::exists(html) &&
-                                    text_of(html).find(what) != std::string::npos;
-                           });
+    return test::ask_until(
+        [] { std::this_thread::yield(); },
+        [&] { return fs::exists(html) && text_of(html).find(what) != std::string::npos; });
   };
   EXPECT_TRUE(says("Nothing was recorded yet"));
   EXPECT_TRUE(says("http-equiv=\"refresh\""));
@@ -218,14 +217,13 @@ TEST_F(RecordedLogTest, WhatIsNoRunIsAClearError) {
   EXPECT_NE(text.err().find("text: is not an LCM log"), std::string::npos);
 }
 
-// What tags add to their noise is one number: the rigs' files and the console agree.
-TEST(TagModelErrorTest, IsTheRigs) {
+// The rigs' files and the console agree.
+TEST(TagSystematicTest, IsTheRigs) {
   for (const auto& rig : fs::directory_iterator(BODYSCHEMA_CONFIG)) {
-    if (!fs::exists(rig.path() / "structure_learner.yaml")) continue;
-    const Noise noise =
-        StructureLearnerConfig::load(rig.path() / "structure_learner.yaml").options.model_error;
-    EXPECT_DOUBLE_EQ(noise.position_m, kTagModelError.position_m) << rig.path();
-    EXPECT_DOUBLE_EQ(noise.rotation_rad, kTagModelError.rotation_rad) << rig.path();
+    if (!fs::is_directory(rig.path())) continue;
+    const Noise noise = load_noise(rig.path()).measurement.systematic;
+    EXPECT_DOUBLE_EQ(noise.position_m, kTagSystematic.position_m) << rig.path();
+    EXPECT_DOUBLE_EQ(noise.rotation_rad, kTagSystematic.rotation_rad) << rig.path();
   }
 }
 

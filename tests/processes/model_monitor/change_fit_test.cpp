@@ -47,7 +47,7 @@ class ChangeFitTest : public testing::Test {
   }
 
   Rng rng_{11};
-  MarkerNoise noise_;
+  MeasurementModel noise_;
   BodySchema schema_ =
       test::BrokenArm({test::Fault::kNone, "", 1}, test::Regime::kTagIso, 1, 3).engineered();
 };

@@ -79,7 +79,7 @@ TEST_F(ChangeSearchTest, OfTwoPlacesThatChangedBackBothAreRestoredAndNothingElse
   const auto samples = observe(stored_, 3);
   std::vector<const ActionPoseSample*> pointers;
   for (const ActionPoseSample& sample : samples) pointers.push_back(&sample);
-  const ChangeSearch search{MarkerNoise{}};
+  const ChangeSearch search{MeasurementModel{}};
   const FoundChanges found =
       find_changes(schema_, {stored_}, {{kOther, false}, {kBent, false}}, pointers, search);
   ASSERT_TRUE(found.best);
@@ -99,8 +99,8 @@ TEST_F(ChangeSearchTest, AMarkerThatIsBackIsOnePlaceThoughBothEdgesChange) {
   const auto samples = observe(stored_, 3);
   std::vector<const ActionPoseSample*> pointers;
   for (const ActionPoseSample& sample : samples) pointers.push_back(&sample);
-  const FoundChanges found =
-      find_changes(schema_, {stored_}, {{kAlmost, false}}, pointers, ChangeSearch{MarkerNoise{}});
+  const FoundChanges found = find_changes(schema_, {stored_}, {{kAlmost, false}}, pointers,
+                                          ChangeSearch{MeasurementModel{}});
   ASSERT_TRUE(found.best);
   EXPECT_EQ(found.best->fitted.change.form, Form::kStored);
   EXPECT_EQ(found.best->place, (Place{kAlmost, true}));

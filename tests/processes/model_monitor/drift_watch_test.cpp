@@ -65,7 +65,7 @@ TEST(DriftWatchTest, AFastBendIsFoundSinceItsBeginAndItsEndIsSeen) {
   for (const int seed : {1, 2, 3}) {
     BrokenArm arm({Fault::kDrift, "", 0.85, 1, kBent}, Regime::kTagIso, kHealthy, seed);
     const BodySchema& schema = arm.engineered();
-    const MarkerNoise noise = test::adaptation_options(Regime::kTagIso).noise;
+    const MeasurementModel noise = test::adaptation_options(Regime::kTagIso).noise;
     std::vector<ActionPoseSample> life;
     for (int t = 0; t < kHealthy + kBent + kStill; ++t) life.push_back(arm.observe(t));
     const auto between = [&life](int begin, int end) {
@@ -103,7 +103,7 @@ TEST(DriftWatchTest, ABentLinkHasNotDriftedWell) {
   for (const int seed : {1, 2, 3}) {
     BrokenArm arm({Fault::kBend, "", 0.85}, Regime::kTagIso, kHealthy, seed);
     const BodySchema& schema = arm.engineered();
-    const MarkerNoise noise = test::adaptation_options(Regime::kTagIso).noise;
+    const MeasurementModel noise = test::adaptation_options(Regime::kTagIso).noise;
     std::vector<ActionPoseSample> life;
     for (int t = 0; t < kHealthy + 8; ++t) life.push_back(arm.observe(t));
     std::vector<const ActionPoseSample*> samples;

@@ -25,7 +25,7 @@ using Bytes = std::vector<std::uint8_t>;
 ModelMonitorConfig test_config() {
   return {.max_mahalanobis2 = 20.06,
           .max_outlier_share = 0.2,
-          .model_error = {.position_m = 0.001, .rotation_rad = 0.2 * kDegree}};
+          .measurement = {.systematic = kTagSystematic}};
 }
 
 Bytes bytes_of(const ModelMonitor& monitor) {
@@ -930,21 +930,22 @@ TEST(ModelMonitorByHandTest, ALearnedEdgeTravelsAndIsKnownAgainInTheHistory) {
 }
 
 TEST(ModelMonitorConfigTest, IsReadInSiUnits) {
-  const std::filesystem::path file = std::filesystem::path(testing::TempDir()) /
-                                     ("model_monitor_config_" + std::to_string(getpid()) + ".yaml");
-  std::ofstream(file) << "max_mahalanobis2: 16\nmax_outlier_share: 0.25\n"
-                         "model_error_position_m: 0.002\nmodel_error_rotation_deg: 90\n"
-                         "false_alarm_rate: 1e-6\noutlier_rate: 0.05\n";
+  const std::filesystem::path folder = std::filesystem::path(testing::TempDir()) /
+                                       ("model_monitor_config_" + std::to_string(getpid()));
+  std::filesystem::create_directories(folder);
+  const std::filesystem::path file = folder / "model_monitor.yaml";
+  std::ofstream(file) << "max_mahalanobis2: 16\nmax_outlier_share: 0.25\nfalse_alarm_rate: 1e-6\n";
+  EXPECT_THROW(ModelMonitorConfig::load(file), ConfigError);  // no noise.yaml
+  std::filesystem::copy_file(std::filesystem::path(BODYSCHEMA_CONFIG) / "arm4" / "noise.yaml",
+                             folder / "noise.yaml");
   const ModelMonitorConfig config = ModelMonitorConfig::load(file);
   EXPECT_EQ(config.max_mahalanobis2, 16);
   EXPECT_EQ(config.max_outlier_share, 0.25);
-  EXPECT_EQ(config.model_error.position_m, 0.002);
-  EXPECT_DOUBLE_EQ(config.model_error.rotation_rad, M_PI / 2);
+  EXPECT_EQ(config.measurement.systematic.position_m, kTagSystematic.position_m);
   EXPECT_EQ(config.false_alarm_rate, 1e-6);
-  EXPECT_EQ(config.outlier_rate, 0.05);
   std::ofstream(file) << "max_mahalanobis2: 0.5\n";
   EXPECT_THROW(ModelMonitorConfig::load(file), ConfigError);
-  std::filesystem::remove(file);
+  std::filesystem::remove_all(folder);
 }
 
 }  // namespace

@@ -107,8 +107,8 @@ class TreeFilterTest : public testing::Test {
   Rng rng_{7};
   BodySchema schema_;
   ActionPoseSample sample_;
-  MarkerNoise noise_ = [] {
-    MarkerNoise noise;
+  MeasurementModel noise_ = [] {
+    MeasurementModel noise;
     noise.outlier_rate = 1e-9;
     return noise;
   }();

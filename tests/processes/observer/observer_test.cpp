@@ -31,7 +31,6 @@ ObserverConfig config() {
   config.frames_per_sample = 2;
   config.max_buffered_frames = 8;
   config.max_motion_px = 1;
-  config.noise = {0.1, 0};
   config.part_pose.max_tag_error_px = 1.5;
   config.part_pose.min_other_rotation_rad = 2 * kDegree;
   config.part_pose.max_error_ratio = 10;
@@ -86,6 +85,7 @@ marker_pose_t sight_of(int id, const Pose& X_CM, double noise_px, std::mt19937& 
     marker.corner_px[c][1] = p_px.y();
     points.push_back(*lens.straighten(p_px));
   }
+  to_message(Matrix8d(0.1 * 0.1 * Matrix8d::Identity()), marker.corner_covariance);
   const auto minima = solve_tag_pose(0.08, points);
   marker.num_hypotheses = static_cast<std::int8_t>(minima.size());
   for (int h = 0; h < 2; ++h) {

@@ -293,9 +293,10 @@ TEST(StructureLearnerConfigTest, IsReadInSiUnitsWithTheRootOfTheRig) {
   std::filesystem::create_directories(folder);
   std::ofstream(folder / "signals.yaml")
       << "signals:\n  - {name: a, lower: 0, upper: 1}\nroot_part: 4\nend_effector_part: 5\n";
-  std::ofstream(folder / "structure_learner.yaml")
-      << "max_signals: 1\noutlier_rate: 0.1\nmodel_error_position_m: 0.002\n"
-         "model_error_rotation_deg: 90\n";
+  std::ofstream(folder / "structure_learner.yaml") << "max_signals: 1\n";
+  std::ofstream(folder / "noise.yaml")
+      << "corner_noise_px: 0.05\nsmall_tag_noise_px: 0.15\noutlier_rate: 0.1\n"
+         "systematic_position_m: 0.002\nsystematic_rotation_deg: 90\n";
   std::ofstream(folder / "markers.yaml")
       << "family: tag36h11\ntags:\n  - {id: 0, size_m: 0.1, part: 5, placement: none}\n"
          "  - {id: 1, size_m: 0.1, part: 4, placement: none}\n";
@@ -305,16 +306,16 @@ TEST(StructureLearnerConfigTest, IsReadInSiUnitsWithTheRootOfTheRig) {
   EXPECT_EQ(config.options.expected_parts, (std::vector<int>{4, 5}));
   EXPECT_EQ(config.options.max_signals, 1);
   EXPECT_EQ(config.options.outlier_rate, 0.1);
-  EXPECT_EQ(config.options.model_error.position_m, 0.002);
-  EXPECT_DOUBLE_EQ(config.options.model_error.rotation_rad, M_PI / 2);
+  EXPECT_EQ(config.options.systematic.position_m, 0.002);
+  EXPECT_DOUBLE_EQ(config.options.systematic.rotation_rad, M_PI / 2);
 
   std::ofstream(folder / "structure_learner.yaml", std::ios::app) << "window: 3\n";
   EXPECT_THROW(StructureLearnerConfig::load(folder / "structure_learner.yaml"), ConfigError);
   std::filesystem::remove_all(folder);
 }
 
-// The retained set, whenever it is asked: after a restart, with prefixes left out, or since a change
-// that was found long after it.
+// The retained set, whenever it is asked: after a restart, with prefixes left out, or since a
+// change that was found long after it.
 TEST_F(StructureLearnerTest, ManySamplesAreLearnedFromTheRetainedOnes) {
   constexpr std::int64_t kMany = 5'000, kSince = 400, kFound = 4'500;
   std::vector<sample_t> samples;

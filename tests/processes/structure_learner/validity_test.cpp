@@ -15,9 +15,10 @@ using test::Regime;
 using test::Rng;
 
 Validity rigid_validity(const std::vector<ActionPoseSample>& samples, const Noise& noise,
-                        const Noise& model_error = {}) {
+                        const Noise& systematic = {}) {
   const NormalizedActions actions(samples, static_cast<int>(samples[0].action.size()));
-  const PairData pair = make_pair_data(samples, 1, 2, {noise, model_error}, 2000);
+  const PairData pair =
+      make_pair_data(samples, 1, 2, {.noise = noise, .systematic = systematic}, 2000);
   const Fit fit = fit_local_model(screen_rigid(pair, actions).model, pair, actions, 40);
   return check_validity(fit, leave_one_out(fit, pair, actions), pair, actions, {});
 }

@@ -1,0 +1,43 @@
+#pragma once
+
+#include <optional>
+
+#include "common/schema/body_schema.h"
+#include "common/schema/sample.h"
+
+namespace bodyschema {
+
+/// How far the observed pose of a part may be from the true one: the one place where an
+/// observation becomes a covariance.
+///
+///   X_CB = X_CB_true · exp(ε + β),   ε ~ N(0, Σ),   β ~ N(0, M)
+///
+/// The noise ε is new at every sight. The systematic error β (tags that are not where markers.yaml
+/// says, a lens that is not as calibrated, what a view biases) is the same at every sight of the
+/// same tags from the same side: no number of samples averages it out.
+struct MeasurementModel {
+  /// Standard deviations per axis of ε, instead of each observation's own covariance.
+  std::optional<Noise> noise;
+  /// Multiplies the standard deviations of ε: 1 where what is told of them is true.
+  double scale = 1;
+  /// Standard deviations per axis of β. Under-stating it refutes true models in the end;
+  /// over-stating it hides joints and changes that move less.
+  Noise systematic;
+  /// Expected share of a part's observations that are flips of planar tags or false detections.
+  double outlier_rate = 0.03;
+  /// A second reading of a planar part counts while its reprojection error is at most this multiple
+  /// of the first's.
+  double max_error_ratio = 10;
+
+  /// Σ of X_CB: 6×6, (translation [m], rotation [rad]), right perturbation in B.
+  Matrix6d noise_covariance(const PartObservation& observation) const;
+  /// M, and a little that keeps exact measurements invertible.
+  Matrix6d systematic_covariance() const;
+  /// Σ + M.
+  Matrix6d covariance(const PartObservation& observation) const;
+};
+
+/// Variances per axis on the diagonal: 6×6, (translation [m²], rotation [rad²]).
+Matrix6d isotropic(const Noise& noise);
+
+}  // namespace bodyschema
