@@ -8,8 +8,8 @@
 namespace bodyschema {
 
 /// Looks up an image at fixed places by the polynomials through 8 × 8 pixels, to 1/2048 px. An edge
-/// with a blur of 0.8 px is moved by at most 0.0015 px; the cubic of cv::remap moves it by 0.02 px,
-/// and its places are rounded to 1/32 px.
+/// with a blur of 0.8 px is moved by at most 0.004 px, mostly by rounding; the cubic of cv::remap
+/// moves it by 0.02 px, and its places are rounded to 1/32 px.
 class ImageLookup {
  public:
   /// Nothing to look up.
