@@ -9,7 +9,6 @@
 #include "common/bus/images_url.h"
 #include "common/bus/process.h"
 #include "common/bus/rig_door.h"
-#include "common/config/yaml.h"
 #include "common/scene/scene_renderer.h"
 #include "processes/camera/camera.h"
 #include "processes/camera/capture.h"
@@ -64,9 +63,7 @@ int main(int argc, char** argv) {
                                  .noise_sd = simulation.noise_sd,
                                  .msaa_samples = simulation.msaa_samples};
       const SceneDescription ideal = SceneDescription::load(process.rig_folder());
-      if (ideal.robot.lens.width != config.calibration.width ||
-          ideal.robot.lens.height != config.calibration.height)
-        throw ConfigError("robot.yaml: lens: its size_px is not that of the calibration");
+      check_lens(ideal.robot.lens, config.calibration);
       renderer.emplace(ideal, effects);
       // Which robot it is, the seed says, and that SIM_STATE.
       std::optional<std::int64_t> seed;
