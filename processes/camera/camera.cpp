@@ -52,13 +52,13 @@ CameraConfig CameraConfig::load(const std::filesystem::path& file) {
   return config;
 }
 
-void check_lens(const CameraCalibration& lens, const CameraCalibration& calibration) {
-  if (lens.width == calibration.width && lens.height == calibration.height) return;
+std::optional<std::string> lens_problem(const CameraCalibration& lens,
+                                        const CameraCalibration& calibration) {
+  if (lens.width == calibration.width && lens.height == calibration.height) return std::nullopt;
   const auto size = [](const CameraCalibration& c) {
     return std::to_string(c.width) + "×" + std::to_string(c.height) + " px";
   };
-  throw ConfigError("robot.yaml: lens.size_px: " + size(lens) + ", the calibration holds for " +
-                    size(calibration));
+  return "size_px is " + size(lens) + ", the calibration holds for " + size(calibration);
 }
 
 namespace {

@@ -48,9 +48,9 @@ struct CameraConfig {
   static CameraConfig load(const std::filesystem::path& file);
 };
 
-/// robot.yaml's lens must make images of the size that the rig's calibration holds for.
-/// @throws ConfigError.
-void check_lens(const CameraCalibration& lens, const CameraCalibration& calibration);
+/// Why robot.yaml's lens cannot be what the rig's calibration claims to be of: another size.
+std::optional<std::string> lens_problem(const CameraCalibration& lens,
+                                        const CameraCalibration& calibration);
 
 /// A frame of any depth and number of channels as the message that travels: 8-bit grey, encoded.
 /// @throws std::invalid_argument if the frame is empty, of an unknown format or not of the

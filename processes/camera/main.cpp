@@ -9,6 +9,7 @@
 #include "common/bus/images_url.h"
 #include "common/bus/process.h"
 #include "common/bus/rig_door.h"
+#include "common/config/yaml.h"
 #include "common/scene/scene_renderer.h"
 #include "processes/camera/camera.h"
 #include "processes/camera/capture.h"
@@ -63,7 +64,8 @@ int main(int argc, char** argv) {
                                  .noise_sd = simulation.noise_sd,
                                  .msaa_samples = simulation.msaa_samples};
       const SceneDescription ideal = SceneDescription::load(process.rig_folder());
-      check_lens(ideal.robot.lens, config.calibration);
+      if (const auto problem = lens_problem(ideal.robot.lens, config.calibration))
+        throw ConfigError("robot.yaml: lens: " + *problem);
       renderer.emplace(ideal, effects);
       // Which robot it is, the seed says, and that SIM_STATE.
       std::optional<std::int64_t> seed;

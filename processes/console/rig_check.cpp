@@ -106,7 +106,9 @@ class Check {
         rig_.markers)
       guarded([&] {
         const Scene scene(folder_);
-        if (rig_.camera) check_lens(scene.robot().lens, rig_.camera->calibration);
+        if (!rig_.camera) return;
+        if (const auto problem = lens_problem(scene.robot().lens, rig_.camera->calibration))
+          add_problem("robot.yaml", "lens", *problem);
       });
     if (rig_.camera) {
       // By whatever name camera.yaml tells.

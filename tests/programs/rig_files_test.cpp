@@ -216,7 +216,7 @@ TEST_F(RigCheckTest, WhatOneFileSaysOfAnotherMustBeThere) {
   EXPECT_EQ(problem_with("robot.yaml", "part: 5, link: arm", "part: 5, link: leg"),
             "robot.yaml:69: parts[4].link: 'leg' is none of: base, turret, arm");
   EXPECT_EQ(problem_with("robot.yaml", "size_px: [1280,", "size_px: [640,"),
-            "robot.yaml: lens.size_px: 640×960 px, the calibration holds for 1280×960 px");
+            "robot.yaml:10: lens: size_px is 640×960 px, the calibration holds for 1280×960 px");
   EXPECT_EQ(problem_with("robot.yaml", "signal: q2", "signal: q9"),
             "robot.yaml:55: links[2].joint.signal: 'q9' is none of: q1, q2");
   EXPECT_NE(
