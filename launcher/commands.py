@@ -17,8 +17,9 @@ from launcher.words import Failure, UsageError, say
 
 LEARN_USAGES = (
     (
-        "[--rig arm7] [--seed N] [--samples N] [--hide PART] [--initial SCHEMA] [--keep] [--build-only]",
+        "[--rig arm7] [--seed N] [--samples N] [--ideal] [--hide PART] [--initial SCHEMA] [--keep] [--build-only]",
         "set up, build, let the simulated arm learn its body, show the result;",
+        "--ideal: tags, lens and joints of the simulation are exactly what the rig's files say;",
         "--initial begins with a body schema, of another run or from `engineer`;",
         "--keep leaves the process group running",
     ),
@@ -117,6 +118,7 @@ def learn_options(arguments):
     parser.add_argument("--rig")
     parser.add_argument("--seed", default="1", type=matching("[0-9]{1,18}", "a whole number of at most 18 digits"))
     parser.add_argument("--samples", type=matching("[1-9][0-9]{0,8}", "a whole number from 1 to 999999999"))
+    parser.add_argument("--ideal", action="store_true")
     parser.add_argument("--hide", type=matching("[0-9]{1,9}", "the id of a part"))
     parser.add_argument("--initial", type=readable_file)
     parser.add_argument("--host")
@@ -126,7 +128,7 @@ def learn_options(arguments):
     parser.add_argument("--keep", action="store_true")
     parser.add_argument("--build-only", action="store_true")
     options = parser.parse_args(arguments)
-    for name in ("seed", "samples", "hide", "initial", "host", "watch", "keep"):
+    for name in ("seed", "samples", "ideal", "hide", "initial", "host", "watch", "keep"):
         if options.replay and getattr(options, name) != parser.get_default(name):
             parser.error(f"--{name} has no meaning with --replay")
     if not options.replay and options.speed != parser.get_default("speed"):

@@ -69,6 +69,7 @@ def learn(place, options):
     commands = processes(place, folder)
     hide = ["--hide", options.hide] if options.hide else []
     initial = ["--initial", options.initial] if options.initial else []
+    ideal = ["--ideal"] if options.ideal else []
     host = ["--host", options.host] if options.host else []
     settings = Settings(place, folder, *hide, *initial, *host, "--group", *commands)
     # Where the group is split, this host's share goes on after the result; others may need it.
@@ -78,7 +79,8 @@ def learn(place, options):
     run, lock = run_folder.begin(place, folder)
     samples = ["--samples", options.samples] if options.samples else []
     variables = {
-        "SIMULATOR_FLAGS": shlex.join(["--seed", options.seed, *hide]),
+        "SIMULATOR_FLAGS": shlex.join(["--seed", options.seed, *hide, *ideal]),
+        "CAMERA_FLAGS": shlex.join(ideal),
         "BABBLER_FLAGS": shlex.join(["--seed", options.seed, *samples]),
     }
     if options.initial:

@@ -28,13 +28,10 @@ const TagPlacement* Markers::find(int tag_id) const {
   return tag != tags.end() && tag->id == tag_id ? &*tag : nullptr;
 }
 
-Markers load_markers(const std::filesystem::path& rig_folder) {
-  const Yaml yaml = Yaml::load(rig_folder / "markers.yaml");
-  Markers markers;
-  markers.family = yaml.choice("family", {"tag36h11"});
+std::vector<TagPlacement> load_tags(const Yaml& yaml) {
+  std::vector<TagPlacement> tags;
   std::map<int, int> tags_of_part;
-  const std::vector<Yaml> tags = yaml.list("tags");
-  for (const Yaml& tag : tags) {
+  for (const Yaml& tag : yaml.list("tags")) {
     TagPlacement placement;
     placement.id = static_cast<int>(tag.integer("id", 0, 586));
     placement.size_m = tag.number("size_m", 0.001, 10);
@@ -47,22 +44,29 @@ Markers load_markers(const std::filesystem::path& rig_folder) {
     }
     if (!is_none) placement.X_BM = tag.pose("placement");
     ++tags_of_part[placement.part];
-    markers.tags.push_back(placement);
+    tags.push_back(placement);
   }
-  yaml.finish();
-  std::stable_sort(markers.tags.begin(), markers.tags.end(),
+  std::stable_sort(tags.begin(), tags.end(),
                    [](const auto& a, const auto& b) { return a.id < b.id; });
-  for (std::size_t i = 1; i < markers.tags.size(); ++i) {
-    if (markers.tags[i].id == markers.tags[i - 1].id) {
-      throw yaml.error("tags", "tag id " + std::to_string(markers.tags[i].id) + " stands twice");
-    }
+  for (std::size_t i = 1; i < tags.size(); ++i) {
+    if (tags[i].id == tags[i - 1].id)
+      throw yaml.error("tags", "tag id " + std::to_string(tags[i].id) + " stands twice");
   }
-  for (const TagPlacement& tag : markers.tags) {
+  for (const TagPlacement& tag : tags) {
     if (!tag.X_BM && tags_of_part[tag.part] > 1) {
       throw yaml.error("tags", "part " + std::to_string(tag.part) +
                                    " has several tags, so each needs a placement");
     }
   }
+  return tags;
+}
+
+Markers load_markers(const std::filesystem::path& rig_folder) {
+  const Yaml yaml = Yaml::load(rig_folder / "markers.yaml");
+  Markers markers;
+  markers.family = yaml.choice("family", {"tag36h11"});
+  markers.tags = load_tags(yaml);
+  yaml.finish();
   return markers;
 }
 

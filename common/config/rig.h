@@ -12,7 +12,9 @@
 
 namespace bodyschema {
 
-/// One tag of a rig's markers.yaml.
+class Yaml;
+
+/// One tag of a rig's markers.yaml, or of its robot.yaml as it truly is.
 struct TagPlacement {
   int id = 0;
   double size_m = 0;  ///< side of the black square
@@ -63,6 +65,8 @@ struct Network {
   std::vector<std::string> share_of(const std::string& host) const;
 };
 
+/// The list `tags` of a mapping, as markers.yaml has it, ascending id. @throws ConfigError.
+std::vector<TagPlacement> load_tags(const Yaml& yaml);
 /// @throws ConfigError.
 Markers load_markers(const std::filesystem::path& rig_folder);
 Signals load_signals(const std::filesystem::path& rig_folder);

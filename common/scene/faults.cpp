@@ -274,7 +274,7 @@ SceneDescription broken(const SceneDescription& as_built, const std::vector<Faul
         result.fallen_tags[fault.number] = fallen_pose(fault.fallen);
         break;
       case Command::FAULT_MARKER_MOVED:
-        for (TagPlacement& tag : result.markers.tags) {
+        for (TagPlacement& tag : robot.markers.tags) {
           if (tag.id != fault.number) continue;
           const Pose shift = Eigen::Translation3d(0.2 * tag.size_m, 0.15 * tag.size_m, 0) *
                              Eigen::AngleAxisd(15 * kDegree, Eigen::Vector3d::UnitZ());

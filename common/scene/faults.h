@@ -16,7 +16,7 @@ namespace bodyschema {
 //   stuck          the signal's joints stay where they are
 //   bend, drift    what lies beyond the middle of the link is turned about the middle, parts too
 //   tool           what lies beyond the flange is displaced, parts too: X_WB of a part on the tool
-//                  is the frame in which its tags sit at markers.yaml's X_BM, before and after
+//                  is the frame in which its tags sit at robot.yaml's X_BM, before and after
 //   marker-lost    the plate lies on the floor, face up; X_WB unchanged
 //   marker-moved   the plate sits 0.25 sides and 15° off in its plane; X_WB unchanged
 //   camera-bump    X_WC is off by 20 … 30 mm and 1.5 … 2.5°; nothing else changes

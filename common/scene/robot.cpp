@@ -70,6 +70,28 @@ RobotJoint load_joint(const Yaml& yaml, const Servo& servo, const Signals& signa
   return joint;
 }
 
+CameraCalibration load_lens(const Yaml& yaml) {
+  CameraCalibration lens;
+  const std::vector<double> size = yaml.numbers("size_px", 2, 32, 32768);
+  const std::vector<double> focal_length = yaml.numbers("focal_length_px", 2, 1, 1e6);
+  const std::vector<double> centre = yaml.numbers("centre_px", 2, 0, 32768);
+  lens.width = static_cast<int>(size[0]);
+  lens.height = static_cast<int>(size[1]);
+  lens.fx = focal_length[0];
+  lens.fy = focal_length[1];
+  lens.cx = centre[0];
+  lens.cy = centre[1];
+  const std::string model =
+      yaml.choice("model", {"plumb_bob", "rational_polynomial", "equidistant"});
+  using Model = CameraCalibration::Model;
+  lens.model = model == "plumb_bob"     ? Model::kPlumbBob
+               : model == "equidistant" ? Model::kFisheye
+                                        : Model::kRational;
+  const int count = lens.model == Model::kPlumbBob ? 5 : lens.model == Model::kFisheye ? 4 : 8;
+  lens.distortion = yaml.numbers("distortion", count, -1e4, 1e4);
+  return lens;
+}
+
 ToolChanger load_tool_changer(const Yaml& yaml, const std::vector<std::string>& link_names) {
   ToolChanger changer;
   const std::string link = yaml.choice("link", link_names);
@@ -125,6 +147,9 @@ Robot load_robot(const std::filesystem::path& rig_folder, const Signals& signals
   Robot robot;
   robot.name = yaml.text("name");
   robot.X_WC = yaml.pose("X_WC");
+  robot.lens = load_lens(yaml.section("lens"));
+  if (yaml.has("calibration_error"))
+    robot.calibration_error = CalibrationError::load(yaml.section("calibration_error"));
   const Servo servo = load_servo(yaml.section("servo"));
 
   const std::vector<double> home = yaml.numbers("home", static_cast<int>(signals.signals.size()));
@@ -186,6 +211,12 @@ Robot load_robot(const std::filesystem::path& rig_folder, const Signals& signals
   for (const PartPlacement& part : robot.parts) parts.push_back(part.part);
   if (parts != markers.parts()) {
     throw yaml.error("parts", "must be the parts of markers.yaml, each once");
+  }
+
+  robot.markers = {markers.family, load_tags(yaml)};
+  for (const TagPlacement& tag : robot.markers.tags) {
+    if (!std::binary_search(parts.begin(), parts.end(), tag.part))
+      throw yaml.error("tags", "part " + std::to_string(tag.part) + " is not in parts");
   }
 
   for (const Yaml& item : yaml.list("may_touch")) {

@@ -7,8 +7,10 @@
 #include <utility>
 #include <vector>
 
+#include "common/config/camera_calibration.h"
 #include "common/config/rig.h"
 #include "common/geometry/pose.h"
+#include "common/scene/calibration_error.h"
 
 namespace bodyschema {
 
@@ -60,7 +62,7 @@ struct Link {
   std::vector<Shape> shapes;
 };
 
-/// Where a body part's frame sits. Its tags follow by markers.yaml's X_BM.
+/// Where a body part's frame sits.
 struct PartPlacement {
   int part = 0;
   int link = 0;  ///< index into Robot::links
@@ -85,13 +87,16 @@ struct ToolChanger {
 struct Robot {
   std::string name;
   Pose X_WC = Pose::Identity();      ///< camera, optical frame
+  CameraCalibration lens;            ///< without a name
   std::vector<RobotJoint> joints;    ///< in the order of their links
   std::vector<Link> links;           ///< parents before children
   std::vector<PartPlacement> parts;  ///< ascending part id
+  Markers markers;                   ///< as they truly are
   /// Links that may touch beside parent and child, which always may.
   std::vector<std::pair<std::string, std::string>> may_touch;
   Eigen::VectorXd home;  ///< action of the start pose, command units
   std::optional<ToolChanger> tool_changer;
+  CalibrationError calibration_error;
 
   /// Joint positions that `action` leads to: gain · command + offset, stuck joints where they are.
   /// @throws std::invalid_argument on a wrong size.
@@ -100,7 +105,7 @@ struct Robot {
   std::optional<std::string> beyond_range(const Eigen::VectorXd& joint_positions) const;
 };
 
-/// Reads robot.yaml. Signals are named as in signals.yaml; the parts must be those of markers.yaml.
+/// Reads robot.yaml, its tables as they stand there. Signals are named as in signals.yaml; the parts must be those of markers.yaml.
 /// @throws ConfigError.
 Robot load_robot(const std::filesystem::path& rig_folder, const Signals& signals,
                  const Markers& markers);

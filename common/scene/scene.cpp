@@ -132,7 +132,6 @@ void add_light(XMLElement* world, const Eigen::Vector3d& position, const Eigen::
 
 std::string make_mjcf(const SceneDescription& description) {
   const Robot& robot = description.robot;
-  const Markers& markers = description.markers;
   XMLDocument document;
   XMLElement* mujoco = document.NewElement("mujoco");
   document.InsertEndChild(mujoco);
@@ -194,7 +193,7 @@ std::string make_mjcf(const SceneDescription& description) {
   XMLElement* floor_material = add_material("floor", "floor", 0);
   set(floor_material, "texrepeat", "12 12");
   add_material("solid", "", 0);
-  for (const TagPlacement& tag : markers.tags) {
+  for (const TagPlacement& tag : robot.markers.tags) {
     add_texture(tag_name(tag.id), "2d", "flat", kTagTexels, 1, 1);
     // Paper scatters light; without emission a plate in shade would lose its contrast.
     add_material(tag_name(tag.id), tag_name(tag.id), 0.35);
@@ -264,7 +263,7 @@ std::string make_mjcf(const SceneDescription& description) {
     }
     for (const PartPlacement& part : robot.parts) {
       if (part.link != static_cast<int>(i)) continue;
-      for (const TagPlacement& tag : markers.tags) {
+      for (const TagPlacement& tag : robot.markers.tags) {
         if (tag.part == part.part) {
           add_plate(body, tag, part.X_LB * tag.X_BM.value_or(Pose::Identity()),
                     description.fallen_tags.contains(tag.id));
@@ -310,11 +309,16 @@ Pose pose_of(const mjtNum* position, const mjtNum* matrix) {
 
 std::string tag_name(int tag_id) { return "tag_" + std::to_string(tag_id); }
 
-SceneDescription SceneDescription::load(const std::filesystem::path& rig_folder) {
+SceneDescription SceneDescription::load(const std::filesystem::path& rig_folder,
+                                        std::optional<std::int64_t> seed) {
   SceneDescription description;
-  description.markers = load_markers(rig_folder);
   description.signals = load_signals(rig_folder);
-  description.robot = load_robot(rig_folder, description.signals, description.markers);
+  description.robot = load_robot(rig_folder, description.signals, load_markers(rig_folder));
+  if (seed) {
+    description.robot = with_calibration_error(std::move(description.robot), *seed);
+  } else {
+    description.robot.calibration_error = {};
+  }
   return description;
 }
 

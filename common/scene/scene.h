@@ -18,18 +18,19 @@ namespace bodyschema {
 /// What a scene is made of. Changed, it is another scene: a broken arm, an exchanged tool
 /// (common/scene/faults.h).
 struct SceneDescription {
-  Markers markers;
   Signals signals;
   Robot robot;
   /// X_WM of tags that have fallen off their parts: their plates lie there and touch nothing.
   std::map<int, Pose> fallen_tags;
 
-  /// The rig as built. @throws ConfigError.
-  static SceneDescription load(const std::filesystem::path& rig_folder);
+  /// The rig as built. `seed`: of the draw of its calibration errors; none: the ideal robot, of which
+  /// all tables of robot.yaml are true. @throws ConfigError.
+  static SceneDescription load(const std::filesystem::path& rig_folder,
+                               std::optional<std::int64_t> seed = std::nullopt);
 };
 
-/// A rig folder as a MuJoCo model: robot.yaml's links, joints, servos and solids, markers.yaml's
-/// plates, a floor and lights. The simulator steps it, SceneRenderer looks at it, and an experiment
+/// A rig folder as a MuJoCo model: robot.yaml's links, joints, servos, solids and tags' plates, a
+/// floor and lights. The simulator steps it, SceneRenderer looks at it, and an experiment
 /// may do without either:
 ///
 ///   const Scene scene("config/arm7");
@@ -39,8 +40,8 @@ struct SceneDescription {
 /// Immutable; scratch memory is mjData (make_data()), so one Scene may serve several threads.
 class Scene {
  public:
-  /// @throws ConfigError; std::runtime_error with MuJoCo's words if it refuses the model, or if the
-  /// start pose collides.
+  /// The ideal robot. @throws ConfigError; std::runtime_error with MuJoCo's words if it refuses the
+  /// model, or if the start pose collides.
   explicit Scene(const std::filesystem::path& rig_folder);
   /// Any change of a rig's description. As many geoms, joints and parts, in the same order, as the
   /// rig's own scene: its SIM_STATE can be rendered by a camera that knows the rig alone. The start
@@ -48,7 +49,7 @@ class Scene {
   explicit Scene(SceneDescription description);
 
   const Robot& robot() const { return description_.robot; }
-  const Markers& markers() const { return description_.markers; }
+  const Markers& markers() const { return robot().markers; }
   const Signals& signals() const { return description_.signals; }
   const SceneDescription& description() const { return description_; }
   const mjModel& model() const { return *model_; }

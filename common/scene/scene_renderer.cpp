@@ -56,9 +56,9 @@ cv::Mat undistorted_rays(const CameraCalibration& calibration) {
 }  // namespace
 
 struct SceneRenderer::Implementation {
-  Implementation(const std::filesystem::path& rig_folder, CameraCalibration calibration_given,
+  Implementation(SceneDescription description, CameraCalibration calibration_given,
                  ImageEffects effects_given)
-      : scene(rig_folder),
+      : scene(std::move(description)),
         calibration(std::move(calibration_given)),
         effects(effects_given),
         noise(effects.noise_sd) {
@@ -261,13 +261,16 @@ struct SceneRenderer::Implementation {
 };
 
 SceneRenderer::SceneRenderer(const std::filesystem::path& rig_folder, ImageEffects effects)
-    : SceneRenderer(rig_folder, load_camera_calibration(rig_folder / "camera_info.yaml"), effects) {
-}
+    : SceneRenderer(SceneDescription::load(rig_folder), effects) {}
+
+SceneRenderer::SceneRenderer(const SceneDescription& description, ImageEffects effects)
+    : implementation_(
+          std::make_unique<Implementation>(description, description.robot.lens, effects)) {}
 
 SceneRenderer::SceneRenderer(const std::filesystem::path& rig_folder, CameraCalibration calibration,
                              ImageEffects effects)
-    : implementation_(
-          std::make_unique<Implementation>(rig_folder, std::move(calibration), effects)) {}
+    : implementation_(std::make_unique<Implementation>(SceneDescription::load(rig_folder),
+                                                       std::move(calibration), effects)) {}
 
 SceneRenderer::~SceneRenderer() = default;
 

@@ -7,20 +7,24 @@
 #include "bodyschema/sim_state_t.hpp"
 #include "common/config/camera_calibration.h"
 #include "common/scene/image_effects.h"
+#include "common/scene/scene.h"
 
 namespace bodyschema {
 
 /// The simulated camera: SIM_STATE in, grey image out, of the size and with the intrinsics and
-/// distortion of the rig's camera_info.yaml. Poses and visibility of all geoms come from the state;
+/// distortion of robot.yaml's lens. Poses and visibility of all geoms come from the state;
 /// the joints are unknown here. Two renderings of one (state, frame) are equal bit by bit on one
 /// machine. Headless; 1280×960 takes about 15 ms on one core without distortion, MSAA and shadows.
 ///
 /// To be used from one thread at a time.
 class SceneRenderer {
  public:
-  /// @throws ConfigError on the rig's files; std::runtime_error where OpenGL does not work.
+  /// The ideal robot's lens and tags. @throws ConfigError on the rig's files; std::runtime_error
+  /// where OpenGL does not work.
   explicit SceneRenderer(const std::filesystem::path& rig_folder, ImageEffects effects = {});
-  /// With another calibration than the rig's.
+  /// Lens and tags of this robot, e.g. with calibration errors.
+  SceneRenderer(const SceneDescription& description, ImageEffects effects);
+  /// The ideal robot behind another lens.
   SceneRenderer(const std::filesystem::path& rig_folder, CameraCalibration calibration,
                 ImageEffects effects);
   ~SceneRenderer();

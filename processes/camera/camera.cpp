@@ -52,6 +52,15 @@ CameraConfig CameraConfig::load(const std::filesystem::path& file) {
   return config;
 }
 
+std::optional<std::string> lens_problem(const CameraCalibration& lens,
+                                        const CameraCalibration& calibration) {
+  if (lens.width == calibration.width && lens.height == calibration.height) return std::nullopt;
+  const auto size = [](const CameraCalibration& c) {
+    return std::to_string(c.width) + "×" + std::to_string(c.height) + " px";
+  };
+  return "size_px is " + size(lens) + ", the calibration holds for " + size(calibration);
+}
+
 namespace {
 
 cv::Mat grey_of(const cv::Mat& frame) {

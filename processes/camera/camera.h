@@ -48,6 +48,10 @@ struct CameraConfig {
   static CameraConfig load(const std::filesystem::path& file);
 };
 
+/// Why robot.yaml's lens cannot be what the rig's calibration claims to be of: another size.
+std::optional<std::string> lens_problem(const CameraCalibration& lens,
+                                        const CameraCalibration& calibration);
+
 /// A frame of any depth and number of channels as the message that travels: 8-bit grey, encoded.
 /// @throws std::invalid_argument if the frame is empty, of an unknown format or not of the
 /// calibration's size.

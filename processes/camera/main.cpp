@@ -9,6 +9,7 @@
 #include "common/bus/images_url.h"
 #include "common/bus/process.h"
 #include "common/bus/rig_door.h"
+#include "common/config/yaml.h"
 #include "common/scene/scene_renderer.h"
 #include "processes/camera/camera.h"
 #include "processes/camera/capture.h"
@@ -21,10 +22,12 @@ constexpr int kMaxRepeats = 30;  // of the images of one SIM_STATE, at 1 Hz
 
 int main(int argc, char** argv) {
   std::string images_option;
+  bool is_ideal = false;
   CLI::App* arguments = nullptr;
   const auto add_options = [&](CLI::App& app) {
     arguments = &app;
     app.add_option("--images", images_option, "URL of the images; default: the next port of --out");
+    app.add_flag("--ideal", is_ideal, "Simulated: without robot.yaml's calibration errors");
   };
   const auto body = [&](Process& process) {
     const CameraConfig config = CameraConfig::load(process.config_file());
@@ -57,11 +60,20 @@ int main(int argc, char** argv) {
     std::optional<Capture> capture;
     if (config.simulation) {
       const SimulationConfig& simulation = *config.simulation;
-      renderer.emplace(process.rig_folder(), config.calibration,
-                       ImageEffects{.blur_sd_px = simulation.blur_sd_px,
-                                    .noise_sd = simulation.noise_sd,
-                                    .msaa_samples = simulation.msaa_samples});
-      simulated.emplace(config, [&](const sim_state_t& state, int frame) {
+      const ImageEffects effects{.blur_sd_px = simulation.blur_sd_px,
+                                 .noise_sd = simulation.noise_sd,
+                                 .msaa_samples = simulation.msaa_samples};
+      const SceneDescription ideal = SceneDescription::load(process.rig_folder());
+      if (const auto problem = lens_problem(ideal.robot.lens, config.calibration))
+        throw ConfigError("robot.yaml: lens: " + *problem);
+      renderer.emplace(ideal, effects);
+      // Which robot it is, the seed says, and that SIM_STATE.
+      std::optional<std::int64_t> seed;
+      simulated.emplace(config, [&, effects, seed](const sim_state_t& state, int frame) mutable {
+        if (!is_ideal && seed != state.seed) {
+          renderer.emplace(SceneDescription::load(process.rig_folder(), state.seed), effects);
+          seed = state.seed;
+        }
         return renderer->render(state, frame);
       });
       door.emplace(process.rig_folder());

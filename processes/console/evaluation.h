@@ -1,5 +1,7 @@
 #pragma once
 
+#include <map>
+#include <optional>
 #include <vector>
 
 #include "common/schema/body_schema.h"
@@ -18,9 +20,41 @@ struct PartErrors {
   double rotation_rms_rad = 0;
 };
 
+/// What differs between a schema and the truth without an error of the kinematics: where tags that
+/// are not where the rig says put the frames of the parts, and how long their printed sides and the
+/// focal length make a metre. The true pose of part B in root R is X_RS · (scaled prediction) · X_PB.
+struct Alignment {
+  double scale = 1;                 ///< true length per predicted length
+  Pose X_RS = Pose::Identity();     ///< the schema's frame of the root, in the true one
+  std::map<int, Pose> X_PB;         ///< the true frame of each part, in the schema's
+
+  /// Of a prediction X_SP of `part`.
+  Pose aligned(int part, const Pose& X_SP) const;
+};
+
+/// Least squares over all parts of all samples, 1 mm against 0.1°; what they leave open stays near
+/// the identity. std::nullopt for less than
+/// kMinAligned samples with the root: too few to tell a frame from an error.
+/// @throws as evaluate().
+std::optional<Alignment> align(const BodySchema& schema,
+                               const std::vector<ActionPoseSample>& samples);
+inline constexpr int kMinAligned = 5;  // chosen: of 30 residuals a part some 6 are spent
+
 /// Predicted against observed pose of every part that the schema connects to its root, the root
 /// itself left out. @throws std::invalid_argument if the actions do not fit the schema's signals.
 std::vector<PartErrors> evaluate(const BodySchema& schema,
-                                 const std::vector<ActionPoseSample>& samples);
+                                 const std::vector<ActionPoseSample>& samples,
+                                 const Alignment& alignment = {});
+
+/// Errors as they are, and beside them those after an alignment.
+struct JudgedErrors {
+  std::vector<PartErrors> parts;
+  std::optional<Alignment> alignment;
+  std::vector<PartErrors> aligned_parts;  ///< as parts; empty without an alignment
+};
+
+/// `held_out` are judged; the alignment is made on `truth`, true poses of any actions.
+JudgedErrors judge(const BodySchema& schema, const std::vector<ActionPoseSample>& held_out,
+                   const std::vector<ActionPoseSample>& truth);
 
 }  // namespace bodyschema

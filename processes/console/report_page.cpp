@@ -186,7 +186,8 @@ class Page {
       held_out_ = fitting(
           record_.watch().held_out(body_->schema.body_since(body_->schema.last_sample_index)),
           body_->schema);
-      errors_ = evaluate(body_->schema, held_out_);
+      errors_ = bodyschema::judge(body_->schema, held_out_,
+                      record_.watch().has_truth() ? held_out_ : std::vector<ActionPoseSample>());
     }
   }
 
@@ -240,14 +241,14 @@ class Page {
         degrees(record_.health()->worst_rotation_rad));
   }
   const PartErrors* errors_of(std::optional<int> part) const {
-    for (const PartErrors& errors : errors_) {
+    for (const PartErrors& errors : errors_.parts) {
       if (errors.part == part && errors.count > 0) return &errors;
     }
     return nullptr;
   }
   const PartErrors* worst() const {
     const PartErrors* worst = nullptr;
-    for (const PartErrors& errors : errors_) {
+    for (const PartErrors& errors : errors_.parts) {
       if (errors.count > 0 && (!worst || errors.position_median_m > worst->position_median_m))
         worst = &errors;
     }
@@ -451,23 +452,44 @@ class Page {
                                 record_.faults().empty() ? "as the monitor found it"
                                                          : "the simulation’s ground truth")));
     }
-    Table table({"part", "#seen in", "#median", "#", "#rms", "#", "#largest"});
-    for (const PartErrors& part : errors_) {
+    std::vector<std::string> head = {"part", "#seen in", "#median", "#", "#rms", "#", "#largest"};
+    if (errors_.alignment) head.insert(head.end(), {"#aligned median", "#"});
+    Table table(head);
+    for (std::size_t i = 0; i < errors_.parts.size(); ++i) {
+      const PartErrors& part = errors_.parts[i];
       const std::string name =
           fmt::format("{}{}", part.part, part.part == report_.end_effector ? ", end effector" : "");
       if (part.count == 0) {
-        table.row({name, "0", "–", "–", "–", "–", "–"});
+        std::vector<std::string> row(head.size(), "–");
+        row[0] = name;
+        row[1] = "0";
+        table.row(row);
         continue;
       }
-      table.row({name, std::to_string(part.count), millimetres(part.position_median_m),
-                 degrees(part.rotation_median_rad), millimetres(part.position_rms_m),
-                 degrees(part.rotation_rms_rad), millimetres(part.position_max_m)});
+      std::vector<std::string> row = {
+          name, std::to_string(part.count), millimetres(part.position_median_m),
+          degrees(part.rotation_median_rad), millimetres(part.position_rms_m),
+          degrees(part.rotation_rms_rad), millimetres(part.position_max_m)};
+      if (errors_.alignment) {
+        const PartErrors& aligned = errors_.aligned_parts[i];
+        row.push_back(millimetres(aligned.position_median_m));
+        row.push_back(degrees(aligned.rotation_median_rad));
+      }
+      table.row(row);
     }
     html += table.html();
     return html + fmt::format(
                       "<p class=\"note\">The schema above on the held-out samples, each part "
-                      "relative to the root, against {}.{}</p></section>\n",
-                      judge(), as_seen());
+                      "relative to the root, against {}.{}{}</p></section>\n",
+                      judge(), as_seen(), alignment());
+  }
+
+  std::string alignment() {
+    if (!errors_.alignment) return "";
+    return fmt::format(
+        " Aligned: with the frames of the parts and the unit of length of the truth (scale {:.4f}), "
+        "which tags that are not where the rig says displace.",
+        errors_.alignment->scale);
   }
 
   std::string local_models() {
@@ -657,7 +679,7 @@ class Page {
   const RunRecord& record_;
   const std::optional<Body> body_;
   std::vector<ActionPoseSample> held_out_;
-  std::vector<PartErrors> errors_;
+  JudgedErrors errors_;
   std::vector<Plot> plots_;
 };
 

@@ -105,7 +105,12 @@ class Check {
     read_.insert("robot.yaml");
     if ((is_simulated() || has("robot_simulator.yaml") || has("robot.yaml")) && rig_.signals &&
         rig_.markers)
-      guarded([&] { Scene scene(folder_); });
+      guarded([&] {
+        const Scene scene(folder_);
+        if (!rig_.camera) return;
+        if (const auto problem = lens_problem(scene.robot().lens, rig_.camera->calibration))
+          add_problem("robot.yaml", "lens", *problem);
+      });
     if (rig_.camera) {
       // By whatever name camera.yaml tells.
       const path calibration = Yaml::load(folder_ / "camera.yaml").text("calibration");

@@ -138,6 +138,21 @@ ordered_json errors_json(int num_samples, const std::vector<PartErrors>& errors)
   return json;
 }
 
+ordered_json errors_json(int num_samples, const JudgedErrors& errors) {
+  ordered_json json = errors_json(num_samples, errors.parts);
+  json["scale"] = errors.alignment ? ordered_json(errors.alignment->scale) : nullptr;
+  for (std::size_t i = 0; i < errors.parts.size(); ++i) {
+    ordered_json& part = json["parts"][i];
+    const bool is_known = errors.alignment && errors.parts[i].count > 0;
+    const auto value = [&](double PartErrors::*x, double unit) {
+      return is_known ? ordered_json(errors.aligned_parts[i].*x / unit) : ordered_json();
+    };
+    part["aligned_position_median_m"] = value(&PartErrors::position_median_m, 1);
+    part["aligned_rotation_median_deg"] = value(&PartErrors::rotation_median_rad, kDegree);
+  }
+  return json;
+}
+
 ordered_json schema_json(const BodySchema& schema) {
   ordered_json json = structure_json(schema, {});
   json.erase("outliers");
@@ -206,19 +221,42 @@ std::string structure_text(const BodySchema& schema, std::optional<NoiseSource> 
   return text;
 }
 
+namespace {
+
+std::string errors_line(const PartErrors& part) {
+  if (part.count == 0)
+    return fmt::format("  {:>4}      0   never seen together with the root", part.part);
+  return fmt::format("  {:>4} {:>6} {:7.2f} mm {:5.2f}° {:7.2f} mm {:5.2f}° {:7.2f} mm", part.part,
+                     part.count, part.position_median_m * 1e3, part.rotation_median_rad / kDegree,
+                     part.position_rms_m * 1e3, part.rotation_rms_rad / kDegree,
+                     part.position_max_m * 1e3);
+}
+
+constexpr char kErrorsHead[] = "  part  count   median            rms               max";
+
+}  // namespace
+
 std::string errors_text(const std::vector<PartErrors>& errors) {
-  std::string text = "  part  count   median            rms               max\n";
-  for (const PartErrors& part : errors) {
-    if (part.count == 0) {
-      text += fmt::format("  {:>4}      0   never seen together with the root\n", part.part);
-      continue;
-    }
-    text += fmt::format("  {:>4} {:>6} {:7.2f} mm {:5.2f}° {:7.2f} mm {:5.2f}° {:7.2f} mm\n",
-                        part.part, part.count, part.position_median_m * 1e3,
-                        part.rotation_median_rad / kDegree, part.position_rms_m * 1e3,
-                        part.rotation_rms_rad / kDegree, part.position_max_m * 1e3);
-  }
+  std::string text = fmt::format("{}\n", kErrorsHead);
+  for (const PartErrors& part : errors) text += errors_line(part) + "\n";
   return text;
+}
+
+std::string errors_text(const JudgedErrors& errors) {
+  if (!errors.alignment) return errors_text(errors.parts);
+  std::string text = fmt::format("{}        aligned median\n", kErrorsHead);
+  for (std::size_t i = 0; i < errors.parts.size(); ++i) {
+    const PartErrors& aligned = errors.aligned_parts[i];
+    text += errors_line(errors.parts[i]);
+    if (aligned.count > 0) {
+      text += fmt::format(" {:7.2f} mm {:5.2f}°", aligned.position_median_m * 1e3,
+                          aligned.rotation_median_rad / kDegree);
+    }
+    text += "\n";
+  }
+  return text + fmt::format("(Aligned: with the parts' frames and the unit of length of the truth; "
+                            "scale {:.4f}.)\n",
+                            errors.alignment->scale);
 }
 
 }  // namespace bodyschema

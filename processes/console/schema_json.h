@@ -20,6 +20,8 @@ nlohmann::ordered_json structure_json(const BodySchema& schema,
 
 /// `predict --json`, and `held_out` in result.json.
 nlohmann::ordered_json errors_json(int num_samples, const std::vector<PartErrors>& errors);
+/// With `aligned_…` beside the errors, and `scale`; null without an alignment.
+nlohmann::ordered_json errors_json(int num_samples, const JudgedErrors& errors);
 
 /// `show --json`: structure_json without outliers, with every parameter of every edge.
 nlohmann::ordered_json schema_json(const BodySchema& schema);
@@ -29,5 +31,6 @@ nlohmann::ordered_json schema_json(const BodySchema& schema);
 /// With the noise that it was learned with, and where that is known from.
 std::string structure_text(const BodySchema& schema, std::optional<NoiseSource> source = {});
 std::string errors_text(const std::vector<PartErrors>& errors);
+std::string errors_text(const JudgedErrors& errors);
 
 }  // namespace bodyschema

@@ -257,7 +257,9 @@ nlohmann::ordered_json result_json(const RunWatch& watch, const Learned& learned
       {"accepted", learned.is_accepted},
       {"structure", structure_json(learned.schema, learned.outliers)},
       {"held_out",
-       errors_json(static_cast<int>(held_out.size()), evaluate(learned.schema, held_out))},
+       watch.has_truth()
+           ? errors_json(static_cast<int>(held_out.size()), judge(learned.schema, held_out, held_out))
+           : errors_json(static_cast<int>(held_out.size()), evaluate(learned.schema, held_out))},
       {"held_out_since", watch.body_since()},
       {"held_out_against", watch.has_truth() ? "noise-free simulator" : "observations"},
       {"visibility", nlohmann::ordered_json::object()}};
@@ -315,7 +317,8 @@ void report(const RunWatch& watch, const BestPicture& picture, const WatchArgume
                       ? fmt::format(", since the body last changed (sample {})", watch.body_since())
                       : "")
               << "\n"
-              << errors_text(evaluate(learned.schema, held_out));
+              << (watch.has_truth() ? errors_text(judge(learned.schema, held_out, held_out))
+                                    : errors_text(evaluate(learned.schema, held_out)));
     if (watch.has_truth() && watch.health() && watch.health()->worst_position_m >= 0) {
       std::cout << fmt::format(
           "(The line of progress and `status` go by what the camera sees, noise and bias of the "

@@ -11,16 +11,19 @@ using namespace bodyschema;
 
 int main(int argc, char** argv) {
   std::int64_t seed = 1;
+  bool is_ideal = false;
   std::vector<int> hidden;
   std::filesystem::path state_file;
   const auto add_options = [&](CLI::App& app) {
-    app.add_option("--seed", seed, "Seed of the image noise");
+    app.add_option("--seed", seed, "Seed of the image noise and the calibration errors");
+    app.add_flag("--ideal", is_ideal, "Without robot.yaml's calibration errors");
     app.add_option("--hide", hidden, "Body part whose markers are invisible; may be repeated");
     app.add_option("--state", state_file, "Saved at every rest, restored at the start");
   };
   const auto body = [&](Process& process) {
     RobotSimulatorConfig config = RobotSimulatorConfig::load(process.config_file());
     config.seed = seed;
+    config.is_ideal = is_ideal;
     config.hidden_parts = {hidden.begin(), hidden.end()};
     RobotSimulator simulator(config);
     if (!state_file.empty() && std::filesystem::exists(state_file)) simulator.restore(state_file);

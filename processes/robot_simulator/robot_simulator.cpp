@@ -11,6 +11,7 @@
 #include "common/bus/event_log.h"
 #include "common/config/yaml.h"
 #include "common/geometry/angle.h"
+#include "processes/robot_simulator/saved_status.h"
 
 namespace bodyschema {
 namespace {
@@ -30,36 +31,17 @@ constexpr double kSmoothStepTopSpeed = 15.0 / 8;
 
 std::int64_t microseconds(double seconds) { return std::llround(seconds * 1e6); }
 
+SceneDescription as_built(const RobotSimulatorConfig& config) {
+  return SceneDescription::load(config.rig_folder,
+                                config.is_ideal ? std::nullopt : std::optional(config.seed));
+}
+
 std::string name_of(const std::string& text) { return text.empty() ? "''" : text; }
 
 /// Who was served: what an id means.
 bool is_same_command(const motion_status_t& status, const std::string& source, std::int64_t epoch,
                      std::int64_t action_id) {
   return status.action_id == action_id && status.epoch == epoch && status.source == source;
-}
-
-std::string saved_status(const motion_status_t& status) {
-  std::ostringstream text;
-  text << "{source: " << yaml_quoted(status.source) << ", epoch: " << status.epoch
-       << ", action_id: " << status.action_id << ", kind: " << int{status.kind}
-       << ", purpose: " << int{status.purpose} << ", state: " << int{status.state}
-       << ", reason: " << yaml_quoted(status.reason)
-       << ", commanded: " << yaml_list(status.commanded) << "}";
-  return text.str();
-}
-
-motion_status_t load_status(const Yaml& yaml) {
-  motion_status_t status{};
-  status.source = yaml.text("source");
-  status.epoch = yaml.integer("epoch", 0);
-  status.action_id = yaml.integer("action_id", -1);
-  status.kind = static_cast<std::int8_t>(yaml.integer("kind", 0, action_command_t::KIND_RESUME));
-  status.purpose =
-      static_cast<std::int8_t>(yaml.integer("purpose", 0, action_command_t::PURPOSE_CONTROL));
-  status.state = static_cast<std::int8_t>(yaml.integer("state", 0, motion_status_t::STATE_HOLDING));
-  status.reason = yaml.text("reason");
-  set_array(status.num_signals, status.commanded, yaml.numbers("commanded"));
-  return status;
 }
 
 }  // namespace
@@ -84,8 +66,10 @@ RobotSimulator::Body::Body(SceneDescription description)
 
 RobotSimulator::RobotSimulator(RobotSimulatorConfig config)
     : config_(std::move(config)),
-      as_built_(Scene(config_.rig_folder).description()),
-      body_(as_built_) {
+      as_built_(as_built(config_)),
+      body_(as_built_),
+      play_(Eigen::VectorXd::Zero(as_built_.robot.joints.size())) {
+  const Scene whole(config_.rig_folder);  // its start pose must not collide
   for (const int part : config_.hidden_parts) {
     if (scene().plate_geoms(part).empty()) {
       throw std::invalid_argument("the rig has no part " + std::to_string(part) + " to hide");
@@ -137,6 +121,7 @@ std::optional<std::string> RobotSimulator::move(Body& body, const Eigen::VectorX
   const int ramp_steps = static_cast<int>(std::ceil(duration_s / step_s));
   const int quiet_needed = static_cast<int>(std::ceil(config_.settled_for_s / step_s));
   const int max_steps = ramp_steps + static_cast<int>(config_.settle_timeout_s / step_s);
+  const double compensated_share = 1 - body.scene.robot().calibration_error.droop_share;
   int quiet = 0;
   for (int step = 1; step <= max_steps; ++step) {
     const double s = smooth_step(static_cast<double>(step) / ramp_steps);
@@ -146,8 +131,8 @@ std::optional<std::string> RobotSimulator::move(Body& body, const Eigen::VectorX
     mj_step1(&model, &trial);
     if (const auto problem = body.scene.collision(trial)) return problem;
     // Gravity and Coriolis forces are known to a real arm's controller as well; this version of
-    // MuJoCo has no option for it.
-    mju_copy(trial.qfrc_applied, trial.qfrc_bias, model.nv);
+    // MuJoCo has no option for it. What is left of them lets the arm droop.
+    mju_scl(trial.qfrc_applied, trial.qfrc_bias, compensated_share, model.nv);
     mj_step2(&model, &trial);
 
     // Each joint's speed as a multiple of its own limit: rad/s and m/s do not add up.
@@ -284,6 +269,7 @@ RobotSimulator::Answer RobotSimulator::on_command(const action_command_t& comman
     body_ = *std::move(drifted);
     faults_ = faults;
   }
+  const Eigen::VectorXd before = joint_positions() + play_;
   std::swap(body_.data, body_.trial);
   // At rest the joints' positions are all there is: what a restart restores is then the same.
   Eigen::VectorXd positions = scene().joint_positions(*body_.data);
@@ -291,6 +277,7 @@ RobotSimulator::Answer RobotSimulator::on_command(const action_command_t& comman
     positions[i] = scene().robot().joints[i].stuck_at.value_or(positions[i]);
   }
   scene().set_joint_positions(*body_.data, positions);
+  follow(before);
   rest_since_utime_ = microseconds(body_.data->time - config_.settled_for_s);
   at_ = command.action;
   conclude(motion_status_t::STATE_SETTLED, "");
@@ -356,8 +343,21 @@ RobotSimulator::Answer RobotSimulator::on_tick(std::int64_t now_us) {
   return {{status_}, state_};
 }
 
+void RobotSimulator::follow(const Eigen::VectorXd& before) {
+  const Robot& robot = scene().robot();
+  const Eigen::VectorXd positions = joint_positions();
+  for (std::size_t i = 0; i < robot.joints.size(); ++i) {
+    if (robot.joints[i].kind != RobotJoint::Kind::kRevolute) continue;
+    play_[i] = play_after(positions[i], before[i], robot.calibration_error.backlash_rad);
+  }
+}
+
 void RobotSimulator::update_state(std::int64_t action_id) {
   state_ = scene().state(*body_.data);
+  if (!play_.isZero(0)) {
+    scene().set_joint_positions(*body_.trial, joint_positions() + play_);
+    state_.X_WG = scene().state(*body_.trial).X_WG;
+  }
   state_.action_id = action_id;
   state_.seed = config_.seed;
   for (const int part : config_.hidden_parts) {
@@ -377,10 +377,12 @@ void RobotSimulator::save(const std::filesystem::path& file) const {
   text << "# robot_simulator at rest. Joint positions in rad or m, times in us.\n"
        << "robot: " << yaml_quoted(as_built_.robot.name) << "\n"
        << "seed: " << config_.seed << "\n"
+       << "is_ideal: " << (config_.is_ideal ? "true" : "false") << "\n"
        << "time_s: " << yaml_list({body_.data->time}) << "\n"
        << "rest_since_us: " << rest_since_utime_ << "\n"
        << "stop_latched: " << (stop_latched_ ? "true" : "false") << "\n"
        << "joint_positions: " << yaml_list({positions.begin(), positions.end()}) << "\n"
+       << "play: " << yaml_list({play_.begin(), play_.end()}) << "\n"
        << "at: " << yaml_list(at_) << "\n"
        << "state_action_id: " << state_.action_id << "\n"
        << "last: " << saved_status(status_) << "\n"
@@ -421,11 +423,14 @@ void RobotSimulator::restore_from(const Yaml& yaml) {
   }
   const int num_joints = static_cast<int>(as_built_.robot.joints.size());
   const int num_signals = static_cast<int>(as_built_.signals.signals.size());
-  const std::int64_t seed = yaml.integer("seed");
+  RobotSimulatorConfig config = config_;
+  config.seed = yaml.integer("seed");
+  config.is_ideal = yaml.boolean("is_ideal");
   const double time_s = yaml.numbers("time_s", 1)[0];
   const std::int64_t rest_since = yaml.integer("rest_since_us", 0);
   const bool stop_latched = yaml.boolean("stop_latched");
   const std::vector<double> positions = yaml.numbers("joint_positions", num_joints);
+  const std::vector<double> play = yaml.numbers("play", num_joints);
   const std::vector<double> at = yaml.numbers("at", num_signals);
   const std::int64_t state_action_id = yaml.integer("state_action_id", -1);
   const motion_status_t last = load_status(yaml.section("last"));
@@ -453,14 +458,17 @@ void RobotSimulator::restore_from(const Yaml& yaml) {
 
   const Eigen::VectorXd joints = Eigen::Map<const Eigen::VectorXd>(positions.data(), num_joints);
   std::optional<Body> body;
+  SceneDescription built = as_built(config);
   try {
-    body.emplace(broken(as_built_, faults, joints, seed));
+    body.emplace(broken(built, faults, joints, config.seed));
   } catch (const std::exception& error) {
     throw yaml.error("faults", error.what());
   }
+  as_built_ = std::move(built);
   body_ = *std::move(body);
   faults_ = std::move(faults);
-  config_.seed = seed;
+  config_ = std::move(config);
+  play_ = Eigen::Map<const Eigen::VectorXd>(play.data(), num_joints);
   at_ = at;
   rest_since_utime_ = rest_since;
   stop_latched_ = stop_latched;

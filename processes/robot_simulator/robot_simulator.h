@@ -30,7 +30,9 @@ struct RobotSimulatorConfig {
   std::int64_t repeat_us = 1'000'000;  ///< of MOTION_STATUS and SIM_STATE
   /// Parts whose plates are invisible.
   std::set<int> hidden_parts;
-  std::int64_t seed = 1;  ///< of the image noise; goes into SIM_STATE
+  std::int64_t seed = 1;  ///< of image noise and calibration errors; goes into SIM_STATE
+  /// Without robot.yaml's calibration errors.
+  bool is_ideal = false;
 
   /// @throws ConfigError.
   static RobotSimulatorConfig load(const std::filesystem::path& file);
@@ -43,6 +45,9 @@ struct RobotSimulatorConfig {
 ///
 /// Before the first command it is idle at the start pose; when commands stop it stays where it is.
 /// The same seed, the same commands and faults give the same answers, bit by bit.
+///
+/// What is seen (SIM_STATE's X_WG) has the joints' backlash, which the direction of approach decides;
+/// the truth that is told (X_WB) is in the middle of it. Droop is in both.
 class RobotSimulator {
  public:
   /// What a command leads to, in the order in which it is to be sent.
@@ -74,13 +79,13 @@ class RobotSimulator {
   const sim_state_t& state() const { return state_; }
   /// The arm as it is now; another one after a fault.
   const Scene& scene() const { return body_.scene; }
-  /// True positions of the joints [rad or m]; for tests.
+  /// True positions of the joints in the middle of their backlash [rad or m]; for tests.
   Eigen::VectorXd joint_positions() const { return body_.scene.joint_positions(*body_.data); }
 
-  /// Everything that a restart needs: pose, time, seed, faults, the newest answers. Numbers are
-  /// exact. @throws std::runtime_error if the file cannot be written.
+  /// Everything that a restart needs: pose, play, time, seed, whether it is ideal, faults, the newest
+  /// answers. Numbers are exact. @throws std::runtime_error if the file cannot be written.
   void save(const std::filesystem::path& file) const;
-  /// Continues from a saved file; the seed becomes the saved one. @throws ConfigError, which says
+  /// Continues from a saved file; seed and is_ideal become the saved ones. @throws ConfigError, which says
   /// what to do, if it is damaged or not of this rig.
   void restore(const std::filesystem::path& file);
 
@@ -89,7 +94,7 @@ class RobotSimulator {
   struct Body {
     explicit Body(SceneDescription description);
     Scene scene;
-    MjDataPtr data;   // at rest
+    MjDataPtr data;   // at rest, each joint in the middle of its backlash
     MjDataPtr trial;  // scratch
   };
   struct FaultKey {
@@ -108,12 +113,15 @@ class RobotSimulator {
                             const std::string& reason) const;
   motion_status_t answer_again(const motion_status_t& served) const;
   void remember(const motion_status_t& status);
+  /// The joints' far side follows into its play.
+  void follow(const Eigen::VectorXd& before);
   void update_state(std::int64_t action_id);
   void restore_from(const Yaml& yaml);
 
   RobotSimulatorConfig config_;
   SceneDescription as_built_;
   Body body_;
+  Eigen::VectorXd play_;    // of each joint's far side, from the middle of its backlash [rad]
   std::vector<double> at_;  // the action that led here, or the start pose
   motion_status_t status_{};
   sim_state_t state_{};

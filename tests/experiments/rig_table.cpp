@@ -1,7 +1,7 @@
 // What the simulated rigs reach, from rendered images: structure right after N samples, over seeds,
 // and the held-out error of the end effector against the simulator's truth. Every fifth sample is
-// TEST, as in
-// ./run. Prints Markdown.
+// TEST, as in ./run. The ideal robot, and the robot with calibration errors: of the latter aligned
+// (evaluation.h; by the truth of all actions), as it is, and the scale. Prints Markdown.
 //
 //   rig_table config/arm2 config/arm4 config/arm7 --seeds 10 --at 20 30 60 100
 
@@ -11,6 +11,7 @@
 #include <cmath>
 #include <cstdio>
 #include <filesystem>
+#include <numeric>
 #include <optional>
 #include <string>
 #include <vector>
@@ -27,32 +28,28 @@ using namespace bodyschema;
 
 namespace {
 
+/// Of the seeds, the end effector's errors.
+struct Errors {
+  std::vector<double> position_m, rotation_rad;
+  void add(const std::vector<PartErrors>& parts, int end_effector) {
+    for (const PartErrors& part : parts) {
+      if (part.part != end_effector || part.count == 0) continue;
+      position_m.push_back(part.position_median_m);
+      rotation_rad.push_back(part.rotation_median_rad);
+    }
+  }
+};
+
 struct Row {
   int right = 0;
   int incomplete = 0;
-  std::vector<double> position_m, rotation_rad, seconds;
+  Errors errors, aligned;
   /// Squared Mahalanobis distance of the truth from the end effector's pose in the root, and from
   /// X_CR, by the schema's covariances: χ²₆ if they are true.
   std::vector<double> end_effector_d2, root_d2;
+  std::vector<double> scale, seconds;
   std::string objections;
 };
-
-double squared_distance(const Pose& estimate, const Matrix6d& covariance, const Pose& truth) {
-  const Vector6d error = log(estimate.inverse() * truth);
-  return error.dot(covariance.ldlt().solve(error));
-}
-
-/// "mean (95 % quantile)".
-std::string of_distances(std::vector<double> values) {
-  if (values.empty()) return "–";
-  std::sort(values.begin(), values.end());
-  double sum = 0;
-  for (const double value : values) sum += value;
-  char text[64];
-  std::snprintf(text, sizeof text, "%.1f (%.1f)", sum / static_cast<double>(values.size()),
-                values[values.size() * 95 / 100]);
-  return text;
-}
 
 double median(std::vector<double> values) {
   if (values.empty()) return NAN;
@@ -60,112 +57,186 @@ double median(std::vector<double> values) {
   return values[values.size() / 2];
 }
 
-}  // namespace
+double worst(const std::vector<double>& values) {
+  return values.empty() ? NAN : *std::max_element(values.begin(), values.end());
+}
 
-int main(int argc, char** argv) {
-  std::vector<std::string> rigs;
+/// "0.18 mm, 0.01° | 0.22 mm, 0.03°": median and worst seed.
+std::string text(const Errors& errors) {
+  char buffer[100];
+  std::snprintf(buffer, sizeof buffer, "%.2f mm, %.2f° | %.2f mm, %.2f°",
+                median(errors.position_m) * 1e3, median(errors.rotation_rad) / kDegree,
+                worst(errors.position_m) * 1e3, worst(errors.rotation_rad) / kDegree);
+  return buffer;
+}
+
+/// "5.3 (11.2)": mean and 95 % quantile.
+std::string text(std::vector<double> distances) {
+  if (distances.empty()) return "";
+  std::sort(distances.begin(), distances.end());
+  const double sum = std::accumulate(distances.begin(), distances.end(), 0.0);
+  char buffer[100];
+  std::snprintf(buffer, sizeof buffer, "%.1f (%.1f)", sum / static_cast<double>(distances.size()),
+                distances[distances.size() * 95 / 100]);
+  return buffer;
+}
+
+double squared_distance(const Pose& estimate, const Matrix6d& covariance, const Pose& truth) {
+  const Vector6d error = log(estimate.inverse() * truth);
+  return error.dot(covariance.ldlt().solve(error));
+}
+
+void add_distances(const BodySchema& schema, const std::vector<ActionPoseSample>& held_out,
+                   int end_effector, Row* row) {
+  const auto path = KinematicPath::between(schema, schema.root, end_effector);
+  if (!path || held_out.empty()) return;
+  for (const ActionPoseSample& exact : held_out)
+    row->end_effector_d2.push_back(squared_distance(
+        path->predict(exact.action), path->covariance(exact.action, Variance::kFirstOrder),
+        exact.find(schema.root)->X_CB.inverse() * exact.find(end_effector)->X_CB));
+  row->root_d2.push_back(squared_distance(schema.X_CR, schema.X_CR_covariance,
+                                          held_out.front().find(schema.root)->X_CB));
+}
+
+/// What a run shows up to some sample: what may be learned from, and true poses.
+struct Seen {
+  std::vector<ActionPoseSample> training;
+  std::vector<ActionPoseSample> truth;     ///< of all actions
+  std::vector<ActionPoseSample> held_out;  ///< of the TEST actions
+};
+
+void add(const test::RenderedRun::Step& step, bool is_test, Seen& seen) {
+  ActionPoseSample exact = step.sample;
+  exact.parts.clear();
+  for (const auto& [part, X_CB] : step.truth) {
+    PartObservation& observation = exact.parts.emplace_back();
+    observation.part = part;
+    observation.X_CB = X_CB;
+  }
+  if (is_test) {
+    seen.held_out.push_back(exact);
+  } else {
+    seen.training.push_back(step.sample);
+  }
+  seen.truth.push_back(std::move(exact));
+}
+
+struct Options {
   std::vector<int> at = {20, 30, 60, 100};
   std::vector<int> hidden;
   int num_seeds = 10;
   std::int64_t first_seed = 1;
+  std::optional<Choice> choice;
+  std::vector<double> systematic;  ///< [mm, deg] instead of noise.yaml's
+};
+
+/// One row for each of options.at.
+std::vector<Row> measured(const std::filesystem::path& rig, bool is_ideal, const Options& options) {
+  StructureLearnerConfig config = StructureLearnerConfig::load(rig / "structure_learner.yaml");
+  if (!options.systematic.empty())
+    config.options.systematic = {options.systematic[0] * 1e-3, options.systematic[1] * kDegree};
+  const int end_effector = load_signals(rig).end_effector_part;
+  const test::RigTruth truth(rig);
+  std::vector<int> observed = truth.parts();
+  for (const int part : options.hidden) std::erase(observed, part);
+  std::vector<Row> rows(options.at.size());
+  for (std::int64_t seed = options.first_seed; seed < options.first_seed + options.num_seeds;
+       ++seed) {
+    test::RenderedRun run(rig, seed, {options.hidden.begin(), options.hidden.end()}, options.choice,
+                          is_ideal);
+    Seen seen;
+    std::vector<std::vector<ActionPoseSample>> trained;
+    for (int n = 1; n <= options.at.back(); ++n) {
+      add(run.next(), n % 5 == 0, seen);
+      if (std::find(options.at.begin(), options.at.end(), n) != options.at.end())
+        trained.push_back(seen.training);
+    }
+    std::fprintf(stderr, "%s seed %d%s: %d actions refused\n", rig.filename().c_str(),
+                 static_cast<int>(seed), is_ideal ? ", ideal" : "", run.num_rejected());
+    for (std::size_t i = 0; i < rows.size(); ++i) {
+      Row& row = rows[i];
+      const auto start = std::chrono::steady_clock::now();
+      const BodySchema schema = learn(config.signals, trained[i], config.options).schema;
+      row.seconds.push_back(
+          std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count());
+      const std::string objection = truth.objection(schema, observed);
+      row.right += objection.empty();
+      row.incomplete += !schema.complete;
+      if (objection.empty())
+        add_distances(schema, seen.held_out, end_effector, &row);
+      else
+        row.objections += " seed " + std::to_string(seed) + ": " + objection + ";";
+      const JudgedErrors errors = judge(schema, seen.held_out, seen.truth);
+      row.errors.add(errors.parts, end_effector);
+      row.aligned.add(errors.aligned_parts, end_effector);
+      if (errors.alignment) row.scale.push_back(errors.alignment->scale);
+    }
+  }
+  return rows;
+}
+
+void print(const std::string& rig, const Options& options, const std::vector<Row>& ideal,
+           const std::vector<Row>& honest) {
+  for (std::size_t i = 0; i < options.at.size(); ++i) {
+    std::printf("| %s | %d |", rig.c_str(), options.at[i]);
+    if (ideal.empty()) {
+      std::printf(" | | | | | |");
+    } else {
+      std::printf(" %d of %d | %d | %s | %s | %s |", ideal[i].right, options.num_seeds,
+                  ideal[i].incomplete, text(ideal[i].errors).c_str(),
+                  text(ideal[i].end_effector_d2).c_str(), text(ideal[i].root_d2).c_str());
+    }
+    if (honest.empty()) {
+      std::printf(" | | | | | | | |");
+    } else {
+      const Row& row = honest[i];
+      std::printf(" %d of %d | %d | %s | %s | %.4f |", row.right, options.num_seeds, row.incomplete,
+                  text(row.aligned).c_str(), text(row.errors).c_str(), median(row.scale));
+    }
+    std::printf(" %.0f ms |\n", median((honest.empty() ? ideal : honest)[i].seconds) * 1e3);
+    for (const auto* rows : {&ideal, &honest}) {
+      if (rows->empty() || (*rows)[i].objections.empty()) continue;
+      std::fprintf(stderr, "%s at %d%s:%s\n", rig.c_str(), options.at[i],
+                   rows == &ideal ? ", ideal" : "", (*rows)[i].objections.c_str());
+    }
+    std::fflush(stdout);
+  }
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+  std::vector<std::string> rigs;
+  Options options;
   CLI::App app("Structure and accuracy of the simulated rigs, from rendered images");
   app.add_option("RIGS", rigs, "Rig folders")->required();
-  app.add_option("--at", at, "Numbers of samples, TEST samples included");
-  app.add_option("--seeds", num_seeds)->check(CLI::PositiveNumber);
-  app.add_option("--first-seed", first_seed);
-  app.add_option("--hide", hidden, "Parts that are hidden");
-  std::string choice;
+  app.add_option("--at", options.at, "Numbers of samples, TEST samples included");
+  app.add_option("--seeds", options.num_seeds)->check(CLI::PositiveNumber);
+  app.add_option("--first-seed", options.first_seed);
+  app.add_option("--hide", options.hidden, "Parts that are hidden");
+  std::string choice, only;
   app.add_option("--choice", choice, "How actions are found; else as motor_babbler.yaml says")
       ->check(CLI::IsMember({"active", "random"}));
+  app.add_option("--systematic", options.systematic,
+                 "Systematic error of a part that the learner is told [mm, deg], not noise.yaml's")
+      ->expected(2);
+  app.add_option("--only", only, "One of the two robots")
+      ->check(CLI::IsMember({"ideal", "honest"}));
   CLI11_PARSE(app, argc, argv);
-  std::sort(at.begin(), at.end());
-
-  std::optional<Choice> forced;
-  if (!choice.empty()) forced = choice == "active" ? Choice::kActive : Choice::kRandom;
+  std::sort(options.at.begin(), options.at.end());
+  if (!choice.empty()) options.choice = choice == "active" ? Choice::kActive : Choice::kRandom;
   std::printf(
-      "| rig | samples | right | incomplete | end effector, median | worst seed | d² end effector, "
-      "mean (95 %%) | d² X_CR | learning |\n"
-      "| --- | --- | --- | --- | --- | --- | --- | --- | --- |\n");
+      "| rig | samples | ideal: right | incomplete | end effector, median | worst seed | d² of its "
+      "pose in the root, mean (95 %%) | d² of X_CR | with "
+      "calibration errors: right | incomplete | aligned, median | worst seed | unaligned, median | "
+      "worst seed | scale | learning |\n"
+      "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | "
+      "--- |\n");
   for (const std::filesystem::path rig : rigs) {
-    const StructureLearnerConfig config =
-        StructureLearnerConfig::load(rig / "structure_learner.yaml");
-    const Signals signals = load_signals(rig);
-    const test::RigTruth truth(rig);
-    std::vector<int> observed = truth.parts();
-    for (const int part : hidden) std::erase(observed, part);
-    std::vector<Row> rows(at.size());
-    for (std::int64_t seed = first_seed; seed < first_seed + num_seeds; ++seed) {
-      test::RenderedRun run(rig, seed, {hidden.begin(), hidden.end()}, forced);
-      // Held out for judging: the TEST samples of the whole run, with their true poses.
-      std::vector<ActionPoseSample> training, held_out;
-      std::vector<std::vector<ActionPoseSample>> trained;
-      for (int n = 1; n <= at.back(); ++n) {
-        const auto step = run.next();
-        if (n % 5 == 0) {
-          ActionPoseSample exact = step.sample;
-          exact.parts.clear();
-          for (const auto& [part, X_CB] : step.truth) {
-            PartObservation observation;
-            observation.part = part;
-            observation.X_CB = X_CB;
-            exact.parts.push_back(observation);
-          }
-          held_out.push_back(std::move(exact));
-        } else {
-          training.push_back(step.sample);
-        }
-        if (std::find(at.begin(), at.end(), n) != at.end()) trained.push_back(training);
-      }
-      std::fprintf(stderr, "%s seed %d: %d actions refused\n", rig.filename().c_str(),
-                   static_cast<int>(seed), run.num_rejected());
-      for (std::size_t i = 0; i < at.size(); ++i) {
-        const auto start = std::chrono::steady_clock::now();
-        const BodySchema schema = learn(config.signals, trained[i], config.options).schema;
-        rows[i].seconds.push_back(
-            std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count());
-        const std::string objection = truth.objection(schema, observed);
-        rows[i].right += objection.empty();
-        rows[i].incomplete += !schema.complete;
-        if (!objection.empty())
-          rows[i].objections += " seed " + std::to_string(seed) + ": " + objection + ";";
-        if (objection.empty()) {
-          const auto path = KinematicPath::between(schema, schema.root, signals.end_effector_part);
-          for (const ActionPoseSample& exact : held_out) {
-            const PartObservation* root = exact.find(schema.root);
-            const PartObservation* end = exact.find(signals.end_effector_part);
-            if (!path || !root || !end) continue;
-            rows[i].end_effector_d2.push_back(squared_distance(
-                path->predict(exact.action), path->covariance(exact.action, Variance::kFirstOrder),
-                root->X_CB.inverse() * end->X_CB));
-          }
-          if (const PartObservation* root = held_out.front().find(schema.root))
-            rows[i].root_d2.push_back(
-                squared_distance(schema.X_CR, schema.X_CR_covariance, root->X_CB));
-        }
-        for (const PartErrors& part : evaluate(schema, held_out)) {
-          if (part.part != signals.end_effector_part || part.count == 0) continue;
-          rows[i].position_m.push_back(part.position_median_m);
-          rows[i].rotation_rad.push_back(part.rotation_median_rad);
-        }
-      }
-    }
-    for (std::size_t i = 0; i < at.size(); ++i) {
-      const Row& row = rows[i];
-      const auto worst = [](const std::vector<double>& v) {
-        return v.empty() ? NAN : *std::max_element(v.begin(), v.end());
-      };
-      std::printf(
-          "| %s | %d | %d of %d | %d | %.2f mm, %.2f° | %.2f mm, %.2f° | %s | %s | %.0f ms |\n",
-          rig.filename().c_str(), at[i], row.right, num_seeds, row.incomplete,
-          median(row.position_m) * 1e3, median(row.rotation_rad) / kDegree,
-          worst(row.position_m) * 1e3, worst(row.rotation_rad) / kDegree,
-          of_distances(row.end_effector_d2).c_str(), of_distances(row.root_d2).c_str(),
-          median(row.seconds) * 1e3);
-      if (!row.objections.empty())
-        std::fprintf(stderr, "%s at %d:%s\n", rig.filename().c_str(), at[i],
-                     row.objections.c_str());
-      std::fflush(stdout);
-    }
+    std::vector<Row> ideal, honest;
+    if (only != "honest") ideal = measured(rig, true, options);
+    if (only != "ideal") honest = measured(rig, false, options);
+    print(rig.filename(), options, ideal, honest);
   }
   return 0;
 }

@@ -118,6 +118,7 @@ int main(int argc, char** argv) {
 
   RobotSimulatorConfig config = RobotSimulatorConfig::load(rig / "robot_simulator.yaml");
   config.seed = seed;
+  config.is_ideal = true;
   RobotSimulator simulator(config);
   const Scene& scene = simulator.scene();
   SceneRenderer renderer(rig, effects);

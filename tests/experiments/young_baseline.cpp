@@ -3,6 +3,7 @@
 // is hidden in it in turn. Prints Markdown; fails if anything was told or what is held is worse.
 //
 //   young_baseline [config/arm2 config/arm4 config/arm7] --seeds 50 --samples 60
+//   young_baseline --honest --as-seen --seeds 1 --samples 2000      with calibration errors, false events
 
 #include <CLI/CLI.hpp>
 #include <algorithm>
@@ -32,10 +33,12 @@ namespace {
 /// Rendered, or as an earlier call left it in `folder`.
 /// @throws std::runtime_error if it is not there and must be.
 std::vector<sample_t> samples_of(const std::filesystem::path& rig, std::int64_t seed,
-                                 const std::set<int>& hidden, std::size_t num_samples,
+                                 const std::set<int>& hidden, bool is_ideal,
+                                 std::size_t num_samples,
                                  const std::filesystem::path& folder, bool must_be_there) {
   std::string name = rig.filename().string() + "_" + std::to_string(seed);
   for (const int part : hidden) name += "_" + std::to_string(part);
+  if (!is_ideal) name += "_honest";
   const auto file = folder / (name + ".lcmlog");
   std::vector<sample_t> samples;
   if (!folder.empty() && std::filesystem::exists(file)) samples = read_log(file, kSample);
@@ -47,7 +50,7 @@ std::vector<sample_t> samples_of(const std::filesystem::path& rig, std::int64_t 
     throw std::runtime_error(file.string() +
                              " is no run of so many samples; render it with --keep alone");
   samples.clear();
-  test::RenderedRun run(rig, seed, hidden);
+  test::RenderedRun run(rig, seed, hidden, std::nullopt, is_ideal);
   while (samples.size() < num_samples) samples.push_back(run.next().message);
   if (!folder.empty()) {
     LogAppender log(file, LogAppender::Mode::kOverwrite, LogAppender::Durability::kToKernel);
@@ -79,13 +82,15 @@ int main(int argc, char** argv) {
   std::size_t num_samples = 60;
   std::optional<int> hide;
   std::string folder;
-  bool must_be_there = false;
+  bool must_be_there = false, is_honest = false, is_as_seen = false;
   CLI::App app("A young baseline of a body that nothing happens to");
   app.add_option("RIGS", rigs, "Rig folders");
   app.add_option("--seeds", num_seeds)->check(CLI::PositiveNumber);
   app.add_option("--first-seed", first_seed);
   app.add_option("--samples", num_samples)->check(CLI::PositiveNumber);
   app.add_option("--hide", hide, "This part alone is hidden, in the images, as ./run --hide does");
+  app.add_flag("--honest", is_honest, "The robot with calibration errors");
+  app.add_flag("--as-seen", is_as_seen, "No part is hidden in turn");
   app.add_option("--keep", folder, "Rendered samples are kept here and used again")
       ->check(CLI::ExistingDirectory);
   app.add_flag("--recorded", must_be_there, "Nothing is rendered: all is in --keep's folder");
@@ -109,8 +114,10 @@ int main(int argc, char** argv) {
     std::map<Rightness, int> live, offline;
     for (std::int64_t seed = first_seed; seed < first_seed + num_seeds; ++seed) {
       const std::set<int> in_images = hide ? std::set<int>{*hide} : std::set<int>{};
-      const auto rendered = samples_of(rig, seed, in_images, num_samples, folder, must_be_there);
-      std::vector<int> hidden = truth.parts();
+      const auto rendered =
+          samples_of(rig, seed, in_images, !is_honest, num_samples, folder, must_be_there);
+      std::vector<int> hidden;
+      if (!is_as_seen) hidden = truth.parts();
       hidden.insert(hidden.begin(), -1);  // none
       if (hide) hidden = {*hide};
       for (const int part : hidden) {

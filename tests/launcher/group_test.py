@@ -54,6 +54,26 @@ class LearningEnds(GroupTest):
         self.assert_nothing_is_left(group)
 
 
+class CalibrationErrors(GroupTest):
+    def words_of_the_simulation(self, *arguments):
+        for name in ("robot_simulator", "camera"):
+            self.write_program(name, '#!/bin/sh\necho "$@"\nwhile :; do sleep 0.1; done\n')
+        run = self.start(*LEARN, *arguments)
+        logs = [(self.current / f"{name}.log").read_text() for name in ("robot_simulator", "camera")]
+        (self.current / "learned").touch()
+        self.assertEqual(self.wait_for_end(run), 0)
+        return logs
+
+    def test_are_there_unless_the_robot_is_to_be_ideal(self):
+        for log in self.words_of_the_simulation():
+            self.assertNotIn("--ideal", log)
+        for log in self.words_of_the_simulation("--ideal"):
+            self.assertIn("--ideal", log)
+
+    def test_are_not_those_of_a_replay(self):
+        self.assertIn("--ideal has no meaning with --replay", self.run_to_end("--replay", "log", "--ideal")[0])
+
+
 class OthersEndTheGroup(GroupTest):
     def test_a_run_says_at_once_that_it_was_stopped_from_elsewhere(self):
         run = self.start(*LEARN)

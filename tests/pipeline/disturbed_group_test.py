@@ -14,7 +14,7 @@ sys.path.insert(0, str(source))
 
 from launcher.group import Group, until  # noqa: E402
 
-LEARN = ("--rig", "arm2", "--seed", "3", "--samples", "30")
+LEARN = ("--rig", "arm2", "--ideal", "--seed", "3", "--samples", "30")
 FULL_S = 15  # processes say how they are, loggers write, watches look: all of it often
 
 # Two fragments of one message: the second lies 256 bytes before its begin, and LCM 1.x adds in 32 bits (upstream's PR 628).

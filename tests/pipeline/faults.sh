@@ -44,7 +44,7 @@ fault() { "$source/run" fault "$@" >>"$work/console.txt" 2>&1 || fail "fault $*"
 # The program itself, not the setpriv that became it: its command line begins with its path.
 kill_process() { kill -KILL "$("$source/run" exec pgrep -f "^$build/bin/$1 .*$work")" || fail "no $1 to kill"; }
 
-"$source/run" --rig arm7 --seed 1 --samples 100000 --keep >"$work/run.txt" 2>&1 &
+"$source/run" --rig arm7 --ideal --seed 1 --samples 100000 --keep >"$work/run.txt" 2>&1 &
 run=$!
 until_true "the arm was not learned" is_learned
 

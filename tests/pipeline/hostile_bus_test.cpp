@@ -78,8 +78,8 @@ class HostileBus : public testing::Test {
 };
 
 TEST_F(HostileBus, NothingThatIsNotTheRigsOwnChangesAByteOfWhatIsLearned) {
-  const std::string arguments = "--rig arm2 --seed 3 --samples 20";
-  ASSERT_EQ(run("foreign", "--rig arm7 --seed 5 --samples 10"), 0)
+  const std::string arguments = "--rig arm2 --ideal --seed 3 --samples 20";
+  ASSERT_EQ(run("foreign", "--rig arm7 --ideal --seed 5 --samples 10"), 0)
       << contents(folder_ / "foreign.err");
   ASSERT_EQ(run("peace", arguments), 0) << contents(folder_ / "peace.err");
 

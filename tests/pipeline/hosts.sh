@@ -79,7 +79,7 @@ done
 # Shares are started in any order; here those that only answer come last.
 share() { # HOST: its ./run, on its network
   BODYSCHEMA_LOGS=$folder/$1 exec nsenter -t "${holder[$1]}" -n \
-    "$source/run" --rig "$folder/rig" --host "$1" --seed 3 --samples "$samples"
+    "$source/run" --rig "$folder/rig" --host "$1" --ideal --seed 3 --samples "$samples"
 }
 for ((i = num_hosts - 1; i >= 0; --i)); do
   host=${hosts[$i]}

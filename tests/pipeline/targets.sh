@@ -15,7 +15,7 @@ fail() {
 }
 console() { "$source/run" exec bodyschema "$@" >>"$work/console.txt" 2>&1; }
 
-"$source/run" --rig arm2 --seed 3 --samples 30 --keep >"$work/run.txt" 2>&1 || fail "the group did not learn"
+"$source/run" --rig arm2 --ideal --seed 3 --samples 30 --keep >"$work/run.txt" 2>&1 || fail "the group did not learn"
 "$source/run" exec targets --rig-folder "$work/logs/current/config" --count 6 --limit-mm 8 >"$work/targets.txt" 2>&1 ||
   fail "the targets were not reached"
 console target --part 5 --position 9 9 9 --timeout 30 && fail "a target out of reach was reached"

@@ -215,9 +215,11 @@ TEST_F(RigCheckTest, WhatOneFileSaysOfAnotherMustBeThere) {
   EXPECT_EQ(problem_with("signals.yaml", "root_part: 1", "root_part: 5"),
             "signals.yaml:6: end_effector_part: is the root part, which never moves");
   EXPECT_EQ(problem_with("robot.yaml", "part: 5, link: arm", "part: 5, link: leg"),
-            "robot.yaml:55: parts[4].link: 'leg' is none of: base, turret, arm");
+            "robot.yaml:69: parts[4].link: 'leg' is none of: base, turret, arm");
+  EXPECT_EQ(problem_with("robot.yaml", "size_px: [1280,", "size_px: [640,"),
+            "robot.yaml:10: lens: size_px is 640×960 px, the calibration holds for 1280×960 px");
   EXPECT_EQ(problem_with("robot.yaml", "signal: q2", "signal: q9"),
-            "robot.yaml:41: links[2].joint.signal: 'q9' is none of: q1, q2");
+            "robot.yaml:55: links[2].joint.signal: 'q9' is none of: q1, q2");
   EXPECT_NE(
       problem_with("robot.yaml", "parent: turret", "parent: torso").find("'torso' is none of"),
       std::string::npos);

@@ -15,10 +15,11 @@ namespace bodyschema::test {
 namespace {
 
 RobotSimulatorConfig simulator_config(const std::filesystem::path& rig_folder, std::int64_t seed,
-                                      const std::set<int>& hidden_parts) {
+                                      const std::set<int>& hidden_parts, bool is_ideal) {
   RobotSimulatorConfig config = RobotSimulatorConfig::load(rig_folder / "robot_simulator.yaml");
   config.seed = seed;
   config.hidden_parts = hidden_parts;
+  config.is_ideal = is_ideal;
   return config;
 }
 
@@ -32,10 +33,11 @@ ImageEffects effects(const SimulationConfig& simulation) {
 
 struct RenderedRun::Implementation {
   Implementation(const std::filesystem::path& rig, std::int64_t seed,
-                 const std::set<int>& hidden_parts, std::optional<Choice> choice)
+                 const std::set<int>& hidden_parts, std::optional<Choice> choice, bool is_ideal)
       : camera_config(CameraConfig::load(rig / "camera.yaml")),
-        simulator(simulator_config(rig, seed, hidden_parts)),
-        renderer(rig, camera_config.calibration, effects(camera_config.simulation.value())),
+        simulator(simulator_config(rig, seed, hidden_parts, is_ideal)),
+        renderer(SceneDescription::load(rig, is_ideal ? std::nullopt : std::optional(seed)),
+                 effects(camera_config.simulation.value())),
         camera(camera_config, [this](const sim_state_t& state,
                                      int frame) { return renderer.render(state, frame); }),
         estimator(MarkerEstimatorConfig::load(rig / "marker_estimator.yaml"), load_markers(rig)),
@@ -94,8 +96,10 @@ struct RenderedRun::Implementation {
 };
 
 RenderedRun::RenderedRun(const std::filesystem::path& rig_folder, std::int64_t seed,
-                         const std::set<int>& hidden_parts, std::optional<Choice> choice)
-    : implementation_(std::make_unique<Implementation>(rig_folder, seed, hidden_parts, choice)) {}
+                         const std::set<int>& hidden_parts, std::optional<Choice> choice,
+                         bool is_ideal)
+    : implementation_(
+          std::make_unique<Implementation>(rig_folder, seed, hidden_parts, choice, is_ideal)) {}
 
 RenderedRun::~RenderedRun() = default;
 

@@ -19,20 +19,23 @@ namespace bodyschema::test {
 
 /// A rig's whole way from action to sample in one thread without a bus: simulator, rendered images,
 /// marker estimator, observer, and learner and monitor where actions are chosen by what they found,
-/// all with the rig's own configuration. The samples are those that ./run records with the same
-/// seed.
+/// all with the rig's own configuration. The samples are those that ./run --ideal (or, if not
+/// ideal, ./run) records with the same seed.
 class RenderedRun {
  public:
   struct Step {
     sample_t message;
     ActionPoseSample sample;
-    /// Noise-free pose X_CB of every part of the rig, seen or not.
+    /// Noise-free pose X_CB of every part of the rig, seen or not, its joints in the middle of their
+    /// backlash.
     std::map<int, Pose> truth;
   };
 
+  /// `is_ideal`: without robot.yaml's calibration errors.
   RenderedRun(const std::filesystem::path& rig_folder, std::int64_t seed,
               const std::set<int>& hidden_parts = {},
-              std::optional<Choice> choice = std::nullopt);  ///< else the rig's
+              std::optional<Choice> choice = std::nullopt,  ///< else the rig's
+              bool is_ideal = true);
   ~RenderedRun();
 
   /// The next sample. Actions that the simulator refuses are passed over.

@@ -163,6 +163,21 @@ TEST_P(RenderedRig, ShowsItsTagsToTheDetectorWithoutBias) {
   EXPECT_LT(result.bias_px.norm(), 0.1) << result.bias_px.transpose();
 }
 
+TEST_P(RenderedRig, ShowsTheTagsAndTheLensOfTheRobotWithCalibrationErrors) {
+  const SceneDescription drawn = SceneDescription::load(kConfig / GetParam(), 3);
+  const Scene scene(drawn);
+  SceneRenderer renderer(drawn, no_noise());
+  const sim_state_t state = scene.state_at(scene.robot().home, 3, 0);
+  const cv::Mat image = renderer.render(state, 0);
+  const Comparison result = compare(scene, renderer.calibration(), state, image, 60);
+  EXPECT_GE(result.num_tags, static_cast<int>(scene.markers().parts().size()) - 1);
+  EXPECT_LT(result.mean_px, 0.25);
+  EXPECT_LT(result.bias_px.norm(), 0.1) << result.bias_px.transpose();
+  // The same tags through the lens that the rig claims are elsewhere.
+  const CameraCalibration claimed = load_camera_calibration(kConfig / GetParam() / "camera_info.yaml");
+  EXPECT_GT(compare(scene, claimed, state, image, 60).mean_px, 2 * result.mean_px);
+}
+
 TEST(SceneRenderer, DistortsAsOpenCvProjects) {
   const Scene scene(kConfig / "arm2");
   using Model = CameraCalibration::Model;

@@ -160,22 +160,31 @@ TEST(Scene, RefusesPartsThatMarkersYamlDoesNotKnow) {
   EXPECT_THROW(Scene{rig}, ConfigError);
 }
 
+TEST(Scene, RefusesATagOnAPartThatIsNotThere) {
+  const auto rig = changed_rig("unknown_tag_part", "robot.yaml", "part: 1, placement",
+                               "part: 6, placement");
+  EXPECT_THROW(Scene{rig}, ConfigError);
+}
+
 TEST(Scene, RefusesAStartPoseOutsideTheSignalLimits) {
   const auto rig = changed_rig("bad_home", "robot.yaml", "home: [0, 0]", "home: [0, 99]");
   EXPECT_THROW(Scene{rig}, ConfigError);
 }
 
 TEST(Scene, TakesTheTagItselfForThePartWherePlacementIsNone) {
-  const auto rig = changed_rig("no_placement", "markers.yaml",
-                               "family: tag36h11\ntags:", "family: tag36h11\ntags:");
+  const auto rig = changed_rig("no_placement", "robot.yaml", "name: arm2", "name: arm2");
   // Leave one tag a part, without placement.
   const Scene scene(kConfig / "arm2");
-  std::ofstream markers(rig / "markers.yaml");
-  markers << "family: tag36h11\ntags:\n";
+  std::stringstream text;
+  text << std::ifstream(rig / "robot.yaml").rdbuf();
+  std::string content = text.str();
+  const std::size_t begin = content.find("tags:\n"), end = content.find("\n\n", begin);
+  std::string tags = "tags:";
   for (const int part : scene.markers().parts()) {
-    markers << "  - {id: " << part << ", size_m: 0.05, part: " << part << ", placement: none}\n";
+    const std::string id = std::to_string(part);
+    tags += "\n  - {id: " + id + ", size_m: 0.05, part: " + id + ", placement: none}";
   }
-  markers.close();
+  std::ofstream(rig / "robot.yaml") << content.replace(begin, end - begin, tags);
   const Scene changed(rig);
   const sim_state_t state = changed.state_at(Eigen::Vector2d(0, 0), 0, 0);
   const Pose X_WM = from_message(state.X_WG[changed.tag_geom(5)]) *

@@ -71,6 +71,88 @@ TEST(EvaluationTest, TheErrorDoesNotDependOnWhereTheCameraStands) {
   }
 }
 
+/// The samples as a rig tells them whose tags are not where it says, and whose metre is another one.
+std::vector<ActionPoseSample> displaced(std::vector<ActionPoseSample> samples, double scale,
+                                        test::Rng& rng) {
+  std::map<int, Pose> X_PB;
+  for (ActionPoseSample& sample : samples) {
+    const Pose X_RC = sample.find(1)->X_CB.inverse();
+    for (PartObservation& part : sample.parts) {
+      if (!X_PB.contains(part.part)) {
+        X_PB[part.part] = exp(Vector6d(
+            (Vector6d() << 0.001 * test::random_pose(rng, 1, 1).translation(),
+             0.01 * test::random_pose(rng, 1, 1).translation()).finished()));
+      }
+      Pose X_RP = X_RC * part.X_CB;
+      X_RP.translation() *= scale;
+      part.X_CB = X_RP * X_PB.at(part.part);
+    }
+  }
+  return samples;
+}
+
+TEST(EvaluationTest, AlignmentFindsTheFramesOfThePartsAndTheScale) {
+  test::Rng rng(53);
+  for (int run = 0; run < 10; ++run) {
+    const auto robot = test::random_tree({.num_hidden = 0}, rng);
+    const BodySchema schema = truth_as_schema(robot);
+    const auto truth = displaced(test::babble(robot, 15, {}, rng), 1.003, rng);
+    const JudgedErrors errors = judge(schema, truth, truth);
+    ASSERT_TRUE(errors.alignment.has_value());
+    EXPECT_NEAR(errors.alignment->scale, 1.003, 1e-4);
+    ASSERT_EQ(errors.parts.size(), errors.aligned_parts.size());
+    for (std::size_t i = 0; i < errors.parts.size(); ++i) {
+      EXPECT_GT(errors.parts[i].position_median_m, 1e-4);
+      EXPECT_LT(errors.aligned_parts[i].position_max_m, 1e-5);
+      EXPECT_LT(errors.aligned_parts[i].rotation_rms_rad, 1e-4);
+    }
+  }
+}
+
+TEST(EvaluationTest, AScaleThatNoSampleTellsStaysOne) {
+  // One joint, part 2 on its axis: any length may be the frame's.
+  BodySchema schema;
+  schema.parts = {1, 2};
+  schema.root = 1;
+  schema.signals = {{"q1", -1, 1}};
+  Edge edge;
+  edge.from = 1;
+  edge.to = 2;
+  edge.left.translation() = Eigen::Vector3d(0, 0, 0.5);
+  ScrewJoint joint;
+  joint.turn = 1;
+  edge.joints = {joint};
+  schema.edges = {edge};
+  test::Rng rng(55);
+  std::vector<ActionPoseSample> truth;
+  for (int i = 0; i < 20; ++i) {
+    ActionPoseSample& sample = truth.emplace_back();
+    sample.action = Eigen::VectorXd::Constant(1, -1 + i / 10.0);
+    sample.parts.resize(2);
+    sample.parts[0].part = 1;
+    sample.parts[1].part = 2;
+    sample.parts[1].X_CB = schema.predict_all(sample.action).at(2) *
+                           exp(Vector6d(0.002 * Vector6d::Unit(6, i % 6)));
+  }
+  const JudgedErrors errors = judge(schema, truth, truth);
+  ASSERT_TRUE(errors.alignment.has_value());
+  EXPECT_NEAR(errors.alignment->scale, 1, 0.01);
+  EXPECT_LT(errors.aligned_parts[0].position_rms_m, 0.002);
+}
+
+TEST(EvaluationTest, AlignmentHidesNoErrorOfTheKinematics) {
+  test::Rng rng(54);
+  const auto robot = test::chapter_robot("c", rng);
+  BodySchema schema = truth_as_schema(robot);
+  const auto truth = test::babble(robot, 40, {}, rng);
+  ASSERT_EQ(schema.edges.back().joints.size(), 1U);
+  schema.edges.back().joints[0].gain *= 1.1;
+  const JudgedErrors errors = judge(schema, truth, truth);
+  ASSERT_TRUE(errors.alignment.has_value());
+  EXPECT_GT(errors.aligned_parts.back().rotation_rms_rad,
+            0.3 * errors.parts.back().rotation_rms_rad);
+}
+
 /// Part 2 rigidly 1 m along x of part 1; part 3 is not connected.
 BodySchema by_hand() {
   BodySchema schema;
@@ -120,6 +202,15 @@ TEST(EvaluationTest, ARootThatIsNeverSeenLeavesNothingToCompare) {
   EXPECT_EQ(errors[0].count, 0);
   EXPECT_EQ(errors[0].position_rms_m, 0);
   EXPECT_TRUE(evaluate(by_hand(), {}).at(0).count == 0);
+}
+
+TEST(EvaluationTest, ARigidPairAndFewSamplesAreAlignedAsFarAsTheyTell) {
+  const JudgedErrors few = judge(by_hand(), {seen(0.004, 0.01)}, {seen(0.004, 0.01)});
+  EXPECT_FALSE(few.alignment.has_value());
+  EXPECT_TRUE(few.aligned_parts.empty());
+  const JudgedErrors rigid = judge(by_hand(), {seen(0.004, 0.01)}, std::vector(5, seen(0.004, 0.01)));
+  ASSERT_TRUE(rigid.alignment.has_value());
+  EXPECT_LT(rigid.aligned_parts.at(0).position_max_m, 1e-5);
 }
 
 TEST(EvaluationTest, ASchemaWithoutPartsHasNoErrors) {

@@ -124,7 +124,7 @@ TEST(SchemaJsonTest, PredictHasExactlyTheDocumentedKeysAndDegrees) {
   errors.position_max_m = 0.003;
   errors.rotation_median_rad = kDegree;
   errors.rotation_rms_rad = M_PI / 90;
-  const auto json = errors_json(11, {errors});
+  const auto json = errors_json(11, std::vector{errors});
   EXPECT_EQ(keys_of(json), (Keys{"samples", "parts"}));
   EXPECT_EQ(json["samples"], 11);
   ASSERT_EQ(json["parts"].size(), 1U);
@@ -137,19 +137,19 @@ TEST(SchemaJsonTest, PredictHasExactlyTheDocumentedKeysAndDegrees) {
   EXPECT_NEAR(part["rotation_median_deg"].get<double>(), 1, 1e-12);
   EXPECT_NEAR(part["rotation_rms_deg"].get<double>(), 2, 1e-12);
   EXPECT_NE(
-      errors_text({errors}).find("   3      7    1.00 mm  1.00°    2.00 mm  2.00°    3.00 mm"),
+      errors_text(std::vector{errors}).find("   3      7    1.00 mm  1.00°    2.00 mm  2.00°    3.00 mm"),
       std::string::npos)
-      << errors_text({errors});
+      << errors_text(std::vector{errors});
 }
 
 TEST(SchemaJsonTest, WhereNothingWasMeasuredStandsNoNumber) {
   PartErrors errors;
   errors.part = 3;
-  const auto json = errors_json(0, {errors});
+  const auto json = errors_json(0, std::vector{errors});
   EXPECT_EQ(json["parts"][0]["count"], 0);
   EXPECT_TRUE(json["parts"][0]["position_rms_m"].is_null());
   EXPECT_EQ(json.dump().find("nan"), std::string::npos);
-  EXPECT_NE(errors_text({errors}).find("never seen together with the root"), std::string::npos);
+  EXPECT_NE(errors_text(std::vector{errors}).find("never seen together with the root"), std::string::npos);
 }
 
 TEST(SchemaJsonTest, ShowHasEveryParameterOfEveryEdge) {

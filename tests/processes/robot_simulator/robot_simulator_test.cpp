@@ -23,6 +23,14 @@ using Status = motion_status_t;
 RobotSimulatorConfig config(const std::string& rig, std::int64_t seed = 1) {
   RobotSimulatorConfig result = RobotSimulatorConfig::load(kConfig / rig / "robot_simulator.yaml");
   result.seed = seed;
+  result.is_ideal = true;
+  return result;
+}
+
+/// With robot.yaml's calibration errors.
+RobotSimulatorConfig honest(const std::string& rig, std::int64_t seed = 1) {
+  RobotSimulatorConfig result = config(rig, seed);
+  result.is_ideal = false;
   return result;
 }
 
@@ -280,6 +288,68 @@ TEST(RobotSimulator, ContinuesFromItsSavedStateAsIfNothingHadHappened) {
     EXPECT_EQ(bytes(restarted.state()), bytes(lasting.state()));
   }
   EXPECT_EQ(restarted.state().action_id, 4);
+}
+
+TEST(RobotSimulator, ContinuesWithItsCalibrationErrorsAndItsPlay) {
+  const std::filesystem::path file = scratch_file("honest_state.yaml");
+  RobotSimulator lasting(honest("arm7", 42));
+  lasting.on_command(move_to(0, {0.3, -10, 0.4, -0.2, 15, 0.5, 60}));
+  lasting.save(file);
+  RobotSimulator restarted(config("arm7", 1));
+  restarted.restore(file);
+  std::filesystem::remove(file);
+  EXPECT_EQ(bytes(restarted.state()), bytes(lasting.state()));
+  // Within the play of the first joint: where it stands then is known from before alone.
+  action_command_t next = move_to(1, {0.3001, -10, 0.1, 0.2, -15, 0.1, 30});
+  next.utime = lasting.status().utime;
+  lasting.on_command(next);
+  restarted.on_command(next);
+  EXPECT_EQ(bytes(restarted.state()), bytes(lasting.state()));
+}
+
+/// What is seen of the last part is turned against its true pose by so much [deg].
+double seen_beside_truth_deg(const RobotSimulator& simulator) {
+  const sim_state_t& state = simulator.state();
+  const TagPlacement& tag = simulator.scene().markers().tags.back();
+  const Pose X_WM = from_message(state.X_WG[simulator.scene().tag_geom(tag.id)]);
+  const Pose X_WB = X_WM * Eigen::Translation3d(0, 0, -kSheetThickness_m / 2) * tag.X_BM->inverse();
+  return rotation_angle(X_WB.inverse() * from_message(state.X_WB.back())) / kDegree;
+}
+
+TEST(RobotSimulator, AJointStandsInItsBacklashWhereItCameFromAndTheTruthIsItsMiddle) {
+  RobotSimulator simulator(honest("arm2"));
+  EXPECT_LT(seen_beside_truth_deg(simulator), 1e-6);
+  const auto turret = [&](double command) {
+    static int id = 0;
+    EXPECT_TRUE(simulator.on_command(move_to(id++, {command, 0})).state.has_value());
+    const int plate = simulator.scene().tag_geom(simulator.scene().markers().tags[7].id);
+    return from_message(simulator.state().X_WG[plate]);
+  };
+  ASSERT_EQ(simulator.scene().markers().find(simulator.scene().markers().tags[7].id)->part, 3);
+  turret(-0.5);
+  const Pose from_below = turret(0);
+  const auto middle = from_message(simulator.state().X_WB[2]);
+  turret(0.5);
+  const Pose from_above = turret(0);
+  // The servo is at rest within 0.01°.
+  EXPECT_NEAR(rotation_angle(from_below.inverse() * from_above) / kDegree, 0.2, 0.01);
+  EXPECT_LT(rotation_angle(middle.inverse() * from_message(simulator.state().X_WB[2])) / kDegree,
+            0.01);
+  // Once more the same: nothing moves.
+  const Pose again = turret(0);
+  EXPECT_LT(rotation_angle(again.inverse() * from_above) / kDegree, 0.01);
+}
+
+TEST(RobotSimulator, DroopsWhereGravityPulls) {
+  RobotSimulator simulator(honest("arm2"));
+  RobotSimulator ideal(config("arm2"));
+  for (RobotSimulator* one : {&simulator, &ideal}) one->on_command(move_to(0, {0.5, 50}));
+  const Eigen::VectorXd droop = simulator.joint_positions() - ideal.joint_positions();
+  // j1 is upright, j2 level.
+  EXPECT_LT(std::abs(droop[0]), 1e-6);
+  EXPECT_GT(std::abs(droop[1]), 0.005 * kDegree);
+  EXPECT_LT(std::abs(droop[1]), 0.5 * kDegree);
+  EXPECT_LT(simulator.state().X_WB[4].position_m[2], ideal.state().X_WB[4].position_m[2]);
 }
 
 TEST(RobotSimulator, DoesNotCarryOutWhatWasSentBeforeItsRestart) {
