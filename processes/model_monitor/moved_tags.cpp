@@ -1,6 +1,7 @@
 #include "processes/model_monitor/moved_tags.h"
 
 #include <algorithm>
+#include <cmath>
 
 #include "processes/model_monitor/reading_distance.h"
 
@@ -10,6 +11,11 @@ namespace {
 constexpr double kSame = ReadingDistance::kSame, kOther = ReadingDistance::kOther;
 /// Of the tag in the wrong place, and of others in the right one: an outlier repeats itself rarely.
 constexpr int kSightings = 3;
+/// Log-likelihood ratios of a tag having moved to the body being wrong, of a sighting by another
+/// tag in its place and elsewhere: it is elsewhere as often as there are outliers (3 %,
+/// tests/experiments/README.md), or half of the time (chosen: a body that is wrong shows by some
+/// actions only).
+const double kInPlace = std::log(0.97 / 0.5), kElsewhere = std::log(0.03 / 0.5);
 /// Sightings of a part in a row, all by tags set aside, after which they are what there is of it.
 constexpr int kAlone = 30;
 
@@ -96,7 +102,7 @@ std::vector<MovedTags::Finding> MovedTags::look(const ActionPoseSample& sample,
         if (track == tracks_.end()) continue;
         const bool is_seen = std::find(seen.tags.begin(), seen.tags.end(), tag) != seen.tags.end();
         if (!is_seen) {
-          ++track->second.num_others;
+          track->second.others += kInPlace;
         } else if (!track->second.has_moved) {
           tracks_.erase(track);
         } else if (++track->second.num_alike == kSightings) {
@@ -117,16 +123,26 @@ std::vector<MovedTags::Finding> MovedTags::look(const ActionPoseSample& sample,
         track.X_CB = seen.X_CB;
       } else if (track.num_alike == 0 || !(is_alike_on_part || is_alike_in_room)) {
         track = {sample.sample_index, 1, 0, seen.X_CB, X_BS};
-      } else if (++track.num_alike >= kSightings && track.num_others >= kSightings) {
+        count_elsewhere(seen);
+      } else if (++track.num_alike >= kSightings && track.others > (kSightings - 0.5) * kInPlace) {
         findings.push_back(
             {seen.part, seen.tags.front(), track.since, track.num_alike, is_alike_on_part});
         track.has_moved = true;
         track.is_on_part = is_alike_on_part;
         track.num_alike = 0;
       }
+    } else if (far_off > kOther && !affects(seen)) {
+      count_elsewhere(seen);
     }
   }
   return findings;
+}
+
+void MovedTags::count_elsewhere(const PartObservation& seen) {
+  for (const int tag : of_[seen.part])
+    if (const auto track = tracks_.find(tag);
+        track != tracks_.end() && seen.tags != std::vector<int>{tag})
+      track->second.others += kElsewhere;
 }
 
 }  // namespace bodyschema
