@@ -48,7 +48,7 @@ void MovedTags::look_back(const ActionPoseSample& sample, const BodySchema& sche
     });
   });
   // They were not back by then, whatever the noise is now thought to be, and no other had moved.
-  for (const Finding& finding : look(after, schema, noise, true))
+  for (const Finding& finding : look(after, schema, schema, noise, true))
     if (finding.is_back)
       tracks_[finding.tag] = {
           .num_alike = kSightings - 1, .has_moved = true, .is_on_part = finding.is_on_part};
@@ -61,22 +61,31 @@ void MovedTags::begin_anew() {
 
 std::vector<MovedTags::Finding> MovedTags::look(const ActionPoseSample& sample,
                                                 const BodySchema& schema,
+                                                const BodySchema& standing,
                                                 const MarkerNoise& noise) {
-  return look(sample, schema, noise, false);
+  return look(sample, schema, standing, noise, false);
 }
 
 std::vector<MovedTags::Finding> MovedTags::look(const ActionPoseSample& sample,
-                                                const BodySchema& schema, const MarkerNoise& noise,
-                                                bool is_past) {
+                                                const BodySchema& schema,
+                                                const BodySchema& standing,
+                                                const MarkerNoise& noise, bool is_past) {
   std::vector<Finding> findings;
   const auto X_RB = schema.predict_all(sample.action);
+  const auto standing_X_RB = standing.predict_all(sample.action);
   for (const PartObservation& seen : sample.parts) {
     const auto predicted = X_RB.find(seen.part);
     if (seen.tags.empty() || predicted == X_RB.end()) continue;
     const Pose X_CB = schema.X_CR * predicted->second;
     const ReadingDistance distance(covariance_of(seen, noise));
-    double far_off = distance(X_CB, seen.X_CB);
-    if (seen.X_CB_other) far_off = std::min(far_off, distance(X_CB, *seen.X_CB_other));
+    const auto from = [&](const Pose& X) {
+      const double d2 = distance(X, seen.X_CB);
+      return seen.X_CB_other ? std::min(d2, distance(X, *seen.X_CB_other)) : d2;
+    };
+    const double far_off = from(X_CB);
+    const auto by_standing = standing_X_RB.find(seen.part);
+    const bool is_explained =
+        by_standing != standing_X_RB.end() && from(standing.X_CR * by_standing->second) < kSame;
 
     if (int& num = num_affected_[seen.part]; !affects(seen)) {
       num = 0;
@@ -103,6 +112,7 @@ std::vector<MovedTags::Finding> MovedTags::look(const ActionPoseSample& sample,
         const bool is_seen = std::find(seen.tags.begin(), seen.tags.end(), tag) != seen.tags.end();
         if (!is_seen) {
           track->second.others += kInPlace;
+          track->second.num_unexplained += !is_explained;
         } else if (!track->second.has_moved) {
           tracks_.erase(track);
         } else if (++track->second.num_alike == kSightings) {
@@ -122,9 +132,14 @@ std::vector<MovedTags::Finding> MovedTags::look(const ActionPoseSample& sample,
         track.X_BS = X_BS;
         track.X_CB = seen.X_CB;
       } else if (track.num_alike == 0 || !(is_alike_on_part || is_alike_in_room)) {
-        track = {sample.sample_index, 1, 0, seen.X_CB, X_BS};
+        track = {sample.sample_index, 1, 0, !is_explained, seen.X_CB, X_BS};
         count_elsewhere(seen);
-      } else if (++track.num_alike >= kSightings && track.others > (kSightings - 0.5) * kInPlace) {
+      } else {
+        ++track.num_alike;
+        track.num_unexplained += !is_explained;
+        if (std::min(track.num_alike, track.num_unexplained) < kSightings ||
+            track.others < (kSightings - 0.5) * kInPlace)
+          continue;
         findings.push_back(
             {seen.part, seen.tags.front(), track.since, track.num_alike, is_alike_on_part});
         track.has_moved = true;

@@ -28,7 +28,7 @@ class MovedTagsTest : public testing::Test {
     return sample;
   }
   std::vector<MovedTags::Finding> look(MovedTags* tags, const ActionPoseSample& sample) const {
-    return tags->look(sample, schema_, {});
+    return tags->look(sample, schema_, schema_, {});
   }
 
   const BodySchema schema_ =
@@ -92,6 +92,21 @@ TEST_F(MovedTagsTest, NoneHasMovedWhereOthersAreElsewhereToo) {
       }
       EXPECT_TRUE(look(&tags, sample).empty()) << n;
     }
+  }
+}
+
+TEST_F(MovedTagsTest, NoneHasMovedWhereTheBodyAsItStandsExplainsIt) {
+  BodySchema standing = schema_;
+  for (Edge& edge : standing.edges)
+    if (edge.to == kPart)
+      for (ScrewJoint& joint : edge.joints) joint.gain *= 0.5;
+  MovedTags tags({});
+  for (int n = 0; n < 40; ++n) {
+    ActionPoseSample sample = seen(n, n % 2 ? kTag : kOther, true);
+    // kTag is seen at one action alone.
+    sample.action.setConstant(n % 2 ? 0.8 : 0);
+    sample.parts[0].X_CB = standing.X_CR * standing.predict_all(sample.action).at(kPart);
+    EXPECT_TRUE(tags.look(sample, schema_, standing, {}).empty()) << n;
   }
 }
 
