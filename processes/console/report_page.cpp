@@ -434,6 +434,11 @@ class Page {
     const auto all = record_.watch().held_out();
     const std::vector<BodyMark> marks = body_marks(record_);
     const auto versions = version_errors(record_.versions(), all, marks, report_.end_effector);
+    const bool has_drifted =
+        std::any_of(record_.faults().begin(), record_.faults().end(), [](const auto& change) {
+          return std::any_of(change.faults.begin(), change.faults.end(),
+                             [](const std::string& fault) { return fault.starts_with("drift"); });
+        });
     if (const auto curve = version_plot(versions, marks)) {
       html += figure(
           plot(*curve),
@@ -448,9 +453,13 @@ class Page {
                   ? ""
                   : fmt::format("Where the body became another (dashed; {}) a new curve begins: "
                                 "every version is judged on samples of the body that it was for, "
-                                "the first point is the schema that stood before. ",
+                                "the first point is the schema that stood before. {}",
                                 record_.faults().empty() ? "as the monitor found it"
-                                                         : "the simulation’s ground truth")));
+                                                         : "the simulation’s ground truth",
+                                has_drifted ? "While a link drifts, every sample is of another "
+                                              "body: the error shows how far it drifts, not how "
+                                              "well it is followed. "
+                                            : "")));
     }
     std::vector<std::string> head = {"part", "#seen in", "#median", "#", "#rms", "#", "#largest"};
     if (errors_.alignment) head.insert(head.end(), {"#aligned median", "#"});

@@ -416,8 +416,10 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
                                log_likelihood(schema_, noise_, earlier) - 4 * options_.acceptance;
   if (replacements_.empty() || since - since_ > kTogether || fitted.everywhere || ends ||
       began_later) {
-    if (trouble_ && since_ >= trouble_->since)
+    if (trouble_ && since_ >= trouble_->since && !replacements_.empty()) {
       trouble_->adopted.insert(trouble_->adopted.end(), replacements_.begin(), replacements_.end());
+      trouble_->stages.push_back({before_, since_});
+    }
     before_ = schema_;
     replacements_.clear();
     maturing_.clear();
@@ -642,7 +644,7 @@ void Adaptation::set_aside(int tag, std::int64_t since, std::int64_t found) {
 
 void Adaptation::watch_tags(ActionPoseSample* sample, std::vector<AdaptationEvent>* events) {
   if (num_samples_ >= options_.calibration_samples) {
-    for (const MovedTags::Finding& finding : tags_.look(*sample, trusted_, noise_)) {
+    for (const MovedTags::Finding& finding : tags_.look(*sample, trusted_, schema_, noise_)) {
       using Kind = AdaptationEvent::Kind;
       const Kind kind = finding.is_back ? (finding.is_on_part ? Kind::kRestored : Kind::kRecovered)
                                         : (finding.is_on_part ? Kind::kCandidate : Kind::kMissing);
@@ -794,13 +796,22 @@ void Adaptation::begin_drift(int part, std::int64_t since, std::int64_t sample_i
 }
 
 double Adaptation::standing_evidence(const std::vector<const ActionPoseSample*>& samples) const {
-  if (replacements_.empty()) return log_likelihood(schema_, noise_, samples);
-  const auto changed = std::find_if(samples.begin(), samples.end(), [this](const auto* sample) {
-    return sample->sample_index >= since_;
-  });
-  double evidence = log_likelihood(before_, noise_, {samples.begin(), changed}) +
-                    log_likelihood(schema_, noise_, {changed, samples.end()});
+  double evidence = 0;
+  auto begin = samples.begin();
+  const auto judge = [&](const BodySchema& schema, std::int64_t until) {
+    const auto end = std::find_if(begin, samples.end(), [until](const auto* sample) {
+      return sample->sample_index >= until;
+    });
+    evidence += log_likelihood(schema, noise_, {begin, end});
+    begin = end;
+  };
+  if (trouble_) {
+    for (const Trouble::Stage& stage : trouble_->stages) judge(stage.schema, stage.until);
+    for (const Replacement& r : trouble_->adopted) evidence += r.fitted.log_prior;
+  }
+  if (!replacements_.empty()) judge(before_, since_);
   for (const Replacement& r : replacements_) evidence += r.fitted.log_prior;
+  judge(schema_, std::numeric_limits<std::int64_t>::max());
   return evidence;
 }
 
@@ -813,6 +824,7 @@ void Adaptation::try_drift(std::int64_t sample_index, std::vector<AdaptationEven
   // When it began is no longer known.
   if (samples.empty() || samples.front()->sample_index > trouble_->since) {
     trouble_->adopted.clear();
+    trouble_->stages.clear();
     return;
   }
   std::set<int> parts;

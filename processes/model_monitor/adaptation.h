@@ -141,8 +141,8 @@ class Adaptation {
   void calibrate();
   /// What changes all the time looks like one step after another: an edge in trouble may drift.
   void try_drift(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
-  /// Evidence of what stands for these samples: of the present replacements, and before them of
-  /// what was there.
+  /// Evidence of what stands for these samples: each under what stood then, with the priors of all
+  /// that was adopted since the trouble began.
   double standing_evidence(const std::vector<const ActionPoseSample*>& samples) const;
   void begin_drift(int part, std::int64_t since, std::int64_t sample_index,
                    std::vector<AdaptationEvent>* events);
@@ -233,6 +233,11 @@ class Adaptation {
     std::map<int, Edge> edges;         ///< by the part that they lead to
     BodySchema before;                 ///< what stood when it began
     std::vector<Replacement> adopted;  ///< since, and taken as they are
+    struct Stage {
+      BodySchema schema;
+      std::int64_t until = 0;
+    };
+    std::vector<Stage> stages;  ///< what stood, one after the other, until before_ did
   };
   std::optional<Trouble> trouble_;
   BodySchema before_;                      ///< what stood before the present replacements

@@ -1,6 +1,7 @@
 #include "processes/model_monitor/moved_tags.h"
 
 #include <algorithm>
+#include <cmath>
 
 #include "processes/model_monitor/reading_distance.h"
 
@@ -10,6 +11,11 @@ namespace {
 constexpr double kSame = ReadingDistance::kSame, kOther = ReadingDistance::kOther;
 /// Of the tag in the wrong place, and of others in the right one: an outlier repeats itself rarely.
 constexpr int kSightings = 3;
+/// Log-likelihood ratios of a tag having moved to the body being wrong, of a sighting by another
+/// tag in its place and elsewhere: it is elsewhere as often as there are outliers (3 %,
+/// tests/experiments/README.md), or half of the time (chosen: a body that is wrong shows by some
+/// actions only).
+const double kInPlace = std::log(0.97 / 0.5), kElsewhere = std::log(0.03 / 0.5);
 /// Sightings of a part in a row, all by tags set aside, after which they are what there is of it.
 constexpr int kAlone = 30;
 
@@ -42,7 +48,7 @@ void MovedTags::look_back(const ActionPoseSample& sample, const BodySchema& sche
     });
   });
   // They were not back by then, whatever the noise is now thought to be, and no other had moved.
-  for (const Finding& finding : look(after, schema, noise, true))
+  for (const Finding& finding : look(after, schema, schema, noise, true))
     if (finding.is_back)
       tracks_[finding.tag] = {
           .num_alike = kSightings - 1, .has_moved = true, .is_on_part = finding.is_on_part};
@@ -55,22 +61,31 @@ void MovedTags::begin_anew() {
 
 std::vector<MovedTags::Finding> MovedTags::look(const ActionPoseSample& sample,
                                                 const BodySchema& schema,
+                                                const BodySchema& standing,
                                                 const MeasurementModel& noise) {
-  return look(sample, schema, noise, false);
+  return look(sample, schema, standing, noise, false);
 }
 
 std::vector<MovedTags::Finding> MovedTags::look(const ActionPoseSample& sample,
                                                 const BodySchema& schema,
+                                                const BodySchema& standing,
                                                 const MeasurementModel& noise, bool is_past) {
   std::vector<Finding> findings;
   const auto X_RB = schema.predict_all(sample.action);
+  const auto standing_X_RB = standing.predict_all(sample.action);
   for (const PartObservation& seen : sample.parts) {
     const auto predicted = X_RB.find(seen.part);
     if (seen.tags.empty() || predicted == X_RB.end()) continue;
     const Pose X_CB = schema.X_CR * predicted->second;
     const ReadingDistance distance(noise.covariance(seen));
-    double far_off = distance(X_CB, seen.X_CB);
-    if (seen.X_CB_other) far_off = std::min(far_off, distance(X_CB, *seen.X_CB_other));
+    const auto from = [&](const Pose& X) {
+      const double d2 = distance(X, seen.X_CB);
+      return seen.X_CB_other ? std::min(d2, distance(X, *seen.X_CB_other)) : d2;
+    };
+    const double far_off = from(X_CB);
+    const auto by_standing = standing_X_RB.find(seen.part);
+    const bool is_explained =
+        by_standing != standing_X_RB.end() && from(standing.X_CR * by_standing->second) < kSame;
 
     if (int& num = num_affected_[seen.part]; !affects(seen)) {
       num = 0;
@@ -96,7 +111,8 @@ std::vector<MovedTags::Finding> MovedTags::look(const ActionPoseSample& sample,
         if (track == tracks_.end()) continue;
         const bool is_seen = std::find(seen.tags.begin(), seen.tags.end(), tag) != seen.tags.end();
         if (!is_seen) {
-          ++track->second.num_others;
+          track->second.others += kInPlace;
+          track->second.num_unexplained += !is_explained;
         } else if (!track->second.has_moved) {
           tracks_.erase(track);
         } else if (++track->second.num_alike == kSightings) {
@@ -116,17 +132,32 @@ std::vector<MovedTags::Finding> MovedTags::look(const ActionPoseSample& sample,
         track.X_BS = X_BS;
         track.X_CB = seen.X_CB;
       } else if (track.num_alike == 0 || !(is_alike_on_part || is_alike_in_room)) {
-        track = {sample.sample_index, 1, 0, seen.X_CB, X_BS};
-      } else if (++track.num_alike >= kSightings && track.num_others >= kSightings) {
+        track = {sample.sample_index, 1, 0, !is_explained, seen.X_CB, X_BS};
+        count_elsewhere(seen);
+      } else {
+        ++track.num_alike;
+        track.num_unexplained += !is_explained;
+        if (std::min(track.num_alike, track.num_unexplained) < kSightings ||
+            track.others < (kSightings - 0.5) * kInPlace)
+          continue;
         findings.push_back(
             {seen.part, seen.tags.front(), track.since, track.num_alike, is_alike_on_part});
         track.has_moved = true;
         track.is_on_part = is_alike_on_part;
         track.num_alike = 0;
       }
+    } else if (far_off > kOther && !affects(seen)) {
+      count_elsewhere(seen);
     }
   }
   return findings;
+}
+
+void MovedTags::count_elsewhere(const PartObservation& seen) {
+  for (const int tag : of_[seen.part])
+    if (const auto track = tracks_.find(tag);
+        track != tracks_.end() && seen.tags != std::vector<int>{tag})
+      track->second.others += kElsewhere;
 }
 
 }  // namespace bodyschema

@@ -14,9 +14,11 @@ namespace bodyschema {
 /// stayed. The part is then seen now here and now there, by which of them the camera sees; no
 /// change of the body explains that. A tag has moved once it was seen in one wrong place again and
 /// again (on the part, or lying in the room), never in the right one, and other tags of the part
-/// in between in theirs. Once it is seen there again, it is back; so with a tag that was lost,
-/// which may have been put elsewhere. Where a babbling arm shows a part by such tags alone for
-/// long, they are what there is of it: they are taken for back.
+/// in between in theirs. Where these, too, are now here and now there, or a change of the body that
+/// was found meanwhile explains it all, the body is wrong. Once it
+/// is seen there again, it is back; so with a tag that was lost, which may have been put elsewhere.
+/// Where a babbling arm shows a part by such tags alone for long, they are what there is of it:
+/// they are taken for back.
 class MovedTags {
  public:
   /// `moved`: those known already.
@@ -30,9 +32,9 @@ class MovedTags {
     bool is_on_part = false;  ///< moved on it; else it was lost, and maybe lies in sight
     bool is_back = false;     ///< it is where it was, or all that there is
   };
-  /// `schema`: the body before anything was wrong.
+  /// `schema`: the body before anything was wrong; `standing`: as it is now thought to be.
   std::vector<Finding> look(const ActionPoseSample& sample, const BodySchema& schema,
-                            const MeasurementModel& noise);
+                            const BodySchema& standing, const MeasurementModel& noise);
   /// Samples of the past: what they say of those known.
   void look_back(const ActionPoseSample& sample, const BodySchema& schema,
                  const MeasurementModel& noise);
@@ -48,14 +50,19 @@ class MovedTags {
   struct Track {
     std::int64_t since = 0;  ///< of the present run of sightings alike
     int num_alike = 0;       ///< in the wrong place or, once moved, in the right one
-    int num_others = 0;      ///< sightings of the part by its other tags, in the right place
+    /// Of the part's sightings since by other tags: log-likelihood ratio of this tag having moved
+    /// to the body being wrong there [nats].
+    double others = 0;
+    int num_unexplained = 0;  ///< sightings since that the body as it then stood did not explain
     /// The first of that run: the part as seen; and in its own frame.
     Pose X_CB = Pose::Identity(), X_BS = Pose::Identity();
     bool has_moved = false;
     bool is_on_part = false;  ///< and moves with it
   };
   std::vector<Finding> look(const ActionPoseSample& sample, const BodySchema& schema,
-                            const MeasurementModel& noise, bool is_past);
+                            const BodySchema& standing, const MeasurementModel& noise, bool is_past);
+  /// The part was seen elsewhere, not by one of its moved tags.
+  void count_elsewhere(const PartObservation& seen);
 
   std::map<int, Track> tracks_;         ///< by tag
   std::map<int, std::vector<int>> of_;  ///< the tags of every part that were seen

@@ -7,6 +7,7 @@
 #include <tuple>
 
 #include "common/statistics/median.h"
+#include "common/statistics/student_t.h"
 
 namespace bodyschema {
 namespace {
@@ -50,7 +51,7 @@ Start judged(const LocalModel& model, const PairData& pair, const NormalizedActi
     const int t = static_cast<int>(static_cast<long>(k) * pair.size() / n);
     squared[k] =
         best_reading(pair, t, model.predict(actions, pair.frames[t].sample)).squared_distance;
-    start.score += (kStudentNu + 6) / 2 * std::log1p(squared[k] / kStudentNu) / n;
+    start.score += robust_cost(squared[k]) / n;
   }
   start.median = median_or_zero(std::move(squared));
   return start;

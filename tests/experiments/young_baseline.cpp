@@ -100,17 +100,19 @@ int main(int argc, char** argv) {
       rigs.push_back(std::string(BODYSCHEMA_SOURCE_FOLDER "/config/") + name);
 
   std::printf(
-      "| rig | runs | with events | events | live: right / incomplete / wrong | offline: right / "
-      "incomplete / wrong | live worse than offline |\n| --- | --- | --- | --- | --- | --- | --- "
-      "|\n");
+      "| rig | runs | with events | events | of them `marker_missing` | live: right / incomplete / "
+      "wrong | offline: right / incomplete / wrong | wrong in both | live worse than offline |\n| "
+      "--- "
+      "| --- | --- | --- | --- | --- | --- | --- | --- |\n");
   bool is_good = true;
   for (const std::filesystem::path rig : rigs) {
     const StructureLearnerConfig learner =
         StructureLearnerConfig::load(rig / "structure_learner.yaml");
     const ModelMonitorConfig monitor = ModelMonitorConfig::load(rig / "model_monitor.yaml");
     const test::RigTruth truth(rig);
-    int num_runs = 0, num_eventful = 0, num_worse = 0;
+    int num_runs = 0, num_eventful = 0, num_wrong = 0, num_worse = 0;
     std::size_t num_events = 0;
+    std::ptrdiff_t num_missing = 0;
     std::map<Rightness, int> live, offline;
     for (std::int64_t seed = first_seed; seed < first_seed + num_seeds; ++seed) {
       const std::set<int> in_images = hide ? std::set<int>{*hide} : std::set<int>{};
@@ -132,10 +134,15 @@ int main(int argc, char** argv) {
         ++num_runs;
         num_eventful += !run.events.empty();
         num_events += run.events.size();
+        num_missing += std::count_if(run.events.begin(), run.events.end(), [](const auto& event) {
+          return event.event_cause == "marker_missing";
+        });
+        num_wrong += held == Rightness::kWrong && learned == Rightness::kWrong;
         num_worse += held > learned;
         ++live[held];
         ++offline[learned];
-        if (run.events.empty() && held <= learned) continue;
+        if (run.events.empty() && held == Rightness::kRight && learned == Rightness::kRight)
+          continue;
         std::fprintf(stderr, "%s seed %lld, part %d hidden: live %d, offline %d\n",
                      rig.filename().c_str(), static_cast<long long>(seed), part,
                      static_cast<int>(held), static_cast<int>(learned));
@@ -149,8 +156,9 @@ int main(int argc, char** argv) {
              std::to_string(of[Rightness::kIncomplete]) + " / " +
              std::to_string(of[Rightness::kWrong]);
     };
-    std::printf("| %s | %d | %d | %zu | %s | %s | %d |\n", rig.filename().c_str(), num_runs,
-                num_eventful, num_events, counts(live).c_str(), counts(offline).c_str(), num_worse);
+    std::printf("| %s | %d | %d | %zu | %td | %s | %s | %d | %d |\n", rig.filename().c_str(),
+                num_runs, num_eventful, num_events, num_missing, counts(live).c_str(),
+                counts(offline).c_str(), num_wrong, num_worse);
     std::fflush(stdout);
     is_good &= num_eventful == 0 && num_worse == 0;
   }

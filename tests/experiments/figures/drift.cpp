@@ -41,6 +41,7 @@ int length_of(double rate_deg) { return static_cast<int>(std::ceil(kMost_deg / r
 struct Life {
   std::vector<double> error;           ///< of the end effector, by sample [m]
   std::optional<double> named, ended;  ///< told so many samples after its begin, its end
+  int num_too_early = 0;               ///< told as ended before its end, and so begun again
   bool is_wrong = false;               ///< an event elsewhere, or before it
   bool is_invalid = false;             ///< an edge or a marker, at some sample
   double seconds = 0;
@@ -66,8 +67,9 @@ Life live(double rate_deg, int seed) {
       const bool is_drift = event.kind == Kind::kDrift;
       life.is_wrong |= t < kHealthy || !arm.is_near(part) || (is_drift && part != kPart);
       if (is_drift && part == kPart && !life.named && t < end) life.named = t - kHealthy;
-      if (event.kind == Kind::kRecovered && event.cause == "drift" && t >= end && !life.ended)
-        life.ended = t - end;
+      if (event.kind != Kind::kRecovered || event.cause != "drift") continue;
+      life.num_too_early += t < end;
+      if (t >= end && !life.ended) life.ended = t - end;
     }
     for (const int part : adaptation.schema().parts)
       life.is_invalid |= adaptation.edge_state(part) == EdgeState::kInvalid ||
@@ -123,8 +125,8 @@ Findings drift(const Setup& setup) {
                "runs with a wrong event", "with an invalid edge", "error before, mm",
                "while it drifts: median of a run", "worst of a run",
                fmt::format("from {} samples after its end on", kSettled),
-               "samples until its end is told", "of all runs", "baseline: worst of a run",
-               "ms a sample"});
+               "samples until its end is told", "of all runs", "told as ended before: runs, times",
+               "baseline: worst of a run", "ms a sample"});
   std::vector<Panel> panels;
   const std::vector<double> rates = setup.quick ? std::vector<double>{0.1, 0.5, 1}
                                                 : std::vector<double>{0.02, 0.05, 0.1, 0.2, 0.5, 1};
@@ -141,13 +143,15 @@ Findings drift(const Setup& setup) {
     for_each_robot(setup, fmt::format("{:g}° a sample, baseline", rate), num_theirs, [&](int n) {
       theirs[static_cast<std::size_t>(n)] = live_as_the_chapter(rate, n + 1);
     });
-    int num_right = 0, num_wrong = 0, num_invalid = 0;
+    int num_right = 0, num_wrong = 0, num_invalid = 0, num_early_runs = 0, num_early = 0;
     double seconds = 0;
     std::vector<double> until, before, during, worst, after, ended, their_worst;
     for (const Life& life : lives) {
       num_right += life.named && !life.is_wrong;
       num_wrong += life.is_wrong;
       num_invalid += life.is_invalid;
+      num_early_runs += life.num_too_early > 0;
+      num_early += life.num_too_early;
       seconds += life.seconds;
       if (life.named) until.push_back(*life.named);
       if (life.ended) ended.push_back(*life.ended);
@@ -163,7 +167,7 @@ Findings drift(const Setup& setup) {
                std::to_string(num_invalid), three(before, kMillimetre), three(during, kMillimetre),
                three(worst, kMillimetre), three(after, kMillimetre), three(ended),
                percentage(static_cast<int>(ended.size()), num_runs),
-               three(their_worst, kMillimetre),
+               fmt::format("{}, {}", num_early_runs, num_early), three(their_worst, kMillimetre),
                fmt::format("{:.2f}", 1e3 * seconds / (num_runs * (end + kAfter)))});
     if (is_fast)
       findings.musts.push_back(

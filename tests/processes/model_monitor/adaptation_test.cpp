@@ -650,6 +650,22 @@ TEST_P(FourTagsAPart, OneThatIsLostIsNamedAndThePartIsNotMissedForLong) {
   EXPECT_GE(of_tag[1].sample_index, kRepaired);
 }
 
+/// A part that now is where it should be and now is not, whatever tag shows it.
+TEST_P(FourTagsAPart, NoneHasMovedWhereTheBodyIsWrong) {
+  for (const Fault fault : {Fault::kStuck, Fault::kGain, Fault::kWorn, Fault::kElastic}) {
+    BrokenArm arm({fault, "", 0.9}, Regime::kTagIso, kBlock, GetParam());
+    Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kTagIso));
+    for (int t = 0; t < arm.num_samples(); ++t) {
+      ActionPoseSample sample = arm.observe(t);
+      for (PartObservation& o : sample.parts)
+        o.tags = {10 * o.part + static_cast<int>(test::uniform(rng_, 0, 4))};
+      for (const auto& e : adaptation.on_sample(sample)) {
+        EXPECT_FALSE(e.tag >= 0 && e.cause == "marker_moved") << text(e);
+      }
+    }
+  }
+}
+
 INSTANTIATE_TEST_SUITE_P(AdaptationTest, FourTagsAPart, testing::Range(1, 9));
 
 /// The root does not turn: both its tags are always in sight.

@@ -2,6 +2,9 @@
 
 #include <gtest/gtest.h>
 
+#include <set>
+#include <vector>
+
 #include "tests/support/broken_arm.h"
 
 namespace bodyschema {
@@ -20,12 +23,12 @@ class MovedTagsTest : public testing::Test {
     o.part = kPart;
     o.tags = {tag};
     o.X_CB = schema_.X_CR * schema_.predict_all(sample.action).at(kPart);
-    if (!is_in_place) o.X_CB.translation().x() += 0.1;
+    if (!is_in_place) o.X_CB = o.X_CB * Eigen::Translation3d(0.1, 0, 0);
     o.covariance = 1e-6 * Matrix6d::Identity();
     return sample;
   }
   std::vector<MovedTags::Finding> look(MovedTags* tags, const ActionPoseSample& sample) const {
-    return tags->look(sample, schema_, {});
+    return tags->look(sample, schema_, schema_, {});
   }
 
   const BodySchema schema_ =
@@ -63,6 +66,62 @@ TEST_F(MovedTagsTest, WhereATagWasBeforeItMovedDoesNotBringItBack) {
     EXPECT_EQ(findings.size(), n == 62 ? 1U : 0U) << n;
   }
   EXPECT_FALSE(tags.has_moved(kTag));
+}
+
+TEST_F(MovedTagsTest, OneThatIsAloneInTheWrongPlaceHasMoved) {
+  MovedTags tags({});
+  std::vector<MovedTags::Finding> findings;
+  for (int n = 0; n < 7; ++n) {
+    EXPECT_TRUE(findings.empty()) << n;
+    findings = look(&tags, seen(n, n % 2 ? kOther : kTag, n % 2));
+  }
+  ASSERT_EQ(findings.size(), 1U);
+  EXPECT_EQ(findings[0].tag, kTag);
+  EXPECT_EQ(findings[0].since, 0);
+}
+
+/// Where other tags of its part are elsewhere too, each time somewhere else, the body is wrong.
+TEST_F(MovedTagsTest, NoneHasMovedWhereOthersAreElsewhereToo) {
+  for (const bool are_two_seen : {false, true}) {
+    MovedTags tags({});
+    for (int n = 0; n < 40; ++n) {
+      ActionPoseSample sample = seen(n, n % 2 ? kTag : kOther, n % 4 == 0);
+      if (n % 4 == 2) {
+        sample.parts[0].X_CB = sample.parts[0].X_CB * Eigen::Translation3d(0, 0.01 * n, 0);
+        if (are_two_seen) sample.parts[0].tags = {kTag, kOther};
+      }
+      EXPECT_TRUE(look(&tags, sample).empty()) << n;
+    }
+  }
+}
+
+TEST_F(MovedTagsTest, NoneHasMovedWhereTheBodyAsItStandsExplainsIt) {
+  BodySchema standing = schema_;
+  for (Edge& edge : standing.edges)
+    if (edge.to == kPart)
+      for (ScrewJoint& joint : edge.joints) joint.gain *= 0.5;
+  MovedTags tags({});
+  for (int n = 0; n < 40; ++n) {
+    ActionPoseSample sample = seen(n, n % 2 ? kTag : kOther, true);
+    // kTag is seen at one action alone.
+    sample.action.setConstant(n % 2 ? 0.8 : 0);
+    sample.parts[0].X_CB = standing.X_CR * standing.predict_all(sample.action).at(kPart);
+    EXPECT_TRUE(tags.look(sample, schema_, standing, {}).empty()) << n;
+  }
+}
+
+TEST_F(MovedTagsTest, TwoOfFourThatMovedAreBothNamed) {
+  MovedTags tags({});
+  std::multiset<int> named;
+  for (int n = 0; n < 60; ++n) {
+    ActionPoseSample sample = seen(n, kTag + n % 4, n % 4 > 1);
+    if (n % 4 == 1) sample.parts[0].X_CB = sample.parts[0].X_CB * Eigen::Translation3d(0, 0.1, 0);
+    for (const auto& finding : look(&tags, sample)) {
+      EXPECT_FALSE(finding.is_back);
+      named.insert(finding.tag);
+    }
+  }
+  EXPECT_EQ(named, (std::multiset<int>{kTag, kOther}));
 }
 
 }  // namespace
