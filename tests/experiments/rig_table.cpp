@@ -98,7 +98,8 @@ struct Options {
 
 /// One row for each of options.at.
 std::vector<Row> measured(const std::filesystem::path& rig, bool is_ideal, const Options& options) {
-  const StructureLearnerConfig config = StructureLearnerConfig::load(rig / "structure_learner.yaml");
+  const StructureLearnerConfig config =
+      StructureLearnerConfig::load(rig / "structure_learner.yaml");
   const int end_effector = load_signals(rig).end_effector_part;
   const test::RigTruth truth(rig);
   std::vector<int> observed = truth.parts();
@@ -151,9 +152,8 @@ void print(const std::string& rig, const Options& options, const std::vector<Row
       std::printf(" | | | | | | | |");
     } else {
       const Row& row = honest[i];
-      std::printf(" %d of %d | %d | %s | %s | %.4f |", row.right, options.num_seeds,
-                  row.incomplete, text(row.aligned).c_str(), text(row.errors).c_str(),
-                  median(row.scale));
+      std::printf(" %d of %d | %d | %s | %s | %.4f |", row.right, options.num_seeds, row.incomplete,
+                  text(row.aligned).c_str(), text(row.errors).c_str(), median(row.scale));
     }
     std::printf(" %.0f ms |\n", median((honest.empty() ? ideal : honest)[i].seconds) * 1e3);
     for (const auto* rows : {&ideal, &honest}) {
@@ -179,7 +179,8 @@ int main(int argc, char** argv) {
   std::string choice, only;
   app.add_option("--choice", choice, "How actions are found; else as motor_babbler.yaml says")
       ->check(CLI::IsMember({"active", "random"}));
-  app.add_option("--only", only, "One of the two robots")->check(CLI::IsMember({"ideal", "honest"}));
+  app.add_option("--only", only, "One of the two robots")
+      ->check(CLI::IsMember({"ideal", "honest"}));
   CLI11_PARSE(app, argc, argv);
   std::sort(options.at.begin(), options.at.end());
   if (!choice.empty()) options.choice = choice == "active" ? Choice::kActive : Choice::kRandom;
