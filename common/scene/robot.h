@@ -105,7 +105,8 @@ struct Robot {
   std::optional<std::string> beyond_range(const Eigen::VectorXd& joint_positions) const;
 };
 
-/// Reads robot.yaml, its tables as they stand there. Signals are named as in signals.yaml; the parts must be those of markers.yaml.
+/// Reads robot.yaml, its tables as they stand there. Signals are named as in signals.yaml; the
+/// parts must be those of markers.yaml.
 /// @throws ConfigError.
 Robot load_robot(const std::filesystem::path& rig_folder, const Signals& signals,
                  const Markers& markers);

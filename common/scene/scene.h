@@ -23,8 +23,8 @@ struct SceneDescription {
   /// X_WM of tags that have fallen off their parts: their plates lie there and touch nothing.
   std::map<int, Pose> fallen_tags;
 
-  /// The rig as built. `seed`: of the draw of its calibration errors; none: the ideal robot, of which
-  /// all tables of robot.yaml are true. @throws ConfigError.
+  /// The rig as built. `seed`: of the draw of its calibration errors; none: the ideal robot, of
+  /// which all tables of robot.yaml are true. @throws ConfigError.
   static SceneDescription load(const std::filesystem::path& rig_folder,
                                std::optional<std::int64_t> seed = std::nullopt);
 };

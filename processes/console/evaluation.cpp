@@ -36,7 +36,8 @@ constexpr double kRotationUnit_rad = 0.1 * kDegree;
 constexpr int kShared = 7;  // unknowns that all parts share: X_RS, log scale
 
 // What no sample decides (the scale where all axes meet, one of two frames of a rigid part) stays
-// where it is: a prior, chosen ten times a lab's calibration errors, so that it weighs nothing else.
+// where it is: a prior, chosen ten times a lab's calibration errors, so that it weighs nothing
+// else.
 constexpr double kPriorPosition_m = 0.01;
 constexpr double kPriorRotation_rad = 5 * kDegree;
 constexpr double kPriorScale = 0.02;
@@ -76,8 +77,7 @@ class AlignmentStep {
     shared.col(6).tail<3>().setZero();
     shared = weight.asDiagonal() * shared;
     const Matrix6d own = weight.asDiagonal();
-    const Eigen::Index at =
-        kShared + 6 * std::distance(alignment_.X_PB.begin(), of_part);
+    const Eigen::Index at = kShared + 6 * std::distance(alignment_.X_PB.begin(), of_part);
     H_.topLeftCorner<kShared, kShared>() += shared.transpose() * shared;
     H_.block<kShared, 6>(0, at) += shared.transpose() * own;
     H_.block<6, kShared>(at, 0) += own * shared;
@@ -102,7 +102,8 @@ class AlignmentStep {
 
  private:
   void add_prior(Eigen::Index at, const Pose& X) {
-    const Vector6d weight = per_axis(std::pow(kPriorPosition_m, -2), std::pow(kPriorRotation_rad, -2));
+    const Vector6d weight =
+        per_axis(std::pow(kPriorPosition_m, -2), std::pow(kPriorRotation_rad, -2));
     H_.diagonal().segment<6>(at) += weight;
     g_.segment<6>(at) -= weight.cwiseProduct(log(X));
   }
@@ -178,7 +179,8 @@ std::vector<PartErrors> evaluate(const BodySchema& schema,
     for (auto& [part, of_part] : errors) {
       const PartObservation* seen = sample.find(part);
       if (!seen) continue;
-      const Pose error = alignment.aligned(part, predicted.at(part)).inverse() * root->X_CB.inverse() * seen->X_CB;
+      const Pose error =
+          alignment.aligned(part, predicted.at(part)).inverse() * root->X_CB.inverse() * seen->X_CB;
       of_part.position_m.push_back(error.translation().norm());
       of_part.rotation_rad.push_back(rotation_angle(error));
     }

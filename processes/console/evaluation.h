@@ -22,11 +22,12 @@ struct PartErrors {
 
 /// What differs between a schema and the truth without an error of the kinematics: where tags that
 /// are not where the rig says put the frames of the parts, and how long their printed sides and the
-/// focal length make a metre. The true pose of part B in root R is X_RS · (scaled prediction) · X_PB.
+/// focal length make a metre. The true pose of part B in root R is X_RS · (scaled prediction) ·
+/// X_PB.
 struct Alignment {
-  double scale = 1;                 ///< true length per predicted length
-  Pose X_RS = Pose::Identity();     ///< the schema's frame of the root, in the true one
-  std::map<int, Pose> X_PB;         ///< the true frame of each part, in the schema's
+  double scale = 1;              ///< true length per predicted length
+  Pose X_RS = Pose::Identity();  ///< the schema's frame of the root, in the true one
+  std::map<int, Pose> X_PB;      ///< the true frame of each part, in the schema's
 
   /// Of a prediction X_SP of `part`.
   Pose aligned(int part, const Pose& X_SP) const;

@@ -186,8 +186,9 @@ class Page {
       held_out_ = fitting(
           record_.watch().held_out(body_->schema.body_since(body_->schema.last_sample_index)),
           body_->schema);
-      errors_ = bodyschema::judge(body_->schema, held_out_,
-                      record_.watch().has_truth() ? held_out_ : std::vector<ActionPoseSample>());
+      errors_ = bodyschema::judge(
+          body_->schema, held_out_,
+          record_.watch().has_truth() ? held_out_ : std::vector<ActionPoseSample>());
     }
   }
 
@@ -475,10 +476,13 @@ class Page {
         table.row(row);
         continue;
       }
-      std::vector<std::string> row = {
-          name, std::to_string(part.count), millimetres(part.position_median_m),
-          degrees(part.rotation_median_rad), millimetres(part.position_rms_m),
-          degrees(part.rotation_rms_rad), millimetres(part.position_max_m)};
+      std::vector<std::string> row = {name,
+                                      std::to_string(part.count),
+                                      millimetres(part.position_median_m),
+                                      degrees(part.rotation_median_rad),
+                                      millimetres(part.position_rms_m),
+                                      degrees(part.rotation_rms_rad),
+                                      millimetres(part.position_max_m)};
       if (errors_.alignment) {
         const PartErrors& aligned = errors_.aligned_parts[i];
         row.push_back(millimetres(aligned.position_median_m));
@@ -496,7 +500,8 @@ class Page {
   std::string alignment() {
     if (!errors_.alignment) return "";
     return fmt::format(
-        " Aligned: with the frames of the parts and the unit of length of the truth (scale {:.4f}), "
+        " Aligned: with the frames of the parts and the unit of length of the truth (scale "
+        "{:.4f}), "
         "which tags that are not where the rig says displace.",
         errors_.alignment->scale);
   }

@@ -256,10 +256,10 @@ nlohmann::ordered_json result_json(const RunWatch& watch, const Learned& learned
       {"end_effector", signals.end_effector_part},
       {"accepted", learned.is_accepted},
       {"structure", structure_json(learned.schema, learned.outliers)},
-      {"held_out",
-       watch.has_truth()
-           ? errors_json(static_cast<int>(held_out.size()), judge(learned.schema, held_out, held_out))
-           : errors_json(static_cast<int>(held_out.size()), evaluate(learned.schema, held_out))},
+      {"held_out", watch.has_truth() ? errors_json(static_cast<int>(held_out.size()),
+                                                   judge(learned.schema, held_out, held_out))
+                                     : errors_json(static_cast<int>(held_out.size()),
+                                                   evaluate(learned.schema, held_out))},
       {"held_out_since", watch.body_since()},
       {"held_out_against", watch.has_truth() ? "noise-free simulator" : "observations"},
       {"visibility", nlohmann::ordered_json::object()}};

@@ -42,6 +42,7 @@ ObserverConfig ObserverConfig::load(const std::filesystem::path& file) {
   config.part_pose.min_other_rotation_rad = yaml.number("min_other_rotation_deg", 0, 90) * kDegree;
   config.part_pose.max_error_ratio = yaml.number("max_error_ratio", 1, 1e6);
   yaml.finish();
+  config.part_pose.calibration = load_noise(file.parent_path()).calibration;
   return config;
 }
 
@@ -205,12 +206,8 @@ sample_t Observer::sample_from(const Rest& rest, const std::vector<const marker_
       continue;
     }
     const TagPlacement& placement = *markers_.find(id);
-    SeenTag tag{id,
-                placement.size_m,
-                placement.X_BM.value_or(Pose::Identity()),
-                {},
-                whitener_of(covariance_px2),
-                {}};
+    SeenTag tag{id, placement.size_m, placement.X_BM.value_or(Pose::Identity()),
+                {}, covariance_px2,   {}};
     for (const auto& corner : mean.mean_corner_px) {
       if (auto point = lens_->straighten({corner[0], corner[1]})) {
         point->sigma_px = sigma_px(covariance_px2);

@@ -7,35 +7,59 @@
 namespace bodyschema {
 namespace {
 
+/// Covariance of a tag's corners about where markers.yaml has them, seen from X_CM: of their
+/// measurement, of the tag's place on its part and of its size.
+Matrix8d covariance_of(const SeenTag& tag, const TagCalibration& calibration, const Pose& X_CM) {
+  const std::vector<Eigen::Vector3d> p_MP = tag_corners(tag.size_m);
+  Eigen::Matrix<double, Eigen::Dynamic, 6> J;
+  if (!reprojection_residual(X_CM, p_MP, tag.corners, &J)) return tag.corner_covariance_px2;
+  Vector6d variances;
+  variances << Eigen::Vector3d::Constant(std::pow(calibration.position_m, 2)),
+      Eigen::Vector3d::Constant(std::pow(calibration.rotation_rad, 2));
+  // A corner of a larger print moves as if the tag were moved by its own vector to the corner.
+  Eigen::Matrix<double, 8, 1> of_size;
+  for (int c = 0; c < 4; ++c)
+    of_size.segment<2>(2 * c) = J.block<2, 3>(2 * c, 0) * p_MP[c] * calibration.size_share;
+  const double sigma2 = std::pow(tag.corners[0].sigma_px, 2);
+  return tag.corner_covariance_px2 +
+         sigma2 * (J * variances.asDiagonal() * J.transpose() + of_size * of_size.transpose());
+}
+
+/// The corners of tags with their covariances about what markers.yaml says.
 struct Points {
   std::vector<Eigen::Vector3d> p_BP;
   std::vector<ImagePoint> measured;
   Eigen::MatrixXd whitener;
 };
 
-Points points_of(const std::vector<SeenTag>& tags) {
+Points points_of(const std::vector<SeenTag>& tags, const TagCalibration& calibration,
+                 const Pose& X_CB) {
   Points points;
   const auto size = static_cast<Eigen::Index>(8 * tags.size());
   points.whitener = Eigen::MatrixXd::Zero(size, size);
   for (const SeenTag& tag : tags) {
-    for (const Eigen::Vector3d& p_MP : tag_corners(tag.size_m)) {
-      points.p_BP.push_back(tag.X_BM * p_MP);
-    }
     const auto row = static_cast<Eigen::Index>(2 * points.measured.size());
-    points.whitener.block<8, 8>(row, row) = tag.whitener;
-    points.measured.insert(points.measured.end(), tag.corners.begin(), tag.corners.end());
+    const Matrix8d covariance = covariance_of(tag, calibration, X_CB * tag.X_BM);
+    points.whitener.block<8, 8>(row, row) = whitener_of(covariance);
+    for (const Eigen::Vector3d& p_MP : tag_corners(tag.size_m))
+      points.p_BP.push_back(tag.X_BM * p_MP);
+    for (ImagePoint corner : tag.corners) {
+      corner.sigma_px = sigma_px(covariance);
+      points.measured.push_back(corner);
+    }
   }
   return points;
 }
 
 /// All local minima that the tags' hypotheses lead to, best first.
-std::vector<PoseFit> minima_of(const std::vector<SeenTag>& tags) {
-  const Points points = points_of(tags);
+std::vector<PoseFit> minima_of(const std::vector<SeenTag>& tags,
+                               const TagCalibration& calibration) {
   std::vector<PoseFit> minima;
   for (const SeenTag& tag : tags) {
     for (const Pose& X_CM : tag.X_CM) {
-      const auto fit =
-          fit_pose(X_CM * tag.X_BM.inverse(), points.p_BP, points.measured, &points.whitener);
+      const Pose start = X_CM * tag.X_BM.inverse();
+      const Points points = points_of(tags, calibration, start);
+      const auto fit = fit_pose(start, points.p_BP, points.measured, &points.whitener);
       if (!fit) continue;
       const auto same = [&](const PoseFit& m) { return is_same_minimum(m.X_CB, fit->X_CB); };
       if (std::none_of(minima.begin(), minima.end(), same)) minima.push_back(*fit);
@@ -50,8 +74,8 @@ std::vector<PoseFit> minima_of(const std::vector<SeenTag>& tags) {
 double worst_tag_error(const Pose& X_CB, const std::vector<SeenTag>& tags) {
   double worst = 0;
   for (const SeenTag& tag : tags) {
-    const Points points = points_of({tag});
-    const auto residual = reprojection_residual(X_CB, points.p_BP, points.measured, nullptr);
+    const auto residual =
+        reprojection_residual(X_CB * tag.X_BM, tag_corners(tag.size_m), tag.corners, nullptr);
     if (!residual) return std::numeric_limits<double>::infinity();
     worst = std::max(worst, std::sqrt(residual->squaredNorm() / 8) * tag.corners[0].sigma_px);
   }
@@ -63,7 +87,7 @@ double worst_tag_error(const Pose& X_CB, const std::vector<SeenTag>& tags) {
 std::optional<PartPose> solve_part_pose(std::vector<SeenTag> tags, const PartPoseOptions& options,
                                         std::int64_t turn) {
   PartPose result;
-  std::vector<PoseFit> minima = minima_of(tags);
+  std::vector<PoseFit> minima = minima_of(tags, options.calibration);
   while (!minima.empty() && worst_tag_error(minima[0].X_CB, tags) > options.max_tag_error_px) {
     if (tags.size() == 1) return std::nullopt;
     // The tag with the largest residual need not be the wrong one: it may be the only right one far
@@ -74,7 +98,7 @@ std::optional<PartPose> solve_part_pose(std::vector<SeenTag> tags, const PartPos
     for (std::size_t i = 0; i < tags.size(); ++i) {
       std::vector<SeenTag> others = tags;
       others.erase(others.begin() + static_cast<std::ptrdiff_t>(i));
-      without.push_back(minima_of(others));
+      without.push_back(minima_of(others, options.calibration));
       if (without[i].empty()) continue;
       num_fitting += worst_tag_error(without[i][0].X_CB, others) <= options.max_tag_error_px;
       if (without[i][0].rms_sigma >= best_error) continue;

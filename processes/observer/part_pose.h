@@ -14,12 +14,14 @@ struct SeenTag {
   int id = 0;
   double size_m = 0;
   Pose X_BM = Pose::Identity();
-  std::vector<ImagePoint> corners;           ///< four, AprilTag's order
-  Matrix8d whitener = Matrix8d::Identity();  ///< fit_pose()'s, of this tag's corners
-  std::vector<Pose> X_CM;                    ///< hypotheses of its pose: the starts of the fit
+  std::vector<ImagePoint> corners;  ///< four, AprilTag's order
+  /// Of the corners' measurement; their sigma_px is sigma_px() of it.
+  Matrix8d corner_covariance_px2 = Matrix8d::Identity();
+  std::vector<Pose> X_CM;  ///< hypotheses of its pose: the starts of the fit
 };
 
 struct PartPoseOptions {
+  TagCalibration calibration;         ///< adds to what the corners' covariances say of the tags
   double max_tag_error_px = 0;        ///< a tag with a larger rms in the common fit disagrees
   double min_other_rotation_rad = 0;  ///< a second minimum closer than this is the same pose
   double max_error_ratio = 0;         ///< a second minimum worse than this is no hypothesis

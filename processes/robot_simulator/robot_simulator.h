@@ -46,8 +46,8 @@ struct RobotSimulatorConfig {
 /// Before the first command it is idle at the start pose; when commands stop it stays where it is.
 /// The same seed, the same commands and faults give the same answers, bit by bit.
 ///
-/// What is seen (SIM_STATE's X_WG) has the joints' backlash, which the direction of approach decides;
-/// the truth that is told (X_WB) is in the middle of it. Droop is in both.
+/// What is seen (SIM_STATE's X_WG) has the joints' backlash, which the direction of approach
+/// decides; the truth that is told (X_WB) is in the middle of it. Droop is in both.
 class RobotSimulator {
  public:
   /// What a command leads to, in the order in which it is to be sent.
@@ -82,11 +82,11 @@ class RobotSimulator {
   /// True positions of the joints in the middle of their backlash [rad or m]; for tests.
   Eigen::VectorXd joint_positions() const { return body_.scene.joint_positions(*body_.data); }
 
-  /// Everything that a restart needs: pose, play, time, seed, whether it is ideal, faults, the newest
-  /// answers. Numbers are exact. @throws std::runtime_error if the file cannot be written.
+  /// Everything that a restart needs: pose, play, time, seed, whether it is ideal, faults, the
+  /// newest answers. Numbers are exact. @throws std::runtime_error if the file cannot be written.
   void save(const std::filesystem::path& file) const;
-  /// Continues from a saved file; seed and is_ideal become the saved ones. @throws ConfigError, which says
-  /// what to do, if it is damaged or not of this rig.
+  /// Continues from a saved file; seed and is_ideal become the saved ones. @throws ConfigError,
+  /// which says what to do, if it is damaged or not of this rig.
   void restore(const std::filesystem::path& file);
 
  private:

@@ -3,7 +3,8 @@
 // is hidden in it in turn. Prints Markdown; fails if anything was told or what is held is worse.
 //
 //   young_baseline [config/arm2 config/arm4 config/arm7] --seeds 50 --samples 60
-//   young_baseline --honest --as-seen --seeds 1 --samples 2000      with calibration errors, false events
+//   young_baseline --honest --as-seen --seeds 1 --samples 2000      with calibration errors, false
+//   events
 
 #include <CLI/CLI.hpp>
 #include <algorithm>
@@ -34,8 +35,8 @@ namespace {
 /// @throws std::runtime_error if it is not there and must be.
 std::vector<sample_t> samples_of(const std::filesystem::path& rig, std::int64_t seed,
                                  const std::set<int>& hidden, bool is_ideal,
-                                 std::size_t num_samples,
-                                 const std::filesystem::path& folder, bool must_be_there) {
+                                 std::size_t num_samples, const std::filesystem::path& folder,
+                                 bool must_be_there) {
   std::string name = rig.filename().string() + "_" + std::to_string(seed);
   for (const int part : hidden) name += "_" + std::to_string(part);
   if (!is_ideal) name += "_honest";

@@ -361,7 +361,8 @@ TEST_F(Arm2, AReplayThroughTheCameraGivesTheSameImages) {
     return distinct_payloads<camera_image_t>(
         log, kCameraImage, [](const camera_image_t& image) { return image.image_seq >= 2; });
   };
-  EXPECT_TRUE(are_equal(images(replay("camera", "--ideal")), images(run("first") / "images.lcmlog.00")));
+  EXPECT_TRUE(
+      are_equal(images(replay("camera", "--ideal")), images(run("first") / "images.lcmlog.00")));
 }
 
 TEST_F(Arm2, AReplayThroughTheMarkerEstimatorGivesTheSamePoses) {

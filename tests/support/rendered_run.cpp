@@ -29,6 +29,12 @@ ImageEffects effects(const SimulationConfig& simulation) {
           .msaa_samples = simulation.msaa_samples};
 }
 
+ObserverConfig observer_config(const std::filesystem::path& rig, bool is_ideal) {
+  ObserverConfig config = ObserverConfig::load(rig / "observer.yaml");
+  if (is_ideal) config.part_pose.calibration = {};  // as ./run --ideal tells it
+  return config;
+}
+
 }  // namespace
 
 struct RenderedRun::Implementation {
@@ -41,7 +47,7 @@ struct RenderedRun::Implementation {
         camera(camera_config, [this](const sim_state_t& state,
                                      int frame) { return renderer.render(state, frame); }),
         estimator(MarkerEstimatorConfig::load(rig / "marker_estimator.yaml"), load_markers(rig)),
-        observer(ObserverConfig::load(rig / "observer.yaml"), load_markers(rig)),
+        observer(observer_config(rig, is_ideal), load_markers(rig)),
         babbler_config(endless(MotorBabblerConfig::load(rig / "motor_babbler.yaml"), choice)),
         babbler(babbler_config, seed),
         learner(StructureLearnerConfig::load(rig / "structure_learner.yaml")),

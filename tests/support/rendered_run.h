@@ -26,8 +26,8 @@ class RenderedRun {
   struct Step {
     sample_t message;
     ActionPoseSample sample;
-    /// Noise-free pose X_CB of every part of the rig, seen or not, its joints in the middle of their
-    /// backlash.
+    /// Noise-free pose X_CB of every part of the rig, seen or not, its joints in the middle of
+    /// their backlash.
     std::map<int, Pose> truth;
   };
 

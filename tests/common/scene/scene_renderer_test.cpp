@@ -174,7 +174,8 @@ TEST_P(RenderedRig, ShowsTheTagsAndTheLensOfTheRobotWithCalibrationErrors) {
   EXPECT_LT(result.mean_px, 0.25);
   EXPECT_LT(result.bias_px.norm(), 0.1) << result.bias_px.transpose();
   // The same tags through the lens that the rig claims are elsewhere.
-  const CameraCalibration claimed = load_camera_calibration(kConfig / GetParam() / "camera_info.yaml");
+  const CameraCalibration claimed =
+      load_camera_calibration(kConfig / GetParam() / "camera_info.yaml");
   EXPECT_GT(compare(scene, claimed, state, image, 60).mean_px, 2 * result.mean_px);
 }
 

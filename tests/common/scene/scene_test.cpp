@@ -161,8 +161,8 @@ TEST(Scene, RefusesPartsThatMarkersYamlDoesNotKnow) {
 }
 
 TEST(Scene, RefusesATagOnAPartThatIsNotThere) {
-  const auto rig = changed_rig("unknown_tag_part", "robot.yaml", "part: 1, placement",
-                               "part: 6, placement");
+  const auto rig =
+      changed_rig("unknown_tag_part", "robot.yaml", "part: 1, placement", "part: 6, placement");
   EXPECT_THROW(Scene{rig}, ConfigError);
 }
 

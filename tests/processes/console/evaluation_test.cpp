@@ -71,7 +71,8 @@ TEST(EvaluationTest, TheErrorDoesNotDependOnWhereTheCameraStands) {
   }
 }
 
-/// The samples as a rig tells them whose tags are not where it says, and whose metre is another one.
+/// The samples as a rig tells them whose tags are not where it says, and whose metre is another
+/// one.
 std::vector<ActionPoseSample> displaced(std::vector<ActionPoseSample> samples, double scale,
                                         test::Rng& rng) {
   std::map<int, Pose> X_PB;
@@ -79,9 +80,10 @@ std::vector<ActionPoseSample> displaced(std::vector<ActionPoseSample> samples, d
     const Pose X_RC = sample.find(1)->X_CB.inverse();
     for (PartObservation& part : sample.parts) {
       if (!X_PB.contains(part.part)) {
-        X_PB[part.part] = exp(Vector6d(
-            (Vector6d() << 0.001 * test::random_pose(rng, 1, 1).translation(),
-             0.01 * test::random_pose(rng, 1, 1).translation()).finished()));
+        X_PB[part.part] =
+            exp(Vector6d((Vector6d() << 0.001 * test::random_pose(rng, 1, 1).translation(),
+                          0.01 * test::random_pose(rng, 1, 1).translation())
+                             .finished()));
       }
       Pose X_RP = X_RC * part.X_CB;
       X_RP.translation() *= scale;
@@ -131,8 +133,8 @@ TEST(EvaluationTest, AScaleThatNoSampleTellsStaysOne) {
     sample.parts.resize(2);
     sample.parts[0].part = 1;
     sample.parts[1].part = 2;
-    sample.parts[1].X_CB = schema.predict_all(sample.action).at(2) *
-                           exp(Vector6d(0.002 * Vector6d::Unit(6, i % 6)));
+    sample.parts[1].X_CB =
+        schema.predict_all(sample.action).at(2) * exp(Vector6d(0.002 * Vector6d::Unit(6, i % 6)));
   }
   const JudgedErrors errors = judge(schema, truth, truth);
   ASSERT_TRUE(errors.alignment.has_value());
@@ -208,7 +210,8 @@ TEST(EvaluationTest, ARigidPairAndFewSamplesAreAlignedAsFarAsTheyTell) {
   const JudgedErrors few = judge(by_hand(), {seen(0.004, 0.01)}, {seen(0.004, 0.01)});
   EXPECT_FALSE(few.alignment.has_value());
   EXPECT_TRUE(few.aligned_parts.empty());
-  const JudgedErrors rigid = judge(by_hand(), {seen(0.004, 0.01)}, std::vector(5, seen(0.004, 0.01)));
+  const JudgedErrors rigid =
+      judge(by_hand(), {seen(0.004, 0.01)}, std::vector(5, seen(0.004, 0.01)));
   ASSERT_TRUE(rigid.alignment.has_value());
   EXPECT_LT(rigid.aligned_parts.at(0).position_max_m, 1e-5);
 }

@@ -43,7 +43,7 @@ Pose X_CB_of(std::mt19937& random) {
 
 SeenTag seen(int id, const Pose& X_CB, const Pose& X_BM, double sigma_px, std::mt19937& random) {
   std::normal_distribution<double> noise(0, sigma_px / kFocal_px);
-  SeenTag tag{id, kSize_m, X_BM, {}, Matrix8d::Identity(), {}};
+  SeenTag tag{id, kSize_m, X_BM, {}, sigma_px * sigma_px * Matrix8d::Identity(), {}};
   for (const Eigen::Vector3d& p_MP : tag_corners(kSize_m)) {
     const Eigen::Vector3d p_C = X_CB * X_BM * p_MP;
     ImagePoint point;

@@ -296,7 +296,8 @@ TEST(StructureLearnerConfigTest, IsReadInSiUnitsWithTheRootOfTheRig) {
   std::ofstream(folder / "structure_learner.yaml") << "max_signals: 1\n";
   std::ofstream(folder / "noise.yaml")
       << "corner_noise_px: 0.05\nsmall_tag_noise_px: 0.15\noutlier_rate: 0.1\n"
-         "systematic_position_m: 0.002\nsystematic_rotation_deg: 90\n";
+         "tag_position_m: 0\ntag_rotation_deg: 0\ntag_size_share: 0\nsystematic_position_m: "
+         "0.002\nsystematic_rotation_deg: 90\n";
   std::ofstream(folder / "markers.yaml")
       << "family: tag36h11\ntags:\n  - {id: 0, size_m: 0.1, part: 5, placement: none}\n"
          "  - {id: 1, size_m: 0.1, part: 4, placement: none}\n";
