@@ -77,6 +77,8 @@ def learn(place, options):
     if is_share:
         network.check_route()
     run, lock = run_folder.begin(place, folder)
+    if options.ideal:
+        run_folder.tell_ideal_noise(run)
     samples = ["--samples", options.samples] if options.samples else []
     variables = {
         "SIMULATOR_FLAGS": shlex.join(["--seed", options.seed, *hide, *ideal]),

@@ -148,8 +148,8 @@ std::vector<std::string> Network::share_of(const std::string& host) const {
                               (all.empty() ? "all runs on one machine" : "there are: " + all));
 }
 
-RigNoise load_noise(const std::filesystem::path& rig_folder) {
-  const Yaml yaml = Yaml::load(rig_folder / "noise.yaml");
+RigNoise load_noise(const std::filesystem::path& rig_folder, const std::string& file) {
+  const Yaml yaml = Yaml::load(rig_folder / file);
   RigNoise noise;
   noise.corner_noise_px = yaml.number("corner_noise_px", 1e-3, 10);
   noise.small_tag_noise_px = yaml.number("small_tag_noise_px", 0, 10);

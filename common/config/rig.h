@@ -78,7 +78,9 @@ std::vector<TagPlacement> load_tags(const Yaml& yaml);
 /// @throws ConfigError.
 Markers load_markers(const std::filesystem::path& rig_folder);
 Signals load_signals(const std::filesystem::path& rig_folder);
-RigNoise load_noise(const std::filesystem::path& rig_folder);
+/// `file`: also ideal_noise.yaml, which stands in for it in `./run --ideal`.
+RigNoise load_noise(const std::filesystem::path& rig_folder,
+                    const std::string& file = "noise.yaml");
 /// `group`: all processes of the rig's group. If there are any, each must run on exactly one host.
 Network load_network(const std::filesystem::path& rig_folder,
                      const std::vector<std::string>& group = {});

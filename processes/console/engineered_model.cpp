@@ -221,7 +221,7 @@ void run_engineer(const EngineerArguments& arguments) {
   BodySchema schema = engineered_model(arguments.urdf, arguments.placement);
   const Recording recording = load_for(arguments.samples, schema);
   MeasurementModel measurement;
-  if (recording.is_log) measurement.systematic = kTagSystematic;
+  measurement.systematic = recording.systematic;
   if (!recording.has_noise) measurement.noise = Noise{0.001, 0.2 * kDegree};  // weights alone
   estimate_root_pose(recording.samples, measurement, &schema);
   if (schema.X_CR_covariance.isZero(0))

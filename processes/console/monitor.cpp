@@ -81,7 +81,7 @@ AdaptationOptions options_of(const MonitorArguments& arguments, const Recording&
                              const BodySchema& schema) {
   AdaptationOptions options;
   if (recording.is_log) {
-    options.noise.systematic = kTagSystematic;  // as model_monitor has it
+    options.noise.systematic = recording.systematic;  // as model_monitor has it
     options.least_noise_scale = 1;
   }
   if (!arguments.noise.empty()) {

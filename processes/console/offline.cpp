@@ -73,7 +73,7 @@ void run_learn(const LearnArguments& arguments) {
   if (!arguments.noise.empty()) options.noise = noise_given(arguments.noise);
   const Recording recording = load(arguments.samples);
   options.root = arguments.root;
-  if (recording.is_log) options.systematic = kTagSystematic;
+  options.systematic = recording.systematic;
   check_out(arguments.out, {arguments.samples});
   const std::vector<ActionPoseSample> training = recording.training();
   if (options.root) {

@@ -19,9 +19,11 @@
 #include "common/bus/check.h"
 #include "common/bus/convert.h"
 #include "common/bus/event_log.h"
+#include "common/config/rig.h"
 #include "common/geometry/angle.h"
 #include "common/schema/retained_samples.h"
 #include "processes/console/hint.h"
+#include "processes/structure_learner/learn.h"
 
 namespace bodyschema {
 namespace {
@@ -273,6 +275,10 @@ Recording read_samples(const std::filesystem::path& file, const std::string& nam
   Recording recording;
   recording.is_log = true;
   recording.has_noise = true;
+  const std::filesystem::path rig = std::filesystem::path(name).parent_path() / "config";
+  recording.systematic = std::filesystem::exists(rig / "noise.yaml")
+                             ? load_noise(rig).measurement.systematic
+                             : kTagSystematic;
   LogReport report;
   const std::vector<sample_t> messages = read_log(file, kSample, &report);
   if (messages.empty()) {

@@ -26,6 +26,9 @@ struct Recording {
   bool has_noise = false;
   /// Whether the poses are those of camera markers, recorded by our observer.
   bool is_log = false;
+  /// MeasurementModel::systematic of a log: of the noise.yaml in the run's folder, else
+  /// kTagSystematic; 0 of a CSV.
+  Noise systematic;
   /// What keeps a log from being whole, for people: "" if nothing does. What precedes it was read.
   std::string damage;
   /// Of a CSV, for people: what is read as it stands but looks like another unit or order.

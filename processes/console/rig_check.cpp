@@ -84,8 +84,10 @@ class Check {
     guarded([&] { rig_.signals = load_signals(folder_); });
     guarded([&] { rig_.markers = load_markers(folder_); });
     guarded([&] { load_noise(folder_); });
+    if (has("ideal_noise.yaml")) guarded([&] { load_noise(folder_, "ideal_noise.yaml"); });
     guarded([&] { load_network(folder_); });
-    read_.insert({"signals.yaml", "markers.yaml", "noise.yaml", "network.yaml"});
+    read_.insert(
+        {"signals.yaml", "markers.yaml", "noise.yaml", "ideal_noise.yaml", "network.yaml"});
     const auto of_process = [&](const std::string& name, auto load, bool is_needed = true) {
       read_.insert(name);
       if (is_needed || has(name)) guarded([&] { load(folder_ / name); });

@@ -68,8 +68,7 @@ void RunRecord::on_event(const LogEvent& event, const std::filesystem::path& fil
     on_image(image->utime, {file, byte});
     if (note_receipt(image->utime)) image_received_.insert(image->utime, event.event_utime);
   } else if (const auto markers = read_as(kMarkerPoses, event)) {
-    if (note_receipt(markers->utime))
-      markers_received_.insert(markers->utime, event.event_utime);
+    if (note_receipt(markers->utime)) markers_received_.insert(markers->utime, event.event_utime);
     on_markers(*markers);
   } else if (const auto camera = read_as(kCameraInfo, event)) {
     note_receipt(camera->utime);
@@ -159,9 +158,9 @@ void RunRecord::on_health_event(const health_event_t& event) {
 }
 
 void RunRecord::on_image(std::int64_t utime, const Place& place) {
-  const auto awaited =
-      std::find_if(awaited_.begin(), awaited_.end(),
-                   [&](const Picture& picture) { return picture.markers.utime == utime; });
+  const auto awaited = std::find_if(awaited_.begin(), awaited_.end(), [&](const Picture& picture) {
+    return picture.markers.utime == utime;
+  });
   if (awaited == awaited_.end()) {
     image_places_.insert(utime, place);
     return;
@@ -202,8 +201,7 @@ void RunRecord::on_markers(const marker_poses_t& markers) {
       if (picture.markers.utime == markers.utime) return;
   }
   const Place* place = image_places_.find(markers.utime);
-  add(place != nullptr ? &pictures_ : &awaited_,
-      {markers, place != nullptr ? *place : Place{}});
+  add(place != nullptr ? &pictures_ : &awaited_, {markers, place != nullptr ? *place : Place{}});
 }
 
 std::vector<health_event_t> RunRecord::events() const {

@@ -213,8 +213,8 @@ int main(int argc, char** argv) {
   }
   const Outcome undisturbed = judge(calm, rig, num_samples);
 
-  // All along the run: the k-th kill comes after a share k/num_kills of the samples, but for the last
-  // twentieth, so that the run does not end before the last kill.
+  // All along the run: the k-th kill comes after a share k/num_kills of the samples, but for the
+  // last twentieth, so that the run does not end before the last kill.
   std::mt19937_64 random(seed);
   std::map<std::string, int> killed;
   int num_killed = 0;

@@ -133,6 +133,8 @@ struct Options {
 /// One row for each of options.at.
 std::vector<Row> measured(const std::filesystem::path& rig, bool is_ideal, const Options& options) {
   StructureLearnerConfig config = StructureLearnerConfig::load(rig / "structure_learner.yaml");
+  if (is_ideal)
+    config.options.systematic = load_noise(rig, "ideal_noise.yaml").measurement.systematic;
   if (!options.systematic.empty())
     config.options.systematic = {options.systematic[0] * 1e-3, options.systematic[1] * kDegree};
   const int end_effector = load_signals(rig).end_effector_part;

@@ -107,9 +107,12 @@ int main(int argc, char** argv) {
       "| --- | --- | --- | --- | --- | --- | --- | --- |\n");
   bool is_good = true;
   for (const std::filesystem::path rig : rigs) {
-    const StructureLearnerConfig learner =
-        StructureLearnerConfig::load(rig / "structure_learner.yaml");
-    const ModelMonitorConfig monitor = ModelMonitorConfig::load(rig / "model_monitor.yaml");
+    const MeasurementModel measurement =
+        load_noise(rig, is_honest ? "noise.yaml" : "ideal_noise.yaml").measurement;
+    StructureLearnerConfig learner = StructureLearnerConfig::load(rig / "structure_learner.yaml");
+    learner.options.systematic = measurement.systematic;
+    ModelMonitorConfig monitor = ModelMonitorConfig::load(rig / "model_monitor.yaml");
+    monitor.measurement = measurement;
     const test::RigTruth truth(rig);
     int num_runs = 0, num_eventful = 0, num_wrong = 0, num_worse = 0;
     std::size_t num_events = 0;

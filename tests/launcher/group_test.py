@@ -64,11 +64,16 @@ class CalibrationErrors(GroupTest):
         self.assertEqual(self.wait_for_end(run), 0)
         return logs
 
+    def noise(self):
+        return (self.current / "config" / "noise.yaml").read_text()
+
     def test_are_there_unless_the_robot_is_to_be_ideal(self):
         for log in self.words_of_the_simulation():
             self.assertNotIn("--ideal", log)
+        self.assertIn("tag_position_m: 0.0005", self.noise())
         for log in self.words_of_the_simulation("--ideal"):
             self.assertIn("--ideal", log)
+        self.assertIn("tag_position_m: 0\n", self.noise())
 
     def test_are_not_those_of_a_replay(self):
         self.assertIn("--ideal has no meaning with --replay", self.run_to_end("--replay", "log", "--ideal")[0])

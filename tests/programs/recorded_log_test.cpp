@@ -221,7 +221,7 @@ TEST_F(RecordedLogTest, WhatIsNoRunIsAClearError) {
 TEST(TagSystematicTest, IsTheRigs) {
   for (const auto& rig : fs::directory_iterator(BODYSCHEMA_CONFIG)) {
     if (!fs::is_directory(rig.path())) continue;
-    const Noise noise = load_noise(rig.path()).measurement.systematic;
+    const Noise noise = load_noise(rig.path(), "ideal_noise.yaml").measurement.systematic;
     EXPECT_DOUBLE_EQ(noise.position_m, kTagSystematic.position_m) << rig.path();
     EXPECT_DOUBLE_EQ(noise.rotation_rad, kTagSystematic.rotation_rad) << rig.path();
   }

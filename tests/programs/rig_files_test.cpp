@@ -40,6 +40,8 @@ const std::map<std::string, std::function<void(const path&)>> kReaders = {
     {"model_monitor.yaml", [](const path& file) { ModelMonitorConfig::load(file); }},
     {"motor_babbler.yaml", [](const path& file) { MotorBabblerConfig::load(file); }},
     {"network.yaml", [](const path& file) { load_network(file.parent_path()); }},
+    {"ideal_noise.yaml",
+     [](const path& file) { load_noise(file.parent_path(), "ideal_noise.yaml"); }},
     {"noise.yaml", [](const path& file) { load_noise(file.parent_path()); }},
     {"observer.yaml", [](const path& file) { ObserverConfig::load(file); }},
     {"robot.yaml",

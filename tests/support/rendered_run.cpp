@@ -29,9 +29,25 @@ ImageEffects effects(const SimulationConfig& simulation) {
           .msaa_samples = simulation.msaa_samples};
 }
 
+RigNoise noise_of(const std::filesystem::path& rig, bool is_ideal) {
+  return load_noise(rig, is_ideal ? "ideal_noise.yaml" : "noise.yaml");
+}
+
 ObserverConfig observer_config(const std::filesystem::path& rig, bool is_ideal) {
   ObserverConfig config = ObserverConfig::load(rig / "observer.yaml");
-  if (is_ideal) config.part_pose.calibration = {};  // as ./run --ideal tells it
+  config.part_pose.calibration = noise_of(rig, is_ideal).calibration;
+  return config;
+}
+
+StructureLearnerConfig learner_config(const std::filesystem::path& rig, bool is_ideal) {
+  StructureLearnerConfig config = StructureLearnerConfig::load(rig / "structure_learner.yaml");
+  config.options.systematic = noise_of(rig, is_ideal).measurement.systematic;
+  return config;
+}
+
+ModelMonitorConfig monitor_config(const std::filesystem::path& rig, bool is_ideal) {
+  ModelMonitorConfig config = ModelMonitorConfig::load(rig / "model_monitor.yaml");
+  config.measurement = noise_of(rig, is_ideal).measurement;
   return config;
 }
 
@@ -50,8 +66,8 @@ struct RenderedRun::Implementation {
         observer(observer_config(rig, is_ideal), load_markers(rig)),
         babbler_config(endless(MotorBabblerConfig::load(rig / "motor_babbler.yaml"), choice)),
         babbler(babbler_config, seed),
-        learner(StructureLearnerConfig::load(rig / "structure_learner.yaml")),
-        monitor(ModelMonitorConfig::load(rig / "model_monitor.yaml")) {
+        learner(learner_config(rig, is_ideal)),
+        monitor(monitor_config(rig, is_ideal)) {
     const camera_info_t info = make_info(camera_config.calibration, 0);
     estimator.on_camera_info(info);
     observer.on_camera_info(info);

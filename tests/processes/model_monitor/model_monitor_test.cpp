@@ -941,7 +941,7 @@ TEST(ModelMonitorConfigTest, IsReadInSiUnits) {
   const ModelMonitorConfig config = ModelMonitorConfig::load(file);
   EXPECT_EQ(config.max_mahalanobis2, 16);
   EXPECT_EQ(config.max_outlier_share, 0.25);
-  EXPECT_EQ(config.measurement.systematic.position_m, kTagSystematic.position_m);
+  EXPECT_EQ(config.measurement.systematic.position_m, 0.001);
   EXPECT_EQ(config.false_alarm_rate, 1e-6);
   std::ofstream(file) << "max_mahalanobis2: 0.5\n";
   EXPECT_THROW(ModelMonitorConfig::load(file), ConfigError);
