@@ -14,8 +14,6 @@
 #include <utility>
 #include <vector>
 
-#include "common/bus/convert.h"
-
 namespace bodyschema {
 namespace {
 
@@ -207,7 +205,11 @@ class Checker {
   /// Finite and positive definite, so that it can be inverted.
   void covariance(const char* field, const float (&triangle)[36]) {
     for (const float value : triangle) finite(field, double{value});
-    if (problem_.empty() && from_message(triangle).llt().info() != Eigen::Success)
+    if (!problem_.empty()) return;
+    Eigen::Matrix<double, 8, 8> lower = Eigen::Matrix<double, 8, 8>::Zero();
+    for (int i = 0, k = 0; i < 8; ++i)
+      for (int j = 0; j <= i; ++j, ++k) lower(i, j) = double{triangle[k]};
+    if (lower.llt().info() != Eigen::Success)
       complain(field, "is not positive definite");
   }
 

@@ -17,12 +17,12 @@ namespace bodyschema {
 /// same tags from the same side: no number of samples averages it out.
 struct MeasurementModel {
   /// Standard deviations per axis of ε, instead of each observation's own covariance.
-  std::optional<Noise> noise;
-  /// Multiplies the standard deviations of ε: 1 where what is told of them is true.
-  double scale = 1;
+  std::optional<Noise> noise = std::nullopt;
   /// Standard deviations per axis of β. Under-stating it refutes true models in the end;
   /// over-stating it hides joints and changes that move less.
-  Noise systematic;
+  Noise systematic = {};
+  /// Multiplies the standard deviations of ε: 1 where what is told of them is true.
+  double scale = 1;
   /// Expected share of a part's observations that are flips of planar tags or false detections.
   double outlier_rate = 0.03;
   /// A second reading of a planar part counts while its reprojection error is at most this multiple

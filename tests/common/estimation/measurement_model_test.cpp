@@ -100,7 +100,7 @@ TEST(MeasurementModel, ToldInThreeWaysIsTheSameDistanceToThePairsTheRootAndTheMo
 }
 
 TEST(MeasurementModel, ScalesTheNoiseAndLeavesTheSystematicError) {
-  MeasurementModel model{.noise = kNoise, .scale = 2, .systematic = {0.001, 0.002}};
+  MeasurementModel model{.noise = kNoise, .systematic = {0.001, 0.002}, .scale = 2};
   const PartObservation seen;
   const Matrix6d covariance = model.covariance(seen);
   EXPECT_NEAR(covariance(0, 0), 4 * 0.003 * 0.003 + 1e-6, 1e-9);
