@@ -165,7 +165,7 @@ class Arm2 : public testing::Test {
     const fs::path out = folder_ / ("replayed_" + process + ".lcmlog");
     const fs::path err = out.string() + ".err";
     EXPECT_EQ(shell(in_quotes(kBin / process) + " --config " +
-                    in_quotes(kSource / "config/arm2" / (process + ".yaml")) + " --in " +
+                    in_quotes(run("first") / "config" / (process + ".yaml")) + " --in " +
                     in_quotes(log_url(run("first") / "run.lcmlog.00")) + " --out " +
                     in_quotes("file://" + out.string() + "?mode=w") + " " + flags + " 2>" +
                     in_quotes(err)),
@@ -381,7 +381,7 @@ TEST_F(Arm2, AReplayFromTheLogGivesTheSameSchemaBytesTwice) {
   for (const char* name : {"replay1.lcmlog", "replay2.lcmlog"}) {
     const fs::path out = folder_ / name;
     ASSERT_EQ(shell(in_quotes(kBin / "structure_learner") + " --config " +
-                    in_quotes(kSource / "config/arm2/structure_learner.yaml") + " --in " +
+                    in_quotes(run("first") / "config/structure_learner.yaml") + " --in " +
                     in_quotes("file://" + (run("first") / "samples.lcmlog").string() + "?speed=0") +
                     " --out " + in_quotes("file://" + out.string() + "?mode=w") + " 2>/dev/null"),
               0);
@@ -392,7 +392,7 @@ TEST_F(Arm2, AReplayFromTheLogGivesTheSameSchemaBytesTwice) {
 TEST_F(Arm2, AReplayThroughTheMonitorGivesTheSameBodySchemaBytes) {
   const fs::path out = folder_ / "monitor.lcmlog";
   ASSERT_EQ(shell(in_quotes(kBin / "model_monitor") + " --config " +
-                  in_quotes(kSource / "config/arm2/model_monitor.yaml") + " --in " +
+                  in_quotes(run("first") / "config/model_monitor.yaml") + " --in " +
                   in_quotes("file://" + (run("first") / "run.lcmlog.00").string() + "?speed=0") +
                   " --out " + in_quotes("file://" + out.string() + "?mode=w") + " 2>/dev/null"),
             0);
@@ -406,7 +406,7 @@ TEST_F(Arm2, LogplayerOnALiveBusGivesTheSameSchemaBytes) {
       << payloads(run("first") / "run.lcmlog.00", "LEARNED_SCHEMA", true);
   const int status = shell(in_quotes(kSource / "tests/private_bus.sh") + " " +
                            in_quotes(kSource / "tests/pipeline/replay_live.sh") + " " +
-                           in_quotes(kBin) + " " + in_quotes(kSource / "config/arm2") + " " +
+                           in_quotes(kBin) + " " + in_quotes(run("first") / "config") + " " +
                            in_quotes(run("first") / "samples.lcmlog") + " " + in_quotes(expected));
   if (status == 77) GTEST_SKIP() << "no user namespaces";
   EXPECT_EQ(status, 0);

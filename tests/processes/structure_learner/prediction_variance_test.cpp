@@ -74,8 +74,8 @@ TEST(PredictionVariance, OfALearnedRobotIsWhatItSaysOnSamplesNotLearnedFrom) {
     EXPECT_GT(by_edges, 0.85 * 6 / 4) << seed;
     EXPECT_LT(by_edges, 1.15 * 6 / 2.75) << seed;
 
-    // First order is of the mean alone: about the truth that no marker blurs. It is that of edges
-    // fitted a pair at a time, an upper bound since all are fitted to all markers.
+    // First order is of the mean alone: about the truth that no marker blurs. It adds up edges as
+    // if they were independent, an upper bound: what the marker between two is off is in both.
     double squared = 0;
     constexpr int kActions = 200;
     for (int n = 0; n < kActions; ++n) {
@@ -91,9 +91,9 @@ TEST(PredictionVariance, OfALearnedRobotIsWhatItSaysOnSamplesNotLearnedFrom) {
   EXPECT_NEAR(mean(global_distance), 6.17, 0.4);
   // About 40 parameters of 360 numbers.
   EXPECT_NEAR(mean(trained_share), 1, 0.15);
-  // Fitted to all markers, errors are 1.4 to 2 times smaller than a pair at a time (learn.h: 1.6).
-  EXPECT_GT(mean(first_order), 6 / (2.0 * 2.0));
-  EXPECT_LT(mean(first_order), 6 / (1.4 * 1.4));
+  // Covariances of pairs fitted by themselves gave 6/1.6², those of the joint fit give half of 6.
+  EXPECT_GT(mean(first_order), 2.7);
+  EXPECT_LT(mean(first_order), 4.5);
 }
 
 }  // namespace
