@@ -158,6 +158,10 @@ struct BodySchema {
   Matrix6d X_CR_covariance = Matrix6d::Zero();
   std::vector<Signal> signals;
   std::vector<Edge> edges;  ///< ordered from the root outwards; `from` is nearer to the root
+  /// By part, right perturbation in its frame: what X_CR and the edges that meet there have in
+  /// common with opposite sign, for a part's frame is where its markers were seen. Along a path it
+  /// cancels. Of parts whose edges were fitted together.
+  std::map<int, Matrix6d> frame_covariances;
   std::vector<UnconnectedPart> unconnected;
   /// Signals of which the samples do not tell yet whether they move anything (indices, ascending).
   std::vector<int> undecided_signals;

@@ -1,5 +1,7 @@
 #include "common/schema/kinematic_path.h"
 
+#include <Eigen/Cholesky>
+#include <Eigen/Eigenvalues>
 #include <algorithm>
 #include <cmath>
 #include <map>
@@ -45,6 +47,19 @@ Matrix6d turned(const Matrix6d& covariance, const Pose& X) {
   return A * covariance * A.transpose();
 }
 
+/// covariance − shared, or as much of `shared` less as leaves a covariance.
+Matrix6d without(const Matrix6d& covariance, const Matrix6d& shared) {
+  const Matrix6d rest = covariance - shared;
+  if (Eigen::LLT<Matrix6d>(rest).info() == Eigen::Success) return rest;
+  const Eigen::LLT<Matrix6d> llt(covariance);
+  if (llt.info() != Eigen::Success) return covariance;
+  const Matrix6d whitened =
+      llt.matrixL().solve(llt.matrixL().solve(shared).transpose());  // L⁻¹ F L⁻ᵀ
+  const double most =
+      Eigen::SelfAdjointEigenSolver<Matrix6d>(whitened, Eigen::EigenvaluesOnly).eigenvalues()(5);
+  return covariance - shared / std::max(most, 1.0);
+}
+
 }  // namespace
 
 std::optional<KinematicPath> KinematicPath::between(const BodySchema& schema, int from, int to) {
@@ -53,7 +68,10 @@ std::optional<KinematicPath> KinematicPath::between(const BodySchema& schema, in
   KinematicPath path;
   path.signals_ = schema.signals;
   for (const auto& [edge, is_forward] : *edges) {
+    const auto start = schema.frame_covariances.find(is_forward ? edge->from : edge->to);
     path.legs_.push_back({*edge, is_forward});
+    if (path.legs_.size() > 1 && start != schema.frame_covariances.end())
+      path.legs_.back().start = start->second;
     if (!is_screw_chain(*edge)) {
       path.steps_.push_back({.leg = static_cast<int>(path.legs_.size()) - 1});
     } else if (is_forward) {
@@ -209,6 +227,10 @@ Matrix6d KinematicPath::covariance(const Eigen::Ref<const Eigen::VectorXd>& acti
     if (!leg.is_forward) {
       covariance = turned(covariance, X);
       X = X.inverse();
+    }
+    if (leg.start && variance == Variance::kFirstOrder) {
+      sum = without(sum, *leg.start);
+      covariance = turned(without(turned(covariance, X), *leg.start), X.inverse());
     }
     sum = turned(sum, X.inverse()) + covariance;
   }

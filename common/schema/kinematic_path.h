@@ -30,7 +30,8 @@ class KinematicPath {
   /// The same, and its derivative by the action, 6×m: right perturbation in frame B,
   /// predict(q + δ) = predict(q) · exp(J δ + O(δ²)).
   Pose predict(const Eigen::Ref<const Eigen::VectorXd>& action, PoseJacobian* jacobian) const;
-  /// Right perturbation in frame B.
+  /// Right perturbation in frame B. Of first order, what the legs have in common
+  /// (BodySchema::frame_covariances) is taken out; else they add up as if independent.
   Matrix6d covariance(const Eigen::Ref<const Eigen::VectorXd>& action, Variance variance) const;
 
   /// The columns of `actions`, m×T, one after another.
@@ -44,6 +45,8 @@ class KinematicPath {
   struct Leg {
     Edge edge;
     bool is_forward = true;
+    /// BodySchema::frame_covariances of the part between the leg before and this one.
+    std::optional<Matrix6d> start = std::nullopt;
   };
   /// What moves, and the constant transform X_after up to the next that moves: a screw motion along
   /// and about z, or else a leg of another kind, asked as a whole.

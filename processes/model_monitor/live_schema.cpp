@@ -277,6 +277,14 @@ void LiveSchema::update(const ActionPoseSample& sample, std::optional<std::int64
     else if (next.X_CR.matrix() == base_.X_CR.matrix())
       camera_since_ = base_.changes.empty() ? 0 : base_.changes.back().since;
   }
+  // What edges have in common holds of those that were fitted together.
+  next.frame_covariances = base_.frame_covariances;
+  if (next.X_CR.matrix() != base_.X_CR.matrix()) next.frame_covariances.erase(next.root);
+  for (std::size_t e = 0; e < next.edges.size(); ++e) {
+    if (is_same_model(next.edges[e], base_.edges[e])) continue;
+    next.frame_covariances.erase(next.edges[e].from);
+    next.frame_covariances.erase(next.edges[e].to);
+  }
   std::int64_t since = camera_since_;
   for (const Edge& edge : next.edges) since = std::max(since, edge.valid_since_sample);
   next.changes = schema_.changes;

@@ -212,7 +212,11 @@ void fit_jointly(const std::vector<ActionPoseSample>& samples, const NormalizedA
     }
   }
   schema->X_CR = fit.root_pose();
-  if (covariance) schema->X_CR_covariance = covariance->root;
+  if (!covariance) return;
+  schema->X_CR_covariance = covariance->root;
+  for (std::size_t k = 0; k < fit.nodes().size(); ++k)
+    if (!covariance->frames[k].isZero(0))
+      schema->frame_covariances[fit.nodes()[k].part] = covariance->frames[k];
 }
 
 // Which part is to blame where edges disagree with the data at one instant.

@@ -14,7 +14,7 @@
 namespace bodyschema {
 
 /// MeasurementModel::systematic of tags, where no rig's noise.yaml says it: recordings of camera
-/// markers are learned with this. The rigs say the same.
+/// markers are learned with this.
 inline constexpr Noise kTagSystematic{.position_m = 0.0007, .rotation_rad = 0.14 * kDegree};
 
 /// X_CR of `schema` with its covariance: the robust mean of the poses of its root, Student-t

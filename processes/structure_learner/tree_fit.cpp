@@ -11,6 +11,7 @@
 #include <type_traits>
 
 #include "processes/structure_learner/screen.h"
+#include "processes/structure_learner/tree_fit_normal.h"
 
 namespace bodyschema {
 namespace {
@@ -56,35 +57,6 @@ bool is_at_rest(const PairData& data, const NormalizedActions& actions,
   return check_validity(fit, leave_one_out(fit, data, actions), data, actions, options).verdict ==
          Verdict::kValid;
 }
-
-// Gauss–Newton quantities, all twists in the camera's frame.
-struct TreeFit::Normal {
-  Eigen::MatrixXd H;
-  Eigen::VectorXd g;
-  std::vector<int> offset;           // of a node's parameters; the root's 6 come first if it rests
-  std::vector<ParameterJacobian> S;  // at(frame, node): 6 × parameters of its edge
-  std::vector<Matrix6d> I;           // at(frame, node): information of the markers from there on
-  std::vector<Vector6d> gradient;
-  std::vector<Matrix6d> own_I;  // of the node's own marker
-  std::vector<Vector6d> own_gradient;
-  std::vector<Matrix6d> inverse_total;  // a frame: I of the root, inverted
-  double scale = 1;  // variance of the weighted residuals over what the weights say
-
-  double noise_scale() const { return std::max(scale, 0.25); }
-
-  // H⁻¹; std::nullopt where there is nothing to invert. The gauge directions of the screws' frames
-  // have no information: a ridge leaves them at rest.
-  std::optional<Eigen::MatrixXd> inverse() const {
-    if (H.rows() == 0) return std::nullopt;
-    const Eigen::VectorXd unit = H.diagonal().cwiseMax(1e-300).cwiseSqrt().cwiseInverse();
-    Eigen::MatrixXd scaled = unit.asDiagonal() * H * unit.asDiagonal();
-    scaled.diagonal().array() += 1e-9;
-    const Eigen::LLT<Eigen::MatrixXd> llt(scaled);
-    if (llt.info() != Eigen::Success) return std::nullopt;
-    return unit.asDiagonal() * llt.solve(Eigen::MatrixXd::Identity(H.rows(), H.rows())) *
-           unit.asDiagonal();
-  }
-};
 
 TreeFit::TreeFit(std::vector<TreeNode> nodes, std::vector<PairData> data,
                  const NormalizedActions& actions, bool root_rests)
@@ -250,83 +222,6 @@ TreeFit::Normal TreeFit::normal_equations() const {
   result.H = Eigen::MatrixXd(result.H.selfadjointView<Eigen::Lower>());
   const double dof = std::max(6.0 * count - size - (root_rests_ ? 0 : 6 * num_frames()), 1.0);
   if (weights > 0) result.scale = weighted / weights / 6 * (6.0 * count / dof);
-  return result;
-}
-
-std::optional<TreeFit::Covariance> TreeFit::covariance(const Matrix6d& systematic) const {
-  const Normal normal = normal_equations();
-  const auto size = normal.H.rows();
-  if (size == 0) return std::nullopt;
-  const int n = static_cast<int>(nodes_.size());
-  // By (node, view): G, parameters × 6.
-  std::map<std::pair<int, int>, Eigen::MatrixXd> considered;
-  double weight = 0;
-  int inliers = 0;
-  for (int t = 0; t < num_frames(); ++t) {
-    for (int k = 0; k < n; ++k) {
-      const int index = at(t, k);
-      const int frame = frame_index_[index];
-      if (frame < 0) continue;
-      const FrameFit& fit = fits_[index];
-      const double w = robust_weight(fit.squared_distance);
-      if (fit.squared_distance < kOutlierThreshold) {
-        weight += w;
-        ++inliers;
-      }
-      // The error of the marker as a twist in the camera's frame, weighed.
-      const PairHypothesis& h = data_[k].hypotheses[fit.hypothesis];
-      const Matrix6d WX =
-          w * adjoint(poses_[index].inverse()).transpose() * h.whitening.transpose() * h.whitening;
-      Eigen::MatrixXd& G =
-          considered.try_emplace({k, data_[k].frames[frame].view}, Eigen::MatrixXd::Zero(size, 6))
-              .first->second;
-      for (int e = k;; e = nodes_[e].parent) {
-        const ParameterJacobian& S = normal.S[at(t, e)];
-        if (e != 0 || root_rests_) G.middleRows(normal.offset[e], S.cols()) += S.transpose() * WX;
-        if (nodes_[e].parent < 0) break;
-      }
-    }
-  }
-  if (inliers == 0) return std::nullopt;
-  Eigen::MatrixXd H = normal.H;
-  // A screw frame may turn about its axis and slide along it: these directions get the variance
-  // of a direction that is known well, and no prediction depends on them.
-  for (int k = 1; k < n; ++k)
-    for (int d = 0; d < nodes_[k].model.num_joints; ++d)
-      for (const int component : {2, 5}) {
-        Vector6d before = Vector6d::Zero();
-        before(component) = 1;
-        const Vector6d after = -adjoint(nodes_[k].model.A[d + 1].inverse()) * before;
-        Eigen::VectorXd gauge = Eigen::VectorXd::Zero(size);
-        gauge.segment<6>(normal.offset[k] + 8 * d) = before;
-        gauge.segment<6>(normal.offset[k] + 8 * (d + 1)) = after;
-        const double information =
-            gauge.dot(normal.H.diagonal().cwiseProduct(gauge)) / std::pow(gauge.squaredNorm(), 2);
-        H += information * gauge * gauge.transpose();
-      }
-  const Eigen::VectorXd unit = H.diagonal().cwiseMax(1e-300).cwiseSqrt().cwiseInverse();
-  Eigen::MatrixXd scaled = unit.asDiagonal() * H * unit.asDiagonal();
-  // What the data hardly determine (where the axis of a sliding joint lies) stays finite in float.
-  scaled.diagonal().array() += 1e-7;
-  const Eigen::LLT<Eigen::MatrixXd> llt(scaled);
-  if (llt.info() != Eigen::Success) return std::nullopt;
-  const Eigen::MatrixXd inverse =
-      unit.asDiagonal() * llt.solve(Eigen::MatrixXd::Identity(size, size)) * unit.asDiagonal();
-  const Eigen::LLT<Matrix6d> root_of_systematic(systematic);
-  const Matrix6d L = root_of_systematic.matrixL();
-  // The robust weights are relative: an inlier counts as one measurement, on the average.
-  Eigen::MatrixXd joint = weight / inliers * inverse;
-  for (const auto& [view, G] : considered) {
-    const Eigen::MatrixXd moved = inverse * (G * L);
-    joint += moved * moved.transpose();
-  }
-  Covariance result;
-  result.models.resize(n);
-  if (root_rests_) result.root = joint.topLeftCorner<6, 6>();
-  for (int k = 1; k < n; ++k) {
-    const int p = nodes_[k].model.num_parameters();
-    result.models[k] = joint.block(normal.offset[k], normal.offset[k], p, p);
-  }
   return result;
 }
 

@@ -217,15 +217,5 @@ TEST_F(RecordedLogTest, WhatIsNoRunIsAClearError) {
   EXPECT_NE(text.err().find("text: is not an LCM log"), std::string::npos);
 }
 
-// The rigs' files and the console agree.
-TEST(TagSystematicTest, IsTheRigs) {
-  for (const auto& rig : fs::directory_iterator(BODYSCHEMA_CONFIG)) {
-    if (!fs::is_directory(rig.path())) continue;
-    const Noise noise = load_noise(rig.path(), "ideal_noise.yaml").measurement.systematic;
-    EXPECT_DOUBLE_EQ(noise.position_m, kTagSystematic.position_m) << rig.path();
-    EXPECT_DOUBLE_EQ(noise.rotation_rad, kTagSystematic.rotation_rad) << rig.path();
-  }
-}
-
 }  // namespace
 }  // namespace bodyschema

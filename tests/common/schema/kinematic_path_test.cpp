@@ -200,45 +200,83 @@ TEST(KinematicPath, ATrajectoryIsItsInstants) {
   }
 }
 
-// A hundred thousand robots whose parameters are drawn from the covariance that each edge states.
+/// How the parameters of an edge change where the frames of its two parts are off: 6 columns for
+/// each part.
+Eigen::MatrixXd by_frames(const Edge& edge) {
+  const Eigen::Index size = 6 + 8 * static_cast<Eigen::Index>(edge.joints.size());
+  Eigen::MatrixXd G = Eigen::MatrixXd::Zero(size, 12);
+  G.topLeftCorner<6, 6>() = -adjoint(edge.left.inverse());
+  G.bottomRightCorner<6, 6>() = adjoint(edge.right);
+  return G;
+}
+
+// A hundred thousand robots whose parameters are drawn from the covariance that each edge states;
+// then also the frames of the parts, which the edges that meet there share.
 TEST(KinematicPath, FirstOrderCovarianceIsThatOfDrawnParameters) {
-  Rng rng(4);
-  BodySchema schema = random_schema(rng);
-  schema.edges.pop_back();
-  const Eigen::VectorXd q = random_action(rng), theta = schema.displacements(q);
-  const auto path = KinematicPath::between(schema, 6, 4);
-  const Pose inverse = path->predict(q).inverse();
-  std::vector<Eigen::MatrixXd> roots;
-  for (const Edge& edge : schema.edges)
-    roots.push_back(Eigen::LLT<Eigen::MatrixXd>(edge.parameter_covariance).matrixL());
-  Matrix6d drawn = Matrix6d::Zero();
-  constexpr int kDraws = 100'000;
-  BodySchema robot = schema;
-  for (int n = 0; n < kDraws; ++n) {
-    for (std::size_t e = 0; e < schema.edges.size(); ++e) {
-      Edge& edge = robot.edges[e];
-      edge = schema.edges[e];
-      const Eigen::VectorXd delta = roots[e] * Eigen::VectorXd::NullaryExpr(roots[e].rows(), [&] {
-                                      return test::gaussian(rng);
-                                    });
-      edge.left = edge.left * exp(delta.head<6>());
-      for (std::size_t d = 0; d < edge.joints.size(); ++d) {
-        const auto first = 6 + 8 * static_cast<Eigen::Index>(d);
-        edge.joints[d].slide += delta(first);
-        edge.joints[d].turn += delta(first + 1);
-        edge.joints[d].X_after = edge.joints[d].X_after * exp(delta.segment<6>(first + 2));
+  for (const bool in_common : {false, true}) {
+    Rng rng(4);
+    BodySchema schema = random_schema(rng);
+    schema.edges.pop_back();
+    const Eigen::VectorXd q = random_action(rng), theta = schema.displacements(q);
+    std::vector<Eigen::MatrixXd> roots;
+    for (const Edge& edge : schema.edges)
+      roots.push_back(Eigen::LLT<Eigen::MatrixXd>(edge.parameter_covariance).matrixL());
+    if (in_common) {
+      for (const int part : schema.parts) {
+        const Matrix6d root = Matrix6d::NullaryExpr([&] { return 2e-4 * test::gaussian(rng); });
+        schema.frame_covariances[part] = root * root.transpose();
+      }
+      for (Edge& edge : schema.edges) {
+        const Eigen::MatrixXd G = by_frames(edge);
+        int column = 0;
+        for (const int part : {edge.from, edge.to}) {
+          const auto G_part = G.middleCols<6>(column);
+          edge.parameter_covariance +=
+              G_part * schema.frame_covariances.at(part) * G_part.transpose();
+          column += 6;
+        }
       }
     }
-    const Pose X_64 = robot.edges[3].predict(theta).inverse() *
-                      robot.edges[1].predict(theta).inverse() * robot.edges[2].predict(theta);
-    const Vector6d e = log(inverse * X_64);
-    drawn += e * e.transpose() / kDraws;
+    const auto path = KinematicPath::between(schema, 6, 4);
+    const Pose inverse = path->predict(q).inverse();
+    Matrix6d drawn = Matrix6d::Zero();
+    constexpr int kDraws = 100'000;
+    BodySchema robot = schema;
+    for (int n = 0; n < kDraws; ++n) {
+      std::map<int, Vector6d> frames;
+      for (const auto& [part, covariance] : schema.frame_covariances)
+        frames[part] = Eigen::LLT<Matrix6d>(covariance).matrixL() *
+                       Vector6d::NullaryExpr([&] { return test::gaussian(rng); });
+      for (std::size_t e = 0; e < schema.edges.size(); ++e) {
+        Edge& edge = robot.edges[e];
+        edge = schema.edges[e];
+        Eigen::VectorXd delta = roots[e] * Eigen::VectorXd::NullaryExpr(roots[e].rows(), [&] {
+                                  return test::gaussian(rng);
+                                });
+        if (in_common) {
+          Eigen::VectorXd of_both(12);
+          of_both << frames.at(edge.from), frames.at(edge.to);
+          delta += by_frames(edge) * of_both;
+        }
+        edge.left = edge.left * exp(delta.head<6>());
+        for (std::size_t d = 0; d < edge.joints.size(); ++d) {
+          const auto first = 6 + 8 * static_cast<Eigen::Index>(d);
+          edge.joints[d].slide += delta(first);
+          edge.joints[d].turn += delta(first + 1);
+          edge.joints[d].X_after = edge.joints[d].X_after * exp(delta.segment<6>(first + 2));
+        }
+      }
+      const Pose X_64 = robot.edges[3].predict(theta).inverse() *
+                        robot.edges[1].predict(theta).inverse() * robot.edges[2].predict(theta);
+      const Vector6d e = log(inverse * X_64);
+      drawn += e * e.transpose() / kDraws;
+    }
+    // Relative to the drawn one the eigenvalues are 1, within 5 standard deviations of √(2/n).
+    const Eigen::GeneralizedSelfAdjointEigenSolver<Matrix6d> ratio(
+        path->covariance(q, Variance::kFirstOrder), drawn);
+    EXPECT_GT(ratio.eigenvalues().minCoeff(), 0.975) << in_common;
+    EXPECT_LT(ratio.eigenvalues().maxCoeff(), 1.025) << in_common;
   }
-  // Relative to the drawn one the eigenvalues are 1, within 5 standard deviations of √(2/n).
-  const Eigen::GeneralizedSelfAdjointEigenSolver<Matrix6d> ratio(
-      path->covariance(q, Variance::kFirstOrder), drawn);
-  EXPECT_GT(ratio.eigenvalues().minCoeff(), 0.975);
-  EXPECT_LT(ratio.eigenvalues().maxCoeff(), 1.025);
 }
 
 TEST(KinematicPath, EmpiricalCovarianceIsThatOfEdgesThatScatterAsTheySay) {

@@ -74,8 +74,7 @@ TEST(PredictionVariance, OfALearnedRobotIsWhatItSaysOnSamplesNotLearnedFrom) {
     EXPECT_GT(by_edges, 0.85 * 6 / 4) << seed;
     EXPECT_LT(by_edges, 1.15 * 6 / 2.75) << seed;
 
-    // First order is of the mean alone: about the truth that no marker blurs. It adds up edges as
-    // if they were independent, an upper bound: what the marker between two is off is in both.
+    // First order is of the mean alone: about the truth that no marker blurs.
     double squared = 0;
     constexpr int kActions = 200;
     for (int n = 0; n < kActions; ++n) {
@@ -84,16 +83,15 @@ TEST(PredictionVariance, OfALearnedRobotIsWhatItSaysOnSamplesNotLearnedFrom) {
       const Vector6d e = log(path->predict(q).inverse() * truth.at(1).inverse() * truth.at(5));
       squared += e.dot(path->covariance(q, Variance::kFirstOrder).ldlt().solve(e)) / kActions;
     }
-    EXPECT_LT(squared, 6) << seed;
     first_order.push_back(squared);
   }
   // Over the robots; the tails of a path that turns are somewhat heavier than a Gaussian's.
   EXPECT_NEAR(mean(global_distance), 6.17, 0.4);
   // About 40 parameters of 360 numbers.
   EXPECT_NEAR(mean(trained_share), 1, 0.15);
-  // Covariances of pairs fitted by themselves gave 6/1.6², those of the joint fit give half of 6.
-  EXPECT_GT(mean(first_order), 2.7);
-  EXPECT_LT(mean(first_order), 4.5);
+  // What two edges have in common with opposite sign is taken out: added up as if independent they
+  // gave half of it. (150 robots: 6.2 ± 0.2.)
+  EXPECT_NEAR(mean(first_order), 6, 1.2);
 }
 
 }  // namespace

@@ -1,0 +1,41 @@
+#pragma once
+
+#include <Eigen/Cholesky>
+#include <algorithm>
+#include <optional>
+#include <vector>
+
+#include "processes/structure_learner/tree_fit.h"
+
+namespace bodyschema {
+
+/// Gauss–Newton quantities, all twists in the camera's frame.
+struct TreeFit::Normal {
+  Eigen::MatrixXd H;
+  Eigen::VectorXd g;
+  std::vector<int> offset;           // of a node's parameters; the root's 6 come first if it rests
+  std::vector<ParameterJacobian> S;  // at(frame, node): 6 × parameters of its edge
+  std::vector<Matrix6d> I;           // at(frame, node): information of the markers from there on
+  std::vector<Vector6d> gradient;
+  std::vector<Matrix6d> own_I;  // of the node's own marker
+  std::vector<Vector6d> own_gradient;
+  std::vector<Matrix6d> inverse_total;  // a frame: I of the root, inverted
+  double scale = 1;  // variance of the weighted residuals over what the weights say
+
+  double noise_scale() const { return std::max(scale, 0.25); }
+
+  // H⁻¹; std::nullopt where there is nothing to invert. The gauge directions of the screws' frames
+  // have no information: a ridge leaves them at rest.
+  std::optional<Eigen::MatrixXd> inverse() const {
+    if (H.rows() == 0) return std::nullopt;
+    const Eigen::VectorXd unit = H.diagonal().cwiseMax(1e-300).cwiseSqrt().cwiseInverse();
+    Eigen::MatrixXd scaled = unit.asDiagonal() * H * unit.asDiagonal();
+    scaled.diagonal().array() += 1e-9;
+    const Eigen::LLT<Eigen::MatrixXd> llt(scaled);
+    if (llt.info() != Eigen::Success) return std::nullopt;
+    return unit.asDiagonal() * llt.solve(Eigen::MatrixXd::Identity(H.rows(), H.rows())) *
+           unit.asDiagonal();
+  }
+};
+
+}  // namespace bodyschema
