@@ -15,6 +15,7 @@
 #include <vector>
 
 #include "common/bus/bus.h"
+#include "common/bus/event_log.h"
 #include "tests/common/bus/bus_test_support.h"
 #include "tests/lcmtypes/example_messages.h"
 
@@ -100,6 +101,43 @@ TEST(BusOverUdp, ASchemaOfTwoHundredPartsIsHeardWholeFromTwoSendersAtOnce) {
   }
   EXPECT_GT(num_datagrams, 2 * num_pieces);
   EXPECT_LE(largest, kLargestDatagram);
+}
+
+TEST(BusOverUdp, PiecesAreRecordedByLcmLoggerAndPlayedByLcmLogplayer) {
+  const TemporaryFolder folder;
+  const std::string file = (folder / "run").string();
+  const body_schema_t schema = large_schema(200);
+  const std::vector<std::uint8_t> bytes = encode(kBodySchema, schema);
+  {
+    Bus sender("", kUrl);
+    Program logger(
+        {"lcm-logger", std::string("--lcm-url=") + kUrl + "&recv_buf_size=4194304", file});
+    std::error_code none;
+    ASSERT_TRUE(ask_until(
+        [&] {
+          sender.publish(kBodySchema, schema);
+          std::this_thread::sleep_for(milliseconds(20));
+        },
+        [&] { return std::filesystem::file_size(file, none) > 3 * bytes.size() && !none; }));
+    logger.send_signal(SIGTERM);
+    EXPECT_EQ(logger.wait(), 0) << logger.err();
+  }
+  LogReader pieces(file, OnDamage::kThrow, 0, Pieces::kAsRecorded);
+  ASSERT_TRUE(pieces.next());
+  EXPECT_TRUE(is_piece(pieces.event().data));
+  const auto recorded = read_log(file, kBodySchema);
+  ASSERT_GE(recorded.size(), 2U);
+  for (const body_schema_t& message : recorded) EXPECT_EQ(encode(kBodySchema, message), bytes);
+
+  Bus receiver(kUrl, "");
+  std::size_t num_heard = 0;
+  receiver.subscribe(kBodySchema, [&](const body_schema_t& message) {
+    EXPECT_EQ(encode(kBodySchema, message), bytes);
+    ++num_heard;
+  });
+  Program player({"lcm-logplayer", std::string("--lcm-url=") + kUrl, file});
+  EXPECT_TRUE(handle_until(receiver, [&] { return num_heard == recorded.size(); }));
+  EXPECT_EQ(player.wait(), 0) << player.err();
 }
 
 TEST(BusOverUdp, ABurstOfAThousandMessagesIsNotLost) {
