@@ -199,6 +199,7 @@ struct Bus::Impl {
     std::int64_t malformed = 0;
     std::int64_t senseless = 0;
     std::int64_t skipped = 0;
+    PieceJoiner pieces;
     Impl* bus = nullptr;
   };
   struct Pending {
@@ -230,6 +231,7 @@ struct Bus::Impl {
   std::map<std::string, std::int64_t> published;
   std::map<std::string, std::int64_t> failed;  ///< not sent, by channel
   bool is_sending = true;
+  PieceMaker piece_maker;
   std::int64_t truncated_logs = 0;
 
   void open_log(const Url& url) {
@@ -282,18 +284,36 @@ struct Bus::Impl {
     }
   }
 
-  void dispatch(ChannelState& channel, const void* data, std::size_t size) {
-    Incoming incoming = channel.decoder(data, size);
+  /// A piece is handled with the last one of its message.
+  void receive(ChannelState& channel, std::span<const std::uint8_t> bytes) {
+    if (!is_piece(bytes)) return dispatch(channel, bytes);
+    std::string problem;
+    std::unique_lock lock(mutex);
+    const auto whole = channel.pieces.add(bytes, &problem);
+    if (!problem.empty()) {
+      ++channel.received;
+      count_dropped(channel, problem, true);
+    }
+    lock.unlock();
+    if (whole) dispatch(channel, *whole);
+  }
+
+  /// Requires the mutex.
+  void count_dropped(ChannelState& channel, const std::string& problem, bool is_malformed) {
+    std::int64_t& count = is_malformed ? channel.malformed : channel.senseless;
+    if (++count == 1) {
+      spdlog::warn("{}: dropped a {} message: {} (further ones are only counted)", channel.name,
+                   is_malformed ? "malformed" : "senseless", problem);
+    }
+  }
+
+  void dispatch(ChannelState& channel, std::span<const std::uint8_t> bytes) {
+    Incoming incoming = channel.decoder(bytes.data(), bytes.size());
     {
       const std::scoped_lock lock(mutex);
       ++channel.received;
       if (incoming.message == nullptr) {
-        std::int64_t& count = incoming.is_malformed ? channel.malformed : channel.senseless;
-        if (++count == 1) {
-          spdlog::warn("{}: dropped a {} message: {} (further ones are only counted)", channel.name,
-                       incoming.is_malformed ? "malformed" : "senseless", incoming.problem);
-        }
-        return;
+        return count_dropped(channel, incoming.problem, incoming.is_malformed);
       }
     }
     if (channel.name != kProcessInfo.name) last_utime = std::max(last_utime, incoming.utime);
@@ -342,11 +362,26 @@ struct Bus::Impl {
   }
 
   /// Lets LCM hand over what has arrived, without waiting.
-  void receive() {
+  void take_from_lcm() {
     // Never lcm_handle(): on memq:// it crashes when a signal interrupts its wait.
     if (lcm_handle_timeout(input.get(), 0) < 0 && errno != EINTR && errno != EAGAIN) {
       throw url_error(in_url, "the connection broke");
     }
+  }
+
+  /// −1, or errno, which may be 0.
+  int send(const std::string& channel, std::span<const std::uint8_t> bytes) {
+    errno = 0;
+    return lcm_publish(output.get(), channel.c_str(), bytes.data(),
+                       static_cast<unsigned>(bytes.size())) < 0
+               ? errno
+               : -1;
+  }
+
+  int send_pieces(const std::string& channel, std::span<const std::uint8_t> bytes) {
+    for (const auto& piece : piece_maker.split(bytes))
+      if (const int error = send(channel, piece); error >= 0) return error;
+    return -1;
   }
 
   bool handle_live(std::chrono::milliseconds timeout) {
@@ -362,11 +397,11 @@ struct Bus::Impl {
     }
     const Clock::time_point begin = Clock::now();
     do {
-      if (pending.empty()) receive();
+      if (pending.empty()) take_from_lcm();
       if (pending.empty()) break;
       const Pending message = std::move(pending.front());
       pending.pop_front();
-      dispatch(*message.channel, message.bytes.data(), message.bytes.size());
+      receive(*message.channel, message.bytes);
     } while (Clock::now() - begin < kLongestBatch);
     dispatch_newest();
     return true;
@@ -403,7 +438,7 @@ struct Bus::Impl {
       log_event_utime = event.event_utime;
       // First, so that an exception of a handler does not bring the same event again.
       advance_log();
-      dispatch(channel->second, event.data.data(), event.data.size());
+      dispatch(channel->second, event.data);
       dispatch_newest();
       return true;
     }
@@ -461,7 +496,8 @@ void Bus::subscribe_raw(const std::string& channel, Decoder decoder, int queue_c
   state.subscribers.push_back({std::move(handler), latest_only, nullptr});
 }
 
-void Bus::publish_raw(const std::string& channel, std::span<const std::uint8_t> bytes) {
+void Bus::publish_raw(const std::string& channel, std::span<const std::uint8_t> bytes,
+                      bool may_be_split) {
   if (channel.empty() || channel.size() > LCM_MAX_CHANNEL_NAME_LENGTH) {
     throw std::logic_error("a channel's name has 1 to 63 bytes: \"" + channel + "\"");
   }
@@ -472,10 +508,10 @@ void Bus::publish_raw(const std::string& channel, std::span<const std::uint8_t> 
     impl_->output_log->append_bytes(channel, bytes,
                                     is_replay() ? impl_->log_event_utime : now.count());
   } else if (impl_->output != nullptr) {
-    errno = 0;
-    if (lcm_publish(impl_->output.get(), channel.c_str(), bytes.data(),
-                    static_cast<unsigned>(bytes.size())) < 0) {
-      const int error = errno;
+    const int error = may_be_split && bytes.size() > kLargestDatagram
+                          ? impl_->send_pieces(channel, bytes)
+                          : impl_->send(channel, bytes);
+    if (error >= 0) {
       const std::string problem =
           fmt::format("{}: cannot send {}: {}", impl_->out_url, channel,
                       error != 0 ? std::strerror(error) : "LCM refuses the message");
@@ -513,9 +549,13 @@ std::map<std::string, std::int64_t> Bus::counters() const {
     counters["malformed " + channel->name] = channel->malformed;
     counters["senseless " + channel->name] = channel->senseless;
     counters["skipped " + channel->name] = channel->skipped;
+    if (const std::int64_t lost = channel->pieces.num_lost(); lost > 0)
+      counters["incomplete " + channel->name] = lost;
   }
   for (const auto& [channel, count] : impl_->published) counters["published " + channel] = count;
   for (const auto& [channel, count] : impl_->failed) counters["send failed " + channel] = count;
+  if (impl_->log != nullptr && impl_->log->report().incomplete > 0)
+    counters["incomplete messages of log"] = impl_->log->report().incomplete;
   if (impl_->truncated_logs > 0) counters["truncated log"] = impl_->truncated_logs;
   return counters;
 }

@@ -20,7 +20,8 @@ namespace bodyschema {
 /// where both URLs are equal and live), and closes LCM's traps: a message must decode to its last
 /// byte and make sense (check()) or it is dropped, counted and reported once a channel; handlers
 /// run after LCM has returned, so their exceptions leave through handle() and never through LCM's C
-/// frames; EINTR is no error; channel names are matched literally; a dead URL throws here, at once.
+/// frames; EINTR is no error; a message in pieces is handled when it is whole; channel names are
+/// matched literally; a dead URL throws here, at once.
 ///
 /// | URL                                     | in                        | out | |
 /// udpm://239.255.76.67:7667?ttl=0         | multicast (live)          | multicast                |
@@ -65,14 +66,16 @@ class Bus {
                   erase(std::move(handler)), true);
   }
 
-  /// Encodes and sends. A message that does not pass check() is a bug: @throws std::logic_error.
-  /// @throws std::runtime_error if the disk is full or the relay gone. A datagram that cannot be
-  /// sent (the interface is down) is lost: counted as "send failed CHANNEL" and warned of once. In
-  /// a log the event time is now, in a replay that of the event in hand: a replayed log makes the
-  /// same bytes again.
+  /// Encodes and sends; beyond kLargestDatagram in pieces, images excepted (common/bus/pieces.h). A
+  /// log gets the whole message. A message that does not pass check() is a bug: @throws
+  /// std::logic_error.
+  /// @throws std::runtime_error if it is larger than kLargestOf, the disk is full or the relay
+  /// gone. A datagram that cannot be sent (the interface is down) is lost: counted as "send failed
+  /// CHANNEL" and warned of once. In a log the event time is now, in a replay that of the event in
+  /// hand: a replayed log makes the same bytes again.
   template <class Message>
   void publish(const Channel<Message>& channel, const Message& message) {
-    publish_raw(channel.name, encode(channel, message));
+    publish_raw(channel.name, encode(channel, message), !std::is_same_v<Message, camera_image_t>);
   }
 
   /// Waits up to `timeout` for a message, then dispatches all that is there (for at most 100 ms, so
@@ -94,8 +97,9 @@ class Bus {
   /// where the input is no log or an empty one.
   std::int64_t event_utime() const;
   /// "received CHANNEL" (all that arrived), "malformed CHANNEL", "senseless CHANNEL", "skipped
-  /// CHANNEL" for every channel subscribed to, "published CHANNEL", "send failed CHANNEL",
-  /// "truncated log" → count.
+  /// CHANNEL" for every channel subscribed to, "incomplete CHANNEL" (messages of which a piece was
+  /// lost, where there are any), "published CHANNEL", "send failed CHANNEL",
+  /// "truncated log", "incomplete messages of log" → count.
   std::map<std::string, std::int64_t> counters() const;
 
  private:
@@ -138,7 +142,8 @@ class Bus {
 
   void subscribe_raw(const std::string& channel, Decoder decoder, int queue_capacity,
                      Handler handler, bool latest_only);
-  void publish_raw(const std::string& channel, std::span<const std::uint8_t> bytes);
+  void publish_raw(const std::string& channel, std::span<const std::uint8_t> bytes,
+                   bool may_be_split);
 
   struct Impl;
   std::unique_ptr<Impl> impl_;

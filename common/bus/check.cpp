@@ -2,7 +2,6 @@
 
 #include <spdlog/fmt/fmt.h>
 
-#include <Eigen/Cholesky>
 #include <Eigen/Eigenvalues>
 #include <algorithm>
 #include <cmath>
@@ -13,6 +12,8 @@
 #include <string_view>
 #include <utility>
 #include <vector>
+
+#include "common/bus/triangle.h"
 
 namespace bodyschema {
 namespace {
@@ -39,9 +40,6 @@ constexpr std::int64_t kMaxImageBytes = std::int64_t{1} << 28;
 constexpr std::size_t kMaxName = 1'000;
 constexpr std::size_t kMaxText = 1'000'000;
 constexpr double kUnitTolerance = 1e-3;
-/// Relative to the diagonal: what rounding to double and back through text may cost.
-constexpr double kSymmetryTolerance = 1e-6;
-constexpr double kNegativeEigenvalue = 1e-6;
 /// parameter_covariance is float.
 constexpr double kCorrelationTolerance = 1e-3;
 
@@ -202,46 +200,26 @@ class Checker {
     path_.pop_back();
   }
 
-  /// Finite and positive definite, so that it can be inverted.
-  void covariance(const char* field, const float (&triangle)[36]) {
+  /// Finite and positive semidefinite, up to rounding to float. `is_required`: with a positive
+  /// diagonal.
+  template <int Side, std::size_t N>
+  void covariance(const char* field, const float (&triangle)[N], bool is_required) {
+    static_assert(N == Side * (Side + 1) / 2);
     for (const float value : triangle) finite(field, double{value});
     if (!problem_.empty()) return;
-    Eigen::Matrix<double, 8, 8> lower = Eigen::Matrix<double, 8, 8>::Zero();
-    for (int i = 0, k = 0; i < 8; ++i)
-      for (int j = 0; j <= i; ++j, ++k) lower(i, j) = double{triangle[k]};
-    if (lower.llt().info() != Eigen::Success)
-      complain(field, "is not positive definite");
-  }
-
-  /// Finite, symmetric, positive semidefinite. `is_required`: with a positive diagonal.
-  void covariance(const char* field, const double (&wire)[6][6], bool is_required) {
-    finite(field, wire);
-    if (!problem_.empty()) return;
-    // As a correlation matrix, because metres² and radians² differ by orders of magnitude.
-    Eigen::Matrix<double, 6, 6> correlation = Eigen::Matrix<double, 6, 6>::Identity();
-    for (int i = 0; i < 6; ++i) {
-      if (wire[i][i] < 0 || (is_required && wire[i][i] == 0)) {
-        return complain(field, fmt::format("has {} on its diagonal", wire[i][i]));
-      }
+    const Eigen::Matrix<double, Side, Side> covariance = unpack_triangle<Side>(triangle);
+    const auto& variances = covariance.diagonal();
+    if (variances.minCoeff() < 0 || (is_required && variances.minCoeff() == 0))
+      return complain(field, fmt::format("has {} on its diagonal", variances.minCoeff()));
+    for (int i = 0; i < Side; ++i) {
+      if (variances[i] == 0 && !covariance.row(i).isZero(0))
+        return complain(field, "is not positive semidefinite");
     }
-    for (int i = 0; i < 6; ++i) {
-      for (int j = 0; j < i; ++j) {
-        const double scale = std::sqrt(wire[i][i]) * std::sqrt(wire[j][j]);
-        if (std::abs(wire[i][j] - wire[j][i]) > kSymmetryTolerance * scale) {
-          return complain(field, "is not symmetric");
-        }
-        if (scale == 0 && wire[i][j] != 0) {
-          return complain(field, "is not positive semidefinite");
-        }
-        correlation(i, j) = correlation(j, i) = scale == 0 ? 0 : wire[i][j] / scale;
-      }
-    }
-    const Eigen::SelfAdjointEigenSolver<Eigen::Matrix<double, 6, 6>> solver(correlation,
-                                                                            Eigen::EigenvaluesOnly);
+    const Eigen::SelfAdjointEigenSolver<Eigen::Matrix<double, Side, Side>> solver(
+        correlation_of(covariance), Eigen::EigenvaluesOnly);
     // Written so that a NaN (from values near the ends of the range) fails as well.
-    if (!(solver.eigenvalues()[0] >= -kNegativeEigenvalue)) {
+    if (!(solver.eigenvalues()[0] >= -kTriangleRounding))
       complain(field, "is not positive semidefinite");
-    }
   }
 
   void complain(const char* field, const std::string& what) {
@@ -320,6 +298,26 @@ void check_matrix_gp(Checker& check, const matrix_gp_t& gp, const body_schema_t&
              [&](const pose_t& z) { check.pose("z", z); });
 }
 
+/// Of a position alone nothing is said of rotation.
+void check_rotation(Checker& check, const part_observation_t& part) {
+  check.flag("has_rotation", part.has_rotation);
+  check.covariance<6>("covariance", part.covariance, part.has_rotation == 1);
+  if (part.has_rotation == 1 || !check.problem().empty()) return;
+  const auto no_rotation = [&](const char* field, const pose_t& X) {
+    const double* q = X.rotation_wxyz;
+    check.require(q[0] == 1 && q[1] == 0 && q[2] == 0 && q[3] == 0, field,
+                  "has a rotation, but has_rotation is 0");
+  };
+  no_rotation("X_CB", part.X_CB);
+  no_rotation("X_CB_other", part.X_CB_other);
+  const Eigen::Matrix<double, 6, 6> covariance = unpack_triangle<6>(part.covariance);
+  check.require(covariance.bottomRows<3>().isZero(0), "covariance",
+                "has rotation rows, but has_rotation is 0");
+  check.require(covariance.diagonal().head<3>().minCoeff() > 0, "covariance",
+                "has 0 on the position's diagonal");
+  check.require(part.has_other == 0, "has_other", "is 1, but has_rotation is 0");
+}
+
 void check_edge(Checker& check, const schema_edge_t& edge, const body_schema_t& schema,
                 const std::set<std::int32_t>& parts, std::set<std::int32_t>& placed) {
   check.require(parts.count(edge.from_part) == 1, "from_part", "is not in part_ids");
@@ -341,6 +339,7 @@ void check_edge(Checker& check, const schema_edge_t& edge, const body_schema_t& 
     check.finite("offset", joint.offset);
     check.finite("slide_m", joint.slide_m);
     check.finite("turn_rad", joint.turn_rad);
+    check.integer_at_least("order_group", joint.order_group, -1);
     check.pose("X_after", joint.X_after);
   });
   const bool has_joints = edge.num_joints > 0;
@@ -428,6 +427,7 @@ std::string check(const sim_state_t& message) {
   Checker check;
   check.time("utime", message.utime);
   check.integer_at_least("action_id", message.action_id, -1);
+  check.flag("is_ideal", message.is_ideal);
   check.time("fault_epoch", message.fault_epoch);
   check.integer_at_least("fault_id", message.fault_id, -1);
   check.text("fault_answer", message.fault_answer, kMaxText);
@@ -498,7 +498,7 @@ std::string check(const marker_poses_t& message) {
                check.ascending("marker_id", marker.marker_id, previous);
                check.positive("size_m", marker.size_m);
                check.finite("corner_px", marker.corner_px);
-               check.covariance("corner_covariance", marker.corner_covariance);
+               check.covariance<8>("corner_covariance", marker.corner_covariance, true);
                check.integer_within("num_hypotheses", marker.num_hypotheses, 1, 2);
                check.pose("X_CM[0]", marker.X_CM[0]);
                check.pose("X_CM[1]", marker.X_CM[1]);
@@ -507,7 +507,7 @@ std::string check(const marker_poses_t& message) {
                check.require(marker.num_hypotheses == 1 ||
                                  marker.reprojection_error_px[0] <= marker.reprojection_error_px[1],
                              "reprojection_error_px", "is not ascending");
-               check.covariance("covariance", marker.covariance, true);
+               check.covariance<6>("covariance", marker.covariance, true);
                check.finite("decision_margin", marker.decision_margin);
                check.integer_at_least("hamming", marker.hamming, 0);
              });
@@ -532,7 +532,7 @@ std::string check(const sample_t& message) {
       "parts", message.num_parts, message.parts, kMaxParts, [&](const part_observation_t& part) {
         check.ascending("part_id", part.part_id, previous);
         check.pose("X_CB", part.X_CB);
-        check.covariance("covariance", part.covariance, true);
+        check_rotation(check, part);
         check.flag("has_other", part.has_other);
         check.pose("X_CB_other", part.X_CB_other);
         check.finite("error_ratio", part.error_ratio);
@@ -543,6 +543,7 @@ std::string check(const sample_t& message) {
         check.each("tags", part.num_tags, part.tags, kMaxTags, [&](const tag_corners_t& tag) {
           check.ascending("tag_id", tag.tag_id, previous_tag);
           check.finite("mean_corner_px", tag.mean_corner_px);
+          check.covariance<8>("corner_covariance", tag.corner_covariance, false);
         });
       });
   return check.problem();
@@ -565,7 +566,7 @@ std::string check(const body_schema_t& message) {
   check.require(parts.empty() ? message.root_part == -1 : parts.count(message.root_part) == 1,
                 "root_part", "is not in part_ids (-1 where those are empty)");
   check.pose("X_CR", message.X_CR);
-  check.covariance("X_CR_covariance", message.X_CR_covariance, false);
+  check.covariance<6>("X_CR_covariance", message.X_CR_covariance, false);
   check.each("signals", message.num_signals, message.signals, kMaxSignals,
              [&](const signal_t& signal) {
                check.name("signal_name", signal.signal_name);

@@ -8,11 +8,11 @@ namespace bodyschema {
 
 // Does a well-formed message make sense? "" if so, else what is wrong, for people, beginning with
 // the field ("parts[3].X_CB.rotation_wxyz has norm 0.5, not 1"): NaN, a quaternion that is not unit
-// (1e-3), a covariance that is not symmetric positive semidefinite, ids that repeat or are out of
-// order, counts beyond reason or unlike the length of their array, times before 0, an unknown
-// constant, a string that is not UTF-8, edges that are no tree ordered from the root outwards.
-// The bus calls check() before any handler; what fails is dropped and counted as "senseless".
-// publish() calls it too; there a failure is a bug.
+// (1e-3), a covariance that is not positive semidefinite (up to rounding to float), ids that repeat
+// or are out of order, counts beyond reason or unlike the length of their array, times before 0, an
+// unknown constant, a string that is not UTF-8, edges that are no tree ordered from the root
+// outwards. The bus calls check() before any handler; what fails is dropped and counted as
+// "senseless". publish() calls it too; there a failure is a bug.
 
 std::string check(const action_command_t& message);
 std::string check(const motion_status_t& message);

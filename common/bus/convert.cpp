@@ -1,12 +1,33 @@
 #include "common/bus/convert.h"
 
+#include <Eigen/Eigenvalues>
 #include <Eigen/Geometry>
 #include <algorithm>
 #include <memory>
 #include <stdexcept>
 #include <string>
 
+#include "common/bus/triangle.h"
+
 namespace bodyschema {
+namespace {
+
+/// Rounding to float may leave a nearly singular covariance indefinite: its correlation's
+/// eigenvalues are raised to several times what rounding can hide, so that the next rounding leaves
+/// it as it is. Others, and what is 0 on its diagonal, stay.
+template <int Side>
+Eigen::Matrix<double, Side, Side> invertible(const Eigen::Matrix<double, Side, Side>& covariance) {
+  using Matrix = Eigen::Matrix<double, Side, Side>;
+  if (covariance.diagonal().minCoeff() <= 0) return covariance;
+  const Eigen::SelfAdjointEigenSolver<Matrix> solver(correlation_of(covariance));
+  if (!(solver.eigenvalues()[0] < kTriangleRounding)) return covariance;
+  const Eigen::Matrix<double, Side, 1> sd = covariance.diagonal().cwiseSqrt();
+  const Matrix root = sd.asDiagonal() * solver.eigenvectors() *
+                      solver.eigenvalues().cwiseMax(4 * kTriangleRounding).cwiseSqrt().asDiagonal();
+  return root * root.transpose();
+}
+
+}  // namespace
 
 pose_t to_message(const Pose& X_AB) {
   Eigen::Quaterniond q_AB(X_AB.linear());
@@ -29,30 +50,20 @@ Pose from_message(const pose_t& message) {
       Eigen::Vector3d(message.position_m[0], message.position_m[1], message.position_m[2]));
 }
 
-void to_message(const Matrix6d& matrix, double (&message)[6][6]) {
-  for (int i = 0; i < 6; ++i) {
-    for (int j = 0; j < 6; ++j) message[i][j] = matrix(i, j);
-  }
+void to_message(const Matrix6d& covariance, float (&message)[21]) {
+  pack_triangle(covariance, message);
 }
 
-Matrix6d from_message(const double (&message)[6][6]) {
-  Matrix6d matrix;
-  for (int i = 0; i < 6; ++i) {
-    for (int j = 0; j < 6; ++j) matrix(i, j) = message[i][j];
-  }
-  return matrix;
+Matrix6d from_message(const float (&message)[21]) {
+  return invertible(unpack_triangle<6>(message));
 }
 
 void to_message(const Matrix8d& covariance, float (&message)[36]) {
-  for (int i = 0, k = 0; i < 8; ++i)
-    for (int j = 0; j <= i; ++j, ++k) message[k] = static_cast<float>(covariance(i, j));
+  pack_triangle(covariance, message);
 }
 
 Matrix8d from_message(const float (&message)[36]) {
-  Matrix8d covariance;
-  for (int i = 0, k = 0; i < 8; ++i)
-    for (int j = 0; j <= i; ++j, ++k) covariance(i, j) = covariance(j, i) = double{message[k]};
-  return covariance;
+  return invertible(unpack_triangle<8>(message));
 }
 
 ActionPoseSample from_message(const sample_t& message) {
@@ -62,7 +73,9 @@ ActionPoseSample from_message(const sample_t& message) {
   sample.purpose = static_cast<Purpose>(message.purpose);
   sample.action = Eigen::Map<const Eigen::VectorXd>(
       message.action.data(), static_cast<Eigen::Index>(message.action.size()));
+  sample.calibration_id = message.calibration_id;
   for (const part_observation_t& part : message.parts) {
+    if (part.has_rotation == 0) continue;
     PartObservation& observation = sample.parts.emplace_back();
     observation.part = part.part_id;
     observation.X_CB = from_message(part.X_CB);
@@ -74,10 +87,17 @@ ActionPoseSample from_message(const sample_t& message) {
   return sample;
 }
 
+int num_positions_alone(const sample_t& sample) {
+  return static_cast<int>(
+      std::count_if(sample.parts.begin(), sample.parts.end(),
+                    [](const part_observation_t& part) { return part.has_rotation == 0; }));
+}
+
 sample_t to_message(const ActionPoseSample& sample) {
   sample_t message{};
   message.utime = sample.utime;
   message.sample_index = sample.sample_index;
+  message.calibration_id = sample.calibration_id;
   message.purpose = static_cast<std::int8_t>(sample.purpose);
   set_array(message.num_signals, message.action,
             std::vector<double>(sample.action.begin(), sample.action.end()));
@@ -86,6 +106,7 @@ sample_t to_message(const ActionPoseSample& sample) {
     part_observation_t& part = parts.emplace_back();
     part.part_id = observation.part;
     part.X_CB = to_message(observation.X_CB);
+    part.has_rotation = 1;
     to_message(observation.covariance, part.covariance);
     part.has_other = observation.X_CB_other ? 1 : 0;
     part.X_CB_other = to_message(observation.X_CB_other.value_or(observation.X_CB));
@@ -211,6 +232,7 @@ schema_edge_t to_message(const Edge& edge) {
     out.offset = joint.offset;
     out.slide_m = joint.slide;
     out.turn_rad = joint.turn;
+    out.order_group = joint.order_group;
     out.X_after = bodyschema::to_message(joint.X_after);
   }
   set_array(message.num_joints, message.joints, std::move(joints));
@@ -221,10 +243,9 @@ schema_edge_t to_message(const Edge& edge) {
     set_array(message.num_matrix_gp, message.matrix_gp, std::vector{to_message(*edge.matrix_gp)});
   message.X_right = bodyschema::to_message(edge.right);
   const Eigen::MatrixXd& covariance = edge.parameter_covariance;
-  std::vector<float> packed;
-  for (Eigen::Index i = 0; i < covariance.rows(); ++i) {
-    for (Eigen::Index j = 0; j <= i; ++j) packed.push_back(static_cast<float>(covariance(i, j)));
-  }
+  const auto num_rows = static_cast<std::size_t>(covariance.rows());
+  std::vector<float> packed(num_rows * (num_rows + 1) / 2);
+  pack_triangle(covariance, packed);
   set_array(message.num_covariance, message.parameter_covariance, std::move(packed));
   message.position_rms_m = edge.position_rms_m;
   message.rotation_rms_rad = edge.rotation_rms_rad;
@@ -248,6 +269,7 @@ Edge from_message(const schema_edge_t& message) {
     out.offset = joint.offset;
     out.slide = joint.slide_m;
     out.turn = joint.turn_rad;
+    out.order_group = joint.order_group;
     out.X_after = bodyschema::from_message(joint.X_after);
   }
   if (!message.residual_gp.empty()) edge.residual_gp = from_message(message.residual_gp.front());
@@ -258,14 +280,7 @@ Edge from_message(const schema_edge_t& message) {
     if (static_cast<Eigen::Index>(message.parameter_covariance.size()) != side * (side + 1) / 2) {
       throw std::invalid_argument("parameter_covariance does not go with the number of joints");
     }
-    edge.parameter_covariance.resize(side, side);
-    std::size_t k = 0;
-    for (Eigen::Index i = 0; i < side; ++i) {
-      for (Eigen::Index j = 0; j <= i; ++j, ++k) {
-        edge.parameter_covariance(i, j) = edge.parameter_covariance(j, i) =
-            message.parameter_covariance[k];
-      }
-    }
+    edge.parameter_covariance = unpack_triangle<Eigen::Dynamic>(message.parameter_covariance, side);
   }
   edge.position_rms_m = message.position_rms_m;
   edge.rotation_rms_rad = message.rotation_rms_rad;
@@ -285,6 +300,7 @@ body_schema_t to_message(const BodySchema& schema) {
   message.schema_version = schema.version;
   message.base_version = schema.base_version;
   message.last_sample_index = schema.last_sample_index;
+  message.calibration_id = schema.calibration_id;
   message.num_samples_seen = schema.num_samples;
   message.is_complete = schema.complete ? 1 : 0;
   set_array(message.num_parts, message.part_ids,
@@ -342,6 +358,7 @@ BodySchema from_message(const body_schema_t& message) {
   schema.version = message.schema_version;
   schema.base_version = message.base_version;
   schema.last_sample_index = message.last_sample_index;
+  schema.calibration_id = message.calibration_id;
   schema.num_samples = message.num_samples_seen;
   schema.complete = message.is_complete == 1;
   schema.parts.assign(message.part_ids.begin(), message.part_ids.end());

@@ -21,15 +21,19 @@ namespace bodyschema {
 pose_t to_message(const Pose& X_AB);
 Pose from_message(const pose_t& message);
 
-void to_message(const Matrix6d& matrix, double (&message)[6][6]);
-Matrix6d from_message(const double (&message)[6][6]);
+// Covariances. Where rounding to float leaves one that is nearly singular, from_message() makes it
+// invertible: it raises the eigenvalues of the correlations to 4 kTriangleRounding.
 
-/// Lower triangle, row by row.
+void to_message(const Matrix6d& covariance, float (&message)[21]);
+Matrix6d from_message(const float (&message)[21]);
 void to_message(const Matrix8d& covariance, float (&message)[36]);
 Matrix8d from_message(const float (&message)[36]);
 
-/// `corners` are left out: sample_t carries them, ActionPoseSample does not.
+/// Corners are left out: sample_t carries them, ActionPoseSample does not. So are parts of which
+/// the position alone is known.
 ActionPoseSample from_message(const sample_t& message);
+/// Parts of which the position alone is known.
+int num_positions_alone(const sample_t& sample);
 /// Source, epoch, action id, rest interval and corners are left empty.
 sample_t to_message(const ActionPoseSample& sample);
 

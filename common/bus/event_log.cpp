@@ -115,8 +115,24 @@ std::string describe_malformed(const void* data, std::size_t size, const char* t
   return fmt::format("{} bytes do not decode as {}: cut off, too long or damaged", size, type_name);
 }
 
-LogReader::LogReader(const std::filesystem::path& path, OnDamage on_damage, std::int64_t from_byte)
-    : path_(path), on_damage_(on_damage), position_(from_byte) {
+bool EventJoiner::join(LogEvent* event) {
+  if (!is_piece(event->data)) return true;
+  std::string problem;
+  auto whole = joiners_[event->channel].add(event->data, &problem);
+  if (!problem.empty()) ++num_bad_;
+  if (whole) event->data = *std::move(whole);
+  return whole.has_value();
+}
+
+std::int64_t EventJoiner::num_incomplete() const {
+  std::int64_t sum = num_bad_;
+  for (const auto& [channel, joiner] : joiners_) sum += joiner.num_lost() + joiner.num_unfinished();
+  return sum;
+}
+
+LogReader::LogReader(const std::filesystem::path& path, OnDamage on_damage, std::int64_t from_byte,
+                     Pieces pieces)
+    : path_(path), on_damage_(on_damage), pieces_(pieces), position_(from_byte) {
   std::error_code error;
   if (std::filesystem::is_directory(path, error)) throw file_error(path, "is a folder, not a log");
   file_ = std::fopen(path.c_str(), "rbe");
@@ -135,6 +151,14 @@ void LogReader::seek(std::int64_t position) {
 }
 
 bool LogReader::next() {
+  bool has_event = next_recorded();
+  while (has_event && pieces_ == Pieces::kJoin && !joiner_.join(&event_))
+    has_event = next_recorded();
+  report_.incomplete = joiner_.num_incomplete();
+  return has_event;
+}
+
+bool LogReader::next_recorded() {
   if (report_.truncated_at_byte) return false;
   for (;;) {
     const Found found = read_event(true);

@@ -5,6 +5,7 @@
 #include <cstdio>
 #include <filesystem>
 #include <functional>
+#include <map>
 #include <optional>
 #include <span>
 #include <stdexcept>
@@ -37,10 +38,26 @@ struct LogEvent {
   std::int64_t event_number = 0;  ///< modulo 2^32
 };
 
+/// Joins the messages of a log that were recorded in pieces (common/bus/pieces.h).
+class EventJoiner {
+ public:
+  /// Turns the last missing piece into the whole message's event. False for the other pieces, of
+  /// which nothing is told before they are whole; bad ones count as incomplete messages.
+  bool join(LogEvent* event);
+  /// Messages of which pieces are missing so far.
+  std::int64_t num_incomplete() const;
+
+ private:
+  std::map<std::string, PieceJoiner> joiners_;
+  std::int64_t num_bad_ = 0;
+};
+
 /// What a log was found to hold.
 struct LogReport {
-  /// Whole events read.
+  /// Whole events read, pieces of messages included.
   std::int64_t events = 0;
+  /// Messages that were recorded in pieces, and not all of these.
+  std::int64_t incomplete = 0;
   /// Where the last event begins, if the file ends before that event does: what a writer leaves
   /// that was killed or ran out of disk. Everything before it is good.
   std::optional<std::int64_t> truncated_at_byte;
@@ -55,13 +72,17 @@ struct LogReport {
 /// wrong, or one that cannot be decoded: throw, or go on at the next event there is.
 enum class OnDamage { kThrow, kSkip };
 
-/// Reads a log from its beginning, event by event.
+/// kJoin: an event is a whole message. kAsRecorded: it may be a piece of one.
+enum class Pieces { kJoin, kAsRecorded };
+
+/// Reads a log from its beginning, event by event. A message that was recorded in pieces is one
+/// event, with number and time of the last piece.
 class LogReader {
  public:
   /// Begins at `from_byte`, where an event must begin: the position() of an earlier reader.
   /// @throws std::runtime_error if there is no such file, it cannot be read or is not an LCM log.
   explicit LogReader(const std::filesystem::path& path, OnDamage on_damage = OnDamage::kThrow,
-                     std::int64_t from_byte = 0);
+                     std::int64_t from_byte = 0, Pieces pieces = Pieces::kJoin);
   ~LogReader();
   LogReader(const LogReader&) = delete;
   LogReader& operator=(const LogReader&) = delete;
@@ -79,11 +100,14 @@ class LogReader {
 
  private:
   enum class Found { kEvent, kEnd, kTruncated, kDamaged, kWrongChecksum };
+  bool next_recorded();
   Found read_event(bool looks_behind);
   std::optional<std::int64_t> find_event(std::int64_t from);
 
   std::filesystem::path path_;
   OnDamage on_damage_;
+  Pieces pieces_;
+  EventJoiner joiner_;
   std::FILE* file_ = nullptr;
   std::int64_t position_ = 0;
   LogEvent event_;

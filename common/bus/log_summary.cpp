@@ -71,6 +71,7 @@ LogSummary summarize_log(const std::filesystem::path& file) {
     const std::string& damage = reader.report().damage;
     summary.damage = damage.empty() ? as_text(error.what()) : damage;
   }
+  summary.incomplete = reader.report().incomplete;
   std::error_code error;
   const auto size = std::filesystem::file_size(file, error);
   summary.file_bytes = error ? reader.position() : static_cast<std::int64_t>(size);
@@ -97,6 +98,10 @@ std::string flaws_text(const LogSummary& summary) {
     if (channel.unreadable == 0) continue;
     text += fmt::format("{}: {} of {} messages cannot be read: {}\n", name, channel.unreadable,
                         channel.events, channel.first_problem);
+  }
+  if (summary.incomplete > 0) {
+    text +=
+        fmt::format("{} messages are incomplete: pieces of them were lost\n", summary.incomplete);
   }
   const std::string own = program_version();
   for (const std::string& version : summary.versions) {

@@ -28,6 +28,7 @@ struct LogSummary {
   std::int64_t first_utime = 0;  ///< event time of the first event [us since 1970]
   std::int64_t last_utime = 0;   ///< the latest
   std::int64_t file_bytes = 0;
+  std::int64_t incomplete = 0;     ///< messages of which pieces are missing
   std::int64_t unread_bytes = 0;   ///< after the last whole event
   std::string damage;              ///< why the rest was not read; "" if all was
   std::set<std::string> versions;  ///< of the programs that were heard, from PROCESS_INFO
@@ -35,7 +36,7 @@ struct LogSummary {
   void add(const LogEvent& event);
   std::int64_t unreadable() const;
   /// Whole, not empty, and nothing of our channels unreadable.
-  bool is_sound() const { return damage.empty() && events > 0 && unreadable() == 0; }
+  bool is_sound() const { return damage.empty() && events > 0 && unreadable() + incomplete == 0; }
 };
 
 /// Reads the whole log; what cannot be read is counted, never an error.

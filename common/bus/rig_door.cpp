@@ -8,14 +8,17 @@
 #include <tuple>
 #include <vector>
 
+#include "common/bus/convert.h"
 #include "common/bus/event_log.h"
-#include "common/config/yaml.h"
 
 namespace bodyschema {
 namespace {
 
 /// What rewriting a calibration as text may change [px, or no unit].
 constexpr double kSameNumber = 1e-6;
+
+constexpr const char* kNewRun =
+    "begin a new run, or put those files back as they were and start the group again";
 
 bool is_same(double a, double b) { return std::abs(a - b) <= kSameNumber; }
 
@@ -41,22 +44,33 @@ bool is_same_distortion(std::int8_t model, const std::vector<double>& distortion
 
 }  // namespace
 
-std::filesystem::path RigDoor::calibration_of(const std::filesystem::path& rig_folder) {
-  const std::filesystem::path file = Yaml::load(rig_folder / "camera.yaml").text("calibration");
-  return file.is_relative() ? rig_folder / file : file;
-}
-
 RigDoor::RigDoor(const std::filesystem::path& rig_folder, const std::filesystem::path& calibration)
     : signals_(load_signals(rig_folder)),
       markers_(load_markers(rig_folder)),
       calibration_file_(calibration.filename().string()),
-      camera_(load_camera_calibration(calibration)) {}
+      camera_(load_camera_calibration(calibration)),
+      calibration_id_(bodyschema::calibration_id(markers_, camera_)) {}
 
 void RigDoor::refuse(Process& process, const std::string& channel, const std::string& why) {
   if (process.count("refused " + channel) == 1) {
     spdlog::warn("{}: refused, not of this rig: {} (further ones are only counted)", channel, why);
   }
   process.set_notice(channel, channel + " refused: " + why);
+}
+
+bool RigDoor::takes(Process& process, const sample_t& sample) const {
+  if (!lets_in(process, kSample, sample)) return false;
+  if (const int n = num_positions_alone(sample); n > 0) process.count("position alone", n);
+  return true;
+}
+
+std::string RigDoor::objection_to_calibration(std::int64_t id, const char* what_to_do) const {
+  if (id == 0 || id == calibration_id_) return "";
+  return fmt::format(
+      "of another calibration of the tags or lens: {:016x}, that of markers.yaml and {} is "
+      "{:016x}; {}",
+      static_cast<std::uint64_t>(id), calibration_file_,
+      static_cast<std::uint64_t>(calibration_id_), what_to_do);
 }
 
 std::string RigDoor::objection_to_part(int part) const {
@@ -108,7 +122,8 @@ std::string RigDoor::objection(const marker_poses_t& poses) const {
                          marker.size_m, tag->size_m);
     }
   }
-  return "";
+  return objection_to_calibration(poses.calibration_id,
+                                  "start marker_estimator and this process again");
 }
 
 std::string RigDoor::objection(const motion_status_t& status) const {
@@ -129,7 +144,7 @@ std::string RigDoor::objection(const sample_t& sample) const {
       }
     }
   }
-  return why_not;
+  return why_not.empty() ? objection_to_calibration(sample.calibration_id, kNewRun) : why_not;
 }
 
 std::string RigDoor::objection(const body_schema_t& schema) const {
@@ -147,7 +162,7 @@ std::string RigDoor::objection(const body_schema_t& schema) const {
   for (const std::int32_t part : schema.part_ids) {
     if (why_not.empty()) why_not = objection_to_part(part);
   }
-  return why_not;
+  return why_not.empty() ? objection_to_calibration(schema.calibration_id, kNewRun) : why_not;
 }
 
 std::string RigDoor::objection(const model_health_t& health) const {

@@ -8,6 +8,7 @@
 #include <utility>
 
 #include "common/bus/process.h"
+#include "common/config/calibration_id.h"
 #include "common/config/camera_calibration.h"
 #include "common/config/rig.h"
 
@@ -21,20 +22,19 @@ class RigDoor {
  public:
   /// @throws ConfigError.
   explicit RigDoor(const std::filesystem::path& rig_folder)
-      : RigDoor(rig_folder, calibration_of(rig_folder)) {}
+      : RigDoor(rig_folder, bodyschema::calibration_file(rig_folder)) {}
 
   // "" if the message may be of this rig, else why not, for people.
 
   /// The rig's own calibration: of this camera, this image size, these intrinsics.
   std::string objection(const camera_info_t& info) const;
-  /// Of this camera, by name: which calibration its poses were found with is not told. Tags of
-  /// markers.yaml with their sizes.
+  /// Of this camera, by name, and of this calibration. Tags of markers.yaml with their sizes.
   std::string objection(const marker_poses_t& poses) const;
   /// One value per signal; none where no MOVE is answered.
   std::string objection(const motion_status_t& status) const;
-  /// One value per signal; parts of markers.yaml, each with its own tags.
+  /// Of this calibration. One value per signal; parts of markers.yaml, each with its own tags.
   std::string objection(const sample_t& sample) const;
-  /// The rig's signals, by name and limits; parts of markers.yaml.
+  /// Of this calibration. The rig's signals, by name and limits; parts of markers.yaml.
   std::string objection(const body_schema_t& schema) const;
   /// Parts of markers.yaml.
   std::string objection(const model_health_t& health) const;
@@ -46,23 +46,37 @@ class RigDoor {
   /// @throws std::runtime_error if there is none or it is of another rig.
   body_schema_t load_initial_schema(const std::filesystem::path& file) const;
 
-  /// Subscribes behind the door: what it objects to is counted as "refused CHANNEL", logged once a
-  /// channel, told with the process's activity while it comes, and not handled. The door must
-  /// outlive the bus's use of it.
+  /// Of the rig's tags and lens. A message that does not tell its own (0) passes.
+  std::int64_t calibration_id() const { return calibration_id_; }
+
+  /// False for what is objected to: it is counted as "refused CHANNEL", logged once a channel and
+  /// told with the process's activity.
+  template <class Message>
+  bool lets_in(Process& process, const Channel<Message>& channel, const Message& message) const {
+    const std::string why_not = objection(message);
+    if (!why_not.empty()) refuse(process, channel.name, why_not);
+    return why_not.empty();
+  }
+
+  /// What every process does with a SAMPLE that it uses, once each: false if it is not let in;
+  /// counts parts that are left out ("position alone").
+  bool takes(Process& process, const sample_t& sample) const;
+
+  /// Subscribes behind the door: what it does not let in is not handled. The door must outlive the
+  /// bus's use of it.
   template <class Message>
   void subscribe(Process& process, const Channel<Message>& channel,
                  std::type_identity_t<std::function<void(const Message&)>> handler) const {
-    process.bus().subscribe(channel, [this, &process, name = channel.name,
-                                      handler = std::move(handler)](const Message& message) {
-      const std::string why_not = objection(message);
-      why_not.empty() ? handler(message) : refuse(process, name, why_not);
-    });
+    process.bus().subscribe(
+        channel, [this, &process, channel, handler = std::move(handler)](const Message& message) {
+          if (lets_in(process, channel, message)) handler(message);
+        });
   }
 
  private:
-  static std::filesystem::path calibration_of(const std::filesystem::path& rig_folder);
   RigDoor(const std::filesystem::path& rig_folder, const std::filesystem::path& calibration);
   static void refuse(Process& process, const std::string& channel, const std::string& why);
+  std::string objection_to_calibration(std::int64_t id, const char* what_to_do) const;
   std::string objection_to_part(int part) const;
   std::string objection_to_signals(std::size_t num_signals) const;
 
@@ -70,6 +84,7 @@ class RigDoor {
   const Markers markers_;
   const std::string calibration_file_;  ///< its name
   const CameraCalibration camera_;
+  const std::int64_t calibration_id_;
 };
 
 }  // namespace bodyschema

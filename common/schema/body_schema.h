@@ -25,6 +25,8 @@ struct ScrewJoint {
   double slide = 0;                 ///< [m per command unit]
   double turn = 0;                  ///< [rad per command unit]
   Pose X_after = Pose::Identity();  ///< the constant transform that follows
+  /// Joints of an edge with the same number: their mutual order is open. −1: it is settled.
+  int order_group = -1;
 };
 
 /// Derivative of a pose by an action, 6×m: (translation [m], rotation [rad]) per command unit.
@@ -149,6 +151,8 @@ struct BodySchema {
   std::int64_t base_version = 0;
   /// Index of the last sample that this schema rests on; −1 before the first.
   std::int64_t last_sample_index = -1;
+  /// Of the samples that it rests on (common/config/calibration_id.h); 0: not told.
+  std::int64_t calibration_id = 0;
   int num_samples = 0;  ///< samples used
   bool complete = false;
   std::vector<int> parts;  ///< observed parts, ascending

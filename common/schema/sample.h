@@ -35,6 +35,8 @@ struct ActionPoseSample {
   std::int64_t utime = 0;
   /// Counts the instants of a recording from 0.
   std::int64_t sample_index = 0;
+  /// Of the tags and the lens (common/config/calibration_id.h); 0: not told.
+  std::int64_t calibration_id = 0;
   Purpose purpose = Purpose::kTrain;
   /// Action signals q_1..q_m in command units.
   Eigen::VectorXd action;

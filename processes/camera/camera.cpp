@@ -128,6 +128,12 @@ camera_info_t make_info(const CameraCalibration& calibration, std::int64_t utime
   return info;
 }
 
+std::optional<std::string> ideal_problem(bool is_ideal, const sim_state_t& state) {
+  if (is_ideal == (state.is_ideal == 1)) return std::nullopt;
+  return std::string("shows nothing: robot_simulator runs ") + (is_ideal ? "without" : "with") +
+         " --ideal, this camera " + (is_ideal ? "with it" : "without") + "; start both alike";
+}
+
 SimulatedCamera::SimulatedCamera(CameraConfig config, Render render)
     : config_(std::move(config)), render_(std::move(render)) {}
 

@@ -62,6 +62,10 @@ camera_image_t make_image(const cv::Mat& frame, const CameraCalibration& calibra
 /// CAMERA_INFO. `utime`: of the newest frame, 0 before the first.
 camera_info_t make_info(const CameraCalibration& calibration, std::int64_t utime);
 
+/// Why a camera that was started `is_ideal` must not show a SIM_STATE: the simulator was not, so
+/// the tags and the lens would not be those of the robot.
+std::optional<std::string> ideal_problem(bool is_ideal, const sim_state_t& state);
+
 /// The simulated camera: for every SIM_STATE the frames_per_action images that a camera of 30 Hz
 /// would have taken from then on. Frame f of a state has utime = state.utime + f · 33 333 µs and
 /// image_seq = (action_id + 1) · frames_per_action + f, so both are the same from run to run.

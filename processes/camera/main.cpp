@@ -82,6 +82,11 @@ int main(int argc, char** argv) {
           [&, shown_utime = std::int64_t{-1}, num_repeats = 0](const sim_state_t& state) mutable {
             // Repeated for who missed them, but not for ever: an arm that was left alone would fill
             // the disk with the same images.
+            if (const auto problem = ideal_problem(is_ideal, state)) {
+              process.count("refused SIM_STATE");
+              process.set_activity(process_info_t::PHASE_WAITING, *problem);
+              return;
+            }
             num_repeats = state.utime == shown_utime ? num_repeats + 1 : 0;
             shown_utime = state.utime;
             if (num_repeats > kMaxRepeats) return;

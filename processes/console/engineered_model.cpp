@@ -224,6 +224,7 @@ void run_engineer(const EngineerArguments& arguments) {
   measurement.systematic = recording.systematic;
   if (!recording.has_noise) measurement.noise = Noise{0.001, 0.2 * kDegree};  // weights alone
   estimate_root_pose(recording.samples, measurement, &schema);
+  schema.calibration_id = recording.samples.front().calibration_id;
   if (schema.X_CR_covariance.isZero(0))
     throw std::runtime_error(arguments.samples + ": the root, part " + std::to_string(schema.root) +
                              ", is never seen");

@@ -19,11 +19,14 @@ bool LogFollower::read(const std::filesystem::path& file, const Visit& visit) {
   const std::int64_t events_before = summary.events;
   summary.damage.clear();
   try {
-    LogReader reader(file, OnDamage::kThrow, progress.position);
+    LogReader reader(file, OnDamage::kThrow, progress.position, Pieces::kAsRecorded);
     try {
       while (reader.next()) {
-        summary.add(reader.event());
-        visit(reader.event(), file, progress.position);
+        LogEvent event = reader.event();
+        if (progress.joiner.join(&event)) {
+          summary.add(event);
+          visit(event, file, progress.position);
+        }
         progress.position = reader.position();
       }
       if (reader.report().truncated_at_byte) {

@@ -19,6 +19,7 @@ class LogFollower {
 
   /// Reads what `file` got since the last time. A file that is not there yet, or empty, is no
   /// error; one that is damaged or no log is read up to there and says so in its summary.
+  /// A message in pieces is one event, at the byte of its last piece.
   /// Returns whether there was a new event.
   bool read(const std::filesystem::path& file, const Visit& visit);
 
@@ -30,6 +31,7 @@ class LogFollower {
   struct Progress {
     std::int64_t position = 0;   ///< [bytes] of whole events
     std::int64_t seen_size = 0;  ///< [bytes] of the file when it was last looked into
+    EventJoiner joiner;          ///< of pieces up to position
     bool is_damaged = false;     ///< nothing can be read beyond position, ever
   };
   std::map<std::filesystem::path, Progress> progress_;

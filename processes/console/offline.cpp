@@ -37,8 +37,6 @@ Recording load(const std::string& file) {
   return recording;
 }
 
-constexpr int kLargestSchema = 64'000;  // lcmtypes/README.md
-
 struct LearnArguments {
   std::string samples;
   std::string out;
@@ -94,12 +92,7 @@ void run_learn(const LearnArguments& arguments) {
   if (!arguments.out.empty()) {
     BodySchema schema = result.schema;
     schema.version = schema.last_sample_index + 1;
-    const body_schema_t message = to_message(schema);
-    if (message.getEncodedSize() >= kLargestSchema)
-      throw std::runtime_error(
-          "--out: the schema takes " + std::to_string(message.getEncodedSize()) +
-          " bytes, a message holds " + std::to_string(kLargestSchema) + "; use --method screw");
-    write_one_event_log(arguments.out, kBodySchema, message);
+    write_one_event_log(arguments.out, kBodySchema, to_message(schema));
   }
   if (arguments.json) {
     std::cout << structure_json(result.schema, result.outliers, result.noise_source).dump(2)

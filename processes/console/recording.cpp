@@ -293,9 +293,18 @@ Recording read_samples(const std::filesystem::path& file, const std::string& nam
   // Samples are repeated, and sent again later where somebody missed them.
   std::map<std::int64_t, const sample_t*> by_index;
   for (const sample_t& message : messages) by_index.try_emplace(message.sample_index, &message);
+  int num_alone = 0;
   for (const auto& [index, first] : by_index) {
     const sample_t& message = *first;
     ActionPoseSample sample = from_message(message);
+    num_alone += num_positions_alone(message);
+    if (!recording.samples.empty() &&
+        sample.calibration_id != recording.samples.front().calibration_id) {
+      throw RecordingError(
+          name + ": sample " + std::to_string(message.sample_index) +
+          " is of another calibration of the tags or lens than the first: markers.yaml or the "
+          "camera's calibration changed in between; make a new run");
+    }
     sample.sample_index = static_cast<std::int64_t>(recording.samples.size());
     if (!recording.samples.empty() &&
         sample.action.size() != recording.samples.front().action.size()) {
@@ -305,6 +314,10 @@ Recording read_samples(const std::filesystem::path& file, const std::string& nam
                            std::to_string(recording.samples.front().action.size()));
     }
     recording.samples.push_back(std::move(sample));
+  }
+  if (num_alone > 0) {
+    recording.hints.push_back(std::to_string(num_alone) +
+                              " observations left out: position alone, without an orientation");
   }
   const auto num_signals = recording.samples.front().action.size();
   const std::vector<body_schema_t> schemas = read_log(file, kBodySchema);

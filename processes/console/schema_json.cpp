@@ -177,12 +177,15 @@ ordered_json schema_json(const BodySchema& schema) {
     item["left"] = pose_json(edge.left);
     item["joints"] = ordered_json::array();
     for (const ScrewJoint& joint : edge.joints) {
-      item["joints"].push_back({{"signal", schema.signals.at(joint.signal).name},
-                                {"gain", joint.gain},
-                                {"offset", joint.offset},
-                                {"slide_m", joint.slide},
-                                {"turn_rad", joint.turn},
-                                {"X_after", pose_json(joint.X_after)}});
+      item["joints"].push_back(
+          {{"signal", schema.signals.at(joint.signal).name},
+           {"gain", joint.gain},
+           {"offset", joint.offset},
+           {"slide_m", joint.slide},
+           {"turn_rad", joint.turn},
+           {"order_group",
+            joint.order_group < 0 ? ordered_json() : ordered_json(joint.order_group)},
+           {"X_after", pose_json(joint.X_after)}});
     }
     if (edge.residual_gp) item["residual_gp"] = residual_gp_json(schema, *edge.residual_gp);
     if (edge.matrix_gp) item["matrix_gp"] = matrix_gp_json(schema, *edge.matrix_gp);

@@ -379,10 +379,13 @@ void run_watch(const WatchArguments& arguments) {
     bus.publish(kSampleRequest, request);
   };
   if (is_replay && !(is_played && listener == "observer")) ask = nullptr;
-  SampleIntake intake((std::filesystem::path(arguments.out) / "samples.lcmlog").string(),
-                      [&](const sample_t& m) { watch.on_sample(m); }, ask);
   // What another rig's group says, or a recording that is played, is none of this run.
   const RigDoor door(arguments.rig_folder);
+  SampleIntake intake((std::filesystem::path(arguments.out) / "samples.lcmlog").string(),
+                      [&](const sample_t& m) {
+                        if (door.objection(m).empty()) watch.on_sample(m);
+                      },
+                      ask);
   const auto hear = [&](const auto& channel, auto handler) {
     bus.subscribe(channel, [&door, handler](const auto& m) {
       if (door.objection(m).empty()) handler(m);

@@ -28,12 +28,12 @@ int main(int argc, char** argv) {
     const auto say = [&] {
       const control_status_t status = controller.status();
       const bool is_open = status.control_state == control_status_t::CONTROL_MOVING;
-      process.set_activity(is_open && state.problem().empty() ? process_info_t::PHASE_WORKING
-                                                              : process_info_t::PHASE_WAITING,
-                           state.problem().empty()
-                               ? status.why
-                               : "no MOVE is sent: its state is not saved: " + state.problem() +
-                                     "; " + status.why);
+      process.set_activity(
+          is_open && state.problem().empty() ? process_info_t::PHASE_WORKING
+                                             : process_info_t::PHASE_WAITING,
+          state.problem().empty()
+              ? status.why
+              : "no MOVE is sent: its state is not saved: " + state.problem() + "; " + status.why);
     };
     const auto send = [&](const Controller::Answer& answer) {
       // The babbler is told that the arm is taken before anything moves. Neither this nor a HOLD
@@ -63,7 +63,9 @@ int main(int argc, char** argv) {
     });
     subscribe(kMotionStatus, &Controller::on_motion_status);
     subscribe(kMarkerPoses, &Controller::on_marker_poses);
-    subscribe(kSample, &Controller::on_sample);
+    process.bus().subscribe(kSample, [&](const sample_t& sample) {
+      if (door.takes(process, sample)) send(controller.on_sample(sample));
+    });
     subscribe(kBodySchema, &Controller::on_body_schema);
     subscribe(kModelHealth, &Controller::on_model_health);
     process.on_tick([&](std::int64_t now_us) {

@@ -21,7 +21,8 @@ int main(int argc, char** argv) {
   };
   const auto body = [&](Process& process) {
     const auto config = MarkerEstimatorConfig::load(process.config_file());
-    MarkerEstimator estimator(config, load_markers(process.rig_folder()));
+    const RigDoor door(process.rig_folder());
+    MarkerEstimator estimator(config, load_markers(process.rig_folder()), door.calibration_id());
     std::mutex mutex;  // guards estimator and failure
 
     const auto on_image = [&](const camera_image_t& image) {
@@ -30,7 +31,6 @@ int main(int argc, char** argv) {
         process.bus().publish(kMarkerPoses, *poses);
       }
     };
-    const RigDoor door(process.rig_folder());
     door.subscribe(process, kCameraInfo, [&](const camera_info_t& info) {
       const std::lock_guard lock(mutex);
       estimator.on_camera_info(info);

@@ -50,9 +50,11 @@ MarkerEstimatorConfig MarkerEstimatorConfig::load(const std::filesystem::path& f
   return config;
 }
 
-MarkerEstimator::MarkerEstimator(const MarkerEstimatorConfig& config, Markers markers)
+MarkerEstimator::MarkerEstimator(const MarkerEstimatorConfig& config, Markers markers,
+                                 std::int64_t calibration_id)
     : config_(config),
       markers_(std::move(markers)),
+      calibration_id_(calibration_id),
       detector_(markers_.family, config.max_hamming, config.min_white_black_difference) {}
 
 void MarkerEstimator::on_camera_info(const camera_info_t& info) {
@@ -124,6 +126,7 @@ std::optional<marker_poses_t> MarkerEstimator::on_camera_image(const camera_imag
   poses.utime = image.utime;
   poses.image_seq = image.image_seq;
   poses.camera_name = image.camera_name;
+  poses.calibration_id = calibration_id_;
   set_array(poses.num_markers, poses.markers, std::move(markers));
   num_seen_ = poses.num_markers;
   if (answered_.size() == kMaxAnswered) answered_.pop_front();

@@ -45,7 +45,9 @@ struct MarkerEstimatorConfig {
 /// do the answers.
 class MarkerEstimator {
  public:
-  MarkerEstimator(const MarkerEstimatorConfig& config, Markers markers);
+  /// `calibration_id`: of the rig; 0: not told.
+  MarkerEstimator(const MarkerEstimatorConfig& config, Markers markers,
+                  std::int64_t calibration_id = 0);
 
   /// A calibration that makes no sense is refused and counted; the last good one stays.
   void on_camera_info(const camera_info_t& info);
@@ -65,6 +67,7 @@ class MarkerEstimator {
 
   const MarkerEstimatorConfig config_;
   const Markers markers_;
+  const std::int64_t calibration_id_;
   TagDetector detector_;
   std::optional<Lens> lens_;
   camera_info_t info_{};                                            ///< lens_ is made of it

@@ -92,10 +92,12 @@ int main(int argc, char** argv) {
     };
     const auto go_on = [&] {
       for (int n = 0; n < kMostAtOnce && !ahead.empty() && !proposals.is_waiting(); ++n) {
-        if (ahead.front().purpose == action_command_t::PURPOSE_TEST)
-          proposals.ask(ahead.front().sample_index);
-        follow(ahead.front());
-        is_news |= monitor.on_sample(ahead.front());
+        const sample_t& sample = ahead.front();
+        follow(sample);
+        if (door.takes(process, sample)) {
+          if (sample.purpose == action_command_t::PURPOSE_TEST) proposals.ask(sample.sample_index);
+          is_news |= monitor.on_sample(sample);
+        }
         ahead.pop_front();
       }
     };

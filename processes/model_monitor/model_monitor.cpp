@@ -165,7 +165,7 @@ bool ModelMonitor::on_sample(const sample_t& message) {
   if (message.sample_index <= last_sample_index_) return false;
   last_sample_index_ = message.sample_index;
   for (const auto& part : message.parts)
-    seen_in_[part.part_id].later.push_back(message.sample_index);
+    if (part.has_rotation == 1) seen_in_[part.part_id].later.push_back(message.sample_index);
   ActionPoseSample sample = from_message(message);
   if (sample.purpose == Purpose::kTest) {
     test_indices_.later.push_back(sample.sample_index);

@@ -53,6 +53,7 @@ int main(int argc, char** argv) {
     SampleIntake intake(
         samples_file,
         [&](const sample_t& sample) {
+          if (!door.takes(process, sample)) return;
           try {
             send(babbler.remember(sample));
           } catch (const std::invalid_argument&) {
@@ -83,8 +84,9 @@ int main(int argc, char** argv) {
       count("sample never seen", babbler.num_unseen());
       const std::string late = "BODY_SCHEMA not in time";
       if (babbler.num_without_schema() > reported[late])
-        spdlog::warn("no BODY_SCHEMA to choose by: drawn at random up to the next TEST; "
-                     "are structure_learner and model_monitor running?");
+        spdlog::warn(
+            "no BODY_SCHEMA to choose by: drawn at random up to the next TEST; "
+            "are structure_learner and model_monitor running?");
       count(late, babbler.num_without_schema());
       if (state.num_failed() > 0) count("state not saved", state.num_failed());
     });

@@ -21,11 +21,14 @@ int main(int argc, char** argv) {
   const auto body = [&](Process& process) {
     const RigDoor door(process.rig_folder());
     Observer observer(ObserverConfig::load(process.config_file()),
-                      load_markers(process.rig_folder()));
+                      load_markers(process.rig_folder()), door.calibration_id());
     Bus& bus = process.bus();
     SampleOutbox outbox(samples_file,
                         [&](const sample_t& sample) { bus.publish(kSample, sample); });
-    outbox.for_each_recorded([&](const sample_t& sample) { observer.restore(sample); });
+    outbox.for_each_recorded([&](const sample_t& sample) {
+      door.lets_in(process, kSample, sample);  // else it stays in the file, and others refuse it
+      observer.restore(sample);
+    });
     const auto send = [&](const std::optional<sample_t>& sample) {
       if (sample) outbox.send(*sample);
     };

@@ -46,8 +46,8 @@ ObserverConfig ObserverConfig::load(const std::filesystem::path& file) {
   return config;
 }
 
-Observer::Observer(const ObserverConfig& config, Markers markers)
-    : config_(config), markers_(std::move(markers)) {}
+Observer::Observer(const ObserverConfig& config, Markers markers, std::int64_t calibration_id)
+    : config_(config), markers_(std::move(markers)), calibration_id_(calibration_id) {}
 
 void Observer::restore(const sample_t& sample) {
   remember({sample.source, sample.epoch, sample.action_id});
@@ -222,6 +222,7 @@ sample_t Observer::sample_from(const Rest& rest, const std::vector<const marker_
       tag.X_CM.push_back(from_message(seen[0]->X_CM[h]));
     }
     tags_of_part[placement.part].push_back(std::move(tag));
+    to_message(covariance_px2, mean.corner_covariance);
     corners_of_tag[id] = mean;
   }
 
@@ -236,6 +237,7 @@ sample_t Observer::sample_from(const Rest& rest, const std::vector<const marker_
     part_observation_t observation{};
     observation.part_id = part;
     observation.X_CB = to_message(pose->X_CB);
+    observation.has_rotation = 1;
     to_message(pose->covariance, observation.covariance);
     observation.has_other = pose->X_CB_other ? 1 : 0;
     observation.X_CB_other = to_message(pose->X_CB_other.value_or(pose->X_CB));
@@ -251,6 +253,7 @@ sample_t Observer::sample_from(const Rest& rest, const std::vector<const marker_
   sample_t sample{};
   sample.utime = frames.back()->utime;
   sample.sample_index = next_index_++;
+  sample.calibration_id = calibration_id_;
   sample.source = status.source;
   sample.epoch = status.epoch;
   sample.action_id = status.action_id;

@@ -46,7 +46,8 @@ struct ObserverConfig {
 /// same bytes.
 class Observer {
  public:
-  Observer(const ObserverConfig& config, Markers markers);
+  /// `calibration_id`: of the rig; 0: not told.
+  Observer(const ObserverConfig& config, Markers markers, std::int64_t calibration_id = 0);
 
   /// Continues after a sample of an earlier run; called for each, in the order of their indices.
   void restore(const sample_t& sample);
@@ -83,6 +84,7 @@ class Observer {
 
   const ObserverConfig config_;
   const Markers markers_;
+  const std::int64_t calibration_id_;
   std::optional<Lens> lens_;
   std::map<std::int64_t, marker_poses_t> frames_;  // by utime
   std::deque<Rest> rests_;                         // oldest first

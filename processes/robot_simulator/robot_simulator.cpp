@@ -360,6 +360,7 @@ void RobotSimulator::update_state(std::int64_t action_id) {
   }
   state_.action_id = action_id;
   state_.seed = config_.seed;
+  state_.is_ideal = config_.is_ideal ? 1 : 0;
   for (const int part : config_.hidden_parts) {
     for (const int geom : scene().plate_geoms(part)) state_.geom_alpha[geom] = 0;
   }

@@ -460,6 +460,7 @@ LearnResult fit_tree(const LearnedStructure& structure,
   schema.num_samples = static_cast<int>(samples.size());
   for (const auto& sample : samples)
     schema.last_sample_index = std::max(schema.last_sample_index, sample.sample_index);
+  if (!samples.empty()) schema.calibration_id = samples.back().calibration_id;
   const std::map<int, int> num_seen = count_seen(samples);
   schema.parts = parts_of(num_seen);
   if (!schema.parts.empty()) schema.root = schema.parts.front();

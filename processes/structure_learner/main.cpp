@@ -27,6 +27,7 @@ int main(int argc, char** argv) {
     const RigDoor door(process.rig_folder());
     StructureLearner learner(StructureLearnerConfig::load(process.config_file()));
     const auto learn_from = [&](const sample_t& sample) {
+      if (!door.takes(process, sample)) return;
       try {
         learner.on_sample(sample);
       } catch (const std::invalid_argument&) {

@@ -27,15 +27,19 @@ pose_t pose(int number) {
 }
 
 /// B Bᵀ with B = 1e-3 (identity + a little everywhere).
-void covariance(double (&wire)[6][6]) {
-  for (int i = 0; i < 6; ++i) {
-    for (int j = 0; j < 6; ++j) {
-      wire[i][j] = 0;
-      for (int k = 0; k < 6; ++k) {
-        wire[i][j] += 1e-6 * ((i == k) + 0.02 * (i + k)) * ((j == k) + 0.02 * (j + k));
-      }
+void covariance(float (&wire)[21]) {
+  for (int i = 0, n = 0; i < 6; ++i) {
+    for (int j = 0; j <= i; ++j, ++n) {
+      double sum = 0;
+      for (int k = 0; k < 6; ++k)
+        sum += 1e-6 * ((i == k) + 0.02 * (i + k)) * ((j == k) + 0.02 * (j + k));
+      wire[n] = static_cast<float>(sum);
     }
   }
+}
+
+void corner_covariance(float (&wire)[36]) {
+  for (int i = 0; i < 8; ++i) wire[i * (i + 3) / 2] = 0.0025F;
 }
 
 void corners(double (&wire)[4][2], double offset) {
@@ -60,6 +64,7 @@ schema_edge_t edge(int from, int to, int num_joints) {
     joint.offset = 0.01;
     joint.slide_m = 0.002;
     joint.turn_rad = 1.02;
+    joint.order_group = num_joints > 1 ? 3 : -1;
     joint.X_after = pose(10 + n);
   }
   fill(edge.num_joints, edge.joints, joints);
@@ -152,6 +157,7 @@ sim_state_t example_sim_state() {
   message.utime = 1'000'003;
   message.action_id = -1;
   message.seed = -42;
+  message.is_ideal = 1;
   message.fault_epoch = 88;
   message.fault_id = 2;
   message.fault_answer = "no signal q9";
@@ -198,13 +204,14 @@ marker_poses_t example_marker_poses() {
   message.utime = 1'000'006;
   message.image_seq = 9;
   message.camera_name = "ceiling";
+  message.calibration_id = 99;
   std::vector<marker_pose_t> markers;
   for (const int id : {4, 11}) {
     marker_pose_t& marker = markers.emplace_back();
     marker.marker_id = id;
     marker.size_m = 0.05;
     corners(marker.corner_px, id);
-    for (int i = 0; i < 8; ++i) marker.corner_covariance[i * (i + 3) / 2] = 0.0025F;
+    corner_covariance(marker.corner_covariance);
     marker.num_hypotheses = 2;
     marker.X_CM[0] = pose(id);
     marker.X_CM[1] = pose(id + 1);
@@ -222,6 +229,7 @@ sample_t example_sample() {
   sample_t message{};
   message.utime = 1'000'007;
   message.sample_index = 12;
+  message.calibration_id = 99;
   message.source = "motor_babbler";
   message.epoch = 77;
   message.action_id = 5;
@@ -234,6 +242,7 @@ sample_t example_sample() {
     part_observation_t& part = parts.emplace_back();
     part.part_id = id;
     part.X_CB = pose(id);
+    part.has_rotation = 1;
     covariance(part.covariance);
     part.has_other = id == 3 ? 1 : 0;
     part.X_CB_other = pose(id == 3 ? 4 : 0);
@@ -242,6 +251,7 @@ sample_t example_sample() {
     tag_corners_t tag{};
     tag.tag_id = 10 + id;
     corners(tag.mean_corner_px, id);
+    corner_covariance(tag.corner_covariance);
     fill(part.num_tags, part.tags, {tag});
   }
   fill(message.num_parts, message.parts, parts);
@@ -254,6 +264,7 @@ body_schema_t example_body_schema() {
   message.schema_version = 4;
   message.base_version = 3;
   message.last_sample_index = 50;
+  message.calibration_id = 99;
   message.num_samples_seen = 40;
   message.is_complete = 0;
   fill(message.num_parts, message.part_ids, {1, 2, 4, 5, 6, 9});
@@ -288,6 +299,22 @@ body_schema_t example_body_schema() {
   fill(message.num_moved_tags, message.moved_tags, {tag});
   message.noise_position_m = 0.003;
   message.noise_rotation_rad = 0.017;
+  return message;
+}
+
+body_schema_t large_schema(int num_parts) {
+  body_schema_t message = example_body_schema();
+  std::vector<std::int32_t> parts;
+  std::vector<schema_edge_t> edges;
+  for (int part = 0; part < num_parts; ++part) {
+    parts.push_back(part);
+    if (part > 0) edges.push_back(edge(part - 1, part, 1));
+  }
+  message.is_complete = 1;
+  message.root_part = 0;
+  fill(message.num_parts, message.part_ids, parts);
+  fill(message.num_edges, message.edges, edges);
+  fill(message.num_unconnected, message.unconnected, {});
   return message;
 }
 

@@ -22,6 +22,9 @@ control_status_t example_control_status();
 fault_command_t example_fault_command();
 process_info_t example_process_info();
 
+/// A chain of `num_parts` parts; each edge has one joint, of the one signal.
+body_schema_t large_schema(int num_parts);
+
 /// Calls visit(channel, example message) for every channel.
 template <class Visit>
 void for_each_channel(Visit visit) {

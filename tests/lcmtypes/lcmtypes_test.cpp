@@ -16,6 +16,7 @@
 #include <vector>
 
 #include "bodyschema/counter_t.hpp"
+#include "bodyschema/message_piece_t.hpp"
 #include "common/bus/codec.h"
 #include "tests/lcmtypes/example_messages.h"
 #include "tests/lcmtypes/lcm_definitions.h"
@@ -56,6 +57,7 @@ std::map<std::string, std::string> fingerprints() {
           {"marker_pose_t", hash_of<marker_pose_t>()},
           {"marker_poses_t", hash_of<marker_poses_t>()},
           {"matrix_gp_t", hash_of<matrix_gp_t>()},
+          {"message_piece_t", hash_of<message_piece_t>()},
           {"model_health_t", hash_of<model_health_t>()},
           {"motion_status_t", hash_of<motion_status_t>()},
           {"moved_tag_t", hash_of<moved_tag_t>()},

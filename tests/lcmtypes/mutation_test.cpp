@@ -12,6 +12,7 @@
 #include <string>
 #include <vector>
 
+#include "bodyschema/message_piece_t.hpp"
 #include "common/bus/codec.h"
 #include "tests/lcmtypes/example_messages.h"
 
@@ -115,6 +116,36 @@ TEST(Mutation, NoDamagedMessageCrashesTheDecoderOrMakesItAllocateWildly) {
     }
     EXPECT_GT(num_refused, kMutationsPerChannel / 10) << channel.name;
   });
+}
+
+TEST(Mutation, NoDamagedPieceCrashesTheJoinerOrMakesItKeepMuch) {
+  message_piece_t piece{};
+  piece.piece_sender = 7;
+  piece.whole_fingerprint = sample_t::getHash();
+  piece.num_pieces = 3;
+  piece.num_bytes = 100;
+  piece.piece.assign(100, 1);
+  std::vector<Bytes> originals;
+  for (; piece.piece_index < piece.num_pieces; ++piece.piece_index) {
+    Bytes& bytes = originals.emplace_back(static_cast<std::size_t>(piece.getEncodedSize()));
+    piece.encode(bytes.data(), 0, static_cast<int>(bytes.size()));
+  }
+  Rng rng(20240301);
+  PieceJoiner joiner;
+  int num_refused = 0;
+  for (int n = 0; n < kMutationsPerChannel; ++n) {
+    const Bytes bytes = mutate(originals[below(rng, originals.size())], rng);
+    const std::unique_ptr<std::uint8_t[]> exact(new std::uint8_t[bytes.size()]);
+    std::copy(bytes.begin(), bytes.end(), exact.get());
+    std::string problem;
+    allocated_bytes = 0;
+    joiner.add({exact.get(), bytes.size()}, &problem);
+    // An unfinished message has room for all its pieces' names.
+    ASSERT_LE(allocated_bytes, 12 * bytes.size() + 16'384);
+    num_refused += problem.empty() ? 0 : 1;
+  }
+  EXPECT_GT(num_refused, kMutationsPerChannel / 10);
+  EXPECT_LE(joiner.num_unfinished(), static_cast<std::int64_t>(PieceJoiner::kMostUnfinished));
 }
 
 TEST(Mutation, EveryTruncationIsRefused) {

@@ -95,7 +95,7 @@ void add_nonsense(std::vector<Hostile>& all) {
   add(kCameraInfo, example_camera_info(), [](auto& m) { m.image_width = 1 << 30; });
   add(kMarkerPoses, example_marker_poses(), [](auto& m) { m.markers.at(0).size_m = kNan; });
   add(kMarkerPoses, example_marker_poses(), [](auto& m) { m.markers.at(0).marker_id = -3; });
-  add(kSample, example_sample(), [](auto& m) { m.parts.at(0).covariance[1][1] = -1; });
+  add(kSample, example_sample(), [](auto& m) { m.parts.at(0).covariance[2] = -1; });
   add(kSample, example_sample(), [](auto& m) { m.action.at(0) = kNan; });
   add(kSample, example_sample(), [](auto& m) { m.sample_index = -9; });
   add(kSampleRequest, example_sample_request(), [](auto& m) { m.last_missing = -1; });

@@ -10,6 +10,7 @@
 #include <iomanip>
 #include <map>
 #include <nlohmann/json.hpp>
+#include <random>
 #include <set>
 #include <sstream>
 #include <string>
@@ -19,6 +20,7 @@
 #include "common/bus/convert.h"
 #include "common/bus/event_log.h"
 #include "common/geometry/angle.h"
+#include "tests/lcmtypes/example_messages.h"
 #include "tests/support/synthetic_robot.h"
 
 namespace bodyschema {
@@ -122,6 +124,36 @@ class BodyschemaProgramTest : public testing::Test {
   std::filesystem::path folder_;
   test::SyntheticRobot robot_;
 };
+
+TEST_F(BodyschemaProgramTest, ASchemaBeyondADatagramIsLearnedSavedAndLoaded) {
+  constexpr int kParts = 25;
+  std::mt19937_64 rng(3);
+  std::normal_distribution<double> normal;
+  std::vector<ActionPoseSample> samples;
+  for (int t = 0; t < 70; ++t) {
+    ActionPoseSample& sample = samples.emplace_back();
+    sample.utime = 1'000'000 * t;
+    sample.sample_index = t;
+    sample.action = Eigen::VectorXd::Constant(1, std::sin(t));
+    for (int part = 0; part < kParts; ++part) {
+      Vector6d noise;
+      for (double& value : noise) value = 1e-3 * normal(rng);
+      sample.parts.push_back({part, Eigen::Translation3d(0.1 * part, 0, 1) * exp(noise)});
+    }
+  }
+  const std::string csv = write("rigid.csv", samples);
+  const Outcome learned = run(
+      {"learn", csv, "--method", "chapter", "--noise", "0.001", "0.06", "--out", "large.lcmlog"});
+  ASSERT_EQ(learned.exit_code, 0) << learned.err;
+  EXPECT_GT(std::filesystem::file_size(folder_ / "large.lcmlog"), 64'000U);
+  const Json shown = run({"show", "large.lcmlog", "--json"}).json();
+  EXPECT_TRUE(shown["complete"].get<bool>());
+  EXPECT_EQ(shown["edges"].size(), kParts - 1U);
+  EXPECT_EQ(run({"predict", "large.lcmlog", csv}).exit_code, 0);
+
+  write_one_event_log(folder_ / "larger.lcmlog", kBodySchema, test::large_schema(200));
+  EXPECT_EQ(run({"show", "larger.lcmlog", "--json"}).json()["edges"].size(), 199U);
+}
 
 TEST_F(BodyschemaProgramTest, LearnFindsTheStructureOfTreesWithBranchesSlidersAndSharedSignals) {
   test::Rng rng(72);

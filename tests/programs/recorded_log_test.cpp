@@ -4,9 +4,11 @@
 #include <gtest/gtest.h>
 #include <sys/wait.h>
 
+#include <algorithm>
 #include <csignal>
 #include <cstdlib>
 #include <filesystem>
+#include <fstream>
 #include <set>
 #include <string>
 #include <thread>
@@ -91,6 +93,34 @@ TEST_F(RecordedLogTest, TheLearnerFindsTheBody) {
   ASSERT_FALSE(learned.empty());
   EXPECT_EQ(learned.back().num_samples_seen, 12);
   EXPECT_EQ(objection(from_message(learned.back())), "");
+}
+
+// markers.yaml was edited after the recording, or in the middle of the run.
+TEST_F(RecordedLogTest, SamplesOfAnotherCalibrationAreRefusedFromTheBusAndFromTheirFile) {
+  const fs::path rig = folder_ / "arm2";
+  fs::copy(kRig, rig, fs::copy_options::recursive);
+  std::string markers = text_of(rig / "markers.yaml");
+  markers.replace(markers.find("-0.056"), 6, "-0.057");
+  std::ofstream(rig / "markers.yaml") << markers;
+  for (const std::string process : {"structure_learner", "model_monitor"}) {
+    const fs::path out = folder_ / (process + ".lcmlog");
+    test::Program program({kBin + process, "--config", rig / (process + ".yaml"), "--samples", kLog,
+                           "--in", "file://" + kLog.string() + "?speed=0", "--out",
+                           "file://" + out.string() + "?mode=w"});
+    EXPECT_EQ(program.wait(), 0) << program.err();
+    EXPECT_NE(program.err().find("of another calibration of the tags or lens"), std::string::npos)
+        << program.err();
+    for (const body_schema_t& schema : read_log(out, kLearnedSchema))
+      EXPECT_EQ(schema.num_samples_seen, 0);
+    EXPECT_TRUE(read_log(out, kBodySchema).empty());
+    const process_info_t info = read_log(out, kProcessInfo).back();
+    const auto refused =
+        std::find_if(info.counters.begin(), info.counters.end(),
+                     [](const counter_t& c) { return c.counter_name == "refused SAMPLE"; });
+    ASSERT_NE(refused, info.counters.end());
+    EXPECT_GE(refused->count, 15);
+    EXPECT_NE(info.activity.find("begin a new run"), std::string::npos) << info.activity;
+  }
 }
 
 TEST_F(RecordedLogTest, TheMonitorAcceptsWhatItAcceptedThen) {

@@ -103,6 +103,7 @@ class BaselineSearch {
     const std::clock_t start = std::clock();
     BodySchema& schema = result_.schema;
     schema.num_samples = static_cast<int>(samples_.size());
+    if (!samples_.empty()) schema.calibration_id = samples_.back().calibration_id;
     std::map<int, int> num_seen;
     for (const ActionPoseSample& sample : samples_) {
       schema.last_sample_index = std::max(schema.last_sample_index, sample.sample_index);

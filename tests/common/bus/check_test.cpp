@@ -2,12 +2,18 @@
 
 #include <gtest/gtest.h>
 
+#include <Eigen/Cholesky>
+#include <Eigen/Eigenvalues>
+#include <algorithm>
 #include <cmath>
 #include <functional>
+#include <random>
 #include <string>
 #include <type_traits>
 #include <utility>
 
+#include "common/bus/convert.h"
+#include "common/bus/triangle.h"
 #include "tests/lcmtypes/example_messages.h"
 
 namespace bodyschema::test {
@@ -67,35 +73,84 @@ TEST(Check, RefusesQuaternionsThatAreNotUnit) {
 
 TEST(Check, RefusesCovariancesThatAreNone) {
   expect_refused(example_sample(), "parts[0].covariance",
-                 [](auto& m) { m.parts[0].covariance[1][2] += 1e-7; });
+                 [](auto& m) { m.parts[0].covariance[4] = 1; });
   expect_refused(example_sample(), "parts[0].covariance",
-                 [](auto& m) { m.parts[0].covariance[1][2] = m.parts[0].covariance[2][1] = 1; });
-  expect_refused(example_sample(), "parts[0].covariance",
-                 [](auto& m) { m.parts[0].covariance[3][3] = -1e-9; });
-  expect_refused(example_marker_poses(), "markers[0].covariance", [](auto& m) {
-    for (auto& row : m.markers[0].covariance) {
-      for (double& value : row) value = 0;
-    }
-  });
+                 [](auto& m) { m.parts[0].covariance[9] = -1e-9F; });
+  expect_refused(example_sample(), "parts[0].tags[0].corner_covariance",
+                 [](auto& m) { m.parts[0].tags[0].corner_covariance[1] = 1; });
+  expect_refused(example_marker_poses(), "markers[0].corner_covariance",
+                 [](auto& m) { m.markers[0].corner_covariance[35] = 0; });
+  expect_refused(example_marker_poses(), "markers[0].covariance",
+                 [](auto& m) { std::ranges::fill(m.markers[0].covariance, 0.0F); });
   expect_refused(example_body_schema(), "edges[0].parameter_covariance",
                  [](auto& m) { m.edges[0].parameter_covariance[1] = 1; });
   body_schema_t schema = example_body_schema();
-  for (auto& row : schema.X_CR_covariance) {
-    for (double& value : row) value = 0;
-  }
+  std::ranges::fill(schema.X_CR_covariance, 0.0F);
   EXPECT_EQ(check(schema), "") << "an unknown camera pose has no covariance yet";
 }
 
 TEST(Check, AcceptsASingularCovarianceAndOneWithVeryDifferentUnits) {
   sample_t sample = example_sample();
-  for (int i = 0; i < 6; ++i) {
-    for (int j = 0; j < 6; ++j) {
-      const double scale_i = i < 3 ? 1e-6 : 1e3;
-      const double scale_j = j < 3 ? 1e-6 : 1e3;
-      sample.parts[0].covariance[i][j] = scale_i * scale_j;
+  for (int i = 0, k = 0; i < 6; ++i) {
+    for (int j = 0; j <= i; ++j, ++k) {
+      const float scale_i = i < 3 ? 1e-6F : 1e3F;
+      const float scale_j = j < 3 ? 1e-6F : 1e3F;
+      sample.parts[0].covariance[k] = scale_i * scale_j;
     }
   }
   EXPECT_EQ(check(sample), "");
+}
+
+TEST(Check, AcceptsANearlySingularCovarianceThatRoundingToFloatMadeIndefinite) {
+  std::mt19937_64 rng(5);
+  std::normal_distribution<double> normal;
+  int num_indefinite = 0;
+  sample_t sample = example_sample();
+  for (int n = 0; n < 2000; ++n) {
+    Eigen::Matrix<double, 6, 6> root = Eigen::Matrix<double, 6, 6>::Zero();
+    for (double& value : root.leftCols<5>().reshaped()) value = normal(rng);
+    root.topRows<3>() *= 1e-3;
+    const Eigen::Matrix<double, 6, 6> singular = root * root.transpose();
+    pack_triangle(singular, sample.parts[0].covariance);
+    ASSERT_EQ(check(sample), "");
+    const auto rounded = unpack_triangle<6>(sample.parts[0].covariance);
+    num_indefinite += correlation_of(rounded).selfadjointView<Eigen::Lower>().eigenvalues()[0] < 0;
+    // Whoever uses it may invert it, and sends it on as it came.
+    const Matrix6d covariance = from_message(sample.parts[0].covariance);
+    EXPECT_EQ(covariance.llt().info(), Eigen::Success);
+    EXPECT_TRUE(correlation_of(covariance).isApprox(correlation_of(rounded), 3e-5));
+    to_message(covariance, sample.parts[0].covariance);
+    EXPECT_EQ(from_message(sample.parts[0].covariance),
+              unpack_triangle<6>(sample.parts[0].covariance));
+  }
+  EXPECT_GT(num_indefinite, 100);
+}
+
+TEST(Check, APositionAloneSaysNothingOfRotation) {
+  const auto alone = [] {
+    sample_t sample = example_sample();
+    part_observation_t& part = sample.parts[0];
+    part.has_rotation = 0;
+    part.X_CB.rotation_wxyz[0] = 1;
+    for (int i = 1; i < 4; ++i) part.X_CB.rotation_wxyz[i] = 0;
+    part.X_CB_other = part.X_CB;
+    std::fill(part.covariance + 6, part.covariance + 21, 0.0F);
+    return sample;
+  };
+  EXPECT_EQ(check(alone()), "");
+  expect_refused(alone(), "parts[0].X_CB", [](auto& m) { m.parts[0].X_CB = m.parts[1].X_CB; });
+  expect_refused(alone(), "parts[0].X_CB_other",
+                 [](auto& m) { m.parts[0].X_CB_other = m.parts[1].X_CB; });
+  expect_refused(alone(), "parts[0].covariance",
+                 [](auto& m) { m.parts[0].covariance[20] = 1e-6F; });
+  expect_refused(alone(), "parts[0].covariance", [](auto& m) {
+    std::fill(m.parts[0].covariance, m.parts[0].covariance + 6, 0.0F);
+  });
+  expect_refused(alone(), "parts[0].has_other", [](auto& m) {
+    m.parts[0].has_other = 1;
+    m.parts[0].error_ratio = 2;
+  });
+  expect_refused(alone(), "parts[0].has_rotation", [](auto& m) { m.parts[0].has_rotation = 2; });
 }
 
 TEST(Check, RefusesIdsThatRepeatOrAreOutOfOrder) {

@@ -46,6 +46,7 @@ TEST(Convert, AQuaternionThatPassesCheckBecomesARotation) {
 TEST(Convert, ASampleSurvivesTheWire) {
   const ActionPoseSample sample = from_message(example_sample());
   EXPECT_EQ(sample.sample_index, 12);
+  EXPECT_EQ(sample.calibration_id, 99);
   EXPECT_EQ(sample.purpose, Purpose::kProbe);
   EXPECT_EQ(sample.action, Eigen::Vector2d(0.25, -0.5));
   ASSERT_EQ(sample.parts.size(), 2U);
@@ -57,6 +58,7 @@ TEST(Convert, ASampleSurvivesTheWire) {
   EXPECT_EQ(check(message), "");
   const ActionPoseSample again = from_message(message);
   EXPECT_EQ(again.utime, sample.utime);
+  EXPECT_EQ(again.calibration_id, 99);
   EXPECT_EQ(again.action, sample.action);
   for (std::size_t i = 0; i < sample.parts.size(); ++i) {
     EXPECT_EQ(again.parts[i].part, sample.parts[i].part);
@@ -66,6 +68,16 @@ TEST(Convert, ASampleSurvivesTheWire) {
     EXPECT_EQ(again.parts[i].error_ratio, sample.parts[i].error_ratio);
     EXPECT_EQ(again.parts[i].tags, sample.parts[i].tags);
   }
+}
+
+TEST(Convert, APartOfWhichThePositionAloneIsKnownIsLeftOut) {
+  sample_t message = example_sample();
+  EXPECT_EQ(num_positions_alone(message), 0);
+  message.parts[0].has_rotation = 0;
+  EXPECT_EQ(num_positions_alone(message), 1);
+  const ActionPoseSample sample = from_message(message);
+  ASSERT_EQ(sample.parts.size(), 1U);
+  EXPECT_EQ(sample.parts[0].part, 3);
 }
 
 TEST(Convert, ABodySchemaSurvivesTheWire) {
@@ -87,6 +99,11 @@ TEST(Convert, ABodySchemaSurvivesTheWire) {
     EXPECT_TRUE(twice.edges[i].predict(action).isApprox(schema.edges[i].predict(action), 1e-13));
     EXPECT_EQ(twice.edges[i].parameter_covariance, schema.edges[i].parameter_covariance);
   }
+  EXPECT_EQ(schema.edges[0].joints[0].order_group, 3);
+  EXPECT_EQ(twice.edges[0].joints[1].order_group, 3);
+  EXPECT_EQ(twice.edges[2].joints[0].order_group, -1);
+  EXPECT_EQ(twice.calibration_id, 99);
+  EXPECT_EQ(twice.X_CR_covariance, schema.X_CR_covariance);
   EXPECT_EQ(twice.parts, schema.parts);
   EXPECT_EQ(twice.noise.position_m, schema.noise.position_m);
   ASSERT_EQ(schema.moved_tags.size(), 1U);

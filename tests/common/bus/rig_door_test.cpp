@@ -114,6 +114,26 @@ TEST(RigDoor, ASmallDifferenceIsEnough) {
   EXPECT_NE(door.objection(health), "");
 }
 
+// A markers.yaml edited between two processes' starts.
+TEST(RigDoor, AnotherCalibrationOfTheTagsOrLensIsRefused) {
+  const auto rig = kConfig / "arm2";
+  const RigDoor door(rig);
+  EXPECT_EQ(door.calibration_id(), calibration_id(rig));
+  sample_t sample = sample_of(rig);
+  body_schema_t schema = schema_of(rig);
+  marker_poses_t poses = poses_of(rig);
+  const auto objections = [&](std::int64_t id) {
+    sample.calibration_id = schema.calibration_id = poses.calibration_id = id;
+    return std::vector{door.objection(sample), door.objection(schema), door.objection(poses)};
+  };
+  for (const std::string& why : objections(0)) EXPECT_EQ(why, "") << "not told";
+  for (const std::string& why : objections(door.calibration_id())) EXPECT_EQ(why, "");
+  for (const std::string& why : objections(door.calibration_id() + 1)) {
+    EXPECT_TRUE(why.starts_with("of another calibration of the tags or lens: ")) << why;
+    EXPECT_NE(why.find("start"), std::string::npos) << "what to do: " << why;
+  }
+}
+
 /// As the camera of the rig sends it.
 camera_info_t info_of(const std::filesystem::path& rig) {
   const CameraCalibration calibration = load_camera_calibration(rig / "camera_info.yaml");

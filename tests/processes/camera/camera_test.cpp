@@ -70,6 +70,19 @@ TEST(SimulatedCamera, SendsTheSameBytesForARepeatedStateWithoutRenderingThemAgai
   EXPECT_EQ(num_rendered, 4);
 }
 
+TEST(SimulatedCamera, RefusesAStateOfASimulatorThatWasStartedOtherwise) {
+  sim_state_t ideal = state(0, 5), honest = state(0, 5);
+  ideal.is_ideal = 1;
+  EXPECT_FALSE(ideal_problem(true, ideal));
+  EXPECT_FALSE(ideal_problem(false, honest));
+  EXPECT_EQ(ideal_problem(true, honest),
+            "shows nothing: robot_simulator runs without --ideal, this camera with it; start both "
+            "alike");
+  EXPECT_EQ(ideal_problem(false, ideal),
+            "shows nothing: robot_simulator runs with --ideal, this camera without; start both "
+            "alike");
+}
+
 TEST(MakeImage, TurnsColourAnd16BitFramesIntoGrey) {
   const CameraConfig c = config();
   const cv::Mat colour(48, 64, CV_8UC3, cv::Scalar(50, 100, 150));  // blue, green, red

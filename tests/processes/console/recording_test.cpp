@@ -536,13 +536,34 @@ TEST_F(RecordingFileTest, ALogOfSamplesIsReadWithInstantsCountedFromZero) {
       const PartObservation &a = read.parts[k], &b = samples_[i].parts[k];
       EXPECT_EQ(a.part, b.part);
       EXPECT_LT((a.X_CB.matrix() - b.X_CB.matrix()).norm(), 1e-12);
-      EXPECT_LT((a.covariance - b.covariance).norm(), 1e-15);
+      EXPECT_TRUE(a.covariance.isApprox(b.covariance, 1e-6)) << "beyond rounding to float";
       EXPECT_EQ(a.X_CB_other.has_value(), b.X_CB_other.has_value());
       EXPECT_EQ(a.error_ratio, b.error_ratio);
     }
   }
   ASSERT_EQ(recording.signals.size(), 2U);
   EXPECT_EQ(recording.signals[0].name, "q1");
+}
+
+TEST_F(RecordingFileTest, APositionAloneIsLeftOutAndTold) {
+  {
+    LogAppender log(file_);
+    sample_t alone = to_message(samples_[0]);
+    part_observation_t& part = alone.parts[0];
+    part.has_rotation = part.has_other = 0;
+    part.error_ratio = 0;
+    part.X_CB.rotation_wxyz[0] = 1;
+    for (int i = 1; i < 4; ++i) part.X_CB.rotation_wxyz[i] = 0;
+    part.X_CB_other = part.X_CB;
+    std::fill(part.covariance + 6, part.covariance + 21, 0.0F);
+    log.append(kSample, alone);
+    log.append(kSample, to_message(samples_[1]));
+  }
+  const Recording recording = load_recording(file_);
+  EXPECT_EQ(recording.samples[0].parts.size() + 1, samples_[0].parts.size());
+  EXPECT_EQ(
+      recording.hints,
+      std::vector<std::string>{"1 observations left out: position alone, without an orientation"});
 }
 
 TEST_F(RecordingFileTest, OnlyTrainAndProbeAreLearnedFrom) {
@@ -602,6 +623,18 @@ TEST_F(RecordingFileTest, ALogThatIsOfNoUseIsRefused) {
     log.append(kSample, longer);
   }
   EXPECT_EQ(load_error(), " sample 6 has 3 action signals, the first one 2");
+
+  std::filesystem::remove(file_);
+  {
+    LogAppender log(file_);
+    samples_[0].calibration_id = 1;
+    samples_[1].calibration_id = 2;
+    log.append(kSample, to_message(samples_[0]));
+    log.append(kSample, to_message(samples_[1]));
+  }
+  EXPECT_EQ(load_error(),
+            " sample 6 is of another calibration of the tags or lens than the first: markers.yaml "
+            "or the camera's calibration changed in between; make a new run");
 
   std::filesystem::remove(file_);
   {

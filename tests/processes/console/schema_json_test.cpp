@@ -186,6 +186,7 @@ TEST(SchemaJsonTest, ShowHasEveryParameterOfEveryEdge) {
       joint.slide = j["slide_m"];
       joint.turn = j["turn_rad"];
       joint.X_after = pose_of(j["X_after"]);
+      EXPECT_TRUE(j["order_group"].is_null());
       edge.joints.push_back(joint);
     }
     for (int n = 0; n < 5; ++n) {
@@ -194,6 +195,17 @@ TEST(SchemaJsonTest, ShowHasEveryParameterOfEveryEdge) {
                 1e-9);
     }
   }
+}
+
+TEST(SchemaJsonTest, JointsWhoseOrderIsOpenHaveTheNumberOfTheirGroup) {
+  BodySchema schema;
+  schema.signals = {{"a", -1, 1, {}}, {"b", -1, 1, {}}};
+  Edge& edge = schema.edges.emplace_back();
+  edge.joints = {ScrewJoint{.signal = 0, .turn = 1, .order_group = 2},
+                 ScrewJoint{.signal = 1, .turn = 1}};
+  const auto joints = schema_json(schema)["edges"][0]["joints"];
+  EXPECT_EQ(joints[0]["order_group"], 2);
+  EXPECT_TRUE(joints[1]["order_group"].is_null());
 }
 
 TEST(SchemaJsonTest, ASignalThatDidNotMoveEnoughToTellIsNotCalledWithoutEffect) {

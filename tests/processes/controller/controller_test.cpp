@@ -206,6 +206,7 @@ class Bench {
       if (hidden.count(part)) continue;
       part_observation_t seen{};
       seen.part_id = part;
+      seen.has_rotation = 1;
       Pose X_CB = X_CC_moved * planar().X_CR * X_RB;
       if (part == 4) X_CB.translation() += bend_m;
       seen.X_CB = seen.X_CB_other = to_message(X_CB);

@@ -38,7 +38,7 @@ Markers markers() {
 struct Estimator : MarkerEstimator {
   explicit Estimator(const camera_info_t& info = pinhole_camera(),
                      const MarkerEstimatorConfig& c = config())
-      : MarkerEstimator(c, markers()) {
+      : MarkerEstimator(c, markers(), 99) {
     on_camera_info(info);
   }
   marker_poses_t see(const std::vector<Plate>& plates, const camera_info_t& info,

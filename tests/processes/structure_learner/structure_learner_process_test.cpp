@@ -84,8 +84,7 @@ TEST_F(StructureLearnerTest, ATestSampleIsNeverLearnedFrom) {
     for (auto& part : sample.parts) {
       part.part_id += 100;  // parts that do not exist
       part.X_CB = to_message(test::random_pose(rng, 0, 100));
-      for (auto& row : part.covariance)
-        for (double& value : row) value *= 1e4;
+      for (float& value : part.covariance) value *= 1e4F;
     }
   }
   EXPECT_EQ(bytes_of(learn_all(garbage)), expected);
