@@ -581,6 +581,13 @@ std::string check(const body_schema_t& message) {
              [&](const schema_edge_t& edge) { check_edge(check, edge, message, parts, placed); });
   check.require(message.is_complete == 0 || message.num_edges == message.num_parts - 1,
                 "is_complete", "is 1 but the edges do not span the parts");
+  std::int64_t previous_frame = -1;
+  check.each(
+      "frames", message.num_frames, message.frames, kMaxParts, [&](const part_frame_t& frame) {
+        check.ascending("frame_part", frame.frame_part, previous_frame);
+        check.require(parts.count(frame.frame_part) == 1, "frame_part", "is not in part_ids");
+        check.covariance<6>("frame_covariance", frame.frame_covariance, false);
+      });
   std::set<std::int32_t> unconnected;
   check.each("unconnected", message.num_unconnected, message.unconnected, kMaxParts,
              [&](const unconnected_part_t& part) {

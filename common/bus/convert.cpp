@@ -320,6 +320,13 @@ body_schema_t to_message(const BodySchema& schema) {
   std::vector<schema_edge_t> edges;
   for (const Edge& edge : schema.edges) edges.push_back(to_message(edge));
   set_array(message.num_edges, message.edges, std::move(edges));
+  std::vector<part_frame_t> frames;
+  for (const auto& [part, covariance] : schema.frame_covariances) {
+    part_frame_t& out = frames.emplace_back();
+    out.frame_part = part;
+    to_message(covariance, out.frame_covariance);
+  }
+  set_array(message.num_frames, message.frames, std::move(frames));
   std::vector<unconnected_part_t> unconnected;
   for (const UnconnectedPart& part : schema.unconnected) {
     unconnected_part_t& out = unconnected.emplace_back();
@@ -370,6 +377,8 @@ BodySchema from_message(const body_schema_t& message) {
         {signal.signal_name, signal.lower_limit, signal.upper_limit, signal.warp_weights});
   }
   for (const schema_edge_t& edge : message.edges) schema.edges.push_back(from_message(edge));
+  for (const part_frame_t& frame : message.frames)
+    schema.frame_covariances[frame.frame_part] = from_message(frame.frame_covariance);
   for (const unconnected_part_t& part : message.unconnected) {
     schema.unconnected.push_back(
         {part.unconnected_part, static_cast<Unconnected>(part.reason), part.detail});

@@ -281,6 +281,10 @@ body_schema_t example_body_schema() {
   fill(message.num_signals, message.signals, signals);
   fill(message.num_edges, message.edges,
        {edge(2, 4, 2), edge(4, 1, 0), screw_gp_edge(4, 5), matrix_gp_edge(1, 6)});
+  part_frame_t frame{};
+  frame.frame_part = 4;
+  covariance(frame.frame_covariance);
+  fill(message.num_frames, message.frames, {frame});
   unconnected_part_t lost{};
   lost.unconnected_part = 9;
   lost.reason = unconnected_part_t::REASON_NO_VALID_MODEL;

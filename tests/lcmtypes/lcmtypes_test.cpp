@@ -61,6 +61,7 @@ std::map<std::string, std::string> fingerprints() {
           {"model_health_t", hash_of<model_health_t>()},
           {"motion_status_t", hash_of<motion_status_t>()},
           {"moved_tag_t", hash_of<moved_tag_t>()},
+          {"part_frame_t", hash_of<part_frame_t>()},
           {"part_health_t", hash_of<part_health_t>()},
           {"part_observation_t", hash_of<part_observation_t>()},
           {"pose_t", hash_of<pose_t>()},

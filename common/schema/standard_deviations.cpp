@@ -1,0 +1,42 @@
+#include "common/schema/standard_deviations.h"
+
+#include <cmath>
+
+namespace bodyschema {
+
+std::vector<JointDeviation> joint_deviations(const Edge& edge, const Eigen::VectorXd& theta) {
+  const Eigen::MatrixXd& P = edge.parameter_covariance;
+  const Eigen::Index size = 6 + 8 * static_cast<Eigen::Index>(edge.joints.size());
+  std::vector<JointDeviation> result;
+  if (P.rows() != size || P.cols() != size) return result;
+  const auto across = [&](Eigen::Index x) { return std::sqrt((P(x, x) + P(x + 1, x + 1)) / 2); };
+  Eigen::Index before = 0;  // of the transform that the joint's frame ends
+  for (std::size_t d = 0; d < edge.joints.size(); ++d) {
+    const ScrewJoint& joint = edge.joints[d];
+    const Eigen::Index slide = 6 + 8 * static_cast<Eigen::Index>(d), after = slide + 2;
+    const Matrix6d A = adjoint(joint.X_after);
+    // What a screw frame gains along its axis the transform that follows loses.
+    const auto along = [&](Eigen::Index axis, Eigen::Index rate) {
+      Eigen::VectorXd g = Eigen::VectorXd::Zero(size);
+      g(before + axis) = 1;
+      g(rate) = joint.gain * theta(joint.signal) + joint.offset;
+      g.segment<6>(after) = A.row(axis);
+      return std::sqrt(g.dot(P * g));
+    };
+    result.push_back({.axis_position_m = across(before),
+                      .axis_tilt_rad = across(before + 3),
+                      .displacement_m = along(2, slide),
+                      .displacement_rad = along(5, slide + 1),
+                      .slide = std::sqrt(P(slide, slide)),
+                      .turn = std::sqrt(P(slide + 1, slide + 1))});
+    before = after;
+  }
+  return result;
+}
+
+Noise deviations_of(const Matrix6d& covariance) {
+  return {std::sqrt(covariance.topLeftCorner<3, 3>().trace() / 3),
+          std::sqrt(covariance.bottomRightCorner<3, 3>().trace() / 3)};
+}
+
+}  // namespace bodyschema

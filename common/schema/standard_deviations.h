@@ -1,0 +1,26 @@
+#pragma once
+
+#include <vector>
+
+#include "common/schema/body_schema.h"
+
+namespace bodyschema {
+
+/// How well the samples tell a joint, one standard deviation: Edge::parameter_covariance in terms
+/// that do not depend on how the joint's frame is turned about its axis.
+struct JointDeviation {
+  double axis_position_m = 0;   ///< of the axis, across it; not determined where nothing turns
+  double axis_tilt_rad = 0;     ///< of the axis, about each direction across it
+  double displacement_m = 0;    ///< of how far it has slid at these displacements ...
+  double displacement_rad = 0;  ///< ... and turned
+  double slide = 0;             ///< [m per command unit]
+  double turn = 0;              ///< [rad per command unit]
+};
+
+/// Of each joint in the frame of the one before (the first: of `from`). Empty without a covariance.
+std::vector<JointDeviation> joint_deviations(const Edge& edge, const Eigen::VectorXd& theta);
+
+/// Root mean square over three axes: translation [m], rotation [rad].
+Noise deviations_of(const Matrix6d& covariance);
+
+}  // namespace bodyschema
