@@ -118,6 +118,10 @@ std::optional<marker_poses_t> MarkerEstimator::on_camera_image(const camera_imag
       ++counters_["tag not in markers.yaml"];
       continue;
     }
+    if (!markers.empty() && markers.back().marker_id == detection.id) {
+      ++counters_["tag seen twice"];
+      continue;
+    }
     if (const auto marker = estimate(*grey, detection, tag->size_m)) markers.push_back(*marker);
   }
   marker_poses_t poses;
