@@ -116,6 +116,9 @@ def replay(place, log, rig, speed):
     if rig:
         folder = rig_folder(place, rig)
         rig = folder.name
+        recorded = log.parent / "config"
+        if (recorded / "signals.yaml").exists() and (names := run_folder.differences(recorded, folder)):
+            say(f"--rig {rig} differs from {recorded} in {', '.join(names)}; without --rig the replay takes the latter.")
     else:
         # A run's folder says which rig it was; of another recording its messages do.
         folder = log.parent / "config"

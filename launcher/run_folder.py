@@ -65,3 +65,15 @@ def tell_ideal_noise(run):
     ideal = run / "config" / "ideal_noise.yaml"
     if ideal.exists():
         ideal.replace(run / "config" / "noise.yaml")
+
+
+def differences(recorded, rig):
+    """Names of the YAML files in which the configuration of a recorded run is not that of a rig's folder."""
+    # A run with --ideal has it under another name.
+    names = {file.name for folder in (recorded, rig) for file in folder.glob("*.yaml")} - {"ideal_noise.yaml"}
+
+    def text(folder, name):
+        file = folder / name
+        return file.read_bytes() if file.exists() else None
+
+    return sorted(name for name in names if text(recorded, name) != text(rig, name))

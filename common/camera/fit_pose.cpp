@@ -56,7 +56,7 @@ std::optional<PoseFit> fit_pose(const Pose& start, const std::vector<Eigen::Vect
     return r;
   };
   Pose X_CB = start;
-  Jacobian J;
+  Jacobian J, candidate_J;
   auto residual = residual_at(X_CB, &J);
   if (!residual || !residual->allFinite() || p_BP.size() < 3) return std::nullopt;
   double cost = residual->squaredNorm();
@@ -71,12 +71,11 @@ std::optional<PoseFit> fit_pose(const Pose& start, const std::vector<Eigen::Vect
     const Vector6d step = -damped.ldlt().solve(gradient);
     if (!step.allFinite()) return std::nullopt;
     const Pose candidate = X_CB * exp(step);
-    const auto candidate_residual = residual_at(candidate, nullptr);
+    const auto candidate_residual = residual_at(candidate, &candidate_J);
     if (candidate_residual && candidate_residual->squaredNorm() <= cost) {
       X_CB = candidate;
-      X_CB.linear() = nearest_rotation(X_CB.linear());
-      residual = residual_at(X_CB, &J);
-      if (!residual) return std::nullopt;
+      residual = candidate_residual;
+      J.swap(candidate_J);
       cost = residual->squaredNorm();
       damping = std::max(damping / 10, 1e-12);
     } else {
@@ -88,6 +87,7 @@ std::optional<PoseFit> fit_pose(const Pose& start, const std::vector<Eigen::Vect
       break;
     }
   }
+  X_CB.linear() = nearest_rotation(X_CB.linear());
   return PoseFit{X_CB, std::sqrt(cost / static_cast<double>(2 * p_BP.size())), J.transpose() * J};
 }
 

@@ -28,16 +28,16 @@ double sigma_px(const Matrix8d& corner_covariance_px2);
 Matrix8d whitener_of(const Matrix8d& corner_covariance_px2);
 
 /// Where the points `p_BP` of body B, posed at X_CB, are seen, minus where they were measured:
-/// 2n values in units of their standard deviations. `jacobian`, if given, receives the 2n×6
-/// derivative with respect to ξ in X_CB · exp(ξ). std::nullopt if a point lies behind the camera.
+/// 2n values in units of their standard deviations; nothing if a point lies behind the camera.
+/// `jacobian`, if given, receives the 2n×6 derivative with respect to ξ in X_CB · exp(ξ).
 std::optional<Eigen::VectorXd> reprojection_residual(
     const Pose& X_CB, const std::vector<Eigen::Vector3d>& p_BP,
     const std::vector<ImagePoint>& measured, Eigen::Matrix<double, Eigen::Dynamic, 6>* jacobian);
 
 /// Levenberg–Marquardt from `start` down to the local minimum of the reprojection error of at least
-/// 3 points. Where the errors of the n points are correlated, `whitener` (2n × 2n) is the inverse
-/// of the Cholesky factor of their covariance, in units of the points' sigma_px. std::nullopt if
-/// the start has a point behind the camera or the points do not determine the pose.
+/// 3 points; nothing if the start has a point behind the camera or the points do not determine the
+/// pose. Where the errors of the n points are correlated, `whitener` (2n × 2n) is the inverse of
+/// the Cholesky factor of their covariance, in units of the points' sigma_px.
 std::optional<PoseFit> fit_pose(const Pose& start, const std::vector<Eigen::Vector3d>& p_BP,
                                 const std::vector<ImagePoint>& measured,
                                 const Eigen::MatrixXd* whitener = nullptr);

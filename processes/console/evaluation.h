@@ -34,9 +34,8 @@ struct Alignment {
 };
 
 /// Least squares over all parts of all samples, 1 mm against 0.1°; what they leave open stays near
-/// the identity. std::nullopt for less than
-/// kMinAligned samples with the root: too few to tell a frame from an error.
-/// @throws as evaluate().
+/// the identity. std::nullopt where fewer than kMinAligned samples have the root, which cannot tell
+/// a frame from an error. @throws as evaluate().
 std::optional<Alignment> align(const BodySchema& schema,
                                const std::vector<ActionPoseSample>& samples);
 inline constexpr int kMinAligned = 5;  // chosen: of 30 residuals a part some 6 are spent

@@ -81,16 +81,16 @@ AdaptationOptions options_of(const MonitorArguments& arguments, const Recording&
                              const BodySchema& schema) {
   AdaptationOptions options;
   if (recording.is_log) {
-    options.noise.systematic = recording.systematic;  // as model_monitor has it
+    options.measurement.systematic = recording.systematic;  // as model_monitor has it
     options.least_noise_scale = 1;
   }
   if (!arguments.noise.empty()) {
-    options.noise.noise = noise_given(arguments.noise);
+    options.measurement.noise = noise_given(arguments.noise);
   } else if (!recording.has_noise) {
     if (!(schema.noise.position_m > 0 && schema.noise.rotation_rad > 0))
       throw std::invalid_argument(arguments.samples + " and " + arguments.schema +
                                   " do not say how noisy the markers are: give --noise");
-    options.noise.noise = schema.noise;
+    options.measurement.noise = schema.noise;
   }
   return options;
 }
@@ -135,9 +135,9 @@ std::unique_ptr<Method> method_of(const MonitorArguments& arguments, const Recor
   if (arguments.method == "evidence")
     return std::make_unique<MethodOf<Adaptation>>(Adaptation(schema, options));
   ChapterAdaptationOptions chapter;
-  if (options.noise.noise) {
+  if (options.measurement.noise) {
     BaselineOptions baseline;
-    baseline.set_noise(*options.noise.noise);
+    baseline.set_noise(*options.measurement.noise);
     chapter.sigma_position_m = baseline.sigma_position_m;
     chapter.sigma_rotation_rad = baseline.sigma_rotation_rad;
   }

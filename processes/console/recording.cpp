@@ -275,10 +275,7 @@ Recording read_samples(const std::filesystem::path& file, const std::string& nam
   Recording recording;
   recording.is_log = true;
   recording.has_noise = true;
-  const std::filesystem::path rig = std::filesystem::path(name).parent_path() / "config";
-  recording.systematic = std::filesystem::exists(rig / "noise.yaml")
-                             ? load_noise(rig).measurement.systematic
-                             : kTagSystematic;
+  recording.systematic = systematic_of(name);
   LogReport report;
   const std::vector<sample_t> messages = read_log(file, kSample, &report);
   if (messages.empty()) {
@@ -477,6 +474,12 @@ Recording load_recording(const std::filesystem::path& file) {
     if (what.starts_with(path)) what.replace(0, path.size(), name);
     throw RecordingError(what);
   }
+}
+
+Noise systematic_of(const std::filesystem::path& log) {
+  const std::filesystem::path rig = log.parent_path() / "config";
+  return std::filesystem::exists(rig / "noise.yaml") ? load_noise(rig).measurement.systematic
+                                                     : kTagSystematic;
 }
 
 }  // namespace bodyschema

@@ -26,8 +26,7 @@ struct Recording {
   bool has_noise = false;
   /// Whether the poses are those of camera markers, recorded by our observer.
   bool is_log = false;
-  /// MeasurementModel::systematic of a log: of the noise.yaml in the run's folder, else
-  /// kTagSystematic; 0 of a CSV.
+  /// systematic_of() a log; 0 of a CSV.
   Noise systematic;
   /// What keeps a log from being whole, for people: "" if nothing does. What precedes it was read.
   std::string damage;
@@ -49,6 +48,10 @@ struct Recording {
 /// Either may be packed by gzip; "-" is stdin.
 /// @throws RecordingError.
 Recording load_recording(const std::filesystem::path& file);
+
+/// MeasurementModel::systematic of a log: of the noise.yaml in `config/` beside it, as a run's
+/// folder has it, else kTagSystematic. @throws ConfigError.
+Noise systematic_of(const std::filesystem::path& log);
 
 /// The signals of samples of which nothing is known but their numbers: called q1, q2, …, with the
 /// range that they were seen in as limits. All samples have as many signals as the first.

@@ -19,8 +19,10 @@
 #include "processes/console/interruption.h"
 #include "processes/console/log_follower.h"
 #include "processes/console/picture.h"
+#include "processes/console/recording.h"
 #include "processes/console/report_page.h"
 #include "processes/console/run_record.h"
+#include "processes/structure_learner/learn.h"
 
 namespace bodyschema {
 namespace {
@@ -82,6 +84,11 @@ class Source {
     report.logs = follower_.summaries();
     for (auto& [file, summary] : report.logs) {
       if (grows_ && summary.damage.starts_with("is cut off")) summary.damage.clear();
+    }
+    try {
+      report.systematic = systematic_of(is_folder_ ? path_ / "run.lcmlog" : path_);
+    } catch (const std::exception&) {
+      report.systematic = kTagSystematic;
     }
     report.reload_s = reload_s;
     report.picture = picture();

@@ -145,7 +145,7 @@ struct Body {
   std::string origin;
 };
 
-std::optional<Body> body_of(const RunRecord& record) {
+std::optional<Body> body_of(const RunRecord& record, const Noise& systematic) {
   if (const auto& accepted = record.watch().schema()) {
     return Body{*accepted, fmt::format("version {}, accepted by the monitor", accepted->version)};
   }
@@ -162,7 +162,7 @@ std::optional<Body> body_of(const RunRecord& record) {
   if (recording.samples.empty()) return std::nullopt;
   recording.signals = observed_signals(recording.samples);
   LearnOptions options;
-  options.systematic = kTagSystematic;
+  options.systematic = systematic;
   return Body{learn(recording.signals, recording.training(), options).schema,
               "learned for this report: the log holds no body schema"};
 }
@@ -181,7 +181,9 @@ std::vector<ActionPoseSample> fitting(const std::vector<ActionPoseSample>& sampl
 class Page {
  public:
   explicit Page(const Report& report)
-      : report_(report), record_(*report.record), body_(body_of(*report.record)) {
+      : report_(report),
+        record_(*report.record),
+        body_(body_of(*report.record, report.systematic)) {
     if (body_) {
       held_out_ = fitting(
           record_.watch().held_out(body_->schema.body_since(body_->schema.last_sample_index)),
@@ -400,10 +402,10 @@ class Page {
     html +=
         "<p class=\"note\">Residual: root mean square, each observation predicted without itself, "
         "outliers left out. Health and d²: the monitor’s, on held-out samples, d² in units of the "
-        "assumed covariance. That is wide enough for the views that tags are worst in, so that "
-        "most residuals are far within it: the median of a right model is about 0.8 (0.3 to 2; "
-        "<code>./run experiment pose_error</code>), and 5.3, that of χ² with 6 degrees of freedom, "
-        "only where the noise is as it is assumed. Above that the edge is wrong.</p>\n";
+        "assumed covariance. That has the systematic error of a pose in it, which is mostly common "
+        "to all samples and learned with the edge: the median of a right model is far below 5.3, "
+        "that of χ² with 6 degrees of freedom (0.0 to 0.1 of an ideal rig’s tags). Above 5.3 the "
+        "edge is wrong.</p>\n";
     static const char* const kReasons[] = {"never seen", "not enough data yet", "no valid model"};
     Table lone({"not connected", "why", "detail"});
     for (const UnconnectedPart& part : schema.unconnected) {

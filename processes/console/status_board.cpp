@@ -449,10 +449,10 @@ std::string StatusBoard::text(int width) const {
     const std::size_t first = health_->events.size() - std::min(kShown, health_->events.size());
     for (std::size_t i = health_->events.size(); i-- > first;) {
       const health_event_t& event = health_->events[i];
-      // By the arm's clock: the newest sample is now.
+      // In samples: the arm's clock may be a simulated one.
+      const std::int64_t ago = sample_ ? sample_->sample_index - event.event_sample : -1;
       const std::string age =
-          sample_ ? ", " + duration(std::max(0.0, seconds(event.utime, sample_->utime))) + " ago"
-                  : "";
+          ago < 0 ? "" : fmt::format(", {} sample{} ago", ago, ago == 1 ? "" : "s");
       text +=
           wrap(fmt::format("sample {}{}: {}", event.event_sample, age, event.event_text), width, 2);
     }

@@ -120,6 +120,10 @@ std::optional<marker_poses_t> MarkerEstimator::on_camera_image(const camera_imag
       ++counters_["tag not in markers.yaml"];
       continue;
     }
+    if (!markers.empty() && markers.back().marker_id == detection.id) {
+      ++counters_["tag seen twice"];
+      continue;
+    }
     if (const auto marker = estimate(*grey, detection, tag->size_m)) markers.push_back(*marker);
   }
   marker_poses_t poses;
@@ -129,8 +133,14 @@ std::optional<marker_poses_t> MarkerEstimator::on_camera_image(const camera_imag
   poses.calibration_id = calibration_id_;
   set_array(poses.num_markers, poses.markers, std::move(markers));
   num_seen_ = poses.num_markers;
-  if (answered_.size() == kMaxAnswered) answered_.pop_front();
-  answered_.emplace_back(image, poses);
+  if (answered_.size() < kMaxAnswered) {
+    answered_.emplace_back(image, poses);
+  } else {
+    // The oldest one's memory is used again: an image is megabytes.
+    std::rotate(answered_.begin(), answered_.begin() + 1, answered_.end());
+    answered_.back().first = image;
+    answered_.back().second = poses;
+  }
   return poses;
 }
 

@@ -36,7 +36,8 @@ struct MarkerEstimatorConfig {
 /// hypotheses of a planar marker, each refined to its local minimum, and the covariance of the
 /// better one. Corners are fitted to the grey values of the tag (refine_corners()), whose residuals
 /// give their noise; where that is refused, AprilTag's corners with the configured noise take their
-/// place. It knows ids and sizes, not what carries the markers.
+/// place. It knows ids and sizes, not what carries the markers. Of several tags with one id, the
+/// one with the largest decision margin counts among those that pass all gates.
 ///
 /// Before the first CAMERA_INFO it answers nothing, since pixels mean no poses yet. Afterwards it
 /// answers every readable image of the calibrated size, with no markers where none is seen. An

@@ -121,8 +121,6 @@ std::vector<TagDetection> TagDetector::detect(const cv::Mat& grey) {
   std::sort(detections.begin(), detections.end(), [](const auto& a, const auto& b) {
     return a.id != b.id ? a.id < b.id : a.decision_margin > b.decision_margin;
   });
-  const auto same_id = [](const auto& a, const auto& b) { return a.id == b.id; };
-  detections.erase(std::unique(detections.begin(), detections.end(), same_id), detections.end());
   return detections;
 }
 

@@ -36,8 +36,8 @@ class TagDetector {
   TagDetector(const TagDetector&) = delete;
   TagDetector& operator=(const TagDetector&) = delete;
 
-  /// Tags in an 8-bit grey image, ascending id; of several with one id, the one with the largest
-  /// decision margin. @throws std::invalid_argument if the image is not 8-bit grey or a side is
+  /// Tags in an 8-bit grey image, by ascending id, those with one id by descending decision margin.
+  /// @throws std::invalid_argument if the image is not 8-bit grey or a side is
   /// shorter than kMinSide_px (AprilTag reads outside of smaller images).
   std::vector<TagDetection> detect(const cv::Mat& grey);
 

@@ -122,7 +122,7 @@ Adaptation::Adaptation(BodySchema schema, AdaptationOptions options)
         if (is_soft_) options.least_noise_scale = std::max(options.least_noise_scale, 1.0);
         return options;
       }()),
-      noise_(options.noise),
+      measurement_(options.measurement),
       credit_(kMostWork),
       schema_(std::move(schema)),
       visibility_(options.false_alarm_rate),
@@ -141,7 +141,7 @@ Adaptation::Adaptation(BodySchema schema, AdaptationOptions options,
   for (const ActionPoseSample& sample : past) {
     if (stream_.repeats(sample, schema_.signals)) continue;
     visibility_.look(schema_.parts, sample, sample, tags_);
-    tags_.look_back(sample, schema_, noise_);
+    tags_.look_back(sample, schema_, measurement_);
     if (sample.purpose != Purpose::kTest) continue;
     recent_.push_back(sample);
     drop_moved_tags(moved_tags_, &recent_.back());
@@ -167,7 +167,7 @@ EdgeState Adaptation::state_of(const Place& place) const {
 
 void Adaptation::install(const BodySchema& schema) {
   schema_ = schema;
-  filter_.emplace(schema_, noise_);
+  filter_.emplace(schema_, measurement_);
   // However loud, one sample finds nothing out where a model is soft.
   const double loudest =
       is_soft_ ? alarm_threshold(filter_->num_nodes(), options_.false_alarm_rate) / kFewestSoft
@@ -189,7 +189,7 @@ void Adaptation::calibrate() {
   // The filter's own beliefs depend on the scale: a few rounds.
   for (int round = 0; round < 4; ++round) {
     std::vector<double> distances;
-    const TreeFilter filter(schema_, noise_);
+    const TreeFilter filter(schema_, measurement_);
     for (const ActionPoseSample& sample : recent_) {
       const TreeFilter::Judgement judgement = filter.judge(filter.prepare(sample));
       for (const double d2 : judgement.squared_distance)
@@ -197,10 +197,12 @@ void Adaptation::calibrate() {
     }
     if (distances.size() < kFewestDistances) return;
     const double scale = std::sqrt(upper_median(distances) / kMedianChiSquare6);
-    noise_.scale = std::clamp(noise_.scale * scale, options_.least_noise_scale, kLargestScale);
+    measurement_.scale =
+        std::clamp(measurement_.scale * scale, options_.least_noise_scale, kLargestScale);
   }
   // A few samples tell no better than this.
-  if (std::abs(std::log(noise_.scale)) < 0.15) noise_.scale = options_.noise.scale;
+  if (std::abs(std::log(measurement_.scale)) < 0.15)
+    measurement_.scale = options_.measurement.scale;
 }
 
 void Adaptation::watch_noise(const TreeFilter::Judgement& judgement) {
@@ -211,8 +213,8 @@ void Adaptation::watch_noise(const TreeFilter::Judgement& judgement) {
   quiet_distances_.clear();
   num_quiet_ = 0;
   if (std::abs(std::log(scale)) < 0.05) return;
-  noise_.scale =
-      std::clamp(noise_.scale * std::sqrt(scale), options_.least_noise_scale, kLargestScale);
+  measurement_.scale =
+      std::clamp(measurement_.scale * std::sqrt(scale), options_.least_noise_scale, kLargestScale);
   install(schema_);
 }
 
@@ -228,7 +230,7 @@ std::vector<const ActionPoseSample*> Adaptation::segment(std::int64_t since, int
 FoundChanges Adaptation::search(const BodySchema& standing, const std::vector<Place>& places,
                                 const std::vector<const ActionPoseSample*>& samples,
                                 const BodyChange* standing_form) {
-  ChangeSearch search{noise_, options_.ambiguity};
+  ChangeSearch search{measurement_, options_.ambiguity};
   if (standing_form) {
     search.standing_form = *standing_form;
     search.learn = standing_form->is_learned();
@@ -411,9 +413,10 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
   // So is one that stood alone for a while: samples from then speak against the new one.
   std::vector<const ActionPoseSample*> earlier = segment(since_, options_.longest_segment);
   std::erase_if(earlier, [&](const auto* sample) { return sample->sample_index >= since; });
-  const bool began_later = !replacements_.empty() && earlier.size() >= kStoodAlone &&
-                           log_likelihood(with_change(schema_, fitted), noise_, earlier) <
-                               log_likelihood(schema_, noise_, earlier) - 4 * options_.acceptance;
+  const bool began_later =
+      !replacements_.empty() && earlier.size() >= kStoodAlone &&
+      log_likelihood(with_change(schema_, fitted), measurement_, earlier) <
+          log_likelihood(schema_, measurement_, earlier) - 4 * options_.acceptance;
   if (replacements_.empty() || since - since_ > kTogether || fitted.everywhere || ends ||
       began_later) {
     if (trouble_ && since_ >= trouble_->since && !replacements_.empty()) {
@@ -466,7 +469,7 @@ void Adaptation::try_learning(std::int64_t sample_index, std::vector<AdaptationE
   }
   if (part < 0 || (trouble_->last_part != part && trouble_->last == sample_index)) return;
   const auto samples = segment(trouble_->since, options_.longest_segment);
-  const double standing = log_likelihood(schema_, noise_, samples);
+  const double standing = log_likelihood(schema_, measurement_, samples);
   std::optional<Replacement> best;
   BodySchema before;
   // This edge as it was, the others too or as they are now.
@@ -476,7 +479,7 @@ void Adaptation::try_learning(std::int64_t sample_index, std::vector<AdaptationE
       }))
     bases.push_back(with_edge_of(schema_, trouble_->before, part));
   for (const BodySchema& base : bases) {
-    const PlaceEvidence evidence(base, noise_, part, false, samples);
+    const PlaceEvidence evidence(base, measurement_, part, false, samples);
     for (FittedChange& learned : evidence.learn()) {
       if (best && learned.log_evidence <= best->fitted.log_evidence) continue;
       best = Replacement{{part, false}, std::move(learned)};
@@ -490,7 +493,7 @@ void Adaptation::try_learning(std::int64_t sample_index, std::vector<AdaptationE
   const std::vector<const ActionPoseSample*> newest(
       samples.end() - std::min<std::ptrdiff_t>(kNewest, std::ssize(samples)), samples.end());
   if (margin <= required_margin(best->place, sample_index) ||
-      log_likelihood(with, noise_, newest) < log_likelihood(schema_, noise_, newest))
+      log_likelihood(with, measurement_, newest) < log_likelihood(schema_, measurement_, newest))
     return;
   AdaptationEvent candidate = event(AdaptationEvent::Kind::kCandidate, sample_index, best->place);
   candidate.cause = best->fitted.change.cause(schema_);
@@ -517,7 +520,7 @@ bool Adaptation::reconsider_place(const std::vector<const ActionPoseSample*>& sa
   std::vector<Place> places = places_around(*filter_, here.place.part);
   std::erase(places, here.place);
   FoundChanges there = search(before_, places, samples);
-  const double standing = log_likelihood(composed(), noise_, samples) + here.fitted.log_prior;
+  const double standing = log_likelihood(composed(), measurement_, samples) + here.fitted.log_prior;
   if (!there.best || there.best->fitted.log_evidence < standing + 2 * options_.acceptance)
     return false;
   tell(AdaptationEvent::Kind::kReverted, sample_index, here, 0, 0, events);
@@ -542,7 +545,7 @@ void Adaptation::reconsider(std::int64_t sample_index, bool all_forms,
         if (r.fitted.change.size() > 0 && is_possible(r.fitted, others)) {
           const BodySchema base =
               r.fitted.origin ? with_edge_of(others, *r.fitted.origin, r.place.part) : others;
-          const PlaceEvidence evidence(base, noise_, r.place.part, r.place.marker, samples);
+          const PlaceEvidence evidence(base, measurement_, r.place.part, r.place.marker, samples);
           if (auto again = evidence.fit(r.fitted.change)) {
             again->origin = r.fitted.origin;
             r.fitted = *again;
@@ -644,7 +647,7 @@ void Adaptation::set_aside(int tag, std::int64_t since, std::int64_t found) {
 
 void Adaptation::watch_tags(ActionPoseSample* sample, std::vector<AdaptationEvent>* events) {
   if (num_samples_ >= options_.calibration_samples) {
-    for (const MovedTags::Finding& finding : tags_.look(*sample, trusted_, schema_, noise_)) {
+    for (const MovedTags::Finding& finding : tags_.look(*sample, trusted_, schema_, measurement_)) {
       using Kind = AdaptationEvent::Kind;
       const Kind kind = finding.is_back ? (finding.is_on_part ? Kind::kRestored : Kind::kRecovered)
                                         : (finding.is_on_part ? Kind::kCandidate : Kind::kMissing);
@@ -714,7 +717,7 @@ void Adaptation::drop_fallen(ActionPoseSample* sample, std::vector<AdaptationEve
     std::erase_if(from->parts, [part](const PartObservation& o) { return o.part == part; });
   };
   for (const auto& [part, X_RB] : schema_.predict_all(sample->action)) {
-    const auto since = fallen_.look(*sample, part, schema_.X_CR * X_RB, noise_);
+    const auto since = fallen_.look(*sample, part, schema_.X_CR * X_RB, measurement_);
     if (!since) continue;
     drop(part, sample);
     if (visibility_.is_missing(part)) continue;
@@ -802,7 +805,7 @@ double Adaptation::standing_evidence(const std::vector<const ActionPoseSample*>&
     const auto end = std::find_if(begin, samples.end(), [until](const auto* sample) {
       return sample->sample_index >= until;
     });
-    evidence += log_likelihood(schema, noise_, {begin, end});
+    evidence += log_likelihood(schema, measurement_, {begin, end});
     begin = end;
   };
   if (trouble_) {
@@ -843,11 +846,11 @@ void Adaptation::try_drift(std::int64_t sample_index, std::vector<AdaptationEven
   // Edges beside each other explain a bend nearly alike: until one leads, nothing is told.
   std::optional<BegunDrift> best;
   double most = -std::numeric_limits<double>::infinity(), second = most;
-  for (BegunDrift& drift : begun_drifts(trouble_->before, noise_, {parts.begin(), parts.end()},
-                                        samples, trouble_->since)) {
+  for (BegunDrift& drift : begun_drifts(trouble_->before, measurement_,
+                                        {parts.begin(), parts.end()}, samples, trouble_->since)) {
     if (drift.gain < options_.acceptance) continue;
     const double evidence =
-        drift.log_prior + drift.log_likelihood(trouble_->before, noise_, samples);
+        drift.log_prior + drift.log_likelihood(trouble_->before, measurement_, samples);
     second = std::max(second, std::min(most, evidence));
     if (evidence <= most) continue;
     most = evidence;
@@ -867,7 +870,7 @@ void Adaptation::try_drift(std::int64_t sample_index, std::vector<AdaptationEven
   replacements_.clear();
   install(BodySchema(trouble_->before));
   begin_drift(best->drift.part, best->begin + 1, sample_index, events);
-  drift_watch_.look_again(before_, noise_, *drifting_,
+  drift_watch_.look_again(before_, measurement_, *drifting_,
                           segment(best->begin, static_cast<int>(kRing)));
   install(best->drift.applied_to(before_));
 }

@@ -22,7 +22,7 @@
 namespace bodyschema {
 
 struct AdaptationOptions {
-  MeasurementModel noise;
+  MeasurementModel measurement;
   /// Wished false alarms a sample, over all tests together.
   double false_alarm_rate = 1e-5;
   /// Below it noise_scale() does not go. 1 where the assumed noise has room for rare errors that a
@@ -121,8 +121,8 @@ class Adaptation {
   EdgeState marker_state(int part) const { return state_of({part, true}); }
   /// True over assumed standard deviation of the markers, as the residuals of quiet samples show
   /// it.
-  double noise_scale() const { return noise_.scale; }
-  const MeasurementModel& noise() const { return noise_; }
+  double noise_scale() const { return measurement_.scale; }
+  const MeasurementModel& measurement() const { return measurement_; }
   /// Parts whose markers have not been seen for longer than chance explains.
   std::vector<int> missing_parts() const { return visibility_.missing_parts(); }
   bool is_drifting(int part) const { return drifting_ == part; }
@@ -197,7 +197,7 @@ class Adaptation {
 
   const bool is_soft_;  ///< some edge has a residual GP
   const AdaptationOptions options_;
-  MeasurementModel noise_;
+  MeasurementModel measurement_;
   int num_samples_ = 0;
   int credit_;                           ///< work that may be done now; see kWorkPerSample
   std::vector<double> quiet_distances_;  ///< d² of believed markers since the noise was last set

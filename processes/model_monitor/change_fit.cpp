@@ -68,10 +68,10 @@ BodySchema with_change(const BodySchema& schema, const FittedChange& fitted) {
   return changed(result, fitted.change, fitted.theta, fitted.covariance);
 }
 
-double log_likelihood(const BodySchema& schema, const MeasurementModel& noise,
+double log_likelihood(const BodySchema& schema, const MeasurementModel& measurement,
                       const std::vector<const ActionPoseSample*>& samples,
                       const std::vector<int>& cut_parts) {
-  const TreeFilter filter(schema, noise);
+  const TreeFilter filter(schema, measurement);
   Alternative alternative;
   alternative.cut_edges = nodes_of(filter, cut_parts);
   double sum = 0;
@@ -80,16 +80,16 @@ double log_likelihood(const BodySchema& schema, const MeasurementModel& noise,
   return sum;
 }
 
-PlaceEvidence::PlaceEvidence(const BodySchema& base, const MeasurementModel& noise, int part,
+PlaceEvidence::PlaceEvidence(const BodySchema& base, const MeasurementModel& measurement, int part,
                              bool marker, std::vector<const ActionPoseSample*> samples,
                              std::vector<int> cut_parts)
     : base_(base),
-      noise_(noise),
+      measurement_(measurement),
       part_(part),
       marker_(marker),
       samples_(std::move(samples)),
       cut_parts_(std::move(cut_parts)) {
-  const TreeFilter filter(base_, noise_);
+  const TreeFilter filter(base_, measurement_);
   const int node = filter.node_of(part_);
   if (node < 0) return;
   const std::vector<int> cut = nodes_of(filter, cut_parts_);
@@ -242,11 +242,11 @@ std::vector<Eigen::VectorXd> PlaceEvidence::starts(const BodyChange& change) con
 }
 
 double PlaceEvidence::log_flat_outlier() const {
-  return std::log(noise_.outlier_rate) + log_flat_density();
+  return std::log(measurement_.outlier_rate) + log_flat_density();
 }
 
 double PlaceEvidence::log_inlier(std::size_t n, double d2) const {
-  return std::log1p(-noise_.outlier_rate) - 0.5 * d2 + measurements_[n].log_norm;
+  return std::log1p(-measurement_.outlier_rate) - 0.5 * d2 + measurements_[n].log_norm;
 }
 
 double PlaceEvidence::cost(const BodyChange& change, const Eigen::VectorXd& theta,
@@ -367,8 +367,8 @@ void PlaceEvidence::judge(FittedChange* fitted) const {
   // The likelihood at the most probable θ; the width of its peak is in the Laplace term, so the
   // model's new uncertainty must not be in it as well.
   fitted->log_evidence =
-      fitted->log_prior +
-      log_likelihood(changed(base_, fitted->change, fitted->theta), noise_, samples_, cut_parts_);
+      fitted->log_prior + log_likelihood(changed(base_, fitted->change, fitted->theta),
+                                         measurement_, samples_, cut_parts_);
   fitted->schema = changed(base_, fitted->change, fitted->theta, fitted->covariance);
 }
 
@@ -405,7 +405,8 @@ std::vector<FittedChange> PlaceEvidence::learn() const {
       if (e.to == part_) e = edge;
     return schema;
   };
-  const std::vector<LearnedEdge> learned = learn_edge(base_, part_, of_edge, noise_.outlier_rate);
+  const std::vector<LearnedEdge> learned =
+      learn_edge(base_, part_, of_edge, measurement_.outlier_rate);
   for (const LearnedEdge& one : learned) {
     if (one.log_evidence < learned.front().log_evidence - kHopeless ||
         result.size() == kLearnedJudged)
@@ -416,7 +417,7 @@ std::vector<FittedChange> PlaceEvidence::learn() const {
     fitted.num_usable = num_usable();
     fitted.log_prior = one.log_prior;
     fitted.log_evidence =
-        one.log_prior + log_likelihood(with_edge(one.certain), noise_, samples_, cut_parts_);
+        one.log_prior + log_likelihood(with_edge(one.certain), measurement_, samples_, cut_parts_);
     fitted.schema = with_edge(one.edge);
     fitted.origin = fitted.schema;
     result.push_back(std::move(fitted));
@@ -431,7 +432,8 @@ FittedChange PlaceEvidence::judge_stored(const BodySchema& schema) const {
   result.schema = schema;
   result.num_usable = num_usable();
   result.log_prior = result.change.log_odds();
-  result.log_evidence = result.log_prior + log_likelihood(schema, noise_, samples_, cut_parts_);
+  result.log_evidence =
+      result.log_prior + log_likelihood(schema, measurement_, samples_, cut_parts_);
   return result;
 }
 

@@ -34,7 +34,7 @@ BodySchema with_change(const BodySchema& schema, const FittedChange& fitted);
 BodySchema with_edge_of(const BodySchema& schema, const BodySchema& other, int part);
 
 /// Σ log p(observations) over the samples under a schema.
-double log_likelihood(const BodySchema& schema, const MeasurementModel& noise,
+double log_likelihood(const BodySchema& schema, const MeasurementModel& measurement,
                       const std::vector<const ActionPoseSample*>& samples,
                       const std::vector<int>& cut_parts = {});
 
@@ -42,7 +42,7 @@ double log_likelihood(const BodySchema& schema, const MeasurementModel& noise,
 class PlaceEvidence {
  public:
   /// `cut_parts`: parts whose edges say nothing. `marker`: the marker of `part`, not its edge.
-  PlaceEvidence(const BodySchema& base, const MeasurementModel& noise, int part, bool marker,
+  PlaceEvidence(const BodySchema& base, const MeasurementModel& measurement, int part, bool marker,
                 std::vector<const ActionPoseSample*> samples, std::vector<int> cut_parts = {});
 
   int num_usable() const { return static_cast<int>(measurements_.size()); }
@@ -96,7 +96,7 @@ class PlaceEvidence {
   State climb(const BodyChange& change, Eigen::VectorXd theta) const;
 
   const BodySchema base_;
-  const MeasurementModel noise_;
+  const MeasurementModel measurement_;
   const int part_;
   const bool marker_;
   const std::vector<const ActionPoseSample*> samples_;

@@ -59,7 +59,7 @@ std::vector<Base> bases_of(const Place& place, const BodySchema& standing,
 std::optional<Replacement> whole(const BodySchema& stored, const BodySchema& standing,
                                  const std::vector<Place>& places,
                                  const std::vector<const ActionPoseSample*>& samples,
-                                 const MeasurementModel& noise, double null) {
+                                 const MeasurementModel& measurement, double null) {
   Replacement all;
   FittedChange& fitted = all.fitted;
   fitted.change.form = BodyChange::Form::kStored;
@@ -69,7 +69,7 @@ std::optional<Replacement> whole(const BodySchema& stored, const BodySchema& sta
   fitted.num_usable = 1;
   const auto judge = [&] {
     const BodySchema with = with_change(standing, fitted);
-    fitted.log_evidence = fitted.log_prior + log_likelihood(with, noise, samples);
+    fitted.log_evidence = fitted.log_prior + log_likelihood(with, measurement, samples);
     return with;
   };
   const auto num_different =
@@ -104,14 +104,15 @@ FoundChanges find_changes(const BodySchema& standing, const std::vector<BodySche
                           const std::vector<const ActionPoseSample*>& samples,
                           const ChangeSearch& search) {
   FoundChanges found;
-  found.null = log_likelihood(standing, search.noise, samples);
+  found.null = log_likelihood(standing, search.measurement, samples);
   Ranking ranking{search.standing_form};
   const bool are_many = static_cast<int>(samples.size()) >= kManySamples;
   // What could not be explained for so long is not explained by a change of a body of the past.
   const bool is_old = !search.standing_form && static_cast<int>(samples.size()) > kManySamples;
   for (const Place& place : places) {
     for (const Base& base : bases_of(place, standing, history)) {
-      const PlaceEvidence evidence(base.schema, search.noise, place.part, place.marker, samples);
+      const PlaceEvidence evidence(base.schema, search.measurement, place.part, place.marker,
+                                   samples);
       const auto offer = [&](FittedChange fitted) {
         if (base.origin) fitted.origin = *base.origin;
         ranking.offer({place, std::move(fitted)});
@@ -127,7 +128,7 @@ FoundChanges find_changes(const BodySchema& standing, const std::vector<BodySche
     }
   }
   for (const BodySchema& stored : history)
-    if (auto all = whole(stored, standing, places, samples, search.noise, found.null))
+    if (auto all = whole(stored, standing, places, samples, search.measurement, found.null))
       ranking.offer(std::move(*all));
   found.best = std::move(ranking.best);
   found.runner_up = std::move(ranking.second);

@@ -16,7 +16,7 @@ struct Replacement {
 };
 
 struct ChangeSearch {
-  MeasurementModel noise;
+  MeasurementModel measurement;
   double ambiguity = 6;  ///< lead that another form than the standing one needs [nats]
   /// What explains the samples so far.
   std::optional<BodyChange> standing_form = std::nullopt;

@@ -221,10 +221,10 @@ void DriftWatch::add(const TreeFilter& filter, const TreeFilter::Instant& instan
   }
 }
 
-void DriftWatch::look_again(const BodySchema& schema, const MeasurementModel& noise, int part,
+void DriftWatch::look_again(const BodySchema& schema, const MeasurementModel& measurement, int part,
                             const std::vector<const ActionPoseSample*>& samples) {
   forget_all();
-  const TreeFilter filter(schema, noise);
+  const TreeFilter filter(schema, measurement);
   const int node = filter.node_of(part);
   if (node < 0) return;
   for (const ActionPoseSample* sample : samples) {
@@ -373,7 +373,7 @@ BodySchema Drift::applied_to(const BodySchema& before) const {
                  covariance + (1 - has_ended) * rate * rate.transpose());
 }
 
-double BegunDrift::log_likelihood(const BodySchema& before, const MeasurementModel& noise,
+double BegunDrift::log_likelihood(const BodySchema& before, const MeasurementModel& measurement,
                                   const std::vector<const ActionPoseSample*>& samples) const {
   const BodyChange change{drift.left ? BodyChange::Form::kLeft : BodyChange::Form::kRight,
                           drift.part};
@@ -386,16 +386,16 @@ double BegunDrift::log_likelihood(const BodySchema& before, const MeasurementMod
     }
     const auto elapsed = static_cast<double>(sample->sample_index - begin);
     sum += bodyschema::log_likelihood(
-        changed(before, change, coordinates(exp(elapsed * drift.rate))), noise, {sample});
+        changed(before, change, coordinates(exp(elapsed * drift.rate))), measurement, {sample});
   }
-  return sum + bodyschema::log_likelihood(before, noise, unmoved);
+  return sum + bodyschema::log_likelihood(before, measurement, unmoved);
 }
 
-std::vector<BegunDrift> begun_drifts(const BodySchema& before, const MeasurementModel& noise,
+std::vector<BegunDrift> begun_drifts(const BodySchema& before, const MeasurementModel& measurement,
                                      const std::vector<int>& parts,
                                      const std::vector<const ActionPoseSample*>& samples,
                                      std::int64_t since) {
-  const TreeFilter filter(before, noise);
+  const TreeFilter filter(before, measurement);
   struct Places {
     int part, node;
     const Edge* edge;

@@ -43,14 +43,14 @@ struct BegunDrift {
   bool is_good = false;
 
   /// Σ log p(observations) over the samples under `before` with the drift.
-  double log_likelihood(const BodySchema& before, const MeasurementModel& noise,
+  double log_likelihood(const BodySchema& before, const MeasurementModel& measurement,
                         const std::vector<const ActionPoseSample*>& samples) const;
 };
 
 /// The drifts that began about sample `since` of the edges to `parts`, one each where there are
 /// enough measurements, that with the most gain first. `before` is the body as it was until then;
 /// samples from before bound the begin.
-std::vector<BegunDrift> begun_drifts(const BodySchema& before, const MeasurementModel& noise,
+std::vector<BegunDrift> begun_drifts(const BodySchema& before, const MeasurementModel& measurement,
                                      const std::vector<int>& parts,
                                      const std::vector<const ActionPoseSample*>& samples,
                                      std::int64_t since);
@@ -73,7 +73,7 @@ class DriftWatch {
   void forget_all();
   /// Measures the edge to a part anew in these samples, and forgets all else. `schema` is right for
   /// the other edges.
-  void look_again(const BodySchema& schema, const MeasurementModel& noise, int part,
+  void look_again(const BodySchema& schema, const MeasurementModel& measurement, int part,
                   const std::vector<const ActionPoseSample*>& samples);
 
   /// The edge that has moved most, if any has. `schema` is the one that stands.

@@ -14,9 +14,10 @@ constexpr int kRepetitions = 2;
 }  // namespace
 
 std::optional<std::int64_t> FallenMarkers::look(const ActionPoseSample& sample, int part,
-                                                const Pose& X_CB, const MeasurementModel& noise) {
+                                                const Pose& X_CB,
+                                                const MeasurementModel& measurement) {
   if (const PartObservation* seen = sample.find(part)) {
-    const ReadingDistance distance(noise.covariance(*seen));
+    const ReadingDistance distance(measurement.covariance(*seen));
     if (distance(X_CB, seen->X_CB) < kOther) {
       far_off_.erase(part);
       return std::nullopt;

@@ -20,7 +20,7 @@ class FallenMarkers {
   /// Looks at what the sample shows of `part`. Returns the first sample that showed its marker
   /// where it lies; std::nullopt while it does not. `X_CB` is where the schema has the part.
   std::optional<std::int64_t> look(const ActionPoseSample& sample, int part, const Pose& X_CB,
-                                   const MeasurementModel& noise);
+                                   const MeasurementModel& measurement);
 
  private:
   struct Sighting {

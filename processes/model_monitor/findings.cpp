@@ -50,6 +50,10 @@ void Findings::erase(const AdaptationEvent& event) {
 
 void Findings::update(const Adaptation& adaptation, const std::vector<AdaptationEvent>& events,
                       std::int64_t sample_index) {
+  for (Finding& finding : findings_) {
+    finding.num_confirming +=
+        finding.state == State::kConfirmed && state_at(adaptation, finding) == EdgeState::kOk;
+  }
   for (const AdaptationEvent& event : events) hear(adaptation, event);
   agree_with(adaptation, sample_index);
   if (findings_.size() > kMost)

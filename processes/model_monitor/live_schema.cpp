@@ -157,9 +157,9 @@ double LiveSchema::log_likelihood_ratio(const BodySchema& other,
     all.push_back(&sample);
     (sample.sample_index < since ? before : after).push_back(&sample);
   }
-  return log_likelihood(other, adaptation_.noise(), all) -
-         log_likelihood(base_, adaptation_.noise(), before) -
-         log_likelihood(schema_, adaptation_.noise(), after);
+  return log_likelihood(other, adaptation_.measurement(), all) -
+         log_likelihood(base_, adaptation_.measurement(), before) -
+         log_likelihood(schema_, adaptation_.measurement(), after);
 }
 
 void LiveSchema::tell(std::int64_t sample_index, std::int64_t utime) {

@@ -73,7 +73,7 @@ ModelMonitorConfig ModelMonitorConfig::load(const std::filesystem::path& file) {
 }
 
 ModelMonitor::ModelMonitor(ModelMonitorConfig config) : config_(config) {
-  options_.noise = config_.measurement;
+  options_.measurement = config_.measurement;
   options_.least_noise_scale = 1;
   if (config_.false_alarm_rate > 0) options_.false_alarm_rate = config_.false_alarm_rate;
   for (model_health_t* health : {&health_, &memory_.at_base, &memory_.verdicts}) {

@@ -37,7 +37,7 @@ bool MovedTags::affects(const PartObservation& observation) const {
 }
 
 void MovedTags::look_back(const ActionPoseSample& sample, const BodySchema& schema,
-                          const MeasurementModel& noise) {
+                          const MeasurementModel& measurement) {
   // Before they moved they were where they should be.
   ActionPoseSample after = sample;
   std::erase_if(after.parts, [&](const PartObservation& o) {
@@ -48,7 +48,7 @@ void MovedTags::look_back(const ActionPoseSample& sample, const BodySchema& sche
     });
   });
   // They were not back by then, whatever the noise is now thought to be, and no other had moved.
-  for (const Finding& finding : look(after, schema, schema, noise, true))
+  for (const Finding& finding : look(after, schema, schema, measurement, true))
     if (finding.is_back)
       tracks_[finding.tag] = {
           .num_alike = kSightings - 1, .has_moved = true, .is_on_part = finding.is_on_part};
@@ -62,14 +62,14 @@ void MovedTags::begin_anew() {
 std::vector<MovedTags::Finding> MovedTags::look(const ActionPoseSample& sample,
                                                 const BodySchema& schema,
                                                 const BodySchema& standing,
-                                                const MeasurementModel& noise) {
-  return look(sample, schema, standing, noise, false);
+                                                const MeasurementModel& measurement) {
+  return look(sample, schema, standing, measurement, false);
 }
 
 std::vector<MovedTags::Finding> MovedTags::look(const ActionPoseSample& sample,
                                                 const BodySchema& schema,
                                                 const BodySchema& standing,
-                                                const MeasurementModel& noise, bool is_past) {
+                                                const MeasurementModel& measurement, bool is_past) {
   std::vector<Finding> findings;
   const auto X_RB = schema.predict_all(sample.action);
   const auto standing_X_RB = standing.predict_all(sample.action);
@@ -77,7 +77,7 @@ std::vector<MovedTags::Finding> MovedTags::look(const ActionPoseSample& sample,
     const auto predicted = X_RB.find(seen.part);
     if (seen.tags.empty() || predicted == X_RB.end()) continue;
     const Pose X_CB = schema.X_CR * predicted->second;
-    const ReadingDistance distance(noise.covariance(seen));
+    const ReadingDistance distance(measurement.covariance(seen));
     const auto from = [&](const Pose& X) {
       const double d2 = distance(X, seen.X_CB);
       return seen.X_CB_other ? std::min(d2, distance(X, *seen.X_CB_other)) : d2;

@@ -34,10 +34,10 @@ class MovedTags {
   };
   /// `schema`: the body before anything was wrong; `standing`: as it is now thought to be.
   std::vector<Finding> look(const ActionPoseSample& sample, const BodySchema& schema,
-                            const BodySchema& standing, const MeasurementModel& noise);
+                            const BodySchema& standing, const MeasurementModel& measurement);
   /// Samples of the past: what they say of those known.
   void look_back(const ActionPoseSample& sample, const BodySchema& schema,
-                 const MeasurementModel& noise);
+                 const MeasurementModel& measurement);
   /// Another schema than before is right: of those that are in their places nothing is known.
   void begin_anew();
   /// It is not seen any more.
@@ -60,7 +60,8 @@ class MovedTags {
     bool is_on_part = false;  ///< and moves with it
   };
   std::vector<Finding> look(const ActionPoseSample& sample, const BodySchema& schema,
-                            const BodySchema& standing, const MeasurementModel& noise, bool is_past);
+                            const BodySchema& standing, const MeasurementModel& measurement,
+                            bool is_past);
   /// The part was seen elsewhere, not by one of its moved tags.
   void count_elsewhere(const PartObservation& seen);
 

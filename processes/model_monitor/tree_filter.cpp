@@ -105,8 +105,8 @@ double log_marker_density(const Pose& X, const Pose& X_CB, const Matrix6d& S,
   return log_sum_exp({inlier, outlier});
 }
 
-TreeFilter::TreeFilter(const BodySchema& schema, const MeasurementModel& noise)
-    : schema_(schema), noise_(noise) {
+TreeFilter::TreeFilter(const BodySchema& schema, const MeasurementModel& measurement)
+    : schema_(schema), measurement_(measurement) {
   if (schema_.root < 0) return;
   nodes_.push_back({schema_.root, -1, -1, false, {}});
   std::set<int> reached{schema_.root};
@@ -151,7 +151,7 @@ TreeFilter::Instant TreeFilter::prepare(const ActionPoseSample& sample) const {
     instant.edge_covariance[k].diagonal().array() += 1e-12;  // what is exact can still be inverted
     instant.transport[k] = adjoint(instant.delta[k].inverse());
     if (const PartObservation* o = sample.find(node.part)) {
-      const Matrix6d covariance = noise_.covariance(*o);
+      const Matrix6d covariance = measurement_.covariance(*o);
       instant.seen[k] = Instant::Seen{o->X_CB, covariance, o->X_CB_other, covariance};
       if (o->X_CB_other) instant.seen[k]->covariance_other = covariance_of_other(*o, covariance);
     }
@@ -309,7 +309,7 @@ class TreeFilter::Walk {
       judgement.log_likelihood += detached;
       return;
     }
-    const double rate = filter_.noise_.outlier_rate;
+    const double rate = filter_.measurement_.outlier_rate;
     Pose X_CB = seen->X_CB;
     bool is_inlier = true;
     double d2 = 0;

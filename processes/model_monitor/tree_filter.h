@@ -46,7 +46,7 @@ struct VirtualMeasurement {
 class TreeFilter {
  public:
   /// Parts that are not connected to the root take no part. Edges that are kInvalid are cut.
-  TreeFilter(const BodySchema& schema, const MeasurementModel& noise);
+  TreeFilter(const BodySchema& schema, const MeasurementModel& measurement);
 
   int num_nodes() const { return static_cast<int>(nodes_.size()); }
   /// Part id by node; node 0 is the root, parents come before children.
@@ -106,7 +106,7 @@ class TreeFilter {
   class Walk;
 
   const BodySchema schema_;
-  const MeasurementModel noise_;
+  const MeasurementModel measurement_;
   std::vector<Node> nodes_;
 };
 

@@ -12,7 +12,7 @@ from unittest import mock
 
 from support import SOURCE
 
-from launcher import commands, group_file, supervisor, test_selection
+from launcher import commands, group_file, run_folder, supervisor, test_selection
 from launcher.place import Place
 
 
@@ -38,6 +38,18 @@ class TheGroupFile(Folder):
             group = group_file.processes(SOURCE / "config" / "group.conf", SOURCE / "config" / rig)
             self.assertIn("robot_simulator", group)
             self.assertIn("log", group)
+
+
+class ARecordedConfiguration(Folder):
+    def test_names_the_files_in_which_a_rig_differs_from_it(self):
+        rig = SOURCE / "config" / "arm4"
+        recorded = self.folder / "config"
+        shutil.copytree(rig, recorded)
+        self.assertEqual(run_folder.differences(recorded, rig), [])
+        run_folder.tell_ideal_noise(self.folder)
+        self.assertEqual(run_folder.differences(recorded, rig), ["noise.yaml"])
+        (recorded / "observer.yaml").unlink()
+        self.assertEqual(run_folder.differences(recorded, rig), ["noise.yaml", "observer.yaml"])
 
 
 class AProcess(Folder):

@@ -214,13 +214,13 @@ bool BrokenArm::is_near(int part) const {
 AdaptationOptions adaptation_options(Regime regime, double noise_factor) {
   AdaptationOptions options;
   if (regime != Regime::kTag) {
-    options.noise.noise = nominal_noise(regime);
-    options.noise.noise->position_m *= noise_factor;
-    options.noise.noise->rotation_rad *= noise_factor;
+    options.measurement.noise = nominal_noise(regime);
+    options.measurement.noise->position_m *= noise_factor;
+    options.measurement.noise->rotation_rad *= noise_factor;
   }
   // A third more than there are; never none.
   const bool has_outliers = regime == Regime::kTag || regime == Regime::kTagIso;
-  options.noise.outlier_rate = has_outliers ? 0.04 : 0.013;
+  options.measurement.outlier_rate = has_outliers ? 0.04 : 0.013;
   return options;
 }
 

@@ -233,6 +233,10 @@ TEST(StatusBoardTest, AnEdgeIsShownWithItsHealth) {
   event.event_text = "version 9 accepted";
   set_array(health.num_events, health.events, {event});
   board_.on_message(health);
+  sample_t sample{};
+  sample.sample_index = 37;
+  sample.utime = 3'600'000'000;
+  board_.on_message(sample);
   const auto edge = board_.json()["schema"]["edges"][0];
   EXPECT_EQ(edge["signals"], nlohmann::ordered_json({"q2", "q1"}));
   EXPECT_EQ(edge["state"], "SUSPECT");
@@ -242,7 +246,7 @@ TEST(StatusBoardTest, AnEdgeIsShownWithItsHealth) {
             std::string::npos)
       << text;
   EXPECT_NE(text.find("not connected: not enough data yet: seen once"), std::string::npos) << text;
-  EXPECT_NE(text.find("version 9 accepted"), std::string::npos) << text;
+  EXPECT_NE(text.find("sample 14, 23 samples ago: version 9 accepted"), std::string::npos) << text;
   EXPECT_TRUE(board_.json()["parts"][0]["position_median_m"].is_null());
 }
 

@@ -285,6 +285,60 @@ TEST(RefineCorners, SaysWhyItRefuses) {
   }
 }
 
+/// A tag that faces the camera, in cells of `cell_px`, blurred.
+struct BlurredTag {
+  BlurredTag(int cell_px, const Eigen::Vector2d& blur_cells) : cells(detector().cells(5)) {
+    cv::Mat pattern(cells.width, cells.width, CV_8UC1);
+    for (int i = 0; i < cells.width * cells.width; ++i) {
+      pattern.data[i] = cells.is_white[i] ? 220 : 25;
+    }
+    const int pad = 3 * cell_px;
+    cv::resize(pattern, image, {}, cell_px, cell_px, cv::INTER_NEAREST);
+    cv::copyMakeBorder(image, image, pad, pad, pad, pad, cv::BORDER_CONSTANT, cv::Scalar(90));
+    cv::GaussianBlur(image, image, {0, 0}, blur_cells.x() * cell_px, blur_cells.y() * cell_px);
+    camera = pinhole_camera();
+    camera.image_width = image.cols;
+    camera.image_height = image.rows;
+    camera.cx = image.cols / 2.0;
+    camera.cy = image.rows / 2.0;
+    const double low = pad + cell_px - 0.5, high = low + cells.border * cell_px;
+    corners_px = {{low, high}, {high, high}, {high, low}, {low, low}};
+  }
+  CornerRefinement refine() const { return refine_corners(image, Lens(camera), cells, corners_px); }
+
+  const TagCells& cells;
+  cv::Mat image;
+  camera_info_t camera;
+  std::vector<Eigen::Vector2d> corners_px;
+};
+
+TEST(RefineCorners, SpendsNoMoreOnALargeBlurredTagThanOnASmallOne) {
+  // Eight iterations, each with 40 000 pixels at most.
+  constexpr std::int64_t kMost = 320'000;
+  for (const Eigen::Vector2d& blur_cells :
+       {Eigen::Vector2d(0.8, 0.8), Eigen::Vector2d(0.5, 0.05)}) {
+    for (const int cell_px : {8, 20, 40, 110}) {
+      const CornerRefinement fit = BlurredTag(cell_px, blur_cells).refine();
+      EXPECT_FALSE(fit.corners) << cell_px;
+      EXPECT_LT(fit.num_evaluations, kMost) << cell_px << " " << blur_cells.transpose();
+    }
+  }
+}
+
+TEST(RefineCorners, FindsLargeTagsSharpAndBlurred) {
+  for (const double blur_px : {0.7, 6.0}) {
+    for (const int cell_px : {20, 40, 110}) {
+      const BlurredTag tag(cell_px, Eigen::Vector2d::Constant(blur_px / cell_px));
+      const CornerRefinement fit = tag.refine();
+      ASSERT_TRUE(fit.corners) << cell_px << " " << blur_px << " " << name_of(fit.refusal);
+      for (int k = 0; k < 4; ++k) {
+        EXPECT_LT((fit.corners->corners_px[k] - tag.corners_px[k]).norm(), 0.03)
+            << cell_px << " " << blur_px;
+      }
+    }
+  }
+}
+
 TEST(RefineCorners, RefusesAPictureOfAnythingElse) {
   const Sight sight(50, 20, {.blur_px = 0.7});
   cv::Mat image = sight.view.taken(2, 1);

@@ -57,6 +57,20 @@ double best_angle(const marker_pose_t& marker, const Pose& X_CM) {
                   rotation_angle(X_CM.inverse() * from_message(marker.X_CM[1])));
 }
 
+/// Something dark over half of the margin's left side: the code stays readable.
+void cover_half_a_side(cv::Mat& image, const Plate& plate) {
+  const Lens lens(pinhole_camera());
+  std::vector<cv::Point> cover;
+  for (const auto& [x, y] :
+       {std::pair{-0.06, -0.06}, {-0.042, -0.06}, {-0.042, 0.0}, {-0.06, 0.0}}) {
+    const Eigen::Vector3d p_C = plate.X_CM * Eigen::Vector3d(x, y, 0);
+    const Eigen::Vector2d p_px = lens.project(p_C.head<2>() / p_C.z());
+    cover.emplace_back(static_cast<int>(p_px.x()), static_cast<int>(p_px.y()));
+  }
+  cv::fillConvexPoly(image, cover, cv::Scalar(50));
+  cv::GaussianBlur(image, image, {0, 0}, 0.7);
+}
+
 TEST(MarkerEstimator, PinsTheMarkerFrameXRightYDownZIntoTheMarker) {
   Estimator estimator;
   Plate plate{7, 0.08, Pose::Identity()};
@@ -192,6 +206,25 @@ TEST(MarkerEstimator, KeepsTheClearerOfTwoTagsWithOneId) {
       {{3, 0.08, marker_pose(0.8, 0.4, 0, 0, -0.2)}, {3, 0.08, marker_pose(0.8, 0.4, 0, 0, 0.2)}},
       pinhole_camera());
   EXPECT_EQ(poses.num_markers, 1);
+  EXPECT_EQ(estimator.counted("tag seen twice"), 1);
+}
+
+TEST(MarkerEstimator, ARefusedTagHidesNoGoodOneWithItsId) {
+  Estimator estimator;
+  const Plate covered{3, 0.08, marker_pose(0.6, 0.5, 0.3, 0)};
+  const Plate pale{3, 0.08, marker_pose(0.8, 0.4, 0, 0, 0.3)};
+  cv::Mat image = render_plates({covered, pale}, pinhole_camera());
+  cover_half_a_side(image, covered);
+  cv::Mat right = image.colRange(800, image.cols);
+  right.convertTo(right, -1, 0.4);
+  const auto found = TagDetector("tag36h11", 1, 20).detect(image);
+  ASSERT_FALSE(found.empty());
+  ASSERT_LT(found[0].corners_px[0].x(), 800) << "the covered tag's margin is not the larger one";
+  const auto poses = estimator.on_camera_image(grey_message(image));
+  ASSERT_TRUE(poses);
+  ASSERT_EQ(poses->num_markers, 1);
+  EXPECT_LT(best_angle(poses->markers[0], pale.X_CM), 1 * kDegree);
+  EXPECT_EQ(estimator.counted("tag half covered"), 1);
 }
 
 TEST(MarkerEstimator, AnswersABlankImageWithNoMarkers) {
@@ -243,20 +276,11 @@ TEST(MarkerEstimator, DoesNotTrustATagWhoseMarginIsHalfCovered) {
   Estimator estimator;
   const Plate plate{3, 0.08, marker_pose(0.6, 0.5, 0.3, 0)};
   cv::Mat image = render_plates({plate}, pinhole_camera());
-  // Something dark over the margin and half of the border's left side: the code stays readable.
-  const Lens lens(pinhole_camera());
-  std::vector<cv::Point> cover;
-  for (const auto& [x, y] :
-       {std::pair{-0.06, -0.06}, {-0.036, -0.06}, {-0.036, 0.0}, {-0.06, 0.0}}) {
-    const Eigen::Vector3d p_C = plate.X_CM * Eigen::Vector3d(x, y, 0);
-    const Eigen::Vector2d p_px = lens.project(p_C.head<2>() / p_C.z());
-    cover.emplace_back(static_cast<int>(p_px.x()), static_cast<int>(p_px.y()));
-  }
-  cv::fillConvexPoly(image, cover, cv::Scalar(25));
-  cv::GaussianBlur(image, image, {0, 0}, 0.7);
+  cover_half_a_side(image, plate);
   const auto poses = estimator.on_camera_image(grey_message(image));
   ASSERT_TRUE(poses);
   EXPECT_EQ(poses->num_markers, 0);
+  EXPECT_EQ(estimator.counted("tag half covered"), 1);
 }
 
 TEST(MarkerEstimator, RefusesATagThatIsTooSteep) {

@@ -47,7 +47,7 @@ class ChangeFitTest : public testing::Test {
   }
 
   Rng rng_{11};
-  MeasurementModel noise_;
+  MeasurementModel measurement_;
   BodySchema schema_ =
       test::BrokenArm({test::Fault::kNone, "", 1}, test::Regime::kTagIso, 1, 3).engineered();
 };
@@ -82,7 +82,7 @@ TEST_F(ChangeFitTest, TheResidualsJacobianIsThatOfCentralDifferences) {
   const auto samples = observe(schema_, 5);
   for (const auto& [part, is_marker] :
        {std::pair{kPart, false}, {kPart, true}, {schema_.root, false}}) {
-    const PlaceEvidence evidence(schema_, noise_, part, is_marker, pointers(samples));
+    const PlaceEvidence evidence(schema_, measurement_, part, is_marker, pointers(samples));
     for (const BodyChange& change : possible_changes(schema_, part, is_marker)) {
       SCOPED_TRACE("form " + std::to_string(static_cast<int>(change.form)));
       Eigen::VectorXd theta(change.size());
@@ -123,7 +123,7 @@ TEST_F(ChangeFitTest, EveryChangeIsFoundAgainAndPreferred) {
     SCOPED_TRACE("form " + std::to_string(static_cast<int>(c.change.form)));
     const BodySchema truth = changed(schema_, c.change, c.theta);
     const auto samples = observe(truth, 12);
-    const PlaceEvidence evidence(schema_, noise_, kPart, false, pointers(samples));
+    const PlaceEvidence evidence(schema_, measurement_, kPart, false, pointers(samples));
     EXPECT_EQ(evidence.num_usable(), 12);
     std::optional<FittedChange> best;
     for (const BodyChange& change : possible_changes(schema_, kPart, false)) {
@@ -132,7 +132,7 @@ TEST_F(ChangeFitTest, EveryChangeIsFoundAgainAndPreferred) {
       if (!best || fitted->log_evidence > best->log_evidence) best = std::move(fitted);
     }
     EXPECT_EQ(best->change.form, c.change.form);
-    EXPECT_GT(best->log_evidence, log_likelihood(schema_, noise_, pointers(samples)) + 12);
+    EXPECT_GT(best->log_evidence, log_likelihood(schema_, measurement_, pointers(samples)) + 12);
     if (c.change.form == Form::kBoth) continue;  // its two sides share the turn about the axis
     const Eigen::VectorXd error = best->theta - c.theta;
     EXPECT_LT(error.dot(best->covariance.ldlt().solve(error)), 25);
@@ -144,30 +144,32 @@ TEST_F(ChangeFitTest, AMovedMarkerIsFoundAgain) {
   theta << 0.05, 0, 0, 0, 1, 0;
   const BodyChange change{Form::kMarkerMoved, kPart};
   const auto samples = observe(changed(schema_, change, theta), 6);
-  const auto fitted = PlaceEvidence(schema_, noise_, kPart, true, pointers(samples)).fit(change);
+  const auto fitted =
+      PlaceEvidence(schema_, measurement_, kPart, true, pointers(samples)).fit(change);
   ASSERT_TRUE(fitted);
   const Eigen::VectorXd error = fitted->theta - theta;
   EXPECT_LT(error.dot(fitted->covariance.ldlt().solve(error)), 25);
-  const auto edge =
-      PlaceEvidence(schema_, noise_, kPart, false, pointers(samples)).fit({Form::kRight, kPart});
+  const auto edge = PlaceEvidence(schema_, measurement_, kPart, false, pointers(samples))
+                        .fit({Form::kRight, kPart});
   EXPECT_GT(fitted->log_evidence, edge->log_evidence + 12);
 }
 
 TEST_F(ChangeFitTest, LaplaceEvidenceIsTheIntegralOverTheParameter) {
   const BodyChange change{Form::kOffset, kPart};
   const auto samples = observe(changed(schema_, change, Eigen::VectorXd::Constant(1, 0.35)), 4);
-  const auto fitted = PlaceEvidence(schema_, noise_, kPart, false, pointers(samples)).fit(change);
+  const auto fitted =
+      PlaceEvidence(schema_, measurement_, kPart, false, pointers(samples)).fit(change);
   ASSERT_TRUE(fitted);
   const double sigma = prior_sigma(change, schema_)(0);
   const double peak = fitted->theta(0), width = std::sqrt(fitted->covariance(0, 0));
   const double at_peak =
-      log_likelihood(changed(schema_, change, fitted->theta), noise_, pointers(samples));
+      log_likelihood(changed(schema_, change, fitted->theta), measurement_, pointers(samples));
   double integral = 0;
   const double h = width / 10;
   for (double t = peak - 8 * width; t <= peak + 8 * width; t += h) {
     const BodySchema with = changed(schema_, change, Eigen::VectorXd::Constant(1, t));
     integral += h *
-                std::exp(log_likelihood(with, noise_, pointers(samples)) - at_peak -
+                std::exp(log_likelihood(with, measurement_, pointers(samples)) - at_peak -
                          0.5 * t * t / (sigma * sigma)) /
                 (sigma * std::sqrt(2 * M_PI));
   }
@@ -176,9 +178,9 @@ TEST_F(ChangeFitTest, LaplaceEvidenceIsTheIntegralOverTheParameter) {
 
 TEST_F(ChangeFitTest, AHealthyBodyIsBetterThanAnyChange) {
   const auto samples = observe(schema_, 12);
-  const double null = log_likelihood(schema_, noise_, pointers(samples));
+  const double null = log_likelihood(schema_, measurement_, pointers(samples));
   for (const bool marker : {false, true}) {
-    const PlaceEvidence evidence(schema_, noise_, kPart, marker, pointers(samples));
+    const PlaceEvidence evidence(schema_, measurement_, kPart, marker, pointers(samples));
     for (const BodyChange& change : possible_changes(schema_, kPart, marker))
       EXPECT_LT(evidence.fit(change)->log_evidence, null);
   }
@@ -191,7 +193,7 @@ TEST_F(ChangeFitTest, AnOutlierDoesNotTurnTheFit) {
   auto samples = observe(changed(schema_, change, theta), 6);
   for (PartObservation& o : samples.back().parts)
     if (o.part == 7) o.X_CB = o.X_CB * exp((Vector6d() << 0, 0, 0, 1, 0, 0).finished());
-  const auto fitted = PlaceEvidence(schema_, noise_, 7, false, pointers(samples)).fit(change);
+  const auto fitted = PlaceEvidence(schema_, measurement_, 7, false, pointers(samples)).fit(change);
   ASSERT_TRUE(fitted);
   const Eigen::VectorXd error = fitted->theta - theta;
   EXPECT_LT(error.head<3>().norm(), 0.01);
@@ -200,12 +202,12 @@ TEST_F(ChangeFitTest, AnOutlierDoesNotTurnTheFit) {
 
 TEST_F(ChangeFitTest, TooFewSamplesFitNothing) {
   auto samples = observe(schema_, 1);
-  const PlaceEvidence one(schema_, noise_, kPart, false, pointers(samples));
+  const PlaceEvidence one(schema_, measurement_, kPart, false, pointers(samples));
   EXPECT_TRUE(one.fit({Form::kStuck, kPart}));
   EXPECT_FALSE(one.fit({Form::kRight, kPart}));
   // Nothing beyond the edge was seen: the sample says nothing of it.
   std::erase_if(samples[0].parts, [](const PartObservation& o) { return o.part >= kPart; });
-  const PlaceEvidence none(schema_, noise_, kPart, false, pointers(samples));
+  const PlaceEvidence none(schema_, measurement_, kPart, false, pointers(samples));
   EXPECT_EQ(none.num_usable(), 0);
   EXPECT_FALSE(none.fit({Form::kStuck, kPart}));
 }

@@ -20,7 +20,7 @@ using test::Regime;
 template <typename Stop>
 int feed(BrokenArm& arm, DriftWatch& watch, int begin, int end, Stop stop) {
   const BodySchema& schema = arm.engineered();
-  const TreeFilter filter(schema, test::adaptation_options(Regime::kTagIso).noise);
+  const TreeFilter filter(schema, test::adaptation_options(Regime::kTagIso).measurement);
   for (int t = begin; t < end; ++t) {
     const ActionPoseSample sample = arm.observe(t);
     watch.add(filter, filter.prepare(sample), schema.displacements(sample.action), t);
@@ -65,7 +65,7 @@ TEST(DriftWatchTest, AFastBendIsFoundSinceItsBeginAndItsEndIsSeen) {
   for (const int seed : {1, 2, 3}) {
     BrokenArm arm({Fault::kDrift, "", 0.85, 1, kBent}, Regime::kTagIso, kHealthy, seed);
     const BodySchema& schema = arm.engineered();
-    const MeasurementModel noise = test::adaptation_options(Regime::kTagIso).noise;
+    const MeasurementModel measurement = test::adaptation_options(Regime::kTagIso).measurement;
     std::vector<ActionPoseSample> life;
     for (int t = 0; t < kHealthy + kBent + kStill; ++t) life.push_back(arm.observe(t));
     const auto between = [&life](int begin, int end) {
@@ -74,22 +74,22 @@ TEST(DriftWatchTest, AFastBendIsFoundSinceItsBeginAndItsEndIsSeen) {
       return samples;
     };
     const auto samples = between(0, kHealthy + kBent);
-    const auto found = begun_drifts(schema, noise, {3, 4, 5}, samples, kHealthy + 2);
+    const auto found = begun_drifts(schema, measurement, {3, 4, 5}, samples, kHealthy + 2);
     ASSERT_FALSE(found.empty());
     EXPECT_EQ(found[0].drift.part, 4);
     EXPECT_TRUE(found[0].is_good);
     EXPECT_NEAR(static_cast<double>(found[0].begin), kHealthy, 2);
     EXPECT_NEAR(found[0].drift.rate.tail<3>().norm() / kDegree, 1, 0.4);
     EXPECT_NEAR(rotation_angle(found[0].drift.T) / kDegree, kBent - 1, 2);
-    EXPECT_GT(found[0].log_likelihood(schema, noise, samples) + found[0].log_prior,
-              log_likelihood(schema, noise, samples) + 50);
+    EXPECT_GT(found[0].log_likelihood(schema, measurement, samples) + found[0].log_prior,
+              log_likelihood(schema, measurement, samples) + 50);
 
     DriftWatch watch(1e-5);
-    watch.look_again(schema, noise, 4, between(kHealthy, kHealthy + kBent));
+    watch.look_again(schema, measurement, 4, between(kHealthy, kHealthy + kBent));
     const auto going_on = watch.follow(schema, 4);
     ASSERT_TRUE(going_on);
     EXPECT_LT(going_on->has_ended, 0.5);
-    watch.look_again(schema, noise, 4, between(kHealthy, kHealthy + kBent + kStill));
+    watch.look_again(schema, measurement, 4, between(kHealthy, kHealthy + kBent + kStill));
     const auto ended = watch.follow(schema, 4);
     ASSERT_TRUE(ended);
     EXPECT_GT(ended->has_ended, 0.99);
@@ -103,12 +103,12 @@ TEST(DriftWatchTest, ABentLinkHasNotDriftedWell) {
   for (const int seed : {1, 2, 3}) {
     BrokenArm arm({Fault::kBend, "", 0.85}, Regime::kTagIso, kHealthy, seed);
     const BodySchema& schema = arm.engineered();
-    const MeasurementModel noise = test::adaptation_options(Regime::kTagIso).noise;
+    const MeasurementModel measurement = test::adaptation_options(Regime::kTagIso).measurement;
     std::vector<ActionPoseSample> life;
     for (int t = 0; t < kHealthy + 8; ++t) life.push_back(arm.observe(t));
     std::vector<const ActionPoseSample*> samples;
     for (const ActionPoseSample& sample : life) samples.push_back(&sample);
-    const auto drifts = begun_drifts(schema, noise, {5}, samples, kHealthy);
+    const auto drifts = begun_drifts(schema, measurement, {5}, samples, kHealthy);
     EXPECT_FALSE(drifts.empty());
     for (const BegunDrift& drift : drifts) EXPECT_FALSE(drift.is_good);
   }

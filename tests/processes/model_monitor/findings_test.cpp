@@ -121,6 +121,18 @@ TEST(FindingsTest, TwoFaultsAreTwoFindings) {
   EXPECT_TRUE(life.at_end[2].empty());
 }
 
+TEST(FindingsTest, WhatADriftLeftIsConfirmedByEverySampleAfterItsEnd) {
+  constexpr double kRate_deg = 0.5, kMost_deg = 15;
+  BrokenArm arm({Fault::kDrift, "", 0.85, kRate_deg, kMost_deg}, Regime::kTagIso, kBlock, 1);
+  const KnownLife life(&arm);
+  SCOPED_TRACE(life.log);
+  ASSERT_EQ(life.at_end[1].size(), 1U);
+  const Finding& left = life.at_end[1].front();
+  EXPECT_EQ(left.state, State::kConfirmed);
+  EXPECT_GE(left.num_confirming, 2 * kBlock - 1 - left.adopted);
+  EXPECT_LE(left.num_confirming, kBlock - kMost_deg / kRate_deg);
+}
+
 TEST(FindingsTest, NothingIsWrongWithAHealthyArm) {
   BrokenArm arm({Fault::kNone, "none", 0.9}, Regime::kTagIso, kBlock, 4);
   const KnownLife life(&arm);

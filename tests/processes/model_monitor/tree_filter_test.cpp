@@ -68,7 +68,7 @@ class TreeFilterTest : public testing::Test {
     Eigen::VectorXd y;
   };
   Joint joint() const {
-    const TreeFilter filter(schema_, noise_);
+    const TreeFilter filter(schema_, measurement_);
     const TreeFilter::Instant instant = filter.prepare(sample_);
     const Eigen::Index n = filter.num_nodes();
     Joint j;
@@ -107,10 +107,10 @@ class TreeFilterTest : public testing::Test {
   Rng rng_{7};
   BodySchema schema_;
   ActionPoseSample sample_;
-  MeasurementModel noise_ = [] {
-    MeasurementModel noise;
-    noise.outlier_rate = 1e-9;
-    return noise;
+  MeasurementModel measurement_ = [] {
+    MeasurementModel measurement;
+    measurement.outlier_rate = 1e-9;
+    return measurement;
   }();
 };
 
@@ -121,7 +121,7 @@ double log_normal(const Eigen::VectorXd& y, const Eigen::MatrixXd& S) {
 }
 
 TEST_F(TreeFilterTest, LikelihoodIsThatOfAllMarkersTogether) {
-  const TreeFilter filter(schema_, noise_);
+  const TreeFilter filter(schema_, measurement_);
   const Joint j = joint();
   const double expected = log_normal(j.y, j.H * j.C * j.H.transpose() + j.noise);
   const auto judgement = filter.judge(filter.prepare(sample_));
@@ -132,7 +132,7 @@ TEST_F(TreeFilterTest, LikelihoodIsThatOfAllMarkersTogether) {
 TEST_F(TreeFilterTest, LikelihoodIsThatOfTheMarkersSeen) {
   hide(2);
   hide(1);
-  const TreeFilter filter(schema_, noise_);
+  const TreeFilter filter(schema_, measurement_);
   const Joint j = joint();
   const double expected = log_normal(j.y, j.H * j.C * j.H.transpose() + j.noise);
   const auto judgement = filter.judge(filter.prepare(sample_));
@@ -145,7 +145,7 @@ TEST_F(TreeFilterTest, LikelihoodIsThatOfTheMarkersSeen) {
 TEST_F(TreeFilterTest, VirtualMeasurementIsWhatTheOtherMarkersSayOfAnEdge) {
   for (const int hidden : {0, 2, 5}) {
     if (hidden > 0) hide(hidden);
-    const TreeFilter filter(schema_, noise_);
+    const TreeFilter filter(schema_, measurement_);
     const auto instant = filter.prepare(sample_);
     const Joint j = joint();
     for (int node = 0; node < filter.num_nodes(); ++node) {
@@ -180,7 +180,7 @@ TEST_F(TreeFilterTest, AMarkerIsMeasuredWithoutItself) {
   const Pose T = test::random_pose(rng_, 0.1, 0.2);
   for (PartObservation& o : sample_.parts)
     if (o.part == 2) o.X_CB = o.X_CB * T;
-  const TreeFilter filter(schema_, noise_);
+  const TreeFilter filter(schema_, measurement_);
   const auto measured = filter.measure_marker(filter.prepare(sample_), filter.node_of(2));
   ASSERT_TRUE(measured);
   const Vector6d error = log(T.inverse() * measured->z);
@@ -191,7 +191,7 @@ TEST_F(TreeFilterTest, AMarkerIsMeasuredWithoutItself) {
 
 TEST_F(TreeFilterTest, AnEdgeWithNothingSeenBehindItIsNotMeasured) {
   hide(4);
-  const TreeFilter filter(schema_, noise_);
+  const TreeFilter filter(schema_, measurement_);
   EXPECT_FALSE(filter.measure_edge(filter.prepare(sample_), filter.node_of(4)));
   hide(2);
   hide(5);
@@ -202,9 +202,9 @@ TEST_F(TreeFilterTest, AnEdgeWithNothingSeenBehindItIsNotMeasured) {
 
 /// The chain of evidence: a wrong edge speaks for being cut, a wrong marker for being detached.
 TEST_F(TreeFilterTest, TellsAWrongEdgeFromAWrongMarker) {
-  noise_.outlier_rate = 0.03;
+  measurement_.outlier_rate = 0.03;
   const Pose T = test::random_pose(rng_, 0.1, 0.2);
-  const TreeFilter filter(schema_, noise_);
+  const TreeFilter filter(schema_, measurement_);
   const int node = filter.node_of(2);
   Alternative cut, detached;
   cut.cut_edges = {node};
@@ -228,8 +228,8 @@ TEST_F(TreeFilterTest, TellsAWrongEdgeFromAWrongMarker) {
 }
 
 TEST_F(TreeFilterTest, AFlippedMarkerIsReadInItsOtherPoseOrNotBelieved) {
-  noise_.outlier_rate = 0.03;
-  const TreeFilter filter(schema_, noise_);
+  measurement_.outlier_rate = 0.03;
+  const TreeFilter filter(schema_, measurement_);
   const int node = filter.node_of(4);
   const double healthy = filter.judge(filter.prepare(sample_)).log_likelihood;
   Vector6d tilt = Vector6d::Zero();
@@ -251,8 +251,8 @@ TEST_F(TreeFilterTest, AFlippedMarkerIsReadInItsOtherPoseOrNotBelieved) {
 TEST_F(TreeFilterTest, AFlippedTagBesideThePartsOriginSpeaksForNoBrokenEdge) {
   // The tag sits 5 cm beside the part's origin: the flip moves the part. Its other reading is near
   // the truth, not quite.
-  noise_.outlier_rate = 0.03;
-  const TreeFilter filter(schema_, noise_);
+  measurement_.outlier_rate = 0.03;
+  const TreeFilter filter(schema_, measurement_);
   Vector6d tilt = Vector6d::Zero();
   tilt(4) = 40 * kDegree;
   Pose X_BM = Pose::Identity();
@@ -269,9 +269,9 @@ TEST_F(TreeFilterTest, AFlippedTagBesideThePartsOriginSpeaksForNoBrokenEdge) {
 }
 
 TEST_F(TreeFilterTest, NothingCrossesAnInvalidEdge) {
-  const int node = TreeFilter(schema_, noise_).node_of(2);
+  const int node = TreeFilter(schema_, measurement_).node_of(2);
   schema_.edges[0].state = EdgeState::kInvalid;
-  const TreeFilter filter(schema_, noise_);
+  const TreeFilter filter(schema_, measurement_);
   const auto before = filter.judge(filter.prepare(sample_));
   // Wherever the whole branch behind it is, it is as likely.
   const Pose T = test::random_pose(rng_, 0.1, 0.2);
@@ -284,7 +284,7 @@ TEST_F(TreeFilterTest, NothingCrossesAnInvalidEdge) {
 
 TEST_F(TreeFilterTest, PartsWithoutAWayToTheRootTakeNoPart) {
   schema_.edges.erase(schema_.edges.begin());
-  const TreeFilter filter(schema_, noise_);
+  const TreeFilter filter(schema_, measurement_);
   EXPECT_EQ(filter.num_nodes(), 2);
   EXPECT_EQ(filter.node_of(4), -1);
   EXPECT_TRUE(std::isfinite(filter.judge(filter.prepare(sample_)).log_likelihood));
@@ -292,7 +292,7 @@ TEST_F(TreeFilterTest, PartsWithoutAWayToTheRootTakeNoPart) {
 
 TEST_F(TreeFilterTest, RefusesAnActionOfAnotherLength) {
   sample_.action.resize(3);
-  const TreeFilter filter(schema_, noise_);
+  const TreeFilter filter(schema_, measurement_);
   EXPECT_THROW(filter.prepare(sample_), std::invalid_argument);
 }
 
