@@ -49,4 +49,11 @@ double Signal::displacement_rate(double q) const {
   return 1 + 0.5 * M_PI / kWarpReach * (b1 * cosine - b2) / half;
 }
 
+Eigen::VectorXd mid_range(const std::vector<Signal>& signals) {
+  Eigen::VectorXd action(static_cast<Eigen::Index>(signals.size()));
+  for (std::size_t s = 0; s < signals.size(); ++s)
+    action(static_cast<Eigen::Index>(s)) = 0.5 * (signals[s].lower + signals[s].upper);
+  return action;
+}
+
 }  // namespace bodyschema

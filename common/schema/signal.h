@@ -22,6 +22,9 @@ struct Signal {
   double displacement_rate(double q) const;
 };
 
+/// The action with every signal in the middle of its range.
+Eigen::VectorXd mid_range(const std::vector<Signal>& signals);
+
 /// φ_n(q) = sin(½nπ (1 + x/kWarpReach)), n = 1 … size, with x = −1 … 1 over the signal's range: the
 /// sines that vanish kWarpReach half ranges from the middle. With variances that fall as a
 /// covariance function's spectral density does, they are a Gaussian process (Solin and Särkkä,

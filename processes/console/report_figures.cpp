@@ -423,12 +423,7 @@ std::optional<Plot> version_plot(const std::vector<VersionErrors>& versions,
 EdgeSlice edge_slice(const BodySchema& schema, const Edge& edge, int signal,
                      const std::vector<ActionPoseSample>& samples) {
   constexpr int kPoints = 60;
-  const auto num_signals = static_cast<Eigen::Index>(schema.signals.size());
-  Eigen::VectorXd middle(num_signals);
-  for (Eigen::Index s = 0; s < num_signals; ++s) {
-    const Signal& limits = schema.signals[static_cast<std::size_t>(s)];
-    middle[s] = 0.5 * (limits.lower + limits.upper);
-  }
+  const Eigen::VectorXd middle = mid_range(schema.signals);
   const Pose X_middle = edge.predict(schema.displacements(middle));
   const Matrix6d noise = observation_noise(schema, edge, samples);
   const auto point_at = [&](const Eigen::VectorXd& action) {

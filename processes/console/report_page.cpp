@@ -11,6 +11,7 @@
 
 #include "common/geometry/angle.h"
 #include "common/plot/plot.h"
+#include "common/schema/standard_deviations.h"
 #include "processes/console/evaluation.h"
 #include "processes/console/health_view.h"
 #include "processes/console/hint.h"
@@ -375,8 +376,9 @@ class Page {
                     "{}. Thick grey edges are rigid{}.",
                     body_->origin, schema.complete ? "" : "; red parts have no way to the root"));
     static const char* const kStates[] = {"OK", "suspect", "invalid", "provisional"};
-    Table table({"edge", "kind", "signals", "#residual", "#", "#seen in", "#outliers", "health",
-                 "#median d²"});
+    Table table({"edge", "kind", "signals", "#residual", "#", "#±", "#", "#seen in", "#outliers",
+                 "health", "#median d²"});
+    const Eigen::VectorXd middle = schema.displacements(mid_range(schema.signals));
     for (const Edge& edge : schema.edges) {
       std::string signals;
       for (const int signal : edge.signals()) {
@@ -393,15 +395,20 @@ class Page {
             distance = fmt::format("{:.1f}", item.median_mahalanobis2);
         }
       }
+      const Noise sd = deviations_of(edge.prediction_covariance(middle));
       table.row({fmt::format("{} → {}", edge.from, edge.to), edge.kind(), signals,
                  millimetres(edge.position_rms_m), degrees(edge.rotation_rms_rad),
+                 millimetres(sd.position_m), degrees(sd.rotation_rad),
                  std::to_string(edge.num_samples), std::to_string(edge.num_outliers), health,
                  distance});
     }
     html += table.html();
     html +=
         "<p class=\"note\">Residual: root mean square, each observation predicted without itself, "
-        "outliers left out. Health and d²: the monitor’s, on held-out samples, d² in units of the "
+        "outliers left out. ±: standard deviation per axis of the model itself, joints in "
+        "mid-range; "
+        "`bodyschema show --json` has that of each axis, offset and rate. Health and d²: the "
+        "monitor’s, on held-out samples, d² in units of the "
         "assumed covariance. That has the systematic error of a pose in it, which is mostly common "
         "to all samples and learned with the edge: the median of a right model is far below 5.3, "
         "that of χ² with 6 degrees of freedom (0.0 to 0.1 of an ideal rig’s tags). Above 5.3 the "

@@ -5,6 +5,7 @@
 #include <cmath>
 
 #include "common/geometry/angle.h"
+#include "common/schema/standard_deviations.h"
 
 namespace bodyschema {
 namespace {
@@ -95,6 +96,26 @@ ordered_json pose_json(const Pose& X) {
           {"rotation_wxyz", {q.w(), q.x(), q.y(), q.z()}}};
 }
 
+/// One standard deviation; null where it is not known.
+ordered_json deviation(double value, double unit = 1) {
+  return std::isfinite(value) && value > 0 ? ordered_json(value / unit) : ordered_json();
+}
+
+ordered_json axes_json(const Eigen::Vector3d& variances, double unit) {
+  ordered_json json = ordered_json::array();
+  for (const double variance : variances) json.push_back(deviation(std::sqrt(variance), unit));
+  return json;
+}
+
+ordered_json joint_sd_json(const ScrewJoint& joint, const JointDeviation& sd) {
+  return {{"axis_position_m", joint.turn == 0 ? ordered_json() : deviation(sd.axis_position_m)},
+          {"axis_tilt_deg", deviation(sd.axis_tilt_rad, kDegree)},
+          {"displacement_m", deviation(sd.displacement_m)},
+          {"displacement_deg", deviation(sd.displacement_rad, kDegree)},
+          {"slide_m", deviation(sd.slide)},
+          {"turn_rad", deviation(sd.turn)}};
+}
+
 }  // namespace
 
 ordered_json structure_json(const BodySchema& schema, const std::vector<Outlier>& outliers,
@@ -160,6 +181,9 @@ ordered_json schema_json(const BodySchema& schema) {
   json["base_version"] = schema.base_version;
   json["last_sample"] = schema.last_sample_index;
   json["X_CR"] = pose_json(schema.X_CR);
+  const auto& variances = schema.X_CR_covariance.diagonal();
+  json["X_CR"]["position_sd_m"] = axes_json(variances.head<3>(), 1);
+  json["X_CR"]["rotation_sd_deg"] = axes_json(variances.tail<3>(), kDegree);
   json["signals"] = ordered_json::array();
   for (const Signal& signal : schema.signals) {
     json["signals"].push_back({{"name", signal.name},
@@ -167,6 +191,7 @@ ordered_json schema_json(const BodySchema& schema) {
                                {"upper", signal.upper},
                                {"warp", signal.warp}});
   }
+  const Eigen::VectorXd middle = schema.displacements(mid_range(schema.signals));
   static const char* const kStates[] = {"OK", "SUSPECT", "INVALID", "PROVISIONAL"};
   for (std::size_t i = 0; i < schema.edges.size(); ++i) {
     const Edge& edge = schema.edges[i];
@@ -175,8 +200,13 @@ ordered_json schema_json(const BodySchema& schema) {
     item["confidence"] = edge.confidence;
     item["valid_since_sample"] = edge.valid_since_sample;
     item["left"] = pose_json(edge.left);
+    const Noise sd = deviations_of(edge.prediction_covariance(middle));
+    item["position_sd_m"] = deviation(sd.position_m);
+    item["rotation_sd_deg"] = deviation(sd.rotation_rad, kDegree);
+    const std::vector<JointDeviation> deviations = joint_deviations(edge, middle);
     item["joints"] = ordered_json::array();
-    for (const ScrewJoint& joint : edge.joints) {
+    for (std::size_t d = 0; d < edge.joints.size(); ++d) {
+      const ScrewJoint& joint = edge.joints[d];
       item["joints"].push_back(
           {{"signal", schema.signals.at(joint.signal).name},
            {"gain", joint.gain},
@@ -185,7 +215,8 @@ ordered_json schema_json(const BodySchema& schema) {
            {"turn_rad", joint.turn},
            {"order_group",
             joint.order_group < 0 ? ordered_json() : ordered_json(joint.order_group)},
-           {"X_after", pose_json(joint.X_after)}});
+           {"X_after", pose_json(joint.X_after)},
+           {"sd", deviations.empty() ? ordered_json() : joint_sd_json(joint, deviations[d])}});
     }
     if (edge.residual_gp) item["residual_gp"] = residual_gp_json(schema, *edge.residual_gp);
     if (edge.matrix_gp) item["matrix_gp"] = matrix_gp_json(schema, *edge.matrix_gp);

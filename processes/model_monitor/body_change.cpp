@@ -307,11 +307,7 @@ BodySchema changed(const BodySchema& schema, const BodyChange& change, const Eig
       multiply_right(edge, theta.tail<6>(), is_unsure ? &second : nullptr);
       break;
     case Form::kRigid: {
-      Eigen::VectorXd middle(schema.signals.size());
-      for (std::size_t s = 0; s < schema.signals.size(); ++s)
-        middle(static_cast<Eigen::Index>(s)) =
-            0.5 * (schema.signals[s].lower + schema.signals[s].upper);
-      edge->left = edge->predict(schema.displacements(middle));
+      edge->left = edge->predict(schema.displacements(mid_range(schema.signals)));
       edge->right = Pose::Identity();
       edge->joints.clear();
       edge->matrix_gp.reset();

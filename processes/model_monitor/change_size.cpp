@@ -10,20 +10,12 @@ namespace {
 using Form = BodyChange::Form;
 using Kind = ChangeSize::Kind;
 
-Eigen::VectorXd middle_of(const BodySchema& schema) {
-  Eigen::VectorXd middle(static_cast<Eigen::Index>(schema.signals.size()));
-  for (Eigen::Index s = 0; s < middle.size(); ++s) {
-    const Signal& signal = schema.signals[static_cast<std::size_t>(s)];
-    middle(s) = 0.5 * (signal.lower + signal.upper);
-  }
-  return middle;
-}
-
 /// The pose that a change of the edge to `part` moves: the part in its parent; of the root, which
 /// hangs on nothing, the camera in the root.
 Pose pose_at(const BodySchema& schema, int part) {
   const Edge* edge = edge_to(schema, part);
-  return edge ? edge->predict(schema.displacements(middle_of(schema))) : schema.X_CR.inverse();
+  return edge ? edge->predict(schema.displacements(mid_range(schema.signals)))
+              : schema.X_CR.inverse();
 }
 
 std::vector<double> distance_and_angle(const Pose& T) {

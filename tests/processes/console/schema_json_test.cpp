@@ -163,6 +163,8 @@ TEST(SchemaJsonTest, ShowHasEveryParameterOfEveryEdge) {
   EXPECT_EQ(json["signals"].size(), 3U);
   EXPECT_EQ(keys_of(json["signals"][0]), (Keys{"name", "lower", "upper", "warp"}));
   EXPECT_EQ(json["last_sample"], 29);
+  EXPECT_EQ(keys_of(json["X_CR"]),
+            (Keys{"position_m", "rotation_wxyz", "position_sd_m", "rotation_sd_deg"}));
 
   // The model can be built again from what is printed.
   const auto pose_of = [](const nlohmann::ordered_json& X) {
@@ -195,6 +197,34 @@ TEST(SchemaJsonTest, ShowHasEveryParameterOfEveryEdge) {
                 1e-9);
     }
   }
+}
+
+// Of a robot in tag noise (3 mm, 1°) seen 30 times.
+TEST(SchemaJsonTest, ShowHasStandardDeviationsThatAPersonCanRead) {
+  test::SyntheticRobot robot;
+  BodySchema schema = learned(robot).schema;
+  const auto json = schema_json(schema);
+  for (const auto& sd : json["X_CR"]["position_sd_m"]) EXPECT_GT(sd.get<double>(), 1e-5);
+  for (const auto& edge : json["edges"]) {
+    EXPECT_GT(edge["position_sd_m"], 1e-5);
+    EXPECT_LT(edge["position_sd_m"], 3e-3);
+    EXPECT_GT(edge["rotation_sd_deg"], 1e-3);
+    EXPECT_LT(edge["rotation_sd_deg"], 1);
+    for (const auto& joint : edge["joints"]) {
+      const auto& sd = joint["sd"];
+      EXPECT_EQ(keys_of(sd), (Keys{"axis_position_m", "axis_tilt_deg", "displacement_m",
+                                   "displacement_deg", "slide_m", "turn_rad"}));
+      EXPECT_LT(sd["axis_tilt_deg"], 1);
+      EXPECT_LT(sd["displacement_deg"], 1);
+      if (joint["turn_rad"] == 0)
+        EXPECT_TRUE(sd["axis_position_m"].is_null());
+      else
+        EXPECT_LT(sd["axis_position_m"], 0.01);
+    }
+  }
+  schema.edges[0].parameter_covariance.resize(0, 0);
+  EXPECT_TRUE(schema_json(schema)["edges"][0]["position_sd_m"].is_null());
+  EXPECT_TRUE(schema_json(schema)["edges"][0]["joints"][0]["sd"].is_null());
 }
 
 TEST(SchemaJsonTest, JointsWhoseOrderIsOpenHaveTheNumberOfTheirGroup) {
