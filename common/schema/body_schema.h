@@ -65,7 +65,7 @@ struct Edge {
 
   /// Covariance of the parameters, order: left tangent (6); per joint: slide, turn, X_after tangent
   /// (6). Right perturbations. Side 6 + 8·|joints|. Singular along the gauge of the screw frames.
-  /// As the two parts' own poses tell: an upper bound where the whole tree was fitted at once.
+  /// Of the fit of the whole tree where the root rests, else of the two parts' own poses.
   Eigen::MatrixXd parameter_covariance;
 
   /// Root mean square of the leave-one-out residuals of the inliers: over the three axes together.
