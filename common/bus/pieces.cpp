@@ -82,6 +82,9 @@ std::optional<std::vector<std::uint8_t>> PieceJoiner::add(std::span<const std::u
     return m.sender == piece.piece_sender && m.number == piece.whole_number;
   });
   if (message == unfinished_.end()) {
+    const std::pair of_piece{piece.piece_sender, piece.whole_number};
+    if (std::count(newest_whole_.begin(), newest_whole_.end(), of_piece) > 0)
+      return std::nullopt;  // a datagram that came twice
     if (unfinished_.size() == kMostUnfinished) {
       unfinished_.pop_front();
       ++num_lost_;
@@ -107,6 +110,9 @@ std::optional<std::vector<std::uint8_t>> PieceJoiner::add(std::span<const std::u
       whole.size() >= kLeastMessage && fingerprint_of(whole) == message->fingerprint;
   const std::int64_t sender = message->sender, number = message->number;
   unfinished_.erase(message);
+  std::erase_if(newest_whole_, [&](const auto& newest) { return newest.first == sender; });
+  if (newest_whole_.size() == kMostUnfinished) newest_whole_.pop_front();
+  newest_whole_.emplace_back(sender, number);
   num_lost_ += static_cast<std::int64_t>(std::erase_if(
       unfinished_, [&](const Unfinished& m) { return m.sender == sender && m.number < number; }));
   if (!is_of_its_type) {

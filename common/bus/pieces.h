@@ -2,11 +2,13 @@
 
 #include <cstddef>
 #include <cstdint>
+#include <deque>
 #include <list>
 #include <map>
 #include <optional>
 #include <span>
 #include <string>
+#include <utility>
 #include <vector>
 
 namespace bodyschema {
@@ -63,6 +65,7 @@ class PieceJoiner {
     std::size_t num_missing = 0;
   };
   std::list<Unfinished> unfinished_;  ///< in the order of their first pieces
+  std::deque<std::pair<std::int64_t, std::int64_t>> newest_whole_;  ///< (sender, number)
   std::int64_t num_lost_ = 0;
 };
 

@@ -12,9 +12,9 @@ namespace bodyschema {
 ///
 ///   X_CB = X_CB_true · exp(ε + β),   ε ~ N(0, Σ),   β ~ N(0, M)
 ///
-/// The noise ε is new at every sight. The systematic error β (tags that are not where markers.yaml
-/// says, a lens that is not as calibrated, what a view biases) is the same at every sight of the
-/// same tags from the same side: no number of samples averages it out.
+/// The noise ε is new at every sight; an observation's Σ also has how sure markers.yaml is of its
+/// tags. The systematic error β (a lens that is not as calibrated, what a view biases) is the same
+/// at every sight of the same tags from the same side: no number of samples averages it out.
 struct MeasurementModel {
   /// Standard deviations per axis of ε, instead of each observation's own covariance.
   std::optional<Noise> noise = std::nullopt;

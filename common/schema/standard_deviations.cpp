@@ -1,5 +1,6 @@
 #include "common/schema/standard_deviations.h"
 
+#include <algorithm>
 #include <cmath>
 
 namespace bodyschema {
@@ -9,7 +10,7 @@ std::vector<JointDeviation> joint_deviations(const Edge& edge, const Eigen::Vect
   const Eigen::Index size = 6 + 8 * static_cast<Eigen::Index>(edge.joints.size());
   std::vector<JointDeviation> result;
   if (P.rows() != size || P.cols() != size) return result;
-  const auto across = [&](Eigen::Index x) { return std::sqrt((P(x, x) + P(x + 1, x + 1)) / 2); };
+  const auto sum = [&](Eigen::Index x) { return P(x, x) + P(x + 1, x + 1); };  // about x and y
   Eigen::Index before = 0;  // of the transform that the joint's frame ends
   for (std::size_t d = 0; d < edge.joints.size(); ++d) {
     const ScrewJoint& joint = edge.joints[d];
@@ -23,8 +24,11 @@ std::vector<JointDeviation> joint_deviations(const Edge& edge, const Eigen::Vect
       g.segment<6>(after) = A.row(axis);
       return std::sqrt(g.dot(P * g));
     };
-    result.push_back({.axis_position_m = across(before),
-                      .axis_tilt_rad = across(before + 3),
+    // A point of the axis at height h is off by (δx + h δry, δy − h δrx): least where that is zero.
+    const double slope = P(before, before + 4) - P(before + 1, before + 3);
+    const double position = sum(before) - slope * slope / std::max(sum(before + 3), 1e-300);
+    result.push_back({.axis_position_m = std::sqrt(std::max(position, 0.0) / 2),
+                      .axis_tilt_rad = std::sqrt(sum(before + 3) / 2),
                       .displacement_m = along(2, slide),
                       .displacement_rad = along(5, slide + 1),
                       .slide = std::sqrt(P(slide, slide)),

@@ -450,7 +450,7 @@ EdgeSlice edge_slice(const BodySchema& schema, const Edge& edge, int signal,
   for (const ActionPoseSample& sample : samples) {
     const PartObservation* from = sample.find(edge.from);
     const PartObservation* to = sample.find(edge.to);
-    if (!from || !to || sample.action.size() != num_signals) continue;
+    if (!from || !to || sample.action.size() != middle.size()) continue;
     const Pose observed = from->X_CB.inverse() * to->X_CB;
     Eigen::VectorXd action = middle;
     action[signal] = sample.action[signal];

@@ -282,8 +282,10 @@ void Controller::observe(const sample_t& message) {
   observed_offset_ = position_of(target_) - X_CR.inverse() * part->X_CB.translation();
   observed_error_m_ = observed_offset_.norm();
   const Eigen::Matrix3d R_RB = (X_CR.inverse() * part->X_CB).linear();
-  const Eigen::Matrix3d covariance =
-      R_RB * part->covariance.topLeftCorner<3, 3>() * R_RB.transpose();
+  Eigen::Matrix3d covariance = part->covariance.topLeftCorner<3, 3>();
+  if (const auto X_RB = schema_->predict(schema_->root, part->part, sample.action))
+    covariance += X_RB->covariance.topLeftCorner<3, 3>();
+  covariance = (R_RB * covariance * R_RB.transpose()).eval();
   // By the schema the part is at the aim.
   const Eigen::Vector3d surprise = observed_offset_ - (position_of(target_) - aim_);
   is_observation_sure_ =
@@ -417,9 +419,8 @@ Controller::Command Controller::advance() {
     }
     is_lent_for_probe_ = worst != EdgeState::kInvalid;
     enter(S::CONTROL_LENT, false,
-          is_lent_for_probe_
-              ? edge + " can be told two ways: the babbler has the arm for a probe"
-              : edge + " is invalid: the babbler has the arm until it is mended");
+          is_lent_for_probe_ ? edge + " can be told two ways: the babbler has the arm for a probe"
+                             : edge + " is invalid: the babbler has the arm until it is mended");
     return std::nullopt;
   }
   if (!owns_arm_ || state_ == S::CONTROL_LENT) {

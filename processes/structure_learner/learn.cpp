@@ -17,6 +17,16 @@
 namespace bodyschema {
 namespace {
 
+// Share of the variance of a marker's noise that near-identical views have in common: SAMPLE tells
+// one frame's covariance for the mean of two. None where no systematic error is told either.
+double view_share(const MeasurementModel& measurement) {
+  // `./run experiment rig_table`, over the ideal rigs: d² of X_CR has the mean 5.8, 4.1 and 2.5 with
+  // 0.08, 0.2 and 0.5. One draw a rig, for their roots rest.
+  constexpr double kOfTags = 0.1;
+  const Noise& systematic = measurement.systematic;
+  return systematic.position_m > 0 || systematic.rotation_rad > 0 ? kOfTags : 0;
+}
+
 bool has_covariances(const std::vector<ActionPoseSample>& samples) {
   for (const auto& sample : samples)
     for (const auto& o : sample.parts)
@@ -199,7 +209,8 @@ void fit_jointly(const std::vector<ActionPoseSample>& samples, const NormalizedA
   if (nodes.size() < 2) return;
   TreeFit fit(std::move(nodes), std::move(data), actions, true);
   fit.fit(20, 1e-6);
-  const auto covariance = fit.covariance(measurement.systematic_covariance());
+  const auto covariance =
+      fit.covariance(measurement.systematic_covariance(), view_share(measurement));
   for (std::size_t k = 1; k < fit.nodes().size(); ++k) {
     const TreeNode& node = fit.nodes()[k];
     for (FittedEdge& f : *fitted) {
@@ -586,7 +597,8 @@ void estimate_root_pose(const std::vector<ActionPoseSample>& samples,
     if (step.norm() < 1e-13) break;
   }
   schema->X_CR = mean;
-  schema->X_CR_covariance = weight * H.inverse();
+  const double views = 1 + view_share(measurement) * static_cast<double>(readings.size());
+  schema->X_CR_covariance = views * weight * H.inverse() + measurement.systematic_covariance();
 }
 
 SourcedNoise marker_noise(const std::vector<ActionPoseSample>& samples, int num_signals,

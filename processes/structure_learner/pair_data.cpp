@@ -3,9 +3,8 @@
 #include <algorithm>
 #include <cmath>
 #include <initializer_list>
+#include <map>
 #include <stdexcept>
-
-#include "common/geometry/angle.h"
 
 namespace bodyschema {
 namespace {
@@ -30,29 +29,6 @@ int readings_of(const PartObservation& observation, const MeasurementModel& meas
   return 2;
 }
 
-// Which frames look alike: the same tags, and nowhere farther than this from the first such frame.
-class Views {
- public:
-  int index_of(const PartObservation& seen) {
-    for (std::size_t v = 0; v < firsts_.size(); ++v)
-      if (is_alike(*firsts_[v], seen)) return static_cast<int>(v);
-    firsts_.push_back(&seen);
-    return static_cast<int>(firsts_.size()) - 1;
-  }
-
- private:
-  // Chosen: pixels of a tag change with less, what a lens adds changes slowly.
-  static constexpr double kPosition_m = 5e-3, kRotation_rad = 2 * kDegree;
-
-  static bool is_alike(const PartObservation& x, const PartObservation& y) {
-    return (x.X_CB.translation() - y.X_CB.translation()).squaredNorm() <
-               kPosition_m * kPosition_m &&
-           x.tags == y.tags && log(x.X_CB.inverse() * y.X_CB).tail<3>().norm() < kRotation_rad;
-  }
-
-  std::vector<const PartObservation*> firsts_;
-};
-
 // Visits at most `max_frames` of the samples that show all of `parts`, evenly chosen.
 template <typename Visitor>
 void for_thinned(const std::vector<ActionPoseSample>& samples, int max_frames,
@@ -68,9 +44,9 @@ void for_thinned(const std::vector<ActionPoseSample>& samples, int max_frames,
 // Collects the readings of one instant.
 class FrameWriter {
  public:
-  FrameWriter(int sample, PairData* pair, int view = 0) : pair_(*pair) {
+  FrameWriter(int sample, PairData* pair, int tag_set = 0) : pair_(*pair) {
     frame_.sample = sample;
-    frame_.view = view;
+    frame_.tag_set = tag_set;
     frame_.first_hypothesis = static_cast<int>(pair_.hypotheses.size());
   }
   FrameWriter(const FrameWriter&) = delete;
@@ -163,11 +139,12 @@ PairData make_part_data(const std::vector<ActionPoseSample>& samples, int part,
   pair.part_i = pair.part_j = part;
   const Matrix6d systematic = measurement.systematic_covariance();
   MarkerReading readings[2];
-  Views views;
+  std::map<std::vector<int>, int> tag_sets;
   for_thinned(samples, max_frames, {part}, [&](int sample) {
     const PartObservation& seen = *samples[sample].find(part);
     const int num = readings_of(seen, measurement, readings);
-    FrameWriter frame(sample, &pair, views.index_of(seen));
+    const auto [tags, is_new] = tag_sets.try_emplace(seen.tags, static_cast<int>(tag_sets.size()));
+    FrameWriter frame(sample, &pair, tags->second);
     for (int a = 0; a < num; ++a)
       frame.add(readings[a].X_CB, readings[a].covariance, systematic, readings[a].penalty);
   });

@@ -53,9 +53,8 @@ struct PairFrame {
   int sample = 0;
   int first_hypothesis = 0;
   int num_hypotheses = 0;
-  /// Of make_part_data(): frames of one view show the same tags from the same side, and share their
-  /// systematic error. Counts from 0.
-  int view = 0;
+  /// Of make_part_data(): frames with the same number rest on the same tags. Counts from 0.
+  int tag_set = 0;
 };
 
 struct PairData {

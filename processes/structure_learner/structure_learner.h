@@ -87,7 +87,7 @@ class StructureLearner {
   std::shared_ptr<OnlineLearner> online_;
   std::int64_t online_since_ = 0, online_stride_ = 1;
   std::vector<MovedTag> online_moved_;
-  BodySchema known_;  ///< for its changes and moved tags
+  BodySchema known_;         ///< for its changes and moved tags
   RetainedSamples samples_;  ///< TRAIN and PROBE
   bool has_new_ = false;     ///< since the last preparation
   std::int64_t last_sample_index_ = -1;

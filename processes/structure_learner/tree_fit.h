@@ -71,22 +71,19 @@ class TreeFit {
   double log_likelihood() const;         ///< −cost − ½ Σ log|2πΣ|
   int num_frames() const { return static_cast<int>(samples_.size()); }
 
-  /// Of the fit's parameters, normalised; right perturbations. The score's covariance between two
-  /// H⁻¹ (Huber 1967), where frames of one view share the systematic error, of covariance
-  /// `systematic`, and kViewShare of their noise: it does not average out over them.
+  /// Of the fit's parameters, normalised; right perturbations. The covariance of the score, by what
+  /// is told of the measurements, between two inverse Hessians (the sandwich of an M-estimator):
+  /// near-identical views of a part share its systematic error, of covariance `systematic`, and
+  /// `view_share` of the variance of its noise, which do not average out over them.
   struct Covariance {
-    Matrix6d root = Matrix6d::Zero();     ///< of root_pose(); zero if the root moves
+    Matrix6d root = Matrix6d::Zero();     ///< of root_pose()
     std::vector<ParameterMatrix> models;  ///< by node
     /// By node, in its part's frame: what the edges that meet there have in common with opposite
     /// sign, for the part's frame is where its markers were seen. Zero at leaves.
     std::vector<Matrix6d> frames;
   };
-  /// Share of the noise's variance that near-identical views have in common. Of 0.08, 0.2 and 0.5
-  /// the d² of X_CR has the mean 5.8, 4.1 and 2.5 over the ideal rigs, which differ 1 to 2.7
-  /// (`./run experiment rig_table`; one draw a rig: their root rests).
-  static constexpr double kViewShare = 0.1;
-  /// std::nullopt if the data do not determine the tree.
-  std::optional<Covariance> covariance(const Matrix6d& systematic) const;
+  /// std::nullopt if the root moves, or the data do not determine the tree.
+  std::optional<Covariance> covariance(const Matrix6d& systematic, double view_share) const;
 
   /// Rao's score test of one more joint, for every rigid cluster and every moving signal: how much
   /// the residuals shrink, to second order, if Exp(ξ q_g) moves some of what is in or on the
@@ -116,6 +113,8 @@ class TreeFit {
   void start_roots();
   struct Normal;
   Normal normal_equations() const;
+  std::vector<int> views_of(int node) const;
+  void add_composites(const Normal& normal, std::vector<Matrix6d> own, Eigen::MatrixXd* sum) const;
   std::vector<int> cluster_of(int top) const;
   bool is_below(int node, int ancestor) const;  // or the same
   int at(int frame, int node) const { return frame * static_cast<int>(nodes_.size()) + node; }

@@ -1,25 +1,65 @@
 #include <Eigen/Eigenvalues>
+#include <algorithm>
 #include <cmath>
 #include <map>
+#include <utility>
 
+#include "common/geometry/angle.h"
 #include "processes/structure_learner/tree_fit.h"
 #include "processes/structure_learner/tree_fit_normal.h"
 
 namespace bodyschema {
 namespace {
 
+/// Without the negative eigenvalues of its correlation matrix.
 Matrix6d positive_part(const Matrix6d& matrix) {
-  const Eigen::SelfAdjointEigenSolver<Matrix6d> eigen(0.5 * (matrix + matrix.transpose()));
-  return eigen.eigenvectors() * eigen.eigenvalues().cwiseMax(0).asDiagonal() *
-         eigen.eigenvectors().transpose();
+  const Vector6d unit = matrix.diagonal().cwiseMax(0).cwiseSqrt();
+  const Vector6d inverse = unit.unaryExpr([](double x) { return x > 0 ? 1 / x : 0.0; });
+  const Matrix6d symmetric = 0.5 * (matrix + matrix.transpose());
+  const Eigen::SelfAdjointEigenSolver<Matrix6d> eigen(inverse.asDiagonal() * symmetric *
+                                                      inverse.asDiagonal());
+  const Matrix6d V = unit.asDiagonal() * eigen.eigenvectors();
+  return V * eigen.eigenvalues().cwiseMax(0).asDiagonal() * V.transpose();
+}
+
+/// Where a part was, to within which its views are alike: pixels of a tag change with less, what a
+/// lens adds changes slowly. Chosen; a part that rests has one view, one that moves many.
+constexpr double kSamePosition_m = 5e-3, kSameRotation_rad = 2 * kDegree;
+
+bool is_alike(const Pose& x, const Pose& y) {
+  return (x.translation() - y.translation()).squaredNorm() < kSamePosition_m * kSamePosition_m &&
+         log(x.inverse() * y).tail<3>().norm() < kSameRotation_rad;
 }
 
 }  // namespace
 
-std::optional<TreeFit::Covariance> TreeFit::covariance(const Matrix6d& systematic) const {
+// By node's frame: the first frame with the same tags where the fit has the part in the same place.
+std::vector<int> TreeFit::views_of(int node) const {
+  const std::vector<PairFrame>& frames = data_[node].frames;
+  std::vector<int> result(frames.size());
+  std::map<int, std::vector<std::pair<int, const Pose*>>> firsts;  // by tags
+  for (int t = 0; t < num_frames(); ++t) {
+    const int frame = frame_index_[at(t, node)];
+    if (frame < 0) continue;
+    const Pose& X = poses_[at(t, node)];
+    auto& of_tags = firsts[frames[frame].tag_set];
+    const auto known = std::find_if(of_tags.begin(), of_tags.end(),
+                                    [&](const auto& first) { return is_alike(*first.second, X); });
+    if (known != of_tags.end()) {
+      result[frame] = known->first;
+    } else {
+      result[frame] = frame;
+      of_tags.emplace_back(frame, &X);
+    }
+  }
+  return result;
+}
+
+std::optional<TreeFit::Covariance> TreeFit::covariance(const Matrix6d& systematic,
+                                                       double view_share) const {
+  if (!root_rests_) return std::nullopt;
   const Normal normal = normal_equations();
   const auto size = normal.H.rows();
-  if (size == 0) return std::nullopt;
   const int n = static_cast<int>(nodes_.size());
   Eigen::MatrixXd H = normal.H;
   // A screw frame may turn about its axis and slide along it: these directions get the variance
@@ -45,53 +85,45 @@ std::optional<TreeFit::Covariance> TreeFit::covariance(const Matrix6d& systemati
 
   // Covariance of the score Σ Jᵀ W e. What was added to H is a measurement like others.
   Eigen::MatrixXd score = H - normal.H;
+  std::vector<Matrix6d> own(frame_index_.size(), Matrix6d::Zero());  // what averages out
   for (int k = 0; k < n; ++k) {
-    std::vector<int> path;  // of nodes whose parameters move this one
-    std::vector<int> rows;  // and these parameters
-    for (int e = k; e >= 0; e = nodes_[e].parent) {
-      if (e == 0 && !root_rests_) break;
-      path.push_back(e);
-      const int count = e == 0 ? 6 : nodes_[e].model.num_parameters();
-      for (int p = 0; p < count; ++p) rows.push_back(normal.offset[e] + p);
-    }
-    std::map<int, int> views;  // frames of each
-    for (const PairFrame& frame : data_[k].frames) ++views[frame.view];
-    std::map<int, Eigen::MatrixXd> common;  // of views with several frames
-    Eigen::MatrixXd own(rows.size(), 6 * data_[k].size());
+    const std::vector<int> views = views_of(k);
+    std::map<int, int> sizes;
+    for (const int view : views) ++sizes[view];
+    std::map<int, Eigen::MatrixXd> common;  // by view, parameters × 6
     for (int t = 0; t < num_frames(); ++t) {
       const int frame = frame_index_[at(t, k)];
       if (frame < 0) continue;
       const FrameFit& fit = fits_[at(t, k)];
       const Matrix6d& whitening = data_[k].hypotheses[fit.hypothesis].whitening;
-      // Jᵀ W L of the measurement's covariance L Lᵀ.
-      const Matrix6d whitened = robust_weight(fit.squared_distance) *
-                                adjoint(poses_[at(t, k)].inverse()).transpose() *
-                                whitening.transpose();
-      auto column = own.middleCols<6>(6 * frame);
-      Eigen::Index row = 0;
-      for (const int e : path) {
-        const ParameterJacobian& S = normal.S[at(t, e)];
-        column.middleRows(row, S.cols()).noalias() = S.transpose().lazyProduct(whitened);
-        row += S.cols();
+      // The whitened error of the marker as a twist in the camera's frame, weighed.
+      const Matrix6d twist = robust_weight(fit.squared_distance) *
+                             adjoint(poses_[at(t, k)].inverse()).transpose() *
+                             whitening.transpose();
+      if (sizes.at(views[frame]) == 1) {
+        own[at(t, k)] = twist * twist.transpose();
+        continue;
       }
-      const int view = data_[k].frames[frame].view;
-      if (views.at(view) == 1) continue;
-      const Matrix6d shared = kViewShare * Matrix6d::Identity() +
-                              (1 - kViewShare) * whitening * systematic * whitening.transpose();
-      const Matrix6d L = shared.llt().matrixL();
-      common.try_emplace(view, Eigen::MatrixXd::Zero(column.rows(), 6)).first->second += column * L;
-      column *= std::sqrt(1 - kViewShare);
+      const Matrix6d noise = Matrix6d::Identity() - whitening * systematic * whitening.transpose();
+      own[at(t, k)] = (1 - view_share) * twist * noise * twist.transpose();
+      const Matrix6d shared = Matrix6d::Identity() - (1 - view_share) * noise;
+      const Matrix6d in_common = twist * Eigen::LLT<Matrix6d>(shared).matrixL();
+      Eigen::MatrixXd& G =
+          common.try_emplace(views[frame], Eigen::MatrixXd::Zero(size, 6)).first->second;
+      for (int e = k; e >= 0; e = nodes_[e].parent) {
+        const ParameterJacobian& S = normal.S[at(t, e)];
+        G.middleRows(normal.offset[e], S.cols()) += S.transpose().lazyProduct(in_common);
+      }
     }
-    Eigen::MatrixXd of_node = own * own.transpose();
-    for (const auto& [view, G] : common) of_node += G * G.transpose();
-    score(rows, rows) += of_node;
+    for (const auto& [view, G] : common) score += G * G.transpose();
   }
+  add_composites(normal, std::move(own), &score);
   const Eigen::MatrixXd inverse = unit.asDiagonal() * llt.solve(Eigen::MatrixXd(unit.asDiagonal()));
   const Eigen::MatrixXd joint = inverse * score * inverse;
 
   Covariance result;
   result.models.resize(n);
-  if (root_rests_) result.root = joint.topLeftCorner<6, 6>();
+  result.root = joint.topLeftCorner<6, 6>();
   for (int k = 1; k < n; ++k) {
     const int p = nodes_[k].model.num_parameters();
     result.models[k] = joint.block(normal.offset[k], normal.offset[k], p, p);
@@ -101,7 +133,6 @@ std::optional<TreeFit::Covariance> TreeFit::covariance(const Matrix6d& systemati
   std::vector<int> children(n, 0);
   for (int k = 1; k < n; ++k) {
     const int parent = nodes_[k].parent;
-    if (parent == 0 && !root_rests_) continue;
     const auto p = normal.S[at(0, parent)].cols(), c = normal.S[at(0, k)].cols();
     const Eigen::MatrixXd cross = joint.block(normal.offset[parent], normal.offset[k], p, c);
     Matrix6d sum = Matrix6d::Zero();
@@ -116,6 +147,25 @@ std::optional<TreeFit::Covariance> TreeFit::covariance(const Matrix6d& systemati
   for (int k = 0; k < n; ++k)
     if (children[k] > 0) result.frames[k] = positive_part(result.frames[k] / children[k]);
   return result;
+}
+
+// Σ_t S_eᵀ (Σ own of e' and beyond) S_e' of nodes e' and their ancestors e, for a root that rests.
+void TreeFit::add_composites(const Normal& normal, std::vector<Matrix6d> own,
+                             Eigen::MatrixXd* sum) const {
+  const int n = static_cast<int>(nodes_.size());
+  Eigen::MatrixXd lower = Eigen::MatrixXd::Zero(sum->rows(), sum->cols());
+  for (int t = 0; t < num_frames(); ++t) {
+    for (int k = n; k-- > 0;) {
+      if (k > 0) own[at(t, nodes_[k].parent)] += own[at(t, k)];
+      const ParameterJacobian IS = own[at(t, k)].lazyProduct(normal.S[at(t, k)]);
+      for (int e = k; e >= 0; e = nodes_[e].parent) {
+        const ParameterJacobian& S = normal.S[at(t, e)];
+        lower.block(normal.offset[k], normal.offset[e], IS.cols(), S.cols()) +=
+            IS.transpose().lazyProduct(S);
+      }
+    }
+  }
+  *sum += Eigen::MatrixXd(lower.selfadjointView<Eigen::Lower>());
 }
 
 }  // namespace bodyschema

@@ -1,8 +1,7 @@
 // How wrong are the poses that the pipeline sees? Samples of a simulated rig go from action to
 // SAMPLE and are compared with the simulator's truth: per part, by the tilt of its best tag, by
 // distance, and per pair of neighbours, where the learner's test statistic d² lives. From this the
-// corner noise (marker_estimator.yaml, observer.yaml) and the model error (structure_learner.yaml)
-// are set. Prints Markdown.
+// corner noise and the systematic error of noise.yaml are judged. Prints Markdown.
 //
 //   pose_error config/arm7 --samples 2000 --seed 1
 

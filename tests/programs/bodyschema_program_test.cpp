@@ -138,7 +138,9 @@ TEST_F(BodyschemaProgramTest, ASchemaBeyondADatagramIsLearnedSavedAndLoaded) {
     for (int part = 0; part < kParts; ++part) {
       Vector6d noise;
       for (double& value : noise) value = 1e-3 * normal(rng);
-      sample.parts.push_back({part, Eigen::Translation3d(0.1 * part, 0, 1) * exp(noise)});
+      PartObservation& seen = sample.parts.emplace_back();
+      seen.part = part;
+      seen.X_CB = Eigen::Translation3d(0.1 * part, 0, 1) * exp(noise);
     }
   }
   const std::string csv = write("rigid.csv", samples);

@@ -80,8 +80,10 @@ TEST(Pieces, MayComeInAnyOrderAndTwice) {
     Receiver receiver;
     receiver.hear(pieces[0]);
     receiver.hear(pieces);
+    receiver.hear(pieces[1]);
     EXPECT_EQ(receiver.whole, std::vector<Bytes>{message});
     EXPECT_TRUE(receiver.problems.empty());
+    EXPECT_EQ(receiver.joiner.num_unfinished(), 0);
   }
 }
 

@@ -20,7 +20,7 @@ Calibration example() {
   const Pose X_BM =
       Eigen::Translation3d(0.01, -0.02, 0.3) * Eigen::AngleAxisd(0.7, Eigen::Vector3d::UnitY());
   c.markers = {"tag36h11", {{3, 0.08, 1, std::nullopt}, {7, 0.05, 2, X_BM}}};
-  c.camera = {"ceiling", 1280, 960, 1104.6, 1104.6, 639.5, 479.5};
+  c.camera = {"ceiling", 1280, 960, 1104.6, 1104.6, 639.5, 479.5, {}, {}};
   return c;
 }
 

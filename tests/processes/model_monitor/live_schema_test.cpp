@@ -3,6 +3,7 @@
 #include <gtest/gtest.h>
 
 #include <cmath>
+#include <set>
 
 #include "tests/support/broken_arm.h"
 
@@ -34,6 +35,33 @@ TEST(LiveSchemaTest, AfterADriftTheBodyIsAsItIsSinceItsEnd) {
           EXPECT_EQ(edge.valid_since_sample, 0) << "edge to " << edge.to;
       }
     }
+}
+
+// What the edges at a part have in common holds while they are those that were fitted together.
+TEST(LiveSchemaTest, AChangedEdgeHasNothingInCommonWithItsNeighboursUntilItIsAsBefore) {
+  constexpr int kBlock = 40;
+  BrokenArm arm({Fault::kBend, ""}, Regime::kTagIso, kBlock, 1);
+  BodySchema engineered = arm.engineered();
+  for (const int part : engineered.parts)
+    engineered.frame_covariances[part] = 1e-8 * Matrix6d::Identity();
+  LiveSchema live(engineered, test::adaptation_options(Regime::kTagIso), {}, {});
+  const auto told = [&] {
+    std::set<int> parts;
+    for (const auto& [part, covariance] : live.schema().frame_covariances) parts.insert(part);
+    return parts;
+  };
+  const std::set<int> all(engineered.parts.begin(), engineered.parts.end());
+  int t = 0;
+  for (; t < kBlock; ++t) live.on_sample(arm.observe(t));
+  EXPECT_EQ(told(), all);
+  for (; t < 2 * kBlock; ++t) live.on_sample(arm.observe(t));
+  const int bent = arm.changes().front().part;
+  std::set<int> others = all;
+  others.erase(bent);
+  others.erase(bent - 1);
+  EXPECT_EQ(told(), others);
+  for (; t < 3 * kBlock; ++t) live.on_sample(arm.observe(t));
+  EXPECT_EQ(told(), all);
 }
 
 }  // namespace

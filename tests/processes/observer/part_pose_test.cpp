@@ -3,6 +3,7 @@
 #include <gtest/gtest.h>
 
 #include <Eigen/LU>
+#include <cmath>
 #include <random>
 
 #include "processes/marker_estimator/tag_pose.h"
@@ -41,10 +42,12 @@ Pose X_CB_of(std::mt19937& random) {
   return X;
 }
 
-SeenTag seen(int id, const Pose& X_CB, const Pose& X_BM, double sigma_px, std::mt19937& random) {
+/// `printed_m`: the side that it really has.
+SeenTag seen(int id, const Pose& X_CB, const Pose& X_BM, double sigma_px, std::mt19937& random,
+             double printed_m = kSize_m) {
   std::normal_distribution<double> noise(0, sigma_px / kFocal_px);
   SeenTag tag{id, kSize_m, X_BM, {}, sigma_px * sigma_px * Matrix8d::Identity(), {}};
-  for (const Eigen::Vector3d& p_MP : tag_corners(kSize_m)) {
+  for (const Eigen::Vector3d& p_MP : tag_corners(printed_m)) {
     const Eigen::Vector3d p_C = X_CB * X_BM * p_MP;
     ImagePoint point;
     point.ray = p_C.head<2>() / p_C.z() + Eigen::Vector2d(noise(random), noise(random));
@@ -81,6 +84,41 @@ TEST(SolvePartPose, IsBetterOverSeveralTagsThanOverOne) {
   }
   EXPECT_LT(squares[2], 0.5 * squares[1]);
   EXPECT_LT(squares[3], squares[2]);
+}
+
+// Tags are not where markers.yaml has them, and printed larger or smaller: d² of the part's pose.
+TEST(SolvePartPose, HasACovarianceThatIsConsistentWithTagsThatAreOff) {
+  PartPoseOptions off = options();
+  off.calibration = {.position_m = 0.0005, .rotation_rad = 0.005, .size_share = 0.002};
+  constexpr int kViews = 300;
+  for (const int num_tags : {1, 2, 3}) {
+    std::mt19937 random(num_tags);
+    std::normal_distribution<double> normal;
+    const auto drawn = [&](double sd) {
+      return Eigen::Vector3d(Eigen::Vector3d::NullaryExpr([&] { return sd * normal(random); }));
+    };
+    double sum = 0;
+    int count = 0;
+    for (int i = 0; i < kViews; ++i) {
+      const Pose X_CB = X_CB_of(random);
+      std::vector<SeenTag> tags;
+      for (int n = 0; n < num_tags; ++n) {
+        Vector6d moved;
+        moved << drawn(off.calibration.position_m), drawn(off.calibration.rotation_rad);
+        const double size_m = kSize_m * (1 + off.calibration.size_share * normal(random));
+        tags.push_back(seen(n, X_CB, box()[n] * exp(moved), 0.02, random, size_m));
+        tags.back().X_BM = box()[n];
+      }
+      const auto pose = solve_part_pose(tags, off);
+      ASSERT_TRUE(pose);
+      if (static_cast<int>(pose->used.size()) < num_tags) continue;
+      const Vector6d e = log(pose->X_CB.inverse() * X_CB);
+      sum += e.dot(pose->covariance.inverse() * e);
+      ++count;
+    }
+    EXPECT_GT(count, 0.95 * kViews);
+    EXPECT_NEAR(sum / count, 6, 4 * std::sqrt(12.0 / kViews)) << num_tags << " tags";
+  }
 }
 
 TEST(SolvePartPose, HasACovarianceThatIsConsistentWithGaussianCornerNoise) {

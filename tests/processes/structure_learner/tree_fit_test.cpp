@@ -2,8 +2,12 @@
 
 #include <gtest/gtest.h>
 
+#include <Eigen/Cholesky>
 #include <algorithm>
+#include <cmath>
 #include <limits>
+#include <map>
+#include <utility>
 
 #include "common/geometry/angle.h"
 #include "processes/structure_learner/screen.h"
@@ -45,14 +49,13 @@ SyntheticRobot chain(double slide_m, Rng& rng) {
 
 struct Case {
   Case(const SyntheticRobot& robot, int num_samples, Regime regime, bool root_moves, Rng& rng)
-      : samples(
-            test::babble(robot, num_samples, {.regime = regime, .with_covariances = true}, rng)),
+      : Case(robot, babbled(robot, num_samples, regime, root_moves, rng), {}) {}
+
+  Case(const SyntheticRobot& robot, std::vector<ActionPoseSample> seen,
+       const MeasurementModel& measurement)
+      : measurement(measurement),
+        samples(std::move(seen)),
         actions(samples, static_cast<int>(robot.signals.size())) {
-    if (root_moves)
-      for (ActionPoseSample& sample : samples) {
-        const Pose X = test::random_pose(rng, 0, 0.5);
-        for (PartObservation& o : sample.parts) o.X_CB = X * o.X_CB;
-      }
     for (const TrueLink& link : robot.links) {
       TreeNode node;
       node.part = link.part;
@@ -75,6 +78,18 @@ struct Case {
       data.push_back(
           make_part_data(samples, link.part, measurement, std::numeric_limits<int>::max()));
     }
+  }
+
+  static std::vector<ActionPoseSample> babbled(const SyntheticRobot& robot, int num_samples,
+                                               Regime regime, bool root_moves, Rng& rng) {
+    auto samples =
+        test::babble(robot, num_samples, {.regime = regime, .with_covariances = true}, rng);
+    if (root_moves)
+      for (ActionPoseSample& sample : samples) {
+        const Pose X = test::random_pose(rng, 0, 0.5);
+        for (PartObservation& o : sample.parts) o.X_CB = X * o.X_CB;
+      }
+    return samples;
   }
 
   // The tree without the joint of one node.
@@ -226,6 +241,68 @@ TEST(TreeFit, AJointThatMovesBranchesOnlyIsPutIntoTheirEdges) {
   const TreeFit full(nodes, c.data, c.actions, true);
   EXPECT_FALSE(full.with_joint(joint).has_value());
   EXPECT_EQ(full.full_edges(joint), std::vector<int>{2});
+}
+
+// Ten poses, each seen once or eight times: what a view biases is the same each time.
+TEST(TreeFit, CovariancesAreTrueHoweverOftenAViewIsRepeated) {
+  constexpr double kShare = 0.3;
+  constexpr int kPoses = 10, kRobots = 80;
+  const MeasurementModel measurement{.systematic = {.position_m = 0.001, .rotation_rad = 0.004}};
+  const Matrix6d noise = isotropic({.position_m = 0.0015, .rotation_rad = 0.006});
+  const Matrix6d M = measurement.systematic_covariance();
+  for (const int repeats : {1, 8}) {
+    double of_root = 0, of_edge = 0;
+    for (int seed = 1; seed <= kRobots; ++seed) {
+      Rng rng(seed);
+      const SyntheticRobot robot = chain(0.1, rng);
+      const auto drawn = [&](const Matrix6d& covariance) -> Vector6d {
+        return covariance.diagonal().cwiseSqrt().cwiseProduct(
+            Vector6d::NullaryExpr([&] { return test::gaussian(rng); }));
+      };
+      std::vector<ActionPoseSample> samples;
+      const Vector6d root_bias = drawn(M + kShare * noise);  // the root rests: one view
+      for (int pose = 0; pose < kPoses; ++pose) {
+        const Eigen::VectorXd action = robot.random_action(rng);
+        const auto truth = robot.poses_in_camera(action);
+        std::map<int, Vector6d> bias;
+        for (const auto& [part, X] : truth)
+          bias[part] = part == 1 ? root_bias : drawn(M + kShare * noise);
+        for (int n = 0; n < repeats; ++n) {
+          ActionPoseSample& sample = samples.emplace_back();
+          sample.sample_index = static_cast<std::int64_t>(samples.size()) - 1;
+          sample.action = action;
+          for (const auto& [part, X] : truth) {
+            PartObservation& seen = sample.parts.emplace_back();
+            seen.part = part;
+            seen.X_CB = X * exp(bias[part] + drawn((1 - kShare) * noise));
+            seen.covariance = noise;
+          }
+        }
+      }
+      Case c(robot, samples, measurement);
+      TreeFit fit(c.nodes, c.data, c.actions, true);
+      fit.fit(30, 1e-9);
+      const auto covariance = fit.covariance(M, kShare);
+      ASSERT_TRUE(covariance);
+      const Vector6d root = log(fit.root_pose().inverse() * robot.X_CR);
+      of_root += root.dot(covariance->root.ldlt().solve(root)) / kRobots;
+      // The edge with the last joint, as the fit has it and as it is, at the last pose.
+      const int last = static_cast<int>(samples.size()) - 1;
+      ParameterJacobian J;
+      const Pose X = predict_with_jacobian(fit.nodes()[6].model, c.actions, last, &J);
+      const Vector6d edge = log(X.inverse() * c.nodes[6].model.predict(c.actions, last));
+      of_edge += edge.dot((J * covariance->models[6] * J.transpose()).ldlt().solve(edge)) / kRobots;
+    }
+    EXPECT_NEAR(of_root, 6, 3 * std::sqrt(12.0 / kRobots)) << repeats;
+    EXPECT_NEAR(of_edge, 6, 3 * std::sqrt(12.0 / kRobots)) << repeats;
+  }
+}
+
+TEST(TreeFit, ATreeWhoseRootMovesHasNoCovariance) {
+  Rng rng(5);
+  const Case c(chain(0.1, rng), 20, Regime::kTag, true, rng);
+  const TreeFit fit(c.nodes, c.data, c.actions, false);
+  EXPECT_FALSE(fit.covariance(Matrix6d::Identity(), 0.1));
 }
 
 }  // namespace
