@@ -409,8 +409,8 @@ class Page {
         "mid-range; <code>bodyschema show --json</code> has that of each axis, offset and rate. "
         "Health and d²: the monitor’s, on held-out samples, d² in units of the assumed "
         "covariance. That has the systematic error of a pose in it, which is mostly common "
-        "to all samples and learned with the edge: the median of a right model is far below 5.3, "
-        "that of χ² with 6 degrees of freedom (0.0 to 0.1 of an ideal rig’s tags). Above 5.3 the "
+        "to all samples and learned with the edge: the median of a right model is below 5.3, "
+        "that of χ² with 6 degrees of freedom (0.1 to 2 of an ideal rig’s tags). Above 5.3 the "
         "edge is wrong.</p>\n";
     static const char* const kReasons[] = {"never seen", "not enough data yet", "no valid model"};
     Table lone({"not connected", "why", "detail"});
