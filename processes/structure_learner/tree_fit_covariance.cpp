@@ -58,7 +58,7 @@ std::vector<int> TreeFit::views_of(int node) const {
 std::optional<TreeFit::Covariance> TreeFit::covariance(const Matrix6d& systematic,
                                                        double view_share) const {
   if (!root_rests_) return std::nullopt;
-  const Normal normal = normal_equations();
+  Normal normal = normal_equations();
   const auto size = normal.H.rows();
   const int n = static_cast<int>(nodes_.size());
   Eigen::MatrixXd H = normal.H;
@@ -85,7 +85,9 @@ std::optional<TreeFit::Covariance> TreeFit::covariance(const Matrix6d& systemati
 
   // Covariance of the score Σ Jᵀ W e. What was added to H is a measurement like others.
   Eigen::MatrixXd score = H - normal.H;
-  std::vector<Matrix6d> own(frame_index_.size(), Matrix6d::Zero());  // what averages out
+  // Of what averages out, by the marker.
+  std::vector<Matrix6d> own = std::move(normal.own_I);
+  std::fill(own.begin(), own.end(), Matrix6d::Zero());
   for (int k = 0; k < n; ++k) {
     const std::vector<int> views = views_of(k);
     std::map<int, int> sizes;
