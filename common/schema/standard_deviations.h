@@ -7,10 +7,10 @@
 namespace bodyschema {
 
 /// How well the samples tell a joint, one standard deviation: Edge::parameter_covariance in terms
-/// that do not depend on how the joint's frame is turned about its axis.
+/// that do not depend on where on its axis the joint's frame sits, and how it is turned about it.
 struct JointDeviation {
-  double axis_position_m =
-      0;  ///< of the axis, across it, at the frame's origin; undetermined where nothing turns
+  /// Of the axis, across it, where it is known best; undetermined where nothing turns.
+  double axis_position_m = 0;
   double axis_tilt_rad = 0;     ///< of the axis, about each direction across it
   double displacement_m = 0;    ///< of how far it has slid at these displacements ...
   double displacement_rad = 0;  ///< ... and turned
