@@ -1,5 +1,6 @@
 // structure_learner: SAMPLE, BODY_SCHEMA, MODEL_HEALTH -> LEARNED_SCHEMA, SAMPLE_REQUEST
 
+#include <malloc.h>
 #include <spdlog/spdlog.h>
 
 #include <CLI/CLI.hpp>
@@ -83,7 +84,10 @@ int main(int argc, char** argv) {
         if (is_ready(fit, kUsualFit)) collect();
       }
       if (!fit.valid() && !learner.has_job() && !preparation.valid() && learner.has_preparation()) {
-        preparation = std::async(std::launch::async, learner.take_preparation());
+        preparation = std::async(std::launch::async, [prepare = learner.take_preparation()] {
+          prepare();
+          malloc_trim(0);  // a search needs for a moment several times what is kept
+        });
       }
     };
 

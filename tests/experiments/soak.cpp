@@ -6,9 +6,11 @@
 // soak [--samples N] [--keep FOLDER]; on a bus of its own (tests/private_bus.sh).
 
 #include <CLI/CLI.hpp>
+#include <algorithm>
 #include <chrono>
 #include <csignal>
 #include <cstdio>
+#include <deque>
 #include <fstream>
 #include <map>
 #include <memory>
@@ -30,6 +32,9 @@ namespace fs = std::filesystem;
 // The retained set is full after 2000 samples; what a run holds then is what it holds for good, but
 // for half a set more whenever the samples double.
 constexpr std::int64_t kFull = 2000;
+// A search needs for a moment several times what is kept: of so many samples' memory the least is
+// taken.
+constexpr std::int64_t kMoment = 100;
 // Allowed growth from there on: 1000 samples of five parts (4 kB) a doubling, an index of the
 // samples (SampleIntake, 64 B each), and what malloc scatters.
 constexpr double kMaxGrowthMb = 12, kMaxGrowthMbADoubling = 8;
@@ -197,12 +202,19 @@ int main(int argc, char** argv) {
     for (std::size_t i = 0; i < soak.usage().size(); ++i) std::printf(" --- | --- |");
     std::printf(" --- |\n");
     std::map<std::string, Usage> before = soak.usage();
+    std::map<std::string, std::deque<double>> recent_mb;
     std::int64_t printed = 0;
     for (std::int64_t n = 1; n <= num_samples; ++n) {
       soak.step(n - 1);
+      for (const auto& [name, u] : soak.usage()) {
+        std::deque<double>& memory = recent_mb[name];
+        memory.push_back(u.memory_mb);
+        if (std::ssize(memory) > kMoment) memory.pop_front();
+      }
       if (n % std::max<std::int64_t>(500, num_samples / 20) != 0 && n != kFull && n != num_samples)
         continue;
       usage[n] = soak.usage();
+      for (auto& [name, u] : usage[n]) u.memory_mb = *std::ranges::min_element(recent_mb.at(name));
       double sum = 0;
       std::printf("| %lld |", static_cast<long long>(n));
       for (const auto& [name, u] : usage[n]) {
