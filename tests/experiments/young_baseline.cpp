@@ -150,6 +150,8 @@ int main(int argc, char** argv) {
         std::fprintf(stderr, "%s seed %lld, part %d hidden: live %d, offline %d\n",
                      rig.filename().c_str(), static_cast<long long>(seed), part,
                      static_cast<int>(held), static_cast<int>(learned));
+        if (run.schema && held != Rightness::kRight)
+          std::fprintf(stderr, "  held: %s\n", truth.objection(*run.schema, observed).c_str());
         for (const health_event_t& event : run.events)
           std::fprintf(stderr, "  %lld  %s\n", static_cast<long long>(event.event_sample),
                        event.event_text.c_str());
