@@ -14,12 +14,12 @@ namespace {
 // Starts whose mean robust cost a frame is above these are beyond repair by a local fit. (A frame
 // at the squared distance d² costs 5 log(1 + d²/4).)
 constexpr double kMaxScrewStartCost = 26;
-// And starts whose median squared distance is above these (χ²₆ has 5.35), from kManyFrames on. The
-// valid models' stay below half of that in every noise regime, whatever the outliers.
-constexpr double kMaxRigidStartMedian = 20;
-constexpr double kMaxScrewStartMedian = 30;
-constexpr double kMaxFewFramesMedian = 100;  // from kSomeFrames on
-constexpr double kGoodStartCost = 12;        // below it none of this holds
+// Starts that cost more than this are taken only if the bulk of the frames is near them: by their
+// median squared distance (χ²₆ has 5.35), from kSomeFrames on. A start's error is that of the
+// typical frame: where a few frames are known much better, a right one has a median of 100.
+constexpr double kGoodStartCost = 20;
+constexpr double kMaxStartMedian = 30;
+constexpr double kMaxFewFramesMedian = 100;
 constexpr int kSomeFrames = 10;
 constexpr int kManyFrames = 20;
 // A refuted fit that costs less a frame may yet be right (a valid one costs 4 to 7).
@@ -66,9 +66,10 @@ struct Candidate {
 };
 
 // Beyond what a local fit mends, by the bulk of the frames.
-bool is_hopeless(const Start& start, int num_frames, double max_median) {
-  return num_frames >= kSomeFrames && start.score > kGoodStartCost &&
-         start.median > (num_frames >= kManyFrames ? max_median : kMaxFewFramesMedian);
+bool is_hopeless(const Start& start, int num_frames) {
+  return start.score > kMaxScrewStartCost ||
+         (num_frames >= kSomeFrames && start.score > kGoodStartCost &&
+          start.median > (num_frames >= kManyFrames ? kMaxStartMedian : kMaxFewFramesMedian));
 }
 
 std::set<int> signal_set(const LocalModel& model) {
@@ -590,9 +591,7 @@ class Search {
     for_each_open_pair([&](int i, int j) {
       ++result_.num_screens;
       const Start start = screen_rigid(pair(i, j), actions_);
-      if (start.score > kMaxRigidStartCost ||
-          is_hopeless(start, pair(i, j).size(), kMaxRigidStartMedian))
-        return;
+      if (start.score > kMaxRigidStartCost) return;
       if (auto c = try_start(i, j, start.model)) candidates.push_back(std::move(*c));
     });
     connect(std::move(candidates));
@@ -609,9 +608,7 @@ class Search {
         if (n >= 1 && regressions[n].score > 1.5 * regressions[0].score) break;
         const Start start =
             one_joint_start(regressions[n], pair(i, j), actions_, motions(i, j).sigma_rad);
-        if (start.score > kMaxScrewStartCost ||
-            is_hopeless(start, pair(i, j).size(), kMaxScrewStartMedian))
-          continue;
+        if (is_hopeless(start, pair(i, j).size())) continue;
         if (auto c = try_start(i, j, start.model)) valid.push_back(std::move(*c));
       }
       decide(i, j, std::move(valid), &candidates);

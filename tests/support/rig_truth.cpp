@@ -35,20 +35,25 @@ std::vector<int> RigTruth::ancestors(int link) const {
   }
 }
 
-std::set<int> RigTruth::path_signals(int part_a, int part_b) const {
+std::vector<int> RigTruth::path_joints(int part_a, int part_b) const {
   const std::vector<int> a = ancestors(link_of(part_a));
   const std::vector<int> b = ancestors(link_of(part_b));
-  std::set<int> signals;
+  std::vector<int> signals;
   const auto add_unshared = [&](const std::vector<int>& chain, const std::vector<int>& other) {
     for (const int link : chain) {
       const bool is_shared = std::find(other.begin(), other.end(), link) != other.end();
       const auto& joint = robot_.links[link].joint;
-      if (!is_shared && joint) signals.insert(robot_.joints[*joint].signal);
+      if (!is_shared && joint) signals.push_back(robot_.joints[*joint].signal);
     }
   };
   add_unshared(a, b);
   add_unshared(b, a);
   return signals;
+}
+
+std::set<int> RigTruth::path_signals(int part_a, int part_b) const {
+  const std::vector<int> joints = path_joints(part_a, part_b);
+  return {joints.begin(), joints.end()};
 }
 
 std::string RigTruth::objection(const BodySchema& schema, const std::vector<int>& observed) const {
@@ -62,7 +67,7 @@ std::string RigTruth::objection(const BodySchema& schema, const std::vector<int>
     return from != to;
   };
 
-  std::size_t num_signals = 0;
+  std::size_t num_joints = 0;
   std::size_t num_joined = 0;
   for (const Edge& edge : schema.edges) {
     const std::vector<int> used = edge.signals();
@@ -72,7 +77,7 @@ std::string RigTruth::objection(const BodySchema& schema, const std::vector<int>
     if (std::set<int>(used.begin(), used.end()) != path_signals(edge.from, edge.to)) {
       return name + " has the wrong signals";
     }
-    num_signals += used.size();
+    num_joints += path_joints(edge.from, edge.to).size();
     if (!join(edge.from, edge.to)) return name + " closes a loop";
     ++num_joined;
   }
@@ -81,11 +86,11 @@ std::string RigTruth::objection(const BodySchema& schema, const std::vector<int>
            " parts joined";
   }
 
-  // The least number of signals: Kruskal over the true path lengths.
+  // The least number of joints: Kruskal over the true path lengths.
   std::vector<std::tuple<std::size_t, int, int>> pairs;
   for (const int a : observed) {
     for (const int b : observed) {
-      if (a < b) pairs.emplace_back(path_signals(a, b).size(), a, b);
+      if (a < b) pairs.emplace_back(path_joints(a, b).size(), a, b);
     }
   }
   std::sort(pairs.begin(), pairs.end());
@@ -94,8 +99,8 @@ std::string RigTruth::objection(const BodySchema& schema, const std::vector<int>
   for (const auto& [length, a, b] : pairs) {
     if (join(a, b)) least += length;
   }
-  if (num_signals != least) {
-    return std::to_string(num_signals) + " signals on the edges where " + std::to_string(least) +
+  if (num_joints != least) {
+    return std::to_string(num_joints) + " joints on the edges where " + std::to_string(least) +
            " suffice";
   }
   return "";

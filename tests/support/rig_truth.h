@@ -14,6 +14,9 @@ class RigTruth {
  public:
   explicit RigTruth(const std::filesystem::path& rig_folder);
 
+  /// The signal of each joint on the path between two parts: two joints may share one, as the
+  /// fingers of a gripper do.
+  std::vector<int> path_joints(int part_a, int part_b) const;
   /// Indices of the signals whose joints lie on the path between two parts.
   std::set<int> path_signals(int part_a, int part_b) const;
   std::vector<int> parts() const;
@@ -21,8 +24,9 @@ class RigTruth {
   const Robot& robot() const { return robot_; }
 
   /// "" if `schema` is right: it spans `observed` parts, every edge's signals are exactly those on
-  /// the true path between its two parts, and their number is the least possible. Else what is
-  /// wrong.
+  /// the true path between its two parts, and the joints on these paths are the least possible (a
+  /// gripper's fingers, without what carries them, are two joints apart, which no screw on their
+  /// one signal is). Else what is wrong.
   std::string objection(const BodySchema& schema, const std::vector<int>& observed) const;
 
  private:
