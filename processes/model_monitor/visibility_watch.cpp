@@ -55,11 +55,9 @@ void VisibilityWatch::count(int part, int tag, bool is_seen, std::vector<Finding
   const auto num = std::accumulate(
       counts_.begin(), counts_.end(), std::size_t{0},
       [](std::size_t sum, const auto& of_part) { return sum + of_part.second.size(); });
-  const double a = c.num_seen + 0.5, b = c.num_asked - c.num_seen + 0.5, share = a / (a + b);
-  // Of a tag that was in sight in its first ten samples little is known; there are many tags.
-  const double chance = tag == kAnyTag
-                            ? share * std::pow(1 - share, c.num_missed)
-                            : std::exp(log_beta(a + 1, b + c.num_missed) - log_beta(a, b));
+  // What was in sight in its first ten samples is not known to be seen always.
+  const double a = c.num_seen + 0.5, b = c.num_asked - c.num_seen + 0.5;
+  const double chance = std::exp(log_beta(a + 1, b + c.num_missed) - log_beta(a, b));
   if (chance * static_cast<double>(num) > false_alarm_rate_) return;
   c.is_missing = true;
   findings->push_back({part, tag, true, c.num_missed});

@@ -11,8 +11,8 @@ namespace bodyschema {
 
 /// Counts how often every part, and every tag of a part that has several, is seen, and finds what
 /// has not been seen for longer than chance explains: a run of m misses begins at any sample with
-/// probability v (1 − v)^m, where v is the share of samples that show it; of a tag this is the mean
-/// over what v may be (Jeffreys' prior).
+/// probability v (1 − v)^m, where v is the share of samples that show it: its mean over what v may
+/// be (Jeffreys' prior).
 class VisibilityWatch {
  public:
   /// `false_alarm_rate`: a sample, over all parts and tags together.

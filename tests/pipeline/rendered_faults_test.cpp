@@ -19,7 +19,7 @@
 namespace bodyschema::test {
 namespace {
 
-constexpr std::int64_t kBrokenAt = 30, kRepairedAt = 45, kEnd = 60;
+constexpr std::int64_t kBrokenAt = 30, kRepairedAt = 50, kEnd = 65;
 /// Samples until the monitor has decided, and after which the schema must be right.
 constexpr std::int64_t kSoon = 5;
 constexpr double kFalseAlarmRate = 1e-5;  // as the rig says
@@ -101,12 +101,15 @@ TEST_P(AdaptationTest, IsFoundNamedAndMendedAndSoIsTheRepair) {
 
   for (const int number : c.numbers) run_.break_body(c.fault, c.place, number, c.amount_deg);
   // A part that is gone is missed when so long a run of misses is rarer than the false alarms that
-  // are allowed, given how often it was seen.
+  // are allowed, whatever share of the samples may show it (Jeffreys' prior).
   std::int64_t soon = kSoon;
-  if (c.fault == fault_command_t::FAULT_MARKER_LOST)
-    soon = std::llround(std::ceil(std::log(kFalseAlarmRate / 10) /
-                                  std::log(1 - num_seen_[c.part] / double{kBrokenAt}))) +
-           2;
+  if (c.fault == fault_command_t::FAULT_MARKER_LOST) {
+    const double seen = num_seen_[c.part] + 0.5, missed = kBrokenAt - num_seen_[c.part] + 0.5;
+    double chance = seen / (seen + missed);
+    for (soon = 2; chance > kFalseAlarmRate / 50; ++soon)  // ten parts and their forty tags
+      chance *= (missed + static_cast<double>(soon) - 2) /
+                (seen + missed + static_cast<double>(soon) - 1);
+  }
   if (c.fault == fault_command_t::FAULT_MARKER_MOVED) {
     soon = kRepairedAt - kBrokenAt;  // when the tag is in sight
     moved_marker_ = c.part;
