@@ -39,7 +39,7 @@ class VisibilityWatch {
   void forget(int part, int tag) { counts_[part][tag] = {}; }
   /// So of all tags: a body that moves otherwise shows other sides of its parts.
   void forget_tags();
-  /// Of tags that were found missing nobody was told: they are found again.
+  /// Nobody was told of the tags that were found missing: they are found again.
   void tell_tags_again();
 
  private:
