@@ -11,19 +11,21 @@ function(precompiled_header name header)
 endfunction()
 
 # reuse_precompiled_header(FOLDER NAME [LIBRARY]): in all targets of the folder and those below it, but for those with
-# compile options of their own, which need a header of their own, and those that do not link LIBRARY.
+# a header already, those with compile options of their own, which need a header of their own, and those that do not
+# link LIBRARY.
 function(reuse_precompiled_header folder name)
   get_property(targets DIRECTORY ${folder} PROPERTY BUILDSYSTEM_TARGETS)
   foreach(target IN LISTS targets)
     get_target_property(type ${target} TYPE)
     get_target_property(options ${target} COMPILE_OPTIONS)
     get_target_property(header ${target} PRECOMPILE_HEADERS)
+    get_target_property(reused ${target} PRECOMPILE_HEADERS_REUSE_FROM)
     get_directory_property(common_options DIRECTORY ${folder} COMPILE_OPTIONS)
     get_target_property(libraries ${target} LINK_LIBRARIES)
     if(ARGN AND NOT libraries MATCHES "${ARGN}")
       continue()
     endif()
-    if(type MATCHES "^(STATIC_LIBRARY|EXECUTABLE)$" AND NOT header AND options STREQUAL common_options)
+    if(type MATCHES "^(STATIC_LIBRARY|EXECUTABLE)$" AND NOT header AND NOT reused AND options STREQUAL common_options)
       target_precompile_headers(${target} REUSE_FROM ${name})
     endif()
   endforeach()
