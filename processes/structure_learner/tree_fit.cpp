@@ -7,13 +7,16 @@
 #include <cmath>
 #include <limits>
 #include <set>
-#include <type_traits>
 
 #include "processes/structure_learner/screen.h"
 #include "processes/structure_learner/tree_fit_normal.h"
 
 namespace bodyschema {
 namespace {
+
+// Of 3 or 6 dimensions, without a heap; one type, for the decompositions are long to compile.
+using UpTo6x6 = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::ColMajor, 6, 6>;
+using UpTo6 = Eigen::Matrix<double, Eigen::Dynamic, 1, Eigen::ColMajor, 6, 1>;
 
 double log_chi_square_tail(double x, int dof) {
   const double tail = boost::math::gamma_q(0.5 * dof, 0.5 * x);
@@ -465,14 +468,13 @@ std::vector<MissingJoint> TreeFit::missing_joints(const Noise& bias) const {
         const Matrix6d unit_C = d.asDiagonal() * C_S * d.asDiagonal();
         const Matrix6d unit_bias =
             d.cwiseInverse().asDiagonal() * bias_S * d.cwiseInverse().asDiagonal();
-        const auto offer = [&](const auto& C_d, const auto& bias_d, const auto& u_d, int dof) {
-          using Matrix = std::decay_t<decltype(C_d)>;
-          const Eigen::SelfAdjointEigenSolver<Matrix> eigen(C_d);
-          const auto& V = eigen.eigenvectors();
+        const auto offer = [&](int dof) {
+          const Eigen::SelfAdjointEigenSolver<UpTo6x6> eigen(unit_C.topLeftCorner(dof, dof));
+          const UpTo6x6& V = eigen.eigenvectors();
           // ξ along the eigenvectors, and its covariance: of the noise and of the bias. Directions
           // that the tree's other parameters take over are no evidence.
-          auto xi = (V.transpose() * u_d).eval();
-          Matrix covariance = V.transpose() * bias_d * V;
+          UpTo6 xi = V.transpose() * unit_u.head(dof);
+          UpTo6x6 covariance = V.transpose() * unit_bias.topLeftCorner(dof, dof) * V;
           for (int i = 0; i < dof; ++i) {
             if (eigen.eigenvalues()(i) < 1e-4) {
               xi(i) = 0;
@@ -493,10 +495,8 @@ std::vector<MissingJoint> TreeFit::missing_joints(const Noise& bias) const {
           joint.xi.setZero();
           joint.xi.head(dof) = -d.head(dof).cwiseProduct(V * xi);
         };
-        offer(Eigen::Matrix3d(unit_C.topLeftCorner<3, 3>()),
-              Eigen::Matrix3d(unit_bias.topLeftCorner<3, 3>()), Eigen::Vector3d(unit_u.head<3>()),
-              3);
-        offer(unit_C, unit_bias, unit_u, 6);
+        offer(3);
+        offer(6);
         return joint;
       };
       for (int first = 0; first < num_items; ++first) {
