@@ -7,6 +7,7 @@
 #include <system_error>
 
 #include "common/bus/all_channels.h"
+#include "common/bus/check.h"
 
 namespace bodyschema {
 namespace {

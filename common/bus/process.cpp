@@ -24,6 +24,7 @@
 #include <utility>
 #include <vector>
 
+#include "common/bus/check.h"
 #include "common/bus/convert.h"
 
 namespace bodyschema {

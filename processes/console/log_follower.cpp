@@ -5,6 +5,8 @@
 #include <stdexcept>
 #include <system_error>
 
+#include "common/bus/check.h"
+
 namespace bodyschema {
 
 bool LogFollower::read(const std::filesystem::path& file, const Visit& visit) {

@@ -16,6 +16,7 @@
 #include <vector>
 
 #include "common/bus/bus.h"
+#include "common/bus/check.h"
 #include "processes/console/hint.h"
 #include "processes/console/interruption.h"
 

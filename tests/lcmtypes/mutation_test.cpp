@@ -13,6 +13,7 @@
 #include <vector>
 
 #include "bodyschema/message_piece_t.hpp"
+#include "common/bus/check.h"
 #include "common/bus/codec.h"
 #include "tests/lcmtypes/example_messages.h"
 

@@ -6,6 +6,7 @@
 #include <fstream>
 #include <regex>
 
+#include "common/bus/check.h"
 #include "common/bus/convert.h"
 #include "common/geometry/angle.h"
 #include "common/plot/plot.h"
