@@ -223,7 +223,10 @@ class Search {
     is_clean_ =
         num_outliers_ < binomial_quantile(num_judged_, pair_outlier_rate(options_.validity), 0.02);
     for (Candidate& c : candidates) {
-      if (forest_.connected(c.i, c.j)) continue;
+      if (forest_.connected(c.i, c.j)) {
+        spare_.push_back(c);
+        continue;
+      }
       if ((is_clean_ && c.doubtful) || smaller_undecided(c)) {
         note_undecided(c.i, c.j, c.model.num_joints, c.mean_capped);
         doubtful_.push_back(c);
@@ -308,6 +311,7 @@ class Search {
           result_.log_likelihood += fit.log_likelihood();
           break;
         }
+        if (exchange(tree, worst->signal, fit.cost())) continue;
         if (const auto edges = fit.with_joint(*worst)) {
           adopt(tree, *edges);
           continue;
@@ -330,6 +334,53 @@ class Search {
       forest_.connect(index_of(m.part_i), index_of(m.part_j));
     doubtful_.clear();
     return true;
+  }
+
+  // Puts a valid model that was spare in the place of one that is not simpler, if all poses then
+  // cost less: pairs do not tell two models of one size apart that their markers together do. Of
+  // those with the signal of which a joint is missing.
+  bool exchange(const Tree& tree, int signal, double cost) {
+    const int component = index_of(tree.nodes[0].part);
+    const std::vector<AcceptedModel> before = result_.models;
+    std::vector<AcceptedModel> best;
+    for (Candidate& c : spare_) {
+      if (!forest_.connected(component, c.i) || !c.model.uses(signal) ||
+          refuted_.count({parts_[c.i], parts_[c.j], signal_set(c.model)}))
+        continue;
+      for (const int node : path_between(tree, parts_[c.i], parts_[c.j])) {
+        const AcceptedModel& present = before[tree.accepted[node]];
+        if (present.model.num_joints < c.model.num_joints ||
+            std::tie(present.part_i, present.part_j) == std::tie(parts_[c.i], parts_[c.j]) ||
+            !confirm_on_all_data(&c))
+          continue;
+        result_.models = before;
+        result_.models[tree.accepted[node]] = {parts_[c.i], parts_[c.j], c.model, c.score};
+        const double other_cost = fit_tree(tree_of(component)).cost();
+        if (other_cost >= cost) continue;
+        cost = other_cost;
+        best = result_.models;
+      }
+    }
+    result_.models = best.empty() ? before : best;
+    return !best.empty();
+  }
+
+  // Nodes whose edges to their parents are the path between two parts.
+  static std::vector<int> path_between(const Tree& tree, int part_a, int part_b) {
+    const auto node_of = [&](int part) {
+      return static_cast<int>(
+          std::find_if(tree.nodes.begin(), tree.nodes.end(),
+                       [&](const TreeNode& node) { return node.part == part; }) -
+          tree.nodes.begin());
+    };
+    std::vector<int> path;
+    // Parents come before their children.
+    for (int a = node_of(part_a), b = node_of(part_b); a != b;) {
+      int& lower = a > b ? a : b;
+      path.push_back(lower);
+      lower = tree.nodes[lower].parent;
+    }
+    return path;
   }
 
   // Connects what is left by models that their own pair could not make valid, if all markers of
@@ -701,6 +752,7 @@ class Search {
   double last_cost_ = 0;                                   // a frame, of the latest fit
   std::vector<Hopeful> hopefuls_;
   std::vector<Candidate> doubtful_;
+  std::vector<Candidate> spare_;  // valid, between parts that were connected already
   int num_judged_ = 0;  // frames of the valid models found so far, and the outliers among them
   int num_outliers_ = 0;
   bool is_clean_ = false;
