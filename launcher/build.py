@@ -1,12 +1,14 @@
 """The build tree."""
 
+import contextlib
+import fcntl
 import os
 import shutil
 import subprocess
 import sys
 
 from launcher import packages
-from launcher.words import Failure
+from launcher.words import Failure, say
 
 
 def num_processors():
@@ -17,9 +19,25 @@ def build(place, *targets, preset="release"):
     """Sets up, configures and builds, unless the build is given."""
     if place.is_build_given:
         return
-    configure(place, preset)
-    if targets:
-        cmake("--build", place.build, "--target", *targets, "-j", num_processors())
+    with alone(place.source):
+        configure(place, preset)
+        if targets:
+            cmake("--build", place.build, "--target", *targets, "-j", num_processors())
+
+
+@contextlib.contextmanager
+def alone(folder):
+    """Two Ninjas in one tree spoil each other's record of what is built."""
+    held = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            say("another ./run builds here: waiting for it")
+            fcntl.flock(held, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(held)
 
 
 def configure(place, preset="release"):

@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 from launcher import group_file, packages, run_folder, test_selection
-from launcher.build import build, cmake, configure, num_processors
+from launcher.build import alone, build, cmake, configure, num_processors
 from launcher.group import Group
 from launcher.learn import driver_test, learn, processes, rig_folder
 from launcher.words import Failure, UsageError, say
@@ -156,7 +156,7 @@ def stop(place, arguments):
         say("stopped")
         return 0
     if run_folder.is_locked(place.logs):
-        raise Failure("a group runs here, but it just begins or is another user's, who can stop it")
+        raise Failure("a group runs here, but it just begins, sums up its run, or is another user's, who can stop it")
     say("no group runs")
     return 0
 
@@ -225,9 +225,10 @@ def test(place, arguments):
     else:
         preset = "release"
     if not place.is_build_given:
-        configure(place, preset)
-        # What CMake has to say anew, it says now.
-        cmake("--build", place.build, "--target", "build.ninja")
+        with alone(place.source):
+            configure(place, preset)
+            # What CMake has to say anew, it says now.
+            cmake("--build", place.build, "--target", "build.ninja")
         targets = test_selection.targets(place, arguments)
         build(place, *(["all"] if targets is None else targets), preset=preset)
     become([*ctest, "--output-on-failure", "-j", num_processors(), *arguments])

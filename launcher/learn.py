@@ -99,7 +99,7 @@ def learn(place, options):
             patience = ["--patience-s", "1e9"] if is_share else []
             flags = ["--seed", options.seed, *samples, *patience]
             status = session.watch(watch_command(place, run, folder.name, settings.images, commands, *flags))
-        if options.keep and session.is_running():
+        if options.keep and not session.is_over and session.is_running():
             say("The group keeps running: ./run exec CMD… works on its bus, ./run stop ends it.")
         elif is_share and not session.is_over:
             say("Runs on until Ctrl-C or ./run stop.")

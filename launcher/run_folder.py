@@ -42,8 +42,9 @@ def begin(place, rig):
     # The lock may have been deleted with the folder.
     group = Group.find(logs)
     if held is None or group:
-        running = group.run if group else "a run of another user"
-        raise Failure(f"a group runs already, from {running}; stop it with ./run stop")
+        if group:
+            raise Failure(f"a group runs already, from {group.run}; stop it with ./run stop")
+        raise Failure("a group runs here already: it just begins, sums up its run, or is another user's")
     while True:
         run = logs / time.strftime("%Y%m%d-%H%M%S")
         try:

@@ -108,12 +108,15 @@ class OthersEndTheGroup(GroupTest):
                 self.assert_nothing_is_left(group)
 
     def test_a_run_whose_folder_is_deleted_says_so_and_ends_its_group(self):
-        run = self.start(*LEARN)
-        group = self.group()
-        self.delete(self.current.resolve())
-        self.assertEqual(self.wait_for_end(run), 1)
-        self.assertIn("the folder of this run was deleted", self.words())
-        self.assert_nothing_is_left(group)
+        for keep in ((), ("--keep",)):
+            with self.subTest(keep=keep):
+                run = self.start(*LEARN, *keep)
+                group = self.group()
+                self.delete(self.current.resolve())
+                self.assertEqual(self.wait_for_end(run), 1)
+                self.assertIn("the folder of this run was deleted", self.words())
+                self.assertNotIn("keeps running", self.words())
+                self.assert_nothing_is_left(group)
 
     def test_a_kept_group_is_found_and_stopped_when_its_folder_is_gone(self):
         for gone in ("current", "logs"):

@@ -5,6 +5,7 @@ import shutil
 import socket
 import subprocess
 import tempfile
+import threading
 import unittest
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +13,7 @@ from unittest import mock
 
 from support import SOURCE
 
-from launcher import commands, group_file, run_folder, supervisor, test_selection
+from launcher import build, commands, group_file, run_folder, supervisor, test_selection
 from launcher.place import Place
 
 
@@ -20,6 +21,23 @@ class Folder(unittest.TestCase):
     def setUp(self):
         self.folder = Path(tempfile.mkdtemp())
         self.addCleanup(shutil.rmtree, self.folder)
+
+
+class ABuild(Folder):
+    def test_waits_for_another_of_the_same_tree(self):
+        done = []
+
+        def second():
+            with build.alone(self.folder):
+                done.append("second")
+
+        with build.alone(self.folder):
+            thread = threading.Thread(target=second)
+            thread.start()
+            thread.join(0.3)
+            done.append("first")
+        thread.join()
+        self.assertEqual(done, ["first", "second"])
 
 
 class TheGroupFile(Folder):
