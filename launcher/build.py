@@ -28,7 +28,8 @@ def build(place, *targets, preset="release"):
 @contextlib.contextmanager
 def alone(folder):
     """Two Ninjas in one tree spoil each other's record of what is built."""
-    held = os.open(folder, os.O_RDONLY)
+    # A file that can be written: NFS locks no other.
+    held = os.open(folder / ".build.lock", os.O_RDWR | os.O_CREAT, 0o644)
     try:
         try:
             fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -63,6 +63,7 @@ struct Candidate {
   double mean_capped = 0;  // mean of min(d², 2c)
   bool doubtful = false;
   bool on_all_data = false;
+  bool is_valid = true;  // on all data, once it was judged there
 };
 
 // Beyond what a local fit mends, by the bulk of the frames.
@@ -183,7 +184,7 @@ class Search {
   }
 
   bool confirm_on_all_data(Candidate* candidate) {
-    if (candidate->on_all_data) return true;
+    if (candidate->on_all_data) return candidate->is_valid;
     const PairData data = make_pair_data(samples_, parts_[candidate->i], parts_[candidate->j],
                                          options_.measurement, std::numeric_limits<int>::max());
     const Fit fit = fit_local_model(candidate->model, data, actions_, 15, 1e-2);
@@ -192,7 +193,8 @@ class Search {
         check_validity(fit, leave_one_out(fit, data, actions_), data, actions_, options_.validity);
     candidate->model = fit.model;
     candidate->on_all_data = true;
-    return validity.verdict == Verdict::kValid;
+    candidate->is_valid = validity.verdict == Verdict::kValid;
+    return candidate->is_valid;
   }
 
   // Keeps a pair's best model, unless another signal set explains the data as well.

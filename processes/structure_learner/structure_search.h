@@ -74,8 +74,9 @@ struct SearchResult {
 ///
 /// When the layers are through, each tree is fitted to all its poses at once (TreeFit). A pair
 /// shows only what exceeds the noise of two markers; all markers beyond a joint together show far
-/// smaller motions. So joints that a score test finds missing are put in, models that have no room
-/// for them are dropped and the layers run again, and components that narrowly refuted models keep
+/// smaller motions. So where a score test finds a joint missing, a valid model that was left over
+/// takes the place of one on its path if all poses then cost less; else the joint is put in; models
+/// that have no room for it are dropped and the layers run again, and components that narrowly refuted models keep
 /// apart are joined if that costs no more than noise does.
 ///
 /// In the end an edge stands only if its data could have refuted it: if a joint on any other signal

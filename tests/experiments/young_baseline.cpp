@@ -1,6 +1,6 @@
 // A body that nothing happens to: what the learner and the monitor tell of it live, and what they
 // hold in the end beside learn() on the same samples. One run a rig and seed is rendered; each part
-// is hidden in it in turn. Prints Markdown; fails if anything was told or what is held is worse.
+// is hidden in it in turn. Prints Markdown; fails if anything was told, or what is held is wrong or worse.
 //
 //   young_baseline [config/arm2 config/arm4 config/arm7] --seeds 50 --samples 60
 //   young_baseline --honest --as-seen --seeds 1 --samples 2000      with calibration errors, false
@@ -166,7 +166,7 @@ int main(int argc, char** argv) {
                 num_runs, num_eventful, num_events, num_missing, counts(live).c_str(),
                 counts(offline).c_str(), num_wrong, num_worse);
     std::fflush(stdout);
-    is_good &= num_eventful == 0 && num_worse == 0;
+    is_good &= num_eventful == 0 && num_wrong == 0 && num_worse == 0;
   }
   return is_good ? 0 : 1;
 }

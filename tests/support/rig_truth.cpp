@@ -77,7 +77,11 @@ std::string RigTruth::objection(const BodySchema& schema, const std::vector<int>
     if (std::set<int>(used.begin(), used.end()) != path_signals(edge.from, edge.to)) {
       return name + " has the wrong signals";
     }
-    num_joints += path_joints(edge.from, edge.to).size();
+    const std::size_t num_true = path_joints(edge.from, edge.to).size();
+    if (edge.joints.size() != num_true)
+      return name + " has " + std::to_string(edge.joints.size()) + " joints, not " +
+             std::to_string(num_true);
+    num_joints += num_true;
     if (!join(edge.from, edge.to)) return name + " closes a loop";
     ++num_joined;
   }

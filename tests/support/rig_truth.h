@@ -23,9 +23,9 @@ class RigTruth {
   /// Exact pose of every part in the world for an action.
   const Robot& robot() const { return robot_; }
 
-  /// "" if `schema` is right: it spans `observed` parts, every edge's signals are exactly those on
-  /// the true path between its two parts, and the joints on these paths are the least possible (a
-  /// gripper's fingers, without what carries them, are two joints apart, which no screw on their
+  /// "" if `schema` is right: it spans `observed` parts, every edge's signals, and the number of
+  /// its joints, are those of the true path between its two parts, and they are the least possible
+  /// (a gripper's fingers, without what carries them, are two joints apart, which no screw on their
   /// one signal is). Else what is wrong.
   std::string objection(const BodySchema& schema, const std::vector<int>& observed) const;
 
