@@ -1,6 +1,7 @@
 #include "processes/console/health_view.h"
 
 #include <fmt/format.h>
+#include <fmt/ranges.h>
 
 #include <algorithm>
 #include <cmath>
@@ -79,7 +80,8 @@ ordered_json finding_json(const finding_t& finding, const std::vector<std::strin
   return json;
 }
 
-BodyVerdict verdict_of(const std::vector<finding_t>& findings) {
+BodyVerdict verdict_of(const model_health_t& health) {
+  const std::vector<finding_t>& findings = health.findings;
   BodyVerdict verdict;
   int num_open = 0;
   for (const finding_t& finding : findings) {
@@ -90,9 +92,17 @@ BodyVerdict verdict_of(const std::vector<finding_t>& findings) {
   const auto places = [](std::ptrdiff_t num) {
     return fmt::format("{} place{}", num, num == 1 ? "" : "s");
   };
-  if (findings.empty())
-    verdict.sentence = "Nothing is known to be wrong with the body.";
-  else if (num_open > 0)
+  if (findings.empty()) {
+    std::vector<std::string> doubted;
+    for (const edge_health_t& edge : health.edge_health)
+      if (edge.edge_state == schema_edge_t::EDGE_SUSPECT ||
+          edge.edge_state == schema_edge_t::EDGE_INVALID)
+        doubted.push_back(fmt::format("{}→{}", edge.health_from, edge.health_to));
+    verdict.sentence =
+        doubted.empty() ? "Nothing is known to be wrong with the body."
+                        : fmt::format("Nothing is known to be wrong with the body; in doubt: {}.",
+                                      fmt::join(doubted, ", "));
+  } else if (num_open > 0)
     verdict.sentence = fmt::format("The body is not as the schema says in {}.", places(num_open));
   else
     verdict.sentence = fmt::format("The body is not as it was in {}, and the schema knows.",

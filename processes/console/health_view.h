@@ -26,14 +26,14 @@ inline constexpr const char* kWhatIsWrong = "What is wrong now";
 
 /// What MODEL_HEALTH says of the body as a whole.
 struct BodyVerdict {
-  /// "The body is known: …", "The body has changed in 1 place, and the schema with it.", …
+  /// "Nothing is known to be wrong with the body.", "The body is not as the schema says in 1
+  /// place.", …
   std::string sentence;
   /// The lines under kWhatIsWrong; empty: nothing is known to be wrong.
   std::vector<std::string> wrong;
   bool is_schema_wrong = false;  ///< something is found that the schema does not have yet
 };
-/// Of findings that were heard, empty ones too.
-BodyVerdict verdict_of(const std::vector<finding_t>& findings);
+BodyVerdict verdict_of(const model_health_t& health);
 
 /// Said where a run is over or its babbler done.
 inline constexpr const char* kNobodyWatches =

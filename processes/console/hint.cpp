@@ -11,6 +11,10 @@ std::string to_type(const std::string& words) {
   return std::string(command != nullptr && *command != '\0' ? command : "bodyschema") + " " + words;
 }
 
+std::string counted(std::int64_t count, const std::string& noun) {
+  return fmt::format("{} {}{}", count, noun, count == 1 ? "" : "s");
+}
+
 std::string duration(double s) {
   if (s < 100) return fmt::format("{:.0f} s", s);
   if (s < 6000) return fmt::format("{:.0f} min", s / 60);

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <cstdint>
 #include <string>
 #include <string_view>
 
@@ -8,6 +9,9 @@ namespace bodyschema {
 /// What the user types for a command of this program: "./run WORDS" where the launcher says so
 /// (BODYSCHEMA_COMMAND), else "bodyschema WORDS".
 std::string to_type(const std::string& words);
+
+/// "1 sample", "2 samples".
+std::string counted(std::int64_t count, const std::string& noun);
 
 /// A time for people: "95 s", "12 min", "2.5 h".
 std::string duration(double seconds);

@@ -131,11 +131,6 @@ class Table {
 std::string millimetres(double m) { return fmt::format("{:.2f} mm", m * 1e3); }
 std::string degrees(double rad) { return fmt::format("{:.2f}°", rad / kDegree); }
 
-/// "1 sample", "2 samples"
-std::string counted(std::int64_t count, const std::string& noun) {
-  return fmt::format("{} {}{}", count, noun, count == 1 ? "" : "s");
-}
-
 std::string figure(const std::string& content, const std::string& caption) {
   return fmt::format("<figure>{}<figcaption>{}</figcaption></figure>\n", content, caption);
 }
@@ -288,12 +283,12 @@ class Page {
 
   std::string headline() const {
     if (!record_.health() || record_.health()->findings.empty()) return "The body is known:";
-    return verdict_of(record_.health()->findings).sentence;
+    return verdict_of(*record_.health()).sentence;
   }
 
   std::string wrong() const {
     if (!record_.health()) return "";
-    const BodyVerdict verdict = verdict_of(record_.health()->findings);
+    const BodyVerdict verdict = verdict_of(*record_.health());
     if (verdict.wrong.empty()) return "";
     std::string html = fmt::format("<section class=\"wrong{}\"><h2>{}</h2><ul>",
                                    verdict.is_schema_wrong ? " open" : "", kWhatIsWrong);

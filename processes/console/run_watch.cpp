@@ -171,7 +171,7 @@ std::string RunWatch::progress(const std::optional<SampleGoal>& goal,
                         health_->worst_position_m * 1e3, health_->worst_rotation_rad / kDegree);
   }
   if (health_) {
-    if (const auto verdict = verdict_of(health_->findings); !verdict.wrong.empty())
+    if (const auto verdict = verdict_of(*health_); !verdict.wrong.empty())
       line += " · " + verdict.sentence;
   }
   return line;

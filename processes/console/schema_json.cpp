@@ -6,6 +6,8 @@
 
 #include "common/geometry/angle.h"
 #include "common/schema/standard_deviations.h"
+#include "processes/console/hint.h"
+#include "processes/structure_learner/noise_estimate.h"
 
 namespace bodyschema {
 namespace {
@@ -226,9 +228,9 @@ ordered_json schema_json(const BodySchema& schema) {
 }
 
 std::string structure_text(const BodySchema& schema, std::optional<NoiseSource> source) {
-  std::string text = fmt::format("{} structure of {} parts from {} samples\n",
-                                 schema.complete ? "Complete" : "Incomplete", schema.parts.size(),
-                                 schema.num_samples);
+  std::string text =
+      fmt::format("{} structure of {} from {}\n", schema.complete ? "Complete" : "Incomplete",
+                  counted(std::ssize(schema.parts), "part"), counted(schema.num_samples, "sample"));
   if (!schema.edges.empty())
     text += fmt::format("  {:<9} {:<9} {:<12} {:>10} {:>7}\n", "edge", "kind", "signals",
                         "residual", "(rms)");
@@ -245,9 +247,13 @@ std::string structure_text(const BodySchema& schema, std::optional<NoiseSource> 
   if (!unused.empty())
     text += fmt::format("  signals without effect: {}\n", fmt::join(unused, ", "));
   if (schema.noise.position_m > 0) {
-    text += fmt::format("  noise per axis and marker: {:.2f} mm {:.2f}°{}\n",
+    const bool is_least = source && *source != NoiseSource::kGiven &&
+                          schema.noise.position_m <= kNoiseFloor.position_m &&
+                          schema.noise.rotation_rad <= kNoiseFloor.rotation_rad;
+    text += fmt::format("  noise per axis and marker: {:.2f} mm {:.2f}°{}{}\n",
                         schema.noise.position_m * 1e3, schema.noise.rotation_rad / kDegree,
-                        source ? std::string(", ") + name_of(*source).second : "");
+                        source ? std::string(", ") + name_of(*source).second : "",
+                        is_least ? "; it is less, this is the least that is taken" : "");
   }
   const auto undecided = signal_names(schema, schema.undecided_signals);
   if (!undecided.empty())

@@ -286,7 +286,7 @@ std::string StatusBoard::text(int width) const {
 
   // These are not cut: they are what one came for.
   const std::optional<BodyVerdict> verdict = health_ && schema_ && schema_->is_complete == 1
-                                                 ? std::optional(verdict_of(health_->findings))
+                                                 ? std::optional(verdict_of(*health_))
                                                  : std::nullopt;
   if (verdict && !verdict->wrong.empty()) {
     text += std::string(kWhatIsWrong) + "\n";

@@ -228,10 +228,8 @@ Learned learn_again(const RunWatch& watch, const WatchArguments& arguments) {
   return {watch.schema().value_or(learned.schema), learned.outliers, watch.schema().has_value()};
 }
 
-/// What MODEL_HEALTH last said is wrong; of a schema that the monitor accepted.
-std::vector<finding_t> findings_of(const RunWatch& watch) {
-  return watch.health() ? watch.health()->findings : std::vector<finding_t>();
-}
+/// What MODEL_HEALTH last said, of a schema that the monitor accepted.
+model_health_t health_of(const RunWatch& watch) { return watch.health().value_or(model_health_t{}); }
 
 /// How many samples there will be; std::nullopt in a replay, which has what it has.
 std::optional<SampleGoal> goal_of(const WatchArguments& arguments) {
@@ -271,7 +269,7 @@ nlohmann::ordered_json result_json(const RunWatch& watch, const Learned& learned
   std::vector<std::string> names;
   for (const Signal& signal : learned.schema.signals) names.push_back(signal.name);
   json["wrong"] = nlohmann::ordered_json::array();
-  for (const finding_t& finding : findings_of(watch))
+  for (const finding_t& finding : health_of(watch).findings)
     json["wrong"].push_back(finding_json(finding, names));
   for (const auto& [part, share] : watch.visibility())
     json["visibility"][std::to_string(part)] = share;
@@ -291,7 +289,7 @@ void report(const RunWatch& watch, const BestPicture& picture, const WatchArgume
                                                       : "replay of " + arguments.replay;
   std::cout << fmt::format("\n{} · {} · {} samples, {} of them held out · {:.0f} s\n\n",
                            arguments.rig, origin, watch.num_samples(), held_out.size(), seconds);
-  if (const BodyVerdict verdict = verdict_of(findings_of(watch)); !verdict.wrong.empty()) {
+  if (const BodyVerdict verdict = verdict_of(health_of(watch)); !verdict.wrong.empty()) {
     std::cout << kWhatIsWrong << "\n";
     for (const std::string& wrong : verdict.wrong) std::cout << "  " << wrong << "\n";
     std::cout << verdict.sentence << "\n" << kNobodyWatches << "\n\n";

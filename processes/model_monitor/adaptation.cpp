@@ -442,7 +442,7 @@ void Adaptation::try_changes(std::int64_t sample_index, std::vector<AdaptationEv
 
 void Adaptation::note_trouble(const AdaptationEvent& mismatch, std::int64_t since) {
   if (!trouble_ || mismatch.sample_index - trouble_->last > options_.settled_after) {
-    trouble_.emplace();
+    trouble_ = Trouble{};
     trouble_->since = since;
     trouble_->before = schema_;
   }

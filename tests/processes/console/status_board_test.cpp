@@ -167,8 +167,9 @@ TEST(StatusBoardTest, LossesAreThoseOfWhomTheyHitMost) {
     message.num_counters = static_cast<std::int32_t>(message.counters.size());
     return message;
   };
-  board_.on_message(with(info("motor_babbler"),
-                         {{"malformed SAMPLE", 3}, {"received SAMPLE", 99}, {"senseless SAMPLE", 0}}));
+  board_.on_message(
+      with(info("motor_babbler"),
+           {{"malformed SAMPLE", 3}, {"received SAMPLE", 99}, {"senseless SAMPLE", 0}}));
   board_.on_message(with(info("robot_simulator"),
                          {{"malformed SAMPLE", 5}, {"refused SAMPLE", 1}, {"tag too small", 4}}));
   board_.on_arrival("SAMPLE", 1);
@@ -290,6 +291,16 @@ TEST(StatusBoardTest, WhatIsWrongStandsFirstAndNoTerminalIsTooNarrowForIt) {
       "Learning: 5 samples.\nNothing is known to be wrong with the body.\n"))
       << board_.text(100);
   EXPECT_TRUE(board_.json()["wrong"].empty());
+  model_health_t doubted{};
+  edge_health_t edge{};
+  edge.health_from = 1;
+  edge.health_to = 2;
+  edge.edge_state = schema_edge_t::EDGE_SUSPECT;
+  set_array(doubted.num_edges, doubted.edge_health, {edge});
+  board_.on_message(doubted);
+  EXPECT_TRUE(board_.text(100).starts_with(
+      "Learning: 5 samples.\nNothing is known to be wrong with the body; in doubt: 1→2.\n"))
+      << board_.text(100);
   board_.on_message(wrong_in_two_places());
   EXPECT_TRUE(board_.text(100).starts_with(
       "What is wrong now\n"
@@ -403,7 +414,9 @@ TEST(StatusBoardTest, NoLineIsWiderThanTheTerminalAndNoneObeysAMessage) {
   std::getline(lines, line);  // the headline is never cut
   int num_cut = 0;
   while (std::getline(lines, line)) {
-    const auto is_first_byte = [](char c) { return (static_cast<unsigned char>(c) & 0xC0) != 0x80; };
+    const auto is_first_byte = [](char c) {
+      return (static_cast<unsigned char>(c) & 0xC0) != 0x80;
+    };
     EXPECT_LE(std::count_if(line.begin(), line.end(), is_first_byte), 60) << line;
     num_cut += line.ends_with("…");
   }
@@ -423,7 +436,10 @@ TEST(FitTest, CutsBetweenCharacters) {
   EXPECT_EQ(fit("äöüß", 4), "äöüß");
   EXPECT_EQ(fit("äöüßx", 4), "äöü…");
   EXPECT_EQ(fit("a\tb\nc", 10), "a b c");
-  EXPECT_EQ(fit("a\xC2\x9B" "b", 10), "a b");  // a control character of two bytes
+  EXPECT_EQ(fit("a\xC2\x9B"
+                "b",
+                10),
+            "a b");  // a control character of two bytes
   EXPECT_EQ(fit("", 0), "");
 }
 
