@@ -342,7 +342,7 @@ bool is_live(const process_info_t& info, std::int64_t now_us) {
 
 int run_process(const std::string& name, int argc, char** argv,
                 const std::function<void(Process&)>& body,
-                const std::function<void(CLI::App&)>& add_options) {
+                const std::function<void(Arguments)>& add_options) {
   try {
     // Before anything slow, so that a SIGTERM during start-up also ends in good order.
     install_signal_handlers();
@@ -362,7 +362,7 @@ int run_process(const std::string& name, int argc, char** argv,
         ->check(CLI::IsMember({"trace", "debug", "info", "warning", "error", "critical", "off"}))
         ->capture_default_str();
     app.set_version_flag("--version", std::string(BODYSCHEMA_VERSION));
-    if (add_options) add_options(app);
+    if (add_options) add_options(Arguments(&app));
     try {
       app.parse(argc, argv);
     } catch (const CLI::Success& request) {

@@ -7,11 +7,8 @@
 #include <memory>
 #include <string>
 
+#include "common/bus/arguments.h"
 #include "common/bus/bus.h"
-
-namespace CLI {
-class App;
-}
 
 namespace bodyschema {
 
@@ -30,8 +27,8 @@ namespace bodyschema {
 /// is there: at its start it says who it is and listens for 0.5 s before it publishes anything
 /// else; the elder answers at once, and must be heard again within 1.2 s, with a newer time. An
 /// elder that was busy then may still be heard in the first 3 s of the loop. After that none ends
-/// because of what others say: two that meet later both tell it (set_notice). Only live PROCESS_INFO
-/// counts (is_live()), and a bus that is both heard and spoken to.
+/// because of what others say: two that meet later both tell it (set_notice). Only live
+/// PROCESS_INFO counts (is_live()), and a bus that is both heard and spoken to.
 ///
 /// `--in` is default_url() unless given. `--out` is then the same bus, but nowhere where the input
 /// is a log: a replay must not reach a robot by accident.
@@ -85,7 +82,7 @@ class Process {
 
  private:
   friend int run_process(const std::string&, int, char**, const std::function<void(Process&)>&,
-                         const std::function<void(CLI::App&)>&);
+                         const std::function<void(Arguments)>&);
   struct Impl;
   explicit Process(std::unique_ptr<Impl> impl);
   std::unique_ptr<Impl> impl_;
@@ -103,6 +100,6 @@ bool is_live(const process_info_t& info, std::int64_t now_us);
 /// stderr; stdout belongs to results.
 int run_process(const std::string& name, int argc, char** argv,
                 const std::function<void(Process&)>& body,
-                const std::function<void(CLI::App&)>& add_options = nullptr);
+                const std::function<void(Arguments)>& add_options = nullptr);
 
 }  // namespace bodyschema

@@ -74,6 +74,10 @@ Eigen::Matrix3d exp_so3(const Eigen::Vector3d& w) {
   return Eigen::Matrix3d::Identity() + sinc(a) * W + one_minus_cos(a) * W * W;
 }
 
+Eigen::Matrix3d rotation_of_z_to(const Eigen::Vector3d& z) {
+  return Eigen::Quaterniond::FromTwoVectors(Eigen::Vector3d::UnitZ(), z).toRotationMatrix();
+}
+
 Eigen::Vector3d log_so3(const Eigen::Matrix3d& R) {
   // By way of the quaternion, whose vector part stays well conditioned up to the angle π, where the
   // antisymmetric part of R vanishes.

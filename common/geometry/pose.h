@@ -2,6 +2,8 @@
 
 #include <Eigen/Geometry>
 
+#include "common/geometry/instantiations.h"
+
 namespace bodyschema {
 
 using Vector6d = Eigen::Matrix<double, 6, 1>;
@@ -18,6 +20,9 @@ Eigen::Matrix3d skew(const Eigen::Vector3d& v);
 
 /// Rotation of angle |w| [rad] about w.
 Eigen::Matrix3d exp_so3(const Eigen::Vector3d& w);
+
+/// The shortest rotation that takes the z axis to the direction of `z`.
+Eigen::Matrix3d rotation_of_z_to(const Eigen::Vector3d& z);
 
 /// Inverse of exp_so3, |result| ≤ π [rad]. `R` must be a rotation.
 Eigen::Vector3d log_so3(const Eigen::Matrix3d& R);

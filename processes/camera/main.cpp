@@ -1,6 +1,5 @@
 // camera: device or SIM_STATE -> CAMERA_IMAGE, CAMERA_INFO
 
-#include <CLI/CLI.hpp>
 #include <atomic>
 #include <optional>
 #include <stdexcept>
@@ -23,19 +22,19 @@ constexpr int kMaxRepeats = 30;  // of the images of one SIM_STATE, at 1 Hz
 int main(int argc, char** argv) {
   std::string images_option;
   bool is_ideal = false;
-  CLI::App* arguments = nullptr;
-  const auto add_options = [&](CLI::App& app) {
-    arguments = &app;
+  std::optional<Arguments> arguments;
+  const auto add_options = [&](Arguments app) {
+    arguments = app;
     app.add_option("--images", images_option, "URL of the images; default: the next port of --out");
     app.add_flag("--ideal", is_ideal, "Simulated: without robot.yaml's calibration errors");
   };
   const auto body = [&](Process& process) {
     const CameraConfig config = CameraConfig::load(process.config_file());
     const auto url = [&](const char* option) {
-      const auto text = arguments->get_option(option)->as<std::string>();
+      const auto text = arguments->text_of(option);
       return text.empty() ? default_url() : text;
     };
-    const bool has_out = arguments->get_option("--out")->count() > 0;
+    const bool has_out = arguments->is_given("--out");
     const std::string out = has_out ? url("--out") : process.bus().is_replay() ? "" : url("--in");
     const std::string images_to = images_option.empty() ? images_url(out) : images_option;
     std::optional<Bus> images_bus;

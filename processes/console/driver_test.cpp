@@ -6,7 +6,6 @@
 #include <sys/wait.h>
 #include <unistd.h>
 
-#include <CLI/CLI.hpp>
 #include <algorithm>
 #include <array>
 #include <cerrno>
@@ -198,29 +197,29 @@ void run_driver_test(const DriverTestArguments& arguments) {
                              results.size(), results.size() - failed - skipped, failed, skipped);
   }
   std::cout.flush();
-  if (failed > 0) throw CLI::RuntimeError(1);
+  if (failed > 0) end_as_failed();
 }
 
 }  // namespace
 
-void add_driver_test_command(CLI::App& console) {
+void add_driver_test_command(Arguments console) {
   const auto arguments = std::make_shared<DriverTestArguments>();
-  CLI::App* test = console.add_subcommand(
+  Arguments test = console.add_subcommand(
       "driver-test", "Does the driver on the bus keep lcmtypes/DRIVER.md? Moves the arm gently");
-  test->add_option("--in", arguments->in, "URL of the bus")->capture_default_str();
-  test->add_option("--rig-folder", arguments->rig_folder, "The rig's configuration")->required();
-  test->add_option("--step-share", arguments->step_share,
-                   "Size of the motions, share of each range; a motion should last half a second")
-      ->check(CLI::Range(0.001, 0.4))
-      ->capture_default_str();
-  test->add_flag("--yes", arguments->yes, "Do not ask before moving");
-  test->add_flag("--json", arguments->json, "The result as JSON");
-  CLI::Option* restart = test->add_option("--restart", arguments->restart,
-                                          "Shell command that ends the driver and starts it again");
-  test->add_option("--kill", arguments->kill,
-                   "Process name of the driver: kill -9; its supervisor starts it again")
-      ->excludes(restart);
-  test->callback([arguments] { run_driver_test(*arguments); });
+  test.add_option("--in", arguments->in, "URL of the bus").capture_default_str();
+  test.add_option("--rig-folder", arguments->rig_folder, "The rig's configuration").required();
+  test.add_option("--step-share", arguments->step_share,
+                  "Size of the motions, share of each range; a motion should last half a second")
+      .in_range(0.001, 0.4)
+      .capture_default_str();
+  test.add_flag("--yes", arguments->yes, "Do not ask before moving");
+  test.add_flag("--json", arguments->json, "The result as JSON");
+  const Argument restart = test.add_option(
+      "--restart", arguments->restart, "Shell command that ends the driver and starts it again");
+  test.add_option("--kill", arguments->kill,
+                  "Process name of the driver: kill -9; its supervisor starts it again")
+      .excludes(restart);
+  test.callback([arguments] { run_driver_test(*arguments); });
 }
 
 }  // namespace bodyschema

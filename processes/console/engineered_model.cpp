@@ -3,7 +3,6 @@
 #include <urdf_model/model.h>
 #include <urdf_parser/urdf_parser.h>
 
-#include <CLI/CLI.hpp>
 #include <algorithm>
 #include <fstream>
 #include <iostream>
@@ -171,7 +170,7 @@ class Walk {
       leader = next.get();
     }
     Pose X_JZ = Pose::Identity();  // z along the axis
-    X_JZ.linear() = Eigen::Quaterniond::FromTwoVectors(Eigen::Vector3d::UnitZ(), axis).matrix();
+    X_JZ.linear() = rotation_of_z_to(axis);
     const auto drive = drives_.find(leader->name);
     if (drive != drives_.end()) {
       offset += gain * drive->second.offset;
@@ -248,20 +247,20 @@ BodySchema engineered_model(const std::filesystem::path& urdf,
   return walk.run();
 }
 
-void add_engineer_command(CLI::App& console) {
+void add_engineer_command(Arguments console) {
   const auto arguments = std::make_shared<EngineerArguments>();
-  CLI::App* engineer = console.add_subcommand(
+  Arguments engineer = console.add_subcommand(
       "engineer", "A schema from a URDF and where the parts are on its links");
-  engineer->add_option("URDF", arguments->urdf, "The robot")->required();
-  engineer->add_option("PLACEMENT", arguments->placement, "YAML: root, signals, parts on links")
-      ->required();
+  engineer.add_option("URDF", arguments->urdf, "The robot").required();
+  engineer.add_option("PLACEMENT", arguments->placement, "YAML: root, signals, parts on links")
+      .required();
   engineer
-      ->add_option("--samples", arguments->samples,
-                   "A recording that shows where the root stands in the camera's frame")
-      ->required();
-  engineer->add_option("--out", arguments->out, "Write the schema to this file")->required();
-  engineer->add_flag("--json", arguments->json, "Print JSON");
-  engineer->callback([arguments] { run_engineer(*arguments); });
+      .add_option("--samples", arguments->samples,
+                  "A recording that shows where the root stands in the camera's frame")
+      .required();
+  engineer.add_option("--out", arguments->out, "Write the schema to this file").required();
+  engineer.add_flag("--json", arguments->json, "Print JSON");
+  engineer.callback([arguments] { run_engineer(*arguments); });
 }
 
 }  // namespace bodyschema

@@ -2,11 +2,8 @@
 
 #include <filesystem>
 
+#include "common/bus/arguments.h"
 #include "common/schema/body_schema.h"
-
-namespace CLI {
-class App;
-}
 
 namespace bodyschema {
 
@@ -30,6 +27,6 @@ BodySchema engineered_model(const std::filesystem::path& urdf,
 
 /// Adds `engineer`: a schema file from a URDF, marker placements and a recording that tells where
 /// the camera stands.
-void add_engineer_command(CLI::App& console);
+void add_engineer_command(Arguments console);
 
 }  // namespace bodyschema

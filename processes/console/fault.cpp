@@ -2,7 +2,6 @@
 
 #include <fmt/format.h>
 
-#include <CLI/CLI.hpp>
 #include <chrono>
 #include <cmath>
 #include <cstdlib>
@@ -70,17 +69,17 @@ void inject(FaultArguments& arguments) {
 
 }  // namespace
 
-void add_fault_command(CLI::App& console) {
+void add_fault_command(Arguments console) {
   const auto arguments = std::make_shared<FaultArguments>();
-  CLI::App* fault =
+  Arguments fault =
       console.add_subcommand("fault", "Break the simulated arm, or repair it; the simulator alone");
-  fault->add_option("--in", arguments->in, "URL of the bus")->capture_default_str();
-  fault->add_flag("--json", arguments->json, "The result as JSON");
-  fault->require_subcommand(1);
+  fault.add_option("--in", arguments->in, "URL of the bus").capture_default_str();
+  fault.add_flag("--json", arguments->json, "The result as JSON");
+  fault.require_subcommand(1);
   const auto add = [&](const char* name, const char* help, std::int8_t kind) {
-    CLI::App* sub = fault->add_subcommand(name, help);
-    sub->fallthrough();  // options of `fault` may come last
-    sub->callback([arguments, kind] {
+    Arguments sub = fault.add_subcommand(name, help);
+    sub.fallthrough();  // options of `fault` may come last
+    sub.callback([arguments, kind] {
       arguments->command.fault = kind;
       inject(*arguments);
     });
@@ -93,34 +92,34 @@ void add_fault_command(CLI::App& console) {
     return std::isnan(std::strtod(text.c_str(), nullptr)) ? "expected a number" : std::string();
   };
   add("stuck", "The joints of a signal no longer move", Command::FAULT_STUCK)
-      ->add_option("SIGNAL", command.place, "Name in signals.yaml")
-      ->required();
-  CLI::App* bend = add("bend", "A link is bent in its middle", Command::FAULT_BEND);
-  bend->add_option("LINK", command.place, "Name in robot.yaml")->required();
-  bend->add_option("DEG", command.amount_deg, "Angle [deg]")
-      ->required()
-      ->check(CLI::Range(-90.0, 90.0))
-      ->check(a_number);
+      .add_option("SIGNAL", command.place, "Name in signals.yaml")
+      .required();
+  Arguments bend = add("bend", "A link is bent in its middle", Command::FAULT_BEND);
+  bend.add_option("LINK", command.place, "Name in robot.yaml").required();
+  bend.add_option("DEG", command.amount_deg, "Angle [deg]")
+      .required()
+      .in_range(-90.0, 90.0)
+      .check(a_number);
   add("tool", "Another tool", Command::FAULT_TOOL)
-      ->add_option("N", command.number, "Of robot.yaml's tools; 0 is the first")
-      ->required()
-      ->check(CLI::Range(0, 9999));
+      .add_option("N", command.number, "Of robot.yaml's tools; 0 is the first")
+      .required()
+      .in_range(0, 9999);
   add("marker-lost", "A marker falls off", Command::FAULT_MARKER_LOST)
-      ->add_option("ID", command.number, "Tag in markers.yaml")
-      ->required()
-      ->check(CLI::Range(0, 9999));
+      .add_option("ID", command.number, "Tag in markers.yaml")
+      .required()
+      .in_range(0, 9999);
   add("marker-moved", "A marker sits elsewhere on its part", Command::FAULT_MARKER_MOVED)
-      ->add_option("ID", command.number, "Tag in markers.yaml")
-      ->required()
-      ->check(CLI::Range(0, 9999));
+      .add_option("ID", command.number, "Tag in markers.yaml")
+      .required()
+      .in_range(0, 9999);
   add("camera-bump", "The camera is knocked to another pose", Command::FAULT_CAMERA_BUMP);
-  CLI::App* drift =
+  Arguments drift =
       add("drift", "A link bends more with each action; 0 ends it", Command::FAULT_DRIFT);
-  drift->add_option("LINK", command.place, "Name in robot.yaml")->required();
-  drift->add_option("DEG_PER_SAMPLE", command.amount_deg, "Angle an action [deg]")
-      ->required()
-      ->check(CLI::Range(-90.0, 90.0))
-      ->check(a_number);
+  drift.add_option("LINK", command.place, "Name in robot.yaml").required();
+  drift.add_option("DEG_PER_SAMPLE", command.amount_deg, "Angle an action [deg]")
+      .required()
+      .in_range(-90.0, 90.0)
+      .check(a_number);
   add("repair", "As built", Command::FAULT_REPAIR);
 }
 

@@ -3,7 +3,6 @@
 #include <fmt/chrono.h>
 #include <fmt/format.h>
 
-#include <CLI/CLI.hpp>
 #include <algorithm>
 #include <iostream>
 #include <list>
@@ -236,26 +235,25 @@ std::int64_t thin_log(const std::filesystem::path& file, const std::filesystem::
   return written;
 }
 
-void add_log_command(CLI::App& console) {
+void add_log_command(Arguments console) {
   const auto arguments = std::make_shared<LogArguments>();
-  CLI::App* log = console.add_subcommand("log", "What an LCM log holds, and what is wrong with it");
-  log->add_option("FILE", arguments->file, "LCM log")->required();
-  log->add_flag("--json", arguments->json, "Print JSON");
-  log->add_flag("--check", arguments->check,
-                "Fail unless it is whole and every message of ours can be read");
-  log->add_flag("--replay-from", arguments->replay_from,
-                "Print the channel from which a replay can learn: MARKER_POSES or SAMPLE");
-  log->add_option("--rig-of", arguments->rigs,
-                  "Print the name of the rig in this folder that was recorded")
-      ->type_name("FOLDER");
-  log->add_option("--thin", arguments->thin,
-                  "Write a small copy: no images, no ground truth, nothing twice")
-      ->type_name("FILE");
-  CLI::Option* to = log->add_option("--to", arguments->copy, "Copy to a new log …");
-  log->add_option("--copy", arguments->channels,
-                  "… the messages of these channels that can be read")
-      ->needs(to);
-  log->callback([arguments] { run_log(*arguments); });
+  Arguments log = console.add_subcommand("log", "What an LCM log holds, and what is wrong with it");
+  log.add_option("FILE", arguments->file, "LCM log").required();
+  log.add_flag("--json", arguments->json, "Print JSON");
+  log.add_flag("--check", arguments->check,
+               "Fail unless it is whole and every message of ours can be read");
+  log.add_flag("--replay-from", arguments->replay_from,
+               "Print the channel from which a replay can learn: MARKER_POSES or SAMPLE");
+  log.add_option("--rig-of", arguments->rigs,
+                 "Print the name of the rig in this folder that was recorded")
+      .type_name("FOLDER");
+  log.add_option("--thin", arguments->thin,
+                 "Write a small copy: no images, no ground truth, nothing twice")
+      .type_name("FILE");
+  const Argument to = log.add_option("--to", arguments->copy, "Copy to a new log …");
+  log.add_option("--copy", arguments->channels, "… the messages of these channels that can be read")
+      .needs(to);
+  log.callback([arguments] { run_log(*arguments); });
 }
 
 }  // namespace bodyschema

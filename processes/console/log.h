@@ -5,16 +5,13 @@
 #include <nlohmann/json.hpp>
 #include <string>
 
+#include "common/bus/arguments.h"
 #include "common/bus/log_summary.h"
-
-namespace CLI {
-class App;
-}
 
 namespace bodyschema {
 
 /// Adds `log`: what an LCM log holds, and whether it is whole and of this version.
-void add_log_command(CLI::App& console);
+void add_log_command(Arguments console);
 
 /// The one rig folder below `rigs` to which all that the log tells may belong: cameras, tags,
 /// signals, parts. @throws std::runtime_error if there is none or several.

@@ -6,6 +6,7 @@
 #include <iostream>
 #include <stdexcept>
 
+#include "common/bus/arguments.h"
 #include "common/bus/log_summary.h"
 #include "processes/console/driver_test.h"
 #include "processes/console/engineered_model.h"
@@ -29,16 +30,17 @@ int main(int argc, char** argv) {
   console.footer(
       "Exit codes: 0 a result; 1 the input, the bus or a file is at fault, or the arm did not do "
       "it; 2 wrong usage.");
-  bodyschema::add_offline_commands(console);
-  bodyschema::add_monitor_command(console);
-  bodyschema::add_engineer_command(console);
-  bodyschema::add_log_command(console);
-  bodyschema::add_operate_commands(console);
-  bodyschema::add_watch_command(console);
-  bodyschema::add_driver_test_command(console);
-  bodyschema::add_fault_command(console);
-  bodyschema::add_status_command(console);
-  bodyschema::add_report_command(console);
+  const bodyschema::Arguments commands(&console);
+  bodyschema::add_offline_commands(commands);
+  bodyschema::add_monitor_command(commands);
+  bodyschema::add_engineer_command(commands);
+  bodyschema::add_log_command(commands);
+  bodyschema::add_operate_commands(commands);
+  bodyschema::add_watch_command(commands);
+  bodyschema::add_driver_test_command(commands);
+  bodyschema::add_fault_command(commands);
+  bodyschema::add_status_command(commands);
+  bodyschema::add_report_command(commands);
   try {
     console.parse(argc, argv);
     // A full disk must not look like a result.

@@ -2,7 +2,6 @@
 
 #include <fmt/format.h>
 
-#include <CLI/CLI.hpp>
 #include <algorithm>
 #include <cmath>
 #include <iostream>
@@ -200,28 +199,28 @@ void run_monitor(const MonitorArguments& arguments) {
 
 }  // namespace
 
-void add_monitor_command(CLI::App& console) {
+void add_monitor_command(Arguments console) {
   const auto arguments = std::make_shared<MonitorArguments>();
-  CLI::App* monitor = console.add_subcommand(
+  Arguments monitor = console.add_subcommand(
       "monitor", "Keep a schema true over a recording in which the body changes");
-  monitor->add_option("SCHEMA", arguments->schema, "Schema file to start from")->required();
-  monitor->add_option("SAMPLES", arguments->samples, "Recording (LCM log or CSV)")->required();
-  monitor->add_option("--out", arguments->out, "Write the schema as it is in the end to this file");
-  monitor->add_option("--evaluate", arguments->evaluate,
-                      "Compare the schema with this recording after every sample");
+  monitor.add_option("SCHEMA", arguments->schema, "Schema file to start from").required();
+  monitor.add_option("SAMPLES", arguments->samples, "Recording (LCM log or CSV)").required();
+  monitor.add_option("--out", arguments->out, "Write the schema as it is in the end to this file");
+  monitor.add_option("--evaluate", arguments->evaluate,
+                     "Compare the schema with this recording after every sample");
   monitor
-      ->add_option("--noise", arguments->noise,
-                   "Standard deviation per axis and marker: position [m], rotation [deg]")
-      ->expected(2)
-      ->type_name("POS_M ROT_DEG");
+      .add_option("--noise", arguments->noise,
+                  "Standard deviation per axis and marker: position [m], rotation [deg]")
+      .expected(2)
+      .type_name("POS_M ROT_DEG");
   monitor
-      ->add_option(
+      .add_option(
           "--method", arguments->method,
           "evidence, or the chapter's procedure: a window of 15, 3 sigma (its own, or --noise)")
-      ->check(CLI::IsMember({"evidence", "chapter"}))
-      ->capture_default_str();
-  monitor->add_flag("--json", arguments->json, "Print one JSON line an event (and a sample)");
-  monitor->callback([arguments] { run_monitor(*arguments); });
+      .one_of({"evidence", "chapter"})
+      .capture_default_str();
+  monitor.add_flag("--json", arguments->json, "Print one JSON line an event (and a sample)");
+  monitor.callback([arguments] { run_monitor(*arguments); });
 }
 
 }  // namespace bodyschema

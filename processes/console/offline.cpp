@@ -3,7 +3,6 @@
 #include <fmt/format.h>
 #include <unistd.h>
 
-#include <CLI/CLI.hpp>
 #include <algorithm>
 #include <array>
 #include <cerrno>
@@ -185,7 +184,7 @@ Recording load_for(const std::string& file, const BodySchema& schema) {
 }
 
 Noise noise_given(const std::vector<double>& numbers) {
-  const auto refuse = [](const std::string& why) { throw CLI::ValidationError("--noise", why); };
+  const auto refuse = [](const std::string& why) { refuse_argument("--noise", why); };
   for (const double number : numbers)
     if (!std::isfinite(number) || number <= 0) refuse("expected two standard deviations above 0");
   const Noise noise{numbers[0], numbers[1] * kDegree};
@@ -211,58 +210,57 @@ void check_out(const std::string& out, const std::vector<std::string>& inputs) {
     throw std::invalid_argument("--out: cannot write " + out + ": " + std::strerror(errno));
 }
 
-void add_offline_commands(CLI::App& console) {
+void add_offline_commands(Arguments console) {
   const auto learning = std::make_shared<LearnArguments>();
-  CLI::App* learn =
+  Arguments learn =
       console.add_subcommand("learn", "Learn a body schema from a recording (LCM log or CSV)");
-  learn->add_option("SAMPLES", learning->samples, "Recording; - reads stdin")->required();
-  learn->add_option("--out", learning->out, "Write the schema to this file");
-  learn->add_option("--root", learning->root, "Root part; the lowest id if not given");
+  learn.add_option("SAMPLES", learning->samples, "Recording; - reads stdin").required();
+  learn.add_option("--out", learning->out, "Write the schema to this file");
+  learn.add_option("--root", learning->root, "Root part; the lowest id if not given");
   learn
-      ->add_option("--noise", learning->noise,
-                   "Standard deviation per axis and marker: position [m], rotation [deg]; "
-                   "estimated if neither this nor the recording says it")
-      ->expected(2)
-      ->type_name("POS_M ROT_DEG");
+      .add_option("--noise", learning->noise,
+                  "Standard deviation per axis and marker: position [m], rotation [deg]; "
+                  "estimated if neither this nor the recording says it")
+      .expected(2)
+      .type_name("POS_M ROT_DEG");
   learn
-      ->add_option(
-          "--method", learning->method,
-          "screw, or chapter: matrix GPs, and thresholds on mean errors at three times the "
-          "noise, for comparison")
-      ->check(CLI::IsMember({"screw", "chapter"}));
-  learn->add_flag("--json", learning->json, "Print JSON");
-  learn->callback([learning] { run_learn(*learning); });
+      .add_option("--method", learning->method,
+                  "screw, or chapter: matrix GPs, and thresholds on mean errors at three times the "
+                  "noise, for comparison")
+      .one_of({"screw", "chapter"});
+  learn.add_flag("--json", learning->json, "Print JSON");
+  learn.callback([learning] { run_learn(*learning); });
 
   struct Files {
     std::string schema, samples;
     bool json = false;
   };
   const auto predicting = std::make_shared<Files>();
-  CLI::App* predict =
+  Arguments predict =
       console.add_subcommand("predict", "Compare a schema's predictions with a recording");
-  predict->add_option("SCHEMA", predicting->schema, "Schema file")->required();
-  predict->add_option("SAMPLES", predicting->samples, "Recording")->required();
-  predict->add_flag("--json", predicting->json, "Print JSON");
-  predict->callback(
+  predict.add_option("SCHEMA", predicting->schema, "Schema file").required();
+  predict.add_option("SAMPLES", predicting->samples, "Recording").required();
+  predict.add_flag("--json", predicting->json, "Print JSON");
+  predict.callback(
       [predicting] { run_predict(predicting->schema, predicting->samples, predicting->json); });
 
   const auto showing = std::make_shared<Files>();
-  CLI::App* show = console.add_subcommand("show", "Print a schema file");
-  show->add_option("SCHEMA", showing->schema, "Schema file")->required();
-  show->add_flag("--json", showing->json, "Print JSON");
-  show->callback([showing] { run_show(showing->schema, showing->json); });
+  Arguments show = console.add_subcommand("show", "Print a schema file");
+  show.add_option("SCHEMA", showing->schema, "Schema file").required();
+  show.add_flag("--json", showing->json, "Print JSON");
+  show.callback([showing] { run_show(showing->schema, showing->json); });
 
   const auto checking = std::make_shared<RigArguments>();
-  CLI::App* rig = console.add_subcommand(
+  Arguments rig = console.add_subcommand(
       "rig",
       "Check every file of a rig by its process's own reader, and against the others; print its "
       "network (kind, bus, images, this host, its processes) and what it has");
-  rig->add_option("RIG", checking->rig, "Folder, or name of one in config/")->required();
-  rig->add_option("--hide", checking->hidden_part, "A part that is to be hidden: is there one?");
-  rig->add_option("--group", checking->group, "All processes; each must run on exactly one host");
-  rig->add_option("--host", checking->host, "Host of network.yaml; this machine if not given");
-  rig->add_option("--initial", checking->initial, "A schema to begin with: is it of this rig?");
-  rig->callback([checking] { run_rig(*checking); });
+  rig.add_option("RIG", checking->rig, "Folder, or name of one in config/").required();
+  rig.add_option("--hide", checking->hidden_part, "A part that is to be hidden: is there one?");
+  rig.add_option("--group", checking->group, "All processes; each must run on exactly one host");
+  rig.add_option("--host", checking->host, "Host of network.yaml; this machine if not given");
+  rig.add_option("--initial", checking->initial, "A schema to begin with: is it of this rig?");
+  rig.callback([checking] { run_rig(*checking); });
 }
 
 }  // namespace bodyschema

@@ -4,18 +4,15 @@
 #include <string>
 #include <vector>
 
+#include "common/bus/arguments.h"
 #include "common/schema/body_schema.h"
 #include "processes/console/recording.h"
-
-namespace CLI {
-class App;
-}
 
 namespace bodyschema {
 
 /// Adds `learn`, `predict`, `show` and `rig`: work on files, without a bus. The result goes to
 /// stdout.
-void add_offline_commands(CLI::App& console);
+void add_offline_commands(Arguments console);
 
 /// Reads a schema file: a log with one BODY_SCHEMA; of several the last counts.
 /// @throws std::runtime_error.
@@ -25,7 +22,7 @@ BodySchema load_schema(const std::filesystem::path& file);
 /// whole is said on stderr. @throws std::runtime_error.
 Recording load_for(const std::string& file, const BodySchema& schema);
 
-/// The two numbers of `--noise POS_M ROT_DEG`. @throws CLI::ValidationError where they are not
+/// The two numbers of `--noise POS_M ROT_DEG`. @throws as refuse_argument() where they are not
 /// above 0 or no noise of a marker, and may be in another unit.
 Noise noise_given(const std::vector<double>& numbers);
 

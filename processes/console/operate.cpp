@@ -3,10 +3,11 @@
 #include <fmt/format.h>
 #include <unistd.h>
 
-#include <CLI/CLI.hpp>
 #include <algorithm>
 #include <array>
 #include <chrono>
+#include <cstdlib>
+#include <functional>
 #include <iostream>
 #include <limits>
 #include <memory>
@@ -255,23 +256,22 @@ struct OperateArguments {
 constexpr double kLongest_s = 1e7;
 
 /// CLI::Range lets "nan" pass.
-CLI::Validator within(double lowest, double highest) {
-  return CLI::Validator(
-      [=](std::string& text) {
-        double value = NAN;
-        const bool is_number = CLI::detail::lexical_cast(text, value);
-        return is_number && value >= lowest && value <= highest
-                   ? std::string()
-                   : fmt::format("expected a number within {} … {}, found '{}'", lowest, highest,
-                                 abbreviated(text));
-      },
-      "NUMBER");
+std::function<std::string(const std::string&)> within(double lowest, double highest) {
+  return [=](const std::string& text) {
+    char* end = nullptr;
+    const auto value = static_cast<double>(std::strtold(text.c_str(), &end));
+    const bool is_number = !text.empty() && *end == '\0';
+    return is_number && value >= lowest && value <= highest
+               ? std::string()
+               : fmt::format("expected a number within {} … {}, found '{}'", lowest, highest,
+                             abbreviated(text));
+  };
 }
 
 /// The result is on stdout; exit code 1.
 [[noreturn]] void fail() {
   if (!std::cout.flush()) throw std::runtime_error("stdout: the result could not be written");
-  throw CLI::RuntimeError(1);
+  end_as_failed();
 }
 
 /// Whether anybody is on the bus: whoever lives there says so once a second.
@@ -482,36 +482,33 @@ void run_latch(const OperateArguments& arguments, std::int8_t kind) {
 
 }  // namespace
 
-void add_operate_commands(CLI::App& console) {
+void add_operate_commands(Arguments console) {
   const auto arguments = std::make_shared<OperateArguments>();
   const auto add = [&](const char* name, const char* what, auto run) {
-    CLI::App* command = console.add_subcommand(name, what);
-    command->add_option("--in", arguments->in, "URL of the bus");
-    command->callback([arguments, run] { run(*arguments); });
+    Arguments command = console.add_subcommand(name, what);
+    command.add_option("--in", arguments->in, "URL of the bus");
+    command.callback([arguments, run] { run(*arguments); });
     return command;
   };
-  CLI::App* target = add("target", "Bring a body part to a position", run_target);
-  target->add_option("--part", arguments->part, "Body part")
-      ->required()
-      ->check(CLI::Range(0, 9999));
+  Arguments target = add("target", "Bring a body part to a position", run_target);
+  target.add_option("--part", arguments->part, "Body part").required().in_range(0, 9999);
+  target.add_option("--position", arguments->position_m, "X Y Z of its origin in the root part [m]")
+      .required()
+      .expected(3)
+      .check(within(-1000, 1000), "NUMBER");
   target
-      ->add_option("--position", arguments->position_m, "X Y Z of its origin in the root part [m]")
-      ->required()
-      ->expected(3)
-      ->check(within(-1000, 1000));
+      .add_option("--keep", arguments->keep_s,
+                  "Stay so long [s] before the babbler gets the arm; default: until released")
+      .check(within(0, kLongest_s), "NUMBER");
   target
-      ->add_option("--keep", arguments->keep_s,
-                   "Stay so long [s] before the babbler gets the arm; default: until released")
-      ->check(within(0, kLongest_s));
+      .add_option("--timeout", arguments->timeout_s,
+                  "Follow it for so long [s]; then it is dropped and the arm held")
+      .check(within(1e-3, kLongest_s), "NUMBER");
   target
-      ->add_option("--timeout", arguments->timeout_s,
-                   "Follow it for so long [s]; then it is dropped and the arm held")
-      ->check(within(1e-3, kLongest_s));
-  target
-      ->add_option("--tolerance", arguments->tolerance_m,
-                   "Seen farther than this from the target [m], it was missed")
-      ->check(within(1e-6, 1000));
-  target->add_flag("--json", arguments->json, "The result as JSON");
+      .add_option("--tolerance", arguments->tolerance_m,
+                  "Seen farther than this from the target [m], it was missed")
+      .check(within(1e-6, 1000), "NUMBER");
+  target.add_flag("--json", arguments->json, "The result as JSON");
   add("hold", "Stop where the arm is; nothing moves it until another target", run_hold);
   add("release", "Give the arm back to the babbler", run_release);
   add("halt", "Stop the arm at once; latches until resume",
@@ -519,11 +516,11 @@ void add_operate_commands(CLI::App& console) {
   add("resume", "End a halt",
       [](const OperateArguments& a) { run_latch(a, action_command_t::KIND_RESUME); });
   // Both meanings were once typed so, and one of them ends everything.
-  CLI::App* stop = console.add_subcommand("stop", "Nothing: see halt, and ./run stop")->group("");
-  stop->allow_extras();
-  stop->callback([] {
-    throw CLI::ValidationError(
-        "stop", "`" + to_type("halt") + "` stops the arm; a group is ended by `./run stop`");
+  Arguments stop = console.add_subcommand("stop", "Nothing: see halt, and ./run stop").group("");
+  stop.allow_extras();
+  stop.callback([] {
+    refuse_argument("stop",
+                    "`" + to_type("halt") + "` stops the arm; a group is ended by `./run stop`");
   });
 }
 

@@ -10,17 +10,14 @@
 #include "bodyschema/motion_status_t.hpp"
 #include "bodyschema/pose_target_t.hpp"
 #include "bodyschema/process_info_t.hpp"
-
-namespace CLI {
-class App;
-}
+#include "common/bus/arguments.h"
 
 namespace bodyschema {
 
 /// Adds `target`, `hold`, `release`, `halt` and `resume`: they talk on the bus, show progress on
 /// stderr, the result on stdout, and exit with 0 only where it is what was asked for. `stop` does
 /// nothing but say which of `halt` and `./run stop` may be meant.
-void add_operate_commands(CLI::App& console);
+void add_operate_commands(Arguments console);
 
 /// Repeats one POSE_TARGET until CONTROL_STATUS acknowledges it, and follows it to its end.
 class TargetFollower {

@@ -4,7 +4,6 @@
 #include <poll.h>
 #include <sys/resource.h>
 
-#include <CLI/CLI.hpp>
 #include <algorithm>
 #include <chrono>
 #include <filesystem>
@@ -201,19 +200,19 @@ void run_report(const ReportArguments& arguments) {
 
 }  // namespace
 
-void add_report_command(CLI::App& console) {
+void add_report_command(Arguments console) {
   const auto arguments = std::make_shared<ReportArguments>();
-  CLI::App* report =
+  Arguments report =
       console.add_subcommand("report", "What a run tells, as one HTML file that needs no network");
-  report->add_option("RUN", arguments->source, "Run folder, or an LCM log with SAMPLEs")
-      ->envname("BODYSCHEMA_RUN")
-      ->required();
-  report->add_option("--out", arguments->out, "The file; default: report.html in the run folder");
-  report->add_flag("--follow", arguments->follow,
-                   "Write it again while the run goes on, until SIGTERM");
-  report->add_flag("--growing", arguments->grows,
-                   "The run goes on: an event that is cut off at the end is still being written");
-  report->callback([arguments] { run_report(*arguments); });
+  report.add_option("RUN", arguments->source, "Run folder, or an LCM log with SAMPLEs")
+      .envname("BODYSCHEMA_RUN")
+      .required();
+  report.add_option("--out", arguments->out, "The file; default: report.html in the run folder");
+  report.add_flag("--follow", arguments->follow,
+                  "Write it again while the run goes on, until SIGTERM");
+  report.add_flag("--growing", arguments->grows,
+                  "The run goes on: an event that is cut off at the end is still being written");
+  report.callback([arguments] { run_report(*arguments); });
 }
 
 }  // namespace bodyschema

@@ -5,7 +5,6 @@
 #include <sys/ioctl.h>
 #include <unistd.h>
 
-#include <CLI/CLI.hpp>
 #include <chrono>
 #include <iostream>
 #include <memory>
@@ -87,19 +86,19 @@ void run_status(const StatusArguments& arguments) {
 
 }  // namespace
 
-void add_status_command(CLI::App& console) {
+void add_status_command(Arguments console) {
   const auto arguments = std::make_shared<StatusArguments>();
-  CLI::App* status = console.add_subcommand("status", "How the group on the bus is");
-  status->add_option("--in", arguments->in, "URL of the bus")->capture_default_str();
-  status->add_option("--images", arguments->images,
-                     "URL of the images' bus; default: the next port of --in");
-  status->add_option("--processes", arguments->processes,
-                     "Processes that should be heard of; says which is not");
-  status->add_option("--seconds", arguments->seconds, "How long to listen [s]")
-      ->check(CLI::Range(0.1, 3600.0))
-      ->capture_default_str();
-  status->add_flag("--json", arguments->json, "Print JSON");
-  status->callback([arguments] { run_status(*arguments); });
+  Arguments status = console.add_subcommand("status", "How the group on the bus is");
+  status.add_option("--in", arguments->in, "URL of the bus").capture_default_str();
+  status.add_option("--images", arguments->images,
+                    "URL of the images' bus; default: the next port of --in");
+  status.add_option("--processes", arguments->processes,
+                    "Processes that should be heard of; says which is not");
+  status.add_option("--seconds", arguments->seconds, "How long to listen [s]")
+      .in_range(0.1, 3600.0)
+      .capture_default_str();
+  status.add_flag("--json", arguments->json, "Print JSON");
+  status.callback([arguments] { run_status(*arguments); });
 }
 
 }  // namespace bodyschema

@@ -8,7 +8,6 @@
 #include <sys/wait.h>
 #include <unistd.h>
 
-#include <CLI/CLI.hpp>
 #include <chrono>
 #include <deque>
 #include <fstream>
@@ -484,33 +483,32 @@ void run_watch(const WatchArguments& arguments) {
 
 }  // namespace
 
-void add_watch_command(CLI::App& console) {
+void add_watch_command(Arguments console) {
   const auto arguments = std::make_shared<WatchArguments>();
-  CLI::App* watch = console.add_subcommand("watch", "Follow a learning run and sum it up");
-  watch->add_option("--in", arguments->in, "URL of the bus");
-  watch->add_option("--images", arguments->images, "URL of the images' bus");
-  watch->add_option("--rig-folder", arguments->rig_folder, "The rig's configuration")->required();
-  watch->add_option("--rig", arguments->rig, "Name of the rig")->required();
-  watch->add_option("--out", arguments->out, "Folder for result.json and detections.png")
-      ->required();
-  watch->add_option("--seed", arguments->seed, "Seed of the run, for the record");
-  watch->add_option("--samples", arguments->samples,
-                    "How many samples the run is to have; default: at most as many as the rig's "
-                    "motor_babbler.yaml says");
-  watch->add_option("--patience-s", arguments->patience_s,
-                    "Give up after so long without a new sample or proposal [s]");
-  watch->add_option("--processes", arguments->processes,
-                    "Processes that should be heard of; says who is silent when nothing goes on");
-  CLI::Option* replay = watch->add_option(
+  Arguments watch = console.add_subcommand("watch", "Follow a learning run and sum it up");
+  watch.add_option("--in", arguments->in, "URL of the bus");
+  watch.add_option("--images", arguments->images, "URL of the images' bus");
+  watch.add_option("--rig-folder", arguments->rig_folder, "The rig's configuration").required();
+  watch.add_option("--rig", arguments->rig, "Name of the rig").required();
+  watch.add_option("--out", arguments->out, "Folder for result.json and detections.png").required();
+  watch.add_option("--seed", arguments->seed, "Seed of the run, for the record");
+  watch.add_option("--samples", arguments->samples,
+                   "How many samples the run is to have; default: at most as many as the rig's "
+                   "motor_babbler.yaml says");
+  watch.add_option("--patience-s", arguments->patience_s,
+                   "Give up after so long without a new sample or proposal [s]");
+  watch.add_option("--processes", arguments->processes,
+                   "Processes that should be heard of; says who is silent when nothing goes on");
+  const Argument replay = watch.add_option(
       "--replay", arguments->replay, "The recording that is replayed; then there is no babbler");
   watch
-      ->add_option("--speed", arguments->speed,
-                   "Play the recording so many times faster than it was; 0: somebody else does")
-      ->needs(replay);
-  watch->add_option("--replay-from", arguments->replay_from, "What is played, as `log` says")
-      ->check(CLI::IsMember({kMarkerPoses.name, kSample.name}))
-      ->needs(replay);
-  watch->callback([arguments] { run_watch(*arguments); });
+      .add_option("--speed", arguments->speed,
+                  "Play the recording so many times faster than it was; 0: somebody else does")
+      .needs(replay);
+  watch.add_option("--replay-from", arguments->replay_from, "What is played, as `log` says")
+      .one_of({kMarkerPoses.name, kSample.name})
+      .needs(replay);
+  watch.callback([arguments] { run_watch(*arguments); });
 }
 
 }  // namespace bodyschema

@@ -1,13 +1,11 @@
 #pragma once
 
-namespace CLI {
-class App;
-}
+#include "common/bus/arguments.h"
 
 namespace bodyschema {
 
 /// Adds `watch`: follows the group on the bus, shows a live line of progress on stderr, and at the
 /// end prints the result to stdout and writes result.json and detections.png into the run's folder.
-void add_watch_command(CLI::App& console);
+void add_watch_command(Arguments console);
 
 }  // namespace bodyschema

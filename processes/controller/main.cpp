@@ -3,7 +3,6 @@
 
 #include <spdlog/fmt/fmt.h>
 
-#include <CLI/CLI.hpp>
 #include <filesystem>
 #include <utility>
 
@@ -16,7 +15,7 @@ using namespace bodyschema;
 
 int main(int argc, char** argv) {
   std::filesystem::path state_file;
-  const auto add_options = [&](CLI::App& app) {
+  const auto add_options = [&](Arguments app) {
     app.add_option("--state", state_file, "Saved before each MOVE, restored at the start");
   };
   const auto body = [&](Process& process) {

@@ -1,6 +1,5 @@
 // marker_estimator: CAMERA_IMAGE, CAMERA_INFO -> MARKER_POSES
 
-#include <CLI/CLI.hpp>
 #include <exception>
 #include <mutex>
 #include <thread>
@@ -14,9 +13,9 @@ using namespace bodyschema;
 
 int main(int argc, char** argv) {
   std::string images_option;
-  CLI::App* arguments = nullptr;
-  const auto add_options = [&](CLI::App& app) {
-    arguments = &app;
+  std::optional<Arguments> arguments;
+  const auto add_options = [&](Arguments app) {
+    arguments = app;
     app.add_option("--images", images_option, "URL of the images; default: the next port of --in");
   };
   const auto body = [&](Process& process) {
@@ -35,7 +34,7 @@ int main(int argc, char** argv) {
       const std::lock_guard lock(mutex);
       estimator.on_camera_info(info);
     });
-    std::string in = arguments->get_option("--in")->as<std::string>();
+    std::string in = arguments->text_of("--in");
     if (in.empty()) in = default_url();
     const std::string images_from = images_option.empty() ? images_url(in) : images_option;
     const auto subscribe_images = [&](Bus& bus) {

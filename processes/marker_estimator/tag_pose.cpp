@@ -27,8 +27,8 @@ Pose frontal(double size_m, const std::vector<ImagePoint>& corners) {
   const Eigen::Vector2d x = corners[1].ray - corners[0].ray + corners[2].ray - corners[3].ray;
   const Eigen::Vector3d sight = centre.homogeneous().normalized();
   Pose X = Pose::Identity();
-  X.linear() = Eigen::Quaterniond::FromTwoVectors(Eigen::Vector3d::UnitZ(), sight) *
-               exp_so3(std::atan2(x.y(), x.x()) * Eigen::Vector3d::UnitZ());
+  X.linear() =
+      rotation_of_z_to(sight) * exp_so3(std::atan2(x.y(), x.x()) * Eigen::Vector3d::UnitZ());
   X.translation() = 4 * size_m / perimeter * centre.homogeneous();
   return X;
 }

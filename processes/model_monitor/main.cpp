@@ -2,7 +2,6 @@
 
 #include <spdlog/spdlog.h>
 
-#include <CLI/CLI.hpp>
 #include <deque>
 #include <filesystem>
 #include <stdexcept>
@@ -33,7 +32,7 @@ int main(int argc, char** argv) {
   std::string samples_file;
   bool is_replayed = false;
   std::string schema_file, initial_file;
-  const auto add_options = [&](CLI::App& app) {
+  const auto add_options = [&](Arguments app) {
     app.add_option("--samples", samples_file, "The observer's samples.lcmlog, read at start");
     app.add_flag("--replayed", is_replayed,
                  "The samples are a recording's and no observer runs: what is missing is given up");
@@ -43,7 +42,7 @@ int main(int argc, char** argv) {
     app.add_option(
            "--initial", initial_file,
            "Body schema to begin with where none is kept: engineered, learned, another run's")
-        ->check(CLI::ExistingFile);
+        .existing_file();
   };
   const auto body = [&](Process& process) {
     const RigDoor door(process.rig_folder());

@@ -3,7 +3,6 @@
 
 #include <spdlog/spdlog.h>
 
-#include <CLI/CLI.hpp>
 #include <filesystem>
 #include <utility>
 
@@ -20,10 +19,9 @@ int main(int argc, char** argv) {
   std::int64_t samples = 0;
   std::filesystem::path state_file;
   std::string samples_file;
-  const auto add_options = [&](CLI::App& app) {
+  const auto add_options = [&](Arguments app) {
     app.add_option("--seed", seed, "Seed of the random actions");
-    app.add_option("--samples", samples, "Stop after exactly this many samples")
-        ->check(CLI::PositiveNumber);
+    app.add_option("--samples", samples, "Stop after exactly this many samples").positive();
     app.add_option("--samples-file", samples_file,
                    "The observer's samples.lcmlog, read at start: what an action is chosen by");
     app.add_option("--state", state_file, "Saved before each command, restored at the start");

@@ -2,7 +2,6 @@
 
 #include <spdlog/spdlog.h>
 
-#include <CLI/CLI.hpp>
 #include <stdexcept>
 
 #include "common/bus/process.h"
@@ -14,7 +13,7 @@ using namespace bodyschema;
 
 int main(int argc, char** argv) {
   std::string samples_file;
-  const auto add_options = [&](CLI::App& app) {
+  const auto add_options = [&](Arguments app) {
     app.add_option("--samples", samples_file,
                    "Log that every SAMPLE is appended to; the next run continues it");
   };

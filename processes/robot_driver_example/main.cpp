@@ -2,7 +2,6 @@
 
 #include <spdlog/spdlog.h>
 
-#include <CLI/CLI.hpp>
 #include <chrono>
 #include <exception>
 #include <thread>
@@ -41,8 +40,8 @@ std::optional<motion_status_t> load_record(const std::filesystem::path& file) {
 
 int main(int argc, char** argv) {
   std::filesystem::path record;
-  const auto add_options = [&](CLI::App& app) {
-    app.add_option("--record", record, "Keeps the newest status over a restart")->required();
+  const auto add_options = [&](Arguments app) {
+    app.add_option("--record", record, "Keeps the newest status over a restart").required();
   };
   const auto body = [&](Process& process) {
     const RobotDriverConfig config = RobotDriverConfig::load(process.config_file());

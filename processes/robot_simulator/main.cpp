@@ -2,8 +2,6 @@
 
 #include <spdlog/spdlog.h>
 
-#include <CLI/CLI.hpp>
-
 #include "common/bus/process.h"
 #include "processes/robot_simulator/robot_simulator.h"
 
@@ -14,7 +12,7 @@ int main(int argc, char** argv) {
   bool is_ideal = false;
   std::vector<int> hidden;
   std::filesystem::path state_file;
-  const auto add_options = [&](CLI::App& app) {
+  const auto add_options = [&](Arguments app) {
     app.add_option("--seed", seed, "Seed of the image noise and the calibration errors");
     app.add_flag("--ideal", is_ideal, "Without robot.yaml's calibration errors");
     app.add_option("--hide", hidden, "Body part whose markers are invisible; may be repeated");

@@ -60,7 +60,7 @@ void leave_blocks_out(const Fit& fit, const PairData& pair, const NormalizedActi
   std::vector<ParameterJacobian> JR;
   for (int first = 0, last = 0; first < pair.size(); first = last) {
     const int block = blocks.block_of(pair.frames[first].sample);
-    ParameterMatrix A = ParameterMatrix::Identity(p, p);
+    Eigen::MatrixXd A = Eigen::MatrixXd::Identity(p, p);
     ParameterVector g = ParameterVector::Zero(p);
     JR.clear();
     for (; last < pair.size() && blocks.block_of(pair.frames[last].sample) == block; ++last) {
@@ -235,7 +235,7 @@ LeaveOneOut leave_one_out(const Fit& fit, const PairData& pair, const Normalized
   // Scaled to a unit diagonal, so that metres and radians count alike in the rank.
   ParameterVector scale(p);
   for (int n = 0; n < p; ++n) scale(n) = H(n, n) > 0 ? 1 / std::sqrt(H(n, n)) : 1;
-  const ParameterMatrix scaled = scale.asDiagonal() * H * scale.asDiagonal();
+  const Eigen::MatrixXd scaled = scale.asDiagonal() * H * scale.asDiagonal();
   const Eigen::SelfAdjointEigenSolver<Eigen::MatrixXd> eigen(scaled);
   const double threshold = 1e-9 * std::max(eigen.eigenvalues()(p - 1), 1e-300);
   ParameterMatrix root(p, p);  // (JᵀWJ)⁺ = root · rootᵀ

@@ -3,7 +3,6 @@
 #include <malloc.h>
 #include <spdlog/spdlog.h>
 
-#include <CLI/CLI.hpp>
 #include <algorithm>
 #include <future>
 #include <stdexcept>
@@ -19,7 +18,7 @@ using namespace bodyschema;
 int main(int argc, char** argv) {
   std::string samples_file;
   bool is_replayed = false;
-  const auto add_options = [&](CLI::App& app) {
+  const auto add_options = [&](Arguments app) {
     app.add_option("--samples", samples_file, "The observer's samples.lcmlog, read at start");
     app.add_flag("--replayed", is_replayed,
                  "The samples are a recording's and no observer runs: what is missing is given up");

@@ -469,8 +469,9 @@ std::vector<MissingJoint> TreeFit::missing_joints(const Noise& bias) const {
         const Matrix6d unit_bias =
             d.cwiseInverse().asDiagonal() * bias_S * d.cwiseInverse().asDiagonal();
         const auto offer = [&](int dof) {
-          const Eigen::SelfAdjointEigenSolver<UpTo6x6> eigen(unit_C.topLeftCorner(dof, dof));
-          const UpTo6x6& V = eigen.eigenvectors();
+          const Eigen::SelfAdjointEigenSolver<Eigen::MatrixXd> eigen(
+              Eigen::MatrixXd(unit_C.topLeftCorner(dof, dof)));
+          const UpTo6x6 V = eigen.eigenvectors();
           // ξ along the eigenvectors, and its covariance: of the noise and of the bias. Directions
           // that the tree's other parameters take over are no evidence.
           UpTo6 xi = V.transpose() * unit_u.head(dof);

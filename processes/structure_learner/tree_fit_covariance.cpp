@@ -16,8 +16,8 @@ Matrix6d positive_part(const Matrix6d& matrix) {
   const Vector6d unit = matrix.diagonal().cwiseMax(0).cwiseSqrt();
   const Vector6d inverse = unit.unaryExpr([](double x) { return x > 0 ? 1 / x : 0.0; });
   const Matrix6d symmetric = 0.5 * (matrix + matrix.transpose());
-  const Eigen::SelfAdjointEigenSolver<Matrix6d> eigen(inverse.asDiagonal() * symmetric *
-                                                      inverse.asDiagonal());
+  const Matrix6d correlation = inverse.asDiagonal() * symmetric * inverse.asDiagonal();
+  const Eigen::SelfAdjointEigenSolver<Matrix6d> eigen(correlation);
   const Matrix6d V = unit.asDiagonal() * eigen.eigenvectors();
   return V * eigen.eigenvalues().cwiseMax(0).asDiagonal() * V.transpose();
 }

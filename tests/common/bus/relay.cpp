@@ -2,7 +2,6 @@
 // The smallest process, for tests of what every process has: passes MOTION_STATUS on, answers each
 // SAMPLE with a MOTION_STATUS, and says on stdout where it is.
 
-#include <CLI/CLI.hpp>
 #include <cstdio>
 #include <memory>
 #include <stdexcept>
@@ -48,7 +47,7 @@ int main(int argc, char** argv) {
     process.run();
     std::puts("ended");
   };
-  return run_process("relay", argc, argv, body, [&](CLI::App& app) {
+  return run_process("relay", argc, argv, body, [&](Arguments app) {
     app.add_flag("--fail", fails, "throw in a handler");
     app.add_flag("--fail-at-end", fails_at_end, "throw in the first end handler");
     app.add_flag("--only-answer", only_answers, "pass no MOTION_STATUS on");

@@ -1,0 +1,87 @@
+#pragma once
+
+#include <cstdint>
+#include <filesystem>
+#include <functional>
+#include <optional>
+#include <set>
+#include <string>
+#include <vector>
+
+namespace CLI {
+class App;
+class Option;
+}  // namespace CLI
+
+namespace bodyschema {
+
+/// One option or positional argument; CLI11's methods of the same names.
+class Argument {
+ public:
+  explicit Argument(CLI::Option* option) : option_(option) {}
+  Argument& required();
+  Argument& expected(int count);
+  Argument& type_name(const std::string& name);
+  Argument& envname(const std::string& name);
+  Argument& capture_default_str();
+  Argument& needs(const Argument& other);
+  Argument& excludes(const Argument& other);
+
+  Argument& in_range(int lowest, int highest);
+  Argument& in_range(double lowest, double highest);
+  Argument& positive();
+  Argument& one_of(const std::vector<std::string>& values);
+  Argument& existing_file();
+  /// `problem_of` a text is "" if there is none.
+  Argument& check(std::function<std::string(const std::string& text)> problem_of,
+                  const std::string& type_name = "");
+
+ private:
+  CLI::Option* option_;
+};
+
+/// The arguments of a program or of one of its commands. CLI11's own header takes 6 to 9 s in each
+/// source that includes it.
+class Arguments {
+ public:
+  explicit Arguments(CLI::App* app) : app_(app) {}
+
+  Argument add_option(const std::string& name, std::string& value, const std::string& help);
+  Argument add_option(const std::string& name, std::filesystem::path& value,
+                      const std::string& help);
+  Argument add_option(const std::string& name, int& value, const std::string& help);
+  Argument add_option(const std::string& name, std::int64_t& value, const std::string& help);
+  Argument add_option(const std::string& name, double& value, const std::string& help);
+  Argument add_option(const std::string& name, std::optional<int>& value, const std::string& help);
+  Argument add_option(const std::string& name, std::vector<int>& value, const std::string& help);
+  Argument add_option(const std::string& name, std::vector<double>& value, const std::string& help);
+  Argument add_option(const std::string& name, std::vector<std::string>& value,
+                      const std::string& help);
+  Argument add_option(const std::string& name, std::set<std::string>& value,
+                      const std::string& help);
+  Argument add_flag(const std::string& name, bool& value, const std::string& help);
+
+  Arguments add_subcommand(const std::string& name, const std::string& help);
+  Arguments& require_subcommand(int count);
+  /// Options of the command above may come last.
+  Arguments& fallthrough();
+  /// "" hides a command.
+  Arguments& group(const std::string& name);
+  Arguments& allow_extras();
+  Arguments& callback(std::function<void()> run);
+
+  /// Of an option added before.
+  bool is_given(const std::string& name) const;
+  std::string text_of(const std::string& name) const;
+
+ private:
+  CLI::App* app_;
+};
+
+/// Ends a command as wrong usage. @throws CLI::ValidationError
+[[noreturn]] void refuse_argument(const std::string& name, const std::string& why);
+
+/// Ends a command whose result is printed with exit code 1. @throws CLI::RuntimeError
+[[noreturn]] void end_as_failed();
+
+}  // namespace bodyschema

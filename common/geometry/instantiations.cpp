@@ -1,0 +1,7 @@
+#include "common/geometry/instantiations.h"
+
+namespace Eigen {
+
+BODYSCHEMA_INSTANTIATIONS()
+
+}  // namespace Eigen
