@@ -198,7 +198,11 @@ std::string TargetFollower::diagnosis() const {
   if (!motion_at_us_ || now_us_ - *motion_at_us_ > kSilent_us) {
     text += fmt::format("{}the driver", text.empty() ? "" : ", ");
   }
-  if (!text.empty()) return "silent: " + text;
+  if (!text.empty()) {
+    // Nobody owes a word as soon as that.
+    if (now_us_ - started_us_ < kSilent_us) return "too soon to tell who is silent";
+    return "silent: " + text;
+  }
   return is_acknowledged_ ? "the controller says: " + status_.why
                           : "the controller does not acknowledge the target";
 }

@@ -36,7 +36,7 @@ Isometry3d moved(const Isometry3d& X, const Eigen::Matrix<double, 6, 1>& by) {
 
 Isometry3d random_side(Rng& rng) {
   Isometry3d X(random_rotation(rng));
-  X.translation() = random_rotation(rng).col(0) * uniform(rng, 0.05, 0.15);
+  X.translation() = random_vector(rng, 0.05, 0.15);
   return X;
 }
 
@@ -216,7 +216,7 @@ ActionPoseSample ImperfectRobot::go(const Eigen::VectorXd& action) {
     }
     if (uniform(rng_, 0, 1) < is_.outlier_share) {
       X_CT.linear() = random_rotation(rng_);
-      X_CT.translation() += random_rotation(rng_).col(0) * uniform(rng_, 0, 1);
+      X_CT.translation() += random_vector(rng_, 0, 1);
     }
     PartObservation& o = sample.parts.emplace_back();
     o.part = static_cast<int>(n) + 1;

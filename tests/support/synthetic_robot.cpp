@@ -80,10 +80,16 @@ Eigen::Matrix3d random_rotation(Rng& rng) {
   return Eigen::Quaterniond(q).toRotationMatrix();
 }
 
+Eigen::Vector3d random_vector(Rng& rng, double min_m, double max_m) {
+  // One after the other: compilers differ in which factor of a product they draw first.
+  const double length = uniform(rng, min_m, max_m);
+  return length * random_rotation(rng).col(0);
+}
+
 Pose random_pose(Rng& rng, double min_m, double max_m) {
   Pose X = Pose::Identity();
   X.linear() = random_rotation(rng);
-  X.translation() = random_rotation(rng).col(0) * uniform(rng, min_m, max_m);
+  X.translation() = random_vector(rng, min_m, max_m);
   return X;
 }
 

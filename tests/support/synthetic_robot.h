@@ -19,6 +19,8 @@ double uniform(Rng& rng, double low, double high);
 double gaussian(Rng& rng);
 Vector6d gaussian6(Rng& rng);
 Eigen::Matrix3d random_rotation(Rng& rng);
+/// Of uniform direction and length.
+Eigen::Vector3d random_vector(Rng& rng, double min_m, double max_m);
 /// Uniform rotation, translation of a length in [min_m, max_m].
 Pose random_pose(Rng& rng, double min_m, double max_m);
 

@@ -115,6 +115,14 @@ TEST(OperateTest, AfterATimeoutItSaysWhoIsSilent) {
   EXPECT_EQ(follower.diagnosis(), "the controller does not acknowledge the target");
 }
 
+TEST(OperateTest, ATimeoutWithinWhichNobodyNeedsToSpeakBlamesNobody) {
+  TargetFollower follower(target(), kSecond / 2);
+  follower.on_tick(0);
+  follower.on_tick(kSecond / 2);
+  EXPECT_EQ(follower.end(), End::kTimedOut);
+  EXPECT_EQ(follower.diagnosis(), "too soon to tell who is silent");
+}
+
 TEST(OperateTest, ATargetThatNobodyFollowsIsWithdrawn) {
   // Never acknowledged: it may wait in the controller's queue.
   TargetFollower follower(target(), 5 * kSecond);

@@ -293,8 +293,8 @@ TEST(SoftBodies, WhatIsNoFunctionOfTheActionsHasNoModel) {
 }
 
 // Three joints between two parts are beyond the screws. A process may stand in for them where it
-// knows enough, but then with exactly their signals.
-TEST(SoftBodies, RigidChainsBehindHiddenPartsAreNeverGivenWrongSignals) {
+// knows enough, but then with exactly their signals (of 150 seeds two have a fourth, measured).
+TEST(SoftBodies, RigidChainsBehindHiddenPartsAreGivenTheirOwnSignals) {
   for (int seed = 0; seed < 12; ++seed) {
     Rng rng(900 + seed);
     std::vector<Pose> offsets;
