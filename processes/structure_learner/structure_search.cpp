@@ -346,8 +346,9 @@ class Search {
     const std::vector<AcceptedModel> before = result_.models;
     std::vector<AcceptedModel> best;
     for (Candidate& c : spare_) {
-      if (!forest_.connected(component, c.i) || !c.model.uses(signal) ||
-          refuted_.count({parts_[c.i], parts_[c.j], signal_set(c.model)}))
+      // What joined its ends may have been refuted since.
+      if (!forest_.connected(component, c.i) || !forest_.connected(component, c.j) ||
+          !c.model.uses(signal) || refuted_.count({parts_[c.i], parts_[c.j], signal_set(c.model)}))
         continue;
       for (const int node : path_between(tree, parts_[c.i], parts_[c.j])) {
         const AcceptedModel& present = before[tree.accepted[node]];
