@@ -121,6 +121,10 @@ Matrix6d little_adjoint(const Vector6d& xi) {
   return A;
 }
 
+double squared_mahalanobis(const Vector6d& x, const Matrix6d& C) {
+  return x.dot(C.ldlt().solve(x));
+}
+
 Matrix6d right_jacobian_inverse(const Vector6d& xi) {
   // The right Jacobian at ξ is the left one at −ξ. The left one is [J Q; 0 J] with J of SO(3) and
   // Q of Barfoot (7.86b), so its inverse is [J⁻¹ −J⁻¹QJ⁻¹; 0 J⁻¹].

@@ -39,6 +39,9 @@ Matrix6d adjoint(const Pose& X);
 /// ad(ξ), the derivative of Ad(exp(tξ)) at t = 0.
 Matrix6d little_adjoint(const Vector6d& xi);
 
+/// xᵀ C⁻¹ x, the squared Mahalanobis distance of x from 0: χ²₆ if C is its covariance.
+double squared_mahalanobis(const Vector6d& x, const Matrix6d& C);
+
 /// Inverse of the right Jacobian: log(exp(ξ) exp(δ)) = ξ + right_jacobian_inverse(ξ) δ + O(δ²).
 /// Closed form (Barfoot, "State Estimation for Robotics", 7.1.5); valid for |rotation| < 2π.
 Matrix6d right_jacobian_inverse(const Vector6d& xi);

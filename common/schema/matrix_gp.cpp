@@ -112,6 +112,7 @@ Pose MatrixGp::predict(const Eigen::VectorXd& action) const {
 }
 
 Eigen::MatrixXd MatrixGp::jacobian(const Eigen::VectorXd& action) const {
+  if (signals_.empty()) return Eigen::MatrixXd::Zero(6, action.size());
   const Eigen::VectorXd x = input_of(action);
   Entries mean;
   Eigen::Matrix<double, kNumEntries, Eigen::Dynamic> gradient(kNumEntries, x.size());

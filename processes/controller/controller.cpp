@@ -277,7 +277,7 @@ void Controller::observe(const sample_t& message) {
   if (const PartObservation* root = sample.find(schema_->root)) {
     const Vector6d off = log(X_CR.inverse() * root->X_CB);
     const Matrix6d covariance = root->covariance + schema_->X_CR_covariance;
-    if (off.dot(covariance.ldlt().solve(off)) > kMovedCamera) X_CR = root->X_CB;
+    if (squared_mahalanobis(off, covariance) > kMovedCamera) X_CR = root->X_CB;
   }
   observed_offset_ = position_of(target_) - X_CR.inverse() * part->X_CB.translation();
   observed_error_m_ = observed_offset_.norm();

@@ -105,7 +105,7 @@ double mean_offset(const std::vector<Reading>& readings, const Matrix6d& model) 
     }
     mean = H.ldlt().solve(g);
   }
-  return mean.dot(Matrix6d(H.inverse() + model).ldlt().solve(mean));
+  return squared_mahalanobis(mean, H.inverse() + model);
 }
 
 TreeFilter::Instant with_exact_models(TreeFilter::Instant instant) {
@@ -360,7 +360,7 @@ std::optional<Drift> DriftWatch::follow(const BodySchema& schema, int part) cons
     drift.T = reference * exp(mean);
     drift.rate = line.ab.tail<6>();
     drift.rate_covariance = line.covariance.bottomRightCorner<6, 6>();
-    drift.significance = drift.rate.dot(drift.rate_covariance.ldlt().solve(drift.rate));
+    drift.significance = squared_mahalanobis(drift.rate, drift.rate_covariance);
     best = drift;
   }
   return best;
@@ -439,7 +439,7 @@ std::vector<BegunDrift> begun_drifts(const BodySchema& before, const Measurement
         best->drift.left = left;
         best->drift.rate = line->rate;
         best->drift.rate_covariance = line->covariance;
-        best->drift.significance = line->rate.dot(line->covariance.ldlt().solve(line->rate));
+        best->drift.significance = squared_mahalanobis(line->rate, line->covariance);
         const auto elapsed = static_cast<double>(now - begin);
         best->drift.T = exp(elapsed * line->rate);
         best->drift.covariance = elapsed * elapsed * line->covariance;

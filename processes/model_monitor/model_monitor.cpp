@@ -329,7 +329,7 @@ ModelMonitor::EdgeTest ModelMonitor::test(const BodySchema& schema, const Edge& 
                                                config_.measurement.covariance(*to)) +
                            model;
         const Vector6d residual = log(predicted.inverse() * z);
-        smallest = std::min(smallest, residual.dot(S.ldlt().solve(residual)));
+        smallest = std::min(smallest, squared_mahalanobis(residual, S));
       }
     }
     if (!std::isfinite(smallest)) continue;

@@ -43,7 +43,7 @@ Eigen::VectorXd spread_action(const std::vector<Signal>& signals, int n) {
 bool is_near(const Pose& x, const Matrix6d& of_x, const Pose& y, const Matrix6d& of_y) {
   const Vector6d difference = log(x.inverse() * y);
   const Matrix6d S = of_x + of_y + 1e-12 * Matrix6d::Identity();
-  return difference.dot(S.ldlt().solve(difference)) < kAlike;
+  return squared_mahalanobis(difference, S) < kAlike;
 }
 
 }  // namespace

@@ -325,7 +325,7 @@ class OutlierAttribution {
     int bad = 0, all = 0;
     const auto judge = [&](const Vector6d& residual, const Matrix6d& covariance) {
       ++all;
-      const double d2 = residual.dot(covariance.ldlt().solve(residual));
+      const double d2 = squared_mahalanobis(residual, covariance);
       if (!(d2 < kOutlierThreshold)) ++bad;
     };
     for (const PartObservation& other : s.parts) {
