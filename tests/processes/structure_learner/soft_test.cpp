@@ -293,9 +293,10 @@ TEST(SoftBodies, WhatIsNoFunctionOfTheActionsHasNoModel) {
 }
 
 // Three joints between two parts are beyond the screws. A process may stand in for them where it
-// knows enough, but then with exactly their signals (of 150 seeds two have a fourth, measured).
-TEST(SoftBodies, RigidChainsBehindHiddenPartsAreGivenTheirOwnSignals) {
-  for (int seed = 0; seed < 12; ++seed) {
+// knows enough, but then with exactly their signals. (The last two had a fourth, by noise in a few
+// blocks; of the first 150 these alone.)
+TEST(SoftBodies, RigidChainsBehindHiddenPartsAreNeverGivenWrongSignals) {
+  for (const int seed : {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 30, 122}) {
     Rng rng(900 + seed);
     std::vector<Pose> offsets;
     for (int n = 0; n < 4; ++n) offsets.push_back(test::random_pose(rng, 0.06, 0.16));
