@@ -60,6 +60,28 @@ TEST(Pose, LittleAdjointIsTheDerivativeOfTheAdjoint) {
   EXPECT_LT((numeric - little_adjoint(xi)).norm(), 1e-8);
 }
 
+TEST(Pose, RotationOfZIsTheShortestThatTakesItThere) {
+  Rng rng(5);
+  for (int n = 0; n < 50; ++n) {
+    const Eigen::Vector3d to = test::gaussian6(rng).head<3>();
+    const Eigen::Matrix3d R = rotation_of_z_to(to);
+    EXPECT_LT((R.col(2) - to.normalized()).norm(), 1e-12);
+    EXPECT_LT(std::abs(log_so3(R).z()), 1e-9);  // about an axis across z
+  }
+  EXPECT_LT((rotation_of_z_to({0, 0, -2}).col(2) - Eigen::Vector3d(0, 0, -1)).norm(), 1e-12);
+}
+
+TEST(Pose, SquaredMahalanobisCountsInStandardDeviationsAlongTheCovariancesAxes) {
+  const Vector6d sd(0.1, 0.2, 0.3, 1, 2, 3), x(0.1, 0.4, 0, 0, -4, 9);
+  const Matrix6d uncorrelated = sd.cwiseAbs2().asDiagonal();
+  EXPECT_NEAR(squared_mahalanobis(x, uncorrelated), 1 + 4 + 4 + 9, 1e-12);
+  Rng rng(6);
+  Matrix6d M;
+  for (int c = 0; c < 6; ++c) M.col(c) = test::gaussian6(rng);
+  // The same in other coordinates.
+  EXPECT_NEAR(squared_mahalanobis(M * x, M * uncorrelated * M.transpose()), 18, 1e-6);
+}
+
 TEST(Pose, RightJacobianInverseAgreesWithCentralDifferences) {
   Rng rng(5);
   const double h = 1e-6;
