@@ -503,9 +503,9 @@ class Page {
   std::string alignment() {
     if (!errors_.alignment) return "";
     return fmt::format(
-        " Aligned: with the frames of the parts and the unit of length of the truth (scale "
-        "{:.4f}), "
-        "which tags that are not where the rig says displace.",
+        " Aligned to these samples: with the frames of the parts and the unit of length of the "
+        "truth "
+        "(scale {:.4f}), which tags that are not where the rig says displace.",
         errors_.alignment->scale);
   }
 

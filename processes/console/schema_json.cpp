@@ -294,10 +294,11 @@ std::string errors_text(const JudgedErrors& errors) {
     }
     text += "\n";
   }
-  return text + fmt::format(
-                    "(Aligned: with the parts' frames and the unit of length of the truth; "
-                    "scale {:.4f}.)\n",
-                    errors.alignment->scale);
+  return text +
+         fmt::format(
+             "(Aligned to these samples: with the parts' frames and the unit of length of the "
+             "truth; scale {:.4f}.)\n",
+             errors.alignment->scale);
 }
 
 }  // namespace bodyschema
