@@ -98,6 +98,7 @@ BodyVerdict verdict_of(const model_health_t& health) {
       if (edge.edge_state == schema_edge_t::EDGE_SUSPECT ||
           edge.edge_state == schema_edge_t::EDGE_INVALID)
         doubted.push_back(fmt::format("{}→{}", edge.health_from, edge.health_to));
+    verdict.is_in_doubt = !doubted.empty();
     verdict.sentence =
         doubted.empty() ? "Nothing is known to be wrong with the body."
                         : fmt::format("Nothing is known to be wrong with the body; in doubt: {}.",

@@ -31,6 +31,7 @@ struct BodyVerdict {
   std::string sentence;
   /// The lines under kWhatIsWrong; empty: nothing is known to be wrong.
   std::vector<std::string> wrong;
+  bool is_in_doubt = false;      ///< nothing is, but an edge may be: the sentence says which
   bool is_schema_wrong = false;  ///< something is found that the schema does not have yet
 };
 BodyVerdict verdict_of(const model_health_t& health);

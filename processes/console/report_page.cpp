@@ -282,8 +282,9 @@ class Page {
   }
 
   std::string headline() const {
-    if (!record_.health() || record_.health()->findings.empty()) return "The body is known:";
-    return verdict_of(*record_.health()).sentence;
+    if (!record_.health()) return "The body is known:";
+    const BodyVerdict verdict = verdict_of(*record_.health());
+    return verdict.wrong.empty() && !verdict.is_in_doubt ? "The body is known:" : verdict.sentence;
   }
 
   std::string wrong() const {

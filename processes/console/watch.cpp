@@ -228,7 +228,9 @@ Learned learn_again(const RunWatch& watch, const WatchArguments& arguments) {
 }
 
 /// What MODEL_HEALTH last said, of a schema that the monitor accepted.
-model_health_t health_of(const RunWatch& watch) { return watch.health().value_or(model_health_t{}); }
+model_health_t health_of(const RunWatch& watch) {
+  return watch.health().value_or(model_health_t{});
+}
 
 /// How many samples there will be; std::nullopt in a replay, which has what it has.
 std::optional<SampleGoal> goal_of(const WatchArguments& arguments) {
@@ -288,10 +290,13 @@ void report(const RunWatch& watch, const BestPicture& picture, const WatchArgume
                                                       : "replay of " + arguments.replay;
   std::cout << fmt::format("\n{} · {} · {} samples, {} of them held out · {:.0f} s\n\n",
                            arguments.rig, origin, watch.num_samples(), held_out.size(), seconds);
-  if (const BodyVerdict verdict = verdict_of(health_of(watch)); !verdict.wrong.empty()) {
+  const BodyVerdict verdict = verdict_of(health_of(watch));
+  if (!verdict.wrong.empty()) {
     std::cout << kWhatIsWrong << "\n";
     for (const std::string& wrong : verdict.wrong) std::cout << "  " << wrong << "\n";
     std::cout << verdict.sentence << "\n" << kNobodyWatches << "\n\n";
+  } else if (verdict.is_in_doubt) {
+    std::cout << verdict.sentence << "\n\n";
   }
   for (const auto& [first, last] : lost.samples) {
     std::cout << (first == last ? fmt::format("lost SAMPLE {}\n", first)

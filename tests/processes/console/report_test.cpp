@@ -350,6 +350,14 @@ TEST_F(ReportPageTest, WhatIsWrongStandsFirst) {
   model_health_t health{};
   health.judged_sample = 49;
   health.probe_sample = -1;
+  edge_health_t edge{};
+  edge.health_from = 1;
+  edge.health_to = 2;
+  edge.edge_state = schema_edge_t::EDGE_INVALID;
+  set_array(health.num_edges, health.edge_health, {edge});
+  hear(kModelHealth, health);
+  EXPECT_EQ(count(page(), "The body is known"), 0);
+  EXPECT_EQ(count(page(), "in doubt: 1→2. 3 parts hang together"), 1);
   finding_t finding{};
   finding.finding_text = "q1 (1→2) stuck at <b>";
   set_array(health.num_findings, health.findings, {finding});
