@@ -267,6 +267,8 @@ def check_rig(place, arguments):
 
 def status(place, arguments):
     group = Group.find(place.logs)
+    if not group and not place.console.exists() and not asks_for_help(arguments):
+        raise Failure("no group runs, and nothing is built yet; ./run does both")
     if not group:
         return console(place, "status", arguments)
     rig = group.run / "config"

@@ -271,6 +271,13 @@ std::string StatusBoard::headline() const {
   if (!line.ends_with('.')) line += '.';
   if (babbler && babbler->newest.phase == process_info_t::PHASE_DONE && line.starts_with("Done"))
     line += std::string(" ") + kNobodyWatches;
+  // At first all wait for each other, and a controller waits for a target.
+  for (const auto& [key, heard] : processes_) {
+    const process_info_t& info = heard.newest;
+    if (schema_ && info.phase == process_info_t::PHASE_WAITING &&
+        info.process_name != "motor_babbler" && info.process_name != "controller")
+      line += fmt::format(" {} waits: {}.", info.process_name, info.activity);
+  }
   if (const auto silent = missing(); !silent.empty())
     line += fmt::format(" Not heard: {}.", fmt::join(silent, ", "));
   return line;

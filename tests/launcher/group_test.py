@@ -226,6 +226,11 @@ class HelpNeverActs(GroupTest):
         self.assertIn("did you mean 'learn'?", self.run_to_end("lern")[0])
         self.assertFalse(self.logs.exists())
 
+    def test_status_of_a_tree_that_is_not_built_builds_nothing(self):
+        (self.bin / "bodyschema").unlink()
+        out, code = self.run_to_end("status")
+        self.assertEqual((out, code), ("run: no group runs, and nothing is built yet; ./run does both\n", 1))
+
 
 if __name__ == "__main__":
     unittest.main()

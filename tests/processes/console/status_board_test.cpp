@@ -77,6 +77,17 @@ TEST(StatusBoardTest, TheFirstLineSaysWhatIsDone) {
   EXPECT_EQ(waits.headline(), "Waits: waiting for SAMPLE.");
 }
 
+TEST(StatusBoardTest, WhoeverWaitsThoughThereIsASchemaIsNamed) {
+  StatusBoard board_ = board();
+  board_.on_message(
+      info("observer", process_info_t::PHASE_WAITING, "samples.lcmlog: no space left on device"));
+  board_.on_message(info("controller", process_info_t::PHASE_WAITING, "no target"));
+  EXPECT_EQ(board_.headline(), "Learning: 5 samples.");
+  board_.on_body_schema(to_message(two_parts()));
+  EXPECT_EQ(board_.headline(),
+            "Learning: 5 samples. observer waits: samples.lcmlog: no space left on device.");
+}
+
 TEST(StatusBoardTest, AStopComesBeforeAllElseAndTheControllerBeforeTheBabbler) {
   StatusBoard board_ = board();
   control_status_t control{};
