@@ -4,7 +4,7 @@
 
 namespace bodyschema {
 
-/// Calls visit(channel) for every channel of the contract: for those who look at all of them.
+/// Calls visit(channel) for every channel of the contract.
 template <class Visit>
 void for_each_channel(Visit visit) {
   visit(kActionCommand);

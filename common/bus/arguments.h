@@ -70,7 +70,7 @@ class Arguments {
   Arguments& allow_extras();
   Arguments& callback(std::function<void()> run);
 
-  /// Of an option added before.
+  /// Makes the option that was added last require another one.
   bool is_given(const std::string& name) const;
   std::string text_of(const std::string& name) const;
 

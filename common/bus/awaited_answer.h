@@ -4,10 +4,10 @@
 
 namespace bodyschema {
 
-/// Waits for another process' answers to numbered questions, as the learner and the monitor do for
-/// each other's in a replay, where nobody waits for either. Not for ever: after a timeout it goes
-/// on without, until an answer is heard again. Answers come in order, so that one to a later
-/// question is one to all before it.
+/// Waits for another process' answers to numbered questions, as learner and monitor do for each
+/// other's in a replay, where nobody else waits for them. After a timeout it no longer waits, until
+/// an answer is heard again. Answers come in order: one to a later question answers all before
+/// it.
 class AwaitedAnswer {
  public:
   AwaitedAnswer(bool is_awaited, std::int64_t timeout_us)

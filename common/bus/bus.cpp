@@ -276,7 +276,7 @@ struct Bus::Impl {
       log_has_event = log->next();
       if (!log_has_event) report_tail();
     } catch (const std::runtime_error& error) {
-      // What was read so far is good and was used; nothing after this byte can be trusted.
+      // The events before this byte are good and were used; nothing after it can be trusted.
       log_has_event = false;
       const std::scoped_lock lock(mutex);
       ++truncated_logs;
@@ -407,8 +407,8 @@ struct Bus::Impl {
     return true;
   }
 
-  /// A datagram that the system refused is lost like one that the network drops: an interface that
-  /// is down comes up again. Everything else (a dead relay, a message that is too large) stays.
+  /// A datagram refused by the system is lost like one dropped by the network: an interface that is
+  /// down comes up again. Every other error (a dead relay, a message that is too large) stays.
   bool may_send_later(int error) const {
     return out_url.rfind("udpm://", 0) == 0 && error != 0 && error != EMSGSIZE && error != EBADF;
   }

@@ -23,17 +23,17 @@ namespace bodyschema {
 /// frames; EINTR is no error; a message in pieces is handled when it is whole; channel names are
 /// matched literally; a dead URL throws here, at once.
 ///
-/// | URL                                     | in                        | out | |
-/// udpm://239.255.76.67:7667?ttl=0         | multicast (live)          | multicast                |
-/// | tcpq://host:7700                        | LCM's TCP relay (live)    | the same | | memq:// |
-/// this Bus's own (live)     | only where in is memq:// | | file://PATH?speed=0 | log; 0: at once,
-/// 1: paced | –                        | | file://PATH?mode=w, file://PATH?mode=a  | – | log,
-/// replaced / extended | | (empty)                                 | hears nothing             |
-/// publishes nowhere        |
+/// URLs, for input (in) and output (out):
+///   udpm://239.255.76.67:7667?ttl=0    in, out: multicast (live)
+///   tcpq://host:7700                   in, out: LCM's TCP relay (live)
+///   memq://                            in: this Bus's own messages; out: only if in is memq://
+///   file://PATH?speed=0                in: a log; 0: at once, 1: paced
+///   file://PATH?mode=w, …?mode=a       out: a log, replaced or extended
+///   (empty)                            in: hears nothing; out: publishes nowhere
 ///
-/// PATH may be relative and hold spaces. A udpm URL without recv_buf_size gets one of 2 MiB: LCM's
-/// default loses images. A network is trusted: forged packets can crash any LCM 1.x subscriber, so
-/// keep ttl=0 or a firewall around the robot.
+/// PATH may be relative and hold spaces. A udpm URL without recv_buf_size gets one of 2 MiB,
+/// because LCM's default loses images. The network is trusted: forged packets can crash any LCM 1.x
+/// subscriber, so keep ttl=0 or a firewall around the robot.
 ///
 /// Use one Bus from one thread; publish() and counters() alone are thread safe.
 class Bus {
@@ -55,10 +55,9 @@ class Bus {
                   erase(std::move(handler)), false);
   }
 
-  /// Calls `handler` once a handle() with the newest good message of the channel, older ones
-  /// skipped (and counted as "skipped CHANNEL"). In a replay nothing is skipped, because there
-  /// "all that is there" is one event at a time: so a replay does not depend on the machine's
-  /// speed.
+  /// Calls `handler` once per handle() with the newest good message of the channel; older ones are
+  /// skipped (and counted as "skipped CHANNEL"). A replay skips nothing, because it dispatches one
+  /// event at a time; so it does not depend on the machine's speed.
   template <class Message>
   void subscribe_latest(const Channel<Message>& channel,
                         std::type_identity_t<std::function<void(const Message&)>> handler) {
@@ -78,11 +77,11 @@ class Bus {
     publish_raw(channel.name, encode(channel, message), !std::is_same_v<Message, camera_image_t>);
   }
 
-  /// Waits up to `timeout` for a message, then dispatches all that is there (for at most 100 ms, so
-  /// that the caller's ticks are not starved), latest-only handlers last. A replay dispatches one
-  /// event that somebody subscribed to. Returns false at the end of a log, which may be truncated:
-  /// that is warned of and counted as "truncated log". A signal ends the wait early.
-  /// Rethrows what a handler threw; the messages after it are kept for the next call.
+  /// Waits up to `timeout` for a message, then dispatches all messages that have come (for at most
+  /// 100 ms, so that the caller's ticks are not starved), latest-only handlers last. A replay
+  /// dispatches one event of a subscribed channel. Returns false at the end of a log; a truncated
+  /// log is warned of and counted as "truncated log". A signal ends the wait early. Rethrows an
+  /// exception of a handler; the messages after it are kept for the next call.
   /// @throws std::runtime_error if the connection breaks.
   bool handle(std::chrono::milliseconds timeout);
 
@@ -96,10 +95,10 @@ class Bus {
   /// Event time of the log's event in hand, of its first event before that [µs since 1970]; −1
   /// where the input is no log or an empty one.
   std::int64_t event_utime() const;
-  /// "received CHANNEL" (all that arrived), "malformed CHANNEL", "senseless CHANNEL", "skipped
-  /// CHANNEL" for every channel subscribed to, "incomplete CHANNEL" (messages of which a piece was
-  /// lost, where there are any), "published CHANNEL", "send failed CHANNEL",
-  /// "truncated log", "incomplete messages of log" → count.
+  /// Name → count, for every subscribed channel "received CHANNEL" (all that arrived), "malformed
+  /// …", "senseless …", "skipped …"; "incomplete CHANNEL" (messages that lost a piece, if there are
+  /// any), "published CHANNEL", "send failed CHANNEL", "truncated log", "incomplete messages of
+  /// log".
   std::map<std::string, std::int64_t> counters() const;
 
  private:

@@ -22,14 +22,14 @@ constexpr std::int64_t kMaxParts = 10'000;
 constexpr std::int64_t kMaxId = 1'000'000;
 constexpr double kMaxReach_m = 1'000;
 constexpr std::int64_t kMaxTags = 10'000;
-/// A sample a millisecond for thirty years; what is computed with indices does not overflow.
+/// One sample per millisecond for thirty years; arithmetic on indices does not overflow.
 constexpr std::int64_t kMaxSampleIndex = 1'000'000'000'000;
 constexpr std::int64_t kMaxSignals = 1'000;
 constexpr std::int64_t kMaxChanges = 1'000;
 constexpr std::int64_t kMaxJoints = 100;
 constexpr std::int64_t kMaxGpSamples = 64;
-/// Variances, length scales and weights of Gaussian processes: wide enough for any unit, and what
-/// is made of them stays within what doubles hold.
+/// Variances, length scales and weights of Gaussian processes: wide enough for any unit, and their
+/// products stay within the range of doubles.
 constexpr double kLeastHyperParameter = 1e-60;
 constexpr double kLargestHyperParameter = 1e60;
 constexpr std::int64_t kMaxGeoms = 100'000;
@@ -44,7 +44,7 @@ constexpr double kUnitTolerance = 1e-3;
 constexpr double kCorrelationTolerance = 1e-3;
 
 /// Length of the UTF-8 character (RFC 3629) that begins at `i`; 0 if none does. A zero byte is
-/// none: the wire ends strings with it. JSON refuses what is not UTF-8.
+/// none, because the wire ends strings with it. JSON refuses text that is not UTF-8.
 std::size_t character_size(std::string_view text, std::size_t i) {
   const auto byte = [&](std::size_t k) {
     return k < text.size() ? static_cast<unsigned char>(text[k]) : 0U;
@@ -105,7 +105,7 @@ class Checker {
     finite(field, value);
     if (!(value > 0)) complain(field, fmt::format("is {}, not positive", value));
   }
-  /// ≥ 0, or −1 where nothing was measured.
+  /// ≥ 0, or −1: not measured.
   void measured(const char* field, double value) {
     finite(field, value);
     if (value < 0 && value != -1) {
@@ -237,7 +237,7 @@ class Checker {
   std::vector<std::pair<const char*, std::int64_t>> path_;
 };
 
-/// Whatever passes can be factorised again.
+/// A GP that passes can be factorised again.
 class GpChecker {
  public:
   explicit GpChecker(Checker& check) : check_(check) {}
@@ -298,7 +298,7 @@ void check_matrix_gp(Checker& check, const matrix_gp_t& gp, const body_schema_t&
              [&](const pose_t& z) { check.pose("z", z); });
 }
 
-/// Of a position alone nothing is said of rotation.
+/// The covariance of a position alone has no rotation rows.
 void check_rotation(Checker& check, const part_observation_t& part) {
   check.flag("has_rotation", part.has_rotation);
   check.covariance<6>("covariance", part.covariance, part.has_rotation == 1);
@@ -325,7 +325,7 @@ void check_edge(Checker& check, const schema_edge_t& edge, const body_schema_t& 
   check.require(edge.from_part != edge.to_part, "to_part", "is from_part");
   check.require(edge.to_part != schema.root_part, "to_part", "is the root");
   // Ordered from the root outwards: an edge leads to a part that no edge before it touched. So
-  // there is no cycle, and whoever walks the edges once has placed every part.
+  // there is no cycle, and one pass over the edges places every part.
   check.require(placed.count(edge.to_part) == 0, "to_part",
                 "was reached before: the edges are no tree ordered from the root outwards");
   placed.insert(edge.from_part);
@@ -368,7 +368,7 @@ void check_edge(Checker& check, const schema_edge_t& edge, const body_schema_t& 
         "num_covariance",
         fmt::format("is {}, neither 0 nor {}", edge.num_covariance, side * (side + 1) / 2));
   }
-  // Positive semidefinite only as far as pairs go: the screw frames' gauge makes it singular, and
+  // Positive semidefinite only up to pairs: the screw frames' gauge makes the matrix singular, and
   // in float its smallest eigenvalues are noise of either sign.
   const auto& packed = edge.parameter_covariance;
   const auto variance = [&](std::size_t i) { return double{packed[i * (i + 3) / 2]}; };

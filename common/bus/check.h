@@ -6,13 +6,13 @@
 
 namespace bodyschema {
 
-// Does a well-formed message make sense? "" if so, else what is wrong, for people, beginning with
-// the field ("parts[3].X_CB.rotation_wxyz has norm 0.5, not 1"): NaN, a quaternion that is not unit
-// (1e-3), a covariance that is not positive semidefinite (up to rounding to float), ids that repeat
-// or are out of order, counts beyond reason or unlike the length of their array, times before 0, an
-// unknown constant, a string that is not UTF-8, edges that are no tree ordered from the root
-// outwards. The bus calls check() before any handler; what fails is dropped and counted as
-// "senseless". publish() calls it too; there a failure is a bug.
+// Problem of a well-formed message, for people, beginning with the field ("parts[3].X_CB.
+// rotation_wxyz has norm 0.5, not 1"); "" if it makes sense. Problems: NaN, a quaternion that is
+// not unit (1e-3), a covariance that is not positive semidefinite (up to rounding to float), ids
+// that repeat or are out of order, counts beyond reason or unlike the length of their array, times
+// before 0, an unknown constant, a string that is not UTF-8, edges that are no tree ordered from
+// the root outwards. The bus calls check() before any handler; a message with a problem is dropped
+// and counted as "senseless". publish() calls it too; there a problem is a bug.
 
 std::string check(const action_command_t& message);
 std::string check(const motion_status_t& message);
@@ -29,8 +29,8 @@ std::string check(const control_status_t& message);
 std::string check(const fault_command_t& message);
 std::string check(const process_info_t& message);
 
-/// `text` with every byte replaced by '?' that keeps it from being UTF-8 without zero bytes. For
-/// what comes from outside: files, host names, a camera's error messages.
+/// `text` with every byte that is no UTF-8, or zero, replaced by '?'. For texts from outside:
+/// files, host names, a camera's error messages.
 std::string as_text(std::string text);
 
 }  // namespace bodyschema

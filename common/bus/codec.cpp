@@ -40,7 +40,8 @@ std::vector<std::uint8_t> encode(const Channel<Message>& channel, const Message&
   return bytes;
 }
 
-// Here alone, not in each source that sends or receives: what lcm-gen writes is long to compile.
+// Instantiated here only, not in each source that sends or receives: lcm-gen's code compiles
+// slowly.
 #define BODYSCHEMA_CODEC(Message)                                      \
   template Decoded<Message> decode<Message>(const void*, std::size_t); \
   template std::vector<std::uint8_t> encode<Message>(const Channel<Message>&, const Message&);

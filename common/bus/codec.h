@@ -12,15 +12,15 @@
 
 namespace bodyschema {
 
-/// LCM's own limit [bytes]. Images may be so large.
+/// LCM's own limit [bytes], for images.
 inline constexpr std::size_t kLargestMessage = std::size_t{1} << 28;
 
-/// [bytes]. Images travel in LCM's own fragments, on a port of their own; all else in our pieces.
+/// Limit of all other messages [bytes]. Images travel in LCM's fragments, all else in our pieces.
 template <class Message>
 inline constexpr std::size_t kLargestOf =
     std::is_same_v<Message, camera_image_t> ? kLargestMessage : kLargestInPieces;
 
-/// What came of received bytes: a message, or the reason why there is none.
+/// Result of decoding: a message, or the reason why there is none.
 template <class Message>
 struct Decoded {
   std::optional<Message> message;
@@ -37,8 +37,8 @@ std::string describe_malformed(const void* data, std::size_t size, const char* t
 template <class Message>
 Decoded<Message> decode(const void* data, std::size_t size);
 
-/// The bytes that travel. Checked first, because the generated encoder trusts the counts: a count
-/// above the length of its array would be read out of bounds.
+/// The encoded bytes. The message is checked first, because the generated encoder trusts the
+/// counts: a count above the length of its array would be read out of bounds.
 /// @throws std::logic_error if the message does not pass check(): a bug of its sender;
 /// std::runtime_error if it is larger than kLargestOf.
 template <class Message>

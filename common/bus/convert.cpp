@@ -12,9 +12,9 @@
 namespace bodyschema {
 namespace {
 
-/// Rounding to float may leave a nearly singular covariance indefinite: its correlation's
-/// eigenvalues are raised to several times what rounding can hide, so that the next rounding leaves
-/// it as it is. Others, and what is 0 on its diagonal, stay.
+/// Makes a covariance that rounding to float left nearly singular or indefinite invertible: raises
+/// the eigenvalues of its correlations to several times the rounding error, so that the next
+/// rounding leaves it unchanged. Other covariances, and rows with 0 on the diagonal, stay.
 template <int Side>
 Eigen::Matrix<double, Side, Side> invertible(const Eigen::Matrix<double, Side, Side>& covariance) {
   using Matrix = Eigen::Matrix<double, Side, Side>;
@@ -32,7 +32,7 @@ Eigen::Matrix<double, Side, Side> invertible(const Eigen::Matrix<double, Side, S
 pose_t to_message(const Pose& X_AB) {
   Eigen::Quaterniond q_AB(X_AB.linear());
   q_AB.normalize();
-  // Of q and −q always the same one, so that equal poses make equal bytes.
+  // Of q and −q the one with this sign, so that equal poses make equal bytes.
   if (q_AB.w() < 0) q_AB.coeffs() = -q_AB.coeffs();
   pose_t message{};
   for (int i = 0; i < 3; ++i) message.position_m[i] = X_AB.translation()[i];

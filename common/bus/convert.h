@@ -15,24 +15,24 @@
 
 namespace bodyschema {
 
-// Between messages and the types of common/. Only these functions know the order of a quaternion
-// on the wire (w x y z). from_message() of a message that passed check() does not throw.
+// Conversion between messages and the types of common/. Only these functions know the order of a
+// quaternion on the wire (w x y z). from_message() of a message that passed check() does not throw.
 
 pose_t to_message(const Pose& X_AB);
 Pose from_message(const pose_t& message);
 
-// Covariances. Where rounding to float leaves one that is nearly singular, from_message() makes it
-// invertible: it raises the eigenvalues of the correlations to 4 kTriangleRounding.
+// Covariances. from_message() makes one that rounding to float left nearly singular invertible: it
+// raises the eigenvalues of the correlations to 4 kTriangleRounding.
 
 void to_message(const Matrix6d& covariance, float (&message)[21]);
 Matrix6d from_message(const float (&message)[21]);
 void to_message(const Matrix8d& covariance, float (&message)[36]);
 Matrix8d from_message(const float (&message)[36]);
 
-/// Corners are left out: sample_t carries them, ActionPoseSample does not. So are parts of which
-/// the position alone is known.
+/// Leaves out corners, which sample_t carries and ActionPoseSample does not, and parts with a
+/// position alone.
 ActionPoseSample from_message(const sample_t& message);
-/// Parts of which the position alone is known.
+/// Number of parts with a position alone.
 int num_positions_alone(const sample_t& sample);
 /// Source, epoch, action id, rest interval and corners are left empty.
 sample_t to_message(const ActionPoseSample& sample);

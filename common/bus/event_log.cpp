@@ -21,7 +21,7 @@ namespace {
 constexpr std::uint32_t kSync = 0xEDA1DA01;
 constexpr std::array<std::uint8_t, 4> kSyncBytes = {0xED, 0xA1, 0xDA, 0x01};
 constexpr std::size_t kHeaderSize = 28;
-/// Where the checksum stands, and where what it covers begins.
+/// Offsets of the checksum, and of the first byte that it covers.
 constexpr std::size_t kChecksum = 4, kChecked = 8;
 /// lcm-logplayer refuses longer names.
 constexpr std::int32_t kLongestChannel = 999;
@@ -44,7 +44,7 @@ void append_big_endian(std::vector<std::uint8_t>& bytes, Integer value) {
 
 using Crc32c = boost::crc_optimal<32, 0x1EDC6F41, 0xFFFFFFFF, 0xFFFFFFFF, true, true>;
 
-/// Never 0, which says that there is none.
+/// Never 0, which means "no checksum".
 std::uint32_t checksum_of(std::span<const std::uint8_t> header, const std::string& channel,
                           std::span<const std::uint8_t> data) {
   Crc32c crc;
@@ -165,7 +165,7 @@ bool LogReader::next_recorded() {
     if (std::ferror(file_) != 0) throw system_error(path_, "cannot read the log");
     if (found == Found::kEvent || found == Found::kEnd) return found == Found::kEvent;
     // An event that reaches beyond the end is a torn tail, unless others follow: then its length is
-    // what is damaged.
+    // damaged.
     const std::optional<std::int64_t> next = find_event(position_ + 1);
     if (found == Found::kTruncated && !next) {
       report_.truncated_at_byte = position_;
@@ -195,7 +195,7 @@ LogReader::Found LogReader::read_event(bool looks_behind) {
   const std::size_t header_read = std::fread(header.data(), 1, header.size(), file_);
   if (header_read == 0) return Found::kEnd;
 
-  // Zeros up to the end are what a power cut leaves of an event that was never written back.
+  // A power cut leaves zeros up to the end in place of an event that was never written back.
   if (std::all_of(header.begin(), header.begin() + header_read, [](auto b) { return b == 0; })) {
     int byte = 0;
     while ((byte = std::fgetc(file_)) == 0) {
@@ -214,7 +214,7 @@ LogReader::Found LogReader::read_event(bool looks_behind) {
       static_cast<std::size_t>(data_size) > kLargestMessage) {
     return Found::kDamaged;
   }
-  // A length that the file cannot hold must not be allocated before it is found out.
+  // A length beyond the end of the file must be detected before it is allocated.
   std::error_code error;
   const auto file_size = static_cast<std::int64_t>(std::filesystem::file_size(path_, error));
   const std::int64_t end =
@@ -223,8 +223,8 @@ LogReader::Found LogReader::read_event(bool looks_behind) {
 
   const auto event_number = read_big_endian<std::uint64_t>(&header[kChecksum]);
   const auto checksum = static_cast<std::uint32_t>(event_number >> 32);
-  // Where no event follows either that one is damaged or the length of this one: then it would
-  // swallow what is whole. A checksum decides it better.
+  // If no event follows, the next event or the length of this one is damaged; a damaged length
+  // would swallow whole events. A checksum decides it.
   if (looks_behind && checksum == 0 && end < file_size) {
     std::array<std::uint8_t, 4> next{};
     if (::fseeko(file_, end, SEEK_SET) != 0) return Found::kTruncated;
@@ -296,7 +296,7 @@ LogLock::LogLock(const std::filesystem::path& path) {
     if (::flock(file.get(), LOCK_EX | LOCK_NB) != 0) {
       throw file_error(path, "is being written by another process");
     }
-    // Somebody may have replaced the file between the two calls: then the lock is of no use.
+    // The file may have been replaced between the two calls: then the lock is of no use.
     struct stat locked {
     }, named{};
     if (::fstat(file.get(), &locked) != 0) throw system_error(path, "cannot write the log");

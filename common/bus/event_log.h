@@ -33,7 +33,7 @@ namespace bodyschema {
 struct LogEvent {
   std::string channel;
   std::vector<std::uint8_t> data;
-  /// When it was recorded, or the message's own utime in files that must be reproducible [µs].
+  /// Time of recording, or the message's own utime in files that must be reproducible [µs].
   std::int64_t event_utime = 0;
   std::int64_t event_number = 0;  ///< modulo 2^32
 };
@@ -41,8 +41,8 @@ struct LogEvent {
 /// Joins the messages of a log that were recorded in pieces (common/bus/pieces.h).
 class EventJoiner {
  public:
-  /// Turns the last missing piece into the whole message's event. False for the other pieces, of
-  /// which nothing is told before they are whole; bad ones count as incomplete messages.
+  /// Turns the last missing piece into the whole message's event. False for the other pieces, which
+  /// stay hidden until their message is whole; bad ones count as incomplete messages.
   bool join(LogEvent* event);
   /// Messages of which pieces are missing so far.
   std::int64_t num_incomplete() const;
@@ -52,24 +52,24 @@ class EventJoiner {
   std::int64_t num_bad_ = 0;
 };
 
-/// What a log was found to hold.
+/// Contents and damage of a log.
 struct LogReport {
   /// Whole events read, pieces of messages included.
   std::int64_t events = 0;
-  /// Messages that were recorded in pieces, and not all of these.
+  /// Messages that were recorded in pieces, with a piece missing.
   std::int64_t incomplete = 0;
-  /// Where the last event begins, if the file ends before that event does: what a writer leaves
-  /// that was killed or ran out of disk. Everything before it is good.
+  /// Offset of the last event, if the file ends before that event does: left by a writer that was
+  /// killed or ran out of disk. Everything before it is good.
   std::optional<std::int64_t> truncated_at_byte;
-  /// Where the first damage begins that was skipped (OnDamage::kSkip), and how much was.
+  /// Offset of the first damage that was skipped (OnDamage::kSkip), and number of skipped bytes.
   std::optional<std::int64_t> damaged_at_byte;
   std::int64_t damaged_bytes = 0;
-  /// What was found there, for people: "is damaged: …"; "" if nothing.
+  /// Description of that damage, for people: "is damaged: …"; "" if there is none.
   std::string damage;
 };
 
-/// What to do about bytes in the middle of a log that are no event, an event whose checksum is
-/// wrong, or one that cannot be decoded: throw, or go on at the next event there is.
+/// Reaction to damage in the middle of a log (bytes that are no event, a wrong checksum, an event
+/// that cannot be decoded): throw, or go on at the next event.
 enum class OnDamage { kThrow, kSkip };
 
 /// kJoin: an event is a whole message. kAsRecorded: it may be a piece of one.
@@ -91,11 +91,11 @@ class LogReader {
   /// @throws std::runtime_error naming the byte where something begins that is not an event, or one
   /// that is not as it was written (with OnDamage::kSkip only if there is no event at all).
   bool next();
-  /// Goes to where an event begins, a position() of earlier.
+  /// Goes to the start of an event, an earlier position().
   void seek(std::int64_t position);
   const LogEvent& event() const { return event_; }
   const LogReport& report() const { return report_; }
-  /// Where the next event begins [bytes].
+  /// Offset of the next event [bytes].
   std::int64_t position() const { return position_; }
 
  private:
@@ -121,8 +121,8 @@ LogReport for_each_event(const std::filesystem::path& path,
 
 /// All messages of one channel, in order. A truncated tail is no error but reported.
 /// @throws std::runtime_error as LogReader does, and if a message of that channel is malformed or
-/// makes no sense (naming the event); with OnDamage::kSkip it is left out and its bytes are counted
-/// as damaged.
+/// makes no sense (naming the event); with OnDamage::kSkip it is left out and its bytes count as
+/// damaged.
 template <class Message>
 std::vector<Message> read_log(const std::filesystem::path& path, const Channel<Message>& channel,
                               LogReport* report = nullptr, OnDamage on_damage = OnDamage::kThrow) {
@@ -174,7 +174,7 @@ class LogAppender {
   /// kToKernel: the event survives the death of the process only.
   enum class Durability { kToDisk, kToKernel };
 
-  /// Opens or creates the log. A torn tail is cut off, so that what follows can be read.
+  /// Opens or creates the log. A torn tail is cut off, so that later events can be read.
   /// @throws std::runtime_error if the file cannot be written, is damaged elsewhere than at its
   /// tail, or is being written by somebody else.
   explicit LogAppender(const std::filesystem::path& path, Mode mode = Mode::kAppend,
@@ -193,9 +193,9 @@ class LogAppender {
   void append_bytes(const std::string& channel, std::span<const std::uint8_t> data,
                     std::int64_t event_utime);
 
-  /// What the log held when it was opened.
+  /// Contents of the log when it was opened.
   const LogReport& found() const { return found_; }
-  /// Where the next event will begin [bytes].
+  /// Offset of the next event [bytes].
   std::int64_t position() const { return end_; }
 
  private:
@@ -216,7 +216,7 @@ std::vector<std::uint8_t> encode_event(const std::string& channel,
                                        std::int64_t event_number);
 
 /// Replaces a file as a whole: a temporary file in the same folder, synced, renamed, the folder
-/// synced. Whoever reads `path` sees the old or the new text, also after a power cut.
+/// synced. A reader of `path` sees the old or the new text, also after a power cut.
 /// @throws std::runtime_error naming the file.
 void write_file_atomically(const std::filesystem::path& path, const std::string& text);
 

@@ -7,10 +7,10 @@
 
 namespace bodyschema {
 
-/// Where the images of the bus `bus_url` travel: on the next port of the same network, so that
-/// processes that want no images do not receive them (an idle socket on the images' port overflows
-/// thousands of times). "udpm://239.255.76.67:7667?ttl=0" → "udpm://239.255.76.67:7668?ttl=0".
-/// Where there is no port (file://, memq://, empty) images share the bus.
+/// URL of the images' bus beside `bus_url`: the next port of the same network, so that processes
+/// that want no images do not receive them (an idle socket on the images' port overflows thousands
+/// of times). "udpm://239.255.76.67:7667?ttl=0" → "udpm://239.255.76.67:7668?ttl=0".
+/// URLs without a port (file://, memq://, empty): images share the bus.
 /// @throws std::runtime_error if the port is not 1 … 65534.
 inline std::string images_url(const std::string& bus_url) {
   const bool has_port = bus_url.starts_with("udpm://") || bus_url.starts_with("tcpq://");

@@ -12,7 +12,7 @@
 namespace bodyschema {
 namespace {
 
-/// What is wrong with the event's bytes; "" if nothing is.
+/// Problem of the event's bytes; "" if there is none.
 using Check = std::string (*)(const LogEvent&, std::set<std::string>& versions);
 
 template <class Message>

@@ -10,7 +10,7 @@
 
 namespace bodyschema {
 
-/// What a log holds of one channel.
+/// Contents of one channel of a log.
 struct ChannelSummary {
   std::int64_t events = 0;
   std::int64_t bytes = 0;        ///< of the payloads
@@ -21,7 +21,7 @@ struct ChannelSummary {
   std::int64_t last_utime = 0;
 };
 
-/// What a log holds and where it ends.
+/// Contents and end of a log.
 struct LogSummary {
   std::map<std::string, ChannelSummary> channels;
   std::int64_t events = 0;
@@ -39,7 +39,7 @@ struct LogSummary {
   bool is_sound() const { return damage.empty() && events > 0 && unreadable() + incomplete == 0; }
 };
 
-/// Reads the whole log; what cannot be read is counted, never an error.
+/// Reads the whole log; unreadable events are counted, never an error.
 /// @throws std::runtime_error if there is no such file or it is not an LCM log.
 LogSummary summarize_log(const std::filesystem::path& file);
 

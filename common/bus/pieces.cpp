@@ -18,10 +18,10 @@ std::int64_t fingerprint_of(std::span<const std::uint8_t> bytes) {
   return static_cast<std::int64_t>(fingerprint);
 }
 
-/// What has at least a fingerprint.
+/// Length of the shortest message: a fingerprint.
 constexpr std::size_t kLeastMessage = 8;
 
-/// Of the contents of an encoded piece; "" if it makes sense.
+/// Problem of the contents of an encoded piece; "" if there is none.
 std::string check_piece(const message_piece_t& piece) {
   if (piece.num_pieces < 2 || piece.num_pieces > kMostPieces)
     return fmt::format("a message of {} pieces, outside 2 … {}", piece.num_pieces, kMostPieces);

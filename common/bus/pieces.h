@@ -20,9 +20,9 @@ namespace bodyschema {
 /// which two forged packets turn into a crash of any receiver.
 inline constexpr std::size_t kLargestDatagram = 64'000;
 /// The largest message that travels in pieces [bytes]: twice a schema of 10 000 parts, the most
-/// that check() lets pass. It bounds what a receiver keeps of pieces whose others never come.
+/// that check() lets pass. It bounds the memory for pieces of messages that stay incomplete.
 inline constexpr std::size_t kLargestInPieces = std::size_t{16} << 20;
-/// Of the whole message, in each piece but the last: with its head a piece is no larger than
+/// Bytes of the whole message in each piece but the last: with its head a piece is no larger than
 /// kLargestDatagram.
 inline constexpr std::size_t kPieceBytes = kLargestDatagram - 64;
 inline constexpr std::int32_t kMostPieces =
@@ -44,17 +44,17 @@ class PieceMaker {
 };
 
 /// Joins the pieces of one channel: in any order, of several senders at a time. Keeps
-/// kMostUnfinished messages at most; the one that was begun first gives way. A message of which a
-/// piece is missing is lost once a later one of its sender is whole.
+/// kMostUnfinished messages at most; the one that was begun first gives way. A message with a
+/// missing piece is lost once a later one of its sender is whole.
 class PieceJoiner {
  public:
   static constexpr std::size_t kMostUnfinished = 4;
 
-  /// The whole message where this is its last missing piece. Otherwise std::nullopt, and `problem`
-  /// is "" or says what is wrong with the piece, which is then left out.
+  /// The whole message if this is its last missing piece. Otherwise std::nullopt, and `problem` is
+  /// "" or says why the piece is left out.
   std::optional<std::vector<std::uint8_t>> add(std::span<const std::uint8_t> piece,
                                                std::string* problem);
-  /// Messages of which pieces are missing, those that may still become whole excepted.
+  /// Messages with missing pieces, except those that may still become whole.
   std::int64_t num_lost() const { return num_lost_; }
   std::int64_t num_unfinished() const { return static_cast<std::int64_t>(unfinished_.size()); }
 

@@ -35,15 +35,15 @@ using SteadyClock = std::chrono::steady_clock;
 constexpr std::chrono::milliseconds kTickPeriod{100};
 constexpr std::chrono::milliseconds kInfoPeriod{1000};
 constexpr std::chrono::milliseconds kShortestInfoPeriod{100};
-/// How long a process that starts listens for another of its name, which answers at its next tick
-/// (kTickPeriod), on a busy machine later.
+/// Time for which a starting process listens for another of its name, which answers at its next
+/// tick (kTickPeriod), on a busy machine later.
 constexpr std::chrono::milliseconds kListening{500};
-/// And for what was heard once to be heard again: repeated at 1 Hz, also by who is too busy to
-/// answer.
+/// Time for a process that was heard once to be heard again: it repeats at 1 Hz, also when it is
+/// too busy to answer.
 constexpr std::chrono::milliseconds kListeningAgain{1200};
 /// An elder that was busy with its own start is heard twice within this time, at 1 Hz.
 constexpr std::chrono::seconds kYouth{3};
-/// What is repeated at 1 Hz may be lost four times in a row.
+/// A message repeated at 1 Hz may be lost four times in a row.
 constexpr std::chrono::seconds kNoticeAge{5};
 
 std::atomic<bool> stop_requested{false};
@@ -81,7 +81,7 @@ std::int64_t processor_time_us() {
   return microseconds(usage.ru_utime) + microseconds(usage.ru_stime);
 }
 
-/// Memory in use; 0 where /proc does not tell.
+/// Memory in use; 0 if /proc does not tell.
 std::int64_t resident_bytes() {
   std::int64_t size_pages = 0, resident_pages = 0;
   std::ifstream("/proc/self/statm") >> size_pages >> resident_pages;
@@ -140,7 +140,7 @@ struct Process::Impl {
   bool info_changed = true;
   bool is_listening = false;
   std::optional<SteadyClock::time_point> running_since;
-  /// Of the same name, heard while listening or young → its time.
+  /// Processes of the same name, heard while listening or young → time.
   std::map<std::tuple<std::int64_t, std::string, std::int32_t>, std::int64_t> elders;
   const SteadyClock::time_point start = SteadyClock::now();
   SteadyClock::time_point last_info{};
@@ -174,7 +174,7 @@ struct Process::Impl {
         other.phase == process_info_t::PHASE_ENDED || !is_live(other, now_us())) {
       return;
     }
-    // One that starts gives way to one that runs, whatever the clock was when either began.
+    // A starting process gives way to a running one, whatever the clock was when either began.
     const bool is_other_starting = other.phase == process_info_t::PHASE_STARTING;
     if (is_other_starting && !is_listening) {
       info_changed = true;  // answered at once
@@ -187,7 +187,7 @@ struct Process::Impl {
         other.process_name, other.pid, other.host);
     const bool is_young = !running_since || SteadyClock::now() - *running_since < kYouth;
     if (is_listening || (is_young && identity(other) < identity(info))) {
-      // As many as a test of many twins starts, not as many as a stranger can invent.
+      // Enough for a test of many twins; bounds the number that a stranger can invent.
       constexpr std::size_t kMostElders = 16;
       const auto elder = elders.find(identity(other));
       if (elder != elders.end() && other.utime > elder->second) throw std::runtime_error(who);

@@ -12,8 +12,8 @@
 
 namespace bodyschema {
 
-/// What every process has: `--config FILE --in URL --out URL --log-level LEVEL`, a bus, a loop that
-/// ends on SIGTERM, SIGINT or at the end of a log, PROCESS_INFO at 1 Hz, an exit code.
+/// The common part of every process: `--config FILE --in URL --out URL --log-level LEVEL`, a bus, a
+/// loop that ends on SIGTERM, SIGINT or at the end of a log, PROCESS_INFO at 1 Hz, an exit code.
 ///
 ///   int main(int argc, char** argv) {
 ///     return run_process("observer", argc, argv, [](Process& process) {
@@ -23,15 +23,15 @@ namespace bodyschema {
 ///     });
 ///   }
 ///
-/// Of two processes of one name on a bus the younger ends with exit code 1 and a line that says who
-/// is there: at its start it says who it is and listens for 0.5 s before it publishes anything
-/// else; the elder answers at once, and must be heard again within 1.2 s, with a newer time. An
-/// elder that was busy then may still be heard in the first 3 s of the loop. After that none ends
-/// because of what others say: two that meet later both tell it (set_notice). Only live
-/// PROCESS_INFO counts (is_live()), and a bus that is both heard and spoken to.
+/// One process of a name per bus: the younger of two ends with exit code 1 and a line that names
+/// the elder. At its start it publishes PROCESS_INFO and listens for 0.5 s before it publishes
+/// anything else; the elder answers at once, and must be heard again within 1.2 s, with a newer
+/// time. An elder that was busy then may still be heard in the first 3 s of the loop. Later no
+/// process ends because of another: both report it (set_notice). Only live PROCESS_INFO counts
+/// (is_live()), and only a bus that is both input and output.
 ///
-/// `--in` is default_url() unless given. `--out` is then the same bus, but nowhere where the input
-/// is a log: a replay must not reach a robot by accident.
+/// `--in` is default_url() unless given. `--out` is then the same bus, but empty if the input is a
+/// log: a replay must not reach a robot by accident.
 class Process {
  public:
   ~Process();
@@ -44,17 +44,17 @@ class Process {
   /// The folder of the configuration file: the rig.
   std::filesystem::path rig_folder() const;
   /// Start of this process, µs since 1970; in a replay the event time of the log's first event, so
-  /// that a replay gives the same bytes again.
+  /// that a replay makes the same bytes again.
   std::int64_t epoch() const;
-  /// The wall clock, µs since 1970; −1 in a replay, which does not ask it.
+  /// The wall clock, µs since 1970; −1 in a replay, which does not read it.
   std::int64_t wall_clock_us() const;
 
-  /// What PROCESS_INFO says. `phase` is process_info_t::PHASE_*. Bytes of `activity` that are not
-  /// UTF-8 are replaced by '?'.
+  /// Phase and activity in PROCESS_INFO. `phase` is process_info_t::PHASE_*. Bytes of `activity`
+  /// that are not UTF-8 are replaced by '?'.
   void set_activity(std::int8_t phase, std::string activity);
-  /// What people must know that is not this process's own doing, such as messages that it refuses:
-  /// told before the activity until it was not repeated for 5 s, in a replay to the end. One text
-  /// a subject.
+  /// A notice for people beside the process's own activity, such as messages that it refuses. It
+  /// stands before the activity until it was not repeated for 5 s, in a replay to the end. One text
+  /// per subject.
   void set_notice(const std::string& subject, std::string text);
   void set_seed(std::int64_t seed);
   /// A counter of the process's own beside those of the bus. Returns its value.
@@ -66,12 +66,12 @@ class Process {
   /// replay, else with a time that began as the wall clock's at the start of the process and went
   /// on steadily since, however that clock is set [µs].
   void on_tick(std::function<void(std::int64_t now_us)> handler);
-  /// Called after every batch of messages, and at least every 100 ms when live; may publish. The
-  /// place to look whether a worker has finished.
+  /// Called after every batch of messages, and at least every 100 ms when live; may publish. Check
+  /// here whether a worker has finished.
   void on_idle(std::function<void()> handler);
   /// Called once when the loop ends, in order (SIGTERM, end of the log, an exception of another
-  /// handler): the place for the last answer and the safe command. One that throws does not keep
-  /// those after it from being called.
+  /// handler), for the last answer and the safe command. An exception of one does not keep the
+  /// others from being called.
   void on_end(std::function<void()> handler);
 
   /// Returns after SIGTERM or SIGINT (the message in hand is finished first) or at the end of a
@@ -88,11 +88,11 @@ class Process {
   std::unique_ptr<Impl> impl_;
 };
 
-/// As far the clocks of several machines must agree.
+/// Largest difference between the clocks of several machines.
 inline constexpr std::int64_t kClockTolerance_us = 3'000'000;
 
-/// Whether the message tells of a process that runs now and is no recording that is played: its
-/// time is within kClockTolerance_us of `now_us`, the wall clock.
+/// True if the message is of a process that runs now, not of a recording: its time is within
+/// kClockTolerance_us of `now_us`, the wall clock.
 bool is_live(const process_info_t& info, std::int64_t now_us);
 
 /// Parses the arguments, constructs a Process, calls `body`, and turns an exception into one line

@@ -14,7 +14,7 @@
 namespace bodyschema {
 namespace {
 
-/// What rewriting a calibration as text may change [px, or no unit].
+/// Largest change of a calibration by rewriting it as text [px, or no unit].
 constexpr double kSameNumber = 1e-6;
 
 constexpr const char* kNewRun =
@@ -22,7 +22,7 @@ constexpr const char* kNewRun =
 
 bool is_same(double a, double b) { return std::abs(a - b) <= kSameNumber; }
 
-/// Without the zeros at its end, which say nothing.
+/// Without the zeros at its end, which have no effect.
 std::vector<double> significant(std::vector<double> distortion) {
   while (!distortion.empty() && distortion.back() == 0) distortion.pop_back();
   return distortion;
@@ -127,7 +127,7 @@ std::string RigDoor::objection(const marker_poses_t& poses) const {
 }
 
 std::string RigDoor::objection(const motion_status_t& status) const {
-  // Only a MOVE has an action to echo, and a driver that was never asked for anything has none.
+  // Only a MOVE has an action to echo; a driver that was never commanded has none.
   const bool has_action = status.kind == action_command_t::KIND_MOVE && status.action_id >= 0;
   if (!has_action && status.commanded.empty()) return "";
   return objection_to_signals(status.commanded.size());

@@ -14,43 +14,43 @@
 
 namespace bodyschema {
 
-/// Keeps the messages of another rig out: of a second group on the same bus, of a recording that is
+/// Refuses messages of another rig: of a second group on the same bus, of a recording that is
 /// played there. It knows this rig's signals.yaml, markers.yaml and the calibration that
-/// camera.yaml names. What agrees with all of them cannot be told from this rig's own: a bus is for
-/// one robot.
+/// camera.yaml names. A foreign message that agrees with all of them is not recognised: a bus is
+/// for one robot.
 class RigDoor {
  public:
   /// @throws ConfigError.
   explicit RigDoor(const std::filesystem::path& rig_folder)
       : RigDoor(rig_folder, bodyschema::calibration_file(rig_folder)) {}
 
-  // "" if the message may be of this rig, else why not, for people.
+  // "" if the message may be of this rig, else the reason why not, for people.
 
   /// The rig's own calibration: of this camera, this image size, these intrinsics.
   std::string objection(const camera_info_t& info) const;
-  /// Of this camera, by name, and of this calibration. Tags of markers.yaml with their sizes.
+  /// camera_name and calibration are the rig's, tags those of markers.yaml with their sizes.
   std::string objection(const marker_poses_t& poses) const;
-  /// One value per signal; none where no MOVE is answered.
+  /// One value per signal; none if no MOVE is answered.
   std::string objection(const motion_status_t& status) const;
-  /// Of this calibration. One value per signal; parts of markers.yaml, each with its own tags.
+  /// The calibration is the rig's. One value per signal; parts of markers.yaml with their tags.
   std::string objection(const sample_t& sample) const;
-  /// Of this calibration. The rig's signals, by name and limits; parts of markers.yaml.
+  /// The calibration is the rig's, so are signals by name and limits, and parts of markers.yaml.
   std::string objection(const body_schema_t& schema) const;
   /// Parts of markers.yaml.
   std::string objection(const model_health_t& health) const;
   std::string objection(const sim_state_t& state) const;
 
-  /// The newest BODY_SCHEMA of a file, to begin with. What was learned from a recording has that
-  /// recording's limits of the signals: the rig's replace them, unless something is said in their
-  /// terms (a warp).
+  /// The newest BODY_SCHEMA of a file, to begin with. A schema that was learned from a recording
+  /// has the recording's limits of the signals: the rig's replace them, unless a warp is defined on
+  /// them.
   /// @throws std::runtime_error if there is none or it is of another rig.
   body_schema_t load_initial_schema(const std::filesystem::path& file) const;
 
-  /// Of the rig's tags and lens. A message that does not tell its own (0) passes.
+  /// The calibration is that of the rig's tags and lens, or unknown (0).
   std::int64_t calibration_id() const { return calibration_id_; }
 
-  /// False for what is objected to: it is counted as "refused CHANNEL", logged once a channel and
-  /// told with the process's activity.
+  /// False for a refused message: it is counted as "refused CHANNEL", logged once per channel and
+  /// reported with the process's activity.
   template <class Message>
   bool lets_in(Process& process, const Channel<Message>& channel, const Message& message) const {
     const std::string why_not = objection(message);
@@ -58,12 +58,12 @@ class RigDoor {
     return why_not.empty();
   }
 
-  /// What every process does with a SAMPLE that it uses, once each: false if it is not let in;
-  /// counts parts that are left out ("position alone").
+  /// Admits each SAMPLE that a process uses, once; false if it is refused. Counts parts that are
+  /// left out ("position alone").
   bool takes(Process& process, const sample_t& sample) const;
 
-  /// Subscribes behind the door: what it does not let in is not handled. The door must outlive the
-  /// bus's use of it.
+  /// Subscribes behind the door: refused messages are not handled. The door must outlive the bus's
+  /// use of it.
   template <class Message>
   void subscribe(Process& process, const Channel<Message>& channel,
                  std::type_identity_t<std::function<void(const Message&)>> handler) const {

@@ -21,7 +21,7 @@ constexpr int kMaxUnanswered = 10;
 constexpr int kMaxRepeats = 3;
 constexpr std::size_t kMaxAhead = 1'000;
 
-/// Which action it is a sample of, and when: two samples of one index that agree in that are one.
+/// Identity of a sample's action: two samples of one index that agree in it are the same.
 std::size_t identity(const sample_t& sample) {
   return std::hash<std::string>()(
       fmt::format("{} {} {} {}", sample.source, sample.epoch, sample.action_id, sample.utime));
@@ -94,8 +94,8 @@ bool SampleIntake::on_sample(const sample_t& sample) {
   if (taken == Taken::kConflicting) is_begun_anew_ |= !is_recorded_here() && index < next_index_;
   if (taken == Taken::kConflicting || taken == Taken::kTooLate) return false;
   is_observer_heard_ |= !ahead_.empty() && index >= ahead_.begin()->first;
-  // The observer says again and again that this is its newest: what seemed to come after it is not
-  // the observer's.
+  // The observer has reported its newest index again and again: a sample that seemed to come after
+  // it is not the observer's.
   if (index == next_index_ - 1 && !ahead_.empty() && ++num_repeats_ >= kMaxRepeats) {
     counters_["conflicting SAMPLE"] += static_cast<std::int64_t>(ahead_.size());
     ahead_.clear();

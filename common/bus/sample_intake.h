@@ -15,36 +15,37 @@ namespace bodyschema {
 
 class Process;
 
-/// Hands SAMPLEs on in order of their index, each once and without gaps: what was recorded before
-/// this process started and what a datagram lost is read from the observer's log, and where there
-/// is none, or it does not have them, the observer is asked to send them again. Samples behind a
-/// gap wait until it is closed, so that on every machine the same samples come in the same order.
+/// Delivers SAMPLEs in order of their index, each once and without gaps: samples from before the
+/// start of this process, and those lost with a datagram, are read from the observer's log; the
+/// observer is asked for those that the log does not have. Samples behind a gap wait until it is
+/// closed, so that on every machine the same samples come in the same order.
 ///
 /// A gap is given up when the observer was heard ten times and did not fill it: its log was
-/// deleted. The samples in it are then "lost SAMPLE" in counters(). While nothing is heard of the
-/// observer there is no hurry.
+/// deleted. Its samples are then "lost SAMPLE" in counters(). While the observer is silent the gap
+/// stays.
 ///
 /// The first content of an index counts. Another one ("conflicting SAMPLE") comes from an observer
-/// that began anew, and whoever learned from the first must do so too; or from somebody who is no
-/// observer.
+/// that began anew, and a process that learned from the first must begin anew too; or from a sender
+/// that is no observer.
 ///
-/// Where somebody can be asked and the file exists, the observer is on this machine and writes each
-/// sample before it sends it: what is not in the file is not the observer's ("unrecorded SAMPLE")
-/// and is refused. On other machines that cannot be told.
+/// If the log exists and the observer is live, the observer is on this machine and writes each
+/// sample before it sends it: a sample that is not in the file is not the observer's ("unrecorded
+/// SAMPLE") and is refused. Other machines cannot recognise it.
 class SampleIntake {
  public:
   using Handler = std::function<void(const sample_t&)>;
   /// Publishes a SAMPLE_REQUEST.
   using Ask = std::function<void(sample_request_t request)>;
-  /// Publishes in the name of the process; nobody is asked in a replay, where nobody answers, nor
-  /// where `has_observer` says that none runs.
+  /// Publishes in the name of the process; does not ask in a replay, nor if `has_observer` says
+  /// that no observer runs.
   static Ask asking(Process& process, bool has_observer = true);
 
-  /// Hands on what `samples_file` holds already. An empty name, a file that does not exist yet or a
-  /// damaged one is no error. Without `ask` what the file cannot fill is given up at once.
+  /// Delivers the samples that `samples_file` holds. An empty name, a file that does not exist yet
+  /// or a damaged one is no error. Without `ask` gaps that the file cannot fill are given up at
+  /// once.
   SampleIntake(std::string samples_file, Handler handler, Ask ask = nullptr);
 
-  /// Returns false for what is refused: unrecorded or conflicting.
+  /// Returns false for a refused sample: unrecorded or conflicting.
   bool on_sample(const sample_t& sample);
   /// Asks at 2 Hz. `now_us`: Process::on_tick's.
   void on_tick(std::int64_t now_us);
@@ -55,7 +56,7 @@ class SampleIntake {
   std::int64_t num_lost() const { return counters_.at("lost SAMPLE"); }
   /// First and last index of every gap that was given up, in order.
   const std::vector<std::pair<std::int64_t, std::int64_t>>& lost() const { return lost_; }
-  /// What it waits for, for people; "" if for nothing.
+  /// Reason for waiting, for people; "" if it waits for nothing.
   std::string activity() const;
 
  private:
@@ -75,7 +76,7 @@ class SampleIntake {
   std::map<std::string, std::int64_t> counters_ = {{"conflicting SAMPLE", 0}, {"lost SAMPLE", 0}};
   std::vector<std::pair<std::int64_t, std::int64_t>> lost_;
   bool is_begun_anew_ = false;
-  // Of the file: what it was when it was read last, and how far.
+  // Identity of the file when it was read last, and the position reached.
   std::uintmax_t file_id_ = 0;
   std::int64_t size_read_ = 0, position_ = 0;
   std::int64_t newest_recorded_ = -1;

@@ -7,17 +7,17 @@
 
 namespace bodyschema {
 
-/// The text that a process needs after a restart, kept in a file. A disk that is full is no reason
-/// to die: what could not be saved is said and tried again. Without a file nothing is kept, and
+/// The text that a process needs after a restart, kept in a file. A full disk does not end the
+/// process: a failed save is reported and tried again. Without a file nothing is kept, and
 /// everything counts as saved.
 class StateFile {
  public:
-  /// `text`: what needs no saving because the file says it already, or nothing was done yet.
+  /// `text` needs no saving, because the file holds it or nothing was done yet.
   StateFile(std::filesystem::path file, std::string text)
       : file_(std::move(file)), wanted_(text), saved_(std::move(text)) {}
 
-  /// Replaces the file as a whole unless it holds `text`; what failed before is tried again only by
-  /// retry(). True if the file holds `text`.
+  /// Replaces the file as a whole unless it holds `text`; only retry() repeats a failed save. True
+  /// if the file holds `text`.
   bool save(const std::string& text);
   /// To be called now and then. True if the file holds the text of the last save().
   bool retry();

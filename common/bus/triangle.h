@@ -7,8 +7,8 @@
 
 namespace bodyschema {
 
-// Symmetric matrices travel as their lower triangle, row by row, in float: N(N + 1)/2 numbers. The
-// only code that knows it.
+// Symmetric matrices travel as their lower triangle, row by row, in float: N(N + 1)/2 numbers. Only
+// this code knows that layout.
 
 /// Largest error of an eigenvalue of an N×N correlation matrix, N ≤ 8, whose covariance was rounded
 /// to float: an entry is off by two roundings (its own, and half of each of its variances'), so

@@ -40,14 +40,14 @@ struct Signals {
   int end_effector_part = 0;
 };
 
-/// How sure markers.yaml is, 1 σ, each tag by itself.
+/// Uncertainty of markers.yaml, 1 σ, each tag by itself.
 struct TagCalibration {
   double position_m = 0;    ///< of a tag on its part, per axis
   double rotation_rad = 0;  ///< per axis
   double size_share = 0;    ///< of the printed side
 };
 
-/// noise.yaml: how far what is seen is off, told once for all who reckon with it.
+/// noise.yaml: the errors of observed poses, for every process that uses them.
 struct RigNoise {
   double corner_noise_px = 0;     ///< AprilTag's own corners: see CornerNoise
   double small_tag_noise_px = 0;  ///< see CornerNoise
@@ -55,7 +55,7 @@ struct RigNoise {
   TagCalibration calibration;     ///< of markers.yaml
 };
 
-/// network.yaml: where the bus of a rig's process group lives.
+/// network.yaml: the bus of a rig's process group.
 struct Network {
   bool is_private = true;  ///< in a network namespace of its own, else on the host's network
   int port = 0;            ///< UDP port of the bus; images use port + 1
@@ -64,8 +64,8 @@ struct Network {
   std::map<std::string, std::vector<std::string>> hosts;
 
   std::string bus_url() const;
-  /// Of a group that is split over hosts images never leave their host: where frames are lost, the
-  /// pieces of theirs would fill every other host's memory for incomplete datagrams, for 30 s each
+  /// True if the group is split over hosts: then images never leave their host. With lost packets
+  /// their fragments would fill every other host's memory for incomplete datagrams, for 30 s each
   /// time, and small messages would be lost with them.
   std::string images_url() const;
   /// The processes of `host`, in the order of hosts.

@@ -15,7 +15,7 @@
 namespace bodyschema {
 namespace {
 
-/// Levenshtein distance: what turns an unknown word into "did you mean".
+/// Levenshtein distance, for "did you mean".
 std::size_t edit_distance(const std::string& a, const std::string& b) {
   std::vector<std::size_t> row(b.size() + 1);
   for (std::size_t j = 0; j <= b.size(); ++j) row[j] = j;
@@ -35,7 +35,7 @@ bool same_mapping(const YAML::Node& a, const YAML::Node& b) { return a.is(b); }
 /// Counted from 1. An empty file's node stands nowhere.
 int line_of(const YAML::Node& node) { return std::max(node.Mark().line, 0) + 1; }
 
-/// Where the newest document begins.
+/// Position of the newest document.
 class DocumentMark : public YAML::EventHandler {
  public:
   int line() const { return line_; }
@@ -96,8 +96,8 @@ struct Yaml::File {
   std::string text;
 };
 
-/// What was asked of a mapping, shared by all copies of its Yaml, so that finish() can tell what
-/// was not.
+/// The keys of a mapping that were read, shared by all copies of its Yaml, so that finish() finds
+/// those that were not.
 struct Yaml::Usage {
   std::set<std::string> asked;
   std::vector<Yaml> below;
@@ -281,7 +281,7 @@ Pose Yaml::pose(const std::string& key) const {
 }
 
 Yaml Yaml::below(const YAML::Node& node, const std::string& name) const {
-  // Whoever asks twice adds to the same usage.
+  // A second reader of the mapping adds to the same usage.
   for (const Yaml& known : usage_->below) {
     if (same_mapping(*known.node_, node)) return known;
   }

@@ -17,14 +17,13 @@ class Node;
 
 namespace bodyschema {
 
-/// What is wrong with a configuration file: "FILE:LINE: key: what was expected".
+/// Error in a configuration file: "FILE:LINE: key: what was expected".
 class ConfigError : public std::runtime_error {
  public:
   using std::runtime_error::runtime_error;
 };
 
-/// "; did you mean 'X'?" with the one of `known` that `word` differs least from; "" if there is
-/// none.
+/// "; did you mean 'X'?" with the one of `known` nearest to `word`; "" if there is none.
 std::string did_you_mean(const std::string& word, const std::set<std::string>& known);
 
 /// A mapping of a strict YAML file: a key that is missing, of the wrong type or out of range is an

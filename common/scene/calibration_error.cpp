@@ -10,10 +10,10 @@
 namespace bodyschema {
 namespace {
 
-/// Of the draw of the lens, where tags have their ids.
+/// Id of the lens's draw, in place of a tag's id.
 constexpr std::uint32_t kLens = 0xffffffffU;
 
-/// Standard normal numbers of one thing that is displaced.
+/// Standard normal numbers for one displaced tag or lens.
 class Draw {
  public:
   Draw(std::int64_t seed, std::uint32_t what) {

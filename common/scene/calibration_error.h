@@ -7,8 +7,8 @@ namespace bodyschema {
 class Yaml;
 struct Robot;
 
-/// robot.yaml's calibration_error: how far the robot, its tags and its lens are from what the
-/// tables there say, 1 σ each. All 0: an ideal robot. GROUND TRUTH, as all of robot.yaml.
+/// robot.yaml's calibration_error: difference between the robot, its tags and its lens and the
+/// tables there, 1 σ each. All 0: an ideal robot. GROUND TRUTH, as all of robot.yaml.
 struct CalibrationError {
   double tag_position_m = 0;      ///< of each tag on its part, per axis of its frame
   double tag_rotation_rad = 0;    ///< of each tag on its part, per axis of its frame
@@ -28,8 +28,9 @@ struct CalibrationError {
 /// id alone. Backlash and droop are the simulator's.
 Robot with_calibration_error(Robot robot, std::int64_t seed);
 
-/// Where in its play a joint's far side stands after the near side came to `position` [rad], when
-/// it stood at `before` in absolute position: as near to there as the play of `width` lets it.
+/// Position of a joint's far side within its play, after the near side came to `position` [rad];
+/// the far side stood at `before` (absolute) and stays as near to there as the play of `width` lets
+/// it.
 /// @return relative to the middle, −width/2 … width/2 [rad].
 double play_after(double position, double before, double width);
 

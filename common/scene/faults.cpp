@@ -13,7 +13,7 @@ namespace {
 
 using Command = fault_command_t;
 
-/// Where a marker that falls comes to lie: not under the base [m].
+/// Radius at which a fallen marker lies, clear of the base [m].
 constexpr double kFallenRadius_m = 0.3;
 constexpr double kPlateThickness_m = 0.006;
 

@@ -10,18 +10,18 @@
 
 namespace bodyschema {
 
-// What can break on a simulated arm. A fault changes the scene's description, never its geoms'
-// number or order, so the simulated camera shows it by SIM_STATE alone. Part poses X_WB stay the
-// truth of what the learners call a part:
+// Faults of a simulated arm. A fault changes the scene's description, never its geoms' number or
+// order, so the simulated camera shows it by SIM_STATE alone. Part poses X_WB stay the truth of the
+// parts that learners find:
 //   stuck          the signal's joints stay where they are
-//   bend, drift    what lies beyond the middle of the link is turned about the middle, parts too
-//   tool           what lies beyond the flange is displaced, parts too: X_WB of a part on the tool
+//   bend, drift    everything beyond the middle of the link is turned about the middle, parts too
+//   tool           everything beyond the flange is displaced, parts too: X_WB of a part on the tool
 //                  is the frame in which its tags sit at robot.yaml's X_BM, before and after
 //   marker-lost    the plate lies on the floor, face up; X_WB unchanged
 //   marker-moved   the plate sits 0.25 sides and 15° off in its plane; X_WB unchanged
 //   camera-bump    X_WC is off by 20 … 30 mm and 1.5 … 2.5°; nothing else changes
 
-/// One thing that is broken.
+/// One fault.
 struct Fault {
   std::int8_t kind = fault_command_t::FAULT_STUCK;  ///< fault_command_t::FAULT_*
   std::string place;                                ///< signal or link; "" where there is none
@@ -35,12 +35,13 @@ struct Fault {
 /// For people: "stuck q3", "bend forearm 5 deg".
 std::string describe(const Fault& fault, const SceneDescription& as_built);
 
-/// Adds what `command` asks for to `faults`; FAULT_REPAIR removes all. `scene` and `data` are the
-/// arm as it is now. "" or why it cannot be, naming what there is; `faults` is then unchanged.
+/// Adds the fault of `command` to `faults`; FAULT_REPAIR removes all. `scene` and `data` are the
+/// arm as it is now. Returns "" or the reason of a refusal, naming the choices; `faults` is then
+/// unchanged.
 std::string add_fault(const fault_command_t& command, const Scene& scene, const mjData& data,
                       std::vector<Fault>& faults);
 
-/// One action's worth of every drift. False where nothing drifts.
+/// Advances every drift by one action. False if nothing drifts.
 bool drift(std::vector<Fault>& faults);
 
 /// The broken scene: a function of its arguments. Stuck joints are stuck at `joint_positions`

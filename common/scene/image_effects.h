@@ -6,7 +6,7 @@
 
 namespace bodyschema {
 
-/// What a real camera does to a clean picture.
+/// Effects of a real camera on a clean picture.
 struct ImageEffects {
   double blur_sd_px = 0.7;  ///< Gaussian blur of lens and pixel [px]; 0: none
   double noise_sd = 2;      ///< Gaussian noise of the sensor [grey levels]; 0: none

@@ -7,7 +7,7 @@ namespace bodyschema {
 namespace {
 
 // MuJoCo calls this in the middle of its C code, with its stack half used: it must not return, and
-// an exception must not unwind through C. What remains is to end.
+// an exception must not unwind through C. So it ends the process.
 [[noreturn]] void on_error(const char* text) {
   std::fprintf(stderr, "MuJoCo cannot go on and ends the process: %s\n", text);
   std::_Exit(1);

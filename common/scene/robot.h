@@ -62,15 +62,15 @@ struct Link {
   std::vector<Shape> shapes;
 };
 
-/// Where a body part's frame sits.
+/// Frame of a body part on its link.
 struct PartPlacement {
   int part = 0;
   int link = 0;  ///< index into Robot::links
   Pose X_LB = Pose::Identity();
 };
 
-/// What a link can carry beyond its flange. A tool displaces everything that the description puts
-/// there (solids, parts, further links) and adds solids of its own.
+/// A tool that a link can carry beyond its flange. It displaces everything that the description
+/// puts there (solids, parts, further links) and adds solids of its own.
 struct Tool {
   std::string name;
   Pose X_FT = Pose::Identity();  ///< where the flange's frame F, and all beyond it, goes

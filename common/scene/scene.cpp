@@ -375,7 +375,7 @@ void Scene::set_joint_positions(mjData& data, const Eigen::VectorXd& positions) 
     throw std::invalid_argument("the robot has " + std::to_string(qpos_address_.size()) +
                                 " joints, not " + std::to_string(positions.size()));
   }
-  // Everything but the time starts anew, so that what follows depends on the positions alone.
+  // Everything but the time starts anew, so that the motion depends on the positions alone.
   const double time = data.time;
   mj_resetData(model_.get(), &data);
   data.time = time;

@@ -15,7 +15,7 @@
 
 namespace bodyschema {
 
-/// What a scene is made of. Changed, it is another scene: a broken arm, an exchanged tool
+/// Description of a scene. A broken arm or an exchanged tool is another scene
 /// (common/scene/faults.h).
 struct SceneDescription {
   Signals signals;
@@ -23,8 +23,8 @@ struct SceneDescription {
   /// X_WM of tags that have fallen off their parts: their plates lie there and touch nothing.
   std::map<int, Pose> fallen_tags;
 
-  /// The rig as built. `seed`: of the draw of its calibration errors; none: the ideal robot, of
-  /// which all tables of robot.yaml are true. @throws ConfigError.
+  /// The rig as built. `seed` draws its calibration errors; none: the ideal robot, for which all
+  /// tables of robot.yaml are true. @throws ConfigError.
   static SceneDescription load(const std::filesystem::path& rig_folder,
                                std::optional<std::int64_t> seed = std::nullopt);
 };
@@ -58,7 +58,7 @@ class Scene {
 
   /// Geom whose front face carries tag `tag_id`. @throws std::out_of_range.
   int tag_geom(int tag_id) const;
-  /// Geoms of the plates of `part`: what has to become invisible to hide it.
+  /// Geoms of the plates of `part`, which must become invisible to hide it.
   std::vector<int> plate_geoms(int part) const;
 
   /// At the start pose, at rest, forward kinematics done.

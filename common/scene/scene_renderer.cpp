@@ -187,9 +187,9 @@ struct SceneRenderer::Implementation {
   }
 
   // Sky and floor fill the image and cost three quarters of the time, but change only with the
-  // camera's pose; so they are kept, and the robot is drawn over them. Where it is not, OpenGL
-  // leaves the black of a cleared buffer, which no lit solid has. Outlines that blend with what is
-  // behind them, and shadows, need everything in one go.
+  // camera's pose; so they are kept, and the robot is drawn over them. OpenGL leaves pixels without
+  // robot as black as a cleared buffer, which no lit solid is. Outlines that blend with their
+  // background, and shadows, need everything in one go.
   cv::Mat draw(const sim_state_t& state) {
     const Pose X_WC = from_message(state.X_WC);
     place_camera(X_WC);
@@ -289,7 +289,7 @@ cv::Mat SceneRenderer::render(const sim_state_t& state, int frame) {
   if (self.effects.blur_sd_px > 0) {
     cv::GaussianBlur(image, image, {}, self.effects.blur_sd_px);
   }
-  // After the blur: what is looked up between pixels must not have finer detail than they have.
+  // After the blur: an image that is interpolated must not have detail finer than its pixels.
   if (!self.distort.empty()) image = self.distort(image);
   self.noise.add(image, state.seed, state.action_id, frame);
   return image;
