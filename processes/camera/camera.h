@@ -15,13 +15,13 @@
 
 namespace bodyschema {
 
-/// How frames travel.
+/// Encoding of the frames.
 struct ImageEncoding {
   std::int8_t format = camera_image_t::ENCODING_JPEG;  ///< camera_image_t::ENCODING_*
   int jpeg_quality = 0;                                ///< 1 … 100
 };
 
-/// Where frames come from if there is a real camera, or a recording of one.
+/// Source of the frames if there is a real camera, or a recording of one.
 struct CaptureConfig {
   /// "/dev/video0" or "0"; a stream's URL; a video file; an image sequence ("frames/%04d.png").
   std::string device;
@@ -48,11 +48,11 @@ struct CameraConfig {
   static CameraConfig load(const std::filesystem::path& file);
 };
 
-/// Why robot.yaml's lens cannot be what the rig's calibration claims to be of: another size.
+/// Why robot.yaml's lens does not fit the rig's calibration (another size); "" if it does.
 std::optional<std::string> lens_problem(const CameraCalibration& lens,
                                         const CameraCalibration& calibration);
 
-/// A frame of any depth and number of channels as the message that travels: 8-bit grey, encoded.
+/// The message for a frame of any depth and number of channels: 8-bit grey, encoded.
 /// @throws std::invalid_argument if the frame is empty, of an unknown format or not of the
 /// calibration's size.
 camera_image_t make_image(const cv::Mat& frame, const CameraCalibration& calibration,
@@ -62,17 +62,17 @@ camera_image_t make_image(const cv::Mat& frame, const CameraCalibration& calibra
 /// CAMERA_INFO. `utime`: of the newest frame, 0 before the first.
 camera_info_t make_info(const CameraCalibration& calibration, std::int64_t utime);
 
-/// Why a camera that was started `is_ideal` must not show a SIM_STATE: the simulator was not, so
-/// the tags and the lens would not be those of the robot.
+/// Why a camera that was started `is_ideal` must not show a SIM_STATE: the simulator was started
+/// otherwise, so tags and lens would not be those of the robot.
 std::optional<std::string> ideal_problem(bool is_ideal, const sim_state_t& state);
 
 /// The simulated camera: for every SIM_STATE the frames_per_action images that a camera of 30 Hz
 /// would have taken from then on. Frame f of a state has utime = state.utime + f · 33 333 µs and
 /// image_seq = (action_id + 1) · frames_per_action + f, so both are the same from run to run.
 ///
-/// Before the first SIM_STATE it shows nothing. A state that is repeated gives the same images
-/// again, byte by byte and without rendering: consumers know them by utime, and whoever missed one
-/// sees it then.
+/// Before the first SIM_STATE it shows nothing. A repeated state gives the same images again, byte
+/// by byte and without rendering: consumers recognise them by utime, and one that missed an image
+/// gets it then.
 class SimulatedCamera {
  public:
   using Render = std::function<cv::Mat(const sim_state_t&, int frame)>;

@@ -13,16 +13,16 @@
 
 namespace bodyschema {
 
-/// What CaptureConfig::device names.
+/// Kind of source that CaptureConfig::device names.
 enum class SourceKind { kDevice, kStream, kSequence, kFile };
 SourceKind kind_of(const std::string& device);
 
-/// Why OpenCV cannot open it and what to do, for people: no such device (and which there are), no
-/// permission, busy, no such file, no decoder.
+/// Reason why OpenCV cannot open it and a remedy, for people: no such device (with those there
+/// are), no permission, busy, no such file, no decoder.
 std::string why_not_open(const std::string& device);
 
-/// Reads a camera, stream, video or image sequence in a thread of its own, so that nobody waits for
-/// a slow device, and hands on each frame with the clock's time at which it was grabbed.
+/// Reads a camera, stream, video or image sequence in a thread of its own, so that no caller waits
+/// for a slow device, and delivers each frame with the clock's time at which it was grabbed.
 ///
 /// A device or stream that vanishes is opened again after 0.5, 1, 2 … 10 s, for ever; a stream that
 /// delivers nothing for 5 s (a V4L2 device: 10 s, OpenCV's own limit) has vanished. A file or
@@ -30,8 +30,8 @@ std::string why_not_open(const std::string& device);
 /// state() says which.
 class Capture {
  public:
-  /// Called from the capture's thread. A frame that it throws std::invalid_argument about is
-  /// refused and counted; anything else ends the capture and is rethrown by check().
+  /// Called from the capture's thread. A frame for which it throws std::invalid_argument is refused
+  /// and counted; any other exception ends the capture and is rethrown by check().
   using OnFrame = std::function<void(const cv::Mat& frame, std::int64_t utime)>;
   enum class Phase { kRunning, kLost, kEnded };
   struct State {
@@ -47,7 +47,7 @@ class Capture {
   ~Capture();
 
   State state() const;
-  /// Rethrows what ended the capture, if anything did.
+  /// Rethrows the exception that ended the capture, if there was one.
   void check() const;
 
  private:

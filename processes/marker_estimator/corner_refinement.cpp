@@ -121,7 +121,7 @@ class Pattern {
   }
 
   float cell(int column, int row) const { return white_[(row + kPad) * stride_ + column + kPad]; }
-  /// What changes around the point where two lines between cells cross.
+  /// Change of the pattern at the point where two lines between cells cross.
   Crossing crossing(int x_line, int y_line) const {
     return crossings_[y_line * (width_ + 1) + x_line];
   }
@@ -175,12 +175,12 @@ struct Smoothed {
 
 /// A Gaussian of covariance S [cells²] in front of the pattern.
 ///
-/// Across one straight line it is one error function. Where lines cross, axes first: the Gaussian
-/// with the covariance diag(S), whose correlation is then brought in by the series of the operator
-/// exp(S_xy ∂x ∂y) to the third order (Mehler's), good to 0.1 % of the contrast at a correlation of
-/// 0.5. What is beyond that is a sum of shifted Gaussians, S = D + r rᵀ, by a Gauss–Hermite rule
-/// along r. The pixel's square, where it is not much narrower than the blur and so no Gaussian, is
-/// a grid of shifts as well.
+/// Across one straight line it is one error function. At a crossing of lines, axes first: the
+/// Gaussian with the covariance diag(S), into which the series of the operator exp(S_xy ∂x ∂y) to
+/// the third order (Mehler's) brings the correlation, good to 0.1 % of the contrast at a
+/// correlation of 0.5. Larger correlations are a sum of shifted Gaussians, S = D + r rᵀ, by a
+/// Gauss–Hermite rule along r. The pixel's square, if it is not much narrower than the blur and so
+/// no Gaussian, is a grid of shifts as well.
 class Smoothing {
  public:
   /// `A`: cells per pixel. `blur_px2`: without the pixel's square, `sharpest_px2` its least
@@ -224,12 +224,12 @@ class Smoothing {
     }
   }
 
-  /// [cells]: what lies farther away than this shows in a pixel by less than 0.4 %.
+  /// [cells]: a line farther away than this changes a pixel by less than 0.4 %.
   float tail(int axis) const { return tail_[axis]; }
   /// Standard deviation along the tag's axis where it is larger [cells].
   float widest() const { return std::max(sd_[0], sd_[1]); }
 
-  /// False where the pattern is flat around (x, y); `s` is then its value alone.
+  /// False if the pattern is flat around (x, y); `s` is then its value alone.
   bool operator()(const Pattern& pattern, float x, float y, Smoothed& s) const {
     if (widest() >= Pattern::kNarrow) {
       if (widest() < Pattern::kMedium) {
@@ -336,14 +336,14 @@ class Smoothing {
   int num_grid_nodes_ = 0;
 };
 
-/// What is fitted.
+/// State of the fit.
 struct Model {
   Eigen::Matrix3d H;  ///< (X, Y, 1) on the tag to the ray
   Eigen::Matrix<double, kLight, 1> light;
   Eigen::Matrix2d blur_px2;
 };
 
-/// Which pixels are looked at: all, half or a quarter of them on a regular grid, or those of a
+/// Choice of pixels: all, half or a quarter of them on a regular grid, or those of a
 /// Fibonacci lattice, (u + offset · v) mod spacing = 0, which lines up with no tag's cells.
 struct Pixels {
   enum class Grid { kAll, kHalf, kQuarter, kLattice };
@@ -368,12 +368,12 @@ struct Pixels {
   }
 };
 
-// A fit of a large tag begins with so many pixels, and no look at a tag that is so blurred that
-// every pixel has the whole sum takes more than the second number: a bound on what a tag costs,
-// whatever its size. Chosen: tags of 160 px and above are found to 0.03 px with 6 px of blur.
+// Number of pixels with which the fit of a large tag begins; and the most for one evaluation of a
+// tag so blurred that every pixel has the whole sum: it bounds the cost of a tag, whatever its
+// size. Chosen: tags of 160 px and above are found to 0.03 px with 6 px of blur.
 constexpr double kFirstPixels = 10000, kBlurredPixels = 40000;
 
-/// One look at the pixels.
+/// Sums of one evaluation over the pixels.
 struct Sums {
   Normal H = Normal::Zero();
   Parameters g = Parameters::Zero();  ///< Jᵀr
@@ -532,7 +532,7 @@ void Refiner::make_lattice(const cv::Rect& region, int block_px) {
     return Eigen::Vector2d(origin_.x - 0.5 + 0.5 * block_px * i,
                            origin_.y - 0.5 + 0.5 * block_px * j);
   };
-  // To invert a lens takes iterations, but over a tag it is smooth: a polynomial of the fifth
+  // Inverting a lens takes iterations, but over a tag it is smooth: a polynomial of the fifth
   // degree in either direction, through Chebyshev's points.
   constexpr int n = 6;
   Eigen::Matrix<double, n, n> x, y;
@@ -567,7 +567,7 @@ void Refiner::make_lattice(const cv::Rect& region, int block_px) {
     const Eigen::Matrix<double, Eigen::Dynamic, n> along_u = weights(cols), along_v = weights(rows);
     const Eigen::MatrixXd all_x = along_v * x * along_u.transpose();
     const Eigen::MatrixXd all_y = along_v * y * along_u.transpose();
-    // In a corner of the lattice, where it is worst.
+    // In a corner of the lattice, where the error is largest.
     constexpr double kAccuracy_px = 2e-3;
     const Eigen::Vector2d corner(all_x(0, 0), all_y(0, 0));
     if ((lens_.project(corner) - pixel(0, 0)).norm() < kAccuracy_px) {
@@ -647,8 +647,8 @@ void sum_products(const std::vector<Row>& rows, BlockSums& sums) {
 
 void Refiner::look_at_block(int bu, int bv, const Eigen::Matrix3d& to_tag, double robust_cut,
                             Pixels pixels, std::vector<Row>& rows, Sums& sums) const {
-  // Where the pixels lie on the tag, in cells from the corner of its margin: a quadratic over the
-  // block through its 3 × 3 points.
+  // Positions of the pixels on the tag, in cells from the corner of its margin: a quadratic over
+  // the block through its 3 × 3 points.
   Eigen::Vector2d p[3][3];
   for (int j = 0; j < 3; ++j) {
     for (int i = 0; i < 3; ++i) {
@@ -710,7 +710,7 @@ void Refiner::look_at_block(int bu, int bv, const Eigen::Matrix3d& to_tag, doubl
         static_cast<int>((u0 + static_cast<std::int64_t>(pixels.offset) * v) % stride);
     return past == 0 ? u0 : u0 + stride - past;
   };
-  // An eleventh of an edge's steepest slope: what lies below has 1 % of its information.
+  // An eleventh of an edge's steepest slope: pixels with less hold 1 % of its information.
   const float least_gradient2 = std::pow(0.035F / smooth.widest(), 2.0F);
   rows.clear();
   for (int v = v0; v < v1; ++v) {
@@ -729,7 +729,7 @@ void Refiner::look_at_block(int bu, int bv, const Eigen::Matrix3d& to_tag, doubl
       Smoothed m;
       const bool is_flat = !smooth(pattern_, x, y, m);
       ++sums.num_visited;
-      // Flat places say nothing of the corners: a quarter of them is enough for the light.
+      // Flat places hold no information on the corners: a quarter of them is enough for the light.
       if (!is_lattice && ((u | v) & 1) && (is_flat || m.x * m.x + m.y * m.y < least_gradient2))
         continue;
       const float X = (x - static_cast<float>(half_width_)) * inverse_half;
@@ -808,7 +808,7 @@ void Refiner::look(double robust_cut, Pixels pixels, Sums& sums) {
   sums.squares = total(kParameters, kParameters);
 }
 
-/// Those of a look after the first ones, by the blur that is known so far.
+/// Pixels of a later evaluation, by the blur known so far.
 Pixels Refiner::all_looks() const {
   const Eigen::Matrix2d& B = model_.blur_px2;
   const double widest_px2 = B.trace() / 2 + std::hypot(0.5 * (B(0, 0) - B(1, 1)), B(0, 1));
@@ -819,7 +819,7 @@ Pixels Refiner::all_looks() const {
   return all_looks_;
 }
 
-/// How far the image moved while the shutter was open if that is why the blur is wider in one
+/// Motion of the image while the shutter was open, if it explains that the blur is wider in one
 /// direction: straight motion of length l has the variance l²/12. Along the tag's sides [cells].
 double Refiner::motion_cells(const std::vector<Eigen::Vector2d>& corners_px) const {
   const Eigen::Matrix2d motion_px2 = model_.blur_px2 - sharpest_px2_ * Eigen::Matrix2d::Identity();
@@ -858,18 +858,17 @@ CornerRefinement Refiner::fit(const std::vector<Eigen::Vector2d>& corners_px) {
   const auto refuse = [](CornerRefusal why) { return CornerRefinement{std::nullopt, why}; };
   constexpr int kMaxLooks = 8;
   constexpr double kSettled_px = 0.04;  // a Gauss–Newton step this short leaves its square
-  // What differs more than this share of the contrast from what is printed is something else. At
-  // first the corners themselves may be off.
+  // Pixels that differ from the print by more than this share of the contrast show something else.
+  // At first the corners themselves may be off.
   constexpr double kFirstCut = 0.5, kCut = 0.15;
-  // [cells]: a longer motion is no Gaussian blur, and what it spoils no longer shows in the
-  // residuals.
+  // [cells]: a longer motion is no Gaussian blur, and its damage no longer shows in the residuals.
   constexpr double kLongestMotion = 0.65;
   Sums sums;
   Parameters step = Parameters::Zero();
   Normal inverse = Normal::Zero();
   Eigen::Matrix<double, 8, kGeometry> J;
   bool is_settled = false;
-  // A lattice is looked at until the blur is known; one look at a grid leads near enough.
+  // A lattice is used until the blur is known; one evaluation on a grid leads near enough.
   bool is_coarse = first_look_.grid == Pixels::Grid::kLattice;
   Eigen::Matrix<double, 8, 1> moved = Eigen::Matrix<double, 8, 1>::Zero();
   for (int n = 0; n < kMaxLooks && !is_settled; ++n) {
@@ -944,7 +943,7 @@ CornerRefinement Refiner::fit(const std::vector<Eigen::Vector2d>& corners_px) {
     if (sums.side_covered[side] > 0.1 * sums.side_seen[side])
       return refuse(CornerRefusal::kCovered);
 
-  // The noise, and how much the blocks pull more in common than independent pixels would.
+  // The noise, and the correlation of residuals within blocks beyond that of independent pixels.
   const double freedom = sums.num_pixels - kParameters;
   const double left = std::max(0.0, sums.squares - step.dot(sums.g));
   // A grey value is rounded to whole levels: no residual is better than that.
@@ -952,8 +951,8 @@ CornerRefinement Refiner::fit(const std::vector<Eigen::Vector2d>& corners_px) {
   Matrix8d covariance = J * inverse.topLeftCorner<kGeometry, kGeometry>() * J.transpose();
   const Eigen::LLT<Matrix8d> root(covariance);
   if (root.info() != Eigen::Success) return refuse(CornerRefusal::kNotFound);
-  // What a block adds to the whitened corners is T (g_b − H_b step), its covariance under
-  // independent noise σ² T (H_b − H_b H⁻¹ H_b) Tᵀ; T H Tᵀ is the identity.
+  // A block adds T (g_b − H_b step) to the whitened corners, with the covariance under independent
+  // noise σ² T (H_b − H_b H⁻¹ H_b) Tᵀ; T H Tᵀ is the identity.
   using Wide = Eigen::Matrix<float, 8, kColumns>;
   Wide T = Wide::Zero();
   T.leftCols<kParameters>() = root.matrixL().solve(J * inverse.topRows<kGeometry>()).cast<float>();
@@ -970,7 +969,7 @@ CornerRefinement Refiner::fit(const std::vector<Eigen::Vector2d>& corners_px) {
     pulled += share.lazyProduct(after).squaredNorm();
     expected -= Wide(share.lazyProduct(R)).squaredNorm();
   }
-  // One block has it all: nothing to compare.
+  // With a single block there is nothing to compare.
   if (!(expected > 0.01)) return refuse(CornerRefusal::kTooSmall);
   const double inflation =
       expected > 1 ? std::max(1.0, pulled / (variance * expected)) : 8 / expected;

@@ -23,7 +23,7 @@ struct TagCells {
 struct RefinedCorners {
   /// Pixel-centre convention, order (−,+) (+,+) (+,−) (−,−) in the marker's frame M, as AprilTag's.
   std::vector<Eigen::Vector2d> corners_px;
-  /// Of (x0, y0, x1, y1, …) [px²]. Corners that share an edge are correlated.
+  /// Covariance of (x0, y0, x1, y1, …) [px²]. Corners that share an edge are correlated.
   Matrix8d covariance_px2 = Matrix8d::Zero();
   double noise_sd = 0;  ///< of a pixel's residual [grey levels]
   double contrast = 0;  ///< white − black [grey levels]
@@ -57,10 +57,10 @@ struct CornerRefinement {
 /// part, not the outline alone. The lens is part of the map, so that edges are straight in rays,
 /// not in pixels.
 ///
-/// The noise is that of the residuals. The covariance is σ²(JᵀJ)⁻¹, widened where the residuals of
-/// neighbouring pixels (blocks of 8 × 8, as JPEG's) pull in common more often than independent
-/// noise would (the cluster-robust covariance of White, 1980, as one factor). Pixels that are not
-/// as printed lose their weight; those cut off by the range of grey values have none.
+/// The noise is that of the residuals. The covariance is σ²(JᵀJ)⁻¹, widened if the residuals of
+/// neighbouring pixels (blocks of 8 × 8, as JPEG's) are correlated more than independent noise
+/// would be (the cluster-robust covariance of White, 1980, as one factor). Pixels that differ from
+/// the print lose their weight; those cut off by the range of grey values have none.
 ///
 /// The work for a tag that is refused for its blur is bounded whatever its size: no iteration
 /// evaluates more than some 40 000 pixels of a blurred tag.

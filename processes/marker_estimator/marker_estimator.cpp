@@ -15,7 +15,7 @@
 namespace bodyschema {
 namespace {
 
-/// As many as a simulated action has frames (camera.yaml allows 100; more are looked at again).
+/// As many as a simulated action has frames (camera.yaml allows 100; more are detected again).
 constexpr std::size_t kMaxAnswered = 16;
 
 template <class Message>
@@ -136,7 +136,7 @@ std::optional<marker_poses_t> MarkerEstimator::on_camera_image(const camera_imag
   if (answered_.size() < kMaxAnswered) {
     answered_.emplace_back(image, poses);
   } else {
-    // The oldest one's memory is used again: an image is megabytes.
+    // The memory of the oldest is used again: an image is megabytes.
     std::rotate(answered_.begin(), answered_.begin() + 1, answered_.end());
     answered_.back().first = image;
     answered_.back().second = poses;
@@ -175,7 +175,7 @@ std::optional<marker_pose_t> MarkerEstimator::estimate(const cv::Mat& grey,
   }
   const std::vector<PoseFit> minima = solve_tag_pose(size_m, corners, &whitener);
   if (minima.empty()) return refuse("tag without a pose");
-  // In pixels, whatever the poses were weighted by.
+  // In pixels, whatever weights the poses had.
   const auto error_px = [&](const PoseFit& fit) {
     const auto residual = reprojection_residual(fit.X_CB, tag_corners(size_m), corners, nullptr);
     return residual ? sigma * residual->norm() / std::sqrt(8.0)

@@ -35,30 +35,30 @@ struct MarkerEstimatorConfig {
 /// Finds the rig's tags in an image and estimates their poses X_CM in the camera's frame: both
 /// hypotheses of a planar marker, each refined to its local minimum, and the covariance of the
 /// better one. Corners are fitted to the grey values of the tag (refine_corners()), whose residuals
-/// give their noise; where that is refused, AprilTag's corners with the configured noise take their
-/// place. It knows ids and sizes, not what carries the markers. Of several tags with one id, the
+/// give their noise; if that is refused, AprilTag's corners with the configured noise replace them.
+/// It knows ids and sizes, not the parts that carry the markers. If several tags have one id, the
 /// one with the largest decision margin counts among those that pass all gates.
 ///
 /// Before the first CAMERA_INFO it answers nothing, since pixels mean no poses yet. Afterwards it
-/// answers every readable image of the calibrated size, with no markers where none is seen. An
-/// image that cannot be read, has another size or is another camera's is refused and counted. An
-/// image that is repeated gets the same answer again without being looked at. When images stop, so
-/// do the answers.
+/// answers every readable image of the calibrated size, with an empty list if no marker is seen. An
+/// image that cannot be read, has another size or is another camera's is refused and counted. A
+/// repeated image gets the same answer again without detection. When images stop, so do the
+/// answers.
 class MarkerEstimator {
  public:
-  /// `calibration_id`: of the rig; 0: not told.
+  /// `calibration_id`: of the rig; 0: unknown.
   MarkerEstimator(const MarkerEstimatorConfig& config, Markers markers,
                   std::int64_t calibration_id = 0);
 
-  /// A calibration that makes no sense is refused and counted; the last good one stays.
+  /// A senseless calibration is refused and counted; the last good one stays.
   void on_camera_info(const camera_info_t& info);
   std::optional<marker_poses_t> on_camera_image(const camera_image_t& image);
 
   /// False while it waits for the calibration or the first image, or refuses what it gets.
   bool is_working() const { return lens_ && num_images_ > 0 && refused_.empty(); }
-  /// What it does or waits for, for people.
+  /// Activity for people.
   std::string activity() const;
-  /// What was refused and why, since the start.
+  /// Reason → number of refused images and tags since the start.
   const std::map<std::string, std::int64_t>& counters() const { return counters_; }
 
  private:

@@ -18,14 +18,14 @@ struct TagDetection {
   std::vector<Eigen::Vector2d> corners_px;
   double decision_margin = 0;
   int hamming = 0;
-  /// How well the black border stands out against the white margin at the worst of its four sides:
-  /// that side's 5 % quantile of white − black, relative to the median over the whole border. Near
-  /// 1 for a free tag; low or negative where something covers the border or the margin, and −1
-  /// where the margin is cut off by the image's edge.
+  /// Contrast of the black border to the white margin at the worst of its four sides: that side's
+  /// 5 % quantile of white − black, relative to the median over the whole border. Near
+  /// 1 for a free tag; low or negative if something covers the border or the margin, and −1
+  /// if the margin is cut off by the image's edge.
   double border_contrast = 0;
 };
 
-/// AprilTag's detector with what it allocates. One object per thread; detect() is deterministic.
+/// AprilTag's detector and its memory. One object per thread; detect() is deterministic.
 class TagDetector {
  public:
   /// `max_hamming`: bits corrected, 0 … 2. `min_white_black_difference`: [grey levels], below it a

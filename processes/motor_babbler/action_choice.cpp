@@ -41,7 +41,7 @@ bool has_parameters(const Edge& edge) {
          edge.parameter_covariance.cols() == 6 + 8 * static_cast<Eigen::Index>(edge.joints.size());
 }
 
-/// log det growth of six regressions on φ, and what they were taken at.
+/// Growth of log det of six regressions on φ, and the φ they were taken at.
 class PotentialInformation {
  public:
   explicit PotentialInformation(Eigen::Index num_terms)
@@ -99,7 +99,7 @@ std::map<int, double> VisibilityModel::probabilities(const Eigen::VectorXd& acti
       seen += is_seen ? weight : 0;
       num_seen += is_seen;
     }
-    // Where nothing is like it, the share overall, with one seen and one unseen added.
+    // Without similar actions: the share overall, with one seen and one unseen added.
     const double share = (num_seen + 1) / (static_cast<double>(past_.size()) + 2);
     result[part] = (seen + kPriorCount * share) / (all + kPriorCount);
   }
@@ -132,7 +132,7 @@ std::size_t choose_action(const BodySchema& schema, const std::vector<SeenAction
       Edge& edge = edges[e];
       if (!seen.parts.count(edge.from) || !seen.parts.count(edge.to)) continue;
       of_edge[e].add(phi);
-      // The schema's covariance knows of the samples that it rests on.
+      // The schema's covariance includes the samples that it rests on.
       if (seen.sample_index <= schema.last_sample_index || !has_parameters(edge)) continue;
       const Eigen::MatrixXd JC = edge.parameter_jacobian(theta) * edge.parameter_covariance;
       const Matrix6d S = noise_of(edge, theta) + edge.prediction_covariance(theta);

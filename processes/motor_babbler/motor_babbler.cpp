@@ -21,7 +21,7 @@ constexpr std::int64_t kEyesSilent_us = 5'000'000;  // frames and SAMPLE repeat 
 
 constexpr std::size_t kNumCandidates = 40;
 constexpr std::int64_t kCandidates = 1;  // another stream of random numbers than that of the draw
-// Of the memory: what the arm looked like long ago says little, and a choice takes time for each.
+// Size of the memory: old actions matter little, and a choice takes time for each.
 constexpr std::size_t kMaxMemory = 500;
 
 std::int64_t microseconds(double seconds) { return std::llround(seconds * 1e6); }
@@ -111,8 +111,8 @@ std::optional<action_command_t> MotorBabbler::on_motion_status(const motion_stat
   is_stopped_ = status.stop_latched == 1;
   if (done_) return std::nullopt;
   if (wait_ == Wait::kDriver && !is_restored_) {
-    // Driver's time makes the epoch the same in every simulated run of a seed. Where no state was
-    // kept, at least no id of a predecessor's is used again.
+    // Driver's time makes the epoch the same in every simulated run of a seed. Without kept state
+    // it at least avoids a predecessor's ids.
     epoch_ = status.utime;
     if (status.source == kSource) action_id_ = std::max(action_id_, status.action_id + 1);
   }
@@ -126,12 +126,13 @@ std::optional<action_command_t> MotorBabbler::on_motion_status(const motion_stat
   wait_since_us_ = -1;  // the driver is not silent
   switch (status.state) {
     case motion_status_t::STATE_REJECTED:
-      // Asking again while the arm moves would only be refused again.
+      // A repetition while the arm moves would only be refused again.
       if (!is_at_rest_) return std::nullopt;
       ++num_rejected_;
       rejection_ = status.reason;
       if (++num_rejected_in_a_row_ <= kMaxHastyRejections) return act();
-      // A driver that refuses everything is asked at leisure: on_tick sends what act() chose.
+      // A driver that refuses everything is asked slowly: on_tick sends the action that act()
+      // chose.
       act();
       return std::nullopt;
     case motion_status_t::STATE_EXPIRED:
@@ -225,7 +226,7 @@ std::optional<action_command_t> MotorBabbler::on_body_schema(const body_schema_t
 
 std::optional<action_command_t> MotorBabbler::remember(const sample_t& sample) {
   if (config_.choice == Choice::kRandom) return std::nullopt;
-  // What comes from a samples file has not passed the rig's door.
+  // Samples of a samples file have not passed the rig's door.
   if (sample.num_signals != static_cast<std::int32_t>(config_.signals.size()))
     throw std::invalid_argument("a sample of another rig: " + std::to_string(sample.num_signals) +
                                 " signals");
@@ -244,7 +245,7 @@ std::optional<action_command_t> MotorBabbler::remember(const sample_t& sample) {
 std::optional<action_command_t> MotorBabbler::on_sample(const sample_t& sample) {
   has_heard_observer_ = has_ever_heard_observer_ = true;
   if (wait_ == Wait::kDriver && !is_restored_) {
-    // All that tells a babbler without kept state about its predecessor.
+    // The only trace of a predecessor for a babbler without kept state.
     num_samples_ = std::max(num_samples_, sample.sample_index + 1);
     if (sample.source == kSource) action_id_ = std::max(action_id_, sample.action_id + 1);
   }
@@ -267,8 +268,8 @@ void MotorBabbler::on_marker_poses(const marker_poses_t& poses) {
 }
 
 std::optional<action_command_t> MotorBabbler::on_model_health(const model_health_t& health) {
-  // The first verdict on a TEST sample counts until the next: what the monitor finds in between it
-  // may find before or after the next action is chosen.
+  // The first verdict on a TEST sample counts until the next: later findings of the monitor may
+  // come before or after the next action is chosen.
   if (last_test_sample_ < 0 || !has_verdict() || health.judged_sample != health_.judged_sample) {
     health_ = health;
     take_schema();
@@ -287,7 +288,7 @@ std::optional<action_command_t> MotorBabbler::on_control_status(const control_st
   control_since_us_ = -1;
   if (done_ || is_lent_) return std::nullopt;
   if (wait_ == Wait::kDriver) return begin();
-  // What was not finished when the arm was taken is replaced.
+  // An action that was not finished when the arm was taken is replaced.
   if (was_lent && (wait_ == Wait::kAnswer || wait_ == Wait::kSample)) wait_ = Wait::kRest;
   return wait_ == Wait::kRest && may_move() ? act() : std::nullopt;
 }
@@ -344,8 +345,8 @@ std::string MotorBabbler::blindness() const {
 bool MotorBabbler::should_stop() const {
   const StoppingRule& stop = config_.stop;
   if (num_samples_ >= stop.max_samples) return true;
-  // Only right after a TEST sample is a verdict waited for; which others arrive, and when, depends
-  // on the speed of learner and monitor.
+  // A verdict is awaited only right after a TEST sample; the arrival of others depends on the speed
+  // of learner and monitor.
   const bool is_judged = last_sample_ >= 0 && last_test_sample_ == last_sample_ && has_verdict();
   return is_judged && num_samples_ >= stop.min_samples && health_.schema_complete &&
          health_.num_test_samples >= stop.min_test_samples && health_.worst_position_m >= 0 &&

@@ -32,7 +32,7 @@ struct StoppingRule {
   double rotation_rad = 0;
 };
 
-/// How the next action is found: drawn, or chosen by what the body schema expects to learn from it.
+/// Choice of the next action: drawn, or by the information that the body schema expects from it.
 enum class Choice { kRandom, kActive };
 
 struct MotorBabblerConfig {
@@ -56,13 +56,13 @@ struct MotorBabblerConfig {
 /// rejected action changes nothing about the others.
 Eigen::VectorXd random_action(const MotorBabblerConfig& config, std::int64_t seed,
                               std::int64_t action_id);
-/// What action `action_id` is chosen from: 40, uniform over the ranges. (With half of them near the
-/// ends fewer structures are right where the view is narrow: tests/experiments/README.md.)
+/// Candidates for action `action_id`: 40, uniform over the ranges. (With half of them near the ends
+/// fewer structures are right if the view is narrow: docs/results.md, Active babbling.)
 std::vector<Eigen::VectorXd> candidate_actions(const MotorBabblerConfig& config, std::int64_t seed,
                                                std::int64_t action_id);
 
 /// Motor babbling: actions within the limits, one at a time, each answered by the driver and
-/// followed by its SAMPLE, until the stopping rule holds. Collisions are the driver's to refuse: a
+/// followed by its SAMPLE, until the stopping rule holds. The driver refuses collisions: a
 /// rejected action is replaced by the next.
 ///
 /// Before the first MOTION_STATUS it does nothing (start guard), and it listens until it knows
@@ -72,7 +72,7 @@ std::vector<Eigen::VectorXd> candidate_actions(const MotorBabblerConfig& config,
 /// It does not move blind: a settled action whose SAMPLE does not come is replaced only after
 /// sample_timeout in which frames of that rest and the observer (which repeats its newest SAMPLE at
 /// 1 Hz) were heard. Otherwise it waits for them; when they are back that SAMPLE is made after all.
-/// Where no SAMPLE was ever heard nothing tells whether the observer lives: one action is replaced.
+/// Before the first SAMPLE the observer cannot be heard: then one action is replaced.
 ///
 /// While a STOP is latched it waits for RESUME; while the controller owns the arm it sends nothing,
 /// however long the controller is silent. An action that was cut short by that is replaced by the
@@ -82,18 +82,18 @@ std::vector<Eigen::VectorXd> candidate_actions(const MotorBabblerConfig& config,
 /// With Choice::kActive an action is chosen (choose_action) by the body schema that the monitor
 /// published with its verdict on the newest TEST sample, and by the 500 newest samples: both are
 /// the same in every run of a seed, however fast learner and monitor are. Drawn at random are:
-/// what comes before the first schema; TEST actions, so that held-out data do not depend on what
-/// is judged by them; what replaces an action that was refused, cut short or not seen, so that no
-/// refusal is chosen again and again; and the actions up to the next TEST where schema or verdict
-/// did not come within verdict_timeout (counted).
+/// actions before the first schema; TEST actions, so that held-out data do not depend on the
+/// schema that they judge; replacements of actions that were refused, cut short or not seen, so
+/// that no refusal is chosen again and again; and the actions up to the next TEST if schema or
+/// verdict did not come within verdict_timeout (counted).
 ///
-/// Where the verdict on a TEST sample comes with a probe (MODEL_HEALTH), the action that tells two
+/// If the verdict on a TEST sample comes with a probe (MODEL_HEALTH), the action that tells two
 /// explanations of a change apart, the next action is that one, with purpose PROBE. Refused, it is
 /// replaced as any other; still wanted after the next TEST sample, it is made again.
 ///
 /// A restart with the kept state goes on as if nothing had happened: it sends the last command
-/// again, unless that command's SAMPLE has come. Samples are counted where they are its own, so
-/// that every test_every-th of them is TEST whatever others do in between.
+/// again, unless that command's SAMPLE has come. Only its own samples are counted, so that every
+/// test_every-th of them is TEST whatever other sources do in between.
 class MotorBabbler {
  public:
   MotorBabbler(MotorBabblerConfig config, std::int64_t seed);
@@ -104,25 +104,25 @@ class MotorBabbler {
   void on_marker_poses(const marker_poses_t& poses);
   std::optional<action_command_t> on_model_health(const model_health_t& health);
   std::optional<action_command_t> on_body_schema(const body_schema_t& schema);
-  /// Every SAMPLE, anybody's, once and in order of its index, as SampleIntake hands them on: what
-  /// a choice rests on. on_sample() hears of the newest when it comes, and of its repetitions.
+  /// Every SAMPLE of any source, once and in order of its index, as SampleIntake delivers them: the
+  /// basis of a choice. on_sample() gets the newest when it comes, and its repetitions.
   std::optional<action_command_t> remember(const sample_t& sample);
   std::optional<action_command_t> on_control_status(const control_status_t& status);
-  /// `now_us`: the clock. Sees silence.
+  /// `now_us`: the clock. Detects silence.
   std::optional<action_command_t> on_tick(std::int64_t now_us);
 
   bool is_done() const { return done_; }
-  /// What it does or waits for, for people.
+  /// Activity for people.
   std::string activity() const;
-  /// Of its own, those of predecessors included.
+  /// Samples of its own actions, those of predecessors included.
   std::int64_t num_samples() const { return num_samples_; }
   std::int64_t num_rejected() const { return num_rejected_; }
   /// Settled actions whose SAMPLE never came.
   std::int64_t num_unseen() const { return num_unseen_; }
-  /// TEST samples after which the body schema to choose by did not come in time.
+  /// TEST samples after which the body schema did not come in time.
   std::int64_t num_without_schema() const { return num_without_schema_; }
 
-  /// What a restart needs, as YAML; to be on disk before a command is sent. "" before the first.
+  /// State for a restart, as YAML; to be on disk before a command is sent. "" before the first.
   std::string state_text() const;
   /// Continues from a file with state_text(). @throws ConfigError, also if it is of another seed.
   void restore(const std::filesystem::path& file);
@@ -132,23 +132,23 @@ class MotorBabbler {
 
   std::optional<action_command_t> begin();
   std::optional<action_command_t> act();
-  /// act(), once all is there that the next action rests on.
+  /// act(), once everything that the next action rests on has come.
   std::optional<action_command_t> go_on();
   bool has_verdict() const { return health_.judged_sample >= last_test_sample_; }
   /// The next action is to be chosen, not drawn.
   bool is_to_choose() const;
-  /// Verdict, its schema (if there is one at all) and every sample so far are there.
+  /// Verdict, its schema (if there is one at all) and every sample so far have come.
   bool can_choose() const;
-  /// Takes the schema of the verdict once both are there.
+  /// Takes the schema of the verdict once both have come.
   void take_schema();
-  /// After the verdict on a TEST sample that wants a probe, the next action is that.
+  /// Makes the probe that the verdict on a TEST sample wants the next action.
   bool is_to_probe() const;
   Eigen::VectorXd next_action() const;
   std::int8_t next_purpose() const;
   bool may_move() const { return is_at_rest_ && !is_stopped_ && !is_lent_; }
   bool is_mine(const motion_status_t& status) const;
   bool should_stop() const;
-  /// "" or who does not show that a SAMPLE can come.
+  /// Reason why no SAMPLE can come, for people; "" if none is known.
   std::string blindness() const;
 
   const MotorBabblerConfig config_;

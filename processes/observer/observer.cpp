@@ -78,7 +78,7 @@ std::optional<sample_t> Observer::on_marker_poses(const marker_poses_t& poses) {
     return std::nullopt;
   }
   if (!frames_.empty() && frames_.rbegin()->first - poses.utime > kMaxApartUs) {
-    // Each frame from now on would be the oldest and the first to leave the buffer.
+    // Otherwise each new frame would be the oldest and the first to leave the buffer.
     frames_.clear();
     ++counters_["camera time ran backwards"];
   }
@@ -99,7 +99,7 @@ void Observer::end_rests(const motion_status_t& status) {
     } else if (status.rest_since_utime < 0) {
       rest.end_utime = status.utime;  // the motion has begun by then
     } else {
-      // It moved in between and we did not hear of it.
+      // The arm moved in between without a status.
       rest.end_utime = rest.known_until_utime;
     }
   }
@@ -107,7 +107,7 @@ void Observer::end_rests(const motion_status_t& status) {
 
 std::optional<sample_t> Observer::on_motion_status(const motion_status_t& status) {
   if (status.utime < driver_utime_) {
-    // The driver began anew: frames of its earlier life may carry times that come again.
+    // The driver began anew: frames of its earlier life may have times that come again.
     frames_.clear();
     rests_.clear();
     ++counters_["driver time ran backwards"];
@@ -129,7 +129,7 @@ std::optional<sample_t> Observer::on_motion_status(const motion_status_t& status
     if (same == rests_.end()) {
       rests_.push_back({status, kNotEnded, status.utime});
     } else if (status.rest_since_utime > same->status.rest_since_utime) {
-      // Something disturbed it before it was seen: it rests anew, where the action led.
+      // Disturbed before it was seen: the arm rests anew at the same action.
       *same = {status, kNotEnded, status.utime};
     }
     if (rests_.size() > kMaxRests) {
@@ -157,7 +157,7 @@ std::optional<sample_t> Observer::make_sample() {
     const auto frames = frames_of(*rest);
     if (frames.size() < static_cast<std::size_t>(config_.frames_per_sample)) continue;
     const Rest complete = *rest;
-    // Those before it were overtaken; nothing more will be seen of them.
+    // Earlier rests were overtaken and get no more frames.
     counters_["action never seen"] += rest - rests_.begin();
     rests_.erase(rests_.begin(), rest + 1);
     remember(key_of(complete.status));
@@ -189,7 +189,7 @@ sample_t Observer::sample_from(const Rest& rest, const std::vector<const marker_
     Matrix8d covariance_px2 = Matrix8d::Zero();
     double motion_px = 0;
     for (const marker_pose_t* marker : seen) {
-      // Not divided by their number: what a corner is off is mostly the same in all frames.
+      // Not divided by their number: a corner's error is mostly the same in all frames.
       covariance_px2 += from_message(marker->corner_covariance) / static_cast<double>(seen.size());
       for (int c = 0; c < 4; ++c) {
         for (int axis = 0; axis < 2; ++axis) {

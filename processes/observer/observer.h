@@ -31,22 +31,21 @@ struct ObserverConfig {
   static ObserverConfig load(const std::filesystem::path& file);
 };
 
-/// Joins each settled action with what was seen while the arm was at rest: one SAMPLE for every
+/// Joins each settled action with the frames taken while the arm was at rest: one SAMPLE for every
 /// (source, epoch, action_id) of kind MOVE, from the first frames_per_sample frames whose utime
 /// lies in the rest interval. Tags become body parts here: one pose a part, over all its visible
 /// tags.
 ///
 /// Times of frames and of MOTION_STATUS must come from one clock. Messages may arrive in either
-/// order: frames and rest intervals wait for each other in bounded buffers. A frame that was seen
-/// before (same utime) is ignored. A frame 10 s before the newest one says that the camera's clock
-/// was set back: the frames of before are forgotten. One 10 s ahead of the driver is dropped. A
-/// rest interval ends when a later motion begins, or where the driver says that the arm rests anew;
-/// what was not seen by then never becomes a sample. Nothing is invented: without frames, status or
-/// calibration it waits, and activity() says for what. With the same messages the samples are the
-/// same bytes.
+/// order: frames and rest intervals wait for each other in bounded buffers. A repeated frame (same
+/// utime) is ignored. A frame 10 s before the newest one means that the camera's clock was set
+/// back: earlier frames are forgotten. One 10 s ahead of the driver is dropped. A rest interval
+/// ends when a later motion begins, or when the driver reports a new rest; without enough frames by
+/// then it never becomes a sample. Nothing is invented: without frames, status or calibration it
+/// waits, and activity() says for which. The same messages give the same samples, byte by byte.
 class Observer {
  public:
-  /// `calibration_id`: of the rig; 0: not told.
+  /// `calibration_id`: of the rig; 0: unknown.
   Observer(const ObserverConfig& config, Markers markers, std::int64_t calibration_id = 0);
 
   /// Continues after a sample of an earlier run; called for each, in the order of their indices.
@@ -60,10 +59,10 @@ class Observer {
   /// `now_us`: the clock.
   std::optional<std::string> on_tick(std::int64_t now_us);
 
-  /// What it does or waits for, for people.
+  /// Activity for people.
   std::string activity() const;
   bool is_waiting() const { return !lens_ || num_samples_ == 0 || !rests_.empty(); }
-  /// What was left out and why, since the start.
+  /// Reason → number of rejected tags, parts and frames since the start.
   const std::map<std::string, std::int64_t>& counters() const { return counters_; }
 
  private:

@@ -7,7 +7,7 @@
 namespace bodyschema {
 namespace {
 
-/// Covariance of a tag's corners about where markers.yaml has them, seen from X_CM: of their
+/// Covariance of a tag's corners about their positions by markers.yaml, seen from X_CM: of their
 /// measurement, of the tag's place on its part and of its size.
 Matrix8d covariance_of(const SeenTag& tag, const TagCalibration& calibration, const Pose& X_CM) {
   const std::vector<Eigen::Vector3d> p_MP = tag_corners(tag.size_m);
@@ -25,7 +25,7 @@ Matrix8d covariance_of(const SeenTag& tag, const TagCalibration& calibration, co
          sigma2 * (J * variances.asDiagonal() * J.transpose() + of_size * of_size.transpose());
 }
 
-/// The corners of tags with their covariances about what markers.yaml says.
+/// The corners of tags with their covariances about the positions by markers.yaml.
 struct Points {
   std::vector<Eigen::Vector3d> p_BP;
   std::vector<ImagePoint> measured;
@@ -51,7 +51,7 @@ Points points_of(const std::vector<SeenTag>& tags, const TagCalibration& calibra
   return points;
 }
 
-/// All local minima that the tags' hypotheses lead to, best first.
+/// All local minima reached from the tags' hypotheses, best first.
 std::vector<PoseFit> minima_of(const std::vector<SeenTag>& tags,
                                const TagCalibration& calibration) {
   std::vector<PoseFit> minima;
@@ -119,7 +119,7 @@ std::optional<PartPose> solve_part_pose(std::vector<SeenTag> tags, const PartPos
     if (rotation_angle(result.X_CB.inverse() * minima[i].X_CB) < options.min_other_rotation_rad) {
       continue;
     }
-    // Errors far below the noise say nothing, and 0 would make any ratio infinite.
+    // Errors far below the noise are not informative, and 0 would make any ratio infinite.
     constexpr double kLeast = 1e-2;
     const double ratio =
         std::max(minima[i].rms_sigma, kLeast) / std::max(minima[0].rms_sigma, kLeast);

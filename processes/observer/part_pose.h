@@ -15,7 +15,7 @@ struct SeenTag {
   double size_m = 0;
   Pose X_BM = Pose::Identity();
   std::vector<ImagePoint> corners;  ///< four, AprilTag's order
-  /// Of the corners' measurement; their sigma_px is sigma_px() of it.
+  /// Covariance of the corners' measurement; their sigma_px is sigma_px() of it.
   Matrix8d corner_covariance_px2 = Matrix8d::Identity();
   std::vector<Pose> X_CM;  ///< hypotheses of its pose: the starts of the fit
 };
@@ -39,9 +39,9 @@ struct PartPose {
 /// The pose of a part over all its tags at once: the minimum of the reprojection error of all
 /// corners, searched from every hypothesis of every tag. Tags in different planes leave one
 /// minimum; a single tag seen from afar has two. While a tag disagrees with the common pose the one
-/// whose absence helps most is dropped; of two that fit each alone, either may be the wrong one:
-/// the one or the other by turns, so that who knows the body can tell. std::nullopt if nothing is
-/// left that fits.
+/// whose absence helps most is dropped. If two tags each fit alone, either may be the wrong one:
+/// the one or the other is used in turn, so that a process that knows the body can decide.
+/// std::nullopt if no tag is left that fits.
 std::optional<PartPose> solve_part_pose(std::vector<SeenTag> tags, const PartPoseOptions& options,
                                         std::int64_t turn = 0);
 

@@ -134,7 +134,7 @@ void SampleOutbox::send_again() {
       ++counters_["sent again SAMPLE"];
     }
   } catch (const std::runtime_error& error) {
-    // Who asks gives up in the end and says so.
+    // The asking process gives up in the end and says so.
     if (++counters_["unreadable SAMPLE"] == 1) spdlog::warn("{}", error.what());
   }
 }

@@ -16,21 +16,21 @@
 
 namespace bodyschema {
 
-/// What leaves the observer: each sample once it is on disk, the newest one again at 1 Hz, and
-/// those that somebody asks for, at most 250 a second.
+/// Sends the observer's samples: each once it is on disk, the newest one again at 1 Hz, and
+/// requested ones, at most 250 a second.
 ///
-/// A sample that cannot be written (the disk is full) is held back, and those after it; that is
-/// tried again every second. Who acts on a sample finds it in the log after a crash.
+/// A sample that cannot be written (the disk is full) is held back, with those after it, and tried
+/// again every second. So a sample that was used is in the log after a crash.
 class SampleOutbox {
  public:
   using Publish = std::function<void(const sample_t&)>;
 
-  /// `file`: samples.lcmlog, continued; empty: nothing is kept but the newest sample. Of a damaged
-  /// file what can be read is kept, and the whole of it in FILE.bad-1.
+  /// `file`: samples.lcmlog, continued; empty: only the newest sample is kept. The readable samples
+  /// of a damaged file are kept, and the whole of it in FILE.bad-1.
   /// @throws std::runtime_error if the file cannot be opened or another process writes it.
   SampleOutbox(std::filesystem::path file, Publish publish);
 
-  /// What the file held at the start, in order of the indices, one at a time.
+  /// Samples of the file at the start, in order of the indices, one at a time.
   void for_each_recorded(const std::function<void(const sample_t&)>& visit) const;
 
   void send(const sample_t& sample);

@@ -3,13 +3,13 @@
 //   imaginary_robot --link /tmp/robot --signals 3 --speed 20
 //
 // makes a pseudo terminal, puts a symbolic link to it at --link and speaks this protocol on it, one
-// line each way; N counts the orders, so that an answer can be told from an older one:
+// line each way; N counts the orders, so that an answer can be distinguished from an older one:
 //
 //   GO N Q1 … QM    move all joints to Q1 … QM [deg], together, the farthest at --speed
 //   HALT N          stop where you are
 //   ?               where are you?  →  AT N REST|MOVING Q1 … QM, N of the newest order
 //
-// It moves in real time. Like many a robot it goes on with its motion when nobody listens any more.
+// It moves in real time. Like many a robot it finishes its motion when nobody listens any more.
 
 #include <fcntl.h>
 #include <poll.h>
@@ -51,7 +51,7 @@ class Arm {
     }
   }
 
-  /// The robot's answer; "" where it has none.
+  /// The robot's answer; "" if it has none.
   std::string obey(const std::string& line) {
     std::istringstream words(line);
     std::string verb;
@@ -105,7 +105,7 @@ int open_terminal(std::string* name) {
 void play(const std::string& link, std::size_t num_signals, double speed) {
   std::string name;
   const int master = open_terminal(&name);
-  // Renamed into place: whoever finds the link finds a robot behind it.
+  // Renamed into place: behind a link that exists there is a robot.
   const std::string temporary = link + "." + std::to_string(::getpid());
   std::filesystem::create_symlink(name, temporary);
   std::filesystem::rename(temporary, link);

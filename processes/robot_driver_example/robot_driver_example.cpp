@@ -14,12 +14,12 @@ using Command = action_command_t;
 using Status = motion_status_t;
 
 constexpr std::size_t kMaxServed = 4096;
-/// How far ahead of driver's time the record reaches when it is written; a driver that is started
-/// again is ahead of the clock by no more than this. And what is left of it when it is renewed.
+/// Largest lead of the record over driver's time, when it is written: a restarted driver is ahead
+/// of the clock by no more than this. And the lead that is left when the record is renewed.
 constexpr std::int64_t kAheadUs = 5'000'000;
 constexpr std::int64_t kLeftUs = 1'000'000;
-/// Driver's time that is ahead of the clock by less than this goes at half speed until they meet;
-/// ahead by more, the clock was set back and is no guide.
+/// Driver's time that is ahead of the clock by less than this runs at half speed until they meet;
+/// a larger lead means that the clock was set back, and it is ignored.
 constexpr std::int64_t kMeetUs = 10'000'000;
 
 bool is_refusal(const Status& status) {
@@ -79,7 +79,7 @@ RobotDriver::RobotDriver(RobotDriverConfig config, std::optional<motion_status_t
   // A report that was on its way when the last driver died must not pass for an answer.
   order_ = start_ / 1000;
   if (record) {
-    // R15: what nobody watched is not vouched for.
+    // R15: nobody watched the end of the motion.
     if (record->state == Status::STATE_ACCEPTED || record->state == Status::STATE_MOVING ||
         record->state == Status::STATE_SETTLED) {
       record->state = Status::STATE_STOPPED;
@@ -115,7 +115,7 @@ std::string RobotDriver::refusal(const Command& command) const {
       return text.str();
     }
   }
-  // Here a driver refuses what would collide: with the robot's own check, or a model of the cell.
+  // A driver refuses collisions here: with the robot's own check, or a model of the cell.
   return "";
 }
 
@@ -149,7 +149,7 @@ void RobotDriver::conclude(const Command& command, std::int8_t state, const std:
   if (is_refusal(status)) return;  // R4: told, not repeated
   status_ = status;
   said_at_ = steady_;
-  // What must be on disk before the arm moves was written by on_command.
+  // The record that must be on disk before the arm moves was written by on_command.
   if (state != Status::STATE_MOVING) answer.must_save = true;
 }
 
@@ -268,10 +268,10 @@ void RobotDriver::lose(const std::string& reason, Answer& answer) {
   if (is_lost_) return;
   is_lost_ = true;
   rest_since_utime_ = -1;
-  // That nothing is heard of it does not mean that it hears nothing.
+  // A silent robot may still hear.
   if (is_open_) answer.lines.push_back(halt());
   interrupt(reason, answer);
-  // Where the arm is now nobody knows: it is neither settled nor holding.
+  // The position of the arm is unknown: it is neither settled nor holding.
   status_.state = Status::STATE_STOPPED;
   status_.reason = reason;
   refresh_status(answer);

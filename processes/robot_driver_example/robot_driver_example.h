@@ -27,48 +27,48 @@ struct RobotDriverConfig {
 };
 
 /// A driver that keeps lcmtypes/DRIVER.md (its rules are cited as R1 …), for the robot that
-/// imaginary_robot plays. To make it yours, replace what is under "The robot's protocol" and
-/// convert command units where your robot has others.
+/// imaginary_robot plays. To make it yours, replace the part under "The robot's protocol" and
+/// convert command units if your robot has others.
 ///
 /// Before its first report the robot is lost: nothing moves, `rest_since_utime` is −1. A robot that
-/// was lost is halted before anything else, and nothing that was under way is taken up again. When
-/// commands stop, the arm ends its motion and stays there: one MOVE is one motion, known to be safe
-/// as a whole, so there is nothing to watch between two commands.
+/// was lost is halted before anything else, and no earlier motion is resumed. When commands stop,
+/// the arm ends its motion and stays there: one MOVE is one motion, known to be safe as a whole, so
+/// nothing needs watching between two commands.
 class RobotDriver {
  public:
-  /// The watchdogs go by the steady clock, which nobody can set; `utime` goes by the system clock,
-  /// which stamps the camera's frames. Both [µs].
+  /// The watchdogs use the steady clock, which nobody can set; `utime` uses the system clock, which
+  /// stamps the camera's frames. Both [µs].
   struct Now {
     std::int64_t steady_us;
     std::int64_t clock_us;
   };
-  /// To be done in this order: lines to the robot, then save(), then statuses to the bus. A robot
-  /// that is to halt must not wait for a disk, nor for the network.
+  /// Order of the work: lines to the robot, then save(), then statuses to the bus. A HALT must not
+  /// wait for a disk, nor for the network.
   struct Answer {
     std::vector<std::string> lines;
     std::vector<motion_status_t> statuses;
     bool must_save = false;
   };
-  /// Keeps the newest status over a restart; "" or what went wrong. The `utime` of what is kept is
-  /// a time that this driver has not reached yet: the next one begins there, or later.
+  /// Keeps the newest status over a restart; returns "" or the problem. The `utime` of the record
+  /// is a time that this driver has not reached yet: the next one begins there, or later.
   using Save = std::function<std::string(const motion_status_t&)>;
 
-  /// `record`: what Save kept last.
+  /// `record`: the last one that Save kept.
   RobotDriver(RobotDriverConfig config, std::optional<motion_status_t> record, Save save, Now now);
 
   Answer on_command(const action_command_t& command, Now now);
   /// The port was opened.
   Answer on_connect(Now now);
-  /// A line of the robot's.
+  /// A line from the robot.
   Answer on_line(const std::string& line, Now now);
   /// The port is gone.
   Answer on_disconnect(const std::string& problem, Now now);
-  /// Every 0.1 s: asks the robot, sees silence, repeats.
+  /// Every 0.1 s: asks the robot for its position, detects silence, repeats the status.
   Answer on_tick(Now now);
   /// The driver is told to end.
   Answer on_end(Now now);
-  /// Keeps the record if `answer` wants that. Where a STOP could not be kept the answer says so; it
-  /// is tried again with the ticks.
+  /// Keeps the record if `answer` wants that. If a STOP could not be kept the answer says so, and
+  /// the ticks try again.
   void save(Answer& answer);
 
   const motion_status_t& status() const { return status_; }

@@ -50,8 +50,8 @@ bool SerialLine::open() {
 
 bool SerialLine::write_line(const std::string& text) {
   const std::string line = text + "\n";
-  // A command is far shorter than the kernel's buffer: what does not fit at once means that the
-  // robot has stopped reading.
+  // A command is far shorter than the kernel's buffer: if it does not fit at once, the robot has
+  // stopped reading.
   if (file_ >= 0 && ::write(file_, line.data(), line.size()) == static_cast<ssize_t>(line.size())) {
     return true;
   }

@@ -17,7 +17,7 @@ namespace bodyschema {
 namespace {
 
 constexpr double kStartTime_s = 1;
-/// Answers that are remembered, and of these the newest that a restart remembers.
+/// Number of answers that are remembered, and of the newest that survive a restart.
 constexpr std::size_t kMaxServed = 4096;
 constexpr std::size_t kMaxSaved = 64;
 constexpr double kFaultTakes_s = 1;
@@ -38,7 +38,7 @@ SceneDescription as_built(const RobotSimulatorConfig& config) {
 
 std::string name_of(const std::string& text) { return text.empty() ? "''" : text; }
 
-/// Who was served: what an id means.
+/// True if the status answers this command; an id counts within source and epoch.
 bool is_same_command(const motion_status_t& status, const std::string& source, std::int64_t epoch,
                      std::int64_t action_id) {
   return status.action_id == action_id && status.epoch == epoch && status.source == source;
@@ -131,7 +131,7 @@ std::optional<std::string> RobotSimulator::move(Body& body, const Eigen::VectorX
     mj_step1(&model, &trial);
     if (const auto problem = body.scene.collision(trial)) return problem;
     // Gravity and Coriolis forces are known to a real arm's controller as well; this version of
-    // MuJoCo has no option for it. What is left of them lets the arm droop.
+    // MuJoCo has no option for it. The uncompensated share lets the arm droop.
     mju_scl(trial.qfrc_applied, trial.qfrc_bias, compensated_share, model.nv);
     mj_step2(&model, &trial);
 
@@ -166,7 +166,7 @@ motion_status_t RobotSimulator::answer_to(const action_command_t& command, std::
   status.stop_latched = stop_latched_;
   std::vector<double> commanded =
       command.kind == action_command_t::KIND_MOVE && command.action_id >= 0 ? command.action : at_;
-  // What is not a number must not travel on.
+  // NaN must not travel on.
   for (double& value : commanded) {
     if (!std::isfinite(value)) value = 0;
   }
@@ -179,14 +179,14 @@ motion_status_t RobotSimulator::answer_again(const motion_status_t& served) cons
   again.utime = microseconds(body_.data->time);
   again.rest_since_utime = rest_since_utime_;
   again.stop_latched = stop_latched_;
-  // Who hears SETTLED or HOLDING may look at the arm: it must be there.
+  // A receiver of SETTLED or HOLDING may look at the arm: it must be there.
   const bool is_where = served.state == motion_status_t::STATE_SETTLED ||
                         served.state == motion_status_t::STATE_HOLDING;
   if (is_where && served.commanded != at_) {
     again.state = motion_status_t::STATE_STOPPED;
     again.reason = "was carried out; the arm has moved on since";
   }
-  // What is not the echo of an action says where the arm is.
+  // An answer that echoes no action has the arm's position.
   if (served.kind != action_command_t::KIND_MOVE) again.commanded = at_;
   return again;
 }
@@ -244,7 +244,7 @@ RobotSimulator::Answer RobotSimulator::on_command(const action_command_t& comman
     return answer;
   }
 
-  // What drifts does so while the arm moves, unless an obstacle keeps it from bending further.
+  // Drifts proceed while the arm moves, unless an obstacle keeps a link from bending further.
   std::vector<Fault> faults = faults_;
   std::optional<Body> drifted;
   if (drift(faults)) drifted = body_with(faults, nullptr);
@@ -328,7 +328,8 @@ RobotSimulator::Answer RobotSimulator::on_fault(const fault_command_t& command) 
 }
 
 void RobotSimulator::remember(const motion_status_t& status) {
-  // A refusal is told once and to whom it asks again; what the arm does is repeated.
+  // A refusal is sent once, and again when asked again; the answer to an accepted command is
+  // repeated.
   if (status.state != motion_status_t::STATE_REJECTED &&
       status.state != motion_status_t::STATE_EXPIRED) {
     status_ = status;

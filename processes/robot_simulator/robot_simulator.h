@@ -41,16 +41,16 @@ struct RobotSimulatorConfig {
 /// The stand-in for a robot: physics with position servos, in lock step. A command that is accepted
 /// is simulated at once until the arm rests, so between two calls the arm is always at rest; time
 /// is simulated time, from 1 000 000 µs on, and stands still between commands. A motion is tried on
-/// a copy first: one that would touch what it must not is rejected and changes nothing.
+/// a copy first: one with a forbidden contact is rejected and changes nothing.
 ///
 /// Before the first command it is idle at the start pose; when commands stop it stays where it is.
 /// The same seed, the same commands and faults give the same answers, bit by bit.
 ///
-/// What is seen (SIM_STATE's X_WG) has the joints' backlash, which the direction of approach
-/// decides; the truth that is told (X_WB) is in the middle of it. Droop is in both.
+/// The visible pose (SIM_STATE's X_WG) has the joints' backlash, which the direction of approach
+/// decides; the true pose of a part (X_WB) is in the middle of it. Both have droop.
 class RobotSimulator {
  public:
-  /// What a command leads to, in the order in which it is to be sent.
+  /// The messages after a command, in the order in which they are to be sent.
   struct Answer {
     std::vector<motion_status_t> statuses;
     std::optional<sim_state_t> state;  ///< only where the arm moved
@@ -62,19 +62,19 @@ class RobotSimulator {
   /// Answers every command as lcmtypes/DRIVER.md says: MOVE with ACCEPTED, MOVING, SETTLED, or
   /// REJECTED, or EXPIRED; HOLD with HOLDING; STOP with STOPPED, and from then on every MOVE is
   /// rejected until RESUME, which is answered with IDLE. A command that was answered before
-  /// (source, epoch and action id) moves nothing: it gets its answer again, STOPPED where it had
+  /// (source, epoch and action id) moves nothing: it gets its answer again, STOPPED if it had
   /// settled and the arm has moved on since.
   Answer on_command(const action_command_t& command);
 
   /// Breaks the arm, or says in the state's fault_answer why not; each (sender, epoch, fault_id)
-  /// once. It takes a second of simulated time, so that what was seen before and after is two
+  /// once. It takes a second of simulated time, so that frames before and after lie in two
   /// intervals of rest.
   Answer on_fault(const fault_command_t& command);
 
   /// Status and state once each repeat_s, by the caller's clock [µs].
   Answer on_tick(std::int64_t now_us);
 
-  /// What is repeated: the newest command that was not refused.
+  /// The repeated status: that of the newest command that was not refused.
   const motion_status_t& status() const { return status_; }
   const sim_state_t& state() const { return state_; }
   /// The arm as it is now; another one after a fault.
