@@ -13,7 +13,7 @@ from launcher.words import Failure, UsageError, say  # noqa: E402
 
 
 def main():
-    # The console's hints say what was typed to get there.
+    # The console's hints repeat the command that the user typed.
     os.environ["BODYSCHEMA_COMMAND"] = "./run"
     try:
         return commands.run(Place.from_environment(), sys.argv[1:])

@@ -27,8 +27,8 @@ def build(place, *targets, preset="release"):
 
 @contextlib.contextmanager
 def alone(folder):
-    """Two Ninjas in one tree spoil each other's record of what is built."""
-    # A file that can be written: NFS locks no other.
+    """Waits until no other ./run builds in this tree: two Ninjas would spoil each other's record."""
+    # NFS locks only a file that can be written.
     held = os.open(folder / ".build.lock", os.O_RDWR | os.O_CREAT, 0o644)
     try:
         try:

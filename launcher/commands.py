@@ -34,11 +34,11 @@ LEARN_USAGES = (
         "learn from a recording, without a robot; X times real time, or 0: at once",
     ),
 )
-# What the console does on the group's bus.
+# Words of the console that need the group's bus.
 ON_THE_BUS = ("target", "hold", "release", "halt", "resume", "fault")
-# Words of ours whose options are the console's.
+# Words of `./run` with the console's options.
 OPTIONS_OF_THE_CONSOLE = ("driver-test", "status", "report", "rig")
-# What follows is another program's; its --help too.
+# Words whose arguments, --help included, belong to another program.
 PASSED_ON = ("exec", "spy", "experiment", "experiments")
 
 
@@ -57,7 +57,7 @@ def help_text():
 
 
 def run(place, arguments):
-    """Does what was typed; returns the exit code."""
+    """Carries out a command line; returns the exit code."""
     if arguments and (arguments[0] in ("", "-h", "--help", "help")):
         print(help_text())
         return 0
@@ -76,7 +76,7 @@ def asks_for_help(arguments):
 
 
 def show_help(place, name):
-    """Of the console's words what it says itself, if it is built: to ask for help builds nothing."""
+    """Prints the help of a word; that of the console's words only if the console is built, because help builds nothing."""
     if (name not in WORDS or name in OPTIONS_OF_THE_CONSOLE) and place.console.exists():
         return console(place, name, ["--help"])
     if name not in WORDS:
@@ -86,7 +86,7 @@ def show_help(place, name):
 
 
 class Parser(argparse.ArgumentParser):
-    """Words its errors as we do, and takes no beginnings of options."""
+    """Reports errors in the words of `./run`; abbreviated options are errors."""
 
     def __init__(self):
         super().__init__(prog="./run", add_help=False, allow_abbrev=False)
@@ -168,7 +168,7 @@ def execute(place, arguments):
 
 
 def exec_in_group(place, group, command):
-    """Becomes a tool of the user's own, with the group's bus as LCM's default."""
+    """Becomes a program of the user, with the group's bus as LCM's default."""
     os.environ["LCM_DEFAULT_URL"] = group.variables["LCM_DEFAULT_URL"]
     os.environ["PATH"] = f"{place.bin}:{os.environ['PATH']}"
     become(group.entered(command))
@@ -176,7 +176,7 @@ def exec_in_group(place, group, command):
 
 def become(command):
     sys.stdout.flush()
-    # Python ignores them, and who is executed would inherit that.
+    # Python ignores them, and an executed program would inherit that.
     for number in (signal.SIGPIPE, signal.SIGXFSZ):
         signal.signal(number, signal.SIG_DFL)
     try:
@@ -214,7 +214,7 @@ def test_driver(place, arguments):
 def test(place, arguments):
     """Builds what the selected tests need, and runs them."""
     os.chdir(place.source)
-    # The tests expect what a console says that was not started by ./run.
+    # The tests expect the texts of a console that was not started by ./run.
     os.environ.pop("BODYSCHEMA_COMMAND", None)
     ctest = ["ctest", "--test-dir", place.build]
     if arguments[:1] == ["--sanitize"]:
@@ -227,7 +227,7 @@ def test(place, arguments):
     if not place.is_build_given:
         with alone(place.source):
             configure(place, preset)
-            # What CMake has to say anew, it says now.
+            # CMake runs again, if it must, before the tests are listed.
             cmake("--build", place.build, "--target", "build.ninja")
         targets = test_selection.targets(place, arguments)
         build(place, *(["all"] if targets is None else targets), preset=preset)
@@ -290,12 +290,12 @@ def report(place, arguments):
 
 
 def console(place, word, arguments):
-    """A word of the console; of a misspelt one says which may be meant."""
+    """Runs a word of the console; suggests the nearest one for a misspelt word."""
     if word in ON_THE_BUS and not asks_for_help(arguments):
         group = Group.find(place.logs)
         if group:
             exec_in_group(place, group, ["bodyschema", word, *arguments])
-        # A lab's own group has a bus that is named.
+        # The user names the bus of a lab's own group.
         if "LCM_DEFAULT_URL" not in os.environ and "--in" not in arguments:
             raise Failure(f"no group runs here; start one with ./run --keep, or name a bus: LCM_DEFAULT_URL=URL ./run {word} …")
     if not asks_for_help(arguments):
@@ -313,7 +313,7 @@ def console_words(place):
     return re.findall(r"^  ([a-z][a-z-]*)", text.partition("\nSubcommands:")[2], re.MULTILINE)
 
 
-# Word → what does it, its arguments, what it does.
+# Word → function, arguments, description.
 WORDS = {
     "stop": (stop, "", "end a kept group; the arm's stop has a word of its own: halt"),
     "exec": (execute, "CMD…", "run a tool on the group's bus, e.g. ./run exec lcm-logger FILE"),
@@ -343,7 +343,7 @@ WORDS = {
     "report": (report, "[RUN]", "what a run tells, on one page; the newest one's"),
     "rig": (check_rig, "RIG", "is the configuration of a rig sound?"),
 }
-# Of the console, whose own help says more.
+# Words of the console, whose own help says more.
 CONSOLE_WORDS = {
     "halt": ("", "stop the arm at once, until ./run resume"),
     "target|hold|release|fault": ("…", "steer or break the group's arm"),

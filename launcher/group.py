@@ -1,4 +1,4 @@
-"""A process group that runs, found by what its processes carry in their environment: nothing that can be deleted."""
+"""A running process group, found by the environment of its processes, which cannot be deleted."""
 
 import contextlib
 import os
@@ -17,12 +17,12 @@ MARK = "BODYSCHEMA_GROUP"
 
 # supervisord gives a process 10 s to end before it kills it.
 ORDERLY_END_S = 15
-# Processes that are asked themselves, because supervisord does not answer.
+# Time for processes to end that are asked directly, because supervisord does not answer.
 HASTY_END_S = 5
 
 
 def environment(pid):
-    """Of one of our own processes, as it was started; empty for any other."""
+    """Environment of one of our own processes at its start; empty for any other."""
     try:
         if os.stat(f"/proc/{pid}").st_uid != os.getuid():
             return {}
@@ -53,7 +53,7 @@ def until(condition, limit_s):
 
 class Group:
     def __init__(self, pid, variables):
-        self.pid = pid  # of whom we started: it lives longer than the others
+        self.pid = pid  # of the process that we started: it lives longer than the others
         self.variables = variables
         self.folder = Path(variables[MARK])
         self.run = Path(variables["BODYSCHEMA_RUN"])
@@ -65,7 +65,7 @@ class Group:
         for pid, variables in processes().items():
             if Path(variables.get("BODYSCHEMA_RUN", "/")).parent != logs:
                 continue
-            # Where supervisord was killed it may be any that is left.
+            # If supervisord was killed, any process that is left.
             with contextlib.suppress(ProcessLookupError):
                 if found is None or os.getsid(pid) == pid:
                     found = cls(pid, variables)
@@ -78,16 +78,16 @@ class Group:
         return not self.pids()
 
     def entered(self, command):
-        """The command that runs `command` where the group's bus is."""
+        """The command that runs `command` on the group's network."""
         return network.entered(self.pid, command)
 
     def was_stopped(self):
-        """Whether somebody called stop(): it marks the folder, then removes it."""
+        """True after stop(), which marks the folder and then removes it."""
         return (self.folder / "stopped").exists() or not self.folder.exists()
 
     def stop(self):
-        """Ends it in order if it can be, within some 25 s in any case."""
-        # Whoever follows it in another shell is to know why.
+        """Ends the group, in order if possible, within some 25 s in any case."""
+        # A ./run that follows the group in another shell reads the reason.
         with contextlib.suppress(OSError):
             (self.folder / "stopped").touch()
         try:
@@ -95,18 +95,18 @@ class Group:
                 proxy.supervisor.shutdown()
             until(self.has_ended, ORDERLY_END_S)
         except (OSError, xmlrpc.client.Error):
-            # It is gone, frozen, or not ours: the others end by themselves when asked.
+            # supervisord is gone, frozen, or not ours: the other processes are asked directly.
             self._signal(signal.SIGTERM, *self._workers())
             until(lambda: not self._workers(), HASTY_END_S)
         self._signal(signal.SIGKILL, *self.pids())
         if not until(self.has_ended, HASTY_END_S):
             raise Failure(f"these processes cannot be ended: {' '.join(map(str, self.pids()))}")
-        # At once, so that it is either marked or gone.
+        # Atomically, so that the folder is either marked or gone.
         with contextlib.suppress(OSError):
             shutil.rmtree(self.folder.rename(f"{self.folder}.stopped"))
 
     def _workers(self):
-        """All but supervisord and what holds its namespace, with which all others would end at once."""
+        """All processes except supervisord and the holder of its namespace, whose end would end all others at once."""
         workers = []
         for pid in self.pids():
             with contextlib.suppress(ProcessLookupError):

@@ -1,8 +1,8 @@
-"""config/group.conf: which processes a group has."""
+"""config/group.conf: the processes of a group."""
 
 
 def processes(file, rig):
-    """Name → command of the group of a rig: without what the rig has no file for."""
+    """Name → command of the group of a rig, without processes for which the rig has no file."""
     group = {}
     for line in file.read_text().splitlines():
         if not line.strip() or line.startswith("#"):
@@ -17,5 +17,5 @@ def processes(file, rig):
 
 
 def speakers(rig, names):
-    """Those of `names` that say how they are: what has a file in the rig."""
+    """Those of `names` that publish PROCESS_INFO: they have a file in the rig."""
     return [name for name in names if (rig / f"{name}.yaml").exists()]

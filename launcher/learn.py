@@ -1,4 +1,4 @@
-"""What runs a group: learning, a replay, the test of a driver."""
+"""Commands that run a group: learning, a replay, the test of a driver."""
 
 import os
 import re
@@ -36,7 +36,7 @@ def pick(commands, names):
 
 
 def asked_of_console(place, *words):
-    """What it answers; where it cannot it says why, and this program ends as it did."""
+    """The answer of a console command; if it fails, this program ends with its exit code."""
     asked = subprocess.run(list(map(str, [place.console, *words])), stdout=subprocess.PIPE, text=True)
     if asked.returncode != 0:
         raise SystemExit(asked.returncode)
@@ -44,7 +44,7 @@ def asked_of_console(place, *words):
 
 
 class Settings:
-    """What `bodyschema rig` says of the group."""
+    """The result of `bodyschema rig` for the group."""
 
     def __init__(self, place, folder, *flags):
         answer = asked_of_console(place, "rig", folder, *flags)
@@ -72,7 +72,7 @@ def learn(place, options):
     ideal = ["--ideal"] if options.ideal else []
     host = ["--host", options.host] if options.host else []
     settings = Settings(place, folder, *hide, *initial, *host, "--group", *commands)
-    # Where the group is split, this host's share goes on after the result; others may need it.
+    # The share of a split group goes on after the result, because other hosts may need it.
     is_share = settings.host != "all"
     if is_share:
         network.check_route()
@@ -120,7 +120,7 @@ def replay(place, log, rig, speed):
         if (recorded / "signals.yaml").exists() and (names := run_folder.differences(recorded, folder)):
             say(f"--rig {rig} differs from {recorded} in {', '.join(names)}; without --rig the replay takes the latter.")
     else:
-        # A run's folder says which rig it was; of another recording its messages do.
+        # A run's folder has its rig; the rig of another recording is found by its messages.
         folder = log.parent / "config"
         if (folder / "signals.yaml").exists():
             rig = rig_of_result(log.parent / "result.json") or log.name
@@ -135,12 +135,12 @@ def replay(place, log, rig, speed):
         names.insert(0, "observer")
     elif not is_played:
         make_samples(place, log, source, run)
-    # Without an observer nobody is there to be asked for a missing sample.
+    # Without an observer missing samples cannot be requested.
     flags = "" if "observer" in names else "--replayed"
     commands = pick(processes(place, folder), names)
     with Session(place, run, lock, True, PRIVATE_BUS, PRIVATE_IMAGES, commands, SAMPLES_FLAGS=flags) as session:
         words = ["--replay", log, "--replay-from", source, "--speed", speed]
-        # What was played would be played again.
+        # The recording would be played again.
         return session.watch(watch_command(place, run, rig, PRIVATE_IMAGES, names, *words), may_restart=not is_played)
 
 
@@ -152,7 +152,7 @@ def rig_of_result(file):
 def make_samples(place, log, source, run):
     samples = run / "samples.lcmlog"
     if source == "SAMPLE":
-        # What is damaged is used as far as it goes; who reads it says so.
+        # The readable part of a damaged file is used, and its reader reports the damage.
         subprocess.run([place.console, "log", log, "--copy", "SAMPLE", "--to", samples], capture_output=True)
         return
     words = run / "observer.log"

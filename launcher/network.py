@@ -10,7 +10,7 @@ PREPARE = 'ip link set lo up multicast on && ip route add 224.0.0.0/4 dev lo && 
 
 
 def in_private_namespace(command):
-    """The command that runs `command` on a network of its own; whatever it starts ends with it."""
+    """The command that runs `command` on a network of its own; its children end with it."""
     user = ["--user", "--map-root-user"]
     if subprocess.run(["unshare", *user, "--net", "true"], capture_output=True).returncode != 0:
         if os.getuid() != 0:

@@ -20,7 +20,7 @@ def is_installed(package):
 
 
 def install(file):
-    """Installs what is missing of a packages*.txt."""
+    """Installs the missing packages of a packages*.txt."""
     missing = [package for package in listed(file) if not is_installed(package)]
     if not missing:
         return

@@ -1,4 +1,4 @@
-"""Where things are."""
+"""Paths of a checkout."""
 
 import os
 from dataclasses import dataclass, replace
@@ -12,7 +12,7 @@ class Place:
     source: Path
     build: Path
     logs: Path
-    is_build_given: bool = False  # somebody else keeps it up to date
+    is_build_given: bool = False  # the caller keeps it up to date
 
     @classmethod
     def from_environment(cls):

@@ -11,7 +11,7 @@ from launcher.words import Failure
 
 
 def lock(logs):
-    """Takes the lock of a folder of runs; None if somebody has it. The group inherits it and holds it as long as it lives."""
+    """Takes the lock of a folder of runs; None if it is taken. The group inherits it and holds it as long as it lives."""
     file = os.open(logs / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -22,7 +22,7 @@ def lock(logs):
 
 
 def is_locked(logs):
-    """Whether a group runs from there, be it another user's."""
+    """True if a group runs from this folder, also another user's."""
     with contextlib.suppress(FileNotFoundError), open(logs / ".lock", "rb") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -62,15 +62,15 @@ def begin(place, rig):
 
 
 def tell_ideal_noise(run):
-    """`./run --ideal`: tags and lens are exactly as the files say, and the processes are told so."""
+    """`./run --ideal`: tags and lens are exactly as the files say; tells the processes so."""
     ideal = run / "config" / "ideal_noise.yaml"
     if ideal.exists():
         ideal.replace(run / "config" / "noise.yaml")
 
 
 def differences(recorded, rig):
-    """Names of the YAML files in which the configuration of a recorded run is not that of a rig's folder."""
-    # A run with --ideal has it under another name.
+    """Names of the YAML files in which the configuration of a recorded run differs from a rig's folder."""
+    # A run with --ideal has noise.yaml from ideal_noise.yaml.
     names = {file.name for folder in (recorded, rig) for file in folder.glob("*.yaml")} - {"ideal_noise.yaml"}
 
     def text(folder, name):

@@ -1,4 +1,4 @@
-"""One group from its start to its end, and who follows it."""
+"""One group from its start to its end, and the programs that follow it."""
 
 import os
 import shutil
@@ -12,9 +12,9 @@ from launcher.group import MARK, Group, until
 from launcher.words import Failure, say
 
 START_S = 10
-# To sum up takes a moment; who cannot wait interrupts once more.
+# Summing up takes a moment; a second interrupt ends it.
 WATCH_END_S = 60
-# Two forged packets end any program of LCM 1.x (lcmtypes/README.md); somebody who goes on sending them is not outlasted.
+# Two forged packets end any program of LCM 1.x (lcmtypes/README.md): restarts are bounded, because an attacker may go on sending them.
 MAX_WATCH_RESTARTS = 10
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -42,7 +42,7 @@ class Session:
         self._process = None
         self._words = os.memfd_create("stderr")  # on no disk
         self.group = None
-        self.is_over = False  # the group ended, or somebody wants it to
+        self.is_over = False  # the group ended, or is to end
 
     def __enter__(self):
         for number in SIGNALS:
@@ -55,7 +55,7 @@ class Session:
         return self
 
     def __exit__(self, *_):
-        # What follows is bounded, and not to be cut short.
+        # The rest takes bounded time and must not be cut short.
         for number in SIGNALS:
             signal.signal(number, signal.SIG_IGN)
         if self.group and not self._keep:
@@ -70,7 +70,7 @@ class Session:
         if self._is_private:
             command = network.in_private_namespace(command)
         if not self._keep:
-            # It ends with this program, whatever ends that. (unshare ignores SIGTERM; killed, it takes its namespace along.)
+            # The group ends with this program, however that ends. (unshare ignores SIGTERM; killed, it ends its namespace.)
             command = ["setpriv", "--pdeathsig", "KILL" if self._is_private else "TERM", *command]
         variables = {name: value for name, value in os.environ.items() if not name.startswith("BODYSCHEMA_")}
         variables |= {f"BODYSCHEMA_{name}": value for name, value in self._variables.items()}
@@ -140,7 +140,7 @@ class Session:
         return 1
 
     def wait(self):
-        """Until somebody ends it; returns 1 if it died, else 0."""
+        """Waits until the group is ended; returns 1 if it died, else 0."""
         try:
             return self._wait()
         except Interrupted:
@@ -148,7 +148,7 @@ class Session:
             return 0
 
     def _wait(self, watch=None):
-        """Until `watch` or the group ended; the latter is told, and 1 returned if nobody wanted it."""
+        """Waits until `watch` or the group ended; reports the latter, and returns 1 if the group was not stopped."""
         while True:
             if watch and watch.poll() is not None:
                 return 0
@@ -170,14 +170,14 @@ class Session:
         if code == 0:
             _tell("the group ended")
             return 0
-        # A shell says so of what it ran; unshare does as its child.
+        # Exit code as a shell gives it for a killed child; unshare ends as its child did.
         number = -code if code < 0 else code - 128
         how = f"by {_signal_name(number)}" if number > 0 else f"with exit code {code}"
         _tell(f"the process group ended {how}; see {self._run}/supervisord.log{self._last_words()}")
         return 1
 
     def _end(self, watch):
-        """What was learned so far is summed up, if there is still somewhere to."""
+        """Sums up the result so far, if the run's folder still exists."""
         watch.send_signal(signal.SIGTERM if self._run.exists() else signal.SIGKILL)
         try:
             return watch.wait(WATCH_END_S)
@@ -187,7 +187,7 @@ class Session:
 
 
 def _tell(text):
-    # The line of progress is not ended.
+    # The line of progress has no line end yet.
     say(("\n" if sys.stderr.isatty() else "") + "run: " + text)
 
 

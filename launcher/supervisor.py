@@ -1,4 +1,4 @@
-"""supervisord (Debian's supervisor): what it is to run, and how to speak to it.
+"""supervisord (Debian's supervisor): its configuration, and calls to it.
 
 It writes to no disk once it runs: what it says goes to stdout, and each process writes its own log. So a full disk costs
 words, and no process.
@@ -19,9 +19,9 @@ from pathlib import Path
 FOLDER_PREFIX = "bodyschema-"
 SOCKET = "supervisor.sock"
 
-# A process that fails is started again, one that was told to end is not. One that ended within a second of its start waits
-# 1, 2, 3 … s before the next: a wrong configuration does not spin, and however often and fast something is killed, it comes
-# back (startretries: never give up).
+# A failed process is restarted, a stopped one is not. One that ended within a second of its start is restarted after
+# 1, 2, 3 … s: a wrong configuration does not spin, and a process that is killed often and fast comes back
+# (startretries: never give up).
 CONFIGURATION = """\
 [supervisord]
 nodaemon=true
@@ -68,7 +68,7 @@ def private_folder():
 
 
 def write_files(folder, commands):
-    """Makes `folder` what `supervisord -c folder/supervisord.conf` runs; `commands`: name → command as in group.conf."""
+    """Writes the files of `supervisord -c folder/supervisord.conf`; `commands`: name → command as in group.conf."""
     text = CONFIGURATION.replace("{names}", ",".join(commands))
     for name, command in commands.items():
         text += PROGRAM.replace("{name}", name)
@@ -77,13 +77,13 @@ def write_files(folder, commands):
 
 
 def script(name, command):
-    """The shell's text that becomes a process of the group; its $NAMEs are in the environment as BODYSCHEMA_NAME."""
+    """The shell script that becomes a process of the group; its $NAMEs are in the environment as BODYSCHEMA_NAME."""
     command = re.sub(r"\$(\{?)([A-Z_]+)", r"$\1BODYSCHEMA_\2", command)
     return SCRIPT.format(log=shlex.quote(f"{name}.log"), command=command)
 
 
 def remove_dead_folders():
-    """Folders of groups that were killed: ours, and nobody answers.
+    """Folders of groups that were killed: they are ours, and no supervisord answers.
 
     The youngest may be of a group that is just starting.
     """
@@ -114,11 +114,11 @@ def connect(path, timeout_s=3):
 
 
 class Stranger(OSError):
-    """Not our supervisord listens there."""
+    """Another program than our supervisord listens there."""
 
 
 class Supervisor(xmlrpc.client.ServerProxy):
-    """supervisord's own interface (XML-RPC over its socket), after a look at who it is that answers.
+    """supervisord's own interface (XML-RPC over its socket), after a check which program answers.
 
     `pids`: the processes of the group. A call takes at most 3 s, else it throws OSError.
     """

@@ -1,4 +1,4 @@
-"""Which targets must be built for the tests that a ctest command line selects."""
+"""The targets that the tests selected by a ctest command line need."""
 
 import json
 import re
@@ -11,7 +11,7 @@ NOT_BUILT = "_NOT_BUILT"
 
 
 def targets(place, arguments):
-    """The targets, or None where all are needed: nothing is selected by name or label, or no test is known by it."""
+    """The targets, or None if all are needed: nothing is selected by name or label, or no known test is."""
     if name_pattern(arguments) is None and not has_label(arguments):
         return None
     sources = sources_of_targets(json.loads((place.build / "compile_commands.json").read_text()))
@@ -25,14 +25,14 @@ def chosen(place, arguments, tests, sources, discovered):
     found = set()
     for test in tests:
         found |= targets_of(test, place, sources.keys())
-    # Tests that are yet to be built, or are new in a source, are known by their source alone.
+    # Tests that are not built yet, or are new in a source, are found by their source.
     if pattern is not None:
         found |= {target for target in discovered if any(has_test(pattern, file) for file in sources.get(target, ()))}
     return sorted(found) if found or tests else None
 
 
 def name_pattern(arguments):
-    """What follows -R."""
+    """The argument of -R."""
     for option, value in zip(arguments, [*arguments[1:], None]):
         if option in ("-R", "--tests-regex"):
             return value
@@ -44,13 +44,13 @@ def has_label(arguments):
 
 
 def listed(place, arguments):
-    """Tests as ctest knows them, with what is not built yet under the name of its program."""
+    """Tests as ctest lists them; those that are not built yet have the name of their program."""
     command = ["ctest", "--test-dir", str(place.build), "--show-only=json-v1", *arguments]
     asked = subprocess.run(command, stdout=subprocess.PIPE)
     if asked.returncode != 0:
         raise Failure("ctest does not know these arguments")
     tests = json.loads(asked.stdout)["tests"]
-    # ctest says no command whose program is not built.
+    # ctest lists no command of a program that is not built.
     written = commands_written(file.read_text() for file in place.build.rglob("CTestTestfile.cmake"))
     return [{"command": written.get(test["name"], []), **test} for test in tests]
 
@@ -72,7 +72,7 @@ def sources_of_targets(compile_commands):
 
 
 def has_test(pattern, file):
-    """Whether a GoogleTest of this name stands in a source; of a parameterized one the parameter's name is not known."""
+    """True if a source has a GoogleTest of this name; the parameter's name of a parameterized one is not known."""
     if not file.exists():
         return False
     text = file.read_text(errors="replace")
@@ -84,7 +84,7 @@ def has_test(pattern, file):
 
 
 def targets_of(test, place, known):
-    """What a test runs: programs of the build; of the whole build also those that its script names."""
+    """The programs that a test runs: those of its command and those that its script names."""
     if test["name"].endswith(NOT_BUILT):
         return {test["name"].removesuffix(NOT_BUILT)}
     words = [Path(word) for word in test.get("command", [])]

@@ -1,4 +1,4 @@
-"""What is told to the user, on stderr."""
+"""Messages to the user, on stderr."""
 
 import sys
 
@@ -8,7 +8,7 @@ class Failure(Exception):
 
 
 class UsageError(Failure):
-    """The same with exit code 2: what was typed cannot be meant."""
+    """The same with exit code 2: wrong usage."""
 
 
 def say(*words):
