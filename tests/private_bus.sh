@@ -2,7 +2,7 @@
 # Runs a command on an LCM bus of its own: `tests/private_bus.sh COMMAND…`.
 # Two LCM programs with the same port hear each other whatever their groups, so a port of one's own
 # is not enough: the command gets a network and a process namespace. Needs no root. Exit code: the
-# command's; 77 ("skip") where namespaces are not allowed.
+# command's; 77 ("skip") if namespaces are not allowed.
 [ $# -gt 0 ] || { echo "usage: $0 COMMAND..." >&2; exit 2; }
 unshare --user --map-root-user --net true 2>/dev/null || {
   echo "SKIP: this machine allows no user namespaces" >&2

@@ -1,5 +1,5 @@
-// What learning and predicting cost: local models, structure search, a new sample online, beside
-// the chapter's method with all models enumerated; forward kinematics and Jacobian beside Orocos
+// Cost of learning and predicting: local models, structure search, a new sample online, beside the
+// chapter's method with all models enumerated; forward kinematics and Jacobian beside Orocos
 // KDL on the same learned arm. All on synthetic robots, seeded.
 
 #include <benchmark/benchmark.h>
@@ -50,8 +50,8 @@ Recording forty_parts(int num_samples) {
 
 // ---- prediction
 
-/// A robot that was learned from exact samples, so that its joints turn and do not slide, the way
-/// from its root to a finger by seven joints, and random actions.
+/// A robot that was learned from exact samples, so that its joints turn and do not slide; the path
+/// from its root to a finger by seven joints; random actions.
 struct Arm {
   BodySchema schema;
   KinematicPath path;
@@ -79,7 +79,7 @@ KDL::Frame to_kdl(const Pose& X) {
           {p.x(), p.y(), p.z()}};
 }
 
-/// The same way as a chain of KDL's: joints about z, which cost it least, and what is constant
+/// The same path as a KDL chain: joints about z, which cost it least, and all constant transforms
 /// between two joints in one frame.
 struct KdlArm {
   KDL::Chain chain;
@@ -209,7 +209,7 @@ void JacobianByKdl(benchmark::State& state) {
   }
 }
 
-/// A pose of it.
+/// A pose of the trajectory.
 void PredictTrajectory(benchmark::State& state) {
   for (auto _ : state) benchmark::DoNotOptimize(arm().path.predict_trajectory(arm().actions));
   state.SetItemsProcessed(state.iterations() * arm().actions.cols());
@@ -222,7 +222,7 @@ void PredictCovariance(benchmark::State& state) {
         arm().path.covariance(actions.col(t++ % actions.cols()), Variance::kFirstOrder));
 }
 
-/// With the way found anew each time.
+/// With the path found anew each time.
 void PredictOnce(benchmark::State& state) {
   const Eigen::MatrixXd& actions = arm().actions;
   for (Eigen::Index t = 0; auto _ : state)
@@ -297,7 +297,7 @@ void LearnFortyPartsAsTheChapter(benchmark::State& state) {
   learn_baseline_all(state, forty_parts(state.range(0)));
 }
 
-/// Sample N, where the structure was found before it came.
+/// Sample N, with the structure found before it comes.
 void LearnOneMore(benchmark::State& state) {
   const Recording run = seven_dof(state.range(0));
   SharedSamples samples;

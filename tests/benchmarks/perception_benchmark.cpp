@@ -24,7 +24,7 @@ namespace {
 const std::filesystem::path kRig = "config/arm7";
 constexpr int kActions = 20;
 
-/// What the camera shows of one action at rest: as it travels, and decoded.
+/// Images of one action at rest: encoded, and decoded.
 struct View {
   std::vector<camera_image_t> jpeg;
   std::vector<camera_image_t> grey;
@@ -131,7 +131,7 @@ void image_to_sample(benchmark::State& state, std::vector<camera_image_t> View::
 void ImageToSample(benchmark::State& state) { image_to_sample(state, &View::grey); }
 void JpegToSample(benchmark::State& state) { image_to_sample(state, &View::jpeg); }
 
-/// What of JpegToSample is OpenCV's decoder.
+/// The share of OpenCV's decoder in JpegToSample.
 void DecodeJpeg(benchmark::State& state) {
   for (std::size_t i = 0; auto _ : state) {
     for (const camera_image_t& image : views()[i++ % kActions].jpeg) {

@@ -1,8 +1,8 @@
-// What active babbling gains: end effector's error and share of right structures after N samples,
-// with actions drawn uniformly, near the ends of the ranges, half and half (what `choice: random`
-// does), and chosen. As in the motor_babbler the first four samples are drawn, uniformly or half
-// and half, and the schema that a choice rests on is learned again after every fourth; TEST
-// samples, of which nothing is learned, do not count here. Prints Markdown.
+// Gain of active babbling: the end effector's error and the share of right structures after N
+// samples, with actions drawn uniformly, near the ends of the ranges, half and half (as `choice:
+// random` does), and chosen. As in the motor_babbler the first four samples are drawn, uniformly or
+// half and half, and the schema that a choice rests on is learned again after every fourth; TEST
+// samples, which are not learned from, do not count here. Prints Markdown.
 //
 //   active_babbling --seeds 20 --robots c d --regimes chapter tag --at 10 20 30
 

@@ -1,4 +1,4 @@
-// How wrong are the corners of a tag? Rendered tags with known corners over side, tilt, blur,
+// Errors of a tag's corners. Rendered tags with known corners over side, tilt, blur,
 // noise, JPEG quality, light and lens: AprilTag's own corners, OpenCV's cornerSubPix, lines along
 // the edges (edge_corners.h) and the fit to the grey values (corner_refinement.h), beside the
 // Cramér–Rao bound of the pixels. Prints Markdown.
@@ -54,7 +54,7 @@ camera_info_t camera_of(const Cell& cell) {
   return camera;
 }
 
-/// Errors of one way to find corners.
+/// Errors of one corner detector.
 struct Errors {
   struct View {
     Eigen::Matrix<double, 8, 1> sum = Eigen::Matrix<double, 8, 1>::Zero();
@@ -93,8 +93,7 @@ struct Errors {
     }
     return std::sqrt(squares / n);
   }
-  /// Root mean square over views and coordinates of the mean error; the mean's own scatter is taken
-  /// off.
+  /// Root mean square over views and coordinates of the mean error, less the mean's own scatter.
   double bias() const {
     double squares = 0;
     int n = 0;
@@ -206,7 +205,7 @@ void print_row(const std::string& name, const Cell& cell, int num_views, int num
                 photometric.bias(), photometric.rms(), photometric.over_bound(),
                 photometric.mean_d2(), photometric.d2_quantile(0.95), std::sqrt(bound2),
                 100 * photometric.failed / seen, why.c_str(), time_us / seen);
-  // Where nothing was found there is no figure.
+  // A detector that found nothing has no figure.
   std::string row = line;
   for (const char* none : {"-nan", "nan"}) {
     for (std::size_t at; (at = row.find(none)) != std::string::npos;) {

@@ -65,7 +65,7 @@ std::optional<EdgeLine> fit_edge(const cv::Mat& grey, const Lens& lens, int bord
   const double cell = 2.0 / border;
   std::vector<Eigen::Vector2d> points;
   for (int i = 0; i < num_places; ++i) {
-    // The corners' own surroundings have no straight edge.
+    // The edge is not straight near the corners.
     const double share = (cell * 0.6 + (2 - 1.2 * cell) * (i + 0.5) / num_places) / 2;
     const Eigen::Vector2d place = from + share * (to - from);
     const double px_per_unit =

@@ -10,9 +10,9 @@
 
 namespace bodyschema::test {
 
-/// The other way to better corners, for comparison: centroids of the grey values' gradient across
+/// Another corner detector, for comparison: centroids of the grey values' gradient across
 /// the four edges of the black square, one line per edge through them in rays (robust by Huber's
-/// weights, scatter as measured), corners where lines meet. `border`: cells across the black
+/// weights, scatter as measured), corners at the intersections. `border`: cells across the black
 /// square. Nothing if an edge has fewer than 6 usable places.
 std::optional<RefinedCorners> edge_corners(const cv::Mat& grey, const Lens& lens, int border,
                                            const std::vector<Eigen::Vector2d>& corners_px);

@@ -1,5 +1,5 @@
 #!/bin/bash
-# hosts.sh [RIG [SAMPLES]]: what several hosts and lost frames cost. Markdown to stdout.
+# hosts.sh [RIG [SAMPLES]]: cost of several hosts and of lost frames. Markdown to stdout.
 set -euo pipefail
 tests=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 rig=${1:-arm7} samples=${2:-100}

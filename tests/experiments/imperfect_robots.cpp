@@ -1,6 +1,6 @@
-// What learn() makes of robots that no model of ours describes: chains and trees of 2 to 7 joints,
-// one imperfection a row. Right, incomplete, and wrong structures, and those of the wrong that are
-// called complete; prints Markdown.
+// Structures that learn() finds for robots that no model of ours describes: chains and trees of 2
+// to 7 joints, one imperfection a row. Counts right, incomplete and wrong structures, and wrong
+// ones that are called complete; prints Markdown.
 //
 //   imperfect_robots [--robots 12] [--samples 20 50 100] [--estimate-noise] [--cell WORDS]
 

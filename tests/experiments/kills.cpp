@@ -1,5 +1,5 @@
-// What is left of a run whose processes are killed (kill -9) at random moments all along it: one
-// run of ./run without kills and one with, same rig and seed. Prints Markdown; exit code 1 if a
+// Result of a run whose processes are killed (kill -9) at random moments all along it, beside one
+// without kills, same rig and seed. Prints Markdown; exit code 1 if a
 // sample was lost or doubled, the structure is wrong or the end effector's held-out error is more
 // than 20 % larger.
 //
@@ -38,7 +38,7 @@ namespace fs = std::filesystem;
 
 const fs::path kSource = BODYSCHEMA_SOURCE_FOLDER;
 const fs::path kBuild = BODYSCHEMA_BUILD_FOLDER;
-/// Programs of the group, as often as they run in it.
+/// Programs of the group, each as often as it runs in it.
 const std::vector<std::string> kVictims = {"robot_simulator", "camera",        "marker_estimator",
                                            "observer",        "motor_babbler", "structure_learner",
                                            "model_monitor",   "controller",    "lcm-logger"};
@@ -128,7 +128,7 @@ class Run {
   int exit_code_ = -1;
 };
 
-/// What came out of a run.
+/// Result of a run.
 struct Outcome {
   std::string objection;  ///< "" if nothing was lost, doubled or learned wrongly
   double end_effector_m = -1;
@@ -213,8 +213,8 @@ int main(int argc, char** argv) {
   }
   const Outcome undisturbed = judge(calm, rig, num_samples);
 
-  // All along the run: the k-th kill comes after a share k/num_kills of the samples, but for the
-  // last twentieth, so that the run does not end before the last kill.
+  // The k-th kill comes after a share k/num_kills of the samples, except their last twentieth, so
+  // that the run does not end before the last kill.
   std::mt19937_64 random(seed);
   std::map<std::string, int> killed;
   int num_killed = 0;

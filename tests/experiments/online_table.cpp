@@ -1,4 +1,4 @@
-// online_table: what one new sample costs, online. Prints a Markdown table, one row per range of N:
+// online_table: cost of one new sample online. Prints a Markdown table, one row per range of N:
 // the processor time of one thread from a SAMPLE to its LEARNED_SCHEMA, both as messages; that of
 // the preparation for the next one in the idle time between; the share of
 // right structures.

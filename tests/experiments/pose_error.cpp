@@ -1,7 +1,7 @@
-// How wrong are the poses that the pipeline sees? Samples of a simulated rig go from action to
+// Errors of the poses that the pipeline observes. Samples of a simulated rig go from action to
 // SAMPLE and are compared with the simulator's truth: per part, by the tilt of its best tag, by
-// distance, and per pair of neighbours, where the learner's test statistic d² lives. From this the
-// corner noise and the systematic error of noise.yaml are judged. Prints Markdown.
+// distance, and per pair of neighbours, for which the learner's test statistic d² is defined. They
+// judge the corner noise and the systematic error of noise.yaml. Prints Markdown.
 //
 //   pose_error config/arm7 --samples 2000 --seed 1
 

@@ -1,7 +1,7 @@
-// What the simulated rigs reach, from rendered images: structure right after N samples, over seeds,
-// and the held-out error of the end effector against the simulator's truth. Every fifth sample is
-// TEST, as in ./run. The ideal robot, and the robot with calibration errors: of the latter aligned
-// (evaluation.h; by the truth of all actions), as it is, and the scale. Prints Markdown.
+// Accuracy of the simulated rigs, from rendered images: structure right after N samples, over
+// seeds, and the held-out error of the end effector against the simulator's truth. Every fifth
+// sample is TEST, as in ./run. For the ideal robot; for the robot with calibration errors also
+// aligned (evaluation.h; by the truth of all actions), and the scale. Prints Markdown.
 //
 //   rig_table config/arm2 config/arm4 config/arm7 --seeds 10 --at 20 30 60 100
 
@@ -28,7 +28,7 @@ using namespace bodyschema;
 
 namespace {
 
-/// Of the seeds, the end effector's errors.
+/// Errors of the end effector over the seeds.
 struct Errors {
   std::vector<double> position_m, rotation_rad;
   void add(const std::vector<PartErrors>& parts, int end_effector) {
@@ -98,7 +98,7 @@ void add_distances(const BodySchema& schema, const std::vector<ActionPoseSample>
                                           held_out.front().find(schema.root)->X_CB));
 }
 
-/// What a run shows up to some sample: what may be learned from, and true poses.
+/// Samples of a run up to some sample: for learning, and true poses.
 struct Seen {
   std::vector<ActionPoseSample> training;
   std::vector<ActionPoseSample> truth;     ///< of all actions

@@ -1,7 +1,7 @@
-// soak: what many samples cost. Sends synthetic samples of a 2-DOF robot to the processes that keep
-// something of every sample (structure_learner, model_monitor, `bodyschema watch`, `bodyschema
+// soak: cost of many samples. Sends synthetic samples of a 2-DOF robot to the processes that keep
+// data of every sample (structure_learner, model_monitor, `bodyschema watch`, `bodyschema
 // report --follow`), in step with the monitor's verdicts as a babbler is, and prints, over the run,
-// the memory that each holds and the bytes that it read a sample. Fails if either grows.
+// the memory that each holds and the bytes that it read per sample. Fails if either grows.
 //
 // soak [--samples N] [--keep FOLDER]; on a bus of its own (tests/private_bus.sh).
 
@@ -29,14 +29,14 @@ namespace {
 
 namespace fs = std::filesystem;
 
-// The retained set is full after 2000 samples; what a run holds then is what it holds for good, but
-// for half a set more whenever the samples double.
+// The retained set is full after 2000 samples; from then on a run's memory stays, except for half a
+// set more whenever the samples double.
 constexpr std::int64_t kFull = 2000;
-// A search needs for a moment several times what is kept: of so many samples' memory the least is
-// taken.
+// A search briefly needs several times the memory that is kept: the least over this many samples
+// counts.
 constexpr std::int64_t kMoment = 100;
-// Allowed growth from there on: 1000 samples of five parts (4 kB) a doubling, an index of the
-// samples (SampleIntake, 64 B each), and what malloc scatters.
+// Allowed growth from there on: 1000 samples of five parts (4 kB) per doubling, an index of the
+// samples (SampleIntake, 64 B each), and malloc's fragmentation.
 constexpr double kMaxGrowthMb = 12, kMaxGrowthMbADoubling = 8;
 
 struct Usage {
@@ -99,7 +99,7 @@ class Soak {
              "the processes");
   }
 
-  /// One action of the babbler's and all that follows from it.
+  /// One action of the babbler and all that follows from it.
   void step(std::int64_t index) {
     const Eigen::VectorXd action = robot_.random_action(rng_);
     ActionPoseSample sample = test::observe(
@@ -140,7 +140,7 @@ class Soak {
   }
   bool is_complete() const { return is_complete_; }
 
-  /// The report is written once more and the watch sums up: both over everything that there was.
+  /// The report is written once more and the watch sums up, both over all samples.
   void end() {
     programs_.at("report")->send_signal(SIGTERM);
     programs_.at("watch")->send_signal(SIGTERM);

@@ -1,4 +1,4 @@
-// structure_table: how often is the learned structure right? Prints a Markdown table
+// structure_table: share of right learned structures. Prints a Markdown table
 //   robot | regime | noise | N | right / incomplete / wrong % | detectable, right of these % |
 //   mean CPU ms | fits
 // "Detectable": every joint shows in the two markers next to it, r/√3 · √N > 5 σ with r its half

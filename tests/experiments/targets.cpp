@@ -1,7 +1,7 @@
-// How near the controller brings the end effector: random reachable positions served on the bus of
+// Accuracy of steering: random reachable positions served on the bus of
 // a group that has learned its body, judged against the simulator's noise-free truth. The positions
-// are the body schema's own forward kinematics of random actions, so some lie where the arm
-// collides. Prints Markdown.
+// are the body schema's own forward kinematics of random actions, so the arm collides at some.
+// Prints Markdown.
 //
 //   ./run --keep --samples 60 && ./run exec build/bin/targets --rig-folder logs/current/config
 

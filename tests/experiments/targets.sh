@@ -1,5 +1,5 @@
 #!/bin/bash
-# targets.sh [RIG [TARGETS]]: learns RIG, then sends its end effector to random positions and asks the simulator where it is.
+# targets.sh [RIG [TARGETS]]: learns RIG, then sends its end effector to random positions and compares with the simulator's truth.
 # Fails if the median is above 5 mm.
 set -euo pipefail
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/../.." && pwd)

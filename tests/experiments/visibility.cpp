@@ -1,4 +1,4 @@
-// How well does the camera see each body part of a rig? Random actions as the babbler draws them go
+// Visibility of each body part of a rig. Random actions as the babbler draws them go
 // through the simulator; every accepted pose is rendered and searched for tags by the detector with
 // the settings of the pipeline. Prints Markdown.
 //

@@ -1,6 +1,7 @@
-// A body that nothing happens to: what the learner and the monitor tell of it live, and what they
-// hold in the end beside learn() on the same samples. One run a rig and seed is rendered; each part
-// is hidden in it in turn. Prints Markdown; fails if anything was told, or what is held is wrong or worse.
+// A body that does not change: events that learner and monitor report of it live, and their last
+// schema beside learn() on the same samples. One run a rig and seed is rendered; each part
+// is hidden in it in turn. Prints Markdown; fails if there are events, or the schema is wrong or
+// worse.
 //
 //   young_baseline [config/arm2 config/arm4 config/arm7] --seeds 50 --samples 60
 //   young_baseline --honest --as-seen --seeds 1 --samples 2000      with calibration errors, false
@@ -31,7 +32,7 @@ using test::Rightness;
 
 namespace {
 
-/// Rendered, or as an earlier call left it in `folder`.
+/// Rendered, or kept in `folder` by an earlier call.
 /// @throws std::runtime_error if it is not there and must be.
 std::vector<sample_t> samples_of(const std::filesystem::path& rig, std::int64_t seed,
                                  const std::set<int>& hidden, bool is_ideal,
@@ -127,7 +128,7 @@ int main(int argc, char** argv) {
       hidden.insert(hidden.begin(), -1);  // none
       if (hide) hidden = {*hide};
       for (const int part : hidden) {
-        // Nothing can hang on a root that is never seen.
+        // A root that is never seen has no tree.
         if (part == learner.options.root) continue;
         const auto samples = part < 0 ? rendered : test::without_part(rendered, part);
         std::vector<int> observed = truth.parts();

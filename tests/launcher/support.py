@@ -13,7 +13,7 @@ sys.path.insert(0, str(SOURCE))
 
 from launcher.group import Group, until  # noqa: E402
 
-# `watch` ends when there is a file `learned` in the run's folder; told to end, it says so and fails.
+# `watch` ends when there is a file `learned` in the run's folder; on SIGTERM it says so and fails.
 CONSOLE = """\
 import os, signal, sys, time
 word, *rest = sys.argv[1:]
@@ -104,7 +104,7 @@ class GroupTest(unittest.TestCase):
         return done.stdout, done.returncode
 
     def start(self, *arguments, **environment):
-        """A ./run that goes on, once its group runs; what it says goes to self.words()."""
+        """A ./run that goes on, once its group runs; its output goes to self.words()."""
         with open(self.folder / "words", "w") as output:
             process = subprocess.Popen(
                 [SOURCE / "run", *arguments],
@@ -116,7 +116,7 @@ class GroupTest(unittest.TestCase):
         self.started.append(process)
         self.wait_for(lambda: self.has_started() or process.poll() is not None, "a group")
         self.assertIsNone(process.poll(), self.words())
-        # setpriv has done its work where a program says something.
+        # A program that prints something has replaced setpriv.
         speaking = [program.name for program in self.bin.iterdir() if "echo" in program.read_text()]
         self.wait_for(lambda: all(self.has_spoken(name) for name in speaking), f"a word of all of {speaking}")
         return process

@@ -22,12 +22,12 @@ struct TypeDefinition {
   std::vector<FieldDefinition> fields;
 };
 
-/// Reads every .lcm file of a folder, by type. Knows as much of the language as our files use: one
-/// struct a file, one field a line, comments with //.
-/// @throws std::runtime_error naming file and line of what it does not understand.
+/// Reads every .lcm file of a folder, by type. Supports the part of the language that our files
+/// use: one struct a file, one field a line, comments with //.
+/// @throws std::runtime_error naming file and line of anything else.
 std::map<std::string, TypeDefinition> read_definitions(const std::filesystem::path& folder);
 
-/// Where in an encoded message the floating-point numbers stand.
+/// Place of the floating-point numbers in an encoded message.
 struct FloatPlace {
   std::string field;
   std::size_t offset = 0;

@@ -177,8 +177,7 @@ TEST(LcmDefinitions, EveryFloatingPointScalarAndEveryTimeNamesItsUnit) {
 }
 
 TEST(LcmDefinitions, EveryTypeHasAFieldNameThatNoOtherTypeHas) {
-  // Fingerprints cover names of fields but not of types: two types alike would be taken for each
-  // other.
+  // Fingerprints cover names of fields but not of types: two equal types would be confused.
   const auto definitions = read_definitions(kSources);
   std::map<std::string, int> uses;
   for (const auto& [name, type] : definitions) {
@@ -214,7 +213,7 @@ TEST(LcmDefinitions, AnArraysCountStandsBeforeIt) {
 }
 
 TEST(GeneratedHeaders, EveryAllocationIsPrecededByTheHardenedCheck) {
-  // Another version of lcm-gen may write what harden.sed does not recognise.
+  // Another version of lcm-gen may write code that harden.sed does not recognise.
   int num_resizes = 0;
   int num_strings = 0;
   for (const auto& [name, type] : read_definitions(kSources)) {

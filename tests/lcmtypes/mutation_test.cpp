@@ -1,6 +1,6 @@
-// Whatever arrives, decoding must neither crash nor allocate wildly. Always built with
+// Decoding of any bytes must neither crash nor allocate wildly. Always built with
 // AddressSanitizer and UBSan, whatever the rest is built with: an out-of-bounds read is a failure
-// here even where it would go unnoticed.
+// here even if it would go unnoticed elsewhere.
 
 #include <gtest/gtest.h>
 
@@ -46,7 +46,7 @@ void write_int32(Bytes& bytes, std::size_t at, std::uint32_t value) {
   }
 }
 
-/// One to four injuries. The fingerprint is spared, or nothing behind it would be tested.
+/// One to four mutations. The fingerprint is spared, or the bytes after it would not be tested.
 Bytes mutate(const Bytes& original, Rng& rng) {
   constexpr std::uint32_t kEvilCounts[] = {0,          1,          2,          0x7FFFFFFF,
                                            0xFFFFFFFF, 0x80000000, 0x10000000, 0x20000000,
@@ -82,7 +82,7 @@ Bytes mutate(const Bytes& original, Rng& rng) {
   return bytes;
 }
 
-/// Copied to the exact size on the heap, so that AddressSanitizer sees the first byte too far.
+/// Copied to the exact size on the heap, so that AddressSanitizer detects the first byte beyond.
 template <class Message>
 bool decodes(const Bytes& bytes) {
   const std::unique_ptr<std::uint8_t[]> exact(new std::uint8_t[bytes.size()]);
@@ -93,7 +93,7 @@ bool decodes(const Bytes& bytes) {
   const bool is_good = message.decode(exact.get(), 0, size) == size;
   EXPECT_LE(allocated_bytes, 12 * bytes.size() + 4096)
       << Message::getTypeName() << " of " << bytes.size() << " bytes";
-  // What decodes must also be safe to check, and what passes safe to encode.
+  // Decoded messages must be safe to check, and checked ones safe to encode.
   if (is_good && check(message).empty()) {
     Bytes again(static_cast<std::size_t>(message.getEncodedSize()));
     EXPECT_EQ(message.encode(again.data(), 0, static_cast<int>(again.size())),

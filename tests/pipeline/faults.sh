@@ -1,7 +1,7 @@
 #!/bin/bash
-# faults.sh SOURCE BUILD: while arm7 babbles it is broken in seven ways and repaired each time, by the console; each change
-# is found, named and mended by processes that are killed in between. In the end the schema is right and the report
-# shows it all.
+# faults.sh SOURCE BUILD: while arm7 babbles the console breaks it in seven ways and repairs it each time; each change
+# is found, named and repaired in the schema by processes that are killed in between. In the end the schema is right and
+# the report shows it all.
 set -euo pipefail
 source=$1 build=$2
 work=$(mktemp -d)
@@ -33,7 +33,7 @@ newest() {
   sample=$(sed -n 's/^sample *\([0-9]*\):.*/\1/p' "$work/status.txt")
   echo "${sample:-0}"
 }
-# told SINCE PATTERN: one of the newest 32 events, of that sample or a later one.
+# told SINCE PATTERN: one of the newest 32 events, at that sample or a later one, matches.
 told() {
   awk -v since="$1" -v pattern="$2" '/"sample":/ {sample = $2 + 0} /"text":/ && sample >= since && $0 ~ pattern {found = 1}
     END {exit !found}' "$work/status.json"
@@ -48,10 +48,10 @@ kill_process() { kill -KILL "$("$source/run" exec pgrep -f "^$build/bin/$1 .*$wo
 run=$!
 until_true "the arm was not learned" is_learned
 
-# nothing_wrong: the list of what is wrong is there and empty.
+# nothing_wrong: the list of findings exists and is empty.
 nothing_wrong() { grep -q '^  "wrong": \[\]' "$work/status.json"; }
 
-# break_and_repair PLACE WHAT VICTIM FAULT…: patterns of what the events and the list of what is wrong say.
+# break_and_repair PLACE WHAT VICTIM FAULT…: patterns of the text of events and findings.
 break_and_repair() {
   local place=$1 what=$2 victim=$3
   shift 3

@@ -1,4 +1,4 @@
-// A run of the simulated arm2 with a sender on its bus that sends everything it should not.
+// A run of the simulated arm2 with a hostile sender on its bus.
 
 #include <gtest/gtest.h>
 #include <sys/wait.h>
@@ -87,7 +87,7 @@ TEST_F(HostileBus, NothingThatIsNotTheRigsOwnChangesAByteOfWhatIsLearned) {
   int sender_status = -1;
   std::string num_sent;
   std::thread sender([&] {
-    // As soon as the group's bus is there.
+    // As soon as the group's bus exists.
     becomes_true(std::chrono::seconds(30), [&] {
       std::string socket = contents(current("war") / "socket");
       return !socket.empty() && fs::exists(socket.erase(socket.find('\n')));
@@ -112,7 +112,7 @@ TEST_F(HostileBus, NothingThatIsNotTheRigsOwnChangesAByteOfWhatIsLearned) {
   EXPECT_EQ(payloads(current("war") / "schema.lcmlog", "BODY_SCHEMA"),
             payloads(current("peace") / "schema.lcmlog", "BODY_SCHEMA"));
 
-  // Each process counted what it kept out.
+  // Each process counted the messages that it refused.
   std::map<std::string, std::map<std::string, std::int64_t>> counters;
   for_each_event(current("war") / "run.lcmlog.00", [&](const LogEvent& event) {
     if (event.channel != kProcessInfo.name) return;

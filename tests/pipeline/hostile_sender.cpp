@@ -1,10 +1,10 @@
-// hostile_sender: everything that should not be on a robot's bus, on every channel, until FILE
+// hostile_sender: every kind of foreign and broken message, on every channel, until FILE
 // exists: bytes that are no message, cut, lengthened and of other types, counts beyond reason, NaN,
-// nonsense, and what another rig's group said, as recorded.
+// nonsense, and recorded messages of another rig's group.
 //
 //   hostile_sender FOREIGN_RUN_FOLDER --until FILE
 //
-// Not sent is what cannot be told from the rig's own, such as a STOP, which anybody may send.
+// Not sent are forgeries of the rig's own messages, such as a STOP, which any sender may send.
 
 #include <lcm/lcm.h>
 
@@ -42,7 +42,7 @@ struct Hostile {
 
 constexpr double kNan = std::numeric_limits<double>::quiet_NaN();
 
-/// Without check(): what a careful sender would never send.
+/// Without check(), as a careful sender never does.
 template <class Message>
 Bytes bytes_of(const Message& message) {
   Bytes bytes(static_cast<std::size_t>(message.getEncodedSize()));
@@ -112,7 +112,7 @@ void add_nonsense(std::vector<Hostile>& all) {
   add(kFaultCommand, example_fault_command(), [](auto& m) { m.amount_deg = kNan; });
   add(kProcessInfo, example_process_info(), [](auto& m) { m.pid = 0; });
   add(kCameraImage, example_camera_image(), [](auto& m) { m.width = 31; });
-  // Well-formed and sensible, and of no rig that is shipped.
+  // Well-formed and sensible, but of no shipped rig.
   add(kLearnedSchema, example_body_schema(), [](auto&) {});
   add(kSample, example_sample(), [](auto& m) { m.sample_index = 1'000'000'000; });
   add(kMarkerPoses, example_marker_poses(), [](auto&) {});
@@ -123,7 +123,8 @@ void add_nonsense(std::vector<Hostile>& all) {
       [](auto& m) { m.part_health.back().health_part = 999; });
 }
 
-/// What another rig's group said, commands included: they are for another number of signals.
+/// Recorded messages of another rig's group, commands included: they have another number of
+/// signals.
 void add_foreign(std::vector<Hostile>& all, const std::filesystem::path& run) {
   std::size_t num_images = 0;
   for (const char* log : {"run.lcmlog.00", "images.lcmlog.00"}) {
@@ -148,8 +149,8 @@ int main(int argc, char** argv) {
   add_garbage(kinds[0], random);
   add_nonsense(kinds[1]);
   add_foreign(kinds[2], foreign);
-  // By turns, so that each channel gets something of each kind however long it lasts: of what a
-  // group says little is MODEL_HEALTH.
+  // In turn, so that each channel gets each kind however long it lasts: a group sends few messages
+  // on MODEL_HEALTH.
   struct Turn {
     std::vector<Hostile> all;
     std::size_t next = 0;

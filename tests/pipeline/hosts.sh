@@ -8,7 +8,7 @@ PATH=$PATH:/usr/sbin:/sbin
 source=$(cd "$(dirname "${BASH_SOURCE[0]}")/../.." && pwd)
 if [ "$1" != inside ]; then
   unshare --user --map-root-user --net true 2>/dev/null || { echo "SKIP: no user namespaces" >&2; exit 77; }
-  # The shell stays process 1; whatever is left ends with it.
+  # The shell stays process 1; everything left over ends with it.
   exec unshare --user --map-root-user --net --pid --fork --kill-child --mount-proc -- \
     bash -c '"$@"; exit $?' bash "${BASH_SOURCE[0]}" inside "$@"
 fi
@@ -36,7 +36,7 @@ until_ok() { # SECONDS COMMAND…
 mkdir -p "$folder"
 cp -r "$rig" "$folder/rig"
 chmod -R u+w "$folder/rig"
-# All that is not the robot's or the camera's runs on the learning host.
+# All processes except robot and camera run on the learning host.
 seeing="camera marker_estimator observer log_images"
 learning=
 for name in $(sed -n 's/^\([a-z_]*?\{0,1\}\) .*/\1/p' "$source/config/group.conf"); do
@@ -76,7 +76,7 @@ for host in "${hosts[@]}"; do
     { echo "SKIP: no packet filter: $(cat "$folder/nft.err")" >&2; exit 77; }
 done
 
-# Shares are started in any order; here those that only answer come last.
+# Shares are started in any order; here passive ones come last.
 share() { # HOST: its ./run, on its network
   BODYSCHEMA_LOGS=$folder/$1 exec nsenter -t "${holder[$1]}" -n \
     "$source/run" --rig "$folder/rig" --host "$1" --ideal --seed 3 --samples "$samples"
@@ -96,7 +96,7 @@ has_result_or_ended() { grep -q "Runs on" "$folder/learning.err" || ! kill -0 "$
 until_ok $((60 + samples * 2)) has_result_or_ended || fail "no result"
 [ -f "$folder/learning/current/result.json" ] || fail "the learning host ended without a result"
 
-# Every host knows of every process.
+# Every host hears every process.
 for host in "${hosts[@]}"; do
   BODYSCHEMA_LOGS=$folder/$host nsenter -t "${holder[$host]}" -n "$source/run" status --json --seconds 4 \
     >"$folder/$host/status.json" 2>"$folder/$host/status.err" || fail "no status on $host: $(cat "$folder/$host/status.err")"
@@ -105,7 +105,7 @@ done
 for host in "${hosts[@]}"; do
   [ "$loss" = 0 ] || echo "$host $(nsenter -t "${holder[$host]}" -n nft list ruleset | sed -n 's/.*counter packets \([0-9]*\).*/\1/p')" >>"$folder/lost"
 done
-# One is ended by its user's signal, the others by ./run stop.
+# One host is ended by a signal to its ./run, the others by ./run stop.
 kill -TERM "${run[learning]}"
 for host in "${hosts[@]}"; do
   [ "$host" = learning ] || BODYSCHEMA_LOGS=$folder/$host "$source/run" stop 2>/dev/null

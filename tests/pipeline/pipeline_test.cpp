@@ -58,8 +58,8 @@ std::string payloads(const fs::path& log, const std::string& channel, bool only_
 }
 
 /// The payloads of one channel that `is_wanted`, each once, in the order in which they first came:
-/// what is published again at 1 Hz is there as often as the clock says, in a replay otherwise than
-/// live. (The camera repeats all frames of an action in turn, so neighbours are not enough.)
+/// the number of 1 Hz repetitions depends on the clock, and differs between a replay and the live
+/// run. (The camera repeats all frames of an action in turn, so neighbours are not enough.)
 template <class Message>
 std::vector<std::string> distinct_payloads(
     const fs::path& log, const Channel<Message>& channel,
@@ -99,8 +99,8 @@ testing::AssertionResult are_equal(const std::string& one, const std::string& ot
                                      << " bytes differ from byte " << end.first - one.begin();
 }
 
-/// "pid command line" of every process that has the run folder in its environment; all that ./run
-/// starts inherit it.
+/// "pid command line" of every process that has the run folder in its environment, which all
+/// processes of ./run inherit.
 std::vector<std::string> processes_of(const fs::path& run_folder) {
   const std::string mark = "BODYSCHEMA_RUN=" + run_folder.string() + '\0';
   std::vector<std::string> found;
@@ -226,7 +226,7 @@ TEST_F(Arm2, NothingWasLostOnTheWay) {
   const auto utimes = [](const fs::path& log, const auto& channel) {
     std::set<std::int64_t> times;
     for (const auto& message : read_log(run("first") / log, channel)) {
-      // Those of the start pose, two, may have passed before the loggers listened.
+      // The two frames of the start pose may have passed before the loggers listened.
       if (message.image_seq >= 2) times.insert(message.utime);
     }
     return times;
@@ -251,7 +251,7 @@ TEST_F(Arm2, NothingWasLostOnTheWay) {
 TEST_F(Arm2, ThePictureIsAFrameWithMarkersDrawnIn) {
   const cv::Mat picture = cv::imread((run("first") / "detections.png").string());
   ASSERT_EQ(picture.size(), cv::Size(1280, 960));
-  // The frame is grey; what has colour was drawn: outlines (yellow) and the axes of each marker.
+  // The frame is grey; coloured pixels were drawn: outlines (yellow) and the axes of each marker.
   int num_yellow = 0, num_red = 0, num_blue = 0;
   for (const cv::Vec3b& bgr : cv::Mat_<cv::Vec3b>(picture)) {
     num_yellow += bgr[2] - bgr[0] > 100 && bgr[1] - bgr[0] > 60;
@@ -340,7 +340,7 @@ TEST_F(Arm2, AReplayThroughTheObserverGivesTheSameSamples) {
 }
 
 TEST_F(Arm2, AReplayThroughTheSimulatorGivesTheSameStates) {
-  // Live, the state before the first action is told at 1 Hz; no command causes it.
+  // Live, the state before the first action is repeated at 1 Hz; no command causes it.
   const auto states = [](const fs::path& log) {
     return distinct_payloads<sim_state_t>(
         log, kSimState, [](const sim_state_t& state) { return state.action_id >= 0; });
@@ -356,7 +356,7 @@ TEST_F(Arm2, AReplayThroughTheBabblerGivesTheSameActions) {
 }
 
 TEST_F(Arm2, AReplayThroughTheCameraGivesTheSameImages) {
-  // Those of the start pose, two, may have passed live before the logger listened.
+  // The two frames of the start pose may have passed live before the logger listened.
   const auto images = [](const fs::path& log) {
     return distinct_payloads<camera_image_t>(
         log, kCameraImage, [](const camera_image_t& image) { return image.image_seq >= 2; });
@@ -482,7 +482,7 @@ TEST_F(Arm2, AReplayWithAHoleSaysWhatIsLostAndLearnsFromTheRest) {
   EXPECT_EQ(result("without the first")["lost_samples"], nlohmann::json({{0, 4}}));
 }
 
-// As a lab has it: tags, prints, lens and joints are not what the rig's files say.
+// A lab's robot: tags, prints, lens and joints differ from the rig's files.
 TEST_F(Arm2, WithCalibrationErrorsArm4IsLearnedRight) {
   ASSERT_EQ(shell(run_command("honest", "--rig arm4 --seed 3 --samples 30")), 0)
       << contents(folder_ / "honest.err");
@@ -519,7 +519,7 @@ TEST_F(Arm2, AReplayOfSamplesThatAreCutOffSaysWhereAndLearnsFromTheRest) {
   const fs::path whole = run("first") / "samples.lcmlog", cut = folder_ / "cut.lcmlog";
   fs::copy_file(whole, cut, fs::copy_options::overwrite_existing);
   fs::resize_file(cut, fs::file_size(whole) * 9 / 10);
-  // No rig is named and none lies beside the log: its samples tell it.
+  // No rig is named and none lies beside the log: it is found from the samples.
   ASSERT_EQ(replay_group("cut", cut), 0) << contents(folder_ / "cut.err");
   EXPECT_EQ(result("cut")["rig"], "arm2");
   const int whole_samples = static_cast<int>(read_log(cut, kSample).size());

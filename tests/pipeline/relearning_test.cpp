@@ -55,8 +55,8 @@ class RelearningTest : public testing::Test {
     for (sample_t& sample : samples_) EXPECT_EQ(check(sample), "");
   }
 
-  /// The monitor after samples 0..end-1; the learner's answers come `late` samples late, and what
-  /// it hears of the body schema `heard_late`.
+  /// The monitor after samples 0..end-1; the learner's answers come `late` samples late, and it
+  /// hears the body schema `heard_late` samples late.
   ModelMonitor run(std::int64_t late = 0, std::int64_t end = kEnd, std::size_t heard_late = 0) {
     ModelMonitor monitor(
         {.max_mahalanobis2 = 20.06,
@@ -133,7 +133,7 @@ TEST_F(RelearningTest, AfterAChangeTheBodyIsLearnedAnewFromWhatCameSince) {
                 proposal.last_sample_index < schema.changes[0].found ? 0 : schema.changes[0].since);
     }
   }
-  // The monitor's own replacement rests on the first samples after the change; what was learned
+  // The monitor's own replacement rests on the first samples after the change; the model learned
   // from all of them stands in the end.
   EXPECT_GT(monitor.memory().at_base.judged_sample, kBrokenAt + 40);
   EXPECT_TRUE(test::is_right(schema, broken_));

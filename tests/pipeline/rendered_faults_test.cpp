@@ -1,6 +1,6 @@
 // The simulated arm breaks while it babbles and is repaired again: from rendered images to the body
-// schema, with the configuration of the rig, in one thread. When it breaks is told by the sample,
-// so every run is the same.
+// schema, with the configuration of the rig, in one thread. The sample's index decides when it
+// breaks, so every run is the same.
 
 #include <gtest/gtest.h>
 
@@ -20,7 +20,7 @@ namespace bodyschema::test {
 namespace {
 
 constexpr std::int64_t kBrokenAt = 30, kRepairedAt = 50, kEnd = 65;
-/// Samples until the monitor has decided, and after which the schema must be right.
+/// Samples until the monitor has decided and the schema must be right.
 constexpr std::int64_t kSoon = 5;
 constexpr double kFalseAlarmRate = 1e-5;  // as the rig says
 
@@ -41,7 +41,7 @@ class AdaptationTest : public testing::TestWithParam<Case> {
  protected:
   AdaptationTest() : run_(BODYSCHEMA_SOURCE_FOLDER "/config/arm7", 1, {}, Choice::kActive) {}
 
-  /// One more sample. Keeps what the monitor says.
+  /// One more sample. Keeps the monitor's events.
   void step() {
     const RenderedRun::Step step = run_.next();
     for (const PartObservation& o : step.sample.parts) ++num_seen_[o.part];
@@ -100,8 +100,8 @@ TEST_P(AdaptationTest, IsFoundNamedAndMendedAndSoIsTheRepair) {
     ASSERT_LE(event.event_kind, health_event_t::EVENT_SCHEMA_REFUSED) << told();
 
   for (const int number : c.numbers) run_.break_body(c.fault, c.place, number, c.amount_deg);
-  // A part that is gone is missed when so long a run of misses is rarer than the false alarms that
-  // are allowed, whatever share of the samples may show it (Jeffreys' prior).
+  // A missing part is reported when a run of misses of this length is rarer than the allowed false
+  // alarms, whatever share of the samples shows the part (Jeffreys' prior).
   std::int64_t soon = kSoon;
   if (c.fault == fault_command_t::FAULT_MARKER_LOST) {
     const double seen = num_seen_[c.part] + 0.5, missed = kBrokenAt - num_seen_[c.part] + 0.5;
@@ -136,7 +136,7 @@ TEST_P(AdaptationTest, IsFoundNamedAndMendedAndSoIsTheRepair) {
   }
 }
 
-/// One of the four tags of a part, as real ones come off one by one.
+/// One of the four tags of a part; real tags come off one by one.
 class OneTag : public AdaptationTest {
  protected:
   static constexpr std::int64_t kRepaired = 90, kLast = 120;

@@ -10,8 +10,8 @@ trap 'kill $(jobs -p) 2>/dev/null || true; wait; rm -rf "$work"' EXIT
 lcm-logger --quiet --lcm-url="$LCM_DEFAULT_URL" "$work/replayed.lcmlog" &
 "$bin/structure_learner" --config "$rig/structure_learner.yaml" 2>"$work/learner.log" &
 
-# lcm-logplayer starts at once, so first make sure that both hear the bus: it is on disk that the learner, which begins
-# by looking for a twin, waits for samples.
+# lcm-logplayer starts at once, so first make sure that both hear the bus: the logger has recorded that the learner,
+# which first listens for a twin, waits for samples.
 for _ in $(seq 200); do
   "$bin/log_payloads" "$work/replayed.lcmlog" PROCESS_INFO --last 2>/dev/null | grep -aq "waiting for SAMPLE" && break
   read -rt 0.1 <> <(:) || true

@@ -1,6 +1,6 @@
 #!/bin/bash
-# targets.sh SOURCE BUILD: a group learns arm2, then the end effector is sent to random positions; halt, resume,
-# hold and release are said by the console; a target that times out or is interrupted is dropped; the controller is
+# targets.sh SOURCE BUILD: a group learns arm2, then the end effector is sent to random positions; the console
+# says halt, resume, hold and release; a target that times out or is interrupted is dropped; the controller is
 # killed with a hold and in the middle of a target and holds.
 set -euo pipefail
 source=$1 build=$2
@@ -38,7 +38,7 @@ position=$(awk -F'|' '/reached/ {print $3; exit}' "$work/targets.txt")
 elsewhere=$(awk -F'|' '/reached/ && ++n == 2 {print $3; exit}' "$work/targets.txt")
 observer=$("$source/run" exec pgrep -f "^$build/bin/observer ")
 
-# Nobody follows it any longer: it is dropped and the arm held, also once its SAMPLE has come.
+# Without a follower the target is dropped and the arm held, also once its SAMPLE has come.
 state() { "$source/run" exec bodyschema status --json | python3 -c 'import json, sys
 status = json.load(sys.stdin)
 print(status["control"]["state"], status["newest_sample"], status["arm"]["action_id"])'; }
@@ -63,7 +63,7 @@ for end in timeout interrupt; do
   console release || fail "release after $end"
 done
 
-# Killed in the middle of a target, which stays open because its SAMPLE does not come: the one who follows it is
+# Killed in the middle of a target, which stays open because its SAMPLE does not come: its follower is
 # told, and it is not served again.
 kill -STOP "$observer"
 # shellcheck disable=SC2086

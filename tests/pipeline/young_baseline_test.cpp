@@ -1,6 +1,6 @@
 // Learner and monitor in the first samples of a run, in one thread, on synthetic robots with
 // tag-like noise: a first structure that is wrong is learned better, not explained as a change of
-// the body; and a body that does change is found out all the same.
+// the body; and a real change of the body is still found.
 
 #include <gtest/gtest.h>
 
@@ -112,7 +112,7 @@ TEST(YoungBodyThatChanges, IsFoundOutWithinFewSamples) {
         return e.event_kind == health_event_t::EVENT_CANDIDATE;
       });
       ASSERT_NE(told, soon.events.end());
-      // What the joint carries hangs on the edge that leads to it.
+      // The link behind the joint belongs to the edge that leads to it.
       EXPECT_EQ(robot.path_signals(told->event_from, told->event_to).contains(link->signal), true);
       const auto run = test::live_run(samples, learner, kMonitor);
       ASSERT_TRUE(run.schema);

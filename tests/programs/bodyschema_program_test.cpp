@@ -47,7 +47,7 @@ struct Outcome {
   }
 };
 
-/// The structure that `learn --json` printed, with what test::judge() looks at.
+/// The structure that `learn --json` printed, in the form that test::judge() reads.
 BodySchema structure_of(const Json& json) {
   BodySchema schema;
   schema.complete = json.at("complete");
@@ -78,7 +78,7 @@ class BodyschemaProgramTest : public testing::Test {
   }
   ~BodyschemaProgramTest() override { std::filesystem::remove_all(folder_); }
 
-  /// `before`: what the shell does before the program, e.g. "cat s.csv | ".
+  /// `before`: shell text in front of the program, e.g. "cat s.csv | ".
   Outcome run(const std::vector<std::string>& arguments, const std::string& before = "") const {
     const auto out = folder_ / "stdout.txt", err = folder_ / "stderr.txt";
     std::string command =
@@ -226,7 +226,7 @@ TEST_F(BodyschemaProgramTest, LearnsAsTheChapterDidForComparison) {
   EXPECT_TRUE(test::is_right(structure_of(json), robot_)) << json;
   for (const Json& edge : json["edges"]) EXPECT_EQ(edge["kind"], "matrix_gp");
   EXPECT_NE(outcome.err.find("30 local models learned"), std::string::npos) << outcome.err;
-  // What was written predicts like what was learned: the processes are factorised again.
+  // The written schema predicts like the learned one: the Gaussian processes are factorised again.
   EXPECT_EQ(run({"learn", csv, "--method", "chapter", "--noise", "0.001", "0.3", "--out",
                  "schema.lcmlog"})
                 .exit_code,
@@ -322,14 +322,14 @@ TEST_F(BodyschemaProgramTest, ShowPrintsASchemaFile) {
   for (const Json& edge : shown["edges"]) EXPECT_TRUE(edge.contains("joints"));
   const Outcome text = run({"show", "schema.lcmlog"});
   EXPECT_EQ(text.exit_code, 0);
-  // Only who learned knows where the noise is known from.
+  // Only `learn` knows the source of the noise.
   std::string learned_text = run({"learn", "s.csv"}).out;
   const std::string source = ", estimated from what the best models leave";
   ASSERT_NE(learned_text.find(source), std::string::npos) << learned_text;
   EXPECT_EQ(text.out, learned_text.erase(learned_text.find(source), source.size()));
 }
 
-/// Samples of a 2-DOF robot of which `parts` fly about at random.
+/// Samples of a 2-DOF robot whose `parts` have random poses.
 std::vector<ActionPoseSample> with_flying_parts(const std::set<int>& parts) {
   test::Rng rng(75);
   auto samples = test::babble(test::chapter_robot("a", rng), 60, {}, rng);
@@ -796,7 +796,7 @@ TEST_F(BodyschemaProgramTest, ALogTellsItsRig) {
   expect_failure({"log", "schema.lcmlog", "--rig-of", "nowhere"}, "nowhere", 1);
 }
 
-/// Recordings of others, read where they lie; the project keeps no copy.
+/// Recordings of others, read in their own folder; the project keeps no copy.
 class RealDataTest : public BodyschemaProgramTest {
  protected:
   void SetUp() override {
@@ -825,12 +825,12 @@ class RealDataTest : public BodyschemaProgramTest {
   std::filesystem::path data_;
 };
 
-// In metres, w x y z, by commas: what is right gets no hint.
+// In metres, w x y z, with commas: right input gets no hint.
 TEST_F(RealDataTest, NoneOfThemGetsAHint) {
   int num_recordings = 0;
   for (const auto& entry : std::filesystem::directory_iterator(data_)) {
     if (entry.path().extension() != ".csv") continue;
-    // Refused as soon as it was read: what it would learn is not asked here.
+    // Refused as soon as it was read: the result of learning does not matter here.
     const Outcome outcome = run({"learn", entry.path().string(), "--root", "99"});
     EXPECT_EQ(outcome.exit_code, 1);
     EXPECT_NE(outcome.err.find("--root: part 99 is never seen"), std::string::npos) << outcome.err;
@@ -850,7 +850,7 @@ TEST_F(RealDataTest, TheWeldingPositionerIsOneEdgeOfBothSignals) {
   ASSERT_EQ(json["edges"].size(), 1U) << json;
   const auto signals = json["edges"][0]["signals"].get<std::set<std::string>>();
   EXPECT_EQ(signals, (std::set<std::string>{"q1", "q2"}));
-  // Its axes are no perfect screws: what they leave, 0.3 mm, is more than its noise.
+  // Its axes are no perfect screws: their residual, 0.3 mm, is more than its noise.
   EXPECT_EQ(json["edges"][0]["kind"], "screw_gp");
   const Json errors = run({"predict", "schema.lcmlog", csv, "--json"}).json();
   EXPECT_EQ(errors["parts"][0]["count"], 205);
@@ -913,7 +913,7 @@ TEST_F(RealDataTest, TheSoftTrunkIsAChainOfScrewsWithResidualProcesses) {
     EXPECT_LT(outliers[0] + outliers[1] + outliers[3], 0.08 * samples);
   }
   const Json parts = run({"predict", "schema.lcmlog", odd, "--json"}).json()["parts"];
-  // Measured: 1.0, 3.2 and 6.0 mm from the root; see tests/experiments/README.md.
+  // Measured: 1.0, 3.2 and 6.0 mm from the root; see docs/results.md.
   const double position_m[] = {0.002, 0.006, 0.010};
   for (int n = 0; n < 3; ++n)
     EXPECT_LT(parts[n]["position_median_m"].get<double>(), position_m[n]) << parts[n];
@@ -945,7 +945,7 @@ class TrunkMonitorTest : public RealDataTest {
     EXPECT_EQ(outcome.exit_code, 0) << outcome.err;
     return lines_of(outcome.out);
   }
-  /// The rows of a recording, what `change` makes of each.
+  /// The rows of a recording, each after `change`.
   template <class Change>
   std::string rewritten(const std::string& name, const std::string& file, Change change) const {
     std::ifstream in(folder_ / file);
@@ -962,7 +962,7 @@ class TrunkMonitorTest : public RealDataTest {
 
 TEST_F(TrunkMonitorTest, NoAlarmOnTheHeldOutHalfOfTheTrunk) {
   EXPECT_EQ(events(odd_), std::vector<Json>{});
-  // Which instants of a stream are judged is chance: the whole recording from other instants on.
+  // The judged instants of a stream are random: the whole recording from other instants on.
   const std::string whole = write("whole.csv", text_of(csv_));
   for (const double from_s : {0.0, 0.21, 0.42, 0.63, 0.84}) {
     const std::string later = rewritten("later.csv", whole, [&](const std::string& row) {

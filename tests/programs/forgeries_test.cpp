@@ -1,4 +1,4 @@
-// What a stranger on the bus sends that agrees with the rig, and what it does to the programs. Runs
+// Forged messages that agree with the rig, and their effect on the programs. Runs
 // in tests/private_bus.sh.
 
 #include <gtest/gtest.h>

@@ -1,4 +1,4 @@
-// Whoever keeps something, on a full disk, as programs. Runs in tests/private_bus.sh and
+// Programs that write files, on a full disk. Runs in tests/private_bus.sh and
 // tiny_disk.sh.
 
 #include <gtest/gtest.h>
@@ -44,7 +44,7 @@ class FullDisk : public testing::Test {
     return arguments;
   }
   void fill_disk() const {
-    // Until the last byte: page by page, then what is left of one.
+    // Until the last byte: page by page, then the rest of a page.
     std::ofstream filler(disk_ / "filler", std::ios::binary | std::ios::app);
     while (filler.write("x", 1).flush()) {
     }
@@ -127,7 +127,7 @@ TEST_F(FullDisk, ASampleThatCannotBeWrittenIsHeldBackUntilItCan) {
       << info_.activity;
   EXPECT_NE(info_.activity.find("No space left"), std::string::npos) << info_.activity;
   ASSERT_TRUE(handle_until(bus_, [&] { return counter("held SAMPLE") > 0; }));
-  // The newest that is on disk is still told, what is not there is not.
+  // The newest sample on disk is still repeated, the unwritten one is not sent.
   heard_.clear();
   ASSERT_TRUE(handle_until(bus_, [&] { return heard_[next - 1] >= 2; }));
   EXPECT_EQ(heard_[next], 0);

@@ -26,7 +26,7 @@ lcm-logger --quiet --lcm-url="$LCM_DEFAULT_URL" "$work/bus.lcmlog" &
 "$program" --config "$rig/$name.yaml" 2>"$work/process.log" &
 process=$!
 
-# The name is in the payload: it is this process that was heard.
+# The name is in the payload: this process was heard.
 is_heard() { "$log_payloads" "$work/bus.lcmlog" PROCESS_INFO 2>/dev/null | grep -qaF "$name"; }
 is_heard_or_dead() { is_heard || ! kill -0 "$process" 2>/dev/null; }
 has_ended() { ! kill -0 "$process" 2>/dev/null; }

@@ -1,5 +1,5 @@
-// model_monitor, the program, killed and started again while a joint sticks: what it ends with is
-// what it would have ended with.
+// The program model_monitor, killed and started again while a joint sticks: it ends with the same
+// result as without kills.
 
 #include <gtest/gtest.h>
 #include <sys/wait.h>
@@ -26,7 +26,7 @@ namespace fs = std::filesystem;
 const fs::path kRig = BODYSCHEMA_CONFIG "/arm2";
 constexpr std::int64_t kNumSamples = 45, kStuckFrom = 27;
 
-/// A 2-DOF robot in a rig of its own, and what the bus would carry of it.
+/// A 2-DOF robot in a rig of its own, and its messages on the bus.
 class MonitorRestartTest : public testing::Test {
  protected:
   MonitorRestartTest() {
@@ -44,7 +44,7 @@ class MonitorRestartTest : public testing::Test {
     const test::ObservationOptions options{
         .regime = test::Regime::kTag, .with_covariances = true, .with_other_hypothesis = true};
     std::vector<ActionPoseSample> samples = test::babble(robot_, kStuckFrom, options, rng);
-    // Signal 1 sticks; what is commanded is what the sample says.
+    // Signal 1 sticks; the sample has the command.
     for (ActionPoseSample sample : test::babble(robot_, kNumSamples - kStuckFrom, options, rng)) {
       Eigen::VectorXd stuck = sample.action;
       stuck(1) = 0.4;
@@ -81,7 +81,7 @@ class MonitorRestartTest : public testing::Test {
     }
   }
 
-  /// A log of the samples up to `last`, with the proposals where they come or without.
+  /// A log of the samples up to `last`, with the proposals between them or without.
   fs::path log_up_to(std::int64_t last, bool with_proposals) {
     const fs::path file =
         folder_ / ((with_proposals ? "bus_" : "samples_") + std::to_string(last) + ".lcmlog");
@@ -137,7 +137,7 @@ TEST_F(MonitorRestartTest, AfterAnEndAtAnyMomentItEndsWithTheSameSchemaAndHealth
   }));
   for (const std::int64_t ended_after : {3, 11, 19, 27, 29, 31, 38}) {
     const std::string name = "ended_" + std::to_string(ended_after);
-    // What the observer had written by then is there at the second start.
+    // The second start finds the samples that the observer had written by then.
     ASSERT_NO_FATAL_FAILURE(run(ended_after, name, folder_ / "none"));
     ASSERT_NO_FATAL_FAILURE(run(kNumSamples - 1, name, log_up_to(ended_after, false)));
     EXPECT_EQ(last_of(name, kBodySchema), schema) << ended_after;
@@ -175,8 +175,8 @@ TEST_F(MonitorRestartTest, KilledInTheMiddleOfItAllItEndsWithTheSameFiles) {
   }
 }
 
-// A bit that a disk lost is no reason for a wrong body schema: the end is the same, or the monitor
-// says what it could not use.
+// A bit lost by a disk gives no wrong body schema: the end is the same, or the monitor reports the
+// file that it could not use.
 TEST_F(MonitorRestartTest, AFlippedBitIsHarmlessOrNoticed) {
   constexpr std::int64_t kEndedAfter = 38;
   ASSERT_NO_FATAL_FAILURE(run(kNumSamples - 1, "undisturbed", folder_ / "none"));
@@ -215,7 +215,7 @@ TEST_F(MonitorRestartTest, AHistoryOfOtherSamplesIsSetAside) {
       << program.err();
   EXPECT_TRUE(fs::exists(folder_ / "ended" / "history.lcmlog.bad-1"));
   EXPECT_TRUE(fs::exists(folder_ / "ended" / "schema.lcmlog.bad-1"));
-  // From the samples alone, as if there had been nothing.
+  // From the samples alone, as without a history.
   ASSERT_NO_FATAL_FAILURE(run(kNumSamples - 1, "undisturbed", folder_ / "none"));
   EXPECT_EQ(last_of("ended", kBodySchema), last_of("undisturbed", kBodySchema));
 }

@@ -40,7 +40,7 @@ std::string text_of(const fs::path& file) {
 
 class RecordedLogTest : public testing::Test {
  protected:
-  /// Runs a process of the group from the log to a log; what it wrote.
+  /// Runs a process of the group from the log to a log; returns its messages.
   fs::path replay(const std::string& process) {
     const fs::path out = folder_ / (process + ".lcmlog");
     test::Program program({kBin + process, "--config", kRig / (process + ".yaml"), "--in",
@@ -165,7 +165,7 @@ TEST_F(RecordedLogTest, CutOffAnywhereItIsReportedAndSaysSo) {
     EXPECT_EQ(check.wait(), 1);
     EXPECT_NE(check.err().find("is cut off"), std::string::npos) << check.err();
   }
-  // A recording that is cut off is learned from, and that is said too.
+  // A recording that is cut off is learned from, with a message.
   test::Program learn({kBin + "bodyschema", "learn", folder_ / "cut.lcmlog"});
   EXPECT_EQ(learn.wait(), 0);
   EXPECT_NE(learn.err().find("ends in the middle of an event"), std::string::npos) << learn.err();
@@ -225,7 +225,7 @@ TEST_F(RecordedLogTest, AReportFollowsARunUntilItIsEnded) {
   EXPECT_TRUE(says("http-equiv=\"refresh\""));
   test::write_bytes(folder_ / "run.lcmlog.00",
                     {bytes.begin(), bytes.begin() + static_cast<std::ptrdiff_t>(bytes.size() / 2)});
-  // Asked to end, it reads what is there and writes a last time.
+  // Asked to end, it reads the rest and writes a last time.
   test::write_bytes(folder_ / "run.lcmlog.00", bytes);
   follow.send_signal(SIGTERM);
   EXPECT_EQ(follow.wait(), 0) << follow.err();

@@ -1,5 +1,5 @@
-// Every file of every rig in config/ is read by the process that it is for. A new rig is covered as
-// soon as it is there; a new kind of file wants a line in the table below.
+// Every file of every rig in config/ is read by its process. A new rig is covered as
+// soon as it is there; a new kind of file needs a line in the table below.
 
 #include <gtest/gtest.h>
 #include <unistd.h>
@@ -102,7 +102,7 @@ TEST_P(RigFilesTest, RootAndEndEffectorAreParts) {
   }
 }
 
-// A process that skips what it does not know would run with a misspelt key's default.
+// A process that ignores unknown keys would run with the default of a misspelt key.
 TEST_P(RigFilesTest, AnUnknownKeyInAnyFileIsRefused) {
   const path copy = path(testing::TempDir()) /
                     ("rig_files_" + std::to_string(getpid()) + GetParam().filename().string());
@@ -124,8 +124,8 @@ TEST_P(RigFilesTest, AnUnknownKeyInAnyFileIsRefused) {
   std::filesystem::remove_all(copy);
 }
 
-// The other way round: whatever key is taken away or damaged, the reader throws a ConfigError or
-// does without, and nothing else.
+// The other way round: whichever key is removed or damaged, the reader throws a ConfigError or
+// does without the key.
 TEST_P(RigFilesTest, AFileWithALineLessIsRefusedWithAConfigErrorOrRead) {
   const path copy = path(testing::TempDir()) /
                     ("rig_lines_" + std::to_string(getpid()) + GetParam().filename().string());
@@ -279,7 +279,7 @@ TEST_F(RigCheckTest, ALabsRigIsNotSimulated) {
   EXPECT_EQ(check_rig(copy_).problems, std::vector<std::string>{});
 }
 
-// Whatever number of a rig is damaged so that squares of it overflow.
+// Any number of a rig is damaged so that its square overflows.
 TEST_F(RigCheckTest, NoNumberMayBe1e308) {
   const std::regex number(R"([-+]?\b[0-9]+(\.[0-9]+)?(e[-+]?[0-9]+)?\b)");
   int num_numbers = 0;
@@ -292,7 +292,7 @@ TEST_F(RigCheckTest, NoNumberMayBe1e308) {
       line = line.substr(0, line.find('#'));
       for (std::sregex_iterator match(line.begin(), line.end(), number), end; match != end;
            ++match) {
-        // A name or a path; numbers of a calibration that nobody reads.
+        // A name or a path; numbers of a calibration that no process reads.
         const std::size_t at = static_cast<std::size_t>(match->position());
         const char before = at > 0 ? line[at - 1] : ' ';
         if (std::string(" [{:,").find(before) == std::string::npos) continue;

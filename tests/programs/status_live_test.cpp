@@ -93,7 +93,7 @@ TEST(StatusLive, ProcessesAreSeenThroughGarbageOnEveryChannel) {
   EXPECT_EQ(outcome.exit_code, 0) << outcome.err;
   EXPECT_NE(outcome.out.find("Not heard: camera."), std::string::npos) << outcome.out;
   EXPECT_EQ(outcome.out.find("\x1b"), std::string::npos);
-  // Nobody said who should be there.
+  // Without --processes no process is expected.
   EXPECT_EQ(status({}).out.find("Not heard"), std::string::npos);
 }
 

@@ -32,7 +32,7 @@ SyntheticRobot chain(Rng& rng) {
   return robot;
 }
 
-/// The truth but for 1 mm and 0.2° per axis and edge, and it says so.
+/// The truth except 1 mm and 0.2° per axis and edge, which its covariances state.
 BodySchema engineered_model(const SyntheticRobot& robot, Rng& rng) {
   Vector6d sigma;
   sigma << Eigen::Vector3d::Constant(0.001), Eigen::Vector3d::Constant(0.2 * kDegree);

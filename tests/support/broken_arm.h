@@ -25,10 +25,10 @@ enum class Fault {
   kDrift,     ///< a link bends by drift_deg a sample
   kWorn,      ///< a joint's transmission: it goes to q + 0.6 sin 3q
   kCoupled,   ///< a joint is moved by another signal too, half as far
-  kElastic    ///< what a joint carries bends with the angle: 17° and 4 cm at 1 rad
+  kElastic    ///< the link behind a joint bends with the angle: 17° and 4 cm at 1 rad
 };
 
-/// What a fault is, as a monitor may name it.
+/// Description of a fault, as a monitor may name it.
 struct TrueChange {
   int part = 0;         ///< the edge that leads to it, or its marker
   bool at_edge = true;  ///< the edge is a right answer
@@ -47,7 +47,7 @@ struct Scenario {
 
 /// The chapter's arm of Sections 5.2 and 5.3: a chain of seven parts x1 … x7, the edge i–(i+1)
 /// moved by q_i, q7 idle; the camera 2 m away. Its geometry, its "engineered model" (right to 1 mm
-/// and 0.2° an axis and edge) and all that it sees follow from the seed.
+/// and 0.2° an axis and edge) and all its observations follow from the seed.
 ///
 /// Its life has four blocks: healthy, broken, repaired, broken again in the same way.
 class BrokenArm {
@@ -64,9 +64,9 @@ class BrokenArm {
   BodySchema engineered_but_exact(int part, int index) const;
   /// Must be called for 0, 1, 2, … in this order.
   ActionPoseSample observe(int index);
-  /// Mean distance of what is judged from where the schema believes it at `index`, over 60 actions
-  /// [m]; noise-free. That is the end effector in the root part; of a moved marker, this marker's
-  /// part; of a bumped camera, the end effector in the camera.
+  /// Mean distance of the judged part from its position by the schema at `index`, over 60 actions
+  /// [m]; noise-free. The judged part is the end effector in the root part; for a moved marker,
+  /// this marker's part; for a bumped camera, the end effector in the camera.
   double error(const BodySchema& schema, int index) const;
   const std::vector<TrueChange>& changes() const { return changes_; }
   /// True for an edge or a part that is affected or next to it.

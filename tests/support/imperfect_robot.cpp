@@ -143,8 +143,8 @@ void ImperfectRobot::move(const Eigen::VectorXd& action) {
     angles[n] = links_[n].angle;
   }
   if (is_.droop_deg > 0) {
-    // Every link weighs as much; a joint's greatest torque is that of all that it carries, each
-    // stretched out sideways.
+    // Every link weighs as much; a joint's greatest torque is that of all links that it carries,
+    // each stretched out sideways.
     const auto X_RB = poses_at(angles);
     for (std::size_t n = 1; n < links_.size(); ++n) {
       const Isometry3d X_RJ = X_RB[static_cast<std::size_t>(links_[n].parent)] * links_[n].before;

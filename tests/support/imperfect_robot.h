@@ -10,8 +10,8 @@
 
 namespace bodyschema::test {
 
-/// How a robot, or what is seen of it, differs from a perfect one with independent noise. Zero is
-/// perfect.
+/// Differences of a robot, or of its observations, from a perfect one with independent noise. Zero
+/// is perfect.
 struct Imperfection {
   std::string name;
   double backlash_deg = 0;      ///< play between motor and link, both ways together
@@ -25,10 +25,10 @@ struct Imperfection {
   double flip_share = 0;        ///< the tag's normal mirrored at the line of sight
   double missing_share = 0;
   double range_deg = 0;      ///< of every joint; 0: 120° to 240° each
-  double placement_m = 0;    ///< 1 σ an axis: four tags a part sit off from where they should
+  double placement_m = 0;    ///< 1 σ an axis: displacement of the four tags of a part
   double placement_deg = 0;  ///< likewise
-  double tag_size = 0;       ///< 1 σ: a tag is this share larger than it is said to be
-  double focal_length = 0;   ///< the lens is this share longer than it is said to be
+  double tag_size = 0;       ///< 1 σ: a tag is this share larger than assumed
+  double focal_length = 0;   ///< the lens is this share longer than assumed
   double distortion = 0;     ///< at 45° from the optical axis a ray is off by this share
 };
 
@@ -47,17 +47,17 @@ class ImperfectRobot {
   /// Parents and signals alone, for judge().
   const SyntheticRobot& structure() const { return structure_; }
   Eigen::VectorXd random_action();
-  /// Goes there and is looked at.
+  /// Carries out an action and returns its observation.
   ActionPoseSample go(const Eigen::VectorXd& action);
   std::vector<ActionPoseSample> babble(int num_samples);
-  /// Where part n + 1 is at the last action, in the camera's frame.
+  /// Pose of part n + 1 at the last action, in the camera's frame.
   const std::vector<Eigen::Isometry3d>& poses() const { return poses_; }
 
  private:
   struct Tag {
-    Eigen::Isometry3d X_BT;            ///< as it is said to sit
+    Eigen::Isometry3d X_BT;            ///< its assumed pose
     Eigen::Isometry3d placement;       ///< X_BT_true = X_BT · placement
-    double size = 1;                   ///< true over said
+    double size = 1;                   ///< true over assumed
     Eigen::Matrix<double, 6, 9> bias;  ///< of (translation, rotation), of monomials of the view
   };
   struct Link {

@@ -184,7 +184,7 @@ TEST(ImperfectRobotTest, EveryRowOfTheTableHasANameAndIsAnImperfection) {
   EXPECT_EQ(all.front().name, "none");
   for (std::size_t a = 1; a < all.size(); ++a) {
     for (std::size_t b = 0; b < a; ++b) EXPECT_NE(all[a].name, all[b].name);
-    // The arm goes elsewhere, or is seen otherwise.
+    // The arm goes elsewhere, or its observation differs.
     ImperfectRobot robot(3, true, all[a], 1), perfect(3, true, {}, 1);
     bool is_other = false;
     for (int n = 0; n < 20; ++n) {

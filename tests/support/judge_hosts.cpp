@@ -1,5 +1,5 @@
-// judge_hosts: was a run over several hosts (tests/pipeline/hosts.sh) right, and what did the lost
-// frames cost? Prints a row of a Markdown table; exit 1 and the reason if something is wrong.
+// judge_hosts: judges a run over several hosts (tests/pipeline/hosts.sh), and the cost of lost
+// frames. Prints a row of a Markdown table; exit 1 and the reason if something is wrong.
 //
 //   judge_hosts FOLDER SAMPLES [--head]      (--head prints the table's head instead)
 
@@ -37,7 +37,7 @@ Message message_of(const LogEvent& event) {
   return *decoded.message;
 }
 
-/// The newest PROCESS_INFO of every process that the learning host heard of.
+/// The newest PROCESS_INFO of every process heard by the learning host.
 struct Heard {
   std::int64_t num_commands = 0;  ///< ACTION_COMMANDs beyond the first of each action
   std::int64_t num_requests = 0;  ///< SAMPLE_REQUESTs

@@ -1,5 +1,5 @@
-// judge_schema: is a learned schema right? Exit 0 if so; else says what is wrong. Reads the rig's
-// ground truth, which no learner does.
+// judge_schema: judges a learned schema. Exit 0 if it is right; else prints why not. Reads the
+// rig's ground truth, which no learner does.
 //
 //   judge_schema RIG_FOLDER SCHEMA_FILE [HIDDEN_PART…]
 

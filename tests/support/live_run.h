@@ -11,10 +11,10 @@
 
 namespace bodyschema::test {
 
-/// What learner and monitor end with.
+/// Last outputs of learner and monitor.
 struct LiveRun {
   std::optional<BodySchema> schema;    ///< BODY_SCHEMA
-  std::vector<health_event_t> events;  ///< told, verdicts on proposals apart
+  std::vector<health_event_t> events;  ///< all except verdicts on proposals
 };
 
 /// The learner and the monitor on the samples of one run, in one thread, message by message.
@@ -25,7 +25,7 @@ LiveRun live_run(const std::vector<sample_t>& samples, const StructureLearnerCon
 BodySchema learned_offline(const std::vector<sample_t>& samples,
                            const StructureLearnerConfig& learner);
 
-/// The run as it is where the part bears no marker.
+/// The run as it would be if the part had no marker.
 std::vector<sample_t> without_part(std::vector<sample_t> samples, int part);
 
 }  // namespace bodyschema::test

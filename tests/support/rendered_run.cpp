@@ -80,7 +80,7 @@ struct RenderedRun::Implementation {
     return config;
   }
 
-  /// What the babbler hears after a sample, up to its next command.
+  /// The messages to the babbler after a sample, up to its next command.
   std::optional<action_command_t> answer_to(const sample_t& sample) {
     babbler.remember(sample);
     auto next = babbler.on_sample(sample);

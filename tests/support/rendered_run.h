@@ -17,10 +17,10 @@
 
 namespace bodyschema::test {
 
-/// A rig's whole way from action to sample in one thread without a bus: simulator, rendered images,
-/// marker estimator, observer, and learner and monitor where actions are chosen by what they found,
-/// all with the rig's own configuration. The samples are those that ./run --ideal (or, if not
-/// ideal, ./run) records with the same seed.
+/// A rig's whole path from action to sample in one thread without a bus: simulator, rendered
+/// images, marker estimator, observer, and, if actions are chosen by their results, learner and
+/// monitor, all with the rig's own configuration. The samples are those that ./run --ideal (or, if
+/// not ideal, ./run) records with the same seed.
 class RenderedRun {
  public:
   struct Step {

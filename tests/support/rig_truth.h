@@ -25,8 +25,8 @@ class RigTruth {
 
   /// "" if `schema` is right: it spans `observed` parts, every edge's signals, and the number of
   /// its joints, are those of the true path between its two parts, and they are the least possible
-  /// (a gripper's fingers, without what carries them, are two joints apart, which no screw on their
-  /// one signal is). Else what is wrong.
+  /// (a gripper's fingers, without the part that carries them, are two joints apart, which no screw
+  /// on their one signal is). Else the reason why it is wrong.
   std::string objection(const BodySchema& schema, const std::vector<int>& observed) const;
 
  private:

@@ -19,7 +19,7 @@ double uniform(Rng& rng, double low, double high);
 double gaussian(Rng& rng);
 Vector6d gaussian6(Rng& rng);
 Eigen::Matrix3d random_rotation(Rng& rng);
-/// Of uniform direction and length.
+/// A vector of uniform direction, its length uniform in [min_m, max_m].
 Eigen::Vector3d random_vector(Rng& rng, double min_m, double max_m);
 /// Uniform rotation, translation of a length in [min_m, max_m].
 Pose random_pose(Rng& rng, double min_m, double max_m);
@@ -38,7 +38,7 @@ struct TrueLink {
   double wear = 0;   ///< the joint goes by wear · sin(3q) farther [command units]
   int also = -1;     ///< another signal that moves the joint: also_gain times as far
   double also_gain = 0;
-  Vector6d sag = Vector6d::Zero();  ///< what it carries is bent by Exp(sag · q²)
+  Vector6d sag = Vector6d::Zero();  ///< its load is bent by Exp(sag · q²)
   bool hidden = false;
 };
 

@@ -20,8 +20,8 @@ struct Plate {
 /// 1280×960 px, f = 1159 px, no distortion.
 camera_info_t pinhole_camera();
 
-/// What the camera sees: every pixel is the mean of 6×6 rays, intersected with the plates exactly;
-/// then blur and sensor noise. Grey 90 where there is no plate.
+/// The camera's image: every pixel is the mean of 6×6 rays, intersected with the plates exactly;
+/// then blur and sensor noise. Grey 90 beside the plates.
 cv::Mat render_plates(const std::vector<Plate>& plates, const camera_info_t& camera,
                       double blur_px = 0.7, double noise_sd = 2, std::uint64_t seed = 1);
 

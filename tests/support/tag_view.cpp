@@ -84,7 +84,7 @@ TagView::TagView(const Plate& plate, const camera_info_t& camera, const TagViewO
 
   const int n = options.rays_per_px;
   const int cols = camera.image_width, rows = camera.image_height;
-  // What the plate is printed with; −1: beyond it.
+  // Value of the print; −1: beyond the plate.
   const cv::Mat bitmap = tag_bitmap(plate.id, 1);
   const auto cell = [&](const Eigen::Vector2d& p) {
     const Eigen::Vector2d c = 4 * p + Eigen::Vector2d::Constant(kCells / 2.0);
@@ -96,7 +96,7 @@ TagView::TagView(const Plate& plate, const camera_info_t& camera, const TagViewO
   const auto ink = [&](int c) {
     return c < 0 ? beyond : bitmap.at<uchar>(c / kCells, c % kCells) ? 1.0 : 0.0;
   };
-  // Where the pixels' corners lie on the tag; within a pixel the map is bilinear.
+  // Positions of the pixels' corners on the tag; within a pixel the map is bilinear.
   std::vector<Eigen::Vector2d> lattice(static_cast<std::size_t>(cols + 1) * (rows + 1));
   for (int v = 0; v <= rows; ++v) {
     for (int u = 0; u <= cols; ++u) {
@@ -204,7 +204,7 @@ Eigen::Matrix<double, 8, 8> TagView::cramer_rao_px2(double noise_sd) const {
       if (!point) continue;
       const Eigen::Vector2d p = (to_tag_ * point->ray.homogeneous()).hnormalized();
       Eigen::Matrix<double, 11, 1> J;
-      // A pattern that moves by d shows at a pixel what was d before it.
+      // A pattern that moves by d shows at a pixel the value from d before it.
       J.head<8>() = -contrast * (gradient * displacement(p) * geometry_per_corners).transpose();
       J[8] = 1 - here;
       J[9] = here;

@@ -10,11 +10,11 @@
 
 namespace bodyschema::test {
 
-/// How a view of a tag is taken, beside its pose.
+/// Conditions of a view of a tag, beside its pose.
 struct TagViewOptions {
   double blur_px =
       0;  ///< standard deviation of a Gaussian point spread; 0: the pixel's square alone
-  /// How far the image of the tag moves on a straight line while the shutter is open, its middle at
+  /// Length of the straight motion of the tag's image while the shutter is open, its middle at
   /// the true pose [px].
   Eigen::Vector2d motion_px = Eigen::Vector2d::Zero();
   double black = 25, white = 220, background = 90;  ///< grey levels; above 255 they saturate
@@ -27,7 +27,7 @@ struct TagViewOptions {
 /// whole blocks of 8 × 8 pixels of the full image and has 16 pixels around the plate.
 camera_info_t camera_around(const Plate& plate, const camera_info_t& camera);
 
-/// What a camera sees of one tag, without noise and to a thousandth of a pixel: every pixel is the
+/// A camera's image of one tag, without noise and to a thousandth of a pixel: every pixel is the
 /// integral over its square of the printed tag after blur and motion. Pixel (0, 0) is the centre of
 /// the upper left pixel. The areas that cells cover in a fraction of a pixel come from 64 points of
 /// a Hammersley set, so that an edge along the pixels' rows is no worse than a slanted one.
@@ -45,8 +45,8 @@ class TagView {
   cv::Mat taken(double noise_sd, std::uint64_t seed, int jpeg_quality = 0) const;
 
   /// The Cramér–Rao bound of the corners (x0, y0, …) [px²] of any unbiased estimate from pixels
-  /// with independent Gaussian noise, where black, white and the width of the blur are unknown too
-  /// and nothing is known of what lies beyond the tag's white margin. 8 × 8.
+  /// with independent Gaussian noise, with unknown black, white and width of the blur,
+  /// and unknown surroundings of the tag's white margin. 8 × 8.
   Eigen::Matrix<double, 8, 8> cramer_rao_px2(double noise_sd) const;
 
  private:

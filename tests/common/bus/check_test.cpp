@@ -115,7 +115,7 @@ TEST(Check, AcceptsANearlySingularCovarianceThatRoundingToFloatMadeIndefinite) {
     ASSERT_EQ(check(sample), "");
     const auto rounded = unpack_triangle<6>(sample.parts[0].covariance);
     num_indefinite += correlation_of(rounded).selfadjointView<Eigen::Lower>().eigenvalues()[0] < 0;
-    // Whoever uses it may invert it, and sends it on as it came.
+    // A receiver may invert it, and sends it on unchanged.
     const Matrix6d covariance = from_message(sample.parts[0].covariance);
     EXPECT_EQ(covariance.llt().info(), Eigen::Success);
     EXPECT_TRUE(correlation_of(covariance).isApprox(correlation_of(rounded), 3e-5));

@@ -121,8 +121,8 @@ TEST(EventLog, TheChecksumIsCrc32c) {
   EXPECT_EQ(stored, crc32c({event.data() + 8, event.size() - 8}));
 }
 
-// One bit is what a disk or a memory loses. Whatever it is: never another sample than was written,
-// and none is missing unsaid.
+// A disk or a memory loses one bit. Whichever: the log never gives another sample than was written,
+// and reports every missing one.
 TEST(EventLog, AFlippedBitIsNeverReadAsASample) {
   const TemporaryFolder folder;
   write_samples(folder / "log", 3);
@@ -271,8 +271,8 @@ TEST(EventLog, WhateverIsDamagedInTheMiddleTheOtherEventsCanBeRead) {
   write_samples(folder / "log", 4);
   const std::vector<std::uint8_t> good = read_bytes(folder / "log");
   const std::size_t size = good.size() / 4;
-  // Every byte of the second event's header, among them its lengths: too large for the file, they
-  // would make it look like a torn tail, and what follows would be cut off.
+  // Every byte of the second event's header, among them its lengths: a length beyond the file would
+  // look like a torn tail, and the events after it would be cut off.
   for (std::size_t at = size; at < size + 28 + 6; ++at) {
     std::vector<std::uint8_t> bytes = good;
     bytes[at] ^= 0xFF;
@@ -351,7 +351,7 @@ TEST(EventLog, DamagedLogsNeverCrashTheReader) {
   }
 }
 
-// The learner and the monitor rest on this: what the observer has appended is there after kill -9.
+// Learner and monitor rely on this: the observer's appended samples survive kill -9.
 TEST(EventLog, EveryAppendedEventSurvivesAKill) {
   const TemporaryFolder folder;
   for (int round = 0; round < 5; ++round) {

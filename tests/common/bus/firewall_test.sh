@@ -1,7 +1,7 @@
 #!/bin/bash
-# firewall_test.sh README RELAY: the rules of config/README.md, taken from there. Without them a packet that
+# firewall_test.sh README RELAY: tests the rules in config/README.md. Without them a packet that
 # another machine sends to this one, to no multicast group, reaches a process on the bus, whatever its
-# ttl; with them none does, and the bus itself still works. Another machine is a network namespace
+# ttl; with them none does, and the bus itself still works. The other machine is a network namespace
 # behind a veth pair.
 set -euo pipefail
 if [ "${1:-}" != inside ]; then
@@ -42,7 +42,7 @@ there ip addr add 192.168.7.9/24 dev eth9
 there ip link set eth9 up multicast on
 there ip route add 224.0.0.0/4 dev eth9
 
-# A packet of LCM's on CHANNEL that no process can decode: who hears it says so.
+# A packet of LCM's on CHANNEL that no process can decode: a process that hears it reports it.
 packet='printf "LC02\0\0\0\1$0\0junk" >"/dev/udp/$1/7700"'
 here() { bash -c "$packet" "$@"; }
 hears() { grep -q "$1: dropped a malformed message" "$work/relay.err"; }
@@ -55,7 +55,7 @@ begin() { # DEVICE ADDRESS: of the bus
   until_ok grep -q ready "$work/relay.out" || fail "the process does not start"
 }
 end() { kill -TERM "$process"; wait "$process" || fail "the process failed"; }
-# What the process heard before MOTION_STATUS, it has said by then.
+# The process has reported every earlier packet once it reports one on MOTION_STATUS.
 drain() {
   drained() { here MOTION_STATUS 239.255.76.67 && hears MOTION_STATUS; }
   until_ok drained || fail "the bus itself is cut off: $1"

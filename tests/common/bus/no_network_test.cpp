@@ -1,4 +1,4 @@
-// What a user sees who has no route for multicast. Runs in a network namespace without one.
+// Message to a user without a route for multicast. Runs in a network namespace without one.
 
 #include <gtest/gtest.h>
 

@@ -24,7 +24,7 @@ Bytes message_of(std::size_t size, int seed = 1) {
   return bytes;
 }
 
-/// Joined pieces in the order given; what is whole comes in `whole`.
+/// Joins pieces in the order given; complete messages go to `whole`.
 struct Receiver {
   void hear(const Bytes& piece) {
     std::string problem;

@@ -139,7 +139,7 @@ TEST_F(ProcessTest, TicksGoOnSteadilyWhenTheClockIsSet) {
     EXPECT_GT(times[i], times[i - 1]);
     EXPECT_LT(times[i], times[i - 1] + 2'000'000);
   }
-  // PROCESS_INFO tells the wall clock's time, and never paused either.
+  // PROCESS_INFO has the wall clock's time, and never paused either.
   const std::vector<process_info_t> infos = read_log(folder_ / "out", kProcessInfo);
   ASSERT_GE(infos.size(), 4U);
   const auto [least, most] = std::minmax_element(

@@ -1,6 +1,6 @@
 // relay: SAMPLE, MOTION_STATUS -> MOTION_STATUS
-// The smallest process, for tests of what every process has: passes MOTION_STATUS on, answers each
-// SAMPLE with a MOTION_STATUS, and says on stdout where it is.
+// The smallest process, for tests of the common part of every process: passes MOTION_STATUS on,
+// answers each SAMPLE with a MOTION_STATUS, and reports its progress on stdout.
 
 #include <cstdio>
 #include <memory>

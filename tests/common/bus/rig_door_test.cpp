@@ -150,7 +150,7 @@ camera_info_t info_of(const std::filesystem::path& rig) {
   return info;
 }
 
-// Intrinsics that differ by a sixth gave a result that was 20 mm wrong and told 0.9 mm.
+// Intrinsics that differed by a sixth gave an error of 20 mm and a reported one of 0.9 mm.
 TEST(RigDoor, ACalibrationMustBeTheRigsOwnToTheLastNumber) {
   for (const char* rig : {"arm2", "arm4", "arm7"}) {
     const RigDoor door(kConfig / rig);

@@ -122,7 +122,7 @@ TEST_F(SampleIntakeTest, TheLogMayBeBehindTheBus) {
   EXPECT_EQ(intake_->num_lost(), 2);
 }
 
-// A sample that nobody recorded must not hide those that were recorded after it.
+// An unrecorded sample must not hide the recorded ones after it.
 TEST_F(SampleIntakeTest, AHoleInTheLogCostsOnlyWhatIsMissing) {
   record({0, 1, 3, 4, 7});
   start();
@@ -169,7 +169,7 @@ TEST_F(SampleIntakeTest, AGapIsGivenUpOnlyWhenTheObserverIsThereAndDoesNotFillIt
   start_asking();
   hear({0, 3});
   std::int64_t t = 0;
-  // An observer that is silent may come back with what is missing.
+  // A silent observer may come back with the missing samples.
   for (; t < 600 * kSecond; t += kSecond / 2) intake_->on_tick(t);
   EXPECT_EQ(heard_, (Indices{0}));
   for (int n = 0; heard_.size() == 1; ++n, t += kSecond / 2) {
@@ -235,7 +235,7 @@ TEST_F(SampleIntakeTest, TheFirstContentOfAnIndexCounts) {
 }
 
 // On the observer's machine a sample that was not written cannot be the observer's: whatever index
-// a stranger chooses, nobody waits for it and none of the observer's is displaced.
+// a stranger chooses, no process waits for it and no sample of the observer is displaced.
 TEST_F(SampleIntakeTest, WhatTheObserverDidNotWriteIsRefused) {
   record({0, 1});
   start_asking();
@@ -328,7 +328,7 @@ TEST_F(SampleIntakeTest, ATornTailIsLeftOutUntilItIsWhole) {
   EXPECT_EQ(heard_, (Indices{0, 1, 2, 3, 4, 5}));
 }
 
-// Whatever is lost, repeated or delayed: in order, each once, and what the log has is never
+// Samples are lost, repeated and delayed: they come in order, each once, and none of the log is
 // missing.
 TEST_F(SampleIntakeTest, AnyHistoryIsHandedOnInOrderEachOnce) {
   std::mt19937_64 rng(3);

@@ -34,7 +34,7 @@ class Twins : public testing::Test {
   std::vector<std::string> relay() const {
     return {RELAY, "--config", (folder_ / "relay.yaml").string(), "--in", kUrl, "--only-answer"};
   }
-  /// Whether somebody answers a SAMPLE, and how many do.
+  /// Number of processes that answer a SAMPLE.
   std::size_t num_answering() {
     answers_.clear();
     if (!ask_until(
@@ -110,7 +110,7 @@ TEST_F(Twins, OneOnAnotherNameOrARecordingOfItselfDoesNotDisturb) {
   ASSERT_TRUE(program.wait_for_output("ready"));
   process_info_t info = heard_of(program.pid());
   ASSERT_EQ(info.process_name, "relay");
-  // An elder, as a recording of yesterday has it.
+  // An elder in an old recording.
   process_info_t recorded = info;
   recorded.start_utime -= 86'400'000'000;
   recorded.utime -= 86'400'000'000;
@@ -128,7 +128,7 @@ TEST_F(Twins, OneOnAnotherNameOrARecordingOfItselfDoesNotDisturb) {
   EXPECT_EQ(num_answering(), 1U);
 }
 
-// One forged message a process once ended eight of them.
+// Regression: one forged message per process ended eight of them.
 TEST_F(Twins, OneThatWorksNeverEndsBecauseOfWhatOthersSayButTellsIt) {
   Program program(relay());
   ASSERT_TRUE(program.wait_for_output("ready"));
@@ -156,7 +156,7 @@ TEST_F(Twins, OneThatWorksNeverEndsBecauseOfWhatOthersSayButTellsIt) {
   EXPECT_TRUE(std::any_of(counters.begin(), counters.end(), [](const counter_t& counter) {
     return counter.counter_name == "twin PROCESS_INFO" && counter.count > 0;
   }));
-  // When it is not heard any more it is forgotten.
+  // A silent twin is forgotten.
   EXPECT_TRUE(handle_until(bus_, [&] { return !tells(); }));
   program.send_signal(SIGTERM);
   EXPECT_EQ(program.wait(), 0);
@@ -169,7 +169,7 @@ TEST_F(Twins, AStartIsNotPreventedByOneMessageButByOneThatGoesOn) {
   elder.phase = process_info_t::PHASE_WORKING;
   {
     Program program(relay());
-    // The same message again and again is one.
+    // Repetitions of one message count as one.
     elder.utime = now_us();
     ASSERT_TRUE(ask_until(
         [&] {

@@ -68,7 +68,7 @@ TEST(BusOverUdp, ASchemaOfTwoHundredPartsIsHeardWholeFromTwoSendersAtOnce) {
     EXPECT_EQ(encode(kBodySchema, again), encode(kBodySchema, schema));
     ++heard[m.schema_version];
   });
-  // What LCM does not split: every datagram is one message of its own.
+  // LCM does not split these: every datagram is one message of its own.
   int num_datagrams = 0;
   std::size_t largest = 0;
   const auto count = [&](const lcm_recv_buf_t* buffer) {
@@ -252,8 +252,8 @@ TEST(BusOverUdp, AProcessAnswersSaysWhoItIsAndEndsOnSigterm) {
   int num_answers = 0;
   bus.subscribe(kProcessInfo, [&](const process_info_t& m) { infos.push_back(m); });
   bus.subscribe(kMotionStatus, [&](const motion_status_t&) { ++num_answers; });
-  // Its answers to a MOTION_STATUS of its own would go round for ever: it publishes to the bus what
-  // it hears as SAMPLE only, because its input is a port of its own.
+  // It would answer its own MOTION_STATUS for ever; its input is a port of its own, so it publishes
+  // to the bus only what it hears as SAMPLE.
   const std::string in = "udpm://239.255.76.67:7668?ttl=0";
   Bus to_relay("", in);
   Program relay({RELAY, "--config", (folder / "relay.yaml").string(), "--in", in, "--out", kUrl});

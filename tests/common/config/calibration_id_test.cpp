@@ -25,7 +25,7 @@ Calibration example() {
 }
 
 TEST(CalibrationId, IsStable) {
-  // By the definition in calibration_id.h: a change of it makes recordings another calibration's.
+  // By the definition in calibration_id.h: changing it invalidates the calibration of recordings.
   EXPECT_EQ(static_cast<std::uint64_t>(example().id()), 0x99707F5C098858E0ULL);
 }
 

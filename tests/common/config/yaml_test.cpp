@@ -14,7 +14,7 @@
 namespace bodyschema {
 namespace {
 
-/// What the ConfigError says; fails if there is none.
+/// Text of the ConfigError; fails if there is none.
 std::string error_of(const std::function<void()>& action) {
   try {
     action();
@@ -174,7 +174,7 @@ TEST(YamlTest, ADuplicateKeyIsRefusedAtAnyDepth) {
 
 TEST(YamlTest, WhatIsNoMappingIsRefused) {
   EXPECT_CONFIG_ERROR(Yaml::parse("- 1\n- 2\n", "f"), "f:1: expected a mapping 'key: value'");
-  // A reader of the first document would pass over all that follows.
+  // A reader of the first document would miss all later ones.
   EXPECT_CONFIG_ERROR(Yaml::parse("a: 1\n---\na: 2\n", "f"),
                       "f:2: expected one YAML document, found a second one");
   EXPECT_EQ(Yaml::parse("---\na: 1\n", "f").integer("a"), 1);
@@ -284,7 +284,7 @@ TEST(YamlTest, AQuaternionThatIsNotUnitAndAPoseWithTwoRotationsAreRefused) {
   EXPECT_TRUE(contains(error, "f:2: b.rpy_deg")) << error;
 }
 
-// Whatever stands in a file: a value or a ConfigError, never another exception or a crash.
+// Any text of a file gives a value or a ConfigError, never another exception or a crash.
 TEST(YamlTest, DamagedFilesGiveAConfigErrorOrAValue) {
   const std::string good = R"(family: tag36h11
 tags:

@@ -36,7 +36,7 @@ TEST(MarginalLikelihood, FindsTheHyperParametersThatTheDataWereDrawnFrom) {
   EXPECT_NEAR(error(3), 0, 0.15);
 }
 
-// The search ends on one of several maxima; what is less than a nat likelier is no better.
+// The search ends on one of several maxima; a gain of less than a nat is no better.
 TEST(MarginalLikelihood, NoPriorOfAThousandAtRandomIsLikelierByANat) {
   const HyperParameterRange range;
   for (int seed = 1; seed <= 12; ++seed) {

@@ -21,7 +21,8 @@ Robot robot_of(const std::filesystem::path& rig, std::optional<std::int64_t> see
   return SceneDescription::load(rig, seed).robot;
 }
 
-/// From where a tag is said to sit to where it sits: translation [m], rotation vector [rad].
+/// Difference between a tag's place by the rig's files and its true one: translation [m], rotation
+/// vector [rad].
 Vector6d displacement(const TagPlacement& told, const TagPlacement& drawn) {
   const Pose X = told.X_BM.value().inverse() * drawn.X_BM.value();
   Vector6d result;
@@ -111,7 +112,7 @@ TEST(CalibrationError, OfOneTagHangsOnNoOther) {
   EXPECT_EQ(with_calibration_error(robot, 3).markers.tags.back().X_BM->matrix(), X_BM.matrix());
 }
 
-// What a lab writes into its own files is its opinion; the robot stays as it is.
+// A lab's own files change only what the group assumes; the robot stays as it is.
 TEST(CalibrationError, MovesWithNothingThatTheRigClaims) {
   const std::filesystem::path rig =
       std::filesystem::path(testing::TempDir()) / ("bodyschema_claims_" + std::to_string(getpid()));

@@ -40,7 +40,7 @@ TEST(ImageLookup, MovesAnEdgeByThousandthsOfAPixel) {
     for (int y = 0; y < moved.rows; ++y)
       for (int x = 0; x < moved.cols; ++x) {
         const double slope = edge(x + 4.5, y + 4) - edge(x + 3.5, y + 4);
-        // As it would be if it were moved exactly: what is left is a shift along the slope.
+        // Against an exactly moved image: the remaining difference is a shift along the slope.
         numerator += slope * (moved.at<std::uint8_t>(y, x) - edge(x + 4 + shift, y + 4));
         denominator += slope * slope;
       }

@@ -47,7 +47,7 @@ std::map<int, Corners> detect(const cv::Mat& image) {
   return result;
 }
 
-/// Where the corners of a tag must be, in marker_pose_t's order.
+/// Expected corners of a tag, in marker_pose_t's order.
 Corners project(const CameraCalibration& c, const Pose& X_CM, double size_m) {
   const double h = size_m / 2;
   std::vector<cv::Point3d> points;
@@ -173,7 +173,7 @@ TEST_P(RenderedRig, ShowsTheTagsAndTheLensOfTheRobotWithCalibrationErrors) {
   EXPECT_GE(result.num_tags, static_cast<int>(scene.markers().parts().size()) - 1);
   EXPECT_LT(result.mean_px, 0.25);
   EXPECT_LT(result.bias_px.norm(), 0.1) << result.bias_px.transpose();
-  // The same tags through the lens that the rig claims are elsewhere.
+  // Through the lens of camera_info.yaml the same tags are elsewhere.
   const CameraCalibration claimed =
       load_camera_calibration(kConfig / GetParam() / "camera_info.yaml");
   EXPECT_GT(compare(scene, claimed, state, image, 60).mean_px, 2 * result.mean_px);
@@ -191,8 +191,8 @@ TEST(SceneRenderer, DistortsAsOpenCvProjects) {
     SceneRenderer renderer(kConfig / "arm2", calibration, no_noise());
     sim_state_t state = scene.state_at(scene.robot().home, 1, 0);
     int num_tags = 0;
-    // Tags all over the image, also where the distortion is strong; small ones, since the detector
-    // fits straight lines to what are curves now.
+    // Tags all over the image, also in strong distortion; small ones, since the detector fits
+    // straight lines to curves.
     for (const double right : {-0.45, -0.25, 0.0, 0.25, 0.45}) {
       look_at(scene, 12, 1.3, 25, 15, state);
       const Pose X_WC = from_message(state.X_WC) * Eigen::Translation3d(right, right / 2, 0);
@@ -284,13 +284,13 @@ TEST(SceneRenderer, ShowsEveryFaultBySimStateAlone) {
   for (const std::vector<Fault>& faults : cases) {
     const sim_state_t state = broken_state("arm7", faults);
     const cv::Mat image = renderer.render(state, 0);
-    // Where the state says that the tags are, the detector finds them …
+    // The detector finds the tags at the places of the state …
     const Comparison result = compare(whole, renderer.calibration(), state, image, 60);
     const std::string what = describe(faults[0], whole.description());
     EXPECT_GE(result.num_tags, 8) << what;
     EXPECT_LT(result.mean_px, 0.25) << what;
     EXPECT_LT(result.bias_px.norm(), 0.1) << what;
-    // … and some are not where they were.
+    // … and some of these have changed.
     double farthest_px = 0;
     for (const auto& [id, corners] : detect(image)) {
       if (!before.contains(id)) continue;

@@ -34,15 +34,15 @@ constexpr double kMillimetre = 1e-3;
 /// Below this error of the end effector the schema is right.
 double limit_m(Regime regime) { return regime == Regime::kChapter ? 0.075 : 0.030; }
 
-/// One arm's life as one way of adapting saw it.
+/// One arm's life under one adaptation method.
 struct Life {
-  std::vector<double> error;      ///< of what is judged, by sample [m]
+  std::vector<double> error;      ///< of the judged part, by sample [m]
   std::vector<double> original;   ///< the same of the schema that was there at the start
   std::vector<bool> is_valid;     ///< every edge has a valid model, after the sample
   std::vector<double> statistic;  ///< CUSUM of the first edge that will break
   std::vector<AdaptationEvent> events;
   int num_wrong_events = 0;
-  /// What was said to be wrong, of blocks 2 to 4.
+  /// Reported findings of blocks 2 to 4.
   struct Named {
     bool place = false, cause = false;
   };
@@ -50,7 +50,7 @@ struct Life {
   int num_models = 0;               ///< baseline: sampled
   double seconds = 0, slowest = 0;  ///< of processor time
 
-  /// Samples of the block after which no valid spanning tree is there: the chapter's count.
+  /// Samples of the block after which there is no valid spanning tree: the chapter's count.
   int without_tree(int block, int length) const {
     return static_cast<int>(std::count(is_valid.begin() + block * length,
                                        is_valid.begin() + (block + 1) * length, false));
@@ -69,7 +69,7 @@ struct Life {
   }
 };
 
-/// What a monitor says to be wrong, from its events.
+/// Findings of a monitor, from its events.
 class Explanations {
   struct Place {
     int part = 0;
@@ -92,7 +92,7 @@ class Explanations {
   }
 
  private:
-  /// Each affected place is named, and no other.
+  /// Every affected place is named, and no other.
   bool places_right(const std::vector<TrueChange>& changes) const {
     const auto is_right = [](const auto& explanation, const TrueChange& change) {
       const Place& place = explanation.first;
@@ -225,7 +225,7 @@ struct Count {
   bool is_at_least(double share) const { return of > 0 && right >= share * of; }
 };
 
-/// What the issue asks for, in samples after the first fault, the repair, the second fault.
+/// Required number of samples after the first fault, the repair, the second fault.
 struct Limits {
   std::vector<double> samples;  ///< 1 or 3 values; empty: nothing
 };
@@ -281,7 +281,7 @@ Curve mean_curve(const std::string& title, const std::vector<Life>& lives, int c
   return curve_of(title, mean, colour, is_dashed);
 }
 
-/// When the monitor said what: a row of points for each kind of event, along the bottom.
+/// Times of the monitor's events: a row of points for each kind, along the bottom.
 std::vector<Curve> event_marks(const Life& life) {
   std::map<Kind, Curve> marks;
   for (const AdaptationEvent& event : life.events)
@@ -318,7 +318,7 @@ std::vector<Panel> panels_of(const std::string& figure, const std::vector<Life>&
   return {single, average};
 }
 
-/// Fig. 9: what the monitor felt and did about the exchange of a tool.
+/// Fig. 9: the monitor's statistic and decisions at the exchange of a tool.
 Panel story_of(const Life& life, int length) {
   Panel panel{.title = "Fig. 9: the tool is exchanged",
               .x_label = "samples since the exchange",
@@ -386,8 +386,8 @@ Findings adaptation(const Setup& setup) {
       const std::string name = row.scenario.name;
       const auto ours = run(setup, name + ", " + noise, num_runs,
                             [&](int seed) { return live(row.scenario, regime, 1, length, seed); });
-      // Beside Table 1 a few runs of the baseline do: where flips leave it no valid tree it learns
-      // model upon model.
+      // Beside Table 1 a few runs of the baseline suffice: with flips, which leave it no valid
+      // tree, it learns model upon model.
       const int num_theirs = !row.has_baseline ? 0
                              : regime == Regime::kChapter
                                  ? (in_table_1 ? num_runs : setup.robots(5, 0))

@@ -17,10 +17,10 @@ using test::Regime;
 
 constexpr double kMillimetre = 1e-3;
 
-/// One way to learn at one N, over all robots.
+/// One learning method at one N, over all robots.
 struct Cell {
   Judgements structure;
-  int false_complete = 0;  ///< wrong, and said to be complete
+  int false_complete = 0;  ///< wrong, but called complete
   long fits = 0;
   std::vector<double> position_m, angle_rad;
 
@@ -42,7 +42,7 @@ struct Cell {
   }
 };
 
-/// What one robot said.
+/// Result of one robot.
 struct Answer {
   test::Rightness rightness = test::Rightness::kIncomplete;
   bool is_complete = false;

@@ -9,29 +9,29 @@
 
 namespace bodyschema::experiments {
 
-/// The Cramér–Rao bound of a robot's forward kinematics: no unbiased way to learn it from these
-/// marker poses is more precise, however it goes about it.
+/// The Cramér–Rao bound of a robot's forward kinematics: the least covariance of any unbiased
+/// estimate from these marker poses.
 ///
 /// Unknown are the resting root's pose X_CR and, for every link, X_before, and of a joint slide and
-/// turn per command unit and X_after too: 6 + 6 or 14 a link; the structure, which joint hangs on
-/// which signal, is known, as are the markers' covariances. A marker's pose y = x · Exp(ε), ε ~
+/// turn per command unit and X_after too: 6 + 6 or 14 a link; the structure and each joint's signal
+/// are known, as are the markers' covariances. A marker's pose y = x · Exp(ε), ε ~
 /// N(0, Σ) adds Jᵀ Σ⁻¹ J to the Fisher information, J = ∂x/∂parameters (right perturbation, marker
 /// frame; terms of the second order in ε are left out). The pose of one part in another at some
-/// action has at least the covariance G F⁺ Gᵀ, G its derivative: what F lacks is gauge (where a
-/// screw's frame sits along and about its axis), which no pose depends on.
+/// action has at least the covariance G F⁺ Gᵀ, G its derivative: the null space of F is gauge (the
+/// place of a screw's frame along and about its axis), which no pose depends on.
 ///
-/// Outliers are not in it: the bound is that of the same markers without flips.
+/// Outliers are left out: the bound is that of the same markers without flips.
 class CramerRao {
  public:
   /// The robot must outlive this.
   explicit CramerRao(const test::SyntheticRobot& robot);
 
-  /// Adds what one sample says, by its true poses and the observations' covariances (which must be
-  /// invertible), for the parts that were seen.
+  /// Adds the information of one sample, by its true poses and the observations' covariances (which
+  /// must be invertible), for the parts that were seen.
   void add(const ActionPoseSample& sample);
 
-  /// 6×6 covariance of the pose of `to` in `from` that cannot be undercut; right perturbation in
-  /// the frame of `to`. Infinite where the samples leave the pose open.
+  /// 6×6 lower bound of the covariance of the pose of `to` in `from`; right perturbation in the
+  /// frame of `to`. Infinite if the samples leave the pose open.
   Matrix6d bound(int from, int to, const Eigen::VectorXd& action) const;
 
   /// 6 × number of parameters: derivative of a part's pose in the camera frame.

@@ -33,7 +33,7 @@ TEST(CramerRao, KnowsHowEveryPoseDependsOnEveryParameter) {
   }
 }
 
-// Two parts that are firmly connected: all that N samples can say is the mean of z.
+// Two rigidly connected parts: the information of N samples is that of the mean of z.
 TEST(CramerRao, OfARigidConnectionIsTheCovarianceOfTheMean) {
   Rng rng(5);
   SyntheticRobot robot;

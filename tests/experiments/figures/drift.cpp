@@ -1,4 +1,4 @@
-// Beyond the chapter: a link that bends all the time, slowly or fast, and then no more.
+// Beyond the chapter: a link that bends continuously, slowly or fast, and then stops.
 
 #include <fmt/format.h>
 
@@ -28,7 +28,7 @@ constexpr int kHealthy = 60, kAfter = 60;
 constexpr int kSettled = 20;
 constexpr double kMost_deg = 25;
 constexpr int kPart = 4;  // where the edge that drifts leads
-/// From this rate on it is to be told as what it is; a slower one is below the noise for long.
+/// From this rate on it must be named a drift; a slower one is below the noise for long.
 constexpr double kFast_deg = 0.1;
 constexpr double kMillimetre = 1e-3;
 
@@ -40,8 +40,8 @@ int length_of(double rate_deg) { return static_cast<int>(std::ceil(kMost_deg / r
 
 struct Life {
   std::vector<double> error;           ///< of the end effector, by sample [m]
-  std::optional<double> named, ended;  ///< told so many samples after its begin, its end
-  int num_too_early = 0;               ///< told as ended before its end, and so begun again
+  std::optional<double> named, ended;  ///< reported so many samples after its begin, its end
+  int num_too_early = 0;               ///< reported as ended before its end, and so begun again
   bool is_wrong = false;               ///< an event elsewhere, or before it
   bool is_invalid = false;             ///< an edge or a marker, at some sample
   double seconds = 0;

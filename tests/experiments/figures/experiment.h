@@ -7,19 +7,19 @@
 
 namespace bodyschema::experiments {
 
-/// How an experiment is to be run.
+/// Options of an experiment.
 struct Setup {
   bool quick = false;  ///< few robots and sizes: seconds instead of minutes
   std::filesystem::path out;
   int jobs = 1;  ///< threads; results do not depend on it
-  /// Says on stderr how far a part of the experiment is, 0 … 1.
+  /// Reports on stderr the progress of a part of the experiment, 0 … 1.
   std::function<void(const std::string& part, double share)> progress;
 
   /// `full` robots, or fewer if quick.
   int robots(int full, int few) const { return quick ? few : full; }
 };
 
-/// What must come out.
+/// A required result.
 struct Must {
   std::string what;      ///< "2-DOF, free, N = 5: mean position < 1e-9 m"
   std::string measured;  ///< "5.0e-16 m"
@@ -50,8 +50,8 @@ Findings adaptation(const Setup& setup);
 Findings drift(const Setup& setup);
 Findings false_alarms(const Setup& setup);
 
-/// Calls work(0) … work(count − 1), on `setup.jobs` threads, in any order. What `work` throws first
-/// is thrown on when all have ended.
+/// Calls work(0) … work(count − 1), on `setup.jobs` threads, in any order. Rethrows the first
+/// exception of `work` when all have ended.
 void for_each_robot(const Setup& setup, const std::string& part, int count,
                     const std::function<void(int)>& work);
 

@@ -1,5 +1,5 @@
 #!/bin/bash
-# experiments --quick: every experiment leaves its table and a plot, what must come out does, and the
+# experiments --quick: every experiment leaves its table and a plot, required results are reached, and the
 # same seeds give the same tables on one thread and on two. Wrong arguments are refused.
 #   experiments_test.sh EXPERIMENTS
 set -euo pipefail
@@ -36,7 +36,7 @@ refused "There are: local_model, spherical, chain," help
 refused "--quik" --quik
 refused "--jobs" chain --jobs 0
 [ -f "$out/all/all.md" ] && [ ! -e "$out/again/all.md" ] || fail "all.md is not of all experiments"
-# Found before the work, not after it: nothing was said of its progress.
+# Found before the work, not after it: there was no line of progress.
 mkdir -p "$out/full/.probe"
 if said=$("$program" chain --quick --out "$out/full" 2>&1); then fail "wrote where it cannot"; fi
 grep -q 'cannot be written' <<<"$said" && ! grep -q 'chain: ' <<<"$said" || fail "an unwritable folder: $said"

@@ -19,7 +19,7 @@ namespace {
 using test::Regime;
 
 constexpr double kMillimetre = 1e-3;
-/// The pair that q1 moves on robot a; q2 has nothing to do with it.
+/// The pair that q1 moves on robot a; q2 does not move it.
 constexpr int kFrom = 2, kTo = 3;
 constexpr int kRightSignal = 0, kWrongSignal = 1;
 

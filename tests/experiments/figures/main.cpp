@@ -77,7 +77,7 @@ void show_progress(const std::string& name, const std::string& part, double shar
 
 int run(const std::vector<Experiment>& experiments, Setup setup) {
   std::filesystem::create_directories(setup.out);
-  // A folder that cannot be written into is to be found now, not after minutes.
+  // An unwritable folder must be found now, not after minutes.
   write(setup.out / ".probe", "");
   std::filesystem::remove(setup.out / ".probe");
   std::string all = "# The chapter's figures, measured again\n";

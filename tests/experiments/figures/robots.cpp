@@ -42,7 +42,7 @@ Trial make_trial(const std::string& kind, Regime regime, int num_samples, int se
   observation.regime = regime;
   observation.with_covariances = true;
   trial.samples = test::babble(trial.robot, num_samples, observation, rng);
-  // Of a stream of their own: the same whatever was seen.
+  // A random stream of their own, so that they do not depend on the observations.
   Rng test_rng(0x7e57'0000u + static_cast<Rng::result_type>(seed));
   for (int n = 0; n < kTestPoses; ++n)
     trial.test_actions.push_back(trial.robot.random_action(test_rng));

@@ -11,8 +11,8 @@
 
 namespace bodyschema::experiments {
 
-/// A robot, what it saw of itself, and where it will be judged. A function of kind, regime and
-/// seed. Observations bear their covariances, as the observer's do.
+/// A robot, its observations of itself, and the actions at which it is judged. A function of kind,
+/// regime and seed. Observations have covariances, as the observer's do.
 struct Trial {
   test::SyntheticRobot robot;
   test::Regime regime = test::Regime::kFree;
@@ -42,11 +42,11 @@ struct PoseErrors {
 /// std::nullopt if the schema does not connect the end effector with the root.
 std::optional<PoseErrors> end_effector_errors(const BodySchema& schema, const Trial& trial);
 
-/// σ_z of the chapter (50 mm, 15°) in its noise; what follows from the markers' noise else, at
-/// least 1 mm and 0.3° per axis.
+/// σ_z of the chapter (50 mm, 15°) in its noise; else derived from the markers' noise, at least
+/// 1 mm and 0.3° per axis.
 BaselineOptions baseline_options(test::Regime regime);
 
-/// The chapter's local models on the tree that learning ought to find: what it would predict if its
+/// The chapter's local models on the tree that learning ought to find: its predictions if its
 /// structure search made no mistake. A part without two samples in common with its neighbour is
 /// left out.
 BodySchema baseline_on_true_structure(const Trial& trial,

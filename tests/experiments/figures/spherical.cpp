@@ -17,7 +17,7 @@ using test::Regime;
 
 constexpr int kResting = 15;  ///< samples while q2 = 0
 
-/// What a schema says moves part 2 against part 1.
+/// Signals that move part 2 against part 1 by a schema.
 enum class Said { kOne, kBoth, kNothing, kOther };
 
 Said said_by(const BodySchema& schema) {

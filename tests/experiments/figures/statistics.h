@@ -10,7 +10,7 @@ struct Spread {
   int count = 0;
   double mean = 0;                ///< NaN of nothing
   double standard_deviation = 0;  ///< with count − 1; 0 of a single value
-  /// Of the mean: standard_deviation / √count.
+  /// Standard error of the mean: standard_deviation / √count.
   double standard_error() const;
 };
 Spread spread_of(const std::vector<double>& values);

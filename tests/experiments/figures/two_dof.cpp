@@ -22,7 +22,7 @@ constexpr double kMillimetre = 1e-3;
 /// σ_markers of the chapter, rms over the three axes.
 constexpr double kMarkerNoise = 0.044;
 
-/// Distances between targets and where the end effector came to be by the robot's truth: rms [m].
+/// Rms distance between targets and the end effector's true positions after control [m].
 /// Targets are the true positions at the first `count` test actions, as if seen without noise.
 double control_error_rms(const BodySchema& schema, const Trial& trial, int count) {
   const InverseKinematicsOptions options{
@@ -46,12 +46,12 @@ double control_error_rms(const BodySchema& schema, const Trial& trial, int count
 /// The chapter's search learns all models anew at each N; beyond this it takes seconds.
 constexpr int kLargestSearch = 30;
 
-/// What all robots had to say at one N.
+/// Results of all robots at one N.
 struct Column {
   std::vector<double> mean, rms, angle, control;
   Judgements structure;
 
-  /// "97.5 % (≥ 90.1)", or a dash where no structure was looked for.
+  /// "97.5 % (≥ 90.1)", or a dash if no structure was searched.
   std::string right() const {
     return structure.total() > 0 ? percentage(structure.right, structure.total()) : "–";
   }
@@ -64,7 +64,7 @@ struct Column {
   }
 };
 
-/// Both ways at one N, of one robot.
+/// Both methods at one N, of one robot.
 struct Result {
   std::optional<PoseErrors> errors;
   double control_m = NAN;

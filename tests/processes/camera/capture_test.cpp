@@ -21,7 +21,7 @@
 namespace bodyschema {
 namespace {
 
-/// Asks until `question` is answered with yes, for at most 10 s.
+/// Asks until `question` returns true, for at most 10 s.
 template <class Question>
 bool eventually(const Question& question) {
   const auto end = std::chrono::steady_clock::now() + std::chrono::seconds(10);

@@ -128,7 +128,7 @@ TEST(TagView, PutsTheCentreOfTheUpperLeftPixelAtZero) {
     EXPECT_NEAR(view.exact().at<double>(99, v), 25, 1e-6);
     EXPECT_NEAR(view.exact().at<double>(100, v), 220, 1e-6);
   }
-  // And where the fit finds it, from a sharp and from a soft picture.
+  // And the result of the fit, from a sharp and from a soft picture.
   for (const double blur_px : {0.0, 0.7}) {
     const TagView soft(plate, camera, {.blur_px = blur_px});
     auto corners = soft.corners_px();
@@ -260,7 +260,7 @@ TEST(RefineCorners, RefusesATagThatIsPartlyCovered) {
                  -1);
       cv::GaussianBlur(image, image, {0, 0}, 0.5);
       const auto fit = sight.refine(image);
-      // What is let through has to be right.
+      // An accepted fit has to be right.
       if (fit.corners) {
         EXPECT_LT(sight.error(*fit.corners).cwiseAbs().maxCoeff(), 0.03) << k << " " << grey;
       }

@@ -82,7 +82,7 @@ TEST(MarkerEstimator, PinsTheMarkerFrameXRightYDownZIntoTheMarker) {
   // Upright and facing the camera: corner 0 is (−,+), that is, lower left in the image.
   EXPECT_LT(marker.corner_px[0][0], marker.corner_px[1][0]);
   EXPECT_GT(marker.corner_px[0][1], marker.corner_px[3][1]);
-  // Edges along the pixel grid are AprilTag's worst case: 0.2 px. A convention mistaken would be
+  // Edges along the pixel grid are AprilTag's worst case: 0.2 px. A wrong convention would be
   // 0.5.
   EXPECT_NEAR(marker.corner_px[0][0], 643.2 + 1159 * (0.05 - 0.04) / 0.5, 0.3);
   EXPECT_NEAR(marker.corner_px[0][1], 477.9 + 1159 * (-0.03 + 0.04) / 0.5, 0.3);
@@ -155,7 +155,7 @@ TEST(MarkerEstimator, KeepsItsCovarianceConsistentWithTheMeasuredCornerNoise) {
     ASSERT_TRUE(fit);
     const Vector6d error = log(fit->X_CB.inverse() * plates[i].X_CM);
     sum += error.dot(covariance_from(fit->information)->inverse() * error);
-    // What is published is not more optimistic than what was measured.
+    // The published covariance is not more optimistic than the measured error.
     const Matrix6d published = from_message(seen[i].covariance);
     EXPECT_GT(published.trace(), 0.3 * covariance_from(fit->information)->trace());
   }

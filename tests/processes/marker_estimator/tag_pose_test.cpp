@@ -64,7 +64,7 @@ TEST(SolveTagPose, OfCorrelatedCornersHasATrueCovarianceIfTheyAreWhitened) {
   std::normal_distribution<double> normal(0, 1);
   const Lens lens(pinhole_camera());
   const Pose X_CM = marker_pose(0.6, 0.7, 0.5, 1.2, 0.1, 0);
-  // Two sides that a reflection pulls, each its two corners alike, and little else.
+  // Two sides displaced as by a reflection, the two corners of each alike, and little else.
   Eigen::MatrixXd S = 0.03 * 0.03 * Eigen::MatrixXd::Identity(8, 8);
   for (const auto& [a, b] : {std::pair{0, 2}, {1, 3}, {4, 7}})
     for (const int i : {a, b})

@@ -108,7 +108,7 @@ TEST(VisibilityModelTest, PredictsTheSyntheticCameraBetterThanTheSharesDo) {
 
 TEST(ActionChoiceTest, PrefersWhatTheModelIsUnsureOf) {
   BodySchema schema = hinge();
-  // All that is not known is the joint's turn: it shows the more, the further the joint turns.
+  // Only the joint's turn is unknown: it shows more, the further the joint turns.
   schema.edges[0].parameter_covariance.setZero();
   schema.edges[0].parameter_covariance(7, 7) = 1e-2;
   const std::vector<SeenAction> past = {seen_at(0, 0, {1, 2}), seen_at(0.5, 0, {1, 2}),
@@ -120,12 +120,12 @@ TEST(ActionChoiceTest, WhatWasTakenSinceTheSchemaCountsAsLearned) {
   BodySchema schema = hinge();
   schema.edges[0].parameter_covariance.setZero();
   schema.edges[0].parameter_covariance(7, 7) = 1e-2;
-  // Both ways tell the same of the turn; after many samples at one of them, of what the model left
-  // out the other tells more.
+  // Both directions are equally informative on the turn; after many samples at one of them, the
+  // other is more informative on the residual of the model.
   std::vector<SeenAction> past;
   for (int n = 0; n < 6; ++n) past.push_back(seen_at(0.9, 0, {1, 2}, 10 + n));
   EXPECT_EQ(choose(schema, past, {{0.9, 0}, {-0.9, 0}}), 1U);
-  // The turn is known by then; before, it was worth more than anything that is left out.
+  // The turn is known by then; before, it was worth more than any residual.
   EXPECT_EQ(choose(schema, past, {{0.9, 0}, {0, 0.9}}), 1U);
   for (SeenAction& seen : past) seen.is_learned_from = false;
   EXPECT_EQ(choose(schema, past, {{0.9, 0}, {0, 0.9}}), 0U);
@@ -137,7 +137,7 @@ TEST(ActionChoiceTest, BothPartsOfAnEdgeMustBeSeen) {
     past.push_back(seen_at(0.8, 0, {1, 2}));
     past.push_back(seen_at(-0.8, 0, {1}));
   }
-  // The lower side is what less is known of, and where nothing can be learned.
+  // The lower side is less known, but nothing can be learned there.
   EXPECT_EQ(choose(hinge(), past, {{-0.8, 0}, {0.8, 0}}), 1U);
 }
 
@@ -155,7 +155,7 @@ TEST(ActionChoiceTest, LooksForPartsWithoutAnEdgeWhereTheyMayBeSeen) {
   for (int n = 0; n < 40; ++n) past.push_back(seen_at(0.02 * n, -0.8, {1, 2}));
   for (int n = 0; n < 4; ++n) past.push_back(seen_at(0.2 * n, 0.8, {1, 2, 3}));
   EXPECT_EQ(choose(schema, past, {{0.5, -0.8}, {0.5, 0.8}}), 1U);
-  // One that was never seen is looked for where nobody looked yet.
+  // An unseen part is searched at actions that were not tried yet.
   schema.unconnected = {{4, Unconnected::kNeverSeen, ""}};
   EXPECT_EQ(choose(schema, past, {{0.5, -0.8}, {-1, 0}, {0.5, 0.8}}), 1U);
 }

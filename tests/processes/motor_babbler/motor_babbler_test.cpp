@@ -126,7 +126,7 @@ control_status_t control(bool owns_arm) {
   return status;
 }
 
-/// One that has heard that nobody else wants the arm.
+/// A babbler that has heard that no other process wants the arm.
 MotorBabbler free_babbler(MotorBabblerConfig config = test_config(), std::int64_t seed = 1) {
   MotorBabbler babbler(std::move(config), seed);
   babbler.on_control_status(control(false));
@@ -200,7 +200,7 @@ TEST(MotorBabblerTest, BeforeItsFirstActionItListensWhetherTheArmIsLent) {
   ASSERT_TRUE(command);
   EXPECT_EQ(command->action_id, 0);
 
-  // A STOP at the start is no way around it.
+  // A STOP at the start does not bypass it.
   MotorBabbler stopped(test_config(), 1);
   motion_status_t latched = idle_at_rest(5 * kSecond);
   latched.stop_latched = 1;
@@ -327,7 +327,7 @@ TEST(MotorBabblerTest, ARejectedTestIsReplacedByATest) {
   EXPECT_EQ(bench.babbler.num_rejected(), 7);
 }
 
-// A driver refuses what comes while the arm moves; asking again at once would only burn ids.
+// A driver refuses commands while the arm moves; repeating them at once would only burn ids.
 TEST(MotorBabblerTest, AfterARejectionItWaitsForRest) {
   Bench bench;
   bench.start();
@@ -359,7 +359,7 @@ TEST(MotorBabblerTest, ADriverThatRefusesEverythingIsAskedAtLeisure) {
     EXPECT_EQ(bench.last.action_id, id + 1);
     EXPECT_FALSE(refuse());
   }
-  // One that is accepted ends the caution.
+  // An accepted command ends the caution.
   ASSERT_FALSE(bench.take(bench.babbler.on_tick(2000 * kSecond)));
   ASSERT_TRUE(bench.take(bench.babbler.on_tick(2001 * kSecond)));
   ASSERT_TRUE(bench.make_sample());
@@ -478,7 +478,7 @@ TEST(MotorBabblerTest, ASampleThatOvertakesSettledIsTaken) {
 }
 
 /// Seconds pass, in which a frame of the present rest and the observer are heard or not. Returns
-/// after how many a command came.
+/// the number of seconds until a command came.
 struct Seconds {
   bool frames = true, observer = true;
 
@@ -526,7 +526,7 @@ TEST(MotorBabblerTest, WithoutCameraOrObserverItDoesNotMove) {
     const std::string activity = bench.babbler.activity();
     EXPECT_NE(activity.find("SAMPLE of action 1"), std::string::npos) << activity;
     EXPECT_NE(activity.find(is_camera ? "marker_estimator" : "observer"), std::string::npos);
-    // Frames of an earlier rest are no eyes.
+    // Frames of an earlier rest do not count.
     marker_poses_t old{};
     old.utime = bench.last.utime;
     for (int i = 0; is_camera && i < 100; ++i, seconds.now += kSecond) {
@@ -598,7 +598,7 @@ TEST(MotorBabblerTest, AVerdictIsNotAwaitedForEver) {
   EXPECT_TRUE(bench.babbler.on_tick(210 * kSecond));
 }
 
-/// Whether the run ends if `verdict` is the monitor's on TEST sample 14, the first with three
+/// True if the run ends when `verdict` is the monitor's on TEST sample 14, the first with three
 /// tests.
 bool stops_with(const model_health_t& verdict, MotorBabblerConfig config = test_config()) {
   Bench bench(config);
@@ -654,7 +654,7 @@ TEST(MotorBabblerTest, StopsAfterTheLargestNumberOfSamplesWhateverTheVerdict) {
   EXPECT_EQ(bench.babbler.num_samples(), 7);
 }
 
-// Verdicts on TRAIN samples come when the learner finds the time; the end must not depend on that.
+// Verdicts on TRAIN samples come when the learner has time; the end must not depend on them.
 TEST(MotorBabblerTest, TheRunEndsAtTheSameSampleHoweverFastTheMonitorIs) {
   for (int arrives_after = 15; arrives_after < 19; ++arrives_after) {
     Bench bench;
@@ -794,7 +794,7 @@ TEST(MotorBabblerTest, WhileTheControllerOwnsTheArmItSendsNothing) {
     EXPECT_NE(bench.babbler.activity().find("silent"), std::string::npos);
     EXPECT_FALSE(bench.babbler.on_control_status(control(true)));
     EXPECT_EQ(bench.babbler.activity().find("silent"), std::string::npos);
-    // Given back, it goes on: what was not finished is replaced.
+    // When the arm is given back, the unfinished action is replaced.
     const auto next = bench.babbler.on_control_status(control(false));
     ASSERT_TRUE(next) << stage;
     EXPECT_EQ(next->action_id, stage == 0 ? 0 : 5);
@@ -898,7 +898,7 @@ TEST(MotorBabblerTest, WhichOfSampleVerdictAndSchemaComesFirstDoesNotMatter) {
   early.babbler.on_motion_status(answer(early.last, motion_status_t::STATE_SETTLED));
   early.babbler.on_body_schema(schema_of(5));
   EXPECT_FALSE(early.take(early.babbler.on_model_health(verdict(4, 5))));
-  // Of the sample it hears before it is its turn: there is a gap before it.
+  // It hears the sample too early: there is a gap before it.
   EXPECT_FALSE(early.take(early.babbler.on_sample(sample_of(early.last, 4))));
   EXPECT_NE(early.babbler.activity().find("samples up to 4"), std::string::npos);
   ASSERT_TRUE(early.take(early.babbler.remember(sample_of(early.last, 4))));
@@ -961,7 +961,7 @@ TEST(MotorBabblerTest, AProbeThatIsWantedIsTheFirstActionAfterTheVerdict) {
     ASSERT_TRUE(bench.take(bench.babbler.on_model_health(wants)));
     EXPECT_EQ(bench.last.action, wants.probe_action);
     EXPECT_EQ(bench.last.purpose, action_command_t::PURPOSE_PROBE);
-    // Refused it is not tried again and again.
+    // A refused probe is not tried again and again.
     Bench refused = bench;
     ASSERT_TRUE(refused.take(
         refused.babbler.on_motion_status(answer(refused.last, motion_status_t::STATE_REJECTED))));
@@ -1034,7 +1034,8 @@ class World {
       : config_(std::move(config)), kill_share_(kill_share), rng_(seed) {}
   ~World() { std::filesystem::remove(file_); }
 
-  /// Until the babbler is done; every message may be the last that this babbler hears or sends.
+  /// Runs until the babbler is done; every message may be the last that this babbler hears or
+  /// sends.
   void run() {
     start();
     for (int i = 0; i < 20'000 && !babbler_->is_done(); ++i) {

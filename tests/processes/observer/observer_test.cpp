@@ -257,7 +257,7 @@ TEST(Observer, UsesNoFrameFromAfterTheNextMotionBegan) {
 }
 
 TEST(Observer, MixesNoFramesOfTwoRestsOfOneAction) {
-  // The driver says so when the arm was disturbed, the simulator when a fault came.
+  // The driver reports a new rest when the arm was disturbed, the simulator after a fault.
   Observer observer = calibrated();
   Scene scene;
   observer.on_motion_status(settled(0));
@@ -271,7 +271,7 @@ TEST(Observer, MixesNoFramesOfTwoRestsOfOneAction) {
   EXPECT_EQ(sample->action_id, 0);
   EXPECT_EQ(sample->rest_begin_utime, anew);
   EXPECT_EQ(sample->parts.at(0).num_frames, 2);
-  // Once it was seen, a later rest of the same action makes no second sample.
+  // Once an action has its sample, a later rest of it makes no second one.
   observer.on_motion_status(settled(0, anew + 1'000'000));
   observer.on_marker_poses(scene.frame(anew + 1'050'000));
   EXPECT_FALSE(observer.on_marker_poses(scene.frame(anew + 1'083'333)));

@@ -42,7 +42,7 @@ Pose X_CB_of(std::mt19937& random) {
   return X;
 }
 
-/// `printed_m`: the side that it really has.
+/// `printed_m`: the true side of the print.
 SeenTag seen(int id, const Pose& X_CB, const Pose& X_BM, double sigma_px, std::mt19937& random,
              double printed_m = kSize_m) {
   std::normal_distribution<double> noise(0, sigma_px / kFocal_px);
@@ -86,7 +86,7 @@ TEST(SolvePartPose, IsBetterOverSeveralTagsThanOverOne) {
   EXPECT_LT(squares[3], squares[2]);
 }
 
-// Tags are not where markers.yaml has them, and printed larger or smaller: d² of the part's pose.
+// Tags are displaced from markers.yaml, and printed larger or smaller: d² of the part's pose.
 TEST(SolvePartPose, HasACovarianceThatIsConsistentWithTagsThatAreOff) {
   PartPoseOptions off = options();
   off.calibration = {.position_m = 0.0005, .rotation_rad = 0.005, .size_share = 0.002};
@@ -197,7 +197,7 @@ TEST(SolvePartPose, OfTwoTagsThatDisagreeGivesTheOneOrTheOtherByTurns) {
     EXPECT_EQ(pose->dropped, std::vector<int>{turn % 2});
     EXPECT_EQ(pose->used, std::vector<int>{1 - turn % 2});
   }
-  // One that fits no pose is the wrong one.
+  // A tag that fits no pose is the wrong one.
   tags[0].corners[0].ray.x() += 20 / kFocal_px;
   for (int turn = 0; turn < 2; ++turn) {
     const auto pose = solve_part_pose(tags, options(), turn);

@@ -57,7 +57,7 @@ class SampleOutboxTest : public testing::Test {
       indices.push_back(message.sample_index);
     return indices;
   }
-  /// What a restart hands on.
+  /// Samples that a restart delivers.
   Indices kept() const {
     Indices indices;
     outbox_->for_each_recorded(
@@ -100,7 +100,7 @@ TEST_F(SampleOutboxTest, TheNewestIsRepeatedAtOneHertzAlsoAfterARestart) {
   EXPECT_EQ(take_sent(), (Indices{0, 1}));
   tick_for(3.2);
   EXPECT_EQ(take_sent(), (Indices{1, 1, 1}));
-  // What a kill left on disk and nobody heard of is told at once.
+  // A sample that a kill left on disk unsent is sent at once.
   start();
   tick_for(0.1);
   EXPECT_EQ(take_sent(), (Indices{1}));
@@ -115,7 +115,7 @@ TEST_F(SampleOutboxTest, WhatIsAskedForIsSentAgainALittleAtATime) {
   outbox_->on_request(request(4, 6));  // of another process, at the same time
   outbox_->on_tick(now_us_ += kSecond / 10);
   EXPECT_EQ(take_sent(), (Indices{3, 4, 5, 6}));
-  // Whatever is asked: 50 for all that ask, 25 a tick.
+  // Whatever is requested: 50 for all requests together, 25 per tick.
   for (int n = 0; n < 1000; ++n) outbox_->on_request(request(0, INT64_MAX));
   outbox_->on_tick(now_us_ += kSecond / 10);
   EXPECT_EQ(sent_.size(), 25U);
@@ -132,7 +132,7 @@ TEST_F(SampleOutboxTest, WhatItDoesNotHaveIsNotSent) {
   outbox_->on_request(request(8, 99));
   tick_for(0.5);
   EXPECT_EQ(take_sent(), Indices{});
-  // The log was deleted under its hands.
+  // The log was deleted while it was open.
   outbox_->on_request(request(7, 7));
   std::filesystem::remove(file_);
   EXPECT_NO_THROW(tick_for(0.2));

@@ -1,12 +1,12 @@
 #!/bin/bash
-# driver_test_simulator.sh BIN RIG: robot_simulator keeps lcmtypes/DRIVER.md, as far as a motion that takes no
-# time lets one see.
+# driver_test_simulator.sh BIN RIG: robot_simulator keeps lcmtypes/DRIVER.md, as far as that is visible with
+# motions that take no time.
 set -euo pipefail
 bin=$1 rig=$2 here=$(dirname "$0")
 work=$(mktemp -d)
 trap 'kill $(jobs -p) 2>/dev/null || true; wait 2>/dev/null; rm -rf "$work"' EXIT
 
-# A process that is not named as its PROCESS_INFO says is not killed.
+# A process whose program has another name than in PROCESS_INFO is not killed.
 ln -s "$bin/robot_simulator" "$work/stranger"
 "$work/stranger" --config "$rig/robot_simulator.yaml" --state "$work/state.yaml" 2>"$work/driver.log" &
 stranger=$!
@@ -29,7 +29,7 @@ status=0
 "$bin/bodyschema" driver-test --rig-folder "$rig" </dev/null 2>/dev/null || status=$?
 [ "$status" = 2 ] || { echo "exit code $status without confirmation"; exit 1; }
 
-# Faults reach it by command and are named; a wrong one says what there is.
+# Faults reach it by command and are named; a wrong one is refused with the choices.
 "$bin/bodyschema" fault bend forearm 5 | grep -qx 'bend forearm 5 deg'
 "$bin/bodyschema" fault marker-lost 12 | grep -qx 'marker-lost 12'
 if "$bin/bodyschema" fault stuck q9 2>"$work/error"; then exit 1; fi

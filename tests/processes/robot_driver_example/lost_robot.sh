@@ -1,6 +1,6 @@
 #!/bin/bash
-# lost_robot.sh BIN RIG: the serial device vanishes in the middle of a motion and comes back; then the driver is
-# told to end in the middle of another. What the driver said is in the log of the bus.
+# lost_robot.sh BIN RIG: the serial device vanishes in the middle of a motion and comes back; then the driver gets
+# SIGTERM in the middle of another. Its answers are in the log of the bus.
 set -euo pipefail
 bin=$1
 work=$(mktemp -d)
@@ -25,7 +25,7 @@ cp "$2"/*.yaml "$work/"
 sed -i 's|^device:.*|device: robot|' "$work/robot_driver_example.yaml"
 "$bin/motion_client" >"$work/statuses" &
 client=$!
-# Nobody is there yet: the driver waits.
+# The device does not exist yet: the driver waits.
 "$bin/robot_driver_example" --config "$work/robot_driver_example.yaml" --record "$work/record" \
   2>"$work/driver.log" &
 driver=$!
@@ -49,6 +49,6 @@ until_ok says 'id=1 STOPPED rest=yes' || fail "SIGTERM did not halt the arm"
 status=0
 wait "$driver" || status=$?
 [ "$status" = 0 ] || fail "exit code $status after SIGTERM"
-# It never went on by itself, nor to the end.
+# The motion was neither resumed nor finished.
 says SETTLED && fail "a motion that was interrupted settled"
 exit 0

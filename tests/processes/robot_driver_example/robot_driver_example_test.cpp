@@ -23,7 +23,7 @@ constexpr std::int64_t kStart = 1'700'000'000'000'000;
 constexpr std::int64_t kBoot = kStart - 1'000'000;
 constexpr std::int64_t kHour = 3'600'000'000;
 
-/// A driver and a robot of three joints that does as it is told, in a time of its own.
+/// A driver and an obedient robot of three joints, on a clock of their own.
 class Lab {
  public:
   explicit Lab(std::optional<Status> record = std::nullopt, std::int64_t now = kStart)
@@ -38,7 +38,7 @@ class Lab {
     take(driver.on_connect(now()));
     tick();
   }
-  /// A tick later; the robot answers what it was asked, unless it is silent.
+  /// A tick later; the robot answers the driver's question, unless it is silent.
   void tick(int times = 1) {
     for (; times > 0; --times) {
       now_ += 100'000;
@@ -160,7 +160,7 @@ TEST(RobotDriver, LosesASilentRobotAndHaltsItWhenItIsBack) {
   EXPECT_EQ(lab.driver.status().rest_since_utime, -1);
   EXPECT_EQ(lab.send(lab.move()).state, Status::STATE_REJECTED);
 
-  // It may be the robot's voice only that is lost.
+  // The robot may still hear, though it is not heard.
   EXPECT_TRUE(lab.was_told("HALT"));
   lab.lines.clear();
   lab.tick(1);
@@ -290,7 +290,7 @@ TEST(RobotDriver, SaysThatAStopCouldNotBeKeptAndTriesAgain) {
   EXPECT_EQ(lab.record->stop_latched, 1);
   EXPECT_EQ(lab.record->action_id, stop.action_id);
   EXPECT_EQ(lab.heard.back().reason.find("disk full"), std::string::npos);
-  // What is kept stays kept.
+  // A recorded STOP needs no further save.
   lab.disk_is_full = true;
   lab.tick(100);
   EXPECT_EQ(lab.heard.back().reason.find("disk full"), std::string::npos);
@@ -326,7 +326,7 @@ TEST(RobotDriver, DoesNotMoveWithoutARecordOfTheMotion) {
   EXPECT_EQ(answer.state, Status::STATE_REJECTED);
   EXPECT_NE(answer.reason.find("disk full"), std::string::npos);
   EXPECT_FALSE(lab.was_told("GO"));
-  // HOLD and STOP need none.
+  // HOLD and STOP need no record.
   lab.lines.clear();
   EXPECT_EQ(lab.send(lab.make(Command::KIND_STOP)).state, Status::STATE_STOPPED);
   EXPECT_TRUE(lab.was_told("HALT"));

@@ -1,6 +1,6 @@
 #!/bin/bash
-# supervise.sh LOG COMMAND…: starts the command again whenever it fails, as a supervisor does; ends
-# it when it is told to end.
+# supervise.sh LOG COMMAND…: restarts the command whenever it fails, as a supervisor does; SIGTERM ends
+# both.
 log=$1
 shift
 trap 'kill "$child" 2>/dev/null; wait "$child"; exit 0' TERM

@@ -136,7 +136,7 @@ TEST(RobotSimulator, RefusesAMotionThatWouldTouchItself) {
   // The fingers press against each other.
   expect_rejected(simulator, move_to(1, {0.1, 5, 0, 0.1, 3, 0, 0}),
                   "self-collision between link finger_left and link finger_right");
-  // It still does what it can.
+  // It still carries out other actions.
   EXPECT_TRUE(simulator.on_command(move_to(2, {0, 0, 0, 0, 0, 0, 40})).state.has_value());
 }
 
@@ -299,7 +299,7 @@ TEST(RobotSimulator, ContinuesWithItsCalibrationErrorsAndItsPlay) {
   restarted.restore(file);
   std::filesystem::remove(file);
   EXPECT_EQ(bytes(restarted.state()), bytes(lasting.state()));
-  // Within the play of the first joint: where it stands then is known from before alone.
+  // Within the play of the first joint: its position in the play depends on the previous motion.
   action_command_t next = move_to(1, {0.3001, -10, 0.1, 0.2, -15, 0.1, 30});
   next.utime = lasting.status().utime;
   lasting.on_command(next);
@@ -307,7 +307,7 @@ TEST(RobotSimulator, ContinuesWithItsCalibrationErrorsAndItsPlay) {
   EXPECT_EQ(bytes(restarted.state()), bytes(lasting.state()));
 }
 
-/// What is seen of the last part is turned against its true pose by so much [deg].
+/// Angle between the visible and the true pose of the last part [deg].
 double seen_beside_truth_deg(const RobotSimulator& simulator) {
   const sim_state_t& state = simulator.state();
   const TagPlacement& tag = simulator.scene().markers().tags.back();
@@ -409,7 +409,7 @@ TEST(RobotSimulator, HidesThePlatesOfAPart) {
       EXPECT_EQ(answer.state->geom_alpha[geom], part == 4 ? 0.0F : 1.0F);
     }
   }
-  // The truth knows it all the same.
+  // SIM_STATE still has the true poses of hidden parts.
   EXPECT_EQ(answer.state->num_parts, 10);
   hiding.hidden_parts = {44};
   EXPECT_THROW(RobotSimulator{hiding}, std::invalid_argument);
@@ -453,7 +453,7 @@ TEST(RobotSimulator, AFaultBeginsARestOfItsOwn) {
   EXPECT_EQ(answer.state->fault_answer, "");
   EXPECT_EQ(answer.state->faults, std::vector<std::string>{"bend forearm 5 deg"});
   EXPECT_EQ(answer.state->action_id, 0);
-  // The camera takes a few frames from the state's time on; those of before are older.
+  // The camera takes a few frames from the state's time on; earlier frames are older.
   EXPECT_GT(answer.state->utime, before.utime + 500'000);
   ASSERT_EQ(answer.statuses.size(), 1U);
   EXPECT_EQ(answer.statuses[0].state, Status::STATE_SETTLED);
@@ -556,7 +556,7 @@ TEST(RobotSimulator, ADriftBendsWithEveryActionAndSurvivesARestart) {
     simulator.on_command(move_to(id, id % 2 ? kElsewhere : kSomewhere));
     EXPECT_NEAR(bent_deg(simulator), 0.25 * (id + 1), 1e-6);
   }
-  // What is refused is no action.
+  // A refused action advances no drift.
   simulator.on_command(move_to(4, {9, 0, 0, 0, 0, 0, 40}));
   EXPECT_NEAR(bent_deg(simulator), 1, 1e-6);
   EXPECT_EQ(simulator.state().faults.at(0), "drift base 0.25 deg per action, 1 deg so far");

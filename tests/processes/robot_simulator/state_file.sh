@@ -32,7 +32,7 @@ for _ in 1 2 3; do
 done
 kill -0 "$simulator" || fail "ended by a full disk"
 [ "$(grep -c 'a restart would not know' "$work/simulator.log")" = 1 ] || fail "not warned exactly once"
-# What was saved before is whole.
+# The earlier state is whole.
 grep -q '^served_faults:' "$work/disk/state.yaml" || fail "the old state was destroyed"
 kill "$simulator"
 wait "$simulator" || fail "exit code $? after SIGTERM"
