@@ -32,7 +32,7 @@ Eigen::Matrix<double, Side, Side> invertible(const Eigen::Matrix<double, Side, S
 pose_t to_message(const Pose& X_AB) {
   Eigen::Quaterniond q_AB(X_AB.linear());
   q_AB.normalize();
-  // Of q and −q the one with this sign, so that equal poses make equal bytes.
+  // One sign for q and −q, so that equal poses make equal bytes.
   if (q_AB.w() < 0) q_AB.coeffs() = -q_AB.coeffs();
   pose_t message{};
   for (int i = 0; i < 3; ++i) message.position_m[i] = X_AB.translation()[i];

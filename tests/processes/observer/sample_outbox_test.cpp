@@ -115,7 +115,7 @@ TEST_F(SampleOutboxTest, WhatIsAskedForIsSentAgainALittleAtATime) {
   outbox_->on_request(request(4, 6));  // of another process, at the same time
   outbox_->on_tick(now_us_ += kSecond / 10);
   EXPECT_EQ(take_sent(), (Indices{3, 4, 5, 6}));
-  // Whatever is requested: 50 for all requests together, 25 per tick.
+  // Any number of requests gets 50 samples together, 25 per tick.
   for (int n = 0; n < 1000; ++n) outbox_->on_request(request(0, INT64_MAX));
   outbox_->on_tick(now_us_ += kSecond / 10);
   EXPECT_EQ(sent_.size(), 25U);
