@@ -14,7 +14,7 @@
 namespace bodyschema {
 
 // A message beyond one datagram travels as numbered pieces (message_piece_t) on its own channel,
-// whole or not at all. A receiver tells a piece from a whole message by the fingerprint.
+// whole or not at all. The fingerprint distinguishes a piece from a whole message.
 
 /// The largest message that travels whole [bytes]. LCM has fragments of its own from 65 487 B on,
 /// which two forged packets turn into a crash of any receiver.

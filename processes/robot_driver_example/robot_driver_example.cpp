@@ -146,7 +146,7 @@ void RobotDriver::conclude(const Command& command, std::int8_t state, const std:
   answer.statuses.push_back(status);
   served_.push_back(status);
   if (served_.size() > kMaxServed) served_.pop_front();
-  if (is_refusal(status)) return;  // R4: told, not repeated
+  if (is_refusal(status)) return;  // R4: sent, not repeated
   status_ = status;
   said_at_ = steady_;
   // The record that must be on disk before the arm moves was written by on_command.

@@ -51,7 +51,7 @@ class FullDisk : public testing::Test {
   }
   void free_disk() const { std::filesystem::remove(disk_ / "filler"); }
 
-  /// A settled action of the arm2 that saw nothing, told once more.
+  /// A settled action of the arm2 without visible parts, published once more.
   void act(std::int64_t id) {
     camera_info_t info{};
     info.camera_name = "arm2_camera";
