@@ -65,7 +65,7 @@ class RobotDriver {
   Answer on_disconnect(const std::string& problem, Now now);
   /// Every 0.1 s: asks the robot for its position, detects silence, repeats the status.
   Answer on_tick(Now now);
-  /// SIGTERM.
+  /// The end of the process: halts the arm.
   Answer on_end(Now now);
   /// Keeps the record if `answer` wants that. If a STOP could not be kept the answer says so, and
   /// the ticks try again.
