@@ -152,14 +152,6 @@ Arguments& Arguments::callback(std::function<void()> run) {
   return *this;
 }
 
-bool Arguments::is_given(const std::string& name) const {
-  return app_->get_option(name)->count() > 0;
-}
-
-std::string Arguments::text_of(const std::string& name) const {
-  return app_->get_option(name)->as<std::string>();
-}
-
 void refuse_argument(const std::string& name, const std::string& why) {
   throw CLI::ValidationError(name, why);
 }

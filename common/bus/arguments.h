@@ -70,10 +70,6 @@ class Arguments {
   Arguments& allow_extras();
   Arguments& callback(std::function<void()> run);
 
-  /// Makes the option that was added last require another one.
-  bool is_given(const std::string& name) const;
-  std::string text_of(const std::string& name) const;
-
  private:
   CLI::App* app_;
 };

@@ -115,9 +115,11 @@ int fail(const std::string& name, const std::string& what) {
 }  // namespace
 
 struct Process::Impl {
-  Impl(std::string process_name, std::filesystem::path config, const std::string& in_url,
-       const std::string& out_url)
-      : config_file(std::move(config)), bus(in_url, out_url) {
+  Impl(std::string process_name, std::filesystem::path config, std::string in, std::string out)
+      : config_file(std::move(config)),
+        in_url(std::move(in)),
+        out_url(std::move(out)),
+        bus(in_url, out_url) {
     info.process_name = std::move(process_name);
     info.host = as_text(host_name());
     info.pid = static_cast<std::int32_t>(::getpid());
@@ -128,7 +130,8 @@ struct Process::Impl {
     if (!bus.is_replay() && in_url == out_url) listen_for_twin();
   }
 
-  std::filesystem::path config_file;
+  const std::filesystem::path config_file;
+  const std::string in_url, out_url;
   Bus bus;
   process_info_t info{};
   std::string activity;
@@ -263,6 +266,10 @@ Bus& Process::bus() { return impl_->bus; }
 const std::string& Process::name() const { return impl_->info.process_name; }
 
 const std::filesystem::path& Process::config_file() const { return impl_->config_file; }
+
+const std::string& Process::in_url() const { return impl_->in_url; }
+
+const std::string& Process::out_url() const { return impl_->out_url; }
 
 std::filesystem::path Process::rig_folder() const {
   return impl_->config_file.has_parent_path() ? impl_->config_file.parent_path() : ".";

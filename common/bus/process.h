@@ -15,13 +15,7 @@ namespace bodyschema {
 /// The common part of every process: `--config FILE --in URL --out URL --log-level LEVEL`, a bus, a
 /// loop that ends on SIGTERM, SIGINT or at the end of a log, PROCESS_INFO at 1 Hz, an exit code.
 ///
-///   int main(int argc, char** argv) {
-///     return run_process("observer", argc, argv, [](Process& process) {
-///       Observer observer(ObserverConfig::load(process.config_file()));
-///       process.bus().subscribe(kMarkerPoses, …);
-///       process.run();
-///     });
-///   }
+///   int main(int argc, char** argv) { return run_process<ObserverProcess>("observer", argc, argv); }
 ///
 /// One process of a name per bus: the younger of two ends with exit code 1 and a line that names
 /// the elder. At its start it publishes PROCESS_INFO and listens for 0.5 s before it publishes
@@ -41,6 +35,9 @@ class Process {
   Bus& bus();
   const std::string& name() const;
   const std::filesystem::path& config_file() const;
+  /// The URLs of bus(), defaults resolved.
+  const std::string& in_url() const;
+  const std::string& out_url() const;
   /// The folder of the configuration file: the rig.
   std::filesystem::path rig_folder() const;
   /// Start of this process, µs since 1970; in a replay the event time of the log's first event, so
@@ -101,5 +98,19 @@ bool is_live(const process_info_t& info, std::int64_t now_us);
 int run_process(const std::string& name, int argc, char** argv,
                 const std::function<void(Process&)>& body,
                 const std::function<void(Arguments)>& add_options = nullptr);
+
+/// The same for a class whose constructor takes the Process and subscribes, and whose
+/// `Options::add_to(Arguments)` declares its own flags.
+template <class Subscriber>
+int run_process(const std::string& name, int argc, char** argv) {
+  typename Subscriber::Options options;
+  return run_process(
+      name, argc, argv,
+      [&](Process& process) {
+        Subscriber subscriber(process, options);
+        process.run();
+      },
+      [&](Arguments app) { options.add_to(app); });
+}
 
 }  // namespace bodyschema

@@ -1078,7 +1078,7 @@ class World {
     start();
     return true;
   }
-  /// As main.cpp does: saved, then sent.
+  /// As MotorBabblerProcess does: saved, then sent.
   void tell(const std::optional<action_command_t>& command) {
     if (is_killed()) return;
     kept_ = babbler_->state_text();
