@@ -1,4 +1,4 @@
-#include "processes/console/driver_test.h"
+#include "processes/driver_test/driver_test.h"
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
@@ -21,7 +21,7 @@
 
 #include "common/bus/bus.h"
 #include "common/config/rig.h"
-#include "processes/console/conformance.h"
+#include "processes/driver_test/conformance.h"
 
 namespace bodyschema {
 namespace {

@@ -1,4 +1,4 @@
-#include "processes/console/conformance.h"
+#include "processes/driver_test/conformance.h"
 
 #include <gtest/gtest.h>
 
