@@ -19,4 +19,12 @@ std::string duration(double seconds);
 /// `text` for an error: of more than 40 bytes the first ones and "…".
 std::string abbreviated(std::string_view text);
 
+/// `text` as lines of at most `width` characters, broken between words where there are any; the
+/// first begins with `indent` spaces, the others with two more.
+std::string wrap(const std::string& text, int width, int indent);
+
+/// `text` as one line of at most `width` characters: longer ones end in "…", control characters
+/// (a terminal would obey them) become spaces.
+std::string fit(const std::string& text, int width);
+
 }  // namespace bodyschema

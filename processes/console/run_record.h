@@ -86,6 +86,7 @@ class RunRecord {
     std::optional<std::int64_t> answered = {}, settled = {}, sampled = {};
   };
 
+  void on_faults(const sim_state_t& state, std::int64_t received_us);
   void on_version(const body_schema_t& schema);
   void on_health_event(const health_event_t& event);
   static std::int64_t hash_of(const ActionKey& key);

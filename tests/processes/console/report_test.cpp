@@ -10,8 +10,8 @@
 #include "common/bus/convert.h"
 #include "common/geometry/angle.h"
 #include "common/plot/plot.h"
-#include "processes/console/report_figures.h"
-#include "processes/console/report_page.h"
+#include "processes/console/report/report_figures.h"
+#include "processes/console/report/report_page.h"
 #include "processes/structure_learner/learn.h"
 #include "tests/support/synthetic_robot.h"
 
@@ -488,11 +488,6 @@ TEST_F(ReportPageTest, ALogThatIsCutOffIsToldAtTheTop) {
   // While it is written it always ends somewhere.
   report_.reload_s = 10;
   EXPECT_EQ(page().find("cut off"), std::string::npos);
-}
-
-TEST(EscapeTest, LeavesNoMarkup) {
-  EXPECT_EQ(escape_html("<a href='x'>\"&\x01</a>"),
-            "&lt;a href=&#39;x&#39;&gt;&quot;&amp; &lt;/a&gt;");
 }
 
 }  // namespace
