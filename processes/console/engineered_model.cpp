@@ -40,7 +40,7 @@ struct Drive {
   double offset = 0;  ///< [rad or m]
 };
 
-/// What lies between the last part and the place where a walk over the links stands.
+/// The joints between the last part and the place where a walk over the links stands.
 struct Way {
   Pose left = Pose::Identity();
   std::vector<ScrewJoint> joints;

@@ -6,8 +6,8 @@
 
 namespace bodyschema {
 
-/// What the user types for a command of this program: "./run WORDS" where the launcher says so
-/// (BODYSCHEMA_COMMAND), else "bodyschema WORDS".
+/// The words that the user types for a command of this program: "./run WORDS" where the launcher
+/// says so (BODYSCHEMA_COMMAND), else "bodyschema WORDS".
 std::string to_type(const std::string& words);
 
 /// "1 sample", "2 samples".

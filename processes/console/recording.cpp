@@ -29,7 +29,7 @@ namespace bodyschema {
 namespace {
 
 constexpr double kUnitTolerance = 1e-3;
-/// Of any column. Squares, sums and microseconds of what is larger would overflow.
+/// Largest number of any column. Squares, sums and microseconds of what is larger would overflow.
 constexpr double kLargest = 1e12;
 /// [bytes] Unpacked, and of what has to be in memory: more is no recording of an arm.
 constexpr std::size_t kLargestFile = 2'000'000'000;
@@ -161,7 +161,7 @@ class Row {
   std::vector<std::size_t> columns_;
 };
 
-/// Where the columns of a CSV recording stand.
+/// The columns of a CSV recording.
 struct Header {
   std::vector<std::string> signals;
   std::size_t part = 0;  ///< column of `part`; the pose follows it
@@ -264,7 +264,7 @@ PartObservation parse_observation(const Row& row, const Header& header) {
   return observation;
 }
 
-/// Where the sample of an instant stands, and its first line. Rows may come part by part as well as
+/// The sample of an instant and its first line. Rows may come part by part as well as
 /// instant by instant.
 struct Instant {
   std::size_t sample = 0, line = 0;

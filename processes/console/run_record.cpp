@@ -148,7 +148,7 @@ void RunRecord::on_health_event(const health_event_t& event) {
   const auto [added, is_new] =
       events_.try_emplace({event.event_sample, event.event_number, event.event_text}, event);
   if (!is_new) return;
-  // Of acceptances in a row the newest says it all.
+  // The newest of acceptances in a row says it all.
   if (is_acceptance(event)) {
     const auto next = std::next(added);
     if (added != events_.begin() && is_acceptance(std::prev(added)->second))

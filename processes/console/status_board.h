@@ -62,7 +62,7 @@ class StatusBoard {
   void on_learned_schema(const body_schema_t& schema) { proposal_ = schema; }
   void on_message(const model_health_t& health) { health_ = health; }
   void on_message(const sim_state_t& state) { sim_state_ = state; }
-  /// What this listener itself had to drop: Bus::counters().
+  /// Messages that this listener itself had to drop: Bus::counters().
   void on_own_counters(const std::map<std::string, std::int64_t>& counters);
   void end(std::int64_t now_us) { end_us_ = now_us; }
 
@@ -94,10 +94,10 @@ class StatusBoard {
   std::vector<std::string> missing() const;
   /// Names of which several processes are alive.
   std::vector<std::string> twins() const;
-  /// What needs somebody's attention, for people.
+  /// Faults that need somebody's attention, for people.
   std::vector<std::string> warnings() const;
   const Heard* find(const std::string& name) const;
-  /// Of which anything came, be it garbage.
+  /// Names of those on which anything came, be it garbage.
   std::set<std::string> channels() const;
   /// "malformed", "senseless", … of a channel: the most that any process counted, since its start.
   std::map<std::string, std::int64_t> dropped(const std::string& channel) const;

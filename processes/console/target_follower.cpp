@@ -19,7 +19,7 @@ constexpr std::int64_t kSilent_us = 3'000'000;
 
 }  // namespace
 
-std::string millimetres(double error_m) {
+std::string distance_text(double error_m) {
   return error_m < 0 ? "unknown" : fmt::format("{:.1f} mm", error_m * 1e3);
 }
 
@@ -116,8 +116,8 @@ std::string TargetFollower::progress() const {
   }
   return fmt::format("{} · {} moves · by the schema {} away, as seen {} · {}",
                      name_in(kControlStates, status_.control_state), status_.num_moves,
-                     millimetres(status_.predicted_error_m), millimetres(status_.observed_error_m),
-                     status_.why);
+                     distance_text(status_.predicted_error_m),
+                     distance_text(status_.observed_error_m), status_.why);
 }
 
 bool TargetFollower::has_been_heard(const std::string& process) const {

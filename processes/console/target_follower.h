@@ -36,9 +36,9 @@ class TargetFollower {
   std::optional<pose_target_t> on_tick(std::int64_t now_us);
   /// Ends what is open.
   void interrupt();
-  /// What makes the controller drop the target when nobody follows it any longer: a hold, or a
-  /// release where the arm is the babbler's meanwhile. It is newer than this target only, so that
-  /// another sender's stays.
+  /// The message that makes the controller drop the target when nobody follows it any longer: a
+  /// hold, or a release where the arm is the babbler's meanwhile. It is newer than this target
+  /// only, so that another sender's stays.
   pose_target_t withdrawal() const;
 
   End end() const { return end_; }
@@ -97,8 +97,8 @@ inline constexpr std::int64_t kCommandPeriod_us = 200'000;  ///< of what is not 
 action_command_t make_console_command(std::int8_t kind, std::int64_t epoch, std::int64_t action_id);
 
 /// "1.2 mm"; "unknown" below 0.
-std::string millimetres(double error_m);
-/// What `target --json` prints.
+std::string distance_text(double error_m);
+/// The output of `target --json`.
 std::string target_json(const control_status_t& status, TargetFollower::End end);
 
 }  // namespace bodyschema

@@ -40,9 +40,9 @@ struct RuleResult {
   std::string note;  ///< what was expected and what came, or why it was skipped
 };
 
-/// Where the test will move the arm, command units: about where the driver says that it is, or the
-/// middle of the ranges where it does not say. @throws std::runtime_error if no driver is heard, it
-/// is stopped, or does not rest.
+/// The two places between which the test moves the arm, command units: about where the driver says
+/// that it is, or the middle of the ranges where it does not say. @throws std::runtime_error if no
+/// driver is heard, it is stopped, or does not rest.
 struct ConformancePlan {
   std::vector<double> here, there;
   bool is_from_middle = false;

@@ -81,8 +81,8 @@ class LiveDriver {
     return link;
   }
 
-  /// What --kill would end. @throws std::runtime_error if that is not the driver: one in a
-  /// container tells a number that is another program's here, and numbers are used again.
+  /// Finds the process that --kill would end. @throws std::runtime_error if that is not the driver:
+  /// one in a container tells a number that is another program's here, and numbers are used again.
   void find_process() {
     const auto end = SteadyClock::now() + std::chrono::seconds(5);
     while (!process_ && SteadyClock::now() < end) bus_.handle(std::chrono::milliseconds(100));
@@ -126,7 +126,7 @@ class LiveDriver {
     drain();
   }
 
-  /// What the driver that has ended had still sent.
+  /// Drops the messages that the driver had sent before it ended.
   void drain() {
     const auto end = SteadyClock::now() + std::chrono::milliseconds(50);
     while (SteadyClock::now() < end) bus_.handle(std::chrono::milliseconds(5));

@@ -36,7 +36,8 @@ struct LogArguments {
   std::string copy;
 };
 
-/// Where a replay starts: MARKER_POSES, from which the observer makes the samples again, or SAMPLE.
+/// The channel from which a replay starts: MARKER_POSES, from which the observer makes the samples
+/// again, or SAMPLE.
 std::string replay_start(const LogSummary& summary, const std::string& file) {
   const auto has = [&](const std::string& channel) {
     const auto found = summary.channels.find(channel);
@@ -95,7 +96,7 @@ std::filesystem::path rig_of(const std::filesystem::path& log, const std::filesy
       rule_out(folder, error.what());
     }
   }
-  // What is repeated says nothing new, and a log may be long.
+  // Repetitions say nothing new, and a log may be long.
   constexpr int kEnough = 1000;
   int num_judged = 0;
   LogReader reader(log, OnDamage::kSkip);

@@ -14,10 +14,10 @@
 #include "common/bus/event_log.h"
 #include "common/geometry/angle.h"
 #include "processes/console/commands/commands.h"
-#include "processes/console/evaluation.h"
-#include "processes/console/views/health_view.h"
 #include "processes/console/commands/files.h"
+#include "processes/console/evaluation.h"
 #include "processes/console/recording.h"
+#include "processes/console/views/health_view.h"
 #include "processes/console/views/structure_view.h"
 #include "processes/model_monitor/adaptation.h"
 #include "processes/model_monitor/chapter_adaptation.h"
@@ -106,7 +106,7 @@ void tell_noise(const MonitorArguments& arguments, const Recording& recording,
                            is_given ? "given" : "that of " + arguments.schema);
 }
 
-/// What keeps the schema true.
+/// A procedure that keeps the schema true.
 class Method {
  public:
   virtual ~Method() = default;

@@ -186,8 +186,8 @@ void run_target(const OperateArguments& arguments) {
                              : status.control_state == control_status_t::CONTROL_REFUSED
                                  ? "refused"
                                  : "not reached",
-                             status.why, millimetres(status.predicted_error_m),
-                             millimetres(status.observed_error_m), status.num_moves);
+                             status.why, distance_text(status.predicted_error_m),
+                             distance_text(status.observed_error_m), status.num_moves);
   }
   if (!is_reached) fail();
   if (arguments.keep_s < 0)

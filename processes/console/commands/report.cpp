@@ -68,7 +68,8 @@ class Source {
     return is_new;
   }
 
-  /// What a page would be rewritten for: samples, versions, decisions, processes that come and go.
+  /// Counts for whose change a page is rewritten: samples, versions, decisions, processes that come
+  /// and go.
   std::tuple<std::int64_t, std::int64_t, std::size_t, std::size_t> state() const {
     return {record_.watch().num_samples(), record_.num_versions(), record_.events().size(),
             record_.faults().size() + record_.processes().size()};
@@ -166,7 +167,7 @@ void run_report(const ReportArguments& arguments) {
   }
 
   catch_interruption();
-  // What the arm does comes first.
+  // The processes that move the arm come first.
   ::setpriority(PRIO_PROCESS, 0, 10);
   auto write = [&, last = std::string()](std::optional<int> reload_s) mutable {
     std::string problem;

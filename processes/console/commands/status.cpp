@@ -40,7 +40,7 @@ int terminal_width() {
 }
 
 void run_status(const StatusArguments& arguments) {
-  // What is dropped stands in the result.
+  // Dropped messages stand in the result.
   spdlog::set_level(spdlog::level::err);
   StatusBoard board(arguments.processes, program_version());
   Bus bus(arguments.in, "");

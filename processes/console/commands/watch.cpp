@@ -1,6 +1,10 @@
+#include <fcntl.h>
 #include <fmt/format.h>
+#include <signal.h>
+#include <spawn.h>
 #include <spdlog/sinks/stdout_color_sinks.h>
 #include <spdlog/spdlog.h>
+#include <sys/wait.h>
 #include <unistd.h>
 
 #include <algorithm>
@@ -10,6 +14,7 @@
 #include <iterator>
 #include <memory>
 #include <set>
+#include <system_error>
 #include <utility>
 
 #include "common/bus/bus.h"
@@ -22,7 +27,6 @@
 #include "processes/console/clock.h"
 #include "processes/console/commands/commands.h"
 #include "processes/console/interruption.h"
-#include "processes/console/log_player.h"
 #include "processes/console/picture.h"
 #include "processes/console/run_watch.h"
 #include "processes/console/views/run_result.h"
@@ -66,6 +70,60 @@ class ProgressLine {
  private:
   const bool is_terminal_ = isatty(STDERR_FILENO);
   std::int64_t shown_us_ = 0;
+};
+
+/// Plays a recording onto the bus with lcm-logplayer: what the learning half of the group needs,
+/// never a command.
+class LogPlayer {
+ public:
+  ~LogPlayer() {
+    if (pid_ <= 0 || has_ended_) return;
+    ::kill(pid_, SIGTERM);
+    ::waitpid(pid_, nullptr, 0);
+  }
+
+  bool has_started() const { return pid_ > 0; }
+  void start(const WatchArguments& arguments) {
+    const std::string channels =
+        arguments.replay_from == kSample.name
+            ? kSample.name
+            : fmt::format("({}|{}|{})", kMarkerPoses.name, kMotionStatus.name, kCameraInfo.name);
+    std::vector<std::string> words = {"setpriv",
+                                      "--pdeathsig",
+                                      "TERM",
+                                      "lcm-logplayer",
+                                      "-s",
+                                      fmt::format("{}", arguments.speed),
+                                      "-e",
+                                      channels,
+                                      "--lcm-url=" + arguments.in,
+                                      arguments.replay};
+    std::vector<char*> argv;
+    for (std::string& word : words) argv.push_back(word.data());
+    argv.push_back(nullptr);
+    posix_spawn_file_actions_t actions;
+    ::posix_spawn_file_actions_init(&actions);
+    ::posix_spawn_file_actions_addopen(&actions, STDOUT_FILENO, "/dev/null", O_WRONLY, 0);
+    const int error = ::posix_spawnp(&pid_, argv[0], &actions, nullptr, argv.data(), environ);
+    ::posix_spawn_file_actions_destroy(&actions);
+    if (error != 0) {
+      throw std::runtime_error(fmt::format("lcm-logplayer: {}; it is in Debian's liblcm-bin",
+                                           std::generic_category().message(error)));
+    }
+  }
+  /// @throws std::runtime_error if it failed.
+  bool is_running() {
+    if (pid_ <= 0 || has_ended_) return false;
+    int status = 0;
+    if (::waitpid(pid_, &status, WNOHANG) == 0) return true;
+    has_ended_ = true;
+    if (status != 0) throw std::runtime_error("lcm-logplayer failed");
+    return false;
+  }
+
+ private:
+  pid_t pid_ = -1;
+  bool has_ended_ = false;
 };
 
 /// The simulator's truth of a recorded run is read from the recording: it does not go on a bus.
@@ -183,7 +241,7 @@ class WatchSession {
   }
 
  private:
-  /// Where the observer runs on another host, a sample that a lost frame took is asked for.
+  /// Asks for samples that lost frames took, as from an observer on another host.
   SampleIntake::Ask ask_again() {
     if (is_replay_ && !(is_played_ && listener_ == "observer")) return nullptr;
     return [this](sample_request_t request) {
@@ -192,7 +250,7 @@ class WatchSession {
     };
   }
 
-  /// What another rig's group says, or a recording that is played, is none of this run.
+  /// Messages of another rig's group or of a recording that is played are none of this run.
   template <class Message, class Handler>
   void hear(const Channel<Message>& channel, Handler handler) {
     bus_.subscribe(channel, [this, handler](const Message& m) {
@@ -232,14 +290,14 @@ class WatchSession {
   }
 
   bool is_played_out() {
-    // What is played before somebody listens is lost.
+    // Messages that are played before somebody listens are lost.
     if (!player_.has_started() && watch_.are_listening(arguments_.processes, clock_us()))
-      player_.start(arguments_.replay, arguments_.replay_from, arguments_.speed, arguments_.in);
+      player_.start(arguments_);
     if (!player_.has_started() || player_.is_running()) {
       played_s_ = seconds();
       return false;
     }
-    // Whoever listens may have messages before it still; what is lost will not come.
+    // The listener may have messages in its queue still; lost ones will not come.
     const double waited_s = seconds() - std::max(played_s_, progressed_s_);
     if (num_heard() < num_played_ && waited_s < 5) return false;
     if (watch_.num_samples() == 0 && seconds() - played_s_ > 10)

@@ -48,7 +48,7 @@ Bins bins_of(std::size_t index, const Signal& signal,
   return bins;
 }
 
-/// Where the parts of a tree stand: leaves get rows of their own in order, a part stands beside its
+/// Places of the parts of a tree: leaves get rows of their own in order, a part stands beside its
 /// first child, and below the root's tree stands what hangs together without reaching it.
 class TreeLayout {
  public:

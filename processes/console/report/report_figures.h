@@ -5,9 +5,9 @@
 #include <string>
 #include <vector>
 
+#include "common/plot/plot.h"
 #include "common/schema/body_schema.h"
 #include "common/schema/sample.h"
-#include "common/plot/plot.h"
 #include "processes/console/run_record.h"
 
 namespace bodyschema {
@@ -23,7 +23,7 @@ std::string visibility_svg(const std::vector<Signal>& signals,
                            const std::vector<ActionPoseSample>& samples,
                            const std::vector<int>& parts);
 
-/// Where the body became another one.
+/// A sample at which the body became another one.
 struct BodyMark {
   std::int64_t sample = 0;  ///< the first of the new body
   std::string label;        ///< what became of it
@@ -41,7 +41,7 @@ struct VersionErrors {
   std::optional<double> end_effector_m;  ///< median of the end effector
 };
 
-/// Of each body at most `most` versions, the last one included, each on all held-out samples of
+/// At most `most` versions of each body, the last one included, each on all held-out samples of
 /// that body; of one that changed also the version which stood when it did. A version that connects
 /// no part, or whose signals are others, is left out.
 std::vector<VersionErrors> version_errors(const std::map<std::int64_t, BodySchema>& versions,

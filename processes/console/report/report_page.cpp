@@ -166,7 +166,7 @@ class Page {
   }
 
   bool has_truth() const { return record_.watch().has_truth(); }
-  /// What the monitor can know, where the table knows better.
+  /// The error that the monitor knows, where the table has the truth.
   Json as_seen() const {
     const auto& health = record_.health();
     if (!has_truth() || !health || health->worst_position_m < 0) return nullptr;
@@ -298,7 +298,6 @@ class Page {
     for (std::size_t i = 0; i < errors_.parts.size(); ++i) rows.push_back(errors_row(i));
     return {{"curve", curve()},
             {"errors", table(std::move(rows))},
-            // Whom the errors are measured against.
             {"judge", has_truth() ? "the simulator’s noise-free truth" : "what the camera saw"},
             {"as_seen", as_seen()},
             {"scale",

@@ -11,7 +11,7 @@
 
 namespace bodyschema {
 
-/// What a report tells of.
+/// The contents of a report.
 struct Report {
   std::string title;  ///< of the run
   const RunRecord* record = nullptr;

@@ -78,7 +78,7 @@ Json processes_data(const RunRecord& record) {
 
 Json events_data(const RunRecord& record) {
   const auto& samples = record.watch().samples();
-  // Of the arm: simulated where it is.
+  // The arm's clock, a simulated one of a simulated arm.
   const auto time = [&](std::int64_t utime) {
     if (samples.empty()) return std::string("–");
     return fmt::format("{:.1f} s", static_cast<double>(utime - samples.front().utime) * 1e-6);

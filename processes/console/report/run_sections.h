@@ -11,7 +11,7 @@ namespace bodyschema {
 /// A table of the template.
 nlohmann::ordered_json table(nlohmann::ordered_json rows);
 
-/// What is wrong with the logs: the rest may be told from half of them.
+/// Flaws of the logs: the page may be told from half of them.
 nlohmann::ordered_json flaws_data(const Report& report);
 /// `loads`, the figures, is left empty.
 nlohmann::ordered_json processes_data(const RunRecord& record);

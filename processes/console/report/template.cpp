@@ -14,7 +14,7 @@ bool is_nothing(const Json& value) {
 
 using Sections = std::vector<const Json*>;  ///< the innermost last
 
-/// What precedes `end`; `text` is then what follows it.
+/// The text before `end`; `text` is then the rest after it.
 std::string_view take_up_to(std::string_view& text, const std::string& end) {
   const std::size_t at = text.find(end);
   if (at == std::string_view::npos) throw std::logic_error("template: no " + end);

@@ -9,7 +9,7 @@
 
 namespace bodyschema {
 
-/// What status, report, watch and `monitor` tell of MODEL_HEALTH, in one way.
+/// MODEL_HEALTH as status, report, watch and `monitor` tell it, in one way.
 
 /// `signal`, `amount`, `amount_sd`, `since`: null where not told. `signals`: names.
 void add_size(const change_size_t& size, std::int64_t since,
@@ -21,7 +21,7 @@ nlohmann::ordered_json finding_json(const finding_t& finding,
 
 inline constexpr const char* kWhatIsWrong = "What is wrong now";
 
-/// What MODEL_HEALTH says of the body as a whole.
+/// MODEL_HEALTH in one sentence about the body as a whole.
 struct BodyVerdict {
   /// "Nothing is known to be wrong with the body.", "The body is not as the schema says in 1
   /// place.", …

@@ -16,7 +16,7 @@
 
 namespace bodyschema {
 
-/// What a run came to.
+/// The outcome of a run.
 struct RunResult {
   std::string rig;
   std::optional<std::int64_t> seed;  ///< none of a replay

@@ -182,7 +182,7 @@ TEST(VersionErrorsTest, AVersionIsJudgedByTheBodyThatItWasFor) {
   ASSERT_EQ(errors.size(), 4U);
   EXPECT_EQ(errors[1].body, 0U);
   EXPECT_NEAR(errors[1].worst_position_m, 0, 1e-9);
-  // What stood when it broke, on the broken body.
+  // The version that stood when it broke, on the broken body.
   EXPECT_EQ(errors[2].body, 1U);
   EXPECT_EQ(errors[2].num_samples, 30);
   EXPECT_NEAR(errors[2].worst_position_m, 0.2, 0.05);

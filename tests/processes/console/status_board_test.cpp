@@ -110,11 +110,12 @@ TEST(StatusBoardTest, WhoIsMissingIsNamed) {
   alone.on_message(info("motor_babbler"));
   EXPECT_EQ(alone.headline(),
             "Waits for a driver: nobody sends MOTION_STATUS. Not heard: camera, robot_simulator.");
-  EXPECT_NE(status_text(alone.status(), 100).find("! not heard: camera, robot_simulator\n"), std::string::npos);
+  EXPECT_NE(status_text(alone.status(), 100).find("! not heard: camera, robot_simulator\n"),
+            std::string::npos);
   // Any driver will do.
   alone.on_message(at_rest());
   EXPECT_TRUE(alone.headline().ends_with("Not heard: camera."));
-  // What has ended is as good as not there.
+  // A process that has ended is as good as not there.
   alone.on_message(info("camera"));
   EXPECT_EQ(alone.headline().find("Not heard"), std::string::npos);
   alone.on_message(info("camera", process_info_t::PHASE_ENDED));
@@ -206,7 +207,8 @@ TEST(StatusBoardTest, TheBodySchemaStandsBeforeAProposal) {
   BodySchema proposal = two_parts();
   proposal.version = 0;
   board_.on_learned_schema(to_message(proposal));
-  EXPECT_NE(status_text(board_.status(), 100).find("none accepted yet; proposal, incomplete: 3 parts, 1 edges"),
+  EXPECT_NE(status_text(board_.status(), 100)
+                .find("none accepted yet; proposal, incomplete: 3 parts, 1 edges"),
             std::string::npos)
       << status_text(board_.status(), 100);
   EXPECT_FALSE(status_json(board_.status())["schema"]["accepted"].get<bool>());
@@ -221,7 +223,8 @@ TEST(StatusBoardTest, TagsThatAreSetAsideAreNamedUntilTheyAreBack) {
   BodySchema schema = two_parts();
   schema.moved_tags = {{20, 40, 38, -1}, {21, 41, 39, 60}};
   board_.on_body_schema(to_message(schema));
-  EXPECT_NE(status_text(board_.status(), 200).find("tag 20 is set aside since sample 40"), std::string::npos)
+  EXPECT_NE(status_text(board_.status(), 200).find("tag 20 is set aside since sample 40"),
+            std::string::npos)
       << status_text(board_.status(), 200);
   EXPECT_EQ(status_text(board_.status(), 200).find("tag 21"), std::string::npos);
 }
@@ -300,8 +303,9 @@ TEST(StatusBoardTest, WhatIsWrongStandsFirstAndNoTerminalIsTooNarrowForIt) {
   schema.complete = true;
   board_.on_body_schema(to_message(schema));
   board_.on_message(model_health_t{});
-  EXPECT_TRUE(status_text(board_.status(), 100).starts_with(
-      "Learning: 5 samples.\nNothing is known to be wrong with the body.\n"))
+  EXPECT_TRUE(
+      status_text(board_.status(), 100)
+          .starts_with("Learning: 5 samples.\nNothing is known to be wrong with the body.\n"))
       << status_text(board_.status(), 100);
   EXPECT_TRUE(status_json(board_.status())["wrong"].empty());
   model_health_t doubted{};
@@ -311,15 +315,19 @@ TEST(StatusBoardTest, WhatIsWrongStandsFirstAndNoTerminalIsTooNarrowForIt) {
   edge.edge_state = schema_edge_t::EDGE_SUSPECT;
   set_array(doubted.num_edges, doubted.edge_health, {edge});
   board_.on_message(doubted);
-  EXPECT_TRUE(status_text(board_.status(), 100).starts_with(
-      "Learning: 5 samples.\nNothing is known to be wrong with the body; in doubt: 1→2.\n"))
+  EXPECT_TRUE(
+      status_text(board_.status(), 100)
+          .starts_with(
+              "Learning: 5 samples.\nNothing is known to be wrong with the body; in doubt: 1→2.\n"))
       << status_text(board_.status(), 100);
   board_.on_message(wrong_in_two_places());
-  EXPECT_TRUE(status_text(board_.status(), 100).starts_with(
-      "What is wrong now\n"
-      "  q2 (1→2) stuck at −0.25 since sample 290, mended at 291, confirmed by 40 samples\n"
-      "  marker of part 3 not as known since sample 300, found at 301\n\n"
-      "Learning: 5 samples.\nThe body is not as the schema says in 1 place.\n"))
+  EXPECT_TRUE(
+      status_text(board_.status(), 100)
+          .starts_with(
+              "What is wrong now\n"
+              "  q2 (1→2) stuck at −0.25 since sample 290, mended at 291, confirmed by 40 samples\n"
+              "  marker of part 3 not as known since sample 300, found at 301\n\n"
+              "Learning: 5 samples.\nThe body is not as the schema says in 1 place.\n"))
       << status_text(board_.status(), 100);
   const std::string narrow = status_text(board_.status(), 40);
   EXPECT_TRUE(
@@ -342,7 +350,8 @@ TEST(StatusBoardTest, WhatIsWrongStandsFirstAndNoTerminalIsTooNarrowForIt) {
   // Before the body is known nothing can be said of it.
   schema.complete = false;
   board_.on_body_schema(to_message(schema));
-  EXPECT_TRUE(status_text(board_.status(), 100).starts_with("Learning: 5 samples.\n\n")) << status_text(board_.status(), 100);
+  EXPECT_TRUE(status_text(board_.status(), 100).starts_with("Learning: 5 samples.\n\n"))
+      << status_text(board_.status(), 100);
 }
 
 TEST(StatusBoardTest, ANarrowTerminalKeepsTheHealthOfAnEdge) {
@@ -371,9 +380,9 @@ TEST(StatusBoardTest, FaultsAreMarkedAsGroundTruth) {
   sim_state_t state{};
   set_array(state.num_faults, state.faults, {"stuck q3", "bend link2 10°"});
   board_.on_message(state);
-  EXPECT_NE(
-      status_text(board_.status(), 100).find("faults   stuck q3, bend link2 10°   (ground truth of the simulation)"),
-      std::string::npos)
+  EXPECT_NE(status_text(board_.status(), 100)
+                .find("faults   stuck q3, bend link2 10°   (ground truth of the simulation)"),
+            std::string::npos)
       << status_text(board_.status(), 100);
 }
 

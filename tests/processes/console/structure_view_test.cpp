@@ -182,7 +182,8 @@ TEST(SchemaJsonTest, ShowHasEveryParameterOfEveryEdge) {
     for (const auto& j : printed["joints"]) {
       ScrewJoint joint;
       for (std::size_t s = 0; s < schema.signals.size(); ++s)
-        if (schema.signals[s].name == j["signal"].get<std::string>()) joint.signal = static_cast<int>(s);
+        if (schema.signals[s].name == j["signal"].get<std::string>())
+          joint.signal = static_cast<int>(s);
       joint.gain = j["gain"];
       joint.offset = j["offset"];
       joint.slide = j["slide_m"];
@@ -199,7 +200,7 @@ TEST(SchemaJsonTest, ShowHasEveryParameterOfEveryEdge) {
   }
 }
 
-// Of a robot in tag noise (3 mm, 1°) seen 30 times.
+// A robot in tag noise (3 mm, 1°) seen 30 times.
 TEST(SchemaJsonTest, ShowHasStandardDeviationsThatAPersonCanRead) {
   test::SyntheticRobot robot;
   BodySchema schema = learned(robot).schema;

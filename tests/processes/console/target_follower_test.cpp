@@ -143,7 +143,7 @@ TEST(OperateTest, ATargetThatNobodyFollowsIsWithdrawn) {
   follower.on_tick(5 * kSecond);
   EXPECT_EQ(follower.end(), End::kTimedOut);
   expect(pose_target_t::KIND_HOLD);
-  // What is lent to the babbler stays its own.
+  // An arm lent to the babbler stays its own.
   TargetFollower lent(target(), 5 * kSecond);
   lent.on_tick(0);
   lent.on_control_status(status(S::CONTROL_LENT));

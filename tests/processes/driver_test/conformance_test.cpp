@@ -155,7 +155,7 @@ class FakeDriver {
     }
   }
 
-  /// What ends the motion here and now.
+  /// Ends the motion here and now.
   void halt(const std::string& reason) {
     if (!motion_) return;
     at_ = position();
