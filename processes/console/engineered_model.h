@@ -2,7 +2,6 @@
 
 #include <filesystem>
 
-#include "common/bus/arguments.h"
 #include "common/schema/body_schema.h"
 
 namespace bodyschema {
@@ -24,9 +23,5 @@ namespace bodyschema {
 /// is.
 BodySchema engineered_model(const std::filesystem::path& urdf,
                             const std::filesystem::path& placement);
-
-/// Adds `engineer`: a schema file from a URDF, marker placements and a recording that tells where
-/// the camera stands.
-void add_engineer_command(Arguments console);
 
 }  // namespace bodyschema

@@ -35,9 +35,9 @@ constexpr double kPositionUnit_m = 0.001;
 constexpr double kRotationUnit_rad = 0.1 * kDegree;
 constexpr int kShared = 7;  // unknowns that all parts share: X_RS, log scale
 
-// What no sample decides (the scale where all axes meet, one of two frames of a rigid part) stays
-// where it is: a prior, chosen ten times a lab's calibration errors, so that it weighs nothing
-// else.
+// Unknowns that no sample decides (the scale where all axes meet, one of two frames of a rigid
+// part) stays where it is: a prior, chosen ten times a lab's calibration errors, so that it weighs
+// nothing else.
 constexpr double kPriorPosition_m = 0.01;
 constexpr double kPriorRotation_rad = 5 * kDegree;
 constexpr double kPriorScale = 0.02;

@@ -20,7 +20,7 @@ struct PartErrors {
   double rotation_rms_rad = 0;
 };
 
-/// What differs between a schema and the truth without an error of the kinematics: where tags that
+/// Differences between a schema and the truth without an error of the kinematics: where tags that
 /// are not where the rig says put the frames of the parts, and how long their printed sides and the
 /// focal length make a metre. The true pose of part B in root R is X_RS · (scaled prediction) ·
 /// X_PB.
@@ -29,7 +29,7 @@ struct Alignment {
   Pose X_RS = Pose::Identity();  ///< the schema's frame of the root, in the true one
   std::map<int, Pose> X_PB;      ///< the true frame of each part, in the schema's
 
-  /// Of a prediction X_SP of `part`.
+  /// The true pose that a prediction X_SP of `part` stands for.
   Pose aligned(int part, const Pose& X_SP) const;
 };
 

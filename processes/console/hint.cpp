@@ -2,7 +2,9 @@
 
 #include <fmt/format.h>
 
+#include <algorithm>
 #include <cstdlib>
+#include <sstream>
 
 namespace bodyschema {
 
@@ -28,6 +30,52 @@ std::string abbreviated(std::string_view text) {
   // Not in the middle of a character of UTF-8.
   while (size > 0 && (static_cast<unsigned char>(text[size]) & 0xC0) == 0x80) --size;
   return std::string(text.substr(0, size)) + "…";
+}
+
+std::string fit(const std::string& text, int width) {
+  std::string line;
+  int columns = 0;
+  for (std::size_t i = 0; i < text.size();) {
+    std::size_t size = 1;
+    while (i + size < text.size() && (static_cast<unsigned char>(text[i + size]) & 0xC0) == 0x80)
+      ++size;
+    const auto byte = static_cast<unsigned char>(text[i]);
+    // U+0080 … U+009F are control characters too.
+    const bool is_control =
+        byte < 0x20 || byte == 0x7F ||
+        (byte == 0xC2 && size == 2 && static_cast<unsigned char>(text[i + 1]) < 0xA0);
+    if (columns == width) {
+      while (!line.empty() && (static_cast<unsigned char>(line.back()) & 0xC0) == 0x80)
+        line.pop_back();
+      if (!line.empty()) line.pop_back();
+      return line + "…";
+    }
+    line += is_control ? " " : text.substr(i, size);
+    ++columns;
+    i += size;
+  }
+  return line;
+}
+
+std::string wrap(const std::string& text, int width, int indent) {
+  const auto columns = [](const std::string& word) {
+    return static_cast<int>(std::count_if(word.begin(), word.end(), [](char c) {
+      return (static_cast<unsigned char>(c) & 0xC0) != 0x80;
+    }));
+  };
+  std::string result, line(static_cast<std::size_t>(indent), ' ');
+  bool is_begun = false;
+  std::istringstream words(text);
+  for (std::string word; words >> word;) {
+    if (is_begun && columns(line) + 1 + columns(word) > width) {
+      result += fit(line, width) + "\n";
+      line = std::string(static_cast<std::size_t>(indent) + 2, ' ');
+      is_begun = false;
+    }
+    line += (is_begun ? " " : "") + word;
+    is_begun = true;
+  }
+  return result + fit(line, width) + "\n";
 }
 
 }  // namespace bodyschema

@@ -6,8 +6,8 @@
 
 namespace bodyschema {
 
-/// What the user types for a command of this program: "./run WORDS" where the launcher says so
-/// (BODYSCHEMA_COMMAND), else "bodyschema WORDS".
+/// The words that the user types for a command of this program: "./run WORDS" where the launcher
+/// says so (BODYSCHEMA_COMMAND), else "bodyschema WORDS".
 std::string to_type(const std::string& words);
 
 /// "1 sample", "2 samples".
@@ -18,5 +18,13 @@ std::string duration(double seconds);
 
 /// `text` for an error: of more than 40 bytes the first ones and "…".
 std::string abbreviated(std::string_view text);
+
+/// `text` as lines of at most `width` characters, broken between words where there are any; the
+/// first begins with `indent` spaces, the others with two more.
+std::string wrap(const std::string& text, int width, int indent);
+
+/// `text` as one line of at most `width` characters: longer ones end in "…", control characters
+/// (a terminal would obey them) become spaces.
+std::string fit(const std::string& text, int width);
 
 }  // namespace bodyschema

@@ -7,7 +7,7 @@ namespace bodyschema {
 void catch_interruption();
 /// Whether such a signal came since then.
 bool is_interrupted();
-/// What came so far is dealt with.
+/// Signals that came so far are dealt with.
 void clear_interruption();
 
 }  // namespace bodyschema

@@ -23,8 +23,8 @@ class LogFollower {
   /// Returns whether there was a new event.
   bool read(const std::filesystem::path& file, const Visit& visit);
 
-  /// What was read so far, by file. A torn event at the end, which may still be growing, counts as
-  /// damage until it is whole.
+  /// Summaries of what was read so far, by file. A torn event at the end, which may still be
+  /// growing, counts as damage until it is whole.
   const std::map<std::filesystem::path, LogSummary>& summaries() const { return summaries_; }
 
  private:

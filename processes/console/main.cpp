@@ -8,16 +8,8 @@
 
 #include "common/bus/arguments.h"
 #include "common/bus/log_summary.h"
-#include "processes/console/driver_test.h"
-#include "processes/console/engineered_model.h"
-#include "processes/console/fault.h"
-#include "processes/console/log.h"
-#include "processes/console/monitor.h"
-#include "processes/console/offline.h"
-#include "processes/console/operate.h"
-#include "processes/console/report.h"
-#include "processes/console/status.h"
-#include "processes/console/watch.h"
+#include "processes/console/commands/commands.h"
+#include "processes/driver_test/driver_test.h"
 
 namespace {
 constexpr int kWrongUsage = 2;

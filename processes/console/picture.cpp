@@ -63,4 +63,45 @@ void write_detections(const camera_image_t& image, const marker_poses_t& markers
   write_file_atomically(png, draw_detections(image, markers, camera, PictureFormat::kPng));
 }
 
+namespace {
+
+/// An image and its markers come within so many of each.
+constexpr std::size_t kKept = 8;
+
+template <class Message>
+void keep(std::deque<Message>* kept, const Message& message) {
+  kept->push_back(message);
+  if (kept->size() > kKept) kept->pop_front();
+}
+
+}  // namespace
+
+void BestPicture::on_image(const camera_image_t& image) {
+  keep(&images_, image);
+  match();
+}
+
+void BestPicture::on_markers(const marker_poses_t& markers) {
+  keep(&markers_, markers);
+  match();
+}
+
+void BestPicture::match() {
+  for (const camera_image_t& image : images_) {
+    for (const marker_poses_t& markers : markers_) {
+      if (image.utime != markers.utime || image.camera_name != markers.camera_name ||
+          markers.num_markers <= best_markers_.num_markers)
+        continue;
+      best_image_ = image;
+      best_markers_ = markers;
+    }
+  }
+}
+
+bool BestPicture::write(const std::filesystem::path& png) const {
+  if (!best_image_ || !info_) return false;
+  write_detections(*best_image_, best_markers_, *info_, png);
+  return true;
+}
+
 }  // namespace bodyschema

@@ -1,6 +1,8 @@
 #pragma once
 
+#include <deque>
 #include <filesystem>
+#include <optional>
 #include <string>
 
 #include "bodyschema/camera_image_t.hpp"
@@ -20,5 +22,24 @@ std::string draw_detections(const camera_image_t& image, const marker_poses_t& m
 /// The same into a PNG file. @throws std::runtime_error, also if the file cannot be written.
 void write_detections(const camera_image_t& image, const marker_poses_t& markers,
                       const camera_info_t& camera, const std::filesystem::path& png);
+
+/// Keeps the picture with the most markers whose image and markers were both heard.
+class BestPicture {
+ public:
+  void on_image(const camera_image_t& image);
+  void on_markers(const marker_poses_t& markers);
+  void on_info(const camera_info_t& info) { info_ = info; }
+  /// Whether there was one, which is a PNG file then. @throws as write_detections().
+  bool write(const std::filesystem::path& png) const;
+
+ private:
+  void match();
+
+  std::deque<camera_image_t> images_;
+  std::deque<marker_poses_t> markers_;
+  std::optional<camera_info_t> info_;
+  std::optional<camera_image_t> best_image_;
+  marker_poses_t best_markers_{};
+};
 
 }  // namespace bodyschema

@@ -29,7 +29,7 @@ namespace bodyschema {
 namespace {
 
 constexpr double kUnitTolerance = 1e-3;
-/// Of any column. Squares, sums and microseconds of what is larger would overflow.
+/// Largest number of any column. Squares, sums and microseconds of what is larger would overflow.
 constexpr double kLargest = 1e12;
 /// [bytes] Unpacked, and of what has to be in memory: more is no recording of an arm.
 constexpr std::size_t kLargestFile = 2'000'000'000;
@@ -161,7 +161,7 @@ class Row {
   std::vector<std::size_t> columns_;
 };
 
-/// Where the columns of a CSV recording stand.
+/// The columns of a CSV recording.
 struct Header {
   std::vector<std::string> signals;
   std::size_t part = 0;  ///< column of `part`; the pose follows it
@@ -262,6 +262,46 @@ PartObservation parse_observation(const Row& row, const Header& header) {
         Eigen::Vector3d::Constant(rotation * rotation);
   }
   return observation;
+}
+
+/// The sample of an instant and its first line. Rows may come part by part as well as
+/// instant by instant.
+struct Instant {
+  std::size_t sample = 0, line = 0;
+};
+using Instants = std::map<double, Instant>;  ///< by t
+
+void add_row(const Row& row, std::size_t number, const Header& header, Instants& instants,
+             Recording& recording) {
+  const double t = row.number(0, "t");
+  Eigen::VectorXd action(header.signals.size());
+  for (std::size_t i = 0; i < header.signals.size(); ++i) {
+    action[i] = row.number(i + 1, header.signals[i]);
+  }
+  PartObservation observation = parse_observation(row, header);
+  const auto [known, is_new] = instants.try_emplace(t, recording.samples.size(), number);
+  const Instant& instant = known->second;
+  if (is_new) {
+    ActionPoseSample sample;
+    sample.utime = std::llround(t * 1e6);
+    sample.sample_index = static_cast<std::int64_t>(recording.samples.size());
+    sample.action = action;
+    recording.samples.push_back(std::move(sample));
+  }
+  const Eigen::VectorXd& first = recording.samples[instant.sample].action;
+  for (std::size_t i = 0; i < header.signals.size(); ++i) {
+    if (action[i] == first[i]) continue;
+    throw row.error(i + 1, header.signals[i] + ": expected the value of line " +
+                               std::to_string(instant.line) +
+                               ", which has the same t: one instant has one action");
+  }
+  auto& parts = recording.samples[instant.sample].parts;
+  if (std::any_of(parts.begin(), parts.end(),
+                  [&](const auto& other) { return other.part == observation.part; })) {
+    throw row.error(header.part,
+                    "part " + std::to_string(observation.part) + " stands twice at this instant");
+  }
+  parts.push_back(std::move(observation));
 }
 
 void sort_parts(Recording& recording) {
@@ -385,11 +425,7 @@ Recording parse_csv(const std::string& text, const std::string& name) {
   std::optional<Header> header;
   std::string_view rest = text;
   if (rest.starts_with("\xEF\xBB\xBF")) rest.remove_prefix(3);  // a byte order mark
-  // Rows may come part by part as well as instant by instant.
-  struct Instant {
-    std::size_t sample = 0, line = 0;
-  };
-  std::map<double, Instant> instants;  // by t
+  Instants instants;
   for (std::size_t number = 1; !rest.empty(); ++number) {
     const std::size_t end = rest.find('\n');
     const std::string_view line = rest.substr(0, end);
@@ -412,35 +448,7 @@ Recording parse_csv(const std::string& text, const std::string& name) {
                           std::to_string(row.size()) + separator_hint(line) +
                           (row.size() > header->size() ? decimal_comma_hint(line) : ""));
     }
-    const double t = row.number(0, "t");
-    Eigen::VectorXd action(header->signals.size());
-    for (std::size_t i = 0; i < header->signals.size(); ++i) {
-      action[i] = row.number(i + 1, header->signals[i]);
-    }
-    PartObservation observation = parse_observation(row, *header);
-    const auto [known, is_new] = instants.try_emplace(t, recording.samples.size(), number);
-    const Instant& instant = known->second;
-    if (is_new) {
-      ActionPoseSample sample;
-      sample.utime = std::llround(t * 1e6);
-      sample.sample_index = static_cast<std::int64_t>(recording.samples.size());
-      sample.action = action;
-      recording.samples.push_back(std::move(sample));
-    }
-    const Eigen::VectorXd& first = recording.samples[instant.sample].action;
-    for (std::size_t i = 0; i < header->signals.size(); ++i) {
-      if (action[i] == first[i]) continue;
-      throw row.error(i + 1, header->signals[i] + ": expected the value of line " +
-                                 std::to_string(instant.line) +
-                                 ", which has the same t: one instant has one action");
-    }
-    auto& parts = recording.samples[instant.sample].parts;
-    if (std::any_of(parts.begin(), parts.end(),
-                    [&](const auto& other) { return other.part == observation.part; })) {
-      throw row.error(header->part,
-                      "part " + std::to_string(observation.part) + " stands twice at this instant");
-    }
-    parts.push_back(std::move(observation));
+    add_row(row, number, *header, instants, recording);
   }
   if (!header) throw RecordingError(name + ":1:1: expected a header line, found an empty file");
   if (recording.samples.empty()) throw RecordingError(name + ":2:1: expected at least one row");

@@ -10,7 +10,7 @@
 
 namespace bodyschema {
 
-/// What is wrong with a recording: "FILE:LINE:COLUMN: what was expected".
+/// A fault of a recording: "FILE:LINE:COLUMN: what was expected".
 class RecordingError : public std::runtime_error {
  public:
   using std::runtime_error::runtime_error;
@@ -28,9 +28,9 @@ struct Recording {
   bool is_log = false;
   /// systematic_of() a log; 0 of a CSV.
   Noise systematic;
-  /// What keeps a log from being whole, for people: "" if nothing does. What precedes it was read.
+  /// Damage of a log, for people: "" if it is whole. Samples before the damage were read.
   std::string damage;
-  /// Of a CSV, for people: what is read as it stands but looks like another unit or order.
+  /// Oddities of a CSV, for people: read as they stand, but like another unit or order.
   std::vector<std::string> hints;
 
   /// Samples that are learned from, as the structure learner does: TRAIN and PROBE of the retained
@@ -66,7 +66,7 @@ std::vector<ActionPoseSample> samples_by_signals(const Recording& recording,
 /// The CSV reader alone; `name` stands in errors.
 Recording parse_csv(const std::string& text, const std::string& name);
 
-/// What speaks for other units or another order than a CSV's: positions that spread over more than
+/// Signs of other units or another order than a CSV's: positions that spread over more than
 /// 10 m, standard deviations above 0.1 m, rotations that make a body of the parts only when read
 /// as x y z w. No evidence, no hint; none changes what is read.
 std::vector<std::string> hints_of(const Recording& recording);

@@ -29,7 +29,7 @@ namespace {
 
 using std::filesystem::path;
 
-/// What several files of the rig say; none where the file could not be read.
+/// Settings that several files of the rig share; none where the file could not be read.
 struct Rig {
   std::optional<Signals> signals;
   std::optional<Markers> markers;

@@ -11,10 +11,10 @@ struct RigCheck {
   int num_parts = 0;
   int num_signals = 0;
   int num_tags = 0;
-  /// What keeps a process from starting, or the group from working, each "FILE:LINE: key: what was
-  /// expected". Empty: the rig is good, and the numbers hold.
+  /// Faults that keep a process from starting, or the group from working, each "FILE:LINE: key:
+  /// what was expected". Empty: the rig is good, and the numbers hold.
   std::vector<std::string> problems;
-  /// What is odd but does no harm: files that no process reads.
+  /// Oddities that do no harm: files that no process reads.
   std::vector<std::string> remarks;
 };
 

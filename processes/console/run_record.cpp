@@ -95,13 +95,7 @@ void RunRecord::on_event(const LogEvent& event, const std::filesystem::path& fil
   } else if (const auto state = read_as(kSimState, event)) {
     note_receipt(state->utime);
     watch_.on_sim_state(*state);
-    const std::vector<std::string>& before =
-        faults_.empty() ? std::vector<std::string>() : faults_.back().faults;
-    std::vector<std::string> faults;
-    for (const std::string& fault : state->faults) faults.push_back(name_of_fault(fault));
-    if (faults != before)
-      faults_.push_back(
-          {seconds(event.event_utime), state->utime, state->action_id, std::move(faults)});
+    on_faults(*state, event.event_utime);
   } else if (const auto schema = read_as(kBodySchema, event)) {
     note_receipt(schema->utime);
     watch_.on_body_schema(*schema);
@@ -115,6 +109,13 @@ void RunRecord::on_event(const LogEvent& event, const std::filesystem::path& fil
     health_ = health;
     for (const health_event_t& item : health->events) on_health_event(item);
   }
+}
+
+void RunRecord::on_faults(const sim_state_t& state, std::int64_t received_us) {
+  std::vector<std::string> faults;
+  for (const std::string& fault : state.faults) faults.push_back(name_of_fault(fault));
+  if (faults != (faults_.empty() ? std::vector<std::string>() : faults_.back().faults))
+    faults_.push_back({seconds(received_us), state.utime, state.action_id, std::move(faults)});
 }
 
 std::int64_t RunRecord::hash_of(const ActionKey& key) {
@@ -147,7 +148,7 @@ void RunRecord::on_health_event(const health_event_t& event) {
   const auto [added, is_new] =
       events_.try_emplace({event.event_sample, event.event_number, event.event_text}, event);
   if (!is_new) return;
-  // Of acceptances in a row the newest says it all.
+  // The newest of acceptances in a row says it all.
   if (is_acceptance(event)) {
     const auto next = std::next(added);
     if (added != events_.begin() && is_acceptance(std::prev(added)->second))

@@ -15,8 +15,8 @@
 
 namespace bodyschema {
 
-/// What the logs of a run say, kept so that it can be told at any time. Memory is bounded: of images
-/// only their places are kept, long series are thinned.
+/// The contents of a run's logs, kept so that it can be told at any time. Memory is bounded: of
+/// images only their places are kept, long series are thinned.
 class RunRecord {
  public:
   /// One event of any log of the run, in any order of files; what cannot be decoded or is of
@@ -52,18 +52,18 @@ class RunRecord {
   const RunWatch& watch() const { return watch_; }
   /// The newest proposal of the learner.
   const std::optional<BodySchema>& learned() const { return learned_; }
-  /// Versions of the body schema, ascending: every one, or of many an even choice with the first and
-  /// the last of each body.
+  /// Versions of the body schema, ascending: every one, or of many an even choice with the first
+  /// and the last of each body.
   const std::map<std::int64_t, BodySchema>& versions() const { return versions_; }
   std::int64_t num_versions() const { return num_versions_; }
   const std::optional<model_health_t>& health() const { return health_; }
-  /// What the monitor decided, in order; of acceptances in a row the newest.
+  /// Decisions of the monitor, in order; of acceptances in a row the newest.
   std::vector<health_event_t> events() const;
   /// Ordered by name, host, pid.
   std::vector<Process> processes() const;
   const std::vector<FaultChange>& faults() const { return faults_; }
   std::vector<Latency> latencies() const;
-  /// Where the run began and how long it was recorded; nullopt without a logger's log.
+  /// The time at which the run began and how long it was recorded; nullopt without a logger's log.
   std::optional<std::int64_t> begin_utime() const { return begin_us_; }
   double duration_s() const;
   /// Whether anything was read that a report can tell of.
@@ -86,6 +86,7 @@ class RunRecord {
     std::optional<std::int64_t> answered = {}, settled = {}, sampled = {};
   };
 
+  void on_faults(const sim_state_t& state, std::int64_t received_us);
   void on_version(const body_schema_t& schema);
   void on_health_event(const health_event_t& event);
   static std::int64_t hash_of(const ActionKey& key);

@@ -8,7 +8,8 @@
 
 #include "common/bus/convert.h"
 #include "common/geometry/angle.h"
-#include "processes/console/health_view.h"
+#include "processes/console/names.h"
+#include "processes/console/views/health_view.h"
 
 namespace bodyschema {
 namespace {
@@ -155,11 +156,10 @@ std::string RunWatch::progress(const std::optional<SampleGoal>& goal,
   line += fmt::format(" · {} of {} edges", edges, seen.empty() ? 0 : seen.size() - 1);
   if (!schema_ || !schema_->complete) {
     constexpr std::size_t kMost = 3;
-    static const char* const kReasons[] = {"never seen", "not enough data yet", "no valid model"};
     std::string missing;
     for (std::size_t i = 0; i < std::min(unconnected_.size(), kMost); ++i) {
       missing += fmt::format("{}part {} ({})", i == 0 ? "" : ", ", unconnected_[i].unconnected_part,
-                             kReasons[unconnected_[i].reason]);
+                             name_in(kUnconnectedReasons, unconnected_[i].reason));
     }
     if (unconnected_.size() > kMost)
       missing += fmt::format(", {} more", unconnected_.size() - kMost);

@@ -37,8 +37,8 @@ struct SampleGoal {
 };
 
 /// Follows a learning run from outside and sums it up. It alone compares the schema with the
-/// simulator's truth, and tells nobody. Memory is bounded: of the samples it keeps the retained set,
-/// as the learner does.
+/// simulator's truth, and tells nobody. Memory is bounded: of the samples it keeps the retained
+/// set, as the learner does.
 class RunWatch {
  public:
   void on_sample(const sample_t& sample);
@@ -65,9 +65,9 @@ class RunWatch {
   std::set<std::string> silent(const std::set<std::string>& expected, std::int64_t now_us) const;
   /// Whether all of `expected` are heard and listen: one that is starting has not subscribed yet.
   bool are_listening(const std::set<std::string>& expected, std::int64_t now_us) const;
-  /// What the process last said of this counter; 0 if it did not.
+  /// The newest count of the process's counter; 0 if it did not.
   std::int64_t counter(const std::string& process, const std::string& counter) const;
-  /// What every process does or waits for, and which one is silent; for the moment when nothing
+  /// The activity of every process, and which one is silent; for the moment when nothing
   /// goes on.
   std::string diagnosis(const std::set<std::string>& expected, std::int64_t now_us) const;
 

@@ -2,7 +2,6 @@
 
 #include <cstdint>
 #include <map>
-#include <nlohmann/json.hpp>
 #include <optional>
 #include <set>
 #include <string>
@@ -12,6 +11,35 @@
 #include "common/bus/channels.h"
 
 namespace bodyschema {
+
+/// How a group is: what `status` shows.
+struct GroupStatus {
+  struct Process {
+    process_info_t info;  ///< the newest
+    double age_s = 0;
+    double cpu_percent = 0;                 ///< share of one core
+    std::vector<counter_t> other_counters;  ///< neither traffic nor in ChannelUse::dropped
+  };
+  struct ChannelUse {
+    std::string name;
+    std::int64_t count = 0;
+    double rate_hz = 0;
+    std::optional<double> age_s;                  ///< of the newest message; none came
+    std::map<std::string, std::int64_t> dropped;  ///< see StatusBoard::dropped()
+  };
+
+  std::string headline;
+  std::vector<std::string> missing, twins, warnings;
+  std::vector<Process> processes;    ///< by host and name
+  std::vector<ChannelUse> channels;  ///< by name; of which anything came, be it garbage
+  std::optional<motion_status_t> motion;
+  std::optional<control_status_t> control;
+  std::optional<sample_t> sample;
+  std::optional<sim_state_t> sim_state;
+  std::optional<body_schema_t> schema;  ///< a proposal while none is accepted
+  bool is_accepted = false;
+  std::optional<model_health_t> health;
+};
 
 /// Listens to a group for a moment and says how it is. Whole state is repeated at 1 Hz on the bus,
 /// so two seconds show everything.
@@ -34,7 +62,7 @@ class StatusBoard {
   void on_learned_schema(const body_schema_t& schema) { proposal_ = schema; }
   void on_message(const model_health_t& health) { health_ = health; }
   void on_message(const sim_state_t& state) { sim_state_ = state; }
-  /// What this listener itself had to drop: Bus::counters().
+  /// Messages that this listener itself had to drop: Bus::counters().
   void on_own_counters(const std::map<std::string, std::int64_t>& counters);
   void end(std::int64_t now_us) { end_us_ = now_us; }
 
@@ -42,9 +70,7 @@ class StatusBoard {
   bool is_silent() const { return arrivals_.empty() && num_dropped_here() == 0; }
   /// One sentence: what the system is doing, what it waits for.
   std::string headline() const;
-  /// One screen of lines of at most `width` characters: what is wrong, the headline, all else.
-  std::string text(int width) const;
-  nlohmann::ordered_json json() const;
+  GroupStatus status() const;
 
  private:
   struct Arrivals {
@@ -63,13 +89,15 @@ class StatusBoard {
   };
   using Key = std::tuple<std::string, std::string, std::int32_t>;  ///< host, name, pid
 
+  /// The headline without who else waits.
+  std::string activity() const;
   std::vector<std::string> missing() const;
   /// Names of which several processes are alive.
   std::vector<std::string> twins() const;
-  /// What needs somebody's attention, for people.
+  /// Faults that need somebody's attention, for people.
   std::vector<std::string> warnings() const;
   const Heard* find(const std::string& name) const;
-  /// Of which anything came, be it garbage.
+  /// Names of those on which anything came, be it garbage.
   std::set<std::string> channels() const;
   /// "malformed", "senseless", … of a channel: the most that any process counted, since its start.
   std::map<std::string, std::int64_t> dropped(const std::string& channel) const;
@@ -89,13 +117,5 @@ class StatusBoard {
   std::optional<model_health_t> health_;
   std::optional<sim_state_t> sim_state_;
 };
-
-/// `text` as lines of at most `width` characters, broken between words where there are any; the
-/// first begins with `indent` spaces, the others with two more.
-std::string wrap(const std::string& text, int width, int indent);
-
-/// `text` as one line of at most `width` characters: longer ones end in "…", control characters
-/// (a terminal would obey them) become spaces.
-std::string fit(const std::string& text, int width);
 
 }  // namespace bodyschema

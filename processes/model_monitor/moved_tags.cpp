@@ -13,7 +13,7 @@ constexpr double kSame = ReadingDistance::kSame, kOther = ReadingDistance::kOthe
 constexpr int kSightings = 3;
 /// Log-likelihood ratios of a tag having moved to the body being wrong, of a sighting by another
 /// tag in its place and elsewhere: it is elsewhere as often as there are outliers (3 %,
-/// tests/experiments/README.md), or half of the time (chosen: a body that is wrong shows by some
+/// docs/results.md), or half of the time (chosen: a body that is wrong shows by some
 /// actions only).
 const double kInPlace = std::log(0.97 / 0.5), kElsewhere = std::log(0.03 / 0.5);
 /// Sightings of a part in a row, all by tags set aside, after which they are what there is of it.

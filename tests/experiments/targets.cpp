@@ -19,7 +19,7 @@
 #include "common/bus/bus.h"
 #include "common/bus/convert.h"
 #include "common/config/rig.h"
-#include "processes/console/operate.h"
+#include "processes/console/target_follower.h"
 
 using namespace bodyschema;
 

@@ -12,7 +12,7 @@
 namespace bodyschema::test {
 namespace {
 
-/// What a follower was shown.
+/// Events that a follower was shown.
 struct Shown {
   std::vector<std::string> channels;
   LogFollower follower;

@@ -100,5 +100,23 @@ TEST_F(PictureTest, AnImageThatCannotBeDecodedIsAnErrorAndNothingIsWritten) {
   EXPECT_FALSE(std::filesystem::exists(png_));
 }
 
+TEST_F(PictureTest, TheFrameWithTheMostMarkersIsKeptOnceItsImageCame) {
+  BestPicture best;
+  best.on_info(camera_);
+  best.on_image(image_);
+  EXPECT_FALSE(best.write(png_));
+  marker_poses_t markers{};
+  markers.utime = image_.utime + 1;
+  set_array(markers.num_markers, markers.markers, {marker()});
+  best.on_markers(markers);
+  EXPECT_FALSE(best.write(png_));  // of another frame
+  markers.utime = image_.utime;
+  best.on_markers(markers);
+  set_array(markers.num_markers, markers.markers, {});
+  best.on_markers(markers);  // the same frame with fewer
+  EXPECT_TRUE(best.write(png_));
+  EXPECT_GT(cv::imread(png_.string()).at<cv::Vec3b>(50, 106)[2], 178);  // the marker's x axis, red
+}
+
 }  // namespace
 }  // namespace bodyschema

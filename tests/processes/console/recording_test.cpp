@@ -386,7 +386,7 @@ TEST(RecordingTest, ANoiseThatIsNotPositiveIsRefused) {
             "f.csv:2:23: sr_deg: expected a standard deviation above 0");
 }
 
-// What no robot has would overflow further on.
+// Numbers that no robot has would overflow further on.
 TEST(RecordingTest, AbsurdlyLargeNumbersAreRefused) {
   for (const std::string row :
        {"1e300,1,2,1,0,0,0,1,0,0,0", "0,-1e300,2,1,0,0,0,1,0,0,0", "0,1,2,1,0,1e300,0,1,0,0,0"}) {

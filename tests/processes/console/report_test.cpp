@@ -10,8 +10,8 @@
 #include "common/bus/convert.h"
 #include "common/geometry/angle.h"
 #include "common/plot/plot.h"
-#include "processes/console/report_figures.h"
-#include "processes/console/report_page.h"
+#include "processes/console/report/report_figures.h"
+#include "processes/console/report/report_page.h"
 #include "processes/structure_learner/learn.h"
 #include "tests/support/synthetic_robot.h"
 
@@ -182,7 +182,7 @@ TEST(VersionErrorsTest, AVersionIsJudgedByTheBodyThatItWasFor) {
   ASSERT_EQ(errors.size(), 4U);
   EXPECT_EQ(errors[1].body, 0U);
   EXPECT_NEAR(errors[1].worst_position_m, 0, 1e-9);
-  // What stood when it broke, on the broken body.
+  // The version that stood when it broke, on the broken body.
   EXPECT_EQ(errors[2].body, 1U);
   EXPECT_EQ(errors[2].num_samples, 30);
   EXPECT_NEAR(errors[2].worst_position_m, 0.2, 0.05);
@@ -488,11 +488,6 @@ TEST_F(ReportPageTest, ALogThatIsCutOffIsToldAtTheTop) {
   // While it is written it always ends somewhere.
   report_.reload_s = 10;
   EXPECT_EQ(page().find("cut off"), std::string::npos);
-}
-
-TEST(EscapeTest, LeavesNoMarkup) {
-  EXPECT_EQ(escape_html("<a href='x'>\"&\x01</a>"),
-            "&lt;a href=&#39;x&#39;&gt;&quot;&amp; &lt;/a&gt;");
 }
 
 }  // namespace

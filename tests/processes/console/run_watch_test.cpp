@@ -222,7 +222,7 @@ TEST(RunWatchTest, AnActionOfTheSameNumberOfAnotherSourceDoesNotChangeTheTruth) 
             1e-12);
 }
 
-// Of a long run the retained samples are kept, with their truths, in whatever order logs are read.
+// The retained samples of a long run are kept, with their truths, in whatever order logs are read.
 TEST(RunWatchTest, OfManySamplesTheRetainedOnesAndTheirTruthsAreKept) {
   constexpr std::int64_t kMany = 12'000;
   for (const bool has_truth_first : {true, false}) {

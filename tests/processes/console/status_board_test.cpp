@@ -5,6 +5,8 @@
 #include <sstream>
 
 #include "common/bus/convert.h"
+#include "processes/console/hint.h"
+#include "processes/console/views/status_view.h"
 
 namespace bodyschema {
 namespace {
@@ -67,7 +69,7 @@ BodySchema two_parts() {
 
 TEST(StatusBoardTest, TheFirstLineSaysWhatIsDone) {
   EXPECT_EQ(board().headline(), "Learning: 5 samples.");
-  EXPECT_TRUE(board().text(100).starts_with("Learning: 5 samples.\n"));
+  EXPECT_TRUE(status_text(board().status(), 100).starts_with("Learning: 5 samples.\n"));
   StatusBoard done = board();
   done.on_message(info("motor_babbler", process_info_t::PHASE_DONE, "60 samples"));
   EXPECT_EQ(done.headline(),
@@ -108,11 +110,12 @@ TEST(StatusBoardTest, WhoIsMissingIsNamed) {
   alone.on_message(info("motor_babbler"));
   EXPECT_EQ(alone.headline(),
             "Waits for a driver: nobody sends MOTION_STATUS. Not heard: camera, robot_simulator.");
-  EXPECT_NE(alone.text(100).find("! not heard: camera, robot_simulator\n"), std::string::npos);
+  EXPECT_NE(status_text(alone.status(), 100).find("! not heard: camera, robot_simulator\n"),
+            std::string::npos);
   // Any driver will do.
   alone.on_message(at_rest());
   EXPECT_TRUE(alone.headline().ends_with("Not heard: camera."));
-  // What has ended is as good as not there.
+  // A process that has ended is as good as not there.
   alone.on_message(info("camera"));
   EXPECT_EQ(alone.headline().find("Not heard"), std::string::npos);
   alone.on_message(info("camera", process_info_t::PHASE_ENDED));
@@ -125,17 +128,17 @@ TEST(StatusBoardTest, TwinsAndOtherVersionsAreNamed) {
   process_info_t old = info("camera");
   old.program_version = "1.0.0";
   board_.on_message(old);
-  const std::string text = board_.text(120);
+  const std::string text = status_text(board_.status(), 120);
   EXPECT_NE(text.find("! motor_babbler runs more than once (pid 1 on lab, pid 22 on lab)"),
             std::string::npos)
       << text;
   EXPECT_NE(text.find("! camera on lab is of version 1.0.0, this command of 1.2.3"),
             std::string::npos)
       << text;
-  EXPECT_EQ(board_.json()["twins"], nlohmann::ordered_json({"motor_babbler"}));
+  EXPECT_EQ(status_json(board_.status())["twins"], nlohmann::ordered_json({"motor_babbler"}));
   // One that was started again after it had ended is no twin.
   board_.on_message(info("motor_babbler", process_info_t::PHASE_ENDED));
-  EXPECT_EQ(board_.json()["twins"], nlohmann::ordered_json::array());
+  EXPECT_EQ(status_json(board_.status())["twins"], nlohmann::ordered_json::array());
 }
 
 TEST(StatusBoardTest, ProcessorTimeIsThatOfTheWindowWhereThereIsOne) {
@@ -143,12 +146,12 @@ TEST(StatusBoardTest, ProcessorTimeIsThatOfTheWindowWhereThereIsOne) {
   process_info_t first = info("camera");
   first.cpu_us = 30 * kSecond;  // half of its minute
   board_.on_message(first);
-  EXPECT_DOUBLE_EQ(board_.json()["processes"][0]["cpu_percent"].get<double>(), 50);
+  EXPECT_DOUBLE_EQ(status_json(board_.status())["processes"][0]["cpu_percent"].get<double>(), 50);
   process_info_t second = first;
   second.utime += kSecond;
   second.cpu_us += kSecond / 4;
   board_.on_message(second);
-  const auto json = board_.json()["processes"][0];
+  const auto json = status_json(board_.status())["processes"][0];
   EXPECT_EQ(json["name"], "camera");
   EXPECT_DOUBLE_EQ(json["cpu_percent"].get<double>(), 25);
   EXPECT_DOUBLE_EQ(json["age_s"].get<double>(), 61);
@@ -160,7 +163,7 @@ TEST(StatusBoardTest, ChannelsHaveTheirRateAndAge) {
   board_.begin(0);
   for (int i = 1; i <= 10; ++i) board_.on_arrival("SAMPLE", i * kSecond / 10);
   board_.end(2 * kSecond);
-  const auto json = board_.json()["channels"]["SAMPLE"];
+  const auto json = status_json(board_.status())["channels"]["SAMPLE"];
   EXPECT_EQ(json["count"], 10);
   EXPECT_DOUBLE_EQ(json["rate_hz"].get<double>(), 5);
   EXPECT_DOUBLE_EQ(json["age_s"].get<double>(), 1);
@@ -185,13 +188,13 @@ TEST(StatusBoardTest, LossesAreThoseOfWhomTheyHitMost) {
                          {{"malformed SAMPLE", 5}, {"refused SAMPLE", 1}, {"tag too small", 4}}));
   board_.on_arrival("SAMPLE", 1);
   board_.on_own_counters({{"malformed SAMPLE", 2}, {"senseless CAMERA_INFO", 6}});
-  const auto json = board_.json();
+  const auto json = status_json(board_.status());
   EXPECT_EQ(json["channels"]["SAMPLE"]["dropped"],
             nlohmann::ordered_json({{"malformed", 5}, {"refused", 1}}));
   // Nothing but garbage came there.
   EXPECT_EQ(json["channels"]["CAMERA_INFO"]["count"], 0);
   EXPECT_TRUE(json["channels"]["CAMERA_INFO"]["age_s"].is_null());
-  const std::string text = board_.text(100);
+  const std::string text = status_text(board_.status(), 100);
   EXPECT_NE(text.find("5 malformed, 1 refused"), std::string::npos) << text;
   EXPECT_NE(text.find("6 senseless"), std::string::npos) << text;
   EXPECT_NE(text.find("robot_simulator counted 4 tag too small"), std::string::npos) << text;
@@ -200,18 +203,19 @@ TEST(StatusBoardTest, LossesAreThoseOfWhomTheyHitMost) {
 
 TEST(StatusBoardTest, TheBodySchemaStandsBeforeAProposal) {
   StatusBoard board_ = board();
-  EXPECT_NE(board_.text(100).find("schema   none yet"), std::string::npos);
+  EXPECT_NE(status_text(board_.status(), 100).find("schema   none yet"), std::string::npos);
   BodySchema proposal = two_parts();
   proposal.version = 0;
   board_.on_learned_schema(to_message(proposal));
-  EXPECT_NE(board_.text(100).find("none accepted yet; proposal, incomplete: 3 parts, 1 edges"),
+  EXPECT_NE(status_text(board_.status(), 100)
+                .find("none accepted yet; proposal, incomplete: 3 parts, 1 edges"),
             std::string::npos)
-      << board_.text(100);
-  EXPECT_FALSE(board_.json()["schema"]["accepted"].get<bool>());
+      << status_text(board_.status(), 100);
+  EXPECT_FALSE(status_json(board_.status())["schema"]["accepted"].get<bool>());
   board_.on_body_schema(to_message(two_parts()));
   board_.on_learned_schema(to_message(proposal));
-  EXPECT_EQ(board_.json()["schema"]["version"], 9);
-  EXPECT_TRUE(board_.json()["schema"]["accepted"].get<bool>());
+  EXPECT_EQ(status_json(board_.status())["schema"]["version"], 9);
+  EXPECT_TRUE(status_json(board_.status())["schema"]["accepted"].get<bool>());
 }
 
 TEST(StatusBoardTest, TagsThatAreSetAsideAreNamedUntilTheyAreBack) {
@@ -219,9 +223,10 @@ TEST(StatusBoardTest, TagsThatAreSetAsideAreNamedUntilTheyAreBack) {
   BodySchema schema = two_parts();
   schema.moved_tags = {{20, 40, 38, -1}, {21, 41, 39, 60}};
   board_.on_body_schema(to_message(schema));
-  EXPECT_NE(board_.text(200).find("tag 20 is set aside since sample 40"), std::string::npos)
-      << board_.text(200);
-  EXPECT_EQ(board_.text(200).find("tag 21"), std::string::npos);
+  EXPECT_NE(status_text(board_.status(), 200).find("tag 20 is set aside since sample 40"),
+            std::string::npos)
+      << status_text(board_.status(), 200);
+  EXPECT_EQ(status_text(board_.status(), 200).find("tag 21"), std::string::npos);
 }
 
 TEST(StatusBoardTest, AnEdgeIsShownWithItsHealth) {
@@ -249,17 +254,17 @@ TEST(StatusBoardTest, AnEdgeIsShownWithItsHealth) {
   sample.sample_index = 37;
   sample.utime = 3'600'000'000;
   board_.on_message(sample);
-  const auto edge = board_.json()["schema"]["edges"][0];
+  const auto edge = status_json(board_.status())["schema"]["edges"][0];
   EXPECT_EQ(edge["signals"], nlohmann::ordered_json({"q2", "q1"}));
   EXPECT_EQ(edge["state"], "SUSPECT");
   EXPECT_EQ(edge["median_mahalanobis2"], 12.3);
-  const std::string text = board_.text(100);
+  const std::string text = status_text(board_.status(), 100);
   EXPECT_NE(text.find("1 → 2   SUSPECT      screw  {q2,q1}        1.20 mm   0.00°     4      12.3"),
             std::string::npos)
       << text;
   EXPECT_NE(text.find("not connected: not enough data yet: seen once"), std::string::npos) << text;
   EXPECT_NE(text.find("sample 14, 23 samples ago: version 9 accepted"), std::string::npos) << text;
-  EXPECT_TRUE(board_.json()["parts"][0]["position_median_m"].is_null());
+  EXPECT_TRUE(status_json(board_.status())["parts"][0]["position_median_m"].is_null());
 }
 
 /// A joint that is stuck and mended, and another place that nothing explains.
@@ -298,10 +303,11 @@ TEST(StatusBoardTest, WhatIsWrongStandsFirstAndNoTerminalIsTooNarrowForIt) {
   schema.complete = true;
   board_.on_body_schema(to_message(schema));
   board_.on_message(model_health_t{});
-  EXPECT_TRUE(board_.text(100).starts_with(
-      "Learning: 5 samples.\nNothing is known to be wrong with the body.\n"))
-      << board_.text(100);
-  EXPECT_TRUE(board_.json()["wrong"].empty());
+  EXPECT_TRUE(
+      status_text(board_.status(), 100)
+          .starts_with("Learning: 5 samples.\nNothing is known to be wrong with the body.\n"))
+      << status_text(board_.status(), 100);
+  EXPECT_TRUE(status_json(board_.status())["wrong"].empty());
   model_health_t doubted{};
   edge_health_t edge{};
   edge.health_from = 1;
@@ -309,24 +315,28 @@ TEST(StatusBoardTest, WhatIsWrongStandsFirstAndNoTerminalIsTooNarrowForIt) {
   edge.edge_state = schema_edge_t::EDGE_SUSPECT;
   set_array(doubted.num_edges, doubted.edge_health, {edge});
   board_.on_message(doubted);
-  EXPECT_TRUE(board_.text(100).starts_with(
-      "Learning: 5 samples.\nNothing is known to be wrong with the body; in doubt: 1→2.\n"))
-      << board_.text(100);
+  EXPECT_TRUE(
+      status_text(board_.status(), 100)
+          .starts_with(
+              "Learning: 5 samples.\nNothing is known to be wrong with the body; in doubt: 1→2.\n"))
+      << status_text(board_.status(), 100);
   board_.on_message(wrong_in_two_places());
-  EXPECT_TRUE(board_.text(100).starts_with(
-      "What is wrong now\n"
-      "  q2 (1→2) stuck at −0.25 since sample 290, mended at 291, confirmed by 40 samples\n"
-      "  marker of part 3 not as known since sample 300, found at 301\n\n"
-      "Learning: 5 samples.\nThe body is not as the schema says in 1 place.\n"))
-      << board_.text(100);
-  const std::string narrow = board_.text(40);
+  EXPECT_TRUE(
+      status_text(board_.status(), 100)
+          .starts_with(
+              "What is wrong now\n"
+              "  q2 (1→2) stuck at −0.25 since sample 290, mended at 291, confirmed by 40 samples\n"
+              "  marker of part 3 not as known since sample 300, found at 301\n\n"
+              "Learning: 5 samples.\nThe body is not as the schema says in 1 place.\n"))
+      << status_text(board_.status(), 100);
+  const std::string narrow = status_text(board_.status(), 40);
   EXPECT_TRUE(
       narrow.starts_with("What is wrong now\n"
                          "  q2 (1→2) stuck at −0.25 since sample\n"
                          "    290, mended at 291, confirmed by 40\n"
                          "    samples\n"))
       << narrow;
-  const auto wrong = board_.json()["wrong"];
+  const auto wrong = status_json(board_.status())["wrong"];
   ASSERT_EQ(wrong.size(), 2U);
   EXPECT_EQ(wrong[0]["state"], "confirmed");
   EXPECT_EQ(wrong[0]["signal"], "q2");
@@ -340,7 +350,8 @@ TEST(StatusBoardTest, WhatIsWrongStandsFirstAndNoTerminalIsTooNarrowForIt) {
   // Before the body is known nothing can be said of it.
   schema.complete = false;
   board_.on_body_schema(to_message(schema));
-  EXPECT_TRUE(board_.text(100).starts_with("Learning: 5 samples.\n\n")) << board_.text(100);
+  EXPECT_TRUE(status_text(board_.status(), 100).starts_with("Learning: 5 samples.\n\n"))
+      << status_text(board_.status(), 100);
 }
 
 TEST(StatusBoardTest, ANarrowTerminalKeepsTheHealthOfAnEdge) {
@@ -357,29 +368,29 @@ TEST(StatusBoardTest, ANarrowTerminalKeepsTheHealthOfAnEdge) {
   part.part_state = schema_edge_t::EDGE_INVALID;
   set_array(health.num_parts, health.part_health, {part});
   board_.on_message(health);
-  const std::string text = board_.text(30);
+  const std::string text = status_text(board_.status(), 30);
   EXPECT_NE(text.find("1 → 2   PROVISIONAL"), std::string::npos) << text;
   EXPECT_NE(text.find("2         INVALID"), std::string::npos) << text;
 }
 
 TEST(StatusBoardTest, FaultsAreMarkedAsGroundTruth) {
   StatusBoard board_ = board();
-  EXPECT_EQ(board_.text(100).find("faults"), std::string::npos);
-  EXPECT_TRUE(board_.json()["faults"].is_null());
+  EXPECT_EQ(status_text(board_.status(), 100).find("faults"), std::string::npos);
+  EXPECT_TRUE(status_json(board_.status())["faults"].is_null());
   sim_state_t state{};
   set_array(state.num_faults, state.faults, {"stuck q3", "bend link2 10°"});
   board_.on_message(state);
-  EXPECT_NE(
-      board_.text(100).find("faults   stuck q3, bend link2 10°   (ground truth of the simulation)"),
-      std::string::npos)
-      << board_.text(100);
+  EXPECT_NE(status_text(board_.status(), 100)
+                .find("faults   stuck q3, bend link2 10°   (ground truth of the simulation)"),
+            std::string::npos)
+      << status_text(board_.status(), 100);
 }
 
 TEST(StatusBoardTest, WhatWasNotHeardIsNull) {
   StatusBoard board_({}, "1.2.3");
   board_.begin(0);
   for (const char* key : {"arm", "control", "newest_sample", "faults", "schema", "parts", "events"})
-    EXPECT_TRUE(board_.json().at(key).is_null()) << key;
+    EXPECT_TRUE(status_json(board_.status()).at(key).is_null()) << key;
   control_status_t control{};
   control.target_part = -1;
   control.predicted_error_m = control.observed_error_m = -1;
@@ -388,14 +399,14 @@ TEST(StatusBoardTest, WhatWasNotHeardIsNull) {
   motion.action_id = -1;
   board_.on_message(motion);
   board_.on_message(model_health_t{});
-  const auto json = board_.json();
+  const auto json = status_json(board_.status());
   for (const char* key : {"target_part", "predicted_error_m", "observed_error_m"})
     EXPECT_TRUE(json["control"].at(key).is_null()) << key;
   EXPECT_TRUE(json["arm"]["action_id"].is_null());
   EXPECT_EQ(json["parts"], nlohmann::ordered_json::array());
   control.observed_error_m = 0.25;
   board_.on_message(control);
-  EXPECT_EQ(board_.json()["control"]["observed_error_m"], 0.25);
+  EXPECT_EQ(status_json(board_.status())["control"]["observed_error_m"], 0.25);
 }
 
 TEST(StatusBoardTest, SilenceAndGarbageAreTold) {
@@ -408,7 +419,7 @@ TEST(StatusBoardTest, SilenceAndGarbageAreTold) {
   board_.on_own_counters({{"malformed SAMPLE", 3}});
   EXPECT_FALSE(board_.is_silent());
   EXPECT_TRUE(board_.headline().starts_with("Nothing but garbage"));
-  EXPECT_NO_THROW(board_.json());
+  EXPECT_NO_THROW(status_json(board_.status()));
 }
 
 TEST(StatusBoardTest, NoLineIsWiderThanTheTerminalAndNoneObeysAMessage) {
@@ -418,7 +429,7 @@ TEST(StatusBoardTest, NoLineIsWiderThanTheTerminalAndNoneObeysAMessage) {
   board_.on_message(info("motor_babbler", process_info_t::PHASE_WORKING, hostile));
   board_.on_message(info(std::string(63, 'n'), process_info_t::PHASE_WAITING, hostile));
   board_.on_body_schema(to_message(two_parts()));
-  const std::string text = board_.text(60);
+  const std::string text = status_text(board_.status(), 60);
   EXPECT_EQ(text.find('\x1b'), std::string::npos);
   std::istringstream lines(text);
   std::string line;

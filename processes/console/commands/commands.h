@@ -1,0 +1,32 @@
+#pragma once
+
+#include "common/bus/arguments.h"
+
+namespace bodyschema {
+
+// Each adds subcommands of `bodyschema` with their options; the result goes to stdout.
+
+/// `learn`, `predict`, `show` and `rig`: work on files, without a bus.
+void add_offline_commands(Arguments console);
+/// `engineer`: a schema file from a URDF, marker placements and a recording that tells where the
+/// camera stands.
+void add_engineer_command(Arguments console);
+/// `log`: what an LCM log holds, and whether it is whole and of this version.
+void add_log_command(Arguments console);
+/// `monitor`: keeps a schema true over a recording; its events and errors, line by line.
+void add_monitor_command(Arguments console);
+/// `report`: what a run folder or a log tells, as one HTML file.
+void add_report_command(Arguments console);
+/// `status`: listens to the bus for two seconds and prints how the group is.
+void add_status_command(Arguments console);
+/// `watch`: follows the group on the bus, shows a live line of progress on stderr, and at the end
+/// prints the result and writes result.json and detections.png into the run's folder.
+void add_watch_command(Arguments console);
+/// `target`, `hold`, `release`, `halt` and `resume`: they talk on the bus, show progress on stderr,
+/// and exit with 0 only where the result is what was asked for. `stop` does nothing but say which
+/// of `halt` and `./run stop` may be meant.
+void add_operate_commands(Arguments console);
+/// `fault KIND …`: breaks the simulated arm and says what is broken then.
+void add_fault_command(Arguments console);
+
+}  // namespace bodyschema

@@ -1,0 +1,123 @@
+#include <fmt/format.h>
+
+#include <chrono>
+#include <cmath>
+#include <cstdlib>
+#include <iostream>
+#include <memory>
+#include <nlohmann/json.hpp>
+#include <optional>
+#include <stdexcept>
+
+#include "common/bus/bus.h"
+#include "processes/console/clock.h"
+#include "processes/console/commands/commands.h"
+
+namespace bodyschema {
+namespace {
+
+using SteadyClock = std::chrono::steady_clock;
+
+struct FaultArguments {
+  std::string in = default_url();
+  bool json = false;
+  fault_command_t command{};
+};
+
+void inject(FaultArguments& arguments) {
+  fault_command_t& command = arguments.command;
+  command.utime = command.epoch = wall_clock_us();
+  command.sender = "console";
+
+  Bus bus(arguments.in, arguments.in);
+  if (bus.is_replay()) throw std::runtime_error("a log has no simulator: --in wants a bus");
+  bool is_heard = false;
+  std::optional<sim_state_t> done;
+  bus.subscribe<sim_state_t>(kSimState, [&](const sim_state_t& state) {
+    is_heard = true;
+    if (state.fault_epoch == command.epoch && state.fault_id == command.fault_id) done = state;
+  });
+  // A simulator repeats its state at 1 Hz; one that is heard may have many commands to serve first.
+  const auto begin = SteadyClock::now();
+  auto next_send = begin;
+  while (!done && SteadyClock::now() < begin + std::chrono::seconds(is_heard ? 10 : 4)) {
+    if (SteadyClock::now() >= next_send) {
+      bus.publish(kFaultCommand, command);
+      next_send += std::chrono::milliseconds(500);
+    }
+    bus.handle(std::chrono::milliseconds(50));
+  }
+  if (!done) {
+    throw std::runtime_error(
+        is_heard ? "the simulator is heard but did not acknowledge within 10 s; its log says why"
+                 : "no simulator is heard on " + arguments.in +
+                       " within 4 s; faults are for simulated rigs, in a group that runs "
+                       "(./run --keep)");
+  }
+  if (!done->fault_answer.empty()) throw std::runtime_error("refused: " + done->fault_answer);
+  if (arguments.json) {
+    std::cout << nlohmann::ordered_json{{"faults", done->faults}, {"utime", done->utime}}.dump(2)
+              << "\n";
+    return;
+  }
+  if (done->faults.empty()) std::cout << "nothing is broken\n";
+  for (const std::string& fault : done->faults) std::cout << fault << "\n";
+}
+
+}  // namespace
+
+void add_fault_command(Arguments console) {
+  const auto arguments = std::make_shared<FaultArguments>();
+  Arguments fault =
+      console.add_subcommand("fault", "Break the simulated arm, or repair it; the simulator alone");
+  fault.add_option("--in", arguments->in, "URL of the bus").capture_default_str();
+  fault.add_flag("--json", arguments->json, "The result as JSON");
+  fault.require_subcommand(1);
+  const auto add = [&](const char* name, const char* help, std::int8_t kind) {
+    Arguments sub = fault.add_subcommand(name, help);
+    sub.fallthrough();  // options of `fault` may come last
+    sub.callback([arguments, kind] {
+      arguments->command.fault = kind;
+      inject(*arguments);
+    });
+    return sub;
+  };
+  using Command = fault_command_t;
+  Command& command = arguments->command;
+  command.number = -1;
+  const auto a_number = [](const std::string& text) {
+    return std::isnan(std::strtod(text.c_str(), nullptr)) ? "expected a number" : std::string();
+  };
+  add("stuck", "The joints of a signal no longer move", Command::FAULT_STUCK)
+      .add_option("SIGNAL", command.place, "Name in signals.yaml")
+      .required();
+  Arguments bend = add("bend", "A link is bent in its middle", Command::FAULT_BEND);
+  bend.add_option("LINK", command.place, "Name in robot.yaml").required();
+  bend.add_option("DEG", command.amount_deg, "Angle [deg]")
+      .required()
+      .in_range(-90.0, 90.0)
+      .check(a_number);
+  add("tool", "Another tool", Command::FAULT_TOOL)
+      .add_option("N", command.number, "Of robot.yaml's tools; 0 is the first")
+      .required()
+      .in_range(0, 9999);
+  add("marker-lost", "A marker falls off", Command::FAULT_MARKER_LOST)
+      .add_option("ID", command.number, "Tag in markers.yaml")
+      .required()
+      .in_range(0, 9999);
+  add("marker-moved", "A marker sits elsewhere on its part", Command::FAULT_MARKER_MOVED)
+      .add_option("ID", command.number, "Tag in markers.yaml")
+      .required()
+      .in_range(0, 9999);
+  add("camera-bump", "The camera is knocked to another pose", Command::FAULT_CAMERA_BUMP);
+  Arguments drift =
+      add("drift", "A link bends more with each action; 0 ends it", Command::FAULT_DRIFT);
+  drift.add_option("LINK", command.place, "Name in robot.yaml").required();
+  drift.add_option("DEG_PER_SAMPLE", command.amount_deg, "Angle an action [deg]")
+      .required()
+      .in_range(-90.0, 90.0)
+      .check(a_number);
+  add("repair", "As built", Command::FAULT_REPAIR);
+}
+
+}  // namespace bodyschema

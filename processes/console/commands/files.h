@@ -1,0 +1,27 @@
+#pragma once
+
+#include <filesystem>
+#include <string>
+#include <vector>
+
+#include "common/schema/body_schema.h"
+#include "processes/console/recording.h"
+
+namespace bodyschema {
+
+/// Reads a schema file: a log with one BODY_SCHEMA; of several the last counts.
+/// @throws std::runtime_error.
+BodySchema load_schema(const std::filesystem::path& file);
+
+/// Reads a recording whose actions are those of the schema, in its order. What keeps it from being
+/// whole is said on stderr. @throws std::runtime_error.
+Recording load_for(const std::string& file, const BodySchema& schema);
+
+/// The two numbers of `--noise POS_M ROT_DEG`. @throws as refuse_argument() where they are not
+/// above 0 or no noise of a marker, and may be in another unit.
+Noise noise_given(const std::vector<double>& numbers);
+
+/// @throws std::invalid_argument if `out` would be written over one of `inputs`.
+void check_out(const std::string& out, const std::vector<std::string>& inputs);
+
+}  // namespace bodyschema

@@ -1,0 +1,30 @@
+#pragma once
+
+#include <filesystem>
+#include <map>
+#include <optional>
+#include <string>
+
+#include "common/bus/log_summary.h"
+#include "processes/console/recording.h"
+#include "processes/console/run_record.h"
+
+namespace bodyschema {
+
+/// The contents of a report.
+struct Report {
+  std::string title;  ///< of the run
+  const RunRecord* record = nullptr;
+  std::map<std::filesystem::path, LogSummary> logs;
+  Noise systematic;  ///< of a part's pose, see systematic_of(); what the report learns with
+  std::optional<int> end_effector;     ///< part id, where the rig's files are at hand
+  std::optional<std::string> picture;  ///< a frame with the markers drawn in, JPEG bytes
+  /// Seconds after which a browser loads the page again; for a run that goes on.
+  std::optional<int> reload_s;
+};
+
+/// The page, one file without anything outside it. Where there is nothing to show, it says so.
+/// `problem`, if given, is set to why there are no plots, else to "".
+std::string report_page(const Report& report, std::string* problem = nullptr);
+
+}  // namespace bodyschema

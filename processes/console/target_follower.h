@@ -1,0 +1,104 @@
+#pragma once
+
+#include <cstdint>
+#include <map>
+#include <optional>
+#include <string>
+
+#include "bodyschema/action_command_t.hpp"
+#include "bodyschema/control_status_t.hpp"
+#include "bodyschema/motion_status_t.hpp"
+#include "bodyschema/pose_target_t.hpp"
+#include "bodyschema/process_info_t.hpp"
+
+namespace bodyschema {
+
+/// Repeats one POSE_TARGET until CONTROL_STATUS acknowledges it, and follows it to its end.
+class TargetFollower {
+ public:
+  enum class End {
+    kOpen,
+    kAsked,    ///< reached; for a hold: held; for a release: released
+    kRefused,  ///< refused, held or given up for another target: see why()
+    kMissed,   ///< reached by the schema, but seen more than the tolerance away
+    kTimedOut,
+    kInterrupted,  ///< by the user
+  };
+
+  /// `timeout_us`: of the clock, from the first tick.
+  TargetFollower(pose_target_t target, std::int64_t timeout_us, double tolerance_m = 0.02);
+
+  void on_control_status(const control_status_t& status);
+  /// Remembered for diagnosis().
+  void on_process_info(const process_info_t& info);
+  void on_motion_status(const motion_status_t& motion);
+  /// The target when it is due: at 1 Hz until it is acknowledged. `now_us`: the clock.
+  std::optional<pose_target_t> on_tick(std::int64_t now_us);
+  /// Ends what is open.
+  void interrupt();
+  /// The message that makes the controller drop the target when nobody follows it any longer: a
+  /// hold, or a release where the arm is the babbler's meanwhile. It is newer than this target
+  /// only, so that another sender's stays.
+  pose_target_t withdrawal() const;
+
+  End end() const { return end_; }
+  bool is_acknowledged() const { return is_acknowledged_; }
+  /// The newest status that answers this target; before that all fields are as in "unknown".
+  const control_status_t& status() const { return status_; }
+  /// One line for people.
+  std::string progress() const;
+  /// After a timeout: which process is silent, or what each one says.
+  std::string diagnosis() const;
+
+ private:
+  bool has_been_heard(const std::string& process) const;
+
+  const pose_target_t target_;
+  const std::int64_t timeout_us_;
+  const double tolerance_m_;
+  std::int64_t now_us_ = -1;
+  std::int64_t started_us_ = -1;
+  std::int64_t sent_us_ = -1;
+  bool is_acknowledged_ = false;
+  End end_ = End::kOpen;
+  control_status_t status_{};
+  bool has_controller_ = false;
+  struct Heard {
+    std::string activity;
+    std::int64_t at_us = 0;
+  };
+  std::map<std::string, Heard> processes_;
+  std::optional<std::int64_t> motion_at_us_;
+};
+
+/// Repeats STOP or RESUME until MOTION_STATUS says that it is so.
+class LatchFollower {
+ public:
+  /// `kind`: action_command_t::KIND_STOP or KIND_RESUME. `epoch`: start of the sender [us].
+  LatchFollower(std::int8_t kind, std::int64_t epoch);
+
+  void on_motion_status(const motion_status_t& motion);
+  /// The command when it is due: at 5 Hz until done. `now_us`: the clock.
+  std::optional<action_command_t> on_tick(std::int64_t now_us);
+  bool is_done() const { return is_done_; }
+  bool has_heard_driver() const { return has_heard_driver_; }
+
+ private:
+  action_command_t command_{};
+  std::int64_t sent_us_ = -1;
+  bool is_done_ = false;
+  bool has_heard_driver_ = false;
+};
+
+inline constexpr char kConsole[] = "console";  ///< sender of POSE_TARGET, source of ACTION_COMMAND
+inline constexpr std::int64_t kCommandPeriod_us = 200'000;  ///< of what is not answered yet
+
+/// An ACTION_COMMAND of the console without an action: HOLD, STOP or RESUME.
+action_command_t make_console_command(std::int8_t kind, std::int64_t epoch, std::int64_t action_id);
+
+/// "1.2 mm"; "unknown" below 0.
+std::string distance_text(double error_m);
+/// The output of `target --json`.
+std::string target_json(const control_status_t& status, TargetFollower::End end);
+
+}  // namespace bodyschema
