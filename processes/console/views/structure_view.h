@@ -11,7 +11,7 @@
 
 namespace bodyschema {
 
-// The JSON that the console prints with --json. The README documents every key.
+// The JSON that the console prints with --json. docs/json.md documents every key.
 
 /// `learn --json`, and `structure` in result.json.
 nlohmann::ordered_json structure_json(const BodySchema& schema,
