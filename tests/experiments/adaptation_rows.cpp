@@ -10,7 +10,6 @@
 #include <vector>
 
 #include "processes/model_monitor/adaptation.h"
-#include "processes/model_monitor/hypothesis_tracker.h"
 #include "tests/support/broken_arm.h"
 
 using namespace bodyschema;
@@ -115,9 +114,7 @@ int main(int argc, char** argv) {
     if (std::string(scenario.name).find(fault) == std::string::npos) continue;
     std::vector<Life> lives;
     for (int r = 0; r < runs; ++r)
-      lives.push_back(which == "old"
-                          ? live<Adaptation>(scenario, regime, length, first + r, verbose)
-                          : live<HypothesisTracker>(scenario, regime, length, first + r, verbose));
+      lives.push_back(live<Adaptation>(scenario, regime, length, first + r, verbose));
     std::printf("%-15s %-8s until", scenario.name, regime_name.c_str());
     for (int b = 1; b < 4; ++b) {
       double sum = 0;
