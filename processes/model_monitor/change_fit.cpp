@@ -68,6 +68,16 @@ BodySchema with_change(const BodySchema& schema, const FittedChange& fitted) {
   return changed(result, fitted.change, fitted.theta, fitted.covariance);
 }
 
+BodySchema with_certain_change(const BodySchema& schema, const FittedChange& fitted) {
+  FittedChange certain = fitted;
+  certain.covariance.resize(0, 0);
+  if (!fitted.certain) return with_change(schema, certain);
+  BodySchema result = with_change(schema, certain);
+  for (Edge& edge : result.edges)
+    if (edge.to == fitted.change.part) edge = *fitted.certain;
+  return result;
+}
+
 double log_likelihood(const BodySchema& schema, const MeasurementModel& measurement,
                       const std::vector<const ActionPoseSample*>& samples,
                       const std::vector<int>& cut_parts) {
@@ -420,6 +430,7 @@ std::vector<FittedChange> PlaceEvidence::learn() const {
         one.log_prior + log_likelihood(with_edge(one.certain), measurement_, samples_, cut_parts_);
     fitted.schema = with_edge(one.edge);
     fitted.origin = fitted.schema;
+    fitted.certain = one.certain;
     result.push_back(std::move(fitted));
   }
   return result;

@@ -18,6 +18,8 @@ struct FittedChange {
   bool everywhere = false;
   Eigen::VectorXd theta;
   Eigen::MatrixXd covariance;  ///< of θ, Laplace
+  /// Of what is learned: the edge at the peak of its posterior, without its uncertainty.
+  std::optional<Edge> certain = std::nullopt;
   BodySchema schema;           ///< with the change, and its uncertainty, in it
   /// log ∫ p(observations | θ) p(θ) dθ by Laplace, plus the log prior odds [nats].
   double log_evidence = 0;
@@ -30,6 +32,8 @@ bool is_possible(const FittedChange& fitted, const BodySchema& schema);
 /// `schema` with the fitted change, and its uncertainty, in it.
 /// @throws std::invalid_argument, std::out_of_range if it is not possible.
 BodySchema with_change(const BodySchema& schema, const FittedChange& fitted);
+/// The same without its uncertainty: its width is in log_prior (Laplace).
+BodySchema with_certain_change(const BodySchema& schema, const FittedChange& fitted);
 /// `schema` with the edge to `part` (root: the camera's pose) of another.
 BodySchema with_edge_of(const BodySchema& schema, const BodySchema& other, int part);
 

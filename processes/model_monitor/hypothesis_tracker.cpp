@@ -1,0 +1,699 @@
+#include "processes/model_monitor/hypothesis_tracker.h"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <utility>
+
+#include "processes/model_monitor/schema_difference.h"
+
+namespace bodyschema {
+namespace {
+
+using Kind = AdaptationEvent::Kind;
+
+constexpr std::size_t kRing = 96;
+constexpr std::size_t kBeam = 12;
+/// Samples after a replacement at which all forms are tried again.
+constexpr int kRefits[] = {1, 2, 3, 4, 5, 7, 11, 19, 30};
+/// Samples up to which a change may turn out to be one of what is next to its place.
+constexpr int kUnsure = 5;
+/// From so many samples on a form must lead another clearly.
+constexpr int kManySamples = 8;
+/// Of a CUSUM, from which on it is told which place is wrong, although nothing explains it [nats];
+/// or after so many samples.
+constexpr double kClearLead = 1;
+constexpr std::int64_t kLongestUnclear = 3;
+/// Samples below which nothing is found out where an edge is soft.
+constexpr int kFewestSoft = 3;
+/// What the settled body is off by from the start, as a share of what a change explains.
+constexpr double kSystematicShare = 0.03;
+/// Samples without an explanation after which an edge is learned; newest samples that must then be
+/// explained no worse.
+constexpr std::int64_t kUnexplained = 8;
+constexpr std::int64_t kNewest = 5;
+/// Samples from one fit of what has settled to the next.
+constexpr int kMaturing = 10;
+/// Samples that all forms of change in one place are fitted to are counted: so many are free a
+/// sample, and so many are saved up at most. Less would be done than a fault of two places needs.
+constexpr int kWorkPerSample = 4;
+constexpr int kMostWork = 1000;
+
+bool is_in(std::int64_t value, const auto& values) {
+  return std::find(std::begin(values), std::end(values), value) != std::end(values);
+}
+
+/// Of a suspicion so many samples old: growing steps bound the work of one that lasts.
+bool is_worth_a_fit(std::int64_t age) {
+  constexpr std::int64_t kAges[] = {10, 12, 15, 19, 24};
+  return age <= 8 || age % 30 == 0 || is_in(age, kAges);
+}
+
+bool is_worth_learning(std::int64_t age) {
+  constexpr std::int64_t kAges[] = {8, 10, 13, 16, 20, 25, 32};
+  return age % 40 == 0 || is_in(age, kAges);
+}
+
+bool is_in_places(const std::vector<Place>& places, const Place& place) {
+  return std::find(places.begin(), places.end(), place) != places.end();
+}
+
+bool is_same_explanation(const Replacement& a, const Replacement& b) {
+  return a.place == b.place && a.fitted.change == b.fitted.change && a.also == b.also;
+}
+
+}  // namespace
+
+HypothesisTracker::HypothesisTracker(BodySchema settled, const MeasurementModel& measurement,
+                                     const AdaptationOptions& options, bool is_soft)
+    : options_(options),
+      is_soft_(is_soft),
+      measurement_(measurement),
+      settled_(std::move(settled)),
+      credit_(kMostWork) {
+  history_.push_back(settled_);
+  begin(BodySchema(settled_), measurement);
+}
+
+void HypothesisTracker::set_settled(const BodySchema& settled) {
+  settled_ = settled;
+  settled_filter_ = std::make_shared<TreeFilter>(settled_, measurement_);
+  for (Seen& seen : recent_)
+    seen.settled = settled_filter_->judge(settled_filter_->prepare(seen.sample)).log_likelihood;
+  beam_.assign(1, {{}, settled_, settled_filter_, 0});
+}
+
+void HypothesisTracker::begin(const BodySchema& settled, const MeasurementModel& measurement) {
+  measurement_ = measurement;
+  set_settled(settled);
+  detected_.reset();
+  begin_tests(std::numeric_limits<std::int64_t>::max());
+}
+
+void HypothesisTracker::follow(const BodySchema& settled, int part) {
+  settled_ = settled;
+  settled_filter_ = std::make_shared<TreeFilter>(settled_, measurement_);
+  recent_.back().settled =
+      settled_filter_->judge(settled_filter_->prepare(recent_.back().sample)).log_likelihood;
+  beam_.assign(1, {{}, settled_, settled_filter_, 0});
+  tests_->clear(settled_filter_->node_of(part));
+}
+
+void HypothesisTracker::set_history(std::vector<BodySchema> history) {
+  history_ = std::move(history);
+  remember(settled_);
+}
+
+std::vector<Place> HypothesisTracker::suspects() const {
+  return tests_->suspects(filter(), options_.suspicion);
+}
+
+std::int64_t HypothesisTracker::trouble_since() const {
+  const SequentialTests::Cusum cusum = tests_->highest().cusum;
+  std::int64_t since =
+      cusum.value > options_.suspicion ? cusum.since : std::numeric_limits<std::int64_t>::max();
+  for (const Change& c : changes()) since = std::min(since, c.since);
+  return since;
+}
+
+bool HypothesisTracker::was_adopted_at(std::int64_t sample) const {
+  return std::any_of(changes().begin(), changes().end(),
+                     [sample](const Change& c) { return c.adopted == sample; });
+}
+
+double HypothesisTracker::most_log_odds() const {
+  double most = 0;
+  for (const Hypothesis& h : beam_) most = std::max(most, h.log_odds);
+  return most;
+}
+
+void HypothesisTracker::go_on_fitting(BodySchema base, Change change) {
+  const std::int64_t adopted = change.adopted;
+  maturing_ = {std::move(base), {std::move(change)}, adopted};
+}
+
+std::int64_t HypothesisTracker::newest_adopted() const {
+  std::int64_t newest = 0;
+  for (const Change& c : changes()) newest = std::max(newest, c.adopted);
+  return newest;
+}
+
+std::vector<ActionPoseSample> HypothesisTracker::recent() const {
+  std::vector<ActionPoseSample> result;
+  for (const Seen& seen : recent_) result.push_back(seen.sample);
+  return result;
+}
+
+const HypothesisTracker::Change* HypothesisTracker::last_at(const std::vector<Change>& changes,
+                                                            const Place& place) {
+  for (auto c = changes.rbegin(); c != changes.rend(); ++c)
+    if (c->what.place == place) return &*c;
+  return nullptr;
+}
+
+void HypothesisTracker::begin_tests(std::int64_t since) {
+  // However loud, one sample finds nothing out where a model is soft.
+  const double loudest =
+      is_soft_ ? alarm_threshold(filter().num_nodes(), options_.false_alarm_rate) / kFewestSoft
+               : std::numeric_limits<double>::infinity();
+  tests_.emplace(filter(), options_.false_alarm_rate, loudest);
+  for (const Seen& seen : recent_)
+    if (seen.sample.sample_index >= since)
+      tests_->update(filter(), filter().prepare(seen.sample), seen.sample.sample_index);
+}
+
+std::vector<const ActionPoseSample*> HypothesisTracker::segment(std::int64_t since,
+                                                                int longest) const {
+  std::vector<const ActionPoseSample*> result;
+  for (const Seen& seen : recent_)
+    if (seen.sample.sample_index >= since) result.push_back(&seen.sample);
+  if (result.size() > static_cast<std::size_t>(longest))
+    result.erase(result.begin(), result.end() - longest);
+  return result;
+}
+
+FoundChanges HypothesisTracker::search(const BodySchema& base, const std::vector<Place>& places,
+                                       const std::vector<const ActionPoseSample*>& samples,
+                                       const BodyChange* standing_form) {
+  ChangeSearch search{measurement_, options_.ambiguity};
+  if (standing_form) {
+    search.standing_form = *standing_form;
+    search.learn = standing_form->is_learned();
+  }
+  FoundChanges found = find_changes(base, history_, places, samples, search);
+  credit_ -= found.work;
+  return found;
+}
+
+BodySchema HypothesisTracker::composed(const std::vector<Change>& changes,
+                                       std::size_t without) const {
+  BodySchema schema = settled_;
+  for (std::size_t n = 0; n < changes.size(); ++n)
+    if (n != without && is_possible(changes[n].what.fitted, schema))
+      schema = with_change(schema, changes[n].what.fitted);
+  return schema;
+}
+
+HypothesisTracker::Hypothesis HypothesisTracker::made_of(std::vector<Change> changes) const {
+  Hypothesis result;
+  BodySchema schema = settled_;
+  std::erase_if(changes, [&](const Change& c) {
+    if (!is_possible(c.what.fitted, schema)) return true;
+    schema = with_change(schema, c.what.fitted);
+    return false;
+  });
+  result.changes = std::move(changes);
+  result.body = std::move(schema);
+  result.filter = std::make_shared<TreeFilter>(result.body, measurement_);
+  return result;
+}
+
+double HypothesisTracker::log_odds_of(const std::vector<Change>& changes) const {
+  double odds = 0;
+  BodySchema body = settled_;
+  for (std::size_t n = 0; n < changes.size(); ++n) {
+    odds += changes[n].what.fitted.log_prior;
+    if (is_possible(changes[n].what.fitted, body))
+      body = with_certain_change(body, changes[n].what.fitted);
+    const std::int64_t until = n + 1 < changes.size() ? changes[n + 1].since
+                                                      : std::numeric_limits<std::int64_t>::max();
+    const TreeFilter filter(body, measurement_);
+    for (const Seen& seen : recent_)
+      if (seen.sample.sample_index >= changes[n].since && seen.sample.sample_index < until)
+        odds += filter.judge(filter.prepare(seen.sample)).log_likelihood - seen.settled;
+  }
+  return odds;
+}
+
+void HypothesisTracker::offer(Hypothesis hypothesis) {
+  const auto is_it = [&](const Hypothesis& other) {
+    return other.changes.size() == hypothesis.changes.size() &&
+           std::equal(other.changes.begin(), other.changes.end(), hypothesis.changes.begin(),
+                      [](const Change& a, const Change& b) {
+                        return is_same_explanation(a.what, b.what) && a.since == b.since;
+                      });
+  };
+  if (is_it(standing())) return;
+  std::erase_if(beam_, is_it);
+  beam_.push_back(std::move(hypothesis));
+  if (beam_.size() <= kBeam) return;
+  const auto least = std::min_element(
+      beam_.begin() + 1, beam_.end(),
+      [](const Hypothesis& a, const Hypothesis& b) {
+        if (a.changes.empty() != b.changes.empty()) return b.changes.empty();
+        return a.log_odds < b.log_odds;
+      });
+  beam_.erase(least);
+}
+
+void HypothesisTracker::propose_more(std::int64_t now) {
+  const std::vector<Place> places = suspects();
+  if (places.empty() || credit_ <= 0) return;
+  const std::int64_t since = tests_->highest().cusum.since;
+  if (!is_worth_a_fit(now - since + 1)) return;
+  const FoundChanges found =
+      search(schema(), places, segment(since, options_.longest_segment), nullptr);
+  for (const auto* one : {&found.best, &found.runner_up}) {
+    if (!*one) continue;
+    std::vector<Change> changes = this->changes();
+    Change change{**one, since, now};
+    // It takes the place of an earlier one there, which holds until then.
+    const bool is_again = !change.what.place.marker && last_at(changes, change.what.place);
+    if (is_again && !change.what.fitted.origin) change.what.fitted.origin = schema();
+    changes.push_back(std::move(change));
+    Hypothesis more = made_of(std::move(changes));
+    more.log_odds = log_odds() + (*one)->fitted.log_evidence - found.null;
+    if (more.log_odds > log_odds() - options_.ambiguity) offer(std::move(more));
+  }
+}
+
+void HypothesisTracker::propose_learned(std::int64_t now) {
+  const std::vector<Place> places = suspects();
+  const std::int64_t since = trouble_since();
+  if (places.empty() || !(detected_ || now - last_mismatch_ < kUnexplained) ||
+      !is_worth_learning(now - since + 1))
+    return;
+  std::vector<int> parts;
+  const auto add = [&](const Place& place) {
+    const bool is_new = std::find(parts.begin(), parts.end(), place.part) == parts.end();
+    if (!place.marker && edge_to(settled_, place.part) && is_new) parts.push_back(place.part);
+  };
+  for (const Change& c : changes()) add(c.what.place);
+  add(places.front());
+  const auto samples = segment(since, options_.longest_segment);
+  const auto newest = segment(now - kNewest + 1, kNewest);
+  const double of_newest = log_likelihood(schema(), measurement_, newest);
+  for (const int part : parts) {
+    // The other edges as they were, or as they are now.
+    std::vector<std::vector<Change>> rests{{}};
+    std::vector<Change> others = changes();
+    std::erase_if(others, [part](const Change& c) { return c.what.place.part == part; });
+    if (!others.empty()) rests.push_back(std::move(others));
+    for (const std::vector<Change>& rest : rests) {
+      const BodySchema base = composed(rest, rest.size());
+      const double before =
+          log_odds_of(rest) - log_likelihood(base, measurement_, samples);
+      const PlaceEvidence evidence(base, measurement_, part, false, samples);
+      for (FittedChange& learned : evidence.learn()) {
+        const double odds = before + learned.log_evidence;
+        std::vector<Change> changes = rest;
+        changes.push_back({{{part, false}, std::move(learned)}, since, now});
+        Hypothesis hypothesis = made_of(std::move(changes));
+        hypothesis.log_odds = odds;
+        // What the body has changed back from meanwhile explains many samples, too.
+        if (log_likelihood(hypothesis.body, measurement_, newest) >= of_newest)
+          offer(std::move(hypothesis));
+      }
+    }
+  }
+}
+
+void HypothesisTracker::refit(const BodySchema& others, int longest, Change* change) const {
+  FittedChange& fitted = change->what.fitted;
+  if (fitted.change.size() == 0 || !is_possible(fitted, others)) return;
+  const Place& place = change->what.place;
+  const BodySchema base = fitted.origin ? with_edge_of(others, *fitted.origin, place.part) : others;
+  const PlaceEvidence evidence(base, measurement_, place.part, place.marker,
+                               segment(change->since, longest));
+  auto again = evidence.fit(fitted.change);
+  if (!again) return;
+  again->origin = fitted.origin;
+  again->certain = fitted.certain;
+  fitted = std::move(*again);
+}
+
+std::optional<Replacement> HypothesisTracker::best_form(const Hypothesis& of, const Change& change,
+                                                        const BodySchema& others,
+                                                        std::int64_t now) {
+  const auto samples = segment(change.since, options_.longest_segment);
+  const FittedChange& fitted = change.what.fitted;
+  FoundChanges found = search(others, {change.what.place}, samples, &fitted.change);
+  const bool is_young = now - change.adopted <= kUnsure && change.what.also.empty() &&
+                        !fitted.everywhere && !fitted.change.is_learned();
+  if (is_young && of.changes.size() == 1) {
+    std::vector<Place> around = places_around(*of.filter, change.what.place.part);
+    std::erase(around, change.what.place);
+    FoundChanges there = search(others, around, samples, nullptr);
+    if (there.best && (!found.best || there.best->fitted.log_evidence >
+                                          found.best->fitted.log_evidence + options_.acceptance))
+      found = std::move(there);
+  }
+  if (!found.best || found.margin() < 0) return std::nullopt;
+  if (found.runner_up && of.changes.size() == 1) {
+    Hypothesis rival = made_of({{*found.runner_up, change.since, change.adopted}});
+    rival.log_odds = found.runner_up->fitted.log_evidence - found.null;
+    offer(std::move(rival));
+  }
+  return found.best;
+}
+
+HypothesisTracker::Hypothesis HypothesisTracker::fitted_again(Hypothesis hypothesis, bool all_forms,
+                                                              int longest, std::int64_t now) {
+  std::vector<Change> changes = hypothesis.changes;
+  const int rounds = all_forms && changes.size() > 1 ? 3 : 1;
+  for (int round = 0; round < rounds; ++round) {
+    bool is_changed = false;
+    for (std::size_t n = 0; n < changes.size();) {
+      Change& c = changes[n];
+      if (now - c.adopted > longest || last_at(changes, c.what.place) != &c) {
+        ++n;
+        continue;
+      }
+      const BodySchema others = composed(changes, n);
+      if (!all_forms) {
+        refit(others, longest, &c);
+        ++n;
+        continue;
+      }
+      auto best = best_form(hypothesis, c, others, now);
+      is_changed |= !best || !is_same_explanation(*best, c.what);
+      if (best) {
+        c.what = std::move(*best);
+        ++n;
+      } else {
+        changes.erase(changes.begin() + static_cast<std::ptrdiff_t>(n));
+      }
+    }
+    if (!is_changed) break;
+  }
+  Hypothesis result = made_of(std::move(changes));
+  result.log_odds = log_odds_of(result.changes);
+  return result;
+}
+
+double HypothesisTracker::needed_lead(const Hypothesis& other, std::int64_t now) const {
+  const double systematic = kSystematicShare * std::max(0.0, log_odds());
+  const auto is_learned = [](const Change& c) { return c.what.fitted.change.is_learned(); };
+  bool is_new = other.changes.size() > changes().size();
+  for (const Change& c : other.changes) {
+    is_new |= !last_at(changes(), c.what.place);
+    is_new |= is_learned(c) && std::none_of(changes().begin(), changes().end(), is_learned);
+    if (is_soft_ && now - c.since + 1 < kFewestSoft) return std::numeric_limits<double>::infinity();
+  }
+  if (is_new) return options_.acceptance + systematic;
+  return other.changes.size() < changes().size() ? 0 : options_.ambiguity + systematic;
+}
+
+void HypothesisTracker::choose(std::int64_t now, std::vector<AdaptationEvent>* events) {
+  // Whoever seems to lead is fitted to all its samples before it stands.
+  std::optional<Hypothesis> next;
+  for (Hypothesis rival : std::vector<Hypothesis>(beam_.begin() + 1, beam_.end())) {
+    if (rival.log_odds - log_odds() <= needed_lead(rival, now)) continue;
+    if (next && rival.log_odds <= next->log_odds) continue;
+    if (!rival.changes.empty())
+      rival = fitted_again(rival, rival.changes.size() > 1, options_.settled_after, now);
+    const bool is_leading = rival.log_odds - log_odds() > needed_lead(rival, now);
+    if (is_leading && (!next || rival.log_odds > next->log_odds))
+      next = std::move(rival);
+    else
+      offer(std::move(rival));
+  }
+  if (next) stand(std::move(*next), now, events);
+}
+
+AdaptationEvent HypothesisTracker::event(Kind kind, std::int64_t sample, const Place& place) const {
+  AdaptationEvent result;
+  result.kind = kind;
+  result.sample_index = sample;
+  const Edge* edge = edge_to(settled_, place.part);
+  if (place.marker || !edge) {
+    result.part = place.part;
+  } else {
+    result.from = edge->from;
+    result.to = edge->to;
+  }
+  return result;
+}
+
+void HypothesisTracker::tell(Kind kind, std::int64_t sample, const Hypothesis& of,
+                             const Change& change, double margin,
+                             std::vector<AdaptationEvent>* events) const {
+  const Replacement& what = change.what;
+  const FittedChange& fitted = what.fitted;
+  BodySchema base = composed(of.changes, static_cast<std::size_t>(&change - of.changes.data()));
+  if (fitted.origin) base = with_edge_of(base, *fitted.origin, what.place.part);
+  std::vector<Place> places{what.place};
+  places.insert(places.end(), what.also.begin(), what.also.end());
+  for (const Place& place : places) {
+    AdaptationEvent told = event(kind, sample, place);
+    BodyChange there = fitted.change;
+    there.part = place.part;
+    told.cause = there.cause(settled_);
+    if (place == what.place)
+      told.size = size_of(base, fitted.change, fitted.theta, fitted.covariance);
+    told.margin = margin;
+    told.since = change.since;
+    told.num_samples = static_cast<int>(sample - change.since + 1);
+    events->push_back(std::move(told));
+  }
+}
+
+void HypothesisTracker::tell_difference(const Hypothesis& before, const Hypothesis& after,
+                                        std::int64_t sample,
+                                        std::vector<AdaptationEvent>* events) const {
+  const auto at = [](const Hypothesis& h, const Place& place) {
+    return last_at(h.changes, place);
+  };
+  const double margin = after.log_odds - before.log_odds;
+  bool is_moved = false;
+  for (const Change& c : before.changes)
+    if (at(before, c.what.place) == &c && !at(after, c.what.place)) {
+      tell(Kind::kReverted, sample, before, c, margin, events);
+      is_moved = true;
+    }
+  for (const Change& c : after.changes) {
+    if (at(after, c.what.place) != &c) continue;
+    const Change* old = at(before, c.what.place);
+    if (old && is_same_explanation(old->what, c.what)) continue;
+    const bool is_learned_anew = old && c.what.fitted.change.is_learned() &&
+                                 !old->what.fitted.change.is_learned();
+    if (is_learned_anew) {
+      tell(Kind::kReverted, sample, before, *old, margin, events);
+      tell(Kind::kCandidate, sample, after, c, margin, events);
+      continue;
+    }
+    const bool is_stored = c.what.fitted.change.form == BodyChange::Form::kStored;
+    tell(old || is_moved ? Kind::kRefined : is_stored ? Kind::kRestored : Kind::kCandidate, sample,
+         after, c, margin, events);
+  }
+}
+
+void HypothesisTracker::stand(Hypothesis next, std::int64_t now,
+                              std::vector<AdaptationEvent>* events) {
+  if (next.changes.size() > changes().size() && !(detected_ && is_told_)) {
+    AdaptationEvent mismatch = event(Kind::kMismatch, now, next.changes.back().what.place);
+    mismatch.since = next.changes.back().since;
+    mismatch.num_samples = static_cast<int>(now - mismatch.since + 1);
+    mismatch.margin = tests_->highest().cusum.value;
+    if (next.changes.back().what.place == Place{settled_.root, false})
+      mismatch.cause = "camera_moved";
+    events->push_back(mismatch);
+    last_mismatch_ = now;
+  }
+  tell_difference(standing(), next, now, events);
+  std::int64_t since = std::numeric_limits<std::int64_t>::max();
+  for (const Hypothesis* of : {&std::as_const(next), &standing()})
+    for (const Change& c : of->changes) since = std::min(since, c.since);
+  Hypothesis before = std::exchange(beam_.front(), std::move(next));
+  offer(std::move(before));
+  detected_.reset();
+  maturing_.reset();
+  // What the explanation that was taken back was wrong about is nobody's fault.
+  begin_tests(since);
+}
+
+void HypothesisTracker::propose_again(std::int64_t now, std::vector<AdaptationEvent>* events) {
+  if (changes().empty()) return;
+  const std::int64_t age = now - newest_adopted();
+  if (age == 0) return;
+  beam_.front() = fitted_again(standing(), false, options_.settled_after, now);
+  if (credit_ <= 0 || !is_in(age, kRefits)) return;
+  Hypothesis again = fitted_again(standing(), true, options_.settled_after, now);
+  const double lead = again.log_odds - log_odds();
+  if (lead <= (age < kManySamples ? 0 : needed_lead(again, now)))
+    offer(std::move(again));
+  else
+    stand(std::move(again), now, events);
+}
+
+void HypothesisTracker::want_probe(std::int64_t now, std::vector<AdaptationEvent>* events) {
+  const auto is_asked = [this](const Replacement& a, const Replacement& b) {
+    return std::any_of(asked_.begin(), asked_.end(), [&](const auto& pair) {
+      return (is_same_explanation(pair.first, a) && is_same_explanation(pair.second, b)) ||
+             (is_same_explanation(pair.first, b) && is_same_explanation(pair.second, a));
+    });
+  };
+  if (changes().empty()) {
+    asked_.clear();
+    return;
+  }
+  const std::int64_t age = now - newest_adopted();
+  if (age != 0 && !is_in(age, kRefits)) return;
+  const Replacement& one = changes().back().what;
+  for (std::size_t n = 1; n < beam_.size(); ++n) {
+    const Hypothesis& rival = beam_[n];
+    if (rival.changes.size() != changes().size()) continue;
+    const Replacement& other = rival.changes.back().what;
+    const double lead = std::abs(log_odds() - rival.log_odds);
+    // Of two functions the samples to come decide.
+    if (lead > options_.ambiguity || one.place != other.place || is_same_explanation(one, other) ||
+        one.fitted.change.is_learned() || is_asked(one, other))
+      continue;
+    const Eigen::VectorXd probe = most_telling_action(schema(), rival.body, options_.tolerance);
+    if (probe.size() == 0) continue;
+    AdaptationEvent wanted = event(Kind::kProbeWanted, now, one.place);
+    const std::string cause = one.fitted.change.cause(settled_),
+                      other_cause = other.fitted.change.cause(settled_);
+    wanted.cause = cause == other_cause ? cause : cause + " or " + other_cause;
+    wanted.margin = lead;
+    wanted.probe = probe;
+    asked_.emplace_back(one, other);
+    events->push_back(std::move(wanted));
+  }
+}
+
+void HypothesisTracker::detect(std::int64_t now, std::vector<AdaptationEvent>* events) {
+  const std::vector<Place> places = suspects();
+  if (places.empty()) {
+    if (detected_ && is_told_) {
+      events->push_back(event(Kind::kRecovered, now, *detected_));
+      events->back().cause = "unexplained";
+    }
+    detected_.reset();
+    return;
+  }
+  const auto [cusum, second] = tests_->highest();
+  if (cusum.value <= tests_->alarm() || (detected_ && is_told_)) return;
+  // What a young explanation leaves elsewhere may be its own fault.
+  const auto is_beside = [&](const Change& c) {
+    return is_in_places(places_around(filter(), c.what.place.part), places.front());
+  };
+  if (!changes().empty() && now - newest_adopted() <= kUnexplained &&
+      std::none_of(changes().begin(), changes().end(), is_beside))
+    return;
+  // Edges between which nothing was seen are suspected alike: which one it is is told later, if
+  // there is more evidence of it. (A lead may also come from evidence against all of them.)
+  const bool is_rising = !detected_ || cusum.value > std::min(untold_, tests_->ceiling());
+  is_told_ = is_rising &&
+             (cusum.value - second > kClearLead || now - cusum.since >= kLongestUnclear);
+  detected_ = places.front();
+  untold_ = cusum.value;
+  if (!is_told_) return;
+  AdaptationEvent mismatch = event(Kind::kMismatch, now, *detected_);
+  if (*detected_ == Place{settled_.root, false}) mismatch.cause = "camera_moved";
+  mismatch.since = cusum.since;
+  mismatch.margin = cusum.value;
+  mismatch.num_samples = static_cast<int>(now - cusum.since + 1);
+  last_mismatch_ = now;
+  events->push_back(mismatch);
+}
+
+void HypothesisTracker::settle(std::int64_t now, std::vector<AdaptationEvent>* events) {
+  // One change more is pursued while something is suspected: what a model is off by from the start
+  // adds up to evidence of a change, too.
+  if (suspects().empty()) {
+    const std::size_t most = changes().size();
+    std::erase_if(beam_, [most](const Hypothesis& h) { return h.changes.size() > most; });
+  }
+  if (changes().empty() || now - newest_adopted() < options_.settled_after) return;
+  for (const Change& c : changes())
+    if (last_at(changes(), c.what.place) == &c)
+      tell(Kind::kRecovered, now, standing(), c, 0, events);
+  // Of a drift, which may look like small changes, the mean of many samples is not what is now.
+  const bool any_small = std::any_of(changes().begin(), changes().end(), [](const Change& c) {
+    return c.what.fitted.change.small;
+  });
+  maturing_.reset();
+  if (!any_small) maturing_ = {settled_, changes(), newest_adopted()};
+  set_settled(BodySchema(schema()));
+  remember(settled_);
+}
+
+void HypothesisTracker::mature(std::int64_t now) {
+  if (!maturing_) return;
+  if (now - maturing_->adopted > options_.matured_after) {
+    maturing_.reset();
+    return;
+  }
+  if ((now - maturing_->adopted) % kMaturing != 0 || !suspects().empty()) return;
+  const BodySchema before = settled_;
+  settled_ = maturing_->base;
+  for (std::size_t n = 0; n < maturing_->changes.size(); ++n) {
+    Change& c = maturing_->changes[n];
+    if (last_at(maturing_->changes, c.what.place) == &c)
+      refit(composed(maturing_->changes, n), options_.matured_after, &c);
+  }
+  const SequentialTests tests = *tests_;
+  set_settled(composed(maturing_->changes, maturing_->changes.size()));
+  tests_ = tests;
+  for (BodySchema& stored : history_)
+    if (is_same(stored, before)) stored = settled_;
+}
+
+void HypothesisTracker::take_back_all(std::int64_t sample, std::vector<AdaptationEvent>* events) {
+  const Hypothesis nothing{{}, settled_, settled_filter_, 0};
+  tell_difference(standing(), nothing, sample, events);
+  begin(BodySchema(settled_), measurement_);
+}
+
+void HypothesisTracker::take_back(const std::function<bool(const Place&)>& is_at,
+                                  std::int64_t since, const Filter& clean, std::int64_t sample,
+                                  std::vector<AdaptationEvent>* events) {
+  for (Seen& seen : recent_) {
+    if (seen.sample.sample_index < since) continue;
+    clean(&seen.sample);
+    seen.settled = settled_filter_->judge(settled_filter_->prepare(seen.sample)).log_likelihood;
+  }
+  const auto is_of_it = [&](const Change& c) { return c.since >= since && is_at(c.what.place); };
+  std::vector<Change> rest = changes();
+  std::erase_if(rest, is_of_it);
+  Hypothesis next = made_of(std::move(rest));
+  next.log_odds = log_odds_of(next.changes);
+  tell_difference(standing(), next, sample, events);
+  beam_.assign(1, std::move(next));
+  if (detected_ && is_at(*detected_)) detected_.reset();
+  begin_tests(std::numeric_limits<std::int64_t>::max());
+}
+
+void HypothesisTracker::remember(const BodySchema& schema) {
+  const auto alike = std::find_if(history_.begin(), history_.end(), [&](const BodySchema& stored) {
+    return is_alike(stored, schema);
+  });
+  if (alike != history_.end()) {
+    if (alike == history_.begin()) return;
+    history_.erase(alike);
+  }
+  if (history_.size() > options_.history) history_.erase(history_.begin() + 1);
+  history_.push_back(schema);
+}
+
+void HypothesisTracker::add_silently(const ActionPoseSample& sample) {
+  recent_.push_back({sample, 0});
+  if (recent_.size() > kRing) recent_.pop_front();
+}
+
+TreeFilter::Judgement HypothesisTracker::on_sample(const ActionPoseSample& sample,
+                                                   std::vector<AdaptationEvent>* events) {
+  credit_ = std::min(credit_ + kWorkPerSample, kMostWork);
+  const std::int64_t now = sample.sample_index;
+  const auto judge = [&](const TreeFilter& filter) {
+    return filter.judge(filter.prepare(sample)).log_likelihood;
+  };
+  add_silently(sample);
+  recent_.back().settled = judge(*settled_filter_);
+  for (Hypothesis& h : beam_)
+    if (!h.changes.empty()) h.log_odds += judge(*h.filter) - recent_.back().settled;
+  const TreeFilter::Judgement judgement =
+      tests_->update(filter(), filter().prepare(sample), now);
+  propose_again(now, events);
+  propose_more(now);
+  propose_learned(now);
+  choose(now, events);
+  want_probe(now, events);
+  detect(now, events);
+  settle(now, events);
+  mature(now);
+  return judgement;
+}
+
+}  // namespace bodyschema
