@@ -9,7 +9,7 @@ inline double chi_square_median(double dof) { return chi_square_quantile(dof, 0.
 /// log P(X > x). Finite however far out.
 double log_chi_square_tail(double x, double dof);
 
-/// Of χ² given that it is at most `limit`.
+/// Mean and variance of χ² given that it is at most `limit`.
 struct ChiSquareMoments {
   double mean = 0;
   double variance = 0;

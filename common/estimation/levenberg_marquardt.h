@@ -23,7 +23,7 @@ class LevenbergMarquardt {
     for (int attempt = 0; attempt < max_attempts_; ++attempt) {
       Matrix damped = H;
       damped.diagonal() += damping_ * H.diagonal();
-      // What has no information at all stays at rest.
+      // A parameter without information stays at rest.
       damped.diagonal().array() += 1e-14 * H.diagonal().maxCoeff();
       const Eigen::LLT<Matrix> llt(damped);
       if (llt.info() == Eigen::Success) {

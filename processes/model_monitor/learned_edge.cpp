@@ -7,8 +7,8 @@
 #include <memory>
 #include <optional>
 
-#include "common/statistics/median.h"
-#include "common/statistics/student_t.h"
+#include "common/estimation/quantile.h"
+#include "common/estimation/student_t.h"
 #include "processes/model_monitor/tree_filter.h"
 
 namespace bodyschema {
