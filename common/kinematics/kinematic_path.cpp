@@ -146,7 +146,7 @@ Pose KinematicPath::predict(const Eigen::Ref<const Eigen::VectorXd>& action,
       const double theta = signal.displacement(action(step->signal));
       const double rate = signal.displacement_rate(action(step->signal));
       // Exp(ŝθ) commutes with ŝ, so it drops out.
-      J.col(step->signal) += rate * step->screw.twist_after(R, p);
+      step->screw.add_twist_after(R, p, rate, J.col(step->signal));
       step->screw.prepend_motion(theta, R, p);
     } else {
       const Leg& leg = legs_[step->leg];

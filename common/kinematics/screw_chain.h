@@ -37,13 +37,21 @@ struct Screw {
     Eigen::Matrix<double, 6, 2> twists;
     const Eigen::Vector3d z = R.row(2).transpose();
     twists.col(0) << z, Eigen::Vector3d::Zero();
-    twists.col(1) << p.x() * R.row(1).transpose() - p.y() * R.row(0).transpose(), z;
+    twists.col(1) << lever(R, p), z;
     return twists;
   }
-  /// Ad(X⁻¹) ŝ.
+  /// The velocity at the end of X of a turn about z.
   template <class Rotation, class Translation>
-  Vector6d twist_after(const Rotation& R, const Translation& p) const {
-    return twists_after(R, p) * Eigen::Vector2d(slide, turn);
+  static Eigen::Vector3d lever(const Rotation& R, const Translation& p) {
+    return p.x() * R.row(1).transpose() - p.y() * R.row(0).transpose();
+  }
+  /// column += rate · Ad(X⁻¹) ŝ.
+  template <class Rotation, class Translation, class Column>
+  void add_twist_after(const Rotation& R, const Translation& p, double rate,
+                       Column&& column) const {
+    const Eigen::Vector3d z = R.row(2).transpose();
+    column.template head<3>() += rate * (slide * z + turn * lever(R, p));
+    column.template tail<3>() += rate * turn * z;
   }
 };
 
@@ -100,11 +108,11 @@ class ScrewChain {
   /// Δ · suffix and its derivative by the displacements q_d, 6 × the number of screws.
   template <class Jacobian>
   Pose predict_by_displacements(Jacobian* J, Pose suffix = Pose::Identity()) const {
-    J->resize(6, num_screws_);
+    J->setZero(6, num_screws_);
     visit_backwards(
         &suffix,
         [&](int d, const ScrewLink& link) {
-          J->col(d) = link.screw.twist_after(suffix.linear(), suffix.translation());
+          link.screw.add_twist_after(suffix.linear(), suffix.translation(), 1, J->col(d));
         },
         [](int) {});
     return first_ * suffix;
