@@ -5,6 +5,8 @@
 #include <cmath>
 #include <limits>
 
+#include "common/estimation/levenberg_marquardt.h"
+
 namespace bodyschema {
 
 double sigma_px(const Matrix8d& corner_covariance_px2) {
@@ -60,32 +62,26 @@ std::optional<PoseFit> fit_pose(const Pose& start, const std::vector<Eigen::Vect
   auto residual = residual_at(X_CB, &J);
   if (!residual || !residual->allFinite() || p_BP.size() < 3) return std::nullopt;
   double cost = residual->squaredNorm();
-  // Damping is relative to the diagonal, so that metres and radians need no common unit.
-  double damping = 1e-4;
+  LevenbergMarquardt optimizer(1e-4, 1e-12, 1);
   constexpr int kMaxIterations = 200;
   for (int iteration = 0; iteration < kMaxIterations; ++iteration) {
     const Matrix6d H = J.transpose() * J;
     const Vector6d gradient = J.transpose() * *residual;
-    Matrix6d damped = H;
-    damped.diagonal() *= 1 + damping;
-    const Vector6d step = -damped.ldlt().solve(gradient);
-    if (!step.allFinite()) return std::nullopt;
-    const Pose candidate = X_CB * exp(step);
-    const auto candidate_residual = residual_at(candidate, &candidate_J);
-    if (candidate_residual && candidate_residual->squaredNorm() <= cost) {
+    if (!H.allFinite()) return std::nullopt;
+    bool is_converged = false;
+    const bool improved = optimizer.step(H, gradient, [&](const Vector6d& step) {
+      const Pose candidate = X_CB * exp(step);
+      is_converged = step.head<3>().norm() < 1e-11 * candidate.translation().norm() &&
+                     step.tail<3>().norm() < 1e-11;
+      const auto candidate_residual = residual_at(candidate, &candidate_J);
+      if (!candidate_residual || candidate_residual->squaredNorm() > cost) return false;
       X_CB = candidate;
       residual = candidate_residual;
       J.swap(candidate_J);
       cost = residual->squaredNorm();
-      damping = std::max(damping / 10, 1e-12);
-    } else {
-      damping *= 10;
-      if (damping > 1e9) break;
-    }
-    if (step.head<3>().norm() < 1e-11 * X_CB.translation().norm() &&
-        step.tail<3>().norm() < 1e-11) {
-      break;
-    }
+      return true;
+    });
+    if (is_converged || (!improved && optimizer.damping() > 1e9)) break;
   }
   X_CB.linear() = nearest_rotation(X_CB.linear());
   return PoseFit{X_CB, std::sqrt(cost / static_cast<double>(2 * p_BP.size())), J.transpose() * J};

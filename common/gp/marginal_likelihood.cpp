@@ -70,24 +70,14 @@ std::vector<Eigen::VectorXd> coarse_grid(const Box& box) {
   return grid;
 }
 
-}  // namespace
-
-std::vector<GpPrior> maximize_marginal_likelihood(const Eigen::MatrixXd& inputs,
-                                                  const Eigen::MatrixXd& targets,
-                                                  const Eigen::VectorXd& noise_scales,
-                                                  std::optional<double> mean,
-                                                  const HyperParameterRange& range) {
+/// The likeliest cell of the grid for each of P functions: one factorisation a cell for all of them.
+/// An unknown mean is projected out.
+std::vector<Eigen::VectorXd> best_cells(const Eigen::MatrixXd& inputs,
+                                        const Eigen::MatrixXd& targets,
+                                        const Eigen::VectorXd& noise_scales,
+                                        std::optional<double> mean,
+                                        const HyperParameterRange& range, const Box& box) {
   const Eigen::Index N = inputs.cols(), P = targets.cols();
-  if (inputs.rows() < 1 || N < 1 || targets.rows() != N ||
-      (noise_scales.size() > 0 && noise_scales.size() != N))
-    throw std::invalid_argument("hyper-parameters: inputs must be D×N, targets N×P, with D, N ≥ 1");
-  if (!inputs.allFinite() || !targets.allFinite() || !noise_scales.allFinite())
-    throw std::invalid_argument("hyper-parameters: inputs and targets must be finite");
-  const Eigen::VectorXd scales_of_noise =
-      noise_scales.size() > 0 ? noise_scales : Eigen::VectorXd::Ones(N);
-  const Box box = make_box(inputs, range);
-
-  // The grid: one factorisation a cell for all P functions. An unknown mean is projected out.
   Eigen::MatrixXd centred = targets;
   if (mean) {
     centred.array() -= *mean;
@@ -100,7 +90,7 @@ std::vector<GpPrior> maximize_marginal_likelihood(const Eigen::MatrixXd& inputs,
   for (const Eigen::VectorXd& shape : coarse_grid(box)) {
     const GpPrior prior = unit_prior(shape, mean);
     Eigen::MatrixXd K = prior.kernel.covariance(inputs, inputs);
-    K.diagonal() += prior.noise_variance * scales_of_noise;
+    K.diagonal() += prior.noise_variance * noise_scales;
     const Eigen::LLT<Eigen::MatrixXd> llt(K);
     if (llt.info() != Eigen::Success) continue;
     double log_det = 2 * llt.matrixLLT().diagonal().array().log().sum();
@@ -120,7 +110,28 @@ std::vector<GpPrior> maximize_marginal_likelihood(const Eigen::MatrixXd& inputs,
       shapes[p] = shape;
     }
   }
+  return shapes;
+}
 
+}  // namespace
+
+std::vector<GpPrior> maximize_marginal_likelihood(const Eigen::MatrixXd& inputs,
+                                                  const Eigen::MatrixXd& targets,
+                                                  const Eigen::VectorXd& noise_scales,
+                                                  std::optional<double> mean,
+                                                  const HyperParameterRange& range) {
+  const Eigen::Index N = inputs.cols(), P = targets.cols();
+  if (inputs.rows() < 1 || N < 1 || targets.rows() != N ||
+      (noise_scales.size() > 0 && noise_scales.size() != N))
+    throw std::invalid_argument("hyper-parameters: inputs must be D×N, targets N×P, with D, N ≥ 1");
+  if (!inputs.allFinite() || !targets.allFinite() || !noise_scales.allFinite())
+    throw std::invalid_argument("hyper-parameters: inputs and targets must be finite");
+  const Eigen::VectorXd scales_of_noise =
+      noise_scales.size() > 0 ? noise_scales : Eigen::VectorXd::Ones(N);
+  const Box box = make_box(inputs, range);
+
+  const std::vector<Eigen::VectorXd> shapes =
+      best_cells(inputs, targets, scales_of_noise, mean, range, box);
   std::vector<GpPrior> result;
   for (Eigen::Index p = 0; p < P; ++p) {
     const auto fitted = [&](const Eigen::VectorXd& shape) {

@@ -3,24 +3,22 @@
 #include <algorithm>
 #include <stdexcept>
 
-#include "common/schema/kinematic_path.h"
+#include "common/kinematics/kinematic_path.h"
+#include "common/kinematics/kinematic_tree.h"
+#include "common/kinematics/screw_chain.h"
 
 namespace bodyschema {
 namespace {
 
-// Exp of the screw (0, 0, slide, 0, 0, turn) scaled by the joint's displacement.
-Pose screw_motion(const ScrewJoint& joint, double displacement) {
-  Pose X = Pose::Identity();
-  X.linear() =
-      Eigen::AngleAxisd(joint.turn * displacement, Eigen::Vector3d::UnitZ()).toRotationMatrix();
-  X.translation().z() = joint.slide * displacement;
-  return X;
-}
-
-double screw_displacement(const ScrewJoint& joint, const Eigen::VectorXd& theta) {
-  if (joint.signal < 0 || joint.signal >= theta.size())
-    throw std::invalid_argument("action has no signal " + std::to_string(joint.signal));
-  return joint.gain * theta(joint.signal) + joint.offset;
+// The chain left · ∏ Exp(ŝ ϑ) X_after of an edge at an action.
+auto chain_of(const Edge& edge, const Eigen::VectorXd& theta) {
+  return ScrewChain(edge.left, static_cast<int>(edge.joints.size()), [&edge, &theta](int d) {
+    const ScrewJoint& joint = edge.joints[static_cast<std::size_t>(d)];
+    if (joint.signal < 0 || joint.signal >= theta.size())
+      throw std::invalid_argument("action has no signal " + std::to_string(joint.signal));
+    return ScrewLink{
+        {joint.slide, joint.turn}, joint.gain * theta(joint.signal) + joint.offset, joint.X_after};
+  });
 }
 
 void check_size(const BodySchema& schema, const Eigen::VectorXd& action) {
@@ -67,9 +65,7 @@ std::vector<int> Edge::signals() const {
 
 Pose Edge::predict(const Eigen::VectorXd& theta) const {
   if (matrix_gp) return left * matrix_gp->predict(theta) * right;
-  Pose X = left;
-  for (const ScrewJoint& joint : joints)
-    X = X * screw_motion(joint, screw_displacement(joint, theta)) * joint.X_after;
+  Pose X = chain_of(*this, theta).predict();
   if (residual_gp) X = X * exp(residual_gp->mean(theta));
   return X * right;
 }
@@ -77,38 +73,23 @@ Pose Edge::predict(const Eigen::VectorXd& theta) const {
 Eigen::MatrixXd Edge::jacobian(const Eigen::VectorXd& theta) const {
   if (matrix_gp) return adjoint(right.inverse()) * matrix_gp->jacobian(theta);
   Eigen::MatrixXd J = Eigen::MatrixXd::Zero(6, theta.size());
-  Pose suffix = right;  // what follows the joint's own motion, which commutes with its screw
+  Pose suffix = right;
   if (residual_gp) {
     const Residual residual(*residual_gp, theta, right);
     J = residual.by_mean * residual_gp->mean_gradient(theta);
     suffix = residual.suffix;
   }
-  for (auto joint = joints.rbegin(); joint != joints.rend(); ++joint) {
-    const double displacement = screw_displacement(*joint, theta);
-    suffix = joint->X_after * suffix;
-    const Matrix6d A = adjoint(suffix.inverse());
-    J.col(joint->signal) += joint->gain * (joint->slide * A.col(2) + joint->turn * A.col(5));
-    suffix = screw_motion(*joint, displacement) * suffix;
-  }
+  Eigen::MatrixXd by_displacements;
+  chain_of(*this, theta).predict_by_displacements(&by_displacements, suffix);
+  for (std::size_t d = joints.size(); d-- > 0;)
+    J.col(joints[d].signal) += joints[d].gain * by_displacements.col(static_cast<Eigen::Index>(d));
   return J;
 }
 
 Eigen::MatrixXd Edge::parameter_jacobian(const Eigen::VectorXd& theta) const {
-  Eigen::MatrixXd G(6, 6 + 8 * static_cast<Eigen::Index>(joints.size()));
-  // From the last parameter to the first.
-  Pose suffix = residual_gp ? Residual(*residual_gp, theta, right).suffix : right;
-  for (std::size_t d = joints.size(); d-- > 0;) {
-    const ScrewJoint& joint = joints[d];
-    const double displacement = screw_displacement(joint, theta);
-    const Eigen::Index column = 6 + 8 * static_cast<Eigen::Index>(d);
-    G.middleCols<6>(column + 2) = adjoint(suffix.inverse());
-    suffix = joint.X_after * suffix;
-    const Matrix6d A = adjoint(suffix.inverse());
-    G.col(column) = displacement * A.col(2);
-    G.col(column + 1) = displacement * A.col(5);
-    suffix = screw_motion(joint, displacement) * suffix;
-  }
-  G.leftCols<6>() = adjoint(suffix.inverse());
+  Eigen::MatrixXd G;
+  chain_of(*this, theta)
+      .predict_by_parameters(&G, residual_gp ? Residual(*residual_gp, theta, right).suffix : right);
   return G;
 }
 
@@ -208,20 +189,12 @@ std::map<int, Pose> BodySchema::predict_all(const Eigen::VectorXd& action) const
   std::map<int, Pose> X_RB;
   if (root < 0) return X_RB;
   X_RB.emplace(root, Pose::Identity());
-  // Edges come ordered from the root outwards; the loop repeats only if somebody reordered them.
-  for (bool grown = true; grown;) {
-    grown = false;
-    for (const Edge& edge : edges) {
-      const auto from = X_RB.find(edge.from);
-      const auto to = X_RB.find(edge.to);
-      if ((from == X_RB.end()) == (to == X_RB.end())) continue;
-      const Pose X = edge.predict(theta);
-      if (to == X_RB.end())
-        X_RB.emplace(edge.to, from->second * X);
-      else
-        X_RB.emplace(edge.from, to->second * X.inverse());
-      grown = true;
-    }
+  const KinematicTree tree(edges, root);
+  for (const KinematicTree::Node& node : tree.nodes()) {
+    if (node.parent < 0) continue;
+    const Pose X = edges[static_cast<std::size_t>(node.edge)].predict(theta);
+    X_RB.emplace(node.part, X_RB.at(tree.nodes()[static_cast<std::size_t>(node.parent)].part) *
+                                (node.is_forward ? X : X.inverse()));
   }
   return X_RB;
 }

@@ -3,18 +3,22 @@
 #include <algorithm>
 #include <cmath>
 
+#include "common/kinematics/screw_chain.h"
+
 namespace bodyschema {
 
 std::vector<JointDeviation> joint_deviations(const Edge& edge, const Eigen::VectorXd& theta) {
   const Eigen::MatrixXd& P = edge.parameter_covariance;
-  const Eigen::Index size = 6 + 8 * static_cast<Eigen::Index>(edge.joints.size());
+  const Eigen::Index size = ScrewChainLayout::size(static_cast<int>(edge.joints.size()));
   std::vector<JointDeviation> result;
   if (P.rows() != size || P.cols() != size) return result;
   const auto sum = [&](Eigen::Index x) { return P(x, x) + P(x + 1, x + 1); };  // about x and y
-  Eigen::Index before = 0;  // of the transform that the joint's frame ends
   for (std::size_t d = 0; d < edge.joints.size(); ++d) {
     const ScrewJoint& joint = edge.joints[d];
-    const Eigen::Index slide = 6 + 8 * static_cast<Eigen::Index>(d), after = slide + 2;
+    const int at = static_cast<int>(d);
+    const Eigen::Index before = ScrewChainLayout::transform(at);  // ends in the joint's frame
+    const Eigen::Index slide = ScrewChainLayout::slide(at), turn = ScrewChainLayout::turn(at);
+    const Eigen::Index after = ScrewChainLayout::transform(at + 1);
     const Matrix6d A = adjoint(joint.X_after);
     // What a screw frame gains along its axis the transform that follows loses.
     const auto along = [&](Eigen::Index axis, Eigen::Index rate) {
@@ -30,10 +34,9 @@ std::vector<JointDeviation> joint_deviations(const Edge& edge, const Eigen::Vect
     result.push_back({.axis_position_m = std::sqrt(std::max(position, 0.0) / 2),
                       .axis_tilt_rad = std::sqrt(sum(before + 3) / 2),
                       .displacement_m = along(2, slide),
-                      .displacement_rad = along(5, slide + 1),
+                      .displacement_rad = along(5, turn),
                       .slide = std::sqrt(P(slide, slide)),
-                      .turn = std::sqrt(P(slide + 1, slide + 1))});
-    before = after;
+                      .turn = std::sqrt(P(turn, turn))});
   }
   return result;
 }

@@ -7,8 +7,8 @@
 #include <stdexcept>
 #include <string>
 
+#include "common/estimation/quantile.h"
 #include "common/geometry/angle.h"
-#include "common/statistics/median.h"
 
 namespace bodyschema {
 namespace {

@@ -3,7 +3,7 @@
 #include <map>
 #include <utility>
 
-#include "common/statistics/median.h"
+#include "common/estimation/quantile.h"
 #include "processes/console/recording.h"
 
 namespace bodyschema {

@@ -7,6 +7,8 @@
 #include <random>
 #include <stdexcept>
 
+#include "common/kinematics/kinematic_tree.h"
+
 namespace bodyschema {
 namespace {
 
@@ -59,20 +61,15 @@ Eigen::VectorXd damped_step(Eigen::MatrixXd J, const Eigen::Vector3d& e, double 
 }  // namespace
 
 std::optional<BodySchema> chain_to(const BodySchema& schema, int part) {
+  const KinematicTree tree(schema.edges, schema.root);
+  const int end = tree.node_of(part);
+  if (end < 0) return std::nullopt;
   BodySchema chain = schema;
   chain.edges.clear();
-  // `from` is nearer to the root, so each part is the `to` of one edge at most.
-  for (int at = part; at != schema.root;) {
-    const auto edge = std::find_if(schema.edges.begin(), schema.edges.end(),
-                                   [&](const Edge& candidate) { return candidate.to == at; });
-    if (edge == schema.edges.end() || chain.edges.size() == schema.edges.size()) {
-      return std::nullopt;
-    }
-    chain.edges.push_back(*edge);
+  for (const int node : tree.path_to(end)) {
+    chain.edges.push_back(schema.edges[tree.nodes()[node].edge]);
     chain.edges.back().parameter_covariance.resize(0, 0);
-    at = edge->from;
   }
-  std::reverse(chain.edges.begin(), chain.edges.end());
   return chain;
 }
 

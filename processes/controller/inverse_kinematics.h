@@ -4,7 +4,7 @@
 #include <optional>
 #include <vector>
 
-#include "common/schema/kinematic_path.h"
+#include "common/kinematics/kinematic_path.h"
 
 namespace bodyschema {
 

@@ -6,8 +6,8 @@
 #include <set>
 #include <stdexcept>
 
+#include "common/estimation/quantile.h"
 #include "common/geometry/angle.h"
-#include "common/statistics/median.h"
 #include "processes/model_monitor/schema_difference.h"
 
 namespace bodyschema {

@@ -5,7 +5,9 @@
 #include <cmath>
 #include <limits>
 
-#include "common/statistics/student_t.h"
+#include "common/estimation/levenberg_marquardt.h"
+#include "common/estimation/student_t.h"
+#include "common/kinematics/screw_chain.h"
 #include "processes/model_monitor/learned_edge.h"
 
 namespace bodyschema {
@@ -14,8 +16,7 @@ namespace {
 using Form = BodyChange::Form;
 
 constexpr int kIterations = 16;
-constexpr double kLargestStep =
-    0.7;  // of θ, in prior standard deviations of a transform: m and rad
+constexpr double kLargestStep = 2.1;  // of θ, in prior standard deviations
 /// Starts that are followed up.
 constexpr std::size_t kClimbs = 4;
 /// Evidence behind the best change of a place, by the place's measurements, that all observations
@@ -173,7 +174,7 @@ std::vector<Pose> PlaceEvidence::predict(const BodyChange& change, const Eigen::
       // The last parameter is a displacement, that of a gain before it multiplies one.
       out.rightCols<1>() = adjoint(suffix.inverse()) *
                            screws.parameter_jacobian(m.displacements)
-                               .middleCols<6>(8 + 8 * static_cast<Eigen::Index>(joint)) *
+                               .middleCols<6>(ScrewChainLayout::transform(change.joint + 1)) *
                            displacement_twist(old);
       if (change.form == Form::kGain)
         out.col(0) = old.gain * m.displacements(old.signal) * out.col(1);
@@ -268,7 +269,7 @@ double PlaceEvidence::cost(const BodyChange& change, const Eigen::VectorXd& thet
   for (std::size_t n = 0; n < measurements_.size(); ++n) {
     const double d2 = r.segment<6>(6 * static_cast<Eigen::Index>(n)).squaredNorm();
     if (robust) {
-      sum += (kStudentNu + 6) / 2 * std::log1p(d2 / kStudentNu);
+      sum += robust_cost(d2);
     } else {
       const double inlier = log_inlier(n, d2);
       sum -= std::max(inlier, flat) + std::log1p(std::exp(-std::abs(inlier - flat)));
@@ -283,10 +284,11 @@ PlaceEvidence::State PlaceEvidence::climb(const BodyChange& change, Eigen::Vecto
   const double flat = log_flat_outlier();
   const std::size_t count = measurements_.size();
   State state;
-  double damping = 1e-3;
+  const LevenbergMarquardt fresh(1e-3, 1e-9, 5);
+  LevenbergMarquardt optimizer = fresh;
   for (int iteration = 0; iteration < kIterations; ++iteration) {
     const bool robust = iteration < kIterations / 2;
-    if (iteration == kIterations / 2) damping = 1e-3;
+    if (iteration == kIterations / 2) optimizer = fresh;
     Eigen::MatrixXd J;
     const Eigen::VectorXd r = residuals(change, theta, &J);
     Eigen::MatrixXd H = prior.asDiagonal();
@@ -294,7 +296,7 @@ PlaceEvidence::State PlaceEvidence::climb(const BodyChange& change, Eigen::Vecto
     for (std::size_t n = 0; n < count; ++n) {
       const auto at = 6 * static_cast<Eigen::Index>(n);
       const double d2 = r.segment<6>(at).squaredNorm();
-      const double w = robust ? (kStudentNu + 6) / (kStudentNu + d2)
+      const double w = robust ? robust_weight(d2)
                               : 1 / (1 + std::exp(std::min(flat - log_inlier(n, d2), 500.0)));
       H += w * J.middleRows<6>(at).transpose() * J.middleRows<6>(at);
       g += w * J.middleRows<6>(at).transpose() * r.segment<6>(at);
@@ -303,24 +305,16 @@ PlaceEvidence::State PlaceEvidence::climb(const BodyChange& change, Eigen::Vecto
     const double before = cost(change, theta, robust);
     state.theta = theta;
     state.cost = before;
-    bool improved = false;
     double gain = 0;
-    for (int attempt = 0; attempt < 5 && !improved; ++attempt) {
-      Eigen::MatrixXd damped = H;
-      damped.diagonal() *= 1 + damping;
-      Eigen::VectorXd step = -damped.ldlt().solve(g);
+    const bool improved = optimizer.step(H, g, [&](Eigen::VectorXd step) {
       const double longest = step.cwiseQuotient(sigma.cwiseMax(1e-9)).cwiseAbs().maxCoeff();
-      if (longest > 3 * kLargestStep) step *= 3 * kLargestStep / longest;
+      if (longest > kLargestStep) step *= kLargestStep / longest;
       const double after = cost(change, theta + step, robust);
-      if (after < before) {
-        theta += step;
-        gain = before - after;
-        improved = true;
-        damping = std::max(damping / 10, 1e-9);
-      } else {
-        damping *= 10;
-      }
-    }
+      if (!(after < before)) return false;
+      theta += step;
+      gain = before - after;
+      return true;
+    });
     if (!improved || gain < 1e-4) {
       if (!robust) break;
       iteration = std::max(iteration, kIterations / 2 - 1);

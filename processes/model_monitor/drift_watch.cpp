@@ -6,7 +6,7 @@
 #include <cmath>
 #include <utility>
 
-#include "common/statistics/student_t.h"
+#include "common/estimation/student_t.h"
 #include "processes/model_monitor/body_change.h"
 #include "processes/model_monitor/change_fit.h"
 

@@ -9,9 +9,9 @@
 #include "common/bus/convert.h"
 #include "common/config/rig.h"
 #include "common/config/yaml.h"
+#include "common/estimation/quantile.h"
 #include "common/geometry/angle.h"
-#include "common/schema/kinematic_path.h"
-#include "common/statistics/median.h"
+#include "common/kinematics/kinematic_path.h"
 
 namespace bodyschema {
 namespace {

@@ -21,24 +21,6 @@ constexpr double kSlack = 0.3;
 /// A parameter of a model's own line is free within this many half ranges.
 constexpr double kFree = 10;
 
-/// ∂Δ/∂q_d of the normalised signal of joint d, right perturbation in frame j: 6 × num_joints.
-using MotionJacobian = Eigen::Matrix<double, 6, Eigen::Dynamic, 0, 6, kMaxJoints>;
-
-MotionJacobian motion_jacobian(const LocalModel& model, const NormalizedActions& actions,
-                               int sample) {
-  MotionJacobian J(6, model.num_joints);
-  Pose suffix = Pose::Identity();
-  for (int d = model.num_joints; d-- > 0;) {
-    suffix = model.A[d + 1] * suffix;
-    Vector6d screw = Vector6d::Zero();
-    screw(2) = model.slide[d];
-    screw(5) = model.turn[d];
-    J.col(d) = adjoint(suffix.inverse()) * screw;
-    suffix = exp(screw * actions(sample, model.signal[d])) * suffix;
-  }
-  return J;
-}
-
 /// The pair with Σ_z + J σ² Jᵀ in place of Σ_z.
 PairData with_slack(const PairData& pair, const LocalModel& model,
                     const NormalizedActions& actions) {
@@ -57,7 +39,7 @@ PairData with_slack(const PairData& pair, const LocalModel& model,
   return result;
 }
 
-/// What one model says about θ of one of its signals at one instant.
+/// A model's measurement of θ of one of its signals at one instant.
 struct Reading {
   int sample = 0;
   double theta = 0;      ///< [half ranges], in the model's own line
@@ -123,7 +105,7 @@ bool ask(const NormalizedActions& actions, Witness* witness) {
 }
 
 struct Regression {
-  /// Of the basis, as a share of the models' mean slope b: what a model's own gain is drops out.
+  /// Weights of the basis over the models' mean slope b: a model's own gain drops out.
   Eigen::VectorXd weights;
   double evidence = 0;  ///< log marginal likelihood over that of lines alone [nats]
 };

@@ -7,10 +7,11 @@
 #include <set>
 #include <stdexcept>
 
-#include "common/schema/kinematic_path.h"
+#include "common/kinematics/kinematic_path.h"
 #include "processes/structure_learner/command_warp.h"
 #include "processes/structure_learner/noise_estimate.h"
 #include "processes/structure_learner/residual_fit.h"
+#include "processes/structure_learner/soft_parts.h"
 #include "processes/structure_learner/structure_search.h"
 #include "processes/structure_learner/tree_fit.h"
 

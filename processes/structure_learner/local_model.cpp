@@ -4,15 +4,18 @@
 #include <cmath>
 #include <limits>
 
+#include "common/estimation/levenberg_marquardt.h"
+
 namespace bodyschema {
 namespace {
 
-Pose screw_motion(double slide, double turn, double q) {
-  Pose X = Pose::Identity();
-  const double c = std::cos(turn * q), s = std::sin(turn * q);
-  X.linear() << c, -s, 0, s, c, 0, 0, 0, 1;
-  X.translation().z() = slide * q;
-  return X;
+using Layout = ScrewChainLayout;
+
+auto chain_of(const LocalModel& model, const NormalizedActions& actions, int sample) {
+  return ScrewChain(model.A[0], model.num_joints, [&model, &actions, sample](int d) {
+    return ScrewLink{
+        {model.slide[d], model.turn[d]}, actions(sample, model.signal[d]), model.A[d + 1]};
+  });
 }
 
 // Whitened residual and its Jacobian: log((Δ̂ exp δ)⁻¹ z) = r − J_l⁻¹(r) δ + O(δ²).
@@ -103,10 +106,7 @@ bool LocalModel::uses(int s) const {
 }
 
 Pose LocalModel::predict(const NormalizedActions& actions, int sample) const {
-  Pose X = A[0];
-  for (int d = 0; d < num_joints; ++d)
-    X = X * screw_motion(slide[d], turn[d], actions(sample, signal[d])) * A[d + 1];
-  return X;
+  return chain_of(*this, actions, sample).predict();
 }
 
 LocalModel LocalModel::inverse() const {
@@ -123,36 +123,23 @@ LocalModel LocalModel::inverse() const {
 
 Pose predict_with_jacobian(const LocalModel& model, const NormalizedActions& actions, int sample,
                            ParameterJacobian* jacobian) {
-  ParameterJacobian& J = *jacobian;
-  J.resize(6, model.num_parameters());
-  Pose suffix = Pose::Identity();
-  for (int d = model.num_joints; d-- > 0;) {
-    const double q = actions(sample, model.signal[d]);
-    const int column = 6 + 8 * d;
-    J.middleCols<6>(column + 2) = adjoint(suffix.inverse());
-    suffix = model.A[d + 1] * suffix;
-    // Exp(ŝq) commutes with ŝ, so the screw's own motion drops out of the suffix. The columns are
-    // those of Ad(suffix⁻¹) for translation along and rotation about z.
-    const Eigen::Vector3d z_axis = suffix.linear().row(2).transpose();
-    J.col(column) << q * z_axis, Eigen::Vector3d::Zero();
-    J.col(column + 1) << q * (suffix.linear().transpose() *
-                              Eigen::Vector3d(-suffix.translation().y(), suffix.translation().x(),
-                                              0)),
-        q * z_axis;
-    suffix = screw_motion(model.slide[d], model.turn[d], q) * suffix;
-  }
-  J.leftCols<6>() = adjoint(suffix.inverse());
-  return model.A[0] * suffix;
+  return chain_of(model, actions, sample).predict_by_parameters(jacobian);
+}
+
+MotionJacobian motion_jacobian(const LocalModel& model, const NormalizedActions& actions,
+                               int sample) {
+  MotionJacobian J;
+  chain_of(model, actions, sample).predict_by_displacements(&J);
+  return J;
 }
 
 LocalModel perturbed(const LocalModel& model, const ParameterVector& step) {
   LocalModel result = model;
   result.A[0] = model.A[0] * exp(step.head<6>());
   for (int d = 0; d < model.num_joints; ++d) {
-    const int row = 6 + 8 * d;
-    result.slide[d] += step(row);
-    result.turn[d] += step(row + 1);
-    result.A[d + 1] = model.A[d + 1] * exp(step.segment<6>(row + 2));
+    result.slide[d] += step(Layout::slide(d));
+    result.turn[d] += step(Layout::turn(d));
+    result.A[d + 1] = model.A[d + 1] * exp(step.segment<6>(Layout::transform(d + 1)));
   }
   return result;
 }
@@ -194,30 +181,17 @@ Fit fit_local_model(const LocalModel& start, const PairData& pair, const Normali
   Fit fit = evaluate(start, pair, actions);
   ParameterMatrix H;
   ParameterVector g;
-  double damping = 1e-4;
+  LevenbergMarquardt optimizer(1e-4, 1e-10, 8);
   for (int iteration = 0; iteration < max_iterations; ++iteration) {
     normal_equations(fit, pair, actions, &H, &g);
-    bool improved = false;
     double decrease = 0;
-    for (int attempt = 0; attempt < 8 && !improved; ++attempt) {
-      ParameterMatrix damped = H;
-      damped.diagonal() += damping * H.diagonal();
-      damped.diagonal().array() += 1e-14 * H.diagonal().maxCoeff();
-      const Eigen::LLT<ParameterMatrix> llt(damped);
-      if (llt.info() == Eigen::Success) {
-        const ParameterVector step = -llt.solve(g);
-        if (step.allFinite()) {
-          Fit candidate = evaluate(perturbed(fit.model, step), pair, actions);
-          if (candidate.cost < fit.cost) {
-            decrease = fit.cost - candidate.cost;
-            fit = std::move(candidate);
-            improved = true;
-            damping = std::max(damping / 10, 1e-10);
-          }
-        }
-      }
-      if (!improved) damping *= 10;
-    }
+    const bool improved = optimizer.step(H, g, [&](const ParameterVector& step) {
+      Fit candidate = evaluate(perturbed(fit.model, step), pair, actions);
+      if (!(candidate.cost < fit.cost)) return false;
+      decrease = fit.cost - candidate.cost;
+      fit = std::move(candidate);
+      return true;
+    });
     // Residuals far below the noise go on to the end of the arithmetic: it costs a step or two.
     if (!improved || (decrease < tolerance && fit.cost > 1e-3 * pair.size())) break;
     // Stuck where no model is valid (a valid one costs about 5 a frame, outliers 30).
@@ -250,7 +224,7 @@ LeaveOneOut leave_one_out(const Fit& fit, const PairData& pair, const Normalized
 
   result.squared_distance.reserve(pair.size());
   result.residual.reserve(pair.size());
-  if (actions.blocks().is_dense()) {
+  if (actions.blocks().is_stream()) {
     leave_blocks_out(fit, pair, actions, root, &result);
     return result;
   }

@@ -3,14 +3,15 @@
 #include <array>
 #include <vector>
 
-#include "common/statistics/student_t.h"
+#include "common/estimation/student_t.h"
+#include "common/kinematics/screw_chain.h"
 #include "processes/structure_learner/pair_data.h"
 
 namespace bodyschema {
 
 /// Largest number of joints inside one local model.
 inline constexpr int kMaxJoints = 2;
-inline constexpr int kMaxParameters = 6 + 8 * kMaxJoints;
+inline constexpr int kMaxParameters = ScrewChainLayout::size(kMaxJoints);
 
 /// A local model in the learner's own terms, over normalised signals q ∈ [−1, 1]:
 ///   Δ(q) = A_0 ∏_d Exp(ŝ_d q_d) A_d,  ŝ_d = (0, 0, slide_d, 0, 0, turn_d)
@@ -23,7 +24,7 @@ struct LocalModel {
   std::array<double, kMaxJoints> turn{};   ///< [rad per half range]
   std::array<Pose, kMaxJoints + 1> A{Pose::Identity(), Pose::Identity(), Pose::Identity()};
 
-  int num_parameters() const { return 6 + 8 * num_joints; }
+  int num_parameters() const { return ScrewChainLayout::size(num_joints); }
   bool uses(int s) const;
   /// Pose of j in i at sample `sample`.
   Pose predict(const NormalizedActions& actions, int sample) const;
@@ -36,10 +37,14 @@ using ParameterMatrix =
     Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, 0, kMaxParameters, kMaxParameters>;
 using ParameterVector = Eigen::Matrix<double, Eigen::Dynamic, 1, 0, kMaxParameters, 1>;
 
-/// Prediction and its Jacobian ∂(right perturbation)/∂parameters; parameters in the order A_0
-/// tangent (6), then per joint slide, turn, A_d tangent (6).
+/// Prediction and its Jacobian ∂(right perturbation)/∂parameters, in the order of ScrewChainLayout.
 Pose predict_with_jacobian(const LocalModel& model, const NormalizedActions& actions, int sample,
                            ParameterJacobian* jacobian);
+
+/// ∂Δ/∂q_d of the normalised signal of joint d, right perturbation in frame j: 6 × num_joints.
+using MotionJacobian = Eigen::Matrix<double, 6, Eigen::Dynamic, 0, 6, kMaxJoints>;
+MotionJacobian motion_jacobian(const LocalModel& model, const NormalizedActions& actions,
+                               int sample);
 
 /// The model moved by a parameter step.
 LocalModel perturbed(const LocalModel& model, const ParameterVector& step);

@@ -7,7 +7,7 @@
 #include <numeric>
 #include <set>
 
-#include "common/statistics/median.h"
+#include "common/estimation/quantile.h"
 #include "processes/structure_learner/screen.h"
 
 namespace bodyschema {
@@ -124,7 +124,7 @@ std::optional<Noise> noise_from_repeats(const std::vector<ActionPoseSample>& sam
 // uniform. The white part of the noise, whatever the model.
 std::optional<Noise> noise_from_neighbours(const std::vector<ActionPoseSample>& samples,
                                            const NormalizedActions& actions) {
-  if (!actions.blocks().is_dense()) return std::nullopt;
+  if (!actions.blocks().is_stream()) return std::nullopt;
   std::vector<NoiseResidual> residuals;
   for (std::size_t t = 1; t + 1 < samples.size(); ++t)
     for (const PartObservation& o : samples[t].parts) {

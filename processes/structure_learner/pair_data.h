@@ -3,10 +3,10 @@
 #include <vector>
 
 #include "common/estimation/measurement_model.h"
+#include "common/estimation/time_blocks.h"
 #include "common/geometry/pose.h"
 #include "common/schema/body_schema.h"
 #include "common/schema/sample.h"
-#include "processes/structure_learner/time_blocks.h"
 
 namespace bodyschema {
 

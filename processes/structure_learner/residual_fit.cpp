@@ -4,22 +4,15 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
-#include <map>
-#include <set>
-#include <tuple>
 
+#include "common/estimation/quantile.h"
 #include "common/gp/minimize_in_box.h"
-#include "common/statistics/median.h"
 
 namespace bodyschema {
 namespace {
 
-constexpr int kMaxFrames = 600;
-// Fewer independent frames than this per signal say too little of a function of them.
-constexpr int kLeastFrames = 30;
 constexpr int kMaxInputs = 12;
 constexpr std::size_t kLeastSamples = 10;
-constexpr double kMedianChi6 = 5.348;
 constexpr int kIterations = 15, kDropIterations = 8;  // of the marginal likelihood
 // A signal stays if the blocks left out miss it by this [nats] and by so many of its standard
 // errors: what few blocks say may be noise. Of 150 chains with a signal without effect two kept it
@@ -27,8 +20,6 @@ constexpr int kIterations = 15, kDropIterations = 8;  // of the marginal likelih
 constexpr double kMissed = 10, kMissedErrors = 2;
 // Trace of the whitened covariance of a prediction: 6 is that of a measurement.
 constexpr double kLargestUncertainty = 6;
-constexpr int kScreenFrames = 150;
-constexpr std::size_t kPairsTried = 3;  // between two components
 
 struct Blocks {
   std::vector<int> of_frame;  // ascending from 0
@@ -97,7 +88,7 @@ class Fitter {
     std::vector<double> distances;
     for (const FrameFit& f : fit.frames) distances.push_back(f.squared_distance);
     // Against the model's own errors, not the noise: what it cannot explain is no outlier yet.
-    const double scale = std::max(1.0, upper_median(distances) / kMedianChi6);
+    const double scale = std::max(1.0, upper_median(distances) / chi_square_median(6));
     targets_.frames = fit.frames;
     set_targets();
     for (int t = 0; t < pair.size(); ++t) targets_.weights(t) = robust_weight(distances[t] / scale);
@@ -122,7 +113,7 @@ class Fitter {
     return result;
   }
 
-  // Whether the blocks that were left out, most of them, were predicted better with all signals.
+  // True if the left-out blocks, taken together, were predicted better with all signals.
   bool misses(const Fitter& fewer) const {
     double sum = 0, squares = 0;
     for (std::size_t b = 0; b < block_density_.size(); ++b) {
@@ -271,18 +262,16 @@ class Fitter {
     shape_ = unpack(minimize_in_box(objective, v, lower, upper, 1e-2, 1.5, max_iterations).x);
   }
 
-  // What the model says about every frame without the frame's block, in closed form: with
-  // P = K⁻¹, the precision of the remaining samples is P_RR − P_RB P_BB⁻¹ P_BR.
-  void judge() {
+  // Mean and variance of every coordinate at every frame, without the frame's block, in closed
+  // form: with P = K⁻¹, the precision of the remaining samples is P_RR − P_RB P_BB⁻¹ P_BR.
+  void leave_blocks_out(ResidualGp::Residuals* mean, ResidualGp::Residuals* variance) const {
     const int n = pair_->size();
     const auto N = static_cast<Eigen::Index>(samples_.size());
-    const Eigen::VectorXd lengths = shape_.log_lengths.array().exp();
-    const Kernel unit(SquaredExponential{1, lengths});
+    const Kernel unit(SquaredExponential{1, shape_.log_lengths.array().exp()});
     const Eigen::MatrixXd x = inputs_(Eigen::all, samples_);
     const Eigen::MatrixXd K = unit.covariance(x, x);
     const Eigen::MatrixXd k = unit.covariance(x, inputs_);  // N×n
     const Eigen::VectorXd scales = noise_scales();
-    ResidualGp::Residuals mean(6, n), variance(6, n);
     for (int c = 0; c < 6; ++c) {
       const double v = std::exp(shape_.log_variances(c));
       Eigen::MatrixXd K_c = v * K;
@@ -305,11 +294,18 @@ class Fitter {
           alpha_R -= P_B * P_BB.solve(alpha(out));
         }
         for (int t = first; t < last; ++t) {
-          mean(c, t) = v * k.col(t).dot(alpha_R);
-          variance(c, t) = std::max(0.0, v - v * v * k.col(t).dot(P_R * k.col(t)));
+          (*mean)(c, t) = v * k.col(t).dot(alpha_R);
+          (*variance)(c, t) = std::max(0.0, v - v * v * k.col(t).dot(P_R * k.col(t)));
         }
       }
     }
+  }
+
+  // The model's judgement on every frame without the frame's block.
+  void judge() {
+    const int n = pair_->size();
+    ResidualGp::Residuals mean(6, n), variance(6, n);
+    leave_blocks_out(&mean, &variance);
     judged_ = SoftFit{};
     judged_.frames.resize(n);
     judged_.squared_distance.resize(n);
@@ -363,32 +359,42 @@ class Fitter {
   SoftFit judged_;
 };
 
-// The screws that leave least: rigid, the best joint or the best two.
-LocalModel best_screws(const PairData& pair, const NormalizedActions& actions, int max_signals,
-                       SearchResult* counted) {
-  std::vector<Start> starts{screen_rigid(pair, actions)};
-  const RelativeMotions motions = relative_motions(pair, 300);
-  if (max_signals >= 1) {
-    const auto regressions = screen_one_joint(motions, actions);
-    if (!regressions.empty())
-      starts.push_back(one_joint_start(regressions[0], pair, actions, motions.sigma_rad));
+// Backwards: the signal that is missed least goes first.
+void drop_signals(Fitter* fitter) {
+  while (fitter->signals().size() > 1) {
+    const Fitter full = *fitter;
+    std::optional<Fitter> best;
+    for (std::size_t d = 0; d < full.signals().size(); ++d) {
+      Fitter without = full;
+      std::vector<int> fewer = full.signals();
+      fewer.erase(fewer.begin() + static_cast<std::ptrdiff_t>(d));
+      Shape shape = full.shape();
+      Eigen::VectorXd lengths(fewer.size());
+      for (std::size_t n = 0; n < fewer.size(); ++n)
+        lengths(static_cast<Eigen::Index>(n)) =
+            shape.log_lengths(static_cast<Eigen::Index>(n < d ? n : n + 1));
+      shape.log_lengths = lengths;
+      if (!without.fit(fewer, &shape, kDropIterations)) continue;
+      if (!best || without.judged().log_density > best->judged().log_density)
+        best.emplace(std::move(without));
+    }
+    if (!best || full.misses(*best)) break;
+    *fitter = std::move(*best);
   }
-  if (max_signals >= 2) {
-    const std::vector<std::vector<double>> turns(actions.num_signals(), default_turns());
-    for (Start& s : screen_two_joints(pair, actions, motions, turns, 2))
-      starts.push_back(std::move(s));
-  }
-  std::optional<Fit> best;
-  double best_cost = 0;
-  for (const Start& start : starts) {
-    Fit fit = fit_local_model(start.model, pair, actions, 20, 1e-2);
-    ++counted->num_fits;
-    const double cost = fit.cost + 6 * fit.model.num_joints * std::log(6.0 * pair.size());
-    if (best && cost >= best_cost) continue;
-    best_cost = cost;
-    best = std::move(fit);
-  }
-  return best->model;
+}
+
+// As V1 judges screws, and by how much of the prediction is known.
+Verdict verdict_of(const SoftFit& fit, int num_independent, const ValidityOptions& options) {
+  const auto num_frames = static_cast<double>(fit.frames.size());
+  const double share = num_independent / num_frames;
+  const double inliers = num_frames - fit.num_outliers;
+  const double max_outliers =
+      std::min(binomial_quantile(num_independent, pair_outlier_rate(options), 0.9997) / share,
+               0.35 * num_frames);
+  if (fit.num_outliers > max_outliers ||
+      fit.mean_inlier > largest_inlier_mean(std::max(1.0, share * inliers), 3))
+    return Verdict::kRefuted;
+  return fit.mean_uncertainty > kLargestUncertainty ? Verdict::kNotEnoughData : Verdict::kValid;
 }
 
 }  // namespace
@@ -400,7 +406,7 @@ std::optional<SoftFit> fit_soft_model(const LocalModel& screws, const PairData& 
   if (actions.moving().empty() || pair.size() == 0) return std::nullopt;
   Fitter fitter(screws, pair, actions);
   const int num_independent = fitter.num_blocks();
-  if (num_independent < kLeastFrames) return std::nullopt;
+  if (num_independent < kFewestSoftFrames) return std::nullopt;
   std::vector<int> chosen = signals;
   if (chosen.empty()) {
     chosen = fitter.ranked_signals();
@@ -409,30 +415,10 @@ std::optional<SoftFit> fit_soft_model(const LocalModel& screws, const PairData& 
   }
   if (!fitter.fit(chosen, nullptr, kIterations)) return std::nullopt;
   fitter.reweigh();
-  Shape shape = fitter.shape();
+  const Shape shape = fitter.shape();
   if (!fitter.fit(chosen, &shape, kIterations)) return std::nullopt;
-  // Backwards: the signal that is missed least goes first.
-  while (signals.empty() && chosen.size() > 1) {
-    const Fitter full = fitter;
-    std::optional<Fitter> best;
-    for (std::size_t d = 0; d < chosen.size(); ++d) {
-      Fitter without = full;
-      std::vector<int> fewer = chosen;
-      fewer.erase(fewer.begin() + static_cast<std::ptrdiff_t>(d));
-      shape = full.shape();
-      Eigen::VectorXd lengths(fewer.size());
-      for (std::size_t n = 0; n < fewer.size(); ++n)
-        lengths(static_cast<Eigen::Index>(n)) =
-            shape.log_lengths(static_cast<Eigen::Index>(n < d ? n : n + 1));
-      shape.log_lengths = lengths;
-      if (!without.fit(fewer, &shape, kDropIterations)) continue;
-      if (!best || without.judged().log_density > best->judged().log_density)
-        best.emplace(std::move(without));
-    }
-    if (!best || full.misses(*best)) break;
-    fitter = std::move(*best);
-    chosen = fitter.signals();
-  }
+  if (signals.empty()) drop_signals(&fitter);
+  chosen = fitter.signals();
 
   SoftFit result = fitter.judged();
   result.model.screws = screws;
@@ -441,89 +427,8 @@ std::optional<SoftFit> fit_soft_model(const LocalModel& screws, const PairData& 
   for (const int s : chosen)
     if (!screws.uses(s)) result.model.signals.push_back(s);
 
-  const double share = static_cast<double>(num_independent) / pair.size();
-  const int inliers = pair.size() - result.num_outliers;
-  const double max_outliers =
-      std::min(binomial_quantile(num_independent, pair_outlier_rate(options), 0.9997) / share,
-               0.35 * pair.size());
-  const double max_mean = 1.2 * 5.964 + 3 * std::sqrt(11.309 / std::max(1.0, share * inliers));
-  if (result.num_outliers > max_outliers || result.mean_inlier > max_mean)
-    result.verdict = Verdict::kRefuted;
-  else
-    result.verdict =
-        result.mean_uncertainty > kLargestUncertainty ? Verdict::kNotEnoughData : Verdict::kValid;
+  result.verdict = verdict_of(result, num_independent, options);
   return result;
-}
-
-void connect_soft_parts(const std::vector<ActionPoseSample>& samples,
-                        const NormalizedActions& actions, const std::vector<int>& parts,
-                        const SearchOptions& options, SearchResult* found) {
-  // Components by their lowest part.
-  std::map<int, int> component;
-  for (const int part : parts) component[part] = part;
-  const auto join = [&](int a, int b) {
-    const int from = std::max(component[a], component[b]);
-    const int to = std::min(component[a], component[b]);
-    for (auto& [part, c] : component)
-      if (c == from) c = to;
-  };
-  for (const AcceptedModel& m : found->models) join(m.part_i, m.part_j);
-
-  struct Open {
-    double cost;  // of the best screws, a frame
-    int i, j;
-    LocalModel screws;
-  };
-  std::map<std::pair<int, int>, std::vector<Open>> open;
-  std::set<std::pair<int, int>> undecided;
-  for (const auto& [pair, record] : found->records) {
-    const auto components = std::minmax(component[pair.first], component[pair.second]);
-    if (components.first == components.second) continue;
-    if (!record.undecided.empty()) undecided.insert(components);
-    if (record.num_common >= kLeastFrames)
-      open[components].push_back({0, pair.first, pair.second, {}});
-  }
-  std::vector<AcceptedModel> candidates;
-  for (auto& [components, pairs] : open) {
-    if (undecided.count(components)) continue;
-    for (Open& o : pairs) {
-      const PairData data = make_pair_data(samples, o.i, o.j, options.measurement, kScreenFrames);
-      if (blocks_of(data, actions.blocks()).count < kLeastFrames) {
-        o.cost = std::numeric_limits<double>::infinity();
-        continue;
-      }
-      o.screws = best_screws(data, actions, options.max_signals, found);
-      o.cost = evaluate(o.screws, data, actions).cost / data.size();
-    }
-    std::stable_sort(pairs.begin(), pairs.end(),
-                     [](const Open& x, const Open& y) { return x.cost < y.cost; });
-    if (pairs.size() > kPairsTried) pairs.resize(kPairsTried);
-    for (const Open& o : pairs) {
-      if (!std::isfinite(o.cost)) continue;
-      const PairData data = make_pair_data(samples, o.i, o.j, options.measurement, kMaxFrames);
-      std::optional<SoftFit> best;
-      std::vector<LocalModel> bases{screen_rigid(data, actions).model};
-      if (o.screws.num_joints > 0) bases.push_back(o.screws);
-      for (const LocalModel& base : bases) {
-        const auto fit = fit_soft_model(fit_local_model(base, data, actions, 30, 1e-3).model, data,
-                                        actions, options.validity);
-        ++found->num_fits;
-        found->records[{o.i, o.j}].was_soft_tried |= fit.has_value();
-        if (fit && (!best || fit->log_density > best->log_density)) best = fit;
-      }
-      if (!best || best->verdict != Verdict::kValid) continue;
-      candidates.push_back({o.i, o.j, best->model.screws, best->score, best->model.signals});
-    }
-  }
-  std::stable_sort(candidates.begin(), candidates.end(), [](const auto& x, const auto& y) {
-    return std::make_tuple(-x.score, x.part_i, x.part_j) <
-           std::make_tuple(-y.score, y.part_i, y.part_j);
-  });
-  for (AcceptedModel& c : candidates) {
-    if (component[c.part_i] == component[c.part_j]) continue;
-    join(c.part_i, c.part_j);
-    found->models.push_back(std::move(c));
-  }
 }
 
 }  // namespace bodyschema

@@ -5,9 +5,12 @@
 #include <vector>
 
 #include "common/schema/residual_gp.h"
-#include "processes/structure_learner/structure_search.h"
+#include "processes/structure_learner/validity.h"
 
 namespace bodyschema {
+
+/// Independent frames below which a function of the signals is not fitted.
+inline constexpr int kFewestSoftFrames = 30;
 
 /// A chain of screws and what it leaves, as a Gaussian process of the signals in Q.
 struct SoftModel {
@@ -46,13 +49,5 @@ std::optional<SoftFit> fit_soft_model(const LocalModel& screws, const PairData& 
                                       const NormalizedActions& actions,
                                       const ValidityOptions& options,
                                       const std::vector<int>& signals = {});
-
-/// The fallback of the search: between components of the forest where every screw model was refuted
-/// on enough data, soft models; those with fewer signals first, then by score. What outliers cost
-/// does not enter the score: a marker that flips says nothing about its neighbours. Rigid robots
-/// never come here once their tree spans.
-void connect_soft_parts(const std::vector<ActionPoseSample>& samples,
-                        const NormalizedActions& actions, const std::vector<int>& parts,
-                        const SearchOptions& options, SearchResult* found);
 
 }  // namespace bodyschema

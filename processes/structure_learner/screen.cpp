@@ -6,8 +6,8 @@
 #include <limits>
 #include <tuple>
 
-#include "common/statistics/median.h"
-#include "common/statistics/student_t.h"
+#include "common/estimation/quantile.h"
+#include "common/estimation/student_t.h"
 
 namespace bodyschema {
 namespace {

@@ -65,16 +65,17 @@ class TreeFit {
   void fit(int max_iterations, double tolerance);
 
   const std::vector<TreeNode>& nodes() const { return nodes_; }
-  /// Of a root that rests, in the camera's frame.
+  /// The pose of a root that rests in the camera's frame.
   const Pose& root_pose() const { return roots_.front(); }
   double cost() const { return cost_; }  ///< Σ (ν + 6)/2 · log(1 + d²/ν)
   double log_likelihood() const;         ///< −cost − ½ Σ log|2πΣ|
   int num_frames() const { return static_cast<int>(samples_.size()); }
 
-  /// Of the fit's parameters, normalised; right perturbations. The covariance of the score, by what
-  /// is told of the measurements, between two inverse Hessians (the sandwich of an M-estimator):
-  /// near-identical views of a part share its systematic error, of covariance `systematic`, and
-  /// `view_share` of the variance of its noise, which do not average out over them.
+  /// Covariance of the fit's parameters, normalised; right perturbations. The covariance of the
+  /// score, by what is told of the measurements, between two inverse Hessians (the sandwich of an
+  /// M-estimator): near-identical views of a part share its systematic error, of covariance
+  /// `systematic`, and `view_share` of the variance of its noise, which do not average out over
+  /// them.
   struct Covariance {
     Matrix6d root = Matrix6d::Zero();     ///< of root_pose()
     std::vector<ParameterMatrix> models;  ///< by node
@@ -112,9 +113,20 @@ class TreeFit {
                   std::vector<Pose>* poses, std::vector<FrameFit>* fits) const;
   void start_roots();
   struct Normal;
+  class MissingJointTest;
+  void gather(int frame, Normal* normal) const;
+  void add_frame(int frame, Normal* normal) const;
   Normal normal_equations() const;
+  // The tree after a step of the parameters, and what the eliminated roots make of it.
+  void move_by(const Eigen::VectorXd& step, const Normal& normal, std::vector<TreeNode>* nodes,
+               std::vector<Pose>* roots) const;
   std::vector<int> views_of(int node) const;
+  Eigen::MatrixXd with_fixed_gauge(const Normal& normal) const;
+  Eigen::MatrixXd score_covariance(const Normal& normal, const Matrix6d& systematic,
+                                   double view_share) const;
+  std::vector<Matrix6d> frame_covariances(const Normal& normal, const Eigen::MatrixXd& joint) const;
   void add_composites(const Normal& normal, std::vector<Matrix6d> own, Eigen::MatrixXd* sum) const;
+  Eigen::MatrixXd moving_actions() const;  // frames × moving signals
   std::vector<int> cluster_of(int top) const;
   bool is_below(int node, int ancestor) const;  // or the same
   int at(int frame, int node) const { return frame * static_cast<int>(nodes_.size()) + node; }

@@ -55,40 +55,37 @@ std::vector<int> TreeFit::views_of(int node) const {
   return result;
 }
 
-std::optional<TreeFit::Covariance> TreeFit::covariance(const Matrix6d& systematic,
-                                                       double view_share) const {
-  if (!root_rests_) return std::nullopt;
-  Normal normal = normal_equations();
-  const auto size = normal.H.rows();
-  const int n = static_cast<int>(nodes_.size());
+// H with a prior on the gauge: a screw frame may turn about its axis and slide along it, directions
+// on which no prediction depends. They get the variance of a direction that is known well.
+Eigen::MatrixXd TreeFit::with_fixed_gauge(const Normal& normal) const {
   Eigen::MatrixXd H = normal.H;
-  // A screw frame may turn about its axis and slide along it: these directions get the variance
-  // of a direction that is known well, and no prediction depends on them.
-  for (int k = 1; k < n; ++k)
+  for (int k = 1; k < static_cast<int>(nodes_.size()); ++k)
     for (int d = 0; d < nodes_[k].model.num_joints; ++d)
       for (const int component : {2, 5}) {
         Vector6d before = Vector6d::Zero();
         before(component) = 1;
         const Vector6d after = -adjoint(nodes_[k].model.A[d + 1].inverse()) * before;
-        Eigen::VectorXd gauge = Eigen::VectorXd::Zero(size);
-        gauge.segment<6>(normal.offset[k] + 8 * d) = before;
-        gauge.segment<6>(normal.offset[k] + 8 * (d + 1)) = after;
+        Eigen::VectorXd gauge = Eigen::VectorXd::Zero(H.rows());
+        gauge.segment<6>(normal.offset[k] + ScrewChainLayout::transform(d)) = before;
+        gauge.segment<6>(normal.offset[k] + ScrewChainLayout::transform(d + 1)) = after;
         const double information =
             gauge.dot(normal.H.diagonal().cwiseProduct(gauge)) / std::pow(gauge.squaredNorm(), 2);
         H += information * gauge * gauge.transpose();
       }
-  // What the data hardly determine (where the axis of a sliding joint lies) stays finite in float.
+  // A parameter that the data hardly determine (where the axis of a sliding joint lies) stays
+  // finite in float.
   H.diagonal() *= 1 + 1e-7;
-  const Eigen::VectorXd unit = H.diagonal().cwiseMax(1e-300).cwiseSqrt().cwiseInverse();
-  const Eigen::LLT<Eigen::MatrixXd> llt(unit.asDiagonal() * H * unit.asDiagonal());
-  if (llt.info() != Eigen::Success) return std::nullopt;
+  return H;
+}
 
-  // Covariance of the score Σ Jᵀ W e. What was added to H is a measurement like others.
-  Eigen::MatrixXd score = H - normal.H;
-  // Of what averages out, by the marker.
-  std::vector<Matrix6d> own = std::move(normal.own_I);
-  std::fill(own.begin(), own.end(), Matrix6d::Zero());
-  for (int k = 0; k < n; ++k) {
+// Covariance of Σ Jᵀ W e over all markers.
+Eigen::MatrixXd TreeFit::score_covariance(const Normal& normal, const Matrix6d& systematic,
+                                          double view_share) const {
+  const auto size = normal.H.rows();
+  Eigen::MatrixXd score = Eigen::MatrixXd::Zero(size, size);
+  // The share that averages out, by the marker.
+  std::vector<Matrix6d> own(frame_index_.size(), Matrix6d::Zero());
+  for (int k = 0; k < static_cast<int>(nodes_.size()); ++k) {
     const std::vector<int> views = views_of(k);
     std::map<int, int> sizes;
     for (const int view : views) ++sizes[view];
@@ -120,18 +117,14 @@ std::optional<TreeFit::Covariance> TreeFit::covariance(const Matrix6d& systemati
     for (const auto& [view, G] : common) score += G * G.transpose();
   }
   add_composites(normal, std::move(own), &score);
-  const Eigen::MatrixXd inverse = unit.asDiagonal() * llt.solve(Eigen::MatrixXd(unit.asDiagonal()));
-  const Eigen::MatrixXd joint = inverse * score * inverse;
+  return score;
+}
 
-  Covariance result;
-  result.models.resize(n);
-  result.root = joint.topLeftCorner<6, 6>();
-  for (int k = 1; k < n; ++k) {
-    const int p = nodes_[k].model.num_parameters();
-    result.models[k] = joint.block(normal.offset[k], normal.offset[k], p, p);
-  }
-  // Where a part's frame is off, the edge to it is off by as much as those from it, the other way.
-  result.frames.assign(n, Matrix6d::Zero());
+// An error of a part's frame is in the edge to it and, with opposite sign, in those from it.
+std::vector<Matrix6d> TreeFit::frame_covariances(const Normal& normal,
+                                                 const Eigen::MatrixXd& joint) const {
+  const int n = static_cast<int>(nodes_.size());
+  std::vector<Matrix6d> result(n, Matrix6d::Zero());
   std::vector<int> children(n, 0);
   for (int k = 1; k < n; ++k) {
     const int parent = nodes_[k].parent;
@@ -143,11 +136,34 @@ std::optional<TreeFit::Covariance> TreeFit::covariance(const Matrix6d& systemati
       sum -= to_parent * normal.S[at(t, parent)] * cross * normal.S[at(t, k)].transpose() *
              to_parent.transpose();
     }
-    result.frames[parent] += sum / num_frames();
+    result[parent] += sum / num_frames();
     ++children[parent];
   }
   for (int k = 0; k < n; ++k)
-    if (children[k] > 0) result.frames[k] = positive_part(result.frames[k] / children[k]);
+    if (children[k] > 0) result[k] = positive_part(result[k] / children[k]);
+  return result;
+}
+
+std::optional<TreeFit::Covariance> TreeFit::covariance(const Matrix6d& systematic,
+                                                       double view_share) const {
+  if (!root_rests_) return std::nullopt;
+  const Normal normal = normal_equations();
+  const Eigen::MatrixXd H = with_fixed_gauge(normal);
+  const Eigen::VectorXd unit = H.diagonal().cwiseMax(1e-300).cwiseSqrt().cwiseInverse();
+  const Eigen::LLT<Eigen::MatrixXd> llt(unit.asDiagonal() * H * unit.asDiagonal());
+  if (llt.info() != Eigen::Success) return std::nullopt;
+  const Eigen::MatrixXd inverse = unit.asDiagonal() * llt.solve(Eigen::MatrixXd(unit.asDiagonal()));
+  // The prior added to H is a measurement like others.
+  const Eigen::MatrixXd score = H - normal.H + score_covariance(normal, systematic, view_share);
+  const Eigen::MatrixXd joint = inverse * score * inverse;
+  Covariance result;
+  result.models.resize(nodes_.size());
+  result.root = joint.topLeftCorner<6, 6>();
+  for (std::size_t k = 1; k < nodes_.size(); ++k) {
+    const int p = nodes_[k].model.num_parameters();
+    result.models[k] = joint.block(normal.offset[k], normal.offset[k], p, p);
+  }
+  result.frames = frame_covariances(normal, joint);
   return result;
 }
 

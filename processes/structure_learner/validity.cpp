@@ -1,17 +1,12 @@
 #include "processes/structure_learner/validity.h"
 
 #include <algorithm>
-#include <boost/math/distributions/binomial.hpp>
-#include <boost/math/distributions/chi_squared.hpp>
-#include <boost/math/special_functions/beta.hpp>
 #include <cmath>
+
+#include "common/estimation/quantile.h"
 
 namespace bodyschema {
 namespace {
-
-// Moments of χ²₆ cut at kOutlierThreshold.
-constexpr double kInlierMean = 5.964;
-constexpr double kInlierVariance = 11.309;
 
 // Squared distance beyond which V2 trusts a frame no further.
 constexpr double kClip = 20;
@@ -27,22 +22,98 @@ double explained_sum(const Eigen::MatrixXd& F, const Eigen::Matrix<double, 6, Ei
   return (projected * gram.ldlt().solve(projected.transpose())).trace();
 }
 
+// Outliers, mean distances and score.
+void tally(const Fit& fit, const LeaveOneOut& loo, const PairData& pair, Validity* result) {
+  const int n = pair.size();
+  double inlier_sum = 0;
+  for (int t = 0; t < n; ++t) {
+    const double d2 = loo.squared_distance[t];
+    const double log_det = pair.hypotheses[fit.frames[t].hypothesis].log_det;
+    result->mean_capped += std::min(d2, 2 * kOutlierThreshold) / n;
+    result->score -= 0.5 * (std::min(d2, 2 * kOutlierThreshold) + log_det) / n;
+    if (d2 > kOutlierThreshold)
+      ++result->num_outliers;
+    else
+      inlier_sum += d2;
+  }
+  if (n > result->num_outliers) result->mean_inlier = inlier_sum / (n - result->num_outliers);
+}
+
+// Whitened residuals, 6×n, clipped, and fading where they are far beyond what a missed joint does
+// to a frame or two: flips must not find a signal that happens to go along with them.
+Eigen::Matrix<double, 6, Eigen::Dynamic> clipped_residuals(const Fit& fit) {
+  const auto n = static_cast<Eigen::Index>(fit.frames.size());
+  Eigen::Matrix<double, 6, Eigen::Dynamic> r(6, n);
+  for (Eigen::Index t = 0; t < n; ++t) {
+    const FrameFit& frame = fit.frames[static_cast<std::size_t>(t)];
+    const double d2 = frame.squared_distance;
+    r.col(t) =
+        frame.residual * (std::sqrt(std::min(1.0, kClip / d2)) * std::min(1.0, 20 * kClip / d2));
+  }
+  return r;
+}
+
+// The largest share of the residuals that a signal outside Q explains, over the threshold of V2.
+double explained_excess(const Fit& fit, const PairData& pair, const NormalizedActions& actions,
+                        const ValidityOptions& options, double mean_inlier, double share) {
+  const int n = pair.size(), k = fit.model.num_joints;
+  const int others = static_cast<int>(actions.moving().size()) - k;
+  const Eigen::Matrix<double, 6, Eigen::Dynamic> r = clipped_residuals(fit);
+  double bias = 0;
+  for (const FrameFit& frame : fit.frames) bias += pair.hypotheses[frame.hypothesis].systematic;
+  const bool tensor = k == 1 && n >= 12;
+  const int num_features = tensor ? 3 : 1;
+  Eigen::MatrixXd F(n, num_features);
+  const double threshold =
+      chi_square_quantile(6 * num_features,
+                          (options.lenient ? 1e-6 : 1.35e-3) / std::max(others, 1)) *
+          std::max(1.0, mean_inlier / 6) / share +
+      // A motion far below the noise of every single frame is no joint but a bias; and all of the
+      // model error may go along with one signal: its variance is ⅓ that of the ends of its range.
+      0.05 * n + bias / 3;
+  double largest = 0;
+  for (const int g : actions.moving()) {
+    if (fit.model.uses(g)) continue;
+    double mean = 0;
+    for (int t = 0; t < n; ++t) mean += actions(pair.frames[t].sample, g) / n;
+    for (int t = 0; t < n; ++t) {
+      const int sample = pair.frames[t].sample;
+      F(t, 0) = actions(sample, g) - mean;
+      if (tensor) {
+        const double q = actions(sample, fit.model.signal[0]);
+        const double theta = std::max(std::abs(fit.model.turn[0]), 0.1) * q;
+        F(t, 1) = F(t, 0) * std::cos(theta);
+        F(t, 2) = F(t, 0) * std::sin(theta);
+      }
+    }
+    if (F.col(0).squaredNorm() > 0) largest = std::max(largest, explained_sum(F, r) / threshold);
+  }
+  return largest;
+}
+
+// log λ, averaged over the six axes: spread of the readings about their own robust centre against
+// their noise.
+double log_spread(const Fit& fit, const PairData& pair) {
+  std::vector<double> spread;
+  const int n = pair.size();
+  const Pose centre = pair.hypotheses[fit.frames[n / 2].hypothesis].z;
+  for (int t = 0; t < n; ++t) {
+    const PairHypothesis& h = pair.hypotheses[fit.frames[t].hypothesis];
+    spread.push_back((h.whitening * log(centre.inverse() * h.z)).squaredNorm() / 6);
+  }
+  return 0.5 * std::log(std::max(upper_median(std::move(spread)) / 2, 1.0));
+}
+
 }  // namespace
 
-double chi_square_quantile(double dof, double tail) {
-  return boost::math::quantile(
-      boost::math::complement(boost::math::chi_squared_distribution<double>(dof), tail));
+double largest_inlier_mean(double num_inliers, double sigmas) {
+  static const ChiSquareMoments inlier = chi_square_below(kOutlierThreshold, 6);
+  // A fifth of slack: the noise is known to some ten per cent at best.
+  return 1.2 * inlier.mean + sigmas * std::sqrt(inlier.variance / num_inliers);
 }
 
 double pair_outlier_rate(const ValidityOptions& options) {
   return std::min(2 * options.outlier_rate + 0.01, 0.35);
-}
-
-int binomial_quantile(int trials, double rate, double p) {
-  using namespace boost::math::policies;
-  using RoundUp = policy<discrete_quantile<integer_round_up>>;
-  return static_cast<int>(
-      boost::math::quantile(boost::math::binomial_distribution<double, RoundUp>(trials, rate), p));
 }
 
 Validity check_validity(const Fit& fit, const LeaveOneOut& loo, const PairData& pair,
@@ -53,24 +124,13 @@ Validity check_validity(const Fit& fit, const LeaveOneOut& loo, const PairData& 
     result.verdict = Verdict::kNotEnoughData;
     return result;
   }
-  double inlier_sum = 0;
-  for (int t = 0; t < n; ++t) {
-    const double d2 = loo.squared_distance[t];
-    const double log_det = pair.hypotheses[fit.frames[t].hypothesis].log_det;
-    result.mean_capped += std::min(d2, 2 * kOutlierThreshold) / n;
-    result.score -= 0.5 * (std::min(d2, 2 * kOutlierThreshold) + log_det) / n;
-    if (d2 > kOutlierThreshold)
-      ++result.num_outliers;
-    else
-      inlier_sum += d2;
-  }
+  tally(fit, loo, pair, &result);
   const int inliers = n - result.num_outliers;
   const int p = loo.rank;
-  // Of a stream a block of time counts as one frame. `share`: independent frames per frame.
+  // A block of time of a stream counts as one frame. `share`: independent frames per frame.
   const int num_independent =
       actions.blocks().count(pair.frames, [](const PairFrame& f) { return f.sample; });
   const double share = static_cast<double>(num_independent) / n;
-  if (inliers > 0) result.mean_inlier = inlier_sum / inliers;
 
   // V1
   const double rate = pair_outlier_rate(options);
@@ -91,73 +151,23 @@ Validity check_validity(const Fit& fit, const LeaveOneOut& loo, const PairData& 
     return result;
   }
   if (suspicious && (n >= kFewFrames || 2 * result.num_outliers > n)) return result;
-  const double sampling =
-      (options.lenient ? 5 : 3) *
-      std::sqrt(kInlierVariance / independent_inliers * (6.0 * independent_inliers / dof));
-  // A fifth of slack: the noise is known to some ten per cent at best.
-  const double max_mean = std::min(1.2 * kInlierMean + sampling, 0.75 * kOutlierThreshold);
-  if (result.mean_inlier > max_mean) return result;
+  const double max_mean = largest_inlier_mean(dof / 6, options.lenient ? 5 : 3);
+  if (result.mean_inlier > std::min(max_mean, 0.75 * kOutlierThreshold)) return result;
 
   // V2
-  const int k = fit.model.num_joints;
-  const int others = static_cast<int>(actions.moving().size()) - k;
-  Eigen::Matrix<double, 6, Eigen::Dynamic> r(6, n);
-  double bias = 0;
-  for (int t = 0; t < n; ++t) {
-    bias += pair.hypotheses[fit.frames[t].hypothesis].systematic;
-    const double d2 = fit.frames[t].squared_distance;
-    // Clipped, and fading where it is far beyond what a missed joint does to a frame or two: flips
-    // must not find a signal that happens to go along with them.
-    r.col(t) = fit.frames[t].residual *
-               (std::sqrt(std::min(1.0, kClip / d2)) * std::min(1.0, 20 * kClip / d2));
-  }
-  const bool tensor = k == 1 && n >= 12;
-  const int num_features = tensor ? 3 : 1;
-  Eigen::MatrixXd F(n, num_features);
-  const double threshold =
-      chi_square_quantile(6 * num_features,
-                          (options.lenient ? 1e-6 : 1.35e-3) / std::max(others, 1)) *
-          std::max(1.0, result.mean_inlier / 6) / share +
-      // What is far below the noise of every single frame is no joint but a bias; and all of the
-      // model error may go along with one signal: its variance is ⅓ that of the ends of its range.
-      0.05 * n + bias / 3;
-  for (const int g : actions.moving()) {
-    if (fit.model.uses(g)) continue;
-    double mean = 0;
-    for (int t = 0; t < n; ++t) mean += actions(pair.frames[t].sample, g) / n;
-    for (int t = 0; t < n; ++t) {
-      const int sample = pair.frames[t].sample;
-      F(t, 0) = actions(sample, g) - mean;
-      if (tensor) {
-        const double q = actions(sample, fit.model.signal[0]);
-        const double theta = std::max(std::abs(fit.model.turn[0]), 0.1) * q;
-        F(t, 1) = F(t, 0) * std::cos(theta);
-        F(t, 2) = F(t, 0) * std::sin(theta);
-      }
-    }
-    if (!(F.col(0).squaredNorm() > 0)) continue;
-    result.explained = std::max(result.explained, explained_sum(F, r) / threshold);
-  }
+  result.explained = explained_excess(fit, pair, actions, options, result.mean_inlier, share);
   if (result.explained > 1) return result;
 
-  // Improbable by chance? Spread of the readings about their own robust centre, per axis, against
-  // their noise: log λ averaged over the six axes.
-  std::vector<double> spread;
-  const Pose centre = pair.hypotheses[fit.frames[n / 2].hypothesis].z;
-  for (int t = 0; t < n; ++t) {
-    const PairHypothesis& h = pair.hypotheses[fit.frames[t].hypothesis];
-    spread.push_back((h.whitening * log(centre.inverse() * h.z)).squaredNorm() / 6);
-  }
-  std::nth_element(spread.begin(), spread.begin() + n / 2, spread.end());
-  const double log_lambda = 0.5 * std::log(std::max(spread[n / 2] / 2, 1.0));
-  const double num_candidates = 1.0 + std::pow(std::max(others + k, 1), k);
+  const int k = fit.model.num_joints;
+  const double num_candidates =
+      1.0 + std::pow(std::max(static_cast<int>(actions.moving().size()), 1), k);
   result.verdict = Verdict::kValid;
   if (suspicious) result.verdict = Verdict::kNotEnoughData;
   // Few readings of a joint that happened to move little look rigid, the more so with some set
   // aside.
   if (k == 0 && independent_inliers < 4 + share * result.num_outliers)
     result.verdict = Verdict::kNotEnoughData;
-  const bool improbable_by_chance = dof * log_lambda > std::log(num_candidates) + 7;
+  const bool improbable_by_chance = dof * log_spread(fit, pair) > std::log(num_candidates) + 7;
   if (k > 0 && dof < 2 * p && !improbable_by_chance) result.verdict = Verdict::kNotEnoughData;
   return result;
 }

@@ -1,11 +1,9 @@
 #pragma once
 
+#include "common/estimation/chi_square.h"
 #include "processes/structure_learner/local_model.h"
 
 namespace bodyschema {
-
-/// χ²₆(0.9973): three standard deviations of one frame's residual.
-inline constexpr double kOutlierThreshold = 20.06;
 
 enum class Verdict {
   kValid,
@@ -52,9 +50,8 @@ Validity check_validity(const Fit& fit, const LeaveOneOut& loo, const PairData& 
 
 /// Expected share of frames of a pair with an outlier among its two markers.
 double pair_outlier_rate(const ValidityOptions& options);
-/// Quantile of χ² with `dof` degrees of freedom at 1 − `tail`.
-double chi_square_quantile(double dof, double tail);
-/// Smallest n with P(X ≤ n) ≥ p for X ~ Binomial(trials, rate).
-int binomial_quantile(int trials, double rate, double p);
+/// Bound on the mean d² of so many independent inliers of a true model, `sigmas` of its sampling
+/// errors above what is expected.
+double largest_inlier_mean(double num_inliers, double sigmas);
 
 }  // namespace bodyschema

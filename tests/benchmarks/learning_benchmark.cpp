@@ -10,7 +10,7 @@
 #include <limits>
 #include <stdexcept>
 
-#include "common/schema/kinematic_path.h"
+#include "common/kinematics/kinematic_path.h"
 #include "processes/structure_learner/baseline/fit_matrix_gp.h"
 #include "processes/structure_learner/baseline/learn_baseline.h"
 #include "processes/structure_learner/online_learner.h"

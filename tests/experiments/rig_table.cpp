@@ -18,7 +18,7 @@
 
 #include "common/config/rig.h"
 #include "common/geometry/angle.h"
-#include "common/schema/kinematic_path.h"
+#include "common/kinematics/kinematic_path.h"
 #include "processes/console/evaluation.h"
 #include "processes/structure_learner/structure_learner.h"
 #include "tests/support/rendered_run.h"

@@ -3,7 +3,7 @@
 #include <gtest/gtest.h>
 
 #include "common/geometry/angle.h"
-#include "common/schema/kinematic_path.h"
+#include "common/kinematics/kinematic_path.h"
 #include "tests/support/synthetic_robot.h"
 
 namespace bodyschema {

@@ -3,7 +3,7 @@
 #include <Eigen/Cholesky>
 #include <functional>
 
-#include "common/schema/kinematic_path.h"
+#include "common/kinematics/kinematic_path.h"
 #include "processes/structure_learner/learn.h"
 #include "tests/support/synthetic_robot.h"
 

@@ -127,7 +127,7 @@ TEST(TimeBlocks, PosesAtRestStandForThemselvesHoweverFastTheyCome) {
     for (std::size_t t = 0; t < samples.size(); ++t)
       samples[t].utime = interval * static_cast<std::int64_t>(t);
     const NormalizedActions actions(samples, 3);
-    EXPECT_FALSE(actions.blocks().is_dense());
+    EXPECT_FALSE(actions.blocks().is_stream());
     EXPECT_EQ(actions.blocks().block_of(17), 17);
   }
 }
@@ -136,7 +136,7 @@ TEST(TimeBlocks, AStreamHasBlocksAsLongAsItsActionsRememberWhereTheyWere) {
   Rng rng(802);
   const auto fast = stream(3000, 3, rng);
   const NormalizedActions actions(fast, 3);
-  ASSERT_TRUE(actions.blocks().is_dense());
+  ASSERT_TRUE(actions.blocks().is_stream());
   // Sines of 0.15 to 0.7 Hz change by half of their range's square within 0.2 to 1 s.
   EXPECT_GT(actions.blocks().length(), 30);
   EXPECT_LT(actions.blocks().length(), 300);
@@ -153,7 +153,7 @@ TEST(TimeBlocks, AGridOfPosesAtRestIsNoStream) {
     samples[t].utime = 25'000'000 * std::int64_t{t};
     samples[t].action = Eigen::Vector2d(t / 20, t % 20);
   }
-  EXPECT_FALSE(NormalizedActions(samples, 2).blocks().is_dense());
+  EXPECT_FALSE(NormalizedActions(samples, 2).blocks().is_stream());
 }
 
 TEST(TimeBlocks, TheClosedFormIsWhatAFitWithoutTheBlockSays) {
@@ -161,7 +161,7 @@ TEST(TimeBlocks, TheClosedFormIsWhatAFitWithoutTheBlockSays) {
   auto samples = stream(1200, 3, rng);
   observe(&samples, 3, arm, rng);
   const NormalizedActions actions(samples, 3);
-  ASSERT_TRUE(actions.blocks().is_dense());
+  ASSERT_TRUE(actions.blocks().is_stream());
   // Far wider than the noise, so that all robust weights are equal: the closed form holds them
   // fixed.
   MeasurementModel measurement;

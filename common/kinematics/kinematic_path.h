@@ -3,6 +3,7 @@
 #include <optional>
 #include <vector>
 
+#include "common/kinematics/screw_chain.h"
 #include "common/schema/body_schema.h"
 #include "common/schema/sample.h"
 
@@ -48,12 +49,11 @@ class KinematicPath {
     /// BodySchema::frame_covariances of the part between the leg before and this one.
     std::optional<Matrix6d> start = std::nullopt;
   };
-  /// What moves, and the constant transform X_after up to the next that moves: a screw motion along
+  /// A motion, and the constant transform X_after up to the next one: a screw motion along
   /// and about z, or else a leg of another kind, asked as a whole.
   struct Step {
     int signal = 0;
-    double slide = 0;  ///< [m per command unit]
-    double turn = 0;   ///< [rad per command unit]
+    Screw screw = {};  ///< per command unit
     int leg = -1;      ///< index into legs_; −1: a screw
     Pose X_after = Pose::Identity();
   };

@@ -1,42 +1,17 @@
-#include "common/schema/kinematic_path.h"
+#include "common/kinematics/kinematic_path.h"
 
 #include <Eigen/Cholesky>
 #include <Eigen/Eigenvalues>
 #include <algorithm>
 #include <cmath>
-#include <map>
 #include <stdexcept>
+
+#include "common/estimation/chi_square.h"
+#include "common/estimation/quantile.h"
+#include "common/kinematics/kinematic_tree.h"
 
 namespace bodyschema {
 namespace {
-
-struct EdgeStep {
-  const Edge* edge;
-  bool is_forward;
-};
-
-/// Breadth first; works for edges in any order.
-std::optional<std::vector<EdgeStep>> edges_between(const std::vector<Edge>& edges, int from,
-                                                   int to) {
-  std::map<int, EdgeStep> reached_by{{from, {nullptr, true}}};
-  std::vector<int> queue{from};
-  for (std::size_t head = 0; head < queue.size() && !reached_by.count(to); ++head) {
-    for (const Edge& edge : edges) {
-      const bool is_forward = edge.from == queue[head];
-      if (!is_forward && edge.to != queue[head]) continue;
-      const int other = is_forward ? edge.to : edge.from;
-      if (reached_by.emplace(other, EdgeStep{&edge, is_forward}).second) queue.push_back(other);
-    }
-  }
-  if (!reached_by.count(to)) return std::nullopt;
-  std::vector<EdgeStep> path;
-  for (int part = to; part != from;) {
-    path.push_back(reached_by.at(part));
-    part = path.back().is_forward ? path.back().edge->from : path.back().edge->to;
-  }
-  std::reverse(path.begin(), path.end());
-  return path;
-}
 
 /// Rigid or screws and nothing else.
 bool is_screw_chain(const Edge& edge) { return !edge.matrix_gp && !edge.residual_gp; }
@@ -63,11 +38,14 @@ Matrix6d without(const Matrix6d& covariance, const Matrix6d& shared) {
 }  // namespace
 
 std::optional<KinematicPath> KinematicPath::between(const BodySchema& schema, int from, int to) {
-  const auto edges = edges_between(schema.edges, from, to);
-  if (!edges) return std::nullopt;
+  const KinematicTree tree(schema.edges, from);
+  const int end = tree.node_of(to);
+  if (end < 0) return std::nullopt;
   KinematicPath path;
   path.signals_ = schema.signals;
-  for (const auto& [edge, is_forward] : *edges) {
+  for (const int node : tree.path_to(end)) {
+    const bool is_forward = tree.nodes()[node].is_forward;
+    const Edge* const edge = &schema.edges[tree.nodes()[node].edge];
     const auto start = schema.frame_covariances.find(is_forward ? edge->from : edge->to);
     path.legs_.push_back({*edge, is_forward});
     if (path.legs_.size() > 1 && start != schema.frame_covariances.end())
@@ -102,15 +80,11 @@ void KinematicPath::append(const ScrewJoint& joint, double sense) {
   if (joint.signal < 0 || joint.signal >= num_signals())
     throw std::invalid_argument("a joint follows signal " + std::to_string(joint.signal) +
                                 " and the schema has " + std::to_string(num_signals()));
-  Pose offset = Pose::Identity();
-  offset.linear() =
-      Eigen::AngleAxisd(sense * joint.turn * joint.offset, Eigen::Vector3d::UnitZ()).matrix();
-  offset.translation().z() = sense * joint.slide * joint.offset;
-  append(offset);
+  Pose& X = steps_.empty() ? X_before_ : steps_.back().X_after;
+  Screw{joint.slide, joint.turn}.append_motion(sense * joint.offset, X.linear(), X.translation());
   const double rate = sense * joint.gain;
   if (rate == 0) return;
-  steps_.push_back(
-      {.signal = joint.signal, .slide = rate * joint.slide, .turn = rate * joint.turn});
+  steps_.push_back({.signal = joint.signal, .screw = {rate * joint.slide, rate * joint.turn}});
 }
 
 void KinematicPath::check_size(Eigen::Index num_values) const {
@@ -138,13 +112,7 @@ Pose KinematicPath::predict_unchecked(const Eigen::Ref<const Eigen::VectorXd>& a
   Eigen::Vector3d p = X_before_.translation();
   for (const Step& step : steps_) {
     if (step.leg < 0) {
-      // X · Exp(ŝθ) without the product: z stays, x and y turn about it.
-      const double theta = signals_[step.signal].displacement(action(step.signal));
-      const double c = std::cos(step.turn * theta), s = std::sin(step.turn * theta);
-      p += step.slide * theta * R.col(2);
-      const Eigen::Vector3d x = R.col(0);
-      R.col(0) = c * x + s * R.col(1);
-      R.col(1) = c * R.col(1) - s * x;
+      step.screw.append_motion(signals_[step.signal].displacement(action(step.signal)), R, p);
     } else {
       const Leg& leg = legs_[step.leg];
       Pose X = leg.edge.predict(displacements(action));
@@ -177,18 +145,9 @@ Pose KinematicPath::predict(const Eigen::Ref<const Eigen::VectorXd>& action,
       const Signal& signal = signals_[step->signal];
       const double theta = signal.displacement(action(step->signal));
       const double rate = signal.displacement_rate(action(step->signal));
-      // Exp(ŝθ) commutes with ŝ, so it drops out; of Ad(X⁻¹) only translation along and rotation
-      // about z are needed.
-      const Eigen::Vector3d z = R.row(2).transpose();
-      const Eigen::Vector3d lever = p.x() * R.row(1).transpose() - p.y() * R.row(0).transpose();
-      J.col(step->signal).head<3>() += rate * (step->slide * z + step->turn * lever);
-      J.col(step->signal).tail<3>() += rate * step->turn * z;
-      const double c = std::cos(step->turn * theta), s = std::sin(step->turn * theta);
-      const Eigen::RowVector3d x = R.row(0);
-      R.row(0) = c * x - s * R.row(1);
-      R.row(1) = s * x + c * R.row(1);
-      p = Eigen::Vector3d(c * p.x() - s * p.y(), s * p.x() + c * p.y(),
-                          p.z() + step->slide * theta);
+      // Exp(ŝθ) commutes with ŝ, so it drops out.
+      step->screw.add_twist_after(R, p, rate, J.col(step->signal));
+      step->screw.prepend_motion(theta, R, p);
     } else {
       const Leg& leg = legs_[step->leg];
       const Eigen::VectorXd theta = displacements(action);
@@ -264,8 +223,6 @@ std::vector<PoseJacobian> KinematicPath::jacobian_trajectory(const Eigen::Matrix
 
 std::optional<Matrix6d> empirical_covariance(const KinematicPath& path, int from, int to,
                                              const std::vector<ActionPoseSample>& samples) {
-  constexpr double kOutlier = 20.06;             // χ²₆(.9973)
-  constexpr double kDeviationOfMedian = 1.4826;  // of a normal distribution
   constexpr std::size_t kFewest = 7;
   std::vector<Vector6d> residuals;
   for (const ActionPoseSample& sample : samples) {
@@ -279,16 +236,14 @@ std::optional<Matrix6d> empirical_covariance(const KinematicPath& path, int from
   std::vector<double> sizes(residuals.size());
   for (int axis = 0; axis < 6; ++axis) {
     for (std::size_t t = 0; t < residuals.size(); ++t) sizes[t] = std::abs(residuals[t](axis));
-    const auto middle = sizes.begin() + static_cast<std::ptrdiff_t>(sizes.size() / 2);
-    std::nth_element(sizes.begin(), middle, sizes.end());
-    covariance(axis, axis) = std::pow(kDeviationOfMedian * *middle, 2);
+    covariance(axis, axis) = std::pow(upper_median(sizes), 2) / chi_square_median(1);
   }
   std::vector<Vector6d> inliers, before;
   for (int step = 0; step < 20; ++step) {
     const Eigen::LDLT<Matrix6d> ldlt(covariance);
     inliers.clear();
     for (const Vector6d& r : residuals)
-      if (r.dot(ldlt.solve(r)) <= kOutlier) inliers.push_back(r);
+      if (r.dot(ldlt.solve(r)) <= kOutlierThreshold) inliers.push_back(r);
     if (inliers.size() < kFewest) return std::nullopt;
     if (inliers == before) break;
     covariance = empirical_covariance(inliers);

@@ -1,4 +1,4 @@
-#include "common/schema/kinematic_path.h"
+#include "common/kinematics/kinematic_path.h"
 
 #include <gtest/gtest.h>
 

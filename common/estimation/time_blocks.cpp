@@ -1,11 +1,14 @@
-#include "processes/structure_learner/time_blocks.h"
+#include "common/estimation/time_blocks.h"
 
 #include <algorithm>
+#include <utility>
+
+#include "common/estimation/quantile.h"
 
 namespace bodyschema {
 namespace {
 
-constexpr std::int64_t kLongestInterval_us = 1'000'000;
+constexpr double kLongestInterval_us = 1e6;
 constexpr Eigen::Index kLeastInstants = 50;
 constexpr Eigen::Index kLeastLag = 3;
 
@@ -14,12 +17,11 @@ constexpr Eigen::Index kLeastLag = 3;
 TimeBlocks::TimeBlocks(const std::vector<std::int64_t>& utimes, const Eigen::MatrixXd& actions) {
   const Eigen::Index N = actions.cols();
   if (N < kLeastInstants || static_cast<Eigen::Index>(utimes.size()) != N) return;
-  std::vector<std::int64_t> intervals;
-  for (std::size_t t = 1; t < utimes.size(); ++t) intervals.push_back(utimes[t] - utimes[t - 1]);
+  std::vector<double> intervals;
+  for (std::size_t t = 1; t < utimes.size(); ++t)
+    intervals.push_back(static_cast<double>(utimes[t] - utimes[t - 1]));
   if (*std::min_element(intervals.begin(), intervals.end()) <= 0) return;
-  const auto middle = intervals.begin() + static_cast<std::ptrdiff_t>(intervals.size() / 2);
-  std::nth_element(intervals.begin(), middle, intervals.end());
-  if (*middle > kLongestInterval_us) return;
+  if (upper_median(std::move(intervals)) > kLongestInterval_us) return;
 
   const double random =
       2 * (actions.colwise() - actions.rowwise().mean()).squaredNorm() / static_cast<double>(N);

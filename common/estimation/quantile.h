@@ -6,14 +6,14 @@
 
 namespace bodyschema {
 
-/// Of an even number of values the upper one of the two in the middle. There must be a value. O(n).
+/// The middle value, the upper of two if their number is even. There must be a value. O(n).
 inline double upper_median(std::vector<double> values) {
   const auto middle = values.begin() + static_cast<std::ptrdiff_t>(values.size() / 2);
   std::nth_element(values.begin(), middle, values.end());
   return *middle;
 }
 
-/// Of an even number of values the mean of the two in the middle. There must be a value. O(n).
+/// The middle value, the mean of two if their number is even. There must be a value. O(n).
 inline double median(std::vector<double> values) {
   const auto middle = values.begin() + static_cast<std::ptrdiff_t>(values.size() / 2);
   std::nth_element(values.begin(), middle, values.end());

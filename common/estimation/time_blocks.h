@@ -22,7 +22,7 @@ class TimeBlocks {
   /// comparable; instants ascend in time, else they are no stream.
   TimeBlocks(const std::vector<std::int64_t>& utimes, const Eigen::MatrixXd& actions);
 
-  bool is_dense() const { return length_ > 1; }
+  bool is_stream() const { return length_ > 1; }
   int length() const { return length_; }  ///< [instants]
   int block_of(int sample) const { return sample / length_; }
   /// How many of these ascending samples are independent: the blocks that they touch.

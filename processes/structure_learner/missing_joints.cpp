@@ -1,0 +1,339 @@
+#include <Eigen/Eigenvalues>
+#include <algorithm>
+#include <cmath>
+
+#include "common/estimation/chi_square.h"
+#include "processes/structure_learner/tree_fit.h"
+#include "processes/structure_learner/tree_fit_normal.h"
+
+namespace bodyschema {
+namespace {
+
+// 3 or 6 dimensions without a heap; one type, for the decompositions are long to compile.
+using UpTo6x6 = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::ColMajor, 6, 6>;
+using UpTo6 = Eigen::Matrix<double, Eigen::Dynamic, 1, Eigen::ColMajor, 6, 1>;
+
+// Directions of ξ that the tree's other parameters take over to this share are no evidence.
+constexpr double kLeastShare = 1e-4;
+
+}  // namespace
+
+/// The score test of one more joint in one rigid cluster, for every moving signal.
+class TreeFit::MissingJointTest {
+ public:
+  /// The same for all clusters.
+  struct Context {
+    const Normal& normal;
+    const Eigen::MatrixXd& inverse;  // of H
+    const Eigen::VectorXd newton;    // H⁻¹g
+    const Eigen::MatrixXd q, q2;     // frames × moving signals
+    const Matrix6d bias;             // covariance of a marker's own bias
+  };
+
+  MissingJointTest(const TreeFit& tree, const Context& context, int top)
+      : tree_(tree), context_(context), top_(top), members_(tree.cluster_of(top)) {
+    find_items();
+    find_related();
+    stack_frames();
+  }
+
+  /// The parting that explains most with the moving signal `s`; log_tail 0 if none does.
+  MissingJoint best_joint(int s) {
+    sum_over_frames(s);
+    MissingJoint best;
+    for (int first = 0; first < num_items(); ++first) {
+      std::vector<bool> moves(num_items(), false);
+      moves[first] = true;
+      MissingJoint joint = exchange(first, &moves);
+      // A resting root does not move.
+      if (top_ == 0 && !std::count(moves.begin(), moves.end(), false)) continue;
+      if (first > 0 && joint.log_tail >= best.log_tail) continue;
+      for (int i = 0; i < num_items(); ++i)
+        if (moves[i])
+          (items_[i].is_branch ? joint.branches : joint.members).push_back(items_[i].node);
+      joint.signal = tree_.actions_.moving()[s];
+      joint.log_ways = num_items() * std::log(2.0);
+      best = joint;
+    }
+    return best;
+  }
+
+ private:
+  /// Anything that may move: a marker of the cluster, or a branch on it.
+  struct Item {
+    int node;
+    bool is_branch;
+    Matrix6d bias;  // covariance of a bias about where the item is, as a twist in the top's frame
+  };
+
+  int num_items() const { return static_cast<int>(items_.size()); }
+  int num_frames() const { return tree_.num_frames(); }
+  int at(int frame, int node) const { return tree_.at(frame, node); }
+  /// The root's poses are free and eliminated: items share them.
+  bool is_eliminated() const { return !tree_.root_rests_; }
+
+  void add_item(int node, bool is_branch) {
+    Pose at_item = Pose::Identity();
+    for (int t = 0; t < num_frames(); ++t)
+      at_item.translation() +=
+          (tree_.poses_[at(t, top_)].inverse() * tree_.poses_[at(t, node)]).translation() /
+          num_frames();
+    const Matrix6d F = adjoint(at_item);
+    items_.push_back({node, is_branch, F * context_.bias * F.transpose()});
+  }
+
+  void find_items() {
+    for (const int k : members_)
+      if (tree_.data_[k].size() > 0) add_item(k, false);
+    for (int k = top_ + 1; k < static_cast<int>(tree_.nodes_.size()); ++k)
+      if (tree_.nodes_[k].model.num_joints > 0 &&
+          std::count(members_.begin(), members_.end(), tree_.nodes_[k].parent))
+        add_item(k, true);
+  }
+
+  // Parameters that share a marker with the cluster.
+  void find_related() {
+    std::vector<int> columns;
+    for (int k = is_eliminated() ? 1 : 0; k < static_cast<int>(tree_.nodes_.size()); ++k) {
+      if (!is_eliminated() && !tree_.is_below(k, top_) && !tree_.is_below(top_, k)) continue;
+      related_.push_back(k);
+      const int p = k == 0 ? 6 : tree_.nodes_[k].model.num_parameters();
+      for (int c = 0; c < p; ++c) columns.push_back(context_.normal.offset[k] + c);
+    }
+    inverse_ = context_.inverse(columns, columns);
+    newton_ = context_.newton(columns);
+  }
+
+  // For q = 1 and F = Ad(X_top): F_tᵀJ_t, F_tᵀr_t, F_tᵀF_t of each item.
+  void stack_frames() {
+    const auto p = newton_.size();
+    const int T = num_frames(), n = num_items();
+    FJ_.assign(n, Eigen::MatrixXd::Zero(6 * p, T));
+    Fr_.assign(n, Eigen::MatrixXd(6, T));
+    FF_.resize(n * n);
+    for (int i = 0; i < n; ++i)
+      for (int j = 0; j < n; ++j)
+        if (i == j || is_eliminated()) FF_[i * n + j] = Eigen::MatrixXd::Zero(36, T);
+    std::vector<Matrix6d> FI(n);
+    for (int t = 0; t < T; ++t) {
+      for (int i = 0; i < n; ++i) FI[i] = stack_item(t, i);
+      if (!is_eliminated()) continue;
+      for (int i = 0; i < n; ++i)
+        for (int j = 0; j < n; ++j)
+          Eigen::Map<Matrix6d>(FF_[i * n + j].col(t).data()) -=
+              FI[i] * context_.normal.inverse_total[t] * FI[j].transpose();
+    }
+    for (int i = 0; i < n; ++i) FJ_[i] = (FJ_[i] * context_.q).eval();
+  }
+
+  // FᵀI of the item in the frame.
+  Matrix6d stack_item(int t, int i) {
+    const Normal& normal = context_.normal;
+    const auto& [k, is_branch, bias] = items_[i];
+    const Matrix6d F = adjoint(tree_.poses_[at(t, top_)]);
+    // A marker counts with its own share, a branch with all beyond it.
+    const Matrix6d FI = F.transpose() * (is_branch ? normal.I : normal.own_I)[at(t, k)];
+    Vector6d r = F.transpose() * (is_branch ? normal.gradient : normal.own_gradient)[at(t, k)];
+    if (is_eliminated()) r -= FI * (normal.inverse_total[t] * normal.gradient[at(t, 0)]);
+    Fr_[i].col(t) = r;
+    Eigen::Map<Matrix6d>(FF_[i * num_items() + i].col(t).data()) = FI * F;
+    Eigen::Map<Eigen::MatrixXd> fj(FJ_[i].col(t).data(), 6, newton_.size());
+    Eigen::Index column = 0;
+    for (const int e : related_) {
+      const ParameterJacobian& S = normal.S[at(t, e)];
+      auto block = fj.middleCols(column, S.cols());
+      if (is_branch && tree_.is_below(e, k))
+        block = (F.transpose() * normal.I[at(t, e)]).lazyProduct(S);
+      else if (tree_.is_below(k, e))
+        block = FI.lazyProduct(S);
+      if (is_eliminated())
+        block -= (FI * normal.inverse_total[t] * normal.I[at(t, e)]).lazyProduct(S);
+      column += S.cols();
+    }
+    return FI;
+  }
+
+  void sum_over_frames(int s) {
+    const int n = num_items();
+    Eigen::MatrixXd B(6 * n, newton_.size());
+    u_.resize(6 * n);
+    for (int i = 0; i < n; ++i) {
+      B.middleRows<6>(6 * i) =
+          Eigen::Map<const Eigen::MatrixXd>(FJ_[i].col(s).data(), 6, newton_.size());
+      u_.segment<6>(6 * i) = Fr_[i] * context_.q.col(s);
+    }
+    u_ -= B * newton_;
+    C_ = -B * inverse_ * B.transpose();
+    own_ = Eigen::MatrixXd::Zero(6, 6 * n);
+    for (int i = 0; i < n; ++i)
+      for (int j = 0; j < n; ++j) {
+        if (i != j && !is_eliminated()) continue;
+        const Eigen::Matrix<double, 36, 1> sum = FF_[i * n + j] * context_.q2.col(s);
+        C_.block<6, 6>(6 * i, 6 * j) += Eigen::Map<const Matrix6d>(sum.data());
+        if (i == j) own_.middleCols<6>(6 * i) = Eigen::Map<const Matrix6d>(sum.data());
+      }
+  }
+
+  // Items change sides, `first` apart, while the joint gets less likely by chance.
+  MissingJoint exchange(int first, std::vector<bool>* moves) const {
+    MissingJoint joint = test(*moves);
+    for (bool changed = true; changed;) {
+      changed = false;
+      for (int i = 0; i < num_items(); ++i) {
+        if (i == first) continue;
+        (*moves)[i] = !(*moves)[i];
+        MissingJoint other = test(*moves);
+        if (other.log_tail < joint.log_tail - 1e-9) {
+          joint = other;
+          changed = true;
+        } else {
+          (*moves)[i] = !(*moves)[i];
+        }
+      }
+    }
+    return joint;
+  }
+
+  MissingJoint test(const std::vector<bool>& moves) const {
+    Matrix6d C = Matrix6d::Zero(), own = Matrix6d::Zero(), bias = Matrix6d::Zero();
+    Vector6d u = Vector6d::Zero();
+    for (int i = 0; i < num_items(); ++i) {
+      if (!moves[i]) continue;
+      u += u_.segment<6>(6 * i);
+      own += own_.middleCols<6>(6 * i);
+      bias += items_[i].bias;
+      for (int j = 0; j < num_items(); ++j)
+        if (moves[j]) C += C_.block<6, 6>(6 * i, 6 * j);
+    }
+    bias /= static_cast<double>(std::count(moves.begin(), moves.end(), true));
+    MissingJoint joint;
+    joint.top = top_;
+    // Scaled to units of the markers' own information, so that metres and radians count alike.
+    const Vector6d unit = own.diagonal().cwiseMax(1e-300).cwiseSqrt().cwiseInverse();
+    const Vector6d inverse = unit.cwiseInverse();
+    const Vector6d unit_u = unit.cwiseProduct(u);
+    const Matrix6d unit_C = unit.asDiagonal() * C * unit.asDiagonal();
+    const Matrix6d unit_bias = inverse.asDiagonal() * bias * inverse.asDiagonal();
+    for (const int dof : {3, 6}) explain(dof, unit_u, unit_C, unit_bias, unit, &joint);
+    return joint;
+  }
+
+  // The joint becomes the one of so many degrees of freedom if that is less likely by chance.
+  void explain(int dof, const Vector6d& u, const Matrix6d& C, const Matrix6d& bias,
+               const Vector6d& unit, MissingJoint* joint) const {
+    const Eigen::SelfAdjointEigenSolver<Eigen::MatrixXd> eigen(
+        Eigen::MatrixXd(C.topLeftCorner(dof, dof)));
+    const UpTo6x6 V = eigen.eigenvectors();
+    // ξ along the eigenvectors, and its covariance: of the noise and of the bias.
+    UpTo6 xi = V.transpose() * u.head(dof);
+    UpTo6x6 covariance = V.transpose() * bias.topLeftCorner(dof, dof) * V;
+    for (int i = 0; i < dof; ++i) {
+      if (eigen.eigenvalues()(i) < kLeastShare) {
+        xi(i) = 0;
+        covariance.row(i).setZero();
+        covariance.col(i).setZero();
+        covariance(i, i) = 1;
+      } else {
+        xi(i) /= eigen.eigenvalues()(i);
+        covariance(i, i) += context_.normal.noise_scale() / eigen.eigenvalues()(i);
+      }
+    }
+    const double sum = xi.dot(covariance.ldlt().solve(xi));
+    const double log_tail = log_chi_square_tail(sum, dof);
+    if (log_tail >= joint->log_tail) return;
+    joint->log_tail = log_tail;
+    joint->statistic = sum;
+    joint->slides = dof == 3;
+    joint->xi.setZero();
+    joint->xi.head(dof) = -unit.head(dof).cwiseProduct(V * xi);
+  }
+
+  const TreeFit& tree_;
+  const Context& context_;
+  const int top_;
+  const std::vector<int> members_;
+  std::vector<Item> items_;
+  std::vector<int> related_;  // nodes whose parameters share a marker with the cluster ...
+  Eigen::MatrixXd inverse_;   // ... and their share of H⁻¹ and of H⁻¹g
+  Eigen::VectorXd newton_;
+  std::vector<Eigen::MatrixXd> FJ_, Fr_, FF_;  // by item (FF_: by two), a column a frame or signal
+  // For one signal, stacked over the items: the score, its covariance, the items' own information.
+  Eigen::VectorXd u_;
+  Eigen::MatrixXd C_, own_;
+};
+
+Eigen::MatrixXd TreeFit::moving_actions() const {
+  const auto& moving = actions_.moving();
+  Eigen::MatrixXd q(num_frames(), moving.size());
+  for (int t = 0; t < num_frames(); ++t)
+    for (std::size_t s = 0; s < moving.size(); ++s)
+      q(t, static_cast<Eigen::Index>(s)) = actions_(samples_[t], moving[s]);
+  return q;
+}
+
+std::vector<MissingJoint> TreeFit::missing_joints(const Noise& bias) const {
+  const Normal normal = normal_equations();
+  const std::optional<Eigen::MatrixXd> inverse = normal.inverse();
+  if (!inverse) return {};
+  const Eigen::MatrixXd q = moving_actions();
+  const MissingJointTest::Context context{normal, *inverse,          *inverse * normal.g,
+                                          q,      q.cwiseProduct(q), isotropic(bias)};
+  std::vector<MissingJoint> result;
+  for (int top = 0; top < static_cast<int>(nodes_.size()); ++top) {
+    if (top > 0 && nodes_[top].model.num_joints == 0) continue;
+    MissingJointTest test(*this, context, top);
+    for (int s = 0; s < static_cast<int>(q.cols()); ++s)
+      if (MissingJoint joint = test.best_joint(s); joint.log_tail < 0)
+        result.push_back(std::move(joint));
+  }
+  std::stable_sort(result.begin(), result.end(),
+                   [](const auto& x, const auto& y) { return x.log_tail < y.log_tail; });
+  return result;
+}
+
+Eigen::MatrixXd TreeFit::joint_information() const {
+  const int n = static_cast<int>(nodes_.size());
+  const int T = num_frames();
+  const auto m = static_cast<Eigen::Index>(actions_.moving().size());
+  Eigen::MatrixXd result = Eigen::MatrixXd::Zero(n, m);
+  const Normal normal = normal_equations();
+  const auto size = normal.H.rows();
+  const std::optional<Eigen::MatrixXd> inverse = normal.inverse();
+  if (!inverse) return result;
+  const Eigen::MatrixXd q = moving_actions();
+  const Eigen::MatrixXd q2 = q.cwiseProduct(q);
+  for (int k = 1; k < n; ++k) {
+    // Stacked over the frames, for q = 1: what the three axes share with each other and with the
+    // tree's parameters.
+    Eigen::MatrixXd own(9, T);
+    Eigen::MatrixXd shared = Eigen::MatrixXd::Zero(3 * size, T);
+    for (int t = 0; t < T; ++t) {
+      const Eigen::Matrix<double, 6, 3> axes = adjoint(poses_[at(t, k)]).rightCols<3>();
+      const Eigen::Matrix<double, 3, 6> AI = axes.transpose() * normal.I[at(t, k)];
+      const Eigen::Matrix<double, 3, 6> AIT =
+          root_rests_ ? Eigen::Matrix<double, 3, 6>::Zero() : (AI * normal.inverse_total[t]).eval();
+      Eigen::Map<Eigen::Matrix3d>(own.col(t).data()) = AI * axes - AIT * AI.transpose();
+      Eigen::Map<Eigen::MatrixXd> row(shared.col(t).data(), 3, size);
+      for (int e = root_rests_ ? 0 : 1; e < n; ++e) {
+        const ParameterJacobian& S = normal.S[at(t, e)];
+        auto block = row.middleCols(normal.offset[e], S.cols());
+        if (is_below(e, k))
+          block = (axes.transpose() * normal.I[at(t, e)]).lazyProduct(S);
+        else if (is_below(k, e))
+          block = AI.lazyProduct(S);
+        if (!root_rests_) block -= (AIT * normal.I[at(t, e)]).lazyProduct(S);
+      }
+    }
+    const Eigen::MatrixXd owns = own * q2, shares = shared * q;
+    for (Eigen::Index s = 0; s < m; ++s) {
+      const Eigen::Map<const Eigen::MatrixXd> B(shares.col(s).data(), 3, size);
+      const Eigen::Matrix3d C =
+          Eigen::Map<const Eigen::Matrix3d>(owns.col(s).data()) - B * *inverse * B.transpose();
+      const Eigen::SelfAdjointEigenSolver<Eigen::Matrix3d> eigen(C, Eigen::EigenvaluesOnly);
+      result(k, s) = std::max(eigen.eigenvalues()(0), 0.0) / normal.noise_scale();
+    }
+  }
+  return result;
+}
+
+}  // namespace bodyschema

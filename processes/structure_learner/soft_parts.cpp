@@ -1,0 +1,147 @@
+#include "processes/structure_learner/soft_parts.h"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <map>
+#include <set>
+#include <tuple>
+
+#include "processes/structure_learner/residual_fit.h"
+#include "processes/structure_learner/screen.h"
+
+namespace bodyschema {
+namespace {
+
+constexpr int kMaxFrames = 600;
+constexpr int kScreenFrames = 150;
+constexpr std::size_t kPairsTried = 3;  // between two components
+
+// Parts by their component, which is named after its lowest part.
+class Components {
+ public:
+  explicit Components(const std::vector<int>& parts) {
+    for (const int part : parts) of_part_[part] = part;
+  }
+  int of(int part) const { return of_part_.at(part); }
+  // False if they are one already.
+  bool join(int a, int b) {
+    const int lower = std::min(of(a), of(b)), upper = std::max(of(a), of(b));
+    if (lower == upper) return false;
+    for (auto& [part, component] : of_part_)
+      if (component == upper) component = lower;
+    return true;
+  }
+
+ private:
+  std::map<int, int> of_part_;
+};
+
+struct OpenPair {
+  double cost;  // of the best screws, a frame
+  int i, j;
+  LocalModel screws;
+};
+
+// The screws that leave least: rigid, the best joint or the best two.
+LocalModel best_screws(const PairData& pair, const NormalizedActions& actions, int max_signals,
+                       SearchResult* counted) {
+  std::vector<Start> starts{screen_rigid(pair, actions)};
+  const RelativeMotions motions = relative_motions(pair, 300);
+  if (max_signals >= 1) {
+    const auto regressions = screen_one_joint(motions, actions);
+    if (!regressions.empty())
+      starts.push_back(one_joint_start(regressions[0], pair, actions, motions.sigma_rad));
+  }
+  if (max_signals >= 2) {
+    const std::vector<std::vector<double>> turns(actions.num_signals(), default_turns());
+    for (Start& s : screen_two_joints(pair, actions, motions, turns, 2))
+      starts.push_back(std::move(s));
+  }
+  std::optional<Fit> best;
+  double best_cost = 0;
+  for (const Start& start : starts) {
+    Fit fit = fit_local_model(start.model, pair, actions, 20, 1e-2);
+    ++counted->num_fits;
+    const double cost = fit.cost + 6 * fit.model.num_joints * std::log(6.0 * pair.size());
+    if (best && cost >= best_cost) continue;
+    best_cost = cost;
+    best = std::move(fit);
+  }
+  return best->model;
+}
+
+// The pairs of two components by what the best screws leave of them, least first.
+void rank_pairs(const std::vector<ActionPoseSample>& samples, const NormalizedActions& actions,
+                const SearchOptions& options, std::vector<OpenPair>* pairs, SearchResult* found) {
+  for (OpenPair& o : *pairs) {
+    const PairData data = make_pair_data(samples, o.i, o.j, options.measurement, kScreenFrames);
+    const int num_independent =
+        actions.blocks().count(data.frames, [](const PairFrame& f) { return f.sample; });
+    if (num_independent < kFewestSoftFrames) {
+      o.cost = std::numeric_limits<double>::infinity();
+      continue;
+    }
+    o.screws = best_screws(data, actions, options.max_signals, found);
+    o.cost = evaluate(o.screws, data, actions).cost / data.size();
+  }
+  std::stable_sort(pairs->begin(), pairs->end(),
+                   [](const OpenPair& x, const OpenPair& y) { return x.cost < y.cost; });
+}
+
+// On a rigid base, and on the best screws if these are more.
+std::optional<SoftFit> best_soft_fit(const OpenPair& open,
+                                     const std::vector<ActionPoseSample>& samples,
+                                     const NormalizedActions& actions, const SearchOptions& options,
+                                     SearchResult* found) {
+  const PairData data = make_pair_data(samples, open.i, open.j, options.measurement, kMaxFrames);
+  std::optional<SoftFit> best;
+  std::vector<LocalModel> bases{screen_rigid(data, actions).model};
+  if (open.screws.num_joints > 0) bases.push_back(open.screws);
+  for (const LocalModel& base : bases) {
+    const auto fit = fit_soft_model(fit_local_model(base, data, actions, 30, 1e-3).model, data,
+                                    actions, options.validity);
+    ++found->num_fits;
+    found->records[{open.i, open.j}].was_soft_tried |= fit.has_value();
+    if (fit && (!best || fit->log_density > best->log_density)) best = fit;
+  }
+  return best;
+}
+
+}  // namespace
+
+void connect_soft_parts(const std::vector<ActionPoseSample>& samples,
+                        const NormalizedActions& actions, const std::vector<int>& parts,
+                        const SearchOptions& options, SearchResult* found) {
+  Components components(parts);
+  for (const AcceptedModel& m : found->models) components.join(m.part_i, m.part_j);
+  std::map<std::pair<int, int>, std::vector<OpenPair>> open;  // by the two components
+  std::set<std::pair<int, int>> undecided;
+  for (const auto& [pair, record] : found->records) {
+    const int a = components.of(pair.first), b = components.of(pair.second);
+    if (a == b) continue;
+    if (!record.undecided.empty()) undecided.insert(std::minmax(a, b));
+    if (record.num_common >= kFewestSoftFrames)
+      open[std::minmax(a, b)].push_back({0, pair.first, pair.second, {}});
+  }
+  std::vector<AcceptedModel> candidates;
+  for (auto& [between, pairs] : open) {
+    if (undecided.count(between)) continue;
+    rank_pairs(samples, actions, options, &pairs, found);
+    if (pairs.size() > kPairsTried) pairs.resize(kPairsTried);
+    for (const OpenPair& o : pairs) {
+      if (!std::isfinite(o.cost)) continue;
+      const std::optional<SoftFit> best = best_soft_fit(o, samples, actions, options, found);
+      if (!best || best->verdict != Verdict::kValid) continue;
+      candidates.push_back({o.i, o.j, best->model.screws, best->score, best->model.signals});
+    }
+  }
+  std::stable_sort(candidates.begin(), candidates.end(), [](const auto& x, const auto& y) {
+    return std::make_tuple(-x.score, x.part_i, x.part_j) <
+           std::make_tuple(-y.score, y.part_i, y.part_j);
+  });
+  for (AcceptedModel& c : candidates)
+    if (components.join(c.part_i, c.part_j)) found->models.push_back(std::move(c));
+}
+
+}  // namespace bodyschema
