@@ -6,6 +6,7 @@
 #include <set>
 #include <stdexcept>
 
+#include "common/estimation/chi_square.h"
 #include "common/estimation/quantile.h"
 #include "common/geometry/angle.h"
 #include "processes/model_monitor/schema_difference.h"
@@ -21,12 +22,11 @@ constexpr int kLongestDrift = 96;
 /// Small changes nearer than this are one, and nearer than that a drift [samples].
 constexpr std::int64_t kTogether = 12;
 constexpr std::int64_t kSoon = 150;
-/// χ²₆(0.99): below it a rate is none.
-constexpr double kSignificantRate = 16.8;
+/// Below it a rate is none.
+const double kSignificantRate = chi_square_quantile(6, 0.01);
 /// A drift has ended: so probable, and so many samples ago.
 constexpr double kSurelyEnded = 0.999;
 constexpr std::int64_t kEndedFor = 6;
-constexpr double kMedianChiSquare6 = 5.348;
 constexpr double kLargestScale = 5;
 constexpr std::size_t kFewestDistances = 20;
 /// Quiet samples after which the noise is looked at again.
@@ -103,8 +103,7 @@ Adaptation::Adaptation(BodySchema schema, AdaptationOptions options,
     tests.push_back(sample);
     drop_moved_tags(moved_tags_, &tests.back());
   }
-  if (tests.size() > kLongestDrift)
-    tests.erase(tests.begin(), tests.end() - kLongestDrift);
+  if (tests.size() > kLongestDrift) tests.erase(tests.begin(), tests.end() - kLongestDrift);
   visibility_.tell_tags_again();  // news of them is for the next sample
   calibrate(tests);
   if (!history.empty()) tracker_.set_history(std::move(history));
@@ -153,7 +152,7 @@ void Adaptation::calibrate(const std::vector<ActionPoseSample>& samples) {
         if (d2 >= 0) distances.push_back(d2);
     }
     if (distances.size() < kFewestDistances) break;
-    set_noise_scale(measurement_.scale * std::sqrt(upper_median(distances) / kMedianChiSquare6));
+    set_noise_scale(measurement_.scale * std::sqrt(upper_median(distances) / chi_square_median(6)));
     // A few samples tell no better than this.
     if (round == 3 && std::abs(std::log(measurement_.scale)) < 0.15)
       measurement_.scale = options_.measurement.scale;
@@ -165,7 +164,7 @@ void Adaptation::watch_noise(const TreeFilter::Judgement& judgement) {
   for (std::size_t n = 0; n < judgement.believed.size(); ++n)
     if (judgement.believed[n] == 1) quiet_distances_.push_back(judgement.squared_distance[n]);
   if (++num_quiet_ < kQuietSamples || quiet_distances_.size() < kFewestDistances) return;
-  const double scale = std::sqrt(upper_median(quiet_distances_) / kMedianChiSquare6);
+  const double scale = std::sqrt(upper_median(quiet_distances_) / chi_square_median(6));
   quiet_distances_.clear();
   num_quiet_ = 0;
   if (std::abs(std::log(scale)) < 0.05) return;
@@ -176,8 +175,7 @@ void Adaptation::watch_noise(const TreeFilter::Judgement& judgement) {
 void Adaptation::complete(std::int64_t sample_index, AdaptationEvent* event) const {
   using Kind = AdaptationEvent::Kind;
   event->sample_index = sample_index;
-  if (event->since >= 0)
-    event->since = stream_.sample_index_of(event->since);
+  if (event->since >= 0) event->since = stream_.sample_index_of(event->since);
   const bool may_be_normal = event->kind == Kind::kRestored || event->kind == Kind::kRefined ||
                              (event->kind == Kind::kRecovered &&
                               (event->cause == "stored" || event->cause == "camera_moved"));
@@ -245,8 +243,7 @@ void Adaptation::try_drift(std::int64_t sample_index, std::vector<AdaptationEven
   for (BegunDrift& drift :
        begun_drifts(before, measurement_, {parts.begin(), parts.end()}, samples, since)) {
     if (drift.gain < options_.acceptance) continue;
-    const double evidence =
-        drift.log_prior + drift.log_likelihood(before, measurement_, samples);
+    const double evidence = drift.log_prior + drift.log_likelihood(before, measurement_, samples);
     second = std::max(second, std::min(most, evidence));
     if (evidence <= most) continue;
     most = evidence;
@@ -320,9 +317,9 @@ void Adaptation::watch_visibility(const ActionPoseSample& sample, const ActionPo
                                   std::vector<AdaptationEvent>* events) {
   for (const auto& finding : visibility_.look(schema_.parts, sample, used, tags_)) {
     const auto [part, tag, is_missing, num_missed] = finding;
-    AdaptationEvent told =
-        tracker_.event(is_missing ? AdaptationEvent::Kind::kMissing : AdaptationEvent::Kind::kRecovered,
-              sample.sample_index, {part, true});
+    AdaptationEvent told = tracker_.event(
+        is_missing ? AdaptationEvent::Kind::kMissing : AdaptationEvent::Kind::kRecovered,
+        sample.sample_index, {part, true});
     told.tag = tag;
     told.cause = "marker_missing";
     told.num_samples = num_missed;
@@ -342,7 +339,8 @@ void Adaptation::set_aside(int tag, std::int64_t since, std::int64_t found) {
 
 void Adaptation::watch_tags(ActionPoseSample* sample, std::vector<AdaptationEvent>* events) {
   if (num_samples_ >= options_.calibration_samples) {
-    for (const MovedTags::Finding& finding : tags_.look(*sample, tracker_.settled(), schema_, measurement_)) {
+    for (const MovedTags::Finding& finding :
+         tags_.look(*sample, tracker_.settled(), schema_, measurement_)) {
       using Kind = AdaptationEvent::Kind;
       const Kind kind = finding.is_back ? (finding.is_on_part ? Kind::kRestored : Kind::kRecovered)
                                         : (finding.is_on_part ? Kind::kCandidate : Kind::kMissing);

@@ -215,8 +215,8 @@ double HypothesisTracker::log_odds_of(const std::vector<Change>& changes) const 
     odds += changes[n].what.fitted.log_prior;
     if (is_possible(changes[n].what.fitted, body))
       body = with_certain_change(body, changes[n].what.fitted);
-    const std::int64_t until = n + 1 < changes.size() ? changes[n + 1].since
-                                                      : std::numeric_limits<std::int64_t>::max();
+    const std::int64_t until =
+        n + 1 < changes.size() ? changes[n + 1].since : std::numeric_limits<std::int64_t>::max();
     const TreeFilter filter(body, measurement_);
     for (const Seen& seen : recent_)
       if (seen.sample.sample_index >= changes[n].since && seen.sample.sample_index < until)
@@ -237,12 +237,12 @@ void HypothesisTracker::offer(Hypothesis hypothesis) {
   std::erase_if(beam_, is_it);
   beam_.push_back(std::move(hypothesis));
   if (beam_.size() <= kBeam) return;
-  const auto least = std::min_element(
-      beam_.begin() + 1, beam_.end(),
-      [](const Hypothesis& a, const Hypothesis& b) {
-        if (a.changes.empty() != b.changes.empty()) return b.changes.empty();
-        return a.log_odds < b.log_odds;
-      });
+  const auto least = std::min_element(beam_.begin() + 1, beam_.end(),
+                                      [](const Hypothesis& a, const Hypothesis& b) {
+                                        if (a.changes.empty() != b.changes.empty())
+                                          return b.changes.empty();
+                                        return a.log_odds < b.log_odds;
+                                      });
   beam_.erase(least);
 }
 
@@ -291,8 +291,7 @@ void HypothesisTracker::propose_learned(std::int64_t now) {
     if (!others.empty()) rests.push_back(std::move(others));
     for (const std::vector<Change>& rest : rests) {
       const BodySchema base = composed(rest, rest.size());
-      const double before =
-          log_odds_of(rest) - log_likelihood(base, measurement_, samples);
+      const double before = log_odds_of(rest) - log_likelihood(base, measurement_, samples);
       const PlaceEvidence evidence(base, measurement_, part, false, samples);
       for (FittedChange& learned : evidence.learn()) {
         const double odds = before + learned.log_evidence;
@@ -451,9 +450,7 @@ void HypothesisTracker::tell(Kind kind, std::int64_t sample, const Hypothesis& o
 void HypothesisTracker::tell_difference(const Hypothesis& before, const Hypothesis& after,
                                         std::int64_t sample,
                                         std::vector<AdaptationEvent>* events) const {
-  const auto at = [](const Hypothesis& h, const Place& place) {
-    return last_at(h.changes, place);
-  };
+  const auto at = [](const Hypothesis& h, const Place& place) { return last_at(h.changes, place); };
   const double margin = after.log_odds - before.log_odds;
   bool is_moved = false;
   for (const Change& c : before.changes)
@@ -465,16 +462,18 @@ void HypothesisTracker::tell_difference(const Hypothesis& before, const Hypothes
     if (at(after, c.what.place) != &c) continue;
     const Change* old = at(before, c.what.place);
     if (old && is_same_explanation(old->what, c.what)) continue;
-    const bool is_learned_anew = old && c.what.fitted.change.is_learned() &&
-                                 !old->what.fitted.change.is_learned();
+    const bool is_learned_anew =
+        old && c.what.fitted.change.is_learned() && !old->what.fitted.change.is_learned();
     if (is_learned_anew) {
       tell(Kind::kReverted, sample, before, *old, margin, events);
       tell(Kind::kCandidate, sample, after, c, margin, events);
       continue;
     }
     const bool is_stored = c.what.fitted.change.form == BodyChange::Form::kStored;
-    tell(old || is_moved ? Kind::kRefined : is_stored ? Kind::kRestored : Kind::kCandidate, sample,
-         after, c, margin, events);
+    tell(old || is_moved ? Kind::kRefined
+         : is_stored     ? Kind::kRestored
+                         : Kind::kCandidate,
+         sample, after, c, margin, events);
   }
 }
 
@@ -574,8 +573,8 @@ void HypothesisTracker::detect(std::int64_t now, std::vector<AdaptationEvent>* e
   // Edges between which nothing was seen are suspected alike: which one it is is told later, if
   // there is more evidence of it. (A lead may also come from evidence against all of them.)
   const bool is_rising = !detected_ || cusum.value > std::min(untold_, tests_->ceiling());
-  is_told_ = is_rising &&
-             (cusum.value - second > kClearLead || now - cusum.since >= kLongestUnclear);
+  is_told_ =
+      is_rising && (cusum.value - second > kClearLead || now - cusum.since >= kLongestUnclear);
   detected_ = places.front();
   untold_ = cusum.value;
   if (!is_told_) return;
@@ -600,9 +599,8 @@ void HypothesisTracker::settle(std::int64_t now, std::vector<AdaptationEvent>* e
     if (last_at(changes(), c.what.place) == &c)
       tell(Kind::kRecovered, now, standing(), c, 0, events);
   // Of a drift, which may look like small changes, the mean of many samples is not what is now.
-  const bool any_small = std::any_of(changes().begin(), changes().end(), [](const Change& c) {
-    return c.what.fitted.change.small;
-  });
+  const bool any_small = std::any_of(changes().begin(), changes().end(),
+                                     [](const Change& c) { return c.what.fitted.change.small; });
   maturing_.reset();
   if (!any_small) maturing_ = {settled_, changes(), newest_adopted()};
   set_settled(BodySchema(schema()));
@@ -683,8 +681,7 @@ TreeFilter::Judgement HypothesisTracker::on_sample(const ActionPoseSample& sampl
   recent_.back().settled = judge(*settled_filter_);
   for (Hypothesis& h : beam_)
     if (!h.changes.empty()) h.log_odds += judge(*h.filter) - recent_.back().settled;
-  const TreeFilter::Judgement judgement =
-      tests_->update(filter(), filter().prepare(sample), now);
+  const TreeFilter::Judgement judgement = tests_->update(filter(), filter().prepare(sample), now);
   propose_again(now, events);
   propose_more(now);
   propose_learned(now);
