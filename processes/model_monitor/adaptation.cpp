@@ -222,8 +222,8 @@ void Adaptation::begin_drift(int part, std::int64_t since, std::int64_t sample_i
 
 void Adaptation::try_drift(std::int64_t sample_index, std::vector<AdaptationEvent>* events) {
   const std::vector<Place> places = tracker_.suspects();
-  if (drifting_ || (tracker_.changes().empty() && !tracker_.detected()) ||
-      (places.empty() && !tracker_.was_adopted_at(sample_index)))
+  if (drifting_ || (tracker_.changes().empty() && !tracker_.detected()) || places.empty() ||
+      tracker_.was_adopted_at(sample_index))
     return;
   const std::int64_t since = tracker_.trouble_since();
   const auto samples = tracker_.segment(since - kBeforeDrift, kLongestDrift);
@@ -235,7 +235,7 @@ void Adaptation::try_drift(std::int64_t sample_index, std::vector<AdaptationEven
       if (!place.marker) parts.insert(place.part);
   };
   for (const HypothesisTracker::Change& c : tracker_.changes()) add_around(c.what.place.part);
-  if (!places.empty()) add_around(places.front().part);
+  add_around(places.front().part);
   // Edges beside each other explain a bend nearly alike: until one leads, nothing is told.
   const BodySchema& before = tracker_.settled();
   std::optional<BegunDrift> best;

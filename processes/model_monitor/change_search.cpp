@@ -99,6 +99,10 @@ std::optional<Replacement> whole(const BodySchema& stored, const BodySchema& sta
 
 }  // namespace
 
+bool is_same_explanation(const Replacement& a, const Replacement& b) {
+  return a.place == b.place && a.fitted.change == b.fitted.change && a.also == b.also;
+}
+
 FoundChanges find_changes(const BodySchema& standing, const std::vector<BodySchema>& history,
                           const std::vector<Place>& places,
                           const std::vector<const ActionPoseSample*>& samples,

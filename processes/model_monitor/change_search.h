@@ -15,6 +15,9 @@ struct Replacement {
   std::vector<Place> also = {};  ///< what else a whole schema of the history changes
 };
 
+/// The same form of change in the same places, whatever its parameters.
+bool is_same_explanation(const Replacement& a, const Replacement& b);
+
 struct ChangeSearch {
   MeasurementModel measurement;
   double ambiguity = 6;  ///< lead that another form than the standing one needs [nats]

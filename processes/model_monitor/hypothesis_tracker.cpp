@@ -14,12 +14,6 @@ using Kind = AdaptationEvent::Kind;
 
 constexpr std::size_t kRing = 96;
 constexpr std::size_t kBeam = 12;
-/// Samples after a replacement at which all forms are tried again.
-constexpr int kRefits[] = {1, 2, 3, 4, 5, 7, 11, 19, 30};
-/// Samples up to which a change may turn out to be one of what is next to its place.
-constexpr int kUnsure = 5;
-/// From so many samples on a form must lead another clearly.
-constexpr int kManySamples = 8;
 /// Of a CUSUM, from which on it is told which place is wrong, although nothing explains it [nats];
 /// or after so many samples.
 constexpr double kClearLead = 1;
@@ -28,10 +22,6 @@ constexpr std::int64_t kLongestUnclear = 3;
 constexpr int kFewestSoft = 3;
 /// What the settled body is off by from the start, as a share of what a change explains.
 constexpr double kSystematicShare = 0.03;
-/// Samples without an explanation after which an edge is learned; newest samples that must then be
-/// explained no worse.
-constexpr std::int64_t kUnexplained = 8;
-constexpr std::int64_t kNewest = 5;
 /// Samples from one fit of what has settled to the next.
 constexpr int kMaturing = 10;
 /// Samples that all forms of change in one place are fitted to are counted: so many are free a
@@ -39,27 +29,8 @@ constexpr int kMaturing = 10;
 constexpr int kWorkPerSample = 4;
 constexpr int kMostWork = 1000;
 
-bool is_in(std::int64_t value, const auto& values) {
-  return std::find(std::begin(values), std::end(values), value) != std::end(values);
-}
-
-/// Of a suspicion so many samples old: growing steps bound the work of one that lasts.
-bool is_worth_a_fit(std::int64_t age) {
-  constexpr std::int64_t kAges[] = {10, 12, 15, 19, 24};
-  return age <= 8 || age % 30 == 0 || is_in(age, kAges);
-}
-
-bool is_worth_learning(std::int64_t age) {
-  constexpr std::int64_t kAges[] = {8, 10, 13, 16, 20, 25, 32};
-  return age % 40 == 0 || is_in(age, kAges);
-}
-
 bool is_in_places(const std::vector<Place>& places, const Place& place) {
   return std::find(places.begin(), places.end(), place) != places.end();
-}
-
-bool is_same_explanation(const Replacement& a, const Replacement& b) {
-  return a.place == b.place && a.fitted.change == b.fitted.change && a.also == b.also;
 }
 
 }  // namespace
@@ -172,19 +143,6 @@ std::vector<const ActionPoseSample*> HypothesisTracker::segment(std::int64_t sin
   return result;
 }
 
-FoundChanges HypothesisTracker::search(const BodySchema& base, const std::vector<Place>& places,
-                                       const std::vector<const ActionPoseSample*>& samples,
-                                       const BodyChange* standing_form) {
-  ChangeSearch search{measurement_, options_.ambiguity};
-  if (standing_form) {
-    search.standing_form = *standing_form;
-    search.learn = standing_form->is_learned();
-  }
-  FoundChanges found = find_changes(base, history_, places, samples, search);
-  credit_ -= found.work;
-  return found;
-}
-
 BodySchema HypothesisTracker::composed(const std::vector<Change>& changes,
                                        std::size_t without) const {
   BodySchema schema = settled_;
@@ -244,140 +202,6 @@ void HypothesisTracker::offer(Hypothesis hypothesis) {
                                         return a.log_odds < b.log_odds;
                                       });
   beam_.erase(least);
-}
-
-void HypothesisTracker::propose_more(std::int64_t now) {
-  const std::vector<Place> places = suspects();
-  if (places.empty() || credit_ <= 0) return;
-  const std::int64_t since = tests_->highest().cusum.since;
-  if (!is_worth_a_fit(now - since + 1)) return;
-  const FoundChanges found =
-      search(schema(), places, segment(since, options_.longest_segment), nullptr);
-  for (const auto* one : {&found.best, &found.runner_up}) {
-    if (!*one) continue;
-    std::vector<Change> changes = this->changes();
-    Change change{**one, since, now};
-    // It takes the place of an earlier one there, which holds until then.
-    const bool is_again = !change.what.place.marker && last_at(changes, change.what.place);
-    if (is_again && !change.what.fitted.origin) change.what.fitted.origin = schema();
-    changes.push_back(std::move(change));
-    Hypothesis more = made_of(std::move(changes));
-    more.log_odds = log_odds() + (*one)->fitted.log_evidence - found.null;
-    if (more.log_odds > log_odds() - options_.ambiguity) offer(std::move(more));
-  }
-}
-
-void HypothesisTracker::propose_learned(std::int64_t now) {
-  const std::vector<Place> places = suspects();
-  const std::int64_t since = trouble_since();
-  if (places.empty() || !(detected_ || now - last_mismatch_ < kUnexplained) ||
-      !is_worth_learning(now - since + 1))
-    return;
-  std::vector<int> parts;
-  const auto add = [&](const Place& place) {
-    const bool is_new = std::find(parts.begin(), parts.end(), place.part) == parts.end();
-    if (!place.marker && edge_to(settled_, place.part) && is_new) parts.push_back(place.part);
-  };
-  for (const Change& c : changes()) add(c.what.place);
-  add(places.front());
-  const auto samples = segment(since, options_.longest_segment);
-  const auto newest = segment(now - kNewest + 1, kNewest);
-  const double of_newest = log_likelihood(schema(), measurement_, newest);
-  for (const int part : parts) {
-    // The other edges as they were, or as they are now.
-    std::vector<std::vector<Change>> rests{{}};
-    std::vector<Change> others = changes();
-    std::erase_if(others, [part](const Change& c) { return c.what.place.part == part; });
-    if (!others.empty()) rests.push_back(std::move(others));
-    for (const std::vector<Change>& rest : rests) {
-      const BodySchema base = composed(rest, rest.size());
-      const double before = log_odds_of(rest) - log_likelihood(base, measurement_, samples);
-      const PlaceEvidence evidence(base, measurement_, part, false, samples);
-      for (FittedChange& learned : evidence.learn()) {
-        const double odds = before + learned.log_evidence;
-        std::vector<Change> changes = rest;
-        changes.push_back({{{part, false}, std::move(learned)}, since, now});
-        Hypothesis hypothesis = made_of(std::move(changes));
-        hypothesis.log_odds = odds;
-        // What the body has changed back from meanwhile explains many samples, too.
-        if (log_likelihood(hypothesis.body, measurement_, newest) >= of_newest)
-          offer(std::move(hypothesis));
-      }
-    }
-  }
-}
-
-void HypothesisTracker::refit(const BodySchema& others, int longest, Change* change) const {
-  FittedChange& fitted = change->what.fitted;
-  if (fitted.change.size() == 0 || !is_possible(fitted, others)) return;
-  const Place& place = change->what.place;
-  const BodySchema base = fitted.origin ? with_edge_of(others, *fitted.origin, place.part) : others;
-  const PlaceEvidence evidence(base, measurement_, place.part, place.marker,
-                               segment(change->since, longest));
-  auto again = evidence.fit(fitted.change);
-  if (!again) return;
-  again->origin = fitted.origin;
-  again->certain = fitted.certain;
-  fitted = std::move(*again);
-}
-
-std::optional<Replacement> HypothesisTracker::best_form(const Hypothesis& of, const Change& change,
-                                                        const BodySchema& others,
-                                                        std::int64_t now) {
-  const auto samples = segment(change.since, options_.longest_segment);
-  const FittedChange& fitted = change.what.fitted;
-  FoundChanges found = search(others, {change.what.place}, samples, &fitted.change);
-  const bool is_young = now - change.adopted <= kUnsure && change.what.also.empty() &&
-                        !fitted.everywhere && !fitted.change.is_learned();
-  if (is_young && of.changes.size() == 1) {
-    std::vector<Place> around = places_around(*of.filter, change.what.place.part);
-    std::erase(around, change.what.place);
-    FoundChanges there = search(others, around, samples, nullptr);
-    if (there.best && (!found.best || there.best->fitted.log_evidence >
-                                          found.best->fitted.log_evidence + options_.acceptance))
-      found = std::move(there);
-  }
-  if (!found.best || found.margin() < 0) return std::nullopt;
-  if (found.runner_up && of.changes.size() == 1) {
-    Hypothesis rival = made_of({{*found.runner_up, change.since, change.adopted}});
-    rival.log_odds = found.runner_up->fitted.log_evidence - found.null;
-    offer(std::move(rival));
-  }
-  return found.best;
-}
-
-HypothesisTracker::Hypothesis HypothesisTracker::fitted_again(Hypothesis hypothesis, bool all_forms,
-                                                              int longest, std::int64_t now) {
-  std::vector<Change> changes = hypothesis.changes;
-  const int rounds = all_forms && changes.size() > 1 ? 3 : 1;
-  for (int round = 0; round < rounds; ++round) {
-    bool is_changed = false;
-    for (std::size_t n = 0; n < changes.size();) {
-      Change& c = changes[n];
-      if (now - c.adopted > longest || last_at(changes, c.what.place) != &c) {
-        ++n;
-        continue;
-      }
-      const BodySchema others = composed(changes, n);
-      if (!all_forms) {
-        refit(others, longest, &c);
-        ++n;
-        continue;
-      }
-      auto best = best_form(hypothesis, c, others, now);
-      is_changed |= !best || !is_same_explanation(*best, c.what);
-      if (best) {
-        c.what = std::move(*best);
-        ++n;
-      } else {
-        changes.erase(changes.begin() + static_cast<std::ptrdiff_t>(n));
-      }
-    }
-    if (!is_changed) break;
-  }
-  Hypothesis result = made_of(std::move(changes));
-  result.log_odds = log_odds_of(result.changes);
-  return result;
 }
 
 double HypothesisTracker::needed_lead(const Hypothesis& other, std::int64_t now) const {
@@ -487,7 +311,7 @@ void HypothesisTracker::stand(Hypothesis next, std::int64_t now,
     if (next.changes.back().what.place == Place{settled_.root, false})
       mismatch.cause = "camera_moved";
     events->push_back(mismatch);
-    last_mismatch_ = now;
+    note_mismatch(next.changes.back().what.place, now);
   }
   tell_difference(standing(), next, now, events);
   std::int64_t since = std::numeric_limits<std::int64_t>::max();
@@ -499,56 +323,6 @@ void HypothesisTracker::stand(Hypothesis next, std::int64_t now,
   maturing_.reset();
   // What the explanation that was taken back was wrong about is nobody's fault.
   begin_tests(since);
-}
-
-void HypothesisTracker::propose_again(std::int64_t now, std::vector<AdaptationEvent>* events) {
-  if (changes().empty()) return;
-  const std::int64_t age = now - newest_adopted();
-  if (age == 0) return;
-  beam_.front() = fitted_again(standing(), false, options_.settled_after, now);
-  if (credit_ <= 0 || !is_in(age, kRefits)) return;
-  Hypothesis again = fitted_again(standing(), true, options_.settled_after, now);
-  const double lead = again.log_odds - log_odds();
-  if (lead <= (age < kManySamples ? 0 : needed_lead(again, now)))
-    offer(std::move(again));
-  else
-    stand(std::move(again), now, events);
-}
-
-void HypothesisTracker::want_probe(std::int64_t now, std::vector<AdaptationEvent>* events) {
-  const auto is_asked = [this](const Replacement& a, const Replacement& b) {
-    return std::any_of(asked_.begin(), asked_.end(), [&](const auto& pair) {
-      return (is_same_explanation(pair.first, a) && is_same_explanation(pair.second, b)) ||
-             (is_same_explanation(pair.first, b) && is_same_explanation(pair.second, a));
-    });
-  };
-  if (changes().empty()) {
-    asked_.clear();
-    return;
-  }
-  const std::int64_t age = now - newest_adopted();
-  if (age != 0 && !is_in(age, kRefits)) return;
-  const Replacement& one = changes().back().what;
-  for (std::size_t n = 1; n < beam_.size(); ++n) {
-    const Hypothesis& rival = beam_[n];
-    if (rival.changes.size() != changes().size()) continue;
-    const Replacement& other = rival.changes.back().what;
-    const double lead = std::abs(log_odds() - rival.log_odds);
-    // Of two functions the samples to come decide.
-    if (lead > options_.ambiguity || one.place != other.place || is_same_explanation(one, other) ||
-        one.fitted.change.is_learned() || is_asked(one, other))
-      continue;
-    const Eigen::VectorXd probe = most_telling_action(schema(), rival.body, options_.tolerance);
-    if (probe.size() == 0) continue;
-    AdaptationEvent wanted = event(Kind::kProbeWanted, now, one.place);
-    const std::string cause = one.fitted.change.cause(settled_),
-                      other_cause = other.fitted.change.cause(settled_);
-    wanted.cause = cause == other_cause ? cause : cause + " or " + other_cause;
-    wanted.margin = lead;
-    wanted.probe = probe;
-    asked_.emplace_back(one, other);
-    events->push_back(std::move(wanted));
-  }
 }
 
 void HypothesisTracker::detect(std::int64_t now, std::vector<AdaptationEvent>* events) {
@@ -583,8 +357,12 @@ void HypothesisTracker::detect(std::int64_t now, std::vector<AdaptationEvent>* e
   mismatch.since = cusum.since;
   mismatch.margin = cusum.value;
   mismatch.num_samples = static_cast<int>(now - cusum.since + 1);
-  last_mismatch_ = now;
+  note_mismatch(*detected_, now);
   events->push_back(mismatch);
+}
+
+void HypothesisTracker::note_mismatch(const Place& place, std::int64_t now) {
+  mismatched_[place] = last_mismatch_ = now;
 }
 
 void HypothesisTracker::settle(std::int64_t now, std::vector<AdaptationEvent>* events) {
@@ -593,6 +371,7 @@ void HypothesisTracker::settle(std::int64_t now, std::vector<AdaptationEvent>* e
   if (suspects().empty()) {
     const std::size_t most = changes().size();
     std::erase_if(beam_, [most](const Hypothesis& h) { return h.changes.size() > most; });
+    if (most == 0) mismatched_.clear();
   }
   if (changes().empty() || now - newest_adopted() < options_.settled_after) return;
   for (const Change& c : changes())

@@ -3,6 +3,7 @@
 #include <cstdint>
 #include <deque>
 #include <functional>
+#include <map>
 #include <memory>
 #include <optional>
 #include <vector>
@@ -33,6 +34,8 @@ class HypothesisTracker {
     std::int64_t adopted = 0;  ///< sample in which its place was found
   };
   using Filter = std::function<void(ActionPoseSample*)>;
+  /// Samples without an explanation after which an edge is learned anew.
+  static constexpr std::int64_t kUnexplained = 8;
 
   /// `is_soft`: some edge has a residual GP, so that nothing is found from one loud sample.
   HypothesisTracker(BodySchema settled, const MeasurementModel& measurement,
@@ -127,6 +130,7 @@ class HypothesisTracker {
             const Change& change, double margin, std::vector<AdaptationEvent>* events) const;
   void want_probe(std::int64_t now, std::vector<AdaptationEvent>* events);
   void detect(std::int64_t now, std::vector<AdaptationEvent>* events);
+  void note_mismatch(const Place& place, std::int64_t now);
   void settle(std::int64_t now, std::vector<AdaptationEvent>* events);
   void mature(std::int64_t now);
   void begin_tests(std::int64_t since);
@@ -146,6 +150,7 @@ class HypothesisTracker {
   bool is_told_ = false;  ///< that and where something was detected
   double untold_ = 0;     ///< the highest CUSUM when it was not told yet
   std::int64_t last_mismatch_ = -1000;
+  std::map<Place, std::int64_t> mismatched_;  ///< places in the present trouble → the newest
   std::vector<std::pair<Replacement, Replacement>> asked_;  ///< a probe was wanted for
   int credit_;  ///< work that may be done now; see kWorkPerSample
 };
