@@ -204,13 +204,20 @@ void Adaptation::watch_small_changes(std::int64_t sample_index,
                       is_next(last_small_->first, part));
   last_small_ = {part, sample_index};
   if (!again) return;
-  tracker_.take_back_all(sample_index, events);
+  // Small changes that have not settled were this drift as well.
+  const std::vector<HypothesisTracker::Change>& changes = tracker_.changes();
+  if (std::all_of(changes.begin(), changes.end(),
+                  [](const auto& c) { return c.what.fitted.change.small; }))
+    tracker_.take_back_all(sample_index, events);
+  else
+    tracker_.keep_all();
   begin_drift(part, sample_index, sample_index, events);
 }
 
 void Adaptation::begin_drift(int part, std::int64_t since, std::int64_t sample_index,
                              std::vector<AdaptationEvent>* events) {
   drifting_ = part;
+  tracker_.stop_fitting();
   before_ = tracker_.settled();
   num_still_ = 0;
   AdaptationEvent drift =
@@ -225,6 +232,7 @@ void Adaptation::try_drift(std::int64_t sample_index, std::vector<AdaptationEven
   if (drifting_ || (tracker_.changes().empty() && !tracker_.detected()) || places.empty() ||
       tracker_.was_adopted_at(sample_index))
     return;
+  if (!is_worth_a_fit(sample_index - tracker_.tests().highest().cusum.since + 1)) return;
   const std::int64_t since = tracker_.trouble_since();
   const auto samples = tracker_.segment(since - kBeforeDrift, kLongestDrift);
   // When it began is no longer known.
@@ -444,7 +452,6 @@ std::vector<AdaptationEvent> Adaptation::on_new_sample(ActionPoseSample sample) 
   const TreeFilter& filter = tracker_.filter();
   drift_watch_.add(filter, filter.prepare(sample), schema_.displacements(sample.action),
                    sample.sample_index);
-  const bool was_settled = tracker_.changes().empty();
   const TreeFilter::Judgement judgement = tracker_.on_sample(sample, &events);
   watch_small_changes(sample.sample_index, &events);
   try_drift(sample.sample_index, &events);
@@ -455,7 +462,11 @@ std::vector<AdaptationEvent> Adaptation::on_new_sample(ActionPoseSample sample) 
   };
   if (std::any_of(events.begin(), events.end(), is_change)) visibility_.forget_tags();
   if (tracker_.changes().empty()) {
-    if (!was_settled) tags_.begin_anew();
+    const auto has_settled = [](const AdaptationEvent& e) {
+      return e.kind == AdaptationEvent::Kind::kRecovered && e.tag < 0 &&
+             e.cause != "marker_missing" && e.cause != "unexplained";
+    };
+    if (std::any_of(events.begin(), events.end(), has_settled)) tags_.begin_anew();
     watch_drift(sample.sample_index, &events);
   } else {
     drifting_.reset();

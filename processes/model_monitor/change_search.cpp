@@ -103,6 +103,12 @@ bool is_same_explanation(const Replacement& a, const Replacement& b) {
   return a.place == b.place && a.fitted.change == b.fitted.change && a.also == b.also;
 }
 
+bool is_worth_a_fit(std::int64_t age) {
+  constexpr std::int64_t kAges[] = {10, 12, 15, 19, 24};
+  return age <= 8 || age % 30 == 0 ||
+         std::find(std::begin(kAges), std::end(kAges), age) != std::end(kAges);
+}
+
 FoundChanges find_changes(const BodySchema& standing, const std::vector<BodySchema>& history,
                           const std::vector<Place>& places,
                           const std::vector<const ActionPoseSample*>& samples,

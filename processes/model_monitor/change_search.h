@@ -18,6 +18,9 @@ struct Replacement {
 /// The same form of change in the same places, whatever its parameters.
 bool is_same_explanation(const Replacement& a, const Replacement& b);
 
+/// Of a suspicion so many samples old: growing steps bound the work of one that lasts.
+bool is_worth_a_fit(std::int64_t age);
+
 struct ChangeSearch {
   MeasurementModel measurement;
   double ambiguity = 6;  ///< lead that another form than the standing one needs [nats]

@@ -26,12 +26,6 @@ bool is_in(std::int64_t value, const auto& values) {
   return std::find(std::begin(values), std::end(values), value) != std::end(values);
 }
 
-/// Of a suspicion so many samples old: growing steps bound the work of one that lasts.
-bool is_worth_a_fit(std::int64_t age) {
-  constexpr std::int64_t kAges[] = {10, 12, 15, 19, 24};
-  return age <= 8 || age % 30 == 0 || is_in(age, kAges);
-}
-
 bool is_worth_learning(std::int64_t age) {
   constexpr std::int64_t kAges[] = {8, 10, 13, 16, 20, 25, 32};
   return age % 40 == 0 || is_in(age, kAges);

@@ -33,6 +33,10 @@ bool is_in_places(const std::vector<Place>& places, const Place& place) {
   return std::find(places.begin(), places.end(), place) != places.end();
 }
 
+bool is_same_change(const HypothesisTracker::Change& a, const HypothesisTracker::Change& b) {
+  return a.since == b.since && is_same_explanation(a.what, b.what);
+}
+
 }  // namespace
 
 HypothesisTracker::HypothesisTracker(BodySchema settled, const MeasurementModel& measurement,
@@ -64,8 +68,11 @@ void HypothesisTracker::begin(const BodySchema& settled, const MeasurementModel&
 void HypothesisTracker::follow(const BodySchema& settled, int part) {
   settled_ = settled;
   settled_filter_ = std::make_shared<TreeFilter>(settled_, measurement_);
-  recent_.back().settled =
-      settled_filter_->judge(settled_filter_->prepare(recent_.back().sample)).log_likelihood;
+  // What is suspected elsewhere is judged by the body as it is now.
+  const SequentialTests::Cusum cusum = tests_->highest().cusum;
+  for (Seen& seen : recent_)
+    if (&seen == &recent_.back() || (cusum.value > 0 && seen.sample.sample_index >= cusum.since))
+      seen.settled = settled_filter_->judge(settled_filter_->prepare(seen.sample)).log_likelihood;
   beam_.assign(1, {{}, settled_, settled_filter_, 0});
   tests_->clear(settled_filter_->node_of(part));
 }
@@ -185,14 +192,11 @@ double HypothesisTracker::log_odds_of(const std::vector<Change>& changes) const 
 
 void HypothesisTracker::offer(Hypothesis hypothesis) {
   const auto is_it = [&](const Hypothesis& other) {
-    return other.changes.size() == hypothesis.changes.size() &&
-           std::equal(other.changes.begin(), other.changes.end(), hypothesis.changes.begin(),
-                      [](const Change& a, const Change& b) {
-                        return is_same_explanation(a.what, b.what) && a.since == b.since;
-                      });
+    return std::equal(other.changes.begin(), other.changes.end(), hypothesis.changes.begin(),
+                      hypothesis.changes.end(), is_same_change);
   };
+  beam_.erase(std::remove_if(beam_.begin() + 1, beam_.end(), is_it), beam_.end());
   if (is_it(standing())) return;
-  std::erase_if(beam_, is_it);
   beam_.push_back(std::move(hypothesis));
   if (beam_.size() <= kBeam) return;
   const auto least = std::min_element(beam_.begin() + 1, beam_.end(),
@@ -274,35 +278,45 @@ void HypothesisTracker::tell(Kind kind, std::int64_t sample, const Hypothesis& o
 void HypothesisTracker::tell_difference(const Hypothesis& before, const Hypothesis& after,
                                         std::int64_t sample,
                                         std::vector<AdaptationEvent>* events) const {
-  const auto at = [](const Hypothesis& h, const Place& place) { return last_at(h.changes, place); };
   const double margin = after.log_odds - before.log_odds;
-  bool is_moved = false;
   for (const Change& c : before.changes)
-    if (at(before, c.what.place) == &c && !at(after, c.what.place)) {
+    if (last_at(before.changes, c.what.place) == &c && !last_at(after.changes, c.what.place))
       tell(Kind::kReverted, sample, before, c, margin, events);
-      is_moved = true;
-    }
   for (const Change& c : after.changes) {
-    if (at(after, c.what.place) != &c) continue;
-    const Change* old = at(before, c.what.place);
-    if (old && is_same_explanation(old->what, c.what)) continue;
+    if (last_at(after.changes, c.what.place) != &c) continue;
+    const Change* old = last_at(before.changes, c.what.place);
+    if (old && is_same_change(*old, c)) continue;
+    const auto is_old = [old](const Change& other) { return is_same_change(other, *old); };
+    const bool is_superseded =
+        old && std::any_of(after.changes.begin(), after.changes.end(), is_old);
     const bool is_learned_anew =
         old && c.what.fitted.change.is_learned() && !old->what.fitted.change.is_learned();
-    if (is_learned_anew) {
-      tell(Kind::kReverted, sample, before, *old, margin, events);
-      tell(Kind::kCandidate, sample, after, c, margin, events);
+    const bool is_refined = old && !is_superseded && !is_learned_anew && c.since <= old->since;
+    if (is_refined) {
+      tell(Kind::kRefined, sample, after, c, margin, events);
       continue;
     }
+    if (old && !is_superseded) tell(Kind::kReverted, sample, before, *old, margin, events);
     const bool is_stored = c.what.fitted.change.form == BodyChange::Form::kStored;
-    tell(old || is_moved ? Kind::kRefined
-         : is_stored     ? Kind::kRestored
-                         : Kind::kCandidate,
-         sample, after, c, margin, events);
+    tell(is_stored ? Kind::kRestored : Kind::kCandidate, sample, after, c, margin, events);
   }
 }
 
 void HypothesisTracker::stand(Hypothesis next, std::int64_t now,
                               std::vector<AdaptationEvent>* events) {
+  bool is_another = next.changes.size() != changes().size();
+  for (Change& c : next.changes) {
+    const auto standing_one =
+        std::find_if(changes().begin(), changes().end(), [&](const Change& other) {
+          return other.what.place == c.what.place && other.since == c.since;
+        });
+    c.adopted = standing_one == changes().end() ? now : standing_one->adopted;
+    is_another |= standing_one == changes().end() || !is_same_change(*standing_one, c);
+  }
+  if (!is_another) {
+    beam_.front() = std::move(next);
+    return;
+  }
   if (next.changes.size() > changes().size() && !(detected_ && is_told_)) {
     AdaptationEvent mismatch = event(Kind::kMismatch, now, next.changes.back().what.place);
     mismatch.since = next.changes.back().since;
@@ -375,8 +389,12 @@ void HypothesisTracker::settle(std::int64_t now, std::vector<AdaptationEvent>* e
   }
   if (changes().empty() || now - newest_adopted() < options_.settled_after) return;
   for (const Change& c : changes())
-    if (last_at(changes(), c.what.place) == &c)
+    if (last_at(changes(), c.what.place) == &c) {
+      const std::size_t first = events->size();
       tell(Kind::kRecovered, now, standing(), c, 0, events);
+      for (std::size_t n = first; n < events->size(); ++n)
+        (*events)[n].num_samples = static_cast<int>(now - c.adopted);
+    }
   // Of a drift, which may look like small changes, the mean of many samples is not what is now.
   const bool any_small = std::any_of(changes().begin(), changes().end(),
                                      [](const Change& c) { return c.what.fitted.change.small; });
@@ -407,6 +425,11 @@ void HypothesisTracker::mature(std::int64_t now) {
     if (is_same(stored, before)) stored = settled_;
 }
 
+void HypothesisTracker::keep_all() {
+  remember(schema());
+  begin(BodySchema(schema()), measurement_);
+}
+
 void HypothesisTracker::take_back_all(std::int64_t sample, std::vector<AdaptationEvent>* events) {
   const Hypothesis nothing{{}, settled_, settled_filter_, 0};
   tell_difference(standing(), nothing, sample, events);
@@ -427,7 +450,9 @@ void HypothesisTracker::take_back(const std::function<bool(const Place&)>& is_at
   Hypothesis next = made_of(std::move(rest));
   next.log_odds = log_odds_of(next.changes);
   tell_difference(standing(), next, sample, events);
+  const bool is_nothing = next.changes.empty();
   beam_.assign(1, std::move(next));
+  if (!is_nothing) offer({{}, settled_, settled_filter_, 0});
   if (detected_ && is_at(*detected_)) detected_.reset();
   begin_tests(std::numeric_limits<std::int64_t>::max());
 }

@@ -31,7 +31,7 @@ class HypothesisTracker {
   struct Change {
     Replacement what;
     std::int64_t since = 0;    ///< first sample that shows it
-    std::int64_t adopted = 0;  ///< sample in which its place was found
+    std::int64_t adopted = 0;  ///< sample since which it stands
   };
   using Filter = std::function<void(ActionPoseSample*)>;
   /// Samples without an explanation after which an edge is learned anew.
@@ -73,6 +73,9 @@ class HypothesisTracker {
   void follow(const BodySchema& settled, int part);
   /// `change` of `base` made the settled body: its parameters go on being fitted for a while.
   void go_on_fitting(BodySchema base, Change change);
+  void stop_fitting() { maturing_.reset(); }
+  /// What stands is kept as it is, and remembered.
+  void keep_all();
   /// What stands is taken back, and told; the settled body is what there is.
   void take_back_all(std::int64_t sample, std::vector<AdaptationEvent>* events);
   /// What stands or is detected in these places, if it began no earlier than `since`, is taken

@@ -87,6 +87,16 @@ TEST_F(HypothesisTrackerTest, ANewerChangeOfAPlaceTakesThePlaceOfAnOlderOne) {
   for (const auto& change : tracker_->changes()) EXPECT_EQ(change.what.place, (Place{4, false}));
   EXPECT_LT(arm.error(tracker_->schema(), 4 * 15 - 1), 0.015);
   EXPECT_EQ(tracker_->trouble_since(), 15);
+  // The way back is told as what it is, so that the body holds since then.
+  const auto is_back = [](const AdaptationEvent& e) {
+    return e.kind == Kind::kRestored && e.sample_index >= 30 && e.sample_index < 35 &&
+           e.since >= 30;
+  };
+  EXPECT_TRUE(std::any_of(events_.begin(), events_.end(), is_back));
+  const auto is_broken_again = [](const AdaptationEvent& e) {
+    return (e.kind == Kind::kRestored || e.kind == Kind::kCandidate) && e.since >= 45;
+  };
+  EXPECT_TRUE(std::any_of(events_.begin(), events_.end(), is_broken_again));
 }
 
 TEST_F(HypothesisTrackerTest, WhatIsTakenBackIsToldAndGone) {
