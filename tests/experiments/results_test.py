@@ -61,7 +61,8 @@ def quoted_again(page, read):
         if isinstance(block, str):
             lines.append(block)
             continue
-        source = next(table for _, table in quotations(read(LINK.findall(introduction)[-1])) if table[0] == block[0])
+        tables = [table for _, table in quotations(read(LINK.findall(introduction)[-1]))]
+        source = max(tables, key=lambda table, head=block[0]: equal_cells(head, table[0]))  # it may have columns more
         lines += source[:2] + [max(source[2:], key=lambda other, row=row: equal_cells(row, other)) for row in block[2:]]
     return "\n".join(lines) + "\n"
 
