@@ -193,11 +193,12 @@ void HypothesisTracker::propose_again(std::int64_t now, std::vector<AdaptationEv
   beam_.front() = fitted_again(standing(), false, options_.settled_after, now);
   if (credit_ <= 0 || !is_in(age, kRefits)) return;
   Hypothesis again = fitted_again(standing(), true, options_.settled_after, now);
+  // The same, learned from more samples, needs no lead.
   const double lead = again.log_odds - log_odds();
-  if (lead <= (age < kManySamples ? 0 : needed_lead(again, now)))
-    offer(std::move(again));
-  else
+  if (is_standing(again.changes) || lead > (age < kManySamples ? 0 : needed_lead(again, now)))
     stand(std::move(again), now, events);
+  else
+    offer(std::move(again));
 }
 
 void HypothesisTracker::want_probe(std::int64_t now, std::vector<AdaptationEvent>* events) {

@@ -190,13 +190,18 @@ double HypothesisTracker::log_odds_of(const std::vector<Change>& changes) const 
   return odds;
 }
 
+bool HypothesisTracker::is_standing(const std::vector<Change>& changes) const {
+  return std::equal(changes.begin(), changes.end(), standing().changes.begin(),
+                    standing().changes.end(), is_same_change);
+}
+
 void HypothesisTracker::offer(Hypothesis hypothesis) {
   const auto is_it = [&](const Hypothesis& other) {
     return std::equal(other.changes.begin(), other.changes.end(), hypothesis.changes.begin(),
                       hypothesis.changes.end(), is_same_change);
   };
   beam_.erase(std::remove_if(beam_.begin() + 1, beam_.end(), is_it), beam_.end());
-  if (is_it(standing())) return;
+  if (is_standing(hypothesis.changes)) return;
   beam_.push_back(std::move(hypothesis));
   if (beam_.size() <= kBeam) return;
   const auto least = std::min_element(beam_.begin() + 1, beam_.end(),

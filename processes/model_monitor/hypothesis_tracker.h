@@ -106,6 +106,8 @@ class HypothesisTracker {
   /// The newest change there, which is the one that holds now.
   static const Change* last_at(const std::vector<Change>& changes, const Place& place);
   const Hypothesis& standing() const { return beam_.front(); }
+  /// The same explanation, whatever its parameters.
+  bool is_standing(const std::vector<Change>& changes) const;
   std::int64_t newest_adopted() const;
   Hypothesis made_of(std::vector<Change> changes) const;
   BodySchema composed(const std::vector<Change>& changes, std::size_t without) const;
