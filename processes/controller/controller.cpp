@@ -267,10 +267,12 @@ double Controller::predicted_error_m() const {
 }
 
 void Controller::observe(const sample_t& message) {
-  const ActionPoseSample sample = from_message(message);
-  const PartObservation* part = sample.find(target_.target_part);
   observed_error_m_ = -1;
-  if (part == nullptr || !schema_) return;
+  if (!schema_) return;
+  ActionPoseSample sample = from_message(message);
+  drop_moved_tags(schema_->moved_tags, &sample);
+  const PartObservation* part = sample.find(target_.target_part);
+  if (part == nullptr) return;
   // One view of the root is worse than the schema's mean over all: half a degree is 9 mm at 1 m.
   // Unless the camera was moved since.
   Pose X_CR = schema_->X_CR;

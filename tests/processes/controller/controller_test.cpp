@@ -214,6 +214,11 @@ class Bench {
       to_message(Matrix6d(Matrix6d::Identity() * variance), seen.covariance);
       seen.has_other = part == 4 && is_ambiguous;
       seen.error_ratio = seen.has_other ? 2 : 0;
+      if (part == 4 && tag >= 0) {
+        tag_corners_t corners{};
+        corners.tag_id = tag;
+        set_array(seen.num_tags, seen.tags, {corners});
+      }
       parts.push_back(seen);
     }
     set_array(sample.num_parts, sample.parts, parts);
@@ -263,6 +268,7 @@ class Bench {
   Eigen::Vector3d bend_m = Eigen::Vector3d::Zero();
   double observation_sd_m = 0.001;
   bool is_ambiguous = false;
+  int tag = -1;  ///< by which part 4 is seen
   Pose X_CC_moved = Pose::Identity();
   std::int64_t now = 1000 * kSecond;
   std::int64_t num_samples = 0;
@@ -1238,6 +1244,22 @@ TEST(ControllerTest, ACameraThatWasMovedIsSeenByTheRoot) {
   bench.give(position_target(0, kNear));
   ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED));
   EXPECT_LT(bench.status.observed_error_m, 1e-4);
+}
+
+TEST(ControllerTest, ATagThatMovedOnItsPartNeitherJudgesNorCorrects) {
+  constexpr int kTag = 41;
+  for (const bool has_moved : {false, true}) {
+    Bench bench;
+    bench.bend_m = Eigen::Vector3d(0.01, -0.005, 0);
+    bench.tag = kTag;
+    if (has_moved) bench.schema.moved_tags = {{.tag = kTag, .found = 0, .since = 0, .until = -1}};
+    bench.start();
+    bench.give(position_target(0, kNear));
+    ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED));
+    EXPECT_EQ(bench.status.observed_error_m < 0, has_moved);
+    EXPECT_EQ(bench.status.predicted_error_m < 1e-4, has_moved);
+    EXPECT_EQ(bench.has_why("not seen there"), has_moved) << bench.status.why;
+  }
 }
 
 TEST(ControllerTest, WhatIsSeenTooFarOffIsToldButNotBelieved) {
