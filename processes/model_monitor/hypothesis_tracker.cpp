@@ -380,18 +380,20 @@ void HypothesisTracker::detect(std::int64_t now, std::vector<AdaptationEvent>* e
   events->push_back(mismatch);
 }
 
+void HypothesisTracker::drop_stale() {
+  // One change more is pursued while what it was proposed for is suspected: what a model is off by
+  // from the start adds up to evidence of a change, too.
+  const std::size_t most = changes().size();
+  if (!suspects().empty()) return;
+  std::erase_if(beam_, [most](const Hypothesis& h) { return h.changes.size() > most; });
+  if (most == 0) mismatched_.clear();
+}
+
 void HypothesisTracker::note_mismatch(const Place& place, std::int64_t now) {
   mismatched_[place] = last_mismatch_ = now;
 }
 
 void HypothesisTracker::settle(std::int64_t now, std::vector<AdaptationEvent>* events) {
-  // One change more is pursued while something is suspected: what a model is off by from the start
-  // adds up to evidence of a change, too.
-  if (suspects().empty()) {
-    const std::size_t most = changes().size();
-    std::erase_if(beam_, [most](const Hypothesis& h) { return h.changes.size() > most; });
-    if (most == 0) mismatched_.clear();
-  }
   if (changes().empty() || now - newest_adopted() < options_.settled_after) return;
   for (const Change& c : changes())
     if (last_at(changes(), c.what.place) == &c) {
@@ -494,6 +496,7 @@ TreeFilter::Judgement HypothesisTracker::on_sample(const ActionPoseSample& sampl
   propose_again(now, events);
   propose_more(now);
   propose_learned(now);
+  drop_stale();
   choose(now, events);
   want_probe(now, events);
   detect(now, events);

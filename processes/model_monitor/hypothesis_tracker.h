@@ -135,6 +135,7 @@ class HypothesisTracker {
             const Change& change, double margin, std::vector<AdaptationEvent>* events) const;
   void want_probe(std::int64_t now, std::vector<AdaptationEvent>* events);
   void detect(std::int64_t now, std::vector<AdaptationEvent>* events);
+  void drop_stale();
   void note_mismatch(const Place& place, std::int64_t now);
   void settle(std::int64_t now, std::vector<AdaptationEvent>* events);
   void mature(std::int64_t now);

@@ -174,6 +174,14 @@ TEST(AdaptationTest, AHealthyArmIsLeftInPeace) {
   }
 }
 
+TEST(AdaptationTest, FaintSuspicionsAddUpToNoChange) {
+  // An edge at the limit of what its noise explains is suspected off and on for 600 samples.
+  BrokenArm arm({Fault::kNone, "", 0.85}, Regime::kTagIso, 1250, 1006);
+  Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kTagIso));
+  const Life life = live(arm, adaptation, 650);
+  EXPECT_TRUE(life.events.empty()) << life.log();
+}
+
 TEST(AdaptationTest, AMarkerThatOnlyUncertainModelsBelieveIsNoDrift) {
   // This arm's window of drift watching has one such by sample 74, of the edge to part 6.
   BrokenArm arm({Fault::kNone, "", 0.85}, Regime::kChapter, 25, 14);
