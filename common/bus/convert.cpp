@@ -276,7 +276,7 @@ Edge from_message(const schema_edge_t& message) {
   if (!message.matrix_gp.empty()) edge.matrix_gp = from_message(message.matrix_gp.front());
   edge.right = bodyschema::from_message(message.X_right);
   if (!message.parameter_covariance.empty()) {
-    const auto side = static_cast<Eigen::Index>(6 + 8 * edge.joints.size());
+    const Eigen::Index side = edge.num_parameters();
     if (static_cast<Eigen::Index>(message.parameter_covariance.size()) != side * (side + 1) / 2) {
       throw std::invalid_argument("parameter_covariance does not go with the number of joints");
     }

@@ -63,6 +63,10 @@ std::vector<int> Edge::signals() const {
   return result;
 }
 
+Eigen::Index Edge::num_parameters() const {
+  return ScrewChainLayout::size(static_cast<int>(joints.size()));
+}
+
 Pose Edge::predict(const Eigen::VectorXd& theta) const {
   if (matrix_gp) return left * matrix_gp->predict(theta) * right;
   Pose X = chain_of(*this, theta).predict();

@@ -64,7 +64,7 @@ struct Edge {
   Pose right = Pose::Identity();
 
   /// Covariance of the parameters, order: left tangent (6); per joint: slide, turn, X_after tangent
-  /// (6). Right perturbations. Side 6 + 8·|joints|. Singular along the gauge of the screw frames.
+  /// (6). Right perturbations. Side num_parameters(). Singular along the gauge of the screw frames.
   /// Of the fit of the whole tree where the root rests, else of the two parts' own poses.
   Eigen::MatrixXd parameter_covariance;
 
@@ -83,12 +83,14 @@ struct Edge {
   const char* kind() const;
   /// Distinct signal indices, in the order of the joints; then those of the residual GP alone.
   std::vector<int> signals() const;
+  /// Of the screws: 6 + 8·|joints|.
+  Eigen::Index num_parameters() const;
 
   Pose predict(const Eigen::VectorXd& theta) const;
   /// ∂/∂θ of the predicted pose: 6×m, right perturbation in the frame of `to`:
   /// predict(θ + δ) = predict(θ) · exp(J δ + O(δ²)).
   Eigen::MatrixXd jacobian(const Eigen::VectorXd& theta) const;
-  /// ∂/∂parameters of the predicted pose, 6×(6 + 8·|joints|): right perturbation in the frame of
+  /// ∂/∂parameters of the predicted pose, 6×num_parameters(): right perturbation in the frame of
   /// `to`, parameters in the order of parameter_covariance. Of the screws, not of a matrix GP.
   Eigen::MatrixXd parameter_jacobian(const Eigen::VectorXd& theta) const;
   /// First-order covariance of the prediction (right perturbation in the frame of `to`): from

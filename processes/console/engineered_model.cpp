@@ -189,7 +189,7 @@ class Walk {
     edge.to = to;
     edge.left = way.left;
     edge.joints = way.joints;
-    const auto size = static_cast<Eigen::Index>(6 + 8 * way.joints.size());
+    const Eigen::Index size = edge.num_parameters();
     edge.parameter_covariance = Eigen::MatrixXd::Zero(size, size);
     edge.parameter_covariance.diagonal().tail<6>() = variances_;
     schema_.edges.push_back(std::move(edge));

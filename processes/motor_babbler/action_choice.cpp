@@ -37,8 +37,7 @@ double log_determinant(const Matrix6d& M) {
 }
 
 bool has_parameters(const Edge& edge) {
-  return !edge.matrix_gp &&
-         edge.parameter_covariance.cols() == 6 + 8 * static_cast<Eigen::Index>(edge.joints.size());
+  return !edge.matrix_gp && edge.parameter_covariance.cols() == edge.num_parameters();
 }
 
 /// Growth of log det of six regressions on φ, and the φ they were taken at.

@@ -93,6 +93,31 @@ Pose random_pose(Rng& rng, double min_m, double max_m) {
   return X;
 }
 
+Edge random_edge(int from, int to, const std::vector<int>& signals, Rng& rng) {
+  Edge edge;
+  edge.from = from;
+  edge.to = to;
+  edge.left = random_pose(rng, 0, 0.2);
+  edge.right = random_pose(rng, 0, 0.2);
+  for (const int signal : signals) {
+    ScrewJoint joint;
+    joint.signal = signal;
+    joint.gain = uniform(rng, -2, 2);
+    joint.offset = uniform(rng, -1, 1);
+    joint.slide = uniform(rng, -0.1, 0.1);
+    joint.turn = uniform(rng, -1, 1);
+    joint.X_after = random_pose(rng, 0, 0.2);
+    edge.joints.push_back(joint);
+  }
+  const Eigen::Index size = edge.num_parameters();
+  const Eigen::MatrixXd root =
+      Eigen::MatrixXd::NullaryExpr(size, size, [&] { return 1e-4 * gaussian(rng); });
+  edge.parameter_covariance = root * root.transpose();
+  edge.position_rms_m = uniform(rng, 1e-4, 1e-3);
+  edge.rotation_rms_rad = uniform(rng, 1e-4, 1e-3);
+  return edge;
+}
+
 std::map<int, Pose> SyntheticRobot::poses_in_camera(const Eigen::VectorXd& action) const {
   std::map<int, Pose> X_CB;
   for (const TrueLink& link : links) {

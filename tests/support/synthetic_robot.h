@@ -23,6 +23,8 @@ Eigen::Matrix3d random_rotation(Rng& rng);
 Eigen::Vector3d random_vector(Rng& rng, double min_m, double max_m);
 /// Uniform rotation, translation of a length in [min_m, max_m].
 Pose random_pose(Rng& rng, double min_m, double max_m);
+/// A screw edge of these signals, all its parameters, their covariance and its residuals random.
+Edge random_edge(int from, int to, const std::vector<int>& signals, Rng& rng);
 
 /// A body part with the joint that carries it: X_PB(q) = X_before · Exp(screw · θ) · X_after with
 /// θ = turn_or_slide · (q − zero). `signal` −1: fixed.

@@ -10,32 +10,8 @@
 namespace bodyschema {
 namespace {
 
+using test::random_edge;
 using test::Rng;
-
-Edge random_edge(int from, int to, const std::vector<int>& signals, Rng& rng) {
-  Edge edge;
-  edge.from = from;
-  edge.to = to;
-  edge.left = test::random_pose(rng, 0, 0.2);
-  edge.right = test::random_pose(rng, 0, 0.2);
-  for (const int signal : signals) {
-    ScrewJoint joint;
-    joint.signal = signal;
-    joint.gain = test::uniform(rng, -2, 2);
-    joint.offset = test::uniform(rng, -1, 1);
-    joint.slide = test::uniform(rng, -0.1, 0.1);
-    joint.turn = test::uniform(rng, -1, 1);
-    joint.X_after = test::random_pose(rng, 0, 0.2);
-    edge.joints.push_back(joint);
-  }
-  const Eigen::Index size = 6 + 8 * static_cast<Eigen::Index>(signals.size());
-  const Eigen::MatrixXd root =
-      Eigen::MatrixXd::NullaryExpr(size, size, [&] { return 1e-4 * test::gaussian(rng); });
-  edge.parameter_covariance = root * root.transpose();
-  edge.position_rms_m = test::uniform(rng, 1e-4, 1e-3);
-  edge.rotation_rms_rad = test::uniform(rng, 1e-4, 1e-3);
-  return edge;
-}
 
 /// A matrix GP of the two signals, through 30 poses of a screw edge.
 Edge matrix_gp_edge(int from, int to, Rng& rng) {
@@ -203,7 +179,7 @@ TEST(KinematicPath, ATrajectoryIsItsInstants) {
 /// How the parameters of an edge change where the frames of its two parts are off: 6 columns for
 /// each part.
 Eigen::MatrixXd by_frames(const Edge& edge) {
-  const Eigen::Index size = 6 + 8 * static_cast<Eigen::Index>(edge.joints.size());
+  const Eigen::Index size = edge.num_parameters();
   Eigen::MatrixXd G = Eigen::MatrixXd::Zero(size, 12);
   G.topLeftCorner<6, 6>() = -adjoint(edge.left.inverse());
   G.bottomRightCorner<6, 6>() = adjoint(edge.right);
