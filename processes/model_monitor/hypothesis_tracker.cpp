@@ -384,9 +384,12 @@ void HypothesisTracker::drop_stale() {
   // One change more is pursued while what it was proposed for is suspected: what a model is off by
   // from the start adds up to evidence of a change, too.
   const std::size_t most = changes().size();
-  if (!suspects().empty()) return;
-  std::erase_if(beam_, [most](const Hypothesis& h) { return h.changes.size() > most; });
-  if (most == 0) mismatched_.clear();
+  const bool is_quiet = suspects().empty();
+  const std::int64_t since = tests_->highest().cusum.since;
+  std::erase_if(beam_, [&](const Hypothesis& h) {
+    return h.changes.size() > most && (is_quiet || h.changes.back().since < since);
+  });
+  if (is_quiet && most == 0) mismatched_.clear();
 }
 
 void HypothesisTracker::note_mismatch(const Place& place, std::int64_t now) {

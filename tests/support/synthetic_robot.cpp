@@ -504,4 +504,35 @@ std::vector<ActionPoseSample> read_csv(std::istream& in, int* num_signals) {
   return samples;
 }
 
+BodySchema true_schema(const SyntheticRobot& robot) {
+  BodySchema schema;
+  schema.version = 1;
+  schema.complete = true;
+  schema.signals = robot.signals;
+  schema.root = robot.links.front().part;
+  schema.X_CR = robot.X_CR;
+  for (const TrueLink& link : robot.links) {
+    schema.parts.push_back(link.part);
+    if (link.parent < 0) continue;
+    Edge edge;
+    edge.from = link.parent;
+    edge.to = link.part;
+    edge.left = link.X_before;
+    if (link.signal >= 0) {
+      ScrewJoint joint;
+      joint.signal = link.signal;
+      joint.gain = 0.5;
+      joint.offset = -0.5 * link.zero;
+      joint.turn = 2 * link.turn;
+      joint.slide = 2 * link.slide;
+      joint.X_after = link.X_after;
+      edge.joints.push_back(joint);
+    } else {
+      edge.right = link.X_after;
+    }
+    schema.edges.push_back(edge);
+  }
+  return schema;
+}
+
 }  // namespace bodyschema::test

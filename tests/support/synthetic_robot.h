@@ -23,6 +23,19 @@ Eigen::Matrix3d random_rotation(Rng& rng);
 Eigen::Vector3d random_vector(Rng& rng, double min_m, double max_m);
 /// Uniform rotation, translation of a length in [min_m, max_m].
 Pose random_pose(Rng& rng, double min_m, double max_m);
+/// ∂pose/∂q of `predict`, 6×|q|, right perturbation, by central differences.
+template <typename Predict>
+Eigen::MatrixXd numeric_jacobian(const Predict& predict, const Eigen::VectorXd& q,
+                                 double h = 1e-6) {
+  Eigen::MatrixXd J(6, q.size());
+  const Pose inverse = predict(q).inverse();
+  for (Eigen::Index n = 0; n < q.size(); ++n) {
+    const Eigen::VectorXd step = h * Eigen::VectorXd::Unit(q.size(), n);
+    J.col(n) = (log(inverse * predict(q + step)) - log(inverse * predict(q - step))) / (2 * h);
+  }
+  return J;
+}
+
 /// A screw edge of these signals, all its parameters, their covariance and its residuals random.
 Edge random_edge(int from, int to, const std::vector<int>& signals, Rng& rng);
 
@@ -61,6 +74,9 @@ struct SyntheticRobot {
   std::vector<int> visible_parts() const;
   Eigen::VectorXd random_action(Rng& rng) const;
 };
+
+/// The robot as a schema without noise, with gains and offsets as learned ones have them.
+BodySchema true_schema(const SyntheticRobot& robot);
 
 enum class Regime {
   kFree,     ///< exact

@@ -28,18 +28,6 @@ Eigen::VectorXd random_action(Rng& rng, int size) {
   return q;
 }
 
-template <typename Predict>
-Eigen::MatrixXd central_differences(const Predict& predict, const Eigen::VectorXd& q) {
-  const double h = 1e-6;
-  Eigen::MatrixXd J(6, q.size());
-  const Pose inverse = predict(q).inverse();
-  for (Eigen::Index n = 0; n < q.size(); ++n) {
-    const Eigen::VectorXd step = h * Eigen::VectorXd::Unit(q.size(), n);
-    J.col(n) = (log(inverse * predict(q + step)) - log(inverse * predict(q - step))) / (2 * h);
-  }
-  return J;
-}
-
 TEST(Edge, JacobianAgreesWithCentralDifferences) {
   Rng rng(1);
   for (int n = 0; n < 20; ++n) {
@@ -47,7 +35,7 @@ TEST(Edge, JacobianAgreesWithCentralDifferences) {
         random_edge(1, 2, n % 2 ? std::vector<int>{2, 0} : std::vector<int>{1, 1}, rng);
     const Eigen::VectorXd q = random_action(rng, 3);
     const auto predict = [&](const Eigen::VectorXd& a) { return edge.predict(a); };
-    EXPECT_LT((edge.jacobian(q) - central_differences(predict, q)).norm(), 1e-8);
+    EXPECT_LT((edge.jacobian(q) - test::numeric_jacobian(predict, q)).norm(), 1e-8);
   }
 }
 
@@ -108,7 +96,7 @@ TEST(BodySchema, JacobianAgreesWithCentralDifferencesOverBranches) {
     const auto predict = [&, from = from, to = to](const Eigen::VectorXd& a) {
       return schema.predict(from, to, a)->X_AB;
     };
-    EXPECT_LT((*schema.jacobian(from, to, q) - central_differences(predict, q)).norm(), 1e-8);
+    EXPECT_LT((*schema.jacobian(from, to, q) - test::numeric_jacobian(predict, q)).norm(), 1e-8);
   }
 }
 

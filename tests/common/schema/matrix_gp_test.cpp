@@ -49,18 +49,6 @@ struct Example {
   Edge truth;
 };
 
-template <typename Predict>
-Eigen::MatrixXd central_differences(const Predict& predict, const Eigen::VectorXd& q) {
-  const double h = 1e-5;
-  Eigen::MatrixXd J(6, q.size());
-  const Pose inverse = predict(q).inverse();
-  for (Eigen::Index n = 0; n < q.size(); ++n) {
-    const Eigen::VectorXd step = h * Eigen::VectorXd::Unit(q.size(), n);
-    J.col(n) = (log(inverse * predict(q + step)) - log(inverse * predict(q - step))) / (2 * h);
-  }
-  return J;
-}
-
 TEST(MatrixGp, PredictsAPoseNearTheTruth) {
   Rng rng(1);
   for (const auto& signals : {std::vector<int>{2}, {1, 0}}) {
@@ -90,7 +78,7 @@ TEST(MatrixGp, JacobianThroughTheProjectionAgreesWithCentralDifferences) {
         Eigen::VectorXd x(signals.size());
         for (double& value : x) value = test::uniform(rng, -1.5, 1.5);
         const Eigen::VectorXd q = example.action(x);
-        EXPECT_LT((model.jacobian(q) - central_differences(predict, q)).norm(), 1e-6);
+        EXPECT_LT((model.jacobian(q) - test::numeric_jacobian(predict, q, 1e-5)).norm(), 1e-6);
       }
     }
   }
@@ -222,7 +210,7 @@ TEST(Edge, StandsOnAMatrixGpAsOnJoints) {
   const Eigen::Vector3d q(0.5, 0.1, -0.4);
   EXPECT_TRUE(edge.predict(q).isApprox(edge.left * edge.matrix_gp->predict(q) * edge.right));
   const auto predict = [&](const Eigen::VectorXd& a) { return edge.predict(a); };
-  EXPECT_LT((edge.jacobian(q) - central_differences(predict, q)).norm(), 1e-6);
+  EXPECT_LT((edge.jacobian(q) - test::numeric_jacobian(predict, q, 1e-5)).norm(), 1e-6);
   // The same uncertainty, seen from the other end of `right`.
   const Matrix6d A = adjoint(edge.right);
   EXPECT_TRUE((A * edge.prediction_covariance(q) * A.transpose())
@@ -239,7 +227,7 @@ TEST(Edge, StandsOnAMatrixGpAsOnJoints) {
   schema.edges[1].to = 3;
   EXPECT_EQ(schema.unused_signals(), std::vector<int>{1});
   const auto along = [&](const Eigen::VectorXd& a) { return schema.predict(3, 1, a)->X_AB; };
-  EXPECT_LT((*schema.jacobian(3, 1, q) - central_differences(along, q)).norm(), 1e-6);
+  EXPECT_LT((*schema.jacobian(3, 1, q) - test::numeric_jacobian(along, q, 1e-5)).norm(), 1e-6);
 }
 
 }  // namespace

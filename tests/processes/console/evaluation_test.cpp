@@ -10,38 +10,11 @@ namespace bodyschema {
 namespace {
 
 /// The true kinematics of a robot as a schema: what an errorless learner would find.
-BodySchema truth_as_schema(const test::SyntheticRobot& robot) {
-  BodySchema schema;
-  schema.complete = true;
-  schema.root = 1;
-  schema.signals = robot.signals;
-  schema.X_CR = robot.X_CR;
-  for (const test::TrueLink& link : robot.links) {
-    schema.parts.push_back(link.part);
-    if (link.parent < 0) continue;
-    Edge edge;
-    edge.from = link.parent;
-    edge.to = link.part;
-    edge.left = link.X_before;
-    if (link.signal >= 0) {
-      ScrewJoint joint;
-      joint.signal = link.signal;
-      joint.offset = -link.zero;
-      joint.slide = link.slide;
-      joint.turn = link.turn;
-      edge.joints = {joint};
-    }
-    edge.right = link.X_after;
-    schema.edges.push_back(edge);
-  }
-  return schema;
-}
-
 TEST(EvaluationTest, TheTrueSchemaHasNoErrorOnExactData) {
   test::Rng rng(51);
   for (int run = 0; run < 20; ++run) {
     const auto robot = test::random_tree({.num_hidden = 0}, rng);
-    const auto errors = evaluate(truth_as_schema(robot), test::babble(robot, 10, {}, rng));
+    const auto errors = evaluate(test::true_schema(robot), test::babble(robot, 10, {}, rng));
     ASSERT_EQ(errors.size(), 8U);
     for (std::size_t i = 0; i < errors.size(); ++i) {
       EXPECT_EQ(errors[i].part, static_cast<int>(i) + 2);
@@ -56,7 +29,7 @@ TEST(EvaluationTest, TheErrorDoesNotDependOnWhereTheCameraStands) {
   test::Rng rng(52);
   const auto robot = test::chapter_robot("c", rng);
   auto samples = test::babble(robot, 20, {.regime = test::Regime::kTag}, rng);
-  const BodySchema schema = truth_as_schema(robot);
+  const BodySchema schema = test::true_schema(robot);
   const auto before = evaluate(schema, samples);
   for (ActionPoseSample& sample : samples) {
     const Pose X = test::random_pose(rng, 0, 5);
@@ -97,7 +70,7 @@ TEST(EvaluationTest, AlignmentFindsTheFramesOfThePartsAndTheScale) {
   test::Rng rng(53);
   for (int run = 0; run < 10; ++run) {
     const auto robot = test::random_tree({.num_hidden = 0}, rng);
-    const BodySchema schema = truth_as_schema(robot);
+    const BodySchema schema = test::true_schema(robot);
     const auto truth = displaced(test::babble(robot, 15, {}, rng), 1.003, rng);
     const JudgedErrors errors = judge(schema, truth, truth);
     ASSERT_TRUE(errors.alignment.has_value());
@@ -145,7 +118,7 @@ TEST(EvaluationTest, AScaleThatNoSampleTellsStaysOne) {
 TEST(EvaluationTest, AlignmentHidesNoErrorOfTheKinematics) {
   test::Rng rng(54);
   const auto robot = test::chapter_robot("c", rng);
-  BodySchema schema = truth_as_schema(robot);
+  BodySchema schema = test::true_schema(robot);
   const auto truth = test::babble(robot, 40, {}, rng);
   ASSERT_EQ(schema.edges.back().joints.size(), 1U);
   schema.edges.back().joints[0].gain *= 1.1;

@@ -15,41 +15,9 @@ using test::Rng;
 const InverseKinematicsOptions kOptions{
     .tolerance_m = 1e-4, .damping_m = 0.05, .max_iterations = 100, .max_starts = 20};
 
-/// A schema without noise, with gains and offsets as learned ones have them.
-BodySchema schema_of(const test::SyntheticRobot& robot) {
-  BodySchema schema;
-  schema.version = 1;
-  schema.complete = true;
-  schema.signals = robot.signals;
-  schema.root = robot.links.front().part;
-  schema.X_CR = robot.X_CR;
-  for (const test::TrueLink& link : robot.links) {
-    schema.parts.push_back(link.part);
-    if (link.parent < 0) continue;
-    Edge edge;
-    edge.from = link.parent;
-    edge.to = link.part;
-    edge.left = link.X_before;
-    if (link.signal >= 0) {
-      ScrewJoint joint;
-      joint.signal = link.signal;
-      joint.gain = 0.5;
-      joint.offset = -0.5 * link.zero;
-      joint.turn = 2 * link.turn;
-      joint.slide = 2 * link.slide;
-      joint.X_after = link.X_after;
-      edge.joints.push_back(joint);
-    } else {
-      edge.right = link.X_after;
-    }
-    schema.edges.push_back(edge);
-  }
-  return schema;
-}
-
 BodySchema seven_joints(std::uint64_t seed) {
   Rng rng(seed);
-  return schema_of(test::chapter_robot("d", rng));
+  return test::true_schema(test::chapter_robot("d", rng));
 }
 
 Eigen::VectorXd random_action(const BodySchema& schema, Rng& rng) {
