@@ -1,9 +1,13 @@
 // soak: cost of many samples. Sends synthetic samples of a 2-DOF robot to the processes that keep
 // data of every sample (structure_learner, model_monitor, `bodyschema watch`, `bodyschema
 // report --follow`), in step with the monitor's verdicts as a babbler is, and prints, over the run,
-// the memory that each holds and the bytes that it read per sample. Fails if either grows.
+// the memory that each holds, and the bytes that it read and its processor time per sample. Fails
+// if one of them grows, or if all together hold more than 1 GB. (The learner's time is not judged:
+// it searches as long as nothing new comes.)
 //
-// soak [--samples N] [--keep FOLDER]; on a bus of its own (tests/private_bus.sh).
+// soak [--samples N] [--robot d] [--keep FOLDER]; on a bus of its own (tests/private_bus.sh).
+
+#include <unistd.h>
 
 #include <CLI/CLI.hpp>
 #include <algorithm>
@@ -12,6 +16,7 @@
 #include <cstdio>
 #include <deque>
 #include <fstream>
+#include <limits>
 #include <map>
 #include <memory>
 #include <stdexcept>
@@ -38,10 +43,11 @@ constexpr std::int64_t kMoment = 100;
 // Allowed growth from there on: 1000 samples of five parts (4 kB) per doubling, an index of the
 // samples (SampleIntake, 64 B each), and malloc's fragmentation.
 constexpr double kMaxGrowthMb = 12, kMaxGrowthMbADoubling = 8;
+constexpr double kMaxSumMb = 1000;
 
 struct Usage {
   double memory_mb = 0;
-  double read_kb = 0;  // since the start
+  double read_kb = 0, processor_ms = 0;  // since the start
 };
 
 Usage usage_of(pid_t pid) {
@@ -52,13 +58,21 @@ Usage usage_of(pid_t pid) {
       if (w == word && stream >> number) return number;
     throw std::runtime_error("process " + std::to_string(pid) + " is gone");
   };
-  return {number_after("status", "VmRSS:") / 1024, number_after("io", "rchar:") / 1024};
+  // Two numbers after 11 others that follow the name in parentheses (proc(5): utime, stime).
+  std::ifstream stat("/proc/" + std::to_string(pid) + "/stat");
+  stat.ignore(std::numeric_limits<std::streamsize>::max(), ')');
+  std::string skipped;
+  for (int n = 0; n < 11; ++n) stat >> skipped;
+  double user = 0, system = 0;
+  stat >> user >> system;
+  return {number_after("status", "VmRSS:") / 1024, number_after("io", "rchar:") / 1024,
+          (user + system) * 1e3 / static_cast<double>(::sysconf(_SC_CLK_TCK))};
 }
 
 class Soak {
  public:
-  explicit Soak(const fs::path& folder) : folder_(folder), rng_(41) {
-    robot_ = test::chapter_robot("a", rng_);
+  Soak(const fs::path& folder, const std::string& robot) : folder_(folder), rng_(41) {
+    robot_ = test::chapter_robot(robot, rng_);
     fs::create_directories(folder_ / "config");
     for (const auto& file : fs::directory_iterator(BODYSCHEMA_CONFIG "/arm2"))
       fs::copy(file, folder_ / "config", fs::copy_options::overwrite_existing);
@@ -68,7 +82,7 @@ class Soak {
     for (const Signal& signal : robot_.signals)
       signals << "  - {name: " << signal.name << ", lower: " << signal.lower
               << ", upper: " << signal.upper << "}\n";
-    signals << "root_part: 1\nend_effector_part: 5\n";
+    signals << "root_part: 1\nend_effector_part: " << robot_.visible_parts().back() << "\n";
     signals.close();
 
     samples_ = std::make_unique<LogAppender>(samples_file(), LogAppender::Mode::kOverwrite,
@@ -185,21 +199,23 @@ class Soak {
 int main(int argc, char** argv) {
   CLI::App app("Memory and work of the processes over many samples");
   std::int64_t num_samples = 100'000;
-  std::string keep;
+  std::string keep, robot = "a";
   app.add_option("--samples", num_samples, "So many samples")
       ->check(CLI::Range(2 * kFull, 10'000'000L));
+  app.add_option("--robot", robot, "a: two joints, five parts; d: seven joints, ten parts")
+      ->check(CLI::IsMember({"a", "d"}));
   app.add_option("--keep", keep, "Keep the run's folder, here");
   CLI11_PARSE(app, argc, argv);
 
   const test::TemporaryFolder temporary;
   try {
-    Soak soak(keep.empty() ? temporary.path() : fs::path(keep));
+    Soak soak(keep.empty() ? temporary.path() : fs::path(keep), robot);
     std::map<std::int64_t, std::map<std::string, Usage>> usage;
     std::printf("| samples |");
     for (const auto& [name, u] : soak.usage())
-      std::printf(" %s MB | kB read a sample |", name.c_str());
+      std::printf(" %s MB | kB read a sample | ms a sample |", name.c_str());
     std::printf(" all MB |\n| --- |");
-    for (std::size_t i = 0; i < soak.usage().size(); ++i) std::printf(" --- | --- |");
+    for (std::size_t i = 0; i < soak.usage().size(); ++i) std::printf(" --- | --- | --- |");
     std::printf(" --- |\n");
     std::map<std::string, Usage> before = soak.usage();
     std::map<std::string, std::deque<double>> recent_mb;
@@ -218,8 +234,10 @@ int main(int argc, char** argv) {
       double sum = 0;
       std::printf("| %lld |", static_cast<long long>(n));
       for (const auto& [name, u] : usage[n]) {
-        std::printf(" %.0f | %.1f |", u.memory_mb,
-                    (u.read_kb - before.at(name).read_kb) / static_cast<double>(n - printed));
+        const Usage& then = before.at(name);
+        const auto num_new = static_cast<double>(n - printed);
+        std::printf(" %.0f | %.1f | %.2f |", u.memory_mb, (u.read_kb - then.read_kb) / num_new,
+                    (u.processor_ms - then.processor_ms) / num_new);
         sum += u.memory_mb;
       }
       std::printf(" %.0f |\n", sum);
@@ -233,7 +251,9 @@ int main(int argc, char** argv) {
     if (!soak.is_complete()) problems += "the body was not learned; ";
     const double doublings = std::log2(static_cast<double>(num_samples) / kFull);
     const auto& full = usage.at(kFull);
+    double sum_mb = 0;
     for (const auto& [name, last] : usage.at(num_samples)) {
+      sum_mb += last.memory_mb;
       const double growth = last.memory_mb - full.at(name).memory_mb;
       if (growth > kMaxGrowthMb + kMaxGrowthMbADoubling * doublings)
         problems += name + " grew by " + std::to_string(growth) + " MB; ";
@@ -243,7 +263,14 @@ int main(int argc, char** argv) {
       if (later_kb > 1.5 * first_kb + 1)
         problems += name + " reads " + std::to_string(later_kb) + " kB a sample after " +
                     std::to_string(first_kb) + "; ";
+      const double first_ms = full.at(name).processor_ms / kFull;
+      const double later_ms = (last.processor_ms - full.at(name).processor_ms) /
+                              static_cast<double>(num_samples - kFull);
+      if (name != "structure_learner" && later_ms > 2 * first_ms + 1)
+        problems += name + " takes " + std::to_string(later_ms) + " ms a sample after " +
+                    std::to_string(first_ms) + "; ";
     }
+    if (sum_mb > kMaxSumMb) problems += "all processes hold " + std::to_string(sum_mb) + " MB; ";
     if (problems.empty()) return 0;
     std::fprintf(stderr, "soak: %s\n", problems.c_str());
   } catch (const std::exception& error) {
