@@ -222,6 +222,8 @@ Header parse_header(const Row& row, const std::string& hint) {
       std::string what = "expected the column '" + name + "'";
       if (i < row.size() && name == "qw" && row[i] == "qx")
         what += "; quaternions are w x y z: put qw first";
+      else if (name == "qw")
+        what += "; rotations are unit quaternions";
       if (i < row.size() && row[i].find("mm") != std::string_view::npos)
         what += "; positions are in metres";
       throw row.error(i, what);

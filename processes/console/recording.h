@@ -66,9 +66,13 @@ std::vector<ActionPoseSample> samples_by_signals(const Recording& recording,
 /// The CSV reader alone; `name` stands in errors.
 Recording parse_csv(const std::string& text, const std::string& name);
 
+/// A rotation's standard deviation so small beside the position's that radians seem to be meant:
+/// the marker would be 4 m wide.
+bool looks_like_radians(const Noise& noise);
+
 /// Signs of other units or another order than a CSV's: positions that spread over more than
-/// 10 m, standard deviations above 0.1 m, rotations that make a body of the parts only when read
-/// as x y z w. No evidence, no hint; none changes what is read.
+/// 10 m, standard deviations above 0.1 m or in radians, rotations that make a body of the parts
+/// only when read as x y z w. No evidence, no hint; none changes what is read.
 std::vector<std::string> hints_of(const Recording& recording);
 
 }  // namespace bodyschema

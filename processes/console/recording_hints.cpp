@@ -118,6 +118,11 @@ bool is_order_x_y_z_w(const std::vector<ActionPoseSample>& samples,
 
 }  // namespace
 
+bool looks_like_radians(const Noise& noise) {
+  constexpr double kLargestMarker_m = 4;
+  return noise.rotation_rad < noise.position_m / (kLargestMarker_m / 2);
+}
+
 std::vector<std::string> hints_of(const Recording& recording) {
   std::vector<std::string> hints;
   const std::map<int, Track> tracks = tracks_of(recording.samples);
@@ -130,12 +135,16 @@ std::vector<std::string> hints_of(const Recording& recording) {
   if (std::max(largest_m, spread_m(middles)) > kLargestBody_m)
     hints.emplace_back("positions look like millimetres; expected metres");
   if (recording.has_noise) {
-    std::vector<double> noise_m;
+    std::vector<double> noise_m, noise_rad;
     for (const ActionPoseSample& sample : recording.samples)
-      for (const PartObservation& o : sample.parts)
+      for (const PartObservation& o : sample.parts) {
         noise_m.push_back(std::sqrt(o.covariance(0, 0)));
+        noise_rad.push_back(std::sqrt(o.covariance(5, 5)));
+      }
     if (upper_median(noise_m) > kLargestNoise_m)
       hints.emplace_back("sp_m looks like millimetres; expected metres");
+    else if (looks_like_radians({upper_median(noise_m), upper_median(noise_rad)}))
+      hints.emplace_back("sr_deg looks like radians; expected degrees");
   }
   if (is_order_x_y_z_w(recording.samples, tracks))
     hints.emplace_back("the quaternion column order looks like x y z w; expected qw,qx,qy,qz");

@@ -620,7 +620,7 @@ Controller::Answer Controller::on_motion_status(const motion_status_t& motion) {
     if (state_ == S::CONTROL_WAITING && !owns_arm_) {
       refuse(kHalted);
     } else {
-      halt(motion.reason + "; after RESUME give another target, or release the arm");
+      halt(motion.reason + "; after ./run resume give another target, or release the arm");
     }
     return answer(std::nullopt);
   }

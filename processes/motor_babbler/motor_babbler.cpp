@@ -394,7 +394,7 @@ std::string MotorBabbler::activity() const {
   switch (wait_) {
     case Wait::kDriver:
       if (driver_utime_ == 0) return "waiting for MOTION_STATUS of a driver";
-      return samples + (is_stopped_ ? ", stopped: waiting for RESUME"
+      return samples + (is_stopped_ ? ", halted, until: ./run resume"
                                     : ", waiting until the arm is at rest and nobody else's");
     case Wait::kAnswer:
       return samples + ", waiting for the driver's answer to action " +
@@ -416,7 +416,7 @@ std::string MotorBabbler::activity() const {
       return samples + ", waiting for the samples up to " + std::to_string(last_sample_);
     case Wait::kRest:
       return samples +
-             (is_stopped_ ? ", stopped: waiting for RESUME" : ", waiting for the arm to rest");
+             (is_stopped_ ? ", halted, until: ./run resume" : ", waiting for the arm to rest");
     case Wait::kDone:
       return samples + ", done";
   }

@@ -96,7 +96,7 @@ RobotDriver::RobotDriver(RobotDriverConfig config, std::optional<motion_status_t
 }
 
 std::string RobotDriver::refusal(const Command& command) const {
-  if (is_stopped_) return "stopped: RESUME first";  // R12
+  if (is_stopped_) return "halted: resume first";  // R12
   if (is_lost_) return "the robot does not answer";
   if (motion_) return "the arm moves";  // R6
   if (!is_at_rest()) return "the arm is being halted";
@@ -217,8 +217,8 @@ RobotDriver::Answer RobotDriver::on_command(const Command& command, Now now) {
     case Command::KIND_STOP:  // R12, R13
       answer.lines.push_back(halt());
       is_stopped_ = true;
-      interrupt("STOP by " + command.source, answer);
-      conclude(command, Status::STATE_STOPPED, is_lost_ ? kLost : "STOP by " + command.source,
+      interrupt("halted by " + command.source, answer);
+      conclude(command, Status::STATE_STOPPED, is_lost_ ? kLost : "halted by " + command.source,
                answer);
       return answer;
     case Command::KIND_RESUME:  // R14

@@ -86,7 +86,7 @@ RobotSimulator::RobotSimulator(RobotSimulatorConfig config)
 }
 
 std::string RobotSimulator::refusal(const action_command_t& command) const {
-  if (stop_latched_) return "stopped: RESUME first";
+  if (stop_latched_) return "halted: resume first";
   const std::vector<Signal>& signals = scene().signals().signals;
   if (command.action.size() != signals.size()) {
     return "the robot has " + std::to_string(signals.size()) + " signals, the action " +
@@ -210,7 +210,7 @@ RobotSimulator::Answer RobotSimulator::on_command(const action_command_t& comman
       return answer;
     case action_command_t::KIND_STOP:
       stop_latched_ = true;
-      conclude(motion_status_t::STATE_STOPPED, "STOP by " + name_of(command.source));
+      conclude(motion_status_t::STATE_STOPPED, "halted by " + name_of(command.source));
       return answer;
     case action_command_t::KIND_RESUME:
       stop_latched_ = false;

@@ -523,6 +523,8 @@ TEST_F(BodyschemaProgramTest, ANoiseThatIsNoneIsAskedBack) {
     expect("0.003", "57", "57 degrees are no noise of a marker");
     expect(std::string(309, '9'), "1", "--noise");
   }
+  EXPECT_NE(run({"learn", csv, "--noise", "0.003", "0.0175"}).err.find("looks like radians"),
+            std::string::npos);
   EXPECT_EQ(run({"learn", csv, "--noise", "0.0254", "6.1"}).exit_code, 0);
 }
 
@@ -540,7 +542,9 @@ TEST_F(BodyschemaProgramTest, TheNoiseIsAlwaysToldWithWhereItIsKnownFrom) {
   EXPECT_EQ(from({"learn", csv, "--noise", "0.003", "1"}), "given");
   EXPECT_EQ(from({"learn", csv, "--method", "chapter"}), "residuals");
   const std::string header = "t,q1,part,x,y,z,qw,qx,qy,qz\n";
-  EXPECT_EQ(from({"learn", write("one.csv", header + "0,1,3,0,0,1,1,0,0,0\n")}), "assumed");
+  const auto one = write("one.csv", header + "0,1,3,0,0,1,1,0,0,0\n");
+  EXPECT_EQ(from({"learn", one}), "assumed");
+  EXPECT_EQ(run({"learn", one}).out.find("it is less"), std::string::npos);
   test::Rng rng(79);
   std::vector<ActionPoseSample> repeats;
   for (int n = 0; n < 40; ++n) {

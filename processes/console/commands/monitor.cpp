@@ -93,17 +93,14 @@ AdaptationOptions options_of(const MonitorArguments& arguments, const Recording&
   return options;
 }
 
-void tell_noise(const MonitorArguments& arguments, const Recording& recording,
-                const BodySchema& schema) {
-  if (arguments.noise.empty() && recording.has_noise) {
+void tell_noise(const MonitorArguments& arguments, const std::optional<Noise>& noise) {
+  if (!noise) {
     std::cerr << "noise: the covariances of " << arguments.samples << "\n";
     return;
   }
-  const bool is_given = !arguments.noise.empty();
-  const Noise noise = is_given ? noise_given(arguments.noise) : schema.noise;
   std::cerr << fmt::format("noise per axis and marker: {:.2f} mm {:.2f}°, {}\n",
-                           noise.position_m * 1e3, noise.rotation_rad / kDegree,
-                           is_given ? "given" : "that of " + arguments.schema);
+                           noise->position_m * 1e3, noise->rotation_rad / kDegree,
+                           arguments.noise.empty() ? "that of " + arguments.schema : "given");
 }
 
 /// A procedure that keeps the schema true.
@@ -127,10 +124,9 @@ class MethodOf : public Method {
   Adapting adapting_;
 };
 
-std::unique_ptr<Method> method_of(const MonitorArguments& arguments, const Recording& recording,
+std::unique_ptr<Method> method_of(const std::string& name, const AdaptationOptions& options,
                                   const BodySchema& schema) {
-  const AdaptationOptions options = options_of(arguments, recording, schema);
-  if (arguments.method == "evidence")
+  if (name == "evidence")
     return std::make_unique<MethodOf<Adaptation>>(Adaptation(schema, options));
   ChapterAdaptationOptions chapter;
   if (options.measurement.noise) {
@@ -161,8 +157,9 @@ void run_monitor(const MonitorArguments& arguments) {
                                 " is seen in it; is it of another body?");
   check_out(arguments.out, {arguments.samples, arguments.schema, arguments.evaluate});
 
-  const std::unique_ptr<Method> method = method_of(arguments, recording, schema);
-  tell_noise(arguments, recording, schema);
+  const AdaptationOptions options = options_of(arguments, recording, schema);
+  const std::unique_ptr<Method> method = method_of(arguments.method, options, schema);
+  tell_noise(arguments, options.measurement.noise);
   int num_events = 0;
   for (const ActionPoseSample& sample : recording.samples) {
     for (const AdaptationEvent& event : method->on_sample(sample)) {

@@ -196,6 +196,9 @@ Noise noise_given(const std::vector<double>& numbers) {
     refuse(fmt::format("{} degrees are no noise of a marker; at most {:.0f} are", numbers[1],
                        kNoiseCeiling.rotation_rad / kDegree));
   }
+  if (looks_like_radians(noise))
+    std::cerr << fmt::format("bodyschema: --noise {} {} looks like radians; expected degrees\n",
+                             numbers[0], numbers[1]);
   return noise;
 }
 

@@ -89,6 +89,7 @@ class Source {
     } catch (const std::exception&) {
       report.systematic = kTagSystematic;
     }
+    report.goes_on = grows_;
     report.reload_s = reload_s;
     report.picture = picture();
     if (is_folder_ && fs::exists(path_ / "config" / "signals.yaml")) {

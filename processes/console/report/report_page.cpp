@@ -124,6 +124,7 @@ class Page {
   Json data() {
     Json data = {
         {"reload_s", report_.reload_s ? Json(*report_.reload_s) : Json()},
+        {"goes_on", report_.goes_on},
         {"title", report_.title},
         {"style", std::string(kReportStyle)},
         {"plot_symbols", plot_symbols()},
@@ -214,7 +215,7 @@ class Page {
     if (verdict.wrong.empty()) return nullptr;
     Json json = {
         {"is_open", verdict.is_schema_wrong}, {"heading", kWhatIsWrong}, {"lines", verdict.wrong}};
-    if (!report_.reload_s && record_.watch().num_samples() > 0)
+    if (!report_.goes_on && record_.watch().num_samples() > 0)
       json["as_of"] = {{"sample", record_.watch().samples().back().sample_index},
                        {"then", kNobodyWatches}};
     return json;

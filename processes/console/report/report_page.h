@@ -19,8 +19,8 @@ struct Report {
   Noise systematic;  ///< of a part's pose, see systematic_of(); what the report learns with
   std::optional<int> end_effector;     ///< part id, where the rig's files are at hand
   std::optional<std::string> picture;  ///< a frame with the markers drawn in, JPEG bytes
-  /// Seconds after which a browser loads the page again; for a run that goes on.
-  std::optional<int> reload_s;
+  bool goes_on = false;                ///< its group runs, logs may end in the middle of an event
+  std::optional<int> reload_s;         ///< seconds after which a browser loads the page again
 };
 
 /// The page, one file without anything outside it. Where there is nothing to show, it says so.

@@ -35,7 +35,7 @@ Json flaws_data(const Report& report) {
   Json lines = Json::array();
   for (const auto& [file, summary] : report.logs) {
     // A file that is being written often ends in the middle of an event.
-    if (report.reload_s && summary.unreadable() == 0) continue;
+    if (report.goes_on && summary.unreadable() == 0) continue;
     for (std::string text = flaws_text(summary); !text.empty();) {
       const std::size_t end = text.find('\n');
       lines.push_back(file.filename().string() + ": " + text.substr(0, end));

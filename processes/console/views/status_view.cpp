@@ -149,7 +149,7 @@ class StatusText {
         if (!motion->reason.empty()) arm += " (" + motion->reason + ")";
       }
       arm += motion->rest_since_utime >= 0 ? ", at rest" : ", moves";
-      if (motion->stop_latched == 1) arm += ", STOP is latched";
+      if (motion->stop_latched == 1) arm += ", halted";
       line(arm);
     }
     if (const auto& control = status_.control) {

@@ -235,7 +235,9 @@ std::string structure_text(const BodySchema& schema, std::optional<NoiseSource> 
   if (!unused.empty())
     text += fmt::format("  signals without effect: {}\n", fmt::join(unused, ", "));
   if (schema.noise.position_m > 0) {
-    const bool is_least = source && *source != NoiseSource::kGiven &&
+    const bool is_least = source &&
+                          (source == NoiseSource::kRepeats || source == NoiseSource::kFrames ||
+                           source == NoiseSource::kResiduals) &&
                           schema.noise.position_m <= kNoiseFloor.position_m &&
                           schema.noise.rotation_rad <= kNoiseFloor.rotation_rad;
     text += fmt::format("  noise per axis and marker: {:.2f} mm {:.2f}°{}{}\n",

@@ -230,6 +230,8 @@ TEST(RecordingTest, ABrokenHeaderIsPointedAt) {
   EXPECT_EQ(error_of("t,q1,part,x,y,w,qw,qx,qy,qz\n"), "f.csv:1:15: expected the column 'z'");
   EXPECT_EQ(error_of("t,q1,part,x,y,z,qx,qy,qz,qw\n"),
             "f.csv:1:17: expected the column 'qw'; quaternions are w x y z: put qw first");
+  EXPECT_EQ(error_of("t,q1,part,x,y,z,roll_deg,pitch_deg,yaw_deg\n"),
+            "f.csv:1:17: expected the column 'qw'; rotations are unit quaternions");
   EXPECT_EQ(error_of("t,q1,part,x_mm,y,z,qw,qx,qy,qz\n"),
             "f.csv:1:11: expected the column 'x'; positions are in metres");
   EXPECT_EQ(error_of("t,q1,part,x,y,z,qw,qx,qy\n"), "f.csv:1:23: expected the column 'qz'");
@@ -376,6 +378,12 @@ TEST(RecordingHintsTest, StandardDeviationsInMillimetresAreNamed) {
   const std::string header = "t,q,part,x,y,z,qw,qx,qy,qz,sp_m,sr_deg\n";
   EXPECT_TRUE(is_hinted(parse_csv(header + "0,1,1,0,0,0,1,0,0,0,3,1\n", "f"), "sp_m"));
   EXPECT_TRUE(parse_csv(header + "0,1,1,0,0,0,1,0,0,0,0.003,1\n", "f").hints.empty());
+}
+
+TEST(RecordingHintsTest, StandardDeviationsInRadiansAreNamed) {
+  const std::string header = "t,q,part,x,y,z,qw,qx,qy,qz,sp_m,sr_deg\n";
+  EXPECT_TRUE(is_hinted(parse_csv(header + "0,1,1,0,0,0,1,0,0,0,0.001,0.0035\n", "f"), "sr_deg"));
+  EXPECT_TRUE(parse_csv(header + "0,1,1,0,0,0,1,0,0,0,0.001,0.2\n", "f").hints.empty());
 }
 
 TEST(RecordingTest, ANoiseThatIsNotPositiveIsRefused) {

@@ -375,7 +375,7 @@ TEST_F(ReportPageTest, WhatIsWrongStandsFirst) {
   EXPECT_EQ(count(html, "q1 (1→2) stuck at 0.20 ± 0.01 since sample 29: adopted"), 1);
   EXPECT_EQ(count(html, "As of sample 49, the last. No sample comes any more"), 1);
   // While the run goes on somebody watches.
-  report_.reload_s = 10;
+  report_.goes_on = true;
   EXPECT_EQ(count(page(), "No sample comes any more"), 0);
 }
 
@@ -486,7 +486,7 @@ TEST_F(ReportPageTest, ALogThatIsCutOffIsToldAtTheTop) {
   EXPECT_NE(page().find("run.lcmlog.00: is cut off in the middle of an event at byte 123"),
             std::string::npos);
   // While it is written it always ends somewhere.
-  report_.reload_s = 10;
+  report_.goes_on = true;
   EXPECT_EQ(page().find("cut off"), std::string::npos);
 }
 

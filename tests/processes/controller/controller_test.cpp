@@ -330,7 +330,7 @@ class Bench {
       set_array(held.num_signals, held.commanded, std::vector<double>{});
       say(held);
     } else if (const std::string reason =
-                   motion.stop_latched ? "stopped: RESUME first" : rejects(command);
+                   motion.stop_latched ? "halted: resume first" : rejects(command);
                !reason.empty()) {
       answer_last_move(motion_status_t::STATE_REJECTED, reason);
     } else {

@@ -170,7 +170,7 @@ TEST(RobotSimulator, StaysStoppedUntilResume) {
   ASSERT_EQ(stopped.statuses.size(), 1U);
   EXPECT_EQ(stopped.statuses[0].state, Status::STATE_STOPPED);
   EXPECT_EQ(stopped.statuses[0].stop_latched, 1);
-  expect_rejected(simulator, move_to(1, {0.5, 0}), "RESUME");
+  expect_rejected(simulator, move_to(1, {0.5, 0}), "resume");
   EXPECT_EQ(simulator.status().stop_latched, 1);
   const auto held = simulator.on_command(command(action_command_t::KIND_HOLD, 2));
   EXPECT_EQ(held.statuses.at(0).state, Status::STATE_HOLDING);
