@@ -42,13 +42,13 @@ FoundChanges HypothesisTracker::search(const BodySchema& base, const std::vector
     search.learn = standing_form->is_learned();
   }
   FoundChanges found = find_changes(base, history_, places, samples, search);
-  credit_ -= found.work;
+  work_budget_ -= found.work;
   return found;
 }
 
 void HypothesisTracker::propose_more(std::int64_t now) {
   const std::vector<Place> places = suspects();
-  if (places.empty() || credit_ <= 0) return;
+  if (places.empty() || work_budget_ <= 0) return;
   const std::int64_t since = tests_->highest().cusum.since;
   if (!is_worth_a_fit(now - since + 1)) return;
   const FoundChanges found =
@@ -191,7 +191,7 @@ void HypothesisTracker::propose_again(std::int64_t now, std::vector<AdaptationEv
   const std::int64_t age = now - newest_adopted();
   if (age == 0) return;
   beam_.front() = fitted_again(standing(), false, options_.settled_after, now);
-  if (credit_ <= 0 || !is_in(age, kRefits)) return;
+  if (work_budget_ <= 0 || !is_in(age, kRefits)) return;
   Hypothesis again = fitted_again(standing(), true, options_.settled_after, now);
   // The same, learned from more samples, needs no lead.
   const double lead = again.log_odds - log_odds();

@@ -45,7 +45,7 @@ HypothesisTracker::HypothesisTracker(BodySchema settled, const MeasurementModel&
       is_soft_(is_soft),
       measurement_(measurement),
       settled_(std::move(settled)),
-      credit_(kMostWork) {
+      work_budget_(kMostWork) {
   history_.push_back(settled_);
   begin(BodySchema(settled_), measurement);
 }
@@ -365,11 +365,11 @@ void HypothesisTracker::detect(std::int64_t now, std::vector<AdaptationEvent>* e
     return;
   // Edges between which nothing was seen are suspected alike: which one it is is told later, if
   // there is more evidence of it. (A lead may also come from evidence against all of them.)
-  const bool is_rising = !detected_ || cusum.value > std::min(untold_, tests_->ceiling());
+  const bool is_rising = !detected_ || cusum.value > std::min(unreported_, tests_->ceiling());
   is_told_ =
       is_rising && (cusum.value - second > kClearLead || now - cusum.since >= kLongestUnclear);
   detected_ = places.front();
-  untold_ = cusum.value;
+  unreported_ = cusum.value;
   if (!is_told_) return;
   AdaptationEvent mismatch = event(Kind::kMismatch, now, *detected_);
   if (*detected_ == Place{settled_.root, false}) mismatch.cause = "camera_moved";
@@ -486,7 +486,7 @@ void HypothesisTracker::add_silently(const ActionPoseSample& sample) {
 
 TreeFilter::Judgement HypothesisTracker::on_sample(const ActionPoseSample& sample,
                                                    std::vector<AdaptationEvent>* events) {
-  credit_ = std::min(credit_ + kWorkPerSample, kMostWork);
+  work_budget_ = std::min(work_budget_ + kWorkPerSample, kMostWork);
   const std::int64_t now = sample.sample_index;
   const auto judge = [&](const TreeFilter& filter) {
     return filter.judge(filter.prepare(sample)).log_likelihood;

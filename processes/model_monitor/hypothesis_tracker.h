@@ -154,11 +154,11 @@ class HypothesisTracker {
   std::optional<Maturing> maturing_;
   std::optional<Place> detected_;
   bool is_told_ = false;  ///< that and where something was detected
-  double untold_ = 0;     ///< the highest CUSUM when it was not told yet
+  double unreported_ = 0;     ///< the highest CUSUM when it was not told yet
   std::int64_t last_mismatch_ = -1000;
   std::map<Place, std::int64_t> mismatched_;  ///< places in the present trouble → the newest
   std::vector<std::pair<Replacement, Replacement>> asked_;  ///< a probe was wanted for
-  int credit_;  ///< work that may be done now; see kWorkPerSample
+  int work_budget_;  ///< work that may be done now; see kWorkPerSample
 };
 
 }  // namespace bodyschema

@@ -239,7 +239,7 @@ TEST(AdaptationTest, WhatIsRestoredIsToldInAllItsPlacesAndNotWhereAMarkerIsAnOut
   }
 }
 
-TEST(AdaptationTest, WhichOfTheEdgesBetweenWhichNothingWasSeenIsWrongIsToldWhenItIsKnown) {
+TEST(AdaptationTest, AnAmbiguousEdgeIsReportedOnceItIsLocalised) {
   for (const int seed : {1, 2, 3}) {
     BrokenArm arm({Fault::kCamera, "", 1}, Regime::kTagIso, 20, seed);
     Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kTagIso));
