@@ -11,6 +11,7 @@
 #include "processes/structure_learner/command_warp.h"
 #include "processes/structure_learner/noise_estimate.h"
 #include "processes/structure_learner/residual_fit.h"
+#include "processes/structure_learner/search/withdrawal.h"
 #include "processes/structure_learner/soft_parts.h"
 #include "processes/structure_learner/structure_search.h"
 #include "processes/structure_learner/tree_fit.h"
