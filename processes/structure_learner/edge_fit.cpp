@@ -37,7 +37,8 @@ Eigen::MatrixXd in_command_units(const ParameterMatrix& covariance, const LocalM
   return units.asDiagonal() * covariance * units.asDiagonal();
 }
 
-// What the leave-one-out residuals of the frames say of an edge. Number of inliers.
+// Sets an edge's outliers and mean residuals from the leave-one-out residuals of its frames.
+// Returns the number of inliers.
 int judge(const PairData& pair, const std::vector<double>& squared_distance,
           const std::vector<Vector6d>& residual, FittedEdge* result) {
   Edge& edge = result->edge;

@@ -7,7 +7,7 @@
 
 namespace bodyschema {
 
-/// What edges are fitted to. Actions are displacements.
+/// The data that edges are fitted to. Actions are displacements.
 struct EdgeData {
   const std::vector<ActionPoseSample>& samples;
   const NormalizedActions& actions;

@@ -118,8 +118,8 @@ std::optional<Noise> noise_from_repeats(const std::vector<ActionPoseSample>& sam
   return noise_from(residuals);
 }
 
-// Of a stream: from what is left of three successive poses of a part when its motion is taken to be
-// uniform. The white part of the noise, whatever the model.
+// The white part of a stream's noise, whatever the model: from what is left of three successive
+// poses of a part when its motion is taken to be uniform.
 std::optional<Noise> noise_from_neighbours(const std::vector<ActionPoseSample>& samples,
                                            const NormalizedActions& actions) {
   if (!actions.blocks().is_stream()) return std::nullopt;

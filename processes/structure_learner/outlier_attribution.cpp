@@ -19,7 +19,7 @@ class OutlierAttribution {
     for (const Edge& edge : schema.edges) depth_[edge.to] = depth_[edge.from] + 1;
   }
 
-  // What an edge says of one instant.
+  // An edge's verdict on one instant.
   struct Judgement {
     const Edge* edge;
     bool outlying;

@@ -17,7 +17,7 @@ SearchResult search_structure(const std::vector<ActionPoseSample>& samples,
   Settled settled;
   for (int round = 0; round < kMaxRounds; ++round) {
     layers.run(round == 0 ? 0 : 1);
-    // What all markers together refute leaves a gap, which other models may fill.
+    // Models that all markers together refute leave gaps, which others may fill.
     settled = settle_trees(&layers.spare(), &pairs, &forest);
     if (!settled.any_refuted) break;
   }

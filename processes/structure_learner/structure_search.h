@@ -11,12 +11,12 @@ namespace bodyschema {
 struct SearchResult {
   std::vector<AcceptedModel> models;  ///< the forest, in the order of acceptance
   std::map<std::pair<int, int>, PairRecord> records;
-  /// Of all poses, each tree fitted as a whole, Student-t [nats]; up to a constant. Of a forest
-  /// that spans: from one with gaps models may have been taken since.
+  /// All poses', each tree fitted as a whole, Student-t [nats]; up to a constant. It holds for a
+  /// forest that spans: from one with gaps models may have been taken since.
   double log_likelihood = 0;
-  /// Of each signal that moved: how clearly a joint on it would show in that edge which would show
-  /// it least (missing_joint_information() [per (rad per half range)²]); of edges that have it
-  /// already, nothing. Infinite where there is no edge to judge.
+  /// By signal that moved: how clearly a joint on it would show in that edge which would show it
+  /// least (missing_joint_information() [per (rad per half range)²]), edges that have it already
+  /// apart. Infinite if there is no edge to judge.
   std::map<int, double> joint_information;
   int num_screens = 0;  ///< closed-form starts and regressions
   int num_fits = 0;     ///< Levenberg–Marquardt fits, of pairs and of whole trees

@@ -63,7 +63,7 @@ class TreeFit {
   const Pose& pose(int frame, int node) const { return poses_[at(frame, node)]; }
   bool is_seen(int node) const { return data_[node].size() > 0; }
   bool is_below(int node, int ancestor) const;  ///< or the same
-  /// Where Normal has what it says by frame and node.
+  /// Index of a frame and node in Normal.
   int at(int frame, int node) const { return frame * static_cast<int>(nodes_.size()) + node; }
   struct Normal;  // tree_fit_normal.h
   Normal normal_equations() const;

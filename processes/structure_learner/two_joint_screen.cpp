@@ -21,8 +21,8 @@ constexpr int kRotationFrames = 56;  // frames of the eigenvector screen
 
 enum class JointType { kTurning, kSliding };
 
-// What is known of a model with the joints a and b, R_t = R_0 R_z(α) R_1 R_z(β) R_2, before its
-// translations.
+// A model with the joints a and b, R_t = R_0 R_z(α) R_1 R_z(β) R_2, before its translations are
+// known.
 struct RotationHypothesis {
   int a = 0, b = 0;
   JointType type_a = JointType::kTurning, type_b = JointType::kTurning;
@@ -60,7 +60,7 @@ struct Side {
 // By moving signal.
 std::vector<Side> best_of_turns(AxisScreen screen, const NormalizedActions& actions,
                                 const std::vector<std::vector<double>>& turns) {
-  // Of many signals only the promising ones are worth more than two rounds of re-weighting.
+  // Only the promising ones of many signals are worth more than two rounds of re-weighting.
   constexpr int kRounds = 4;
   constexpr std::size_t kMaxSignals = 8;
   const std::vector<int>& moving = actions.moving();

@@ -45,7 +45,7 @@ std::vector<int> cluster_of(const std::vector<TreeNode>& nodes, int top);
 /// kMaxJoints.
 std::optional<std::vector<TreeEdge>> insert_joint(const std::vector<TreeNode>& nodes,
                                                   const MissingJoint& joint);
-/// Where insert_joint() fails: the nodes whose edges to their parents have no room for the joint.
+/// The nodes whose edges to their parents have no room for the joint: why insert_joint() fails.
 std::vector<int> full_edges(const std::vector<TreeNode>& nodes, const MissingJoint& joint);
 
 }  // namespace bodyschema

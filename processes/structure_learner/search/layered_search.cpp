@@ -157,8 +157,8 @@ LayeredSearch::Turns LayeredSearch::assumed_turns(bool known_only) const {
 }
 
 void LayeredSearch::layer_two_joints() {
-  // What the forest knows of a signal's range may not hold for its other joints: so a second pass
-  // without it, where the first leaves gaps.
+  // A signal's range in the forest may not hold for its other joints: so a second pass without it
+  // if the first leaves gaps.
   for (const bool known_only : {true, false}) {
     const Turns turns = assumed_turns(known_only);
     if (turns.empty() || forest_.spans()) continue;

@@ -71,7 +71,7 @@ class ModelForest {
   std::vector<int> members(int part) const;
   bool spans() const { return components_.is_one(); }
   int num_joints() const;
-  /// Of a forest that spans: the signals among these that move nothing in it. Else none.
+  /// The signals among these that move nothing in a forest that spans; none in another.
   std::set<int> idle_signals(const std::vector<int>& signals) const;
 
   void add(AcceptedModel model);

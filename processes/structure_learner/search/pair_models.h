@@ -22,7 +22,7 @@ struct SearchOptions {
   int max_signals = 2;  ///< largest k, at most kMaxJoints
 };
 
-/// What the search tried between two parts.
+/// A search's trials between two parts.
 struct PairRecord {
   int num_common = 0;  ///< instants at which both were seen
   /// The models that were not refuted but that the data are too few to trust: mean of min(d², 2c)
@@ -53,8 +53,9 @@ struct NearMiss {
   double cost = 0;  ///< a frame
 };
 
-/// What a search knows of the parts and of each two of them: their data, made once, and what became
-/// of the models that were tried on these. Hypotheses are judged on an even subset of the instants.
+/// A search's knowledge of the parts and of each two of them: their data, made once, and what
+/// became of the models that were tried on these. Hypotheses are judged on an even subset of the
+/// instants.
 class PairModels {
  public:
   /// Keeps references to `samples`, `actions` and `options`.

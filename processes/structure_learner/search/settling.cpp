@@ -17,7 +17,7 @@ bool exchange(const ComponentTree& tree, int signal, double cost, std::vector<Ca
   const int root = tree.nodes().front().part;
   std::vector<AcceptedModel> best;
   for (Candidate& c : *spare) {
-    // What joined its ends may have been refuted since.
+    // The models that joined its ends may have been refuted since.
     if (!forest->connected(root, c.part_i) || !forest->connected(root, c.part_j) ||
         !c.model.uses(signal) || pairs->is_refuted(c.part_i, c.part_j, c.model))
       continue;

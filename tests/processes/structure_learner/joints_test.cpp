@@ -44,6 +44,22 @@ TEST(InsertJoint, PartsARigidClusterAndLeavesEachBranchOnItsSide) {
   EXPECT_EQ(full_edges(nodes, joint), std::vector<int>{3});
 }
 
+TEST(InsertJoint, WhateverMovesAllPosesAreAsBeforeAtTheMiddleOfTheSignal) {
+  const std::vector<TreeNode> nodes = chain();
+  const Pose X_23 = nodes[2].model.A[0], X_24 = X_23 * nodes[3].model.A[0];
+  MissingJoint joint{.top = 1, .signal = 7, .members = {1}};
+  joint.xi << 0, 0, 0, 0, 0.5, 0;
+  auto edges = insert_joint(nodes, joint);  // from part 3, which rests, to part 2
+  ASSERT_TRUE(edges);
+  const LocalModel& model = edges->front().model;
+  EXPECT_TRUE((model.A[0] * model.A[1]).isApprox(X_23.inverse(), 1e-12));
+  joint.members = {2};  // part 4 comes to part 2
+  edges = insert_joint(nodes, joint);
+  ASSERT_TRUE(edges);
+  EXPECT_EQ(edges->back().a, 1);
+  EXPECT_TRUE(edges->back().model.A[0].isApprox(X_24, 1e-12));
+}
+
 TEST(PlacedScrew, IsTheTwistInItsFrame) {
   test::Rng rng(3);
   for (const bool slides : {false, true}) {

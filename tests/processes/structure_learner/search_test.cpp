@@ -40,6 +40,10 @@ struct Case {
   Case(double turn_rad, int num_samples, Regime regime = Regime::kTagIso)
       : samples(test::babble(hinge(turn_rad, rng), num_samples,
                              {.regime = regime, .with_covariances = true}, rng)) {}
+  // Exact samples.
+  explicit Case(std::vector<ActionPoseSample> seen) : samples(std::move(seen)) {
+    options.measurement.noise = Noise{0.002, 0.02};
+  }
 
   Candidate fitted(int i, int j, int num_joints, int signal = 0) {
     LocalModel start = screen_rigid(pairs.pair(i, j), actions).model;
@@ -132,22 +136,22 @@ TEST(LayeredSearch, TwoSignalSetsThatExplainAPairAlikeLeaveItUndecided) {
 }
 
 TEST(ComponentTree, GrowsFromAPartThatRestsAndTakesNewEdges) {
-  Case c(1, 20);
-  for (ActionPoseSample& sample : c.samples)  // part 3 rests, and the base moves
+  auto samples = Case(1, 20, Regime::kFree).samples;
+  for (ActionPoseSample& sample : samples)  // parts 2 and 3 rest, and the base moves
     for (int n = 0; n < 3; ++n)
       sample.parts[n].X_CB = sample.parts[2].X_CB.inverse() * sample.parts[n].X_CB;
-  PairModels pairs(c.samples, c.actions, {1, 2, 3}, c.options);
+  Case c(samples);
   c.forest.add(c.fitted(1, 2, 1));
   c.forest.add(c.fitted(2, 3, 0));
-  const ComponentTree tree(c.forest, 1, &pairs);
+  const ComponentTree tree(c.forest, 1, &c.pairs);
   EXPECT_TRUE(tree.root_rests());
   ASSERT_EQ(tree.nodes().size(), 3u);
-  EXPECT_EQ(tree.nodes()[0].part, 3);
-  EXPECT_EQ(tree.model_of(1), 1);
-  tree.replace_edges({{2, 0, c.fitted(1, 3, 1).model}}, &c.forest);
+  EXPECT_EQ(tree.nodes()[0].part, 2);
+  EXPECT_EQ(tree.model_of(2), 1);
+  tree.replace_edges({{1, 2, c.fitted(1, 3, 1).model}}, &c.forest);
   ASSERT_EQ(c.forest.models().size(), 1u);
   EXPECT_TRUE(c.forest.models()[0].joins(1, 3));
-  tree.replace_edges({{1, 2, c.fitted(1, 2, 1).model}}, &c.forest);  // part 1 seen from part 2
+  tree.replace_edges({{0, 1, c.fitted(1, 2, 1).model}}, &c.forest);  // part 1 seen from part 2
   const Pose X = c.forest.models()[0].model.predict(c.actions, 0);
   EXPECT_TRUE(X.isApprox(c.fitted(1, 2, 1).model.inverse().predict(c.actions, 0), 1e-9));
 }
@@ -167,8 +171,9 @@ TEST(SettleTrees, ExchangesAModelForASpareOneWithWhichAllPosesCostLess) {
   Case c(1, 40);
   c.forest.add(c.fitted(1, 2, 1, 1));  // the wrong signal
   c.forest.add(c.fitted(2, 3, 0));
-  std::vector<Candidate> spare{c.fitted(1, 3, 1, 0)};
+  std::vector<Candidate> spare{c.fitted(1, 3, 1, 1), c.fitted(1, 3, 1, 0)};
   settle_trees(&spare, &c.pairs, &c.forest);
+  EXPECT_FALSE(spare[0].on_all_data);  // not asked: it lacks the signal too
   ASSERT_EQ(c.forest.models().size(), 2u);
   EXPECT_TRUE(c.forest.models()[0].joins(1, 3));
   EXPECT_EQ(c.forest.num_joints(), 1);
@@ -188,13 +193,34 @@ TEST(SettleTrees, RemovesAModelThatHasNoRoomForTheMissingJoint) {
 }
 
 TEST(Bridge, JoinsByANarrowlyRefutedModelThatGrowsByItsJoint) {
-  Case c(8 * kDegree, 40, Regime::kFree);
-  c.options.measurement.noise = Noise{0.002, 0.02};
+  Case c(Case(8 * kDegree, 40, Regime::kFree).samples);
   EXPECT_FALSE(bridge(&c.pairs, &c.forest));
   EXPECT_FALSE(c.pairs.try_start(1, 2, c.fitted(1, 2, 0).model));
   EXPECT_TRUE(bridge(&c.pairs, &c.forest));
   ASSERT_EQ(c.forest.models().size(), 1u);
   EXPECT_EQ(signal_set(c.forest.models()[0].model), std::set<int>{0});
+}
+
+TEST(Bridge, TwoSignalSetsThatDoAsWellLeaveItOpen) {
+  for (const bool are_alike : {false, true}) {
+    auto samples = Case(8 * kDegree, 4, Regime::kFree).samples;
+    if (are_alike)
+      for (ActionPoseSample& sample : samples) sample.action(1) = sample.action(0);
+    Case c(samples);
+    for (const int signal : {0, 1}) c.pairs.try_start(1, 2, c.fitted(1, 2, 1, signal).model);
+    EXPECT_EQ(bridge(&c.pairs, &c.forest), !are_alike);
+  }
+}
+
+TEST(Bridge, TwoPartsThatRestTellNothingOfEachOther) {
+  auto samples = Case(0, 40, Regime::kFree).samples;
+  for (int t = 0; t < 40; ++t)
+    if (t < 19 || t > 20)
+      std::erase_if(samples[t].parts, [t](const auto& o) { return o.part == (t < 19 ? 1 : 2); });
+  Case c(samples);
+  EXPECT_FALSE(c.pairs.try_start(1, 2, c.fitted(1, 2, 0).model));
+  EXPECT_EQ(c.pairs.near_misses().size(), 1u);
+  EXPECT_FALSE(bridge(&c.pairs, &c.forest));
 }
 
 // A part that swings freely, seen at a tenth of the instants: what all the others say of themselves
