@@ -1,7 +1,5 @@
 #pragma once
 
-#include <cmath>
-#include <cstdint>
 #include <optional>
 #include <vector>
 
@@ -9,6 +7,7 @@
 #include "common/schema/body_schema.h"
 #include "common/schema/sample.h"
 #include "processes/structure_learner/noise_estimate.h"
+#include "processes/structure_learner/outlier_attribution.h"
 #include "processes/structure_learner/structure_search.h"
 
 namespace bodyschema {
@@ -16,11 +15,6 @@ namespace bodyschema {
 /// MeasurementModel::systematic of tags, where no rig's noise.yaml says it: recordings of camera
 /// markers are learned with this.
 inline constexpr Noise kTagSystematic{.position_m = 0.0007, .rotation_rad = 0.14 * kDegree};
-
-/// X_CR of `schema` with its covariance: the robust mean of the poses of its root, Student-t
-/// weights. Left alone if the root is never seen.
-void estimate_root_pose(const std::vector<ActionPoseSample>& samples,
-                        const MeasurementModel& measurement, BodySchema* schema);
 
 struct LearnOptions {
   /// The root part; else the lowest part id seen.
@@ -39,12 +33,6 @@ struct LearnOptions {
   /// A second pose hypothesis is offered to the fits while its reprojection error is below this
   /// multiple of the first's.
   double max_error_ratio = 10;
-};
-
-/// A pose that disagrees with the rest of the learned schema.
-struct Outlier {
-  std::int64_t sample_index = 0;
-  int part = 0;
 };
 
 struct LearnResult {

@@ -4,8 +4,6 @@
 #include <cmath>
 #include <limits>
 #include <map>
-#include <numeric>
-#include <set>
 
 #include "common/estimation/quantile.h"
 #include "processes/structure_learner/screen.h"
@@ -120,8 +118,8 @@ std::optional<Noise> noise_from_repeats(const std::vector<ActionPoseSample>& sam
   return noise_from(residuals);
 }
 
-// Of a stream: from what is left of three successive poses of a part when its motion is taken to be
-// uniform. The white part of the noise, whatever the model.
+// The white part of a stream's noise, whatever the model: from what is left of three successive
+// poses of a part when its motion is taken to be uniform.
 std::optional<Noise> noise_from_neighbours(const std::vector<ActionPoseSample>& samples,
                                            const NormalizedActions& actions) {
   if (!actions.blocks().is_stream()) return std::nullopt;
@@ -215,6 +213,26 @@ class ModelNoise {
   const NormalizedActions& actions_;
 };
 
+// Prim's minimum spanning tree by scale: every part by the partner that predicts it best.
+std::vector<std::pair<int, int>> spanning_tree(
+    int num_parts, const std::map<std::pair<int, int>, ScaledFit>& fits) {
+  std::vector<bool> in_tree(num_parts, false);
+  in_tree[0] = true;
+  std::vector<std::pair<int, int>> tree;
+  while (true) {
+    std::pair<int, int> best{-1, -1};
+    double best_scale = std::numeric_limits<double>::infinity();
+    for (const auto& [ij, fit] : fits) {
+      if (in_tree[ij.first] == in_tree[ij.second] || !(fit.scale < best_scale)) continue;
+      best_scale = fit.scale;
+      best = ij;
+    }
+    if (best.first < 0) return tree;
+    in_tree[best.first] = in_tree[best.second] = true;
+    tree.push_back(best);
+  }
+}
+
 }  // namespace
 
 std::optional<SourcedNoise> estimate_noise(const std::vector<ActionPoseSample>& samples,
@@ -235,10 +253,7 @@ std::optional<SourcedNoise> estimate_noise(const std::vector<ActionPoseSample>& 
   if (const auto noise = noise_from_repeats(samples, actions))
     return bounded(*noise, NoiseSource::kRepeats);
 
-  std::set<int> seen;
-  for (const auto& sample : samples)
-    for (const auto& o : sample.parts) seen.insert(o.part);
-  const std::vector<int> parts(seen.begin(), seen.end());
+  const std::vector<int> parts = seen_parts(samples);
   const int n = static_cast<int>(parts.size());
   if (n < 2) return std::nullopt;
 
@@ -247,22 +262,7 @@ std::optional<SourcedNoise> estimate_noise(const std::vector<ActionPoseSample>& 
   for (int i = 0; i < n; ++i)
     for (int j = i + 1; j < n; ++j) fits[{i, j}] = model_noise.best(parts[i], parts[j], false);
 
-  // Prim's minimum spanning tree by scale: every part by the partner that predicts it best.
-  std::vector<bool> in_tree(n, false);
-  in_tree[0] = true;
-  std::vector<std::pair<int, int>> tree;
-  for (int step = 1; step < n; ++step) {
-    std::pair<int, int> best{-1, -1};
-    double best_scale = std::numeric_limits<double>::infinity();
-    for (const auto& [ij, fit] : fits) {
-      if (in_tree[ij.first] == in_tree[ij.second] || !(fit.scale < best_scale)) continue;
-      best_scale = fit.scale;
-      best = ij;
-    }
-    if (best.first < 0) break;
-    in_tree[best.first] = in_tree[best.second] = true;
-    tree.push_back(best);
-  }
+  const std::vector<std::pair<int, int>> tree = spanning_tree(n, fits);
   if (tree.empty()) return std::nullopt;
 
   // Where one joint does not suffice, two may. Edges far above the quietest do, and with few edges

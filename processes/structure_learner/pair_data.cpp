@@ -4,6 +4,7 @@
 #include <cmath>
 #include <initializer_list>
 #include <map>
+#include <set>
 #include <stdexcept>
 
 namespace bodyschema {
@@ -101,6 +102,13 @@ NormalizedActions::NormalizedActions(const std::vector<ActionPoseSample>& sample
   std::vector<std::int64_t> utimes;
   for (const ActionPoseSample& sample : samples) utimes.push_back(sample.utime);
   blocks_ = TimeBlocks(utimes, values_(moving_, Eigen::all));
+}
+
+std::vector<int> seen_parts(const std::vector<ActionPoseSample>& samples) {
+  std::set<int> parts;
+  for (const ActionPoseSample& sample : samples)
+    for (const PartObservation& o : sample.parts) parts.insert(o.part);
+  return {parts.begin(), parts.end()};
 }
 
 int count_common(const std::vector<ActionPoseSample>& samples, int part_i, int part_j) {

@@ -70,7 +70,10 @@ struct PairData {
   }
 };
 
-/// Instants at which both parts were seen, as (sample, observation of i, observation of j).
+/// The parts that were seen, ascending.
+std::vector<int> seen_parts(const std::vector<ActionPoseSample>& samples);
+
+/// Number of instants at which both parts were seen.
 int count_common(const std::vector<ActionPoseSample>& samples, int part_i, int part_j);
 
 /// The pair's data, thinned evenly to at most `max_frames` instants.

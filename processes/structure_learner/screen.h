@@ -31,6 +31,12 @@ struct Start {
   double median = 0;  ///< of the squared distances: outliers do not count
 };
 
+/// Frames on which a start is judged.
+inline constexpr int kStartFrames = 48;
+/// How well a model fits an even choice of so many frames.
+Start judged_start(const LocalModel& model, const PairData& pair, const NormalizedActions& actions,
+                   int max_frames = kStartFrames);
+
 /// Score of a rigid start beyond which no rigid model is valid.
 inline constexpr double kMaxRigidStartCost = 20;
 

@@ -17,26 +17,6 @@ constexpr int kMaxFrames = 600;
 constexpr int kScreenFrames = 150;
 constexpr std::size_t kPairsTried = 3;  // between two components
 
-// Parts by their component, which is named after its lowest part.
-class Components {
- public:
-  explicit Components(const std::vector<int>& parts) {
-    for (const int part : parts) of_part_[part] = part;
-  }
-  int of(int part) const { return of_part_.at(part); }
-  // False if they are one already.
-  bool join(int a, int b) {
-    const int lower = std::min(of(a), of(b)), upper = std::max(of(a), of(b));
-    if (lower == upper) return false;
-    for (auto& [part, component] : of_part_)
-      if (component == upper) component = lower;
-    return true;
-  }
-
- private:
-  std::map<int, int> of_part_;
-};
-
 struct OpenPair {
   double cost;  // of the best screws, a frame
   int i, j;

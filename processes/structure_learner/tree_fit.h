@@ -4,40 +4,10 @@
 #include <utility>
 #include <vector>
 
-#include "processes/structure_learner/local_model.h"
+#include "processes/structure_learner/joints/joint_insertion.h"
 #include "processes/structure_learner/validity.h"
 
 namespace bodyschema {
-
-/// One part of a kinematic tree with the local model that carries it.
-struct TreeNode {
-  int part = 0;
-  int parent = -1;   ///< index into the nodes, below the node's own; −1: the tree's root
-  LocalModel model;  ///< Δ of this part in its parent; unused at the root
-};
-
-/// A joint that the tree lacks: part of a rigid cluster (and of what hangs on it) moves with a
-/// signal relative to the rest of it.
-struct MissingJoint {
-  int top = 0;  ///< the cluster's node next to the tree's root
-  int signal = 0;
-  /// Nodes of the cluster, and nodes joined to it by their own edges, that move. What the cluster
-  /// itself hangs on does not.
-  std::vector<int> members, branches;
-  /// Most likely screw in the frame of `top`, Exp(ξ q), per half range of the signal.
-  Vector6d xi = Vector6d::Zero();
-  bool slides = false;  ///< ξ is a translation, which explains the data as well as a general screw
-  double statistic = 0;  ///< score statistic: χ² of ξ = 0
-  double log_tail = 0;   ///< log of the χ² tail beyond the statistic
-  /// log of the number of ways to part this cluster: for the significance of the best of them.
-  double log_ways = 0;
-};
-
-/// An edge between two nodes of a tree.
-struct TreeEdge {
-  int a = 0, b = 0;
-  LocalModel model;  ///< Δ of b in a
-};
 
 /// Does a part keep its pose in the camera's frame? `data` are its make_part_data(); true if a
 /// rigid model of them is valid.
@@ -86,37 +56,24 @@ class TreeFit {
   /// std::nullopt if the root moves, or the data do not determine the tree.
   std::optional<Covariance> covariance(const Matrix6d& systematic, double view_share) const;
 
-  /// Rao's score test of one more joint, for every rigid cluster and every moving signal: how much
-  /// the residuals shrink, to second order, if Exp(ξ q_g) moves some of what is in or on the
-  /// cluster and all other parameters of the tree adapt. The parting that explains most is found by
-  /// greedy exchange; of a sliding (3 degrees of freedom) and a general joint (6), the less likely
-  /// by chance. A marker's own bias, which turns with the signals that turn it to the camera, is no
-  /// joint: `bias`, standard deviations at half range of a signal, adds to the noise of ξ however
-  /// many samples there are.
-  std::vector<MissingJoint> missing_joints(const Noise& bias) const;
-
-  /// How clearly one more joint would show: χ² that Exp(turn · q) puts into the residuals, about
-  /// the least visible axis through a node's origin, where that node and all beyond it move and
-  /// every other parameter of the tree adapts [per (rad per half range)²]. Nodes × moving signals;
-  /// 0 at the tree's root.
-  Eigen::MatrixXd joint_information() const;
-
-  /// The tree's edges with that joint. Where only branches move, each of their edges gets it. Edges
-  /// between the two sides are moved to the right one. std::nullopt if an edge had more than
-  /// kMaxJoints.
-  std::optional<std::vector<TreeEdge>> with_joint(const MissingJoint& joint) const;
-  /// Where with_joint() fails: the nodes whose edges to their parents have no room for the joint.
-  std::vector<int> full_edges(const MissingJoint& joint) const;
+  bool root_rests() const { return root_rests_; }
+  const NormalizedActions& actions() const { return actions_; }
+  int sample(int frame) const { return samples_[frame]; }
+  /// In the camera's frame.
+  const Pose& pose(int frame, int node) const { return poses_[at(frame, node)]; }
+  bool is_seen(int node) const { return data_[node].size() > 0; }
+  bool is_below(int node, int ancestor) const;  ///< or the same
+  /// Index of a frame and node in Normal.
+  int at(int frame, int node) const { return frame * static_cast<int>(nodes_.size()) + node; }
+  struct Normal;  // tree_fit_normal.h
+  Normal normal_equations() const;
 
  private:
   double evaluate(const std::vector<TreeNode>& nodes, const std::vector<Pose>& roots,
                   std::vector<Pose>* poses, std::vector<FrameFit>* fits) const;
   void start_roots();
-  struct Normal;
-  class MissingJointTest;
   void gather(int frame, Normal* normal) const;
   void add_frame(int frame, Normal* normal) const;
-  Normal normal_equations() const;
   // The tree after a step of the parameters, and what the eliminated roots make of it.
   void move_by(const Eigen::VectorXd& step, const Normal& normal, std::vector<TreeNode>* nodes,
                std::vector<Pose>* roots) const;
@@ -126,10 +83,6 @@ class TreeFit {
                                    double view_share) const;
   std::vector<Matrix6d> frame_covariances(const Normal& normal, const Eigen::MatrixXd& joint) const;
   void add_composites(const Normal& normal, std::vector<Matrix6d> own, Eigen::MatrixXd* sum) const;
-  Eigen::MatrixXd moving_actions() const;  // frames × moving signals
-  std::vector<int> cluster_of(int top) const;
-  bool is_below(int node, int ancestor) const;  // or the same
-  int at(int frame, int node) const { return frame * static_cast<int>(nodes_.size()) + node; }
 
   std::vector<TreeNode> nodes_;
   std::vector<PairData> data_;

@@ -10,7 +10,7 @@
 #include "processes/console/commands/files.h"
 #include "processes/console/engineered_model.h"
 #include "processes/console/views/structure_view.h"
-#include "processes/structure_learner/learn.h"
+#include "processes/structure_learner/root_pose.h"
 
 namespace bodyschema {
 namespace {

@@ -4,14 +4,14 @@
 #include <cmath>
 #include <ctime>
 #include <limits>
-#include <map>
 #include <memory>
 #include <numeric>
-#include <set>
 #include <stdexcept>
 
 #include "processes/structure_learner/baseline/fit_matrix_gp.h"
+#include "processes/structure_learner/learned_schema.h"
 #include "processes/structure_learner/pair_data.h"
+#include "processes/structure_learner/search/model_forest.h"
 
 namespace bodyschema {
 namespace {
@@ -20,7 +20,7 @@ namespace {
 constexpr int kMinSamples = 3;
 
 struct Candidate {
-  int i = 0, j = 0;  // indices into parts, i < j
+  int i = 0, j = 0;  // parts, i < j
   std::vector<int> signals;
   double log_likelihood = 0;  // s(M)
 };
@@ -66,7 +66,8 @@ std::vector<std::vector<int>> subsets(const std::vector<int>& items, int k) {
 }
 
 // Kruskal over models in the order of their quality.
-std::vector<Candidate> spanning_forest(const std::vector<Candidate>& valid, int num_parts) {
+std::vector<Candidate> spanning_forest(const std::vector<Candidate>& valid,
+                                       const std::vector<int>& parts) {
   std::vector<ModelScore> scores;
   for (const Candidate& c : valid)
     scores.push_back({static_cast<int>(c.signals.size()), c.log_likelihood});
@@ -75,16 +76,10 @@ std::vector<Candidate> spanning_forest(const std::vector<Candidate>& valid, int 
   std::iota(order.begin(), order.end(), std::size_t{0});
   std::stable_sort(order.begin(), order.end(),
                    [&](std::size_t x, std::size_t y) { return quality[x] > quality[y]; });
-  std::vector<int> component(num_parts);
-  std::iota(component.begin(), component.end(), 0);
+  Components components(parts);
   std::vector<Candidate> forest;
-  for (const std::size_t n : order) {
-    const Candidate& c = valid[n];
-    const int from = component[c.j], to = component[c.i];
-    if (from == to) continue;
-    std::replace(component.begin(), component.end(), from, to);
-    forest.push_back(c);
-  }
+  for (const std::size_t n : order)
+    if (components.join(valid[n].i, valid[n].j)) forest.push_back(valid[n]);
   return forest;
 }
 
@@ -96,28 +91,25 @@ class BaselineSearch {
         samples_(samples),
         options_(options),
         moving_(NormalizedActions(samples, num_signals_).moving()) {
-    result_.schema.signals = signals;
+    result_.schema = start_schema(signals, samples, options.root);
   }
 
   BaselineResult run() {
     const std::clock_t start = std::clock();
     BodySchema& schema = result_.schema;
-    schema.num_samples = static_cast<int>(samples_.size());
-    if (!samples_.empty()) schema.calibration_id = samples_.back().calibration_id;
-    std::map<int, int> num_seen;
-    for (const ActionPoseSample& sample : samples_) {
-      schema.last_sample_index = std::max(schema.last_sample_index, sample.sample_index);
-      for (const PartObservation& o : sample.parts) ++num_seen[o.part];
-    }
-    for (const auto& [part, count] : num_seen) schema.parts.push_back(part);
-    if (!schema.parts.empty()) schema.root = schema.parts.front();
-    if (options_.root) schema.root = *options_.root;
     // Per axis and marker, as the schema says it.
     schema.noise = {options_.sigma_position_m / std::sqrt(6),
                     options_.sigma_rotation_rad / std::sqrt(6)};
 
-    grow_from_root(search());
-    report_unconnected(num_seen);
+    const std::vector<Candidate> forest = search();
+    std::vector<std::pair<int, int>> ends;
+    for (const Candidate& c : forest) ends.emplace_back(c.i, c.j);
+    visit_outwards(ends, schema, [&](int edge, int from, int to) {
+      schema.edges.push_back(make_edge(from, to, forest[static_cast<std::size_t>(edge)].signals));
+      return true;
+    });
+    report_unconnected(
+        options_.expected_parts, [&](int part) { return explain(part); }, &schema);
     estimate_root_pose();
     result_.seconds = static_cast<double>(std::clock() - start) / CLOCKS_PER_SEC;
     return std::move(result_);
@@ -127,13 +119,12 @@ class BaselineSearch {
   // Algorithm 1.
   std::vector<Candidate> search() {
     const std::vector<int>& parts = result_.schema.parts;
-    const int n = static_cast<int>(parts.size());
     std::vector<Candidate> valid, forest;
     for (int k = 0; k <= options_.max_signals; ++k) {
-      for (int i = 0; i < n; ++i) {
-        for (int j = i + 1; j < n; ++j) {
-          const PairSamples pair =
-              pair_samples(samples_, parts[i], parts[j], num_signals_, options_.max_samples);
+      for (const int i : parts) {
+        for (const int j : parts) {
+          if (j <= i) continue;
+          const PairSamples pair = pair_samples(samples_, i, j, num_signals_, options_.max_samples);
           if (static_cast<int>(pair.poses.size()) < kMinSamples) continue;
           for (const std::vector<int>& signals : subsets(moving_, k)) {
             ++result_.num_fits;
@@ -143,8 +134,8 @@ class BaselineSearch {
           }
         }
       }
-      forest = spanning_forest(valid, n);
-      if (options_.stop_at_first_tree && static_cast<int>(forest.size()) + 1 >= n) break;
+      forest = spanning_forest(valid, parts);
+      if (options_.stop_at_first_tree && forest.size() + 1 >= parts.size()) break;
     }
     result_.num_valid = static_cast<int>(valid.size());
     return forest;
@@ -170,30 +161,6 @@ class BaselineSearch {
                    3 * std::log(position_variance * rotation_variance));
   }
 
-  // The forest's edges, breadth first from the root, then from the lowest part of every other
-  // component; each learned in its direction.
-  void grow_from_root(const std::vector<Candidate>& forest) {
-    const std::vector<int>& parts = result_.schema.parts;
-    const auto grow = [&](int start) {
-      std::vector<int> queue{start};
-      reached_.insert(start);
-      for (std::size_t head = 0; head < queue.size(); ++head) {
-        for (const Candidate& c : forest) {
-          const int i = parts[c.i], j = parts[c.j];
-          if (i != queue[head] && j != queue[head]) continue;
-          const int to = i == queue[head] ? j : i;
-          if (!reached_.insert(to).second) continue;
-          result_.schema.edges.push_back(make_edge(queue[head], to, c.signals));
-          queue.push_back(to);
-        }
-      }
-    };
-    if (result_.schema.has_part(result_.schema.root)) grow(result_.schema.root);
-    connected_to_root_ = reached_;
-    for (const int part : parts)
-      if (!reached_.count(part)) grow(part);
-  }
-
   Edge make_edge(int from, int to, const std::vector<int>& signals) {
     const PairSamples pair = pair_samples(samples_, from, to, num_signals_, options_.max_samples);
     auto model = std::make_shared<const MatrixGp>(fit(pair, signals));
@@ -208,39 +175,18 @@ class BaselineSearch {
     return edge;
   }
 
-  void report_unconnected(const std::map<int, int>& num_seen) {
-    BodySchema& schema = result_.schema;
-    std::set<int> expected(options_.expected_parts.begin(), options_.expected_parts.end());
-    expected.insert(schema.parts.begin(), schema.parts.end());
-    if (options_.root) expected.insert(*options_.root);
-    for (const int part : expected) {
-      if (connected_to_root_.count(part)) continue;
-      const auto seen = num_seen.find(part);
-      if (seen == num_seen.end()) {
-        schema.unconnected.push_back({part, Unconnected::kNeverSeen, "never seen"});
-        continue;
-      }
-      int common = 0;
-      for (const int other : connected_to_root_)
-        common = std::max(common, count_common(samples_, part, other));
-      const std::string detail = "seen " + std::to_string(seen->second) + " times, at most " +
-                                 std::to_string(common) +
-                                 " of them together with one connected part";
-      if (common < kMinSamples) {
-        schema.unconnected.push_back({part, Unconnected::kNotEnoughData, detail});
-      } else {
-        schema.unconnected.push_back({part, Unconnected::kNoValidModel,
-                                      detail + "; no model with up to " +
-                                          std::to_string(options_.max_signals) +
-                                          " signals is valid to any connected part"});
-      }
-    }
-    if (schema.parts.size() == 1 && connected_to_root_.count(schema.parts.front()))
-      schema.unconnected.push_back(
-          {schema.parts.front(), Unconnected::kNotEnoughData, kOnlyPart});
-    schema.complete = schema.parts.size() > 1 &&
-                      std::all_of(schema.parts.begin(), schema.parts.end(),
-                                  [&](int part) { return connected_to_root_.count(part) > 0; });
+  // Why a part that was seen is not connected to the root.
+  UnconnectedPart explain(int part) const {
+    int common = 0;
+    for (const int other : connected_to_root(result_.schema))
+      common = std::max(common, count_common(samples_, part, other));
+    const std::string detail = "seen " + std::to_string(count_common(samples_, part, part)) +
+                               " times, at most " + std::to_string(common) +
+                               " of them together with one connected part";
+    if (common < kMinSamples) return {part, Unconnected::kNotEnoughData, detail};
+    return {part, Unconnected::kNoValidModel,
+            detail + "; no model with up to " + std::to_string(options_.max_signals) +
+                " signals is valid to any connected part"};
   }
 
   // As that of a rigid connection between camera and root.
@@ -262,7 +208,6 @@ class BaselineSearch {
   const std::vector<ActionPoseSample>& samples_;
   const BaselineOptions& options_;
   const std::vector<int> moving_;  // a signal that is constant explains nothing
-  std::set<int> reached_, connected_to_root_;
   BaselineResult result_;
 };
 

@@ -2,6 +2,7 @@
 
 #include <gtest/gtest.h>
 
+#include "processes/structure_learner/axis_screen.h"
 #include "tests/support/synthetic_robot.h"
 
 namespace bodyschema {
@@ -90,6 +91,26 @@ TEST(OneJointScreen, PutsTheTrueSignalFirstAndStartsAtTheTruth) {
     const Start start = one_joint_start(regressions.front(), pair, actions, motions.sigma_rad);
     EXPECT_LT(start.score, 1e-3);
   }
+}
+
+TEST(AxisScreen, ATurnOfOneJointLeavesNothingAtItsSignalWhateverTheOtherDoes) {
+  Rng rng(2);
+  const auto robot = two_joint_robot(Joint::kRevolute, Joint::kRevolute, false, rng);
+  const auto samples = test::babble(robot, 15, {}, rng);
+  const NormalizedActions actions(samples, 4);
+  std::vector<Eigen::Matrix3d> R;
+  std::vector<int> index;
+  for (const ActionPoseSample& s : samples) {
+    R.push_back((s.find(1)->X_CB.inverse() * s.find(3)->X_CB).linear());
+    index.push_back(static_cast<int>(index.size()));
+  }
+  AxisScreen screen(R, index, 1e-3, actions);
+  const AxisFit fit = screen.fit(1, robot.links[1].turn * actions.half_range(1), 4);
+  EXPECT_LT(fit.score, 1e-6);
+  // The axis of the other joint, seen from part 3.
+  const Eigen::Vector3d axis = robot.links[2].X_after.linear().transpose().col(2);
+  EXPECT_NEAR(std::abs(fit.axis.dot(axis)), 1, 1e-6);
+  EXPECT_GT(screen.fit(0, robot.links[1].turn * actions.half_range(1), 4).score, 1);
 }
 
 TEST(OneJointScreen, CoversAFullTurn) {

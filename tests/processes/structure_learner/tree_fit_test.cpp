@@ -10,6 +10,7 @@
 #include <utility>
 
 #include "common/geometry/angle.h"
+#include "processes/structure_learner/joints/missing_joint_test.h"
 #include "processes/structure_learner/screen.h"
 #include "processes/structure_learner/validity.h"
 #include "tests/support/synthetic_robot.h"
@@ -135,7 +136,7 @@ TEST(TreeFit, ATrueTreeLacksNoJoint) {
       Case c(chain(0.2, rng), 25, Regime::kChapter, root_moves, rng);
       TreeFit fit(c.nodes, c.data, c.actions, !root_moves);
       fit.fit(20, 1e-3);
-      for (const MissingJoint& joint : fit.missing_joints({})) {
+      for (const MissingJoint& joint : missing_joints(fit, {})) {
         ++num_tests;
         const double corrected = joint.log_tail + std::log(2.0) + joint.log_ways;
         num_below += corrected < std::log(0.05);
@@ -162,7 +163,7 @@ TEST(TreeFit, AllMarkersTogetherShowAJointThatNoPairShows) {
         Verdict::kValid;
     TreeFit fit(c.without(3), c.data, c.actions, true);
     fit.fit(20, 1e-3);
-    const auto missing = fit.missing_joints({});
+    const auto missing = missing_joints(fit, {});
     ASSERT_FALSE(missing.empty());
     const MissingJoint& best = missing.front();
     if (best.log_tail > -13 || best.signal != 3) continue;
@@ -171,7 +172,7 @@ TEST(TreeFit, AllMarkersTogetherShowAJointThatNoPairShows) {
     ++num_found;
     EXPECT_NEAR(best.xi.head<3>().norm(), 0.04, 0.02);
 
-    const auto edges = fit.with_joint(best);
+    const auto edges = insert_joint(fit.nodes(), best);
     ASSERT_TRUE(edges.has_value());
     std::vector<TreeNode> grown = c.nodes;
     ASSERT_EQ(edges->size(), grown.size() - 1);
@@ -202,7 +203,7 @@ TEST(TreeFit, AMarkersOwnBiasIsNoJoint) {
   TreeFit fit(c.nodes, c.data, c.actions, true);
   fit.fit(20, 1e-3);
   const auto worst = [&](const Noise& bias) {
-    const auto missing = fit.missing_joints(bias);
+    const auto missing = missing_joints(fit, bias);
     return *std::min_element(missing.begin(), missing.end(),
                              [](const auto& x, const auto& y) { return x.log_tail < y.log_tail; });
   };
@@ -214,7 +215,7 @@ TEST(TreeFit, AMarkersOwnBiasIsNoJoint) {
   // A true joint is far beyond the bias.
   TreeFit lacking(c.without(3), c.data, c.actions, true);
   lacking.fit(20, 1e-3);
-  const auto missing = lacking.missing_joints({0.003, 0.2 * kDegree});
+  const auto missing = missing_joints(lacking, {0.003, 0.2 * kDegree});
   ASSERT_FALSE(missing.empty());
   EXPECT_LT(missing.front().log_tail, -100);
 }
@@ -228,7 +229,7 @@ TEST(TreeFit, AJointThatMovesBranchesOnlyIsPutIntoTheirEdges) {
   joint.signal = 4;
   joint.branches = {2};
   joint.xi << 0, 0, 0, 0, 0.5, 0;
-  const auto edges = fit.with_joint(joint);
+  const auto edges = insert_joint(fit.nodes(), joint);
   ASSERT_TRUE(edges.has_value());
   int num_joints = 0;
   for (const TreeEdge& e : *edges) num_joints += e.model.num_joints;
@@ -239,8 +240,8 @@ TEST(TreeFit, AJointThatMovesBranchesOnlyIsPutIntoTheirEdges) {
     if (std::max(e.a, e.b) == 2) nodes[2].model = e.a < e.b ? e.model : e.model.inverse();
   joint.signal = 3;
   const TreeFit full(nodes, c.data, c.actions, true);
-  EXPECT_FALSE(full.with_joint(joint).has_value());
-  EXPECT_EQ(full.full_edges(joint), std::vector<int>{2});
+  EXPECT_FALSE(insert_joint(full.nodes(), joint).has_value());
+  EXPECT_EQ(full_edges(full.nodes(), joint), std::vector<int>{2});
 }
 
 // Ten poses, each seen once or four times: what a view biases is the same each time.

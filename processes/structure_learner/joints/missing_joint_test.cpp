@@ -1,3 +1,5 @@
+#include "processes/structure_learner/joints/missing_joint_test.h"
+
 #include <Eigen/Eigenvalues>
 #include <algorithm>
 #include <cmath>
@@ -16,28 +18,26 @@ using UpTo6 = Eigen::Matrix<double, Eigen::Dynamic, 1, Eigen::ColMajor, 6, 1>;
 // Directions of ξ that the tree's other parameters take over to this share are no evidence.
 constexpr double kLeastShare = 1e-4;
 
-}  // namespace
-
-/// The score test of one more joint in one rigid cluster, for every moving signal.
-class TreeFit::MissingJointTest {
+// The score test of one more joint in one rigid cluster, for every moving signal.
+class ClusterTest {
  public:
-  /// The same for all clusters.
+  // The same for all clusters.
   struct Context {
-    const Normal& normal;
+    const TreeFit::Normal& normal;
     const Eigen::MatrixXd& inverse;  // of H
     const Eigen::VectorXd newton;    // H⁻¹g
     const Eigen::MatrixXd q, q2;     // frames × moving signals
     const Matrix6d bias;             // covariance of a marker's own bias
   };
 
-  MissingJointTest(const TreeFit& tree, const Context& context, int top)
-      : tree_(tree), context_(context), top_(top), members_(tree.cluster_of(top)) {
+  ClusterTest(const TreeFit& tree, const Context& context, int top)
+      : tree_(tree), context_(context), top_(top), members_(cluster_of(tree.nodes(), top)) {
     find_items();
     find_related();
     stack_frames();
   }
 
-  /// The parting that explains most with the moving signal `s`; log_tail 0 if none does.
+  // The parting that explains most with the moving signal `s`; log_tail 0 if none does.
   MissingJoint best_joint(int s) {
     sum_over_frames(s);
     MissingJoint best;
@@ -51,7 +51,7 @@ class TreeFit::MissingJointTest {
       for (int i = 0; i < num_items(); ++i)
         if (moves[i])
           (items_[i].is_branch ? joint.branches : joint.members).push_back(items_[i].node);
-      joint.signal = tree_.actions_.moving()[s];
+      joint.signal = tree_.actions().moving()[s];
       joint.log_ways = num_items() * std::log(2.0);
       best = joint;
     }
@@ -59,7 +59,7 @@ class TreeFit::MissingJointTest {
   }
 
  private:
-  /// Anything that may move: a marker of the cluster, or a branch on it.
+  // Anything that may move: a marker of the cluster, or a branch on it.
   struct Item {
     int node;
     bool is_branch;
@@ -69,35 +69,34 @@ class TreeFit::MissingJointTest {
   int num_items() const { return static_cast<int>(items_.size()); }
   int num_frames() const { return tree_.num_frames(); }
   int at(int frame, int node) const { return tree_.at(frame, node); }
-  /// The root's poses are free and eliminated: items share them.
-  bool is_eliminated() const { return !tree_.root_rests_; }
+  // The root's poses are free and eliminated: items share them.
+  bool is_eliminated() const { return !tree_.root_rests(); }
 
   void add_item(int node, bool is_branch) {
     Pose at_item = Pose::Identity();
     for (int t = 0; t < num_frames(); ++t)
       at_item.translation() +=
-          (tree_.poses_[at(t, top_)].inverse() * tree_.poses_[at(t, node)]).translation() /
-          num_frames();
+          (tree_.pose(t, top_).inverse() * tree_.pose(t, node)).translation() / num_frames();
     const Matrix6d F = adjoint(at_item);
     items_.push_back({node, is_branch, F * context_.bias * F.transpose()});
   }
 
   void find_items() {
     for (const int k : members_)
-      if (tree_.data_[k].size() > 0) add_item(k, false);
-    for (int k = top_ + 1; k < static_cast<int>(tree_.nodes_.size()); ++k)
-      if (tree_.nodes_[k].model.num_joints > 0 &&
-          std::count(members_.begin(), members_.end(), tree_.nodes_[k].parent))
+      if (tree_.is_seen(k)) add_item(k, false);
+    for (int k = top_ + 1; k < static_cast<int>(tree_.nodes().size()); ++k)
+      if (tree_.nodes()[k].model.num_joints > 0 &&
+          std::count(members_.begin(), members_.end(), tree_.nodes()[k].parent))
         add_item(k, true);
   }
 
   // Parameters that share a marker with the cluster.
   void find_related() {
     std::vector<int> columns;
-    for (int k = is_eliminated() ? 1 : 0; k < static_cast<int>(tree_.nodes_.size()); ++k) {
+    for (int k = is_eliminated() ? 1 : 0; k < static_cast<int>(tree_.nodes().size()); ++k) {
       if (!is_eliminated() && !tree_.is_below(k, top_) && !tree_.is_below(top_, k)) continue;
       related_.push_back(k);
-      const int p = k == 0 ? 6 : tree_.nodes_[k].model.num_parameters();
+      const int p = k == 0 ? 6 : tree_.nodes()[k].model.num_parameters();
       for (int c = 0; c < p; ++c) columns.push_back(context_.normal.offset[k] + c);
     }
     inverse_ = context_.inverse(columns, columns);
@@ -128,9 +127,9 @@ class TreeFit::MissingJointTest {
 
   // FᵀI of the item in the frame.
   Matrix6d stack_item(int t, int i) {
-    const Normal& normal = context_.normal;
+    const TreeFit::Normal& normal = context_.normal;
     const auto& [k, is_branch, bias] = items_[i];
-    const Matrix6d F = adjoint(tree_.poses_[at(t, top_)]);
+    const Matrix6d F = adjoint(tree_.pose(t, top_));
     // A marker counts with its own share, a branch with all beyond it.
     const Matrix6d FI = F.transpose() * (is_branch ? normal.I : normal.own_I)[at(t, k)];
     Vector6d r = F.transpose() * (is_branch ? normal.gradient : normal.own_gradient)[at(t, k)];
@@ -262,26 +261,29 @@ class TreeFit::MissingJointTest {
   Eigen::MatrixXd C_, own_;
 };
 
-Eigen::MatrixXd TreeFit::moving_actions() const {
-  const auto& moving = actions_.moving();
-  Eigen::MatrixXd q(num_frames(), moving.size());
-  for (int t = 0; t < num_frames(); ++t)
+// Frames × moving signals.
+Eigen::MatrixXd moving_actions(const TreeFit& fit) {
+  const auto& moving = fit.actions().moving();
+  Eigen::MatrixXd q(fit.num_frames(), moving.size());
+  for (int t = 0; t < fit.num_frames(); ++t)
     for (std::size_t s = 0; s < moving.size(); ++s)
-      q(t, static_cast<Eigen::Index>(s)) = actions_(samples_[t], moving[s]);
+      q(t, static_cast<Eigen::Index>(s)) = fit.actions()(fit.sample(t), moving[s]);
   return q;
 }
 
-std::vector<MissingJoint> TreeFit::missing_joints(const Noise& bias) const {
-  const Normal normal = normal_equations();
+}  // namespace
+
+std::vector<MissingJoint> missing_joints(const TreeFit& fit, const Noise& bias) {
+  const TreeFit::Normal normal = fit.normal_equations();
   const std::optional<Eigen::MatrixXd> inverse = normal.inverse();
   if (!inverse) return {};
-  const Eigen::MatrixXd q = moving_actions();
-  const MissingJointTest::Context context{normal, *inverse,          *inverse * normal.g,
-                                          q,      q.cwiseProduct(q), isotropic(bias)};
+  const Eigen::MatrixXd q = moving_actions(fit);
+  const ClusterTest::Context context{normal, *inverse,          *inverse * normal.g,
+                                     q,      q.cwiseProduct(q), isotropic(bias)};
   std::vector<MissingJoint> result;
-  for (int top = 0; top < static_cast<int>(nodes_.size()); ++top) {
-    if (top > 0 && nodes_[top].model.num_joints == 0) continue;
-    MissingJointTest test(*this, context, top);
+  for (int top = 0; top < static_cast<int>(fit.nodes().size()); ++top) {
+    if (top > 0 && fit.nodes()[top].model.num_joints == 0) continue;
+    ClusterTest test(fit, context, top);
     for (int s = 0; s < static_cast<int>(q.cols()); ++s)
       if (MissingJoint joint = test.best_joint(s); joint.log_tail < 0)
         result.push_back(std::move(joint));
@@ -291,16 +293,38 @@ std::vector<MissingJoint> TreeFit::missing_joints(const Noise& bias) const {
   return result;
 }
 
-Eigen::MatrixXd TreeFit::joint_information() const {
-  const int n = static_cast<int>(nodes_.size());
-  const int T = num_frames();
-  const auto m = static_cast<Eigen::Index>(actions_.moving().size());
+std::optional<MissingJoint> most_significant(const std::vector<MissingJoint>& joints,
+                                             int num_frames, const std::set<int>& idle_signals) {
+  constexpr double kErrorRates[2] = {0.002, 0.003};  // of a signal in use, of an idle one
+  constexpr double kFewFrames = 20;
+  const double log_frames = std::log(std::max(num_frames / kFewFrames, 1.0));
+  double ways[2] = {0, 0};
+  for (const MissingJoint& j : joints) ways[idle_signals.count(j.signal)] += std::exp(j.log_ways);
+  const MissingJoint* best = nullptr;
+  double best_margin = 0;
+  for (const MissingJoint& j : joints) {
+    const std::size_t idle = idle_signals.count(j.signal);
+    const double margin = j.log_tail + std::log(2 * ways[idle] / kErrorRates[idle]) +
+                          0.5 * (j.slides ? 3 : 6) * log_frames;
+    if (margin < best_margin) {
+      best = &j;
+      best_margin = margin;
+    }
+  }
+  return best ? std::optional(*best) : std::nullopt;
+}
+
+Eigen::MatrixXd missing_joint_information(const TreeFit& fit) {
+  const int n = static_cast<int>(fit.nodes().size());
+  const int T = fit.num_frames();
+  const bool rests = fit.root_rests();
+  const auto m = static_cast<Eigen::Index>(fit.actions().moving().size());
   Eigen::MatrixXd result = Eigen::MatrixXd::Zero(n, m);
-  const Normal normal = normal_equations();
+  const TreeFit::Normal normal = fit.normal_equations();
   const auto size = normal.H.rows();
   const std::optional<Eigen::MatrixXd> inverse = normal.inverse();
   if (!inverse) return result;
-  const Eigen::MatrixXd q = moving_actions();
+  const Eigen::MatrixXd q = moving_actions(fit);
   const Eigen::MatrixXd q2 = q.cwiseProduct(q);
   for (int k = 1; k < n; ++k) {
     // Stacked over the frames, for q = 1: what the three axes share with each other and with the
@@ -308,20 +332,20 @@ Eigen::MatrixXd TreeFit::joint_information() const {
     Eigen::MatrixXd own(9, T);
     Eigen::MatrixXd shared = Eigen::MatrixXd::Zero(3 * size, T);
     for (int t = 0; t < T; ++t) {
-      const Eigen::Matrix<double, 6, 3> axes = adjoint(poses_[at(t, k)]).rightCols<3>();
-      const Eigen::Matrix<double, 3, 6> AI = axes.transpose() * normal.I[at(t, k)];
+      const Eigen::Matrix<double, 6, 3> axes = adjoint(fit.pose(t, k)).rightCols<3>();
+      const Eigen::Matrix<double, 3, 6> AI = axes.transpose() * normal.I[fit.at(t, k)];
       const Eigen::Matrix<double, 3, 6> AIT =
-          root_rests_ ? Eigen::Matrix<double, 3, 6>::Zero() : (AI * normal.inverse_total[t]).eval();
+          rests ? Eigen::Matrix<double, 3, 6>::Zero() : (AI * normal.inverse_total[t]).eval();
       Eigen::Map<Eigen::Matrix3d>(own.col(t).data()) = AI * axes - AIT * AI.transpose();
       Eigen::Map<Eigen::MatrixXd> row(shared.col(t).data(), 3, size);
-      for (int e = root_rests_ ? 0 : 1; e < n; ++e) {
-        const ParameterJacobian& S = normal.S[at(t, e)];
+      for (int e = rests ? 0 : 1; e < n; ++e) {
+        const ParameterJacobian& S = normal.S[fit.at(t, e)];
         auto block = row.middleCols(normal.offset[e], S.cols());
-        if (is_below(e, k))
-          block = (axes.transpose() * normal.I[at(t, e)]).lazyProduct(S);
-        else if (is_below(k, e))
+        if (fit.is_below(e, k))
+          block = (axes.transpose() * normal.I[fit.at(t, e)]).lazyProduct(S);
+        else if (fit.is_below(k, e))
           block = AI.lazyProduct(S);
-        if (!root_rests_) block -= (AIT * normal.I[at(t, e)]).lazyProduct(S);
+        if (!rests) block -= (AIT * normal.I[fit.at(t, e)]).lazyProduct(S);
       }
     }
     const Eigen::MatrixXd owns = own * q2, shares = shared * q;

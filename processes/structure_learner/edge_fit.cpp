@@ -1,0 +1,179 @@
+#include "processes/structure_learner/edge_fit.h"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+
+#include "processes/structure_learner/residual_fit.h"
+#include "processes/structure_learner/root_pose.h"
+#include "processes/structure_learner/tree_fit.h"
+
+namespace bodyschema {
+namespace {
+
+// The same model over command units: Exp(ŝ (q − centre)/half_range).
+Edge to_edge(const LocalModel& model, const NormalizedActions& actions) {
+  Edge edge;
+  edge.left = model.A[0];
+  for (int d = 0; d < model.num_joints; ++d) {
+    ScrewJoint joint;
+    joint.signal = model.signal[d];
+    joint.offset = -actions.centre(joint.signal);
+    joint.slide = model.slide[d] / actions.half_range(joint.signal);
+    joint.turn = model.turn[d] / actions.half_range(joint.signal);
+    joint.X_after = model.A[d + 1];
+    edge.joints.push_back(joint);
+  }
+  return edge;
+}
+
+// The covariance of a model's parameters, for to_edge().
+Eigen::MatrixXd in_command_units(const ParameterMatrix& covariance, const LocalModel& model,
+                                 const NormalizedActions& actions) {
+  Eigen::VectorXd units = Eigen::VectorXd::Ones(model.num_parameters());
+  for (int d = 0; d < model.num_joints; ++d)
+    units.segment<2>(ScrewChainLayout::slide(d))
+        .setConstant(1 / actions.half_range(model.signal[d]));
+  return units.asDiagonal() * covariance * units.asDiagonal();
+}
+
+// Sets an edge's outliers and mean residuals from the leave-one-out residuals of its frames.
+// Returns the number of inliers.
+int judge(const PairData& pair, const std::vector<double>& squared_distance,
+          const std::vector<Vector6d>& residual, FittedEdge* result) {
+  Edge& edge = result->edge;
+  edge.num_samples = pair.size();
+  double position = 0, rotation = 0;
+  for (int t = 0; t < pair.size(); ++t) {
+    const bool outlying = squared_distance[t] > kOutlierThreshold;
+    result->frames.push_back(pair.frames[t].sample);
+    result->outlying.push_back(outlying);
+    edge.num_outliers += outlying;
+    if (outlying) continue;
+    position += residual[t].head<3>().squaredNorm();
+    rotation += residual[t].tail<3>().squaredNorm();
+  }
+  const int inliers = pair.size() - edge.num_outliers;
+  if (inliers > 0) {
+    edge.position_rms_m = std::sqrt(position / inliers);
+    edge.rotation_rms_rad = std::sqrt(rotation / inliers);
+    edge.confidence = static_cast<double>(inliers) / pair.size();
+  }
+  return inliers;
+}
+
+// The screws of a soft edge stay as they are: the process says what they leave, and its variance is
+// that of the whole.
+void fit_soft_edge(const LocalModel& screws, const std::vector<int>& signals, const PairData& pair,
+                   const EdgeData& data, bool must_be_valid, FittedEdge* result) {
+  const LocalModel start = fit_local_model(screws, pair, data.actions, 30, 1e-3).model;
+  const auto fit = fit_soft_model(start, pair, data.actions, data.validity, signals);
+  result->edge = to_edge(start, data.actions);
+  result->is_valid = fit && (!must_be_valid || fit->verdict == Verdict::kValid);
+  if (fit) {
+    result->edge.residual_gp = fit->model.residual_gp;
+    judge(pair, fit->squared_distance, fit->residual, result);
+  } else {  // what the search's part of the data carried, all of them refuse
+    result->edge.num_samples = result->edge.num_outliers = pair.size();
+    result->edge.confidence = 0;
+  }
+}
+
+void fit_screw_edge(const LocalModel& start, const PairData& pair, const EdgeData& data,
+                    bool must_be_valid, FittedEdge* result) {
+  const Fit fit = fit_local_model(start, pair, data.actions, 60, 1e-6);
+  const LeaveOneOut loo = leave_one_out(fit, pair, data.actions);
+  result->is_valid =
+      !must_be_valid ||
+      check_validity(fit, loo, pair, data.actions, data.validity).verdict == Verdict::kValid;
+  if (!result->is_valid) return;
+  result->model = fit.model;
+  result->edge = to_edge(fit.model, data.actions);
+  const int inliers = judge(pair, loo.squared_distance, loo.residual, result);
+  double weight = 0;
+  for (int t = 0; t < pair.size(); ++t)
+    if (!result->outlying[t]) weight += robust_weight(fit.frames[t].squared_distance);
+  // The robust weights are relative: an inlier counts as one measurement, on the average.
+  if (inliers > 0)
+    result->edge.parameter_covariance =
+        weight / inliers * in_command_units(loo.parameter_covariance, fit.model, data.actions);
+}
+
+}  // namespace
+
+LocalModel rescaled(LocalModel model, const NormalizedActions& from, const NormalizedActions& to) {
+  for (int d = 0; d < model.num_joints; ++d) {
+    const int s = model.signal[d];
+    const double ratio = to.half_range(s) / from.half_range(s);
+    const double shift = (to.centre(s) - from.centre(s)) / from.half_range(s);
+    Vector6d screw = Vector6d::Zero();
+    screw(2) = model.slide[d] * shift;
+    screw(5) = model.turn[d] * shift;
+    model.A[d] = model.A[d] * exp(screw);
+    model.slide[d] *= ratio;
+    model.turn[d] *= ratio;
+  }
+  return model;
+}
+
+FittedEdge fit_edge(const AcceptedModel& accepted, int from, int to, const EdgeData& data,
+                    bool must_be_valid) {
+  const LocalModel start = accepted.part_i == from ? accepted.model : accepted.model.inverse();
+  const PairData pair =
+      make_pair_data(data.samples, from, to, data.measurement, std::numeric_limits<int>::max());
+  FittedEdge result;
+  if (accepted.soft_signals.empty())
+    fit_screw_edge(start, pair, data, must_be_valid, &result);
+  else
+    fit_soft_edge(start, accepted.soft_signals, pair, data, must_be_valid, &result);
+  result.edge.from = from;
+  result.edge.to = to;
+  return result;
+}
+
+void fit_jointly(const EdgeData& data, std::vector<FittedEdge>* fitted, BodySchema* schema) {
+  // More instants than this are thinned; so many more that thinning costs what the joint fit gains
+  // are left to the pairs.
+  constexpr int kMaxFrames = 2500;
+  constexpr std::size_t kTooMany = 6000;
+  if (data.samples.size() > kTooMany) return;
+  const auto seen = [&](int part) {
+    return make_part_data(data.samples, part, data.measurement, kMaxFrames);
+  };
+  std::vector<TreeNode> nodes{{schema->root, -1, {}}};
+  std::vector<PairData> poses{seen(schema->root)};
+  if (poses[0].size() < 2 || !is_at_rest(poses[0], data.actions, data.validity)) return;
+  for (const FittedEdge& f : *fitted) {
+    const auto parent = std::find_if(
+        nodes.begin(), nodes.end(), [&](const TreeNode& node) { return node.part == f.edge.from; });
+    if (parent == nodes.end()) continue;  // another component
+    if (f.edge.residual_gp) return;       // no chain of screws
+    nodes.push_back({f.edge.to, static_cast<int>(parent - nodes.begin()), f.model});
+    poses.push_back(seen(f.edge.to));
+  }
+  if (nodes.size() < 2) return;
+  TreeFit fit(std::move(nodes), std::move(poses), data.actions, true);
+  fit.fit(20, 1e-6);
+  const auto covariance =
+      fit.covariance(data.measurement.systematic_covariance(), view_share(data.measurement));
+  for (std::size_t k = 1; k < fit.nodes().size(); ++k) {
+    const TreeNode& node = fit.nodes()[k];
+    for (FittedEdge& f : *fitted) {
+      if (f.edge.to != node.part) continue;
+      const Edge moved = to_edge(node.model, data.actions);
+      f.edge.left = moved.left;
+      f.edge.joints = moved.joints;
+      if (covariance)
+        f.edge.parameter_covariance =
+            in_command_units(covariance->models[k], node.model, data.actions);
+    }
+  }
+  schema->X_CR = fit.root_pose();
+  if (!covariance) return;
+  schema->X_CR_covariance = covariance->root;
+  for (std::size_t k = 0; k < fit.nodes().size(); ++k)
+    if (!covariance->frames[k].isZero(0))
+      schema->frame_covariances[fit.nodes()[k].part] = covariance->frames[k];
+}
+
+}  // namespace bodyschema

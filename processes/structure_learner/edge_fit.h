@@ -1,0 +1,40 @@
+#pragma once
+
+#include <vector>
+
+#include "processes/structure_learner/search/model_forest.h"
+#include "processes/structure_learner/validity.h"
+
+namespace bodyschema {
+
+/// The data that edges are fitted to. Actions are displacements.
+struct EdgeData {
+  const std::vector<ActionPoseSample>& samples;
+  const NormalizedActions& actions;
+  const MeasurementModel& measurement;
+  const ValidityOptions& validity;
+};
+
+struct FittedEdge {
+  Edge edge;
+  std::vector<int> frames;  ///< samples at which it was judged
+  std::vector<bool> outlying;
+  bool is_valid = true;  ///< as far as that was asked
+  LocalModel model;      ///< what of the edge is screws
+};
+
+/// The same model over actions that are scaled otherwise.
+LocalModel rescaled(LocalModel model, const NormalizedActions& from, const NormalizedActions& to);
+
+/// The final fit of an edge in its direction, on all data, with everything the schema says about
+/// it. Without `must_be_valid` an edge of screws that is not valid stays.
+FittedEdge fit_edge(const AcceptedModel& accepted, int from, int to, const EdgeData& data,
+                    bool must_be_valid);
+
+/// The edges of the root's component fitted to all of its markers at once: a root that rests and
+/// everything on the way from it are witnesses too, beside the two markers that each edge was
+/// fitted to before. X_CR with them. Left alone where the root moves or an edge is no chain of
+/// screws.
+void fit_jointly(const EdgeData& data, std::vector<FittedEdge>* fitted, BodySchema* schema);
+
+}  // namespace bodyschema

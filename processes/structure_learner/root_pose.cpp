@@ -1,0 +1,82 @@
+#include "processes/structure_learner/root_pose.h"
+
+#include <Eigen/Cholesky>
+#include <algorithm>
+#include <cmath>
+#include <limits>
+
+#include "common/estimation/chi_square.h"
+#include "common/estimation/student_t.h"
+
+namespace bodyschema {
+
+double view_share(const MeasurementModel& measurement) {
+  // Over the ideal rigs d² of X_CR has the mean 5.3 (`./run experiment rig_table`): one draw a rig,
+  // for their roots rest.
+  constexpr double kOfTags = 0.1;
+  const Noise& systematic = measurement.systematic;
+  return systematic.position_m > 0 || systematic.rotation_rad > 0 ? kOfTags : 0;
+}
+
+void estimate_root_pose(const std::vector<ActionPoseSample>& samples,
+                        const MeasurementModel& measurement, BodySchema* schema) {
+  struct Reading {
+    Pose X;
+    Matrix6d information;
+  };
+  std::vector<Reading> readings;
+  for (const auto& sample : samples) {
+    const PartObservation* o = sample.find(schema->root);
+    if (!o) continue;
+    readings.push_back({o->X_CB, measurement.covariance(*o).inverse()});
+  }
+  if (readings.empty()) return;
+  const auto cost = [&](const Pose& X) {
+    double sum = 0;
+    for (const Reading& r : readings) {
+      const Vector6d e = log(X.inverse() * r.X);
+      sum += std::log1p(e.dot(r.information * e) / kStudentNu);
+    }
+    return sum;
+  };
+  Pose mean = readings.front().X;
+  double best = std::numeric_limits<double>::infinity();
+  const std::size_t candidates = std::min<std::size_t>(readings.size(), 16);
+  for (std::size_t n = 0; n < candidates; ++n) {
+    const Pose& X = readings[n * readings.size() / candidates].X;
+    const double c = cost(X);
+    if (c < best) {
+      best = c;
+      mean = X;
+    }
+  }
+  Matrix6d H;
+  double weight = 1;  // mean of the inliers'
+  for (int iteration = 0; iteration < 30; ++iteration) {
+    H.setZero();
+    Vector6d g = Vector6d::Zero();
+    double sum = 0;
+    int inliers = 0;
+    for (const Reading& r : readings) {
+      const Vector6d e = log(mean.inverse() * r.X);
+      const Vector6d Ie = r.information * e;
+      const double d2 = e.dot(Ie), w = robust_weight(d2);
+      if (d2 < kOutlierThreshold) {
+        sum += w;
+        ++inliers;
+      }
+      H += w * r.information;
+      g += w * Ie;
+    }
+    if (inliers > 0) weight = sum / inliers;
+    const Vector6d step = H.llt().solve(g);
+    if (!step.allFinite()) break;
+    mean = mean * exp(step);
+    if (step.norm() < 1e-13) break;
+  }
+  schema->X_CR = mean;
+  const double views = 1 + view_share(measurement) * static_cast<double>(readings.size());
+  schema->X_CR_covariance = views * weight * H.inverse() + measurement.systematic_covariance();
+}
+
+}  // namespace bodyschema

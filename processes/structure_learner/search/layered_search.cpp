@@ -1,0 +1,214 @@
+#include "processes/structure_learner/search/layered_search.h"
+
+#include <algorithm>
+#include <cmath>
+#include <map>
+#include <tuple>
+
+namespace bodyschema {
+namespace {
+
+// Starts whose mean robust cost a frame is above these are beyond repair by a local fit. (A frame
+// at the squared distance d² costs 5 log(1 + d²/4).)
+constexpr double kMaxScrewStartCost = 26;
+// Starts that cost more than this are taken only if the bulk of the frames is near them: by their
+// median squared distance (χ²₆ has 5.35), from kSomeFrames on. A start's error is that of the
+// typical frame: where a few frames are known much better, a right one has a median of 100.
+constexpr double kGoodStartCost = 20;
+constexpr double kMaxStartMedian = 30;
+constexpr double kMaxFewFramesMedian = 100;
+constexpr int kSomeFrames = 10;
+constexpr int kManyFrames = 20;
+
+// Beyond what a local fit mends, by the bulk of the frames.
+bool is_hopeless(const Start& start, int num_frames) {
+  return start.score > kMaxScrewStartCost ||
+         (num_frames >= kSomeFrames && start.score > kGoodStartCost &&
+          start.median > (num_frames >= kManyFrames ? kMaxStartMedian : kMaxFewFramesMedian));
+}
+
+void sort_by_quality(std::vector<Candidate>* candidates) {
+  std::stable_sort(candidates->begin(), candidates->end(), [](const auto& x, const auto& y) {
+    return std::tie(x.model.num_joints, y.score, x.part_i, x.part_j) <
+           std::tie(y.model.num_joints, x.score, y.part_i, y.part_j);
+  });
+}
+
+}  // namespace
+
+void LayeredSearch::run(int first_layer) {
+  doubtful_.clear();
+  for (int k = first_layer; k <= pairs_.options().max_signals && !forest_.spans(); ++k) {
+    if (k == 0) layer_rigid();
+    if (k == 1) layer_one_joint();
+    if (k == 2) layer_two_joints();
+  }
+  sort_by_quality(&doubtful_);
+  for (Candidate& c : doubtful_)
+    if (!forest_.connected(c.part_i, c.part_j) && !is_smaller_undecided(c) &&
+        pairs_.confirm_on_all_data(&c))
+      forest_.add(c);
+}
+
+void LayeredSearch::decide(std::vector<Candidate> valid, std::vector<Candidate>* candidates) {
+  if (valid.empty()) return;
+  std::stable_sort(valid.begin(), valid.end(),
+                   [](const auto& x, const auto& y) { return x.score > y.score; });
+  const Candidate& best = valid.front();
+  for (const Candidate& other : valid) {
+    if (signal_set(other.model) == signal_set(best.model)) continue;
+    if ((best.score - other.score) * best.num_frames < kAmbiguityMargin) {
+      pairs_.record(best.part_i, best.part_j)
+          .note_undecided(other.model.num_joints, other.mean_capped);
+      return;
+    }
+  }
+  candidates->push_back(best);
+}
+
+void LayeredSearch::connect(std::vector<Candidate> candidates) {
+  sort_by_quality(&candidates);
+  for (const Candidate& c : candidates) {
+    num_judged_ += c.num_frames;
+    num_outliers_ += c.num_outliers;
+  }
+  // Fewer outliers in all than the assumed rate would bring: then many on one model speak against
+  // it.
+  is_clean_ = num_outliers_ <
+              binomial_quantile(num_judged_, pair_outlier_rate(pairs_.options().validity), 0.02);
+  for (Candidate& c : candidates) {
+    if (forest_.connected(c.part_i, c.part_j)) {
+      spare_.push_back(c);
+    } else if ((is_clean_ && c.doubtful) || is_smaller_undecided(c)) {
+      pairs_.record(c.part_i, c.part_j).note_undecided(c.model.num_joints, c.mean_capped);
+      doubtful_.push_back(c);
+    } else if (pairs_.confirm_on_all_data(&c)) {
+      forest_.add(c);
+    }
+  }
+}
+
+// Is a smaller model between the same components undecided, and not clearly worse than this one?
+bool LayeredSearch::is_smaller_undecided(const Candidate& c) {
+  const int k = c.model.num_joints;
+  for (const int x : forest_.members(c.part_i))
+    for (const int y : forest_.members(c.part_j))
+      for (const auto& [smaller, mean_capped] : pairs_.record(x, y).undecided)
+        if (smaller < k && (!is_clean_ || c.num_frames * (mean_capped - c.mean_capped) <
+                                              6 * (k - smaller) * std::log(6.0 * c.num_frames)))
+          return true;
+  return false;
+}
+
+template <typename Visitor>
+void LayeredSearch::for_each_open_pair(Visitor&& visit) {
+  for (const auto& [ij, record] : pairs_.records())
+    if (!forest_.connected(ij.first, ij.second) && record.num_common >= 2)
+      visit(ij.first, ij.second);
+}
+
+void LayeredSearch::layer_rigid() {
+  std::vector<Candidate> candidates;
+  for_each_open_pair([&](int i, int j) {
+    ++pairs_.num_screens;
+    const Start start = screen_rigid(pairs_.pair(i, j), pairs_.actions());
+    if (start.score > kMaxRigidStartCost) return;
+    if (const auto c = pairs_.try_start(i, j, start.model)) candidates.push_back(*c);
+  });
+  connect(std::move(candidates));
+}
+
+void LayeredSearch::layer_one_joint() {
+  constexpr std::size_t kMaxFits = 3;
+  std::vector<Candidate> candidates;
+  for_each_open_pair([&](int i, int j) {
+    const PairData& pair = pairs_.pair(i, j);
+    const RelativeMotions& motions = pairs_.motions(i, j);
+    const auto regressions = screen_one_joint(motions, pairs_.actions());
+    pairs_.num_screens += static_cast<int>(regressions.size());
+    std::vector<Candidate> valid;
+    for (std::size_t n = 0; n < std::min(kMaxFits, regressions.size()); ++n) {
+      if (n >= 1 && regressions[n].score > 1.5 * regressions[0].score) break;
+      const Start start =
+          one_joint_start(regressions[n], pair, pairs_.actions(), motions.sigma_rad);
+      if (is_hopeless(start, pair.size())) continue;
+      if (const auto c = pairs_.try_start(i, j, start.model)) valid.push_back(*c);
+    }
+    decide(std::move(valid), &candidates);
+  });
+  connect(std::move(candidates));
+}
+
+// Joint ranges of the signals where the forest already knows them, else a grid.
+LayeredSearch::Turns LayeredSearch::assumed_turns(bool known_only) const {
+  Turns turns(pairs_.actions().num_signals());
+  if (known_only)
+    for (const AcceptedModel& m : forest_.models())
+      for (int d = 0; d < m.model.num_joints; ++d)
+        if (std::abs(m.model.turn[d]) > 0.1)
+          turns[m.model.signal[d]].push_back(std::abs(m.model.turn[d]));
+  bool any_known = false;
+  for (auto& t : turns) {
+    any_known |= !t.empty();
+    if (t.empty()) t = default_turns();
+  }
+  if (known_only && !any_known) turns.clear();
+  return turns;
+}
+
+void LayeredSearch::layer_two_joints() {
+  // A signal's range in the forest may not hold for its other joints: so a second pass without it
+  // if the first leaves gaps.
+  for (const bool known_only : {true, false}) {
+    const Turns turns = assumed_turns(known_only);
+    if (turns.empty() || forest_.spans()) continue;
+    two_joints_pass(turns);
+  }
+  // So few frames leave the fits narrow valleys: a finer grid of ranges, where parts are few.
+  constexpr std::size_t kMaxParts = 14;
+  if (pairs_.actions().num_samples() < 12 && !forest_.spans() &&
+      forest_.parts().size() <= kMaxParts) {
+    std::vector<double> fine;
+    for (double turn = 0.25; turn < 3.1; turn *= 1.15) fine.push_back(turn);
+    two_joints_pass(Turns(pairs_.actions().num_signals(), fine));
+  }
+}
+
+void LayeredSearch::two_joints_pass(const Turns& turns) {
+  // Fits of two components that stay above this cost a frame, in a row, before the rest is given
+  // up.
+  constexpr double kHopelessCost = 16;
+  constexpr int kMaxHopeless = 12;
+  struct Screened {
+    int i, j;
+    Start start;
+  };
+  std::map<std::pair<int, int>, std::vector<Screened>> by_components;
+  for_each_open_pair([&](int i, int j) {
+    auto& list = by_components[std::minmax({forest_.component(i), forest_.component(j)})];
+    for (const auto& t : turns) pairs_.num_screens += static_cast<int>(2 * t.size());
+    for (Start& start :
+         screen_two_joints(pairs_.pair(i, j), pairs_.actions(), pairs_.motions(i, j), turns, 10))
+      list.push_back({i, j, std::move(start)});
+  });
+  std::vector<Candidate> candidates;
+  for (auto& [components, list] : by_components) {
+    std::stable_sort(list.begin(), list.end(),
+                     [](const auto& x, const auto& y) { return x.start.score < y.start.score; });
+    std::map<std::pair<int, int>, std::vector<Candidate>> valid;
+    int num_tried = 0;
+    int num_hopeless = 0;  // in a row
+    for (const Screened& s : list) {
+      const int num_frames = pairs_.pair(s.i, s.j).size();
+      const int max_fits = std::clamp(1200 / std::max(num_frames, 1), 8, 40);
+      if (num_tried++ >= max_fits || num_hopeless >= kMaxHopeless) break;
+      if (const auto c = pairs_.try_start(s.i, s.j, s.start.model)) valid[{s.i, s.j}].push_back(*c);
+      const bool is_far = pairs_.last_cost() > kHopelessCost && num_frames >= kManyFrames;
+      num_hopeless = is_far ? num_hopeless + 1 : 0;
+    }
+    for (auto& [ij, of_pair] : valid) decide(std::move(of_pair), &candidates);
+  }
+  connect(std::move(candidates));
+}
+
+}  // namespace bodyschema

@@ -1,0 +1,84 @@
+#include "processes/structure_learner/search/settling.h"
+
+#include <algorithm>
+#include <optional>
+
+#include "common/kinematics/kinematic_tree.h"
+#include "processes/structure_learner/search/component_tree.h"
+
+namespace bodyschema {
+namespace {
+
+// Pairs do not tell two models of one size apart that their markers together do. Of the spare
+// models with the signal of which a joint is missing, the one with which all poses cost least, and
+// less than `cost`. False if there is none.
+bool exchange(const ComponentTree& tree, int signal, double cost, std::vector<Candidate>* spare,
+              PairModels* pairs, ModelForest* forest) {
+  const int root = tree.nodes().front().part;
+  std::vector<AcceptedModel> best;
+  for (Candidate& c : *spare) {
+    // The models that joined its ends may have been refuted since.
+    if (!forest->connected(root, c.part_i) || !forest->connected(root, c.part_j) ||
+        !c.model.uses(signal) || pairs->is_refuted(c.part_i, c.part_j, c.model))
+      continue;
+    const KinematicTree from_i(ends_of(forest->models()), c.part_i);
+    for (const int node : from_i.path_to(from_i.node_of(c.part_j))) {
+      std::vector<AcceptedModel> models = forest->models();
+      AcceptedModel& present = models[from_i.nodes()[node].edge];
+      if (present.model.num_joints < c.model.num_joints || present.joins(c.part_i, c.part_j) ||
+          !pairs->confirm_on_all_data(&c))
+        continue;
+      present = c;
+      ModelForest other = *forest;
+      other.set_models(models);
+      const double other_cost = ComponentTree(other, root, pairs).fit().cost();
+      if (other_cost >= cost) continue;
+      cost = other_cost;
+      best = std::move(models);
+    }
+  }
+  if (best.empty()) return false;
+  forest->set_models(std::move(best));
+  return true;
+}
+
+// Log likelihood of a part's component, settled.
+double settle_tree(int part, std::vector<Candidate>* spare, PairModels* pairs, ModelForest* forest,
+                   std::vector<AcceptedModel>* refuted) {
+  constexpr int kMaxSplits = 12;
+  for (int round = 1;; ++round) {
+    const ComponentTree tree(*forest, part, pairs);
+    TreeFit fit = tree.fit();
+    const auto worst =
+        tree.nodes().size() < 2 ? std::nullopt : missing_joint(*forest, *pairs, &fit);
+    if (!worst || round == kMaxSplits) return fit.log_likelihood();
+    if (exchange(tree, worst->signal, fit.cost(), spare, pairs, forest)) continue;
+    if (const auto edges = insert_joint(fit.nodes(), *worst)) {
+      tree.replace_edges(*edges, forest);
+      continue;
+    }
+    for (const int node : full_edges(fit.nodes(), *worst))
+      refuted->push_back(forest->models()[tree.model_of(node)]);
+    return fit.log_likelihood();
+  }
+}
+
+}  // namespace
+
+Settled settle_trees(std::vector<Candidate>* spare, PairModels* pairs, ModelForest* forest) {
+  Settled result;
+  std::vector<AcceptedModel> refuted;
+  for (const int part : forest->parts())
+    if (forest->component(part) == part)
+      result.log_likelihood += settle_tree(part, spare, pairs, forest, &refuted);
+  result.any_refuted = !refuted.empty();
+  std::vector<AcceptedModel> models = forest->models();
+  for (const AcceptedModel& m : refuted) {
+    pairs->refute(m);
+    std::erase_if(models, [&](const AcceptedModel& o) { return o.joins(m.part_i, m.part_j); });
+  }
+  forest->set_models(std::move(models));
+  return result;
+}
+
+}  // namespace bodyschema

@@ -1,0 +1,18 @@
+#pragma once
+
+#include <map>
+
+#include "processes/structure_learner/search/pair_models.h"
+
+namespace bodyschema {
+
+/// χ² that a joint must put into the residuals to be noticed: against χ²₆ beyond 25, the threshold
+/// of V2 (check_validity()), a noncentrality of 48 has a power of 97.7 %.
+inline constexpr double kNoticed = 48;
+
+/// Takes back the edges whose data could not have refuted them: few poses, or poses at which a
+/// signal hardly moved, agree with a smaller model by chance. Returns what SearchResult calls
+/// joint_information, of the edges that stand.
+std::map<int, double> withdraw_untold_edges(PairModels* pairs, ModelForest* forest);
+
+}  // namespace bodyschema

@@ -1,0 +1,318 @@
+#include <gtest/gtest.h>
+
+#include <cmath>
+#include <utility>
+
+#include "common/geometry/angle.h"
+#include "processes/structure_learner/learn.h"
+#include "processes/structure_learner/search/bridging.h"
+#include "processes/structure_learner/search/component_tree.h"
+#include "processes/structure_learner/search/layered_search.h"
+#include "processes/structure_learner/search/settling.h"
+#include "processes/structure_learner/search/withdrawal.h"
+#include "tests/support/synthetic_robot.h"
+
+namespace bodyschema {
+namespace {
+
+using test::Regime;
+using test::Rng;
+
+// Parts 1 to 3 in a chain: q1 turns part 2 by ± turn_rad, part 3 is fixed on it, q2 moves nothing.
+test::SyntheticRobot hinge(double turn_rad, Rng& rng) {
+  test::SyntheticRobot robot;
+  robot.signals = {{"q1", -1, 1}, {"q2", -1, 1}};
+  robot.X_CR.translation().z() = 2;
+  robot.links.push_back({.part = 1});
+  for (const int part : {2, 3}) {
+    test::TrueLink link{.part = part, .parent = part - 1};
+    link.X_before = test::random_pose(rng, 0.06, 0.16);
+    link.X_after = test::random_pose(rng, 0.06, 0.16);
+    if (part == 2) link.signal = 0;
+    if (part == 2) link.turn = turn_rad;
+    robot.links.push_back(link);
+  }
+  return robot;
+}
+
+// A search before its first layer.
+struct Case {
+  Case(double turn_rad, int num_samples, Regime regime = Regime::kTagIso)
+      : samples(test::babble(hinge(turn_rad, rng), num_samples,
+                             {.regime = regime, .with_covariances = true}, rng)) {}
+  // Exact samples.
+  explicit Case(std::vector<ActionPoseSample> seen) : samples(std::move(seen)) {
+    options.measurement.noise = Noise{0.002, 0.02};
+  }
+
+  Candidate fitted(int i, int j, int num_joints, int signal = 0) {
+    LocalModel start = screen_rigid(pairs.pair(i, j), actions).model;
+    if (num_joints > 0)
+      for (const ScrewRegression& r : screen_one_joint(pairs.motions(i, j), actions))
+        if (r.signal == signal) start = one_joint_start(r, pairs.pair(i, j), actions, 1e-9).model;
+    return {{i, j, fit_local_model(start, pairs.pair(i, j), actions, 40).model}, 30};
+  }
+
+  Rng rng{7};
+  std::vector<ActionPoseSample> samples;
+  NormalizedActions actions{samples, 2};
+  SearchOptions options;
+  PairModels pairs{samples, actions, {1, 2, 3}, options};
+  ModelForest forest{{1, 2, 3}};
+  LayeredSearch layers{&pairs, &forest};
+};
+
+TEST(Components, AreNamedAfterTheirLowestPart) {
+  Components components({1, 3, 5});
+  EXPECT_TRUE(components.join(5, 3));
+  EXPECT_EQ(components.of(5), 3);
+  EXPECT_FALSE(components.is_one());
+  EXPECT_FALSE(components.join(3, 5));
+  EXPECT_TRUE(components.join(5, 1));
+  EXPECT_EQ(components.of(3), 1);
+  EXPECT_TRUE(components.is_one());
+}
+
+TEST(ModelForest, SignalsAreIdleOnlyWhereTheForestSpans) {
+  Case c(1, 10);
+  c.forest.add(c.fitted(1, 2, 1));
+  EXPECT_EQ(c.forest.members(2), (std::vector<int>{1, 2}));
+  EXPECT_TRUE(c.forest.idle_signals({0, 1}).empty());
+  c.forest.add(c.fitted(2, 3, 0));
+  EXPECT_EQ(c.forest.num_joints(), 1);
+  EXPECT_EQ(c.forest.idle_signals({0, 1}), std::set<int>{1});
+  c.forest.set_models({});
+  EXPECT_FALSE(c.forest.connected(1, 2));
+}
+
+TEST(PairModels, AModelThatAllMarkersRefutedIsNotTriedAgain) {
+  Case c(1, 20);
+  const Candidate model = c.fitted(2, 3, 0);
+  EXPECT_TRUE(c.pairs.try_start(2, 3, model.model));
+  c.pairs.refute(model);
+  EXPECT_FALSE(c.pairs.try_start(2, 3, model.model));
+}
+
+TEST(PairModels, ANarrowlyRefutedModelIsKeptOnce) {
+  Case c(8 * kDegree, 40);
+  for (int n = 0; n < 2; ++n) EXPECT_FALSE(c.pairs.try_start(1, 2, c.fitted(1, 2, 0).model));
+  EXPECT_EQ(c.pairs.near_misses().size(), 1u);
+  Case far(2, 40);
+  EXPECT_FALSE(far.pairs.try_start(1, 2, far.fitted(1, 2, 0).model));
+  EXPECT_TRUE(far.pairs.near_misses().empty());
+}
+
+TEST(LayeredSearch, FindsTheSimplestSpanningForest) {
+  Case c(1, 20);
+  c.layers.run(0);
+  ASSERT_TRUE(c.forest.spans());
+  EXPECT_EQ(c.forest.num_joints(), 1);
+  EXPECT_EQ(c.forest.models().front().model.num_joints, 0);  // parts 2 and 3
+  EXPECT_TRUE(c.forest.models().back().model.uses(0));
+}
+
+TEST(LayeredSearch, ALargerModelWaitsWhileASmallerOneIsUndecided) {
+  for (const bool is_undecided : {false, true}) {
+    Case c(1, 20);
+    if (is_undecided) c.pairs.record(1, 3).note_undecided(0, 6);
+    c.forest.add(c.fitted(2, 3, 0));
+    c.layers.connect({c.fitted(1, 2, 1)});
+    EXPECT_EQ(c.forest.spans(), !is_undecided);
+  }
+}
+
+TEST(LayeredSearch, TwoSignalSetsThatExplainAPairAlikeLeaveItUndecided) {
+  Case c(1, 20);
+  std::vector<Candidate> candidates, valid{c.fitted(1, 2, 1, 0), c.fitted(1, 2, 1, 1)};
+  valid[0].score = 1 + 1.01 * kAmbiguityMargin / valid[0].num_frames;
+  valid[1].score = 1;
+  c.layers.decide(valid, &candidates);
+  ASSERT_EQ(candidates.size(), 1u);
+  EXPECT_TRUE(candidates[0].model.uses(0));
+  valid[1].score += 0.02 * kAmbiguityMargin / valid[0].num_frames;
+  c.layers.decide(valid, &candidates);
+  EXPECT_EQ(candidates.size(), 1u);
+  EXPECT_EQ(c.pairs.record(1, 2).undecided.count(1), 1u);
+}
+
+TEST(ComponentTree, GrowsFromAPartThatRestsAndTakesNewEdges) {
+  auto samples = Case(1, 20, Regime::kFree).samples;
+  for (ActionPoseSample& sample : samples)  // parts 2 and 3 rest, and the base moves
+    for (int n = 0; n < 3; ++n)
+      sample.parts[n].X_CB = sample.parts[2].X_CB.inverse() * sample.parts[n].X_CB;
+  Case c(samples);
+  c.forest.add(c.fitted(1, 2, 1));
+  c.forest.add(c.fitted(2, 3, 0));
+  const ComponentTree tree(c.forest, 1, &c.pairs);
+  EXPECT_TRUE(tree.root_rests());
+  ASSERT_EQ(tree.nodes().size(), 3u);
+  EXPECT_EQ(tree.nodes()[0].part, 2);
+  EXPECT_EQ(tree.model_of(2), 1);
+  tree.replace_edges({{1, 2, c.fitted(1, 3, 1).model}}, &c.forest);
+  ASSERT_EQ(c.forest.models().size(), 1u);
+  EXPECT_TRUE(c.forest.models()[0].joins(1, 3));
+  tree.replace_edges({{0, 1, c.fitted(1, 2, 1).model}}, &c.forest);  // part 1 seen from part 2
+  const Pose X = c.forest.models()[0].model.predict(c.actions, 0);
+  EXPECT_TRUE(X.isApprox(c.fitted(1, 2, 1).model.inverse().predict(c.actions, 0), 1e-9));
+}
+
+TEST(SettleTrees, PutsInTheJointThatIsMissing) {
+  Case c(8 * kDegree, 40);
+  c.forest.add(c.fitted(1, 2, 0));
+  c.forest.add(c.fitted(2, 3, 0));
+  std::vector<Candidate> spare;
+  EXPECT_FALSE(settle_trees(&spare, &c.pairs, &c.forest).any_refuted);
+  EXPECT_EQ(c.forest.num_joints(), 1);
+  EXPECT_TRUE(c.forest.spans());
+  for (const AcceptedModel& m : c.forest.models()) EXPECT_FALSE(m.model.uses(1));
+}
+
+TEST(SettleTrees, ExchangesAModelForASpareOneWithWhichAllPosesCostLess) {
+  Case c(1, 40);
+  c.forest.add(c.fitted(1, 2, 1, 1));  // the wrong signal
+  c.forest.add(c.fitted(2, 3, 0));
+  std::vector<Candidate> spare{c.fitted(1, 3, 1, 1), c.fitted(1, 3, 1, 0)};
+  settle_trees(&spare, &c.pairs, &c.forest);
+  EXPECT_FALSE(spare[0].on_all_data);  // not asked: it lacks the signal too
+  ASSERT_EQ(c.forest.models().size(), 2u);
+  EXPECT_TRUE(c.forest.models()[0].joins(1, 3));
+  EXPECT_EQ(c.forest.num_joints(), 1);
+}
+
+TEST(SettleTrees, RemovesAModelThatHasNoRoomForTheMissingJoint) {
+  Case c(1, 40);
+  Candidate full = c.fitted(1, 2, 1, 1);
+  full.model.num_joints = 2;  // the wrong signal twice
+  full.model.signal[1] = 1;
+  full.model.A[2] = Pose::Identity();
+  c.forest.add(full);
+  std::vector<Candidate> spare;
+  EXPECT_TRUE(settle_trees(&spare, &c.pairs, &c.forest).any_refuted);
+  EXPECT_TRUE(c.forest.models().empty());
+  EXPECT_TRUE(c.pairs.is_refuted(1, 2, full.model));
+}
+
+TEST(Bridge, JoinsByANarrowlyRefutedModelThatGrowsByItsJoint) {
+  Case c(Case(8 * kDegree, 40, Regime::kFree).samples);
+  EXPECT_FALSE(bridge(&c.pairs, &c.forest));
+  EXPECT_FALSE(c.pairs.try_start(1, 2, c.fitted(1, 2, 0).model));
+  EXPECT_TRUE(bridge(&c.pairs, &c.forest));
+  ASSERT_EQ(c.forest.models().size(), 1u);
+  EXPECT_EQ(signal_set(c.forest.models()[0].model), std::set<int>{0});
+}
+
+TEST(Bridge, TwoSignalSetsThatDoAsWellLeaveItOpen) {
+  for (const bool are_alike : {false, true}) {
+    auto samples = Case(8 * kDegree, 4, Regime::kFree).samples;
+    if (are_alike)
+      for (ActionPoseSample& sample : samples) sample.action(1) = sample.action(0);
+    Case c(samples);
+    for (const int signal : {0, 1}) c.pairs.try_start(1, 2, c.fitted(1, 2, 1, signal).model);
+    EXPECT_EQ(bridge(&c.pairs, &c.forest), !are_alike);
+  }
+}
+
+TEST(Bridge, TwoPartsThatRestTellNothingOfEachOther) {
+  auto samples = Case(0, 40, Regime::kFree).samples;
+  for (int t = 0; t < 40; ++t)
+    if (t < 19 || t > 20)
+      std::erase_if(samples[t].parts, [t](const auto& o) { return o.part == (t < 19 ? 1 : 2); });
+  Case c(samples);
+  EXPECT_FALSE(c.pairs.try_start(1, 2, c.fitted(1, 2, 0).model));
+  EXPECT_EQ(c.pairs.near_misses().size(), 1u);
+  EXPECT_FALSE(bridge(&c.pairs, &c.forest));
+}
+
+// A part that swings freely, seen at a tenth of the instants: what all the others say of themselves
+// is no evidence that it is fixed to one of them.
+TEST(Bridge, InstantsAtWhichOnlyOneOfTwoComponentsIsSeenDoNotSpeakForJoiningThem) {
+  int num_joined = 0;
+  for (int seed = 1; seed <= 10; ++seed) {
+    Rng rng(seed);
+    std::vector<ActionPoseSample> samples;
+    for (int t = 0; t < 80; ++t) {
+      ActionPoseSample& sample = samples.emplace_back();
+      sample.sample_index = t;
+      sample.action = Eigen::VectorXd::Constant(1, test::uniform(rng, -1, 1));
+      const auto see = [&](int part, const Pose& X, double scale) {
+        Vector6d e = scale * test::gaussian6(rng);
+        e.head<3>() *= 0.003;
+        e.tail<3>() *= 0.02;
+        PartObservation& seen = sample.parts.emplace_back();
+        seen.part = part;
+        seen.X_CB = X * exp(e);
+      };
+      Pose X = Pose::Identity();
+      X.translation().z() = 1;
+      see(1, X, 1);
+      if (t % 10 == 0) see(2, X, 4);
+    }
+    LearnOptions options;
+    options.noise = Noise{0.003, 0.02};
+    num_joined += learn({{"q", -1, 1, {}}}, samples, options).schema.complete;
+  }
+  EXPECT_EQ(num_joined, 0);
+}
+
+// A part on a joint, seen together with the base a few times while its signal hardly moved.
+TEST(WithdrawUntoldEdges, AnEdgeIsNotRigidBecauseItsSignalHardlyMovedWhileItWasSeen) {
+  Rng rng(81);
+  for (const double spread : {0.02, 1.0}) {
+    int num_rigid = 0, num_right = 0;
+    for (int seed = 0; seed < 20; ++seed) {
+      test::SyntheticRobot robot = test::chapter_robot("a", rng);
+      std::vector<ActionPoseSample> samples;
+      for (int t = 0; t < 16; ++t) {
+        Eigen::VectorXd q = robot.random_action(rng);
+        const bool is_seen = t >= 10;  // the hand, parts 4 and 5, on signal 1
+        if (is_seen) q(1) *= spread;
+        samples.push_back(
+            test::observe(robot, q, {.regime = Regime::kTagIso, .with_covariances = true}, t, rng));
+        if (!is_seen)
+          std::erase_if(samples.back().parts, [](const auto& o) { return o.part >= 4; });
+      }
+      const BodySchema schema = learn(robot.signals, samples).schema;
+      for (const Edge& edge : schema.edges)
+        num_rigid += edge.from < 4 && edge.to >= 4 && edge.joints.empty();
+      num_right += test::is_right(schema, robot);
+      if (schema.complete) continue;
+      // What is missing is told, and the signal is not called one without effect.
+      EXPECT_EQ(schema.unused_signals(), std::vector<int>{});
+      EXPECT_FALSE(schema.unconnected.empty());
+    }
+    EXPECT_EQ(num_rigid, 0);
+    if (spread == 1.0) {
+      EXPECT_GE(num_right, 17);
+    }
+  }
+}
+
+TEST(WithdrawUntoldEdges, AnEdgeThatTooFewPosesTellOfIsTakenBack) {
+  for (const int num_samples : {3, 40}) {
+    Case c(1, num_samples, Regime::kChapter);
+    c.forest.add(c.fitted(2, 3, 0));
+    const auto information = withdraw_untold_edges(&c.pairs, &c.forest);
+    EXPECT_EQ(c.forest.models().size(), num_samples == 3 ? 0u : 1u);
+    EXPECT_EQ(c.pairs.record(2, 3).untold_signals.empty(), num_samples == 40);
+    EXPECT_EQ(std::isfinite(information.at(0)), num_samples == 40);
+  }
+}
+
+// Samples that repeat are surer than they are right: models are refuted that had joined the ends of
+// others. (Of 19 seeds the first that comes there.)
+TEST(SettleTrees, ASpareModelWhosePartsWerePartedSinceIsPassedOver) {
+  Rng rng(19);
+  const auto robot = test::chapter_robot("c", rng);
+  const auto some =
+      test::babble(robot, 60, {.regime = Regime::kTagIso, .with_covariances = true}, rng);
+  std::vector<ActionPoseSample> samples;
+  for (int n = 0; n < 480; ++n) {
+    samples.push_back(some[static_cast<std::size_t>(n) % some.size()]);
+    samples.back().sample_index = n;
+    samples.back().utime = 1'000'000 * (n + 1);
+  }
+  EXPECT_LE(learn(robot.signals, samples).schema.edges.size(), 4U);
+}
+
+}  // namespace
+}  // namespace bodyschema
