@@ -74,7 +74,8 @@ class Soak {
   Soak(const fs::path& folder, const std::string& robot) : folder_(folder), rng_(41) {
     robot_ = test::chapter_robot(robot, rng_);
     fs::create_directories(folder_ / "config");
-    for (const auto& file : fs::directory_iterator(BODYSCHEMA_CONFIG "/arm2"))
+    const std::string rig = robot == "a" ? "/arm2" : "/arm7";
+    for (const auto& file : fs::directory_iterator(BODYSCHEMA_CONFIG + rig))
       fs::copy(file, folder_ / "config", fs::copy_options::overwrite_existing);
     std::ofstream signals(folder_ / "config" / "signals.yaml");
     signals.precision(17);
