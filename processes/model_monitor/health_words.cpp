@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdio>
+#include <string_view>
 
 #include "common/geometry/angle.h"
 
@@ -24,7 +25,8 @@ std::string measured(double value, double sd, const std::string& unit) {
   return number(value, decimals) + (sd > 0 ? " ± " + number(sd, decimals) : "") + unit;
 }
 
-std::string distance_and_angle(const ChangeSize& size) {
+std::string text_of(const ChangeSize& size) {
+  if (size.amounts.size() == 1) return measured(size.amounts[0], size.sds[0], "");
   return measured(size.amounts[0] * 1e3, size.sds[0] < 0 ? -1 : size.sds[0] * 1e3, " mm") + ", " +
          measured(size.amounts[1] / kDegree, size.sds[1] < 0 ? -1 : size.sds[1] / kDegree, "°");
 }
@@ -33,46 +35,59 @@ std::string counted(int count, const char* noun) {
   return std::to_string(count) + " " + noun + (count == 1 ? "" : "s");
 }
 
-/// Of an event or a finding: what is wrong, and how much.
+/// A cause in words; `sized` where the size is of that kind. Parts and signals stand in braces.
+struct Words {
+  std::string_view cause;
+  bool is_of_edge;
+  ChangeSize::Kind kind;
+  std::string_view text, sized;
+};
+using enum ChangeSize::Kind;
+constexpr Words kWords[] = {
+    {"marker_missing", false, kUnknown, "marker{part} not seen", ""},
+    {"marker_moved", false, kPose, "marker{part} moved", "marker{part} moved by {size}"},
+    {"camera_moved", false, kPose, "camera moved", "camera moved by {size}"},
+    {"joint_stuck", true, kCommand, "{joint} stuck", "{joint} stuck at {size}"},
+    {"joint_offset", true, kCommand, "{joint} off", "{joint} off by {size}"},
+    {"joint_gain", true, kFactor, "{joint} goes another way", "{joint} goes {size} times as far"},
+    {"other_signal", true, kUnknown, "{edge} moved by {signal}", ""},
+    {"rigid", true, kPose, "{edge} rigid", "{edge} rigid, other by {size}"},
+    {"joint_nonlinear", true, kUnknown, "{edge} moves along another curve", ""},
+    {"new_model", true, kUnknown, "{edge} learned anew", ""},
+    {"geometry", true, kPose, "{edge} bent or exchanged", "{edge} bent or exchanged by {size}"},
+    {"drift", true, kRate, "{edge} drifts", "{edge} drifts by {size} a sample"},
+};
+
+/// What is wrong by an event or a finding, and by how much.
 template <class Told>
 std::string what(const Told& told, const std::vector<Signal>& signals) {
-  using Kind = ChangeSize::Kind;
   const std::string edge = std::to_string(told.from) + "→" + std::to_string(told.to);
-  const ChangeSize& size = told.size;
-  const bool is_sized = size.kind != Kind::kUnknown;
-  std::string signal;
-  if (size.signal >= 0 && size.signal < std::ssize(signals))
-    signal = signals[static_cast<std::size_t>(size.signal)].name;
-  const std::string joint = signal.empty() ? edge : signal + " (" + edge + ")";
-  const std::string by =
-      size.kind == Kind::kPose ? " by " + distance_and_angle(size) : std::string();
   const std::string part = told.part >= 0 ? " of part " + std::to_string(told.part) : "";
   if (told.tag >= 0) {
     return "tag " + std::to_string(told.tag) + part +
            (told.cause == "marker_moved" ? " elsewhere on it" : " not where it was, or lost");
   }
-  if (told.cause == "marker_missing") return "marker" + part + " not seen";
-  if (told.cause == "marker_moved") return "marker" + part + " moved" + by;
-  if (told.cause == "camera_moved") return "camera moved" + by;
-  if (told.from < 0) return "marker" + part + " not as known";
-  if (told.cause == "joint_stuck")
-    return joint + " stuck" + (is_sized ? " at " + measured(size.amounts[0], size.sds[0], "") : "");
-  if (told.cause == "joint_offset")
-    return joint + " off" + (is_sized ? " by " + measured(size.amounts[0], size.sds[0], "") : "");
-  if (told.cause == "joint_gain")
-    return joint + " goes " +
-           (is_sized ? measured(size.amounts[0], size.sds[0], "") + " times as far"
-                     : "another way");
-  if (told.cause == "other_signal")
-    return edge + " moved by " + (signal.empty() ? "another signal" : signal);
-  if (told.cause == "rigid") return edge + " rigid" + (is_sized ? ", other" + by : "");
-  if (told.cause == "joint_nonlinear") return edge + " moves along another curve";
-  if (told.cause == "new_model") return edge + " learned anew";
-  if (told.cause == "geometry") return edge + " bent or exchanged" + by;
-  if (told.cause == "drift")
-    return edge + " drifts" +
-           (size.kind == Kind::kRate ? " by " + distance_and_angle(size) + " a sample" : "");
-  return edge + " not as known";
+  const bool is_of_edge = told.from >= 0;
+  const auto words = std::find_if(std::begin(kWords), std::end(kWords), [&](const Words& w) {
+    return w.cause == told.cause && w.is_of_edge == is_of_edge;
+  });
+  if (words == std::end(kWords)) return (is_of_edge ? edge : "marker" + part) + " not as known";
+  const ChangeSize& size = told.size;
+  const bool is_sized = size.kind != kUnknown && size.kind == words->kind;
+  std::string signal;
+  if (size.signal >= 0 && size.signal < std::ssize(signals))
+    signal = signals[static_cast<std::size_t>(size.signal)].name;
+  std::string text(is_sized ? words->sized : words->text);
+  const auto fill = [&text](std::string_view name, const std::string& value) {
+    if (const std::size_t at = text.find(name); at != std::string::npos)
+      text.replace(at, name.size(), value);
+  };
+  fill("{edge}", edge);
+  fill("{joint}", signal.empty() ? edge : signal + " (" + edge + ")");
+  fill("{part}", part);
+  fill("{signal}", signal.empty() ? "another signal" : signal);
+  if (is_sized) fill("{size}", text_of(size));
+  return text;
 }
 
 std::string since_text(std::int64_t since) {

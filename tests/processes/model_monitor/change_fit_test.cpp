@@ -160,7 +160,7 @@ TEST_F(ChangeFitTest, LaplaceEvidenceIsTheIntegralOverTheParameter) {
   const auto fitted =
       PlaceEvidence(schema_, measurement_, kPart, false, pointers(samples)).fit(change);
   ASSERT_TRUE(fitted);
-  const double sigma = prior_sigma(change, schema_)(0);
+  const double sigma = prior_of(change, schema_).sigma(0);
   const double peak = fitted->theta(0), width = std::sqrt(fitted->covariance(0, 0));
   const double at_peak =
       log_likelihood(changed(schema_, change, fitted->theta), measurement_, pointers(samples));

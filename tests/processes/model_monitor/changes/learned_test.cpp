@@ -1,4 +1,4 @@
-#include "processes/model_monitor/learned_edge.h"
+#include "processes/model_monitor/changes/learned.h"
 
 #include <gtest/gtest.h>
 
@@ -21,14 +21,14 @@ class LearnedEdgeTest : public testing::Test {
  protected:
   /// With 3 mm and 1°.
   template <typename PoseOf>
-  std::vector<EdgeMeasurement> measure_pose(int count, PoseOf pose_of) {
+  std::vector<PlaceMeasurement> measure_pose(int count, PoseOf pose_of) {
     const Noise noise = test::nominal_noise(test::Regime::kTagIso);
     Vector6d sigma;
     sigma << Eigen::Vector3d::Constant(noise.position_m),
         Eigen::Vector3d::Constant(noise.rotation_rad);
-    std::vector<EdgeMeasurement> result;
+    std::vector<PlaceMeasurement> result;
     for (int n = 0; n < count; ++n) {
-      EdgeMeasurement m;
+      PlaceMeasurement m;
       m.displacements.resize(7);
       for (double& q : m.displacements) q = test::uniform(rng_, -1.35, 1.35);
       m.z = pose_of(m.displacements) * exp(sigma.cwiseProduct(test::gaussian6(rng_)));
@@ -38,7 +38,7 @@ class LearnedEdgeTest : public testing::Test {
     return result;
   }
   template <typename Displacement>
-  std::vector<EdgeMeasurement> measure(int count, Displacement displacement) {
+  std::vector<PlaceMeasurement> measure(int count, Displacement displacement) {
     return measure_pose(count,
                         [&](const Eigen::VectorXd& theta) { return at(displacement(theta)); });
   }
@@ -133,7 +133,7 @@ TEST_F(LearnedEdgeTest, ItsEvidenceIsThePriorsShareAndTheLikelihoodAtThePeak) {
   const LearnedEdge& best = learned.front();
   ASSERT_EQ(best.edge.residual_gp->num_samples(), 15);
   double sum = best.log_prior;
-  for (const EdgeMeasurement& m : measurements) {
+  for (const PlaceMeasurement& m : measurements) {
     sum += std::log1p(-kOutlierRate) +
            log_normal_density(log(best.certain.predict(m.displacements).inverse() * m.z),
                               m.covariance);
@@ -146,7 +146,7 @@ TEST_F(LearnedEdgeTest, ItsEvidenceIsThePriorsShareAndTheLikelihoodAtThePeak) {
 
 TEST_F(LearnedEdgeTest, WhatIsElsewhereAtEverySampleIsNoFunction) {
   auto measurements = measure(30, [](const Eigen::VectorXd& q) { return q(kOwn); });
-  for (EdgeMeasurement& m : measurements) {
+  for (PlaceMeasurement& m : measurements) {
     Vector6d wobble = Vector6d::Zero();
     for (int c = 3; c < 6; ++c) wobble(c) = test::uniform(rng_, -1, 1);
     m.z = m.z * exp(wobble);

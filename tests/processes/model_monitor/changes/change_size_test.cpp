@@ -1,4 +1,4 @@
-#include "processes/model_monitor/change_size.h"
+#include "processes/model_monitor/changes/change_size.h"
 
 #include <gtest/gtest.h>
 
@@ -85,7 +85,7 @@ TEST_F(ChangeSizeTest, ACameraWasKnockedAsFarAsItsOwnFrameMoved) {
   knock.linear() = exp_so3({0.1, 0, 0});
   knock.translation() << 0.02, 0.01, 0;
   const Pose T = schema_.X_CR.inverse() * knock.inverse() * schema_.X_CR;
-  const ChangeSize size = this->size({Form::kRight, schema_.root}, coordinates(T));
+  const ChangeSize size = this->size({Form::kCamera, schema_.root}, coordinates(T));
   EXPECT_NEAR(size.amounts[0], knock.translation().norm(), 1e-9);
   EXPECT_NEAR(size.amounts[1], 0.1, 1e-9);
 }
@@ -105,7 +105,7 @@ TEST_F(ChangeSizeTest, StandardDeviationsAreThoseOfTheAmounts) {
        {Case{{Form::kStuck, kPart}, vector({0.9})}, Case{{Form::kOffset, kPart}, vector({0.3})},
         Case{{Form::kGain, kPart}, vector({-0.3, 0.1})}, Case{{Form::kLeft, kPart}, pose},
         Case{{Form::kRight, kPart}, pose}, Case{{Form::kBoth, kPart}, both},
-        Case{{Form::kMarkerMoved, kPart}, pose}, Case{{Form::kRight, schema_.root}, pose}}) {
+        Case{{Form::kMarkerMoved, kPart}, pose}, Case{{Form::kCamera, schema_.root}, pose}}) {
     SCOPED_TRACE(static_cast<int>(c.change.form));
     const Eigen::Index d = c.theta.size();
     const Eigen::MatrixXd A =

@@ -1,4 +1,4 @@
-#include "processes/model_monitor/body_change.h"
+#include "processes/model_monitor/changes/body_change.h"
 
 #include <gtest/gtest.h>
 
@@ -86,7 +86,7 @@ TEST_F(BodyChangeTest, ADisplacementMayBeAsLargeAsTheJointsGainMakesIt) {
   ScrewJoint& joint = schema_.edges[2].joints[0];
   joint.gain = 1;
   const auto displacement = [&](const BodyChange& change) {
-    const Eigen::VectorXd sigma = prior_sigma(change, schema_);
+    const Eigen::VectorXd sigma = prior_of(change, schema_).sigma;
     return sigma(sigma.size() - 1);
   };
   const std::vector<double> before{displacement(stuck), displacement(offset), displacement(gain)};
@@ -94,7 +94,7 @@ TEST_F(BodyChangeTest, ADisplacementMayBeAsLargeAsTheJointsGainMakesIt) {
   EXPECT_NEAR(displacement(stuck), 20 * before[0], 1e-12);
   EXPECT_NEAR(displacement(offset), 20 * before[1], 1e-12);
   EXPECT_NEAR(displacement(gain), 20 * before[2], 1e-12);
-  EXPECT_EQ(prior_sigma(gain, schema_)(0), 1);
+  EXPECT_EQ(prior_of(gain, schema_).sigma(0), 1);
   joint.gain = 0;  // stuck already: it may be moved by hand
   EXPECT_NEAR(displacement(stuck), before[0], 1e-12);
 }
@@ -126,9 +126,9 @@ TEST_F(BodyChangeTest, EveryPossibleChangeKeepsTheEdgesFlatAndTheOthersAsTheyWer
       const auto theta = schema_.displacements(action_);
       EXPECT_TRUE(with.edges[e].predict(theta).isApprox(schema_.edges[e].predict(theta), 1e-12));
     }
-    EXPECT_EQ(prior_sigma(change, schema_).size(), change.size());
-    EXPECT_EQ(prior_mean(change, schema_).size(), change.size());
-    EXPECT_TRUE((prior_sigma(change, schema_).array() > 0).all());
+    EXPECT_EQ(prior_of(change, schema_).sigma.size(), change.size());
+    EXPECT_EQ(prior_of(change, schema_).mean.size(), change.size());
+    EXPECT_TRUE((prior_of(change, schema_).sigma.array() > 0).all());
     EXPECT_LT(change.log_odds(), 0);
   }
   for (const Form form : {Form::kStuck, Form::kOffset, Form::kGain, Form::kLeft, Form::kRight,
@@ -172,7 +172,7 @@ TEST_F(BodyChangeTest, UncertaintyOfTheParametersIsThatOfThePrediction) {
 }
 
 TEST_F(BodyChangeTest, ACameraMoves) {
-  const BodyChange change{Form::kRight, schema_.root};
+  const BodyChange change{Form::kCamera, schema_.root};
   const Eigen::VectorXd theta = random_theta(change);
   const BodySchema with = changed(schema_, change, theta, Matrix6d::Identity() * 1e-4);
   EXPECT_TRUE(with.X_CR.isApprox(schema_.X_CR * transform(theta), 1e-12));

@@ -1,9 +1,10 @@
-#include "processes/model_monitor/learned_edge.h"
+#include "processes/model_monitor/changes/learned.h"
 
 #include <Eigen/Cholesky>
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <set>
 
 #include "common/estimation/chi_square.h"
 #include "common/estimation/quantile.h"
@@ -30,7 +31,7 @@ double log_normal_constant(const Matrix6d& S) {
 
 /// ρ = Log(Δ⁻¹ z) of a measurement, in the place that the residual has in the edge, and its
 /// covariance.
-void residual_of(const Edge& edge, const EdgeMeasurement& m, Vector6d* rho, Matrix6d* covariance) {
+void residual_of(const Edge& edge, const PlaceMeasurement& m, Vector6d* rho, Matrix6d* covariance) {
   const Pose to_right = edge.predict(m.displacements) * edge.right.inverse();
   *rho = log(to_right.inverse() * m.z * edge.right.inverse());
   const Matrix6d A = right_jacobian_inverse(*rho) * adjoint(edge.right);
@@ -38,7 +39,7 @@ void residual_of(const Edge& edge, const EdgeMeasurement& m, Vector6d* rho, Matr
 }
 
 ProcessTargets all_coordinates(const BodyChange& change, const Edge& edge,
-                               const std::vector<EdgeMeasurement>& measurements) {
+                               const std::vector<PlaceMeasurement>& measurements) {
   const auto n = static_cast<Eigen::Index>(measurements.size());
   ProcessTargets targets;
   targets.change = change;
@@ -62,7 +63,7 @@ ProcessTargets all_coordinates(const BodyChange& change, const Edge& edge,
 
 /// Along the screw of the last joint alone.
 ProcessTargets one_displacement(const BodyChange& change, const Edge& edge,
-                                const std::vector<EdgeMeasurement>& measurements) {
+                                const std::vector<PlaceMeasurement>& measurements) {
   const auto n = static_cast<Eigen::Index>(measurements.size());
   const ScrewJoint& joint = edge.joints.back();
   const Vector6d along = displacement_twist(joint);
@@ -93,7 +94,7 @@ ProcessTargets one_displacement(const BodyChange& change, const Edge& edge,
 }
 
 Eigen::MatrixXd inputs_of(const std::vector<int>& signals,
-                          const std::vector<EdgeMeasurement>& measurements) {
+                          const std::vector<PlaceMeasurement>& measurements) {
   Eigen::MatrixXd x(signals.size(), measurements.size());
   for (std::size_t t = 0; t < measurements.size(); ++t)
     x.col(static_cast<Eigen::Index>(t)) = measurements[t].displacements(signals);
@@ -146,12 +147,12 @@ double screen(const ProcessTargets& targets, const Eigen::VectorXd& variances,
 }
 
 /// The measurement in the midst of all others.
-Pose middle_of(const std::vector<EdgeMeasurement>& measurements) {
+Pose middle_of(const std::vector<PlaceMeasurement>& measurements) {
   double least = std::numeric_limits<double>::infinity();
   Pose middle = Pose::Identity();
-  for (const EdgeMeasurement& a : measurements) {
+  for (const PlaceMeasurement& a : measurements) {
     double sum = 0;
-    for (const EdgeMeasurement& b : measurements) {
+    for (const PlaceMeasurement& b : measurements) {
       const Pose T = a.z.inverse() * b.z;
       sum += T.translation().norm() + 0.3 * rotation_angle(T);
     }
@@ -164,7 +165,7 @@ Pose middle_of(const std::vector<EdgeMeasurement>& measurements) {
 
 // The measurements as each form takes them that the edge may have; signals still open.
 std::vector<ProcessTargets> possible_forms(const Edge& old, int part,
-                                           const std::vector<EdgeMeasurement>& measurements) {
+                                           const std::vector<PlaceMeasurement>& measurements) {
   std::vector<ProcessTargets> forms;
   const auto has_enough = [&](const BodyChange& change) {
     return static_cast<int>(measurements.size()) >= change.fewest_samples();
@@ -178,17 +179,12 @@ std::vector<ProcessTargets> possible_forms(const Edge& old, int part,
     forms.push_back(all_coordinates(change, old, measurements));
   if (const BodyChange change{Form::kFresh, part}; has_enough(change)) {
     Edge fresh = old;
-    fresh.left = middle_of(measurements);
-    fresh.right = Pose::Identity();
-    fresh.joints.clear();
-    fresh.matrix_gp.reset();
-    fresh.residual_gp.reset();
-    fresh.parameter_covariance = Eigen::MatrixXd::Zero(6, 6);
+    make_constant(middle_of(measurements), &fresh);
     forms.push_back(all_coordinates(change, fresh, measurements));
   }
   Eigen::VectorXd old_cost(measurements.size());
   for (std::size_t t = 0; t < measurements.size(); ++t) {
-    const EdgeMeasurement& m = measurements[t];
+    const PlaceMeasurement& m = measurements[t];
     const Vector6d r = log(old.predict(m.displacements).inverse() * m.z);
     old_cost(static_cast<Eigen::Index>(t)) = student_cost(r.dot(m.covariance.llt().solve(r)));
   }
@@ -201,7 +197,7 @@ class SignalScreen {
  public:
   SignalScreen(const BodySchema& base, const ProcessTargets& targets,
                const Eigen::VectorXd& typical, const std::vector<int>& own,
-               const std::vector<EdgeMeasurement>& measurements)
+               const std::vector<PlaceMeasurement>& measurements)
       : base_(base), targets_(targets), typical_(typical), own_(own), measurements_(measurements) {
     const int num_signals = static_cast<int>(base.signals.size());
     for (int s = 0; s < num_signals; ++s) look(s, -1);
@@ -256,14 +252,14 @@ class SignalScreen {
   const ProcessTargets& targets_;
   const Eigen::VectorXd& typical_;
   const std::vector<int>& own_;
-  const std::vector<EdgeMeasurement>& measurements_;
+  const std::vector<PlaceMeasurement>& measurements_;
   std::vector<std::pair<double, BodyChange>> screened_;  // by score, the best first
 };
 
 }  // namespace
 
 std::vector<LearnedEdge> learn_edge(const BodySchema& base, int part,
-                                    const std::vector<EdgeMeasurement>& measurements,
+                                    const std::vector<PlaceMeasurement>& measurements,
                                     double outlier_rate) {
   std::vector<LearnedEdge> result;
   const Edge* const old = edge_to(base, part);
@@ -284,6 +280,14 @@ std::vector<LearnedEdge> learn_edge(const BodySchema& base, int part,
     return a.log_evidence > b.log_evidence;
   });
   return result;
+}
+
+double structural_proximity(const std::vector<int>& signals, const std::vector<int>& other) {
+  const std::set<int> a(signals.begin(), signals.end()), b(other.begin(), other.end());
+  std::set<int> all = a;
+  all.insert(b.begin(), b.end());
+  const double num_shared = static_cast<double>(a.size() + b.size() - all.size());
+  return (2 + num_shared) / (2 + static_cast<double>(all.size()));
 }
 
 }  // namespace bodyschema
