@@ -22,13 +22,6 @@ constexpr double kHopeless = 25;
 /// Learned models that are held against all the observations.
 constexpr std::size_t kLearnedJudged = 3;
 
-std::vector<int> nodes_of(const TreeFilter& filter, const std::vector<int>& parts) {
-  std::vector<int> nodes;
-  for (const int part : parts)
-    if (const int node = filter.node_of(part); node >= 0) nodes.push_back(node);
-  return nodes;
-}
-
 }  // namespace
 
 BodySchema with_edge_of(const BodySchema& schema, const BodySchema& other, int part) {
@@ -65,42 +58,34 @@ BodySchema with_change(const BodySchema& schema, const FittedChange& fitted) {
 BodySchema with_certain_change(const BodySchema& schema, const FittedChange& fitted) {
   FittedChange certain = fitted;
   certain.covariance.resize(0, 0);
-  if (!fitted.certain) return with_change(schema, certain);
   BodySchema result = with_change(schema, certain);
-  for (Edge& edge : result.edges)
-    if (edge.to == fitted.change.part) edge = *fitted.certain;
+  if (fitted.certain) edge_at(&result, fitted.change.part) = *fitted.certain;
   return result;
 }
 
 double log_likelihood(const BodySchema& schema, const MeasurementModel& measurement,
-                      const std::vector<const ActionPoseSample*>& samples,
-                      const std::vector<int>& cut_parts) {
+                      const std::vector<const ActionPoseSample*>& samples) {
   const TreeFilter filter(schema, measurement);
-  Alternative alternative;
-  alternative.cut_edges = nodes_of(filter, cut_parts);
   double sum = 0;
   for (const ActionPoseSample* sample : samples)
-    sum += filter.judge(filter.prepare(*sample), alternative).log_likelihood;
+    sum += filter.judge(filter.prepare(*sample)).log_likelihood;
   return sum;
 }
 
 PlaceEvidence::PlaceEvidence(const BodySchema& base, const MeasurementModel& measurement, int part,
-                             bool marker, std::vector<const ActionPoseSample*> samples,
-                             std::vector<int> cut_parts)
+                             bool marker, std::vector<const ActionPoseSample*> samples)
     : base_(base),
       measurement_(measurement),
       part_(part),
       marker_(marker),
-      samples_(std::move(samples)),
-      cut_parts_(std::move(cut_parts)) {
+      samples_(std::move(samples)) {
   const TreeFilter filter(base_, measurement_);
   const int node = filter.node_of(part_);
   if (node < 0) return;
-  const std::vector<int> cut = nodes_of(filter, cut_parts_);
   for (const ActionPoseSample* sample : samples_) {
     const TreeFilter::Instant instant = filter.prepare(*sample);
-    const auto of = marker_ ? filter.measure_marker(instant, node, cut)
-                            : filter.measure_edge(instant, node, cut);
+    const auto of =
+        marker_ ? filter.measure_marker(instant, node) : filter.measure_edge(instant, node);
     if (!of) continue;
     const Eigen::LLT<Matrix6d> llt(of->covariance);
     if (llt.info() != Eigen::Success) continue;
@@ -212,7 +197,6 @@ std::optional<FittedChange> PlaceEvidence::fit_place(const BodyChange& change) c
   const Eigen::Index d = change.size();
   FittedChange best;
   best.change = change;
-  best.num_usable = num_usable();
   best.theta = Eigen::VectorXd::Zero(d);
   best.log_prior = change.log_odds();
   if (d == 0) {
@@ -223,8 +207,7 @@ std::optional<FittedChange> PlaceEvidence::fit_place(const BodyChange& change) c
   std::vector<std::pair<double, Eigen::VectorXd>> promising;
   for (Eigen::VectorXd& start : form_of(change).family.starts(base_, change, measurements_))
     promising.emplace_back(cost(change, start, true), std::move(start));
-  std::stable_sort(promising.begin(), promising.end(),
-                   [](const auto& a, const auto& b) { return a.first < b.first; });
+  std::ranges::stable_sort(promising, {}, [](const auto& start) { return start.first; });
   if (promising.size() > kClimbs) promising.resize(kClimbs);
   std::optional<State> found;
   for (const auto& [unused, start] : promising) {
@@ -249,8 +232,8 @@ void PlaceEvidence::judge(FittedChange* fitted) const {
   // The likelihood at the most probable θ; the width of its peak is in the Laplace term, so the
   // model's new uncertainty must not be in it as well.
   fitted->log_evidence =
-      fitted->log_prior + log_likelihood(changed(base_, fitted->change, fitted->theta),
-                                         measurement_, samples_, cut_parts_);
+      fitted->log_prior +
+      log_likelihood(changed(base_, fitted->change, fitted->theta), measurement_, samples_);
   fitted->schema = changed(base_, fitted->change, fitted->theta, fitted->covariance);
 }
 
@@ -280,8 +263,7 @@ std::vector<FittedChange> PlaceEvidence::learn() const {
   if (marker_ || measurements_.empty()) return result;
   const auto with_edge = [this](const Edge& edge) {
     BodySchema schema = base_;
-    for (Edge& e : schema.edges)
-      if (e.to == part_) e = edge;
+    edge_at(&schema, part_) = edge;
     return schema;
   };
   const std::vector<LearnedEdge> learned =
@@ -292,11 +274,9 @@ std::vector<FittedChange> PlaceEvidence::learn() const {
       break;
     FittedChange fitted;
     fitted.change = one.change;
-    fitted.theta.resize(0);
-    fitted.num_usable = num_usable();
     fitted.log_prior = one.log_prior;
     fitted.log_evidence =
-        one.log_prior + log_likelihood(with_edge(one.certain), measurement_, samples_, cut_parts_);
+        one.log_prior + log_likelihood(with_edge(one.certain), measurement_, samples_);
     fitted.schema = with_edge(one.edge);
     fitted.origin = fitted.schema;
     fitted.certain = one.certain;
@@ -308,12 +288,9 @@ std::vector<FittedChange> PlaceEvidence::learn() const {
 FittedChange PlaceEvidence::judge_stored(const BodySchema& schema) const {
   FittedChange result;
   result.change = {BodyChange::Form::kStored, part_};
-  result.theta.resize(0);
   result.schema = schema;
-  result.num_usable = num_usable();
   result.log_prior = result.change.log_odds();
-  result.log_evidence =
-      result.log_prior + log_likelihood(schema, measurement_, samples_, cut_parts_);
+  result.log_evidence = result.log_prior + log_likelihood(schema, measurement_, samples_);
   return result;
 }
 

@@ -24,7 +24,6 @@ struct FittedChange {
   /// log ∫ p(observations | θ) p(θ) dθ by Laplace, plus the log prior odds [nats].
   double log_evidence = 0;
   double log_prior = 0;  ///< its share that is not the likelihood at θ
-  int num_usable = 0;    ///< samples that say something of the place
 };
 
 /// Whether the schema, or what the change starts from, has the joint that changed.
@@ -39,16 +38,16 @@ BodySchema with_edge_of(const BodySchema& schema, const BodySchema& other, int p
 
 /// Σ log p(observations) over the samples under a schema.
 double log_likelihood(const BodySchema& schema, const MeasurementModel& measurement,
-                      const std::vector<const ActionPoseSample*>& samples,
-                      const std::vector<int>& cut_parts = {});
+                      const std::vector<const ActionPoseSample*>& samples);
 
 /// What every sample says of one place, whatever the change there: made once for all its forms.
 class PlaceEvidence {
  public:
-  /// `cut_parts`: parts whose edges say nothing. `marker`: the marker of `part`, not its edge.
+  /// `marker`: the marker of `part`, not its edge.
   PlaceEvidence(const BodySchema& base, const MeasurementModel& measurement, int part, bool marker,
-                std::vector<const ActionPoseSample*> samples, std::vector<int> cut_parts = {});
+                std::vector<const ActionPoseSample*> samples);
 
+  /// Samples that say something of the place.
   int num_usable() const { return static_cast<int>(measurements_.size()); }
   /// Whitened residuals of the measurements, one after the other: 6N; and ∂/∂θ: 6N×d.
   Eigen::VectorXd residuals(const BodyChange& change, const Eigen::VectorXd& theta,
@@ -89,7 +88,6 @@ class PlaceEvidence {
   const int part_;
   const bool marker_;
   const std::vector<const ActionPoseSample*> samples_;
-  const std::vector<int> cut_parts_;
   std::vector<PlaceMeasurement> measurements_;
   std::vector<Matrix6d> whitenings_;
   std::vector<double> log_norms_;  ///< log |2πS|^(−½)

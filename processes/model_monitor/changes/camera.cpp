@@ -1,4 +1,4 @@
-#include "processes/model_monitor/changes/geometry.h"
+#include "processes/model_monitor/changes/change_family.h"
 
 namespace bodyschema {
 namespace {

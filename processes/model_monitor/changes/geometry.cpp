@@ -1,6 +1,5 @@
-#include "processes/model_monitor/changes/geometry.h"
-
 #include "common/kinematics/screw_chain.h"
+#include "processes/model_monitor/changes/change_family.h"
 
 namespace bodyschema {
 namespace {
@@ -13,10 +12,6 @@ bool has_left(const BodyChange& change) {
   return change.form == Form::kLeft || change.form == Form::kBoth;
 }
 bool has_right(const BodyChange& change) { return change.form != Form::kLeft; }
-
-Pose in_mid_range(const BodySchema& schema, const Edge& edge) {
-  return edge.predict(schema.displacements(mid_range(schema.signals)));
-}
 
 }  // namespace
 
@@ -47,7 +42,7 @@ std::vector<Eigen::VectorXd> Geometry::starts(
 void Geometry::apply(const BodyChange& change, const Eigen::VectorXd& theta,
                      const Eigen::MatrixXd& covariance, BodySchema* schema) const {
   Edge& edge = edge_at(schema, change.part);
-  if (change.form == Form::kRigid) make_constant(in_mid_range(*schema, edge), &edge);
+  if (change.form == Form::kRigid) make_constant(pose_at(*schema, change.part), &edge);
   if (has_left(change)) {
     const Vector6d t = theta.head<6>();
     if (covariance.size() > 0) {
@@ -73,7 +68,7 @@ PlacePrediction Geometry::prediction(const BodySchema& schema, const BodyChange&
   const bool moves_left = has_left(change), moves_right = has_right(change);
   const Vector6d first = theta.head<6>(), last = theta.tail<6>();
   std::optional<Pose> rigid;
-  if (change.form == Form::kRigid) rigid = in_mid_range(schema, *edge_to(schema, change.part));
+  if (change.form == Form::kRigid) rigid = pose_at(schema, change.part);
   return [moves_left, moves_right, rigid, left = moves_left ? transform(first) : Pose::Identity(),
           right = moves_right ? transform(last) : Pose::Identity(),
           J_left = transform_jacobian(first), J_right = transform_jacobian(last)](

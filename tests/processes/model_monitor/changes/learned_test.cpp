@@ -6,26 +6,22 @@
 #include <cmath>
 
 #include "processes/model_monitor/tree_filter.h"
-#include "tests/support/broken_arm.h"
+#include "tests/processes/model_monitor/changed_arm.h"
 
 namespace bodyschema {
 namespace {
 
-using Form = BodyChange::Form;
-using test::Rng;
-
-constexpr int kPart = 4, kOwn = 2, kOther = 5;
+constexpr int kOwn = 2, kOther = 5;
 constexpr double kOutlierRate = 0.04;
 
-class LearnedEdgeTest : public testing::Test {
+class LearnedEdgeTest : public ChangedArm {
  protected:
+  LearnedEdgeTest() : ChangedArm(5) {}
+
   /// With 3 mm and 1°.
   template <typename PoseOf>
   std::vector<PlaceMeasurement> measure_pose(int count, PoseOf pose_of) {
-    const Noise noise = test::nominal_noise(test::Regime::kTagIso);
-    Vector6d sigma;
-    sigma << Eigen::Vector3d::Constant(noise.position_m),
-        Eigen::Vector3d::Constant(noise.rotation_rad);
+    const Vector6d sigma = nominal_sigma();
     std::vector<PlaceMeasurement> result;
     for (int n = 0; n < count; ++n) {
       PlaceMeasurement m;
@@ -45,7 +41,7 @@ class LearnedEdgeTest : public testing::Test {
   Pose at(double displacement) const {
     return edge().predict(Eigen::VectorXd::Constant(7, displacement));
   }
-  const Edge& edge() const { return *edge_to(schema_, kPart); }
+  const Edge& edge() const { return ChangedArm::edge(schema_); }
   /// Mean error of the position over the range [m].
   template <typename Displacement>
   double error(const Edge& learned, Displacement displacement) {
@@ -62,10 +58,6 @@ class LearnedEdgeTest : public testing::Test {
     }
     return sum / kActions;
   }
-
-  Rng rng_{5};
-  BodySchema schema_ =
-      test::BrokenArm({test::Fault::kNone, "", 1}, test::Regime::kTagIso, 1, 3).engineered();
 };
 
 double worn(const Eigen::VectorXd& q) { return q(kOwn) + 0.6 * std::sin(3 * q(kOwn)); }
@@ -164,8 +156,7 @@ TEST_F(LearnedEdgeTest, AnEdgeThatHasAProcessIsOnlyLearnedAfresh) {
   const auto measurements = measure(30, worn);
   const auto first = learn_edge(schema_, kPart, measurements, kOutlierRate);
   ASSERT_FALSE(first.empty());
-  for (Edge& e : schema_.edges)
-    if (e.to == kPart) e = first.front().edge;
+  edge_at(&schema_, kPart) = first.front().edge;
   const auto inverse = [](const Eigen::VectorXd& q) { return -q(kOwn); };
   const auto again = learn_edge(schema_, kPart, measure(30, inverse), kOutlierRate);
   ASSERT_FALSE(again.empty());
