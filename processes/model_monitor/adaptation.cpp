@@ -9,6 +9,7 @@
 #include "common/estimation/chi_square.h"
 #include "common/estimation/quantile.h"
 #include "common/geometry/angle.h"
+#include "processes/model_monitor/changes/drift.h"
 #include "processes/model_monitor/schema_difference.h"
 
 namespace bodyschema {
@@ -310,8 +311,7 @@ void Adaptation::end_drift(std::int64_t since, const Drift& drift, std::int64_t 
   tags_.begin_anew();
   HypothesisTracker::Change there;
   there.what.place = {*drifting_, false};
-  there.what.fitted.change = {drift.left ? BodyChange::Form::kLeft : BodyChange::Form::kRight,
-                              *drifting_};
+  there.what.fitted.change = drift_step(before_, *drifting_, drift.left);
   there.what.fitted.theta = coordinates(drift.T);
   there.what.fitted.covariance = drift.covariance;
   there.since = there.adopted = since;

@@ -5,7 +5,7 @@
 #include <string>
 
 #include "common/estimation/measurement_model.h"
-#include "processes/model_monitor/change_size.h"
+#include "processes/model_monitor/changes/change_size.h"
 
 namespace bodyschema {
 

@@ -7,13 +7,10 @@
 
 #include "common/estimation/levenberg_marquardt.h"
 #include "common/estimation/student_t.h"
-#include "common/kinematics/screw_chain.h"
-#include "processes/model_monitor/learned_edge.h"
+#include "processes/model_monitor/changes/learned.h"
 
 namespace bodyschema {
 namespace {
-
-using Form = BodyChange::Form;
 
 constexpr int kIterations = 16;
 constexpr double kLargestStep = 2.1;  // of θ, in prior standard deviations
@@ -24,13 +21,6 @@ constexpr std::size_t kClimbs = 4;
 constexpr double kHopeless = 25;
 /// Learned models that are held against all the observations.
 constexpr std::size_t kLearnedJudged = 3;
-
-std::vector<int> nodes_of(const TreeFilter& filter, const std::vector<int>& parts) {
-  std::vector<int> nodes;
-  for (const int part : parts)
-    if (const int node = filter.node_of(part); node >= 0) nodes.push_back(node);
-  return nodes;
-}
 
 }  // namespace
 
@@ -47,12 +37,8 @@ BodySchema with_edge_of(const BodySchema& schema, const BodySchema& other, int p
 }
 
 bool is_possible(const FittedChange& fitted, const BodySchema& schema) {
-  const BodyChange& change = fitted.change;
-  if (change.form != Form::kStuck && change.form != Form::kOffset && change.form != Form::kGain &&
-      change.form != Form::kOtherSignal)
-    return true;
-  const Edge* edge = edge_to(fitted.origin ? *fitted.origin : schema, change.part);
-  return edge && change.joint < static_cast<int>(edge->joints.size());
+  return form_of(fitted.change)
+      .family.is_possible(fitted.origin ? *fitted.origin : schema, fitted.change);
 }
 
 BodySchema with_change(const BodySchema& schema, const FittedChange& fitted) {
@@ -72,184 +58,66 @@ BodySchema with_change(const BodySchema& schema, const FittedChange& fitted) {
 BodySchema with_certain_change(const BodySchema& schema, const FittedChange& fitted) {
   FittedChange certain = fitted;
   certain.covariance.resize(0, 0);
-  if (!fitted.certain) return with_change(schema, certain);
   BodySchema result = with_change(schema, certain);
-  for (Edge& edge : result.edges)
-    if (edge.to == fitted.change.part) edge = *fitted.certain;
+  if (fitted.certain) edge_at(&result, fitted.change.part) = *fitted.certain;
   return result;
 }
 
 double log_likelihood(const BodySchema& schema, const MeasurementModel& measurement,
-                      const std::vector<const ActionPoseSample*>& samples,
-                      const std::vector<int>& cut_parts) {
+                      const std::vector<const ActionPoseSample*>& samples) {
   const TreeFilter filter(schema, measurement);
-  Alternative alternative;
-  alternative.cut_edges = nodes_of(filter, cut_parts);
   double sum = 0;
   for (const ActionPoseSample* sample : samples)
-    sum += filter.judge(filter.prepare(*sample), alternative).log_likelihood;
+    sum += filter.judge(filter.prepare(*sample)).log_likelihood;
   return sum;
 }
 
 PlaceEvidence::PlaceEvidence(const BodySchema& base, const MeasurementModel& measurement, int part,
-                             bool marker, std::vector<const ActionPoseSample*> samples,
-                             std::vector<int> cut_parts)
+                             bool marker, std::vector<const ActionPoseSample*> samples)
     : base_(base),
       measurement_(measurement),
       part_(part),
       marker_(marker),
-      samples_(std::move(samples)),
-      cut_parts_(std::move(cut_parts)) {
+      samples_(std::move(samples)) {
   const TreeFilter filter(base_, measurement_);
   const int node = filter.node_of(part_);
   if (node < 0) return;
-  const std::vector<int> cut = nodes_of(filter, cut_parts_);
   for (const ActionPoseSample* sample : samples_) {
     const TreeFilter::Instant instant = filter.prepare(*sample);
-    const auto of = marker_ ? filter.measure_marker(instant, node, cut)
-                            : filter.measure_edge(instant, node, cut);
+    const auto of =
+        marker_ ? filter.measure_marker(instant, node) : filter.measure_edge(instant, node);
     if (!of) continue;
     const Eigen::LLT<Matrix6d> llt(of->covariance);
     if (llt.info() != Eigen::Success) continue;
-    measurements_.push_back(
-        {base_.displacements(sample->action), *of, llt.matrixL().solve(Matrix6d::Identity()),
-         -llt.matrixLLT().diagonal().array().log().sum() - 3 * std::log(2 * M_PI)});
+    measurements_.push_back({base_.displacements(sample->action), of->z, of->covariance});
+    whitenings_.push_back(llt.matrixL().solve(Matrix6d::Identity()));
+    log_norms_.push_back(-llt.matrixLLT().diagonal().array().log().sum() - 3 * std::log(2 * M_PI));
   }
-  place_ = base_;
-  std::erase_if(place_.edges, [part](const Edge& edge) { return edge.to != part; });
   if (marker) return;
-  const Edge* edge = edge_to(place_, part);
-  for (Measured& m : measurements_) {
-    m.unchanged = edge ? edge->predict(m.displacements) : place_.X_CR;
+  const Edge* edge = edge_to(base_, part);
+  for (PlaceMeasurement& m : measurements_) {
+    m.X = edge ? edge->predict(m.displacements) : base_.X_CR;
     if (edge && edge->matrix_gp) m.process = edge->matrix_gp->predict(m.displacements);
     if (edge && edge->residual_gp) m.process = exp(edge->residual_gp->mean(m.displacements));
   }
-  if (edge) rigid_ = edge_to(changed(place_, {Form::kRigid, part}, Vector6d::Zero()), part)->left;
-}
-
-std::vector<Pose> PlaceEvidence::predict(const BodyChange& change, const Eigen::VectorXd& theta,
-                                         std::vector<Jacobian>* jacobians) const {
-  std::vector<Pose> result;
-  result.reserve(measurements_.size());
-  if (jacobians) jacobians->assign(measurements_.size(), Jacobian(6, change.size()));
-  const Edge* base = edge_to(place_, part_);
-  if (change.size() >= 6) {
-    const Pose T = transform(theta.head<6>()), last = transform(theta.tail<6>());
-    const Matrix6d J = transform_jacobian(theta.head<6>());
-    for (const Measured& m : measurements_) {
-      const Pose& X = m.unchanged;
-      Jacobian* out = jacobians ? &(*jacobians)[result.size()] : nullptr;
-      switch (change.form) {
-        case Form::kLeft:
-          result.push_back(T * X);
-          if (out) *out = adjoint(X.inverse()) * J;
-          break;
-        case Form::kBoth:
-          result.push_back(T * X * last);
-          if (out) *out << adjoint((X * last).inverse()) * J, transform_jacobian(theta.tail<6>());
-          break;
-        default:
-          result.push_back((change.form == Form::kRigid ? rigid_ : X) * T);
-          if (out) *out = J;
-      }
-    }
-    return result;
-  }
-  if (!base) {
-    for (const Measured& m : measurements_) result.push_back(m.unchanged);
-    return result;
-  }
-  const BodySchema with = changed(place_, change, theta);
-  Edge screws = *edge_to(with, part_);
-  const Pose right = screws.right;
-  screws.right = Pose::Identity();
-  screws.matrix_gp.reset();
-  screws.residual_gp.reset();
-  for (const Measured& m : measurements_) {
-    const Pose suffix = m.process * right;
-    if (jacobians && change.size() > 0) {
-      const auto joint = static_cast<std::size_t>(change.joint);
-      const ScrewJoint& old = base->joints[joint];
-      Jacobian& out = (*jacobians)[result.size()];
-      // The last parameter is a displacement, that of a gain before it multiplies one.
-      out.rightCols<1>() = adjoint(suffix.inverse()) *
-                           screws.parameter_jacobian(m.displacements)
-                               .middleCols<6>(ScrewChainLayout::transform(change.joint + 1)) *
-                           displacement_twist(old);
-      if (change.form == Form::kGain)
-        out.col(0) = old.gain * m.displacements(old.signal) * out.col(1);
-    }
-    result.push_back(screws.predict(m.displacements) * suffix);
-  }
-  return result;
 }
 
 Eigen::VectorXd PlaceEvidence::residuals(const BodyChange& change, const Eigen::VectorXd& theta,
                                          Eigen::MatrixXd* jacobian) const {
-  std::vector<Jacobian> moves;
-  const std::vector<Pose> predicted = predict(change, theta, jacobian ? &moves : nullptr);
-  Eigen::VectorXd r(6 * static_cast<Eigen::Index>(predicted.size()));
+  const PlacePrediction predict = form_of(change).family.prediction(base_, change, theta);
+  ChangeJacobian moves(6, change.size());
+  Eigen::VectorXd r(6 * static_cast<Eigen::Index>(measurements_.size()));
   if (jacobian) jacobian->resize(r.size(), change.size());
-  for (std::size_t n = 0; n < predicted.size(); ++n) {
+  for (std::size_t n = 0; n < measurements_.size(); ++n) {
     const Eigen::Index at = 6 * static_cast<Eigen::Index>(n);
-    const Matrix6d& W = measurements_[n].whitening;
-    const Vector6d xi = log(predicted[n].inverse() * measurements_[n].of.z);
-    r.segment<6>(at) = W * xi;
+    const PlaceMeasurement& m = measurements_[n];
+    const Vector6d xi = log(predict(m, jacobian ? &moves : nullptr).inverse() * m.z);
+    r.segment<6>(at) = whitenings_[n] * xi;
     // log(Exp(−δ) Exp(ξ)) = ξ − J_l⁻¹(ξ) δ, and J_l(ξ) = J_r(−ξ).
-    if (jacobian) jacobian->middleRows<6>(at) = -W * right_jacobian_inverse(-xi) * moves[n];
+    if (jacobian)
+      jacobian->middleRows<6>(at) = -whitenings_[n] * right_jacobian_inverse(-xi) * moves;
   }
   return r;
-}
-
-std::vector<Eigen::VectorXd> PlaceEvidence::starts(const BodyChange& change) const {
-  std::vector<Eigen::VectorXd> result;
-  const Eigen::VectorXd mean = prior_mean(change, base_), sigma = prior_sigma(change, base_);
-  switch (change.form) {
-    case Form::kStuck:
-      for (int k = 0; k < 9; ++k)
-        result.push_back(mean +
-                         Eigen::VectorXd::Constant(1, std::sqrt(3.0) * (k - 4) / 4 * sigma(0)));
-      break;
-    case Form::kOffset:
-      for (int k = 0; k < 7; ++k)
-        result.push_back(Eigen::VectorXd::Constant(1, 0.6 * (k - 3) * sigma(0)));
-      break;
-    case Form::kGain:
-      for (const double a : {-0.6, -0.25, 0.0, 0.4})
-        for (const double b : {-0.5, 0.0, 0.5}) result.push_back(Eigen::Vector2d(a, b * sigma(1)));
-      break;
-    case Form::kOtherSignal:
-    case Form::kStored:
-      result.push_back(mean);
-      break;
-    default: {
-      // What each of the newest samples alone says.
-      const Eigen::VectorXd zero = Eigen::VectorXd::Zero(change.size());
-      const std::size_t count = measurements_.size();
-      for (std::size_t n = count > 3 ? count - 3 : 0; n < count; ++n) {
-        const Pose& z = measurements_[n].of.z;
-        const Pose& before = change.form == Form::kRigid ? rigid_ : measurements_[n].unchanged;
-        const Vector6d right = coordinates(before.inverse() * z);
-        const Vector6d left = coordinates(z * before.inverse());
-        if (change.form == Form::kLeft) {
-          result.push_back(left);
-        } else if (change.form == Form::kBoth) {
-          Eigen::VectorXd start = zero;
-          start.head<6>() = left;
-          result.push_back(start);
-          start.setZero();
-          start.tail<6>() = right;
-          result.push_back(start);
-          start.head<6>() = 0.5 * left;
-          start.tail<6>() = 0.5 * right;
-          result.push_back(start);
-        } else {
-          result.push_back(right);
-        }
-      }
-    }
-  }
-  return result;
 }
 
 double PlaceEvidence::log_flat_outlier() const {
@@ -257,14 +125,13 @@ double PlaceEvidence::log_flat_outlier() const {
 }
 
 double PlaceEvidence::log_inlier(std::size_t n, double d2) const {
-  return std::log1p(-measurement_.outlier_rate) - 0.5 * d2 + measurements_[n].log_norm;
+  return std::log1p(-measurement_.outlier_rate) - 0.5 * d2 + log_norms_[n];
 }
 
 double PlaceEvidence::cost(const BodyChange& change, const Eigen::VectorXd& theta,
                            bool robust) const {
   const double flat = log_flat_outlier();
-  const Eigen::VectorXd mean = prior_mean(change, base_), sigma = prior_sigma(change, base_);
-  double sum = 0.5 * (theta - mean).cwiseQuotient(sigma).squaredNorm();
+  double sum = 0.5 * prior_of(change, base_).squared_distance(theta);
   const Eigen::VectorXd r = residuals(change, theta);
   for (std::size_t n = 0; n < measurements_.size(); ++n) {
     const double d2 = r.segment<6>(6 * static_cast<Eigen::Index>(n)).squaredNorm();
@@ -279,8 +146,8 @@ double PlaceEvidence::cost(const BodyChange& change, const Eigen::VectorXd& thet
 }
 
 PlaceEvidence::State PlaceEvidence::climb(const BodyChange& change, Eigen::VectorXd theta) const {
-  const Eigen::VectorXd mean = prior_mean(change, base_), sigma = prior_sigma(change, base_);
-  const Eigen::VectorXd prior = sigma.cwiseAbs2().cwiseInverse();
+  const ChangePrior prior = prior_of(change, base_);
+  const Eigen::VectorXd information = prior.sigma.cwiseAbs2().cwiseInverse();
   const double flat = log_flat_outlier();
   const std::size_t count = measurements_.size();
   State state;
@@ -291,8 +158,8 @@ PlaceEvidence::State PlaceEvidence::climb(const BodyChange& change, Eigen::Vecto
     if (iteration == kIterations / 2) optimizer = fresh;
     Eigen::MatrixXd J;
     const Eigen::VectorXd r = residuals(change, theta, &J);
-    Eigen::MatrixXd H = prior.asDiagonal();
-    Eigen::VectorXd g = prior.cwiseProduct(theta - mean);
+    Eigen::MatrixXd H = information.asDiagonal();
+    Eigen::VectorXd g = information.cwiseProduct(theta - prior.mean);
     for (std::size_t n = 0; n < count; ++n) {
       const auto at = 6 * static_cast<Eigen::Index>(n);
       const double d2 = r.segment<6>(at).squaredNorm();
@@ -307,7 +174,7 @@ PlaceEvidence::State PlaceEvidence::climb(const BodyChange& change, Eigen::Vecto
     state.cost = before;
     double gain = 0;
     const bool improved = optimizer.step(H, g, [&](Eigen::VectorXd step) {
-      const double longest = step.cwiseQuotient(sigma.cwiseMax(1e-9)).cwiseAbs().maxCoeff();
+      const double longest = step.cwiseQuotient(prior.sigma.cwiseMax(1e-9)).cwiseAbs().maxCoeff();
       if (longest > kLargestStep) step *= kLargestStep / longest;
       const double after = cost(change, theta + step, robust);
       if (!(after < before)) return false;
@@ -330,7 +197,6 @@ std::optional<FittedChange> PlaceEvidence::fit_place(const BodyChange& change) c
   const Eigen::Index d = change.size();
   FittedChange best;
   best.change = change;
-  best.num_usable = num_usable();
   best.theta = Eigen::VectorXd::Zero(d);
   best.log_prior = change.log_odds();
   if (d == 0) {
@@ -339,10 +205,9 @@ std::optional<FittedChange> PlaceEvidence::fit_place(const BodyChange& change) c
   }
   // The most promising starts.
   std::vector<std::pair<double, Eigen::VectorXd>> promising;
-  for (Eigen::VectorXd& start : starts(change))
+  for (Eigen::VectorXd& start : form_of(change).family.starts(base_, change, measurements_))
     promising.emplace_back(cost(change, start, true), std::move(start));
-  std::stable_sort(promising.begin(), promising.end(),
-                   [](const auto& a, const auto& b) { return a.first < b.first; });
+  std::ranges::stable_sort(promising, {}, [](const auto& start) { return start.first; });
   if (promising.size() > kClimbs) promising.resize(kClimbs);
   std::optional<State> found;
   for (const auto& [unused, start] : promising) {
@@ -355,15 +220,11 @@ std::optional<FittedChange> PlaceEvidence::fit_place(const BodyChange& change) c
   if (llt.info() != Eigen::Success) return std::nullopt;
   best.theta = found->theta;
   best.covariance = llt.solve(Eigen::MatrixXd::Identity(d, d));
-  const Eigen::VectorXd sigma = prior_sigma(change, base_);
-  const double distance =
-      0.5 * (best.theta - prior_mean(change, base_)).cwiseQuotient(sigma).squaredNorm();
-  // log prior + d/2 log 2π − ½ log|H|; a uniform prior has the density of its interval.
-  best.log_prior += change.form == Form::kStuck
-                        ? 0.5 * std::log(2 * M_PI) - std::log(sigma(0) * std::sqrt(12.0))
-                        : -distance - sigma.array().log().sum();
+  const ChangePrior prior = prior_of(change, base_);
+  // log prior + d/2 log 2π − ½ log|H|
+  best.log_prior += prior.log_density(best.theta);
   best.log_prior -= llt.matrixLLT().diagonal().array().log().sum();
-  best.log_evidence = best.log_prior + distance - found->cost;
+  best.log_evidence = best.log_prior + 0.5 * prior.squared_distance(best.theta) - found->cost;
   return best;
 }
 
@@ -371,8 +232,8 @@ void PlaceEvidence::judge(FittedChange* fitted) const {
   // The likelihood at the most probable θ; the width of its peak is in the Laplace term, so the
   // model's new uncertainty must not be in it as well.
   fitted->log_evidence =
-      fitted->log_prior + log_likelihood(changed(base_, fitted->change, fitted->theta),
-                                         measurement_, samples_, cut_parts_);
+      fitted->log_prior +
+      log_likelihood(changed(base_, fitted->change, fitted->theta), measurement_, samples_);
   fitted->schema = changed(base_, fitted->change, fitted->theta, fitted->covariance);
 }
 
@@ -400,28 +261,22 @@ std::vector<FittedChange> PlaceEvidence::fit_likely(const std::vector<BodyChange
 std::vector<FittedChange> PlaceEvidence::learn() const {
   std::vector<FittedChange> result;
   if (marker_ || measurements_.empty()) return result;
-  std::vector<EdgeMeasurement> of_edge;
-  for (const Measured& m : measurements_)
-    of_edge.push_back({m.displacements, m.of.z, m.of.covariance});
   const auto with_edge = [this](const Edge& edge) {
     BodySchema schema = base_;
-    for (Edge& e : schema.edges)
-      if (e.to == part_) e = edge;
+    edge_at(&schema, part_) = edge;
     return schema;
   };
   const std::vector<LearnedEdge> learned =
-      learn_edge(base_, part_, of_edge, measurement_.outlier_rate);
+      learn_edge(base_, part_, measurements_, measurement_.outlier_rate);
   for (const LearnedEdge& one : learned) {
     if (one.log_evidence < learned.front().log_evidence - kHopeless ||
         result.size() == kLearnedJudged)
       break;
     FittedChange fitted;
     fitted.change = one.change;
-    fitted.theta.resize(0);
-    fitted.num_usable = num_usable();
     fitted.log_prior = one.log_prior;
     fitted.log_evidence =
-        one.log_prior + log_likelihood(with_edge(one.certain), measurement_, samples_, cut_parts_);
+        one.log_prior + log_likelihood(with_edge(one.certain), measurement_, samples_);
     fitted.schema = with_edge(one.edge);
     fitted.origin = fitted.schema;
     fitted.certain = one.certain;
@@ -432,13 +287,10 @@ std::vector<FittedChange> PlaceEvidence::learn() const {
 
 FittedChange PlaceEvidence::judge_stored(const BodySchema& schema) const {
   FittedChange result;
-  result.change = {Form::kStored, part_};
-  result.theta.resize(0);
+  result.change = {BodyChange::Form::kStored, part_};
   result.schema = schema;
-  result.num_usable = num_usable();
   result.log_prior = result.change.log_odds();
-  result.log_evidence =
-      result.log_prior + log_likelihood(schema, measurement_, samples_, cut_parts_);
+  result.log_evidence = result.log_prior + log_likelihood(schema, measurement_, samples_);
   return result;
 }
 

@@ -4,7 +4,7 @@
 #include <vector>
 
 #include "common/schema/sample.h"
-#include "processes/model_monitor/body_change.h"
+#include "processes/model_monitor/changes/change_family.h"
 #include "processes/model_monitor/tree_filter.h"
 
 namespace bodyschema {
@@ -20,11 +20,10 @@ struct FittedChange {
   Eigen::MatrixXd covariance;  ///< of θ, Laplace
   /// Of what is learned: the edge at the peak of its posterior, without its uncertainty.
   std::optional<Edge> certain = std::nullopt;
-  BodySchema schema;           ///< with the change, and its uncertainty, in it
+  BodySchema schema;  ///< with the change, and its uncertainty, in it
   /// log ∫ p(observations | θ) p(θ) dθ by Laplace, plus the log prior odds [nats].
   double log_evidence = 0;
   double log_prior = 0;  ///< its share that is not the likelihood at θ
-  int num_usable = 0;    ///< samples that say something of the place
 };
 
 /// Whether the schema, or what the change starts from, has the joint that changed.
@@ -39,16 +38,16 @@ BodySchema with_edge_of(const BodySchema& schema, const BodySchema& other, int p
 
 /// Σ log p(observations) over the samples under a schema.
 double log_likelihood(const BodySchema& schema, const MeasurementModel& measurement,
-                      const std::vector<const ActionPoseSample*>& samples,
-                      const std::vector<int>& cut_parts = {});
+                      const std::vector<const ActionPoseSample*>& samples);
 
 /// What every sample says of one place, whatever the change there: made once for all its forms.
 class PlaceEvidence {
  public:
-  /// `cut_parts`: parts whose edges say nothing. `marker`: the marker of `part`, not its edge.
+  /// `marker`: the marker of `part`, not its edge.
   PlaceEvidence(const BodySchema& base, const MeasurementModel& measurement, int part, bool marker,
-                std::vector<const ActionPoseSample*> samples, std::vector<int> cut_parts = {});
+                std::vector<const ActionPoseSample*> samples);
 
+  /// Samples that say something of the place.
   int num_usable() const { return static_cast<int>(measurements_.size()); }
   /// Whitened residuals of the measurements, one after the other: 6N; and ∂/∂θ: 6N×d.
   Eigen::VectorXd residuals(const BodyChange& change, const Eigen::VectorXd& theta,
@@ -62,33 +61,18 @@ class PlaceEvidence {
   /// Those of the changes that may be the best one: what the place's own measurements speak clearly
   /// against is not held against all the observations.
   std::vector<FittedChange> fit_likely(const std::vector<BodyChange>& changes) const;
-  /// What learn_edge() makes of an edge's place, those of it that may be the best one. Of no
-  /// others.
+  /// What learn_edge() makes of an edge's place, those of it that may be the best one; of a
+  /// marker's nothing.
   std::vector<FittedChange> learn() const;
   /// A schema of the history in this place.
   FittedChange judge_stored(const BodySchema& schema) const;
 
  private:
-  struct Measured {
-    Eigen::VectorXd displacements;
-    VirtualMeasurement of;
-    Matrix6d whitening;
-    double log_norm = 0;                ///< log |2πS|^(−½)
-    Pose unchanged = Pose::Identity();  ///< the place as the base has it; of a marker the identity
-    /// What the Gaussian process of the place's edge says here: no change of a form moves it.
-    Pose process = Pose::Identity();
-  };
   struct State {
     Eigen::VectorXd theta;
     double cost = 0;
     Eigen::MatrixXd H;
   };
-  using Jacobian = Eigen::Matrix<double, 6, Eigen::Dynamic>;
-  /// What the place looks like with a change: its pose at every measurement. With `jacobians` also
-  /// how it moves with θ: X ← X · Exp(J dθ), 6×d.
-  std::vector<Pose> predict(const BodyChange& change, const Eigen::VectorXd& theta,
-                            std::vector<Jacobian>* jacobians = nullptr) const;
-  std::vector<Eigen::VectorXd> starts(const BodyChange& change) const;
   double log_flat_outlier() const;
   double log_inlier(std::size_t n, double squared_distance) const;
   /// −log of prior times likelihood of the place's measurements; `robust`: Student-t.
@@ -104,10 +88,9 @@ class PlaceEvidence {
   const int part_;
   const bool marker_;
   const std::vector<const ActionPoseSample*> samples_;
-  const std::vector<int> cut_parts_;
-  BodySchema place_;               ///< the base with the place's edge alone
-  Pose rigid_ = Pose::Identity();  ///< the edge in mid-range
-  std::vector<Measured> measurements_;
+  std::vector<PlaceMeasurement> measurements_;
+  std::vector<Matrix6d> whitenings_;
+  std::vector<double> log_norms_;  ///< log |2πS|^(−½)
 };
 
 }  // namespace bodyschema

@@ -45,9 +45,8 @@ std::vector<Base> bases_of(const Place& place, const BodySchema& standing,
   if (place.marker) return bases;
   for (const BodySchema& stored : history) {
     BodySchema with = with_edge_of(standing, stored, place.part);
-    const bool is_known = std::any_of(bases.begin(), bases.end(), [&](const Base& base) {
-      return !differ_at(base.schema, with, place.part);
-    });
+    const bool is_known = std::ranges::any_of(
+        bases, [&](const Base& base) { return !differ_at(base.schema, with, place.part); });
     if (!is_known) bases.push_back({std::move(with), &stored});
   }
   return bases;
@@ -66,15 +65,13 @@ std::optional<Replacement> whole(const BodySchema& stored, const BodySchema& sta
   fitted.origin = stored;
   fitted.everywhere = true;
   fitted.log_prior = fitted.change.log_odds();
-  fitted.num_usable = 1;
   const auto judge = [&] {
     const BodySchema with = with_change(standing, fitted);
     fitted.log_evidence = fitted.log_prior + log_likelihood(with, measurement, samples);
     return with;
   };
-  const auto num_different =
-      std::count_if(standing.parts.begin(), standing.parts.end(),
-                    [&](int part) { return differ_at(standing, stored, part); });
+  const auto num_different = std::ranges::count_if(
+      standing.parts, [&](int part) { return differ_at(standing, stored, part); });
   if (num_different < 2) return std::nullopt;
   judge();
   if (fitted.log_evidence <= null) return std::nullopt;
@@ -88,9 +85,7 @@ std::optional<Replacement> whole(const BodySchema& stored, const BodySchema& sta
   if (num_clear < 2) return std::nullopt;
   fitted.origin = std::move(different);
   std::vector<Place> at = differences(standing, judge());
-  std::stable_sort(at.begin(), at.end(), [&places](const Place& a, const Place& b) {
-    return std::find(places.begin(), places.end(), a) < std::find(places.begin(), places.end(), b);
-  });
+  std::ranges::stable_sort(at, {}, [&](const Place& p) { return std::ranges::find(places, p); });
   all.place = at.front();
   all.also = {at.begin() + 1, at.end()};
   fitted.change.part = all.place.part;
@@ -105,8 +100,7 @@ bool is_same_explanation(const Replacement& a, const Replacement& b) {
 
 bool is_worth_a_fit(std::int64_t age) {
   constexpr std::int64_t kAges[] = {10, 12, 15, 19, 24};
-  return age <= 8 || age % 30 == 0 ||
-         std::find(std::begin(kAges), std::end(kAges), age) != std::end(kAges);
+  return age <= 8 || age % 30 == 0 || std::ranges::find(kAges, age) != std::end(kAges);
 }
 
 FoundChanges find_changes(const BodySchema& standing, const std::vector<BodySchema>& history,

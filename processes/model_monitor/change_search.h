@@ -3,7 +3,7 @@
 #include <optional>
 #include <vector>
 
-#include "processes/model_monitor/body_change.h"
+#include "processes/model_monitor/changes/body_change.h"
 #include "processes/model_monitor/change_fit.h"
 
 namespace bodyschema {

@@ -4,7 +4,7 @@
 #include <cmath>
 #include <utility>
 
-#include "processes/model_monitor/body_change.h"
+#include "processes/model_monitor/changes/learned.h"
 
 namespace bodyschema {
 namespace {

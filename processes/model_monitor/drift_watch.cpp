@@ -7,8 +7,8 @@
 #include <utility>
 
 #include "common/estimation/student_t.h"
-#include "processes/model_monitor/body_change.h"
 #include "processes/model_monitor/change_fit.h"
+#include "processes/model_monitor/changes/drift.h"
 
 namespace bodyschema {
 namespace {
@@ -21,11 +21,6 @@ constexpr std::size_t kFewest = 16;
 constexpr std::size_t kFollowed = 40;
 constexpr std::size_t kFewestFollowed = 4;
 
-/// Prior of a rate, standard deviations a sample: in 15 samples, at which a fast one is told from a
-/// step, it goes as far as the prior of a small step (BodyChange::small: 0.03 m, 0.1 rad).
-constexpr Noise kRatePrior{0.03 / 15, 0.1 / 15};
-/// log odds against no change: those of a small step.
-constexpr double kLogOdds = -3.5;
 /// A drift of 0.1° a sample is suspected about 20 samples after its begin.
 constexpr std::int64_t kLongestUnseen = 28;
 constexpr std::int64_t kCoarse = 4;
@@ -55,8 +50,8 @@ struct Line {
 
 Matrix6d rate_information() {
   Vector6d sigma;
-  sigma << Eigen::Vector3d::Constant(kRatePrior.position_m),
-      Eigen::Vector3d::Constant(kRatePrior.rotation_rad);
+  sigma << Eigen::Vector3d::Constant(kDriftRateSigma.position_m),
+      Eigen::Vector3d::Constant(kDriftRateSigma.rotation_rad);
   return sigma.cwiseAbs2().cwiseInverse().asDiagonal();
 }
 
@@ -155,7 +150,7 @@ std::optional<BegunLine> fit_begun(const std::vector<Reading>& readings, double 
   line.covariance = H.inverse();
   const Eigen::LLT<Matrix6d> llt(H), of_prior(prior);
   if (llt.info() != Eigen::Success || !line.rate.allFinite()) return std::nullopt;
-  line.log_prior = kLogOdds - 0.5 * line.rate.dot(prior * line.rate) +
+  line.log_prior = kSmallLogOdds - 0.5 * line.rate.dot(prior * line.rate) +
                    of_prior.matrixLLT().diagonal().array().log().sum() -
                    llt.matrixLLT().diagonal().array().log().sum() -
                    std::log(static_cast<double>(kLongestUnseen));
@@ -368,15 +363,13 @@ std::optional<Drift> DriftWatch::follow(const BodySchema& schema, int part) cons
 
 BodySchema Drift::applied_to(const BodySchema& before) const {
   // `covariance` is that of a right perturbation of T: near enough to that of θ.
-  const BodyChange change{left ? BodyChange::Form::kLeft : BodyChange::Form::kRight, part};
-  return changed(before, change, coordinates(T),
+  return changed(before, drift_step(before, part, left), coordinates(T),
                  covariance + (1 - has_ended) * rate * rate.transpose());
 }
 
 double BegunDrift::log_likelihood(const BodySchema& before, const MeasurementModel& measurement,
                                   const std::vector<const ActionPoseSample*>& samples) const {
-  const BodyChange change{drift.left ? BodyChange::Form::kLeft : BodyChange::Form::kRight,
-                          drift.part};
+  const BodyChange change = drift_step(before, drift.part, drift.left);
   std::vector<const ActionPoseSample*> unmoved;
   double sum = 0;
   for (const ActionPoseSample* sample : samples) {

@@ -5,7 +5,7 @@
 #include <vector>
 
 #include "processes/model_monitor/adaptation.h"
-#include "processes/model_monitor/change_size.h"
+#include "processes/model_monitor/changes/change_size.h"
 
 namespace bodyschema {
 

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdio>
+#include <string_view>
 
 #include "common/geometry/angle.h"
 
@@ -24,7 +25,8 @@ std::string measured(double value, double sd, const std::string& unit) {
   return number(value, decimals) + (sd > 0 ? " ± " + number(sd, decimals) : "") + unit;
 }
 
-std::string distance_and_angle(const ChangeSize& size) {
+std::string text_of(const ChangeSize& size) {
+  if (size.amounts.size() == 1) return measured(size.amounts[0], size.sds[0], "");
   return measured(size.amounts[0] * 1e3, size.sds[0] < 0 ? -1 : size.sds[0] * 1e3, " mm") + ", " +
          measured(size.amounts[1] / kDegree, size.sds[1] < 0 ? -1 : size.sds[1] / kDegree, "°");
 }
@@ -33,46 +35,66 @@ std::string counted(int count, const char* noun) {
   return std::to_string(count) + " " + noun + (count == 1 ? "" : "s");
 }
 
-/// Of an event or a finding: what is wrong, and how much.
+/// A cause in words: `sized` where the size is of that kind.
+struct Words {
+  std::string_view cause;
+  bool is_of_edge;
+  ChangeSize::Kind kind;
+  std::string_view text, sized;
+};
+using enum ChangeSize::Kind;
+constexpr Words kWords[] = {
+    {"marker_missing", false, kUnknown, "{place} not seen", ""},
+    {"marker_moved", false, kPose, "{place} moved", "{place} moved by {size}"},
+    {"camera_moved", false, kPose, "{place} moved", "{place} moved by {size}"},
+    {"joint_stuck", true, kCommand, "{joint} stuck", "{joint} stuck at {size}"},
+    {"joint_offset", true, kCommand, "{joint} off", "{joint} off by {size}"},
+    {"joint_gain", true, kFactor, "{joint} goes another way", "{joint} goes {size} times as far"},
+    {"other_signal", true, kUnknown, "{place} moved by {signal}", ""},
+    {"rigid", true, kPose, "{place} rigid", "{place} rigid, other by {size}"},
+    {"joint_nonlinear", true, kUnknown, "{place} moves along another curve", ""},
+    {"new_model", true, kUnknown, "{place} learned anew", ""},
+    {"geometry", true, kPose, "{place} bent or exchanged", "{place} bent or exchanged by {size}"},
+    {"drift", true, kRate, "{place} drifts", "{place} drifts by {size} a sample"},
+};
+
+/// The tag, marker, camera or edge that an event or a finding is about.
+template <class Told>
+std::string place_of(const Told& told) {
+  const std::string part = told.part >= 0 ? " of part " + std::to_string(told.part) : "";
+  if (told.tag >= 0) return "tag " + std::to_string(told.tag) + part;
+  if (told.cause == "camera_moved") return "camera";
+  if (told.from < 0) return "marker" + part;
+  return std::to_string(told.from) + "→" + std::to_string(told.to);
+}
+
+/// What is wrong there, and by how much.
 template <class Told>
 std::string what(const Told& told, const std::vector<Signal>& signals) {
-  using Kind = ChangeSize::Kind;
-  const std::string edge = std::to_string(told.from) + "→" + std::to_string(told.to);
+  const std::string place = place_of(told);
+  if (told.tag >= 0) {
+    const bool is_on_part = told.cause == "marker_moved";
+    return place + (is_on_part ? " elsewhere on it" : " not where it was, or lost");
+  }
+  const auto words = std::find_if(std::begin(kWords), std::end(kWords), [&told](const Words& w) {
+    return w.cause == told.cause && w.is_of_edge == (told.from >= 0);
+  });
+  if (words == std::end(kWords)) return place + " not as known";
   const ChangeSize& size = told.size;
-  const bool is_sized = size.kind != Kind::kUnknown;
+  const bool is_sized = size.kind != kUnknown && size.kind == words->kind;
   std::string signal;
   if (size.signal >= 0 && size.signal < std::ssize(signals))
     signal = signals[static_cast<std::size_t>(size.signal)].name;
-  const std::string joint = signal.empty() ? edge : signal + " (" + edge + ")";
-  const std::string by =
-      size.kind == Kind::kPose ? " by " + distance_and_angle(size) : std::string();
-  const std::string part = told.part >= 0 ? " of part " + std::to_string(told.part) : "";
-  if (told.tag >= 0) {
-    return "tag " + std::to_string(told.tag) + part +
-           (told.cause == "marker_moved" ? " elsewhere on it" : " not where it was, or lost");
-  }
-  if (told.cause == "marker_missing") return "marker" + part + " not seen";
-  if (told.cause == "marker_moved") return "marker" + part + " moved" + by;
-  if (told.cause == "camera_moved") return "camera moved" + by;
-  if (told.from < 0) return "marker" + part + " not as known";
-  if (told.cause == "joint_stuck")
-    return joint + " stuck" + (is_sized ? " at " + measured(size.amounts[0], size.sds[0], "") : "");
-  if (told.cause == "joint_offset")
-    return joint + " off" + (is_sized ? " by " + measured(size.amounts[0], size.sds[0], "") : "");
-  if (told.cause == "joint_gain")
-    return joint + " goes " +
-           (is_sized ? measured(size.amounts[0], size.sds[0], "") + " times as far"
-                     : "another way");
-  if (told.cause == "other_signal")
-    return edge + " moved by " + (signal.empty() ? "another signal" : signal);
-  if (told.cause == "rigid") return edge + " rigid" + (is_sized ? ", other" + by : "");
-  if (told.cause == "joint_nonlinear") return edge + " moves along another curve";
-  if (told.cause == "new_model") return edge + " learned anew";
-  if (told.cause == "geometry") return edge + " bent or exchanged" + by;
-  if (told.cause == "drift")
-    return edge + " drifts" +
-           (size.kind == Kind::kRate ? " by " + distance_and_angle(size) + " a sample" : "");
-  return edge + " not as known";
+  std::string text(is_sized ? words->sized : words->text);
+  const auto fill = [&text](std::string_view name, const std::string& value) {
+    if (const std::size_t at = text.find(name); at != std::string::npos)
+      text.replace(at, name.size(), value);
+  };
+  fill("{place}", place);
+  fill("{joint}", signal.empty() ? place : signal + " (" + place + ")");
+  fill("{signal}", signal.empty() ? "another signal" : signal);
+  if (is_sized) fill("{size}", text_of(size));
+  return text;
 }
 
 std::string since_text(std::int64_t since) {
@@ -87,24 +109,12 @@ std::string text_of(const AdaptationEvent& event, const std::vector<Signal>& sig
   if (event.num_samples > 0) evidence += " after " + counted(event.num_samples, "sample");
   if (event.margin > 0) evidence += ", by " + number(event.margin, 1) + " nats";
   const bool is_back = event.is_normal || event.tag >= 0;
-  // What it is now, not what it was.
-  const auto place = [&] {
-    AdaptationEvent bare = event;
-    bare.cause = "";
-    bare.size = {};
-    std::string text = what(bare, signals);
-    if (event.cause == "camera_moved") text = "camera not as known";
-    if (event.tag >= 0)
-      text = "tag " + std::to_string(event.tag) + " of part " + std::to_string(event.part);
-    const std::size_t end = text.find(" not as known");
-    return text.substr(0, end);
-  };
+  const std::string place = place_of(event);
   const std::string subject = what(event, signals) + since_text(event.since);
   switch (event.kind) {
     case Kind::kMismatch:
     case Kind::kMissing:
-      return (event.cause == "camera_moved" ? "camera not as known" + since_text(event.since)
-                                            : subject) +
+      return (place == "camera" ? "camera not as known" + since_text(event.since) : subject) +
              ": found" + evidence;
     case Kind::kDrift:
       return subject + ": found";
@@ -115,23 +125,23 @@ std::string text_of(const AdaptationEvent& event, const std::vector<Signal>& sig
       if (!event.is_normal) return subject + ": adopted instead" + evidence;
       [[fallthrough]];
     case Kind::kRestored:
-      return place() + (is_back ? ": back to normal" : ": as once before, adopted again") +
+      return place + (is_back ? ": back to normal" : ": as once before, adopted again") +
              since_text(event.since) + evidence;
     case Kind::kReverted:
       return what(event, signals) + ": undone";
     case Kind::kRecovered:
-      if (event.cause == "unexplained") return place() + ": back to normal by itself, unexplained";
-      if (event.cause == "drift") return place() + ": drifts no more, confirmed";
+      if (event.cause == "unexplained") return place + ": back to normal by itself, unexplained";
+      if (event.cause == "drift") return place + ": drifts no more, confirmed";
       if (event.cause == "marker_missing" || event.tag >= 0)
-        return place() + " is " + (event.tag >= 0 ? "where it was" : "seen") +
+        return place + " is " + (event.tag >= 0 ? "where it was" : "seen") +
                " again: back to normal";
       return (event.is_normal || event.cause == "stored"
-                  ? place() + (event.is_normal ? " normal" : " as once before") +
+                  ? place + (event.is_normal ? " normal" : " as once before") +
                         since_text(event.since)
                   : subject) +
              ": confirmed by " + counted(event.num_samples, "sample");
     case Kind::kProbeWanted:
-      return place() + ": " + event.cause + "? A probe is asked for";
+      return place + ": " + event.cause + "? A probe is asked for";
   }
   return "";
 }

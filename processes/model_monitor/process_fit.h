@@ -3,7 +3,7 @@
 #include <optional>
 
 #include "common/estimation/student_t.h"
-#include "processes/model_monitor/learned_edge.h"
+#include "processes/model_monitor/changes/learned.h"
 
 namespace bodyschema {
 

@@ -13,16 +13,12 @@ constexpr int kProbeCandidates = 200;
 constexpr double kAlike = 16.8;
 
 bool differ(const Edge& a, const Edge& b) {
-  if (!a.left.isApprox(b.left, 1e-9) || !a.right.isApprox(b.right, 1e-9) ||
-      a.joints.size() != b.joints.size() || !a.has_process_of(b))
-    return true;
-  for (std::size_t d = 0; d < a.joints.size(); ++d) {
-    const ScrewJoint &x = a.joints[d], &y = b.joints[d];
-    if (x.signal != y.signal || x.gain != y.gain || x.offset != y.offset || x.turn != y.turn ||
-        x.slide != y.slide || !x.X_after.isApprox(y.X_after, 1e-9))
-      return true;
-  }
-  return false;
+  const auto is_same_joint = [](const ScrewJoint& x, const ScrewJoint& y) {
+    return x.signal == y.signal && x.gain == y.gain && x.offset == y.offset && x.turn == y.turn &&
+           x.slide == y.slide && x.X_after.isApprox(y.X_after, 1e-9);
+  };
+  return !a.left.isApprox(b.left, 1e-9) || !a.right.isApprox(b.right, 1e-9) ||
+         !a.has_process_of(b) || !std::ranges::equal(a.joints, b.joints, is_same_joint);
 }
 
 /// The n-th of actions that lie evenly in the box of the limits: the additive recurrence of the
@@ -56,8 +52,8 @@ bool differ_at(const BodySchema& a, const BodySchema& b, int part) {
 
 bool is_same(const BodySchema& a, const BodySchema& b) {
   return a.X_CR.isApprox(b.X_CR, 1e-9) &&
-         std::equal(a.edges.begin(), a.edges.end(), b.edges.begin(), b.edges.end(),
-                    [](const Edge& x, const Edge& y) { return !differ(x, y); });
+         std::ranges::equal(a.edges, b.edges,
+                            [](const Edge& x, const Edge& y) { return !differ(x, y); });
 }
 
 bool is_alike_at(const BodySchema& a, const BodySchema& b, int part) {
@@ -92,8 +88,7 @@ bool is_close_at(const BodySchema& a, const BodySchema& b, int part, const Noise
 }
 
 bool is_alike(const BodySchema& a, const BodySchema& b) {
-  return std::all_of(a.parts.begin(), a.parts.end(),
-                     [&](int part) { return is_alike_at(a, b, part); });
+  return std::ranges::all_of(a.parts, [&](int part) { return is_alike_at(a, b, part); });
 }
 
 std::vector<Place> differences(const BodySchema& a, const BodySchema& b) {

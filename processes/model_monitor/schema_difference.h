@@ -3,7 +3,7 @@
 #include <vector>
 
 #include "common/schema/body_schema.h"
-#include "processes/model_monitor/body_change.h"
+#include "processes/model_monitor/changes/body_change.h"
 
 namespace bodyschema {
 

@@ -3,7 +3,7 @@
 #include <cstdint>
 #include <vector>
 
-#include "processes/model_monitor/body_change.h"
+#include "processes/model_monitor/changes/body_change.h"
 #include "processes/model_monitor/tree_filter.h"
 
 namespace bodyschema {

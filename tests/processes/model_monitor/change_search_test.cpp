@@ -2,53 +2,38 @@
 
 #include <gtest/gtest.h>
 
+#include "common/kinematics/screw_chain.h"
 #include "processes/model_monitor/schema_difference.h"
-#include "tests/support/broken_arm.h"
+#include "tests/processes/model_monitor/changed_arm.h"
 
 namespace bodyschema {
 namespace {
-
-using Form = BodyChange::Form;
 
 constexpr int kBent = 3, kOther = 7, kAlmost = 5;
 
 /// An arm that was once bent in two places; a third edge of that schema differs by less than is
 /// uncertain about it.
-class ChangeSearchTest : public testing::Test {
+class ChangeSearchTest : public ChangedArm {
  protected:
-  ChangeSearchTest() {
-    for (Edge& edge : schema_.edges)
-      edge.parameter_covariance =
-          1e-6 * Eigen::MatrixXd::Identity(6 + 8 * edge.joints.size(), 6 + 8 * edge.joints.size());
+  ChangeSearchTest() : ChangedArm(5) {
+    for (Edge& edge : schema_.edges) {
+      const int size = ScrewChainLayout::size(static_cast<int>(edge.joints.size()));
+      edge.parameter_covariance = 1e-6 * Eigen::MatrixXd::Identity(size, size);
+    }
     schema_.X_CR_covariance = 1e-6 * Matrix6d::Identity();
-    Eigen::VectorXd bend(6), little(6);
-    bend << 0.02, 0, 0, 0, 0.5, 0;
-    little << 5e-4, 0, 0, 0, 0, 0;
+    const Eigen::VectorXd bend = vector({0.02, 0, 0, 0, 0.5, 0}),
+                          little = vector({5e-4, 0, 0, 0, 0, 0});
     stored_ = changed(schema_, {Form::kRight, kBent}, bend);
     stored_ = changed(stored_, {Form::kRight, kOther}, bend);
     stored_ = changed(stored_, {Form::kRight, kAlmost}, little);
   }
 
-  std::vector<ActionPoseSample> observe(const BodySchema& body, int count) {
-    std::vector<ActionPoseSample> samples;
-    for (int t = 0; t < count; ++t) {
-      ActionPoseSample& sample = samples.emplace_back();
-      sample.sample_index = t;
-      sample.action.resize(7);
-      for (double& q : sample.action) q = test::uniform(rng_, -1.3, 1.3);
-      for (const auto& [part, X_RB] : body.predict_all(sample.action)) {
-        PartObservation& o = sample.parts.emplace_back();
-        o.part = part;
-        o.X_CB = body.X_CR * X_RB;
-        o.covariance = 1e-6 * Matrix6d::Identity();
-      }
-    }
-    return samples;
+  FoundChanges find(const std::vector<Place>& places) {
+    const auto samples = observe(stored_, 3, Vector6d::Constant(1e-3));
+    return find_changes(schema_, {stored_}, places, pointers(samples), {measurement_});
   }
 
-  test::Rng rng_{5};
-  BodySchema schema_ =
-      test::BrokenArm({test::Fault::kNone, "", 1}, test::Regime::kTagIso, 1, 3).engineered();
+  const Eigen::VectorXd move_ = vector({0.03, 0, 0.01, 0, 0, 0.3});
   BodySchema stored_;
 };
 
@@ -67,21 +52,14 @@ TEST_F(ChangeSearchTest, WhatIsAlikeIsNoDifference) {
 }
 
 TEST_F(ChangeSearchTest, AMarkerThatMovedIsOnePlaceAndNotTheEdgesOnEitherSide) {
-  Eigen::VectorXd move(6);
-  move << 0.03, 0, 0.01, 0, 0, 0.3;
-  const BodySchema moved = changed(schema_, {Form::kMarkerMoved, kAlmost}, move);
+  const BodySchema moved = changed(schema_, {Form::kMarkerMoved, kAlmost}, move_);
   EXPECT_EQ(differences(schema_, moved), (std::vector<Place>{{kAlmost, true}}));
   EXPECT_EQ(differences(schema_, stored_),
             (std::vector<Place>{{kBent, false}, {kAlmost, false}, {kOther, false}}));
 }
 
 TEST_F(ChangeSearchTest, OfTwoPlacesThatChangedBackBothAreRestoredAndNothingElse) {
-  const auto samples = observe(stored_, 3);
-  std::vector<const ActionPoseSample*> pointers;
-  for (const ActionPoseSample& sample : samples) pointers.push_back(&sample);
-  const ChangeSearch search{MeasurementModel{}};
-  const FoundChanges found =
-      find_changes(schema_, {stored_}, {{kOther, false}, {kBent, false}}, pointers, search);
+  const FoundChanges found = find({{kOther, false}, {kBent, false}});
   ASSERT_TRUE(found.best);
   EXPECT_EQ(found.best->fitted.change.form, Form::kStored);
   EXPECT_EQ(found.best->place, (Place{kOther, false}));  // suspected first
@@ -93,14 +71,8 @@ TEST_F(ChangeSearchTest, OfTwoPlacesThatChangedBackBothAreRestoredAndNothingElse
 }
 
 TEST_F(ChangeSearchTest, AMarkerThatIsBackIsOnePlaceThoughBothEdgesChange) {
-  Eigen::VectorXd move(6);
-  move << 0.03, 0, 0.01, 0, 0, 0.3;
-  stored_ = changed(schema_, {Form::kMarkerMoved, kAlmost}, move);
-  const auto samples = observe(stored_, 3);
-  std::vector<const ActionPoseSample*> pointers;
-  for (const ActionPoseSample& sample : samples) pointers.push_back(&sample);
-  const FoundChanges found = find_changes(schema_, {stored_}, {{kAlmost, false}}, pointers,
-                                          ChangeSearch{MeasurementModel{}});
+  stored_ = changed(schema_, {Form::kMarkerMoved, kAlmost}, move_);
+  const FoundChanges found = find({{kAlmost, false}});
   ASSERT_TRUE(found.best);
   EXPECT_EQ(found.best->fitted.change.form, Form::kStored);
   EXPECT_EQ(found.best->place, (Place{kAlmost, true}));

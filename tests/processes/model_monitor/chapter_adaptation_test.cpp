@@ -4,6 +4,7 @@
 
 #include <stdexcept>
 
+#include "processes/model_monitor/changes/learned.h"
 #include "tests/support/broken_arm.h"
 
 namespace bodyschema {

@@ -5,7 +5,7 @@
 #include <cmath>
 
 #include "common/geometry/angle.h"
-#include "processes/model_monitor/body_change.h"
+#include "processes/model_monitor/changes/body_change.h"
 #include "processes/model_monitor/change_fit.h"
 #include "tests/support/broken_arm.h"
 

@@ -1,4 +1,4 @@
-#include "processes/model_monitor/learned_edge.h"
+#include "processes/model_monitor/changes/learned.h"
 
 #include <gtest/gtest.h>
 
@@ -6,29 +6,25 @@
 #include <cmath>
 
 #include "processes/model_monitor/tree_filter.h"
-#include "tests/support/broken_arm.h"
+#include "tests/processes/model_monitor/changed_arm.h"
 
 namespace bodyschema {
 namespace {
 
-using Form = BodyChange::Form;
-using test::Rng;
-
-constexpr int kPart = 4, kOwn = 2, kOther = 5;
+constexpr int kOwn = 2, kOther = 5;
 constexpr double kOutlierRate = 0.04;
 
-class LearnedEdgeTest : public testing::Test {
+class LearnedEdgeTest : public ChangedArm {
  protected:
+  LearnedEdgeTest() : ChangedArm(5) {}
+
   /// With 3 mm and 1°.
   template <typename PoseOf>
-  std::vector<EdgeMeasurement> measure_pose(int count, PoseOf pose_of) {
-    const Noise noise = test::nominal_noise(test::Regime::kTagIso);
-    Vector6d sigma;
-    sigma << Eigen::Vector3d::Constant(noise.position_m),
-        Eigen::Vector3d::Constant(noise.rotation_rad);
-    std::vector<EdgeMeasurement> result;
+  std::vector<PlaceMeasurement> measure_pose(int count, PoseOf pose_of) {
+    const Vector6d sigma = nominal_sigma();
+    std::vector<PlaceMeasurement> result;
     for (int n = 0; n < count; ++n) {
-      EdgeMeasurement m;
+      PlaceMeasurement m;
       m.displacements.resize(7);
       for (double& q : m.displacements) q = test::uniform(rng_, -1.35, 1.35);
       m.z = pose_of(m.displacements) * exp(sigma.cwiseProduct(test::gaussian6(rng_)));
@@ -38,14 +34,14 @@ class LearnedEdgeTest : public testing::Test {
     return result;
   }
   template <typename Displacement>
-  std::vector<EdgeMeasurement> measure(int count, Displacement displacement) {
+  std::vector<PlaceMeasurement> measure(int count, Displacement displacement) {
     return measure_pose(count,
                         [&](const Eigen::VectorXd& theta) { return at(displacement(theta)); });
   }
   Pose at(double displacement) const {
     return edge().predict(Eigen::VectorXd::Constant(7, displacement));
   }
-  const Edge& edge() const { return *edge_to(schema_, kPart); }
+  const Edge& edge() const { return ChangedArm::edge(schema_); }
   /// Mean error of the position over the range [m].
   template <typename Displacement>
   double error(const Edge& learned, Displacement displacement) {
@@ -62,10 +58,6 @@ class LearnedEdgeTest : public testing::Test {
     }
     return sum / kActions;
   }
-
-  Rng rng_{5};
-  BodySchema schema_ =
-      test::BrokenArm({test::Fault::kNone, "", 1}, test::Regime::kTagIso, 1, 3).engineered();
 };
 
 double worn(const Eigen::VectorXd& q) { return q(kOwn) + 0.6 * std::sin(3 * q(kOwn)); }
@@ -133,7 +125,7 @@ TEST_F(LearnedEdgeTest, ItsEvidenceIsThePriorsShareAndTheLikelihoodAtThePeak) {
   const LearnedEdge& best = learned.front();
   ASSERT_EQ(best.edge.residual_gp->num_samples(), 15);
   double sum = best.log_prior;
-  for (const EdgeMeasurement& m : measurements) {
+  for (const PlaceMeasurement& m : measurements) {
     sum += std::log1p(-kOutlierRate) +
            log_normal_density(log(best.certain.predict(m.displacements).inverse() * m.z),
                               m.covariance);
@@ -146,7 +138,7 @@ TEST_F(LearnedEdgeTest, ItsEvidenceIsThePriorsShareAndTheLikelihoodAtThePeak) {
 
 TEST_F(LearnedEdgeTest, WhatIsElsewhereAtEverySampleIsNoFunction) {
   auto measurements = measure(30, [](const Eigen::VectorXd& q) { return q(kOwn); });
-  for (EdgeMeasurement& m : measurements) {
+  for (PlaceMeasurement& m : measurements) {
     Vector6d wobble = Vector6d::Zero();
     for (int c = 3; c < 6; ++c) wobble(c) = test::uniform(rng_, -1, 1);
     m.z = m.z * exp(wobble);
@@ -164,8 +156,7 @@ TEST_F(LearnedEdgeTest, AnEdgeThatHasAProcessIsOnlyLearnedAfresh) {
   const auto measurements = measure(30, worn);
   const auto first = learn_edge(schema_, kPart, measurements, kOutlierRate);
   ASSERT_FALSE(first.empty());
-  for (Edge& e : schema_.edges)
-    if (e.to == kPart) e = first.front().edge;
+  edge_at(&schema_, kPart) = first.front().edge;
   const auto inverse = [](const Eigen::VectorXd& q) { return -q(kOwn); };
   const auto again = learn_edge(schema_, kPart, measure(30, inverse), kOutlierRate);
   ASSERT_FALSE(again.empty());

@@ -1,30 +1,18 @@
-#include "processes/model_monitor/body_change.h"
+#include "processes/model_monitor/changes/body_change.h"
 
 #include <gtest/gtest.h>
 
 #include <cmath>
 #include <map>
 
-#include "tests/support/broken_arm.h"
+#include "tests/processes/model_monitor/changed_arm.h"
 
 namespace bodyschema {
 namespace {
 
-using Form = BodyChange::Form;
-using test::Rng;
-
-Pose transform(const Vector6d& theta) {
-  Pose T = Pose::Identity();
-  T.linear() = exp_so3(theta.tail<3>());
-  T.translation() = theta.head<3>();
-  return T;
-}
-
-class BodyChangeTest : public testing::Test {
+class BodyChangeTest : public ChangedArm {
  protected:
-  static constexpr int kPart = 4;
-
-  BodyChangeTest() {
+  BodyChangeTest() : ChangedArm(3) {
     for (Edge& edge : schema_.edges) edge.right = test::random_pose(rng_, 0.05, 0.1);
     schema_.edges[2].joints[0].gain = 1.2;
     schema_.edges[2].joints[0].slide = 0.05;
@@ -32,12 +20,6 @@ class BodyChangeTest : public testing::Test {
     action_(2) = -0.7;
   }
 
-  Eigen::VectorXd random_theta(const BodyChange& change) {
-    Eigen::VectorXd theta(change.size());
-    for (double& t : theta) t = 0.3 * test::gaussian(rng_);
-    return theta;
-  }
-  const Edge& edge(const BodySchema& schema) const { return *edge_to(schema, kPart); }
   Pose predict(const BodySchema& schema) const {
     return edge(schema).predict(schema.displacements(action_));
   }
@@ -50,9 +32,6 @@ class BodyChangeTest : public testing::Test {
     return e.left * exp(screw * displacement) * e.joints[0].X_after * e.right;
   }
 
-  Rng rng_{3};
-  BodySchema schema_ =
-      test::BrokenArm({test::Fault::kNone, "", 1}, test::Regime::kTagIso, 1, 3).engineered();
   Eigen::VectorXd action_;
 };
 
@@ -86,7 +65,7 @@ TEST_F(BodyChangeTest, ADisplacementMayBeAsLargeAsTheJointsGainMakesIt) {
   ScrewJoint& joint = schema_.edges[2].joints[0];
   joint.gain = 1;
   const auto displacement = [&](const BodyChange& change) {
-    const Eigen::VectorXd sigma = prior_sigma(change, schema_);
+    const Eigen::VectorXd sigma = prior_of(change, schema_).sigma;
     return sigma(sigma.size() - 1);
   };
   const std::vector<double> before{displacement(stuck), displacement(offset), displacement(gain)};
@@ -94,9 +73,22 @@ TEST_F(BodyChangeTest, ADisplacementMayBeAsLargeAsTheJointsGainMakesIt) {
   EXPECT_NEAR(displacement(stuck), 20 * before[0], 1e-12);
   EXPECT_NEAR(displacement(offset), 20 * before[1], 1e-12);
   EXPECT_NEAR(displacement(gain), 20 * before[2], 1e-12);
-  EXPECT_EQ(prior_sigma(gain, schema_)(0), 1);
+  EXPECT_EQ(prior_of(gain, schema_).sigma(0), 1);
   joint.gain = 0;  // stuck already: it may be moved by hand
   EXPECT_NEAR(displacement(stuck), before[0], 1e-12);
+}
+
+TEST_F(BodyChangeTest, APriorIsADensity) {
+  for (const BodyChange& change : {BodyChange{Form::kStuck, kPart},
+                                   {Form::kOffset, kPart},
+                                   {Form::kOffset, kPart, 0, 0, true}}) {
+    const ChangePrior prior = prior_of(change, schema_);
+    const double sigma = prior.sigma(0), reach = prior.is_uniform ? std::sqrt(3) : 8;
+    double integral = 0;
+    for (double t = -reach; t < reach; t += 1e-3)
+      integral += 1e-3 * sigma * std::exp(prior.log_density(prior.mean.array() + t * sigma));
+    EXPECT_NEAR(integral, std::sqrt(2 * M_PI), 3e-3);
+  }
 }
 
 TEST_F(BodyChangeTest, AMovedMarkerMovesItsPartAndNothingElse) {
@@ -126,9 +118,9 @@ TEST_F(BodyChangeTest, EveryPossibleChangeKeepsTheEdgesFlatAndTheOthersAsTheyWer
       const auto theta = schema_.displacements(action_);
       EXPECT_TRUE(with.edges[e].predict(theta).isApprox(schema_.edges[e].predict(theta), 1e-12));
     }
-    EXPECT_EQ(prior_sigma(change, schema_).size(), change.size());
-    EXPECT_EQ(prior_mean(change, schema_).size(), change.size());
-    EXPECT_TRUE((prior_sigma(change, schema_).array() > 0).all());
+    EXPECT_EQ(prior_of(change, schema_).sigma.size(), change.size());
+    EXPECT_EQ(prior_of(change, schema_).mean.size(), change.size());
+    EXPECT_TRUE((prior_of(change, schema_).sigma.array() > 0).all());
     EXPECT_LT(change.log_odds(), 0);
   }
   for (const Form form : {Form::kStuck, Form::kOffset, Form::kGain, Form::kLeft, Form::kRight,
@@ -172,14 +164,31 @@ TEST_F(BodyChangeTest, UncertaintyOfTheParametersIsThatOfThePrediction) {
 }
 
 TEST_F(BodyChangeTest, ACameraMoves) {
-  const BodyChange change{Form::kRight, schema_.root};
+  const BodyChange change{Form::kCamera, schema_.root};
   const Eigen::VectorXd theta = random_theta(change);
   const BodySchema with = changed(schema_, change, theta, Matrix6d::Identity() * 1e-4);
   EXPECT_TRUE(with.X_CR.isApprox(schema_.X_CR * transform(theta), 1e-12));
   EXPECT_GT(with.X_CR_covariance.trace(), schema_.X_CR_covariance.trace());
-  EXPECT_EQ(change.cause(schema_), "camera_moved");
-  EXPECT_EQ((BodyChange{Form::kRight, kPart}.cause(schema_)), "geometry");
-  EXPECT_EQ((BodyChange{Form::kStuck, kPart}.cause(schema_)), "joint_stuck");
+}
+
+TEST_F(BodyChangeTest, EveryFormSaysItsCauseAndItsParameters) {
+  constexpr const char* kCauses[] = {
+      "stored",       "joint_stuck",     "joint_offset", "joint_gain", "other_signal",
+      "geometry",     "geometry",        "geometry",     "rigid",      "marker_moved",
+      "camera_moved", "joint_nonlinear", "new_model",    "new_model"};
+  constexpr int kSizes[] = {0, 1, 1, 2, 0, 6, 6, 12, 6, 6, 6, 0, 0, 0};
+  for (std::size_t n = 0; n < std::size(kSizes); ++n) {
+    const BodyChange change{static_cast<Form>(n), kPart};
+    EXPECT_EQ(change.cause(schema_), kCauses[n]) << n;
+    EXPECT_EQ(change.size(), kSizes[n]) << n;
+  }
+  EXPECT_EQ((BodyChange{Form::kStored, schema_.root}.cause(schema_)), "camera_moved");
+  BodyChange learned{Form::kFresh, kPart};
+  learned.proximity = 0.5;
+  const double one_input = learned.log_odds();
+  learned.second_signal = 3;
+  EXPECT_DOUBLE_EQ(one_input, -13 + std::log(0.5));
+  EXPECT_DOUBLE_EQ(learned.log_odds(), one_input - 3);
 }
 
 TEST_F(BodyChangeTest, RefusesPlacesAndParametersThatAreNotThere) {

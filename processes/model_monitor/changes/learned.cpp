@@ -1,9 +1,11 @@
-#include "processes/model_monitor/learned_edge.h"
+#include "processes/model_monitor/changes/learned.h"
 
 #include <Eigen/Cholesky>
 #include <algorithm>
 #include <cmath>
+#include <functional>
 #include <limits>
+#include <set>
 
 #include "common/estimation/chi_square.h"
 #include "common/estimation/quantile.h"
@@ -30,7 +32,7 @@ double log_normal_constant(const Matrix6d& S) {
 
 /// ρ = Log(Δ⁻¹ z) of a measurement, in the place that the residual has in the edge, and its
 /// covariance.
-void residual_of(const Edge& edge, const EdgeMeasurement& m, Vector6d* rho, Matrix6d* covariance) {
+void residual_of(const Edge& edge, const PlaceMeasurement& m, Vector6d* rho, Matrix6d* covariance) {
   const Pose to_right = edge.predict(m.displacements) * edge.right.inverse();
   *rho = log(to_right.inverse() * m.z * edge.right.inverse());
   const Matrix6d A = right_jacobian_inverse(*rho) * adjoint(edge.right);
@@ -38,7 +40,7 @@ void residual_of(const Edge& edge, const EdgeMeasurement& m, Vector6d* rho, Matr
 }
 
 ProcessTargets all_coordinates(const BodyChange& change, const Edge& edge,
-                               const std::vector<EdgeMeasurement>& measurements) {
+                               const std::vector<PlaceMeasurement>& measurements) {
   const auto n = static_cast<Eigen::Index>(measurements.size());
   ProcessTargets targets;
   targets.change = change;
@@ -62,7 +64,7 @@ ProcessTargets all_coordinates(const BodyChange& change, const Edge& edge,
 
 /// Along the screw of the last joint alone.
 ProcessTargets one_displacement(const BodyChange& change, const Edge& edge,
-                                const std::vector<EdgeMeasurement>& measurements) {
+                                const std::vector<PlaceMeasurement>& measurements) {
   const auto n = static_cast<Eigen::Index>(measurements.size());
   const ScrewJoint& joint = edge.joints.back();
   const Vector6d along = displacement_twist(joint);
@@ -93,7 +95,7 @@ ProcessTargets one_displacement(const BodyChange& change, const Edge& edge,
 }
 
 Eigen::MatrixXd inputs_of(const std::vector<int>& signals,
-                          const std::vector<EdgeMeasurement>& measurements) {
+                          const std::vector<PlaceMeasurement>& measurements) {
   Eigen::MatrixXd x(signals.size(), measurements.size());
   for (std::size_t t = 0; t < measurements.size(); ++t)
     x.col(static_cast<Eigen::Index>(t)) = measurements[t].displacements(signals);
@@ -146,12 +148,12 @@ double screen(const ProcessTargets& targets, const Eigen::VectorXd& variances,
 }
 
 /// The measurement in the midst of all others.
-Pose middle_of(const std::vector<EdgeMeasurement>& measurements) {
+Pose middle_of(const std::vector<PlaceMeasurement>& measurements) {
   double least = std::numeric_limits<double>::infinity();
   Pose middle = Pose::Identity();
-  for (const EdgeMeasurement& a : measurements) {
+  for (const PlaceMeasurement& a : measurements) {
     double sum = 0;
-    for (const EdgeMeasurement& b : measurements) {
+    for (const PlaceMeasurement& b : measurements) {
       const Pose T = a.z.inverse() * b.z;
       sum += T.translation().norm() + 0.3 * rotation_angle(T);
     }
@@ -164,106 +166,75 @@ Pose middle_of(const std::vector<EdgeMeasurement>& measurements) {
 
 // The measurements as each form takes them that the edge may have; signals still open.
 std::vector<ProcessTargets> possible_forms(const Edge& old, int part,
-                                           const std::vector<EdgeMeasurement>& measurements) {
-  std::vector<ProcessTargets> forms;
-  const auto has_enough = [&](const BodyChange& change) {
-    return static_cast<int>(measurements.size()) >= change.fewest_samples();
-  };
-  const bool has_process = old.residual_gp || old.matrix_gp;
-  if (const BodyChange change{Form::kNonlinear, part};
-      has_enough(change) && !has_process && !old.joints.empty())
-    forms.push_back(one_displacement(change, old, measurements));
-  if (const BodyChange change{Form::kResidual, part};
-      has_enough(change) && !has_process && !old.joints.empty())
-    forms.push_back(all_coordinates(change, old, measurements));
-  if (const BodyChange change{Form::kFresh, part}; has_enough(change)) {
-    Edge fresh = old;
-    fresh.left = middle_of(measurements);
-    fresh.right = Pose::Identity();
-    fresh.joints.clear();
-    fresh.matrix_gp.reset();
-    fresh.residual_gp.reset();
-    fresh.parameter_covariance = Eigen::MatrixXd::Zero(6, 6);
-    forms.push_back(all_coordinates(change, fresh, measurements));
-  }
+                                           const std::vector<PlaceMeasurement>& measurements) {
   Eigen::VectorXd old_cost(measurements.size());
   for (std::size_t t = 0; t < measurements.size(); ++t) {
-    const EdgeMeasurement& m = measurements[t];
+    const PlaceMeasurement& m = measurements[t];
     const Vector6d r = log(old.predict(m.displacements).inverse() * m.z);
     old_cost(static_cast<Eigen::Index>(t)) = student_cost(r.dot(m.covariance.llt().solve(r)));
   }
-  for (ProcessTargets& targets : forms) targets.old_cost = old_cost;
+  const bool has_screws = !old.residual_gp && !old.matrix_gp && !old.joints.empty();
+  std::vector<ProcessTargets> forms;
+  for (const Form form : {Form::kNonlinear, Form::kResidual, Form::kFresh}) {
+    const BodyChange change{form, part};
+    const bool is_fresh = form == Form::kFresh;
+    if (std::ssize(measurements) < change.fewest_samples() || !(is_fresh || has_screws)) continue;
+    Edge edge = old;
+    if (is_fresh) make_constant(middle_of(measurements), &edge);
+    forms.push_back(form == Form::kNonlinear ? one_displacement(change, edge, measurements)
+                                             : all_coordinates(change, edge, measurements));
+    forms.back().old_cost = old_cost;
+  }
   return forms;
 }
 
-// Ranks the signals that a form's functions may be of, one or two, by one factorisation each.
-class SignalScreen {
- public:
-  SignalScreen(const BodySchema& base, const ProcessTargets& targets,
-               const Eigen::VectorXd& typical, const std::vector<int>& own,
-               const std::vector<EdgeMeasurement>& measurements)
-      : base_(base), targets_(targets), typical_(typical), own_(own), measurements_(measurements) {
-    const int num_signals = static_cast<int>(base.signals.size());
-    for (int s = 0; s < num_signals; ++s) look(s, -1);
-    sort();
-    std::vector<int> paired = own;
-    for (std::size_t k = 0; k < screened_.size() && k < kPaired; ++k)
-      if (const int s = screened_[k].second.signal; !contains(paired, s)) paired.push_back(s);
-    std::vector<int> done;
-    for (const int first : paired) {
-      done.push_back(first);
-      for (int s = 0; s < num_signals; ++s)
-        if (!contains(done, s)) look(std::min(first, s), std::max(first, s));
-    }
-    sort();
-  }
-
-  /// The form with each of the likeliest signal sets.
-  std::vector<BodyChange> likeliest() const {
-    std::vector<BodyChange> result;
-    for (std::size_t k = 0; k < screened_.size() && k < kFitted; ++k)
-      result.push_back(screened_[k].second);
-    return result;
-  }
-
- private:
-  static bool contains(const std::vector<int>& values, int value) {
-    return std::find(values.begin(), values.end(), value) != values.end();
-  }
-
-  void look(int first, int second) {
-    BodyChange change = targets_.change;
+// The form with each of the likeliest signal sets, of one or two, by one factorisation each.
+std::vector<BodyChange> likeliest(const BodySchema& base, const ProcessTargets& targets,
+                                  const Eigen::VectorXd& typical, const std::vector<int>& own,
+                                  const std::vector<PlaceMeasurement>& measurements) {
+  const int num_signals = static_cast<int>(base.signals.size());
+  std::vector<std::pair<double, BodyChange>> screened;  // by score
+  const auto contains = [](const std::vector<int>& values, int value) {
+    return std::ranges::find(values, value) != values.end();
+  };
+  const auto look = [&](int first, int second) {
+    BodyChange change = targets.change;
     change.signal = first;
     change.second_signal = second;
     const std::vector<int> signals = signals_of(change);
     // A refined model has its own signals in it as well.
     std::vector<int> all = signals;
-    if (change.form != Form::kFresh)
-      for (const int s : own_)
-        if (!contains(all, s)) all.push_back(s);
-    change.proximity = structural_proximity(all, own_);
+    if (change.form != Form::kFresh) all.insert(all.end(), own.begin(), own.end());
+    change.proximity = structural_proximity(all, own);
     const double score =
-        screen(targets_, typical_, inputs_of(signals, measurements_), half_ranges(base_, signals));
-    screened_.emplace_back(change.log_odds() + score, change);
+        screen(targets, typical, inputs_of(signals, measurements), half_ranges(base, signals));
+    screened.emplace_back(change.log_odds() + score, change);
+  };
+  const auto sort = [&screened] {
+    std::ranges::stable_sort(screened, std::greater(), [](const auto& s) { return s.first; });
+  };
+  for (int s = 0; s < num_signals; ++s) look(s, -1);
+  sort();
+  std::vector<int> paired = own;
+  for (std::size_t k = 0; k < screened.size() && k < kPaired; ++k)
+    if (const int s = screened[k].second.signal; !contains(paired, s)) paired.push_back(s);
+  std::vector<int> done;
+  for (const int first : paired) {
+    done.push_back(first);
+    for (int s = 0; s < num_signals; ++s)
+      if (!contains(done, s)) look(std::min(first, s), std::max(first, s));
   }
-
-  void sort() {
-    std::stable_sort(screened_.begin(), screened_.end(),
-                     [](const auto& a, const auto& b) { return a.first > b.first; });
-  }
-
-  const BodySchema& base_;
-  const ProcessTargets& targets_;
-  const Eigen::VectorXd& typical_;
-  const std::vector<int>& own_;
-  const std::vector<EdgeMeasurement>& measurements_;
-  std::vector<std::pair<double, BodyChange>> screened_;  // by score, the best first
-};
+  sort();
+  std::vector<BodyChange> result;
+  for (std::size_t k = 0; k < screened.size() && k < kFitted; ++k)
+    result.push_back(screened[k].second);
+  return result;
+}
 
 }  // namespace
 
 std::vector<LearnedEdge> learn_edge(const BodySchema& base, int part,
-                                    const std::vector<EdgeMeasurement>& measurements,
+                                    const std::vector<PlaceMeasurement>& measurements,
                                     double outlier_rate) {
   std::vector<LearnedEdge> result;
   const Edge* const old = edge_to(base, part);
@@ -271,8 +242,7 @@ std::vector<LearnedEdge> learn_edge(const BodySchema& base, int part,
   const std::vector<int> own = old->signals();
   for (ProcessTargets& targets : possible_forms(*old, part, measurements)) {
     const Eigen::VectorXd typical = typical_variances(targets);
-    for (const BodyChange& change :
-         SignalScreen(base, targets, typical, own, measurements).likeliest()) {
+    for (const BodyChange& change : likeliest(base, targets, typical, own, measurements)) {
       targets.change = change;
       const std::vector<int> signals = signals_of(change);
       auto learned = fit_process(targets, typical, inputs_of(signals, measurements),
@@ -280,10 +250,15 @@ std::vector<LearnedEdge> learn_edge(const BodySchema& base, int part,
       if (learned) result.push_back(std::move(*learned));
     }
   }
-  std::stable_sort(result.begin(), result.end(), [](const LearnedEdge& a, const LearnedEdge& b) {
-    return a.log_evidence > b.log_evidence;
-  });
+  std::ranges::stable_sort(result, std::greater(), &LearnedEdge::log_evidence);
   return result;
+}
+
+double structural_proximity(const std::vector<int>& signals, const std::vector<int>& other) {
+  const std::set<int> a(signals.begin(), signals.end()), b(other.begin(), other.end());
+  const auto num_shared = std::count_if(a.begin(), a.end(), [&](int s) { return b.contains(s); });
+  const auto num_all = std::ssize(a) + std::ssize(b) - num_shared;
+  return (2 + static_cast<double>(num_shared)) / (2 + static_cast<double>(num_all));
 }
 
 }  // namespace bodyschema

@@ -1,9 +1,10 @@
 #pragma once
 
 #include <cstdint>
+#include <functional>
 #include <vector>
 
-#include "processes/model_monitor/body_change.h"
+#include "processes/model_monitor/changes/body_change.h"
 
 namespace bodyschema {
 
@@ -28,16 +29,20 @@ struct ChangeSize {
 ChangeSize size_of(const BodySchema& schema, const BodyChange& change, const Eigen::VectorXd& theta,
                    const Eigen::MatrixXd& covariance);
 
-/// Of a drift by `rate` (log T a sample) of what follows `schema`'s edge to `part`; `left`: T
-/// stands before the edge's model.
-ChangeSize size_of_rate(const BodySchema& schema, int part, bool left, const Vector6d& rate,
-                        const Matrix6d& covariance);
-
 /// What became of a place, where no fit says it: by the two local models alone.
 struct FoundDifference {
   std::string cause;  ///< as BodyChange::cause()
   ChangeSize size;    ///< without standard deviations
 };
 FoundDifference difference_at(const BodySchema& before, const BodySchema& now, const Place& place);
+
+/// The size whose amounts are a function of θ, with their standard deviations.
+ChangeSize sized(ChangeSize::Kind kind, int signal,
+                 const std::function<std::vector<double>(const Eigen::VectorXd&)>& amounts,
+                 const Eigen::VectorXd& theta, const Eigen::MatrixXd& covariance);
+/// The pose that a change of the edge to `part` moves: the part in its parent; of the root, which
+/// hangs on nothing, the camera in the root.
+Pose pose_at(const BodySchema& schema, int part);
+std::vector<double> distance_and_angle(const Pose& T);
 
 }  // namespace bodyschema

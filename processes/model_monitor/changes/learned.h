@@ -2,17 +2,9 @@
 
 #include <vector>
 
-#include "common/schema/body_schema.h"
-#include "processes/model_monitor/body_change.h"
+#include "processes/model_monitor/changes/change_family.h"
 
 namespace bodyschema {
-
-/// The pose of one edge at one instant, as everything but its own model knows it.
-struct EdgeMeasurement {
-  Eigen::VectorXd displacements;  ///< of all signals
-  Pose z = Pose::Identity();
-  Matrix6d covariance = Matrix6d::Zero();  ///< right perturbation
-};
 
 /// A model of an edge that has a Gaussian process in it.
 struct LearnedEdge {
@@ -26,7 +18,7 @@ struct LearnedEdge {
   double log_evidence = 0;  ///< by the measurements alone
 };
 
-/// What an edge may be if it is none of the families of body_change.h, by its measurements alone:
+/// What an edge may be if no form with parameters explains it, by its measurements alone:
 ///   kNonlinear: a joint goes farther by g(Q),
 ///   kResidual:  Δ(θ) · Exp(ρ(Q)) with the model Δ that stood (refined prior),
 ///   kFresh:     X · Exp(ρ(Q)) with a constant X;
@@ -44,7 +36,11 @@ struct LearnedEdge {
 /// none if there are fewer measurements than BodyChange::fewest_samples(). An edge that has a
 /// process already is only learned afresh.
 std::vector<LearnedEdge> learn_edge(const BodySchema& base, int part,
-                                    const std::vector<EdgeMeasurement>& measurements,
+                                    const std::vector<PlaceMeasurement>& measurements,
                                     double outlier_rate);
+
+/// The ratio of shared to all nodes of the Bayesian networks of two local models of one pair of
+/// parts: (2 + |Q₁ ∩ Q₂|) / (2 + |Q₁ ∪ Q₂|).
+double structural_proximity(const std::vector<int>& signals, const std::vector<int>& other);
 
 }  // namespace bodyschema
