@@ -16,6 +16,14 @@ namespace {
 constexpr int kFewSightings = 6;
 constexpr double kCommonTurn = 0.65;
 
+// k + 1 poses determine an edge of k joints: its parameters are 6 (k + 1). Two more test it,
+// however many poses tell of the edges around it.
+bool has_poses_enough(const AcceptedModel& m, PairModels* pairs) {
+  const int num_poses = pairs->actions().blocks().count(
+      pairs->pair(m.part_i, m.part_j).frames, [](const PairFrame& frame) { return frame.sample; });
+  return num_poses >= m.model.num_joints + 3;
+}
+
 // Takes back the edge whose data tell least of some signal's joint, if that is not enough.
 bool withdraw_least_told(const ComponentTree& tree, PairModels* pairs, ModelForest* forest,
                          std::map<int, double>* joint_information) {
@@ -53,6 +61,13 @@ bool withdraw_least_told(const ComponentTree& tree, PairModels* pairs, ModelFore
 }  // namespace
 
 std::map<int, double> withdraw_untold_edges(PairModels* pairs, ModelForest* forest) {
+  std::vector<AcceptedModel> models = forest->models();
+  std::erase_if(models, [&](const AcceptedModel& m) {
+    if (has_poses_enough(m, pairs)) return false;
+    pairs->record(m.part_i, m.part_j).undecided.emplace(m.model.num_joints, 0.0);
+    return true;
+  });
+  forest->set_models(std::move(models));
   std::map<int, double> information;
   for (bool is_changed = true; is_changed;) {
     is_changed = false;

@@ -298,6 +298,15 @@ TEST(WithdrawUntoldEdges, AnEdgeThatTooFewPosesTellOfIsTakenBack) {
   }
 }
 
+TEST(WithdrawUntoldEdges, AnEdgeNeedsTwoPosesMoreThanDetermineIt) {
+  for (const int num_samples : {3, 4}) {
+    Case c(Case(1, num_samples, Regime::kFree).samples);
+    c.forest.add(c.fitted(1, 2, 1));
+    withdraw_untold_edges(&c.pairs, &c.forest);
+    EXPECT_EQ(c.forest.models().size(), num_samples == 4 ? 1u : 0u);
+  }
+}
+
 // Samples that repeat are surer than they are right: models are refuted that had joined the ends of
 // others. (Of 19 seeds the first that comes there.)
 TEST(SettleTrees, ASpareModelWhosePartsWerePartedSinceIsPassedOver) {
