@@ -59,7 +59,7 @@ struct Body {
   std::string origin;
 };
 
-std::optional<Body> body_of(const RunRecord& record, const Noise& systematic) {
+std::optional<Body> body_of(const RunRecord& record, const MeasurementModel& measurement) {
   if (const auto& accepted = record.watch().schema()) {
     return Body{*accepted, fmt::format("version {}, accepted by the monitor", accepted->version)};
   }
@@ -76,7 +76,8 @@ std::optional<Body> body_of(const RunRecord& record, const Noise& systematic) {
   if (recording.samples.empty()) return std::nullopt;
   recording.signals = observed_signals(recording.samples);
   LearnOptions options;
-  options.systematic = systematic;
+  options.systematic = measurement.systematic;
+  options.outlier_rate = measurement.outlier_rate;
   return Body{learn(recording.signals, recording.training(), options).schema,
               "learned for this report: the log holds no body schema"};
 }
@@ -98,7 +99,7 @@ class Page {
   explicit Page(const Report& report)
       : report_(report),
         record_(*report.record),
-        body_(body_of(*report.record, report.systematic)) {
+        body_(body_of(*report.record, report.measurement)) {
     if (!body_) return;
     held_out_ =
         fitting(record_.watch().held_out(body_->schema.body_since(body_->schema.last_sample_index)),

@@ -16,7 +16,7 @@ struct Report {
   std::string title;  ///< of the run
   const RunRecord* record = nullptr;
   std::map<std::filesystem::path, LogSummary> logs;
-  Noise systematic;  ///< of a part's pose, see systematic_of(); what the report learns with
+  MeasurementModel measurement;        ///< see measurement_of(); what the report learns with
   std::optional<int> end_effector;     ///< part id, where the rig's files are at hand
   std::optional<std::string> picture;  ///< a frame with the markers drawn in, JPEG bytes
   /// Seconds after which a browser loads the page again; for a run that goes on.

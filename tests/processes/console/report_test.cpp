@@ -443,7 +443,7 @@ TEST_F(ReportPageTest, SamplesAloneAreLearnedFrom) {
   const test::ObservationOptions options{.regime = test::Regime::kTag, .with_covariances = true};
   for (const ActionPoseSample& sample : test::babble(robot, 40, options, rng))
     hear(kSample, to_message(sample));
-  report_.systematic = kTagSystematic;
+  report_.measurement.systematic = kTagSystematic;
   const std::string html = page();
   EXPECT_NE(html.find("learned for this report"), std::string::npos);
   EXPECT_NE(html.find("The body is known: 5 parts hang together by 4 edges"), std::string::npos);
