@@ -317,7 +317,7 @@ Recording read_samples(const std::filesystem::path& file, const std::string& nam
   Recording recording;
   recording.is_log = true;
   recording.has_noise = true;
-  recording.systematic = systematic_of(name);
+  recording.measurement = measurement_of(name);
   LogReport report;
   const std::vector<sample_t> messages = read_log(file, kSample, &report);
   if (messages.empty()) {
@@ -486,10 +486,10 @@ Recording load_recording(const std::filesystem::path& file) {
   }
 }
 
-Noise systematic_of(const std::filesystem::path& log) {
+MeasurementModel measurement_of(const std::filesystem::path& log) {
   const std::filesystem::path rig = log.parent_path() / "config";
-  return std::filesystem::exists(rig / "noise.yaml") ? load_noise(rig).measurement.systematic
-                                                     : kTagSystematic;
+  if (std::filesystem::exists(rig / "noise.yaml")) return load_noise(rig).measurement;
+  return {.systematic = kTagSystematic};
 }
 
 }  // namespace bodyschema

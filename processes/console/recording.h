@@ -5,6 +5,7 @@
 #include <string>
 #include <vector>
 
+#include "common/estimation/measurement_model.h"
 #include "common/schema/body_schema.h"
 #include "common/schema/sample.h"
 
@@ -26,8 +27,8 @@ struct Recording {
   bool has_noise = false;
   /// Whether the poses are those of camera markers, recorded by our observer.
   bool is_log = false;
-  /// systematic_of() a log; 0 of a CSV.
-  Noise systematic;
+  /// measurement_of() a log; of a CSV without a systematic error.
+  MeasurementModel measurement;
   /// Damage of a log, for people: "" if it is whole. Samples before the damage were read.
   std::string damage;
   /// Oddities of a CSV, for people: read as they stand, but like another unit or order.
@@ -49,9 +50,9 @@ struct Recording {
 /// @throws RecordingError.
 Recording load_recording(const std::filesystem::path& file);
 
-/// MeasurementModel::systematic of a log: of the noise.yaml in `config/` beside it, as a run's
-/// folder has it, else kTagSystematic. @throws ConfigError.
-Noise systematic_of(const std::filesystem::path& log);
+/// The measurement model of the noise.yaml in `config/` beside a log, as a run's folder has it;
+/// else with kTagSystematic. @throws ConfigError.
+MeasurementModel measurement_of(const std::filesystem::path& log);
 
 /// The signals of samples of which nothing is known but their numbers: called q1, q2, …, with the
 /// range that they were seen in as limits. All samples have as many signals as the first.

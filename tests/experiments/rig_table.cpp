@@ -44,6 +44,7 @@ struct Row {
   int right = 0;
   int incomplete = 0;
   Errors errors, aligned;
+  Errors in_camera;  ///< of X_CR too
   /// Squared Mahalanobis distance of the truth from the end effector's pose in the root, and from
   /// X_CR, by the schema's covariances: χ²₆ if they are true.
   std::vector<double> end_effector_d2, root_d2;
@@ -171,6 +172,10 @@ std::vector<Row> measured(const std::filesystem::path& rig, bool is_ideal, const
       const JudgedErrors errors = judge(schema, seen.held_out, seen.truth);
       row.errors.add(errors.parts, end_effector);
       row.aligned.add(errors.aligned_parts, end_effector);
+      if (const PartObservation* root = seen.held_out.front().find(schema.root)) {
+        const Pose X_RS = root->X_CB.inverse() * schema.X_CR;  // it rests
+        row.in_camera.add(evaluate(schema, seen.held_out, {.X_RS = X_RS}), end_effector);
+      }
       if (errors.alignment) row.scale.push_back(errors.alignment->scale);
     }
   }
@@ -182,11 +187,12 @@ void print(const std::string& rig, const Options& options, const std::vector<Row
   for (std::size_t i = 0; i < options.at.size(); ++i) {
     std::printf("| %s | %d |", rig.c_str(), options.at[i]);
     if (ideal.empty()) {
-      std::printf(" | | | | | |");
+      std::printf(" | | | | | | | |");
     } else {
-      std::printf(" %d of %d | %d | %s | %s | %s |", ideal[i].right, options.num_seeds,
+      std::printf(" %d of %d | %d | %s | %s | %s | %s |", ideal[i].right, options.num_seeds,
                   ideal[i].incomplete, text(ideal[i].errors).c_str(),
-                  text(ideal[i].end_effector_d2).c_str(), text(ideal[i].root_d2).c_str());
+                  text(ideal[i].in_camera).c_str(), text(ideal[i].end_effector_d2).c_str(),
+                  text(ideal[i].root_d2).c_str());
     }
     if (honest.empty()) {
       std::printf(" | | | | | | | |");
@@ -228,12 +234,13 @@ int main(int argc, char** argv) {
   std::sort(options.at.begin(), options.at.end());
   if (!choice.empty()) options.choice = choice == "active" ? Choice::kActive : Choice::kRandom;
   std::printf(
-      "| rig | samples | ideal: right | incomplete | end effector, median | worst seed | d² of its "
-      "pose in the root, mean (95 %%) | d² of X_CR | with "
+      "| rig | samples | ideal: right | incomplete | end effector, median | worst seed | in "
+      "the camera's frame, median | worst seed | d² of its pose in the root, mean (95 %%) | d² of "
+      "X_CR | with "
       "calibration errors: right | incomplete | aligned, median | worst seed | unaligned, median | "
       "worst seed | scale | learning |\n"
       "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | "
-      "--- |\n");
+      "--- | --- | --- |\n");
   for (const std::filesystem::path rig : rigs) {
     std::vector<Row> ideal, honest;
     if (only != "honest") ideal = measured(rig, true, options);

@@ -1105,6 +1105,37 @@ TEST_F(BodyschemaProgramTest, MonitorSaysNothingOfAHealthyBody) {
   EXPECT_EQ(outcome.out, "");
 }
 
+TEST_F(BodyschemaProgramTest, TheRateOfOutliersIsThatOfTheRigBesideALog) {
+  test::Rng rng(76);
+  robot_ = test::chapter_robot("a", rng);
+  const test::ObservationOptions options{.regime = test::Regime::kTagIso, .with_covariances = true};
+  {
+    LogAppender log(folder_ / "run.lcmlog");
+    for (ActionPoseSample& sample : test::babble(robot_, 100, options, rng)) {
+      for (PartObservation& part : sample.parts)
+        if (test::uniform(rng, 0, 1) < 0.1) part.X_CB = test::random_pose(rng, 1, 2);
+      log.append(kSample, to_message(sample));
+    }
+  }
+  std::filesystem::create_directory(folder_ / "config");
+  std::map<std::string, std::size_t> num_edges, events;
+  for (const std::string rate : {"0.3", "0.001"}) {
+    write("config/noise.yaml",
+          "tag_position_m: 0\ntag_rotation_deg: 0\ntag_size_share: 0\n"
+          "systematic_position_m: 0.0005\nsystematic_rotation_deg: 0.1\n"
+          "corner_noise_px: 0.05\nsmall_tag_noise_px: 0.15\noutlier_rate: " +
+              rate + "\n");
+    std::vector<std::string> learn = {"learn", "run.lcmlog", "--json"};
+    if (!exists("schema.lcmlog")) learn.insert(learn.end(), {"--out", "schema.lcmlog"});
+    num_edges[rate] = run(learn).json()["edges"].size();
+    events[rate] = run({"monitor", "schema.lcmlog", "run.lcmlog", "--json"}).out.size();
+  }
+  EXPECT_EQ(num_edges["0.3"], 4U);
+  EXPECT_EQ(num_edges["0.001"], 0U);
+  EXPECT_EQ(events["0.3"], 0U);
+  EXPECT_GT(events["0.001"], 0U);
+}
+
 TEST_F(BodyschemaProgramTest, MonitorRefusesWhatDoesNotBelongTogether) {
   const auto csv = write_robot("robot.csv");
   run({"learn", csv, "--out", "schema.lcmlog"});

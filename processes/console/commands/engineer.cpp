@@ -23,8 +23,7 @@ struct EngineerArguments {
 void run_engineer(const EngineerArguments& arguments) {
   BodySchema schema = engineered_model(arguments.urdf, arguments.placement);
   const Recording recording = load_for(arguments.samples, schema);
-  MeasurementModel measurement;
-  measurement.systematic = recording.systematic;
+  MeasurementModel measurement = recording.measurement;
   if (!recording.has_noise) measurement.noise = Noise{0.001, 0.2 * kDegree};  // weights alone
   estimate_root_pose(recording.samples, measurement, &schema);
   schema.calibration_id = recording.samples.front().calibration_id;

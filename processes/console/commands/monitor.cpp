@@ -78,10 +78,8 @@ Json event_json(const AdaptationEvent& event, const ActionPoseSample& sample,
 AdaptationOptions options_of(const MonitorArguments& arguments, const Recording& recording,
                              const BodySchema& schema) {
   AdaptationOptions options;
-  if (recording.is_log) {
-    options.measurement.systematic = recording.systematic;  // as model_monitor has it
-    options.least_noise_scale = 1;
-  }
+  options.measurement = recording.measurement;
+  if (recording.is_log) options.least_noise_scale = 1;  // as model_monitor has it
   if (!arguments.noise.empty()) {
     options.measurement.noise = noise_given(arguments.noise);
   } else if (!recording.has_noise) {

@@ -70,7 +70,8 @@ void run_learn(const LearnArguments& arguments) {
   if (!arguments.noise.empty()) options.noise = noise_given(arguments.noise);
   const Recording recording = load(arguments.samples);
   options.root = arguments.root;
-  options.systematic = recording.systematic;
+  options.systematic = recording.measurement.systematic;
+  options.outlier_rate = recording.measurement.outlier_rate;
   check_out(arguments.out, {arguments.samples});
   const std::vector<ActionPoseSample> training = recording.training();
   if (options.root) {

@@ -85,9 +85,9 @@ class Source {
       if (grows_ && summary.damage.starts_with("is cut off")) summary.damage.clear();
     }
     try {
-      report.systematic = systematic_of(is_folder_ ? path_ / "run.lcmlog" : path_);
+      report.measurement = measurement_of(is_folder_ ? path_ / "run.lcmlog" : path_);
     } catch (const std::exception&) {
-      report.systematic = kTagSystematic;
+      report.measurement.systematic = kTagSystematic;
     }
     report.goes_on = grows_;
     report.reload_s = reload_s;

@@ -20,6 +20,7 @@
 #include "processes/console/report/run_sections.h"
 #include "processes/console/report/template.h"
 #include "processes/console/views/health_view.h"
+#include "processes/console/views/structure_view.h"
 #include "processes/structure_learner/learn.h"
 
 namespace bodyschema {
@@ -46,6 +47,8 @@ std::string base64(const std::string& bytes) {
 std::string millimetres(double m) { return fmt::format("{:.2f} mm", m * 1e3); }
 std::string degrees(double rad) { return fmt::format("{:.2f}°", rad / kDegree); }
 
+std::string edge_name(int from, int to) { return fmt::format("{} → {}", from, to); }
+
 std::string names_of(const BodySchema& schema, const std::vector<int>& signals) {
   std::vector<std::string> names;
   for (const int signal : signals)
@@ -59,7 +62,7 @@ struct Body {
   std::string origin;
 };
 
-std::optional<Body> body_of(const RunRecord& record, const Noise& systematic) {
+std::optional<Body> body_of(const RunRecord& record, const MeasurementModel& measurement) {
   if (const auto& accepted = record.watch().schema()) {
     return Body{*accepted, fmt::format("version {}, accepted by the monitor", accepted->version)};
   }
@@ -76,7 +79,8 @@ std::optional<Body> body_of(const RunRecord& record, const Noise& systematic) {
   if (recording.samples.empty()) return std::nullopt;
   recording.signals = observed_signals(recording.samples);
   LearnOptions options;
-  options.systematic = systematic;
+  options.systematic = measurement.systematic;
+  options.outlier_rate = measurement.outlier_rate;
   return Body{learn(recording.signals, recording.training(), options).schema,
               "learned for this report: the log holds no body schema"};
 }
@@ -98,7 +102,7 @@ class Page {
   explicit Page(const Report& report)
       : report_(report),
         record_(*report.record),
-        body_(body_of(*report.record, report.systematic)) {
+        body_(body_of(*report.record, report.measurement)) {
     if (!body_) return;
     held_out_ =
         fitting(record_.watch().held_out(body_->schema.body_since(body_->schema.last_sample_index)),
@@ -263,9 +267,36 @@ class Page {
             {"origin", body_->origin},
             {"is_complete", schema.complete},
             {"edges", table(std::move(edges))},
+            {"deviations", deviations(schema_json(schema))},
             {"unconnected", table(std::move(unconnected))},
             {"unused", names_of(schema, schema.unused_signals())},
             {"undecided", names_of(schema, schema.undecided_signals)}};
+  }
+
+  /// The standard deviations in `schema`, from schema_json(), in mm and degrees.
+  static Json deviations(const Json& schema) {
+    const auto number = [](const Json& sd, double unit) {
+      return sd.is_null() ? "–" : fmt::format("{:.2g}", sd.get<double>() * unit);
+    };
+    const auto axes = [&](const Json& sd, double unit) {
+      return fmt::format("{} {} {}", number(sd[0], unit), number(sd[1], unit), number(sd[2], unit));
+    };
+    Json rows = Json::array();
+    for (const Json& edge : schema["edges"]) {
+      for (const Json& joint : edge["joints"]) {
+        const Json& sd = joint["sd"];
+        if (sd.is_null()) continue;
+        rows.push_back({{"edge", edge_name(edge["from"], edge["to"])},
+                        {"signal", joint["signal"]},
+                        {"numbers",
+                         {number(sd["axis_position_m"], 1e3), number(sd["axis_tilt_deg"], 1),
+                          number(sd["displacement_m"], 1e3), number(sd["displacement_deg"], 1),
+                          number(sd["slide_m"], 1e3), number(sd["turn_rad"], 1 / kDegree)}}});
+      }
+    }
+    return {{"root", axes(schema["X_CR"]["position_sd_m"], 1e3) + " mm, " +
+                         axes(schema["X_CR"]["rotation_sd_deg"], 1) + "°"},
+            {"joints", table(std::move(rows))}};
   }
 
   Json edge_row(const Edge& edge) const {
@@ -282,7 +313,7 @@ class Page {
     }
     const Noise sd =
         deviations_of(edge.prediction_covariance(schema.displacements(mid_range(schema.signals))));
-    return {{"edge", fmt::format("{} → {}", edge.from, edge.to)},
+    return {{"edge", edge_name(edge.from, edge.to)},
             {"kind", edge.kind()},
             {"signals", names_of(schema, edge.signals())},
             {"numbers",

@@ -16,7 +16,7 @@ struct Report {
   std::string title;  ///< of the run
   const RunRecord* record = nullptr;
   std::map<std::filesystem::path, LogSummary> logs;
-  Noise systematic;  ///< of a part's pose, see systematic_of(); what the report learns with
+  MeasurementModel measurement;        ///< see measurement_of(); what the report learns with
   std::optional<int> end_effector;     ///< part id, where the rig's files are at hand
   std::optional<std::string> picture;  ///< a frame with the markers drawn in, JPEG bytes
   bool goes_on = false;                ///< its group runs, logs may end in the middle of an event
