@@ -35,7 +35,8 @@ struct MarkerEstimatorConfig {
 /// Finds the rig's tags in an image and estimates their poses X_CM in the camera's frame: both
 /// hypotheses of a planar marker, each refined to its local minimum, and the covariance of the
 /// better one. Corners are fitted to the grey values of the tag (refine_corners()), whose residuals
-/// give their noise; if that is refused, AprilTag's corners with the configured noise replace them.
+/// give their noise; if that is refused, AprilTag's corners replace them, with the configured noise
+/// and what the blur adds.
 /// It knows ids and sizes, not the parts that carry the markers. If several tags have one id, the
 /// one with the largest decision margin counts among those that pass all gates.
 ///
