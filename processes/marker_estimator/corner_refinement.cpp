@@ -849,8 +849,7 @@ Eigen::Matrix<double, 8, kGeometry> Refiner::corner_jacobian() const {
 
 CornerRefinement Refiner::run(const std::vector<Eigen::Vector2d>& corners_px) {
   CornerRefinement answer = fit(corners_px);
-  const bool is_settled = answer.refusal != CornerRefusal::kNotFound;
-  answer.blur_cells = is_settled ? blur_cells_ : std::max<double>(blur_cells_, Pattern::kWide);
+  answer.blur_cells = blur_cells_;
   answer.num_evaluations = num_visited_;
   answer.misfit = misfit_;
   return answer;
@@ -1041,12 +1040,14 @@ CornerRefinement refine_corners(const cv::Mat& grey, const Lens& lens, const Tag
 Matrix8d detected_covariance_px2(const CornerNoise& noise, const TagCells& cells,
                                  const std::vector<Eigen::Vector2d>& corners_px,
                                  const CornerRefinement& refused) {
-  // Of a cell, for either. Measured: ./run experiment corner_error --only blur motion, AprilTag's
-  // d² where refused; over sides of 25 to 80 px and tilts up to 55° its mean is 8, its median 6.5.
-  constexpr double kPull = 0.5;
-  const double cell_px = shortest_side_px(corners_px) / cells.border;
-  const double pull_px =
-      kPull * cell_px * std::hypot(std::pow(refused.blur_cells, 3), refused.misfit);
+  // Shares of a cell. Measured: ./run experiment corner_error --only blur motion, AprilTag's d²
+  // where refused; the last of tags with a tenth to a half of an edge hidden: 0.05 to 0.2 cells.
+  constexpr double kBlurPull = 0.5, kMisfitPull = 0.5, kHiddenPull = 0.12;
+  const bool is_hidden =
+      refused.refusal == CornerRefusal::kCovered || refused.refusal == CornerRefusal::kNotFound;
+  const double pull = std::hypot(kBlurPull * std::pow(refused.blur_cells, 3),
+                                 kMisfitPull * refused.misfit, is_hidden ? kHiddenPull : 0);
+  const double pull_px = pull * shortest_side_px(corners_px) / cells.border;
   const double sigma_px = std::hypot(noise.sigma_px(corners_px), pull_px);
   return sigma_px * sigma_px * Matrix8d::Identity();
 }
