@@ -80,6 +80,7 @@ ControllerConfig ControllerConfig::load(const std::filesystem::path& file) {
   const Yaml yaml = Yaml::load(file);
   ControllerConfig config;
   config.signals = load_signals(file.parent_path()).signals;
+  config.measurement = load_noise(file.parent_path()).measurement;
   config.reached_m = yaml.number("reached_m", 1e-6, 1);
   config.max_step = yaml.number("max_step", 1e-3, 1);
   config.slow_step = yaml.number("slow_step", 1e-3, config.max_step);
@@ -278,13 +279,13 @@ void Controller::observe(const sample_t& message) {
   Pose X_CR = schema_->X_CR;
   if (const PartObservation* root = sample.find(schema_->root)) {
     const Vector6d off = log(X_CR.inverse() * root->X_CB);
-    const Matrix6d covariance = root->covariance + schema_->X_CR_covariance;
+    const Matrix6d covariance = config_.measurement.covariance(*root) + schema_->X_CR_covariance;
     if (squared_mahalanobis(off, covariance) > kMovedCamera) X_CR = root->X_CB;
   }
   observed_offset_ = position_of(target_) - X_CR.inverse() * part->X_CB.translation();
   observed_error_m_ = observed_offset_.norm();
   const Eigen::Matrix3d R_RB = (X_CR.inverse() * part->X_CB).linear();
-  Eigen::Matrix3d covariance = part->covariance.topLeftCorner<3, 3>();
+  Eigen::Matrix3d covariance = config_.measurement.covariance(*part).topLeftCorner<3, 3>();
   if (const auto X_RB = schema_->predict(schema_->root, part->part, sample.action))
     covariance += X_RB->covariance.topLeftCorner<3, 3>();
   covariance = (R_RB * covariance * R_RB.transpose()).eval();

@@ -24,6 +24,7 @@ namespace bodyschema {
 
 struct ControllerConfig {
   std::vector<Signal> signals;
+  MeasurementModel measurement;  ///< of noise.yaml
   InverseKinematicsOptions inverse_kinematics;
   double reached_m = 0;  ///< a target is reached this near, and out of reach if none comes as near
   double max_step = 0;   ///< of one action, share of each signal's range
@@ -41,7 +42,7 @@ struct ControllerConfig {
   std::int64_t max_marker_poses_silence_us = 0;
   std::int64_t max_body_schema_silence_us = 0;
 
-  /// Reads controller.yaml and signals.yaml beside it. @throws ConfigError.
+  /// Reads controller.yaml, and signals.yaml and noise.yaml beside it. @throws ConfigError.
   static ControllerConfig load(const std::filesystem::path& file);
 };
 
@@ -192,8 +193,8 @@ class Controller {
   Eigen::Vector3d observed_offset_ = Eigen::Vector3d::Zero();  ///< target minus seen position, in R
   bool is_observation_sure_ = false;  ///< unambiguous, and not to be explained by its covariance
   Stopwatch guard_, taking_, quiet_, keep_;
-  Stopwatch idle_;  ///< its own arm, but nothing is sent or awaited
-  Stopwatch lent_;  ///< without a new SAMPLE
+  Stopwatch idle_;                  ///< its own arm, but nothing is sent or awaited
+  Stopwatch lent_;                  ///< without a new SAMPLE
   bool is_lent_for_probe_ = false;  ///< not because an edge is INVALID
   int num_lent_samples_ = 0;
   std::int64_t probed_ = -1;  ///< probes wanted up to this sample are made, or given up

@@ -48,6 +48,9 @@ const char* name_of(CornerRefusal refusal);
 struct CornerRefinement {
   std::optional<RefinedCorners> corners;  ///< nothing if refused
   CornerRefusal refusal = CornerRefusal::kNone;
+  // Of the last iteration, 0 if there was none:
+  double blur_cells = 0;  ///< standard deviation along the side where it is larger [cells]
+  double misfit = 0;      ///< mean amount of a residual, share of the contrast
   std::int64_t num_evaluations = 0;  ///< of the model at a pixel, over all iterations: the work
 };
 
@@ -69,5 +72,14 @@ struct CornerRefinement {
 /// @throws std::invalid_argument if the image is not of that type, or `cells` is no tag.
 CornerRefinement refine_corners(const cv::Mat& grey, const Lens& lens, const TagCells& cells,
                                 const std::vector<Eigen::Vector2d>& corners_px);
+
+/// Covariance of AprilTag's own corners (x0, y0, …) [px²] of a tag that was refused, `noise` and
+/// more: blur mixes the cells beside an edge and rounds its ends, which pulls AprilTag's lines by a
+/// share of a cell that goes with its third power. What is no Gaussian blur, as a long motion,
+/// shows in the misfit. Where the fit is refused as covered or does not settle, no measure tells
+/// how far the lines are pulled: a constant share of a cell.
+Matrix8d detected_covariance_px2(const CornerNoise& noise, const TagCells& cells,
+                                 const std::vector<Eigen::Vector2d>& corners_px,
+                                 const CornerRefinement& refused);
 
 }  // namespace bodyschema

@@ -156,13 +156,14 @@ std::optional<marker_pose_t> MarkerEstimator::estimate(const cv::Mat& grey,
   std::vector<ImagePoint> corners;
   if (shortest_side_px(detection.corners_px) < config_.min_side_px) return refuse("tag too small");
   std::vector<Eigen::Vector2d> corners_px = detection.corners_px;
-  Matrix8d covariance_px2 = std::pow(config_.noise.sigma_px(corners_px), 2) * Matrix8d::Identity();
-  const CornerRefinement refinement =
-      refine_corners(grey, *lens_, detector_.cells(detection.id), corners_px);
+  Matrix8d covariance_px2;
+  const TagCells& cells = detector_.cells(detection.id);
+  const CornerRefinement refinement = refine_corners(grey, *lens_, cells, corners_px);
   if (refinement.corners) {
     corners_px = refinement.corners->corners_px;
     covariance_px2 = refinement.corners->covariance_px2;
   } else {
+    covariance_px2 = detected_covariance_px2(config_.noise, cells, corners_px, refinement);
     ++counters_[std::string("corners not refined: ") + name_of(refinement.refusal)];
   }
   const double sigma = sigma_px(covariance_px2);

@@ -35,9 +35,10 @@ struct MarkerEstimatorConfig {
 /// Finds the rig's tags in an image and estimates their poses X_CM in the camera's frame: both
 /// hypotheses of a planar marker, each refined to its local minimum, and the covariance of the
 /// better one. Corners are fitted to the grey values of the tag (refine_corners()), whose residuals
-/// give their noise; if that is refused, AprilTag's corners with the configured noise replace them.
-/// It knows ids and sizes, not the parts that carry the markers. If several tags have one id, the
-/// one with the largest decision margin counts among those that pass all gates.
+/// give their noise; if that is refused, AprilTag's corners replace them, with the configured noise
+/// and what blur or a cover adds. It knows ids and sizes, not the parts that carry the markers. If
+/// several tags have one id, the one with the largest decision margin counts among those that pass
+/// all gates.
 ///
 /// Before the first CAMERA_INFO it answers nothing, since pixels mean no poses yet. Afterwards it
 /// answers every readable image of the calibrated size, with an empty list if no marker is seen. An

@@ -39,7 +39,8 @@ int main(int argc, char** argv) {
     for (const int num_samples : nums_samples) {
       int num_right = 0, num_incomplete = 0, num_wrong = 0, num_complete = 0;
       for (int r = 0; r < num_robots; ++r) {
-        ImperfectRobot robot(2 + r % 6, r % 2 == 0, imperfection, static_cast<std::uint64_t>(r));
+        ImperfectRobot robot(2 + r % 6, r / 6 % 2 == 0, imperfection,
+                             static_cast<std::uint64_t>(r));
         LearnOptions options;
         options.root = 1;
         if (!is_noise_estimated) options.noise = Noise{0.003, 1 * kDegree};

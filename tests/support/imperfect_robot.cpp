@@ -193,7 +193,8 @@ ActionPoseSample ImperfectRobot::go(const Eigen::VectorXd& action) {
       white *= std::sqrt((is_.student_nu - 2) / chi2);
     }
     const double rho = is_.correlation;
-    link.noise = rho * link.noise + std::sqrt(1 - rho * rho) * white;
+    link.noise =
+        sample.sample_index == 0 ? white : rho * link.noise + std::sqrt(1 - rho * rho) * white;
     const double luck = uniform(rng_, 0, 1);
     if (luck < is_.missing_share) continue;
 

@@ -50,6 +50,21 @@ TEST(ImperfectRobotTest, APerfectOneIsSeenWithItsNoise) {
   EXPECT_NEAR(spread.rotation_rad, 1 * kDegree, 0.05 * kDegree);
 }
 
+TEST(ImperfectRobotTest, CorrelatedNoiseIsAsLargeAtFirstAsLater) {
+  double squares = 0;
+  constexpr int kNumRobots = 100, kNumParts = 3;
+  for (int seed = 0; seed < kNumRobots; ++seed) {
+    ImperfectRobot robot(kNumParts - 1, true, with(&Imperfection::correlation, 0.9),
+                         static_cast<std::uint64_t>(seed));
+    const ActionPoseSample sample = robot.go(robot.random_action());
+    for (int n = 0; n < kNumParts; ++n) {
+      const Eigen::Isometry3d X = robot.poses()[n].inverse() * sample.parts.at(n).X_CB;
+      squares += std::pow(Eigen::AngleAxisd(X.linear()).angle(), 2) / 3;
+    }
+  }
+  EXPECT_NEAR(std::sqrt(squares / (kNumRobots * kNumParts)), 1 * kDegree, 0.1 * kDegree);
+}
+
 TEST(ImperfectRobotTest, ASeedIsARobot) {
   ImperfectRobot a(5, false, {}, 7), b(5, false, {}, 7), c(5, false, {}, 8);
   const auto at_a = a.babble(3), at_b = b.babble(3), at_c = c.babble(3);

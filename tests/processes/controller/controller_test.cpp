@@ -1237,6 +1237,20 @@ TEST(ControllerTest, WhatIsSeenUnsurelyCorrectsNothing) {
   }
 }
 
+TEST(ControllerTest, ASystematicErrorNeitherMovesTheCameraNorCorrects) {
+  ControllerConfig config = test_config();
+  config.measurement.systematic = {0.02, 2 * kDegree};
+  Bench bench(config);
+  bench.X_CC_moved.translation() = Eigen::Vector3d(0.02, 0, 0);
+  bench.bend_m = Eigen::Vector3d(0.01, -0.005, 0);
+  bench.start();
+  bench.give(position_target(0, kNear));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED));
+  const Eigen::Vector3d seen_off = bench.X_CC_moved.translation() + bench.bend_m;
+  EXPECT_NEAR(bench.status.observed_error_m, seen_off.norm(), 1e-3);
+  EXPECT_LT(bench.status.predicted_error_m, 1e-4);
+}
+
 TEST(ControllerTest, ACameraThatWasMovedIsSeenByTheRoot) {
   Bench bench;
   bench.X_CC_moved.translation() = Eigen::Vector3d(0.2, 0, 0.1);
@@ -1436,6 +1450,7 @@ TEST(ControllerTest, TheConfigurationIsReadInSiUnits) {
   EXPECT_EQ(config.resend_us, 1 * kSecond);
   EXPECT_EQ(config.max_marker_poses_silence_us, 2 * kSecond);
   EXPECT_LT(config.slow_step, config.max_step);
+  EXPECT_NEAR(config.measurement.systematic.rotation_rad, 0.3 * kDegree, 1e-12);
 }
 
 // Anything in any order: Bench asserts that every message makes sense, that nothing moves an arm
