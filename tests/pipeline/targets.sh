@@ -28,7 +28,7 @@ grep -q "first: ./run resume" "$work/console.txt" || fail "a halt is not said"
 console resume || fail "resume"
 console hold || fail "hold"
 # The program itself, not the setpriv that became it: its command line begins with its path.
-controller=$("$source/run" exec pgrep -f "^$build/bin/controller ")
+controller=$("$source/run" exec pgrep -f "^$build/bin/controller .*$work/")
 kill -KILL "$controller"
 console hold || fail "no hold after the restart"
 grep -q "held as before the restart" "$work/logs/current/run.lcmlog.00" || fail "the hold did not survive a kill"
@@ -36,7 +36,7 @@ console release || fail "release"
 
 position=$(awk -F'|' '/reached/ {print $3; exit}' "$work/targets.txt")
 elsewhere=$(awk -F'|' '/reached/ && ++n == 2 {print $3; exit}' "$work/targets.txt")
-observer=$("$source/run" exec pgrep -f "^$build/bin/observer ")
+observer=$("$source/run" exec pgrep -f "^$build/bin/observer .*$work/")
 
 # Without a follower the target is dropped and the arm held, also once its SAMPLE has come.
 state() { "$source/run" exec bodyschema status --json | python3 -c 'import json, sys
@@ -73,7 +73,7 @@ for _ in $(seq 100); do
   grep -q "waiting for the SAMPLE of action" "$work/middle.txt" && break
   read -rt 0.1 <> <(:) || true
 done
-kill -KILL "$("$source/run" exec pgrep -f "^$build/bin/controller ")"
+kill -KILL "$("$source/run" exec pgrep -f "^$build/bin/controller .*$work/")"
 kill -CONT "$observer"
 status=0
 wait "$follower" || status=$?
