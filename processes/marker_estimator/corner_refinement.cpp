@@ -1043,9 +1043,11 @@ Matrix8d detected_covariance_px2(const CornerNoise& noise, const TagCells& cells
   // Shares of a cell. Measured: ./run experiment corner_error --only blur motion, AprilTag's d²
   // where refused; the last of tags with a tenth to a half of an edge hidden: 0.05 to 0.2 cells.
   constexpr double kBlurPull = 0.5, kMisfitPull = 0.5, kHiddenPull = 0.12;
+  // A blur beyond that was no estimate: the tag was found.
+  constexpr double kMostBlur = 1;
   const bool is_hidden =
       refused.refusal == CornerRefusal::kCovered || refused.refusal == CornerRefusal::kNotFound;
-  const double pull = std::hypot(kBlurPull * std::pow(refused.blur_cells, 3),
+  const double pull = std::hypot(kBlurPull * std::pow(std::min(refused.blur_cells, kMostBlur), 3),
                                  kMisfitPull * refused.misfit, is_hidden ? kHiddenPull : 0);
   const double pull_px = pull * shortest_side_px(corners_px) / cells.border;
   const double sigma_px = std::hypot(noise.sigma_px(corners_px), pull_px);

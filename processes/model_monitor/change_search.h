@@ -3,8 +3,8 @@
 #include <optional>
 #include <vector>
 
-#include "processes/model_monitor/changes/body_change.h"
 #include "processes/model_monitor/change_fit.h"
+#include "processes/model_monitor/changes/body_change.h"
 
 namespace bodyschema {
 

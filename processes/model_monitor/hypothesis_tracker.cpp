@@ -381,13 +381,16 @@ void HypothesisTracker::detect(std::int64_t now, std::vector<AdaptationEvent>* e
 }
 
 void HypothesisTracker::drop_stale() {
-  // One change more is pursued while what it was proposed for is suspected: what a model is off by
-  // from the start adds up to evidence of a change, too.
+  // One change more is pursued while something is suspected, and since it began: what a model is
+  // off by from the start adds up to evidence of a change, too. (An edge is learned from all
+  // samples of the trouble, so its change is older.)
   const std::size_t most = changes().size();
   const bool is_quiet = suspects().empty();
   const std::int64_t since = tests_->highest().cusum.since;
   std::erase_if(beam_, [&](const Hypothesis& h) {
-    return h.changes.size() > most && (is_quiet || h.changes.back().since < since);
+    if (h.changes.size() <= most) return false;
+    const Change& newest = h.changes.back();
+    return is_quiet || (newest.since < since && !newest.what.fitted.change.is_learned());
   });
   if (is_quiet && most == 0) mismatched_.clear();
 }

@@ -153,8 +153,8 @@ class HypothesisTracker {
   std::vector<BodySchema> history_;  ///< the first is pinned
   std::optional<Maturing> maturing_;
   std::optional<Place> detected_;
-  bool is_told_ = false;  ///< that and where something was detected
-  double unreported_ = 0;     ///< the highest CUSUM when it was not told yet
+  bool is_told_ = false;   ///< that and where something was detected
+  double unreported_ = 0;  ///< CUSUM at the latest detection [nats]
   std::int64_t last_mismatch_ = -1000;
   std::map<Place, std::int64_t> mismatched_;  ///< places in the present trouble → the newest
   std::vector<std::pair<Replacement, Replacement>> asked_;  ///< a probe was wanted for

@@ -82,7 +82,7 @@ Life live(const Case& c, const std::filesystem::path& rig, std::int64_t seed, bo
         continue;
       if (part_of(event) != c.part || n < kBroken) {
         life.strange.push_back(std::to_string(n) + " " + event.event_text);
-      } else if (life.until < 0 && is_decision(event)) {
+      } else if (life.until < 0 && n < kRepaired && is_decision(event)) {
         life.until = n - kBroken + 1;
         life.is_named = c.causes.count(event.event_cause);
       }

@@ -195,7 +195,7 @@ void print(const std::string& rig, const Options& options, const std::vector<Row
                   text(ideal[i].root_d2).c_str());
     }
     if (honest.empty()) {
-      std::printf(" | | | | | | | |");
+      std::printf(" | | | | | | |");
     } else {
       const Row& row = honest[i];
       std::printf(" %d of %d | %d | %s | %s | %.4f |", row.right, options.num_seeds, row.incomplete,

@@ -1,4 +1,4 @@
-// soak: cost of many samples. Sends synthetic samples of a 2-DOF robot to the processes that keep
+// soak: cost of many samples. Sends synthetic samples of a robot to the processes that keep
 // data of every sample (structure_learner, model_monitor, `bodyschema watch`, `bodyschema
 // report --follow`), in step with the monitor's verdicts as a babbler is, and prints, over the run,
 // the memory that each holds, and the bytes that it read and its processor time per sample. Fails

@@ -37,6 +37,7 @@ const ChangeForm& form_of(const BodyChange& change) {
       {learned, "new_model", 0, -5, 5, {}},   // kResidual
       {learned, "new_model", 0, -10, 8, {}},  // kFresh
   };
+  static_assert(std::size(forms) == static_cast<std::size_t>(BodyChange::Form::kFresh) + 1);
   return forms[static_cast<std::size_t>(change.form)];
 }
 

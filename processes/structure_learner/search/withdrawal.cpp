@@ -2,6 +2,8 @@
 
 #include <algorithm>
 #include <limits>
+#include <map>
+#include <vector>
 
 #include "processes/structure_learner/joints/missing_joint_test.h"
 #include "processes/structure_learner/search/component_tree.h"
@@ -16,12 +18,37 @@ namespace {
 constexpr int kFewSightings = 6;
 constexpr double kCommonTurn = 0.65;
 
-// k + 1 poses determine an edge of k joints: its parameters are 6 (k + 1). Two more test it,
-// however many poses tell of the edges around it.
-bool has_poses_enough(const AcceptedModel& m, PairModels* pairs) {
-  const int num_poses = pairs->actions().blocks().count(
-      pairs->pair(m.part_i, m.part_j).frames, [](const PairFrame& frame) { return frame.sample; });
-  return num_poses >= m.model.num_joints + 3;
+// Samples in which parts on both sides of each node's edge were seen; a root that rests always is.
+std::vector<std::vector<int>> tied_samples(const ComponentTree& tree) {
+  const std::vector<TreeNode>& nodes = tree.nodes();
+  std::vector<std::map<int, int>> beyond(nodes.size());  // parts of the subtree seen, by sample
+  for (std::size_t k = 0; k < nodes.size(); ++k)
+    for (const PairFrame& frame : tree.data()[k].frames) ++beyond[k][frame.sample];
+  for (std::size_t k = nodes.size() - 1; k > 0; --k)
+    for (const auto& [sample, num_parts] : beyond[k]) beyond[nodes[k].parent][sample] += num_parts;
+  std::vector<std::vector<int>> tied(nodes.size());
+  for (std::size_t k = 1; k < nodes.size(); ++k)
+    for (const auto& [sample, num_parts] : beyond[k])
+      if (tree.root_rests() || beyond[0].at(sample) > num_parts) tied[k].push_back(sample);
+  return tied;
+}
+
+// k + 1 poses determine an edge of k joints: its parameters are 6 (k + 1). Two more test it. A
+// sample that tells of it by other parts alone counts half: their edges are fitted to it, too.
+void withdraw_untestable(const ComponentTree& tree, PairModels* pairs,
+                         std::vector<AcceptedModel>* kept) {
+  const std::vector<std::vector<int>> tied = tied_samples(tree);
+  const TimeBlocks& blocks = pairs->actions().blocks();
+  for (std::size_t k = 1; k < tied.size(); ++k) {
+    const TreeNode& node = tree.nodes()[k];
+    const int part_i = tree.nodes()[node.parent].part, part_j = node.part;
+    const auto sample_of = [](const PairFrame& frame) { return frame.sample; };
+    const int num_own = blocks.count(pairs->pair(part_i, part_j).frames, sample_of);
+    const int num_tied = blocks.count(tied[k], [](int sample) { return sample; });
+    if (num_own + 0.5 * (num_tied - num_own) >= node.model.num_joints + 3) continue;
+    pairs->record(part_i, part_j).undecided.emplace(node.model.num_joints, 0.0);
+    std::erase_if(*kept, [&](const AcceptedModel& m) { return m.joins(part_i, part_j); });
+  }
 }
 
 // Takes back the edge whose data tell least of some signal's joint, if that is not enough.
@@ -61,13 +88,11 @@ bool withdraw_least_told(const ComponentTree& tree, PairModels* pairs, ModelFore
 }  // namespace
 
 std::map<int, double> withdraw_untold_edges(PairModels* pairs, ModelForest* forest) {
-  std::vector<AcceptedModel> models = forest->models();
-  std::erase_if(models, [&](const AcceptedModel& m) {
-    if (has_poses_enough(m, pairs)) return false;
-    pairs->record(m.part_i, m.part_j).undecided.emplace(m.model.num_joints, 0.0);
-    return true;
-  });
-  forest->set_models(std::move(models));
+  std::vector<AcceptedModel> kept = forest->models();
+  for (const int part : forest->parts())
+    if (forest->component(part) == part)
+      withdraw_untestable(ComponentTree(*forest, part, pairs), pairs, &kept);
+  forest->set_models(std::move(kept));
   std::map<int, double> information;
   for (bool is_changed = true; is_changed;) {
     is_changed = false;

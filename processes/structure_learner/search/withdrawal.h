@@ -10,9 +10,9 @@ namespace bodyschema {
 /// of V2 (check_validity()), a noncentrality of 48 has a power of 97.7 %.
 inline constexpr double kNoticed = 48;
 
-/// Takes back the edges whose data could not have refuted them: fewer than two poses more than
-/// determine an edge, or poses at which a signal hardly moved, agree with a model by chance. Returns what SearchResult calls
-/// joint_information, of the edges that stand.
+/// Takes back the edges that their data could not have refuted: with fewer than two poses more than
+/// determine an edge, or where a signal hardly moved, a wrong model agrees by chance. Returns what
+/// SearchResult calls joint_information, of the edges that stand.
 std::map<int, double> withdraw_untold_edges(PairModels* pairs, ModelForest* forest);
 
 }  // namespace bodyschema

@@ -9,7 +9,6 @@
 namespace bodyschema {
 namespace {
 
-/// The true kinematics of a robot as a schema: what an errorless learner would find.
 TEST(EvaluationTest, TheTrueSchemaHasNoErrorOnExactData) {
   test::Rng rng(51);
   for (int run = 0; run < 20; ++run) {

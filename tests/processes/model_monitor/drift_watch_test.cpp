@@ -5,8 +5,8 @@
 #include <cmath>
 
 #include "common/geometry/angle.h"
-#include "processes/model_monitor/changes/body_change.h"
 #include "processes/model_monitor/change_fit.h"
+#include "processes/model_monitor/changes/body_change.h"
 #include "tests/support/broken_arm.h"
 
 namespace bodyschema {
