@@ -355,12 +355,9 @@ TreeFilter::Judgement TreeFilter::judge(const Instant& instant,
   return walk.judgement;
 }
 
-std::optional<VirtualMeasurement> TreeFilter::measure_edge(
-    const Instant& instant, int node, const std::vector<int>& cut_edges) const {
-  Alternative alternative;
-  alternative.cut_edges = cut_edges;
-  std::erase(alternative.cut_edges, node);
-  Walk right(*this, instant, alternative);
+std::optional<VirtualMeasurement> TreeFilter::measure_edge(const Instant& instant, int node) const {
+  const Alternative as_it_is;
+  Walk right(*this, instant, as_it_is);
   const auto child = right.behind_cut(node);
   if (!child) return std::nullopt;
   if (nodes_[node].parent < 0) return VirtualMeasurement{child->X, child->P};
@@ -370,14 +367,13 @@ std::optional<VirtualMeasurement> TreeFilter::measure_edge(
   std::vector<int> path;
   for (int n = nodes_[node].parent; n >= 0; n = nodes_[n].parent) path.push_back(n);
   std::reverse(path.begin(), path.end());
-  Walk left(*this, instant, alternative);
+  Walk left(*this, instant, as_it_is);
   std::optional<Belief> belief = Belief{};
   for (std::size_t k = 0; k < path.size(); ++k) {
     const int next = k + 1 < path.size() ? path[k + 1] : node;
     if (left.is_cut(path[k])) {
       // Nothing from above: what is below begins anew, without the branch in question.
-      Alternative above = alternative;
-      above.cut_edges.push_back(node);
+      const Alternative above{.cut_edges = {node}};
       Walk anew(*this, instant, above);
       belief = anew.behind_cut(path[k]);
       if (!belief) return std::nullopt;
@@ -406,16 +402,15 @@ std::optional<VirtualMeasurement> TreeFilter::measure_edge(
   return result;
 }
 
-std::optional<VirtualMeasurement> TreeFilter::measure_marker(
-    const Instant& instant, int node, const std::vector<int>& cut_edges) const {
+std::optional<VirtualMeasurement> TreeFilter::measure_marker(const Instant& instant,
+                                                             int node) const {
   const auto& seen = instant.seen[node];
   if (!seen) return std::nullopt;
   // The part's belief without its own marker: that of an instant in which it was not seen.
   Instant without = instant;
   without.seen[node].reset();
-  Alternative alternative;
-  alternative.cut_edges = cut_edges;
-  Walk walk(*this, without, alternative);
+  const Alternative as_it_is;
+  Walk walk(*this, without, as_it_is);
   std::vector<int> path;
   for (int n = node; n >= 0; n = nodes_[n].parent) {
     if (walk.is_cut(n)) return std::nullopt;

@@ -84,12 +84,10 @@ class TreeFilter {
   Judgement judge(const Instant& instant, const Alternative& alternative = {}) const;
 
   /// The pose of `node` in its parent (root: in the camera), from the markers on either side of its
-  /// edge alone, none of the `cut_edges` crossed. std::nullopt if a side saw nothing.
-  std::optional<VirtualMeasurement> measure_edge(const Instant& instant, int node,
-                                                 const std::vector<int>& cut_edges = {}) const;
+  /// edge alone. std::nullopt if a side saw nothing.
+  std::optional<VirtualMeasurement> measure_edge(const Instant& instant, int node) const;
   /// The pose of the node's marker in the part, as all other markers know the part.
-  std::optional<VirtualMeasurement> measure_marker(const Instant& instant, int node,
-                                                   const std::vector<int>& cut_edges = {}) const;
+  std::optional<VirtualMeasurement> measure_marker(const Instant& instant, int node) const;
 
  private:
   struct Node {

@@ -307,6 +307,22 @@ TEST(WithdrawUntoldEdges, AnEdgeNeedsTwoPosesMoreThanDetermineIt) {
   }
 }
 
+TEST(WithdrawUntoldEdges, PartsBeyondAnEdgeTellOfItWhileItsOwnEndIsHidden) {
+  for (const bool is_other_seen : {false, true}) {
+    auto samples = Case(1, 20, Regime::kFree).samples;
+    for (std::size_t t = 3; t < samples.size(); ++t)
+      std::erase_if(samples[t].parts, [&](const PartObservation& o) {
+        return o.part == 3 || (o.part == 2 && !is_other_seen);
+      });
+    Case c(samples);
+    c.forest.add(c.fitted(1, 3, 1));
+    c.forest.add(c.fitted(2, 3, 0));
+    withdraw_untold_edges(&c.pairs, &c.forest);
+    const auto is_kept = [&](const AcceptedModel& m) { return m.joins(1, 3); };
+    EXPECT_EQ(std::ranges::any_of(c.forest.models(), is_kept), is_other_seen);
+  }
+}
+
 // Samples that repeat are surer than they are right: models are refuted that had joined the ends of
 // others. (Of 19 seeds the first that comes there.)
 TEST(SettleTrees, ASpareModelWhosePartsWerePartedSinceIsPassedOver) {
