@@ -228,7 +228,8 @@ int main(int argc, char** argv) {
         memory.push_back(u.memory_mb);
         if (std::ssize(memory) > kMoment) memory.pop_front();
       }
-      if (n % std::max<std::int64_t>(500, num_samples / 20) != 0 && n != kFull && n != num_samples)
+      if (n % std::max<std::int64_t>(500, num_samples / 20) != 0 && n != kFull / 2 && n != kFull &&
+          n != num_samples)
         continue;
       usage[n] = soak.usage();
       for (auto& [name, u] : usage[n]) u.memory_mb = *std::ranges::min_element(recent_mb.at(name));
@@ -258,13 +259,14 @@ int main(int argc, char** argv) {
       const double growth = last.memory_mb - full.at(name).memory_mb;
       if (growth > kMaxGrowthMb + kMaxGrowthMbADoubling * doublings)
         problems += name + " grew by " + std::to_string(growth) + " MB; ";
-      const double first_kb = full.at(name).read_kb / kFull;
+      const Usage& half = usage.at(kFull / 2).at(name);
+      const double first_kb = (full.at(name).read_kb - half.read_kb) / (kFull / 2);
       const double later_kb =
           (last.read_kb - full.at(name).read_kb) / static_cast<double>(num_samples - kFull);
       if (later_kb > 1.5 * first_kb + 1)
         problems += name + " reads " + std::to_string(later_kb) + " kB a sample after " +
                     std::to_string(first_kb) + "; ";
-      const double first_ms = full.at(name).processor_ms / kFull;
+      const double first_ms = (full.at(name).processor_ms - half.processor_ms) / (kFull / 2);
       const double later_ms = (last.processor_ms - full.at(name).processor_ms) /
                               static_cast<double>(num_samples - kFull);
       if (name != "structure_learner" && later_ms > 2 * first_ms + 1)

@@ -1134,6 +1134,9 @@ TEST_F(BodyschemaProgramTest, TheRateOfOutliersIsThatOfTheRigBesideALog) {
   EXPECT_EQ(num_edges["0.001"], 0U);
   EXPECT_EQ(events["0.3"], 0U);
   EXPECT_GT(events["0.001"], 0U);
+  write("config/noise.yaml", "tag_position_m: 0\noutlier_rate: often\n");
+  expect_failure({"learn", "run.lcmlog"}, "noise.yaml");
+  expect_failure({"report", "run.lcmlog"}, "noise.yaml");
 }
 
 TEST_F(BodyschemaProgramTest, MonitorRefusesWhatDoesNotBelongTogether) {

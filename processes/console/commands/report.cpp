@@ -84,11 +84,7 @@ class Source {
     for (auto& [file, summary] : report.logs) {
       if (grows_ && summary.damage.starts_with("is cut off")) summary.damage.clear();
     }
-    try {
-      report.measurement = measurement_of(is_folder_ ? path_ / "run.lcmlog" : path_);
-    } catch (const std::exception&) {
-      report.measurement.systematic = kTagSystematic;
-    }
+    report.measurement = measurement_of(is_folder_ ? path_ / "run.lcmlog" : path_);
     report.goes_on = grows_;
     report.reload_s = reload_s;
     report.picture = picture();

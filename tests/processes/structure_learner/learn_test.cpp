@@ -224,21 +224,23 @@ TEST(Learn, SaysSoWhereNoModelIsValid) {
       << detail;
 }
 
-// So few poses that a wrong structure fits by chance are no structure. Some
-// wrong ones have evidence enough all the same.
+// So few poses that a wrong structure fits by chance are no structure. A wrong edge may have evidence
+// enough all the same (13 of 600 robots), a whole wrong body had none (0 of 600).
 TEST(Learn, FewPosesAreRatherIncompleteThanWrong) {
-  int num_wrong = 0, num_complete = 0;
-  for (int seed = 1; seed <= 60; ++seed) {
-    Rng rng(seed);
+  constexpr int kRobots = 120;
+  int num_wrong = 0, num_complete_and_wrong = 0;
+  for (int seed = 1; seed <= kRobots; ++seed) {
+    Rng rng(1000 + seed);
     const auto robot = test::chapter_robot("d", rng);
     const auto samples =
         test::babble(robot, 4 + seed % 2, {.regime = Regime::kTag, .with_covariances = true}, rng);
     const BodySchema schema = learn(robot.signals, samples).schema;
-    num_wrong += test::judge(schema, robot) == test::Rightness::kWrong;
-    num_complete += schema.complete;
+    const bool is_wrong = test::judge(schema, robot) == test::Rightness::kWrong;
+    num_wrong += is_wrong;
+    num_complete_and_wrong += is_wrong && schema.complete;
   }
-  EXPECT_LE(num_wrong, 6);
-  EXPECT_LE(num_complete, num_wrong);
+  EXPECT_EQ(num_complete_and_wrong, 0);
+  EXPECT_LE(num_wrong, kRobots / 20);
 }
 
 TEST(Learn, OnePartOrOneSampleIsNoStructure) {
