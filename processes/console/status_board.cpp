@@ -197,7 +197,8 @@ std::string StatusBoard::headline() const {
     const process_info_t& info = heard.newest;
     if (schema_ && info.phase == process_info_t::PHASE_WAITING &&
         info.process_name != "motor_babbler" && info.process_name != "controller")
-      line += fmt::format(" {} waits: {}.", info.process_name, info.activity);
+      line += fmt::format(" {} {}{}.", info.process_name,
+                          info.activity.starts_with("waits") ? "" : "waits: ", info.activity);
   }
   if (const auto silent = missing(); !silent.empty())
     line += fmt::format(" Not heard: {}.", fmt::join(silent, ", "));

@@ -285,12 +285,15 @@ std::string Observer::activity() const {
   if (!rests_.empty()) {
     const Rest& rest = rests_.back();
     const auto missing = config_.frames_per_sample - static_cast<int>(frames_of(rest).size());
+    std::string newest = "; no MARKER_POSES at all";
+    if (!frames_.empty()) {
+      const std::int64_t after_us = frames_.rbegin()->first - rest.status.rest_since_utime;
+      newest = "; newest MARKER_POSES " + std::to_string(std::abs(after_us) / 1000) + " ms " +
+               (after_us < 0 ? "before" : "after") + " it came to rest";
+    }
     return "waits for " + std::to_string(missing) + " of " +
            std::to_string(config_.frames_per_sample) + " frames of " + name_of(rest.status) +
-           " at rest since " + std::to_string(rest.status.rest_since_utime) + " us" +
-           (frames_.empty()
-                ? "; no MARKER_POSES at all"
-                : "; newest MARKER_POSES at " + std::to_string(frames_.rbegin()->first) + " us");
+           newest;
   }
   if (num_samples_ == 0) return "waits for a settled action";
   return "sample " + std::to_string(next_index_ - 1) + ": " + std::to_string(num_parts_) +

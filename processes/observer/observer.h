@@ -61,7 +61,7 @@ class Observer {
 
   /// Activity for people.
   std::string activity() const;
-  bool is_waiting() const { return !lens_ || num_samples_ == 0 || !rests_.empty(); }
+  bool is_waiting() const { return !lens_ || num_samples_ == 0 || has_warned_; }
   /// Reason → number of rejected tags, parts and frames since the start.
   const std::map<std::string, std::int64_t>& counters() const { return counters_; }
 

@@ -35,8 +35,8 @@ std::vector<std::vector<int>> tied_samples(const ComponentTree& tree) {
 
 // k + 1 poses determine an edge of k joints: its parameters are 6 (k + 1). Two more test it. A
 // sample that tells of it by other parts alone counts a quarter, for their edges are fitted to it,
-// too. (Of 180 robots of 7 joints, 8 samples each, 6 are complete and wrong, 77 right; counted half,
-// 9 and 78; not at all, 4 and 68.)
+// too. (Of 180 robots of 7 joints, 8 samples each, 6 are complete and wrong, 77 right; counted
+// half, 9 and 78; not at all, 4 and 68.)
 constexpr double kOthersShare = 0.25;
 
 void withdraw_untestable(const ComponentTree& tree, PairModels* pairs,

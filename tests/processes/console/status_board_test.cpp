@@ -88,6 +88,8 @@ TEST(StatusBoardTest, WhoeverWaitsThoughThereIsASchemaIsNamed) {
   board_.on_body_schema(to_message(two_parts()));
   EXPECT_EQ(board_.headline(),
             "Learning: 5 samples. observer waits: samples.lcmlog: no space left on device.");
+  board_.on_message(info("observer", process_info_t::PHASE_WAITING, "waits for 2 of 2 frames"));
+  EXPECT_EQ(board_.headline(), "Learning: 5 samples. observer waits for 2 of 2 frames.");
 }
 
 TEST(StatusBoardTest, AStopComesBeforeAllElseAndTheControllerBeforeTheBabbler) {

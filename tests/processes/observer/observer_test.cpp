@@ -324,12 +324,29 @@ TEST(Observer, SaysWhatItWaitsForAndWarnsOnce) {
   Scene scene;
   observer.on_motion_status(settled(9));
   observer.on_marker_poses(scene.frame(kRest_us));
-  EXPECT_NE(observer.activity().find("1 of 2 frames of action 9 of motor_babbler"),
-            std::string::npos);
+  EXPECT_EQ(
+      observer.activity(),
+      "waits for 1 of 2 frames of action 9 of motor_babbler; newest MARKER_POSES 0 ms after it "
+      "came to rest");
   EXPECT_FALSE(observer.on_tick(1'000'000));
   EXPECT_FALSE(observer.on_tick(5'000'000));
   EXPECT_TRUE(observer.on_tick(6'000'000));
   EXPECT_FALSE(observer.on_tick(7'000'000));
+}
+
+// Between an action's rest and its frames it waits all the time: people hear of it after 5 s.
+TEST(Observer, SaysThatItWaitsOnlyOnceItTakesLong) {
+  Observer observer = calibrated();
+  Scene scene;
+  EXPECT_TRUE(observer.is_waiting());
+  observer.on_motion_status(settled(9));
+  observer.on_marker_poses(scene.frame(kRest_us));
+  ASSERT_TRUE(observer.on_marker_poses(scene.frame(kRest_us + 33'333)));
+  observer.on_motion_status(settled(10));
+  observer.on_tick(1'000'000);
+  EXPECT_FALSE(observer.is_waiting());
+  observer.on_tick(7'000'000);
+  EXPECT_TRUE(observer.is_waiting());
 }
 
 TEST(Observer, MakesASampleWithoutPartsWhereNothingIsSeen) {

@@ -224,8 +224,8 @@ TEST(Learn, SaysSoWhereNoModelIsValid) {
       << detail;
 }
 
-// So few poses that a wrong structure fits by chance are no structure. A wrong edge may have evidence
-// enough all the same (13 of 600 robots), a whole wrong body had none (0 of 600).
+// So few poses that a wrong structure fits by chance are no structure. A wrong edge may have
+// evidence enough all the same (13 of 600 robots), a whole wrong body had none (0 of 600).
 TEST(Learn, FewPosesAreRatherIncompleteThanWrong) {
   constexpr int kRobots = 120;
   int num_wrong = 0, num_complete_and_wrong = 0;
