@@ -195,11 +195,12 @@ void print(const std::string& rig, const Options& options, const std::vector<Row
                   text(ideal[i].root_d2).c_str());
     }
     if (honest.empty()) {
-      std::printf(" | | | | | | |");
+      std::printf(" | | | | | | | | |");
     } else {
       const Row& row = honest[i];
-      std::printf(" %d of %d | %d | %s | %s | %.4f |", row.right, options.num_seeds, row.incomplete,
-                  text(row.aligned).c_str(), text(row.errors).c_str(), median(row.scale));
+      std::printf(" %d of %d | %d | %s | %s | %s | %s | %.4f |", row.right, options.num_seeds,
+                  row.incomplete, text(row.aligned).c_str(), text(row.errors).c_str(),
+                  text(row.end_effector_d2).c_str(), text(row.root_d2).c_str(), median(row.scale));
     }
     std::printf(" %.0f ms |\n", median((honest.empty() ? ideal : honest)[i].seconds) * 1e3);
     for (const auto* rows : {&ideal, &honest}) {
@@ -238,9 +239,9 @@ int main(int argc, char** argv) {
       "the camera's frame, median | worst seed | d² of its pose in the root, mean (95 %%) | d² of "
       "X_CR | with "
       "calibration errors: right | incomplete | aligned, median | worst seed | unaligned, median | "
-      "worst seed | scale | learning |\n"
+      "worst seed | d² of its pose in the root | d² of X_CR | scale | learning |\n"
       "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | "
-      "--- | --- | --- |\n");
+      "--- | --- | --- | --- | --- |\n");
   for (const std::filesystem::path rig : rigs) {
     std::vector<Row> ideal, honest;
     if (only != "honest") ideal = measured(rig, true, options);

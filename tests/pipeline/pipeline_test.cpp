@@ -206,8 +206,8 @@ TEST_F(Arm2, TheResultSaysWhatWasLearnedAndHowWell) {
   ASSERT_EQ(result["held_out"]["parts"].size(), 4u);
   for (const auto& part : result["held_out"]["parts"]) {
     EXPECT_EQ(part["count"], 6);
-    EXPECT_LT(part["position_median_m"], 0.008) << part;
-    EXPECT_LT(part["rotation_median_deg"], 1.5) << part;
+    EXPECT_LT(part["position_median_m"], 0.0006) << part;
+    EXPECT_LT(part["rotation_median_deg"], 0.1) << part;
     EXPECT_GT(part["position_median_m"], 0.0)
         << "the learned model cannot be exact: was it the truth?";
   }
@@ -496,8 +496,8 @@ TEST_F(Arm2, WithCalibrationErrorsArm4IsLearnedRight) {
   EXPECT_NE(honest["held_out"]["scale"], 1);
   ASSERT_EQ(honest["held_out"]["parts"].size(), 4u);
   for (const auto& part : honest["held_out"]["parts"]) {
-    EXPECT_LT(part["aligned_position_median_m"], 0.008) << part;
-    EXPECT_LT(part["aligned_rotation_median_deg"], 1.5) << part;
+    EXPECT_LT(part["aligned_position_median_m"], 0.002) << part;
+    EXPECT_LT(part["aligned_rotation_median_deg"], 0.5) << part;
     EXPECT_LT(part["aligned_position_median_m"], part["position_median_m"]) << part;
   }
   EXPECT_NE(contents(folder_ / "honest.out").find("aligned median"), std::string::npos);
