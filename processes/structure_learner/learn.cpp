@@ -103,9 +103,8 @@ int check_actions(const std::vector<ActionPoseSample>& samples, std::size_t num_
 SearchOptions search_options_of(const LearnOptions& options) {
   SearchOptions result;
   result.max_signals = options.max_signals;
-  result.validity.outlier_rate = options.outlier_rate;
-  result.measurement.systematic = options.systematic;
-  result.measurement.max_error_ratio = options.max_error_ratio;
+  result.validity.outlier_rate = options.measurement.outlier_rate;
+  result.measurement = options.measurement;
   return result;
 }
 
@@ -159,9 +158,9 @@ LearnResult fit_tree(const LearnedStructure& structure,
 
 SourcedNoise marker_noise(const std::vector<ActionPoseSample>& samples, int num_signals,
                           const LearnOptions& options) {
-  if (options.noise)
-    return {{std::max(options.noise->position_m, kNoiseFloor.position_m),
-             std::max(options.noise->rotation_rad, kNoiseFloor.rotation_rad)},
+  if (const std::optional<Noise>& given = options.measurement.noise)
+    return {{std::max(given->position_m, kNoiseFloor.position_m),
+             std::max(given->rotation_rad, kNoiseFloor.rotation_rad)},
             NoiseSource::kGiven};
   if (has_covariances(samples)) return {typical_noise(samples), NoiseSource::kCovariances};
   return estimate_noise(samples, num_signals, options.max_signals)
@@ -179,7 +178,7 @@ LearnedStructure find_structure(const std::vector<Signal>& signals,
   MeasurementModel& measurement = search_options.measurement;
   NoiseSource noise_source = NoiseSource::kCovariances;
   const auto set_noise = [&](const std::vector<ActionPoseSample>& of) {
-    if (!options.noise && has_covariances(of)) return;
+    if (!options.measurement.noise && has_covariances(of)) return;
     const SourcedNoise noise = marker_noise(of, num_signals, options);
     measurement.noise = noise;
     noise_source = noise.source;

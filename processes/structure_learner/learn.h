@@ -22,18 +22,11 @@ struct LearnOptions {
   std::optional<int> root;
   /// Parts that should be there: reported where they were never seen.
   std::vector<int> expected_parts;
-  /// Standard deviations per axis per marker: replace the covariances of the observations. Without
-  /// them and with all covariances zero, the noise is estimated (see noise_estimate.h).
-  std::optional<Noise> noise;
-  /// MeasurementModel::systematic of each part.
-  Noise systematic;
+  /// Without `noise`, and with all covariances of the observations zero, the noise is estimated
+  /// (see noise_estimate.h).
+  MeasurementModel measurement;
   /// Largest number of joints in one local model (0 to 2).
   int max_signals = 2;
-  /// Expected share of outliers per marker: flips of planar tags, false detections.
-  double outlier_rate = 0.03;
-  /// A second pose hypothesis is offered to the fits while its reprojection error is below this
-  /// multiple of the first's.
-  double max_error_ratio = 10;
 };
 
 struct LearnResult {
@@ -55,8 +48,8 @@ struct LearnResult {
 LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPoseSample>& samples,
                   const LearnOptions& options = {});
 
-/// Noise per axis of one marker that learn() goes by: `options.noise`; else the mean of the
-/// observations' covariances; where these are zero, the estimate of noise_estimate.h.
+/// Noise per axis of one marker that learn() goes by: `options.measurement.noise`; else the mean of
+/// the observations' covariances; where these are zero, the estimate of noise_estimate.h.
 SourcedNoise marker_noise(const std::vector<ActionPoseSample>& samples, int num_signals,
                           const LearnOptions& options = {});
 

@@ -17,9 +17,7 @@ StructureLearnerConfig StructureLearnerConfig::load(const std::filesystem::path&
   config.options.root = signals.root_part;
   config.options.expected_parts = load_markers(file.parent_path()).parts();
   config.options.max_signals = static_cast<int>(yaml.integer("max_signals", 0, 2));
-  const MeasurementModel measurement = load_noise(file.parent_path()).measurement;
-  config.options.outlier_rate = measurement.outlier_rate;
-  config.options.systematic = measurement.systematic;
+  config.options.measurement = load_noise(file.parent_path()).measurement;
   yaml.finish();
   return config;
 }

@@ -43,7 +43,7 @@ int main(int argc, char** argv) {
                              static_cast<std::uint64_t>(r));
         LearnOptions options;
         options.root = 1;
-        if (!is_noise_estimated) options.noise = Noise{0.003, 1 * kDegree};
+        if (!is_noise_estimated) options.measurement.noise = Noise{0.003, 1 * kDegree};
         const BodySchema schema = learn(robot.signals(), robot.babble(num_samples), options).schema;
         const Rightness rightness = judge(schema, robot.structure());
         num_right += rightness == Rightness::kRight;

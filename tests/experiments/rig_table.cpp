@@ -135,9 +135,11 @@ struct Options {
 std::vector<Row> measured(const std::filesystem::path& rig, bool is_ideal, const Options& options) {
   StructureLearnerConfig config = StructureLearnerConfig::load(rig / "structure_learner.yaml");
   if (is_ideal)
-    config.options.systematic = load_noise(rig, "ideal_noise.yaml").measurement.systematic;
+    config.options.measurement.systematic =
+        load_noise(rig, "ideal_noise.yaml").measurement.systematic;
   if (!options.systematic.empty())
-    config.options.systematic = {options.systematic[0] * 1e-3, options.systematic[1] * kDegree};
+    config.options.measurement.systematic = {options.systematic[0] * 1e-3,
+                                             options.systematic[1] * kDegree};
   const int end_effector = load_signals(rig).end_effector_part;
   const test::RigTruth truth(rig);
   std::vector<int> observed = truth.parts();

@@ -111,7 +111,7 @@ int main(int argc, char** argv) {
             observation.with_covariances = noise == "covariance" || noise == "other";
             observation.with_other_hypothesis = noise == "other";
             LearnOptions options;
-            if (noise == "given") options.noise = nominal_noise(observation.regime);
+            if (noise == "given") options.measurement.noise = nominal_noise(observation.regime);
             const auto samples = babble(robot, n, observation, rng);
             const std::clock_t start = std::clock();
             const LearnedStructure structure = find_structure(robot.signals, samples, options);

@@ -45,7 +45,7 @@ StructureLearnerConfig learner_of(const test::SyntheticRobot& robot) {
   StructureLearnerConfig config;
   config.signals = robot.signals;
   config.options.root = 1;
-  config.options.systematic = kTagSystematic;
+  config.options.measurement.systematic = kTagSystematic;
   return config;
 }
 

@@ -41,7 +41,7 @@ ObserverConfig observer_config(const std::filesystem::path& rig, bool is_ideal) 
 
 StructureLearnerConfig learner_config(const std::filesystem::path& rig, bool is_ideal) {
   StructureLearnerConfig config = StructureLearnerConfig::load(rig / "structure_learner.yaml");
-  config.options.systematic = noise_of(rig, is_ideal).measurement.systematic;
+  config.options.measurement = noise_of(rig, is_ideal).measurement;
   return config;
 }
 

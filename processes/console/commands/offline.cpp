@@ -52,8 +52,8 @@ LearnResult learn_as_the_chapter(const Recording& recording,
   BaselineOptions baseline;
   baseline.root = options.root;
   SourcedNoise noise = marker_noise(training, static_cast<int>(recording.signals.size()), options);
-  noise.position_m = std::hypot(noise.position_m, options.systematic.position_m);
-  noise.rotation_rad = std::hypot(noise.rotation_rad, options.systematic.rotation_rad);
+  noise.position_m = std::hypot(noise.position_m, options.measurement.systematic.position_m);
+  noise.rotation_rad = std::hypot(noise.rotation_rad, options.measurement.systematic.rotation_rad);
   baseline.set_noise(noise);
   baseline.max_samples = std::min(baseline.max_samples, ResidualGp::kMaxSamples);  // to be written
   const BaselineResult result = learn_baseline(recording.signals, training, baseline);
@@ -66,12 +66,13 @@ LearnResult learn_as_the_chapter(const Recording& recording,
 }
 
 void run_learn(const LearnArguments& arguments) {
-  LearnOptions options;
-  if (!arguments.noise.empty()) options.noise = noise_given(arguments.noise);
+  std::optional<Noise> noise;
+  if (!arguments.noise.empty()) noise = noise_given(arguments.noise);
   const Recording recording = load(arguments.samples);
+  LearnOptions options;
   options.root = arguments.root;
-  options.systematic = recording.measurement.systematic;
-  options.outlier_rate = recording.measurement.outlier_rate;
+  options.measurement = recording.measurement;
+  options.measurement.noise = noise;
   check_out(arguments.out, {arguments.samples});
   const std::vector<ActionPoseSample> training = recording.training();
   if (options.root) {

@@ -79,8 +79,7 @@ std::optional<Body> body_of(const RunRecord& record, const MeasurementModel& mea
   if (recording.samples.empty()) return std::nullopt;
   recording.signals = observed_signals(recording.samples);
   LearnOptions options;
-  options.systematic = measurement.systematic;
-  options.outlier_rate = measurement.outlier_rate;
+  options.measurement = measurement;
   return Body{learn(recording.signals, recording.training(), options).schema,
               "learned for this report: the log holds no body schema"};
 }

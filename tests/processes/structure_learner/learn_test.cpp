@@ -23,7 +23,7 @@ int count_right(const std::string& name, Regime regime, int num_samples, int num
     Rng rng(seed);
     const auto robot = test::chapter_robot(name, rng);
     LearnOptions options;
-    if (given_noise) options.noise = test::nominal_noise(regime);
+    if (given_noise) options.measurement.noise = test::nominal_noise(regime);
     const auto result =
         learn(robot.signals, test::babble(robot, num_samples, {regime}, rng), options);
     right += is_right(result.schema, robot);
@@ -86,7 +86,7 @@ TEST(Learn, LeavesAStraightCommandStraight) {
       Rng rng(seed);
       const auto robot = test::chapter_robot("c", rng);
       LearnOptions options;
-      options.noise = test::nominal_noise(regime);
+      options.measurement.noise = test::nominal_noise(regime);
       const auto result = learn(robot.signals, test::babble(robot, 60, {regime}, rng), options);
       for (const Signal& signal : result.schema.signals) {
         EXPECT_TRUE(signal.warp.empty()) << test::name_of(regime) << " seed " << seed;
@@ -127,7 +127,7 @@ TEST(Learn, ReportsPartsBehindTwoHiddenOnesInsteadOfGuessing) {
     options.adjacent_hidden = true;
     const auto robot = test::random_tree(options, rng);
     LearnOptions given;
-    given.noise = test::nominal_noise(Regime::kTag);
+    given.measurement.noise = test::nominal_noise(Regime::kTag);
     const auto schema =
         learn(robot.signals, test::babble(robot, 30, {Regime::kTag}, rng), given).schema;
     EXPECT_NE(test::judge(schema, robot), Rightness::kWrong) << seed;
@@ -211,7 +211,7 @@ TEST(Learn, SaysSoWhereNoModelIsValid) {
     for (auto& o : s.parts)
       if (o.part == 5) o.X_CB = test::random_pose(rng, 1, 2);
   LearnOptions options;
-  options.noise = Noise{0.001, 0.01};
+  options.measurement.noise = Noise{0.001, 0.01};
   const auto schema = learn(robot.signals, samples, options).schema;
   ASSERT_EQ(schema.unconnected.size(), 1u);
   EXPECT_EQ(schema.unconnected[0].part, 5);

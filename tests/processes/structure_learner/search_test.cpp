@@ -248,7 +248,7 @@ TEST(Bridge, InstantsAtWhichOnlyOneOfTwoComponentsIsSeenDoNotSpeakForJoiningThem
       if (t % 10 == 0) see(2, X, 4);
     }
     LearnOptions options;
-    options.noise = Noise{0.003, 0.02};
+    options.measurement.noise = Noise{0.003, 0.02};
     num_joined += learn({{"q", -1, 1, {}}}, samples, options).schema.complete;
   }
   EXPECT_EQ(num_joined, 0);

@@ -195,7 +195,7 @@ TEST(TimeBlocks, ARigidArmInAStreamIsRightAlthoughAMarkerFlipsInBursts) {
   observe(&samples, 3, arm, rng);
   const int flipped = flip_in_bursts(1, 0.12, &samples, rng);
   LearnOptions options;
-  options.noise = kNoise;
+  options.measurement.noise = kNoise;
   const LearnResult result = learn({{"q1"}, {"q2"}, {"q3"}}, samples, options);
   ASSERT_TRUE(result.schema.complete);
   ASSERT_EQ(result.schema.edges.size(), 2U);
@@ -257,7 +257,7 @@ TEST(SoftBodies, ATrunkIsLearnedFromPosesAtRest) {
   auto samples = at_rest(200, 5, rng);  // the fifth signal does nothing
   observe(&samples, 3, trunk, rng);
   LearnOptions options;
-  options.noise = kNoise;
+  options.measurement.noise = kNoise;
   const LearnResult result = learn({{"q1"}, {"q2"}, {"q3"}, {"q4"}, {"q5"}}, samples, options);
   expect_trunk(result);
   EXPECT_LT(median_error_m(result.schema, rng), 0.004);
@@ -269,7 +269,7 @@ TEST(SoftBodies, ATrunkInAStreamIsLearnedAlthoughAMarkerFlipsInBursts) {
   observe(&samples, 3, trunk, rng);
   const int flipped = flip_in_bursts(1, 0.12, &samples, rng);
   LearnOptions options;
-  options.noise = kNoise;
+  options.measurement.noise = kNoise;
   const LearnResult result = learn({{"q1"}, {"q2"}, {"q3"}, {"q4"}, {"q5"}}, samples, options);
   expect_trunk(result);
   int found = 0;
@@ -287,7 +287,7 @@ TEST(SoftBodies, WhatIsNoFunctionOfTheActionsHasNoModel) {
     samples[t].parts = one[0].parts;
   }
   LearnOptions options;
-  options.noise = kNoise;
+  options.measurement.noise = kNoise;
   const LearnResult result = learn({{"q1"}, {"q2"}, {"q3"}, {"q4"}}, samples, options);
   EXPECT_TRUE(result.schema.edges.empty());
 }
@@ -312,7 +312,8 @@ TEST(SoftBodies, RigidChainsBehindHiddenPartsAreNeverGivenWrongSignals) {
     auto samples = at_rest(seed % 2 ? 60 : 150, 4, rng);
     observe(&samples, 2, chain, rng);
     LearnOptions options;
-    options.noise = seed % 3 ? kNoise : Noise{0.025, 0.1};  // of the tags, of the chapter
+    options.measurement.noise =
+        seed % 3 ? kNoise : Noise{0.025, 0.1};  // of the tags, of the chapter
     if (seed % 3 == 0)
       for (auto& sample : samples)
         for (auto& o : sample.parts) {

@@ -305,9 +305,9 @@ TEST(StructureLearnerConfigTest, IsReadInSiUnitsWithTheRootOfTheRig) {
   EXPECT_EQ(config.options.root, 4);
   EXPECT_EQ(config.options.expected_parts, (std::vector<int>{4, 5}));
   EXPECT_EQ(config.options.max_signals, 1);
-  EXPECT_EQ(config.options.outlier_rate, 0.1);
-  EXPECT_EQ(config.options.systematic.position_m, 0.002);
-  EXPECT_DOUBLE_EQ(config.options.systematic.rotation_rad, M_PI / 2);
+  EXPECT_EQ(config.options.measurement.outlier_rate, 0.1);
+  EXPECT_EQ(config.options.measurement.systematic.position_m, 0.002);
+  EXPECT_DOUBLE_EQ(config.options.measurement.systematic.rotation_rad, M_PI / 2);
 
   std::ofstream(folder / "structure_learner.yaml", std::ios::app) << "window: 3\n";
   EXPECT_THROW(StructureLearnerConfig::load(folder / "structure_learner.yaml"), ConfigError);
