@@ -157,9 +157,9 @@ RigNoise load_noise(const std::filesystem::path& rig_folder, const std::string& 
   noise.measurement.systematic.rotation_rad =
       yaml.number("systematic_rotation_deg", 0, 90) * kDegree;
   noise.measurement.outlier_rate = yaml.number("outlier_rate", 0, 0.5);
-  noise.calibration.position_m = yaml.number("tag_position_m", 0, 1);
-  noise.calibration.rotation_rad = yaml.number("tag_rotation_deg", 0, 90) * kDegree;
-  noise.calibration.size_share = yaml.number("tag_size_share", 0, 0.5);
+  noise.measurement.tags.position_m = yaml.number("tag_position_m", 0, 1);
+  noise.measurement.tags.rotation_rad = yaml.number("tag_rotation_deg", 0, 90) * kDegree;
+  noise.measurement.tags.size_share = yaml.number("tag_size_share", 0, 0.5);
   yaml.finish();
   return noise;
 }

@@ -40,19 +40,11 @@ struct Signals {
   int end_effector_part = 0;
 };
 
-/// Uncertainty of markers.yaml, 1 σ, each tag by itself.
-struct TagCalibration {
-  double position_m = 0;    ///< of a tag on its part, per axis
-  double rotation_rad = 0;  ///< per axis
-  double size_share = 0;    ///< of the printed side
-};
-
 /// noise.yaml: the errors of observed poses, for every process that uses them.
 struct RigNoise {
   double corner_noise_px = 0;     ///< AprilTag's own corners: see CornerNoise
   double small_tag_noise_px = 0;  ///< see CornerNoise
   MeasurementModel measurement;   ///< of poses of parts
-  TagCalibration calibration;     ///< of markers.yaml
 };
 
 /// network.yaml: the bus of a rig's process group.

@@ -19,6 +19,16 @@ Matrix6d MeasurementModel::noise_covariance(const PartObservation& observation) 
   return scale * scale * (noise ? isotropic(*noise) : observation.covariance);
 }
 
+Eigen::Matrix<double, 6, 7> MeasurementModel::effect_of_tag(const Pose& X_CB,
+                                                            std::size_t num_tags) const {
+  Eigen::Matrix<double, 6, 7> result = Eigen::Matrix<double, 6, 7>::Zero();
+  if (noise || num_tags == 0) return result;
+  result.diagonal().head<3>().setConstant(tags.position_m);
+  result.diagonal().tail<3>().setConstant(tags.rotation_rad);
+  result.col(6).head<3>() = tags.size_share * (X_CB.linear().transpose() * X_CB.translation());
+  return result / static_cast<double>(num_tags);
+}
+
 Matrix6d MeasurementModel::systematic_covariance() const {
   return isotropic(systematic) + kLeastVariance * Matrix6d::Identity();
 }

@@ -7,20 +7,29 @@
 
 namespace bodyschema {
 
+/// How far a tag may be from what markers.yaml says of it: standard deviations.
+struct TagCalibration {
+  double position_m = 0;    ///< of a tag on its part, per axis
+  double rotation_rad = 0;  ///< per axis
+  double size_share = 0;    ///< of the printed side
+};
+
 /// How far the observed pose of a part may be from the true one: the one place where an
 /// observation becomes a covariance.
 ///
 ///   X_CB = X_CB_true · exp(ε + β),   ε ~ N(0, Σ),   β ~ N(0, M)
 ///
-/// The noise ε is new at every sight; an observation's Σ also has how sure markers.yaml is of its
-/// tags. The systematic error β (a lens that is not as calibrated, what a view biases) is the same
-/// at every sight of the same tags from the same side: no number of samples averages it out.
+/// The noise ε is new at every sight but for what is off of a tag itself, which an observation's Σ
+/// also has. The systematic error β (a lens that is not as calibrated, what a view biases) is the
+/// same at every sight of the same tags from the same side: no number of samples averages it out.
 struct MeasurementModel {
   /// Standard deviations per axis of ε, instead of each observation's own covariance.
   std::optional<Noise> noise = std::nullopt;
   /// Standard deviations per axis of β. Under-stating it refutes true models in the end;
   /// over-stating it hides joints and changes that move less.
   Noise systematic = {};
+  /// What each observation's covariance has of its tags; the same at every sight of a tag.
+  TagCalibration tags = {};
   /// Multiplies the standard deviations of ε: 1 where what is told of them is true.
   double scale = 1;
   /// Expected share of a part's observations that are flips of planar tags or false detections.
@@ -33,6 +42,9 @@ struct MeasurementModel {
   Matrix6d noise_covariance(const PartObservation& observation) const;
   /// M, and a little that keeps exact measurements invertible.
   Matrix6d systematic_covariance() const;
+  /// Columns are what one standard deviation of each error of a tag makes of the pose of a part
+  /// that is seen at X_CB by `num_tags` tags: place and rotation on it, size (depth).
+  Eigen::Matrix<double, 6, 7> effect_of_tag(const Pose& X_CB, std::size_t num_tags) const;
   /// Σ + M.
   Matrix6d covariance(const PartObservation& observation) const;
 };

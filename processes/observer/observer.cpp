@@ -42,7 +42,7 @@ ObserverConfig ObserverConfig::load(const std::filesystem::path& file) {
   config.part_pose.min_other_rotation_rad = yaml.number("min_other_rotation_deg", 0, 90) * kDegree;
   config.part_pose.max_error_ratio = yaml.number("max_error_ratio", 1, 1e6);
   yaml.finish();
-  config.part_pose.calibration = load_noise(file.parent_path()).calibration;
+  config.part_pose.calibration = load_noise(file.parent_path()).measurement.tags;
   return config;
 }
 

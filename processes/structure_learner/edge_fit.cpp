@@ -154,8 +154,7 @@ void fit_jointly(const EdgeData& data, std::vector<FittedEdge>* fitted, BodySche
   if (nodes.size() < 2) return;
   TreeFit fit(std::move(nodes), std::move(poses), data.actions, true);
   fit.fit(20, 1e-6);
-  const auto covariance =
-      fit.covariance(data.measurement.systematic_covariance(), view_share(data.measurement));
+  const auto covariance = fit.covariance(data.measurement, view_share(data.measurement));
   for (std::size_t k = 1; k < fit.nodes().size(); ++k) {
     const TreeNode& node = fit.nodes()[k];
     for (FittedEdge& f : *fitted) {

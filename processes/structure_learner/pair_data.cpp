@@ -152,6 +152,7 @@ PairData make_part_data(const std::vector<ActionPoseSample>& samples, int part,
     const PartObservation& seen = *samples[sample].find(part);
     const int num = readings_of(seen, measurement, readings);
     const auto [tags, is_new] = tag_sets.try_emplace(seen.tags, static_cast<int>(tag_sets.size()));
+    if (is_new) pair.tag_sets.push_back(seen.tags);
     FrameWriter frame(sample, &pair, tags->second);
     for (int a = 0; a < num; ++a)
       frame.add(readings[a].X_CB, readings[a].covariance, systematic, readings[a].penalty);

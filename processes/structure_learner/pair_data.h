@@ -62,6 +62,7 @@ struct PairData {
   int part_j = 0;
   std::vector<PairFrame> frames;
   std::vector<PairHypothesis> hypotheses;
+  std::vector<std::vector<int>> tag_sets;  ///< ids, by PairFrame::tag_set
 
   int size() const { return static_cast<int>(frames.size()); }
   /// The reading of both primary hypotheses.

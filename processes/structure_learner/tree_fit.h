@@ -43,9 +43,9 @@ class TreeFit {
 
   /// Covariance of the fit's parameters, normalised; right perturbations. The covariance of the
   /// score, by what is told of the measurements, between two inverse Hessians (the sandwich of an
-  /// M-estimator): near-identical views of a part share its systematic error, of covariance
-  /// `systematic`, and `view_share` of the variance of its noise, which do not average out over
-  /// them.
+  /// M-estimator). What does not average out: the errors of a tag, which all its sights share; of
+  /// near-identical views of a part its systematic error and `view_share` of the variance of its
+  /// noise.
   struct Covariance {
     Matrix6d root = Matrix6d::Zero();     ///< of root_pose()
     std::vector<ParameterMatrix> models;  ///< by node
@@ -54,7 +54,8 @@ class TreeFit {
     std::vector<Matrix6d> frames;
   };
   /// std::nullopt if the root moves, or the data do not determine the tree.
-  std::optional<Covariance> covariance(const Matrix6d& systematic, double view_share) const;
+  std::optional<Covariance> covariance(const MeasurementModel& measurement,
+                                       double view_share) const;
 
   bool root_rests() const { return root_rests_; }
   const NormalizedActions& actions() const { return actions_; }
@@ -79,7 +80,7 @@ class TreeFit {
                std::vector<Pose>* roots) const;
   std::vector<int> views_of(int node) const;
   Eigen::MatrixXd with_fixed_gauge(const Normal& normal) const;
-  Eigen::MatrixXd score_covariance(const Normal& normal, const Matrix6d& systematic,
+  Eigen::MatrixXd score_covariance(const Normal& normal, const MeasurementModel& measurement,
                                    double view_share) const;
   std::vector<Matrix6d> frame_covariances(const Normal& normal, const Eigen::MatrixXd& joint) const;
   void add_composites(const Normal& normal, std::vector<Matrix6d> own, Eigen::MatrixXd* sum) const;

@@ -79,7 +79,7 @@ Eigen::MatrixXd TreeFit::with_fixed_gauge(const Normal& normal) const {
 }
 
 // Covariance of Σ Jᵀ W e over all markers.
-Eigen::MatrixXd TreeFit::score_covariance(const Normal& normal, const Matrix6d& systematic,
+Eigen::MatrixXd TreeFit::score_covariance(const Normal& normal, const MeasurementModel& measurement,
                                           double view_share) const {
   const auto size = normal.H.rows();
   Eigen::MatrixXd score = Eigen::MatrixXd::Zero(size, size);
@@ -89,7 +89,8 @@ Eigen::MatrixXd TreeFit::score_covariance(const Normal& normal, const Matrix6d& 
     const std::vector<int> views = views_of(k);
     std::map<int, int> sizes;
     for (const int view : views) ++sizes[view];
-    std::map<int, Eigen::MatrixXd> common;  // by view, parameters × 6
+    // What is common to a view and to all sights of a tag, parameters × effects.
+    std::map<int, Eigen::MatrixXd> of_view, of_tag;
     for (int t = 0; t < num_frames(); ++t) {
       const int frame = frame_index_[at(t, k)];
       if (frame < 0) continue;
@@ -99,22 +100,32 @@ Eigen::MatrixXd TreeFit::score_covariance(const Normal& normal, const Matrix6d& 
       const Matrix6d twist = robust_weight(fit.squared_distance) *
                              adjoint(poses_[at(t, k)].inverse()).transpose() *
                              whitening.transpose();
-      if (sizes.at(views[frame]) == 1) {
-        own[at(t, k)] = twist * twist.transpose();
-        continue;
-      }
-      const Matrix6d noise = Matrix6d::Identity() - whitening * systematic * whitening.transpose();
-      own[at(t, k)] = (1 - view_share) * twist * noise * twist.transpose();
-      const Matrix6d shared = Matrix6d::Identity() - (1 - view_share) * noise;
-      const Matrix6d in_common = twist * Eigen::LLT<Matrix6d>(shared).matrixL();
-      Eigen::MatrixXd& G =
-          common.try_emplace(views[frame], Eigen::MatrixXd::Zero(size, 6)).first->second;
-      for (int e = k; e >= 0; e = nodes_[e].parent) {
-        const ParameterJacobian& S = normal.S[at(t, e)];
-        G.middleRows(normal.offset[e], S.cols()) += S.transpose().lazyProduct(in_common);
-      }
+      const auto add = [&](const Eigen::MatrixXd& effect, Eigen::MatrixXd* sum) {
+        if (sum->size() == 0) *sum = Eigen::MatrixXd::Zero(size, effect.cols());
+        for (int e = k; e >= 0; e = nodes_[e].parent) {
+          const ParameterJacobian& S = normal.S[at(t, e)];
+          sum->middleRows(normal.offset[e], S.cols()) += S.transpose().lazyProduct(effect);
+        }
+      };
+      const std::vector<int>& tags = data_[k].tag_sets[data_[k].frames[frame].tag_set];
+      const Eigen::Matrix<double, 6, 7> tag =
+          whitening * measurement.effect_of_tag(poses_[at(t, k)], tags.size());
+      for (const int id : tags) add(twist * tag, &of_tag[id]);
+      const Matrix6d systematic =
+          whitening * measurement.systematic_covariance() * whitening.transpose();
+      const Matrix6d noise =
+          positive_part(Matrix6d::Identity() - systematic -
+                        static_cast<double>(tags.size()) * tag * tag.transpose());
+      const bool is_alone = sizes.at(views[frame]) == 1;
+      const double share = is_alone ? 0 : view_share;
+      own[at(t, k)] =
+          twist * ((1 - share) * noise + (is_alone ? 1 : 0) * systematic) * twist.transpose();
+      if (!is_alone)
+        add(twist * Eigen::LLT<Matrix6d>(systematic + share * noise).matrixL().toDenseMatrix(),
+            &of_view[views[frame]]);
     }
-    for (const auto& [view, G] : common) score += G * G.transpose();
+    for (const auto* common : {&of_view, &of_tag})
+      for (const auto& [id, G] : *common) score += G * G.transpose();
   }
   add_composites(normal, std::move(own), &score);
   return score;
@@ -144,7 +155,7 @@ std::vector<Matrix6d> TreeFit::frame_covariances(const Normal& normal,
   return result;
 }
 
-std::optional<TreeFit::Covariance> TreeFit::covariance(const Matrix6d& systematic,
+std::optional<TreeFit::Covariance> TreeFit::covariance(const MeasurementModel& measurement,
                                                        double view_share) const {
   if (!root_rests_) return std::nullopt;
   const Normal normal = normal_equations();
@@ -154,7 +165,7 @@ std::optional<TreeFit::Covariance> TreeFit::covariance(const Matrix6d& systemati
   if (llt.info() != Eigen::Success) return std::nullopt;
   const Eigen::MatrixXd inverse = unit.asDiagonal() * llt.solve(Eigen::MatrixXd(unit.asDiagonal()));
   // The prior added to H is a measurement like others.
-  const Eigen::MatrixXd score = H - normal.H + score_covariance(normal, systematic, view_share);
+  const Eigen::MatrixXd score = H - normal.H + score_covariance(normal, measurement, view_share);
   const Eigen::MatrixXd joint = inverse * score * inverse;
   Covariance result;
   result.models.resize(nodes_.size());

@@ -35,7 +35,7 @@ RigNoise noise_of(const std::filesystem::path& rig, bool is_ideal) {
 
 ObserverConfig observer_config(const std::filesystem::path& rig, bool is_ideal) {
   ObserverConfig config = ObserverConfig::load(rig / "observer.yaml");
-  config.part_pose.calibration = noise_of(rig, is_ideal).calibration;
+  config.part_pose.calibration = noise_of(rig, is_ideal).measurement.tags;
   return config;
 }
 

@@ -283,7 +283,7 @@ TEST(TreeFit, CovariancesAreTrueHoweverOftenAViewIsRepeated) {
       Case c(robot, samples, measurement);
       TreeFit fit(c.nodes, c.data, c.actions, true);
       fit.fit(30, 1e-9);
-      const auto covariance = fit.covariance(M, kShare);
+      const auto covariance = fit.covariance(measurement, kShare);
       ASSERT_TRUE(covariance);
       const Vector6d root = log(fit.root_pose().inverse() * robot.X_CR);
       of_root += root.dot(covariance->root.ldlt().solve(root)) / kRobots;
@@ -299,11 +299,64 @@ TEST(TreeFit, CovariancesAreTrueHoweverOftenAViewIsRepeated) {
   }
 }
 
+// Each part has two tags, which sit elsewhere and are larger than told; one or both are seen.
+TEST(TreeFit, CovariancesAreTrueHoweverOftenATagIsSeen) {
+  constexpr int kRobots = 40;
+  const MeasurementModel measurement{
+      .tags = {.position_m = 0.002, .rotation_rad = 0.01, .size_share = 0.003}};
+  const Matrix6d noise = isotropic({.position_m = 0.001, .rotation_rad = 0.004});
+  for (const int num_poses : {10, 60}) {
+    double of_root = 0, of_edge = 0;
+    for (int seed = 1; seed <= kRobots; ++seed) {
+      Rng rng(seed);
+      const SyntheticRobot robot = chain(0.1, rng);
+      const auto drawn = [&](auto size) -> Eigen::Matrix<double, size(), 1> {
+        return Eigen::Matrix<double, size(), 1>::NullaryExpr([&] { return test::gaussian(rng); });
+      };
+      std::map<int, Eigen::Matrix<double, 7, 1>> of_tag;
+      std::vector<ActionPoseSample> samples(static_cast<std::size_t>(num_poses));
+      for (std::size_t t = 0; t < samples.size(); ++t) {
+        samples[t].sample_index = static_cast<std::int64_t>(t);
+        samples[t].action = robot.random_action(rng);
+        for (const auto& [part, X] : robot.poses_in_camera(samples[t].action)) {
+          PartObservation& seen = samples[t].parts.emplace_back();
+          seen.part = part;
+          seen.tags = {2 * part, 2 * part + 1};
+          if (test::uniform(rng, 0, 1) < 0.5) seen.tags.pop_back();
+          const auto effect = measurement.effect_of_tag(X, seen.tags.size());
+          Vector6d error = noise.llt().matrixL() * drawn(std::integral_constant<int, 6>{});
+          seen.covariance = noise;
+          for (const int tag : seen.tags) {
+            if (!of_tag.contains(tag)) of_tag[tag] = drawn(std::integral_constant<int, 7>{});
+            error += effect * of_tag[tag];
+            seen.covariance += effect * effect.transpose();
+          }
+          seen.X_CB = X * exp(error);
+        }
+      }
+      Case c(robot, samples, measurement);
+      TreeFit fit(c.nodes, c.data, c.actions, true);
+      fit.fit(30, 1e-9);
+      const auto covariance = fit.covariance(measurement, 0);
+      ASSERT_TRUE(covariance);
+      const Vector6d root = log(fit.root_pose().inverse() * robot.X_CR);
+      of_root += root.dot(covariance->root.ldlt().solve(root)) / kRobots;
+      const int last = num_poses - 1;
+      ParameterJacobian J;
+      const Pose X = predict_with_jacobian(fit.nodes()[6].model, c.actions, last, &J);
+      const Vector6d edge = log(X.inverse() * c.nodes[6].model.predict(c.actions, last));
+      of_edge += edge.dot((J * covariance->models[6] * J.transpose()).ldlt().solve(edge)) / kRobots;
+    }
+    EXPECT_NEAR(of_root, 6, 3 * std::sqrt(12.0 / kRobots)) << num_poses;
+    EXPECT_NEAR(of_edge, 6, 3 * std::sqrt(12.0 / kRobots)) << num_poses;
+  }
+}
+
 TEST(TreeFit, ATreeWhoseRootMovesHasNoCovariance) {
   Rng rng(5);
   const Case c(chain(0.1, rng), 20, Regime::kTag, true, rng);
   const TreeFit fit(c.nodes, c.data, c.actions, false);
-  EXPECT_FALSE(fit.covariance(Matrix6d::Identity(), 0.1));
+  EXPECT_FALSE(fit.covariance(c.measurement, 0.1));
 }
 
 }  // namespace
