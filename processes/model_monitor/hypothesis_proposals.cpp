@@ -15,7 +15,7 @@ using Kind = AdaptationEvent::Kind;
 
 /// Samples after a replacement at which all forms are tried again.
 constexpr int kRefits[] = {1, 2, 3, 4, 5, 7, 11, 19, 30};
-/// Samples up to which a change may turn out to be one of what is next to its place.
+/// Samples up to which a change may turn out to be one elsewhere.
 constexpr int kUnsure = 5;
 /// From so many samples on a form must lead another clearly.
 constexpr int kManySamples = 8;
@@ -137,6 +137,8 @@ std::optional<Replacement> HypothesisTracker::best_form(const Hypothesis& of, co
                         !fitted.everywhere && !fitted.change.is_learned();
   if (is_young && of.changes.size() == 1) {
     std::vector<Place> around = places_around(*of.filter, change.what.place.part);
+    for (const Place& place : suspects_of_settled(change.since))
+      if (std::find(around.begin(), around.end(), place) == around.end()) around.push_back(place);
     std::erase(around, change.what.place);
     FoundChanges there = search(others, around, samples, nullptr);
     if (there.best && (!found.best || there.best->fitted.log_evidence >

@@ -129,15 +129,22 @@ const HypothesisTracker::Change* HypothesisTracker::last_at(const std::vector<Ch
   return nullptr;
 }
 
-void HypothesisTracker::begin_tests(std::int64_t since) {
+SequentialTests HypothesisTracker::tests_of(const TreeFilter& filter, std::int64_t since) const {
   // However loud, one sample finds nothing out where a model is soft.
   const double loudest =
-      is_soft_ ? alarm_threshold(filter().num_nodes(), options_.false_alarm_rate) / kFewestSoft
+      is_soft_ ? alarm_threshold(filter.num_nodes(), options_.false_alarm_rate) / kFewestSoft
                : std::numeric_limits<double>::infinity();
-  tests_.emplace(filter(), options_.false_alarm_rate, loudest);
+  SequentialTests tests(filter, options_.false_alarm_rate, loudest);
   for (const Seen& seen : recent_)
     if (seen.sample.sample_index >= since)
-      tests_->update(filter(), filter().prepare(seen.sample), seen.sample.sample_index);
+      tests.update(filter, filter.prepare(seen.sample), seen.sample.sample_index);
+  return tests;
+}
+
+void HypothesisTracker::begin_tests(std::int64_t since) { tests_ = tests_of(filter(), since); }
+
+std::vector<Place> HypothesisTracker::suspects_of_settled(std::int64_t since) const {
+  return tests_of(*settled_filter_, since).suspects(*settled_filter_, options_.suspicion);
 }
 
 std::vector<const ActionPoseSample*> HypothesisTracker::segment(std::int64_t since,

@@ -139,7 +139,11 @@ class HypothesisTracker {
   void note_mismatch(const Place& place, std::int64_t now);
   void settle(std::int64_t now, std::vector<AdaptationEvent>* events);
   void mature(std::int64_t now);
+  /// Of the samples since then.
+  SequentialTests tests_of(const TreeFilter& filter, std::int64_t since) const;
   void begin_tests(std::int64_t since);
+  /// As if nothing stood.
+  std::vector<Place> suspects_of_settled(std::int64_t since) const;
   void set_settled(const BodySchema& settled);
 
   const AdaptationOptions options_;
