@@ -26,7 +26,7 @@ Eigen::Matrix<double, 6, 7> MeasurementModel::effect_of_tag(const Pose& X_CB,
   result.diagonal().head<3>().setConstant(tags.position_m);
   result.diagonal().tail<3>().setConstant(tags.rotation_rad);
   result.col(6).head<3>() = tags.size_share * (X_CB.linear().transpose() * X_CB.translation());
-  return result / static_cast<double>(num_tags);
+  return scale / static_cast<double>(num_tags) * result;
 }
 
 Matrix6d MeasurementModel::systematic_covariance() const {

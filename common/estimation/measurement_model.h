@@ -42,8 +42,10 @@ struct MeasurementModel {
   Matrix6d noise_covariance(const PartObservation& observation) const;
   /// M, and a little that keeps exact measurements invertible.
   Matrix6d systematic_covariance() const;
-  /// Columns are what one standard deviation of each error of a tag makes of the pose of a part
-  /// that is seen at X_CB by `num_tags` tags: place and rotation on it, size (depth).
+  /// 6×7, (translation [m], rotation [rad]), right perturbation in B: what one standard deviation
+  /// of each error of one tag (place and rotation on its part, size: depth) makes of a pose that is
+  /// the mean over `num_tags` of them. Takes the tag to be at the part's origin. Zero where `noise`
+  /// is set or the tags are not known.
   Eigen::Matrix<double, 6, 7> effect_of_tag(const Pose& X_CB, std::size_t num_tags) const;
   /// Σ + M.
   Matrix6d covariance(const PartObservation& observation) const;

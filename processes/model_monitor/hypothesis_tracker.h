@@ -20,7 +20,7 @@ namespace bodyschema {
 /// A hypothesis is the settled body with changes on it, oldest first; without any, that nothing
 /// changed. Its weight are log odds against that one: priors of its changes, and of every sample
 /// the log-likelihood ratio of the tree filter. CUSUMs of the standing hypothesis propose others:
-/// one change more, another form or a neighbouring place of one, one less, an edge learned anew.
+/// one change more, another form or place of one, one less, an edge learned anew.
 /// Each sample adds to all weights. Another takes the place of the standing one when it leads by
 /// enough, fitted to all its samples: by `acceptance` for what is new, by nothing for what is less.
 /// Events are the difference of the two. Once a hypothesis has stood unchanged for `settled_after`
@@ -139,10 +139,10 @@ class HypothesisTracker {
   void note_mismatch(const Place& place, std::int64_t now);
   void settle(std::int64_t now, std::vector<AdaptationEvent>* events);
   void mature(std::int64_t now);
-  /// Of the samples since then.
+  /// CUSUMs of `filter` over the kept samples from `since` on.
   SequentialTests tests_of(const TreeFilter& filter, std::int64_t since) const;
   void begin_tests(std::int64_t since);
-  /// As if nothing stood.
+  /// Suspected under the settled body by the samples from `since` on.
   std::vector<Place> suspects_of_settled(std::int64_t since) const;
   void set_settled(const BodySchema& settled);
 

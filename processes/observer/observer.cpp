@@ -280,6 +280,12 @@ std::optional<std::string> Observer::on_tick(std::int64_t now_us) {
   return activity();
 }
 
+bool Observer::is_waiting() const {
+  const bool is_late =
+      has_warned_ && !rests_.empty() && key_of(rests_.back().status) == waited_for_;
+  return !lens_ || num_samples_ == 0 || is_late;
+}
+
 std::string Observer::activity() const {
   if (!lens_) return "waits for CAMERA_INFO";
   if (!rests_.empty()) {

@@ -61,7 +61,8 @@ class Observer {
 
   /// Activity for people.
   std::string activity() const;
-  bool is_waiting() const { return !lens_ || num_samples_ == 0 || has_warned_; }
+  /// No lens, no sample yet, or on_tick() has told of the action that it waits for.
+  bool is_waiting() const;
   /// Reason → number of rejected tags, parts and frames since the start.
   const std::map<std::string, std::int64_t>& counters() const { return counters_; }
 

@@ -62,7 +62,8 @@ struct PairData {
   int part_j = 0;
   std::vector<PairFrame> frames;
   std::vector<PairHypothesis> hypotheses;
-  std::vector<std::vector<int>> tag_sets;  ///< ids, by PairFrame::tag_set
+  /// Of make_part_data(): ids of the tags, by PairFrame::tag_set; an empty set: not known.
+  std::vector<std::vector<int>> tag_sets;
 
   int size() const { return static_cast<int>(frames.size()); }
   /// The reading of both primary hypotheses.

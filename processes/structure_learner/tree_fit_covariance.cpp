@@ -107,7 +107,7 @@ Eigen::MatrixXd TreeFit::score_covariance(const Normal& normal, const Measuremen
           sum->middleRows(normal.offset[e], S.cols()) += S.transpose().lazyProduct(effect);
         }
       };
-      const std::vector<int>& tags = data_[k].tag_sets[data_[k].frames[frame].tag_set];
+      const std::vector<int>& tags = data_[k].tag_sets.at(data_[k].frames[frame].tag_set);
       const Eigen::Matrix<double, 6, 7> tag =
           whitening * measurement.effect_of_tag(poses_[at(t, k)], tags.size());
       for (const int id : tags) add(twist * tag, &of_tag[id]);

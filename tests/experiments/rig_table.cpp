@@ -134,9 +134,8 @@ struct Options {
 /// One row for each of options.at.
 std::vector<Row> measured(const std::filesystem::path& rig, bool is_ideal, const Options& options) {
   StructureLearnerConfig config = StructureLearnerConfig::load(rig / "structure_learner.yaml");
-  if (is_ideal)
-    config.options.measurement.systematic =
-        load_noise(rig, "ideal_noise.yaml").measurement.systematic;
+  config.options.measurement =
+      load_noise(rig, is_ideal ? "ideal_noise.yaml" : "noise.yaml").measurement;
   if (!options.systematic.empty())
     config.options.measurement.systematic = {options.systematic[0] * 1e-3,
                                              options.systematic[1] * kDegree};

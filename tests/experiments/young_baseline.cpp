@@ -111,7 +111,7 @@ int main(int argc, char** argv) {
     const MeasurementModel measurement =
         load_noise(rig, is_honest ? "noise.yaml" : "ideal_noise.yaml").measurement;
     StructureLearnerConfig learner = StructureLearnerConfig::load(rig / "structure_learner.yaml");
-    learner.options.measurement.systematic = measurement.systematic;
+    learner.options.measurement = measurement;
     ModelMonitorConfig monitor = ModelMonitorConfig::load(rig / "model_monitor.yaml");
     monitor.measurement = measurement;
     const test::RigTruth truth(rig);

@@ -264,8 +264,8 @@ TEST(AdaptationTest, AnAmbiguousEdgeIsReportedOnceItIsLocalised) {
   }
 }
 
-// A remembered body in which a link was bent explains some of the first sample, and others beside
-// it the rest: where nothing was bent before, the camera is found.
+// A stored body with a bent link explains part of the first sample after the camera moved; the
+// camera must be found all the same.
 TEST(AdaptationTest, ARememberedBendDoesNotHideThatTheCameraMoved) {
   for (int seed = 1; seed <= 10; ++seed) {
     BrokenArm arm({Fault::kNone, "", 1}, Regime::kTagIso, 20, seed);

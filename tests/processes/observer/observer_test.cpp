@@ -347,6 +347,9 @@ TEST(Observer, SaysThatItWaitsOnlyOnceItTakesLong) {
   EXPECT_FALSE(observer.is_waiting());
   observer.on_tick(7'000'000);
   EXPECT_TRUE(observer.is_waiting());
+  observer.on_marker_poses(scene.frame(kRest_us + 66'666));
+  ASSERT_TRUE(observer.on_marker_poses(scene.frame(kRest_us + 99'999)));
+  EXPECT_FALSE(observer.is_waiting());
 }
 
 TEST(Observer, MakesASampleWithoutPartsWhereNothingIsSeen) {
