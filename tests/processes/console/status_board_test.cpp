@@ -286,7 +286,7 @@ model_health_t wrong_in_two_places() {
   stuck.finding_adopted = 291;
   stuck.num_confirming = 40;
   stuck.finding_text =
-      "q2 (1→2) stuck at −0.25 since sample 290, mended at 291, confirmed by 40 samples";
+      "q2 (1→2) stuck at −0.25 since sample 290, in the schema since 291, confirmed by 40 samples";
   finding_t open{};
   open.finding_from = open.finding_to = open.finding_tag = -1;
   open.finding_part = 3;
@@ -325,18 +325,18 @@ TEST(StatusBoardTest, WhatIsWrongStandsFirstAndNoTerminalIsTooNarrowForIt) {
   board_.on_message(wrong_in_two_places());
   EXPECT_TRUE(
       status_text(board_.status(), 100)
-          .starts_with(
-              "What is wrong now\n"
-              "  q2 (1→2) stuck at −0.25 since sample 290, mended at 291, confirmed by 40 samples\n"
-              "  marker of part 3 not as known since sample 300, found at 301\n\n"
-              "Learning: 5 samples.\nThe body is not as the schema says in 1 place.\n"))
+          .starts_with("What is wrong now\n"
+                       "  q2 (1→2) stuck at −0.25 since sample 290, in the schema since 291, "
+                       "confirmed by 40 samples\n"
+                       "  marker of part 3 not as known since sample 300, found at 301\n\n"
+                       "Learning: 5 samples.\nThe body is not as the schema says in 1 place.\n"))
       << status_text(board_.status(), 100);
   const std::string narrow = status_text(board_.status(), 40);
   EXPECT_TRUE(
       narrow.starts_with("What is wrong now\n"
                          "  q2 (1→2) stuck at −0.25 since sample\n"
-                         "    290, mended at 291, confirmed by 40\n"
-                         "    samples\n"))
+                         "    290, in the schema since 291,\n"
+                         "    confirmed by 40 samples\n"))
       << narrow;
   const auto wrong = status_json(board_.status())["wrong"];
   ASSERT_EQ(wrong.size(), 2U);
