@@ -156,7 +156,7 @@ std::vector<std::string> hints_of(const Recording& recording) {
     middles.emplace_back(Eigen::Translation3d(median_position(track)));
   }
   if (std::max(largest_m, spread_m(middles)) > kLargestBody_m)
-    hints.emplace_back("positions look like millimetres; expected metres");
+    hints.emplace_back("positions look like millimetres or centimetres; expected metres");
   if (recording.has_noise) {
     std::vector<double> noise_m, noise_rad;
     for (const ActionPoseSample& sample : recording.samples)

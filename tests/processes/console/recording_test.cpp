@@ -663,7 +663,7 @@ TEST_F(RecordingFileTest, ATornTailOfALogIsNoError) {
 TEST_F(RecordingFileTest, ALogThatIsOfNoUseIsRefused) {
   BodySchema schema;
   LogAppender(file_).append(kBodySchema, to_message(schema));
-  EXPECT_EQ(load_error(), " expected SAMPLE messages, found none in 1 events");
+  EXPECT_EQ(load_error(), " expected SAMPLE messages, found none in 1 event");
 
   std::filesystem::remove(file_);
   {
@@ -695,6 +695,15 @@ TEST_F(RecordingFileTest, ALogThatIsOfNoUseIsRefused) {
     log.append_bytes("SAMPLE", garbage, 1);
   }
   EXPECT_EQ(load_error().rfind(" event 1 (SAMPLE): ", 0), 0U);
+
+  std::filesystem::resize_file(file_, 50);
+  EXPECT_EQ(load_error(),
+            " expected SAMPLE messages, found none in 0 events; it ends in the middle of an event "
+            "at byte 0");
+}
+
+TEST(RecordingTest, BytesThatAreNoTextAreNotRepeated) {
+  EXPECT_NE(error_of("\xED\x1b[2J\x9b,7\n").find(", found '? [2J?'"), std::string::npos);
 }
 
 TEST_F(RecordingFileTest, AFileThatCannotBeReadIsNamed) {

@@ -1,6 +1,8 @@
 #include "processes/console/status_board.h"
 
 #include <gtest/gtest.h>
+#include <pty.h>
+#include <unistd.h>
 
 #include <sstream>
 
@@ -465,6 +467,16 @@ TEST(FitTest, CutsBetweenCharacters) {
                 10),
             "a b");  // a control character of two bytes
   EXPECT_EQ(fit("", 0), "");
+}
+
+TEST(InPlaceTest, ALineFitsTheTerminal) {
+  int outer = -1, terminal = -1;
+  const winsize size{24, 8, 0, 0};
+  ASSERT_EQ(::openpty(&outer, &terminal, nullptr, nullptr, &size), 0);
+  EXPECT_EQ(terminal_width(terminal), 8);
+  EXPECT_EQ(in_place("12 of 300 samples", terminal), "\r\x1b[2K12 of 3…");
+  ::close(outer);
+  ::close(terminal);
 }
 
 }  // namespace
