@@ -11,9 +11,12 @@ from pathlib import Path
 
 from launcher import group_file, packages, run_folder, test_selection
 from launcher.build import alone, build, cmake, configure, num_processors
-from launcher.group import Group
+from launcher.group import Group, until
 from launcher.learn import driver_test, learn, processes, rig_folder
 from launcher.words import Failure, UsageError, say
+
+# Time for a ./run in another shell to sum up, after its group was stopped.
+SUMMARY_S = 30
 
 LEARN_USAGES = (
     (
@@ -61,6 +64,8 @@ def run(place, arguments):
     if arguments and (arguments[0] in ("", "-h", "--help", "help")):
         print(help_text())
         return 0
+    if arguments == ["--version"]:
+        return version(place)
     if not arguments or arguments[0].startswith("-"):
         return learn(place, learn_options(arguments))
     name, *rest = arguments
@@ -69,6 +74,12 @@ def run(place, arguments):
     if name in WORDS:
         return WORDS[name][0](place, rest)
     return console(place, name, rest)
+
+
+def version(place):
+    if not place.console.exists():
+        raise Failure("--version is known once there is a build: ./run --build-only")
+    become([place.console, "--version"])
 
 
 def asks_for_help(arguments):
@@ -153,6 +164,10 @@ def stop(place, arguments):
     group = Group.find(place.logs)
     if group:
         group.stop()
+        # A ./run that followed the group holds the lock until it has summed up.
+        if not until(lambda: not run_folder.is_locked(place.logs), SUMMARY_S):
+            say("stopped; its run is still being summed up: another can begin after that")
+            return 0
         say("stopped")
         return 0
     if run_folder.is_locked(place.logs):

@@ -44,7 +44,7 @@ def begin(place, rig):
     if held is None or group:
         if group:
             raise Failure(f"a group runs already, from {group.run}; stop it with ./run stop")
-        raise Failure("a group runs here already: it just begins, sums up its run, or is another user's")
+        raise Failure("a group runs here already: it just begins, sums up its run, or is another user's; try again in some seconds")
     while True:
         run = logs / time.strftime("%Y%m%d-%H%M%S")
         try:

@@ -1,10 +1,14 @@
 #include "processes/console/hint.h"
 
 #include <fmt/format.h>
+#include <sys/ioctl.h>
+#include <unistd.h>
 
 #include <algorithm>
 #include <cstdlib>
 #include <sstream>
+
+#include "common/bus/check.h"
 
 namespace bodyschema {
 
@@ -24,12 +28,9 @@ std::string duration(double s) {
 }
 
 std::string abbreviated(std::string_view text) {
-  constexpr std::size_t kMost = 40;
-  if (text.size() <= kMost) return std::string(text);
-  std::size_t size = kMost;
-  // Not in the middle of a character of UTF-8.
-  while (size > 0 && (static_cast<unsigned char>(text[size]) & 0xC0) == 0x80) --size;
-  return std::string(text.substr(0, size)) + "…";
+  constexpr int kMost = 40;
+  // Of four bytes each at most.
+  return fit(as_text(std::string(text.substr(0, 5 * kMost))), kMost + 1);
 }
 
 std::string fit(const std::string& text, int width) {
@@ -76,6 +77,17 @@ std::string wrap(const std::string& text, int width, int indent) {
     is_begun = true;
   }
   return result + fit(line, width) + "\n";
+}
+
+std::optional<int> terminal_width(int file) {
+  winsize size{};
+  if (::isatty(file) != 1 || ::ioctl(file, TIOCGWINSZ, &size) != 0 || size.ws_col == 0)
+    return std::nullopt;
+  return size.ws_col;
+}
+
+std::string in_place(const std::string& line, int terminal) {
+  return "\r\x1b[2K" + fit(line, terminal_width(terminal).value_or(1000));
 }
 
 }  // namespace bodyschema

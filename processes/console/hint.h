@@ -1,6 +1,7 @@
 #pragma once
 
 #include <cstdint>
+#include <optional>
 #include <string>
 #include <string_view>
 
@@ -16,7 +17,7 @@ std::string counted(std::int64_t count, const std::string& noun);
 /// A time for people: "95 s", "12 min", "2.5 h".
 std::string duration(double seconds);
 
-/// `text` for an error: of more than 40 bytes the first ones and "…".
+/// `text` for an error: fit() for 41 characters, with "?" for what is not UTF-8.
 std::string abbreviated(std::string_view text);
 
 /// `text` as lines of at most `width` characters, broken between words where there are any; the
@@ -26,5 +27,12 @@ std::string wrap(const std::string& text, int width, int indent);
 /// `text` as one line of at most `width` characters: longer ones end in "…", control characters
 /// (a terminal would obey them) become spaces.
 std::string fit(const std::string& text, int width);
+
+/// Columns of the terminal that a file descriptor is; none if it is no terminal.
+std::optional<int> terminal_width(int file);
+
+/// A line that takes the place of the last one on a terminal: cut, because a row that it begins
+/// anew could not be erased.
+std::string in_place(const std::string& line, int terminal);
 
 }  // namespace bodyschema

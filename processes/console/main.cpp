@@ -1,19 +1,39 @@
 // bodyschema: the operator's command. It listens to everything on the bus and works on recordings.
 
+#include <fmt/format.h>
+
 #include <CLI/CLI.hpp>
+#include <algorithm>
 #include <cstdio>
 #include <exception>
 #include <iostream>
 #include <stdexcept>
+#include <string>
+#include <vector>
 
 #include "common/bus/arguments.h"
 #include "common/bus/log_summary.h"
 #include "processes/console/commands/commands.h"
+#include "processes/console/hint.h"
 #include "processes/driver_test/driver_test.h"
 
 namespace {
 constexpr int kWrongUsage = 2;
+
+/// What was typed where one of several commands was expected; "" if that is not what was wrong.
+std::string unknown_command(const CLI::App& console) {
+  const CLI::App* app = &console;
+  while (!app->get_subcommands().empty()) app = app->get_subcommands().front();
+  const std::vector<std::string> rest = app->remaining();
+  const auto word = std::find_if(rest.begin(), rest.end(),
+                                 [](const std::string& text) { return !text.starts_with("-"); });
+  if (app->get_require_subcommand_min() == 0 || word == rest.end()) return "";
+  std::string names;
+  for (const CLI::App* command : app->get_subcommands(nullptr)) names += " " + command->get_name();
+  return fmt::format("{}: unknown command '{}'; there are:{}\n", app->get_name(),
+                     bodyschema::fit(*word, 40), names);
 }
+}  // namespace
 
 int main(int argc, char** argv) {
   CLI::App console("A robot arm's body schema: learn it, look at it, judge it", "bodyschema");
@@ -39,6 +59,13 @@ int main(int argc, char** argv) {
     if (!std::cout.flush()) throw std::runtime_error("stdout: the result could not be written");
   } catch (const CLI::RuntimeError& error) {
     return console.exit(error);  // the result was printed
+  } catch (const CLI::RequiredError& error) {
+    const std::string unknown = unknown_command(console);
+    if (unknown.empty())
+      console.exit(error);
+    else
+      std::fputs(unknown.c_str(), stderr);
+    return kWrongUsage;
   } catch (const CLI::ParseError& error) {
     return console.exit(error) == 0 ? 0 : kWrongUsage;
   } catch (const std::exception& error) {

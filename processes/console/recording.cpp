@@ -321,8 +321,11 @@ Recording read_samples(const std::filesystem::path& file, const std::string& nam
   LogReport report;
   const std::vector<sample_t> messages = read_log(file, kSample, &report);
   if (messages.empty()) {
-    throw RecordingError(name + ": expected SAMPLE messages, found none in " +
-                         std::to_string(report.events) + " events");
+    throw RecordingError(
+        name + ": expected SAMPLE messages, found none in " + counted(report.events, "event") +
+        (report.truncated_at_byte ? "; it ends in the middle of an event at byte " +
+                                        std::to_string(*report.truncated_at_byte)
+                                  : ""));
   }
   if (report.truncated_at_byte) {
     recording.damage = name + ": ends in the middle of an event at byte " +

@@ -8,6 +8,7 @@
 
 #include "common/bus/convert.h"
 #include "common/geometry/angle.h"
+#include "processes/console/hint.h"
 #include "processes/console/names.h"
 #include "processes/console/views/health_view.h"
 
@@ -150,7 +151,7 @@ std::string RunWatch::progress(const std::optional<SampleGoal>& goal,
   if (goal) line += fmt::format(" of {}{}", goal->is_exact ? "" : "at most ", goal->most);
   line += " samples";
   if (goal && remaining_s && num_samples() < goal->most)
-    line += fmt::format(" · {}{:.0f} s left", goal->is_exact ? "" : "at most ", *remaining_s);
+    line += fmt::format(" · {}{} left", goal->is_exact ? "" : "at most ", duration(*remaining_s));
   line += fmt::format(" · {:2} parts, each seen in {:3.0f} %", seen.size(), mean * 100);
   const std::size_t edges = schema_ ? schema_->edges.size() : 0;
   line += fmt::format(" · {} of {} edges", edges, seen.empty() ? 0 : seen.size() - 1);

@@ -7,6 +7,7 @@
 #include <tuple>
 #include <utility>
 
+#include "processes/console/hint.h"
 #include "processes/console/names.h"
 
 namespace bodyschema {
@@ -19,8 +20,13 @@ constexpr std::int64_t kSilent_us = 3'000'000;
 
 }  // namespace
 
-std::string distance_text(double error_m) {
-  return error_m < 0 ? "unknown" : fmt::format("{:.1f} mm", error_m * 1e3);
+std::string course_text(const control_status_t& status) {
+  std::string text = counted(status.num_moves, "move");
+  if (status.predicted_error_m >= 0)
+    text += fmt::format(", by the schema {:.1f} mm away", status.predicted_error_m * 1e3);
+  if (status.observed_error_m >= 0)
+    text += fmt::format(", as seen {:.1f} mm", status.observed_error_m * 1e3);
+  return text;
 }
 
 action_command_t make_console_command(std::int8_t kind, std::int64_t epoch,
@@ -114,10 +120,8 @@ std::string TargetFollower::progress() const {
     return has_controller_ ? "waiting for the controller to take up the target"
                            : "waiting for the controller";
   }
-  return fmt::format("{} · {} moves · by the schema {} away, as seen {} · {}",
-                     name_in(kControlStates, status_.control_state), status_.num_moves,
-                     distance_text(status_.predicted_error_m),
-                     distance_text(status_.observed_error_m), status_.why);
+  return fmt::format("{} · {} · {}", name_in(kControlStates, status_.control_state),
+                     course_text(status_), status_.why);
 }
 
 bool TargetFollower::has_been_heard(const std::string& process) const {

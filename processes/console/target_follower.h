@@ -96,8 +96,8 @@ inline constexpr std::int64_t kCommandPeriod_us = 200'000;  ///< of what is not 
 /// An ACTION_COMMAND of the console without an action: HOLD, STOP or RESUME.
 action_command_t make_console_command(std::int8_t kind, std::int64_t epoch, std::int64_t action_id);
 
-/// "1.2 mm"; "unknown" below 0.
-std::string distance_text(double error_m);
+/// "2 moves, by the schema 0.1 mm away, as seen 1.2 mm": as far as it is known.
+std::string course_text(const control_status_t& status);
 /// The output of `target --json`.
 std::string target_json(const control_status_t& status, TargetFollower::End end);
 

@@ -19,6 +19,7 @@ using S = control_status_t;
 
 constexpr char kSource[] = "controller";
 constexpr char kHalted[] = "the arm is halted; first: ./run resume (or bodyschema resume)";
+constexpr char kWasHalted[] = "the arm was halted; it is resumed: give the target again";
 constexpr char kHeldAsBefore[] = "held as before the restart: ";
 constexpr std::int64_t kRepeat_us = 1'000'000;
 constexpr int kMaxExpired = 3;         // in a row
@@ -611,6 +612,7 @@ Controller::Answer Controller::on_motion_status(const motion_status_t& motion) {
     if (is_news) quiet_.restart();
   }
   locate();
+  if (state_ == S::CONTROL_REFUSED && why_ == kHalted && !motion.stop_latched) why_ = kWasHalted;
   if (hold_command_ && is_mine && motion.action_id == hold_command_->action_id) {
     hold_command_.reset();
   }

@@ -152,15 +152,15 @@ std::string text_of(const Finding& finding, const std::vector<Signal>& signals) 
   std::string text =
       (is_camera_open ? std::string("camera not as known") : what(finding, signals)) +
       since_text(finding.since);
-  const std::string mended = ", mended at " + std::to_string(finding.adopted);
+  const std::string adopted = ", in the schema since " + std::to_string(finding.adopted);
   switch (finding.state) {
     case Finding::State::kFound:
       return text + ", found at " + std::to_string(finding.found) + ", not explained yet";
     case Finding::State::kAdopted:
-      return text + mended + ", not confirmed yet (" + counted(finding.num_confirming, "sample") +
+      return text + adopted + ", not confirmed yet (" + counted(finding.num_confirming, "sample") +
              ")";
     case Finding::State::kConfirmed:
-      return text + mended + ", confirmed by " + counted(finding.num_confirming, "sample");
+      return text + adopted + ", confirmed by " + counted(finding.num_confirming, "sample");
     case Finding::State::kFollowed:
       return text + ", followed";
     case Finding::State::kAside:

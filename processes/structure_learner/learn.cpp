@@ -56,9 +56,10 @@ UnconnectedPart explain(int part, int num_seen, const std::set<int>& connected,
   }
   // With fewer numbers than five a parameter of the largest model, its refusal says little.
   const int parameters = 6 + 6 * max_signals;
-  const std::string seen = "seen " + std::to_string(num_seen) + " times, at most " +
-                           std::to_string(common) + " of them together with one connected part" +
-                           (partner >= 0 ? " (" + std::to_string(partner) + ")" : "");
+  const std::string seen =
+      "seen " + (num_seen == 1 ? "once" : std::to_string(num_seen) + " times") + ", at most " +
+      std::to_string(common) + " of them together with one connected part" +
+      (partner >= 0 ? " (" + std::to_string(partner) + ")" : "");
   if (!undecided && 6 * common >= 5 * parameters)
     return {part, Unconnected::kNoValidModel,
             seen + "; no model with up to " + std::to_string(max_signals) +

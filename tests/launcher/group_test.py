@@ -7,6 +7,8 @@ from pathlib import Path
 
 from support import STUBBORN, GroupTest
 
+from launcher import run_folder
+
 LEARN = ("--rig", "arm2")
 
 
@@ -88,6 +90,11 @@ class OthersEndTheGroup(GroupTest):
         self.assertIn("the group was stopped from elsewhere (./run stop)", self.words())
         self.assertNotIn("keeps running", self.words())
         self.assert_nothing_is_left(group)
+
+    def test_stop_waits_until_the_run_is_summed_up(self):
+        self.start(*LEARN, FAKE_SUMMARY_S="2")
+        self.run_to_end("stop")
+        self.assertFalse(run_folder.is_locked(self.logs))
 
     def test_a_run_that_keeps_its_group_says_so_too(self):
         run = self.start(*LEARN, "--keep")
@@ -218,6 +225,10 @@ class HelpNeverActs(GroupTest):
         self.run_to_end("stop", "--now")
         self.assertFalse(self.group().has_ended())
         self.assertEqual(sorted(self.logs.iterdir()), runs)
+
+    def test_the_version_is_that_of_the_console(self):
+        self.assertEqual(self.run_to_end("--version"), ("bodyschema 1.2.3\n", 0))
+        self.assertFalse(self.logs.exists())
 
     def test_words_that_are_not_there_are_refused(self):
         for words in ("stop all", "lern", "--sample 3", "--samples 0", "--seed x", "--speed 2", "--replay FILE --keep", "exec"):

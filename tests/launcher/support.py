@@ -19,6 +19,8 @@ import os, signal, sys, time
 word, *rest = sys.argv[1:]
 if word == "--help":
     print("A console\\n\\nSubcommands:\\n  learn  …\\n  halt  …\\n  target  …\\n  hold  …\\n  release  …\\n  resume  …\\n  fault  …")
+elif word == "--version":
+    print("bodyschema 1.2.3")
 elif "--help" in rest:
     print(word, *rest)
 elif word == "rig":
@@ -28,6 +30,7 @@ elif word == "rig":
 elif word == "watch":
     def end(*_):
         print("interrupted", flush=True)
+        time.sleep(float(os.environ.get("FAKE_SUMMARY_S", "0")))
         sys.exit(1)
     signal.signal(signal.SIGTERM, end)
     print("watching", flush=True)

@@ -426,7 +426,7 @@ TEST_F(BodyschemaProgramTest, SenselessOptionsAreRefused) {
   expect_failure({"learn", csv, "--speed", "3"}, "--speed");
   expect_failure({"learn"}, "SAMPLES");
   expect_failure({"predict", csv}, "SAMPLES");
-  expect_failure({"forget", csv}, "subcommand is required");
+  expect_failure({"forget", csv}, "bodyschema: unknown command 'forget'; there are: learn ");
   expect_failure({}, "subcommand is required");
   EXPECT_FALSE(exists("schema.lcmlog"));
 }
@@ -1195,7 +1195,7 @@ TEST_F(BodyschemaProgramTest, AFaultIsCheckedBeforeItIsSent) {
   expect_failure({"fault", "bend", "forearm", "91"}, "not in range");
   expect_failure({"fault", "tool", "-1"}, "not in range");
   expect_failure({"fault", "marker-lost", "twelve"}, "not in range");
-  expect_failure({"fault", "melt"}, "subcommand is required");
+  expect_failure({"fault", "melt"}, "fault: unknown command 'melt'; there are: stuck bend ");
 }
 
 TEST_F(BodyschemaProgramTest, ADriverTestWithoutADriverSaysSo) {

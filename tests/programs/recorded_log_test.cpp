@@ -225,6 +225,7 @@ TEST_F(RecordedLogTest, AReportFollowsARunUntilItIsEnded) {
   };
   EXPECT_TRUE(says("Nothing was recorded yet"));
   EXPECT_TRUE(says("http-equiv=\"refresh\""));
+  EXPECT_TRUE(says("the run goes on"));
   test::write_bytes(folder_ / "run.lcmlog.00",
                     {bytes.begin(), bytes.begin() + static_cast<std::ptrdiff_t>(bytes.size() / 2)});
   // Asked to end, it reads the rest and writes a last time.
@@ -233,6 +234,7 @@ TEST_F(RecordedLogTest, AReportFollowsARunUntilItIsEnded) {
   EXPECT_EQ(follow.wait(), 0) << follow.err();
   EXPECT_TRUE(says("The body is known"));
   EXPECT_EQ(text_of(html).find("http-equiv"), std::string::npos);
+  EXPECT_EQ(text_of(html).find("the run goes on"), std::string::npos);
 }
 
 TEST_F(RecordedLogTest, WhatIsNoRunIsAClearError) {

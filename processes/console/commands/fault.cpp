@@ -60,7 +60,10 @@ void inject(FaultArguments& arguments) {
               << "\n";
     return;
   }
-  if (done->faults.empty()) std::cout << "nothing is broken\n";
+  if (done->faults.empty()) {
+    std::cout << (command.fault == fault_command_t::FAULT_REPAIR ? "repaired: as built\n"
+                                                                 : "nothing is broken\n");
+  }
   for (const std::string& fault : done->faults) std::cout << fault << "\n";
 }
 

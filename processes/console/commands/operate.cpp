@@ -34,8 +34,7 @@ class ProgressLine {
   void show(const std::string& line) {
     if (line == shown_) return;
     shown_ = line;
-    std::cerr << (is_terminal_ ? "\r\x1b[2K" : "") << line << (is_terminal_ ? "" : "\n")
-              << std::flush;
+    std::cerr << (is_terminal_ ? in_place(line, STDERR_FILENO) : line + "\n") << std::flush;
   }
 
  private:
@@ -179,15 +178,15 @@ void run_target(const OperateArguments& arguments) {
   if (arguments.json) {
     std::cout << target_json(status, follower.end()) << "\n";
   } else {
-    std::cout << fmt::format("{}: {} (by the schema {} away, as seen {}; {} moves)\n",
-                             is_reached                                                  ? "reached"
-                             : follower.end() == TargetFollower::End::kMissed            ? "missed"
-                             : status.control_state == control_status_t::CONTROL_HOLDING ? "held"
+    // The controller's own words begin with "reached".
+    std::cout << fmt::format("{}{} ({})\n",
+                             is_reached                                       ? ""
+                             : follower.end() == TargetFollower::End::kMissed ? "missed: "
+                             : status.control_state == control_status_t::CONTROL_HOLDING ? "held: "
                              : status.control_state == control_status_t::CONTROL_REFUSED
-                                 ? "refused"
-                                 : "not reached",
-                             status.why, distance_text(status.predicted_error_m),
-                             distance_text(status.observed_error_m), status.num_moves);
+                                 ? "refused: "
+                                 : "not reached: ",
+                             status.why, course_text(status));
   }
   if (!is_reached) fail();
   if (arguments.keep_s < 0)

@@ -75,8 +75,9 @@ class Source {
             record_.faults().size() + record_.processes().size()};
   }
 
-  /// Writes the page; returns what keeps it from having its plots, "" if nothing does.
-  std::string write(const fs::path& out, std::optional<int> reload_s) const {
+  /// Writes the page of a run that `goes_on`; returns what keeps it from having its plots, "" if
+  /// nothing does.
+  std::string write(const fs::path& out, bool goes_on, std::optional<int> reload_s) const {
     Report report;
     report.title = title();
     report.record = &record_;
@@ -85,7 +86,7 @@ class Source {
       if (grows_ && summary.damage.starts_with("is cut off")) summary.damage.clear();
     }
     report.measurement = measurement_of(is_folder_ ? path_ / "run.lcmlog" : path_);
-    report.goes_on = grows_;
+    report.goes_on = goes_on;
     report.reload_s = reload_s;
     report.picture = picture();
     if (is_folder_ && fs::exists(path_ / "config" / "signals.yaml")) {
@@ -157,7 +158,7 @@ void run_report(const ReportArguments& arguments) {
   const fs::path out = arguments.out.empty() ? source.default_out() : fs::path(arguments.out);
   if (!arguments.follow) {
     source.read();
-    const std::string problem = source.write(out, std::nullopt);
+    const std::string problem = source.write(out, arguments.grows, std::nullopt);
     if (!problem.empty()) throw std::runtime_error(out.string() + " has no plots: " + problem);
     std::cout << out.string() << std::endl;
     return;
@@ -169,7 +170,7 @@ void run_report(const ReportArguments& arguments) {
   auto write = [&, last = std::string()](std::optional<int> reload_s) mutable {
     std::string problem;
     try {
-      problem = source.write(out, reload_s);
+      problem = source.write(out, reload_s.has_value(), reload_s);
     } catch (const std::exception& error) {
       problem = error.what();  // a full disk, say: the next page may succeed
     }
@@ -192,6 +193,7 @@ void run_report(const ReportArguments& arguments) {
     write(kReload_s);
   }
   source.read();
+  // The group that starts this program ends it when the run ends.
   write(std::nullopt);
 }
 

@@ -1,6 +1,5 @@
 #include <fmt/format.h>
 #include <spdlog/spdlog.h>
-#include <sys/ioctl.h>
 #include <unistd.h>
 
 #include <chrono>
@@ -16,6 +15,7 @@
 #include "common/bus/log_summary.h"
 #include "processes/console/clock.h"
 #include "processes/console/commands/commands.h"
+#include "processes/console/hint.h"
 #include "processes/console/status_board.h"
 #include "processes/console/views/status_view.h"
 
@@ -29,15 +29,6 @@ struct StatusArguments {
   double seconds = 2.1;
   bool json = false;
 };
-
-/// Columns of the terminal; 100 where there is none.
-int terminal_width() {
-  winsize size{};
-  return ::isatty(STDOUT_FILENO) == 1 && ::ioctl(STDOUT_FILENO, TIOCGWINSZ, &size) == 0 &&
-                 size.ws_col > 0
-             ? size.ws_col
-             : 100;
-}
 
 void run_status(const StatusArguments& arguments) {
   // Dropped messages stand in the result.
@@ -75,7 +66,8 @@ void run_status(const StatusArguments& arguments) {
   if (arguments.json) {
     std::cout << status_json(board.status()).dump(2) << std::endl;
   } else {
-    std::cout << status_text(board.status(), terminal_width()) << std::flush;
+    std::cout << status_text(board.status(), terminal_width(STDOUT_FILENO).value_or(100))
+              << std::flush;
   }
 }
 

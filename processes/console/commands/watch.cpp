@@ -26,6 +26,7 @@
 #include "common/config/rig.h"
 #include "processes/console/clock.h"
 #include "processes/console/commands/commands.h"
+#include "processes/console/hint.h"
 #include "processes/console/interruption.h"
 #include "processes/console/picture.h"
 #include "processes/console/run_watch.h"
@@ -58,7 +59,7 @@ class ProgressLine {
     if (!now && clock_us() - shown_us_ < (is_terminal_ ? 100'000 : 5'000'000)) return;
     shown_us_ = clock_us();
     if (is_terminal_) {
-      std::cerr << "\r\x1b[2K" << line << std::flush;
+      std::cerr << in_place(line, STDERR_FILENO) << std::flush;
     } else {
       std::cerr << line << std::endl;
     }

@@ -294,6 +294,8 @@ TEST(RunWatchTest, TheLineOfProgressSaysHowManyThereWillBeAndWhenAndWhatIsWrong)
   EXPECT_TRUE(watch.progress(SampleGoal{60, true}).starts_with("   1 of 60 samples ·  1 parts"));
   EXPECT_TRUE(watch.progress(SampleGoal{300, false}, 70)
                   .starts_with("   1 of at most 300 samples · at most 70 s left · "));
+  EXPECT_TRUE(watch.progress(SampleGoal{300, true}, 540)
+                  .starts_with("   1 of 300 samples · 9 min left · "));
   EXPECT_EQ(watch.progress(SampleGoal{1, true}, 0.).find("left"), std::string::npos);
   model_health_t broken = health(1);
   finding_t finding{};

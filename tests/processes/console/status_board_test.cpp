@@ -1,6 +1,8 @@
 #include "processes/console/status_board.h"
 
 #include <gtest/gtest.h>
+#include <pty.h>
+#include <unistd.h>
 
 #include <sstream>
 
@@ -286,7 +288,7 @@ model_health_t wrong_in_two_places() {
   stuck.finding_adopted = 291;
   stuck.num_confirming = 40;
   stuck.finding_text =
-      "q2 (1→2) stuck at −0.25 since sample 290, mended at 291, confirmed by 40 samples";
+      "q2 (1→2) stuck at −0.25 since sample 290, in the schema since 291, confirmed by 40 samples";
   finding_t open{};
   open.finding_from = open.finding_to = open.finding_tag = -1;
   open.finding_part = 3;
@@ -325,18 +327,18 @@ TEST(StatusBoardTest, WhatIsWrongStandsFirstAndNoTerminalIsTooNarrowForIt) {
   board_.on_message(wrong_in_two_places());
   EXPECT_TRUE(
       status_text(board_.status(), 100)
-          .starts_with(
-              "What is wrong now\n"
-              "  q2 (1→2) stuck at −0.25 since sample 290, mended at 291, confirmed by 40 samples\n"
-              "  marker of part 3 not as known since sample 300, found at 301\n\n"
-              "Learning: 5 samples.\nThe body is not as the schema says in 1 place.\n"))
+          .starts_with("What is wrong now\n"
+                       "  q2 (1→2) stuck at −0.25 since sample 290, in the schema since 291, "
+                       "confirmed by 40 samples\n"
+                       "  marker of part 3 not as known since sample 300, found at 301\n\n"
+                       "Learning: 5 samples.\nThe body is not as the schema says in 1 place.\n"))
       << status_text(board_.status(), 100);
   const std::string narrow = status_text(board_.status(), 40);
   EXPECT_TRUE(
       narrow.starts_with("What is wrong now\n"
                          "  q2 (1→2) stuck at −0.25 since sample\n"
-                         "    290, mended at 291, confirmed by 40\n"
-                         "    samples\n"))
+                         "    290, in the schema since 291,\n"
+                         "    confirmed by 40 samples\n"))
       << narrow;
   const auto wrong = status_json(board_.status())["wrong"];
   ASSERT_EQ(wrong.size(), 2U);
@@ -465,6 +467,16 @@ TEST(FitTest, CutsBetweenCharacters) {
                 10),
             "a b");  // a control character of two bytes
   EXPECT_EQ(fit("", 0), "");
+}
+
+TEST(InPlaceTest, ALineFitsTheTerminal) {
+  int outer = -1, terminal = -1;
+  const winsize size{24, 8, 0, 0};
+  ASSERT_EQ(::openpty(&outer, &terminal, nullptr, nullptr, &size), 0);
+  EXPECT_EQ(terminal_width(terminal), 8);
+  EXPECT_EQ(in_place("12 of 300 samples", terminal), "\r\x1b[2K12 of 3…");
+  ::close(outer);
+  ::close(terminal);
 }
 
 }  // namespace

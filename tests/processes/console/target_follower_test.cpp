@@ -60,6 +60,16 @@ TEST(OperateTest, ATargetIsRepeatedUntilItIsAcknowledged) {
   EXPECT_EQ(follower.end(), End::kOpen);
 }
 
+TEST(OperateTest, DistancesThatAreNotKnownAreNotTold) {
+  control_status_t told = status(S::CONTROL_REACHED);
+  told.num_moves = 1;
+  EXPECT_EQ(course_text(told), "1 move, by the schema 1.0 mm away");
+  told.observed_error_m = 0.0024;
+  EXPECT_EQ(course_text(told), "1 move, by the schema 1.0 mm away, as seen 2.4 mm");
+  told.predicted_error_m = told.observed_error_m = -1;
+  EXPECT_EQ(course_text(told), "1 move");
+}
+
 TEST(OperateTest, ATargetThatIsSeenElsewhereIsMissed) {
   for (const bool is_far : {false, true}) {
     TargetFollower follower(target(), 60 * kSecond, 0.02);

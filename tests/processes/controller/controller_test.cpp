@@ -994,8 +994,10 @@ TEST(ControllerTest, WhileStoppedATargetIsRefused) {
   EXPECT_EQ(bench.status.control_state, S::CONTROL_IDLE);  // none of its business
   bench.give(position_target(0, kNear));
   EXPECT_EQ(bench.status.control_state, S::CONTROL_REFUSED);
-  EXPECT_TRUE(bench.has_why("resume")) << bench.status.why;
+  EXPECT_TRUE(bench.has_why("first: ./run resume")) << bench.status.why;
   bench.stop(false);
+  EXPECT_EQ(bench.status.control_state, S::CONTROL_REFUSED);
+  EXPECT_TRUE(bench.has_why("give the target again")) << bench.status.why;
   bench.run(10);
   EXPECT_TRUE(bench.moves.empty());
 }

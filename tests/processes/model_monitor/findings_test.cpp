@@ -207,12 +207,14 @@ TEST(HealthWordsTest, AFindingSaysHowFarOneIsWithIt) {
   finding.adopted = 291;
   finding.num_confirming = 40;
   EXPECT_EQ(text_of(finding, signals),
-            "q1 (4→5) stuck at −12.00 since sample 290, mended at 291, confirmed by 40 samples");
+            "q1 (4→5) stuck at −12.00 since sample 290, in the schema since 291, confirmed by 40 "
+            "samples");
   finding.state = State::kAdopted;
   finding.num_confirming = 1;
-  EXPECT_EQ(text_of(finding, signals),
-            "q1 (4→5) stuck at −12.00 since sample 290, mended at 291, not confirmed yet (1 "
-            "sample)");
+  EXPECT_EQ(
+      text_of(finding, signals),
+      "q1 (4→5) stuck at −12.00 since sample 290, in the schema since 291, not confirmed yet (1 "
+      "sample)");
   finding.state = State::kFound;
   finding.cause = "";
   finding.size = {};

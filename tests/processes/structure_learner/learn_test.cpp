@@ -119,6 +119,21 @@ TEST(Learn, HandlesGainsOffsetsBranchesScrewsAndIdleSignals) {
   }
 }
 
+TEST(Learn, APartThatWasSeenOnceIsToldSo) {
+  Rng rng(1);
+  const auto robot = test::random_tree({}, rng);
+  auto samples = test::babble(robot, 20, {Regime::kTag}, rng);
+  PartObservation once = samples[0].parts.front();
+  once.part = 99;
+  samples[0].parts.push_back(once);
+  LearnOptions given;
+  given.measurement.noise = test::nominal_noise(Regime::kTag);
+  const auto schema = learn(robot.signals, samples, given).schema;
+  ASSERT_FALSE(schema.unconnected.empty());
+  EXPECT_TRUE(schema.unconnected.back().detail.starts_with("seen once, at most 1 of them "))
+      << schema.unconnected.back().detail;
+}
+
 TEST(Learn, ReportsPartsBehindTwoHiddenOnesInsteadOfGuessing) {
   int incomplete = 0;
   for (int seed = 1; seed <= 6; ++seed) {
