@@ -5,7 +5,6 @@
 #include <limits>
 #include <set>
 #include <stdexcept>
-#include <utility>
 
 #include "common/estimation/chi_square.h"
 #include "common/estimation/quantile.h"
@@ -325,19 +324,18 @@ void Adaptation::end_drift(std::int64_t since, const Drift& drift, std::int64_t 
 void Adaptation::watch_visibility(const ActionPoseSample& sample, const ActionPoseSample& used,
                                   std::vector<AdaptationEvent>* events) {
   for (const auto& finding : visibility_.look(schema_.parts, sample, used, tags_)) {
-    const auto [part, tag, is_missing, is_as_before, num_samples] = finding;
+    const auto [part, tag, is_missing, num_missed] = finding;
     AdaptationEvent told = tracker_.event(
         is_missing ? AdaptationEvent::Kind::kMissing : AdaptationEvent::Kind::kRecovered,
         sample.sample_index, {part, true});
     told.tag = tag;
     told.cause = "marker_missing";
-    told.num_samples = num_samples;
-    told.is_normal = is_as_before;
-    if (is_missing) told.since = std::max<std::int64_t>(0, sample.sample_index - num_samples + 1);
+    told.num_samples = num_missed;
+    if (is_missing) told.since = std::max<std::int64_t>(0, sample.sample_index - num_missed + 1);
     events->push_back(std::move(told));
     if (!is_missing || tag == VisibilityWatch::kAnyTag) continue;
     tags_.lose(tag);
-    set_aside(tag, sample.sample_index - num_samples + 1, sample.sample_index);
+    set_aside(tag, sample.sample_index - num_missed + 1, sample.sample_index);
   }
 }
 
@@ -410,8 +408,7 @@ void Adaptation::drop_fallen(ActionPoseSample* sample, std::vector<AdaptationEve
       ++num_missed;
     };
     drop(sample);
-    const bool is_known = visibility_.is_missing(part);
-    if (std::exchange(lying_since_[part], *since) == *since && is_known) continue;
+    if (visibility_.is_missing(part)) continue;
     num_missed = 0;
     AdaptationEvent missing =
         tracker_.event(AdaptationEvent::Kind::kMissing, sample->sample_index, {part, true});
@@ -424,7 +421,7 @@ void Adaptation::drop_fallen(ActionPoseSample* sample, std::vector<AdaptationEve
     std::vector<AdaptationEvent> taken_back;
     tracker_.take_back(is_at_it, *since, drop, sample->sample_index, &taken_back);
     missing.num_samples = visibility_.lose(part, num_missed) + 1;
-    if (!is_known) events->push_back(missing);
+    events->push_back(missing);
     events->insert(events->end(), taken_back.begin(), taken_back.end());
   }
 }

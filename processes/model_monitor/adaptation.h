@@ -1,7 +1,6 @@
 #pragma once
 
 #include <cstdint>
-#include <map>
 #include <optional>
 #include <utility>
 #include <vector>
@@ -106,7 +105,6 @@ class Adaptation {
   HypothesisTracker tracker_;
   VisibilityWatch visibility_;
   FallenMarkers fallen_;
-  std::map<int, std::int64_t> lying_since_;  ///< by part: the sample of which fallen_ told last
   MovedTags tags_;
   /// Tags that moved, or were lost, where others of their part stayed: what rests on them is left
   /// out until they are seen in their places again. schema_ has them, too.

@@ -133,8 +133,8 @@ std::string text_of(const AdaptationEvent& event, const std::vector<Signal>& sig
       if (event.cause == "unexplained") return place + ": back to normal by itself, unexplained";
       if (event.cause == "drift") return place + ": drifts no more, confirmed";
       if (event.cause == "marker_missing" || event.tag >= 0)
-        return place + " is " + (event.tag >= 0 ? "where it was" : "seen") + " again" +
-               (is_back ? ": back to normal" : "");
+        return place + " is " + (event.tag >= 0 ? "where it was" : "seen") +
+               " again: back to normal";
       return (event.is_normal || event.cause == "stored"
                   ? place + (event.is_normal ? " normal" : " as once before") +
                         since_text(event.since)

@@ -36,23 +36,6 @@ bool MovedTags::affects(const PartObservation& observation) const {
                      [this](int tag) { return has_moved(tag); });
 }
 
-bool MovedTags::is_lying(int tag) const {
-  const auto track = tracks_.find(tag);
-  return track != tracks_.end() && track->second.has_moved && track->second.is_lying;
-}
-
-bool MovedTags::has_lying(const PartObservation& observation) const {
-  return std::any_of(observation.tags.begin(), observation.tags.end(),
-                     [this](int tag) { return is_lying(tag); });
-}
-
-int MovedTags::num_lying(int part) const {
-  const auto tags = of_.find(part);
-  if (tags == of_.end()) return 0;
-  return static_cast<int>(std::count_if(tags->second.begin(), tags->second.end(),
-                                        [this](int tag) { return is_lying(tag); }));
-}
-
 void MovedTags::look_back(const ActionPoseSample& sample, const BodySchema& schema,
                           const MeasurementModel& measurement) {
   // Before they moved they were where they should be.
@@ -106,8 +89,6 @@ std::vector<MovedTags::Finding> MovedTags::look(const ActionPoseSample& sample,
 
     if (int& num = num_affected_[seen.part]; !affects(seen)) {
       num = 0;
-    } else if (has_lying(seen)) {
-      // It shows nothing of the part.
     } else if (sample.purpose != Purpose::kControl && ++num >= kAlone && is_past) {
       num = kAlone - 1;  // it was not given up by then
     } else if (num >= kAlone) {
@@ -148,7 +129,6 @@ std::vector<MovedTags::Finding> MovedTags::look(const ActionPoseSample& sample,
       if (track.has_moved) {
         track.num_alike = 0;
         track.is_on_part |= is_alike_on_part && !is_alike_in_room;
-        if (is_alike_on_part != is_alike_in_room) track.is_lying = is_alike_in_room;
         track.X_BS = X_BS;
         track.X_CB = seen.X_CB;
       } else if (track.num_alike == 0 || !(is_alike_on_part || is_alike_in_room)) {
@@ -164,7 +144,6 @@ std::vector<MovedTags::Finding> MovedTags::look(const ActionPoseSample& sample,
             {seen.part, seen.tags.front(), track.since, track.num_alike, is_alike_on_part});
         track.has_moved = true;
         track.is_on_part = is_alike_on_part;
-        track.is_lying = !is_alike_on_part;
         track.num_alike = 0;
       }
     } else if (far_off > kOther && !affects(seen)) {

@@ -18,7 +18,7 @@ namespace bodyschema {
 /// was found meanwhile explains it all, the body is wrong. Once it
 /// is seen there again, it is back; so with a tag that was lost, which may have been put elsewhere.
 /// Where a babbling arm shows a part by such tags alone for long, they are what there is of it:
-/// they are taken for back, unless they lie in the room.
+/// they are taken for back.
 class MovedTags {
  public:
   /// `moved`: those known already.
@@ -45,10 +45,6 @@ class MovedTags {
   bool has_moved(int tag) const;
   /// It rests on a tag that has moved.
   bool affects(const PartObservation& observation) const;
-  /// Or on one that lies in the room while the part moves.
-  bool has_lying(const PartObservation& observation) const;
-  /// Of a part's tags.
-  int num_lying(int part) const;
 
  private:
   struct Track {
@@ -62,14 +58,12 @@ class MovedTags {
     Pose X_CB = Pose::Identity(), X_BS = Pose::Identity();
     bool has_moved = false;
     bool is_on_part = false;  ///< and moves with it
-    bool is_lying = false;    ///< and does not, as last seen
   };
   std::vector<Finding> look(const ActionPoseSample& sample, const BodySchema& schema,
                             const BodySchema& standing, const MeasurementModel& measurement,
                             bool is_past);
   /// The part was seen elsewhere, not by one of its moved tags.
   void count_elsewhere(const PartObservation& seen);
-  bool is_lying(int tag) const;
 
   std::map<int, Track> tracks_;         ///< by tag
   std::map<int, std::vector<int>> of_;  ///< the tags of every part that were seen

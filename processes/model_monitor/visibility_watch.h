@@ -12,8 +12,7 @@ namespace bodyschema {
 /// Counts how often every part, and every tag of a part that has several, is seen, and finds what
 /// has not been seen for longer than chance explains: a run of m misses begins at any sample with
 /// probability v (1 − v)^m, where v is the share of samples that show it: its mean over what v may
-/// be (Jeffreys' prior). What is missing is back after a few sightings with no such run between
-/// them. A part of which a tag is lost shows less often: how often is then found out anew.
+/// be (Jeffreys' prior).
 class VisibilityWatch {
  public:
   /// `false_alarm_rate`: a sample, over all parts and tags together.
@@ -23,12 +22,11 @@ class VisibilityWatch {
   struct Finding {
     int part = 0;
     int tag = kAnyTag;
-    bool is_missing = false;    ///< else it is seen again
-    bool is_as_before = false;  ///< as often as before it was missing
-    int num_samples = 0;        ///< that tell it: misses in a row, or since it is seen again
+    bool is_missing = false;  ///< else it is seen again
+    int num_missed = 0;       ///< samples in a row
   };
   /// `seen`: all of a sample; `used`: without what is not believed, which says that a part was not
-  /// seen unless it rests on one of the `moved` tags that is on it. Those are not looked for.
+  /// seen unless it rests on one of the `moved` tags. Those are not looked for.
   std::vector<Finding> look(const std::vector<int>& parts, const ActionPoseSample& seen,
                             const ActionPoseSample& used, const MovedTags& moved);
   /// A part that lies somewhere: its marker is missing, and was in the last `num_missed` samples.
@@ -49,22 +47,11 @@ class VisibilityWatch {
     int num_seen = 0, num_asked = 0;  ///< before the present run of misses
     int num_missed = 0;               ///< in a row
     bool is_missing = false;
-    bool was_seen_again = false;           ///< since it is missing
-    int num_back = 0, num_since_back = 0;  ///< sightings of its return, and samples since the first
-    double chance_of_misses() const;
-    bool is_as_before() const;
   };
-  /// Of what is missing.
-  void count_return(int part, int tag, bool is_seen, std::vector<Finding>* findings);
   void count(int part, int tag, bool is_seen, std::vector<Finding>* findings);
-
-  bool is_by_chance(const Count& c) const;
-  /// A tag of the part is lost.
-  void begin_anew(int part);
 
   double false_alarm_rate_;
   std::map<int, std::map<int, Count>> counts_;  ///< by part and tag
-  std::map<int, int> num_lying_;                ///< tags of a part
 };
 
 }  // namespace bodyschema

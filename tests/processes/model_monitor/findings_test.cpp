@@ -185,8 +185,6 @@ TEST(HealthWordsTest, AnEventSaysWhatWhereHowMuchAndSinceWhen) {
   EXPECT_EQ(text_of(lost, signals), "marker of part 9 not seen since sample 30: found");
   lost.kind = Kind::kRecovered;
   lost.since = -1;
-  EXPECT_EQ(text_of(lost, signals), "marker of part 9 is seen again");
-  lost.is_normal = true;
   EXPECT_EQ(text_of(lost, signals), "marker of part 9 is seen again: back to normal");
   lost.tag = 34;
   EXPECT_EQ(text_of(lost, signals), "tag 34 of part 9 is where it was again: back to normal");
