@@ -34,4 +34,4 @@ status=0
 "$bin/bodyschema" fault marker-lost 12 | grep -qx 'marker-lost 12'
 if "$bin/bodyschema" fault stuck q9 2>"$work/error"; then exit 1; fi
 grep -q 'no signal q9; there are q1, q2' "$work/error"
-"$bin/bodyschema" fault repair | grep -qx 'nothing is broken'
+"$bin/bodyschema" fault repair | grep -qx 'repaired: as built'
