@@ -342,13 +342,13 @@ TEST(Observer, SaysThatItWaitsOnlyOnceItTakesLong) {
   observer.on_motion_status(settled(9));
   observer.on_marker_poses(scene.frame(kRest_us));
   ASSERT_TRUE(observer.on_marker_poses(scene.frame(kRest_us + 33'333)));
-  observer.on_motion_status(settled(10));
+  observer.on_motion_status(settled(10, kRest_us + 1'000'000));
   observer.on_tick(1'000'000);
   EXPECT_FALSE(observer.is_waiting());
   observer.on_tick(7'000'000);
   EXPECT_TRUE(observer.is_waiting());
-  observer.on_marker_poses(scene.frame(kRest_us + 66'666));
-  ASSERT_TRUE(observer.on_marker_poses(scene.frame(kRest_us + 99'999)));
+  observer.on_marker_poses(scene.frame(kRest_us + 1'000'000));
+  ASSERT_TRUE(observer.on_marker_poses(scene.frame(kRest_us + 1'033'333)));
   EXPECT_FALSE(observer.is_waiting());
 }
 
