@@ -242,7 +242,7 @@ TEST(Learn, SaysSoWhereNoModelIsValid) {
 // So few poses that a wrong structure fits by chance are no structure. A wrong edge may have
 // evidence enough all the same (13 of 600 robots), a whole wrong body had none (0 of 600).
 TEST(Learn, FewPosesAreRatherIncompleteThanWrong) {
-  constexpr int kRobots = 120;
+  constexpr int kRobots = 60;
   int num_wrong = 0, num_complete_and_wrong = 0;
   for (int seed = 1; seed <= kRobots; ++seed) {
     Rng rng(1000 + seed);
