@@ -1,7 +1,7 @@
 #include "common/scene/image_effects.h"
 
 #include <algorithm>
-#include <cmath>
+#include <boost/math/distributions/normal.hpp>
 #include <stdexcept>
 
 namespace bodyschema {
@@ -21,39 +21,36 @@ std::uint64_t absorb(std::uint64_t key, std::int64_t value) {
   return mix(key * kGolden + static_cast<std::uint64_t>(value) + kGolden);
 }
 
-// Φ(x) of the normal distribution.
-double normal_cdf(double x) { return 0.5 * std::erfc(-x / std::sqrt(2.0)); }
-
 }  // namespace
 
-SensorNoise::SensorNoise(double sd) : sd_(sd) {
+SensorNoise::SensorNoise(double sd) {
   if (!(sd >= 0 && sd <= 30)) throw std::invalid_argument("noise_sd must be within 0 … 30");
-  int level = -127;
-  for (std::size_t i = 0; i < quantiles_.size(); ++i) {
-    const double probability = (static_cast<double>(i) + 0.5) / quantiles_.size();
-    while (sd > 0 && level < 127 && normal_cdf((level + 0.5) / sd) < probability) ++level;
-    quantiles_[i] = sd > 0 ? static_cast<std::int8_t>(level) : 0;
-  }
+  if (sd == 0) return;
+  const boost::math::normal noise(0, sd);
+  for (std::size_t i = 0; i < quantiles_.size(); ++i)
+    quantiles_[i] = static_cast<float>(
+        quantile(noise, (static_cast<double>(i) + 0.5) / static_cast<double>(quantiles_.size())));
 }
 
-void SensorNoise::add(cv::Mat& image, std::int64_t seed, std::int64_t action_id,
-                      std::int64_t frame) const {
-  if (sd_ == 0) return;
-  if (image.type() != CV_8UC1)
-    throw std::invalid_argument("SensorNoise: needs an 8-bit grey image");
+cv::Mat SensorNoise::read(const cv::Mat& image, std::int64_t seed, std::int64_t action_id,
+                          std::int64_t frame) const {
+  if (image.type() != CV_32FC1)
+    throw std::invalid_argument("SensorNoise: needs a grey image in single precision");
+  cv::Mat result(image.size(), CV_8UC1);
   const std::uint64_t key = absorb(absorb(absorb(0, seed), action_id), frame);
   std::uint64_t counter = 0;
   for (int y = 0; y < image.rows; ++y) {
-    std::uint8_t* row = image.ptr<std::uint8_t>(y);
+    const float* exact = image.ptr<float>(y);
+    std::uint8_t* row = result.ptr<std::uint8_t>(y);
     for (int x = 0; x < image.cols; x += 5) {
       // 64 bits serve five pixels with 12 bits each.
       std::uint64_t bits = mix(key + kGolden * ++counter);
       const int end = std::min(x + 5, image.cols);
-      for (int i = x; i < end; ++i, bits >>= 12) {
-        row[i] = static_cast<std::uint8_t>(std::clamp(row[i] + quantiles_[bits & 4095], 0, 255));
-      }
+      for (int i = x; i < end; ++i, bits >>= 12)
+        row[i] = cv::saturate_cast<std::uint8_t>(exact[i] + quantiles_[bits & 4095]);
     }
   }
+  return result;
 }
 
 }  // namespace bodyschema

@@ -8,23 +8,25 @@ namespace bodyschema {
 
 /// Effects of a real camera on a clean picture.
 struct ImageEffects {
-  double blur_sd_px = 0.7;  ///< Gaussian blur of lens and pixel [px]; 0: none
+  double blur_sd_px = 0.7;  ///< Gaussian blur of the lens [px]; 0: none
   double noise_sd = 2;      ///< Gaussian noise of the sensor [grey levels]; 0: none
-  int msaa_samples = 0;     ///< samples a pixel for the outlines of solids: 0, 2, 4 …
+  int pixel_samples = 1;    ///< along each side of a pixel, which integrates over its area
   bool shadows = false;     ///< for pictures that people look at; three times slower
 };
 
-/// Adds Gaussian noise, rounded to whole grey levels. The noise of a pixel is a function of (seed,
-/// action_id, frame, pixel) alone: a counter-based generator, no state.
+/// A sensor with Gaussian noise, and the rounding to whole grey levels behind it. The noise of a
+/// pixel is a function of (seed, action_id, frame, pixel) alone: a counter-based generator, no
+/// state.
 class SensorNoise {
  public:
   explicit SensorNoise(double sd);
-  void add(cv::Mat& image, std::int64_t seed, std::int64_t action_id, std::int64_t frame) const;
+  /// CV_8UC1 of a CV_32FC1 in grey levels. @throws std::invalid_argument on another type.
+  cv::Mat read(const cv::Mat& image, std::int64_t seed, std::int64_t action_id,
+               std::int64_t frame) const;
 
  private:
-  double sd_;
   // Quantiles of the distribution: a uniform index makes a Gaussian value.
-  std::array<std::int8_t, 4096> quantiles_;
+  std::array<float, 4096> quantiles_{};
 };
 
 }  // namespace bodyschema

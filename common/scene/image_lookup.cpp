@@ -39,12 +39,12 @@ ImageLookup::ImageLookup(const cv::Mat& u, const cv::Mat& v, int width, int heig
 }
 
 cv::Mat ImageLookup::operator()(const cv::Mat& image) const {
-  CV_Assert(image.type() == CV_8UC1 && image.cols == width_ && image.rows == height_ &&
+  CV_Assert(image.type() == CV_32FC1 && image.cols == width_ && image.rows == height_ &&
             image.isContinuous());
-  cv::Mat result(rows_, cols_, CV_8UC1);
-  std::uint8_t* out = result.data;
+  cv::Mat result(rows_, cols_, CV_32FC1);
+  float* out = result.ptr<float>();
   for (const Place& place : places_) {
-    const std::uint8_t* pixel = image.data + place.first;
+    const float* pixel = image.ptr<float>() + place.first;
     const auto& wu = weights_[place.phase_u];
     const auto& wv = weights_[place.phase_v];
     std::array<float, kTaps> columns{};
@@ -52,7 +52,7 @@ cv::Mat ImageLookup::operator()(const cv::Mat& image) const {
       for (int column = 0; column < kTaps; ++column) columns[column] += wv[row] * pixel[column];
     float sum = 0;
     for (int column = 0; column < kTaps; ++column) sum += wu[column] * columns[column];
-    *out++ = cv::saturate_cast<std::uint8_t>(sum);
+    *out++ = sum;
   }
   return result;
 }

@@ -8,8 +8,8 @@
 namespace bodyschema {
 
 /// Looks up an image at fixed places by the polynomials through 8 × 8 pixels, to 1/2048 px. An edge
-/// with a blur of 0.8 px is moved by at most 0.004 px, mostly by rounding; the cubic of cv::remap
-/// moves it by 0.02 px, and its places are rounded to 1/32 px.
+/// with a blur of 0.8 px is moved by at most 0.003 px; the cubic of cv::remap moves it by 0.02 px,
+/// and its places are rounded to 1/32 px.
 class ImageLookup {
  public:
   /// Nothing to look up.
@@ -19,7 +19,7 @@ class ImageLookup {
   ImageLookup(const cv::Mat& u, const cv::Mat& v, int width, int height);
 
   bool empty() const { return places_.empty(); }
-  /// `image`: CV_8UC1 of that size. The result has the size of `u`.
+  /// `image`: CV_32FC1 of that size. The result has the size of `u`.
   cv::Mat operator()(const cv::Mat& image) const;
 
  private:

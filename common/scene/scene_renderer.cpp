@@ -9,8 +9,8 @@
 #include <vector>
 
 #include "common/bus/convert.h"
-#include "common/scene/image_lookup.h"
 #include "common/scene/egl_context.h"
+#include "common/scene/image_lookup.h"
 #include "common/scene/scene.h"
 #include "common/scene/tag_bitmap.h"
 
@@ -20,6 +20,7 @@ namespace {
 constexpr float kNear_m = 0.05F;
 constexpr float kFar_m = 30.0F;
 constexpr int kMaxSide_px = 4096;
+constexpr int kMaxDrawn_px = 16384;  // of OpenGL
 // Ink and paper: no printed black is black, and white must not saturate where light adds up.
 constexpr int kInk = 18;
 constexpr int kPaper = 235;
@@ -69,11 +70,17 @@ struct SceneRenderer::Implementation {
                     [](double k) { return k != 0; });
     if (is_distorted) make_remap();
 
+    if (std::max(drawn_size().width, drawn_size().height) > kMaxDrawn_px) {
+      throw std::runtime_error(
+          "camera " + calibration.camera_name + ": " + std::to_string(effects.pixel_samples) +
+          " samples along each side of a pixel are too many for " + std::to_string(pinhole.width) +
+          " × " + std::to_string(pinhole.height) + " px");
+    }
     // The renderer owns a copy of the model: it changes buffer size and textures.
     model.reset(mj_copyModel(nullptr, &scene.model()));
-    model->vis.global.offwidth = pinhole.width;
-    model->vis.global.offheight = pinhole.height;
-    model->vis.quality.offsamples = effects.msaa_samples;
+    model->vis.global.offwidth = drawn_size().width;
+    model->vis.global.offheight = drawn_size().height;
+    model->vis.quality.offsamples = 0;
     paint_tags();
 
     egl.make_current();
@@ -181,29 +188,60 @@ struct SceneRenderer::Implementation {
   cv::Mat draw(const sim_state_t& state, const Pose& X_WC, Layer layer) {
     place_geoms(state, X_WC, layer);
     abstract_scene.flags[mjRND_SKYBOX] = layer != Layer::kForeground;
-    const mjrRect viewport{0, 0, pinhole.width, pinhole.height};
+    const mjrRect viewport{0, 0, drawn_size().width, drawn_size().height};
     mjr_render(viewport, &abstract_scene, &context);
     return read_pixels(viewport);
   }
 
   // Sky and floor fill the image and cost three quarters of the time, but change only with the
   // camera's pose; so they are kept, and the robot is drawn over them. OpenGL leaves pixels without
-  // robot as black as a cleared buffer, which no lit solid is. Outlines that blend with their
-  // background, and shadows, need everything in one go.
+  // robot as black as a cleared buffer, which no lit solid is. Shadows need everything in one go.
   cv::Mat draw(const sim_state_t& state) {
     const Pose X_WC = from_message(state.X_WC);
     place_camera(X_WC);
-    if (effects.msaa_samples > 0 || effects.shadows) return draw(state, X_WC, Layer::kAll);
+    if (effects.shadows) return exposed(draw(state, X_WC, Layer::kAll));
     if (backdrop.empty() || X_WC.matrix() != backdrop_X_WC.matrix() ||
         state.geom_alpha[floor_geom] != backdrop_alpha) {
       backdrop = draw(state, X_WC, Layer::kBackdrop);
+      exposed_backdrop = exposed(backdrop);
       backdrop_X_WC = X_WC;
       backdrop_alpha = state.geom_alpha[floor_geom];
     }
-    cv::Mat image = draw(state, X_WC, Layer::kForeground);
-    std::uint8_t* const pixels = image.ptr<std::uint8_t>();
-    const std::uint8_t* const behind = backdrop.ptr<std::uint8_t>();
-    for (std::size_t i = 0; i < image.total(); ++i) pixels[i] = pixels[i] ? pixels[i] : behind[i];
+    const cv::Mat robot = draw(state, X_WC, Layer::kForeground);
+    // Where the robot is and its blur reaches, and what blurs into that [px].
+    const int n = effects.pixel_samples,
+              reach = static_cast<int>(std::ceil(4 * effects.blur_sd_px)) + 1;
+    const cv::Rect drawn = cv::boundingRect(robot);
+    const auto grown = [&](int margin) {
+      const cv::Point low(drawn.x / n - margin, drawn.y / n - margin);
+      const cv::Point high(drawn.br().x / n + 1 + margin, drawn.br().y / n + 1 + margin);
+      return cv::Rect(low, high) & cv::Rect(0, 0, pinhole.width, pinhole.height);
+    };
+    const cv::Rect changed = grown(reach), around = grown(2 * reach);
+    const cv::Rect around_drawn(n * around.x, n * around.y, n * around.width, n * around.height);
+    cv::Mat both = backdrop(around_drawn).clone();
+    robot(around_drawn).copyTo(both, robot(around_drawn));
+    cv::Mat image = exposed_backdrop.clone();
+    exposed(both)(changed - around.tl()).copyTo(image(changed));
+    return image;
+  }
+
+  /// Pixels of the drawing, before they are integrated to the camera's.
+  cv::Size drawn_size() const {
+    return {effects.pixel_samples * pinhole.width, effects.pixel_samples * pinhole.height};
+  }
+
+  /// CV_32FC1: the lens's blur, then each pixel's mean. What is sampled or rounded before it is
+  /// blurred moves an edge along the pixels' rows by 0.02 px.
+  cv::Mat exposed(const cv::Mat& drawn) const {
+    cv::Mat image;
+    constexpr double kFine = 256;
+    drawn.convertTo(image, CV_16U, kFine);
+    if (effects.blur_sd_px > 0)
+      cv::GaussianBlur(image, image, {}, effects.pixel_samples * effects.blur_sd_px);
+    image.convertTo(image, CV_32F, 1 / kFine);
+    if (effects.pixel_samples > 1)
+      cv::resize(image, image, drawn.size() / effects.pixel_samples, 0, 0, cv::INTER_AREA);
     return image;
   }
 
@@ -233,7 +271,7 @@ struct SceneRenderer::Implementation {
   }
 
   cv::Mat read_pixels(const mjrRect& viewport) {
-    rgb.create(pinhole.height, pinhole.width, CV_8UC3);
+    rgb.create(drawn_size(), CV_8UC3);
     mjr_readPixels(rgb.data, nullptr, viewport, &context);
     // Every colour of the scene is grey, and OpenGL's first row is the lowest.
     cv::Mat grey, upright;
@@ -257,6 +295,9 @@ struct SceneRenderer::Implementation {
   cv::Mat backdrop;
   Pose backdrop_X_WC = Pose::Identity();
   float backdrop_alpha = 1;
+  cv::Mat exposed_backdrop;
+  cv::Mat image;  // without noise, of the last state
+  std::vector<std::uint8_t> scene_of_image;
   cv::Mat rgb;
 };
 
@@ -284,15 +325,17 @@ cv::Mat SceneRenderer::render(const sim_state_t& state, int frame) {
                                 " geoms, the rig's scene " + std::to_string(num_geoms) +
                                 ": is the simulator running another rig?");
   }
-  self.egl.make_current();
-  cv::Mat image = self.draw(state);
-  if (self.effects.blur_sd_px > 0) {
-    cv::GaussianBlur(image, image, {}, self.effects.blur_sd_px);
+  // The frames of a rest differ in their noise alone.
+  std::vector<std::uint8_t> scene(static_cast<std::size_t>(state.getEncodedSize()));
+  state.encode(scene.data(), 0, static_cast<int>(scene.size()));
+  if (self.image.empty() || scene != self.scene_of_image) {
+    self.egl.make_current();
+    self.image = self.draw(state);
+    // After the blur: an image that is interpolated must not have detail finer than its pixels.
+    if (!self.distort.empty()) self.image = self.distort(self.image);
+    self.scene_of_image = std::move(scene);
   }
-  // After the blur: an image that is interpolated must not have detail finer than its pixels.
-  if (!self.distort.empty()) image = self.distort(image);
-  self.noise.add(image, state.seed, state.action_id, frame);
-  return image;
+  return self.noise.read(self.image, state.seed, state.action_id, frame);
 }
 
 }  // namespace bodyschema

@@ -32,7 +32,7 @@ CameraConfig CameraConfig::load(const std::filesystem::path& file) {
     simulation.frames_per_action = static_cast<int>(section.integer("frames_per_action", 1, 100));
     simulation.blur_sd_px = section.number("blur_px", 0, 10);
     simulation.noise_sd = section.number("noise_sd", 0, 30);
-    simulation.msaa_samples = static_cast<int>(section.integer("msaa_samples", 0, 16));
+    simulation.pixel_samples = static_cast<int>(section.integer("pixel_samples", 1, 8));
   } else {
     const Yaml section = yaml.section("capture");
     CaptureConfig& capture = config.capture.emplace();

@@ -34,7 +34,7 @@ struct SimulationConfig {
   int frames_per_action = 0;
   double blur_sd_px = 0;
   double noise_sd = 0;  ///< grey levels
-  int msaa_samples = 0;
+  int pixel_samples = 1;
 };
 
 /// camera.yaml: exactly one of `capture` and `simulation`.

@@ -36,7 +36,7 @@ CameraProcess::CameraProcess(Process& process, const Options& options)
 void CameraProcess::start_simulation(const SimulationConfig& simulation) {
   effects_ = {.blur_sd_px = simulation.blur_sd_px,
               .noise_sd = simulation.noise_sd,
-              .msaa_samples = simulation.msaa_samples};
+              .pixel_samples = simulation.pixel_samples};
   const SceneDescription ideal = SceneDescription::load(process_.rig_folder());
   if (const auto problem = lens_problem(ideal.robot.lens, config_.calibration))
     throw ConfigError("robot.yaml: lens: " + *problem);

@@ -231,7 +231,10 @@ class Smoothing {
 
   /// False if the pattern is flat around (x, y); `s` is then its value alone.
   bool operator()(const Pattern& pattern, float x, float y, Smoothed& s) const {
-    if (widest() >= Pattern::kNarrow) {
+    const int kx = pattern.nearest_line(x), ky = pattern.nearest_line(y);
+    const float to_x = std::abs(x - static_cast<float>(kx));
+    const float to_y = std::abs(y - static_cast<float>(ky));
+    if (1 - to_x < tail_[0] || 1 - to_y < tail_[1]) {  // the lines behind count too
       if (widest() < Pattern::kMedium) {
         s = at_crossing<2>(pattern, x, y);
       } else {
@@ -239,14 +242,13 @@ class Smoothing {
       }
       return true;
     }
-    const int kx = pattern.nearest_line(x), ky = pattern.nearest_line(y);
     const Pattern::Crossing crossing = pattern.crossing(kx, ky);
     const bool varies_x =
         (crossing == Pattern::Crossing::kAcrossX || crossing == Pattern::Crossing::kBoth) &&
-        std::abs(x - static_cast<float>(kx)) < reach_[0];
+        to_x < reach_[0];
     const bool varies_y =
         (crossing == Pattern::Crossing::kAcrossY || crossing == Pattern::Crossing::kBoth) &&
-        std::abs(y - static_cast<float>(ky)) < reach_[1];
+        to_y < reach_[1];
     if (varies_x && varies_y) {
       s = at_crossing<2>(pattern, x, y);
       return true;

@@ -38,7 +38,7 @@ const std::vector<View>& views() {
     SceneRenderer renderer(kRig, config.calibration,
                            {.blur_sd_px = config.simulation->blur_sd_px,
                             .noise_sd = config.simulation->noise_sd,
-                            .msaa_samples = config.simulation->msaa_samples});
+                            .pixel_samples = config.simulation->pixel_samples});
     SimulatedCamera camera(
         config, [&](const sim_state_t& state, int frame) { return renderer.render(state, frame); });
     const MotorBabblerConfig babbler = MotorBabblerConfig::load(kRig / "motor_babbler.yaml");

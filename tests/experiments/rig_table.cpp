@@ -5,14 +5,18 @@
 //
 //   rig_table config/arm2 config/arm4 config/arm7 --seeds 10 --at 20 30 60 100
 
+#include <yaml-cpp/yaml.h>
+
 #include <CLI/CLI.hpp>
 #include <algorithm>
 #include <chrono>
 #include <cmath>
 #include <cstdio>
 #include <filesystem>
+#include <fstream>
 #include <numeric>
 #include <optional>
+#include <random>
 #include <string>
 #include <vector>
 
@@ -21,6 +25,7 @@
 #include "common/kinematics/kinematic_path.h"
 #include "processes/console/evaluation.h"
 #include "processes/structure_learner/structure_learner.h"
+#include "tests/common/bus/bus_test_support.h"
 #include "tests/support/rendered_run.h"
 #include "tests/support/rig_truth.h"
 
@@ -129,7 +134,25 @@ struct Options {
   std::int64_t first_seed = 1;
   std::optional<Choice> choice;
   std::vector<double> systematic;  ///< [mm, deg] instead of noise.yaml's
+  bool moves_camera = false;       ///< by seed, within ±5 cm and ±3° of robot.yaml's X_WC
 };
+
+/// A copy of the rig with its camera elsewhere: what a view biases is drawn anew.
+std::filesystem::path with_moved_camera(const std::filesystem::path& rig, std::int64_t seed,
+                                        const std::filesystem::path& copy) {
+  std::filesystem::copy(rig, copy, std::filesystem::copy_options::recursive);
+  YAML::Node robot = YAML::LoadFile(copy / "robot.yaml");
+  std::mt19937_64 random(static_cast<std::uint64_t>(seed));
+  const auto move = [&](YAML::Node values, double most) {
+    for (std::size_t axis = 0; axis < 3; ++axis)
+      values[axis] =
+          values[axis].as<double>() + std::uniform_real_distribution(-most, most)(random);
+  };
+  move(robot["X_WC"]["position_m"], 0.05);
+  move(robot["X_WC"]["rpy_deg"], 3);
+  std::ofstream(copy / "robot.yaml") << robot;
+  return copy;
+}
 
 /// One row for each of options.at.
 std::vector<Row> measured(const std::filesystem::path& rig, bool is_ideal, const Options& options) {
@@ -146,8 +169,10 @@ std::vector<Row> measured(const std::filesystem::path& rig, bool is_ideal, const
   std::vector<Row> rows(options.at.size());
   for (std::int64_t seed = options.first_seed; seed < options.first_seed + options.num_seeds;
        ++seed) {
-    test::RenderedRun run(rig, seed, {options.hidden.begin(), options.hidden.end()}, options.choice,
-                          is_ideal);
+    const test::TemporaryFolder scratch;
+    test::RenderedRun run(
+        options.moves_camera ? with_moved_camera(rig, seed, scratch / rig.filename()) : rig, seed,
+        {options.hidden.begin(), options.hidden.end()}, options.choice, is_ideal);
     Seen seen;
     std::vector<std::vector<ActionPoseSample>> trained;
     for (int n = 1; n <= options.at.back(); ++n) {
@@ -230,6 +255,8 @@ int main(int argc, char** argv) {
   app.add_option("--systematic", options.systematic,
                  "Systematic error of a part that the learner is told [mm, deg], not noise.yaml's")
       ->expected(2);
+  app.add_flag("--move-camera", options.moves_camera,
+               "By seed, within 5 cm and 3° an axis of robot.yaml's");
   app.add_option("--only", only, "One of the two robots")
       ->check(CLI::IsMember({"ideal", "honest"}));
   CLI11_PARSE(app, argc, argv);

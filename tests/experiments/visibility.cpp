@@ -112,7 +112,7 @@ int main(int argc, char** argv) {
   app.add_option("--seed", seed, "Of actions and noise");
   app.add_option("--pictures", num_pictures, "Write the first poses as PNG");
   app.add_option("--prefix", picture_prefix, "Of the pictures' names");
-  app.add_option("--msaa", effects.msaa_samples, "Samples a pixel");
+  app.add_option("--pixel-samples", effects.pixel_samples, "Along each side of a pixel");
   app.add_flag("--shadows", effects.shadows, "Draw shadows");
   CLI11_PARSE(app, argc, argv);
 

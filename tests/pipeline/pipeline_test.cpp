@@ -206,8 +206,8 @@ TEST_F(Arm2, TheResultSaysWhatWasLearnedAndHowWell) {
   ASSERT_EQ(result["held_out"]["parts"].size(), 4u);
   for (const auto& part : result["held_out"]["parts"]) {
     EXPECT_EQ(part["count"], 6);
-    EXPECT_LT(part["position_median_m"], 0.0006) << part;
-    EXPECT_LT(part["rotation_median_deg"], 0.1) << part;
+    EXPECT_LT(part["position_median_m"], 0.0003) << part;
+    EXPECT_LT(part["rotation_median_deg"], 0.03) << part;
     EXPECT_GT(part["position_median_m"], 0.0)
         << "the learned model cannot be exact: was it the truth?";
   }

@@ -26,7 +26,7 @@ RobotSimulatorConfig simulator_config(const std::filesystem::path& rig_folder, s
 ImageEffects effects(const SimulationConfig& simulation) {
   return {.blur_sd_px = simulation.blur_sd_px,
           .noise_sd = simulation.noise_sd,
-          .msaa_samples = simulation.msaa_samples};
+          .pixel_samples = simulation.pixel_samples};
 }
 
 RigNoise noise_of(const std::filesystem::path& rig, bool is_ideal) {

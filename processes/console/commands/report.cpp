@@ -20,7 +20,6 @@
 #include "processes/console/recording.h"
 #include "processes/console/report/report_page.h"
 #include "processes/console/run_record.h"
-#include "processes/structure_learner/learn.h"
 
 namespace bodyschema {
 namespace {
@@ -85,7 +84,9 @@ class Source {
     for (auto& [file, summary] : report.logs) {
       if (grows_ && summary.damage.starts_with("is cut off")) summary.damage.clear();
     }
-    report.measurement = measurement_of(is_folder_ ? path_ / "run.lcmlog" : path_);
+    report.measurement = [log = is_folder_ ? path_ / "run.lcmlog" : path_] {
+      return measurement_of(log);
+    };
     report.goes_on = goes_on;
     report.reload_s = reload_s;
     report.picture = picture();

@@ -62,7 +62,8 @@ struct Body {
   std::string origin;
 };
 
-std::optional<Body> body_of(const RunRecord& record, const MeasurementModel& measurement) {
+std::optional<Body> body_of(const Report& report) {
+  const RunRecord& record = *report.record;
   if (const auto& accepted = record.watch().schema()) {
     return Body{*accepted, fmt::format("version {}, accepted by the monitor", accepted->version)};
   }
@@ -79,7 +80,7 @@ std::optional<Body> body_of(const RunRecord& record, const MeasurementModel& mea
   if (recording.samples.empty()) return std::nullopt;
   recording.signals = observed_signals(recording.samples);
   LearnOptions options;
-  options.measurement = measurement;
+  if (report.measurement) options.measurement = report.measurement();
   return Body{learn(recording.signals, recording.training(), options).schema,
               "learned for this report: the log holds no body schema"};
 }
@@ -99,9 +100,7 @@ std::vector<ActionPoseSample> fitting(const std::vector<ActionPoseSample>& sampl
 class Page {
  public:
   explicit Page(const Report& report)
-      : report_(report),
-        record_(*report.record),
-        body_(body_of(*report.record, report.measurement)) {
+      : report_(report), record_(*report.record), body_(body_of(report)) {
     if (!body_) return;
     held_out_ =
         fitting(record_.watch().held_out(body_->schema.body_since(body_->schema.last_sample_index)),

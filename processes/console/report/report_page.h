@@ -1,6 +1,7 @@
 #pragma once
 
 #include <filesystem>
+#include <functional>
 #include <map>
 #include <optional>
 #include <string>
@@ -16,7 +17,8 @@ struct Report {
   std::string title;  ///< of the run
   const RunRecord* record = nullptr;
   std::map<std::filesystem::path, LogSummary> logs;
-  MeasurementModel measurement;        ///< see measurement_of(); what the report learns with
+  /// Asked if the logs hold no schema and the page learns one; see measurement_of().
+  std::function<MeasurementModel()> measurement;
   std::optional<int> end_effector;     ///< part id, where the rig's files are at hand
   std::optional<std::string> picture;  ///< a frame with the markers drawn in, JPEG bytes
   bool goes_on = false;                ///< its group runs, logs may end in the middle of an event

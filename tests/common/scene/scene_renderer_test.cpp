@@ -143,6 +143,44 @@ TEST(SceneRenderer, ShowsTheTagsCornersWherePinholeProjectionPutsThem) {
   }
 }
 
+// Sampled before it is blurred, an edge along the pixels' columns would look different wherever it
+// lies between them, and be fitted 0.02 px off.
+TEST(SceneRenderer, AnEdgeAlongThePixelsIsBlurredBeforeItIsSampled) {
+  const Scene scene(kConfig / "arm2");
+  const CameraCalibration calibration{"test", 640, 480, 1100, 1100, 319.5, 239.5, {}, {}};
+  ImageEffects effects = no_noise();
+  effects.pixel_samples = 2;
+  SceneRenderer renderer(kConfig / "arm2", calibration, effects);
+  sim_state_t state = scene.state_at(scene.robot().home, 1, 0);
+  for (const double phase_px : {0.0, 0.2, 0.4, 0.6, 0.8}) {
+    constexpr double kDistance_m = 0.7;
+    look_at(scene, 12, kDistance_m, 0, 0, state);
+    Pose X_WC = from_message(state.X_WC);
+    X_WC = X_WC * Eigen::Translation3d(-phase_px / calibration.fx * kDistance_m, 0, 0);
+    state.X_WC = to_message(X_WC);
+    const cv::Mat image = renderer.render(state, 0);
+    const Pose X_CM = X_WC.inverse() * from_message(state.X_WG[scene.tag_geom(12)]) *
+                      Eigen::Translation3d(0, 0, -kSheetThickness_m / 2);
+    const Corners corners = project(calibration, X_CM, scene.markers().find(12)->size_m);
+    // The middle of the left side: paper, then the black border, a cell wide.
+    const double edge_px = corners[0].x();
+    const int row = static_cast<int>(std::lround(0.5 * (corners[0].y() + corners[3].y())));
+    const int middle = static_cast<int>(std::lround(edge_px));
+    const auto grey = [&](int u) { return static_cast<double>(image.at<std::uint8_t>(row, u)); };
+    const double white = grey(middle - 5), black = grey(middle + 5);
+    ASSERT_GT(white - black, 100);
+    for (int u = middle - 4; u <= middle + 4; ++u) {
+      double light = 0;
+      constexpr int kSteps = 100;
+      for (int i = 0; i < kSteps; ++i) {
+        const double x = u - 0.5 + (i + 0.5) / kSteps;
+        light += std::erfc((x - edge_px) / (effects.blur_sd_px * M_SQRT2)) / 2 / kSteps;
+      }
+      EXPECT_NEAR(grey(u), black + (white - black) * light, 4) << phase_px << " px, column " << u;
+    }
+  }
+}
+
 class RenderedRig : public testing::TestWithParam<const char*> {};
 
 INSTANTIATE_TEST_SUITE_P(SceneRenderer, RenderedRig, testing::Values("arm2", "arm4", "arm7"),

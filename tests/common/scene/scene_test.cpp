@@ -121,8 +121,8 @@ TEST(Scene, RefusesAnUnknownKeyOfRobotYaml) {
 }
 
 TEST(Scene, RefusesAToolOnALinkThatIsNotThere) {
-  const auto rig = changed_rig("unknown_tool_link", "robot.yaml", "tools:\n  link: arm",
-                               "tools:\n  link: leg");
+  const auto rig =
+      changed_rig("unknown_tool_link", "robot.yaml", "tools:\n  link: arm", "tools:\n  link: leg");
   EXPECT_THROW(Scene{rig}, ConfigError);
 }
 

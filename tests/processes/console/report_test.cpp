@@ -443,13 +443,21 @@ TEST_F(ReportPageTest, ARunOfWhichNothingIsThereYetSaysSo) {
   EXPECT_EQ(problem_, "");
 }
 
+TEST_F(ReportPageTest, ADamagedNoiseHidesNoSchema) {
+  hear_run();
+  report_.measurement = []() -> MeasurementModel { throw std::runtime_error("noise.yaml"); };
+  EXPECT_NE(page().find("accepted by the monitor"), std::string::npos);
+}
+
 TEST_F(ReportPageTest, SamplesAloneAreLearnedFrom) {
   test::Rng rng(6);
   const auto robot = test::chapter_robot("a", rng);
   const test::ObservationOptions options{.regime = test::Regime::kTag, .with_covariances = true};
   for (const ActionPoseSample& sample : test::babble(robot, 40, options, rng))
     hear(kSample, to_message(sample));
-  report_.measurement.systematic = {.position_m = 0.001, .rotation_rad = 0.005};
+  report_.measurement = [] {
+    return MeasurementModel{.systematic = {.position_m = 0.001, .rotation_rad = 0.005}};
+  };
   const std::string html = page();
   EXPECT_NE(html.find("learned for this report"), std::string::npos);
   EXPECT_NE(html.find("The body is known: 5 parts hang together by 4 edges"), std::string::npos);

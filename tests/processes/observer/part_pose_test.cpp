@@ -6,6 +6,7 @@
 #include <cmath>
 #include <random>
 
+#include "common/estimation/measurement_model.h"
 #include "processes/marker_estimator/tag_pose.h"
 
 namespace bodyschema {
@@ -118,6 +119,34 @@ TEST(SolvePartPose, HasACovarianceThatIsConsistentWithTagsThatAreOff) {
     }
     EXPECT_GT(count, 0.95 * kViews);
     EXPECT_NEAR(sum / count, 6, 4 * std::sqrt(12.0 / kViews)) << num_tags << " tags";
+  }
+}
+
+// What tags that are off add to a part's covariance is what MeasurementModel takes to be common to
+// all sights of them: exactly for a tag at the part's origin, by and large for two beside it.
+TEST(SolvePartPose, TagsThatAreOffDoWhatTheMeasurementModelSays) {
+  PartPoseOptions off = options();
+  off.calibration = {.position_m = 0.0005, .rotation_rad = 0.005, .size_share = 0.002};
+  std::mt19937 random(1);
+  for (const int num_tags : {1, 2}) {
+    const Pose X_CB = X_CB_of(random);
+    std::vector<SeenTag> tags;
+    for (int n = 0; n < num_tags; ++n) {
+      Pose X_BM = Pose::Identity();
+      X_BM.translation().x() = num_tags == 1 ? 0 : 0.1 * n - 0.05;
+      tags.push_back(seen(n, X_CB, X_BM, 0.02, random));
+    }
+    const auto with = solve_part_pose(tags, off), without = solve_part_pose(tags, options());
+    ASSERT_TRUE(with && without);
+    const Matrix6d added = with->covariance - without->covariance;
+    const auto effect =
+        MeasurementModel{.tags = off.calibration}.effect_of_tag(with->X_CB, tags.size());
+    const Matrix6d told = num_tags * effect * effect.transpose();
+    if (num_tags == 1) {
+      EXPECT_LT((added - told).norm(), 1e-6 * told.norm()) << added << "\n\n" << told;
+    }
+    for (int axis = 0; axis < 6; ++axis)
+      EXPECT_NEAR(added(axis, axis) / told(axis, axis), 1, 0.2) << num_tags << " tags, " << axis;
   }
 }
 

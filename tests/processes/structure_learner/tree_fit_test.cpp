@@ -244,6 +244,28 @@ TEST(TreeFit, AJointThatMovesBranchesOnlyIsPutIntoTheirEdges) {
   EXPECT_EQ(full_edges(full.nodes(), joint), std::vector<int>{2});
 }
 
+struct SquaredDistances {
+  double of_root = 0;
+  double of_edge = 0;  ///< with the last joint, at the last pose
+};
+
+/// Of what the fit finds from the truth that `c` begins with, by the covariances it tells: χ²₆ if
+/// they are true.
+SquaredDistances squared_distances(const Case& c, const Pose& X_CR,
+                                   const MeasurementModel& measurement, double view_share) {
+  TreeFit fit(c.nodes, c.data, c.actions, true);
+  fit.fit(30, 1e-9);
+  const auto covariance = fit.covariance(measurement, view_share);
+  if (!covariance) throw std::runtime_error("no covariance");
+  const Vector6d root = log(fit.root_pose().inverse() * X_CR);
+  const int last = static_cast<int>(c.samples.size()) - 1;
+  ParameterJacobian J;
+  const Pose X = predict_with_jacobian(fit.nodes()[6].model, c.actions, last, &J);
+  const Vector6d edge = log(X.inverse() * c.nodes[6].model.predict(c.actions, last));
+  return {root.dot(covariance->root.ldlt().solve(root)),
+          edge.dot((J * covariance->models[6] * J.transpose()).ldlt().solve(edge))};
+}
+
 // Ten poses, each seen once or four times: what a view biases is the same each time.
 TEST(TreeFit, CovariancesAreTrueHoweverOftenAViewIsRepeated) {
   constexpr double kShare = 0.3;
@@ -281,18 +303,9 @@ TEST(TreeFit, CovariancesAreTrueHoweverOftenAViewIsRepeated) {
         }
       }
       Case c(robot, samples, measurement);
-      TreeFit fit(c.nodes, c.data, c.actions, true);
-      fit.fit(30, 1e-9);
-      const auto covariance = fit.covariance(measurement, kShare);
-      ASSERT_TRUE(covariance);
-      const Vector6d root = log(fit.root_pose().inverse() * robot.X_CR);
-      of_root += root.dot(covariance->root.ldlt().solve(root)) / kRobots;
-      // The edge with the last joint, as the fit has it and as it is, at the last pose.
-      const int last = static_cast<int>(samples.size()) - 1;
-      ParameterJacobian J;
-      const Pose X = predict_with_jacobian(fit.nodes()[6].model, c.actions, last, &J);
-      const Vector6d edge = log(X.inverse() * c.nodes[6].model.predict(c.actions, last));
-      of_edge += edge.dot((J * covariance->models[6] * J.transpose()).ldlt().solve(edge)) / kRobots;
+      const auto [root, edge] = squared_distances(c, robot.X_CR, measurement, kShare);
+      of_root += root / kRobots;
+      of_edge += edge / kRobots;
     }
     EXPECT_NEAR(of_root, 6, 3 * std::sqrt(12.0 / kRobots)) << repeats;
     EXPECT_NEAR(of_edge, 6, 3 * std::sqrt(12.0 / kRobots)) << repeats;
@@ -335,17 +348,9 @@ TEST(TreeFit, CovariancesAreTrueHoweverOftenATagIsSeen) {
         }
       }
       Case c(robot, samples, measurement);
-      TreeFit fit(c.nodes, c.data, c.actions, true);
-      fit.fit(30, 1e-9);
-      const auto covariance = fit.covariance(measurement, 0);
-      ASSERT_TRUE(covariance);
-      const Vector6d root = log(fit.root_pose().inverse() * robot.X_CR);
-      of_root += root.dot(covariance->root.ldlt().solve(root)) / kRobots;
-      const int last = num_poses - 1;
-      ParameterJacobian J;
-      const Pose X = predict_with_jacobian(fit.nodes()[6].model, c.actions, last, &J);
-      const Vector6d edge = log(X.inverse() * c.nodes[6].model.predict(c.actions, last));
-      of_edge += edge.dot((J * covariance->models[6] * J.transpose()).ldlt().solve(edge)) / kRobots;
+      const auto [root, edge] = squared_distances(c, robot.X_CR, measurement, 0);
+      of_root += root / kRobots;
+      of_edge += edge / kRobots;
     }
     EXPECT_NEAR(of_root, 6, 3 * std::sqrt(12.0 / kRobots)) << num_poses;
     EXPECT_NEAR(of_edge, 6, 3 * std::sqrt(12.0 / kRobots)) << num_poses;
