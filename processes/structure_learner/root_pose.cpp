@@ -11,7 +11,7 @@
 namespace bodyschema {
 
 double view_share(const MeasurementModel& measurement) {
-  // With it d² of X_CR has the mean 3.9 over 60 views of ideal rigs
+  // With it d² of X_CR has the mean 2.2 over 60 views of ideal rigs
   // (`./run experiment rig_table … --move-camera`).
   constexpr double kOfTags = 0.1;
   const Noise& systematic = measurement.systematic;
