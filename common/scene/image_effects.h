@@ -10,7 +10,7 @@ namespace bodyschema {
 struct ImageEffects {
   double blur_sd_px = 0.7;  ///< Gaussian blur of the lens [px]; 0: none
   double noise_sd = 2;      ///< Gaussian noise of the sensor [grey levels]; 0: none
-  int pixel_samples = 1;    ///< along each side of a pixel, which integrates over its area
+  int pixel_samples = 1;    ///< along each side of a pixel, whose value is their mean; 1 to 8
   bool shadows = false;     ///< for pictures that people look at; three times slower
 };
 

@@ -212,6 +212,7 @@ struct SceneRenderer::Implementation {
     const int n = effects.pixel_samples,
               reach = static_cast<int>(std::ceil(4 * effects.blur_sd_px)) + 1;
     const cv::Rect drawn = cv::boundingRect(robot);
+    if (drawn.empty()) return exposed_backdrop;
     const auto grown = [&](int margin) {
       const cv::Point low(drawn.x / n - margin, drawn.y / n - margin);
       const cv::Point high(drawn.br().x / n + 1 + margin, drawn.br().y / n + 1 + margin);
@@ -231,8 +232,8 @@ struct SceneRenderer::Implementation {
     return {effects.pixel_samples * pinhole.width, effects.pixel_samples * pinhole.height};
   }
 
-  /// CV_32FC1: the lens's blur, then each pixel's mean. What is sampled or rounded before it is
-  /// blurred moves an edge along the pixels' rows by 0.02 px.
+  /// CV_32FC1: blurred at the drawing's resolution, then each pixel's mean. With one sample a pixel
+  /// an edge along rows or columns is up to 0.02 px off.
   cv::Mat exposed(const cv::Mat& drawn) const {
     cv::Mat image;
     constexpr double kFine = 256;
@@ -330,9 +331,10 @@ cv::Mat SceneRenderer::render(const sim_state_t& state, int frame) {
   state.encode(scene.data(), 0, static_cast<int>(scene.size()));
   if (self.image.empty() || scene != self.scene_of_image) {
     self.egl.make_current();
-    self.image = self.draw(state);
+    cv::Mat image = self.draw(state);
     // After the blur: an image that is interpolated must not have detail finer than its pixels.
-    if (!self.distort.empty()) self.image = self.distort(self.image);
+    if (!self.distort.empty()) image = self.distort(image);
+    self.image = image;
     self.scene_of_image = std::move(scene);
   }
   return self.noise.read(self.image, state.seed, state.action_id, frame);

@@ -33,8 +33,8 @@ struct CaptureConfig {
 struct SimulationConfig {
   int frames_per_action = 0;
   double blur_sd_px = 0;
-  double noise_sd = 0;  ///< grey levels
-  int pixel_samples = 1;
+  double noise_sd = 0;    ///< grey levels
+  int pixel_samples = 1;  ///< see ImageEffects
 };
 
 /// camera.yaml: exactly one of `capture` and `simulation`.

@@ -13,9 +13,9 @@ namespace bodyschema {
 double view_share(const MeasurementModel& measurement) {
   // With it d² of X_CR has the mean 2.2 over 60 views of ideal rigs
   // (`./run experiment rig_table … --move-camera`).
-  constexpr double kOfTags = 0.1;
+  constexpr double kViewShare = 0.1;
   const Noise& systematic = measurement.systematic;
-  return systematic.position_m > 0 || systematic.rotation_rad > 0 ? kOfTags : 0;
+  return systematic.position_m > 0 || systematic.rotation_rad > 0 ? kViewShare : 0;
 }
 
 void estimate_root_pose(const std::vector<ActionPoseSample>& samples,

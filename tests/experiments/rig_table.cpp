@@ -3,7 +3,7 @@
 // sample is TEST, as in ./run. For the ideal robot; for the robot with calibration errors also
 // aligned (evaluation.h; by the truth of all actions), and the scale. Prints Markdown.
 //
-//   rig_table config/arm2 config/arm4 config/arm7 --seeds 10 --at 20 30 60 100
+//   rig_table config/arm2 config/arm4 config/arm7 --seeds 10 --at 20 30 60 100 [--move-camera]
 
 #include <yaml-cpp/yaml.h>
 
