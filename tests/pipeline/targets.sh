@@ -30,8 +30,13 @@ console hold || fail "hold"
 # The program itself, not the setpriv that became it: its command line begins with its path.
 controller=$("$source/run" exec pgrep -f "^$build/bin/controller .*$work/")
 kill -KILL "$controller"
+says_held() { grep -q "held as before the restart" "$work/logs/current/run.lcmlog.00"; }
+for _ in $(seq 100); do
+  says_held && break
+  sleep 0.1
+done
+says_held || fail "the hold did not survive a kill"
 console hold || fail "no hold after the restart"
-grep -q "held as before the restart" "$work/logs/current/run.lcmlog.00" || fail "the hold did not survive a kill"
 console release || fail "release"
 
 position=$(awk -F'|' '/reached/ {print $3; exit}' "$work/targets.txt")
