@@ -8,6 +8,7 @@
 #include <cmath>
 #include <map>
 #include <opencv2/calib3d.hpp>
+#include <opencv2/imgproc.hpp>
 
 #include "common/bus/convert.h"
 #include "common/geometry/angle.h"
@@ -177,6 +178,32 @@ TEST(SceneRenderer, AnEdgeAlongThePixelsIsBlurredBeforeItIsSampled) {
         light += std::erfc((x - edge_px) / (effects.blur_sd_px * M_SQRT2)) / 2 / kSteps;
       }
       EXPECT_NEAR(grey(u), black + (white - black) * light, 4) << phase_px << " px, column " << u;
+    }
+  }
+}
+
+// The blur is computed only where the robot is: nothing of it may be cut off, at the image's border
+// either, where the robot is half in view or not at all.
+TEST(SceneRenderer, TheBlurIsThatOfTheWholeImage) {
+  const Scene scene(kConfig / "arm2");
+  const CameraCalibration calibration{"test", 640, 480, 600, 600, 319.5, 239.5, {}, {}};
+  sim_state_t state = scene.state_at(scene.robot().home, 1, 0);
+  const Pose X_WC = from_message(state.X_WC);
+  for (const double blur_sd_px : {0.7, 4.0}) {
+    ImageEffects sharp = no_noise(), blurred = no_noise();
+    sharp.blur_sd_px = 0;
+    blurred.blur_sd_px = blur_sd_px;
+    SceneRenderer without(kConfig / "arm2", calibration, sharp);
+    SceneRenderer with(kConfig / "arm2", calibration, blurred);
+    for (const double pan_deg : {0.0, 25.0, -25.0, 90.0}) {
+      state.X_WC =
+          to_message(Pose(X_WC * Eigen::AngleAxisd(pan_deg * kDegree, Eigen::Vector3d::UnitY())));
+      cv::Mat expected;
+      without.render(state, 0).convertTo(expected, CV_32F);
+      cv::GaussianBlur(expected, expected, {}, blur_sd_px);
+      cv::Mat image;
+      with.render(state, 0).convertTo(image, CV_32F);
+      EXPECT_LT(cv::norm(image, expected, cv::NORM_INF), 1) << blur_sd_px << " px, " << pan_deg;
     }
   }
 }
