@@ -27,17 +27,4 @@ struct TypeDefinition {
 /// @throws std::runtime_error naming file and line of anything else.
 std::map<std::string, TypeDefinition> read_definitions(const std::filesystem::path& folder);
 
-/// Place of the floating-point numbers in an encoded message.
-struct FloatPlace {
-  std::string field;
-  std::size_t offset = 0;
-  /// 4 or 8.
-  std::size_t size = 0;
-};
-
-/// Walks over the bytes of a message (fingerprint included) as its definition says.
-std::vector<FloatPlace> find_floats(const std::map<std::string, TypeDefinition>& definitions,
-                                    const std::string& type,
-                                    const std::vector<std::uint8_t>& bytes);
-
 }  // namespace bodyschema::test
