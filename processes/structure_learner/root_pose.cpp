@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <map>
 
 #include "common/estimation/chi_square.h"
 #include "common/estimation/student_t.h"
@@ -23,20 +24,22 @@ void estimate_root_pose(const std::vector<ActionPoseSample>& samples,
   struct Reading {
     Pose X;
     Matrix6d information;
+    const std::vector<int>* tags;
   };
   std::vector<Reading> readings;
   for (const auto& sample : samples) {
     const PartObservation* o = sample.find(schema->root);
     if (!o) continue;
-    readings.push_back({o->X_CB, measurement.covariance(*o).inverse()});
+    readings.push_back({o->X_CB, measurement.covariance(*o).inverse(), &o->tags});
   }
   if (readings.empty()) return;
+  const auto squared_distance = [&](const Reading& r, const Pose& X) {
+    const Vector6d e = log(X.inverse() * r.X);
+    return e.dot(r.information * e);
+  };
   const auto cost = [&](const Pose& X) {
     double sum = 0;
-    for (const Reading& r : readings) {
-      const Vector6d e = log(X.inverse() * r.X);
-      sum += std::log1p(e.dot(r.information * e) / kStudentNu);
-    }
+    for (const Reading& r : readings) sum += std::log1p(squared_distance(r, X) / kStudentNu);
     return sum;
   };
   Pose mean = readings.front().X;
@@ -76,7 +79,20 @@ void estimate_root_pose(const std::vector<ActionPoseSample>& samples,
   }
   schema->X_CR = mean;
   const double views = 1 + view_share(measurement) * static_cast<double>(readings.size());
-  schema->X_CR_covariance = views * weight * H.inverse() + measurement.systematic_covariance();
+  // What is off of a tag is the same at all its sights: no number of them averages it out.
+  std::map<int, Eigen::Matrix<double, 6, 7>> of_tag;
+  for (const Reading& r : readings) {
+    const double w = robust_weight(squared_distance(r, mean));
+    for (const int id : *r.tags) {
+      auto& sum = of_tag.try_emplace(id, Eigen::Matrix<double, 6, 7>::Zero()).first->second;
+      sum += w * r.information * measurement.effect_of_tag(r.X, r.tags->size());
+    }
+  }
+  const Matrix6d inverse = H.inverse();
+  Matrix6d of_tags = Matrix6d::Zero();
+  for (const auto& [id, sum] : of_tag) of_tags += sum * sum.transpose();
+  schema->X_CR_covariance =
+      views * weight * inverse + inverse * of_tags * inverse + measurement.systematic_covariance();
 }
 
 }  // namespace bodyschema

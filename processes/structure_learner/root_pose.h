@@ -11,7 +11,8 @@ namespace bodyschema {
 double view_share(const MeasurementModel& measurement);
 
 /// X_CR of `schema` with its covariance: the robust mean of the poses of its root, Student-t
-/// weights. Left alone if the root is never seen.
+/// weights. What is off of a tag counts twice where it is seen once, and once where it is seen
+/// often: the covariance errs to the large side. Left alone if the root is never seen.
 void estimate_root_pose(const std::vector<ActionPoseSample>& samples,
                         const MeasurementModel& measurement, BodySchema* schema);
 

@@ -2,6 +2,8 @@
 
 #include <gtest/gtest.h>
 
+#include <map>
+
 #include "processes/structure_learner/edge_fit.h"
 #include "processes/structure_learner/root_pose.h"
 #include "tests/support/synthetic_robot.h"
@@ -60,6 +62,49 @@ TEST(Rescaled, PredictsTheSame) {
   model.turn = {0.7, -1.2};
   for (Pose& A : model.A) A = test::random_pose(rng, 0.1, 0.2);
   EXPECT_TRUE(rescaled(model, from, to).predict(to, 3).isApprox(model.predict(from, 3), 1e-12));
+}
+
+// Two tags that sit elsewhere and are larger than told, one or both in sight.
+TEST(RootPose, ItsCovarianceIsTrueHoweverOftenATagIsSeen) {
+  const MeasurementModel measurement{
+      .tags = {.position_m = 0.002, .rotation_rad = 0.01, .size_share = 0.003}};
+  const Matrix6d noise = isotropic({.position_m = 0.001, .rotation_rad = 0.004});
+  constexpr int kRobots = 200;
+  test::Rng rng(3);
+  const auto drawn = [&](auto size) -> Eigen::Matrix<double, size(), 1> {
+    return Eigen::Matrix<double, size(), 1>::NullaryExpr([&] { return test::gaussian(rng); });
+  };
+  for (const int num_samples : {10, 200}) {
+    double mean = 0;
+    for (int robot = 0; robot < kRobots; ++robot) {
+      Pose X_CR = test::random_pose(rng, 0.3, 3);
+      X_CR.translation().z() += 1;
+      std::map<int, Eigen::Matrix<double, 7, 1>> of_tag;
+      for (const int id : {4, 5}) of_tag[id] = drawn(std::integral_constant<int, 7>{});
+      std::vector<ActionPoseSample> samples(num_samples);
+      for (ActionPoseSample& sample : samples) {
+        PartObservation& seen = sample.parts.emplace_back();
+        seen.part = 1;
+        seen.tags = {4, 5};
+        if (test::uniform(rng, 0, 1) < 0.5) seen.tags.pop_back();
+        const auto effect = measurement.effect_of_tag(X_CR, seen.tags.size());
+        Vector6d error = noise.llt().matrixL() * drawn(std::integral_constant<int, 6>{});
+        seen.covariance = noise;
+        for (const int id : seen.tags) {
+          error += effect * of_tag.at(id);
+          seen.covariance += effect * effect.transpose();
+        }
+        seen.X_CB = X_CR * exp(error);
+      }
+      BodySchema schema;
+      schema.root = 1;
+      estimate_root_pose(samples, measurement, &schema);
+      const Vector6d error = log(schema.X_CR.inverse() * X_CR);
+      mean += error.dot(schema.X_CR_covariance.ldlt().solve(error)) / kRobots;
+    }
+    EXPECT_GT(mean, 3) << num_samples;
+    EXPECT_LT(mean, 6 + 4 * std::sqrt(12.0 / kRobots)) << num_samples;
+  }
 }
 
 TEST(RootPose, OneWrongReadingDoesNotMoveIt) {
