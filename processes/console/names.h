@@ -24,6 +24,16 @@ inline constexpr std::array kHealthEvents = {"accepted", "refused",  "mismatch",
                                              "drift",    "missing",  "probe_wanted"};
 inline constexpr std::array kFindingStates = {"found", "adopted", "confirmed", "followed", "aside"};
 
+/// Of NoiseSource: in JSON, and for people.
+inline constexpr std::array kNoiseSources = {"given",  "covariances", "repeats",
+                                             "frames", "residuals",   "assumed"};
+inline constexpr std::array kNoiseSourceWords = {"given",
+                                                 "mean of the observations' covariances",
+                                                 "estimated from repeated actions",
+                                                 "estimated from what jumps between frames",
+                                                 "estimated from what the best models leave",
+                                                 "assumed: too few samples to estimate it"};
+
 /// `number`: an enumerator or what a message carries. @throws std::out_of_range.
 template <std::size_t size, class Number>
 const char* name_in(const std::array<const char*, size>& names, Number number) {

@@ -12,8 +12,6 @@
 namespace bodyschema {
 namespace {
 
-using Json = nlohmann::ordered_json;
-
 Json latency_rows(const RunRecord& record) {
   Json rows = Json::array();
   for (const RunRecord::Latency& latency : record.latencies()) {
