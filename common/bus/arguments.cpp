@@ -1,6 +1,10 @@
 #include "common/bus/arguments.h"
 
 #include <CLI/CLI.hpp>
+#include <cstdint>
+#include <filesystem>
+#include <optional>
+#include <set>
 #include <utility>
 
 namespace bodyschema {
@@ -71,53 +75,21 @@ Argument& Argument::check(std::function<std::string(const std::string& text)> pr
   return *this;
 }
 
-Argument Arguments::add_option(const std::string& name, std::string& value,
-                               const std::string& help) {
+using Text = const std::string&;
+template <class Value>
+Argument Arguments::add_option(const std::string& name, Value& value, const std::string& help) {
   return Argument(app_->add_option(name, value, help));
 }
-
-Argument Arguments::add_option(const std::string& name, std::filesystem::path& value,
-                               const std::string& help) {
-  return Argument(app_->add_option(name, value, help));
-}
-
-Argument Arguments::add_option(const std::string& name, int& value, const std::string& help) {
-  return Argument(app_->add_option(name, value, help));
-}
-
-Argument Arguments::add_option(const std::string& name, std::int64_t& value,
-                               const std::string& help) {
-  return Argument(app_->add_option(name, value, help));
-}
-
-Argument Arguments::add_option(const std::string& name, double& value, const std::string& help) {
-  return Argument(app_->add_option(name, value, help));
-}
-
-Argument Arguments::add_option(const std::string& name, std::optional<int>& value,
-                               const std::string& help) {
-  return Argument(app_->add_option(name, value, help));
-}
-
-Argument Arguments::add_option(const std::string& name, std::vector<int>& value,
-                               const std::string& help) {
-  return Argument(app_->add_option(name, value, help));
-}
-
-Argument Arguments::add_option(const std::string& name, std::vector<double>& value,
-                               const std::string& help) {
-  return Argument(app_->add_option(name, value, help));
-}
-
-Argument Arguments::add_option(const std::string& name, std::vector<std::string>& value,
-                               const std::string& help) {
-  return Argument(app_->add_option(name, value, help));
-}
-
-Argument Arguments::add_option(const std::string& name, std::set<std::string>& value,
-                               const std::string& help) {
-  return Argument(app_->add_option(name, value, help));
-}
+template Argument Arguments::add_option(Text, std::string&, Text);
+template Argument Arguments::add_option(Text, std::filesystem::path&, Text);
+template Argument Arguments::add_option(Text, int&, Text);
+template Argument Arguments::add_option(Text, std::int64_t&, Text);
+template Argument Arguments::add_option(Text, double&, Text);
+template Argument Arguments::add_option(Text, std::optional<int>&, Text);
+template Argument Arguments::add_option(Text, std::vector<int>&, Text);
+template Argument Arguments::add_option(Text, std::vector<double>&, Text);
+template Argument Arguments::add_option(Text, std::vector<std::string>&, Text);
+template Argument Arguments::add_option(Text, std::set<std::string>&, Text);
 
 Argument Arguments::add_flag(const std::string& name, bool& value, const std::string& help) {
   return Argument(app_->add_flag(name, value, help));

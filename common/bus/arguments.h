@@ -1,10 +1,6 @@
 #pragma once
 
-#include <cstdint>
-#include <filesystem>
 #include <functional>
-#include <optional>
-#include <set>
 #include <string>
 #include <vector>
 
@@ -46,19 +42,10 @@ class Arguments {
  public:
   explicit Arguments(CLI::App* app) : app_(app) {}
 
-  Argument add_option(const std::string& name, std::string& value, const std::string& help);
-  Argument add_option(const std::string& name, std::filesystem::path& value,
-                      const std::string& help);
-  Argument add_option(const std::string& name, int& value, const std::string& help);
-  Argument add_option(const std::string& name, std::int64_t& value, const std::string& help);
-  Argument add_option(const std::string& name, double& value, const std::string& help);
-  Argument add_option(const std::string& name, std::optional<int>& value, const std::string& help);
-  Argument add_option(const std::string& name, std::vector<int>& value, const std::string& help);
-  Argument add_option(const std::string& name, std::vector<double>& value, const std::string& help);
-  Argument add_option(const std::string& name, std::vector<std::string>& value,
-                      const std::string& help);
-  Argument add_option(const std::string& name, std::set<std::string>& value,
-                      const std::string& help);
+  /// Value: std::string, std::filesystem::path, int, std::int64_t, double, an optional int, a
+  /// vector of ints, doubles or strings, a set of strings.
+  template <class Value>
+  Argument add_option(const std::string& name, Value& value, const std::string& help);
   Argument add_flag(const std::string& name, bool& value, const std::string& help);
 
   Arguments add_subcommand(const std::string& name, const std::string& help);

@@ -38,6 +38,14 @@ struct LogEvent {
   std::int64_t event_number = 0;  ///< modulo 2^32
 };
 
+/// The event as a message of the channel; std::nullopt where it is of another channel or cannot be
+/// decoded.
+template <class Message>
+std::optional<Message> message_of(const LogEvent& event, const Channel<Message>& channel) {
+  if (event.channel != channel.name) return std::nullopt;
+  return decode<Message>(event.data.data(), event.data.size()).message;
+}
+
 /// Joins the messages of a log that were recorded in pieces (common/bus/pieces.h).
 class EventJoiner {
  public:

@@ -46,4 +46,9 @@ struct ActionPoseSample {
   const PartObservation* find(int part) const;
 };
 
+/// TEST samples judge, those of the controller follow its model.
+inline bool is_learned_from(const ActionPoseSample& sample) {
+  return sample.purpose == Purpose::kTrain || sample.purpose == Purpose::kProbe;
+}
+
 }  // namespace bodyschema

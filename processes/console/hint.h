@@ -1,9 +1,13 @@
 #pragma once
 
+#include <fmt/format.h>
+
 #include <cstdint>
 #include <optional>
 #include <string>
 #include <string_view>
+
+#include "common/geometry/angle.h"
 
 namespace bodyschema {
 
@@ -13,6 +17,31 @@ std::string to_type(const std::string& words);
 
 /// "1 sample", "2 samples".
 std::string counted(std::int64_t count, const std::string& noun);
+
+/// The texts of `text_of` each item, "a, b, c".
+template <class Items, class TextOf>
+std::string listed(const Items& items, TextOf text_of, std::string_view separator = ", ") {
+  std::string text;
+  for (const auto& item : items) {
+    if (!text.empty()) text += separator;
+    text += text_of(item);
+  }
+  return text;
+}
+template <class Items>
+std::string listed(const Items& items) {
+  return fmt::format("{}", fmt::join(items, ", "));
+}
+/// "{a,b,c}".
+template <class Items>
+std::string in_braces(const Items& items) {
+  return fmt::format("{{{}}}", fmt::join(items, ","));
+}
+
+/// "3.21 mm 0.41°".
+inline std::string pose_text(double position_m, double rotation_rad, int decimals_mm = 2) {
+  return fmt::format("{:.{}f} mm {:.2f}°", position_m * 1e3, decimals_mm, rotation_rad / kDegree);
+}
 
 /// A time for people: "95 s", "12 min", "2.5 h".
 std::string duration(double seconds);

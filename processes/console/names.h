@@ -2,6 +2,7 @@
 
 #include <array>
 #include <cstddef>
+#include <string>
 
 namespace bodyschema {
 
@@ -23,6 +24,21 @@ inline constexpr std::array kHealthEvents = {"accepted", "refused",  "mismatch",
                                              "refined",  "restored", "reverted",    "recovered",
                                              "drift",    "missing",  "probe_wanted"};
 inline constexpr std::array kFindingStates = {"found", "adopted", "confirmed", "followed", "aside"};
+
+/// Of NoiseSource: in JSON, and for people.
+inline constexpr std::array kNoiseSources = {"given",  "covariances", "repeats",
+                                             "frames", "residuals",   "assumed"};
+inline constexpr std::array kNoiseSourceWords = {"given",
+                                                 "mean of the observations' covariances",
+                                                 "estimated from repeated actions",
+                                                 "estimated from what jumps between frames",
+                                                 "estimated from what the best models leave",
+                                                 "assumed: too few samples to estimate it"};
+
+/// Whether a counter of PROCESS_INFO tells of normal traffic.
+inline bool is_traffic(const std::string& counter) {
+  return counter.starts_with("received ") || counter.starts_with("published ");
+}
 
 /// `number`: an enumerator or what a message carries. @throws std::out_of_range.
 template <std::size_t size, class Number>

@@ -33,37 +33,9 @@ void draw_marker(cv::Mat& picture, const marker_pose_t& marker, const Lens& lens
   }
   const std::string id = std::to_string(marker.marker_id);
   const cv::Point where = outline[0] + cv::Point(2, -5);
-  cv::putText(picture, id, where, cv::FONT_HERSHEY_SIMPLEX, 0.5, cv::Scalar(0, 0, 0), 3,
-              cv::LINE_AA);
-  cv::putText(picture, id, where, cv::FONT_HERSHEY_SIMPLEX, 0.5, cv::Scalar(255, 255, 255), 1,
-              cv::LINE_AA);
+  for (const auto& [colour, width] : {std::pair(cv::Scalar(0, 0, 0), 3), {{255, 255, 255}, 1}})
+    cv::putText(picture, id, where, cv::FONT_HERSHEY_SIMPLEX, 0.5, colour, width, cv::LINE_AA);
 }
-
-}  // namespace
-
-std::string draw_detections(const camera_image_t& image, const marker_poses_t& markers,
-                            const camera_info_t& camera, PictureFormat format) {
-  const cv::Mat grey = decode_image(image);
-  if (grey.empty()) throw std::runtime_error("the camera's image cannot be decoded");
-  const Lens lens(camera);
-  cv::Mat picture;
-  cv::cvtColor(grey, picture, cv::COLOR_GRAY2BGR);
-  for (const marker_pose_t& marker : markers.markers) draw_marker(picture, marker, lens);
-  std::vector<std::uint8_t> encoded;
-  if (format == PictureFormat::kPng) {
-    cv::imencode(".png", picture, encoded);
-  } else {
-    cv::imencode(".jpg", picture, encoded, {cv::IMWRITE_JPEG_QUALITY, 85});
-  }
-  return {encoded.begin(), encoded.end()};
-}
-
-void write_detections(const camera_image_t& image, const marker_poses_t& markers,
-                      const camera_info_t& camera, const std::filesystem::path& png) {
-  write_file_atomically(png, draw_detections(image, markers, camera, PictureFormat::kPng));
-}
-
-namespace {
 
 /// An image and its markers come within so many of each.
 constexpr std::size_t kKept = 8;
@@ -75,6 +47,21 @@ void keep(std::deque<Message>* kept, const Message& message) {
 }
 
 }  // namespace
+
+std::string draw_detections(const camera_image_t& image, const marker_poses_t& markers,
+                            const camera_info_t& camera, const std::string& format) {
+  const cv::Mat grey = decode_image(image);
+  if (grey.empty()) throw std::runtime_error("the camera's image cannot be decoded");
+  const Lens lens(camera);
+  cv::Mat picture;
+  cv::cvtColor(grey, picture, cv::COLOR_GRAY2BGR);
+  for (const marker_pose_t& marker : markers.markers) draw_marker(picture, marker, lens);
+  std::vector<std::uint8_t> encoded;
+  std::vector<int> options;
+  if (format == ".jpg") options = {cv::IMWRITE_JPEG_QUALITY, 85};
+  cv::imencode(format, picture, encoded, options);
+  return {encoded.begin(), encoded.end()};
+}
 
 void BestPicture::on_image(const camera_image_t& image) {
   keep(&images_, image);
@@ -100,7 +87,7 @@ void BestPicture::match() {
 
 bool BestPicture::write(const std::filesystem::path& png) const {
   if (!best_image_ || !info_) return false;
-  write_detections(*best_image_, best_markers_, *info_, png);
+  write_file_atomically(png, draw_detections(*best_image_, best_markers_, *info_, ".png"));
   return true;
 }
 

@@ -11,17 +11,11 @@
 
 namespace bodyschema {
 
-enum class PictureFormat { kPng, kJpeg };
-
 /// `image` in colours with the outline, the id and the three axes (x red, y green, z blue, into the
-/// marker) of every marker drawn in, as the bytes of a PNG or JPEG file. @throws std::runtime_error
-/// if the image cannot be decoded.
+/// marker) of every marker drawn in, as the bytes of a file of `format`, ".png" or ".jpg".
+/// @throws std::runtime_error if the image cannot be decoded.
 std::string draw_detections(const camera_image_t& image, const marker_poses_t& markers,
-                            const camera_info_t& camera, PictureFormat format);
-
-/// The same into a PNG file. @throws std::runtime_error, also if the file cannot be written.
-void write_detections(const camera_image_t& image, const marker_poses_t& markers,
-                      const camera_info_t& camera, const std::filesystem::path& png);
+                            const camera_info_t& camera, const std::string& format);
 
 /// Keeps the picture with the most markers whose image and markers were both heard.
 class BestPicture {
@@ -29,7 +23,8 @@ class BestPicture {
   void on_image(const camera_image_t& image);
   void on_markers(const marker_poses_t& markers);
   void on_info(const camera_info_t& info) { info_ = info; }
-  /// Whether there was one, which is a PNG file then. @throws as write_detections().
+  /// Whether there was one, which is a PNG file then. @throws as draw_detections(), also
+  /// if the file cannot be written.
   bool write(const std::filesystem::path& png) const;
 
  private:

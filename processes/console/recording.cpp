@@ -391,9 +391,7 @@ std::vector<Signal> observed_signals(const std::vector<ActionPoseSample>& sample
 
 std::vector<ActionPoseSample> Recording::training() const {
   std::vector<ActionPoseSample> result = retained(samples);
-  std::erase_if(result, [](const ActionPoseSample& sample) {
-    return sample.purpose != Purpose::kTrain && sample.purpose != Purpose::kProbe;
-  });
+  std::erase_if(result, [](const auto& sample) { return !is_learned_from(sample); });
   return result;
 }
 

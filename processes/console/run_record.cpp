@@ -5,6 +5,7 @@
 
 #include "common/bus/channels.h"
 #include "common/bus/convert.h"
+#include "processes/console/clock.h"
 
 namespace bodyschema {
 namespace {
@@ -13,12 +14,6 @@ constexpr std::size_t kMostPoints = 800;
 constexpr std::size_t kMostPictures = 8;
 constexpr std::size_t kMostVersions = 256;
 constexpr std::size_t kMostEvents = 2000;
-
-template <class Message>
-std::optional<Message> read_as(const Channel<Message>& channel, const LogEvent& event) {
-  if (event.channel != channel.name) return std::nullopt;
-  return decode<Message>(event.data.data(), event.data.size()).message;
-}
 
 /// Without how far one has come that goes on: "drift arm 0.5 deg per action, 3 deg so far".
 std::string name_of_fault(const std::string& fault) {
@@ -47,8 +42,8 @@ double quantile(std::vector<double> values, double q) {
   return values[static_cast<std::size_t>(index)];
 }
 
-double RunRecord::seconds(std::int64_t received_us) const {
-  return begin_us_ ? static_cast<double>(received_us - *begin_us_) * 1e-6 : 0;
+double RunRecord::at_s(std::int64_t received_us) const {
+  return begin_us_ ? seconds(received_us - *begin_us_) : 0;
 }
 
 void RunRecord::on_event(const LogEvent& event, const std::filesystem::path& file,
@@ -61,49 +56,49 @@ void RunRecord::on_event(const LogEvent& event, const std::filesystem::path& fil
     end_us_ = std::max(end_us_, event.event_utime);
     return true;
   };
-  if (const auto info = read_as(kProcessInfo, event)) {
+  if (const auto info = message_of(event, kProcessInfo)) {
     note_receipt(-1);
     on_process_info(*info, event.event_utime);
-  } else if (const auto image = read_as(kCameraImage, event)) {
+  } else if (const auto image = message_of(event, kCameraImage)) {
     on_image(image->utime, {file, byte});
     if (note_receipt(image->utime)) image_received_.insert(image->utime, event.event_utime);
-  } else if (const auto markers = read_as(kMarkerPoses, event)) {
+  } else if (const auto markers = message_of(event, kMarkerPoses)) {
     if (note_receipt(markers->utime)) markers_received_.insert(markers->utime, event.event_utime);
     on_markers(*markers);
-  } else if (const auto camera = read_as(kCameraInfo, event)) {
+  } else if (const auto camera = message_of(event, kCameraInfo)) {
     note_receipt(camera->utime);
     camera_info_ = camera;
-  } else if (const auto sample = read_as(kSample, event)) {
+  } else if (const auto sample = message_of(event, kSample)) {
     watch_.on_sample(*sample);
     if (!note_receipt(sample->utime)) return;
     sample_received_.insert(sample->utime, event.event_utime);
     Action* action = action_of({sample->source, sample->epoch, sample->action_id});
     if (action != nullptr && !action->sampled) action->sampled = event.event_utime;
-  } else if (const auto command = read_as(kActionCommand, event)) {
+  } else if (const auto command = message_of(event, kActionCommand)) {
     note_receipt(command->utime);
     if (command->kind == action_command_t::KIND_MOVE) {
       const ActionKey key{command->source, command->epoch, command->action_id};
       actions_.insert(hash_of(key), {.key = key, .sent = event.event_utime});
     }
-  } else if (const auto status = read_as(kMotionStatus, event)) {
+  } else if (const auto status = message_of(event, kMotionStatus)) {
     note_receipt(status->utime);
     Action* action = action_of({status->source, status->epoch, status->action_id});
     if (action == nullptr) return;
     if (!action->answered) action->answered = event.event_utime;
     if (!action->settled && status->state == motion_status_t::STATE_SETTLED)
       action->settled = event.event_utime;
-  } else if (const auto state = read_as(kSimState, event)) {
+  } else if (const auto state = message_of(event, kSimState)) {
     note_receipt(state->utime);
     watch_.on_sim_state(*state);
     on_faults(*state, event.event_utime);
-  } else if (const auto schema = read_as(kBodySchema, event)) {
+  } else if (const auto schema = message_of(event, kBodySchema)) {
     note_receipt(schema->utime);
     watch_.on_body_schema(*schema);
     on_version(*schema);
-  } else if (const auto proposal = read_as(kLearnedSchema, event)) {
+  } else if (const auto proposal = message_of(event, kLearnedSchema)) {
     note_receipt(proposal->utime);
     learned_ = from_message(*proposal);
-  } else if (const auto health = read_as(kModelHealth, event)) {
+  } else if (const auto health = message_of(event, kModelHealth)) {
     note_receipt(health->utime);
     watch_.on_model_health(*health);
     health_ = health;
@@ -115,7 +110,7 @@ void RunRecord::on_faults(const sim_state_t& state, std::int64_t received_us) {
   std::vector<std::string> faults;
   for (const std::string& fault : state.faults) faults.push_back(name_of_fault(fault));
   if (faults != (faults_.empty() ? std::vector<std::string>() : faults_.back().faults))
-    faults_.push_back({seconds(received_us), state.utime, state.action_id, std::move(faults)});
+    faults_.push_back({at_s(received_us), state.utime, state.action_id, std::move(faults)});
 }
 
 std::int64_t RunRecord::hash_of(const ActionKey& key) {
@@ -173,7 +168,7 @@ void RunRecord::on_image(std::int64_t utime, const Place& place) {
 void RunRecord::on_process_info(const process_info_t& info, std::int64_t received_us) {
   Track& track = tracks_[{info.process_name, info.host, info.pid}];
   track.process.newest = info;
-  const double period_s = static_cast<double>(info.utime - track.last_utime) * 1e-6;
+  const double period_s = seconds(info.utime - track.last_utime);
   // The first one has nothing to be compared with; a clock that was set back begins anew.
   if (track.last_utime == 0 || period_s < 0) {
     track.last_utime = info.utime;
@@ -181,8 +176,8 @@ void RunRecord::on_process_info(const process_info_t& info, std::int64_t receive
     return;
   }
   if (period_s < track.period_s) return;
-  const double used_s = static_cast<double>(info.cpu_us - track.last_cpu_us) * 1e-6;
-  track.process.load.push_back({.at_s = seconds(received_us),
+  const double used_s = seconds(info.cpu_us - track.last_cpu_us);
+  track.process.load.push_back({.at_s = at_s(received_us),
                                 .cpu_percent = std::max(0.0, 100 * used_s / period_s),
                                 .memory_mb = static_cast<double>(info.resident_bytes) * 1e-6});
   track.last_utime = info.utime;
@@ -222,7 +217,7 @@ std::vector<RunRecord::Latency> RunRecord::latencies() const {
       answered{"ACTION_COMMAND → answer of the driver", {}},
       settled{"ACTION_COMMAND → settled", {}}, cycle{"ACTION_COMMAND → SAMPLE", {}};
   const auto add = [](Latency& latency, std::int64_t from, std::int64_t to) {
-    latency.seconds.push_back(static_cast<double>(to - from) * 1e-6);
+    latency.seconds.push_back(seconds(to - from));
   };
   for (const auto& [utime, received] : image_received_) {
     if (const auto* markers = markers_received_.find(utime)) add(seen, received, *markers);
@@ -240,6 +235,6 @@ std::vector<RunRecord::Latency> RunRecord::latencies() const {
   return result;
 }
 
-double RunRecord::duration_s() const { return seconds(end_us_); }
+double RunRecord::duration_s() const { return at_s(end_us_); }
 
 }  // namespace bodyschema

@@ -94,7 +94,7 @@ class RunRecord {
   void on_process_info(const process_info_t& info, std::int64_t received_us);
   void on_image(std::int64_t utime, const Place& place);
   void on_markers(const marker_poses_t& markers);
-  double seconds(std::int64_t received_us) const;
+  double at_s(std::int64_t received_us) const;
 
   RunWatch watch_;
   std::optional<BodySchema> learned_;

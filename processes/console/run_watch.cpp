@@ -5,9 +5,9 @@
 #include <algorithm>
 #include <cmath>
 #include <iterator>
+#include <span>
 
 #include "common/bus/convert.h"
-#include "common/geometry/angle.h"
 #include "processes/console/hint.h"
 #include "processes/console/names.h"
 #include "processes/console/views/health_view.h"
@@ -106,10 +106,8 @@ void RunWatch::on_process_info(const process_info_t& info, std::int64_t now_us) 
 
 bool RunWatch::is_finished() const {
   const auto babbler = processes_.find("motor_babbler");
-  if (babbler == processes_.end() || babbler->second.info.phase != process_info_t::PHASE_DONE) {
-    return false;
-  }
-  return num_samples_ > 0 && is_judged();
+  return babbler != processes_.end() && babbler->second.info.phase == process_info_t::PHASE_DONE &&
+         num_samples_ > 0 && is_judged();
 }
 
 bool RunWatch::is_caught_up() const {
@@ -157,20 +155,19 @@ std::string RunWatch::progress(const std::optional<SampleGoal>& goal,
   line += fmt::format(" · {} of {} edges", edges, seen.empty() ? 0 : seen.size() - 1);
   if (!schema_ || !schema_->complete) {
     constexpr std::size_t kMost = 3;
-    std::string missing;
-    for (std::size_t i = 0; i < std::min(unconnected_.size(), kMost); ++i) {
-      missing += fmt::format("{}part {} ({})", i == 0 ? "" : ", ", unconnected_[i].unconnected_part,
-                             name_in(kUnconnectedReasons, unconnected_[i].reason));
-    }
+    const std::span first = std::span(unconnected_).first(std::min(unconnected_.size(), kMost));
+    std::string missing = listed(first, [](const unconnected_part_t& part) {
+      return fmt::format("part {} ({})", part.unconnected_part,
+                         name_in(kUnconnectedReasons, part.reason));
+    });
     if (unconnected_.size() > kMost)
       missing += fmt::format(", {} more", unconnected_.size() - kMost);
     line += missing.empty() ? learned_sample_ < 0 ? ", no proposal yet" : ", not judged yet"
                             : ", missing: " + missing;
   }
-  if (health_ && health_->worst_position_m >= 0) {
-    line += fmt::format(" · worst part {:.1f} mm {:.2f}° off, as the camera sees it, held out",
-                        health_->worst_position_m * 1e3, health_->worst_rotation_rad / kDegree);
-  }
+  if (health_ && health_->worst_position_m >= 0)
+    line += fmt::format(" · worst part {} off, as the camera sees it, held out",
+                        pose_text(health_->worst_position_m, health_->worst_rotation_rad, 1));
   if (health_) {
     if (const auto verdict = verdict_of(*health_); !verdict.wrong.empty())
       line += " · " + verdict.sentence;

@@ -7,6 +7,7 @@
 #include <set>
 #include <utility>
 
+#include "processes/console/clock.h"
 #include "processes/console/hint.h"
 #include "processes/console/names.h"
 #include "processes/console/views/health_view.h"
@@ -17,25 +18,21 @@ namespace {
 /// Counters of a bus that say that something did not get through.
 const char* const kLosses[] = {"malformed", "senseless", "skipped", "refused", "dropped", "lost"};
 
-double seconds(std::int64_t from_us, std::int64_t to_us) {
-  return static_cast<double>(to_us - from_us) * 1e-6;
-}
-
-/// A counter that tells of normal traffic.
-bool is_traffic(const std::string& counter) {
-  return counter.starts_with("received ") || counter.starts_with("published ");
-}
-
 bool is_loss_on(const std::string& counter, const std::set<std::string>& channels) {
   return std::any_of(std::begin(kLosses), std::end(kLosses), [&](const std::string& loss) {
     return counter.starts_with(loss + " ") && channels.contains(counter.substr(loss.size() + 1));
   });
 }
 
+/// Of a bus's counters: that a message was dropped.
+bool is_drop(const std::string& counter) {
+  return counter.starts_with("malformed ") || counter.starts_with("senseless ");
+}
+
 }  // namespace
 
 double StatusBoard::Heard::age_s() const {
-  return std::max(0.0, seconds(newest.start_utime, newest.utime));
+  return std::max(0.0, seconds(newest.utime - newest.start_utime));
 }
 
 double StatusBoard::Heard::cpu_percent() const {
@@ -69,9 +66,7 @@ void StatusBoard::on_own_counters(const std::map<std::string, std::int64_t>& cou
 
 std::int64_t StatusBoard::num_dropped_here() const {
   std::int64_t sum = 0;
-  for (const auto& [name, count] : own_counters_) {
-    if (name.starts_with("malformed ") || name.starts_with("senseless ")) sum += count;
-  }
+  for (const auto& [name, count] : own_counters_) sum += is_drop(name) ? count : 0;
   return sum;
 }
 
@@ -95,29 +90,25 @@ std::vector<std::string> StatusBoard::missing() const {
 }
 
 std::vector<std::string> StatusBoard::twins() const {
-  std::map<std::string, int> alive;
+  std::set<std::string> alive, twins;
   for (const auto& [key, heard] : processes_) {
-    if (!heard.has_ended()) ++alive[heard.newest.process_name];
+    const std::string& name = heard.newest.process_name;
+    if (!heard.has_ended() && !alive.insert(name).second) twins.insert(name);
   }
-  std::vector<std::string> names;
-  for (const auto& [name, count] : alive) {
-    if (count > 1) names.push_back(name);
-  }
-  return names;
+  return {twins.begin(), twins.end()};
 }
 
 std::vector<std::string> StatusBoard::warnings() const {
   std::vector<std::string> lines;
   const std::vector<std::string> silent = missing();
-  if (!silent.empty()) lines.push_back(fmt::format("not heard: {}", fmt::join(silent, ", ")));
+  if (!silent.empty()) lines.push_back("not heard: " + listed(silent));
   for (const std::string& name : twins()) {
-    std::string where;
-    for (const auto& [key, heard] : processes_) {
-      if (heard.newest.process_name != name || heard.has_ended()) continue;
-      where += fmt::format("{}{} on {}", where.empty() ? "pid " : ", pid ", heard.newest.pid,
-                           heard.newest.host);
-    }
-    lines.push_back(fmt::format("{} runs more than once ({}): end all but one", name, where));
+    std::vector<std::string> where;
+    for (const auto& [key, heard] : processes_)
+      if (heard.newest.process_name == name && !heard.has_ended())
+        where.push_back(fmt::format("pid {} on {}", heard.newest.pid, heard.newest.host));
+    lines.push_back(
+        fmt::format("{} runs more than once ({}): end all but one", name, listed(where)));
   }
   for (const auto& [key, heard] : processes_) {
     if (heard.newest.program_version == own_version_) continue;
@@ -131,10 +122,8 @@ std::vector<std::string> StatusBoard::warnings() const {
 std::set<std::string> StatusBoard::channels() const {
   std::set<std::string> names;
   for (const auto& [name, arrivals] : arrivals_) names.insert(name);
-  for (const auto& [name, count] : own_counters_) {
-    if (count > 0 && (name.starts_with("malformed ") || name.starts_with("senseless ")))
-      names.insert(name.substr(name.find(' ') + 1));
-  }
+  for (const auto& [name, count] : own_counters_)
+    if (count > 0 && is_drop(name)) names.insert(name.substr(name.find(' ') + 1));
   return names;
 }
 
@@ -164,29 +153,21 @@ std::string StatusBoard::activity() const {
   }
   if (babbler && !babbler->has_ended()) {
     const process_info_t& info = babbler->newest;
-    const bool is_done = info.phase == process_info_t::PHASE_DONE;
-    const bool is_working = info.phase == process_info_t::PHASE_WORKING;
-    return fmt::format("{}: {}",
-                       is_done      ? "Done"
-                       : is_working ? "Learning"
-                                    : "Waits",
-                       info.activity);
+    if (info.phase == process_info_t::PHASE_DONE) return "Done: " + info.activity;
+    return (info.phase == process_info_t::PHASE_WORKING ? "Learning: " : "Waits: ") + info.activity;
   }
-  std::string line;
-  for (const auto& [key, heard] : processes_) {
-    if (heard.newest.phase != process_info_t::PHASE_WORKING) continue;
-    line += fmt::format("{}{}: {}", line.empty() ? "" : "; ", heard.newest.process_name,
-                        heard.newest.activity);
-  }
-  return line.empty() ? "Nobody works: no babbler moves the arm."
-                      : "No babbler moves the arm; " + line;
+  std::vector<std::string> working;
+  for (const auto& [key, heard] : processes_)
+    if (heard.newest.phase == process_info_t::PHASE_WORKING)
+      working.push_back(heard.newest.process_name + ": " + heard.newest.activity);
+  return working.empty() ? "Nobody works: no babbler moves the arm."
+                         : fmt::format("No babbler moves the arm; {}", fmt::join(working, "; "));
 }
 
 std::string StatusBoard::headline() const {
-  if (arrivals_.empty()) {
+  if (arrivals_.empty())
     return is_silent() ? "Nothing on the bus."
                        : "Nothing but garbage on the bus: is it another program's?";
-  }
   const Heard* babbler = find("motor_babbler");
   std::string line = activity();
   if (!line.ends_with('.')) line += '.';
@@ -200,8 +181,7 @@ std::string StatusBoard::headline() const {
       line += fmt::format(" {} {}{}.", info.process_name,
                           info.activity.starts_with("waits") ? "" : "waits: ", info.activity);
   }
-  if (const auto silent = missing(); !silent.empty())
-    line += fmt::format(" Not heard: {}.", fmt::join(silent, ", "));
+  if (const auto silent = missing(); !silent.empty()) line += " Not heard: " + listed(silent) + ".";
   return line;
 }
 
@@ -211,7 +191,7 @@ GroupStatus StatusBoard::status() const {
   status.missing = missing();
   status.twins = twins();
   status.warnings = warnings();
-  const double window_s = std::max(1e-3, seconds(begin_us_, end_us_));
+  const double window_s = std::max(1e-3, seconds(end_us_ - begin_us_));
   const std::set<std::string> names = channels();
   for (const std::string& name : names) {
     GroupStatus::ChannelUse& channel = status.channels.emplace_back();
@@ -221,7 +201,7 @@ GroupStatus StatusBoard::status() const {
     if (arrivals == arrivals_.end()) continue;
     channel.count = arrivals->second.count;
     channel.rate_hz = static_cast<double>(channel.count) / window_s;
-    channel.age_s = seconds(arrivals->second.last_us, end_us_);
+    channel.age_s = seconds(end_us_ - arrivals->second.last_us);
   }
   for (const auto& [key, heard] : processes_) {
     GroupStatus::Process& process = status.processes.emplace_back();

@@ -3,12 +3,13 @@
 #include <fmt/format.h>
 
 #include <limits>
-#include <nlohmann/json.hpp>
 #include <tuple>
 #include <utility>
+#include <vector>
 
 #include "processes/console/hint.h"
 #include "processes/console/names.h"
+#include "processes/console/views/json.h"
 
 namespace bodyschema {
 namespace {
@@ -17,6 +18,7 @@ using S = control_status_t;
 
 constexpr std::int64_t kTargetPeriod_us = 1'000'000;
 constexpr std::int64_t kSilent_us = 3'000'000;
+constexpr char kDriver[] = "the driver";
 
 }  // namespace
 
@@ -66,26 +68,23 @@ void TargetFollower::on_control_status(const control_status_t& status) {
   is_acknowledged_ = true;
   status_ = status;
   const std::int8_t state = status.control_state;
-  switch (target_.target_kind) {
-    case pose_target_t::KIND_HOLD:
-      if (state == S::CONTROL_HOLDING) end_ = End::kAsked;
-      break;
-    case pose_target_t::KIND_RELEASE:
-      if (state == S::CONTROL_RELEASED) end_ = End::kAsked;
-      break;
-    default:
-      // It was kept for keep_s and given back.
-      if (state == S::CONTROL_REACHED || state == S::CONTROL_RELEASED)
-        end_ = status.observed_error_m > tolerance_m_ ? End::kMissed : End::kAsked;
-      if (state == S::CONTROL_REFUSED || state == S::CONTROL_HOLDING) end_ = End::kRefused;
+  if (target_.target_kind == pose_target_t::KIND_HOLD) {
+    if (state == S::CONTROL_HOLDING) end_ = End::kAsked;
+  } else if (target_.target_kind == pose_target_t::KIND_RELEASE) {
+    if (state == S::CONTROL_RELEASED) end_ = End::kAsked;
+  } else if (state == S::CONTROL_REACHED || state == S::CONTROL_RELEASED) {
+    // RELEASED: it was kept for keep_s and given back.
+    end_ = status.observed_error_m > tolerance_m_ ? End::kMissed : End::kAsked;
+  } else if (state == S::CONTROL_REFUSED || state == S::CONTROL_HOLDING) {
+    end_ = End::kRefused;
   }
 }
 
 void TargetFollower::on_process_info(const process_info_t& info) {
-  processes_[info.process_name] = {info.activity, now_us_};
+  heard_at_us_[info.process_name] = now_us_;
 }
 
-void TargetFollower::on_motion_status(const motion_status_t&) { motion_at_us_ = now_us_; }
+void TargetFollower::on_motion_status(const motion_status_t&) { heard_at_us_[kDriver] = now_us_; }
 
 std::optional<pose_target_t> TargetFollower::on_tick(std::int64_t now_us) {
   now_us_ = now_us;
@@ -124,45 +123,35 @@ std::string TargetFollower::progress() const {
                      course_text(status_), status_.why);
 }
 
-bool TargetFollower::has_been_heard(const std::string& process) const {
-  const auto heard = processes_.find(process);
-  return heard != processes_.end() && now_us_ - heard->second.at_us <= kSilent_us;
-}
-
 std::string TargetFollower::diagnosis() const {
-  std::string text;
-  for (const char* process :
-       {"controller", "camera", "marker_estimator", "observer", "model_monitor"}) {
-    if (!has_been_heard(process)) text += fmt::format("{}{}", text.empty() ? "" : ", ", process);
-  }
-  if (!motion_at_us_ || now_us_ - *motion_at_us_ > kSilent_us) {
-    text += fmt::format("{}the driver", text.empty() ? "" : ", ");
-  }
-  if (!text.empty()) {
+  std::vector<std::string> silent = {"controller", "camera",        "marker_estimator",
+                                     "observer",   "model_monitor", kDriver};
+  std::erase_if(silent, [this](const std::string& name) {
+    const auto heard = heard_at_us_.find(name);
+    return heard != heard_at_us_.end() && now_us_ - heard->second <= kSilent_us;
+  });
+  if (!silent.empty()) {
     // Nobody owes a word as soon as that.
     if (now_us_ - started_us_ < kSilent_us) return "too soon to tell who is silent";
-    return "silent: " + text;
+    return "silent: " + listed(silent);
   }
   return is_acknowledged_ ? "the controller says: " + status_.why
                           : "the controller does not acknowledge the target";
 }
 
 std::string target_json(const control_status_t& status, TargetFollower::End end) {
-  const auto metres = [](double value) {
-    return value < 0 ? nlohmann::ordered_json(nullptr) : nlohmann::ordered_json(value);
-  };
-  const nlohmann::ordered_json json = {
-      {"reached", end == TargetFollower::End::kAsked},
-      {"state", end == TargetFollower::End::kTimedOut      ? "timed out"
-                : end == TargetFollower::End::kInterrupted ? "interrupted"
-                : end == TargetFollower::End::kMissed
-                    ? "missed"
-                    : name_in(kControlStates, status.control_state)},
-      {"why", status.why},
-      {"predicted_error_m", metres(status.predicted_error_m)},
-      {"observed_error_m", metres(status.observed_error_m)},
-      {"moves", status.num_moves},
-      {"schema_version", status.schema_version}};
+  using End = TargetFollower::End;
+  const char* state = end == End::kTimedOut      ? "timed out"
+                      : end == End::kInterrupted ? "interrupted"
+                      : end == End::kMissed      ? "missed"
+                                                 : name_in(kControlStates, status.control_state);
+  const Json json = {{"reached", end == End::kAsked},
+                     {"state", state},
+                     {"why", status.why},
+                     {"predicted_error_m", known(status.predicted_error_m)},
+                     {"observed_error_m", known(status.observed_error_m)},
+                     {"moves", status.num_moves},
+                     {"schema_version", status.schema_version}};
   return json.dump();
 }
 

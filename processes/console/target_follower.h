@@ -51,8 +51,6 @@ class TargetFollower {
   std::string diagnosis() const;
 
  private:
-  bool has_been_heard(const std::string& process) const;
-
   const pose_target_t target_;
   const std::int64_t timeout_us_;
   const double tolerance_m_;
@@ -63,12 +61,7 @@ class TargetFollower {
   End end_ = End::kOpen;
   control_status_t status_{};
   bool has_controller_ = false;
-  struct Heard {
-    std::string activity;
-    std::int64_t at_us = 0;
-  };
-  std::map<std::string, Heard> processes_;
-  std::optional<std::int64_t> motion_at_us_;
+  std::map<std::string, std::int64_t> heard_at_us_;  ///< by name, when last
 };
 
 /// Repeats STOP or RESUME until MOTION_STATUS says that it is so.

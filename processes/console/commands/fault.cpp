@@ -3,15 +3,14 @@
 #include <chrono>
 #include <cmath>
 #include <cstdlib>
-#include <iostream>
 #include <memory>
-#include <nlohmann/json.hpp>
 #include <optional>
 #include <stdexcept>
 
 #include "common/bus/bus.h"
 #include "processes/console/clock.h"
 #include "processes/console/commands/commands.h"
+#include "processes/console/commands/files.h"
 
 namespace bodyschema {
 namespace {
@@ -55,16 +54,11 @@ void inject(FaultArguments& arguments) {
                        "(./run --keep)");
   }
   if (!done->fault_answer.empty()) throw std::runtime_error("refused: " + done->fault_answer);
-  if (arguments.json) {
-    std::cout << nlohmann::ordered_json{{"faults", done->faults}, {"utime", done->utime}}.dump(2)
-              << "\n";
-    return;
-  }
-  if (done->faults.empty()) {
-    std::cout << (command.fault == fault_command_t::FAULT_REPAIR ? "repaired: as built\n"
-                                                                 : "nothing is broken\n");
-  }
-  for (const std::string& fault : done->faults) std::cout << fault << "\n";
+  const bool is_repair = command.fault == fault_command_t::FAULT_REPAIR;
+  print(arguments.json, {{"faults", done->faults}, {"utime", done->utime}},
+        !done->faults.empty() ? fmt::format("{}\n", fmt::join(done->faults, "\n"))
+        : is_repair           ? "repaired: as built\n"
+                              : "nothing is broken\n");
 }
 
 }  // namespace
@@ -88,38 +82,38 @@ void add_fault_command(Arguments console) {
   using Command = fault_command_t;
   Command& command = arguments->command;
   command.number = -1;
-  const auto a_number = [](const std::string& text) {
-    return std::isnan(std::strtod(text.c_str(), nullptr)) ? "expected a number" : std::string();
+  const auto add_place = [&](Arguments sub, const char* name, const char* help) {
+    sub.add_option(name, command.place, help).required();
+    return sub;
   };
-  add("stuck", "The joints of a signal no longer move", Command::FAULT_STUCK)
-      .add_option("SIGNAL", command.place, "Name in signals.yaml")
-      .required();
-  Arguments bend = add("bend", "A link is bent in its middle", Command::FAULT_BEND);
-  bend.add_option("LINK", command.place, "Name in robot.yaml").required();
-  bend.add_option("DEG", command.amount_deg, "Angle [deg]")
-      .required()
-      .in_range(-90.0, 90.0)
-      .check(a_number);
-  add("tool", "Another tool", Command::FAULT_TOOL)
-      .add_option("N", command.number, "Of robot.yaml's tools; 0 is the first")
-      .required()
-      .in_range(0, 9999);
-  add("marker-lost", "A marker falls off", Command::FAULT_MARKER_LOST)
-      .add_option("ID", command.number, "Tag in markers.yaml")
-      .required()
-      .in_range(0, 9999);
-  add("marker-moved", "A marker sits elsewhere on its part", Command::FAULT_MARKER_MOVED)
-      .add_option("ID", command.number, "Tag in markers.yaml")
-      .required()
-      .in_range(0, 9999);
+  const auto add_number = [&](Arguments sub, const char* name, const char* help) {
+    sub.add_option(name, command.number, help).required().in_range(0, 9999);
+  };
+  const auto add_angle = [&](Arguments sub, const char* name, const char* help) {
+    sub.add_option(name, command.amount_deg, help)
+        .required()
+        .in_range(-90.0, 90.0)
+        .check([](const std::string& text) {
+          return std::isnan(std::strtod(text.c_str(), nullptr)) ? "expected a number" : "";
+        });
+  };
+  add_place(add("stuck", "The joints of a signal no longer move", Command::FAULT_STUCK), "SIGNAL",
+            "Name in signals.yaml");
+  add_angle(add_place(add("bend", "A link is bent in its middle", Command::FAULT_BEND), "LINK",
+                      "Name in robot.yaml"),
+            "DEG", "Angle [deg]");
+  add_number(add("tool", "Another tool", Command::FAULT_TOOL), "N",
+             "Of robot.yaml's tools; 0 is the first");
+  add_number(add("marker-lost", "A marker falls off", Command::FAULT_MARKER_LOST), "ID",
+             "Tag in markers.yaml");
+  add_number(
+      add("marker-moved", "A marker sits elsewhere on its part", Command::FAULT_MARKER_MOVED), "ID",
+      "Tag in markers.yaml");
   add("camera-bump", "The camera is knocked to another pose", Command::FAULT_CAMERA_BUMP);
-  Arguments drift =
-      add("drift", "A link bends more with each action; 0 ends it", Command::FAULT_DRIFT);
-  drift.add_option("LINK", command.place, "Name in robot.yaml").required();
-  drift.add_option("DEG_PER_SAMPLE", command.amount_deg, "Angle an action [deg]")
-      .required()
-      .in_range(-90.0, 90.0)
-      .check(a_number);
+  add_angle(
+      add_place(add("drift", "A link bends more with each action; 0 ends it", Command::FAULT_DRIFT),
+                "LINK", "Name in robot.yaml"),
+      "DEG_PER_SAMPLE", "Angle an action [deg]");
   add("repair", "As built", Command::FAULT_REPAIR);
 }
 

@@ -4,8 +4,10 @@
 #include <string>
 #include <vector>
 
+#include "common/bus/arguments.h"
 #include "common/schema/body_schema.h"
 #include "processes/console/recording.h"
+#include "processes/console/views/json.h"
 
 namespace bodyschema {
 
@@ -17,11 +19,16 @@ BodySchema load_schema(const std::filesystem::path& file);
 /// whole is said on stderr. @throws std::runtime_error.
 Recording load_for(const std::string& file, const BodySchema& schema);
 
-/// The two numbers of `--noise POS_M ROT_DEG`. @throws as refuse_argument() where they are not
-/// above 0 or no noise of a marker, and may be in another unit.
+/// Adds `--noise POS_M ROT_DEG`.
+void add_noise(Arguments& command, std::vector<double>& numbers, const std::string& more = "");
+/// Its two numbers. @throws as refuse_argument() where they are not above 0 or no noise of a
+/// marker, and may be in another unit.
 Noise noise_given(const std::vector<double>& numbers);
 
 /// @throws std::invalid_argument if `out` would be written over one of `inputs`.
 void check_out(const std::string& out, const std::vector<std::string>& inputs);
+
+/// Prints the result of a command.
+void print(bool as_json, const Json& json, const std::string& text);
 
 }  // namespace bodyschema

@@ -6,7 +6,6 @@
 #include <list>
 #include <map>
 #include <memory>
-#include <nlohmann/json.hpp>
 #include <set>
 #include <stdexcept>
 #include <tuple>
@@ -16,14 +15,13 @@
 #include "common/bus/all_channels.h"
 #include "common/bus/log_summary.h"
 #include "common/bus/rig_door.h"
+#include "processes/console/clock.h"
 #include "processes/console/commands/commands.h"
+#include "processes/console/commands/files.h"
+#include "processes/console/hint.h"
 
 namespace bodyschema {
 namespace {
-
-double seconds(std::int64_t from_us, std::int64_t to_us) {
-  return static_cast<double>(to_us - from_us) * 1e-6;
-}
 
 struct LogArguments {
   std::string file;
@@ -51,26 +49,39 @@ std::string replay_start(const LogSummary& summary, const std::string& file) {
                            "MOTION_STATUS and CAMERA_INFO, that can be read");
 }
 
+/// Events of a log for another one.
+class Copy {
+ public:
+  void add(const LogEvent& event) {
+    const auto encoded = encode_event(event.channel, event.data, event.event_utime, num_events_++);
+    bytes_.append(encoded.begin(), encoded.end());
+  }
+  void write(const std::filesystem::path& file) const {
+    write_file_atomically(file, bytes_);
+    std::cout << num_events_ << " events in " << file.string() << std::endl;
+  }
+
+ private:
+  std::string bytes_;
+  std::int64_t num_events_ = 0;
+};
+
 /// The messages of these channels that can be read, up to where the log is damaged.
 void copy_channels(const std::string& file, const std::vector<std::string>& channels,
-                   const std::string& copy) {
+                   const std::string& to) {
   std::error_code none;
-  if (std::filesystem::equivalent(file, copy, none))
-    throw std::invalid_argument("--to: " + copy + " is the log that is read");
-  std::string bytes;
-  std::int64_t written = 0;
+  if (std::filesystem::equivalent(file, to, none))
+    throw std::invalid_argument("--to: " + to + " is the log that is read");
+  Copy copy;
   const std::int64_t num_good = summarize_log(file).events;
   LogReader reader(file);
   for (std::int64_t i = 0; i < num_good && reader.next(); ++i) {
     const LogEvent& event = reader.event();
-    if (std::find(channels.begin(), channels.end(), event.channel) == channels.end() ||
-        !problem_of(event).empty())
-      continue;
-    const auto encoded = encode_event(event.channel, event.data, event.event_utime, written++);
-    bytes.append(encoded.begin(), encoded.end());
+    if (std::count(channels.begin(), channels.end(), event.channel) > 0 &&
+        problem_of(event).empty())
+      copy.add(event);
   }
-  write_file_atomically(copy, bytes);
-  std::cout << written << " events in " << copy << std::endl;
+  copy.write(to);
 }
 
 /// The one rig folder below `rigs` to which all that the log tells may belong: cameras, tags,
@@ -85,10 +96,9 @@ std::filesystem::path rig_of(const std::filesystem::path& log, const std::filesy
   const auto rule_out = [&](const std::filesystem::path& folder, const std::string& why) {
     against += fmt::format("\n  {}: {}", folder.filename().string(), why);
   };
-  std::vector<std::filesystem::path> folders;
+  std::set<std::filesystem::path> folders;
   for (const auto& entry : std::filesystem::directory_iterator(rigs))
-    if (entry.is_directory()) folders.push_back(entry.path());
-  std::sort(folders.begin(), folders.end());
+    if (entry.is_directory()) folders.insert(entry.path());
   for (const std::filesystem::path& folder : folders) {
     try {
       candidates.push_back({folder, RigDoor(folder)});
@@ -103,8 +113,7 @@ std::filesystem::path rig_of(const std::filesystem::path& log, const std::filesy
   while (num_judged < kEnough && reader.next()) {
     const LogEvent& event = reader.event();
     const auto judge_by = [&]<class Message>(const Channel<Message>& channel) {
-      if (event.channel != channel.name) return;
-      const auto message = decode<Message>(event.data.data(), event.data.size()).message;
+      const auto message = message_of(event, channel);
       if (!message) return;
       ++num_judged;
       std::erase_if(candidates, [&](const Candidate& candidate) {
@@ -127,22 +136,20 @@ std::filesystem::path rig_of(const std::filesystem::path& log, const std::filesy
                                          log.string(), rigs.string(), against));
   }
   if (candidates.size() > 1) {
-    std::string names;
-    for (const Candidate& candidate : candidates)
-      names += (names.empty() ? "" : ", ") + candidate.folder.filename().string();
+    const std::string names =
+        listed(candidates, [](const Candidate& one) { return one.folder.filename().string(); });
     throw std::runtime_error(log.string() + ": may be of several rigs: " + names +
                              "; type --rig RIG");
   }
   return candidates.front().folder;
 }
 
-nlohmann::ordered_json log_json(const LogSummary& summary) {
-  nlohmann::ordered_json json = {
-      {"sound", summary.is_sound()},        {"events", summary.events},
-      {"first_utime", summary.first_utime}, {"last_utime", summary.last_utime},
-      {"bytes", summary.file_bytes},        {"unread_bytes", summary.unread_bytes},
-      {"damage", summary.damage},           {"unreadable", summary.unreadable()},
-      {"versions", summary.versions},       {"channels", nlohmann::ordered_json::object()}};
+Json log_json(const LogSummary& summary) {
+  Json json = {{"sound", summary.is_sound()},        {"events", summary.events},
+               {"first_utime", summary.first_utime}, {"last_utime", summary.last_utime},
+               {"bytes", summary.file_bytes},        {"unread_bytes", summary.unread_bytes},
+               {"damage", summary.damage},           {"unreadable", summary.unreadable()},
+               {"versions", summary.versions},       {"channels", Json::object()}};
   for (const auto& [name, channel] : summary.channels) {
     json["channels"][name] = {
         {"events", channel.events},         {"bytes", channel.bytes},
@@ -158,7 +165,7 @@ std::string log_text(const LogSummary& summary) {
   std::string text;
   if (summary.events > 0) {
     text += fmt::format("{} events in {:.1f} s from {:%Y-%m-%d %H:%M:%S} UTC, {:.1f} MB\n",
-                        summary.events, seconds(summary.first_utime, summary.last_utime),
+                        summary.events, seconds(summary.last_utime - summary.first_utime),
                         fmt::gmtime(static_cast<std::time_t>(summary.first_utime / 1'000'000)),
                         static_cast<double>(summary.file_bytes) * 1e-6);
     text += "  channel            events  unreadable       kB   first    last\n";
@@ -168,8 +175,8 @@ std::string log_text(const LogSummary& summary) {
         fmt::format("  {:<18} {:>6}  {:>10} {:>8.0f} {:>6.1f}s {:>6.1f}s\n", name, channel.events,
                     channel.is_known ? std::to_string(channel.unreadable) : "not ours",
                     static_cast<double>(channel.bytes) * 1e-3,
-                    seconds(summary.first_utime, channel.first_utime),
-                    seconds(summary.first_utime, channel.last_utime));
+                    seconds(channel.first_utime - summary.first_utime),
+                    seconds(channel.last_utime - summary.first_utime));
   }
   const std::string flaws = flaws_text(summary);
   return text + (flaws.empty() ? "whole, and every message can be read\n" : flaws);
@@ -177,9 +184,9 @@ std::string log_text(const LogSummary& summary) {
 
 /// Writes a small copy of a log, enough to replay and to report it: without images, ground truth
 /// (SIM_STATE) and channels that are not ours, every message once however often it was repeated, of
-/// PROCESS_INFO each process' first and last. Returns the number of events written.
+/// PROCESS_INFO each process' first and last.
 /// @throws std::runtime_error; nothing is left of the copy then.
-std::int64_t thin_log(const std::filesystem::path& file, const std::filesystem::path& copy) {
+void thin_log(const std::filesystem::path& file, const std::filesystem::path& to) {
   std::set<std::string> kept_channels;
   for_each_channel([&](const auto& channel) { kept_channels.insert(channel.name); });
   kept_channels.erase(kCameraImage.name);
@@ -189,8 +196,7 @@ std::int64_t thin_log(const std::filesystem::path& file, const std::filesystem::
   std::int64_t index = 0;
   for_each_event(file, [&](const LogEvent& event) {
     ++index;
-    if (event.channel != kProcessInfo.name) return;
-    const auto info = decode<process_info_t>(event.data.data(), event.data.size()).message;
+    const auto info = message_of(event, kProcessInfo);
     if (!info) return;
     const auto [place, is_first] =
         infos.try_emplace({info->host, info->process_name, info->pid}, index, index);
@@ -200,28 +206,21 @@ std::int64_t thin_log(const std::filesystem::path& file, const std::filesystem::
   for (const auto& [process, first_last] : infos)
     kept_infos.insert({first_last.first, first_last.second});
 
-  std::string bytes;
-  std::int64_t written = 0;
+  Copy copy;
   std::set<std::pair<std::string, std::vector<std::uint8_t>>> seen;
   index = 0;
   for_each_event(file, [&](const LogEvent& event) {
     ++index;
     if (!kept_channels.contains(event.channel)) return;
     if (event.channel == kProcessInfo.name && !kept_infos.contains(index)) return;
-    if (!seen.emplace(event.channel, event.data).second) return;
-    const auto encoded = encode_event(event.channel, event.data, event.event_utime, written++);
-    bytes.append(encoded.begin(), encoded.end());
+    if (seen.emplace(event.channel, event.data).second) copy.add(event);
   });
-  write_file_atomically(copy, bytes);
-  return written;
+  copy.write(to);
 }
 
 void run_log(const LogArguments& arguments) {
   const std::string& file = arguments.file;
-  if (!arguments.thin.empty()) {
-    std::cout << thin_log(file, arguments.thin) << " events in " << arguments.thin << std::endl;
-    return;
-  }
+  if (!arguments.thin.empty()) return thin_log(file, arguments.thin);
   if (!arguments.rigs.empty()) {
     std::cout << rig_of(file, arguments.rigs).filename().string() << std::endl;
     return;
@@ -232,14 +231,11 @@ void run_log(const LogArguments& arguments) {
   if (arguments.replay_from) {
     if (!flaws.empty()) std::cerr << file << ": " << flaws << std::flush;
     std::cout << replay_start(summary, file) << std::endl;
-  } else if (arguments.json) {
-    std::cout << log_json(summary).dump(2) << std::endl;
   } else {
-    std::cout << log_text(summary) << std::flush;
+    print(arguments.json, log_json(summary), log_text(summary));
   }
-  if (arguments.check && !summary.is_sound()) {
+  if (arguments.check && !summary.is_sound())
     throw std::runtime_error(file + ": " + flaws.substr(0, flaws.find('\n')));
-  }
 }
 
 }  // namespace

@@ -4,18 +4,18 @@
 #include <cmath>
 #include <iostream>
 #include <memory>
-#include <nlohmann/json.hpp>
 #include <optional>
 #include <stdexcept>
 #include <string>
+#include <variant>
 #include <vector>
 
 #include "common/bus/convert.h"
 #include "common/bus/event_log.h"
-#include "common/geometry/angle.h"
 #include "processes/console/commands/commands.h"
 #include "processes/console/commands/files.h"
 #include "processes/console/evaluation.h"
+#include "processes/console/hint.h"
 #include "processes/console/recording.h"
 #include "processes/console/views/health_view.h"
 #include "processes/console/views/structure_view.h"
@@ -30,8 +30,6 @@
 namespace bodyschema {
 namespace {
 
-using Json = nlohmann::ordered_json;
-
 struct MonitorArguments {
   std::string schema;
   std::string samples;
@@ -44,35 +42,24 @@ struct MonitorArguments {
 
 double seconds(const ActionPoseSample& sample) { return 1e-6 * static_cast<double>(sample.utime); }
 
-std::vector<std::string> names_of(const std::vector<Signal>& signals) {
-  std::vector<std::string> names;
-  for (const Signal& signal : signals) names.push_back(signal.name);
-  return names;
-}
-
-Json event_json(const AdaptationEvent& event, const ActionPoseSample& sample,
-                const std::vector<Signal>& signals) {
-  const health_event_t message = to_message(event, signals, sample.utime);
-  Json json;
-  json["sample"] = event.sample_index;
-  json["t"] = seconds(sample);
-  json["event"] = name_of(event.kind);
+/// event_json() with the time, without what is not told.
+Json event_line(const AdaptationEvent& event, const ActionPoseSample& sample,
+                const BodySchema& schema) {
+  Json told = event_json(to_message(event, schema.signals, sample.utime), signal_names(schema));
+  std::vector<std::string> untold = {"number"};
   if (event.part >= 0) {
-    json["part"] = event.part;
-    if (event.tag >= 0) json["tag"] = event.tag;
+    untold.insert(untold.end(), {"from", "to"});
+    if (event.tag < 0) untold.push_back("tag");
   } else {
-    json["from"] = event.from;
-    json["to"] = event.to;
+    untold.insert(untold.end(), {"part", "tag"});
   }
-  if (!event.cause.empty()) json["cause"] = event.cause;
-  add_size(message.event_size, message.event_since, names_of(signals), &json);
-  json["margin"] = event.margin;
-  json["samples_used"] = event.num_samples;
-  json["text"] = message.event_text;
+  if (event.cause.empty()) untold.push_back("cause");
+  for (const std::string& key : untold) told.erase(key);
+  Json line = {{"sample", event.sample_index}, {"t", seconds(sample)}};
+  line.update(told);
   if (event.probe.size() > 0)
-    json["action"] =
-        std::vector<double>(event.probe.data(), event.probe.data() + event.probe.size());
-  return json;
+    line["action"] = std::vector<double>(event.probe.begin(), event.probe.end());
+  return line;
 }
 
 AdaptationOptions options_of(const MonitorArguments& arguments, const Recording& recording,
@@ -92,40 +79,20 @@ AdaptationOptions options_of(const MonitorArguments& arguments, const Recording&
 }
 
 void tell_noise(const MonitorArguments& arguments, const std::optional<Noise>& noise) {
-  if (!noise) {
+  if (!noise)
     std::cerr << "noise: the covariances of " << arguments.samples << "\n";
-    return;
-  }
-  std::cerr << fmt::format("noise per axis and marker: {:.2f} mm {:.2f}°, {}\n",
-                           noise->position_m * 1e3, noise->rotation_rad / kDegree,
-                           arguments.noise.empty() ? "that of " + arguments.schema : "given");
+  else
+    std::cerr << fmt::format("noise per axis and marker: {}, {}\n",
+                             pose_text(noise->position_m, noise->rotation_rad),
+                             arguments.noise.empty() ? "that of " + arguments.schema : "given");
 }
 
 /// A procedure that keeps the schema true.
-class Method {
- public:
-  virtual ~Method() = default;
-  virtual std::vector<AdaptationEvent> on_sample(const ActionPoseSample& sample) = 0;
-  virtual const BodySchema& schema() const = 0;
-};
+using Method = std::variant<Adaptation, ChapterAdaptation>;
 
-template <class Adapting>
-class MethodOf : public Method {
- public:
-  explicit MethodOf(Adapting adapting) : adapting_(std::move(adapting)) {}
-  std::vector<AdaptationEvent> on_sample(const ActionPoseSample& sample) override {
-    return adapting_.on_sample(sample);
-  }
-  const BodySchema& schema() const override { return adapting_.schema(); }
-
- private:
-  Adapting adapting_;
-};
-
-std::unique_ptr<Method> method_of(const std::string& name, const AdaptationOptions& options,
-                                  const BodySchema& schema) {
-  if (name == "evidence")
-    return std::make_unique<MethodOf<Adaptation>>(Adaptation(schema, options));
+Method method_of(const std::string& name, const AdaptationOptions& options,
+                 const BodySchema& schema) {
+  if (name == "evidence") return Adaptation(schema, options);
   ChapterAdaptationOptions chapter;
   if (options.measurement.noise) {
     BaselineOptions baseline;
@@ -133,8 +100,15 @@ std::unique_ptr<Method> method_of(const std::string& name, const AdaptationOptio
     chapter.sigma_position_m = baseline.sigma_position_m;
     chapter.sigma_rotation_rad = baseline.sigma_rotation_rad;
   }
-  return std::make_unique<MethodOf<ChapterAdaptation>>(
-      ChapterAdaptation(schema, chapter, fit_matrix_gp_edge));
+  return ChapterAdaptation(schema, chapter, fit_matrix_gp_edge);
+}
+
+/// Whether any of the parts of the schema is seen.
+bool shows_any_part(const std::vector<ActionPoseSample>& samples, const BodySchema& schema) {
+  return std::any_of(samples.begin(), samples.end(), [&](const ActionPoseSample& sample) {
+    return std::any_of(sample.parts.begin(), sample.parts.end(),
+                       [&](const auto& seen) { return schema.has_part(seen.part); });
+  });
 }
 
 void run_monitor(const MonitorArguments& arguments) {
@@ -144,47 +118,43 @@ void run_monitor(const MonitorArguments& arguments) {
   if (!arguments.evaluate.empty()) evaluation = load_for(arguments.evaluate, schema);
   if (schema.edges.empty())
     throw std::invalid_argument(arguments.schema + ": expected a schema with edges, found none");
-  const bool is_seen = std::any_of(
-      recording.samples.begin(), recording.samples.end(), [&](const ActionPoseSample& sample) {
-        return std::any_of(sample.parts.begin(), sample.parts.end(), [&](const auto& o) {
-          return std::find(schema.parts.begin(), schema.parts.end(), o.part) != schema.parts.end();
-        });
-      });
-  if (!is_seen)
+  if (!shows_any_part(recording.samples, schema))
     throw std::invalid_argument(arguments.samples + ": none of the parts of " + arguments.schema +
                                 " is seen in it; is it of another body?");
   check_out(arguments.out, {arguments.samples, arguments.schema, arguments.evaluate});
 
   const AdaptationOptions options = options_of(arguments, recording, schema);
-  const std::unique_ptr<Method> method = method_of(arguments.method, options, schema);
+  Method method = method_of(arguments.method, options, schema);
+  const auto adapted = [&]() -> const BodySchema& {
+    return std::visit([](const auto& by) -> const BodySchema& { return by.schema(); }, method);
+  };
   tell_noise(arguments, options.measurement.noise);
   int num_events = 0;
   for (const ActionPoseSample& sample : recording.samples) {
-    for (const AdaptationEvent& event : method->on_sample(sample)) {
+    for (const AdaptationEvent& event :
+         std::visit([&](auto& by) { return by.on_sample(sample); }, method)) {
       ++num_events;
       if (arguments.json)
-        std::cout << event_json(event, sample, schema.signals).dump() << '\n';
+        std::cout << event_line(event, sample, schema).dump() << '\n';
       else
         std::cout << fmt::format("sample {:5} {:9.2f} s  {}\n", event.sample_index, seconds(sample),
                                  text_of(event, schema.signals));
     }
     if (!evaluation) continue;
-    const auto errors = evaluate(method->schema(), evaluation->samples);
-    Json line;
-    line["sample"] = sample.sample_index;
-    line["t"] = seconds(sample);
-    line.update(errors_json(static_cast<int>(evaluation->samples.size()), errors));
+    const auto errors = evaluate(adapted(), evaluation->samples);
     if (arguments.json) {
+      Json line = {{"sample", sample.sample_index}, {"t", seconds(sample)}};
+      line.update(errors_json(static_cast<int>(evaluation->samples.size()), errors));
       std::cout << line.dump() << '\n';
     } else if (sample.sample_index + 1 == std::ssize(recording.samples)) {
-      std::cout << errors_text(errors);
+      std::cout << errors_text({.parts = errors});
     }
   }
   if (!arguments.json)
     std::cout << fmt::format("{} samples, {} events\n", recording.samples.size(), num_events);
   std::cout << std::flush;
   if (arguments.out.empty()) return;
-  schema = method->schema();
+  schema = adapted();
   schema.base_version = schema.version;
   schema.last_sample_index = recording.samples.back().sample_index;
   schema.version = schema.last_sample_index + 1;
@@ -202,11 +172,7 @@ void add_monitor_command(Arguments console) {
   monitor.add_option("--out", arguments->out, "Write the schema as it is in the end to this file");
   monitor.add_option("--evaluate", arguments->evaluate,
                      "Compare the schema with this recording after every sample");
-  monitor
-      .add_option("--noise", arguments->noise,
-                  "Standard deviation per axis and marker: position [m], rotation [deg]")
-      .expected(2)
-      .type_name("POS_M ROT_DEG");
+  add_noise(monitor, arguments->noise);
   monitor
       .add_option(
           "--method", arguments->method,

@@ -18,12 +18,14 @@
 #include "common/geometry/angle.h"
 #include "processes/console/commands/commands.h"
 #include "processes/console/commands/files.h"
+#include "processes/console/engineered_model.h"
 #include "processes/console/evaluation.h"
 #include "processes/console/recording.h"
 #include "processes/console/rig_check.h"
 #include "processes/console/views/structure_view.h"
 #include "processes/structure_learner/baseline/learn_baseline.h"
 #include "processes/structure_learner/learn.h"
+#include "processes/structure_learner/root_pose.h"
 
 namespace bodyschema {
 namespace {
@@ -75,53 +77,59 @@ void run_learn(const LearnArguments& arguments) {
   options.measurement.noise = noise;
   check_out(arguments.out, {arguments.samples});
   const std::vector<ActionPoseSample> training = recording.training();
-  if (options.root) {
-    bool is_seen = false;
-    for (const ActionPoseSample& sample : training)
-      is_seen |= sample.find(*options.root) != nullptr;
-    if (!is_seen) {
-      throw std::invalid_argument("--root: part " + std::to_string(*options.root) +
-                                  " is never seen in " + arguments.samples);
-    }
-  }
-  LearnResult result;
-  if (arguments.method == "chapter") {
-    result = learn_as_the_chapter(recording, training, options);
-  } else {
-    result = learn(recording.signals, training, options);
-  }
+  const auto shows_root = [&](const auto& sample) { return sample.find(*options.root); };
+  if (options.root && std::none_of(training.begin(), training.end(), shows_root))
+    throw std::invalid_argument(
+        fmt::format("--root: part {} is never seen in {}", *options.root, arguments.samples));
+  const LearnResult result = arguments.method == "chapter"
+                                 ? learn_as_the_chapter(recording, training, options)
+                                 : learn(recording.signals, training, options);
   if (!arguments.out.empty()) {
     BodySchema schema = result.schema;
     schema.version = schema.last_sample_index + 1;
     write_one_event_log(arguments.out, kBodySchema, to_message(schema));
   }
-  if (arguments.json) {
-    std::cout << structure_json(result.schema, result.outliers, result.noise_source).dump(2)
-              << std::endl;
-  } else {
-    std::cout << structure_text(result.schema, result.noise_source) << std::flush;
-  }
+  print(arguments.json, structure_json(result.schema, result.outliers, result.noise_source),
+        structure_text(result.schema, result.noise_source));
 }
 
-void run_predict(const std::string& schema_file, const std::string& samples_file, bool json) {
-  const BodySchema schema = load_schema(schema_file);
-  const Recording recording = load_for(samples_file, schema);
-  const auto errors = evaluate(schema, recording.samples);
-  if (json) {
-    std::cout << errors_json(static_cast<int>(recording.samples.size()), errors).dump(2)
-              << std::endl;
-  } else {
-    std::cout << errors_text(errors) << std::flush;
-  }
+/// Of `predict` and `show`.
+struct SchemaArguments {
+  std::string schema, samples;
+  bool json = false;
+};
+
+void run_predict(const SchemaArguments& arguments) {
+  const BodySchema schema = load_schema(arguments.schema);
+  const std::vector<ActionPoseSample> samples = load_for(arguments.samples, schema).samples;
+  const auto errors = evaluate(schema, samples);
+  print(arguments.json, errors_json(static_cast<int>(samples.size()), errors),
+        errors_text({.parts = errors}));
 }
 
-void run_show(const std::string& schema_file, bool json) {
-  const BodySchema schema = load_schema(schema_file);
-  if (json) {
-    std::cout << schema_json(schema).dump(2) << std::endl;
-  } else {
-    std::cout << structure_text(schema) << std::flush;
-  }
+void run_show(const SchemaArguments& arguments) {
+  const BodySchema schema = load_schema(arguments.schema);
+  print(arguments.json, schema_json(schema), structure_text(schema));
+}
+
+struct EngineerArguments {
+  std::string urdf, placement, samples, out;
+  bool json = false;
+};
+
+void run_engineer(const EngineerArguments& arguments) {
+  BodySchema schema = engineered_model(arguments.urdf, arguments.placement);
+  const Recording recording = load_for(arguments.samples, schema);
+  MeasurementModel measurement = recording.measurement;
+  if (!recording.has_noise) measurement.noise = Noise{0.001, 0.2 * kDegree};  // weights alone
+  estimate_root_pose(recording.samples, measurement, &schema);
+  schema.calibration_id = recording.samples.front().calibration_id;
+  if (schema.X_CR_covariance.isZero(0))
+    throw std::runtime_error(
+        fmt::format("{}: the root, part {}, is never seen", arguments.samples, schema.root));
+  check_out(arguments.out, {arguments.samples, arguments.urdf, arguments.placement});
+  write_one_event_log(arguments.out, kBodySchema, to_message(schema));
+  print(arguments.json, schema_json(schema), structure_text(schema));
 }
 
 struct RigArguments {
@@ -144,25 +152,22 @@ void run_rig(const RigArguments& arguments) {
   const std::filesystem::path folder = find_rig(arguments.rig);
   const RigCheck check = check_rig(folder);
   for (const std::string& remark : check.remarks) std::cerr << "bodyschema: " << remark << "\n";
-  if (!check.problems.empty()) {
+  if (!check.problems.empty())
     throw std::runtime_error(fmt::format("{}", fmt::join(check.problems, "\n")));
-  }
   const std::vector<int> parts = load_markers(folder).parts();
   if (arguments.hidden_part &&
-      !std::binary_search(parts.begin(), parts.end(), *arguments.hidden_part)) {
-    throw std::invalid_argument("--hide: " + folder.string() + " has no part " +
-                                std::to_string(*arguments.hidden_part));
-  }
+      !std::binary_search(parts.begin(), parts.end(), *arguments.hidden_part))
+    throw std::invalid_argument(
+        fmt::format("--hide: {} has no part {}", folder.string(), *arguments.hidden_part));
   if (!arguments.initial.empty()) RigDoor(folder).load_initial_schema(arguments.initial);
   const Network network = load_network(folder, arguments.group);
   const std::string host = arguments.host.empty() ? own_host(network) : arguments.host;
-  std::cout << (network.is_private ? "private " : "host ") << network.bus_url() << ' '
-            << network.images_url() << ' ' << host;
+  std::vector<std::string> words = {network.is_private ? "private" : "host", network.bus_url(),
+                                    network.images_url(), host};
   for (const std::string& process : host == "all" ? arguments.group : network.share_of(host))
-    std::cout << ' ' << process;
-  std::cout << fmt::format("\nOK: {} parts, {} signals, {} tags\n", check.num_parts,
-                           check.num_signals, check.num_tags)
-            << std::flush;
+    words.push_back(process);
+  std::cout << fmt::format("{}\nOK: {} parts, {} signals, {} tags\n", fmt::join(words, " "),
+                           check.num_parts, check.num_signals, check.num_tags);
 }
 
 }  // namespace
@@ -183,6 +188,14 @@ Recording load_for(const std::string& file, const BodySchema& schema) {
   }
   recording.signals = schema.signals;
   return recording;
+}
+
+void add_noise(Arguments& command, std::vector<double>& numbers, const std::string& more) {
+  command
+      .add_option("--noise", numbers,
+                  "Standard deviation per axis and marker: position [m], rotation [deg]" + more)
+      .expected(2)
+      .type_name("POS_M ROT_DEG");
 }
 
 Noise noise_given(const std::vector<double>& numbers) {
@@ -215,6 +228,10 @@ void check_out(const std::string& out, const std::vector<std::string>& inputs) {
     throw std::invalid_argument("--out: cannot write " + out + ": " + std::strerror(errno));
 }
 
+void print(bool as_json, const Json& json, const std::string& text) {
+  std::cout << (as_json ? json.dump(2) + "\n" : text) << std::flush;
+}
+
 void add_offline_commands(Arguments console) {
   const auto learning = std::make_shared<LearnArguments>();
   Arguments learn =
@@ -222,12 +239,7 @@ void add_offline_commands(Arguments console) {
   learn.add_option("SAMPLES", learning->samples, "Recording; - reads stdin").required();
   learn.add_option("--out", learning->out, "Write the schema to this file");
   learn.add_option("--root", learning->root, "Root part; the lowest id if not given");
-  learn
-      .add_option("--noise", learning->noise,
-                  "Standard deviation per axis and marker: position [m], rotation [deg]; "
-                  "estimated if neither this nor the recording says it")
-      .expected(2)
-      .type_name("POS_M ROT_DEG");
+  add_noise(learn, learning->noise, "; estimated if neither this nor the recording says it");
   learn
       .add_option("--method", learning->method,
                   "screw, or chapter: matrix GPs, and thresholds on mean errors at three times the "
@@ -236,24 +248,19 @@ void add_offline_commands(Arguments console) {
   learn.add_flag("--json", learning->json, "Print JSON");
   learn.callback([learning] { run_learn(*learning); });
 
-  struct Files {
-    std::string schema, samples;
-    bool json = false;
-  };
-  const auto predicting = std::make_shared<Files>();
+  const auto predicting = std::make_shared<SchemaArguments>();
   Arguments predict =
       console.add_subcommand("predict", "Compare a schema's predictions with a recording");
   predict.add_option("SCHEMA", predicting->schema, "Schema file").required();
   predict.add_option("SAMPLES", predicting->samples, "Recording").required();
   predict.add_flag("--json", predicting->json, "Print JSON");
-  predict.callback(
-      [predicting] { run_predict(predicting->schema, predicting->samples, predicting->json); });
+  predict.callback([predicting] { run_predict(*predicting); });
 
-  const auto showing = std::make_shared<Files>();
+  const auto showing = std::make_shared<SchemaArguments>();
   Arguments show = console.add_subcommand("show", "Print a schema file");
   show.add_option("SCHEMA", showing->schema, "Schema file").required();
   show.add_flag("--json", showing->json, "Print JSON");
-  show.callback([showing] { run_show(showing->schema, showing->json); });
+  show.callback([showing] { run_show(*showing); });
 
   const auto checking = std::make_shared<RigArguments>();
   Arguments rig = console.add_subcommand(
@@ -266,6 +273,22 @@ void add_offline_commands(Arguments console) {
   rig.add_option("--host", checking->host, "Host of network.yaml; this machine if not given");
   rig.add_option("--initial", checking->initial, "A schema to begin with: is it of this rig?");
   rig.callback([checking] { run_rig(*checking); });
+}
+
+void add_engineer_command(Arguments console) {
+  const auto arguments = std::make_shared<EngineerArguments>();
+  Arguments engineer = console.add_subcommand(
+      "engineer", "A schema from a URDF and where the parts are on its links");
+  engineer.add_option("URDF", arguments->urdf, "The robot").required();
+  engineer.add_option("PLACEMENT", arguments->placement, "YAML: root, signals, parts on links")
+      .required();
+  engineer
+      .add_option("--samples", arguments->samples,
+                  "A recording that shows where the root stands in the camera's frame")
+      .required();
+  engineer.add_option("--out", arguments->out, "Write the schema to this file").required();
+  engineer.add_flag("--json", arguments->json, "Print JSON");
+  engineer.callback([arguments] { run_engineer(*arguments); });
 }
 
 }  // namespace bodyschema

@@ -84,16 +84,45 @@ std::function<std::string(const std::string&)> within(double lowest, double high
   end_as_failed();
 }
 
-/// Whether anybody is on the bus: whoever lives there says so once a second.
-class Company {
+/// The bus of a command that somebody must answer: whoever lives there says so once a second.
+class Session {
  public:
-  Company(Bus& bus, std::string url) : url_(std::move(url)) {
-    bus.subscribe<process_info_t>(kProcessInfo, [this](const auto&) { is_heard_ = true; });
-    bus.subscribe<motion_status_t>(kMotionStatus, [this](const auto&) { is_heard_ = true; });
-    bus.subscribe<control_status_t>(kControlStatus, [this](const auto&) { is_heard_ = true; });
+  explicit Session(const std::string& url) : bus(url, url), url_(url) {
+    catch_interruption();
+    for_anybody(kProcessInfo);
+    for_anybody(kMotionStatus);
+    for_anybody(kControlStatus);
   }
+
+  /// Turns the bus until `is_done` or Ctrl-C, at most for so long; `on_turn` gets the clock.
+  void turn(std::int64_t most_us, const std::function<bool()>& is_done,
+            const std::function<void(std::int64_t)>& on_turn = nullptr) {
+    const std::int64_t end_us = clock_us() + most_us;
+    while (!is_done() && clock_us() < end_us && !is_interrupted()) {
+      if (on_turn) on_turn(clock_us());
+      bus.handle(kTurn);
+    }
+  }
+
+  /// Shows the follower's progress until it has come to an end; `on_turn` on every turn.
+  void follow(TargetFollower& follower,
+              const std::function<void(std::int64_t)>& on_turn = nullptr) {
+    bus.subscribe(kControlStatus, [&](const auto& m) { follower.on_control_status(m); });
+    bus.subscribe(kProcessInfo, [&](const auto& m) { follower.on_process_info(m); });
+    bus.subscribe(kMotionStatus, [&](const auto& m) { follower.on_motion_status(m); });
+    ProgressLine line;
+    while (follower.end() == TargetFollower::End::kOpen) {
+      expect_company();
+      if (is_interrupted()) follower.interrupt();
+      if (const auto target = follower.on_tick(clock_us())) bus.publish(kPoseTarget, *target);
+      if (on_turn) on_turn(clock_us());
+      line.show(follower.progress());
+      bus.handle(kTurn);
+    }
+  }
+
   /// @throws std::runtime_error with what to type once nobody can be there.
-  void expect() const {
+  void expect_company() const {
     if (is_heard_ || clock_us() - start_us_ < kAlone_us) return;
     throw std::runtime_error(
         "nothing is heard on " + url_ +
@@ -101,38 +130,27 @@ class Company {
         "… speaks to one that runs");
   }
 
+  Bus bus;
+
  private:
+  static constexpr std::chrono::milliseconds kTurn{50};
+
+  template <class Message>
+  void for_anybody(const Channel<Message>& channel) {
+    bus.subscribe(channel, [this](const Message&) { is_heard_ = true; });
+  }
+
   const std::string url_;
   const std::int64_t start_us_ = clock_us();
   bool is_heard_ = false;
 };
 
-/// Runs until the follower has come to an end; `also` on every turn.
-void follow(Bus& bus, const Company& company, TargetFollower& follower, ProgressLine& line,
-            const std::function<void(std::int64_t)>& also = nullptr) {
-  bus.subscribe<control_status_t>(
-      kControlStatus, [&](const control_status_t& m) { follower.on_control_status(m); });
-  bus.subscribe<process_info_t>(kProcessInfo,
-                                [&](const process_info_t& m) { follower.on_process_info(m); });
-  while (follower.end() == TargetFollower::End::kOpen) {
-    company.expect();
-    if (is_interrupted()) follower.interrupt();
-    if (const auto target = follower.on_tick(clock_us())) bus.publish(kPoseTarget, *target);
-    if (also) also(clock_us());
-    line.show(follower.progress());
-    bus.handle(std::chrono::milliseconds(50));
-  }
-}
-
 /// Makes the controller drop what `follower` follows no longer; says what became of it.
-std::string withdraw(Bus& bus, const Company& company, const TargetFollower& follower) {
+std::string withdraw(Session& session, const TargetFollower& follower) {
   clear_interruption();  // a second Ctrl-C ends this too
   const pose_target_t withdrawal = follower.withdrawal();
   TargetFollower dropped(withdrawal, kPatience_us);
-  {
-    ProgressLine line;
-    follow(bus, company, dropped, line);
-  }
+  session.follow(dropped);
   switch (dropped.end()) {
     case TargetFollower::End::kAsked:
       return withdrawal.target_kind == pose_target_t::KIND_HOLD
@@ -148,79 +166,58 @@ std::string withdraw(Bus& bus, const Company& company, const TargetFollower& fol
   }
 }
 
+/// How a target ended, before the controller's own words, which begin with "reached".
+const char* ending(TargetFollower::End end, const control_status_t& status) {
+  if (end == TargetFollower::End::kAsked) return "";
+  if (end == TargetFollower::End::kMissed) return "missed: ";
+  if (status.control_state == control_status_t::CONTROL_HOLDING) return "held: ";
+  return status.control_state == control_status_t::CONTROL_REFUSED ? "refused: " : "not reached: ";
+}
+
 void run_target(const OperateArguments& arguments) {
   pose_target_t target = make_target(pose_target_t::KIND_POSITION);
   target.target_part = arguments.part;
   std::copy(arguments.position_m.begin(), arguments.position_m.end(), target.position_m);
   target.keep_s = arguments.keep_s;
-  if (const std::string problem = check(target); !problem.empty()) {
+  if (const std::string problem = check(target); !problem.empty())
     throw std::runtime_error("target: " + problem);
-  }
-  catch_interruption();
-  Bus bus(arguments.in, arguments.in);
-  const Company company(bus, arguments.in);
+  Session session(arguments.in);
   TargetFollower follower(target, std::llround(arguments.timeout_s * 1e6), arguments.tolerance_m);
-  bus.subscribe<motion_status_t>(kMotionStatus,
-                                 [&](const motion_status_t& m) { follower.on_motion_status(m); });
-  {
-    ProgressLine line;
-    follow(bus, company, follower, line);
-  }
+  session.follow(follower);
   control_status_t status = follower.status();
-  if (follower.end() == TargetFollower::End::kInterrupted) {
-    status.why = "interrupted; " + withdraw(bus, company, follower);
-  }
-  if (follower.end() == TargetFollower::End::kTimedOut) {
+  if (follower.end() == TargetFollower::End::kInterrupted)
+    status.why = "interrupted; " + withdraw(session, follower);
+  if (follower.end() == TargetFollower::End::kTimedOut)
     status.why = fmt::format("no end within {} s; {}; {}", arguments.timeout_s,
-                             follower.diagnosis(), withdraw(bus, company, follower));
-  }
-  const bool is_reached = follower.end() == TargetFollower::End::kAsked;
-  if (arguments.json) {
-    std::cout << target_json(status, follower.end()) << "\n";
-  } else {
-    // The controller's own words begin with "reached".
-    std::cout << fmt::format("{}{} ({})\n",
-                             is_reached                                       ? ""
-                             : follower.end() == TargetFollower::End::kMissed ? "missed: "
-                             : status.control_state == control_status_t::CONTROL_HOLDING ? "held: "
-                             : status.control_state == control_status_t::CONTROL_REFUSED
-                                 ? "refused: "
-                                 : "not reached: ",
-                             status.why, course_text(status));
-  }
-  if (!is_reached) fail();
+                             follower.diagnosis(), withdraw(session, follower));
+  std::cout << (arguments.json ? target_json(status, follower.end())
+                               : fmt::format("{}{} ({})", ending(follower.end(), status),
+                                             status.why, course_text(status)))
+            << "\n";
+  if (follower.end() != TargetFollower::End::kAsked) fail();
   if (arguments.keep_s < 0)
     std::cerr << "The arm stays there until: " << to_type("release") << "\n";
 }
 
 void run_hold(const OperateArguments& arguments) {
-  catch_interruption();
-  Bus bus(arguments.in, arguments.in);
-  const Company company(bus, arguments.in);
+  Session session(arguments.in);
   const pose_target_t target = make_target(pose_target_t::KIND_HOLD);
   TargetFollower follower(target, kPatience_us);
   const action_command_t command =
       make_console_command(action_command_t::KIND_HOLD, target.epoch, 0);
   bool is_answered = false;
-  bus.subscribe<motion_status_t>(kMotionStatus, [&](const motion_status_t& motion) {
-    follower.on_motion_status(motion);
+  session.bus.subscribe(kMotionStatus, [&](const motion_status_t& motion) {
     is_answered |= motion.source == command.source && motion.epoch == command.epoch;
   });
   std::int64_t sent_us = -1;
   const auto tell_driver = [&](std::int64_t now_us) {
     if (is_answered || (sent_us >= 0 && now_us - sent_us < kCommandPeriod_us)) return;
     sent_us = now_us;
-    bus.publish(kActionCommand, command);
+    session.bus.publish(kActionCommand, command);
   };
-  {
-    ProgressLine line;
-    follow(bus, company, follower, line, tell_driver);
-    const std::int64_t end_us = clock_us() + kPatience_us;
-    while (!is_answered && clock_us() < end_us && !is_interrupted()) {
-      tell_driver(clock_us());
-      bus.handle(std::chrono::milliseconds(50));
-    }
-  }
+  session.follow(follower, tell_driver);
+  session.turn(
+      kPatience_us, [&] { return is_answered; }, tell_driver);
   const bool is_held = follower.end() == TargetFollower::End::kAsked;
   std::cout << (is_answered ? "the driver holds" : "the driver does not answer") << "; "
             << (is_held ? "the controller keeps the arm still until another target or: " +
@@ -233,55 +230,47 @@ void run_hold(const OperateArguments& arguments) {
 }
 
 void run_release(const OperateArguments& arguments) {
-  catch_interruption();
-  Bus bus(arguments.in, arguments.in);
-  const Company company(bus, arguments.in);
+  Session session(arguments.in);
   TargetFollower follower(make_target(pose_target_t::KIND_RELEASE), kPatience_us);
-  bus.subscribe<motion_status_t>(kMotionStatus,
-                                 [&](const motion_status_t& m) { follower.on_motion_status(m); });
-  {
-    ProgressLine line;
-    follow(bus, company, follower, line);
-  }
-  if (follower.end() != TargetFollower::End::kAsked) {
+  session.follow(follower);
+  if (follower.end() != TargetFollower::End::kAsked)
     throw std::runtime_error("release: " + follower.diagnosis());
-  }
   std::cout << "released: the babbler may move the arm\n";
 }
 
-void run_latch(const OperateArguments& arguments, std::int8_t kind) {
-  catch_interruption();
-  Bus bus(arguments.in, arguments.in);
-  const Company company(bus, arguments.in);
-  LatchFollower follower(kind, wall_clock_us());
+/// @throws std::runtime_error unless MOTION_STATUS soon says what was asked for. The session hears
+/// the follower from then on.
+void latch(Session& session, LatchFollower& follower, const std::string& name) {
+  session.bus.subscribe(kMotionStatus, [&](const auto& m) { follower.on_motion_status(m); });
+  session.turn(
+      kPatience_us, [&] { return follower.is_done(); },
+      [&](std::int64_t now_us) {
+        session.expect_company();
+        if (const auto command = follower.on_tick(now_us))
+          session.bus.publish(kActionCommand, *command);
+      });
+  if (follower.is_done()) return;
+  throw std::runtime_error(
+      name + (follower.has_heard_driver()
+                  ? ": the driver was told for 5 s, but MOTION_STATUS does not say so"
+                  : ": no MOTION_STATUS for 5 s: does the driver run, and on this bus?"));
+}
+
+void run_halt(const OperateArguments& arguments) {
+  Session session(arguments.in);
+  LatchFollower follower(action_command_t::KIND_STOP, wall_clock_us());
+  latch(session, follower, "halt");
+  std::cout << "halted, until: " << to_type("resume") << "\n";
+}
+
+void run_resume(const OperateArguments& arguments) {
+  Session session(arguments.in);
   bool owns_arm = false;
-  bus.subscribe<motion_status_t>(kMotionStatus,
-                                 [&](const motion_status_t& m) { follower.on_motion_status(m); });
-  bus.subscribe<control_status_t>(kControlStatus,
-                                  [&](const control_status_t& m) { owns_arm = m.owns_arm == 1; });
-  const std::int64_t end_us = clock_us() + kPatience_us;
-  while (!follower.is_done() && clock_us() < end_us && !is_interrupted()) {
-    company.expect();
-    if (const auto command = follower.on_tick(clock_us())) bus.publish(kActionCommand, *command);
-    bus.handle(std::chrono::milliseconds(50));
-  }
-  const bool is_halt = kind == action_command_t::KIND_STOP;
-  if (!follower.is_done()) {
-    throw std::runtime_error(
-        std::string(is_halt ? "halt" : "resume") +
-        (follower.has_heard_driver()
-             ? ": the driver was told for 5 s, but MOTION_STATUS does not say so"
-             : ": no MOTION_STATUS for 5 s: does the driver run, and on this bus?"));
-  }
-  if (is_halt) {
-    std::cout << "halted, until: " << to_type("resume") << "\n";
-    return;
-  }
+  session.bus.subscribe(kControlStatus, [&](const auto& m) { owns_arm = m.owns_arm == 1; });
+  LatchFollower follower(action_command_t::KIND_RESUME, wall_clock_us());
+  latch(session, follower, "resume");
   // Whether the arm is the controller's is repeated at 1 Hz.
-  const std::int64_t listen_us = clock_us() + 1'500'000;
-  while (!owns_arm && clock_us() < listen_us && !is_interrupted()) {
-    bus.handle(std::chrono::milliseconds(50));
-  }
+  session.turn(1'500'000, [&] { return owns_arm; });
   std::cout << "resumed; "
             << (owns_arm
                     ? "the controller holds the arm until another target or: " + to_type("release")
@@ -321,10 +310,8 @@ void add_operate_commands(Arguments console) {
   target.add_flag("--json", arguments->json, "The result as JSON");
   add("hold", "Stop where the arm is; nothing moves it until another target", run_hold);
   add("release", "Give the arm back to the babbler", run_release);
-  add("halt", "Stop the arm at once; latches until resume",
-      [](const OperateArguments& a) { run_latch(a, action_command_t::KIND_STOP); });
-  add("resume", "End a halt",
-      [](const OperateArguments& a) { run_latch(a, action_command_t::KIND_RESUME); });
+  add("halt", "Stop the arm at once; latches until resume", run_halt);
+  add("resume", "End a halt", run_resume);
   // Both meanings were once typed so, and one of them ends everything.
   Arguments stop = console.add_subcommand("stop", "Nothing: see halt, and ./run stop").group("");
   stop.allow_extras();

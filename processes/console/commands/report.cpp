@@ -81,9 +81,8 @@ class Source {
     report.title = title();
     report.record = &record_;
     report.logs = follower_.summaries();
-    for (auto& [file, summary] : report.logs) {
+    for (auto& [file, summary] : report.logs)
       if (grows_ && summary.damage.starts_with("is cut off")) summary.damage.clear();
-    }
     report.measurement = [log = is_folder_ ? path_ / "run.lcmlog" : path_] {
       return measurement_of(log);
     };
@@ -135,11 +134,8 @@ class Source {
       try {
         LogReader reader(picture.image.file, OnDamage::kThrow, picture.image.byte);
         if (!reader.next()) continue;
-        const auto image =
-            decode<camera_image_t>(reader.event().data.data(), reader.event().data.size()).message;
-        if (!image) continue;
-        return draw_detections(*image, picture.markers, *record_.camera_info(),
-                               PictureFormat::kJpeg);
+        if (const auto image = message_of(reader.event(), kCameraImage))
+          return draw_detections(*image, picture.markers, *record_.camera_info(), ".jpg");
       } catch (const std::exception&) {
         // Another frame may do.
       }

@@ -3,7 +3,6 @@
 #include <unistd.h>
 
 #include <chrono>
-#include <iostream>
 #include <memory>
 #include <set>
 #include <stdexcept>
@@ -15,6 +14,7 @@
 #include "common/bus/log_summary.h"
 #include "processes/console/clock.h"
 #include "processes/console/commands/commands.h"
+#include "processes/console/commands/files.h"
 #include "processes/console/hint.h"
 #include "processes/console/status_board.h"
 #include "processes/console/views/status_view.h"
@@ -57,18 +57,14 @@ void run_status(const StatusArguments& arguments) {
   board.end(clock_us());
   board.on_own_counters(bus.counters());
   board.on_own_counters(images.counters());
-  if (board.is_silent()) {
+  if (board.is_silent())
     throw std::runtime_error(fmt::format(
         "nothing on {} in {:.1f} s. `./run --keep` starts a group, `./run exec bodyschema status` "
         "looks at one that runs",
         arguments.in, arguments.seconds));
-  }
-  if (arguments.json) {
-    std::cout << status_json(board.status()).dump(2) << std::endl;
-  } else {
-    std::cout << status_text(board.status(), terminal_width(STDOUT_FILENO).value_or(100))
-              << std::flush;
-  }
+  const GroupStatus status = board.status();
+  print(arguments.json, status_json(status),
+        status_text(status, terminal_width(STDOUT_FILENO).value_or(100)));
 }
 
 }  // namespace

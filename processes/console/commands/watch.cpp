@@ -89,16 +89,9 @@ class LogPlayer {
         arguments.replay_from == kSample.name
             ? kSample.name
             : fmt::format("({}|{}|{})", kMarkerPoses.name, kMotionStatus.name, kCameraInfo.name);
-    std::vector<std::string> words = {"setpriv",
-                                      "--pdeathsig",
-                                      "TERM",
-                                      "lcm-logplayer",
-                                      "-s",
-                                      fmt::format("{}", arguments.speed),
-                                      "-e",
-                                      channels,
-                                      "--lcm-url=" + arguments.in,
-                                      arguments.replay};
+    std::vector<std::string> words = {"setpriv", "--pdeathsig", "TERM", "lcm-logplayer"};
+    words.insert(words.end(), {"-s", fmt::format("{}", arguments.speed), "-e", channels,
+                               "--lcm-url=" + arguments.in, arguments.replay});
     std::vector<char*> argv;
     for (std::string& word : words) argv.push_back(word.data());
     argv.push_back(nullptr);
@@ -107,10 +100,9 @@ class LogPlayer {
     ::posix_spawn_file_actions_addopen(&actions, STDOUT_FILENO, "/dev/null", O_WRONLY, 0);
     const int error = ::posix_spawnp(&pid_, argv[0], &actions, nullptr, argv.data(), environ);
     ::posix_spawn_file_actions_destroy(&actions);
-    if (error != 0) {
+    if (error != 0)
       throw std::runtime_error(fmt::format("lcm-logplayer: {}; it is in Debian's liblcm-bin",
                                            std::generic_category().message(error)));
-    }
   }
   /// @throws std::runtime_error if it failed.
   bool is_running() {
@@ -127,28 +119,13 @@ class LogPlayer {
   bool has_ended_ = false;
 };
 
-/// The simulator's truth of a recorded run is read from the recording: it does not go on a bus.
-void read_truth(const std::string& log, RunWatch& watch) {
+/// The events of a recording, up to where it is damaged.
+void for_each_readable(const std::string& log, const std::function<void(const LogEvent&)>& visit) {
   try {
-    for_each_event(log, [&](const LogEvent& event) {
-      if (event.channel != kSimState.name) return;
-      const auto state = decode<sim_state_t>(event.data.data(), event.data.size());
-      if (state.message) watch.on_sim_state(*state.message);
-    });
+    for_each_event(log, visit);
   } catch (const std::runtime_error&) {
-    // Damaged in the middle: what stands before that is used, as everywhere.
+    // What stands before the damage is used, as everywhere.
   }
-}
-
-/// Messages of a channel in a recording, as far as it can be read.
-std::int64_t count_messages(const std::string& log, const std::string& channel) {
-  std::int64_t count = 0;
-  try {
-    for_each_event(log, [&](const LogEvent& event) { count += event.channel == channel; });
-  } catch (const std::runtime_error&) {
-    // As above.
-  }
-  return count;
 }
 
 /// The body schema is the monitor's where it accepted one; a schema does not carry its outliers, so
@@ -156,17 +133,13 @@ std::int64_t count_messages(const std::string& log, const std::string& channel) 
 void learn_again(const RunWatch& watch, const WatchArguments& arguments, RunResult* result) {
   const StructureLearnerConfig config = StructureLearnerConfig::load(
       std::filesystem::path(arguments.rig_folder) / "structure_learner.yaml");
-  std::vector<ActionPoseSample> training;
-  for (const ActionPoseSample& sample : watch.samples()) {
-    if (sample.purpose == Purpose::kTrain || sample.purpose == Purpose::kProbe)
-      training.push_back(sample);
-  }
+  std::vector<ActionPoseSample> training = watch.samples();
+  std::erase_if(training, [](const auto& sample) { return !is_learned_from(sample); });
   LearnOptions options = config.options;
-  if (std::none_of(training.begin(), training.end(), [&](const ActionPoseSample& sample) {
-        return options.root && sample.find(*options.root);
-      })) {
-    options.root.reset();
-  }
+  const auto shows_root = [&](const auto& sample) {
+    return options.root && sample.find(*options.root);
+  };
+  if (std::none_of(training.begin(), training.end(), shows_root)) options.root.reset();
   const LearnResult learned = learn(config.signals, training, options);
   result->schema = watch.schema().value_or(learned.schema);
   result->outliers = learned.outliers;
@@ -216,14 +189,17 @@ class WatchSession {
                 },
                 ask_again()) {
     subscribe();
-    if (is_replay_) read_truth(arguments_.replay, watch_);
+    if (is_replay_) read_truth(arguments_.replay);
     // ./run starts this again after a crash: what went over the bus before is in the run's logs.
     for (int part = 0; !is_replay_; ++part) {
       const std::string log = fmt::format("{}/run.lcmlog.{:02}", arguments_.out, part);
       if (!std::filesystem::exists(log)) break;
-      read_truth(log, watch_);
+      read_truth(log);
     }
-    if (is_played_) num_played_ = count_messages(arguments_.replay, arguments_.replay_from);
+    if (is_played_)
+      for_each_readable(arguments_.replay, [this](const LogEvent& event) {
+        num_played_ += event.channel == arguments_.replay_from;
+      });
   }
 
   void run() {
@@ -242,6 +218,13 @@ class WatchSession {
   }
 
  private:
+  /// The simulator's truth of a recorded run is read from the recording: it does not go on a bus.
+  void read_truth(const std::string& log) {
+    for_each_readable(log, [this](const LogEvent& event) {
+      if (const auto state = message_of(event, kSimState)) watch_.on_sim_state(*state);
+    });
+  }
+
   /// Asks for samples that lost frames took, as from an observer on another host.
   SampleIntake::Ask ask_again() {
     if (is_replay_ && !(is_played_ && listener_ == "observer")) return nullptr;
@@ -274,7 +257,7 @@ class WatchSession {
                                       [this](const camera_image_t& m) { picture_.on_image(m); });
   }
 
-  double seconds() const { return static_cast<double>(clock_us() - start_us_) * 1e-6; }
+  double seconds() const { return bodyschema::seconds(clock_us() - start_us_); }
   std::int64_t num_heard() const {
     return watch_.counter(listener_, "received " + arguments_.replay_from);
   }
@@ -324,11 +307,10 @@ class WatchSession {
       std::cerr << fmt::format("nothing new for {:.0f} s:\n", seconds() - progressed_s_)
                 << watch_.diagnosis(arguments_.processes, clock_us());
     }
-    if (seconds() - progressed_s_ > arguments_.patience_s) {
+    if (seconds() - progressed_s_ > arguments_.patience_s)
       throw std::runtime_error(
           fmt::format("nothing new for {:.0f} s, so I give up; the processes' own words are in {}",
                       arguments_.patience_s, arguments_.out));
-    }
   }
 
   void finish() {

@@ -26,8 +26,6 @@
 namespace bodyschema {
 namespace {
 
-using Json = nlohmann::ordered_json;
-
 std::string base64(const std::string& bytes) {
   static const char* const kDigits =
       "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";

@@ -3,28 +3,37 @@
 #include <fmt/format.h>
 
 #include <algorithm>
+#include <span>
+#include <sstream>
 #include <string>
 #include <utility>
 #include <vector>
 
+#include "processes/console/clock.h"
+#include "processes/console/hint.h"
 #include "processes/console/names.h"
 
 namespace bodyschema {
 namespace {
 
-using Json = nlohmann::ordered_json;
+Json latency_row(const RunRecord::Latency& latency) {
+  const auto ms = [&](double q) {
+    return fmt::format("{:.1f} ms", quantile(latency.seconds, q) * 1e3);
+  };
+  return {{"between", latency.name},
+          {"numbers", {std::to_string(latency.seconds.size()), ms(0.5), ms(0.95), ms(1)}}};
+}
 
-Json latency_rows(const RunRecord& record) {
-  Json rows = Json::array();
-  for (const RunRecord::Latency& latency : record.latencies()) {
-    const auto ms = [&](double q) {
-      return fmt::format("{:.1f} ms", quantile(latency.seconds, q) * 1e3);
-    };
-    rows.push_back(
-        {{"between", latency.name},
-         {"numbers", {std::to_string(latency.seconds.size()), ms(0.5), ms(0.95), ms(1)}}});
-  }
-  return rows;
+Json resources_row(const RunRecord::Process& process) {
+  const process_info_t& info = process.newest;
+  const double age_s = seconds(info.utime - info.start_utime), used_s = seconds(info.cpu_us);
+  return {{"process", info.process_name},
+          {"host", info.host},
+          {"numbers",
+           {std::to_string(info.pid), fmt::format("{:.1f} s", used_s),
+            age_s > 0.1 ? fmt::format("{:.0f} %", 100 * used_s / age_s) : "–",
+            fmt::format("{:.0f} MB", static_cast<double>(info.resident_bytes) * 1e-6)}},
+          {"at_the_end", fmt::format("{}: {}", name_in(kPhases, info.phase), info.activity)}};
 }
 
 }  // namespace
@@ -36,43 +45,28 @@ Json flaws_data(const Report& report) {
   for (const auto& [file, summary] : report.logs) {
     // A file that is being written often ends in the middle of an event.
     if (report.goes_on && summary.unreadable() == 0) continue;
-    for (std::string text = flaws_text(summary); !text.empty();) {
-      const std::size_t end = text.find('\n');
-      lines.push_back(file.filename().string() + ": " + text.substr(0, end));
-      text.erase(0, end + 1);
-    }
+    std::istringstream flaws(flaws_text(summary));
+    for (std::string flaw; std::getline(flaws, flaw);)
+      lines.push_back(file.filename().string() + ": " + flaw);
   }
   return lines;
 }
 
 Json processes_data(const RunRecord& record) {
   const auto processes = record.processes();
-  Json resources = Json::array(), counters = Json::array();
-  for (const RunRecord::Process& process : processes) {
-    const process_info_t& info = process.newest;
-    const double age_s = static_cast<double>(info.utime - info.start_utime) * 1e-6;
-    const double used_s = static_cast<double>(info.cpu_us) * 1e-6;
-    resources.push_back(
-        {{"process", info.process_name},
-         {"host", info.host},
-         {"numbers",
-          {std::to_string(info.pid), fmt::format("{:.1f} s", used_s),
-           age_s > 0.1 ? fmt::format("{:.0f} %", 100 * used_s / age_s) : "–",
-           fmt::format("{:.0f} MB", static_cast<double>(info.resident_bytes) * 1e-6)}},
-         {"at_the_end", fmt::format("{}: {}", name_in(kPhases, info.phase), info.activity)}});
-    for (const counter_t& counter : info.counters) {
-      const std::string& name = counter.counter_name;
-      if (counter.count == 0 || name.starts_with("received ") || name.starts_with("published "))
-        continue;
-      counters.push_back(
-          {{"process", info.process_name}, {"counter", name}, {"count", counter.count}});
-    }
-  }
-  Json latencies = latency_rows(record);
+  const auto latencies = record.latencies();
   if (processes.empty() && latencies.empty()) return nullptr;
+  Json counters = Json::array();
+  for (const RunRecord::Process& process : processes) {
+    for (const counter_t& counter : process.newest.counters)
+      if (counter.count != 0 && !is_traffic(counter.counter_name))
+        counters.push_back({{"process", process.newest.process_name},
+                            {"counter", counter.counter_name},
+                            {"count", counter.count}});
+  }
   return {{"loads", Json::array()},
-          {"resources", table(std::move(resources))},
-          {"latencies", table(std::move(latencies))},
+          {"resources", table(array_of(processes, resources_row))},
+          {"latencies", table(array_of(latencies, latency_row))},
           {"counters", table(std::move(counters))}};
 }
 
@@ -81,29 +75,26 @@ Json events_data(const RunRecord& record) {
   // The arm's clock, a simulated one of a simulated arm.
   const auto time = [&](std::int64_t utime) {
     if (samples.empty()) return std::string("–");
-    return fmt::format("{:.1f} s", static_cast<double>(utime - samples.front().utime) * 1e-6);
+    return fmt::format("{:.1f} s", seconds(utime - samples.front().utime));
   };
-  Json faults = Json::array(), decisions = Json::array();
-  for (const RunRecord::FaultChange& change : record.faults()) {
+  const auto fault_row = [&](const RunRecord::FaultChange& change) -> Json {
     const auto first = std::find_if(samples.begin(), samples.end(), [&](const auto& sample) {
       return sample.utime >= change.utime;
     });
-    faults.push_back(
-        {{"sample", first == samples.end() ? "–" : std::to_string(first->sample_index)},
-         {"time", time(change.utime)},
-         {"broken", change.faults.empty() ? "nothing: repaired"
-                                          : fmt::format("{}", fmt::join(change.faults, ", "))}});
-  }
+    return {{"sample", first == samples.end() ? "–" : std::to_string(first->sample_index)},
+            {"time", time(change.utime)},
+            {"broken", change.faults.empty() ? "nothing: repaired" : listed(change.faults)}};
+  };
+  const auto decision_row = [&](const health_event_t& event) -> Json {
+    return {
+        {"sample", event.event_sample}, {"time", time(event.utime)}, {"text", event.event_text}};
+  };
   constexpr std::size_t kMost = 200;
   const std::vector<health_event_t> all = record.events();
-  for (std::size_t i = all.size() - std::min(all.size(), kMost); i < all.size(); ++i) {
-    decisions.push_back({{"sample", all[i].event_sample},
-                         {"time", time(all[i].utime)},
-                         {"text", all[i].event_text}});
-  }
-  if (faults.empty() && decisions.empty()) return nullptr;
-  return {{"faults", table(std::move(faults))},
-          {"decisions", table(std::move(decisions))},
+  if (record.faults().empty() && all.empty()) return nullptr;
+  const std::span newest = std::span(all).last(std::min(all.size(), kMost));
+  return {{"faults", table(array_of(record.faults(), fault_row))},
+          {"decisions", table(array_of(newest, decision_row))},
           {"left_out", all.size() > kMost ? Json{{"newest", kMost}, {"all", all.size()}} : Json()}};
 }
 
@@ -112,7 +103,7 @@ Json messages_data(const Report& report) {
   Json rows = Json::array();
   for (const auto& [file, summary] : report.logs) {
     for (const auto& [name, channel] : summary.channels) {
-      const double s = static_cast<double>(channel.last_utime - channel.first_utime) * 1e-6;
+      const double s = seconds(channel.last_utime - channel.first_utime);
       rows.push_back(
           {{"log", file.filename().string()},
            {"channel", name},

@@ -6,8 +6,6 @@
 namespace bodyschema {
 namespace {
 
-using Json = nlohmann::ordered_json;
-
 bool is_nothing(const Json& value) {
   return value.is_null() || value == false || value == "" || (value.is_array() && value.empty());
 }

@@ -1,8 +1,9 @@
 #pragma once
 
-#include <nlohmann/json.hpp>
 #include <string>
 #include <string_view>
+
+#include "processes/console/views/json.h"
 
 namespace bodyschema {
 
@@ -15,7 +16,7 @@ std::string escape_html(const std::string& text);
 /// false, "" or an empty array; a key that no section around has is null. Not of the standard:
 /// white space around sections stays, and no section stands in one of its own name.
 /// @throws std::logic_error for a tag or section without an end.
-std::string render(std::string_view text, const nlohmann::ordered_json& data);
+std::string render(std::string_view text, const Json& data);
 
 // The files of this folder, compiled in.
 extern const char kReportTemplate[];  ///< report.mustache

@@ -1,23 +1,21 @@
 #pragma once
 
-#include <nlohmann/json.hpp>
 #include <string>
 #include <vector>
 
 #include "bodyschema/body_schema_t.hpp"
 #include "bodyschema/model_health_t.hpp"
+#include "processes/console/views/json.h"
 
 namespace bodyschema {
 
-/// MODEL_HEALTH as status, report, watch and `monitor` tell it, in one way.
+/// MODEL_HEALTH as status, report, watch and `monitor` tell it, in one way. `signals`: their names;
+/// null where something is not told.
+Json event_json(const health_event_t& event, const std::vector<std::string>& signals);
+Json finding_json(const finding_t& finding, const std::vector<std::string>& signals);
 
-/// `signal`, `amount`, `amount_sd`, `since`: null where not told. `signals`: names.
-void add_size(const change_size_t& size, std::int64_t since,
-              const std::vector<std::string>& signals, nlohmann::ordered_json* json);
-nlohmann::ordered_json event_json(const health_event_t& event,
-                                  const std::vector<std::string>& signals);
-nlohmann::ordered_json finding_json(const finding_t& finding,
-                                    const std::vector<std::string>& signals);
+/// nullptr where the edge was not judged.
+const edge_health_t* health_of(const std::optional<model_health_t>& health, int from, int to);
 
 inline constexpr const char* kWhatIsWrong = "What is wrong now";
 

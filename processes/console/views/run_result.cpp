@@ -4,7 +4,7 @@
 
 #include <cmath>
 
-#include "common/geometry/angle.h"
+#include "processes/console/hint.h"
 #include "processes/console/views/health_view.h"
 #include "processes/console/views/structure_view.h"
 
@@ -13,14 +13,11 @@ namespace {
 
 std::string losses_text(const RunResult& result) {
   std::string text;
-  for (const auto& [first, last] : result.lost_samples) {
-    text += first == last ? fmt::format("lost SAMPLE {}\n", first)
-                          : fmt::format("lost SAMPLE {}…{}\n", first, last);
-  }
-  if (result.lost_frames > 0) {
+  for (const auto& [first, last] : result.lost_samples)
+    text += fmt::format("lost SAMPLE {}{}\n", first, first == last ? "" : fmt::format("…{}", last));
+  if (result.lost_frames > 0)
     text += fmt::format("{} of the played {} were not heard: play it slower, or at --speed 0\n",
                         result.lost_frames, result.replay_from);
-  }
   return text;
 }
 
@@ -36,8 +33,8 @@ std::string held_out_text(const RunResult& result) {
   if (result.has_truth && result.health && result.health->worst_position_m >= 0) {
     text += fmt::format(
         "(The line of progress and `status` go by what the camera sees, noise and bias of the "
-        "markers included: worst part {:.1f} mm {:.2f}°.)\n",
-        result.health->worst_position_m * 1e3, result.health->worst_rotation_rad / kDegree);
+        "markers included: worst part {}.)\n",
+        pose_text(result.health->worst_position_m, result.health->worst_rotation_rad, 1));
   }
   return text;
 }
@@ -60,10 +57,10 @@ std::string files_text(const std::filesystem::path& folder) {
 
 }  // namespace
 
-nlohmann::ordered_json run_result_json(const RunResult& result) {
-  nlohmann::ordered_json json = {
+Json run_result_json(const RunResult& result) {
+  Json json = {
       {"rig", result.rig},
-      {"seed", result.seed ? nlohmann::ordered_json(*result.seed) : nullptr},
+      {"seed", or_null(result.seed)},
       {"samples", result.num_samples},
       {"seconds", std::round(result.seconds * 10) / 10},
       {"end_effector", result.end_effector},
@@ -73,21 +70,17 @@ nlohmann::ordered_json run_result_json(const RunResult& result) {
                                     : errors_json(result.num_held_out, result.held_out.parts)},
       {"held_out_since", result.held_out_since},
       {"held_out_against", result.has_truth ? "noise-free simulator" : "observations"},
-      {"visibility", nlohmann::ordered_json::object()}};
+      {"visibility", Json::object()}};
+  for (const auto& [part, share] : result.visibility)
+    json["visibility"][std::to_string(part)] = share;
   if (!result.replay_of.empty()) {
     json["replay_of"] = result.replay_of;
     json["lost_frames"] = result.lost_frames;
   }
   json["lost_samples"] = result.lost_samples;
-  std::vector<std::string> names;
-  for (const Signal& signal : result.schema.signals) names.push_back(signal.name);
-  json["wrong"] = nlohmann::ordered_json::array();
-  if (result.health) {
-    for (const finding_t& finding : result.health->findings)
-      json["wrong"].push_back(finding_json(finding, names));
-  }
-  for (const auto& [part, share] : result.visibility)
-    json["visibility"][std::to_string(part)] = share;
+  json["wrong"] =
+      array_of(result.health.value_or(model_health_t{}).findings,
+               [&](const finding_t& f) { return finding_json(f, signal_names(result.schema)); });
   return json;
 }
 

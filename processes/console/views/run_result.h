@@ -3,7 +3,6 @@
 #include <cstdint>
 #include <filesystem>
 #include <map>
-#include <nlohmann/json.hpp>
 #include <optional>
 #include <string>
 #include <utility>
@@ -12,6 +11,7 @@
 #include "bodyschema/model_health_t.hpp"
 #include "common/schema/body_schema.h"
 #include "processes/console/evaluation.h"
+#include "processes/console/views/json.h"
 #include "processes/structure_learner/learn.h"
 
 namespace bodyschema {
@@ -40,7 +40,7 @@ struct RunResult {
 };
 
 /// result.json.
-nlohmann::ordered_json run_result_json(const RunResult& result);
+Json run_result_json(const RunResult& result);
 
 /// For people, with the files that are in `folder`.
 std::string run_result_text(const RunResult& result, const std::filesystem::path& folder);

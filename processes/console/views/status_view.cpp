@@ -14,36 +14,28 @@
 namespace bodyschema {
 namespace {
 
-using nlohmann::ordered_json;
-
 /// An edge of the schema with its health.
 struct EdgeStatus {
   const schema_edge_t& edge;
-  const edge_health_t* health = nullptr;
-  const char* state;
-  const char* kind;
+  const edge_health_t* health;
   std::vector<std::string> signals;  ///< names, each once, in the order of the chain
+
+  const char* kind() const { return name_in(kEdgeKinds, edge.base_kind); }
+  const char* state() const {
+    return name_in(kEdgeStates, health ? health->edge_state : edge.state);
+  }
 };
 
 std::vector<EdgeStatus> edges_of(const GroupStatus& status) {
   std::vector<EdgeStatus> edges;
   for (const schema_edge_t& edge : status.schema->edges) {
-    EdgeStatus item{
-        edge, nullptr, name_in(kEdgeStates, edge.state), name_in(kEdgeKinds, edge.base_kind), {}};
-    if (status.health) {
-      for (const edge_health_t& health : status.health->edge_health) {
-        if (health.health_from != edge.from_part || health.health_to != edge.to_part) continue;
-        item.health = &health;
-        item.state = name_in(kEdgeStates, health.edge_state);
-        break;
-      }
-    }
+    EdgeStatus& item = edges.emplace_back(
+        EdgeStatus{edge, health_of(status.health, edge.from_part, edge.to_part), {}});
     for (const screw_joint_t& joint : edge.joints) {
       const std::string& name = status.schema->signals.at(joint.signal_index).signal_name;
       if (std::find(item.signals.begin(), item.signals.end(), name) == item.signals.end())
         item.signals.push_back(name);
     }
-    edges.push_back(std::move(item));
   }
   return edges;
 }
@@ -53,11 +45,6 @@ std::vector<std::string> flags_of(const part_health_t& part) {
   if (part.is_unseen == 1) flags.push_back("unseen");
   if (part.is_flipping == 1) flags.push_back("flipping");
   return flags;
-}
-
-/// "3.2 mm 0.41°" of `digits` digits each.
-std::string pose_error(double position_m, double rotation_rad, int digits) {
-  return fmt::format("{:.{}f} mm {:.2f}°", position_m * 1e3, digits, rotation_rad / kDegree);
 }
 
 class StatusText {
@@ -121,19 +108,18 @@ class StatusText {
     line(fmt::format("  {:<18} {:>9} {:>9}  {}", "channel", "rate", "newest",
                      "dropped since the start, by whom it hit most"));
     for (const GroupStatus::ChannelUse& channel : status_.channels) {
-      std::string losses;
-      for (const auto& [loss, count] : channel.dropped)
-        losses += fmt::format("{}{} {}", losses.empty() ? "" : ", ", count, loss);
+      const std::string losses = listed(channel.dropped, [](const auto& dropped) {
+        return fmt::format("{} {}", dropped.second, dropped.first);
+      });
       line(channel.age_s
                ? fmt::format("  {:<18} {:>7.1f}/s {:>7.1f} s  {}", channel.name, channel.rate_hz,
                              *channel.age_s, losses)
                : fmt::format("  {:<18} {:>9} {:>9}  {}", channel.name, "", "none", losses));
     }
     for (const GroupStatus::Process& process : status_.processes) {
-      std::string others;
-      for (const counter_t& counter : process.other_counters)
-        others +=
-            fmt::format("{}{} {}", others.empty() ? "" : ", ", counter.count, counter.counter_name);
+      const std::string others = listed(process.other_counters, [](const counter_t& counter) {
+        return fmt::format("{} {}", counter.count, counter.counter_name);
+      });
       if (!others.empty()) line(fmt::format("  {} counted {}", process.info.process_name, others));
     }
   }
@@ -171,7 +157,7 @@ class StatusText {
     if (status_.sim_state) {
       const std::vector<std::string>& faults = status_.sim_state->faults;
       line(fmt::format("faults   {}   (ground truth of the simulation)",
-                       faults.empty() ? "none" : fmt::format("{}", fmt::join(faults, ", "))));
+                       faults.empty() ? "none" : listed(faults)));
     }
   }
 
@@ -187,7 +173,7 @@ class StatusText {
       line(
           fmt::format("         worst part off by {} (median, as the camera sees it) in {} "
                       "held-out samples",
-                      pose_error(health->worst_position_m, health->worst_rotation_rad, 1),
+                      pose_text(health->worst_position_m, health->worst_rotation_rad, 1),
                       health->num_test_samples));
     }
     for (const moved_tag_t& tag : schema.moved_tags)
@@ -208,10 +194,10 @@ class StatusText {
 
   static std::string edge_row(const EdgeStatus& item) {
     const schema_edge_t& edge = item.edge;
-    std::string row = fmt::format("  {:>3} → {:<3} {:<11}  {:<6} {:<12} {:6.2f} mm {:6.2f}°",
-                                  edge.from_part, edge.to_part, item.state, item.kind,
-                                  fmt::format("{{{}}}", fmt::join(item.signals, ",")),
-                                  edge.position_rms_m * 1e3, edge.rotation_rms_rad / kDegree);
+    std::string row =
+        fmt::format("  {:>3} → {:<3} {:<11}  {:<6} {:<12} {:6.2f} mm {:6.2f}°", edge.from_part,
+                    edge.to_part, item.state(), item.kind(), in_braces(item.signals),
+                    edge.position_rms_m * 1e3, edge.rotation_rms_rad / kDegree);
     if (const edge_health_t* health = item.health) {
       row += fmt::format(" {:>5} {:>9}", health->num_tests,
                          health->median_mahalanobis2 < 0
@@ -228,12 +214,11 @@ class StatusText {
     line("");
     line(fmt::format("  {:<9} {:<11}  {:>5}  {:>18}", "part", "health", "seen", "held-out error"));
     for (const part_health_t& part : status_.health->part_health) {
-      std::string row =
-          fmt::format("  {:<9} {:<11}  {:>3.0f} %  {:>18}", part.health_part,
-                      name_in(kEdgeStates, part.part_state), part.visibility * 100,
-                      part.position_median_m < 0
-                          ? "–"
-                          : pose_error(part.position_median_m, part.rotation_median_rad, 2));
+      std::string row = fmt::format(
+          "  {:<9} {:<11}  {:>3.0f} %  {:>18}", part.health_part,
+          name_in(kEdgeStates, part.part_state), part.visibility * 100,
+          part.position_median_m < 0 ? "–"
+                                     : pose_text(part.position_median_m, part.rotation_median_rad));
       for (const std::string& flag : flags_of(part)) row += "  " + flag;
       line(row);
     }
@@ -262,37 +247,31 @@ class StatusText {
   std::string text_;
 };
 
-/// -1 on the wire says that nothing is known.
-template <class Number>
-ordered_json known(Number value) {
-  return value < 0 ? ordered_json() : ordered_json(value);
-}
-
-ordered_json process_json(const GroupStatus::Process& process) {
+Json process_json(const GroupStatus::Process& process) {
   const process_info_t& info = process.info;
-  ordered_json json = {{"name", info.process_name},
-                       {"host", info.host},
-                       {"pid", info.pid},
-                       {"phase", name_in(kPhases, info.phase)},
-                       {"activity", info.activity},
-                       {"age_s", process.age_s},
-                       {"cpu_percent", process.cpu_percent},
-                       {"resident_bytes", info.resident_bytes},
-                       {"version", info.program_version},
-                       {"counters", ordered_json::object()}};
+  Json json = {{"name", info.process_name},
+               {"host", info.host},
+               {"pid", info.pid},
+               {"phase", name_in(kPhases, info.phase)},
+               {"activity", info.activity},
+               {"age_s", process.age_s},
+               {"cpu_percent", process.cpu_percent},
+               {"resident_bytes", info.resident_bytes},
+               {"version", info.program_version},
+               {"counters", Json::object()}};
   for (const counter_t& counter : info.counters)
     json["counters"][counter.counter_name] = counter.count;
   return json;
 }
 
-ordered_json channel_json(const GroupStatus::ChannelUse& channel) {
+Json channel_json(const GroupStatus::ChannelUse& channel) {
   return {{"count", channel.count},
           {"rate_hz", channel.rate_hz},
-          {"age_s", channel.age_s ? ordered_json(*channel.age_s) : nullptr},
+          {"age_s", or_null(channel.age_s)},
           {"dropped", channel.dropped}};
 }
 
-ordered_json arm_json(const std::optional<motion_status_t>& motion) {
+Json arm_json(const std::optional<motion_status_t>& motion) {
   if (!motion) return nullptr;
   return {{"state", name_in(kMotionStates, motion->state)},
           {"source", motion->source},
@@ -302,7 +281,7 @@ ordered_json arm_json(const std::optional<motion_status_t>& motion) {
           {"stop_latched", motion->stop_latched == 1}};
 }
 
-ordered_json control_json(const std::optional<control_status_t>& control) {
+Json control_json(const std::optional<control_status_t>& control) {
   if (!control) return nullptr;
   return {{"state", name_in(kControlStates, control->control_state)},
           {"owns_arm", control->owns_arm == 1},
@@ -312,39 +291,39 @@ ordered_json control_json(const std::optional<control_status_t>& control) {
           {"observed_error_m", known(control->observed_error_m)}};
 }
 
-ordered_json edge_json(const EdgeStatus& item) {
+Json edge_json(const EdgeStatus& item) {
   const edge_health_t* health = item.health;
   return {{"from", item.edge.from_part},
           {"to", item.edge.to_part},
-          {"kind", item.kind},
+          {"kind", item.kind()},
           {"signals", item.signals},
           {"position_rms_m", item.edge.position_rms_m},
           {"rotation_rms_deg", item.edge.rotation_rms_rad / kDegree},
-          {"state", item.state},
+          {"state", item.state()},
           {"drifting", health && health->edge_is_drifting == 1},
           {"cusum", health ? known(health->edge_cusum) : nullptr},
           {"tests", health ? health->num_tests : 0},
           {"median_mahalanobis2", health ? known(health->median_mahalanobis2) : nullptr}};
 }
 
-ordered_json schema_status_json(const GroupStatus& status) {
+Json schema_status_json(const GroupStatus& status) {
   if (!status.schema) return nullptr;
   const body_schema_t& schema = *status.schema;
-  ordered_json json = {
-      {"accepted", status.is_accepted},          {"version", schema.schema_version},
-      {"complete", schema.is_complete == 1},     {"samples", schema.num_samples_seen},
-      {"last_sample", schema.last_sample_index}, {"parts", schema.part_ids},
-      {"edges", ordered_json::array()},          {"unconnected", ordered_json::array()}};
-  for (const EdgeStatus& edge : edges_of(status)) json["edges"].push_back(edge_json(edge));
-  for (const unconnected_part_t& part : schema.unconnected) {
-    json["unconnected"].push_back({{"part", part.unconnected_part},
-                                   {"reason", name_in(kUnconnectedReasons, part.reason)},
-                                   {"detail", part.detail}});
-  }
-  return json;
+  return {{"accepted", status.is_accepted},
+          {"version", schema.schema_version},
+          {"complete", schema.is_complete == 1},
+          {"samples", schema.num_samples_seen},
+          {"last_sample", schema.last_sample_index},
+          {"parts", schema.part_ids},
+          {"edges", array_of(edges_of(status), edge_json)},
+          {"unconnected", array_of(schema.unconnected, [](const unconnected_part_t& part) -> Json {
+             return {{"part", part.unconnected_part},
+                     {"reason", name_in(kUnconnectedReasons, part.reason)},
+                     {"detail", part.detail}};
+           })}};
 }
 
-ordered_json part_json(const part_health_t& part) {
+Json part_json(const part_health_t& part) {
   const bool is_tested = part.position_median_m >= 0;
   return {{"part", part.health_part},
           {"visibility", part.visibility},
@@ -352,8 +331,7 @@ ordered_json part_json(const part_health_t& part) {
           {"flags", flags_of(part)},
           {"tests", part.num_predicted},
           {"position_median_m", known(part.position_median_m)},
-          {"rotation_median_deg",
-           is_tested ? ordered_json(part.rotation_median_rad / kDegree) : nullptr}};
+          {"rotation_median_deg", is_tested ? Json(part.rotation_median_rad / kDegree) : nullptr}};
 }
 
 }  // namespace
@@ -362,35 +340,34 @@ std::string status_text(const GroupStatus& status, int width) {
   return StatusText(status, width).text();
 }
 
-ordered_json status_json(const GroupStatus& status) {
-  ordered_json json = {{"headline", status.headline},
-                       {"missing", status.missing},
-                       {"twins", status.twins},
-                       {"warnings", status.warnings},
-                       {"processes", ordered_json::array()},
-                       {"channels", ordered_json::object()}};
-  for (const GroupStatus::Process& process : status.processes)
-    json["processes"].push_back(process_json(process));
-  for (const GroupStatus::ChannelUse& channel : status.channels)
-    json["channels"][channel.name] = channel_json(channel);
-  json["arm"] = arm_json(status.motion);
-  json["control"] = control_json(status.control);
-  json["newest_sample"] = status.sample ? ordered_json(status.sample->sample_index) : nullptr;
-  // Ground truth: the simulator alone knows.
-  json["faults"] = status.sim_state ? ordered_json(status.sim_state->faults) : nullptr;
-  json["schema"] = schema_status_json(status);
-  json["parts"] = json["events"] = json["wrong"] = nullptr;
+Json status_json(const GroupStatus& status) {
+  Json channels = Json::object();
+  for (const auto& channel : status.channels) channels[channel.name] = channel_json(channel);
+  Json json = {{"headline", status.headline},
+               {"missing", status.missing},
+               {"twins", status.twins},
+               {"warnings", status.warnings},
+               {"processes", array_of(status.processes, process_json)},
+               {"channels", channels},
+               {"arm", arm_json(status.motion)},
+               {"control", control_json(status.control)},
+               {"newest_sample", status.sample ? Json(status.sample->sample_index) : nullptr},
+               // Ground truth: the simulator alone knows.
+               {"faults", status.sim_state ? Json(status.sim_state->faults) : nullptr},
+               {"schema", schema_status_json(status)},
+               {"wrong", nullptr},
+               {"events", nullptr},
+               {"parts", nullptr}};
   if (!status.health) return json;
-  json["parts"] = json["events"] = json["wrong"] = ordered_json::array();
   std::vector<std::string> signals;
   if (status.is_accepted)
     for (const signal_t& signal : status.schema->signals) signals.push_back(signal.signal_name);
-  for (const part_health_t& part : status.health->part_health)
-    json["parts"].push_back(part_json(part));
-  for (const health_event_t& event : status.health->events)
-    json["events"].push_back(event_json(event, signals));
-  for (const finding_t& finding : status.health->findings)
-    json["wrong"].push_back(finding_json(finding, signals));
+  const auto named = [&](auto to_json) {
+    return [&signals, to_json](const auto& item) { return to_json(item, signals); };
+  };
+  json["parts"] = array_of(status.health->part_health, part_json);
+  json["events"] = array_of(status.health->events, named(event_json));
+  json["wrong"] = array_of(status.health->findings, named(finding_json));
   return json;
 }
 

@@ -1,9 +1,9 @@
 #pragma once
 
-#include <nlohmann/json.hpp>
 #include <string>
 
 #include "processes/console/status_board.h"
+#include "processes/console/views/json.h"
 
 namespace bodyschema {
 
@@ -11,6 +11,6 @@ namespace bodyschema {
 std::string status_text(const GroupStatus& status, int width);
 
 /// `status --json`.
-nlohmann::ordered_json status_json(const GroupStatus& status);
+Json status_json(const GroupStatus& status);
 
 }  // namespace bodyschema

@@ -28,6 +28,11 @@ class PictureTest : public testing::Test {
   }
   ~PictureTest() override { std::filesystem::remove(png_); }
 
+  static cv::Mat drawn(const camera_image_t& image, const marker_poses_t& markers,
+                       const camera_info_t& camera) {
+    const std::string png = draw_detections(image, markers, camera, ".png");
+    return cv::imdecode(std::vector<char>(png.begin(), png.end()), cv::IMREAD_COLOR);
+  }
   /// A marker of 0.4 m straight before the camera at 2 m: 20 px wide.
   static marker_pose_t marker() {
     marker_pose_t marker{};
@@ -49,8 +54,7 @@ class PictureTest : public testing::Test {
 TEST_F(PictureTest, AMarkersOutlineAndItsXAndYAxesStandWhereTheyShould) {
   marker_poses_t markers{};
   set_array(markers.num_markers, markers.markers, {marker()});
-  write_detections(image_, markers, camera_, png_);
-  const cv::Mat picture = cv::imread(png_.string(), cv::IMREAD_COLOR);
+  const cv::Mat picture = drawn(image_, markers, camera_);
   ASSERT_EQ(picture.cols, 200);
   ASSERT_EQ(picture.rows, 100);
   const auto at = [&](int x, int y) { return picture.at<cv::Vec3b>(y, x); };
@@ -77,8 +81,7 @@ TEST_F(PictureTest, EveryEncodingAndLensIsDrawn) {
       camera_info_t camera = camera_;
       camera.distortion_model = model;
       set_array(camera.num_coefficients, camera.distortion, std::vector<double>(count, 0.001));
-      EXPECT_NO_THROW(write_detections(encoded, markers, camera, png_));
-      EXPECT_FALSE(cv::imread(png_.string()).empty());
+      EXPECT_FALSE(drawn(encoded, markers, camera).empty());
     }
   }
 }
@@ -90,13 +93,21 @@ TEST_F(PictureTest, ALensWithoutCoefficientsIsDrawnToo) {
   for (const auto model : {camera_info_t::MODEL_PLUMB_BOB, camera_info_t::MODEL_FISHEYE}) {
     camera_info_t camera = camera_;
     camera.distortion_model = model;
-    EXPECT_NO_THROW(write_detections(image_, markers, camera, png_)) << int(model);
+    EXPECT_FALSE(drawn(image_, markers, camera).empty()) << int(model);
   }
 }
 
 TEST_F(PictureTest, AnImageThatCannotBeDecodedIsAnErrorAndNothingIsWritten) {
   image_.encoding = camera_image_t::ENCODING_JPEG;
-  EXPECT_THROW(write_detections(image_, {}, camera_, png_), std::runtime_error);
+  EXPECT_THROW(draw_detections(image_, {}, camera_, ".png"), std::runtime_error);
+  BestPicture best;
+  best.on_info(camera_);
+  best.on_image(image_);
+  marker_poses_t markers{};
+  markers.utime = image_.utime;
+  set_array(markers.num_markers, markers.markers, {marker()});
+  best.on_markers(markers);
+  EXPECT_THROW(best.write(png_), std::runtime_error);
   EXPECT_FALSE(std::filesystem::exists(png_));
 }
 

@@ -12,7 +12,6 @@
 namespace bodyschema {
 namespace {
 
-using Json = nlohmann::json;
 using Keys = std::vector<std::string>;
 
 Keys keys_of(const nlohmann::ordered_json& object) {
@@ -136,10 +135,10 @@ TEST(SchemaJsonTest, PredictHasExactlyTheDocumentedKeysAndDegrees) {
   EXPECT_EQ(part["position_max_m"], 0.003);
   EXPECT_NEAR(part["rotation_median_deg"].get<double>(), 1, 1e-12);
   EXPECT_NEAR(part["rotation_rms_deg"].get<double>(), 2, 1e-12);
-  EXPECT_NE(errors_text(std::vector{errors})
+  EXPECT_NE(errors_text({.parts = {errors}})
                 .find("   3      7    1.00 mm  1.00°    2.00 mm  2.00°    3.00 mm"),
             std::string::npos)
-      << errors_text(std::vector{errors});
+      << errors_text({.parts = {errors}});
 }
 
 TEST(SchemaJsonTest, WhereNothingWasMeasuredStandsNoNumber) {
@@ -149,7 +148,7 @@ TEST(SchemaJsonTest, WhereNothingWasMeasuredStandsNoNumber) {
   EXPECT_EQ(json["parts"][0]["count"], 0);
   EXPECT_TRUE(json["parts"][0]["position_rms_m"].is_null());
   EXPECT_EQ(json.dump().find("nan"), std::string::npos);
-  EXPECT_NE(errors_text(std::vector{errors}).find("never seen together with the root"),
+  EXPECT_NE(errors_text({.parts = {errors}}).find("never seen together with the root"),
             std::string::npos);
 }
 

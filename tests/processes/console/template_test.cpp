@@ -5,7 +5,6 @@
 namespace bodyschema {
 namespace {
 
-using Json = nlohmann::ordered_json;
 
 TEST(EscapeTest, LeavesNoMarkup) {
   EXPECT_EQ(escape_html("<a href='x'>\"&\x01</a>"),
