@@ -1,5 +1,6 @@
 #include <gtest/gtest.h>
 
+#include <algorithm>
 #include <cctype>
 #include <cstdint>
 #include <filesystem>
@@ -15,6 +16,7 @@
 
 #include "bodyschema/counter_t.hpp"
 #include "bodyschema/message_piece_t.hpp"
+#include "common/bus/cause_names.h"
 #include "common/bus/codec.h"
 #include "tests/lcmtypes/example_messages.h"
 #include "tests/lcmtypes/lcm_definitions.h"
@@ -218,6 +220,19 @@ TEST(GeneratedHeaders, DescribeEveryField) {
       EXPECT_LT(at, end) << name << "." << field.name;
     }
   }
+}
+
+TEST(CauseNames, AreTheConstantsInSmallLetters) {
+  const std::string definition = read_text(kSources / "health_event_t.lcm");
+  const std::regex constant(R"(CAUSE_([A-Z_]+) = (\d+))");
+  std::size_t num_constants = 0;
+  for (std::sregex_iterator i(definition.begin(), definition.end(), constant), end; i != end; ++i) {
+    std::string name = (*i)[1] == "NONE" ? "" : (*i)[1].str();
+    std::ranges::transform(name, name.begin(), [](unsigned char c) { return std::tolower(c); });
+    EXPECT_EQ(kCauseNames.at(std::stoul((*i)[2])), name);
+    ++num_constants;
+  }
+  EXPECT_EQ(num_constants, kCauseNames.size());
 }
 
 TEST(Fingerprints, AreThoseOfTheCheckedInList) {

@@ -10,6 +10,7 @@
 #include <string>
 #include <vector>
 
+#include "common/bus/cause_names.h"
 #include "common/bus/convert.h"
 #include "common/bus/event_log.h"
 #include "common/geometry/angle.h"
@@ -64,7 +65,8 @@ Json event_json(const AdaptationEvent& event, const ActionPoseSample& sample,
     json["from"] = event.from;
     json["to"] = event.to;
   }
-  if (!event.cause.empty()) json["cause"] = event.cause;
+  if (!event.cause.empty())
+    json["cause"] = cause_text(message.event_cause, message.event_other_cause);
   add_size(message.event_size, message.event_since, names_of(signals), &json);
   json["margin"] = event.margin;
   json["samples_used"] = event.num_samples;

@@ -6,6 +6,7 @@
 #include <algorithm>
 #include <cmath>
 
+#include "common/bus/cause_names.h"
 #include "common/geometry/angle.h"
 #include "processes/console/names.h"
 
@@ -49,7 +50,7 @@ ordered_json event_json(const health_event_t& event, const std::vector<std::stri
                        {"to", id(event.event_to)},
                        {"part", id(event.event_part)},
                        {"tag", id(event.event_tag)},
-                       {"cause", event.event_cause}};
+                       {"cause", cause_text(event.event_cause, event.event_other_cause)}};
   add_size(event.event_size, event.event_since, signals, &json);
   json["margin"] = event.event_margin;
   json["samples_used"] = event.samples_used;
@@ -63,7 +64,7 @@ ordered_json finding_json(const finding_t& finding, const std::vector<std::strin
                        {"to", id(finding.finding_to)},
                        {"part", id(finding.finding_part)},
                        {"tag", id(finding.finding_tag)},
-                       {"cause", finding.finding_cause}};
+                       {"cause", cause_text(finding.finding_cause)}};
   add_size(finding.finding_size, finding.finding_since, signals, &json);
   json["found"] = finding.finding_found;
   json["adopted"] =
