@@ -234,6 +234,12 @@ TEST(Check, AcceptsWhatIsNotKnown) {
   EXPECT_EQ(check(health), "");
 }
 
+TEST(Check, IdsAscendInTheirOwnArray) {
+  sample_t sample = example_sample();
+  sample.parts[1].tags[0].tag_id = 0;
+  EXPECT_EQ(check(sample), "");
+}
+
 TEST(Check, AcceptsASingularCovarianceAndOneWithVeryDifferentUnits) {
   sample_t sample = example_sample();
   for (int i = 0, k = 0; i < 6; ++i) {
