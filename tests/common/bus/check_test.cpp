@@ -312,6 +312,7 @@ TEST(Check, RefusesASchemaThatIsNoTreeOfItsOwnPartsAndSignals) {
   refused("edges[0].to_part", [](auto& m) { m.edges[0].to_part = 9, m.edges[0].from_part = 9; });
   refused("edges[0].to_part", [](auto& m) { m.edges[0].to_part = 2, m.edges[0].from_part = 4; });
   refused("edges[1].to_part", [](auto& m) { m.edges[1].to_part = 4; });
+  refused("edges[2].to_part", [](auto& m) { m.edges[2].to_part = 1; });
   refused("edges[1].to_part", [](auto& m) { std::swap(m.edges[0], m.edges[1]); });
   refused("edges[0].joints[1].signal_index",
           [](auto& m) { m.edges[0].joints[1].signal_index = 2; });
