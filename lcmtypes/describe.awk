@@ -1,5 +1,5 @@
-# Writes describe() of every type (field_kinds.h) from the .lcm files. A field's kind stands in braces at the beginning
-# of its comment:
+# Writes describe() of every type (field_kinds.h), and for_each_type(visit), from the .lcm files. The kind of a field
+# stands in braces at the beginning of its comment:
 #   {0..1}  {-1..}                 range of a number, or of the length of a text [bytes]
 #   {KIND_POSITION..KIND_RELEASE}  constants of this type; of another {schema_edge_t.EDGE_OK..EDGE_INVALID}
 #   {measured}                     Measured{} of field_kinds.h; likewise any other word
@@ -18,7 +18,7 @@ BEGIN {
   for (i = 1; i < ARGC; ++i) { name = ARGV[i]; gsub(/.*\/|[.]lcm/, "", name); print "#include \"bodyschema/" name ".hpp\"" }
   print "\nnamespace bodyschema {\n"
 }
-/^struct / { struct = $2; print "void describe(auto& v, Is<" struct "> auto& m) {" }
+/^struct / { struct = $2; types = types "  visit(" struct "{});\n"; print "void describe(auto& v, Is<" struct "> auto& m) {" }
 /^}/ { print "}\n" }
 /^  [a-z]/ && $1 != "const" {
   name = $2; sub(/[[;].*/, "", name)
@@ -27,4 +27,4 @@ BEGIN {
   kind = $1 ~ /^(int|byte|float|double|string)/ ? ", " kind_of($1, text) : ""
   print "  v" (count ? ".array" : "") "(\"" name "\"" count ", m." name kind ");"
 }
-END { print "}  // namespace bodyschema" }
+END { print "void for_each_type(auto visit) {\n" types "}\n\n}  // namespace bodyschema" }

@@ -48,9 +48,10 @@ struct AdaptationEvent {
   std::int64_t sample_index = 0;
   int from = -1;  ///< parts of an edge; −1 for a part alone or the camera
   int to = -1;
-  int part = -1;  ///< of a marker; −1 for an edge
-  int tag = -1;   ///< the one of the part's tags that it is about; −1: all
-  std::string cause;
+  int part = -1;            ///< of a marker; −1 for an edge
+  int tag = -1;             ///< the one of the part's tags that it is about; −1: all
+  std::string cause;        ///< as in common/bus/cause_names.h
+  std::string other_cause;  ///< kProbeWanted: the other explanation, if it has another name
   ChangeSize size;
   std::int64_t since = -1;  ///< first sample that shows it; −1: not told
   bool is_normal = false;   ///< of what was stored: the place is as in the first schema again

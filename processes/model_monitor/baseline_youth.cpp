@@ -21,7 +21,8 @@ double log_odds(std::int64_t num_mismatches, std::int64_t num_confirming) {
 }
 
 bool is_about_a_part_alone(const health_event_t& event) {
-  return event.event_part >= 0 && event.event_tag < 0 && event.event_cause == "marker_missing";
+  return event.event_part >= 0 && event.event_tag < 0 &&
+         event.event_cause == health_event_t::CAUSE_MARKER_MISSING;
 }
 
 /// Each change begins with one.

@@ -141,7 +141,9 @@ std::string text_of(const AdaptationEvent& event, const std::vector<Signal>& sig
                   : subject) +
              ": confirmed by " + counted(event.num_samples, "sample");
     case Kind::kProbeWanted:
-      return place + ": " + event.cause + "? A probe is asked for";
+      return place + ": " + event.cause +
+             (event.other_cause.empty() ? "" : " or " + event.other_cause) +
+             "? A probe is asked for";
   }
   return "";
 }

@@ -229,9 +229,9 @@ void HypothesisTracker::want_probe(std::int64_t now, std::vector<AdaptationEvent
     const Eigen::VectorXd probe = most_telling_action(schema(), rival.body, options_.tolerance);
     if (probe.size() == 0) continue;
     AdaptationEvent wanted = event(Kind::kProbeWanted, now, one.place);
-    const std::string cause = one.fitted.change.cause(settled_),
-                      other_cause = other.fitted.change.cause(settled_);
-    wanted.cause = cause == other_cause ? cause : cause + " or " + other_cause;
+    wanted.cause = one.fitted.change.cause(settled_);
+    wanted.other_cause = other.fitted.change.cause(settled_);
+    if (wanted.other_cause == wanted.cause) wanted.other_cause.clear();
     wanted.margin = lead;
     wanted.probe = probe;
     asked_.emplace_back(one, other);

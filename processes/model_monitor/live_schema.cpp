@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 
+#include "common/bus/cause_names.h"
 #include "common/bus/codec.h"
 #include "common/bus/convert.h"
 #include "processes/model_monitor/health_words.h"
@@ -57,7 +58,7 @@ finding_t to_message(const Finding& finding, const std::vector<Signal>& signals)
   message.finding_to = finding.to;
   message.finding_part = finding.part;
   message.finding_tag = finding.tag;
-  message.finding_cause = finding.cause;
+  message.finding_cause = cause_named(finding.cause);
   message.finding_size = to_message(finding.size);
   message.finding_since = finding.since;
   message.finding_found = finding.found;
@@ -76,7 +77,7 @@ Findings from_message(const std::vector<finding_t>& messages) {
                         .to = message.finding_to,
                         .part = message.finding_part,
                         .tag = message.finding_tag,
-                        .cause = message.finding_cause,
+                        .cause = cause_text(message.finding_cause),
                         .size = {static_cast<ChangeSize::Kind>(size.size_kind), size.size_signal,
                                  size.amount, size.amount_sd},
                         .since = message.finding_since,
@@ -117,7 +118,8 @@ health_event_t to_message(const AdaptationEvent& event, const std::vector<Signal
   message.event_to = event.to;
   message.event_part = event.part;
   message.event_tag = event.tag;
-  message.event_cause = event.cause;
+  message.event_cause = cause_named(event.cause);
+  message.event_other_cause = cause_named(event.other_cause);
   message.event_since = event.since;
   message.event_size = to_message(event.size);
   message.event_margin = std::isfinite(event.margin) ? event.margin : 0;

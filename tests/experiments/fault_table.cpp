@@ -13,6 +13,7 @@
 #include <vector>
 
 #include "bodyschema/fault_command_t.hpp"
+#include "common/bus/cause_names.h"
 #include "common/bus/convert.h"
 #include "common/estimation/quantile.h"
 #include "tests/support/rendered_run.h"
@@ -84,7 +85,7 @@ Life live(const Case& c, const std::filesystem::path& rig, std::int64_t seed, bo
         life.strange.push_back(std::to_string(n) + " " + event.event_text);
       } else if (life.until < 0 && n < kRepaired && is_decision(event)) {
         life.until = n - kBroken + 1;
-        life.is_named = c.causes.count(event.event_cause);
+        life.is_named = c.causes.count(cause_text(event.event_cause));
       }
     }
     if (!run.monitor().schema()) continue;

@@ -140,7 +140,7 @@ int main(int argc, char** argv) {
         num_eventful += !run.events.empty();
         num_events += run.events.size();
         num_missing += std::count_if(run.events.begin(), run.events.end(), [](const auto& event) {
-          return event.event_cause == "marker_missing";
+          return event.event_cause == health_event_t::CAUSE_MARKER_MISSING;
         });
         num_wrong += held == Rightness::kWrong && learned == Rightness::kWrong;
         num_worse += held > learned;

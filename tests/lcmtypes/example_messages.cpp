@@ -359,7 +359,7 @@ model_health_t example_model_health() {
   finding.finding_from = 2;
   finding.finding_to = 4;
   finding.finding_part = finding.finding_tag = -1;
-  finding.finding_cause = "geometry";
+  finding.finding_cause = health_event_t::CAUSE_GEOMETRY;
   finding.finding_size.size_kind = change_size_t::SIZE_POSE;
   finding.finding_size.size_signal = -1;
   finding.finding_size.num_amounts = 2;
@@ -379,7 +379,8 @@ model_health_t example_model_health() {
   event.event_from = 2;
   event.event_to = 4;
   event.event_part = event.event_tag = -1;
-  event.event_cause = "joint_stuck";
+  event.event_cause = health_event_t::CAUSE_JOINT_STUCK;
+  event.event_other_cause = health_event_t::CAUSE_GEOMETRY;
   event.event_since = 49;
   event.event_size.size_kind = change_size_t::SIZE_COMMAND;
   event.event_size.size_signal = 1;

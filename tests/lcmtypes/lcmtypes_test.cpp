@@ -1,9 +1,11 @@
 #include <gtest/gtest.h>
 
+#include <algorithm>
 #include <cctype>
 #include <cstdint>
 #include <filesystem>
 #include <fstream>
+#include <iomanip>
 #include <iterator>
 #include <map>
 #include <regex>
@@ -13,8 +15,8 @@
 #include <type_traits>
 #include <vector>
 
-#include "bodyschema/counter_t.hpp"
-#include "bodyschema/message_piece_t.hpp"
+#include "bodyschema/message_fields.h"
+#include "common/bus/cause_names.h"
 #include "common/bus/codec.h"
 #include "tests/lcmtypes/example_messages.h"
 #include "tests/lcmtypes/lcm_definitions.h"
@@ -31,49 +33,16 @@ std::string read_text(const std::filesystem::path& file) {
   return {std::istreambuf_iterator<char>(stream), {}};
 }
 
-template <class Message>
-std::string hash_of() {
-  std::ostringstream text;
-  text << std::hex << static_cast<std::uint64_t>(Message::getHash());
-  return std::string(16 - text.str().size(), '0') + text.str();
-}
-
 /// By type, the parts of messages included.
 std::map<std::string, std::string> fingerprints() {
-  return {{"action_command_t", hash_of<action_command_t>()},
-          {"body_change_t", hash_of<body_change_t>()},
-          {"body_schema_t", hash_of<body_schema_t>()},
-          {"camera_image_t", hash_of<camera_image_t>()},
-          {"camera_info_t", hash_of<camera_info_t>()},
-          {"change_size_t", hash_of<change_size_t>()},
-          {"control_status_t", hash_of<control_status_t>()},
-          {"counter_t", hash_of<counter_t>()},
-          {"edge_health_t", hash_of<edge_health_t>()},
-          {"fault_command_t", hash_of<fault_command_t>()},
-          {"finding_t", hash_of<finding_t>()},
-          {"health_event_t", hash_of<health_event_t>()},
-          {"marker_pose_t", hash_of<marker_pose_t>()},
-          {"marker_poses_t", hash_of<marker_poses_t>()},
-          {"matrix_gp_t", hash_of<matrix_gp_t>()},
-          {"message_piece_t", hash_of<message_piece_t>()},
-          {"model_health_t", hash_of<model_health_t>()},
-          {"motion_status_t", hash_of<motion_status_t>()},
-          {"moved_tag_t", hash_of<moved_tag_t>()},
-          {"part_frame_t", hash_of<part_frame_t>()},
-          {"part_health_t", hash_of<part_health_t>()},
-          {"part_observation_t", hash_of<part_observation_t>()},
-          {"pose_t", hash_of<pose_t>()},
-          {"pose_target_t", hash_of<pose_target_t>()},
-          {"process_info_t", hash_of<process_info_t>()},
-          {"residual_gp_t", hash_of<residual_gp_t>()},
-          {"sample_request_t", hash_of<sample_request_t>()},
-          {"sample_t", hash_of<sample_t>()},
-          {"schema_edge_t", hash_of<schema_edge_t>()},
-          {"screw_joint_t", hash_of<screw_joint_t>()},
-          {"signal_t", hash_of<signal_t>()},
-          {"sim_state_t", hash_of<sim_state_t>()},
-          {"tag_corners_t", hash_of<tag_corners_t>()},
-          {"unconnected_part_t", hash_of<unconnected_part_t>()}};
+  std::map<std::string, std::string> hashes;
+  for_each_type([&](const auto& message) {
+    std::ostringstream hash;
+    hash << std::hex << std::setfill('0') << std::setw(16)
+         << static_cast<std::uint64_t>(message.getHash());
+    hashes[message.getTypeName()] = hash.str();
+  });
+  return hashes;
 }
 
 TEST(LcmTypes, EveryMessageSurvivesARoundTripByteForByte) {
@@ -218,6 +187,19 @@ TEST(GeneratedHeaders, DescribeEveryField) {
       EXPECT_LT(at, end) << name << "." << field.name;
     }
   }
+}
+
+TEST(CauseNames, AreTheConstantsInSmallLetters) {
+  const std::string definition = read_text(kSources / "health_event_t.lcm");
+  const std::regex constant(R"(CAUSE_([A-Z_]+) = (\d+))");
+  std::size_t num_constants = 0;
+  for (std::sregex_iterator i(definition.begin(), definition.end(), constant), end; i != end; ++i) {
+    std::string name = (*i)[1] == "NONE" ? "" : (*i)[1].str();
+    std::ranges::transform(name, name.begin(), [](unsigned char c) { return std::tolower(c); });
+    EXPECT_EQ(kCauseNames.at(std::stoul((*i)[2])), name);
+    ++num_constants;
+  }
+  EXPECT_EQ(num_constants, kCauseNames.size());
 }
 
 TEST(Fingerprints, AreThoseOfTheCheckedInList) {

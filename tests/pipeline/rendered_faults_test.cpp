@@ -12,6 +12,7 @@
 #include <vector>
 
 #include "bodyschema/fault_command_t.hpp"
+#include "common/bus/cause_names.h"
 #include "common/bus/check.h"
 #include "common/bus/convert.h"
 #include "tests/support/rendered_run.h"
@@ -124,7 +125,7 @@ TEST_P(AdaptationTest, IsFoundNamedAndMendedAndSoIsTheRepair) {
   ASSERT_TRUE(found) << told();
   EXPECT_LT(found->event_sample, kBrokenAt + soon) << told();
   EXPECT_EQ(found->event_from >= 0 ? found->event_to : found->event_part, c.part) << told();
-  EXPECT_TRUE(c.causes.count(found->event_cause)) << told();
+  EXPECT_TRUE(c.causes.count(cause_text(found->event_cause))) << told();
 
   run_.break_body(fault_command_t::FAULT_REPAIR);
   moved_marker_ = -1;
@@ -165,7 +166,7 @@ TEST_F(OneTag, ThatMovedIsNamedAndLeftOutUntilItIsBack) {
   ASSERT_EQ(of_tag.size(), 2U) << told();
   EXPECT_EQ(of_tag[0]->event_kind, health_event_t::EVENT_CANDIDATE);
   EXPECT_EQ(of_tag[0]->event_part, 8);
-  EXPECT_EQ(of_tag[0]->event_cause, "marker_moved");
+  EXPECT_EQ(of_tag[0]->event_cause, health_event_t::CAUSE_MARKER_MOVED);
   EXPECT_LT(of_tag[0]->event_sample, kBrokenAt + 30) << told();
   EXPECT_EQ(of_tag[1]->event_kind, health_event_t::EVENT_RESTORED);
   EXPECT_GE(of_tag[1]->event_sample, kRepaired);

@@ -4,6 +4,7 @@
 
 #include <algorithm>
 
+#include "common/bus/cause_names.h"
 #include "common/geometry/angle.h"
 #include "processes/console/hint.h"
 #include "processes/console/names.h"
@@ -48,7 +49,8 @@ Json event_json(const health_event_t& event, const std::vector<std::string>& sig
                            {"sample", event.event_sample},
                            {"event", name_in(kHealthEvents, event.event_kind)}},
                           event.event_from, event.event_to, event.event_part, event.event_tag,
-                          event.event_cause, event.event_size, event.event_since, signals);
+                          cause_text(event.event_cause, event.event_other_cause), event.event_size,
+                          event.event_since, signals);
   json["margin"] = event.event_margin;
   json["samples_used"] = event.samples_used;
   json["text"] = event.event_text;
@@ -56,10 +58,10 @@ Json event_json(const health_event_t& event, const std::vector<std::string>& sig
 }
 
 Json finding_json(const finding_t& finding, const std::vector<std::string>& signals) {
-  Json json =
-      change_json({{"state", name_in(kFindingStates, finding.finding_state)}}, finding.finding_from,
-                  finding.finding_to, finding.finding_part, finding.finding_tag,
-                  finding.finding_cause, finding.finding_size, finding.finding_since, signals);
+  Json json = change_json({{"state", name_in(kFindingStates, finding.finding_state)}},
+                          finding.finding_from, finding.finding_to, finding.finding_part,
+                          finding.finding_tag, cause_text(finding.finding_cause),
+                          finding.finding_size, finding.finding_since, signals);
   json["found"] = finding.finding_found;
   json["adopted"] = known(finding.finding_adopted);
   json["confirming"] = finding.num_confirming;

@@ -234,6 +234,12 @@ TEST(Check, AcceptsWhatIsNotKnown) {
   EXPECT_EQ(check(health), "");
 }
 
+TEST(Check, IdsAscendInTheirOwnArray) {
+  sample_t sample = example_sample();
+  sample.parts[1].tags[0].tag_id = 0;
+  EXPECT_EQ(check(sample), "");
+}
+
 TEST(Check, AcceptsASingularCovarianceAndOneWithVeryDifferentUnits) {
   sample_t sample = example_sample();
   for (int i = 0, k = 0; i < 6; ++i) {
@@ -304,7 +310,9 @@ TEST(Check, RefusesASchemaThatIsNoTreeOfItsOwnPartsAndSignals) {
   refused("edges[0].to_part", [](auto& m) { m.edges[0].to_part = 7; });
   refused("edges[0].from_part", [](auto& m) { m.edges[0].from_part = 7; });
   refused("edges[0].to_part", [](auto& m) { m.edges[0].to_part = 9, m.edges[0].from_part = 9; });
-  refused("edges[1].to_part", [](auto& m) { m.edges[1].to_part = 2; });
+  refused("edges[0].to_part", [](auto& m) { m.edges[0].to_part = 2, m.edges[0].from_part = 4; });
+  refused("edges[1].to_part", [](auto& m) { m.edges[1].to_part = 4; });
+  refused("edges[2].to_part", [](auto& m) { m.edges[2].to_part = 1; });
   refused("edges[1].to_part", [](auto& m) { std::swap(m.edges[0], m.edges[1]); });
   refused("edges[0].joints[1].signal_index",
           [](auto& m) { m.edges[0].joints[1].signal_index = 2; });

@@ -279,7 +279,7 @@ model_health_t wrong_in_two_places() {
   stuck.finding_from = 1;
   stuck.finding_to = 2;
   stuck.finding_part = stuck.finding_tag = -1;
-  stuck.finding_cause = "joint_stuck";
+  stuck.finding_cause = health_event_t::CAUSE_JOINT_STUCK;
   stuck.finding_size.size_kind = change_size_t::SIZE_COMMAND;
   stuck.finding_size.size_signal = 1;
   set_array(stuck.finding_size.num_amounts, stuck.finding_size.amount, {-0.25});

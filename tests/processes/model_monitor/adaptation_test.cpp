@@ -341,9 +341,8 @@ TEST(AdaptationTest, AProbeIsWantedOncePerAmbiguity) {
       if (e.kind != Kind::kProbeWanted) continue;
       EXPECT_GE(e.margin, 0) << text(e);
       EXPECT_LE(e.margin, adaptation.options().ambiguity) << text(e);
-      const std::size_t middle = e.cause.find(" or ");
-      const std::string one = e.cause.substr(0, middle);
-      const std::string other = middle == std::string::npos ? one : e.cause.substr(middle + 4);
+      const std::string& one = e.cause;
+      const std::string& other = e.other_cause.empty() ? one : e.other_cause;
       // "geometry" is several forms, and each of two may be a small one.
       if (one != "geometry" && other != "geometry")
         ++asked[{part_of(e), std::min(one, other) + "," + std::max(one, other)}];

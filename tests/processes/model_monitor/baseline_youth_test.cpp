@@ -89,7 +89,7 @@ TEST(BaselineYouthTest, AMarkerThatIsGoneIsToldAtOnceAndSpeaksAgainstNothing) {
   auto missing = event(health_event_t::EVENT_MISSING, 3);
   missing.event_from = missing.event_to = -1;
   missing.event_part = 4;
-  missing.event_cause = "marker_missing";
+  missing.event_cause = health_event_t::CAUSE_MARKER_MISSING;
   EXPECT_EQ(youth.on_sample({missing}, true).size(), 1U);
   EXPECT_FALSE(youth.has_story());
   // One of several tags of a part is looked for by the schema.

@@ -400,7 +400,7 @@ TEST_F(ModelMonitorTest, BeginsWithASchemaOfBeforeAndIsHeardOfItAtOnce) {
   const auto& events = monitor.health().events;
   EXPECT_TRUE(std::any_of(events.begin(), events.end(), [&](const health_event_t& e) {
     return e.event_kind == health_event_t::EVENT_CANDIDATE && e.event_to == broken.to &&
-           e.event_cause == "joint_stuck";
+           e.event_cause == health_event_t::CAUSE_JOINT_STUCK;
   }));
 }
 
@@ -617,7 +617,8 @@ TEST_F(ModelMonitorTest, AChangeInTheYouthIsHeldBackThenToldWheneverItIsKilledOr
   std::map<std::int64_t, body_schema_t> proposals;
   for (std::int64_t i = 9; i < kNumSamples; i += 5) proposals[i] = proposal(i);
   const auto is_about = [](const health_event_t& e) {
-    return e.event_kind == health_event_t::EVENT_CANDIDATE && e.event_cause == "joint_stuck";
+    return e.event_kind == health_event_t::EVENT_CANDIDATE &&
+           e.event_cause == health_event_t::CAUSE_JOINT_STUCK;
   };
   ModelMonitor undisturbed(test_config());
   std::vector<MonitorMemory> memories;
@@ -714,15 +715,16 @@ TEST_F(ModelMonitorTest, AStuckJointIsFoundPublishedAtOnceAndWhatTheLearnerSaysL
   EXPECT_GE(found, 30);
   EXPECT_LE(found, 35);
   // The last decision on it names the joint.
-  std::string cause;
+  std::int8_t cause = health_event_t::CAUSE_NONE;
   for (const auto& event : monitor.health().events) {
     if (event.event_from < 0) continue;
     EXPECT_EQ(event.event_from, broken.from);
     EXPECT_EQ(event.event_to, broken.to);
-    if (event.event_kind != health_event_t::EVENT_PROBE_WANTED && !event.event_cause.empty())
+    if (event.event_kind != health_event_t::EVENT_PROBE_WANTED &&
+        event.event_cause != health_event_t::CAUSE_NONE)
       cause = event.event_cause;
   }
-  EXPECT_EQ(cause, "joint_stuck");
+  EXPECT_EQ(cause, health_event_t::CAUSE_JOINT_STUCK);
   for (const auto& edge : monitor.schema()->edges) {
     const bool is_broken = edge.to_part == broken.to;
     EXPECT_EQ(edge.state == schema_edge_t::EDGE_PROVISIONAL, is_broken);
@@ -769,7 +771,7 @@ TEST_F(ModelMonitorTest, WhatIsWrongOutlivesItsEventsANewBaseAndARestart) {
     EXPECT_EQ(finding.finding_state, finding_t::FINDING_CONFIRMED);
     EXPECT_EQ(finding.finding_from, broken.from);
     EXPECT_EQ(finding.finding_to, broken.to);
-    EXPECT_EQ(finding.finding_cause, "joint_stuck");
+    EXPECT_EQ(finding.finding_cause, health_event_t::CAUSE_JOINT_STUCK);
     EXPECT_EQ(finding.finding_size.size_signal, broken.joints.front().signal);
     ASSERT_EQ(finding.finding_size.num_amounts, 1);
     EXPECT_NEAR(finding.finding_size.amount[0], 0.4, 0.02);
