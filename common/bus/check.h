@@ -29,8 +29,4 @@ std::string check(const control_status_t& message);
 std::string check(const fault_command_t& message);
 std::string check(const process_info_t& message);
 
-/// `text` with every byte that is no UTF-8, or zero, replaced by '?'. For texts from outside:
-/// files, host names, a camera's error messages.
-std::string as_text(std::string text);
-
 }  // namespace bodyschema

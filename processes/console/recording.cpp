@@ -23,6 +23,7 @@
 #include "common/config/rig.h"
 #include "common/geometry/angle.h"
 #include "common/schema/retained_samples.h"
+#include "common/text/text.h"
 #include "processes/console/hint.h"
 #include "processes/structure_learner/learn.h"
 

@@ -14,6 +14,7 @@
 
 #include "common/bus/convert.h"
 #include "common/bus/triangle.h"
+#include "common/text/text.h"
 #include "tests/lcmtypes/example_messages.h"
 
 namespace bodyschema::test {
