@@ -9,19 +9,19 @@
 #include <utility>
 #include <vector>
 
+#include "common/estimation/evaluation.h"
 #include "common/geometry/angle.h"
 #include "common/plot/plot.h"
 #include "common/schema/standard_deviations.h"
-#include "processes/console/evaluation.h"
 #include "processes/console/hint.h"
 #include "processes/console/names.h"
-#include "processes/console/recording.h"
 #include "processes/console/report/report_figures.h"
 #include "processes/console/report/run_sections.h"
 #include "processes/console/report/template.h"
 #include "processes/console/views/health_view.h"
 #include "processes/console/views/structure_view.h"
 #include "processes/structure_learner/learn.h"
+#include "processes/structure_learner/recording/recording.h"
 
 namespace bodyschema {
 namespace {

@@ -5,10 +5,10 @@
 #include <limits>
 #include <utility>
 
+#include "common/estimation/evaluation.h"
 #include "common/estimation/measurement_model.h"
 #include "common/geometry/angle.h"
 #include "common/geometry/pose.h"
-#include "processes/console/evaluation.h"
 #include "processes/console/hint.h"
 #include "processes/console/report/report_figures.h"
 

@@ -1,4 +1,4 @@
-#include "processes/console/recording.h"
+#include "processes/structure_learner/recording/recording.h"
 
 #include <fmt/format.h>
 #include <sys/mman.h>
@@ -24,7 +24,6 @@
 #include "common/geometry/angle.h"
 #include "common/schema/retained_samples.h"
 #include "common/text/text.h"
-#include "processes/console/hint.h"
 #include "processes/structure_learner/learn.h"
 
 namespace bodyschema {
