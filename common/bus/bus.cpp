@@ -18,6 +18,7 @@
 
 #include "common/bus/bus_url.h"
 #include "common/bus/event_log.h"
+#include "common/text/clock.h"
 
 namespace bodyschema {
 namespace {
@@ -360,10 +361,8 @@ void Bus::publish_raw(const std::string& channel, std::span<const std::uint8_t> 
   }
   const std::scoped_lock lock(impl_->mutex);
   if (impl_->output_log != nullptr) {
-    const auto now = std::chrono::duration_cast<std::chrono::microseconds>(
-        std::chrono::system_clock::now().time_since_epoch());
     impl_->output_log->append_bytes(channel, bytes,
-                                    is_replay() ? impl_->log_event_utime : now.count());
+                                    is_replay() ? impl_->log_event_utime : wall_clock_us());
   } else if (impl_->output != nullptr) {
     const int error = may_be_split && bytes.size() > kLargestDatagram
                           ? impl_->send_pieces(channel, bytes)

@@ -15,6 +15,7 @@
 
 #include "bodyschema/message_fields.h"
 #include "common/bus/triangle.h"
+#include "common/text/text.h"
 
 namespace bodyschema {
 namespace {
@@ -22,40 +23,6 @@ namespace {
 constexpr double kUnitTolerance = 1e-3;
 /// parameter_covariance is float.
 constexpr double kCorrelationTolerance = 1e-3;
-
-/// Length of the UTF-8 character (RFC 3629) that begins at `i`; 0 if none does. A zero byte is
-/// none, because the wire ends strings with it. JSON refuses text that is not UTF-8.
-std::size_t character_size(std::string_view text, std::size_t i) {
-  const auto byte = [&](std::size_t k) {
-    return k < text.size() ? static_cast<unsigned char>(text[k]) : 0U;
-  };
-  const unsigned lead = byte(i);
-  if (lead == 0) return 0;
-  if (lead < 0x80) return 1;
-  const std::size_t size = lead >= 0xC2 && lead <= 0xDF   ? 2
-                           : lead >= 0xE0 && lead <= 0xEF ? 3
-                           : lead >= 0xF0 && lead <= 0xF4 ? 4
-                                                          : 0;
-  const unsigned second = byte(i + 1);
-  // Overlong forms, surrogates, beyond U+10FFFF.
-  if ((lead == 0xE0 && second < 0xA0) || (lead == 0xED && second > 0x9F) ||
-      (lead == 0xF0 && second < 0x90) || (lead == 0xF4 && second > 0x8F)) {
-    return 0;
-  }
-  for (std::size_t k = 1; k < size; ++k) {
-    if ((byte(i + k) & 0xC0U) != 0x80U) return 0;
-  }
-  return size;
-}
-
-bool is_text(std::string_view text) {
-  for (std::size_t i = 0; i < text.size();) {
-    const std::size_t size = character_size(text, i);
-    if (size == 0) return false;
-    i += size;
-  }
-  return true;
-}
 
 // Problem of a value of that kind; "" if there is none.
 
@@ -457,14 +424,5 @@ template std::string check(const pose_target_t&);
 template std::string check(const control_status_t&);
 template std::string check(const fault_command_t&);
 template std::string check(const process_info_t&);
-
-std::string as_text(std::string text) {
-  for (std::size_t i = 0; i < text.size();) {
-    const std::size_t size = character_size(text, i);
-    if (size == 0) text[i] = '?';
-    i += std::max<std::size_t>(size, 1);
-  }
-  return text;
-}
 
 }  // namespace bodyschema

@@ -17,8 +17,4 @@ namespace bodyschema {
 template <class Message>
 std::string check(const Message& message);
 
-/// `text` with every byte that is no UTF-8, or zero, replaced by '?'. For texts from outside:
-/// files, host names, a camera's error messages.
-std::string as_text(std::string text);
-
 }  // namespace bodyschema

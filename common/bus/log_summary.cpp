@@ -8,6 +8,7 @@
 
 #include "common/bus/all_channels.h"
 #include "common/bus/check.h"
+#include "common/text/text.h"
 
 namespace bodyschema {
 namespace {

@@ -26,6 +26,8 @@
 
 #include "common/bus/check.h"
 #include "common/bus/convert.h"
+#include "common/text/clock.h"
+#include "common/text/text.h"
 
 namespace bodyschema {
 namespace {
@@ -63,12 +65,6 @@ void install_signal_handlers() {
   ::sigaction(SIGINT, &action, nullptr);
   // A relay that went away is reported by publish(), not by a signal.
   ::signal(SIGPIPE, SIG_IGN);
-}
-
-std::int64_t now_us() {
-  return std::chrono::duration_cast<std::chrono::microseconds>(
-             std::chrono::system_clock::now().time_since_epoch())
-      .count();
 }
 
 /// Processor time since the start, user and system [us].
@@ -123,7 +119,8 @@ struct Process::Impl {
     info.process_name = std::move(process_name);
     info.host = as_text(host_name());
     info.pid = static_cast<std::int32_t>(::getpid());
-    info.start_utime = bus.is_replay() ? std::max<std::int64_t>(0, bus.event_utime()) : now_us();
+    info.start_utime = bus.is_replay() ? std::max<std::int64_t>(0, bus.event_utime())
+                                       : bodyschema::wall_clock_us();
     info.program_version = BODYSCHEMA_VERSION;
     info.seed = -1;
     info.configuration = as_text(read_text(config_file));
@@ -174,7 +171,8 @@ struct Process::Impl {
       return std::tuple(process.start_utime, process.host, process.pid);
     };
     if (other.process_name != info.process_name || identity(other) == identity(info) ||
-        other.phase == process_info_t::PHASE_ENDED || !is_live(other, now_us())) {
+        other.phase == process_info_t::PHASE_ENDED ||
+        !is_live(other, bodyschema::wall_clock_us())) {
       return;
     }
     // A starting process gives way to a running one, whatever the clock was when either began.
@@ -210,7 +208,8 @@ struct Process::Impl {
   }
 
   void publish_info() {
-    info.utime = bus.is_replay() ? std::max<std::int64_t>(0, bus.last_utime()) : now_us();
+    info.utime =
+        bus.is_replay() ? std::max<std::int64_t>(0, bus.last_utime()) : bodyschema::wall_clock_us();
     if (!bus.is_replay()) {
       std::erase_if(notices, [now = SteadyClock::now()](const auto& item) {
         return now - item.second.repeated > kNoticeAge;
@@ -277,7 +276,9 @@ std::filesystem::path Process::rig_folder() const {
 
 std::int64_t Process::epoch() const { return impl_->info.start_utime; }
 
-std::int64_t Process::wall_clock_us() const { return impl_->bus.is_replay() ? -1 : now_us(); }
+std::int64_t Process::wall_clock_us() const {
+  return impl_->bus.is_replay() ? -1 : bodyschema::wall_clock_us();
+}
 
 void Process::set_activity(std::int8_t phase, std::string activity) {
   activity = as_text(std::move(activity));

@@ -9,6 +9,7 @@
 #include <sstream>
 
 #include "common/config/yaml.h"
+#include "common/text/text.h"
 
 namespace bodyschema {
 namespace {
@@ -74,12 +75,9 @@ class CalibrationFile {
     } catch (const YAML::Exception&) {
       fail(key, "expected {rows: …, cols: …, data: [numbers]}");
     }
-    if (std::find(sizes.begin(), sizes.end(), data.size()) == sizes.end()) {
-      std::string expected;
-      for (const std::size_t n : sizes)
-        expected += (expected.empty() ? "" : ", ") + std::to_string(n);
-      fail(key, "has " + std::to_string(data.size()) + " elements, expected " + expected);
-    }
+    if (std::find(sizes.begin(), sizes.end(), data.size()) == sizes.end())
+      fail(key, "has " + std::to_string(data.size()) + " elements, expected " +
+                    listed(sizes, [](std::size_t size) { return std::to_string(size); }));
     for (const double value : data) {
       if (!std::isfinite(value)) fail(key, "expected finite numbers");
     }

@@ -6,6 +6,7 @@
 
 #include "common/config/yaml.h"
 #include "common/geometry/angle.h"
+#include "common/text/text.h"
 
 namespace bodyschema {
 
@@ -114,9 +115,8 @@ std::map<std::string, std::vector<std::string>> load_hosts(const Yaml& yaml,
         throw section.error(host, "'" + process + "' runs on '" + other->second + "' already");
       }
       if (!group.empty() && std::find(group.begin(), group.end(), process) == group.end()) {
-        std::string all;
-        for (const std::string& name : group) all += (all.empty() ? "" : ", ") + name;
-        throw section.error(host, "'" + process + "' is no process of this rig; there are: " + all);
+        throw section.error(
+            host, "'" + process + "' is no process of this rig; there are: " + listed(group));
       }
     }
   }
@@ -142,8 +142,7 @@ std::string Network::images_url() const { return url(port + 1, hosts.empty() ? t
 std::vector<std::string> Network::share_of(const std::string& host) const {
   const auto share = hosts.find(host);
   if (share != hosts.end()) return share->second;
-  std::string all;
-  for (const auto& [name, processes] : hosts) all += (all.empty() ? "" : ", ") + name;
+  const std::string all = listed(hosts, [](const auto& known) { return known.first; });
   throw std::invalid_argument("--host: network.yaml has no host '" + host + "'; " +
                               (all.empty() ? "all runs on one machine" : "there are: " + all));
 }

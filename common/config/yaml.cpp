@@ -11,6 +11,7 @@
 #include <sstream>
 
 #include "common/geometry/angle.h"
+#include "common/text/text.h"
 
 namespace bodyschema {
 namespace {
@@ -216,9 +217,7 @@ std::string Yaml::text(const std::string& key) const {
 std::string Yaml::choice(const std::string& key, const std::vector<std::string>& choices) const {
   const std::string value = text(key);
   if (std::find(choices.begin(), choices.end(), value) != choices.end()) return value;
-  std::string all;
-  for (const auto& choice : choices) all += (all.empty() ? "" : ", ") + choice;
-  throw error(key, "'" + value + "' is none of: " + all);
+  throw error(key, "'" + value + "' is none of: " + listed(choices));
 }
 
 std::vector<double> Yaml::numbers(const std::string& key, int count, double lowest,

@@ -7,6 +7,7 @@
 #include <sstream>
 
 #include "common/geometry/angle.h"
+#include "common/text/text.h"
 
 namespace bodyschema {
 namespace {
@@ -16,13 +17,6 @@ using Command = fault_command_t;
 /// Radius at which a fallen marker lies, clear of the base [m].
 constexpr double kFallenRadius_m = 0.3;
 constexpr double kPlateThickness_m = 0.006;
-
-template <class Range, class Name>
-std::string listed(const Range& range, const Name& name) {
-  std::string text;
-  for (const auto& element : range) text += (text.empty() ? "" : ", ") + name(element);
-  return text;
-}
 
 std::string name_of(const std::string& text) { return text.empty() ? "''" : text; }
 

@@ -14,20 +14,13 @@
 #include <stdexcept>
 #include <vector>
 
+#include "common/text/clock.h"
+#include "common/text/text.h"
+
 namespace bodyschema {
 namespace {
 
 constexpr int kStreamTimeout_ms = 5'000;
-
-std::int64_t clock_us() {
-  const auto now = std::chrono::system_clock::now().time_since_epoch();
-  return std::chrono::duration_cast<std::chrono::microseconds>(now).count();
-}
-
-std::int64_t steady_us() {
-  const auto now = std::chrono::steady_clock::now().time_since_epoch();
-  return std::chrono::duration_cast<std::chrono::microseconds>(now).count();
-}
 
 bool is_number(const std::string& text) {
   return !text.empty() && text.find_first_not_of("0123456789") == std::string::npos;
@@ -45,10 +38,8 @@ std::string devices_there_are() {
     if (name.starts_with("video")) names.push_back(entry.path());
   }
   std::sort(names.begin(), names.end());
-  std::string text;
-  for (const std::string& name : names) text += (text.empty() ? "" : ", ") + name;
-  return text.empty() ? "there is no /dev/video* at all: is the camera plugged in?"
-                      : "there are: " + text;
+  return names.empty() ? "there is no /dev/video* at all: is the camera plugged in?"
+                       : "there are: " + listed(names);
 }
 
 bool has_backend(cv::VideoCaptureAPIs backend) {
@@ -189,27 +180,27 @@ void Capture::run(const std::stop_token& stop) {
   const auto period_us = static_cast<std::int64_t>(1e6 / config_.max_rate_hz);
   constexpr std::int64_t kFirstRetry_us = 500'000, kLongestRetry_us = 10'000'000;
   std::int64_t retry_us = kFirstRetry_us;
-  std::int64_t due_us = steady_us();
+  std::int64_t due_us = clock_us();
   cv::Mat frame;
   while (!stop.stop_requested()) {
     bool has_frame = false;
     std::int64_t utime = 0;
     try {
       has_frame = source_->video.grab();
-      utime = clock_us();
+      utime = wall_clock_us();
       // A live frame that comes too early is grabbed, so that the next is fresh, but not decoded.
       // Half a period of tolerance: a 30 Hz camera must pass a limit of 30 Hz.
-      if (has_frame && !is_recording && steady_us() < due_us - period_us / 2) continue;
+      if (has_frame && !is_recording && clock_us() < due_us - period_us / 2) continue;
       has_frame = has_frame && source_->video.retrieve(frame) && !frame.empty();
     } catch (const cv::Exception&) {
       has_frame = false;
     }
     if (has_frame) {
       if (is_recording) {
-        if (!sleep(stop, std::max<std::int64_t>(0, due_us - steady_us()))) return;
-        utime = clock_us();
+        if (!sleep(stop, std::max<std::int64_t>(0, due_us - clock_us()))) return;
+        utime = wall_clock_us();
       }
-      due_us = std::max(due_us + period_us, steady_us());
+      due_us = std::max(due_us + period_us, clock_us());
       retry_us = kFirstRetry_us;
       try {
         on_frame_(frame, utime);

@@ -13,6 +13,7 @@
 #include <vector>
 
 #include "common/config/yaml.h"
+#include "common/estimation/measurement_model.h"
 #include "common/geometry/angle.h"
 
 namespace bodyschema {
@@ -69,10 +70,8 @@ class Walk {
     schema_.root = static_cast<int>(yaml.integer("root"));
     if (!parts.count(schema_.root)) throw yaml.error("root", "expected one of the parts");
     const Yaml uncertainty = yaml.section("uncertainty");
-    const double position = uncertainty.number("position_m", 0, 1);
-    const double rotation = uncertainty.number("rotation_deg", 0, 180) * kDegree;
-    variances_ << Eigen::Vector3d::Constant(position * position),
-        Eigen::Vector3d::Constant(rotation * rotation);
+    uncertainty_.position_m = uncertainty.number("position_m", 0, 1);
+    uncertainty_.rotation_rad = uncertainty.number("rotation_deg", 0, 180) * kDegree;
   }
 
   BodySchema run() {
@@ -144,19 +143,19 @@ class Walk {
   void cross(const urdf::Joint& joint, double sense, Way* way) const {
     if (joint.type == urdf::Joint::FIXED) return;
     const bool slides = joint.type == urdf::Joint::PRISMATIC;
+    const auto refuse = [&](const std::string& why) {
+      throw std::runtime_error(urdf_.string() + ": joint " + joint.name + ": " + why);
+    };
     if (!slides && joint.type != urdf::Joint::REVOLUTE && joint.type != urdf::Joint::CONTINUOUS)
-      throw std::runtime_error(urdf_.string() + ": joint " + joint.name +
-                               ": expected revolute, continuous, prismatic or fixed");
+      refuse("expected revolute, continuous, prismatic or fixed");
     const Eigen::Vector3d axis(joint.axis.x, joint.axis.y, joint.axis.z);
-    if (!(axis.norm() > 1e-9))
-      throw std::runtime_error(urdf_.string() + ": joint " + joint.name + ": its axis is 0");
+    if (!(axis.norm() > 1e-9)) refuse("its axis is 0");
     // The joint that a mimic follows, and how.
     const urdf::Joint* leader = &joint;
     double gain = 1, offset = 0;
     for (int hops = 0; leader->mimic; ++hops) {
       const auto next = model_.getJoint(leader->mimic->joint_name);
-      if (!next || hops > 100)
-        throw std::runtime_error(urdf_.string() + ": joint " + joint.name + ": mimics nothing");
+      if (!next || hops > 100) refuse("mimics nothing");
       offset += gain * leader->mimic->offset;
       gain *= leader->mimic->multiplier;
       leader = next.get();
@@ -191,7 +190,7 @@ class Walk {
     edge.joints = way.joints;
     const Eigen::Index size = edge.num_parameters();
     edge.parameter_covariance = Eigen::MatrixXd::Zero(size, size);
-    edge.parameter_covariance.diagonal().tail<6>() = variances_;
+    edge.parameter_covariance.bottomRightCorner<6, 6>() = isotropic(uncertainty_);
     schema_.edges.push_back(std::move(edge));
   }
 
@@ -200,7 +199,7 @@ class Walk {
   BodySchema schema_;
   std::map<std::string, Drive> drives_;                                // by joint
   std::map<std::string, std::vector<std::pair<int, Pose>>> parts_on_;  // by link
-  Vector6d variances_ = Vector6d::Zero();
+  Noise uncertainty_;                                                  // of an edge, per axis
 };
 
 }  // namespace

@@ -8,7 +8,7 @@
 #include <cstdlib>
 #include <sstream>
 
-#include "common/bus/check.h"
+#include "common/text/text.h"
 
 namespace bodyschema {
 
@@ -17,45 +17,10 @@ std::string to_type(const std::string& words) {
   return std::string(command != nullptr && *command != '\0' ? command : "bodyschema") + " " + words;
 }
 
-std::string counted(std::int64_t count, const std::string& noun) {
-  return fmt::format("{} {}{}", count, noun, count == 1 ? "" : "s");
-}
-
 std::string duration(double s) {
   if (s < 100) return fmt::format("{:.0f} s", s);
   if (s < 6000) return fmt::format("{:.0f} min", s / 60);
   return fmt::format("{:.1f} h", s / 3600);
-}
-
-std::string abbreviated(std::string_view text) {
-  constexpr int kMost = 40;
-  // Of four bytes each at most.
-  return fit(as_text(std::string(text.substr(0, 5 * kMost))), kMost + 1);
-}
-
-std::string fit(const std::string& text, int width) {
-  std::string line;
-  int columns = 0;
-  for (std::size_t i = 0; i < text.size();) {
-    std::size_t size = 1;
-    while (i + size < text.size() && (static_cast<unsigned char>(text[i + size]) & 0xC0) == 0x80)
-      ++size;
-    const auto byte = static_cast<unsigned char>(text[i]);
-    // U+0080 … U+009F are control characters too.
-    const bool is_control =
-        byte < 0x20 || byte == 0x7F ||
-        (byte == 0xC2 && size == 2 && static_cast<unsigned char>(text[i + 1]) < 0xA0);
-    if (columns == width) {
-      while (!line.empty() && (static_cast<unsigned char>(line.back()) & 0xC0) == 0x80)
-        line.pop_back();
-      if (!line.empty()) line.pop_back();
-      return line + "…";
-    }
-    line += is_control ? " " : text.substr(i, size);
-    ++columns;
-    i += size;
-  }
-  return line;
 }
 
 std::string wrap(const std::string& text, int width, int indent) {

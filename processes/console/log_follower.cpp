@@ -5,7 +5,7 @@
 #include <stdexcept>
 #include <system_error>
 
-#include "common/bus/check.h"
+#include "common/text/text.h"
 
 namespace bodyschema {
 

@@ -13,6 +13,7 @@
 
 #include "common/bus/arguments.h"
 #include "common/bus/log_summary.h"
+#include "common/text/text.h"
 #include "processes/console/commands/commands.h"
 #include "processes/console/hint.h"
 #include "processes/driver_test/driver_test.h"

@@ -5,7 +5,7 @@
 
 #include "common/bus/channels.h"
 #include "common/bus/convert.h"
-#include "processes/console/clock.h"
+#include "common/text/clock.h"
 
 namespace bodyschema {
 namespace {

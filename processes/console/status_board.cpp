@@ -7,7 +7,7 @@
 #include <set>
 #include <utility>
 
-#include "processes/console/clock.h"
+#include "common/text/clock.h"
 #include "processes/console/hint.h"
 #include "processes/console/names.h"
 #include "processes/console/views/health_view.h"

@@ -21,6 +21,7 @@
 
 #include "common/bus/bus.h"
 #include "common/config/rig.h"
+#include "common/text/clock.h"
 #include "processes/driver_test/conformance.h"
 
 namespace bodyschema {
@@ -163,9 +164,7 @@ void run_driver_test(const DriverTestArguments& arguments) {
   ConformanceOptions options;
   options.signals = load_signals(arguments.rig_folder);
   options.step_share = arguments.step_share;
-  options.epoch = std::chrono::duration_cast<std::chrono::microseconds>(
-                      std::chrono::system_clock::now().time_since_epoch())
-                      .count();
+  options.epoch = wall_clock_us();
   LiveDriver driver(arguments);
   if (!arguments.kill.empty()) driver.find_process();  // before the arm moves
   const DriverLink link = driver.link();

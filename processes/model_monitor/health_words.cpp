@@ -6,6 +6,7 @@
 #include <string_view>
 
 #include "common/geometry/angle.h"
+#include "common/text/text.h"
 
 namespace bodyschema {
 namespace {
@@ -29,10 +30,6 @@ std::string text_of(const ChangeSize& size) {
   if (size.amounts.size() == 1) return measured(size.amounts[0], size.sds[0], "");
   return measured(size.amounts[0] * 1e3, size.sds[0] < 0 ? -1 : size.sds[0] * 1e3, " mm") + ", " +
          measured(size.amounts[1] / kDegree, size.sds[1] < 0 ? -1 : size.sds[1] / kDegree, "°");
-}
-
-std::string counted(int count, const char* noun) {
-  return std::to_string(count) + " " + noun + (count == 1 ? "" : "s");
 }
 
 /// A cause in words: `sized` where the size is of that kind.

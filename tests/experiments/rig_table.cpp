@@ -21,9 +21,9 @@
 #include <vector>
 
 #include "common/config/rig.h"
+#include "common/estimation/evaluation.h"
 #include "common/geometry/angle.h"
 #include "common/kinematics/kinematic_path.h"
-#include "processes/console/evaluation.h"
 #include "processes/structure_learner/structure_learner.h"
 #include "tests/common/bus/bus_test_support.h"
 #include "tests/support/rendered_run.h"

@@ -19,17 +19,12 @@
 #include "common/bus/bus.h"
 #include "common/bus/convert.h"
 #include "common/config/rig.h"
+#include "common/text/clock.h"
 #include "processes/console/target_follower.h"
 
 using namespace bodyschema;
 
 namespace {
-
-std::int64_t clock_us() {
-  return std::chrono::duration_cast<std::chrono::microseconds>(
-             std::chrono::steady_clock::now().time_since_epoch())
-      .count();
-}
 
 Eigen::VectorXd random_action(const std::vector<Signal>& signals, std::mt19937_64& engine) {
   Eigen::VectorXd action(signals.size());
@@ -110,9 +105,7 @@ int main(int argc, char** argv) {
     wait("BODY_SCHEMA", [&] { return schema.has_value(); });
     wait("SIM_STATE", [&] { return state.has_value(); });
 
-    const std::int64_t epoch = std::chrono::duration_cast<std::chrono::microseconds>(
-                                   std::chrono::system_clock::now().time_since_epoch())
-                                   .count();
+    const std::int64_t epoch = wall_clock_us();
     std::mt19937_64 engine(seed);
     std::vector<double> errors_m, observed_m;
     std::int64_t target_id = 0;

@@ -32,8 +32,7 @@ BodySchema learned_offline(const std::vector<sample_t>& samples,
   std::vector<ActionPoseSample> training;
   for (const sample_t& message : samples) {
     ActionPoseSample sample = from_message(message);
-    if (is_learned_from(sample))
-      training.push_back(std::move(sample));
+    if (is_learned_from(sample)) training.push_back(std::move(sample));
   }
   return learn(config.signals, training, config.options).schema;
 }

@@ -8,7 +8,7 @@
 #include <stdexcept>
 
 #include "common/bus/bus.h"
-#include "processes/console/clock.h"
+#include "common/text/clock.h"
 #include "processes/console/commands/commands.h"
 #include "processes/console/commands/files.h"
 

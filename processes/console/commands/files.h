@@ -6,8 +6,8 @@
 
 #include "common/bus/arguments.h"
 #include "common/schema/body_schema.h"
-#include "processes/console/recording.h"
 #include "processes/console/views/json.h"
+#include "processes/structure_learner/recording/recording.h"
 
 namespace bodyschema {
 

@@ -15,7 +15,7 @@
 #include "common/bus/all_channels.h"
 #include "common/bus/log_summary.h"
 #include "common/bus/rig_door.h"
-#include "processes/console/clock.h"
+#include "common/text/clock.h"
 #include "processes/console/commands/commands.h"
 #include "processes/console/commands/files.h"
 #include "processes/console/hint.h"

@@ -12,11 +12,10 @@
 
 #include "common/bus/convert.h"
 #include "common/bus/event_log.h"
+#include "common/estimation/evaluation.h"
 #include "processes/console/commands/commands.h"
 #include "processes/console/commands/files.h"
-#include "processes/console/evaluation.h"
 #include "processes/console/hint.h"
-#include "processes/console/recording.h"
 #include "processes/console/views/health_view.h"
 #include "processes/console/views/structure_view.h"
 #include "processes/model_monitor/adaptation.h"
@@ -26,6 +25,7 @@
 #include "processes/structure_learner/baseline/fit_matrix_gp.h"
 #include "processes/structure_learner/baseline/learn_baseline.h"
 #include "processes/structure_learner/learn.h"
+#include "processes/structure_learner/recording/recording.h"
 
 namespace bodyschema {
 namespace {

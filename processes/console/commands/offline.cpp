@@ -15,16 +15,16 @@
 #include "common/bus/event_log.h"
 #include "common/bus/rig_door.h"
 #include "common/config/rig.h"
+#include "common/estimation/evaluation.h"
 #include "common/geometry/angle.h"
 #include "processes/console/commands/commands.h"
 #include "processes/console/commands/files.h"
 #include "processes/console/engineered_model.h"
-#include "processes/console/evaluation.h"
-#include "processes/console/recording.h"
 #include "processes/console/rig_check.h"
 #include "processes/console/views/structure_view.h"
 #include "processes/structure_learner/baseline/learn_baseline.h"
 #include "processes/structure_learner/learn.h"
+#include "processes/structure_learner/recording/recording.h"
 #include "processes/structure_learner/root_pose.h"
 
 namespace bodyschema {

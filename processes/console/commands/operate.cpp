@@ -13,7 +13,8 @@
 
 #include "common/bus/bus.h"
 #include "common/bus/check.h"
-#include "processes/console/clock.h"
+#include "common/text/clock.h"
+#include "common/text/text.h"
 #include "processes/console/commands/commands.h"
 #include "processes/console/hint.h"
 #include "processes/console/interruption.h"

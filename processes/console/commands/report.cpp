@@ -17,9 +17,9 @@
 #include "processes/console/interruption.h"
 #include "processes/console/log_follower.h"
 #include "processes/console/picture.h"
-#include "processes/console/recording.h"
 #include "processes/console/report/report_page.h"
 #include "processes/console/run_record.h"
+#include "processes/structure_learner/recording/recording.h"
 
 namespace bodyschema {
 namespace {

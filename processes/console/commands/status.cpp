@@ -12,7 +12,7 @@
 #include "common/bus/bus.h"
 #include "common/bus/images_url.h"
 #include "common/bus/log_summary.h"
-#include "processes/console/clock.h"
+#include "common/text/clock.h"
 #include "processes/console/commands/commands.h"
 #include "processes/console/commands/files.h"
 #include "processes/console/hint.h"

@@ -24,7 +24,7 @@
 #include "common/bus/rig_door.h"
 #include "common/bus/sample_intake.h"
 #include "common/config/rig.h"
-#include "processes/console/clock.h"
+#include "common/text/clock.h"
 #include "processes/console/commands/commands.h"
 #include "processes/console/hint.h"
 #include "processes/console/interruption.h"

@@ -6,43 +6,50 @@
 #include <set>
 #include <utility>
 
+#include "processes/console/hint.h"
 #include "processes/console/names.h"
 #include "processes/console/report/report_figures.h"
 #include "processes/console/report/template.h"
+#include "processes/console/views/structure_view.h"
 
 namespace bodyschema {
 namespace {
 
-std::string label(const BodySchema& schema, const Edge& edge) {
-  std::string names;
-  for (const int signal : edge.signals())
-    names += (names.empty() ? "" : ", ") + schema.signals.at(static_cast<std::size_t>(signal)).name;
-  return names.empty() ? "rigid" : names;
+/// `css`: class of the style sheet.
+std::string text_svg(const char* css, double x, double y, const std::string& text) {
+  return fmt::format("<text class=\"{}\" x=\"{:.1f}\" y=\"{:.1f}\">{}</text>", css, x, y,
+                     escape_html(text));
+}
+std::string circle_svg(const char* css, double x, double y, double radius) {
+  return fmt::format("<circle class=\"{}\" cx=\"{:.1f}\" cy=\"{:.1f}\" r=\"{}\"/>", css, x, y,
+                     radius);
+}
+std::string figure_svg(const char* css, double width, double height, const char* label,
+                       const std::string& content) {
+  return fmt::format(
+      "<svg class=\"{}\" viewBox=\"0 0 {:.0f} {:.0f}\" role=\"img\" aria-label=\"{}\">\n{}</svg>\n",
+      css, width, height, label, content);
 }
 
 /// How often a signal was in each bin of its range, and each part seen then.
 struct Bins {
-  std::vector<int> count;
+  std::vector<int> count = std::vector<int>(kVisibilityBins);
   std::map<int, std::vector<int>> seen;
 };
 
-Bins bins_of(std::size_t index, const Signal& signal,
+Bins bins_of(Eigen::Index signal, const Signal& limits,
              const std::vector<ActionPoseSample>& samples) {
   Bins bins;
-  bins.count.resize(kVisibilityBins);
-  const auto i = static_cast<Eigen::Index>(index);
-  const double range = signal.upper - signal.lower;
   for (const ActionPoseSample& sample : samples) {
-    if (sample.action.size() <= i || !(range > 0)) continue;
-    const double share = (sample.action[i] - signal.lower) / range;
+    if (sample.action.size() <= signal || !(limits.upper > limits.lower)) continue;
+    const double share = (sample.action[signal] - limits.lower) / (limits.upper - limits.lower);
     if (!std::isfinite(share)) continue;
     const auto bin =
         static_cast<std::size_t>(std::clamp(share * kVisibilityBins, 0.0, kVisibilityBins - 1.0));
     ++bins.count[bin];
     for (const PartObservation& part : sample.parts) {
-      std::vector<int>& seen = bins.seen[part.part];
-      seen.resize(kVisibilityBins);
-      ++seen[bin];
+      const auto seen = bins.seen.try_emplace(part.part, kVisibilityBins).first;
+      ++seen->second[bin];
     }
   }
   return bins;
@@ -58,7 +65,7 @@ class TreeLayout {
   };
 
   explicit TreeLayout(const BodySchema& schema) {
-    for (const Edge& edge : schema.edges) children_[edge.from].push_back(&edge);
+    for (const Edge& edge : schema.edges) children_[edge.from].push_back(edge.to);
     if (schema.root >= 0) place(schema.root, 0);
     for (const Edge& edge : schema.edges) {
       if (spots_.contains(edge.from)) continue;
@@ -74,8 +81,8 @@ class TreeLayout {
   bool is_loose_root(int part) const { return loose_roots_.contains(part); }
   double width() const { return width_; }
   double column() const { return column_; }
-  double x(const Spot& spot) const { return 30 + column_ * spot.depth; }
-  double y(const Spot& spot) const { return kTop + kRow * spot.row; }
+  double x(int part) const { return 30 + column_ * spots_.at(part).depth; }
+  double y(int part) const { return kTop + kRow * spots_.at(part).row; }
   /// Below all spots.
   double bottom() const { return kTop + next_row_ * kRow; }
 
@@ -84,26 +91,19 @@ class TreeLayout {
 
   /// Returns the row of the part.
   double place(int part, int depth) {
-    if (spots_.contains(part)) return spots_[part].row;
-    spots_[part] = {depth, next_row_};
+    const auto [spot, is_new] = spots_.try_emplace(part, Spot{depth, next_row_});
+    if (!is_new) return spot->second.row;
     deepest_ = std::max(deepest_, depth);
-    const auto below = children_.find(part);
-    double row = next_row_;
-    if (below == children_.end()) {
-      next_row_ += 1;
-    } else {
-      // The longest branch first, so that the arm is a straight line.
-      bool is_first = true;
-      for (const Edge* edge : below->second) {
-        const double child_row = place(edge->to, depth + 1);
-        if (std::exchange(is_first, false)) row = child_row;
-      }
+    // The longest branch first, so that the arm is a straight line.
+    std::optional<double> first_row;
+    for (const int child : children_[part]) {
+      const double row = place(child, depth + 1);
+      if (!first_row) first_row = row;
     }
-    spots_[part].row = row;
-    return row;
+    return spot->second.row = first_row ? *first_row : next_row_++;
   }
 
-  std::map<int, std::vector<const Edge*>> children_;
+  std::map<int, std::vector<int>> children_;
   std::map<int, Spot> spots_;
   std::set<int> loose_roots_;
   double next_row_ = 0;
@@ -114,74 +114,53 @@ class TreeLayout {
 constexpr double kRadius = 17;  // of a part in the tree
 
 std::string edge_svg(const BodySchema& schema, const Edge& edge, const TreeLayout& layout) {
-  const TreeLayout::Spot& from = layout.spots().at(edge.from);
-  const TreeLayout::Spot& to = layout.spots().at(edge.to);
-  const double x_from = layout.x(from), y_from = layout.y(from);
-  const double x_to = layout.x(to), y_to = layout.y(to);
-  const std::string kind = edge.joints.empty() ? "rigid" : "screw";
-  const char* state = name_in(kEdgeStateClasses, edge.state);
-  std::string svg;
-  if (from.row == to.row) {
-    svg = fmt::format("<path class=\"{} {}\" d=\"M{:.1f},{:.1f} H{:.1f}\"/>\n", kind, state,
-                      x_from + kRadius, y_from, x_to - kRadius);
-  } else {
-    const double x_bend = x_from + 0.4 * layout.column();
-    svg = fmt::format(
-        "<path class=\"{} {}\" d=\"M{:.1f},{:.1f} C{:.1f},{:.1f} {:.1f},{:.1f} "
-        "{:.1f},{:.1f}\"/>\n",
-        kind, state, x_from + kRadius * 0.6, y_from + kRadius * 0.8, x_bend, y_to, x_bend, y_to,
-        x_to - kRadius, y_to);
-  }
-  return svg + fmt::format("<text class=\"signal\" x=\"{:.1f}\" y=\"{:.1f}\">{}</text>\n",
-                           x_to - 0.5 * layout.column(), y_to - 7,
-                           escape_html(label(schema, edge)));
+  const double x_from = layout.x(edge.from), y_from = layout.y(edge.from);
+  const double x_to = layout.x(edge.to), y_to = layout.y(edge.to);
+  const double x_bend = x_from + 0.4 * layout.column();
+  const std::string way =
+      y_from == y_to
+          ? fmt::format("M{:.1f},{:.1f} H{:.1f}", x_from + kRadius, y_from, x_to - kRadius)
+          : fmt::format("M{:.1f},{:.1f} C{:.1f},{:.1f} {:.1f},{:.1f} {:.1f},{:.1f}",
+                        x_from + kRadius * 0.6, y_from + kRadius * 0.8, x_bend, y_to, x_bend, y_to,
+                        x_to - kRadius, y_to);
+  const std::string signals = listed(signal_names(schema, edge.signals()));
+  return fmt::format("<path class=\"{} {}\" d=\"{}\"/>\n", edge.joints.empty() ? "rigid" : "screw",
+                     name_in(kEdgeStateClasses, edge.state), way) +
+         text_svg("signal", x_to - 0.5 * layout.column(), y_to - 7,
+                  signals.empty() ? "rigid" : signals) +
+         "\n";
 }
 
-std::string part_svg(const BodySchema& schema, int part, std::optional<int> end_effector,
-                     const TreeLayout& layout) {
-  const bool is_root = part == schema.root, is_effector = part == end_effector;
-  const double x = layout.x(layout.spots().at(part)), y = layout.y(layout.spots().at(part));
-  std::string svg = fmt::format(
-      "<circle class=\"{}\" cx=\"{:.1f}\" cy=\"{:.1f}\" r=\"{}\"/>"
-      "<text class=\"id\" x=\"{:.1f}\" y=\"{:.1f}\">{}</text>\n",
-      is_root       ? "root"
-      : is_effector ? "effector"
-                    : "part",
-      x, y, kRadius, x, y + 4.5, part);
-  if (!is_root && !is_effector && !layout.is_loose_root(part)) return svg;
-  return svg + fmt::format("<text class=\"role\" x=\"{:.1f}\" y=\"{:.1f}\">{}</text>\n", x, y - 24,
-                           is_root       ? "root"
-                           : is_effector ? "end effector"
-                                         : "no way to the root");
+std::string part_svg(int part, const char* css, const char* role, const TreeLayout& layout) {
+  const double x = layout.x(part), y = layout.y(part);
+  const std::string svg =
+      circle_svg(css, x, y, kRadius) + text_svg("id", x, y + 4.5, std::to_string(part)) + "\n";
+  return *role == '\0' ? svg : svg + text_svg("role", x, y - 24, role) + "\n";
 }
 
 }  // namespace
 
 std::string tree_svg(const BodySchema& schema, std::optional<int> end_effector) {
   const TreeLayout layout(schema);
-  std::vector<const UnconnectedPart*> lone;
-  for (const UnconnectedPart& part : schema.unconnected) {
-    if (!layout.spots().contains(part.part)) lone.push_back(&part);
-  }
-  const double height =
-      layout.bottom() + (lone.empty() ? -12 : 24.0 * static_cast<double>(lone.size()));
-  std::string svg = fmt::format(
-      "<svg class=\"tree\" viewBox=\"0 0 {:.0f} {:.0f}\" role=\"img\" aria-label=\"Tree of the "
-      "parts\">\n",
-      layout.width(), std::max(height, 60.0));
+  std::string svg;
   for (const Edge& edge : schema.edges) svg += edge_svg(schema, edge, layout);
   for (const auto& [part, spot] : layout.spots())
-    svg += part_svg(schema, part, end_effector, layout);
+    svg += part == schema.root          ? part_svg(part, "root", "root", layout)
+           : part == end_effector       ? part_svg(part, "effector", "end effector", layout)
+           : layout.is_loose_root(part) ? part_svg(part, "part", "no way to the root", layout)
+                                        : part_svg(part, "part", "", layout);
   double y = layout.bottom();
-  for (const UnconnectedPart* part : lone) {
-    svg += fmt::format(
-        "<circle class=\"lone\" cx=\"30\" cy=\"{:.1f}\" r=\"10\"/><text class=\"id small\" "
-        "x=\"30\" y=\"{:.1f}\">{}</text><text class=\"reason\" x=\"50\" y=\"{:.1f}\">not "
-        "connected: {}</text>\n",
-        y, y + 3.5, part->part, y + 4, name_in(kUnconnectedReasons, part->reason));
+  for (const UnconnectedPart& part : schema.unconnected) {
+    if (layout.spots().contains(part.part)) continue;
+    svg += circle_svg("lone", 30, y, 10) +
+           text_svg("id small", 30, y + 3.5, std::to_string(part.part)) +
+           text_svg("reason", 50, y + 4,
+                    std::string("not connected: ") + name_in(kUnconnectedReasons, part.reason)) +
+           "\n";
     y += 24;
   }
-  return svg + "</svg>\n";
+  const double height = y > layout.bottom() ? y : y - 12;
+  return figure_svg("tree", layout.width(), std::max(height, 60.0), "Tree of the parts", svg);
 }
 
 std::string visibility_svg(const std::vector<Signal>& signals,
@@ -192,52 +171,43 @@ std::string visibility_svg(const std::vector<Signal>& signals,
   const auto num_signals = static_cast<double>(signals.size());
   const double column = (kWidth - kLabel - kGap * (num_signals - 1)) / num_signals;
   const double bin_width = column / kVisibilityBins;
-  const double height = kTop + kRow * static_cast<double>(parts.size()) + 4;
-  std::string svg = fmt::format(
-      "<svg class=\"visibility\" viewBox=\"0 0 {:.0f} {:.0f}\" role=\"img\" "
-      "aria-label=\"Visibility "
-      "of the parts over the signals\">\n",
-      kWidth, height);
-  for (std::size_t p = 0; p < parts.size(); ++p) {
-    svg += fmt::format("<text class=\"row\" x=\"{:.1f}\" y=\"{:.1f}\">{}</text>\n", kLabel - 10,
-                       kTop + kRow * static_cast<double>(p) + 13, parts[p]);
+  std::string svg;
+  double top = kTop;
+  for (const int part : parts) {
+    svg += text_svg("row", kLabel - 10, top + 13, std::to_string(part)) + "\n";
+    top += kRow;
   }
-  svg += fmt::format("<text class=\"row\" x=\"{:.1f}\" y=\"{:.1f}\">part</text>\n", kLabel - 10,
-                     kTop - 22.0);
+  const double height = top + 4;
+  svg += text_svg("row", kLabel - 10, kTop - 22, "part") + "\n";
   for (std::size_t s = 0; s < signals.size(); ++s) {
     const double left = kLabel + static_cast<double>(s) * (column + kGap);
-    svg += fmt::format(
-        "<text class=\"head\" x=\"{:.1f}\" y=\"14\">{}</text>"
-        "<text class=\"limit\" x=\"{:.1f}\" y=\"32\">{:g}</text>"
-        "<text class=\"limit end\" x=\"{:.1f}\" y=\"32\">{:g}</text>\n",
-        left + column / 2, escape_html(signals[s].name), left, signals[s].lower, left + column,
-        signals[s].upper);
-    const auto [count, seen] = bins_of(s, signals[s], samples);
-    for (std::size_t p = 0; p < parts.size(); ++p) {
-      const double top = kTop + kRow * static_cast<double>(p);
+    svg += text_svg("head", left + column / 2, 14, signals[s].name) +
+           text_svg("limit", left, 32, fmt::format("{:g}", signals[s].lower)) +
+           text_svg("limit end", left + column, 32, fmt::format("{:g}", signals[s].upper)) + "\n";
+    Bins bins = bins_of(static_cast<Eigen::Index>(s), signals[s], samples);
+    top = kTop;
+    for (const int part : parts) {
       svg += fmt::format(
           "<rect class=\"strip\" x=\"{:.1f}\" y=\"{:.1f}\" width=\"{:.1f}\" height=\"15\"/>", left,
           top, column);
-      const auto of_part = seen.find(parts[p]);
+      const std::vector<int>& seen = bins.seen.try_emplace(part, kVisibilityBins).first->second;
       for (std::size_t b = 0; b < kVisibilityBins; ++b) {
         const double x = left + bin_width * static_cast<double>(b);
-        if (count[b] == 0) {
+        const int count = bins.count[b];
+        if (count == 0)
           svg += fmt::format("<path class=\"unknown\" d=\"M{:.1f},{:.1f} l{:.1f},-15\"/>", x,
                              top + 15, bin_width);
-          continue;
-        }
-        const int num_seen = of_part == seen.end() ? 0 : of_part->second[b];
-        if (num_seen == 0) continue;
-        svg += fmt::format(
-            "<rect class=\"seen\" x=\"{:.2f}\" y=\"{:.1f}\" width=\"{:.2f}\" height=\"15\" "
-            "fill-opacity=\"{:.2f}\"><title>part {}: seen in {} of {} samples</title></rect>",
-            x, top, bin_width, static_cast<double>(num_seen) / count[b], parts[p], num_seen,
-            count[b]);
+        else if (seen[b] > 0)
+          svg += fmt::format(
+              "<rect class=\"seen\" x=\"{:.2f}\" y=\"{:.1f}\" width=\"{:.2f}\" height=\"15\" "
+              "fill-opacity=\"{:.2f}\"><title>part {}: seen in {} of {} samples</title></rect>",
+              x, top, bin_width, static_cast<double>(seen[b]) / count, part, seen[b], count);
       }
       svg += "\n";
+      top += kRow;
     }
   }
-  return svg + "</svg>\n";
+  return figure_svg("visibility", kWidth, height, "Visibility of the parts over the signals", svg);
 }
 
 }  // namespace bodyschema

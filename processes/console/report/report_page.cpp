@@ -9,19 +9,19 @@
 #include <utility>
 #include <vector>
 
+#include "common/estimation/evaluation.h"
 #include "common/geometry/angle.h"
 #include "common/plot/plot.h"
 #include "common/schema/standard_deviations.h"
-#include "processes/console/evaluation.h"
 #include "processes/console/hint.h"
 #include "processes/console/names.h"
-#include "processes/console/recording.h"
 #include "processes/console/report/report_figures.h"
 #include "processes/console/report/run_sections.h"
 #include "processes/console/report/template.h"
 #include "processes/console/views/health_view.h"
 #include "processes/console/views/structure_view.h"
 #include "processes/structure_learner/learn.h"
+#include "processes/structure_learner/recording/recording.h"
 
 namespace bodyschema {
 namespace {
@@ -48,10 +48,7 @@ std::string degrees(double rad) { return fmt::format("{:.2f}°", rad / kDegree);
 std::string edge_name(int from, int to) { return fmt::format("{} → {}", from, to); }
 
 std::string names_of(const BodySchema& schema, const std::vector<int>& signals) {
-  std::vector<std::string> names;
-  for (const int signal : signals)
-    names.push_back(schema.signals.at(static_cast<std::size_t>(signal)).name);
-  return fmt::format("{}", fmt::join(names, ", "));
+  return listed(signal_names(schema, signals));
 }
 
 /// The schema that the report shows, and where it comes from.
@@ -60,37 +57,27 @@ struct Body {
   std::string origin;
 };
 
+std::vector<ActionPoseSample> fitting(std::vector<ActionPoseSample> samples,
+                                      std::ptrdiff_t num_signals) {
+  std::erase_if(samples, [&](const auto& sample) { return sample.action.size() != num_signals; });
+  return samples;
+}
+
 std::optional<Body> body_of(const Report& report) {
   const RunRecord& record = *report.record;
-  if (const auto& accepted = record.watch().schema()) {
+  if (const auto& accepted = record.watch().schema())
     return Body{*accepted, fmt::format("version {}, accepted by the monitor", accepted->version)};
-  }
-  if (const auto& proposal = record.learned()) {
+  if (const auto& proposal = record.learned())
     return Body{*proposal, "the learner’s newest proposal: the monitor accepted none"};
-  }
-  Recording recording;
-  for (const ActionPoseSample& sample : record.watch().samples()) {
-    // A log may hold another rig's samples too; the first one decides.
-    if (recording.samples.empty() ||
-        sample.action.size() == recording.samples.front().action.size())
-      recording.samples.push_back(sample);
-  }
+  Recording recording{.samples = record.watch().samples()};
   if (recording.samples.empty()) return std::nullopt;
+  // A log may hold another rig's samples too; the first one decides.
+  recording.samples = fitting(recording.samples, recording.samples.front().action.size());
   recording.signals = observed_signals(recording.samples);
   LearnOptions options;
   if (report.measurement) options.measurement = report.measurement();
   return Body{learn(recording.signals, recording.training(), options).schema,
               "learned for this report: the log holds no body schema"};
-}
-
-std::vector<ActionPoseSample> fitting(const std::vector<ActionPoseSample>& samples,
-                                      const BodySchema& schema) {
-  std::vector<ActionPoseSample> result;
-  for (const ActionPoseSample& sample : samples) {
-    if (sample.action.size() == static_cast<Eigen::Index>(schema.signals.size()))
-      result.push_back(sample);
-  }
-  return result;
 }
 
 /// The data of report.mustache; plots are drawn together at the end and take the place of their
@@ -100,11 +87,10 @@ class Page {
   explicit Page(const Report& report)
       : report_(report), record_(*report.record), body_(body_of(report)) {
     if (!body_) return;
-    held_out_ =
-        fitting(record_.watch().held_out(body_->schema.body_since(body_->schema.last_sample_index)),
-                body_->schema);
-    errors_ =
-        judge(body_->schema, held_out_, has_truth() ? held_out_ : std::vector<ActionPoseSample>());
+    const BodySchema& schema = body_->schema;
+    held_out_ = fitting(record_.watch().held_out(schema.body_since(schema.last_sample_index)),
+                        std::ssize(schema.signals));
+    errors_ = judge(schema, held_out_, has_truth() ? held_out_ : std::vector<ActionPoseSample>());
   }
 
   std::string html(std::string* problem) {
@@ -123,7 +109,7 @@ class Page {
  private:
   Json data() {
     Json data = {
-        {"reload_s", report_.reload_s ? Json(*report_.reload_s) : Json()},
+        {"reload_s", or_null(report_.reload_s)},
         {"goes_on", report_.goes_on},
         {"title", report_.title},
         {"style", std::string(kReportStyle)},
@@ -174,20 +160,6 @@ class Page {
     return fmt::format("{}, {}", millimetres(health->worst_position_m),
                        degrees(health->worst_rotation_rad));
   }
-  const PartErrors* errors_of(std::optional<int> part) const {
-    for (const PartErrors& errors : errors_.parts) {
-      if (errors.part == part && errors.count > 0) return &errors;
-    }
-    return nullptr;
-  }
-  const PartErrors* worst() const {
-    const PartErrors* worst = nullptr;
-    for (const PartErrors& errors : errors_.parts) {
-      if (errors.count > 0 && (!worst || errors.position_median_m > worst->position_median_m))
-        worst = &errors;
-    }
-    return worst;
-  }
   std::ptrdiff_t num_edges_needed() const {
     return std::max<std::ptrdiff_t>(0, std::ssize(body_->schema.parts) - 1);
   }
@@ -226,21 +198,24 @@ class Page {
     const auto add = [&](const char* name, const std::string& value, const std::string& more) {
       items.push_back({{"name", name}, {"value", value}, {"more", more}});
     };
-    if (body_) {
+    if (body_)
       add("Structure", body_->schema.complete ? "complete" : "incomplete",
           fmt::format("{} of {} edges", body_->schema.edges.size(), num_edges_needed()));
-    }
     add("Samples", std::to_string(record_.watch().num_samples()),
         fmt::format("{} held out", held_out_.size()));
     const char* against = has_truth() ? ", against the truth" : ", against what was seen";
-    if (const PartErrors* effector = errors_of(report_.end_effector)) {
+    const PartErrors *effector = nullptr, *worst = nullptr;
+    for (const PartErrors& part : errors_.parts) {
+      if (part.count == 0) continue;
+      if (part.part == report_.end_effector) effector = &part;
+      if (!worst || part.position_median_m > worst->position_median_m) worst = &part;
+    }
+    if (effector)
       add("End effector", millimetres(effector->position_median_m),
           degrees(effector->rotation_median_rad) + against);
-    }
-    if (const PartErrors* part = worst()) {
-      add("Worst part", millimetres(part->position_median_m),
-          fmt::format("part {}, {}{}", part->part, degrees(part->rotation_median_rad), against));
-    }
+    if (worst)
+      add("Worst part", millimetres(worst->position_median_m),
+          fmt::format("part {}, {}{}", worst->part, degrees(worst->rotation_median_rad), against));
     if (const auto begin = record_.begin_utime()) {
       add("Recorded", duration(record_.duration_s()),
           fmt::format("{:%Y-%m-%d %H:%M}",
@@ -252,19 +227,17 @@ class Page {
   Json body() const {
     if (!body_) return nullptr;
     const BodySchema& schema = body_->schema;
-    Json edges = Json::array(), unconnected = Json::array();
-    for (const Edge& edge : schema.edges) edges.push_back(edge_row(edge));
-    for (const UnconnectedPart& part : schema.unconnected) {
-      unconnected.push_back({{"part", part.part},
-                             {"reason", name_in(kUnconnectedReasons, part.reason)},
-                             {"detail", part.detail}});
-    }
+    const auto unconnected_row = [](const UnconnectedPart& part) -> Json {
+      return {{"part", part.part},
+              {"reason", name_in(kUnconnectedReasons, part.reason)},
+              {"detail", part.detail}};
+    };
     return {{"tree", tree_svg(schema, report_.end_effector)},
             {"origin", body_->origin},
             {"is_complete", schema.complete},
-            {"edges", table(std::move(edges))},
+            {"edges", table(array_of(schema.edges, [&](const Edge& e) { return edge_row(e); }))},
             {"deviations", deviations(schema_json(schema))},
-            {"unconnected", table(std::move(unconnected))},
+            {"unconnected", table(array_of(schema.unconnected, unconnected_row))},
             {"unused", names_of(schema, schema.unused_signals())},
             {"undecided", names_of(schema, schema.undecided_signals)}};
   }
@@ -298,14 +271,11 @@ class Page {
   Json edge_row(const Edge& edge) const {
     const BodySchema& schema = body_->schema;
     std::string health = name_in(kEdgeStateWords, edge.state), distance = "–";
-    if (record_.health()) {
-      for (const edge_health_t& item : record_.health()->edge_health) {
-        if (item.health_from != edge.from || item.health_to != edge.to) continue;
-        health = name_in(kEdgeStateWords, item.edge_state);
-        if (item.edge_is_drifting == 1) health += ", drifting";
-        if (item.median_mahalanobis2 >= 0)
-          distance = fmt::format("{:.1f}", item.median_mahalanobis2);
-      }
+    if (const edge_health_t* told = health_of(record_.health(), edge.from, edge.to)) {
+      health = name_in(kEdgeStateWords, told->edge_state);
+      if (told->edge_is_drifting == 1) health += ", drifting";
+      if (told->median_mahalanobis2 >= 0)
+        distance = fmt::format("{:.1f}", told->median_mahalanobis2);
     }
     const Noise sd =
         deviations_of(edge.prediction_covariance(schema.displacements(mid_range(schema.signals))));
@@ -348,11 +318,10 @@ class Page {
     if (marks.empty()) return json;
     json["marks"] =
         record_.faults().empty() ? "as the monitor found it" : "the simulation’s ground truth";
-    json["has_drifted"] =
-        std::any_of(record_.faults().begin(), record_.faults().end(), [](const auto& change) {
-          return std::any_of(change.faults.begin(), change.faults.end(),
-                             [](const std::string& fault) { return fault.starts_with("drift"); });
-        });
+    json["has_drifted"] = false;
+    for (const RunRecord::FaultChange& change : record_.faults())
+      for (const std::string& fault : change.faults)
+        if (fault.starts_with("drift")) json["has_drifted"] = true;
     return json;
   }
 
@@ -402,30 +371,23 @@ class Page {
 
   Json visibility() const {
     if (!body_) return nullptr;
-    const auto shares = record_.watch().visibility();
+    std::map<int, double> shares = record_.watch().visibility();
+    for (const UnconnectedPart& part : body_->schema.unconnected) shares.try_emplace(part.part, 0);
+    if (shares.empty()) return nullptr;
     std::vector<int> parts;
     for (const auto& [part, share] : shares) parts.push_back(part);
-    for (const UnconnectedPart& part : body_->schema.unconnected) {
-      if (!shares.contains(part.part)) parts.push_back(part.part);
-    }
-    std::sort(parts.begin(), parts.end());
-    if (parts.empty()) return nullptr;
-    std::string text;
-    for (const int part : parts) {
-      const auto share = shares.find(part);
-      text += fmt::format("{}part {} in {:.0f} %", text.empty() ? "" : ", ", part,
-                          share == shares.end() ? 0 : share->second * 100);
-    }
+    const std::string text = listed(shares, [](const auto& seen) {
+      return fmt::format("part {} in {:.0f} %", seen.first, seen.second * 100);
+    });
     return {{"strips", visibility_svg(body_->schema.signals, record_.watch().samples(), parts)},
             {"shares", text}};
   }
 
   Json processes() {
-    const auto processes = record_.processes();
     Json json = processes_data(record_);
     if (json.is_null()) return json;
     const char* const captions[] = {"Processor time, of one core.", "Memory in use."};
-    for (const Plot& load : load_plots(processes)) {
+    for (const Plot& load : load_plots(record_.processes())) {
       const char* caption = captions[json["loads"].size()];
       json["loads"].push_back({{"plot", plot(load)}, {"caption", caption}});
     }

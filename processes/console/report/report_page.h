@@ -7,8 +7,8 @@
 #include <string>
 
 #include "common/bus/log_summary.h"
-#include "processes/console/recording.h"
 #include "processes/console/run_record.h"
+#include "processes/structure_learner/recording/recording.h"
 
 namespace bodyschema {
 

@@ -5,9 +5,11 @@
 #include <limits>
 #include <utility>
 
+#include "common/estimation/evaluation.h"
+#include "common/estimation/measurement_model.h"
 #include "common/geometry/angle.h"
 #include "common/geometry/pose.h"
-#include "processes/console/evaluation.h"
+#include "processes/console/hint.h"
 #include "processes/console/report/report_figures.h"
 
 namespace bodyschema {
@@ -54,10 +56,7 @@ Matrix6d observation_noise(const BodySchema& schema, const Edge& edge,
     ++count;
   }
   if (count > 0 && !sum.isZero(0)) return sum / count;
-  Vector6d variance;
-  variance << Eigen::Vector3d::Constant(std::pow(schema.noise.position_m, 2)),
-      Eigen::Vector3d::Constant(std::pow(schema.noise.rotation_rad, 2));
-  return 2 * Matrix6d(variance.asDiagonal());
+  return 2 * isotropic(schema.noise);
 }
 
 /// The largest round step that gives at least `least` intervals over `span`.
@@ -102,10 +101,10 @@ std::string curve_block(const EdgeSlice& slice) {
 std::string dots_blocks(const EdgeSlice& slice, const Limits& limits, EdgePlot* result) {
   std::string dots[2];
   const std::size_t step = (slice.observations.size() + kMostDots - 1) / kMostDots;
-  int num_drawn = 0;
+  result->num_left_out = static_cast<int>(slice.observations.size());
   for (std::size_t i = 0; i < slice.observations.size(); i += std::max<std::size_t>(1, step)) {
     const EdgeSlice::Observation& observation = slice.observations[i];
-    ++num_drawn;
+    --result->num_left_out;
     std::string& row = dots[observation.is_held_out ? 1 : 0];
     row += number(observation.q);
     bool is_beyond = false;
@@ -117,7 +116,6 @@ std::string dots_blocks(const EdgeSlice& slice, const Limits& limits, EdgePlot* 
     row += "\n";
     result->num_beyond += is_beyond ? 1 : 0;
   }
-  result->num_left_out = static_cast<int>(slice.observations.size()) - num_drawn;
   // A block without a row would be an error of gnuplot's.
   for (std::string& rows : dots)
     if (rows.empty()) rows = "NaN NaN NaN NaN NaN NaN NaN\n";
@@ -137,12 +135,11 @@ std::vector<BodyMark> body_marks(const RunRecord& record) {
     for (const RunRecord::FaultChange& change : record.faults()) {
       for (const ActionPoseSample& sample : record.watch().samples()) {
         if (sample.utime < change.utime) continue;
-        std::string label;
-        for (const std::string& fault : change.faults) {
-          if (std::find(before.begin(), before.end(), fault) == before.end())
-            label += (label.empty() ? "" : ", ") + fault;
-        }
-        add(sample.sample_index, label.empty() ? "repair" : label);
+        std::vector<std::string> added = change.faults;
+        std::erase_if(added, [&](const std::string& fault) {
+          return std::find(before.begin(), before.end(), fault) != before.end();
+        });
+        add(sample.sample_index, added.empty() ? "repair" : listed(added));
         break;
       }
       before = change.faults;
@@ -365,11 +362,8 @@ EdgePlot edge_plot(const BodySchema& schema, const EdgeSlice& slice) {
     script += fmt::format("set title {} offset 0,-0.6\nset yrange [{}:{}]\nset ytics {}\n",
                           gnuplot_string(kTitles[c]), number(low), number(high),
                           number(tic_step(high - low, 2.2)));
-    if (c == 4) {
-      script += fmt::format("set xlabel {} offset 0,0.6\n", gnuplot_string(signal.name));
-    } else {
-      script += "unset xlabel\n";
-    }
+    script += c == 4 ? fmt::format("set xlabel {} offset 0,0.6\n", gnuplot_string(signal.name))
+                     : "unset xlabel\n";
     const int mean = 2 + 3 * c;
     const auto band = [&](int column, double alpha) {
       return fmt::format(

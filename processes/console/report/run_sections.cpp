@@ -9,7 +9,7 @@
 #include <utility>
 #include <vector>
 
-#include "processes/console/clock.h"
+#include "common/text/clock.h"
 #include "processes/console/hint.h"
 #include "processes/console/names.h"
 

@@ -9,8 +9,8 @@
 #include <vector>
 
 #include "bodyschema/model_health_t.hpp"
+#include "common/estimation/evaluation.h"
 #include "common/schema/body_schema.h"
-#include "processes/console/evaluation.h"
 #include "processes/console/views/json.h"
 #include "processes/structure_learner/learn.h"
 

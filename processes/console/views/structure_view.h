@@ -4,8 +4,8 @@
 #include <string>
 #include <vector>
 
+#include "common/estimation/evaluation.h"
 #include "common/schema/body_schema.h"
-#include "processes/console/evaluation.h"
 #include "processes/console/views/json.h"
 #include "processes/structure_learner/learn.h"
 

@@ -16,6 +16,7 @@
 #include "bodyschema/message_fields.h"
 #include "common/bus/convert.h"
 #include "common/bus/triangle.h"
+#include "common/text/text.h"
 #include "tests/lcmtypes/example_messages.h"
 
 namespace bodyschema::test {

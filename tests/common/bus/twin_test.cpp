@@ -10,6 +10,7 @@
 #include <string>
 #include <vector>
 
+#include "common/text/clock.h"
 #include "tests/common/bus/bus_test_support.h"
 #include "tests/lcmtypes/example_messages.h"
 
@@ -17,12 +18,6 @@ namespace bodyschema::test {
 namespace {
 
 const char* const kUrl = "udpm://239.255.76.67:7667?ttl=0";
-
-std::int64_t now_us() {
-  return std::chrono::duration_cast<std::chrono::microseconds>(
-             std::chrono::system_clock::now().time_since_epoch())
-      .count();
-}
 
 class Twins : public testing::Test {
  protected:
@@ -115,7 +110,7 @@ TEST_F(Twins, OneOnAnotherNameOrARecordingOfItselfDoesNotDisturb) {
   recorded.start_utime -= 86'400'000'000;
   recorded.utime -= 86'400'000'000;
   bus_.publish(kProcessInfo, recorded);
-  info.utime = now_us();
+  info.utime = wall_clock_us();
   info.phase = process_info_t::PHASE_WORKING;
   process_info_t other = info;
   other.process_name = "observer";
@@ -138,7 +133,7 @@ TEST_F(Twins, OneThatWorksNeverEndsBecauseOfWhatOthersSayButTellsIt) {
   elder.start_utime = 0;
   elder.phase = process_info_t::PHASE_WORKING;
   const auto forge = [&] {
-    elder.utime = now_us();
+    elder.utime = wall_clock_us();
     bus_.publish(kProcessInfo, elder);
     bus_.handle(std::chrono::milliseconds(20));
   };
@@ -148,7 +143,7 @@ TEST_F(Twins, OneThatWorksNeverEndsBecauseOfWhatOthersSayButTellsIt) {
   };
   // A busy elder may be heard late, but not so late.
   constexpr std::int64_t kLate_us = 5'000'000;
-  ASSERT_TRUE(handle_until(bus_, [&] { return now_us() - start_utime > kLate_us; }));
+  ASSERT_TRUE(handle_until(bus_, [&] { return wall_clock_us() - start_utime > kLate_us; }));
   ASSERT_TRUE(ask_until(forge, tells));
   for (int n = 0; n < 30; ++n) forge();
   EXPECT_EQ(num_answering(), 1U);
@@ -170,7 +165,7 @@ TEST_F(Twins, AStartIsNotPreventedByOneMessageButByOneThatGoesOn) {
   {
     Program program(relay());
     // Repetitions of one message count as one.
-    elder.utime = now_us();
+    elder.utime = wall_clock_us();
     ASSERT_TRUE(ask_until(
         [&] {
           bus_.publish(kProcessInfo, elder);
@@ -181,7 +176,7 @@ TEST_F(Twins, AStartIsNotPreventedByOneMessageButByOneThatGoesOn) {
   Program program(relay());
   ask_until(
       [&] {
-        elder.utime = now_us();
+        elder.utime = wall_clock_us();
         bus_.publish(kProcessInfo, elder);
         bus_.handle(std::chrono::milliseconds(20));
       },

@@ -7,6 +7,7 @@
 #include <cmath>
 #include <map>
 
+#include "common/text/text.h"
 #include "processes/model_monitor/adaptation.h"
 #include "processes/model_monitor/chapter_adaptation.h"
 #include "tests/experiments/figures/experiment.h"
@@ -123,9 +124,8 @@ Findings false_alarms(const Setup& setup) {
       all.seconds += w.seconds;
     }
     const int total = num_robots * num_samples;
-    std::string kinds;
-    for (const auto& [kind, count] : all.kinds)
-      kinds += fmt::format("{}{} {}", kinds.empty() ? "" : ", ", count, kind);
+    const std::string kinds = listed(
+        all.kinds, [](const auto& kind) { return fmt::format("{} {}", kind.second, kind.first); });
     table.add({noise, fmt::format("{:g}", c.noise_factor), std::to_string(total), "–",
                short_number(theirs), std::to_string(all.num_alarms), kinds.empty() ? "–" : kinds,
                short_number(1e5 * wilson_upper_bound(std::min(all.num_alarms, total), total)),

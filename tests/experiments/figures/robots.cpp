@@ -8,6 +8,7 @@
 #include <numeric>
 
 #include "common/geometry/angle.h"
+#include "common/text/text.h"
 #include "processes/structure_learner/baseline/fit_matrix_gp.h"
 #include "tests/experiments/figures/statistics.h"
 
@@ -134,13 +135,10 @@ std::string Judgements::text() const {
 }
 
 std::string structure_of(const BodySchema& schema) {
-  std::string result;
-  for (const Edge& edge : schema.edges) {
-    std::string names;
-    for (const int s : edge.signals())
-      names += (names.empty() ? "" : ", ") + schema.signals.at(static_cast<std::size_t>(s)).name;
-    result += fmt::format("{}{}–{} {{{}}}", result.empty() ? "" : ", ", edge.from, edge.to, names);
-  }
+  const auto name_of = [&](int signal) { return schema.signals.at(signal).name; };
+  const std::string result = listed(schema.edges, [&](const Edge& edge) {
+    return fmt::format("{}–{} {{{}}}", edge.from, edge.to, listed(edge.signals(), name_of));
+  });
   return result.empty() ? "nothing" : result;
 }
 

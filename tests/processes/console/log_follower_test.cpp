@@ -18,15 +18,15 @@ struct Shown {
   LogFollower follower;
 
   bool read(const std::filesystem::path& file) {
-    return follower.read(file, [&](const LogEvent& event, const std::filesystem::path& from,
-                                   std::int64_t byte) {
-      EXPECT_EQ(from, file);
-      // The event can be found again.
-      LogReader reader(file, OnDamage::kThrow, byte);
-      EXPECT_TRUE(reader.next());
-      EXPECT_EQ(reader.event().data, event.data);
-      channels.push_back(event.channel);
-    });
+    return follower.read(
+        file, [&](const LogEvent& event, const std::filesystem::path& from, std::int64_t byte) {
+          EXPECT_EQ(from, file);
+          // The event can be found again.
+          LogReader reader(file, OnDamage::kThrow, byte);
+          EXPECT_TRUE(reader.next());
+          EXPECT_EQ(reader.event().data, event.data);
+          channels.push_back(event.channel);
+        });
   }
 };
 
@@ -80,7 +80,8 @@ TEST(LogFollower, ADamagedLogIsReadUpToThereAndSaysSo) {
   Shown shown;
   EXPECT_TRUE(shown.read(folder / "log"));
   EXPECT_EQ(shown.channels.size(), 1U);
-  EXPECT_NE(shown.follower.summaries().at(folder / "log").damage.find("damaged"), std::string::npos);
+  EXPECT_NE(shown.follower.summaries().at(folder / "log").damage.find("damaged"),
+            std::string::npos);
   // It stays so, however it grows.
   bytes.push_back(0);
   write_bytes(folder / "log", bytes);

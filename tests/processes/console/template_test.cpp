@@ -5,7 +5,6 @@
 namespace bodyschema {
 namespace {
 
-
 TEST(EscapeTest, LeavesNoMarkup) {
   EXPECT_EQ(escape_html("<a href='x'>\"&\x01</a>"),
             "&lt;a href=&#39;x&#39;&gt;&quot;&amp; &lt;/a&gt;");

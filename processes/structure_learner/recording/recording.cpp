@@ -1,5 +1,6 @@
-#include "processes/console/recording.h"
+#include "processes/structure_learner/recording/recording.h"
 
+#include <fmt/format.h>
 #include <sys/mman.h>
 #include <unistd.h>
 #include <zlib.h>
@@ -22,7 +23,7 @@
 #include "common/config/rig.h"
 #include "common/geometry/angle.h"
 #include "common/schema/retained_samples.h"
-#include "processes/console/hint.h"
+#include "common/text/text.h"
 #include "processes/structure_learner/learn.h"
 
 namespace bodyschema {
@@ -125,36 +126,35 @@ class Row {
   std::size_t size() const { return fields_.size(); }
   std::string_view operator[](std::size_t i) const { return fields_[i]; }
 
-  RecordingError error(std::size_t i, const std::string& expected) const {
+  RecordingError error(std::size_t i, std::string expected, bool tells_field = false) const {
+    if (tells_field) expected += ", found '" + abbreviated(fields_[i]) + "'";
     const std::size_t column = i < columns_.size() ? columns_[i] : columns_.back();
-    return RecordingError(file_ + ":" + std::to_string(number_) + ":" + std::to_string(column) +
-                          ": " + expected);
+    return RecordingError(fmt::format("{}:{}:{}: {}", file_, number_, column, expected));
   }
 
   double number(std::size_t i, const std::string& name) const {
-    double value = 0;
-    const std::string_view field = fields_[i];
-    const auto [end, problem] = std::from_chars(field.data(), field.data() + field.size(), value);
-    if (problem != std::errc() || end != field.data() + field.size() || !std::isfinite(value)) {
-      throw error(i, name + ": expected a finite number, found '" + abbreviated(field) + "'");
-    }
-    if (std::abs(value) > kLargest) {
-      throw error(i, name + ": expected a number within ±1e12, found '" + abbreviated(field) + "'");
-    }
-    return value;
+    const auto value = parsed<double>(i);
+    if (!value || !std::isfinite(*value)) throw error(i, name + ": expected a finite number", true);
+    if (std::abs(*value) > kLargest)
+      throw error(i, name + ": expected a number within ±1e12", true);
+    return *value;
   }
 
   int integer(std::size_t i, const std::string& name) const {
-    int value = 0;
-    const std::string_view field = fields_[i];
-    const auto [end, problem] = std::from_chars(field.data(), field.data() + field.size(), value);
-    if (problem != std::errc() || end != field.data() + field.size() || value < 0) {
-      throw error(i, name + ": expected a whole number from 0, found '" + abbreviated(field) + "'");
-    }
-    return value;
+    const auto value = parsed<int>(i);
+    if (!value || *value < 0) throw error(i, name + ": expected a whole number from 0", true);
+    return *value;
   }
 
  private:
+  template <class Value>
+  std::optional<Value> parsed(std::size_t i) const {
+    Value value{};
+    const char *begin = fields_[i].data(), *end = begin + fields_[i].size();
+    const auto [stop, problem] = std::from_chars(begin, end, value);
+    return problem == std::errc() && stop == end ? std::optional(value) : std::nullopt;
+  }
+
   std::size_t number_;
   const std::string& file_;
   std::vector<std::string_view> fields_;
@@ -199,20 +199,19 @@ std::string decimal_comma_hint(std::string_view line) {
 
 Header parse_header(const Row& row, const std::string& hint) {
   Header header;
-  if (row[0] != "t") {
+  if (row[0] != "t")
     throw row.error(
-        0, "expected the header t,q1,...,qm,part,x,y,z,qw,qx,qy,qz[,sp_m,sr_deg], found '" +
-               abbreviated(row[0]) + "'" + hint);
-  }
+        0, fmt::format("expected the header t,q1,...,qm,part,x,y,z,qw,qx,qy,qz[,sp_m,sr_deg], "
+                       "found '{}'{}",
+                       abbreviated(row[0]), hint));
   std::size_t i = 1;
   std::set<std::string> names;
   for (; i < row.size() && row[i] != "part"; ++i) {
     if (row[i].empty()) throw row.error(i, "expected the name of an action signal");
     if (as_text(std::string(row[i])) != row[i])
       throw row.error(i, "expected the name of an action signal in UTF-8");
-    if (!names.insert(std::string(row[i])).second) {
-      throw row.error(i, "the name '" + std::string(row[i]) + "' stands twice");
-    }
+    if (!names.insert(std::string(row[i])).second)
+      throw row.error(i, fmt::format("the name '{}' stands twice", row[i]));
     header.signals.emplace_back(row[i]);
   }
   if (i == row.size()) throw row.error(i, "expected a column 'part' after the action signals");
@@ -232,9 +231,8 @@ Header parse_header(const Row& row, const std::string& hint) {
   }
   if (i < row.size()) {
     for (const char* name : {"sp_m", "sr_deg"}) {
-      if (i == row.size() || row[i] != name) {
-        throw row.error(i, std::string("expected the column '") + name + "' or nothing");
-      }
+      if (i == row.size() || row[i] != name)
+        throw row.error(i, fmt::format("expected the column '{}' or nothing", name));
       ++i;
     }
     header.has_noise = true;
@@ -250,18 +248,19 @@ PartObservation parse_observation(const Row& row, const Header& header) {
   double pose[7];
   for (std::size_t k = 0; k < kPoseColumns.size(); ++k) pose[k] = row.number(i++, kPoseColumns[k]);
   const Eigen::Quaterniond q(pose[3], pose[4], pose[5], pose[6]);
-  if (std::abs(q.norm() - 1) > kUnitTolerance) {
-    throw row.error(header.part + 4, "qw,qx,qy,qz: expected a unit quaternion, found norm " +
-                                         std::to_string(q.norm()));
-  }
+  if (std::abs(q.norm() - 1) > kUnitTolerance)
+    throw row.error(
+        header.part + 4,
+        fmt::format("qw,qx,qy,qz: expected a unit quaternion, found norm {:f}", q.norm()));
   observation.X_CB = make_pose(q, {pose[0], pose[1], pose[2]});
   if (header.has_noise) {
-    const double position = row.number(i, "sp_m");
-    if (position <= 0) throw row.error(i, "sp_m: expected a standard deviation above 0");
-    const double rotation = row.number(++i, "sr_deg") * kDegree;
-    if (rotation <= 0) throw row.error(i, "sr_deg: expected a standard deviation above 0");
-    observation.covariance.diagonal() << Eigen::Vector3d::Constant(position * position),
-        Eigen::Vector3d::Constant(rotation * rotation);
+    Noise noise;
+    noise.position_m = row.number(i, "sp_m");
+    if (noise.position_m <= 0) throw row.error(i, "sp_m: expected a standard deviation above 0");
+    noise.rotation_rad = row.number(++i, "sr_deg") * kDegree;
+    if (noise.rotation_rad <= 0)
+      throw row.error(i, "sr_deg: expected a standard deviation above 0");
+    observation.covariance = isotropic(noise);
   }
   return observation;
 }
@@ -293,24 +292,15 @@ void add_row(const Row& row, std::size_t number, const Header& header, Instants&
   const Eigen::VectorXd& first = recording.samples[instant.sample].action;
   for (std::size_t i = 0; i < header.signals.size(); ++i) {
     if (action[i] == first[i]) continue;
-    throw row.error(i + 1, header.signals[i] + ": expected the value of line " +
-                               std::to_string(instant.line) +
-                               ", which has the same t: one instant has one action");
+    throw row.error(i + 1, fmt::format("{}: expected the value of line {}, which has the same t: "
+                                       "one instant has one action",
+                                       header.signals[i], instant.line));
   }
   auto& parts = recording.samples[instant.sample].parts;
-  if (std::any_of(parts.begin(), parts.end(),
-                  [&](const auto& other) { return other.part == observation.part; })) {
+  if (recording.samples[instant.sample].find(observation.part))
     throw row.error(header.part,
-                    "part " + std::to_string(observation.part) + " stands twice at this instant");
-  }
+                    fmt::format("part {} stands twice at this instant", observation.part));
   parts.push_back(std::move(observation));
-}
-
-void sort_parts(Recording& recording) {
-  for (ActionPoseSample& sample : recording.samples) {
-    std::stable_sort(sample.parts.begin(), sample.parts.end(),
-                     [](const auto& a, const auto& b) { return a.part < b.part; });
-  }
 }
 
 Recording read_samples(const std::filesystem::path& file, const std::string& name) {
@@ -320,54 +310,43 @@ Recording read_samples(const std::filesystem::path& file, const std::string& nam
   recording.measurement = measurement_of(name);
   LogReport report;
   const std::vector<sample_t> messages = read_log(file, kSample, &report);
-  if (messages.empty()) {
-    throw RecordingError(
-        name + ": expected SAMPLE messages, found none in " + counted(report.events, "event") +
-        (report.truncated_at_byte ? "; it ends in the middle of an event at byte " +
-                                        std::to_string(*report.truncated_at_byte)
-                                  : ""));
-  }
-  if (report.truncated_at_byte) {
-    recording.damage = name + ": ends in the middle of an event at byte " +
-                       std::to_string(*report.truncated_at_byte) + "; the " +
-                       std::to_string(messages.size()) + " SAMPLEs before it are used";
-  }
+  std::string cut;
+  if (report.truncated_at_byte)
+    cut = fmt::format("ends in the middle of an event at byte {}", *report.truncated_at_byte);
+  if (messages.empty())
+    throw RecordingError(fmt::format("{}: expected SAMPLE messages, found none in {}{}", name,
+                                     counted(report.events, "event"),
+                                     cut.empty() ? "" : "; it " + cut));
+  if (!cut.empty())
+    recording.damage =
+        fmt::format("{}: {}; the {} SAMPLEs before it are used", name, cut, messages.size());
   // Samples are repeated, and sent again later where somebody missed them.
   std::map<std::int64_t, const sample_t*> by_index;
   for (const sample_t& message : messages) by_index.try_emplace(message.sample_index, &message);
   int num_alone = 0;
-  for (const auto& [index, first] : by_index) {
-    const sample_t& message = *first;
-    ActionPoseSample sample = from_message(message);
-    num_alone += num_positions_alone(message);
-    if (!recording.samples.empty() &&
-        sample.calibration_id != recording.samples.front().calibration_id) {
+  for (const auto& [index, message] : by_index) {
+    ActionPoseSample& sample = recording.samples.emplace_back(from_message(*message));
+    const ActionPoseSample& first = recording.samples.front();
+    num_alone += num_positions_alone(*message);
+    if (sample.calibration_id != first.calibration_id)
       throw RecordingError(
-          name + ": sample " + std::to_string(message.sample_index) +
-          " is of another calibration of the tags or lens than the first: markers.yaml or the "
-          "camera's calibration changed in between; make a new run");
-    }
-    sample.sample_index = static_cast<std::int64_t>(recording.samples.size());
-    if (!recording.samples.empty() &&
-        sample.action.size() != recording.samples.front().action.size()) {
-      throw RecordingError(name + ": sample " + std::to_string(message.sample_index) + " has " +
-                           std::to_string(sample.action.size()) +
-                           " action signals, the first one " +
-                           std::to_string(recording.samples.front().action.size()));
-    }
-    recording.samples.push_back(std::move(sample));
+          fmt::format("{}: sample {} is of another calibration of the tags or lens than the first: "
+                      "markers.yaml "
+                      "or the camera's calibration changed in between; make a new run",
+                      name, index));
+    if (sample.action.size() != first.action.size())
+      throw RecordingError(fmt::format("{}: sample {} has {} action signals, the first one {}",
+                                       name, index, sample.action.size(), first.action.size()));
+    sample.sample_index = std::ssize(recording.samples) - 1;
   }
-  if (num_alone > 0) {
-    recording.hints.push_back(std::to_string(num_alone) +
-                              " observations left out: position alone, without an orientation");
-  }
+  if (num_alone > 0)
+    recording.hints.push_back(
+        fmt::format("{} observations left out: position alone, without an orientation", num_alone));
   const auto num_signals = recording.samples.front().action.size();
   const std::vector<body_schema_t> schemas = read_log(file, kBodySchema);
-  if (!schemas.empty() && schemas.back().num_signals == num_signals) {
-    recording.signals = from_message(schemas.back()).signals;
-  } else {
-    recording.signals = observed_signals(recording.samples);
-  }
+  recording.signals = !schemas.empty() && schemas.back().num_signals == num_signals
+                          ? from_message(schemas.back()).signals
+                          : observed_signals(recording.samples);
   return recording;
 }
 
@@ -398,15 +377,13 @@ std::vector<ActionPoseSample> Recording::training() const {
 std::vector<ActionPoseSample> samples_by_signals(const Recording& recording,
                                                  const std::vector<Signal>& signals) {
   const auto names = [](const std::vector<Signal>& of) {
-    std::string text;
-    for (const Signal& signal : of) text += (text.empty() ? "" : ", ") + signal.name;
-    return of.empty() ? "none" : text;
+    return of.empty() ? "none" : listed(of, [](const Signal& signal) { return signal.name; });
   };
   std::vector<ActionPoseSample> samples = recording.samples;
   if (recording.is_log) {
     if (recording.signals.size() == signals.size()) return samples;
-    throw std::invalid_argument("the samples have " + std::to_string(recording.signals.size()) +
-                                " action signals, the schema " + std::to_string(signals.size()));
+    throw std::invalid_argument(fmt::format("the samples have {} action signals, the schema {}",
+                                            recording.signals.size(), signals.size()));
   }
   std::vector<Eigen::Index> columns;
   for (const Signal& signal : signals) {
@@ -414,11 +391,11 @@ std::vector<ActionPoseSample> samples_by_signals(const Recording& recording,
                                      [&](const Signal& s) { return s.name == signal.name; });
     if (column != recording.signals.end()) columns.push_back(column - recording.signals.begin());
   }
-  if (columns.size() != signals.size() || signals.size() != recording.signals.size()) {
-    throw std::invalid_argument("the signals of the samples are " + names(recording.signals) +
-                                "; those of the schema " + names(signals) +
-                                ": name the columns as the schema does");
-  }
+  if (columns.size() != signals.size() || signals.size() != recording.signals.size())
+    throw std::invalid_argument(
+        fmt::format("the signals of the samples are {}; those of the schema {}: name the columns "
+                    "as the schema does",
+                    names(recording.signals), names(signals)));
   for (ActionPoseSample& sample : samples) sample.action = sample.action(columns).eval();
   return samples;
 }
@@ -444,18 +421,19 @@ Recording parse_csv(const std::string& text, const std::string& name) {
       recording.has_noise = header->has_noise;
       continue;
     }
-    if (row.size() != header->size()) {
-      // At the first field too many, or at the last one there is.
+    // At the first field too many, or at the last one there is.
+    if (row.size() != header->size())
       throw row.error(header->size(),
-                      "expected " + std::to_string(header->size()) + " fields, found " +
-                          std::to_string(row.size()) + separator_hint(line) +
-                          (row.size() > header->size() ? decimal_comma_hint(line) : ""));
-    }
+                      fmt::format("expected {} fields, found {}{}{}", header->size(), row.size(),
+                                  separator_hint(line),
+                                  row.size() > header->size() ? decimal_comma_hint(line) : ""));
     add_row(row, number, *header, instants, recording);
   }
   if (!header) throw RecordingError(name + ":1:1: expected a header line, found an empty file");
   if (recording.samples.empty()) throw RecordingError(name + ":2:1: expected at least one row");
-  sort_parts(recording);
+  for (ActionPoseSample& sample : recording.samples)
+    std::sort(sample.parts.begin(), sample.parts.end(),
+              [](const auto& a, const auto& b) { return a.part < b.part; });
   const std::vector<Signal> observed = observed_signals(recording.samples);
   for (std::size_t i = 0; i < observed.size(); ++i) {
     recording.signals[i].lower = observed[i].lower;

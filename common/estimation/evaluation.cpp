@@ -1,4 +1,6 @@
-#include "processes/console/evaluation.h"
+#include "common/estimation/evaluation.h"
+
+#include <fmt/format.h>
 
 #include <Eigen/Cholesky>
 #include <algorithm>
@@ -14,8 +16,7 @@ namespace bodyschema {
 namespace {
 
 struct Errors {
-  std::vector<double> position_m;
-  std::vector<double> rotation_rad;
+  std::vector<double> position_m, rotation_rad;
 };
 
 double rms(const std::vector<double>& values) {
@@ -26,9 +27,8 @@ double rms(const std::vector<double>& values) {
 
 void check_signals(const BodySchema& schema, const ActionPoseSample& sample) {
   if (sample.action.size() == static_cast<int>(schema.signals.size())) return;
-  throw std::invalid_argument("the samples have " + std::to_string(sample.action.size()) +
-                              " action signals, the schema " +
-                              std::to_string(schema.signals.size()));
+  throw std::invalid_argument(fmt::format("the samples have {} action signals, the schema {}",
+                                          sample.action.size(), schema.signals.size()));
 }
 
 constexpr double kPositionUnit_m = 0.001;
@@ -148,8 +148,7 @@ std::optional<Alignment> align(const BodySchema& schema,
   for (int i = 0; i < kSteps; ++i) {
     AlignmentStep step(result);
     for (const Pair& pair : pairs) step.add(pair.part, pair.predicted, pair.truth);
-    Alignment next = step.solved();
-    result = std::move(next);
+    result = Alignment(step.solved());
   }
   return result;
 }

@@ -1,4 +1,4 @@
-#include "processes/console/evaluation.h"
+#include "common/estimation/evaluation.h"
 
 #include <gtest/gtest.h>
 

@@ -1,4 +1,4 @@
-#include "processes/console/recording.h"
+#include "processes/structure_learner/recording/recording.h"
 
 #include <gtest/gtest.h>
 #include <unistd.h>

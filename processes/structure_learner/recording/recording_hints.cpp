@@ -4,7 +4,7 @@
 #include <utility>
 
 #include "common/estimation/quantile.h"
-#include "processes/console/recording.h"
+#include "processes/structure_learner/recording/recording.h"
 
 namespace bodyschema {
 namespace {
