@@ -6,6 +6,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <map>
 #include <set>
 #include <span>
 #include <string_view>
@@ -251,6 +252,21 @@ void check_together(Checker& check, const part_observation_t& m) {
 void check_together(Checker& check, const sample_t& m) {
   check.require(m.rest_begin_utime <= m.rest_end_utime, "rest_end_utime",
                 "is before rest_begin_utime");
+  std::map<std::int32_t, std::set<std::int32_t>> tags_of;
+  std::int32_t previous = -1;
+  check.each("parts", m.parts, [&](const part_observation_t& part) {
+    check.require(part.part_id > std::exchange(previous, part.part_id), "part_id",
+                  "is not ascending");
+    for (const tag_corners_t& tag : part.tags) tags_of[part.part_id].insert(tag.tag_id);
+  });
+  previous = -1;
+  check.each("contradictions", m.contradictions, [&](const part_observation_t& part) {
+    check.require(part.part_id >= std::exchange(previous, part.part_id), "part_id", "descends");
+    check.require(part.num_tags == 1, "num_tags", "is not 1");
+    if (check.problem().empty())
+      check.require(tags_of[part.part_id].insert(part.tags.front().tag_id).second, "tags",
+                    "repeats a tag");
+  });
 }
 
 void check_together(Checker& check, const signal_t& m) {

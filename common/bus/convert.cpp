@@ -66,6 +66,45 @@ Matrix8d from_message(const float (&message)[36]) {
   return invertible(unpack_triangle<8>(message));
 }
 
+namespace {
+
+/// Those with a rotation.
+std::vector<PartObservation> from_messages(const std::vector<part_observation_t>& messages) {
+  std::vector<PartObservation> observations;
+  for (const part_observation_t& message : messages) {
+    if (message.has_rotation == 0) continue;
+    PartObservation& observation = observations.emplace_back();
+    observation.part = message.part_id;
+    observation.X_CB = from_message(message.X_CB);
+    observation.covariance = from_message(message.covariance);
+    if (message.has_other == 1) observation.X_CB_other = from_message(message.X_CB_other);
+    observation.error_ratio = message.error_ratio;
+    for (const tag_corners_t& tag : message.tags) observation.tags.push_back(tag.tag_id);
+  }
+  return observations;
+}
+
+std::vector<part_observation_t> to_messages(const std::vector<PartObservation>& observations) {
+  std::vector<part_observation_t> messages;
+  for (const PartObservation& observation : observations) {
+    part_observation_t& part = messages.emplace_back();
+    part.part_id = observation.part;
+    part.X_CB = to_message(observation.X_CB);
+    part.has_rotation = 1;
+    to_message(observation.covariance, part.covariance);
+    part.has_other = observation.X_CB_other ? 1 : 0;
+    part.X_CB_other = to_message(observation.X_CB_other.value_or(observation.X_CB));
+    part.error_ratio = observation.X_CB_other ? observation.error_ratio : 0;
+    part.num_frames = 1;
+    std::vector<tag_corners_t> tags;
+    for (const int id : observation.tags) tags.emplace_back().tag_id = id;
+    set_array(part.num_tags, part.tags, std::move(tags));
+  }
+  return messages;
+}
+
+}  // namespace
+
 ActionPoseSample from_message(const sample_t& message) {
   ActionPoseSample sample;
   sample.utime = message.utime;
@@ -74,16 +113,8 @@ ActionPoseSample from_message(const sample_t& message) {
   sample.action = Eigen::Map<const Eigen::VectorXd>(
       message.action.data(), static_cast<Eigen::Index>(message.action.size()));
   sample.calibration_id = message.calibration_id;
-  for (const part_observation_t& part : message.parts) {
-    if (part.has_rotation == 0) continue;
-    PartObservation& observation = sample.parts.emplace_back();
-    observation.part = part.part_id;
-    observation.X_CB = from_message(part.X_CB);
-    observation.covariance = from_message(part.covariance);
-    if (part.has_other == 1) observation.X_CB_other = from_message(part.X_CB_other);
-    observation.error_ratio = part.error_ratio;
-    for (const tag_corners_t& tag : part.tags) observation.tags.push_back(tag.tag_id);
-  }
+  sample.parts = from_messages(message.parts);
+  sample.contradictions = from_messages(message.contradictions);
   return sample;
 }
 
@@ -101,22 +132,8 @@ sample_t to_message(const ActionPoseSample& sample) {
   message.purpose = static_cast<std::int8_t>(sample.purpose);
   set_array(message.num_signals, message.action,
             std::vector<double>(sample.action.begin(), sample.action.end()));
-  std::vector<part_observation_t> parts;
-  for (const PartObservation& observation : sample.parts) {
-    part_observation_t& part = parts.emplace_back();
-    part.part_id = observation.part;
-    part.X_CB = to_message(observation.X_CB);
-    part.has_rotation = 1;
-    to_message(observation.covariance, part.covariance);
-    part.has_other = observation.X_CB_other ? 1 : 0;
-    part.X_CB_other = to_message(observation.X_CB_other.value_or(observation.X_CB));
-    part.error_ratio = observation.X_CB_other ? observation.error_ratio : 0;
-    part.num_frames = 1;
-    std::vector<tag_corners_t> tags;
-    for (const int id : observation.tags) tags.emplace_back().tag_id = id;
-    set_array(part.num_tags, part.tags, std::move(tags));
-  }
-  set_array(message.num_parts, message.parts, std::move(parts));
+  set_array(message.num_parts, message.parts, to_messages(sample.parts));
+  set_array(message.num_contradictions, message.contradictions, to_messages(sample.contradictions));
   return message;
 }
 

@@ -135,12 +135,13 @@ std::string RigDoor::objection(const motion_status_t& status) const {
 
 std::string RigDoor::objection(const sample_t& sample) const {
   std::string why_not = objection_to_signals(sample.action.size());
-  for (const part_observation_t& part : sample.parts) {
-    if (why_not.empty()) why_not = objection_to_part(part.part_id);
-    for (const tag_corners_t& corners : part.tags) {
-      const TagPlacement* tag = markers_.find(corners.tag_id);
-      if (why_not.empty() && (!tag || tag->part != part.part_id)) {
-        why_not = fmt::format("tag {} does not belong to part {}", corners.tag_id, part.part_id);
+  for (const auto* observations : {&sample.parts, &sample.contradictions}) {
+    for (const part_observation_t& part : *observations) {
+      if (why_not.empty()) why_not = objection_to_part(part.part_id);
+      for (const tag_corners_t& corners : part.tags) {
+        const TagPlacement* tag = markers_.find(corners.tag_id);
+        if (why_not.empty() && (!tag || tag->part != part.part_id))
+          why_not = fmt::format("tag {} does not belong to part {}", corners.tag_id, part.part_id);
       }
     }
   }

@@ -137,21 +137,15 @@ std::vector<MovedTag> BodySchema::moved_tags_known(std::int64_t sample_index) co
   return known;
 }
 
-bool rests_on_moved_tags(const PartObservation& observation, std::int64_t sample_index,
-                         const std::vector<MovedTag>& moved) {
-  const auto has_moved = [&](int id) {
-    return std::any_of(moved.begin(), moved.end(), [&](const MovedTag& tag) {
-      return tag.tag == id && tag.since <= sample_index &&
-             (tag.until < 0 || sample_index < tag.until);
-    });
-  };
-  return std::any_of(observation.tags.begin(), observation.tags.end(), has_moved);
+bool has_moved(const std::vector<MovedTag>& moved, int tag, std::int64_t sample_index) {
+  return std::any_of(moved.begin(), moved.end(), [&](const MovedTag& m) {
+    return m.tag == tag && m.since <= sample_index && (m.until < 0 || sample_index < m.until);
+  });
 }
 
 void drop_moved_tags(const std::vector<MovedTag>& moved, ActionPoseSample* sample) {
-  std::erase_if(sample->parts, [&](const PartObservation& observation) {
-    return rests_on_moved_tags(observation, sample->sample_index, moved);
-  });
+  if (moved.empty()) return;
+  sample->leave_out([&](int tag) { return has_moved(moved, tag, sample->sample_index); });
 }
 
 bool BodySchema::has_part(int part) const {

@@ -200,10 +200,9 @@ struct BodySchema {
   std::optional<Eigen::MatrixXd> jacobian(int from, int to, const Eigen::VectorXd& action) const;
 };
 
-/// Whether what a sample says of a part rests on a tag that had moved by then.
-bool rests_on_moved_tags(const PartObservation& observation, std::int64_t sample_index,
-                         const std::vector<MovedTag>& moved);
-/// Leaves out what rests on them.
+/// By then.
+bool has_moved(const std::vector<MovedTag>& moved, int tag, std::int64_t sample_index);
+/// The sample as if tags that had moved had not been seen.
 void drop_moved_tags(const std::vector<MovedTag>& moved, ActionPoseSample* sample);
 
 }  // namespace bodyschema

@@ -1,6 +1,7 @@
 #pragma once
 
 #include <cstdint>
+#include <functional>
 #include <optional>
 #include <vector>
 
@@ -40,10 +41,17 @@ struct ActionPoseSample {
   Purpose purpose = Purpose::kTrain;
   /// Action signals q_1..q_m in command units.
   Eigen::VectorXd action;
-  /// Seen parts only, ascending part id, each at most once.
+  /// Seen parts only, by the tags that agree; ascending part id, each at most once.
   std::vector<PartObservation> parts;
+  /// By a single tag each that disagrees with the part's others. Where no two agree the part is
+  /// only here. Ascending part id, then tag.
+  std::vector<PartObservation> contradictions;
 
   const PartObservation* find(int part) const;
+  /// As if such tags had not been seen: of those of a part that contradict each other the only one
+  /// that is left is believed.
+  const PartObservation* find_without(const std::function<bool(int tag)>& is_such, int part) const;
+  void leave_out(const std::function<bool(int tag)>& is_such);
 };
 
 /// TEST samples judge, those of the controller follow its model.

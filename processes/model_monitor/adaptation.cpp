@@ -3,13 +3,16 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <map>
 #include <set>
 #include <stdexcept>
+#include <utility>
 
 #include "common/estimation/chi_square.h"
 #include "common/estimation/quantile.h"
 #include "common/geometry/angle.h"
 #include "processes/model_monitor/changes/drift.h"
+#include "processes/model_monitor/reading_distance.h"
 #include "processes/model_monitor/schema_difference.h"
 
 namespace bodyschema {
@@ -42,11 +45,32 @@ void check(const ActionPoseSample& sample, const BodySchema& schema) {
   if (!schema.displacements(sample.action).allFinite())
     throw std::invalid_argument("sample " + std::to_string(sample.sample_index) +
                                 ": the action is not finite");
-  for (const PartObservation& o : sample.parts)
-    if (!o.X_CB.matrix().allFinite() || !o.covariance.allFinite() ||
-        (o.X_CB_other && !o.X_CB_other->matrix().allFinite()))
-      throw std::invalid_argument("sample " + std::to_string(sample.sample_index) + ", part " +
-                                  std::to_string(o.part) + ": the pose is not finite");
+  for (const auto* observations : {&sample.parts, &sample.contradictions})
+    for (const PartObservation& o : *observations)
+      if (!o.X_CB.matrix().allFinite() || !o.covariance.allFinite() ||
+          (o.X_CB_other && !o.X_CB_other->matrix().allFinite()))
+        throw std::invalid_argument("sample " + std::to_string(sample.sample_index) + ", part " +
+                                    std::to_string(o.part) + ": the pose is not finite");
+}
+
+/// Of the tags of a part that contradict each other it believes the one that is nearest to where
+/// the schema has the part, if no two agree.
+void believe_nearest(const BodySchema& schema, const MeasurementModel& measurement,
+                     ActionPoseSample* sample) {
+  if (sample->contradictions.empty()) return;
+  const auto X_RB = schema.predict_all(sample->action);
+  std::map<int, std::pair<double, const PartObservation*>> nearest;
+  for (const PartObservation& o : sample->contradictions) {
+    const auto expected = X_RB.find(o.part);
+    if (sample->find(o.part) || expected == X_RB.end()) continue;
+    const double d2 =
+        ReadingDistance(measurement.covariance(o))(schema.X_CR * expected->second, o.X_CB);
+    const auto [known, is_new] = nearest.try_emplace(o.part, d2, &o);
+    if (!is_new && d2 < known->second.first) known->second = {d2, &o};
+  }
+  for (const auto& [part, of_part] : nearest) sample->parts.push_back(*of_part.second);
+  std::sort(sample->parts.begin(), sample->parts.end(),
+            [](const PartObservation& a, const PartObservation& b) { return a.part < b.part; });
 }
 
 }  // namespace
@@ -369,7 +393,8 @@ void Adaptation::watch_tags(ActionPoseSample* sample, std::vector<AdaptationEven
       }
     }
   }
-  std::erase_if(sample->parts, [this](const PartObservation& o) { return tags_.affects(o); });
+  sample->leave_out([this](int tag) { return tags_.has_moved(tag); });
+  believe_nearest(schema_, measurement_, sample);
 }
 
 /// What a moved tag was taken for meanwhile.
@@ -381,9 +406,7 @@ void Adaptation::take_back(const MovedTags::Finding& moved, std::int64_t sample_
     return !place.marker && edge && edge->from == moved.part;
   };
   const auto clean = [&](ActionPoseSample* sample) {
-    std::erase_if(sample->parts, [&](const PartObservation& o) {
-      return std::find(o.tags.begin(), o.tags.end(), moved.tag) != o.tags.end();
-    });
+    sample->leave_out([&](int tag) { return tag == moved.tag; });
   };
   tracker_.take_back(is_at_it, moved.since, clean, sample_index, events);
 }
@@ -404,7 +427,9 @@ void Adaptation::drop_fallen(ActionPoseSample* sample, std::vector<AdaptationEve
     if (!since) continue;
     int num_missed = 0;
     const auto drop = [&, part = part](ActionPoseSample* from) {
-      std::erase_if(from->parts, [part](const PartObservation& o) { return o.part == part; });
+      const auto is_of_it = [part](const PartObservation& o) { return o.part == part; };
+      std::erase_if(from->parts, is_of_it);
+      std::erase_if(from->contradictions, is_of_it);
       ++num_missed;
     };
     drop(sample);

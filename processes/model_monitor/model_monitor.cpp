@@ -55,8 +55,8 @@ std::vector<Pose> hypotheses(const PartObservation& part) {
 /// What a sample shows of a part, unless it rests on tags that had moved.
 const PartObservation* sighting(const ActionPoseSample& sample, int part,
                                 const std::vector<MovedTag>& moved) {
-  const PartObservation* seen = sample.find(part);
-  return seen && !rests_on_moved_tags(*seen, sample.sample_index, moved) ? seen : nullptr;
+  return sample.find_without([&](int tag) { return has_moved(moved, tag, sample.sample_index); },
+                             part);
 }
 
 }  // namespace

@@ -2,7 +2,9 @@
 
 #include <algorithm>
 #include <cmath>
+#include <iterator>
 #include <numeric>
+#include <set>
 
 namespace bodyschema {
 namespace {
@@ -20,19 +22,24 @@ std::vector<VisibilityWatch::Finding> VisibilityWatch::look(const std::vector<in
                                                             const MovedTags& moved) {
   std::vector<Finding> findings;
   for (const int part : parts) {
-    const PartObservation* observation = seen.find(part);
-    // A marker that lies somewhere is none; a tag that moved is still one.
-    if (observation && !used.find(part) && !moved.affects(*observation)) observation = nullptr;
-    count(part, kAnyTag, observation, &findings);
+    // A tag that lies somewhere is none; one that moved is.
+    std::set<int> tags;
+    for (const auto* observations : {&seen.parts, &seen.contradictions})
+      for (const PartObservation& o : *observations)
+        if (o.part == part)
+          std::copy_if(o.tags.begin(), o.tags.end(), std::inserter(tags, tags.end()),
+                       [&](int tag) { return !moved.is_lying(tag); });
+    const bool is_seen = used.find(part) || std::any_of(tags.begin(), tags.end(), [&](int tag) {
+                           return moved.has_moved(tag);
+                         });
+    count(part, kAnyTag, is_seen, &findings);
     // An arm that holds still or is led shows one side of its parts for as long.
-    if (!observation || seen.purpose == Purpose::kControl) continue;
-    const std::vector<int>& tags = observation->tags;
+    if (!is_seen || seen.purpose == Purpose::kControl) continue;
     auto& of_part = counts_[part];
     for (const int tag : tags) of_part[tag];
     if (of_part.size() < 3) continue;  // its only tag is the part's marker
     for (const auto& [tag, _] : of_part)
-      if (tag != kAnyTag && !moved.has_moved(tag))
-        count(part, tag, std::find(tags.begin(), tags.end(), tag) != tags.end(), &findings);
+      if (tag != kAnyTag && !moved.has_moved(tag)) count(part, tag, tags.contains(tag), &findings);
   }
   return findings;
 }

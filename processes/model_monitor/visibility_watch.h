@@ -26,7 +26,7 @@ class VisibilityWatch {
     int num_missed = 0;       ///< samples in a row
   };
   /// `seen`: all of a sample; `used`: without what is not believed, which says that a part was not
-  /// seen unless it rests on one of the `moved` tags. Those are not looked for.
+  /// seen unless one of the `moved` tags shows it. Those are not looked for.
   std::vector<Finding> look(const std::vector<int>& parts, const ActionPoseSample& seen,
                             const ActionPoseSample& used, const MovedTags& moved);
   /// A part that lies somewhere: its marker is missing, and was in the last `num_missed` samples.

@@ -166,6 +166,28 @@ std::optional<sample_t> Observer::make_sample() {
   return std::nullopt;
 }
 
+namespace {
+
+part_observation_t observation_of(int part, const PartPose& pose,
+                                  const std::map<int, tag_corners_t>& corners_of_tag,
+                                  std::int32_t num_frames) {
+  part_observation_t message{};
+  message.part_id = part;
+  message.X_CB = to_message(pose.X_CB);
+  message.has_rotation = 1;
+  to_message(pose.covariance, message.covariance);
+  message.has_other = pose.X_CB_other ? 1 : 0;
+  message.X_CB_other = to_message(pose.X_CB_other.value_or(pose.X_CB));
+  message.error_ratio = pose.error_ratio;
+  message.num_frames = num_frames;
+  std::vector<tag_corners_t> corners;
+  for (const int id : pose.tags) corners.push_back(corners_of_tag.at(id));
+  set_array(message.num_tags, message.tags, std::move(corners));
+  return message;
+}
+
+}  // namespace
+
 sample_t Observer::sample_from(const Rest& rest, const std::vector<const marker_poses_t*>& frames) {
   // The same tag in all frames.
   std::map<int, std::vector<const marker_pose_t*>> sightings;
@@ -226,27 +248,16 @@ sample_t Observer::sample_from(const Rest& rest, const std::vector<const marker_
     corners_of_tag[id] = mean;
   }
 
-  std::vector<part_observation_t> parts;
+  std::vector<part_observation_t> parts, contradictions;
   for (auto& [part, tags] : tags_of_part) {
-    const auto pose = solve_part_pose(std::move(tags), config_.part_pose, next_index_);
-    if (!pose) {
-      ++counters_["part without a pose"];
-      continue;
-    }
-    counters_["tag disagrees with its part"] += static_cast<std::int64_t>(pose->dropped.size());
-    part_observation_t observation{};
-    observation.part_id = part;
-    observation.X_CB = to_message(pose->X_CB);
-    observation.has_rotation = 1;
-    to_message(pose->covariance, observation.covariance);
-    observation.has_other = pose->X_CB_other ? 1 : 0;
-    observation.X_CB_other = to_message(pose->X_CB_other.value_or(pose->X_CB));
-    observation.error_ratio = pose->error_ratio;
-    observation.num_frames = static_cast<std::int32_t>(frames_of_part[part].size());
-    std::vector<tag_corners_t> corners;
-    for (const int id : pose->used) corners.push_back(corners_of_tag[id]);
-    set_array(observation.num_tags, observation.tags, std::move(corners));
-    parts.push_back(std::move(observation));
+    const PartPoses poses = solve_part_pose(std::move(tags), config_.part_pose);
+    const auto num_frames = static_cast<std::int32_t>(frames_of_part[part].size());
+    if (poses.agreed)
+      parts.push_back(observation_of(part, *poses.agreed, corners_of_tag, num_frames));
+    for (const PartPose& pose : poses.contradictions)
+      contradictions.push_back(observation_of(part, pose, corners_of_tag, num_frames));
+    counters_["tag disagrees with its part"] += std::ssize(poses.contradictions);
+    if (!poses.agreed && poses.contradictions.empty()) ++counters_["part without a pose"];
   }
 
   const motion_status_t& status = rest.status;
@@ -263,6 +274,7 @@ sample_t Observer::sample_from(const Rest& rest, const std::vector<const marker_
   set_array(sample.num_signals, sample.action, status.commanded);
   num_parts_ = static_cast<int>(parts.size());
   set_array(sample.num_parts, sample.parts, std::move(parts));
+  set_array(sample.num_contradictions, sample.contradictions, std::move(contradictions));
   ++num_samples_;
   return sample;
 }

@@ -82,55 +82,82 @@ double worst_tag_error(const Pose& X_CB, const std::vector<SeenTag>& tags) {
   return worst;
 }
 
-}  // namespace
-
-std::optional<PartPose> solve_part_pose(std::vector<SeenTag> tags, const PartPoseOptions& options,
-                                        std::int64_t turn) {
-  PartPose result;
-  std::vector<PoseFit> minima = minima_of(tags, options.calibration);
-  while (!minima.empty() && worst_tag_error(minima[0].X_CB, tags) > options.max_tag_error_px) {
-    if (tags.size() == 1) return std::nullopt;
+/// Takes the tags that disagree with the others out of `tags`, and returns them. `minima`: of those
+/// that stay, none if not even one fits.
+std::vector<SeenTag> take_out_disagreeing(const PartPoseOptions& options,
+                                          std::vector<SeenTag>* tags,
+                                          std::vector<PoseFit>* minima) {
+  std::vector<SeenTag> disagreeing;
+  *minima = minima_of(*tags, options.calibration);
+  while (!minima->empty() && worst_tag_error((*minima)[0].X_CB, *tags) > options.max_tag_error_px) {
+    if (tags->size() == 1) {
+      minima->clear();
+      break;
+    }
     // The tag with the largest residual need not be the wrong one: it may be the only right one far
     // from the others. So each is left out in turn.
-    double best_error = std::numeric_limits<double>::infinity();
-    std::size_t culprit = 0, num_fitting = 0;
-    std::vector<std::vector<PoseFit>> without;
-    for (std::size_t i = 0; i < tags.size(); ++i) {
-      std::vector<SeenTag> others = tags;
+    double least_rms = std::numeric_limits<double>::infinity();
+    std::size_t culprit = 0;
+    std::vector<PoseFit> without_culprit;
+    for (std::size_t i = 0; i < tags->size(); ++i) {
+      std::vector<SeenTag> others = *tags;
       others.erase(others.begin() + static_cast<std::ptrdiff_t>(i));
-      without.push_back(minima_of(others, options.calibration));
-      if (without[i].empty()) continue;
-      num_fitting += worst_tag_error(without[i][0].X_CB, others) <= options.max_tag_error_px;
-      if (without[i][0].rms_sigma >= best_error) continue;
-      best_error = without[i][0].rms_sigma;
+      std::vector<PoseFit> without = minima_of(others, options.calibration);
+      if (without.empty() || without[0].rms_sigma >= least_rms) continue;
+      least_rms = without[0].rms_sigma;
       culprit = i;
+      without_culprit = std::move(without);
     }
-    if (tags.size() == 2 && num_fitting == 2) culprit = turn % 2 == 0 ? 0 : 1;
-    result.dropped.push_back(tags[culprit].id);
-    tags.erase(tags.begin() + static_cast<std::ptrdiff_t>(culprit));
-    minima = std::move(without[culprit]);
+    disagreeing.push_back(std::move((*tags)[culprit]));
+    tags->erase(tags->begin() + static_cast<std::ptrdiff_t>(culprit));
+    *minima = std::move(without_culprit);
   }
+  return disagreeing;
+}
+
+std::optional<PartPose> pose_from(const std::vector<PoseFit>& minima,
+                                  const std::vector<SeenTag>& tags,
+                                  const PartPoseOptions& options) {
   if (minima.empty()) return std::nullopt;
   const auto covariance = covariance_from(minima[0].information);
   if (!covariance) return std::nullopt;
+  PartPose result;
   result.X_CB = minima[0].X_CB;
   result.covariance = *covariance;
-  for (std::size_t i = 1; i < minima.size(); ++i) {
-    if (rotation_angle(result.X_CB.inverse() * minima[i].X_CB) < options.min_other_rotation_rad) {
-      continue;
-    }
-    // Errors far below the noise are not informative, and 0 would make any ratio infinite.
-    constexpr double kLeast = 1e-2;
-    const double ratio =
-        std::max(minima[i].rms_sigma, kLeast) / std::max(minima[0].rms_sigma, kLeast);
-    if (ratio <= options.max_error_ratio) {
-      result.X_CB_other = minima[i].X_CB;
-      result.error_ratio = ratio;
-    }
-    break;
+  for (const SeenTag& tag : tags) result.tags.push_back(tag.id);
+  const auto other = std::find_if(minima.begin() + 1, minima.end(), [&](const PoseFit& m) {
+    return rotation_angle(result.X_CB.inverse() * m.X_CB) >= options.min_other_rotation_rad;
+  });
+  if (other == minima.end()) return result;
+  // Errors far below the noise are not informative, and 0 would make any ratio infinite.
+  constexpr double kLeast = 1e-2;
+  const double ratio = std::max(other->rms_sigma, kLeast) / std::max(minima[0].rms_sigma, kLeast);
+  if (ratio <= options.max_error_ratio) {
+    result.X_CB_other = other->X_CB;
+    result.error_ratio = ratio;
   }
-  for (const SeenTag& tag : tags) result.used.push_back(tag.id);
-  std::sort(result.dropped.begin(), result.dropped.end());
+  return result;
+}
+
+}  // namespace
+
+PartPoses solve_part_pose(std::vector<SeenTag> tags, const PartPoseOptions& options) {
+  PartPoses result;
+  std::vector<PoseFit> minima;
+  for (const SeenTag& tag : take_out_disagreeing(options, &tags, &minima)) {
+    std::vector<SeenTag> alone{tag};
+    std::vector<PoseFit> of_it;
+    take_out_disagreeing(options, &alone, &of_it);
+    if (auto pose = pose_from(of_it, alone, options))
+      result.contradictions.push_back(std::move(*pose));
+  }
+  result.agreed = pose_from(minima, tags, options);
+  if (result.agreed && tags.size() == 1 && !result.contradictions.empty()) {
+    result.contradictions.push_back(std::move(*result.agreed));
+    result.agreed.reset();
+  }
+  std::sort(result.contradictions.begin(), result.contradictions.end(),
+            [](const PartPose& a, const PartPose& b) { return a.tags < b.tags; });
   return result;
 }
 

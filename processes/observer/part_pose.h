@@ -32,17 +32,21 @@ struct PartPose {
   Matrix6d covariance = Matrix6d::Zero();  ///< (translation [m], rotation [rad]), right, in B
   std::optional<Pose> X_CB_other;          ///< the best other minimum, if it is a hypothesis
   double error_ratio = 0;                  ///< its reprojection error over that of X_CB, ≥ 1
-  std::vector<int> used;                   ///< ids of the tags it rests on, ascending
-  std::vector<int> dropped;                ///< ids of the tags that disagreed
+  std::vector<int> tags;                   ///< ids of those it rests on, ascending
+};
+
+/// What the tags of a part say of its pose.
+struct PartPoses {
+  std::optional<PartPose> agreed;        ///< by those that agree
+  std::vector<PartPose> contradictions;  ///< by each of the others alone; ascending id
 };
 
 /// The pose of a part over all its tags at once: the minimum of the reprojection error of all
 /// corners, searched from every hypothesis of every tag. Tags in different planes leave one
 /// minimum; a single tag seen from afar has two. While a tag disagrees with the common pose the one
-/// whose absence helps most is dropped. If two tags each fit alone, either may be the wrong one:
-/// the one or the other is used in turn, so that a process that knows the body can decide.
-/// std::nullopt if no tag is left that fits.
-std::optional<PartPose> solve_part_pose(std::vector<SeenTag> tags, const PartPoseOptions& options,
-                                        std::int64_t turn = 0);
+/// whose absence helps most is taken out. Where no two tags agree, though each fits a pose alone,
+/// none is believed: a process that knows the body may decide.
+/// `tags`: ascending id.
+PartPoses solve_part_pose(std::vector<SeenTag> tags, const PartPoseOptions& options);
 
 }  // namespace bodyschema

@@ -62,11 +62,7 @@ SharedSamples StructureLearner::of_this_body(std::int64_t sample_index) {
   }
   SharedSamples samples = samples_.between(since, sample_index);
   for (auto& sample : samples) {
-    const bool is_touched =
-        std::any_of(sample->parts.begin(), sample->parts.end(), [&](const PartObservation& o) {
-          return rests_on_moved_tags(o, sample->sample_index, online_moved_);
-        });
-    if (!is_touched) continue;
+    if (online_moved_.empty()) break;
     auto clean = std::make_shared<ActionPoseSample>(*sample);
     drop_moved_tags(online_moved_, clean.get());
     sample = std::move(clean);

@@ -238,14 +238,15 @@ sample_t example_sample() {
   message.rest_end_utime = 1'000'007;
   fill(message.num_signals, message.action, {0.25, -0.5});
   std::vector<part_observation_t> parts;
-  for (const int id : {0, 3}) {
+  for (const int id : {0, 3, 4}) {
     part_observation_t& part = parts.emplace_back();
     part.part_id = id;
     part.X_CB = pose(id);
     part.has_rotation = 1;
     covariance(part.covariance);
     part.has_other = id == 3 ? 1 : 0;
-    part.X_CB_other = pose(id == 3 ? 4 : 0);
+    part.X_CB_other = pose(id);
+    if (id == 3) part.X_CB_other = pose(4);
     part.error_ratio = id == 3 ? 2.5 : 0;
     part.num_frames = 3;
     tag_corners_t tag{};
@@ -254,6 +255,10 @@ sample_t example_sample() {
     corner_covariance(tag.corner_covariance);
     fill(part.num_tags, part.tags, {tag});
   }
+  // Part 3 by tag 13, and otherwise by tag 14.
+  parts.back().part_id = 3;
+  fill(message.num_contradictions, message.contradictions, {parts.back()});
+  parts.pop_back();
   fill(message.num_parts, message.parts, parts);
   return message;
 }

@@ -241,6 +241,21 @@ TEST(Check, IdsAscendInTheirOwnArray) {
   EXPECT_EQ(check(sample), "");
 }
 
+TEST(Check, ContradictionsAreOfOneTagEachThatIsNowhereElse) {
+  const auto refuses = [](auto spoil) {
+    sample_t sample = example_sample();
+    spoil(sample);
+    return check(sample);
+  };
+  EXPECT_EQ(refuses([](sample_t& m) { m.parts[1].part_id = m.parts[0].part_id; }),
+            "parts[1].part_id: is not ascending");
+  EXPECT_EQ(refuses([](sample_t& m) { m.contradictions[0].tags[0].tag_id = 13; }),
+            "contradictions[0].tags: repeats a tag");
+  EXPECT_EQ(refuses([](sample_t& m) { m.contradictions[0].num_tags = 0; }).substr(0, 17),
+            "contradictions[0]");
+  EXPECT_EQ(refuses([](sample_t& m) { m.contradictions[0].part_id = 7; }), "");  // seen so alone
+}
+
 TEST(Check, AcceptsASingularCovarianceAndOneWithVeryDifferentUnits) {
   sample_t sample = example_sample();
   for (int i = 0, k = 0; i < 6; ++i) {

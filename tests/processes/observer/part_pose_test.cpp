@@ -74,7 +74,7 @@ TEST(SolvePartPose, IsBetterOverSeveralTagsThanOverOne) {
   for (int i = 0; i < kViews; ++i) {
     const Pose X_CB = X_CB_of(random);
     for (const int num_tags : {1, 2, 3}) {
-      const auto pose = solve_part_pose(seen_box(X_CB, num_tags, 0.1, random), options());
+      const auto pose = solve_part_pose(seen_box(X_CB, num_tags, 0.1, random), options()).agreed;
       ASSERT_TRUE(pose);
       squares[num_tags] += (pose->X_CB.translation() - X_CB.translation()).squaredNorm();
     }
@@ -110,9 +110,9 @@ TEST(SolvePartPose, HasACovarianceThatIsConsistentWithTagsThatAreOff) {
         tags.push_back(seen(n, X_CB, box()[n] * exp(moved), 0.02, random, size_m));
         tags.back().X_BM = box()[n];
       }
-      const auto pose = solve_part_pose(tags, off);
+      const auto pose = solve_part_pose(tags, off).agreed;
       ASSERT_TRUE(pose);
-      if (static_cast<int>(pose->used.size()) < num_tags) continue;
+      if (static_cast<int>(pose->tags.size()) < num_tags) continue;
       const Vector6d e = log(pose->X_CB.inverse() * X_CB);
       sum += e.dot(pose->covariance.inverse() * e);
       ++count;
@@ -136,7 +136,8 @@ TEST(SolvePartPose, TagsThatAreOffDoWhatTheMeasurementModelSays) {
       X_BM.translation().x() = num_tags == 1 ? 0 : 0.1 * n - 0.05;
       tags.push_back(seen(n, X_CB, X_BM, 0.02, random));
     }
-    const auto with = solve_part_pose(tags, off), without = solve_part_pose(tags, options());
+    const auto with = solve_part_pose(tags, off).agreed,
+               without = solve_part_pose(tags, options()).agreed;
     ASSERT_TRUE(with && without);
     const Matrix6d added = with->covariance - without->covariance;
     const auto effect =
@@ -158,7 +159,7 @@ TEST(SolvePartPose, HasACovarianceThatIsConsistentWithGaussianCornerNoise) {
       constexpr int kViews = 300;
       for (int i = 0; i < kViews; ++i) {
         const Pose X_CB = X_CB_of(random);
-        const auto pose = solve_part_pose(seen_box(X_CB, num_tags, 0.1, random), options());
+        const auto pose = solve_part_pose(seen_box(X_CB, num_tags, 0.1, random), options()).agreed;
         ASSERT_TRUE(pose);
         const Vector6d error = log(pose->X_CB.inverse() * X_CB);
         sum += error.dot(pose->covariance.inverse() * error);
@@ -177,7 +178,8 @@ TEST(SolvePartPose, TellsTheOtherPoseOfASingleDistantTagButNotOfTagsInTwoPlanes)
     Pose X_CB = Pose::Identity();
     X_CB.linear() = exp_so3(Eigen::Vector3d(0.2, 0.15, 0));
     X_CB.translation() = Eigen::Vector3d(0, 0, 2);
-    const auto single = solve_part_pose({seen(0, X_CB, Pose::Identity(), 0.3, random)}, options());
+    const auto single =
+        solve_part_pose({seen(0, X_CB, Pose::Identity(), 0.3, random)}, options()).agreed;
     ASSERT_TRUE(single);
     if (single->X_CB_other) {
       ++num_other_single;
@@ -189,7 +191,7 @@ TEST(SolvePartPose, TellsTheOtherPoseOfASingleDistantTagButNotOfTagsInTwoPlanes)
     } else {
       EXPECT_EQ(single->error_ratio, 0);
     }
-    const auto two = solve_part_pose(seen_box(X_CB_of(random), 2, 0.1, random), options());
+    const auto two = solve_part_pose(seen_box(X_CB_of(random), 2, 0.1, random), options()).agreed;
     ASSERT_TRUE(two);
     num_other_two += two->X_CB_other.has_value();
   }
@@ -197,7 +199,7 @@ TEST(SolvePartPose, TellsTheOtherPoseOfASingleDistantTagButNotOfTagsInTwoPlanes)
   EXPECT_EQ(num_other_two, 0);
 }
 
-TEST(SolvePartPose, DropsTheTagThatDisagrees) {
+TEST(SolvePartPose, TakesOutTheTagThatDisagrees) {
   std::mt19937 random(4);
   for (int i = 0; i < 20; ++i) {
     const Pose X_CB = X_CB_of(random);
@@ -205,42 +207,45 @@ TEST(SolvePartPose, DropsTheTagThatDisagrees) {
     Pose moved = X_CB;
     moved.translation().x() += 0.02;
     tags[i % 3] = seen(i % 3, moved, box()[i % 3], 0.1, random);
-    const auto pose = solve_part_pose(tags, options(), i);  // no matter whose turn it is
-    ASSERT_TRUE(pose);
-    EXPECT_EQ(pose->dropped, std::vector<int>{i % 3});
-    EXPECT_EQ(pose->used.size(), 2u);
-    EXPECT_LT((pose->X_CB.translation() - X_CB.translation()).norm(), 3e-3);
+    const auto [agreed, contradictions] = solve_part_pose(tags, options());
+    ASSERT_TRUE(agreed);
+    EXPECT_EQ(agreed->tags.size(), 2u);
+    EXPECT_LT((agreed->X_CB.translation() - X_CB.translation()).norm(), 3e-3);
+    ASSERT_EQ(contradictions.size(), 1u);
+    EXPECT_EQ(contradictions[0].tags, std::vector<int>{i % 3});
+    EXPECT_LT((contradictions[0].X_CB.translation() - moved.translation()).norm(), 1e-2);
   }
 }
 
-TEST(SolvePartPose, OfTwoTagsThatDisagreeGivesTheOneOrTheOtherByTurns) {
+TEST(SolvePartPose, BelievesNoneOfTwoTagsThatDisagree) {
   std::mt19937 random(7);
   const Pose X_CB = X_CB_of(random);
   std::vector<SeenTag> tags = seen_box(X_CB, 2, 0.1, random);
   Pose moved = X_CB;
   moved.translation().x() += 0.02;
   tags[0] = seen(0, moved, box()[0], 0.1, random);
-  for (int turn = 0; turn < 4; ++turn) {
-    const auto pose = solve_part_pose(tags, options(), turn);
-    ASSERT_TRUE(pose);
-    EXPECT_EQ(pose->dropped, std::vector<int>{turn % 2});
-    EXPECT_EQ(pose->used, std::vector<int>{1 - turn % 2});
+  const auto [agreed, contradictions] = solve_part_pose(tags, options());
+  EXPECT_FALSE(agreed);
+  ASSERT_EQ(contradictions.size(), 2u);
+  for (int i = 0; i < 2; ++i) {
+    const Pose& by_it = i == 0 ? moved : X_CB;
+    EXPECT_EQ(contradictions[i].tags, std::vector<int>{i});
+    EXPECT_LT((contradictions[i].X_CB.translation() - by_it.translation()).norm(), 1e-2);
   }
-  // A tag that fits no pose is the wrong one.
+  // A tag that fits no pose contradicts nobody.
   tags[0].corners[0].ray.x() += 20 / kFocal_px;
-  for (int turn = 0; turn < 2; ++turn) {
-    const auto pose = solve_part_pose(tags, options(), turn);
-    ASSERT_TRUE(pose);
-    EXPECT_EQ(pose->dropped, std::vector<int>{0});
-  }
+  const PartPoses by_one = solve_part_pose(tags, options());
+  ASSERT_TRUE(by_one.agreed);
+  EXPECT_EQ(by_one.agreed->tags, std::vector<int>{1});
+  EXPECT_TRUE(by_one.contradictions.empty());
 }
 
 TEST(SolvePartPose, GivesNothingForATagThatFitsNoPose) {
   std::mt19937 random(6);
   SeenTag tag = seen(0, X_CB_of(random), Pose::Identity(), 0.1, random);
   tag.corners[0].ray.x() += 20 / kFocal_px;
-  EXPECT_FALSE(solve_part_pose({tag}, options()));
-  EXPECT_FALSE(solve_part_pose({}, options()));
+  EXPECT_FALSE(solve_part_pose({tag}, options()).agreed);
+  EXPECT_FALSE(solve_part_pose({}, options()).agreed);
 }
 
 }  // namespace
