@@ -248,9 +248,9 @@ TEST(Check, ContradictionsAreOfOneTagEachThatIsNowhereElse) {
     return check(sample);
   };
   EXPECT_EQ(refuses([](sample_t& m) { m.parts[1].part_id = m.parts[0].part_id; }),
-            "parts[1].part_id: is not ascending");
+            "parts[1].part_id is not ascending");
   EXPECT_EQ(refuses([](sample_t& m) { m.contradictions[0].tags[0].tag_id = 13; }),
-            "contradictions[0].tags: repeats a tag");
+            "contradictions[0].tags repeats a tag");
   EXPECT_EQ(refuses([](sample_t& m) { m.contradictions[0].num_tags = 0; }).substr(0, 17),
             "contradictions[0]");
   EXPECT_EQ(refuses([](sample_t& m) { m.contradictions[0].part_id = 7; }), "");  // seen so alone

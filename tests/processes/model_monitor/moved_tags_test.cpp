@@ -27,6 +27,18 @@ class MovedTagsTest : public testing::Test {
     o.covariance = 1e-6 * Matrix6d::Identity();
     return sample;
   }
+  /// In one picture the one tag has the part in its place, the other elsewhere: on the part, or at
+  /// a place of its own in the room.
+  ActionPoseSample contradictory(std::int64_t index, bool is_lying) const {
+    ActionPoseSample sample = seen(index, kTag, false);
+    if (is_lying) {
+      const Eigen::VectorXd home = Eigen::VectorXd::Zero(7);
+      sample.parts[0].X_CB = schema_.X_CR * schema_.predict_all(home).at(kPart);
+    }
+    sample.contradictions = {sample.parts[0], seen(index, kOther, true).parts[0]};
+    sample.parts.clear();
+    return sample;
+  }
   std::vector<MovedTags::Finding> look(MovedTags* tags, const ActionPoseSample& sample) const {
     return tags->look(sample, schema_, schema_, {});
   }
@@ -78,6 +90,38 @@ TEST_F(MovedTagsTest, OneThatIsAloneInTheWrongPlaceHasMoved) {
   ASSERT_EQ(findings.size(), 1U);
   EXPECT_EQ(findings[0].tag, kTag);
   EXPECT_EQ(findings[0].since, 0);
+}
+
+TEST_F(MovedTagsTest, OneThatOthersContradictInThreePicturesHasMoved) {
+  for (const bool is_lying : {false, true}) {
+    MovedTags tags({});
+    std::vector<MovedTags::Finding> findings;
+    for (int n = 1; n < 4; ++n) {
+      EXPECT_TRUE(findings.empty()) << n;
+      findings = look(&tags, contradictory(n, is_lying));
+    }
+    ASSERT_EQ(findings.size(), 1U);
+    EXPECT_EQ(findings[0].tag, kTag);
+    EXPECT_EQ(findings[0].since, 1);
+    EXPECT_EQ(findings[0].is_on_part, !is_lying);
+    EXPECT_EQ(tags.is_lying(kTag), is_lying);
+    EXPECT_FALSE(tags.has_moved(kOther));
+  }
+}
+
+/// What lies in the room shows nothing of the part, however long it alone is seen.
+TEST_F(MovedTagsTest, OneThatLiesInTheRoomIsNotTakenBack) {
+  MovedTags tags({});
+  for (int n = 1; n < 4; ++n) look(&tags, contradictory(n, true));
+  ASSERT_TRUE(tags.is_lying(kTag));
+  for (int n = 4; n < 100; ++n) {
+    ActionPoseSample sample = contradictory(n, true);
+    sample.contradictions.pop_back();
+    EXPECT_TRUE(look(&tags, sample).empty()) << n;
+  }
+  for (int n = 100; n < 103; ++n)
+    EXPECT_EQ(look(&tags, seen(n, kTag, true)).size(), n == 102 ? 1U : 0U) << n;
+  EXPECT_FALSE(tags.has_moved(kTag));
 }
 
 /// Where other tags of its part are elsewhere too, each time somewhere else, the body is wrong.
