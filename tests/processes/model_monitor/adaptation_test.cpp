@@ -697,6 +697,67 @@ TEST_P(FourTagsAPart, OneThatIsLostIsNamedAndThePartIsNotMissedForLong) {
   EXPECT_GE(of_tag[1].sample_index, kRepaired);
 }
 
+/// The camera sees two neighbours of four tags at a time, and always those that lie in the room.
+TEST_P(FourTagsAPart, TwoThatFallOneAfterTheOtherAndLieInSightAreNamedOnceEach) {
+  const Noise noise = test::nominal_noise(Regime::kTagIso);
+  const auto lying = [&](int tag) {
+    PartObservation o;
+    o.part = kPart;
+    o.tags = {tag};
+    o.X_CB.translation() << 0.4, 0.1 * (tag - kTag), 1.5;
+    Vector6d error = test::gaussian6(rng_);
+    error.head<3>() *= noise.position_m;
+    error.tail<3>() *= noise.rotation_rad;
+    o.X_CB = o.X_CB * exp(error);
+    return o;
+  };
+  Life life;
+  for (int t = 0; t < kEnd; ++t) {
+    ActionPoseSample sample = arm_.observe(t);
+    std::vector<int> fallen;
+    for (const int tag : {kTag, kTag + 1})
+      if (t >= kBroken + 50 * (tag - kTag) && t < kRepaired) fallen.push_back(tag);
+    std::vector<PartObservation> readings;
+    if (const PartObservation* seen = sample.find(kPart)) {
+      PartObservation& o = readings.emplace_back(*seen);
+      const int side = static_cast<int>(test::uniform(rng_, 0, 4));
+      o.tags.clear();
+      for (const int i : {side, (side + 1) % 4})
+        if (std::find(fallen.begin(), fallen.end(), 10 * kPart + i) == fallen.end())
+          o.tags.push_back(10 * kPart + i);
+      std::sort(o.tags.begin(), o.tags.end());
+      if (o.tags.empty()) readings.clear();
+    }
+    for (const int tag : fallen) readings.push_back(lying(tag));
+    // As the observer has it.
+    std::erase_if(sample.parts, [](const PartObservation& o) { return o.part == kPart; });
+    for (PartObservation& o : readings) {
+      o.X_CB_other.reset();
+      const bool is_agreed = readings.size() == 1 || o.tags.size() > 1;
+      (is_agreed ? sample.parts : sample.contradictions).push_back(std::move(o));
+    }
+    std::sort(sample.parts.begin(), sample.parts.end(),
+              [](const PartObservation& a, const PartObservation& b) { return a.part < b.part; });
+    for (const auto& e : adaptation_.on_sample(sample)) life.events.push_back(e);
+    life.error.push_back(arm_.error(adaptation_.schema(), t));
+  }
+  SCOPED_TRACE("events:\n" + life.log());
+  std::map<int, std::vector<AdaptationEvent>> of_tag;
+  for (const AdaptationEvent& e : life.events) of_tag[e.tag].push_back(e);
+  for (const int tag : {kTag, kTag + 1}) {
+    ASSERT_EQ(of_tag[tag].size(), 2U) << tag;
+    EXPECT_EQ(of_tag[tag][0].kind, Kind::kMissing);
+    EXPECT_LT(of_tag[tag][0].sample_index, kBroken + 50 * (tag - kTag) + 20);
+    EXPECT_EQ(of_tag[tag][1].kind, Kind::kRecovered);
+    EXPECT_GE(of_tag[tag][1].sample_index, kRepaired);
+    EXPECT_LT(of_tag[tag][1].sample_index, kRepaired + 40);
+    of_tag.erase(tag);
+  }
+  for (const auto& [tag, events] : of_tag) EXPECT_LE(events.size(), 2U) << tag;
+  for (std::size_t t = kBroken + 20; t < kEnd; ++t)
+    EXPECT_NEAR(life.error[t], life.error[kBroken - 1], 1e-3) << t;
+}
+
 /// A part that now is where it should be and now is not, whatever tag shows it.
 TEST_P(FourTagsAPart, NoneHasMovedWhereTheBodyIsWrong) {
   for (const Fault fault : {Fault::kStuck, Fault::kGain, Fault::kWorn, Fault::kElastic}) {
