@@ -389,9 +389,6 @@ void Adaptation::watch_tags(ActionPoseSample* sample, std::vector<AdaptationEven
         visibility_.forget(finding.part, finding.tag);
       } else {
         set_aside(finding.tag, finding.since, sample->sample_index);
-        // Fewer tags show less of the part.
-        if (!visibility_.is_missing(finding.part))
-          visibility_.forget(finding.part, VisibilityWatch::kAnyTag);
         take_back(finding, sample->sample_index, events);
       }
     }
