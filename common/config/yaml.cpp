@@ -64,6 +64,16 @@ std::string outside(double value, double lowest, double highest) {
   return text.str();
 }
 
+/// `line` counts from 0.
+bool is_indented_by_tab(const std::string& text, int line) {
+  std::istringstream stream(text);
+  std::string found;
+  while (line-- >= 0 && std::getline(stream, found)) {
+  }
+  const std::size_t first = found.find_first_not_of(" \t");
+  return found.find('\t') < first;
+}
+
 }  // namespace
 
 std::string did_you_mean(const std::string& word, const std::set<std::string>& known) {
@@ -88,7 +98,10 @@ YAML::Node only_document(const std::string& text, const std::string& name) {
     return document;
   } catch (const YAML::Exception& problem) {
     throw ConfigError(name + ":" + std::to_string(problem.mark.line + 1) + ":" +
-                      std::to_string(problem.mark.column + 1) + ": " + problem.msg);
+                      std::to_string(problem.mark.column + 1) + ": " + problem.msg +
+                      (is_indented_by_tab(text, problem.mark.line)
+                           ? "; the line begins with a tab, YAML wants spaces"
+                           : ""));
   }
 }
 
@@ -178,7 +191,10 @@ double Yaml::number(const std::string& key, double lowest, double highest) const
   try {
     value = child(key).as<double>();
   } catch (const YAML::Exception&) {
-    throw error(key, "expected a number");
+    const YAML::Node node = child(key);
+    const bool has_comma = node.IsScalar() && node.Scalar().find(',') != std::string::npos;
+    throw error(
+        key, has_comma ? "expected a number, with a point and not a comma" : "expected a number");
   }
   if (!std::isfinite(value)) throw error(key, "expected a finite number");
   if (value < lowest || value > highest) throw error(key, outside(value, lowest, highest));

@@ -1,5 +1,7 @@
 #include "processes/motor_babbler/motor_babbler.h"
 
+#include <fmt/format.h>
+
 #include <algorithm>
 #include <cmath>
 #include <random>
@@ -72,8 +74,13 @@ MotorBabblerConfig MotorBabblerConfig::load(const std::filesystem::path& file) {
   config.verdict_timeout_us = microseconds(yaml.number("verdict_timeout_s", 0.1, 3600));
   const Yaml stop = yaml.section("stop");
   config.stop.max_samples = stop.integer("max_samples", 1, 1'000'000);
-  config.stop.min_samples = stop.integer("min_samples", 1, config.stop.max_samples);
-  config.stop.min_test_samples = stop.integer("min_test_samples", 1, config.stop.max_samples);
+  for (const auto& [key, least] : {std::pair{"min_samples", &config.stop.min_samples},
+                                   {"min_test_samples", &config.stop.min_test_samples}}) {
+    *least = stop.integer(key, 1, 1'000'000);
+    if (*least > config.stop.max_samples)
+      throw stop.error(key,
+                       fmt::format("{} is above max_samples, {}", *least, config.stop.max_samples));
+  }
   config.stop.position_m = stop.number("position_m", 0, 10);
   config.stop.rotation_rad = stop.number("rotation_deg", 0, 180) * kDegree;
   yaml.finish();

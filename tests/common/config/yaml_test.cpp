@@ -199,6 +199,14 @@ TEST(YamlTest, BrokenSyntaxIsReportedWithLineAndColumn) {
   EXPECT_TRUE(contains(tab, "f.yaml:3:4: ")) << tab;
 }
 
+TEST(YamlTest, ATabAndADecimalCommaAreNamed) {
+  const std::string tab = error_of([] { Yaml::parse("a:\n\tb: 1\n", "f"); });
+  EXPECT_TRUE(contains(tab, "f:2:")) << tab;
+  EXPECT_TRUE(contains(tab, "begins with a tab")) << tab;
+  EXPECT_CONFIG_ERROR(Yaml::parse("a: 0,5\n", "f").number("a"),
+                      "f:1: a: expected a number, with a point and not a comma");
+}
+
 TEST(YamlTest, AFileThatCannotBeReadIsNamed) {
   const std::string folder = testing::TempDir();
   EXPECT_TRUE(contains(error_of([&] { Yaml::load(folder + "/no_such.yaml"); }),
