@@ -131,7 +131,6 @@ void SampleIntake::hand_on(bool over_gaps) {
       give_up_gap();
     }
     const sample_t sample = std::move(ahead_.extract(ahead_.begin()).mapped());
-    if (sample.sample_index < next_index_) continue;  // the file had filled the gap
     next_index_ = sample.sample_index + 1;
     known_[sample.sample_index] = identity(sample);
     num_unanswered_ = num_repeats_ = 0;

@@ -33,18 +33,6 @@ Pose frontal(double size_m, const std::vector<ImagePoint>& corners) {
   return X;
 }
 
-/// The same tag with its tilt mirrored about the line of sight.
-Pose mirrored(const Pose& X_CM) {
-  const Eigen::Vector3d sight = X_CM.translation().normalized();
-  const Eigen::Vector3d normal = X_CM.linear().col(2);
-  const Eigen::Vector3d axis = normal.cross(sight);
-  if (axis.norm() < 1e-9) return X_CM;
-  Pose X = X_CM;
-  X.linear() =
-      exp_so3(axis.normalized() * (2 * std::asin(std::min(1.0, axis.norm())))) * X_CM.linear();
-  return X;
-}
-
 }  // namespace
 
 std::vector<PoseFit> solve_tag_pose(double size_m, const std::vector<ImagePoint>& corners,
@@ -78,8 +66,6 @@ std::vector<PoseFit> solve_tag_pose(double size_m, const std::vector<ImagePoint>
   };
   for (const Pose& start : starts) descend(start);
   if (minima.empty()) descend(frontal(size_m, corners));
-  // Both closed-form starts may lie in one valley although there is a second.
-  if (minima.size() == 1) descend(mirrored(minima.front().X_CB));
   std::stable_sort(minima.begin(), minima.end(),
                    [](const PoseFit& a, const PoseFit& b) { return a.rms_sigma < b.rms_sigma; });
   if (minima.size() > 2) minima.resize(2);

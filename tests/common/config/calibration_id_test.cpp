@@ -86,5 +86,16 @@ TEST(CalibrationId, EveryRigHasItsOwn) {
     EXPECT_TRUE(ids.insert(calibration_id(std::filesystem::path(CONFIG) / rig)).second);
 }
 
+// A quaternion's sign says nothing, and at 120° rounding decides which one comes of a matrix.
+TEST(CalibrationId, DoesNotDependOnTheSignOfAQuaternion) {
+  std::set<std::int64_t> ids;
+  for (const double angle : {-2 * M_PI / 3 - 1e-13, -2 * M_PI / 3 + 1e-13}) {
+    Calibration c = example();
+    c.markers.tags[1].X_BM = Pose(Eigen::AngleAxisd(angle, Eigen::Vector3d::UnitX()));
+    ids.insert(c.id());
+  }
+  EXPECT_EQ(ids.size(), 1U);
+}
+
 }  // namespace
 }  // namespace bodyschema

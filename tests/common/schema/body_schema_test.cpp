@@ -139,5 +139,16 @@ TEST(ActionPoseSample, FindsAPartOrNothing) {
   EXPECT_EQ(sample.find(5), nullptr);
 }
 
+TEST(BodySchema, AMovedTagIsKnownFromItsFindingOnAndItsEndFromItsEndOn) {
+  BodySchema schema;
+  schema.moved_tags = {{.tag = 41, .found = 20, .since = 10, .until = 50}};
+  EXPECT_TRUE(schema.moved_tags_known(19).empty());
+  for (const auto& [sample, until] : {std::pair{20, -1}, {49, -1}, {50, 50}}) {
+    const auto known = schema.moved_tags_known(sample);
+    ASSERT_EQ(known.size(), 1U) << sample;
+    EXPECT_EQ(known[0].until, until) << sample;
+  }
+}
+
 }  // namespace
 }  // namespace bodyschema

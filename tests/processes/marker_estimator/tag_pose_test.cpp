@@ -160,6 +160,31 @@ TEST(SolveTagPose, HasACovarianceThatIsConsistentWithGaussianCornerNoise) {
   }
 }
 
+// A tag mirrored at the line of sight looks much the same: where that is another minimum, it is
+// found.
+TEST(SolveTagPose, OverlooksNoMirroredMinimum) {
+  std::mt19937 random(9);
+  std::uniform_real_distribution<double> unit(0, 1);
+  int num_single = 0;
+  for (int n = 0; n < 3000; ++n) {
+    const Pose X_CM = marker_pose(0.5 + 2.5 * unit(random), 40 * kDegree * unit(random),
+                                  2 * M_PI * unit(random), 2 * M_PI * unit(random), 0.3, 0.1);
+    const auto points = view(X_CM, 0.3, random);
+    const auto minima = solve_tag_pose(kSize_m, points);
+    if (minima.size() != 1) continue;
+    ++num_single;
+    const Pose& X = minima[0].X_CB;
+    const Eigen::Vector3d sight = X.translation().normalized();
+    const Eigen::Vector3d axis = X.linear().col(2).cross(sight);
+    Pose mirrored = X;
+    mirrored.linear() =
+        exp_so3(axis.normalized() * (2 * std::asin(std::min(1.0, axis.norm())))) * X.linear();
+    const auto fit = fit_pose(mirrored, tag_corners(kSize_m), points);
+    if (fit && tilt_rad(fit->X_CB) < M_PI / 2) EXPECT_TRUE(is_same_minimum(fit->X_CB, X)) << n;
+  }
+  EXPECT_GT(num_single, 10);
+}
+
 TEST(SolveTagPose, GivesNothingForCornersThatAreNoSquare) {
   const ImagePoint point{{0.1, 0.1}, 1000 * Eigen::Matrix2d::Identity(), 1};
   const auto minima = solve_tag_pose(kSize_m, {point, point, point, point});

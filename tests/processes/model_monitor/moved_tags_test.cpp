@@ -168,5 +168,15 @@ TEST_F(MovedTagsTest, TwoOfFourThatMovedAreBothNamed) {
   EXPECT_EQ(named, (std::multiset<int>{kTag, kOther}));
 }
 
+TEST_F(MovedTagsTest, ATagThatIsSeenInItsPlaceDoesNotLieInTheRoom) {
+  MovedTags tags({});
+  int n = 0;
+  for (; n < 20 && !tags.is_lying(kTag); ++n) look(&tags, contradictory(n, true));
+  ASSERT_TRUE(tags.is_lying(kTag));
+  look(&tags, seen(n, kTag, true));
+  EXPECT_FALSE(tags.is_lying(kTag));
+  EXPECT_TRUE(tags.has_moved(kTag));  // once in its place may be chance
+}
+
 }  // namespace
 }  // namespace bodyschema

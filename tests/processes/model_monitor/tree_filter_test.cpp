@@ -296,5 +296,27 @@ TEST_F(TreeFilterTest, RefusesAnActionOfAnotherLength) {
   EXPECT_THROW(filter.prepare(sample_), std::invalid_argument);
 }
 
+// Behind a cut two markers agree or do not, whichever of them the belief is begun from.
+TEST_F(TreeFilterTest, BehindACutTheBeginningsAreAlternatives) {
+  hide(2);
+  hide(3);
+  const TreeFilter filter(schema_, measurement_);
+  const TreeFilter::Instant instant = filter.prepare(sample_);
+  const int top = filter.node_of(2), a = filter.node_of(4), b = filter.node_of(5);
+  const auto at = [](int node) { return static_cast<std::size_t>(node); };
+  const double together = filter.judge(instant, {.cut_edges = {top}}).log_likelihood;
+  hide(4);
+  hide(5);
+  const double rest = filter.judge(filter.prepare(sample_), {.cut_edges = {top}}).log_likelihood;
+  // 5 as seen from 4, by way of 2.
+  const Pose X = instant.seen[at(a)]->X_CB * instant.delta[at(a)].inverse() * instant.delta[at(b)];
+  const Matrix6d F = adjoint(X.inverse() * instant.seen[at(a)]->X_CB);
+  const Matrix6d at_2 = instant.seen[at(a)]->covariance + instant.edge_covariance[at(a)];
+  const Matrix6d S =
+      F * at_2 * F.transpose() + instant.edge_covariance[at(b)] + instant.seen[at(b)]->covariance;
+  const Vector6d y = log(X.inverse() * instant.seen[at(b)]->X_CB);
+  EXPECT_NEAR(together - rest, log_flat_density() + log_normal(y, S), 0.05);
+}
+
 }  // namespace
 }  // namespace bodyschema

@@ -110,5 +110,29 @@ TEST_F(VisibilityWatchTest, WhatIsNotBelievedIsNotSeen) {
   EXPECT_FALSE(other.is_missing(kPart));
 }
 
+TEST(VisibilityWatchOfMany, TheMoreIsWatchedTheLongerEachMayBeMissed) {
+  std::vector<int> misses;
+  for (const int num_parts : {1, 1000}) {
+    VisibilityWatch watch(1e-5);
+    std::vector<int> parts(num_parts);
+    ActionPoseSample all;
+    for (int part = 0; part < num_parts; ++part) {
+      parts[part] = part;
+      all.parts.push_back({.part = part, .tags = {part}});
+    }
+    const MovedTags none({});
+    for (int n = 0; n < 30; ++n) watch.look(parts, all, all, none);
+    ActionPoseSample without = all;
+    without.parts.erase(without.parts.begin());
+    int n = 0;
+    while (!watch.is_missing(0) && n < 1000) {
+      watch.look(parts, without, without, none);
+      ++n;
+    }
+    misses.push_back(n);
+  }
+  EXPECT_GT(misses[1], misses[0]);
+}
+
 }  // namespace
 }  // namespace bodyschema

@@ -131,6 +131,19 @@ TEST(ActionChoiceTest, WhatWasTakenSinceTheSchemaCountsAsLearned) {
   EXPECT_EQ(choose(schema, past, {{0.9, 0}, {0, 0.9}}), 0U);
 }
 
+TEST(ActionChoiceTest, OnlySamplesThatTheSchemaLacksMakeItSurer) {
+  BodySchema schema = hinge();
+  schema.edges[0].parameter_covariance.setZero();
+  schema.edges[0].parameter_covariance(7, 7) = 1e-2;
+  std::vector<SeenAction> past;
+  for (int n = 0; n < 400; ++n)  // no action is new to the residual of the model
+    past.push_back(seen_at(0.1 * (n % 20) - 0.95, 0.1 * (n / 20) - 0.95, {1, 2}));
+  for (int n = 0; n < 60; ++n) past.push_back(seen_at(0.9, 0, {1, 2}));
+  EXPECT_EQ(choose(schema, past, {{0.9, 0}, {0, 0.9}}), 0U);
+  for (int n = 0; n < 60; ++n) past[400 + n].sample_index = schema.last_sample_index + 1 + n;
+  EXPECT_EQ(choose(schema, past, {{0.9, 0}, {0, 0.9}}), 1U);
+}
+
 TEST(ActionChoiceTest, BothPartsOfAnEdgeMustBeSeen) {
   std::vector<SeenAction> past;
   for (int n = 0; n < 10; ++n) {

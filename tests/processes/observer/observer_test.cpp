@@ -277,6 +277,18 @@ TEST(Observer, MixesNoFramesOfTwoRestsOfOneAction) {
   EXPECT_FALSE(observer.on_marker_poses(scene.frame(anew + 1'083'333)));
 }
 
+TEST(Observer, UsesNoFrameOfAMotionThatNoStatusTold) {
+  Observer observer = calibrated();
+  Scene scene;
+  observer.on_motion_status(settled(0));  // at rest until 50 ms later, as far as is known
+  observer.on_marker_poses(scene.frame(kRest_us + 10'000));
+  EXPECT_FALSE(observer.on_motion_status(settled(1, kRest_us + 1'000'000)));
+  EXPECT_FALSE(observer.on_marker_poses(scene.frame(kRest_us + 500'000)));
+  const auto sample = observer.on_marker_poses(scene.frame(kRest_us + 40'000));
+  ASSERT_TRUE(sample);
+  EXPECT_EQ(sample->action_id, 0);
+}
+
 TEST(Observer, GivesUpAnActionWhoseFramesNeverCameWhenALaterOneIsSeen) {
   Observer observer = calibrated();
   Scene scene;

@@ -357,6 +357,20 @@ TEST(TreeFit, CovariancesAreTrueHoweverOftenATagIsSeen) {
   }
 }
 
+// A screw frame may turn about its axis and slide along it: no prediction tells how far.
+TEST(TreeFit, WhatNoPredictionDependsOnIsAsSureAsTheRest) {
+  Rng rng(5);
+  const SyntheticRobot robot = chain(0.1, rng);
+  const Case c(robot, 40, Regime::kTagIso, false, rng);
+  TreeFit fit(c.nodes, c.data, c.actions, true);
+  fit.fit(30, 1e-9);
+  const auto covariance = fit.covariance(c.measurement, 0.1);
+  ASSERT_TRUE(covariance);
+  for (std::size_t k = 1; k < c.nodes.size(); ++k)
+    if (c.nodes[k].model.turn[0] != 0)
+      EXPECT_LT(covariance->models[k].diagonal().maxCoeff(), 1e-3) << k;
+}
+
 TEST(TreeFit, ATreeWhoseRootMovesHasNoCovariance) {
   Rng rng(5);
   const Case c(chain(0.1, rng), 20, Regime::kTag, true, rng);

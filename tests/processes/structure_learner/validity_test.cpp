@@ -94,5 +94,44 @@ TEST(Validity, TwoSamplesAreNotEnough) {
   EXPECT_EQ(rigid_validity(samples, {1e-4, 3e-4}).verdict, Verdict::kNotEnoughData);
 }
 
+// Errors of √12 standard deviations each: no outlier, and along with no signal.
+TEST(Validity, AModelThatIsOffEverywhereIsRefutedThoughNothingIsAnOutlier) {
+  const Noise noise = test::nominal_noise(Regime::kTagIso);
+  for (const auto& [squared_distance, expected] :
+       {std::pair{5.0, Verdict::kValid}, {12.0, Verdict::kRefuted}}) {
+    Rng rng(1);
+    auto samples = test::babble(hinge(0, rng), 60, {Regime::kTagIso}, rng);
+    const Pose z = test::random_pose(rng, 0.1, 0.2);
+    for (ActionPoseSample& sample : samples) {
+      const Vector6d direction = std::sqrt(squared_distance) * test::gaussian6(rng).normalized();
+      const Matrix6d C = relative_covariance(z, isotropic(noise), isotropic(noise));
+      sample.parts[1].X_CB =
+          sample.parts[0].X_CB * z * exp(Vector6d(C.llt().matrixL() * direction));
+    }
+    const Validity v = rigid_validity(samples, noise);
+    EXPECT_EQ(v.num_outliers, 0);
+    EXPECT_EQ(v.verdict, expected) << squared_distance;
+  }
+}
+
+// A screw has more parameters than a few resting poses decide: that it fits them says nothing.
+TEST(Validity, AJointThatFitsFewReadingsOfNoMotionIsNotYetTold) {
+  for (int seed = 1; seed <= 10; ++seed) {
+    Rng rng(seed);
+    const auto samples = test::babble(hinge(0, rng), 5, {Regime::kTagIso}, rng);
+    const NormalizedActions actions(samples, 2);
+    const PairData pair =
+        make_pair_data(samples, 1, 2, {.noise = test::nominal_noise(Regime::kTagIso)}, 2000);
+    LocalModel screw;
+    screw.num_joints = 1;
+    screw.turn[0] = 0.02;
+    screw.A[0] = screen_rigid(pair, actions).model.A[0];
+    const Fit fit = fit_local_model(screw, pair, actions, 40);
+    EXPECT_NE(check_validity(fit, leave_one_out(fit, pair, actions), pair, actions, {}).verdict,
+              Verdict::kValid)
+        << seed;
+  }
+}
+
 }  // namespace
 }  // namespace bodyschema

@@ -1,0 +1,175 @@
+// What class Controller knows of the arm, of what is seen of it and of the schema.
+
+#include <Eigen/Cholesky>
+
+#include "common/bus/convert.h"
+#include "common/estimation/chi_square.h"
+#include "processes/controller/controller.h"
+#include "processes/controller/controller_words.h"
+
+namespace bodyschema {
+namespace {
+
+/// Beyond this squared distance the camera is not where the schema says.
+const double kMovedCamera = chi_square_quantile(6, 1e-5);
+/// Beyond this one what is seen refutes the schema.
+const double kSurprise = chi_square_quantile(3, 0.0027);
+
+Eigen::VectorXd vector_of(const std::vector<double>& values) {
+  return Eigen::Map<const Eigen::VectorXd>(values.data(), static_cast<Eigen::Index>(values.size()));
+}
+
+}  // namespace
+
+bool Controller::is_active() const {
+  return state_ == S::CONTROL_WAITING || state_ == S::CONTROL_MOVING ||
+         state_ == S::CONTROL_REACHED || state_ == S::CONTROL_LENT;
+}
+
+std::string Controller::unheard() const {
+  if (!motion_) return "MOTION_STATUS: does the driver run?";
+  if (!schema_) return "BODY_SCHEMA: nothing was learned yet, or does model_monitor run?";
+  if (is_at_rest() && seen_until_utime_ < motion_->rest_since_utime) {
+    return "MARKER_POSES of the arm at rest: do camera and marker_estimator run?";
+  }
+  return "";
+}
+
+std::string Controller::silence(std::int64_t now_us) {
+  // Every stopwatch is looked at on every tick: it starts when it is first seen.
+  const std::int64_t motion_us = motion_silence_.elapsed_us(now_us);
+  const std::int64_t schema_us = schema_silence_.elapsed_us(now_us);
+  const bool is_image_due = motion_ && seen_until_utime_ < motion_->utime;
+  if (!is_image_due) eyes_silence_.restart();
+  const std::int64_t eyes_us = eyes_silence_.elapsed_us(now_us);
+  if (motion_us > config_.max_motion_status_silence_us) {
+    return "no MOTION_STATUS for " + seconds(config_.max_motion_status_silence_us) +
+           ": is the driver alive?";
+  }
+  if (eyes_us > config_.max_marker_poses_silence_us) {
+    return "no MARKER_POSES for " + seconds(config_.max_marker_poses_silence_us) +
+           ": are camera and marker_estimator alive?";
+  }
+  if (schema_us > config_.max_body_schema_silence_us) {
+    return "no BODY_SCHEMA for " + seconds(config_.max_body_schema_silence_us) +
+           ": is model_monitor alive?";
+  }
+  return "";
+}
+
+void Controller::see(std::int64_t frame_utime) {
+  // A frame from far ahead would make the eyes look open for ever.
+  if (!motion_ || frame_utime > motion_->utime + config_.max_motion_status_silence_us +
+                                    config_.max_marker_poses_silence_us) {
+    return;
+  }
+  if (frame_utime <= seen_until_utime_) return;
+  seen_until_utime_ = frame_utime;
+  if (motion_->utime - frame_utime <= config_.max_marker_poses_silence_us) {
+    eyes_silence_.restart();
+  }
+}
+
+void Controller::locate() {
+  if (!is_at_rest()) {
+    position_.reset();
+    return;
+  }
+  if (motion_->rest_since_utime != position_rest_utime_) position_.reset();
+  const bool is_whole = motion_->commanded.size() == config_.signals.size();
+  const bool is_settled = motion_->state == motion_status_t::STATE_SETTLED &&
+                          motion_->kind == action_command_t::KIND_MOVE;
+  // A driver that never moved, or that answers a HOLD, may say where it stands.
+  const bool is_told = motion_->action_id < 0 || motion_->kind != action_command_t::KIND_MOVE;
+  if (is_whole && (is_settled || is_told)) {
+    position_ = vector_of(motion_->commanded);
+  } else if (!position_ && sample_ && sample_->rest_begin_utime == motion_->rest_since_utime) {
+    position_ = vector_of(sample_->action);
+  }
+  position_rest_utime_ = motion_->rest_since_utime;
+}
+
+double Controller::predicted_error_m() const {
+  if (!schema_ || !position_ || target_.target_part < 0) return -1;
+  const auto X_RB = schema_->predict(schema_->root, target_.target_part, *position_);
+  return X_RB ? (X_RB->X_AB.translation() - position_of(target_)).norm() : -1;
+}
+
+void Controller::observe(const sample_t& message) {
+  observed_error_m_ = -1;
+  if (!schema_) return;
+  ActionPoseSample sample = from_message(message);
+  drop_moved_tags(schema_->moved_tags, &sample);
+  const PartObservation* part = sample.find(target_.target_part);
+  if (part == nullptr) return;
+  // One view of the root is worse than the schema's mean over all: half a degree is 9 mm at 1 m.
+  // Unless the camera was moved since.
+  Pose X_CR = schema_->X_CR;
+  if (const PartObservation* root = sample.find(schema_->root)) {
+    const Vector6d off = log(X_CR.inverse() * root->X_CB);
+    const Matrix6d covariance = config_.measurement.covariance(*root) + schema_->X_CR_covariance;
+    if (squared_mahalanobis(off, covariance) > kMovedCamera) X_CR = root->X_CB;
+  }
+  observed_offset_ = position_of(target_) - X_CR.inverse() * part->X_CB.translation();
+  observed_error_m_ = observed_offset_.norm();
+  const Eigen::Matrix3d R_RB = (X_CR.inverse() * part->X_CB).linear();
+  Eigen::Matrix3d covariance = config_.measurement.covariance(*part).topLeftCorner<3, 3>();
+  if (const auto X_RB = schema_->predict(schema_->root, part->part, sample.action))
+    covariance += X_RB->covariance.topLeftCorner<3, 3>();
+  covariance = (R_RB * covariance * R_RB.transpose()).eval();
+  // By the schema the part is at the aim.
+  const Eigen::Vector3d surprise = observed_offset_ - (position_of(target_) - aim_);
+  is_observation_sure_ =
+      !part->X_CB_other && surprise.dot(covariance.ldlt().solve(surprise)) > kSurprise;
+}
+
+EdgeState Controller::worst_edge(std::string* name) const {
+  EdgeState worst = EdgeState::kOk;
+  const auto severity = [](EdgeState state) {
+    return state == EdgeState::kOk ? 0 : state == EdgeState::kInvalid ? 2 : 1;
+  };
+  const auto chain = chain_to(*schema_, target_.target_part);
+  if (!chain) return worst;
+  for (const Edge& edge : chain->edges) {
+    EdgeState state = edge.state;
+    // The monitor's judgement is newer than the schema that it judges.
+    if (health_ && health_->schema_version == schema_->version) {
+      for (const edge_health_t& health : health_->edge_health) {
+        if (health.health_from != edge.from || health.health_to != edge.to) continue;
+        const auto judged = static_cast<EdgeState>(health.edge_state);
+        if (severity(judged) > severity(state)) state = judged;
+      }
+    }
+    if (severity(state) <= severity(worst)) continue;
+    worst = state;
+    if (name) *name = "edge " + std::to_string(edge.from) + "–" + std::to_string(edge.to);
+  }
+  // The marker by which the part is seen, and that of the root or the camera.
+  if (health_ && health_->schema_version == schema_->version && worst != EdgeState::kInvalid) {
+    for (const part_health_t& health : health_->part_health) {
+      if (health.part_state != schema_edge_t::EDGE_INVALID ||
+          (health.health_part != target_.target_part && health.health_part != schema_->root))
+        continue;
+      worst = EdgeState::kInvalid;
+      if (name) *name = "the marker of part " + std::to_string(health.health_part);
+      break;
+    }
+  }
+  return worst;
+}
+
+std::string Controller::objection() const {
+  const int part = target_.target_part;
+  if (motion_->stop_latched) return kHalted;
+  if (!schema_->has_part(part)) {
+    return "the body schema has no part " + std::to_string(part) + "; see: ./run status";
+  }
+  if (!chain_to(*schema_, part)) {
+    return "part " + std::to_string(part) + " is not connected to the root " +
+           std::to_string(schema_->root) + " in body schema version " +
+           std::to_string(schema_->version) + "; let the babbler go on learning";
+  }
+  return "";
+}
+
+}  // namespace bodyschema
