@@ -12,8 +12,8 @@
 #include "common/estimation/quantile.h"
 #include "common/geometry/angle.h"
 #include "processes/model_monitor/changes/drift.h"
-#include "processes/model_monitor/reading_distance.h"
-#include "processes/model_monitor/schema_difference.h"
+#include "processes/model_monitor/hypotheses/schema_difference.h"
+#include "processes/model_monitor/likelihood/reading_distance.h"
 
 namespace bodyschema {
 namespace {
@@ -74,31 +74,6 @@ void believe_nearest(const BodySchema& schema, const MeasurementModel& measureme
 }
 
 }  // namespace
-
-const char* name_of(AdaptationEvent::Kind kind) {
-  using Kind = AdaptationEvent::Kind;
-  switch (kind) {
-    case Kind::kMismatch:
-      return "mismatch";
-    case Kind::kCandidate:
-      return "candidate";
-    case Kind::kRefined:
-      return "refined";
-    case Kind::kRestored:
-      return "restored";
-    case Kind::kReverted:
-      return "reverted";
-    case Kind::kRecovered:
-      return "recovered";
-    case Kind::kDrift:
-      return "drift";
-    case Kind::kMissing:
-      return "missing";
-    case Kind::kProbeWanted:
-      return "probe_wanted";
-  }
-  return "";
-}
 
 Adaptation::Adaptation(BodySchema schema, AdaptationOptions options)
     : is_soft_(std::any_of(schema.edges.begin(), schema.edges.end(),

@@ -5,13 +5,13 @@
 #include <utility>
 #include <vector>
 
-#include "processes/model_monitor/adaptation_event.h"
-#include "processes/model_monitor/drift_watch.h"
-#include "processes/model_monitor/fallen_markers.h"
-#include "processes/model_monitor/hypothesis_tracker.h"
-#include "processes/model_monitor/moved_tags.h"
+#include "processes/model_monitor/health/adaptation_event.h"
+#include "processes/model_monitor/health/fallen_markers.h"
+#include "processes/model_monitor/health/moved_tags.h"
+#include "processes/model_monitor/health/visibility_watch.h"
+#include "processes/model_monitor/hypotheses/drift_watch.h"
+#include "processes/model_monitor/hypotheses/hypothesis_tracker.h"
 #include "processes/model_monitor/sample_stream.h"
-#include "processes/model_monitor/visibility_watch.h"
 
 namespace bodyschema {
 

@@ -6,7 +6,7 @@
 #include "common/bus/cause_names.h"
 #include "common/bus/codec.h"
 #include "common/bus/convert.h"
-#include "processes/model_monitor/health_words.h"
+#include "processes/model_monitor/health/health_words.h"
 
 namespace bodyschema {
 namespace {

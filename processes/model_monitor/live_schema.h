@@ -13,7 +13,7 @@
 #include "common/schema/body_schema.h"
 #include "common/schema/sample.h"
 #include "processes/model_monitor/adaptation.h"
-#include "processes/model_monitor/findings.h"
+#include "processes/model_monitor/health/findings.h"
 
 namespace bodyschema {
 

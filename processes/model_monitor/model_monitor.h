@@ -14,7 +14,7 @@
 #include "bodyschema/sample_t.hpp"
 #include "common/schema/body_schema.h"
 #include "common/schema/sample.h"
-#include "processes/model_monitor/baseline_youth.h"
+#include "processes/model_monitor/health/baseline_youth.h"
 #include "processes/model_monitor/live_schema.h"
 #include "processes/model_monitor/monitor_memory.h"
 
@@ -113,6 +113,12 @@ class ModelMonitor {
   std::int64_t num_tests(std::int64_t last) const;
   /// The newest of these TEST samples, oldest first; both ends included.
   std::vector<const ActionPoseSample*> tests_between(std::int64_t first, std::int64_t last) const;
+  /// Edges between the same parts, by the same signals.
+  static bool has_same_tree(const BodySchema& a, const BodySchema& b);
+  static constexpr std::size_t kMaxEvents = 32;  ///< told at once
+  /// What a sample shows of a part, unless it rests on tags that had moved.
+  static const PartObservation* sighting(const ActionPoseSample& sample, int part,
+                                         const std::vector<MovedTag>& moved);
   EdgeTest test(const BodySchema& schema, const Edge& edge, std::int64_t first,
                 std::int64_t last) const;
   /// `standing` one sample later. Verdicts that a restart remembers are spoken again.

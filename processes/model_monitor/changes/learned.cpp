@@ -9,7 +9,7 @@
 
 #include "common/estimation/chi_square.h"
 #include "common/estimation/quantile.h"
-#include "processes/model_monitor/process_fit.h"
+#include "processes/model_monitor/hypotheses/process_fit.h"
 
 namespace bodyschema {
 namespace {

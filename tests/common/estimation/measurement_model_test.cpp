@@ -7,7 +7,7 @@
 #include <random>
 
 #include "common/geometry/angle.h"
-#include "processes/model_monitor/tree_filter.h"
+#include "processes/model_monitor/likelihood/tree_filter.h"
 #include "processes/structure_learner/pair_data.h"
 
 namespace bodyschema {

@@ -10,7 +10,7 @@
 #include <map>
 #include <optional>
 
-#include "processes/model_monitor/chapter_adaptation.h"
+#include "processes/model_monitor/baseline/chapter_adaptation.h"
 #include "processes/structure_learner/baseline/fit_matrix_gp.h"
 #include "tests/experiments/figures/experiment.h"
 #include "tests/experiments/figures/robots.h"

@@ -9,7 +9,7 @@
 
 #include "common/text/text.h"
 #include "processes/model_monitor/adaptation.h"
-#include "processes/model_monitor/chapter_adaptation.h"
+#include "processes/model_monitor/baseline/chapter_adaptation.h"
 #include "tests/experiments/figures/experiment.h"
 #include "tests/experiments/figures/robots.h"
 #include "tests/experiments/figures/statistics.h"

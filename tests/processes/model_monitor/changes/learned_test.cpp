@@ -5,7 +5,7 @@
 #include <algorithm>
 #include <cmath>
 
-#include "processes/model_monitor/tree_filter.h"
+#include "processes/model_monitor/likelihood/tree_filter.h"
 #include "tests/processes/model_monitor/changed_arm.h"
 
 namespace bodyschema {

@@ -1,0 +1,101 @@
+#pragma once
+
+#include <cstdint>
+#include <deque>
+#include <map>
+#include <optional>
+#include <vector>
+
+#include "processes/model_monitor/likelihood/tree_filter.h"
+
+namespace bodyschema {
+
+/// An edge that changes all the time: T(t) on one side of its model, linear in the number of
+/// samples.
+struct Drift {
+  int part = 0;
+  bool left = false;                       ///< T · Δ; else Δ · T
+  Pose T = Pose::Identity();               ///< now
+  Matrix6d covariance = Matrix6d::Zero();  ///< of T, right perturbation
+  Vector6d rate = Vector6d::Zero();        ///< of log T a sample
+  Matrix6d rate_covariance = Matrix6d::Zero();
+  double significance = 0;  ///< squared Mahalanobis distance of the rate from standing still
+  /// Probability that it has ended, and the last sample in which it moved if it has.
+  double has_ended = 0;
+  std::int64_t last_moved = -1;
+
+  /// The edge with the drift as of now. Until the next sample it goes on: that is in the
+  /// covariance.
+  BodySchema applied_to(const BodySchema& before) const;
+};
+
+/// A drift from standing still: T(t) = Exp(rate · (t − begin)), 1 before.
+struct BegunDrift {
+  Drift drift;
+  std::int64_t begin = 0;
+  std::int64_t now = 0;  ///< the sample that drift.T is of
+  /// log of the prior of what was fitted, its odds, and the width of the likelihood's peak
+  /// (Laplace) [nats].
+  double log_prior = 0;
+  /// Of the place's measurements over no change at all, log_prior included [nats].
+  double gain = 0;
+  /// Of the measurements that were found wrong most, and the newest, are as it says.
+  bool is_good = false;
+
+  /// Σ log p(observations) over the samples under `before` with the drift.
+  double log_likelihood(const BodySchema& before, const MeasurementModel& measurement,
+                        const std::vector<const ActionPoseSample*>& samples) const;
+};
+
+/// The drifts that began about sample `since` of the edges to `parts`, one each where there are
+/// enough measurements, that with the most gain first. `before` is the body as it was until then;
+/// samples from before bound the begin.
+std::vector<BegunDrift> begun_drifts(const BodySchema& before, const MeasurementModel& measurement,
+                                     const std::vector<int>& parts,
+                                     const std::vector<const ActionPoseSample*>& samples,
+                                     std::int64_t since);
+
+/// Finds what changes too slowly for a CUSUM: means of the virtual measurements of every edge over
+/// the newest samples. The bend of a link by 0.05° a sample is below the noise of each of them, and
+/// ten standard deviations of their mean.
+///
+/// Follows what drifts, slowly or fast: the mean, by their probabilities, of a straight line
+/// through the newest measurements and of lines that ended some samples ago.
+class DriftWatch {
+ public:
+  explicit DriftWatch(double false_alarm_rate);
+
+  /// The sample as `filter` sees it; `filter` has the schema as it stands.
+  void add(const TreeFilter& filter, const TreeFilter::Instant& instant,
+           const Eigen::VectorXd& displacements, std::int64_t sample_index);
+  /// Measurements of the edge to a part that are older than this say nothing of the present one.
+  void forget(int part, std::int64_t before);
+  void forget_all();
+  /// Measures the edge to a part anew in these samples, and forgets all else. `schema` is right for
+  /// the other edges.
+  void look_again(const BodySchema& schema, const MeasurementModel& measurement, int part,
+                  const std::vector<const ActionPoseSample*>& samples);
+
+  /// The edge that has moved most, if any has. `schema` is the one that stands.
+  std::optional<int> moved_part(const BodySchema& schema) const;
+  /// T(t) of an edge from its newest measurements: the better of the two sides. std::nullopt if
+  /// there are fewer than four.
+  std::optional<Drift> follow(const BodySchema& schema, int part) const;
+
+ private:
+  struct Measured {
+    std::int64_t sample_index = 0;
+    Eigen::VectorXd displacements;
+    VirtualMeasurement of;
+    Matrix6d systematic;  ///< what the other edges' models contribute to its covariance
+  };
+  static std::optional<Measured> measure(const TreeFilter& filter,
+                                         const TreeFilter::Instant& instant,
+                                         const TreeFilter::Instant& exact, int node);
+  const std::deque<Measured>* find(int part, std::size_t fewest) const;
+
+  const double threshold_;
+  std::map<int, std::deque<Measured>> measured_;
+};
+
+}  // namespace bodyschema

@@ -1,0 +1,105 @@
+#include "processes/model_monitor/hypotheses/sequential_tests.h"
+
+#include <algorithm>
+#include <cmath>
+#include <iterator>
+
+namespace bodyschema {
+namespace {
+
+/// Squared distance of every marker below which a sample cannot raise a CUSUM that is at zero.
+constexpr double kClear = 14;
+constexpr double kInflations[] = {3, 10};
+constexpr double kLargestRatio = 600;  // e to it is finite
+constexpr std::size_t kMostSuspects = 4;
+
+}  // namespace
+
+double alarm_threshold(int num_nodes, double false_alarm_rate) {
+  return std::log(2.0 * num_nodes / false_alarm_rate);
+}
+
+SequentialTests::SequentialTests(const TreeFilter& filter, double false_alarm_rate, double loudest)
+    : alarm_(alarm_threshold(filter.num_nodes(), false_alarm_rate)),
+      loudest_(loudest),
+      edges_(static_cast<std::size_t>(filter.num_nodes())),
+      markers_(edges_) {}
+
+TreeFilter::Judgement SequentialTests::update(const TreeFilter& filter,
+                                              const TreeFilter::Instant& instant,
+                                              std::int64_t sample_index) {
+  const TreeFilter::Judgement now = filter.judge(instant);
+  const auto is_zero = [](const Cusum& c) { return c.value == 0; };
+  const bool is_clear = std::all_of(now.squared_distance.begin(), now.squared_distance.end(),
+                                    [](double d2) { return d2 < kClear; });
+  if (is_clear && std::all_of(edges_.begin(), edges_.end(), is_zero) &&
+      std::all_of(markers_.begin(), markers_.end(), is_zero))
+    return now;
+  const auto ratio = [&](const Alternative& alternative) {
+    return filter.judge(instant, alternative).log_likelihood - now.log_likelihood;
+  };
+  const auto add = [&](Cusum* cusum, double log_ratio) {
+    if (cusum->value == 0) cusum->since = sample_index;
+    cusum->value = std::max(0.0, std::min(cusum->value, ceiling()) + log_ratio);
+  };
+  for (int node = 0; node < filter.num_nodes(); ++node) {
+    const auto n = static_cast<std::size_t>(node);
+    double wrong = 0;
+    for (const double inflation : kInflations)
+      wrong +=
+          std::exp(std::min(ratio({.inflated_edge = node, .inflation = inflation}), kLargestRatio));
+    wrong += std::exp(std::min(ratio({.cut_edges = {node}}), kLargestRatio));
+    add(&edges_[n], std::min(std::log(wrong / (std::size(kInflations) + 1)), loudest_));
+    if (instant.seen[n]) add(&markers_[n], ratio({.detached_node = node}));
+  }
+  return now;
+}
+
+void SequentialTests::clear(int node) {
+  edges_[static_cast<std::size_t>(node)] = markers_[static_cast<std::size_t>(node)] = {};
+}
+
+SequentialTests::Highest SequentialTests::highest() const {
+  Highest result;
+  for (std::size_t n = 0; n < edges_.size(); ++n)
+    for (const Cusum* cusum : {&edges_[n], &markers_[n]}) {
+      result.second = std::max(result.second, std::min(cusum->value, result.cusum.value));
+      if (cusum->value > result.cusum.value) result.cusum = *cusum;
+    }
+  return result;
+}
+
+std::vector<Place> SequentialTests::suspects(const TreeFilter& filter, double suspicion) const {
+  struct Scored {
+    double value;
+    Place place;
+  };
+  std::vector<Scored> scored;
+  for (int node = 0; node < filter.num_nodes(); ++node) {
+    scored.push_back({edge(node).value, {filter.part(node), false}});
+    scored.push_back({marker(node).value, {filter.part(node), true}});
+  }
+  std::erase_if(scored, [suspicion](const Scored& s) { return !(s.value > suspicion); });
+  std::stable_sort(scored.begin(), scored.end(),
+                   [](const Scored& a, const Scored& b) { return a.value > b.value; });
+  if (scored.size() > kMostSuspects) scored.resize(kMostSuspects);
+  std::vector<Place> places;
+  for (const Scored& s : scored) places.push_back(s.place);
+  if (places.empty()) return places;
+  for (const Place& place : places_around(filter, places.front().part))
+    if (std::find(places.begin(), places.end(), place) == places.end()) places.push_back(place);
+  return places;
+}
+
+std::vector<Place> places_around(const TreeFilter& filter, int part) {
+  std::vector<Place> places{{part, false}, {part, true}};
+  const int node = filter.node_of(part);
+  if (const int parent = filter.parent(node); parent >= 0) {
+    places.push_back({filter.part(parent), false});
+    places.push_back({filter.part(parent), true});
+  }
+  for (const int child : filter.children(node)) places.push_back({filter.part(child), false});
+  return places;
+}
+
+}  // namespace bodyschema

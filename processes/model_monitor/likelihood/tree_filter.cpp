@@ -1,0 +1,432 @@
+#include "processes/model_monitor/likelihood/tree_filter.h"
+
+#include <Eigen/Cholesky>
+#include <algorithm>
+#include <cmath>
+#include <map>
+#include <set>
+
+#include "common/geometry/angle.h"
+
+namespace bodyschema {
+namespace {
+
+constexpr double kRoom_m3 = 8;
+/// Tilt of a marker that was read in its other way, standard deviation about x and y.
+constexpr double kTilt_rad = 35 * kDegree;
+/// Below this squared distance an outlier density cannot matter.
+constexpr double kClearInlier = 10;
+/// Reading a marker by its second pose is one in ten.
+constexpr double kLogOtherReading = -2.3;
+/// Markers from which the belief behind a cut edge is begun anew.
+constexpr std::size_t kMaxStarters = 3;
+/// A beginning farther away is taken if it is likelier by this much: what lies on its way is
+/// counted twice [nats].
+constexpr double kMuchLikelier = 3;
+
+double log_sum_exp(const std::vector<double>& terms) {
+  const double largest = *std::max_element(terms.begin(), terms.end());
+  if (!std::isfinite(largest)) return largest;
+  double sum = 0;
+  for (const double term : terms) sum += std::exp(term - largest);
+  return largest + std::log(sum);
+}
+
+/// The pose that a planar marker at X shows in its second reading: its normal mirrored at the line
+/// of sight.
+Pose flipped(const Pose& X) {
+  const Eigen::Vector3d sight = X.translation().normalized();
+  const Eigen::Vector3d normal = X.linear().col(2);
+  const Eigen::Vector3d axis = normal.cross(sight);
+  const double sine = axis.norm(), cosine = normal.dot(sight);
+  Pose result = X;
+  if (sine > 1e-9)
+    result.linear() = exp_so3(2 * std::atan2(sine, cosine) / sine * axis) * X.linear();
+  return result;
+}
+
+}  // namespace
+
+Matrix6d model_covariance(const Edge& edge, const Eigen::VectorXd& theta) {
+  Matrix6d covariance = edge.prediction_covariance(theta);
+  if (edge.residual_gp) covariance += edge.empirical_covariance();
+  return covariance;
+}
+
+double log_flat_density() { return -std::log(8 * M_PI * M_PI * kRoom_m3); }
+
+double log_normal_density(const Vector6d& xi, const Matrix6d& S) {
+  const Eigen::LLT<Matrix6d> llt(S);
+  if (llt.info() != Eigen::Success) return -std::numeric_limits<double>::infinity();
+  const double d2 = llt.matrixL().solve(xi).squaredNorm();
+  const double log_det = 2 * llt.matrixLLT().diagonal().array().log().sum();
+  return -0.5 * (d2 + log_det + 6 * std::log(2 * M_PI));
+}
+
+double log_outlier_density(const Pose& X, const Pose& X_CB, const Matrix6d& S,
+                           const Matrix6d& marker_covariance) {
+  const Vector6d xi = log(X.inverse() * X_CB);
+  const Matrix6d variances = marker_covariance.diagonal().asDiagonal();
+  Matrix6d flip = S.diagonal().asDiagonal();
+  flip.diagonal().head<3>().array() += 0.01 * 0.01;
+  flip.diagonal().tail<3>().array() += std::pow(2 * kDegree, 2);
+  Matrix6d tilt = S;
+  tilt.diagonal().segment<2>(3).array() += kTilt_rad * kTilt_rad;
+  // Anywhere near by, any orientation.
+  const Eigen::Matrix3d near =
+      S.topLeftCorner<3, 3>() + 100 * Eigen::Matrix3d(variances.topLeftCorner<3, 3>());
+  const Eigen::LLT<Eigen::Matrix3d> llt(near);
+  const double log_near =
+      -0.5 * (llt.matrixL().solve(xi.head<3>()).squaredNorm() +
+              2 * llt.matrixLLT().diagonal().array().log().sum() + 3 * std::log(2 * M_PI)) -
+      std::log(8 * M_PI * M_PI);
+  const double quarter = std::log(0.25), eighth = std::log(0.125);
+  return log_sum_exp({quarter + log_normal_density(log(flipped(X).inverse() * X_CB), flip),
+                      quarter + log_normal_density(xi, tilt),
+                      eighth + log_normal_density(xi, S + 9 * variances),
+                      eighth + log_normal_density(xi, S + 100 * variances), eighth + log_near,
+                      eighth + log_flat_density()});
+}
+
+double log_marker_density(const Pose& X, const Pose& X_CB, const Matrix6d& S,
+                          const Matrix6d& marker_covariance, double outlier_rate, bool* is_inlier,
+                          double* squared_distance) {
+  const Vector6d xi = log(X.inverse() * X_CB);
+  const Eigen::LLT<Matrix6d> llt(S);
+  const double d2 = llt.matrixL().solve(xi).squaredNorm();
+  const double log_det = 2 * llt.matrixLLT().diagonal().array().log().sum();
+  const double inlier = std::log1p(-outlier_rate) - 0.5 * (d2 + log_det + 6 * std::log(2 * M_PI));
+  *squared_distance = d2;
+  *is_inlier = true;
+  if (d2 < kClearInlier) return inlier;
+  const double outlier =
+      std::log(outlier_rate) + log_outlier_density(X, X_CB, S, marker_covariance);
+  *is_inlier = inlier >= outlier;
+  return log_sum_exp({inlier, outlier});
+}
+
+TreeFilter::TreeFilter(const BodySchema& schema, const MeasurementModel& measurement)
+    : schema_(schema), measurement_(measurement) {
+  if (schema_.root < 0) return;
+  nodes_.push_back({schema_.root, -1, -1, false, {}});
+  std::set<int> reached{schema_.root};
+  for (std::size_t n = 0; n < nodes_.size(); ++n) {
+    for (std::size_t e = 0; e < schema_.edges.size(); ++e) {
+      const Edge& edge = schema_.edges[e];
+      if (edge.from != nodes_[n].part || !reached.insert(edge.to).second) continue;
+      nodes_[n].children.push_back(static_cast<int>(nodes_.size()));
+      nodes_.push_back({edge.to,
+                        static_cast<int>(n),
+                        static_cast<int>(e),
+                        edge.state == EdgeState::kInvalid,
+                        {}});
+    }
+  }
+}
+
+int TreeFilter::node_of(int part) const {
+  for (std::size_t n = 0; n < nodes_.size(); ++n)
+    if (nodes_[n].part == part) return static_cast<int>(n);
+  return -1;
+}
+
+TreeFilter::Instant TreeFilter::prepare(const ActionPoseSample& sample) const {
+  const Eigen::VectorXd theta = schema_.displacements(sample.action);
+  const std::size_t n = nodes_.size();
+  Instant instant;
+  instant.delta.resize(n);
+  instant.transport.resize(n);
+  instant.edge_covariance.resize(n);
+  instant.seen.resize(n);
+  for (std::size_t k = 0; k < n; ++k) {
+    const Node& node = nodes_[k];
+    if (node.edge < 0) {
+      instant.delta[k] = schema_.X_CR;
+      instant.edge_covariance[k] = schema_.X_CR_covariance;
+    } else {
+      const Edge& edge = schema_.edges[static_cast<std::size_t>(node.edge)];
+      instant.delta[k] = edge.predict(theta);
+      instant.edge_covariance[k] = model_covariance(edge, theta);
+    }
+    instant.edge_covariance[k].diagonal().array() += 1e-12;  // what is exact can still be inverted
+    instant.transport[k] = adjoint(instant.delta[k].inverse());
+    if (const PartObservation* o = sample.find(node.part)) {
+      const Matrix6d covariance = measurement_.covariance(*o);
+      instant.seen[k] = Instant::Seen{o->X_CB, covariance, o->X_CB_other, covariance};
+      if (o->X_CB_other) instant.seen[k]->covariance_other = covariance_of_other(*o, covariance);
+    }
+  }
+  return instant;
+}
+
+/// One pass over the tree.
+class TreeFilter::Walk {
+ public:
+  Walk(const TreeFilter& filter, const Instant& instant, const Alternative& alternative)
+      : filter_(filter), instant_(instant), alternative_(alternative) {
+    judgement.squared_distance.assign(filter.nodes_.size(), -1);
+    judgement.believed.assign(filter.nodes_.size(), -1);
+  }
+
+  Judgement judgement;
+
+  bool is_cut(int node) const {
+    return filter_.nodes_[node].is_cut ||
+           std::find(alternative_.cut_edges.begin(), alternative_.cut_edges.end(), node) !=
+               alternative_.cut_edges.end();
+  }
+
+  /// Everything from the camera on.
+  void all() {
+    if (is_cut(0)) {
+      behind_cut(0);
+      return;
+    }
+    Belief belief = descend({Pose::Identity(), Matrix6d::Zero()}, 0);
+    subtree(0, &belief);
+  }
+
+  /// The marker of `node`, then all children but `except`.
+  void subtree(int node, Belief* belief, int except = -1) {
+    if (node != skipped_) marker(node, belief);
+    for (const int child : filter_.nodes_[node].children)
+      if (child != except) branch(child, belief);
+  }
+
+  /// A child's subtree; what it learns goes back to its parent.
+  void branch(int child, Belief* parent) {
+    if (is_cut(child)) {
+      behind_cut(child);
+      return;
+    }
+    const Belief before = descend(*parent, child);
+    Belief after = before;
+    subtree(child, &after);
+    const Matrix6d& F = instant_.transport[child];
+    const Matrix6d G = (before.P.ldlt().solve(F * parent->P)).transpose();
+    parent->X = parent->X * exp(G * log(before.X.inverse() * after.X));
+    parent->P += G * (after.P - before.P) * G.transpose();
+    parent->P = (0.5 * (parent->P + parent->P.transpose())).eval();
+  }
+
+  Belief descend(const Belief& parent, int child) const {
+    const Matrix6d& F = instant_.transport[child];
+    Belief belief{parent.X * instant_.delta[child],
+                  F * parent.P * F.transpose() + instant_.edge_covariance[child]};
+    if (child == alternative_.inflated_edge) {
+      // In units of a marker's noise, wherever there is one.
+      for (const auto& seen : instant_.seen) {
+        if (!seen) continue;
+        const Vector6d variances = seen->covariance.diagonal();
+        belief.P.diagonal() += std::pow(alternative_.inflation, 2) * variances;
+        break;
+      }
+    }
+    return belief;
+  }
+
+  /// Visible nodes of a subtree that can be reached without crossing a cut, nearest first.
+  std::vector<int> visible_below(int top) const {
+    std::vector<int> queue{top}, visible;
+    for (std::size_t n = 0; n < queue.size(); ++n) {
+      if (instant_.seen[queue[n]] && queue[n] != skipped_ && queue[n] != alternative_.detached_node)
+        visible.push_back(queue[n]);
+      for (const int child : filter_.nodes_[queue[n]].children)
+        if (!is_cut(child)) queue.push_back(child);
+    }
+    return visible;
+  }
+
+  /// The belief on `top` from the marker of one node of its subtree.
+  Belief begun_at(int node, int top) const {
+    Belief belief{instant_.seen[node]->X_CB, instant_.seen[node]->covariance};
+    for (; node != top; node = filter_.nodes_[node].parent) {
+      const Matrix6d A = adjoint(instant_.delta[node]);
+      belief.X = belief.X * instant_.delta[node].inverse();
+      belief.P = (A * (belief.P + instant_.edge_covariance[node]) * A.transpose()).eval();
+    }
+    return belief;
+  }
+
+  /// A subtree whose edge says nothing: begun anew from one of its markers, each with equal odds.
+  /// The belief of the nearest beginning that is likely; std::nullopt if nothing was seen there.
+  std::optional<Belief> behind_cut(int top) {
+    std::vector<int> starters = visible_below(top);
+    if (starters.size() > kMaxStarters) starters.resize(kMaxStarters);
+    if (starters.empty()) {
+      // Further cuts below may hide markers of their own.
+      for (const int child : filter_.nodes_[top].children) below_nothing(child);
+      if (instant_.seen[top]) judgement.log_likelihood += log_flat_density();
+      return std::nullopt;
+    }
+    std::vector<double> scores;
+    std::optional<Walk> best;
+    Belief best_belief;
+    double best_score = 0;
+    for (const int starter : starters) {
+      Walk walk = *this;
+      walk.judgement.log_likelihood = log_flat_density();
+      walk.judgement.believed[starter] = 1;
+      walk.judgement.squared_distance[starter] = 0;
+      walk.skipped_ = starter;
+      Belief belief = begun_at(starter, top);
+      walk.subtree(top, &belief);
+      walk.skipped_ = skipped_;
+      scores.push_back(walk.judgement.log_likelihood);
+      if (!best || scores.back() > best_score + kMuchLikelier) {
+        best.emplace(walk);
+        best_belief = belief;
+        best_score = scores.back();
+      }
+    }
+    const double so_far = judgement.log_likelihood;
+    judgement = best->judgement;
+    judgement.log_likelihood =
+        so_far + log_sum_exp(scores) - std::log(static_cast<double>(scores.size()));
+    return best_belief;
+  }
+
+ private:
+  void below_nothing(int node) {
+    if (is_cut(node)) {
+      behind_cut(node);
+      return;
+    }
+    for (const int child : filter_.nodes_[node].children) below_nothing(child);
+  }
+
+  void marker(int node, Belief* belief) {
+    const auto& seen = instant_.seen[node];
+    if (!seen) return;
+    Matrix6d S = belief->P + seen->covariance;
+    if (node == alternative_.detached_node) {
+      double detached = log_outlier_density(belief->X, seen->X_CB, S, seen->covariance);
+      if (seen->X_CB_other)
+        detached = std::max(
+            detached, kLogOtherReading + log_outlier_density(belief->X, *seen->X_CB_other,
+                                                             belief->P + seen->covariance_other,
+                                                             seen->covariance_other));
+      judgement.log_likelihood += detached;
+      return;
+    }
+    const double rate = filter_.measurement_.outlier_rate;
+    Pose X_CB = seen->X_CB;
+    bool is_inlier = true;
+    double d2 = 0;
+    double density =
+        log_marker_density(belief->X, X_CB, S, seen->covariance, rate, &is_inlier, &d2);
+    // Where the marker does not sit at the part's origin only its other reading knows where a
+    // flip's part is; and that may be an outlier in turn.
+    if (seen->X_CB_other && d2 > kClearInlier) {
+      const Matrix6d S_other = belief->P + seen->covariance_other;
+      bool is_other_inlier = false;
+      double other_d2 = 0;
+      const double other = kLogOtherReading + log_marker_density(belief->X, *seen->X_CB_other,
+                                                                 S_other, seen->covariance_other,
+                                                                 rate, &is_other_inlier, &other_d2);
+      if (other > density) {
+        density = other;
+        S = S_other;
+        X_CB = *seen->X_CB_other;
+        is_inlier = is_other_inlier;
+        d2 = other_d2;
+      }
+    }
+    judgement.log_likelihood += density;
+    judgement.squared_distance[node] = d2;
+    judgement.believed[node] = is_inlier;
+    if (!is_inlier) return;
+    const Matrix6d K = S.ldlt().solve(belief->P).transpose();
+    belief->X = belief->X * exp(K * log(belief->X.inverse() * X_CB));
+    belief->P -= K * belief->P;
+    belief->P = (0.5 * (belief->P + belief->P.transpose())).eval();
+  }
+
+  const TreeFilter& filter_;
+  const Instant& instant_;
+  const Alternative& alternative_;
+  int skipped_ = -1;  // its marker began the belief
+};
+
+TreeFilter::Judgement TreeFilter::judge(const Instant& instant,
+                                        const Alternative& alternative) const {
+  Walk walk(*this, instant, alternative);
+  if (!nodes_.empty()) walk.all();
+  return walk.judgement;
+}
+
+std::optional<VirtualMeasurement> TreeFilter::measure_edge(const Instant& instant, int node) const {
+  const Alternative as_it_is;
+  Walk right(*this, instant, as_it_is);
+  const auto child = right.behind_cut(node);
+  if (!child) return std::nullopt;
+  if (nodes_[node].parent < 0) return VirtualMeasurement{child->X, child->P};
+
+  // Down the path from the last edge that says something (the camera's, if none is cut) to the
+  // parent, side branches on the way.
+  std::vector<int> path;
+  for (int n = nodes_[node].parent; n >= 0; n = nodes_[n].parent) path.push_back(n);
+  std::reverse(path.begin(), path.end());
+  Walk left(*this, instant, as_it_is);
+  std::optional<Belief> belief = Belief{};
+  for (std::size_t k = 0; k < path.size(); ++k) {
+    const int next = k + 1 < path.size() ? path[k + 1] : node;
+    if (left.is_cut(path[k])) {
+      // Nothing from above: what is below begins anew, without the branch in question.
+      const Alternative above{.cut_edges = {node}};
+      Walk anew(*this, instant, above);
+      belief = anew.behind_cut(path[k]);
+      if (!belief) return std::nullopt;
+      if (k + 1 == path.size()) break;
+      // That belief is on path[k] and has the whole subtree in it: go down without further markers.
+      for (std::size_t m = k + 1; m < path.size(); ++m) {
+        if (left.is_cut(path[m])) {
+          belief.reset();
+          k = m - 1;
+          break;
+        }
+        belief = left.descend(*belief, path[m]);
+        k = m;
+      }
+      if (belief) break;
+      continue;
+    }
+    belief = left.descend(*belief, path[k]);
+    left.subtree(path[k], &*belief, next);
+  }
+  if (!belief) return std::nullopt;
+  VirtualMeasurement result;
+  result.z = belief->X.inverse() * child->X;
+  const Matrix6d A = adjoint(result.z.inverse());
+  result.covariance = child->P + A * belief->P * A.transpose();
+  return result;
+}
+
+std::optional<VirtualMeasurement> TreeFilter::measure_marker(const Instant& instant,
+                                                             int node) const {
+  const auto& seen = instant.seen[node];
+  if (!seen) return std::nullopt;
+  // The part's belief without its own marker: that of an instant in which it was not seen.
+  Instant without = instant;
+  without.seen[node].reset();
+  const Alternative as_it_is;
+  Walk walk(*this, without, as_it_is);
+  std::vector<int> path;
+  for (int n = node; n >= 0; n = nodes_[n].parent) {
+    if (walk.is_cut(n)) return std::nullopt;
+    path.push_back(n);
+  }
+  std::reverse(path.begin(), path.end());
+  Belief belief;
+  for (std::size_t k = 0; k < path.size(); ++k) {
+    belief = walk.descend(belief, path[k]);
+    walk.subtree(path[k], &belief, k + 1 < path.size() ? path[k + 1] : -1);
+  }
+  VirtualMeasurement result;
+  result.z = belief.X.inverse() * seen->X_CB;
+  const Matrix6d A = adjoint(result.z.inverse());
+  result.covariance = seen->covariance + A * belief.P * A.transpose();
+  return result;
+}
+
+}  // namespace bodyschema
