@@ -130,13 +130,7 @@ void add_light(XMLElement* world, const Eigen::Vector3d& position, const Eigen::
   set(light, "specular", "0.15 0.15 0.15");
 }
 
-std::string make_mjcf(const SceneDescription& description) {
-  const Robot& robot = description.robot;
-  XMLDocument document;
-  XMLElement* mujoco = document.NewElement("mujoco");
-  document.InsertEndChild(mujoco);
-  set(mujoco, "model", robot.name);
-
+void add_options(XMLElement* mujoco) {
   XMLElement* compiler = child(mujoco, "compiler");
   set(compiler, "angle", "radian");
   set(compiler, "boundmass", "1e-6");
@@ -164,7 +158,9 @@ std::string make_mjcf(const SceneDescription& description) {
   set(defaults, "margin", text({kContactMargin_m}));
   set(defaults, "gap", text({kContactMargin_m}));
   set(defaults, "condim", "1");
+}
 
+void add_assets(XMLElement* mujoco, const Robot& robot) {
   XMLElement* asset = child(mujoco, "asset");
   const auto add_texture = [&](const std::string& name, const char* type, const char* builtin,
                                int width, double grey_1, double grey_2) {
@@ -198,8 +194,10 @@ std::string make_mjcf(const SceneDescription& description) {
     // Paper scatters light; without emission a plate in shade would lose its contrast.
     add_material(tag_name(tag.id), tag_name(tag.id), 0.35);
   }
+}
 
-  XMLElement* world = child(mujoco, "worldbody");
+/// Lights and floor.
+void add_room(XMLElement* world, const Robot& robot) {
   const Eigen::Vector3d C = robot.X_WC.translation();
   const Eigen::Vector3d toward_camera = Eigen::Vector3d(C.x(), C.y(), 0).normalized();
   const Eigen::Vector3d left = Eigen::Vector3d::UnitZ().cross(toward_camera);
@@ -212,7 +210,62 @@ std::string make_mjcf(const SceneDescription& description) {
   set(floor, "type", "plane");
   set(floor, "size", "6 6 0.1");
   set(floor, "material", "floor");
+}
 
+void add_joint(XMLElement* body, XMLElement* actuator, const RobotJoint& moving) {
+  XMLElement* joint = child(body, "joint");
+  set(joint, "name", moving.name);
+  set(joint, "type", moving.kind == RobotJoint::Kind::kRevolute ? "hinge" : "slide");
+  set(joint, "axis", text(moving.axis));
+  set(joint, "armature", text({moving.servo.armature}));
+  if (moving.stuck_at) set(joint, "damping", text({kStuckDamping}));
+  // <position> of this version has no velocity gain.
+  const double kp = moving.servo.stiffness;
+  XMLElement* servo = child(actuator, "general");
+  set(servo, "joint", moving.name);
+  set(servo, "gaintype", "fixed");
+  set(servo, "biastype", "affine");
+  set(servo, "gainprm", text({kp}));
+  set(servo, "biasprm", text({0, -kp, -moving.servo.damping}));
+}
+
+/// The shapes of a link, the mounted tool and the others of its changer, and the tags.
+void add_geoms(XMLElement* body, const SceneDescription& description, int i) {
+  const Robot& robot = description.robot;
+  const Link& link = robot.links[static_cast<std::size_t>(i)];
+  for (std::size_t k = 0; k < link.shapes.size(); ++k) {
+    add_shape(body, link.name + " shape " + std::to_string(k), link.shapes[k]);
+  }
+  if (robot.tool_changer && robot.tool_changer->link == i) {
+    const ToolChanger& changer = *robot.tool_changer;
+    for (int t = 0; t < static_cast<int>(changer.tools.size()); ++t) {
+      for (std::size_t k = 0; k < changer.tools[t].shapes.size(); ++k) {
+        add_shape(body, tool_shape_name(t, k), changer.tools[t].shapes[k], t == changer.mounted);
+      }
+    }
+  }
+  for (const PartPlacement& part : robot.parts) {
+    if (part.link != i) continue;
+    for (const TagPlacement& tag : robot.markers.tags) {
+      if (tag.part == part.part) {
+        add_plate(body, tag, part.X_LB * tag.X_BM.value_or(Pose::Identity()),
+                  description.fallen_tags.contains(tag.id));
+      }
+    }
+  }
+}
+
+std::string make_mjcf(const SceneDescription& description) {
+  const Robot& robot = description.robot;
+  XMLDocument document;
+  XMLElement* mujoco = document.NewElement("mujoco");
+  document.InsertEndChild(mujoco);
+  set(mujoco, "model", robot.name);
+
+  add_options(mujoco);
+  add_assets(mujoco, robot);
+  XMLElement* world = child(mujoco, "worldbody");
+  add_room(world, robot);
   std::vector<XMLElement*> bodies;
   const auto body_of = [&](const std::string& link) {
     for (std::size_t i = 0; i < robot.links.size(); ++i) {
@@ -233,43 +286,8 @@ std::string make_mjcf(const SceneDescription& description) {
     bodies.push_back(body);
     set(body, "name", link.name);
     set_pose(body, link.X_PL);
-    if (link.joint) {
-      const RobotJoint& moving = robot.joints[*link.joint];
-      XMLElement* joint = child(body, "joint");
-      set(joint, "name", moving.name);
-      set(joint, "type", moving.kind == RobotJoint::Kind::kRevolute ? "hinge" : "slide");
-      set(joint, "axis", text(moving.axis));
-      set(joint, "armature", text({moving.servo.armature}));
-      if (moving.stuck_at) set(joint, "damping", text({kStuckDamping}));
-      // <position> of this version has no velocity gain.
-      const double kp = moving.servo.stiffness;
-      XMLElement* servo = child(actuator, "general");
-      set(servo, "joint", moving.name);
-      set(servo, "gaintype", "fixed");
-      set(servo, "biastype", "affine");
-      set(servo, "gainprm", text({kp}));
-      set(servo, "biasprm", text({0, -kp, -moving.servo.damping}));
-    }
-    for (std::size_t k = 0; k < link.shapes.size(); ++k) {
-      add_shape(body, link.name + " shape " + std::to_string(k), link.shapes[k]);
-    }
-    if (robot.tool_changer && robot.tool_changer->link == static_cast<int>(i)) {
-      const ToolChanger& changer = *robot.tool_changer;
-      for (int t = 0; t < static_cast<int>(changer.tools.size()); ++t) {
-        for (std::size_t k = 0; k < changer.tools[t].shapes.size(); ++k) {
-          add_shape(body, tool_shape_name(t, k), changer.tools[t].shapes[k], t == changer.mounted);
-        }
-      }
-    }
-    for (const PartPlacement& part : robot.parts) {
-      if (part.link != static_cast<int>(i)) continue;
-      for (const TagPlacement& tag : robot.markers.tags) {
-        if (tag.part == part.part) {
-          add_plate(body, tag, part.X_LB * tag.X_BM.value_or(Pose::Identity()),
-                    description.fallen_tags.contains(tag.id));
-        }
-      }
-    }
+    if (link.joint) add_joint(body, actuator, robot.joints[*link.joint]);
+    add_geoms(body, description, static_cast<int>(i));
     // MuJoCo ignores contacts of parent and child by itself, but not where the parent is fixed to
     // the world.
     if (link.parent != "world") exclude(link.parent, link.name);

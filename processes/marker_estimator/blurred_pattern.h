@@ -118,8 +118,9 @@ class Pattern {
     }
   }
 
-  // [cells]: the line behind the last one that is counted is 2.6 standard deviations away or more.
-  static constexpr float kNarrow = 0.19F, kMedium = 0.38F, kWide = 0.55F;
+  // Blurs [cells] up to which two and three lines in a direction are enough: the line behind the
+  // last one that is counted is 2.6 standard deviations away or more.
+  static constexpr float kMedium = 0.38F, kWide = 0.55F;
 
  private:
   static constexpr int kPad = 3;

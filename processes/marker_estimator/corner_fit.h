@@ -134,6 +134,11 @@ class Refiner {
   /// Pixels of a later look, by the blur known so far.
   Pixels all_looks() const;
   void look(double robust_cut, Pixels pixels, Sums& sums);
+  /// Positions of a block's pixels on the tag, in cells from the corner of its margin: coefficients
+  /// [power of t][power of s] of the quadratic through its 3 × 3 points of the lattice, s and t −1
+  /// … 1 over the block. Nothing if the tag is not there.
+  using BlockMap = std::array<std::array<Eigen::Vector2d, 3>, 3>;
+  std::optional<BlockMap> map_of_block(int bu, int bv, const Eigen::Matrix3d& to_tag) const;
   void look_at_block(int bu, int bv, const Eigen::Matrix3d& to_tag, double robust_cut,
                      Pixels pixels, std::vector<Row>& rows, Sums& sums) const;
   std::optional<Step> solve(const Sums& sums) const;

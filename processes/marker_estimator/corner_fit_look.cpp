@@ -114,17 +114,15 @@ void sum_products(const std::vector<Row>& rows, BlockSums& sums) {
 
 }  // namespace
 
-void Refiner::look_at_block(int bu, int bv, const Eigen::Matrix3d& to_tag, double robust_cut,
-                            Pixels pixels, std::vector<Row>& rows, Sums& sums) const {
-  // Positions of the pixels on the tag, in cells from the corner of its margin: a quadratic over
-  // the block through its 3 × 3 points.
+std::optional<Refiner::BlockMap> Refiner::map_of_block(int bu, int bv,
+                                                       const Eigen::Matrix3d& to_tag) const {
   Eigen::Vector2d p[3][3];
   for (int j = 0; j < 3; ++j) {
     for (int i = 0; i < 3; ++i) {
       const Eigen::Vector2d& ray = lattice_[(2 * bv + j) * (2 * num_u_ + 1) + 2 * bu + i];
       const Eigen::Vector3d q = to_tag * ray.homogeneous();
       p[j][i] = q.hnormalized() * half_border_ + Eigen::Vector2d::Constant(half_width_);
-      if (!p[j][i].allFinite()) return;
+      if (!p[j][i].allFinite()) return std::nullopt;
     }
   }
   const double width = cells_.width;
@@ -135,9 +133,9 @@ void Refiner::look_at_block(int bu, int bv, const Eigen::Matrix3d& to_tag, doubl
       high = high.max(point.array());
     }
   }
-  if ((high < 0).any() || (low > width).any()) return;
-  // coefficient[t power][s power]
-  Eigen::Vector2d across[3][3], c[3][3];
+  if ((high < 0).any() || (low > width).any()) return std::nullopt;
+  Eigen::Vector2d across[3][3];
+  BlockMap c;
   for (int j = 0; j < 3; ++j) {
     across[j][0] = p[j][1];
     across[j][1] = 0.5 * (p[j][2] - p[j][0]);
@@ -148,6 +146,15 @@ void Refiner::look_at_block(int bu, int bv, const Eigen::Matrix3d& to_tag, doubl
     c[1][k] = 0.5 * (across[2][k] - across[0][k]);
     c[2][k] = 0.5 * (across[2][k] + across[0][k]) - across[1][k];
   }
+  return c;
+}
+
+// One loop, though long: what it needs of the block stays in registers.
+void Refiner::look_at_block(int bu, int bv, const Eigen::Matrix3d& to_tag, double robust_cut,
+                            Pixels pixels, std::vector<Row>& rows, Sums& sums) const {
+  const std::optional<BlockMap> map = map_of_block(bu, bv, to_tag);
+  if (!map) return;
+  const BlockMap& c = *map;
   const double half_px = 0.5 * block_px_;
   Eigen::Matrix2d A;  // cells per pixel
   A.col(0) = c[0][1] / half_px;
@@ -156,8 +163,8 @@ void Refiner::look_at_block(int bu, int bv, const Eigen::Matrix3d& to_tag, doubl
   sums.widest_blur = std::max(sums.widest_blur, smooth.widest());
   // Beyond the white margin anything may lie.
   const float low_limit[2] = {smooth.tail(0), smooth.tail(1)};
-  const float high_limit[2] = {static_cast<float>(width) - low_limit[0],
-                               static_cast<float>(width) - low_limit[1]};
+  const auto width = static_cast<float>(cells_.width);
+  const float high_limit[2] = {width - low_limit[0], width - low_limit[1]};
 
   const float a00 = static_cast<float>(A(0, 0)), a01 = static_cast<float>(A(0, 1));
   const float a10 = static_cast<float>(A(1, 0)), a11 = static_cast<float>(A(1, 1));

@@ -133,7 +133,8 @@ bool Refiner::guess_light() {
 Pixels Refiner::all_looks() const {
   const Eigen::Matrix2d& B = model_.blur_px2;
   const double widest_px2 = B.trace() / 2 + std::hypot(0.5 * (B(0, 0) - B(1, 1)), B(0, 1));
-  const bool is_blurred = std::sqrt(widest_px2) > Pattern::kNarrow * least_cell_px_;
+  constexpr double kFlat = 0.19;  // [cells]: with less blur most pixels are flat, and cost little
+  const bool is_blurred = std::sqrt(widest_px2) > kFlat * least_cell_px_;
   if (is_blurred && area_px_ * all_looks_.share() > kBlurredPixels) {
     return Pixels::lattice(area_px_, kBlurredPixels);
   }

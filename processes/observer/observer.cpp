@@ -188,6 +188,49 @@ part_observation_t observation_of(int part, const PartPose& pose,
 
 }  // namespace
 
+std::optional<std::pair<SeenTag, tag_corners_t>> Observer::mean_of(
+    int id, const std::vector<const marker_pose_t*>& seen) {
+  tag_corners_t mean{};
+  mean.tag_id = id;
+  Matrix8d covariance_px2 = Matrix8d::Zero();
+  double motion_px = 0;
+  for (const marker_pose_t* marker : seen) {
+    // Not divided by their number: a corner's error is mostly the same in all frames.
+    covariance_px2 += from_message(marker->corner_covariance) / static_cast<double>(seen.size());
+    for (int c = 0; c < 4; ++c) {
+      for (int axis = 0; axis < 2; ++axis) {
+        mean.mean_corner_px[c][axis] +=
+            marker->corner_px[c][axis] / static_cast<double>(seen.size());
+      }
+      motion_px =
+          std::max(motion_px, std::hypot(marker->corner_px[c][0] - seen[0]->corner_px[c][0],
+                                         marker->corner_px[c][1] - seen[0]->corner_px[c][1]));
+    }
+  }
+  if (motion_px > config_.max_motion_px) {
+    ++counters_["tag moved between frames"];
+    return std::nullopt;
+  }
+  const TagPlacement& placement = *markers_.find(id);
+  SeenTag tag{id, placement.size_m, placement.X_BM.value_or(Pose::Identity()),
+              {}, covariance_px2,   {}};
+  for (const auto& corner : mean.mean_corner_px) {
+    if (auto point = lens_->straighten({corner[0], corner[1]})) {
+      point->sigma_px = sigma_px(covariance_px2);
+      tag.corners.push_back(*point);
+    }
+  }
+  if (tag.corners.size() < 4) {
+    ++counters_["tag outside of the lens model"];
+    return std::nullopt;
+  }
+  for (int h = 0; h < seen[0]->num_hypotheses; ++h) {
+    tag.X_CM.push_back(from_message(seen[0]->X_CM[h]));
+  }
+  to_message(covariance_px2, mean.corner_covariance);
+  return std::pair{std::move(tag), mean};
+}
+
 sample_t Observer::sample_from(const Rest& rest, const std::vector<const marker_poses_t*>& frames) {
   // The same tag in all frames.
   std::map<int, std::vector<const marker_pose_t*>> sightings;
@@ -206,46 +249,10 @@ sample_t Observer::sample_from(const Rest& rest, const std::vector<const marker_
   std::map<int, std::vector<SeenTag>> tags_of_part;
   std::map<int, tag_corners_t> corners_of_tag;
   for (const auto& [id, seen] : sightings) {
-    tag_corners_t mean{};
-    mean.tag_id = id;
-    Matrix8d covariance_px2 = Matrix8d::Zero();
-    double motion_px = 0;
-    for (const marker_pose_t* marker : seen) {
-      // Not divided by their number: a corner's error is mostly the same in all frames.
-      covariance_px2 += from_message(marker->corner_covariance) / static_cast<double>(seen.size());
-      for (int c = 0; c < 4; ++c) {
-        for (int axis = 0; axis < 2; ++axis) {
-          mean.mean_corner_px[c][axis] +=
-              marker->corner_px[c][axis] / static_cast<double>(seen.size());
-        }
-        motion_px =
-            std::max(motion_px, std::hypot(marker->corner_px[c][0] - seen[0]->corner_px[c][0],
-                                           marker->corner_px[c][1] - seen[0]->corner_px[c][1]));
-      }
-    }
-    if (motion_px > config_.max_motion_px) {
-      ++counters_["tag moved between frames"];
-      continue;
-    }
-    const TagPlacement& placement = *markers_.find(id);
-    SeenTag tag{id, placement.size_m, placement.X_BM.value_or(Pose::Identity()),
-                {}, covariance_px2,   {}};
-    for (const auto& corner : mean.mean_corner_px) {
-      if (auto point = lens_->straighten({corner[0], corner[1]})) {
-        point->sigma_px = sigma_px(covariance_px2);
-        tag.corners.push_back(*point);
-      }
-    }
-    if (tag.corners.size() < 4) {
-      ++counters_["tag outside of the lens model"];
-      continue;
-    }
-    for (int h = 0; h < seen[0]->num_hypotheses; ++h) {
-      tag.X_CM.push_back(from_message(seen[0]->X_CM[h]));
-    }
-    tags_of_part[placement.part].push_back(std::move(tag));
-    to_message(covariance_px2, mean.corner_covariance);
-    corners_of_tag[id] = mean;
+    auto mean = mean_of(id, seen);
+    if (!mean) continue;
+    tags_of_part[markers_.find(id)->part].push_back(std::move(mean->first));
+    corners_of_tag[id] = mean->second;
   }
 
   std::vector<part_observation_t> parts, contradictions;

@@ -80,6 +80,10 @@ class Observer {
   void end_rests(const motion_status_t& status);
   std::vector<const marker_poses_t*> frames_of(const Rest& rest) const;
   std::optional<sample_t> make_sample();
+  /// A tag of markers.yaml over the frames of a rest: the mean of its corners, with their
+  /// covariance; nothing, and counted, if it moved or is outside of the lens model.
+  std::optional<std::pair<SeenTag, tag_corners_t>> mean_of(
+      int id, const std::vector<const marker_pose_t*>& seen);
   sample_t sample_from(const Rest& rest, const std::vector<const marker_poses_t*>& frames);
 
   const ObserverConfig config_;

@@ -244,6 +244,12 @@ RobotSimulator::Answer RobotSimulator::on_command(const action_command_t& comman
     return answer;
   }
 
+  if (const std::string reason = carry_out(command, &answer); !reason.empty())
+    conclude(motion_status_t::STATE_REJECTED, reason);
+  return answer;
+}
+
+std::string RobotSimulator::carry_out(const action_command_t& command, Answer* answer) {
   // Drifts proceed while the arm moves, unless an obstacle keeps a link from bending further.
   std::vector<Fault> faults = faults_;
   std::optional<Body> drifted;
@@ -252,19 +258,13 @@ RobotSimulator::Answer RobotSimulator::on_command(const action_command_t& comman
 
   const Eigen::VectorXd target = body.scene.robot().joint_positions(
       Eigen::Map<const Eigen::VectorXd>(command.action.data(), command.action.size()));
-  if (const auto reason = body.scene.robot().beyond_range(target)) {
-    conclude(motion_status_t::STATE_REJECTED, *reason);
-    return answer;
-  }
-  if (const auto reason = move(body, target)) {
-    conclude(motion_status_t::STATE_REJECTED, *reason);
-    return answer;
-  }
+  if (const auto reason = body.scene.robot().beyond_range(target)) return *reason;
+  if (const auto reason = move(body, target)) return *reason;
 
-  answer.statuses.push_back(answer_to(command, motion_status_t::STATE_ACCEPTED, ""));
+  answer->statuses.push_back(answer_to(command, motion_status_t::STATE_ACCEPTED, ""));
   motion_status_t moving = answer_to(command, motion_status_t::STATE_MOVING, "");
   moving.rest_since_utime = -1;
-  answer.statuses.push_back(moving);
+  answer->statuses.push_back(moving);
   if (drifted) {
     body_ = *std::move(drifted);
     faults_ = faults;
@@ -280,10 +280,11 @@ RobotSimulator::Answer RobotSimulator::on_command(const action_command_t& comman
   follow(before);
   rest_since_utime_ = microseconds(body_.data->time - config_.settled_for_s);
   at_ = command.action;
-  conclude(motion_status_t::STATE_SETTLED, "");
+  answer->statuses.push_back(answer_to(command, motion_status_t::STATE_SETTLED, ""));
+  remember(answer->statuses.back());
   update_state(command.action_id);
-  answer.state = state_;
-  return answer;
+  answer->state = state_;
+  return "";
 }
 
 std::optional<RobotSimulator::Body> RobotSimulator::body_with(const std::vector<Fault>& faults,

@@ -21,7 +21,7 @@ namespace bodyschema {
 /// robot_simulator.yaml.
 struct RobotSimulatorConfig {
   std::filesystem::path rig_folder;
-  double speed_share = 1;    ///< of the joints' max_speed, for the servo set points
+  double speed_share = 1;  ///< of the joints' max_speed, for the servo set points
   // At rest is who is slower than this, each joint by its own unit, all together …
   double settled_speed_rad_per_s = 0;  ///< of a revolute joint that moves alone
   double settled_speed_m_per_s = 0;    ///< of a prismatic joint that moves alone
@@ -107,6 +107,8 @@ class RobotSimulator {
   std::string refusal(const action_command_t& command) const;
   /// Simulates body.trial until rest; a reason if it must not be. The trial is then worthless.
   std::optional<std::string> move(Body& body, const Eigen::VectorXd& target) const;
+  /// Moves the arm as commanded. Why not, or "".
+  std::string carry_out(const action_command_t& command, Answer* answer);
   /// The arm with these faults where it stands now, or why it cannot be.
   std::optional<Body> body_with(const std::vector<Fault>& faults, std::string* problem) const;
   motion_status_t answer_to(const action_command_t& command, std::int8_t state,

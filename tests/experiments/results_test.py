@@ -84,7 +84,7 @@ class Tables(unittest.TestCase):
         self.assertGreater(len(files), 20)
         for file in files:
             text = file.read_text()
-            self.assertRegex(text, r"^(## .*\n)?`(\./run experiments? |bodyschema )", file)
+            self.assertRegex(text, r"^(## .*\n)?`(\./run experiments? |bodyschema |tests/mutation/run)", file)
             self.assertTrue(any(RULE.fullmatch(line) for line in text.splitlines()), file)
 
 

@@ -60,6 +60,43 @@ void Findings::update(const Adaptation& adaptation, const std::vector<Adaptation
     findings_.erase(findings_.begin(), findings_.end() - static_cast<std::ptrdiff_t>(kMost));
 }
 
+void Findings::forget(const AdaptationEvent& event, State state) {
+  std::erase_if(findings_,
+                [&](const Finding& known) { return known.state == state && known.is_at(event); });
+}
+
+void Findings::adopt(const AdaptationEvent& event, Finding finding) {
+  if (const Finding* found = newest(event, State::kFound)) finding.found = found->found;
+  forget(event, State::kFound);
+  finding.state = State::kAdopted;
+  finding.adopted = event.sample_index;
+  Finding* adopted = newest(event, State::kAdopted);
+  if (!adopted) {
+    findings_.push_back(finding);
+    return;
+  }
+  finding.found = adopted->found;
+  finding.adopted = adopted->adopted;
+  *adopted = finding;
+}
+
+void Findings::confirm(const Adaptation& adaptation, const AdaptationEvent& event,
+                       const Finding& finding) {
+  if (Finding* followed = newest(event, State::kFollowed)) {
+    const FoundDifference difference = difference_at(
+        adaptation.history().front(), adaptation.schema(), place_of(finding, adaptation.schema()));
+    followed->state = State::kConfirmed;
+    followed->cause = difference.cause;
+    followed->size = difference.size;
+    followed->adopted = event.sample_index;
+    followed->num_confirming = event.num_samples;
+  } else if (Finding* adopted = newest(event, State::kAdopted)) {
+    adopted->state = State::kConfirmed;
+    adopted->num_confirming = event.num_samples;
+    if (event.size.kind != ChangeSize::Kind::kUnknown) adopted->size = event.size;
+  }
+}
+
 void Findings::hear(const Adaptation& adaptation, const AdaptationEvent& event) {
   Finding finding;
   finding.from = event.from;
@@ -70,41 +107,26 @@ void Findings::hear(const Adaptation& adaptation, const AdaptationEvent& event) 
   finding.size = event.size;
   finding.found = event.sample_index;
   finding.since = event.since >= 0 ? event.since : event.sample_index;
-  const auto forget = [&](State state) {
-    std::erase_if(findings_,
-                  [&](const Finding& known) { return known.state == state && known.is_at(event); });
-  };
   const bool is_aside = event.tag >= 0 || event.cause == "marker_missing";
   // Some other form may turn out to be a body of before.
   const bool is_restored =
       event.kind == Kind::kRefined && (event.is_normal || event.cause == "stored");
   switch (is_restored ? Kind::kRestored : event.kind) {
     case Kind::kMismatch:
-      forget(State::kFound);
+      forget(event, State::kFound);
       findings_.push_back(finding);
       break;
     case Kind::kMissing:
     case Kind::kCandidate:
-    case Kind::kRefined: {
+    case Kind::kRefined:
       if (is_aside) {
-        forget(State::kAside);
+        forget(event, State::kAside);
         finding.state = State::kAside;
         findings_.push_back(finding);
-        break;
-      }
-      if (const Finding* found = newest(event, State::kFound)) finding.found = found->found;
-      forget(State::kFound);
-      finding.state = State::kAdopted;
-      finding.adopted = event.sample_index;
-      if (Finding* adopted = newest(event, State::kAdopted)) {
-        finding.found = adopted->found;
-        finding.adopted = adopted->adopted;
-        *adopted = finding;
       } else {
-        findings_.push_back(finding);
+        adopt(event, finding);
       }
       break;
-    }
     case Kind::kRestored: {
       erase(event);
       if (is_aside || event.is_normal) break;
@@ -129,20 +151,9 @@ void Findings::hear(const Adaptation& adaptation, const AdaptationEvent& event) 
       break;
     case Kind::kRecovered:
       if (is_aside) {
-        forget(State::kAside);
-      } else if (Finding* followed = newest(event, State::kFollowed); followed) {
-        const FoundDifference difference =
-            difference_at(adaptation.history().front(), adaptation.schema(),
-                          place_of(finding, adaptation.schema()));
-        followed->state = State::kConfirmed;
-        followed->cause = difference.cause;
-        followed->size = difference.size;
-        followed->adopted = event.sample_index;
-        followed->num_confirming = event.num_samples;
-      } else if (Finding* adopted = newest(event, State::kAdopted)) {
-        adopted->state = State::kConfirmed;
-        adopted->num_confirming = event.num_samples;
-        if (event.size.kind != ChangeSize::Kind::kUnknown) adopted->size = event.size;
+        forget(event, State::kAside);
+      } else {
+        confirm(adaptation, event, finding);
       }
       break;
     case Kind::kProbeWanted:

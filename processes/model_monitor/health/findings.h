@@ -52,6 +52,12 @@ class Findings {
   Finding* newest(const AdaptationEvent& event, Finding::State state);
   void erase(const AdaptationEvent& event);
   void hear(const Adaptation& adaptation, const AdaptationEvent& event);
+  /// What is known at the event's place in this state.
+  void forget(const AdaptationEvent& event, Finding::State state);
+  /// `finding`, or what stands there already, is in the schema.
+  void adopt(const AdaptationEvent& event, Finding finding);
+  /// What was followed or adopted there is confirmed.
+  void confirm(const Adaptation& adaptation, const AdaptationEvent& event, const Finding& finding);
   void agree_with(const Adaptation& adaptation, std::int64_t sample_index);
 
   std::vector<Finding> findings_;
