@@ -198,7 +198,8 @@ class Smoothing {
   float widest() const { return std::max(sd_[0], sd_[1]); }
 
   /// False if the pattern is flat around (x, y); `s` is then its value alone.
-  bool operator()(const Pattern& pattern, float x, float y, Smoothed& s) const {
+  [[gnu::always_inline]] bool operator()(const Pattern& pattern, float x, float y,
+                                         Smoothed& s) const {
     const int kx = pattern.nearest_line(x), ky = pattern.nearest_line(y);
     const float to_x = std::abs(x - static_cast<float>(kx));
     const float to_y = std::abs(y - static_cast<float>(ky));
@@ -277,7 +278,7 @@ class Smoothing {
   }
 
   template <int lines>
-  Smoothed at_crossing(const Pattern& pattern, float x, float y) const {
+  [[gnu::always_inline]] Smoothed at_crossing(const Pattern& pattern, float x, float y) const {
     Lane d[4];
     pattern.smooth<lines>(x + nodes_[0].x, y + nodes_[0].y, per_sd_, d);
     if (num_nodes_ > 1) {
