@@ -1,6 +1,5 @@
 #include "processes/controller/controller.h"
 
-#include <Eigen/Cholesky>
 #include <algorithm>
 #include <cmath>
 #include <cstring>

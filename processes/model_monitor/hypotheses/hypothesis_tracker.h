@@ -103,8 +103,9 @@ class HypothesisTracker {
     std::int64_t adopted = 0;
   };
 
-  /// The newest change there, which is the one that holds now.
+  /// The same explanation since the same sample.
   static bool is_same_change(const Change& a, const Change& b);
+  /// The newest change there, which is the one that holds now.
   static const Change* last_at(const std::vector<Change>& changes, const Place& place);
   const Hypothesis& standing() const { return beam_.front(); }
   /// The same explanation, whatever its parameters.

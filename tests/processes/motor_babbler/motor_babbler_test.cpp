@@ -6,7 +6,9 @@
 #include <fstream>
 #include <memory>
 #include <random>
+#include <regex>
 #include <set>
+#include <sstream>
 
 #include "common/bus/check.h"
 #include "common/bus/convert.h"
@@ -1250,6 +1252,26 @@ TEST(MotorBabblerTest, TheConfigurationIsReadInSiUnits) {
   EXPECT_EQ(config.expiry_us, 60 * kSecond);
   EXPECT_NEAR(config.stop.rotation_rad, kDegree, 1e-12);
   EXPECT_EQ(config.extreme_from, 0.7);
+}
+
+TEST(MotorBabblerTest, MoreLeastSamplesThanMostAreRefusedByName) {
+  namespace fs = std::filesystem;
+  const fs::path rig = fs::path(testing::TempDir()) / "motor_babbler_least_samples";
+  fs::remove_all(rig);
+  fs::copy(std::string(BODYSCHEMA_CONFIG) + "/arm2", rig, fs::copy_options::recursive);
+  const fs::path file = rig / "motor_babbler.yaml";
+  std::stringstream text;
+  text << std::ifstream(file).rdbuf();
+  std::ofstream(file) << std::regex_replace(text.str(), std::regex("max_samples: *[0-9]+"),
+                                            "max_samples: 3");
+  try {
+    MotorBabblerConfig::load(file);
+    ADD_FAILURE() << "accepted";
+  } catch (const ConfigError& error) {
+    EXPECT_NE(std::string(error.what()).find("above max_samples, 3"), std::string::npos)
+        << error.what();
+  }
+  fs::remove_all(rig);
 }
 
 }  // namespace
