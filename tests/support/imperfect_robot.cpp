@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <random>
 
 #include "common/geometry/angle.h"
 
@@ -64,6 +65,7 @@ const std::vector<Imperfection>& imperfections() {
       {.name = "correlation 0.5", .correlation = 0.5},
       {.name = "correlation 0.9", .correlation = 0.9},
       {.name = "Student t, ν = 3", .student_nu = 3},
+      {.name = "Student t, ν = 2.2", .student_nu = 2.2},
       {.name = "outliers 10 %", .outlier_share = 0.1},
       {.name = "flips 10 %", .flip_share = 0.1},
       {.name = "missing 30 %", .missing_share = 0.3},
@@ -189,7 +191,9 @@ ActionPoseSample ImperfectRobot::go(const Eigen::VectorXd& action) {
     if (is_.student_nu > 0) {
       // t = z / √(χ²/ν), its variance as the Gaussian's.
       double chi2 = 0;
-      for (int k = 0; k < is_.student_nu; ++k) chi2 += std::pow(gaussian(rng_), 2);
+      for (int k = 1; k <= is_.student_nu; ++k) chi2 += std::pow(gaussian(rng_), 2);
+      const double rest = is_.student_nu - std::floor(is_.student_nu);
+      if (rest > 0) chi2 += std::chi_squared_distribution<>(rest)(rng_);
       white *= std::sqrt((is_.student_nu - 2) / chi2);
     }
     const double rho = is_.correlation;
@@ -230,6 +234,13 @@ std::vector<ActionPoseSample> ImperfectRobot::babble(int num_samples) {
   std::vector<ActionPoseSample> samples;
   for (int n = 0; n < num_samples; ++n) samples.push_back(go(random_action()));
   return samples;
+}
+
+void ImperfectRobot::bend(int part, double position_m, double rotation_rad) {
+  Isometry3d step = turned(rotation_rad * gaussian3(rng_).normalized());
+  step.translation() = position_m * gaussian3(rng_).normalized();
+  Isometry3d& after = links_[static_cast<std::size_t>(part) - 1].after;
+  after = after * step;
 }
 
 }  // namespace bodyschema::test

@@ -20,7 +20,7 @@ struct Imperfection {
   double view_bias_m = 0;       ///< rms over all views of a tag, a smooth function of the view
   double view_bias_deg = 0;     ///< likewise
   double correlation = 0;       ///< of the noise from one sample to the next: AR(1)
-  int student_nu = 0;           ///< degrees of freedom of t-distributed noise, above 2; 0: Gaussian
+  double student_nu = 0;        ///< degrees of freedom of t-distributed noise, above 2; 0: Gaussian
   double outlier_share = 0;     ///< anywhere within 1 m
   double flip_share = 0;        ///< the tag's normal mirrored at the line of sight
   double missing_share = 0;
@@ -50,6 +50,8 @@ class ImperfectRobot {
   /// Carries out an action and returns its observation.
   ActionPoseSample go(const Eigen::VectorXd& action);
   std::vector<ActionPoseSample> babble(int num_samples);
+  /// The link of a part bends, behind its joint: by so much in a random direction each.
+  void bend(int part, double position_m, double rotation_rad);
   /// Pose of part n + 1 at the last action, in the camera's frame.
   const std::vector<Eigen::Isometry3d>& poses() const { return poses_; }
 
