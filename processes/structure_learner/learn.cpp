@@ -6,6 +6,7 @@
 #include <stdexcept>
 
 #include "processes/structure_learner/command_warp.h"
+#include "processes/structure_learner/confirmed_structure.h"
 #include "processes/structure_learner/edge_fit.h"
 #include "processes/structure_learner/learned_schema.h"
 #include "processes/structure_learner/root_pose.h"
@@ -60,6 +61,11 @@ UnconnectedPart explain(int part, int num_seen, const std::set<int>& connected,
       "seen " + (num_seen == 1 ? "once" : std::to_string(num_seen) + " times") + ", at most " +
       std::to_string(common) + " of them together with one connected part" +
       (partner >= 0 ? " (" + std::to_string(partner) + ")" : "");
+  if (structure.is_contested)
+    return {part, Unconnected::kNotEnoughData,
+            seen +
+                "; another structure fits if the noise is larger than it is said to be: tell "
+                "the true noise, or give more samples"};
   if (!undecided && 6 * common >= 5 * parameters)
     return {part, Unconnected::kNoValidModel,
             seen + "; no model with up to " + std::to_string(max_signals) +
@@ -124,6 +130,8 @@ LearnResult fit_tree(const LearnedStructure& structure,
   BodySchema& schema = result.schema;
   schema = start_schema(structure.signals, samples, options.root);
   schema.noise = measurement.noise ? *measurement.noise : typical_noise(samples);
+  schema.noise.position_m *= measurement.scale;
+  schema.noise.rotation_rad *= measurement.scale;
 
   // Everything that is fitted sees displacements.
   const std::vector<ActionPoseSample> moved = displaced(samples, structure.signals);
@@ -168,14 +176,17 @@ SourcedNoise marker_noise(const std::vector<ActionPoseSample>& samples, int num_
       .value_or(SourcedNoise{kNoiseFloor, NoiseSource::kAssumed});
 }
 
-LearnedStructure find_structure(const std::vector<Signal>& signals,
+namespace {
+
+LearnedStructure find_with_bias(const std::vector<Signal>& signals,
                                 const std::vector<ActionPoseSample>& samples,
-                                const LearnOptions& options) {
+                                const LearnOptions& options, double unknown_bias) {
   if (options.max_signals < 0 || options.max_signals > kMaxJoints)
     throw std::invalid_argument("max_signals must be 0 to " + std::to_string(kMaxJoints));
   const int num_signals = check_actions(samples, signals.size());
   const std::vector<int> parts = seen_parts(samples);
   SearchOptions search_options = search_options_of(options);
+  search_options.unknown_bias = unknown_bias;
   MeasurementModel& measurement = search_options.measurement;
   NoiseSource noise_source = NoiseSource::kCovariances;
   const auto set_noise = [&](const std::vector<ActionPoseSample>& of) {
@@ -216,9 +227,23 @@ LearnedStructure find_structure(const std::vector<Signal>& signals,
     if (was_spanning) break;
   }
   measurement = result.measurement;
-  connect_soft_parts(displaced(samples, result.signals), result.actions, parts, search_options,
-                     &result.search);
+  // With enough noise a screw passes for anything soft: nothing is tried beside it.
+  if (unknown_bias == 0)
+    connect_soft_parts(displaced(samples, result.signals), result.actions, parts, search_options,
+                       &result.search);
   return result;
+}
+
+}  // namespace
+
+LearnedStructure find_structure(const std::vector<Signal>& signals,
+                                const std::vector<ActionPoseSample>& samples,
+                                const LearnOptions& options) {
+  return confirmed_structure([&](double factor, double unknown_bias) {
+    LearnOptions louder = options;
+    louder.measurement.scale *= factor;
+    return find_with_bias(signals, samples, louder, unknown_bias);
+  });
 }
 
 LearnResult fit_structure(const LearnedStructure& structure,

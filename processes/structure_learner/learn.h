@@ -62,10 +62,14 @@ struct LearnedStructure {
   NormalizedActions actions;  ///< that the models are over
   SearchResult search;
   NoiseSource noise_source = NoiseSource::kAssumed;
+  /// Another structure stands where the noise is larger than told: edges that the two do not share
+  /// were taken out.
+  bool is_contested = false;
 
   /// The edges span all parts seen.
   bool spans() const { return search.models.size() + 1 >= parts.size(); }
 };
+/// Where the residuals refute the noise told, a larger one (see confirmed_structure.h).
 /// @throws std::invalid_argument as learn().
 LearnedStructure find_structure(const std::vector<Signal>& signals,
                                 const std::vector<ActionPoseSample>& samples,

@@ -28,6 +28,7 @@ SearchResult search_structure(const std::vector<ActionPoseSample>& samples,
   result.models = forest.models();
   result.records = std::move(pairs.records());
   result.log_likelihood = settled.log_likelihood;
+  result.residual_scale = settled.residual_scale;
   result.num_screens = pairs.num_screens;
   result.num_fits = pairs.num_fits;
   return result;

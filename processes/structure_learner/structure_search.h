@@ -14,6 +14,8 @@ struct SearchResult {
   /// All poses', each tree fitted as a whole, Student-t [nats]; up to a constant. It holds for a
   /// forest that spans: from one with gaps models may have been taken since.
   double log_likelihood = 0;
+  /// Variance of what the forest leaves, over that of the noise assumed.
+  double residual_scale = 0;
   /// By signal that moved: how clearly a joint on it would show in that edge which would show it
   /// least (missing_joint_information() [per (rad per half range)²]), edges that have it already
   /// apart. Infinite if there is no edge to judge.

@@ -2,7 +2,8 @@
 // to 7 joints, one imperfection a row. Counts right, incomplete and wrong structures, and wrong
 // ones that are called complete; prints Markdown.
 //
-//   imperfect_robots [--robots 12] [--samples 20 50 100] [--estimate-noise] [--cell WORDS]
+//   imperfect_robots [--robots 12] [--samples 20 50 100] [--told 1 | --estimate-noise] [--cell
+//   WORDS]
 
 #include <CLI/CLI.hpp>
 #include <cstdio>
@@ -20,10 +21,12 @@ int main(int argc, char** argv) {
   int num_robots = 12;
   std::vector<int> nums_samples = {20, 50, 100};
   bool is_noise_estimated = false;
+  double told = 1;
   std::string cell;
   CLI::App app("Robots that are not as our models are");
   app.add_option("--robots", num_robots, "A row")->check(CLI::PositiveNumber);
   app.add_option("--samples", nums_samples)->check(CLI::PositiveNumber);
+  app.add_option("--told", told, "Times the true noise, 3 mm and 1°")->check(CLI::PositiveNumber);
   app.add_flag("--estimate-noise", is_noise_estimated, "Its 3 mm and 1° are not told");
   app.add_option("--cell", cell, "Rows whose name has these words alone");
   CLI11_PARSE(app, argc, argv);
@@ -43,7 +46,7 @@ int main(int argc, char** argv) {
                              static_cast<std::uint64_t>(r));
         LearnOptions options;
         options.root = 1;
-        if (!is_noise_estimated) options.measurement.noise = Noise{0.003, 1 * kDegree};
+        if (!is_noise_estimated) options.measurement.noise = Noise{told * 0.003, told * kDegree};
         const BodySchema schema = learn(robot.signals(), robot.babble(num_samples), options).schema;
         const Rightness rightness = judge(schema, robot.structure());
         num_right += rightness == Rightness::kRight;

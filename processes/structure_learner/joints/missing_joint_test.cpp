@@ -28,6 +28,7 @@ class ClusterTest {
     const Eigen::VectorXd newton;    // H⁻¹g
     const Eigen::MatrixXd q, q2;     // frames × moving signals
     const Matrix6d bias;             // covariance of a marker's own bias
+    const double unknown_bias;       // beside it, in standard deviations of one sight
   };
 
   ClusterTest(const TreeFit& tree, const Context& context, int top)
@@ -171,6 +172,21 @@ class ClusterTest {
         C_.block<6, 6>(6 * i, 6 * j) += Eigen::Map<const Matrix6d>(sum.data());
         if (i == j) own_.middleCols<6>(6 * i) = Eigen::Map<const Matrix6d>(sum.data());
       }
+    unknown_.clear();
+    for (int i = 0; i < n; ++i) unknown_.push_back(unknown_bias(i, s));
+  }
+
+  // Covariance of a bias that nobody told, as a twist in the top's frame.
+  Matrix6d unknown_bias(int i, int s) const {
+    double q2 = 0;
+    for (int t = 0; t < num_frames(); ++t)
+      if (!FF_[i * num_items() + i].col(t).isZero(0)) q2 += context_.q2(t, s);
+    Matrix6d information = own_.middleCols<6>(6 * i) / std::max(q2, 1e-300);
+    const Vector6d unit = information.diagonal().cwiseMax(1e-300).cwiseSqrt().cwiseInverse();
+    information = unit.asDiagonal() * information * unit.asDiagonal();
+    information.diagonal().array() += 1e-6;
+    return context_.unknown_bias * context_.unknown_bias * context_.normal.noise_scale() *
+           (unit.asDiagonal() * information.inverse() * unit.asDiagonal());
   }
 
   // Items change sides, `first` apart, while the joint gets less likely by chance.
@@ -200,7 +216,7 @@ class ClusterTest {
       if (!moves[i]) continue;
       u += u_.segment<6>(6 * i);
       own += own_.middleCols<6>(6 * i);
-      bias += items_[i].bias;
+      bias += items_[i].bias + unknown_[i];
       for (int j = 0; j < num_items(); ++j)
         if (moves[j]) C += C_.block<6, 6>(6 * i, 6 * j);
     }
@@ -259,6 +275,7 @@ class ClusterTest {
   // For one signal, stacked over the items: the score, its covariance, the items' own information.
   Eigen::VectorXd u_;
   Eigen::MatrixXd C_, own_;
+  std::vector<Matrix6d> unknown_;
 };
 
 // Frames × moving signals.
@@ -273,13 +290,14 @@ Eigen::MatrixXd moving_actions(const TreeFit& fit) {
 
 }  // namespace
 
-std::vector<MissingJoint> missing_joints(const TreeFit& fit, const Noise& bias) {
+std::vector<MissingJoint> missing_joints(const TreeFit& fit, const Noise& bias,
+                                         double unknown_bias) {
   const TreeFit::Normal normal = fit.normal_equations();
   const std::optional<Eigen::MatrixXd> inverse = normal.inverse();
   if (!inverse) return {};
   const Eigen::MatrixXd q = moving_actions(fit);
-  const ClusterTest::Context context{normal, *inverse,          *inverse * normal.g,
-                                     q,      q.cwiseProduct(q), isotropic(bias)};
+  const ClusterTest::Context context{
+      normal, *inverse, *inverse * normal.g, q, q.cwiseProduct(q), isotropic(bias), unknown_bias};
   std::vector<MissingJoint> result;
   for (int top = 0; top < static_cast<int>(fit.nodes().size()); ++top) {
     if (top > 0 && fit.nodes()[top].model.num_joints == 0) continue;

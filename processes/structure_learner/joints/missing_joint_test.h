@@ -14,8 +14,10 @@ namespace bodyschema {
 /// exchange; of a sliding (3 degrees of freedom) and a general joint (6), the less likely by
 /// chance. A marker's own bias, which turns with the signals that turn it to the camera, is no
 /// joint: `bias`, standard deviations at half range of a signal, adds to the noise of ξ however
-/// many samples there are. The least likely by chance first.
-std::vector<MissingJoint> missing_joints(const TreeFit& fit, const Noise& bias);
+/// many samples there are, and so does `unknown_bias`, in standard deviations of the noise of one
+/// sight of what moves. The least likely by chance first.
+std::vector<MissingJoint> missing_joints(const TreeFit& fit, const Noise& bias,
+                                         double unknown_bias = 0);
 
 /// The one that chance explains least, if it is significant (Bonferroni over all that was tried).
 /// An idle signal, which moves nothing in a spanning forest, is probably somewhere: it has an error

@@ -51,8 +51,10 @@ std::optional<MissingJoint> missing_joint(const ModelForest& forest, const PairM
                                           TreeFit* fit) {
   const std::set<int> idle = forest.idle_signals(pairs.actions().moving());
   for (bool is_settled = false;; is_settled = true) {
-    const auto worst = most_significant(
-        missing_joints(*fit, pairs.options().measurement.systematic), fit->num_frames(), idle);
+    const SearchOptions& options = pairs.options();
+    const auto worst =
+        most_significant(missing_joints(*fit, options.measurement.systematic, options.unknown_bias),
+                         fit->num_frames(), idle);
     if (!worst || is_settled) return worst;
     fit->fit(60, 1e-5);
   }

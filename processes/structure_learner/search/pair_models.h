@@ -20,6 +20,9 @@ struct SearchOptions {
   MeasurementModel measurement;
   ValidityOptions validity;
   int max_signals = 2;  ///< largest k, at most kMaxJoints
+  /// Standard deviation of the bias that every marker may have beside measurement.systematic, at
+  /// half range of a signal, in those of the noise of one sight.
+  double unknown_bias = 0;
 };
 
 /// A search's trials between two parts.

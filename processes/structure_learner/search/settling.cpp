@@ -5,6 +5,7 @@
 
 #include "common/kinematics/kinematic_tree.h"
 #include "processes/structure_learner/search/component_tree.h"
+#include "processes/structure_learner/tree_fit_normal.h"
 
 namespace bodyschema {
 namespace {
@@ -42,16 +43,16 @@ bool exchange(const ComponentTree& tree, int signal, double cost, std::vector<Ca
   return true;
 }
 
-// Log likelihood of a part's component, settled.
-double settle_tree(int part, std::vector<Candidate>* spare, PairModels* pairs, ModelForest* forest,
-                   std::vector<AcceptedModel>* refuted) {
+// A part's component, settled, as all markers see it.
+TreeFit settle_tree(int part, std::vector<Candidate>* spare, PairModels* pairs, ModelForest* forest,
+                    std::vector<AcceptedModel>* refuted) {
   constexpr int kMaxSplits = 12;
   for (int round = 1;; ++round) {
     const ComponentTree tree(*forest, part, pairs);
     TreeFit fit = tree.fit();
     const auto worst =
         tree.nodes().size() < 2 ? std::nullopt : missing_joint(*forest, *pairs, &fit);
-    if (!worst || round == kMaxSplits) return fit.log_likelihood();
+    if (!worst || round == kMaxSplits) return fit;
     if (exchange(tree, worst->signal, fit.cost(), spare, pairs, forest)) continue;
     if (const auto edges = insert_joint(fit.nodes(), *worst)) {
       tree.replace_edges(*edges, forest);
@@ -59,7 +60,7 @@ double settle_tree(int part, std::vector<Candidate>* spare, PairModels* pairs, M
     }
     for (const int node : full_edges(fit.nodes(), *worst))
       refuted->push_back(forest->models()[tree.model_of(node)]);
-    return fit.log_likelihood();
+    return fit;
   }
 }
 
@@ -68,9 +69,13 @@ double settle_tree(int part, std::vector<Candidate>* spare, PairModels* pairs, M
 Settled settle_trees(std::vector<Candidate>* spare, PairModels* pairs, ModelForest* forest) {
   Settled result;
   std::vector<AcceptedModel> refuted;
-  for (const int part : forest->parts())
-    if (forest->component(part) == part)
-      result.log_likelihood += settle_tree(part, spare, pairs, forest, &refuted);
+  for (const int part : forest->parts()) {
+    if (forest->component(part) != part) continue;
+    const TreeFit fit = settle_tree(part, spare, pairs, forest, &refuted);
+    result.log_likelihood += fit.log_likelihood();
+    if (fit.nodes().size() > 1)
+      result.residual_scale = std::max(result.residual_scale, fit.normal_equations().scale);
+  }
   result.any_refuted = !refuted.empty();
   std::vector<AcceptedModel> models = forest->models();
   for (const AcceptedModel& m : refuted) {

@@ -9,6 +9,7 @@ namespace bodyschema {
 struct Settled {
   double log_likelihood = 0;  ///< of all poses, each tree fitted as a whole [nats]
   bool any_refuted = false;   ///< models were removed, and left a gap
+  double residual_scale = 0;  ///< variance of a tree's residuals over the noise assumed, largest
 };
 
 /// Puts in the joints that only all markers together show, until nothing is left to explain. Where

@@ -1,0 +1,85 @@
+#include "processes/structure_learner/confirmed_structure.h"
+
+#include <algorithm>
+#include <set>
+#include <tuple>
+#include <utility>
+#include <vector>
+
+namespace bodyschema {
+namespace {
+
+// Above it the residuals refute the noise that is told. Of right structures in white noise they
+// have 0.84 to 0.98 of the variance assumed (heavy tails are weighted down).
+constexpr double kLargestResidual = 1;
+constexpr double kMostNoise = 4;  // of the told one; it is confirmed at twice that
+// Chosen: of 12 robots with a view bias of 4 mm and 2°, told 12 mm and 4°, 50 samples, none is
+// right with 0, all with 0.5, 1 and 2.
+constexpr double kUnknownBias = 0.5;
+
+// Ends, signals with their multiplicity, and those of a Gaussian process.
+using EdgeSignature = std::tuple<int, int, std::multiset<int>, std::vector<int>>;
+
+EdgeSignature signature_of(const AcceptedModel& edge) {
+  const auto begin = edge.model.signal.begin();
+  return {edge.part_i, edge.part_j, {begin, begin + edge.model.num_joints}, edge.soft_signals};
+}
+
+std::set<EdgeSignature> signatures_of(const LearnedStructure& structure) {
+  std::set<EdgeSignature> result;
+  for (const AcceptedModel& edge : structure.search.models) result.insert(signature_of(edge));
+  return result;
+}
+
+bool is_soft(const LearnedStructure& structure) {
+  return std::any_of(structure.search.models.begin(), structure.search.models.end(),
+                     [](const AcceptedModel& edge) { return !edge.soft_signals.empty(); });
+}
+
+std::set<int> signals_of(const LearnedStructure& structure) {
+  std::set<int> result;
+  for (const AcceptedModel& edge : structure.search.models) result.merge(signal_set(edge.model));
+  return result;
+}
+
+// A structure that does not span for want of data: more noise does not help.
+bool lacks_data(const LearnedStructure& structure) {
+  return !structure.spans() &&
+         std::any_of(structure.search.records.begin(), structure.search.records.end(),
+                     [](const auto& record) { return !record.second.undecided.empty(); });
+}
+
+LearnedStructure contested(LearnedStructure structure, const LearnedStructure& rival) {
+  const std::set<EdgeSignature> shared = signatures_of(rival);
+  const auto removed = std::erase_if(structure.search.models, [&](const AcceptedModel& edge) {
+    return !shared.contains(signature_of(edge));
+  });
+  structure.is_contested = removed > 0;
+  return structure;
+}
+
+}  // namespace
+
+LearnedStructure confirmed_structure(const FindStructure& find) {
+  LearnedStructure told = find(1, 0);
+  if (told.search.models.empty() || lacks_data(told)) return told;
+  const bool is_explained = told.spans() && !is_soft(told);
+  if (is_explained && told.search.residual_scale <= kLargestResidual) return told;
+  LearnedStructure quieter = told;
+  for (double factor = 2; factor <= 2 * kMostNoise; factor *= 2) {
+    LearnedStructure louder = find(factor, kUnknownBias);
+    const bool is_first = factor == 2;
+    if (is_first && is_explained && !louder.spans()) return told;
+    if (quieter.spans() && !is_soft(quieter) && signatures_of(quieter) == signatures_of(louder)) {
+      if (!is_first) quieter.noise_source = NoiseSource::kResiduals;
+      return quieter;
+    }
+    const std::set<int> used = signals_of(louder);
+    for (const int s : signals_of(quieter))
+      if (is_explained && !used.contains(s)) return contested(std::move(told), louder);
+    quieter = std::move(louder);
+  }
+  return is_explained ? contested(std::move(told), quieter) : told;
+}
+
+}  // namespace bodyschema

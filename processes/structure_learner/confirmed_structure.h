@@ -1,0 +1,26 @@
+#pragma once
+
+#include <functional>
+
+#include "processes/structure_learner/learn.h"
+
+namespace bodyschema {
+
+/// Searches with all standard deviations of the noise `factor` times as large, where every marker
+/// may have a bias that nobody told (SearchOptions::unknown_bias).
+using FindStructure = std::function<LearnedStructure(double factor, double unknown_bias)>;
+
+/// The structure as it is with the noise told, unless the residuals refute that noise. What no
+/// model describes (a bias of views, a tag that is not where it should be) looks like more joints
+/// to whoever believes too small a noise: these go when the noise is doubled, joints that move
+/// several times the noise stay.
+///
+/// So where the residuals are larger than the noise explains, or nothing but Gaussian processes
+/// explains them, or no structure spans although data are enough, the noise is doubled until two
+/// structures in a row are the same; that of the smaller noise, at most four times the told one, is
+/// the answer. Where a signal that the first structure uses is used no more with larger noise, size
+/// alone does not tell a small joint from a bias: what the two do not share is left open
+/// (LearnedStructure::is_contested).
+LearnedStructure confirmed_structure(const FindStructure& find);
+
+}  // namespace bodyschema

@@ -1,0 +1,114 @@
+#include "processes/structure_learner/confirmed_structure.h"
+
+#include <gtest/gtest.h>
+
+#include <map>
+#include <vector>
+
+#include "common/geometry/angle.h"
+#include "tests/support/imperfect_robot.h"
+
+namespace bodyschema {
+namespace {
+
+// Parts 1 and 2, an edge with these signals, and what it leaves of the variance assumed.
+LearnedStructure structure(const std::vector<int>& signals, double residual_scale) {
+  LearnedStructure result{.parts = {1, 2}, .actions = NormalizedActions({}, 0)};
+  AcceptedModel edge{.part_i = 1, .part_j = 2};
+  for (const int s : signals)
+    edge.model.signal[static_cast<std::size_t>(edge.model.num_joints++)] = s;
+  result.search.models = {edge};
+  result.search.residual_scale = residual_scale;
+  return result;
+}
+
+LearnedStructure nothing() {
+  LearnedStructure result = structure({}, 1);
+  result.parts = {1, 2, 3};
+  return result;
+}
+
+struct Found {
+  int num_searches;
+  LearnedStructure structure;
+};
+
+Found confirmed(const std::map<double, LearnedStructure>& by_factor) {
+  int num_searches = 0;
+  LearnedStructure structure = confirmed_structure([&](double factor, double unknown_bias) {
+    ++num_searches;
+    EXPECT_EQ(unknown_bias > 0, factor > 1);
+    return by_factor.at(factor);
+  });
+  return {num_searches, std::move(structure)};
+}
+
+std::vector<int> signals_of(const LearnedStructure& found) {
+  std::vector<int> result;
+  for (const AcceptedModel& edge : found.search.models)
+    for (int d = 0; d < edge.model.num_joints; ++d)
+      result.push_back(edge.model.signal[static_cast<std::size_t>(d)]);
+  return result;
+}
+
+TEST(ConfirmedStructureTest, ToldNoiseThatResidualsDoNotRefuteStandsAfterOneSearch) {
+  const Found found = confirmed({{1, structure({0}, 0.95)}});
+  EXPECT_EQ(found.num_searches, 1);
+  EXPECT_EQ(signals_of(found.structure), std::vector<int>({0}));
+}
+
+TEST(ConfirmedStructureTest, WhereNothingSpansTheNoiseGrowsUntilTwoStructuresAreTheSame) {
+  const Found found = confirmed({{1, nothing()},
+                                 {2, structure({0, 0}, 1.5)},
+                                 {4, structure({0}, 1)},
+                                 {8, structure({0}, 0.5)}});
+  EXPECT_EQ(signals_of(found.structure), std::vector<int>({0}));
+  EXPECT_EQ(found.structure.search.residual_scale, 1);
+  EXPECT_EQ(found.structure.noise_source, NoiseSource::kResiduals);
+  EXPECT_FALSE(found.structure.is_contested);
+}
+
+TEST(ConfirmedStructureTest, TooFewDataAreNoReasonForMoreNoise) {
+  LearnedStructure few = nothing();
+  few.search.records[{2, 3}].undecided.emplace(1, 5.0);
+  EXPECT_EQ(confirmed({{1, few}}).num_searches, 1);
+}
+
+TEST(ConfirmedStructureTest, WhatTwiceTheNoiseDoesNotSpanContradictsNothing) {
+  const Found found = confirmed({{1, structure({0, 1}, 1.2)}, {2, nothing()}});
+  EXPECT_EQ(signals_of(found.structure), std::vector<int>({0, 1}));
+  EXPECT_FALSE(found.structure.is_contested);
+}
+
+TEST(ConfirmedStructureTest, AnExtraJointOfASignalThatIsUsedAnywayGoes) {
+  const Found found =
+      confirmed({{1, structure({0, 0}, 1.2)}, {2, structure({0}, 0.9)}, {4, structure({0}, 0.3)}});
+  EXPECT_EQ(signals_of(found.structure), std::vector<int>({0}));
+  EXPECT_EQ(found.structure.noise_source, NoiseSource::kResiduals);
+}
+
+TEST(ConfirmedStructureTest, ASignalThatIsLostWithMoreNoiseLeavesItsEdgeOpen) {
+  const Found found = confirmed({{1, structure({0, 1}, 1.2)}, {2, structure({0}, 0.9)}});
+  EXPECT_TRUE(found.structure.is_contested);
+  EXPECT_TRUE(found.structure.search.models.empty());
+}
+
+TEST(ConfirmedStructureTest, ABiasOfViewsAboveTheToldNoiseIsNoJoint) {
+  test::Imperfection biased{.name = "view bias", .view_bias_m = 0.004, .view_bias_deg = 2};
+  LearnOptions options;
+  options.root = 1;
+  options.measurement.noise = Noise{0.003, 1 * kDegree};
+  int num_right = 0, num_confidently_wrong = 0;
+  for (std::uint64_t seed = 0; seed < 4; ++seed) {
+    test::ImperfectRobot robot(2 + static_cast<int>(seed), true, biased, seed);
+    const BodySchema schema = learn(robot.signals(), robot.babble(50), options).schema;
+    const test::Rightness rightness = judge(schema, robot.structure());
+    num_right += rightness == test::Rightness::kRight;
+    num_confidently_wrong += rightness == test::Rightness::kWrong && schema.complete;
+  }
+  EXPECT_GE(num_right, 3);
+  EXPECT_EQ(num_confidently_wrong, 0);
+}
+
+}  // namespace
+}  // namespace bodyschema
