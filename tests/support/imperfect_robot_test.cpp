@@ -11,8 +11,7 @@ namespace {
 
 constexpr int kNumSamples = 300;
 
-template <class Number>
-Imperfection with(Number Imperfection::*member, Number value) {
+Imperfection with(double Imperfection::*member, double value) {
   Imperfection imperfection;
   imperfection.*member = value;
   return imperfection;
@@ -173,6 +172,21 @@ TEST(ImperfectRobotTest, WhatIsRareOrMissingIsSoByItsShare) {
   const Spread heavy = spread_of(with(&Imperfection::student_nu, 3));
   EXPECT_GT(heavy.rotation_rad / kDegree, 0.6);
   EXPECT_LT(heavy.rotation_rad / kDegree, 2);
+}
+
+TEST(ImperfectRobotTest, ABentLinkMovesItsPartAndWhatItCarriesInTheParentAlone) {
+  ImperfectRobot robot(3, true, {}, 1);
+  const Eigen::VectorXd action = robot.random_action();
+  robot.go(action);
+  const auto before = robot.poses();
+  robot.bend(3, 0.03, 20 * kDegree);
+  robot.go(action);
+  const auto& after = robot.poses();
+  EXPECT_TRUE(after[1].isApprox(before[1]));
+  const Eigen::Isometry3d step = before[2].inverse() * after[2];
+  EXPECT_NEAR(step.translation().norm(), 0.03, 1e-12);
+  EXPECT_NEAR(Eigen::AngleAxisd(step.linear()).angle(), 20 * kDegree, 1e-12);
+  EXPECT_TRUE((after[2].inverse() * after[3]).isApprox(before[2].inverse() * before[3]));
 }
 
 TEST(ImperfectRobotTest, MiscalibrationMovesWhatIsSeenByWhatItSays) {
