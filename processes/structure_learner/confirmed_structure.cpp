@@ -70,6 +70,8 @@ LearnedStructure confirmed_structure(const FindStructure& find) {
     LearnedStructure louder = find(factor, kUnknownBias);
     const bool is_first = factor == 2;
     if (is_first && is_explained && !louder.spans()) return told;
+    // What more noise does not help to connect has another reason.
+    if (!louder.spans() && louder.search.models.size() <= quieter.search.models.size()) break;
     if (quieter.spans() && !is_soft(quieter) && signatures_of(quieter) == signatures_of(louder)) {
       if (!is_first) quieter.noise_source = NoiseSource::kResiduals;
       return quieter;

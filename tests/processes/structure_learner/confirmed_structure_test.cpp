@@ -74,6 +74,12 @@ TEST(ConfirmedStructureTest, TooFewDataAreNoReasonForMoreNoise) {
   EXPECT_EQ(confirmed({{1, few}}).num_searches, 1);
 }
 
+TEST(ConfirmedStructureTest, WhatMoreNoiseDoesNotConnectIsLeftAsItIs) {
+  const Found found = confirmed({{1, nothing()}, {2, nothing()}});
+  EXPECT_EQ(found.num_searches, 2);
+  EXPECT_FALSE(found.structure.is_contested);
+}
+
 TEST(ConfirmedStructureTest, WhatTwiceTheNoiseDoesNotSpanContradictsNothing) {
   const Found found = confirmed({{1, structure({0, 1}, 1.2)}, {2, nothing()}});
   EXPECT_EQ(signals_of(found.structure), std::vector<int>({0, 1}));
