@@ -42,6 +42,12 @@ std::set<int> signals_of(const LearnedStructure& structure) {
   return result;
 }
 
+// Noise that is guessed from what models leave has room for whatever they leave.
+bool is_noise_known(const LearnedStructure& structure) {
+  return structure.noise_source != NoiseSource::kResiduals &&
+         structure.noise_source != NoiseSource::kAssumed;
+}
+
 // A structure that does not span for want of data: more noise does not help.
 bool lacks_data(const LearnedStructure& structure) {
   return !structure.spans() &&
@@ -62,7 +68,7 @@ LearnedStructure contested(LearnedStructure structure, const LearnedStructure& r
 
 LearnedStructure confirmed_structure(const FindStructure& find) {
   LearnedStructure told = find(1, 0);
-  if (told.search.models.empty() || lacks_data(told)) return told;
+  if (told.search.models.empty() || lacks_data(told) || !is_noise_known(told)) return told;
   const bool is_explained = told.spans() && !is_soft(told);
   if (is_explained && told.search.residual_scale <= kLargestResidual) return told;
   LearnedStructure quieter = told;

@@ -37,6 +37,17 @@ Noise typical_noise(const std::vector<ActionPoseSample>& samples) {
   return {std::sqrt(position / count), std::sqrt(rotation / count)};
 }
 
+// What stiff models leave is no noise where it is more than any tag or tracker has: chosen, above
+// the 3 mm and 1° of tags, below the 30 to 46 mm and 9 to 15° of two joints fitted to a real arm of
+// seven (16 subsets of arm7_ends.csv), which a Gaussian process would then explain well enough.
+constexpr Noise kLargestGuess{0.01, 3 * kDegree};
+
+bool is_guess_too_large(const LearnedStructure& structure) {
+  return structure.noise_source == NoiseSource::kResiduals &&
+         (structure.measurement.noise->position_m > kLargestGuess.position_m ||
+          structure.measurement.noise->rotation_rad > kLargestGuess.rotation_rad);
+}
+
 // Why `part`, which was seen, is not connected to the root's component.
 UnconnectedPart explain(int part, int num_seen, const std::set<int>& connected,
                         const LearnedStructure& structure, int max_signals) {
@@ -70,7 +81,10 @@ UnconnectedPart explain(int part, int num_seen, const std::set<int>& connected,
     return {part, Unconnected::kNoValidModel,
             seen + "; no model with up to " + std::to_string(max_signals) +
                 " signals is valid to any connected part" +
-                (was_soft_tried ? ", nor any with a Gaussian process beside its joints" : "")};
+                (was_soft_tried ? ", nor any with a Gaussian process beside its joints" : "") +
+                (is_guess_too_large(structure)
+                     ? "; their noise is guessed from what these models leave: tell it (--noise)"
+                     : "")};
   std::string detail = seen + "; more samples are needed to trust a model";
   for (const int s : untold) {
     detail += s == *untold.begin() ? ": too few yet to tell what moves with " : ", ";
@@ -228,7 +242,7 @@ LearnedStructure find_with_bias(const std::vector<Signal>& signals,
   }
   measurement = result.measurement;
   // With enough noise a screw passes for anything soft: nothing is tried beside it.
-  if (unknown_bias == 0)
+  if (unknown_bias == 0 && !is_guess_too_large(result))
     connect_soft_parts(displaced(samples, result.signals), result.actions, parts, search_options,
                        &result.search);
   return result;

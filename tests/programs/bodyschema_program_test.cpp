@@ -876,6 +876,17 @@ TEST_F(RealDataTest, TheWeldingPositionerIsPredictedWhereItWasNotLearned) {
   EXPECT_LT(part["rotation_median_deg"].get<double>(), 0.06);
 }
 
+// Seven joints between the only two parts seen, more than a local model has: what two of them leave
+// is no noise.
+TEST_F(RealDataTest, AnArmSeenAtItsEndsIsNotExplainedByNoise) {
+  const auto csv = data_ / "arm7_ends.csv";
+  if (!std::filesystem::exists(csv)) GTEST_SKIP() << csv << " is not there";
+  const Outcome outcome = run({"learn", csv, "--out", "schema.lcmlog", "--json"});
+  const Json json = outcome.json();
+  EXPECT_FALSE(json["complete"].get<bool>()) << json;
+  EXPECT_NE(json.dump().find("tell it (--noise)"), std::string::npos) << json;
+}
+
 TEST_F(RealDataTest, ABrokenRecordingHasNoValidModel) {
   const auto csv = data_ / "trunk_adiabatic4.csv";
   if (!std::filesystem::exists(csv)) GTEST_SKIP() << csv << " is not there";

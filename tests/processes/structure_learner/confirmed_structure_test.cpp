@@ -13,7 +13,8 @@ namespace {
 
 // Parts 1 and 2, an edge with these signals, and what it leaves of the variance assumed.
 LearnedStructure structure(const std::vector<int>& signals, double residual_scale) {
-  LearnedStructure result{.parts = {1, 2}, .actions = NormalizedActions({}, 0)};
+  LearnedStructure result{
+      .parts = {1, 2}, .actions = NormalizedActions({}, 0), .noise_source = NoiseSource::kGiven};
   AcceptedModel edge{.part_i = 1, .part_j = 2};
   for (const int s : signals)
     edge.model.signal[static_cast<std::size_t>(edge.model.num_joints++)] = s;
@@ -72,6 +73,12 @@ TEST(ConfirmedStructureTest, TooFewDataAreNoReasonForMoreNoise) {
   LearnedStructure few = nothing();
   few.search.records[{2, 3}].undecided.emplace(1, 5.0);
   EXPECT_EQ(confirmed({{1, few}}).num_searches, 1);
+}
+
+TEST(ConfirmedStructureTest, NoiseThatWasGuessedFromResidualsIsNotRefutedByThem) {
+  LearnedStructure guessed = structure({0, 1}, 1.2);
+  guessed.noise_source = NoiseSource::kResiduals;
+  EXPECT_EQ(confirmed({{1, guessed}}).num_searches, 1);
 }
 
 TEST(ConfirmedStructureTest, WhatMoreNoiseDoesNotConnectIsLeftAsItIs) {
