@@ -68,7 +68,7 @@ LearnedStructure contested(LearnedStructure structure, const LearnedStructure& r
 
 LearnedStructure confirmed_structure(const FindStructure& find) {
   LearnedStructure told = find(1, 0);
-  if (told.search.models.empty() || lacks_data(told) || !is_noise_known(told)) return told;
+  if (lacks_data(told) || !is_noise_known(told)) return told;
   const bool is_explained = told.spans() && !is_soft(told);
   if (is_explained && told.search.residual_scale <= kLargestResidual) return told;
   LearnedStructure quieter = told;
