@@ -12,6 +12,8 @@ namespace {
 // Above it the residuals refute the noise that is told. Of right structures in white noise they
 // have 0.84 to 0.98 of the variance assumed (heavy tails are weighted down).
 constexpr double kLargestResidual = 1;
+// Below a quarter of that, half the noise explains them as well: it is not the noise of all parts.
+constexpr double kSmallestResidual = 0.84 / 4;
 constexpr double kMostNoise = 4;  // of the told one; it is confirmed at twice that
 // Chosen: of 12 robots with a view bias of 4 mm and 2°, told 12 mm and 4°, 50 samples, none is
 // right with 0, all with 0.5, 1 and 2.
@@ -55,6 +57,16 @@ bool lacks_data(const LearnedStructure& structure) {
                      [](const auto& record) { return !record.second.undecided.empty(); });
 }
 
+// A part that rests is always seen from the same side: no bias makes it stray, nor what is fixed to
+// it.
+bool fixes_what_strays(const LearnedStructure& louder, const std::set<int>& resting) {
+  return std::any_of(louder.search.models.begin(), louder.search.models.end(),
+                     [&](const AcceptedModel& edge) {
+                       return edge.model.num_joints == 0 && edge.soft_signals.empty() &&
+                              resting.contains(edge.part_i) != resting.contains(edge.part_j);
+                     });
+}
+
 LearnedStructure contested(LearnedStructure structure, const LearnedStructure& rival) {
   const std::set<EdgeSignature> shared = signatures_of(rival);
   const auto removed = std::erase_if(structure.search.models, [&](const AcceptedModel& edge) {
@@ -78,8 +90,11 @@ LearnedStructure confirmed_structure(const FindStructure& find) {
     if (is_first && is_explained && !louder.spans()) return told;
     // What more noise does not help to connect has another reason.
     if (!louder.spans() && louder.search.models.size() <= quieter.search.models.size()) break;
+    if (fixes_what_strays(louder, told.search.resting)) break;
     if (quieter.spans() && !is_soft(quieter) && signatures_of(quieter) == signatures_of(louder)) {
-      if (!is_first) quieter.noise_source = NoiseSource::kResiduals;
+      if (is_first) return quieter;
+      if (quieter.search.residual_scale < kSmallestResidual) break;
+      quieter.noise_source = NoiseSource::kResiduals;
       return quieter;
     }
     const std::set<int> used = signals_of(louder);

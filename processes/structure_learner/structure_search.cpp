@@ -27,6 +27,8 @@ SearchResult search_structure(const std::vector<ActionPoseSample>& samples,
   result.joint_information = withdraw_untold_edges(&pairs, &forest);
   result.models = forest.models();
   result.records = std::move(pairs.records());
+  for (const int part : parts)
+    if (pairs.rests(part)) result.resting.insert(part);
   result.log_likelihood = settled.log_likelihood;
   result.residual_scale = settled.residual_scale;
   result.num_screens = pairs.num_screens;

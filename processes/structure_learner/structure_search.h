@@ -1,6 +1,7 @@
 #pragma once
 
 #include <map>
+#include <set>
 #include <utility>
 #include <vector>
 
@@ -11,6 +12,7 @@ namespace bodyschema {
 struct SearchResult {
   std::vector<AcceptedModel> models;  ///< the forest, in the order of acceptance
   std::map<std::pair<int, int>, PairRecord> records;
+  std::set<int> resting;  ///< parts that keep their pose in the camera's frame
   /// All poses', each tree fitted as a whole, Student-t [nats]; up to a constant. It holds for a
   /// forest that spans: from one with gaps models may have been taken since.
   double log_likelihood = 0;

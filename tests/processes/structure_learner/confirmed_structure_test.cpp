@@ -100,6 +100,21 @@ TEST(ConfirmedStructureTest, AnExtraJointOfASignalThatIsUsedAnywayGoes) {
   EXPECT_EQ(found.structure.noise_source, NoiseSource::kResiduals);
 }
 
+TEST(ConfirmedStructureTest, NoiseThatIsMoreThanTheResidualsSayConnectsNothing) {
+  const Found found = confirmed(
+      {{1, nothing()}, {2, nothing()}, {4, structure({0}, 0.16)}, {8, structure({0}, 0.04)}});
+  EXPECT_FALSE(found.structure.spans());
+}
+
+TEST(ConfirmedStructureTest, MoreNoiseFixesNothingToAPartThatRests) {
+  for (const bool rests : {false, true}) {
+    LearnedStructure apart = nothing();
+    if (rests) apart.search.resting = {1};
+    const Found found = confirmed({{1, apart}, {2, structure({}, 1)}, {4, structure({}, 0.25)}});
+    EXPECT_EQ(found.structure.spans(), !rests);
+  }
+}
+
 TEST(ConfirmedStructureTest, ASignalThatIsLostWithMoreNoiseLeavesItsEdgeOpen) {
   const Found found = confirmed({{1, structure({0, 1}, 1.2)}, {2, structure({0}, 0.9)}});
   EXPECT_TRUE(found.structure.is_contested);
