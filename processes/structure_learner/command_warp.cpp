@@ -93,12 +93,12 @@ bool ask(const NormalizedActions& actions, Witness* witness) {
     if (!(ldlt.vectorD().minCoeff() > 1e-12 * ldlt.vectorD().maxCoeff())) continue;
     const Eigen::VectorXd delta = ldlt.solve(V.transpose() * r);
     const Eigen::MatrixXd covariance =
-        ldlt.solve(Eigen::MatrixXd::Identity(model.num_joints, model.num_joints));
+        ldlt.solve(Eigen::MatrixXd::Identity(model.num_joints(), model.num_joints()));
     const double weight = robust_weight(fit.frames[t].squared_distance);
-    for (int d = 0; d < model.num_joints; ++d) {
+    for (int d = 0; d < model.num_joints(); ++d) {
       if (!(covariance(d, d) > 0)) continue;
-      witness->readings[model.signal[d]].push_back(
-          {sample, actions(sample, model.signal[d]) + delta(d), weight / covariance(d, d)});
+      witness->readings[model.joints[d].signal].push_back(
+          {sample, actions(sample, model.joints[d].signal) + delta(d), weight / covariance(d, d)});
     }
   }
   return true;
@@ -175,7 +175,7 @@ class WarpEstimate {
     const NormalizedActions actions = normalized();
     std::vector<Witness> witnesses;
     for (const AcceptedModel& m : found.models) {
-      if (m.model.num_joints == 0) continue;
+      if (m.model.num_joints() == 0) continue;
       Witness witness{pair_data(m.part_i, m.part_j), m.model, {}};
       if (ask(actions, &witness)) witnesses.push_back(std::move(witness));
     }
@@ -251,7 +251,7 @@ class WarpEstimate {
     constexpr int kFewest = 6;  // frames, below which a bent command cannot be told from noise
     std::set<std::pair<int, int>> known;
     for (const AcceptedModel& m : found.models)
-      if (m.model.num_joints <= 1) known.insert(std::minmax(m.part_i, m.part_j));
+      if (m.model.num_joints() <= 1) known.insert(std::minmax(m.part_i, m.part_j));
     struct Promise {
       int i, j;
       ScrewRegression regression;

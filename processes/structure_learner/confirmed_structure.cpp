@@ -23,8 +23,9 @@ constexpr double kUnknownBias = 0.5;
 using EdgeSignature = std::tuple<int, int, std::multiset<int>, std::vector<int>>;
 
 EdgeSignature signature_of(const AcceptedModel& edge) {
-  const auto begin = edge.model.signal.begin();
-  return {edge.part_i, edge.part_j, {begin, begin + edge.model.num_joints}, edge.soft_signals};
+  std::multiset<int> signals;
+  for (const LocalModel::Joint& joint : edge.model.joints) signals.insert(joint.signal);
+  return {edge.part_i, edge.part_j, signals, edge.soft_signals};
 }
 
 std::set<EdgeSignature> signatures_of(const LearnedStructure& structure) {
@@ -62,7 +63,7 @@ bool lacks_data(const LearnedStructure& structure) {
 bool fixes_what_strays(const LearnedStructure& louder, const std::set<int>& resting) {
   return std::any_of(louder.search.models.begin(), louder.search.models.end(),
                      [&](const AcceptedModel& edge) {
-                       return edge.model.num_joints == 0 && edge.soft_signals.empty() &&
+                       return edge.model.num_joints() == 0 && edge.soft_signals.empty() &&
                               resting.contains(edge.part_i) != resting.contains(edge.part_j);
                      });
 }

@@ -14,14 +14,14 @@ namespace {
 // The same model over command units: Exp(ŝ (q − centre)/half_range).
 Edge to_edge(const LocalModel& model, const NormalizedActions& actions) {
   Edge edge;
-  edge.left = model.A[0];
-  for (int d = 0; d < model.num_joints; ++d) {
+  edge.left = model.first;
+  for (int d = 0; d < model.num_joints(); ++d) {
     ScrewJoint joint;
-    joint.signal = model.signal[d];
+    joint.signal = model.joints[d].signal;
     joint.offset = -actions.centre(joint.signal);
-    joint.slide = model.slide[d] / actions.half_range(joint.signal);
-    joint.turn = model.turn[d] / actions.half_range(joint.signal);
-    joint.X_after = model.A[d + 1];
+    joint.slide = model.joints[d].slide / actions.half_range(joint.signal);
+    joint.turn = model.joints[d].turn / actions.half_range(joint.signal);
+    joint.X_after = model.joints[d].X_after;
     edge.joints.push_back(joint);
   }
   return edge;
@@ -31,9 +31,9 @@ Edge to_edge(const LocalModel& model, const NormalizedActions& actions) {
 Eigen::MatrixXd in_command_units(const ParameterMatrix& covariance, const LocalModel& model,
                                  const NormalizedActions& actions) {
   Eigen::VectorXd units = Eigen::VectorXd::Ones(model.num_parameters());
-  for (int d = 0; d < model.num_joints; ++d)
+  for (int d = 0; d < model.num_joints(); ++d)
     units.segment<2>(ScrewChainLayout::slide(d))
-        .setConstant(1 / actions.half_range(model.signal[d]));
+        .setConstant(1 / actions.half_range(model.joints[d].signal));
   return units.asDiagonal() * covariance * units.asDiagonal();
 }
 
@@ -102,16 +102,16 @@ void fit_screw_edge(const LocalModel& start, const PairData& pair, const EdgeDat
 }  // namespace
 
 LocalModel rescaled(LocalModel model, const NormalizedActions& from, const NormalizedActions& to) {
-  for (int d = 0; d < model.num_joints; ++d) {
-    const int s = model.signal[d];
+  for (int d = 0; d < model.num_joints(); ++d) {
+    const int s = model.joints[d].signal;
     const double ratio = to.half_range(s) / from.half_range(s);
     const double shift = (to.centre(s) - from.centre(s)) / from.half_range(s);
     Vector6d screw = Vector6d::Zero();
-    screw(2) = model.slide[d] * shift;
-    screw(5) = model.turn[d] * shift;
-    model.A[d] = model.A[d] * exp(screw);
-    model.slide[d] *= ratio;
-    model.turn[d] *= ratio;
+    screw(2) = model.joints[d].slide * shift;
+    screw(5) = model.joints[d].turn * shift;
+    model.transform(d) = model.transform(d) * exp(screw);
+    model.joints[d].slide *= ratio;
+    model.joints[d].turn *= ratio;
   }
   return model;
 }

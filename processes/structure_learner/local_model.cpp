@@ -1,6 +1,7 @@
 #include "processes/structure_learner/local_model.h"
 
 #include <Eigen/Eigenvalues>
+#include <algorithm>
 #include <cmath>
 #include <limits>
 
@@ -12,9 +13,10 @@ namespace {
 using Layout = ScrewChainLayout;
 
 auto chain_of(const LocalModel& model, const NormalizedActions& actions, int sample) {
-  return ScrewChain(model.A[0], model.num_joints, [&model, &actions, sample](int d) {
-    return ScrewLink{
-        {model.slide[d], model.turn[d]}, actions(sample, model.signal[d]), model.A[d + 1]};
+  return ScrewChain(model.first, model.num_joints(), [&model, &actions, sample](int d) {
+    return ScrewLink{{model.joints[d].slide, model.joints[d].turn},
+                     actions(sample, model.joints[d].signal),
+                     model.joints[d].X_after};
   });
 }
 
@@ -100,9 +102,7 @@ void leave_blocks_out(const Fit& fit, const PairData& pair, const NormalizedActi
 }  // namespace
 
 bool LocalModel::uses(int s) const {
-  for (int d = 0; d < num_joints; ++d)
-    if (signal[d] == s) return true;
-  return false;
+  return std::any_of(joints.begin(), joints.end(), [s](const Joint& j) { return j.signal == s; });
 }
 
 Pose LocalModel::predict(const NormalizedActions& actions, int sample) const {
@@ -111,13 +111,13 @@ Pose LocalModel::predict(const NormalizedActions& actions, int sample) const {
 
 LocalModel LocalModel::inverse() const {
   LocalModel result;
-  result.num_joints = num_joints;
-  for (int d = 0; d < num_joints; ++d) {
-    result.signal[d] = signal[num_joints - 1 - d];
-    result.slide[d] = -slide[num_joints - 1 - d];
-    result.turn[d] = -turn[num_joints - 1 - d];
+  const int k = num_joints();
+  for (int d = k; d-- > 0;) {
+    const Pose& X_before = d == 0 ? first : joints[d - 1].X_after;
+    result.joints.push_back(
+        {joints[d].signal, -joints[d].slide, -joints[d].turn, X_before.inverse()});
   }
-  for (int d = 0; d <= num_joints; ++d) result.A[d] = A[num_joints - d].inverse();
+  result.first = (k == 0 ? first : joints.back().X_after).inverse();
   return result;
 }
 
@@ -135,11 +135,12 @@ MotionJacobian motion_jacobian(const LocalModel& model, const NormalizedActions&
 
 LocalModel perturbed(const LocalModel& model, const ParameterVector& step) {
   LocalModel result = model;
-  result.A[0] = model.A[0] * exp(step.head<6>());
-  for (int d = 0; d < model.num_joints; ++d) {
-    result.slide[d] += step(Layout::slide(d));
-    result.turn[d] += step(Layout::turn(d));
-    result.A[d + 1] = model.A[d + 1] * exp(step.segment<6>(Layout::transform(d + 1)));
+  result.first = model.first * exp(step.head<6>());
+  for (int d = 0; d < model.num_joints(); ++d) {
+    LocalModel::Joint& joint = result.joints[d];
+    joint.slide += step(Layout::slide(d));
+    joint.turn += step(Layout::turn(d));
+    joint.X_after = joint.X_after * exp(step.segment<6>(Layout::transform(d + 1)));
   }
   return result;
 }

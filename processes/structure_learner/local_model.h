@@ -1,6 +1,5 @@
 #pragma once
 
-#include <array>
 #include <vector>
 
 #include "common/estimation/student_t.h"
@@ -9,22 +8,28 @@
 
 namespace bodyschema {
 
-/// Largest number of joints inside one local model.
-inline constexpr int kMaxJoints = 2;
-inline constexpr int kMaxParameters = ScrewChainLayout::size(kMaxJoints);
+/// Largest number of joints of the models that closed-form starts lead to, pair by pair
+/// (screen.h). Longer ones: long_chain.h.
+inline constexpr int kMaxScreenedJoints = 2;
 
 /// A local model in the learner's own terms, over normalised signals q ∈ [−1, 1]:
 ///   Δ(q) = A_0 ∏_d Exp(ŝ_d q_d) A_d,  ŝ_d = (0, 0, slide_d, 0, 0, turn_d)
 /// Revolute, prismatic and helical joints in one form; the command's gain is in ŝ, its offset in
 /// A_0. k = 0 is a rigid connection.
 struct LocalModel {
-  int num_joints = 0;
-  std::array<int, kMaxJoints> signal{};
-  std::array<double, kMaxJoints> slide{};  ///< [m per half range]
-  std::array<double, kMaxJoints> turn{};   ///< [rad per half range]
-  std::array<Pose, kMaxJoints + 1> A{Pose::Identity(), Pose::Identity(), Pose::Identity()};
+  struct Joint {
+    int signal = 0;
+    double slide = 0;                 ///< [m per half range]
+    double turn = 0;                  ///< [rad per half range]
+    Pose X_after = Pose::Identity();  ///< A_d of joint d − 1, counted from 0
+  };
+  Pose first = Pose::Identity();  ///< A_0
+  std::vector<Joint> joints;
 
-  int num_parameters() const { return ScrewChainLayout::size(num_joints); }
+  int num_joints() const { return static_cast<int>(joints.size()); }
+  int num_parameters() const { return ScrewChainLayout::size(num_joints()); }
+  /// A_d
+  Pose& transform(int d) { return d == 0 ? first : joints[d - 1].X_after; }
   bool uses(int s) const;
   /// Pose of j in i at sample `sample`.
   Pose predict(const NormalizedActions& actions, int sample) const;
@@ -32,17 +37,16 @@ struct LocalModel {
   LocalModel inverse() const;
 };
 
-using ParameterJacobian = Eigen::Matrix<double, 6, Eigen::Dynamic, 0, 6, kMaxParameters>;
-using ParameterMatrix =
-    Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, 0, kMaxParameters, kMaxParameters>;
-using ParameterVector = Eigen::Matrix<double, Eigen::Dynamic, 1, 0, kMaxParameters, 1>;
+using ParameterJacobian = Eigen::Matrix<double, 6, Eigen::Dynamic>;
+using ParameterMatrix = Eigen::MatrixXd;
+using ParameterVector = Eigen::VectorXd;
 
 /// Prediction and its Jacobian ∂(right perturbation)/∂parameters, in the order of ScrewChainLayout.
 Pose predict_with_jacobian(const LocalModel& model, const NormalizedActions& actions, int sample,
                            ParameterJacobian* jacobian);
 
 /// ∂Δ/∂q_d of the normalised signal of joint d, right perturbation in frame j: 6 × num_joints.
-using MotionJacobian = Eigen::Matrix<double, 6, Eigen::Dynamic, 0, 6, kMaxJoints>;
+using MotionJacobian = Eigen::Matrix<double, 6, Eigen::Dynamic>;
 MotionJacobian motion_jacobian(const LocalModel& model, const NormalizedActions& actions,
                                int sample);
 

@@ -423,7 +423,8 @@ std::optional<SoftFit> fit_soft_model(const LocalModel& screws, const PairData& 
   SoftFit result = fitter.judged();
   result.model.screws = screws;
   result.model.residual_gp = fitter.residual_gp();
-  for (int d = 0; d < screws.num_joints; ++d) result.model.signals.push_back(screws.signal[d]);
+  for (int d = 0; d < screws.num_joints(); ++d)
+    result.model.signals.push_back(screws.joints[d].signal);
   for (const int s : chosen)
     if (!screws.uses(s)) result.model.signals.push_back(s);
 

@@ -106,7 +106,7 @@ Start screen_rigid(const PairData& pair, const NormalizedActions& actions) {
   const int n = std::min(pair.size(), kCandidates);
   for (int k = 0; k < n; ++k) {
     LocalModel model;
-    model.A[0] = pair.primary(static_cast<int>(static_cast<long>(k) * pair.size() / n)).z;
+    model.first = pair.primary(static_cast<int>(static_cast<long>(k) * pair.size() / n)).z;
     const Start start = judged_start(model, pair, actions, kCoarseFrames);
     if (start.score < best.score) best = start;
   }
@@ -149,11 +149,7 @@ Start one_joint_start(const ScrewRegression& regression, const PairData& pair,
   const PlacedScrew placed =
       PlacedScrew::of(regression.xi, !(turn > 0.5 * sigma_rad && turn > 1e-6));
   LocalModel model;
-  model.num_joints = 1;
-  model.signal[0] = regression.signal;
-  model.turn[0] = placed.screw.turn;
-  model.slide[0] = placed.screw.slide;
-  model.A[1] = placed.X.inverse();
+  model.joints = {{regression.signal, placed.screw.slide, placed.screw.turn, placed.X.inverse()}};
   Start best;
   best.score = std::numeric_limits<double>::infinity();
   constexpr int kCandidates = 6;
@@ -161,7 +157,7 @@ Start one_joint_start(const ScrewRegression& regression, const PairData& pair,
   for (int k = 0; k < n; ++k) {
     const int t = static_cast<int>(static_cast<long>(k) * pair.size() / n);
     const Vector6d back = -regression.xi * actions(pair.frames[t].sample, regression.signal);
-    model.A[0] = pair.primary(t).z * exp(back) * placed.X;
+    model.first = pair.primary(t).z * exp(back) * placed.X;
     const Start start = judged_start(model, pair, actions, kCoarseFrames);
     if (start.score < best.score) best = start;
   }

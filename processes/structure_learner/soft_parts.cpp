@@ -43,7 +43,7 @@ LocalModel best_screws(const PairData& pair, const NormalizedActions& actions, i
   for (const Start& start : starts) {
     Fit fit = fit_local_model(start.model, pair, actions, 20, 1e-2);
     ++counted->num_fits;
-    const double cost = fit.cost + 6 * fit.model.num_joints * std::log(6.0 * pair.size());
+    const double cost = fit.cost + 6 * fit.model.num_joints() * std::log(6.0 * pair.size());
     if (best && cost >= best_cost) continue;
     best_cost = cost;
     best = std::move(fit);
@@ -77,7 +77,7 @@ std::optional<SoftFit> best_soft_fit(const OpenPair& open,
   const PairData data = make_pair_data(samples, open.i, open.j, options.measurement, kMaxFrames);
   std::optional<SoftFit> best;
   std::vector<LocalModel> bases{screen_rigid(data, actions).model};
-  if (open.screws.num_joints > 0) bases.push_back(open.screws);
+  if (open.screws.num_joints() > 0) bases.push_back(open.screws);
   for (const LocalModel& base : bases) {
     const auto fit = fit_soft_model(fit_local_model(base, data, actions, 30, 1e-3).model, data,
                                     actions, options.validity);

@@ -60,11 +60,11 @@ std::vector<int> TreeFit::views_of(int node) const {
 Eigen::MatrixXd TreeFit::with_fixed_gauge(const Normal& normal) const {
   Eigen::MatrixXd H = normal.H;
   for (int k = 1; k < static_cast<int>(nodes_.size()); ++k)
-    for (int d = 0; d < nodes_[k].model.num_joints; ++d)
+    for (int d = 0; d < nodes_[k].model.num_joints(); ++d)
       for (const int component : {2, 5}) {
         Vector6d before = Vector6d::Zero();
         before(component) = 1;
-        const Vector6d after = -adjoint(nodes_[k].model.A[d + 1].inverse()) * before;
+        const Vector6d after = -adjoint(nodes_[k].model.joints[d].X_after.inverse()) * before;
         Eigen::VectorXd gauge = Eigen::VectorXd::Zero(H.rows());
         gauge.segment<6>(normal.offset[k] + ScrewChainLayout::transform(d)) = before;
         gauge.segment<6>(normal.offset[k] + ScrewChainLayout::transform(d + 1)) = after;

@@ -404,28 +404,27 @@ LocalModel complete_start(const RotationHypothesis& hypothesis, bool try_signs,
   const Unknowns x =
       solve(make_design(hypothesis, rotations, frames, actions), frames.p, motions.sigma_m);
   LocalModel model;
-  model.num_joints = 2;
-  model.signal = {hypothesis.a, hypothesis.b};
-  model.turn = {rotations.turn_a, rotations.turn_b};
+  model.joints = {{.signal = hypothesis.a, .turn = rotations.turn_a},
+                  {.signal = hypothesis.b, .turn = rotations.turn_b}};
   // A sliding joint's frame was arbitrary until now: its z axis turns into the direction found.
   const auto take_slide = [&](int d, JointType type, Eigen::Index at) -> Matrix3d {
     if (type == JointType::kTurning) {
-      model.slide[d] = x(at);
+      model.joints[d].slide = x(at);
       return Matrix3d::Identity();
     }
     const Vector3d direction = x.segment<3>(at);
-    model.slide[d] = direction.norm();
-    if (!(model.slide[d] > 0)) return Matrix3d::Identity();
-    return frame_with_z(direction / model.slide[d]);
+    model.joints[d].slide = direction.norm();
+    if (!(model.joints[d].slide > 0)) return Matrix3d::Identity();
+    return frame_with_z(direction / model.joints[d].slide);
   };
   const Matrix3d Za = take_slide(0, hypothesis.type_a, 9);
   const Matrix3d Zb = take_slide(1, hypothesis.type_b, 9 + slide_size(hypothesis.type_a));
-  model.A[0].linear() = rotations.R0 * Za;
-  model.A[0].translation() = x.head<3>();
-  model.A[1].linear() = Za.transpose() * rotations.R1 * Zb;
-  model.A[1].translation() = Za.transpose() * x.segment<3>(3);
-  model.A[2].linear() = Zb.transpose() * rotations.R2;
-  model.A[2].translation() = Zb.transpose() * x.segment<3>(6);
+  model.first.linear() = rotations.R0 * Za;
+  model.first.translation() = x.head<3>();
+  model.joints[0].X_after.linear() = Za.transpose() * rotations.R1 * Zb;
+  model.joints[0].X_after.translation() = Za.transpose() * x.segment<3>(3);
+  model.joints[1].X_after.linear() = Zb.transpose() * rotations.R2;
+  model.joints[1].X_after.translation() = Zb.transpose() * x.segment<3>(6);
   return model;
 }
 

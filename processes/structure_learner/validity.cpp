@@ -56,7 +56,7 @@ Eigen::Matrix<double, 6, Eigen::Dynamic> clipped_residuals(const Fit& fit) {
 // The largest share of the residuals that a signal outside Q explains, over the threshold of V2.
 double explained_excess(const Fit& fit, const PairData& pair, const NormalizedActions& actions,
                         const ValidityOptions& options, double mean_inlier, double share) {
-  const int n = pair.size(), k = fit.model.num_joints;
+  const int n = pair.size(), k = fit.model.num_joints();
   const int others = static_cast<int>(actions.moving().size()) - k;
   const Eigen::Matrix<double, 6, Eigen::Dynamic> r = clipped_residuals(fit);
   double bias = 0;
@@ -80,8 +80,8 @@ double explained_excess(const Fit& fit, const PairData& pair, const NormalizedAc
       const int sample = pair.frames[t].sample;
       F(t, 0) = actions(sample, g) - mean;
       if (tensor) {
-        const double q = actions(sample, fit.model.signal[0]);
-        const double theta = std::max(std::abs(fit.model.turn[0]), 0.1) * q;
+        const double q = actions(sample, fit.model.joints[0].signal);
+        const double theta = std::max(std::abs(fit.model.joints[0].turn), 0.1) * q;
         F(t, 1) = F(t, 0) * std::cos(theta);
         F(t, 2) = F(t, 0) * std::sin(theta);
       }
@@ -158,7 +158,7 @@ Validity check_validity(const Fit& fit, const LeaveOneOut& loo, const PairData& 
   result.explained = explained_excess(fit, pair, actions, options, result.mean_inlier, share);
   if (result.explained > 1) return result;
 
-  const int k = fit.model.num_joints;
+  const int k = fit.model.num_joints();
   const double num_candidates =
       1.0 + std::pow(std::max(static_cast<int>(actions.moving().size()), 1), k);
   result.verdict = Verdict::kValid;

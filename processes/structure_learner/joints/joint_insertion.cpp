@@ -9,26 +9,17 @@ namespace {
 
 LocalModel rigid(const Pose& X) {
   LocalModel model;
-  model.A[0] = X;
+  model.first = X;
   return model;
 }
 
 // Δ_N,T Exp(±ξ q) Δ_T,N · model.
 LocalModel with_screw_in_front(const PlacedScrew& placed, int signal, const Pose& X_NT,
                                double sense, const LocalModel& model) {
-  LocalModel r;
-  r.num_joints = model.num_joints + 1;
-  r.signal[0] = signal;
-  r.slide[0] = sense * placed.screw.slide;
-  r.turn[0] = sense * placed.screw.turn;
-  r.A[0] = X_NT * placed.X;
-  r.A[1] = placed.X.inverse() * X_NT.inverse() * model.A[0];
-  for (int d = 0; d < model.num_joints; ++d) {
-    r.signal[d + 1] = model.signal[d];
-    r.slide[d + 1] = model.slide[d];
-    r.turn[d + 1] = model.turn[d];
-    r.A[d + 2] = model.A[d + 1];
-  }
+  LocalModel r = model;
+  r.first = X_NT * placed.X;
+  r.joints.insert(r.joints.begin(), {signal, sense * placed.screw.slide, sense * placed.screw.turn,
+                                     placed.X.inverse() * X_NT.inverse() * model.first});
   return r;
 }
 
@@ -39,7 +30,7 @@ std::vector<int> cluster_of(const std::vector<TreeNode>& nodes, int top) {
   std::vector<int> members{top};
   in[top] = true;
   for (int k = top + 1; k < static_cast<int>(nodes.size()); ++k)
-    if (nodes[k].parent >= 0 && in[nodes[k].parent] && nodes[k].model.num_joints == 0) {
+    if (nodes[k].parent >= 0 && in[nodes[k].parent] && nodes[k].model.num_joints() == 0) {
       in[k] = true;
       members.push_back(k);
     }
@@ -53,7 +44,7 @@ std::optional<std::vector<TreeEdge>> insert_joint(const std::vector<TreeNode>& n
   std::vector<Pose> X_TN(n, Pose::Identity());  // of the cluster's nodes in its top's frame
   std::vector<int> side(n, -1);                 // 1 moves, 0 rests
   for (const int k : cluster) {
-    if (k != joint.top) X_TN[k] = X_TN[nodes[k].parent] * nodes[k].model.A[0];
+    if (k != joint.top) X_TN[k] = X_TN[nodes[k].parent] * nodes[k].model.first;
     side[k] = static_cast<int>(std::count(joint.members.begin(), joint.members.end(), k));
   }
   const PlacedScrew screw = PlacedScrew::of(joint.xi, joint.slides);
@@ -81,11 +72,11 @@ std::optional<std::vector<TreeEdge>> insert_joint(const std::vector<TreeNode>& n
     const int own = base[moves];
     if (own >= 0) {
       const int to = side[parent] == static_cast<int>(moves) ? parent : own;
-      model.A[0] = X_TN[to].inverse() * X_TN[parent] * model.A[0];
+      model.first = X_TN[to].inverse() * X_TN[parent] * model.first;
       edges.push_back({to, node, model});
       return true;
     }
-    if (model.num_joints == kMaxJoints) return false;
+    if (model.num_joints() == kMaxScreenedJoints) return false;
     edges.push_back({parent, node, in_front(X_TN[parent].inverse(), moves ? 1 : -1, model)});
     return true;
   };
@@ -105,12 +96,12 @@ std::optional<std::vector<TreeEdge>> insert_joint(const std::vector<TreeNode>& n
 
 std::vector<int> full_edges(const std::vector<TreeNode>& nodes, const MissingJoint& joint) {
   std::vector<int> result;
-  const bool is_full = nodes[joint.top].model.num_joints == kMaxJoints;
+  const bool is_full = nodes[joint.top].model.num_joints() == kMaxScreenedJoints;
   const std::vector<int> cluster = cluster_of(nodes, joint.top);
   const auto unmoved = static_cast<std::ptrdiff_t>(joint.members.size()) < std::ssize(cluster);
   if (!unmoved && is_full && joint.top > 0) result.push_back(joint.top);
   for (int k = 1; k < static_cast<int>(nodes.size()); ++k) {
-    if (nodes[k].model.num_joints < kMaxJoints ||
+    if (nodes[k].model.num_joints() < kMaxScreenedJoints ||
         !std::count(cluster.begin(), cluster.end(), nodes[k].parent))
       continue;
     const bool moves = std::count(joint.branches.begin(), joint.branches.end(), k) > 0;

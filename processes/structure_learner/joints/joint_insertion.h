@@ -42,7 +42,7 @@ std::vector<int> cluster_of(const std::vector<TreeNode>& nodes, int top);
 
 /// The tree's edges with that joint. Where only branches move, each of their edges gets it. Edges
 /// between the two sides are moved to the right one. std::nullopt if an edge had more than
-/// kMaxJoints.
+/// kMaxScreenedJoints.
 std::optional<std::vector<TreeEdge>> insert_joint(const std::vector<TreeNode>& nodes,
                                                   const MissingJoint& joint);
 /// The nodes whose edges to their parents have no room for the joint: why insert_joint() fails.

@@ -86,7 +86,7 @@ class ClusterTest {
     for (const int k : members_)
       if (tree_.is_seen(k)) add_item(k, false);
     for (int k = top_ + 1; k < static_cast<int>(tree_.nodes().size()); ++k)
-      if (tree_.nodes()[k].model.num_joints > 0 &&
+      if (tree_.nodes()[k].model.num_joints() > 0 &&
           std::count(members_.begin(), members_.end(), tree_.nodes()[k].parent))
         add_item(k, true);
   }
@@ -300,7 +300,7 @@ std::vector<MissingJoint> missing_joints(const TreeFit& fit, const Noise& bias,
       normal, *inverse, *inverse * normal.g, q, q.cwiseProduct(q), isotropic(bias), unknown_bias};
   std::vector<MissingJoint> result;
   for (int top = 0; top < static_cast<int>(fit.nodes().size()); ++top) {
-    if (top > 0 && fit.nodes()[top].model.num_joints == 0) continue;
+    if (top > 0 && fit.nodes()[top].model.num_joints() == 0) continue;
     ClusterTest test(fit, context, top);
     for (int s = 0; s < static_cast<int>(q.cols()); ++s)
       if (MissingJoint joint = test.best_joint(s); joint.log_tail < 0)

@@ -40,7 +40,7 @@ std::optional<Joined> join(const ModelForest& apart, double cost_apart, const Ne
                            PairModels* pairs) {
   ModelForest forest = apart;
   forest.add({miss.part_i, miss.part_j, miss.model});
-  for (int added = 0; added <= kMaxJoints; ++added) {
+  for (int added = 0; added <= kMaxScreenedJoints; ++added) {
     const ComponentTree tree(forest, miss.part_i, pairs);
     TreeFit fit = tree.fit();
     if (const auto worst = missing_joint(forest, *pairs, &fit)) {
@@ -67,8 +67,8 @@ std::set<std::tuple<int, int, std::set<int>>> structure_of(const ModelForest& fo
 }
 
 bool is_rival(const NearMiss& x, const NearMiss& y) {
-  return x.part_i == y.part_i && x.part_j == y.part_j && x.model.num_joints == y.model.num_joints &&
-         signal_set(x.model) != signal_set(y.model);
+  return x.part_i == y.part_i && x.part_j == y.part_j &&
+         x.model.num_joints() == y.model.num_joints() && signal_set(x.model) != signal_set(y.model);
 }
 
 }  // namespace
@@ -88,7 +88,7 @@ bool bridge(PairModels* pairs, ModelForest* forest) {
     if (forest->connected(m.part_i, m.part_j) || pairs->is_refuted(m.part_i, m.part_j, m.model))
       continue;
     const auto [x, y] = std::minmax({forest->component(m.part_i), forest->component(m.part_j)});
-    if (tried[{x, y, m.model.num_joints}]++ >= kMaxTried) continue;
+    if (tried[{x, y, m.model.num_joints()}]++ >= kMaxTried) continue;
     const double apart = own_cost(m.part_i) + own_cost(m.part_j);
     std::optional<Joined> joined = join(*forest, apart, m, pairs);
     if (!joined) continue;

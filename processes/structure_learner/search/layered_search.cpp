@@ -29,8 +29,8 @@ bool is_hopeless(const Start& start, int num_frames) {
 
 void sort_by_quality(std::vector<Candidate>* candidates) {
   std::stable_sort(candidates->begin(), candidates->end(), [](const auto& x, const auto& y) {
-    return std::tie(x.model.num_joints, y.score, x.part_i, x.part_j) <
-           std::tie(y.model.num_joints, x.score, y.part_i, y.part_j);
+    return std::tuple(x.model.num_joints(), y.score, x.part_i, x.part_j) <
+           std::tuple(y.model.num_joints(), x.score, y.part_i, y.part_j);
   });
 }
 
@@ -59,7 +59,7 @@ void LayeredSearch::decide(std::vector<Candidate> valid, std::vector<Candidate>*
     if (signal_set(other.model) == signal_set(best.model)) continue;
     if ((best.score - other.score) * best.num_frames < kAmbiguityMargin) {
       pairs_.record(best.part_i, best.part_j)
-          .note_undecided(other.model.num_joints, other.mean_capped);
+          .note_undecided(other.model.num_joints(), other.mean_capped);
       return;
     }
   }
@@ -80,7 +80,7 @@ void LayeredSearch::connect(std::vector<Candidate> candidates) {
     if (forest_.connected(c.part_i, c.part_j)) {
       spare_.push_back(c);
     } else if ((is_clean_ && c.doubtful) || is_smaller_undecided(c)) {
-      pairs_.record(c.part_i, c.part_j).note_undecided(c.model.num_joints, c.mean_capped);
+      pairs_.record(c.part_i, c.part_j).note_undecided(c.model.num_joints(), c.mean_capped);
       doubtful_.push_back(c);
     } else if (pairs_.confirm_on_all_data(&c)) {
       forest_.add(c);
@@ -90,7 +90,7 @@ void LayeredSearch::connect(std::vector<Candidate> candidates) {
 
 // Is a smaller model between the same components undecided, and not clearly worse than this one?
 bool LayeredSearch::is_smaller_undecided(const Candidate& c) {
-  const int k = c.model.num_joints;
+  const int k = c.model.num_joints();
   for (const int x : forest_.members(c.part_i))
     for (const int y : forest_.members(c.part_j))
       for (const auto& [smaller, mean_capped] : pairs_.record(x, y).undecided)
@@ -144,9 +144,9 @@ LayeredSearch::Turns LayeredSearch::assumed_turns(bool known_only) const {
   Turns turns(pairs_.actions().num_signals());
   if (known_only)
     for (const AcceptedModel& m : forest_.models())
-      for (int d = 0; d < m.model.num_joints; ++d)
-        if (std::abs(m.model.turn[d]) > 0.1)
-          turns[m.model.signal[d]].push_back(std::abs(m.model.turn[d]));
+      for (int d = 0; d < m.model.num_joints(); ++d)
+        if (std::abs(m.model.joints[d].turn) > 0.1)
+          turns[m.model.joints[d].signal].push_back(std::abs(m.model.joints[d].turn));
   bool any_known = false;
   for (auto& t : turns) {
     any_known |= !t.empty();

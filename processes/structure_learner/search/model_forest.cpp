@@ -6,7 +6,9 @@
 namespace bodyschema {
 
 std::set<int> signal_set(const LocalModel& model) {
-  return {model.signal.begin(), model.signal.begin() + model.num_joints};
+  std::set<int> signals;
+  for (const LocalModel::Joint& joint : model.joints) signals.insert(joint.signal);
+  return signals;
 }
 
 std::vector<std::pair<int, int>> ends_of(const std::vector<AcceptedModel>& models) {
@@ -24,7 +26,7 @@ std::vector<int> ModelForest::members(int part) const {
 
 int ModelForest::num_joints() const {
   int sum = 0;
-  for (const AcceptedModel& m : models_) sum += m.model.num_joints;
+  for (const AcceptedModel& m : models_) sum += m.model.num_joints();
   return sum;
 }
 

@@ -67,7 +67,7 @@ std::optional<Candidate> PairModels::try_start(int part_i, int part_j, const Loc
   const Validity validity =
       check_validity(fit, leave_one_out(fit, data, actions_), data, actions_, options);
   if (validity.verdict == Verdict::kNotEnoughData)
-    tried.note_undecided(start.num_joints, validity.mean_capped);
+    tried.note_undecided(start.num_joints(), validity.mean_capped);
   if (validity.verdict == Verdict::kValid)
     return Candidate{{part_i, part_j, fit.model, validity.score},
                      data.size(),
@@ -75,7 +75,7 @@ std::optional<Candidate> PairModels::try_start(int part_i, int part_j, const Loc
                      validity.mean_capped,
                      validity.doubtful,
                      all};
-  if (fit.cost < (start.num_joints < 2 ? kMaxSmallNearMissCost : kMaxNearMissCost) * data.size())
+  if (fit.cost < (start.num_joints() < 2 ? kMaxSmallNearMissCost : kMaxNearMissCost) * data.size())
     near_misses_.push_back({part_i, part_j, fit.model, last_cost_});
   return std::nullopt;
 }
@@ -97,7 +97,7 @@ bool PairModels::confirm_on_all_data(Candidate* candidate) {
 std::vector<NearMiss> PairModels::near_misses() const {
   std::vector<NearMiss> result = near_misses_;
   std::stable_sort(result.begin(), result.end(), [](const NearMiss& x, const NearMiss& y) {
-    return std::tie(x.model.num_joints, x.cost) < std::tie(y.model.num_joints, y.cost);
+    return std::tuple(x.model.num_joints(), x.cost) < std::tuple(y.model.num_joints(), y.cost);
   });
   std::set<Key> met;
   std::erase_if(result, [&met](const NearMiss& m) {

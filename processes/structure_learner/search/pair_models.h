@@ -19,7 +19,7 @@ inline constexpr double kAmbiguityMargin = 3;
 struct SearchOptions {
   MeasurementModel measurement;
   ValidityOptions validity;
-  int max_signals = 2;  ///< largest k, at most kMaxJoints
+  int max_signals = 2;  ///< largest k, at most kMaxScreenedJoints
   /// Standard deviation of the bias that every marker may have beside measurement.systematic, at
   /// half range of a signal, in those of the noise of one sight.
   double unknown_bias = 0;

@@ -26,7 +26,7 @@ bool exchange(const ComponentTree& tree, int signal, double cost, std::vector<Ca
     for (const int node : from_i.path_to(from_i.node_of(c.part_j))) {
       std::vector<AcceptedModel> models = forest->models();
       AcceptedModel& present = models[from_i.nodes()[node].edge];
-      if (present.model.num_joints < c.model.num_joints || present.joins(c.part_i, c.part_j) ||
+      if (present.model.num_joints() < c.model.num_joints() || present.joins(c.part_i, c.part_j) ||
           !pairs->confirm_on_all_data(&c))
         continue;
       present = c;

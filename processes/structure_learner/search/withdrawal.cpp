@@ -49,8 +49,8 @@ void withdraw_untestable(const ComponentTree& tree, PairModels* pairs,
     const auto sample_of = [](const PairFrame& frame) { return frame.sample; };
     const int num_own = blocks.count(pairs->pair(part_i, part_j).frames, sample_of);
     const int num_tied = blocks.count(tied[k], [](int sample) { return sample; });
-    if (num_own + kOthersShare * (num_tied - num_own) >= node.model.num_joints + 3) continue;
-    pairs->record(part_i, part_j).undecided.emplace(node.model.num_joints, 0.0);
+    if (num_own + kOthersShare * (num_tied - num_own) >= node.model.num_joints() + 3) continue;
+    pairs->record(part_i, part_j).undecided.emplace(node.model.num_joints(), 0.0);
     std::erase_if(*kept, [&](const AcceptedModel& m) { return m.joins(part_i, part_j); });
   }
 }
@@ -82,7 +82,7 @@ bool withdraw_least_told(const ComponentTree& tree, PairModels* pairs, ModelFore
   std::vector<AcceptedModel> models = forest->models();
   const auto m = models.begin() + tree.model_of(least_node);
   PairRecord& record = pairs->record(m->part_i, m->part_j);
-  record.undecided.emplace(m->model.num_joints, 0.0);
+  record.undecided.emplace(m->model.num_joints(), 0.0);
   record.untold_signals.insert(least_signal);
   models.erase(m);
   forest->set_models(std::move(models));

@@ -104,9 +104,9 @@ Learned by_screw(const Trial& trial, int signal) {
     LocalModel at = model;  // of an action that is none of the samples': the normalised value is 1
     const double u = (x - actions->centre(0)) / actions->half_range(0);
     Vector6d screw = Vector6d::Zero();
-    screw(2) = at.slide[0] * u;
-    screw(5) = at.turn[0] * u;
-    return at.A[0] * exp(screw) * at.A[1];
+    screw(2) = at.joints[0].slide * u;
+    screw(5) = at.joints[0].turn * u;
+    return at.first * exp(screw) * at.joints[0].X_after;
   };
   result.covariance = [about](double) { return about; };
   return result;

@@ -16,8 +16,7 @@ LearnedStructure structure(const std::vector<int>& signals, double residual_scal
   LearnedStructure result{
       .parts = {1, 2}, .actions = NormalizedActions({}, 0), .noise_source = NoiseSource::kGiven};
   AcceptedModel edge{.part_i = 1, .part_j = 2};
-  for (const int s : signals)
-    edge.model.signal[static_cast<std::size_t>(edge.model.num_joints++)] = s;
+  for (const int s : signals) edge.model.joints.push_back({.signal = s});
   result.search.models = {edge};
   result.search.residual_scale = residual_scale;
   return result;
@@ -47,8 +46,8 @@ Found confirmed(const std::map<double, LearnedStructure>& by_factor) {
 std::vector<int> signals_of(const LearnedStructure& found) {
   std::vector<int> result;
   for (const AcceptedModel& edge : found.search.models)
-    for (int d = 0; d < edge.model.num_joints; ++d)
-      result.push_back(edge.model.signal[static_cast<std::size_t>(d)]);
+    for (int d = 0; d < edge.model.num_joints(); ++d)
+      result.push_back(edge.model.joints[static_cast<std::size_t>(d)].signal);
   return result;
 }
 

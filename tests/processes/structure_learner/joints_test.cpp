@@ -14,10 +14,9 @@ std::vector<TreeNode> chain() {
   std::vector<TreeNode> nodes;
   for (int n = 0; n < 4; ++n) {
     TreeNode& node = nodes.emplace_back(TreeNode{n + 1, n - 1, {}});
-    node.model.num_joints = n == 1 ? 1 : n == 3 ? 2 : 0;
-    node.model.signal = {n, n + 1};
-    node.model.turn = {0.5, 0.5};
-    for (Pose& A : node.model.A) A.translation() << 0.1, 0.02 * n, 0;
+    const int k = n == 1 ? 1 : n == 3 ? 2 : 0;
+    for (int d = 0; d < k; ++d) node.model.joints.push_back({.signal = n + d, .turn = 0.5});
+    for (int d = 0; d <= k; ++d) node.model.transform(d).translation() << 0.1, 0.02 * n, 0;
   }
   return nodes;
 }
@@ -32,12 +31,12 @@ TEST(InsertJoint, PartsARigidClusterAndLeavesEachBranchOnItsSide) {
   ASSERT_EQ(edges->size(), 3u);
   const TreeEdge& parted = edges->front();
   EXPECT_EQ(std::minmax(parted.a, parted.b), std::minmax(1, 2));
-  EXPECT_EQ(parted.model.signal[0], 7);
-  EXPECT_EQ(parted.model.num_joints, 1);
+  EXPECT_EQ(parted.model.joints[0].signal, 7);
+  EXPECT_EQ(parted.model.num_joints(), 1);
   EXPECT_TRUE(full_edges(nodes, joint).empty());
   // At q = 0 the new edge is the rigid one.
-  Pose X = parted.model.A[0] * parted.model.A[1];
-  EXPECT_TRUE(X.isApprox(nodes[2].model.A[0], 1e-12));
+  Pose X = parted.model.first * parted.model.joints[0].X_after;
+  EXPECT_TRUE(X.isApprox(nodes[2].model.first, 1e-12));
   // Only the branch moves: its edge would have three joints.
   joint.members = {};
   EXPECT_FALSE(insert_joint(nodes, joint));
@@ -46,18 +45,18 @@ TEST(InsertJoint, PartsARigidClusterAndLeavesEachBranchOnItsSide) {
 
 TEST(InsertJoint, WhateverMovesAllPosesAreAsBeforeAtTheMiddleOfTheSignal) {
   const std::vector<TreeNode> nodes = chain();
-  const Pose X_23 = nodes[2].model.A[0], X_24 = X_23 * nodes[3].model.A[0];
+  const Pose X_23 = nodes[2].model.first, X_24 = X_23 * nodes[3].model.first;
   MissingJoint joint{.top = 1, .signal = 7, .members = {1}};
   joint.xi << 0, 0, 0, 0, 0.5, 0;
   auto edges = insert_joint(nodes, joint);  // from part 3, which rests, to part 2
   ASSERT_TRUE(edges);
   const LocalModel& model = edges->front().model;
-  EXPECT_TRUE((model.A[0] * model.A[1]).isApprox(X_23.inverse(), 1e-12));
+  EXPECT_TRUE((model.first * model.joints[0].X_after).isApprox(X_23.inverse(), 1e-12));
   joint.members = {2};  // part 4 comes to part 2
   edges = insert_joint(nodes, joint);
   ASSERT_TRUE(edges);
   EXPECT_EQ(edges->back().a, 1);
-  EXPECT_TRUE(edges->back().model.A[0].isApprox(X_24, 1e-12));
+  EXPECT_TRUE(edges->back().model.first.isApprox(X_24, 1e-12));
 }
 
 TEST(PlacedScrew, IsTheTwistInItsFrame) {

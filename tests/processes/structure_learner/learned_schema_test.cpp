@@ -56,11 +56,9 @@ TEST(Rescaled, PredictsTheSame) {
   const auto samples = test::babble(robot, 20, {}, rng);
   const NormalizedActions from(samples, 2), to({samples.begin(), samples.begin() + 5}, 2);
   LocalModel model;
-  model.num_joints = 2;
-  model.signal = {1, 0};
-  model.slide = {0.02, 0.1};
-  model.turn = {0.7, -1.2};
-  for (Pose& A : model.A) A = test::random_pose(rng, 0.1, 0.2);
+  model.joints = {{.signal = 1, .slide = 0.02, .turn = 0.7},
+                  {.signal = 0, .slide = 0.1, .turn = -1.2}};
+  for (int d = 0; d <= 2; ++d) model.transform(d) = test::random_pose(rng, 0.1, 0.2);
   EXPECT_TRUE(rescaled(model, from, to).predict(to, 3).isApprox(model.predict(from, 3), 1e-12));
 }
 

@@ -11,12 +11,12 @@ using test::Rng;
 
 LocalModel random_model(int num_joints, Rng& rng) {
   LocalModel model;
-  model.num_joints = num_joints;
-  for (int d = 0; d <= num_joints; ++d) model.A[d] = test::random_pose(rng, 0.05, 0.2);
+  model.joints.resize(num_joints);
+  for (int d = 0; d <= num_joints; ++d) model.transform(d) = test::random_pose(rng, 0.05, 0.2);
   for (int d = 0; d < num_joints; ++d) {
-    model.signal[d] = d;
-    model.slide[d] = test::uniform(rng, -0.05, 0.05);
-    model.turn[d] = test::uniform(rng, 0.5, 1.5);
+    model.joints[d].signal = d;
+    model.joints[d].slide = test::uniform(rng, -0.05, 0.05);
+    model.joints[d].turn = test::uniform(rng, 0.5, 1.5);
   }
   return model;
 }
@@ -123,7 +123,7 @@ TEST(LocalModel, ClosedFormLeaveOneOutAgreesWithRefits) {
 TEST(LocalModel, RankCountsAPrismaticJointsFewerParameters) {
   Rng rng(5);
   LocalModel truth = random_model(1, rng);
-  truth.turn[0] = 0;
+  truth.joints[0].turn = 0;
   auto samples = random_actions(15, rng);
   observe(truth, 0, &samples, rng);
   const NormalizedActions actions(samples, 2);

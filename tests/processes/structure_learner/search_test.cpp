@@ -107,7 +107,7 @@ TEST(LayeredSearch, FindsTheSimplestSpanningForest) {
   c.layers.run(0);
   ASSERT_TRUE(c.forest.spans());
   EXPECT_EQ(c.forest.num_joints(), 1);
-  EXPECT_EQ(c.forest.models().front().model.num_joints, 0);  // parts 2 and 3
+  EXPECT_EQ(c.forest.models().front().model.num_joints(), 0);  // parts 2 and 3
   EXPECT_TRUE(c.forest.models().back().model.uses(0));
 }
 
@@ -182,9 +182,7 @@ TEST(SettleTrees, ExchangesAModelForASpareOneWithWhichAllPosesCostLess) {
 TEST(SettleTrees, RemovesAModelThatHasNoRoomForTheMissingJoint) {
   Case c(1, 40);
   Candidate full = c.fitted(1, 2, 1, 1);
-  full.model.num_joints = 2;  // the wrong signal twice
-  full.model.signal[1] = 1;
-  full.model.A[2] = Pose::Identity();
+  full.model.joints.push_back({.signal = 1});  // the wrong signal twice
   c.forest.add(full);
   std::vector<Candidate> spare;
   EXPECT_TRUE(settle_trees(&spare, &c.pairs, &c.forest).any_refuted);

@@ -65,15 +65,12 @@ struct Case {
       Pose X = Pose::Identity();
       X.linear() = Eigen::AngleAxisd(link.turn * q, Eigen::Vector3d::UnitZ()).toRotationMatrix();
       X.translation().z() = link.slide * q;
-      node.model.A[0] = link.X_before * X;
+      node.model.first = link.X_before * X;
       if (link.signal < 0) {
-        node.model.A[0] = node.model.A[0] * link.X_after;
+        node.model.first = node.model.first * link.X_after;
       } else {
-        node.model.num_joints = 1;
-        node.model.signal[0] = link.signal;
-        node.model.turn[0] = link.turn * actions.half_range(link.signal);
-        node.model.slide[0] = link.slide * actions.half_range(link.signal);
-        node.model.A[1] = link.X_after;
+        const double range = actions.half_range(link.signal);
+        node.model.joints = {{link.signal, link.slide * range, link.turn * range, link.X_after}};
       }
       nodes.push_back(node);
       data.push_back(
@@ -97,7 +94,7 @@ struct Case {
   std::vector<TreeNode> without(int node) const {
     std::vector<TreeNode> result = nodes;
     LocalModel rigid;
-    rigid.A[0] = nodes[node].model.A[0] * nodes[node].model.A[1];
+    rigid.first = nodes[node].model.first * nodes[node].model.joints[0].X_after;
     result[node].model = rigid;
     return result;
   }
@@ -115,8 +112,9 @@ TEST(TreeFit, FindsTheTruthFromAPerturbedStart) {
     Case c(chain(0.2, rng), 12, Regime::kFree, root_moves, rng);
     std::vector<TreeNode> nodes = c.nodes;
     for (std::size_t n = 1; n < nodes.size(); ++n)
-      for (int d = 0; d <= nodes[n].model.num_joints; ++d)
-        nodes[n].model.A[d] = nodes[n].model.A[d] * exp(Vector6d(0.02 * test::gaussian6(rng)));
+      for (int d = 0; d <= nodes[n].model.num_joints(); ++d)
+        nodes[n].model.transform(d) =
+            nodes[n].model.transform(d) * exp(Vector6d(0.02 * test::gaussian6(rng)));
     TreeFit fit(nodes, c.data, c.actions, !root_moves);
     const double before = fit.cost();
     fit.fit(30, 1e-12);
@@ -181,7 +179,7 @@ TEST(TreeFit, AllMarkersTogetherShowAJointThatNoPairShows) {
       EXPECT_EQ(std::min(e.a, e.b), grown[child].parent);
       grown[child].model = e.a < e.b ? e.model : e.model.inverse();
     }
-    EXPECT_EQ(grown[3].model.signal[0], 3);
+    EXPECT_EQ(grown[3].model.joints[0].signal, 3);
     TreeFit with(grown, c.data, c.actions, true);
     with.fit(20, 1e-3);
     // The score statistic is twice the gain in log likelihood, to second order.
@@ -232,7 +230,7 @@ TEST(TreeFit, AJointThatMovesBranchesOnlyIsPutIntoTheirEdges) {
   const auto edges = insert_joint(fit.nodes(), joint);
   ASSERT_TRUE(edges.has_value());
   int num_joints = 0;
-  for (const TreeEdge& e : *edges) num_joints += e.model.num_joints;
+  for (const TreeEdge& e : *edges) num_joints += e.model.num_joints();
   EXPECT_EQ(num_joints, 6);  // five of the chain and the new one
   // Twice is too much for one edge.
   std::vector<TreeNode> nodes = c.nodes;
@@ -367,7 +365,7 @@ TEST(TreeFit, WhatNoPredictionDependsOnIsAsSureAsTheRest) {
   const auto covariance = fit.covariance(c.measurement, 0.1);
   ASSERT_TRUE(covariance);
   for (std::size_t k = 1; k < c.nodes.size(); ++k)
-    if (c.nodes[k].model.turn[0] != 0)
+    if (c.nodes[k].model.num_joints() > 0)
       EXPECT_LT(covariance->models[k].diagonal().maxCoeff(), 1e-3) << k;
 }
 

@@ -123,9 +123,8 @@ TEST(Validity, AJointThatFitsFewReadingsOfNoMotionIsNotYetTold) {
     const PairData pair =
         make_pair_data(samples, 1, 2, {.noise = test::nominal_noise(Regime::kTagIso)}, 2000);
     LocalModel screw;
-    screw.num_joints = 1;
-    screw.turn[0] = 0.02;
-    screw.A[0] = screen_rigid(pair, actions).model.A[0];
+    screw.joints = {{.turn = 0.02}};
+    screw.first = screen_rigid(pair, actions).model.first;
     const Fit fit = fit_local_model(screw, pair, actions, 40);
     EXPECT_NE(check_validity(fit, leave_one_out(fit, pair, actions), pair, actions, {}).verdict,
               Verdict::kValid)
