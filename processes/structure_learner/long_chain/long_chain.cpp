@@ -1,0 +1,244 @@
+#include "processes/structure_learner/long_chain/long_chain.h"
+
+#include <Eigen/Cholesky>
+#include <algorithm>
+#include <cmath>
+
+#include "processes/structure_learner/long_chain/chain_rotations.h"
+#include "processes/structure_learner/placed_screw.h"
+#include "processes/structure_learner/screen.h"
+
+namespace bodyschema {
+namespace {
+
+using Eigen::Matrix3d;
+using Eigen::Vector3d;
+
+constexpr int kSearchFrames = 60;
+constexpr int kStarts = 8;       // of one angle per unit for all, in the listed order
+constexpr int kFreeStarts = 60;  // of lengths of their own: one in ten succeeds
+constexpr int kOrderRestarts = 4;
+constexpr int kFitIterations = 60;
+// Turns below which a joint may slide [rad per half range].
+constexpr double kMaySlide = 0.12;
+// Links are shorter than that [m]: what the poses do not tell of them stays small.
+constexpr double kLongestLink = 1;
+// A right model costs 4 to 7 nats a frame.
+constexpr double kRightCost = 8;
+// Nats a sight: a joint whose effect is below the noise of every single sight is not believed.
+constexpr double kLeastPay = 0.5;
+
+Pose translation(const Vector3d& p) {
+  Pose X = Pose::Identity();
+  X.translation() = p;
+  return X;
+}
+
+Pose rotation(const Matrix3d& R) {
+  Pose X = Pose::Identity();
+  X.linear() = R;
+  return X;
+}
+
+// The links l_0 … l_m and, for joints that slide, s_j: x(q) = l_0 + Σ (P_(j−1) s_j q_j + P_j l_j),
+// P_j = ∏_(i ≤ j) Exp(w_i q_i). Re-weighted least squares; slides take the place of turns.
+LocalModel place(const ChainRotations& chain, const std::vector<bool>& slides, const PairData& pair,
+                 const NormalizedActions& actions, double sigma_m) {
+  constexpr int kRounds = 8;
+  const int m = static_cast<int>(chain.signals.size()), n = pair.size();
+  std::vector<int> slide_at(m, -1);
+  int size = 3 * (m + 1);
+  for (int j = 0; j < m; ++j)
+    if (slides[j]) {
+      slide_at[j] = size;
+      size += 3;
+    }
+  Eigen::MatrixXd design = Eigen::MatrixXd::Zero(3 * n, size);
+  Eigen::VectorXd positions(3 * n);
+  for (int t = 0; t < n; ++t) {
+    Matrix3d P = Matrix3d::Identity();
+    auto rows = design.middleRows<3>(3 * t);
+    rows.leftCols<3>().setIdentity();
+    for (int j = 0; j < m; ++j) {
+      const double q = actions(pair.frames[t].sample, chain.signals[j]);
+      if (slides[j])
+        rows.middleCols<3>(slide_at[j]) = q * P;
+      else
+        P = P * exp_so3(chain.axes[j] * q);
+      rows.middleCols<3>(3 * (j + 1)) = P;
+    }
+    positions.segment<3>(3 * t) = pair.primary(t).z.translation();
+  }
+  Eigen::VectorXd x = Eigen::VectorXd::Zero(size), weights = Eigen::VectorXd::Ones(3 * n);
+  for (int round = 0; round < kRounds; ++round) {
+    Eigen::MatrixXd H = design.transpose() * weights.asDiagonal() * design;
+    H.diagonal().array() += std::pow(sigma_m / kLongestLink, 2);
+    x = H.ldlt().solve(design.transpose() * weights.cwiseProduct(positions));
+    const Eigen::VectorXd residual = positions - design * x;
+    for (int t = 0; t < n; ++t)
+      weights.segment<3>(3 * t).setConstant(
+          1 / std::max(1.0, residual.segment<3>(3 * t).norm() / (2 * sigma_m)));
+  }
+  LocalModel model;
+  model.first = translation(x.head<3>());
+  for (int j = 0; j < m; ++j) {
+    Vector6d xi = Vector6d::Zero();
+    if (slides[j])
+      xi.head<3>() = x.segment<3>(slide_at[j]);
+    else
+      xi.tail<3>() = chain.axes[j];
+    const PlacedScrew placed = PlacedScrew::of(xi, slides[j]);
+    model.transform(j) = model.transform(j) * placed.X;
+    model.joints.push_back({chain.signals[j], placed.screw.slide, placed.screw.turn,
+                            placed.X.inverse() * translation(x.segment<3>(3 * (j + 1)))});
+  }
+  model.transform(m) = model.transform(m) * rotation(chain.R_end);
+  return model;
+}
+
+std::vector<bool> sliding(const ChainRotations& chain) {
+  std::vector<bool> slides;
+  for (const Vector3d& axis : chain.axes) slides.push_back(axis.norm() < kMaySlide);
+  return slides;
+}
+
+// All together, from the better of: joints that hardly turn slide; they turn.
+Fit refined(const ChainRotations& chain, const PairData& pair, const NormalizedActions& actions,
+            double sigma_m) {
+  std::optional<Fit> best;
+  std::vector<bool> slides = sliding(chain);
+  for (const bool any_slides : {true, false}) {
+    if (!any_slides && std::count(slides.begin(), slides.end(), true) == 0) break;
+    if (!any_slides) slides.assign(slides.size(), false);
+    Fit fit = fit_local_model(place(chain, slides, pair, actions, sigma_m), pair, actions,
+                              kFitIterations, 1e-2);
+    if (!best || fit.cost < best->cost) best = std::move(fit);
+  }
+  return *std::move(best);
+}
+
+// Rotations do not order joints with parallel axes, nor those that slide: moves one joint at a time
+// to the place at which the positions, linear in the links, fit best.
+ChainRotations ordered_by_positions(ChainRotations chain, const RotationSearch& search,
+                                    const PairData& pair, const NormalizedActions& actions,
+                                    double sigma_m) {
+  constexpr int kMaxSweeps = 3;
+  constexpr double kSameRotations = 1.2;  // of the cost
+  const auto cost_of = [&](const ChainRotations& c) {
+    return evaluate(place(c, sliding(c), pair, actions, sigma_m), pair, actions).cost;
+  };
+  double cost = cost_of(chain);
+  const int m = static_cast<int>(chain.signals.size());
+  for (int sweep = 0; sweep < kMaxSweeps; ++sweep) {
+    const double before = cost;
+    for (int from = 0; from < m; ++from)
+      for (int to = 0; to < m; ++to) {
+        if (to == from || to == from - 1) continue;  // the neighbours' exchange once
+        ChainRotations moved = chain;
+        move_element(&moved.signals, from, to);
+        move_element(&moved.axes, from, to);
+        moved = search.fit(std::move(moved), false, 10);
+        if (moved.cost > kSameRotations * chain.cost) continue;
+        const double other = cost_of(moved);
+        if (other >= cost) continue;
+        cost = other;
+        chain = std::move(moved);
+      }
+    if (cost >= before - 1) break;
+  }
+  return chain;
+}
+
+// |w_j| if every joint turned by `gain` per command unit.
+std::vector<double> lengths_of(const std::vector<int>& signals, const NormalizedActions& actions,
+                               double gain) {
+  std::vector<double> result;
+  for (const int s : signals) result.push_back(gain * actions.half_range(s));
+  return result;
+}
+
+// Angles per command unit that all joints may share: 1 rad, 1°, and such that the signal that moves
+// most turns by ±1 … ±3 rad; where they turn at all and not many times.
+std::vector<double> shared_gains(const std::vector<int>& signals,
+                                 const NormalizedActions& actions) {
+  double largest = 0;
+  for (const int s : signals) largest = std::max(largest, actions.half_range(s));
+  std::vector<double> result;
+  for (const double gain : {1.0, M_PI / 180})
+    if (gain * largest > 0.2 && gain * largest < 7) result.push_back(gain);
+  if (!result.empty()) return result;
+  for (const double turn : {1.0, 1.7, 3.0}) result.push_back(turn / largest);
+  return result;
+}
+
+LocalModel without_joint(const LocalModel& model, int d) {
+  LocalModel result = model;
+  result.transform(d) = result.transform(d) * model.joints[d].X_after;
+  result.joints.erase(result.joints.begin() + d);
+  return result;
+}
+
+double joint_price(const PairData& pair) {
+  return std::max(3 * std::log(6.0 * pair.size()), kLeastPay * pair.size());
+}
+
+}  // namespace
+
+std::optional<Fit> fit_long_chain(const PairData& pair, const NormalizedActions& actions,
+                                  const std::vector<int>& signals, double noise_rad) {
+  const int m = static_cast<int>(signals.size());
+  if (m == 0 || m > kMaxChainJoints || pair.size() < 2 * m) return std::nullopt;
+  RotationSearch search(pair, actions, kSearchFrames);
+  const RelativeMotions scale = relative_motions(pair, 1);
+  // The median of three axes is 1.54 σ; heavy tails and what is systematic are above that.
+  const double goal = 3 * noise_rad;
+  std::vector<int> reversed(signals.rbegin(), signals.rend());
+  ChainRotations best;
+  const auto offer = [&](ChainRotations found) {
+    if (best.signals.empty() || found.cost < best.cost) best = std::move(found);
+    return best.median_rad < goal;
+  };
+  const auto released = [&](const ChainRotations& held) {
+    return search.fit(held, false, kFitIterations);
+  };
+  const std::vector<double> gains = shared_gains(signals, actions);
+  const auto try_gains = [&] {
+    for (const std::vector<int>& order : {signals, reversed})
+      for (const double gain : gains)
+        if (offer(released(search.best_of(order, lengths_of(order, actions, gain), kStarts, goal))))
+          return true;
+    return false;
+  };
+  const auto try_orders = [&] {
+    for (int restart = 0; restart < kOrderRestarts; ++restart)
+      for (const double gain : gains)
+        if (offer(released(search.best_order(signals, lengths_of(signals, actions, gain), goal))))
+          return true;
+    return false;
+  };
+  if (!try_gains() && !offer(search.best_of(signals, {}, kFreeStarts, goal))) try_orders();
+  Fit fit = refined(best, pair, actions, scale.sigma_m);
+  if (fit.cost < kRightCost * pair.size()) return fit;
+  best = ordered_by_positions(best, search, pair, actions, scale.sigma_m);
+  Fit ordered = refined(best, pair, actions, scale.sigma_m);
+  return ordered.cost < fit.cost ? ordered : fit;
+}
+
+Fit without_idle_joints(Fit fit, const PairData& pair, const NormalizedActions& actions) {
+  while (fit.model.num_joints() > 0) {
+    std::optional<Fit> best;
+    for (int d = 0; d < fit.model.num_joints(); ++d) {
+      Fit without = fit_local_model(without_joint(fit.model, d), pair, actions, 15, 1e-1);
+      if (!best || without.cost < best->cost) best = std::move(without);
+    }
+    if (best->cost - fit.cost > joint_price(pair)) break;
+    fit = fit_local_model(best->model, pair, actions, kFitIterations, 1e-2);
+  }
+  return fit;
+}
+
+Fit with_settled_order(Fit fit, const PairData& pair, const NormalizedActions& actions) {
+  return fit;
+}
+
+}  // namespace bodyschema

@@ -1,0 +1,35 @@
+#pragma once
+
+#include <optional>
+#include <vector>
+
+#include "processes/structure_learner/local_model.h"
+
+namespace bodyschema {
+
+/// Largest number of joints of a chain that is searched for.
+inline constexpr int kMaxChainJoints = 12;
+
+/// Independent poses a joint below which no chain of three or more is looked for.
+inline constexpr int kPosesPerJoint = 3;
+
+/// A chain through all of `signals`, fitted to a pair's poses: rotations first, then the positions,
+/// which are linear given the rotations, then all together. First in the order that `signals` has,
+/// with one angle per command unit for all joints (1 rad, 1°, one that is scanned); then reversed,
+/// then in an order that is searched for, then in the listed order with an angle of each joint's
+/// own. `noise_rad`: of one rotation of the pair, per axis; a chain that leaves no more ends the
+/// search. Signals that move nothing get joints that move next to nothing.
+/// std::nullopt: too few frames.
+std::optional<Fit> fit_long_chain(const PairData& pair, const NormalizedActions& actions,
+                                  const std::vector<int>& signals, double noise_rad);
+
+/// Without the joints that do not pay, one by one, the least first: what a joint explains must be
+/// more than its parameters are worth by chance (Schwarz 1978) and, for a sight, more than
+/// `kLeastPay`.
+Fit without_idle_joints(Fit fit, const PairData& pair, const NormalizedActions& actions);
+
+/// Exchanges neighbouring joints while that lowers the cost, and numbers those whose order stays
+/// open: LocalModel::Joint::order_group. Rotations do not order joints with parallel axes.
+Fit with_settled_order(Fit fit, const PairData& pair, const NormalizedActions& actions);
+
+}  // namespace bodyschema
