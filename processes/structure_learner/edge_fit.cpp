@@ -22,6 +22,7 @@ Edge to_edge(const LocalModel& model, const NormalizedActions& actions) {
     joint.slide = model.joints[d].slide / actions.half_range(joint.signal);
     joint.turn = model.joints[d].turn / actions.half_range(joint.signal);
     joint.X_after = model.joints[d].X_after;
+    joint.order_group = model.joints[d].order_group;
     edge.joints.push_back(joint);
   }
   return edge;

@@ -21,7 +21,8 @@ struct LocalModel {
     int signal = 0;
     double slide = 0;                 ///< [m per half range]
     double turn = 0;                  ///< [rad per half range]
-    Pose X_after = Pose::Identity();  ///< A_d of joint d − 1, counted from 0
+    Pose X_after = Pose::Identity();  ///< A_(d+1) of joint d, counted from 0
+    int order_group = -1;             ///< as ScrewJoint::order_group
   };
   Pose first = Pose::Identity();  ///< A_0
   std::vector<Joint> joints;

@@ -73,14 +73,15 @@ void report(const std::vector<ActionPoseSample>& samples, int num_signals, Noise
   measurement.noise = noise;
   const PairData pair = make_pair_data(samples, part_i, part_j, measurement, 1000);
   const double t0 = now();
-  auto fit = fit_long_chain(pair, actions, order, 1.414 * noise.rotation_rad);
+  auto fit = fit_long_chain(pair, actions, order, JointOrder::kUnknown, 1.414 * noise.rotation_rad);
   const double t1 = now();
   if (!fit) { std::printf("none\n"); return; }
   std::printf("cost/frame %.2f  %.2fs  ", fit->cost / pair.size(), t1 - t0);
   *fit = without_idle_joints(*fit, pair, actions);
+  *fit = with_settled_order(*fit, pair, actions);
   const double t2 = now();
   std::printf("pruned: cost/frame %.2f %.2fs:", fit->cost / pair.size(), t2 - t1);
-  for (auto& j : fit->model.joints) std::printf(" q%d(%.3f,%.3f)", j.signal + 1, j.turn, j.slide);
+  for (auto& j : fit->model.joints) std::printf(" q%d(%.3f,%.3f%s)", j.signal + 1, j.turn, j.slide, j.order_group >= 0 ? " open" : "");
   std::printf("\n");
 }
 

@@ -197,13 +197,14 @@ ChainRotations RotationSearch::best_of(const std::vector<int>& signals,
 
 ChainRotations RotationSearch::best_order(const std::vector<int>& signals,
                                           const std::vector<double>& lengths, double goal_rad) {
-  constexpr int kMaxSweeps = 4;
+  constexpr int kMaxSweeps = 8;
   constexpr int kRandomStarts = 2;
   constexpr double kBetter = 0.98;
   const int m = static_cast<int>(signals.size());
+  bool holds = true;
   const auto fit_order = [&](ChainRotations start, ChainRotations* best) {
     set_end(&start);
-    ChainRotations found = fit(std::move(start), true, kSearchIterations);
+    ChainRotations found = fit(std::move(start), holds, kSearchIterations);
     if (found.cost < kBetter * best->cost) *best = std::move(found);
   };
   ChainRotations incumbent = random_start(signals, lengths);
@@ -238,12 +239,15 @@ ChainRotations RotationSearch::best_order(const std::vector<int>& signals,
       incumbent = std::move(best);
       if (incumbent.median_rad < goal_rad) return incumbent;
     }
-    if (getenv("DBG")) { fprintf(stderr,"sweep %d cost %.4f med %.2f deg:", sweep, incumbent.cost, incumbent.median_rad*57.3); for(int s:incumbent.signals) fprintf(stderr," %d",s+1); fprintf(stderr,"\n"); }
     ChainRotations reversed = incumbent;
     std::reverse(reversed.signals.begin(), reversed.signals.end());
     std::reverse(reversed.axes.begin(), reversed.axes.end());
     fit_order(reversed, &incumbent);
-    if (incumbent.cost >= before) break;
+    if (incumbent.cost < before) continue;
+    if (!holds) break;
+    holds = false;
+    incumbent = fit(incumbent, false, kSearchIterations);
+    if (incumbent.median_rad < goal_rad) return incumbent;
   }
   return incumbent;
 }

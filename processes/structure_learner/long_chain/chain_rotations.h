@@ -29,9 +29,9 @@ void move_element(std::vector<T>* v, int from, int to) {
 }
 
 /// Finds the axes of chains of joints from the rotations of a pair alone, by Levenberg–Marquardt
-/// from random axes with a heavy-tailed loss. Where all joints turn by one angle per command unit
-/// the landscape is benign, and the order of the joints is found, too; with lengths of their own
-/// about one start in ten leads to the global minimum, which is unmistakable.
+/// from random axes with a heavy-tailed loss. Where the lengths |w_j| are held about right the
+/// landscape is benign, and the order of the joints is found, too; with free ones about one start
+/// in ten leads to the global minimum, which is unmistakable.
 ///
 /// Deterministic: the starts are drawn by a seed of its own.
 class RotationSearch {
@@ -51,9 +51,9 @@ class RotationSearch {
   ChainRotations best_of(const std::vector<int>& signals, const std::vector<double>& lengths,
                          int num_starts, double goal_rad);
 
-  /// From a random order of `signals`: moves one joint at a time to the place that costs least,
-  /// lengths held, or lets it slide, and tries the reverse, until nothing is better or the goal is
-  /// reached.
+  /// From a random order of `signals`: moves one joint at a time to the place that costs least, or
+  /// lets it slide, and tries the reverse; with the lengths held until nothing is better, then with
+  /// free ones, or until the goal is reached.
   ChainRotations best_order(const std::vector<int>& signals, const std::vector<double>& lengths,
                             double goal_rad);
 

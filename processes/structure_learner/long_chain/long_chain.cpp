@@ -15,16 +15,23 @@ using Eigen::Matrix3d;
 using Eigen::Vector3d;
 
 constexpr int kSearchFrames = 60;
-constexpr int kStarts = 8;       // of one angle per unit for all, in the listed order
-constexpr int kFreeStarts = 60;  // of lengths of their own: one in ten succeeds
-constexpr int kOrderRestarts = 4;
+constexpr int kHeldStarts = 8;
+constexpr int kFreeStarts = 60;  // one in ten succeeds
+constexpr int kOrderRestarts = 3;
 constexpr int kFitIterations = 60;
+// The median angle of three axes is 1.54 σ; heavy tails and what is systematic are above that.
+constexpr double kGoal = 3;
+// Turn of all joints at half range [rad]: of ranges of 60° to 240°, 12 of 12 random arms of seven
+// joints with gains of their own were found from it in unknown order, 1.5 likewise.
+constexpr double kTypicalTurn = 1.2;
 // Turns below which a joint may slide [rad per half range].
 constexpr double kMaySlide = 0.12;
 // Links are shorter than that [m]: what the poses do not tell of them stays small.
 constexpr double kLongestLink = 1;
 // A right model costs 4 to 7 nats a frame.
 constexpr double kRightCost = 8;
+// Nats between two orders that are told apart.
+constexpr double kSettledMargin = 3;
 // Nats a sight: a joint whose effect is below the noise of every single sight is not believed.
 constexpr double kLeastPay = 0.5;
 
@@ -157,24 +164,56 @@ std::vector<double> lengths_of(const std::vector<int>& signals, const Normalized
   return result;
 }
 
-// Angles per command unit that all joints may share: 1 rad, 1°, and such that the signal that moves
-// most turns by ±1 … ±3 rad; where they turn at all and not many times.
-std::vector<double> shared_gains(const std::vector<int>& signals,
-                                 const NormalizedActions& actions) {
-  double largest = 0;
-  for (const int s : signals) largest = std::max(largest, actions.half_range(s));
-  std::vector<double> result;
-  for (const double gain : {1.0, M_PI / 180})
-    if (gain * largest > 0.2 && gain * largest < 7) result.push_back(gain);
-  if (!result.empty()) return result;
-  for (const double turn : {1.0, 1.7, 3.0}) result.push_back(turn / largest);
+// Lengths |w_j| to hold: of 1 rad and of 1° per command unit, where joints then turn at all and not
+// many times; and the same turn for all, whatever their units.
+std::vector<std::vector<double>> held_lengths(const std::vector<int>& signals,
+                                              const NormalizedActions& actions) {
+  constexpr double kLeast = 0.2, kMost = 7;
+  std::vector<std::vector<double>> result;
+  for (const double gain : {1.0, M_PI / 180}) {
+    std::vector<double> lengths = lengths_of(signals, actions, gain);
+    const double largest = *std::max_element(lengths.begin(), lengths.end());
+    if (largest > kLeast && largest < kMost) result.push_back(std::move(lengths));
+  }
+  result.push_back(std::vector<double>(signals.size(), kTypicalTurn));
   return result;
+}
+
+ChainRotations find_rotations(RotationSearch* search, const NormalizedActions& actions,
+                              const std::vector<int>& listed, JointOrder order, double goal_rad) {
+  ChainRotations best;
+  const auto is_found_by = [&](ChainRotations found) {
+    found = search->fit(std::move(found), false, kFitIterations);
+    if (best.signals.empty() || found.cost < best.cost) best = std::move(found);
+    return best.median_rad < goal_rad;
+  };
+  const std::vector<int> reversed(listed.rbegin(), listed.rend());
+  for (const std::vector<int>& signals : {listed, reversed})
+    for (const std::vector<double>& lengths : held_lengths(signals, actions))
+      if (is_found_by(search->best_of(signals, lengths, kHeldStarts, goal_rad))) return best;
+  if (is_found_by(search->best_of(listed, {}, kFreeStarts, goal_rad))) return best;
+  if (order == JointOrder::kListed) return best;
+  for (int restart = 0; restart < kOrderRestarts; ++restart)
+    for (const std::vector<double>& lengths : held_lengths(listed, actions))
+      if (is_found_by(search->best_order(listed, lengths, goal_rad))) return best;
+  return best;
 }
 
 LocalModel without_joint(const LocalModel& model, int d) {
   LocalModel result = model;
   result.transform(d) = result.transform(d) * model.joints[d].X_after;
   result.joints.erase(result.joints.begin() + d);
+  return result;
+}
+
+// Joints d and d + 1 in the other order, each about its own axis as it is at mid-range.
+LocalModel with_exchanged(const LocalModel& model, int d) {
+  LocalModel result = model;
+  const Pose between = model.joints[d].X_after;
+  result.transform(d) = result.transform(d) * between;
+  std::swap(result.joints[d], result.joints[d + 1]);
+  result.joints[d].X_after = between.inverse();
+  result.joints[d + 1].X_after = between * model.joints[d + 1].X_after;
   return result;
 }
 
@@ -185,42 +224,18 @@ double joint_price(const PairData& pair) {
 }  // namespace
 
 std::optional<Fit> fit_long_chain(const PairData& pair, const NormalizedActions& actions,
-                                  const std::vector<int>& signals, double noise_rad) {
+                                  const std::vector<int>& signals, JointOrder order,
+                                  double noise_rad) {
   const int m = static_cast<int>(signals.size());
   if (m == 0 || m > kMaxChainJoints || pair.size() < 2 * m) return std::nullopt;
+  const double sigma_m = relative_motions(pair, 1).sigma_m;
   RotationSearch search(pair, actions, kSearchFrames);
-  const RelativeMotions scale = relative_motions(pair, 1);
-  // The median of three axes is 1.54 σ; heavy tails and what is systematic are above that.
-  const double goal = 3 * noise_rad;
-  std::vector<int> reversed(signals.rbegin(), signals.rend());
-  ChainRotations best;
-  const auto offer = [&](ChainRotations found) {
-    if (best.signals.empty() || found.cost < best.cost) best = std::move(found);
-    return best.median_rad < goal;
-  };
-  const auto released = [&](const ChainRotations& held) {
-    return search.fit(held, false, kFitIterations);
-  };
-  const std::vector<double> gains = shared_gains(signals, actions);
-  const auto try_gains = [&] {
-    for (const std::vector<int>& order : {signals, reversed})
-      for (const double gain : gains)
-        if (offer(released(search.best_of(order, lengths_of(order, actions, gain), kStarts, goal))))
-          return true;
-    return false;
-  };
-  const auto try_orders = [&] {
-    for (int restart = 0; restart < kOrderRestarts; ++restart)
-      for (const double gain : gains)
-        if (offer(released(search.best_order(signals, lengths_of(signals, actions, gain), goal))))
-          return true;
-    return false;
-  };
-  if (!try_gains() && !offer(search.best_of(signals, {}, kFreeStarts, goal))) try_orders();
-  Fit fit = refined(best, pair, actions, scale.sigma_m);
+  const ChainRotations rotations =
+      find_rotations(&search, actions, signals, order, kGoal * noise_rad);
+  Fit fit = refined(rotations, pair, actions, sigma_m);
   if (fit.cost < kRightCost * pair.size()) return fit;
-  best = ordered_by_positions(best, search, pair, actions, scale.sigma_m);
-  Fit ordered = refined(best, pair, actions, scale.sigma_m);
+  Fit ordered = refined(ordered_by_positions(rotations, search, pair, actions, sigma_m), pair,
+                        actions, sigma_m);
   return ordered.cost < fit.cost ? ordered : fit;
 }
 
@@ -238,6 +253,23 @@ Fit without_idle_joints(Fit fit, const PairData& pair, const NormalizedActions& 
 }
 
 Fit with_settled_order(Fit fit, const PairData& pair, const NormalizedActions& actions) {
+  const int last = fit.model.num_joints() - 1;
+  std::vector<bool> is_open(std::max(last, 0));
+  for (int d = 0; d < last; ++d) {
+    Fit other = fit_local_model(with_exchanged(fit.model, d), pair, actions, kFitIterations, 1e-2);
+    if (other.cost < fit.cost - kSettledMargin) {
+      fit = std::move(other);
+      d = std::max(d - 2, -1);  // what is in front may have to move on
+      continue;
+    }
+    is_open[d] = other.cost < fit.cost + kSettledMargin;
+  }
+  int group = -1;
+  for (int d = 0; d < last; ++d) {
+    if (!is_open[d]) continue;
+    if (d == 0 || !is_open[d - 1]) ++group;
+    fit.model.joints[d].order_group = fit.model.joints[d + 1].order_group = group;
+  }
   return fit;
 }
 

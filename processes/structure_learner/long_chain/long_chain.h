@@ -13,23 +13,26 @@ inline constexpr int kMaxChainJoints = 12;
 /// Independent poses a joint below which no chain of three or more is looked for.
 inline constexpr int kPosesPerJoint = 3;
 
+/// Signals in the order of the joints, or not.
+enum class JointOrder { kListed, kUnknown };
+
 /// A chain through all of `signals`, fitted to a pair's poses: rotations first, then the positions,
-/// which are linear given the rotations, then all together. First in the order that `signals` has,
-/// with one angle per command unit for all joints (1 rad, 1°, one that is scanned); then reversed,
-/// then in an order that is searched for, then in the listed order with an angle of each joint's
-/// own. `noise_rad`: of one rotation of the pair, per axis; a chain that leaves no more ends the
-/// search. Signals that move nothing get joints that move next to nothing.
-/// std::nullopt: too few frames.
+/// which are linear given the rotations, then all together. In the listed order, with one angle per
+/// command unit for all joints or with angles of their own, and reversed; where it is unknown, in
+/// an order that is searched for. `noise_rad`: of one rotation of the pair, per axis; a chain that
+/// leaves no more ends the search. Signals that move nothing get joints that move next to nothing.
+/// std::nullopt: too few frames, no signal or too many.
 std::optional<Fit> fit_long_chain(const PairData& pair, const NormalizedActions& actions,
-                                  const std::vector<int>& signals, double noise_rad);
+                                  const std::vector<int>& signals, JointOrder order,
+                                  double noise_rad);
 
 /// Without the joints that do not pay, one by one, the least first: what a joint explains must be
 /// more than its parameters are worth by chance (Schwarz 1978) and, for a sight, more than
 /// `kLeastPay`.
 Fit without_idle_joints(Fit fit, const PairData& pair, const NormalizedActions& actions);
 
-/// Exchanges neighbouring joints while that lowers the cost, and numbers those whose order stays
-/// open: LocalModel::Joint::order_group. Rotations do not order joints with parallel axes.
+/// Exchanges neighbouring joints while that lowers the cost, and numbers those whose order the
+/// poses leave open: LocalModel::Joint::order_group.
 Fit with_settled_order(Fit fit, const PairData& pair, const NormalizedActions& actions);
 
 }  // namespace bodyschema
