@@ -195,8 +195,7 @@ namespace {
 LearnedStructure find_with_bias(const std::vector<Signal>& signals,
                                 const std::vector<ActionPoseSample>& samples,
                                 const LearnOptions& options, double unknown_bias) {
-  if (options.max_signals < 0 || options.max_signals > kMaxScreenedJoints)
-    throw std::invalid_argument("max_signals must be 0 to " + std::to_string(kMaxScreenedJoints));
+  if (options.max_signals < 0) throw std::invalid_argument("max_signals must not be below 0");
   const int num_signals = check_actions(samples, signals.size());
   const std::vector<int> parts = seen_parts(samples);
   SearchOptions search_options = search_options_of(options);

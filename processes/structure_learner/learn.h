@@ -25,8 +25,8 @@ struct LearnOptions {
   /// Without `noise`, and with all covariances of the observations zero, the noise is estimated
   /// (see noise_estimate.h).
   MeasurementModel measurement;
-  /// Largest number of joints in one local model (0 to 2).
-  int max_signals = 2;
+  /// Largest number of joints in one local model.
+  int max_signals = kMaxChainJoints;
 };
 
 struct LearnResult {

@@ -6,6 +6,8 @@
 #include <map>
 
 #include "common/estimation/quantile.h"
+#include "common/geometry/angle.h"
+#include "processes/structure_learner/long_chain/long_chain.h"
 #include "processes/structure_learner/screen.h"
 
 namespace bodyschema {
@@ -15,6 +17,8 @@ constexpr double kMedianChi3 = 2.366;  // median of χ²₃
 constexpr double kSafety = 1.2;
 constexpr int kFramesOfAPair = 120;
 constexpr int kMinRepeats = 5;
+// Of a pair, per axis: any tag's or tracker's is below.
+constexpr double kLargestRotationNoise = 1.5 * kDegree;
 constexpr double kLargestBias = 4;  // of a stream, in standard deviations of its white noise
 
 // A residual log(Δ̂⁻¹ z) of a relative pose with the lever arm that carries the rotation noise of
@@ -182,27 +186,43 @@ class ModelNoise {
     const auto offer = [&](ScaledFit fit) {
       if (fit.scale < best.scale) best = std::move(fit);
     };
-    const Noise rough{0.005, 0.03};
-    const PairData pair = pair_data(part_i, part_j, rough);
+    const PairData pair = pair_data(part_i, part_j, kRough);
     if (pair.size() < 3) return best;
     if (!with_two_joints) {
-      offer(refine(screen_rigid(pair, actions_).model, part_i, part_j, rough));
+      offer(refine(screen_rigid(pair, actions_).model, part_i, part_j, kRough));
       const RelativeMotions motions = relative_motions(pair, 200);
       const auto regressions = screen_one_joint(motions, actions_);
       if (!regressions.empty())
         offer(refine(one_joint_start(regressions[0], pair, actions_, motions.sigma_rad).model,
-                     part_i, part_j, rough));
+                     part_i, part_j, kRough));
     } else {
       const RelativeMotions motions = relative_motions(pair, 200);
       const std::vector<std::vector<double>> turns(actions_.num_signals(), default_turns());
       const auto starts = screen_two_joints(pair, actions_, motions, turns, 6);
       for (std::size_t n = 0; n < starts.size(); ++n)
-        offer(refine(starts[n].model, part_i, part_j, rough));
+        offer(refine(starts[n].model, part_i, part_j, kRough));
     }
     return best;
   }
 
+  // Replaces `best` if a chain on all signals leaves less than half of the product of its noises.
+  void offer_long_chain(int part_i, int part_j, int max_joints, ScaledFit* best) const {
+    const std::vector<int>& signals = actions_.moving();
+    const int m = static_cast<int>(signals.size());
+    const PairData pair = pair_data(part_i, part_j, kRough);
+    const int num_independent =
+        actions_.blocks().count(pair.frames, [](const PairFrame& frame) { return frame.sample; });
+    if (m <= kMaxScreenedJoints || m > max_joints || num_independent < kPosesPerJoint * m) return;
+    const auto fit =
+        fit_long_chain(pair, actions_, signals, JointOrder::kUnknown, kLargestRotationNoise);
+    if (!fit) return;
+    ScaledFit chain = refine(fit->model, part_i, part_j, kRough);
+    if (chain.scale < best->scale - std::log(2.0)) *best = std::move(chain);
+  }
+
  private:
+  static constexpr Noise kRough{0.005, 0.03};
+
   PairData pair_data(int part_i, int part_j, const Noise& noise) const {
     MeasurementModel measurement;
     measurement.noise = noise;
@@ -276,6 +296,10 @@ std::optional<SourcedNoise> estimate_noise(const std::vector<ActionPoseSample>& 
       if (two.scale < fits[ij].scale) fits[ij] = std::move(two);
     }
   }
+  if (max_signals > kMaxScreenedJoints)
+    for (const auto& ij : tree)
+      if (tree.size() <= 2 || fits[ij].scale >= quietest + std::log(4.0))
+        model_noise.offer_long_chain(parts[ij.first], parts[ij.second], max_signals, &fits[ij]);
 
   // Pool the edges no worse than four times the lower quartile (in the product of both noises): an
   // edge across two hidden parts has no model here and would speak of motion, not of noise.

@@ -31,14 +31,15 @@ struct SourcedNoise : Noise {
 /// Noise per axis of one marker, for data that bring neither noise nor covariances.
 ///
 /// From repeats where an action recurs at least five times: residuals of each part's pose to its
-/// robust mean over the repeats. Else from the best screw models (k ≤ 2) of a minimum spanning tree
-/// over the parts: their pooled leave-one-out residuals. Both through medians, so that outliers do
-/// not count; position and rotation apart (the rotation noise of part i reaches the position of
-/// z_ij through the lever arm). The estimate is returned 1.2 × too large: too small a noise rejects
-/// true models, too large a noise by that factor costs nearly nothing. Never below kNoiseFloor or
-/// above kNoiseCeiling. Of a stream, never above a few times what jumps from frame to frame.
-/// std::nullopt: too few data.
+/// robust mean over the repeats. Else from the best screw models of a minimum spanning tree over
+/// the parts: their pooled leave-one-out residuals. Models of one joint, two and many compete: the
+/// residual of a model is noise only where no richer one leaves far less. Both through medians, so
+/// that outliers do not count; position and rotation apart (the rotation noise of part i reaches
+/// the position of z_ij through the lever arm). The estimate is returned 1.2 × too large: too small
+/// a noise rejects true models, too large a noise by that factor costs nearly nothing. Never below
+/// kNoiseFloor or above kNoiseCeiling. Of a stream, never above a few times what jumps from frame
+/// to frame. std::nullopt: too few data.
 std::optional<SourcedNoise> estimate_noise(const std::vector<ActionPoseSample>& samples,
-                                           int num_signals, int max_signals = 2);
+                                           int num_signals, int max_signals);
 
 }  // namespace bodyschema

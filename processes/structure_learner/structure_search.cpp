@@ -2,6 +2,7 @@
 
 #include "processes/structure_learner/search/bridging.h"
 #include "processes/structure_learner/search/layered_search.h"
+#include "processes/structure_learner/search/long_chains.h"
 #include "processes/structure_learner/search/settling.h"
 #include "processes/structure_learner/search/withdrawal.h"
 
@@ -22,6 +23,8 @@ SearchResult search_structure(const std::vector<ActionPoseSample>& samples,
     if (!settled.any_refuted) break;
   }
   if (!forest.spans() && bridge(&pairs, &forest))
+    settled = settle_trees(&layers.spare(), &pairs, &forest);
+  if (!forest.spans() && connect_long_chains(&pairs, &forest))
     settled = settle_trees(&layers.spare(), &pairs, &forest);
   SearchResult result;
   result.joint_information = withdraw_untold_edges(&pairs, &forest);

@@ -30,8 +30,8 @@ Matrix3d right_jacobian(const Vector3d& w) {
 
 // Of R̂ᵀ R: sin ϑ about its axis; 4 sin²(ϑ/2).
 Vector3d sine_axis(const Matrix3d& error) {
-  return 0.5 * Vector3d(error(2, 1) - error(1, 2), error(0, 2) - error(2, 0),
-                        error(1, 0) - error(0, 1));
+  return 0.5 *
+         Vector3d(error(2, 1) - error(1, 2), error(0, 2) - error(2, 0), error(1, 0) - error(0, 1));
 }
 double squared_chord(const Matrix3d& error) { return std::max(0.0, 3 - error.trace()); }
 
@@ -183,14 +183,19 @@ ChainRotations RotationSearch::random_start(const std::vector<int>& signals,
 }
 
 ChainRotations RotationSearch::best_of(const std::vector<int>& signals,
-                                       const std::vector<double>& lengths, int num_starts,
-                                       double goal_rad) {
+                                       const std::vector<double>& lengths, int max_starts) {
+  // Starts that end in the same minimum are enough to call it the global one.
+  constexpr int kEnough = 3;
+  constexpr double kSameMinimum = 1.02;
   ChainRotations best;
-  for (int n = 0; n < num_starts; ++n) {
-    const ChainRotations found =
-        fit(random_start(signals, lengths), !lengths.empty(), kSearchIterations);
-    if (n == 0 || found.cost < best.cost) best = found;
-    if (best.median_rad < goal_rad) break;
+  int num_ended_there = 0;
+  for (int n = 0; n < max_starts && num_ended_there < kEnough; ++n) {
+    ChainRotations found = fit(random_start(signals, lengths), !lengths.empty(), kSearchIterations);
+    const bool is_same =
+        n > 0 && std::max(found.cost, best.cost) < kSameMinimum * std::min(found.cost, best.cost);
+    const bool is_better = n == 0 || found.cost < best.cost;
+    num_ended_there = is_same ? num_ended_there + 1 : is_better ? 1 : num_ended_there;
+    if (is_better) best = std::move(found);
   }
   return best;
 }

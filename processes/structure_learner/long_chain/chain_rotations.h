@@ -47,9 +47,9 @@ class RotationSearch {
   /// A start with random directions; lengths |w_j| as given, or random where `lengths` is empty.
   ChainRotations random_start(const std::vector<int>& signals, const std::vector<double>& lengths);
 
-  /// The best of `num_starts` random starts; fewer once the median angle is below `goal_rad`.
+  /// The best of `max_starts` random starts; fewer once several have ended in it.
   ChainRotations best_of(const std::vector<int>& signals, const std::vector<double>& lengths,
-                         int num_starts, double goal_rad);
+                         int max_starts);
 
   /// From a random order of `signals`: moves one joint at a time to the place that costs least, or
   /// lets it slide, and tries the reverse; with the lengths held until nothing is better, then with

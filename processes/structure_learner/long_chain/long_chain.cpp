@@ -190,8 +190,8 @@ ChainRotations find_rotations(RotationSearch* search, const NormalizedActions& a
   const std::vector<int> reversed(listed.rbegin(), listed.rend());
   for (const std::vector<int>& signals : {listed, reversed})
     for (const std::vector<double>& lengths : held_lengths(signals, actions))
-      if (is_found_by(search->best_of(signals, lengths, kHeldStarts, goal_rad))) return best;
-  if (is_found_by(search->best_of(listed, {}, kFreeStarts, goal_rad))) return best;
+      if (is_found_by(search->best_of(signals, lengths, kHeldStarts))) return best;
+  if (is_found_by(search->best_of(listed, {}, kFreeStarts))) return best;
   if (order == JointOrder::kListed) return best;
   for (int restart = 0; restart < kOrderRestarts; ++restart)
     for (const std::vector<double>& lengths : held_lengths(listed, actions))

@@ -50,11 +50,17 @@ void ComponentTree::replace_edges(const std::vector<TreeEdge>& edges, ModelFores
 std::optional<MissingJoint> missing_joint(const ModelForest& forest, const PairModels& pairs,
                                           TreeFit* fit) {
   const std::set<int> idle = forest.idle_signals(pairs.actions().moving());
+  // What a long chain leaves of its own signals is how its joints are not perfect.
+  std::set<int> of_chains;
+  for (const AcceptedModel& m : forest.models())
+    if (m.model.num_joints() > kMaxScreenedJoints) of_chains.merge(signal_set(m.model));
   for (bool is_settled = false;; is_settled = true) {
     const SearchOptions& options = pairs.options();
-    const auto worst =
-        most_significant(missing_joints(*fit, options.measurement.systematic, options.unknown_bias),
-                         fit->num_frames(), idle);
+    std::vector<MissingJoint> missing =
+        missing_joints(*fit, options.measurement.systematic, options.unknown_bias);
+    std::erase_if(missing,
+                  [&](const MissingJoint& joint) { return of_chains.contains(joint.signal); });
+    const auto worst = most_significant(missing, fit->num_frames(), idle);
     if (!worst || is_settled) return worst;
     fit->fit(60, 1e-5);
   }

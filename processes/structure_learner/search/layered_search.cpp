@@ -38,7 +38,8 @@ void sort_by_quality(std::vector<Candidate>* candidates) {
 
 void LayeredSearch::run(int first_layer) {
   doubtful_.clear();
-  for (int k = first_layer; k <= pairs_.options().max_signals && !forest_.spans(); ++k) {
+  for (int k = first_layer;
+       k <= std::min(pairs_.options().max_signals, kMaxScreenedJoints) && !forest_.spans(); ++k) {
     if (k == 0) layer_rigid();
     if (k == 1) layer_one_joint();
     if (k == 2) layer_two_joints();

@@ -7,6 +7,7 @@
 #include <utility>
 #include <vector>
 
+#include "processes/structure_learner/long_chain/long_chain.h"
 #include "processes/structure_learner/screen.h"
 #include "processes/structure_learner/search/model_forest.h"
 #include "processes/structure_learner/validity.h"
@@ -19,7 +20,7 @@ inline constexpr double kAmbiguityMargin = 3;
 struct SearchOptions {
   MeasurementModel measurement;
   ValidityOptions validity;
-  int max_signals = 2;  ///< largest k, at most kMaxScreenedJoints
+  int max_signals = kMaxChainJoints;  ///< largest number of joints of one model
   /// Standard deviation of the bias that every marker may have beside measurement.systematic, at
   /// half range of a signal, in those of the noise of one sight.
   double unknown_bias = 0;

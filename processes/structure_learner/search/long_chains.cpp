@@ -1,0 +1,96 @@
+#include "processes/structure_learner/search/long_chains.h"
+
+#include <algorithm>
+#include <tuple>
+
+#include "processes/structure_learner/long_chain/long_chain.h"
+
+namespace bodyschema {
+namespace {
+
+// Pairs of two components that are tried, those seen together most often first.
+constexpr std::size_t kMaxPairs = 12;
+
+std::vector<int> without(const std::vector<int>& signals, const std::set<int>& used) {
+  std::vector<int> result;
+  std::copy_if(signals.begin(), signals.end(), std::back_inserter(result),
+               [&](int s) { return !used.contains(s); });
+  return result;
+}
+
+// A chain on some of the signals, valid by the pair's own data.
+std::optional<Candidate> chain_between(int part_i, int part_j, const std::vector<int>& signals,
+                                       JointOrder order, PairModels* pairs) {
+  const PairData& pair = pairs->pair(part_i, part_j);
+  const NormalizedActions& actions = pairs->actions();
+  const int num_independent =
+      actions.blocks().count(pair.frames, [](const PairFrame& frame) { return frame.sample; });
+  if (num_independent < kPosesPerJoint * static_cast<int>(signals.size())) {
+    pairs->record(part_i, part_j).note_undecided(static_cast<int>(signals.size()), 0);
+    return std::nullopt;
+  }
+  const double sigma_rad = pairs->motions(part_i, part_j).sigma_rad;
+  std::optional<Fit> fit = fit_long_chain(pair, actions, signals, order, sigma_rad);
+  ++pairs->num_fits;
+  if (!fit) return std::nullopt;
+  fit = with_settled_order(without_idle_joints(*std::move(fit), pair, actions), pair, actions);
+  return pairs->try_start(part_i, part_j, fit->model);
+}
+
+std::optional<Candidate> best_chain(const std::vector<std::pair<int, int>>& between,
+                                    const std::vector<int>& signals, PairModels* pairs) {
+  const bool is_alone = between.size() == 1;
+  std::optional<Candidate> best;
+  const auto rank = [](const Candidate& c) { return std::tuple(c.model.num_joints(), -c.score); };
+  for (const auto& [i, j] : between) {
+    std::optional<Candidate> found =
+        chain_between(i, j, signals, is_alone ? JointOrder::kUnknown : JointOrder::kListed, pairs);
+    if (found && (!best || rank(*found) < rank(*best))) best = std::move(found);
+  }
+  return best;
+}
+
+}  // namespace
+
+bool connect_long_chains(PairModels* pairs, ModelForest* forest) {
+  const int max_joints = std::min(pairs->options().max_signals, kMaxChainJoints);
+  if (max_joints <= kMaxScreenedJoints) return false;
+  std::map<std::pair<int, int>, std::vector<std::pair<int, int>>> open;  // by components
+  for (const auto& [ij, record] : pairs->records())
+    if (!forest->connected(ij.first, ij.second) && record.num_common > 0)
+      open[std::minmax(forest->component(ij.first), forest->component(ij.second))].push_back(ij);
+  std::set<int> used;
+  for (const AcceptedModel& m : forest->models()) used.merge(signal_set(m.model));
+  const std::vector<int>& moving = pairs->actions().moving();
+  const std::vector<int> idle = without(moving, used);
+  std::vector<std::vector<int>> choices{idle};
+  if (idle != moving) choices.push_back(moving);
+  std::vector<Candidate> found;
+  for (auto& [components, between] : open) {
+    std::stable_sort(between.begin(), between.end(), [&](const auto& x, const auto& y) {
+      return pairs->record(x.first, x.second).num_common >
+             pairs->record(y.first, y.second).num_common;
+    });
+    if (between.size() > kMaxPairs) between.resize(kMaxPairs);
+    for (const std::vector<int>& signals : choices) {
+      const int m = static_cast<int>(signals.size());
+      if (m <= kMaxScreenedJoints || m > max_joints) continue;
+      if (const auto chain = best_chain(between, signals, pairs)) {
+        found.push_back(*chain);
+        break;
+      }
+    }
+  }
+  std::stable_sort(found.begin(), found.end(), [](const Candidate& x, const Candidate& y) {
+    return x.model.num_joints() < y.model.num_joints();
+  });
+  bool any = false;
+  for (Candidate& c : found) {
+    if (forest->connected(c.part_i, c.part_j) || !pairs->confirm_on_all_data(&c)) continue;
+    forest->add(c);
+    any = true;
+  }
+  return any;
+}
+
+}  // namespace bodyschema
