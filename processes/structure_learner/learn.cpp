@@ -42,10 +42,13 @@ Noise typical_noise(const std::vector<ActionPoseSample>& samples) {
 // seven (16 subsets of arm7_ends.csv), which a Gaussian process would then explain well enough.
 constexpr Noise kLargestGuess{0.01, 3 * kDegree};
 
+bool is_guess_too_large(const MeasurementModel& measurement, NoiseSource source) {
+  return source == NoiseSource::kResiduals &&
+         (measurement.noise->position_m > kLargestGuess.position_m ||
+          measurement.noise->rotation_rad > kLargestGuess.rotation_rad);
+}
 bool is_guess_too_large(const LearnedStructure& structure) {
-  return structure.noise_source == NoiseSource::kResiduals &&
-         (structure.measurement.noise->position_m > kLargestGuess.position_m ||
-          structure.measurement.noise->rotation_rad > kLargestGuess.rotation_rad);
+  return is_guess_too_large(structure.measurement, structure.noise_source);
 }
 
 // Why `part`, which was seen, is not connected to the root's component.
@@ -209,6 +212,9 @@ LearnedStructure find_with_bias(const std::vector<Signal>& signals,
     noise_source = noise.source;
   };
   set_noise(samples);
+  // What many joints leave by that much is no noise either.
+  if (is_guess_too_large(measurement, noise_source))
+    search_options.max_signals = std::min(search_options.max_signals, kMaxScreenedJoints);
   NormalizedActions actions(samples, num_signals);
   SearchResult search = search_structure(samples, actions, parts, search_options);
   LearnedStructure result{signals,           parts,       measurement, std::move(actions),

@@ -3,7 +3,7 @@
 #include <optional>
 #include <vector>
 
-#include "processes/structure_learner/pair_data.h"
+#include "processes/structure_learner/long_chain/long_chain.h"
 
 namespace bodyschema {
 
@@ -40,6 +40,7 @@ struct SourcedNoise : Noise {
 /// kNoiseFloor or above kNoiseCeiling. Of a stream, never above a few times what jumps from frame
 /// to frame. std::nullopt: too few data.
 std::optional<SourcedNoise> estimate_noise(const std::vector<ActionPoseSample>& samples,
-                                           int num_signals, int max_signals);
+                                           int num_signals,
+                                           int max_signals = kMaxChainJoints);
 
 }  // namespace bodyschema

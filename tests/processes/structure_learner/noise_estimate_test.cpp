@@ -17,7 +17,7 @@ TEST(NoiseEstimate, FromScrewModelsIsSlightlyAboveTheTruth) {
       Rng rng(1);
       const auto robot = test::chapter_robot(name, rng);
       const auto samples = test::babble(robot, 40, {regime}, rng);
-      const auto noise = estimate_noise(samples, static_cast<int>(robot.signals.size()), 2);
+      const auto noise = estimate_noise(samples, static_cast<int>(robot.signals.size()));
       ASSERT_TRUE(noise);
       const Noise truth = test::nominal_noise(regime);
       EXPECT_GT(noise->position_m, 0.9 * truth.position_m) << name;
@@ -35,7 +35,7 @@ TEST(NoiseEstimate, RepeatsAtOnePoseDecideWhereThereAreAny) {
   const Eigen::VectorXd action = robot.random_action(rng);
   for (int n = 0; n < 10; ++n)
     samples.push_back(test::observe(robot, action, {Regime::kTagIso}, 10 + n, rng));
-  const auto noise = estimate_noise(samples, 4, 2);
+  const auto noise = estimate_noise(samples, 4);
   ASSERT_TRUE(noise);
   EXPECT_NEAR(noise->position_m, 1.2 * 0.003, 0.001);
   EXPECT_NEAR(noise->rotation_rad, 1.2 * kDegree, 0.005);
@@ -44,13 +44,13 @@ TEST(NoiseEstimate, RepeatsAtOnePoseDecideWhereThereAreAny) {
 TEST(NoiseEstimate, OfExactDataIsTheFloor) {
   Rng rng(3);
   const auto robot = test::chapter_robot("co", rng);
-  const auto noise = estimate_noise(test::babble(robot, 10, {}, rng), 4, 2);
+  const auto noise = estimate_noise(test::babble(robot, 10, {}, rng), 4);
   ASSERT_TRUE(noise);
   EXPECT_EQ(noise->position_m, kNoiseFloor.position_m);
   EXPECT_EQ(noise->rotation_rad, kNoiseFloor.rotation_rad);
 }
 
-TEST(NoiseEstimate, NeedsTwoParts) { EXPECT_FALSE(estimate_noise({}, 2, 2)); }
+TEST(NoiseEstimate, NeedsTwoParts) { EXPECT_FALSE(estimate_noise({}, 2)); }
 
 }  // namespace
 }  // namespace bodyschema
