@@ -171,8 +171,9 @@ LearnResult fit_tree(const LearnedStructure& structure,
   report_unconnected(
       options.expected_parts,
       [&](int part) {
+        const int num_moving = static_cast<int>(actions.moving().size());
         return explain(part, count_common(samples, part, part), connected, structure,
-                       options.max_signals);
+                       std::min(options.max_signals, num_moving));
       },
       &schema);
   schema.undecided_signals = undecided_signals(schema, structure);
