@@ -137,7 +137,7 @@ std::map<int, Pose> SyntheticRobot::poses_in_camera(const Eigen::VectorXd& actio
   return X_CB;
 }
 
-std::vector<int> SyntheticRobot::path_joints(int part_a, int part_b) const {
+Edge SyntheticRobot::true_edge(int from, int to) const {
   const auto to_base = [this](int part) {
     std::vector<const TrueLink*> path;
     while (part >= 0) {
@@ -148,15 +148,29 @@ std::vector<int> SyntheticRobot::path_joints(int part_a, int part_b) const {
     }
     return path;
   };
-  std::vector<const TrueLink*> a = to_base(part_a), b = to_base(part_b);
-  while (!a.empty() && !b.empty() && a.back() == b.back()) {
-    a.pop_back();
-    b.pop_back();
+  std::vector<const TrueLink*> up = to_base(from), down = to_base(to);
+  while (!up.empty() && !down.empty() && up.back() == down.back()) {
+    up.pop_back();
+    down.pop_back();
   }
+  std::reverse(down.begin(), down.end());
+  TrueChain chain(from, to);
+  for (const TrueLink* link : up) {
+    chain.move(link->X_after.inverse());
+    if (link->signal >= 0) chain.add(link->signal, -link->slide, -link->turn, link->zero);
+    chain.move(link->X_before.inverse());
+  }
+  for (const TrueLink* link : down) {
+    chain.move(link->X_before);
+    if (link->signal >= 0) chain.add(link->signal, link->slide, link->turn, link->zero);
+    chain.move(link->X_after);
+  }
+  return chain.edge();
+}
+
+std::vector<int> SyntheticRobot::path_joints(int part_a, int part_b) const {
   std::vector<int> result;
-  for (const auto& path : {a, b})
-    for (const TrueLink* link : path)
-      if (link->signal >= 0) result.push_back(link->signal);
+  for (const ScrewJoint& joint : true_edge(part_a, part_b).joints) result.push_back(joint.signal);
   return result;
 }
 
@@ -432,14 +446,21 @@ SyntheticRobot random_tree(const RandomTreeOptions& options, Rng& rng) {
 
 Rightness judge(const BodySchema& schema, const SyntheticRobot& truth) {
   std::size_t total = 0;
+  bool is_open = false;
+  const std::vector<Signal>& told = schema.signals.empty() ? truth.signals : schema.signals;
   for (const Edge& edge : schema.edges) {
     const std::vector<int> signals = edge.signals();
     if (std::set<int>(signals.begin(), signals.end()) != truth.path_signals(edge.from, edge.to))
       return Rightness::kWrong;
+    const Edge true_edge = truth.true_edge(edge.from, edge.to);
+    const Rightness rightness = judge_chain(edge, true_edge, told).rightness;
+    if (rightness == Rightness::kWrong) return rightness;
+    is_open |= rightness == Rightness::kIncomplete;
     total += signals.size();
   }
   const std::vector<int> parts = truth.visible_parts();
-  if (schema.edges.size() + 1 != parts.size() || !schema.complete) return Rightness::kIncomplete;
+  if (is_open || schema.edges.size() + 1 != parts.size() || !schema.complete)
+    return Rightness::kIncomplete;
   // The least sum: a minimum spanning tree over the true numbers of joints. (Two joints on one
   // signal with nothing visible between them are in general no single screw.)
   std::vector<int> component(parts.size());
