@@ -22,7 +22,9 @@ constexpr std::int64_t kControlSilent_us = 3'000'000;
 constexpr std::int64_t kEyesSilent_us = 5'000'000;  // frames and SAMPLE repeat at 1 Hz at least
 
 constexpr std::size_t kNumCandidates = 40;
-constexpr std::int64_t kCandidates = 1;  // another stream of random numbers than that of the draw
+// Other streams of random numbers than that of the draw.
+constexpr std::int64_t kCandidates = 1;
+constexpr std::int64_t kSingleJoint = 2;
 // Size of the memory: old actions matter little, and a choice takes time for each.
 constexpr std::size_t kMaxMemory = 500;
 
@@ -67,6 +69,7 @@ MotorBabblerConfig MotorBabblerConfig::load(const std::filesystem::path& file) {
       yaml.choice("choice", {"active", "random"}) == "active" ? Choice::kActive : Choice::kRandom;
   config.extreme_share = yaml.number("extreme_share", 0, 1);
   config.extreme_from = yaml.number("extreme_from", 0, 1);
+  config.single_joint_share = yaml.number("single_joint_share", 0, 1);
   config.test_every = yaml.integer("test_every", 2, 1000);
   config.expiry_us = microseconds(yaml.number("expiry_s", 0.1, 3600));
   config.resend_us = microseconds(yaml.number("resend_s", 0.1, 3600));
@@ -102,7 +105,9 @@ std::vector<Eigen::VectorXd> candidate_actions(const MotorBabblerConfig& config,
 }
 
 MotorBabbler::MotorBabbler(MotorBabblerConfig config, std::int64_t seed)
-    : config_(std::move(config)), seed_(seed) {
+    : config_(std::move(config)),
+      seed_(seed),
+      single_joint_moves_(config_.signals, config_.single_joint_share) {
   health_.judged_sample = -1;
 }
 
@@ -185,7 +190,14 @@ std::int8_t MotorBabbler::next_purpose() const {
 bool MotorBabbler::is_to_choose() const {
   return config_.choice == Choice::kActive && next_purpose() == action_command_t::PURPOSE_TRAIN &&
          is_seen_ && last_test_sample_ >= 0 && without_schema_since_ != last_test_sample_ &&
-         !should_stop();
+         !single_joint_action() && !should_stop();
+}
+
+std::optional<std::vector<double>> MotorBabbler::single_joint_action() const {
+  if (next_purpose() != action_command_t::PURPOSE_TRAIN) return std::nullopt;
+  std::mt19937_64 engine = engine_of({seed_, action_id_, kSingleJoint});
+  const double u = std::uniform_real_distribution<double>(0, 1)(engine);
+  return single_joint_moves_.action(num_train(), u);
 }
 
 bool MotorBabbler::can_choose() const {
@@ -197,6 +209,8 @@ bool MotorBabbler::can_choose() const {
 Eigen::VectorXd MotorBabbler::next_action() const {
   if (is_to_probe())
     return Eigen::Map<const Eigen::VectorXd>(health_.probe_action.data(), health_.num_probe);
+  if (const auto single = single_joint_action())
+    return Eigen::Map<const Eigen::VectorXd>(single->data(), std::ssize(*single));
   if (!is_to_choose() || !can_choose() || health_.schema_version == 0)
     return random_action(config_, seed_, action_id_);
   const auto candidates = candidate_actions(config_, seed_, action_id_);
@@ -214,6 +228,11 @@ bool MotorBabbler::is_to_probe() const {
     if (!(value >= signal.lower && value <= signal.upper)) return false;
   }
   return true;
+}
+
+void MotorBabbler::note_verdict() {
+  if (has_verdict())
+    single_joint_moves_.on_verdict(last_test_sample_, health_.schema_complete == 1);
 }
 
 void MotorBabbler::take_schema() {
@@ -264,6 +283,8 @@ std::optional<action_command_t> MotorBabbler::on_sample(const sample_t& sample) 
   last_sample_ = sample.sample_index;
   const bool is_test = sample.purpose == action_command_t::PURPOSE_TEST;
   if (is_test) last_test_sample_ = last_sample_;
+  single_joint_moves_.on_sample(sample, num_train());
+  note_verdict();
   if (sample.action_id != command_.action_id) return std::nullopt;
   is_seen_ = true;
   num_unseen_in_a_row_ = 0;
@@ -281,6 +302,7 @@ std::optional<action_command_t> MotorBabbler::on_model_health(const model_health
   if (last_test_sample_ < 0 || !has_verdict() || health.judged_sample != health_.judged_sample) {
     health_ = health;
     take_schema();
+    note_verdict();
   }
   if (last_sample_ < 0 && !is_restored_) {
     num_samples_ = std::max(num_samples_, health.judged_sample + 1);
@@ -443,7 +465,8 @@ std::string MotorBabbler::state_text() const {
        << "command: {utime: " << command_.utime << ", epoch: " << command_.epoch
        << ", action_id: " << command_.action_id << ", purpose: " << int{command_.purpose}
        << ", expiry_utime: " << command_.expiry_utime << ", action: " << yaml_list(command_.action)
-       << "}\n";
+       << "}\n"
+       << single_joint_moves_.state_text();
   return text.str();
 }
 
@@ -468,6 +491,7 @@ void MotorBabbler::restore(const std::filesystem::path& file) {
   command_.expiry_utime = last.integer("expiry_utime", 0);
   set_array(command_.num_signals, command_.action,
             last.numbers("action", static_cast<int>(config_.signals.size())));
+  single_joint_moves_.restore(yaml.section("single_joint_moves"));
   yaml.finish();
   action_id_ = command_.action_id + 1;
   is_restored_ = true;

@@ -18,6 +18,7 @@
 #include "common/config/rig.h"
 #include "common/schema/body_schema.h"
 #include "processes/motor_babbler/action_choice.h"
+#include "processes/motor_babbler/single_joint_moves.h"
 
 namespace bodyschema {
 
@@ -40,6 +41,7 @@ struct MotorBabblerConfig {
   Choice choice = Choice::kRandom;
   double extreme_share = 0;            ///< share of actions drawn from the ends of the ranges, 0..1
   double extreme_from = 0;             ///< these lie at extreme_from..1 of each half range
+  double single_joint_share = 0;       ///< share of TRAIN actions, see SingleJointMoves, 0..1
   std::int64_t test_every = 0;         ///< every n-th sample is TEST
   std::int64_t expiry_us = 0;          ///< of a command, driver's time
   std::int64_t resend_us = 0;          ///< a command without an answer is sent again after this
@@ -91,6 +93,8 @@ std::vector<Eigen::VectorXd> candidate_actions(const MotorBabblerConfig& config,
 /// explanations of a change apart, the next action is that one, with purpose PROBE. Refused, it is
 /// replaced as any other; still wanted after the next TEST sample, it is made again.
 ///
+/// Some TRAIN actions move one joint alone (SingleJointMoves).
+///
 /// A restart with the kept state goes on as if nothing had happened: it sends the last command
 /// again, unless that command's SAMPLE has come. Only its own samples are counted, so that every
 /// test_every-th of them is TEST whatever other sources do in between.
@@ -135,6 +139,8 @@ class MotorBabbler {
   /// act(), once everything that the next action rests on has come.
   std::optional<action_command_t> go_on();
   bool has_verdict() const { return health_.judged_sample >= last_test_sample_; }
+  /// Tells single_joint_moves_ of the verdict on the newest TEST sample once both have come.
+  void note_verdict();
   /// The next action is to be chosen, not drawn.
   bool is_to_choose() const;
   /// Verdict, its schema (if there is one at all) and every sample so far have come.
@@ -145,6 +151,10 @@ class MotorBabbler {
   bool is_to_probe() const;
   Eigen::VectorXd next_action() const;
   std::int8_t next_purpose() const;
+  /// The next action, if it moves one joint alone.
+  std::optional<std::vector<double>> single_joint_action() const;
+  /// Samples of its own actions that are not TEST.
+  std::int64_t num_train() const { return num_samples_ - num_samples_ / config_.test_every; }
   bool may_move() const { return is_at_rest_ && !is_stopped_ && !is_lent_; }
   bool is_mine(const motion_status_t& status) const;
   bool should_stop() const;
@@ -186,6 +196,7 @@ class MotorBabbler {
   std::int64_t schema_version_ = 0;  ///< of schema_, by which is chosen; 0: none was heard
   BodySchema schema_;
   std::deque<SeenAction> memory_;
+  SingleJointMoves single_joint_moves_;
   std::int64_t without_schema_since_ = -1;  ///< TEST sample whose verdict or schema was given up
   std::int64_t num_without_schema_ = 0;
 };

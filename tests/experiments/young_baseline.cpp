@@ -70,7 +70,9 @@ Rightness judge(const std::optional<BodySchema>& schema, const test::RigTruth& t
       std::any_of(schema->edges.begin(), schema->edges.end(), [&](const Edge& edge) {
         const std::vector<int> signals = edge.signals();
         return std::set<int>(signals.begin(), signals.end()) !=
-               truth.path_signals(edge.from, edge.to);
+                   truth.path_signals(edge.from, edge.to) ||
+               test::judge_chain(edge, truth.true_edge(edge.from, edge.to), schema->signals)
+                       .rightness == Rightness::kWrong;
       });
   return is_wrong ? Rightness::kWrong : Rightness::kIncomplete;
 }

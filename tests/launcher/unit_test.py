@@ -52,7 +52,7 @@ class TheGroupFile(Folder):
         self.assertEqual(group_file.speakers(self.folder, ["log", "controller"]), ["controller"])
 
     def test_each_shipped_rig_has_a_group(self):
-        for rig in ("arm2", "arm4", "arm7"):
+        for rig in ("arm2", "arm4", "arm6_ends", "arm7"):
             group = group_file.processes(SOURCE / "config" / "group.conf", SOURCE / "config" / rig)
             self.assertIn("robot_simulator", group)
             self.assertIn("log", group)

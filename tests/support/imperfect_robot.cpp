@@ -111,7 +111,10 @@ ImperfectRobot::ImperfectRobot(int num_joints, bool is_chain, const Imperfection
       link.tags.push_back(tag);
     }
     links_.push_back(link);
-    structure_.links.push_back({.part = n + 1, .parent = link.parent < 0 ? -1 : link.parent + 1});
+    structure_.links.push_back({.part = n + 1,
+                                .parent = link.parent < 0 ? -1 : link.parent + 1,
+                                .X_before = link.before,
+                                .X_after = link.after});
     if (n == 0) continue;
     structure_.links.back().signal = n - 1;
     structure_.links.back().turn = 1;

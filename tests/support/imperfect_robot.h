@@ -44,7 +44,7 @@ class ImperfectRobot {
                  std::uint64_t seed);
 
   const std::vector<Signal>& signals() const { return structure_.signals; }
-  /// Parents and signals alone, for judge().
+  /// As it was built, without its imperfections: for judge().
   const SyntheticRobot& structure() const { return structure_; }
   Eigen::VectorXd random_action();
   /// Carries out an action and returns its observation.

@@ -15,9 +15,9 @@ std::vector<int> RigTruth::parts() const {
   return parts;
 }
 
-int RigTruth::link_of(int part) const {
+const PartPlacement& RigTruth::placement_of(int part) const {
   for (const PartPlacement& placement : robot_.parts) {
-    if (placement.part == part) return placement.link;
+    if (placement.part == part) return placement;
   }
   throw std::out_of_range("no part " + std::to_string(part));
 }
@@ -35,19 +35,43 @@ std::vector<int> RigTruth::ancestors(int link) const {
   }
 }
 
-std::vector<int> RigTruth::path_joints(int part_a, int part_b) const {
-  const std::vector<int> a = ancestors(link_of(part_a));
-  const std::vector<int> b = ancestors(link_of(part_b));
-  std::vector<int> signals;
-  const auto add_unshared = [&](const std::vector<int>& chain, const std::vector<int>& other) {
-    for (const int link : chain) {
-      const bool is_shared = std::find(other.begin(), other.end(), link) != other.end();
-      const auto& joint = robot_.links[link].joint;
-      if (!is_shared && joint) signals.push_back(robot_.joints[*joint].signal);
-    }
+Edge RigTruth::true_edge(int from, int to) const {
+  std::vector<int> up = ancestors(placement_of(from).link), down = ancestors(placement_of(to).link);
+  while (!up.empty() && !down.empty() && up.back() == down.back()) {
+    up.pop_back();
+    down.pop_back();
+  }
+  std::reverse(down.begin(), down.end());
+  TrueChain chain(from, to);
+  const auto cross = [&](const Link& link, double sense) {
+    if (!link.joint) return;
+    const RobotJoint& joint = robot_.joints[static_cast<std::size_t>(*link.joint)];
+    Pose X_LZ = Pose::Identity();  // its z axis along the joint's
+    X_LZ.linear() = rotation_of_z_to(joint.axis);
+    const bool turns = joint.kind == RobotJoint::Kind::kRevolute;
+    chain.move(X_LZ);
+    chain.add(joint.signal, turns ? 0 : sense * joint.gain, turns ? sense * joint.gain : 0,
+              -joint.offset / joint.gain);
+    chain.move(X_LZ.inverse());
   };
-  add_unshared(a, b);
-  add_unshared(b, a);
+  chain.move(placement_of(from).X_LB.inverse());
+  for (const int index : up) {
+    const Link& link = robot_.links[static_cast<std::size_t>(index)];
+    cross(link, -1);
+    chain.move(link.X_PL.inverse());
+  }
+  for (const int index : down) {
+    const Link& link = robot_.links[static_cast<std::size_t>(index)];
+    chain.move(link.X_PL);
+    cross(link, 1);
+  }
+  chain.move(placement_of(to).X_LB);
+  return chain.edge();
+}
+
+std::vector<int> RigTruth::path_joints(int part_a, int part_b) const {
+  std::vector<int> signals;
+  for (const ScrewJoint& joint : true_edge(part_a, part_b).joints) signals.push_back(joint.signal);
   return signals;
 }
 
@@ -81,6 +105,8 @@ std::string RigTruth::objection(const BodySchema& schema, const std::vector<int>
     if (edge.joints.size() != num_true)
       return name + " has " + std::to_string(edge.joints.size()) + " joints, not " +
              std::to_string(num_true);
+    const ChainVerdict verdict = judge_chain(edge, true_edge(edge.from, edge.to), schema.signals);
+    if (!verdict.reason.empty()) return name + " " + verdict.reason;
     num_joints += num_true;
     if (!join(edge.from, edge.to)) return name + " closes a loop";
     ++num_joined;

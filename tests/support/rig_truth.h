@@ -6,6 +6,7 @@
 
 #include "common/scene/robot.h"
 #include "common/schema/body_schema.h"
+#include "tests/support/chain_judgement.h"
 
 namespace bodyschema::test {
 
@@ -14,8 +15,10 @@ class RigTruth {
  public:
   explicit RigTruth(const std::filesystem::path& rig_folder);
 
-  /// The signal of each joint on the path between two parts: two joints may share one, as the
-  /// fingers of a gripper do.
+  /// The chain of joints between two parts.
+  Edge true_edge(int from, int to) const;
+  /// The signal of each joint on the path between two parts, in its order: two joints may share
+  /// one, as the fingers of a gripper do.
   std::vector<int> path_joints(int part_a, int part_b) const;
   /// Indices of the signals whose joints lie on the path between two parts.
   std::set<int> path_signals(int part_a, int part_b) const;
@@ -24,14 +27,15 @@ class RigTruth {
   const Robot& robot() const { return robot_; }
 
   /// "" if `schema` is right: it spans `observed` parts, every edge's signals, and the number of
-  /// its joints, are those of the true path between its two parts, and they are the least possible
+  /// its joints, are those of the true path between its two parts, long edges are right
+  /// (judge_chain), and the joints are the least possible
   /// (a gripper's fingers, without the part that carries them, are two joints apart, which no screw
   /// on their one signal is). Else the reason why it is wrong.
   std::string objection(const BodySchema& schema, const std::vector<int>& observed) const;
 
  private:
   std::vector<int> ancestors(int link) const;
-  int link_of(int part) const;
+  const PartPlacement& placement_of(int part) const;
 
   Robot robot_;
 };

@@ -10,6 +10,7 @@
 
 #include "common/schema/body_schema.h"
 #include "common/schema/sample.h"
+#include "tests/support/chain_judgement.h"
 
 namespace bodyschema::test {
 
@@ -67,7 +68,9 @@ struct SyntheticRobot {
   Pose X_CR = Pose::Identity();
 
   std::map<int, Pose> poses_in_camera(const Eigen::VectorXd& action) const;
-  /// The signal of every moving joint on the path between two parts.
+  /// The chain of joints between two parts, without noise; of straight commands.
+  Edge true_edge(int from, int to) const;
+  /// The signal of every moving joint on the path between two parts, in the order of the path.
   std::vector<int> path_joints(int part_a, int part_b) const;
   /// Signals of the joints on the path between two parts.
   std::set<int> path_signals(int part_a, int part_b) const;
@@ -126,10 +129,10 @@ struct RandomTreeOptions {
 /// A random tree with branches; command gains 0.5 to 2 of either sign, offsets.
 SyntheticRobot random_tree(const RandomTreeOptions& options, Rng& rng);
 
-enum class Rightness { kRight, kIncomplete, kWrong };
 /// Right: spans the visible parts, every edge's signals are exactly those on the true path between
-/// its two parts, and the number of signals over all edges is minimal. Incomplete: not spanning,
-/// and every edge's signals are right. Wrong: the rest.
+/// its two parts, long edges are right (judge_chain), and the number of signals over all edges is
+/// minimal. Incomplete: not spanning, or long edges leave an order open, and the rest is right.
+/// Wrong: all else.
 Rightness judge(const BodySchema& schema, const SyntheticRobot& truth);
 bool is_right(const BodySchema& schema, const SyntheticRobot& truth);
 

@@ -55,6 +55,15 @@ Bins bins_of(Eigen::Index signal, const Signal& limits,
   return bins;
 }
 
+constexpr double kRadius = 17;        // of a part in the tree
+constexpr double kLetterWidth = 6.5;  // upper bound of the mean at .signal's 12 px
+
+/// The signals of an edge, as they stand above it.
+std::string signals_of(const BodySchema& schema, const Edge& edge) {
+  const std::string signals = listed(signal_names(schema, edge.signals()));
+  return signals.empty() ? "rigid" : signals;
+}
+
 /// Places of the parts of a tree: leaves get rows of their own in order, a part stands beside its
 /// first child, and below the root's tree stands what hangs together without reaching it.
 class TreeLayout {
@@ -72,9 +81,14 @@ class TreeLayout {
       place(edge.from, 0);
       loose_roots_.insert(edge.from);
     }
-    // Columns as wide as the page allows.
+    // Columns as wide as the page allows, or wider for an edge of many signals.
     width_ = std::max(760.0, 2 * 30 + 78.0 * deepest_);
     if (deepest_ > 0) column_ = std::min(120.0, (width_ - 60) / static_cast<double>(deepest_));
+    for (const Edge& edge : schema.edges) {
+      const auto num_letters = static_cast<double>(signals_of(schema, edge).size());
+      column_ = std::max(column_, 2 * kRadius + kLetterWidth * num_letters);
+    }
+    width_ = std::max(width_, 60 + column_ * deepest_);
   }
 
   const std::map<int, Spot>& spots() const { return spots_; }
@@ -111,8 +125,6 @@ class TreeLayout {
   double width_ = 0, column_ = 0;
 };
 
-constexpr double kRadius = 17;  // of a part in the tree
-
 std::string edge_svg(const BodySchema& schema, const Edge& edge, const TreeLayout& layout) {
   const double x_from = layout.x(edge.from), y_from = layout.y(edge.from);
   const double x_to = layout.x(edge.to), y_to = layout.y(edge.to);
@@ -123,11 +135,9 @@ std::string edge_svg(const BodySchema& schema, const Edge& edge, const TreeLayou
           : fmt::format("M{:.1f},{:.1f} C{:.1f},{:.1f} {:.1f},{:.1f} {:.1f},{:.1f}",
                         x_from + kRadius * 0.6, y_from + kRadius * 0.8, x_bend, y_to, x_bend, y_to,
                         x_to - kRadius, y_to);
-  const std::string signals = listed(signal_names(schema, edge.signals()));
   return fmt::format("<path class=\"{} {}\" d=\"{}\"/>\n", edge.joints.empty() ? "rigid" : "screw",
                      name_in(kEdgeStateClasses, edge.state), way) +
-         text_svg("signal", x_to - 0.5 * layout.column(), y_to - 7,
-                  signals.empty() ? "rigid" : signals) +
+         text_svg("signal", x_to - 0.5 * layout.column(), y_to - 7, signals_of(schema, edge)) +
          "\n";
 }
 

@@ -256,7 +256,8 @@ class Page {
         const Json& sd = joint["sd"];
         if (sd.is_null()) continue;
         rows.push_back({{"edge", edge_name(edge["from"], edge["to"])},
-                        {"signal", joint["signal"]},
+                        {"signal", joint["signal"].get<std::string>() +
+                                       (joint["order_group"].is_null() ? "" : ", order open")},
                         {"numbers",
                          {number(sd["axis_position_m"], 1e3), number(sd["axis_tilt_deg"], 1),
                           number(sd["displacement_m"], 1e3), number(sd["displacement_deg"], 1),
@@ -355,8 +356,11 @@ class Page {
         const EdgeSlice slice = edge_slice(schema, edge, signal, record_.watch().samples());
         const EdgePlot drawn = edge_plot(schema, slice);
         std::string caption = fmt::format("{} → {} against {}", edge.from, edge.to, limits.name);
-        if (edge.signals().size() > 1)
-          caption += ", the other signal in the middle of its range, observations carried there";
+        if (const std::size_t num_signals = edge.signals().size(); num_signals > 1)
+          caption +=
+              fmt::format(", {}, observations carried there",
+                          num_signals == 2 ? "the other signal in the middle of its range"
+                                           : "the other signals in the middle of their ranges");
         if (std::isfinite(slice.coverage)) {
           caption += fmt::format("; {:.0f} % of {} lie within the band", slice.coverage * 100,
                                  counted(std::ssize(slice.observations), "observation"));

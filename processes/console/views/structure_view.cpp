@@ -2,6 +2,7 @@
 
 #include <fmt/format.h>
 
+#include <algorithm>
 #include <cmath>
 
 #include "common/geometry/angle.h"
@@ -120,6 +121,31 @@ std::string noise_text(const Noise& noise, std::optional<NoiseSource> source) {
                      is_least ? "; it is less, this is the least that is taken" : "");
 }
 
+// From as many joints on an edge tells its joints one by one: nothing was seen in between.
+constexpr std::size_t kLongEdge = 3;
+
+/// The joints of a long edge in their order, with what each does per unit of its command.
+std::string joints_text(const BodySchema& schema, const Edge& edge, const Eigen::VectorXd& middle) {
+  if (edge.joints.size() < kLongEdge) return "";
+  const std::vector<JointDeviation> deviations = joint_deviations(edge, middle);
+  std::string text;
+  for (std::size_t d = 0; d < edge.joints.size(); ++d) {
+    const ScrewJoint& joint = edge.joints[d];
+    const auto rate = [&](double value, const char* unit, double sd) {
+      return fmt::format(" {:10.4g}{}", joint.gain * value, unit) +
+             (sd > 0 ? fmt::format(" ± {:.2g}{}", sd, unit) : "");
+    };
+    text += fmt::format("{:>13} ", schema.signals.at(joint.signal).name);
+    const JointDeviation sd = deviations.empty() ? JointDeviation() : deviations[d];
+    if (joint.turn != 0) text += rate(joint.turn / kDegree, "°", sd.turn / kDegree);
+    if (joint.slide != 0) text += rate(joint.slide * 1e3, " mm", sd.slide * 1e3);
+    text += " per unit";
+    if (joint.order_group >= 0) text += fmt::format(", order open (group {})", joint.order_group);
+    text += "\n";
+  }
+  return text;
+}
+
 std::string errors_line(const PartErrors& part) {
   if (part.count == 0)
     return fmt::format("  {:>4}      0   never seen together with the root", part.part);
@@ -223,13 +249,23 @@ std::string structure_text(const BodySchema& schema, std::optional<NoiseSource> 
   std::string text =
       fmt::format("{} structure of {} from {}\n", schema.complete ? "Complete" : "Incomplete",
                   counted(std::ssize(schema.parts), "part"), counted(schema.num_samples, "sample"));
+  std::vector<std::string> signals;
+  std::size_t width = 12;
+  for (const Edge& edge : schema.edges) {
+    signals.push_back(in_braces(signal_names(schema, edge.signals())));
+    width = std::max(width, signals.back().size());
+  }
   if (!schema.edges.empty())
-    text += fmt::format("  {:<9} {:<9} {:<12} {:>10} {:>7}\n", "edge", "kind", "signals",
+    text += fmt::format("  {:<9} {:<9} {:<{}} {:>10} {:>7}\n", "edge", "kind", "signals", width,
                         "residual", "(rms)");
-  for (const Edge& edge : schema.edges)
-    text += fmt::format("  {:>3} → {:<3} {:<9} {:<12} {:7.2f} mm {:6.2f}°\n", edge.from, edge.to,
-                        edge.kind(), in_braces(signal_names(schema, edge.signals())),
-                        edge.position_rms_m * 1e3, edge.rotation_rms_rad / kDegree);
+  const Eigen::VectorXd middle = schema.displacements(mid_range(schema.signals));
+  for (std::size_t e = 0; e < schema.edges.size(); ++e) {
+    const Edge& edge = schema.edges[e];
+    text += fmt::format("  {:>3} → {:<3} {:<9} {:<{}} {:7.2f} mm {:6.2f}°\n", edge.from, edge.to,
+                        edge.kind(), signals[e], width, edge.position_rms_m * 1e3,
+                        edge.rotation_rms_rad / kDegree);
+    text += joints_text(schema, edge, middle);
+  }
   for (const UnconnectedPart& part : schema.unconnected)
     text += fmt::format("  {:>3}   not connected: {}\n", part.part, reason_text(part));
   const std::string unused = listed(signal_names(schema, schema.unused_signals()));

@@ -124,6 +124,48 @@ TEST(Convert, AParameterCovarianceKeepsFloatPrecision) {
   EXPECT_TRUE(found.isApprox(schema.edges[0].parameter_covariance, 1e-6));
 }
 
+TEST(Convert, AnEdgeOfEightJointsSurvivesTheWire) {
+  std::mt19937_64 rng(4);
+  std::uniform_real_distribution<double> unit(-1, 1);
+  BodySchema schema;
+  schema.parts = {1, 2};
+  schema.root = 1;
+  schema.complete = true;
+  Edge edge;
+  edge.from = 1;
+  edge.to = 2;
+  for (int s = 7; s >= 0; --s) {
+    std::string name = "q";
+    schema.signals.push_back({name += std::to_string(7 - s), -1, 1, {}});
+    ScrewJoint joint{.signal = s, .offset = unit(rng), .turn = unit(rng)};
+    if (s == 2) std::swap(joint.slide, joint.turn);
+    if (s == 3 || s == 4) joint.order_group = 1;
+    Vector6d xi;
+    for (double& value : xi) value = unit(rng);
+    joint.X_after = exp(xi);
+    edge.joints.push_back(joint);
+  }
+  const Eigen::Index side = 6 + 8 * 8;
+  const Eigen::MatrixXd root = Eigen::MatrixXd::NullaryExpr(side, side, [&] { return unit(rng); });
+  edge.parameter_covariance = 1e-6 * root * root.transpose();
+  schema.edges = {edge};
+
+  const body_schema_t message = to_message(schema);
+  EXPECT_EQ(check(message), "");
+  EXPECT_EQ(message.edges[0].num_joints, 8);
+  EXPECT_EQ(message.edges[0].parameter_covariance.size(), 70U * 71 / 2);
+  EXPECT_LT(message.getEncodedSize(), 64000);  // one datagram
+  const Edge found = from_message(message).edges[0];
+  ASSERT_EQ(found.joints.size(), 8U);
+  for (std::size_t d = 0; d < 8; ++d) {
+    EXPECT_EQ(found.joints[d].signal, edge.joints[d].signal);
+    EXPECT_EQ(found.joints[d].order_group, edge.joints[d].order_group);
+  }
+  EXPECT_TRUE(found.parameter_covariance.isApprox(edge.parameter_covariance, 1e-6));
+  const Eigen::VectorXd q = Eigen::VectorXd::NullaryExpr(8, [&] { return unit(rng); });
+  EXPECT_TRUE(found.predict(q).isApprox(edge.predict(q), 1e-12));
+}
+
 TEST(Convert, GaussianProcessesSurviveTheWireToTheLastBit) {
   const BodySchema schema = from_message(example_body_schema());
   EXPECT_STREQ(schema.edges[2].kind(), "screw_gp");

@@ -65,7 +65,7 @@ motion_status_t status_with(std::size_t num_signals) {
 }
 
 TEST(RigDoor, EveryRigsOwnMessagesComeInAndNoOthers) {
-  const std::vector<std::string> rigs = {"arm2", "arm4", "arm7"};
+  const std::vector<std::string> rigs = {"arm2", "arm4", "arm6_ends", "arm7"};
   for (const std::string& host : rigs) {
     const RigDoor door(kConfig / host);
     for (const std::string& guest : rigs) {
@@ -152,7 +152,7 @@ camera_info_t info_of(const std::filesystem::path& rig) {
 
 // Intrinsics that differed by a sixth gave an error of 20 mm and a reported one of 0.9 mm.
 TEST(RigDoor, ACalibrationMustBeTheRigsOwnToTheLastNumber) {
-  for (const char* rig : {"arm2", "arm4", "arm7"}) {
+  for (const char* rig : {"arm2", "arm4", "arm6_ends", "arm7"}) {
     const RigDoor door(kConfig / rig);
     EXPECT_EQ(door.objection(info_of(kConfig / rig)), "") << rig;
   }

@@ -82,7 +82,7 @@ TEST(CalibrationId, WhatSaysTheSameDoesNot) {
 
 TEST(CalibrationId, EveryRigHasItsOwn) {
   std::set<std::int64_t> ids;
-  for (const char* rig : {"arm2", "arm4", "arm7"})
+  for (const char* rig : {"arm2", "arm4", "arm6_ends", "arm7"})
     EXPECT_TRUE(ids.insert(calibration_id(std::filesystem::path(CONFIG) / rig)).second);
 }
 

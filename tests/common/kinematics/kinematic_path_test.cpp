@@ -151,6 +151,44 @@ TEST(KinematicPath, JacobianByBentCommandsAgreesWithCentralDifferences) {
   }
 }
 
+/// 1 → 2 by six joints, of which the third slides; 2 → 3 by one of their signals.
+BodySchema long_schema(Rng& rng) {
+  BodySchema schema;
+  schema.parts = {1, 2, 3};
+  schema.root = 1;
+  for (const char* name : {"a", "b", "c", "d", "e", "f"})
+    schema.signals.push_back(bent_signal(name, rng));
+  schema.edges = {random_edge(1, 2, {4, 0, 2, 5, 1, 3}, rng), random_edge(2, 3, {5}, rng)};
+  schema.edges[0].joints[2].turn = 0;
+  return schema;
+}
+
+TEST(KinematicPath, AlongALongEdgeJacobianAgreesWithCentralDifferencesAndCovarianceWithItsEdges) {
+  Rng rng(6);
+  for (int n = 0; n < 10; ++n) {
+    const BodySchema schema = long_schema(rng);
+    const Eigen::VectorXd q =
+        Eigen::VectorXd::NullaryExpr(6, [&] { return test::uniform(rng, -1, 1); });
+    const Eigen::VectorXd theta = schema.displacements(q);
+    for (const auto& [from, to] : {std::pair{1, 2}, {2, 1}, {1, 3}, {3, 1}}) {
+      const auto path = KinematicPath::between(schema, from, to);
+      PoseJacobian J;
+      path->predict(q, &J);
+      const auto predict = [&](const Eigen::VectorXd& a) { return path->predict(a); };
+      EXPECT_LT((J - test::numeric_jacobian(predict, q)).norm(), 1e-7) << from << " " << to;
+    }
+    const Edge &first = schema.edges[0], &second = schema.edges[1];
+    EXPECT_EQ(first.num_parameters(), 6 + 8 * 6);
+    const auto forward = KinematicPath::between(schema, 1, 3);
+    EXPECT_TRUE(forward->predict(q).isApprox(first.predict(theta) * second.predict(theta), 1e-12));
+    const Matrix6d B = adjoint(second.predict(theta).inverse());
+    const Matrix6d expected = B * first.prediction_covariance(theta) * B.transpose() +
+                              second.prediction_covariance(theta);
+    EXPECT_LT((forward->covariance(q, Variance::kFirstOrder) - expected).norm(),
+              1e-10 * expected.norm());
+  }
+}
+
 TEST(KinematicPath, ATrajectoryIsItsInstants) {
   Rng rng(3);
   const BodySchema schema = random_schema(rng);

@@ -44,7 +44,7 @@ TEST(CalibrationError, IsTheSameForTheSameSeedAndAnotherForAnother) {
 }
 
 TEST(CalibrationError, IsNoneOfTheIdealRobotWhoseTablesAreTheRigsClaims) {
-  for (const char* name : {"arm2", "arm4", "arm7"}) {
+  for (const char* name : {"arm2", "arm4", "arm6_ends", "arm7"}) {
     const std::filesystem::path rig = kConfig / name;
     const Robot ideal = robot_of(rig);
     EXPECT_EQ(ideal.calibration_error, CalibrationError{});

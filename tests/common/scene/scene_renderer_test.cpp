@@ -210,7 +210,8 @@ TEST(SceneRenderer, TheBlurIsThatOfTheWholeImage) {
 
 class RenderedRig : public testing::TestWithParam<const char*> {};
 
-INSTANTIATE_TEST_SUITE_P(SceneRenderer, RenderedRig, testing::Values("arm2", "arm4", "arm7"),
+INSTANTIATE_TEST_SUITE_P(SceneRenderer, RenderedRig,
+                         testing::Values("arm2", "arm4", "arm6_ends", "arm7"),
                          [](const auto& info) { return std::string(info.param); });
 
 TEST_P(RenderedRig, ShowsItsTagsToTheDetectorWithoutBias) {

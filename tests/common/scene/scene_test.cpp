@@ -18,7 +18,7 @@ const std::filesystem::path kConfig = BODYSCHEMA_CONFIG_FOLDER;
 
 class ShippedRig : public testing::TestWithParam<const char*> {};
 
-INSTANTIATE_TEST_SUITE_P(Scene, ShippedRig, testing::Values("arm2", "arm4", "arm7"),
+INSTANTIATE_TEST_SUITE_P(Scene, ShippedRig, testing::Values("arm2", "arm4", "arm6_ends", "arm7"),
                          [](const auto& info) { return std::string(info.param); });
 
 TEST_P(ShippedRig, Loads) {

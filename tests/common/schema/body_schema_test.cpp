@@ -39,10 +39,17 @@ TEST(Edge, JacobianAgreesWithCentralDifferences) {
   }
 }
 
-TEST(Edge, PredictionCovarianceAgreesWithPerturbedParameters) {
+class EdgeOfJoints : public testing::TestWithParam<std::vector<int>> {};
+
+INSTANTIATE_TEST_SUITE_P(Edge, EdgeOfJoints,
+                         testing::Values(std::vector{1, 0}, std::vector{2, 5, 0, 4, 1, 3},
+                                         std::vector{7, 5, 0, 4, 1, 3, 2, 6}));
+
+TEST_P(EdgeOfJoints, PredictionCovarianceAgreesWithPerturbedParameters) {
   Rng rng(2);
-  const Edge edge = random_edge(1, 2, {1, 0}, rng);
-  const Eigen::VectorXd q = random_action(rng, 2);
+  Edge edge = random_edge(1, 2, GetParam(), rng);
+  if (edge.joints.size() > 2) edge.joints[1].turn = 0;  // it slides
+  const Eigen::VectorXd q = random_action(rng, static_cast<int>(GetParam().size()));
   const double h = 1e-6;
   const auto perturbed = [&](int parameter, double step) {
     Edge e = edge;
@@ -66,6 +73,7 @@ TEST(Edge, PredictionCovarianceAgreesWithPerturbedParameters) {
   for (int n = 0; n < J.cols(); ++n) J.col(n) = (perturbed(n, h) - perturbed(n, -h)) / (2 * h);
   const Matrix6d expected = J * edge.parameter_covariance * J.transpose();
   EXPECT_LT((edge.prediction_covariance(q) - expected).norm(), 1e-6 * expected.norm());
+  EXPECT_LT((edge.parameter_jacobian(q) - J).norm(), 1e-7 * J.norm());
 }
 
 TEST(Edge, SignalsAreListedOnceInTheOrderOfTheJoints) {

@@ -133,7 +133,7 @@ TEST(MakeInfo, CarriesTheCalibration) {
 }
 
 TEST(CameraConfig, OfEveryShippedRigIsReadable) {
-  for (const char* rig : {"arm2", "arm4", "arm7"}) {
+  for (const char* rig : {"arm2", "arm4", "arm6_ends", "arm7"}) {
     EXPECT_NO_THROW(
         CameraConfig::load(std::filesystem::path(BODYSCHEMA_CONFIG) / rig / "camera.yaml"));
   }

@@ -211,6 +211,31 @@ TEST(TreeTest, EveryPartStandsThereOnce) {
   EXPECT_NO_THROW(tree_svg(BodySchema(), std::nullopt));
 }
 
+TEST(TreeTest, TheSignalsOfALongEdgeFitBetweenItsParts) {
+  BodySchema schema;
+  schema.parts = {1, 2};
+  schema.root = 1;
+  Edge edge;
+  edge.from = 1;
+  edge.to = 2;
+  for (int s = 0; s < 8; ++s) {
+    schema.signals.push_back({"joint_" + std::to_string(s), -1, 1});
+    edge.joints.push_back({.signal = s, .turn = 1});
+  }
+  schema.edges = {edge};
+  const std::string svg = tree_svg(schema, 2);
+  std::smatch places;
+  ASSERT_TRUE(std::regex_search(svg, places, std::regex("d=\"M([0-9.]+),[0-9.]+ H([0-9.]+)\"")));
+  // At least 5 px a letter.
+  EXPECT_GT(std::stod(places[2]) - std::stod(places[1]),
+            5.0 * std::string("joint_0, joint_1, joint_2, joint_3, joint_4, joint_5, joint_6, "
+                              "joint_7")
+                      .size());
+  std::smatch size;
+  ASSERT_TRUE(std::regex_search(svg, size, std::regex("viewBox=\"0 0 ([0-9]+) ")));
+  EXPECT_GE(std::stod(size[1]), std::stod(places[2]) + 2 * 17);
+}
+
 TEST(VisibilityTest, ABinSaysInHowManyOfItsSamplesAPartWasSeen) {
   std::vector<ActionPoseSample> samples;
   for (int i = 0; i < 4; ++i) {

@@ -238,6 +238,58 @@ TEST(SchemaJsonTest, JointsWhoseOrderIsOpenHaveTheNumberOfTheirGroup) {
   EXPECT_TRUE(joints[1]["order_group"].is_null());
 }
 
+/// Parts 1 and 2 with six joints between them, q3 sliding, as signals q6 … q1.
+BodySchema long_edge(test::Rng& rng) {
+  BodySchema schema;
+  schema.complete = true;
+  schema.parts = {1, 2};
+  schema.root = 1;
+  for (const char* name : {"q1", "q2", "q3", "q4", "q5", "q6"})
+    schema.signals.push_back({name, -1, 1, {}});
+  schema.edges = {test::random_edge(1, 2, {5, 4, 3, 2, 1, 0}, rng)};
+  for (ScrewJoint& joint : schema.edges[0].joints) {
+    joint.gain = 1;
+    joint.slide = 0;
+    joint.turn = 30 * kDegree;
+  }
+  schema.edges[0].joints[3].slide = -0.02;
+  schema.edges[0].joints[3].turn = 0;
+  return schema;
+}
+
+TEST(SchemaJsonTest, TheJointsOfALongEdgeStandInTheirOrderWithWhatEachDoes) {
+  test::Rng rng(63);
+  BodySchema schema = long_edge(rng);
+  schema.edges[0].joints[1].order_group = schema.edges[0].joints[2].order_group = 0;
+  const Json edge = schema_json(schema)["edges"][0];
+  EXPECT_EQ(edge["signals"], (Json{"q6", "q5", "q4", "q3", "q2", "q1"}));
+  ASSERT_EQ(edge["joints"].size(), 6U);
+  for (std::size_t d = 0; d < 6; ++d) {
+    const Json& joint = edge["joints"][d];
+    EXPECT_EQ(joint["signal"], "q" + std::to_string(6 - d));
+    EXPECT_EQ(joint["order_group"].is_null(), d != 1 && d != 2);
+    EXPECT_GT(joint["sd"]["axis_tilt_deg"].get<double>(), 0);
+    EXPECT_GT(joint["sd"]["turn_rad"].get<double>(), 0);
+  }
+
+  const std::string text = structure_text(schema);
+  std::size_t at = text.find("{q6,q5,q4,q3,q2,q1}");
+  ASSERT_NE(at, std::string::npos) << text;
+  for (const char* name : {"q6 ", "q5 ", "q4 ", "q3 ", "q2 ", "q1 "}) {
+    at = text.find(name, at);
+    ASSERT_NE(at, std::string::npos) << name << text;
+  }
+  EXPECT_NE(text.find("q6          30° ± "), std::string::npos) << text;
+  EXPECT_NE(text.find("q3         -20 mm ± "), std::string::npos) << text;
+  EXPECT_NE(text.find(" per unit, order open (group 0)\n"), std::string::npos) << text;
+  // The residual stands below its heading however long the signals are.
+  const std::size_t heading = text.find("residual");
+  const std::size_t line = text.rfind('\n', heading), end = text.find('\n', heading);
+  const std::size_t millimetres = text.find(" mm", end);
+  // The arrow has two bytes more than columns.
+  EXPECT_EQ(millimetres + 3 - end - 2, heading + 8 - line) << text;
+}
+
 TEST(SchemaJsonTest, ASignalThatDidNotMoveEnoughToTellIsNotCalledWithoutEffect) {
   BodySchema schema;
   schema.signals = {{"idle", -1, 1, {}}, {"held", -1, 1, {}}};

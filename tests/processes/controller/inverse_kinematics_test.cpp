@@ -97,6 +97,24 @@ TEST(InverseKinematicsTest, EveryPositionOfForwardKinematicsIsFoundFromElsewhere
   }
 }
 
+TEST(InverseKinematicsTest, EveryPositionIsFoundAlongOneEdgeOfAllJointsToo) {
+  Rng rng(3);
+  for (int i = 0; i < 100; ++i) {
+    Rng geometry(i % 10);
+    const test::SyntheticRobot robot = test::chapter_robot("d", geometry);
+    BodySchema schema = test::true_schema(robot);
+    schema.parts = {1, 8};
+    schema.edges = {robot.true_edge(1, 8)};
+    ASSERT_EQ(schema.edges[0].joints.size(), 6U);
+    const Eigen::Vector3d p_RT = position(schema, 8, random_action(schema, rng));
+    const auto solution =
+        solve_position(schema, 8, p_RT, schema.signals, random_action(schema, rng), kOptions);
+    EXPECT_TRUE(solution.is_within_tolerance) << i << ": " << solution.error_m;
+    expect_within_limits(schema, solution.action);
+    EXPECT_LT((position(schema, 8, solution.action) - p_RT).norm(), kOptions.tolerance_m);
+  }
+}
+
 TEST(InverseKinematicsTest, AtTheTargetNothingMoves) {
   const BodySchema schema = seven_joints(3);
   Rng rng(3);

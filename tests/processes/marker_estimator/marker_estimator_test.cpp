@@ -395,7 +395,7 @@ TEST(MarkerEstimator, FindsTheCornersInAJpegAsWellAsInTheRawImage) {
 }
 
 TEST(MarkerEstimatorConfig, OfEveryShippedRigIsReadable) {
-  for (const char* rig : {"arm2", "arm4", "arm7"}) {
+  for (const char* rig : {"arm2", "arm4", "arm6_ends", "arm7"}) {
     EXPECT_NO_THROW(MarkerEstimatorConfig::load(std::filesystem::path(BODYSCHEMA_CONFIG) / rig /
                                                 "marker_estimator.yaml"));
   }

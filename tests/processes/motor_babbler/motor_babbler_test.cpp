@@ -4,6 +4,7 @@
 #include <unistd.h>
 
 #include <fstream>
+#include <functional>
 #include <memory>
 #include <random>
 #include <regex>
@@ -837,9 +838,11 @@ TEST(MotorBabblerTest, EveryFifthOfItsOwnSamplesIsTestWhateverOthersDoInBetween)
   }
 }
 
-bool is_drawn(const action_command_t& command, const MotorBabblerConfig& config = active_config()) {
-  const Eigen::VectorXd drawn = random_action(config, 1, command.action_id);
-  return command.action == std::vector<double>(drawn.begin(), drawn.end());
+/// `message`: a command or its SAMPLE.
+template <class Message>
+bool is_drawn(const Message& message, const MotorBabblerConfig& config = active_config()) {
+  const Eigen::VectorXd drawn = random_action(config, 1, message.action_id);
+  return message.action == std::vector<double>(drawn.begin(), drawn.end());
 }
 /// After the first TEST sample, which is not judged yet.
 Bench after_first_test() {
@@ -1029,6 +1032,148 @@ TEST(MotorBabblerTest, ARunThatIsOverWaitsForNoSchema) {
   EXPECT_TRUE(bench.babbler.is_done());
 }
 
+MotorBabblerConfig single_config(double share = 0.34) {
+  MotorBabblerConfig config = test_config();
+  config.single_joint_share = share;
+  config.stop.min_samples = config.stop.max_samples = 200;
+  return config;
+}
+
+/// SAMPLE of an arm of which these parts are seen.
+sample_t ends_seen(const action_command_t& command, std::int64_t sample_index,
+                   const std::vector<int>& parts = {1, 2}) {
+  sample_t sample = sample_of(command, sample_index);
+  std::vector<part_observation_t> seen;
+  for (const int part : parts) {
+    part_observation_t& observation = seen.emplace_back();
+    observation.part_id = part;
+    observation.has_rotation = 1;
+  }
+  set_array(sample.num_parts, sample.parts, seen);
+  return sample;
+}
+
+/// Signals in which two actions differ.
+std::vector<std::size_t> differences(const std::vector<double>& a, const std::vector<double>& b) {
+  std::vector<std::size_t> result;
+  for (std::size_t s = 0; s < a.size(); ++s)
+    if (a[s] != b[s]) result.push_back(s);
+  return result;
+}
+
+/// The samples of a run whose TEST samples all find the schema incomplete.
+std::vector<sample_t> ends_run(const MotorBabblerConfig& config, int num_samples,
+                               const std::function<std::vector<int>(int)>& parts_at) {
+  Bench bench(config);
+  bench.start();
+  std::vector<sample_t> samples;
+  for (int n = 0; n < num_samples; ++n) {
+    samples.push_back(ends_seen(bench.last, n, parts_at(n)));
+    bench.babbler.on_motion_status(answer(bench.last, motion_status_t::STATE_SETTLED));
+    bench.babbler.remember(samples.back());
+    bench.take(bench.babbler.on_sample(samples.back()));
+    if (samples.back().purpose == action_command_t::PURPOSE_TEST)
+      bench.take(bench.babbler.on_model_health(bad_health(n)));
+  }
+  return samples;
+}
+
+TEST(MotorBabblerTest, WhereTwoPartsAreSeenAThirdOfTheTrainActionsMovesOneJointAlone) {
+  for (const Choice choice : {Choice::kRandom, Choice::kActive}) {
+    MotorBabblerConfig config = single_config();
+    config.choice = choice;
+    const auto samples = ends_run(config, 100, [](int) { return std::vector{1, 2}; });
+    int num_single = 0;
+    std::set<std::vector<double>> poses;
+    std::vector<double> pose;
+    for (int n = 0; n < 100; ++n) {
+      const bool is_test = n % 5 == 4;
+      EXPECT_EQ(samples[n].purpose == action_command_t::PURPOSE_TEST, is_test) << n;
+      if (is_drawn(samples[n], config)) {
+        if (!is_test && num_single % 3 == 0) pose = samples[n].action;
+        continue;
+      }
+      EXPECT_FALSE(is_test) << n;
+      EXPECT_GT(n, 4) << "before the first verdict";
+      // About one pose, each signal in turn and far.
+      const std::size_t s = num_single++ % 3;
+      ASSERT_EQ(differences(samples[n].action, pose), std::vector{s}) << n;
+      poses.insert(pose);
+      const Signal& signal = config.signals[s];
+      EXPECT_GE(std::abs(samples[n].action[s] - pose[s]), 0.2499 * (signal.upper - signal.lower));
+      EXPECT_GE(samples[n].action[s], signal.lower);
+      EXPECT_LE(samples[n].action[s], signal.upper);
+    }
+    EXPECT_NEAR(num_single, 0.34 * 80, 2);
+    EXPECT_EQ(poses.size(), (num_single + 2U) / 3);
+  }
+}
+
+TEST(MotorBabblerTest, OnceAThirdPartWasSeenOrTheSchemaIsCompleteNoJointMovesAlone) {
+  const MotorBabblerConfig config = single_config(1);
+  const auto with_third = ends_run(config, 60, [](int n) {
+    return n == 20 ? std::vector{1, 2, 3} : std::vector{1, 2};
+  });
+  for (int n = 0; n < 60; ++n)
+    EXPECT_EQ(is_drawn(with_third[n], config), n < 5 || n > 20 || n % 5 == 4) << n;
+
+  for (const int complete_at : {24, 29}) {
+    Bench bench(config);
+    bench.start();
+    for (int n = 0; n < 60; ++n) {
+      const sample_t sample = ends_seen(bench.last, n);
+      EXPECT_EQ(is_drawn(sample, config), n < 5 || n > complete_at || n % 5 == 4) << n;
+      // A verdict may come before its sample.
+      const model_health_t health = n < complete_at ? bad_health(n) : good_health(n);
+      const bool is_early = complete_at == 29;
+      if (is_early && bench.is_test()) bench.take(bench.babbler.on_model_health(health));
+      const bool was_test = bench.is_test();
+      bench.babbler.on_motion_status(answer(bench.last, motion_status_t::STATE_SETTLED));
+      bench.take(bench.babbler.on_sample(sample));
+      if (!is_early && was_test) bench.take(bench.babbler.on_model_health(health));
+      // What is found in between changes nothing.
+      if (n > 5 && !was_test) bench.babbler.on_model_health(good_health(n / 5 * 5 - 1));
+    }
+  }
+}
+
+TEST(MotorBabblerTest, AJointMovesAloneFromAPoseAtWhichBothPartsWereSeen) {
+  const MotorBabblerConfig config = single_config();
+  const auto samples = ends_run(config, 100, [](int n) {
+    return n % 3 ? std::vector{1} : std::vector{1, 2};
+  });
+  int num_single = 0;
+  for (int n = 0; n < 100; ++n) {
+    if (is_drawn(samples[n], config)) continue;
+    ++num_single;
+    const bool has_pose = std::any_of(samples.begin(), samples.begin() + n, [&](const sample_t& s) {
+      return s.num_parts == 2 && s.purpose != action_command_t::PURPOSE_TEST &&
+             differences(s.action, samples[n].action).size() == 1;
+    });
+    EXPECT_TRUE(has_pose) << n;
+  }
+  EXPECT_GT(num_single, 20);
+  for (const sample_t& sample : ends_run(config, 50, [](int) { return std::vector{1}; }))
+    EXPECT_TRUE(is_drawn(sample, config));
+}
+
+TEST(MotorBabblerTest, ARefusedMoveOfOneJointIsReplacedByAnotherOfThatJoint) {
+  const MotorBabblerConfig config = single_config(1);
+  Bench bench(config);
+  bench.start();
+  for (int n = 0; n < 12; ++n) {
+    const bool was_test = bench.is_test();
+    bench.babbler.on_motion_status(answer(bench.last, motion_status_t::STATE_SETTLED));
+    bench.take(bench.babbler.on_sample(ends_seen(bench.last, n)));
+    if (was_test) bench.take(bench.babbler.on_model_health(bad_health(n)));
+    if (n < 5 || bench.is_test()) continue;
+    const std::vector<double> refused = bench.last.action;
+    ASSERT_TRUE(bench.take(
+        bench.babbler.on_motion_status(answer(bench.last, motion_status_t::STATE_REJECTED))));
+    EXPECT_EQ(differences(bench.last.action, refused).size(), 1U) << n;
+  }
+}
+
 /// Driver, observer and monitor that outlive the babbler. Each answers and repeats as in a group.
 class World {
  public:
@@ -1096,7 +1241,7 @@ class World {
     status_ = answer(command,
                      is_refused ? motion_status_t::STATE_REJECTED : motion_status_t::STATE_SETTLED);
     if (!is_refused && is_new)
-      samples.push_back(sample_of(command, static_cast<std::int64_t>(samples.size())));
+      samples.push_back(ends_seen(command, static_cast<std::int64_t>(samples.size())));
     tell(babbler_->on_motion_status(status_));
     if (is_refused || !is_new) return;
     if (num_remembered_ < samples.size()) tell(babbler_->remember(samples[num_remembered_++]));
@@ -1143,6 +1288,13 @@ TEST(MotorBabblerTest, KilledAtAnyMomentItGoesOnAsIfNothingHadHappened) {
 
 TEST(MotorBabblerTest, KilledAtAnyMomentItChoosesTheSameActions) {
   kill_and_compare(active_config());
+}
+
+TEST(MotorBabblerTest, KilledAtAnyMomentItMovesTheSameJointsAlone) {
+  for (MotorBabblerConfig config : {test_config(), active_config()}) {
+    config.single_joint_share = 0.5;
+    kill_and_compare(config);
+  }
 }
 
 TEST(MotorBabblerTest, ARestartListensFirstWhetherTheArmIsLent) {

@@ -468,7 +468,7 @@ TEST(Observer, DropsFramesFarAheadOfTheDriver) {
 }
 
 TEST(ObserverConfig, OfEveryShippedRigIsReadable) {
-  for (const char* rig : {"arm2", "arm4", "arm7"}) {
+  for (const char* rig : {"arm2", "arm4", "arm6_ends", "arm7"}) {
     EXPECT_NO_THROW(
         ObserverConfig::load(std::filesystem::path(BODYSCHEMA_CONFIG) / rig / "observer.yaml"));
   }

@@ -105,7 +105,8 @@ TEST(RobotSimulator, AnswersAMoveWithItsWholeLife) {
 
 class EveryRig : public testing::TestWithParam<const char*> {};
 
-INSTANTIATE_TEST_SUITE_P(RobotSimulator, EveryRig, testing::Values("arm2", "arm4", "arm7"),
+INSTANTIATE_TEST_SUITE_P(RobotSimulator, EveryRig,
+                         testing::Values("arm2", "arm4", "arm6_ends", "arm7"),
                          [](const auto& info) { return std::string(info.param); });
 
 TEST_P(EveryRig, SettlesAtGainTimesCommandPlusOffsetAndDoesNotSag) {
