@@ -280,7 +280,7 @@ void Adaptation::watch_drift(std::int64_t sample_index, std::vector<AdaptationEv
   for (AdaptationEvent& event : *events)
     if (event.kind == AdaptationEvent::Kind::kDrift)
       event.size =
-          size_of_rate(before_, *drifting_, drift->left, drift->rate, drift->rate_covariance);
+          size_of_rate(before_, *drifting_, drift->link, drift->rate, drift->rate_covariance);
   // What is suspected elsewhere meanwhile stays so.
   tracker_.follow(drift->applied_to(before_), *drifting_);
   num_still_ = drift->significance > kSignificantRate ? 0 : num_still_ + 1;
@@ -310,7 +310,7 @@ void Adaptation::end_drift(std::int64_t since, const Drift& drift, std::int64_t 
   tags_.begin_anew();
   HypothesisTracker::Change there;
   there.what.place = {*drifting_, false};
-  there.what.fitted.change = drift_step(before_, *drifting_, drift.left);
+  there.what.fitted.change = drift_step(before_, *drifting_, drift.link);
   there.what.fitted.theta = coordinates(drift.T);
   there.what.fitted.covariance = drift.covariance;
   there.since = there.adopted = since;

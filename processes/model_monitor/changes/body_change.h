@@ -24,8 +24,7 @@ struct BodyChange {
     kOffset,       ///< b + θ
     kGain,         ///< (1 + θ_0) a, b + θ_1
     kOtherSignal,  ///< the joint follows another signal
-    kLeft,         ///< T(θ) · Δ: what carries the joint was bent
-    kRight,        ///< Δ · T(θ): what the joint carries was bent, a tool exchanged
+    kBent,         ///< T(θ) in a link: bent, a tool exchanged
     kBoth,         ///< T(θ_1) · Δ · T(θ_2)
     kRigid,        ///< no joint any more: T(θ) times the pose in mid-range
     kMarkerMoved,  ///< the marker of `part` is elsewhere on it by T(θ)
@@ -34,13 +33,17 @@ struct BodyChange {
     kResidual,     ///< Δ · Exp(ρ) with a Gaussian process ρ of one or two signals
     kFresh         ///< a constant pose and such a ρ: the edge is learned anew
   };
-  Form form = Form::kRight;
+  Form form = Form::kBent;
   int part = 0;
-  int joint = 0;           ///< index in the edge: kStuck, kOffset, kGain, kOtherSignal
+  /// Where in the edge. kStuck, kOffset, kGain, kOtherSignal: the joint. kBent: the link, 0 before
+  /// the first joint, d + 1 behind joint d.
+  int at = 0;
   int signal = 0;          ///< kOtherSignal; the first input of a learned form
   bool small = false;      ///< a tenth as wide a prior: a little bent is likelier than broken
   int second_signal = -1;  ///< the other input of a learned form; −1: none
-  double proximity = 1;    ///< of the model's signals to those of the edge that stood, 0 … 1
+  /// Of the form's prior odds: of one place among those of the edge; of a learned form the
+  /// proximity of the model's signals to those of the edge that stood, 0 … 1.
+  double share = 1;
 
   /// The last three forms: functions and no parameters, so that FittedChange::origin holds the
   /// edge.

@@ -53,11 +53,13 @@ FoundDifference difference_at(const BodySchema& before, const BodySchema& now, c
     if (!edge->has_process_of(*old)) return {"new_model", {}};
     if (auto joint = joint_difference(before, *old, *edge)) return *joint;
   }
+  const auto link =
+      old && edge && !place.marker ? link_difference(*old, *edge) : std::optional<int>();
   return {place.part == now.root ? "camera_moved"
           : place.marker         ? "marker_moved"
                                  : "geometry",
           {ChangeSize::Kind::kPose,
-           -1,
+           link ? carrying_signal(edge, *link) : -1,
            distance_and_angle(pose_at(before, place.part).inverse() * pose_at(now, place.part)),
            {-1, -1}}};
 }

@@ -97,8 +97,7 @@ PlaceEvidence::PlaceEvidence(const BodySchema& base, const MeasurementModel& mea
   const Edge* edge = edge_to(base_, part);
   for (PlaceMeasurement& m : measurements_) {
     m.X = edge ? edge->predict(m.displacements) : base_.X_CR;
-    if (edge && edge->matrix_gp) m.process = edge->matrix_gp->predict(m.displacements);
-    if (edge && edge->residual_gp) m.process = exp(edge->residual_gp->mean(m.displacements));
+    m.links = link_poses(edge, m.displacements, m.X);
   }
 }
 

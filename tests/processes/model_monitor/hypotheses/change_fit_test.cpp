@@ -87,7 +87,7 @@ TEST_F(ChangeFitTest, AMovedMarkerIsNoMovedPart) {
   const auto marker =
       PlaceEvidence(schema_, measurement_, kPart, true, pointers(samples)).fit(change);
   const auto edge = PlaceEvidence(schema_, measurement_, kPart, false, pointers(samples))
-                        .fit({Form::kRight, kPart});
+                        .fit({Form::kBent, kPart, 1});
   EXPECT_GT(marker->log_evidence, edge->log_evidence + 12);
 }
 
@@ -125,7 +125,7 @@ TEST_F(ChangeFitTest, AHealthyBodyIsBetterThanAnyChange) {
 
 TEST_F(ChangeFitTest, AnOutlierDoesNotTurnTheFit) {
   const Eigen::VectorXd theta = vector({0.2, 0, 0.1, 0.8, -0.5, 0.3});
-  const BodyChange change{Form::kRight, 7};
+  const BodyChange change{Form::kBent, 7, 1};
   auto samples = observe(changed(schema_, change, theta), 6);
   for (PartObservation& o : samples.back().parts)
     if (o.part == 7) o.X_CB = o.X_CB * exp((Vector6d() << 0, 0, 0, 1, 0, 0).finished());
@@ -140,7 +140,7 @@ TEST_F(ChangeFitTest, TooFewSamplesFitNothing) {
   auto samples = observe(schema_, 1);
   const PlaceEvidence one(schema_, measurement_, kPart, false, pointers(samples));
   EXPECT_TRUE(one.fit({Form::kStuck, kPart}));
-  EXPECT_FALSE(one.fit({Form::kRight, kPart}));
+  EXPECT_FALSE(one.fit({Form::kBent, kPart, 1}));
   // Nothing beyond the edge was seen: the sample says nothing of it.
   std::erase_if(samples[0].parts, [](const PartObservation& o) { return o.part >= kPart; });
   const PlaceEvidence none(schema_, measurement_, kPart, false, pointers(samples));

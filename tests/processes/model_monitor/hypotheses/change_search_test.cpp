@@ -23,9 +23,9 @@ class ChangeSearchTest : public ChangedArm {
     schema_.X_CR_covariance = 1e-6 * Matrix6d::Identity();
     const Eigen::VectorXd bend = vector({0.02, 0, 0, 0, 0.5, 0}),
                           little = vector({5e-4, 0, 0, 0, 0, 0});
-    stored_ = changed(schema_, {Form::kRight, kBent}, bend);
-    stored_ = changed(stored_, {Form::kRight, kOther}, bend);
-    stored_ = changed(stored_, {Form::kRight, kAlmost}, little);
+    stored_ = changed(schema_, {Form::kBent, kBent, 1}, bend);
+    stored_ = changed(stored_, {Form::kBent, kOther, 1}, bend);
+    stored_ = changed(stored_, {Form::kBent, kAlmost, 1}, little);
   }
 
   FoundChanges find(const std::vector<Place>& places) {
