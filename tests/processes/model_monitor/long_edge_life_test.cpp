@@ -55,7 +55,7 @@ INSTANTIATE_TEST_SUITE_P(
     testing::Values(Case{"stuck", LongFault::kStuck, 2, kSix, "q3 (1→2) stuck at"},
                     Case{"stuck_slide", LongFault::kStuck, 3, kSeven, "q4 (1→2) stuck at"},
                     Case{"offset", LongFault::kOffset, 0, kSeven, "q1 (1→2) off by"},
-                    Case{"gain", LongFault::kGain, 4, kSix, "q5 (1→2) goes 0.7"},
+                    Case{"gain", LongFault::kGain, 4, kSix, "q5 (1→2) goes 0."},
                     Case{"bend", LongFault::kBend, 2, kSix, "1→2 bent or exchanged behind q3 by"},
                     Case{"bend_fine", LongFault::kBend, 4, kFine,
                          "1→2 bent or exchanged behind q5 by"},
@@ -63,7 +63,7 @@ INSTANTIATE_TEST_SUITE_P(
                     Case{"tool", LongFault::kTool, 0, kSix, ""}),
     [](const auto& info) { return std::string(info.param.name); });
 
-TEST(LongEdgeTest, AHealthyLongEdgeIsLeftAlone) {
+TEST(LongEdgeStream, AHealthyLongEdgeIsLeftAlone) {
   for (const test::LongArmOptions& options : {kSix, kSeven, kFine}) {
     LongArm arm(options, LongFault::kNone, 0, 5);
     const test::LongLife life = live(&arm, 300);
