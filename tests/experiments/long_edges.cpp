@@ -34,8 +34,8 @@ void print(const LongArm& arm, const test::LongLife& life) {
 }
 
 struct Cell {
-  LongFault fault;
-  int at;
+  LongFault fault = LongFault::kNone;
+  int at = 0;
   int num_runs = 0, num_named = 0, num_first = 0, num_early = 0, num_unrepaired = 0;
   std::vector<double> until, strict, again;
   double most_ms = 0, mean_ms = 0;
@@ -130,14 +130,16 @@ int main(int argc, char** argv) {
                                            {LongFault::kWorn, 0, k - 1}}) {
     if (!only.empty() && only != name_of(fault)) continue;
     for (int at = first; at <= last; ++at) {
-      Cell cell{fault, at};
+      Cell cell;
+      cell.fault = fault;
+      cell.at = at;
       for (int seed = 1; seed <= num_seeds; ++seed) run(options, seed, is_verbose, &cell);
       const auto worst = [](const std::vector<double>& v) {
         return *std::max_element(v.begin(), v.end());
       };
       std::printf(
-          "| %s | %d | %d of %d | %d | %.0f (%.0f) | %.1f (%.0f) | %d | %.1f (%.0f) | %d | %.0f "
-          "|\n",
+          "| %s | %d | %d of %d | %d | %.0f (%.0f) | %.1f (%.0f) | %d | %.1f (%.0f) | %d | %.1f "
+          "(%.0f) |\n",
           name_of(fault), at + 1, cell.num_named, cell.num_runs, cell.num_first, median(cell.until),
           worst(cell.until), mean_of(cell.strict), worst(cell.strict), cell.num_unrepaired,
           mean_of(cell.again), worst(cell.again), cell.num_early, cell.mean_ms / cell.num_runs,

@@ -76,8 +76,9 @@ BodySchema changed(const BodySchema& schema, const BodyChange& change, const Eig
   return result;
 }
 
-std::vector<BodyChange> possible_changes(const BodySchema& schema, int part, bool marker) {
+std::vector<BodyChange> possible_changes(const BodySchema& schema, const ElementId& element) {
   using Form = BodyChange::Form;
+  const int part = element.id;
   std::vector<BodyChange> result;
   const auto add = [&](Form form, int at, double share, int signal = 0) {
     result.push_back({form, part, at, signal});
@@ -89,9 +90,9 @@ std::vector<BodyChange> possible_changes(const BodySchema& schema, int part, boo
     result.back().small = true;
   };
   const Edge* edge = edge_to(schema, part);
-  if (marker) add_both_sizes(Form::kMarkerMoved);
-  if (!marker && !edge && part == schema.root) add_both_sizes(Form::kCamera);
-  if (marker || !edge) return result;
+  if (element.is_tag()) add_both_sizes(Form::kMarkerMoved);
+  if (!element.is_tag() && !edge && part == schema.root) add_both_sizes(Form::kCamera);
+  if (element.is_tag() || !edge) return result;
   const int num_joints = static_cast<int>(edge->joints.size());
   for (int d = 0; d < num_joints; ++d) {
     const ScrewJoint& j = edge->joints[static_cast<std::size_t>(d)];

@@ -1,19 +1,37 @@
 #pragma once
 
+#include <compare>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "common/schema/body_schema.h"
 
 namespace bodyschema {
 
-/// Where a body may differ from its schema: the edge that leads to `part` (for the root the
-/// camera's), or the part's marker.
-struct Place {
-  int part = 0;
-  bool marker = false;
-  auto operator<=>(const Place&) const = default;
+/// What of a body may differ from its schema.
+struct ElementId {
+  enum class Kind {
+    kCamera,  ///< the camera's pose; id: the root
+    kJoint,   ///< the edge that leads to part `id`, with all its joints and links
+    kTag      ///< the tags of part `id`, together
+  };
+  Kind kind = Kind::kJoint;
+  int id = 0;  ///< of a part
+
+  bool is_tag() const { return kind == Kind::kTag; }
+  bool is_camera() const { return kind == Kind::kCamera; }
+  bool operator==(const ElementId&) const = default;
+  /// By parts, the tags of each last.
+  auto operator<=>(const ElementId& other) const {
+    return std::pair(id, kind) <=> std::pair(other.id, other.kind);
+  }
 };
+/// The edge that leads to `part`; of the root the camera.
+inline ElementId edge_element(int part, int root) {
+  return {part == root ? ElementId::Kind::kCamera : ElementId::Kind::kJoint, part};
+}
+inline ElementId tag_element(int part) { return {ElementId::Kind::kTag, part}; }
 
 /// How a body may differ from its schema in one place. θ: displacements (as a q + b is), transforms
 /// as (translation [m], rotation vector [rad]) with T(θ) = (Exp(w), p).
@@ -81,8 +99,8 @@ ChangePrior prior_of(const BodyChange& change, const BodySchema& schema);
 BodySchema changed(const BodySchema& schema, const BodyChange& change, const Eigen::VectorXd& theta,
                    const Eigen::MatrixXd& covariance = {});
 
-/// All forms that a change of the place may have (kStored and what is learned apart).
-std::vector<BodyChange> possible_changes(const BodySchema& schema, int part, bool marker);
+/// All forms that a change of the element may have (kStored and what is learned apart).
+std::vector<BodyChange> possible_changes(const BodySchema& schema, const ElementId& element);
 
 /// T(θ) = (Exp(w), p) for θ = (p, w): independent of where the origin of rotation lies.
 Pose transform(const Vector6d& theta);

@@ -109,7 +109,7 @@ TEST_F(BodyChangeTest, AMovedMarkerMovesItsPartAndNothingElse) {
 }
 
 TEST_F(BodyChangeTest, EveryPossibleChangeKeepsTheEdgesFlatAndTheOthersAsTheyWere) {
-  const auto all = possible_changes(schema_, kPart, false);
+  const auto all = possible_changes(schema_, {ElementId::Kind::kJoint, kPart});
   std::map<Form, int> forms;
   for (const BodyChange& change : all) {
     ++forms[change.form];
@@ -136,7 +136,7 @@ TEST_F(BodyChangeTest, EveryPossibleChangeKeepsTheEdgesFlatAndTheOthersAsTheyWer
 /// uncertain as ∂(prediction)/∂θ, here by central differences, says.
 TEST_F(BodyChangeTest, UncertaintyOfTheParametersIsThatOfThePrediction) {
   schema_.edges[2].joints[0].offset = 0;
-  for (const BodyChange& change : possible_changes(schema_, kPart, false)) {
+  for (const BodyChange& change : possible_changes(schema_, {ElementId::Kind::kJoint, kPart})) {
     if (change.size() == 0) continue;
     SCOPED_TRACE("form " + std::to_string(static_cast<int>(change.form)));
     const Eigen::Index d = change.size();
@@ -200,7 +200,7 @@ TEST_F(BodyChangeTest, RefusesPlacesAndParametersThatAreNotThere) {
   EXPECT_THROW(changed(schema_, {Form::kBent, 77, 1}, six), std::invalid_argument);
   EXPECT_THROW(changed(schema_, {Form::kMarkerMoved, 77}, six), std::invalid_argument);
   EXPECT_THROW(changed(schema_, {Form::kStuck, schema_.root}, one), std::invalid_argument);
-  EXPECT_TRUE(possible_changes(schema_, 77, false).empty());
+  EXPECT_TRUE(possible_changes(schema_, {ElementId::Kind::kJoint, 77}).empty());
 }
 
 }  // namespace

@@ -112,7 +112,8 @@ TEST_F(ChangeSizeTest, WhatHasNoParametersHasNoSize) {
 
 TEST_F(ChangeSizeTest, WhatTwoModelsDifferByIsTheChangeBetweenThem) {
   const auto between = [&](const BodyChange& change, const Eigen::VectorXd& theta) {
-    return difference_at(schema_, changed(schema_, change, theta), {kPart, false});
+    return difference_at(schema_, changed(schema_, change, theta),
+                         {ElementId::Kind::kJoint, kPart});
   };
   const FoundDifference stuck = between({Form::kStuck, kPart}, vector({0.9}));
   EXPECT_EQ(stuck.cause, "joint_stuck");

@@ -69,7 +69,8 @@ TEST_F(LongEdgeTest, EveryChangeIsPredictedAsItIsApplied) {
   m.displacements = q;
   m.X = edge.predict(q);
   m.links = link_poses(&edge, q, m.X);
-  for (const BodyChange& change : possible_changes(schema_, LongArm::kHand, false)) {
+  for (const BodyChange& change :
+       possible_changes(schema_, edge_element(LongArm::kHand, LongArm::kRoot))) {
     SCOPED_TRACE("form " + std::to_string(static_cast<int>(change.form)) + " at " +
                  std::to_string(change.at));
     Eigen::VectorXd theta(change.size());
@@ -96,7 +97,7 @@ TEST_F(LongEdgeTest, EveryChangeIsPredictedAsItIsApplied) {
 TEST_F(LongEdgeTest, AnEdgeOfManyJointsChangesNoOftenerThanOneOfOne) {
   const auto odds = [](const BodySchema& schema, int part) {
     std::map<Form, double> sum;
-    for (const BodyChange& change : possible_changes(schema, part, false))
+    for (const BodyChange& change : possible_changes(schema, edge_element(part, LongArm::kRoot)))
       if (!change.small) sum[change.form] += std::exp(change.log_odds());
     return sum;
   };
@@ -111,8 +112,8 @@ TEST_F(LongEdgeTest, TheJointBeforeABentLinkIsTold) {
   for (int link = 0; link <= kJoints; ++link) {
     const BodyChange bent{Form::kBent, LongArm::kHand, link};
     EXPECT_EQ(size_of(schema_, bent, theta, {}).signal, link - 1);
-    const FoundDifference found =
-        difference_at(schema_, changed(schema_, bent, theta), {LongArm::kHand, false});
+    const FoundDifference found = difference_at(schema_, changed(schema_, bent, theta),
+                                                edge_element(LongArm::kHand, LongArm::kRoot));
     EXPECT_EQ(found.cause, "geometry");
     EXPECT_EQ(found.size.signal, link - 1);
   }
