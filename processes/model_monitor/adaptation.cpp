@@ -109,15 +109,16 @@ Adaptation::Adaptation(BodySchema schema, AdaptationOptions options,
   if (!history.empty()) tracker_.set_history(std::move(history));
 }
 
-EdgeState Adaptation::state_of(const Place& place) const {
-  if (tracker_.detected() == place) return EdgeState::kInvalid;
+EdgeState Adaptation::state_of(const ElementId& element) const {
+  if (tracker_.detected() == element) return EdgeState::kInvalid;
   for (const HypothesisTracker::Change& c : tracker_.changes()) {
-    const std::vector<Place>& also = c.what.also;
-    if (c.what.place == place || std::find(also.begin(), also.end(), place) != also.end())
+    const std::vector<ElementId>& also = c.what.also;
+    if (c.what.element == element || std::find(also.begin(), also.end(), element) != also.end())
       return EdgeState::kProvisional;
   }
-  if (!place.marker && drifting_ == place.part) return EdgeState::kProvisional;
-  const double statistic = place.marker ? marker_statistic(place.part) : edge_statistic(place.part);
+  if (!element.is_tag() && drifting_ == element.id) return EdgeState::kProvisional;
+  const double statistic =
+      element.is_tag() ? marker_statistic(element.id) : edge_statistic(element.id);
   return statistic > options_.suspicion ? EdgeState::kSuspect : EdgeState::kOk;
 }
 
@@ -191,8 +192,8 @@ void Adaptation::watch_small_changes(std::int64_t sample_index,
                                      std::vector<AdaptationEvent>* events) {
   if (drifting_ || !tracker_.was_adopted_at(sample_index)) return;
   const HypothesisTracker::Change& newest = tracker_.changes().back();
-  if (!newest.what.fitted.change.small || newest.what.place.marker) return;
-  const int part = newest.what.place.part;
+  if (!newest.what.fitted.change.small || newest.what.element.is_tag()) return;
+  const int part = newest.what.element.id;
   const auto is_next = [this](int a, int b) {
     const Edge* edge = edge_to(schema_, a);
     return edge && edge->from == b;
@@ -221,15 +222,15 @@ void Adaptation::begin_drift(int part, std::int64_t since, std::int64_t sample_i
   before_ = tracker_.settled();
   num_still_ = 0;
   AdaptationEvent drift =
-      tracker_.event(AdaptationEvent::Kind::kDrift, sample_index, {part, false});
+      tracker_.event(AdaptationEvent::Kind::kDrift, sample_index, edge_element(part, schema_.root));
   drift.cause = "drift";
   drift.since = since;
   events->push_back(drift);
 }
 
 void Adaptation::try_drift(std::int64_t sample_index, std::vector<AdaptationEvent>* events) {
-  const std::vector<Place> places = tracker_.suspects();
-  if (drifting_ || (tracker_.changes().empty() && !tracker_.detected()) || places.empty() ||
+  const std::vector<ElementId> elements = tracker_.suspects();
+  if (drifting_ || (tracker_.changes().empty() && !tracker_.detected()) || elements.empty() ||
       tracker_.was_adopted_at(sample_index))
     return;
   if (!is_worth_a_fit(sample_index - tracker_.tests().highest().cusum.since + 1)) return;
@@ -239,11 +240,11 @@ void Adaptation::try_drift(std::int64_t sample_index, std::vector<AdaptationEven
   if (samples.empty() || samples.front()->sample_index > since) return;
   std::set<int> parts;
   const auto add_around = [&](int part) {
-    for (const Place& place : places_around(tracker_.filter(), part))
-      if (!place.marker) parts.insert(place.part);
+    for (const ElementId& element : elements_around(tracker_.filter(), part))
+      if (!element.is_tag()) parts.insert(element.id);
   };
-  for (const HypothesisTracker::Change& c : tracker_.changes()) add_around(c.what.place.part);
-  add_around(places.front().part);
+  for (const HypothesisTracker::Change& c : tracker_.changes()) add_around(c.what.element.id);
+  add_around(elements.front().id);
   // Edges beside each other explain a bend nearly alike: until one leads, nothing is told.
   const BodySchema& before = tracker_.settled();
   std::optional<BegunDrift> best;
@@ -280,7 +281,7 @@ void Adaptation::watch_drift(std::int64_t sample_index, std::vector<AdaptationEv
   for (AdaptationEvent& event : *events)
     if (event.kind == AdaptationEvent::Kind::kDrift)
       event.size =
-          size_of_rate(before_, *drifting_, drift->left, drift->rate, drift->rate_covariance);
+          size_of_rate(before_, *drifting_, drift->link, drift->rate, drift->rate_covariance);
   // What is suspected elsewhere meanwhile stays so.
   tracker_.follow(drift->applied_to(before_), *drifting_);
   num_still_ = drift->significance > kSignificantRate ? 0 : num_still_ + 1;
@@ -299,8 +300,8 @@ void Adaptation::watch_drift(std::int64_t sample_index, std::vector<AdaptationEv
 /// `since`: the first sample with the body as it is now; `sample_index` where that is not known.
 void Adaptation::end_drift(std::int64_t since, const Drift& drift, std::int64_t sample_index,
                            std::vector<AdaptationEvent>* events) {
-  AdaptationEvent recovered =
-      tracker_.event(AdaptationEvent::Kind::kRecovered, sample_index, {*drifting_, false});
+  AdaptationEvent recovered = tracker_.event(AdaptationEvent::Kind::kRecovered, sample_index,
+                                             edge_element(*drifting_, schema_.root));
   recovered.cause = "drift";
   if (since < sample_index) recovered.since = since;
   recovered.num_samples =
@@ -309,8 +310,8 @@ void Adaptation::end_drift(std::int64_t since, const Drift& drift, std::int64_t 
   drift_watch_.forget(*drifting_, since);
   tags_.begin_anew();
   HypothesisTracker::Change there;
-  there.what.place = {*drifting_, false};
-  there.what.fitted.change = drift_step(before_, *drifting_, drift.left);
+  there.what.element = edge_element(*drifting_, before_.root);
+  there.what.fitted.change = drift_step(before_, *drifting_, drift.link);
   there.what.fitted.theta = coordinates(drift.T);
   there.what.fitted.covariance = drift.covariance;
   there.since = there.adopted = since;
@@ -326,7 +327,7 @@ void Adaptation::watch_visibility(const ActionPoseSample& sample, const ActionPo
     const auto [part, tag, is_missing, num_missed] = finding;
     AdaptationEvent told = tracker_.event(
         is_missing ? AdaptationEvent::Kind::kMissing : AdaptationEvent::Kind::kRecovered,
-        sample.sample_index, {part, true});
+        sample.sample_index, tag_element(part));
     told.tag = tag;
     told.cause = "marker_missing";
     told.num_samples = num_missed;
@@ -351,7 +352,7 @@ void Adaptation::watch_tags(ActionPoseSample* sample, std::vector<AdaptationEven
       using Kind = AdaptationEvent::Kind;
       const Kind kind = finding.is_back ? (finding.is_on_part ? Kind::kRestored : Kind::kRecovered)
                                         : (finding.is_on_part ? Kind::kCandidate : Kind::kMissing);
-      AdaptationEvent told = tracker_.event(kind, sample->sample_index, {finding.part, true});
+      AdaptationEvent told = tracker_.event(kind, sample->sample_index, tag_element(finding.part));
       told.tag = finding.tag;
       told.cause = finding.is_on_part ? "marker_moved" : "marker_missing";
       told.num_samples = finding.num_sightings;
@@ -375,10 +376,10 @@ void Adaptation::watch_tags(ActionPoseSample* sample, std::vector<AdaptationEven
 /// What a moved tag was taken for meanwhile.
 void Adaptation::take_back(const MovedTags::Finding& moved, std::int64_t sample_index,
                            std::vector<AdaptationEvent>* events) {
-  const auto is_at_it = [&](const Place& place) {
-    if (place.part == moved.part) return true;
-    const Edge* edge = edge_to(schema_, place.part);
-    return !place.marker && edge && edge->from == moved.part;
+  const auto is_at_it = [&](const ElementId& element) {
+    if (element.id == moved.part) return true;
+    const Edge* edge = edge_to(schema_, element.id);
+    return !element.is_tag() && edge && edge->from == moved.part;
   };
   const auto clean = [&](ActionPoseSample* sample) {
     sample->leave_out([&](int tag) { return tag == moved.tag; });
@@ -411,12 +412,12 @@ void Adaptation::drop_fallen(ActionPoseSample* sample, std::vector<AdaptationEve
     if (visibility_.is_missing(part)) continue;
     num_missed = 0;
     AdaptationEvent missing =
-        tracker_.event(AdaptationEvent::Kind::kMissing, sample->sample_index, {part, true});
+        tracker_.event(AdaptationEvent::Kind::kMissing, sample->sample_index, tag_element(part));
     missing.cause = "marker_missing";
     missing.since = *since;
     // What it was taken for meanwhile is taken back.
-    const auto is_at_it = [this, part = part](const Place& place) {
-      return place.part == part && (place.marker || part != schema_.root);
+    const auto is_at_it = [this, part = part](const ElementId& element) {
+      return element.id == part && (element.is_tag() || part != schema_.root);
     };
     std::vector<AdaptationEvent> taken_back;
     tracker_.take_back(is_at_it, *since, drop, sample->sample_index, &taken_back);

@@ -49,8 +49,8 @@ class Adaptation {
   /// Of the edge to a part (root: of the camera's pose) and of the part's marker: kSuspect while a
   /// CUSUM is up, kInvalid from detection to replacement, kProvisional until that has settled, or
   /// while it drifts.
-  EdgeState edge_state(int part) const { return state_of({part, false}); }
-  EdgeState marker_state(int part) const { return state_of({part, true}); }
+  EdgeState edge_state(int part) const { return state_of(edge_element(part, schema_.root)); }
+  EdgeState marker_state(int part) const { return state_of(tag_element(part)); }
   /// True over assumed standard deviation of the markers, as the residuals of quiet samples show
   /// it.
   double noise_scale() const { return measurement_.scale; }
@@ -71,7 +71,7 @@ class Adaptation {
  private:
   /// Of what is no repetition; its index is SampleStream::count().
   std::vector<AdaptationEvent> on_new_sample(ActionPoseSample sample);
-  EdgeState state_of(const Place& place) const;
+  EdgeState state_of(const ElementId& element) const;
   void calibrate(const std::vector<ActionPoseSample>& samples);
   void set_noise_scale(double scale);
   void watch_noise(const TreeFilter::Judgement& judgement);

@@ -1,5 +1,6 @@
 #include "processes/model_monitor/changes/body_change.h"
 
+#include <algorithm>
 #include <cmath>
 #include <stdexcept>
 
@@ -14,7 +15,8 @@ namespace bodyschema {
 /// Log odds of the form against no change, where one is suspected: what was there before, breaks
 /// often or is told by few numbers comes first; what contains another form comes after it, as the
 /// evidence charges only for the width of θ. A sample is worth several nats, so that they decide
-/// while there are few.
+/// while there are few. An edge of many joints has as much as one of one joint to share out among
+/// its joints, and among its links as much as two.
 /// Fewest samples: as many as determine θ with something left to judge it by.
 /// Widths: a transform goes about as far as a link is long, those of kBoth together as far as one
 /// (0.3 m / √2), one in a joint's stead also as far as that went; a displacement goes by a third of
@@ -27,8 +29,7 @@ const ChangeForm& form_of(const BodyChange& change) {
       {joint_family(), "joint_offset", 1, -3, 1, {0.3}},
       {joint_family(), "joint_gain", 2, -5, 2, {0.3, 1}},
       {joint_family(), "other_signal", 0, -6, 2, {}},
-      {geometry_family(), "geometry", 6, -2.5, 2, {0.3, 1}},   // kLeft
-      {geometry_family(), "geometry", 6, -2.5, 2, {0.3, 1}},   // kRight
+      {geometry_family(), "geometry", 6, -2.5, 2, {0.3, 1}},   // kBent
       {geometry_family(), "geometry", 12, -6, 3, {0.2, 0.7}},  // kBoth
       {geometry_family(), "rigid", 6, -4, 2, {0.5, 1.5}},
       {marker_family(), "marker_moved", 6, -2.5, 2, {0.3, 1}},
@@ -44,10 +45,9 @@ const ChangeForm& form_of(const BodyChange& change) {
 int BodyChange::size() const { return form_of(*this).size; }
 
 double BodyChange::log_odds() const {
-  if (small) return kSmallLogOdds;
-  const double log_odds = form_of(*this).log_odds;
-  if (!is_learned()) return log_odds;
-  return log_odds + (second_signal >= 0 ? 2 : 1) * kInputLogOdds + std::log(proximity);
+  double log_odds = (small ? kSmallLogOdds : form_of(*this).log_odds) + std::log(share);
+  if (is_learned()) log_odds += (second_signal >= 0 ? 2 : 1) * kInputLogOdds;
+  return log_odds;
 }
 
 int BodyChange::fewest_samples() const { return form_of(*this).fewest_samples; }
@@ -76,28 +76,37 @@ BodySchema changed(const BodySchema& schema, const BodyChange& change, const Eig
   return result;
 }
 
-std::vector<BodyChange> possible_changes(const BodySchema& schema, int part, bool marker) {
+std::vector<BodyChange> possible_changes(const BodySchema& schema, const ElementId& element) {
   using Form = BodyChange::Form;
+  const int part = element.id;
   std::vector<BodyChange> result;
-  const auto add_both_sizes = [&](Form form, int joint = 0) {
-    for (const bool small : {false, true}) result.push_back({form, part, joint, 0, small});
+  const auto add = [&](Form form, int at, double share, int signal = 0) {
+    result.push_back({form, part, at, signal});
+    result.back().share = share;
+  };
+  const auto add_both_sizes = [&](Form form, int at = 0, double share = 1) {
+    add(form, at, share);
+    add(form, at, share);
+    result.back().small = true;
   };
   const Edge* edge = edge_to(schema, part);
-  if (marker) add_both_sizes(Form::kMarkerMoved);
-  if (!marker && !edge && part == schema.root) add_both_sizes(Form::kCamera);
-  if (marker || !edge) return result;
-  for (int joint = 0; joint < static_cast<int>(edge->joints.size()); ++joint) {
-    const ScrewJoint& j = edge->joints[static_cast<std::size_t>(joint)];
-    result.push_back({Form::kStuck, part, joint});
+  if (element.is_tag()) add_both_sizes(Form::kMarkerMoved);
+  if (!element.is_tag() && !edge && part == schema.root) add_both_sizes(Form::kCamera);
+  if (element.is_tag() || !edge) return result;
+  const int num_joints = static_cast<int>(edge->joints.size());
+  for (int d = 0; d < num_joints; ++d) {
+    const ScrewJoint& j = edge->joints[static_cast<std::size_t>(d)];
+    const double share = 1.0 / num_joints;
+    add(Form::kStuck, d, share);
     if (j.gain == 0) continue;  // it is stuck: elsewhere is all that it can be
-    add_both_sizes(Form::kOffset, joint);
-    result.push_back({Form::kGain, part, joint});
+    add_both_sizes(Form::kOffset, d, share);
+    add(Form::kGain, d, share);
     for (int s = 0; s < static_cast<int>(schema.signals.size()); ++s)
-      if (s != j.signal) result.push_back({Form::kOtherSignal, part, joint, s});
+      if (s != j.signal) add(Form::kOtherSignal, d, share, s);
   }
-  add_both_sizes(Form::kRight);
-  if (edge->joints.empty()) return result;
-  add_both_sizes(Form::kLeft);
+  for (int link = num_joints; link >= 0; --link)
+    add_both_sizes(Form::kBent, link, std::min(1.0, 2.0 / (num_joints + 1)));
+  if (num_joints == 0) return result;
   result.push_back({Form::kBoth, part});
   result.push_back({Form::kRigid, part});
   return result;
@@ -154,11 +163,30 @@ void add_covariance(const Eigen::MatrixXd& covariance, int at, Edge* edge) {
   edge->parameter_covariance.block(at, at, covariance.rows(), covariance.cols()) += covariance;
 }
 
-Vector6d displacement_twist(const ScrewJoint& joint) {
+Vector6d screw_twist(const ScrewJoint& joint) {
   Vector6d screw = Vector6d::Zero();
   screw(2) = joint.slide;
   screw(5) = joint.turn;
-  return adjoint(joint.X_after.inverse()) * screw;
+  return screw;
+}
+
+Vector6d displacement_twist(const ScrewJoint& joint) {
+  return adjoint(joint.X_after.inverse()) * screw_twist(joint);
+}
+
+std::vector<Pose> link_poses(const Edge* edge, const Eigen::VectorXd& displacements,
+                             const Pose& X) {
+  std::vector<Pose> poses;
+  Pose at = edge ? edge->left : Pose::Identity();
+  for (std::size_t d = 0; edge && d < edge->joints.size(); ++d) {
+    const ScrewJoint& joint = edge->joints[d];
+    poses.push_back(d == 0 ? Pose::Identity() : at);
+    const double q = joint.gain * displacements(joint.signal) + joint.offset;
+    Screw{joint.slide, joint.turn}.append_motion(q, at.linear(), at.translation());
+    at = at * joint.X_after;
+  }
+  poses.push_back(X);
+  return poses;
 }
 
 }  // namespace bodyschema

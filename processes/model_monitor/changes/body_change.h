@@ -1,19 +1,37 @@
 #pragma once
 
+#include <compare>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "common/schema/body_schema.h"
 
 namespace bodyschema {
 
-/// Where a body may differ from its schema: the edge that leads to `part` (for the root the
-/// camera's), or the part's marker.
-struct Place {
-  int part = 0;
-  bool marker = false;
-  auto operator<=>(const Place&) const = default;
+/// What of a body may differ from its schema.
+struct ElementId {
+  enum class Kind {
+    kCamera,  ///< the camera's pose; id: the root
+    kJoint,   ///< the edge that leads to part `id`, with all its joints and links
+    kTag      ///< the tags of part `id`, together
+  };
+  Kind kind = Kind::kJoint;
+  int id = 0;  ///< of a part
+
+  bool is_tag() const { return kind == Kind::kTag; }
+  bool is_camera() const { return kind == Kind::kCamera; }
+  bool operator==(const ElementId&) const = default;
+  /// By parts, the tags of each last.
+  auto operator<=>(const ElementId& other) const {
+    return std::pair(id, kind) <=> std::pair(other.id, other.kind);
+  }
 };
+/// The edge that leads to `part`; of the root the camera.
+inline ElementId edge_element(int part, int root) {
+  return {part == root ? ElementId::Kind::kCamera : ElementId::Kind::kJoint, part};
+}
+inline ElementId tag_element(int part) { return {ElementId::Kind::kTag, part}; }
 
 /// How a body may differ from its schema in one place. θ: displacements (as a q + b is), transforms
 /// as (translation [m], rotation vector [rad]) with T(θ) = (Exp(w), p).
@@ -24,8 +42,7 @@ struct BodyChange {
     kOffset,       ///< b + θ
     kGain,         ///< (1 + θ_0) a, b + θ_1
     kOtherSignal,  ///< the joint follows another signal
-    kLeft,         ///< T(θ) · Δ: what carries the joint was bent
-    kRight,        ///< Δ · T(θ): what the joint carries was bent, a tool exchanged
+    kBent,         ///< T(θ) in a link: bent, a tool exchanged
     kBoth,         ///< T(θ_1) · Δ · T(θ_2)
     kRigid,        ///< no joint any more: T(θ) times the pose in mid-range
     kMarkerMoved,  ///< the marker of `part` is elsewhere on it by T(θ)
@@ -34,13 +51,17 @@ struct BodyChange {
     kResidual,     ///< Δ · Exp(ρ) with a Gaussian process ρ of one or two signals
     kFresh         ///< a constant pose and such a ρ: the edge is learned anew
   };
-  Form form = Form::kRight;
+  Form form = Form::kBent;
   int part = 0;
-  int joint = 0;           ///< index in the edge: kStuck, kOffset, kGain, kOtherSignal
+  /// Where in the edge. kStuck, kOffset, kGain, kOtherSignal: the joint. kBent: the link, 0 before
+  /// the first joint, d + 1 behind joint d.
+  int at = 0;
   int signal = 0;          ///< kOtherSignal; the first input of a learned form
   bool small = false;      ///< a tenth as wide a prior: a little bent is likelier than broken
   int second_signal = -1;  ///< the other input of a learned form; −1: none
-  double proximity = 1;    ///< of the model's signals to those of the edge that stood, 0 … 1
+  /// Of the form's prior odds: of one place among those of the edge; of a learned form the
+  /// proximity of the model's signals to those of the edge that stood, 0 … 1.
+  double share = 1;
 
   /// The last three forms: functions and no parameters, so that FittedChange::origin holds the
   /// edge.
@@ -78,8 +99,8 @@ ChangePrior prior_of(const BodyChange& change, const BodySchema& schema);
 BodySchema changed(const BodySchema& schema, const BodyChange& change, const Eigen::VectorXd& theta,
                    const Eigen::MatrixXd& covariance = {});
 
-/// All forms that a change of the place may have (kStored and what is learned apart).
-std::vector<BodyChange> possible_changes(const BodySchema& schema, int part, bool marker);
+/// All forms that a change of the element may have (kStored and what is learned apart).
+std::vector<BodyChange> possible_changes(const BodySchema& schema, const ElementId& element);
 
 /// T(θ) = (Exp(w), p) for θ = (p, w): independent of where the origin of rotation lies.
 Pose transform(const Vector6d& theta);

@@ -15,7 +15,7 @@ struct PlaceMeasurement {
   Pose z = Pose::Identity();               ///< as everything but the place's own model knows it
   Matrix6d covariance = Matrix6d::Zero();  ///< right perturbation
   Pose X = Pose::Identity();               ///< by the place's own model; of a marker the identity
-  Pose process = Pose::Identity();         ///< what the edge's Gaussian process adds to that
+  std::vector<Pose> links = {};            ///< link_poses() of that model
 };
 
 using ChangeJacobian = Eigen::Matrix<double, 6, Eigen::Dynamic>;
@@ -52,10 +52,10 @@ class ChangeFamily {
   }
 };
 
-/// Transforms before and behind a place: T(θ_1) · X · T(θ_2), or one of them; a base for all that
-/// moves poses.
+/// Transforms in the links of an edge; a base for all that moves poses.
 class Geometry : public ChangeFamily {
  public:
+  bool is_possible(const BodySchema& schema, const BodyChange& change) const override;
   ChangePrior prior(const BodySchema& schema, const BodyChange& change) const override;
   /// What each of the newest measurements alone says.
   std::vector<Eigen::VectorXd> starts(
@@ -98,9 +98,19 @@ Edge& edge_at(BodySchema* schema, int part);
 void make_constant(const Pose& X, Edge* edge);
 /// Adds to the covariance of the edge's parameters (ScrewChainLayout) from `at` on.
 void add_covariance(const Eigen::MatrixXd& covariance, int at, Edge* edge);
+Vector6d screw_twist(const ScrewJoint& joint);
 /// What a joint's displacement does to its X_after, as a right perturbation of that.
 Vector6d displacement_twist(const ScrewJoint& joint);
+/// Where a change of each link stands, of an edge with the pose X: with T in link d the pose is
+/// X_d · T · X_d⁻¹ · X. X_0 is the identity, that of an inner link the frame of the joint that it
+/// carries, the last one X. Of a rigid edge, or none, X alone.
+std::vector<Pose> link_poses(const Edge* edge, const Eigen::VectorXd& displacements, const Pose& X);
+/// The signal of the joint that carries a link of an edge of several joints; −1: none does, or
+/// there is one joint.
+int carrying_signal(const Edge* edge, int link);
 
+/// The link that differs between two models of an edge, if it is one.
+std::optional<int> link_difference(const Edge& old, const Edge& now);
 /// What became of a joint, if one joint and nothing else differs between two models of an edge.
 std::optional<FoundDifference> joint_difference(const BodySchema& before, const Edge& old,
                                                 const Edge& now);

@@ -47,18 +47,21 @@ ChangeSize size_of(const BodySchema& schema, const BodyChange& change, const Eig
   return family.size(schema, change, theta, covariance);
 }
 
-FoundDifference difference_at(const BodySchema& before, const BodySchema& now, const Place& place) {
-  const Edge *old = edge_to(before, place.part), *edge = edge_to(now, place.part);
-  if (old && edge && !place.marker) {
+FoundDifference difference_at(const BodySchema& before, const BodySchema& now,
+                              const ElementId& element) {
+  const Edge *old = edge_to(before, element.id), *edge = edge_to(now, element.id);
+  if (old && edge && !element.is_tag()) {
     if (!edge->has_process_of(*old)) return {"new_model", {}};
     if (auto joint = joint_difference(before, *old, *edge)) return *joint;
   }
-  return {place.part == now.root ? "camera_moved"
-          : place.marker         ? "marker_moved"
+  const auto link =
+      old && edge && !element.is_tag() ? link_difference(*old, *edge) : std::optional<int>();
+  return {element.id == now.root ? "camera_moved"
+          : element.is_tag()     ? "marker_moved"
                                  : "geometry",
           {ChangeSize::Kind::kPose,
-           -1,
-           distance_and_angle(pose_at(before, place.part).inverse() * pose_at(now, place.part)),
+           link ? carrying_signal(edge, *link) : -1,
+           distance_and_angle(pose_at(before, element.id).inverse() * pose_at(now, element.id)),
            {-1, -1}}};
 }
 

@@ -34,7 +34,8 @@ struct FoundDifference {
   std::string cause;  ///< as BodyChange::cause()
   ChangeSize size;    ///< without standard deviations
 };
-FoundDifference difference_at(const BodySchema& before, const BodySchema& now, const Place& place);
+FoundDifference difference_at(const BodySchema& before, const BodySchema& now,
+                              const ElementId& element);
 
 /// The size whose amounts are a function of θ, with their standard deviations.
 ChangeSize sized(ChangeSize::Kind kind, int signal,

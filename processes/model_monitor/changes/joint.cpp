@@ -41,18 +41,22 @@ double stuck_at(const BodySchema& schema, const ScrewJoint& joint, double displa
 }
 
 const ScrewJoint& joint_of(const Edge& edge, const BodyChange& change) {
-  return edge.joints.at(static_cast<std::size_t>(change.joint));
+  return edge.joints.at(static_cast<std::size_t>(change.at));
 }
 
-void change_joint(const BodyChange& change, const Eigen::VectorXd& theta, Edge* edge) {
-  ScrewJoint& joint = edge->joints.at(static_cast<std::size_t>(change.joint));
+ScrewJoint with_change(ScrewJoint joint, const BodyChange& change, const Eigen::VectorXd& theta) {
   if (change.form == Form::kOtherSignal) {
     joint.signal = change.signal;
-    return;
+    return joint;
   }
   if (change.form == Form::kStuck) joint.gain = joint.offset = 0;
   if (change.form == Form::kGain) joint.gain *= 1 + theta(0);
   joint.offset += theta.tail<1>()(0);
+  return joint;
+}
+
+double displacement_of(const ScrewJoint& joint, const Eigen::VectorXd& displacements) {
+  return joint.gain * displacements(joint.signal) + joint.offset;
 }
 
 /// One joint of an edge. θ's last component is a displacement, that of a gain before it multiplies
@@ -61,7 +65,7 @@ class Joint : public ChangeFamily {
  public:
   bool is_possible(const BodySchema& schema, const BodyChange& change) const override {
     const Edge* edge = edge_to(schema, change.part);
-    return edge && change.joint < std::ssize(edge->joints);
+    return edge && change.at < std::ssize(edge->joints);
   }
 
   ChangePrior prior(const BodySchema& schema, const BodyChange& change) const override {
@@ -100,41 +104,38 @@ class Joint : public ChangeFamily {
   void apply(const BodyChange& change, const Eigen::VectorXd& theta,
              const Eigen::MatrixXd& covariance, BodySchema* schema) const override {
     Edge& edge = edge_at(schema, change.part);
-    change_joint(change, theta, &edge);
+    ScrewJoint& joint = edge.joints.at(static_cast<std::size_t>(change.at));
+    joint = with_change(joint, change, theta);
     if (covariance.size() == 0) return;
-    const ScrewJoint& joint = joint_of(edge, change);
     const Vector6d along = displacement_twist(joint);
     add_covariance(covariance.bottomRightCorner<1, 1>()(0) * along * along.transpose(),
-                   ScrewChainLayout::transform(change.joint + 1), &edge);
+                   ScrewChainLayout::transform(change.at + 1), &edge);
     if (change.form != Form::kGain) return;
     // The gain's, as an uncertainty of slide and turn.
     const Eigen::Vector2d screw(joint.slide, joint.turn);
     const double share = 1 / std::max(std::abs(1 + theta(0)), 0.1);
     add_covariance(share * share * covariance(0, 0) * screw * screw.transpose(),
-                   ScrewChainLayout::slide(change.joint), &edge);
+                   ScrewChainLayout::slide(change.at), &edge);
   }
 
   PlacePrediction prediction(const BodySchema& schema, const BodyChange& change,
                              const Eigen::VectorXd& theta) const override {
-    Edge screws = *edge_to(schema, change.part);
-    const ScrewJoint old = joint_of(screws, change);
-    const Pose right = screws.right;
-    screws.right = Pose::Identity();
-    screws.matrix_gp.reset();
-    screws.residual_gp.reset();
-    change_joint(change, theta, &screws);
-    return [change, screws, old, right](const PlaceMeasurement& m, ChangeJacobian* jacobian) {
-      const Pose suffix = m.process * right;
-      if (jacobian && jacobian->cols() > 0)
-        jacobian->rightCols<1>() =
-            adjoint(suffix.inverse()) *
-            screws.parameter_jacobian(m.displacements)
-                .middleCols<6>(ScrewChainLayout::transform(change.joint + 1)) *
-            displacement_twist(old);
-      if (jacobian && change.form == Form::kGain)
-        jacobian->col(0) = old.gain * m.displacements(old.signal) * jacobian->col(1);
-      return screws.predict(m.displacements) * suffix;
-    };
+    const Edge& edge = *edge_to(schema, change.part);
+    const ScrewJoint old = joint_of(edge, change), now = with_change(old, change, theta);
+    return
+        [change, old, now, left = edge.left](const PlaceMeasurement& m, ChangeJacobian* jacobian) {
+          Pose X = change.at == 0 ? left : m.links[static_cast<std::size_t>(change.at)];
+          const Pose rest = X.inverse() * m.X;
+          if (jacobian && jacobian->cols() > 0)
+            jacobian->rightCols<1>() = adjoint(rest.inverse()) * screw_twist(old);
+          if (jacobian && change.form == Form::kGain)
+            jacobian->col(0) = old.gain * m.displacements(old.signal) * jacobian->col(1);
+          // What it goes farther than before: motions along one screw commute.
+          const double farther =
+              displacement_of(now, m.displacements) - displacement_of(old, m.displacements);
+          Screw{old.slide, old.turn}.append_motion(farther, X.linear(), X.translation());
+          return X * rest;
+        };
   }
 
   ChangeSize size(const BodySchema& schema, const BodyChange& change, const Eigen::VectorXd& theta,

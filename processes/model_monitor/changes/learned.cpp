@@ -205,7 +205,7 @@ std::vector<BodyChange> likeliest(const BodySchema& base, const ProcessTargets& 
     // A refined model has its own signals in it as well.
     std::vector<int> all = signals;
     if (change.form != Form::kFresh) all.insert(all.end(), own.begin(), own.end());
-    change.proximity = structural_proximity(all, own);
+    change.share = structural_proximity(all, own);
     const double score =
         screen(targets, typical, inputs_of(signals, measurements), half_ranges(base, signals));
     screened.emplace_back(change.log_odds() + score, change);

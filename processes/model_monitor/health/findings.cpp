@@ -10,9 +10,10 @@ namespace {
 using State = Finding::State;
 using Kind = AdaptationEvent::Kind;
 
-Place place_of(const Finding& finding, const BodySchema& schema) {
-  return finding.from >= 0 ? Place{finding.to, false}
-                           : Place{finding.part, finding.part != schema.root};
+ElementId element_of(const Finding& finding, const BodySchema& schema) {
+  if (finding.from >= 0) return edge_element(finding.to, schema.root);
+  return finding.part == schema.root ? edge_element(finding.part, schema.root)
+                                     : tag_element(finding.part);
 }
 
 /// All that predicts there is as it was, to the bit.
@@ -83,8 +84,9 @@ void Findings::adopt(const AdaptationEvent& event, Finding finding) {
 void Findings::confirm(const Adaptation& adaptation, const AdaptationEvent& event,
                        const Finding& finding) {
   if (Finding* followed = newest(event, State::kFollowed)) {
-    const FoundDifference difference = difference_at(
-        adaptation.history().front(), adaptation.schema(), place_of(finding, adaptation.schema()));
+    const FoundDifference difference =
+        difference_at(adaptation.history().front(), adaptation.schema(),
+                      element_of(finding, adaptation.schema()));
     followed->state = State::kConfirmed;
     followed->cause = difference.cause;
     followed->size = difference.size;
@@ -133,7 +135,7 @@ void Findings::hear(const Adaptation& adaptation, const AdaptationEvent& event) 
       // Another body of before: what that was is not in the event.
       const FoundDifference difference =
           difference_at(adaptation.history().front(), adaptation.schema(),
-                        place_of(finding, adaptation.schema()));
+                        element_of(finding, adaptation.schema()));
       finding.state = State::kAdopted;
       finding.adopted = event.sample_index;
       finding.cause = difference.cause;

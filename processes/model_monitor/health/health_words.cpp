@@ -51,8 +51,9 @@ constexpr Words kWords[] = {
     {"rigid", true, kPose, "{place} rigid", "{place} rigid, other by {size}"},
     {"joint_nonlinear", true, kUnknown, "{place} moves along another curve", ""},
     {"new_model", true, kUnknown, "{place} learned anew", ""},
-    {"geometry", true, kPose, "{place} bent or exchanged", "{place} bent or exchanged by {size}"},
-    {"drift", true, kRate, "{place} drifts", "{place} drifts by {size} a sample"},
+    {"geometry", true, kPose, "{place} bent or exchanged{behind}",
+     "{place} bent or exchanged{behind} by {size}"},
+    {"drift", true, kRate, "{place} drifts{behind}", "{place} drifts{behind} by {size} a sample"},
 };
 
 /// The tag, marker, camera or edge that an event or a finding is about.
@@ -89,6 +90,7 @@ std::string what(const Told& told, const std::vector<Signal>& signals) {
   };
   fill("{place}", place);
   fill("{joint}", signal.empty() ? place : signal + " (" + place + ")");
+  fill("{behind}", signal.empty() ? "" : " behind " + signal);
   fill("{signal}", signal.empty() ? "another signal" : signal);
   if (is_sized) fill("{size}", text_of(size));
   return text;

@@ -72,20 +72,16 @@ double log_likelihood(const BodySchema& schema, const MeasurementModel& measurem
   return sum;
 }
 
-PlaceEvidence::PlaceEvidence(const BodySchema& base, const MeasurementModel& measurement, int part,
-                             bool marker, std::vector<const ActionPoseSample*> samples)
-    : base_(base),
-      measurement_(measurement),
-      part_(part),
-      marker_(marker),
-      samples_(std::move(samples)) {
+PlaceEvidence::PlaceEvidence(const BodySchema& base, const MeasurementModel& measurement,
+                             const ElementId& element, std::vector<const ActionPoseSample*> samples)
+    : base_(base), measurement_(measurement), element_(element), samples_(std::move(samples)) {
   const TreeFilter filter(base_, measurement_);
-  const int node = filter.node_of(part_);
+  const int node = filter.node_of(element_.id);
   if (node < 0) return;
   for (const ActionPoseSample* sample : samples_) {
     const TreeFilter::Instant instant = filter.prepare(*sample);
-    const auto of =
-        marker_ ? filter.measure_marker(instant, node) : filter.measure_edge(instant, node);
+    const auto of = element_.is_tag() ? filter.measure_marker(instant, node)
+                                      : filter.measure_edge(instant, node);
     if (!of) continue;
     const Eigen::LLT<Matrix6d> llt(of->covariance);
     if (llt.info() != Eigen::Success) continue;
@@ -93,12 +89,11 @@ PlaceEvidence::PlaceEvidence(const BodySchema& base, const MeasurementModel& mea
     whitenings_.push_back(llt.matrixL().solve(Matrix6d::Identity()));
     log_norms_.push_back(-llt.matrixLLT().diagonal().array().log().sum() - 3 * std::log(2 * M_PI));
   }
-  if (marker) return;
-  const Edge* edge = edge_to(base_, part);
+  if (element_.is_tag()) return;
+  const Edge* edge = edge_to(base_, element_.id);
   for (PlaceMeasurement& m : measurements_) {
     m.X = edge ? edge->predict(m.displacements) : base_.X_CR;
-    if (edge && edge->matrix_gp) m.process = edge->matrix_gp->predict(m.displacements);
-    if (edge && edge->residual_gp) m.process = exp(edge->residual_gp->mean(m.displacements));
+    m.links = link_poses(edge, m.displacements, m.X);
   }
 }
 
@@ -260,14 +255,14 @@ std::vector<FittedChange> PlaceEvidence::fit_likely(const std::vector<BodyChange
 
 std::vector<FittedChange> PlaceEvidence::learn() const {
   std::vector<FittedChange> result;
-  if (marker_ || measurements_.empty()) return result;
+  if (element_.is_tag() || measurements_.empty()) return result;
   const auto with_edge = [this](const Edge& edge) {
     BodySchema schema = base_;
-    edge_at(&schema, part_) = edge;
+    edge_at(&schema, element_.id) = edge;
     return schema;
   };
   const std::vector<LearnedEdge> learned =
-      learn_edge(base_, part_, measurements_, measurement_.outlier_rate);
+      learn_edge(base_, element_.id, measurements_, measurement_.outlier_rate);
   for (const LearnedEdge& one : learned) {
     if (one.log_evidence < learned.front().log_evidence - kHopeless ||
         result.size() == kLearnedJudged)
@@ -287,7 +282,7 @@ std::vector<FittedChange> PlaceEvidence::learn() const {
 
 FittedChange PlaceEvidence::judge_stored(const BodySchema& schema) const {
   FittedChange result;
-  result.change = {BodyChange::Form::kStored, part_};
+  result.change = {BodyChange::Form::kStored, element_.id};
   result.schema = schema;
   result.log_prior = result.change.log_odds();
   result.log_evidence = result.log_prior + log_likelihood(schema, measurement_, samples_);

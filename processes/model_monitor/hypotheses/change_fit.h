@@ -43,9 +43,8 @@ double log_likelihood(const BodySchema& schema, const MeasurementModel& measurem
 /// What every sample says of one place, whatever the change there: made once for all its forms.
 class PlaceEvidence {
  public:
-  /// `marker`: the marker of `part`, not its edge.
-  PlaceEvidence(const BodySchema& base, const MeasurementModel& measurement, int part, bool marker,
-                std::vector<const ActionPoseSample*> samples);
+  PlaceEvidence(const BodySchema& base, const MeasurementModel& measurement,
+                const ElementId& element, std::vector<const ActionPoseSample*> samples);
 
   /// Samples that say something of the place.
   int num_usable() const { return static_cast<int>(measurements_.size()); }
@@ -85,8 +84,7 @@ class PlaceEvidence {
 
   const BodySchema base_;
   const MeasurementModel measurement_;
-  const int part_;
-  const bool marker_;
+  const ElementId element_;
   const std::vector<const ActionPoseSample*> samples_;
   std::vector<PlaceMeasurement> measurements_;
   std::vector<Matrix6d> whitenings_;

@@ -39,14 +39,14 @@ struct Base {
   const BodySchema* origin = nullptr;  ///< of the history; nullptr: the model that stands
 };
 
-std::vector<Base> bases_of(const Place& place, const BodySchema& standing,
+std::vector<Base> bases_of(const ElementId& element, const BodySchema& standing,
                            const std::vector<BodySchema>& history) {
   std::vector<Base> bases{{standing}};
-  if (place.marker) return bases;
+  if (element.is_tag()) return bases;
   for (const BodySchema& stored : history) {
-    BodySchema with = with_edge_of(standing, stored, place.part);
+    BodySchema with = with_edge_of(standing, stored, element.id);
     const bool is_known = std::ranges::any_of(
-        bases, [&](const Base& base) { return !differ_at(base.schema, with, place.part); });
+        bases, [&](const Base& base) { return !differ_at(base.schema, with, element.id); });
     if (!is_known) bases.push_back({std::move(with), &stored});
   }
   return bases;
@@ -56,7 +56,7 @@ std::vector<Base> bases_of(const Place& place, const BodySchema& standing,
 /// one edge and the samples speak for it: first where that was suspected; an outlier elsewhere may
 /// be the greatest suspicion.
 std::optional<Replacement> whole(const BodySchema& stored, const BodySchema& standing,
-                                 const std::vector<Place>& places,
+                                 const std::vector<ElementId>& elements,
                                  const std::vector<const ActionPoseSample*>& samples,
                                  const MeasurementModel& measurement, double null) {
   Replacement all;
@@ -84,18 +84,19 @@ std::optional<Replacement> whole(const BodySchema& stored, const BodySchema& sta
   }
   if (num_clear < 2) return std::nullopt;
   fitted.origin = std::move(different);
-  std::vector<Place> at = differences(standing, judge());
-  std::ranges::stable_sort(at, {}, [&](const Place& p) { return std::ranges::find(places, p); });
-  all.place = at.front();
+  std::vector<ElementId> at = differences(standing, judge());
+  std::ranges::stable_sort(at, {},
+                           [&](const ElementId& p) { return std::ranges::find(elements, p); });
+  all.element = at.front();
   all.also = {at.begin() + 1, at.end()};
-  fitted.change.part = all.place.part;
+  fitted.change.part = all.element.id;
   return all;
 }
 
 }  // namespace
 
 bool is_same_explanation(const Replacement& a, const Replacement& b) {
-  return a.place == b.place && a.fitted.change == b.fitted.change && a.also == b.also;
+  return a.element == b.element && a.fitted.change == b.fitted.change && a.also == b.also;
 }
 
 bool is_worth_a_fit(std::int64_t age) {
@@ -104,7 +105,7 @@ bool is_worth_a_fit(std::int64_t age) {
 }
 
 FoundChanges find_changes(const BodySchema& standing, const std::vector<BodySchema>& history,
-                          const std::vector<Place>& places,
+                          const std::vector<ElementId>& elements,
                           const std::vector<const ActionPoseSample*>& samples,
                           const ChangeSearch& search) {
   FoundChanges found;
@@ -113,26 +114,24 @@ FoundChanges find_changes(const BodySchema& standing, const std::vector<BodySche
   const bool are_many = static_cast<int>(samples.size()) >= kManySamples;
   // What could not be explained for so long is not explained by a change of a body of the past.
   const bool is_old = !search.standing_form && static_cast<int>(samples.size()) > kManySamples;
-  for (const Place& place : places) {
-    for (const Base& base : bases_of(place, standing, history)) {
-      const PlaceEvidence evidence(base.schema, search.measurement, place.part, place.marker,
-                                   samples);
+  for (const ElementId& element : elements) {
+    for (const Base& base : bases_of(element, standing, history)) {
+      const PlaceEvidence evidence(base.schema, search.measurement, element, samples);
       const auto offer = [&](FittedChange fitted) {
         if (base.origin) fitted.origin = *base.origin;
-        ranking.offer({place, std::move(fitted)});
+        ranking.offer({element, std::move(fitted)});
       };
       if (base.origin && evidence.num_usable() > 0) offer(evidence.judge_stored(base.schema));
       if (base.origin && is_old) continue;
       found.work += static_cast<int>(samples.size());
-      for (FittedChange& fitted :
-           evidence.fit_likely(possible_changes(base.schema, place.part, place.marker)))
+      for (FittedChange& fitted : evidence.fit_likely(possible_changes(base.schema, element)))
         offer(std::move(fitted));
       if (!search.learn || base.origin) continue;
       for (FittedChange& learned : evidence.learn()) offer(std::move(learned));
     }
   }
   for (const BodySchema& stored : history)
-    if (auto all = whole(stored, standing, places, samples, search.measurement, found.null))
+    if (auto all = whole(stored, standing, elements, samples, search.measurement, found.null))
       ranking.offer(std::move(*all));
   found.best = std::move(ranking.best);
   found.runner_up = std::move(ranking.second);

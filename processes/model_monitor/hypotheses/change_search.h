@@ -10,12 +10,12 @@ namespace bodyschema {
 
 /// A change that takes the place of what the schema says there.
 struct Replacement {
-  Place place;
+  ElementId element;
   FittedChange fitted;
-  std::vector<Place> also = {};  ///< what else a whole schema of the history changes
+  std::vector<ElementId> also = {};  ///< what else a whole schema of the history changes
 };
 
-/// The same form of change in the same places, whatever its parameters.
+/// The same form of change of the same elements, whatever its parameters.
 bool is_same_explanation(const Replacement& a, const Replacement& b);
 
 /// Of a suspicion so many samples old: growing steps bound the work of one that lasts.
@@ -33,16 +33,16 @@ struct FoundChanges {
   std::optional<Replacement> best;
   std::optional<Replacement> runner_up;  ///< the best that is another form or place
   double null = 0;                       ///< log-likelihood of the schema as it stands
-  int work = 0;                          ///< samples looked at, over all places and bases
+  int work = 0;                          ///< samples looked at, over all elements and bases
   double margin() const { return best ? best->fitted.log_evidence - null : 0; }
 };
 
-/// The changes of `standing` in one of `places` that the samples speak for most: what the history
+/// The changes of `standing` in one of `elements` that the samples speak for most: what the history
 /// has for a place, all forms of change of the model that stands and of those, and what differs
-/// from a schema of the history in several places at once. O(places · schemas of the history ·
+/// from a schema of the history in several elements at once. O(elements · schemas of the history ·
 /// forms · samples).
 FoundChanges find_changes(const BodySchema& standing, const std::vector<BodySchema>& history,
-                          const std::vector<Place>& places,
+                          const std::vector<ElementId>& elements,
                           const std::vector<const ActionPoseSample*>& samples,
                           const ChangeSearch& search);
 

@@ -4,9 +4,11 @@
 #include <Eigen/Eigenvalues>
 #include <algorithm>
 #include <cmath>
+#include <ranges>
 #include <utility>
 
 #include "common/estimation/student_t.h"
+#include "processes/model_monitor/changes/change_family.h"
 #include "processes/model_monitor/changes/drift.h"
 #include "processes/model_monitor/hypotheses/change_fit.h"
 
@@ -108,13 +110,15 @@ TreeFilter::Instant with_exact_models(TreeFilter::Instant instant) {
   return instant;
 }
 
-/// What a measurement shows of T where T · X (`left`) or X · T is seen, and its information in a
-/// right perturbation.
-std::pair<Pose, Matrix6d> displaced(const Pose& X, const VirtualMeasurement& of, bool left) {
-  if (!left) return {X.inverse() * of.z, of.covariance.inverse()};
-  const Matrix6d A = adjoint(X);
-  return {of.z * X.inverse(), (A * of.covariance * A.transpose()).inverse()};
+/// What a measurement shows of T where X_d · T · X_d⁻¹ · X is seen, `at` = X_d, and its information
+/// in a right perturbation.
+std::pair<Pose, Matrix6d> displaced(const Pose& at, const Pose& X, const VirtualMeasurement& of) {
+  const Pose rest = at.inverse() * X;
+  const Matrix6d A = adjoint(rest);
+  return {at.inverse() * of.z * rest.inverse(), (A * of.covariance * A.transpose()).inverse()};
 }
+
+std::size_t num_links(const Edge* edge) { return edge ? edge->joints.size() + 1 : 1; }
 
 /// ξ(t) = rate · (t − begin) from `begin` on, and 0 before.
 struct BegunLine {
@@ -254,9 +258,12 @@ std::optional<int> DriftWatch::moved_part(const BodySchema& schema) const {
     if (!queue) continue;
     const Edge* edge = edge_to(schema, part);
     if (!edge && part != schema.root) continue;
-    // Mean offset on either side, as far as the model's own uncertainty does not explain it.
-    std::vector<Reading> right, left;
-    Matrix6d model_right = Matrix6d::Zero(), model_left = Matrix6d::Zero();
+    // Mean offset in each link, as far as the model's own uncertainty does not explain it.
+    struct Link {
+      std::vector<Reading> readings;
+      Matrix6d model = Matrix6d::Zero();
+    };
+    std::vector<Link> links(num_links(edge));
     const std::size_t begin = queue->size() > kMean ? queue->size() - kMean : 0;
     const double share = 1 / static_cast<double>(queue->size() - begin);
     for (std::size_t n = begin; n < queue->size(); ++n) {
@@ -266,17 +273,16 @@ std::optional<int> DriftWatch::moved_part(const BodySchema& schema) const {
           m.systematic + (edge ? model_covariance(*edge, m.displacements) : schema.X_CR_covariance);
       const Vector6d xi = log(X.inverse() * m.of.z);
       const Matrix6d information = m.of.covariance.inverse();
-      right.push_back({0, xi, information});
-      model_right += share * model;
-      if (!edge || edge->joints.empty()) continue;
-      const Matrix6d A = adjoint(X), B = adjoint(X.inverse());
-      left.push_back({0, A * xi, B.transpose() * information * B});
-      model_left += share * A * model * A.transpose();
+      const std::vector<Pose> poses = link_poses(edge, m.displacements, X);
+      for (std::size_t link = 0; link < links.size(); ++link) {
+        const Pose rest = poses[link].inverse() * X;
+        const Matrix6d A = adjoint(rest), B = adjoint(rest.inverse());
+        links[link].readings.push_back({0, A * xi, B.transpose() * information * B});
+        links[link].model += share * A * model * A.transpose();
+      }
     }
-    for (const bool is_left : {false, true}) {
-      const std::vector<Reading>& readings = is_left ? left : right;
-      if (readings.empty()) continue;
-      const double d2 = mean_offset(readings, is_left ? model_left : model_right);
+    for (const Link& link : std::views::reverse(links)) {
+      const double d2 = mean_offset(link.readings, link.model);
       if (d2 <= most) continue;
       most = d2;
       moved = part;
@@ -292,15 +298,15 @@ std::optional<Drift> DriftWatch::follow(const BodySchema& schema, int part) cons
   std::optional<Drift> best;
   double most = 0;
   const std::int64_t now = queue->back().sample_index;
-  for (const bool left : {false, true}) {
-    if (left && (!edge || edge->joints.empty())) continue;
+  for (std::size_t link = num_links(edge); link-- > 0;) {
     std::vector<Pose> T;
     std::vector<Reading> readings;
     for (std::size_t n = queue->size() > kFollowed ? queue->size() - kFollowed : 0;
          n < queue->size(); ++n) {
       const Measured& m = (*queue)[n];
       const Pose X = edge ? edge->predict(m.displacements) : schema.X_CR;
-      const auto [seen, information] = displaced(X, m.of, left);
+      const auto [seen, information] =
+          displaced(link_poses(edge, m.displacements, X)[link], X, m.of);
       T.push_back(seen);
       readings.push_back(
           {static_cast<double>(m.sample_index - now), Vector6d::Zero(), information});
@@ -351,7 +357,7 @@ std::optional<Drift> DriftWatch::follow(const BodySchema& schema, int part) cons
                           (course.line.covariance.topLeftCorner<6, 6>() + off * off.transpose());
     }
     drift.part = part;
-    drift.left = left;
+    drift.link = static_cast<int>(link);
     drift.T = reference * exp(mean);
     drift.rate = line.ab.tail<6>();
     drift.rate_covariance = line.covariance.bottomRightCorner<6, 6>();
@@ -363,13 +369,13 @@ std::optional<Drift> DriftWatch::follow(const BodySchema& schema, int part) cons
 
 BodySchema Drift::applied_to(const BodySchema& before) const {
   // `covariance` is that of a right perturbation of T: near enough to that of θ.
-  return changed(before, drift_step(before, part, left), coordinates(T),
+  return changed(before, drift_step(before, part, link), coordinates(T),
                  covariance + (1 - has_ended) * rate * rate.transpose());
 }
 
 double BegunDrift::log_likelihood(const BodySchema& before, const MeasurementModel& measurement,
                                   const std::vector<const ActionPoseSample*>& samples) const {
-  const BodyChange change = drift_step(before, drift.part, drift.left);
+  const BodyChange change = drift_step(before, drift.part, drift.link);
   std::vector<const ActionPoseSample*> unmoved;
   double sum = 0;
   for (const ActionPoseSample* sample : samples) {
@@ -392,12 +398,12 @@ std::vector<BegunDrift> begun_drifts(const BodySchema& before, const Measurement
   struct Places {
     int part, node;
     const Edge* edge;
-    std::vector<Reading> right, left;
+    std::vector<std::vector<Reading>> links;
   };
   std::vector<Places> places;
   for (const int part : parts)
     if (const int node = filter.node_of(part); node >= 0)
-      places.push_back({part, node, edge_to(before, part), {}, {}});
+      places.push_back({part, node, edge_to(before, part), {}});
   std::vector<BegunDrift> result;
   if (samples.empty()) return result;
   for (const ActionPoseSample* sample : samples) {
@@ -407,11 +413,12 @@ std::vector<BegunDrift> begun_drifts(const BodySchema& before, const Measurement
       const auto of = filter.measure_edge(instant, place.node);
       if (!of) continue;
       const Pose X = place.edge ? place.edge->predict(displacements) : before.X_CR;
-      for (const bool left : {false, true}) {
-        if (left && (!place.edge || place.edge->joints.empty())) continue;
-        const auto [T, information] = displaced(X, *of, left);
-        (left ? place.left : place.right)
-            .push_back({static_cast<double>(sample->sample_index), log(T), information});
+      place.links.resize(num_links(place.edge));
+      const std::vector<Pose> poses = link_poses(place.edge, displacements, X);
+      for (std::size_t link = 0; link < poses.size(); ++link) {
+        const auto [T, information] = displaced(poses[link], X, *of);
+        place.links[link].push_back(
+            {static_cast<double>(sample->sample_index), log(T), information});
       }
     }
   }
@@ -419,9 +426,8 @@ std::vector<BegunDrift> begun_drifts(const BodySchema& before, const Measurement
   const std::int64_t earliest = std::max(since - kLongestUnseen, samples.front()->sample_index - 1);
   for (const Places& place : places) {
     std::optional<BegunDrift> best;
-    for (const bool left : {false, true}) {
-      const std::vector<Reading>& readings = left ? place.left : place.right;
-      if (readings.empty()) continue;
+    for (std::size_t link = place.links.size(); link-- > 0;) {
+      const std::vector<Reading>& readings = place.links[link];
       const auto try_begin = [&](std::int64_t begin) -> std::optional<double> {
         const auto line =
             fit_begun(readings, static_cast<double>(begin), static_cast<double>(since));
@@ -429,7 +435,7 @@ std::vector<BegunDrift> begun_drifts(const BodySchema& before, const Measurement
         if (best && line->gain <= best->gain) return line->gain;
         best.emplace();
         best->drift.part = place.part;
-        best->drift.left = left;
+        best->drift.link = static_cast<int>(link);
         best->drift.rate = line->rate;
         best->drift.rate_covariance = line->covariance;
         best->drift.significance = squared_mahalanobis(line->rate, line->covariance);

@@ -10,11 +10,10 @@
 
 namespace bodyschema {
 
-/// An edge that changes all the time: T(t) on one side of its model, linear in the number of
-/// samples.
+/// An edge that changes all the time: T(t) in one of its links, linear in the number of samples.
 struct Drift {
   int part = 0;
-  bool left = false;                       ///< T · Δ; else Δ · T
+  int link = 0;                            ///< as BodyChange::at
   Pose T = Pose::Identity();               ///< now
   Matrix6d covariance = Matrix6d::Zero();  ///< of T, right perturbation
   Vector6d rate = Vector6d::Zero();        ///< of log T a sample

@@ -9,13 +9,14 @@ namespace bodyschema {
 
 using Kind = AdaptationEvent::Kind;
 
-AdaptationEvent HypothesisTracker::event(Kind kind, std::int64_t sample, const Place& place) const {
+AdaptationEvent HypothesisTracker::event(Kind kind, std::int64_t sample,
+                                         const ElementId& element) const {
   AdaptationEvent result;
   result.kind = kind;
   result.sample_index = sample;
-  const Edge* edge = edge_to(settled_, place.part);
-  if (place.marker || !edge) {
-    result.part = place.part;
+  const Edge* edge = edge_to(settled_, element.id);
+  if (element.is_tag() || !edge) {
+    result.part = element.id;
   } else {
     result.from = edge->from;
     result.to = edge->to;
@@ -29,15 +30,15 @@ void HypothesisTracker::tell(Kind kind, std::int64_t sample, const Hypothesis& o
   const Replacement& what = change.what;
   const FittedChange& fitted = what.fitted;
   BodySchema base = composed(of.changes, static_cast<std::size_t>(&change - of.changes.data()));
-  if (fitted.origin) base = with_edge_of(base, *fitted.origin, what.place.part);
-  std::vector<Place> places{what.place};
-  places.insert(places.end(), what.also.begin(), what.also.end());
-  for (const Place& place : places) {
-    AdaptationEvent told = event(kind, sample, place);
+  if (fitted.origin) base = with_edge_of(base, *fitted.origin, what.element.id);
+  std::vector<ElementId> elements{what.element};
+  elements.insert(elements.end(), what.also.begin(), what.also.end());
+  for (const ElementId& element : elements) {
+    AdaptationEvent told = event(kind, sample, element);
     BodyChange there = fitted.change;
-    there.part = place.part;
+    there.part = element.id;
     told.cause = there.cause(settled_);
-    if (place == what.place)
+    if (element == what.element)
       told.size = size_of(base, fitted.change, fitted.theta, fitted.covariance);
     told.margin = margin;
     told.since = change.since;
@@ -51,11 +52,11 @@ void HypothesisTracker::tell_difference(const Hypothesis& before, const Hypothes
                                         std::vector<AdaptationEvent>* events) const {
   const double margin = after.log_odds - before.log_odds;
   for (const Change& c : before.changes)
-    if (last_at(before.changes, c.what.place) == &c && !last_at(after.changes, c.what.place))
+    if (last_at(before.changes, c.what.element) == &c && !last_at(after.changes, c.what.element))
       tell(Kind::kReverted, sample, before, c, margin, events);
   for (const Change& c : after.changes) {
-    if (last_at(after.changes, c.what.place) != &c) continue;
-    const Change* old = last_at(before.changes, c.what.place);
+    if (last_at(after.changes, c.what.element) != &c) continue;
+    const Change* old = last_at(before.changes, c.what.element);
     if (old && is_same_change(*old, c)) continue;
     const auto is_old = [old](const Change& other) { return is_same_change(other, *old); };
     const bool is_superseded =

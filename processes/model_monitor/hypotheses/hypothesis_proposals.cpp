@@ -1,4 +1,4 @@
-// What HypothesisTracker proposes: changes more, changes in another form or place, edges learned
+// What HypothesisTracker proposes: changes more, changes in another form or element, edges learned
 // anew; and which action would tell two explanations apart.
 
 #include <algorithm>
@@ -33,7 +33,8 @@ bool is_worth_learning(std::int64_t age) {
 
 }  // namespace
 
-FoundChanges HypothesisTracker::search(const BodySchema& base, const std::vector<Place>& places,
+FoundChanges HypothesisTracker::search(const BodySchema& base,
+                                       const std::vector<ElementId>& elements,
                                        const std::vector<const ActionPoseSample*>& samples,
                                        const BodyChange* standing_form) {
   ChangeSearch search{measurement_, options_.ambiguity};
@@ -41,24 +42,24 @@ FoundChanges HypothesisTracker::search(const BodySchema& base, const std::vector
     search.standing_form = *standing_form;
     search.learn = standing_form->is_learned();
   }
-  FoundChanges found = find_changes(base, history_, places, samples, search);
+  FoundChanges found = find_changes(base, history_, elements, samples, search);
   work_budget_ -= found.work;
   return found;
 }
 
 void HypothesisTracker::propose_more(std::int64_t now) {
-  const std::vector<Place> places = suspects();
-  if (places.empty() || work_budget_ <= 0) return;
+  const std::vector<ElementId> elements = suspects();
+  if (elements.empty() || work_budget_ <= 0) return;
   const std::int64_t since = tests_->highest().cusum.since;
   if (!is_worth_a_fit(now - since + 1)) return;
   const FoundChanges found =
-      search(schema(), places, segment(since, options_.longest_segment), nullptr);
+      search(schema(), elements, segment(since, options_.longest_segment), nullptr);
   for (const auto* one : {&found.best, &found.runner_up}) {
     if (!*one) continue;
     std::vector<Change> changes = this->changes();
     Change change{**one, since, now};
-    // It takes the place of an earlier one there, which holds until then.
-    const bool is_again = !change.what.place.marker && last_at(changes, change.what.place);
+    // It takes the element of an earlier one there, which holds until then.
+    const bool is_again = !change.what.element.is_tag() && last_at(changes, change.what.element);
     if (is_again && !change.what.fitted.origin) change.what.fitted.origin = schema();
     changes.push_back(std::move(change));
     Hypothesis more = made_of(std::move(changes));
@@ -72,20 +73,20 @@ void HypothesisTracker::propose_more(std::int64_t now) {
 }
 
 void HypothesisTracker::propose_learned(std::int64_t now) {
-  const std::vector<Place> places = suspects();
+  const std::vector<ElementId> elements = suspects();
   const std::int64_t since = trouble_since();
-  if (places.empty() || !(detected_ || now - last_mismatch_ < kUnexplained) ||
+  if (elements.empty() || !(detected_ || now - last_mismatch_ < kUnexplained) ||
       !is_worth_learning(now - since + 1))
     return;
   std::vector<int> parts;
-  const auto add = [&](const Place& place) {
-    const bool is_new = std::find(parts.begin(), parts.end(), place.part) == parts.end();
-    if (!place.marker && edge_to(settled_, place.part) && is_new) parts.push_back(place.part);
+  const auto add = [&](const ElementId& element) {
+    const bool is_new = std::find(parts.begin(), parts.end(), element.id) == parts.end();
+    if (!element.is_tag() && edge_to(settled_, element.id) && is_new) parts.push_back(element.id);
   };
-  for (const Change& c : changes()) add(c.what.place);
-  for (const auto& [place, last] : mismatched_)
-    if (last >= since) add(place);
-  add(places.front());
+  for (const Change& c : changes()) add(c.what.element);
+  for (const auto& [element, last] : mismatched_)
+    if (last >= since) add(element);
+  add(elements.front());
   const auto samples = segment(since, options_.longest_segment);
   const auto newest = segment(now - kNewest + 1, kNewest);
   const double of_newest = log_likelihood(schema(), measurement_, newest);
@@ -93,16 +94,16 @@ void HypothesisTracker::propose_learned(std::int64_t now) {
     // The other edges as they were, or as they are now.
     std::vector<std::vector<Change>> rests{{}};
     std::vector<Change> others = changes();
-    std::erase_if(others, [part](const Change& c) { return c.what.place.part == part; });
+    std::erase_if(others, [part](const Change& c) { return c.what.element.id == part; });
     if (!others.empty()) rests.push_back(std::move(others));
     for (const std::vector<Change>& rest : rests) {
       const BodySchema base = composed(rest, rest.size());
       const double before = log_odds_of(rest) - log_likelihood(base, measurement_, samples);
-      const PlaceEvidence evidence(base, measurement_, part, false, samples);
+      const PlaceEvidence evidence(base, measurement_, edge_element(part, settled_.root), samples);
       for (FittedChange& learned : evidence.learn()) {
         const double odds = before + learned.log_evidence;
         std::vector<Change> changes = rest;
-        changes.push_back({{{part, false}, std::move(learned)}, since, now});
+        changes.push_back({{edge_element(part, settled_.root), std::move(learned)}, since, now});
         Hypothesis hypothesis = made_of(std::move(changes));
         hypothesis.log_odds = odds;
         // What the body has changed back from meanwhile explains many samples, too.
@@ -116,10 +117,9 @@ void HypothesisTracker::propose_learned(std::int64_t now) {
 void HypothesisTracker::refit(const BodySchema& others, int longest, Change* change) const {
   FittedChange& fitted = change->what.fitted;
   if (fitted.change.size() == 0 || !is_possible(fitted, others)) return;
-  const Place& place = change->what.place;
-  const BodySchema base = fitted.origin ? with_edge_of(others, *fitted.origin, place.part) : others;
-  const PlaceEvidence evidence(base, measurement_, place.part, place.marker,
-                               segment(change->since, longest));
+  const ElementId& element = change->what.element;
+  const BodySchema base = fitted.origin ? with_edge_of(others, *fitted.origin, element.id) : others;
+  const PlaceEvidence evidence(base, measurement_, element, segment(change->since, longest));
   auto again = evidence.fit(fitted.change);
   if (!again) return;
   again->origin = fitted.origin;
@@ -132,14 +132,15 @@ std::optional<Replacement> HypothesisTracker::best_form(const Hypothesis& of, co
                                                         std::int64_t now) {
   const auto samples = segment(change.since, options_.longest_segment);
   const FittedChange& fitted = change.what.fitted;
-  FoundChanges found = search(others, {change.what.place}, samples, &fitted.change);
+  FoundChanges found = search(others, {change.what.element}, samples, &fitted.change);
   const bool is_young = now - change.adopted <= kUnsure && change.what.also.empty() &&
                         !fitted.everywhere && !fitted.change.is_learned();
   if (is_young && of.changes.size() == 1) {
-    std::vector<Place> around = places_around(*of.filter, change.what.place.part);
-    for (const Place& place : suspects_of_settled(change.since))
-      if (std::find(around.begin(), around.end(), place) == around.end()) around.push_back(place);
-    std::erase(around, change.what.place);
+    std::vector<ElementId> around = elements_around(*of.filter, change.what.element.id);
+    for (const ElementId& element : suspects_of_settled(change.since))
+      if (std::find(around.begin(), around.end(), element) == around.end())
+        around.push_back(element);
+    std::erase(around, change.what.element);
     FoundChanges there = search(others, around, samples, nullptr);
     if (there.best && (!found.best || there.best->fitted.log_evidence >
                                           found.best->fitted.log_evidence + options_.acceptance))
@@ -162,7 +163,7 @@ HypothesisTracker::Hypothesis HypothesisTracker::fitted_again(Hypothesis hypothe
     bool is_changed = false;
     for (std::size_t n = 0; n < changes.size();) {
       Change& c = changes[n];
-      if (now - c.adopted > longest || last_at(changes, c.what.place) != &c) {
+      if (now - c.adopted > longest || last_at(changes, c.what.element) != &c) {
         ++n;
         continue;
       }
@@ -223,12 +224,12 @@ void HypothesisTracker::want_probe(std::int64_t now, std::vector<AdaptationEvent
     const Replacement& other = rival.changes.back().what;
     const double lead = std::abs(log_odds() - rival.log_odds);
     // Of two functions the samples to come decide.
-    if (lead > options_.ambiguity || one.place != other.place || is_same_explanation(one, other) ||
-        one.fitted.change.is_learned() || is_asked(one, other))
+    if (lead > options_.ambiguity || one.element != other.element ||
+        is_same_explanation(one, other) || one.fitted.change.is_learned() || is_asked(one, other))
       continue;
     const Eigen::VectorXd probe = most_telling_action(schema(), rival.body, options_.tolerance);
     if (probe.size() == 0) continue;
-    AdaptationEvent wanted = event(Kind::kProbeWanted, now, one.place);
+    AdaptationEvent wanted = event(Kind::kProbeWanted, now, one.element);
     wanted.cause = one.fitted.change.cause(settled_);
     wanted.other_cause = other.fitted.change.cause(settled_);
     if (wanted.other_cause == wanted.cause) wanted.other_cause.clear();

@@ -29,8 +29,8 @@ constexpr int kMaturing = 10;
 constexpr int kWorkPerSample = 4;
 constexpr int kMostWork = 1000;
 
-bool is_in_places(const std::vector<Place>& places, const Place& place) {
-  return std::find(places.begin(), places.end(), place) != places.end();
+bool is_in(const std::vector<ElementId>& elements, const ElementId& element) {
+  return std::find(elements.begin(), elements.end(), element) != elements.end();
 }
 
 }  // namespace
@@ -78,7 +78,7 @@ void HypothesisTracker::set_history(std::vector<BodySchema> history) {
   remember(settled_);
 }
 
-std::vector<Place> HypothesisTracker::suspects() const {
+std::vector<ElementId> HypothesisTracker::suspects() const {
   return tests_->suspects(filter(), options_.suspicion);
 }
 
@@ -119,9 +119,9 @@ std::vector<ActionPoseSample> HypothesisTracker::recent() const {
 }
 
 const HypothesisTracker::Change* HypothesisTracker::last_at(const std::vector<Change>& changes,
-                                                            const Place& place) {
+                                                            const ElementId& element) {
   for (auto c = changes.rbegin(); c != changes.rend(); ++c)
-    if (c->what.place == place) return &*c;
+    if (c->what.element == element) return &*c;
   return nullptr;
 }
 
@@ -139,7 +139,7 @@ SequentialTests HypothesisTracker::tests_of(const TreeFilter& filter, std::int64
 
 void HypothesisTracker::begin_tests(std::int64_t since) { tests_ = tests_of(filter(), since); }
 
-std::vector<Place> HypothesisTracker::suspects_of_settled(std::int64_t since) const {
+std::vector<ElementId> HypothesisTracker::suspects_of_settled(std::int64_t since) const {
   return tests_of(*settled_filter_, since).suspects(*settled_filter_, options_.suspicion);
 }
 
@@ -225,7 +225,7 @@ double HypothesisTracker::needed_lead(const Hypothesis& other, std::int64_t now)
   const auto is_learned = [](const Change& c) { return c.what.fitted.change.is_learned(); };
   bool is_new = other.changes.size() > changes().size();
   for (const Change& c : other.changes) {
-    is_new |= !last_at(changes(), c.what.place);
+    is_new |= !last_at(changes(), c.what.element);
     is_new |= is_learned(c) && std::none_of(changes().begin(), changes().end(), is_learned);
     if (is_soft_ && now - c.since + 1 < kFewestSoft) return std::numeric_limits<double>::infinity();
   }
@@ -256,7 +256,7 @@ void HypothesisTracker::stand(Hypothesis next, std::int64_t now,
   for (Change& c : next.changes) {
     const auto standing_one =
         std::find_if(changes().begin(), changes().end(), [&](const Change& other) {
-          return other.what.place == c.what.place && other.since == c.since;
+          return other.what.element == c.what.element && other.since == c.since;
         });
     c.adopted = standing_one == changes().end() ? now : standing_one->adopted;
     is_another |= standing_one == changes().end() || !is_same_change(*standing_one, c);
@@ -266,14 +266,13 @@ void HypothesisTracker::stand(Hypothesis next, std::int64_t now,
     return;
   }
   if (next.changes.size() > changes().size() && !(detected_ && is_told_)) {
-    AdaptationEvent mismatch = event(Kind::kMismatch, now, next.changes.back().what.place);
+    AdaptationEvent mismatch = event(Kind::kMismatch, now, next.changes.back().what.element);
     mismatch.since = next.changes.back().since;
     mismatch.num_samples = static_cast<int>(now - mismatch.since + 1);
     mismatch.margin = tests_->highest().cusum.value;
-    if (next.changes.back().what.place == Place{settled_.root, false})
-      mismatch.cause = "camera_moved";
+    if (next.changes.back().what.element.is_camera()) mismatch.cause = "camera_moved";
     events->push_back(mismatch);
-    note_mismatch(next.changes.back().what.place, now);
+    note_mismatch(next.changes.back().what.element, now);
   }
   tell_difference(standing(), next, now, events);
   std::int64_t since = std::numeric_limits<std::int64_t>::max();
@@ -288,8 +287,8 @@ void HypothesisTracker::stand(Hypothesis next, std::int64_t now,
 }
 
 void HypothesisTracker::detect(std::int64_t now, std::vector<AdaptationEvent>* events) {
-  const std::vector<Place> places = suspects();
-  if (places.empty()) {
+  const std::vector<ElementId> elements = suspects();
+  if (elements.empty()) {
     if (detected_ && is_told_) {
       events->push_back(event(Kind::kRecovered, now, *detected_));
       events->back().cause = "unexplained";
@@ -301,7 +300,7 @@ void HypothesisTracker::detect(std::int64_t now, std::vector<AdaptationEvent>* e
   if (cusum.value <= tests_->alarm() || (detected_ && is_told_)) return;
   // What a young explanation leaves elsewhere may be its own fault.
   const auto is_beside = [&](const Change& c) {
-    return is_in_places(places_around(filter(), c.what.place.part), places.front());
+    return is_in(elements_around(filter(), c.what.element.id), elements.front());
   };
   if (!changes().empty() && now - newest_adopted() <= kUnexplained &&
       std::none_of(changes().begin(), changes().end(), is_beside))
@@ -311,11 +310,11 @@ void HypothesisTracker::detect(std::int64_t now, std::vector<AdaptationEvent>* e
   const bool is_rising = !detected_ || cusum.value > std::min(unreported_, tests_->ceiling());
   is_told_ =
       is_rising && (cusum.value - second > kClearLead || now - cusum.since >= kLongestUnclear);
-  detected_ = places.front();
+  detected_ = elements.front();
   unreported_ = cusum.value;
   if (!is_told_) return;
   AdaptationEvent mismatch = event(Kind::kMismatch, now, *detected_);
-  if (*detected_ == Place{settled_.root, false}) mismatch.cause = "camera_moved";
+  if (detected_->is_camera()) mismatch.cause = "camera_moved";
   mismatch.since = cusum.since;
   mismatch.margin = cusum.value;
   mismatch.num_samples = static_cast<int>(now - cusum.since + 1);
@@ -338,14 +337,14 @@ void HypothesisTracker::drop_stale() {
   if (is_quiet && most == 0) mismatched_.clear();
 }
 
-void HypothesisTracker::note_mismatch(const Place& place, std::int64_t now) {
-  mismatched_[place] = last_mismatch_ = now;
+void HypothesisTracker::note_mismatch(const ElementId& element, std::int64_t now) {
+  mismatched_[element] = last_mismatch_ = now;
 }
 
 void HypothesisTracker::settle(std::int64_t now, std::vector<AdaptationEvent>* events) {
   if (changes().empty() || now - newest_adopted() < options_.settled_after) return;
   for (const Change& c : changes())
-    if (last_at(changes(), c.what.place) == &c) {
+    if (last_at(changes(), c.what.element) == &c) {
       const std::size_t first = events->size();
       tell(Kind::kRecovered, now, standing(), c, 0, events);
       for (std::size_t n = first; n < events->size(); ++n)
@@ -371,7 +370,7 @@ void HypothesisTracker::mature(std::int64_t now) {
   settled_ = maturing_->base;
   for (std::size_t n = 0; n < maturing_->changes.size(); ++n) {
     Change& c = maturing_->changes[n];
-    if (last_at(maturing_->changes, c.what.place) == &c)
+    if (last_at(maturing_->changes, c.what.element) == &c)
       refit(composed(maturing_->changes, n), options_.matured_after, &c);
   }
   const SequentialTests tests = *tests_;
@@ -392,7 +391,7 @@ void HypothesisTracker::take_back_all(std::int64_t sample, std::vector<Adaptatio
   begin(BodySchema(settled_), measurement_);
 }
 
-void HypothesisTracker::take_back(const std::function<bool(const Place&)>& is_at,
+void HypothesisTracker::take_back(const std::function<bool(const ElementId&)>& is_at,
                                   std::int64_t since, const Filter& clean, std::int64_t sample,
                                   std::vector<AdaptationEvent>* events) {
   for (Seen& seen : recent_) {
@@ -400,7 +399,7 @@ void HypothesisTracker::take_back(const std::function<bool(const Place&)>& is_at
     clean(&seen.sample);
     seen.settled = settled_filter_->judge(settled_filter_->prepare(seen.sample)).log_likelihood;
   }
-  const auto is_of_it = [&](const Change& c) { return c.since >= since && is_at(c.what.place); };
+  const auto is_of_it = [&](const Change& c) { return c.since >= since && is_at(c.what.element); };
   std::vector<Change> rest = changes();
   std::erase_if(rest, is_of_it);
   Hypothesis next = made_of(std::move(rest));

@@ -20,7 +20,7 @@ namespace bodyschema {
 /// A hypothesis is the settled body with changes on it, oldest first; without any, that nothing
 /// changed. Its weight are log odds against that one: priors of its changes, and of every sample
 /// the log-likelihood ratio of the tree filter. CUSUMs of the standing hypothesis propose others:
-/// one change more, another form or place of one, one less, an edge learned anew.
+/// one change more, another form or element of one, one less, an edge learned anew.
 /// Each sample adds to all weights. Another takes the place of the standing one when it leads by
 /// enough, fitted to all its samples: by `acceptance` for what is new, by nothing for what is less.
 /// Events are the difference of the two. Once a hypothesis has stood unchanged for `settled_after`
@@ -51,9 +51,9 @@ class HypothesisTracker {
   const BodySchema& settled() const { return settled_; }
   const TreeFilter& filter() const { return *standing().filter; }
   const std::vector<Change>& changes() const { return standing().changes; }
-  const std::optional<Place>& detected() const { return detected_; }
+  const std::optional<ElementId>& detected() const { return detected_; }
   const SequentialTests& tests() const { return *tests_; }
-  std::vector<Place> suspects() const;
+  std::vector<ElementId> suspects() const;
   /// The first sample that shows any of what is thought to have changed, or is suspected.
   std::int64_t trouble_since() const;
   /// Of the standing hypothesis over that nothing changed [nats].
@@ -78,12 +78,13 @@ class HypothesisTracker {
   void keep_all();
   /// What stands is taken back, and told; the settled body is what there is.
   void take_back_all(std::int64_t sample, std::vector<AdaptationEvent>* events);
-  /// What stands or is detected in these places, if it began no earlier than `since`, is taken
+  /// What stands or is detected of these elements, if it began no earlier than `since`, is taken
   /// back, and told; `clean` takes from the samples since what was wrong.
-  void take_back(const std::function<bool(const Place&)>& is_at, std::int64_t since,
+  void take_back(const std::function<bool(const ElementId&)>& is_at, std::int64_t since,
                  const Filter& clean, std::int64_t sample, std::vector<AdaptationEvent>* events);
 
-  AdaptationEvent event(AdaptationEvent::Kind kind, std::int64_t sample, const Place& place) const;
+  AdaptationEvent event(AdaptationEvent::Kind kind, std::int64_t sample,
+                        const ElementId& element) const;
 
  private:
   struct Hypothesis {
@@ -106,7 +107,7 @@ class HypothesisTracker {
   /// The same explanation since the same sample.
   static bool is_same_change(const Change& a, const Change& b);
   /// The newest change there, which is the one that holds now.
-  static const Change* last_at(const std::vector<Change>& changes, const Place& place);
+  static const Change* last_at(const std::vector<Change>& changes, const ElementId& element);
   const Hypothesis& standing() const { return beam_.front(); }
   /// The same explanation, whatever its parameters.
   bool is_standing(const std::vector<Change>& changes) const;
@@ -115,7 +116,7 @@ class HypothesisTracker {
   BodySchema composed(const std::vector<Change>& changes, std::size_t without) const;
   /// Σ log priors and log-likelihood ratios of all samples since its first change.
   double log_odds_of(const std::vector<Change>& changes) const;
-  FoundChanges search(const BodySchema& base, const std::vector<Place>& places,
+  FoundChanges search(const BodySchema& base, const std::vector<ElementId>& elements,
                       const std::vector<const ActionPoseSample*>& samples,
                       const BodyChange* standing_form);
   void offer(Hypothesis hypothesis);
@@ -125,7 +126,7 @@ class HypothesisTracker {
   /// Fits every young change again, given the others; with `all_forms` each may become another.
   Hypothesis fitted_again(Hypothesis hypothesis, bool all_forms, int longest, std::int64_t now);
   void refit(const BodySchema& others, int longest, Change* change) const;
-  /// Another form, or place, of a change; std::nullopt if there is none.
+  /// Another form, or element, of a change; std::nullopt if there is none.
   std::optional<Replacement> best_form(const Hypothesis& of, const Change& change,
                                        const BodySchema& others, std::int64_t now);
   double needed_lead(const Hypothesis& other, std::int64_t now) const;
@@ -138,14 +139,14 @@ class HypothesisTracker {
   void want_probe(std::int64_t now, std::vector<AdaptationEvent>* events);
   void detect(std::int64_t now, std::vector<AdaptationEvent>* events);
   void drop_stale();
-  void note_mismatch(const Place& place, std::int64_t now);
+  void note_mismatch(const ElementId& element, std::int64_t now);
   void settle(std::int64_t now, std::vector<AdaptationEvent>* events);
   void mature(std::int64_t now);
   /// CUSUMs of `filter` over the kept samples from `since` on.
   SequentialTests tests_of(const TreeFilter& filter, std::int64_t since) const;
   void begin_tests(std::int64_t since);
   /// Suspected under the settled body by the samples from `since` on.
-  std::vector<Place> suspects_of_settled(std::int64_t since) const;
+  std::vector<ElementId> suspects_of_settled(std::int64_t since) const;
   void set_settled(const BodySchema& settled);
 
   const AdaptationOptions options_;
@@ -158,11 +159,11 @@ class HypothesisTracker {
   std::deque<Seen> recent_;
   std::vector<BodySchema> history_;  ///< the first is pinned
   std::optional<Maturing> maturing_;
-  std::optional<Place> detected_;
+  std::optional<ElementId> detected_;
   bool is_told_ = false;   ///< that and where something was detected
   double unreported_ = 0;  ///< CUSUM at the latest detection [nats]
   std::int64_t last_mismatch_ = -1000;
-  std::map<Place, std::int64_t> mismatched_;  ///< places in the present trouble → the newest
+  std::map<ElementId, std::int64_t> mismatched_;  ///< in the present trouble → the newest
   std::vector<std::pair<Replacement, Replacement>> asked_;  ///< a probe was wanted for
   int work_budget_;  ///< work that may be done now; see kWorkPerSample
 };

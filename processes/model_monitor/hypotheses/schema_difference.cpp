@@ -91,7 +91,7 @@ bool is_alike(const BodySchema& a, const BodySchema& b) {
   return std::ranges::all_of(a.parts, [&](int part) { return is_alike_at(a, b, part); });
 }
 
-std::vector<Place> differences(const BodySchema& a, const BodySchema& b) {
+std::vector<ElementId> differences(const BodySchema& a, const BodySchema& b) {
   Eigen::VectorXd action(static_cast<Eigen::Index>(a.signals.size()));
   for (Eigen::Index s = 0; s < action.size(); ++s) {
     const Signal& signal = a.signals[static_cast<std::size_t>(s)];
@@ -104,7 +104,7 @@ std::vector<Place> differences(const BodySchema& a, const BodySchema& b) {
   std::set<int> edges;
   for (const int part : a.parts)
     if (differ_at(a, b, part)) edges.insert(part);
-  std::vector<Place> places;
+  std::vector<ElementId> elements;
   for (const int part : a.parts) {
     std::vector<int> children;
     for (const Edge& edge : a.edges)
@@ -116,12 +116,12 @@ std::vector<Place> differences(const BodySchema& a, const BodySchema& b) {
              (X_a * pose_in_parent(a, child)).isApprox(X_b * pose_in_parent(b, child), 1e-6);
     });
     if (!only_the_marker) continue;
-    places.push_back({part, true});
+    elements.push_back(tag_element(part));
     edges.erase(part);
     for (const int child : children) edges.erase(child);
   }
-  for (const int part : edges) places.push_back({part, false});
-  return places;
+  for (const int part : edges) elements.push_back(edge_element(part, a.root));
+  return elements;
 }
 
 Eigen::VectorXd most_telling_action(const BodySchema& a, const BodySchema& b,

@@ -20,9 +20,9 @@ bool is_alike_at(const BodySchema& a, const BodySchema& b, int part);
 bool is_close_at(const BodySchema& a, const BodySchema& b, int part, const Noise& tolerance);
 /// One body: alike everywhere.
 bool is_alike(const BodySchema& a, const BodySchema& b);
-/// The places in which they differ: markers first, of parts that lie elsewhere between edges which
-/// together lead to where they led, then edges.
-std::vector<Place> differences(const BodySchema& a, const BodySchema& b);
+/// The elements in which they differ: markers first, of parts that lie elsewhere between edges
+/// which together lead to where they led, then edges.
+std::vector<ElementId> differences(const BodySchema& a, const BodySchema& b);
 /// The action, of 200 in the box of the limits, at which the poses of a part in the root differ
 /// most, in units of `tolerance`; empty if nowhere by more than one.
 Eigen::VectorXd most_telling_action(const BodySchema& a, const BodySchema& b,

@@ -69,37 +69,39 @@ SequentialTests::Highest SequentialTests::highest() const {
   return result;
 }
 
-std::vector<Place> SequentialTests::suspects(const TreeFilter& filter, double suspicion) const {
+std::vector<ElementId> SequentialTests::suspects(const TreeFilter& filter, double suspicion) const {
   struct Scored {
     double value;
-    Place place;
+    ElementId element;
   };
   std::vector<Scored> scored;
   for (int node = 0; node < filter.num_nodes(); ++node) {
-    scored.push_back({edge(node).value, {filter.part(node), false}});
-    scored.push_back({marker(node).value, {filter.part(node), true}});
+    scored.push_back({edge(node).value, edge_element(filter.part(node), filter.part(0))});
+    scored.push_back({marker(node).value, tag_element(filter.part(node))});
   }
   std::erase_if(scored, [suspicion](const Scored& s) { return !(s.value > suspicion); });
   std::stable_sort(scored.begin(), scored.end(),
                    [](const Scored& a, const Scored& b) { return a.value > b.value; });
   if (scored.size() > kMostSuspects) scored.resize(kMostSuspects);
-  std::vector<Place> places;
-  for (const Scored& s : scored) places.push_back(s.place);
-  if (places.empty()) return places;
-  for (const Place& place : places_around(filter, places.front().part))
-    if (std::find(places.begin(), places.end(), place) == places.end()) places.push_back(place);
-  return places;
+  std::vector<ElementId> elements;
+  for (const Scored& s : scored) elements.push_back(s.element);
+  if (elements.empty()) return elements;
+  for (const ElementId& element : elements_around(filter, elements.front().id))
+    if (std::find(elements.begin(), elements.end(), element) == elements.end())
+      elements.push_back(element);
+  return elements;
 }
 
-std::vector<Place> places_around(const TreeFilter& filter, int part) {
-  std::vector<Place> places{{part, false}, {part, true}};
+std::vector<ElementId> elements_around(const TreeFilter& filter, int part) {
+  const auto edge = [&filter](int of) { return edge_element(of, filter.part(0)); };
+  std::vector<ElementId> elements{edge(part), tag_element(part)};
   const int node = filter.node_of(part);
   if (const int parent = filter.parent(node); parent >= 0) {
-    places.push_back({filter.part(parent), false});
-    places.push_back({filter.part(parent), true});
+    elements.push_back(edge(filter.part(parent)));
+    elements.push_back(tag_element(filter.part(parent)));
   }
-  for (const int child : filter.children(node)) places.push_back({filter.part(child), false});
-  return places;
+  for (const int child : filter.children(node)) elements.push_back(edge(filter.part(child)));
+  return elements;
 }
 
 }  // namespace bodyschema

@@ -36,7 +36,7 @@ class SequentialTests {
   Highest highest() const;
   /// The elements whose CUSUMs are above `suspicion`, four at most, the highest first, and what is
   /// next to that one.
-  std::vector<Place> suspects(const TreeFilter& filter, double suspicion) const;
+  std::vector<ElementId> suspects(const TreeFilter& filter, double suspicion) const;
 
   /// CUSUM above which something is wrong even if nothing explains it [nats].
   double alarm() const { return alarm_; }
@@ -53,7 +53,7 @@ class SequentialTests {
 /// ln(2n/α) for n nodes and α false alarms a sample [nats].
 double alarm_threshold(int num_nodes, double false_alarm_rate);
 
-/// A part's places and those next to it.
-std::vector<Place> places_around(const TreeFilter& filter, int part);
+/// A part's elements and those next to it.
+std::vector<ElementId> elements_around(const TreeFilter& filter, int part);
 
 }  // namespace bodyschema

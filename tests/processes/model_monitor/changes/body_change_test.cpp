@@ -46,9 +46,12 @@ TEST_F(BodyChangeTest, EveryFormIsWhatItSays) {
   EXPECT_TRUE(
       of(Form::kGain, Eigen::Vector2d(-0.3, 0.1)).isApprox(by_hand(1.2 * 0.7 * q + 0.1), 1e-12));
   const Pose before = predict(schema_);
-  const Eigen::VectorXd six = random_theta({Form::kLeft, kPart});
-  EXPECT_TRUE(of(Form::kLeft, six).isApprox(transform(six) * before, 1e-12));
-  EXPECT_TRUE(of(Form::kRight, six).isApprox(before * transform(six), 1e-12));
+  const Eigen::VectorXd six = random_theta({Form::kBent, kPart});
+  const auto bent = [&](int link) {
+    return predict(changed(schema_, {Form::kBent, kPart, link}, six));
+  };
+  EXPECT_TRUE(bent(0).isApprox(transform(six) * before, 1e-12));
+  EXPECT_TRUE(bent(1).isApprox(before * transform(six), 1e-12));
   EXPECT_TRUE(of(Form::kRigid, six).isApprox(by_hand(0) * transform(six), 1e-12));
   const Eigen::VectorXd twelve = random_theta({Form::kBoth, kPart});
   EXPECT_TRUE(
@@ -106,7 +109,7 @@ TEST_F(BodyChangeTest, AMovedMarkerMovesItsPartAndNothingElse) {
 }
 
 TEST_F(BodyChangeTest, EveryPossibleChangeKeepsTheEdgesFlatAndTheOthersAsTheyWere) {
-  const auto all = possible_changes(schema_, kPart, false);
+  const auto all = possible_changes(schema_, {ElementId::Kind::kJoint, kPart});
   std::map<Form, int> forms;
   for (const BodyChange& change : all) {
     ++forms[change.form];
@@ -123,8 +126,8 @@ TEST_F(BodyChangeTest, EveryPossibleChangeKeepsTheEdgesFlatAndTheOthersAsTheyWer
     EXPECT_TRUE((prior_of(change, schema_).sigma.array() > 0).all());
     EXPECT_LT(change.log_odds(), 0);
   }
-  for (const Form form : {Form::kStuck, Form::kOffset, Form::kGain, Form::kLeft, Form::kRight,
-                          Form::kBoth, Form::kRigid, Form::kOtherSignal})
+  for (const Form form : {Form::kStuck, Form::kOffset, Form::kGain, Form::kBent, Form::kBoth,
+                          Form::kRigid, Form::kOtherSignal})
     EXPECT_GT(forms[form], 0);
   EXPECT_EQ(forms[Form::kOtherSignal], 6);
 }
@@ -133,7 +136,7 @@ TEST_F(BodyChangeTest, EveryPossibleChangeKeepsTheEdgesFlatAndTheOthersAsTheyWer
 /// uncertain as ∂(prediction)/∂θ, here by central differences, says.
 TEST_F(BodyChangeTest, UncertaintyOfTheParametersIsThatOfThePrediction) {
   schema_.edges[2].joints[0].offset = 0;
-  for (const BodyChange& change : possible_changes(schema_, kPart, false)) {
+  for (const BodyChange& change : possible_changes(schema_, {ElementId::Kind::kJoint, kPart})) {
     if (change.size() == 0) continue;
     SCOPED_TRACE("form " + std::to_string(static_cast<int>(change.form)));
     const Eigen::Index d = change.size();
@@ -173,10 +176,10 @@ TEST_F(BodyChangeTest, ACameraMoves) {
 
 TEST_F(BodyChangeTest, EveryFormSaysItsCauseAndItsParameters) {
   constexpr const char* kCauses[] = {
-      "stored",       "joint_stuck",     "joint_offset", "joint_gain", "other_signal",
-      "geometry",     "geometry",        "geometry",     "rigid",      "marker_moved",
-      "camera_moved", "joint_nonlinear", "new_model",    "new_model"};
-  constexpr int kSizes[] = {0, 1, 1, 2, 0, 6, 6, 12, 6, 6, 6, 0, 0, 0};
+      "stored",          "joint_stuck", "joint_offset", "joint_gain",   "other_signal",
+      "geometry",        "geometry",    "rigid",        "marker_moved", "camera_moved",
+      "joint_nonlinear", "new_model",   "new_model"};
+  constexpr int kSizes[] = {0, 1, 1, 2, 0, 6, 12, 6, 6, 6, 0, 0, 0};
   for (std::size_t n = 0; n < std::size(kSizes); ++n) {
     const BodyChange change{static_cast<Form>(n), kPart};
     EXPECT_EQ(change.cause(schema_), kCauses[n]) << n;
@@ -184,7 +187,7 @@ TEST_F(BodyChangeTest, EveryFormSaysItsCauseAndItsParameters) {
   }
   EXPECT_EQ((BodyChange{Form::kStored, schema_.root}.cause(schema_)), "camera_moved");
   BodyChange learned{Form::kFresh, kPart};
-  learned.proximity = 0.5;
+  learned.share = 0.5;
   const double one_input = learned.log_odds();
   learned.second_signal = 3;
   EXPECT_DOUBLE_EQ(one_input, -13 + std::log(0.5));
@@ -193,11 +196,11 @@ TEST_F(BodyChangeTest, EveryFormSaysItsCauseAndItsParameters) {
 
 TEST_F(BodyChangeTest, RefusesPlacesAndParametersThatAreNotThere) {
   const Eigen::VectorXd six = Eigen::VectorXd::Zero(6), one = Eigen::VectorXd::Zero(1);
-  EXPECT_THROW(changed(schema_, {Form::kRight, kPart}, one), std::invalid_argument);
-  EXPECT_THROW(changed(schema_, {Form::kRight, 77}, six), std::invalid_argument);
+  EXPECT_THROW(changed(schema_, {Form::kBent, kPart, 1}, one), std::invalid_argument);
+  EXPECT_THROW(changed(schema_, {Form::kBent, 77, 1}, six), std::invalid_argument);
   EXPECT_THROW(changed(schema_, {Form::kMarkerMoved, 77}, six), std::invalid_argument);
   EXPECT_THROW(changed(schema_, {Form::kStuck, schema_.root}, one), std::invalid_argument);
-  EXPECT_TRUE(possible_changes(schema_, 77, false).empty());
+  EXPECT_TRUE(possible_changes(schema_, {ElementId::Kind::kJoint, 77}).empty());
 }
 
 }  // namespace

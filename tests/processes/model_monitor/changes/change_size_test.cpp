@@ -52,14 +52,14 @@ TEST_F(ChangeSizeTest, OffsetAndGainAreThoseOfTheCommand) {
 
 TEST_F(ChangeSizeTest, AToolIsAsFarAwayAsItIs) {
   const Eigen::VectorXd theta = vector({0.03, 0, 0.04, 0, 0.5, 0});
-  const ChangeSize tool = size({Form::kRight, kPart}, theta);
+  const ChangeSize tool = size({Form::kBent, kPart, 1}, theta);
   EXPECT_EQ(tool.kind, Kind::kPose);
   EXPECT_NEAR(tool.amounts[0], 0.05, 1e-9);
   EXPECT_NEAR(tool.amounts[1], 0.5, 1e-9);
   // Bent before the joint: the part goes as far as its lever says, the angle is the same.
   Vector6d bend = Vector6d::Zero();
   bend(4) = 0.5;
-  const ChangeSize bent = size({Form::kLeft, kPart}, bend);
+  const ChangeSize bent = size({Form::kBent, kPart}, bend);
   Eigen::VectorXd middle = Eigen::VectorXd::Zero(7);
   middle(2) = 1;
   const Pose X = edge_to(schema_, kPart)->predict(schema_.displacements(middle));
@@ -107,12 +107,13 @@ TEST_F(ChangeSizeTest, WhatHasNoParametersHasNoSize) {
   EXPECT_EQ(other.signal, 5);
   // A joint that is not there, an edge that is not there.
   EXPECT_EQ(size({Form::kStuck, kPart, 3}, vector({1})).kind, Kind::kUnknown);
-  EXPECT_EQ(size({Form::kRight, 99}, Vector6d::Zero()).kind, Kind::kUnknown);
+  EXPECT_EQ(size({Form::kBent, 99, 1}, Vector6d::Zero()).kind, Kind::kUnknown);
 }
 
 TEST_F(ChangeSizeTest, WhatTwoModelsDifferByIsTheChangeBetweenThem) {
   const auto between = [&](const BodyChange& change, const Eigen::VectorXd& theta) {
-    return difference_at(schema_, changed(schema_, change, theta), {kPart, false});
+    return difference_at(schema_, changed(schema_, change, theta),
+                         {ElementId::Kind::kJoint, kPart});
   };
   const FoundDifference stuck = between({Form::kStuck, kPart}, vector({0.9}));
   EXPECT_EQ(stuck.cause, "joint_stuck");
@@ -120,7 +121,7 @@ TEST_F(ChangeSizeTest, WhatTwoModelsDifferByIsTheChangeBetweenThem) {
   EXPECT_EQ(between({Form::kOffset, kPart}, vector({0.6})).cause, "joint_offset");
   EXPECT_NEAR(between({Form::kGain, kPart}, vector({-0.3, 0.1})).size.amounts[0], 0.7, 1e-12);
   const Eigen::VectorXd theta = vector({0.03, 0, 0.04, 0, 0.5, 0});
-  const FoundDifference tool = between({Form::kRight, kPart}, theta);
+  const FoundDifference tool = between({Form::kBent, kPart, 1}, theta);
   EXPECT_EQ(tool.cause, "geometry");
   EXPECT_NEAR(tool.size.amounts[0], 0.05, 1e-9);
 }

@@ -12,17 +12,17 @@ class DriftChangeTest : public ChangedArm {
 
 TEST_F(DriftChangeTest, ARateIsHowFarItsStepGoesInASample) {
   const Vector6d rate = 0.01 * test::gaussian6(rng_);
-  for (const auto& [part, left, form] : {std::tuple{kPart, false, Form::kRight},
-                                         {kPart, true, Form::kLeft},
-                                         {schema_.root, false, Form::kCamera}}) {
+  for (const auto& [part, link, form] : {std::tuple{kPart, 1, Form::kBent},
+                                         {kPart, 0, Form::kBent},
+                                         {schema_.root, 0, Form::kCamera}}) {
     SCOPED_TRACE(static_cast<int>(form));
-    const BodyChange step = drift_step(schema_, part, left);
-    EXPECT_EQ(step, (BodyChange{form, part}));
+    const BodyChange step = drift_step(schema_, part, link);
+    EXPECT_EQ(step, (BodyChange{form, part, link}));
     const BodySchema now = changed(schema_, step, coordinates(exp(rate)));
     const Vector6d moved = part == kPart
                                ? log(pose_at(schema_, part).inverse() * pose_at(now, part))
                                : log(schema_.X_CR.inverse() * now.X_CR);
-    const ChangeSize size = size_of_rate(schema_, part, left, rate, 1e-8 * rate * rate.transpose());
+    const ChangeSize size = size_of_rate(schema_, part, link, rate, 1e-8 * rate * rate.transpose());
     EXPECT_EQ(size.kind, ChangeSize::Kind::kRate);
     EXPECT_NEAR(size.amounts[0], moved.head<3>().norm(), 1e-9);
     EXPECT_NEAR(size.amounts[1], moved.tail<3>().norm(), 1e-9);

@@ -12,6 +12,8 @@ namespace {
 class ChangeFitTest : public ChangedArm {
  protected:
   ChangeFitTest() : ChangedArm(11) {}
+
+  static ElementId edge() { return {ElementId::Kind::kJoint, kPart}; }
 };
 
 /// Also of an edge with something behind its joint, of one that no joint moves any more, of a
@@ -21,10 +23,10 @@ TEST_F(ChangeFitTest, TheResidualsJacobianIsThatOfCentralDifferences) {
   schema_.edges[2].joints[0].gain = 1.2;
   schema_.edges[2].joints[0].slide = 0.05;
   const auto samples = observe(schema_, 5);
-  for (const auto& [part, is_marker] :
-       {std::pair{kPart, false}, {kPart, true}, {schema_.root, false}}) {
-    const PlaceEvidence evidence(schema_, measurement_, part, is_marker, pointers(samples));
-    for (const BodyChange& change : possible_changes(schema_, part, is_marker)) {
+  for (const ElementId& element :
+       {edge(), tag_element(kPart), edge_element(schema_.root, schema_.root)}) {
+    const PlaceEvidence evidence(schema_, measurement_, element, pointers(samples));
+    for (const BodyChange& change : possible_changes(schema_, element)) {
       SCOPED_TRACE("form " + std::to_string(static_cast<int>(change.form)));
       const Eigen::VectorXd theta = random_theta(change);
       Eigen::MatrixXd J;
@@ -64,11 +66,12 @@ TEST_F(ChangeFitTest, EveryChangeIsFoundAgainAndPreferred) {
     const BodySchema truth = changed(schema_, c.change, c.theta);
     const auto samples = observe(truth, 12);
     const int part = c.change.part;
-    const bool is_marker = c.change.form == Form::kMarkerMoved;
-    const PlaceEvidence evidence(schema_, measurement_, part, is_marker, pointers(samples));
+    const ElementId element =
+        c.change.form == Form::kMarkerMoved ? tag_element(part) : edge_element(part, schema_.root);
+    const PlaceEvidence evidence(schema_, measurement_, element, pointers(samples));
     EXPECT_EQ(evidence.num_usable(), 12);
     std::optional<FittedChange> best;
-    for (const BodyChange& change : possible_changes(schema_, part, is_marker)) {
+    for (const BodyChange& change : possible_changes(schema_, element)) {
       auto fitted = evidence.fit(change);
       ASSERT_TRUE(fitted);
       if (!best || fitted->log_evidence > best->log_evidence) best = std::move(fitted);
@@ -85,17 +88,16 @@ TEST_F(ChangeFitTest, AMovedMarkerIsNoMovedPart) {
   const BodyChange change{Form::kMarkerMoved, kPart};
   const auto samples = observe(changed(schema_, change, vector({0.05, 0, 0, 0, 1, 0})), 6);
   const auto marker =
-      PlaceEvidence(schema_, measurement_, kPart, true, pointers(samples)).fit(change);
-  const auto edge = PlaceEvidence(schema_, measurement_, kPart, false, pointers(samples))
-                        .fit({Form::kRight, kPart});
-  EXPECT_GT(marker->log_evidence, edge->log_evidence + 12);
+      PlaceEvidence(schema_, measurement_, tag_element(kPart), pointers(samples)).fit(change);
+  const auto part =
+      PlaceEvidence(schema_, measurement_, edge(), pointers(samples)).fit({Form::kBent, kPart, 1});
+  EXPECT_GT(marker->log_evidence, part->log_evidence + 12);
 }
 
 TEST_F(ChangeFitTest, LaplaceEvidenceIsTheIntegralOverTheParameter) {
   const BodyChange change{Form::kOffset, kPart};
   const auto samples = observe(changed(schema_, change, Eigen::VectorXd::Constant(1, 0.35)), 4);
-  const auto fitted =
-      PlaceEvidence(schema_, measurement_, kPart, false, pointers(samples)).fit(change);
+  const auto fitted = PlaceEvidence(schema_, measurement_, edge(), pointers(samples)).fit(change);
   ASSERT_TRUE(fitted);
   const double sigma = prior_of(change, schema_).sigma(0);
   const double peak = fitted->theta(0), width = std::sqrt(fitted->covariance(0, 0));
@@ -116,20 +118,22 @@ TEST_F(ChangeFitTest, LaplaceEvidenceIsTheIntegralOverTheParameter) {
 TEST_F(ChangeFitTest, AHealthyBodyIsBetterThanAnyChange) {
   const auto samples = observe(schema_, 12);
   const double null = log_likelihood(schema_, measurement_, pointers(samples));
-  for (const bool marker : {false, true}) {
-    const PlaceEvidence evidence(schema_, measurement_, kPart, marker, pointers(samples));
-    for (const BodyChange& change : possible_changes(schema_, kPart, marker))
+  for (const ElementId& element : {edge(), tag_element(kPart)}) {
+    const PlaceEvidence evidence(schema_, measurement_, element, pointers(samples));
+    for (const BodyChange& change : possible_changes(schema_, element))
       EXPECT_LT(evidence.fit(change)->log_evidence, null);
   }
 }
 
 TEST_F(ChangeFitTest, AnOutlierDoesNotTurnTheFit) {
   const Eigen::VectorXd theta = vector({0.2, 0, 0.1, 0.8, -0.5, 0.3});
-  const BodyChange change{Form::kRight, 7};
+  const BodyChange change{Form::kBent, 7, 1};
   auto samples = observe(changed(schema_, change, theta), 6);
   for (PartObservation& o : samples.back().parts)
     if (o.part == 7) o.X_CB = o.X_CB * exp((Vector6d() << 0, 0, 0, 1, 0, 0).finished());
-  const auto fitted = PlaceEvidence(schema_, measurement_, 7, false, pointers(samples)).fit(change);
+  const auto fitted =
+      PlaceEvidence(schema_, measurement_, {ElementId::Kind::kJoint, 7}, pointers(samples))
+          .fit(change);
   ASSERT_TRUE(fitted);
   const Eigen::VectorXd error = fitted->theta - theta;
   EXPECT_LT(error.head<3>().norm(), 0.01);
@@ -138,12 +142,12 @@ TEST_F(ChangeFitTest, AnOutlierDoesNotTurnTheFit) {
 
 TEST_F(ChangeFitTest, TooFewSamplesFitNothing) {
   auto samples = observe(schema_, 1);
-  const PlaceEvidence one(schema_, measurement_, kPart, false, pointers(samples));
+  const PlaceEvidence one(schema_, measurement_, edge(), pointers(samples));
   EXPECT_TRUE(one.fit({Form::kStuck, kPart}));
-  EXPECT_FALSE(one.fit({Form::kRight, kPart}));
+  EXPECT_FALSE(one.fit({Form::kBent, kPart, 1}));
   // Nothing beyond the edge was seen: the sample says nothing of it.
   std::erase_if(samples[0].parts, [](const PartObservation& o) { return o.part >= kPart; });
-  const PlaceEvidence none(schema_, measurement_, kPart, false, pointers(samples));
+  const PlaceEvidence none(schema_, measurement_, edge(), pointers(samples));
   EXPECT_EQ(none.num_usable(), 0);
   EXPECT_FALSE(none.fit({Form::kStuck, kPart}));
 }

@@ -23,14 +23,15 @@ class ChangeSearchTest : public ChangedArm {
     schema_.X_CR_covariance = 1e-6 * Matrix6d::Identity();
     const Eigen::VectorXd bend = vector({0.02, 0, 0, 0, 0.5, 0}),
                           little = vector({5e-4, 0, 0, 0, 0, 0});
-    stored_ = changed(schema_, {Form::kRight, kBent}, bend);
-    stored_ = changed(stored_, {Form::kRight, kOther}, bend);
-    stored_ = changed(stored_, {Form::kRight, kAlmost}, little);
+    stored_ = changed(schema_, {Form::kBent, kBent, 1}, bend);
+    stored_ = changed(stored_, {Form::kBent, kOther, 1}, bend);
+    stored_ = changed(stored_, {Form::kBent, kAlmost, 1}, little);
   }
 
-  FoundChanges find(const std::vector<Place>& places) {
+  static ElementId edge(int part) { return {ElementId::Kind::kJoint, part}; }
+  FoundChanges find(const std::vector<ElementId>& elements) {
     const auto samples = observe(stored_, 3, Vector6d::Constant(1e-3));
-    return find_changes(schema_, {stored_}, places, pointers(samples), {measurement_});
+    return find_changes(schema_, {stored_}, elements, pointers(samples), {measurement_});
   }
 
   const Eigen::VectorXd move_ = vector({0.03, 0, 0.01, 0, 0, 0.3});
@@ -53,17 +54,17 @@ TEST_F(ChangeSearchTest, WhatIsAlikeIsNoDifference) {
 
 TEST_F(ChangeSearchTest, AMarkerThatMovedIsOnePlaceAndNotTheEdgesOnEitherSide) {
   const BodySchema moved = changed(schema_, {Form::kMarkerMoved, kAlmost}, move_);
-  EXPECT_EQ(differences(schema_, moved), (std::vector<Place>{{kAlmost, true}}));
+  EXPECT_EQ(differences(schema_, moved), (std::vector<ElementId>{tag_element(kAlmost)}));
   EXPECT_EQ(differences(schema_, stored_),
-            (std::vector<Place>{{kBent, false}, {kAlmost, false}, {kOther, false}}));
+            (std::vector<ElementId>{edge(kBent), edge(kAlmost), edge(kOther)}));
 }
 
 TEST_F(ChangeSearchTest, OfTwoPlacesThatChangedBackBothAreRestoredAndNothingElse) {
-  const FoundChanges found = find({{kOther, false}, {kBent, false}});
+  const FoundChanges found = find({edge(kOther), edge(kBent)});
   ASSERT_TRUE(found.best);
   EXPECT_EQ(found.best->fitted.change.form, Form::kStored);
-  EXPECT_EQ(found.best->place, (Place{kOther, false}));  // suspected first
-  EXPECT_EQ(found.best->also, (std::vector<Place>{{kBent, false}}));
+  EXPECT_EQ(found.best->element, edge(kOther));  // suspected first
+  EXPECT_EQ(found.best->also, (std::vector<ElementId>{edge(kBent)}));
   EXPECT_GT(found.margin(), 12);
   const BodySchema with = with_change(schema_, found.best->fitted);
   for (const int part : schema_.parts)
@@ -72,10 +73,10 @@ TEST_F(ChangeSearchTest, OfTwoPlacesThatChangedBackBothAreRestoredAndNothingElse
 
 TEST_F(ChangeSearchTest, AMarkerThatIsBackIsOnePlaceThoughBothEdgesChange) {
   stored_ = changed(schema_, {Form::kMarkerMoved, kAlmost}, move_);
-  const FoundChanges found = find({{kAlmost, false}});
+  const FoundChanges found = find({edge(kAlmost)});
   ASSERT_TRUE(found.best);
   EXPECT_EQ(found.best->fitted.change.form, Form::kStored);
-  EXPECT_EQ(found.best->place, (Place{kAlmost, true}));
+  EXPECT_EQ(found.best->element, tag_element(kAlmost));
   EXPECT_TRUE(found.best->also.empty());
 }
 

@@ -30,6 +30,7 @@ class HypothesisTrackerTest : public testing::Test {
     for (int n = 0; n < num_samples; ++n, ++now_)
       tracker_->on_sample(arm_->observe(now_), &events_);
   }
+  static ElementId edge(int part) { return {ElementId::Kind::kJoint, part}; }
   std::ptrdiff_t count(Kind kind) const {
     return std::count_if(events_.begin(), events_.end(),
                          [kind](const AdaptationEvent& e) { return e.kind == kind; });
@@ -52,7 +53,7 @@ TEST_F(HypothesisTrackerTest, NothingChangesWhereNothingChanged) {
 TEST_F(HypothesisTrackerTest, AChangeStandsAndSettlesAfterFortySamples) {
   watch({Fault::kBend, "", 0.85}, kBlock + 5);
   ASSERT_EQ(tracker_->changes().size(), 1U);
-  EXPECT_EQ(tracker_->changes()[0].what.place, (Place{5, false}));
+  EXPECT_EQ(tracker_->changes()[0].what.element, edge(5));
   EXPECT_EQ(tracker_->changes()[0].since, kBlock);
   EXPECT_GT(tracker_->log_odds(), test::adaptation_options(Regime::kTagIso).acceptance);
   EXPECT_EQ(arm_->error(tracker_->settled(), 0), arm_->error(arm_->engineered(), 0));
@@ -71,7 +72,7 @@ TEST_F(HypothesisTrackerTest, AChangeStandsAndSettlesAfterFortySamples) {
 TEST_F(HypothesisTrackerTest, TwoChangesAtOnceStandBesideEachOther) {
   watch({Fault::kTwo, "", 0.85}, kBlock + 12);
   std::vector<int> parts;
-  for (const auto& change : tracker_->changes()) parts.push_back(change.what.place.part);
+  for (const auto& change : tracker_->changes()) parts.push_back(change.what.element.id);
   std::sort(parts.begin(), parts.end());
   EXPECT_EQ(parts, (std::vector<int>{3, 7}));
   EXPECT_LT(arm_->error(tracker_->schema(), now_ - 1), 0.02);
@@ -84,7 +85,7 @@ TEST_F(HypothesisTrackerTest, ANewerChangeOfAPlaceTakesThePlaceOfAnOlderOne) {
   const AdaptationOptions options = test::adaptation_options(Regime::kTagIso);
   tracker_.emplace(arm.engineered(), options.measurement, options, false);
   for (int t = 0; t < 4 * 15; ++t) tracker_->on_sample(arm.observe(t), &events_);
-  for (const auto& change : tracker_->changes()) EXPECT_EQ(change.what.place, (Place{4, false}));
+  for (const auto& change : tracker_->changes()) EXPECT_EQ(change.what.element, edge(4));
   EXPECT_LT(arm.error(tracker_->schema(), 4 * 15 - 1), 0.015);
   EXPECT_EQ(tracker_->trouble_since(), 15);
   // The way back is told as what it is, so that the body holds since then.
@@ -102,7 +103,7 @@ TEST_F(HypothesisTrackerTest, ANewerChangeOfAPlaceTakesThePlaceOfAnOlderOne) {
 TEST_F(HypothesisTrackerTest, WhatIsTakenBackIsToldAndGone) {
   watch({Fault::kBend, "", 0.85}, kBlock + 5);
   std::vector<AdaptationEvent> told;
-  const auto is_it = [](const Place& place) { return place == Place{5, false}; };
+  const auto is_it = [](const ElementId& element) { return element == edge(5); };
   int num_cleaned = 0;
   const auto clean = [&](ActionPoseSample* sample) {
     sample->parts.clear();
