@@ -16,7 +16,7 @@ StructureLearnerConfig StructureLearnerConfig::load(const std::filesystem::path&
   config.signals = signals.signals;
   config.options.root = signals.root_part;
   config.options.expected_parts = load_markers(file.parent_path()).parts();
-  config.options.max_signals = static_cast<int>(yaml.integer("max_signals", 0, 2));
+  config.options.max_signals = static_cast<int>(yaml.integer("max_signals", 0, kMaxChainJoints));
   config.options.measurement = load_noise(file.parent_path()).measurement;
   yaml.finish();
   return config;
