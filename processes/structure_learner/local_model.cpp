@@ -114,8 +114,11 @@ LocalModel LocalModel::inverse() const {
   const int k = num_joints();
   for (int d = k; d-- > 0;) {
     const Pose& X_before = d == 0 ? first : joints[d - 1].X_after;
-    result.joints.push_back(
-        {joints[d].signal, -joints[d].slide, -joints[d].turn, X_before.inverse()});
+    Joint joint = joints[d];
+    joint.slide = -joint.slide;
+    joint.turn = -joint.turn;
+    joint.X_after = X_before.inverse();
+    result.joints.push_back(joint);
   }
   result.first = (k == 0 ? first : joints.back().X_after).inverse();
   return result;
@@ -123,7 +126,10 @@ LocalModel LocalModel::inverse() const {
 
 Pose predict_with_jacobian(const LocalModel& model, const NormalizedActions& actions, int sample,
                            ParameterJacobian* jacobian) {
-  return chain_of(model, actions, sample).predict_by_parameters(jacobian);
+  const Pose X = chain_of(model, actions, sample).predict_by_parameters(jacobian);
+  for (int d = 0; d < model.num_joints(); ++d)
+    if (model.joints[d].slides) jacobian->col(Layout::turn(d)).setZero();
+  return X;
 }
 
 MotionJacobian motion_jacobian(const LocalModel& model, const NormalizedActions& actions,

@@ -23,6 +23,7 @@ struct LocalModel {
     double turn = 0;                  ///< [rad per half range]
     Pose X_after = Pose::Identity();  ///< A_(d+1) of joint d, counted from 0
     int order_group = -1;             ///< as ScrewJoint::order_group
+    bool slides = false;              ///< its turn stays 0 in fits
   };
   Pose first = Pose::Identity();  ///< A_0
   std::vector<Joint> joints;

@@ -40,7 +40,6 @@ struct SourcedNoise : Noise {
 /// kNoiseFloor or above kNoiseCeiling. Of a stream, never above a few times what jumps from frame
 /// to frame. std::nullopt: too few data.
 std::optional<SourcedNoise> estimate_noise(const std::vector<ActionPoseSample>& samples,
-                                           int num_signals,
-                                           int max_signals = kMaxChainJoints);
+                                           int num_signals, int max_signals = kMaxChainJoints);
 
 }  // namespace bodyschema

@@ -55,13 +55,15 @@ std::vector<int> TreeFit::views_of(int node) const {
   return result;
 }
 
-// H with a prior on the gauge: a screw frame may turn about its axis and slide along it, directions
-// on which no prediction depends. They get the variance of a direction that is known well.
+// H with a prior on the gauge: a screw frame may turn about its axis and slide along it, that of a
+// joint that slides anywhere, directions on which no prediction depends. They get the variance of a
+// direction that is known well.
 Eigen::MatrixXd TreeFit::with_fixed_gauge(const Normal& normal) const {
   Eigen::MatrixXd H = normal.H;
   for (int k = 1; k < static_cast<int>(nodes_.size()); ++k)
     for (int d = 0; d < nodes_[k].model.num_joints(); ++d)
-      for (const int component : {2, 5}) {
+      for (const int component : {0, 1, 2, 5}) {
+        if (component < 2 && !nodes_[k].model.joints[d].slides) continue;
         Vector6d before = Vector6d::Zero();
         before(component) = 1;
         const Vector6d after = -adjoint(nodes_[k].model.joints[d].X_after.inverse()) * before;
@@ -160,8 +162,11 @@ std::optional<TreeFit::Covariance> TreeFit::covariance(const MeasurementModel& m
   if (!root_rests_) return std::nullopt;
   const Normal normal = normal_equations();
   const Eigen::MatrixXd H = with_fixed_gauge(normal);
-  const Eigen::VectorXd unit = H.diagonal().cwiseMax(1e-300).cwiseSqrt().cwiseInverse();
-  const Eigen::LLT<Eigen::MatrixXd> llt(unit.asDiagonal() * H * unit.asDiagonal());
+  const Eigen::VectorXd unit = Normal::unit_of(H);
+  Eigen::MatrixXd scaled = unit.asDiagonal() * H * unit.asDiagonal();
+  for (Eigen::Index n = 0; n < unit.size(); ++n)
+    if (unit(n) == 0) scaled(n, n) = 1;
+  const Eigen::LLT<Eigen::MatrixXd> llt(scaled);
   if (llt.info() != Eigen::Success) return std::nullopt;
   const Eigen::MatrixXd inverse = unit.asDiagonal() * llt.solve(Eigen::MatrixXd(unit.asDiagonal()));
   // The prior added to H is a measurement like others.

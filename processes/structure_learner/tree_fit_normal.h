@@ -26,11 +26,15 @@ struct TreeFit::Normal {
 
   double noise_scale() const { return std::max(scale, 0.25); }
 
+  // 1/√ of the diagonal; 0 for parameters that are held.
+  static Eigen::VectorXd unit_of(const Eigen::MatrixXd& H) {
+    return H.diagonal().unaryExpr([](double x) { return x > 0 ? 1 / std::sqrt(x) : 0.0; });
+  }
   // H⁻¹; std::nullopt where there is nothing to invert. The gauge directions of the screws' frames
   // have no information: a ridge leaves them at rest.
   std::optional<Eigen::MatrixXd> inverse() const {
     if (H.rows() == 0) return std::nullopt;
-    const Eigen::VectorXd unit = H.diagonal().cwiseMax(1e-300).cwiseSqrt().cwiseInverse();
+    const Eigen::VectorXd unit = unit_of(H);
     Eigen::MatrixXd scaled = unit.asDiagonal() * H * unit.asDiagonal();
     scaled.diagonal().array() += 1e-9;
     const Eigen::LLT<Eigen::MatrixXd> llt(scaled);

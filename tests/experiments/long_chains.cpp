@@ -1,120 +1,132 @@
-// dev harness
+// Arms of six and seven joints of which base and hand alone are seen: structures that learn()
+// finds, errors of the hand's pose in the base beside the Cramér–Rao bound, and time. Counts right,
+// incomplete and wrong structures, and wrong ones that are called complete; prints Markdown.
+//
+//   long_chains [--robots 40] [--samples 25 40 100] [--gains own|one] [--scrambled]
+//               [--estimate-noise]
+
 #include <CLI/CLI.hpp>
-#include <chrono>
+#include <algorithm>
+#include <cmath>
 #include <cstdio>
+#include <ctime>
 #include <string>
 #include <vector>
 
 #include "common/geometry/angle.h"
 #include "processes/structure_learner/learn.h"
-#include "processes/structure_learner/long_chain/long_chain.h"
-#include "processes/structure_learner/recording/recording.h"
-#include "tests/support/synthetic_robot.h"
+#include "tests/experiments/figures/cramer_rao.h"
+#include "tests/support/random_arm.h"
 
 using namespace bodyschema;
 using namespace bodyschema::test;
 
 namespace {
 
-// Part 1 is the base, part 2 + num_joints − 1 … the hand; all between are hidden.
-SyntheticRobot random_arm(int num_joints, bool own_gains, Rng& rng) {
-  SyntheticRobot robot;
-  robot.X_CR.translation().z() = 2;
-  TrueLink base;
-  base.part = 1;
-  robot.links.push_back(base);
-  for (int j = 0; j < num_joints; ++j) {
-    TrueLink link;
-    link.part = j + 2;
-    link.parent = j + 1;
-    link.X_before = random_pose(rng, 0.05, 0.2);
-    link.X_after = random_pose(rng, 0.05, 0.2);
-    if (j % 2) {  // parallel or orthogonal to the one before
-      link.X_before.linear() = Eigen::AngleAxisd(uniform(rng, 0, 1) < 0.3 ? 0 : M_PI / 2, Eigen::Vector3d::UnitX()).toRotationMatrix();
-      robot.links.back().X_after.linear().setIdentity();
-    }
-    link.signal = j;
-    const double gain = own_gains ? uniform(rng, 0.6, 1.6) * (uniform(rng, 0, 1) < 0.5 ? -1 : 1) : 1;
-    double half = 0.5 * uniform(rng, 60, 240) * kDegree / std::abs(gain);
-    if (uniform(rng, 0, 1) < 0.1) {
-      link.slide = 0.1 * gain;
-      half = 1;
-    } else {
-      link.turn = gain;
-    }
-    link.hidden = j + 1 < num_joints;
-    const double centre = uniform(rng, -0.5, 0.5);
-    link.zero = 0;
-    robot.signals.push_back({"q" + std::to_string(j + 1), centre - half, centre + half, {}});
-    robot.links.push_back(link);
+constexpr Noise kNoise{0.001, 0.3 * kDegree};
+
+double cpu_seconds() { return static_cast<double>(std::clock()) / CLOCKS_PER_SEC; }
+
+struct Row {
+  int num_right = 0, num_right_complete = 0, num_incomplete = 0, num_wrong = 0;
+  int num_wrong_complete = 0;
+  double squared_error = 0, squared_bound = 0;  // of right ones [m²]
+  double seconds = 0, most_seconds = 0;
+};
+
+// Mean squares over actions: of the hand's error, and of the least that is possible.
+void add_errors(const SyntheticRobot& robot, const BodySchema& schema,
+                const std::vector<ActionPoseSample>& samples, Rng& rng, Row* row) {
+  constexpr int kActions = 100;
+  const int hand = robot.links.back().part;
+  experiments::CramerRao bound(robot);
+  for (ActionPoseSample sample : samples) {
+    for (PartObservation& o : sample.parts) o.covariance = isotropic(kNoise);
+    bound.add(sample);
   }
-  return robot;
+  std::vector<Eigen::VectorXd> actions;
+  double squared = 0;
+  for (int n = 0; n < kActions; ++n) {
+    actions.push_back(robot.random_action(rng));
+    const std::map<int, Pose> X_C = robot.poses_in_camera(actions.back());
+    const Pose truth = X_C.at(1).inverse() * X_C.at(hand);
+    const auto found = schema.predict(1, hand, actions.back());
+    squared += (found->X_AB.translation() - truth.translation()).squaredNorm() / kActions;
+  }
+  row->squared_error += squared;
+  row->squared_bound += std::pow(experiments::position_bound_rms(bound, 1, hand, actions), 2);
 }
 
-std::vector<ActionPoseSample> noisy(const SyntheticRobot& robot, int n, Noise noise, Rng& rng) {
-  std::vector<ActionPoseSample> samples = babble(robot, n, {}, rng);
-  for (auto& sample : samples)
-    for (auto& o : sample.parts) {
-      Vector6d e = gaussian6(rng);
-      e.head<3>() *= noise.position_m;
-      e.tail<3>() *= noise.rotation_rad;
-      o.X_CB = o.X_CB * exp(e);
+Row run(const RandomArmOptions& options, int num_robots, int num_samples, bool is_told) {
+  Row row;
+  for (int r = 0; r < num_robots; ++r) {
+    Rng rng(1000 + r);
+    RandomArmOptions arm = options;
+    arm.num_joints = 6 + r % 2;
+    const SyntheticRobot robot = random_arm(arm, rng);
+    const std::vector<ActionPoseSample> samples = noisy_babble(robot, num_samples, kNoise, rng);
+    LearnOptions learning;
+    learning.root = 1;
+    if (is_told) learning.measurement.noise = kNoise;
+    const double start = cpu_seconds();
+    const BodySchema schema = learn(robot.signals, samples, learning).schema;
+    const double seconds = cpu_seconds() - start;
+    row.seconds += seconds / num_robots;
+    row.most_seconds = std::max(row.most_seconds, seconds);
+    const Rightness rightness = judge(schema, robot);
+    row.num_right += rightness == Rightness::kRight;
+    row.num_right_complete += rightness == Rightness::kRight && schema.complete;
+    row.num_incomplete += rightness == Rightness::kIncomplete;
+    row.num_wrong += rightness == Rightness::kWrong;
+    row.num_wrong_complete += rightness == Rightness::kWrong && schema.complete;
+    if (getenv("DBG") && rightness != Rightness::kRight) {
+      std::printf("robot %d N %d: %d complete %d\n", r, num_samples, (int)rightness, schema.complete);
+      for (auto& e : schema.edges) {
+        auto v = judge_chain(e, robot.true_edge(e.from, e.to), robot.signals);
+        std::printf("  %s\n  found:", v.reason.c_str());
+        for (auto& j : e.joints) std::printf(" %d(%.3f %.3f)%s", j.signal + 1, j.turn, j.slide, j.order_group >= 0 ? "o" : "");
+        std::printf("\n  true:");
+        for (auto& l : robot.links) if (l.signal >= 0) std::printf(" %d(%.3f %.3f)", l.signal + 1, l.turn, l.slide);
+        std::printf("\n");
+      }
+      for (auto& u : schema.unconnected) std::printf("  %s\n", u.detail.c_str());
     }
-  return samples;
-}
-
-double now() {
-  return 1e-9 * std::chrono::steady_clock::now().time_since_epoch().count();
-}
-
-void report(const std::vector<ActionPoseSample>& samples, int num_signals, Noise noise, int part_i, int part_j, std::vector<int> order) {
-  const NormalizedActions actions(samples, num_signals);
-  MeasurementModel measurement;
-  measurement.noise = noise;
-  const PairData pair = make_pair_data(samples, part_i, part_j, measurement, 1000);
-  const double t0 = now();
-  auto fit = fit_long_chain(pair, actions, order, JointOrder::kUnknown, 1.414 * noise.rotation_rad);
-  const double t1 = now();
-  if (!fit) { std::printf("none\n"); return; }
-  std::printf("cost/frame %.2f  %.2fs  ", fit->cost / pair.size(), t1 - t0);
-  *fit = without_idle_joints(*fit, pair, actions);
-  *fit = with_settled_order(*fit, pair, actions);
-  const double t2 = now();
-  std::printf("pruned: cost/frame %.2f %.2fs:", fit->cost / pair.size(), t2 - t1);
-  for (auto& j : fit->model.joints) std::printf(" q%d(%.3f,%.3f%s)", j.signal + 1, j.turn, j.slide, j.order_group >= 0 ? " open" : "");
-  std::printf("\n");
+    if (rightness == Rightness::kRight) add_errors(robot, schema, samples, rng, &row);
+  }
+  return row;
 }
 
 }  // namespace
 
 int main(int argc, char** argv) {
-  std::string file;
-  int robots = 10, samples = 40, joints = 7;
-  bool own = false, scrambled = false;
-  CLI::App app;
-  app.add_option("--file", file);
-  app.add_option("--robots", robots);
-  app.add_option("--samples", samples);
-  app.add_option("--joints", joints);
-  app.add_flag("--own", own);
-  app.add_flag("--scrambled", scrambled);
+  int num_robots = 40;
+  std::vector<int> nums_samples = {25, 40, 100};
+  bool is_estimated = false;
+  RandomArmOptions options;
+  std::string gains = "own";
+  CLI::App app("Arms seen at their ends");
+  app.add_option("--robots", num_robots)->check(CLI::PositiveNumber);
+  app.add_option("--samples", nums_samples)->check(CLI::PositiveNumber);
+  app.add_option("--gains", gains, "Of each signal its own, or one for all")
+      ->check(CLI::IsMember({"own", "one"}));
+  app.add_flag("--scrambled", options.scrambled, "Signals are not listed in the joints' order");
+  app.add_flag("--estimate-noise", is_estimated, "Its 1 mm and 0.3° are not told");
   CLI11_PARSE(app, argc, argv);
-  if (!file.empty()) {
-    const Recording r = load_recording(file);
-    std::vector<int> order;
-    for (std::size_t s = 0; s < r.signals.size(); ++s) order.push_back(s);
-    report(r.samples, r.signals.size(), {0.001, 0.2 * kDegree}, 0, 1, order);
-    std::swap(order[0], order[3]); std::swap(order[1], order[6]); std::swap(order[2], order[4]);
-    report(r.samples, r.signals.size(), {0.001, 0.2 * kDegree}, 0, 1, order);
-    return 0;
-  }
-  for (int r = 0; r < robots; ++r) {
-    Rng rng(r + 1);
-    const SyntheticRobot robot = random_arm(joints, own, rng);
-    const auto data = noisy(robot, samples, {0.001, 0.3 * kDegree}, rng);
-    std::vector<int> order;
-    for (int j = 0; j < joints; ++j) order.push_back(j);
-    if (scrambled) std::shuffle(order.begin(), order.end(), rng);
-    report(data, joints, {0.001, 0.3 * kDegree}, 1, joints + 1, order);
+  options.own_gains = gains == "own";
+
+  std::printf(
+      "| gains | order | noise | N | right / incomplete / wrong (complete) | hand, rms | over "
+      "Cramér–Rao | CPU s, mean (largest) |\n| --- | --- | --- | --- | --- | --- | --- | --- |\n");
+  for (const int num_samples : nums_samples) {
+    const Row row = run(options, num_robots, num_samples, !is_estimated);
+    const double num_right = std::max(row.num_right, 1);
+    std::printf("| %s | %s | %s | %d | %d / %d / %d (%d) | %.2f mm | %.2f | %.2f (%.1f) |\n",
+                gains.c_str(), options.scrambled ? "scrambled" : "listed",
+                is_estimated ? "not told" : "told", num_samples, row.num_right, row.num_incomplete,
+                row.num_wrong, row.num_wrong_complete,
+                1000 * std::sqrt(row.squared_error / num_right),
+                std::sqrt(row.squared_error / std::max(row.squared_bound, 1e-30)), row.seconds,
+                row.most_seconds);
+    std::fflush(stdout);
   }
 }

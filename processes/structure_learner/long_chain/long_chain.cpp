@@ -14,7 +14,7 @@ namespace {
 using Eigen::Matrix3d;
 using Eigen::Vector3d;
 
-constexpr int kSearchFrames = 60;
+constexpr int kSearchFrames = 40;
 constexpr int kHeldStarts = 8;
 constexpr int kFreeStarts = 60;  // one in ten succeeds
 constexpr int kOrderRestarts = 3;
@@ -96,8 +96,11 @@ LocalModel place(const ChainRotations& chain, const std::vector<bool>& slides, c
       xi.tail<3>() = chain.axes[j];
     const PlacedScrew placed = PlacedScrew::of(xi, slides[j]);
     model.transform(j) = model.transform(j) * placed.X;
-    model.joints.push_back({chain.signals[j], placed.screw.slide, placed.screw.turn,
-                            placed.X.inverse() * translation(x.segment<3>(3 * (j + 1)))});
+    model.joints.push_back(
+        {.signal = chain.signals[j],
+         .slide = placed.screw.slide,
+         .turn = placed.screw.turn,
+         .X_after = placed.X.inverse() * translation(x.segment<3>(3 * (j + 1)))});
   }
   model.transform(m) = model.transform(m) * rotation(chain.R_end);
   return model;
@@ -217,8 +220,26 @@ LocalModel with_exchanged(const LocalModel& model, int d) {
   return result;
 }
 
-double joint_price(const PairData& pair) {
-  return std::max(3 * std::log(6.0 * pair.size()), kLeastPay * pair.size());
+// Joint d without its turn, in the direction in which it moves what follows it.
+LocalModel with_slide(const LocalModel& model, int d) {
+  LocalModel result = model;
+  LocalModel::Joint& joint = result.joints[d];
+  const Vector3d p = joint.X_after.translation();
+  const Vector3d v = joint.slide * Vector3d::UnitZ() + joint.turn * Vector3d::UnitZ().cross(p);
+  Vector6d xi = Vector6d::Zero();
+  xi.head<3>() = v;
+  const PlacedScrew placed = PlacedScrew::of(xi, true);
+  result.transform(d) = result.transform(d) * translation(p) * placed.X;
+  joint.X_after = placed.X.inverse() * rotation(joint.X_after.linear());
+  joint.slide = v.norm();
+  joint.turn = 0;
+  joint.slides = true;
+  return result;
+}
+
+// What so many parameters must explain to be more than chance (Schwarz 1978) [nats].
+double price(int num_parameters, const PairData& pair) {
+  return 0.5 * num_parameters * std::log(6.0 * pair.size());
 }
 
 }  // namespace
@@ -246,8 +267,17 @@ Fit without_idle_joints(Fit fit, const PairData& pair, const NormalizedActions& 
       Fit without = fit_local_model(without_joint(fit.model, d), pair, actions, 15, 1e-1);
       if (!best || without.cost < best->cost) best = std::move(without);
     }
-    if (best->cost - fit.cost > joint_price(pair)) break;
+    if (best->cost - fit.cost > std::max(price(6, pair), kLeastPay * pair.size())) break;
     fit = fit_local_model(best->model, pair, actions, kFitIterations, 1e-2);
+  }
+  return fit;
+}
+
+Fit with_pure_slides(Fit fit, const PairData& pair, const NormalizedActions& actions) {
+  for (int d = 0; d < fit.model.num_joints(); ++d) {
+    if (fit.model.joints[d].slides || std::abs(fit.model.joints[d].turn) > kMaySlide) continue;
+    Fit sliding = fit_local_model(with_slide(fit.model, d), pair, actions, kFitIterations, 1e-2);
+    if (sliding.cost - fit.cost < price(3, pair)) fit = std::move(sliding);
   }
   return fit;
 }
@@ -256,7 +286,10 @@ Fit with_settled_order(Fit fit, const PairData& pair, const NormalizedActions& a
   const int last = fit.model.num_joints() - 1;
   std::vector<bool> is_open(std::max(last, 0));
   for (int d = 0; d < last; ++d) {
-    Fit other = fit_local_model(with_exchanged(fit.model, d), pair, actions, kFitIterations, 1e-2);
+    const Fit exchanged = evaluate(with_exchanged(fit.model, d), pair, actions);
+    // Joints that commute, as far as the poses tell, have no order.
+    if (std::abs(exchanged.cost - fit.cost) < kSettledMargin) continue;
+    Fit other = fit_local_model(exchanged.model, pair, actions, kFitIterations, 1e-2);
     if (other.cost < fit.cost - kSettledMargin) {
       fit = std::move(other);
       d = std::max(d - 2, -1);  // what is in front may have to move on

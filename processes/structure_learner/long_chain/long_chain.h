@@ -31,6 +31,10 @@ std::optional<Fit> fit_long_chain(const PairData& pair, const NormalizedActions&
 /// `kLeastPay`.
 Fit without_idle_joints(Fit fit, const PairData& pair, const NormalizedActions& actions);
 
+/// Joints that hardly turn slide where the poses do not say otherwise: a small turn about an axis
+/// far away moves alike.
+Fit with_pure_slides(Fit fit, const PairData& pair, const NormalizedActions& actions);
+
 /// Exchanges neighbouring joints while that lowers the cost, and numbers those whose order the
 /// poses leave open: LocalModel::Joint::order_group.
 Fit with_settled_order(Fit fit, const PairData& pair, const NormalizedActions& actions);

@@ -33,7 +33,8 @@ std::optional<Candidate> chain_between(int part_i, int part_j, const std::vector
   std::optional<Fit> fit = fit_long_chain(pair, actions, signals, order, sigma_rad);
   ++pairs->num_fits;
   if (!fit) return std::nullopt;
-  fit = with_settled_order(without_idle_joints(*std::move(fit), pair, actions), pair, actions);
+  fit = without_idle_joints(with_pure_slides(*std::move(fit), pair, actions), pair, actions);
+  fit = with_settled_order(*std::move(fit), pair, actions);
   return pairs->try_start(part_i, part_j, fit->model);
 }
 

@@ -1,0 +1,183 @@
+#include "processes/structure_learner/long_chain/long_chain.h"
+
+#include <gtest/gtest.h>
+
+#include <algorithm>
+#include <numeric>
+
+#include "common/geometry/angle.h"
+#include "processes/structure_learner/learn.h"
+#include "processes/structure_learner/long_chain/chain_rotations.h"
+#include "tests/support/random_arm.h"
+
+namespace bodyschema {
+namespace {
+
+using test::RandomArmOptions;
+using test::Rightness;
+using test::Rng;
+
+constexpr Noise kNoise{0.001, 0.3 * kDegree};
+
+// An arm, its samples and the pair of base and hand.
+struct Case {
+  Case(const RandomArmOptions& options, int num_samples, int seed)
+      : rng(seed),
+        robot(random_arm(options, rng)),
+        samples(noisy_babble(robot, num_samples, kNoise, rng)),
+        actions(samples, options.num_joints),
+        pair(make_pair_data(samples, 1, options.num_joints + 1, {.noise = kNoise}, num_samples)) {}
+
+  std::vector<int> listed() const {
+    std::vector<int> result(robot.signals.size());
+    std::iota(result.begin(), result.end(), 0);
+    return result;
+  }
+  Fit fit(JointOrder order) const {
+    return fit_long_chain(pair, actions, listed(), order, std::sqrt(2.0) * kNoise.rotation_rad)
+        .value();
+  }
+
+  Rng rng;
+  test::SyntheticRobot robot;
+  std::vector<ActionPoseSample> samples;
+  NormalizedActions actions;
+  PairData pair;
+};
+
+std::vector<int> order_of(const LocalModel& model) {
+  std::vector<int> result;
+  for (const LocalModel::Joint& joint : model.joints) result.push_back(joint.signal);
+  return result;
+}
+
+Rightness learned(const test::SyntheticRobot& robot, const std::vector<ActionPoseSample>& samples,
+                  std::optional<Noise> noise) {
+  LearnOptions options;
+  options.root = 1;
+  options.measurement.noise = noise;
+  return judge(learn(robot.signals, samples, options).schema, robot);
+}
+
+TEST(RotationSearch, FindsTheAxesOfAChainInItsListedOrder) {
+  for (const bool own_gains : {true, false}) {
+    const Case c({.share_sliding = 0, .own_gains = own_gains}, 40, 3);
+    RotationSearch search(c.pair, c.actions, 60);
+    const ChainRotations found = search.fit(search.best_of(c.listed(), {}, 60), false, 60);
+    EXPECT_LT(found.median_rad, 1.5 * kDegree);
+    for (int j = 0; j < 7; ++j)
+      EXPECT_NEAR(found.axes[j].norm(),
+                  std::abs(c.robot.links[j + 1].turn) * c.actions.half_range(j), 0.05);
+  }
+}
+
+TEST(RotationSearch, LengthsThatAreHeldStay) {
+  const Case c({}, 30, 1);
+  RotationSearch search(c.pair, c.actions, 60);
+  const std::vector<double> lengths(7, 1.2);
+  const ChainRotations found = search.best_of(c.listed(), lengths, 1);
+  for (const Eigen::Vector3d& axis : found.axes) EXPECT_NEAR(axis.norm(), 1.2, 1e-9);
+}
+
+TEST(LongChain, AJointThatSlidesIsRecognised) {
+  const Case c({.num_joints = 5, .share_sliding = 0.5}, 40, 2);
+  const Fit fit = c.fit(JointOrder::kListed);
+  int num_sliding = 0;
+  for (int j = 0; j < 5; ++j) {
+    const bool slides = c.robot.links[j + 1].slide != 0;
+    num_sliding += slides;
+    EXPECT_EQ(std::abs(fit.model.joints[j].turn) < 0.02, slides) << j;
+  }
+  EXPECT_GT(num_sliding, 0);
+  EXPECT_LT(num_sliding, 5);
+}
+
+TEST(LongChain, TheOrderIsFoundWhereItIsNotThatOfTheSignals) {
+  for (const bool own_gains : {false, true}) {
+    const Case c({.num_joints = 6, .share_sliding = 0, .own_gains = own_gains, .scrambled = true},
+                 60, 4);
+    const Fit fit = with_settled_order(c.fit(JointOrder::kUnknown), c.pair, c.actions);
+    std::vector<int> truth;
+    for (std::size_t n = 1; n < c.robot.links.size(); ++n) truth.push_back(c.robot.links[n].signal);
+    EXPECT_EQ(order_of(fit.model), truth);
+  }
+}
+
+TEST(LongChain, ASignalThatMovesNothingGetsNoJoint) {
+  Case c({.num_joints = 5, .share_sliding = 0}, 40, 5);
+  for (ActionPoseSample& sample : c.samples) {
+    sample.action.conservativeResize(6);
+    sample.action(5) = test::uniform(c.rng, -1, 1);
+  }
+  const NormalizedActions actions(c.samples, 6);
+  const auto all = fit_long_chain(c.pair, actions, {0, 5, 1, 2, 3, 4}, JointOrder::kListed, 0.01);
+  ASSERT_TRUE(all);
+  const Fit fit = without_idle_joints(*all, c.pair, actions);
+  EXPECT_EQ(order_of(fit.model), std::vector<int>({0, 1, 2, 3, 4}));
+}
+
+TEST(LongChain, JointsThatCommuteHaveNoOrder) {
+  // Two joints about one axis, with a third across it.
+  const Case c({.num_joints = 3, .share_sliding = 0}, 30, 6);
+  LocalModel model;
+  model.joints = {{.signal = 0, .turn = 1}, {.signal = 1, .turn = 0.7}, {.signal = 2, .turn = 0.9}};
+  model.joints[1].X_after.linear() =
+      Eigen::AngleAxisd(M_PI / 2, Eigen::Vector3d::UnitX()).toRotationMatrix();
+  model.joints[1].X_after.translation().x() = 0.2;
+  PairData pair = c.pair;
+  for (int t = 0; t < pair.size(); ++t)
+    pair.hypotheses[pair.frames[t].first_hypothesis].z =
+        model.predict(c.actions, pair.frames[t].sample);
+  const Fit fit = with_settled_order(evaluate(model, pair, c.actions), pair, c.actions);
+  EXPECT_EQ(fit.model.joints[0].order_group, 0);
+  EXPECT_EQ(fit.model.joints[1].order_group, 0);
+  EXPECT_EQ(fit.model.joints[2].order_group, -1);
+}
+
+TEST(Learn, FindsArmsOfWhichBaseAndHandAloneAreSeen) {
+  int num_right = 0;
+  for (int seed = 1; seed <= 10; ++seed) {
+    const Case c({.num_joints = 6 + seed % 2}, 40, seed);
+    const Rightness rightness = learned(c.robot, c.samples, kNoise);
+    EXPECT_NE(rightness, Rightness::kWrong) << seed;
+    num_right += rightness == Rightness::kRight;
+  }
+  EXPECT_GE(num_right, 9);
+}
+
+// The residual of a model that is too short is no noise.
+TEST(Learn, NoiseThatIsNotToldIsNotGuessedFromAChainThatIsTooShort) {
+  int num_right = 0;
+  for (int seed = 1; seed <= 10; ++seed) {
+    for (const int num_samples : {15, 60}) {
+      const Case c({.num_joints = 6 + seed % 2}, num_samples, seed);
+      const Rightness rightness = learned(c.robot, c.samples, std::nullopt);
+      EXPECT_NE(rightness, Rightness::kWrong) << seed;
+      num_right += rightness == Rightness::kRight;
+    }
+  }
+  EXPECT_GE(num_right, 9);
+}
+
+TEST(Learn, AChainOfWhichAJointHasNoSignalIsIncomplete) {
+  for (int missing = 0; missing < 6; ++missing) {
+    const Case c({.num_joints = 6, .share_sliding = 0}, 50, 7);
+    std::vector<ActionPoseSample> samples = c.samples;
+    std::vector<Signal> signals = c.robot.signals;
+    signals.erase(signals.begin() + missing);
+    for (ActionPoseSample& sample : samples) {
+      const Eigen::VectorXd all = sample.action;
+      sample.action.resize(5);
+      sample.action << all.head(missing), all.tail(5 - missing);
+    }
+    for (const auto& noise : {std::optional<Noise>(kNoise), std::optional<Noise>()}) {
+      LearnOptions options;
+      options.root = 1;
+      options.measurement.noise = noise;
+      EXPECT_FALSE(learn(signals, samples, options).schema.complete) << missing;
+    }
+  }
+}
+
+}  // namespace
+}  // namespace bodyschema
