@@ -32,7 +32,7 @@ constexpr double kLongestLink = 1;
 constexpr double kRightCost = 8;
 // Nats between two orders that are told apart.
 constexpr double kSettledMargin = 3;
-// Nats a sight: a joint whose effect is below the noise of every single sight is not believed.
+// Nats a sight.
 constexpr double kLeastPay = 0.5;
 
 Pose translation(const Vector3d& p) {
@@ -237,9 +237,10 @@ LocalModel with_slide(const LocalModel& model, int d) {
   return result;
 }
 
-// What so many parameters must explain to be more than chance (Schwarz 1978) [nats].
+// What so many parameters must explain [nats]: more than chance (Schwarz 1978), and more than what
+// is below the noise of every single sight.
 double price(int num_parameters, const PairData& pair) {
-  return 0.5 * num_parameters * std::log(6.0 * pair.size());
+  return std::max(0.5 * num_parameters * std::log(6.0 * pair.size()), kLeastPay * pair.size());
 }
 
 }  // namespace
@@ -267,7 +268,7 @@ Fit without_idle_joints(Fit fit, const PairData& pair, const NormalizedActions& 
       Fit without = fit_local_model(without_joint(fit.model, d), pair, actions, 15, 1e-1);
       if (!best || without.cost < best->cost) best = std::move(without);
     }
-    if (best->cost - fit.cost > std::max(price(6, pair), kLeastPay * pair.size())) break;
+    if (best->cost - fit.cost > price(6, pair)) break;
     fit = fit_local_model(best->model, pair, actions, kFitIterations, 1e-2);
   }
   return fit;
