@@ -213,8 +213,9 @@ class ModelNoise {
     const int num_independent =
         actions_.blocks().count(pair.frames, [](const PairFrame& frame) { return frame.sample; });
     if (m <= kMaxScreenedJoints || m > max_joints || num_independent < kPosesPerJoint * m) return;
-    const auto fit =
-        fit_long_chain(pair, actions_, signals, JointOrder::kUnknown, kLargestRotationNoise);
+    const JointOrder order =
+        actions_.blocks().is_stream() ? JointOrder::kListed : JointOrder::kUnknown;
+    const auto fit = fit_long_chain(pair, actions_, signals, order, kLargestRotationNoise);
     if (!fit) return;
     ScaledFit chain = refine(fit->model, part_i, part_j, kRough);
     if (chain.scale < best->scale - std::log(2.0)) *best = std::move(chain);

@@ -278,7 +278,9 @@ Fit with_pure_slides(Fit fit, const PairData& pair, const NormalizedActions& act
   for (int d = 0; d < fit.model.num_joints(); ++d) {
     if (fit.model.joints[d].slides || std::abs(fit.model.joints[d].turn) > kMaySlide) continue;
     Fit sliding = fit_local_model(with_slide(fit.model, d), pair, actions, kFitIterations, 1e-2);
-    if (sliding.cost - fit.cost < price(3, pair)) fit = std::move(sliding);
+    if (sliding.cost - fit.cost > price(3, pair)) continue;
+    fit = std::move(sliding);
+    d = -1;  // one that it was mixed up with may slide now
   }
   return fit;
 }

@@ -40,12 +40,13 @@ std::optional<Candidate> chain_between(int part_i, int part_j, const std::vector
 
 std::optional<Candidate> best_chain(const std::vector<std::pair<int, int>>& between,
                                     const std::vector<int>& signals, PairModels* pairs) {
-  const bool is_alone = between.size() == 1;
+  // What moves as a stream is often soft: no order is searched for where none may fit.
+  const bool is_searched = between.size() == 1 && !pairs->actions().blocks().is_stream();
   std::optional<Candidate> best;
   const auto rank = [](const Candidate& c) { return std::tuple(c.model.num_joints(), -c.score); };
   for (const auto& [i, j] : between) {
-    std::optional<Candidate> found =
-        chain_between(i, j, signals, is_alone ? JointOrder::kUnknown : JointOrder::kListed, pairs);
+    std::optional<Candidate> found = chain_between(
+        i, j, signals, is_searched ? JointOrder::kUnknown : JointOrder::kListed, pairs);
     if (found && (!best || rank(*found) < rank(*best))) best = std::move(found);
   }
   return best;
@@ -56,6 +57,7 @@ std::optional<Candidate> best_chain(const std::vector<std::pair<int, int>>& betw
 bool connect_long_chains(PairModels* pairs, ModelForest* forest) {
   const int max_joints = std::min(pairs->options().max_signals, kMaxChainJoints);
   if (max_joints <= kMaxScreenedJoints) return false;
+  if (pairs->options().unknown_bias > 0 && pairs->actions().blocks().is_stream()) return false;
   std::map<std::pair<int, int>, std::vector<std::pair<int, int>>> open;  // by components
   for (const auto& [ij, record] : pairs->records())
     if (!forest->connected(ij.first, ij.second) && record.num_common > 0)
