@@ -16,8 +16,9 @@ constexpr int kBasis = 20;
 constexpr int kWarpFrames = 150;      // a pair, evenly chosen
 constexpr int kMaxModelsASignal = 4;  // the most precise ones
 constexpr int kMaxRounds = 12;
-/// Slack along the motion, in half ranges: far more than any warp, far less than the range.
-constexpr double kSlack = 0.3;
+/// Slack along the motion, in half ranges: far more than any warp, far less than the range. Of a
+/// joint, in radians: no more than its motion is straight for.
+constexpr double kSlack = 0.3, kMostSlack_rad = 0.8;
 /// A parameter of a model's own line is free within this many half ranges.
 constexpr double kFree = 10;
 
@@ -26,7 +27,10 @@ PairData with_slack(const PairData& pair, const LocalModel& model,
                     const NormalizedActions& actions) {
   PairData result = pair;
   for (const PairFrame& frame : pair.frames) {
-    const MotionJacobian J = kSlack * motion_jacobian(model, actions, frame.sample);
+    MotionJacobian J = motion_jacobian(model, actions, frame.sample);
+    for (int d = 0; d < model.num_joints(); ++d)
+      J.col(d) *=
+          std::min(kSlack, kMostSlack_rad / std::max(std::abs(model.joints[d].turn), 1e-12));
     for (int n = 0; n < frame.num_hypotheses; ++n) {
       PairHypothesis& h = result.hypotheses[frame.first_hypothesis + n];
       // Whitened, Σ_z is the identity: (1 + V Vᵀ) with V = L⁻¹ J.

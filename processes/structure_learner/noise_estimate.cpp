@@ -7,6 +7,7 @@
 
 #include "common/estimation/quantile.h"
 #include "processes/structure_learner/screen.h"
+#include "processes/structure_learner/turn_scan.h"
 
 namespace bodyschema {
 namespace {
@@ -192,6 +193,8 @@ class ModelNoise {
       if (!regressions.empty())
         offer(refine(one_joint_start(regressions[0], pair, actions_, motions.sigma_rad).model,
                      part_i, part_j, rough));
+      for (const Start& start : screen_wide_joint(pair, actions_, motions))
+        offer(refine(start.model, part_i, part_j, rough));
     } else {
       const RelativeMotions motions = relative_motions(pair, 200);
       const std::vector<std::vector<double>> turns(actions_.num_signals(), default_turns());
