@@ -136,7 +136,8 @@ LearnResult fit_tree(const LearnedStructure& structure,
   const int num_signals = check_actions(samples, structure.signals.size());
   const SearchResult& search = structure.search;
   const MeasurementModel& measurement = structure.measurement;
-  const ValidityOptions validity = search_options_of(options).validity;
+  ValidityOptions validity = search_options_of(options).validity;
+  validity.allows_far_outliers = structure.allows_far_outliers;
 
   LearnResult result;
   result.noise_source = structure.noise_source;
@@ -179,6 +180,21 @@ LearnResult fit_tree(const LearnedStructure& structure,
 }
 
 }  // namespace
+
+std::vector<ActionPoseSample> without_repetitions(const std::vector<ActionPoseSample>& samples) {
+  std::set<std::vector<double>> met;
+  std::vector<ActionPoseSample> result;
+  for (const ActionPoseSample& sample : samples) {
+    std::vector<double> numbers(sample.action.begin(), sample.action.end());
+    for (const PartObservation& o : sample.parts) {
+      numbers.push_back(o.part);
+      const auto X = o.X_CB.matrix();
+      numbers.insert(numbers.end(), X.reshaped().begin(), X.reshaped().end());
+    }
+    if (met.insert(std::move(numbers)).second) result.push_back(sample);
+  }
+  return result;
+}
 
 SourcedNoise marker_noise(const std::vector<ActionPoseSample>& samples, int num_signals,
                           const LearnOptions& options) {
@@ -266,6 +282,7 @@ LearnedStructure find_with_bias(const std::vector<Signal>& signals,
     if (was_spanning) break;
   }
   measurement = result.measurement;
+  result.allows_far_outliers = search_options.validity.allows_far_outliers;
   // With enough noise a screw passes for anything soft: nothing is tried beside it.
   if (unknown_bias == 0 && !is_guess_too_large(result))
     connect_soft_parts(displaced(samples, result.signals), result.actions, parts, search_options,
@@ -278,22 +295,23 @@ LearnedStructure find_with_bias(const std::vector<Signal>& signals,
 LearnedStructure find_structure(const std::vector<Signal>& signals,
                                 const std::vector<ActionPoseSample>& samples,
                                 const LearnOptions& options) {
+  const std::vector<ActionPoseSample> distinct = without_repetitions(samples);
   return confirmed_structure([&](double factor, double unknown_bias) {
     LearnOptions louder = options;
     louder.measurement.scale *= factor;
-    return find_with_bias(signals, samples, louder, unknown_bias);
+    return find_with_bias(signals, distinct, louder, unknown_bias);
   });
 }
 
 LearnResult fit_structure(const LearnedStructure& structure,
                           const std::vector<ActionPoseSample>& samples,
                           const LearnOptions& options) {
-  return fit_tree(structure, samples, options, false);
+  return fit_tree(structure, without_repetitions(samples), options, false);
 }
 
 LearnResult relearn(const LearnedStructure& structure, const std::vector<ActionPoseSample>& samples,
                     const LearnOptions& options) {
-  return fit_tree(structure, samples, options, true);
+  return fit_tree(structure, without_repetitions(samples), options, true);
 }
 
 LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPoseSample>& samples,

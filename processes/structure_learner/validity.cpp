@@ -4,6 +4,7 @@
 #include <cmath>
 
 #include "common/estimation/quantile.h"
+#include "processes/structure_learner/serial_correlation.h"
 
 namespace bodyschema {
 namespace {
@@ -15,6 +16,10 @@ constexpr int kFewFrames = 60;
 // Outliers beyond this multiple of kOutlierThreshold are wild readings: 16 standard deviations.
 // Flips are by twice the tilt of a tag, of which one in twenty is nearer.
 constexpr double kFar = 10;
+// How much noise that lasts explains is known to such a factor at best (chosen).
+constexpr double kLargestLasting = 2;
+// Fewer independent frames do not tell wild readings from a wrong model.
+constexpr int kFewestFarFrames = 20;
 // Share of the frames. At 20 % of wild readings a marker 64 % of a pair's frames are without one;
 // of 60 frames fewer than 24 are once in 10 000 pairs.
 constexpr double kFewestInliers = 0.4;
@@ -61,24 +66,37 @@ Eigen::Matrix<double, 6, Eigen::Dynamic> clipped_residuals(const Fit& fit) {
   return r;
 }
 
+// Of the noise, from one sample to the next; 0 in a stream, whose blocks have it already.
+double serial_correlation(const Fit& fit, const PairData& pair, const NormalizedActions& actions) {
+  if (actions.blocks().is_stream()) return 0;
+  SerialCorrelation series;
+  for (int t = 1; t < pair.size(); ++t)
+    if (pair.frames[t].sample == pair.frames[t - 1].sample + 1)
+      series.add(fit.frames[t - 1], fit.frames[t]);
+  return series.coefficient(pair.size());
+}
+
 // The largest share of the residuals that a signal outside Q explains, over the threshold of V2.
 double explained_excess(const Fit& fit, const PairData& pair, const NormalizedActions& actions,
-                        const ValidityOptions& options, double mean_inlier, double share) {
+                        const ValidityOptions& options, double mean_inlier, double share,
+                        double correlation) {
   const int n = pair.size(), k = fit.model.num_joints();
   const int others = static_cast<int>(actions.moving().size()) - k;
   const Eigen::Matrix<double, 6, Eigen::Dynamic> r = clipped_residuals(fit);
   double bias = 0;
   for (const FrameFit& frame : fit.frames) bias += pair.hypotheses[frame.hypothesis].systematic;
+  std::vector<int> samples;
+  for (const PairFrame& frame : pair.frames) samples.push_back(frame.sample);
+  std::vector<double> q_g(n);
   const bool tensor = k == 1 && n >= 12;
   const int num_features = tensor ? 3 : 1;
   Eigen::MatrixXd F(n, num_features);
-  const double threshold =
-      chi_square_quantile(6 * num_features,
-                          (options.lenient ? 1e-6 : 1.35e-3) / std::max(others, 1)) *
-          std::max(1.0, mean_inlier / 6) / share +
-      // A motion far below the noise of every single frame is no joint but a bias; and all of the
-      // model error may go along with one signal: its variance is ⅓ that of the ends of its range.
-      0.05 * n + bias / 3;
+  const double noise = chi_square_quantile(6 * num_features, (options.lenient ? 1e-6 : 1.35e-3) /
+                                                                 std::max(others, 1)) *
+                       std::max(1.0, mean_inlier / 6) / share;
+  // A motion far below the noise of every single frame is no joint but a bias; and all of the
+  // model error may go along with one signal: its variance is ⅓ that of the ends of its range.
+  const double no_joint = 0.05 * n + bias / 3;
   double largest = 0;
   for (const int g : actions.moving()) {
     if (fit.model.uses(g)) continue;
@@ -94,7 +112,10 @@ double explained_excess(const Fit& fit, const PairData& pair, const NormalizedAc
         F(t, 2) = F(t, 0) * std::sin(theta);
       }
     }
-    if (F.col(0).squaredNorm() > 0) largest = std::max(largest, explained_sum(F, r) / threshold);
+    if (!(F.col(0).squaredNorm() > 0)) continue;
+    Eigen::VectorXd::Map(q_g.data(), n) = F.col(0);
+    const double threshold = noise * variance_inflation(q_g, samples, correlation) + no_joint;
+    largest = std::max(largest, explained_sum(F, r) / threshold);
   }
   return largest;
 }
@@ -148,7 +169,8 @@ Validity check_validity(const Fit& fit, const LeaveOneOut& loo, const PairData& 
       static_cast<int>(0.35 * n));
   // With few frames a true model may meet more outliers than the bound by bad luck: then it is not
   // refuted, only not to be trusted yet.
-  const bool are_far = result.num_near <= max_outliers && inliers >= kFewestInliers * n;
+  const bool are_far = num_independent >= kFewestFarFrames && result.num_near <= max_outliers &&
+                       inliers >= kFewestInliers * n;
   const bool are_allowed = options.allows_far_outliers && are_far;
   const bool suspicious = result.num_outliers > max_outliers && !are_allowed;
   result.doubtful =
@@ -161,7 +183,10 @@ Validity check_validity(const Fit& fit, const LeaveOneOut& loo, const PairData& 
     result.verdict = suspicious ? Verdict::kRefuted : Verdict::kNotEnoughData;
     return result;
   }
-  const double max_mean = largest_inlier_mean(dof / 6, options.lenient ? 5 : 3);
+  const double correlation = serial_correlation(fit, pair, actions);
+  // Squares of noise that lasts: the sum of ρ^2k over all lags either way.
+  const double lasts = (1 + correlation * correlation) / (1 - correlation * correlation);
+  const double max_mean = largest_inlier_mean(dof / 6 / lasts, options.lenient ? 5 : 3);
   if (result.mean_inlier > std::min(max_mean, 0.75 * kOutlierThreshold)) return result;
   result.has_far_outliers = suspicious && are_far;
   if (suspicious && (n >= kFewFrames || 2 * result.num_outliers > n)) {
@@ -173,8 +198,13 @@ Validity check_validity(const Fit& fit, const LeaveOneOut& loo, const PairData& 
   }
 
   // V2
-  result.explained = explained_excess(fit, pair, actions, options, result.mean_inlier, share);
-  if (result.explained > 1) return result;
+  result.explained =
+      explained_excess(fit, pair, actions, options, result.mean_inlier, share, correlation);
+  if (result.explained > 1) {
+    result.is_noise_lasting = correlation > 0 && result.explained < kLargestLasting;
+    if (result.is_noise_lasting) result.verdict = Verdict::kNotEnoughData;
+    return result;
+  }
 
   const int k = fit.model.num_joints();
   const double num_candidates =

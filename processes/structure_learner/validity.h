@@ -30,6 +30,8 @@ struct Validity {
   /// Valid, but with more outliers than most true models have at so few frames: to be believed only
   /// where nothing larger explains the data better.
   bool doubtful = false;
+  /// Undecided because noise that lasts from sample to sample may have made what speaks against it.
+  bool is_noise_lasting = false;
   double mean_capped = 0;  ///< mean of min(d², 2c): comparable between pairs
   double mean_inlier = 0;  ///< mean leave-one-out d² of the others; 6 under a true model
   double explained = 0;    ///< worst excess of V2: explained sum of squares over its threshold

@@ -9,6 +9,7 @@
 
 #include "common/geometry/angle.h"
 #include "processes/structure_learner/learn.h"
+#include "processes/structure_learner/serial_correlation.h"
 #include "tests/support/imperfect_robot.h"
 
 namespace bodyschema {
@@ -125,6 +126,83 @@ TEST(Warp, BeyondTheAnglesSeenACommandIsLinear) {
       EXPECT_LT(error, q > -1.5 && q < 1 ? 0.3 * kDegree : 12 * kDegree) << q << " seed " << seed;
     }
   }
+}
+
+// How many of so many robots are right; none may be wrong.
+int count_right(const Imperfection& imperfection, int num_robots) {
+  int num_right = 0;
+  for (int seed = 0; seed < num_robots; ++seed) {
+    ImperfectRobot robot(2 + seed, true, imperfection, static_cast<std::uint64_t>(seed));
+    const BodySchema schema = learn(robot.signals(), robot.babble(60), options_of(kTold)).schema;
+    EXPECT_NE(judge(schema, robot.structure()), Rightness::kWrong) << imperfection.name << seed;
+    num_right += judge(schema, robot.structure()) == Rightness::kRight;
+  }
+  return num_right;
+}
+
+TEST(WildReadings, OneInFiveIsNoObstacle) {
+  EXPECT_GE(count_right({.name = "outliers ", .outlier_share = 0.2}, 4), 3);
+  EXPECT_GE(count_right({.name = "flips ", .flip_share = 0.2}, 4), 3);
+}
+
+TEST(WildReadings, AStructureThatHasThemIsRelearned) {
+  ImperfectRobot robot(3, true, {.name = "outliers", .outlier_share = 0.2}, 1);
+  auto samples = robot.babble(60);
+  const LearnOptions options = options_of(kTold);
+  const LearnedStructure structure = find_structure(robot.signals(), samples, options);
+  for (const ActionPoseSample& sample : robot.babble(30)) samples.push_back(sample);
+  EXPECT_TRUE(is_right(relearn(structure, samples, options).schema, robot.structure()));
+}
+
+TEST(Repetitions, ARecordingAppendedToItselfAddsNothing) {
+  ImperfectRobot robot(4, true, {.name = "none"}, 1);
+  const auto samples = robot.babble(12);
+  auto twice = samples;
+  twice.insert(twice.end(), samples.begin(), samples.end());
+  EXPECT_EQ(without_repetitions(twice).size(), samples.size());
+  for (const std::optional<Noise> told : {std::optional(kTold), std::optional<Noise>()}) {
+    const BodySchema once = learn(robot.signals(), samples, options_of(told)).schema;
+    const BodySchema again = learn(robot.signals(), twice, options_of(told)).schema;
+    ASSERT_EQ(once.edges.size(), again.edges.size());
+    EXPECT_EQ(once.complete, again.complete);
+    for (std::size_t e = 0; e < once.edges.size(); ++e) {
+      EXPECT_EQ(once.edges[e].num_samples, again.edges[e].num_samples);
+      EXPECT_EQ(once.edges[e].left.matrix(), again.edges[e].left.matrix());
+    }
+  }
+}
+
+TEST(SerialCorrelation, NoiseThatLastsIsNoJoint) {
+  EXPECT_GE(count_right({.name = "correlation ", .correlation = 0.8}, 6), 5);
+}
+
+TEST(SerialCorrelation, IsThatOfTheNoiseAndOfWhiteNoiseNone) {
+  for (const double rho : {0.0, 0.5, 0.9}) {
+    test::Rng rng(1);
+    SerialCorrelation series;
+    FrameFit before, now;
+    for (int n = 0; n < 2000; ++n) {
+      now.residual = rho * before.residual + std::sqrt(1 - rho * rho) * test::gaussian6(rng);
+      now.squared_distance = now.residual.squaredNorm();
+      if (n > 0) series.add(before, now);
+      before = now;
+    }
+    EXPECT_NEAR(series.coefficient(2000), rho, 0.07);
+  }
+}
+
+TEST(SerialCorrelation, WhatLastsAsLongAsTheNoiseIsExplainedByItTheMost) {
+  std::vector<double> fast, slow;
+  std::vector<int> samples;
+  for (int n = 0; n < 400; ++n) {
+    samples.push_back(n);
+    fast.push_back(n % 2);
+    slow.push_back(n / 50 % 2);
+  }
+  EXPECT_EQ(variance_inflation(slow, samples, 0), 1);
+  EXPECT_LT(variance_inflation(fast, samples, 0.9), 2);
+  EXPECT_GT(variance_inflation(slow, samples, 0.9), 10);
+  EXPECT_LT(variance_inflation(slow, samples, 0.5), variance_inflation(slow, samples, 0.9));
 }
 
 }  // namespace
