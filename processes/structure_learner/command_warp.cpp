@@ -16,8 +16,14 @@ constexpr int kBasis = 20;
 constexpr int kWarpFrames = 150;      // a pair, evenly chosen
 constexpr int kMaxModelsASignal = 4;  // the most precise ones
 constexpr int kMaxRounds = 12;
-/// Slack along the motion, in half ranges: far more than any warp, far less than the range.
-constexpr double kSlack = 0.3;
+/// Slack along the motion, in half ranges: far more than any warp, far less than the range. Of a
+/// joint, in radians: no more than its motion is straight for.
+constexpr double kSlack = 0.3, kMostSlack_rad = 0.8;
+/// Positions of a signal, so far apart [half ranges], below which its command is taken to be
+/// linear: a line and a process of unknown amplitude and length go through any few. A repeated
+/// position tells nothing of what is between. Chosen: of 20 random positions 18 are so far apart.
+constexpr int kFewestPositions = 15;
+constexpr double kApart = 0.01;
 /// A parameter of a model's own line is free within this many half ranges.
 constexpr double kFree = 10;
 
@@ -26,7 +32,10 @@ PairData with_slack(const PairData& pair, const LocalModel& model,
                     const NormalizedActions& actions) {
   PairData result = pair;
   for (const PairFrame& frame : pair.frames) {
-    const MotionJacobian J = kSlack * motion_jacobian(model, actions, frame.sample);
+    MotionJacobian J = motion_jacobian(model, actions, frame.sample);
+    for (int d = 0; d < model.num_joints(); ++d)
+      J.col(d) *=
+          std::min(kSlack, kMostSlack_rad / std::max(std::abs(model.joints[d].turn), 1e-12));
     for (int n = 0; n < frame.num_hypotheses; ++n) {
       PairHypothesis& h = result.hypotheses[frame.first_hypothesis + n];
       // Whitened, Σ_z is the identity: (1 + V Vᵀ) with V = L⁻¹ J.
@@ -164,6 +173,23 @@ Regression regress(const std::vector<const std::vector<Reading>*>& models,
   return best;
 }
 
+/// Number of positions at least kApart from each other that have readings.
+int count_positions(const std::vector<const std::vector<Reading>*>& models,
+                    const std::vector<double>& x_of_sample) {
+  std::vector<double> x;
+  for (const auto* readings : models)
+    for (const Reading& reading : *readings) x.push_back(x_of_sample[reading.sample]);
+  std::sort(x.begin(), x.end());
+  int count = 0;
+  double last = -std::numeric_limits<double>::infinity();
+  for (const double position : x) {
+    if (position - last < kApart) continue;
+    ++count;
+    last = position;
+  }
+  return count;
+}
+
 class WarpEstimate {
  public:
   WarpEstimate(const std::vector<ActionPoseSample>& samples, const std::vector<int>& parts,
@@ -233,8 +259,8 @@ class WarpEstimate {
     for (const int s : actions.moving()) {
       if (!(signals_[s].upper > signals_[s].lower)) continue;
       const auto models = witnesses_of(s, witnesses);
-      if (models.empty()) continue;
-      result[s] = regress(models, positions(s));
+      const std::vector<double> x = positions(s);
+      if (count_positions(models, x) >= kFewestPositions) result[s] = regress(models, x);
     }
     return result;
   }

@@ -48,6 +48,10 @@ struct LearnResult {
 LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPoseSample>& samples,
                   const LearnOptions& options = {});
 
+/// The samples without exact repetitions: instants of an action and poses that were there already
+/// say nothing new. Noise never repeats itself.
+std::vector<ActionPoseSample> without_repetitions(const std::vector<ActionPoseSample>& samples);
+
 /// Noise per axis of one marker that learn() goes by: `options.measurement.noise`; else the mean of
 /// the observations' covariances; where these are zero, the estimate of noise_estimate.h.
 SourcedNoise marker_noise(const std::vector<ActionPoseSample>& samples, int num_signals,
@@ -65,6 +69,8 @@ struct LearnedStructure {
   /// Another structure stands where the noise is larger than told: edges that the two do not share
   /// were taken out.
   bool is_contested = false;
+  /// Far more readings are wild than LearnOptions::measurement says (see ValidityOptions).
+  bool allows_far_outliers = false;
 
   /// The edges span all parts seen.
   bool spans() const { return search.models.size() + 1 >= parts.size(); }

@@ -9,6 +9,7 @@
 #include "common/geometry/angle.h"
 #include "processes/structure_learner/long_chain/long_chain.h"
 #include "processes/structure_learner/screen.h"
+#include "processes/structure_learner/turn_scan.h"
 
 namespace bodyschema {
 namespace {
@@ -195,6 +196,8 @@ class ModelNoise {
       if (!regressions.empty())
         offer(refine(one_joint_start(regressions[0], pair, actions_, motions.sigma_rad).model,
                      part_i, part_j, kRough));
+      for (const Start& start : screen_wide_joint(pair, actions_, motions))
+        offer(refine(start.model, part_i, part_j, kRough));
     } else {
       const RelativeMotions motions = relative_motions(pair, 200);
       const std::vector<std::vector<double>> turns(actions_.num_signals(), default_turns());

@@ -7,6 +7,7 @@
 #include "common/estimation/quantile.h"
 #include "common/estimation/student_t.h"
 #include "processes/structure_learner/placed_screw.h"
+#include "processes/structure_learner/turn_scan.h"
 
 namespace bodyschema {
 namespace {
@@ -165,5 +166,11 @@ Start one_joint_start(const ScrewRegression& regression, const PairData& pair,
 }
 
 std::vector<double> default_turns() { return {kLeastTurn, 0.55, 0.9, 1.4, 2.0, 2.8}; }
+
+std::vector<double> wide_turns() {
+  std::vector<double> turns = default_turns();
+  while (turns.back() < kMostTurn) turns.push_back(turns.back() + kTurnStep);
+  return turns;
+}
 
 }  // namespace bodyschema

@@ -67,7 +67,9 @@ Start one_joint_start(const ScrewRegression& regression, const PairData& pair,
 /// about one fixed axis, or about none, leaves u undetermined: parallel turning joints, one turning
 /// and one sliding joint in either order, and two sliding joints have starts of their own.
 ///
-/// `turns[s]` are the joint ranges [rad per half range] to assume for signal s.
+/// `turns[s]` are the joint ranges [rad per half range] to assume for signal s. Where several are
+/// to be tried for one and they go beyond π, about a single axis too joints may turn more than once
+/// (turn_scan.h).
 std::vector<Start> screen_two_joints(const PairData& pair, const NormalizedActions& actions,
                                      const RelativeMotions& motions,
                                      const std::vector<std::vector<double>>& turns, int max_starts);
@@ -77,5 +79,7 @@ std::vector<Start> screen_two_joints(const PairData& pair, const NormalizedActio
 inline constexpr double kLeastTurn = 0.3;
 /// Ranges that cover joints from there to 320° where nothing is known of a signal.
 std::vector<double> default_turns();
+/// Those, and ranges of joints that turn more than once (kMostTurn).
+std::vector<double> wide_turns();
 
 }  // namespace bodyschema

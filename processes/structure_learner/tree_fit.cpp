@@ -8,13 +8,14 @@
 
 #include "common/estimation/levenberg_marquardt.h"
 #include "processes/structure_learner/screen.h"
+#include "processes/structure_learner/serial_correlation.h"
 #include "processes/structure_learner/tree_fit_normal.h"
 
 namespace bodyschema {
 bool is_at_rest(const PairData& data, const NormalizedActions& actions,
                 const ValidityOptions& options) {
   const Start start = screen_rigid(data, actions);
-  if (!(start.score < kMaxRigidStartCost)) return false;
+  if (!(start.score < kMaxRigidStartCost) && !options.allows_far_outliers) return false;
   const Fit fit = fit_local_model(start.model, data, actions, 20, 1e-4);
   return check_validity(fit, leave_one_out(fit, data, actions), data, actions, options).verdict ==
          Verdict::kValid;
@@ -106,6 +107,18 @@ void TreeFit::start_roots() {
       }
     }
   }
+}
+
+double TreeFit::serial_correlation() const {
+  if (actions_.blocks().is_stream()) return 0;
+  SerialCorrelation series;
+  for (int t = 1; t < num_frames(); ++t) {
+    if (samples_[t] != samples_[t - 1] + 1) continue;
+    for (int n = 0; n < static_cast<int>(nodes_.size()); ++n)
+      if (frame_index_[at(t - 1, n)] >= 0 && frame_index_[at(t, n)] >= 0)
+        series.add(fits_[at(t - 1, n)], fits_[at(t, n)]);
+  }
+  return series.coefficient(num_frames());
 }
 
 // Information and gradient of a frame: of each node's marker, and of all markers from there on.

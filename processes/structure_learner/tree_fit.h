@@ -57,6 +57,9 @@ class TreeFit {
   std::optional<Covariance> covariance(const MeasurementModel& measurement,
                                        double view_share) const;
 
+  /// Of the noise, from one sample to the next; 0 in a stream, whose blocks have it already.
+  double serial_correlation() const;
+
   bool root_rests() const { return root_rests_; }
   const NormalizedActions& actions() const { return actions_; }
   int sample(int frame) const { return samples_[frame]; }

@@ -4,20 +4,21 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <optional>
 #include <tuple>
+#include <utility>
 
 #include "common/estimation/quantile.h"
 #include "processes/structure_learner/axis_screen.h"
 #include "processes/structure_learner/placed_screw.h"
 #include "processes/structure_learner/screen.h"
+#include "processes/structure_learner/turn_scan.h"
 
 namespace bodyschema {
 namespace {
 
 using Eigen::Matrix3d;
 using Eigen::Vector3d;
-
-constexpr int kRotationFrames = 56;  // frames of the eigenvector screen
 
 enum class JointType { kTurning, kSliding };
 
@@ -31,25 +32,6 @@ struct RotationHypothesis {
   Vector3d axis_b = Vector3d::UnitZ();  // u, in frame j
   double score = 0;
 };
-
-// Frames prepared for the closed-form starts.
-struct StartFrames {
-  std::vector<int> sample;
-  std::vector<Matrix3d> R;
-  std::vector<Vector3d> p;
-};
-
-StartFrames start_frames(const PairData& pair) {
-  StartFrames result;
-  const int n = std::min(pair.size(), kRotationFrames);
-  for (int k = 0; k < n; ++k) {
-    const int t = static_cast<int>(static_cast<long>(k) * pair.size() / n);
-    result.sample.push_back(pair.frames[t].sample);
-    result.R.push_back(pair.primary(t).z.linear());
-    result.p.push_back(pair.primary(t).z.translation());
-  }
-  return result;
-}
 
 // One side of a two-joint model: the best axis for each signal, and the turn it was found at.
 struct Side {
@@ -80,39 +62,6 @@ std::vector<Side> best_of_turns(AxisScreen screen, const NormalizedActions& acti
     if (sides[s].fit.score <= scores[kMaxSignals - 1])
       sides[s].fit = screen.fit(moving[s], sides[s].turn, kRounds);
   return sides;
-}
-
-// The rotations of relative motions about their principal axis.
-struct PrincipalAxis {
-  Vector3d axis = Vector3d::UnitZ();
-  std::vector<double> along;   // [rad]
-  std::vector<double> across;  // squared, over the variance
-};
-
-// Frames beyond the gate down-weighted.
-PrincipalAxis principal_axis(const RelativeMotions& motions, double variance) {
-  const auto& all = motions.motions;
-  PrincipalAxis result;
-  result.along.resize(all.size());
-  result.across.resize(all.size());
-  std::vector<double> weights(all.size(), 1);
-  for (int round = 0; round < 4; ++round) {
-    Matrix3d M = Matrix3d::Zero();
-    for (std::size_t n = 0; n < all.size(); ++n) {
-      const Vector3d w = all[n].log.tail<3>();
-      M.noalias() += weights[n] * w * w.transpose();
-    }
-    Eigen::SelfAdjointEigenSolver<Matrix3d> eigen;
-    eigen.computeDirect(M);
-    const Vector3d u = result.axis = eigen.eigenvectors().col(2);
-    for (std::size_t n = 0; n < all.size(); ++n) {
-      const Vector3d w = all[n].log.tail<3>();
-      result.along[n] = u.dot(w);
-      result.across[n] = (w - result.along[n] * u).squaredNorm() / variance;
-      weights[n] = 1 / (1 + result.across[n] / 2);
-    }
-  }
-  return result;
 }
 
 struct TurnRegression {
@@ -210,20 +159,19 @@ void add_sliding_pairs(const std::vector<int>& moving,
 // either order. None at all: two sliding joints.
 std::vector<RotationHypothesis> single_axis_hypotheses(const StartFrames& frames,
                                                        const NormalizedActions& actions,
-                                                       const RelativeMotions& motions) {
-  // In units of variance of a relative motion; the median of χ²₂ is 1.4, of χ²₁ 0.45.
-  constexpr double kGate = 8;
+                                                       const RelativeMotions& motions,
+                                                       bool is_wide) {
   std::vector<RotationHypothesis> hypotheses;
   if (motions.motions.size() < 3) return hypotheses;
   const double variance = 2 * motions.sigma_rad * motions.sigma_rad;
   const PrincipalAxis principal = principal_axis(motions, variance);
-  if (upper_median(principal.across) > kGate) return hypotheses;
+  if (upper_median(principal.across) > kAxisGate) return hypotheses;
   const std::vector<int>& moving = actions.moving();
 
   RotationHypothesis h;
   std::vector<double> squares;
   for (const double psi : principal.along) squares.push_back(psi * psi / variance);
-  if (upper_median(std::move(squares)) < kGate) {
+  if (upper_median(std::move(squares)) < kAxisGate) {
     add_sliding_pairs(moving, &hypotheses);
     return hypotheses;
   }
@@ -233,15 +181,24 @@ std::vector<RotationHypothesis> single_axis_hypotheses(const StartFrames& frames
   if (v.norm() < 1e-6) return hypotheses;
   h.axis_a = v.normalized();
   h.axis_b = principal.axis;
-  const auto turns_of = [&](int a, int b) {
-    return regress(motions, principal.along, actions, a, b, variance);
+  // (turn of a, turn of b) that explain the angles, if any do.
+  const AnglesAboutAxis angles(frames, principal.axis);
+  const auto turns_of = [&](int a, int b) -> std::optional<std::pair<double, double>> {
+    if (is_wide) {
+      const AnglesAboutAxis::Turns turns = angles.scan(actions, a, b);
+      if (turns.power < kLeastScanPower) return std::nullopt;
+      return std::pair(turns.a, turns.b);
+    }
+    const TurnRegression turns = regress(motions, principal.along, actions, a, b, variance);
+    if (turns.median > kAxisGate) return std::nullopt;
+    return std::pair(turns.turn_a, turns.turn_b);
   };
   h.type_b = JointType::kSliding;
   for (const int a : moving) {
-    const TurnRegression one = turns_of(a, -1);
-    if (one.median > kGate) continue;
+    const auto one = turns_of(a, -1);
+    if (!one) continue;
     h.a = a;
-    h.turn_a = one.turn_a;
+    h.turn_a = one->first;
     for (const int b : moving) {
       h.b = b;
       if (b != a) add_in_both_orders(h, &hypotheses);
@@ -250,14 +207,12 @@ std::vector<RotationHypothesis> single_axis_hypotheses(const StartFrames& frames
   h.type_b = JointType::kTurning;
   for (std::size_t s = 0; s < moving.size(); ++s) {
     for (std::size_t r = s + 1; r < moving.size(); ++r) {
-      const TurnRegression two = turns_of(moving[s], moving[r]);
-      if (two.median > kGate ||
-          std::min(std::abs(two.turn_a), std::abs(two.turn_b)) < motions.sigma_rad / 4)
+      const auto two = turns_of(moving[s], moving[r]);
+      if (!two || std::min(std::abs(two->first), std::abs(two->second)) < motions.sigma_rad / 4)
         continue;
       h.a = moving[s];
       h.b = moving[r];
-      h.turn_a = two.turn_a;
-      h.turn_b = two.turn_b;
+      std::tie(h.turn_a, h.turn_b) = *two;
       add_in_both_orders(h, &hypotheses);
     }
   }
@@ -437,6 +392,9 @@ std::vector<Start> screen_two_joints(const PairData& pair, const NormalizedActio
   std::vector<Start> starts;
   if (pair.size() < 3 || actions.moving().size() < 2) return starts;
   const StartFrames frames = start_frames(pair);
+  const bool is_wide = std::any_of(turns.begin(), turns.end(), [](const auto& of_signal) {
+    return of_signal.size() > 1 && *std::max_element(of_signal.begin(), of_signal.end()) > M_PI;
+  });
   const auto add = [&](const RotationHypothesis& h, bool try_signs) {
     starts.push_back(
         judged_start(complete_start(h, try_signs, frames, actions, motions), pair, actions));
@@ -444,7 +402,7 @@ std::vector<Start> screen_two_joints(const PairData& pair, const NormalizedActio
   for (const RotationHypothesis& h :
        general_hypotheses(frames, actions, motions.sigma_rad, turns, max_starts))
     add(h, true);
-  for (const RotationHypothesis& h : single_axis_hypotheses(frames, actions, motions))
+  for (const RotationHypothesis& h : single_axis_hypotheses(frames, actions, motions, is_wide))
     add(h, false);
   std::stable_sort(starts.begin(), starts.end(),
                    [](const Start& x, const Start& y) { return x.score < y.score; });

@@ -4,6 +4,7 @@
 #include <cmath>
 
 #include "common/estimation/quantile.h"
+#include "processes/structure_learner/serial_correlation.h"
 
 namespace bodyschema {
 namespace {
@@ -12,6 +13,16 @@ namespace {
 constexpr double kClip = 20;
 // Below this number of frames an excess of outliers may be bad luck.
 constexpr int kFewFrames = 60;
+// Outliers beyond this multiple of kOutlierThreshold are wild readings: 16 standard deviations.
+// Flips are by twice the tilt of a tag, of which one in twenty is nearer.
+constexpr double kFar = 10;
+// How much noise that lasts explains is known to such a factor at best (chosen).
+constexpr double kLargestLasting = 2;
+// Fewer independent frames do not tell wild readings from a wrong model.
+constexpr int kFewestFarFrames = 20;
+// Share of the frames. At 20 % of wild readings a marker 64 % of a pair's frames are without one;
+// of 60 frames fewer than 24 are once in 10 000 pairs.
+constexpr double kFewestInliers = 0.4;
 
 // Sum of squares that regressors F_t (rows of F) explain of the whitened residuals, all six
 // outputs.
@@ -31,10 +42,12 @@ void tally(const Fit& fit, const LeaveOneOut& loo, const PairData& pair, Validit
     const double log_det = pair.hypotheses[fit.frames[t].hypothesis].log_det;
     result->mean_capped += std::min(d2, 2 * kOutlierThreshold) / n;
     result->score -= 0.5 * (std::min(d2, 2 * kOutlierThreshold) + log_det) / n;
-    if (d2 > kOutlierThreshold)
+    if (d2 > kOutlierThreshold) {
       ++result->num_outliers;
-    else
+      result->num_near += d2 < kFar * kOutlierThreshold;
+    } else {
       inlier_sum += d2;
+    }
   }
   if (n > result->num_outliers) result->mean_inlier = inlier_sum / (n - result->num_outliers);
 }
@@ -53,24 +66,37 @@ Eigen::Matrix<double, 6, Eigen::Dynamic> clipped_residuals(const Fit& fit) {
   return r;
 }
 
+// Of the noise, from one sample to the next; 0 in a stream, whose blocks have it already.
+double serial_correlation(const Fit& fit, const PairData& pair, const NormalizedActions& actions) {
+  if (actions.blocks().is_stream()) return 0;
+  SerialCorrelation series;
+  for (int t = 1; t < pair.size(); ++t)
+    if (pair.frames[t].sample == pair.frames[t - 1].sample + 1)
+      series.add(fit.frames[t - 1], fit.frames[t]);
+  return series.coefficient(pair.size());
+}
+
 // The largest share of the residuals that a signal outside Q explains, over the threshold of V2.
 double explained_excess(const Fit& fit, const PairData& pair, const NormalizedActions& actions,
-                        const ValidityOptions& options, double mean_inlier, double share) {
+                        const ValidityOptions& options, double mean_inlier, double share,
+                        double correlation) {
   const int n = pair.size(), k = fit.model.num_joints();
   const int others = static_cast<int>(actions.moving().size()) - k;
   const Eigen::Matrix<double, 6, Eigen::Dynamic> r = clipped_residuals(fit);
   double bias = 0;
   for (const FrameFit& frame : fit.frames) bias += pair.hypotheses[frame.hypothesis].systematic;
+  std::vector<int> samples;
+  for (const PairFrame& frame : pair.frames) samples.push_back(frame.sample);
+  std::vector<double> q_g(n);
   const bool tensor = k == 1 && n >= 12;
   const int num_features = tensor ? 3 : 1;
   Eigen::MatrixXd F(n, num_features);
-  const double threshold =
-      chi_square_quantile(6 * num_features,
-                          (options.lenient ? 1e-6 : 1.35e-3) / std::max(others, 1)) *
-          std::max(1.0, mean_inlier / 6) / share +
-      // A motion far below the noise of every single frame is no joint but a bias; and all of the
-      // model error may go along with one signal: its variance is ⅓ that of the ends of its range.
-      0.05 * n + bias / 3;
+  const double noise = chi_square_quantile(6 * num_features, (options.lenient ? 1e-6 : 1.35e-3) /
+                                                                 std::max(others, 1)) *
+                       std::max(1.0, mean_inlier / 6) / share;
+  // A motion far below the noise of every single frame is no joint but a bias; and all of the
+  // model error may go along with one signal: its variance is ⅓ that of the ends of its range.
+  const double no_joint = 0.05 * n + bias / 3;
   double largest = 0;
   for (const int g : actions.moving()) {
     if (fit.model.uses(g)) continue;
@@ -86,7 +112,10 @@ double explained_excess(const Fit& fit, const PairData& pair, const NormalizedAc
         F(t, 2) = F(t, 0) * std::sin(theta);
       }
     }
-    if (F.col(0).squaredNorm() > 0) largest = std::max(largest, explained_sum(F, r) / threshold);
+    if (!(F.col(0).squaredNorm() > 0)) continue;
+    Eigen::VectorXd::Map(q_g.data(), n) = F.col(0);
+    const double threshold = noise * variance_inflation(q_g, samples, correlation) + no_joint;
+    largest = std::max(largest, explained_sum(F, r) / threshold);
   }
   return largest;
 }
@@ -140,9 +169,13 @@ Validity check_validity(const Fit& fit, const LeaveOneOut& loo, const PairData& 
       static_cast<int>(0.35 * n));
   // With few frames a true model may meet more outliers than the bound by bad luck: then it is not
   // refuted, only not to be trusted yet.
-  const bool suspicious = result.num_outliers > max_outliers;
-  result.doubtful = num_independent < kFewFrames &&
-                    result.num_outliers > binomial_quantile(num_independent, rate, 0.8) / share;
+  const bool are_far = num_independent >= kFewestFarFrames && result.num_near <= max_outliers &&
+                       inliers >= kFewestInliers * n;
+  const bool are_allowed = options.allows_far_outliers && are_far;
+  const bool suspicious = result.num_outliers > max_outliers && !are_allowed;
+  result.doubtful =
+      num_independent < kFewFrames && (are_allowed ? result.num_near : result.num_outliers) >
+                                          binomial_quantile(num_independent, rate, 0.8) / share;
   const double independent_inliers = share * inliers;
   const double dof = 6 * independent_inliers - p;
   if (dof < 6) {
@@ -150,13 +183,28 @@ Validity check_validity(const Fit& fit, const LeaveOneOut& loo, const PairData& 
     result.verdict = suspicious ? Verdict::kRefuted : Verdict::kNotEnoughData;
     return result;
   }
-  if (suspicious && (n >= kFewFrames || 2 * result.num_outliers > n)) return result;
-  const double max_mean = largest_inlier_mean(dof / 6, options.lenient ? 5 : 3);
+  const double correlation = serial_correlation(fit, pair, actions);
+  // Squares of noise that lasts: the sum of ρ^2k over all lags either way.
+  const double lasts = (1 + correlation * correlation) / (1 - correlation * correlation);
+  const double max_mean = largest_inlier_mean(dof / 6 / lasts, options.lenient ? 5 : 3);
   if (result.mean_inlier > std::min(max_mean, 0.75 * kOutlierThreshold)) return result;
+  result.has_far_outliers = suspicious && are_far;
+  if (suspicious && (n >= kFewFrames || 2 * result.num_outliers > n)) {
+    // So many wild readings say nothing against it, nor for it. (By chance a wrong model has fewer
+    // inliers without more that are near.)
+    if (options.allows_far_outliers && result.num_near <= max_outliers && 4 * inliers > n)
+      result.verdict = Verdict::kNotEnoughData;
+    return result;
+  }
 
   // V2
-  result.explained = explained_excess(fit, pair, actions, options, result.mean_inlier, share);
-  if (result.explained > 1) return result;
+  result.explained =
+      explained_excess(fit, pair, actions, options, result.mean_inlier, share, correlation);
+  if (result.explained > 1) {
+    result.is_noise_lasting = correlation > 0 && result.explained < kLargestLasting;
+    if (result.is_noise_lasting) result.verdict = Verdict::kNotEnoughData;
+    return result;
+  }
 
   const int k = fit.model.num_joints();
   const double num_candidates =

@@ -14,6 +14,9 @@ enum class Verdict {
 struct ValidityOptions {
   /// Expected share of outliers per marker; a pair sees about twice as many.
   double outlier_rate = 0.03;
+  /// More outliers are allowed, up to 60 % of the frames, where these are far off: wild readings.
+  /// A wrong model is wrong by a little, too.
+  bool allows_far_outliers = false;
   /// Widens the tests for a preselection on a part of the data.
   bool lenient = false;
 };
@@ -21,9 +24,14 @@ struct ValidityOptions {
 struct Validity {
   Verdict verdict = Verdict::kRefuted;
   int num_outliers = 0;  ///< frames beyond kOutlierThreshold, leave-one-out
+  int num_near = 0;      ///< of these, those within ten times that
+  /// Its outliers are too many, but would not be if ValidityOptions::allows_far_outliers.
+  bool has_far_outliers = false;
   /// Valid, but with more outliers than most true models have at so few frames: to be believed only
   /// where nothing larger explains the data better.
   bool doubtful = false;
+  /// Undecided because noise that lasts from sample to sample may have made what speaks against it.
+  bool is_noise_lasting = false;
   double mean_capped = 0;  ///< mean of min(d², 2c): comparable between pairs
   double mean_inlier = 0;  ///< mean leave-one-out d² of the others; 6 under a true model
   double explained = 0;    ///< worst excess of V2: explained sum of squares over its threshold

@@ -2,10 +2,11 @@
 // to 7 joints, one imperfection a row. Counts right, incomplete and wrong structures, and wrong
 // ones that are called complete; prints Markdown.
 //
-//   imperfect_robots [--robots 12] [--samples 20 50 100] [--told 1 | --estimate-noise] [--cell
-//   WORDS]
+//   imperfect_robots [--robots 12] [--samples 20 50 100] [--told 1 | --estimate-noise]
+//     [--outlier-rate 0.03] [--cell WORDS...]
 
 #include <CLI/CLI.hpp>
+#include <algorithm>
 #include <cstdio>
 #include <string>
 #include <vector>
@@ -22,13 +23,15 @@ int main(int argc, char** argv) {
   std::vector<int> nums_samples = {20, 50, 100};
   bool is_noise_estimated = false;
   double told = 1;
-  std::string cell;
+  double outlier_rate = MeasurementModel().outlier_rate;
+  std::vector<std::string> cells;
   CLI::App app("Robots that are not as our models are");
   app.add_option("--robots", num_robots, "A row")->check(CLI::PositiveNumber);
   app.add_option("--samples", nums_samples)->check(CLI::PositiveNumber);
   app.add_option("--told", told, "Times the true noise, 3 mm and 1°")->check(CLI::PositiveNumber);
+  app.add_option("--outlier-rate", outlier_rate, "Told, of a marker")->check(CLI::Range(0.0, 0.5));
   app.add_flag("--estimate-noise", is_noise_estimated, "Its 3 mm and 1° are not told");
-  app.add_option("--cell", cell, "Rows whose name has these words alone");
+  app.add_option("--cell", cells, "Rows whose name has one of these words alone");
   CLI11_PARSE(app, argc, argv);
 
   std::printf("| imperfection |");
@@ -37,7 +40,10 @@ int main(int argc, char** argv) {
   for (std::size_t n = 0; n < nums_samples.size(); ++n) std::printf(" --- |");
   std::printf("\n");
   for (const Imperfection& imperfection : imperfections()) {
-    if (imperfection.name.find(cell) == std::string::npos) continue;
+    const auto is_named = [&](const std::string& words) {
+      return imperfection.name.find(words) != std::string::npos;
+    };
+    if (!cells.empty() && std::none_of(cells.begin(), cells.end(), is_named)) continue;
     std::printf("| %s |", imperfection.name.c_str());
     for (const int num_samples : nums_samples) {
       int num_right = 0, num_incomplete = 0, num_wrong = 0, num_complete = 0;
@@ -46,6 +52,7 @@ int main(int argc, char** argv) {
                              static_cast<std::uint64_t>(r));
         LearnOptions options;
         options.root = 1;
+        options.measurement.outlier_rate = outlier_rate;
         if (!is_noise_estimated) options.measurement.noise = Noise{told * 0.003, told * kDegree};
         const BodySchema schema = learn(robot.signals(), robot.babble(num_samples), options).schema;
         const Rightness rightness = judge(schema, robot.structure());

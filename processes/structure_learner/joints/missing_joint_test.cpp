@@ -5,6 +5,7 @@
 #include <cmath>
 
 #include "common/estimation/chi_square.h"
+#include "processes/structure_learner/serial_correlation.h"
 #include "processes/structure_learner/tree_fit.h"
 #include "processes/structure_learner/tree_fit_normal.h"
 
@@ -29,6 +30,7 @@ class ClusterTest {
     const Eigen::MatrixXd q, q2;     // frames × moving signals
     const Matrix6d bias;             // covariance of a marker's own bias
     const double unknown_bias;       // beside it, in standard deviations of one sight
+    const Eigen::VectorXd noise;     // by moving signal: variance of what it explains of noise
   };
 
   ClusterTest(const TreeFit& tree, const Context& context, int top)
@@ -41,6 +43,7 @@ class ClusterTest {
   // The parting that explains most with the moving signal `s`; log_tail 0 if none does.
   MissingJoint best_joint(int s) {
     sum_over_frames(s);
+    noise_ = context_.noise(s);
     MissingJoint best;
     for (int first = 0; first < num_items(); ++first) {
       std::vector<bool> moves(num_items(), false);
@@ -250,7 +253,7 @@ class ClusterTest {
         covariance(i, i) = 1;
       } else {
         xi(i) /= eigen.eigenvalues()(i);
-        covariance(i, i) += context_.normal.noise_scale() / eigen.eigenvalues()(i);
+        covariance(i, i) += noise_ / eigen.eigenvalues()(i);
       }
     }
     const double sum = xi.dot(covariance.ldlt().solve(xi));
@@ -276,6 +279,7 @@ class ClusterTest {
   Eigen::VectorXd u_;
   Eigen::MatrixXd C_, own_;
   std::vector<Matrix6d> unknown_;
+  double noise_ = 1;
 };
 
 // Frames × moving signals.
@@ -288,6 +292,19 @@ Eigen::MatrixXd moving_actions(const TreeFit& fit) {
   return q;
 }
 
+// By moving signal: variance of what it explains of the noise, over what the weights say.
+Eigen::VectorXd explained_noise(const TreeFit& fit, const TreeFit::Normal& normal,
+                                const Eigen::MatrixXd& q) {
+  const double correlation = fit.serial_correlation();
+  std::vector<int> samples;
+  for (int t = 0; t < fit.num_frames(); ++t) samples.push_back(fit.sample(t));
+  Eigen::VectorXd result(q.cols());
+  for (Eigen::Index s = 0; s < q.cols(); ++s)
+    result(s) = normal.noise_scale() *
+                variance_inflation({q.col(s).begin(), q.col(s).end()}, samples, correlation);
+  return result;
+}
+
 }  // namespace
 
 std::vector<MissingJoint> missing_joints(const TreeFit& fit, const Noise& bias,
@@ -296,8 +313,14 @@ std::vector<MissingJoint> missing_joints(const TreeFit& fit, const Noise& bias,
   const std::optional<Eigen::MatrixXd> inverse = normal.inverse();
   if (!inverse) return {};
   const Eigen::MatrixXd q = moving_actions(fit);
-  const ClusterTest::Context context{
-      normal, *inverse, *inverse * normal.g, q, q.cwiseProduct(q), isotropic(bias), unknown_bias};
+  const ClusterTest::Context context{normal,
+                                     *inverse,
+                                     *inverse * normal.g,
+                                     q,
+                                     q.cwiseProduct(q),
+                                     isotropic(bias),
+                                     unknown_bias,
+                                     explained_noise(fit, normal, q)};
   std::vector<MissingJoint> result;
   for (int top = 0; top < static_cast<int>(fit.nodes().size()); ++top) {
     if (top > 0 && fit.nodes()[top].model.num_joints() == 0) continue;
@@ -344,6 +367,7 @@ Eigen::MatrixXd missing_joint_information(const TreeFit& fit) {
   if (!inverse) return result;
   const Eigen::MatrixXd q = moving_actions(fit);
   const Eigen::MatrixXd q2 = q.cwiseProduct(q);
+  const Eigen::VectorXd noise = explained_noise(fit, normal, q);
   for (int k = 1; k < n; ++k) {
     // Stacked over the frames, for q = 1: what the three axes share with each other and with the
     // tree's parameters.
@@ -372,7 +396,7 @@ Eigen::MatrixXd missing_joint_information(const TreeFit& fit) {
       const Eigen::Matrix3d C =
           Eigen::Map<const Eigen::Matrix3d>(owns.col(s).data()) - B * *inverse * B.transpose();
       const Eigen::SelfAdjointEigenSolver<Eigen::Matrix3d> eigen(C, Eigen::EigenvaluesOnly);
-      result(k, s) = std::max(eigen.eigenvalues()(0), 0.0) / normal.noise_scale();
+      result(k, s) = std::max(eigen.eigenvalues()(0), 0.0) / noise(s);
     }
   }
   return result;

@@ -5,6 +5,8 @@
 #include <map>
 #include <tuple>
 
+#include "processes/structure_learner/turn_scan.h"
+
 namespace bodyschema {
 namespace {
 
@@ -20,8 +22,13 @@ constexpr double kMaxFewFramesMedian = 100;
 constexpr int kSomeFrames = 10;
 constexpr int kManyFrames = 20;
 
+// With 60 % of wild readings a true start costs so much. (At 1 m from where it should be, with 3 mm
+// of noise, a frame costs 48.)
+constexpr double kMaxWildStartCost = 34;
+
 // Beyond what a local fit mends, by the bulk of the frames.
-bool is_hopeless(const Start& start, int num_frames) {
+bool is_hopeless(const Start& start, int num_frames, const ValidityOptions& options) {
+  if (options.allows_far_outliers) return start.score > kMaxWildStartCost;
   return start.score > kMaxScrewStartCost ||
          (num_frames >= kSomeFrames && start.score > kGoodStartCost &&
           start.median > (num_frames >= kManyFrames ? kMaxStartMedian : kMaxFewFramesMedian));
@@ -113,7 +120,9 @@ void LayeredSearch::layer_rigid() {
   for_each_open_pair([&](int i, int j) {
     ++pairs_.num_screens;
     const Start start = screen_rigid(pairs_.pair(i, j), pairs_.actions());
-    if (start.score > kMaxRigidStartCost) return;
+    if (pairs_.options().validity.allows_far_outliers ? start.score > kMaxWildStartCost
+                                                      : start.score > kMaxRigidStartCost)
+      return;
     if (const auto c = pairs_.try_start(i, j, start.model)) candidates.push_back(*c);
   });
   connect(std::move(candidates));
@@ -132,8 +141,15 @@ void LayeredSearch::layer_one_joint() {
       if (n >= 1 && regressions[n].score > 1.5 * regressions[0].score) break;
       const Start start =
           one_joint_start(regressions[n], pair, pairs_.actions(), motions.sigma_rad);
-      if (is_hopeless(start, pair.size())) continue;
+      if (is_hopeless(start, pair.size(), pairs_.options().validity)) continue;
       if (const auto c = pairs_.try_start(i, j, start.model)) valid.push_back(*c);
+    }
+    if (valid.empty()) {
+      for (const Start& start : screen_wide_joint(pair, pairs_.actions(), motions)) {
+        ++pairs_.num_screens;
+        if (is_hopeless(start, pair.size(), pairs_.options().validity)) continue;
+        if (const auto c = pairs_.try_start(i, j, start.model)) valid.push_back(*c);
+      }
     }
     decide(std::move(valid), &candidates);
   });
@@ -141,34 +157,30 @@ void LayeredSearch::layer_one_joint() {
 }
 
 // Joint ranges of the signals where the forest already knows them, else a grid.
-LayeredSearch::Turns LayeredSearch::assumed_turns(bool known_only) const {
+LayeredSearch::Turns LayeredSearch::known_turns(const std::vector<double>& grid) const {
   Turns turns(pairs_.actions().num_signals());
-  if (known_only)
-    for (const AcceptedModel& m : forest_.models())
-      for (int d = 0; d < m.model.num_joints(); ++d)
-        if (std::abs(m.model.joints[d].turn) > 0.1)
-          turns[m.model.joints[d].signal].push_back(std::abs(m.model.joints[d].turn));
-  bool any_known = false;
-  for (auto& t : turns) {
-    any_known |= !t.empty();
-    if (t.empty()) t = default_turns();
-  }
-  if (known_only && !any_known) turns.clear();
+  for (const AcceptedModel& m : forest_.models())
+    for (int d = 0; d < m.model.num_joints(); ++d)
+      if (std::abs(m.model.joints[d].turn) > 0.1)
+        turns[m.model.joints[d].signal].push_back(std::abs(m.model.joints[d].turn));
+  for (auto& t : turns)
+    if (t.empty()) t = grid;
   return turns;
 }
 
 void LayeredSearch::layer_two_joints() {
-  // A signal's range in the forest may not hold for its other joints: so a second pass without it
-  // if the first leaves gaps.
-  for (const bool known_only : {true, false}) {
-    const Turns turns = assumed_turns(known_only);
-    if (turns.empty() || forest_.spans()) continue;
-    two_joints_pass(turns);
-  }
-  // So few frames leave the fits narrow valleys: a finer grid of ranges, where parts are few.
+  const Turns grid(pairs_.actions().num_signals(), default_turns());
+  const Turns known = known_turns(default_turns());
+  if (known != grid) two_joints_pass(known);
+  // A signal's range in the forest may not hold for its other joints.
+  if (!forest_.spans()) two_joints_pass(grid);
   constexpr std::size_t kMaxParts = 14;
-  if (pairs_.actions().num_samples() < 12 && !forest_.spans() &&
-      forest_.parts().size() <= kMaxParts) {
+  if (forest_.spans() || forest_.parts().size() > kMaxParts) return;
+  // So few frames leave the fits narrow valleys: a finer grid of ranges, where parts are few. More
+  // tell joints that turn more than once.
+  if (pairs_.actions().num_samples() >= kFewestScanFrames) {
+    two_joints_pass(known_turns(wide_turns()));
+  } else {
     std::vector<double> fine;
     for (double turn = 0.25; turn < 3.1; turn *= 1.15) fine.push_back(turn);
     two_joints_pass(Turns(pairs_.actions().num_signals(), fine));

@@ -34,7 +34,7 @@ class LayeredSearch {
   void layer_rigid();
   void layer_one_joint();
   void layer_two_joints();
-  Turns assumed_turns(bool known_only) const;
+  Turns known_turns(const std::vector<double>& grid) const;
   void two_joints_pass(const Turns& turns);
 
   PairModels& pairs_;

@@ -3,11 +3,13 @@
 #include <gtest/gtest.h>
 
 #include "processes/structure_learner/axis_screen.h"
+#include "processes/structure_learner/turn_scan.h"
 #include "tests/support/synthetic_robot.h"
 
 namespace bodyschema {
 namespace {
 
+using test::Regime;
 using test::Rng;
 
 enum class Joint { kRevolute, kPrismatic, kHelical };
@@ -125,6 +127,67 @@ TEST(OneJointScreen, CoversAFullTurn) {
   EXPECT_EQ(regressions.front().signal, 1);
   EXPECT_NEAR(regressions.front().xi.tail<3>().norm() / actions.half_range(1), 2 * M_PI / 400,
               1e-4);
+}
+
+// Part 2 on part 1 by signal 1, which sweeps so far [rad, half range]; part 3 beyond, on signal 3.
+test::SyntheticRobot wheel(double sweep, Joint type, Rng& rng) {
+  auto robot = two_joint_robot(type, Joint::kRevolute, false, rng);
+  robot.links[1].hidden = false;
+  robot.links[1].turn = sweep / 200;
+  return robot;
+}
+
+TEST(WideJointScreen, LeadsAFitToTheTurnOfAWheelEitherWay) {
+  for (const double sweep : {4.0, 6.0, -6.0, 12.0, -12.0}) {
+    for (int seed = 1; seed <= 5; ++seed) {
+      Rng rng(seed);
+      const auto robot = wheel(sweep, seed % 2 ? Joint::kRevolute : Joint::kHelical, rng);
+      const auto samples = test::babble(robot, 30, {Regime::kTagIso}, rng);
+      const NormalizedActions actions(samples, 4);
+      const PairData pair =
+          make_pair_data(samples, 1, 2, {test::nominal_noise(Regime::kTagIso), {}}, 100);
+      const auto starts = screen_wide_joint(pair, actions, relative_motions(pair, 300));
+      ASSERT_FALSE(starts.empty()) << sweep << " seed " << seed;
+      const Fit fit = fit_local_model(starts.front().model, pair, actions, 60);
+      EXPECT_EQ(fit.model.joints[0].signal, 1);
+      EXPECT_NEAR(std::abs(fit.model.joints[0].turn) / actions.half_range(1) * 200, std::abs(sweep),
+                  0.05);
+      EXPECT_LT(fit.cost, 9 * pair.size());
+    }
+  }
+}
+
+TEST(WideJointScreen, OfTurnsThatFewEqualStepsDoNotTellApartNoneIsTaken) {
+  Rng rng(4);
+  const auto robot = wheel(5, Joint::kRevolute, rng);
+  std::vector<ActionPoseSample> samples;
+  for (int n = 0; n < 30; ++n) {
+    Eigen::VectorXd action = robot.random_action(rng);
+    action(1) = -100 + 80 * (n % 6);  // 5 and −10.7 rad are one
+    samples.push_back(test::observe(robot, action, {Regime::kTagIso}, n, rng));
+  }
+  const NormalizedActions actions(samples, 4);
+  const PairData pair =
+      make_pair_data(samples, 1, 2, {test::nominal_noise(Regime::kTagIso), {}}, 100);
+  EXPECT_TRUE(screen_wide_joint(pair, actions, relative_motions(pair, 300)).empty());
+}
+
+TEST(WideJointScreen, TwoJointsOfWhichOneTurnsMoreThanOnceAreFound) {
+  for (const bool parallel : {false, true}) {
+    for (int seed = 1; seed <= 5; ++seed) {
+      Rng rng(seed);
+      auto robot = two_joint_robot(Joint::kRevolute, Joint::kRevolute, parallel, rng);
+      robot.links[seed % 2 ? 1 : 2].turn = 7.3 / 200;
+      const auto samples = test::babble(robot, 40, {}, rng);
+      const NormalizedActions actions(samples, 4);
+      const PairData pair = make_pair_data(samples, 1, 3, {Noise{1e-3, 6e-3}, {}}, 100);
+      double least = 1e9;
+      for (const Start& start : screen_two_joints(pair, actions, relative_motions(pair, 300),
+                                                  std::vector(4, wide_turns()), 10))
+        least = std::min(least, fit_local_model(start.model, pair, actions, 60).cost);
+      EXPECT_LT(least, 1e-6) << parallel << " seed " << seed;
+    }
+  }
 }
 
 }  // namespace

@@ -1,0 +1,209 @@
+// Robots that no model of ours describes, and recordings that are not as they should be.
+
+#include <gtest/gtest.h>
+
+#include <cmath>
+#include <cstdint>
+#include <optional>
+#include <vector>
+
+#include "common/geometry/angle.h"
+#include "processes/structure_learner/learn.h"
+#include "processes/structure_learner/serial_correlation.h"
+#include "tests/support/imperfect_robot.h"
+
+namespace bodyschema {
+namespace {
+
+using test::Imperfection;
+using test::ImperfectRobot;
+using test::Rightness;
+
+constexpr Noise kTold{0.003, 1 * kDegree};
+
+LearnOptions options_of(std::optional<Noise> told) {
+  LearnOptions options;
+  options.root = 1;
+  options.measurement.noise = told;
+  return options;
+}
+
+void hide(int part, std::vector<ActionPoseSample>* samples) {
+  for (ActionPoseSample& sample : *samples)
+    std::erase_if(sample.parts, [part](const PartObservation& o) { return o.part == part; });
+}
+
+Imperfection sweep(double half_range_rad) {
+  return {.name = "sweep", .range_deg = 2 * half_range_rad / kDegree};
+}
+
+TEST(ManyTurns, JointsThatTurnMoreThanOnceAreFound) {
+  for (const std::optional<Noise> told : {std::optional(kTold), std::optional<Noise>()})
+    for (const double half_range : {3.0, 6.0, 12.0})
+      for (std::uint64_t seed = 0; seed < 3; ++seed) {
+        ImperfectRobot robot(2 + static_cast<int>(seed), true, sweep(half_range), seed);
+        const BodySchema schema = learn(robot.signals(), robot.babble(60), options_of(told)).schema;
+        EXPECT_TRUE(is_right(schema, robot.structure())) << half_range << " seed " << seed;
+      }
+}
+
+TEST(ManyTurns, TwoOnOneEdgeAreFoundOrLeftOpen) {
+  int num_right = 0;
+  for (std::uint64_t seed = 0; seed < 6; ++seed) {
+    ImperfectRobot robot(4, true, sweep(6), seed);
+    auto samples = robot.babble(60);
+    hide(3, &samples);
+    test::SyntheticRobot truth = robot.structure();
+    truth.links[2].hidden = true;
+    const BodySchema schema = learn(robot.signals(), samples, options_of(kTold)).schema;
+    EXPECT_NE(judge(schema, truth), Rightness::kWrong) << seed;
+    num_right += judge(schema, truth) == Rightness::kRight;
+  }
+  EXPECT_GE(num_right, 5);
+}
+
+TEST(ManyTurns, AWheelThatNoSignalTurnsIsNotRigid) {
+  for (std::uint64_t seed = 0; seed < 8; ++seed) {
+    ImperfectRobot robot(2, true, sweep(seed % 2 ? 2 : 6), seed);
+    auto samples = robot.babble(60);
+    for (ActionPoseSample& sample : samples) sample.action(1) = 0;
+    const BodySchema schema = learn(robot.signals(), samples, options_of(std::nullopt)).schema;
+    EXPECT_FALSE(schema.complete) << seed;
+    for (const Edge& edge : schema.edges) EXPECT_LT(edge.rotation_rms_rad, 20 * kDegree) << seed;
+  }
+}
+
+// Part 2 on part 1 by the only signal, in degrees: exactly linear.
+test::SyntheticRobot hinge(double half_range_deg, test::Rng& rng) {
+  test::SyntheticRobot robot;
+  robot.signals = {{"q", -half_range_deg, half_range_deg}};
+  robot.links = {{.part = 1}, {.part = 2, .parent = 1, .signal = 0, .turn = kDegree}};
+  robot.links[1].X_before = test::random_pose(rng, 0.05, 0.15);
+  robot.links[1].X_after = test::random_pose(rng, 0.05, 0.15);
+  robot.X_CR.translation().z() = 1;
+  return robot;
+}
+
+TEST(Warp, ALinearJointThatIsSeenAtSixAnglesIsNotBent) {
+  for (const double half_range_deg : {60, 90, 150, 180, 225, 300, 450})
+    for (const int num_samples : {6, 12, 36})
+      for (const test::Regime regime : {test::Regime::kFree, test::Regime::kTagIso})
+        for (std::uint64_t seed = 0; seed < 4; ++seed) {
+          test::Rng rng(seed);
+          const auto robot = hinge(half_range_deg, rng);
+          std::vector<ActionPoseSample> samples;
+          for (int n = 0; n < num_samples; ++n)
+            samples.push_back(test::observe(
+                robot, Eigen::VectorXd::Constant(1, (n % 6 / 2.5 - 1) * half_range_deg), {regime},
+                n, rng));
+          const BodySchema schema = learn(robot.signals, samples, options_of(std::nullopt)).schema;
+          EXPECT_TRUE(schema.signals[0].warp.empty())
+              << half_range_deg << " deg, " << num_samples << " samples, seed " << seed;
+        }
+}
+
+TEST(Warp, BeyondTheAnglesSeenACommandIsLinear) {
+  for (std::uint64_t seed = 0; seed < 4; ++seed) {
+    test::Rng rng(seed);
+    auto robot = hinge(90, rng);
+    robot.links[1].turn = 1;
+    robot.signals[0] = {"q", -3, 3};
+    robot.bend = 0.1;  // θ = q + 0.1 sin 3q
+    std::vector<ActionPoseSample> samples;
+    for (int n = 0; n < 60; ++n)
+      samples.push_back(test::observe(
+          robot, Eigen::VectorXd::Constant(1, test::uniform(rng, -1.5, 1)), {}, n, rng));
+    const BodySchema schema = learn(robot.signals, samples, options_of(std::nullopt)).schema;
+    ASSERT_EQ(schema.edges.size(), 1U);
+    EXPECT_FALSE(schema.signals[0].warp.empty()) << seed;
+    for (const double q : {-1.2, -0.3, 0.8, 1.2, 2.0, 2.9, -2.0, -2.9}) {
+      const Eigen::VectorXd action = Eigen::VectorXd::Constant(1, q);
+      const auto truth = robot.poses_in_camera(action);
+      const auto predicted = schema.predict(1, 2, action);
+      ASSERT_TRUE(predicted);
+      const double error =
+          rotation_angle(predicted->X_AB.inverse() * truth.at(1).inverse() * truth.at(2));
+      EXPECT_LT(error, q > -1.5 && q < 1 ? 0.3 * kDegree : 12 * kDegree) << q << " seed " << seed;
+    }
+  }
+}
+
+// How many of so many robots are right; none may be wrong.
+int count_right(const Imperfection& imperfection, int num_robots) {
+  int num_right = 0;
+  for (int seed = 0; seed < num_robots; ++seed) {
+    ImperfectRobot robot(2 + seed, true, imperfection, static_cast<std::uint64_t>(seed));
+    const BodySchema schema = learn(robot.signals(), robot.babble(60), options_of(kTold)).schema;
+    EXPECT_NE(judge(schema, robot.structure()), Rightness::kWrong) << imperfection.name << seed;
+    num_right += judge(schema, robot.structure()) == Rightness::kRight;
+  }
+  return num_right;
+}
+
+TEST(WildReadings, OneInFiveIsNoObstacle) {
+  EXPECT_GE(count_right({.name = "outliers ", .outlier_share = 0.2}, 4), 3);
+  EXPECT_GE(count_right({.name = "flips ", .flip_share = 0.2}, 4), 3);
+}
+
+TEST(WildReadings, AStructureThatHasThemIsRelearned) {
+  ImperfectRobot robot(3, true, {.name = "outliers", .outlier_share = 0.2}, 1);
+  auto samples = robot.babble(60);
+  const LearnOptions options = options_of(kTold);
+  const LearnedStructure structure = find_structure(robot.signals(), samples, options);
+  for (const ActionPoseSample& sample : robot.babble(30)) samples.push_back(sample);
+  EXPECT_TRUE(is_right(relearn(structure, samples, options).schema, robot.structure()));
+}
+
+TEST(Repetitions, ARecordingAppendedToItselfAddsNothing) {
+  ImperfectRobot robot(4, true, {.name = "none"}, 1);
+  const auto samples = robot.babble(12);
+  auto twice = samples;
+  twice.insert(twice.end(), samples.begin(), samples.end());
+  EXPECT_EQ(without_repetitions(twice).size(), samples.size());
+  for (const std::optional<Noise> told : {std::optional(kTold), std::optional<Noise>()}) {
+    const BodySchema once = learn(robot.signals(), samples, options_of(told)).schema;
+    const BodySchema again = learn(robot.signals(), twice, options_of(told)).schema;
+    ASSERT_EQ(once.edges.size(), again.edges.size());
+    EXPECT_EQ(once.complete, again.complete);
+    for (std::size_t e = 0; e < once.edges.size(); ++e) {
+      EXPECT_EQ(once.edges[e].num_samples, again.edges[e].num_samples);
+      EXPECT_EQ(once.edges[e].left.matrix(), again.edges[e].left.matrix());
+    }
+  }
+}
+
+TEST(SerialCorrelation, NoiseThatLastsIsNoJoint) {
+  EXPECT_GE(count_right({.name = "correlation ", .correlation = 0.8}, 6), 5);
+}
+
+TEST(SerialCorrelation, IsThatOfTheNoiseAndOfWhiteNoiseNone) {
+  for (const double rho : {0.0, 0.5, 0.9}) {
+    test::Rng rng(1);
+    SerialCorrelation series;
+    FrameFit before, now;
+    for (int n = 0; n < 2000; ++n) {
+      now.residual = rho * before.residual + std::sqrt(1 - rho * rho) * test::gaussian6(rng);
+      now.squared_distance = now.residual.squaredNorm();
+      if (n > 0) series.add(before, now);
+      before = now;
+    }
+    EXPECT_NEAR(series.coefficient(2000), rho, 0.07);
+  }
+}
+
+TEST(SerialCorrelation, WhatLastsAsLongAsTheNoiseIsExplainedByItTheMost) {
+  std::vector<double> fast, slow;
+  std::vector<int> samples;
+  for (int n = 0; n < 400; ++n) {
+    samples.push_back(n);
+    fast.push_back(n % 2);
+    slow.push_back(n / 50 % 2);
+  }
+  EXPECT_EQ(variance_inflation(slow, samples, 0), 1);
+  EXPECT_LT(variance_inflation(fast, samples, 0.9), 2);
+  EXPECT_GT(variance_inflation(slow, samples, 0.9), 10);
+  EXPECT_LT(variance_inflation(slow, samples, 0.5), variance_inflation(slow, samples, 0.9));
+}
+
+}  // namespace
+}  // namespace bodyschema
