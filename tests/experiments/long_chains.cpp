@@ -79,18 +79,6 @@ Row run(const RandomArmOptions& options, int num_robots, int num_samples, bool i
     row.num_incomplete += rightness == Rightness::kIncomplete;
     row.num_wrong += rightness == Rightness::kWrong;
     row.num_wrong_complete += rightness == Rightness::kWrong && schema.complete;
-    if (getenv("DBG") && rightness != Rightness::kRight) {
-      std::printf("robot %d N %d: %d complete %d\n", r, num_samples, (int)rightness, schema.complete);
-      for (auto& e : schema.edges) {
-        auto v = judge_chain(e, robot.true_edge(e.from, e.to), robot.signals);
-        std::printf("  %s\n  found:", v.reason.c_str());
-        for (auto& j : e.joints) std::printf(" %d(%.3f %.3f)%s", j.signal + 1, j.turn, j.slide, j.order_group >= 0 ? "o" : "");
-        std::printf("\n  true:");
-        for (auto& l : robot.links) if (l.signal >= 0) std::printf(" %d(%.3f %.3f)", l.signal + 1, l.turn, l.slide);
-        std::printf("\n");
-      }
-      for (auto& u : schema.unconnected) std::printf("  %s\n", u.detail.c_str());
-    }
     if (rightness == Rightness::kRight) add_errors(robot, schema, samples, rng, &row);
   }
   return row;
