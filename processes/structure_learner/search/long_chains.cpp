@@ -4,6 +4,8 @@
 #include <tuple>
 
 #include "processes/structure_learner/long_chain/long_chain.h"
+#include "processes/structure_learner/residual_fit.h"
+#include "processes/structure_learner/screen.h"
 
 namespace bodyschema {
 namespace {
@@ -52,6 +54,25 @@ std::optional<Candidate> best_chain(const std::vector<std::pair<int, int>>& betw
   return best;
 }
 
+// A soft body, too, moves like a chain of many joints, roughly: where a Gaussian process predicts
+// the blocks that were left out better, it is for connect_soft_parts().
+bool is_rather_soft(const Candidate& chain, const PairModels& pairs) {
+  constexpr int kMaxFrames = 600;
+  const NormalizedActions& actions = pairs.actions();
+  const PairData pair = pairs.pair_data(chain.part_i, chain.part_j, kMaxFrames);
+  const LocalModel rigid = screen_rigid(pair, actions).model;
+  const auto soft = fit_soft_model(fit_local_model(rigid, pair, actions, 30, 1e-3).model, pair,
+                                   actions, pairs.options().validity);
+  if (!soft || soft->verdict != Verdict::kValid) return false;
+  const Fit fit = fit_local_model(chain.model, pair, actions, 15, 1e-2);
+  double mean = 0;
+  for (const double d2 : leave_one_out(fit, pair, actions).squared_distance)
+    mean += std::min(d2, 2 * kOutlierThreshold) / pair.size();
+  const int num_independent =
+      actions.blocks().count(pair.frames, [](const PairFrame& frame) { return frame.sample; });
+  return soft->log_density > -0.5 * mean * num_independent;
+}
+
 }  // namespace
 
 bool connect_long_chains(PairModels* pairs, ModelForest* forest) {
@@ -89,7 +110,9 @@ bool connect_long_chains(PairModels* pairs, ModelForest* forest) {
   });
   bool any = false;
   for (Candidate& c : found) {
-    if (forest->connected(c.part_i, c.part_j) || !pairs->confirm_on_all_data(&c)) continue;
+    if (forest->connected(c.part_i, c.part_j) || !pairs->confirm_on_all_data(&c) ||
+        is_rather_soft(c, *pairs))
+      continue;
     forest->add(c);
     any = true;
   }

@@ -48,6 +48,10 @@ PairData PairModels::part_data(int part) const {
   return make_part_data(samples_, part, options_.measurement, max_frames_);
 }
 
+PairData PairModels::pair_data(int part_i, int part_j, int max_frames) const {
+  return make_pair_data(samples_, part_i, part_j, options_.measurement, max_frames);
+}
+
 bool PairModels::rests(int part) {
   const auto [it, is_new] = rests_.try_emplace(part);
   if (is_new) it->second = is_at_rest(part_data(part), actions_, options_.validity);

@@ -75,6 +75,8 @@ class PairModels {
   const PairData& pair(int part_i, int part_j);
   const RelativeMotions& motions(int part_i, int part_j);
   PairData part_data(int part) const;
+  /// Of at most so many instants.
+  PairData pair_data(int part_i, int part_j, int max_frames) const;
   /// Does the part keep its pose in the camera's frame?
   bool rests(int part);
 
