@@ -285,12 +285,16 @@ LearnedStructure find_structure(const std::vector<Signal>& signals,
 LearnResult fit_structure(const LearnedStructure& structure,
                           const std::vector<ActionPoseSample>& samples,
                           const LearnOptions& options) {
-  return fit_tree(structure, without_repetitions(samples), options, false);
+  LearnResult result = fit_tree(structure, without_repetitions(samples), options, false);
+  result.schema.num_samples = static_cast<int>(samples.size());
+  return result;
 }
 
 LearnResult relearn(const LearnedStructure& structure, const std::vector<ActionPoseSample>& samples,
                     const LearnOptions& options) {
-  return fit_tree(structure, without_repetitions(samples), options, true);
+  LearnResult result = fit_tree(structure, without_repetitions(samples), options, true);
+  result.schema.num_samples = static_cast<int>(samples.size());
+  return result;
 }
 
 LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPoseSample>& samples,
