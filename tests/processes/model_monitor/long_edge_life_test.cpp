@@ -68,7 +68,6 @@ TEST(LongEdgeStream, AHealthyLongEdgeIsLeftAlone) {
     LongArm arm(options, LongFault::kNone, 0, 5);
     const test::LongLife life = live(&arm, 300);
     EXPECT_TRUE(life.events.empty());
-    EXPECT_LT(life.mean_seconds, 5e-3);
   }
 }
 
