@@ -221,15 +221,17 @@ LearnedStructure find_with_bias(const std::vector<Signal>& signals,
   search_options.unknown_bias = unknown_bias;
   MeasurementModel& measurement = search_options.measurement;
   NoiseSource noise_source = NoiseSource::kCovariances;
+  bool is_systematic = false;
   const auto set_noise = [&](const std::vector<ActionPoseSample>& of) {
     if (!options.measurement.noise && has_covariances(of)) return;
     const SourcedNoise noise = marker_noise(of, num_signals, options);
     measurement.noise = noise;
     noise_source = noise.source;
+    is_systematic = noise.is_systematic;
   };
   set_noise(samples);
   // What many joints leave by that much is no noise either.
-  if (is_guess_too_large(measurement, noise_source))
+  if (is_systematic || is_guess_too_large(measurement, noise_source))
     search_options.max_signals = std::min(search_options.max_signals, kMaxScreenedJoints);
   NormalizedActions actions(samples, num_signals);
   SearchResult search = search_structure(samples, actions, parts, search_options);

@@ -4,26 +4,45 @@
 #include <cmath>
 #include <limits>
 #include <map>
+#include <set>
 
-#include "common/estimation/quantile.h"
 #include "common/geometry/angle.h"
 #include "processes/structure_learner/long_chain/long_chain.h"
+#include "processes/structure_learner/residual_fit.h"
 #include "processes/structure_learner/screen.h"
+#include "processes/structure_learner/search/model_forest.h"
 #include "processes/structure_learner/turn_scan.h"
 
 namespace bodyschema {
 namespace {
 
-constexpr double kMedianChi3 = 2.366;  // median of χ²₃
+// A quantile of what is left, and that of χ²₃.
+struct Quantile {
+  double share, chi3;
+  double of(std::vector<double> values) const {
+    const auto n = static_cast<std::ptrdiff_t>(share * static_cast<double>(values.size()));
+    std::nth_element(values.begin(), values.begin() + n, values.end());
+    return values[static_cast<std::size_t>(n)];
+  }
+};
+constexpr Quantile kMedian{0.5, 2.366};
+// A stream rests, or moves slowly, for much of its time: what a model leaves in motion shows in the
+// upper quarter. A marker that flips at a fifth of the instants is outside.
+constexpr Quantile kUpper{0.75, 4.108};
 constexpr double kSafety = 1.2;
-constexpr int kFramesOfAPair = 120;
+constexpr int kFramesOfAPair = 120, kFramesOfAStream = 400;
 constexpr int kMinRepeats = 5;
 // Of a pair, per axis: any tag's or tracker's is below.
 constexpr double kLargestRotationNoise = 1.5 * kDegree;
 constexpr double kLargestBias = 4;  // of a stream, in standard deviations of its white noise
+// A richer model must leave this share of the product of position and rotation deviations. Of the
+// soft trunk's parts models leave 0.01 to 0.3 of what rigid pairs leave, of a recording without a
+// valid model 0.99 and more (trunk_c11, trunk_adiabatic4).
+constexpr double kExplained = 0.5;
 
 // A residual log(Δ̂⁻¹ z) of a relative pose with the lever arm that carries the rotation noise of
-// part i into its position. For a single marker the lever is 0 and `markers` 1.
+// part i into its position; 0 for a single marker (`markers` 1), and for what a soft body leaves,
+// whose position and rotation err together.
 struct NoiseResidual {
   Vector6d residual;
   Eigen::Vector3d lever = Eigen::Vector3d::Zero();
@@ -32,15 +51,15 @@ struct NoiseResidual {
 
 // Noise per axis of one marker from residuals whose covariance is `markers`·σ² plus the lever's
 // part.
-Noise noise_from(const std::vector<NoiseResidual>& residuals) {
+Noise noise_from(const std::vector<NoiseResidual>& residuals, const Quantile& quantile = kMedian) {
   Noise noise;
   std::vector<double> values;
   for (const auto& r : residuals) values.push_back(r.residual.tail<3>().squaredNorm() / r.markers);
-  noise.rotation_rad = std::sqrt(upper_median(values) / kMedianChi3);
+  noise.rotation_rad = std::sqrt(quantile.of(values) / quantile.chi3);
   const double rotation_variance = noise.rotation_rad * noise.rotation_rad;
-  // The position variance that brings the median of the whitened position residuals to that of χ²₃:
-  // the covariance is v·m along the lever and v·m + |lever|²σ_r² across it.
-  const auto median_at = [&](double v) {
+  // The position variance that brings the quantile of the whitened position residuals to that of
+  // χ²₃: the covariance is v·m along the lever and v·m + |lever|²σ_r² across it.
+  const auto quantile_at = [&](double v) {
     values.clear();
     for (const auto& r : residuals) {
       const double l2 = r.lever.squaredNorm();
@@ -49,12 +68,12 @@ Noise noise_from(const std::vector<NoiseResidual>& residuals) {
       values.push_back(along2 / (v * r.markers) +
                        across2 / (v * r.markers + l2 * rotation_variance));
     }
-    return upper_median(values);
+    return quantile.of(values);
   };
   double low = 1e-20, high = 1e2;  // [m²]
   for (int n = 0; n < 60; ++n) {
     const double middle = std::sqrt(low * high);
-    (median_at(middle) > kMedianChi3 ? low : high) = middle;
+    (quantile_at(middle) > quantile.chi3 ? low : high) = middle;
   }
   noise.position_m = std::sqrt(high);
   return noise;
@@ -97,7 +116,8 @@ Pose robust_mean(const std::vector<Pose>& poses) {
 
 std::optional<Noise> noise_from_repeats(const std::vector<ActionPoseSample>& samples,
                                         const NormalizedActions& actions) {
-  if (actions.moving().empty()) return std::nullopt;
+  // A stream that rests says the same thing many times.
+  if (actions.moving().empty() || actions.blocks().is_stream()) return std::nullopt;
   // Repeats: the same action up to a millionth of the range.
   std::map<std::vector<long>, std::vector<int>> groups;
   for (int t = 0; t < actions.num_samples(); ++t) {
@@ -142,17 +162,34 @@ std::optional<Noise> noise_from_neighbours(const std::vector<ActionPoseSample>& 
   return noise_from(residuals);
 }
 
+double scale_of(const Noise& noise) {
+  const Noise bounded = floored(noise, 1);
+  return std::log(bounded.position_m) + std::log(bounded.rotation_rad);
+}
+
 // A model of a pair with its leave-one-out residuals and the noise that they speak of.
 struct ScaledFit {
   std::vector<NoiseResidual> residuals;
   Noise noise;
   double scale = std::numeric_limits<double>::infinity();  // log of position × rotation noise
+  double rigid_scale = std::numeric_limits<double>::infinity();  // of the rigid model
+  std::vector<int> signals;                                      // ascending
+
+  void replace_if_explained(ScaledFit by) {
+    if (!(by.scale < scale + std::log(kExplained))) return;
+    by.rigid_scale = rigid_scale;
+    *this = std::move(by);
+  }
+  bool explains_motion() const { return scale < rigid_scale + std::log(kExplained); }
 };
 
 class ModelNoise {
  public:
   ModelNoise(const std::vector<ActionPoseSample>& samples, const NormalizedActions& actions)
-      : samples_(samples), actions_(actions) {}
+      : samples_(samples),
+        actions_(actions),
+        quantile_(actions.blocks().is_stream() ? kUpper : kMedian) {}
+  const Quantile& quantile() const { return quantile_; }
 
   // The start refined at its own noise: whitening and model in turn.
   ScaledFit refine(LocalModel model, int part_i, int part_j, Noise noise) const {
@@ -165,32 +202,33 @@ class ModelNoise {
       model = fit.model;
       std::vector<NoiseResidual> residuals;
       for (int t = 0; t < pair.size(); ++t)
-        residuals.push_back({loo.residual[t],
-                             pair.hypotheses[fit.frames[t].hypothesis].z.inverse().translation(),
-                             2.0});
+        residuals.push_back(residual_of(loo.residual[t], pair, fit.frames[t]));
       // Leave-one-out residuals are wider than the noise by the model's own uncertainty: exactly so
       // that the mean of d² with (I − H)⁻¹ in it is unbiased. Undo the average widening.
       const double dof = 6.0 * pair.size();
       const double shrink = std::sqrt((dof - loo.rank) / dof);
       for (auto& r : residuals) r.residual *= shrink;
-      result.noise = noise_from(residuals);
+      result.noise = noise_from(residuals, quantile_);
       result.residuals = std::move(residuals);
       noise = floored(result.noise, 1);
     }
-    const Noise bounded = floored(result.noise, 1);
-    result.scale = std::log(bounded.position_m) + std::log(bounded.rotation_rad);
+    result.scale = scale_of(result.noise);
+    const std::set<int> used = signal_set(model);
+    result.signals.assign(used.begin(), used.end());
     return result;
   }
 
   ScaledFit best(int part_i, int part_j, bool with_two_joints) const {
     ScaledFit best;
     const auto offer = [&](ScaledFit fit) {
+      fit.rigid_scale = best.rigid_scale;
       if (fit.scale < best.scale) best = std::move(fit);
     };
     const PairData pair = pair_data(part_i, part_j, kRough);
     if (pair.size() < 3) return best;
     if (!with_two_joints) {
       offer(refine(screen_rigid(pair, actions_).model, part_i, part_j, kRough));
+      best.rigid_scale = best.scale;
       const RelativeMotions motions = relative_motions(pair, 200);
       const auto regressions = screen_one_joint(motions, actions_);
       if (!regressions.empty())
@@ -208,7 +246,29 @@ class ModelNoise {
     return best;
   }
 
-  // Replaces `best` if a chain on all signals leaves less than half of the product of its noises.
+  // A Gaussian process on all signals, by the blocks of time that are left out.
+  void offer_soft(int part_i, int part_j, ScaledFit* best) const {
+    const std::vector<int>& signals = actions_.moving();
+    if (best->signals == signals || signals.size() > kMaxChainJoints) return;
+    ScaledFit soft;
+    Noise noise = kRough;
+    for (int round = 0; round < 4; ++round) {
+      const PairData pair = pair_data(part_i, part_j, noise);
+      const auto fit =
+          fit_soft_model(screen_rigid(pair, actions_).model, pair, actions_, {}, signals);
+      if (!fit) return;
+      soft.residuals.clear();
+      for (int t = 0; t < pair.size(); ++t)
+        soft.residuals.push_back(residual_of(fit->residual[t], pair, fit->frames[t]));
+      soft.noise = noise_from(soft.residuals, quantile_);
+      noise = floored(soft.noise, 1);
+    }
+    soft.scale = scale_of(soft.noise);
+    soft.signals = signals;
+    best->replace_if_explained(std::move(soft));
+  }
+
+  // A chain on all signals.
   void offer_long_chain(int part_i, int part_j, int max_joints, ScaledFit* best) const {
     const std::vector<int>& signals = actions_.moving();
     const int m = static_cast<int>(signals.size());
@@ -220,21 +280,28 @@ class ModelNoise {
         actions_.blocks().is_stream() ? JointOrder::kListed : JointOrder::kUnknown;
     const auto fit = fit_long_chain(pair, actions_, signals, order, kLargestRotationNoise);
     if (!fit) return;
-    ScaledFit chain = refine(fit->model, part_i, part_j, kRough);
-    if (chain.scale < best->scale - std::log(2.0)) *best = std::move(chain);
+    best->replace_if_explained(refine(fit->model, part_i, part_j, kRough));
   }
 
  private:
   static constexpr Noise kRough{0.005, 0.03};
 
+  NoiseResidual residual_of(const Vector6d& residual, const PairData& pair,
+                            const FrameFit& frame) const {
+    if (actions_.blocks().is_stream()) return {residual, Eigen::Vector3d::Zero(), 2};
+    return {residual, pair.hypotheses[frame.hypothesis].z.inverse().translation(), 2};
+  }
+
   PairData pair_data(int part_i, int part_j, const Noise& noise) const {
     MeasurementModel measurement;
     measurement.noise = noise;
-    return make_pair_data(samples_, part_i, part_j, measurement, kFramesOfAPair);
+    return make_pair_data(samples_, part_i, part_j, measurement,
+                          actions_.blocks().is_stream() ? kFramesOfAStream : kFramesOfAPair);
   }
 
   const std::vector<ActionPoseSample>& samples_;
   const NormalizedActions& actions_;
+  const Quantile quantile_;
 };
 
 // Prim's minimum spanning tree by scale: every part by the partner that predicts it best.
@@ -257,66 +324,93 @@ std::vector<std::pair<int, int>> spanning_tree(
   }
 }
 
+using FitsOfPairs = std::map<std::pair<int, int>, ScaledFit>;
+
+// Where one joint does not suffice, more may, or a Gaussian process. Edges far above the quietest
+// do, and those of a stream far above its jitter; with few edges any may.
+void offer_richer_models(const ModelNoise& model_noise, const std::vector<int>& parts,
+                         const std::vector<std::pair<int, int>>& tree,
+                         const std::optional<Noise>& jitter, int max_signals, FitsOfPairs* fits) {
+  double quietest = std::numeric_limits<double>::infinity();
+  for (const auto& ij : tree) quietest = std::min(quietest, fits->at(ij).scale);
+  const auto may_be_richer = [&](const ScaledFit& fit) {
+    return tree.size() <= 2 || fit.scale >= quietest + std::log(4.0) ||
+           (jitter && fit.scale > scale_of(floored(*jitter, kLargestBias)));
+  };
+  for (const auto& ij : tree) {
+    ScaledFit& fit = fits->at(ij);
+    const int part_i = parts[ij.first], part_j = parts[ij.second];
+    if (max_signals >= 2 && may_be_richer(fit)) {
+      ScaledFit two = model_noise.best(part_i, part_j, true);
+      two.rigid_scale = fit.rigid_scale;
+      if (two.scale < fit.scale) fit = std::move(two);
+    }
+    if (max_signals > kMaxScreenedJoints && may_be_richer(fit))
+      model_noise.offer_long_chain(part_i, part_j, max_signals, &fit);
+    if (max_signals > 0 && may_be_richer(fit)) model_noise.offer_soft(part_i, part_j, &fit);
+  }
+}
+
+// Of the quieter fits: an edge across two hidden parts has no model here and would speak of motion,
+// not of noise. Those no worse than four times the lower quartile in the product of both noises; of
+// a stream, the lower half.
+std::vector<NoiseResidual> residuals_of_quiet(const std::vector<const ScaledFit*>& fits,
+                                              bool is_stream) {
+  std::vector<double> scales;
+  for (const ScaledFit* fit : fits) scales.push_back(fit->scale);
+  std::sort(scales.begin(), scales.end());
+  const double limit =
+      is_stream ? scales[scales.size() / 2] : scales[scales.size() / 4] + std::log(4.0);
+  std::vector<NoiseResidual> pooled;
+  for (const ScaledFit* fit : fits)
+    if (fit->scale <= limit)
+      pooled.insert(pooled.end(), fit->residuals.begin(), fit->residuals.end());
+  return pooled;
+}
+
 }  // namespace
 
 std::optional<SourcedNoise> estimate_noise(const std::vector<ActionPoseSample>& samples,
                                            int num_signals, int max_signals) {
   const NormalizedActions actions(samples, num_signals);
-  // What moves under one command, or where no model holds, is no noise: that of a stream is not
-  // taken for more than what jumps from frame to frame and what a marker's bias may add to it.
-  const auto bounded = [&](Noise noise, NoiseSource source) {
-    if (const auto white = noise_from_neighbours(samples, actions)) {
-      const Noise most = floored(*white, kLargestBias);
-      if (most.position_m < noise.position_m || most.rotation_rad < noise.rotation_rad)
-        source = NoiseSource::kFrames;
-      noise.position_m = std::min(noise.position_m, most.position_m);
-      noise.rotation_rad = std::min(noise.rotation_rad, most.rotation_rad);
-    }
-    return SourcedNoise{believable(noise), source};
-  };
   if (const auto noise = noise_from_repeats(samples, actions))
-    return bounded(*noise, NoiseSource::kRepeats);
+    return SourcedNoise{believable(*noise), NoiseSource::kRepeats};
 
   const std::vector<int> parts = seen_parts(samples);
   const int n = static_cast<int>(parts.size());
   if (n < 2) return std::nullopt;
 
   const ModelNoise model_noise(samples, actions);
-  std::map<std::pair<int, int>, ScaledFit> fits;
+  FitsOfPairs fits;
   for (int i = 0; i < n; ++i)
     for (int j = i + 1; j < n; ++j) fits[{i, j}] = model_noise.best(parts[i], parts[j], false);
 
   const std::vector<std::pair<int, int>> tree = spanning_tree(n, fits);
   if (tree.empty()) return std::nullopt;
+  const std::optional<Noise> jitter = noise_from_neighbours(samples, actions);
+  offer_richer_models(model_noise, parts, tree, jitter, max_signals, &fits);
 
-  // Where one joint does not suffice, two may. Edges far above the quietest do, and with few edges
-  // any may.
-  double quietest = std::numeric_limits<double>::infinity();
-  for (const auto& ij : tree) quietest = std::min(quietest, fits[ij].scale);
-  if (max_signals >= 2) {
-    for (const auto& ij : tree) {
-      if (tree.size() > 2 && fits[ij].scale < quietest + std::log(4.0)) continue;
-      ScaledFit two = model_noise.best(parts[ij.first], parts[ij.second], true);
-      if (two.scale < fits[ij].scale) fits[ij] = std::move(two);
+  std::vector<const ScaledFit*> all, explaining;
+  for (const auto& ij : tree) {
+    all.push_back(&fits[ij]);
+    if (jitter && fits[ij].explains_motion()) explaining.push_back(&fits[ij]);
+  }
+  const auto pooled = residuals_of_quiet(explaining.empty() ? all : explaining, jitter.has_value());
+  if (pooled.size() < 6) return std::nullopt;
+  SourcedNoise noise{noise_from(pooled, model_noise.quantile()), NoiseSource::kResiduals};
+  if (jitter) {
+    const Noise most = floored(*jitter, kLargestBias);
+    noise.is_systematic =
+        noise.position_m > most.position_m || noise.rotation_rad > most.rotation_rad;
+    // What no model explains is motion.
+    if (noise.is_systematic && explaining.empty()) {
+      noise.position_m = std::min(noise.position_m, most.position_m);
+      noise.rotation_rad = std::min(noise.rotation_rad, most.rotation_rad);
+      noise.source = NoiseSource::kFrames;
     }
   }
-  if (max_signals > kMaxScreenedJoints)
-    for (const auto& ij : tree)
-      if (tree.size() <= 2 || fits[ij].scale >= quietest + std::log(4.0))
-        model_noise.offer_long_chain(parts[ij.first], parts[ij.second], max_signals, &fits[ij]);
-
-  // Pool the edges no worse than four times the lower quartile (in the product of both noises): an
-  // edge across two hidden parts has no model here and would speak of motion, not of noise.
-  std::vector<double> scales;
-  for (const auto& ij : tree) scales.push_back(fits[ij].scale);
-  std::sort(scales.begin(), scales.end());
-  const double limit = scales[scales.size() / 4] + std::log(4.0);
-  std::vector<NoiseResidual> pooled;
-  for (const auto& ij : tree)
-    if (fits[ij].scale <= limit)
-      pooled.insert(pooled.end(), fits[ij].residuals.begin(), fits[ij].residuals.end());
-  if (pooled.size() < 6) return std::nullopt;
-  return bounded(noise_from(pooled), NoiseSource::kResiduals);
+  static_cast<Noise&>(noise) = believable(noise);
+  return noise;
 }
 
 }  // namespace bodyschema

@@ -19,26 +19,32 @@ enum class NoiseSource {
   kGiven,        ///< told by the user
   kCovariances,  ///< of the observations, their mean
   kRepeats,      ///< estimated from poses seen again under the same action
-  kFrames,       ///< of a stream: bounded by what jumps from frame to frame
+  kFrames,       ///< of a stream that no model explains: a few times what jumps between frames
   kResiduals,    ///< estimated from what the best models leave
   kAssumed,      ///< too few data: the floor
 };
 
 struct SourcedNoise : Noise {
   NoiseSource source = NoiseSource::kAssumed;
+  /// Of a stream: much larger than what jumps from frame to frame. A stiff arm of many joints would
+  /// leave less; a soft one moves like such an arm, roughly.
+  bool is_systematic = false;
 };
 
 /// Noise per axis of one marker, for data that bring neither noise nor covariances.
 ///
-/// From repeats where an action recurs at least five times: residuals of each part's pose to its
-/// robust mean over the repeats. Else from the best screw models of a minimum spanning tree over
-/// the parts: their pooled leave-one-out residuals. Models of one joint, two and many compete: the
-/// residual of a model is noise only where no richer one leaves far less. Both through medians, so
-/// that outliers do not count; position and rotation apart (the rotation noise of part i reaches
-/// the position of z_ij through the lever arm). The estimate is returned 1.2 × too large: too small
-/// a noise rejects true models, too large a noise by that factor costs nearly nothing. Never below
-/// kNoiseFloor or above kNoiseCeiling. Of a stream, never above a few times what jumps from frame
-/// to frame. std::nullopt: too few data.
+/// From repeats where an action recurs at least five times, unless it is a stream that rests:
+/// residuals of each part's pose to its robust mean over the repeats. Else from the best models of
+/// a minimum spanning tree over the parts: their pooled residuals, each without the frame (a
+/// Gaussian process: the block) that it judges. Models of one joint, two and many compete, and a
+/// Gaussian process on all signals: the residual of a model is noise only where no richer one
+/// leaves far less. Through medians, so that outliers do not count (of a stream, which rests for
+/// much of its time, the upper quartile); position and rotation apart (the rotation noise of part i
+/// reaches the position of z_ij through the lever arm). The estimate is returned 1.2 × too large:
+/// too small a noise rejects true models, too large a noise by that factor costs nearly nothing.
+/// Never below kNoiseFloor or above kNoiseCeiling. Of a stream, the jitter from frame to frame is a
+/// lower bound and no more, unless no model explains its motion: then it is not taken for noise.
+/// std::nullopt: too few data.
 std::optional<SourcedNoise> estimate_noise(const std::vector<ActionPoseSample>& samples,
                                            int num_signals, int max_signals = kMaxChainJoints);
 

@@ -2,6 +2,9 @@
 
 #include <gtest/gtest.h>
 
+#include <cmath>
+#include <functional>
+
 #include "common/geometry/angle.h"
 #include "tests/support/synthetic_robot.h"
 
@@ -48,6 +51,56 @@ TEST(NoiseEstimate, OfExactDataIsTheFloor) {
   ASSERT_TRUE(noise);
   EXPECT_EQ(noise->position_m, kNoiseFloor.position_m);
   EXPECT_EQ(noise->rotation_rad, kNoiseFloor.rotation_rad);
+}
+
+// A door at 30 Hz that turns with `angle`: 0.1 mm and 0.03° of white noise, and slow errors of
+// about 1 mm and 0.2° an axis, as optical trackers have them.
+std::vector<ActionPoseSample> door_in_a_stream(const std::function<double(double)>& angle) {
+  constexpr int kInstants = 900;
+  constexpr double kWhite_m = 1e-4, kWhite_rad = 5e-4, kSlow_m = 1.4e-3, kSlow_rad = 5e-3;
+  Rng rng(4);
+  std::vector<ActionPoseSample> samples;
+  for (int t = 0; t < kInstants; ++t) {
+    const double s = t / 30.0, q = 0.7 * std::sin(0.7 * s);
+    ActionPoseSample& sample = samples.emplace_back();
+    sample.utime = std::llround(1e6 * s);
+    sample.sample_index = t;
+    sample.action = Eigen::VectorXd::Constant(1, q);
+    for (int part = 0; part < 2; ++part) {
+      Vector6d error;
+      for (int c = 0; c < 6; ++c)
+        error(c) = (c < 3 ? kSlow_m : kSlow_rad) * std::sin((1.3 + 0.37 * (6 * part + c)) * s + c) +
+                   (c < 3 ? kWhite_m : kWhite_rad) * test::gaussian(rng);
+      Vector6d turn = Vector6d::Zero();
+      turn(5) = part * angle(s);
+      const Pose at(Eigen::Translation3d(0.3 * part, 0, 1.5));
+      PartObservation& seen = sample.parts.emplace_back();
+      seen.part = part;
+      seen.X_CB = at * exp(turn) * Eigen::Translation3d(0.2 * part, 0, 0) * exp(error);
+    }
+  }
+  return samples;
+}
+
+TEST(NoiseEstimate, OfAStreamTheJitterIsALowerBoundAndNoMore) {
+  const auto noise =
+      estimate_noise(door_in_a_stream([](double s) { return 0.7 * std::sin(0.7 * s); }), 1);
+  ASSERT_TRUE(noise);
+  EXPECT_EQ(noise->source, NoiseSource::kResiduals);
+  EXPECT_TRUE(noise->is_systematic);
+  EXPECT_GT(noise->position_m, 0.7e-3);
+  EXPECT_LT(noise->position_m, 3e-3);
+  EXPECT_GT(noise->rotation_rad, 0.15 * kDegree);
+  EXPECT_LT(noise->rotation_rad, 0.6 * kDegree);
+}
+
+TEST(NoiseEstimate, OfAStreamMotionThatNoModelExplainsIsNoNoise) {
+  const auto noise =
+      estimate_noise(door_in_a_stream([](double s) { return 0.5 * std::sin(1.9 * s); }), 1);
+  ASSERT_TRUE(noise);
+  EXPECT_EQ(noise->source, NoiseSource::kFrames);
+  EXPECT_LT(noise->position_m, 0.6e-3);
+  EXPECT_LT(noise->rotation_rad, 0.2 * kDegree);
 }
 
 TEST(NoiseEstimate, NeedsTwoParts) { EXPECT_FALSE(estimate_noise({}, 2)); }
