@@ -81,9 +81,7 @@ LearnedStructure contested(LearnedStructure structure, const LearnedStructure& r
   return structure;
 }
 
-}  // namespace
-
-LearnedStructure confirmed_structure(const FindStructure& find) {
+LearnedStructure least_noise(const FindStructure& find) {
   LearnedStructure told = find(1, 0);
   if (told.actions.blocks().is_stream() && told.noise_source == NoiseSource::kResiduals &&
       !told.search.models.empty())
@@ -93,7 +91,9 @@ LearnedStructure confirmed_structure(const FindStructure& find) {
     }
   if (lacks_data(told) || !is_noise_known(told)) return told;
   const bool is_explained = told.spans() && !is_soft(told);
-  if (is_explained && told.search.residual_scale <= kLargestResidual) return told;
+  if (is_explained && told.search.redundant.empty() &&
+      told.search.residual_scale <= kLargestResidual)
+    return told;
   LearnedStructure quieter = told;
   for (double factor = 2; factor <= 2 * kMostNoise; factor *= 2) {
     LearnedStructure louder = find(factor, kUnknownBias);
@@ -114,6 +114,16 @@ LearnedStructure confirmed_structure(const FindStructure& find) {
     quieter = std::move(louder);
   }
   return is_explained ? contested(std::move(told), quieter) : told;
+}
+
+}  // namespace
+
+LearnedStructure confirmed_structure(const FindStructure& find) {
+  LearnedStructure structure = least_noise(find);
+  for (const auto& [part_i, part_j] : structure.search.redundant)
+    std::erase_if(structure.search.models,
+                  [&](const AcceptedModel& edge) { return edge.joins(part_i, part_j); });
+  return structure;
 }
 
 }  // namespace bodyschema

@@ -55,7 +55,7 @@ bool is_guess_too_large(const LearnedStructure& structure) {
 UnconnectedPart explain(int part, int num_seen, const std::set<int>& connected,
                         const LearnedStructure& structure, int max_signals) {
   int common = 0, partner = -1;
-  bool undecided = false, was_soft_tried = false;
+  bool undecided = false, was_soft_tried = false, is_redundant = false;
   std::set<int> untold;
   for (const auto& [pair, record] : structure.search.records) {
     if (pair.first != part && pair.second != part) continue;
@@ -64,6 +64,7 @@ UnconnectedPart explain(int part, int num_seen, const std::set<int>& connected,
     undecided |= !record.undecided.empty();
     untold.insert(record.untold_signals.begin(), record.untold_signals.end());
     was_soft_tried |= record.was_soft_tried;
+    is_redundant |= record.is_redundant;
     if (record.num_common > common) {
       common = record.num_common;
       partner = other;
@@ -80,6 +81,11 @@ UnconnectedPart explain(int part, int num_seen, const std::set<int>& connected,
             seen +
                 "; another structure fits if the noise is larger than it is said to be: tell "
                 "the true noise, or give more samples"};
+  if (is_redundant)
+    return {part, Unconnected::kNoValidModel,
+            seen +
+                "; a model is valid, but has a joint that the others make needless, and without "
+                "it none is: more of the poses are wrong, or further off, than is told"};
   if (!undecided && 6 * common >= 5 * parameters)
     return {part, Unconnected::kNoValidModel,
             seen + "; no model with up to " + std::to_string(max_signals) +

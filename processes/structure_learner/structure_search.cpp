@@ -3,6 +3,7 @@
 #include "processes/structure_learner/search/bridging.h"
 #include "processes/structure_learner/search/layered_search.h"
 #include "processes/structure_learner/search/long_chains.h"
+#include "processes/structure_learner/search/redundancy.h"
 #include "processes/structure_learner/search/settling.h"
 #include "processes/structure_learner/search/withdrawal.h"
 
@@ -28,6 +29,7 @@ SearchResult search_structure(const std::vector<ActionPoseSample>& samples,
     settled = settle_trees(&layers.spare(), &pairs, &forest);
   SearchResult result;
   result.joint_information = withdraw_untold_edges(&pairs, &forest);
+  result.redundant = redundant_edges(&pairs, forest);
   result.models = forest.models();
   result.records = std::move(pairs.records());
   for (const int part : parts)

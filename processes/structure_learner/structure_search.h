@@ -11,6 +11,9 @@ namespace bodyschema {
 
 struct SearchResult {
   std::vector<AcceptedModel> models;  ///< the forest, in the order of acceptance
+  /// Of the models, by their parts: those with joints that the forest does not need
+  /// (redundant_edges()).
+  std::vector<std::pair<int, int>> redundant;
   std::map<std::pair<int, int>, PairRecord> records;
   std::set<int> resting;  ///< parts that keep their pose in the camera's frame
   /// All poses', each tree fitted as a whole, Student-t [nats]; up to a constant. It holds for a

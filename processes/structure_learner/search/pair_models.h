@@ -36,6 +36,8 @@ struct PairRecord {
   /// Signals that moved too little while both were seen to tell whether they move the one against
   /// the other: why a model was taken back.
   std::set<int> untold_signals = {};
+  /// A valid model has a joint that its tree does not need: redundant_edges().
+  bool is_redundant = false;
 
   void note_undecided(int num_signals, double mean_capped);
 };

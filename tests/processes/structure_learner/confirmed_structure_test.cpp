@@ -68,6 +68,17 @@ TEST(ConfirmedStructureTest, WhereNothingSpansTheNoiseGrowsUntilTwoStructuresAre
   EXPECT_FALSE(found.structure.is_contested);
 }
 
+TEST(ConfirmedStructureTest, JointsThatTheOthersMakeNeedlessAreTakenBackIfMoreNoiseDoesNot) {
+  LearnedStructure needless = structure({0, 1}, 0.95);
+  needless.search.redundant = {{1, 2}};
+  Found found = confirmed({{1, needless}, {2, needless}});
+  EXPECT_TRUE(found.structure.search.models.empty());
+  LearnedStructure other_order = structure({1, 0, 1}, 0.9);
+  other_order.search.redundant = {{1, 2}};
+  found = confirmed({{1, other_order}, {2, structure({1, 0}, 0.5)}, {4, structure({1, 0}, 0.3)}});
+  EXPECT_EQ(signals_of(found.structure), std::vector<int>({1, 0}));
+}
+
 TEST(ConfirmedStructureTest, TooFewDataAreNoReasonForMoreNoise) {
   LearnedStructure few = nothing();
   few.search.records[{2, 3}].undecided.emplace(1, 5.0);

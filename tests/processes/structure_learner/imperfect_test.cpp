@@ -84,6 +84,20 @@ test::SyntheticRobot hinge(double half_range_deg, test::Rng& rng) {
   return robot;
 }
 
+// A part that is often turned over or elsewhere has valid models to parts that seldom are: the true
+// edge is refuted, and a longer one through the part's own parent takes its place.
+TEST(WildReadings, NoJointThatTheOthersMakeNeedlessIsInACompleteStructure) {
+  for (const Imperfection& wild : {Imperfection{.name = "outliers", .outlier_share = 0.1},
+                                   Imperfection{.name = "flips", .flip_share = 0.1}})
+    for (std::uint64_t seed = 0; seed < 5; ++seed) {
+      ImperfectRobot robot(2 + static_cast<int>(seed), true, wild, seed);
+      const LearnResult result = learn(robot.signals(), robot.babble(60), options_of(kTold));
+      EXPECT_FALSE(result.schema.complete &&
+                   judge(result.schema, robot.structure()) == Rightness::kWrong)
+          << wild.name << " " << seed;
+    }
+}
+
 TEST(Warp, ALinearJointThatIsSeenAtSixAnglesIsNotBent) {
   for (const double half_range_deg : {60, 90, 150, 180, 225, 300, 450})
     for (const int num_samples : {6, 12, 36})
