@@ -81,6 +81,7 @@ LearnedStructure contested(LearnedStructure structure, const LearnedStructure& r
   return structure;
 }
 
+// The structure at the least noise that explains it; edges with needless joints are still in it.
 LearnedStructure least_noise(const FindStructure& find) {
   LearnedStructure told = find(1, 0);
   if (told.actions.blocks().is_stream() && told.noise_source == NoiseSource::kResiduals &&

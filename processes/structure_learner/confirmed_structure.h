@@ -15,14 +15,15 @@ using FindStructure = std::function<LearnedStructure(double factor, double unkno
 /// to whoever believes too small a noise: these go when the noise is doubled, joints that move
 /// several times the noise stay.
 ///
-/// So where the residuals are larger than the noise explains, or edges have joints
-/// that they do not need (SearchResult::redundant), or nothing but Gaussian processes
-/// explains them, or no structure spans although data are enough, the noise is doubled until two
-/// structures in a row are the same; that of the smaller noise, at most four times the told one, is
-/// the answer. It ends where more noise connects no more parts. Where a signal that the first
-/// structure uses is used no more with larger noise, size alone does not tell a small joint from a
-/// bias: what the two do not share is left open (LearnedStructure::is_contested). So are redundant
-/// edges of the answer.
+/// So where the residuals are larger than the noise explains, or edges have joints that they do not
+/// need (SearchResult::redundant), or nothing but Gaussian processes explains them, or no structure
+/// spans although data are enough, the noise is doubled until two structures in a row are the same;
+/// that of the smaller noise, at most four times the told one, is the answer. It ends where more
+/// noise connects no more parts. Where a signal that the first structure uses is used no more with
+/// larger noise, size alone does not tell a small joint from a bias: what the two do not share is
+/// left open (LearnedStructure::is_contested). So are redundant edges of the answer. Noise of a
+/// stream that was estimated from residuals is raised by a fifth, at most twice, until a structure
+/// spans.
 LearnedStructure confirmed_structure(const FindStructure& find);
 
 }  // namespace bodyschema
