@@ -55,6 +55,12 @@ bool is_noise_known(const LearnedStructure& structure) {
          structure.noise_source != NoiseSource::kAssumed;
 }
 
+// Neither needs a joint that may be no joint nor Gaussian processes.
+bool is_simple(const LearnedStructure& structure) {
+  return !is_soft(structure) && structure.search.redundant.empty() &&
+         structure.search.couplings.empty();
+}
+
 // A structure that does not span for want of data: more noise does not help.
 bool lacks_data(const LearnedStructure& structure) {
   return !structure.spans() &&
@@ -90,11 +96,12 @@ LearnedStructure least_noise(const FindStructure& find) {
       LearnedStructure louder = find(std::pow(kStep, step), 0);
       if (louder.spans()) told = std::move(louder);
     }
-  if (lacks_data(told) || !is_noise_known(told)) return told;
+  if (lacks_data(told)) return told;
   const bool is_explained = told.spans() && !is_soft(told);
-  if (is_explained && told.search.redundant.empty() &&
-      told.search.residual_scale <= kLargestResidual)
+  if (is_explained && is_simple(told) &&
+      (told.search.residual_scale <= kLargestResidual || !is_noise_known(told)))
     return told;
+  if (!is_noise_known(told) && !(told.spans() && !is_simple(told))) return told;
   LearnedStructure quieter = told;
   for (double factor = 2; factor <= 2 * kMostNoise; factor *= 2) {
     LearnedStructure louder = find(factor, kUnknownBias);
@@ -103,7 +110,7 @@ LearnedStructure least_noise(const FindStructure& find) {
     // What more noise does not help to connect has another reason.
     if (!louder.spans() && louder.search.models.size() <= quieter.search.models.size()) break;
     if (fixes_what_strays(louder, told.search.resting)) break;
-    if (quieter.spans() && !is_soft(quieter) && signatures_of(quieter) == signatures_of(louder)) {
+    if (quieter.spans() && is_simple(quieter) && signatures_of(quieter) == signatures_of(louder)) {
       if (is_first) return quieter;
       if (quieter.search.residual_scale < kSmallestResidual) break;
       quieter.noise_source = NoiseSource::kResiduals;

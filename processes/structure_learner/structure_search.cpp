@@ -3,7 +3,6 @@
 #include "processes/structure_learner/search/bridging.h"
 #include "processes/structure_learner/search/layered_search.h"
 #include "processes/structure_learner/search/long_chains.h"
-#include "processes/structure_learner/search/redundancy.h"
 #include "processes/structure_learner/search/settling.h"
 #include "processes/structure_learner/search/withdrawal.h"
 
@@ -30,6 +29,7 @@ SearchResult search_structure(const std::vector<ActionPoseSample>& samples,
   SearchResult result;
   result.joint_information = withdraw_untold_edges(&pairs, &forest);
   result.redundant = redundant_edges(&pairs, forest);
+  result.couplings = couplings(&pairs, forest);
   result.models = forest.models();
   result.records = std::move(pairs.records());
   for (const int part : parts)

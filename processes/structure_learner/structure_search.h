@@ -6,6 +6,7 @@
 #include <vector>
 
 #include "processes/structure_learner/search/pair_models.h"
+#include "processes/structure_learner/search/redundancy.h"
 
 namespace bodyschema {
 
@@ -14,6 +15,7 @@ struct SearchResult {
   /// Of the models, by their parts: those with joints that the forest does not need
   /// (redundant_edges()).
   std::vector<std::pair<int, int>> redundant;
+  std::vector<Coupling> couplings;  ///< joints of the models that may be none
   std::map<std::pair<int, int>, PairRecord> records;
   std::set<int> resting;  ///< parts that keep their pose in the camera's frame
   /// All poses', each tree fitted as a whole, Student-t [nats]; up to a constant. It holds for a

@@ -18,17 +18,44 @@
 using namespace bodyschema;
 using namespace bodyschema::test;
 
+namespace {
+
+// The edges of a wrong structure, how far each joint goes, and the signals that are on its true
+// path.
+void list_edges(int seed, const BodySchema& schema, const ImperfectRobot& robot) {
+  std::fprintf(stderr, "robot %d%s, noise %.1f mm %.2f°:", seed, schema.complete ? ", complete" : "",
+               1000 * schema.noise.position_m, schema.noise.rotation_rad / kDegree);
+  for (const Edge& edge : schema.edges) {
+    std::fprintf(stderr, "  %d-%d {", edge.from, edge.to);
+    for (const ScrewJoint& joint : edge.joints) {
+      const Signal& signal = schema.signals[static_cast<std::size_t>(joint.signal)];
+      const double range = signal.upper - signal.lower;
+      std::fprintf(stderr, " %s %.1f° %.0f mm", signal.name.c_str(),
+                   joint.gain * joint.turn * range / kDegree, 1000 * joint.gain * joint.slide * range);
+    }
+    std::fprintf(stderr, " | true");
+    for (const int s : robot.structure().path_signals(edge.from, edge.to))
+      std::fprintf(stderr, " %s", schema.signals[static_cast<std::size_t>(s)].name.c_str());
+    std::fprintf(stderr, " }");
+  }
+  std::fprintf(stderr, "\n");
+}
+
+}  // namespace
+
 int main(int argc, char** argv) {
   int num_robots = 12;
   std::vector<int> nums_samples = {20, 50, 100};
   bool is_noise_estimated = false;
   double told = 1;
+  bool are_wrong_listed = false;
   std::vector<std::string> cells;
   CLI::App app("Robots that are not as our models are");
   app.add_option("--robots", num_robots, "A row")->check(CLI::PositiveNumber);
   app.add_option("--samples", nums_samples)->check(CLI::PositiveNumber);
   app.add_option("--told", told, "Times the true noise, 3 mm and 1°")->check(CLI::PositiveNumber);
   app.add_flag("--estimate-noise", is_noise_estimated, "Its 3 mm and 1° are not told");
+  app.add_flag("--list-wrong", are_wrong_listed, "Their edges, on stderr");
   app.add_option("--cell", cells, "Rows whose name has one of these words alone");
   CLI11_PARSE(app, argc, argv);
 
@@ -57,6 +84,7 @@ int main(int argc, char** argv) {
         num_incomplete += rightness == Rightness::kIncomplete;
         num_wrong += rightness == Rightness::kWrong;
         num_complete += rightness == Rightness::kWrong && schema.complete;
+        if (are_wrong_listed && rightness == Rightness::kWrong) list_edges(r, schema, robot);
       }
       std::printf(" %d / %d / %d (%d) |", num_right, num_incomplete, num_wrong, num_complete);
       std::fflush(stdout);

@@ -1,6 +1,7 @@
 #include "processes/structure_learner/search/redundancy.h"
 
 #include <algorithm>
+#include <map>
 #include <optional>
 #include <utility>
 #include <vector>
@@ -13,6 +14,9 @@ namespace {
 
 // d² of one sight.
 constexpr double kNoiseOfOneSight = 6;
+// Of the mean squares of the motions of two joints of one signal: their gains may differ fourfold
+// (RandomTreeOptions), droop of 3° is a twentieth of what a joint of 60° moves.
+constexpr double kCoupling = 1.0 / 36;
 
 using Nodes = std::vector<TreeNode>;
 
@@ -91,7 +95,40 @@ std::optional<int> redundant_node(const Nodes& nodes, PairModels* pairs) {
   return std::nullopt;
 }
 
+// By joint of the model: mean square of what it moves over the frames, whitened by the noise of one
+// sight.
+std::vector<double> joint_motions(const AcceptedModel& m, PairModels* pairs) {
+  const PairData& pair = pairs->pair(m.part_i, m.part_j);
+  std::vector<double> result(static_cast<std::size_t>(m.model.num_joints()), 0);
+  for (int t = 0; t < pair.size(); ++t) {
+    const int sample = pair.frames[t].sample;
+    const MotionJacobian J = motion_jacobian(m.model, pairs->actions(), sample);
+    for (int d = 0; d < m.model.num_joints(); ++d) {
+      const double q = pairs->actions()(sample, m.model.joints[d].signal);
+      result[d] += (pair.primary(t).whitening * (q * J.col(d))).squaredNorm() / pair.size();
+    }
+  }
+  return result;
+}
+
 }  // namespace
+
+std::vector<Coupling> couplings(PairModels* pairs, const ModelForest& forest) {
+  std::vector<std::pair<Coupling, double>> joints;
+  std::map<int, double> largest;
+  for (const AcceptedModel& m : forest.models()) {
+    const std::vector<double> motions = joint_motions(m, pairs);
+    for (int d = 0; d < m.model.num_joints(); ++d) {
+      const int signal = m.model.joints[d].signal;
+      joints.emplace_back(Coupling{m.part_i, m.part_j, signal}, motions[d]);
+      largest[signal] = std::max(largest[signal], motions[d]);
+    }
+  }
+  std::vector<Coupling> result;
+  for (const auto& [joint, motion] : joints)
+    if (motion < kCoupling * largest[joint.signal]) result.push_back(joint);
+  return result;
+}
 
 std::vector<std::pair<int, int>> redundant_edges(PairModels* pairs, ModelForest forest) {
   std::vector<std::pair<int, int>> result;

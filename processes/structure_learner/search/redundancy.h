@@ -1,5 +1,6 @@
 #pragma once
 
+#include <compare>
 #include <utility>
 #include <vector>
 
@@ -14,5 +15,15 @@ namespace bodyschema {
 /// joints is returned, by its parts, and its record says so. O(E² N) for E edges that share a
 /// signal and N frames of a pair.
 std::vector<std::pair<int, int>> redundant_edges(PairModels* pairs, ModelForest forest);
+
+/// A joint of a signal that has another one, which moves far more. Arms are rarely built so: it may
+/// be how that motion loads the other joints, or what a view biases.
+struct Coupling {
+  int part_i = 0, part_j = 0;
+  int signal = 0;
+  friend auto operator<=>(const Coupling&, const Coupling&) = default;
+};
+/// In the order of the forest's models. O(E N).
+std::vector<Coupling> couplings(PairModels* pairs, const ModelForest& forest);
 
 }  // namespace bodyschema
