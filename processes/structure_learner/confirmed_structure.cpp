@@ -55,10 +55,12 @@ bool is_noise_known(const LearnedStructure& structure) {
          structure.noise_source != NoiseSource::kAssumed;
 }
 
-// Neither needs a joint that may be no joint nor Gaussian processes.
+bool has_doubtful_joints(const LearnedStructure& structure) {
+  return !structure.search.redundant.empty() || !structure.search.couplings.empty();
+}
+
 bool is_simple(const LearnedStructure& structure) {
-  return !is_soft(structure) && structure.search.redundant.empty() &&
-         structure.search.couplings.empty();
+  return !is_soft(structure) && !has_doubtful_joints(structure);
 }
 
 // A structure that does not span for want of data: more noise does not help.
@@ -101,7 +103,9 @@ LearnedStructure least_noise(const FindStructure& find) {
   if (is_explained && is_simple(told) &&
       (told.search.residual_scale <= kLargestResidual || !is_noise_known(told)))
     return told;
-  if (!is_noise_known(told) && !(told.spans() && !is_simple(told))) return told;
+  if (!is_noise_known(told) &&
+      (told.actions.blocks().is_stream() || !told.spans() || !has_doubtful_joints(told)))
+    return told;
   LearnedStructure quieter = told;
   for (double factor = 2; factor <= 2 * kMostNoise; factor *= 2) {
     LearnedStructure louder = find(factor, kUnknownBias);

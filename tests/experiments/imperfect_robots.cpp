@@ -23,15 +23,17 @@ namespace {
 // The edges of a wrong structure, how far each joint goes, and the signals that are on its true
 // path.
 void list_edges(int seed, const BodySchema& schema, const ImperfectRobot& robot) {
-  std::fprintf(stderr, "robot %d%s, noise %.1f mm %.2f°:", seed, schema.complete ? ", complete" : "",
-               1000 * schema.noise.position_m, schema.noise.rotation_rad / kDegree);
+  std::fprintf(stderr, "robot %d%s, noise %.1f mm %.2f°:", seed,
+               schema.complete ? ", complete" : "", 1000 * schema.noise.position_m,
+               schema.noise.rotation_rad / kDegree);
   for (const Edge& edge : schema.edges) {
     std::fprintf(stderr, "  %d-%d {", edge.from, edge.to);
     for (const ScrewJoint& joint : edge.joints) {
       const Signal& signal = schema.signals[static_cast<std::size_t>(joint.signal)];
       const double range = signal.upper - signal.lower;
       std::fprintf(stderr, " %s %.1f° %.0f mm", signal.name.c_str(),
-                   joint.gain * joint.turn * range / kDegree, 1000 * joint.gain * joint.slide * range);
+                   joint.gain * joint.turn * range / kDegree,
+                   1000 * joint.gain * joint.slide * range);
     }
     std::fprintf(stderr, " | true");
     for (const int s : robot.structure().path_signals(edge.from, edge.to))

@@ -71,12 +71,28 @@ TEST(ConfirmedStructureTest, WhereNothingSpansTheNoiseGrowsUntilTwoStructuresAre
 TEST(ConfirmedStructureTest, JointsThatTheOthersMakeNeedlessAreTakenBackIfMoreNoiseDoesNot) {
   LearnedStructure needless = structure({0, 1}, 0.95);
   needless.search.redundant = {{1, 2}};
-  Found found = confirmed({{1, needless}, {2, needless}});
+  Found found = confirmed({{1, needless}, {2, needless}, {4, needless}, {8, needless}});
   EXPECT_TRUE(found.structure.search.models.empty());
   LearnedStructure other_order = structure({1, 0, 1}, 0.9);
   other_order.search.redundant = {{1, 2}};
   found = confirmed({{1, other_order}, {2, structure({1, 0}, 0.5)}, {4, structure({1, 0}, 0.3)}});
   EXPECT_EQ(signals_of(found.structure), std::vector<int>({1, 0}));
+}
+
+TEST(ConfirmedStructureTest, ASmallJointOfASignalThatHasALargeOneGoesIfMoreNoiseDoesWithoutIt) {
+  LearnedStructure coupled = structure({0, 0}, 0.9);
+  coupled.search.couplings = {{1, 2, 0}};
+  for (const NoiseSource source : {NoiseSource::kGiven, NoiseSource::kResiduals}) {
+    coupled.noise_source = source;
+    Found found = confirmed({{1, coupled}, {2, structure({0}, 0.5)}, {4, structure({0}, 0.1)}});
+    EXPECT_EQ(signals_of(found.structure), std::vector<int>({0}));
+    found =
+        confirmed({{1, coupled}, {2, coupled}, {4, structure({0}, 0.3)}, {8, structure({0}, 0.1)}});
+    EXPECT_EQ(signals_of(found.structure), std::vector<int>({0}));
+    found = confirmed({{1, coupled}, {2, coupled}, {4, coupled}, {8, coupled}});
+    EXPECT_EQ(signals_of(found.structure), std::vector<int>({0, 0}));
+    EXPECT_FALSE(found.structure.is_contested);
+  }
 }
 
 TEST(ConfirmedStructureTest, TooFewDataAreNoReasonForMoreNoise) {

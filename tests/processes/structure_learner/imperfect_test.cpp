@@ -143,11 +143,12 @@ TEST(Warp, BeyondTheAnglesSeenACommandIsLinear) {
 }
 
 // How many of so many robots are right; none may be wrong.
-int count_right(const Imperfection& imperfection, int num_robots) {
+int count_right(const Imperfection& imperfection, int num_robots,
+                const std::optional<Noise>& told = kTold) {
   int num_right = 0;
   for (int seed = 0; seed < num_robots; ++seed) {
     ImperfectRobot robot(2 + seed, true, imperfection, static_cast<std::uint64_t>(seed));
-    const BodySchema schema = learn(robot.signals(), robot.babble(60), options_of(kTold)).schema;
+    const BodySchema schema = learn(robot.signals(), robot.babble(60), options_of(told)).schema;
     EXPECT_NE(judge(schema, robot.structure()), Rightness::kWrong) << imperfection.name << seed;
     num_right += judge(schema, robot.structure()) == Rightness::kRight;
   }
@@ -170,6 +171,13 @@ TEST(Repetitions, ARecordingAppendedToItselfAddsNothing) {
       EXPECT_EQ(once.edges[e].left.matrix(), again.edges[e].left.matrix());
     }
   }
+}
+
+// Joints give way under the loads of others, and tags seem elsewhere from elsewhere: it goes along
+// with signals, but these have joints already.
+TEST(Couplings, WhatLoadsAndViewsAddIsNoJoint) {
+  EXPECT_GE(count_right({.name = "droop", .droop_deg = 3}, 5, std::nullopt), 4);
+  EXPECT_GE(count_right({.name = "bias", .view_bias_m = 0.003, .view_bias_deg = 1.5}, 5), 4);
 }
 
 TEST(SerialCorrelation, NoiseThatLastsIsNoJoint) {
