@@ -116,7 +116,7 @@ LearnedStructure least_noise(const FindStructure& find) {
     if (fixes_what_strays(louder, told.search.resting)) break;
     if (quieter.spans() && is_simple(quieter) && signatures_of(quieter) == signatures_of(louder)) {
       if (is_first) return quieter;
-      if (quieter.search.residual_scale < kSmallestResidual) break;
+      if (!is_explained && quieter.search.residual_scale < kSmallestResidual) break;
       quieter.noise_source = NoiseSource::kResiduals;
       return quieter;
     }
@@ -125,7 +125,9 @@ LearnedStructure least_noise(const FindStructure& find) {
       if (is_explained && !used.contains(s)) return contested(std::move(told), louder);
     quieter = std::move(louder);
   }
-  return is_explained ? contested(std::move(told), quieter) : told;
+  return is_explained || (told.spans() && has_doubtful_joints(told))
+             ? contested(std::move(told), quieter)
+             : told;
 }
 
 }  // namespace

@@ -4,6 +4,7 @@
 #include <cmath>
 #include <set>
 #include <stdexcept>
+#include <tuple>
 
 #include "processes/structure_learner/command_warp.h"
 #include "processes/structure_learner/confirmed_structure.h"
@@ -144,7 +145,8 @@ LearnResult fit_tree(const LearnedStructure& structure,
   const int num_signals = check_actions(samples, structure.signals.size());
   const SearchResult& search = structure.search;
   const MeasurementModel& measurement = structure.measurement;
-  const ValidityOptions validity = search_options_of(options).validity;
+  ValidityOptions validity = search_options_of(options).validity;
+  validity.allows_far_outliers = structure.allows_far_outliers;
 
   LearnResult result;
   result.noise_source = structure.noise_source;
@@ -217,6 +219,22 @@ SourcedNoise marker_noise(const std::vector<ActionPoseSample>& samples, int num_
 
 namespace {
 
+// More readings are wild than assumed: models are refuted by these alone.
+bool has_far_outliers(const SearchResult& search) {
+  return std::any_of(search.records.begin(), search.records.end(),
+                     [](const auto& record) { return record.second.has_far_outliers; });
+}
+
+// More edges, or as many with fewer joints.
+bool connects_more_simply(const SearchResult& x, const SearchResult& y) {
+  const auto num_joints = [](const SearchResult& search) {
+    int sum = 0;
+    for (const AcceptedModel& m : search.models) sum += m.model.num_joints();
+    return sum;
+  };
+  return std::tuple(x.models.size(), -num_joints(x)) > std::tuple(y.models.size(), -num_joints(y));
+}
+
 LearnedStructure find_with_bias(const std::vector<Signal>& signals,
                                 const std::vector<ActionPoseSample>& samples,
                                 const LearnOptions& options, double unknown_bias) {
@@ -241,6 +259,14 @@ LearnedStructure find_with_bias(const std::vector<Signal>& signals,
     search_options.max_signals = std::min(search_options.max_signals, kMaxScreenedJoints);
   NormalizedActions actions(samples, num_signals);
   SearchResult search = search_structure(samples, actions, parts, search_options);
+  if (unknown_bias == 0 && has_far_outliers(search)) {
+    search_options.validity.allows_far_outliers = true;
+    SearchResult found = search_structure(samples, actions, parts, search_options);
+    found.num_screens += search.num_screens;
+    found.num_fits += search.num_fits;
+    search_options.validity.allows_far_outliers = connects_more_simply(found, search);
+    if (search_options.validity.allows_far_outliers) search = std::move(found);
+  }
   LearnedStructure result{signals,           parts,       measurement, std::move(actions),
                           std::move(search), noise_source};
   // Everything that is fitted sees displacements; which commands are bent shows only by a model.
@@ -270,6 +296,7 @@ LearnedStructure find_with_bias(const std::vector<Signal>& signals,
     if (was_spanning) break;
   }
   measurement = result.measurement;
+  result.allows_far_outliers = search_options.validity.allows_far_outliers;
   // With enough noise a screw passes for anything soft: nothing is tried beside it.
   if (unknown_bias == 0 && !is_guess_too_large(result))
     connect_soft_parts(displaced(samples, result.signals), result.actions, parts, search_options,

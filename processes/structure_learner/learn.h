@@ -69,6 +69,8 @@ struct LearnedStructure {
   /// Another structure stands where the noise is larger than told: edges that the two do not share
   /// were taken out.
   bool is_contested = false;
+  /// Far more readings are wild than LearnOptions::measurement says (see ValidityOptions).
+  bool allows_far_outliers = false;
 
   /// The edges span all parts seen.
   bool spans() const { return search.models.size() + 1 >= parts.size(); }

@@ -15,7 +15,7 @@ namespace bodyschema {
 bool is_at_rest(const PairData& data, const NormalizedActions& actions,
                 const ValidityOptions& options) {
   const Start start = screen_rigid(data, actions);
-  if (!(start.score < kMaxRigidStartCost)) return false;
+  if (!(start.score < kMaxRigidStartCost) && !options.allows_far_outliers) return false;
   const Fit fit = fit_local_model(start.model, data, actions, 20, 1e-4);
   return check_validity(fit, leave_one_out(fit, data, actions), data, actions, options).verdict ==
          Verdict::kValid;

@@ -13,8 +13,18 @@ namespace {
 constexpr double kClip = 20;
 // Below this number of frames an excess of outliers may be bad luck.
 constexpr int kFewFrames = 60;
+// Outliers beyond this multiple of kOutlierThreshold are wild readings: 16 standard deviations.
+// Flips are by twice the tilt of a tag, of which one in twenty is nearer.
+constexpr double kFar = 10;
 // How much noise that lasts explains is known to such a factor at best (chosen).
 constexpr double kLargestLasting = 2;
+// Fewer independent frames do not tell wild readings from a wrong model.
+constexpr int kFewestFarFrames = 20;
+// Share of the frames. At 20 % of wild readings a marker 64 % of a pair's frames are without one;
+// of 60 frames fewer than 24 are once in 10 000 pairs.
+constexpr double kFewestInliers = 0.4;
+// Of as many outliers in a row by chance.
+constexpr double kLeastChanceOfRun = 1e-3;
 
 // Sum of squares that regressors F_t (rows of F) explain of the whitened residuals, all six
 // outputs.
@@ -29,15 +39,20 @@ double explained_sum(const Eigen::MatrixXd& F, const Eigen::Matrix<double, 6, Ei
 void tally(const Fit& fit, const LeaveOneOut& loo, const PairData& pair, Validity* result) {
   const int n = pair.size();
   double inlier_sum = 0;
+  int run = 0;
   for (int t = 0; t < n; ++t) {
     const double d2 = loo.squared_distance[t];
     const double log_det = pair.hypotheses[fit.frames[t].hypothesis].log_det;
     result->mean_capped += std::min(d2, 2 * kOutlierThreshold) / n;
     result->score -= 0.5 * (std::min(d2, 2 * kOutlierThreshold) + log_det) / n;
-    if (d2 > kOutlierThreshold)
+    if (d2 > kOutlierThreshold) {
       ++result->num_outliers;
-    else
+      result->num_near += d2 < kFar * kOutlierThreshold;
+      result->longest_run = std::max(result->longest_run, ++run);
+    } else {
+      run = 0;
       inlier_sum += d2;
+    }
   }
   if (n > result->num_outliers) result->mean_inlier = inlier_sum / (n - result->num_outliers);
 }
@@ -123,6 +138,12 @@ double log_spread(const Fit& fit, const PairData& pair) {
   return 0.5 * std::log(std::max(upper_median(std::move(spread)) / 2, 1.0));
 }
 
+// Wild readings come at any time; those since the body changed come one after the other.
+bool are_scattered(const Validity& validity, int num_frames) {
+  const double share = static_cast<double>(validity.num_outliers) / num_frames;
+  return num_frames * std::pow(share, validity.longest_run) > kLeastChanceOfRun;
+}
+
 }  // namespace
 
 double largest_inlier_mean(double num_inliers, double sigmas) {
@@ -159,9 +180,13 @@ Validity check_validity(const Fit& fit, const LeaveOneOut& loo, const PairData& 
       static_cast<int>(0.35 * n));
   // With few frames a true model may meet more outliers than the bound by bad luck: then it is not
   // refuted, only not to be trusted yet.
-  const bool suspicious = result.num_outliers > max_outliers;
-  result.doubtful = num_independent < kFewFrames &&
-                    result.num_outliers > binomial_quantile(num_independent, rate, 0.8) / share;
+  const bool are_far = num_independent >= kFewestFarFrames && result.num_near <= max_outliers &&
+                       inliers >= kFewestInliers * n && are_scattered(result, n);
+  const bool are_allowed = options.allows_far_outliers && are_far;
+  const bool suspicious = result.num_outliers > max_outliers && !are_allowed;
+  result.doubtful =
+      num_independent < kFewFrames && (are_allowed ? result.num_near : result.num_outliers) >
+                                          binomial_quantile(num_independent, rate, 0.8) / share;
   const double independent_inliers = share * inliers;
   const double dof = 6 * independent_inliers - p;
   if (dof < 6) {
@@ -169,12 +194,19 @@ Validity check_validity(const Fit& fit, const LeaveOneOut& loo, const PairData& 
     result.verdict = suspicious ? Verdict::kRefuted : Verdict::kNotEnoughData;
     return result;
   }
-  if (suspicious && (n >= kFewFrames || 2 * result.num_outliers > n)) return result;
   const double correlation = serial_correlation(fit, pair, actions);
   // Squares of noise that lasts: the sum of ρ^2k over all lags either way.
   const double lasts = (1 + correlation * correlation) / (1 - correlation * correlation);
   const double max_mean = largest_inlier_mean(dof / 6 / lasts, options.lenient ? 5 : 3);
   if (result.mean_inlier > std::min(max_mean, 0.75 * kOutlierThreshold)) return result;
+  result.has_far_outliers = suspicious && are_far;
+  if (suspicious && (n >= kFewFrames || 2 * result.num_outliers > n)) {
+    // So many wild readings say nothing against it, nor for it. (By chance a wrong model has fewer
+    // inliers without more that are near.)
+    if (options.allows_far_outliers && result.num_near <= max_outliers && 4 * inliers > n)
+      result.verdict = Verdict::kNotEnoughData;
+    return result;
+  }
 
   // V2
   result.explained =

@@ -14,6 +14,10 @@ enum class Verdict {
 struct ValidityOptions {
   /// Expected share of outliers per marker; a pair sees about twice as many.
   double outlier_rate = 0.03;
+  /// More outliers are allowed, up to 60 % of the frames, where these are far off and scattered:
+  /// wild readings. A wrong model is wrong by a little, too, and that of a body that changed is
+  /// wrong from then on.
+  bool allows_far_outliers = false;
   /// Widens the tests for a preselection on a part of the data.
   bool lenient = false;
 };
@@ -21,6 +25,10 @@ struct ValidityOptions {
 struct Validity {
   Verdict verdict = Verdict::kRefuted;
   int num_outliers = 0;  ///< frames beyond kOutlierThreshold, leave-one-out
+  int num_near = 0;      ///< of these, those within ten times that
+  int longest_run = 0;   ///< of outliers one after the other
+  /// Its outliers are too many, but would not be if ValidityOptions::allows_far_outliers.
+  bool has_far_outliers = false;
   /// Valid, but with more outliers than most true models have at so few frames: to be believed only
   /// where nothing larger explains the data better.
   bool doubtful = false;

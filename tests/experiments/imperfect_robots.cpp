@@ -3,7 +3,7 @@
 // ones that are called complete; prints Markdown.
 //
 //   imperfect_robots [--robots 12] [--samples 20 50 100] [--told 1 | --estimate-noise]
-//     [--cell WORDS...]
+//     [--outlier-rate 0.03] [--cell WORDS...]
 
 #include <CLI/CLI.hpp>
 #include <algorithm>
@@ -51,11 +51,13 @@ int main(int argc, char** argv) {
   bool is_noise_estimated = false;
   double told = 1;
   bool are_wrong_listed = false;
+  double outlier_rate = MeasurementModel().outlier_rate;
   std::vector<std::string> cells;
   CLI::App app("Robots that are not as our models are");
   app.add_option("--robots", num_robots, "A row")->check(CLI::PositiveNumber);
   app.add_option("--samples", nums_samples)->check(CLI::PositiveNumber);
   app.add_option("--told", told, "Times the true noise, 3 mm and 1°")->check(CLI::PositiveNumber);
+  app.add_option("--outlier-rate", outlier_rate, "Told, of a marker")->check(CLI::Range(0.0, 0.5));
   app.add_flag("--estimate-noise", is_noise_estimated, "Its 3 mm and 1° are not told");
   app.add_flag("--list-wrong", are_wrong_listed, "Their edges, on stderr");
   app.add_option("--cell", cells, "Rows whose name has one of these words alone");
@@ -79,6 +81,7 @@ int main(int argc, char** argv) {
                              static_cast<std::uint64_t>(r));
         LearnOptions options;
         options.root = 1;
+        options.measurement.outlier_rate = outlier_rate;
         if (!is_noise_estimated) options.measurement.noise = Noise{told * 0.003, told * kDegree};
         const BodySchema schema = learn(robot.signals(), robot.babble(num_samples), options).schema;
         const Rightness rightness = judge(schema, robot.structure());

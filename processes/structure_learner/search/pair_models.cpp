@@ -70,6 +70,7 @@ std::optional<Candidate> PairModels::try_start(int part_i, int part_j, const Loc
   options.lenient = !all;
   const Validity validity =
       check_validity(fit, leave_one_out(fit, data, actions_), data, actions_, options);
+  tried.has_far_outliers |= validity.has_far_outliers;
   if (validity.verdict == Verdict::kNotEnoughData)
     tried.note_undecided(start.num_joints(), validity.is_noise_lasting ? 0 : validity.mean_capped);
   if (validity.verdict == Verdict::kValid)

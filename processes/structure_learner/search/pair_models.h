@@ -32,7 +32,8 @@ struct PairRecord {
   /// The models that were not refuted but that the data are too few to trust: mean of min(d², 2c)
   /// of the best, by k.
   std::map<int, double> undecided;
-  bool was_soft_tried = false;  ///< a Gaussian process on the screws' rest was fitted too
+  bool has_far_outliers = false;  ///< of a model, see Validity
+  bool was_soft_tried = false;    ///< a Gaussian process on the screws' rest was fitted too
   /// Signals that moved too little while both were seen to tell whether they move the one against
   /// the other: why a model was taken back.
   std::set<int> untold_signals = {};

@@ -155,6 +155,20 @@ int count_right(const Imperfection& imperfection, int num_robots,
   return num_right;
 }
 
+TEST(WildReadings, OneInFiveIsNoObstacle) {
+  EXPECT_GE(count_right({.name = "outliers ", .outlier_share = 0.2}, 4), 3);
+  EXPECT_GE(count_right({.name = "flips ", .flip_share = 0.2}, 4), 3);
+}
+
+TEST(WildReadings, AStructureThatHasThemIsRelearned) {
+  ImperfectRobot robot(3, true, {.name = "outliers", .outlier_share = 0.2}, 1);
+  auto samples = robot.babble(60);
+  const LearnOptions options = options_of(kTold);
+  const LearnedStructure structure = find_structure(robot.signals(), samples, options);
+  for (const ActionPoseSample& sample : robot.babble(30)) samples.push_back(sample);
+  EXPECT_TRUE(is_right(relearn(structure, samples, options).schema, robot.structure()));
+}
+
 TEST(Repetitions, ARecordingAppendedToItselfAddsNothing) {
   ImperfectRobot robot(4, true, {.name = "none"}, 1);
   const auto samples = robot.babble(12);
