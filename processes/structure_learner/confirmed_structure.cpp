@@ -16,7 +16,7 @@ constexpr double kLargestResidual = 1;
 // Below a quarter of that, half the noise explains them as well: it is not the noise of all parts.
 constexpr double kSmallestResidual = 0.84 / 4;
 constexpr double kMostNoise = 4;  // of the told one; it is confirmed at twice that
-// What a model of a stream leaves is no white noise; how much it is, is known to about that factor.
+// How much noise a model of a stream leaves is known to about that factor.
 constexpr double kStep = 1.2;
 constexpr int kSteps = 2;
 // Chosen: of 12 robots with a view bias of 4 mm and 2°, told 12 mm and 4°, 50 samples, none is
@@ -59,10 +59,6 @@ bool has_doubtful_joints(const LearnedStructure& structure) {
   return !structure.search.redundant.empty() || !structure.search.couplings.empty();
 }
 
-bool is_simple(const LearnedStructure& structure) {
-  return !is_soft(structure) && !has_doubtful_joints(structure);
-}
-
 // A structure that does not span for want of data: more noise does not help.
 bool lacks_data(const LearnedStructure& structure) {
   return !structure.spans() &&
@@ -90,17 +86,10 @@ LearnedStructure contested(LearnedStructure structure, const LearnedStructure& r
 }
 
 // The structure at the least noise that explains it; edges with needless joints are still in it.
-LearnedStructure least_noise(const FindStructure& find) {
-  LearnedStructure told = find(1, 0);
-  if (told.actions.blocks().is_stream() && told.noise_source == NoiseSource::kResiduals &&
-      !told.search.models.empty())
-    for (int step = 1; step <= kSteps && !told.spans() && !lacks_data(told); ++step) {
-      LearnedStructure louder = find(std::pow(kStep, step), 0);
-      if (louder.spans()) told = std::move(louder);
-    }
+LearnedStructure least_noise(LearnedStructure told, const FindStructure& find) {
   if (lacks_data(told)) return told;
   const bool is_explained = told.spans() && !is_soft(told);
-  if (is_explained && is_simple(told) &&
+  if (is_explained && !has_doubtful_joints(told) &&
       (told.search.residual_scale <= kLargestResidual || !is_noise_known(told)))
     return told;
   if (!is_noise_known(told) &&
@@ -114,9 +103,13 @@ LearnedStructure least_noise(const FindStructure& find) {
     // What more noise does not help to connect has another reason.
     if (!louder.spans() && louder.search.models.size() <= quieter.search.models.size()) break;
     if (fixes_what_strays(louder, told.search.resting)) break;
-    if (quieter.spans() && is_simple(quieter) && signatures_of(quieter) == signatures_of(louder)) {
+    if (quieter.spans() && !is_soft(quieter) && !has_doubtful_joints(quieter) &&
+        signatures_of(quieter) == signatures_of(louder)) {
       if (is_first) return quieter;
-      if (!is_explained && quieter.search.residual_scale < kSmallestResidual) break;
+      if (!is_explained && quieter.search.residual_scale < kSmallestResidual) {
+        told.is_contested = true;
+        return told;
+      }
       quieter.noise_source = NoiseSource::kResiduals;
       return quieter;
     }
@@ -125,15 +118,31 @@ LearnedStructure least_noise(const FindStructure& find) {
       if (is_explained && !used.contains(s)) return contested(std::move(told), louder);
     quieter = std::move(louder);
   }
-  return is_explained || (told.spans() && has_doubtful_joints(told))
-             ? contested(std::move(told), quieter)
-             : told;
+  return is_explained ? contested(std::move(told), quieter) : told;
+}
+
+// At the least noise of the steps that spans, if one does.
+LearnedStructure of_stream(LearnedStructure told, const FindStructure& find,
+                           const ConnectSoftParts& connect_soft_parts) {
+  connect_soft_parts(&told);
+  if (told.noise_source != NoiseSource::kResiduals || told.search.models.empty()) return told;
+  for (int step = 1; step <= kSteps && !told.spans() && !lacks_data(told); ++step) {
+    LearnedStructure louder = find(std::pow(kStep, step), 0);
+    connect_soft_parts(&louder);
+    if (louder.spans()) told = std::move(louder);
+  }
+  return told;
 }
 
 }  // namespace
 
-LearnedStructure confirmed_structure(const FindStructure& find) {
-  LearnedStructure structure = least_noise(find);
+LearnedStructure confirmed_structure(const FindStructure& find,
+                                     const ConnectSoftParts& connect_soft_parts) {
+  LearnedStructure structure = find(1, 0);
+  const bool is_stream = structure.actions.blocks().is_stream();
+  if (is_stream) structure = of_stream(std::move(structure), find, connect_soft_parts);
+  structure = least_noise(std::move(structure), find);
+  if (!is_stream && !structure.spans() && !structure.is_contested) connect_soft_parts(&structure);
   for (const auto& [part_i, part_j] : structure.search.redundant)
     std::erase_if(structure.search.models,
                   [&](const AcceptedModel& edge) { return edge.joins(part_i, part_j); });

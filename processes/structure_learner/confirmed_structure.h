@@ -9,6 +9,8 @@ namespace bodyschema {
 /// Searches with all standard deviations of the noise `factor` times as large, where every marker
 /// may have a bias that nobody told (SearchOptions::unknown_bias).
 using FindStructure = std::function<LearnedStructure(double factor, double unknown_bias)>;
+/// Connects what no screws do, with Gaussian processes beside them.
+using ConnectSoftParts = std::function<void(LearnedStructure*)>;
 
 /// The structure as it is with the noise told, unless the residuals refute that noise. What no
 /// model describes (a bias of views, a tag that is not where it should be) looks like more joints
@@ -16,14 +18,18 @@ using FindStructure = std::function<LearnedStructure(double factor, double unkno
 /// several times the noise stay.
 ///
 /// So where the residuals are larger than the noise explains, or edges have joints that they do not
-/// need (SearchResult::redundant), or nothing but Gaussian processes explains them, or no structure
-/// spans although data are enough, the noise is doubled until two structures in a row are the same;
-/// that of the smaller noise, at most four times the told one, is the answer. It ends where more
-/// noise connects no more parts. Where a signal that the first structure uses is used no more with
-/// larger noise, size alone does not tell a small joint from a bias: what the two do not share is
-/// left open (LearnedStructure::is_contested). So are redundant edges of the answer. Noise of a
-/// stream that was estimated from residuals is raised by a fifth, at most twice, until a structure
-/// spans.
-LearnedStructure confirmed_structure(const FindStructure& find);
+/// need (SearchResult::redundant) or that may be none (SearchResult::couplings), or no structure
+/// spans although data are enough, the noise is doubled until two structures in a row are the same
+/// and without such joints; that of the smaller noise, at most four times the told one, is the
+/// answer. It ends where more noise connects no more parts. Where a signal that the first structure
+/// uses is used no more with larger noise, size alone does not tell a small joint from a bias: what
+/// the two do not share is left open (LearnedStructure::is_contested). So are redundant edges of
+/// the answer, and soft parts that screws describe with noise of which the residuals show less than
+/// half. Parts that screws do not connect are soft only where more noise is no answer.
+///
+/// Noise of a stream that was estimated from residuals is raised by a fifth, at most twice, until a
+/// structure spans.
+LearnedStructure confirmed_structure(const FindStructure& find,
+                                     const ConnectSoftParts& connect_soft_parts);
 
 }  // namespace bodyschema

@@ -49,7 +49,7 @@ bool is_guess_too_large(const MeasurementModel& measurement, NoiseSource source)
           measurement.noise->rotation_rad > kLargestGuess.rotation_rad);
 }
 bool is_guess_too_large(const LearnedStructure& structure) {
-  return is_guess_too_large(structure.measurement, structure.noise_source);
+  return is_guess_too_large(structure.options.measurement, structure.noise_source);
 }
 
 // Why `part`, which was seen, is not connected to the root's component.
@@ -144,9 +144,7 @@ LearnResult fit_tree(const LearnedStructure& structure,
                      bool must_be_valid) {
   const int num_signals = check_actions(samples, structure.signals.size());
   const SearchResult& search = structure.search;
-  const MeasurementModel& measurement = structure.measurement;
-  ValidityOptions validity = search_options_of(options).validity;
-  validity.allows_far_outliers = structure.allows_far_outliers;
+  const MeasurementModel& measurement = structure.options.measurement;
 
   LearnResult result;
   result.noise_source = structure.noise_source;
@@ -161,7 +159,7 @@ LearnResult fit_tree(const LearnedStructure& structure,
   // Everything that is fitted sees displacements.
   const std::vector<ActionPoseSample> moved = displaced(samples, structure.signals);
   const NormalizedActions actions(moved, num_signals);
-  const EdgeData data{moved, actions, measurement, validity};
+  const EdgeData data{moved, actions, measurement, structure.options.validity};
   std::vector<FittedEdge> fitted;
   visit_outwards(ends_of(search.models), schema, [&](int edge, int from, int to) {
     AcceptedModel start = search.models[static_cast<std::size_t>(edge)];
@@ -267,7 +265,7 @@ LearnedStructure find_with_bias(const std::vector<Signal>& signals,
     search_options.validity.allows_far_outliers = connects_more_simply(found, search);
     if (search_options.validity.allows_far_outliers) search = std::move(found);
   }
-  LearnedStructure result{signals,           parts,       measurement, std::move(actions),
+  LearnedStructure result{signals,           parts,       search_options, std::move(actions),
                           std::move(search), noise_source};
   // Everything that is fitted sees displacements; which commands are bent shows only by a model.
   constexpr int kMaxWarpRounds = 3;
@@ -291,16 +289,10 @@ LearnedStructure find_with_bias(const std::vector<Signal>& signals,
       result.search.num_fits = found.num_fits;
       break;
     }
-    result = {std::move(bent),  parts,       measurement, std::move(actions_again),
+    result = {std::move(bent),  parts,       search_options, std::move(actions_again),
               std::move(found), noise_source};
     if (was_spanning) break;
   }
-  measurement = result.measurement;
-  result.allows_far_outliers = search_options.validity.allows_far_outliers;
-  // With enough noise a screw passes for anything soft: nothing is tried beside it.
-  if (unknown_bias == 0 && !is_guess_too_large(result))
-    connect_soft_parts(displaced(samples, result.signals), result.actions, parts, search_options,
-                       &result.search);
   return result;
 }
 
@@ -310,10 +302,16 @@ LearnedStructure find_structure(const std::vector<Signal>& signals,
                                 const std::vector<ActionPoseSample>& samples,
                                 const LearnOptions& options) {
   const std::vector<ActionPoseSample> distinct = without_repetitions(samples);
-  return confirmed_structure([&](double factor, double unknown_bias) {
+  const auto find = [&](double factor, double unknown_bias) {
     LearnOptions louder = options;
     louder.measurement.scale *= factor;
     return find_with_bias(signals, distinct, louder, unknown_bias);
+  };
+  return confirmed_structure(find, [&](LearnedStructure* structure) {
+    // With enough noise a screw passes for anything soft: nothing is tried beside it.
+    if (!is_guess_too_large(*structure))
+      connect_soft_parts(displaced(distinct, structure->signals), structure->actions,
+                         structure->parts, structure->options, &structure->search);
   });
 }
 

@@ -62,15 +62,13 @@ SourcedNoise marker_noise(const std::vector<ActionPoseSample>& samples, int num_
 struct LearnedStructure {
   std::vector<Signal> signals;  ///< with what bends their commands
   std::vector<int> parts;       ///< seen, ascending
-  MeasurementModel measurement;
-  NormalizedActions actions;  ///< that the models are over
+  SearchOptions options;        ///< by which it was found
+  NormalizedActions actions;    ///< that the models are over
   SearchResult search;
   NoiseSource noise_source = NoiseSource::kAssumed;
   /// Another structure stands where the noise is larger than told: edges that the two do not share
   /// were taken out.
   bool is_contested = false;
-  /// Far more readings are wild than LearnOptions::measurement says (see ValidityOptions).
-  bool allows_far_outliers = false;
 
   /// The edges span all parts seen.
   bool spans() const { return search.models.size() + 1 >= parts.size(); }

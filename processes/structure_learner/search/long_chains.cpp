@@ -12,6 +12,8 @@ namespace {
 
 // Pairs of two components that are tried, those seen together most often first.
 constexpr std::size_t kMaxPairs = 12;
+// More gaps have another reason than hidden parts: the noise told, or soft parts.
+constexpr std::size_t kMaxComponents = 6;
 
 std::vector<int> without(const std::vector<int>& signals, const std::set<int>& used) {
   std::vector<int> result;
@@ -79,6 +81,7 @@ bool connect_long_chains(PairModels* pairs, ModelForest* forest) {
   const int max_joints = std::min(pairs->options().max_signals, kMaxChainJoints);
   if (max_joints <= kMaxScreenedJoints) return false;
   if (pairs->options().unknown_bias > 0 && pairs->actions().blocks().is_stream()) return false;
+  if (forest->parts().size() > forest->models().size() + kMaxComponents) return false;
   std::map<std::pair<int, int>, std::vector<std::pair<int, int>>> open;  // by components
   for (const auto& [ij, record] : pairs->records())
     if (!forest->connected(ij.first, ij.second) && record.num_common > 0)

@@ -29,18 +29,20 @@ LearnedStructure nothing() {
 }
 
 struct Found {
-  int num_searches;
-  LearnedStructure structure;
+  int num_searches = 0;
+  bool is_soft = false;  ///< Gaussian processes were tried
+  LearnedStructure structure = {.actions = NormalizedActions({}, 0)};
 };
 
 Found confirmed(const std::map<double, LearnedStructure>& by_factor) {
-  int num_searches = 0;
-  LearnedStructure structure = confirmed_structure([&](double factor, double unknown_bias) {
-    ++num_searches;
+  Found found;
+  const auto find = [&](double factor, double unknown_bias) {
+    ++found.num_searches;
     EXPECT_EQ(unknown_bias > 0, factor > 1);
     return by_factor.at(factor);
-  });
-  return {num_searches, std::move(structure)};
+  };
+  found.structure = confirmed_structure(find, [&](LearnedStructure*) { found.is_soft = true; });
+  return found;
 }
 
 std::vector<int> signals_of(const LearnedStructure& found) {
@@ -64,6 +66,7 @@ TEST(ConfirmedStructureTest, WhereNothingSpansTheNoiseGrowsUntilTwoStructuresAre
                                  {8, structure({0}, 0.5)}});
   EXPECT_EQ(signals_of(found.structure), std::vector<int>({0}));
   EXPECT_EQ(found.structure.search.residual_scale, 1);
+  EXPECT_FALSE(found.is_soft);
   EXPECT_EQ(found.structure.noise_source, NoiseSource::kResiduals);
   EXPECT_FALSE(found.structure.is_contested);
 }
@@ -110,6 +113,7 @@ TEST(ConfirmedStructureTest, NoiseThatWasGuessedFromResidualsIsNotRefutedByThem)
 TEST(ConfirmedStructureTest, WhatMoreNoiseDoesNotConnectIsLeftAsItIs) {
   const Found found = confirmed({{1, nothing()}, {2, nothing()}});
   EXPECT_EQ(found.num_searches, 2);
+  EXPECT_TRUE(found.is_soft);
   EXPECT_FALSE(found.structure.is_contested);
 }
 
@@ -127,9 +131,13 @@ TEST(ConfirmedStructureTest, AnExtraJointOfASignalThatIsUsedAnywayGoes) {
 }
 
 TEST(ConfirmedStructureTest, NoiseThatIsMoreThanTheResidualsSayConnectsNothing) {
-  const Found found = confirmed(
-      {{1, nothing()}, {2, nothing()}, {4, structure({0}, 0.16)}, {8, structure({0}, 0.04)}});
+  const Found found = confirmed({{1, nothing()},
+                                 {2, structure({0, 0}, 0.6)},
+                                 {4, structure({0}, 0.16)},
+                                 {8, structure({0}, 0.04)}});
   EXPECT_FALSE(found.structure.spans());
+  EXPECT_TRUE(found.structure.is_contested);
+  EXPECT_FALSE(found.is_soft);
 }
 
 TEST(ConfirmedStructureTest, MoreNoiseFixesNothingToAPartThatRests) {
