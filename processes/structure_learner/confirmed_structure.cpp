@@ -89,9 +89,11 @@ LearnedStructure contested(LearnedStructure structure, const LearnedStructure& r
 LearnedStructure least_noise(LearnedStructure told, const FindStructure& find) {
   if (lacks_data(told)) return told;
   const bool is_explained = told.spans() && !is_soft(told);
-  if (is_explained && !has_doubtful_joints(told) &&
-      (told.search.residual_scale <= kLargestResidual || !is_noise_known(told)))
-    return told;
+  // Couplings alone are no reason to lose other joints.
+  const bool is_in_doubt =
+      !told.search.redundant.empty() ||
+      (told.search.residual_scale > kLargestResidual && is_noise_known(told));
+  if (is_explained && !is_in_doubt && told.search.couplings.empty()) return told;
   if (!is_noise_known(told) &&
       (told.actions.blocks().is_stream() || !told.spans() || !has_doubtful_joints(told)))
     return told;
@@ -115,7 +117,8 @@ LearnedStructure least_noise(LearnedStructure told, const FindStructure& find) {
     }
     const std::set<int> used = signals_of(louder);
     for (const int s : signals_of(quieter))
-      if (is_explained && !used.contains(s)) return contested(std::move(told), louder);
+      if (is_explained && !used.contains(s))
+        return is_in_doubt ? contested(std::move(told), louder) : told;
     quieter = std::move(louder);
   }
   return is_explained ? contested(std::move(told), quieter) : told;
