@@ -12,6 +12,9 @@ namespace {
 
 // Pairs of two components that are tried, those seen together most often first.
 constexpr std::size_t kMaxPairs = 12;
+// Components that lie apart, beyond which no order of joints is searched for: what falls into many
+// pieces is no arm that is seen at its ends, and each two of them would cost a second.
+constexpr std::size_t kMaxSearched = 3;
 
 std::vector<int> without(const std::vector<int>& signals, const std::set<int>& used) {
   std::vector<int> result;
@@ -41,9 +44,10 @@ std::optional<Candidate> chain_between(int part_i, int part_j, const std::vector
 }
 
 std::optional<Candidate> best_chain(const std::vector<std::pair<int, int>>& between,
-                                    const std::vector<int>& signals, PairModels* pairs) {
+                                    const std::vector<int>& signals, bool are_few,
+                                    PairModels* pairs) {
   // What moves as a stream is often soft: no order is searched for where none may fit.
-  const bool is_searched = between.size() == 1 && !pairs->actions().blocks().is_stream();
+  const bool is_searched = are_few && between.size() == 1 && !pairs->actions().blocks().is_stream();
   std::optional<Candidate> best;
   const auto rank = [](const Candidate& c) { return std::tuple(c.model.num_joints(), -c.score); };
   for (const auto& [i, j] : between) {
@@ -89,6 +93,10 @@ bool connect_long_chains(PairModels* pairs, ModelForest* forest) {
   const std::vector<int> idle = without(moving, used);
   std::vector<std::vector<int>> choices{idle};
   if (idle != moving) choices.push_back(moving);
+  std::set<int> components_open;
+  for (const auto& [components, between] : open)
+    components_open.insert({components.first, components.second});
+  const bool are_few = components_open.size() <= kMaxSearched;
   std::vector<Candidate> found;
   for (auto& [components, between] : open) {
     std::stable_sort(between.begin(), between.end(), [&](const auto& x, const auto& y) {
@@ -99,7 +107,7 @@ bool connect_long_chains(PairModels* pairs, ModelForest* forest) {
     for (const std::vector<int>& signals : choices) {
       const int m = static_cast<int>(signals.size());
       if (m <= kMaxScreenedJoints || m > max_joints) continue;
-      if (const auto chain = best_chain(between, signals, pairs)) {
+      if (const auto chain = best_chain(between, signals, are_few, pairs)) {
         found.push_back(*chain);
         break;
       }
