@@ -275,7 +275,7 @@ TEST_F(BodyschemaProgramTest, ALearnedSchemaPredictsWhatItHasNotSeen) {
   ASSERT_EQ(json["parts"].size(), 4U);
   for (std::size_t i = 0; i < 4; ++i) {
     const Json& part = json["parts"][i];
-    EXPECT_EQ(part.size(), 7U);
+    EXPECT_EQ(part.size(), 10U);
     EXPECT_EQ(part.at("part"), i + 2);
     EXPECT_EQ(part.at("count"), 11);
     EXPECT_LT(part.at("position_max_m").get<double>(), 1e-4);
@@ -287,6 +287,54 @@ TEST_F(BodyschemaProgramTest, ALearnedSchemaPredictsWhatItHasNotSeen) {
   const Outcome text = run({"predict", "schema.lcmlog", held_out});
   EXPECT_EQ(text.exit_code, 0);
   EXPECT_NE(text.out.find("median"), std::string::npos);
+}
+
+TEST_F(BodyschemaProgramTest, APredictionSaysHowWellItIsKnownAndWhatWasNeverTried) {
+  const auto csv = write_robot("train.csv", test::Regime::kTagIso);
+  const Json learned = run({"learn", csv, "--out", "schema.lcmlog", "--json"}).json();
+  ASSERT_TRUE(learned.at("complete"));
+  const Json within = run({"predict", "schema.lcmlog", "--action", "0.1", "-0.2", "--json"}).json();
+  const Json beyond = run({"predict", "schema.lcmlog", "--action", "9", "-0.2", "--json"}).json();
+  EXPECT_EQ(within.at("action"), Json({{"q1", 0.1}, {"q2", -0.2}}));
+  EXPECT_EQ(within.at("outside_training"), Json::array());
+  EXPECT_EQ(beyond.at("outside_training"), Json({"q1"}));
+  ASSERT_EQ(within.at("parts").size(), 4U);
+  int num_outside = 0;
+  for (std::size_t i = 0; i < 4; ++i) {
+    const Json &in = within["parts"][i], &out = beyond["parts"][i];
+    EXPECT_EQ(in.at("outside_training"), Json::array());
+    EXPECT_GT(in.at("position_sd_m").get<double>(), 1e-5);
+    EXPECT_LT(in.at("position_sd_m").get<double>(), 0.01);
+    EXPECT_GT(in.at("rotation_sd_deg").get<double>(), 1e-3);
+    if (out.at("outside_training").empty()) continue;
+    EXPECT_EQ(out.at("outside_training"), Json({"q1"}));
+    EXPECT_GT(out.at("rotation_sd_deg"), in.at("rotation_sd_deg"));
+    ++num_outside;
+  }
+  EXPECT_GT(num_outside, 0);
+  EXPECT_NE(
+      run({"predict", "schema.lcmlog", "--action", "9", "-0.2"}).out.find("outside training: q1"),
+      std::string::npos);
+
+  // Of a recording: the samples outside are counted, and each row says it.
+  test::Rng rng(75);
+  std::vector<ActionPoseSample> samples = test::babble(robot_, 3, {}, rng);
+  for (ActionPoseSample& sample : samples) sample.action << 0, 0;
+  samples[1].action << 0, 9;
+  const auto odd = write("odd.csv", samples);
+  const Json json =
+      run({"predict", "schema.lcmlog", odd, "--out", "predicted.csv", "--json"}).json();
+  EXPECT_EQ(json.at("outside_training"), Json({{"samples", 1}, {"signals", {"q2"}}}));
+  const std::string rows = text_of(folder_ / "predicted.csv");
+  EXPECT_TRUE(
+      rows.starts_with("t,q1,q2,part,x,y,z,qw,qx,qy,qz,position_sd_m,rotation_sd_deg,"
+                       "outside_training\n0,0,0,2,"))
+      << rows;
+  EXPECT_EQ(std::count(rows.begin(), rows.end(), '\n'), 1 + 3 * 4);
+  EXPECT_NE(rows.find(",q2\n"), std::string::npos);
+
+  expect_failure({"predict", "schema.lcmlog", "--action", "1"}, "q1 q2");
+  expect_failure({"predict", "schema.lcmlog", odd, "--action", "1", "2"}, "--action");
 }
 
 TEST_F(BodyschemaProgramTest, PredictionErrorsAreThoseThatWerePutIn) {
