@@ -91,8 +91,14 @@ void run_learn(const LearnArguments& arguments) {
     schema.version = schema.last_sample_index + 1;
     write_one_event_log(arguments.out, kBodySchema, to_message(schema));
   }
-  print(arguments.json, structure_json(result.schema, result.outliers, result.noise_source),
-        structure_text(result.schema, result.noise_source));
+  Json json = structure_json(result.schema, result.outliers, result.noise_source);
+  json["one_cluster"] = result.is_one_cluster;
+  std::string text = structure_text(result.schema, result.noise_source);
+  if (result.is_one_cluster)
+    text +=
+        "  the poses are one cluster: what is learned holds near them alone; move all joints "
+        "farther\n";
+  print(arguments.json, json, text);
 }
 
 /// Of `predict` and `show`.
