@@ -170,9 +170,9 @@ void measure_unexplained(const Arguments& arguments, Unexplained kind, int num_p
 int main(int argc, char** argv) {
   Arguments arguments;
   CLI::App app("Learning time and message size over the number of parts");
-  app.add_option("--parts", arguments.parts, "Sizes of the random trees");
+  app.add_option("--parts", arguments.parts, "Sizes of the random trees; 0: none");
   app.add_option("--unexplained", arguments.unexplained_parts,
-                 "Sizes of the recordings that no model explains");
+                 "Sizes of the recordings that no model explains; 0: none");
   app.add_option("--hidden", arguments.num_hidden, "Hidden parts of each tree");
   app.add_option("--samples", arguments.num_samples, "Samples of each tree");
   app.add_option("--seeds", arguments.num_seeds, "Robots a row");
@@ -181,10 +181,11 @@ int main(int argc, char** argv) {
   std::cout << "| recording | parts | noise | right / incomplete / wrong | edges | fits | "
                "CPU s, mean (largest) | bytes |\n|---|---|---|---|---|---|---|---|\n";
   for (const bool is_told : {true, false}) {
-    for (const int n : arguments.parts) measure_tree(arguments, n, is_told);
+    for (const int n : arguments.parts)
+      if (n > 0) measure_tree(arguments, n, is_told);
     for (const int n : arguments.unexplained_parts)
       for (const Unexplained kind : {Unexplained::kWalk, Unexplained::kFree, Unexplained::kSoft})
         for (const int num_samples : {100, 400})
-          measure_unexplained(arguments, kind, n, num_samples, is_told);
+          if (n > 0) measure_unexplained(arguments, kind, n, num_samples, is_told);
   }
 }
