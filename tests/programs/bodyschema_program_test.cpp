@@ -158,6 +158,20 @@ TEST_F(BodyschemaProgramTest, ASchemaBeyondADatagramIsLearnedSavedAndLoaded) {
   EXPECT_EQ(run({"show", "larger.lcmlog", "--json"}).json()["edges"].size(), 199U);
 }
 
+TEST_F(BodyschemaProgramTest, AHundredPartsAreLearnedSavedAndLoaded) {
+  test::Rng rng(5);
+  const auto robot = test::random_tree({.num_parts = 100, .num_hidden = 0}, rng);
+  const auto csv = write("tree.csv", test::babble(robot, 10, {}, rng));
+  const Json learned = run({"learn", csv, "--out", "large.lcmlog", "--json"}).json();
+  EXPECT_TRUE(test::is_right(structure_of(learned), robot));
+  EXPECT_GT(std::filesystem::file_size(folder_ / "large.lcmlog"), 64'000U);
+  const Json shown = run({"show", "large.lcmlog", "--json"}).json();
+  EXPECT_EQ(shown["edges"].size(), 99U);
+  const Json parts = run({"predict", "large.lcmlog", csv, "--json"}).json()["parts"];
+  ASSERT_EQ(parts.size(), 99U);
+  for (const Json& part : parts) EXPECT_LT(part["position_max_m"].get<double>(), 1e-4);
+}
+
 TEST_F(BodyschemaProgramTest, LearnFindsTheStructureOfTreesWithBranchesSlidersAndSharedSignals) {
   test::Rng rng(72);
   int num_prismatic = 0, num_branches = 0;
