@@ -1,7 +1,8 @@
 #pragma once
 
-#include <Eigen/Cholesky>
 #include <algorithm>
+
+#include "common/estimation/cholesky.h"
 
 namespace bodyschema {
 
@@ -25,9 +26,9 @@ class LevenbergMarquardt {
       damped.diagonal() += damping_ * H.diagonal();
       // A parameter without information stays at rest.
       damped.diagonal().array() += 1e-14 * H.diagonal().maxCoeff();
-      const Eigen::LLT<Matrix> llt(damped);
-      if (llt.info() == Eigen::Success) {
-        const Vector delta = -llt.solve(g);
+      const Cholesky<Matrix> cholesky(damped);
+      if (cholesky.is_positive()) {
+        const Vector delta = -cholesky.solve(g);
         if (delta.allFinite() && accept(delta)) {
           damping_ = std::max(damping_ / 10, least_damping_);
           return true;

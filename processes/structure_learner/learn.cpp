@@ -10,6 +10,7 @@
 #include "processes/structure_learner/confirmed_structure.h"
 #include "processes/structure_learner/edge_fit.h"
 #include "processes/structure_learner/learned_schema.h"
+#include "processes/structure_learner/one_cluster.h"
 #include "processes/structure_learner/root_pose.h"
 #include "processes/structure_learner/search/withdrawal.h"
 #include "processes/structure_learner/soft_parts.h"
@@ -52,9 +53,30 @@ bool is_guess_too_large(const LearnedStructure& structure) {
   return is_guess_too_large(structure.options.measurement, structure.noise_source);
 }
 
+// What would tell how a part hangs on the others: more of the same is not always enough.
+std::string wanted_samples(int num_common, const std::set<int>& untold, int num_actions,
+                           int max_signals, const LearnedStructure& structure) {
+  if (num_common == 0) return "samples are needed in which it is seen together with another part";
+  if (structure.actions.moving().empty())
+    return "no signal moved: samples at other actions are needed to trust a model";
+  // So many poses determine a joint on every signal; two more test it.
+  if (num_actions < max_signals + 3)
+    return "samples at other actions are needed to trust a model: there are " +
+           std::to_string(num_actions);
+  std::string result = "more samples are needed to trust a model";
+  for (const int s : untold) {
+    result +=
+        s == *untold.begin()
+            ? ", or such in which these signals move farther; not told yet is what moves with "
+            : ", ";
+    result += structure.signals[static_cast<std::size_t>(s)].name;
+  }
+  return result;
+}
+
 // Why `part`, which was seen, is not connected to the root's component.
 UnconnectedPart explain(int part, int num_seen, const std::set<int>& connected,
-                        const LearnedStructure& structure, int max_signals) {
+                        const LearnedStructure& structure, int max_signals, int num_actions) {
   int common = 0, partner = -1;
   bool undecided = false, was_soft_tried = false, is_redundant = false;
   std::set<int> untold;
@@ -95,12 +117,8 @@ UnconnectedPart explain(int part, int num_seen, const std::set<int>& connected,
                 (is_guess_too_large(structure)
                      ? "; their noise is guessed from what these models leave: tell it (--noise)"
                      : "")};
-  std::string detail = seen + "; more samples are needed to trust a model";
-  for (const int s : untold) {
-    detail += s == *untold.begin() ? ": too few yet to tell what moves with " : ", ";
-    detail += structure.signals[static_cast<std::size_t>(s)].name;
-  }
-  return {part, Unconnected::kNotEnoughData, detail};
+  return {part, Unconnected::kNotEnoughData,
+          seen + "; " + wanted_samples(common, untold, num_actions, max_signals, structure)};
 }
 
 // Signals that no edge uses although one may have to: they moved too little for a joint of
@@ -120,6 +138,13 @@ std::vector<int> undecided_signals(const BodySchema& schema, const LearnedStruct
     result.push_back(s);
   }
   return result;
+}
+
+int count_actions(const std::vector<ActionPoseSample>& samples) {
+  std::set<std::vector<double>> actions;
+  for (const ActionPoseSample& sample : samples)
+    actions.emplace(sample.action.begin(), sample.action.end());
+  return static_cast<int>(actions.size());
 }
 
 int check_actions(const std::vector<ActionPoseSample>& samples, std::size_t num_signals) {
@@ -179,10 +204,11 @@ LearnResult fit_tree(const LearnedStructure& structure,
       [&](int part) {
         const int num_moving = static_cast<int>(actions.moving().size());
         return explain(part, count_common(samples, part, part), connected, structure,
-                       std::min(options.max_signals, num_moving));
+                       std::min(options.max_signals, num_moving), count_actions(samples));
       },
       &schema);
   schema.undecided_signals = undecided_signals(schema, structure);
+  result.is_one_cluster = is_one_cluster(schema, samples);
   result.outliers = attribute_outliers(schema, fitted, samples, measurement);
   return result;
 }

@@ -33,8 +33,9 @@ struct LearnResult {
   BodySchema schema;
   std::vector<Outlier> outliers;  ///< ascending by sample, then part
   NoiseSource noise_source = NoiseSource::kAssumed;
-  int num_screens = 0;  ///< closed-form hypotheses looked at
-  int num_fits = 0;     ///< Levenberg–Marquardt fits of the search
+  bool is_one_cluster = false;  ///< see one_cluster.h
+  int num_screens = 0;          ///< closed-form hypotheses looked at
+  int num_fits = 0;             ///< Levenberg–Marquardt fits of the search
 };
 
 /// Learns the body schema from scratch: structure and local models (Sections 3.1 and 3.2). Where

@@ -324,6 +324,44 @@ std::vector<std::pair<int, int>> spanning_tree(
   }
 }
 
+// The pairs that are worth a model: of few parts all; of many, those that move little against each
+// other, for the fewer joints there are between two parts, the less they do. Each part's nearest
+// ones, and what connects them all.
+std::vector<std::pair<int, int>> near_pairs(const std::vector<ActionPoseSample>& samples,
+                                            const std::vector<int>& parts) {
+  constexpr int kFewParts = 16, kNearest = 6, kMotions = 24;
+  constexpr double kMetresPerRadian = 0.2;  // about the length of a link
+  const int n = static_cast<int>(parts.size());
+  std::vector<std::pair<int, int>> result;
+  std::map<std::pair<int, int>, ScaledFit> motion;
+  std::vector<std::vector<std::pair<double, int>>> near(parts.size());
+  for (int i = 0; i < n; ++i)
+    for (int j = i + 1; j < n; ++j) {
+      if (n <= kFewParts) {
+        result.emplace_back(i, j);
+        continue;
+      }
+      const PairData pair = make_pair_data(samples, parts[i], parts[j], {}, 2 * kMotions);
+      std::vector<double> moved;
+      for (const auto& m : relative_motions(pair, kMotions).motions)
+        moved.push_back(m.log.head<3>().norm() + kMetresPerRadian * m.log.tail<3>().norm());
+      if (moved.empty()) continue;
+      const double typical = kMedian.of(std::move(moved));
+      motion[{i, j}].scale = typical;
+      near[i].emplace_back(typical, j);
+      near[j].emplace_back(typical, i);
+    }
+  if (n <= kFewParts) return result;
+  std::set<std::pair<int, int>> chosen;
+  for (int i = 0; i < n; ++i) {
+    std::sort(near[i].begin(), near[i].end());
+    for (std::size_t k = 0; k < std::min<std::size_t>(kNearest, near[i].size()); ++k)
+      chosen.insert(std::minmax(i, near[i][k].second));
+  }
+  for (const auto& ij : spanning_tree(n, motion)) chosen.insert(ij);
+  return {chosen.begin(), chosen.end()};
+}
+
 using FitsOfPairs = std::map<std::pair<int, int>, ScaledFit>;
 
 // Where one joint does not suffice, more may, or a Gaussian process. Edges far above the quietest
@@ -382,8 +420,8 @@ std::optional<SourcedNoise> estimate_noise(const std::vector<ActionPoseSample>& 
 
   const ModelNoise model_noise(samples, actions);
   FitsOfPairs fits;
-  for (int i = 0; i < n; ++i)
-    for (int j = i + 1; j < n; ++j) fits[{i, j}] = model_noise.best(parts[i], parts[j], false);
+  for (const auto& [i, j] : near_pairs(samples, parts))
+    fits[{i, j}] = model_noise.best(parts[i], parts[j], false);
 
   const std::vector<std::pair<int, int>> tree = spanning_tree(n, fits);
   if (tree.empty()) return std::nullopt;

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <numeric>
 
 #include "common/estimation/quantile.h"
 #include "common/estimation/student_t.h"
@@ -47,6 +48,40 @@ ScrewRegression regress(const std::vector<Vector6d>& scaled, const RelativeMotio
       regression.score = score / static_cast<double>(used.size());
   }
   return regression;
+}
+
+// The signals of which one least squares fit leaves least, motions weighted by their size: of many
+// signals only these are worth a robust one. All of them at once: a pair of 100 parts has 80.
+std::vector<int> promising_signals(const std::vector<Vector6d>& scaled,
+                                   const RelativeMotions& motions, const NormalizedActions& actions,
+                                   std::size_t most) {
+  const std::vector<int>& moving = actions.moving();
+  if (moving.size() <= most) return moving;
+  const auto n = static_cast<Eigen::Index>(scaled.size());
+  const auto m = static_cast<Eigen::Index>(moving.size());
+  Eigen::MatrixXd moved(n, 6), dq(n, m);
+  for (Eigen::Index k = 0; k < n; ++k) {
+    const RelativeMotions::Motion& motion = motions.motions[static_cast<std::size_t>(k)];
+    const Vector6d& xi = scaled[static_cast<std::size_t>(k)];
+    const double weight = 1 / std::sqrt(std::sqrt(1 + xi.squaredNorm()));
+    moved.row(k) = weight * xi.transpose();
+    for (Eigen::Index s = 0; s < m; ++s) {
+      const int signal = moving[static_cast<std::size_t>(s)];
+      const double d = actions(motion.sample_t, signal) - actions(motion.sample_s, signal);
+      dq(k, s) = std::abs(d) > 1 ? 0 : weight * d;
+    }
+  }
+  const Eigen::VectorXd explained = (dq.transpose() * moved).rowwise().squaredNorm().array() /
+                                    (dq.colwise().squaredNorm().transpose().array() + 1e-12);
+  std::vector<int> order(moving.size());
+  std::iota(order.begin(), order.end(), 0);
+  std::stable_sort(order.begin(), order.end(),
+                   [&](int x, int y) { return explained(x) > explained(y); });
+  order.resize(most);
+  std::sort(order.begin(), order.end());
+  std::vector<int> result;
+  for (const int s : order) result.push_back(moving[static_cast<std::size_t>(s)]);
+  return result;
 }
 
 }  // namespace
@@ -123,7 +158,8 @@ std::vector<ScrewRegression> screen_one_joint(const RelativeMotions& motions,
   scaled.reserve(motions.motions.size());
   for (const auto& motion : motions.motions) scaled.push_back(scale.cwiseProduct(motion.log));
   constexpr int kRounds = 6;
-  constexpr std::size_t kMaxSignals = 8;  // worth more than a least squares fit
+  constexpr std::size_t kMaxSignals = 8;  // worth more than two rounds of re-weighting
+  constexpr std::size_t kMostRobust = 24;
   const auto scaled_back = [&](int signal, int rounds) {
     ScrewRegression regression = regress(scaled, motions, actions, signal, rounds);
     regression.xi = regression.xi.cwiseQuotient(scale);
@@ -132,7 +168,7 @@ std::vector<ScrewRegression> screen_one_joint(const RelativeMotions& motions,
   const auto best_first = [](const auto& x, const auto& y) { return x.score < y.score; };
   std::vector<ScrewRegression> result;
   const bool many = actions.moving().size() > kMaxSignals;
-  for (const int signal : actions.moving())
+  for (const int signal : promising_signals(scaled, motions, actions, kMostRobust))
     result.push_back(scaled_back(signal, many ? 2 : kRounds));
   std::stable_sort(result.begin(), result.end(), best_first);
   if (many) {

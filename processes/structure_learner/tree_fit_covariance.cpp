@@ -67,12 +67,13 @@ Eigen::MatrixXd TreeFit::with_fixed_gauge(const Normal& normal) const {
         Vector6d before = Vector6d::Zero();
         before(component) = 1;
         const Vector6d after = -adjoint(nodes_[k].model.joints[d].X_after.inverse()) * before;
-        Eigen::VectorXd gauge = Eigen::VectorXd::Zero(H.rows());
-        gauge.segment<6>(normal.offset[k] + ScrewChainLayout::transform(d)) = before;
-        gauge.segment<6>(normal.offset[k] + ScrewChainLayout::transform(d + 1)) = after;
+        Eigen::Matrix<double, 14, 1> gauge;  // of the two transforms beside the joint
+        gauge << before, 0, 0, after;
+        const auto at = normal.offset[k] + ScrewChainLayout::transform(d);
+        const auto diagonal = normal.H.diagonal().segment<14>(at);
         const double information =
-            gauge.dot(normal.H.diagonal().cwiseProduct(gauge)) / std::pow(gauge.squaredNorm(), 2);
-        H += information * gauge * gauge.transpose();
+            gauge.dot(diagonal.cwiseProduct(gauge)) / std::pow(gauge.squaredNorm(), 2);
+        H.block<14, 14>(at, at) += information * gauge * gauge.transpose();
       }
   // A parameter that the data hardly determine (where the axis of a sliding joint lies) stays
   // finite in float.

@@ -5,6 +5,7 @@
 #include <optional>
 #include <vector>
 
+#include "common/estimation/cholesky.h"
 #include "processes/structure_learner/tree_fit.h"
 
 namespace bodyschema {
@@ -37,10 +38,10 @@ struct TreeFit::Normal {
     const Eigen::VectorXd unit = unit_of(H);
     Eigen::MatrixXd scaled = unit.asDiagonal() * H * unit.asDiagonal();
     scaled.diagonal().array() += 1e-9;
-    const Eigen::LLT<Eigen::MatrixXd> llt(scaled);
-    if (llt.info() != Eigen::Success) return std::nullopt;
-    return unit.asDiagonal() * llt.solve(Eigen::MatrixXd::Identity(H.rows(), H.rows())) *
-           unit.asDiagonal();
+    const Cholesky<Eigen::MatrixXd> cholesky(scaled);
+    if (!cholesky.is_positive()) return std::nullopt;
+    const Eigen::MatrixXd identity = Eigen::MatrixXd::Identity(H.rows(), H.rows());
+    return unit.asDiagonal() * cholesky.solve(identity) * unit.asDiagonal();
   }
 };
 

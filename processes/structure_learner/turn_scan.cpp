@@ -133,9 +133,13 @@ AnglesAboutAxis::Turns AnglesAboutAxis::scan(const NormalizedActions& actions, i
     for (const double turn : turns_b)
       of_b.push_back(b < 0 ? Phasors(n, 1.0) : phasors_of(actions, samples_, b, turn));
     std::vector<Turns> found;
+    // The turns of a are evenly spaced: from one to the next is the same phase.
+    Phasors rest = phasors_of(actions, samples_, a, turns_a.front());
+    const Phasors next = phasors_of(actions, samples_, a, turns_a[1] - turns_a[0]);
+    for (std::size_t t = 0; t < n; ++t) rest[t] *= phasors_[t];
     for (const double turn_a : turns_a) {
-      Phasors rest = phasors_of(actions, samples_, a, turn_a);
-      for (std::size_t t = 0; t < n; ++t) rest[t] *= phasors_[t];
+      if (turn_a != turns_a.front())
+        for (std::size_t t = 0; t < n; ++t) rest[t] *= next[t];
       for (std::size_t k = 0; k < turns_b.size(); ++k) {
         std::complex<double> sum = 0;
         for (std::size_t t = 0; t < n; ++t) sum += rest[t] * of_b[k][t];

@@ -10,6 +10,7 @@
 #include <iomanip>
 #include <map>
 #include <nlohmann/json.hpp>
+#include <numeric>
 #include <random>
 #include <set>
 #include <sstream>
@@ -157,6 +158,20 @@ TEST_F(BodyschemaProgramTest, ASchemaBeyondADatagramIsLearnedSavedAndLoaded) {
   EXPECT_EQ(run({"show", "larger.lcmlog", "--json"}).json()["edges"].size(), 199U);
 }
 
+TEST_F(BodyschemaProgramTest, AHundredPartsAreLearnedSavedAndLoaded) {
+  test::Rng rng(5);
+  const auto robot = test::random_tree({.num_parts = 100, .num_hidden = 0}, rng);
+  const auto csv = write("tree.csv", test::babble(robot, 10, {}, rng));
+  const Json learned = run({"learn", csv, "--out", "large.lcmlog", "--json"}).json();
+  EXPECT_TRUE(test::is_right(structure_of(learned), robot));
+  EXPECT_GT(std::filesystem::file_size(folder_ / "large.lcmlog"), 64'000U);
+  const Json shown = run({"show", "large.lcmlog", "--json"}).json();
+  EXPECT_EQ(shown["edges"].size(), 99U);
+  const Json parts = run({"predict", "large.lcmlog", csv, "--json"}).json()["parts"];
+  ASSERT_EQ(parts.size(), 99U);
+  for (const Json& part : parts) EXPECT_LT(part["position_max_m"].get<double>(), 1e-4);
+}
+
 TEST_F(BodyschemaProgramTest, LearnFindsTheStructureOfTreesWithBranchesSlidersAndSharedSignals) {
   test::Rng rng(72);
   int num_prismatic = 0, num_branches = 0;
@@ -190,11 +205,12 @@ TEST_F(BodyschemaProgramTest, LearnPrintsTheKeysThatAreDocumented) {
   const Outcome outcome = run({"learn", write_robot("s.csv"), "--json"});
   EXPECT_EQ(outcome.err, "");
   const Json json = outcome.json();
-  for (const char* key : {"complete", "samples", "parts", "root", "edges", "unconnected",
-                          "unused_signals", "undecided_signals", "outliers", "noise"}) {
+  for (const char* key :
+       {"complete", "samples", "parts", "root", "edges", "unconnected", "unused_signals",
+        "undecided_signals", "outliers", "noise", "one_cluster"}) {
     EXPECT_TRUE(json.contains(key)) << key;
   }
-  EXPECT_EQ(json.size(), 10U);
+  EXPECT_EQ(json.size(), 11U);
   EXPECT_TRUE(json["complete"].get<bool>());
   ASSERT_EQ(json["edges"].size(), 4U);
   for (const Json& edge : json["edges"]) {
@@ -275,7 +291,7 @@ TEST_F(BodyschemaProgramTest, ALearnedSchemaPredictsWhatItHasNotSeen) {
   ASSERT_EQ(json["parts"].size(), 4U);
   for (std::size_t i = 0; i < 4; ++i) {
     const Json& part = json["parts"][i];
-    EXPECT_EQ(part.size(), 7U);
+    EXPECT_EQ(part.size(), 10U);
     EXPECT_EQ(part.at("part"), i + 2);
     EXPECT_EQ(part.at("count"), 11);
     EXPECT_LT(part.at("position_max_m").get<double>(), 1e-4);
@@ -287,6 +303,138 @@ TEST_F(BodyschemaProgramTest, ALearnedSchemaPredictsWhatItHasNotSeen) {
   const Outcome text = run({"predict", "schema.lcmlog", held_out});
   EXPECT_EQ(text.exit_code, 0);
   EXPECT_NE(text.out.find("median"), std::string::npos);
+}
+
+// What a recording says does not hang on the order in which it says it, nor on units and names.
+TEST_F(BodyschemaProgramTest, OrderOfRowsUnitOfStampsAndNamesChangeNothing) {
+  const std::string text = text_of(folder_ / write_robot("s.csv"));
+  std::vector<std::vector<std::string>> rows;
+  std::stringstream stream(text);
+  for (std::string line; std::getline(stream, line);) {
+    std::stringstream fields(line);
+    for (rows.emplace_back(); std::getline(fields, rows.back().emplace_back(), ',');) {
+    }
+    rows.back().pop_back();
+  }
+  const std::vector<std::string> header = rows.front();
+  rows.erase(rows.begin());
+  const auto csv_of = [](const std::vector<std::string>& names,
+                         const std::vector<std::vector<std::string>>& lines) {
+    std::string csv;
+    const auto add = [&csv](const std::vector<std::string>& fields) {
+      for (const std::string& field : fields) csv += (&field == &fields[0] ? "" : ",") + field;
+      csv += "\n";
+    };
+    add(names);
+    for (const auto& line : lines) add(line);
+    return csv;
+  };
+  const auto learned = [&](const std::string& csv) {
+    return run({"learn", write("other.csv", csv), "--out", "other.lcmlog", "--json"}).json();
+  };
+  const Json as_it_is = run({"learn", "s.csv", "--out", "schema.lcmlog", "--json"}).json();
+  ASSERT_TRUE(test::is_right(structure_of(as_it_is), robot_)) << as_it_is;
+  const std::string bytes = text_of(folder_ / "schema.lcmlog");
+
+  test::Rng rng(76);
+  auto other = rows;
+  std::shuffle(other.begin(), other.end(), rng);
+  EXPECT_EQ(learned(csv_of(header, other)), as_it_is);
+  EXPECT_EQ(text_of(folder_ / "other.lcmlog"), bytes);
+
+  other = rows;
+  for (auto& row : other) row[0] += "000";  // in milliseconds
+  EXPECT_EQ(learned(csv_of(header, other)), as_it_is);
+  EXPECT_EQ(text_of(folder_ / "other.lcmlog"), bytes);
+
+  // Poses at rest: whichever came first. The last digits differ, for sums have another order.
+  other = rows;
+  std::vector<int> stamps(30);
+  std::iota(stamps.begin(), stamps.end(), 0);
+  std::shuffle(stamps.begin(), stamps.end(), rng);
+  for (auto& row : other) row[0] = std::to_string(stamps.at(std::stoul(row[0])));
+  const Json shuffled = learned(csv_of(header, other));
+  for (const char* key : {"complete", "parts", "unused_signals", "undecided_signals"})
+    EXPECT_EQ(shuffled.at(key), as_it_is.at(key));
+  ASSERT_EQ(shuffled.at("edges").size(), as_it_is.at("edges").size());
+  EXPECT_TRUE(test::is_right(structure_of(shuffled), robot_)) << shuffled;
+
+  // Signals and parts of other names, the parts in another order: the same edges.
+  std::vector<std::string> names = header;
+  names[1] = "turn";
+  names[2] = "lift";
+  other = rows;
+  const std::map<std::string, std::string> part_of{
+      {"1", "7"}, {"2", "4"}, {"3", "30"}, {"4", "2"}, {"5", "9"}};
+  for (auto& row : other) row[3] = part_of.at(row[3]);
+  using Ends = std::pair<std::set<std::string>, std::vector<std::string>>;
+  std::set<Ends> expected, found;
+  const std::map<std::string, std::string> signal_of{{"q1", "turn"}, {"q2", "lift"}};
+  for (const Json& edge : as_it_is.at("edges")) {
+    Ends ends;
+    for (const char* end : {"from", "to"})
+      ends.first.insert(part_of.at(std::to_string(edge.at(end).get<int>())));
+    for (const Json& signal : edge.at("signals")) ends.second.push_back(signal_of.at(signal));
+    expected.insert(ends);
+  }
+  write("other.csv", csv_of(names, other));
+  const Json renamed = run({"learn", "other.csv", "--root", "7", "--json"}).json();
+  for (const Json& edge : renamed.at("edges")) {
+    Ends ends;
+    for (const char* end : {"from", "to"})
+      ends.first.insert(std::to_string(edge.at(end).get<int>()));
+    for (const Json& signal : edge.at("signals")) ends.second.push_back(signal);
+    found.insert(ends);
+  }
+  EXPECT_EQ(found, expected);
+}
+
+TEST_F(BodyschemaProgramTest, APredictionSaysHowWellItIsKnownAndWhatWasNeverTried) {
+  const auto csv = write_robot("train.csv", test::Regime::kTagIso);
+  const Json learned = run({"learn", csv, "--out", "schema.lcmlog", "--json"}).json();
+  ASSERT_TRUE(learned.at("complete"));
+  const Json within = run({"predict", "schema.lcmlog", "--action", "0.1", "-0.2", "--json"}).json();
+  const Json beyond = run({"predict", "schema.lcmlog", "--action", "9", "-0.2", "--json"}).json();
+  EXPECT_EQ(within.at("action"), Json({{"q1", 0.1}, {"q2", -0.2}}));
+  EXPECT_EQ(within.at("outside_training"), Json::array());
+  EXPECT_EQ(beyond.at("outside_training"), Json({"q1"}));
+  ASSERT_EQ(within.at("parts").size(), 4U);
+  int num_outside = 0;
+  for (std::size_t i = 0; i < 4; ++i) {
+    const Json &in = within["parts"][i], &out = beyond["parts"][i];
+    EXPECT_EQ(in.at("outside_training"), Json::array());
+    EXPECT_GT(in.at("position_sd_m").get<double>(), 1e-5);
+    EXPECT_LT(in.at("position_sd_m").get<double>(), 0.01);
+    EXPECT_GT(in.at("rotation_sd_deg").get<double>(), 1e-3);
+    if (out.at("outside_training").empty()) continue;
+    EXPECT_EQ(out.at("outside_training"), Json({"q1"}));
+    EXPECT_GT(out.at("rotation_sd_deg"), in.at("rotation_sd_deg"));
+    ++num_outside;
+  }
+  EXPECT_GT(num_outside, 0);
+  EXPECT_NE(
+      run({"predict", "schema.lcmlog", "--action", "9", "-0.2"}).out.find("outside training: q1"),
+      std::string::npos);
+
+  // Of a recording: the samples outside are counted, and each row says it.
+  test::Rng rng(75);
+  std::vector<ActionPoseSample> samples = test::babble(robot_, 3, {}, rng);
+  for (ActionPoseSample& sample : samples) sample.action << 0, 0;
+  samples[1].action << 0, 9;
+  const auto odd = write("odd.csv", samples);
+  const Json json =
+      run({"predict", "schema.lcmlog", odd, "--out", "predicted.csv", "--json"}).json();
+  EXPECT_EQ(json.at("outside_training"), Json({{"samples", 1}, {"signals", {"q2"}}}));
+  const std::string rows = text_of(folder_ / "predicted.csv");
+  EXPECT_TRUE(
+      rows.starts_with("t,q1,q2,part,x,y,z,qw,qx,qy,qz,position_sd_m,rotation_sd_deg,"
+                       "outside_training\n0,0,0,2,"))
+      << rows;
+  EXPECT_EQ(std::count(rows.begin(), rows.end(), '\n'), 1 + 3 * 4);
+  EXPECT_NE(rows.find(",q2\n"), std::string::npos);
+
+  expect_failure({"predict", "schema.lcmlog", "--action", "1"}, "q1 q2");
+  expect_failure({"predict", "schema.lcmlog", odd, "--action", "1", "2"}, "--action");
 }
 
 TEST_F(BodyschemaProgramTest, PredictionErrorsAreThoseThatWerePutIn) {

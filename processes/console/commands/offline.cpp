@@ -7,6 +7,7 @@
 #include <cmath>
 #include <cstring>
 #include <filesystem>
+#include <fstream>
 #include <iostream>
 #include <memory>
 #include <stdexcept>
@@ -21,6 +22,7 @@
 #include "processes/console/commands/files.h"
 #include "processes/console/engineered_model.h"
 #include "processes/console/rig_check.h"
+#include "processes/console/views/prediction_view.h"
 #include "processes/console/views/structure_view.h"
 #include "processes/structure_learner/baseline/learn_baseline.h"
 #include "processes/structure_learner/learn.h"
@@ -89,22 +91,52 @@ void run_learn(const LearnArguments& arguments) {
     schema.version = schema.last_sample_index + 1;
     write_one_event_log(arguments.out, kBodySchema, to_message(schema));
   }
-  print(arguments.json, structure_json(result.schema, result.outliers, result.noise_source),
-        structure_text(result.schema, result.noise_source));
+  Json json = structure_json(result.schema, result.outliers, result.noise_source);
+  json["one_cluster"] = result.is_one_cluster;
+  std::string text = structure_text(result.schema, result.noise_source);
+  if (result.is_one_cluster)
+    text +=
+        "  the poses are one cluster: what is learned holds near them alone; move all joints "
+        "farther\n";
+  print(arguments.json, json, text);
 }
 
 /// Of `predict` and `show`.
 struct SchemaArguments {
-  std::string schema, samples;
+  std::string schema, samples, out;
+  std::vector<double> action;
   bool json = false;
 };
 
+void predict_action(const SchemaArguments& arguments, const BodySchema& schema) {
+  if (!arguments.out.empty()) refuse_argument("--out", "expected with SAMPLES");
+  if (arguments.action.size() != schema.signals.size())
+    refuse_argument("--action", fmt::format("expected {} values: {}", schema.signals.size(),
+                                            fmt::join(signal_names(schema), " ")));
+  for (const double value : arguments.action)
+    if (!std::isfinite(value)) refuse_argument("--action", "expected finite values");
+  const Eigen::VectorXd action = Eigen::Map<const Eigen::VectorXd>(
+      arguments.action.data(), static_cast<Eigen::Index>(arguments.action.size()));
+  print(arguments.json, prediction_json(schema, action), prediction_text(schema, action));
+}
+
 void run_predict(const SchemaArguments& arguments) {
+  if (arguments.samples.empty() == arguments.action.empty())
+    refuse_argument("SAMPLES", "expected either these or --action");
   const BodySchema schema = load_schema(arguments.schema);
+  if (!arguments.action.empty()) return predict_action(arguments, schema);
+  check_out(arguments.out, {arguments.schema, arguments.samples});
   const std::vector<ActionPoseSample> samples = load_for(arguments.samples, schema).samples;
   const auto errors = evaluate(schema, samples);
-  print(arguments.json, errors_json(static_cast<int>(samples.size()), errors),
-        errors_text({.parts = errors}));
+  const PredictionSummary summary = summary_of(schema, samples);
+  if (!arguments.out.empty()) {
+    std::ofstream file(arguments.out);
+    write_predictions(schema, samples, file);
+    if (!file.flush()) throw std::runtime_error("--out: cannot write " + arguments.out);
+  }
+  Json json = errors_json(static_cast<int>(samples.size()), errors);
+  add_summary(schema, summary, &json);
+  print(arguments.json, json, errors_text({.parts = errors}) + summary_text(schema, summary));
 }
 
 void run_show(const SchemaArguments& arguments) {
@@ -249,10 +281,14 @@ void add_offline_commands(Arguments console) {
   learn.callback([learning] { run_learn(*learning); });
 
   const auto predicting = std::make_shared<SchemaArguments>();
-  Arguments predict =
-      console.add_subcommand("predict", "Compare a schema's predictions with a recording");
+  Arguments predict = console.add_subcommand(
+      "predict", "A schema's predictions: of one action, or compared with a recording");
   predict.add_option("SCHEMA", predicting->schema, "Schema file").required();
-  predict.add_option("SAMPLES", predicting->samples, "Recording").required();
+  predict.add_option("SAMPLES", predicting->samples, "Recording");
+  predict.add_option("--action", predicting->action,
+                     "Instead of SAMPLES: a value for each signal, in the schema's order");
+  predict.add_option("--out", predicting->out,
+                     "Write the prediction for each sample and part to this CSV file");
   predict.add_flag("--json", predicting->json, "Print JSON");
   predict.callback([predicting] { run_predict(*predicting); });
 

@@ -55,12 +55,6 @@ Json matrix_gp_json(const BodySchema& schema, const MatrixGp& gp) {
           {"entries", entries}};
 }
 
-Json pose_json(const Pose& X) {
-  const Eigen::Quaterniond q(X.linear());
-  return {{"position_m", {X.translation().x(), X.translation().y(), X.translation().z()}},
-          {"rotation_wxyz", {q.w(), q.x(), q.y(), q.z()}}};
-}
-
 /// One standard deviation; null where it is not known.
 Json deviation(double value, double unit = 1) {
   return std::isfinite(value) && value > 0 ? Json(value / unit) : Json();
@@ -123,6 +117,7 @@ std::string noise_text(const Noise& noise, std::optional<NoiseSource> source) {
 
 // From as many joints on an edge tells its joints one by one: nothing was seen in between.
 constexpr std::size_t kLongEdge = 3;
+constexpr double kLeastShown = 1e-3;  // of a joint, over its signal's range: 1 µm, 0.001°
 
 /// The joints of a long edge in their order, with what each does per unit of its command.
 std::string joints_text(const BodySchema& schema, const Edge& edge, const Eigen::VectorXd& middle) {
@@ -131,11 +126,16 @@ std::string joints_text(const BodySchema& schema, const Edge& edge, const Eigen:
   std::string text;
   for (std::size_t d = 0; d < edge.joints.size(); ++d) {
     const ScrewJoint& joint = edge.joints[d];
-    const auto rate = [&](double value, const char* unit, double sd) {
-      return fmt::format(" {:10.4g}{}", joint.gain * value, unit) +
+    const Signal& signal = schema.signals.at(joint.signal);
+    // What does not show over the whole range is 0, and untold where its deviation is 0 too.
+    const auto rate = [&](double value, const char* unit, double sd) -> std::string {
+      const double per_unit = joint.gain * value;
+      const bool shows = std::abs(per_unit) * (signal.upper - signal.lower) >= kLeastShown;
+      if (!shows && !(sd > 0)) return "";
+      return fmt::format(" {:10.4g}{}", shows ? per_unit : 0.0, unit) +
              (sd > 0 ? fmt::format(" ± {:.2g}{}", sd, unit) : "");
     };
-    text += fmt::format("{:>13} ", schema.signals.at(joint.signal).name);
+    text += fmt::format("{:>13} ", signal.name);
     const JointDeviation sd = deviations.empty() ? JointDeviation() : deviations[d];
     if (joint.turn != 0) text += rate(joint.turn / kDegree, "°", sd.turn / kDegree);
     if (joint.slide != 0) text += rate(joint.slide * 1e3, " mm", sd.slide * 1e3);
@@ -156,6 +156,12 @@ std::string errors_line(const PartErrors& part) {
 }
 
 }  // namespace
+
+Json pose_json(const Pose& X) {
+  const Eigen::Quaterniond q(X.linear());
+  return {{"position_m", {X.translation().x(), X.translation().y(), X.translation().z()}},
+          {"rotation_wxyz", {q.w(), q.x(), q.y(), q.z()}}};
+}
 
 std::vector<std::string> signal_names(const BodySchema& schema) {
   std::vector<std::string> names;

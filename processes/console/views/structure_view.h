@@ -16,6 +16,8 @@ std::vector<std::string> signal_names(const BodySchema& schema, const std::vecto
 
 // The JSON that the console prints with --json. docs/json.md documents every key.
 
+Json pose_json(const Pose& X);
+
 /// `learn --json`, and `structure` in result.json.
 Json structure_json(const BodySchema& schema, const std::vector<Outlier>& outliers,
                     std::optional<NoiseSource> source = {});

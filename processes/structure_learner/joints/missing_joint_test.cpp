@@ -362,15 +362,24 @@ Eigen::MatrixXd missing_joint_information(const TreeFit& fit) {
   const auto m = static_cast<Eigen::Index>(fit.actions().moving().size());
   Eigen::MatrixXd result = Eigen::MatrixXd::Zero(n, m);
   const TreeFit::Normal normal = fit.normal_equations();
-  const auto size = normal.H.rows();
   const std::optional<Eigen::MatrixXd> inverse = normal.inverse();
   if (!inverse) return result;
   const Eigen::MatrixXd q = moving_actions(fit);
   const Eigen::MatrixXd q2 = q.cwiseProduct(q);
   const Eigen::VectorXd noise = explained_noise(fit, normal, q);
   for (int k = 1; k < n; ++k) {
+    // The edges whose parameters the node's motion has in common: where the root rests, those on
+    // its path and beyond it.
+    std::vector<int> edges, columns;
+    for (int e = rests ? 0 : 1; e < n; ++e) {
+      if (rests && !fit.is_below(e, k) && !fit.is_below(k, e)) continue;
+      edges.push_back(e);
+      const int p = e == 0 ? 6 : fit.nodes()[e].model.num_parameters();
+      for (int c = 0; c < p; ++c) columns.push_back(normal.offset[e] + c);
+    }
+    const auto size = static_cast<Eigen::Index>(columns.size());
     // Stacked over the frames, for q = 1: what the three axes share with each other and with the
-    // tree's parameters.
+    // parameters of these edges.
     Eigen::MatrixXd own(9, T);
     Eigen::MatrixXd shared = Eigen::MatrixXd::Zero(3 * size, T);
     for (int t = 0; t < T; ++t) {
@@ -380,9 +389,11 @@ Eigen::MatrixXd missing_joint_information(const TreeFit& fit) {
           rests ? Eigen::Matrix<double, 3, 6>::Zero() : (AI * normal.inverse_total[t]).eval();
       Eigen::Map<Eigen::Matrix3d>(own.col(t).data()) = AI * axes - AIT * AI.transpose();
       Eigen::Map<Eigen::MatrixXd> row(shared.col(t).data(), 3, size);
-      for (int e = rests ? 0 : 1; e < n; ++e) {
+      Eigen::Index offset = 0;
+      for (const int e : edges) {
         const ParameterJacobian& S = normal.S[fit.at(t, e)];
-        auto block = row.middleCols(normal.offset[e], S.cols());
+        auto block = row.middleCols(offset, S.cols());
+        offset += S.cols();
         if (fit.is_below(e, k))
           block = (axes.transpose() * normal.I[fit.at(t, e)]).lazyProduct(S);
         else if (fit.is_below(k, e))
@@ -391,10 +402,17 @@ Eigen::MatrixXd missing_joint_information(const TreeFit& fit) {
       }
     }
     const Eigen::MatrixXd owns = own * q2, shares = shared * q;
+    const Eigen::MatrixXd inverse_of_these = (*inverse)(columns, columns);
+    // All signals' rows at once: a product with three rows alone is slow.
+    const Eigen::Map<const Eigen::MatrixXd> by_signal(shares.data(), 3, size * m);
+    Eigen::MatrixXd stacked(3 * m, size);
+    for (Eigen::Index s = 0; s < m; ++s)
+      stacked.middleRows<3>(3 * s) = by_signal.middleCols(s * size, size);
+    const Eigen::MatrixXd solved = stacked * inverse_of_these;
     for (Eigen::Index s = 0; s < m; ++s) {
-      const Eigen::Map<const Eigen::MatrixXd> B(shares.col(s).data(), 3, size);
       const Eigen::Matrix3d C =
-          Eigen::Map<const Eigen::Matrix3d>(owns.col(s).data()) - B * *inverse * B.transpose();
+          Eigen::Map<const Eigen::Matrix3d>(owns.col(s).data()) -
+          solved.middleRows<3>(3 * s) * stacked.middleRows<3>(3 * s).transpose();
       const Eigen::SelfAdjointEigenSolver<Eigen::Matrix3d> eigen(C, Eigen::EigenvaluesOnly);
       result(k, s) = std::max(eigen.eigenvalues()(0), 0.0) / noise(s);
     }

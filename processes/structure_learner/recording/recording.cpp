@@ -431,9 +431,15 @@ Recording parse_csv(const std::string& text, const std::string& name) {
   }
   if (!header) throw RecordingError(name + ":1:1: expected a header line, found an empty file");
   if (recording.samples.empty()) throw RecordingError(name + ":2:1: expected at least one row");
-  for (ActionPoseSample& sample : recording.samples)
+  // Whatever the order of the rows: by t, and by part.
+  std::vector<ActionPoseSample> ascending;
+  for (const auto& [t, instant] : instants) {
+    ActionPoseSample& sample = ascending.emplace_back(std::move(recording.samples[instant.sample]));
+    sample.sample_index = std::ssize(ascending) - 1;
     std::sort(sample.parts.begin(), sample.parts.end(),
               [](const auto& a, const auto& b) { return a.part < b.part; });
+  }
+  recording.samples = std::move(ascending);
   const std::vector<Signal> observed = observed_signals(recording.samples);
   for (std::size_t i = 0; i < observed.size(); ++i) {
     recording.signals[i].lower = observed[i].lower;

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <map>
 #include <tuple>
 
@@ -136,6 +137,7 @@ void LayeredSearch::layer_one_joint() {
     const RelativeMotions& motions = pairs_.motions(i, j);
     const auto regressions = screen_one_joint(motions, pairs_.actions());
     pairs_.num_screens += static_cast<int>(regressions.size());
+    if (!regressions.empty()) one_joint_score_[{i, j}] = regressions.front().score;
     std::vector<Candidate> valid;
     for (std::size_t n = 0; n < std::min(kMaxFits, regressions.size()); ++n) {
       if (n >= 1 && regressions[n].score > 1.5 * regressions[0].score) break;
@@ -171,23 +173,31 @@ LayeredSearch::Turns LayeredSearch::known_turns(const std::vector<double>& grid)
 void LayeredSearch::layer_two_joints() {
   const Turns grid(pairs_.actions().num_signals(), default_turns());
   const Turns known = known_turns(default_turns());
-  if (known != grid) two_joints_pass(known);
-  // A signal's range in the forest may not hold for its other joints.
-  if (!forest_.spans()) two_joints_pass(grid);
-  constexpr std::size_t kMaxParts = 14;
-  if (forest_.spans() || forest_.parts().size() > kMaxParts) return;
+  // Where two components have many pairs, those first that one joint explains best: the fewer
+  // joints are between two parts, the less it leaves.
+  constexpr std::size_t kMaxParts = 14, kNearPairs = 12;
+  constexpr std::size_t kAllPairs = std::numeric_limits<std::size_t>::max();
+  const bool is_large = forest_.parts().size() > kMaxParts;
+  for (const std::size_t most : {is_large ? kNearPairs : kAllPairs, kAllPairs}) {
+    bool is_all = true;
+    if (known != grid) is_all = two_joints_pass(known, most);
+    // A signal's range in the forest may not hold for its other joints.
+    if (!forest_.spans()) is_all = two_joints_pass(grid, most);
+    if (is_all || forest_.spans()) break;
+  }
+  if (forest_.spans() || is_large) return;
   // So few frames leave the fits narrow valleys: a finer grid of ranges, where parts are few. More
   // tell joints that turn more than once.
   if (pairs_.actions().num_samples() >= kFewestScanFrames) {
-    two_joints_pass(known_turns(wide_turns()));
+    two_joints_pass(known_turns(wide_turns()), kAllPairs);
   } else {
     std::vector<double> fine;
     for (double turn = 0.25; turn < 3.1; turn *= 1.15) fine.push_back(turn);
-    two_joints_pass(Turns(pairs_.actions().num_signals(), fine));
+    two_joints_pass(Turns(pairs_.actions().num_signals(), fine), kAllPairs);
   }
 }
 
-void LayeredSearch::two_joints_pass(const Turns& turns) {
+bool LayeredSearch::two_joints_pass(const Turns& turns, std::size_t most_pairs) {
   // Fits of two components that stay above this cost a frame, in a row, before the rest is given
   // up.
   constexpr double kHopelessCost = 16;
@@ -196,16 +206,32 @@ void LayeredSearch::two_joints_pass(const Turns& turns) {
     int i, j;
     Start start;
   };
-  std::map<std::pair<int, int>, std::vector<Screened>> by_components;
+  const auto score_of = [this](const std::pair<int, int>& ij) {
+    const auto score = one_joint_score_.find(ij);
+    return score == one_joint_score_.end() ? std::numeric_limits<double>::infinity()
+                                           : score->second;
+  };
+  std::map<std::pair<int, int>, std::vector<std::pair<int, int>>> by_components;
   for_each_open_pair([&](int i, int j) {
-    auto& list = by_components[std::minmax({forest_.component(i), forest_.component(j)})];
-    for (const auto& t : turns) pairs_.num_screens += static_cast<int>(2 * t.size());
-    for (Start& start :
-         screen_two_joints(pairs_.pair(i, j), pairs_.actions(), pairs_.motions(i, j), turns, 10))
-      list.push_back({i, j, std::move(start)});
+    by_components[std::minmax({forest_.component(i), forest_.component(j)})].emplace_back(i, j);
   });
   std::vector<Candidate> candidates;
-  for (auto& [components, list] : by_components) {
+  bool is_all = true;
+  for (auto& [components, open] : by_components) {
+    if (open.size() > most_pairs) {
+      is_all = false;
+      std::stable_sort(open.begin(), open.end(),
+                       [&](const auto& x, const auto& y) { return score_of(x) < score_of(y); });
+      open.resize(most_pairs);
+      std::sort(open.begin(), open.end());
+    }
+    std::vector<Screened> list;
+    for (const auto& [i, j] : open) {
+      for (const auto& t : turns) pairs_.num_screens += static_cast<int>(2 * t.size());
+      for (Start& start :
+           screen_two_joints(pairs_.pair(i, j), pairs_.actions(), pairs_.motions(i, j), turns, 10))
+        list.push_back({i, j, std::move(start)});
+    }
     std::stable_sort(list.begin(), list.end(),
                      [](const auto& x, const auto& y) { return x.start.score < y.start.score; });
     std::map<std::pair<int, int>, std::vector<Candidate>> valid;
@@ -222,6 +248,7 @@ void LayeredSearch::two_joints_pass(const Turns& turns) {
     for (auto& [ij, of_pair] : valid) decide(std::move(of_pair), &candidates);
   }
   connect(std::move(candidates));
+  return is_all;
 }
 
 }  // namespace bodyschema

@@ -1,5 +1,8 @@
 #pragma once
 
+#include <cstddef>
+#include <map>
+#include <utility>
 #include <vector>
 
 #include "processes/structure_learner/search/pair_models.h"
@@ -35,12 +38,14 @@ class LayeredSearch {
   void layer_one_joint();
   void layer_two_joints();
   Turns known_turns(const std::vector<double>& grid) const;
-  void two_joints_pass(const Turns& turns);
+  // Of each two components at most so many pairs. True if these are all.
+  bool two_joints_pass(const Turns& turns, std::size_t most_pairs);
 
   PairModels& pairs_;
   ModelForest& forest_;
   std::vector<Candidate> doubtful_;
   std::vector<Candidate> spare_;
+  std::map<std::pair<int, int>, double> one_joint_score_;  // of the best, by pair
   int num_judged_ = 0;  // frames of the valid models found so far, and the outliers among them
   int num_outliers_ = 0;
   bool is_clean_ = false;

@@ -12,8 +12,10 @@ namespace {
 
 // Pairs of two components that are tried, those seen together most often first.
 constexpr std::size_t kMaxPairs = 12;
-// More gaps have another reason than hidden parts: the noise told, or soft parts.
-constexpr std::size_t kMaxComponents = 6;
+// Components that lie apart. More gaps than kMaxComponents have another reason than hidden parts:
+// the noise told, or soft parts. Beyond kMaxSearched no order of joints is searched for: what falls
+// into many pieces is no arm that is seen at its ends, and each two of them would cost a second.
+constexpr std::size_t kMaxComponents = 6, kMaxSearched = 3;
 
 std::vector<int> without(const std::vector<int>& signals, const std::set<int>& used) {
   std::vector<int> result;
@@ -43,9 +45,10 @@ std::optional<Candidate> chain_between(int part_i, int part_j, const std::vector
 }
 
 std::optional<Candidate> best_chain(const std::vector<std::pair<int, int>>& between,
-                                    const std::vector<int>& signals, PairModels* pairs) {
+                                    const std::vector<int>& signals, bool are_few,
+                                    PairModels* pairs) {
   // What moves as a stream is often soft: no order is searched for where none may fit.
-  const bool is_searched = between.size() == 1 && !pairs->actions().blocks().is_stream();
+  const bool is_searched = are_few && between.size() == 1 && !pairs->actions().blocks().is_stream();
   std::optional<Candidate> best;
   const auto rank = [](const Candidate& c) { return std::tuple(c.model.num_joints(), -c.score); };
   for (const auto& [i, j] : between) {
@@ -81,7 +84,9 @@ bool connect_long_chains(PairModels* pairs, ModelForest* forest) {
   const int max_joints = std::min(pairs->options().max_signals, kMaxChainJoints);
   if (max_joints <= kMaxScreenedJoints) return false;
   if (pairs->options().unknown_bias > 0 && pairs->actions().blocks().is_stream()) return false;
-  if (forest->parts().size() > forest->models().size() + kMaxComponents) return false;
+  const std::size_t num_components = forest->parts().size() - forest->models().size();
+  if (num_components > kMaxComponents) return false;
+  const bool are_few = num_components <= kMaxSearched;
   std::map<std::pair<int, int>, std::vector<std::pair<int, int>>> open;  // by components
   for (const auto& [ij, record] : pairs->records())
     if (!forest->connected(ij.first, ij.second) && record.num_common > 0)
@@ -102,7 +107,7 @@ bool connect_long_chains(PairModels* pairs, ModelForest* forest) {
     for (const std::vector<int>& signals : choices) {
       const int m = static_cast<int>(signals.size());
       if (m <= kMaxScreenedJoints || m > max_joints) continue;
-      if (const auto chain = best_chain(between, signals, pairs)) {
+      if (const auto chain = best_chain(between, signals, are_few, pairs)) {
         found.push_back(*chain);
         break;
       }

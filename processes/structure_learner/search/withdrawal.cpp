@@ -55,14 +55,17 @@ void withdraw_untestable(const ComponentTree& tree, PairModels* pairs,
   }
 }
 
-// Takes back the edge whose data tell least of some signal's joint, if that is not enough.
-bool withdraw_least_told(const ComponentTree& tree, PairModels* pairs, ModelForest* forest,
-                         std::map<int, double>* joint_information) {
-  if (tree.nodes().size() < 2) return false;
+// Takes back the edge whose data tell least of some signal's joint, if that is not enough: the
+// parts that it joined. Otherwise none, and the information on every signal's joint is counted.
+std::vector<int> withdraw_least_told(const ComponentTree& tree, PairModels* pairs,
+                                     ModelForest* forest,
+                                     std::map<int, double>* joint_information) {
+  if (tree.nodes().size() < 2) return {};
   const Eigen::MatrixXd information = missing_joint_information(tree.fit());
   const std::vector<int>& moving = pairs->actions().moving();
   double least = kNoticed;
   int least_node = -1, least_signal = -1;
+  std::map<int, double> of_component;
   for (int k = 1; k < static_cast<int>(tree.nodes().size()); ++k) {
     const TreeNode& node = tree.nodes()[k];
     const int sightings = std::min(tree.data()[k].size(), tree.data()[node.parent].size());
@@ -70,23 +73,30 @@ bool withdraw_least_told(const ComponentTree& tree, PairModels* pairs, ModelFore
     for (std::size_t s = 0; s < moving.size(); ++s) {
       if (node.model.uses(moving[s])) continue;
       const double told = information(k, static_cast<Eigen::Index>(s));
-      double& of_signal = (*joint_information)[moving[s]];
-      of_signal = std::min(of_signal, told);
+      double& here = of_component.emplace(moving[s], told).first->second;
+      here = std::min(here, told);
       if (turn * turn * told >= least) continue;
       least = turn * turn * told;
       least_node = k;
       least_signal = moving[s];
     }
   }
-  if (least_node < 0) return false;
+  if (least_node < 0) {
+    for (const auto& [signal, told] : of_component) {
+      double& of_signal = joint_information->at(signal);
+      of_signal = std::min(of_signal, told);
+    }
+    return {};
+  }
   std::vector<AcceptedModel> models = forest->models();
   const auto m = models.begin() + tree.model_of(least_node);
   PairRecord& record = pairs->record(m->part_i, m->part_j);
   record.undecided.emplace(m->model.num_joints(), 0.0);
   record.untold_signals.insert(least_signal);
+  const std::vector<int> parted{m->part_i, m->part_j};
   models.erase(m);
   forest->set_models(std::move(models));
-  return true;
+  return parted;
 }
 
 }  // namespace
@@ -98,14 +108,17 @@ std::map<int, double> withdraw_untold_edges(PairModels* pairs, ModelForest* fore
       withdraw_untestable(ComponentTree(*forest, part, pairs), pairs, &kept);
   forest->set_models(std::move(kept));
   std::map<int, double> information;
-  for (bool is_changed = true; is_changed;) {
-    is_changed = false;
-    for (const int signal : pairs->actions().moving())
-      information[signal] = std::numeric_limits<double>::infinity();
-    for (const int part : forest->parts())
-      if (forest->component(part) == part)
-        is_changed |=
-            withdraw_least_told(ComponentTree(*forest, part, pairs), pairs, forest, &information);
+  for (const int signal : pairs->actions().moving())
+    information[signal] = std::numeric_limits<double>::infinity();
+  std::vector<int> open;  // a part of each component that is to be judged
+  for (const int part : forest->parts())
+    if (forest->component(part) == part) open.push_back(part);
+  while (!open.empty()) {
+    const int part = open.back();
+    open.pop_back();
+    for (const int end :
+         withdraw_least_told(ComponentTree(*forest, part, pairs), pairs, forest, &information))
+      open.push_back(end);
   }
   return information;
 }

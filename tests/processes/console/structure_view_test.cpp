@@ -257,6 +257,19 @@ BodySchema long_edge(test::Rng& rng) {
   return schema;
 }
 
+TEST(SchemaJsonTest, WhatDoesNotShowOverTheRangeOfASignalIsNought) {
+  test::Rng rng(63);
+  BodySchema schema = long_edge(rng);
+  for (ScrewJoint& joint : schema.edges[0].joints) joint.slide = joint.turn != 0 ? 6.937e-8 : 0.02;
+  std::string text = structure_text(schema);
+  EXPECT_NE(text.find(" 0 mm ± "), std::string::npos) << text;
+  EXPECT_EQ(text.find("e-"), std::string::npos) << text;
+  schema.edges[0].parameter_covariance.setZero();
+  text = structure_text(schema);
+  EXPECT_EQ(text.find(" 0 mm"), std::string::npos) << text;
+  EXPECT_NE(text.find("°"), std::string::npos) << text;
+}
+
 TEST(SchemaJsonTest, TheJointsOfALongEdgeStandInTheirOrderWithWhatEachDoes) {
   test::Rng rng(63);
   BodySchema schema = long_edge(rng);

@@ -112,7 +112,7 @@ TEST(RecordingTest, AMissingRowIsAnUnseenPart) {
 }
 
 TEST(RecordingTest, AnInstantIsATimeWhereverItsRowsStand) {
-  // Part by part, and time may run backwards.
+  // Part by part, and backwards.
   const Recording recording = parse_csv(kHeader +
                                             "1,1,2,1,0,0,1,1,0,0,0\n"
                                             "0,1,2,1,0,0,2,1,0,0,0\n"
@@ -120,9 +120,10 @@ TEST(RecordingTest, AnInstantIsATimeWhereverItsRowsStand) {
                                             "0,1,2,2,0,0,4,1,0,0,0\n",
                                         "f");
   ASSERT_EQ(recording.samples.size(), 2U);
-  EXPECT_EQ(recording.samples[0].utime, 1'000'000);
-  EXPECT_EQ(recording.samples[0].find(2)->X_CB.translation().z(), 3);
-  EXPECT_EQ(recording.samples[1].find(2)->X_CB.translation().z(), 4);
+  EXPECT_EQ(recording.samples[0].sample_index, 0);
+  EXPECT_EQ(recording.samples[1].utime, 1'000'000);
+  EXPECT_EQ(recording.samples[0].find(2)->X_CB.translation().z(), 4);
+  EXPECT_EQ(recording.samples[1].find(2)->X_CB.translation().z(), 3);
 }
 
 // Slightly different ones would make two instants with half of the parts each.
