@@ -70,6 +70,8 @@ Eigen::MatrixXd TreeFit::with_fixed_gauge(const Normal& normal) const {
         Eigen::VectorXd gauge = Eigen::VectorXd::Zero(H.rows());
         gauge.segment<6>(normal.offset[k] + ScrewChainLayout::transform(d)) = before;
         gauge.segment<6>(normal.offset[k] + ScrewChainLayout::transform(d + 1)) = after;
+        if (d + 1 == nodes_[k].model.num_joints() && nodes_[k].model.is_position)
+          gauge.segment<3>(normal.offset[k] + ScrewChainLayout::transform(d + 1) + 3).setZero();
         const double information =
             gauge.dot(normal.H.diagonal().cwiseProduct(gauge)) / std::pow(gauge.squaredNorm(), 2);
         H += information * gauge * gauge.transpose();
@@ -97,11 +99,11 @@ Eigen::MatrixXd TreeFit::score_covariance(const Normal& normal, const Measuremen
       const int frame = frame_index_[at(t, k)];
       if (frame < 0) continue;
       const FrameFit& fit = fits_[at(t, k)];
-      const Matrix6d& whitening = data_[k].hypotheses[fit.hypothesis].whitening;
+      const Matrix6d whitening = -data_[k].hypotheses[fit.hypothesis].residual_jacobian(
+          Vector6d::Zero(), poses_[at(t, k)]);
       // The whitened error of the marker as a twist in the camera's frame, weighed.
-      const Matrix6d twist = robust_weight(fit.squared_distance) *
-                             adjoint(poses_[at(t, k)].inverse()).transpose() *
-                             whitening.transpose();
+      const Matrix6d twist =
+          fit.weight() * adjoint(poses_[at(t, k)].inverse()).transpose() * whitening.transpose();
       const auto add = [&](const Eigen::MatrixXd& effect, Eigen::MatrixXd* sum) {
         if (sum->size() == 0) *sum = Eigen::MatrixXd::Zero(size, effect.cols());
         for (int e = k; e >= 0; e = nodes_[e].parent) {
