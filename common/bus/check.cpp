@@ -337,6 +337,8 @@ void check_tree(Checker& check, const body_schema_t& m) {
     check.require(is_part(edge.from_part), "from_part", "is not in part_ids");
     check.require(is_part(edge.to_part), "to_part", "is not in part_ids");
     check.require(edge.from_part != edge.to_part, "to_part", "is from_part");
+    check.require(!std::ranges::binary_search(m.position_parts, edge.from_part), "from_part",
+                  "is in position_parts: such a part is a leaf");
     check.require(edge.to_part != m.root_part, "to_part", "is the root");
     check.require(placed.count(edge.to_part) == 0, "to_part",
                   "was reached before: the edges are no tree ordered from the root outwards");
@@ -371,6 +373,8 @@ void check_together(Checker& check, const body_schema_t& m) {
   const auto is_part = [&](std::int32_t id) { return std::ranges::binary_search(m.part_ids, id); };
   check.require(m.part_ids.empty() ? m.root_part == -1 : is_part(m.root_part), "root_part",
                 "is not in part_ids (-1 where those are empty)");
+  for (const std::int32_t id : m.position_parts)
+    check.require(is_part(id), "position_parts", "is not in part_ids");
   check_tree(check, m);
   check_signal_indices(check, m);
   check.each("frames", m.frames, [&](const part_frame_t& frame) {

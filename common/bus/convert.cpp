@@ -68,14 +68,13 @@ Matrix8d from_message(const float (&message)[36]) {
 
 namespace {
 
-/// Those with a rotation.
 std::vector<PartObservation> from_messages(const std::vector<part_observation_t>& messages) {
   std::vector<PartObservation> observations;
   for (const part_observation_t& message : messages) {
-    if (message.has_rotation == 0) continue;
     PartObservation& observation = observations.emplace_back();
     observation.part = message.part_id;
     observation.X_CB = from_message(message.X_CB);
+    observation.has_rotation = message.has_rotation == 1;
     observation.covariance = from_message(message.covariance);
     if (message.has_other == 1) observation.X_CB_other = from_message(message.X_CB_other);
     observation.error_ratio = message.error_ratio;
@@ -90,7 +89,7 @@ std::vector<part_observation_t> to_messages(const std::vector<PartObservation>& 
     part_observation_t& part = messages.emplace_back();
     part.part_id = observation.part;
     part.X_CB = to_message(observation.X_CB);
-    part.has_rotation = 1;
+    part.has_rotation = observation.has_rotation ? 1 : 0;
     to_message(observation.covariance, part.covariance);
     part.has_other = observation.X_CB_other ? 1 : 0;
     part.X_CB_other = to_message(observation.X_CB_other.value_or(observation.X_CB));
@@ -116,12 +115,6 @@ ActionPoseSample from_message(const sample_t& message) {
   sample.parts = from_messages(message.parts);
   sample.contradictions = from_messages(message.contradictions);
   return sample;
-}
-
-int num_positions_alone(const sample_t& sample) {
-  return static_cast<int>(
-      std::count_if(sample.parts.begin(), sample.parts.end(),
-                    [](const part_observation_t& part) { return part.has_rotation == 0; }));
 }
 
 sample_t to_message(const ActionPoseSample& sample) {
@@ -322,6 +315,8 @@ body_schema_t to_message(const BodySchema& schema) {
   message.is_complete = schema.complete ? 1 : 0;
   set_array(message.num_parts, message.part_ids,
             std::vector<std::int32_t>(schema.parts.begin(), schema.parts.end()));
+  set_array(message.num_position_parts, message.position_parts,
+            std::vector<std::int32_t>(schema.position_parts.begin(), schema.position_parts.end()));
   message.root_part = schema.root;
   message.X_CR = to_message(schema.X_CR);
   to_message(schema.X_CR_covariance, message.X_CR_covariance);
@@ -386,6 +381,7 @@ BodySchema from_message(const body_schema_t& message) {
   schema.num_samples = message.num_samples_seen;
   schema.complete = message.is_complete == 1;
   schema.parts.assign(message.part_ids.begin(), message.part_ids.end());
+  schema.position_parts.assign(message.position_parts.begin(), message.position_parts.end());
   schema.root = message.root_part;
   schema.X_CR = from_message(message.X_CR);
   schema.X_CR_covariance = from_message(message.X_CR_covariance);

@@ -29,11 +29,8 @@ Matrix6d from_message(const float (&message)[21]);
 void to_message(const Matrix8d& covariance, float (&message)[36]);
 Matrix8d from_message(const float (&message)[36]);
 
-/// Leaves out corners, which sample_t carries and ActionPoseSample does not, and parts with a
-/// position alone.
+/// Leaves out corners, which sample_t carries and ActionPoseSample does not.
 ActionPoseSample from_message(const sample_t& message);
-/// Number of parts with a position alone.
-int num_positions_alone(const sample_t& sample);
 /// Source, epoch, action id, rest interval and corners are left empty.
 sample_t to_message(const ActionPoseSample& sample);
 

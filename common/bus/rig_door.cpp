@@ -59,9 +59,7 @@ void RigDoor::refuse(Process& process, const std::string& channel, const std::st
 }
 
 bool RigDoor::takes(Process& process, const sample_t& sample) const {
-  if (!lets_in(process, kSample, sample)) return false;
-  if (const int n = num_positions_alone(sample); n > 0) process.count("position alone", n);
-  return true;
+  return lets_in(process, kSample, sample);
 }
 
 std::string RigDoor::objection_to_calibration(std::int64_t id, const char* what_to_do) const {

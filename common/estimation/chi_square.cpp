@@ -1,5 +1,6 @@
 #include "common/estimation/chi_square.h"
 
+#include <algorithm>
 #include <boost/math/distributions/binomial.hpp>
 #include <boost/math/distributions/chi_squared.hpp>
 #include <boost/math/special_functions/gamma.hpp>
@@ -26,6 +27,13 @@ ChiSquareMoments chi_square_below(double limit, double dof) {
   const double mean = dof * gamma_p(0.5 * dof + 1, 0.5 * limit) / share;
   const double square = dof * (dof + 2) * gamma_p(0.5 * dof + 2, 0.5 * limit) / share;
   return {mean, square - mean * mean};
+}
+
+double as_of_six(double chi_square, int dof) {
+  if (dof == 6) return chi_square;
+  const auto spread = [](double n) { return 2 / (9 * n); };
+  const double z = (std::cbrt(chi_square / dof) - 1 + spread(dof)) / std::sqrt(spread(dof));
+  return 6 * std::pow(std::max(0.0, 1 - spread(6) + z * std::sqrt(spread(6))), 3);
 }
 
 int binomial_quantile(int trials, double rate, double p) {

@@ -65,11 +65,13 @@ class AlignmentStep {
     g_[6] -= std::log(start.scale) / (kPriorScale * kPriorScale);
   }
 
-  void add(int part, const Pose& predicted, const Pose& truth) {
+  void add(int part, const Pose& predicted, const Pose& truth, bool has_rotation) {
     const auto of_part = alignment_.X_PB.find(part);
     const Pose aligned = alignment_.aligned(part, predicted);
-    const Vector6d weight = per_axis(1 / kPositionUnit_m, 1 / kRotationUnit_rad);
-    const Vector6d residual = weight.cwiseProduct(log(Pose(aligned.inverse() * truth)));
+    const Vector6d weight = per_axis(1 / kPositionUnit_m, has_rotation ? 1 / kRotationUnit_rad : 0);
+    Pose turned = truth;
+    if (!has_rotation) turned.linear() = aligned.linear();
+    const Vector6d residual = weight.cwiseProduct(log(Pose(aligned.inverse() * turned)));
     Eigen::Matrix<double, 6, kShared> shared;
     shared.leftCols<6>() = adjoint(Pose(aligned.inverse() * alignment_.X_RS));
     shared.col(6).head<3>() = (alignment_.X_RS.inverse() * aligned).linear().transpose() *
@@ -127,6 +129,7 @@ std::optional<Alignment> align(const BodySchema& schema,
   struct Pair {
     int part;
     Pose predicted, truth;
+    bool has_rotation;
   };
   std::vector<Pair> pairs;
   Alignment result;
@@ -134,12 +137,12 @@ std::optional<Alignment> align(const BodySchema& schema,
   for (const ActionPoseSample& sample : samples) {
     check_signals(schema, sample);
     const PartObservation* root = sample.find(schema.root);
-    if (!root) continue;
+    if (!root || !root->has_rotation) continue;
     ++num_samples;
     for (const auto& [part, predicted] : schema.predict_all(sample.action)) {
       const PartObservation* seen = sample.find(part);
       if (!seen || part == schema.root) continue;
-      pairs.push_back({part, predicted, root->X_CB.inverse() * seen->X_CB});
+      pairs.push_back({part, predicted, root->X_CB.inverse() * seen->X_CB, seen->has_rotation});
       result.X_PB[part] = Pose::Identity();
     }
   }
@@ -147,7 +150,8 @@ std::optional<Alignment> align(const BodySchema& schema,
   constexpr int kSteps = 10;  // from some millimetres and degrees off; quadratic
   for (int i = 0; i < kSteps; ++i) {
     AlignmentStep step(result);
-    for (const Pair& pair : pairs) step.add(pair.part, pair.predicted, pair.truth);
+    for (const Pair& pair : pairs)
+      step.add(pair.part, pair.predicted, pair.truth, pair.has_rotation);
     result = Alignment(step.solved());
   }
   return result;
@@ -173,7 +177,7 @@ std::vector<PartErrors> evaluate(const BodySchema& schema,
   for (const ActionPoseSample& sample : samples) {
     check_signals(schema, sample);
     const PartObservation* root = sample.find(schema.root);
-    if (!root) continue;
+    if (!root || !root->has_rotation) continue;
     const std::map<int, Pose> predicted = schema.predict_all(sample.action);
     for (auto& [part, of_part] : errors) {
       const PartObservation* seen = sample.find(part);
@@ -181,7 +185,7 @@ std::vector<PartErrors> evaluate(const BodySchema& schema,
       const Pose error =
           alignment.aligned(part, predicted.at(part)).inverse() * root->X_CB.inverse() * seen->X_CB;
       of_part.position_m.push_back(error.translation().norm());
-      of_part.rotation_rad.push_back(rotation_angle(error));
+      if (seen->has_rotation) of_part.rotation_rad.push_back(rotation_angle(error));
     }
   }
   std::vector<PartErrors> result;
@@ -194,6 +198,9 @@ std::vector<PartErrors> evaluate(const BodySchema& schema,
       summary.position_rms_m = rms(of_part.position_m);
       summary.position_max_m =
           *std::max_element(of_part.position_m.begin(), of_part.position_m.end());
+    }
+    summary.has_rotation = summary.count == 0 || !of_part.rotation_rad.empty();
+    if (!of_part.rotation_rad.empty()) {
       summary.rotation_median_rad = median(of_part.rotation_rad);
       summary.rotation_rms_rad = rms(of_part.rotation_rad);
     }

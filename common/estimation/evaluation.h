@@ -16,6 +16,7 @@ struct PartErrors {
   double position_median_m = 0;
   double position_rms_m = 0;
   double position_max_m = 0;
+  bool has_rotation = true;  ///< else positions alone were seen: no errors of the rotation
   double rotation_median_rad = 0;
   double rotation_rms_rad = 0;
 };

@@ -5,6 +5,9 @@ namespace {
 
 /// 7 µm and 7 µrad: below what any camera resolves.
 constexpr double kLeastVariance = 5e-11;
+/// Of a rotation of which nothing is known: its normal density at 0 is that of all rotations alike,
+/// 1/(8π²), so that likelihoods with it can be compared with those of a position anywhere.
+constexpr double kUnknownRotation_rad = 1.711;
 
 }  // namespace
 
@@ -15,8 +18,15 @@ Matrix6d isotropic(const Noise& noise) {
   return variances.asDiagonal();
 }
 
+Matrix6d without_rotation(const Matrix6d& covariance) {
+  Matrix6d result = Matrix6d::Zero();
+  result.topLeftCorner<3, 3>() = covariance.topLeftCorner<3, 3>();
+  return result;
+}
+
 Matrix6d MeasurementModel::noise_covariance(const PartObservation& observation) const {
-  return scale * scale * (noise ? isotropic(*noise) : observation.covariance);
+  const Matrix6d covariance = scale * scale * (noise ? isotropic(*noise) : observation.covariance);
+  return observation.has_rotation ? covariance : without_rotation(covariance);
 }
 
 Eigen::Matrix<double, 6, 7> MeasurementModel::effect_of_tag(const Pose& X_CB,
@@ -34,7 +44,20 @@ Matrix6d MeasurementModel::systematic_covariance() const {
 }
 
 Matrix6d MeasurementModel::covariance(const PartObservation& observation) const {
-  return noise_covariance(observation) + systematic_covariance();
+  const Matrix6d M = systematic_covariance();
+  return noise_covariance(observation) + (observation.has_rotation ? M : without_rotation(M));
+}
+
+MeasurementModel::Reading MeasurementModel::reading(const PartObservation& observation,
+                                                    const Pose& expected) const {
+  const Matrix6d known = covariance(observation);
+  if (observation.has_rotation) return {observation.X_CB, known, 6};
+  Reading reading{expected, Matrix6d::Zero(), 3};
+  reading.X_CB.translation() = observation.X_CB.translation();
+  const Eigen::Matrix3d R = expected.linear();
+  reading.covariance.topLeftCorner<3, 3>() = R.transpose() * known.topLeftCorner<3, 3>() * R;
+  reading.covariance.diagonal().tail<3>().setConstant(kUnknownRotation_rad * kUnknownRotation_rad);
+  return reading;
 }
 
 }  // namespace bodyschema

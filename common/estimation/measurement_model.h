@@ -38,9 +38,10 @@ struct MeasurementModel {
   /// of the first's.
   double max_error_ratio = 10;
 
-  /// Σ of X_CB: 6×6, (translation [m], rotation [rad]), right perturbation in B.
+  /// Σ of X_CB: 6×6, (translation [m], rotation [rad]), right perturbation in B. Of a position
+  /// alone the rotation rows are zero, here and in covariance().
   Matrix6d noise_covariance(const PartObservation& observation) const;
-  /// M, and a little that keeps exact measurements invertible.
+  /// M of a pose, and a little that keeps exact measurements invertible.
   Matrix6d systematic_covariance() const;
   /// 6×7, (translation [m], rotation [rad]), right perturbation in B: what one standard deviation
   /// of each error of one tag (place and rotation on its part, size: depth) makes of a pose that is
@@ -49,7 +50,18 @@ struct MeasurementModel {
   Eigen::Matrix<double, 6, 7> effect_of_tag(const Pose& X_CB, std::size_t num_tags) const;
   /// Σ + M.
   Matrix6d covariance(const PartObservation& observation) const;
+  /// An observation as a pose that can be compared with `expected`: a position alone is turned as
+  /// expected, by a rotation of which nothing is known, so that three of its residuals are 0.
+  struct Reading {
+    Pose X_CB;
+    Matrix6d covariance;    ///< Σ + M, which can be inverted
+    int num_residuals = 6;  ///< that tell something: d² has so many degrees of freedom
+  };
+  Reading reading(const PartObservation& observation, const Pose& expected) const;
 };
+
+/// A covariance of (translation, rotation) with nothing of the rotation in it.
+Matrix6d without_rotation(const Matrix6d& covariance);
 
 /// Variances per axis on the diagonal: 6×6, (translation [m²], rotation [rad²]).
 Matrix6d isotropic(const Noise& noise);

@@ -228,7 +228,7 @@ std::optional<Matrix6d> empirical_covariance(const KinematicPath& path, int from
   for (const ActionPoseSample& sample : samples) {
     const PartObservation* a = sample.find(from);
     const PartObservation* b = sample.find(to);
-    if (a && b)
+    if (a && b && a->has_rotation && b->has_rotation)
       residuals.push_back(log(path.predict(sample.action).inverse() * a->X_CB.inverse() * b->X_CB));
   }
   if (residuals.size() < kFewest) return std::nullopt;

@@ -148,6 +148,10 @@ void drop_moved_tags(const std::vector<MovedTag>& moved, ActionPoseSample* sampl
   sample->leave_out([&](int tag) { return has_moved(moved, tag, sample->sample_index); });
 }
 
+bool BodySchema::has_rotation(int part) const {
+  return !std::binary_search(position_parts.begin(), position_parts.end(), part);
+}
+
 bool BodySchema::has_part(int part) const {
   return std::find(parts.begin(), parts.end(), part) != parts.end();
 }

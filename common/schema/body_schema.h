@@ -158,7 +158,10 @@ struct BodySchema {
   int num_samples = 0;  ///< samples used
   bool complete = false;
   std::vector<int> parts;  ///< observed parts, ascending
-  int root = -1;           ///< −1: no part was seen yet
+  /// Those of which positions alone are known, ascending: leaves, whose frames' rotation is
+  /// nobody's measurement but turned as their last joint's.
+  std::vector<int> position_parts;
+  int root = -1;  ///< −1: no part was seen yet
   /// Pose of the root part in the camera's frame, and its covariance (right perturbation).
   Pose X_CR = Pose::Identity();
   Matrix6d X_CR_covariance = Matrix6d::Zero();
@@ -178,6 +181,8 @@ struct BodySchema {
   static constexpr std::size_t kMaxMovedTags = 64;
 
   bool has_part(int part) const;
+  /// Does a prediction of this part say how it is turned?
+  bool has_rotation(int part) const;
   /// The first sample of the body as it was known after sample `sample_index`; 0 before any change.
   std::int64_t body_since(std::int64_t sample_index) const;
   /// The moved tags as they were known after sample `sample_index`.

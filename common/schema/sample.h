@@ -13,6 +13,9 @@ namespace bodyschema {
 struct PartObservation {
   int part = 0;
   Pose X_CB = Pose::Identity();
+  /// False: a position alone. X_CB then has no rotation, its covariance no rotation rows: they are
+  /// zero, so that the covariance is that of the position in the camera's axes.
+  bool has_rotation = true;
   /// 6×6 covariance of X_CB, tangent order (translation [m], rotation [rad]), right perturbation in
   /// the part's frame: X_CB = X_CB_true · exp(ε), ε ~ N(0, covariance).
   Matrix6d covariance = Matrix6d::Zero();

@@ -105,17 +105,18 @@ void Controller::observe(const sample_t& message) {
   // One view of the root is worse than the schema's mean over all: half a degree is 9 mm at 1 m.
   // Unless the camera was moved since.
   Pose X_CR = schema_->X_CR;
-  if (const PartObservation* root = sample.find(schema_->root)) {
+  if (const PartObservation* root = sample.find(schema_->root); root && root->has_rotation) {
     const Vector6d off = log(X_CR.inverse() * root->X_CB);
     const Matrix6d covariance = config_.measurement.covariance(*root) + schema_->X_CR_covariance;
     if (squared_mahalanobis(off, covariance) > kMovedCamera) X_CR = root->X_CB;
   }
   observed_offset_ = position_of(target_) - X_CR.inverse() * part->X_CB.translation();
   observed_error_m_ = observed_offset_.norm();
-  const Eigen::Matrix3d R_RB = (X_CR.inverse() * part->X_CB).linear();
-  Eigen::Matrix3d covariance = config_.measurement.covariance(*part).topLeftCorner<3, 3>();
-  if (const auto X_RB = schema_->predict(schema_->root, part->part, sample.action))
-    covariance += X_RB->covariance.topLeftCorner<3, 3>();
+  const auto X_RB = schema_->predict(schema_->root, part->part, sample.action);
+  const auto seen = config_.measurement.reading(*part, X_RB ? X_CR * X_RB->X_AB : part->X_CB);
+  const Eigen::Matrix3d R_RB = (X_CR.inverse() * seen.X_CB).linear();
+  Eigen::Matrix3d covariance = seen.covariance.topLeftCorner<3, 3>();
+  if (X_RB) covariance += X_RB->covariance.topLeftCorner<3, 3>();
   covariance = (R_RB * covariance * R_RB.transpose()).eval();
   // By the schema the part is at the aim.
   const Eigen::Vector3d surprise = observed_offset_ - (position_of(target_) - aim_);

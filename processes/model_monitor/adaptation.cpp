@@ -63,8 +63,9 @@ void believe_nearest(const BodySchema& schema, const MeasurementModel& measureme
   for (const PartObservation& o : sample->contradictions) {
     const auto expected = X_RB.find(o.part);
     if (sample->find(o.part) || expected == X_RB.end()) continue;
-    const double d2 =
-        ReadingDistance(measurement.covariance(o))(schema.X_CR * expected->second, o.X_CB);
+    const Pose X_CB = schema.X_CR * expected->second;
+    const auto seen = measurement.reading(o, X_CB);
+    const double d2 = ReadingDistance(seen.covariance)(X_CB, seen.X_CB);
     const auto [known, is_new] = nearest.try_emplace(o.part, d2, &o);
     if (!is_new && d2 < known->second.first) known->second = {d2, &o};
   }
@@ -392,7 +393,7 @@ void Adaptation::drop_turned_over(ActionPoseSample* sample) const {
   const auto X_RB = schema_.predict_all(sample->action);
   std::erase_if(sample->parts, [&](const PartObservation& o) {
     const auto expected = X_RB.find(o.part);
-    return expected != X_RB.end() &&
+    return o.has_rotation && expected != X_RB.end() &&
            rotation_angle((schema_.X_CR * expected->second).inverse() * o.X_CB) > kTurnedOver_rad;
   });
 }

@@ -231,7 +231,7 @@ void LiveSchema::watch_flips(const ActionPoseSample& sample) {
   const auto X_RB = schema_.predict_all(sample.action);
   for (const PartObservation& seen : sample.parts) {
     const auto predicted = X_RB.find(seen.part);
-    if (predicted == X_RB.end()) continue;
+    if (predicted == X_RB.end() || !seen.has_rotation) continue;
     const auto error = [&](const Pose& X_CB) {
       return rotation_angle((schema_.X_CR * predicted->second).inverse() * X_CB);
     };

@@ -136,7 +136,7 @@ bool ModelMonitor::on_sample(const sample_t& message) {
   if (message.sample_index <= last_sample_index_) return false;
   last_sample_index_ = message.sample_index;
   for (const auto& part : message.parts)
-    if (part.has_rotation == 1) seen_in_[part.part_id].later.push_back(message.sample_index);
+    seen_in_[part.part_id].later.push_back(message.sample_index);
   ActionPoseSample sample = from_message(message);
   if (sample.purpose == Purpose::kTest) {
     test_indices_.later.push_back(sample.sample_index);
@@ -384,7 +384,7 @@ void ModelMonitor::assess(const BodySchema& schema) const {
       const Pose error =
           path->predict(sample->action).inverse() * schema.X_CR.inverse() * seen->X_CB;
       position_errors.push_back(error.translation().norm());
-      rotation_errors.push_back(rotation_angle(error));
+      if (seen->has_rotation) rotation_errors.push_back(rotation_angle(error));
     }
     part_health_t health{};
     health.health_part = part;

@@ -261,8 +261,7 @@ std::optional<action_command_t> MotorBabbler::remember(const sample_t& sample) {
   seen.is_learned_from = sample.purpose == action_command_t::PURPOSE_TRAIN ||
                          sample.purpose == action_command_t::PURPOSE_PROBE;
   seen.action = Eigen::Map<const Eigen::VectorXd>(sample.action.data(), sample.num_signals);
-  for (const part_observation_t& part : sample.parts)
-    if (part.has_rotation == 1) seen.parts.insert(part.part_id);
+  for (const part_observation_t& part : sample.parts) seen.parts.insert(part.part_id);
   for (const part_observation_t& part : sample.contradictions) seen.parts.insert(part.part_id);
   memory_.push_back(std::move(seen));
   if (memory_.size() > kMaxMemory) memory_.pop_front();

@@ -46,7 +46,7 @@ int judge(const PairData& pair, const std::vector<double>& squared_distance,
   edge.num_samples = pair.size();
   double position = 0, rotation = 0;
   for (int t = 0; t < pair.size(); ++t) {
-    const bool outlying = squared_distance[t] > kOutlierThreshold;
+    const bool outlying = squared_distance[t] > outlier_threshold(pair.num_residuals());
     result->frames.push_back(pair.frames[t].sample);
     result->outlying.push_back(outlying);
     edge.num_outliers += outlying;
@@ -93,7 +93,7 @@ void fit_screw_edge(const LocalModel& start, const PairData& pair, const EdgeDat
   const int inliers = judge(pair, loo.squared_distance, loo.residual, result);
   double weight = 0;
   for (int t = 0; t < pair.size(); ++t)
-    if (!result->outlying[t]) weight += robust_weight(fit.frames[t].squared_distance);
+    if (!result->outlying[t]) weight += fit.frames[t].weight();
   // The robust weights are relative: an inlier counts as one measurement, on the average.
   if (inliers > 0)
     result->edge.parameter_covariance =

@@ -27,16 +27,17 @@ bool has_covariances(const std::vector<ActionPoseSample>& samples) {
 
 Noise typical_noise(const std::vector<ActionPoseSample>& samples) {
   double position = 0, rotation = 0;
-  int count = 0;
+  int count = 0, num_rotations = 0;
   for (const auto& sample : samples) {
     for (const auto& o : sample.parts) {
       position += o.covariance.topLeftCorner<3, 3>().trace() / 3;
       rotation += o.covariance.bottomRightCorner<3, 3>().trace() / 3;
       ++count;
+      num_rotations += o.has_rotation;
     }
   }
   if (count == 0) return {};
-  return {std::sqrt(position / count), std::sqrt(rotation / count)};
+  return {std::sqrt(position / count), std::sqrt(rotation / std::max(num_rotations, 1))};
 }
 
 // What stiff models leave is no noise where it is more than any tag or tracker has: chosen, above
@@ -92,6 +93,20 @@ UnconnectedPart explain(int part, int num_seen, const std::set<int>& connected,
       common = record.num_common;
       partner = other;
     }
+  }
+  if (!structure.position_parts.empty() && connected.empty())
+    return {part, Unconnected::kNotEnoughData,
+            "the root has positions alone: give its orientations, or choose another root"};
+  if (std::binary_search(structure.position_parts.begin(), structure.position_parts.end(), part)) {
+    const auto leaf = structure.open_leaves.find(part);
+    const OpenLeaf why =
+        leaf != structure.open_leaves.end()
+            ? leaf->second
+            : OpenLeaf{true,
+                       "the part that it hangs on is not connected, or its model is not valid "
+                       "any more"};
+    return {part, why.is_data_missing ? Unconnected::kNotEnoughData : Unconnected::kNoValidModel,
+            "seen " + std::to_string(num_seen) + " times without orientation; " + why.reason};
   }
   // With fewer numbers than five a parameter of the largest model, its refusal says little.
   const int parameters = 6 + 6 * max_signals;
@@ -177,6 +192,7 @@ LearnResult fit_tree(const LearnedStructure& structure,
   result.num_fits = search.num_fits;
   BodySchema& schema = result.schema;
   schema = start_schema(structure.signals, samples, options.root);
+  schema.position_parts = structure.position_parts;
   schema.noise = measurement.noise ? *measurement.noise : typical_noise(samples);
   schema.noise.position_m *= measurement.scale;
   schema.noise.rotation_rad *= measurement.scale;
@@ -195,7 +211,8 @@ LearnResult fit_tree(const LearnedStructure& structure,
     return true;
   });
   estimate_root_pose(samples, measurement, &schema);
-  if (schema.has_part(schema.root)) fit_jointly(data, &fitted, &schema);
+  if (schema.has_part(schema.root) && schema.has_rotation(schema.root))
+    fit_jointly(data, &fitted, &schema);
   for (const FittedEdge& f : fitted) schema.edges.push_back(f.edge);
 
   const std::set<int> connected = connected_to_root(schema);
@@ -322,36 +339,87 @@ LearnedStructure find_with_bias(const std::vector<Signal>& signals,
   return result;
 }
 
+// The leaves that have positions alone, beside the structure of all other parts.
+void attach_leaves(const std::vector<ActionPoseSample>& samples, const LearnOptions& options,
+                   LearnedStructure* structure) {
+  const std::vector<ActionPoseSample> moved = displaced(samples, structure->signals);
+  structure->parts = seen_parts(samples);
+  const auto first_posed =
+      std::find_if(structure->parts.begin(), structure->parts.end(), [&](int part) {
+        return !std::binary_search(structure->position_parts.begin(),
+                                   structure->position_parts.end(), part);
+      });
+  if (first_posed == structure->parts.end()) return;
+  const int root = options.root.value_or(*first_posed);
+  std::optional<Noise>& noise = structure->options.measurement.noise;
+  if (noise && structure->noise_source != NoiseSource::kGiven) {
+    const bool is_assumed = structure->noise_source == NoiseSource::kAssumed;
+    if (is_assumed)
+      if (const auto of_root =
+              noise_at_rest(moved, root, structure->actions, structure->options.validity)) {
+        noise = of_root;
+        structure->search.resting.insert(root);
+      }
+    const auto of_positions =
+        estimate_position_noise(moved, structure->actions, root, structure->search.resting);
+    if (is_assumed && !of_positions) {
+      for (const int part : structure->position_parts)
+        structure->open_leaves[part] = {true,
+                                        "how noisy the positions are is not known: tell it "
+                                        "(--noise), or give orientations"};
+      return;
+    }
+    if (of_positions) noise->position_m = std::max(noise->position_m, of_positions->position_m);
+    if (is_assumed) structure->noise_source = of_positions->source;
+  }
+  PositionLeaves leaves = find_position_leaves(moved, structure->actions, root, structure->signals,
+                                               structure->options, &structure->search);
+  for (AcceptedModel& model : leaves.models) structure->search.models.push_back(std::move(model));
+  structure->open_leaves = std::move(leaves.open);
+}
+
 }  // namespace
 
 LearnedStructure find_structure(const std::vector<Signal>& signals,
                                 const std::vector<ActionPoseSample>& samples,
                                 const LearnOptions& options) {
-  const std::vector<ActionPoseSample> distinct = without_repetitions(samples);
+  const std::vector<int> alone = parts_without_rotation(samples);
+  const std::vector<ActionPoseSample> distinct =
+      with_uniform_parts(without_repetitions(samples), alone);
+  std::vector<ActionPoseSample> poses = distinct;
+  for (ActionPoseSample& sample : poses)
+    std::erase_if(sample.parts, [](const PartObservation& o) { return !o.has_rotation; });
   const auto find = [&](double factor, double unknown_bias) {
     LearnOptions louder = options;
     louder.measurement.scale *= factor;
-    return find_with_bias(signals, distinct, louder, unknown_bias);
+    return find_with_bias(signals, poses, louder, unknown_bias);
   };
-  return confirmed_structure(find, [&](LearnedStructure* structure) {
+  LearnedStructure structure = confirmed_structure(find, [&](LearnedStructure* found) {
     // With enough noise a screw passes for anything soft: nothing is tried beside it.
-    if (!is_guess_too_large(*structure))
-      connect_soft_parts(displaced(distinct, structure->signals), structure->actions,
-                         structure->parts, structure->options, &structure->search);
+    if (!is_guess_too_large(*found))
+      connect_soft_parts(displaced(poses, found->signals), found->actions, found->parts,
+                         found->options, &found->search);
   });
+  structure.position_parts = alone;
+  if (!alone.empty()) attach_leaves(distinct, options, &structure);
+  return structure;
 }
 
 LearnResult fit_structure(const LearnedStructure& structure,
                           const std::vector<ActionPoseSample>& samples,
                           const LearnOptions& options) {
-  LearnResult result = fit_tree(structure, without_repetitions(samples), options, false);
+  LearnResult result = fit_tree(
+      structure, with_uniform_parts(without_repetitions(samples), structure.position_parts),
+      options, false);
   result.schema.num_samples = static_cast<int>(samples.size());
   return result;
 }
 
 LearnResult relearn(const LearnedStructure& structure, const std::vector<ActionPoseSample>& samples,
                     const LearnOptions& options) {
-  LearnResult result = fit_tree(structure, without_repetitions(samples), options, true);
+  LearnResult result = fit_tree(
+      structure, with_uniform_parts(without_repetitions(samples), structure.position_parts),
+      options, true);
   result.schema.num_samples = static_cast<int>(samples.size());
   return result;
 }

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <map>
 #include <optional>
 #include <vector>
 
@@ -8,6 +9,7 @@
 #include "common/schema/sample.h"
 #include "processes/structure_learner/noise_estimate.h"
 #include "processes/structure_learner/outlier_attribution.h"
+#include "processes/structure_learner/positions/position_leaves.h"
 #include "processes/structure_learner/structure_search.h"
 
 namespace bodyschema {
@@ -70,11 +72,14 @@ struct LearnedStructure {
   /// Another structure stands where the noise is larger than told: edges that the two do not share
   /// were taken out.
   bool is_contested = false;
+  std::vector<int> position_parts = {};      ///< parts_without_rotation()
+  std::map<int, OpenLeaf> open_leaves = {};  ///< those of them without an edge
 
   /// The edges span all parts seen.
   bool spans() const { return search.models.size() + 1 >= parts.size(); }
 };
-/// Where the residuals refute the noise told, a larger one (see confirmed_structure.h).
+/// Where the residuals refute the noise told, a larger one (see confirmed_structure.h). Parts that
+/// have positions alone are put in when the parts that have poses are (position_leaves.h).
 /// @throws std::invalid_argument as learn().
 LearnedStructure find_structure(const std::vector<Signal>& signals,
                                 const std::vector<ActionPoseSample>& samples,

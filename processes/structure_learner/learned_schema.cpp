@@ -16,14 +16,20 @@ BodySchema start_schema(const std::vector<Signal>& signals,
     schema.last_sample_index = std::max(schema.last_sample_index, sample.sample_index);
   if (!samples.empty()) schema.calibration_id = samples.back().calibration_id;
   schema.parts = seen_parts(samples);
+  schema.position_parts = parts_without_rotation(samples);
   if (!schema.parts.empty()) schema.root = schema.parts.front();
+  const auto first_posed = std::find_if(schema.parts.begin(), schema.parts.end(),
+                                        [&](int part) { return schema.has_rotation(part); });
+  if (first_posed != schema.parts.end()) schema.root = *first_posed;
   if (root) schema.root = *root;
   return schema;
 }
 
 void visit_outwards(const std::vector<std::pair<int, int>>& edges, const BodySchema& schema,
                     const EdgeVisitor& visit) {
-  std::vector<int> starts = schema.parts;
+  std::vector<int> starts = schema.parts;  // a leaf without orientation is no start
+  std::stable_partition(starts.begin(), starts.end(),
+                        [&](int part) { return schema.has_rotation(part); });
   if (schema.has_part(schema.root)) starts.insert(starts.begin(), schema.root);
   std::set<int> reached;
   for (const int start : starts) {
@@ -42,7 +48,7 @@ void visit_outwards(const std::vector<std::pair<int, int>>& edges, const BodySch
 
 std::set<int> connected_to_root(const BodySchema& schema) {
   std::set<int> connected;
-  if (!schema.has_part(schema.root)) return connected;
+  if (!schema.has_part(schema.root) || !schema.has_rotation(schema.root)) return connected;
   const KinematicTree tree(schema.edges, schema.root);
   for (const KinematicTree::Node& node : tree.nodes()) connected.insert(node.part);
   return connected;

@@ -12,7 +12,7 @@
 namespace bodyschema {
 
 /// A schema without edges: what the samples say of signals, parts and root, which is the lowest
-/// part if none is told.
+/// part that has poses if none is told.
 BodySchema start_schema(const std::vector<Signal>& signals,
                         const std::vector<ActionPoseSample>& samples, std::optional<int> root);
 

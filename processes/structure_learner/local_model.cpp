@@ -20,9 +20,10 @@ auto chain_of(const LocalModel& model, const NormalizedActions& actions, int sam
   });
 }
 
-// Whitened residual and its Jacobian: log((Δ̂ exp δ)⁻¹ z) = r − J_l⁻¹(r) δ + O(δ²).
-void whitened_jacobian(const PairHypothesis& h, const Vector6d& residual, ParameterJacobian* J) {
-  const Matrix6d M = -h.whitening * right_jacobian_inverse(-residual);
+// The Jacobian of a prediction becomes that of its whitened residual.
+void whitened_jacobian(const PairHypothesis& h, const Vector6d& error, const Pose& prediction,
+                       ParameterJacobian* J) {
+  const Matrix6d M = h.residual_jacobian(error, prediction);
   *J = M.lazyProduct(*J).eval();
 }
 
@@ -42,9 +43,10 @@ void normal_equations(const Fit& fit, const PairData& pair, const NormalizedActi
     for (int n = 0; n < count; ++n) {
       const FrameFit& frame = fit.frames[first + n];
       const PairHypothesis& h = pair.hypotheses[frame.hypothesis];
-      predict_with_jacobian(fit.model, actions, pair.frames[first + n].sample, &J);
-      whitened_jacobian(h, frame.error, &J);
-      const double root_w = std::sqrt(robust_weight(frame.squared_distance));
+      const Pose prediction =
+          predict_with_jacobian(fit.model, actions, pair.frames[first + n].sample, &J);
+      whitened_jacobian(h, frame.error, prediction, &J);
+      const double root_w = std::sqrt(frame.weight());
       rows.middleRows<6>(6 * n) = root_w * J;
       residuals.segment<6>(6 * n) = root_w * frame.residual;
     }
@@ -74,9 +76,9 @@ void leave_blocks_out(const Fit& fit, const PairData& pair, const NormalizedActi
       ParameterJacobian J;
       const Pose prediction =
           predict_with_jacobian(fit.model, actions, pair.frames[last].sample, &J);
-      whitened_jacobian(h, log(prediction.inverse() * h.z), &J);
+      whitened_jacobian(h, h.error(prediction.inverse()), prediction, &J);
       JR.push_back(J * root);
-      const double w = robust_weight(frame.squared_distance);
+      const double w = frame.weight();
       A.noalias() -= w * JR.back().transpose() * JR.back();
       g.noalias() += w * JR.back().transpose() * frame.residual;
     }
@@ -89,8 +91,8 @@ void leave_blocks_out(const Fit& fit, const PairData& pair, const NormalizedActi
     for (int t = first; t < last; ++t) {
       const ParameterJacobian& J = JR[t - first];
       const Vector6d left_out = fit.frames[t].residual + J * step;
-      const Matrix6d S = Matrix6d::Identity() + robust_weight(fit.frames[t].squared_distance) * J *
-                                                    inverse * J.transpose();
+      const Matrix6d S =
+          Matrix6d::Identity() + fit.frames[t].weight() * J * inverse * J.transpose();
       result->squared_distance.push_back(left_out.dot(S.llt().solve(left_out)));
       result->residual.push_back(
           pair.hypotheses[fit.frames[t].hypothesis].whitening.triangularView<Eigen::Lower>().solve(
@@ -129,6 +131,8 @@ Pose predict_with_jacobian(const LocalModel& model, const NormalizedActions& act
   const Pose X = chain_of(model, actions, sample).predict_by_parameters(jacobian);
   for (int d = 0; d < model.num_joints(); ++d)
     if (model.joints[d].slides) jacobian->col(Layout::turn(d)).setZero();
+  if (model.is_position)
+    jacobian->middleCols<3>(Layout::transform(model.num_joints()) + 3).setZero();
   return X;
 }
 
@@ -158,15 +162,15 @@ FrameFit best_reading(const PairData& pair, int frame, const Pose& prediction) {
   double best_score = std::numeric_limits<double>::infinity();
   for (int n = 0; n < f.num_hypotheses; ++n) {
     const PairHypothesis& h = pair.hypotheses[f.first_hypothesis + n];
-    const Vector6d error = log(inverse * h.z);
-    const Vector6d r = h.whitening * error;
+    const Vector6d error = h.error(inverse);
+    const Vector6d r = h.whitened(error, prediction);
     const double d2 = r.squaredNorm();
     // The readings' shares in a heavy-tailed likelihood: a reading far off by both hypotheses must
     // not be decided by their determinants.
-    const double score = 2 * robust_cost(d2) + h.log_det + h.penalty;
+    const double score = 2 * robust_cost(d2, h.num_residuals) + h.log_det + h.penalty;
     if (score < best_score) {
       best_score = score;
-      best = {f.first_hypothesis + n, error, r, d2};
+      best = {f.first_hypothesis + n, error, r, d2, h.num_residuals};
     }
   }
   return best;
@@ -178,7 +182,7 @@ Fit evaluate(const LocalModel& model, const PairData& pair, const NormalizedActi
   fit.frames.reserve(pair.size());
   for (int t = 0; t < pair.size(); ++t) {
     fit.frames.push_back(best_reading(pair, t, model.predict(actions, pair.frames[t].sample)));
-    fit.cost += robust_cost(fit.frames.back().squared_distance);
+    fit.cost += fit.frames.back().cost();
   }
   return fit;
 }
@@ -239,11 +243,11 @@ LeaveOneOut leave_one_out(const Fit& fit, const PairData& pair, const Normalized
   for (int t = 0; t < pair.size(); ++t) {
     const FrameFit& frame = fit.frames[t];
     const PairHypothesis& h = pair.hypotheses[frame.hypothesis];
-    predict_with_jacobian(fit.model, actions, pair.frames[t].sample, &J);
-    whitened_jacobian(h, frame.error, &J);
+    const Pose prediction = predict_with_jacobian(fit.model, actions, pair.frames[t].sample, &J);
+    whitened_jacobian(h, frame.error, prediction, &J);
     const ParameterJacobian JR = J.lazyProduct(root);
-    const Matrix6d I_minus_H = Matrix6d::Identity() - robust_weight(frame.squared_distance) *
-                                                          JR.lazyProduct(JR.transpose()).eval();
+    const Matrix6d I_minus_H =
+        Matrix6d::Identity() - frame.weight() * JR.lazyProduct(JR.transpose()).eval();
     // A frame that alone decides a parameter has eigenvalue 0 here: it cannot be predicted from the
     // others, so its residual of 0 is no evidence. The floor keeps that finite; away from it a
     // Cholesky factor is enough.

@@ -27,6 +27,7 @@ struct LocalModel {
   };
   Pose first = Pose::Identity();  ///< A_0
   std::vector<Joint> joints;
+  bool is_position = false;  ///< no data tell how the end is turned: it stays as it is in fits
 
   int num_joints() const { return static_cast<int>(joints.size()); }
   int num_parameters() const { return ScrewChainLayout::size(num_joints()); }
@@ -61,11 +62,15 @@ struct FrameFit {
   Vector6d error = Vector6d::Zero();     ///< log(Δ̂⁻¹ z): (translation [m], rotation [rad])
   Vector6d residual = Vector6d::Zero();  ///< whitened log(Δ̂⁻¹ z)
   double squared_distance = 0;           ///< |residual|²
+  int num_residuals = 6;                 ///< 3 of a position alone, whose others are 0
+
+  double weight() const { return robust_weight(squared_distance, num_residuals); }
+  double cost() const { return robust_cost(squared_distance, num_residuals); }
 };
 
 struct Fit {
   LocalModel model;
-  double cost = 0;  ///< Σ (ν + 6)/2 · log(1 + d²/ν)
+  double cost = 0;  ///< Σ (ν + n)/2 · log(1 + d²/ν)
   std::vector<FrameFit> frames;
 };
 
@@ -84,13 +89,14 @@ Fit fit_local_model(const LocalModel& start, const PairData& pair, const Normali
 
 /// Leave-one-out diagnostics of a fit in closed form.
 struct LeaveOneOut {
-  /// d²_t = rᵀ(I − H_tt)⁻¹ r, χ²₆ a frame under a true model.
+  /// d²_t = rᵀ(I − H_tt)⁻¹ r, χ²₆ a frame under a true model (χ²₃ of positions alone).
   std::vector<double> squared_distance;
   /// log(Δ̂₋ₜ⁻¹ z) predicted without frame t, not whitened: (translation [m], rotation [rad]).
   std::vector<Vector6d> residual;
   /// Pseudo-inverse (JᵀWJ)⁺ along the gauge, over normalised parameters.
   ParameterMatrix parameter_covariance;
-  /// Rank of JᵀWJ: 6 + 6k for revolute and helical joints, less for prismatic ones.
+  /// Rank of JᵀWJ: 6 + 6k for revolute and helical joints, less for prismatic ones and for
+  /// positions alone.
   int rank = 0;
 };
 LeaveOneOut leave_one_out(const Fit& fit, const PairData& pair, const NormalizedActions& actions);

@@ -92,24 +92,31 @@ class OutlierAttribution {
     const ActionPoseSample& s = samples_[sample];
     const PartObservation* o = s.find(part);
     int bad = 0, all = 0;
-    const auto judge = [&](const Vector6d& residual, const Matrix6d& covariance) {
+    const auto judge = [&](const Vector6d& residual, const Matrix6d& covariance,
+                           int num_residuals) {
       ++all;
       const double d2 = squared_mahalanobis(residual, covariance);
-      if (!(d2 < kOutlierThreshold)) ++bad;
+      if (!(d2 < outlier_threshold(num_residuals))) ++bad;
     };
     for (const PartObservation& other : s.parts) {
-      if (other.part == part || culprits.count(other.part)) continue;
+      if (other.part == part || culprits.count(other.part) || !other.has_rotation) continue;
       const auto& path = path_between(other.part, part);
       if (!path) continue;
-      const Pose z = other.X_CB.inverse() * o->X_CB;
-      judge(
-          log(path->predict(s.action).inverse() * z),
-          path->covariance(s.action, Variance::kFirstOrder) +
-              relative_covariance(z, measurement_.covariance(other), measurement_.covariance(*o)));
+      const Pose X = path->predict(s.action);
+      const auto seen = measurement_.reading(*o, other.X_CB * X);
+      const Pose z = other.X_CB.inverse() * seen.X_CB;
+      judge(log(X.inverse() * z),
+            path->covariance(s.action, Variance::kFirstOrder) +
+                relative_covariance(z, measurement_.covariance(other), seen.covariance),
+            seen.num_residuals);
     }
-    if (const auto& path = path_between(schema_.root, part))
-      judge(log((schema_.X_CR * path->predict(s.action)).inverse() * o->X_CB),
-            path->covariance(s.action, Variance::kFirstOrder) + measurement_.covariance(*o));
+    if (const auto& path = path_between(schema_.root, part)) {
+      const Pose X = schema_.X_CR * path->predict(s.action);
+      const auto seen = measurement_.reading(*o, X);
+      judge(log(X.inverse() * seen.X_CB),
+            path->covariance(s.action, Variance::kFirstOrder) + seen.covariance,
+            seen.num_residuals);
+    }
     return all > 0 ? static_cast<double>(bad) / all : 0;
   }
 

@@ -20,6 +20,18 @@ struct MarkerReading {
   double penalty;
 };
 
+// Covariance of R_iᵀ (p_j − p_i) in the frame of i, of a pose i and a position j in camera axes.
+Matrix6d position_covariance(const Pose& X_Ci, const Eigen::Vector3d& p_ij, const Matrix6d& of_pose,
+                             const Matrix6d& of_position) {
+  Eigen::Matrix<double, 3, 6> J;
+  J << -Eigen::Matrix3d::Identity(), skew(p_ij);
+  Matrix6d result = Matrix6d::Zero();
+  result.topLeftCorner<3, 3>() =
+      J * of_pose * J.transpose() +
+      X_Ci.linear().transpose() * of_position.topLeftCorner<3, 3>() * X_Ci.linear();
+  return result;
+}
+
 int readings_of(const PartObservation& observation, const MeasurementModel& measurement,
                 MarkerReading* readings) {
   const Matrix6d covariance = measurement.noise_covariance(observation);
@@ -56,15 +68,20 @@ class FrameWriter {
     if (frame_.num_hypotheses > 0) pair_.frames.push_back(frame_);
   }
 
-  void add(const Pose& z, const Matrix6d& noise, const Matrix6d& systematic, double penalty) {
-    const Eigen::LLT<Matrix6d> llt(noise + systematic);
+  void add(const Pose& z, const Matrix6d& noise, const Matrix6d& systematic, double penalty,
+           bool has_rotation) {
+    Matrix6d sum = noise + systematic;
+    if (!has_rotation) sum.bottomRightCorner<3, 3>().setIdentity();
+    const Eigen::LLT<Matrix6d> llt(sum);
     // A covariance that is not positive definite says nothing usable: leave the reading out.
     if (llt.info() != Eigen::Success || !(llt.matrixLLT().diagonal().minCoeff() > 0)) return;
     PairHypothesis h;
     h.z = z;
+    h.num_residuals = has_rotation ? 6 : 3;
     h.penalty = penalty;
     h.whitening = llt.matrixL().solve(Matrix6d::Identity());
-    h.log_det = 6 * std::log(2 * M_PI) + 2 * llt.matrixLLT().diagonal().array().log().sum();
+    h.log_det =
+        h.num_residuals * std::log(2 * M_PI) + 2 * llt.matrixLLT().diagonal().array().log().sum();
     h.systematic = (h.whitening * systematic * h.whitening.transpose()).trace();
     pair_.hypotheses.push_back(h);
   }
@@ -75,6 +92,28 @@ class FrameWriter {
 };
 
 }  // namespace
+
+Vector6d PairHypothesis::error(const Pose& inverse) const {
+  if (num_residuals == 6) return log(inverse * z);
+  Vector6d error = Vector6d::Zero();
+  error.head<3>() = inverse * z.translation();
+  return error;
+}
+
+Vector6d PairHypothesis::whitened(const Vector6d& error, const Pose& prediction) const {
+  if (num_residuals == 6) return whitening * error;
+  Vector6d result = Vector6d::Zero();
+  result.head<3>() = whitening.topLeftCorner<3, 3>() * (prediction.linear() * error.head<3>());
+  return result;
+}
+
+// log((Δ̂ exp δ)⁻¹ z) = r − J_l⁻¹(r) δ + O(δ²); Δ̂ exp δ has its origin at Δ̂ δ_translation.
+Matrix6d PairHypothesis::residual_jacobian(const Vector6d& error, const Pose& prediction) const {
+  if (num_residuals == 6) return -whitening * right_jacobian_inverse(-error);
+  Matrix6d result = Matrix6d::Zero();
+  result.topLeftCorner<3, 3>() = -whitening.topLeftCorner<3, 3>() * prediction.linear();
+  return result;
+}
 
 NormalizedActions::NormalizedActions(const std::vector<ActionPoseSample>& samples, int num_signals)
     : values_(num_signals, samples.size()),
@@ -111,6 +150,28 @@ std::vector<int> seen_parts(const std::vector<ActionPoseSample>& samples) {
   return {parts.begin(), parts.end()};
 }
 
+std::vector<int> parts_without_rotation(const std::vector<ActionPoseSample>& samples) {
+  std::map<int, int> majority;  // positions alone over poses
+  for (const ActionPoseSample& sample : samples)
+    for (const PartObservation& o : sample.parts) majority[o.part] += o.has_rotation ? -1 : 1;
+  std::vector<int> parts;
+  for (const auto& [part, more] : majority)
+    if (more > 0) parts.push_back(part);
+  return parts;
+}
+
+std::vector<ActionPoseSample> with_uniform_parts(std::vector<ActionPoseSample> samples,
+                                                 const std::vector<int>& alone) {
+  const auto is_alone = [&](int part) {
+    return std::binary_search(alone.begin(), alone.end(), part);
+  };
+  for (ActionPoseSample& sample : samples)
+    for (auto* observations : {&sample.parts, &sample.contradictions})
+      std::erase_if(*observations,
+                    [&](const PartObservation& o) { return o.has_rotation == is_alone(o.part); });
+  return samples;
+}
+
 int count_common(const std::vector<ActionPoseSample>& samples, int part_i, int part_j) {
   int count = 0;
   for (const ActionPoseSample& sample : samples)
@@ -126,15 +187,27 @@ PairData make_pair_data(const std::vector<ActionPoseSample>& samples, int part_i
   const Matrix6d systematic = measurement.systematic_covariance();
   MarkerReading readings_i[2], readings_j[2];
   for_thinned(samples, max_frames, {part_i, part_j}, [&](int sample) {
-    const int num_i = readings_of(*samples[sample].find(part_i), measurement, readings_i);
-    const int num_j = readings_of(*samples[sample].find(part_j), measurement, readings_j);
+    const PartObservation& seen_i = *samples[sample].find(part_i);
+    const PartObservation& seen_j = *samples[sample].find(part_j);
+    if (!seen_i.has_rotation) return;
+    const int num_i = readings_of(seen_i, measurement, readings_i);
+    const int num_j = readings_of(seen_j, measurement, readings_j);
     FrameWriter frame(sample, &pair);
     for (int a = 0; a < num_i; ++a) {
       for (int b = 0; b < num_j; ++b) {
-        const Pose z = readings_i[a].X_CB.inverse() * readings_j[b].X_CB;
+        Pose z = readings_i[a].X_CB.inverse() * readings_j[b].X_CB;
+        const double penalty = readings_i[a].penalty + readings_j[b].penalty;
+        if (!seen_j.has_rotation) {
+          z.linear().setIdentity();
+          const auto covariance = [&](const Matrix6d& of_i, const Matrix6d& of_j) {
+            return position_covariance(readings_i[a].X_CB, z.translation(), of_i, of_j);
+          };
+          frame.add(z, covariance(readings_i[a].covariance, readings_j[b].covariance),
+                    covariance(systematic, systematic), penalty, false);
+          continue;
+        }
         frame.add(z, relative_covariance(z, readings_i[a].covariance, readings_j[b].covariance),
-                  relative_covariance(z, systematic, systematic),
-                  readings_i[a].penalty + readings_j[b].penalty);
+                  relative_covariance(z, systematic, systematic), penalty, true);
       }
     }
   });
@@ -155,7 +228,9 @@ PairData make_part_data(const std::vector<ActionPoseSample>& samples, int part,
     if (is_new) pair.tag_sets.push_back(seen.tags);
     FrameWriter frame(sample, &pair, tags->second);
     for (int a = 0; a < num; ++a)
-      frame.add(readings[a].X_CB, readings[a].covariance, systematic, readings[a].penalty);
+      frame.add(readings[a].X_CB, readings[a].covariance,
+                seen.has_rotation ? systematic : without_rotation(systematic), readings[a].penalty,
+                seen.has_rotation);
   });
   return pair;
 }

@@ -36,8 +36,13 @@ class NormalizedActions {
 
 /// One reading of z_ij = y_i⁻¹ y_j.
 struct PairHypothesis {
+  /// Of a position alone without rotation.
   Pose z = Pose::Identity();
-  /// L⁻¹ of Σ_z = L Lᵀ: whitens a residual log(Δ̂⁻¹ z).
+  /// 6 of a pose, 3 of a position alone.
+  int num_residuals = 6;
+  /// L⁻¹ of Σ_z = L Lᵀ: whitens a residual log(Δ̂⁻¹ z). Of a position alone the upper left block
+  /// whitens z − Δ̂ in the frame of i, where Σ_z is known; the rest is the identity, whose residuals
+  /// are 0 under every prediction.
   Matrix6d whitening = Matrix6d::Identity();
   /// log |2πΣ_z|
   double log_det = 0;
@@ -45,6 +50,14 @@ struct PairHypothesis {
   double systematic = 0;
   /// −2 log of the prior odds against this reading: 0 for the first hypotheses of both markers.
   double penalty = 0;
+
+  /// log(Δ̂⁻¹ z) for `inverse` = Δ̂⁻¹: (translation [m], rotation [rad]); a position alone agrees
+  /// with every rotation.
+  Vector6d error(const Pose& inverse) const;
+  /// The whitened residual of that error.
+  Vector6d whitened(const Vector6d& error, const Pose& prediction) const;
+  /// ∂(whitened residual)/∂(right perturbation of the prediction).
+  Matrix6d residual_jacobian(const Vector6d& error, const Pose& prediction) const;
 };
 
 /// One instant at which both parts were seen. Planar markers may be read in two ways, so there are
@@ -66,6 +79,9 @@ struct PairData {
   std::vector<std::vector<int>> tag_sets;
 
   int size() const { return static_cast<int>(frames.size()); }
+  /// Of a frame; where part j has poses at some instants and positions at others those of the first
+  /// are all that is used (see with_uniform_parts()).
+  int num_residuals() const { return hypotheses.empty() ? 6 : hypotheses.front().num_residuals; }
   /// The reading of both primary hypotheses.
   const PairHypothesis& primary(int frame) const {
     return hypotheses[frames[frame].first_hypothesis];
@@ -77,6 +93,13 @@ std::vector<int> seen_parts(const std::vector<ActionPoseSample>& samples);
 
 /// Number of instants at which both parts were seen.
 int count_common(const std::vector<ActionPoseSample>& samples, int part_i, int part_j);
+
+/// Parts that have positions alone at most instants, ascending.
+std::vector<int> parts_without_rotation(const std::vector<ActionPoseSample>& samples);
+/// Each part's observations of one kind: of the parts `alone` (parts_without_rotation(), ascending)
+/// the positions without orientation, of all others the poses.
+std::vector<ActionPoseSample> with_uniform_parts(std::vector<ActionPoseSample> samples,
+                                                 const std::vector<int>& alone);
 
 /// The pair's data, thinned evenly to at most `max_frames` instants.
 PairData make_pair_data(const std::vector<ActionPoseSample>& samples, int part_i, int part_j,

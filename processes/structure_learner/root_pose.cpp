@@ -29,7 +29,7 @@ void estimate_root_pose(const std::vector<ActionPoseSample>& samples,
   std::vector<Reading> readings;
   for (const auto& sample : samples) {
     const PartObservation* o = sample.find(schema->root);
-    if (!o) continue;
+    if (!o || !o->has_rotation) continue;
     readings.push_back({o->X_CB, measurement.covariance(*o).inverse(), &o->tags});
   }
   if (readings.empty()) return;

@@ -95,9 +95,9 @@ Start judged_start(const LocalModel& model, const PairData& pair, const Normaliz
   std::vector<double> squared(n);
   for (int k = 0; k < n; ++k) {
     const int t = static_cast<int>(static_cast<long>(k) * pair.size() / n);
-    squared[k] =
-        best_reading(pair, t, model.predict(actions, pair.frames[t].sample)).squared_distance;
-    start.score += robust_cost(squared[k]) / n;
+    const FrameFit fit = best_reading(pair, t, model.predict(actions, pair.frames[t].sample));
+    squared[k] = fit.squared_distance;
+    start.score += fit.cost() / n;
   }
   start.median = upper_median(std::move(squared));
   return start;

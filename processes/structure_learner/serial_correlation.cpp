@@ -8,8 +8,8 @@ namespace bodyschema {
 
 void SerialCorrelation::add(const FrameFit& before, const FrameFit& now) {
   // With the influence that they have on a robust fit.
-  const Vector6d x = robust_weight(before.squared_distance) * before.residual;
-  const Vector6d y = robust_weight(now.squared_distance) * now.residual;
+  const Vector6d x = before.weight() * before.residual;
+  const Vector6d y = now.weight() * now.residual;
   products_ += x.cwiseProduct(y);
   squares_ += 0.5 * (x.cwiseAbs2() + y.cwiseAbs2());
   ++count_;
@@ -18,8 +18,8 @@ void SerialCorrelation::add(const FrameFit& before, const FrameFit& now) {
 double SerialCorrelation::coefficient(int num_samples) const {
   constexpr int kFewest = 20;
   constexpr double kLargest = 0.98;
-  if (count_ < kFewest || !(squares_.minCoeff() > 0)) return 0;
-  const double seen = products_.cwiseQuotient(squares_).maxCoeff();
+  if (count_ < kFewest || !(squares_.head<3>().minCoeff() > 0)) return 0;
+  const double seen = products_.cwiseQuotient(squares_.cwiseMax(1e-300)).maxCoeff();
   if (seen < 2.5 / std::sqrt(count_)) return 0;
   // Kendall 1954: a series about its own mean.
   return std::min(seen + (1 + 4 * seen) / num_samples, kLargest);

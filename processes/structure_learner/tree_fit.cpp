@@ -54,7 +54,7 @@ double TreeFit::evaluate(const std::vector<TreeNode>& nodes, const std::vector<P
       if (frame < 0) continue;
       FrameFit& fit = (*fits)[at(t, n)];
       fit = best_reading(data_[n], frame, X);
-      cost += robust_cost(fit.squared_distance);
+      cost += fit.cost();
     }
   }
   return cost;
@@ -73,7 +73,7 @@ void TreeFit::start_roots() {
     double cost = 0;
     for (int k = 0; k < n; ++k)
       if (const int frame = frame_index_[at(t, k)]; frame >= 0)
-        cost += robust_cost(best_reading(data_[k], frame, root * X_RB[at(t, k)]).squared_distance);
+        cost += best_reading(data_[k], frame, root * X_RB[at(t, k)]).cost();
     return cost;
   };
   if (root_rests_) {
@@ -84,8 +84,7 @@ void TreeFit::start_roots() {
     for (int c = 0; c < count; ++c) {
       const Pose X = data_[0].primary(c * data_[0].size() / count).z;
       double cost = 0;
-      for (int t = 0; t < data_[0].size(); ++t)
-        cost += robust_cost(best_reading(data_[0], t, X).squared_distance);
+      for (int t = 0; t < data_[0].size(); ++t) cost += best_reading(data_[0], t, X).cost();
       if (cost < best) {
         best = cost;
         roots_[0] = X;
@@ -129,15 +128,15 @@ void TreeFit::gather(int t, Normal* normal) const {
       const FrameFit& fit = fits_[index];
       const PairHypothesis& h = data_[k].hypotheses[fit.hypothesis];
       const Pose X_BC = poses_[index].inverse();
-      const Matrix6d A = -(h.whitening * right_jacobian_inverse(-fit.error)) * adjoint(X_BC);
-      const double w = robust_weight(fit.squared_distance);
+      const Matrix6d A = h.residual_jacobian(fit.error, poses_[index]) * adjoint(X_BC);
+      const double w = fit.weight();
       normal->own_I[index].noalias() = w * A.transpose() * A;
       normal->own_gradient[index].noalias() = w * A.transpose() * fit.residual;
       normal->I[index] += normal->own_I[index];
       normal->gradient[index] += normal->own_gradient[index];
       normal->weighted += w * w * fit.squared_distance;
-      normal->weights += w;
-      ++normal->num_readings;
+      normal->weights += w * fit.num_residuals;
+      normal->num_residuals += fit.num_residuals;
     }
     if (k == 0) {
       normal->S[index] = adjoint(poses_[index]);
@@ -202,9 +201,9 @@ TreeFit::Normal TreeFit::normal_equations() const {
     add_frame(t, &result);
   }
   result.H = Eigen::MatrixXd(result.H.selfadjointView<Eigen::Lower>());
-  const int count = result.num_readings;
-  const double dof = std::max(6.0 * count - size - (root_rests_ ? 0 : 6 * num_frames()), 1.0);
-  if (result.weights > 0) result.scale = result.weighted / result.weights / 6 * (6.0 * count / dof);
+  const double count = result.num_residuals;
+  const double dof = std::max(count - size - (root_rests_ ? 0 : 6 * num_frames()), 1.0);
+  if (result.weights > 0) result.scale = result.weighted / result.weights * (count / dof);
   return result;
 }
 

@@ -37,7 +37,7 @@ class TreeFit {
   const std::vector<TreeNode>& nodes() const { return nodes_; }
   /// The pose of a root that rests in the camera's frame.
   const Pose& root_pose() const { return roots_.front(); }
-  double cost() const { return cost_; }  ///< Σ (ν + 6)/2 · log(1 + d²/ν)
+  double cost() const { return cost_; }  ///< Σ (ν + n)/2 · log(1 + d²/ν)
   double log_likelihood() const;         ///< −cost − ½ Σ log|2πΣ|
   int num_frames() const { return static_cast<int>(samples_.size()); }
 

@@ -69,6 +69,8 @@ Eigen::MatrixXd TreeFit::with_fixed_gauge(const Normal& normal) const {
         const Vector6d after = -adjoint(nodes_[k].model.joints[d].X_after.inverse()) * before;
         Eigen::Matrix<double, 14, 1> gauge;  // of the two transforms beside the joint
         gauge << before, 0, 0, after;
+        if (d + 1 == nodes_[k].model.num_joints() && nodes_[k].model.is_position)
+          gauge.tail<3>().setZero();
         const auto at = normal.offset[k] + ScrewChainLayout::transform(d);
         const auto diagonal = normal.H.diagonal().segment<14>(at);
         const double information =
@@ -98,11 +100,11 @@ Eigen::MatrixXd TreeFit::score_covariance(const Normal& normal, const Measuremen
       const int frame = frame_index_[at(t, k)];
       if (frame < 0) continue;
       const FrameFit& fit = fits_[at(t, k)];
-      const Matrix6d& whitening = data_[k].hypotheses[fit.hypothesis].whitening;
+      const Matrix6d whitening = -data_[k].hypotheses[fit.hypothesis].residual_jacobian(
+          Vector6d::Zero(), poses_[at(t, k)]);
       // The whitened error of the marker as a twist in the camera's frame, weighed.
-      const Matrix6d twist = robust_weight(fit.squared_distance) *
-                             adjoint(poses_[at(t, k)].inverse()).transpose() *
-                             whitening.transpose();
+      const Matrix6d twist =
+          fit.weight() * adjoint(poses_[at(t, k)].inverse()).transpose() * whitening.transpose();
       const auto add = [&](const Eigen::MatrixXd& effect, Eigen::MatrixXd* sum) {
         if (sum->size() == 0) *sum = Eigen::MatrixXd::Zero(size, effect.cols());
         for (int e = k; e >= 0; e = nodes_[e].parent) {

@@ -21,8 +21,8 @@ struct TreeFit::Normal {
   std::vector<Matrix6d> own_I;  // of the node's own marker
   std::vector<Vector6d> own_gradient;
   std::vector<Matrix6d> inverse_total;  // a frame: I of the root, inverted
-  double weighted = 0, weights = 0;     // sums of w² d² and of w over the markers
-  int num_readings = 0;
+  double weighted = 0, weights = 0;     // sums of w² d² over the markers, of w over the residuals
+  int num_residuals = 0;
   double scale = 1;  // variance of the weighted residuals over what the weights say
 
   double noise_scale() const { return std::max(scale, 0.25); }

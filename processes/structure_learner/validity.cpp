@@ -13,7 +13,7 @@ namespace {
 constexpr double kClip = 20;
 // Below this number of frames an excess of outliers may be bad luck.
 constexpr int kFewFrames = 60;
-// Outliers beyond this multiple of kOutlierThreshold are wild readings: 16 standard deviations.
+// Outliers beyond this multiple of outlier_threshold() are wild readings: 16 standard deviations.
 // Flips are by twice the tilt of a tag, of which one in twenty is nearer.
 constexpr double kFar = 10;
 // How much noise that lasts explains is known to such a factor at best (chosen).
@@ -35,19 +35,27 @@ double explained_sum(const Eigen::MatrixXd& F, const Eigen::Matrix<double, 6, Ei
   return (projected * gram.ldlt().solve(projected.transpose())).trace();
 }
 
+// Columns of mean 0 and norm 1, but those that do not vary.
+void standardise(Eigen::MatrixXd* F) {
+  F->rowwise() -= F->colwise().mean().eval();
+  for (auto column : F->colwise())
+    if (const double norm = column.norm(); norm > 0) column /= norm;
+}
+
 // Outliers, mean distances and score.
 void tally(const Fit& fit, const LeaveOneOut& loo, const PairData& pair, Validity* result) {
   const int n = pair.size();
   double inlier_sum = 0;
+  const double outlying = outlier_threshold(pair.num_residuals());
   int run = 0;
   for (int t = 0; t < n; ++t) {
     const double d2 = loo.squared_distance[t];
     const double log_det = pair.hypotheses[fit.frames[t].hypothesis].log_det;
-    result->mean_capped += std::min(d2, 2 * kOutlierThreshold) / n;
-    result->score -= 0.5 * (std::min(d2, 2 * kOutlierThreshold) + log_det) / n;
-    if (d2 > kOutlierThreshold) {
+    result->mean_capped += std::min(d2, 2 * outlying) / n;
+    result->score -= 0.5 * (std::min(d2, 2 * outlying) + log_det) / n;
+    if (d2 > outlying) {
       ++result->num_outliers;
-      result->num_near += d2 < kFar * kOutlierThreshold;
+      result->num_near += d2 < kFar * outlying;
       result->longest_run = std::max(result->longest_run, ++run);
     } else {
       run = 0;
@@ -93,15 +101,22 @@ double explained_excess(const Fit& fit, const PairData& pair, const NormalizedAc
   std::vector<int> samples;
   for (const PairFrame& frame : pair.frames) samples.push_back(frame.sample);
   std::vector<double> q_g(n);
-  const bool tensor = k == 1 && n >= 12;
-  const int num_features = tensor ? 3 : 1;
+  const int num_residuals = pair.num_residuals();
+  const bool of_positions = num_residuals == 3;
+  const bool tensor = !of_positions && k == 1 && n >= 12;
+  const int num_features = of_positions ? 5 : tensor ? 3 : 1;
   Eigen::MatrixXd F(n, num_features);
-  const double noise = chi_square_quantile(6 * num_features, (options.lenient ? 1e-6 : 1.35e-3) /
-                                                                 std::max(others, 1)) *
-                       std::max(1.0, mean_inlier / 6) / share;
+  const double noise =
+      chi_square_quantile(num_residuals * num_features,
+                          (options.lenient ? 1e-6 : 1.35e-3) / std::max(others, 1)) *
+      std::max(1.0, mean_inlier / num_residuals) / share;
   // A motion far below the noise of every single frame is no joint but a bias; and all of the
   // model error may go along with one signal: its variance is ⅓ that of the ends of its range.
   const double no_joint = 0.05 * n + bias / 3;
+  Eigen::Vector3d middle = Eigen::Vector3d::Zero();
+  if (of_positions)
+    for (const PairFrame& frame : pair.frames)
+      middle += fit.model.predict(actions, frame.sample).translation() / n;
   double largest = 0;
   for (const int g : actions.moving()) {
     if (fit.model.uses(g)) continue;
@@ -110,6 +125,11 @@ double explained_excess(const Fit& fit, const PairData& pair, const NormalizedAc
     for (int t = 0; t < n; ++t) {
       const int sample = pair.frames[t].sample;
       F(t, 0) = actions(sample, g) - mean;
+      if (of_positions) {
+        F.row(t).segment<3>(1) =
+            F(t, 0) * (fit.model.predict(actions, sample).translation() - middle).transpose();
+        F(t, 4) = F(t, 0) * F(t, 0);
+      }
       if (tensor) {
         const double q = actions(sample, fit.model.joints[0].signal);
         const double theta = std::max(std::abs(fit.model.joints[0].turn), 0.1) * q;
@@ -118,6 +138,7 @@ double explained_excess(const Fit& fit, const PairData& pair, const NormalizedAc
       }
     }
     if (!(F.col(0).squaredNorm() > 0)) continue;
+    if (of_positions) standardise(&F);
     Eigen::VectorXd::Map(q_g.data(), n) = F.col(0);
     const double threshold = noise * variance_inflation(q_g, samples, correlation) + no_joint;
     largest = std::max(largest, explained_sum(F, r) / threshold);
@@ -125,7 +146,7 @@ double explained_excess(const Fit& fit, const PairData& pair, const NormalizedAc
   return largest;
 }
 
-// log λ, averaged over the six axes: spread of the readings about their own robust centre against
+// log λ, averaged over the axes: spread of the readings about their own robust centre against
 // their noise.
 double log_spread(const Fit& fit, const PairData& pair) {
   std::vector<double> spread;
@@ -133,7 +154,7 @@ double log_spread(const Fit& fit, const PairData& pair) {
   const Pose centre = pair.hypotheses[fit.frames[n / 2].hypothesis].z;
   for (int t = 0; t < n; ++t) {
     const PairHypothesis& h = pair.hypotheses[fit.frames[t].hypothesis];
-    spread.push_back((h.whitening * log(centre.inverse() * h.z)).squaredNorm() / 6);
+    spread.push_back(h.whitened(h.error(centre.inverse()), centre).squaredNorm() / h.num_residuals);
   }
   return 0.5 * std::log(std::max(upper_median(std::move(spread)) / 2, 1.0));
 }
@@ -146,8 +167,10 @@ bool are_scattered(const Validity& validity, int num_frames) {
 
 }  // namespace
 
-double largest_inlier_mean(double num_inliers, double sigmas) {
-  static const ChiSquareMoments inlier = chi_square_below(kOutlierThreshold, 6);
+double largest_inlier_mean(double num_inliers, double sigmas, int num_residuals) {
+  static const ChiSquareMoments of_pose = chi_square_below(outlier_threshold(6), 6),
+                                of_position = chi_square_below(outlier_threshold(3), 3);
+  const ChiSquareMoments& inlier = num_residuals == 3 ? of_position : of_pose;
   // A fifth of slack: the noise is known to some ten per cent at best.
   return 1.2 * inlier.mean + sigmas * std::sqrt(inlier.variance / num_inliers);
 }
@@ -188,7 +211,8 @@ Validity check_validity(const Fit& fit, const LeaveOneOut& loo, const PairData& 
       num_independent < kFewFrames && (are_allowed ? result.num_near : result.num_outliers) >
                                           binomial_quantile(num_independent, rate, 0.8) / share;
   const double independent_inliers = share * inliers;
-  const double dof = 6 * independent_inliers - p;
+  const int num_residuals = pair.num_residuals();
+  const double dof = num_residuals * independent_inliers - p;
   if (dof < 6) {
     // So few frames fit that nothing is left over to test with.
     result.verdict = suspicious ? Verdict::kRefuted : Verdict::kNotEnoughData;
@@ -197,8 +221,10 @@ Validity check_validity(const Fit& fit, const LeaveOneOut& loo, const PairData& 
   const double correlation = serial_correlation(fit, pair, actions);
   // Squares of noise that lasts: the sum of ρ^2k over all lags either way.
   const double lasts = (1 + correlation * correlation) / (1 - correlation * correlation);
-  const double max_mean = largest_inlier_mean(dof / 6 / lasts, options.lenient ? 5 : 3);
-  if (result.mean_inlier > std::min(max_mean, 0.75 * kOutlierThreshold)) return result;
+  const double max_mean =
+      largest_inlier_mean(dof / num_residuals / lasts, options.lenient ? 5 : 3, num_residuals);
+  const double largest_mean = std::min(max_mean, 0.75 * outlier_threshold(num_residuals));
+  if (result.mean_inlier > largest_mean) return result;
   result.has_far_outliers = suspicious && are_far;
   if (suspicious && (n >= kFewFrames || 2 * result.num_outliers > n)) {
     // So many wild readings say nothing against it, nor for it. (By chance a wrong model has fewer

@@ -24,7 +24,7 @@ struct ValidityOptions {
 
 struct Validity {
   Verdict verdict = Verdict::kRefuted;
-  int num_outliers = 0;  ///< frames beyond kOutlierThreshold, leave-one-out
+  int num_outliers = 0;  ///< frames beyond outlier_threshold(), leave-one-out
   int num_near = 0;      ///< of these, those within ten times that
   int longest_run = 0;   ///< of outliers one after the other
   /// Its outliers are too many, but would not be if ValidityOptions::allows_far_outliers.
@@ -35,7 +35,7 @@ struct Validity {
   /// Undecided because noise that lasts from sample to sample may have made what speaks against it.
   bool is_noise_lasting = false;
   double mean_capped = 0;  ///< mean of min(d², 2c): comparable between pairs
-  double mean_inlier = 0;  ///< mean leave-one-out d² of the others; 6 under a true model
+  double mean_inlier = 0;  ///< mean leave-one-out d² of the others; 6 (3) under a true model
   double explained = 0;    ///< worst excess of V2: explained sum of squares over its threshold
   double score = 0;        ///< mean of −½[min(d², 2c) + log|2πΣ_z|] a frame
 };
@@ -49,7 +49,8 @@ struct Validity {
 ///
 /// V2, nothing left to explain: for every moving signal g outside Q the whitened residuals are
 /// regressed on q_g times a basis over Q; the explained sum of squares must stay within χ². This
-/// finds a joint of a few degrees that V1 misses.
+/// finds a joint of a few degrees that V1 misses. For positions alone also on q_g times the
+/// predicted position and on q_g², for a joint nearer to the root moves them so.
 ///
 /// At few samples both tests have little power. So the fit must also be improbable by chance: with
 /// ν degrees of freedom left and data that spread λ times wider than the noise, a wrong model fits
@@ -62,6 +63,6 @@ Validity check_validity(const Fit& fit, const LeaveOneOut& loo, const PairData& 
 double pair_outlier_rate(const ValidityOptions& options);
 /// Bound on the mean d² of so many independent inliers of a true model, `sigmas` of its sampling
 /// errors above what is expected.
-double largest_inlier_mean(double num_inliers, double sigmas);
+double largest_inlier_mean(double num_inliers, double sigmas, int num_residuals = 6);
 
 }  // namespace bodyschema

@@ -273,6 +273,7 @@ body_schema_t example_body_schema() {
   message.num_samples_seen = 40;
   message.is_complete = 0;
   fill(message.num_parts, message.part_ids, {1, 2, 4, 5, 6, 9});
+  fill(message.num_position_parts, message.position_parts, {5, 9});
   message.root_part = 2;
   message.X_CR = pose(2);
   covariance(message.X_CR_covariance);
@@ -322,6 +323,7 @@ body_schema_t large_schema(int num_parts) {
   message.is_complete = 1;
   message.root_part = 0;
   fill(message.num_parts, message.part_ids, parts);
+  fill(message.num_position_parts, message.position_parts, {});
   fill(message.num_edges, message.edges, edges);
   fill(message.num_unconnected, message.unconnected, {});
   return message;

@@ -206,11 +206,11 @@ TEST_F(BodyschemaProgramTest, LearnPrintsTheKeysThatAreDocumented) {
   EXPECT_EQ(outcome.err, "");
   const Json json = outcome.json();
   for (const char* key :
-       {"complete", "samples", "parts", "root", "edges", "unconnected", "unused_signals",
-        "undecided_signals", "outliers", "noise", "one_cluster"}) {
+       {"complete", "samples", "parts", "position_parts", "root", "edges", "unconnected",
+        "unused_signals", "undecided_signals", "outliers", "noise", "one_cluster"}) {
     EXPECT_TRUE(json.contains(key)) << key;
   }
-  EXPECT_EQ(json.size(), 11U);
+  EXPECT_EQ(json.size(), 12U);
   EXPECT_TRUE(json["complete"].get<bool>());
   ASSERT_EQ(json["edges"].size(), 4U);
   for (const Json& edge : json["edges"]) {
@@ -1289,6 +1289,44 @@ TEST_F(BodyschemaProgramTest, MonitorSaysNothingOfAHealthyBody) {
   const Outcome outcome = run({"monitor", "schema.lcmlog", later, "--json"});
   EXPECT_EQ(outcome.exit_code, 0) << outcome.err;
   EXPECT_EQ(outcome.out, "");
+}
+
+TEST_F(BodyschemaProgramTest, PositionsAloneAreLearnedShownPredictedAndMonitored) {
+  test::Rng rng(75);
+  robot_ = test::chapter_robot("a", rng);
+  const int leaf = robot_.visible_parts().back();
+  const auto csv_of = [&](const std::string& name, int num_samples) {
+    return write(name,
+                 test::with_positions_alone(
+                     test::babble(robot_, num_samples, {test::Regime::kTagIso}, rng), {leaf}));
+  };
+  const Json learned =
+      run({"learn", csv_of("s.csv", 100), "--out", "schema.lcmlog", "--json"}).json();
+  EXPECT_TRUE(learned["complete"].get<bool>()) << learned.dump(1);
+  EXPECT_EQ(learned["position_parts"], Json({leaf}));
+  for (const Json& edge : learned["edges"])
+    EXPECT_EQ(edge.at("rotation_rms_deg").is_null(), edge.at("to") == leaf);
+  const Json shown = run({"show", "schema.lcmlog", "--json"}).json();
+  for (const Json& edge : shown["edges"]) {
+    EXPECT_EQ(edge.at("rotation_sd_deg").is_null(), edge.at("to") == leaf);
+    EXPECT_GT(edge.at("position_sd_m").get<double>(), 0);
+  }
+  EXPECT_NE(run({"show", "schema.lcmlog"}).out.find("position alone"), std::string::npos);
+  const auto later = csv_of("later.csv", 150);
+  const Json predicted = run({"predict", "schema.lcmlog", later, "--json"}).json();
+  for (const Json& part : predicted["parts"]) {
+    EXPECT_LT(part.at("position_median_m").get<double>(), 0.02);
+    EXPECT_EQ(part.at("rotation_median_deg").is_null(), part.at("part") == leaf);
+    EXPECT_EQ(part.at("rotation_rms_deg").is_null(), part.at("part") == leaf);
+  }
+  const Outcome monitored = run({"monitor", "schema.lcmlog", later, "--json"});
+  EXPECT_EQ(monitored.exit_code, 0) << monitored.err;
+  EXPECT_EQ(monitored.out, "");
+  expect_failure({"learn", later, "--method", "chapter"}, "needs orientations", 1);
+  expect_failure({"monitor", "schema.lcmlog", later, "--method", "chapter"}, "needs orientations",
+                 1);
+  expect_failure({"learn", write("half.csv", "t,q1,part,x,y,z,qw,qx,qy,qz\n0,0,1,0,0,0,1,,,\n")},
+                 "half.csv:2:", 1);
 }
 
 TEST_F(BodyschemaProgramTest, TheRateOfOutliersIsThatOfTheRigBesideALog) {

@@ -117,6 +117,23 @@ ActionPoseSample observe(const SyntheticRobot& robot, const Eigen::VectorXd& act
   return sample;
 }
 
+std::vector<ActionPoseSample> with_positions_alone(std::vector<ActionPoseSample> samples,
+                                                   const std::set<int>& parts) {
+  for (ActionPoseSample& sample : samples)
+    for (PartObservation& o : sample.parts) {
+      if (!parts.contains(o.part)) continue;
+      const Eigen::Matrix3d R = o.X_CB.linear();
+      const Eigen::Matrix3d covariance = R * o.covariance.topLeftCorner<3, 3>() * R.transpose();
+      o.has_rotation = false;
+      o.X_CB.linear().setIdentity();
+      o.covariance.setZero();
+      o.covariance.topLeftCorner<3, 3>() = covariance;
+      o.X_CB_other.reset();
+      o.error_ratio = 0;
+    }
+  return samples;
+}
+
 std::vector<ActionPoseSample> babble(const SyntheticRobot& robot, int num_samples,
                                      const ObservationOptions& options, Rng& rng) {
   std::vector<ActionPoseSample> samples;

@@ -374,8 +374,11 @@ void write_csv(const std::vector<ActionPoseSample>& samples, std::ostream& out) 
       for (const double q : sample.action) out << ',' << q;
       const Eigen::Quaterniond q(o.X_CB.linear());
       const Eigen::Vector3d p = o.X_CB.translation();
-      out << ',' << o.part << ',' << p.x() << ',' << p.y() << ',' << p.z() << ',' << q.w() << ','
-          << q.x() << ',' << q.y() << ',' << q.z() << '\n';
+      out << ',' << o.part << ',' << p.x() << ',' << p.y() << ',' << p.z();
+      if (o.has_rotation)
+        out << ',' << q.w() << ',' << q.x() << ',' << q.y() << ',' << q.z() << '\n';
+      else
+        out << ",,,,\n";
     }
   }
 }

@@ -108,6 +108,10 @@ ActionPoseSample observe(const SyntheticRobot& robot, const Eigen::VectorXd& act
 std::vector<ActionPoseSample> babble(const SyntheticRobot& robot, int num_samples,
                                      const ObservationOptions& options, Rng& rng);
 
+/// As if `parts` had been seen without their orientations.
+std::vector<ActionPoseSample> with_positions_alone(std::vector<ActionPoseSample> samples,
+                                                   const std::set<int>& parts);
+
 /// The chapter's robots, random geometry. "a": 2-DOF, 5 parts (Fig. 3); "b": two parts on a joint
 /// of two axes that cross at a right angle (Fig. 6); "c": 4-DOF, 5 parts (Fig. 7); "co": c with
 /// part 3 hidden (Fig. 8); "d": 7-DOF, 10 parts, part 4 hidden, 1.3 m long, two hinged fingers on
@@ -136,7 +140,8 @@ SyntheticRobot random_tree(const RandomTreeOptions& options, Rng& rng);
 Rightness judge(const BodySchema& schema, const SyntheticRobot& truth);
 bool is_right(const BodySchema& schema, const SyntheticRobot& truth);
 
-/// Columns t, q1..qm, part, x, y, z, qw, qx, qy, qz; metres, unit quaternions.
+/// Columns t, q1..qm, part, x, y, z, qw, qx, qy, qz; metres, unit quaternions, which are empty
+/// where positions alone are known.
 void write_csv(const std::vector<ActionPoseSample>& samples, std::ostream& out);
 /// The inverse; rows of one t make one sample.
 std::vector<ActionPoseSample> read_csv(std::istream& in, int* num_signals);

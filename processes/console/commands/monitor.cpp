@@ -25,6 +25,7 @@
 #include "processes/structure_learner/baseline/fit_matrix_gp.h"
 #include "processes/structure_learner/baseline/learn_baseline.h"
 #include "processes/structure_learner/learn.h"
+#include "processes/structure_learner/pair_data.h"
 #include "processes/structure_learner/recording/recording.h"
 
 namespace bodyschema {
@@ -122,6 +123,10 @@ void run_monitor(const MonitorArguments& arguments) {
     throw std::invalid_argument(arguments.samples + ": none of the parts of " + arguments.schema +
                                 " is seen in it; is it of another body?");
   check_out(arguments.out, {arguments.samples, arguments.schema, arguments.evaluate});
+
+  if (arguments.method == "chapter" && !parts_without_rotation(recording.samples).empty())
+    throw std::invalid_argument("--method chapter needs orientations: " + arguments.samples +
+                                " has positions alone");
 
   const AdaptationOptions options = options_of(arguments, recording, schema);
   Method method = method_of(arguments.method, options, schema);

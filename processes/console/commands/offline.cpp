@@ -26,6 +26,7 @@
 #include "processes/console/views/structure_view.h"
 #include "processes/structure_learner/baseline/learn_baseline.h"
 #include "processes/structure_learner/learn.h"
+#include "processes/structure_learner/pair_data.h"
 #include "processes/structure_learner/recording/recording.h"
 #include "processes/structure_learner/root_pose.h"
 
@@ -53,6 +54,10 @@ struct LearnArguments {
 LearnResult learn_as_the_chapter(const Recording& recording,
                                  const std::vector<ActionPoseSample>& training,
                                  const LearnOptions& options) {
+  if (!parts_without_rotation(training).empty())
+    throw std::invalid_argument(
+        "--method chapter needs orientations: the chapter's models are of "
+        "poses; the samples have positions alone");
   BaselineOptions baseline;
   baseline.root = options.root;
   SourcedNoise noise = marker_noise(training, static_cast<int>(recording.signals.size()), options);

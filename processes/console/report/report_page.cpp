@@ -278,15 +278,18 @@ class Page {
       if (told->median_mahalanobis2 >= 0)
         distance = fmt::format("{:.1f}", told->median_mahalanobis2);
     }
+    const auto turned = [&](double rad) {
+      return schema.has_rotation(edge.to) ? degrees(rad) : std::string("–");
+    };
     const Noise sd =
         deviations_of(edge.prediction_covariance(schema.displacements(mid_range(schema.signals))));
     return {{"edge", edge_name(edge.from, edge.to)},
             {"kind", edge.kind()},
             {"signals", names_of(schema, edge.signals())},
             {"numbers",
-             {millimetres(edge.position_rms_m), degrees(edge.rotation_rms_rad),
-              millimetres(sd.position_m), degrees(sd.rotation_rad),
-              std::to_string(edge.num_samples), std::to_string(edge.num_outliers)}},
+             {millimetres(edge.position_rms_m), turned(edge.rotation_rms_rad),
+              millimetres(sd.position_m), turned(sd.rotation_rad), std::to_string(edge.num_samples),
+              std::to_string(edge.num_outliers)}},
             {"health", health},
             {"distance", distance}};
   }
@@ -332,12 +335,15 @@ class Page {
     if (part.count == 0) {
       numbers[0] = "0";
     } else {
-      numbers = {std::to_string(part.count),        millimetres(part.position_median_m),
-                 degrees(part.rotation_median_rad), millimetres(part.position_rms_m),
-                 degrees(part.rotation_rms_rad),    millimetres(part.position_max_m)};
+      const auto turned = [&](double rad) {
+        return part.has_rotation ? degrees(rad) : std::string("–");
+      };
+      numbers = {std::to_string(part.count),       millimetres(part.position_median_m),
+                 turned(part.rotation_median_rad), millimetres(part.position_rms_m),
+                 turned(part.rotation_rms_rad),    millimetres(part.position_max_m)};
       if (errors_.alignment) {
         numbers.push_back(millimetres(errors_.aligned_parts[i].position_median_m));
-        numbers.push_back(degrees(errors_.aligned_parts[i].rotation_median_rad));
+        numbers.push_back(turned(errors_.aligned_parts[i].rotation_median_rad));
       }
     }
     return {{"part", fmt::format("{}{}", part.part,

@@ -51,7 +51,7 @@ Matrix6d observation_noise(const BodySchema& schema, const Edge& edge,
   for (const ActionPoseSample& sample : samples) {
     const PartObservation* from = sample.find(edge.from);
     const PartObservation* to = sample.find(edge.to);
-    if (!from || !to) continue;
+    if (!from || !to || !from->has_rotation) continue;
     sum += relative_covariance(from->X_CB.inverse() * to->X_CB, from->covariance, to->covariance);
     ++count;
   }
@@ -323,14 +323,15 @@ EdgeSlice edge_slice(const BodySchema& schema, const Edge& edge, int signal,
   for (const ActionPoseSample& sample : samples) {
     const PartObservation* from = sample.find(edge.from);
     const PartObservation* to = sample.find(edge.to);
-    if (!from || !to || sample.action.size() != middle.size()) continue;
-    const Pose observed = from->X_CB.inverse() * to->X_CB;
+    if (!from || !from->has_rotation || !to || sample.action.size() != middle.size()) continue;
+    Pose observed = from->X_CB.inverse() * to->X_CB;
     Eigen::VectorXd action = middle;
     action[signal] = sample.action[signal];
     EdgeSlice::Observation& observation = slice.observations.emplace_back();
     observation.q = sample.action[signal];
     const Pose X = edge.predict(schema.displacements(action));
     const Pose X_sample = edge.predict(schema.displacements(sample.action));
+    if (!to->has_rotation) observed.linear() = X_sample.linear();
     observation.value = components(X * X_sample.inverse() * observed, X_middle);
     observation.is_held_out = sample.purpose == Purpose::kTest;
     const EdgeSlice::Point expected = point_at(action);

@@ -25,7 +25,8 @@ Json edge_json(const BodySchema& schema, const Edge& edge) {
           {"signals", signal_names(schema, edge.signals())},
           {"kind", edge.kind()},
           {"position_rms_m", edge.position_rms_m},
-          {"rotation_rms_deg", edge.rotation_rms_rad / kDegree},
+          {"rotation_rms_deg",
+           schema.has_rotation(edge.to) ? Json(edge.rotation_rms_rad / kDegree) : Json()},
           {"samples", edge.num_samples},
           {"outliers", edge.num_outliers}};
 }
@@ -97,7 +98,8 @@ void add_parameters(const BodySchema& schema, const Edge& edge, const Eigen::Vec
                 {"valid_since_sample", edge.valid_since_sample},
                 {"left", pose_json(edge.left)},
                 {"position_sd_m", deviation(sd.position_m)},
-                {"rotation_sd_deg", deviation(sd.rotation_rad, kDegree)},
+                {"rotation_sd_deg",
+                 schema.has_rotation(edge.to) ? deviation(sd.rotation_rad, kDegree) : Json()},
                 {"joints", joints}});
   if (edge.residual_gp) (*json)["residual_gp"] = residual_gp_json(schema, *edge.residual_gp);
   if (edge.matrix_gp) (*json)["matrix_gp"] = matrix_gp_json(schema, *edge.matrix_gp);
@@ -149,9 +151,13 @@ std::string joints_text(const BodySchema& schema, const Edge& edge, const Eigen:
 std::string errors_line(const PartErrors& part) {
   if (part.count == 0)
     return fmt::format("  {:>4}      0   never seen together with the root", part.part);
-  return fmt::format("  {:>4} {:>6} {:7.2f} mm {:5.2f}° {:7.2f} mm {:5.2f}° {:7.2f} mm", part.part,
-                     part.count, part.position_median_m * 1e3, part.rotation_median_rad / kDegree,
-                     part.position_rms_m * 1e3, part.rotation_rms_rad / kDegree,
+  const auto pair_text = [&](double position_m, double rotation_rad) {
+    return fmt::format("{:7.2f} mm ", position_m * 1e3) +
+           (part.has_rotation ? fmt::format("{:5.2f}°", rotation_rad / kDegree) : "     –");
+  };
+  return fmt::format("  {:>4} {:>6} {} {} {:7.2f} mm", part.part, part.count,
+                     pair_text(part.position_median_m, part.rotation_median_rad),
+                     pair_text(part.position_rms_m, part.rotation_rms_rad),
                      part.position_max_m * 1e3);
 }
 
@@ -181,6 +187,7 @@ Json structure_json(const BodySchema& schema, const std::vector<Outlier>& outlie
       {"complete", schema.complete},
       {"samples", schema.num_samples},
       {"parts", schema.parts},
+      {"position_parts", schema.position_parts},
       {"root", known(schema.root)},
       {"edges", array_of(schema.edges, [&](const Edge& e) { return edge_json(schema, e); })},
       {"unconnected", array_of(schema.unconnected,
@@ -205,13 +212,16 @@ Json errors_json(int num_samples, const std::vector<PartErrors>& errors) {
           {"parts", array_of(errors, [](const PartErrors& part) -> Json {
              // No number where nothing was measured.
              const auto value = [&](double x) { return part.count > 0 ? Json(x) : Json(); };
+             const auto turned = [&](double rad) {
+               return part.has_rotation ? value(rad / kDegree) : Json();
+             };
              return {{"part", part.part},
                      {"count", part.count},
                      {"position_median_m", value(part.position_median_m)},
                      {"position_rms_m", value(part.position_rms_m)},
                      {"position_max_m", value(part.position_max_m)},
-                     {"rotation_median_deg", value(part.rotation_median_rad / kDegree)},
-                     {"rotation_rms_deg", value(part.rotation_rms_rad / kDegree)}};
+                     {"rotation_median_deg", turned(part.rotation_median_rad)},
+                     {"rotation_rms_deg", turned(part.rotation_rms_rad)}};
            })}};
 }
 
@@ -224,7 +234,7 @@ Json errors_json(int num_samples, const JudgedErrors& errors) {
     Json& part = json["parts"][i];
     part["aligned_position_median_m"] = is_known ? Json(aligned.position_median_m) : Json();
     part["aligned_rotation_median_deg"] =
-        is_known ? Json(aligned.rotation_median_rad / kDegree) : Json();
+        is_known && aligned.has_rotation ? Json(aligned.rotation_median_rad / kDegree) : Json();
   }
   return json;
 }
@@ -267,9 +277,11 @@ std::string structure_text(const BodySchema& schema, std::optional<NoiseSource> 
   const Eigen::VectorXd middle = schema.displacements(mid_range(schema.signals));
   for (std::size_t e = 0; e < schema.edges.size(); ++e) {
     const Edge& edge = schema.edges[e];
-    text += fmt::format("  {:>3} → {:<3} {:<9} {:<{}} {:7.2f} mm {:6.2f}°\n", edge.from, edge.to,
-                        edge.kind(), signals[e], width, edge.position_rms_m * 1e3,
-                        edge.rotation_rms_rad / kDegree);
+    text += fmt::format("  {:>3} → {:<3} {:<9} {:<{}} {:7.2f} mm ", edge.from, edge.to, edge.kind(),
+                        signals[e], width, edge.position_rms_m * 1e3);
+    text += schema.has_rotation(edge.to)
+                ? fmt::format("{:6.2f}°\n", edge.rotation_rms_rad / kDegree)
+                : std::string(" position alone\n");
     text += joints_text(schema, edge, middle);
   }
   for (const UnconnectedPart& part : schema.unconnected)
@@ -289,8 +301,9 @@ std::string errors_text(const JudgedErrors& errors) {
     text += "\n" + errors_line(errors.parts[i]);
     if (!errors.alignment || errors.aligned_parts[i].count == 0) continue;
     const PartErrors& aligned = errors.aligned_parts[i];
-    text += fmt::format(" {:7.2f} mm {:5.2f}°", aligned.position_median_m * 1e3,
-                        aligned.rotation_median_rad / kDegree);
+    text += fmt::format(" {:7.2f} mm", aligned.position_median_m * 1e3);
+    if (aligned.has_rotation)
+      text += fmt::format(" {:5.2f}°", aligned.rotation_median_rad / kDegree);
   }
   text += "\n";
   if (errors.alignment)

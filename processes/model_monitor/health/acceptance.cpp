@@ -6,6 +6,7 @@
 #include <utility>
 
 #include "common/bus/convert.h"
+#include "common/estimation/chi_square.h"
 #include "common/estimation/quantile.h"
 #include "common/kinematics/kinematic_path.h"
 #include "processes/model_monitor/model_monitor.h"
@@ -18,10 +19,10 @@ namespace {
 constexpr std::int64_t kRenewal = 500;
 
 /// What the observer saw of `part`: the likelier pose and, of a planar marker, the other one.
-std::vector<Pose> hypotheses(const PartObservation& part) {
-  std::vector<Pose> poses{part.X_CB};
-  if (part.X_CB_other) poses.push_back(*part.X_CB_other);
-  return poses;
+std::vector<PartObservation> hypotheses(const PartObservation& part) {
+  std::vector<PartObservation> readings{part};
+  if (part.X_CB_other) readings.emplace_back(part).X_CB = *part.X_CB_other;
+  return readings;
 }
 
 }  // namespace
@@ -33,20 +34,22 @@ ModelMonitor::EdgeTest ModelMonitor::test(const BodySchema& schema, const Edge& 
   for (const ActionPoseSample* sample : tests_between(first, last)) {
     const PartObservation* from = sighting(*sample, edge.from, schema.moved_tags);
     const PartObservation* to = sighting(*sample, edge.to, schema.moved_tags);
-    if (!from || !to || !fits(schema, *sample)) continue;
+    if (!from || !from->has_rotation || !to || !fits(schema, *sample)) continue;
     const Eigen::VectorXd theta = schema.displacements(sample->action);
     const Pose predicted = edge.predict(theta);
     const Matrix6d model = edge.prediction_covariance(theta);
     // A planar marker has two poses; the likelier one under the model speaks.
     double smallest = std::numeric_limits<double>::infinity();
-    for (const Pose& X_CF : hypotheses(*from)) {
-      for (const Pose& X_CT : hypotheses(*to)) {
-        const Pose z = X_CF.inverse() * X_CT;
-        const Matrix6d S = relative_covariance(z, config_.measurement.covariance(*from),
-                                               config_.measurement.covariance(*to)) +
-                           model;
+    for (const PartObservation& seen_from : hypotheses(*from)) {
+      for (const PartObservation& seen_to : hypotheses(*to)) {
+        const Pose& X_CF = seen_from.X_CB;
+        const auto seen = config_.measurement.reading(seen_to, X_CF * predicted);
+        const Pose z = X_CF.inverse() * seen.X_CB;
+        const Matrix6d S =
+            relative_covariance(z, config_.measurement.covariance(*from), seen.covariance) + model;
         const Vector6d residual = log(predicted.inverse() * z);
-        smallest = std::min(smallest, squared_mahalanobis(residual, S));
+        smallest =
+            std::min(smallest, as_of_six(squared_mahalanobis(residual, S), seen.num_residuals));
       }
     }
     if (!std::isfinite(smallest)) continue;

@@ -17,15 +17,16 @@ std::optional<std::int64_t> FallenMarkers::look(const ActionPoseSample& sample, 
                                                 const Pose& X_CB,
                                                 const MeasurementModel& measurement) {
   if (const PartObservation* seen = sample.find(part)) {
-    const ReadingDistance distance(measurement.covariance(*seen));
-    if (distance(X_CB, seen->X_CB) < kOther) {
+    const auto reading = measurement.reading(*seen, X_CB);
+    const ReadingDistance distance(reading.covariance);
+    if (distance(X_CB, reading.X_CB) < kOther) {
       far_off_.erase(part);
       return std::nullopt;
     }
-    const Sighting first{sample.sample_index, 0, seen->X_CB, X_CB};
+    const Sighting first{sample.sample_index, 0, reading.X_CB, X_CB};
     const int tag = seen->tags.empty() ? -1 : seen->tags.front();
     Sighting& sighting = far_off_[part].emplace(tag, first).first->second;
-    if (distance(sighting.seen, seen->X_CB) > kSame) {
+    if (distance(sighting.seen, reading.X_CB) > kSame) {
       sighting = first;
       return std::nullopt;
     }

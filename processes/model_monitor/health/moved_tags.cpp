@@ -78,7 +78,7 @@ std::vector<MovedTags::Finding> MovedTags::look(const ActionPoseSample& sample,
   for (const auto* observations : {&sample.parts, &sample.contradictions}) {
     for (const PartObservation& seen : *observations) {
       const auto predicted = X_RB.find(seen.part);
-      if (seen.tags.empty() || predicted == X_RB.end()) continue;
+      if (seen.tags.empty() || !seen.has_rotation || predicted == X_RB.end()) continue;
       Reading reading{&seen, ReadingDistance(measurement.covariance(seen))};
       const auto from = [&](const Pose& X) {
         const double d2 = reading.distance(X, seen.X_CB);

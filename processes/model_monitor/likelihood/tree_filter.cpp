@@ -6,6 +6,7 @@
 #include <map>
 #include <set>
 
+#include "common/estimation/chi_square.h"
 #include "common/geometry/angle.h"
 
 namespace bodyschema {
@@ -138,6 +139,7 @@ TreeFilter::Instant TreeFilter::prepare(const ActionPoseSample& sample) const {
   instant.transport.resize(n);
   instant.edge_covariance.resize(n);
   instant.seen.resize(n);
+  std::vector<Pose> X_C(n);  // of the nodes, predicted
   for (std::size_t k = 0; k < n; ++k) {
     const Node& node = nodes_[k];
     if (node.edge < 0) {
@@ -150,9 +152,11 @@ TreeFilter::Instant TreeFilter::prepare(const ActionPoseSample& sample) const {
     }
     instant.edge_covariance[k].diagonal().array() += 1e-12;  // what is exact can still be inverted
     instant.transport[k] = adjoint(instant.delta[k].inverse());
+    X_C[k] = node.parent < 0 ? instant.delta[k]
+                             : X_C[static_cast<std::size_t>(node.parent)] * instant.delta[k];
     if (const PartObservation* o = sample.find(node.part)) {
-      const Matrix6d covariance = measurement_.covariance(*o);
-      instant.seen[k] = Instant::Seen{o->X_CB, covariance, o->X_CB_other, covariance};
+      const auto [X_CB, covariance, num_residuals] = measurement_.reading(*o, X_C[k]);
+      instant.seen[k] = Instant::Seen{X_CB, covariance, num_residuals, o->X_CB_other, covariance};
       if (o->X_CB_other) instant.seen[k]->covariance_other = covariance_of_other(*o, covariance);
     }
   }
@@ -333,7 +337,7 @@ class TreeFilter::Walk {
       }
     }
     judgement.log_likelihood += density;
-    judgement.squared_distance[node] = d2;
+    judgement.squared_distance[node] = as_of_six(d2, seen->num_residuals);
     judgement.believed[node] = is_inlier;
     if (!is_inlier) return;
     const Matrix6d K = S.ldlt().solve(belief->P).transpose();

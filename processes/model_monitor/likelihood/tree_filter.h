@@ -61,8 +61,10 @@ class TreeFilter {
   /// One instant, with all that does not depend on an alternative. Keeps no reference to `sample`.
   struct Instant {
     struct Seen {
-      Pose X_CB;
+      Pose
+          X_CB;  ///< a position alone is turned as the schema predicts: MeasurementModel::reading()
       Matrix6d covariance;
+      int num_residuals = 6;
       std::optional<Pose> X_CB_other;
       Matrix6d covariance_other;  ///< of X_CB_other, where there is one
     };
@@ -77,6 +79,7 @@ class TreeFilter {
   struct Judgement {
     double log_likelihood = 0;
     /// By node: squared Mahalanobis distance of the marker from the belief that met it; −1 unseen.
+    /// Of a position alone as_of_six().
     std::vector<double> squared_distance;
     /// By node: −1 unseen, 0 taken for an outlier, 1 believed.
     std::vector<int> believed;

@@ -25,6 +25,7 @@
 #include "common/schema/retained_samples.h"
 #include "common/text/text.h"
 #include "processes/structure_learner/learn.h"
+#include "processes/structure_learner/pair_data.h"
 
 namespace bodyschema {
 namespace {
@@ -245,8 +246,14 @@ PartObservation parse_observation(const Row& row, const Header& header) {
   PartObservation observation;
   std::size_t i = header.part;
   observation.part = row.integer(i++, "part");
-  double pose[7];
-  for (std::size_t k = 0; k < kPoseColumns.size(); ++k) pose[k] = row.number(i++, kPoseColumns[k]);
+  const auto begin = header.part + 4, end = header.part + 8;  // of the quaternion
+  std::size_t num_empty = 0;
+  for (std::size_t k = begin; k < end; ++k) num_empty += row[k].empty();
+  observation.has_rotation = num_empty < end - begin;
+  double pose[7] = {0, 0, 0, 1, 0, 0, 0};
+  for (std::size_t k = 0; k < (observation.has_rotation ? 7 : 3); ++k)
+    pose[k] = row.number(i++, kPoseColumns[k]);
+  i = end;
   const Eigen::Quaterniond q(pose[3], pose[4], pose[5], pose[6]);
   if (std::abs(q.norm() - 1) > kUnitTolerance)
     throw row.error(
@@ -257,9 +264,11 @@ PartObservation parse_observation(const Row& row, const Header& header) {
     Noise noise;
     noise.position_m = row.number(i, "sp_m");
     if (noise.position_m <= 0) throw row.error(i, "sp_m: expected a standard deviation above 0");
-    noise.rotation_rad = row.number(++i, "sr_deg") * kDegree;
-    if (noise.rotation_rad <= 0)
-      throw row.error(i, "sr_deg: expected a standard deviation above 0");
+    if (observation.has_rotation) {
+      noise.rotation_rad = row.number(++i, "sr_deg") * kDegree;
+      if (noise.rotation_rad <= 0)
+        throw row.error(i, "sr_deg: expected a standard deviation above 0");
+    }
     observation.covariance = isotropic(noise);
   }
   return observation;
@@ -303,6 +312,25 @@ void add_row(const Row& row, std::size_t number, const Header& header, Instants&
   parts.push_back(std::move(observation));
 }
 
+// Of a part that has both, the rarer kind is left out.
+void add_mixture_hint(Recording& recording) {
+  const std::vector<int> alone = parts_without_rotation(recording.samples);
+  for (const int part : seen_parts(recording.samples)) {
+    const bool is_alone = std::binary_search(alone.begin(), alone.end(), part);
+    int num_left_out = 0, num_seen = 0;
+    for (const ActionPoseSample& sample : recording.samples)
+      if (const PartObservation* o = sample.find(part)) {
+        ++num_seen;
+        num_left_out += o->has_rotation == is_alone;
+      }
+    if (num_left_out > 0)
+      recording.hints.push_back(fmt::format(
+          "part {}: {} of {} observations are left out, which have {} orientation: a part is "
+          "learned by the kind that it has more of",
+          part, num_left_out, num_seen, is_alone ? "an" : "no"));
+  }
+}
+
 Recording read_samples(const std::filesystem::path& file, const std::string& name) {
   Recording recording;
   recording.is_log = true;
@@ -323,11 +351,9 @@ Recording read_samples(const std::filesystem::path& file, const std::string& nam
   // Samples are repeated, and sent again later where somebody missed them.
   std::map<std::int64_t, const sample_t*> by_index;
   for (const sample_t& message : messages) by_index.try_emplace(message.sample_index, &message);
-  int num_alone = 0;
   for (const auto& [index, message] : by_index) {
     ActionPoseSample& sample = recording.samples.emplace_back(from_message(*message));
     const ActionPoseSample& first = recording.samples.front();
-    num_alone += num_positions_alone(*message);
     if (sample.calibration_id != first.calibration_id)
       throw RecordingError(
           fmt::format("{}: sample {} is of another calibration of the tags or lens than the first: "
@@ -339,9 +365,7 @@ Recording read_samples(const std::filesystem::path& file, const std::string& nam
                                        name, index, sample.action.size(), first.action.size()));
     sample.sample_index = std::ssize(recording.samples) - 1;
   }
-  if (num_alone > 0)
-    recording.hints.push_back(
-        fmt::format("{} observations left out: position alone, without an orientation", num_alone));
+  add_mixture_hint(recording);
   const auto num_signals = recording.samples.front().action.size();
   const std::vector<body_schema_t> schemas = read_log(file, kBodySchema);
   recording.signals = !schemas.empty() && schemas.back().num_signals == num_signals
@@ -446,6 +470,7 @@ Recording parse_csv(const std::string& text, const std::string& name) {
     recording.signals[i].upper = observed[i].upper;
   }
   recording.hints = hints_of(recording);
+  add_mixture_hint(recording);
   return recording;
 }
 

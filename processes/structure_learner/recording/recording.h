@@ -44,7 +44,8 @@ struct Recording {
 ///   t,q1,…,qm,part,x,y,z,qw,qx,qy,qz[,sp_m,sr_deg]
 ///
 /// one row per instant and seen part: t [s], action signals, part id, position [m], unit quaternion
-/// of the part in the reference frame; optionally the standard deviations per axis of position [m]
+/// of the part in the reference frame, its four cells empty where only the position is known (then
+/// sr_deg may be empty as well); optionally the standard deviations per axis of position [m]
 /// and rotation [deg]. Rows with equal t are one instant, wherever they stand, and have one action.
 /// Either may be packed by gzip; "-" is stdin.
 /// @throws RecordingError.

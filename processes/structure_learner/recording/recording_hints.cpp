@@ -17,10 +17,11 @@ constexpr double kLargestNoise_m = 0.1;
 /// Positions of one part, or poses of one relative to another, in the order of the samples.
 using Track = std::vector<Pose>;
 
-std::map<int, Track> tracks_of(const std::vector<ActionPoseSample>& samples) {
+std::map<int, Track> tracks_of(const std::vector<ActionPoseSample>& samples, bool posed_only) {
   std::map<int, Track> tracks;
   for (const ActionPoseSample& sample : samples)
-    for (const PartObservation& o : sample.parts) tracks[o.part].push_back(o.X_CB);
+    for (const PartObservation& o : sample.parts)
+      if (o.has_rotation || !posed_only) tracks[o.part].push_back(o.X_CB);
   return tracks;
 }
 
@@ -121,7 +122,7 @@ bool is_order_x_y_z_w(const std::vector<ActionPoseSample>& samples,
       for (std::size_t t = 0; t < samples.size(); t += stride) {
         const PartObservation* a = samples[t].find(i->first);
         const PartObservation* b = samples[t].find(j->first);
-        if (!a || !b) continue;
+        if (!a || !b || !a->has_rotation || !b->has_rotation) continue;
         as_read.push_back(a->X_CB.inverse() * b->X_CB);
         other.push_back(reordered(a->X_CB).inverse() * reordered(b->X_CB));
       }
@@ -148,7 +149,8 @@ bool looks_like_radians(const Noise& noise) {
 
 std::vector<std::string> hints_of(const Recording& recording) {
   std::vector<std::string> hints;
-  const std::map<int, Track> tracks = tracks_of(recording.samples);
+  const std::map<int, Track> tracks = tracks_of(recording.samples, false),
+                             posed_tracks = tracks_of(recording.samples, true);
   double largest_m = 0;
   Track middles;
   for (const auto& [part, track] : tracks) {
@@ -162,14 +164,15 @@ std::vector<std::string> hints_of(const Recording& recording) {
     for (const ActionPoseSample& sample : recording.samples)
       for (const PartObservation& o : sample.parts) {
         noise_m.push_back(std::sqrt(o.covariance(0, 0)));
-        noise_rad.push_back(std::sqrt(o.covariance(5, 5)));
+        if (o.has_rotation) noise_rad.push_back(std::sqrt(o.covariance(5, 5)));
       }
     if (upper_median(noise_m) > kLargestNoise_m)
       hints.emplace_back("sp_m looks like millimetres; expected metres");
-    else if (looks_like_radians({upper_median(noise_m), upper_median(noise_rad)}))
+    else if (!noise_rad.empty() &&
+             looks_like_radians({upper_median(noise_m), upper_median(noise_rad)}))
       hints.emplace_back("sr_deg looks like radians; expected degrees");
   }
-  if (is_order_x_y_z_w(recording.samples, tracks))
+  if (is_order_x_y_z_w(recording.samples, posed_tracks))
     hints.emplace_back("the quaternion column order looks like x y z w; expected qw,qx,qy,qz");
   return hints;
 }

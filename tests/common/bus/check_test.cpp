@@ -323,6 +323,8 @@ TEST(Check, RefusesASchemaThatIsNoTreeOfItsOwnPartsAndSignals) {
   const auto refused = [](const std::string& field, const auto& change) {
     expect_refused(example_body_schema(), field, change);
   };
+  refused("position_parts", [](auto& m) { m.position_parts[1] = 10; });
+  refused("edges[1].from_part", [](auto& m) { m.position_parts[0] = 4; });
   refused("edges[0].to_part", [](auto& m) { m.edges[0].to_part = 7; });
   refused("edges[0].from_part", [](auto& m) { m.edges[0].from_part = 7; });
   refused("edges[0].to_part", [](auto& m) { m.edges[0].to_part = 9, m.edges[0].from_part = 9; });

@@ -70,14 +70,23 @@ TEST(Convert, ASampleSurvivesTheWire) {
   }
 }
 
-TEST(Convert, APartOfWhichThePositionAloneIsKnownIsLeftOut) {
-  sample_t message = example_sample();
-  EXPECT_EQ(num_positions_alone(message), 0);
-  message.parts[0].has_rotation = 0;
-  EXPECT_EQ(num_positions_alone(message), 1);
-  const ActionPoseSample sample = from_message(message);
-  ASSERT_EQ(sample.parts.size(), 1U);
-  EXPECT_EQ(sample.parts[0].part, 3);
+TEST(Convert, APositionAloneSurvivesTheWire) {
+  ActionPoseSample sample = from_message(example_sample());
+  PartObservation& alone = sample.parts[0];
+  alone.has_rotation = false;
+  alone.X_CB.linear().setIdentity();
+  alone.X_CB_other.reset();
+  alone.error_ratio = 0;
+  alone.covariance.setZero();
+  alone.covariance.diagonal().head<3>().setConstant(0.25);
+  const sample_t message = to_message(sample);
+  EXPECT_EQ(message.parts[0].has_rotation, 0);
+  EXPECT_EQ(message.parts[1].has_rotation, 1);
+  const ActionPoseSample again = from_message(message);
+  EXPECT_FALSE(again.parts[0].has_rotation);
+  EXPECT_EQ(again.parts[0].X_CB.matrix(), alone.X_CB.matrix());
+  EXPECT_EQ(again.parts[0].covariance, alone.covariance);
+  EXPECT_TRUE(again.parts[1].has_rotation);
 }
 
 TEST(Convert, ABodySchemaSurvivesTheWire) {
@@ -85,6 +94,8 @@ TEST(Convert, ABodySchemaSurvivesTheWire) {
   const BodySchema schema = from_message(message);
   EXPECT_EQ(schema.version, 4);
   EXPECT_EQ(schema.root, 2);
+  EXPECT_EQ(schema.position_parts, (std::vector<int>{5, 9}));
+  EXPECT_EQ(to_message(schema).position_parts, message.position_parts);
   EXPECT_EQ(schema.edges[0].state, EdgeState::kSuspect);
   EXPECT_EQ(schema.unconnected[0].reason, Unconnected::kNoValidModel);
   ASSERT_EQ(schema.edges[0].parameter_covariance.rows(), 22);

@@ -40,6 +40,15 @@ TEST(ChiSquare, MomentsBelowALimitAreThoseOfDraws) {
   EXPECT_NEAR(chi_square_below(1e3, 6).variance, 12, 1e-9);
 }
 
+TEST(ChiSquare, ThreeResidualsAreExceededAsRarelyAsTheSixTheyAreTakenFor) {
+  for (const double tail : {0.95, 0.5, 0.1, 0.0027, 1e-5})
+    EXPECT_NEAR(as_of_six(chi_square_quantile(3, tail), 3), chi_square_quantile(6, tail),
+                0.03 * chi_square_quantile(6, tail))
+        << tail;
+  EXPECT_EQ(as_of_six(7.5, 6), 7.5);
+  EXPECT_GE(as_of_six(0, 3), 0);
+}
+
 TEST(ChiSquare, BinomialQuantilesRoundUp) {
   EXPECT_EQ(binomial_quantile(10, 0.5, 0.5), 5);
   EXPECT_EQ(binomial_quantile(20, 0.07, 0.995), 5);

@@ -108,5 +108,26 @@ TEST(MeasurementModel, ScalesTheNoiseAndLeavesTheSystematicError) {
   EXPECT_EQ(covariance(0, 5), 0);
 }
 
+TEST(MeasurementModel, ReadsAPositionAloneAsTurnedAsExpected) {
+  MeasurementModel measurement;
+  measurement.noise = Noise{0.01, 0.1};
+  PartObservation o;
+  o.has_rotation = false;
+  o.X_CB.translation() << 1, 2, 3;
+  EXPECT_TRUE(measurement.covariance(o).bottomRows<3>().isZero(0));
+  EXPECT_TRUE(measurement.covariance(o).rightCols<3>().isZero(0));
+  measurement.noise.reset();
+  o.covariance.diagonal() << 1, 4, 9, 0, 0, 0;
+  Pose expected = Pose::Identity();
+  expected.linear() = Eigen::AngleAxisd(M_PI / 2, Eigen::Vector3d::UnitZ()).toRotationMatrix();
+  const auto reading = measurement.reading(o, expected);
+  EXPECT_EQ(reading.num_residuals, 3);
+  EXPECT_EQ(reading.X_CB.translation(), o.X_CB.translation());
+  EXPECT_EQ(reading.X_CB.linear(), expected.linear());
+  EXPECT_NEAR(reading.covariance(0, 0), 4, 1e-9) << "x of the part is y of the camera";
+  EXPECT_NEAR(reading.covariance(1, 1), 1, 1e-9);
+  EXPECT_EQ(reading.covariance.llt().info(), Eigen::Success);
+}
+
 }  // namespace
 }  // namespace bodyschema

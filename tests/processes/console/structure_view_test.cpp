@@ -40,8 +40,9 @@ TEST(SchemaJsonTest, LearnHasExactlyTheDocumentedKeysAndTypes) {
   test::SyntheticRobot robot;
   const LearnResult result = learned(robot);
   const auto json = structure_json(result.schema, {{3, 2}, {5, 4}});
-  EXPECT_EQ(keys_of(json), (Keys{"complete", "samples", "parts", "root", "edges", "unconnected",
-                                 "unused_signals", "undecided_signals", "outliers", "noise"}));
+  EXPECT_EQ(keys_of(json),
+            (Keys{"complete", "samples", "parts", "position_parts", "root", "edges", "unconnected",
+                  "unused_signals", "undecided_signals", "outliers", "noise"}));
   EXPECT_TRUE(json["complete"].is_boolean());
   EXPECT_TRUE(json["samples"].is_number_integer());
   EXPECT_EQ(json["samples"], 30);
@@ -72,8 +73,8 @@ TEST(SchemaJsonTest, LearnHasExactlyTheDocumentedKeysAndTypes) {
 
 TEST(SchemaJsonTest, ASchemaOfNothingIsPrintedToo) {
   const auto json = structure_json(BodySchema{}, {});
-  EXPECT_EQ(Json::parse(json.dump()),
-            Json::parse(R"({"complete": false, "samples": 0, "parts": [], "root": null,
+  EXPECT_EQ(Json::parse(json.dump()), Json::parse(R"({"complete": false, "samples": 0, "parts": [],
+                            "position_parts": [], "root": null,
                             "edges": [], "unconnected": [], "unused_signals": [],
                             "undecided_signals": [], "outliers": [],
                             "noise": {"position_m": 0, "rotation_deg": 0}})"));
@@ -156,9 +157,9 @@ TEST(SchemaJsonTest, ShowHasEveryParameterOfEveryEdge) {
   test::SyntheticRobot robot;
   const BodySchema schema = learned(robot).schema;
   const auto json = schema_json(schema);
-  EXPECT_EQ(keys_of(json), (Keys{"complete", "samples", "parts", "root", "edges", "unconnected",
-                                 "unused_signals", "undecided_signals", "noise", "version",
-                                 "base_version", "last_sample", "X_CR", "signals"}));
+  EXPECT_EQ(keys_of(json), (Keys{"complete", "samples", "parts", "position_parts", "root", "edges",
+                                 "unconnected", "unused_signals", "undecided_signals", "noise",
+                                 "version", "base_version", "last_sample", "X_CR", "signals"}));
   EXPECT_EQ(json["signals"].size(), 3U);
   EXPECT_EQ(keys_of(json["signals"][0]), (Keys{"name", "lower", "upper", "warp"}));
   EXPECT_EQ(json["last_sample"], 29);

@@ -995,7 +995,10 @@ TEST(AdaptationTest, AMalformedSampleIsRefusedAndChangesNothing) {
     }
     // A part that nobody knows is no error.
     ActionPoseSample more = sample;
-    more.parts.push_back({99, Pose::Identity(), Matrix6d::Identity(), std::nullopt, 0, {}});
+    PartObservation unknown;
+    unknown.part = 99;
+    unknown.covariance.setIdentity();
+    more.parts.push_back(unknown);
     for (const auto& e : disturbed.on_sample(more)) one.events.push_back(e);
     for (const auto& e : calm.on_sample(same.observe(t))) other.events.push_back(e);
   }

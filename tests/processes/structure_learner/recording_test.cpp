@@ -182,6 +182,36 @@ TEST(RecordingTest, ABodyWithoutSignalsAndSignalsOfAnyNameAreRead) {
             "\xC3\xBC");
 }
 
+TEST(RecordingTest, EmptyQuaternionCellsArePositionsAlone) {
+  const Recording recording = parse_csv(
+      "t,q1,part,x,y,z,qw,qx,qy,qz,sp_m,sr_deg\n0,1,1,0,0,0,1,0,0,0,0.002,1\n"
+      "0,1,2,0.1,0.2,0.3,,,,,0.002,\n1,1,2,0.1,0.2,0.3, ,,,,0.002,1\n",
+      "f");
+  EXPECT_TRUE(recording.samples[0].parts[0].has_rotation);
+  const PartObservation& alone = recording.samples[0].parts[1];
+  EXPECT_FALSE(alone.has_rotation);
+  EXPECT_EQ(alone.X_CB.translation(), Eigen::Vector3d(0.1, 0.2, 0.3));
+  EXPECT_TRUE(alone.X_CB.linear().isIdentity(0));
+  EXPECT_NEAR(recording.measurement.covariance(alone)(0, 0), 4e-6, 1e-9);
+  EXPECT_TRUE(recording.measurement.covariance(alone).bottomRows<3>().isZero(0));
+  EXPECT_FALSE(recording.samples[1].parts[0].has_rotation);
+  EXPECT_TRUE(recording.hints.empty());
+  // A quaternion is there or not.
+  EXPECT_THROW(parse_csv(kHeader + "0,1,2,1,0,0,0,1,0,,0\n", "f"), RecordingError);
+  EXPECT_THROW(parse_csv(kHeader + "0,1,2,1,0,,0,,,,\n", "f"), RecordingError);
+}
+
+TEST(RecordingTest, AMixtureOfPosesAndPositionsIsTold) {
+  std::string text = kHeader;
+  for (int t = 0; t < 10; ++t)
+    text += std::to_string(t) + ",1,2,1,0,0,0" + (t < 7 ? ",,,,\n" : ",1,0,0,0\n");
+  const Recording recording = parse_csv(text, "f");
+  ASSERT_EQ(recording.hints.size(), 1U);
+  EXPECT_NE(recording.hints[0].find("part 1: 3 of 10 observations are left out, which have an"),
+            std::string::npos)
+      << recording.hints[0];
+}
+
 TEST(RecordingTest, QuaternionsAreNormalised) {
   const Recording recording =
       parse_csv(kHeader + "0,1,2,1,0,0,0,0.5004,0.5004,-0.5004,0.5004\n", "f");
@@ -597,7 +627,7 @@ TEST_F(RecordingFileTest, ALogOfSamplesIsReadWithInstantsCountedFromZero) {
   EXPECT_EQ(recording.signals[0].name, "q1");
 }
 
-TEST_F(RecordingFileTest, APositionAloneIsLeftOutAndTold) {
+TEST_F(RecordingFileTest, APositionAloneIsReadAndAMixtureWithPosesIsTold) {
   {
     LogAppender log(file_);
     sample_t alone = to_message(samples_[0]);
@@ -612,10 +642,16 @@ TEST_F(RecordingFileTest, APositionAloneIsLeftOutAndTold) {
     log.append(kSample, to_message(samples_[1]));
   }
   const Recording recording = load_recording(file_);
-  EXPECT_EQ(recording.samples[0].parts.size() + 1, samples_[0].parts.size());
-  EXPECT_EQ(
-      recording.hints,
-      std::vector<std::string>{"1 observations left out: position alone, without an orientation"});
+  ASSERT_EQ(recording.samples[0].parts.size(), samples_[0].parts.size());
+  const PartObservation& alone = recording.samples[0].parts[0];
+  EXPECT_FALSE(alone.has_rotation);
+  EXPECT_TRUE(alone.X_CB.linear().isIdentity(0));
+  EXPECT_TRUE(alone.covariance.bottomRows<3>().isZero(0));
+  EXPECT_GT(alone.covariance(0, 0), 0);
+  ASSERT_EQ(recording.hints.size(), 1U);
+  EXPECT_NE(recording.hints[0].find("1 of 2 observations are left out, which have no orientation"),
+            std::string::npos)
+      << recording.hints[0];
 }
 
 TEST_F(RecordingFileTest, OnlyTrainAndProbeAreLearnedFrom) {
