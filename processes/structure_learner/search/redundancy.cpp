@@ -14,9 +14,8 @@ namespace {
 
 // d² of one sight.
 constexpr double kNoiseOfOneSight = 6;
-// Of the mean squares of two motions by one signal, below which the smaller is none to speak of:
-// the gains of two joints may differ fourfold (RandomTreeOptions), droop of 3° is a twentieth of
-// what a joint of 60° moves.
+// Of the mean squares of the motions of two joints of one signal: their gains may differ fourfold
+// (RandomTreeOptions), droop of 3° is a twentieth of what a joint of 60° moves.
 constexpr double kCoupling = 1.0 / 36;
 
 using Nodes = std::vector<TreeNode>;
@@ -89,9 +88,6 @@ std::optional<int> redundant_node(const Nodes& nodes, PairModels* pairs) {
         const int far = is_below(nodes, l, k) ? nodes[k].parent : k;
         const auto moved = mean_square_motion(nodes, far, l, signal, pairs);
         if (!moved || *moved >= kNoiseOfOneSight) continue;
-        const auto by_k = mean_square_motion(nodes, nodes[k].parent, k, signal, pairs);
-        const auto by_l = mean_square_motion(nodes, nodes[l].parent, l, signal, pairs);
-        if (!by_k || !by_l || *moved > kCoupling * std::min(*by_k, *by_l)) continue;
         const int larger = nodes[k].model.num_joints() > nodes[l].model.num_joints() ? k : l;
         if (num_joints_between(nodes, far, l, pairs) < nodes[larger].model.num_joints())
           return larger;

@@ -9,8 +9,7 @@
 namespace bodyschema {
 
 /// Edges with a signal that the tree does not need: two edges use it, but the parts at the far ends
-/// of both, as these models predict them, do not move with it by more than the noise of one sight,
-/// and far less than these edges do.
+/// of both, as these models predict them, do not move with it by more than the noise of one sight.
 /// So there is an edge of fewer joints between those parts, and that the data refuted it has
 /// another reason than motion: outliers, or a bias of views. Of the two edges the one with more
 /// joints is returned, by its parts, and its record says so. O(E² N) for E edges that share a
