@@ -116,17 +116,8 @@ Pose robust_mean(const std::vector<Pose>& poses) {
 
 std::optional<Noise> noise_from_repeats(const std::vector<ActionPoseSample>& samples,
                                         const NormalizedActions& actions) {
-  // A stream that rests says the same thing many times.
-  if (actions.moving().empty() || actions.blocks().is_stream()) return std::nullopt;
-  // Repeats: the same action up to a millionth of the range.
-  std::map<std::vector<long>, std::vector<int>> groups;
-  for (int t = 0; t < actions.num_samples(); ++t) {
-    std::vector<long> key;
-    for (const int s : actions.moving()) key.push_back(std::lround(actions(t, s) * 1e6));
-    groups[key].push_back(t);
-  }
   std::vector<NoiseResidual> residuals;
-  for (const auto& [key, members] : groups) {
+  for (const std::vector<int>& members : repeats(actions)) {
     std::map<int, std::vector<Pose>> poses;
     for (const int t : members)
       for (const PartObservation& o : samples[t].parts) poses[o.part].push_back(o.X_CB);
@@ -407,6 +398,19 @@ std::vector<NoiseResidual> residuals_of_quiet(const std::vector<const ScaledFit*
 }
 
 }  // namespace
+
+std::vector<std::vector<int>> repeats(const NormalizedActions& actions) {
+  if (actions.moving().empty() || actions.blocks().is_stream()) return {};
+  std::map<std::vector<long>, std::vector<int>> groups;
+  for (int t = 0; t < actions.num_samples(); ++t) {
+    std::vector<long> key;
+    for (const int s : actions.moving()) key.push_back(std::lround(actions(t, s) * 1e6));
+    groups[key].push_back(t);
+  }
+  std::vector<std::vector<int>> result;
+  for (auto& [key, members] : groups) result.push_back(std::move(members));
+  return result;
+}
 
 std::optional<SourcedNoise> estimate_noise(const std::vector<ActionPoseSample>& samples,
                                            int num_signals, int max_signals) {

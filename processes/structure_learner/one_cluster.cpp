@@ -4,6 +4,7 @@
 #include <cmath>
 #include <map>
 
+#include "common/estimation/chi_square.h"
 #include "common/estimation/quantile.h"
 #include "common/geometry/angle.h"
 
@@ -15,11 +16,11 @@ namespace {
 constexpr double kLeastSpread = 3;
 // Chosen: of arms whose joints have 120°, a twentieth.
 constexpr double kLeastSweep_rad = 5 * kDegree, kLeastSweep_m = 0.01;
-constexpr double kMedianChi3 = 2.366;
 
 // Standard deviations per axis, whatever outliers do.
 Noise spread_of(const std::vector<Pose>& poses) {
   Noise least{INFINITY, INFINITY};
+  static const double kMedian = chi_square_median(3);
   // The middle is one of the poses: that around which the others are nearest.
   constexpr std::size_t kCentres = 12;
   const std::size_t num_centres = std::min(kCentres, poses.size());
@@ -28,8 +29,8 @@ Noise spread_of(const std::vector<Pose>& poses) {
     std::vector<double> position, rotation;
     for (const Pose& X : poses) {
       const Vector6d d = log(inverse * X);
-      position.push_back(d.head<3>().squaredNorm() / kMedianChi3);
-      rotation.push_back(d.tail<3>().squaredNorm() / kMedianChi3);
+      position.push_back(d.head<3>().squaredNorm() / kMedian);
+      rotation.push_back(d.tail<3>().squaredNorm() / kMedian);
     }
     least.position_m = std::min(least.position_m, std::sqrt(upper_median(std::move(position))));
     least.rotation_rad = std::min(least.rotation_rad, std::sqrt(upper_median(std::move(rotation))));

@@ -61,8 +61,8 @@ class TreeFilter {
   /// One instant, with all that does not depend on an alternative. Keeps no reference to `sample`.
   struct Instant {
     struct Seen {
-      Pose
-          X_CB;  ///< a position alone is turned as the schema predicts: MeasurementModel::reading()
+      /// A position alone is turned as the schema predicts: MeasurementModel::reading().
+      Pose X_CB;
       Matrix6d covariance;
       int num_residuals = 6;
       std::optional<Pose> X_CB_other;

@@ -8,6 +8,7 @@
 #include <set>
 #include <tuple>
 
+#include "common/estimation/chi_square.h"
 #include "common/estimation/quantile.h"
 #include "common/geometry/angle.h"
 #include "common/kinematics/kinematic_tree.h"
@@ -35,7 +36,6 @@ constexpr double kCommonMotion_m = 0.65 * kLever_m;
 /// More is no noise: as learn.cpp's kLargestGuess.
 constexpr Noise kLargestGuess{0.01, 3 * kDegree};
 constexpr double kSafety = 1.2;  // as noise_estimate.cpp
-constexpr double kChi3Median = 2.366;
 constexpr int kMinRepeats = 5;
 
 std::vector<int> parts_with_rotation(const std::vector<ActionPoseSample>& samples) {
@@ -270,21 +270,14 @@ class LeafSearch {
 
 // Standard deviation per axis from lengths of residuals.
 double deviation(std::vector<double> lengths) {
-  return median(std::move(lengths)) / std::sqrt(kChi3Median);
+  return median(std::move(lengths)) / std::sqrt(chi_square_median(3));
 }
 
 std::optional<double> noise_of_repeats(const std::vector<ActionPoseSample>& samples,
                                        const std::vector<int>& leaves,
                                        const NormalizedActions& actions) {
-  if (actions.moving().empty() || actions.blocks().is_stream()) return std::nullopt;
-  std::map<std::vector<long>, std::vector<int>> groups;
-  for (int t = 0; t < actions.num_samples(); ++t) {
-    std::vector<long> key;
-    for (const int s : actions.moving()) key.push_back(std::lround(actions(t, s) * 1e6));
-    groups[key].push_back(t);
-  }
   std::vector<double> lengths;
-  for (const auto& [key, members] : groups)
+  for (const std::vector<int>& members : repeats(actions))
     for (const int leaf : leaves) {
       std::vector<Eigen::Vector3d> positions;
       for (const int t : members)

@@ -3,6 +3,7 @@
 #include <gtest/gtest.h>
 
 #include <cmath>
+#include <functional>
 #include <set>
 #include <string>
 
@@ -108,39 +109,37 @@ std::set<int> all_but_root(const test::SyntheticRobot& robot) {
 /// Estimating the noise takes as long again as learning.
 class NoiseTold : public testing::TestWithParam<bool> {
  protected:
+  // Bodies of so many parts, of which those that `alone` names have positions alone.
+  Verdicts learned(int num_parts,
+                   const std::function<std::set<int>(const test::SyntheticRobot&)>& alone) const {
+    Verdicts verdicts;
+    for (int seed = 1; seed <= num_bodies_; ++seed) {
+      Rng rng(seed);
+      const auto robot = body(seed, num_parts, rng);
+      const std::set<int> parts = alone(robot);
+      LearnOptions options;
+      if (GetParam()) options.measurement.noise = kNoise;
+      const auto samples = test::with_positions_alone(
+          noisy(test::babble(robot, 120, {Regime::kFree}, rng), rng), parts);
+      judge_parts(learn(robot.signals, samples, options).schema, robot, parts, rng, &verdicts);
+    }
+    return verdicts;
+  }
+
   const int num_bodies_ = GetParam() ? 20 : 8;
 };
 INSTANTIATE_TEST_SUITE_P(, NoiseTold, testing::Bool());
 
 TEST_P(NoiseTold, NoPartIsWrongWhereAllBelowARestingRootHavePositionsAlone) {
-  Verdicts verdicts;
-  for (int seed = 1; seed <= num_bodies_; ++seed) {
-    Rng rng(seed);
-    const auto robot = body(seed, 5, rng);
-    const std::set<int> parts = all_but_root(robot);
-    LearnOptions options;
-    if (GetParam()) options.measurement.noise = kNoise;
-    const auto samples = test::with_positions_alone(
-        noisy(test::babble(robot, 120, {Regime::kFree}, rng), rng), parts);
-    judge_parts(learn(robot.signals, samples, options).schema, robot, parts, rng, &verdicts);
-  }
+  const Verdicts verdicts = learned(5, all_but_root);
   EXPECT_EQ(verdicts.wrong, "");
   EXPECT_GE(verdicts.num_right, 2.3 * num_bodies_);
   EXPECT_GE(verdicts.num_open, num_bodies_) << "parts three joints from the root";
 }
 
 TEST_P(NoiseTold, NoPartIsWrongWhereTheLeafAloneHasNoOrientation) {
-  Verdicts verdicts;
-  for (int seed = 1; seed <= num_bodies_; ++seed) {
-    Rng rng(seed);
-    const auto robot = body(seed, 6, rng);
-    const std::set<int> parts{robot.links.back().part};
-    LearnOptions options;
-    if (GetParam()) options.measurement.noise = kNoise;
-    const auto samples = test::with_positions_alone(
-        noisy(test::babble(robot, 120, {Regime::kFree}, rng), rng), parts);
-    judge_parts(learn(robot.signals, samples, options).schema, robot, parts, rng, &verdicts);
-  }
+  const Verdicts verdicts = learned(
+      6, [](const test::SyntheticRobot& robot) { return std::set<int>{robot.links.back().part}; });
   EXPECT_EQ(verdicts.wrong, "");
   EXPECT_GE(verdicts.num_right, num_bodies_ - 1);
 }
