@@ -85,8 +85,11 @@ BrokenArm::BrokenArm(const Scenario& scenario, Regime regime, int block_length, 
     link(part).signal = -1;
     changes_.push_back({part, true, false, {"joint_stuck"}});
   };
+  const auto of_size = [&](double position_m, double rotation_rad) {
+    return displacement(rng_, scenario_.size * position_m, scenario_.size * rotation_rad);
+  };
   const auto exchange_tool = [&] {
-    link(7).X_after = link(7).X_after * displacement(rng_, 0.25, 80 * kDegree);
+    link(7).X_after = link(7).X_after * of_size(0.25, 80 * kDegree);
     changes_.push_back({7, true, true, {"geometry", "marker_moved"}});
   };
   switch (scenario_.fault) {
@@ -99,11 +102,12 @@ BrokenArm::BrokenArm(const Scenario& scenario, Regime regime, int block_length, 
       exchange_tool();
       break;
     case Fault::kBend:
-      link(5).X_before = displacement(rng_, 0.03, 45 * kDegree) * link(5).X_before;
+    case Fault::kIntermittent:
+      link(5).X_before = of_size(0.03, 45 * kDegree) * link(5).X_before;
       changes_.push_back({5, true, false, {"geometry"}});
       break;
     case Fault::kOffset:
-      link(4).zero = 20 * kDegree;
+      link(4).zero = scenario_.size * 20 * kDegree;
       changes_.push_back({4, true, false, {"joint_offset"}});
       break;
     case Fault::kGain:
@@ -120,14 +124,14 @@ BrokenArm::BrokenArm(const Scenario& scenario, Regime regime, int block_length, 
       changes_.push_back({6, true, false, {"geometry"}});
       break;
     case Fault::kMarker: {
-      const Pose T = displacement(rng_, 0.05, 1);
+      const Pose T = of_size(0.05, 1);
       link(3).X_after = link(3).X_after * T;
       link(4).X_before = T.inverse() * link(4).X_before;
       changes_.push_back({3, false, true, {"marker_moved"}});
       break;
     }
     case Fault::kCamera:
-      broken_.X_CR = displacement(rng_, 0.1, 15 * kDegree) * broken_.X_CR;
+      broken_.X_CR = of_size(0.1, 15 * kDegree) * broken_.X_CR;
       changes_.push_back({kRoot, true, true, {"camera_moved"}});
       break;
     case Fault::kDrift:
@@ -150,10 +154,17 @@ BrokenArm::BrokenArm(const Scenario& scenario, Regime regime, int block_length, 
   drift_axis_ = random_rotation(rng_).col(0);
   engineered_ = engineered_model(healthy_, rng_);
   for (int n = 0; n < kTestActions; ++n) test_actions_.push_back(healthy_.random_action(rng_));
+  if (scenario_.fault == Fault::kIntermittent)
+    for (int at = block_length_; at < num_samples(); at += static_cast<int>(uniform(rng_, 3, 13)))
+      turns_.push_back(at);
+}
+
+bool BrokenArm::is_broken(int index) const {
+  if (scenario_.fault != Fault::kIntermittent) return index / block_length_ % 2 == 1;
+  return (std::upper_bound(turns_.begin(), turns_.end(), index) - turns_.begin()) % 2 == 1;
 }
 
 SyntheticRobot BrokenArm::robot_at(int index) const {
-  const int block = index / block_length_;
   if (scenario_.fault == Fault::kDrift) {
     SyntheticRobot robot = healthy_;
     Pose T = Pose::Identity();
@@ -163,7 +174,7 @@ SyntheticRobot BrokenArm::robot_at(int index) const {
     robot.links[3].X_before = robot.links[3].X_before * T;
     return robot;
   }
-  return block % 2 == 1 ? broken_ : healthy_;
+  return is_broken(index) ? broken_ : healthy_;
 }
 
 BodySchema BrokenArm::engineered_but_exact(int part, int index) const {

@@ -25,7 +25,8 @@ enum class Fault {
   kDrift,     ///< a link bends by drift_deg a sample
   kWorn,      ///< a joint's transmission: it goes to q + 0.6 sin 3q
   kCoupled,   ///< a joint is moved by another signal too, half as far
-  kElastic    ///< the link behind a joint bends with the angle: 17° and 4 cm at 1 rad
+  kElastic,   ///< the link behind a joint bends with the angle: 17° and 4 cm at 1 rad
+  kIntermittent  ///< kBend comes and goes, for 3 to 12 samples each; it is never repaired
 };
 
 /// Description of a fault, as a monitor may name it.
@@ -43,6 +44,7 @@ struct Scenario {
   double drift_deg = 0.05;  ///< kDrift: a sample, from the second block on …
   /// … until it has come so far.
   double most_drift_deg = std::numeric_limits<double>::infinity();
+  double size = 1;  ///< of kTool, kBend, kOffset, kMarker and kCamera, as a share
 };
 
 /// The chapter's arm of Sections 5.2 and 5.3: a chain of seven parts x1 … x7, the edge i–(i+1)
@@ -74,6 +76,7 @@ class BrokenArm {
 
  private:
   SyntheticRobot robot_at(int index) const;
+  bool is_broken(int index) const;
 
   const Scenario scenario_;
   const Regime regime_;
@@ -84,6 +87,7 @@ class BrokenArm {
   BodySchema engineered_;
   std::vector<Eigen::VectorXd> test_actions_;
   std::vector<TrueChange> changes_;
+  std::vector<int> turns_;  ///< kIntermittent: samples at which it breaks or is whole again
 };
 
 /// Assumed noise is `noise_factor` times the true one. In tag noise it comes with the observations

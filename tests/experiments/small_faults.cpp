@@ -1,0 +1,123 @@
+// How soon a small constant fault is found: the arm of BrokenArm, its engineered model, healthy for
+// 100 samples, then broken for good. Found: something is said of the place that changed, or of one
+// beside it, within --within samples. Prints Markdown.
+//
+//   small_faults [--runs 200] [--within 40] [--healthy 100] [--cell WORDS]
+
+#include <CLI/CLI.hpp>
+#include <algorithm>
+#include <cstdio>
+#include <set>
+#include <string>
+#include <vector>
+
+#include "processes/model_monitor/adaptation.h"
+#include "tests/support/broken_arm.h"
+
+using namespace bodyschema;
+using namespace bodyschema::test;
+
+namespace {
+
+using Kind = AdaptationEvent::Kind;
+
+struct Cell {
+  std::string name;
+  Fault fault;
+  double size;  ///< of BrokenArm's
+};
+
+struct Count {
+  int num_runs = 0, num_found = 0, num_placed = 0, num_named = 0;
+  int num_early = 0, num_elsewhere = 0;  ///< events
+  std::vector<double> until;
+  double seconds = 0;
+};
+
+void live(const Cell& cell, int healthy, int within, int seed, Count* count) {
+  BrokenArm arm({cell.fault, cell.name.c_str(), 0.85, 0, 0, cell.size}, Regime::kTagIso, healthy,
+                seed);
+  Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kTagIso));
+  bool is_found = false, is_placed = false, is_named = false;
+  const int end = std::min(healthy + within, arm.num_samples());
+  for (int t = 0; t < end; ++t) {
+    const ActionPoseSample sample = arm.observe(t);
+    const double start = thread_seconds();
+    const auto events = adaptation.on_sample(sample);
+    count->seconds += thread_seconds() - start;
+    for (const AdaptationEvent& event : events) {
+      if (event.kind == Kind::kProbeWanted) continue;
+      const int part = event.part >= 0 ? event.part : event.to;
+      if (t < healthy) {
+        ++count->num_early;
+        std::fprintf(stderr, "%s seed %d early %d: %s %s part %d\n", cell.name.c_str(), seed, t, name_of(event.kind), event.cause.c_str(), part);
+        continue;
+      }
+      if (!arm.is_near(part)) {
+        ++count->num_elsewhere;
+        continue;
+      }
+      if (!is_found) count->until.push_back(t - healthy + 1);
+      is_found = true;
+      const auto is_it = [&](const TrueChange& change) {
+        return change.part == part && (event.part >= 0 ? change.at_marker : change.at_edge);
+      };
+      const auto it = std::find_if(arm.changes().begin(), arm.changes().end(), is_it);
+      const bool is_explanation = event.kind == Kind::kCandidate || event.kind == Kind::kRefined ||
+                                  event.kind == Kind::kDrift;
+      if (!is_explanation && event.kind != Kind::kMismatch) continue;
+      is_placed = it != arm.changes().end();
+      if (is_explanation) is_named = is_placed && it->causes.contains(event.cause);
+    }
+  }
+  ++count->num_runs;
+  count->num_found += is_found;
+  count->num_placed += is_placed;
+  count->num_named += is_named;
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+  int num_runs = 200, within = 40, healthy = 100;
+  std::string words;
+  CLI::App app("Small constant faults");
+  app.add_option("--runs", num_runs, "A row")->check(CLI::PositiveNumber);
+  app.add_option("--within", within, "Samples after the fault")->check(CLI::PositiveNumber);
+  app.add_option("--healthy", healthy, "Samples before it")->check(CLI::PositiveNumber);
+  app.add_option("--cell", words, "Rows whose name has these words alone");
+  CLI11_PARSE(app, argc, argv);
+
+  const std::vector<Cell> cells{{"joint offset 1°", Fault::kOffset, 0.05},
+                                {"joint offset 1.5°", Fault::kOffset, 0.075},
+                                {"joint offset 2°", Fault::kOffset, 0.1},
+                                {"link bent by 1°, 0.7 mm", Fault::kBend, 1 / 45.0},
+                                {"link bent by 2°, 1.3 mm", Fault::kBend, 2 / 45.0},
+                                {"tool off by 1°, 3 mm", Fault::kTool, 1 / 80.0},
+                                {"tool off by 2°, 6 mm", Fault::kTool, 2 / 80.0},
+                                {"marker moved by 1.1°, 1 mm", Fault::kMarker, 0.02},
+                                {"marker moved by 2.3°, 2 mm", Fault::kMarker, 0.04},
+                                {"camera off by 1°, 7 mm", Fault::kCamera, 1 / 15.0}};
+  std::printf("| fault | found within %d | samples, median (95 %%) | in the end: place right | cause "
+              "right | events before it, in 1000 | events elsewhere, in a run | ms a sample |\n"
+              "| --- | --- | --- | --- | --- | --- | --- | --- |\n", within);
+  for (const Cell& cell : cells) {
+    if (cell.name.find(words) == std::string::npos) continue;
+    Count count;
+    for (int seed = 1; seed <= num_runs; ++seed) live(cell, healthy, within, seed, &count);
+    std::sort(count.until.begin(), count.until.end());
+    const auto until = [&](double share) {
+      if (count.until.empty()) return 0.0;
+      return count.until[static_cast<std::size_t>(
+          share * static_cast<double>(count.until.size() - 1))];
+    };
+    const auto percent = [&](int n) { return 100.0 * n / count.num_runs; };
+    std::printf("| %s | %.1f %% | %.0f (%.0f) | %.1f %% | %.1f %% | %.2f | %.3f | %.2f |\n",
+                cell.name.c_str(), percent(count.num_found),
+                until(0.5), until(0.95), percent(count.num_placed),
+                percent(count.num_named), 1e3 * count.num_early / count.num_runs / healthy,
+                static_cast<double>(count.num_elsewhere) / count.num_runs,
+                1e3 * count.seconds / count.num_runs / (healthy + within));
+    std::fflush(stdout);
+  }
+}
