@@ -26,6 +26,8 @@ constexpr int kLongestDrift = 96;
 /// Small changes nearer than this are one, and nearer than that a drift [samples].
 constexpr std::int64_t kTogether = 12;
 constexpr std::int64_t kSoon = 150;
+/// What may have moved and has not surely is looked at each so many samples.
+constexpr std::int64_t kUnsureEach = 4;
 /// Below it a rate is none.
 const double kSignificantRate = chi_square_quantile(6, 0.01);
 /// A drift has ended: so probable, and so many samples ago.
@@ -270,13 +272,43 @@ void Adaptation::try_drift(std::int64_t sample_index, std::vector<AdaptationEven
   tracker_.begin(best->drift.applied_to(before_), measurement_);
 }
 
-void Adaptation::watch_drift(std::int64_t sample_index, std::vector<AdaptationEvent>* events) {
-  if (!drifting_) {
-    if (tracker_.detected()) return;
-    const auto moved = drift_watch_.moved_part(tracker_.schema());
-    if (!moved) return;
-    begin_drift(*moved, sample_index, sample_index, events);
+void Adaptation::watch_small_means(std::int64_t sample_index,
+                                   std::vector<AdaptationEvent>* events) {
+  if (tracker_.detected()) return;
+  const auto moved = drift_watch_.moved(tracker_.schema());
+  if (!moved) return;
+  if (!moved->is_sure && sample_index % kUnsureEach != 0) return;
+  const std::vector<ElementId> elements = elements_around(tracker_.filter(), moved->element.id);
+  const auto step = tracker_.explain(elements, moved->since);
+  // Steps and drifts are weighed on the same samples.
+  const BodySchema& before = tracker_.settled();
+  const auto samples = tracker_.segment(moved->since - kBeforeDrift, kLongestDrift);
+  std::set<int> parts;
+  for (const ElementId& element : elements)
+    if (!element.is_tag()) parts.insert(element.id);
+  std::optional<BegunDrift> drift;
+  double drift_lead = -std::numeric_limits<double>::infinity();
+  for (BegunDrift& begun : begun_drifts(before, measurement_, {parts.begin(), parts.end()},
+                                        samples, moved->since)) {
+    const double lead = begun.log_prior + begun.log_likelihood(before, measurement_, samples) -
+                        log_likelihood(before, measurement_, samples);
+    if (lead <= drift_lead) continue;
+    drift_lead = lead;
+    drift = std::move(begun);
   }
+  const double step_lead = step ? step->lead : -std::numeric_limits<double>::infinity();
+  if (getenv("DBG")) std::fprintf(stderr, "t %ld moved part %d since %ld sure %d step %s lead %.1f drift %d %.1f\n", (long)sample_index, moved->element.id, (long)moved->since, moved->is_sure, step ? step->what.fitted.change.cause(before).c_str() : "-", step_lead, drift ? drift->drift.part : -1, drift_lead);
+  const double needed = moved->is_sure ? 0 : options_.acceptance;
+  if (step_lead > needed && step_lead > drift_lead + (moved->is_sure ? 0 : options_.ambiguity)) {
+    tracker_.adopt(*step, sample_index, events);
+  } else if (moved->is_sure && drift_lead >= step_lead) {
+    begin_drift(drift ? drift->drift.part : moved->element.id, sample_index, sample_index, events);
+  }
+}
+
+void Adaptation::watch_drift(std::int64_t sample_index, std::vector<AdaptationEvent>* events) {
+  if (!drifting_) watch_small_means(sample_index, events);
+  if (!drifting_) return;
   const auto drift = drift_watch_.follow(before_, *drifting_);
   if (!drift) return;
   for (AdaptationEvent& event : *events)
@@ -452,8 +484,8 @@ std::vector<AdaptationEvent> Adaptation::on_new_sample(ActionPoseSample sample) 
     return events;
   }
   const TreeFilter& filter = tracker_.filter();
-  drift_watch_.add(filter, filter.prepare(sample), schema_.displacements(sample.action),
-                   sample.sample_index);
+  drift_watch_.add(filter, filter.prepare(sample), tracker_.schema(),
+                   schema_.displacements(sample.action), sample.sample_index);
   const TreeFilter::Judgement judgement = tracker_.on_sample(sample, &events);
   watch_small_changes(sample.sample_index, &events);
   try_drift(sample.sample_index, &events);
@@ -476,6 +508,10 @@ std::vector<AdaptationEvent> Adaptation::on_new_sample(ActionPoseSample sample) 
       if (!c.what.fitted.change.small) drift_watch_.forget_all();
   }
   if (is_settled() && tracker_.suspects().empty()) watch_noise(judgement);
+  const auto is_reverted = [](const AdaptationEvent& e) {
+    return e.kind == AdaptationEvent::Kind::kReverted;
+  };
+  if (std::any_of(events.begin(), events.end(), is_reverted)) drift_watch_.forget_all();
   schema_ = tracker_.schema();
   schema_.moved_tags = moved_tags_;
   return events;

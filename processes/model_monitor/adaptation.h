@@ -79,6 +79,8 @@ class Adaptation {
   void watch_small_changes(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
   /// What changes all the time looks like one step after another: an edge in trouble may drift.
   void try_drift(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
+  /// What is too small for the CUSUMs: a step, or a drift.
+  void watch_small_means(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
   void begin_drift(int part, std::int64_t since, std::int64_t sample_index,
                    std::vector<AdaptationEvent>* events);
   void end_drift(std::int64_t since, const Drift& drift, std::int64_t sample_index,

@@ -7,18 +7,28 @@
 #include <ranges>
 #include <utility>
 
+#include "common/estimation/chi_square.h"
 #include "common/estimation/student_t.h"
 #include "processes/model_monitor/changes/change_family.h"
 #include "processes/model_monitor/changes/drift.h"
 #include "processes/model_monitor/hypotheses/change_fit.h"
+#include "processes/model_monitor/hypotheses/schema_difference.h"
 
 namespace bodyschema {
 namespace {
 
 constexpr std::size_t kWindow = 44;
-/// Of the mean that tells whether an edge moved.
-constexpr std::size_t kMean = 36;
-constexpr std::size_t kFewest = 16;
+/// Newest measurements whose mean tells whether an edge moved: so many, and each so many more.
+constexpr std::size_t kFewest = 12, kMostNewest = 40, kEach = 4;
+/// Means that are looked at while one of the longest fills anew, over all edges.
+constexpr double kNumMeans = 10;
+/// Measurements from before, of which the mean tells what the model is off by there.
+constexpr std::size_t kFewestBefore = 30;
+/// Share of the model's covariance that differs from action to action.
+constexpr double kWithTheAction = 0.15;
+/// An edge that may have moved is looked at by what explains it, this much before it surely has
+/// [nats].
+constexpr double kHalfSure = 6;
 /// Of a straight line through the newest measurements.
 constexpr std::size_t kFollowed = 40;
 constexpr std::size_t kFewestFollowed = 4;
@@ -37,7 +47,7 @@ constexpr double kMostlyExplained = 0.75;
 constexpr double kEnds = 0.005;
 constexpr int kLatestEnd = 20;
 
-struct Reading {
+struct TimedReading {
   double time;  // samples, 0 is the newest
   Vector6d xi;
   Matrix6d information;
@@ -58,7 +68,7 @@ Matrix6d rate_information() {
 }
 
 /// `ended`: it stands still since this time.
-Line fit_line(const std::vector<Reading>& readings, double ended = 0, int rounds = 6) {
+Line fit_line(const std::vector<TimedReading>& readings, double ended = 0, int rounds = 6) {
   Line line;
   line.ab.setZero();
   for (int round = 0; round < rounds; ++round) {
@@ -66,7 +76,7 @@ Line fit_line(const std::vector<Reading>& readings, double ended = 0, int rounds
     H.bottomRightCorner<6, 6>() += rate_information();
     Eigen::Matrix<double, 12, 1> g = Eigen::Matrix<double, 12, 1>::Zero();
     line.cost = 0;
-    for (const Reading& r : readings) {
+    for (const TimedReading& r : readings) {
       const double time = std::min(r.time - ended, 0.0);
       const Vector6d e = r.xi - line.ab.head<6>() - time * line.ab.tail<6>();
       const double d2 = e.dot(r.information * e);
@@ -85,24 +95,6 @@ Line fit_line(const std::vector<Reading>& readings, double ended = 0, int rounds
     line.covariance = ldlt.solve(Eigen::Matrix<double, 12, 12>::Identity());
   }
   return line;
-}
-
-/// Squared Mahalanobis distance of the readings' robust mean from 0; `model` is common to them all.
-double mean_offset(const std::vector<Reading>& readings, const Matrix6d& model) {
-  Matrix6d H;
-  Vector6d mean = Vector6d::Zero();
-  for (int round = 0; round < 4; ++round) {
-    H.setZero();
-    Vector6d g = Vector6d::Zero();
-    for (const Reading& r : readings) {
-      const Vector6d e = r.xi - mean;
-      const Matrix6d I = robust_weight(e.dot(r.information * e)) * r.information;
-      H += I;
-      g += I * r.xi;
-    }
-    mean = H.ldlt().solve(g);
-  }
-  return squared_mahalanobis(mean, H.inverse() + model);
 }
 
 TreeFilter::Instant with_exact_models(TreeFilter::Instant instant) {
@@ -129,10 +121,10 @@ struct BegunLine {
 };
 
 /// std::nullopt if too little of it was seen. From time `since` on it is to explain the readings.
-std::optional<BegunLine> fit_begun(const std::vector<Reading>& readings, double begin,
+std::optional<BegunLine> fit_begun(const std::vector<TimedReading>& readings, double begin,
                                    double since) {
   int num_moved = 0;
-  for (const Reading& r : readings) num_moved += r.time > begin;
+  for (const TimedReading& r : readings) num_moved += r.time > begin;
   if (num_moved < kFewestMoved) return std::nullopt;
   const Matrix6d prior = rate_information();
   BegunLine line;
@@ -140,7 +132,7 @@ std::optional<BegunLine> fit_begun(const std::vector<Reading>& readings, double 
   for (int round = 0; round < 6; ++round) {
     H = prior;
     Vector6d g = -prior * line.rate;
-    for (const Reading& r : readings) {
+    for (const TimedReading& r : readings) {
       const double elapsed = r.time - begin;
       if (elapsed <= 0) continue;
       // T is far from 1 where it drifted for long: exact residuals, and Jacobians of small ones.
@@ -161,7 +153,7 @@ std::optional<BegunLine> fit_begun(const std::vector<Reading>& readings, double 
   line.gain = line.log_prior;
   int num = 0, num_explained = 0;
   bool is_newest_explained = false;
-  for (const Reading& r : readings) {
+  for (const TimedReading& r : readings) {
     const double elapsed = r.time - begin;
     if (elapsed <= 0) continue;
     const Vector6d e = log(exp(-elapsed * line.rate) * exp(r.xi));
@@ -186,37 +178,44 @@ Matrix6d positive_part(const Matrix6d& symmetric) {
 }  // namespace
 
 DriftWatch::DriftWatch(double false_alarm_rate)
-    // Tail of χ²₆ beyond x: e^(−x/2) (1 + x/2 + x²/8); solved for a hundredth of the rate, since
-    // windows overlap and there are many edges.
-    : threshold_([&] {
-        const double tail = false_alarm_rate / 100;
-        double x = 20;
-        for (int n = 0; n < 100; ++n) x = 2 * (std::log1p(x / 2 + x * x / 8) - std::log(tail));
-        return x;
-      }()) {}
+    : log_sure_(std::log(false_alarm_rate / kNumMeans)) {}
 
 std::optional<DriftWatch::Measured> DriftWatch::measure(const TreeFilter& filter,
                                                         const TreeFilter::Instant& instant,
                                                         const TreeFilter::Instant& exact,
-                                                        int node) {
-  const auto of = filter.measure_edge(instant, node);
-  const auto with_exact_models = filter.measure_edge(exact, node);
+                                                        int node, Measure how) {
+  const auto of = (filter.*how)(instant, node);
+  const auto with_exact_models = (filter.*how)(exact, node);
   if (!of || !with_exact_models) return std::nullopt;
   // Exact models believe fewer markers: what they know less does not make the others surer.
   return Measured{0, {}, *of, positive_part(of->covariance - with_exact_models->covariance)};
 }
 
 void DriftWatch::add(const TreeFilter& filter, const TreeFilter::Instant& instant,
-                     const Eigen::VectorXd& displacements, std::int64_t sample_index) {
+                     const BodySchema& schema, const Eigen::VectorXd& displacements,
+                     std::int64_t sample_index) {
+  if (!is_same(schema, schema_)) {
+    before_.clear();
+    schema_ = schema;
+  }
   const TreeFilter::Instant exact = with_exact_models(instant);
-  for (int node = 0; node < filter.num_nodes(); ++node) {
-    auto measured = measure(filter, instant, exact, node);
-    if (!measured) continue;
+  const auto add = [&](const ElementId& element, int node, Measure how) {
+    auto measured = measure(filter, instant, exact, node, how);
+    if (!measured) return;
     measured->sample_index = sample_index;
     measured->displacements = displacements;
-    auto& queue = measured_[filter.part(node)];
+    auto& queue = measured_[element];
     queue.push_back(std::move(*measured));
-    if (queue.size() > kWindow) queue.pop_front();
+    if (queue.size() <= kWindow) return;
+    const std::vector<Reading> oldest = readings(schema, element, queue.front());
+    auto& means = before_[element];
+    means.resize(oldest.size());
+    for (std::size_t link = 0; link < means.size(); ++link) means[link].add(oldest[link]);
+    queue.pop_front();
+  };
+  for (int node = 0; node < filter.num_nodes(); ++node) {
+    add(edge_element(filter.part(node), schema.root), node, &TreeFilter::measure_edge);
+    add(tag_element(filter.part(node)), node, &TreeFilter::measure_marker);
   }
 }
 
@@ -228,71 +227,121 @@ void DriftWatch::look_again(const BodySchema& schema, const MeasurementModel& me
   if (node < 0) return;
   for (const ActionPoseSample* sample : samples) {
     const TreeFilter::Instant instant = filter.prepare(*sample);
-    auto measured = measure(filter, instant, with_exact_models(instant), node);
+    auto measured =
+        measure(filter, instant, with_exact_models(instant), node, &TreeFilter::measure_edge);
     if (!measured) continue;
     measured->sample_index = sample->sample_index;
     measured->displacements = schema.displacements(sample->action);
-    auto& queue = measured_[part];
+    auto& queue = measured_[edge_element(part, schema.root)];
     queue.push_back(std::move(*measured));
     if (queue.size() > kWindow) queue.pop_front();
   }
 }
 
 void DriftWatch::forget(int part, std::int64_t before) {
-  auto& queue = measured_[part];
-  while (!queue.empty() && queue.front().sample_index < before) queue.pop_front();
+  const auto is_its = [part](const auto& of) { return !of.first.is_tag() && of.first.id == part; };
+  for (auto& of : measured_)
+    if (is_its(of))
+      while (!of.second.empty() && of.second.front().sample_index < before) of.second.pop_front();
+  std::erase_if(before_, is_its);
 }
 
-void DriftWatch::forget_all() { measured_.clear(); }
+void DriftWatch::forget_all() {
+  measured_.clear();
+  before_.clear();
+}
 
-const std::deque<DriftWatch::Measured>* DriftWatch::find(int part, std::size_t fewest) const {
-  const auto it = measured_.find(part);
+const std::deque<DriftWatch::Measured>* DriftWatch::find(const ElementId& element, std::size_t fewest) const {
+  const auto it = measured_.find(element);
   return it == measured_.end() || it->second.size() < fewest ? nullptr : &it->second;
 }
 
-std::optional<int> DriftWatch::moved_part(const BodySchema& schema) const {
-  std::optional<int> moved;
-  double most = threshold_;
-  for (const auto& [part, unused] : measured_) {
-    const auto* queue = find(part, kFewest);
+void DriftWatch::Mean::add(const Reading& reading) {
+  const double d2 = reading.xi.dot(reading.information * reading.xi);
+  const Matrix6d I = robust_weight(d2) * reading.information;
+  information += I;
+  sum += I * reading.xi;
+  model += reading.model;
+  ++size;
+}
+
+std::vector<DriftWatch::Reading> DriftWatch::readings(const BodySchema& schema,
+                                                      const ElementId& element,
+                                                      const Measured& m) {
+  if (element.is_tag()) return {{log(m.of.z), m.of.covariance.inverse(), m.systematic}};
+  const Edge* edge = edge_to(schema, element.id);
+  const Pose X = edge ? edge->predict(m.displacements) : schema.X_CR;
+  const Matrix6d model =
+      m.systematic + (edge ? model_covariance(*edge, m.displacements) : schema.X_CR_covariance);
+  const Vector6d xi = log(X.inverse() * m.of.z);
+  const Matrix6d information = m.of.covariance.inverse();
+  std::vector<Reading> result;
+  for (const Pose& at : link_poses(edge, m.displacements, X)) {
+    const Pose rest = at.inverse() * X;
+    const Matrix6d A = adjoint(rest), B = adjoint(rest.inverse());
+    result.push_back({A * xi, B.transpose() * information * B, A * model * A.transpose()});
+  }
+  return result;
+}
+
+double DriftWatch::log_chance(const Mean& newest, const Mean* before,
+                              const std::optional<Vector6d>& twist) {
+  const Matrix6d model = newest.model / static_cast<double>(newest.size);
+  Matrix6d covariance = newest.information.inverse();
+  Vector6d offset = covariance * newest.sum;
+  if (before) {
+    // What the model is off by is known from before, but for what differs with the action.
+    const Matrix6d known = (model.inverse() + before->information).inverse();
+    offset -= known * before->sum;
+    covariance += known + kWithTheAction * model;
+  } else {
+    covariance += model;
+  }
+  const Eigen::LDLT<Matrix6d> ldlt(covariance);
+  const Vector6d weighted = ldlt.solve(offset);
+  double log_chance = log_chi_square_tail(offset.dot(weighted), 6);
+  if (twist) {
+    const double d2 = std::pow(twist->dot(weighted), 2) / twist->dot(ldlt.solve(*twist));
+    log_chance = std::min(log_chance, log_chi_square_tail(d2, 1));
+  }
+  return log_chance;
+}
+
+std::optional<DriftWatch::Moved> DriftWatch::moved(const BodySchema& schema) const {
+  std::optional<Moved> moved;
+  double least = log_sure_ + kHalfSure;
+  for (const auto& [element, unused] : measured_) {
+    const auto* queue = find(element, kFewest);
     if (!queue) continue;
-    const Edge* edge = edge_to(schema, part);
-    if (!edge && part != schema.root) continue;
-    // Mean offset in each link, as far as the model's own uncertainty does not explain it.
-    struct Link {
-      std::vector<Reading> readings;
-      Matrix6d model = Matrix6d::Zero();
-    };
-    std::vector<Link> links(num_links(edge));
-    const std::size_t begin = queue->size() > kMean ? queue->size() - kMean : 0;
-    const double share = 1 / static_cast<double>(queue->size() - begin);
-    for (std::size_t n = begin; n < queue->size(); ++n) {
-      const Measured& m = (*queue)[n];
-      const Pose X = edge ? edge->predict(m.displacements) : schema.X_CR;
-      const Matrix6d model =
-          m.systematic + (edge ? model_covariance(*edge, m.displacements) : schema.X_CR_covariance);
-      const Vector6d xi = log(X.inverse() * m.of.z);
-      const Matrix6d information = m.of.covariance.inverse();
-      const std::vector<Pose> poses = link_poses(edge, m.displacements, X);
+    const Edge* edge = element.is_tag() ? nullptr : edge_to(schema, element.id);
+    if (!edge && !element.is_tag() && element.id != schema.root) continue;
+    const auto before = before_.find(element);
+    std::vector<Mean> links(num_links(edge));
+    for (std::size_t n = queue->size(); n-- > 0 && links.front().size < kMostNewest;) {
+      const std::vector<Reading> of = readings(schema, element, (*queue)[n]);
       for (std::size_t link = 0; link < links.size(); ++link) {
-        const Pose rest = poses[link].inverse() * X;
-        const Matrix6d A = adjoint(rest), B = adjoint(rest.inverse());
-        links[link].readings.push_back({0, A * xi, B.transpose() * information * B});
-        links[link].model += share * A * model * A.transpose();
+        links[link].add(of[link]);
+        if (links[link].size < kFewest || links[link].size % kEach != 0) continue;
+        // A joint's displacement is an offset of its own twist before the link that it carries.
+        std::optional<Vector6d> twist;
+        if (edge && link < edge->joints.size()) {
+          twist = screw_twist(edge->joints[link]);
+          if (link == 0) twist = adjoint(edge->left) * *twist;
+        }
+        double chance = log_chance(links[link], nullptr, twist);
+        if (before != before_.end() && before->second[link].size >= kFewestBefore)
+          chance = std::min(chance, log_chance(links[link], &before->second[link], twist));
+        if (chance >= least) continue;
+        least = chance;
+        moved = Moved{element, (*queue)[n].sample_index, chance < log_sure_};
       }
-    }
-    for (const Link& link : std::views::reverse(links)) {
-      const double d2 = mean_offset(link.readings, link.model);
-      if (d2 <= most) continue;
-      most = d2;
-      moved = part;
     }
   }
   return moved;
 }
 
 std::optional<Drift> DriftWatch::follow(const BodySchema& schema, int part) const {
-  const auto* queue = find(part, kFewestFollowed);
+  const auto* queue = find(edge_element(part, schema.root), kFewestFollowed);
   if (!queue) return std::nullopt;
   const Edge* edge = edge_to(schema, part);
   std::optional<Drift> best;
@@ -300,7 +349,7 @@ std::optional<Drift> DriftWatch::follow(const BodySchema& schema, int part) cons
   const std::int64_t now = queue->back().sample_index;
   for (std::size_t link = num_links(edge); link-- > 0;) {
     std::vector<Pose> T;
-    std::vector<Reading> readings;
+    std::vector<TimedReading> readings;
     for (std::size_t n = queue->size() > kFollowed ? queue->size() - kFollowed : 0;
          n < queue->size(); ++n) {
       const Measured& m = (*queue)[n];
@@ -329,7 +378,7 @@ std::optional<Drift> DriftWatch::follow(const BodySchema& schema, int part) cons
     std::vector<Course> courses{{line, 0, -line.cost}};
     for (int ended = 1; ended <= kLatestEnd; ++ended) {
       const auto num_before = std::count_if(readings.begin(), readings.end(),
-                                            [ended](const Reading& r) { return r.time <= -ended; });
+                                            [ended](const TimedReading& r) { return r.time <= -ended; });
       if (num_before < static_cast<std::ptrdiff_t>(kFewestFollowed)) break;
       const Line stopped = fit_line(readings, -ended, 3);
       courses.push_back({stopped, ended, std::log(kEnds) - stopped.cost});
@@ -398,7 +447,7 @@ std::vector<BegunDrift> begun_drifts(const BodySchema& before, const Measurement
   struct Places {
     int part, node;
     const Edge* edge;
-    std::vector<std::vector<Reading>> links;
+    std::vector<std::vector<TimedReading>> links;
   };
   std::vector<Places> places;
   for (const int part : parts)
@@ -427,7 +476,7 @@ std::vector<BegunDrift> begun_drifts(const BodySchema& before, const Measurement
   for (const Places& place : places) {
     std::optional<BegunDrift> best;
     for (std::size_t link = place.links.size(); link-- > 0;) {
-      const std::vector<Reading>& readings = place.links[link];
+      const std::vector<TimedReading>& readings = place.links[link];
       const auto try_begin = [&](std::int64_t begin) -> std::optional<double> {
         const auto line =
             fit_begun(readings, static_cast<double>(begin), static_cast<double>(since));

@@ -6,6 +6,7 @@
 #include <optional>
 #include <vector>
 
+#include "processes/model_monitor/changes/body_change.h"
 #include "processes/model_monitor/likelihood/tree_filter.h"
 
 namespace bodyschema {
@@ -54,9 +55,9 @@ std::vector<BegunDrift> begun_drifts(const BodySchema& before, const Measurement
                                      const std::vector<const ActionPoseSample*>& samples,
                                      std::int64_t since);
 
-/// Finds what changes too slowly for a CUSUM: means of the virtual measurements of every edge over
-/// the newest samples. The bend of a link by 0.05° a sample is below the noise of each of them, and
-/// ten standard deviations of their mean.
+/// Finds what is too small, or changes too slowly, for a CUSUM: means of the virtual measurements
+/// of every edge, and of every marker in its part, over the newest samples. The bend of a link by 0.05° a sample is below the noise
+/// of each of them, and ten standard deviations of their mean.
 ///
 /// Follows what drifts, slowly or fast: the mean, by their probabilities, of a straight line
 /// through the newest measurements and of lines that ended some samples ago.
@@ -64,8 +65,8 @@ class DriftWatch {
  public:
   explicit DriftWatch(double false_alarm_rate);
 
-  /// The sample as `filter` sees it; `filter` has the schema as it stands.
-  void add(const TreeFilter& filter, const TreeFilter::Instant& instant,
+  /// The sample as `filter` sees it, of the schema as it stands.
+  void add(const TreeFilter& filter, const TreeFilter::Instant& instant, const BodySchema& schema,
            const Eigen::VectorXd& displacements, std::int64_t sample_index);
   /// Measurements of the edge to a part that are older than this say nothing of the present one.
   void forget(int part, std::int64_t before);
@@ -75,8 +76,14 @@ class DriftWatch {
   void look_again(const BodySchema& schema, const MeasurementModel& measurement, int part,
                   const std::vector<const ActionPoseSample*>& samples);
 
-  /// The edge that has moved most, if any has. `schema` is the one that stands.
-  std::optional<int> moved_part(const BodySchema& schema) const;
+  /// An edge, or marker, that is not where the schema has it.
+  struct Moved {
+    ElementId element;
+    std::int64_t since = 0;    ///< first sample of the newest ones whose mean shows it most
+    bool is_sure = false;      ///< by the rate of false alarms; else it is worth an explanation
+  };
+  /// The element that has moved most, if any has. `schema` is the one that stands.
+  std::optional<Moved> moved(const BodySchema& schema) const;
   /// T(t) of an edge from its newest measurements: the better of the two sides. std::nullopt if
   /// there are fewer than four.
   std::optional<Drift> follow(const BodySchema& schema, int part) const;
@@ -88,13 +95,37 @@ class DriftWatch {
     VirtualMeasurement of;
     Matrix6d systematic;  ///< what the other edges' models contribute to its covariance
   };
+  using Measure = std::optional<VirtualMeasurement> (TreeFilter::*)(const TreeFilter::Instant&,
+                                                                    int node) const;
   static std::optional<Measured> measure(const TreeFilter& filter,
                                          const TreeFilter::Instant& instant,
-                                         const TreeFilter::Instant& exact, int node);
-  const std::deque<Measured>* find(int part, std::size_t fewest) const;
+                                         const TreeFilter::Instant& exact, int node, Measure how);
+  /// Offset ξ that a link shows, log of T in it; what of its covariance is the model's is apart.
+  struct Reading {
+    Vector6d xi;
+    Matrix6d information;
+    Matrix6d model;
+  };
+  /// Sums of readings of a link.
+  struct Mean {
+    Matrix6d information = Matrix6d::Zero(), model = Matrix6d::Zero();
+    Vector6d sum = Vector6d::Zero();
+    std::size_t size = 0;
+    void add(const Reading& reading);
+  };
+  /// By link of the edge; of a marker, or the camera's pose, one.
+  static std::vector<Reading> readings(const BodySchema& schema, const ElementId& element,
+                                       const Measured& measured);
+  /// log of the chance of a mean so far from what the model says, or from that of the readings
+  /// before: in all directions, or along `twist`.
+  static double log_chance(const Mean& newest, const Mean* before,
+                           const std::optional<Vector6d>& twist);
+  const std::deque<Measured>* find(const ElementId& element, std::size_t fewest) const;
 
-  const double threshold_;
-  std::map<int, std::deque<Measured>> measured_;
+  const double log_sure_;
+  std::map<ElementId, std::deque<Measured>> measured_;
+  std::map<ElementId, std::vector<Mean>> before_;  ///< of what is older, by link, under schema_
+  BodySchema schema_;
 };
 
 }  // namespace bodyschema

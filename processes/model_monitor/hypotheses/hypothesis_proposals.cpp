@@ -47,6 +47,23 @@ FoundChanges HypothesisTracker::search(const BodySchema& base,
   return found;
 }
 
+std::optional<HypothesisTracker::Explanation> HypothesisTracker::explain(
+    const std::vector<ElementId>& elements, std::int64_t since) {
+  FoundChanges found =
+      search(schema(), elements, segment(since, options_.longest_segment), nullptr);
+  if (!found.best) return std::nullopt;
+  return Explanation{std::move(*found.best), since, found.margin()};
+}
+
+void HypothesisTracker::adopt(Explanation explanation, std::int64_t now,
+                              std::vector<AdaptationEvent>* events) {
+  std::vector<Change> changes = this->changes();
+  changes.push_back({std::move(explanation.what), explanation.since, now});
+  Hypothesis more = made_of(std::move(changes));
+  more.log_odds = log_odds() + explanation.lead;
+  stand(std::move(more), now, events);
+}
+
 void HypothesisTracker::propose_more(std::int64_t now) {
   const std::vector<ElementId> elements = suspects();
   if (elements.empty() || work_budget_ <= 0) return;

@@ -67,6 +67,17 @@ class HypothesisTracker {
   std::vector<const ActionPoseSample*> segment(std::int64_t since, int longest) const;
   std::vector<ActionPoseSample> recent() const;
 
+  /// A change of one of `elements` since a sample that explains the samples best, and by how much
+  /// better than what stands [nats].
+  struct Explanation {
+    Replacement what;
+    std::int64_t since = 0;
+    double lead = 0;
+  };
+  std::optional<Explanation> explain(const std::vector<ElementId>& elements, std::int64_t since);
+  /// It stands beside what stood, and is told.
+  void adopt(Explanation explanation, std::int64_t now, std::vector<AdaptationEvent>* events);
+
   /// Nothing has changed since the body became this one; CUSUMs are at zero.
   void begin(const BodySchema& settled, const MeasurementModel& measurement);
   /// The settled body goes on changing at the edge to `part` alone: the other CUSUMs stay.

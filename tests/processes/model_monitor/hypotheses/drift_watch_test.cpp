@@ -23,7 +23,7 @@ int feed(BrokenArm& arm, DriftWatch& watch, int begin, int end, Stop stop) {
   const TreeFilter filter(schema, test::adaptation_options(Regime::kTagIso).measurement);
   for (int t = begin; t < end; ++t) {
     const ActionPoseSample sample = arm.observe(t);
-    watch.add(filter, filter.prepare(sample), schema.displacements(sample.action), t);
+    watch.add(filter, filter.prepare(sample), schema, schema.displacements(sample.action), t);
     if (stop()) return t + 1;
   }
   return end;
@@ -34,7 +34,8 @@ TEST(DriftWatchTest, AHealthyArmDoesNotMove) {
     BrokenArm arm({Fault::kNone, "", 0.85}, Regime::kTagIso, 75, seed);
     DriftWatch watch(1e-5);
     feed(arm, watch, 0, 300, [&] {
-      EXPECT_FALSE(watch.moved_part(arm.engineered()));
+      const auto moved = watch.moved(arm.engineered());
+      EXPECT_FALSE(moved && moved->is_sure);
       return false;
     });
   }
@@ -46,10 +47,13 @@ TEST(DriftWatchTest, ASlowBendIsFoundAtItsEdgeWhileItIsSmallAndThenFollowed) {
     BrokenArm arm({Fault::kDrift, "", 0.85}, Regime::kTagIso, kHealthy, seed);
     DriftWatch watch(1e-5);
     const int found = feed(arm, watch, 0, 4 * kHealthy,
-                           [&] { return watch.moved_part(arm.engineered()).has_value(); });
+                           [&] {
+                             const auto moved = watch.moved(arm.engineered());
+                             return moved && moved->is_sure;
+                           });
     EXPECT_GT(found, kHealthy);
     EXPECT_LT(found, kHealthy + 75);  // 3.75°, about 20 mm at the end effector
-    EXPECT_EQ(watch.moved_part(arm.engineered()), 4);
+    EXPECT_EQ(watch.moved(arm.engineered())->element, edge_element(4, 1));
     const int end = 4 * kHealthy;
     feed(arm, watch, found, end, [] { return false; });
     const auto drift = watch.follow(arm.engineered(), 4);
@@ -125,7 +129,7 @@ TEST(DriftWatchTest, WhatIsForgottenSaysNothing) {
   EXPECT_TRUE(watch.follow(arm.engineered(), 5));
   watch.forget_all();
   EXPECT_FALSE(watch.follow(arm.engineered(), 5));
-  EXPECT_FALSE(watch.moved_part(arm.engineered()));
+  EXPECT_FALSE(watch.moved(arm.engineered()));
 }
 
 }  // namespace
