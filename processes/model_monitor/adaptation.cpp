@@ -298,8 +298,9 @@ void Adaptation::watch_small_means(std::int64_t sample_index,
   }
   const double step_lead = step ? step->lead : -std::numeric_limits<double>::infinity();
   if (getenv("DBG")) std::fprintf(stderr, "t %ld moved part %d since %ld sure %d step %s lead %.1f drift %d %.1f\n", (long)sample_index, moved->element.id, (long)moved->since, moved->is_sure, step ? step->what.fitted.change.cause(before).c_str() : "-", step_lead, drift ? drift->drift.part : -1, drift_lead);
-  const double needed = moved->is_sure ? 0 : options_.acceptance;
-  if (step_lead > needed && step_lead > drift_lead + (moved->is_sure ? 0 : options_.ambiguity)) {
+  // That the means moved speaks for a change already.
+  const double needed = moved->is_sure ? 0 : options_.ambiguity;
+  if (step_lead > needed && step_lead > drift_lead + needed) {
     tracker_.adopt(*step, sample_index, events);
   } else if (moved->is_sure && drift_lead >= step_lead) {
     begin_drift(drift ? drift->drift.part : moved->element.id, sample_index, sample_index, events);
@@ -340,7 +341,8 @@ void Adaptation::end_drift(std::int64_t since, const Drift& drift, std::int64_t 
   recovered.num_samples =
       since < sample_index ? static_cast<int>(sample_index - since) : num_still_;
   events->push_back(recovered);
-  drift_watch_.forget(*drifting_, since);
+  // While it moved, the other elements were measured by a body that lagged behind.
+  drift_watch_.forget_all();
   tags_.begin_anew();
   HypothesisTracker::Change there;
   there.what.element = edge_element(*drifting_, before_.root);

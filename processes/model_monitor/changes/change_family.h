@@ -83,7 +83,7 @@ struct ChangeForm {
 const ChangeForm& form_of(const BodyChange& change);
 /// log odds of every form with BodyChange::small: behind those of a large one.
 constexpr double kSmallLogOdds = -3.5;
-constexpr double kSmallWidth = 0.035;  ///< in widths of a large one
+constexpr double kSmallWidth = 0.1;  ///< in widths of a large one
 /// log odds that one input of a learned function costs.
 constexpr double kInputLogOdds = -3;
 
