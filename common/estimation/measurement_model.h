@@ -34,6 +34,9 @@ struct MeasurementModel {
   double scale = 1;
   /// Expected share of a part's observations that are flips of planar tags or false detections.
   double outlier_rate = 0.03;
+  /// Independent samples that one sample is worth, in (0, 1]: log-likelihoods are multiplied by it
+  /// where the noise of successive samples is correlated.
+  double worth = 1;
   /// A second reading of a planar part counts while its reprojection error is at most this multiple
   /// of the first's.
   double max_error_ratio = 10;

@@ -26,6 +26,14 @@ constexpr int kLongestDrift = 96;
 /// Small changes nearer than this are one, and nearer than that a drift [samples].
 constexpr std::int64_t kTogether = 12;
 constexpr std::int64_t kSoon = 150;
+/// Outliers are counted over about so many readings, and expected a little more often; a told rate
+/// weighs like so many of them.
+constexpr double kFading = 0.998;
+constexpr double kPriorReadings = 100;
+constexpr double kMoreOutliers = 1.2, kMostOutliers = 0.35;
+/// Rates and worths nearer than this are the same [log].
+constexpr double kSameNoise = 0.15;
+constexpr int kUpdateEach = 16;
 /// What may have moved and has not surely is looked at each so many samples.
 constexpr std::int64_t kUnsureEach = 4;
 /// Below it a rate is none.
@@ -176,6 +184,28 @@ void Adaptation::watch_noise(const TreeFilter::Judgement& judgement) {
   tracker_.begin(BodySchema(tracker_.settled()), measurement_);
 }
 
+void Adaptation::count_outliers(const TreeFilter::Judgement& judgement) {
+  for (const int believed : judgement.believed) {
+    if (believed < 0) continue;
+    num_read_ = kFading * num_read_ + 1;
+    num_outliers_ = kFading * num_outliers_ + (believed == 0);
+  }
+}
+
+void Adaptation::update_measurement() {
+  const double told = options_.measurement.outlier_rate;
+  const double seen = (kPriorReadings * told + num_outliers_) / (kPriorReadings + num_read_);
+  const double rate = std::clamp(kMoreOutliers * seen, told, kMostOutliers);
+  const double worth = drift_watch_.worth();
+  if (getenv("DBG")) std::fprintf(stderr, "n %d rate %.3f r %.3f worth %.3f scale %.2f\n", num_samples_, rate, worth, measurement_.worth, measurement_.scale);
+  if (std::abs(std::log(rate / measurement_.outlier_rate)) < kSameNoise &&
+      std::abs(std::log(worth / measurement_.worth)) < kSameNoise)
+    return;
+  measurement_.outlier_rate = rate;
+  measurement_.worth = worth;
+  tracker_.begin(BodySchema(tracker_.settled()), measurement_);
+}
+
 void Adaptation::complete(std::int64_t sample_index, AdaptationEvent* event) const {
   using Kind = AdaptationEvent::Kind;
   event->sample_index = sample_index;
@@ -275,7 +305,7 @@ void Adaptation::try_drift(std::int64_t sample_index, std::vector<AdaptationEven
 void Adaptation::watch_small_means(std::int64_t sample_index,
                                    std::vector<AdaptationEvent>* events) {
   if (tracker_.detected()) return;
-  const auto moved = drift_watch_.moved(tracker_.schema());
+  const auto moved = drift_watch_.moved(tracker_.schema(), measurement_.worth);
   if (!moved) return;
   if (!moved->is_sure && sample_index % kUnsureEach != 0) return;
   const std::vector<ElementId> elements = elements_around(tracker_.filter(), moved->element.id);
@@ -509,7 +539,11 @@ std::vector<AdaptationEvent> Adaptation::on_new_sample(ActionPoseSample sample) 
     for (const HypothesisTracker::Change& c : tracker_.changes())
       if (!c.what.fitted.change.small) drift_watch_.forget_all();
   }
-  if (is_settled() && tracker_.suspects().empty()) watch_noise(judgement);
+  if (is_settled()) {
+    count_outliers(judgement);
+    if (tracker_.suspects().empty()) watch_noise(judgement);
+    if (num_samples_ % kUpdateEach == 0) update_measurement();
+  }
   const auto is_reverted = [](const AdaptationEvent& e) {
     return e.kind == AdaptationEvent::Kind::kReverted;
   };

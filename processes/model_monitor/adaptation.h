@@ -75,6 +75,9 @@ class Adaptation {
   void calibrate(const std::vector<ActionPoseSample>& samples);
   void set_noise_scale(double scale);
   void watch_noise(const TreeFilter::Judgement& judgement);
+  void count_outliers(const TreeFilter::Judgement& judgement);
+  /// How rare outliers are, and how much correlated samples are worth, as seen so far.
+  void update_measurement();
   /// The same small change again soon after, or beside it, is a drift that was not understood yet.
   void watch_small_changes(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
   /// What changes all the time looks like one step after another: an edge in trouble may drift.
@@ -104,6 +107,7 @@ class Adaptation {
   int num_samples_ = 0;
   std::vector<double> quiet_distances_;  ///< d² of believed markers since the noise was last set
   int num_quiet_ = 0;
+  double num_read_ = 0, num_outliers_ = 0;  ///< readings of markers lately, with fading weights
   HypothesisTracker tracker_;
   VisibilityWatch visibility_;
   FallenMarkers fallen_;

@@ -85,8 +85,11 @@ PlaceEvidence::PlaceEvidence(const BodySchema& base, const MeasurementModel& mea
     if (!of) continue;
     const Eigen::LLT<Matrix6d> llt(of->covariance);
     if (llt.info() != Eigen::Success) continue;
-    measurements_.push_back({base_.displacements(sample->action), of->z, of->covariance});
-    whitenings_.push_back(llt.matrixL().solve(Matrix6d::Identity()));
+    // Correlated samples tell as much as fewer of them.
+    measurements_.push_back(
+        {base_.displacements(sample->action), of->z, of->covariance / measurement_.worth});
+    whitenings_.push_back(std::sqrt(measurement_.worth) *
+                          llt.matrixL().solve(Matrix6d::Identity()));
     log_norms_.push_back(-llt.matrixLLT().diagonal().array().log().sum() - 3 * std::log(2 * M_PI));
   }
   if (element_.is_tag()) return;

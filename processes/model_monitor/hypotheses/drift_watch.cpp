@@ -26,6 +26,11 @@ constexpr double kNumMeans = 10;
 constexpr std::size_t kFewestBefore = 30;
 /// Share of the model's covariance that differs from action to action.
 constexpr double kWithTheAction = 0.15;
+/// Samples between residuals whose correlations are looked at, the fewest pairs that tell them to
+/// 0.05, and a pair's weight one sample later. Smaller correlations are not told from none.
+constexpr std::array<std::int64_t, 2> kLags{1, 5};
+constexpr double kFewestProducts = 60, kFading = 0.99;
+constexpr double kNoCorrelation = 0.15;
 /// An edge that may have moved is looked at by what explains it, this much before it surely has
 /// [nats].
 constexpr double kHalfSure = 6;
@@ -206,6 +211,7 @@ void DriftWatch::add(const TreeFilter& filter, const TreeFilter::Instant& instan
     measured->displacements = displacements;
     auto& queue = measured_[element];
     queue.push_back(std::move(*measured));
+    if (element.is_tag()) correlate(element);
     if (queue.size() <= kWindow) return;
     const std::vector<Reading> oldest = readings(schema, element, queue.front());
     auto& means = before_[element];
@@ -217,6 +223,52 @@ void DriftWatch::add(const TreeFilter& filter, const TreeFilter::Instant& instan
     add(edge_element(filter.part(node), schema.root), node, &TreeFilter::measure_edge);
     add(tag_element(filter.part(node)), node, &TreeFilter::measure_marker);
   }
+}
+
+void DriftWatch::Products::add(const Vector6d& residual, const Vector6d& earlier) {
+  products = kFading * products + residual.dot(earlier);
+  squares = kFading * squares + residual.squaredNorm();
+  sum = kFading * sum + residual;
+  size = kFading * size + 1;
+}
+
+void DriftWatch::correlate(const ElementId& tag) {
+  const std::deque<Measured>& queue = measured_[tag];
+  const auto whitened = [](const Measured& m) -> Vector6d {
+    return Eigen::LLT<Matrix6d>(m.of.covariance).matrixL().solve(log(m.of.z));
+  };
+  const Vector6d residual = whitened(queue.back());
+  if (residual.squaredNorm() > kExplained) return;
+  for (std::size_t lag = 0; lag < kLags.size(); ++lag)
+    for (auto m = queue.rbegin(); m != queue.rend(); ++m) {
+      const std::int64_t apart = queue.back().sample_index - m->sample_index;
+      if (apart > kLags[lag]) break;
+      if (apart < kLags[lag]) continue;
+      const Vector6d earlier = whitened(*m);
+      if (earlier.squaredNorm() < kExplained) products_[tag][lag].add(residual, earlier);
+    }
+}
+
+double DriftWatch::worth() const {
+  std::array<double, kLags.size()> correlation{};
+  for (std::size_t lag = 0; lag < kLags.size(); ++lag) {
+    double products = 0, squares = 0, size = 0;
+    for (const auto& [tag, lags] : products_) {
+      const Products& of = lags[lag];
+      // What the model is off by all the time is no noise.
+      const double constant = of.size > 0 ? of.sum.squaredNorm() / of.size : 0;
+      products += of.products - constant;
+      squares += of.squares - constant;
+      size += of.size;
+    }
+    if (size < kFewestProducts || squares <= 0) return 1;
+    correlation[lag] = products / squares;
+  }
+  const auto [near, far] = correlation;
+  if (near < kNoCorrelation) return 1;
+  const double ratio = std::clamp(far / near, 1e-3, 0.99);
+  const double phi = std::pow(ratio, 1.0 / static_cast<double>(kLags[1] - kLags[0]));
+  return 1 / (1 + 2 * near / (1 - phi));
 }
 
 void DriftWatch::look_again(const BodySchema& schema, const MeasurementModel& measurement, int part,
@@ -284,15 +336,16 @@ std::vector<DriftWatch::Reading> DriftWatch::readings(const BodySchema& schema,
   return result;
 }
 
-double DriftWatch::log_chance(const Mean& newest, const Mean* before,
+double DriftWatch::log_chance(const Mean& newest, const Mean* before, double worth,
                               const std::optional<Vector6d>& twist) {
   const Matrix6d model = newest.model / static_cast<double>(newest.size);
-  Matrix6d covariance = newest.information.inverse();
-  Vector6d offset = covariance * newest.sum;
+  const Matrix6d spread = newest.information.inverse();
+  Vector6d offset = spread * newest.sum;
+  Matrix6d covariance = spread / worth;
   if (before) {
     // What the model is off by is known from before, but for what differs with the action.
-    const Matrix6d known = (model.inverse() + before->information).inverse();
-    offset -= known * before->sum;
+    const Matrix6d known = (model.inverse() + worth * before->information).inverse();
+    offset -= worth * known * before->sum;
     covariance += known + kWithTheAction * model;
   } else {
     covariance += model;
@@ -307,7 +360,8 @@ double DriftWatch::log_chance(const Mean& newest, const Mean* before,
   return log_chance;
 }
 
-std::optional<DriftWatch::Moved> DriftWatch::moved(const BodySchema& schema) const {
+std::optional<DriftWatch::Moved> DriftWatch::moved(const BodySchema& schema,
+                                                   double worth) const {
   std::optional<Moved> moved;
   double least = log_sure_ + kHalfSure;
   for (const auto& [element, unused] : measured_) {
@@ -328,9 +382,9 @@ std::optional<DriftWatch::Moved> DriftWatch::moved(const BodySchema& schema) con
           twist = screw_twist(edge->joints[link]);
           if (link == 0) twist = adjoint(edge->left) * *twist;
         }
-        double chance = log_chance(links[link], nullptr, twist);
+        double chance = log_chance(links[link], nullptr, worth, twist);
         if (before != before_.end() && before->second[link].size >= kFewestBefore)
-          chance = std::min(chance, log_chance(links[link], &before->second[link], twist));
+          chance = std::min(chance, log_chance(links[link], &before->second[link], worth, twist));
         if (chance >= least) continue;
         least = chance;
         moved = Moved{element, (*queue)[n].sample_index, chance < log_sure_};

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <array>
 #include <cstdint>
 #include <deque>
 #include <map>
@@ -83,7 +84,11 @@ class DriftWatch {
     bool is_sure = false;      ///< by the rate of false alarms; else it is worth an explanation
   };
   /// The element that has moved most, if any has. `schema` is the one that stands.
-  std::optional<Moved> moved(const BodySchema& schema) const;
+  std::optional<Moved> moved(const BodySchema& schema, double worth = 1) const;
+  /// Independent samples that one is worth: MeasurementModel::worth, of the markers' noise. 1 as long
+  /// as there are few. The correlations of residuals some samples apart, ρ_k = ρ₁ φ^(k − 1), add up
+  /// to 1 + 2 ρ₁ / (1 − φ) samples for one.
+  double worth() const;
   /// T(t) of an edge from its newest measurements: the better of the two sides. std::nullopt if
   /// there are fewer than four.
   std::optional<Drift> follow(const BodySchema& schema, int part) const;
@@ -118,14 +123,22 @@ class DriftWatch {
                                        const Measured& measured);
   /// log of the chance of a mean so far from what the model says, or from that of the readings
   /// before: in all directions, or along `twist`.
-  static double log_chance(const Mean& newest, const Mean* before,
+  static double log_chance(const Mean& newest, const Mean* before, double worth,
                            const std::optional<Vector6d>& twist);
+  void correlate(const ElementId& tag);
   const std::deque<Measured>* find(const ElementId& element, std::size_t fewest) const;
 
   const double log_sure_;
   std::map<ElementId, std::deque<Measured>> measured_;
   std::map<ElementId, std::vector<Mean>> before_;  ///< of what is older, by link, under schema_
   BodySchema schema_;
+  /// Sums of products of a marker's whitened residuals, some samples apart; they fade.
+  struct Products {
+    Vector6d sum = Vector6d::Zero();
+    double products = 0, squares = 0, size = 0;
+    void add(const Vector6d& residual, const Vector6d& earlier);
+  };
+  std::map<ElementId, std::array<Products, 2>> products_;  ///< at kLags
 };
 
 }  // namespace bodyschema

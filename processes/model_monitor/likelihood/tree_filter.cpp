@@ -82,7 +82,10 @@ double log_outlier_density(const Pose& X, const Pose& X_CB, const Matrix6d& S,
               2 * llt.matrixLLT().diagonal().array().log().sum() + 3 * std::log(2 * M_PI)) -
       std::log(8 * M_PI * M_PI);
   const double quarter = std::log(0.25), eighth = std::log(0.125);
-  return log_sum_exp({quarter + log_normal_density(log(flipped(X).inverse() * X_CB), flip),
+  // A flip is mirrored exactly, or nearly so.
+  const Vector6d from_flip = log(flipped(X).inverse() * X_CB);
+  return log_sum_exp({eighth + log_normal_density(from_flip, S),
+                      eighth + log_normal_density(from_flip, flip),
                       quarter + log_normal_density(xi, tilt),
                       eighth + log_normal_density(xi, S + 9 * variances),
                       eighth + log_normal_density(xi, S + 100 * variances), eighth + log_near,
@@ -356,6 +359,7 @@ TreeFilter::Judgement TreeFilter::judge(const Instant& instant,
                                         const Alternative& alternative) const {
   Walk walk(*this, instant, alternative);
   if (!nodes_.empty()) walk.all();
+  walk.judgement.log_likelihood *= measurement_.worth;
   return walk.judgement;
 }
 

@@ -77,7 +77,7 @@ class TreeFilter {
   Instant prepare(const ActionPoseSample& sample) const;
 
   struct Judgement {
-    double log_likelihood = 0;
+    double log_likelihood = 0;  ///< times MeasurementModel::worth
     /// By node: squared Mahalanobis distance of the marker from the belief that met it; −1 unseen.
     /// Of a position alone as_of_six().
     std::vector<double> squared_distance;
