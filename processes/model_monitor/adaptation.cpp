@@ -33,7 +33,7 @@ constexpr double kPriorReadings = 100;
 constexpr double kMoreOutliers = 1.2, kMostOutliers = 0.35;
 /// Rates and worths nearer than this are the same [log].
 constexpr double kSameNoise = 0.15;
-constexpr int kUpdateEach = 16;
+constexpr int kUpdateEach = 8;
 /// What may have moved and has not surely is looked at each so many samples.
 constexpr std::int64_t kUnsureEach = 4;
 /// Below it a rate is none.
@@ -196,7 +196,7 @@ void Adaptation::update_measurement() {
   const double told = options_.measurement.outlier_rate;
   const double seen = (kPriorReadings * told + num_outliers_) / (kPriorReadings + num_read_);
   const double rate = std::clamp(kMoreOutliers * seen, told, kMostOutliers);
-  const double worth = drift_watch_.worth();
+  const double worth = drift_watch_.worth().value_or(1);
   if (getenv("DBG")) std::fprintf(stderr, "n %d rate %.3f r %.3f worth %.3f scale %.2f\n", num_samples_, rate, worth, measurement_.worth, measurement_.scale);
   if (std::abs(std::log(rate / measurement_.outlier_rate)) < kSameNoise &&
       std::abs(std::log(worth / measurement_.worth)) < kSameNoise)
@@ -305,7 +305,7 @@ void Adaptation::try_drift(std::int64_t sample_index, std::vector<AdaptationEven
 void Adaptation::watch_small_means(std::int64_t sample_index,
                                    std::vector<AdaptationEvent>* events) {
   if (tracker_.detected()) return;
-  const auto moved = drift_watch_.moved(tracker_.schema(), measurement_.worth);
+  const auto moved = drift_watch_.moved(tracker_.schema());
   if (!moved) return;
   if (!moved->is_sure && sample_index % kUnsureEach != 0) return;
   const std::vector<ElementId> elements = elements_around(tracker_.filter(), moved->element.id);
@@ -509,15 +509,15 @@ std::vector<AdaptationEvent> Adaptation::on_new_sample(ActionPoseSample sample) 
   watch_tags(&sample, &events);
   if (num_samples_ >= options_.calibration_samples) drop_fallen(&sample, &events);
   watch_visibility(seen, sample, &events);
+  const TreeFilter::Instant instant = tracker_.filter().prepare(sample);
+  drift_watch_.add(tracker_.filter(), instant, tracker_.schema(),
+                   schema_.displacements(sample.action), sample.sample_index);
   if (++num_samples_ <= options_.calibration_samples) {
     tracker_.add_silently(sample);
     if (num_samples_ == options_.calibration_samples) calibrate(tracker_.recent());
     schema_.moved_tags = moved_tags_;
     return events;
   }
-  const TreeFilter& filter = tracker_.filter();
-  drift_watch_.add(filter, filter.prepare(sample), tracker_.schema(),
-                   schema_.displacements(sample.action), sample.sample_index);
   const TreeFilter::Judgement judgement = tracker_.on_sample(sample, &events);
   watch_small_changes(sample.sample_index, &events);
   try_drift(sample.sample_index, &events);

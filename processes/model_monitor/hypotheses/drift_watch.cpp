@@ -27,9 +27,10 @@ constexpr std::size_t kFewestBefore = 30;
 /// Share of the model's covariance that differs from action to action.
 constexpr double kWithTheAction = 0.15;
 /// Samples between residuals whose correlations are looked at, the fewest pairs that tell them to
-/// 0.05, and a pair's weight one sample later. Smaller correlations are not told from none.
+/// 0.1, and a pair's weight one sample later. Smaller correlations than kNoCorrelation, and than
+/// three standard deviations of none, are not told from none.
 constexpr std::array<std::int64_t, 2> kLags{1, 5};
-constexpr double kFewestProducts = 60, kFading = 0.99;
+constexpr double kFewestProducts = 20, kFading = 0.99;
 constexpr double kNoCorrelation = 0.15;
 /// An edge that may have moved is looked at by what explains it, this much before it surely has
 /// [nats].
@@ -249,7 +250,8 @@ void DriftWatch::correlate(const ElementId& tag) {
     }
 }
 
-double DriftWatch::worth() const {
+std::optional<double> DriftWatch::worth() const {
+  double no_correlation = 0;
   std::array<double, kLags.size()> correlation{};
   for (std::size_t lag = 0; lag < kLags.size(); ++lag) {
     double products = 0, squares = 0, size = 0;
@@ -261,11 +263,12 @@ double DriftWatch::worth() const {
       squares += of.squares - constant;
       size += of.size;
     }
-    if (size < kFewestProducts || squares <= 0) return 1;
+    if (size < kFewestProducts || squares <= 0) return std::nullopt;
     correlation[lag] = products / squares;
+    no_correlation = std::max(kNoCorrelation, 3 / std::sqrt(6 * size));
   }
   const auto [near, far] = correlation;
-  if (near < kNoCorrelation) return 1;
+  if (near < no_correlation) return 1;
   const double ratio = std::clamp(far / near, 1e-3, 0.99);
   const double phi = std::pow(ratio, 1.0 / static_cast<double>(kLags[1] - kLags[0]));
   return 1 / (1 + 2 * near / (1 - phi));
@@ -360,8 +363,9 @@ double DriftWatch::log_chance(const Mean& newest, const Mean* before, double wor
   return log_chance;
 }
 
-std::optional<DriftWatch::Moved> DriftWatch::moved(const BodySchema& schema,
-                                                   double worth) const {
+std::optional<DriftWatch::Moved> DriftWatch::moved(const BodySchema& schema) const {
+  const std::optional<double> worth = this->worth();
+  if (!worth) return std::nullopt;
   std::optional<Moved> moved;
   double least = log_sure_ + kHalfSure;
   for (const auto& [element, unused] : measured_) {
@@ -382,9 +386,11 @@ std::optional<DriftWatch::Moved> DriftWatch::moved(const BodySchema& schema,
           twist = screw_twist(edge->joints[link]);
           if (link == 0) twist = adjoint(edge->left) * *twist;
         }
-        double chance = log_chance(links[link], nullptr, worth, twist);
+        // What is off from the first sample on is no change, unless by much.
+        double chance = 0;
+        if (queue->size() >= kMostNewest) chance = log_chance(links[link], nullptr, *worth, twist);
         if (before != before_.end() && before->second[link].size >= kFewestBefore)
-          chance = std::min(chance, log_chance(links[link], &before->second[link], worth, twist));
+          chance = std::min(chance, log_chance(links[link], &before->second[link], *worth, twist));
         if (chance >= least) continue;
         least = chance;
         moved = Moved{element, (*queue)[n].sample_index, chance < log_sure_};

@@ -83,12 +83,12 @@ class DriftWatch {
     std::int64_t since = 0;    ///< first sample of the newest ones whose mean shows it most
     bool is_sure = false;      ///< by the rate of false alarms; else it is worth an explanation
   };
-  /// The element that has moved most, if any has. `schema` is the one that stands.
-  std::optional<Moved> moved(const BodySchema& schema, double worth = 1) const;
-  /// Independent samples that one is worth: MeasurementModel::worth, of the markers' noise. 1 as long
-  /// as there are few. The correlations of residuals some samples apart, ρ_k = ρ₁ φ^(k − 1), add up
+  /// The element that has moved most, if any has, once worth() is known. `schema` is the one that stands.
+  std::optional<Moved> moved(const BodySchema& schema) const;
+  /// Independent samples that one is worth: MeasurementModel::worth, of the markers' noise; unknown
+  /// as long as few were added. The correlations of residuals some samples apart, ρ_k = ρ₁ φ^(k − 1), add up
   /// to 1 + 2 ρ₁ / (1 − φ) samples for one.
-  double worth() const;
+  std::optional<double> worth() const;
   /// T(t) of an edge from its newest measurements: the better of the two sides. std::nullopt if
   /// there are fewer than four.
   std::optional<Drift> follow(const BodySchema& schema, int part) const;
