@@ -12,10 +12,23 @@
 namespace bodyschema {
 
 /// Names of health_event_t::CAUSE_*, in their order, as in docs/glossary.md; "": CAUSE_NONE.
-inline constexpr std::array<std::string_view, health_event_t::CAUSE_UNEXPLAINED + 1> kCauseNames = {
-    "",         "joint_stuck", "joint_offset", "joint_gain",     "joint_nonlinear",
-    "geometry", "new_model",   "marker_moved", "marker_missing", "camera_moved",
-    "drift",    "rigid",       "other_signal", "stored",         "unexplained"};
+inline constexpr std::array<std::string_view, health_event_t::CAUSE_INTERMITTENT + 1> kCauseNames =
+    {"",
+     "joint_stuck",
+     "joint_offset",
+     "joint_gain",
+     "joint_nonlinear",
+     "geometry",
+     "new_model",
+     "marker_moved",
+     "marker_missing",
+     "camera_moved",
+     "drift",
+     "rigid",
+     "other_signal",
+     "stored",
+     "unexplained",
+     "intermittent"};
 
 /// @throws std::logic_error if there is no cause of that name.
 inline std::int8_t cause_named(std::string_view name) {

@@ -11,6 +11,7 @@
 #include "common/estimation/chi_square.h"
 #include "common/estimation/quantile.h"
 #include "common/geometry/angle.h"
+#include "processes/model_monitor/changes/change_family.h"
 #include "processes/model_monitor/changes/drift.h"
 #include "processes/model_monitor/hypotheses/schema_difference.h"
 #include "processes/model_monitor/likelihood/reading_distance.h"
@@ -18,6 +19,8 @@
 namespace bodyschema {
 namespace {
 
+/// Where an edge comes and goes no more, at most one reading in so many is an outlier.
+constexpr std::size_t kEachOutlier = 10;
 /// In a stream a marker that is read farther than this from where it should be is turned over.
 constexpr double kTurnedOver_rad = 120 * kDegree;
 /// Samples before a mismatch that are looked at for the begin of a drift, and all of them.
@@ -127,7 +130,7 @@ EdgeState Adaptation::state_of(const ElementId& element) const {
     if (c.what.element == element || std::find(also.begin(), also.end(), element) != also.end())
       return EdgeState::kProvisional;
   }
-  if (!element.is_tag() && drifting_ == element.id) return EdgeState::kProvisional;
+  if (!element.is_tag() && is_followed(element.id)) return EdgeState::kProvisional;
   const double statistic =
       element.is_tag() ? marker_statistic(element.id) : edge_statistic(element.id);
   return statistic > options_.suspicion ? EdgeState::kSuspect : EdgeState::kOk;
@@ -197,7 +200,6 @@ void Adaptation::update_measurement() {
   const double seen = (kPriorReadings * told + num_outliers_) / (kPriorReadings + num_read_);
   const double rate = std::clamp(kMoreOutliers * seen, told, kMostOutliers);
   const double worth = drift_watch_.worth().value_or(1);
-  if (getenv("DBG")) std::fprintf(stderr, "n %d rate %.3f r %.3f worth %.3f scale %.2f\n", num_samples_, rate, worth, measurement_.worth, measurement_.scale);
   if (std::abs(std::log(rate / measurement_.outlier_rate)) < kSameNoise &&
       std::abs(std::log(worth / measurement_.worth)) < kSameNoise)
     return;
@@ -223,7 +225,7 @@ void Adaptation::complete(std::int64_t sample_index, AdaptationEvent* event) con
 
 void Adaptation::watch_small_changes(std::int64_t sample_index,
                                      std::vector<AdaptationEvent>* events) {
-  if (drifting_ || !tracker_.was_adopted_at(sample_index)) return;
+  if (drifting_ || intermittent_ || !tracker_.was_adopted_at(sample_index)) return;
   const HypothesisTracker::Change& newest = tracker_.changes().back();
   if (!newest.what.fitted.change.small || newest.what.element.is_tag()) return;
   const int part = newest.what.element.id;
@@ -263,8 +265,8 @@ void Adaptation::begin_drift(int part, std::int64_t since, std::int64_t sample_i
 
 void Adaptation::try_drift(std::int64_t sample_index, std::vector<AdaptationEvent>* events) {
   const std::vector<ElementId> elements = tracker_.suspects();
-  if (drifting_ || (tracker_.changes().empty() && !tracker_.detected()) || elements.empty() ||
-      tracker_.was_adopted_at(sample_index))
+  if (drifting_ || intermittent_ || (tracker_.changes().empty() && !tracker_.detected()) ||
+      elements.empty() || tracker_.was_adopted_at(sample_index))
     return;
   if (!is_worth_a_fit(sample_index - tracker_.tests().highest().cusum.since + 1)) return;
   const std::int64_t since = tracker_.trouble_since();
@@ -318,8 +320,8 @@ void Adaptation::watch_small_means(std::int64_t sample_index,
     if (!element.is_tag()) parts.insert(element.id);
   std::optional<BegunDrift> drift;
   double drift_lead = -std::numeric_limits<double>::infinity();
-  for (BegunDrift& begun : begun_drifts(before, measurement_, {parts.begin(), parts.end()},
-                                        samples, moved->since)) {
+  for (BegunDrift& begun :
+       begun_drifts(before, measurement_, {parts.begin(), parts.end()}, samples, moved->since)) {
     const double lead = begun.log_prior + begun.log_likelihood(before, measurement_, samples) -
                         log_likelihood(before, measurement_, samples);
     if (lead <= drift_lead) continue;
@@ -327,7 +329,6 @@ void Adaptation::watch_small_means(std::int64_t sample_index,
     drift = std::move(begun);
   }
   const double step_lead = step ? step->lead : -std::numeric_limits<double>::infinity();
-  if (getenv("DBG")) std::fprintf(stderr, "t %ld moved part %d since %ld sure %d step %s lead %.1f drift %d %.1f\n", (long)sample_index, moved->element.id, (long)moved->since, moved->is_sure, step ? step->what.fitted.change.cause(before).c_str() : "-", step_lead, drift ? drift->drift.part : -1, drift_lead);
   // That the means moved speaks for a change already.
   const double needed = moved->is_sure ? 0 : options_.ambiguity;
   if (step_lead > needed && step_lead > drift_lead + needed) {
@@ -337,7 +338,68 @@ void Adaptation::watch_small_means(std::int64_t sample_index,
   }
 }
 
+void Adaptation::begin_intermittence(const Alternations::Found& found, std::int64_t sample_index,
+                                     std::vector<AdaptationEvent>* events) {
+  tracker_.take_back_all(sample_index, events);
+  tracker_.stop_fitting();
+  before_ = tracker_.settled();
+  intermittent_ = found.part;
+  intermittent_since_ = sample_index;
+  drift_watch_.look_again(before_, measurement_, found.part,
+                          tracker_.segment(found.since, kLongestDrift));
+  const Matrix6d spread = drift_watch_.spread(before_, found.part).second_moment;
+  AdaptationEvent told = tracker_.event(AdaptationEvent::Kind::kDrift, sample_index,
+                                        edge_element(found.part, schema_.root));
+  told.cause = "intermittent";
+  told.since = found.since;
+  told.size = {.kind = ChangeSize::Kind::kPose,
+               .amounts = {std::sqrt(spread.topLeftCorner<3, 3>().trace()),
+                           std::sqrt(spread.bottomRightCorner<3, 3>().trace())},
+               .sds = {-1, -1}};
+  events->push_back(told);
+}
+
+void Adaptation::watch_alternations(std::int64_t sample_index,
+                                    std::vector<AdaptationEvent>* events) {
+  if (!intermittent_) {
+    const auto found = alternations_.look(*events);
+    if (!found || drifting_ || !edge_to(schema_, found->part)) return;
+    begin_intermittence(*found, sample_index, events);
+  }
+  const auto is_at_it = [this](const HypothesisTracker::Change& c) {
+    return !c.what.element.is_tag() && c.what.element.id == *intermittent_;
+  };
+  if (std::any_of(tracker_.changes().begin(), tracker_.changes().end(), is_at_it)) {
+    intermittent_.reset();
+    return;
+  }
+  if (!tracker_.changes().empty()) return;
+  before_ = with_edge_of(tracker_.settled(), before_, *intermittent_);
+  const DriftWatch::Spread spread = drift_watch_.spread(before_, *intermittent_);
+  const std::size_t num_outliers = spread.size / kEachOutlier;
+  const bool is_one =
+      spread.num_off <= num_outliers || spread.num_off + num_outliers >= spread.size;
+  if (is_one && sample_index - intermittent_since_ >= options_.settled_after) {
+    AdaptationEvent over = tracker_.event(AdaptationEvent::Kind::kRecovered, sample_index,
+                                          edge_element(*intermittent_, schema_.root));
+    over.cause = "intermittent";
+    over.num_samples = static_cast<int>(sample_index - intermittent_since_);
+    events->push_back(over);
+    intermittent_.reset();
+    drift_watch_.forget_all();
+    tracker_.begin(before_, measurement_);
+    return;
+  }
+  const int link = static_cast<int>(edge_to(before_, *intermittent_)->joints.size());
+  BodySchema loose = changed(before_, drift_step(before_, *intermittent_, link),
+                             coordinates(Pose::Identity()), spread.second_moment);
+  // Cut: neither of its states is evidence against the other.
+  edge_at(&loose, *intermittent_).state = EdgeState::kInvalid;
+  tracker_.follow(loose, *intermittent_);
+}
+
 void Adaptation::watch_drift(std::int64_t sample_index, std::vector<AdaptationEvent>* events) {
+  if (intermittent_) return;
   if (!drifting_) watch_small_means(sample_index, events);
   if (!drifting_) return;
   const auto drift = drift_watch_.follow(before_, *drifting_);
@@ -519,6 +581,7 @@ std::vector<AdaptationEvent> Adaptation::on_new_sample(ActionPoseSample sample) 
     return events;
   }
   const TreeFilter::Judgement judgement = tracker_.on_sample(sample, &events);
+  watch_alternations(sample.sample_index, &events);
   watch_small_changes(sample.sample_index, &events);
   try_drift(sample.sample_index, &events);
   // A body that moves otherwise shows other sides of its parts.

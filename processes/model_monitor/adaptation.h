@@ -9,6 +9,7 @@
 #include "processes/model_monitor/health/fallen_markers.h"
 #include "processes/model_monitor/health/moved_tags.h"
 #include "processes/model_monitor/health/visibility_watch.h"
+#include "processes/model_monitor/hypotheses/alternations.h"
 #include "processes/model_monitor/hypotheses/drift_watch.h"
 #include "processes/model_monitor/hypotheses/hypothesis_tracker.h"
 #include "processes/model_monitor/sample_stream.h"
@@ -58,6 +59,8 @@ class Adaptation {
   /// Parts whose markers have not been seen for longer than chance explains.
   std::vector<int> missing_parts() const { return visibility_.missing_parts(); }
   bool is_drifting(int part) const { return drifting_ == part; }
+  /// Its edge drifts, or comes and goes.
+  bool is_followed(int part) const { return drifting_ == part || intermittent_ == part; }
   /// First sample with the body as the newest change left it.
   std::int64_t since() const;
   const std::vector<BodySchema>& history() const { return tracker_.history(); }
@@ -65,7 +68,7 @@ class Adaptation {
   /// Samples that were judged, and those that the noise was estimated from.
   std::int64_t num_samples() const { return num_samples_; }
   bool is_settled() const {
-    return tracker_.changes().empty() && !tracker_.detected() && !drifting_;
+    return tracker_.changes().empty() && !tracker_.detected() && !drifting_ && !intermittent_;
   }
 
  private:
@@ -88,6 +91,11 @@ class Adaptation {
                    std::vector<AdaptationEvent>* events);
   void end_drift(std::int64_t since, const Drift& drift, std::int64_t sample_index,
                  std::vector<AdaptationEvent>* events);
+  /// An edge that comes and goes is told once; until it is over its model is as uncertain as it
+  /// goes far, and nothing is adopted for it.
+  void watch_alternations(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
+  void begin_intermittence(const Alternations::Found& found, std::int64_t sample_index,
+                           std::vector<AdaptationEvent>* events);
   void watch_drift(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
   void drop_turned_over(ActionPoseSample* sample) const;
   void drop_fallen(ActionPoseSample* sample, std::vector<AdaptationEvent>* events);
@@ -119,8 +127,11 @@ class Adaptation {
   SampleStream stream_;
   DriftWatch drift_watch_;
   std::optional<int> drifting_;  ///< the edge to this part
-  BodySchema before_;            ///< the schema without the drift
-  int num_still_ = 0;            ///< samples since the drift last moved
+  BodySchema before_;            ///< the schema without the drift, or without what comes and goes
+  Alternations alternations_;
+  std::optional<int> intermittent_;      ///< the edge to this part
+  std::int64_t intermittent_since_ = 0;  ///< the sample at which that was found
+  int num_still_ = 0;                    ///< samples since the drift last moved
   /// The place of the last small change, and when.
   std::optional<std::pair<int, std::int64_t>> last_small_;
 };

@@ -55,7 +55,6 @@ void watch(ImperfectRobot* robot, int num_joints, int num_healthy, int num_broke
     for (const AdaptationEvent& event : adaptation.on_sample(robot->go(robot->random_action()))) {
       if (event.kind == AdaptationEvent::Kind::kProbeWanted) continue;
       ++count->num_alarms;
-      if (getenv("DBG")) std::fprintf(stderr, "  EVENT %d %s %s part %d to %d since %ld margin %.1f\n", n, name_of(event.kind), event.cause.c_str(), event.part, event.to, (long)event.since, event.margin);
       ++count->kinds[std::string(name_of(event.kind)) + " " + event.cause];
     }
   count->num_samples += num_healthy;

@@ -13,19 +13,19 @@ namespace bodyschema::test {
 
 enum class Fault {
   kNone,
-  kStuck,     ///< a joint in the middle stands still, somewhere within ±0.8 rad
-  kTool,      ///< the last marker moves with its tool: 0.25 m, 80°
-  kBend,      ///< a link in the middle: 45° and 3 cm
-  kOffset,    ///< a joint's zero by 20°
-  kGain,      ///< a joint goes 0.7 of the way
-  kTwo,       ///< a stuck joint and an exchanged tool
-  kAdjacent,  ///< a stuck joint, and the link after the next joint bent by 40° and 10 cm
-  kMarker,    ///< a marker in the middle moves on its part: 5 cm, 1 rad
-  kCamera,    ///< bumped: 10 cm, 15°
-  kDrift,     ///< a link bends by drift_deg a sample
-  kWorn,      ///< a joint's transmission: it goes to q + 0.6 sin 3q
-  kCoupled,   ///< a joint is moved by another signal too, half as far
-  kElastic,   ///< the link behind a joint bends with the angle: 17° and 4 cm at 1 rad
+  kStuck,        ///< a joint in the middle stands still, somewhere within ±0.8 rad
+  kTool,         ///< the last marker moves with its tool: 0.25 m, 80°
+  kBend,         ///< a link in the middle: 45° and 3 cm
+  kOffset,       ///< a joint's zero by 20°
+  kGain,         ///< a joint goes 0.7 of the way
+  kTwo,          ///< a stuck joint and an exchanged tool
+  kAdjacent,     ///< a stuck joint, and the link after the next joint bent by 40° and 10 cm
+  kMarker,       ///< a marker in the middle moves on its part: 5 cm, 1 rad
+  kCamera,       ///< bumped: 10 cm, 15°
+  kDrift,        ///< a link bends by drift_deg a sample
+  kWorn,         ///< a joint's transmission: it goes to q + 0.6 sin 3q
+  kCoupled,      ///< a joint is moved by another signal too, half as far
+  kElastic,      ///< the link behind a joint bends with the angle: 17° and 4 cm at 1 rad
   kIntermittent  ///< kBend comes and goes, for 3 to 12 samples each; it is never repaired
 };
 
@@ -40,7 +40,7 @@ struct TrueChange {
 struct Scenario {
   Fault fault = Fault::kNone;
   const char* name = "";
-  double visible = 1;  ///< share of the markers seen, each on its own
+  double visible = 1;       ///< share of the markers seen, each on its own
   double drift_deg = 0.05;  ///< kDrift: a sample, from the second block on …
   /// … until it has come so far.
   double most_drift_deg = std::numeric_limits<double>::infinity();

@@ -178,7 +178,7 @@ void Findings::agree_with(const Adaptation& adaptation, std::int64_t sample_inde
             schema.moved_tags.begin(), schema.moved_tags.end(),
             [&](const MovedTag& moved) { return moved.tag == finding.tag && moved.until < 0; });
       case State::kFollowed:
-        return !adaptation.is_drifting(finding.to >= 0 ? finding.to : finding.part);
+        return !adaptation.is_followed(finding.to >= 0 ? finding.to : finding.part);
       default:
         return is_as_at_first(finding, schema, first);
     }

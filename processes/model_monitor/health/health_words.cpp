@@ -53,6 +53,7 @@ constexpr Words kWords[] = {
     {"new_model", true, kUnknown, "{place} learned anew", ""},
     {"geometry", true, kPose, "{place} bent or exchanged{behind}",
      "{place} bent or exchanged{behind} by {size}"},
+    {"intermittent", true, kPose, "{place} comes and goes", "{place} comes and goes by {size}"},
     {"drift", true, kRate, "{place} drifts{behind}", "{place} drifts{behind} by {size} a sample"},
 };
 
@@ -131,6 +132,7 @@ std::string text_of(const AdaptationEvent& event, const std::vector<Signal>& sig
     case Kind::kRecovered:
       if (event.cause == "unexplained") return place + ": back to normal by itself, unexplained";
       if (event.cause == "drift") return place + ": drifts no more, confirmed";
+      if (event.cause == "intermittent") return place + ": comes and goes no more";
       if (event.cause == "marker_missing" || event.tag >= 0)
         return place + " is " + (event.tag >= 0 ? "where it was" : "seen") +
                " again: back to normal";

@@ -26,6 +26,8 @@ constexpr double kNumMeans = 10;
 constexpr std::size_t kFewestBefore = 30;
 /// Share of the model's covariance that differs from action to action.
 constexpr double kWithTheAction = 0.15;
+/// Of the measurements whose spread is taken, one in so many, the farthest, may be an outlier.
+constexpr std::size_t kEachFarthest = 10;
 /// Samples between residuals whose correlations are looked at, the fewest pairs that tell them to
 /// 0.1, and a pair's weight one sample later. Smaller correlations than kNoCorrelation, and than
 /// three standard deviations of none, are not told from none.
@@ -188,8 +190,8 @@ DriftWatch::DriftWatch(double false_alarm_rate)
 
 std::optional<DriftWatch::Measured> DriftWatch::measure(const TreeFilter& filter,
                                                         const TreeFilter::Instant& instant,
-                                                        const TreeFilter::Instant& exact,
-                                                        int node, Measure how) {
+                                                        const TreeFilter::Instant& exact, int node,
+                                                        Measure how) {
   const auto of = (filter.*how)(instant, node);
   const auto with_exact_models = (filter.*how)(exact, node);
   if (!of || !with_exact_models) return std::nullopt;
@@ -306,7 +308,8 @@ void DriftWatch::forget_all() {
   before_.clear();
 }
 
-const std::deque<DriftWatch::Measured>* DriftWatch::find(const ElementId& element, std::size_t fewest) const {
+const std::deque<DriftWatch::Measured>* DriftWatch::find(const ElementId& element,
+                                                         std::size_t fewest) const {
   const auto it = measured_.find(element);
   return it == measured_.end() || it->second.size() < fewest ? nullptr : &it->second;
 }
@@ -321,8 +324,7 @@ void DriftWatch::Mean::add(const Reading& reading) {
 }
 
 std::vector<DriftWatch::Reading> DriftWatch::readings(const BodySchema& schema,
-                                                      const ElementId& element,
-                                                      const Measured& m) {
+                                                      const ElementId& element, const Measured& m) {
   if (element.is_tag()) return {{log(m.of.z), m.of.covariance.inverse(), m.systematic}};
   const Edge* edge = edge_to(schema, element.id);
   const Pose X = edge ? edge->predict(m.displacements) : schema.X_CR;
@@ -400,6 +402,25 @@ std::optional<DriftWatch::Moved> DriftWatch::moved(const BodySchema& schema) con
   return moved;
 }
 
+DriftWatch::Spread DriftWatch::spread(const BodySchema& schema, int part) const {
+  const ElementId element = edge_element(part, schema.root);
+  Spread spread;
+  const auto* queue = find(element, 1);
+  if (!queue) return spread;
+  std::vector<std::pair<double, Vector6d>> offsets;  // d², ξ
+  for (auto m = queue->rbegin(); m != queue->rend() && offsets.size() < kMostNewest; ++m) {
+    const Reading reading = readings(schema, element, *m).back();
+    offsets.emplace_back(reading.xi.dot(reading.information * reading.xi), reading.xi);
+    spread.num_off += offsets.back().first > kExplained;
+  }
+  spread.size = offsets.size();
+  std::ranges::sort(offsets, {}, [](const auto& offset) { return offset.first; });
+  offsets.resize(offsets.size() - offsets.size() / kEachFarthest);
+  for (const auto& [unused, xi] : offsets)
+    spread.second_moment += xi * xi.transpose() / static_cast<double>(offsets.size());
+  return spread;
+}
+
 std::optional<Drift> DriftWatch::follow(const BodySchema& schema, int part) const {
   const auto* queue = find(edge_element(part, schema.root), kFewestFollowed);
   if (!queue) return std::nullopt;
@@ -437,8 +458,9 @@ std::optional<Drift> DriftWatch::follow(const BodySchema& schema, int part) cons
     };
     std::vector<Course> courses{{line, 0, -line.cost}};
     for (int ended = 1; ended <= kLatestEnd; ++ended) {
-      const auto num_before = std::count_if(readings.begin(), readings.end(),
-                                            [ended](const TimedReading& r) { return r.time <= -ended; });
+      const auto num_before =
+          std::count_if(readings.begin(), readings.end(),
+                        [ended](const TimedReading& r) { return r.time <= -ended; });
       if (num_before < static_cast<std::ptrdiff_t>(kFewestFollowed)) break;
       const Line stopped = fit_line(readings, -ended, 3);
       courses.push_back({stopped, ended, std::log(kEnds) - stopped.cost});

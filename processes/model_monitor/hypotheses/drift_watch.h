@@ -57,8 +57,8 @@ std::vector<BegunDrift> begun_drifts(const BodySchema& before, const Measurement
                                      std::int64_t since);
 
 /// Finds what is too small, or changes too slowly, for a CUSUM: means of the virtual measurements
-/// of every edge, and of every marker in its part, over the newest samples. The bend of a link by 0.05° a sample is below the noise
-/// of each of them, and ten standard deviations of their mean.
+/// of every edge, and of every marker in its part, over the newest samples. The bend of a link by
+/// 0.05° a sample is below the noise of each of them, and ten standard deviations of their mean.
 ///
 /// Follows what drifts, slowly or fast: the mean, by their probabilities, of a straight line
 /// through the newest measurements and of lines that ended some samples ago.
@@ -80,15 +80,22 @@ class DriftWatch {
   /// An edge, or marker, that is not where the schema has it.
   struct Moved {
     ElementId element;
-    std::int64_t since = 0;    ///< first sample of the newest ones whose mean shows it most
-    bool is_sure = false;      ///< by the rate of false alarms; else it is worth an explanation
+    std::int64_t since = 0;  ///< first sample of the newest ones whose mean shows it most
+    bool is_sure = false;    ///< by the rate of false alarms; else it is worth an explanation
   };
-  /// The element that has moved most, if any has, once worth() is known. `schema` is the one that stands.
+  /// The element that has moved most, if any has, once worth() is known. `schema` is the one that
+  /// stands.
   std::optional<Moved> moved(const BodySchema& schema) const;
   /// Independent samples that one is worth: MeasurementModel::worth, of the markers' noise; unknown
-  /// as long as few were added. The correlations of residuals some samples apart, ρ_k = ρ₁ φ^(k − 1), add up
-  /// to 1 + 2 ρ₁ / (1 − φ) samples for one.
+  /// as long as few were added. The correlations of residuals some samples apart, ρ_k = ρ₁ φ^(k −
+  /// 1), add up to 1 + 2 ρ₁ / (1 − φ) samples for one.
   std::optional<double> worth() const;
+  /// How far the pose of an edge's part is from where `schema` has it, in the newest measurements.
+  struct Spread {
+    Matrix6d second_moment = Matrix6d::Zero();  ///< of ξ, right perturbation, without the farthest
+    std::size_t size = 0, num_off = 0;          ///< measurements; those that noise does not explain
+  };
+  Spread spread(const BodySchema& schema, int part) const;
   /// T(t) of an edge from its newest measurements: the better of the two sides. std::nullopt if
   /// there are fewer than four.
   std::optional<Drift> follow(const BodySchema& schema, int part) const;

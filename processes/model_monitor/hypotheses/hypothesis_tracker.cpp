@@ -413,6 +413,8 @@ void HypothesisTracker::take_back(const std::function<bool(const ElementId&)>& i
 }
 
 void HypothesisTracker::remember(const BodySchema& schema) {
+  const auto is_cut = [](const Edge& edge) { return edge.state == EdgeState::kInvalid; };
+  if (std::any_of(schema.edges.begin(), schema.edges.end(), is_cut)) return;
   const auto alike = std::find_if(history_.begin(), history_.end(), [&](const BodySchema& stored) {
     return is_alike(stored, schema);
   });

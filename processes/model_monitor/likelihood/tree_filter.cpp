@@ -84,12 +84,11 @@ double log_outlier_density(const Pose& X, const Pose& X_CB, const Matrix6d& S,
   const double quarter = std::log(0.25), eighth = std::log(0.125);
   // A flip is mirrored exactly, or nearly so.
   const Vector6d from_flip = log(flipped(X).inverse() * X_CB);
-  return log_sum_exp({eighth + log_normal_density(from_flip, S),
-                      eighth + log_normal_density(from_flip, flip),
-                      quarter + log_normal_density(xi, tilt),
-                      eighth + log_normal_density(xi, S + 9 * variances),
-                      eighth + log_normal_density(xi, S + 100 * variances), eighth + log_near,
-                      eighth + log_flat_density()});
+  return log_sum_exp(
+      {eighth + log_normal_density(from_flip, S), eighth + log_normal_density(from_flip, flip),
+       quarter + log_normal_density(xi, tilt), eighth + log_normal_density(xi, S + 9 * variances),
+       eighth + log_normal_density(xi, S + 100 * variances), eighth + log_near,
+       eighth + log_flat_density()});
 }
 
 double log_marker_density(const Pose& X, const Pose& X_CB, const Matrix6d& S,

@@ -46,11 +46,10 @@ TEST(DriftWatchTest, ASlowBendIsFoundAtItsEdgeWhileItIsSmallAndThenFollowed) {
   for (const int seed : {1, 2, 3}) {
     BrokenArm arm({Fault::kDrift, "", 0.85}, Regime::kTagIso, kHealthy, seed);
     DriftWatch watch(1e-5);
-    const int found = feed(arm, watch, 0, 4 * kHealthy,
-                           [&] {
-                             const auto moved = watch.moved(arm.engineered());
-                             return moved && moved->is_sure;
-                           });
+    const int found = feed(arm, watch, 0, 4 * kHealthy, [&] {
+      const auto moved = watch.moved(arm.engineered());
+      return moved && moved->is_sure;
+    });
     EXPECT_GT(found, kHealthy);
     EXPECT_LT(found, kHealthy + 75);  // 3.75°, about 20 mm at the end effector
     EXPECT_EQ(watch.moved(arm.engineered())->element, edge_element(4, 1));
@@ -116,6 +115,21 @@ TEST(DriftWatchTest, ABentLinkHasNotDriftedWell) {
     EXPECT_FALSE(drifts.empty());
     for (const BegunDrift& drift : drifts) EXPECT_FALSE(drift.is_good);
   }
+}
+
+TEST(DriftWatchTest, TheSpreadOfAnEdgeIsThatOfWhatItDoes) {
+  BrokenArm arm({Fault::kIntermittent, "", 1}, Regime::kTagIso, 60, 2);
+  DriftWatch watch(1e-5);
+  feed(arm, watch, 0, 60, [] { return false; });
+  const DriftWatch::Spread whole = watch.spread(arm.engineered(), 5);
+  EXPECT_EQ(whole.size, 40U);
+  EXPECT_LE(whole.num_off, 3U);
+  feed(arm, watch, 60, 120, [] { return false; });
+  const DriftWatch::Spread broken = watch.spread(arm.engineered(), 5);
+  EXPECT_GE(broken.num_off, 8U);
+  // 45° for a part of the time, against some degrees of noise.
+  EXPECT_GT(std::sqrt(broken.second_moment.bottomRightCorner<3, 3>().trace()), 15 * kDegree);
+  EXPECT_LT(std::sqrt(whole.second_moment.bottomRightCorner<3, 3>().trace()), 5 * kDegree);
 }
 
 TEST(DriftWatchTest, WhatIsForgottenSaysNothing) {

@@ -1,0 +1,34 @@
+#pragma once
+
+#include <cstdint>
+#include <deque>
+#include <map>
+#include <optional>
+#include <vector>
+
+#include "processes/model_monitor/health/adaptation_event.h"
+
+namespace bodyschema {
+
+/// Finds an edge that changes to and fro: a loose screw, a cable that catches now and then, or a
+/// transmission with more play than its model has room for. One explanation after another would be
+/// adopted and undone.
+class Alternations {
+ public:
+  struct Found {
+    int part = 0;            ///< the edge that leads to it
+    std::int64_t since = 0;  ///< its first change
+  };
+  /// Events of one sample, samples in their order. Finds an edge at its kChanges-th change within
+  /// kWithin samples, and forgets all others then.
+  std::optional<Found> look(const std::vector<AdaptationEvent>& events);
+
+  /// Chosen: a fault is found and repaired, or explained otherwise once, in fewer.
+  static constexpr std::size_t kChanges = 4;
+  static constexpr std::int64_t kWithin = 60;
+
+ private:
+  std::map<int, std::deque<std::int64_t>> changes_;  ///< by part, samples
+};
+
+}  // namespace bodyschema
