@@ -330,8 +330,9 @@ void Adaptation::watch_small_means(std::int64_t sample_index,
   }
   const double step_lead = step ? step->lead : -std::numeric_limits<double>::infinity();
   // That the means moved speaks for a change already.
-  const double needed = moved->is_sure ? 0 : options_.ambiguity;
-  if (step_lead > needed && step_lead > drift_lead + needed) {
+  const double needed = moved->is_sure ? 0 : options_.acceptance;
+  const double over_drift = moved->is_sure ? 0 : options_.ambiguity;
+  if (step_lead > needed && step_lead > drift_lead + over_drift) {
     tracker_.adopt(*step, sample_index, events);
   } else if (moved->is_sure && drift_lead >= step_lead) {
     begin_drift(drift ? drift->drift.part : moved->element.id, sample_index, sample_index, events);

@@ -189,8 +189,9 @@ TEST(OddNoiseTest, AHealthyArmIsLeftInPeaceAndABentOneIsFound) {
       }
       EXPECT_TRUE(is_found) << "seed " << seed;
     }
-    // 10 and more before correlations and outlier rates were estimated.
-    EXPECT_LE(num_false, 2) << c.correlation << ", " << c.student_nu;
+    // One false episode, of three events; 14 events and more while neither correlations nor the
+    // rate of outliers were estimated.
+    EXPECT_LE(num_false, 3) << c.correlation << ", " << c.student_nu;
   }
 }
 
