@@ -22,8 +22,12 @@ namespace bodyschema {
 /// moved on their part (FallenMarkers, MovedTags). Which changes the body made is for
 /// HypothesisTracker. What changes all the time looks like one step after another: a drift from
 /// nothing at a constant rate (begun_drifts) competes with the steps by its evidence, and is then
-/// followed by DriftWatch until it moves no more; a drift too slow for the CUSUMs is found by
-/// DriftWatch itself.
+/// followed by DriftWatch until it moves no more. What is too small for the CUSUMs, a step or a
+/// slow drift, DriftWatch finds by means over many samples. An edge that comes and goes
+/// (Alternations) is told once, and cut until it is over.
+///
+/// The noise is taken as it is seen: its size, the rate of outliers, and how many independent
+/// samples one is worth where it is correlated.
 ///
 /// What repeats another sample (SampleStream) is neither looked at nor counted. Where an edge is
 /// soft the assumed noise has room for what its model leaves, so noise_scale() stays at 1 or above,
