@@ -4,17 +4,27 @@ namespace bodyschema {
 
 std::optional<Alternations::Found> Alternations::look(const std::vector<AdaptationEvent>& events) {
   using Kind = AdaptationEvent::Kind;
+  struct Seen {
+    std::int64_t sample = 0;
+    bool is_away = false, is_back = false;
+  };
+  std::map<int, Seen> seen;
   for (const AdaptationEvent& event : events) {
-    const bool is_change = event.kind == Kind::kCandidate || event.kind == Kind::kRestored ||
-                           event.kind == Kind::kReverted;
-    if (!is_change || event.from < 0) continue;
-    std::deque<std::int64_t>& changes = changes_[event.to];
+    if (event.from < 0) continue;
+    Seen& there = seen[event.to];
+    there.sample = event.sample_index;
+    there.is_away |= event.kind == Kind::kCandidate;
+    there.is_back |= event.kind == Kind::kRestored || event.kind == Kind::kReverted;
+  }
+  for (const auto& [part, now] : seen) {
     // One form instead of another is no change of the body.
-    if (!changes.empty() && changes.back() == event.sample_index) continue;
-    changes.push_back(event.sample_index);
-    while (changes.front() <= event.sample_index - kWithin) changes.pop_front();
+    if (now.is_away == now.is_back) continue;
+    std::deque<Change>& changes = changes_[part];
+    if (!changes.empty() && changes.back().is_away == now.is_away) continue;
+    changes.push_back({now.sample, now.is_away});
+    while (changes.front().sample <= now.sample - kWithin) changes.pop_front();
     if (changes.size() < kChanges) continue;
-    const Found found{event.to, changes.front()};
+    const Found found{part, changes.front().sample};
     changes_.clear();
     return found;
   }

@@ -19,8 +19,8 @@ class Alternations {
     int part = 0;            ///< the edge that leads to it
     std::int64_t since = 0;  ///< its first change
   };
-  /// Events of one sample, samples in their order. Finds an edge at its kChanges-th change within
-  /// kWithin samples, and forgets all others then.
+  /// Events of one sample, samples in their order. Finds an edge at its kChanges-th change, away
+  /// and back in turn, within kWithin samples, and forgets all others then.
   std::optional<Found> look(const std::vector<AdaptationEvent>& events);
 
   /// Chosen: a fault is found and repaired, or explained otherwise once, in fewer.
@@ -28,7 +28,11 @@ class Alternations {
   static constexpr std::int64_t kWithin = 60;
 
  private:
-  std::map<int, std::deque<std::int64_t>> changes_;  ///< by part, samples
+  struct Change {
+    std::int64_t sample = 0;
+    bool is_away = false;  ///< a changed model was adopted; else one from before, or it was undone
+  };
+  std::map<int, std::deque<Change>> changes_;  ///< by part; away and back in turn
 };
 
 }  // namespace bodyschema

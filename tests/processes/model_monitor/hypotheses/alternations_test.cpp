@@ -46,6 +46,13 @@ TEST(AlternationsTest, OneFormInsteadOfAnotherIsOneChange) {
   }
 }
 
+TEST(AlternationsTest, AFaultThatNoFormExplainsWellIsNoAlternation) {
+  // One form after another is adopted for it.
+  Alternations alternations;
+  for (std::int64_t n = 0; n < 8; ++n)
+    EXPECT_FALSE(alternations.look(change(60 + n, Kind::kCandidate, 3, 4)));
+}
+
 TEST(AlternationsTest, MarkersAreNotLookedAt) {
   Alternations alternations;
   for (std::int64_t n = 0; n < 8; ++n) {
