@@ -131,10 +131,11 @@ void Adaptation::watch_small_means(std::int64_t sample_index,
     if (!element.is_tag()) parts.insert(element.id);
   std::optional<BegunDrift> drift;
   double drift_lead = -std::numeric_limits<double>::infinity();
+  const double unchanged = log_likelihood(before, measurement_, samples);
   for (BegunDrift& begun :
        begun_drifts(before, measurement_, {parts.begin(), parts.end()}, samples, moved->since)) {
-    const double lead = begun.log_prior + begun.log_likelihood(before, measurement_, samples) -
-                        log_likelihood(before, measurement_, samples);
+    const double lead =
+        begun.log_prior + begun.log_likelihood(before, measurement_, samples) - unchanged;
     if (lead <= drift_lead) continue;
     drift_lead = lead;
     drift = std::move(begun);

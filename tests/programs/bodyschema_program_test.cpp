@@ -1329,7 +1329,7 @@ TEST_F(BodyschemaProgramTest, PositionsAloneAreLearnedShownPredictedAndMonitored
                  "half.csv:2:", 1);
 }
 
-TEST_F(BodyschemaProgramTest, TheRateOfOutliersIsThatOfTheRigBesideALog) {
+TEST_F(BodyschemaProgramTest, WildPosesAreSeenWhateverRateTheRigBesideALogTells) {
   test::Rng rng(76);
   robot_ = test::chapter_robot("a", rng);
   const test::ObservationOptions options{.regime = test::Regime::kTagIso, .with_covariances = true};

@@ -8,6 +8,7 @@
 #include "common/estimation/student_t.h"
 #include "processes/model_monitor/changes/change_family.h"
 #include "processes/model_monitor/hypotheses/drift_watch.h"
+#include "processes/model_monitor/hypotheses/schema_difference.h"
 
 namespace bodyschema {
 namespace {
@@ -101,6 +102,8 @@ std::optional<DriftWatch::Moved> DriftWatch::moved(const BodySchema& schema) con
   if (!worth) return std::nullopt;
   std::optional<Moved> moved;
   double least = log_sure_ + kHalfSure;
+  // The schema may have changed with the newest sample.
+  const bool has_before = is_same(schema, schema_);
   for (const auto& [element, unused] : measured_) {
     const auto* queue = find(element, kFewest);
     if (!queue) continue;
@@ -124,7 +127,7 @@ std::optional<DriftWatch::Moved> DriftWatch::moved(const BodySchema& schema) con
         // What is off from the first sample on is no change, unless by much.
         double chance = 0;
         if (queue->size() >= kMostNewest) chance = log_chance(links[link], nullptr, *worth, twist);
-        if (before != before_.end() && before->second[link].size >= kFewestBefore)
+        if (has_before && before != before_.end() && before->second[link].size >= kFewestBefore)
           chance = std::min(chance, log_chance(links[link], &before->second[link], *worth, twist));
         if (chance >= least) continue;
         least = chance;
@@ -167,7 +170,7 @@ void DriftWatch::correlate(const ElementId& tag) {
     return Eigen::LLT<Matrix6d>(m.of.covariance).matrixL().solve(log(m.of.z));
   };
   const Vector6d residual = whitened(queue.back());
-  if (residual.squaredNorm() > kExplained) return;
+  if (!(residual.squaredNorm() <= kExplained)) return;  // nor what is no number
   for (std::size_t lag = 0; lag < kLags.size(); ++lag)
     for (auto m = queue.rbegin(); m != queue.rend(); ++m) {
       const std::int64_t apart = queue.back().sample_index - m->sample_index;

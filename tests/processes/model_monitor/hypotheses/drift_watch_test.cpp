@@ -117,6 +117,22 @@ TEST(DriftWatchTest, ABentLinkHasNotDriftedWell) {
   }
 }
 
+TEST(DriftWatchTest, WhatIsKnownOfAnotherSchemaIsNotHeldAgainstThis) {
+  BrokenArm arm({Fault::kNone, "", 1}, Regime::kTagIso, 75, 1);
+  BodySchema rigid = arm.engineered();  // its edges have fewer links
+  for (Edge& edge : rigid.edges) {
+    edge.joints.clear();
+    edge.parameter_covariance = Eigen::MatrixXd::Zero(6, 6);
+  }
+  const TreeFilter filter(rigid, test::adaptation_options(Regime::kTagIso).measurement);
+  DriftWatch watch(1e-5);
+  for (int t = 0; t < 120; ++t) {
+    const ActionPoseSample sample = arm.observe(t);
+    watch.add(filter, filter.prepare(sample), rigid, rigid.displacements(sample.action), t);
+  }
+  EXPECT_NO_THROW(watch.moved(arm.engineered()));  // reads nothing beyond its links
+}
+
 TEST(DriftWatchTest, TheSpreadOfAnEdgeIsThatOfWhatItDoes) {
   BrokenArm arm({Fault::kIntermittent, "", 1}, Regime::kTagIso, 60, 2);
   DriftWatch watch(1e-5);
