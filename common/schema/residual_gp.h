@@ -16,7 +16,7 @@ namespace bodyschema {
 /// factorisations follow from these. That is what travels.
 class ResidualGp {
  public:
-  static constexpr int kMaxSamples = 64;
+  static constexpr int kMaxSamples = 256;
 
   struct Prior {
     Eigen::VectorXd length_scales;                ///< D, command units

@@ -40,15 +40,8 @@ Noise typical_noise(const std::vector<ActionPoseSample>& samples) {
   return {std::sqrt(position / count), std::sqrt(rotation / std::max(num_rotations, 1))};
 }
 
-// What stiff models leave is no noise where it is more than any tag or tracker has: chosen, above
-// the 3 mm and 1° of tags, below the 30 to 46 mm and 9 to 15° of two joints fitted to a real arm of
-// seven (16 subsets of arm7_ends.csv), which a Gaussian process would then explain well enough.
-constexpr Noise kLargestGuess{0.01, 3 * kDegree};
-
 bool is_guess_too_large(const MeasurementModel& measurement, NoiseSource source) {
-  return source == NoiseSource::kResiduals &&
-         (measurement.noise->position_m > kLargestGuess.position_m ||
-          measurement.noise->rotation_rad > kLargestGuess.rotation_rad);
+  return source == NoiseSource::kResiduals && is_above_any_marker(*measurement.noise);
 }
 bool is_guess_too_large(const LearnedStructure& structure) {
   return is_guess_too_large(structure.options.measurement, structure.noise_source);

@@ -30,7 +30,7 @@ constexpr Quantile kMedian{0.5, 2.366};
 // upper quarter. A marker that flips at a fifth of the instants is outside.
 constexpr Quantile kUpper{0.75, 4.108};
 constexpr double kSafety = 1.2;
-constexpr int kFramesOfAPair = 120, kFramesOfAStream = 400;
+constexpr int kFramesOfAPair = 120, kFramesOfAStream = 400, kFramesOfASoftPair = 400;
 constexpr int kMinRepeats = 5;
 // Of a pair, per axis: any tag's or tracker's is below.
 constexpr double kLargestRotationNoise = 1.5 * kDegree;
@@ -237,17 +237,16 @@ class ModelNoise {
     return best;
   }
 
-  // A Gaussian process on all signals, by the blocks of time that are left out.
+  // A Gaussian process, by the blocks of time that are left out.
   void offer_soft(int part_i, int part_j, ScaledFit* best) const {
-    const std::vector<int>& signals = actions_.moving();
-    if (best->signals == signals || signals.size() > kMaxChainJoints) return;
     ScaledFit soft;
     Noise noise = kRough;
     for (int round = 0; round < 4; ++round) {
-      const PairData pair = pair_data(part_i, part_j, noise);
+      const PairData pair = pair_data(part_i, part_j, noise, kFramesOfASoftPair);
       const auto fit =
-          fit_soft_model(screen_rigid(pair, actions_).model, pair, actions_, {}, signals);
+          fit_soft_model(screen_rigid(pair, actions_).model, pair, actions_, {}, soft.signals);
       if (!fit) return;
+      soft.signals = fit->model.signals;
       soft.residuals.clear();
       for (int t = 0; t < pair.size(); ++t)
         soft.residuals.push_back(residual_of(fit->residual[t], pair, fit->frames[t]));
@@ -255,7 +254,6 @@ class ModelNoise {
       noise = floored(soft.noise, 1);
     }
     soft.scale = scale_of(soft.noise);
-    soft.signals = signals;
     best->replace_if_explained(std::move(soft));
   }
 
@@ -284,10 +282,13 @@ class ModelNoise {
   }
 
   PairData pair_data(int part_i, int part_j, const Noise& noise) const {
+    return pair_data(part_i, part_j, noise,
+                     actions_.blocks().is_stream() ? kFramesOfAStream : kFramesOfAPair);
+  }
+  PairData pair_data(int part_i, int part_j, const Noise& noise, int max_frames) const {
     MeasurementModel measurement;
     measurement.noise = noise;
-    return make_pair_data(samples_, part_i, part_j, measurement,
-                          actions_.blocks().is_stream() ? kFramesOfAStream : kFramesOfAPair);
+    return make_pair_data(samples_, part_i, part_j, measurement, max_frames);
   }
 
   const std::vector<ActionPoseSample>& samples_;
@@ -356,7 +357,8 @@ std::vector<std::pair<int, int>> near_pairs(const std::vector<ActionPoseSample>&
 using FitsOfPairs = std::map<std::pair<int, int>, ScaledFit>;
 
 // Where one joint does not suffice, more may, or a Gaussian process. Edges far above the quietest
-// do, and those of a stream far above its jitter; with few edges any may.
+// do, those of a stream far above its jitter, and what is no marker's noise; with few edges any
+// may. Chains of many joints pass for soft bodies, roughly.
 void offer_richer_models(const ModelNoise& model_noise, const std::vector<int>& parts,
                          const std::vector<std::pair<int, int>>& tree,
                          const std::optional<Noise>& jitter, int max_signals, FitsOfPairs* fits) {
@@ -364,6 +366,7 @@ void offer_richer_models(const ModelNoise& model_noise, const std::vector<int>& 
   for (const auto& ij : tree) quietest = std::min(quietest, fits->at(ij).scale);
   const auto may_be_richer = [&](const ScaledFit& fit) {
     return tree.size() <= 2 || fit.scale >= quietest + std::log(4.0) ||
+           is_above_any_marker(fit.noise) ||
            (jitter && fit.scale > scale_of(floored(*jitter, kLargestBias)));
   };
   for (const auto& ij : tree) {
@@ -376,7 +379,9 @@ void offer_richer_models(const ModelNoise& model_noise, const std::vector<int>& 
     }
     if (max_signals > kMaxScreenedJoints && may_be_richer(fit))
       model_noise.offer_long_chain(part_i, part_j, max_signals, &fit);
-    if (max_signals > 0 && may_be_richer(fit)) model_noise.offer_soft(part_i, part_j, &fit);
+    const bool is_long = fit.signals.size() > kMaxScreenedJoints;
+    if (max_signals > 0 && (is_long || may_be_richer(fit)))
+      model_noise.offer_soft(part_i, part_j, &fit);
   }
 }
 
@@ -398,6 +403,10 @@ std::vector<NoiseResidual> residuals_of_quiet(const std::vector<const ScaledFit*
 }
 
 }  // namespace
+
+bool is_above_any_marker(const Noise& noise) {
+  return noise.position_m > 0.01 || noise.rotation_rad > 3 * kDegree;
+}
 
 std::vector<std::vector<int>> repeats(const NormalizedActions& actions) {
   if (actions.moving().empty() || actions.blocks().is_stream()) return {};

@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <numeric>
 
 #include "common/estimation/quantile.h"
 #include "common/gp/minimize_in_box.h"
@@ -14,6 +15,10 @@ namespace {
 constexpr int kMaxInputs = 12;
 constexpr std::size_t kLeastSamples = 10;
 constexpr int kIterations = 15, kDropIterations = 8;  // of the marginal likelihood
+constexpr double kLeastNoise = 1e-2, kMostNoise = 4;  // factors on the variance that is assumed
+// Instants that tell hyper-parameters and signals: each step costs the cube of their number.
+constexpr std::size_t kShapeSamples = 64;
+constexpr std::size_t kDropCandidates = 3;
 // A signal stays if the blocks left out miss it by this [nats] and by so many of its standard
 // errors: what few blocks say may be noise. Of 150 chains with a signal without effect two kept it
 // by 17 and 12 nats, 1.6 and 0.8 errors; signals with an effect have 2.3 and more.
@@ -46,16 +51,18 @@ struct Targets {
   Vector6d noise;             // mean variance of a reading, per coordinate
 };
 
-// Instants that cover the inputs (D×n) evenly: each the one farthest from all before.
-std::vector<int> spread_evenly(const Eigen::MatrixXd& inputs, const std::vector<int>& candidates) {
+// At most so many instants that cover the inputs (D×n) evenly: each the one farthest from all
+// before.
+std::vector<int> spread_evenly(const Eigen::MatrixXd& inputs, const std::vector<int>& candidates,
+                               std::size_t most) {
   std::vector<int> chosen;
-  if (candidates.size() <= ResidualGp::kMaxSamples) return candidates;
+  if (candidates.size() <= most) return candidates;
   Eigen::VectorXd distance =
       Eigen::VectorXd::Constant(inputs.cols(), std::numeric_limits<double>::infinity());
   int next = candidates.front();
   for (const int c : candidates)
     if (inputs.col(c).squaredNorm() < inputs.col(next).squaredNorm()) next = c;
-  while (chosen.size() < ResidualGp::kMaxSamples) {
+  while (chosen.size() < most) {
     chosen.push_back(next);
     int farthest = -1;
     for (const int c : candidates) {
@@ -69,6 +76,23 @@ std::vector<int> spread_evenly(const Eigen::MatrixXd& inputs, const std::vector<
   std::sort(chosen.begin(), chosen.end());
   return chosen;
 }
+
+// Of a whitened residual about zero.
+class Predicted {
+ public:
+  explicit Predicted(const Matrix6d& covariance) : llt_(covariance) {}
+  double squared_distance(const Vector6d& residual) const {
+    return residual.dot(llt_.solve(residual));
+  }
+  // Of which the constant is left out, and an outlier costs no more than the farthest inlier.
+  double log_density(const Vector6d& residual) const {
+    return -0.5 * std::min(squared_distance(residual), 2 * kOutlierThreshold) -
+           llt_.matrixLLT().diagonal().array().log().sum();
+  }
+
+ private:
+  Eigen::LLT<Matrix6d> llt_;
+};
 
 // Hyper-parameters over normalised inputs.
 struct Shape {
@@ -132,11 +156,20 @@ class Fitter {
     inputs_.resize(static_cast<Eigen::Index>(signals.size()), pair_->size());
     for (std::size_t d = 0; d < signals.size(); ++d)
       inputs_.row(static_cast<Eigen::Index>(d)) = input_row(signals[d]).transpose();
-    choose_samples();
+    choose_samples(kShapeSamples);
     if (samples_.size() < kLeastSamples) return false;
     maximize(start, max_iterations);
     judge();
     return true;
+  }
+  // As many samples as a process takes, with the hyper-parameters as they are. Errors that last
+  // longer than from one sample to the next make that worse: then it is left.
+  void use_more_samples() {
+    Fitter more = *this;
+    more.choose_samples(ResidualGp::kMaxSamples);
+    if (more.samples_.size() <= samples_.size()) return;
+    more.judge();
+    if (more.judged_.log_density > judged_.log_density) *this = std::move(more);
   }
   // Readings and weights from the judgement.
   void reweigh() {
@@ -197,12 +230,12 @@ class Fitter {
   }
 
   // Among the frames that are no outliers, as far as one can tell.
-  void choose_samples() {
+  void choose_samples(std::size_t most) {
     std::vector<int> candidates;
     const double least = robust_weight(kOutlierThreshold);
     for (int t = 0; t < pair_->size(); ++t)
       if (targets_.weights(t) >= least) candidates.push_back(t);
-    samples_ = spread_evenly(inputs_, candidates);
+    samples_ = spread_evenly(inputs_, candidates, most);
   }
 
   void maximize(const Shape* start, int max_iterations) {
@@ -242,8 +275,8 @@ class Fitter {
       upper(D + c) = std::log(1e3 * largest);
       v(D + c) = std::log(std::max(spread(c), 2e-3 * targets_.noise(c)));
     }
-    lower(D + 6) = std::log(1e-2);
-    upper(D + 6) = std::log(4.0);
+    lower(D + 6) = std::log(kLeastNoise);
+    upper(D + 6) = std::log(kMostNoise);
     v(D + 6) = 0;
     if (start) {
       v << start->log_lengths, start->log_variances, start->log_noise;
@@ -323,12 +356,12 @@ class Fitter {
       // To first order the variance of ρ is one of the pose, moved by the right Jacobian.
       const Matrix6d G = h.whitening * right_jacobian_inverse(mean.col(t)).inverse();
       const Matrix6d S = G * variance.col(t).asDiagonal() * G.transpose();
-      const Eigen::LLT<Matrix6d> llt(Matrix6d::Identity() + S);
-      const double d2 = frame.residual.dot(llt.solve(frame.residual));
-      const double density = -share * (0.5 * std::min(d2, 2 * kOutlierThreshold) +
-                                       llt.matrixLLT().diagonal().array().log().sum());
-      judged_.log_density += density;
-      block_density_[static_cast<std::size_t>(blocks_.of_frame[t])] += density;
+      const double d2 = Predicted(Matrix6d::Identity() + S).squared_distance(frame.residual);
+      // The noise that is told has room for signals that are missed: the one that fits tells more.
+      const Predicted predicted(std::exp(shape_.log_noise) * Matrix6d::Identity() + S);
+      const double density = predicted.log_density(frame.residual);
+      judged_.log_density += share * density;
+      block_density_[static_cast<std::size_t>(blocks_.of_frame[t])] += share * density;
       judged_.squared_distance[t] = d2;
       judged_.residual[t] = h.whitening.triangularView<Eigen::Lower>().solve(frame.residual);
       if (d2 > kOutlierThreshold) {
@@ -338,7 +371,7 @@ class Fitter {
       ++inliers;
       distances += d2;
       uncertainty += S.trace();
-      judged_.score -= 0.5 * (frame.squared_distance + h.log_det);
+      judged_.score += density - 0.5 * h.log_det;
     }
     if (inliers == 0) return;
     judged_.mean_inlier = distances / inliers;
@@ -359,26 +392,35 @@ class Fitter {
   SoftFit judged_;
 };
 
-// Backwards: the signal that is missed least goes first.
+// Without the signal at this place in signals().
+std::optional<Fitter> without(const Fitter& full, int place) {
+  std::vector<int> fewer = full.signals();
+  fewer.erase(fewer.begin() + place);
+  Shape shape = full.shape();
+  const Eigen::VectorXd& lengths = full.shape().log_lengths;
+  shape.log_lengths.resize(lengths.size() - 1);
+  shape.log_lengths << lengths.head(place), lengths.tail(lengths.size() - 1 - place);
+  Fitter result = full;
+  if (!result.fit(fewer, &shape, kDropIterations)) return std::nullopt;
+  return result;
+}
+
+// Backwards: of those with the longest length scales the signal that is missed least goes first.
 void drop_signals(Fitter* fitter) {
   while (fitter->signals().size() > 1) {
-    const Fitter full = *fitter;
+    std::vector<int> places(fitter->signals().size());
+    std::iota(places.begin(), places.end(), 0);
+    const Eigen::VectorXd& lengths = fitter->shape().log_lengths;
+    std::stable_sort(places.begin(), places.end(),
+                     [&](int x, int y) { return lengths(x) > lengths(y); });
+    if (places.size() > kDropCandidates) places.resize(kDropCandidates);
     std::optional<Fitter> best;
-    for (std::size_t d = 0; d < full.signals().size(); ++d) {
-      Fitter without = full;
-      std::vector<int> fewer = full.signals();
-      fewer.erase(fewer.begin() + static_cast<std::ptrdiff_t>(d));
-      Shape shape = full.shape();
-      Eigen::VectorXd lengths(fewer.size());
-      for (std::size_t n = 0; n < fewer.size(); ++n)
-        lengths(static_cast<Eigen::Index>(n)) =
-            shape.log_lengths(static_cast<Eigen::Index>(n < d ? n : n + 1));
-      shape.log_lengths = lengths;
-      if (!without.fit(fewer, &shape, kDropIterations)) continue;
-      if (!best || without.judged().log_density > best->judged().log_density)
-        best.emplace(std::move(without));
+    for (const int place : places) {
+      std::optional<Fitter> fewer = without(*fitter, place);
+      if (fewer && (!best || fewer->judged().log_density > best->judged().log_density))
+        best = std::move(fewer);
     }
-    if (!best || full.misses(*best)) break;
+    if (!best || fitter->misses(*best)) break;
     *fitter = std::move(*best);
   }
 }
@@ -399,6 +441,21 @@ Verdict verdict_of(const SoftFit& fit, int num_independent, const ValidityOption
 
 }  // namespace
 
+double log_density_of_screws(const Fit& fit, const PairData& pair,
+                             const NormalizedActions& actions) {
+  const std::vector<double> distances = leave_one_out(fit, pair, actions).squared_distance;
+  const double share =
+      static_cast<double>(blocks_of(pair, actions.blocks()).count) / std::max(pair.size(), 1);
+  double best = -std::numeric_limits<double>::infinity();
+  for (double noise = kLeastNoise; noise < 1.1 * kMostNoise; noise *= 1.2) {
+    double sum = 0;
+    for (const double d2 : distances)
+      sum -= 0.5 * std::min(d2 / noise, 2 * kOutlierThreshold) + 3 * std::log(noise);
+    best = std::max(best, share * sum);
+  }
+  return best;
+}
+
 std::optional<SoftFit> fit_soft_model(const LocalModel& screws, const PairData& pair,
                                       const NormalizedActions& actions,
                                       const ValidityOptions& options,
@@ -418,6 +475,7 @@ std::optional<SoftFit> fit_soft_model(const LocalModel& screws, const PairData& 
   const Shape shape = fitter.shape();
   if (!fitter.fit(chosen, &shape, kIterations)) return std::nullopt;
   if (signals.empty()) drop_signals(&fitter);
+  fitter.use_more_samples();
   chosen = fitter.signals();
 
   SoftFit result = fitter.judged();

@@ -30,15 +30,20 @@ struct SoftFit {
   double mean_inlier = 0;       ///< of d²
   double mean_uncertainty = 0;  ///< trace S over the inliers: 6 is as large as the noise
   int num_outliers = 0;
-  double score = 0;  ///< mean of −½[|r|² + log|2πΣ_z|] over the inliers
-  /// Sum over the independent frames of −½[min(d², 2c) + log|I + S|]: what the data say of two
-  /// models of one pair [nats].
+  double score = 0;  ///< mean over the inliers of the log density of z, up to a constant [nats]
+  /// Sum over the independent frames of −½[min(d², 2c) + log|fI + S|] with d² = rᵀ(fI + S)⁻¹r, the
+  /// noise being f times what was assumed, as fits best: what the data say of two models of one
+  /// pair [nats].
   double log_density = 0;
 };
 
+/// The same of a chain of screws, by the blocks that are left out.
+double log_density_of_screws(const Fit& fit, const PairData& pair,
+                             const NormalizedActions& actions);
+
 /// Fits the model to a pair: Log(f_screw(q)⁻¹ z) by processes with shared length scales of largest
 /// marginal likelihood, Student-t weights throughout, at most ResidualGp::kMaxSamples instants that
-/// cover the actions evenly (farthest-point sampling). Signals without which the blocks that were
+/// cover the actions evenly (farthest-point sampling), fewer where these predict better. Signals without which the blocks that were
 /// left out are predicted no worse are dropped, unless `signals` says which to keep. std::nullopt:
 /// too few data.
 ///

@@ -16,6 +16,10 @@ namespace {
 constexpr int kMaxFrames = 600;
 constexpr int kScreenFrames = 150;
 constexpr std::size_t kPairsTried = 3;  // between two components
+// Of a stream how noisy it is is a guess, or a claim, that has room for screws where a process
+// leaves far less: this share of the product of position and rotation deviations, as where the
+// noise is estimated.
+constexpr double kExplained = 0.5;
 
 struct OpenPair {
   double cost;  // of the best screws, a frame
@@ -88,11 +92,33 @@ std::optional<SoftFit> best_soft_fit(const OpenPair& open,
   return best;
 }
 
+// Models of screws that a process on other signals surpasses.
+void withdraw_soft(const std::vector<ActionPoseSample>& samples, const NormalizedActions& actions,
+                   const SearchOptions& options, SearchResult* found) {
+  std::erase_if(found->models, [&](const AcceptedModel& m) {
+    if (!m.soft_signals.empty()) return false;
+    const auto soft =
+        best_soft_fit({0, m.part_i, m.part_j, m.model}, samples, actions, options, found);
+    if (!soft || soft->verdict != Verdict::kValid) return false;
+    const std::set<int> signals(soft->model.signals.begin(), soft->model.signals.end());
+    if (signals == signal_set(m.model)) return false;
+    const PairData data = make_pair_data(samples, m.part_i, m.part_j, options.measurement,
+                                         kMaxFrames);
+    const Fit screws = fit_local_model(m.model, data, actions, 15, 1e-2);
+    const int num_independent =
+        actions.blocks().count(data.frames, [](const PairFrame& f) { return f.sample; });
+    return soft->log_density > log_density_of_screws(screws, data, actions) -
+                                   3 * std::log(kExplained) * num_independent;
+  });
+}
+
 }  // namespace
 
 void connect_soft_parts(const std::vector<ActionPoseSample>& samples,
                         const NormalizedActions& actions, const std::vector<int>& parts,
                         const SearchOptions& options, SearchResult* found) {
+  const bool is_stream = actions.blocks().is_stream();
+  if (is_stream) withdraw_soft(samples, actions, options, found);
   Components components(parts);
   for (const AcceptedModel& m : found->models) components.join(m.part_i, m.part_j);
   std::map<std::pair<int, int>, std::vector<OpenPair>> open;  // by the two components
@@ -100,7 +126,7 @@ void connect_soft_parts(const std::vector<ActionPoseSample>& samples,
   for (const auto& [pair, record] : found->records) {
     const int a = components.of(pair.first), b = components.of(pair.second);
     if (a == b) continue;
-    if (!record.undecided.empty()) undecided.insert(std::minmax(a, b));
+    if (!record.undecided.empty() && !is_stream) undecided.insert(std::minmax(a, b));
     if (record.num_common >= kFewestSoftFrames)
       open[std::minmax(a, b)].push_back({0, pair.first, pair.second, {}});
   }

@@ -70,12 +70,7 @@ bool is_rather_soft(const Candidate& chain, const PairModels& pairs) {
                                    actions, pairs.options().validity);
   if (!soft || soft->verdict != Verdict::kValid) return false;
   const Fit fit = fit_local_model(chain.model, pair, actions, 15, 1e-2);
-  double mean = 0;
-  for (const double d2 : leave_one_out(fit, pair, actions).squared_distance)
-    mean += std::min(d2, 2 * kOutlierThreshold) / pair.size();
-  const int num_independent =
-      actions.blocks().count(pair.frames, [](const PairFrame& frame) { return frame.sample; });
-  return soft->log_density > -0.5 * mean * num_independent;
+  return soft->log_density > log_density_of_screws(fit, pair, actions);
 }
 
 }  // namespace
