@@ -63,11 +63,18 @@ class ClusterTest {
   }
 
  private:
+  // Columns of B, which is zero apart from them, and where they are among those that are not.
+  struct Columns {
+    Eigen::Index first, packed, size;
+  };
   // Anything that may move: a marker of the cluster, or a branch on it.
   struct Item {
     int node;
     bool is_branch;
     Matrix6d bias;  // covariance of a bias about where the item is, as a twist in the top's frame
+    std::vector<int> related = {};      // nodes whose parameters share a marker with the item ...
+    std::vector<Columns> columns = {};  // ... and where these are in the rows of B
+    Eigen::Index num_columns = 0;
   };
 
   int num_items() const { return static_cast<int>(items_.size()); }
@@ -94,24 +101,36 @@ class ClusterTest {
         add_item(k, true);
   }
 
-  // Parameters that share a marker with the cluster.
+  // Parameters that share a marker with the cluster, and those with each item: most of a large tree
+  // does not with most items.
   void find_related() {
     std::vector<int> columns;
     for (int k = is_eliminated() ? 1 : 0; k < static_cast<int>(tree_.nodes().size()); ++k) {
       if (!is_eliminated() && !tree_.is_below(k, top_) && !tree_.is_below(top_, k)) continue;
-      related_.push_back(k);
       const int p = k == 0 ? 6 : tree_.nodes()[k].model.num_parameters();
+      for (Item& item : items_)
+        if (is_eliminated() || tree_.is_below(item.node, k) ||
+            (item.is_branch && tree_.is_below(k, item.node)))
+          relate(k, static_cast<Eigen::Index>(columns.size()), p, &item);
       for (int c = 0; c < p; ++c) columns.push_back(context_.normal.offset[k] + c);
     }
     inverse_ = context_.inverse(columns, columns);
     newton_ = context_.newton(columns);
   }
 
+  static void relate(int node, Eigen::Index first, Eigen::Index size, Item* item) {
+    item->related.push_back(node);
+    if (item->columns.empty() || item->columns.back().first + item->columns.back().size != first)
+      item->columns.push_back({first, item->num_columns, 0});
+    item->columns.back().size += size;
+    item->num_columns += size;
+  }
+
   // For q = 1 and F = Ad(X_top): F_tᵀJ_t, F_tᵀr_t, F_tᵀF_t of each item.
   void stack_frames() {
-    const auto p = newton_.size();
     const int T = num_frames(), n = num_items();
-    FJ_.assign(n, Eigen::MatrixXd::Zero(6 * p, T));
+    FJ_.clear();
+    for (const Item& item : items_) FJ_.emplace_back(6 * item.num_columns, T);
     Fr_.assign(n, Eigen::MatrixXd(6, T));
     FF_.resize(n * n);
     for (int i = 0; i < n; ++i)
@@ -132,7 +151,8 @@ class ClusterTest {
   // FᵀI of the item in the frame.
   Matrix6d stack_item(int t, int i) {
     const TreeFit::Normal& normal = context_.normal;
-    const auto& [k, is_branch, bias] = items_[i];
+    const int k = items_[i].node;
+    const bool is_branch = items_[i].is_branch;
     const Matrix6d F = adjoint(tree_.pose(t, top_));
     // A marker counts with its own share, a branch with all beyond it.
     const Matrix6d FI = F.transpose() * (is_branch ? normal.I : normal.own_I)[at(t, k)];
@@ -140,15 +160,17 @@ class ClusterTest {
     if (is_eliminated()) r -= FI * (normal.inverse_total[t] * normal.gradient[at(t, 0)]);
     Fr_[i].col(t) = r;
     Eigen::Map<Matrix6d>(FF_[i * num_items() + i].col(t).data()) = FI * F;
-    Eigen::Map<Eigen::MatrixXd> fj(FJ_[i].col(t).data(), 6, newton_.size());
+    Eigen::Map<Eigen::MatrixXd> fj(FJ_[i].col(t).data(), 6, items_[i].num_columns);
     Eigen::Index column = 0;
-    for (const int e : related_) {
+    for (const int e : items_[i].related) {
       const ParameterJacobian& S = normal.S[at(t, e)];
       auto block = fj.middleCols(column, S.cols());
       if (is_branch && tree_.is_below(e, k))
         block = (F.transpose() * normal.I[at(t, e)]).lazyProduct(S);
       else if (tree_.is_below(k, e))
         block = FI.lazyProduct(S);
+      else
+        block.setZero();
       if (is_eliminated())
         block -= (FI * normal.inverse_total[t] * normal.I[at(t, e)]).lazyProduct(S);
       column += S.cols();
@@ -158,15 +180,24 @@ class ClusterTest {
 
   void sum_over_frames(int s) {
     const int n = num_items();
-    Eigen::MatrixXd B(6 * n, newton_.size());
     u_.resize(6 * n);
+    C_.resize(6 * n, 6 * n);
     for (int i = 0; i < n; ++i) {
-      B.middleRows<6>(6 * i) =
-          Eigen::Map<const Eigen::MatrixXd>(FJ_[i].col(s).data(), 6, newton_.size());
+      Eigen::Matrix<double, 6, Eigen::Dynamic> BH(6, newton_.size());  // B_i H⁻¹
+      BH.setZero();
       u_.segment<6>(6 * i) = Fr_[i] * context_.q.col(s);
+      for (const Columns& c : items_[i].columns) {
+        BH.noalias() += columns_of(i, s, c) * inverse_.middleRows(c.first, c.size);
+        u_.segment<6>(6 * i) -= columns_of(i, s, c) * newton_.segment(c.first, c.size);
+      }
+      for (int j = 0; j <= i; ++j) {
+        Matrix6d C = Matrix6d::Zero();
+        for (const Columns& c : items_[j].columns)
+          C.noalias() -= BH.middleCols(c.first, c.size) * columns_of(j, s, c).transpose();
+        C_.block<6, 6>(6 * i, 6 * j) = C;
+        C_.block<6, 6>(6 * j, 6 * i) = C.transpose();
+      }
     }
-    u_ -= B * newton_;
-    C_ = -B * inverse_ * B.transpose();
     own_ = Eigen::MatrixXd::Zero(6, 6 * n);
     for (int i = 0; i < n; ++i)
       for (int j = 0; j < n; ++j) {
@@ -177,6 +208,12 @@ class ClusterTest {
       }
     unknown_.clear();
     for (int i = 0; i < n; ++i) unknown_.push_back(unknown_bias(i, s));
+  }
+
+  // Of the rows of B of an item for one signal.
+  Eigen::Map<const Eigen::Matrix<double, 6, Eigen::Dynamic>> columns_of(int i, int s,
+                                                                        const Columns& c) const {
+    return {FJ_[i].col(s).data() + 6 * c.packed, 6, c.size};
   }
 
   // Covariance of a bias that nobody told, as a twist in the top's frame.
@@ -271,8 +308,7 @@ class ClusterTest {
   const int top_;
   const std::vector<int> members_;
   std::vector<Item> items_;
-  std::vector<int> related_;  // nodes whose parameters share a marker with the cluster ...
-  Eigen::MatrixXd inverse_;   // ... and their share of H⁻¹ and of H⁻¹g
+  Eigen::MatrixXd inverse_;  // share of H⁻¹ and of H⁻¹g of what is related to any item
   Eigen::VectorXd newton_;
   std::vector<Eigen::MatrixXd> FJ_, Fr_, FF_;  // by item (FF_: by two), a column a frame or signal
   // For one signal, stacked over the items: the score, its covariance, the items' own information.
