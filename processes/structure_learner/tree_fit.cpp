@@ -226,25 +226,42 @@ void TreeFit::move_by(const Eigen::VectorXd& step, const Normal& normal,
 }
 
 void TreeFit::fit(int max_iterations, double tolerance) {
+  // Where an iteration costs many times what a trial does. Chosen: longer steps may also lead to
+  // another minimum, and small trees need them least.
+  constexpr std::size_t kManyNodes = 15;
+  const bool goes_farther = nodes_.size() >= kManyNodes;
   LevenbergMarquardt optimizer(1e-4, 1e-10, 6);
-  std::vector<Pose> poses;
-  std::vector<FrameFit> fits;
+  struct Moved {
+    std::vector<TreeNode> nodes;
+    std::vector<Pose> roots, poses;
+    std::vector<FrameFit> fits;
+    double cost;
+  };
   for (int iteration = 0; iteration < max_iterations; ++iteration) {
     const Normal normal = normal_equations();
     if (normal.H.rows() == 0) return;  // one part that moves: each root is at its marker
+    const auto moved = [&](const Eigen::VectorXd& step) {
+      Moved result{nodes_, roots_, {}, fits_, 0};
+      move_by(step, normal, &result.nodes, &result.roots);
+      result.cost = evaluate(result.nodes, result.roots, &result.poses, &result.fits);
+      return result;
+    };
     double decrease = 0;
     const bool improved = optimizer.step(normal.H, normal.g, [&](const Eigen::VectorXd& step) {
-      std::vector<TreeNode> nodes = nodes_;
-      std::vector<Pose> roots = roots_;
-      move_by(step, normal, &nodes, &roots);
-      const double cost = evaluate(nodes, roots, &poses, &fits);
-      if (!(cost < cost_)) return false;
-      decrease = cost_ - cost;
-      cost_ = cost;
-      nodes_ = std::move(nodes);
-      roots_ = std::move(roots);
-      poses_.swap(poses);
-      fits_.swap(fits);
+      Moved best = moved(step);
+      if (!(best.cost < cost_)) return false;
+      // The weights make steps too short where many residuals are large.
+      for (double length = 2; goes_farther; length *= 2) {
+        Moved farther = moved(length * step);
+        if (!(farther.cost < best.cost)) break;
+        best = std::move(farther);
+      }
+      decrease = cost_ - best.cost;
+      cost_ = best.cost;
+      nodes_ = std::move(best.nodes);
+      roots_ = std::move(best.roots);
+      poses_ = std::move(best.poses);
+      fits_ = std::move(best.fits);
       return true;
     });
     if (!improved || decrease < tolerance) break;
