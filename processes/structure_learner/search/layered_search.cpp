@@ -180,24 +180,27 @@ void LayeredSearch::layer_two_joints() {
   const bool is_large = forest_.parts().size() > kMaxParts;
   for (const std::size_t most : {is_large ? kNearPairs : kAllPairs, kAllPairs}) {
     bool is_all = true;
-    if (known != grid) is_all = two_joints_pass(known, most);
+    // Where the near pairs have found a model that waits, the others are not searched for more.
+    const bool skips_doubtful = is_large && most == kAllPairs;
+    if (known != grid) is_all = two_joints_pass(known, most, skips_doubtful);
     // A signal's range in the forest may not hold for its other joints.
-    if (!forest_.spans()) is_all = two_joints_pass(grid, most);
+    if (!forest_.spans()) is_all = two_joints_pass(grid, most, skips_doubtful);
     if (is_all || forest_.spans()) break;
   }
   if (forest_.spans() || is_large) return;
   // So few frames leave the fits narrow valleys: a finer grid of ranges, where parts are few. More
   // tell joints that turn more than once.
   if (pairs_.actions().num_samples() >= kFewestScanFrames) {
-    two_joints_pass(known_turns(wide_turns()), kAllPairs);
+    two_joints_pass(known_turns(wide_turns()), kAllPairs, false);
   } else {
     std::vector<double> fine;
     for (double turn = 0.25; turn < 3.1; turn *= 1.15) fine.push_back(turn);
-    two_joints_pass(Turns(pairs_.actions().num_signals(), fine), kAllPairs);
+    two_joints_pass(Turns(pairs_.actions().num_signals(), fine), kAllPairs, false);
   }
 }
 
-bool LayeredSearch::two_joints_pass(const Turns& turns, std::size_t most_pairs) {
+bool LayeredSearch::two_joints_pass(const Turns& turns, std::size_t most_pairs,
+                                    bool skips_doubtful) {
   // Fits of two components that stay above this cost a frame, in a row, before the rest is given
   // up.
   constexpr double kHopelessCost = 16;
@@ -211,10 +214,13 @@ bool LayeredSearch::two_joints_pass(const Turns& turns, std::size_t most_pairs) 
     return score == one_joint_score_.end() ? std::numeric_limits<double>::infinity()
                                            : score->second;
   };
+  const auto components_of = [this](int i, int j) -> std::pair<int, int> {
+    return std::minmax({forest_.component(i), forest_.component(j)});
+  };
   std::map<std::pair<int, int>, std::vector<std::pair<int, int>>> by_components;
-  for_each_open_pair([&](int i, int j) {
-    by_components[std::minmax({forest_.component(i), forest_.component(j)})].emplace_back(i, j);
-  });
+  for_each_open_pair([&](int i, int j) { by_components[components_of(i, j)].emplace_back(i, j); });
+  if (skips_doubtful)
+    for (const Candidate& c : doubtful_) by_components.erase(components_of(c.part_i, c.part_j));
   std::vector<Candidate> candidates;
   bool is_all = true;
   for (auto& [components, open] : by_components) {

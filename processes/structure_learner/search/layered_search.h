@@ -38,8 +38,9 @@ class LayeredSearch {
   void layer_one_joint();
   void layer_two_joints();
   Turns known_turns(const std::vector<double>& grid) const;
-  // Of each two components at most so many pairs. True if these are all.
-  bool two_joints_pass(const Turns& turns, std::size_t most_pairs);
+  // Of each two components at most so many pairs, of none if they are skipped because a doubtful
+  // model joins them. True if these are all.
+  bool two_joints_pass(const Turns& turns, std::size_t most_pairs, bool skips_doubtful);
 
   PairModels& pairs_;
   ModelForest& forest_;
