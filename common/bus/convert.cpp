@@ -182,10 +182,10 @@ std::shared_ptr<const ResidualGp> from_message(const residual_gp_t& message) {
 }
 
 matrix_gp_t to_message(const MatrixGp& gp) {
-  if (gp.num_samples() > ResidualGp::kMaxSamples)
+  if (gp.num_samples() > MatrixGp::kMaxSamples)
     throw std::invalid_argument("a matrix GP of " + std::to_string(gp.num_samples()) +
                                 " samples cannot travel: a message holds " +
-                                std::to_string(ResidualGp::kMaxSamples));
+                                std::to_string(MatrixGp::kMaxSamples));
   matrix_gp_t message{};
   set_array(message.num_matrix_signals, message.matrix_signals,
             std::vector<std::int32_t>(gp.signals().begin(), gp.signals().end()));

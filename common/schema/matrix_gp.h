@@ -21,6 +21,7 @@ namespace bodyschema {
 class MatrixGp {
  public:
   static constexpr int kNumEntries = 12;
+  static constexpr int kMaxSamples = 64;  ///< of one that travels; it may have more
 
   /// `signals`: the D indices of Q into an action; `inputs`: D×N, their values in command units;
   /// `poses`: the N observed z_ij; `priors`: of the 12 entries, column by column of the 3×4 matrix

@@ -64,7 +64,7 @@ LearnResult learn_as_the_chapter(const Recording& recording,
   noise.position_m = std::hypot(noise.position_m, options.measurement.systematic.position_m);
   noise.rotation_rad = std::hypot(noise.rotation_rad, options.measurement.systematic.rotation_rad);
   baseline.set_noise(noise);
-  baseline.max_samples = std::min(baseline.max_samples, ResidualGp::kMaxSamples);  // to be written
+  baseline.max_samples = std::min(baseline.max_samples, MatrixGp::kMaxSamples);  // to be written
   const BaselineResult result = learn_baseline(recording.signals, training, baseline);
   std::cerr << result.num_fits << " local models learned, " << result.num_valid << " valid, "
             << result.seconds << " s" << std::endl;

@@ -238,7 +238,7 @@ std::vector<LearnedEdge> learn_edge(const BodySchema& base, int part,
                                     double outlier_rate) {
   std::vector<LearnedEdge> result;
   const Edge* const old = edge_to(base, part);
-  if (!old || measurements.size() > ResidualGp::kMaxSamples) return result;
+  if (!old || measurements.size() > kMostMeasurements) return result;
   const std::vector<int> own = old->signals();
   for (ProcessTargets& targets : possible_forms(*old, part, measurements)) {
     const Eigen::VectorXd typical = typical_variances(targets);

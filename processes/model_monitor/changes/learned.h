@@ -18,6 +18,9 @@ struct LearnedEdge {
   double log_evidence = 0;  ///< by the measurements alone
 };
 
+/// Measurements that learn_edge() takes: its time grows as their cube.
+inline constexpr std::size_t kMostMeasurements = 64;
+
 /// What an edge may be if no form with parameters explains it, by its measurements alone:
 ///   kNonlinear: a joint goes farther by g(Q),
 ///   kResidual:  Δ(θ) · Exp(ρ(Q)) with the model Δ that stood (refined prior),
@@ -32,9 +35,9 @@ struct LearnedEdge {
 /// an outlier is one, and is not trained on. A model must halve, by leave-one-out, what the old one
 /// is off by (Student-t); else it is none.
 ///
-/// `measurements`: at most ResidualGp::kMaxSamples. The best of every kind, most evidence first;
-/// none if there are fewer measurements than BodyChange::fewest_samples(). An edge that has a
-/// process already is only learned afresh.
+/// The best of every kind, most evidence first; none if there are fewer measurements than
+/// BodyChange::fewest_samples(), or more than kMostMeasurements. An edge that has a process already
+/// is only learned afresh.
 std::vector<LearnedEdge> learn_edge(const BodySchema& base, int part,
                                     const std::vector<PlaceMeasurement>& measurements,
                                     double outlier_rate);

@@ -173,15 +173,15 @@ LayeredSearch::Turns LayeredSearch::known_turns(const std::vector<double>& grid)
 void LayeredSearch::layer_two_joints() {
   const Turns grid(pairs_.actions().num_signals(), default_turns());
   const Turns known = known_turns(default_turns());
-  // Where two components have many pairs, those first that one joint explains best: the fewer
-  // joints are between two parts, the less it leaves.
-  constexpr std::size_t kMaxParts = 14, kNearPairs = 12;
+  // Where parts are many, few pairs of each component first.
+  constexpr std::size_t kMaxParts = 14, kNearPairs = 12, kFarPairs = 300;
   constexpr std::size_t kAllPairs = std::numeric_limits<std::size_t>::max();
   const bool is_large = forest_.parts().size() > kMaxParts;
-  for (const std::size_t most : {is_large ? kNearPairs : kAllPairs, kAllPairs}) {
+  for (const std::size_t most :
+       {is_large ? kNearPairs : kAllPairs, is_large ? kFarPairs : kAllPairs}) {
     bool is_all = true;
     // Where the near pairs have found a model that waits, the others are not searched for more.
-    const bool skips_doubtful = is_large && most == kAllPairs;
+    const bool skips_doubtful = is_large && most == kFarPairs;
     if (known != grid) is_all = two_joints_pass(known, most, skips_doubtful);
     // A signal's range in the forest may not hold for its other joints.
     if (!forest_.spans()) is_all = two_joints_pass(grid, most, skips_doubtful);
@@ -199,6 +199,31 @@ void LayeredSearch::layer_two_joints() {
   }
 }
 
+// At most so many of each component, to all others: those that one joint explains best, for the
+// fewer joints are between two parts, the less it leaves.
+std::vector<std::pair<int, int>> LayeredSearch::open_pairs(std::size_t most, bool* is_all) {
+  std::vector<std::pair<int, int>> pairs;
+  for_each_open_pair([&](int i, int j) { pairs.emplace_back(i, j); });
+  const auto score_of = [this](const std::pair<int, int>& ij) {
+    const auto score = one_joint_score_.find(ij);
+    return score == one_joint_score_.end() ? std::numeric_limits<double>::infinity()
+                                           : score->second;
+  };
+  std::stable_sort(pairs.begin(), pairs.end(),
+                   [&](const auto& x, const auto& y) { return score_of(x) < score_of(y); });
+  std::map<int, std::size_t> taken;  // by component
+  *is_all = std::erase_if(pairs, [&](const std::pair<int, int>& ij) {
+              std::size_t& of_i = taken[forest_.component(ij.first)];
+              std::size_t& of_j = taken[forest_.component(ij.second)];
+              if (of_i >= most && of_j >= most) return true;
+              ++of_i;
+              ++of_j;
+              return false;
+            }) == 0;
+  std::sort(pairs.begin(), pairs.end());
+  return pairs;
+}
+
 bool LayeredSearch::two_joints_pass(const Turns& turns, std::size_t most_pairs,
                                     bool skips_doubtful) {
   // Fits of two components that stay above this cost a frame, in a row, before the rest is given
@@ -209,28 +234,17 @@ bool LayeredSearch::two_joints_pass(const Turns& turns, std::size_t most_pairs,
     int i, j;
     Start start;
   };
-  const auto score_of = [this](const std::pair<int, int>& ij) {
-    const auto score = one_joint_score_.find(ij);
-    return score == one_joint_score_.end() ? std::numeric_limits<double>::infinity()
-                                           : score->second;
-  };
   const auto components_of = [this](int i, int j) -> std::pair<int, int> {
     return std::minmax({forest_.component(i), forest_.component(j)});
   };
   std::map<std::pair<int, int>, std::vector<std::pair<int, int>>> by_components;
-  for_each_open_pair([&](int i, int j) { by_components[components_of(i, j)].emplace_back(i, j); });
+  bool is_all = true;
+  for (const auto& [i, j] : open_pairs(most_pairs, &is_all))
+    by_components[components_of(i, j)].emplace_back(i, j);
   if (skips_doubtful)
     for (const Candidate& c : doubtful_) by_components.erase(components_of(c.part_i, c.part_j));
   std::vector<Candidate> candidates;
-  bool is_all = true;
-  for (auto& [components, open] : by_components) {
-    if (open.size() > most_pairs) {
-      is_all = false;
-      std::stable_sort(open.begin(), open.end(),
-                       [&](const auto& x, const auto& y) { return score_of(x) < score_of(y); });
-      open.resize(most_pairs);
-      std::sort(open.begin(), open.end());
-    }
+  for (const auto& [components, open] : by_components) {
     std::vector<Screened> list;
     for (const auto& [i, j] : open) {
       for (const auto& t : turns) pairs_.num_screens += static_cast<int>(2 * t.size());

@@ -38,8 +38,9 @@ class LayeredSearch {
   void layer_one_joint();
   void layer_two_joints();
   Turns known_turns(const std::vector<double>& grid) const;
-  // Of each two components at most so many pairs, of none if they are skipped because a doubtful
-  // model joins them. True if these are all.
+  std::vector<std::pair<int, int>> open_pairs(std::size_t most, bool* is_all);
+  // Of open_pairs(), without those of two components that a doubtful model joins if they are
+  // skipped. True if no pair was left out for their number.
   bool two_joints_pass(const Turns& turns, std::size_t most_pairs, bool skips_doubtful);
 
   PairModels& pairs_;
