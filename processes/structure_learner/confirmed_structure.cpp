@@ -90,9 +90,8 @@ LearnedStructure least_noise(LearnedStructure told, const FindStructure& find) {
   if (lacks_data(told)) return told;
   const bool is_explained = told.spans() && !is_soft(told);
   // Couplings alone are no reason to lose other joints.
-  const bool is_in_doubt =
-      !told.search.redundant.empty() ||
-      (told.search.residual_scale > kLargestResidual && is_noise_known(told));
+  const bool is_in_doubt = !told.search.redundant.empty() ||
+                           (told.search.residual_scale > kLargestResidual && is_noise_known(told));
   if (is_explained && !is_in_doubt && told.search.couplings.empty()) return told;
   if (!is_noise_known(told) &&
       (told.actions.blocks().is_stream() || !told.spans() || !has_doubtful_joints(told)))

@@ -14,9 +14,10 @@ inline constexpr Noise kNoiseFloor{1e-4, 3.4906585e-4};
 /// chapter's markers. Without a ceiling, poses at random would pass for a rigid body badly seen.
 inline constexpr Noise kNoiseCeiling{0.1, 0.41887902};
 
-/// More than any tag or tracker has: 10 mm or 3°. What models leave above it is motion, too. Chosen,
-/// above the 3 mm and 1° of tags, below the 30 to 46 mm and 9 to 15° of two joints fitted to a real
-/// arm of seven (16 subsets of arm7_ends.csv), which a Gaussian process would then explain well.
+/// More than any tag or tracker has: 10 mm or 3°. What models leave above it is motion, too.
+/// Chosen, above the 3 mm and 1° of tags, below the 30 to 46 mm and 9 to 15° of two joints fitted
+/// to a real arm of seven (16 subsets of arm7_ends.csv), which a Gaussian process would then
+/// explain well.
 bool is_above_any_marker(const Noise& noise);
 
 /// Where the noise of a marker is known from.
@@ -46,14 +47,14 @@ std::vector<std::vector<int>> repeats(const NormalizedActions& actions);
 /// residuals of each part's pose to its robust mean over the repeats. Else from the best models of
 /// a minimum spanning tree over the parts: their pooled residuals, each without the frame (a
 /// Gaussian process: the block) that it judges. Models of one joint, two and many compete, and a
-/// Gaussian process on the signals that it needs: the residual of a model is noise only where no richer one
-/// leaves far less. Through medians, so that outliers do not count (of a stream, which rests for
-/// much of its time, the upper quartile); position and rotation apart (the rotation noise of part i
-/// reaches the position of z_ij through the lever arm). The estimate is returned 1.2 × too large:
-/// too small a noise rejects true models, too large a noise by that factor costs nearly nothing.
-/// Never below kNoiseFloor or above kNoiseCeiling. Of a stream, the jitter from frame to frame is a
-/// lower bound and no more, unless no model explains its motion: then it is not taken for noise.
-/// std::nullopt: too few data.
+/// Gaussian process on the signals that it needs: the residual of a model is noise only where no
+/// richer one leaves far less. Through medians, so that outliers do not count (of a stream, which
+/// rests for much of its time, the upper quartile); position and rotation apart (the rotation noise
+/// of part i reaches the position of z_ij through the lever arm). The estimate is returned 1.2 ×
+/// too large: too small a noise rejects true models, too large a noise by that factor costs nearly
+/// nothing. Never below kNoiseFloor or above kNoiseCeiling. Of a stream, the jitter from frame to
+/// frame is a lower bound and no more, unless no model explains its motion: then it is not taken
+/// for noise. std::nullopt: too few data.
 std::optional<SourcedNoise> estimate_noise(const std::vector<ActionPoseSample>& samples,
                                            int num_signals, int max_signals = kMaxChainJoints);
 

@@ -405,7 +405,8 @@ std::optional<Fitter> without(const Fitter& full, int place) {
   return result;
 }
 
-// Backwards: of those with the longest length scales the signal that is missed least goes first.
+// Backwards: of those with the longest length scales the signal that is missed least goes first, of
+// the others only where these are missed.
 void drop_signals(Fitter* fitter) {
   while (fitter->signals().size() > 1) {
     std::vector<int> places(fitter->signals().size());
@@ -413,10 +414,10 @@ void drop_signals(Fitter* fitter) {
     const Eigen::VectorXd& lengths = fitter->shape().log_lengths;
     std::stable_sort(places.begin(), places.end(),
                      [&](int x, int y) { return lengths(x) > lengths(y); });
-    if (places.size() > kDropCandidates) places.resize(kDropCandidates);
     std::optional<Fitter> best;
-    for (const int place : places) {
-      std::optional<Fitter> fewer = without(*fitter, place);
+    for (std::size_t n = 0; n < places.size(); ++n) {
+      if (n >= kDropCandidates && best && !fitter->misses(*best)) break;
+      std::optional<Fitter> fewer = without(*fitter, places[n]);
       if (fewer && (!best || fewer->judged().log_density > best->judged().log_density))
         best = std::move(fewer);
     }

@@ -43,9 +43,9 @@ double log_density_of_screws(const Fit& fit, const PairData& pair,
 
 /// Fits the model to a pair: Log(f_screw(q)⁻¹ z) by processes with shared length scales of largest
 /// marginal likelihood, Student-t weights throughout, at most ResidualGp::kMaxSamples instants that
-/// cover the actions evenly (farthest-point sampling), fewer where these predict better. Signals without which the blocks that were
-/// left out are predicted no worse are dropped, unless `signals` says which to keep. std::nullopt:
-/// too few data.
+/// cover the actions evenly (farthest-point sampling), fewer where these predict better. Signals
+/// without which the blocks that were left out are predicted no worse are dropped, unless `signals`
+/// says which to keep. std::nullopt: too few data.
 ///
 /// Valid: as few outliers and as small a mean d² as V1 asks of screws, and the model must know what
 /// it says: where its own uncertainty in the left-out blocks exceeds that of a measurement, a wide

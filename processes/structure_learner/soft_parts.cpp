@@ -102,8 +102,8 @@ void withdraw_soft(const std::vector<ActionPoseSample>& samples, const Normalize
     if (!soft || soft->verdict != Verdict::kValid) return false;
     const std::set<int> signals(soft->model.signals.begin(), soft->model.signals.end());
     if (signals == signal_set(m.model)) return false;
-    const PairData data = make_pair_data(samples, m.part_i, m.part_j, options.measurement,
-                                         kMaxFrames);
+    const PairData data =
+        make_pair_data(samples, m.part_i, m.part_j, options.measurement, kMaxFrames);
     const Fit screws = fit_local_model(m.model, data, actions, 15, 1e-2);
     const int num_independent =
         actions.blocks().count(data.frames, [](const PairFrame& f) { return f.sample; });

@@ -1,176 +1,168 @@
-// soft_bodies: soft arms of several sections that bend with three chambers or tendons each, and a recording split into
-// blocks of time: structure, signals and error where nothing was learned. Prints a Markdown table.
+// soft_bodies: structure and error of soft arms whose sections bend by three chambers each, by the
+// number of poses; or of a recorded stream, learned from every other block of time and judged by
+// the blocks between, for several places of their borders. Prints a Markdown table.
 
 #include <fmt/format.h>
 
 #include <CLI/CLI.hpp>
 #include <algorithm>
+#include <ctime>
 #include <fstream>
 #include <iostream>
 #include <sstream>
 
+#include "common/estimation/quantile.h"
 #include "common/geometry/angle.h"
 #include "processes/structure_learner/learn.h"
 #include "processes/structure_learner/recording/recording.h"
-#include "tests/support/synthetic_robot.h"
+#include "tests/support/soft_arm.h"
 
 using namespace bodyschema;
 using namespace bodyschema::test;
 
 namespace {
 
-// Constant curvature (Webster and Jones 2010), with a pull of the outer sections' tendons on the inner ones.
-struct SoftArm {
-  int num_sections = 3, num_chambers = 3, num_idle = 0;
-  double bend = 1.0;      // [rad] of a section at the largest difference of its chambers
-  double stretch = 0.15;  // of a section's length
-  double coupling = 0.0;  // share of an outer section's bend that its tendons bring to the one before
-
-  int num_signals() const { return num_sections * num_chambers + num_idle; }
-  Pose section(int n, const Eigen::VectorXd& q) const {
-    Eigen::Vector2d k = Eigen::Vector2d::Zero();
-    double mean = 0;
-    for (int m = n; m < num_sections; ++m)
-      for (int c = 0; c < num_chambers; ++c) {
-        const double angle = 2 * M_PI * c / num_chambers + 0.4 * m;
-        const double p = q(m * num_chambers + c) + 0.2 * q(m * num_chambers + c) * q(m * num_chambers + c);
-        const double share = m == n ? 1 : m == n + 1 ? coupling : 0;
-        k += share * bend * p * Eigen::Vector2d(std::cos(angle), std::sin(angle)) * 2 / num_chambers;
-        if (m == n) mean += p / num_chambers;
-      }
-    Vector6d xi;
-    xi << 0, 0, 0.12 * (1 + stretch * mean), -k(1), k(0), 0;
-    return exp(xi);
-  }
-  std::vector<Pose> poses(const Eigen::VectorXd& q) const {
-    std::vector<Pose> result{make_pose(Eigen::Quaterniond::Identity(), Eigen::Vector3d(0, 0, 1))};
-    for (int n = 0; n < num_sections; ++n) result.push_back(result.back() * section(n, q));
-    return result;
-  }
+struct Arguments {
+  std::vector<int> poses = {50, 100, 200, 400};
+  int num_arms = 3;
+  bool lists_wrong = false;
+  std::string recording;
+  int block = 128;  // instants
+  std::vector<int> shifts = {0, 1, 32, 64, 96};
+  std::vector<double> noise = {3, 1.5};  // [mm, °], told of the recording
 };
 
-std::vector<ActionPoseSample> record(const SoftArm& arm, int num, const Noise& noise, Rng& rng) {
-  std::vector<ActionPoseSample> samples(num);
-  for (int t = 0; t < num; ++t) {
-    samples[t].sample_index = t;
-    samples[t].utime = 2'000'000 * std::int64_t{t};
-    samples[t].action.resize(arm.num_signals());
-    for (double& q : samples[t].action) q = uniform(rng, -1, 1);
-    int part = 0;
-    for (const Pose& X : arm.poses(samples[t].action)) {
-      Vector6d e = gaussian6(rng);
-      e.head<3>() *= noise.position_m;
-      e.tail<3>() *= noise.rotation_rad;
-      PartObservation o;
-      o.part = part++;
-      o.X_CB = X * exp(e);
-      samples[t].parts.push_back(o);
-    }
-  }
-  return samples;
+struct Learned {
+  LearnResult result;
+  double cpu_s;
+};
+
+Learned learn_timed(const std::vector<Signal>& signals,
+                    const std::vector<ActionPoseSample>& samples,
+                    const std::optional<Noise>& noise) {
+  LearnOptions options;
+  options.measurement.noise = noise;
+  const std::clock_t start = std::clock();
+  LearnResult result = learn(signals, samples, options);
+  return {std::move(result), static_cast<double>(std::clock() - start) / CLOCKS_PER_SEC};
 }
 
-double median(std::vector<double> v) {
-  if (v.empty()) return NAN;
-  std::nth_element(v.begin(), v.begin() + v.size() / 2, v.end());
-  return v[v.size() / 2];
-}
-
-std::string describe(const LearnResult& r) {
-  std::string s = r.schema.complete ? "complete" : "incomplete";
-  for (const Edge& e : r.schema.edges) {
-    s += fmt::format(" {}-{} {}{{", e.from, e.to, e.kind());
-    for (int x : e.signals()) s += fmt::format("{} ", x + 1);
-    s += "}";
-  }
-  return s;
-}
-
-// medians of part from root, by parts
-std::string errors(const BodySchema& schema, const std::vector<ActionPoseSample>& test, const std::vector<std::vector<Pose>>* truth) {
-  std::map<int, std::vector<double>> p, r;
-  for (std::size_t t = 0; t < test.size(); ++t)
-    for (const auto& o : test[t].parts) {
-      if (o.part == schema.root) continue;
-      const auto* root = test[t].find(schema.root);
-      if (!root) continue;
-      const auto predicted = schema.predict(schema.root, o.part, test[t].action);
+// By part: median error of position [mm] and rotation [°] in the root's frame.
+std::string median_errors(const BodySchema& schema, const std::vector<ActionPoseSample>& samples) {
+  std::map<int, std::vector<double>> position, rotation;
+  for (const ActionPoseSample& sample : samples) {
+    const PartObservation* root = sample.find(schema.root);
+    for (const PartObservation& o : sample.parts) {
+      if (!root || o.part == schema.root) continue;
+      const auto predicted = schema.predict(schema.root, o.part, sample.action);
       if (!predicted) continue;
-      Pose z = root->X_CB.inverse() * o.X_CB;
-      if (truth) z = (*truth)[t][0].inverse() * (*truth)[t][o.part];
-      const Vector6d e = log(predicted->X_AB.inverse() * z);
-      p[o.part].push_back(e.head<3>().norm());
-      r[o.part].push_back(e.tail<3>().norm());
+      const Vector6d error = log(predicted->X_AB.inverse() * root->X_CB.inverse() * o.X_CB);
+      position[o.part].push_back(1e3 * error.head<3>().norm());
+      rotation[o.part].push_back(error.tail<3>().norm() / kDegree);
     }
-  std::string s;
-  for (auto& [part, v] : p) s += fmt::format(" {:.2f}mm {:.2f}°", 1e3 * median(v), median(r[part]) / kDegree);
-  return s;
+  }
+  std::string text;
+  for (auto& [part, errors] : position)
+    text += fmt::format("{}{:.2f} mm, {:.2f}°", text.empty() ? "" : "; ",
+                        upper_median(std::move(errors)), upper_median(rotation[part]));
+  return text;
+}
+
+// The chain 0-1-2-…, each edge with exactly its section's signals.
+bool is_wrong(const BodySchema& schema, const SoftArm& arm) {
+  return std::any_of(schema.edges.begin(), schema.edges.end(), [&](const Edge& edge) {
+    const std::vector<int> signals = edge.signals();
+    return edge.to != edge.from + 1 ||
+           std::set<int>(signals.begin(), signals.end()) != arm.signals_of(edge.from);
+  });
+}
+
+std::string structure_of(const BodySchema& schema, const std::vector<Signal>& signals) {
+  std::string text = schema.complete ? "complete" : "incomplete";
+  for (const Edge& edge : schema.edges) {
+    text += fmt::format(", {}-{} {}:", edge.from, edge.to, edge.kind());
+    for (const int s : edge.signals()) text += " " + signals[static_cast<std::size_t>(s)].name;
+  }
+  return text;
+}
+
+void print_arms(const Arguments& arguments) {
+  constexpr Noise kNoise{0.001, 0.5 * kDegree};
+  fmt::print(
+      "| chambers | poses | noise | right / incomplete / wrong | error, arm by arm, part 1; 2; 3 | "
+      "CPU s, largest |\n|---|---|---|---|---|---|\n");
+  for (const double coupling : {0.0, 0.3})
+    for (const int num_poses : arguments.poses)
+      for (const bool is_told : {true, false}) {
+        int right = 0, incomplete = 0, wrong = 0;
+        double cpu_s = 0;
+        std::string errors;
+        for (int seed = 1; seed <= arguments.num_arms; ++seed) {
+          Rng rng(static_cast<unsigned>(seed));
+          SoftArm arm;
+          arm.coupling = coupling;
+          arm.num_idle = coupling > 0 ? 2 : 0;
+          arm.bend_rad = uniform(rng, 0.6, 1.2);
+          const auto samples = arm.babble(num_poses, kNoise, rng);
+          const Learned learned =
+              learn_timed(arm.signals(), samples, is_told ? std::optional(kNoise) : std::nullopt);
+          const BodySchema& schema = learned.result.schema;
+          const bool is_bad = is_wrong(schema, arm);
+          wrong += is_bad;
+          if (is_bad && arguments.lists_wrong)
+            std::cerr << fmt::format("arm {}, {} poses:{}\n", seed, num_poses,
+                                     structure_of(schema, arm.signals()));
+          right += !is_bad && schema.complete;
+          incomplete += !is_bad && !schema.complete;
+          cpu_s = std::max(cpu_s, learned.cpu_s);
+          errors += (errors.empty() ? "" : " – ") + median_errors(schema, arm.babble(300, {}, rng));
+        }
+        fmt::print("| {} | {} | {} | {} / {} / {} | {} | {:.1f} |\n",
+                   coupling > 0 ? "3 × 3 coupled, 2 idle" : "3 × 3", num_poses,
+                   is_told ? "told" : "–", right, incomplete, wrong, errors, cpu_s);
+      }
+}
+
+void print_recording(const Arguments& arguments) {
+  std::ifstream in(arguments.recording);
+  std::stringstream text;
+  text << in.rdbuf();
+  const Recording recording = parse_csv(text.str(), arguments.recording);
+  fmt::print(
+      "| blocks begin at | learned from | noise | structure | error in the other blocks, by part | "
+      "CPU s |\n|---|---|---|---|---|---|\n");
+  for (const int shift : arguments.shifts)
+    for (const std::size_t which : {0, 1}) {
+      std::vector<ActionPoseSample> half[2];
+      for (std::size_t t = 0; t < recording.samples.size(); ++t)
+        half[(t + static_cast<std::size_t>(shift)) / static_cast<std::size_t>(arguments.block) % 2]
+            .push_back(recording.samples[t]);
+      for (const bool is_told : {true, false}) {
+        const Noise noise{1e-3 * arguments.noise[0], arguments.noise[1] * kDegree};
+        const Learned learned = learn_timed(recording.signals, half[which],
+                                            is_told ? std::optional(noise) : std::nullopt);
+        const BodySchema& schema = learned.result.schema;
+        fmt::print("| {} | {} | {} | {} | {} | {:.1f} |\n", shift, which == 0 ? "even" : "odd",
+                   is_told ? "told" : "–", structure_of(schema, recording.signals),
+                   median_errors(schema, half[1 - which]), learned.cpu_s);
+      }
+    }
 }
 
 }  // namespace
 
 int main(int argc, char** argv) {
-  CLI::App app;
-  std::string csv;
-  std::vector<int> shifts{0, 1, 32, 64, 96}, poses{100, 200, 400};
-  double coupling = 0, sp = 1, sr = 0.5;
-  int tendons = 3, idle = 0, seeds = 2;
-  bool told_only = false, untold_only = false;
-  app.add_option("--csv", csv);
-  app.add_option("--shifts", shifts);
-  app.add_option("--poses", poses);
-  app.add_option("--coupling", coupling);
-  app.add_option("--tendons", tendons);
-  app.add_option("--idle", idle);
-  app.add_option("--seeds", seeds);
-  app.add_option("--mm", sp);
-  app.add_option("--deg", sr);
-  app.add_flag("--told", told_only);
-  app.add_flag("--untold", untold_only);
+  Arguments arguments;
+  CLI::App app("Soft bodies: structure, error, time");
+  app.add_option("--poses", arguments.poses, "Poses to learn from");
+  app.add_option("--arms", arguments.num_arms, "Random arms a row");
+  app.add_flag("--list-wrong", arguments.lists_wrong, "Say what the wrong ones are");
+  app.add_option("--recording", arguments.recording, "A stream in CSV instead")
+      ->check(CLI::ExistingFile);
+  app.add_option("--block", arguments.block, "Instants a block")->check(CLI::PositiveNumber);
+  app.add_option("--shifts", arguments.shifts, "Instants by which the blocks' borders move");
+  app.add_option("--noise", arguments.noise, "mm and degrees told of the recording")->expected(2);
   CLI11_PARSE(app, argc, argv);
   std::setvbuf(stdout, nullptr, _IOLBF, 0);
-  if (!csv.empty()) {
-    std::ifstream in(csv);
-    std::stringstream text;
-    text << in.rdbuf();
-    const Recording rec = parse_csv(text.str(), csv);
-    for (int shift : shifts)
-      for (int which : {0, 1}) {
-        std::vector<ActionPoseSample> half[2];
-        for (std::size_t t = 0; t < rec.samples.size(); ++t) half[((t + shift) / 128) % 2].push_back(rec.samples[t]);
-        for (bool told : {true, false}) {
-          if ((told_only && !told) || (untold_only && told)) continue;
-          LearnOptions o;
-          if (told) o.measurement.noise = Noise{0.003, 1.5 * kDegree};
-          const std::clock_t c = std::clock();
-          const auto r = learn(rec.signals, half[which], o);
-          const double s = double(std::clock() - c) / CLOCKS_PER_SEC;
-          fmt::print("shift {} {} {} : {} | {} | {:.1f} s noise {:.2f} mm {:.2f}°\n", shift, which, told ? "told" : "-", describe(r), errors(r.schema, half[1 - which], nullptr), s, 1e3 * r.schema.noise.position_m, r.schema.noise.rotation_rad / kDegree);
-        }
-      }
-    return 0;
-  }
-  for (int n : poses)
-    for (int seed = 0; seed < seeds; ++seed)
-      for (bool told : {true, false}) {
-        if ((told_only && !told) || (untold_only && told)) continue;
-        Rng rng(77 + seed);
-        SoftArm arm;
-        arm.num_chambers = tendons;
-        arm.coupling = coupling;
-        arm.num_idle = idle;
-        const Noise noise{1e-3 * sp, sr * kDegree};
-        const auto train = record(arm, n, noise, rng);
-        const auto test = record(arm, 300, noise, rng);
-        std::vector<std::vector<Pose>> truth;
-        for (const auto& s : test) truth.push_back(arm.poses(s.action));
-        LearnOptions o;
-        if (told) o.measurement.noise = noise;
-        std::vector<Signal> signals;
-        for (int s = 0; s < arm.num_signals(); ++s) signals.push_back({fmt::format("q{}", s + 1)});
-        const std::clock_t c = std::clock();
-        const auto r = learn(signals, train, o);
-        const double secs = double(std::clock() - c) / CLOCKS_PER_SEC;
-        fmt::print("N {} seed {} {} : {} | {} | {:.1f} s noise {:.2f} mm {:.2f}°\n", n, seed, told ? "told" : "-", describe(r), errors(r.schema, test, &truth), secs, 1e3 * r.schema.noise.position_m, r.schema.noise.rotation_rad / kDegree);
-      }
+  arguments.recording.empty() ? print_arms(arguments) : print_recording(arguments);
 }

@@ -11,6 +11,8 @@
 #include "processes/structure_learner/noise_estimate.h"
 #include "processes/structure_learner/residual_fit.h"
 #include "processes/structure_learner/screen.h"
+#include "processes/structure_learner/soft_parts.h"
+#include "tests/support/soft_arm.h"
 #include "tests/support/synthetic_robot.h"
 
 namespace bodyschema {
@@ -276,6 +278,89 @@ TEST(SoftBodies, ATrunkInAStreamIsLearnedAlthoughAMarkerFlipsInBursts) {
   int found = 0;
   for (const Outlier& o : result.outliers) found += o.part == 1;
   EXPECT_GT(found, 0.95 * flipped);
+}
+
+// Noise that is guessed, or told too large, has room for screws: a process leaves far less.
+TEST(SoftBodies, ScrewsThatLargeNoiseAllowsGiveWayInAStream) {
+  Rng rng(812);
+  auto samples = stream(4000, 4, rng);
+  observe(&samples, 2, trunk, rng);
+  const NormalizedActions actions(samples, 4);
+  SearchOptions options;
+  options.measurement.noise = Noise{0.006, 0.03};
+  const PairData pair = make_pair_data(samples, 0, 1, options.measurement, 600);
+  const auto start = one_joint_start(screen_one_joint(relative_motions(pair, 200), actions)[0],
+                                     pair, actions, 0.03);
+  SearchResult found;
+  found.records[{0, 1}].num_common = 4000;
+  found.models.push_back({0, 1, fit_local_model(start.model, pair, actions, 30, 1e-3).model});
+  connect_soft_parts(samples, actions, {0, 1}, options, &found);
+  ASSERT_EQ(found.models.size(), 1U);
+  const std::vector<int>& soft = found.models[0].soft_signals;
+  EXPECT_EQ(std::set<int>(soft.begin(), soft.end()), (std::set<int>{0, 1, 2}));
+
+  // A screw of an arm stays.
+  observe(&samples, 2, arm, rng);
+  const PairData rigid = make_pair_data(samples, 0, 1, options.measurement, 600);
+  const auto hinge = one_joint_start(screen_one_joint(relative_motions(rigid, 200), actions)[0],
+                                     rigid, actions, 0.03);
+  found.models = {{0, 1, fit_local_model(hinge.model, rigid, actions, 30, 1e-3).model}};
+  connect_soft_parts(samples, actions, {0, 1}, options, &found);
+  ASSERT_EQ(found.models.size(), 1U);
+  EXPECT_TRUE(found.models[0].soft_signals.empty());
+}
+
+// Nine chambers, and two signals that do nothing: each section's own and, by its tendons, those of
+// the next, whether the noise is told or not.
+TEST(SoftBodies, EachSectionHasTheSignalsOfItsChambers) {
+  test::SoftArm arm;
+  arm.coupling = 0.3;
+  arm.num_idle = 2;
+  constexpr Noise kQuiet{0.001, 0.5 * kDegree};
+  Rng rng(810);
+  const auto samples = arm.babble(100, kQuiet, rng);
+  for (const bool is_told : {true, false}) {
+    LearnOptions options;
+    if (is_told) options.measurement.noise = kQuiet;
+    const LearnResult result = learn(arm.signals(), samples, options);
+    EXPECT_TRUE(result.schema.complete) << is_told;
+    for (const Edge& edge : result.schema.edges) {
+      EXPECT_EQ(edge.to, edge.from + 1);
+      const auto signals = edge.signals();
+      EXPECT_EQ(std::set<int>(signals.begin(), signals.end()), arm.signals_of(edge.from));
+    }
+    EXPECT_LT(result.schema.noise.position_m, 2 * kQuiet.position_m);
+    EXPECT_LT(result.schema.noise.rotation_rad, 2 * kQuiet.rotation_rad);
+  }
+}
+
+// What a process learns goes on with the number of poses.
+TEST(SoftBodies, MorePosesArePredictedBetter) {
+  test::SoftArm arm;
+  arm.num_sections = 1;
+  constexpr Noise kQuiet{0.001, 0.5 * kDegree};
+  double error[2];
+  for (const int n : {0, 1}) {
+    Rng rng(811);
+    auto samples = arm.babble(n == 0 ? 64 : 400, kQuiet, rng);
+    const NormalizedActions actions(samples, arm.num_signals());
+    MeasurementModel measurement;
+    measurement.noise = kQuiet;
+    const PairData pair = make_pair_data(samples, 0, 1, measurement, 600);
+    const auto fit =
+        fit_soft_model(screen_rigid(pair, actions).model, pair, actions, {}, {0, 1, 2});
+    ASSERT_TRUE(fit);
+    EXPECT_EQ(fit->model.residual_gp->num_samples(), n == 0 ? 64 : ResidualGp::kMaxSamples);
+    double sum = 0;
+    for (const ActionPoseSample& sample : arm.babble(200, {}, rng)) {
+      const Pose truth = sample.parts[0].X_CB.inverse() * sample.parts[1].X_CB;
+      const Vector6d rest = log(fit->model.screws.predict(actions, 0).inverse() * truth) -
+                            fit->model.residual_gp->mean(sample.action);
+      sum += rest.head<3>().norm();
+    }
+    error[n] = sum / 200;
+  }
+  EXPECT_LT(error[1], 0.75 * error[0]);
 }
 
 TEST(SoftBodies, WhatIsNoFunctionOfTheActionsHasNoModel) {
