@@ -87,7 +87,8 @@ LearnedStructure contested(LearnedStructure structure, const LearnedStructure& r
 
 // The structure at the least noise that explains it; edges with needless joints are still in it.
 LearnedStructure least_noise(LearnedStructure told, const FindStructure& find) {
-  if (lacks_data(told)) return told;
+  // With more noise the screws would be back.
+  if (lacks_data(told) || told.search.gave_way) return told;
   const bool is_explained = told.spans() && !is_soft(told);
   // Couplings alone are no reason to lose other joints.
   const bool is_in_doubt = !told.search.redundant.empty() ||

@@ -35,10 +35,6 @@ constexpr int kMinRepeats = 5;
 // Of a pair, per axis: any tag's or tracker's is below.
 constexpr double kLargestRotationNoise = 1.5 * kDegree;
 constexpr double kLargestBias = 4;  // of a stream, in standard deviations of its white noise
-// A richer model must leave this share of the product of position and rotation deviations. Of the
-// soft trunk's parts models leave 0.01 to 0.3 of what rigid pairs leave, of a recording without a
-// valid model 0.99 and more (trunk_c11, trunk_adiabatic4).
-constexpr double kExplained = 0.5;
 
 // A residual log(Δ̂⁻¹ z) of a relative pose with the lever arm that carries the rotation noise of
 // part i into its position; 0 for a single marker (`markers` 1), and for what a soft body leaves,
@@ -243,8 +239,10 @@ class ModelNoise {
     Noise noise = kRough;
     for (int round = 0; round < 4; ++round) {
       const PairData pair = pair_data(part_i, part_j, noise, kFramesOfASoftPair);
+      // Which signals it needs shows at a noise that is about right.
+      const std::vector<int> signals = round < 2 ? std::vector<int>{} : soft.signals;
       const auto fit =
-          fit_soft_model(screen_rigid(pair, actions_).model, pair, actions_, {}, soft.signals);
+          fit_soft_model(screen_rigid(pair, actions_).model, pair, actions_, {}, signals);
       if (!fit) return;
       soft.signals = fit->model.signals;
       soft.residuals.clear();
@@ -358,7 +356,7 @@ using FitsOfPairs = std::map<std::pair<int, int>, ScaledFit>;
 
 // Where one joint does not suffice, more may, or a Gaussian process. Edges far above the quietest
 // do, those of a stream far above its jitter, and what is no marker's noise; with few edges any
-// may. Chains of many joints pass for soft bodies, roughly.
+// may. A soft body passes for a chain of many joints, roughly: a process is offered there, too.
 void offer_richer_models(const ModelNoise& model_noise, const std::vector<int>& parts,
                          const std::vector<std::pair<int, int>>& tree,
                          const std::optional<Noise>& jitter, int max_signals, FitsOfPairs* fits) {
@@ -405,7 +403,8 @@ std::vector<NoiseResidual> residuals_of_quiet(const std::vector<const ScaledFit*
 }  // namespace
 
 bool is_above_any_marker(const Noise& noise) {
-  return noise.position_m > 0.01 || noise.rotation_rad > 3 * kDegree;
+  return noise.position_m > kLoudestMarker.position_m ||
+         noise.rotation_rad > kLoudestMarker.rotation_rad;
 }
 
 std::vector<std::vector<int>> repeats(const NormalizedActions& actions) {

@@ -7,6 +7,11 @@
 
 namespace bodyschema {
 
+/// A richer model must leave this share of the product of position and rotation deviations. Of the
+/// soft trunk's parts models leave 0.01 to 0.3 of what rigid pairs leave, of a recording without a
+/// valid model 0.99 and more (trunk_c11, trunk_adiabatic4).
+inline constexpr double kExplained = 0.5;
+
 /// Below this no measurement is believed: 0.1 mm and 0.02° per axis.
 inline constexpr Noise kNoiseFloor{1e-4, 3.4906585e-4};
 
@@ -14,10 +19,10 @@ inline constexpr Noise kNoiseFloor{1e-4, 3.4906585e-4};
 /// chapter's markers. Without a ceiling, poses at random would pass for a rigid body badly seen.
 inline constexpr Noise kNoiseCeiling{0.1, 0.41887902};
 
-/// More than any tag or tracker has: 10 mm or 3°. What models leave above it is motion, too.
-/// Chosen, above the 3 mm and 1° of tags, below the 30 to 46 mm and 9 to 15° of two joints fitted
-/// to a real arm of seven (16 subsets of arm7_ends.csv), which a Gaussian process would then
-/// explain well.
+/// As noisy as any tag or tracker: what models leave above it is motion, too. Chosen, above the 3
+/// mm and 1° of tags, below the 30 to 46 mm and 9 to 15° of two joints fitted to a real arm of
+/// seven (16 subsets of arm7_ends.csv), which a Gaussian process would then explain well.
+inline constexpr Noise kLoudestMarker{0.01, 0.05235988};
 bool is_above_any_marker(const Noise& noise);
 
 /// Where the noise of a marker is known from.

@@ -7,6 +7,7 @@
 #include <set>
 #include <tuple>
 
+#include "processes/structure_learner/noise_estimate.h"
 #include "processes/structure_learner/residual_fit.h"
 #include "processes/structure_learner/screen.h"
 
@@ -16,10 +17,6 @@ namespace {
 constexpr int kMaxFrames = 600;
 constexpr int kScreenFrames = 150;
 constexpr std::size_t kPairsTried = 3;  // between two components
-// Of a stream how noisy it is is a guess, or a claim, that has room for screws where a process
-// leaves far less: this share of the product of position and rotation deviations, as where the
-// noise is estimated.
-constexpr double kExplained = 0.5;
 
 struct OpenPair {
   double cost;  // of the best screws, a frame
@@ -92,9 +89,11 @@ std::optional<SoftFit> best_soft_fit(const OpenPair& open,
   return best;
 }
 
-// Models of screws that a process on other signals surpasses.
-void withdraw_soft(const std::vector<ActionPoseSample>& samples, const NormalizedActions& actions,
-                   const SearchOptions& options, SearchResult* found) {
+// The noise of a stream is guessed or claimed: screws may pass where a process on other signals
+// leaves far less. Their models go, and the processes are candidates.
+void withdraw_screws(const std::vector<ActionPoseSample>& samples, const NormalizedActions& actions,
+                     const SearchOptions& options, SearchResult* found,
+                     std::vector<AcceptedModel>* candidates) {
   std::erase_if(found->models, [&](const AcceptedModel& m) {
     if (!m.soft_signals.empty()) return false;
     const auto soft =
@@ -107,8 +106,17 @@ void withdraw_soft(const std::vector<ActionPoseSample>& samples, const Normalize
     const Fit screws = fit_local_model(m.model, data, actions, 15, 1e-2);
     const int num_independent =
         actions.blocks().count(data.frames, [](const PairFrame& f) { return f.sample; });
-    return soft->log_density > log_density_of_screws(screws, data, actions) -
-                                   3 * std::log(kExplained) * num_independent;
+    // Three coordinates of position and three of rotation gain the log of what their deviations
+    // are smaller by.
+    if (soft->log_density <=
+        log_density_of_screws(screws, data, actions) - 3 * std::log(kExplained) * num_independent)
+      return false;
+    candidates->push_back(
+        {m.part_i, m.part_j, soft->model.screws, soft->score, soft->model.signals});
+    std::erase(found->redundant, std::pair(m.part_i, m.part_j));
+    found->records[{m.part_i, m.part_j}].is_redundant = false;
+    found->gave_way = true;
+    return true;
   });
 }
 
@@ -118,7 +126,8 @@ void connect_soft_parts(const std::vector<ActionPoseSample>& samples,
                         const NormalizedActions& actions, const std::vector<int>& parts,
                         const SearchOptions& options, SearchResult* found) {
   const bool is_stream = actions.blocks().is_stream();
-  if (is_stream) withdraw_soft(samples, actions, options, found);
+  std::vector<AcceptedModel> candidates;
+  if (is_stream) withdraw_screws(samples, actions, options, found, &candidates);
   Components components(parts);
   for (const AcceptedModel& m : found->models) components.join(m.part_i, m.part_j);
   std::map<std::pair<int, int>, std::vector<OpenPair>> open;  // by the two components
@@ -126,11 +135,11 @@ void connect_soft_parts(const std::vector<ActionPoseSample>& samples,
   for (const auto& [pair, record] : found->records) {
     const int a = components.of(pair.first), b = components.of(pair.second);
     if (a == b) continue;
+    // What screws need more data for is no reason to wait where they give way to a process anyway.
     if (!record.undecided.empty() && !is_stream) undecided.insert(std::minmax(a, b));
     if (record.num_common >= kFewestSoftFrames)
       open[std::minmax(a, b)].push_back({0, pair.first, pair.second, {}});
   }
-  std::vector<AcceptedModel> candidates;
   for (auto& [between, pairs] : open) {
     if (undecided.count(between)) continue;
     rank_pairs(samples, actions, options, &pairs, found);

@@ -6,10 +6,11 @@
 
 namespace bodyschema {
 
-/// The fallback of the search: between components of the forest where every screw model was refuted
-/// on enough data, soft models; those with fewer signals first, then by score. What outliers cost
-/// does not enter the score: a marker that flips says nothing about its neighbours. Rigid robots
-/// never come here once their tree spans.
+/// The fallback of the search: soft models between components of the forest where every screw model
+/// was refuted on enough data, those of the best score first. What outliers cost does not enter the
+/// score: a marker that flips says nothing about its neighbours. Poses at rest never come here once
+/// their tree spans. Of a stream, screws give way first where a process on other signals leaves at
+/// most kExplained of what they leave (SearchResult::gave_way).
 void connect_soft_parts(const std::vector<ActionPoseSample>& samples,
                         const NormalizedActions& actions, const std::vector<int>& parts,
                         const SearchOptions& options, SearchResult* found);

@@ -16,6 +16,7 @@ struct SearchResult {
   /// (redundant_edges()).
   std::vector<std::pair<int, int>> redundant;
   std::vector<Coupling> couplings;  ///< joints of the models that may be none
+  bool gave_way = false;            ///< screws to soft models (connect_soft_parts())
   std::map<std::pair<int, int>, PairRecord> records;
   std::set<int> resting;  ///< parts that keep their pose in the camera's frame
   /// All poses', each tree fitted as a whole, Student-t [nats]; up to a constant. It holds for a
@@ -37,7 +38,7 @@ struct SearchResult {
 /// The quality q(M) = s(M) − kΛ with Λ above the spread of s is the lexicographic order (k, −s). So
 /// Kruskal may work layer by layer: k = 0 first, then k = 1 for the pairs that the forest has not
 /// yet connected, then k = 2. That is exact (the spanning forests are a matroid) and leaves most
-/// models unevaluated.
+/// models unevaluated. Of more than 14 parts not all pairs are searched for two joints.
 ///
 /// With few frames a true model may be kept out by bad luck (too many outliers) and would come back
 /// as a superset of its signals: so no larger model is accepted between two components while a

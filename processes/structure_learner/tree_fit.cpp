@@ -229,6 +229,7 @@ void TreeFit::fit(int max_iterations, double tolerance) {
   // Where an iteration costs many times what a trial does. Chosen: longer steps may also lead to
   // another minimum, and small trees need them least.
   constexpr std::size_t kManyNodes = 15;
+  constexpr double kLongestStep = 64;
   const bool goes_farther = nodes_.size() >= kManyNodes;
   LevenbergMarquardt optimizer(1e-4, 1e-10, 6);
   struct Moved {
@@ -241,7 +242,7 @@ void TreeFit::fit(int max_iterations, double tolerance) {
     const Normal normal = normal_equations();
     if (normal.H.rows() == 0) return;  // one part that moves: each root is at its marker
     const auto moved = [&](const Eigen::VectorXd& step) {
-      Moved result{nodes_, roots_, {}, fits_, 0};
+      Moved result{nodes_, roots_, {}, {}, 0};
       move_by(step, normal, &result.nodes, &result.roots);
       result.cost = evaluate(result.nodes, result.roots, &result.poses, &result.fits);
       return result;
@@ -250,8 +251,9 @@ void TreeFit::fit(int max_iterations, double tolerance) {
     const bool improved = optimizer.step(normal.H, normal.g, [&](const Eigen::VectorXd& step) {
       Moved best = moved(step);
       if (!(best.cost < cost_)) return false;
-      // The weights make steps too short where many residuals are large.
-      for (double length = 2; goes_farther; length *= 2) {
+      // With the weights of a heavy-tailed cost the curvature is overestimated where many residuals
+      // are large, and steps are too short.
+      for (double length = 2; goes_farther && length <= kLongestStep; length *= 2) {
         Moved farther = moved(length * step);
         if (!(farther.cost < best.cost)) break;
         best = std::move(farther);

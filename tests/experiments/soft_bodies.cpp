@@ -6,9 +6,13 @@
 
 #include <CLI/CLI.hpp>
 #include <algorithm>
+#include <cstdio>
 #include <ctime>
 #include <fstream>
 #include <iostream>
+#include <map>
+#include <optional>
+#include <set>
 #include <sstream>
 
 #include "common/estimation/quantile.h"
@@ -160,7 +164,8 @@ int main(int argc, char** argv) {
   app.add_option("--recording", arguments.recording, "A stream in CSV instead")
       ->check(CLI::ExistingFile);
   app.add_option("--block", arguments.block, "Instants a block")->check(CLI::PositiveNumber);
-  app.add_option("--shifts", arguments.shifts, "Instants by which the blocks' borders move");
+  app.add_option("--shifts", arguments.shifts, "Instants by which the blocks' borders move")
+      ->check(CLI::NonNegativeNumber);
   app.add_option("--noise", arguments.noise, "mm and degrees told of the recording")->expected(2);
   CLI11_PARSE(app, argc, argv);
   std::setvbuf(stdout, nullptr, _IOLBF, 0);

@@ -1,6 +1,8 @@
 #include "tests/support/soft_arm.h"
 
+#include <algorithm>
 #include <cmath>
+#include <string>
 
 namespace bodyschema::test {
 

@@ -199,8 +199,8 @@ void LayeredSearch::layer_two_joints() {
   }
 }
 
-// At most so many of each component, to all others: those that one joint explains best, for the
-// fewer joints are between two parts, the less it leaves.
+// By what one joint leaves, for the fewer joints are between two parts, the less that is: a pair is
+// left out where both components have `most` better ones.
 std::vector<std::pair<int, int>> LayeredSearch::open_pairs(std::size_t most, bool* is_all) {
   std::vector<std::pair<int, int>> pairs;
   for_each_open_pair([&](int i, int j) { pairs.emplace_back(i, j); });
@@ -212,16 +212,18 @@ std::vector<std::pair<int, int>> LayeredSearch::open_pairs(std::size_t most, boo
   std::stable_sort(pairs.begin(), pairs.end(),
                    [&](const auto& x, const auto& y) { return score_of(x) < score_of(y); });
   std::map<int, std::size_t> taken;  // by component
-  *is_all = std::erase_if(pairs, [&](const std::pair<int, int>& ij) {
-              std::size_t& of_i = taken[forest_.component(ij.first)];
-              std::size_t& of_j = taken[forest_.component(ij.second)];
-              if (of_i >= most && of_j >= most) return true;
-              ++of_i;
-              ++of_j;
-              return false;
-            }) == 0;
-  std::sort(pairs.begin(), pairs.end());
-  return pairs;
+  std::vector<std::pair<int, int>> result;
+  for (const auto& [i, j] : pairs) {
+    std::size_t& of_i = taken[forest_.component(i)];
+    std::size_t& of_j = taken[forest_.component(j)];
+    if (of_i >= most && of_j >= most) continue;
+    ++of_i;
+    ++of_j;
+    result.emplace_back(i, j);
+  }
+  *is_all = result.size() == pairs.size();
+  std::sort(result.begin(), result.end());
+  return result;
 }
 
 bool LayeredSearch::two_joints_pass(const Turns& turns, std::size_t most_pairs,

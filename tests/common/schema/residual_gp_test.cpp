@@ -153,7 +153,7 @@ TEST(ResidualGp, RefusesWhatDoesNotGoTogether) {
   prior.variances(2) = 0;
   EXPECT_THROW(ResidualGp({0, 1, 2}, good.inputs(), good.residuals(), scales, prior),
                std::invalid_argument);
-  EXPECT_THROW(model(65, 1e-3, rng), std::invalid_argument);
+  EXPECT_THROW(model(ResidualGp::kMaxSamples + 1, 1e-3, rng), std::invalid_argument);
   EXPECT_THROW(good.mean(Eigen::VectorXd::Zero(2)), std::invalid_argument);
 }
 

@@ -329,6 +329,7 @@ TEST(SoftBodies, EachSectionHasTheSignalsOfItsChambers) {
       const auto signals = edge.signals();
       EXPECT_EQ(std::set<int>(signals.begin(), signals.end()), arm.signals_of(edge.from));
     }
+    EXPECT_GT(result.schema.noise.position_m, 0.8 * kQuiet.position_m);
     EXPECT_LT(result.schema.noise.position_m, 2 * kQuiet.position_m);
     EXPECT_LT(result.schema.noise.rotation_rad, 2 * kQuiet.rotation_rad);
   }
@@ -350,6 +351,7 @@ TEST(SoftBodies, MorePosesArePredictedBetter) {
     const auto fit =
         fit_soft_model(screen_rigid(pair, actions).model, pair, actions, {}, {0, 1, 2});
     ASSERT_TRUE(fit);
+    EXPECT_EQ(fit->verdict, Verdict::kValid);
     EXPECT_EQ(fit->model.residual_gp->num_samples(), n == 0 ? 64 : ResidualGp::kMaxSamples);
     double sum = 0;
     for (const ActionPoseSample& sample : arm.babble(200, {}, rng)) {
