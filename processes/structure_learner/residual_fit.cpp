@@ -17,10 +17,9 @@ constexpr std::size_t kLeastSamples = 10;
 constexpr int kIterations = 15, kDropIterations = 8;  // of the marginal likelihood
 // Factors on the variance that is assumed: a tenth and twice the deviation.
 constexpr double kLeastNoise = 1e-2, kMostNoise = 4;
-// Instants that tell hyper-parameters and signals: each step costs the cube of their number. With
-// 64 a signal without effect is kept as seldom as with more (soft_bodies).
+// Instants that tell hyper-parameters and signals. Chosen: each step costs the cube of their number.
 constexpr std::size_t kShapeSamples = 64;
-// Of eleven signals a third of the fits that all candidates would take.
+// Signals tried for a step. Chosen: of eleven signals three take about half of the fits of all.
 constexpr std::size_t kDropCandidates = 3;
 // A signal stays if the blocks left out miss it by this [nats] and by so many of its standard
 // errors: what few blocks say may be noise. Of 150 chains with a signal without effect two kept it
