@@ -17,7 +17,8 @@ constexpr std::size_t kLeastSamples = 10;
 constexpr int kIterations = 15, kDropIterations = 8;  // of the marginal likelihood
 // Factors on the variance that is assumed: a tenth and twice the deviation.
 constexpr double kLeastNoise = 1e-2, kMostNoise = 4;
-// Instants that tell hyper-parameters and signals. Chosen: each step costs the cube of their number.
+// Instants that tell hyper-parameters and signals. Chosen: each step costs the cube of their
+// number.
 constexpr std::size_t kShapeSamples = 64;
 // Signals tried for a step. Chosen: of eleven signals three take about half of the fits of all.
 constexpr std::size_t kDropCandidates = 3;
