@@ -23,8 +23,9 @@ constexpr std::size_t kShapeSamples = 64;
 // Signals tried for a step. Chosen: of eleven signals three take about half of the fits of all.
 constexpr std::size_t kDropCandidates = 3;
 // A signal stays if the blocks left out miss it by this [nats] and by so many of its standard
-// errors: what few blocks say may be noise. Of 150 chains with a signal without effect two kept it
-// by 17 and 12 nats, 1.6 and 0.8 errors; signals with an effect have 2.3 and more.
+// errors: what few blocks say may be noise. Measured with the assumed noise, not with the one that
+// fits: of 150 chains with a signal without effect two kept it by 17 and 12 nats, 1.6 and 0.8
+// errors; signals with an effect have 2.3 and more.
 constexpr double kMissed = 10, kMissedErrors = 2;
 // Trace of the whitened covariance of a prediction: 6 is that of a measurement.
 constexpr double kLargestUncertainty = 6;
