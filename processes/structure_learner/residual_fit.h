@@ -32,12 +32,13 @@ struct SoftFit {
   int num_outliers = 0;
   double score = 0;  ///< mean over the inliers of the log density of z, up to a constant [nats]
   /// What the data say of two models of one pair [nats]: the sum over the independent frames of
-  /// −½[min(d², 2c) + log|fI + S|] with d² = rᵀ(fI + S)⁻¹r, f the factor on the assumed variance
-  /// that the marginal likelihood chose, c kOutlierThreshold.
+  /// −½[min(d², 2c) + log|fI + S|] with d² = rᵀ(fI + S)⁻¹r, c kOutlierThreshold, f the factor on
+  /// the assumed variance that makes it largest: that of the marginal likelihood is not converged,
+  /// and a signal without effect that moves it a little would seem to explain something.
   double log_density = 0;
 };
 
-/// SoftFit::log_density of a chain of screws, by the blocks that are left out, with the best f; its
+/// SoftFit::log_density of a chain of screws, by the blocks that are left out; its
 /// own uncertainty counts in d² alone. Both favour screws.
 double log_density_of_screws(const Fit& fit, const PairData& pair,
                              const NormalizedActions& actions);
