@@ -424,6 +424,16 @@ std::optional<Fitter> without(const Fitter& full, int place) {
   return result;
 }
 
+// With few samples a process is off by what a signal without effect may seem to explain: it is
+// missed if it is with all of them too.
+bool is_missed(const Fitter& full, const Fitter& fewer) {
+  if (!full.misses(fewer)) return false;
+  Fitter all = full, all_fewer = fewer;
+  all.use_all_samples();
+  all_fewer.use_all_samples();
+  return all.misses(all_fewer);
+}
+
 // Backwards: of those with the longest length scales the signal that is missed least goes first, of
 // the others only where these are missed.
 void drop_signals(Fitter* fitter) {
@@ -440,7 +450,7 @@ void drop_signals(Fitter* fitter) {
       if (fewer && (!best || fewer->judged().log_density > best->judged().log_density))
         best = std::move(fewer);
     }
-    if (!best || fitter->misses(*best)) break;
+    if (!best || is_missed(*fitter, *best)) break;
     *fitter = std::move(*best);
   }
 }
