@@ -1,7 +1,6 @@
 #include "processes/structure_learner/residual_fit.h"
 
 #include <Eigen/Cholesky>
-#include <Eigen/Eigenvalues>
 #include <algorithm>
 #include <cmath>
 #include <limits>
@@ -9,6 +8,7 @@
 
 #include "common/estimation/quantile.h"
 #include "common/gp/minimize_in_box.h"
+#include "processes/structure_learner/predictive_density.h"
 
 namespace bodyschema {
 namespace {
@@ -16,8 +16,6 @@ namespace {
 constexpr int kMaxInputs = 12;
 constexpr std::size_t kLeastSamples = 10;
 constexpr int kIterations = 15, kDropIterations = 8;  // of the marginal likelihood
-// Factors on the variance that is assumed: a tenth and twice the deviation.
-constexpr double kLeastNoise = 1e-2, kMostNoise = 4;
 // Instants that tell hyper-parameters and signals. Chosen: each step costs the cube of their
 // number.
 constexpr std::size_t kShapeSamples = 64;
@@ -80,40 +78,6 @@ std::vector<int> spread_evenly(const Eigen::MatrixXd& inputs, const std::vector<
   }
   std::sort(chosen.begin(), chosen.end());
   return chosen;
-}
-
-// Along the principal axes of the whitened covariance S of a prediction: the residual's squares and
-// the variances.
-struct PrincipalResidual {
-  Vector6d squares, variances;
-
-  double squared_distance(double noise) const {
-    return (squares.array() / (noise + variances.array())).sum();
-  }
-  // −½[min(d², 2c) + log|fI + S|] with the noise f: the distance of an outlier is bounded.
-  double log_density(double noise) const {
-    return -0.5 * (std::min(squared_distance(noise), 2 * kOutlierThreshold) +
-                   (noise + variances.array()).log().sum());
-  }
-};
-
-PrincipalResidual principal(const Vector6d& residual, const Matrix6d& S) {
-  const Eigen::SelfAdjointEigenSolver<Matrix6d> axes(S);
-  return {(axes.eigenvectors().transpose() * residual).cwiseAbs2(), axes.eigenvalues().cwiseMax(0)};
-}
-
-// The factor on the assumed variance that the residuals fit best.
-double best_noise(const std::vector<PrincipalResidual>& residuals) {
-  double best = 1, best_density = -std::numeric_limits<double>::infinity();
-  // Between two steps of 10 % lies a best factor that costs 0.003 nats a frame less at most.
-  for (double noise = kLeastNoise; noise <= kMostNoise; noise *= 1.1) {
-    double density = 0;
-    for (const PrincipalResidual& r : residuals) density += r.log_density(noise);
-    if (density <= best_density) continue;
-    best_density = density;
-    best = noise;
-  }
-  return best;
 }
 
 // Hyper-parameters over normalised inputs.
@@ -370,7 +334,7 @@ class Fitter {
       // To first order the variance of ρ is one of the pose, moved by the right Jacobian.
       const Matrix6d G = h.whitening * right_jacobian_inverse(mean.col(t)).inverse();
       const Matrix6d S = G * variance.col(t).asDiagonal() * G.transpose();
-      residuals.push_back(principal(frame.residual, S));
+      residuals.push_back(principal_residual(frame.residual, S));
       judged_.squared_distance[t] = residuals.back().squared_distance(1);
       judged_.residual[t] = h.whitening.triangularView<Eigen::Lower>().solve(frame.residual);
     }
