@@ -243,6 +243,7 @@ schema_edge_t to_message(const Edge& edge) {
     out.slide_m = joint.slide;
     out.turn_rad = joint.turn;
     out.order_group = joint.order_group;
+    out.scatter = joint.scatter;
     out.X_after = bodyschema::to_message(joint.X_after);
   }
   set_array(message.num_joints, message.joints, std::move(joints));
@@ -280,6 +281,7 @@ Edge from_message(const schema_edge_t& message) {
     out.slide = joint.slide_m;
     out.turn = joint.turn_rad;
     out.order_group = joint.order_group;
+    out.scatter = joint.scatter;
     out.X_after = bodyschema::from_message(joint.X_after);
   }
   if (!message.residual_gp.empty()) edge.residual_gp = from_message(message.residual_gp.front());

@@ -113,6 +113,18 @@ Matrix6d Edge::prediction_covariance(const Eigen::VectorXd& theta) const {
   return covariance;
 }
 
+Matrix6d Edge::scatter_covariance(const Eigen::VectorXd& theta) const {
+  Eigen::VectorXd variances(std::ssize(joints));
+  for (std::size_t d = 0; d < joints.size(); ++d)
+    variances(static_cast<Eigen::Index>(d)) = joints[d].scatter * joints[d].scatter;
+  if (variances.isZero(0)) return Matrix6d::Zero();
+  Eigen::MatrixXd twists;
+  chain_of(*this, theta)
+      .predict_by_displacements(&twists,
+                                residual_gp ? Residual(*residual_gp, theta, right).suffix : right);
+  return twists * variances.asDiagonal() * twists.transpose();
+}
+
 Matrix6d Edge::empirical_covariance() const {
   Vector6d variances;
   variances.head<3>().setConstant(position_rms_m * position_rms_m / 3);

@@ -27,6 +27,9 @@ struct ScrewJoint {
   Pose X_after = Pose::Identity();  ///< the constant transform that follows
   /// Joints of an edge with the same number: their mutual order is open. −1: it is settled.
   int order_group = -1;
+  /// Standard deviation, from one action to the next, of what a θ + b is off by [command units]:
+  /// backlash, steps, droop. 0: none was found.
+  double scatter = 0;
 };
 
 /// Derivative of a pose by an action, 6×m: (translation [m], rotation [rad]) per command unit.
@@ -96,6 +99,9 @@ struct Edge {
   /// First-order covariance of the prediction (right perturbation in the frame of `to`): from
   /// parameter_covariance and the residual GP's variances, or from the matrix GP's.
   Matrix6d prediction_covariance(const Eigen::VectorXd& theta) const;
+  /// What the scatter of the joints adds to the covariance of one pose (right perturbation in the
+  /// frame of `to`): Σ_d scatter_d² t_d t_dᵀ with t_d the twist of joint d.
+  Matrix6d scatter_covariance(const Eigen::VectorXd& theta) const;
   /// Covariance of an observed pose about the predicted one, from position_rms_m and
   /// rotation_rms_rad, alike along all axes; the same everywhere.
   Matrix6d empirical_covariance() const;

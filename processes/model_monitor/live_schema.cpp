@@ -93,7 +93,8 @@ bool is_same_model(const Edge& a, const Edge& b) {
   const auto is_same = [](const Pose& x, const Pose& y) { return x.matrix() == y.matrix(); };
   const auto is_same_joint = [&](const ScrewJoint& x, const ScrewJoint& y) {
     return x.signal == y.signal && x.gain == y.gain && x.offset == y.offset && x.slide == y.slide &&
-           x.turn == y.turn && x.order_group == y.order_group && is_same(x.X_after, y.X_after);
+           x.turn == y.turn && x.order_group == y.order_group && x.scatter == y.scatter &&
+           is_same(x.X_after, y.X_after);
   };
   return is_same(a.left, b.left) && is_same(a.right, b.right) && a.has_process_of(b) &&
          std::equal(a.joints.begin(), a.joints.end(), b.joints.begin(), b.joints.end(),

@@ -4,6 +4,7 @@
 #include <cmath>
 #include <limits>
 
+#include "processes/structure_learner/joint_scatter.h"
 #include "processes/structure_learner/residual_fit.h"
 #include "processes/structure_learner/root_pose.h"
 #include "processes/structure_learner/tree_fit.h"
@@ -90,6 +91,10 @@ void fit_screw_edge(const LocalModel& start, const PairData& pair, const EdgeDat
   if (!result->is_valid) return;
   result->model = fit.model;
   result->edge = to_edge(fit.model, data.actions);
+  const Eigen::VectorXd scatter = joint_scatter(fit, loo, pair, data.actions);
+  for (int d = 0; d < fit.model.num_joints(); ++d)
+    result->edge.joints[static_cast<std::size_t>(d)].scatter =
+        scatter(d) * data.actions.half_range(fit.model.joints[d].signal);
   const int inliers = judge(pair, loo.squared_distance, loo.residual, result);
   double weight = 0;
   for (int t = 0; t < pair.size(); ++t)
@@ -162,7 +167,11 @@ void fit_jointly(const EdgeData& data, std::vector<FittedEdge>* fitted, BodySche
       if (f.edge.to != node.part) continue;
       const Edge moved = to_edge(node.model, data.actions);
       f.edge.left = moved.left;
-      f.edge.joints = moved.joints;
+      for (std::size_t d = 0; d < moved.joints.size(); ++d) {
+        const double scatter = f.edge.joints[d].scatter;
+        f.edge.joints[d] = moved.joints[d];
+        f.edge.joints[d].scatter = scatter;
+      }
       if (covariance)
         f.edge.parameter_covariance =
             in_command_units(covariance->models[k], node.model, data.actions);

@@ -13,9 +13,8 @@ double PrincipalResidual::squared_distance(double noise) const {
 }
 
 double PrincipalResidual::log_density(double noise) const {
-  const auto log_det = [&](double f) { return (f + variances.array()).log().sum(); };
-  return -0.5 *
-         std::min(squared_distance(noise) + log_det(noise), 2 * kOutlierThreshold + log_det(1));
+  return -0.5 * (std::min(squared_distance(noise), 2 * kOutlierThreshold) +
+                 (noise + variances.array()).log().sum());
 }
 
 PrincipalResidual principal_residual(const Vector6d& residual, const Matrix6d& S) {

@@ -17,8 +17,8 @@ struct PrincipalResidual {
 
   /// d² = rᵀ(fI + S)⁻¹r with the factor f on the assumed variance.
   double squared_distance(double noise) const;
-  /// The log density of the residual up to a constant [nats]: −½[d² + log|fI + S|]; of an outlier
-  /// no less than −½[2c + log|I + S|], c kOutlierThreshold, so that f is that of the others.
+  /// −½[min(d², 2c) + log|fI + S|], c kOutlierThreshold: the log density of the residual up to a
+  /// constant [nats], where the distance of an outlier is bounded.
   double log_density(double noise) const;
 };
 
@@ -26,7 +26,8 @@ struct PrincipalResidual {
 PrincipalResidual principal_residual(const Vector6d& residual, const Matrix6d& S);
 
 /// The factor of largest density within [kLeastNoise, kMostNoise], to 10 %: between two steps lies
-/// one that has 0.003 nats a frame more at most.
+/// one that has 0.003 nats a frame more at most. A share of outliers makes it smaller by that
+/// share.
 double best_noise(const std::vector<PrincipalResidual>& residuals);
 
 }  // namespace bodyschema

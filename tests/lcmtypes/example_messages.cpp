@@ -65,6 +65,7 @@ schema_edge_t edge(int from, int to, int num_joints) {
     joint.slide_m = 0.002;
     joint.turn_rad = 1.02;
     joint.order_group = num_joints > 1 ? 3 : -1;
+    joint.scatter = 0.01;
     joint.X_after = pose(10 + n);
   }
   fill(edge.num_joints, edge.joints, joints);

@@ -72,6 +72,7 @@ Json joint_json(const BodySchema& schema, const ScrewJoint& joint, const JointDe
                {"slide_m", joint.slide},
                {"turn_rad", joint.turn},
                {"order_group", known(joint.order_group)},
+               {"scatter", joint.scatter},
                {"X_after", pose_json(joint.X_after)},
                {"sd", nullptr}};
   if (sd)
@@ -142,6 +143,7 @@ std::string joints_text(const BodySchema& schema, const Edge& edge, const Eigen:
     if (joint.turn != 0) text += rate(joint.turn / kDegree, "°", sd.turn / kDegree);
     if (joint.slide != 0) text += rate(joint.slide * 1e3, " mm", sd.slide * 1e3);
     text += " per unit";
+    if (joint.scatter > 0) text += fmt::format(", scatters by {:.2g}", joint.scatter);
     if (joint.order_group >= 0) text += fmt::format(", order open (group {})", joint.order_group);
     text += "\n";
   }

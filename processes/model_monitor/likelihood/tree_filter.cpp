@@ -49,7 +49,7 @@ Pose flipped(const Pose& X) {
 }  // namespace
 
 Matrix6d model_covariance(const Edge& edge, const Eigen::VectorXd& theta) {
-  Matrix6d covariance = edge.prediction_covariance(theta);
+  Matrix6d covariance = edge.prediction_covariance(theta) + edge.scatter_covariance(theta);
   if (edge.residual_gp) covariance += edge.empirical_covariance();
   return covariance;
 }

@@ -10,8 +10,9 @@
 
 namespace bodyschema {
 
-/// Covariance of an edge's prediction, right perturbation: to first order; where it has a residual
-/// GP, which is too sure of itself where it was not trained, plus what its left-out blocks showed.
+/// Covariance of an edge's prediction, right perturbation: to first order, and the scatter of its
+/// joints; where it has a residual GP, which is too sure of itself where it was not trained, plus
+/// what its left-out blocks showed.
 Matrix6d model_covariance(const Edge& edge, const Eigen::VectorXd& theta);
 
 /// What may be wrong with the schema at one instant. Nodes are the places of parts in

@@ -1,0 +1,82 @@
+#include "processes/structure_learner/joint_scatter.h"
+
+#include <Eigen/LU>
+#include <cmath>
+#include <vector>
+
+#include "common/estimation/chi_square.h"
+
+namespace bodyschema {
+namespace {
+
+constexpr int kSweeps = 3;
+// Trial deviations in units of what one frame tells of a displacement.
+constexpr double kLeast = 0.1, kMost = 10, kStep = 1.15;
+
+// What a frame says of the displacements: A = UᵀU, b = Uᵀr.
+struct Term {
+  Eigen::MatrixXd A;
+  Eigen::VectorXd b;
+};
+
+// log N(r; 0, I + U S Uᵀ) − log N(r; 0, I), summed [nats].
+double gain(const std::vector<Term>& terms, const Eigen::VectorXd& S) {
+  double sum = 0;
+  for (const Term& term : terms) {
+    const Eigen::MatrixXd SA = S.asDiagonal() * term.A;
+    const Eigen::PartialPivLU<Eigen::MatrixXd> lu(Eigen::MatrixXd::Identity(S.size(), S.size()) +
+                                                  SA);
+    sum += term.b.dot(lu.solve(S.cwiseProduct(term.b))) - std::log(lu.determinant());
+  }
+  return 0.5 * sum;
+}
+
+std::vector<Term> terms_of(const Fit& fit, const LeaveOneOut& loo, const PairData& pair,
+                           const NormalizedActions& actions) {
+  std::vector<Term> terms;
+  for (int t = 0; t < pair.size(); ++t) {
+    const double d2 = loo.squared_distance[t];
+    if (d2 > kOutlierThreshold) continue;
+    const Matrix6d& W = pair.hypotheses[fit.frames[t].hypothesis].whitening;
+    Vector6d r = W * loo.residual[t];
+    // As long as one of unit covariance: without what the parameters are off by.
+    r *= std::sqrt(d2 / std::max(r.squaredNorm(), 1e-300));
+    const Eigen::MatrixXd U = W * motion_jacobian(fit.model, actions, pair.frames[t].sample);
+    terms.push_back({U.transpose() * U, U.transpose() * r});
+  }
+  return terms;
+}
+
+}  // namespace
+
+Eigen::VectorXd joint_scatter(const Fit& fit, const LeaveOneOut& loo, const PairData& pair,
+                              const NormalizedActions& actions) {
+  const int k = fit.model.num_joints();
+  Eigen::VectorXd S = Eigen::VectorXd::Zero(k);
+  const std::vector<Term> terms = terms_of(fit, loo, pair, actions);
+  if (k == 0 || terms.empty() || pair.num_residuals() < 6) return S;
+  const double share = static_cast<double>(actions.blocks().count(
+                           pair.frames, [](const PairFrame& f) { return f.sample; })) /
+                       pair.size();
+  const double price = 0.5 * std::log(share * static_cast<double>(terms.size()));
+  Eigen::VectorXd information = Eigen::VectorXd::Zero(k);
+  for (const Term& term : terms) information += term.A.diagonal();
+  information /= static_cast<double>(terms.size());
+  for (int sweep = 0; sweep < kSweeps; ++sweep)
+    for (int d = 0; d < k; ++d) {
+      if (!(information(d) > 0)) continue;
+      Eigen::VectorXd trial = S;
+      trial(d) = S(d) = 0;
+      double best = gain(terms, S) + price / share;
+      for (double sd = kLeast; sd <= kMost; sd *= kStep) {
+        trial(d) = sd * sd / information(d);
+        const double found = gain(terms, trial);
+        if (found <= best) continue;
+        best = found;
+        S(d) = trial(d);
+      }
+    }
+  return S.cwiseSqrt();
+}
+
+}  // namespace bodyschema
