@@ -1,0 +1,14 @@
+#pragma once
+
+#include "common/camera/lens.h"
+#include "common/config/camera_calibration.h"
+
+namespace bodyschema {
+
+/// @throws std::invalid_argument if the number of coefficients does not fit the model.
+Lens lens_of(const CameraCalibration& camera);
+
+/// The calibration with a lens's parameters (Lens::parameters()).
+CameraCalibration calibration_with(CameraCalibration camera, const Eigen::VectorXd& parameters);
+
+}  // namespace bodyschema

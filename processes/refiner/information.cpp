@@ -1,0 +1,160 @@
+#include "processes/refiner/information.h"
+
+#include <ceres/crs_matrix.h>
+
+#include <Eigen/Cholesky>
+#include <Eigen/Eigenvalues>
+#include <algorithm>
+#include <cmath>
+#include <stdexcept>
+
+#include "common/estimation/student_t.h"
+
+namespace bodyschema {
+namespace {
+
+/// Eigenvalue of the information scaled to a unit diagonal below which nothing is told of a
+/// direction: rounding leaves 1e-14 of one, a direction that is told has more than 1e-9.
+constexpr double kLeastEigenvalue = 1e-11;
+
+/// ∂r/∂(free directions) of all data, blocks in the order given.
+ceres::CRSMatrix jacobian_of(RefinementProblem& problem,
+                             const std::vector<ParameterBlock*>& blocks) {
+  ceres::Problem::EvaluateOptions options;
+  options.apply_loss_function = false;
+  options.num_threads = 1;
+  for (ParameterBlock* block : blocks) options.parameter_blocks.push_back(block->values.data());
+  for (const auto& datum : problem.data()) options.residual_blocks.push_back(datum.id);
+  ceres::CRSMatrix jacobian;
+  if (!problem.problem().Evaluate(options, nullptr, nullptr, nullptr, &jacobian))
+    throw std::runtime_error("the refined model cannot be evaluated");
+  return jacobian;
+}
+
+}  // namespace
+
+// Over all free directions, the moving roots' eliminated: those refined and those held by priors.
+struct Information::Sums {
+  std::vector<ParameterBlock*> blocks;
+  Eigen::MatrixXd H;
+  double alpha = 0, beta = 0;
+};
+
+Information::Information(RefinementProblem& problem) {
+  const std::vector<double> squared = problem.squared_distances();
+  // What is held has a derivative too.
+  for (ParameterBlock* block : problem.blocks())
+    if (!block->is_refined) problem.problem().SetParameterBlockVariable(block->values.data());
+  Sums sums;
+  add_weighted(squared, problem, &sums);
+  for (ParameterBlock* block : problem.blocks())
+    if (!block->is_refined) problem.problem().SetParameterBlockConstant(block->values.data());
+  double num_residuals = 0;
+  for (const auto& datum : problem.data()) num_residuals += datum.num_residuals;
+  invert(problem, sums, num_residuals);
+}
+
+void Information::add_weighted(const std::vector<double>& squared, RefinementProblem& problem,
+                               Sums* sums) {
+  const std::vector<ParameterBlock*> all = problem.blocks();
+  int num_roots = 0;
+  Eigen::Index size = 0;
+  for (ParameterBlock* block : all) {
+    if (problem.root_moves() && block->kind == ParameterBlock::Kind::kRoot) {
+      ++num_roots;
+    } else {
+      sums->blocks.push_back(block);
+      size += block->num_free();
+    }
+  }
+  const ceres::CRSMatrix J = jacobian_of(problem, all);
+  sums->H = Eigen::MatrixXd::Zero(size, size);
+  std::map<int, std::pair<Matrix6d, Eigen::MatrixXd>> roots;  // H_rr, H_rx
+  double weights = 0, second = 0, score = 0;
+  int row = 0;
+  Eigen::MatrixXd dense;
+  for (std::size_t n = 0; n < squared.size(); ++n) {
+    const int num = problem.data()[n].num_residuals;
+    const double d2 = squared[n], w = robust_weight(d2, num);
+    weights += w * num;
+    second += w * num - 2 * w * d2 / (kStudentNu + d2);
+    score += w * w * d2;
+    // All rows of a residual block have the same columns.
+    const int begin = J.rows[row], width = J.rows[row + 1] - begin;
+    dense.resize(num, width);
+    for (int r = 0; r < num; ++r)
+      for (int c = 0; c < width; ++c) dense(r, c) = J.values[J.rows[row + r] + c];
+    row += num;
+    const Eigen::MatrixXd product = w * dense.transpose() * dense;
+    const int num_of_root = num_roots > 0 ? 6 : 0;
+    const auto column = [&](int c) { return J.cols[begin + c] - 6 * num_roots; };
+    for (int c = num_of_root; c < width; ++c)
+      for (int r = num_of_root; r < width; ++r) sums->H(column(r), column(c)) += product(r, c);
+    if (num_roots == 0) continue;
+    auto& [H_rr, H_rx] = roots[J.cols[begin]];
+    if (H_rx.size() == 0) H_rr.setZero(), H_rx = Eigen::MatrixXd::Zero(6, size);
+    H_rr += product.topLeftCorner<6, 6>();
+    for (int c = 6; c < width; ++c) H_rx.col(column(c)) += product.block<6, 1>(0, c);
+  }
+  for (const auto& [column, root] : roots)
+    sums->H -= root.second.transpose() * root.first.ldlt().solve(root.second);
+  sums->alpha = second / weights;
+  sums->beta = score / weights;
+}
+
+void Information::invert(const RefinementProblem& problem, const Sums& sums, double num_residuals) {
+  std::vector<Eigen::Index> refined, held;
+  std::vector<double> prior;  // information, by column of H
+  for (ParameterBlock* block : sums.blocks) {
+    const Eigen::VectorXd sd = problem.prior_of(*block);
+    if (block->is_refined) {
+      offsets_[block] = static_cast<int>(refined.size());
+      blocks_.push_back(block);
+    }
+    for (const int direction : block->free) {
+      (block->is_refined ? refined : held).push_back(std::ssize(prior));
+      prior.push_back(sd.size() > 0 ? std::pow(sd(direction), -2) : 0);
+    }
+  }
+  const Eigen::VectorXd P = Eigen::Map<const Eigen::VectorXd>(prior.data(), std::ssize(prior));
+  const Eigen::MatrixXd H = sums.H(refined, refined);
+  const Eigen::MatrixXd P_refined = P(refined).asDiagonal();
+  const Eigen::MatrixXd A = sums.alpha * H + P_refined;
+
+  const Eigen::VectorXd unit =
+      A.diagonal().unaryExpr([](double x) { return x > 0 ? 1 / std::sqrt(x) : 1.0; });
+  const Eigen::SelfAdjointEigenSolver<Eigen::MatrixXd> eigen(unit.asDiagonal() * A *
+                                                             unit.asDiagonal());
+  const Eigen::VectorXd& values = eigen.eigenvalues();
+  const auto num_undetermined = (values.array() < kLeastEigenvalue).count();
+  undetermined_ = eigen.eigenvectors().leftCols(num_undetermined);
+  const Eigen::MatrixXd half =
+      unit.asDiagonal() * eigen.eigenvectors() *
+      values.cwiseMax(kLeastEigenvalue).cwiseSqrt().cwiseInverse().asDiagonal();
+  const Eigen::MatrixXd inverse = half * half.transpose();
+  const double num_spent = sums.alpha * inverse.cwiseProduct(H).sum();
+  const double beta = sums.beta * num_residuals / std::max(num_residuals - num_spent, 1.0);
+  covariance_ = inverse * (beta * H + P_refined) * inverse;
+  // Along what nothing tells there is no score either.
+  const Eigen::MatrixXd open = half.leftCols(num_undetermined);
+  covariance_ += open * open.transpose();
+  if (held.empty()) return;
+  const Eigen::MatrixXd K = inverse * (sums.alpha * sums.H(refined, held));
+  covariance_ += K * P(held).cwiseInverse().asDiagonal() * K.transpose();
+}
+
+int Information::offset(const ParameterBlock* block) const {
+  const auto found = offsets_.find(block);
+  return found == offsets_.end() ? -1 : found->second;
+}
+
+Eigen::MatrixXd Information::cross_covariance(const ParameterBlock* one,
+                                              const ParameterBlock* other) const {
+  Eigen::MatrixXd full = Eigen::MatrixXd::Zero(one->tangent_size(), other->tangent_size());
+  const int row = offset(one), column = offset(other);
+  if (row < 0 || column < 0) return full;
+  full(one->free, other->free) = covariance_.block(row, column, one->num_free(), other->num_free());
+  return full;
+}
+
+}  // namespace bodyschema

@@ -1,0 +1,46 @@
+#pragma once
+
+#include <Eigen/Core>
+#include <map>
+#include <string>
+#include <vector>
+
+#include "processes/refiner/refinement_problem.h"
+
+namespace bodyschema {
+
+/// What the samples tell of the parameters at the refined values: the covariance of an M-estimator
+/// (Huber), with the poses of a moving root eliminated (Schur complement).
+///
+///   Cov = A⁻¹ B A⁻¹ + K C Kᵀ,  A = α H + P,  B = β H + P,  H = Σ w JᵀJ,
+///
+/// w the Student-t weights, P the priors' information, α and β the means of the second derivative
+/// and of the squared score per weight over all residuals, β corrected for the degrees of freedom.
+/// K C Kᵀ is what the held parameters' priors C (tags, lens) make of the refined ones.
+class Information {
+ public:
+  explicit Information(RefinementProblem& problem);
+
+  /// Blocks of `covariance`: refined ones, a moving root's left out.
+  const std::vector<ParameterBlock*>& blocks() const { return blocks_; }
+  /// First row of a block; −1 if it is not among them.
+  int offset(const ParameterBlock* block) const;
+  /// Of the free directions of all blocks. Directions that nothing tells have a finite, huge
+  /// variance, so that it can be stored.
+  const Eigen::MatrixXd& covariance() const { return covariance_; }
+  /// Orthonormal columns in parameters scaled to unit information: directions that nothing tells.
+  const Eigen::MatrixXd& undetermined() const { return undetermined_; }
+  /// Part of a block's covariance in its whole tangent: zero along held directions.
+  Eigen::MatrixXd cross_covariance(const ParameterBlock* one, const ParameterBlock* other) const;
+
+ private:
+  struct Sums;
+  void add_weighted(const std::vector<double>& squared, RefinementProblem& problem, Sums* sums);
+  void invert(const RefinementProblem& problem, const Sums& sums, double num_residuals);
+
+  std::vector<ParameterBlock*> blocks_;
+  std::map<const ParameterBlock*, int> offsets_;
+  Eigen::MatrixXd covariance_, undetermined_;
+};
+
+}  // namespace bodyschema

@@ -1,0 +1,98 @@
+#pragma once
+
+#include <ceres/problem.h>
+
+#include <deque>
+#include <map>
+#include <optional>
+#include <set>
+#include <string>
+#include <vector>
+
+#include "common/camera/lens.h"
+#include "common/config/rig.h"
+#include "processes/refiner/parameter_block.h"
+#include "processes/refiner/part_chain.h"
+#include "processes/refiner/refine.h"
+#include "processes/refiner/residuals.h"
+
+namespace bodyschema {
+
+/// What a schema, the rig's calibration and samples make for Ceres: blocks of parameters, residuals
+/// of the tags' corners (or of parts' poses), priors.
+class RefinementProblem {
+ public:
+  /// One observation: a tag's corners, or a part's pose.
+  struct Datum {
+    ceres::ResidualBlockId id = nullptr;
+    int num_residuals = 0;
+    std::int64_t sample_index = 0;
+    int part = 0;
+    int tag = -1;  ///< −1: of a pose
+  };
+
+  /// `samples`: those to fit, ascending. `rig`: none where poses are fitted. What cannot be
+  /// used (a part that hangs on nothing, a tag that moved, a sample before an edge was valid) is
+  /// passed over. @throws std::invalid_argument.
+  RefinementProblem(const BodySchema& schema, const std::vector<RefinerSample>& samples,
+                    const std::optional<RigCalibration>& rig, const RefineOptions& options,
+                    bool root_moves);
+
+  /// Levenberg–Marquardt with Student-t weights, the noise's scale estimated between its runs,
+  /// until neither changes.
+  void solve();
+
+  /// Those that a residual depends on: roots, edges, tags ascending, lens.
+  std::vector<ParameterBlock*> blocks();
+  const std::vector<Datum>& data() const { return data_; }
+  ceres::Problem& problem() { return problem_; }
+  double scale() const { return scale_.value; }
+  int num_iterations() const { return num_iterations_; }
+  /// Tag of the root that defines its frame; −1 without corners.
+  int gauge_tag() const { return gauge_tag_; }
+  bool root_moves() const { return root_moves_; }
+  /// d² of each datum now.
+  std::vector<double> squared_distances();
+  /// Standard deviations of a block's whole tangent beforehand; empty: nothing is known.
+  Eigen::VectorXd prior_of(const ParameterBlock& block) const;
+  const std::map<int, std::vector<const Edge*>>& paths() const { return paths_; }
+  /// Whether the sample's root has a pose: always where it rests.
+  bool has_root(std::int64_t sample_index) const {
+    return !root_moves_ || roots_.contains(sample_index);
+  }
+  /// Blocks of the edges with a block on the way to a part, the root's first (of a sample).
+  std::vector<ParameterBlock*> chain_blocks(int part, std::int64_t sample_index);
+
+ private:
+  void add_paths();
+  void add_roots(const std::vector<RefinerSample>& samples);
+  void add_tags(const std::vector<RefinerSample>& samples);
+  void add_lens();
+  void add_corners(const RefinerSample& sample);
+  void add_poses(const RefinerSample& sample);
+  void add(ceres::CostFunction* cost, const std::vector<ParameterBlock*>& blocks, Datum datum);
+  void add_priors();
+  bool is_usable(int part, std::int64_t sample_index) const;
+  double estimated_scale();
+
+  const BodySchema& schema_;
+  const std::optional<RigCalibration>& rig_;
+  const RefineOptions& options_;
+  const bool root_moves_;
+  std::optional<Lens> lens_;
+  std::map<int, std::vector<const Edge*>> paths_;  // by part
+  std::deque<ParameterBlock> storage_;             // addresses stay
+  std::map<std::int64_t, ParameterBlock*> roots_;  // by sample; by −1 where the root rests
+  std::map<int, ParameterBlock*> edges_, tags_;    // by index, by id
+  ParameterBlock* lens_block_ = nullptr;
+  int gauge_tag_ = -1;
+  NoiseScale scale_;
+  StudentTLoss loss_of_corners_{8}, loss_of_poses_{6}, loss_of_positions_{3};
+  std::deque<BlockManifold> manifolds_;
+  std::set<const ParameterBlock*> used_;
+  std::vector<Datum> data_;
+  int num_iterations_ = 0;
+  ceres::Problem problem_;
+};
+
+}  // namespace bodyschema
