@@ -23,7 +23,7 @@ ceres::CRSMatrix jacobian_of(RefinementProblem& problem,
   ceres::Problem::EvaluateOptions options;
   options.apply_loss_function = false;
   options.num_threads = 1;
-  for (ParameterBlock* block : blocks) options.parameter_blocks.push_back(block->values.data());
+  for (ParameterBlock* block : blocks) options.parameter_blocks.push_back(problem.memory_of(block));
   for (const auto& datum : problem.data()) options.residual_blocks.push_back(datum.id);
   ceres::CRSMatrix jacobian;
   if (!problem.problem().Evaluate(options, nullptr, nullptr, nullptr, &jacobian))
@@ -41,17 +41,21 @@ struct Information::Sums {
 };
 
 Information::Information(RefinementProblem& problem) {
-  const std::vector<double> squared = problem.squared_distances();
+  std::vector<double> squared = problem.squared_distances();
+  // Residuals of a fit are smaller than errors by the degrees of freedom that it took.
+  double num_residuals = 0, num_fitted = 0;
+  for (const auto& datum : problem.data()) num_residuals += datum.num_residuals;
+  for (const ParameterBlock* block : problem.blocks())
+    num_fitted += block->is_refined ? block->num_free() : 0;
+  for (double& d2 : squared) d2 *= num_residuals / std::max(num_residuals - num_fitted, 1.0);
   // What is held has a derivative too.
   for (ParameterBlock* block : problem.blocks())
-    if (!block->is_refined) problem.problem().SetParameterBlockVariable(block->values.data());
+    if (!block->is_refined) problem.problem().SetParameterBlockVariable(problem.memory_of(block));
   Sums sums;
   add_weighted(squared, problem, &sums);
   for (ParameterBlock* block : problem.blocks())
-    if (!block->is_refined) problem.problem().SetParameterBlockConstant(block->values.data());
-  double num_residuals = 0;
-  for (const auto& datum : problem.data()) num_residuals += datum.num_residuals;
-  invert(problem, sums, num_residuals);
+    if (!block->is_refined) problem.problem().SetParameterBlockConstant(problem.memory_of(block));
+  invert(problem, sums);
 }
 
 void Information::add_weighted(const std::vector<double>& squared, RefinementProblem& problem,
@@ -102,7 +106,7 @@ void Information::add_weighted(const std::vector<double>& squared, RefinementPro
   sums->beta = score / weights;
 }
 
-void Information::invert(const RefinementProblem& problem, const Sums& sums, double num_residuals) {
+void Information::invert(const RefinementProblem& problem, const Sums& sums) {
   std::vector<Eigen::Index> refined, held;
   std::vector<double> prior;  // information, by column of H
   for (ParameterBlock* block : sums.blocks) {
@@ -132,9 +136,7 @@ void Information::invert(const RefinementProblem& problem, const Sums& sums, dou
       unit.asDiagonal() * eigen.eigenvectors() *
       values.cwiseMax(kLeastEigenvalue).cwiseSqrt().cwiseInverse().asDiagonal();
   const Eigen::MatrixXd inverse = half * half.transpose();
-  const double num_spent = sums.alpha * inverse.cwiseProduct(H).sum();
-  const double beta = sums.beta * num_residuals / std::max(num_residuals - num_spent, 1.0);
-  covariance_ = inverse * (beta * H + P_refined) * inverse;
+  covariance_ = inverse * (sums.beta * H + P_refined) * inverse;
   // Along what nothing tells there is no score either.
   const Eigen::MatrixXd open = half.leftCols(num_undetermined);
   covariance_ += open * open.transpose();

@@ -15,7 +15,7 @@ namespace bodyschema {
 ///   Cov = A⁻¹ B A⁻¹ + K C Kᵀ,  A = α H + P,  B = β H + P,  H = Σ w JᵀJ,
 ///
 /// w the Student-t weights, P the priors' information, α and β the means of the second derivative
-/// and of the squared score per weight over all residuals, β corrected for the degrees of freedom.
+/// and of the squared score per weight over all residuals.
 /// K C Kᵀ is what the held parameters' priors C (tags, lens) make of the refined ones.
 class Information {
  public:
@@ -36,7 +36,7 @@ class Information {
  private:
   struct Sums;
   void add_weighted(const std::vector<double>& squared, RefinementProblem& problem, Sums* sums);
-  void invert(const RefinementProblem& problem, const Sums& sums, double num_residuals);
+  void invert(const RefinementProblem& problem, const Sums& sums);
 
   std::vector<ParameterBlock*> blocks_;
   std::map<const ParameterBlock*, int> offsets_;

@@ -170,6 +170,8 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   result.held = held_things(schema, options, result.used_corners);
 
   RefinementProblem problem(schema, training, used_rig, options, result.root_moves);
+  for (const int part : problem.unseen_parts())
+    result.held.push_back(fmt::format("the frame of part {}: it was never seen", part));
   problem.solve();
   const Information information(problem);
   const RefinementWords words(schema, information);

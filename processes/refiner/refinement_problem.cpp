@@ -1,6 +1,7 @@
 #include "processes/refiner/refinement_problem.h"
 
 #include <ceres/solver.h>
+#include <glog/logging.h>
 
 #include <algorithm>
 #include <cmath>
@@ -40,16 +41,42 @@ RefinementProblem::RefinementProblem(const BodySchema& schema,
     add_tags(samples);
     add_lens();
   }
+  place_blocks();
   for (const RefinerSample& sample : samples) rig_ ? add_corners(sample) : add_poses(sample);
   if (data_.empty())
     throw std::invalid_argument(
         rig_ ? "no sample shows a tag of the rig on a part of the schema"
              : "no sample shows a part that the schema connects to its root");
+  hold_unseen_frames();
   for (ParameterBlock* block : blocks())
-    problem_.SetManifold(block->values.data(), &manifolds_.emplace_back(*block));
+    problem_.SetManifold(memory_of(block), &manifolds_.emplace_back(*block));
   add_priors();
   for (ParameterBlock* block : blocks())
-    if (!block->is_refined) problem_.SetParameterBlockConstant(block->values.data());
+    if (!block->is_refined) problem_.SetParameterBlockConstant(memory_of(block));
+}
+
+// The frame of a part that was never seen is anywhere: it stays where it is.
+void RefinementProblem::hold_unseen_frames() {
+  std::set<int> seen;
+  for (const Datum& datum : data_) seen.insert(datum.part);
+  const auto hold = [&](ParameterBlock* block, int first, int part) {
+    if (seen.contains(part) || !used_.contains(block)) return;
+    std::erase_if(block->free, [&](int direction) { return direction >= first; });
+    unseen_parts_.push_back(part);
+    if (!block->free.empty()) return;
+    problem_.SetParameterBlockConstant(memory_of(block));
+    used_.erase(block);
+  };
+  if (!root_moves_) hold(roots_.at(-1), 0, schema_.root);
+  for (const auto& [index, block] : edges_)
+    hold(block, block->tangent_size() - 6, schema_.edges[index].to);
+}
+
+void RefinementProblem::place_blocks() {
+  for (const ParameterBlock& block : storage_) {
+    memory_offsets_[&block] = memory_.size();
+    memory_.insert(memory_.end(), block.values.begin(), block.values.end());
+  }
 }
 
 void RefinementProblem::add_paths() {
@@ -145,7 +172,7 @@ void RefinementProblem::add(ceres::CostFunction* cost, const std::vector<Paramet
                             Datum datum) {
   std::vector<double*> values;
   for (ParameterBlock* block : blocks) {
-    values.push_back(block->values.data());
+    values.push_back(memory_of(block));
     used_.insert(block);
   }
   datum.num_residuals = cost->num_residuals();
@@ -242,7 +269,7 @@ void RefinementProblem::add_priors() {
   for (ParameterBlock* block : blocks()) {
     const Eigen::VectorXd sd = prior_of(*block);
     if (sd.size() == 0) continue;
-    problem_.AddResidualBlock(new PriorResidual(*block, sd), nullptr, block->values.data());
+    problem_.AddResidualBlock(new PriorResidual(*block, sd), nullptr, memory_of(block));
   }
 }
 
@@ -283,6 +310,8 @@ double RefinementProblem::estimated_scale() {
 }
 
 void RefinementProblem::solve() {
+  // A step for which Cholesky fails is tried again with more damping; glog would tell the user.
+  FLAGS_minloglevel = google::GLOG_ERROR;
   ceres::Solver::Options options;
   options.logging_type = ceres::SILENT;
   options.num_threads = 1;
@@ -298,7 +327,7 @@ void RefinementProblem::solve() {
     options.linear_solver_ordering = std::make_shared<ceres::ParameterBlockOrdering>();
     const auto eliminated = root_moves_ ? ParameterBlock::Kind::kRoot : ParameterBlock::Kind::kTag;
     for (ParameterBlock* block : blocks())
-      options.linear_solver_ordering->AddElementToGroup(block->values.data(),
+      options.linear_solver_ordering->AddElementToGroup(memory_of(block),
                                                         block->kind == eliminated ? 0 : 1);
   }
   // Far from the minimum all residuals are large: with the scale that they have none is an outlier.
@@ -318,6 +347,8 @@ void RefinementProblem::solve() {
     scale_.value = scale;
     if (change < 1e-3) break;
   }
+  for (ParameterBlock* block : blocks())
+    std::copy_n(memory_of(block), block->values.size(), block->values.begin());
 }
 
 }  // namespace bodyschema

@@ -46,11 +46,16 @@ class RefinementProblem {
   std::vector<ParameterBlock*> blocks();
   const std::vector<Datum>& data() const { return data_; }
   ceres::Problem& problem() { return problem_; }
+  /// Where Ceres knows a block's values. All are in one array, in the order of the blocks: Ceres
+  /// orders blocks by address, and the same samples shall give the same bytes.
+  double* memory_of(const ParameterBlock* block) { return &memory_[memory_offsets_.at(block)]; }
   double scale() const { return scale_.value; }
   int num_iterations() const { return num_iterations_; }
   /// Tag of the root that defines its frame; −1 without corners.
   int gauge_tag() const { return gauge_tag_; }
   bool root_moves() const { return root_moves_; }
+  /// Parts on the way to others that were never seen: their frames are held.
+  const std::vector<int>& unseen_parts() const { return unseen_parts_; }
   /// d² of each datum now.
   std::vector<double> squared_distances();
   /// Standard deviations of a block's whole tangent beforehand; empty: nothing is known.
@@ -72,6 +77,8 @@ class RefinementProblem {
   void add_poses(const RefinerSample& sample);
   void add(ceres::CostFunction* cost, const std::vector<ParameterBlock*>& blocks, Datum datum);
   void add_priors();
+  void place_blocks();
+  void hold_unseen_frames();
   bool is_usable(int part, std::int64_t sample_index) const;
   double estimated_scale();
 
@@ -86,11 +93,14 @@ class RefinementProblem {
   std::map<int, ParameterBlock*> edges_, tags_;    // by index, by id
   ParameterBlock* lens_block_ = nullptr;
   int gauge_tag_ = -1;
+  std::vector<double> memory_;
+  std::map<const ParameterBlock*, std::size_t> memory_offsets_;
   NoiseScale scale_;
   StudentTLoss loss_of_corners_{8}, loss_of_poses_{6}, loss_of_positions_{3};
   std::deque<BlockManifold> manifolds_;
   std::set<const ParameterBlock*> used_;
   std::vector<Datum> data_;
+  std::vector<int> unseen_parts_;
   int num_iterations_ = 0;
   ceres::Problem problem_;
 };

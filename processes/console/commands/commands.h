@@ -11,6 +11,9 @@ void add_offline_commands(Arguments console);
 /// `engineer`: a schema file from a URDF, marker placements and a recording that tells where the
 /// camera stands.
 void add_engineer_command(Arguments console);
+/// `refine`: fits all parameters of a schema to a recording, by Ceres; where this was built without
+/// it, says how to get it.
+void add_refine_command(Arguments console);
 /// `log`: what an LCM log holds, and whether it is whole and of this version.
 void add_log_command(Arguments console);
 /// `monitor`: keeps a schema true over a recording; its events and errors, line by line.

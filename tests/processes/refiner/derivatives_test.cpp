@@ -26,8 +26,7 @@ ParameterBlock pose_block(ParameterBlock::Kind kind, const Pose& X) {
 
 /// Compares the derivative by every free direction of every block with central differences.
 void expect_right_derivatives(const ceres::CostFunction& cost,
-                              const std::vector<const ParameterBlock*>& blocks,
-                              double tolerance) {
+                              const std::vector<const ParameterBlock*>& blocks, double tolerance) {
   std::vector<std::vector<double>> values;
   std::vector<RowMajor> J;
   for (const ParameterBlock* block : blocks) {
@@ -103,7 +102,8 @@ TEST(Residuals, OfCornersHaveTheirDerivatives) {
   Rng rng(2);
   ThreeEdges robot(rng);
   const RigCalibration rig = test::tagged(test::chapter_robot("a", rng), 1, rng).truth;
-  for (const auto model : {CameraCalibration::Model::kPlumbBob, CameraCalibration::Model::kFisheye}) {
+  for (const auto model :
+       {CameraCalibration::Model::kPlumbBob, CameraCalibration::Model::kFisheye}) {
     CameraCalibration camera = rig.camera;
     camera.model = model;
     const Lens lens = lens_of(camera);

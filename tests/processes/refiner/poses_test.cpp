@@ -118,9 +118,7 @@ TEST(Refine, ComesNearTheCramerRaoBound) {
   expect_near_the_bound("d", 60, 1.2, false);
 }
 
-TEST(Refine, ComesNearTheCramerRaoBoundAmongFlips) {
-  expect_near_the_bound("c", 30, 1.35, true);
-}
+TEST(Refine, ComesNearTheCramerRaoBoundAmongFlips) { expect_near_the_bound("c", 30, 1.35, true); }
 
 }  // namespace
 }  // namespace bodyschema

@@ -78,7 +78,7 @@ std::vector<RefinerSample> seen_corners(const TaggedRobot& robot, const RigCalib
       if (cosine < std::cos(kMostTilt_rad)) continue;
       TagSight& sight = seen.tags.emplace_back();
       sight.tag = tag.id;
-      sight.covariance_px2 = std::pow(std::max(noise_px, 1e-4), 2) * Matrix8d::Identity();
+      sight.covariance_px2 = std::pow(std::max(noise_px, 1e-3), 2) * Matrix8d::Identity();
       const auto corners = tag_corners(tag.size_m);
       for (int c = 0; c < 4; ++c) {
         const Eigen::Vector3d p_C = X_CM * corners[c];
