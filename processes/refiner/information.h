@@ -35,8 +35,9 @@ class Information {
 
  private:
   struct Sums;
-  void add_weighted(const std::vector<double>& squared, RefinementProblem& problem, Sums* sums);
-  void invert(const RefinementProblem& problem, const Sums& sums);
+  struct Weights;
+  static Sums weighted(RefinementProblem& problem, const Weights& weights);
+  void invert(const RefinementProblem& problem, const Sums& sums, const Weights& weights);
 
   std::vector<ParameterBlock*> blocks_;
   std::map<const ParameterBlock*, int> offsets_;
