@@ -34,11 +34,11 @@ ceres::CRSMatrix jacobian_of(RefinementProblem& problem,
 
 }  // namespace
 
-// Over all free directions, the moving roots' eliminated: those refined and those held by priors.
+// Over all free directions, the instants' eliminated: those refined and those held by priors.
 struct Information::Sums {
   std::vector<ParameterBlock*> blocks;
   Eigen::MatrixXd H;
-  int num_roots = 0;  // that move
+  int num_instants = 0, instant_size = 0;
 };
 
 // Student-t weights of the data, and what they make of a fit's covariance.
@@ -84,6 +84,8 @@ Information::Information(RefinementProblem& problem) {
   for (const ParameterBlock* block : problem.blocks())
     num_fitted += block->is_refined ? block->num_free() : 0;
   const Weights weights(problem.data(), problem.squared_distances(), num_fitted);
+  // A joint that rested would seem to have moved by its play.
+  problem.leave_out_play();
   // What is held has a derivative too.
   for (ParameterBlock* block : problem.blocks())
     if (!block->is_refined) problem.problem().SetParameterBlockVariable(problem.memory_of(block));
@@ -97,8 +99,9 @@ Information::Sums Information::weighted(RefinementProblem& problem, const Weight
   Sums sums;
   Eigen::Index size = 0;
   for (ParameterBlock* block : problem.blocks()) {
-    if (problem.root_moves() && block->kind == ParameterBlock::Kind::kRoot) {
-      ++sums.num_roots;
+    if (block->kind == ParameterBlock::Kind::kInstant) {
+      ++sums.num_instants;
+      sums.instant_size = block->num_free();
     } else {
       sums.blocks.push_back(block);
       size += block->num_free();
@@ -106,7 +109,11 @@ Information::Sums Information::weighted(RefinementProblem& problem, const Weight
   }
   const ceres::CRSMatrix J = jacobian_of(problem, problem.blocks());
   sums.H = Eigen::MatrixXd::Zero(size, size);
-  std::map<int, std::pair<Matrix6d, Eigen::MatrixXd>> roots;  // H_rr, H_rx
+  struct Instant {
+    Eigen::MatrixXd own, mixed;  // sizes e×e, e×P
+  };
+  std::map<int, Instant> instants;  // by their first column
+  const int e = sums.instant_size, num_eliminated = e * sums.num_instants;
   int row = 0;
   Eigen::MatrixXd dense;
   for (std::size_t n = 0; n < problem.data().size(); ++n) {
@@ -118,18 +125,22 @@ Information::Sums Information::weighted(RefinementProblem& problem, const Weight
       for (int c = 0; c < width; ++c) dense(r, c) = J.values[J.rows[row + r] + c];
     row += num;
     const Eigen::MatrixXd product = weights.of_datum[n] * dense.transpose() * dense;
-    const int first = sums.num_roots > 0 ? 6 : 0;
-    const auto column = [&](int c) { return J.cols[begin + c] - 6 * sums.num_roots; };
-    for (int c = first; c < width; ++c)
-      for (int r = first; r < width; ++r) sums.H(column(r), column(c)) += product(r, c);
-    if (sums.num_roots == 0) continue;
-    auto& [H_rr, H_rx] = roots[J.cols[begin]];
-    if (H_rx.size() == 0) H_rr.setZero(), H_rx = Eigen::MatrixXd::Zero(6, size);
-    H_rr += product.topLeftCorner<6, 6>();
-    for (int c = 6; c < width; ++c) H_rx.col(column(c)) += product.block<6, 1>(0, c);
+    const auto column = [&](int c) { return J.cols[begin + c] - num_eliminated; };
+    for (int c = e; c < width; ++c)
+      for (int r = e; r < width; ++r) sums.H(column(r), column(c)) += product(r, c);
+    if (e == 0) continue;
+    Instant& instant = instants[J.cols[begin]];
+    if (instant.own.size() == 0) {
+      instant.own = Eigen::MatrixXd::Zero(e, e);
+      const auto num_plays = problem.play_sd().size();
+      instant.own.diagonal().tail(num_plays) = problem.play_sd().array().square().inverse();
+      instant.mixed = Eigen::MatrixXd::Zero(e, size);
+    }
+    instant.own += product.topLeftCorner(e, e);
+    for (int c = e; c < width; ++c) instant.mixed.col(column(c)) += product.col(c).head(e);
   }
-  for (const auto& [column, root] : roots)
-    sums.H -= root.second.transpose() * root.first.ldlt().solve(root.second);
+  for (const auto& [column, instant] : instants)
+    sums.H -= instant.mixed.transpose() * instant.own.ldlt().solve(instant.mixed);
   return sums;
 }
 

@@ -10,7 +10,8 @@
 namespace bodyschema {
 
 /// What the samples tell of the parameters at the refined values: the covariance of an M-estimator
-/// (Huber), with the poses of a moving root eliminated (Schur complement).
+/// (Huber), with what each instant has of its own (a moving root's
+/// pose, the joints' plays) eliminated (Schur complement).
 ///
 ///   Cov = A⁻¹ B A⁻¹ + K C Kᵀ,  A = α H + P,  B = β H + P,  H = Σ w JᵀJ,
 ///
@@ -21,7 +22,7 @@ class Information {
  public:
   explicit Information(RefinementProblem& problem);
 
-  /// Blocks of `covariance`: refined ones, a moving root's left out.
+  /// Blocks of `covariance`: refined ones, those of instants left out.
   const std::vector<ParameterBlock*>& blocks() const { return blocks_; }
   /// First row of a block; −1 if it is not among them.
   int offset(const ParameterBlock* block) const;

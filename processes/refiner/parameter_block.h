@@ -15,11 +15,13 @@ namespace bodyschema {
 /// column, and scalars, one after another. The tangent of a pose has 6 numbers (translation [m],
 /// rotation [rad]), right perturbation; that of a scalar is itself.
 struct ParameterBlock {
-  enum class Kind { kRoot, kEdge, kTag, kLens };
+  /// kInstant: of one sample, the root's pose if it moves, and how far each joint is from its
+  /// command.
+  enum class Kind { kInstant, kRoot, kEdge, kTag, kLens };
   static constexpr int kPoseSize = 16;
 
   Kind kind = Kind::kRoot;
-  int id = 0;            ///< index of the edge, id of the tag, index of the sample (root)
+  int id = 0;            ///< index of the edge, id of the tag
   std::string elements;  ///< 'X' a pose, 's' a scalar
   std::vector<double> values;
   std::vector<double> start;  ///< values before the refinement

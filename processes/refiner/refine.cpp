@@ -52,9 +52,8 @@ bool has_corners(const std::vector<RefinerSample>& samples) {
                      [](const RefinerSample& seen) { return !seen.tags.empty(); });
 }
 
-// Which data are fitted: corners where there are any and the rig is known.
-bool uses_corners(const std::vector<RefinerSample>& samples,
-                  const std::optional<RigCalibration>& rig, const RefineOptions& options) {
+void check_calibration(const std::vector<RefinerSample>& samples,
+                       const std::optional<RigCalibration>& rig, const RefineOptions& options) {
   const char* const asked = options.placements ? "placements" : "intrinsics";
   const bool is_asked = options.placements || options.intrinsics;
   if (is_asked && !rig)
@@ -63,7 +62,7 @@ bool uses_corners(const std::vector<RefinerSample>& samples,
   if (is_asked && !has_corners(samples))
     throw std::invalid_argument(
         fmt::format("{} are refined by the tags' corners, which the samples do not have", asked));
-  if (!rig || !has_corners(samples)) return false;
+  if (!rig) return;
   const std::int64_t id = calibration_id(rig->markers, rig->camera);
   for (const RefinerSample& seen : samples)
     if (seen.sample.calibration_id != 0 && seen.sample.calibration_id != id)
@@ -71,7 +70,6 @@ bool uses_corners(const std::vector<RefinerSample>& samples,
           fmt::format("sample {} was seen through another calibration of tags and lens than the "
                       "rig's: its markers.yaml or camera calibration is another",
                       seen.sample.sample_index));
-  return true;
 }
 
 /// Do the observed poses of the root differ by more than their noise?
@@ -108,6 +106,19 @@ std::vector<RefinementOutlier> outliers_of(RefinementProblem& problem) {
   std::stable_sort(result.begin(), result.end(),
                    [](const auto& a, const auto& b) { return a.distance > b.distance; });
   if (result.size() > kMostOutliers) result.resize(kMostOutliers);
+  return result;
+}
+
+std::vector<JointPlay> plays_of(const BodySchema& schema, const RefinementProblem& problem) {
+  std::vector<JointPlay> result;
+  for (std::size_t n = 0; n < problem.plays().size(); ++n) {
+    const auto& [edge, d] = problem.plays()[n];
+    const ScrewJoint& joint = edge->joints[d];
+    const double sd = std::abs(joint.gain) * problem.play_sd()(static_cast<Eigen::Index>(n));
+    result.push_back(
+        {fmt::format("{} ({}→{})", schema.signals.at(joint.signal).name, edge->from, edge->to),
+         sd * std::abs(joint.slide), sd * std::abs(joint.turn)});
+  }
   return result;
 }
 
@@ -159,7 +170,8 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   }
   if (training.empty()) throw std::invalid_argument("there are no TRAIN samples");
   Refinement result;
-  result.used_corners = uses_corners(training, rig, options);
+  check_calibration(training, rig, options);
+  result.used_corners = options.placements || options.intrinsics;
   const std::optional<RigCalibration> used_rig = result.used_corners ? rig : std::nullopt;
   if (rig) result.rig = *rig;
   result.num_available = static_cast<int>(training.size());
@@ -173,6 +185,7 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   for (const int part : problem.unseen_parts())
     result.held.push_back(fmt::format("the frame of part {}: it was never seen", part));
   problem.solve();
+  result.outliers = outliers_of(problem);
   const Information information(problem);
   const RefinementWords words(schema, information);
   result.num_observations = static_cast<int>(problem.data().size());
@@ -182,15 +195,15 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   result.parameters = words.parameters();
   result.undetermined = words.undetermined();
   result.correlations = words.correlations(kMostCorrelations);
-  result.outliers = outliers_of(problem);
+  result.plays = plays_of(schema, problem);
   if (result.used_corners) result.rig = refined_rig(problem, *rig);
   result.schema = refined_schema(schema, training, problem, information);
-  if (result.used_corners && (options.placements || options.intrinsics))
+  if (result.used_corners)
     result.schema.calibration_id = calibration_id(result.rig.markers, result.rig.camera);
-  const std::optional<RigCalibration> refined_rig_used =
-      result.used_corners ? std::optional(result.rig) : std::nullopt;
-  result.before = held_out_errors(schema, held_out, used_rig);
-  result.after = held_out_errors(result.schema, held_out, refined_rig_used);
+  const bool judges_corners = rig && has_corners(held_out);
+  result.before = held_out_errors(schema, held_out, judges_corners ? rig : std::nullopt);
+  result.after = held_out_errors(result.schema, held_out,
+                                 judges_corners ? std::optional(result.rig) : std::nullopt);
   result.seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - begin).count();
   return result;
 }

@@ -62,6 +62,12 @@ struct HeldOutErrors {
   std::optional<double> px_median;  ///< of a corner's distance
 };
 
+/// How far a joint is from its command, 1 σ over the samples: backlash and droop.
+struct JointPlay {
+  std::string joint;  ///< "q5 (5→6)"
+  double slide_m = 0, turn_rad = 0;
+};
+
 struct Refinement {
   BodySchema schema;
   RigCalibration rig;  ///< refined; as claimed where nothing of it was
@@ -78,16 +84,19 @@ struct Refinement {
   std::vector<ParameterCorrelation> correlations;  ///< above kHighCorrelation, the highest first
   std::vector<RefinementOutlier> outliers;         ///< the farthest first
   std::vector<SignalCoverage> coverage;
+  std::vector<JointPlay> plays;   ///< where corners were fitted
   std::vector<std::string> held;  ///< what was not refined, and why
   HeldOutErrors before, after;
 };
 inline constexpr double kHighCorrelation = 0.95;
 
-/// Fits all parameters of a schema at once to TRAIN and PROBE samples, with Student-t weights and,
-/// where the samples have corners and `rig` is given, to the corners' pixels: where the root
-/// stands, every screw, and by `options` the tags and the lens, which the rig's claims hold as
-/// priors. Edges with a Gaussian process, command warps and signals' limits stay as they are. TEST
-/// samples are judged alone. The order of samples changes nothing.
+/// Fits all parameters of a schema at once to TRAIN and PROBE samples, with Student-t weights:
+/// where the root stands and every screw. While tags and lens are as the rig says, the data are the
+/// parts' poses, which were made by these. With tags or lens among the parameters, the data are the
+/// corners' pixels, the rig's claims are priors, and at every sample each joint may be off its
+/// command (backlash, droop) by what is estimated to be usual. Edges with a Gaussian process,
+/// command warps and signals' limits stay as they are. TEST samples are judged alone. The order of
+/// samples changes nothing.
 ///
 /// Gauge: of the tags of the root the one seen most often stays where the rig says it is; the scale
 /// is the mean of all tags' sizes, weighed by their priors, for images do not tell it.

@@ -1,8 +1,10 @@
 #include "processes/refiner/refinement_problem.h"
 
+#include <ceres/crs_matrix.h>
 #include <ceres/solver.h>
 #include <glog/logging.h>
 
+#include <Eigen/Cholesky>
 #include <algorithm>
 #include <cmath>
 #include <memory>
@@ -36,7 +38,8 @@ RefinementProblem::RefinementProblem(const BodySchema& schema,
       root_moves_(root_moves),
       problem_(problem_options()) {
   add_paths();
-  add_roots(samples);
+  add_plays();
+  add_instants(samples);
   if (rig_) {
     add_tags(samples);
     add_lens();
@@ -67,7 +70,7 @@ void RefinementProblem::hold_unseen_frames() {
     problem_.SetParameterBlockConstant(memory_of(block));
     used_.erase(block);
   };
-  if (!root_moves_) hold(roots_.at(-1), 0, schema_.root);
+  if (root_) hold(root_, 0, schema_.root);
   for (const auto& [index, block] : edges_)
     hold(block, block->tangent_size() - 6, schema_.edges[index].to);
 }
@@ -97,23 +100,47 @@ void RefinementProblem::add_paths() {
   }
 }
 
-// Of a root that moves: where its parts say that it was.
-void RefinementProblem::add_roots(const std::vector<RefinerSample>& samples) {
-  const auto add_root = [&](std::int64_t index, const Pose& X_CR) {
-    ParameterBlock& root = storage_.emplace_back();
-    root.id = static_cast<int>(index);
-    root.add(X_CR);
-    root.free = {0, 1, 2, 3, 4, 5};
-    roots_[index] = &root;
-  };
-  if (!root_moves_) return add_root(-1, schema_.X_CR);
-  for (const RefinerSample& seen : samples) {
-    const std::map<int, Pose> X_RB = schema_.predict_all(seen.sample.action);
-    for (const PartObservation& observation : seen.sample.parts) {
-      if (!observation.has_rotation || !X_RB.contains(observation.part)) continue;
-      add_root(seen.sample.sample_index, observation.X_CB * X_RB.at(observation.part).inverse());
-      break;
+// Poses have errors of joints in their covariances.
+void RefinementProblem::add_plays() {
+  if (!rig_) return;
+  std::vector<double> sd;
+  for (const Edge& edge : schema_.edges) {
+    if (!PartChain::has_block(edge) || edge.joints.empty()) continue;
+    first_play_[&edge] = static_cast<int>(plays_.size());
+    for (const ScrewJoint& joint : edge.joints) {
+      plays_.push_back({&edge, static_cast<int>(sd.size()) - first_play_[&edge]});
+      const TagCalibration& play = options_.config.joint_play;
+      const double turn = std::abs(joint.gain * joint.turn);
+      const double slide = std::abs(joint.gain * joint.slide);
+      sd.push_back(turn > 0 ? play.rotation_rad / turn : slide > 0 ? play.position_m / slide : 1);
     }
+  }
+  play_sd_ = play_start_ = Eigen::Map<const Eigen::VectorXd>(sd.data(), std::ssize(sd));
+}
+
+// Of a root that moves: where its parts say that it was.
+void RefinementProblem::add_instants(const std::vector<RefinerSample>& samples) {
+  if (!root_moves_) {
+    root_ = &storage_.emplace_back();
+    root_->add(schema_.X_CR);
+    root_->free = {0, 1, 2, 3, 4, 5};
+    if (plays_.empty()) return;
+  }
+  for (const RefinerSample& seen : samples) {
+    ParameterBlock block;
+    block.kind = ParameterBlock::Kind::kInstant;
+    if (root_moves_) {
+      const std::map<int, Pose> X_RB = schema_.predict_all(seen.sample.action);
+      const auto& parts = seen.sample.parts;
+      const auto witness = std::find_if(parts.begin(), parts.end(), [&](const auto& observation) {
+        return observation.has_rotation && X_RB.contains(observation.part);
+      });
+      if (witness == parts.end()) continue;
+      block.add(Pose(witness->X_CB * X_RB.at(witness->part).inverse()));
+    }
+    for (std::size_t n = 0; n < plays_.size(); ++n) block.add(0.0);
+    for (int n = 0; n < block.tangent_size(); ++n) block.free.push_back(n);
+    instants_[seen.sample.sample_index] = &storage_.emplace_back(std::move(block));
   }
 }
 
@@ -160,7 +187,7 @@ bool RefinementProblem::is_usable(int part, std::int64_t sample_index) const {
 }
 
 std::vector<ParameterBlock*> RefinementProblem::chain_blocks(int part, std::int64_t sample_index) {
-  std::vector<ParameterBlock*> blocks = {roots_.at(root_moves_ ? sample_index : -1)};
+  std::vector<ParameterBlock*> blocks = {root_moves_ ? instants_.at(sample_index) : root_};
   for (const Edge* edge : paths_.at(part)) {
     const auto block = edges_.find(static_cast<int>(edge - schema_.edges.data()));
     if (block != edges_.end()) blocks.push_back(block->second);
@@ -201,8 +228,9 @@ void RefinementProblem::add_corners(const RefinerSample& seen) {
     std::vector<ParameterBlock*> blocks = chain;
     blocks.push_back(tags_.at(sight.tag));
     blocks.push_back(lens_block_);
+    if (!plays_.empty() && !root_moves_) blocks.push_back(instants_.at(index));
     auto cost = std::make_unique<CornerResidual>(
-        PartChain(paths_.at(tag->part), theta),
+        PartChain(paths_.at(tag->part), theta, first_play_),
         std::vector<const ParameterBlock*>(blocks.begin(), blocks.end()), tag->size_m, *lens_,
         sight, covariance, scale_);
     // Predicted behind the camera: nothing to start from.
@@ -240,7 +268,8 @@ std::vector<ParameterBlock*> RefinementProblem::blocks() {
     for (const auto& [id, block] : blocks)
       if (used_.contains(block)) result.push_back(block);
   };
-  add_all(roots_);
+  add_all(instants_);
+  if (root_ && used_.contains(root_)) result.push_back(root_);
   add_all(edges_);
   add_all(tags_);
   if (lens_block_) result.push_back(lens_block_);
@@ -267,6 +296,8 @@ Eigen::VectorXd RefinementProblem::prior_of(const ParameterBlock& block) const {
 
 void RefinementProblem::add_priors() {
   for (ParameterBlock* block : blocks()) {
+    if (block->kind == ParameterBlock::Kind::kInstant && !plays_.empty())
+      problem_.AddResidualBlock(new PlayResidual(*block, play_sd_), nullptr, memory_of(block));
     const Eigen::VectorXd sd = prior_of(*block);
     if (sd.size() == 0) continue;
     problem_.AddResidualBlock(new PriorResidual(*block, sd), nullptr, memory_of(block));
@@ -309,27 +340,85 @@ double RefinementProblem::estimated_scale() {
   return scale_.value * std::sqrt(ratio);
 }
 
-void RefinementProblem::solve() {
+// Evidence (MacKay 1992): the sum of squares of a joint's plays over the number of them that the
+// data determine. Returns the largest change, a share.
+double RefinementProblem::estimate_play() {
+  if (plays_.empty()) return 0;
+  std::vector<ParameterBlock*> instants;
+  for (ParameterBlock* block : blocks())
+    if (block->kind == ParameterBlock::Kind::kInstant) instants.push_back(block);
+  ceres::Problem::EvaluateOptions options;
+  options.num_threads = 1;
+  for (ParameterBlock* block : instants) options.parameter_blocks.push_back(memory_of(block));
+  ceres::CRSMatrix J;  // of all residuals, also the priors', with the loss's weights
+  if (!problem_.Evaluate(options, nullptr, nullptr, nullptr, &J))
+    throw std::runtime_error("the refined model cannot be evaluated");
+  const int size = instants.front()->num_free();
+  const auto num = static_cast<int>(plays_.size());
+  std::vector<Eigen::MatrixXd> information(instants.size(), Eigen::MatrixXd::Zero(size, size));
+  for (int row = 0; row < J.num_rows; ++row) {
+    const int begin = J.rows[row], end = J.rows[row + 1];
+    if (begin == end) continue;
+    const Eigen::Map<const Eigen::VectorXd> values(&J.values[begin], end - begin);
+    information[J.cols[begin] / size] += values * values.transpose();
+  }
+  Eigen::ArrayXd squares = Eigen::ArrayXd::Zero(num), determined = Eigen::ArrayXd::Zero(num);
+  for (std::size_t n = 0; n < instants.size(); ++n) {
+    const double* play = memory_of(instants[n]) + instants[n]->values.size() - num;
+    const Eigen::MatrixXd covariance =
+        information[n].llt().solve(Eigen::MatrixXd::Identity(size, size));
+    squares += Eigen::Map<const Eigen::ArrayXd>(play, num).square();
+    determined += 1 - covariance.diagonal().tail(num).array() / play_sd_.array().square();
+  }
+  // Of no play at all, a hundredth of what it began with.
+  const Eigen::ArrayXd next = (squares / determined.max(1e-6))
+                                  .sqrt()
+                                  .max(play_start_.array() / 100)
+                                  .min(play_start_.array() * 100);
+  const double change = (next / play_sd_.array()).log().abs().maxCoeff();
+  play_sd_ = next;
+  return change;
+}
+
+void RefinementProblem::leave_out_play() {
+  for (const auto& [index, block] : instants_) {
+    const auto num = std::ssize(plays_);
+    std::fill_n(memory_of(block) + std::ssize(block->values) - num, num, 0);
+  }
+}
+
+ceres::Solver::Options RefinementProblem::solver_options() {
   // A step for which Cholesky fails is tried again with more damping; glog would tell the user.
   FLAGS_minloglevel = google::GLOG_ERROR;
   ceres::Solver::Options options;
   options.logging_type = ceres::SILENT;
   options.num_threads = 1;
-  options.max_num_iterations = 50;
-  options.function_tolerance = 1e-9;
   options.gradient_tolerance = 1e-12;
   options.parameter_tolerance = 1e-12;
-  const bool eliminates_tags = options_.placements && rig_.has_value();
-  options.linear_solver_type =
-      root_moves_ || eliminates_tags ? ceres::DENSE_SCHUR : ceres::DENSE_NORMAL_CHOLESKY;
-  if (options.linear_solver_type == ceres::DENSE_SCHUR) {
-    // Each residual has one root and one tag: either can be eliminated.
-    options.linear_solver_ordering = std::make_shared<ceres::ParameterBlockOrdering>();
-    const auto eliminated = root_moves_ ? ParameterBlock::Kind::kRoot : ParameterBlock::Kind::kTag;
-    for (ParameterBlock* block : blocks())
-      options.linear_solver_ordering->AddElementToGroup(memory_of(block),
-                                                        block->kind == eliminated ? 0 : 1);
+  // Each residual has one instant and one tag: either can be eliminated.
+  const auto eliminated =
+      instants_.empty() ? ParameterBlock::Kind::kTag : ParameterBlock::Kind::kInstant;
+  options.linear_solver_type = ceres::DENSE_NORMAL_CHOLESKY;
+  options.linear_solver_ordering = std::make_shared<ceres::ParameterBlockOrdering>();
+  for (ParameterBlock* block : blocks()) {
+    options.linear_solver_ordering->AddElementToGroup(memory_of(block),
+                                                      block->kind == eliminated ? 0 : 1);
+    if (block->kind == eliminated && block->is_refined)
+      options.linear_solver_type = ceres::DENSE_SCHUR;
   }
+  return options;
+}
+
+void RefinementProblem::solve() {
+  ceres::Solver::Options options = solver_options();
+  const auto run = [&](double tolerance, int max_iterations) {
+    options.function_tolerance = tolerance;
+    options.max_num_iterations = max_iterations;
+    ceres::Solver::Summary summary;
+    ceres::Solve(options, &problem_, &summary);
+    num_iterations_ += static_cast<int>(summary.iterations.size());
+    if (!summary.IsSolutionUsable()) throw std::runtime_error("the fit failed: " + summary.message);
+  };
   // Far from the minimum all residuals are large: with the scale that they have none is an outlier.
   std::vector<double> shares;
   const std::vector<double> start = squared_distances();
@@ -338,15 +427,14 @@ void RefinementProblem::solve() {
   scale_.value = std::max(1.0, std::sqrt(median(shares)));
   constexpr int kMaxRounds = 20;
   for (int round = 0; round < kMaxRounds; ++round) {
-    ceres::Solver::Summary summary;
-    ceres::Solve(options, &problem_, &summary);
-    num_iterations_ += static_cast<int>(summary.iterations.size());
-    if (!summary.IsSolutionUsable()) throw std::runtime_error("the fit failed: " + summary.message);
+    run(1e-5, 10);
     const double scale = std::max(1.0, estimated_scale());
     const double change = std::abs(scale / scale_.value - 1);
     scale_.value = scale;
-    if (change < 1e-3) break;
+    const double change_of_play = estimate_play();
+    if (change < 0.01 && change_of_play < 0.2) break;
   }
+  run(1e-9, 50);
   for (ParameterBlock* block : blocks())
     std::copy_n(memory_of(block), block->values.size(), block->values.begin());
 }

@@ -1,6 +1,7 @@
 #pragma once
 
 #include <ceres/problem.h>
+#include <ceres/solver.h>
 
 #include <deque>
 #include <map>
@@ -42,7 +43,7 @@ class RefinementProblem {
   /// until neither changes.
   void solve();
 
-  /// Those that a residual depends on: roots, edges, tags ascending, lens.
+  /// Those that a residual depends on: instants, root, edges, tags ascending, lens.
   std::vector<ParameterBlock*> blocks();
   const std::vector<Datum>& data() const { return data_; }
   ceres::Problem& problem() { return problem_; }
@@ -54,8 +55,17 @@ class RefinementProblem {
   /// Tag of the root that defines its frame; −1 without corners.
   int gauge_tag() const { return gauge_tag_; }
   bool root_moves() const { return root_moves_; }
+  /// Joints that may be off their command at every sample, and by how much, 1 σ [command units].
+  struct Play {
+    const Edge* edge = nullptr;
+    int joint = 0;
+  };
+  const std::vector<Play>& plays() const { return plays_; }
+  const Eigen::VectorXd& play_sd() const { return play_sd_; }
   /// Parts on the way to others that were never seen: their frames are held.
   const std::vector<int>& unseen_parts() const { return unseen_parts_; }
+  /// As if every joint had gone where it was told.
+  void leave_out_play();
   /// d² of each datum now.
   std::vector<double> squared_distances();
   /// Standard deviations of a block's whole tangent beforehand; empty: nothing is known.
@@ -63,14 +73,15 @@ class RefinementProblem {
   const std::map<int, std::vector<const Edge*>>& paths() const { return paths_; }
   /// Whether the sample's root has a pose: always where it rests.
   bool has_root(std::int64_t sample_index) const {
-    return !root_moves_ || roots_.contains(sample_index);
+    return !root_moves_ || instants_.contains(sample_index);
   }
   /// Blocks of the edges with a block on the way to a part, the root's first (of a sample).
   std::vector<ParameterBlock*> chain_blocks(int part, std::int64_t sample_index);
 
  private:
   void add_paths();
-  void add_roots(const std::vector<RefinerSample>& samples);
+  void add_plays();
+  void add_instants(const std::vector<RefinerSample>& samples);
   void add_tags(const std::vector<RefinerSample>& samples);
   void add_lens();
   void add_corners(const RefinerSample& sample);
@@ -80,17 +91,23 @@ class RefinementProblem {
   void place_blocks();
   void hold_unseen_frames();
   bool is_usable(int part, std::int64_t sample_index) const;
+  ceres::Solver::Options solver_options();
   double estimated_scale();
+  double estimate_play();
 
   const BodySchema& schema_;
   const std::optional<RigCalibration>& rig_;
   const RefineOptions& options_;
   const bool root_moves_;
   std::optional<Lens> lens_;
-  std::map<int, std::vector<const Edge*>> paths_;  // by part
-  std::deque<ParameterBlock> storage_;             // addresses stay
-  std::map<std::int64_t, ParameterBlock*> roots_;  // by sample; by −1 where the root rests
-  std::map<int, ParameterBlock*> edges_, tags_;    // by index, by id
+  std::map<int, std::vector<const Edge*>> paths_;     // by part
+  std::deque<ParameterBlock> storage_;                // addresses stay
+  ParameterBlock* root_ = nullptr;                    // that rests
+  std::map<std::int64_t, ParameterBlock*> instants_;  // by sample
+  std::vector<Play> plays_;
+  std::map<const Edge*, int> first_play_;
+  Eigen::VectorXd play_sd_, play_start_;
+  std::map<int, ParameterBlock*> edges_, tags_;  // by index, by id
   ParameterBlock* lens_block_ = nullptr;
   int gauge_tag_ = -1;
   std::vector<double> memory_;

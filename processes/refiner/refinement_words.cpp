@@ -63,6 +63,8 @@ void RefinementWords::add(const ParameterBlock& block) {
 
 std::string RefinementWords::thing_of(const ParameterBlock& block) const {
   switch (block.kind) {
+    case Kind::kInstant:
+      break;
     case Kind::kRoot:
       return "root in the camera's frame";
     case Kind::kEdge: {
@@ -96,6 +98,8 @@ std::string RefinementWords::edge_name(const ParameterBlock& block, int directio
 
 std::string RefinementWords::name_of(const ParameterBlock& block, int direction) const {
   switch (block.kind) {
+    case Kind::kInstant:
+      break;
     case Kind::kRoot:
       return fmt::format("{}, {}", thing_of(block), kPoseWords[direction]);
     case Kind::kEdge:

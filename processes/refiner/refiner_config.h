@@ -16,6 +16,9 @@ struct RefinerConfig {
   double focal_length_share = 0.01;
   double centre_px = 5;
   double distortion = 0.01;  ///< of each coefficient
+  /// How far joints may be from their commands at a sample (backlash, droop), where the search
+  /// begins: it is estimated. Sliding joints: position_m, others: rotation_rad.
+  TagCalibration joint_play = {.position_m = 2e-4, .rotation_rad = 0.05 * kDegree};
   /// Of more training samples as many are fitted, evenly spaced.
   int max_samples = 400;
 

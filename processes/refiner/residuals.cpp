@@ -58,10 +58,24 @@ CornerResidual::CornerResidual(PartChain chain, const std::vector<const Paramete
                                double size_m, const Lens& lens, const TagSight& sight,
                                const Matrix8d& covariance_px2, const NoiseScale& scale)
     : ChainResidual(std::move(chain), blocks, 8, scale),
+      play_(find_play()),
       size_m_(size_m),
       lens_(lens),
       measured_px_(sight.corners_px),
       whitener_(whitener_from(covariance_px2)) {}
+
+CornerResidual::Play CornerResidual::find_play() const {
+  for (const int b : {0, static_cast<int>(blocks_.size()) - 1}) {
+    const ParameterBlock& block = *blocks_[b];
+    if (block.kind != ParameterBlock::Kind::kInstant) continue;
+    const bool has_root = block.elements.starts_with("X");
+    return {.block = b,
+            .value = has_root ? ParameterBlock::kPoseSize : 0,
+            .tangent = has_root ? 6 : 0,
+            .num = static_cast<int>(block.elements.size()) - (has_root ? 1 : 0)};
+  }
+  return {};
+}
 
 Eigen::Matrix<double, 2, Eigen::Dynamic> CornerResidual::by_lens(const Eigen::VectorXd& lens,
                                                                  const Eigen::Vector2d& ray) const {
@@ -87,7 +101,10 @@ bool CornerResidual::Evaluate(double const* const* parameters, double* residuals
   if (!(size_m > 0 && lens_parameters.head<2>().minCoeff() > 0)) return false;
   const Lens lens = lens_.with(lens_parameters);
   std::vector<PartChain::Jacobian> by_block;
-  const Pose X_CM = chain_.pose(parameters, X_BM, jacobians ? &by_block : nullptr);
+  PartChain::Jacobian by_play = PartChain::Jacobian::Zero(6, play_.num);
+  const double* play = play_.num > 0 ? parameters[play_.block] + play_.value : nullptr;
+  const Pose X_CM = chain_.pose(parameters, X_BM, jacobians ? &by_block : nullptr, play,
+                                jacobians && play ? &by_play : nullptr);
 
   Eigen::Matrix<double, 8, 1> error;
   Eigen::Matrix<double, 8, 7> by_tag;  // pose of the tag, then the size's factor
@@ -113,6 +130,14 @@ bool CornerResidual::Evaluate(double const* const* parameters, double* residuals
   Eigen::Map<Eigen::Matrix<double, 8, 1>>(residuals, 8) = whitener * error;
   if (!jacobians) return true;
   const Eigen::Matrix<double, 8, 7> whitened = whitener * by_tag;
+  if (play_.num > 0) {
+    if (play_.block == 0) {
+      by_block[0].conservativeResize(6, 6 + play_.num);
+      by_block[0].rightCols(play_.num) = by_play;
+    } else {
+      write(jacobians, play_.block, whitened.leftCols<6>() * by_play);
+    }
+  }
   write_chain(jacobians, whitened.leftCols<6>(), by_block);
   write(jacobians, tag, whitened);
   if (jacobians[lens_block]) write(jacobians, lens_block, whitener * by_lens_parameters);
@@ -170,6 +195,25 @@ bool PositionResidual::Evaluate(double const* const* parameters, double* residua
   Eigen::Matrix<double, 3, 6> by_pose = Eigen::Matrix<double, 3, 6>::Zero();
   by_pose.leftCols<3>() = whitener * X_CB.linear();
   write_chain(jacobians, by_pose, by_block);
+  return true;
+}
+
+PlayResidual::PlayResidual(const ParameterBlock& block, const Eigen::VectorXd& sd)
+    : num_values_(static_cast<int>(block.values.size())), sd_(sd) {
+  set_num_residuals(static_cast<int>(sd.size()));
+  mutable_parameter_block_sizes()->push_back(num_values_);
+}
+
+bool PlayResidual::Evaluate(double const* const* parameters, double* residuals,
+                            double** jacobians) const {
+  const auto num = static_cast<int>(sd_.size());
+  for (int n = 0; n < num; ++n) residuals[n] = parameters[0][num_values_ - num + n] / sd_(n);
+  if (!jacobians || !jacobians[0]) return true;
+  Eigen::Map<RowMajor> J(jacobians[0], num, num_values_);
+  J.setZero();
+  // All directions of an instant are free: the pose's six come first.
+  const int first = num_values_ > num ? 6 : 0;
+  for (int n = 0; n < num; ++n) J(n, first + n) = 1 / sd_(n);
   return true;
 }
 

@@ -52,7 +52,9 @@ class ChainResidual : public ceres::CostFunction {
 class CornerResidual final : public ChainResidual {
  public:
   /// Blocks: those of the chain, the tag's (X_BM and the size's factor), the lens's
-  /// (Lens::parameters()). `covariance_px2` is positive definite.
+  /// (Lens::parameters()). Where there is a block of the instant it has the joints' plays last: it
+  /// is the chain's first if the root moves, else another one at the end. `covariance_px2` is
+  /// positive definite.
   CornerResidual(PartChain chain, const std::vector<const ParameterBlock*>& blocks, double size_m,
                  const Lens& lens, const TagSight& sight, const Matrix8d& covariance_px2,
                  const NoiseScale& scale);
@@ -65,6 +67,13 @@ class CornerResidual final : public ChainResidual {
   Eigen::Matrix<double, 2, Eigen::Dynamic> by_lens(const Eigen::VectorXd& lens,
                                                    const Eigen::Vector2d& ray) const;
 
+  /// Which block has the plays, and where they begin in its values and in its tangent.
+  struct Play {
+    int block = -1, value = 0, tangent = 0, num = 0;
+  };
+  Play find_play() const;
+
+  const Play play_;
   const double size_m_;
   const Lens lens_;
   const Eigen::Matrix<double, 8, 1> measured_px_;
@@ -100,6 +109,19 @@ class PositionResidual final : public ChainResidual {
  private:
   const Eigen::Vector3d p_CB_;
   Eigen::Matrix3d whitener_;
+};
+
+/// How far joints are from their commands at one instant, over their standard deviations, which may
+/// be changed between evaluations. `sd`: of the scalars of an instant's block.
+class PlayResidual final : public ceres::CostFunction {
+ public:
+  PlayResidual(const ParameterBlock& block, const Eigen::VectorXd& sd);
+  bool Evaluate(double const* const* parameters, double* residuals,
+                double** jacobians) const override;
+
+ private:
+  const int num_values_;
+  const Eigen::VectorXd& sd_;
 };
 
 /// What is known of a block beforehand: the change of each free direction over its standard

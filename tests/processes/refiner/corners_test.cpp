@@ -116,16 +116,27 @@ TEST(RefineCorners, ReachTheNoise) {
   EXPECT_NE(result.schema.calibration_id, c.samples.front().sample.calibration_id);
 }
 
-TEST(RefineCorners, WithoutOptionsTheTagsAndTheLensStayAsClaimed) {
+TEST(RefineCorners, WithoutOptionsPosesAreFittedAndTagsAndLensStayAsClaimed) {
   const Case c(3, 40, 0.05, {});
   RefineOptions options = all();
   options.placements = options.intrinsics = false;
   const Refinement result = refine(c.start, c.samples, c.rig, options);
-  EXPECT_NEAR(*result.after.px_rms, 0.05, 0.01);
+  EXPECT_FALSE(result.used_corners);
+  EXPECT_LT(*result.after.px_rms, 0.1 * *result.before.px_rms);
+  EXPECT_EQ(result.schema.calibration_id, c.start.calibration_id);
+  EXPECT_EQ(result.rig.camera.fx, c.rig.camera.fx);
+}
+
+TEST(RefineCorners, AloneTheLensIsFoundAmongTagsAsClaimed) {
+  const Case c(3, 40, 0.05, {.focal_length_share = 0.01});
+  RefineOptions options = all();
+  options.placements = false;
+  const Refinement result = refine(c.start, c.samples, c.rig, options);
+  EXPECT_NEAR(result.rig.camera.fx / c.robot.truth.camera.fx, 1, 3e-3);
   for (const TagPlacement& tag : result.rig.markers.tags)
     EXPECT_TRUE(tag.X_BM->isApprox(*c.rig.markers.find(tag.id)->X_BM, 1e-12));
-  EXPECT_EQ(result.rig.camera.fx, c.rig.camera.fx);
-  EXPECT_EQ(result.held.size(), 2U);
+  ASSERT_EQ(result.held.size(), 1U);
+  EXPECT_NE(result.held.front().find("tags"), std::string::npos);
 }
 
 TEST(RefineCorners, OrderOfSamplesAndNamesOfSignalsChangeNothing) {
