@@ -19,6 +19,15 @@ Lens lens_of(const CameraCalibration& camera) {
   return Lens(info);
 }
 
+CameraCalibration with_all_coefficients(CameraCalibration camera) {
+  if (!camera.distortion.empty()) return camera;
+  using Model = CameraCalibration::Model;
+  camera.distortion.resize(camera.model == Model::kPlumbBob   ? 5
+                           : camera.model == Model::kRational ? 8
+                                                              : 4);
+  return camera;
+}
+
 CameraCalibration calibration_with(CameraCalibration camera, const Eigen::VectorXd& parameters) {
   camera.fx = parameters(0);
   camera.fy = parameters(1);

@@ -6,6 +6,8 @@
 #include <fstream>
 #include <stdexcept>
 
+#include "processes/refiner/calibrated_lens.h"
+
 namespace bodyschema {
 namespace {
 
@@ -33,7 +35,8 @@ std::string markers_text(const Markers& markers) {
   return text;
 }
 
-std::string camera_text(const CameraCalibration& camera) {
+std::string camera_text(const CameraCalibration& found) {
+  const CameraCalibration camera = with_all_coefficients(found);
   constexpr std::array<const char*, 3> kModels = {"plumb_bob", "rational_polynomial",
                                                   "equidistant"};
   return fmt::format(

@@ -157,7 +157,9 @@ std::vector<std::string> held_things(const BodySchema& schema, const RefineOptio
 }  // namespace
 
 Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
-                  const std::optional<RigCalibration>& rig, const RefineOptions& options) {
+                  const std::optional<RigCalibration>& claimed, const RefineOptions& options) {
+  std::optional<RigCalibration> rig = claimed;
+  if (rig && options.intrinsics) rig->camera = with_all_coefficients(rig->camera);
   const auto begin = std::chrono::steady_clock::now();
   check(schema, samples);
   std::stable_sort(samples.begin(), samples.end(), [](const auto& a, const auto& b) {
@@ -187,7 +189,7 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   problem.solve();
   result.outliers = outliers_of(problem);
   const Information information(problem);
-  const RefinementWords words(schema, information);
+  const RefinementWords words(schema, information, problem.frame_tags());
   result.num_observations = static_cast<int>(problem.data().size());
   result.num_iterations = problem.num_iterations();
   result.noise_scale = problem.scale();

@@ -276,6 +276,18 @@ std::vector<ParameterBlock*> RefinementProblem::blocks() {
   return result;
 }
 
+std::vector<int> RefinementProblem::frame_tags() const {
+  std::map<int, std::map<int, int>> num_seen;  // by part and tag
+  for (const Datum& datum : data_)
+    if (datum.tag >= 0) ++num_seen[datum.part][datum.tag];
+  std::vector<int> result;
+  for (const auto& [part, tags] : num_seen)
+    result.push_back(std::max_element(tags.begin(), tags.end(), [](const auto& a, const auto& b) {
+                       return a.second < b.second;
+                     })->first);
+  return result;
+}
+
 Eigen::VectorXd RefinementProblem::prior_of(const ParameterBlock& block) const {
   const RefinerConfig& config = options_.config;
   if (block.kind == ParameterBlock::Kind::kTag) {

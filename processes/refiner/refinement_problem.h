@@ -54,6 +54,8 @@ class RefinementProblem {
   int num_iterations() const { return num_iterations_; }
   /// Tag of the root that defines its frame; −1 without corners.
   int gauge_tag() const { return gauge_tag_; }
+  /// Of each part the tag that was seen most often.
+  std::vector<int> frame_tags() const;
   bool root_moves() const { return root_moves_; }
   /// Joints that may be off their command at every sample, and by how much, 1 σ [command units].
   struct Play {

@@ -6,6 +6,7 @@
 #include <array>
 #include <cmath>
 #include <set>
+#include <utility>
 
 #include "common/kinematics/screw_chain.h"
 
@@ -26,8 +27,12 @@ int last_transform(const Edge& edge) {
 
 }  // namespace
 
-RefinementWords::RefinementWords(const BodySchema& start, const Information& information)
-    : schema_(start), information_(information), covariance_(information.covariance()) {
+RefinementWords::RefinementWords(const BodySchema& start, const Information& information,
+                                 std::vector<int> frame_tags)
+    : schema_(start),
+      information_(information),
+      frame_tags_(std::move(frame_tags)),
+      covariance_(information.covariance()) {
   const Eigen::MatrixXd& open = information.undetermined();
   undetermined_shares_ = open.cols() > 0 ? Eigen::VectorXd(open.rowwise().squaredNorm())
                                          : Eigen::VectorXd::Zero(covariance_.rows());
@@ -152,14 +157,36 @@ std::string RefinementWords::advice(const Place& one, const Place& other) const 
   return fmt::format("show tag {} while {} moves", tag->block->id, fmt::join(signals, ", "));
 }
 
+// The covariance given the placements of these tags, and one's size: all lengths have a common
+// factor. Zero rows where they are.
+Eigen::MatrixXd RefinementWords::in_frames_of_tags() const {
+  std::vector<Eigen::Index> given;
+  for (std::size_t n = 0; n < places_.size(); ++n) {
+    const Place& place = places_[n];
+    const bool is_given =
+        place.block->kind == Kind::kTag &&
+        std::find(frame_tags_.begin(), frame_tags_.end(), place.block->id) != frame_tags_.end();
+    if (is_given && (place.direction < 6 || place.block->id == frame_tags_.back()))
+      given.push_back(static_cast<Eigen::Index>(n));
+  }
+  if (given.empty()) return covariance_;
+  const Eigen::MatrixXd of_given = covariance_(given, given);
+  const Eigen::MatrixXd mixed = covariance_(Eigen::all, given);
+  Eigen::MatrixXd rest = covariance_ - mixed * of_given.ldlt().solve(mixed.transpose());
+  for (const Eigen::Index n : given) rest.row(n).setZero();
+  for (const Eigen::Index n : given) rest.col(n).setZero();
+  return rest;
+}
+
 std::vector<ParameterCorrelation> RefinementWords::correlations(std::size_t most) const {
   std::vector<ParameterCorrelation> result;
-  const Eigen::VectorXd sd = covariance_.diagonal().cwiseMax(0).cwiseSqrt();
-  for (Eigen::Index i = 0; i < covariance_.rows(); ++i) {
+  const Eigen::MatrixXd covariance = in_frames_of_tags();
+  const Eigen::VectorXd sd = covariance.diagonal().cwiseMax(0).cwiseSqrt();
+  for (Eigen::Index i = 0; i < covariance.rows(); ++i) {
     for (Eigen::Index j = 0; j < i; ++j) {
       if (undetermined_shares_(i) >= kNamedShare || undetermined_shares_(j) >= kNamedShare)
         continue;
-      const double correlation = covariance_(i, j) / (sd(i) * sd(j));
+      const double correlation = covariance(i, j) / (sd(i) * sd(j));
       if (!(std::abs(correlation) > kHighCorrelation)) continue;
       const Place &one = places_[j], &other = places_[i];
       result.push_back({one.element, other.element, correlation, advice(one, other)});

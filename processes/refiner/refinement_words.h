@@ -15,7 +15,10 @@ namespace bodyschema {
 /// joint's offset.
 class RefinementWords {
  public:
-  RefinementWords(const BodySchema& start, const Information& information);
+  /// `frame_tags`: a tag of each part, by which correlations are told: as if it were known where it
+  /// sits on the part. That a part's frame moves with all its tags is no news.
+  RefinementWords(const BodySchema& start, const Information& information,
+                  std::vector<int> frame_tags);
 
   std::vector<RefinedParameter> parameters() const { return parameters_; }
   /// Directions that nothing tells, one sentence an edge, tag or camera.
@@ -34,10 +37,12 @@ class RefinementWords {
   std::string edge_name(const ParameterBlock& block, int direction) const;
   std::string unit_of(const ParameterBlock& block, int direction) const;
   std::string thing_of(const ParameterBlock& block) const;
+  Eigen::MatrixXd in_frames_of_tags() const;
   std::string advice(const Place& one, const Place& other) const;
 
   const BodySchema& schema_;
   const Information& information_;
+  const std::vector<int> frame_tags_;
   std::vector<Place> places_;
   std::vector<RefinedParameter> parameters_;
   Eigen::MatrixXd covariance_;           // in the frames that are told

@@ -94,15 +94,42 @@ std::string held_out_text(const Refinement& result) {
   return text + "\n";
 }
 
+/// Those of the root, the edges and the lens, one a line.
 std::string parameters_text(const std::vector<RefinedParameter>& parameters) {
-  std::string text = "  parameter                                      change      sd\n";
+  std::string text = fmt::format("  {:<40} {:>10} {:>10}\n", "parameter", "change", "sd");
   for (const RefinedParameter& parameter : parameters) {
+    if (parameter.name.find(" tag ") != std::string::npos) continue;
     const Shown unit = shown(parameter.unit);
     const std::string sd =
         parameter.sd ? fmt::format("{:.4f}", *parameter.sd * unit.factor) : std::string("not told");
-    text += fmt::format("    {} {:10.4f} {:>10} {}\n", fit(parameter.name, 42),
+    text += fmt::format("    {:<38} {:10.4f} {:>10} {}\n", parameter.name,
                         parameter.change * unit.factor, sd, unit.unit);
   }
+  return text;
+}
+
+/// How far each tag is from where the rig says, one a line.
+std::string tags_text(const Refinement& result, const std::optional<RigCalibration>& claimed) {
+  if (!result.used_corners || !claimed) return "";
+  std::string text = "  tags, from where the rig says:\n";
+  for (const TagPlacement& tag : result.rig.markers.tags) {
+    const TagPlacement* before = claimed->markers.find(tag.id);
+    Vector6d moved = Vector6d::Zero();
+    if (tag.X_BM && before->X_BM) moved = log(before->X_BM->inverse() * *tag.X_BM);
+    const double larger = 100 * (tag.size_m / before->size_m - 1);
+    if (moved.isZero(1e-12) && std::abs(larger) < 1e-9) continue;
+    text += fmt::format("    tag {:>3} of part {:>2}: {:.3f} mm, {:.3f}°; {:+.3f} % in size\n",
+                        tag.id, tag.part, moved.head<3>().norm() * 1e3,
+                        moved.tail<3>().norm() / kDegree, larger);
+  }
+  return text;
+}
+
+std::string plays_text(const std::vector<JointPlay>& plays) {
+  std::string text;
+  for (const JointPlay& play : plays)
+    text += fmt::format("  {} is off its command by {:.4f}°, {:.4f} mm (1 σ)\n", play.joint,
+                        play.turn_rad / kDegree, play.slide_m * 1e3);
   return text;
 }
 
@@ -153,6 +180,10 @@ Json refinement_json(const Refinement& result, const std::optional<RigCalibratio
   json["coverage"] = array_of(result.coverage, [](const SignalCoverage& signal) {
     return Json{{"signal", signal.signal}, {"share", signal.share}};
   });
+  json["plays"] = array_of(result.plays, [](const JointPlay& play) {
+    return Json{
+        {"joint", play.joint}, {"slide_m", play.slide_m}, {"turn_deg", play.turn_rad / kDegree}};
+  });
   json["held"] = result.held;
   if (result.used_corners && claimed) {
     json["tags"] = array_of(result.rig.markers.tags, tag_json);
@@ -176,6 +207,8 @@ std::string refinement_text(const Refinement& result,
   for (const std::string& held : result.held) text += "  held: " + held + "\n";
   text += held_out_text(result);
   text += parameters_text(result.parameters);
+  text += tags_text(result, claimed);
+  text += plays_text(result.plays);
   text += findings_text(result);
   for (const SignalCoverage& signal : result.coverage)
     text += fmt::format("  {}: {:.0f} % of its range seen\n", signal.signal, 100 * signal.share);
