@@ -446,7 +446,7 @@ void RefinementProblem::solve() {
     const double change_of_play = estimate_play();
     if (change < 0.01 && change_of_play < 0.2) break;
   }
-  run(1e-9, 50);
+  run(1e-9, 200);
   for (ParameterBlock* block : blocks())
     std::copy_n(memory_of(block), block->values.size(), block->values.begin());
 }
