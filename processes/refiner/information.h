@@ -10,14 +10,14 @@
 namespace bodyschema {
 
 /// What the samples tell of the parameters at the refined values: the covariance of an M-estimator
-/// (Huber), with what each instant has of its own (a moving root's
-/// pose, the joints' plays) eliminated (Schur complement).
+/// (Huber), with what each instant has of its own (a moving root's pose, the joints' plays)
+/// eliminated (Schur complement).
 ///
 ///   Cov = A⁻¹ B A⁻¹ + K C Kᵀ,  A = α H + P,  B = β H + P,  H = Σ w JᵀJ,
 ///
 /// w the Student-t weights, P the priors' information, α and β the means of the second derivative
-/// and of the squared score per weight over all residuals.
-/// K C Kᵀ is what the held parameters' priors C (tags, lens) make of the refined ones.
+/// and of the squared score per weight over all residuals. K C Kᵀ is what the held parameters'
+/// priors C (tags, lens) make of the refined ones.
 class Information {
  public:
   explicit Information(RefinementProblem& problem);
