@@ -10,6 +10,7 @@
 
 #include "common/estimation/chi_square.h"
 #include "common/estimation/student_t.h"
+#include "processes/refiner/shared_errors.h"
 
 namespace bodyschema {
 namespace {
@@ -37,7 +38,7 @@ ceres::CRSMatrix jacobian_of(RefinementProblem& problem,
 // Over all free directions, the instants' eliminated: those refined and those held by priors.
 struct Information::Sums {
   std::vector<ParameterBlock*> blocks;
-  Eigen::MatrixXd H;
+  Eigen::MatrixXd H, shared;
   int num_instants = 0, instant_size = 0;
 };
 
@@ -79,7 +80,7 @@ struct Information::Weights {
   }
 };
 
-Information::Information(RefinementProblem& problem) {
+Information::Information(RefinementProblem& problem, const MeasurementModel& measurement) {
   double num_fitted = 0;
   for (const ParameterBlock* block : problem.blocks())
     num_fitted += block->is_refined ? block->num_free() : 0;
@@ -89,13 +90,74 @@ Information::Information(RefinementProblem& problem) {
   // What is held has a derivative too.
   for (ParameterBlock* block : problem.blocks())
     if (!block->is_refined) problem.problem().SetParameterBlockVariable(problem.memory_of(block));
-  const Sums sums = weighted(problem, weights);
+  const Sums sums = weighted(problem, weights, measurement);
   for (ParameterBlock* block : problem.blocks())
     if (!block->is_refined) problem.problem().SetParameterBlockConstant(problem.memory_of(block));
   invert(problem, sums, weights);
 }
 
-Information::Sums Information::weighted(RefinementProblem& problem, const Weights& weights) {
+namespace {
+
+/// Rows of one residual block of the Jacobian, with the columns that they have.
+struct Rows {
+  Eigen::MatrixXd J;
+  std::vector<int> columns;
+};
+
+std::vector<Rows> rows_of(const ceres::CRSMatrix& jacobian,
+                          const std::vector<RefinementProblem::Datum>& data) {
+  std::vector<Rows> result;
+  int row = 0;
+  for (const auto& datum : data) {
+    // All rows of a residual block have the same columns.
+    const int begin = jacobian.rows[row], end = jacobian.rows[row + 1];
+    Rows& rows = result.emplace_back();
+    rows.columns.assign(jacobian.cols.begin() + begin, jacobian.cols.begin() + end);
+    rows.J.resize(datum.num_residuals, end - begin);
+    for (int r = 0; r < datum.num_residuals; ++r, ++row)
+      for (int c = 0; c < end - begin; ++c) rows.J(r, c) = jacobian.values[jacobian.rows[row] + c];
+  }
+  return result;
+}
+
+/// What belongs to one instant alone: its information, and that mixed with the other parameters'.
+struct Instant {
+  Eigen::MatrixXd own, mixed;  // e×e, e×P
+
+  Eigen::MatrixXd effect() const { return own.ldlt().solve(mixed); }
+};
+
+/// Σ G Gᵀ over the errors, the instants' own parameters eliminated by their `effects`.
+struct Sizes {
+  Eigen::Index parameters = 0;
+  int instant = 0, eliminated = 0;
+};
+Eigen::MatrixXd shared_score(const std::vector<Rows>& rows, const std::vector<double>& weights,
+                             const std::vector<std::vector<SharedError>>& errors,
+                             const std::map<int, Eigen::MatrixXd>& effects, const Sizes& sizes) {
+  std::map<int, Eigen::MatrixXd> shared;  // G, by error
+  for (std::size_t n = 0; n < rows.size(); ++n) {
+    if (errors[n].empty()) continue;
+    Eigen::MatrixXd J = Eigen::MatrixXd::Zero(rows[n].J.rows(), sizes.parameters);
+    for (auto c = static_cast<std::size_t>(sizes.instant); c < rows[n].columns.size(); ++c)
+      J.col(rows[n].columns[c] - sizes.eliminated) = rows[n].J.col(static_cast<Eigen::Index>(c));
+    if (sizes.instant > 0)
+      J -= rows[n].J.leftCols(sizes.instant) * effects.at(rows[n].columns.front());
+    for (const auto& [error, effect] : errors[n]) {
+      Eigen::MatrixXd& G = shared[error];
+      if (G.size() == 0) G = Eigen::MatrixXd::Zero(sizes.parameters, effect.cols());
+      G += weights[n] * J.transpose() * effect;
+    }
+  }
+  Eigen::MatrixXd sum = Eigen::MatrixXd::Zero(sizes.parameters, sizes.parameters);
+  for (const auto& [error, G] : shared) sum += G * G.transpose();
+  return sum;
+}
+
+}  // namespace
+
+Information::Sums Information::weighted(RefinementProblem& problem, const Weights& weights,
+                                        const MeasurementModel& measurement) {
   Sums sums;
   Eigen::Index size = 0;
   for (ParameterBlock* block : problem.blocks()) {
@@ -107,29 +169,18 @@ Information::Sums Information::weighted(RefinementProblem& problem, const Weight
       size += block->num_free();
     }
   }
-  const ceres::CRSMatrix J = jacobian_of(problem, problem.blocks());
-  sums.H = Eigen::MatrixXd::Zero(size, size);
-  struct Instant {
-    Eigen::MatrixXd own, mixed;  // sizes e×e, e×P
-  };
-  std::map<int, Instant> instants;  // by their first column
+  const std::vector<Rows> rows = rows_of(jacobian_of(problem, problem.blocks()), problem.data());
   const int e = sums.instant_size, num_eliminated = e * sums.num_instants;
-  int row = 0;
-  Eigen::MatrixXd dense;
-  for (std::size_t n = 0; n < problem.data().size(); ++n) {
-    const int num = problem.data()[n].num_residuals;
-    // All rows of a residual block have the same columns.
-    const int begin = J.rows[row], width = J.rows[row + 1] - begin;
-    dense.resize(num, width);
-    for (int r = 0; r < num; ++r)
-      for (int c = 0; c < width; ++c) dense(r, c) = J.values[J.rows[row + r] + c];
-    row += num;
-    const Eigen::MatrixXd product = weights.of_datum[n] * dense.transpose() * dense;
-    const auto column = [&](int c) { return J.cols[begin + c] - num_eliminated; };
+  sums.H = Eigen::MatrixXd::Zero(size, size);
+  std::map<int, Instant> instants;  // by their first column
+  for (std::size_t n = 0; n < rows.size(); ++n) {
+    const Eigen::MatrixXd product = weights.of_datum[n] * rows[n].J.transpose() * rows[n].J;
+    const auto column = [&](int c) { return rows[n].columns[c] - num_eliminated; };
+    const int width = static_cast<int>(rows[n].columns.size());
     for (int c = e; c < width; ++c)
       for (int r = e; r < width; ++r) sums.H(column(r), column(c)) += product(r, c);
     if (e == 0) continue;
-    Instant& instant = instants[J.cols[begin]];
+    Instant& instant = instants[rows[n].columns.front()];
     if (instant.own.size() == 0) {
       instant.own = Eigen::MatrixXd::Zero(e, e);
       const auto num_plays = problem.play_sd().size();
@@ -139,8 +190,13 @@ Information::Sums Information::weighted(RefinementProblem& problem, const Weight
     instant.own += product.topLeftCorner(e, e);
     for (int c = e; c < width; ++c) instant.mixed.col(column(c)) += product.col(c).head(e);
   }
-  for (const auto& [column, instant] : instants)
-    sums.H -= instant.mixed.transpose() * instant.own.ldlt().solve(instant.mixed);
+  std::map<int, Eigen::MatrixXd> effects;
+  for (const auto& [column, instant] : instants) {
+    effects[column] = instant.effect();
+    sums.H -= instant.mixed.transpose() * effects[column];
+  }
+  sums.shared = shared_score(rows, weights.of_datum, shared_errors(problem, measurement), effects,
+                             {size, e, num_eliminated});
   return sums;
 }
 
@@ -175,7 +231,7 @@ void Information::invert(const RefinementProblem& problem, const Sums& sums,
       unit.asDiagonal() * eigen.eigenvectors() *
       values.cwiseMax(kLeastEigenvalue).cwiseSqrt().cwiseInverse().asDiagonal();
   const Eigen::MatrixXd inverse = half * half.transpose();
-  covariance_ = inverse * (weights.beta * H + P_refined) * inverse;
+  covariance_ = inverse * (weights.beta * H + P_refined + sums.shared(refined, refined)) * inverse;
   // Along what nothing tells there is no score either.
   const Eigen::MatrixXd open = half.leftCols(num_undetermined);
   covariance_ += open * open.transpose();

@@ -13,14 +13,16 @@ namespace bodyschema {
 /// (Huber), with what each instant has of its own (a moving root's pose, the joints' plays)
 /// eliminated (Schur complement).
 ///
-///   Cov = A⁻¹ B A⁻¹ + K C Kᵀ,  A = α H + P,  B = β H + P,  H = Σ w JᵀJ,
+///   Cov = A⁻¹ B A⁻¹ + K C Kᵀ,  A = α H + P,  B = β H + P + Σ G Gᵀ,  H = Σ w JᵀJ,
 ///
 /// w the Student-t weights, P the priors' information, α and β the means of the second derivative
-/// and of the squared score per weight over all residuals. K C Kᵀ is what the held parameters'
-/// priors C (tags, lens) make of the refined ones.
+/// and of the squared score per weight over all residuals, G what an error does that several poses
+/// share (shared_errors.h). K C Kᵀ is what the held parameters' priors C (tags, lens) make of the
+/// refined ones.
 class Information {
  public:
-  explicit Information(RefinementProblem& problem);
+  /// `measurement`: of poses.
+  Information(RefinementProblem& problem, const MeasurementModel& measurement);
 
   /// Blocks of `covariance`: refined ones, those of instants left out.
   const std::vector<ParameterBlock*>& blocks() const { return blocks_; }
@@ -37,7 +39,8 @@ class Information {
  private:
   struct Sums;
   struct Weights;
-  static Sums weighted(RefinementProblem& problem, const Weights& weights);
+  static Sums weighted(RefinementProblem& problem, const Weights& weights,
+                       const MeasurementModel& measurement);
   void invert(const RefinementProblem& problem, const Sums& sums, const Weights& weights);
 
   std::vector<ParameterBlock*> blocks_;

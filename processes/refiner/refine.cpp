@@ -188,7 +188,7 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
     result.held.push_back(fmt::format("the frame of part {}: it was never seen", part));
   problem.solve();
   result.outliers = outliers_of(problem);
-  const Information information(problem);
+  const Information information(problem, options.measurement);
   const RefinementWords words(schema, information, problem.frame_tags());
   result.num_observations = static_cast<int>(problem.data().size());
   result.num_iterations = problem.num_iterations();

@@ -258,7 +258,8 @@ void RefinementProblem::add_poses(const RefinerSample& seen) {
     else
       cost = new PositionResidual(std::move(chain), constant, observation, options_.measurement,
                                   scale_);
-    add(cost, blocks, {.sample_index = index, .part = observation.part});
+    add(cost, blocks,
+        {.sample_index = index, .part = observation.part, .observation = &observation});
   }
 }
 

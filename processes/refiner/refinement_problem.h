@@ -29,12 +29,13 @@ class RefinementProblem {
     int num_residuals = 0;
     std::int64_t sample_index = 0;
     int part = 0;
-    int tag = -1;  ///< −1: of a pose
+    int tag = -1;                                  ///< −1: of a pose
+    const PartObservation* observation = nullptr;  ///< of a pose
   };
 
   /// `samples`: those to fit, ascending. `rig`: none where poses are fitted. What cannot be
   /// used (a part that hangs on nothing, a tag that moved, a sample before an edge was valid) is
-  /// passed over. @throws std::invalid_argument.
+  /// passed over. All arguments must outlive this. @throws std::invalid_argument.
   RefinementProblem(const BodySchema& schema, const std::vector<RefinerSample>& samples,
                     const std::optional<RigCalibration>& rig, const RefineOptions& options,
                     bool root_moves);
