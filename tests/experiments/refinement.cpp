@@ -9,9 +9,9 @@
 
 #include <CLI/CLI.hpp>
 #include <algorithm>
-#include <chrono>
 #include <cmath>
 #include <cstdio>
+#include <ctime>
 #include <filesystem>
 #include <fstream>
 #include <map>
@@ -42,8 +42,9 @@ namespace {
 
 using experiments::Trial;
 
-double seconds_since(std::chrono::steady_clock::time_point begin) {
-  return std::chrono::duration<double>(std::chrono::steady_clock::now() - begin).count();
+/// Processor time of this one thread.
+double seconds_since(std::clock_t begin) {
+  return static_cast<double>(std::clock() - begin) / CLOCKS_PER_SEC;
 }
 
 /// Errors of one method's end effector over robots.
@@ -99,9 +100,10 @@ void compare(const std::string& kind, test::Regime regime, bool has_flips, int n
       ++num_right;
       bounds += limit * limit;
       learned.add(schema, trial);
+      const std::clock_t begin = std::clock();
       const Refinement result = refine(schema, refiner_samples(samples), {}, {});
+      refined.seconds += seconds_since(begin);
       refined.add(result.schema, trial);
-      refined.seconds += result.seconds;
     }
     const double bound_mm = 1e3 * std::sqrt(bounds / std::max(num_right, 1));
     std::printf(
@@ -160,9 +162,10 @@ void refine_nominal(int num_samples, int num_robots) {
                                                          trial.test_actions);
     bounds += limit * limit;
     nominal.add(schema, trial);
+    const std::clock_t begin = std::clock();
     const Refinement result = refine(schema, refiner_samples(trial.samples), {}, {});
+    refined.seconds += seconds_since(begin);
     refined.add(result.schema, trial);
-    refined.seconds += result.seconds;
     num_undetermined += static_cast<int>(result.undetermined.size());
   }
   const double bound_mm = 1e3 * std::sqrt(bounds / num_robots);
@@ -318,7 +321,7 @@ void refine_rig(const std::string& name, const std::filesystem::path& folder, bo
     std::vector<ActionPoseSample> training;
     for (const RefinerSample& sample : seen.samples)
       if (is_learned_from(sample.sample)) training.push_back(sample.sample);
-    const auto begin = std::chrono::steady_clock::now();
+    const std::clock_t begin = std::clock();
     const BodySchema schema = learn(signals.signals, training, learning).schema;
     learned.seconds.push_back(seconds_since(begin));
     learned.add_errors(schema, seen, signals.end_effector_part);
@@ -327,6 +330,7 @@ void refine_rig(const std::string& name, const std::filesystem::path& folder, bo
       options.placements = options.intrinsics = is_all;
       options.measurement = noise.measurement;
       options.corner_noise = {noise.corner_noise_px, noise.small_tag_noise_px};
+      const std::clock_t refining = std::clock();
       const Refinement result = refine(schema, seen.samples, rig, options);
       RigRow& row = is_all ? all : refined;
       Pose X_RG = Pose::Identity();
@@ -334,7 +338,7 @@ void refine_rig(const std::string& name, const std::filesystem::path& folder, bo
         X_RG = *truth.markers.find(result.gauge_tag)->X_BM *
                rig.markers.find(result.gauge_tag)->X_BM->inverse();
       row.add_errors(result.schema, seen, signals.end_effector_part, X_RG);
-      row.seconds.push_back(result.seconds);
+      row.seconds.push_back(seconds_since(refining));
       row.px.push_back(result.after.px_rms.value_or(NAN));
       if (!is_all) learned.px.push_back(result.before.px_rms.value_or(NAN));
       row.tags.add(result.rig, truth, seen.samples);
