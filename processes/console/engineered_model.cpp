@@ -91,6 +91,13 @@ class Walk {
   void read_signal(const Yaml& entry) {
     Signal signal;
     signal.name = entry.text("name");
+    signal.lower = entry.number("lower");
+    signal.upper = entry.number("upper", signal.lower);
+    if (entry.has("joint")) read_drive(entry);
+    schema_.signals.push_back(std::move(signal));
+  }
+
+  void read_drive(const Yaml& entry) {
     const std::string joint = entry.text("joint");
     const auto known = model_.getJoint(joint);
     if (!known) throw entry.error("joint", "the URDF has no joint " + joint);
@@ -103,9 +110,6 @@ class Walk {
     drive.offset = entry.number("offset");
     if (!drives_.emplace(joint, drive).second)
       throw entry.error("joint", "joint " + joint + " has a signal already");
-    signal.lower = entry.number("lower");
-    signal.upper = entry.number("upper", signal.lower);
-    schema_.signals.push_back(std::move(signal));
   }
 
   /// From `link` to all its neighbours but the one that the walk came by. `from` is the last part.

@@ -11,9 +11,9 @@ namespace bodyschema {
 ///
 ///   root: 1                    # the root part
 ///   uncertainty: {position_m: 0.002, rotation_deg: 0.5}   # of every edge, per axis
-///   signals:                   # in the order of the actions; joint position = gain·command +
-///   offset
+///   signals:     # in the order of the actions; joint position = gain·command + offset
 ///     - {name: q1, joint: j1, gain: 0.8727, offset: 0.14, lower: -1, upper: 1}
+///     - {name: q2, lower: 0, upper: 1}                      # moves nothing
 ///   parts:                     # X_LB: the part in the frame of its link
 ///     - {part: 1, link: base, X_LB: {position_m: [0, 0, 0.1], rpy_deg: [0, 0, 0]}}
 ///

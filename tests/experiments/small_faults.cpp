@@ -4,6 +4,8 @@
 //
 //   small_faults [--runs 200] [--within 40] [--healthy 100] [--cell WORDS]
 
+#include <fmt/format.h>
+
 #include <CLI/CLI.hpp>
 #include <algorithm>
 #include <cstdio>
@@ -25,19 +27,27 @@ struct Cell {
   std::string name;
   Fault fault;
   double size;  ///< of BrokenArm's
+  int joint = 4;
+  double range_rad = 1.35;
 };
 
 struct Count {
   int num_runs = 0, num_found = 0, num_placed = 0, num_named = 0;
   int num_early = 0, num_elsewhere = 0;  ///< events
-  std::vector<double> until;
+  std::vector<double> until, mended;
+  int num_marker = 0;  ///< runs in which the cause was marker_moved in the end
   double seconds = 0;
 };
 
 void live(const Cell& cell, Regime regime, int healthy, int within, int seed, Count* count) {
-  BrokenArm arm({cell.fault, cell.name.c_str(), 0.85, 0, 0, cell.size}, regime, healthy, seed);
+  Scenario scenario{cell.fault, cell.name.c_str(), 0.85, 0, 0, cell.size};
+  scenario.joint = cell.joint;
+  scenario.range_rad = cell.range_rad;
+  BrokenArm arm(scenario, regime, healthy, seed);
   Adaptation adaptation(arm.engineered(), adaptation_options(regime));
-  bool is_found = false, is_placed = false, is_named = false;
+  bool is_found = false, is_placed = false, is_named = false, is_marker = false;
+  double healthy_m = 0;
+  int bad = 0;
   const int end = std::min(healthy + within, arm.num_samples());
   for (int t = 0; t < end; ++t) {
     const ActionPoseSample sample = arm.observe(t);
@@ -66,10 +76,15 @@ void live(const Cell& cell, Regime regime, int healthy, int within, int seed, Co
       if (!is_explanation && event.kind != Kind::kMismatch) continue;
       is_placed = it != arm.changes().end();
       if (is_explanation) is_named = is_placed && it->causes.contains(event.cause);
+      if (is_explanation) is_marker = event.cause == "marker_moved";
     }
+    if (t == healthy - 1) healthy_m = arm.error(adaptation.schema(), t);
+    if (t >= healthy && arm.error(adaptation.schema(), t) > 1.5 * healthy_m) bad = t - healthy + 1;
   }
   ++count->num_runs;
   count->num_found += is_found;
+  count->num_marker += is_marker;
+  count->mended.push_back(bad);
   count->num_placed += is_placed;
   count->num_named += is_named;
 }
@@ -101,27 +116,36 @@ int main(int argc, char** argv) {
       {"marker moved by 1.1°, 1 mm", Fault::kMarker, 0.02},
       {"marker moved by 2.3°, 2 mm", Fault::kMarker, 0.04},
       {"camera off by 1°, 7 mm", Fault::kCamera, 1 / 15.0},
+      {"wrist's offset 5°", Fault::kOffset, 0.25, 7},
+      {"wrist's offset 20°", Fault::kOffset, 1, 7},
+      {"joint reversed, ±77°", Fault::kReversed, 1},
+      {"joint reversed, ±160°", Fault::kReversed, 1, 4, 2.8},
+      {"wrist reversed, ±160°", Fault::kReversed, 1, 7, 2.8},
       {"link bent by 10°, 7 mm, on and off", Fault::kIntermittent, 10 / 45.0}};
   std::printf(
-      "| fault | found within %d | samples, median (95 %%) | in the end: place right | cause "
-      "right | events before it, in 1000 | events elsewhere, in a run | ms a sample |\n"
-      "| --- | --- | --- | --- | --- | --- | --- | --- |\n",
+      "| fault | found within %d | samples, median (95 %%) | mended after, median (95 %%) | in the "
+      "end: place right | cause right | called a moved marker | events before it, in 1000 | events "
+      "elsewhere, in a run | ms a sample |\n"
+      "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |\n",
       within);
   for (const Cell& cell : cells) {
     if (cell.name.find(words) == std::string::npos) continue;
     Count count;
     for (int seed = 1; seed <= num_runs; ++seed)
       live(cell, is_chapter ? Regime::kChapter : Regime::kTagIso, healthy, within, seed, &count);
-    std::sort(count.until.begin(), count.until.end());
-    const auto until = [&](double share) {
-      if (count.until.empty()) return 0.0;
-      return count
-          .until[static_cast<std::size_t>(share * static_cast<double>(count.until.size() - 1))];
+    const auto quantiles = [](std::vector<double>& samples) {
+      std::sort(samples.begin(), samples.end());
+      const auto at = [&](double share) {
+        const double last = static_cast<double>(samples.size()) - 1;
+        return samples.empty() ? 0.0 : samples[static_cast<std::size_t>(share * last)];
+      };
+      return fmt::format("{:.0f} ({:.0f})", at(0.5), at(0.95));
     };
     const auto percent = [&](int n) { return 100.0 * n / count.num_runs; };
-    std::printf("| %s | %.1f %% | %.0f (%.0f) | %.1f %% | %.1f %% | %.2f | %.3f | %.2f |\n",
-                cell.name.c_str(), percent(count.num_found), until(0.5), until(0.95),
-                percent(count.num_placed), percent(count.num_named),
+    std::printf("| %s | %.1f %% | %s | %s | %.1f %% | %.1f %% | %.1f %% | %.2f | %.3f | %.2f |\n",
+                cell.name.c_str(), percent(count.num_found), quantiles(count.until).c_str(),
+                quantiles(count.mended).c_str(), percent(count.num_placed),
+                percent(count.num_named), percent(count.num_marker),
                 1e3 * count.num_early / count.num_runs / healthy,
                 static_cast<double>(count.num_elsewhere) / count.num_runs,
                 1e3 * count.seconds / count.num_runs / (healthy + within));

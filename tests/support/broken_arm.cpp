@@ -10,9 +10,8 @@ namespace bodyschema::test {
 namespace {
 
 constexpr int kTestActions = 60;
-constexpr double kRange_rad = 1.35;
 
-SyntheticRobot chain(Rng& rng) {
+SyntheticRobot chain(Rng& rng, double range_rad) {
   SyntheticRobot robot;
   robot.X_CR.linear() = random_rotation(rng);
   robot.X_CR.translation() << 0, 0, 2;
@@ -28,7 +27,7 @@ SyntheticRobot chain(Rng& rng) {
     robot.links.push_back(link);
   }
   for (int s = 1; s <= 7; ++s)
-    robot.signals.push_back({"q" + std::to_string(s), -kRange_rad, kRange_rad});
+    robot.signals.push_back({"q" + std::to_string(s), -range_rad, range_rad});
   return robot;
 }
 
@@ -75,7 +74,7 @@ BrokenArm::BrokenArm(const Scenario& scenario, Regime regime, int block_length, 
       regime_(regime),
       block_length_(block_length),
       rng_(static_cast<Rng::result_type>(seed)),
-      healthy_(chain(rng_)),
+      healthy_(chain(rng_, scenario.range_rad)),
       broken_(healthy_) {
   const auto link = [this](int part) -> TrueLink& { return broken_.links[part - 1]; };
   const auto stick = [&](int part) {
@@ -107,12 +106,13 @@ BrokenArm::BrokenArm(const Scenario& scenario, Regime regime, int block_length, 
       changes_.push_back({5, true, false, {"geometry"}});
       break;
     case Fault::kOffset:
-      link(4).zero = scenario_.size * 20 * kDegree;
-      changes_.push_back({4, true, false, {"joint_offset"}});
+      link(scenario_.joint).zero = scenario_.size * 20 * kDegree;
+      changes_.push_back({scenario_.joint, true, false, {"joint_offset"}});
       break;
     case Fault::kGain:
-      link(4).turn = 0.7;
-      changes_.push_back({4, true, false, {"joint_gain"}});
+    case Fault::kReversed:
+      link(scenario_.joint).turn = scenario_.fault == Fault::kGain ? 0.7 : -1;
+      changes_.push_back({scenario_.joint, true, false, {"joint_gain"}});
       break;
     case Fault::kTwo:
       stick(3);

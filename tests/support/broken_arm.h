@@ -18,6 +18,7 @@ enum class Fault {
   kBend,         ///< a link in the middle: 45° and 3 cm
   kOffset,       ///< a joint's zero by 20°
   kGain,         ///< a joint goes 0.7 of the way
+  kReversed,     ///< a joint goes the other way
   kTwo,          ///< a stuck joint and an exchanged tool
   kAdjacent,     ///< a stuck joint, and the link after the next joint bent by 40° and 10 cm
   kMarker,       ///< a marker in the middle moves on its part: 5 cm, 1 rad
@@ -45,6 +46,8 @@ struct Scenario {
   /// … until it has come so far.
   double most_drift_deg = std::numeric_limits<double>::infinity();
   double size = 1;  ///< of kTool, kBend, kOffset, kMarker and kCamera, as a share
+  int joint = 4;    ///< kOffset, kGain, kReversed: that moves this part
+  double range_rad = 1.35;  ///< of every joint, to both sides
 };
 
 /// The chapter's arm of Sections 5.2 and 5.3: a chain of seven parts x1 … x7, the edge i–(i+1)

@@ -11,6 +11,8 @@ void add_offline_commands(Arguments console);
 /// `engineer`: a schema file from a URDF, marker placements and a recording that tells where the
 /// camera stands.
 void add_engineer_command(Arguments console);
+/// `urdf`: its inverse, a URDF and placements from a schema file.
+void add_urdf_command(Arguments console);
 /// `refine`: fits all parameters of a schema to a recording, by Ceres; where this was built without
 /// it, says how to get it.
 void add_refine_command(Arguments console);

@@ -25,8 +25,10 @@ void add_noise(Arguments& command, std::vector<double>& numbers, const std::stri
 /// marker, and may be in another unit.
 Noise noise_given(const std::vector<double>& numbers);
 
-/// @throws std::invalid_argument if `out` would be written over one of `inputs`.
-void check_out(const std::string& out, const std::vector<std::string>& inputs);
+/// @throws std::invalid_argument if `out` would be written over one of `inputs`, or cannot be
+/// written; `option` stands in the error.
+void check_out(const std::string& out, const std::vector<std::string>& inputs,
+               const std::string& option = "--out");
 
 /// Prints the result of a command.
 void print(bool as_json, const Json& json, const std::string& text);

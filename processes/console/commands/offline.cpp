@@ -254,15 +254,16 @@ Noise noise_given(const std::vector<double>& numbers) {
   return noise;
 }
 
-void check_out(const std::string& out, const std::vector<std::string>& inputs) {
+void check_out(const std::string& out, const std::vector<std::string>& inputs,
+               const std::string& option) {
   std::error_code is_new;
   for (const std::string& input : inputs)
     if (!out.empty() && std::filesystem::equivalent(out, input, is_new) && !is_new)
-      throw std::invalid_argument("--out: " + out + " is an input itself: " + input);
+      throw std::invalid_argument(option + ": " + out + " is an input itself: " + input);
   if (out.empty()) return;
   const std::filesystem::path folder = std::filesystem::absolute(out).parent_path();
   if (::access(folder.c_str(), W_OK | X_OK) != 0)
-    throw std::invalid_argument("--out: cannot write " + out + ": " + std::strerror(errno));
+    throw std::invalid_argument(option + ": cannot write " + out + ": " + std::strerror(errno));
 }
 
 void print(bool as_json, const Json& json, const std::string& text) {

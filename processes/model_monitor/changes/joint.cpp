@@ -91,7 +91,7 @@ class Joint : public ChangeFamily {
     const auto [mean, sigma, is_uniform] = prior_of(change, schema);
     std::vector<Eigen::VectorXd> result;
     if (change.form == Form::kGain) {
-      for (const double a : {-0.6, -0.25, 0.0, 0.4})
+      for (const double a : {-2.0, -0.6, -0.25, 0.0, 0.4})  // −2: reversed
         for (const double b : {-0.5, 0.0, 0.5}) result.push_back(Eigen::Vector2d(a, b * sigma(1)));
       return result;
     }

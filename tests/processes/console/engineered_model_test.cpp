@@ -127,6 +127,16 @@ TEST_F(EngineeredModelTest, AJointWithoutASignalStandsAtZeroAndItsFollowerAtItsO
   EXPECT_LT(log(predicted.at(9).inverse() * expected).norm(), 1e-12);
 }
 
+TEST_F(EngineeredModelTest, ASignalWithoutAJointKeepsItsPlaceAndMovesNothing) {
+  const BodySchema schema = model(
+      kRobot,
+      replaced(kPlacement, "  - {name: b", "  - {name: idle, lower: 0, upper: 1}\n  - {name: b"));
+  ASSERT_EQ(schema.signals.size(), 3U);
+  EXPECT_EQ(schema.signals[1].name, "idle");
+  EXPECT_EQ(schema.unused_signals(), std::vector<int>{1});
+  expect_error(kRobot, replaced(kPlacement, "joint: j2, ", ""), "gain");
+}
+
 TEST_F(EngineeredModelTest, EdgesAreAsUncertainAsThePlacementSays) {
   const BodySchema schema = model(kRobot, kPlacement);
   for (const Edge& edge : schema.edges) {
