@@ -1,6 +1,9 @@
 #include <gtest/gtest.h>
 
+#include <filesystem>
+#include <fstream>
 #include <limits>
+#include <stdexcept>
 #include <string>
 
 #include "processes/refiner/refine.h"
@@ -84,6 +87,22 @@ TEST_F(RefineRefuses, TagsOfOtherParts) {
   for (RefinerSample& seen : samples_)
     for (TagSight& sight : seen.tags) sight.tag += 500;
   expect_refusal("no sample shows a tag", robot_.truth);
+}
+
+TEST(RefinerConfig, ReadsEveryKeyAndRefusesAFileWithoutOne) {
+  const auto file = std::filesystem::path(testing::TempDir()) / "refiner.yaml";
+  const std::string text =
+      "tag_position_m: 0.001\ntag_rotation_deg: 0.5\ntag_size_share: 0.01\n"
+      "focal_length_share: 0.02\ncentre_px: 7\ndistortion: 0.05\njoint_play_m: 0.001\n"
+      "joint_play_deg: 0.1\n";
+  std::ofstream(file) << text;
+  EXPECT_THROW(RefinerConfig::load(file), std::runtime_error);
+  std::ofstream(file) << text << "max_samples: 50\n";
+  const RefinerConfig config = RefinerConfig::load(file);
+  EXPECT_EQ(config.tags.position_m, 0.001);
+  EXPECT_EQ(config.centre_px, 7);
+  EXPECT_EQ(config.joint_play.position_m, 0.001);
+  EXPECT_EQ(config.max_samples, 50);
 }
 
 TEST(RefinerSamples, AreThinnedEvenly) {
