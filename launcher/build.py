@@ -42,9 +42,11 @@ def alone(folder):
 
 
 def configure(place, preset="release"):
-    packages.install(place.source / "config" / "packages.txt")
-    # A build folder that was configured elsewhere (a copied or moved checkout) is of no use.
     cache = place.build / "CMakeCache.txt"
+    # Once: a build that has looked for Ceres in vain goes on without.
+    is_new = not cache.exists() or "Ceres_DIR" not in cache.read_text()
+    packages.install(place.source / "config" / "packages.txt", with_optional=is_new)
+    # A build folder that was configured elsewhere (a copied or moved checkout) is of no use.
     if cache.exists() and f"CMAKE_HOME_DIRECTORY:INTERNAL={place.source}" not in cache.read_text().splitlines():
         shutil.rmtree(place.build)
     if not (place.build / "build.ninja").exists():

@@ -8,10 +8,10 @@ import sys
 from launcher.words import Failure, say
 
 
-def listed(file):
-    """Names in a packages*.txt."""
-    names = (line.split("#")[0].strip() for line in file.read_text().splitlines())
-    return [name for name in names if name]
+def listed(file, optional=False):
+    """Names in a packages*.txt: those that are needed, or those whose line says "# optional"."""
+    lines = (line.partition("#") for line in file.read_text().splitlines())
+    return [name.strip() for name, _, remark in lines if name.strip() and remark.strip().startswith("optional") == optional]
 
 
 def is_installed(package):
@@ -19,9 +19,18 @@ def is_installed(package):
     return subprocess.run(query, capture_output=True, text=True).stdout == "installed"
 
 
-def install(file):
-    """Installs the missing packages of a packages*.txt."""
-    missing = [package for package in listed(file) if not is_installed(package)]
+def install(file, with_optional=False):
+    """Installs the missing packages of a packages*.txt. Without the optional ones it goes on."""
+    install_missing(listed(file))
+    if with_optional:
+        try:
+            install_missing(listed(file, optional=True))
+        except Failure as failure:
+            say(f"{failure}; going on without")
+
+
+def install_missing(names):
+    missing = [package for package in names if not is_installed(package)]
     if not missing:
         return
     say("installing from Debian:", *missing)

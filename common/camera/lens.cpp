@@ -14,6 +14,7 @@ Lens::Lens(const camera_info_t& info)
       focal_px_(info.fx, info.fy),
       centre_px_(info.cx, info.cy),
       model_(info.distortion_model),
+      num_coefficients_(info.num_coefficients),
       is_distorted_(false) {
   const int n = info.num_coefficients;
   const bool fits = n == 0 || (model_ == camera_info_t::MODEL_PLUMB_BOB && (n == 4 || n == 5)) ||
@@ -25,10 +26,29 @@ Lens::Lens(const camera_info_t& info)
   }
   if (!(info.fx > 0 && info.fy > 0)) throw std::invalid_argument("focal length not above 0");
   std::copy_n(info.distortion.begin(), n, k_);
+  set_distorted();
+}
+
+void Lens::set_distorted() {
   // Coefficients of zero are a pinhole's, and a pinhole needs no iteration.
-  is_distorted_ = std::any_of(k_, k_ + n, [](double k) { return k != 0; });
+  is_distorted_ = std::any_of(k_, k_ + num_coefficients_, [](double k) { return k != 0; });
   // Without coefficients a fisheye lens is still not a pinhole.
   if (model_ == camera_info_t::MODEL_FISHEYE) is_distorted_ = true;
+}
+
+Eigen::VectorXd Lens::parameters() const {
+  Eigen::VectorXd parameters(4 + num_coefficients_);
+  parameters << focal_px_, centre_px_, Eigen::Map<const Eigen::VectorXd>(k_, num_coefficients_);
+  return parameters;
+}
+
+Lens Lens::with(const Eigen::Ref<const Eigen::VectorXd>& parameters) const {
+  Lens lens = *this;
+  lens.focal_px_ = parameters.head<2>();
+  lens.centre_px_ = parameters.segment<2>(2);
+  std::copy(parameters.begin() + 4, parameters.end(), lens.k_);
+  lens.set_distorted();
+  return lens;
 }
 
 Eigen::Vector2d Lens::distort(const Eigen::Vector2d& ray) const {

@@ -29,18 +29,27 @@ class Lens {
   /// Pixel (centre convention) of the ray (x/z, y/z).
   Eigen::Vector2d project(const Eigen::Vector2d& ray) const;
 
+  /// Its derivative by the ray [px].
+  Eigen::Matrix2d px_per_ray(const Eigen::Vector2d& ray) const;
+
+  /// fx, fy, cx, cy [px], then the coefficients in OpenCV's order.
+  Eigen::VectorXd parameters() const;
+  /// A lens of this model and size with such parameters, whose focal lengths are above 0.
+  Lens with(const Eigen::Ref<const Eigen::VectorXd>& parameters) const;
+
   /// Inverse of project(): std::nullopt where the model has none, that is, outside of the region
   /// in which it is one-to-one, or 90° and more off the optical axis.
   std::optional<ImagePoint> straighten(const Eigen::Vector2d& p_px) const;
 
  private:
   Eigen::Vector2d distort(const Eigen::Vector2d& ray) const;
-  Eigen::Matrix2d px_per_ray(const Eigen::Vector2d& ray) const;
+  void set_distorted();
 
   int width_, height_;
   Eigen::Array2d focal_px_;
   Eigen::Array2d centre_px_;
   int model_;
+  int num_coefficients_;
   double k_[8] = {};
   bool is_distorted_;
 };

@@ -21,6 +21,7 @@
 #include "processes/model_monitor/model_monitor.h"
 #include "processes/motor_babbler/motor_babbler.h"
 #include "processes/observer/observer.h"
+#include "processes/refiner/refiner_config.h"
 #include "processes/robot_simulator/robot_simulator.h"
 #include "processes/structure_learner/structure_learner.h"
 
@@ -103,6 +104,7 @@ class Check {
     of_process("model_monitor.yaml", ModelMonitorConfig::load);
     of_process("motor_babbler.yaml", MotorBabblerConfig::load);
     of_process("controller.yaml", ControllerConfig::load, false);
+    of_process("refiner.yaml", RefinerConfig::load, false);
     of_process("robot_simulator.yaml", RobotSimulatorConfig::load, is_simulated());
     read_.insert("robot.yaml");
     if ((is_simulated() || has("robot_simulator.yaml") || has("robot.yaml")) && rig_.signals &&

@@ -13,7 +13,7 @@ from unittest import mock
 
 from support import SOURCE
 
-from launcher import build, commands, group_file, run_folder, supervisor, test_selection
+from launcher import build, commands, group_file, packages, run_folder, supervisor, test_selection
 from launcher.place import Place
 
 
@@ -38,6 +38,14 @@ class ABuild(Folder):
             done.append("first")
         thread.join()
         self.assertEqual(done, ["first", "second"])
+
+
+class ThePackageList(Folder):
+    def test_tells_those_that_are_needed_from_those_that_are_not(self):
+        file = self.folder / "packages.txt"
+        file.write_text("# build\nninja-build\nlibceres-dev  # optional: bodyschema refine\ncmake  # not optional\n")
+        self.assertEqual(packages.listed(file), ["ninja-build", "cmake"])
+        self.assertEqual(packages.listed(file, optional=True), ["libceres-dev"])
 
 
 class TheGroupFile(Folder):

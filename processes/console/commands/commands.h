@@ -13,6 +13,9 @@ void add_offline_commands(Arguments console);
 void add_engineer_command(Arguments console);
 /// `urdf`: its inverse, a URDF and placements from a schema file.
 void add_urdf_command(Arguments console);
+/// `refine`: fits all parameters of a schema to a recording, by Ceres; where this was built without
+/// it, says how to get it.
+void add_refine_command(Arguments console);
 /// `log`: what an LCM log holds, and whether it is whole and of this version.
 void add_log_command(Arguments console);
 /// `monitor`: keeps a schema true over a recording; its events and errors, line by line.

@@ -74,6 +74,22 @@ TEST(Lens, KnowsHowPixelsMoveWithTheRay) {
   }
 }
 
+TEST(Lens, WithTheParametersOfAnotherIsThatOne) {
+  for (const camera_info_t& info : kCameras) {
+    const Lens lens(info);
+    camera_info_t other = info;
+    other.fx *= 1.02;
+    other.cy += 3;
+    for (double& coefficient : other.distortion) coefficient += 0.01;
+    const Eigen::VectorXd parameters = Lens(other).parameters();
+    ASSERT_EQ(parameters.size(), 4 + info.num_coefficients);
+    EXPECT_EQ(parameters(0), other.fx);
+    const Eigen::Vector2d ray(0.2, -0.3);
+    EXPECT_EQ(lens.with(parameters).project(ray), Lens(other).project(ray));
+    EXPECT_EQ(lens.with(lens.parameters()).project(ray), lens.project(ray));
+  }
+}
+
 TEST(Lens, RefusesPixelsThatNoRayLeadsTo) {
   // Distortion folds the image back at r² = 1/(3·0.4): farther out nothing is seen.
   const Lens lens(camera_with(camera_info_t::MODEL_PLUMB_BOB, {-0.4, 0, 0, 0}));

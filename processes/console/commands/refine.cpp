@@ -1,0 +1,111 @@
+#include "processes/refiner/refine.h"
+
+#include <fmt/format.h>
+
+#include <filesystem>
+#include <iostream>
+#include <memory>
+#include <stdexcept>
+
+#include "common/bus/channels.h"
+#include "common/bus/convert.h"
+#include "common/bus/event_log.h"
+#include "common/config/calibration_id.h"
+#include "processes/console/commands/commands.h"
+#include "processes/console/commands/files.h"
+#include "processes/console/rig_check.h"
+#include "processes/console/views/refinement_view.h"
+#include "processes/refiner/proposed_files.h"
+
+namespace bodyschema {
+namespace {
+
+struct RefineArguments {
+  std::string schema, samples, out, rig, proposed;
+  std::vector<double> noise;
+  bool placements = false, intrinsics = false, json = false;
+};
+
+/// The rig's folder: that which is told, else the run's own beside a log.
+std::filesystem::path rig_folder(const RefineArguments& arguments, bool is_log) {
+  if (!arguments.rig.empty()) return find_rig(arguments.rig);
+  const auto own = std::filesystem::path(arguments.samples).parent_path() / "config";
+  return is_log && std::filesystem::exists(own / "markers.yaml") ? own : std::filesystem::path();
+}
+
+/// With corners where it is a log that is not packed.
+std::vector<RefinerSample> samples_of(const RefineArguments& arguments,
+                                      const Recording& recording) {
+  if (!recording.is_log) return refiner_samples(recording.samples);
+  try {
+    return refiner_samples(read_log(arguments.samples, kSample));
+  } catch (const std::runtime_error&) {
+    std::cerr << "bodyschema: " << arguments.samples
+              << ": corners are read from a log that is not packed; poses are fitted\n";
+    return refiner_samples(recording.samples);
+  }
+}
+
+/// Of poses: as told, as the recording says, else as the schema was learned with.
+MeasurementModel measurement_of(const RefineArguments& arguments, const Recording& recording,
+                                const BodySchema& schema) {
+  MeasurementModel measurement = recording.measurement;
+  if (!arguments.noise.empty())
+    measurement.noise = noise_given(arguments.noise);
+  else if (!recording.has_noise)
+    measurement.noise = schema.noise;
+  if (measurement.noise && !(measurement.noise->position_m > 0))
+    throw std::invalid_argument(
+        "neither the recording nor the schema tells the noise: give --noise");
+  return measurement;
+}
+
+void run_refine(const RefineArguments& arguments) {
+  if (!arguments.proposed.empty() && !arguments.placements && !arguments.intrinsics)
+    refuse_argument("--proposed", "expected with --placements or --intrinsics");
+  const BodySchema schema = load_schema(arguments.schema);
+  const Recording recording = load_for(arguments.samples, schema);
+  RefineOptions options;
+  options.placements = arguments.placements;
+  options.intrinsics = arguments.intrinsics;
+  std::optional<RigCalibration> rig;
+  const std::filesystem::path folder = rig_folder(arguments, recording.is_log);
+  if (!folder.empty()) {
+    rig = RigCalibration{load_markers(folder), load_camera_calibration(calibration_file(folder))};
+    const RigNoise noise = load_noise(folder);
+    options.corner_noise = {noise.corner_noise_px, noise.small_tag_noise_px};
+    if (std::filesystem::exists(folder / "refiner.yaml"))
+      options.config = RefinerConfig::load(folder / "refiner.yaml");
+  }
+  options.measurement = measurement_of(arguments, recording, schema);
+  check_out(arguments.out, {arguments.schema, arguments.samples});
+  const Refinement result = refine(schema, samples_of(arguments, recording), rig, options);
+  write_one_event_log(arguments.out, kBodySchema, to_message(result.schema));
+  if (!arguments.proposed.empty()) write_proposed_files(result.rig, arguments.proposed);
+  print(arguments.json, refinement_json(result, rig), refinement_text(result, rig));
+}
+
+}  // namespace
+
+void add_refine_command(Arguments console) {
+  const auto arguments = std::make_shared<RefineArguments>();
+  Arguments refine = console.add_subcommand(
+      "refine", "Fit all parameters of a schema at once to a recording, to the tags' corners");
+  refine.add_option("SCHEMA", arguments->schema, "Schema file: where to begin").required();
+  refine.add_option("SAMPLES", arguments->samples, "Recording (LCM log or CSV)").required();
+  refine.add_option("--rig", arguments->rig,
+                    "Folder of the rig that the samples are of, or name of one in config/: its "
+                    "tags and lens; the run's own if not given");
+  refine.add_flag("--placements", arguments->placements,
+                  "Also where the tags sit on their parts, and their sizes");
+  refine.add_flag("--intrinsics", arguments->intrinsics,
+                  "Also focal length, centre and distortion");
+  refine.add_option("--out", arguments->out, "Write the refined schema to this file").required();
+  refine.add_option("--proposed", arguments->proposed,
+                    "Write markers.yaml and camera_info.yaml as found into this folder");
+  add_noise(refine, arguments->noise, "; of poses");
+  refine.add_flag("--json", arguments->json, "Print JSON");
+  refine.callback([arguments] { run_refine(*arguments); });
+}
+
+}  // namespace bodyschema

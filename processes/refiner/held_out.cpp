@@ -1,0 +1,91 @@
+#include "processes/refiner/held_out.h"
+
+#include <algorithm>
+#include <cmath>
+
+#include "common/camera/fit_pose.h"
+#include "common/estimation/quantile.h"
+#include "processes/refiner/calibrated_lens.h"
+
+namespace bodyschema {
+namespace {
+
+Eigen::Vector2d corner_px(const TagSight& sight, int corner) {
+  return sight.corners_px.segment<2>(2 * corner);
+}
+
+const TagSight* find(const std::vector<TagSight>& tags, int id) {
+  const auto sight =
+      std::find_if(tags.begin(), tags.end(), [id](const TagSight& t) { return t.tag == id; });
+  return sight == tags.end() ? nullptr : &*sight;
+}
+
+/// X_CB from the corners of the tags that the observation rests on; where that fails as it was.
+Pose solved_anew(const PartObservation& observation, const std::vector<TagSight>& tags,
+                 const RigCalibration& rig, const Lens& lens) {
+  std::vector<Eigen::Vector3d> p_BP;
+  std::vector<ImagePoint> measured;
+  for (const int id : observation.tags) {
+    const TagPlacement* tag = rig.markers.find(id);
+    const TagSight* sight = find(tags, id);
+    if (!tag || !sight) continue;
+    const std::vector<Eigen::Vector3d> corners = tag_corners(tag->size_m);
+    for (int c = 0; c < 4; ++c) {
+      const auto point = lens.straighten(corner_px(*sight, c));
+      if (!point) continue;
+      p_BP.push_back(tag->X_BM.value_or(Pose::Identity()) * corners[c]);
+      measured.push_back(*point);
+    }
+  }
+  const auto fit = fit_pose(observation.X_CB, p_BP, measured);
+  return fit ? fit->X_CB : observation.X_CB;
+}
+
+/// Distances of predicted corners from those seen [px].
+std::vector<double> corner_distances(const BodySchema& schema,
+                                     const std::vector<RefinerSample>& samples,
+                                     const RigCalibration& rig, const Lens& lens) {
+  std::vector<double> distances;
+  for (const RefinerSample& seen : samples) {
+    const std::map<int, Pose> X_RB = schema.predict_all(seen.sample.action);
+    for (const TagSight& sight : seen.tags) {
+      const TagPlacement* tag = rig.markers.find(sight.tag);
+      if (!tag || !X_RB.contains(tag->part)) continue;
+      const Pose X_CM = schema.X_CR * X_RB.at(tag->part) * tag->X_BM.value_or(Pose::Identity());
+      const std::vector<Eigen::Vector3d> corners = tag_corners(tag->size_m);
+      for (int c = 0; c < 4; ++c) {
+        const Eigen::Vector3d p_C = X_CM * corners[c];
+        if (p_C.z() > 0)
+          distances.push_back((lens.project(p_C.head<2>() / p_C.z()) - corner_px(sight, c)).norm());
+      }
+    }
+  }
+  return distances;
+}
+
+}  // namespace
+
+HeldOutErrors held_out_errors(const BodySchema& schema, const std::vector<RefinerSample>& samples,
+                              const std::optional<RigCalibration>& rig) {
+  HeldOutErrors errors;
+  errors.num_samples = static_cast<int>(samples.size());
+  std::vector<ActionPoseSample> poses;
+  for (const RefinerSample& seen : samples) poses.push_back(seen.sample);
+  if (rig) {
+    const Lens lens = lens_of(rig->camera);
+    for (std::size_t n = 0; n < samples.size(); ++n)
+      for (PartObservation& observation : poses[n].parts)
+        observation.X_CB = solved_anew(observation, samples[n].tags, *rig, lens);
+    const std::vector<double> distances = corner_distances(schema, samples, *rig, lens);
+    if (!distances.empty()) {
+      double sum = 0;
+      for (const double distance : distances) sum += distance * distance;
+      errors.px_rms = std::sqrt(sum / (2 * static_cast<double>(distances.size())));
+      errors.px_median = median(distances);
+    }
+  }
+  errors.parts = evaluate(schema, poses);
+  return errors;
+}
+
+}  // namespace bodyschema

@@ -1,0 +1,61 @@
+#include "processes/refiner/proposed_files.h"
+
+#include <fmt/format.h>
+
+#include <array>
+#include <fstream>
+#include <stdexcept>
+
+#include "processes/refiner/calibrated_lens.h"
+
+namespace bodyschema {
+namespace {
+
+void write(const std::filesystem::path& file, const std::string& text) {
+  std::ofstream stream(file);
+  stream << text;
+  if (!stream.flush()) throw std::runtime_error("--proposed: cannot write " + file.string());
+}
+
+std::string placement_text(const std::optional<Pose>& X_BM) {
+  if (!X_BM) return "none";
+  const Eigen::Vector3d p = X_BM->translation();
+  const Eigen::Quaterniond q(X_BM->linear());
+  return fmt::format("{{position_m: [{}, {}, {}], rotation_wxyz: [{}, {}, {}, {}]}}", p.x(), p.y(),
+                     p.z(), q.w(), q.x(), q.y(), q.z());
+}
+
+std::string markers_text(const Markers& markers) {
+  std::string text =
+      "# Proposed by `bodyschema refine`: where the tags were found to sit, and how large.\n";
+  text += fmt::format("family: {}\ntags:\n", markers.family);
+  for (const TagPlacement& tag : markers.tags)
+    text += fmt::format("  - {{id: {}, size_m: {}, part: {}, placement: {}}}\n", tag.id, tag.size_m,
+                        tag.part, placement_text(tag.X_BM));
+  return text;
+}
+
+std::string camera_text(const CameraCalibration& found) {
+  const CameraCalibration camera = with_all_coefficients(found);
+  constexpr std::array<const char*, 3> kModels = {"plumb_bob", "rational_polynomial",
+                                                  "equidistant"};
+  return fmt::format(
+      "# Proposed by `bodyschema refine`.\n"
+      "image_width: {}\nimage_height: {}\ncamera_name: {}\n"
+      "camera_matrix:\n  rows: 3\n  cols: 3\n  data: [{}, 0.0, {}, 0.0, {}, {}, 0.0, 0.0, 1.0]\n"
+      "distortion_model: {}\n"
+      "distortion_coefficients:\n  rows: 1\n  cols: {}\n  data: [{}]\n",
+      camera.width, camera.height, camera.camera_name.empty() ? "camera" : camera.camera_name,
+      camera.fx, camera.cx, camera.fy, camera.cy, kModels.at(static_cast<int>(camera.model)),
+      camera.distortion.size(), fmt::join(camera.distortion, ", "));
+}
+
+}  // namespace
+
+void write_proposed_files(const RigCalibration& rig, const std::filesystem::path& folder) {
+  std::filesystem::create_directories(folder);
+  write(folder / "markers.yaml", markers_text(rig.markers));
+  write(folder / "camera_info.yaml", camera_text(rig.camera));
+}
+
+}  // namespace bodyschema

@@ -1,0 +1,213 @@
+#include "processes/refiner/refine.h"
+
+#include <fmt/format.h>
+
+#include <algorithm>
+#include <chrono>
+#include <cmath>
+#include <stdexcept>
+
+#include "common/config/calibration_id.h"
+#include "common/estimation/chi_square.h"
+#include "common/estimation/quantile.h"
+#include "processes/refiner/calibrated_lens.h"
+#include "processes/refiner/held_out.h"
+#include "processes/refiner/information.h"
+#include "processes/refiner/refined_schema.h"
+#include "processes/refiner/refinement_problem.h"
+#include "processes/refiner/refinement_words.h"
+
+namespace bodyschema {
+namespace {
+
+/// Chosen: what a person reads.
+constexpr std::size_t kMostCorrelations = 20, kMostOutliers = 50;
+
+bool is_finite(const RefinerSample& seen) {
+  if (!seen.sample.action.allFinite()) return false;
+  for (const PartObservation& o : seen.sample.parts)
+    if (!o.X_CB.matrix().allFinite() || !o.covariance.allFinite()) return false;
+  return std::all_of(seen.tags.begin(), seen.tags.end(), [](const TagSight& sight) {
+    return sight.corners_px.allFinite() && sight.covariance_px2.allFinite();
+  });
+}
+
+void check(const BodySchema& schema, const std::vector<RefinerSample>& samples) {
+  if (schema.edges.empty())
+    throw std::invalid_argument("the schema connects no parts: there is nothing to refine");
+  if (samples.empty()) throw std::invalid_argument("there are no samples");
+  for (const RefinerSample& seen : samples) {
+    const auto refuse = [&](const std::string& why) {
+      throw std::invalid_argument(fmt::format("sample {} {}", seen.sample.sample_index, why));
+    };
+    if (seen.sample.action.size() != std::ssize(schema.signals))
+      refuse(fmt::format("has {} action signals, the schema {}", seen.sample.action.size(),
+                         schema.signals.size()));
+    if (!is_finite(seen)) refuse("has numbers that are not finite");
+  }
+}
+
+bool has_corners(const std::vector<RefinerSample>& samples) {
+  return std::any_of(samples.begin(), samples.end(),
+                     [](const RefinerSample& seen) { return !seen.tags.empty(); });
+}
+
+void check_calibration(const std::vector<RefinerSample>& samples,
+                       const std::optional<RigCalibration>& rig, const RefineOptions& options) {
+  const char* const asked = options.placements ? "placements" : "intrinsics";
+  const bool is_asked = options.placements || options.intrinsics;
+  if (is_asked && !rig)
+    throw std::invalid_argument(
+        fmt::format("{} are refined against a rig's files: none given", asked));
+  if (is_asked && !has_corners(samples))
+    throw std::invalid_argument(
+        fmt::format("{} are refined by the tags' corners, which the samples do not have", asked));
+  if (!rig) return;
+  const std::int64_t id = calibration_id(rig->markers, rig->camera);
+  for (const RefinerSample& seen : samples)
+    if (seen.sample.calibration_id != 0 && seen.sample.calibration_id != id)
+      throw std::invalid_argument(
+          fmt::format("sample {} was seen through another calibration of tags and lens than the "
+                      "rig's: its markers.yaml or camera calibration is another",
+                      seen.sample.sample_index));
+}
+
+/// Do the observed poses of the root differ by more than their noise?
+bool root_moves(const BodySchema& schema, const std::vector<RefinerSample>& samples,
+                const MeasurementModel& measurement) {
+  std::vector<const PartObservation*> seen;
+  for (const RefinerSample& sample : samples)
+    if (const PartObservation* o = sample.sample.find(schema.root); o && o->has_rotation)
+      seen.push_back(o);
+  if (seen.empty()) return false;
+  // The one that most of the others agree with.
+  double best = std::numeric_limits<double>::infinity();
+  const std::size_t num_candidates = std::min<std::size_t>(seen.size(), 8);
+  for (std::size_t n = 0; n < num_candidates; ++n) {
+    const Pose& X = seen[n * seen.size() / num_candidates]->X_CB;
+    std::vector<double> distances;
+    for (const PartObservation* o : seen)
+      distances.push_back(
+          squared_mahalanobis(log(X.inverse() * o->X_CB), measurement.covariance(*o)));
+    best = std::min(best, median(distances));
+  }
+  // Twice: both poses have noise.
+  return best > 2 * chi_square_quantile(6, 1e-4);
+}
+
+std::vector<RefinementOutlier> outliers_of(RefinementProblem& problem) {
+  std::vector<RefinementOutlier> result;
+  const std::vector<double> squared = problem.squared_distances();
+  for (std::size_t n = 0; n < squared.size(); ++n) {
+    const auto& datum = problem.data()[n];
+    if (squared[n] > chi_square_quantile(datum.num_residuals, 1e-4))
+      result.push_back({datum.sample_index, datum.part, datum.tag, std::sqrt(squared[n])});
+  }
+  std::stable_sort(result.begin(), result.end(),
+                   [](const auto& a, const auto& b) { return a.distance > b.distance; });
+  if (result.size() > kMostOutliers) result.resize(kMostOutliers);
+  return result;
+}
+
+std::vector<JointPlay> plays_of(const BodySchema& schema, const RefinementProblem& problem) {
+  std::vector<JointPlay> result;
+  for (std::size_t n = 0; n < problem.plays().size(); ++n) {
+    const auto& [edge, d] = problem.plays()[n];
+    const ScrewJoint& joint = edge->joints[d];
+    const double sd = std::abs(joint.gain) * problem.play_sd()(static_cast<Eigen::Index>(n));
+    result.push_back(
+        {fmt::format("{} ({}→{})", schema.signals.at(joint.signal).name, edge->from, edge->to),
+         sd * std::abs(joint.slide), sd * std::abs(joint.turn)});
+  }
+  return result;
+}
+
+std::vector<SignalCoverage> coverage_of(const BodySchema& schema,
+                                        const std::vector<RefinerSample>& samples) {
+  std::vector<SignalCoverage> result;
+  for (std::size_t s = 0; s < schema.signals.size(); ++s) {
+    const Signal& signal = schema.signals[s];
+    double low = samples.front().sample.action(s), high = low;
+    for (const RefinerSample& seen : samples) {
+      low = std::min(low, seen.sample.action(s));
+      high = std::max(high, seen.sample.action(s));
+    }
+    const double range = signal.upper - signal.lower;
+    result.push_back({signal.name, range > 0 ? (high - low) / range : 0});
+  }
+  return result;
+}
+
+std::vector<std::string> held_things(const BodySchema& schema, const RefineOptions& options,
+                                     bool has_corners) {
+  std::vector<std::string> result;
+  for (const Edge& edge : schema.edges)
+    if (!PartChain::has_block(edge))
+      result.push_back(fmt::format("{}→{}: its Gaussian process", edge.from, edge.to));
+  for (const Signal& signal : schema.signals)
+    if (!signal.warp.empty())
+      result.push_back(fmt::format("{}: the bend of its command", signal.name));
+  if (has_corners && !options.placements)
+    result.push_back("tags: as the rig's files say, within their priors");
+  if (has_corners && !options.intrinsics)
+    result.push_back("lens: as the rig's files say, within its priors");
+  return result;
+}
+
+}  // namespace
+
+Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
+                  const std::optional<RigCalibration>& claimed, const RefineOptions& options) {
+  std::optional<RigCalibration> rig = claimed;
+  if (rig && options.intrinsics) rig->camera = with_all_coefficients(rig->camera);
+  const auto begin = std::chrono::steady_clock::now();
+  check(schema, samples);
+  std::stable_sort(samples.begin(), samples.end(), [](const auto& a, const auto& b) {
+    return a.sample.sample_index < b.sample.sample_index;
+  });
+  std::vector<RefinerSample> training, held_out;
+  for (const RefinerSample& seen : samples) {
+    if (is_learned_from(seen.sample)) training.push_back(seen);
+    if (seen.sample.purpose == Purpose::kTest) held_out.push_back(seen);
+  }
+  if (training.empty()) throw std::invalid_argument("there are no TRAIN samples");
+  Refinement result;
+  check_calibration(training, rig, options);
+  result.used_corners = options.placements || options.intrinsics;
+  const std::optional<RigCalibration> used_rig = result.used_corners ? rig : std::nullopt;
+  if (rig) result.rig = *rig;
+  result.num_available = static_cast<int>(training.size());
+  training = thinned(std::move(training), static_cast<std::size_t>(options.config.max_samples));
+  result.num_samples = static_cast<int>(training.size());
+  result.root_moves = root_moves(schema, training, options.measurement);
+  result.coverage = coverage_of(schema, training);
+  result.held = held_things(schema, options, result.used_corners);
+
+  RefinementProblem problem(schema, training, used_rig, options, result.root_moves);
+  for (const int part : problem.unseen_parts())
+    result.held.push_back(fmt::format("the frame of part {}: it was never seen", part));
+  problem.solve();
+  result.outliers = outliers_of(problem);
+  const Information information(problem, options.measurement);
+  const RefinementWords words(schema, information, problem.frame_tags());
+  result.num_observations = static_cast<int>(problem.data().size());
+  result.num_iterations = problem.num_iterations();
+  result.noise_scale = problem.scale();
+  result.gauge_tag = problem.gauge_tag();
+  result.parameters = words.parameters();
+  result.undetermined = words.undetermined();
+  result.correlations = words.correlations(kMostCorrelations);
+  result.plays = plays_of(schema, problem);
+  if (result.used_corners) result.rig = refined_rig(problem, *rig);
+  result.schema = refined_schema(schema, training, problem, information);
+  if (result.used_corners)
+    result.schema.calibration_id = calibration_id(result.rig.markers, result.rig.camera);
+  const bool judges_corners = rig && has_corners(held_out);
+  result.before = held_out_errors(schema, held_out, judges_corners ? rig : std::nullopt);
+  result.after = held_out_errors(result.schema, held_out,
+                                 judges_corners ? std::optional(result.rig) : std::nullopt);
+  result.seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - begin).count();
+  return result;
+}
+
+}  // namespace bodyschema

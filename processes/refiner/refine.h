@@ -1,0 +1,108 @@
+#pragma once
+
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "common/camera/fit_pose.h"
+#include "common/config/camera_calibration.h"
+#include "common/config/rig.h"
+#include "common/estimation/evaluation.h"
+#include "common/schema/body_schema.h"
+#include "processes/refiner/refiner_config.h"
+#include "processes/refiner/refiner_sample.h"
+
+namespace bodyschema {
+
+/// What a rig claims of its tags and its camera.
+struct RigCalibration {
+  Markers markers;
+  CameraCalibration camera;
+};
+
+struct RefineOptions {
+  bool placements = false;  ///< also where the tags sit, and how large they are
+  bool intrinsics = false;  ///< also focal lengths, centre and distortion
+  RefinerConfig config;
+  CornerNoise corner_noise;      ///< of corners without a covariance of their own
+  MeasurementModel measurement;  ///< of poses, where these are fitted
+};
+
+/// A parameter after the refinement.
+struct RefinedParameter {
+  std::string name;          ///< "offset of q5 (5→6)", "placement of tag 12, about z"
+  std::string unit;          ///< "m", "rad", "px", "1", "m/unit", "rad/unit"
+  double change = 0;         ///< since the start, in `unit`
+  std::optional<double> sd;  ///< none: the samples do not determine it
+};
+
+struct ParameterCorrelation {
+  std::string one, other;
+  double correlation = 0;
+  std::string advice;  ///< which further samples would tell them apart; "" if unknown
+};
+
+struct RefinementOutlier {
+  std::int64_t sample_index = 0;
+  int part = 0;
+  int tag = -1;         ///< −1: a pose
+  double distance = 0;  ///< Mahalanobis distance [σ]
+};
+
+struct SignalCoverage {
+  std::string signal;
+  double share = 0;  ///< of the range between its limits that the fitted samples span
+};
+
+/// How well a model predicts samples that it was not fitted to.
+struct HeldOutErrors {
+  int num_samples = 0;
+  std::vector<PartErrors> parts;    ///< in the root's frame, of all parts but the root
+  std::optional<double> px_rms;     ///< per coordinate of a corner; none without corners
+  std::optional<double> px_median;  ///< of a corner's distance
+};
+
+/// How far a joint is from its command, 1 σ over the samples: backlash and droop.
+struct JointPlay {
+  std::string joint;  ///< "q5 (5→6)"
+  double slide_m = 0, turn_rad = 0;
+};
+
+struct Refinement {
+  BodySchema schema;
+  RigCalibration rig;  ///< refined; as claimed where nothing of it was
+  bool used_corners = false, root_moves = false;
+  int num_samples = 0, num_available = 0;  ///< fitted, and of how many
+  int num_observations = 0;                ///< tags seen, or poses
+  double seconds = 0;
+  int num_iterations = 0;
+  /// The residuals are this many times as large as told (≥ 1).
+  double noise_scale = 1;
+  int gauge_tag = -1;  ///< defines the root's frame; −1: the root's poses do
+  std::vector<RefinedParameter> parameters;
+  std::vector<std::string> undetermined;           ///< directions, in words
+  std::vector<ParameterCorrelation> correlations;  ///< above kHighCorrelation, the highest first
+  std::vector<RefinementOutlier> outliers;         ///< the farthest first
+  std::vector<SignalCoverage> coverage;
+  std::vector<JointPlay> plays;   ///< where corners were fitted
+  std::vector<std::string> held;  ///< what was not refined, and why
+  HeldOutErrors before, after;
+};
+inline constexpr double kHighCorrelation = 0.95;
+
+/// Fits all parameters of a schema at once to TRAIN and PROBE samples, with Student-t weights:
+/// where the root stands and every screw. While tags and lens are as the rig says, the data are the
+/// parts' poses, which were made by these. With tags or lens among the parameters, the data are the
+/// corners' pixels, the rig's claims are priors, and at every sample each joint may be off its
+/// command (backlash, droop) by what is estimated to be usual. Edges with a Gaussian process,
+/// command warps and signals' limits stay as they are. TEST samples are judged alone. The order of
+/// samples changes nothing.
+///
+/// Gauge: of the tags of the root the one seen most often stays where the rig says it is; the scale
+/// is the mean of all tags' sizes, weighed by their priors, for images do not tell it.
+/// @throws std::invalid_argument for people: nothing to fit, corners missing that are asked for,
+/// another rig, numbers that are not finite.
+Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
+                  const std::optional<RigCalibration>& rig, const RefineOptions& options);
+
+}  // namespace bodyschema

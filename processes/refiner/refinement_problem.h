@@ -1,0 +1,128 @@
+#pragma once
+
+#include <ceres/problem.h>
+#include <ceres/solver.h>
+
+#include <deque>
+#include <map>
+#include <optional>
+#include <set>
+#include <string>
+#include <vector>
+
+#include "common/camera/lens.h"
+#include "common/config/rig.h"
+#include "processes/refiner/parameter_block.h"
+#include "processes/refiner/part_chain.h"
+#include "processes/refiner/refine.h"
+#include "processes/refiner/residuals.h"
+
+namespace bodyschema {
+
+/// What a schema, the rig's calibration and samples make for Ceres: blocks of parameters, residuals
+/// of the tags' corners (or of parts' poses), priors.
+class RefinementProblem {
+ public:
+  /// One observation: a tag's corners, or a part's pose.
+  struct Datum {
+    ceres::ResidualBlockId id = nullptr;
+    int num_residuals = 0;
+    std::int64_t sample_index = 0;
+    int part = 0;
+    int tag = -1;                                  ///< −1: of a pose
+    const PartObservation* observation = nullptr;  ///< of a pose
+  };
+
+  /// `samples`: those to fit, ascending. `rig`: none where poses are fitted. What cannot be
+  /// used (a part that hangs on nothing, a tag that moved, a sample before an edge was valid) is
+  /// passed over. All arguments must outlive this. @throws std::invalid_argument.
+  RefinementProblem(const BodySchema& schema, const std::vector<RefinerSample>& samples,
+                    const std::optional<RigCalibration>& rig, const RefineOptions& options,
+                    bool root_moves);
+
+  /// Levenberg–Marquardt with Student-t weights, the noise's scale estimated between its runs,
+  /// until neither changes.
+  void solve();
+
+  /// Those that a residual depends on: instants, root, edges, tags ascending, lens.
+  std::vector<ParameterBlock*> blocks();
+  const std::vector<Datum>& data() const { return data_; }
+  ceres::Problem& problem() { return problem_; }
+  /// Where Ceres knows a block's values. All are in one array, in the order of the blocks: Ceres
+  /// orders blocks by address, and the same samples shall give the same bytes.
+  double* memory_of(const ParameterBlock* block) { return &memory_[memory_offsets_.at(block)]; }
+  double scale() const { return scale_.value; }
+  int num_iterations() const { return num_iterations_; }
+  /// Tag of the root that defines its frame; −1 without corners.
+  int gauge_tag() const { return gauge_tag_; }
+  /// Of each part the tag that was seen most often.
+  std::vector<int> frame_tags() const;
+  bool root_moves() const { return root_moves_; }
+  /// Joints that may be off their command at every sample, and by how much, 1 σ [command units].
+  struct Play {
+    const Edge* edge = nullptr;
+    int joint = 0;
+  };
+  const std::vector<Play>& plays() const { return plays_; }
+  const Eigen::VectorXd& play_sd() const { return play_sd_; }
+  /// Parts on the way to others that were never seen: their frames are held.
+  const std::vector<int>& unseen_parts() const { return unseen_parts_; }
+  /// As if every joint had gone where it was told.
+  void leave_out_play();
+  /// d² of each datum now.
+  std::vector<double> squared_distances();
+  /// Standard deviations of a block's whole tangent beforehand; empty: nothing is known.
+  Eigen::VectorXd prior_of(const ParameterBlock& block) const;
+  const std::map<int, std::vector<const Edge*>>& paths() const { return paths_; }
+  /// Whether the sample's root has a pose: always where it rests.
+  bool has_root(std::int64_t sample_index) const {
+    return !root_moves_ || instants_.contains(sample_index);
+  }
+  /// Blocks of the edges with a block on the way to a part, the root's first (of a sample).
+  std::vector<ParameterBlock*> chain_blocks(int part, std::int64_t sample_index);
+
+ private:
+  void add_paths();
+  void add_plays();
+  void add_instants(const std::vector<RefinerSample>& samples);
+  void add_tags(const std::vector<RefinerSample>& samples);
+  void add_lens();
+  void add_corners(const RefinerSample& sample);
+  void add_poses(const RefinerSample& sample);
+  void add(ceres::CostFunction* cost, const std::vector<ParameterBlock*>& blocks, Datum datum);
+  void add_priors();
+  void place_blocks();
+  void hold_unseen_frames();
+  bool is_usable(int part, std::int64_t sample_index) const;
+  ceres::Solver::Options solver_options();
+  double estimated_scale();
+  double estimate_play();
+
+  const BodySchema& schema_;
+  const std::optional<RigCalibration>& rig_;
+  const RefineOptions& options_;
+  const bool root_moves_;
+  std::optional<Lens> lens_;
+  std::map<int, std::vector<const Edge*>> paths_;     // by part
+  std::deque<ParameterBlock> storage_;                // addresses stay
+  ParameterBlock* root_ = nullptr;                    // that rests
+  std::map<std::int64_t, ParameterBlock*> instants_;  // by sample
+  std::vector<Play> plays_;
+  std::map<const Edge*, int> first_play_;
+  Eigen::VectorXd play_sd_, play_start_;
+  std::map<int, ParameterBlock*> edges_, tags_;  // by index, by id
+  ParameterBlock* lens_block_ = nullptr;
+  int gauge_tag_ = -1;
+  std::vector<double> memory_;
+  std::map<const ParameterBlock*, std::size_t> memory_offsets_;
+  NoiseScale scale_;
+  StudentTLoss loss_of_corners_{8}, loss_of_poses_{6}, loss_of_positions_{3};
+  std::deque<BlockManifold> manifolds_;
+  std::set<const ParameterBlock*> used_;
+  std::vector<Datum> data_;
+  std::vector<int> unseen_parts_;
+  int num_iterations_ = 0;
+  ceres::Problem problem_;
+};
+
+}  // namespace bodyschema

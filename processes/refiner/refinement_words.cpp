@@ -1,0 +1,202 @@
+#include "processes/refiner/refinement_words.h"
+
+#include <fmt/format.h>
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <set>
+#include <utility>
+
+#include "common/kinematics/screw_chain.h"
+
+namespace bodyschema {
+namespace {
+
+using Kind = ParameterBlock::Kind;
+
+constexpr std::array<const char*, 6> kPoseWords = {"x", "y", "z", "about x", "about y", "about z"};
+/// A parameter that has more of it than this is named with a direction that nothing tells: chosen,
+/// a direction of many parameters has a hundredth of each.
+constexpr double kNamedShare = 0.01;
+
+/// The last transform of an edge with joints, and where it is in the tangent; −1: none.
+int last_transform(const Edge& edge) {
+  return edge.joints.empty() ? -1 : ScrewChainLayout::transform(std::ssize(edge.joints));
+}
+
+}  // namespace
+
+RefinementWords::RefinementWords(const BodySchema& start, const Information& information,
+                                 std::vector<int> frame_tags)
+    : schema_(start),
+      information_(information),
+      frame_tags_(std::move(frame_tags)),
+      covariance_(information.covariance()) {
+  const Eigen::MatrixXd& open = information.undetermined();
+  undetermined_shares_ = open.cols() > 0 ? Eigen::VectorXd(open.rowwise().squaredNorm())
+                                         : Eigen::VectorXd::Zero(covariance_.rows());
+  for (const ParameterBlock* block : information.blocks()) add(*block);
+}
+
+void RefinementWords::add(const ParameterBlock& block) {
+  Eigen::VectorXd change = block.change();
+  const int first = information_.offset(&block);
+  if (block.kind == Kind::kEdge) {
+    const Edge edge = edge_from(block, schema_.edges[block.id]);
+    const int last = last_transform(edge);
+    // A part of which positions alone are known has a free translation alone.
+    if (last >= 0 && block.free.back() == last + 5) {
+      const Matrix6d to_joint = adjoint(edge.joints.back().X_after);
+      const auto row = first + block.num_free() - 6;
+      change.segment<6>(last) = (to_joint * change.segment<6>(last)).eval();
+      covariance_.middleRows<6>(row) = (to_joint * covariance_.middleRows<6>(row)).eval();
+      covariance_.middleCols<6>(row) =
+          (covariance_.middleCols<6>(row) * to_joint.transpose()).eval();
+    }
+  }
+  for (int n = 0; n < block.num_free(); ++n) {
+    const int direction = block.free[n];
+    places_.push_back({&block, direction, name_of(block, direction)});
+    RefinedParameter parameter{places_.back().element, unit_of(block, direction), change(direction),
+                               std::nullopt};
+    if (undetermined_shares_(first + n) < kNamedShare)
+      parameter.sd = std::sqrt(std::max(covariance_(first + n, first + n), 0.0));
+    parameters_.push_back(std::move(parameter));
+  }
+}
+
+std::string RefinementWords::thing_of(const ParameterBlock& block) const {
+  switch (block.kind) {
+    case Kind::kInstant:
+      break;
+    case Kind::kRoot:
+      return "root in the camera's frame";
+    case Kind::kEdge: {
+      const Edge& edge = schema_.edges[block.id];
+      return fmt::format("{}→{}", edge.from, edge.to);
+    }
+    case Kind::kTag:
+      return fmt::format("tag {}", block.id);
+    case Kind::kLens:
+      return "lens";
+  }
+  return "";
+}
+
+std::string RefinementWords::edge_name(const ParameterBlock& block, int direction) const {
+  const Edge& edge = schema_.edges[block.id];
+  const std::string thing = thing_of(block);
+  if (edge.joints.empty()) return fmt::format("{}, {}", thing, kPoseWords[direction]);
+  const int d = direction / 8, component = direction % 8;
+  const int num_joints = static_cast<int>(edge.joints.size());
+  const ScrewJoint& joint = edge.joints[std::min(d, num_joints - 1)];
+  const std::string& signal = schema_.signals.at(joint.signal).name;
+  if (d == num_joints) {
+    if (component == 5 && joint.turn != 0) return fmt::format("offset of {} ({})", signal, thing);
+    return fmt::format("link after {} ({}), {}", signal, thing, kPoseWords[component]);
+  }
+  if (component == 6) return fmt::format("travel of {} ({})", signal, thing);
+  if (component == 7) return fmt::format("gain of {} ({})", signal, thing);
+  return fmt::format("axis of {} ({}), {}", signal, thing, kPoseWords[component]);
+}
+
+std::string RefinementWords::name_of(const ParameterBlock& block, int direction) const {
+  switch (block.kind) {
+    case Kind::kInstant:
+      break;
+    case Kind::kRoot:
+      return fmt::format("{}, {}", thing_of(block), kPoseWords[direction]);
+    case Kind::kEdge:
+      return edge_name(block, direction);
+    case Kind::kTag:
+      if (direction == 6) return fmt::format("size of tag {}", block.id);
+      return fmt::format("placement of tag {}, {}", block.id, kPoseWords[direction]);
+    case Kind::kLens: {
+      constexpr std::array<const char*, 4> kWords = {"focal length x", "focal length y", "centre x",
+                                                     "centre y"};
+      if (direction < 4) return kWords[direction];
+      return fmt::format("distortion {}", direction - 3);
+    }
+  }
+  return "";
+}
+
+std::string RefinementWords::unit_of(const ParameterBlock& block, int direction) const {
+  if (block.kind == Kind::kLens) return direction < 4 ? "px" : "1";
+  if (block.kind == Kind::kTag && direction == 6) return "1";
+  const int component = block.kind == Kind::kEdge ? direction % 8 : direction;
+  constexpr std::array<const char*, 8> kUnits = {"m",   "m",   "m",      "rad",
+                                                 "rad", "rad", "m/unit", "rad/unit"};
+  return kUnits[component];
+}
+
+std::vector<std::string> RefinementWords::undetermined() const {
+  std::vector<std::string> result;
+  for (const ParameterBlock* block : information_.blocks()) {
+    std::vector<std::string> names;
+    for (std::size_t n = 0; n < places_.size(); ++n)
+      if (places_[n].block == block &&
+          undetermined_shares_(static_cast<Eigen::Index>(n)) >= kNamedShare)
+        names.push_back(places_[n].element);
+    if (names.empty()) continue;
+    result.push_back(
+        fmt::format("the samples do not tell {}: {}", thing_of(*block), fmt::join(names, "; ")));
+  }
+  return result;
+}
+
+std::string RefinementWords::advice(const Place& one, const Place& other) const {
+  const Place* tag = one.block->kind == Kind::kTag ? &one : &other;
+  const Place* edge = one.block->kind == Kind::kTag ? &other : &one;
+  if (tag->block->kind != Kind::kTag || edge->block->kind != Kind::kEdge) return "";
+  std::set<std::string> signals;
+  for (const ScrewJoint& joint : schema_.edges[edge->block->id].joints)
+    signals.insert(schema_.signals.at(joint.signal).name);
+  if (signals.empty()) return "";
+  return fmt::format("show tag {} while {} moves", tag->block->id, fmt::join(signals, ", "));
+}
+
+// The covariance given the placements of these tags, and one's size: all lengths have a common
+// factor. Zero rows where they are.
+Eigen::MatrixXd RefinementWords::in_frames_of_tags() const {
+  std::vector<Eigen::Index> given;
+  for (std::size_t n = 0; n < places_.size(); ++n) {
+    const Place& place = places_[n];
+    const bool is_given =
+        place.block->kind == Kind::kTag &&
+        std::find(frame_tags_.begin(), frame_tags_.end(), place.block->id) != frame_tags_.end();
+    if (is_given && (place.direction < 6 || place.block->id == frame_tags_.back()))
+      given.push_back(static_cast<Eigen::Index>(n));
+  }
+  if (given.empty()) return covariance_;
+  const Eigen::MatrixXd of_given = covariance_(given, given);
+  const Eigen::MatrixXd mixed = covariance_(Eigen::all, given);
+  Eigen::MatrixXd rest = covariance_ - mixed * of_given.ldlt().solve(mixed.transpose());
+  for (const Eigen::Index n : given) rest.row(n).setZero();
+  for (const Eigen::Index n : given) rest.col(n).setZero();
+  return rest;
+}
+
+std::vector<ParameterCorrelation> RefinementWords::correlations(std::size_t most) const {
+  std::vector<ParameterCorrelation> result;
+  const Eigen::MatrixXd covariance = in_frames_of_tags();
+  const Eigen::VectorXd sd = covariance.diagonal().cwiseMax(0).cwiseSqrt();
+  for (Eigen::Index i = 0; i < covariance.rows(); ++i) {
+    for (Eigen::Index j = 0; j < i; ++j) {
+      if (undetermined_shares_(i) >= kNamedShare || undetermined_shares_(j) >= kNamedShare)
+        continue;
+      const double correlation = covariance(i, j) / (sd(i) * sd(j));
+      if (!(std::abs(correlation) > kHighCorrelation)) continue;
+      const Place &one = places_[j], &other = places_[i];
+      result.push_back({one.element, other.element, correlation, advice(one, other)});
+    }
+  }
+  std::stable_sort(result.begin(), result.end(), [](const auto& a, const auto& b) {
+    return std::abs(a.correlation) > std::abs(b.correlation);
+  });
+  if (result.size() > most) result.resize(most);
+  return result;
+}
+
+}  // namespace bodyschema

@@ -1,0 +1,52 @@
+#pragma once
+
+#include <Eigen/Core>
+#include <string>
+#include <vector>
+
+#include "common/schema/body_schema.h"
+#include "processes/refiner/information.h"
+#include "processes/refiner/refine.h"
+
+namespace bodyschema {
+
+/// Names, changes and standard deviations of the refined parameters; for people. The transform
+/// after the last joint of an edge is told in that joint's frame, so that its turn about z is the
+/// joint's offset.
+class RefinementWords {
+ public:
+  /// `frame_tags`: a tag of each part, by which correlations are told: as if it were known where it
+  /// sits on the part. That a part's frame moves with all its tags is no news.
+  RefinementWords(const BodySchema& start, const Information& information,
+                  std::vector<int> frame_tags);
+
+  std::vector<RefinedParameter> parameters() const { return parameters_; }
+  /// Directions that nothing tells, one sentence an edge, tag or camera.
+  std::vector<std::string> undetermined() const;
+  /// Those above kHighCorrelation, the highest first, at most `most`.
+  std::vector<ParameterCorrelation> correlations(std::size_t most) const;
+
+ private:
+  struct Place {
+    const ParameterBlock* block = nullptr;
+    int direction = 0;    ///< in the block's whole tangent
+    std::string element;  ///< "offset of q5 (5→6)"
+  };
+  void add(const ParameterBlock& block);
+  std::string name_of(const ParameterBlock& block, int direction) const;
+  std::string edge_name(const ParameterBlock& block, int direction) const;
+  std::string unit_of(const ParameterBlock& block, int direction) const;
+  std::string thing_of(const ParameterBlock& block) const;
+  Eigen::MatrixXd in_frames_of_tags() const;
+  std::string advice(const Place& one, const Place& other) const;
+
+  const BodySchema& schema_;
+  const Information& information_;
+  const std::vector<int> frame_tags_;
+  std::vector<Place> places_;
+  std::vector<RefinedParameter> parameters_;
+  Eigen::MatrixXd covariance_;           // in the frames that are told
+  Eigen::VectorXd undetermined_shares_;  // of each place, 0 … 1
+};
+
+}  // namespace bodyschema

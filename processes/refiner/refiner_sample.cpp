@@ -1,0 +1,58 @@
+#include "processes/refiner/refiner_sample.h"
+
+#include <algorithm>
+#include <map>
+
+#include "common/bus/convert.h"
+
+namespace bodyschema {
+namespace {
+
+TagSight tag_sight(const tag_corners_t& message) {
+  TagSight sight;
+  sight.tag = message.tag_id;
+  for (int c = 0; c < 4; ++c)
+    for (int axis = 0; axis < 2; ++axis)
+      sight.corners_px(2 * c + axis) = message.mean_corner_px[c][axis];
+  const bool is_told =
+      std::any_of(std::begin(message.corner_covariance), std::end(message.corner_covariance),
+                  [](float c) { return c != 0; });
+  if (is_told) sight.covariance_px2 = from_message(message.corner_covariance);
+  return sight;
+}
+
+}  // namespace
+
+RefinerSample refiner_sample(const sample_t& message) {
+  RefinerSample result{from_message(message), {}};
+  for (const auto* observations : {&message.parts, &message.contradictions})
+    for (const part_observation_t& observation : *observations)
+      for (const tag_corners_t& tag : observation.tags) result.tags.push_back(tag_sight(tag));
+  std::stable_sort(result.tags.begin(), result.tags.end(),
+                   [](const TagSight& a, const TagSight& b) { return a.tag < b.tag; });
+  return result;
+}
+
+std::vector<RefinerSample> refiner_samples(const std::vector<ActionPoseSample>& samples) {
+  std::vector<RefinerSample> result;
+  for (const ActionPoseSample& sample : samples) result.push_back({sample, {}});
+  return result;
+}
+
+std::vector<RefinerSample> refiner_samples(const std::vector<sample_t>& messages) {
+  std::map<std::int64_t, const sample_t*> by_index;
+  for (const sample_t& message : messages) by_index.try_emplace(message.sample_index, &message);
+  std::vector<RefinerSample> result;
+  for (const auto& [index, message] : by_index) result.push_back(refiner_sample(*message));
+  return result;
+}
+
+std::vector<RefinerSample> thinned(std::vector<RefinerSample> samples, std::size_t most) {
+  if (samples.size() <= most) return samples;
+  std::vector<RefinerSample> result;
+  for (std::size_t n = 0; n < most; ++n)
+    result.push_back(std::move(samples[n * samples.size() / most]));
+  return result;
+}
+
+}  // namespace bodyschema

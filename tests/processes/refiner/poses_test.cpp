@@ -1,0 +1,124 @@
+#include <gtest/gtest.h>
+
+#include <algorithm>
+#include <cmath>
+#include <iostream>
+
+#include "common/estimation/chi_square.h"
+#include "common/geometry/angle.h"
+#include "processes/refiner/refine.h"
+#include "tests/experiments/figures/cramer_rao.h"
+#include "tests/experiments/figures/robots.h"
+
+namespace bodyschema {
+namespace {
+
+using experiments::Trial;
+using test::Regime;
+using test::Rng;
+
+/// The true schema, every edge off by about so much.
+BodySchema displaced(BodySchema schema, double position_m, double rotation_rad, Rng& rng) {
+  Vector6d sd;
+  sd << Eigen::Vector3d::Constant(position_m), Eigen::Vector3d::Constant(rotation_rad);
+  const auto moved = [&](const Pose& X) {
+    return Pose(X * exp(Vector6d(sd.cwiseProduct(test::gaussian6(rng)))));
+  };
+  schema.X_CR = moved(schema.X_CR);
+  for (Edge& edge : schema.edges) {
+    edge.left = moved(edge.left);
+    for (ScrewJoint& joint : edge.joints) {
+      joint.turn *= 1 + 0.02 * test::gaussian(rng);
+      joint.slide *= 1 + 0.02 * test::gaussian(rng);
+      joint.X_after = moved(joint.X_after);
+    }
+  }
+  return schema;
+}
+
+BodySchema start_of(const Trial& trial, Rng& rng) {
+  BodySchema schema = test::true_schema(trial.robot);
+  schema.X_CR = trial.robot.X_CR;
+  return displaced(schema, 0.005, 0.02, rng);
+}
+
+/// Errors of a schema's end effector against the truth, and how many lie in the ellipsoids of 95 %
+/// that it predicts.
+struct Judgement {
+  double rms_m = 0;
+  int num_inside = 0, num = 0;
+};
+
+Judgement judge(const BodySchema& schema, const Trial& trial) {
+  const double limit = chi_square_quantile(6, 0.05);
+  Judgement result;
+  double sum = 0;
+  for (const Eigen::VectorXd& action : trial.test_actions) {
+    const auto truth = trial.robot.poses_in_camera(action);
+    const auto predicted = schema.predict(trial.root(), trial.end_effector(), action);
+    const Vector6d error = log(predicted->X_AB.inverse() *
+                               (truth.at(trial.root()).inverse() * truth.at(trial.end_effector())));
+    sum += error.head<3>().squaredNorm();
+    result.num_inside += squared_mahalanobis(error, predicted->covariance) < limit ? 1 : 0;
+    ++result.num;
+  }
+  result.rms_m = std::sqrt(sum / result.num);
+  return result;
+}
+
+TEST(Refine, FindsExactPosesExactly) {
+  for (const char* kind : {"a", "b", "d", "dP", "tree"}) {
+    Rng rng(3);
+    const Trial trial = experiments::make_trial(kind, Regime::kFree, 40, 3);
+    std::vector<ActionPoseSample> samples = trial.samples;
+    for (auto& sample : samples)
+      for (auto& observation : sample.parts) observation.covariance = isotropic({1e-5, 1e-5});
+    const Refinement result = refine(start_of(trial, rng), refiner_samples(samples), {}, {});
+    EXPECT_LT(judge(result.schema, trial).rms_m, 1e-8) << kind;
+    EXPECT_TRUE(result.outliers.empty()) << kind;
+    EXPECT_FALSE(result.root_moves);
+  }
+}
+
+/// Root mean squares over robots of the error and of the Cramér–Rao bound, and the coverage.
+void expect_near_the_bound(const std::string& kind, int num_samples, double most, bool has_flips) {
+  constexpr int kRobots = 12;
+  double squares = 0, bounds = 0;
+  Judgement all;
+  for (int seed = 1; seed <= kRobots; ++seed) {
+    Rng rng(seed);
+    const Trial trial = experiments::make_trial(kind, Regime::kTag, num_samples, seed);
+    std::vector<ActionPoseSample> samples = trial.samples;
+    experiments::CramerRao bound(trial.robot);
+    for (const auto& sample : samples) bound.add(sample);
+    const double limit = experiments::position_bound_rms(bound, trial.root(), trial.end_effector(),
+                                                         trial.test_actions);
+    bounds += limit * limit;
+    for (auto& sample : samples)
+      for (auto& observation : sample.parts)
+        if (has_flips && test::uniform(rng, 0, 1) < 0.1)
+          observation.X_CB.linear() *= exp_so3(Eigen::Vector3d(0.6, 0, 0));
+    const Refinement result = refine(start_of(trial, rng), refiner_samples(samples), {}, {});
+    const Judgement judgement = judge(result.schema, trial);
+    squares += judgement.rms_m * judgement.rms_m;
+    all.num_inside += judgement.num_inside;
+    all.num += judgement.num;
+  }
+  const double ratio = std::sqrt(squares / bounds);
+  const double coverage = static_cast<double>(all.num_inside) / all.num;
+  std::cout << kind << " N = " << num_samples << ": " << ratio << " of the bound, coverage "
+            << coverage << std::endl;
+  EXPECT_LT(ratio, most) << kind << " " << num_samples;
+  EXPECT_GT(coverage, 0.85) << kind << " " << num_samples;
+}
+
+TEST(Refine, ComesNearTheCramerRaoBound) {
+  expect_near_the_bound("a", 12, 1.2, false);
+  expect_near_the_bound("c", 30, 1.2, false);
+  expect_near_the_bound("d", 60, 1.2, false);
+}
+
+TEST(Refine, ComesNearTheCramerRaoBoundAmongFlips) { expect_near_the_bound("c", 30, 1.35, true); }
+
+}  // namespace
+}  // namespace bodyschema

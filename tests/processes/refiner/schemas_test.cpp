@@ -1,0 +1,165 @@
+// Schemas of every kind: long edges, positions alone, Gaussian processes, parts never seen,
+// changes.
+
+#include <gtest/gtest.h>
+
+#include <algorithm>
+#include <memory>
+#include <string>
+
+#include "common/geometry/angle.h"
+#include "processes/refiner/refine.h"
+#include "tests/support/random_arm.h"
+#include "tests/support/synthetic_robot.h"
+
+namespace bodyschema {
+namespace {
+
+using test::Rng;
+using test::SyntheticRobot;
+
+constexpr Noise kNoise{0.0005, 0.003};
+
+BodySchema true_start(const SyntheticRobot& robot) {
+  BodySchema schema = test::true_schema(robot);
+  schema.X_CR = robot.X_CR;
+  return schema;
+}
+
+BodySchema displaced(BodySchema schema) {
+  Vector6d step;
+  step << 0.003, -0.002, 0.004, 0.02, -0.01, 0.01;
+  for (Edge& edge : schema.edges) {
+    edge.left = edge.left * exp(step);
+    for (ScrewJoint& joint : edge.joints) joint.X_after = joint.X_after * exp(Vector6d(-step));
+  }
+  return schema;
+}
+
+std::vector<ActionPoseSample> exact(const SyntheticRobot& robot, int num_samples, Rng& rng) {
+  std::vector<ActionPoseSample> samples = test::babble(robot, num_samples, {}, rng);
+  for (ActionPoseSample& sample : samples)
+    for (PartObservation& observation : sample.parts) observation.covariance = isotropic(kNoise);
+  return samples;
+}
+
+/// Largest error of a seen part's position relative to the root.
+double worst_error_m(const BodySchema& schema, const SyntheticRobot& robot,
+                     const std::vector<ActionPoseSample>& samples) {
+  double worst = 0;
+  for (const ActionPoseSample& sample : samples) {
+    const auto truth = robot.poses_in_camera(sample.action);
+    for (const auto& [part, X_RB] : schema.predict_all(sample.action))
+      if (sample.find(part) != nullptr)
+        worst = std::max(worst, (truth.at(schema.root).inverse() * truth.at(part).translation() -
+                                 X_RB.translation())
+                                    .norm());
+  }
+  return worst;
+}
+
+bool names(const std::vector<std::string>& sentences, const std::string& words) {
+  return std::any_of(sentences.begin(), sentences.end(), [&](const std::string& sentence) {
+    return sentence.find(words) != std::string::npos;
+  });
+}
+
+TEST(RefineSchemas, WithSevenJointsOnOneEdge) {
+  Rng rng(2);
+  const SyntheticRobot robot = test::random_arm({.num_joints = 7}, rng);
+  const auto samples = exact(robot, 60, rng);
+  BodySchema start = true_start(robot);
+  start.parts = {1, 8};
+  start.edges = {robot.true_edge(1, 8)};
+  const Refinement result = refine(displaced(start), refiner_samples(samples), {}, {});
+  EXPECT_LT(worst_error_m(result.schema, robot, samples), 1e-6) << result.num_iterations;
+  EXPECT_EQ(result.schema.edges.front().parameter_covariance.rows(), 6 + 8 * 7);
+}
+
+TEST(RefineSchemas, OfSevenEdgesWhosePartsWereNeverSeen) {
+  Rng rng(2);
+  const SyntheticRobot robot = test::random_arm({.num_joints = 7}, rng);
+  const auto samples = exact(robot, 60, rng);
+  const Refinement result = refine(displaced(true_start(robot)), refiner_samples(samples), {}, {});
+  EXPECT_LT(worst_error_m(result.schema, robot, samples), 1e-6) << result.num_iterations;
+}
+
+TEST(RefineSchemas, WhosePositionsAloneAreKnown) {
+  Rng rng(3);
+  const SyntheticRobot robot = test::chapter_robot("c", rng);
+  const int last = robot.visible_parts().back();
+  const auto samples = test::with_positions_alone(exact(robot, 40, rng), {last});
+  BodySchema start = displaced(true_start(robot));
+  start.position_parts = {last};
+  const Refinement result = refine(start, refiner_samples(samples), {}, {});
+  EXPECT_LT(worst_error_m(result.schema, robot, samples), 1e-6);
+  EXPECT_TRUE(result.undetermined.empty()) << result.undetermined.front();
+}
+
+TEST(RefineSchemas, HoldEdgesWithAGaussianProcessAndRefineTheRest) {
+  Rng rng(4);
+  const SyntheticRobot robot = test::chapter_robot("c", rng);
+  const auto samples = exact(robot, 40, rng);
+  const BodySchema truth = true_start(robot);
+  BodySchema start = displaced(truth);
+  start.edges[1] = truth.edges[1];
+  ResidualGp::Prior prior;
+  prior.length_scales = Eigen::VectorXd::Ones(1);
+  start.edges[1].residual_gp = std::make_shared<ResidualGp>(
+      std::vector<int>{1}, Eigen::MatrixXd::Zero(1, 1), ResidualGp::Residuals::Zero(6, 1),
+      Eigen::VectorXd::Ones(1), prior);
+  const Refinement result = refine(start, refiner_samples(samples), {}, {});
+  EXPECT_LT(worst_error_m(result.schema, robot, samples), 1e-6);
+  EXPECT_TRUE(result.schema.edges[1].has_process_of(start.edges[1]));
+  EXPECT_TRUE(result.schema.edges[1].left.isApprox(start.edges[1].left, 0));
+  EXPECT_TRUE(names(result.held, "Gaussian process"));
+}
+
+TEST(RefineSchemas, HoldTheFrameOfAPartThatWasNeverSeen) {
+  Rng rng(5);
+  const SyntheticRobot robot = test::chapter_robot("co", rng);
+  const auto samples = exact(robot, 40, rng);
+  SyntheticRobot uncovered = robot;
+  for (auto& link : uncovered.links) link.hidden = false;
+  const Refinement result =
+      refine(displaced(true_start(uncovered)), refiner_samples(samples), {}, {});
+  EXPECT_TRUE(names(result.held, "part 3"));
+  EXPECT_TRUE(result.undetermined.empty()) << result.undetermined.front();
+  double worst = 0;
+  for (const ActionPoseSample& sample : samples) {
+    const auto X = robot.poses_in_camera(sample.action);
+    const auto predicted = result.schema.predict(1, 5, sample.action);
+    worst = std::max(
+        worst, (predicted->X_AB.translation() - X.at(1).inverse() * X.at(5).translation()).norm());
+    EXPECT_LT(predicted->covariance.diagonal().head(3).sum(), 1e-4);
+  }
+  EXPECT_LT(worst, 1e-6);
+}
+
+TEST(RefineSchemas, UseSamplesOfTheBodyAsItIsAlone) {
+  Rng rng(6);
+  const SyntheticRobot robot = test::chapter_robot("a", rng);
+  auto samples = exact(robot, 40, rng);
+  for (int n = 0; n < 15; ++n)
+    for (PartObservation& observation : samples[n].parts)
+      if (observation.part == 5) observation.X_CB.translation().x() += 0.05;
+  BodySchema start = displaced(true_start(robot));
+  for (Edge& edge : start.edges)
+    if (edge.to == 5) edge.valid_since_sample = 15;
+  const Refinement result = refine(start, refiner_samples(samples), {}, {});
+  EXPECT_EQ(result.num_observations, 40 * 5 - 15);
+  EXPECT_TRUE(result.outliers.empty());
+}
+
+TEST(RefineSchemas, FitAnEvenSubsetOfThousandsOfSamples) {
+  Rng rng(7);
+  const SyntheticRobot robot = test::chapter_robot("a", rng);
+  const auto samples = exact(robot, 3000, rng);
+  const Refinement result = refine(displaced(true_start(robot)), refiner_samples(samples), {}, {});
+  EXPECT_EQ(result.num_samples, 400);
+  EXPECT_EQ(result.num_available, 3000);
+  EXPECT_LT(result.seconds, 5);
+}
+
+}  // namespace
+}  // namespace bodyschema

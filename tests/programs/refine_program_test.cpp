@@ -1,0 +1,127 @@
+#include <gtest/gtest.h>
+#include <sys/wait.h>
+#include <unistd.h>
+
+#include <cstdlib>
+#include <filesystem>
+#include <fstream>
+#include <nlohmann/json.hpp>
+#include <sstream>
+#include <string>
+
+#include "common/config/camera_calibration.h"
+#include "common/config/rig.h"
+#include "tests/support/synthetic_robot.h"
+
+namespace bodyschema {
+namespace {
+
+using Json = nlohmann::json;
+
+std::string text_of(const std::filesystem::path& file) {
+  std::stringstream text;
+  text << std::ifstream(file, std::ios::binary).rdbuf();
+  return text.str();
+}
+
+struct Outcome {
+  int exit_code = 0;
+  std::string out, err;
+};
+
+/// `bodyschema refine` on the recorded log of arm2, in a folder of its own.
+class RefineProgramTest : public testing::Test {
+ protected:
+  RefineProgramTest() {
+    const auto* test = testing::UnitTest::GetInstance()->current_test_info();
+    folder_ = std::filesystem::path(testing::TempDir()) /
+              ("refine program " + std::to_string(getpid()) + test->name());
+    std::filesystem::create_directories(folder_);
+    EXPECT_EQ(run("learn '" + log_ + "' --out schema").exit_code, 0);
+  }
+  ~RefineProgramTest() override { std::filesystem::remove_all(folder_); }
+
+  Outcome run(const std::string& arguments) const {
+    const std::string command = "cd '" + folder_.string() + "' && '" BODYSCHEMA_PROGRAM "' " +
+                                arguments + " >stdout.txt 2>stderr.txt </dev/null";
+    const int status = std::system(command.c_str());
+    EXPECT_TRUE(WIFEXITED(status)) << command;
+    return {WEXITSTATUS(status), text_of(folder_ / "stdout.txt"), text_of(folder_ / "stderr.txt")};
+  }
+  Json json_of(const std::string& arguments) const {
+    const Outcome outcome = run(arguments);
+    EXPECT_EQ(outcome.exit_code, 0) << outcome.err;
+    return Json::parse(outcome.out, nullptr, false);
+  }
+  void expect_failure(const std::string& arguments, int exit_code, const std::string& what) const {
+    const Outcome outcome = run(arguments);
+    EXPECT_EQ(outcome.exit_code, exit_code) << outcome.err;
+    EXPECT_EQ(outcome.out, "");
+    EXPECT_NE(outcome.err.find(what), std::string::npos) << outcome.err;
+  }
+
+  std::filesystem::path folder_;
+  const std::string log_ = BODYSCHEMA_LOGS "/arm2_15.lcmlog";
+  const std::string rig_ = "--rig '" BODYSCHEMA_CONFIG "/arm2'";
+};
+
+TEST_F(RefineProgramTest, FitsCornersAndProposesFilesThatReadBack) {
+  const Json json = json_of("refine schema '" + log_ + "' --out refined " + rig_ +
+                            " --placements --intrinsics --proposed found --json");
+  EXPECT_EQ(json.at("fitted"), "corners");
+  EXPECT_EQ(json.at("before").at("samples"), 3);
+  EXPECT_LT(json.at("after").at("corner_rms_px").get<double>(), 0.015);
+  EXPECT_LT(json.at("after").at("corner_rms_px"), json.at("before").at("corner_rms_px"));
+  for (const char* key : {"parameters", "correlations", "coverage", "plays", "tags", "lens"})
+    EXPECT_FALSE(json.at(key).empty()) << key;
+  const Markers markers = load_markers(folder_ / "found");
+  ASSERT_EQ(markers.tags.size(), json.at("tags").size());
+  for (std::size_t n = 0; n < markers.tags.size(); ++n)
+    EXPECT_EQ(markers.tags[n].size_m, json.at("tags")[n].at("size_m").get<double>());
+  const CameraCalibration camera = load_camera_calibration(folder_ / "found" / "camera_info.yaml");
+  EXPECT_EQ(camera.fx, json.at("lens").at("fx_px").get<double>());
+  const Json shown = json_of("show refined --json");
+  EXPECT_EQ(shown.at("edges").size(), 4U);
+  EXPECT_EQ(shown.at("base_version"), json_of("show schema --json").at("version"));
+}
+
+TEST_F(RefineProgramTest, FitsPosesWithoutAnOption) {
+  const Json json = json_of("refine schema '" + log_ + "' --out refined --json");
+  EXPECT_EQ(json.at("fitted"), "poses");
+  EXPECT_EQ(json.at("samples"), 12);
+  EXPECT_LT(json.at("after").at("parts")[0].at("position_rms_m").get<double>(), 0.001);
+  EXPECT_FALSE(json.contains("tags"));
+  const Outcome text = run("refine schema '" + log_ + "' --out refined");
+  for (const char* words : {"12 samples", "held out, 3 samples", "gain of q1 (2→3)"})
+    EXPECT_NE(text.out.find(words), std::string::npos) << text.out;
+}
+
+TEST_F(RefineProgramTest, FitsTheRowsOfACsv) {
+  test::Rng rng(71);
+  const test::SyntheticRobot robot = test::chapter_robot("a", rng);
+  std::ofstream csv(folder_ / "samples.csv");
+  test::write_csv(test::babble(robot, 30, {.regime = test::Regime::kTagIso}, rng), csv);
+  csv.close();
+  ASSERT_EQ(run("learn samples.csv --out of_csv --noise 0.003 1").exit_code, 0);
+  const Json json = json_of("refine of_csv samples.csv --out refined --json");
+  EXPECT_EQ(json.at("fitted"), "poses");
+  EXPECT_TRUE(json.at("before").is_null());
+  EXPECT_TRUE(json.at("undetermined").empty());
+}
+
+TEST_F(RefineProgramTest, SaysWhatIsWrong) {
+  const std::string refine = "refine schema '" + log_ + "' --out refined ";
+  expect_failure(refine + "--placements", 1, "rig");
+  expect_failure(refine + "--placements --rig '" BODYSCHEMA_CONFIG "/arm7'", 1,
+                 "another calibration");
+  expect_failure(refine + "--proposed found", 2, "--proposed");
+  expect_failure("refine schema '" + log_ + "' --out schema", 1, "is an input itself");
+  expect_failure("refine schema '" + log_ + "'", 2, "--out");
+  expect_failure("refine missing '" + log_ + "' --out refined", 1, "missing");
+  EXPECT_FALSE(std::filesystem::exists(folder_ / "refined"));
+  std::ofstream(folder_ / "a.csv") << "t,q1,q2,part,x,y,z,qw,qx,qy,qz\n0,nan,0,1,0,0,0,1,0,0,0\n";
+  expect_failure("refine schema a.csv --out refined", 1, "a.csv:2:3");
+}
+
+}  // namespace
+}  // namespace bodyschema
