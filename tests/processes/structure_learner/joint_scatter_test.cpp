@@ -1,0 +1,63 @@
+#include "processes/structure_learner/joint_scatter.h"
+
+#include <gtest/gtest.h>
+
+#include "common/geometry/angle.h"
+#include "processes/structure_learner/screen.h"
+#include "tests/support/synthetic_robot.h"
+
+namespace bodyschema {
+namespace {
+
+using test::Regime;
+using test::Rng;
+
+// Of the hinge between parts 1 and 2 (±1 rad) whose motor misses the command by `scatter_rad`.
+double found_scatter(double scatter_rad, int num_samples, int seed) {
+  Rng rng(static_cast<Rng::result_type>(seed));
+  test::SyntheticRobot robot;
+  robot.signals = {{"q1", -1, 1}};
+  robot.X_CR.translation().z() = 2;
+  robot.links.push_back({.part = 1});
+  robot.links.push_back({.part = 2,
+                         .parent = 1,
+                         .X_before = test::random_pose(rng, 0.06, 0.16),
+                         .X_after = test::random_pose(rng, 0.06, 0.16),
+                         .signal = 0,
+                         .turn = 1});
+  std::vector<ActionPoseSample> samples;
+  for (int t = 0; t < num_samples; ++t) {
+    const Eigen::VectorXd command = robot.random_action(rng);
+    Eigen::VectorXd reached = command;
+    reached(0) += scatter_rad * test::gaussian(rng);
+    samples.push_back(test::observe(robot, reached, {Regime::kChapter}, t, rng));
+    samples.back().action = command;
+  }
+  const NormalizedActions actions(samples, 1);
+  const PairData pair =
+      make_pair_data(samples, 1, 2, {.noise = test::nominal_noise(Regime::kChapter)}, 2000);
+  const RelativeMotions motions = relative_motions(pair, 300);
+  const Start start =
+      one_joint_start(screen_one_joint(motions, actions).at(0), pair, actions, motions.sigma_rad);
+  const Fit fit = fit_local_model(start.model, pair, actions, 40);
+  return joint_scatter(fit, leave_one_out(fit, pair, actions), pair, actions)(0) *
+         actions.half_range(0);
+}
+
+TEST(JointScatter, IsWhatTheMotorMissesTheCommandBy) {
+  const double noise_rad = test::nominal_noise(Regime::kChapter).rotation_rad;
+  for (const double scatter_rad : {1.5 * noise_rad, 3 * noise_rad}) {
+    double mean = 0;
+    for (int seed = 1; seed <= 10; ++seed) mean += found_scatter(scatter_rad, 100, seed) / 10;
+    EXPECT_NEAR(mean, scatter_rad, 0.15 * scatter_rad);
+  }
+}
+
+TEST(JointScatter, IsZeroOfAnExactJoint) {
+  int zero = 0;
+  for (int seed = 1; seed <= 40; ++seed) zero += found_scatter(0, 40, seed) == 0;
+  EXPECT_GE(zero, 37);
+}
+
+}  // namespace
+}  // namespace bodyschema
