@@ -1,6 +1,7 @@
 #include "processes/structure_learner/joint_scatter.h"
 
 #include <Eigen/LU>
+#include <algorithm>
 #include <cmath>
 #include <vector>
 
@@ -13,20 +14,27 @@ constexpr int kSweeps = 3;
 // Trial deviations in units of what one frame tells of a displacement.
 constexpr double kLeast = 0.1, kMost = 10, kStep = 1.15;
 
-// What a frame says of the displacements: A = UᵀU, b = Uᵀr.
+// What a frame says of the displacements: A = UᵀU, b = Uᵀr, and |r|².
 struct Term {
   Eigen::MatrixXd A;
   Eigen::VectorXd b;
+  double squared_distance = 0;
 };
 
-// log N(r; 0, I + U S Uᵀ) − log N(r; 0, I), summed [nats].
+double bounded(double squared_distance) {
+  return std::min(squared_distance, 2 * kOutlierThreshold);
+}
+
+// log N(r; 0, I + U S Uᵀ) − log N(r; 0, I), summed [nats]; the distance of an outlier is bounded.
 double gain(const std::vector<Term>& terms, const Eigen::VectorXd& S) {
   double sum = 0;
   for (const Term& term : terms) {
     const Eigen::MatrixXd SA = S.asDiagonal() * term.A;
     const Eigen::PartialPivLU<Eigen::MatrixXd> lu(Eigen::MatrixXd::Identity(S.size(), S.size()) +
                                                   SA);
-    sum += term.b.dot(lu.solve(S.cwiseProduct(term.b))) - std::log(lu.determinant());
+    const double explained = term.b.dot(lu.solve(S.cwiseProduct(term.b)));
+    sum += bounded(term.squared_distance) - bounded(term.squared_distance - explained) -
+           std::log(lu.determinant());
   }
   return 0.5 * sum;
 }
@@ -36,13 +44,12 @@ std::vector<Term> terms_of(const Fit& fit, const LeaveOneOut& loo, const PairDat
   std::vector<Term> terms;
   for (int t = 0; t < pair.size(); ++t) {
     const double d2 = loo.squared_distance[t];
-    if (d2 > kOutlierThreshold) continue;
     const Matrix6d& W = pair.hypotheses[fit.frames[t].hypothesis].whitening;
     Vector6d r = W * loo.residual[t];
     // As long as one of unit covariance: without what the parameters are off by.
     r *= std::sqrt(d2 / std::max(r.squaredNorm(), 1e-300));
     const Eigen::MatrixXd U = W * motion_jacobian(fit.model, actions, pair.frames[t].sample);
-    terms.push_back({U.transpose() * U, U.transpose() * r});
+    terms.push_back({U.transpose() * U, U.transpose() * r, d2});
   }
   return terms;
 }

@@ -5,10 +5,10 @@
 namespace bodyschema {
 
 /// Standard deviations of what the displacements of the joints are off by from one frame to the
-/// next [half ranges]: backlash, steps of the motors, droop. Maximum likelihood of the inliers'
-/// leave-one-out residuals, whitened, r ~ N(0, I + U S Uᵀ) with U the whitened twists of the joints
-/// and S diagonal; a joint has a scatter if it gains half the log of the number of independent
-/// frames (BIC). Zeros of a pair of positions alone.
+/// next [half ranges]: backlash, steps of the motors, droop. Maximum likelihood of the
+/// leave-one-out residuals, whitened, r ~ N(0, I + U S Uᵀ), the distance of outliers bounded, with
+/// U the whitened twists of the joints and S diagonal; a joint has a scatter if it gains half the
+/// log of the number of independent frames (BIC). Zeros of a pair of positions alone.
 Eigen::VectorXd joint_scatter(const Fit& fit, const LeaveOneOut& loo, const PairData& pair,
                               const NormalizedActions& actions);
 

@@ -31,14 +31,13 @@ struct SoftFit {
   double mean_uncertainty = 0;  ///< trace S over the inliers: 6 is as large as the noise
   int num_outliers = 0;
   double score = 0;  ///< mean over the inliers of the log density of z, up to a constant [nats]
-  /// What the data say of two models of one pair [nats]: the sum of PrincipalResidual::log_density
-  /// over the independent frames, with best_noise(). The noise of the marginal likelihood would not
-  /// do: it is not converged, and a signal without effect that moves it a little would seem to
-  /// explain something.
+  /// What the data say of two models of one pair [nats]: the sum over the independent frames of
+  /// −½[min(d², 2c) + log|fI + S|] with d² = rᵀ(fI + S)⁻¹r, f the factor on the assumed variance
+  /// that the marginal likelihood chose, c kOutlierThreshold.
   double log_density = 0;
 };
 
-/// SoftFit::log_density of a chain of screws, by the blocks that are left out; its
+/// SoftFit::log_density of a chain of screws, by the blocks that are left out, with the best f; its
 /// own uncertainty counts in d² alone. Both favour screws.
 double log_density_of_screws(const Fit& fit, const PairData& pair,
                              const NormalizedActions& actions);

@@ -335,26 +335,6 @@ TEST(SoftBodies, EachSectionHasTheSignalsOfItsChambers) {
   }
 }
 
-// Told noise leaves room that a signal without effect may seem to fill.
-TEST(SoftBodies, SignalsWithoutEffectAreDroppedWhateverNoiseIsTold) {
-  test::SoftArm arm;
-  arm.num_sections = 1;
-  arm.num_idle = 3;
-  constexpr Noise kQuiet{0.001, 0.5 * kDegree};
-  for (unsigned seed = 820; seed < 826; ++seed) {
-    Rng rng(seed);
-    const auto samples = arm.babble(300, kQuiet, rng);
-    const NormalizedActions actions(samples, arm.num_signals());
-    MeasurementModel measurement;
-    measurement.noise = Noise{3 * kQuiet.position_m, 3 * kQuiet.rotation_rad};
-    const PairData pair = make_pair_data(samples, 0, 1, measurement, 600);
-    const auto fit = fit_soft_model(screen_rigid(pair, actions).model, pair, actions, {});
-    ASSERT_TRUE(fit);
-    EXPECT_EQ(fit->verdict, Verdict::kValid);
-    EXPECT_EQ(fit->model.signals, (std::vector<int>{0, 1, 2})) << seed;
-  }
-}
-
 // What a process learns goes on with the number of poses.
 TEST(SoftBodies, MorePosesArePredictedBetter) {
   test::SoftArm arm;
