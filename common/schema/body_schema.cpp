@@ -116,7 +116,8 @@ Matrix6d Edge::prediction_covariance(const Eigen::VectorXd& theta) const {
 Matrix6d Edge::scatter_covariance(const Eigen::VectorXd& theta) const {
   Eigen::VectorXd variances(std::ssize(joints));
   for (std::size_t d = 0; d < joints.size(); ++d)
-    variances(static_cast<Eigen::Index>(d)) = joints[d].scatter * joints[d].scatter;
+    variances(static_cast<Eigen::Index>(d)) =
+        joints[d].gain != 0 ? joints[d].scatter * joints[d].scatter : 0;
   if (variances.isZero(0)) return Matrix6d::Zero();
   Eigen::MatrixXd twists;
   chain_of(*this, theta)

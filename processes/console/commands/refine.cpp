@@ -89,15 +89,15 @@ void run_refine(const RefineArguments& arguments) {
 
 void add_refine_command(Arguments console) {
   const auto arguments = std::make_shared<RefineArguments>();
-  Arguments refine = console.add_subcommand(
-      "refine", "Fit all parameters of a schema at once to a recording, to the tags' corners");
+  Arguments refine =
+      console.add_subcommand("refine", "Fit all parameters of a schema at once to a recording");
   refine.add_option("SCHEMA", arguments->schema, "Schema file: where to begin").required();
   refine.add_option("SAMPLES", arguments->samples, "Recording (LCM log or CSV)").required();
   refine.add_option("--rig", arguments->rig,
                     "Folder of the rig that the samples are of, or name of one in config/: its "
                     "tags and lens; the run's own if not given");
   refine.add_flag("--placements", arguments->placements,
-                  "Also where the tags sit on their parts, and their sizes");
+                  "Also where the tags sit on their parts, and their sizes, by the tags' corners");
   refine.add_flag("--intrinsics", arguments->intrinsics,
                   "Also focal length, centre and distortion");
   refine.add_option("--out", arguments->out, "Write the refined schema to this file").required();

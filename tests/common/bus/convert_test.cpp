@@ -113,6 +113,8 @@ TEST(Convert, ABodySchemaSurvivesTheWire) {
   EXPECT_EQ(schema.edges[0].joints[0].order_group, 3);
   EXPECT_EQ(twice.edges[0].joints[1].order_group, 3);
   EXPECT_EQ(twice.edges[2].joints[0].order_group, -1);
+  EXPECT_EQ(schema.edges[0].joints[0].scatter, 0.01);
+  EXPECT_EQ(twice.edges[0].joints[0].scatter, 0.01);
   EXPECT_EQ(twice.calibration_id, 99);
   EXPECT_EQ(twice.X_CR_covariance, schema.X_CR_covariance);
   EXPECT_EQ(twice.parts, schema.parts);

@@ -76,6 +76,19 @@ TEST_P(EdgeOfJoints, PredictionCovarianceAgreesWithPerturbedParameters) {
   EXPECT_LT((edge.parameter_jacobian(q) - J).norm(), 1e-7 * J.norm());
 }
 
+TEST(Edge, ScatterIsThatOfTheCommandsOfItsJoints) {
+  Rng rng(7);
+  Edge edge = random_edge(1, 2, {0, 1}, rng);
+  const Eigen::VectorXd q = random_action(rng, 2);
+  EXPECT_TRUE(edge.scatter_covariance(q).isZero(0));
+  edge.joints[1].scatter = 0.1;
+  // The displacement is gain · θ + offset.
+  const Vector6d twist = edge.jacobian(q).col(1) / edge.joints[1].gain;
+  EXPECT_TRUE(edge.scatter_covariance(q).isApprox(0.01 * twist * twist.transpose(), 1e-9));
+  edge.joints[1].gain = 0;
+  EXPECT_TRUE(edge.scatter_covariance(q).isZero(0)) << "what is stuck misses no command";
+}
+
 TEST(Edge, SignalsAreListedOnceInTheOrderOfTheJoints) {
   Rng rng(3);
   EXPECT_EQ(random_edge(1, 2, {2, 0, 2}, rng).signals(), (std::vector<int>{2, 0}));

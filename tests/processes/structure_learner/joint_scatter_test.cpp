@@ -2,7 +2,10 @@
 
 #include <gtest/gtest.h>
 
-#include "common/geometry/angle.h"
+#include <cmath>
+#include <vector>
+
+#include "processes/structure_learner/learn.h"
 #include "processes/structure_learner/screen.h"
 #include "tests/support/synthetic_robot.h"
 
@@ -13,7 +16,7 @@ using test::Regime;
 using test::Rng;
 
 // Of the hinge between parts 1 and 2 (±1 rad) whose motor misses the command by `scatter_rad`.
-double found_scatter(double scatter_rad, int num_samples, int seed) {
+std::vector<ActionPoseSample> samples_of_hinge(double scatter_rad, int num_samples, int seed) {
   Rng rng(static_cast<Rng::result_type>(seed));
   test::SyntheticRobot robot;
   robot.signals = {{"q1", -1, 1}};
@@ -33,6 +36,11 @@ double found_scatter(double scatter_rad, int num_samples, int seed) {
     samples.push_back(test::observe(robot, reached, {Regime::kChapter}, t, rng));
     samples.back().action = command;
   }
+  return samples;
+}
+
+double found_scatter(double scatter_rad, int num_samples, int seed) {
+  const auto samples = samples_of_hinge(scatter_rad, num_samples, seed);
   const NormalizedActions actions(samples, 1);
   const PairData pair =
       make_pair_data(samples, 1, 2, {.noise = test::nominal_noise(Regime::kChapter)}, 2000);
@@ -57,6 +65,18 @@ TEST(JointScatter, IsZeroOfAnExactJoint) {
   int zero = 0;
   for (int seed = 1; seed <= 40; ++seed) zero += found_scatter(0, 40, seed) == 0;
   EXPECT_GE(zero, 37);
+}
+
+TEST(JointScatter, IsInTheLearnedSchema) {
+  const double noise_rad = test::nominal_noise(Regime::kChapter).rotation_rad;
+  LearnOptions options;
+  options.measurement.noise = test::nominal_noise(Regime::kChapter);
+  const BodySchema schema =
+      learn({{"q1", -1, 1}}, samples_of_hinge(1.5 * noise_rad, 100, 1), options).schema;
+  ASSERT_EQ(schema.edges.size(), 1U);
+  ASSERT_EQ(schema.edges[0].joints.size(), 1U);
+  const ScrewJoint& joint = schema.edges[0].joints[0];
+  EXPECT_NEAR(joint.scatter * std::abs(joint.turn), 1.5 * noise_rad, 0.5 * noise_rad);
 }
 
 }  // namespace
