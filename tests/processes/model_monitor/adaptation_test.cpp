@@ -101,15 +101,22 @@ INSTANTIATE_TEST_SUITE_P(AdaptationTest, EveryFault,
                                          test::Scenario{Fault::kBend, "bend", 0.85},
                                          test::Scenario{Fault::kOffset, "offset", 0.85},
                                          test::Scenario{Fault::kGain, "gain", 0.85},
-                                         test::Scenario{.fault = Fault::kReversed,
-                                                        .name = "reversed",
-                                                        .visible = 0.85,
-                                                        .range_rad = 2.8},
                                          test::Scenario{Fault::kTwo, "two", 0.85},
                                          test::Scenario{Fault::kAdjacent, "adjacent", 0.85},
                                          test::Scenario{Fault::kMarker, "marker", 0.85},
                                          test::Scenario{Fault::kCamera, "camera", 0.85}),
                          [](const auto& info) { return std::string(info.param.name); });
+
+// Between the gains 1 and −1 of a joint that turns by ±160° lie others that explain some samples.
+TEST(AdaptationTest, AReversedJointIsMendedWithinTenSamples) {
+  for (int seed = 1; seed <= 6; ++seed) {
+    BrokenArm arm({.fault = Fault::kReversed, .visible = 0.85, .range_rad = 2.8}, Regime::kTagIso,
+                  kBlock, seed);
+    Adaptation adaptation(arm.engineered(), adaptation_options(Regime::kTagIso));
+    const Life life = live(arm, adaptation, kBlock + 11);
+    EXPECT_LT(life.error.back(), life.error[kBlock - 1] + 0.01) << seed << "\n" << life.log();
+  }
+}
 
 class NoFamily : public WholeLife {};
 

@@ -120,6 +120,17 @@ double log_normal(const Eigen::VectorXd& y, const Eigen::MatrixXd& S) {
          0.5 * static_cast<double>(y.size()) * std::log(2 * M_PI);
 }
 
+TEST_F(TreeFilterTest, AnEdgeIsAlsoUncertainByTheScatterOfItsJoints) {
+  const Eigen::VectorXd theta = Eigen::VectorXd::Constant(4, 0.3);
+  Edge edge = schema_.edges[0];
+  EXPECT_EQ(model_covariance(edge, theta), edge.prediction_covariance(theta));
+  edge.joints[0].scatter = 0.02;
+  EXPECT_TRUE(
+      model_covariance(edge, theta)
+          .isApprox(edge.prediction_covariance(theta) + edge.scatter_covariance(theta), 1e-12));
+  EXPECT_GT(edge.scatter_covariance(theta).trace(), 0.02 * 0.02);
+}
+
 TEST_F(TreeFilterTest, LikelihoodIsThatOfAllMarkersTogether) {
   const TreeFilter filter(schema_, measurement_);
   const Joint j = joint();
