@@ -91,7 +91,9 @@ void fit_screw_edge(const LocalModel& start, const PairData& pair, const EdgeDat
   if (!result->is_valid) return;
   result->model = fit.model;
   result->edge = to_edge(fit.model, data.actions);
-  const Eigen::VectorXd scatter = joint_scatter(fit, loo, pair, data.actions);
+  const PairData told = make_pair_data(data.samples, pair.part_i, pair.part_j, data.told,
+                                       std::numeric_limits<int>::max());
+  const Eigen::VectorXd scatter = joint_scatter(fit, loo, pair, told, data.actions);
   for (int d = 0; d < fit.model.num_joints(); ++d)
     result->edge.joints[static_cast<std::size_t>(d)].scatter =
         scatter(d) * data.actions.half_range(fit.model.joints[d].signal);

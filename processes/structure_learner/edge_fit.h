@@ -11,7 +11,8 @@ namespace bodyschema {
 struct EdgeData {
   const std::vector<ActionPoseSample>& samples;
   const NormalizedActions& actions;
-  const MeasurementModel& measurement;
+  const MeasurementModel& measurement;  ///< that the structure was found with
+  const MeasurementModel& told;         ///< the same without the factor that the search put on it
   const ValidityOptions& validity;
 };
 

@@ -12,7 +12,7 @@ namespace {
 
 constexpr int kSweeps = 3;
 // Trial deviations in units of what one frame tells of a displacement.
-constexpr double kLeast = 0.1, kMost = 10, kStep = 1.15;
+constexpr double kLeast = 0.1, kMost = 100, kStep = 1.15;
 
 // What a frame says of the displacements: A = UᵀU, b = Uᵀr, and |r|².
 struct Term {
@@ -40,32 +40,37 @@ double gain(const std::vector<Term>& terms, const Eigen::VectorXd& S) {
 }
 
 std::vector<Term> terms_of(const Fit& fit, const LeaveOneOut& loo, const PairData& pair,
-                           const NormalizedActions& actions) {
+                           const PairData& told, const NormalizedActions& actions) {
   std::vector<Term> terms;
   for (int t = 0; t < pair.size(); ++t) {
-    const double d2 = loo.squared_distance[t];
-    const Matrix6d& W = pair.hypotheses[fit.frames[t].hypothesis].whitening;
-    Vector6d r = W * loo.residual[t];
+    const int h = fit.frames[t].hypothesis;
+    const Matrix6d& W = told.hypotheses[h].whitening;
     // As long as one of unit covariance: without what the parameters are off by.
-    r *= std::sqrt(d2 / std::max(r.squaredNorm(), 1e-300));
+    const double whole = (pair.hypotheses[h].whitening * loo.residual[t]).squaredNorm();
+    const Vector6d r =
+        W * loo.residual[t] * std::sqrt(loo.squared_distance[t] / std::max(whole, 1e-300));
     const Eigen::MatrixXd U = W * motion_jacobian(fit.model, actions, pair.frames[t].sample);
-    terms.push_back({U.transpose() * U, U.transpose() * r, d2});
+    terms.push_back({U.transpose() * U, U.transpose() * r, r.squaredNorm()});
   }
   return terms;
 }
 
-}  // namespace
+// The factor ≥ 1 on the noise's variance that explains most, and what it gains [nats].
+std::pair<double, double> factor_on_noise(const std::vector<Term>& terms) {
+  std::pair<double, double> best{1, 0};
+  for (double factor = 1; factor < kMost * kMost; factor *= kStep) {
+    double sum = 0;
+    for (const Term& term : terms)
+      sum += bounded(term.squared_distance) - bounded(term.squared_distance / factor) -
+             6 * std::log(factor);
+    if (0.5 * sum > best.second) best = {factor, 0.5 * sum};
+  }
+  return best;
+}
 
-Eigen::VectorXd joint_scatter(const Fit& fit, const LeaveOneOut& loo, const PairData& pair,
-                              const NormalizedActions& actions) {
-  const int k = fit.model.num_joints();
+// The variances [half ranges²] that explain most, a joint's if it gains `price`.
+Eigen::VectorXd most_likely(const std::vector<Term>& terms, int k, double price) {
   Eigen::VectorXd S = Eigen::VectorXd::Zero(k);
-  const std::vector<Term> terms = terms_of(fit, loo, pair, actions);
-  if (k == 0 || terms.empty() || pair.num_residuals() < 6) return S;
-  const double share = static_cast<double>(actions.blocks().count(
-                           pair.frames, [](const PairFrame& f) { return f.sample; })) /
-                       pair.size();
-  const double price = 0.5 * std::log(share * static_cast<double>(terms.size()));
   Eigen::VectorXd information = Eigen::VectorXd::Zero(k);
   for (const Term& term : terms) information += term.A.diagonal();
   information /= static_cast<double>(terms.size());
@@ -74,7 +79,7 @@ Eigen::VectorXd joint_scatter(const Fit& fit, const LeaveOneOut& loo, const Pair
       if (!(information(d) > 0)) continue;
       Eigen::VectorXd trial = S;
       trial(d) = S(d) = 0;
-      double best = gain(terms, S) + price / share;
+      double best = gain(terms, S) + price;
       for (double sd = kLeast; sd <= kMost; sd *= kStep) {
         trial(d) = sd * sd / information(d);
         const double found = gain(terms, trial);
@@ -83,7 +88,28 @@ Eigen::VectorXd joint_scatter(const Fit& fit, const LeaveOneOut& loo, const Pair
         S(d) = trial(d);
       }
     }
-  return S.cwiseSqrt();
+  return S;
+}
+
+}  // namespace
+
+Eigen::VectorXd joint_scatter(const Fit& fit, const LeaveOneOut& loo, const PairData& pair,
+                              const PairData& told, const NormalizedActions& actions) {
+  const int k = fit.model.num_joints();
+  std::vector<Term> terms = terms_of(fit, loo, pair, told, actions);
+  if (k == 0 || terms.empty() || pair.num_residuals() < 6) return Eigen::VectorXd::Zero(k);
+  const double num_independent =
+      actions.blocks().count(pair.frames, [](const PairFrame& f) { return f.sample; });
+  const double price = 0.5 * std::log(num_independent) * pair.size() / num_independent;
+  const Eigen::VectorXd S = most_likely(terms, k, price);
+  const auto [factor, gained] = factor_on_noise(terms);
+  if (gain(terms, S) >= gained) return S.cwiseSqrt();
+  for (Term& term : terms) {
+    term.A /= factor;
+    term.b /= factor;
+    term.squared_distance /= factor;
+  }
+  return most_likely(terms, k, price).cwiseSqrt();
 }
 
 }  // namespace bodyschema

@@ -193,7 +193,9 @@ LearnResult fit_tree(const LearnedStructure& structure,
   // Everything that is fitted sees displacements.
   const std::vector<ActionPoseSample> moved = displaced(samples, structure.signals);
   const NormalizedActions actions(moved, num_signals);
-  const EdgeData data{moved, actions, measurement, structure.options.validity};
+  MeasurementModel told = measurement;
+  if (options.measurement.noise || has_covariances(samples)) told.scale = options.measurement.scale;
+  const EdgeData data{moved, actions, measurement, told, structure.options.validity};
   std::vector<FittedEdge> fitted;
   visit_outwards(ends_of(search.models), schema, [&](int edge, int from, int to) {
     AcceptedModel start = search.models[static_cast<std::size_t>(edge)];

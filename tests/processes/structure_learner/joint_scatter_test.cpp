@@ -39,16 +39,21 @@ std::vector<ActionPoseSample> samples_of_hinge(double scatter_rad, int num_sampl
   return samples;
 }
 
-double found_scatter(double scatter_rad, int num_samples, int seed) {
+// `scale`: of the noise that the structure was found with; `told`: of the noise that is told.
+double found_scatter(double scatter_rad, int num_samples, int seed, double scale = 1,
+                     double told = 1) {
   const auto samples = samples_of_hinge(scatter_rad, num_samples, seed);
   const NormalizedActions actions(samples, 1);
-  const PairData pair =
-      make_pair_data(samples, 1, 2, {.noise = test::nominal_noise(Regime::kChapter)}, 2000);
+  const auto pair_at = [&](double factor) {
+    return make_pair_data(
+        samples, 1, 2, {.noise = test::nominal_noise(Regime::kChapter), .scale = factor}, 2000);
+  };
+  const PairData pair = pair_at(scale);
   const RelativeMotions motions = relative_motions(pair, 300);
   const Start start =
       one_joint_start(screen_one_joint(motions, actions).at(0), pair, actions, motions.sigma_rad);
   const Fit fit = fit_local_model(start.model, pair, actions, 40);
-  return joint_scatter(fit, leave_one_out(fit, pair, actions), pair, actions)(0) *
+  return joint_scatter(fit, leave_one_out(fit, pair, actions), pair, pair_at(told), actions)(0) *
          actions.half_range(0);
 }
 
@@ -64,6 +69,21 @@ TEST(JointScatter, IsWhatTheMotorMissesTheCommandBy) {
 TEST(JointScatter, IsZeroOfAnExactJoint) {
   int zero = 0;
   for (int seed = 1; seed <= 40; ++seed) zero += found_scatter(0, 40, seed) == 0;
+  EXPECT_GE(zero, 37);
+}
+
+TEST(JointScatter, OfAStructureWithMoreNoiseIsThatBesideTheToldNoise) {
+  const double noise_rad = test::nominal_noise(Regime::kChapter).rotation_rad;
+  double mean = 0;
+  for (int seed = 1; seed <= 10; ++seed)
+    mean += found_scatter(3 * noise_rad, 100, seed, /*scale=*/4) / 10;
+  EXPECT_NEAR(mean, 3 * noise_rad, 0.45 * noise_rad);
+}
+
+TEST(JointScatter, IsZeroWhereTheNoiseIsMoreThanTold) {
+  int zero = 0;
+  for (int seed = 1; seed <= 40; ++seed)
+    zero += found_scatter(0, 40, seed, /*scale=*/1, /*told=*/0.5) == 0;
   EXPECT_GE(zero, 37);
 }
 
