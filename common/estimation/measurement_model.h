@@ -1,6 +1,8 @@
 #pragma once
 
+#include <map>
 #include <optional>
+#include <vector>
 
 #include "common/schema/body_schema.h"
 #include "common/schema/sample.h"
@@ -40,6 +42,9 @@ struct MeasurementModel {
   /// A second reading of a planar part counts while its reprojection error is at most this multiple
   /// of the first's.
   double max_error_ratio = 10;
+  /// By part: where its marker is read from time to time though it is not there, in the part's
+  /// frame. Half of its outliers are expected there.
+  std::map<int, std::vector<Pose>> misread = {};
 
   /// Σ of X_CB: 6×6, (translation [m], rotation [rad]), right perturbation in B. Of a position
   /// alone the rotation rows are zero, here and in covariance().

@@ -193,6 +193,17 @@ void Adaptation::update_measurement() {
   tracker_.begin(BodySchema(tracker_.settled()), measurement_);
 }
 
+void Adaptation::watch_misreadings(const ActionPoseSample& sample,
+                                   const std::vector<AdaptationEvent>& events) {
+  const auto has_settled = [](const AdaptationEvent& e) {
+    return e.kind == AdaptationEvent::Kind::kRecovered;
+  };
+  if (std::any_of(events.begin(), events.end(), has_settled)) misreadings_.forget_open();
+  if (!is_settled() || !misreadings_.look(sample, tracker_.settled(), measurement_)) return;
+  measurement_.misread = misreadings_.places();
+  tracker_.begin(BodySchema(tracker_.settled()), measurement_);
+}
+
 void Adaptation::complete(std::int64_t sample_index, AdaptationEvent* event) const {
   using Kind = AdaptationEvent::Kind;
   event->sample_index = sample_index;
@@ -367,6 +378,7 @@ std::vector<AdaptationEvent> Adaptation::on_new_sample(ActionPoseSample sample) 
     if (tracker_.suspects().empty()) watch_noise(judgement);
     if (num_samples_ % kUpdateEach == 0) update_measurement();
   }
+  watch_misreadings(sample, events);
   const auto is_reverted = [](const AdaptationEvent& e) {
     return e.kind == AdaptationEvent::Kind::kReverted;
   };

@@ -7,6 +7,7 @@
 
 #include "processes/model_monitor/health/adaptation_event.h"
 #include "processes/model_monitor/health/fallen_markers.h"
+#include "processes/model_monitor/health/misreadings.h"
 #include "processes/model_monitor/health/moved_tags.h"
 #include "processes/model_monitor/health/visibility_watch.h"
 #include "processes/model_monitor/hypotheses/alternations.h"
@@ -26,8 +27,8 @@ namespace bodyschema {
 /// slow drift, DriftWatch finds by means over many samples. An edge that comes and goes
 /// (Alternations) is told once, and cut until it is over.
 ///
-/// The noise is taken as it is seen: its size, the rate of outliers, and how many independent
-/// samples one is worth where it is correlated.
+/// The noise is taken as it is seen: its size, the rate of outliers, where they lie (Misreadings),
+/// and how many independent samples one is worth where it is correlated.
 ///
 /// What repeats another sample (SampleStream) is neither looked at nor counted. Where an edge is
 /// soft the assumed noise has room for what its model leaves, so noise_scale() stays at 1 or above,
@@ -85,6 +86,8 @@ class Adaptation {
   void count_outliers(const TreeFilter::Judgement& judgement);
   /// How rare outliers are, and how much correlated samples are worth, as seen so far.
   void update_measurement();
+  void watch_misreadings(const ActionPoseSample& sample,
+                         const std::vector<AdaptationEvent>& events);
   /// The same small change again soon after, or beside it, is a drift that was not understood yet.
   void watch_small_changes(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
   /// What changes all the time looks like one step after another: an edge in trouble may drift.
@@ -123,6 +126,7 @@ class Adaptation {
   HypothesisTracker tracker_;
   VisibilityWatch visibility_;
   FallenMarkers fallen_;
+  Misreadings misreadings_;
   MovedTags tags_;
   /// Tags that moved, or were lost, where others of their part stayed: what rests on them is left
   /// out until they are seen in their places again. schema_ has them, too.

@@ -92,7 +92,8 @@ double log_outlier_density(const Pose& X, const Pose& X_CB, const Matrix6d& S,
 }
 
 double log_marker_density(const Pose& X, const Pose& X_CB, const Matrix6d& S,
-                          const Matrix6d& marker_covariance, double outlier_rate, bool* is_inlier,
+                          const Matrix6d& marker_covariance, double outlier_rate,
+                          const std::vector<Pose>& misread, bool* is_inlier,
                           double* squared_distance) {
   const Vector6d xi = log(X.inverse() * X_CB);
   const Eigen::LLT<Matrix6d> llt(S);
@@ -102,8 +103,13 @@ double log_marker_density(const Pose& X, const Pose& X_CB, const Matrix6d& S,
   *squared_distance = d2;
   *is_inlier = true;
   if (d2 < kClearInlier) return inlier;
-  const double outlier =
-      std::log(outlier_rate) + log_outlier_density(X, X_CB, S, marker_covariance);
+  std::vector<double> outliers{log_outlier_density(X, X_CB, S, marker_covariance)};
+  for (const Pose& place : misread)
+    outliers.push_back(
+        log_normal_density(log((X * place).inverse() * X_CB), S + marker_covariance) -
+        std::log(static_cast<double>(misread.size())));
+  const double half = misread.empty() ? 0 : std::log(0.5);
+  const double outlier = std::log(outlier_rate) + half + log_sum_exp(outliers);
   *is_inlier = inlier >= outlier;
   return log_sum_exp({inlier, outlier});
 }
@@ -111,7 +117,11 @@ double log_marker_density(const Pose& X, const Pose& X_CB, const Matrix6d& S,
 TreeFilter::TreeFilter(const BodySchema& schema, const MeasurementModel& measurement)
     : schema_(schema), measurement_(measurement) {
   if (schema_.root < 0) return;
-  nodes_.push_back({schema_.root, -1, -1, false, {}});
+  const auto misread = [&](int part) {
+    const auto found = measurement_.misread.find(part);
+    return found == measurement_.misread.end() ? std::vector<Pose>{} : found->second;
+  };
+  nodes_.push_back({schema_.root, -1, -1, false, misread(schema_.root), {}});
   std::set<int> reached{schema_.root};
   for (std::size_t n = 0; n < nodes_.size(); ++n) {
     for (std::size_t e = 0; e < schema_.edges.size(); ++e) {
@@ -122,6 +132,7 @@ TreeFilter::TreeFilter(const BodySchema& schema, const MeasurementModel& measure
                         static_cast<int>(n),
                         static_cast<int>(e),
                         edge.state == EdgeState::kInvalid,
+                        misread(edge.to),
                         {}});
     }
   }
@@ -316,20 +327,22 @@ class TreeFilter::Walk {
       return;
     }
     const double rate = filter_.measurement_.outlier_rate;
+    const std::vector<Pose>& misread = filter_.nodes_[node].misread;
     Pose X_CB = seen->X_CB;
     bool is_inlier = true;
     double d2 = 0;
     double density =
-        log_marker_density(belief->X, X_CB, S, seen->covariance, rate, &is_inlier, &d2);
+        log_marker_density(belief->X, X_CB, S, seen->covariance, rate, misread, &is_inlier, &d2);
     // Where the marker does not sit at the part's origin only its other reading knows where a
     // flip's part is; and that may be an outlier in turn.
     if (seen->X_CB_other && d2 > kClearInlier) {
       const Matrix6d S_other = belief->P + seen->covariance_other;
       bool is_other_inlier = false;
       double other_d2 = 0;
-      const double other = kLogOtherReading + log_marker_density(belief->X, *seen->X_CB_other,
-                                                                 S_other, seen->covariance_other,
-                                                                 rate, &is_other_inlier, &other_d2);
+      const double other =
+          kLogOtherReading + log_marker_density(belief->X, *seen->X_CB_other, S_other,
+                                                seen->covariance_other, rate, misread,
+                                                &is_other_inlier, &other_d2);
       if (other > density) {
         density = other;
         S = S_other;

@@ -40,7 +40,8 @@ struct VirtualMeasurement {
 ///   (1 − ρ) N(ξ; 0, S) + ρ g(ξ),   ξ = log(X⁻¹ y), S = P + Σ_y,
 /// with an outlier density g that is shaped as the outliers of planar markers are: flips, tilts of
 /// unknown direction, wide errors and a floor. (A uniform g makes every flip of a leaf's marker
-/// speak for a broken edge.) A second reading of a planar marker counts as one in ten. Where the
+/// speak for a broken edge.) Where a marker was misread before it is expected again
+/// (MeasurementModel::misread). A second reading of a planar marker counts as one in ten. Where the
 /// first term is the larger one the marker corrects the belief.
 /// What a branch learns goes back to its parent by the smoother's gain P Fᵀ P_child⁻¹, so that
 /// siblings profit from each other.
@@ -99,6 +100,7 @@ class TreeFilter {
     int parent = -1;
     int edge = -1;
     bool is_cut = false;
+    std::vector<Pose> misread;
     std::vector<int> children;
   };
   struct Belief {
@@ -116,9 +118,11 @@ class TreeFilter {
 double log_normal_density(const Vector6d& xi, const Matrix6d& S);
 
 /// log [(1 − ρ) N(ξ; 0, S) + ρ g(ξ)] of a marker's pose `X_CB` under a belief `X` with S = P + Σ_y;
-/// `marker_covariance` is Σ_y. Sets whether the marker is to be believed.
+/// `marker_covariance` is Σ_y; half of g is where the marker was `misread` before, in its part's
+/// frame. Sets whether the marker is to be believed.
 double log_marker_density(const Pose& X, const Pose& X_CB, const Matrix6d& S,
-                          const Matrix6d& marker_covariance, double outlier_rate, bool* is_inlier,
+                          const Matrix6d& marker_covariance, double outlier_rate,
+                          const std::vector<Pose>& misread, bool* is_inlier,
                           double* squared_distance);
 /// log g alone.
 double log_outlier_density(const Pose& X, const Pose& X_CB, const Matrix6d& S,

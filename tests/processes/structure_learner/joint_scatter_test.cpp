@@ -45,8 +45,8 @@ double found_scatter(double scatter_rad, int num_samples, int seed, double scale
   const auto samples = samples_of_hinge(scatter_rad, num_samples, seed);
   const NormalizedActions actions(samples, 1);
   const auto pair_at = [&](double factor) {
-    return make_pair_data(
-        samples, 1, 2, {.noise = test::nominal_noise(Regime::kChapter), .scale = factor}, 2000);
+    return make_pair_data(samples, 1, 2,
+                          {.noise = test::nominal_noise(Regime::kChapter), .scale = factor}, 2000);
   };
   const PairData pair = pair_at(scale);
   const RelativeMotions motions = relative_motions(pair, 300);
