@@ -178,7 +178,7 @@ struct BodySchema {
   /// cancels. Of parts whose edges were fitted together.
   std::map<int, Matrix6d> frame_covariances;
   std::vector<UnconnectedPart> unconnected;
-  /// Signals of which the samples do not tell yet whether they move anything (indices, ascending).
+  /// Signals of which the samples do not tell yet what they move, if anything (indices, ascending).
   std::vector<int> undecided_signals;
   Noise noise;
   std::vector<KnownChange> changes;  ///< of the body, the newest kMaxChanges, ascending by `found`

@@ -130,9 +130,12 @@ UnconnectedPart explain(int part, int num_seen, const std::set<int>& connected,
 }
 
 // Signals that no edge uses although one may have to: they moved too little for a joint of
-// kLeastTurn (over their limits, where these are known) to show, or a part waits for its edge.
+// kLeastTurn (over their limits, where these are known) to show, or a part waits for its edge. And
+// those that a soft edge may use in vain.
 std::vector<int> undecided_signals(const BodySchema& schema, const LearnedStructure& structure) {
-  std::vector<int> result;
+  std::set<int> result;
+  for (const AcceptedModel& model : structure.search.models)
+    result.insert(model.doubtful_signals.begin(), model.doubtful_signals.end());
   for (const int s : schema.unused_signals()) {
     const auto information = structure.search.joint_information.find(s);
     if (schema.complete && information != structure.search.joint_information.end()) {
@@ -143,9 +146,9 @@ std::vector<int> undecided_signals(const BodySchema& schema, const LearnedStruct
       const double turn = share * kLeastTurn;
       if (turn * turn * information->second >= kNoticed) continue;
     }
-    result.push_back(s);
+    result.insert(s);
   }
-  return result;
+  return {result.begin(), result.end()};
 }
 
 int count_actions(const std::vector<ActionPoseSample>& samples) {

@@ -22,6 +22,8 @@ struct SoftModel {
 /// A soft model's judgement on every frame of a pair, without that frame's block of time.
 struct SoftFit {
   SoftModel model;
+  /// Of model.signals: the left-out blocks miss them, but not by so much that it is sure.
+  std::vector<int> doubtful_signals;
   std::vector<FrameFit> frames;  ///< reading and whitened residual log(Δ̂₋B⁻¹ z)
   /// d² = rᵀ(I + S)⁻¹r with S the whitened covariance of the prediction: χ²₆ under a true model.
   std::vector<double> squared_distance;

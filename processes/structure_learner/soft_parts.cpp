@@ -111,8 +111,8 @@ void withdraw_screws(const std::vector<ActionPoseSample>& samples, const Normali
     if (soft->log_density <=
         log_density_of_screws(screws, data, actions) - 3 * std::log(kExplained) * num_independent)
       return false;
-    candidates->push_back(
-        {m.part_i, m.part_j, soft->model.screws, soft->score, soft->model.signals});
+    candidates->push_back({m.part_i, m.part_j, soft->model.screws, soft->score, soft->model.signals,
+                           soft->doubtful_signals});
     std::erase(found->redundant, std::pair(m.part_i, m.part_j));
     found->records[{m.part_i, m.part_j}].is_redundant = false;
     found->gave_way = true;
@@ -148,7 +148,8 @@ void connect_soft_parts(const std::vector<ActionPoseSample>& samples,
       if (!std::isfinite(o.cost)) continue;
       const std::optional<SoftFit> best = best_soft_fit(o, samples, actions, options, found);
       if (!best || best->verdict != Verdict::kValid) continue;
-      candidates.push_back({o.i, o.j, best->model.screws, best->score, best->model.signals});
+      candidates.push_back(
+          {o.i, o.j, best->model.screws, best->score, best->model.signals, best->doubtful_signals});
     }
   }
   std::stable_sort(candidates.begin(), candidates.end(), [](const auto& x, const auto& y) {

@@ -72,13 +72,30 @@ std::string median_errors(const BodySchema& schema, const std::vector<ActionPose
   return text;
 }
 
-// The chain 0-1-2-…, each edge with exactly its section's signals.
+// Not the chain 0-1-2-… where each edge has exactly its section's signals, but for those of which
+// it is told that they may have no effect.
 bool is_wrong(const BodySchema& schema, const SoftArm& arm) {
+  const std::set<int> undecided(schema.undecided_signals.begin(), schema.undecided_signals.end());
   return std::any_of(schema.edges.begin(), schema.edges.end(), [&](const Edge& edge) {
     const std::vector<int> signals = edge.signals();
-    return edge.to != edge.from + 1 ||
-           std::set<int>(signals.begin(), signals.end()) != arm.signals_of(edge.from);
+    std::set<int> differ, of_section = arm.signals_of(edge.from);
+    for (const int s : signals)
+      if (of_section.erase(s) == 0) differ.insert(s);
+    return edge.to != edge.from + 1 || !of_section.empty() ||
+           !std::includes(undecided.begin(), undecided.end(), differ.begin(), differ.end());
   });
+}
+
+// All edges are there, and of none is it open whether a signal has an effect.
+bool is_sure(const BodySchema& schema) {
+  return schema.complete &&
+         std::none_of(schema.edges.begin(), schema.edges.end(), [&](const Edge& edge) {
+           const std::vector<int> signals = edge.signals();
+           return std::any_of(signals.begin(), signals.end(), [&](int s) {
+             return std::binary_search(schema.undecided_signals.begin(),
+                                       schema.undecided_signals.end(), s);
+           });
+         });
 }
 
 std::string structure_of(const BodySchema& schema, const std::vector<Signal>& signals) {
@@ -87,6 +104,9 @@ std::string structure_of(const BodySchema& schema, const std::vector<Signal>& si
     text += fmt::format(", {}-{} {}:", edge.from, edge.to, edge.kind());
     for (const int s : edge.signals()) text += " " + signals[static_cast<std::size_t>(s)].name;
   }
+  if (!schema.undecided_signals.empty()) text += "; perhaps without effect:";
+  for (const int s : schema.undecided_signals)
+    text += " " + signals[static_cast<std::size_t>(s)].name;
   return text;
 }
 
@@ -116,8 +136,8 @@ void print_arms(const Arguments& arguments) {
           if (is_bad && arguments.lists_wrong)
             std::cerr << fmt::format("arm {}, {} poses:{}\n", seed, num_poses,
                                      structure_of(schema, arm.signals()));
-          right += !is_bad && schema.complete;
-          incomplete += !is_bad && !schema.complete;
+          right += !is_bad && is_sure(schema);
+          incomplete += !is_bad && !is_sure(schema);
           cpu_s = std::max(cpu_s, learned.cpu_s);
           errors += (errors.empty() ? "" : " – ") + median_errors(schema, arm.babble(300, {}, rng));
         }

@@ -18,6 +18,8 @@ struct AcceptedModel {
   double score = 0;
   /// Q of a soft model (residual_fit.h), whose screws `model` then are; empty: screws alone.
   std::vector<int> soft_signals = {};
+  /// Of these, those that may have no effect (SoftFit::doubtful_signals).
+  std::vector<int> doubtful_signals = {};
 
   bool joins(int part_a, int part_b) const {
     return std::minmax(part_a, part_b) == std::minmax(part_i, part_j);

@@ -418,5 +418,38 @@ TEST(SoftBodies, RigidChainsBehindHiddenPartsAreNeverGivenWrongSignals) {
   }
 }
 
+// One segment, which a third signal bends by a share of what the first does.
+BodySchema segment_of_three(double share, unsigned seed) {
+  Rng rng(seed);
+  auto samples = at_rest(100, 3, rng);
+  observe(
+      &samples, 2,
+      [&](int part, const Eigen::VectorXd& q) {
+        const Pose X = make_pose(Eigen::Quaterniond::Identity(), Eigen::Vector3d(0, 0, 1));
+        return part == 0 ? X : X * segment(q(0) + share * q(2), q(1));
+      },
+      rng);
+  LearnOptions options;
+  options.measurement.noise = kNoise;
+  return learn({{"q1", -1, 1}, {"q2", -1, 1}, {"q3", -1, 1}}, samples, options).schema;
+}
+
+TEST(SoftParts, ASignalThatMayHaveNoEffectIsTold) {
+  int num_used = 0;
+  for (unsigned seed = 1; seed <= 6; ++seed) {
+    const BodySchema strong = segment_of_three(0.3, seed);
+    ASSERT_EQ(strong.edges.size(), 1u);
+    EXPECT_EQ(strong.edges[0].signals().size(), 3u);
+    EXPECT_TRUE(strong.undecided_signals.empty());
+
+    const BodySchema weak = segment_of_three(0.035, seed);
+    ASSERT_EQ(weak.edges.size(), 1u);
+    if (weak.edges[0].signals().size() < 3) continue;
+    ++num_used;
+    EXPECT_EQ(weak.undecided_signals, std::vector<int>{2});
+  }
+  EXPECT_GE(num_used, 2);
+}
+
 }  // namespace
 }  // namespace bodyschema
