@@ -78,8 +78,10 @@ struct LearnedStructure {
   /// The edges span all parts seen.
   bool spans() const { return search.models.size() + 1 >= parts.size(); }
 };
-/// Where the residuals refute the noise told, a larger one (see confirmed_structure.h). Parts that
-/// have positions alone are put in when the parts that have poses are (position_leaves.h).
+/// Where the residuals refute the noise told, a larger one (see confirmed_structure.h); of poses at
+/// rest where no multiple of it stands, the estimate of noise_estimate.h if that is much more.
+/// Parts that have positions alone are put in when the parts that have poses are
+/// (position_leaves.h).
 /// @throws std::invalid_argument as learn().
 LearnedStructure find_structure(const std::vector<Signal>& signals,
                                 const std::vector<ActionPoseSample>& samples,

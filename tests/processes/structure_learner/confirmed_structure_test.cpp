@@ -172,5 +172,26 @@ TEST(ConfirmedStructureTest, ABiasOfViewsAboveTheToldNoiseIsNoJoint) {
   EXPECT_EQ(num_confidently_wrong, 0);
 }
 
+TEST(ConfirmedStructureTest, ToldNoiseThatTheMarkersRefuteGivesWayToWhatTheyShow) {
+  const std::vector<test::Imperfection> off = {
+      {.name = "placements", .placement_m = 0.004, .placement_deg = 2},
+      {.name = "sizes", .tag_size = 0.01}};
+  LearnOptions options;
+  options.root = 1;
+  options.measurement.noise = Noise{0.003, 1 * kDegree};
+  int num_right = 0, num_said = 0;
+  for (const test::Imperfection& imperfection : off)
+    for (const std::uint64_t seed : {1, 3, 8}) {
+      test::ImperfectRobot robot(2 + static_cast<int>(seed) % 6, seed / 6 % 2 == 0, imperfection,
+                                 seed);
+      const LearnResult learned = learn(robot.signals(), robot.babble(60), options);
+      num_right += judge(learned.schema, robot.structure()) == test::Rightness::kRight;
+      num_said += learned.noise_source == NoiseSource::kResiduals &&
+                  learned.schema.noise.position_m > options.measurement.noise->position_m;
+    }
+  EXPECT_GE(num_right, 5);
+  EXPECT_GE(num_said, 5);
+}
+
 }  // namespace
 }  // namespace bodyschema
