@@ -48,6 +48,7 @@ int main(int argc, char** argv) {
   bodyschema::add_monitor_command(commands);
   bodyschema::add_engineer_command(commands);
   bodyschema::add_urdf_command(commands);
+  bodyschema::add_reach_command(commands);
   bodyschema::add_refine_command(commands);
   bodyschema::add_log_command(commands);
   bodyschema::add_operate_commands(commands);

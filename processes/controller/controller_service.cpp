@@ -149,8 +149,8 @@ Controller::Command Controller::take(std::int64_t now_us) {
 Controller::Command Controller::step() {
   if (!goal_) {
     const InverseKinematicsSolution solution =
-        solve_position(*schema_, target_.target_part, aim_, config_.signals, *position_,
-                       config_.inverse_kinematics, rejected_);
+        solve_pose(*schema_, target_.target_part, {.p_RT = aim_}, config_.signals, *position_,
+                   config_.inverse_kinematics, rejected_);
     if (solution.error_m > config_.reached_m) {
       const std::string after =
           num_moves_ > 0 ? " (after " + std::to_string(num_moves_) + " moves)" : "";

@@ -30,7 +30,7 @@ struct Scale {
   }
   Eigen::VectorXd action(const Eigen::VectorXd& u) const { return lower + range * u.array(); }
   Eigen::VectorXd share(const Eigen::VectorXd& action) const {
-    return (action.array() - lower) / range;
+    return (range > 0).select((action.array() - lower) / range, 0);
   }
 };
 
@@ -38,12 +38,12 @@ Eigen::VectorXd clamped(const Eigen::VectorXd& u) { return u.cwiseMax(0.0).cwise
 
 /// Δu = Jᵀ (J Jᵀ + λ² I)⁻¹ e over the signals that are free: one at its limit that would be pushed
 /// outwards is held there and the others take over its share.
-Eigen::VectorXd damped_step(Eigen::MatrixXd J, const Eigen::Vector3d& e, double damping_m,
+Eigen::VectorXd damped_step(Eigen::MatrixXd J, const Eigen::VectorXd& e, double damping_m,
                             const Eigen::VectorXd& u) {
   Eigen::VectorXd step = Eigen::VectorXd::Zero(u.size());
   for (Eigen::Index round = 0; round <= u.size(); ++round) {
-    const Eigen::Matrix3d A =
-        J * J.transpose() + damping_m * damping_m * Eigen::Matrix3d::Identity();
+    Eigen::MatrixXd A = J * J.transpose();
+    A.diagonal().array() += damping_m * damping_m;
     step = J.transpose() * A.ldlt().solve(e);
     bool is_inside = true;
     for (Eigen::Index i = 0; i < u.size(); ++i) {
@@ -56,6 +56,74 @@ Eigen::VectorXd damped_step(Eigen::MatrixXd J, const Eigen::Vector3d& e, double 
   }
   const double largest = step.cwiseAbs().maxCoeff();
   return largest > kFarthestStep ? step * (kFarthestStep / largest) : step;
+}
+
+/// What is left to a target, in three rows [m], or in six with the rotation [m, weighted].
+class Residual {
+ public:
+  Residual(const PoseTarget& target, const InverseKinematicsOptions& options)
+      : target_(target), options_(options), rows_(target.q_RT ? 6 : 3) {}
+
+  Eigen::VectorXd operator()(const Pose& X_RB) const {
+    Eigen::VectorXd e(rows_);
+    e.head<3>() = target_.p_RT - X_RB.translation();
+    if (target_.q_RT) {
+      const Eigen::AngleAxisd left(target_.q_RT->normalized() * X_RB.linear().transpose());
+      e.tail<3>() = options_.metres_per_radian * left.angle() * left.axis();
+    }
+    return e;
+  }
+  /// Of −e.
+  Eigen::MatrixXd jacobian(const Eigen::MatrixXd& pose_jacobian) const {
+    Eigen::MatrixXd J = pose_jacobian.topRows(rows_);
+    if (rows_ == 6) J.bottomRows<3>() *= options_.metres_per_radian;
+    return J;
+  }
+  double angle_rad(const Eigen::VectorXd& e) const {
+    return rows_ == 6 ? e.tail<3>().norm() / options_.metres_per_radian : 0;
+  }
+  bool is_within_tolerance(const Eigen::VectorXd& e) const {
+    return e.head<3>().norm() <= options_.tolerance_m && angle_rad(e) <= options_.tolerance_rad;
+  }
+
+ private:
+  const PoseTarget& target_;
+  const InverseKinematicsOptions& options_;
+  const Eigen::Index rows_;
+};
+
+/// From one start, until it converges or no step helps.
+Eigen::VectorXd converge(const KinematicPath& path, const Scale& scale, const Residual& residual,
+                         const InverseKinematicsOptions& options, Eigen::VectorXd u) {
+  Eigen::VectorXd error = residual(path.predict(scale.action(u)));
+  double damping_m = options.damping_m;
+  for (int i = 0; i < options.max_iterations && damping_m < kGreatestDamping_m &&
+                  !residual.is_within_tolerance(error);
+       ++i) {
+    const Eigen::MatrixXd J =
+        residual.jacobian(pose_jacobian(path, scale.action(u))) * scale.range.matrix().asDiagonal();
+    const Eigen::VectorXd next = clamped(u + damped_step(J, error, damping_m, u));
+    const Eigen::VectorXd next_error = residual(path.predict(scale.action(next)));
+    if (next_error.norm() < error.norm() - kLeastProgress_m) {
+      u = next;
+      error = next_error;
+      damping_m = std::max(kLeastDamping_m, 0.3 * damping_m);
+    } else {
+      damping_m *= 4;
+    }
+  }
+  return u;
+}
+
+/// The n-th start: the first is `u`, the others ever farther from it, the same in every run.
+Eigen::VectorXd start_near(const Eigen::VectorXd& u, int n) {
+  if (n == 0) return u;
+  std::mt19937_64 engine(static_cast<std::uint64_t>(n));
+  std::uniform_real_distribution<double> unit(0, 1);
+  const double spread = std::min(1.0, 0.25 * n);
+  Eigen::VectorXd start = u;
+  for (double& value : start) value += spread * (unit(engine) - value);
+  return start;
 }
 
 }  // namespace
@@ -73,28 +141,29 @@ std::optional<BodySchema> chain_to(const BodySchema& schema, int part) {
   return chain;
 }
 
-Eigen::MatrixXd position_jacobian(const KinematicPath& path, const Eigen::VectorXd& action) {
-  PoseJacobian J_B;
-  const Pose X_RB = path.predict(action, &J_B);
-  return X_RB.linear() * J_B.topRows<3>();
+Eigen::MatrixXd pose_jacobian(const KinematicPath& path, const Eigen::VectorXd& action) {
+  PoseJacobian J;
+  const Pose X_RB = path.predict(action, &J);
+  J.topRows<3>() = X_RB.linear() * J.topRows<3>();
+  J.bottomRows<3>() = X_RB.linear() * J.bottomRows<3>();
+  return J;
 }
 
-InverseKinematicsSolution solve_position(const BodySchema& schema, int part,
-                                         const Eigen::Vector3d& p_RT,
-                                         const std::vector<Signal>& limits,
-                                         const Eigen::VectorXd& current,
-                                         const InverseKinematicsOptions& options,
-                                         const std::vector<Eigen::VectorXd>& avoided) {
+InverseKinematicsSolution solve_pose(const BodySchema& schema, int part, const PoseTarget& target,
+                                     const std::vector<Signal>& limits,
+                                     const Eigen::VectorXd& current,
+                                     const InverseKinematicsOptions& options,
+                                     const std::vector<Eigen::VectorXd>& avoided) {
   const auto path = KinematicPath::between(schema, schema.root, part);
   if (!path) throw std::invalid_argument("the part has no way to the root");
+  if (target.q_RT && !schema.has_rotation(part))
+    throw std::invalid_argument("of the part positions alone are known, no orientation");
   if (limits.size() != schema.signals.size() ||
       current.size() != static_cast<Eigen::Index>(limits.size())) {
     throw std::invalid_argument("limits and action must have one value per signal");
   }
   const Scale scale(limits);
-  const auto error_at = [&](const Eigen::VectorXd& u) -> Eigen::Vector3d {
-    return p_RT - path->predict(scale.action(u)).translation();
-  };
+  const Residual residual(target, options);
   const auto is_avoided = [&](const Eigen::VectorXd& u) {
     return std::any_of(avoided.begin(), avoided.end(), [&](const Eigen::VectorXd& action) {
       return (scale.share(action) - u).cwiseAbs().maxCoeff() < kDifferent;
@@ -102,39 +171,19 @@ InverseKinematicsSolution solve_position(const BodySchema& schema, int part,
   };
 
   const Eigen::VectorXd u_current = clamped(scale.share(current));
-  InverseKinematicsSolution best;
-  best.error_m = std::numeric_limits<double>::infinity();
-  for (int start = 0; start < options.max_starts; ++start) {
-    Eigen::VectorXd u = u_current;
-    if (start > 0) {
-      std::mt19937_64 engine(static_cast<std::uint64_t>(start));
-      std::uniform_real_distribution<double> unit(0, 1);
-      const double spread = std::min(1.0, 0.25 * start);
-      for (double& value : u) value += spread * (unit(engine) - value);
-    }
-    Eigen::Vector3d error = error_at(u);
-    double damping_m = options.damping_m;
-    for (int i = 0; i < options.max_iterations && damping_m < kGreatestDamping_m &&
-                    error.norm() > options.tolerance_m;
-         ++i) {
-      const Eigen::MatrixXd J =
-          position_jacobian(*path, scale.action(u)) * scale.range.matrix().asDiagonal();
-      const Eigen::VectorXd next = clamped(u + damped_step(J, error, damping_m, u));
-      const Eigen::Vector3d next_error = error_at(next);
-      if (next_error.norm() < error.norm() - kLeastProgress_m) {
-        u = next;
-        error = next_error;
-        damping_m = std::max(kLeastDamping_m, 0.3 * damping_m);
-      } else {
-        damping_m *= 4;
-      }
-    }
+  const double infinity = std::numeric_limits<double>::infinity();
+  InverseKinematicsSolution best{scale.action(u_current), infinity, target.q_RT ? infinity : 0,
+                                 false};
+  double least = infinity;
+  for (int n = 0; n < options.max_starts && !best.is_within_tolerance; ++n) {
+    const Eigen::VectorXd u = converge(*path, scale, residual, options, start_near(u_current, n));
     if (is_avoided(u)) continue;
-    const bool is_within = error.norm() <= options.tolerance_m;
-    if (error.norm() < best.error_m) best = {scale.action(u), error.norm(), is_within};
-    if (is_within) break;
+    const Eigen::VectorXd error = residual(path->predict(scale.action(u)));
+    if (!(error.norm() < least)) continue;
+    least = error.norm();
+    best = {scale.action(u), error.head<3>().norm(), residual.angle_rad(error),
+            residual.is_within_tolerance(error)};
   }
-  if (best.action.size() == 0) best.action = scale.action(u_current);
   return best;
 }
 

@@ -1,6 +1,7 @@
 #pragma once
 
 #include <Eigen/Core>
+#include <Eigen/Geometry>
 #include <optional>
 #include <vector>
 
@@ -13,11 +14,20 @@ struct InverseKinematicsOptions {
   double damping_m = 0;    ///< λ of the first step [m per whole range of a signal]
   int max_iterations = 0;  ///< of one start
   int max_starts = 0;      ///< the first from the current action, the others seeded
+  double tolerance_rad = 0.001;
+  double metres_per_radian = 0.2;  ///< what an error of rotation weighs beside one of position
+};
+
+/// Of a part, in the root's frame.
+struct PoseTarget {
+  Eigen::Vector3d p_RT = Eigen::Vector3d::Zero();  ///< [m]
+  std::optional<Eigen::Quaterniond> q_RT = {};     ///< unit; std::nullopt: however it is turned
 };
 
 struct InverseKinematicsSolution {
   Eigen::VectorXd action;  ///< within the limits, command units
-  double error_m = 0;      ///< distance that remains by the schema
+  /// What remains by the schema; of a position alone error_rad is 0.
+  double error_m = 0, error_rad = 0;
   bool is_within_tolerance = false;
 };
 
@@ -25,27 +35,27 @@ struct InverseKinematicsSolution {
 /// part has no way to the root.
 std::optional<BodySchema> chain_to(const BodySchema& schema, int part);
 
-/// 3×m derivative of a part's origin in the root's frame R [m per command unit]: the upper rows of
-/// the Jacobian of the path from the root are in the part's frame (right perturbation), here turned
-/// by R_RB.
-Eigen::MatrixXd position_jacobian(const KinematicPath& path, const Eigen::VectorXd& action);
+/// 6×m derivative of a part's pose in the root's frame R [m, rad per command unit]: of its origin,
+/// and its angular velocity, both along the axes of R (those of the path's Jacobian, a right
+/// perturbation, are along the part's).
+Eigen::MatrixXd pose_jacobian(const KinematicPath& path, const Eigen::VectorXd& action);
 
-/// An action that brings the origin of `part` to `p_RT` [m, root frame]: damped least squares
-/// (Nakamura and Hanafusa 1986; Buss 2004) in signals scaled by their ranges, the damping governed
-/// as Levenberg and Marquardt do, so that it grows where a singularity lets no step succeed. A
-/// signal at its limit leaves the active set while the step would push it outwards. Tried from
-/// `current`, then from starts ever farther from it, until one converges; start n is the same in
-/// every run. With `avoided` the solution is another than those: at least a tenth of one signal's
-/// range away from each. If none converges, the nearest approach; if all are avoided, `current`
-/// with an infinite error.
+/// An action that brings `part` to the target: damped least squares (Nakamura and Hanafusa 1986;
+/// Buss 2004) of |Δp|² + (w Δφ)², w = metres_per_radian, in signals scaled by their ranges, the
+/// damping governed as Levenberg and Marquardt do, so that it grows where a singularity lets no
+/// step succeed. A signal at its limit leaves the active set while the step would push it outwards.
+/// Tried from `current`, then from starts ever farther from it, until one converges; start n is the
+/// same in every run. With `avoided` the solution is another than those: at least a tenth of one
+/// signal's range away from each. If none converges, the nearest approach; if all are avoided,
+/// `current` with an infinite error.
 ///
 /// Never NaN. `current` beyond the limits is moved to them. @throws std::invalid_argument if sizes
-/// differ or the part has no way to the root.
-InverseKinematicsSolution solve_position(const BodySchema& schema, int part,
-                                         const Eigen::Vector3d& p_RT,
-                                         const std::vector<Signal>& limits,
-                                         const Eigen::VectorXd& current,
-                                         const InverseKinematicsOptions& options,
-                                         const std::vector<Eigen::VectorXd>& avoided = {});
+/// differ, the part has no way to the root, or an orientation is asked of a part of which positions
+/// alone are known.
+InverseKinematicsSolution solve_pose(const BodySchema& schema, int part, const PoseTarget& target,
+                                     const std::vector<Signal>& limits,
+                                     const Eigen::VectorXd& current,
+                                     const InverseKinematicsOptions& options,
+                                     const std::vector<Eigen::VectorXd>& avoided = {});
 
 }  // namespace bodyschema

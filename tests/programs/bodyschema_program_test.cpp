@@ -305,6 +305,64 @@ TEST_F(BodyschemaProgramTest, ALearnedSchemaPredictsWhatItHasNotSeen) {
   EXPECT_NE(text.out.find("median"), std::string::npos);
 }
 
+TEST_F(BodyschemaProgramTest, ReachFindsTheActionOfAPoseOrTheNearest) {
+  ASSERT_EQ(run({"learn", write_robot("train.csv", test::Regime::kFree), "--out", "schema.lcmlog"})
+                .exit_code,
+            0);
+  const Json shown = run({"show", "schema.lcmlog", "--json"}).json();
+  std::vector<std::string> at = {"predict", "schema.lcmlog", "--json", "--action"};
+  for (const Json& signal : shown["signals"])
+    at.push_back(
+        std::to_string(0.7 * signal["upper"].get<double>() + 0.3 * signal["lower"].get<double>()));
+  const auto pose_of = [](const Json& predicted) {
+    for (const Json& part : predicted["parts"])
+      if (part["part"] == 5) return part["X_RB"];
+    return Json();
+  };
+  const Json X_RB = pose_of(run(at).json());
+  const auto add = [](std::vector<std::string> to, const Json& numbers) {
+    for (const Json& number : numbers) to.push_back(number.dump());
+    return to;
+  };
+  std::vector<std::string> reach = {"reach", "schema.lcmlog", "--part",
+                                    "5",     "--json",        "--position"};
+  reach = add(reach, X_RB["position_m"]);
+  EXPECT_TRUE(run(reach).json()["rotation_error_deg"].is_null());
+  reach.push_back("--orientation");
+  reach = add(reach, X_RB["rotation_wxyz"]);
+  const Outcome reached = run(reach);
+  EXPECT_EQ(reached.exit_code, 0);
+  const Json json = reached.json();
+  EXPECT_EQ(json["reached"], true) << json;
+  EXPECT_LE(json["position_error_m"].get<double>(), 1e-4);
+  EXPECT_LE(json["rotation_error_deg"].get<double>(), 0.01);
+  at.resize(4);
+  for (const auto& [name, value] : json["action"].items()) at.push_back(value.dump());
+  const Json found = pose_of(run(at).json());
+  for (int i = 0; i < 3; ++i)
+    EXPECT_NEAR(found["position_m"][i].get<double>(), X_RB["position_m"][i].get<double>(), 1e-3);
+
+  const Outcome far =
+      run({"reach", "schema.lcmlog", "--part", "5", "--json", "--position", "9", "9", "9"});
+  EXPECT_EQ(far.exit_code, 1);
+  const Json nearest = Json::parse(far.out);
+  EXPECT_EQ(nearest["reached"], false);
+  EXPECT_GT(nearest["position_error_m"].get<double>(), 5);
+  EXPECT_NE(nearest["why"].get<std::string>().find("out of reach"), std::string::npos);
+
+  const std::vector<std::string> of_none = {
+      "reach", "schema.lcmlog", "--part", "77", "--position", "0", "0", "0"};
+  expect_failure(of_none, "--part");
+  expect_failure({"reach", "schema.lcmlog", "--part", "5", "--position", "0", "0", "nan"},
+                 "--position");
+  expect_failure({"reach", "schema.lcmlog", "--part", "5", "--position", "0", "0", "0",
+                  "--orientation", "1", "1", "0", "0"},
+                 "unit quaternion");
+  expect_failure(
+      {"reach", "schema.lcmlog", "--part", "5", "--position", "0", "0", "0", "--from", "1"},
+      "--from");
+}
+
 // What a recording says does not hang on the order in which it says it, nor on units and names.
 TEST_F(BodyschemaProgramTest, OrderOfRowsUnitOfStampsAndNamesChangeNothing) {
   const std::string text = text_of(folder_ / write_robot("s.csv"));

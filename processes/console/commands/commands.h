@@ -13,6 +13,8 @@ void add_offline_commands(Arguments console);
 void add_engineer_command(Arguments console);
 /// `urdf`: its inverse, a URDF and placements from a schema file.
 void add_urdf_command(Arguments console);
+/// `reach`: an action that brings a part to a pose by a schema file.
+void add_reach_command(Arguments console);
 /// `refine`: fits all parameters of a schema to a recording, by Ceres; where this was built without
 /// it, says how to get it.
 void add_refine_command(Arguments console);

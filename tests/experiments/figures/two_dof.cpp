@@ -37,7 +37,8 @@ double control_error_rms(const BodySchema& schema, const Trial& trial, int count
   double sum = 0;
   for (int n = 0; n < count; ++n) {
     const Eigen::Vector3d target = position(trial.test_actions[n]);
-    const auto solution = solve_position(schema, to, target, trial.robot.signals, rest, options);
+    const auto solution =
+        solve_pose(schema, to, {.p_RT = target}, trial.robot.signals, rest, options);
     sum += (position(solution.action) - target).squaredNorm();
   }
   return std::sqrt(sum / count);

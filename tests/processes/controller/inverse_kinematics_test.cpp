@@ -68,15 +68,19 @@ TEST(InverseKinematicsTest, ItsJacobianIsTheDerivativeInTheRootsFrame) {
     const Eigen::VectorXd action = random_action(schema, rng);
     for (const int part : schema.parts) {
       const auto path = KinematicPath::between(schema, schema.root, part);
-      const Eigen::MatrixXd J = position_jacobian(*path, action);
+      const Eigen::MatrixXd J = pose_jacobian(*path, action);
       for (Eigen::Index s = 0; s < action.size(); ++s) {
         const double h = 1e-6 * (schema.signals[s].upper - schema.signals[s].lower);
         Eigen::VectorXd more = action, less = action;
         more[s] += h;
         less[s] -= h;
-        const Eigen::Vector3d numeric =
-            (position(schema, part, more) - position(schema, part, less)) / (2 * h);
-        EXPECT_LT((J.col(s) - numeric).norm(), 1e-7 * std::max(1.0, numeric.norm()));
+        const Pose X_more = schema.predict(schema.root, part, more)->X_AB;
+        const Pose X_less = schema.predict(schema.root, part, less)->X_AB;
+        const Eigen::AngleAxisd turn(X_more.linear() * X_less.linear().transpose());
+        Vector6d numeric;
+        numeric << X_more.translation() - X_less.translation(), turn.angle() * turn.axis();
+        numeric /= 2 * h;
+        EXPECT_LT((J.col(s) - numeric).norm(), 1e-6 * std::max(1.0, numeric.norm()));
       }
     }
   }
@@ -88,8 +92,8 @@ TEST(InverseKinematicsTest, EveryPositionOfForwardKinematicsIsFoundFromElsewhere
     const BodySchema schema = seven_joints(i % 10);
     const int part = schema.parts[3 + rng() % (schema.parts.size() - 3)];
     const Eigen::Vector3d p_RT = position(schema, part, random_action(schema, rng));
-    const auto solution =
-        solve_position(schema, part, p_RT, schema.signals, random_action(schema, rng), kOptions);
+    const auto solution = solve_pose(schema, part, {.p_RT = p_RT}, schema.signals,
+                                     random_action(schema, rng), kOptions);
     EXPECT_TRUE(solution.is_within_tolerance) << i << ": " << solution.error_m;
     expect_within_limits(schema, solution.action);
     EXPECT_NEAR((position(schema, part, solution.action) - p_RT).norm(), solution.error_m, 1e-9);
@@ -108,19 +112,79 @@ TEST(InverseKinematicsTest, EveryPositionIsFoundAlongOneEdgeOfAllJointsToo) {
     ASSERT_EQ(schema.edges[0].joints.size(), 6U);
     const Eigen::Vector3d p_RT = position(schema, 8, random_action(schema, rng));
     const auto solution =
-        solve_position(schema, 8, p_RT, schema.signals, random_action(schema, rng), kOptions);
+        solve_pose(schema, 8, {.p_RT = p_RT}, schema.signals, random_action(schema, rng), kOptions);
     EXPECT_TRUE(solution.is_within_tolerance) << i << ": " << solution.error_m;
     expect_within_limits(schema, solution.action);
     EXPECT_LT((position(schema, 8, solution.action) - p_RT).norm(), kOptions.tolerance_m);
   }
 }
 
+PoseTarget pose(const BodySchema& schema, int part, const Eigen::VectorXd& action) {
+  const Pose X_RB = schema.predict(schema.root, part, action)->X_AB;
+  return {X_RB.translation(), Eigen::Quaterniond(X_RB.linear())};
+}
+
+TEST(InverseKinematicsTest, PosesOfForwardKinematicsAreFoundFromElsewhere) {
+  InverseKinematicsOptions options = kOptions;
+  options.max_starts = 100;
+  Rng rng(4);
+  constexpr int kTargets = 200;
+  int num_found = 0;
+  for (int i = 0; i < kTargets; ++i) {
+    const BodySchema schema = seven_joints(i % 10);
+    const int part = schema.parts[3 + rng() % (schema.parts.size() - 3)];
+    const PoseTarget target = pose(schema, part, random_action(schema, rng));
+    const auto solution =
+        solve_pose(schema, part, target, schema.signals, random_action(schema, rng), options);
+    expect_within_limits(schema, solution.action);
+    const PoseTarget reached = pose(schema, part, solution.action);
+    EXPECT_NEAR((reached.p_RT - target.p_RT).norm(), solution.error_m, 1e-9);
+    EXPECT_NEAR(reached.q_RT->angularDistance(*target.q_RT), solution.error_rad, 1e-7);
+    if (!solution.is_within_tolerance) continue;
+    ++num_found;
+    EXPECT_LE(solution.error_m, options.tolerance_m);
+    EXPECT_LE(solution.error_rad, options.tolerance_rad);
+  }
+  EXPECT_GE(num_found, 0.99 * kTargets);
+}
+
+/// Joint a puts the end anywhere on a circle, and turns it as much: an orientation that does not
+/// belong to the position is met half-way, as far as a radian weighs.
+TEST(InverseKinematicsTest, WhereAPoseIsOutOfReachPositionAndRotationAreTradedByTheirWeight) {
+  BodySchema schema = planar();
+  schema.parts = {1, 2};
+  schema.edges.pop_back();
+  const PoseTarget target{{1, 0, 0},
+                          Eigen::Quaterniond(Eigen::AngleAxisd(0.1, Eigen::Vector3d::UnitZ()))};
+  for (const double weight : {0.01, 1.0, 100.0}) {
+    InverseKinematicsOptions options = kOptions;
+    options.metres_per_radian = weight;
+    const auto solution =
+        solve_pose(schema, 2, target, schema.signals, Eigen::Vector2d(20, 0), options);
+    EXPECT_FALSE(solution.is_within_tolerance);
+    // min (2 sin φ/2)² + w² (0.1 − φ)²; 2 sin φ/2 is φ to 0.04 %.
+    const double phi = 0.1 * weight * weight / (1 + weight * weight);
+    EXPECT_NEAR(solution.action[0] * kDegree, phi, 1e-3 * 0.1);
+  }
+}
+
+TEST(InverseKinematicsTest, NoOrientationIsAskedOfAPartOfWhichPositionsAloneAreKnown) {
+  BodySchema schema = planar();
+  schema.position_parts = {3};
+  const PoseTarget target = pose(schema, 3, Eigen::Vector2d(10, 0.2));
+  const Eigen::Vector2d current(0, 0);
+  EXPECT_THROW(solve_pose(schema, 3, target, schema.signals, current, kOptions),
+               std::invalid_argument);
+  EXPECT_TRUE(solve_pose(schema, 3, {.p_RT = target.p_RT}, schema.signals, current, kOptions)
+                  .is_within_tolerance);
+}
+
 TEST(InverseKinematicsTest, AtTheTargetNothingMoves) {
   const BodySchema schema = seven_joints(3);
   Rng rng(3);
   const Eigen::VectorXd action = random_action(schema, rng);
-  const auto solution =
-      solve_position(schema, 10, position(schema, 10, action), schema.signals, action, kOptions);
+  const auto solution = solve_pose(schema, 10, {.p_RT = position(schema, 10, action)},
+                                   schema.signals, action, kOptions);
   EXPECT_LT((solution.action - action).norm(), 1e-9);
   EXPECT_TRUE(solution.is_within_tolerance);
 }
@@ -129,7 +193,7 @@ TEST(InverseKinematicsTest, SignalsThatDoNotMoveThePartStayWhereTheyAre) {
   const BodySchema schema = planar();
   const Eigen::Vector2d current(10, 0.3);
   const Eigen::Vector3d p_RT(std::cos(0.5), std::sin(0.5), 0);
-  const auto solution = solve_position(schema, 2, p_RT, schema.signals, current, kOptions);
+  const auto solution = solve_pose(schema, 2, {.p_RT = p_RT}, schema.signals, current, kOptions);
   EXPECT_TRUE(solution.is_within_tolerance);
   EXPECT_NEAR(solution.action[1], 0.3, 1e-15);
   EXPECT_NEAR(solution.action[0], 0.5 / kDegree, 0.01);
@@ -149,8 +213,8 @@ TEST(InverseKinematicsTest, OutOfReachTheNearestApproachIsTold) {
   Rng rng(4);
   for (const auto& c : cases) {
     for (int i = 0; i < 10; ++i) {
-      const auto solution =
-          solve_position(schema, 3, c.p_RT, schema.signals, random_action(schema, rng), kOptions);
+      const auto solution = solve_pose(schema, 3, {.p_RT = c.p_RT}, schema.signals,
+                                       random_action(schema, rng), kOptions);
       EXPECT_FALSE(solution.is_within_tolerance);
       EXPECT_NEAR(solution.error_m, c.error_m, 1e-3) << c.p_RT.transpose();
       expect_within_limits(schema, solution.action);
@@ -161,8 +225,8 @@ TEST(InverseKinematicsTest, OutOfReachTheNearestApproachIsTold) {
 TEST(InverseKinematicsTest, TheStretchedArmLeavesItsSingularity) {
   const BodySchema schema = planar();
   for (const double reach : {1.5, 1.4999, 1.3, 1.2}) {
-    const auto solution = solve_position(schema, 3, Eigen::Vector3d(reach, 0, 0), schema.signals,
-                                         Eigen::Vector2d(0, 0), kOptions);
+    const auto solution = solve_pose(schema, 3, {.p_RT = Eigen::Vector3d(reach, 0, 0)},
+                                     schema.signals, Eigen::Vector2d(0, 0), kOptions);
     EXPECT_TRUE(solution.is_within_tolerance) << reach << ": " << solution.error_m;
     expect_within_limits(schema, solution.action);
   }
@@ -182,7 +246,7 @@ TEST(InverseKinematicsTest, NothingIsEverNotANumber) {
     for (Signal& limit : limits) limit.upper = std::max(limit.upper, limit.lower + 1e-9);
     const Eigen::VectorXd beyond = 100 * random_action(schema, rng);
     const Eigen::Vector3d p_RT(test::uniform(rng, -900, 900), test::uniform(rng, -1, 1), 0);
-    const auto solution = solve_position(schema, 10, p_RT, limits, beyond, kOptions);
+    const auto solution = solve_pose(schema, 10, {.p_RT = p_RT}, limits, beyond, kOptions);
     schema.signals = limits;
     expect_within_limits(schema, solution.action);
     EXPECT_TRUE(std::isfinite(solution.error_m));
@@ -197,7 +261,7 @@ TEST(InverseKinematicsTest, OtherSolutionsDifferFromThoseAvoided) {
   std::vector<Eigen::VectorXd> avoided;
   for (int i = 0; i < 5; ++i) {
     const auto solution =
-        solve_position(schema, 10, p_RT, schema.signals, current, kOptions, avoided);
+        solve_pose(schema, 10, {.p_RT = p_RT}, schema.signals, current, kOptions, avoided);
     ASSERT_TRUE(solution.is_within_tolerance) << i;
     for (const Eigen::VectorXd& other : avoided) {
       double farthest = 0;
@@ -215,7 +279,7 @@ TEST(InverseKinematicsTest, TheSameQuestionGetsTheSameAnswer) {
   Rng rng(7);
   const Eigen::VectorXd current = random_action(schema, rng);
   const auto ask = [&] {
-    return solve_position(schema, 10, {5, 5, 5}, schema.signals, current, kOptions).action;
+    return solve_pose(schema, 10, {.p_RT = {5, 5, 5}}, schema.signals, current, kOptions).action;
   };
   EXPECT_EQ(ask(), ask());
 }
@@ -227,11 +291,11 @@ TEST(InverseKinematicsTest, APartWithoutAWayToTheRootIsRefused) {
   EXPECT_TRUE(chain_to(schema, 2));
   EXPECT_TRUE(chain_to(schema, 1));
   EXPECT_THROW(
-      solve_position(schema, 3, {1, 0, 0}, schema.signals, Eigen::Vector2d(0, 0), kOptions),
+      solve_pose(schema, 3, {.p_RT = {1, 0, 0}}, schema.signals, Eigen::Vector2d(0, 0), kOptions),
       std::invalid_argument);
-  EXPECT_THROW(
-      solve_position(schema, 2, {1, 0, 0}, schema.signals, Eigen::Vector3d(0, 0, 0), kOptions),
-      std::invalid_argument);
+  EXPECT_THROW(solve_pose(schema, 2, {.p_RT = {1, 0, 0}}, schema.signals, Eigen::Vector3d(0, 0, 0),
+                          kOptions),
+               std::invalid_argument);
 }
 
 }  // namespace

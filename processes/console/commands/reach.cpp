@@ -1,0 +1,94 @@
+#include <fmt/format.h>
+
+#include <cmath>
+#include <memory>
+#include <string>
+#include <vector>
+
+#include "common/geometry/angle.h"
+#include "processes/console/commands/commands.h"
+#include "processes/console/commands/files.h"
+#include "processes/console/views/reach_view.h"
+
+namespace bodyschema {
+namespace {
+
+struct ReachArguments {
+  std::string schema;
+  int part = 0;
+  std::vector<double> position, orientation, from;
+  bool json = false;
+};
+
+void require_finite(const std::string& option, const std::vector<double>& numbers) {
+  for (const double number : numbers)
+    if (!std::isfinite(number)) refuse_argument(option, "expected finite numbers");
+}
+
+PoseTarget target_of(const ReachArguments& arguments) {
+  require_finite("--position", arguments.position);
+  require_finite("--orientation", arguments.orientation);
+  PoseTarget target;
+  target.p_RT = Eigen::Vector3d::Map(arguments.position.data());
+  if (arguments.orientation.empty()) return target;
+  const std::vector<double>& q = arguments.orientation;
+  target.q_RT = Eigen::Quaterniond(q[0], q[1], q[2], q[3]);
+  if (std::abs(target.q_RT->norm() - 1) > 0.01)
+    refuse_argument("--orientation", "expected a unit quaternion w x y z");
+  target.q_RT->normalize();
+  return target;
+}
+
+Eigen::VectorXd start_of(const ReachArguments& arguments, const BodySchema& schema) {
+  const auto num_signals = static_cast<Eigen::Index>(schema.signals.size());
+  Eigen::VectorXd start(num_signals);
+  for (Eigen::Index s = 0; s < num_signals; ++s) {
+    const Signal& signal = schema.signals[static_cast<std::size_t>(s)];
+    start(s) = 0.5 * (signal.lower + signal.upper);
+  }
+  if (arguments.from.empty()) return start;
+  require_finite("--from", arguments.from);
+  if (arguments.from.size() != schema.signals.size())
+    refuse_argument(
+        "--from", fmt::format("expected {} values, in the schema's order", schema.signals.size()));
+  return Eigen::VectorXd::Map(arguments.from.data(), num_signals);
+}
+
+void run_reach(const ReachArguments& arguments) {
+  const BodySchema schema = load_schema(arguments.schema);
+  const PoseTarget target = target_of(arguments);
+  if (!schema.has_part(arguments.part) || arguments.part == schema.root ||
+      !schema.predict(schema.root, arguments.part, start_of(arguments, schema)))
+    refuse_argument("--part", fmt::format("the schema connects no part {} with its root {}",
+                                          arguments.part, schema.root));
+  if (target.q_RT && !schema.has_rotation(arguments.part))
+    refuse_argument("--orientation",
+                    fmt::format("of part {} positions alone are known", arguments.part));
+  const Reach reach = reach_of(schema, arguments.part, target, start_of(arguments, schema));
+  print(arguments.json, reach_json(schema, reach), reach_text(schema, reach));
+  if (!reach.solution.is_within_tolerance) end_as_failed();
+}
+
+}  // namespace
+
+void add_reach_command(Arguments console) {
+  const auto arguments = std::make_shared<ReachArguments>();
+  Arguments reach = console.add_subcommand(
+      "reach", "An action that brings a part to a pose by a schema, or the nearest");
+  reach.add_option("SCHEMA", arguments->schema, "Schema file").required();
+  reach.add_option("--part", arguments->part, "Which part").required();
+  reach.add_option("--position", arguments->position, "In the root's frame [m]")
+      .expected(3)
+      .type_name("X Y Z")
+      .required();
+  reach.add_option("--orientation", arguments->orientation, "Unit quaternion, in the root's frame")
+      .expected(4)
+      .type_name("W X Y Z");
+  reach.add_option("--from", arguments->from,
+                   "The action that it begins at, a value for each signal; of several answers one "
+                   "near it is found first; the middle of the ranges if not given");
+  reach.add_flag("--json", arguments->json, "Print JSON");
+  reach.callback([arguments] { run_reach(*arguments); });
+}
+
+}  // namespace bodyschema

@@ -1,0 +1,91 @@
+#include "processes/console/views/reach_view.h"
+
+#include <fmt/format.h>
+
+#include <vector>
+
+#include "common/geometry/angle.h"
+#include "common/kinematics/kinematic_tree.h"
+#include "common/schema/standard_deviations.h"
+#include "common/text/text.h"
+#include "processes/console/views/structure_view.h"
+
+namespace bodyschema {
+namespace {
+
+constexpr InverseKinematicsOptions kOptions{.tolerance_m = 1e-4,
+                                            .damping_m = 0.05,
+                                            .max_iterations = 100,
+                                            .max_starts = 100,
+                                            .tolerance_rad = 0.01 * kDegree};
+constexpr double kAtLimit = 1e-9;  // of a range
+
+// Signals that move the part and are at an end of their range.
+std::vector<int> at_limits(const BodySchema& schema, int part, const Eigen::VectorXd& action) {
+  std::vector<bool> moves(schema.signals.size());
+  const KinematicTree tree(schema.edges, schema.root);
+  for (const int node : tree.path_to(tree.node_of(part)))
+    for (const int s : schema.edges[tree.nodes()[node].edge].signals())
+      moves[static_cast<std::size_t>(s)] = true;
+  std::vector<int> result;
+  for (std::size_t s = 0; s < moves.size(); ++s) {
+    const Signal& signal = schema.signals[s];
+    const double value = action(static_cast<Eigen::Index>(s));
+    const double margin = kAtLimit * (signal.upper - signal.lower);
+    if (moves[s] && (value <= signal.lower + margin || value >= signal.upper - margin))
+      result.push_back(static_cast<int>(s));
+  }
+  return result;
+}
+
+}  // namespace
+
+Reach reach_of(const BodySchema& schema, int part, const PoseTarget& target,
+               const Eigen::VectorXd& start) {
+  Reach reach;
+  reach.part = part;
+  reach.has_orientation = target.q_RT.has_value();
+  reach.solution = solve_pose(schema, part, target, schema.signals, start, kOptions);
+  const Eigen::VectorXd& action = reach.solution.action;
+  if (const auto predicted = schema.predict(schema.root, part, action))
+    reach.sd = deviations_of(predicted->covariance);
+  if (reach.solution.is_within_tolerance) {
+    reach.why = "reached";
+    return reach;
+  }
+  const std::vector<int> limits = at_limits(schema, part, action);
+  reach.why = fmt::format("out of reach; this is the nearest of {} starts", kOptions.max_starts);
+  if (!limits.empty()) reach.why += ", at the limits of " + listed(signal_names(schema, limits));
+  return reach;
+}
+
+Json reach_json(const BodySchema& schema, const Reach& reach) {
+  const auto known = [](double value) { return value > 0 ? Json(value) : Json(); };
+  Json json = {{"reached", reach.solution.is_within_tolerance},
+               {"why", reach.why},
+               {"action", Json::object()},
+               {"position_error_m", reach.solution.error_m},
+               {"rotation_error_deg",
+                reach.has_orientation ? Json(reach.solution.error_rad / kDegree) : Json()},
+               {"position_sd_m", known(reach.sd.position_m)},
+               {"rotation_sd_deg", known(reach.sd.rotation_rad / kDegree)}};
+  for (std::size_t s = 0; s < schema.signals.size(); ++s)
+    json["action"][schema.signals[s].name] = reach.solution.action(static_cast<Eigen::Index>(s));
+  return json;
+}
+
+std::string reach_text(const BodySchema& schema, const Reach& reach) {
+  std::string text = fmt::format("Part {}: {}; off by {:.2f} mm", reach.part, reach.why,
+                                 1e3 * reach.solution.error_m);
+  if (reach.has_orientation) text += fmt::format(", {:.3f}°", reach.solution.error_rad / kDegree);
+  if (reach.sd.position_m > 0)
+    text += fmt::format("; known to {:.2f} mm, {:.3f}° per axis", 1e3 * reach.sd.position_m,
+                        reach.sd.rotation_rad / kDegree);
+  text += "\n";
+  for (std::size_t s = 0; s < schema.signals.size(); ++s)
+    text += fmt::format("  {:<12} {:.6g}\n", schema.signals[s].name,
+                        reach.solution.action(static_cast<Eigen::Index>(s)));
+  return text;
+}
+
+}  // namespace bodyschema
