@@ -193,7 +193,6 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   result.num_observations = static_cast<int>(problem.data().size());
   result.num_iterations = problem.num_iterations();
   result.noise_scale = problem.scale();
-  result.gauge_tag = problem.gauge_tag();
   result.parameters = words.parameters();
   result.undetermined = words.undetermined();
   result.correlations = words.correlations(kMostCorrelations);

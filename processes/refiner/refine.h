@@ -78,7 +78,6 @@ struct Refinement {
   int num_iterations = 0;
   /// The residuals are this many times as large as told (≥ 1).
   double noise_scale = 1;
-  int gauge_tag = -1;  ///< defines the root's frame; −1: the root's poses do
   std::vector<RefinedParameter> parameters;
   std::vector<std::string> undetermined;           ///< directions, in words
   std::vector<ParameterCorrelation> correlations;  ///< above kHighCorrelation, the highest first
@@ -98,8 +97,8 @@ inline constexpr double kHighCorrelation = 0.95;
 /// command warps and signals' limits stay as they are. TEST samples are judged alone. The order of
 /// samples changes nothing.
 ///
-/// Gauge: of the tags of the root the one seen most often stays where the rig says it is; the scale
-/// is the mean of all tags' sizes, weighed by their priors, for images do not tell it.
+/// Gauge: a part's frame is where its tags are closest to the rig's claims, and the scale is the
+/// mean of all tags' sizes, all weighed by their priors, for images tell neither.
 /// @throws std::invalid_argument for people: nothing to fit, corners missing that are asked for,
 /// another rig, numbers that are not finite.
 Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,

@@ -41,7 +41,7 @@ RefinementProblem::RefinementProblem(const BodySchema& schema,
   add_plays();
   add_instants(samples);
   if (rig_) {
-    add_tags(samples);
+    add_tags();
     add_lens();
   }
   place_blocks();
@@ -144,14 +144,7 @@ void RefinementProblem::add_instants(const std::vector<RefinerSample>& samples) 
   }
 }
 
-void RefinementProblem::add_tags(const std::vector<RefinerSample>& samples) {
-  std::map<int, int> num_seen;
-  for (const RefinerSample& sample : samples)
-    for (const TagSight& sight : sample.tags) ++num_seen[sight.tag];
-  for (const TagPlacement& tag : rig_->markers.tags)
-    if (tag.part == schema_.root && num_seen[tag.id] > 0 &&
-        (gauge_tag_ < 0 || num_seen[tag.id] > num_seen[gauge_tag_]))
-      gauge_tag_ = tag.id;
+void RefinementProblem::add_tags() {
   for (const TagPlacement& tag : rig_->markers.tags) {
     ParameterBlock& block = storage_.emplace_back();
     block.kind = ParameterBlock::Kind::kTag;
@@ -159,10 +152,10 @@ void RefinementProblem::add_tags(const std::vector<RefinerSample>& samples) {
     block.add(tag.X_BM.value_or(Pose::Identity()));
     block.add(1.0);
     // Without a placement the tag is the part's frame.
-    if (tag.id == gauge_tag_ || !tag.X_BM)
-      block.free = {6};
-    else
+    if (tag.X_BM)
       block.free = {0, 1, 2, 3, 4, 5, 6};
+    else
+      block.free = {6};
     block.is_refined = options_.placements;
     tags_[tag.id] = &block;
   }

@@ -53,8 +53,6 @@ class RefinementProblem {
   double* memory_of(const ParameterBlock* block) { return &memory_[memory_offsets_.at(block)]; }
   double scale() const { return scale_.value; }
   int num_iterations() const { return num_iterations_; }
-  /// Tag of the root that defines its frame; −1 without corners.
-  int gauge_tag() const { return gauge_tag_; }
   /// Of each part the tag that was seen most often.
   std::vector<int> frame_tags() const;
   bool root_moves() const { return root_moves_; }
@@ -85,7 +83,7 @@ class RefinementProblem {
   void add_paths();
   void add_plays();
   void add_instants(const std::vector<RefinerSample>& samples);
-  void add_tags(const std::vector<RefinerSample>& samples);
+  void add_tags();
   void add_lens();
   void add_corners(const RefinerSample& sample);
   void add_poses(const RefinerSample& sample);
@@ -112,7 +110,6 @@ class RefinementProblem {
   Eigen::VectorXd play_sd_, play_start_;
   std::map<int, ParameterBlock*> edges_, tags_;  // by index, by id
   ParameterBlock* lens_block_ = nullptr;
-  int gauge_tag_ = -1;
   std::vector<double> memory_;
   std::map<const ParameterBlock*, std::size_t> memory_offsets_;
   NoiseScale scale_;

@@ -271,9 +271,7 @@ struct RigRow {
   std::vector<double> squared;  ///< d² of the true pose by the predicted covariance, unaligned
   TagErrors tags;
 
-  /// `X_RG`: the frame that the model calls the root's, in the true one.
-  void add_errors(const BodySchema& schema, const Seen& seen, int end_effector,
-                  const Pose& X_RG = Pose::Identity()) {
+  void add_errors(const BodySchema& schema, const Seen& seen, int end_effector) {
     const JudgedErrors errors = judge(schema, seen.held_out, seen.truth);
     for (const PartErrors& part : errors.aligned_parts)
       if (part.part == end_effector) {
@@ -285,8 +283,7 @@ struct RigRow {
     if (errors.alignment) scale.push_back(errors.alignment->scale);
     for (const ActionPoseSample& exact : seen.held_out) {
       const auto predicted = schema.predict(schema.root, end_effector, exact.action);
-      const Pose truth =
-          X_RG.inverse() * exact.find(schema.root)->X_CB.inverse() * exact.find(end_effector)->X_CB;
+      const Pose truth = exact.find(schema.root)->X_CB.inverse() * exact.find(end_effector)->X_CB;
       squared.push_back(
           squared_mahalanobis(log(predicted->X_AB.inverse() * truth), predicted->covariance));
     }
@@ -333,11 +330,7 @@ void refine_rig(const std::string& name, const std::filesystem::path& folder, bo
       const std::clock_t refining = std::clock();
       const Refinement result = refine(schema, seen.samples, rig, options);
       RigRow& row = is_all ? all : refined;
-      Pose X_RG = Pose::Identity();
-      if (result.gauge_tag >= 0)
-        X_RG = *truth.markers.find(result.gauge_tag)->X_BM *
-               rig.markers.find(result.gauge_tag)->X_BM->inverse();
-      row.add_errors(result.schema, seen, signals.end_effector_part, X_RG);
+      row.add_errors(result.schema, seen, signals.end_effector_part);
       row.seconds.push_back(seconds_since(refining));
       row.px.push_back(result.after.px_rms.value_or(NAN));
       if (!is_all) learned.px.push_back(result.before.px_rms.value_or(NAN));

@@ -57,11 +57,9 @@ Json tag_json(const TagPlacement& tag) {
 }
 
 std::string gauge_text(const Refinement& result) {
-  if (result.gauge_tag < 0) return "the root's frame is where its poses are seen";
-  return fmt::format(
-      "the root's frame is that of its tag {} (as the rig says); the scale is the mean of all "
-      "tags' sizes, weighed by their priors",
-      result.gauge_tag);
+  if (!result.used_corners) return "a part's frame is where its poses are seen";
+  return "a part's frame is where its tags are closest to where the rig says that they sit; the "
+         "scale is the mean of all tags' sizes, weighed by their priors";
 }
 
 /// Over all parts, root mean squares.
@@ -160,7 +158,7 @@ Json refinement_json(const Refinement& result, const std::optional<RigCalibratio
   json["iterations"] = result.num_iterations;
   json["seconds"] = result.seconds;
   json["noise_scale"] = result.noise_scale;
-  json["gauge"] = {{"tag", known(result.gauge_tag)}, {"text", gauge_text(result)}};
+  json["gauge"] = gauge_text(result);
   json["before"] = held_out_json(result.before);
   json["after"] = held_out_json(result.after);
   json["parameters"] = array_of(result.parameters, parameter_json);

@@ -98,9 +98,30 @@ TEST(RefineCorners, FindPlacementsAndLensFromExactCorners) {
     mean += tag.size_m / c.rig.markers.find(tag.id)->size_m /
             static_cast<double>(c.rig.markers.tags.size());
   EXPECT_NEAR(mean, 1, 2e-4);
-  EXPECT_EQ(result.gauge_tag >= 0, true);
-  EXPECT_TRUE(result.rig.markers.find(result.gauge_tag)
-                  ->X_BM->isApprox(*c.rig.markers.find(result.gauge_tag)->X_BM, 1e-12));
+}
+
+TEST(RefineCorners, PutThePartsFramesWhereTheirTagsAreClosestToTheClaims) {
+  const Case c(1, 60, 0);
+  const RefineOptions options = all();
+  const Markers found = refine(c.start, c.samples, c.rig, options).rig.markers;
+  // Of the priors, where the frame of a part is shifted on it.
+  const auto cost = [&](int part, const Vector6d& shift) {
+    double sum = 0;
+    for (const TagPlacement& tag : found.tags) {
+      if (tag.part != part) continue;
+      const Vector6d error =
+          log(c.rig.markers.find(tag.id)->X_BM->inverse() * exp(shift) * *tag.X_BM);
+      sum += error.head<3>().squaredNorm() / std::pow(options.config.tags.position_m, 2) +
+             error.tail<3>().squaredNorm() / std::pow(options.config.tags.rotation_rad, 2);
+    }
+    return sum;
+  };
+  for (const int part : found.parts())
+    for (int direction = 0; direction < 6; ++direction)
+      for (const double sign : {-1, 1})
+        EXPECT_GT(cost(part, sign * (direction < 3 ? 1e-4 : 1e-3) * Vector6d::Unit(direction)),
+                  cost(part, Vector6d::Zero()))
+            << part << " " << direction;
 }
 
 TEST(RefineCorners, ReachTheNoise) {
