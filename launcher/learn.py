@@ -28,7 +28,11 @@ def rig_folder(place, rig):
 
 
 def processes(place, folder):
-    return group_file.processes(place.source / "config" / "group.conf", folder)
+    commands = group_file.processes(place.source / "config" / "group.conf", folder)
+    if "refiner" in commands and not (place.bin / "refiner").exists():
+        say("built without Ceres: the group runs without its refiner (apt-get install libceres-dev, then ./run clean)")
+        del commands["refiner"]
+    return commands
 
 
 def pick(commands, names):
@@ -129,7 +133,7 @@ def replay(place, log, rig, speed):
             folder = rig_folder(place, rig)
     source = asked_of_console(place, "log", log, "--replay-from")
     run, lock = run_folder.begin(place, folder)
-    names = ["structure_learner", "model_monitor", "report", "log"]
+    names = ["structure_learner", "model_monitor", "refiner", "report", "log"]
     is_played = float(speed) > 0
     if is_played and source != "SAMPLE":
         names.insert(0, "observer")

@@ -19,6 +19,7 @@ void for_each_channel(Visit visit) {
   visit(kMotionStatus);
   visit(kPoseTarget);
   visit(kProcessInfo);
+  visit(kRefinedSchema);
   visit(kSample);
   visit(kSampleRequest);
   visit(kSimState);

@@ -32,6 +32,7 @@ inline constexpr Channel<marker_poses_t> kMarkerPoses{"MARKER_POSES"};
 inline constexpr Channel<sample_t> kSample{"SAMPLE"};
 inline constexpr Channel<sample_request_t> kSampleRequest{"SAMPLE_REQUEST"};
 inline constexpr Channel<body_schema_t> kLearnedSchema{"LEARNED_SCHEMA"};
+inline constexpr Channel<body_schema_t> kRefinedSchema{"REFINED_SCHEMA"};
 inline constexpr Channel<body_schema_t> kBodySchema{"BODY_SCHEMA"};
 inline constexpr Channel<model_health_t> kModelHealth{"MODEL_HEALTH"};
 inline constexpr Channel<pose_target_t> kPoseTarget{"POSE_TARGET"};

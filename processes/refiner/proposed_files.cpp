@@ -3,19 +3,12 @@
 #include <fmt/format.h>
 
 #include <array>
-#include <fstream>
-#include <stdexcept>
 
+#include "common/bus/event_log.h"
 #include "processes/refiner/calibrated_lens.h"
 
 namespace bodyschema {
 namespace {
-
-void write(const std::filesystem::path& file, const std::string& text) {
-  std::ofstream stream(file);
-  stream << text;
-  if (!stream.flush()) throw std::runtime_error("--proposed: cannot write " + file.string());
-}
 
 std::string placement_text(const std::optional<Pose>& X_BM) {
   if (!X_BM) return "none";
@@ -54,8 +47,8 @@ std::string camera_text(const CameraCalibration& found) {
 
 void write_proposed_files(const RigCalibration& rig, const std::filesystem::path& folder) {
   std::filesystem::create_directories(folder);
-  write(folder / "markers.yaml", markers_text(rig.markers));
-  write(folder / "camera_info.yaml", camera_text(rig.camera));
+  write_file_atomically(folder / "markers.yaml", markers_text(rig.markers));
+  write_file_atomically(folder / "camera_info.yaml", camera_text(rig.camera));
 }
 
 }  // namespace bodyschema

@@ -7,6 +7,12 @@ namespace bodyschema {
 RefinerConfig RefinerConfig::load(const std::filesystem::path& file) {
   const Yaml yaml = Yaml::load(file);
   RefinerConfig config;
+  config.enabled = yaml.boolean("enabled");
+  config.refine_every = static_cast<int>(yaml.integer("refine_every", 1, 1'000'000));
+  config.placements = yaml.boolean("placements");
+  config.intrinsics = yaml.boolean("intrinsics");
+  if (!config.placements && !config.intrinsics)
+    throw yaml.error("intrinsics", "is false, and so is placements: nothing is left to refine");
   config.tags.position_m = yaml.number("tag_position_m", 1e-6, 1);
   config.tags.rotation_rad = yaml.number("tag_rotation_deg", 1e-3, 90) * kDegree;
   config.tags.size_share = yaml.number("tag_size_share", 1e-6, 0.5);

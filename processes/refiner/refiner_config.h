@@ -7,9 +7,14 @@
 
 namespace bodyschema {
 
-/// refiner.yaml: how far a rig's tags and lens may be from what its files claim, 1 σ each, and how
-/// much is fitted. The defaults hold where a rig has no such file.
+/// refiner.yaml: what the process refines and when; how far a rig's tags and lens may be from what
+/// its files claim, 1 σ each; how much is fitted. The defaults hold where a rig has no such file.
 struct RefinerConfig {
+  bool enabled = false;   ///< the group has a refiner
+  int refine_every = 50;  ///< samples
+  /// What the process fits beside the schema, one of them at least: poses alone would tell it
+  /// nothing that the learner does not know.
+  bool placements = true, intrinsics = true;
   /// A ruler's and a printer's accuracy.
   TagCalibration tags = {.position_m = 0.0005, .rotation_rad = 0.3 * kDegree, .size_share = 0.003};
   /// Of a calibration with a board, of each axis.

@@ -26,6 +26,8 @@ struct RefinerSample {
   std::vector<TagSight> tags;
 };
 
+inline std::int64_t index_of(const RefinerSample& seen) { return seen.sample.sample_index; }
+
 RefinerSample refiner_sample(const sample_t& message);
 /// Samples without corners.
 std::vector<RefinerSample> refiner_samples(const std::vector<ActionPoseSample>& samples);

@@ -1,11 +1,12 @@
 """./run with groups that end in every way."""
 
 import os
+import shutil
 import signal
 import unittest
 from pathlib import Path
 
-from support import STUBBORN, GroupTest
+from support import SOURCE, STUBBORN, GroupTest
 
 from launcher import run_folder
 
@@ -79,6 +80,27 @@ class CalibrationErrors(GroupTest):
 
     def test_are_not_those_of_a_replay(self):
         self.assertIn("--ideal has no meaning with --replay", self.run_to_end("--replay", "log", "--ideal")[0])
+
+
+class TheRefiner(GroupTest):
+    def words_of_a_run(self, enabled):
+        rig = self.folder / f"rig {enabled}"
+        shutil.copytree(SOURCE / "config" / "arm2", rig)
+        file = rig / "refiner.yaml"
+        file.write_text(file.read_text().replace("enabled: false", f"enabled: {enabled}"))
+        run = self.start("--rig", str(rig))
+        (self.current / "learned").touch()
+        self.assertEqual(self.wait_for_end(run), 0)
+        return self.words()
+
+    def test_runs_where_the_rig_enables_it(self):
+        self.write_program("refiner", '#!/bin/sh\necho "$@"\nwhile :; do sleep 0.1; done\n')
+        self.words_of_a_run("true")
+        self.assertIn("--refined", (self.current / "refiner.log").read_text())
+
+    def test_is_missed_only_where_the_rig_enables_it(self):
+        self.assertIn("built without Ceres", self.words_of_a_run("true"))
+        self.assertNotIn("Ceres", self.words_of_a_run("false"))
 
 
 class OthersEndTheGroup(GroupTest):

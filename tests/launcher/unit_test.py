@@ -59,6 +59,18 @@ class TheGroupFile(Folder):
         )
         self.assertEqual(group_file.speakers(self.folder, ["log", "controller"]), ["controller"])
 
+    def test_leaves_out_what_the_rig_disables(self):
+        file = self.folder / "group.conf"
+        file.write_text("refiner? refines\n")
+        for text, names in [
+            ("enabled: false   # off\n", []),
+            ("placements: true\nenabled: false\n", []),
+            ("enabled: true\n", ["refiner"]),
+            ("# enabled: false\nis_enabled: false\n", ["refiner"]),
+        ]:
+            (self.folder / "refiner.yaml").write_text(text)
+            self.assertEqual(list(group_file.processes(file, self.folder)), names, text)
+
     def test_each_shipped_rig_has_a_group(self):
         for rig in ("arm2", "arm4", "arm6_ends", "arm7"):
             group = group_file.processes(SOURCE / "config" / "group.conf", SOURCE / "config" / rig)

@@ -36,6 +36,7 @@ void for_each_channel(Visit visit) {
   visit(kMarkerPoses, example_marker_poses());
   visit(kSample, example_sample());
   visit(kLearnedSchema, example_body_schema());
+  visit(kRefinedSchema, example_body_schema());
   visit(kBodySchema, example_body_schema());
   visit(kModelHealth, example_model_health());
   visit(kSampleRequest, example_sample_request());

@@ -107,7 +107,9 @@ TEST(Mutation, NoDamagedMessageCrashesTheDecoderOrMakesItAllocateWildly) {
   Rng rng(20240229);
   for_each_channel([&](const auto& channel, const auto& message) {
     using Message = std::decay_t<decltype(message)>;
-    if (std::string(channel.name) == kLearnedSchema.name) return;  // BODY_SCHEMA's type
+    // BODY_SCHEMA's type.
+    if (std::string(channel.name) == kLearnedSchema.name) return;
+    if (std::string(channel.name) == kRefinedSchema.name) return;
     const Bytes original = encode(channel, message);
     ASSERT_TRUE(decodes<Message>(original));
     int num_refused = 0;

@@ -23,6 +23,7 @@
 #include "processes/model_monitor/model_monitor.h"
 #include "processes/motor_babbler/motor_babbler.h"
 #include "processes/observer/observer.h"
+#include "processes/refiner/refiner_config.h"
 #include "processes/robot_simulator/robot_simulator.h"
 #include "processes/structure_learner/structure_learner.h"
 
@@ -44,6 +45,7 @@ const std::map<std::string, std::function<void(const path&)>> kReaders = {
      [](const path& file) { load_noise(file.parent_path(), "ideal_noise.yaml"); }},
     {"noise.yaml", [](const path& file) { load_noise(file.parent_path()); }},
     {"observer.yaml", [](const path& file) { ObserverConfig::load(file); }},
+    {"refiner.yaml", [](const path& file) { RefinerConfig::load(file); }},
     {"robot.yaml",
      [](const path& file) {
        const path rig = file.parent_path();
@@ -250,7 +252,8 @@ TEST_F(RigCheckTest, EveryFileIsReadByItsOwnProcess) {
     restore();
     std::filesystem::remove(copy_ / name);
     problems = check_rig(copy_).problems;
-    const bool is_optional = name == "controller.yaml" || name == "ideal_noise.yaml";
+    const bool is_optional =
+        name == "controller.yaml" || name == "ideal_noise.yaml" || name == "refiner.yaml";
     EXPECT_EQ(problems.size(), is_optional ? 0U : 1U) << name;
   }
 }

@@ -47,6 +47,8 @@ std::string files_text(const std::filesystem::path& folder) {
       {"report.html", "the same with pictures and plots, for a browser"},
       {"detections.png", "a camera frame with the markers found in it"},
       {"schema.lcmlog", "the body schema: ./run show FILE"},
+      {"refined.lcmlog",
+       "fitted to the tags' corners, with other tags and lens: ./run adopt FOLDER"},
       {"samples.lcmlog", "the samples: ./run learn FILE"},
       {"run.lcmlog.00", "everything on the bus but images"}};
   for (const auto& [name, what] : files) {

@@ -38,8 +38,8 @@ TEST(LogSummary, AWholeLogIsSound) {
   const LogSummary summary = summarize_log(folder / "log");
   EXPECT_TRUE(summary.is_sound()) << flaws_text(summary);
   EXPECT_EQ(flaws_text(summary), "");
-  EXPECT_EQ(summary.events, 15);
-  EXPECT_EQ(summary.channels.size(), 15U);
+  EXPECT_EQ(summary.events, 16);
+  EXPECT_EQ(summary.channels.size(), 16U);
   EXPECT_EQ(summary.channels.at("SAMPLE").events, 1);
   EXPECT_EQ(summary.unread_bytes, 0);
   EXPECT_EQ(summary.file_bytes,
@@ -151,7 +151,7 @@ TEST(LogReader, ReadsOnWhereAnotherOneStopped) {
   for (int i = 0; i < 4; ++i) ASSERT_TRUE(first.next());
   LogReader second(folder / "log", OnDamage::kThrow, first.position());
   EXPECT_EQ(second.position(), first.position());
-  for (int i = 4; i < 15; ++i) {
+  for (int i = 4; i < 16; ++i) {
     ASSERT_TRUE(first.next());
     ASSERT_TRUE(second.next());
     EXPECT_EQ(second.event().event_number, first.event().event_number);

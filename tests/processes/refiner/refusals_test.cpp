@@ -92,6 +92,7 @@ TEST_F(RefineRefuses, TagsOfOtherParts) {
 TEST(RefinerConfig, ReadsEveryKeyAndRefusesAFileWithoutOne) {
   const auto file = std::filesystem::path(testing::TempDir()) / "refiner.yaml";
   const std::string text =
+      "enabled: true\nrefine_every: 20\nplacements: true\nintrinsics: false\n"
       "tag_position_m: 0.001\ntag_rotation_deg: 0.5\ntag_size_share: 0.01\n"
       "focal_length_share: 0.02\ncentre_px: 7\ndistortion: 0.05\njoint_play_m: 0.001\n"
       "joint_play_deg: 0.1\n";
@@ -99,6 +100,8 @@ TEST(RefinerConfig, ReadsEveryKeyAndRefusesAFileWithoutOne) {
   EXPECT_THROW(RefinerConfig::load(file), std::runtime_error);
   std::ofstream(file) << text << "max_samples: 50\n";
   const RefinerConfig config = RefinerConfig::load(file);
+  EXPECT_TRUE(config.enabled && config.placements && !config.intrinsics);
+  EXPECT_EQ(config.refine_every, 20);
   EXPECT_EQ(config.tags.position_m, 0.001);
   EXPECT_EQ(config.centre_px, 7);
   EXPECT_EQ(config.joint_play.position_m, 0.001);

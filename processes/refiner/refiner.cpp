@@ -1,0 +1,106 @@
+#include "processes/refiner/refiner.h"
+
+#include <algorithm>
+#include <exception>
+#include <iterator>
+
+#include "bodyschema/action_command_t.hpp"
+#include "common/bus/convert.h"
+#include "common/config/calibration_id.h"
+
+namespace bodyschema {
+namespace {
+
+constexpr std::size_t kMostProposals = 64;
+
+}  // namespace
+
+RefinerSettings RefinerSettings::load(const std::filesystem::path& file) {
+  const std::filesystem::path rig = file.parent_path();
+  RefinerSettings settings;
+  settings.options.config = RefinerConfig::load(file);
+  settings.options.placements = settings.options.config.placements;
+  settings.options.intrinsics = settings.options.config.intrinsics;
+  const RigNoise noise = load_noise(rig);
+  settings.options.corner_noise = {noise.corner_noise_px, noise.small_tag_noise_px};
+  settings.options.measurement = noise.measurement;
+  settings.rig = {load_markers(rig), load_camera_calibration(calibration_file(rig))};
+  return settings;
+}
+
+Refiner::Refiner(RefinerSettings settings)
+    : settings_(std::move(settings)), next_due_(settings_.options.config.refine_every) {}
+
+bool RefinedProposal::is_better() const {
+  return refinement && refinement->before.px_median && refinement->after.px_median &&
+         *refinement->after.px_median < *refinement->before.px_median;
+}
+
+void Refiner::on_sample(const sample_t& sample) {
+  if (sample.sample_index <= last_sample_index_) return;
+  last_sample_index_ = sample.sample_index;
+  samples_.add(std::make_shared<const RefinerSample>(refiner_sample(sample)));
+  const std::int64_t every = settings_.options.config.refine_every;
+  if (sample.purpose == action_command_t::PURPOSE_TEST && sample.sample_index + 1 >= next_due_) {
+    next_due_ = ((sample.sample_index + 1) / every + 1) * every;
+    due_.push_back(sample.sample_index);
+  }
+  match();
+}
+
+void Refiner::on_learned_schema(const body_schema_t& proposal) {
+  if (proposal.is_complete == 0 || proposal.last_sample_index <= taken_) return;
+  proposals_.insert_or_assign(proposal.last_sample_index, proposal);
+  // A proposal from nowhere cannot displace those that will be refined first.
+  if (proposals_.size() > kMostProposals)
+    proposals_.erase(proposals_.begin()->first < last_sample_index_ ? proposals_.begin()
+                                                                    : std::prev(proposals_.end()));
+  match();
+}
+
+void Refiner::match() {
+  for (auto due = due_.begin(); due != due_.end();) {
+    const auto proposal = proposals_.find(*due);
+    if (*due > taken_ && proposal != proposals_.end()) {
+      taken_ = *due;
+      jobs_.push_back(std::move(proposal->second));
+    }
+    // Proposals come in order.
+    due = *due <= taken_ ? due_.erase(due) : std::next(due);
+  }
+  proposals_.erase(proposals_.begin(), proposals_.upper_bound(taken_));
+  while (!due_.empty() && due_.front() < last_sample_index_ - Retained<RefinerSample>::kMaxLag)
+    due_.pop_front();
+}
+
+void Refiner::drop_older_jobs() {
+  while (jobs_.size() > 1) jobs_.pop_front();
+}
+
+std::function<RefinedProposal()> Refiner::take_job() {
+  const body_schema_t message = std::move(jobs_.front());
+  jobs_.pop_front();
+  const BodySchema schema = from_message(message);
+  std::int64_t since = 0;
+  for (const Edge& edge : schema.edges) since = std::max(since, edge.valid_since_sample);
+  std::vector<RefinerSample> samples;
+  for (const auto& sample : samples_.between(since, message.last_sample_index))
+    samples.push_back(*sample);
+  return [schema, samples = std::move(samples), index = message.last_sample_index,
+          utime = message.utime, rig = settings_.rig, options = settings_.options] {
+    RefinedProposal result;
+    result.sample_index = index;
+    try {
+      result.refinement = refine(schema, samples, rig, options);
+      result.refinement->schema.version = 0;
+      result.refinement->schema.base_version = 0;
+      result.refinement->schema.last_sample_index = index;
+      result.refinement->schema.utime = utime;
+    } catch (const std::exception& error) {
+      result.problem = error.what();
+    }
+    return result;
+  };
+}
+
+}  // namespace bodyschema

@@ -1,0 +1,129 @@
+#include "processes/refiner/refiner_process.h"
+
+#include <fmt/format.h>
+#include <spdlog/spdlog.h>
+
+#include <chrono>
+#include <exception>
+
+#include "common/bus/channels.h"
+#include "common/bus/convert.h"
+#include "common/bus/event_log.h"
+#include "processes/refiner/proposed_files.h"
+
+namespace bodyschema {
+
+void RefinerProcess::Options::add_to(Arguments app) {
+  app.add_option("--samples", samples_file, "The observer's samples.lcmlog, read at start");
+  app.add_flag("--replayed", is_replayed,
+               "The samples are a recording's and no observer runs: what is missing is given up");
+  app.add_option("--refined", schema_file,
+                 "Where the refined schema is kept; reloaded and repeated at start");
+  app.add_option("--proposed", proposed_folder,
+                 "Folder for markers.yaml and camera_info.yaml as found");
+}
+
+RefinerProcess::RefinerProcess(Process& process, const Options& options)
+    : process_(process),
+      door_(process.rig_folder()),
+      schema_file_(options.schema_file),
+      proposed_folder_(options.proposed_folder),
+      refiner_(RefinerSettings::load(process.config_file())),
+      intake_(
+          options.samples_file,
+          [this](const sample_t& sample) {
+            if (door_.takes(process_, sample)) refiner_.on_sample(sample);
+          },
+          SampleIntake::asking(process, !options.is_replayed)) {
+  process.set_activity(process_info_t::PHASE_WAITING, "waiting for LEARNED_SCHEMA");
+  restore();
+  door_.subscribe(process, kSample, [this](const sample_t& sample) { intake_.on_sample(sample); });
+  door_.subscribe(process, kLearnedSchema,
+                  [this](const body_schema_t& proposal) { refiner_.on_learned_schema(proposal); });
+  process.on_idle([this] { work(); });
+  process.on_tick([this](std::int64_t now_us) { on_tick(now_us); });
+  process.on_end([this] { on_end(); });
+}
+
+void RefinerProcess::restore() {
+  if (schema_file_.empty() || !std::filesystem::exists(schema_file_)) return;
+  try {
+    const auto kept = read_log(schema_file_, kBodySchema);
+    if (kept.empty()) return;
+    refined_ = kept.back();
+    refiner_.skip(refined_->last_sample_index);
+  } catch (const std::exception& error) {
+    spdlog::warn("{}: begins without it", error.what());
+  }
+}
+
+void RefinerProcess::on_tick(std::int64_t now_us) {
+  intake_.on_tick(now_us);
+  process_.set_counters(intake_.counters());
+  work();
+  if (process_.bus().is_replay() || now_us - sent_us_ < 1'000'000) return;
+  sent_us_ = now_us;
+  if (unsaved_) save();
+  if (refined_) process_.bus().publish(kRefinedSchema, *refined_);
+}
+
+void RefinerProcess::on_end() {
+  if (fit_.valid()) collect();
+}
+
+void RefinerProcess::work() {
+  if (fit_.valid() && fit_.wait_for(std::chrono::seconds(0)) == std::future_status::ready)
+    collect();
+  if (process_.bus().is_replay()) {
+    while (refiner_.has_job()) {
+      fit_ = std::async(std::launch::deferred, refiner_.take_job());
+      collect();
+    }
+  } else if (!fit_.valid() && refiner_.has_job()) {
+    refiner_.drop_older_jobs();
+    fit_ = std::async(std::launch::async, refiner_.take_job());
+    process_.set_activity(process_info_t::PHASE_WORKING, "refines");
+  }
+}
+
+void RefinerProcess::collect() {
+  const RefinedProposal proposal = fit_.get();
+  say(proposal);
+  if (!proposal.is_better()) return;
+  refined_ = to_message(proposal.refinement->schema);
+  unsaved_ = proposal.refinement->rig;
+  save();
+  process_.bus().publish(kRefinedSchema, *refined_);
+}
+
+void RefinerProcess::save() {
+  try {
+    if (!proposed_folder_.empty()) write_proposed_files(*unsaved_, proposed_folder_);
+    if (!schema_file_.empty()) write_one_event_log(schema_file_, kBodySchema, *refined_);
+    unsaved_.reset();
+    process_.set_activity(process_info_t::PHASE_WORKING, words_);
+  } catch (const std::exception& error) {
+    if (process_.count("refined schema not saved") == 1)
+      spdlog::warn("{}; tried again every second", error.what());
+    process_.set_activity(process_info_t::PHASE_WAITING,
+                          std::string("cannot save: ") + error.what());
+  }
+}
+
+void RefinerProcess::say(const RefinedProposal& proposal) {
+  if (!proposal.refinement) {
+    words_ = fmt::format("sample {}: not refined: {}", proposal.sample_index, proposal.problem);
+  } else if (const Refinement& r = *proposal.refinement; !r.before.px_median) {
+    words_ = fmt::format("sample {}: refined, but no TEST sample shows corners to judge it by",
+                         proposal.sample_index);
+  } else {
+    words_ = fmt::format(
+        "sample {}: corners of {} TEST samples {:.3f} → {:.3f} px (median) in {:.1f} s{}",
+        proposal.sample_index, r.after.num_samples, *r.before.px_median, *r.after.px_median,
+        r.seconds, proposal.is_better() ? "" : ": no better, nothing is proposed");
+  }
+  spdlog::info("{}", words_);
+  process_.set_activity(process_info_t::PHASE_WORKING, words_);
+}
+
+}  // namespace bodyschema

@@ -1,0 +1,52 @@
+#pragma once
+
+#include <cstdint>
+#include <filesystem>
+#include <future>
+#include <optional>
+#include <string>
+
+#include "common/bus/rig_door.h"
+#include "common/bus/sample_intake.h"
+#include "processes/refiner/refiner.h"
+
+namespace bodyschema {
+
+/// The refiner on a bus: SAMPLE, LEARNED_SCHEMA → REFINED_SCHEMA. Live, it refines beside the loop
+/// and repeats the newest result at 1 Hz; a replay waits for each. What predicts the held-out
+/// corners better than the rig's files is kept in files: the schema, and beside it the tags and the
+/// lens as found, which `bodyschema adopt` writes into the rig. The refined schema goes with these
+/// alone: its calibration is not the rig's until then.
+class RefinerProcess {
+ public:
+  struct Options {
+    std::string samples_file;
+    bool is_replayed = false;
+    std::filesystem::path schema_file, proposed_folder;
+    void add_to(Arguments app);
+  };
+  RefinerProcess(Process& process, const Options& options);
+  RefinerProcess(const RefinerProcess&) = delete;
+
+ private:
+  void restore();
+  void on_tick(std::int64_t now_us);
+  void on_end();
+  void work();
+  void collect();
+  void save();
+  void say(const RefinedProposal& proposal);
+
+  Process& process_;
+  const RigDoor door_;
+  const std::filesystem::path schema_file_, proposed_folder_;
+  Refiner refiner_;
+  SampleIntake intake_;
+  std::future<RefinedProposal> fit_;
+  std::optional<body_schema_t> refined_;
+  std::optional<RigCalibration> unsaved_;  ///< goes with refined_
+  std::string words_;                      ///< of the newest refinement
+  std::int64_t sent_us_ = 0;
+};
+
+}  // namespace bodyschema

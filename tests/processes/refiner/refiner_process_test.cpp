@@ -1,0 +1,188 @@
+#include "processes/refiner/refiner_process.h"
+
+#include <gtest/gtest.h>
+
+#include <filesystem>
+#include <fstream>
+#include <regex>
+#include <set>
+#include <sstream>
+#include <string>
+#include <vector>
+
+#include "common/bus/channels.h"
+#include "common/bus/convert.h"
+#include "common/bus/event_log.h"
+#include "common/config/calibration_id.h"
+#include "common/config/yaml.h"
+#include "tests/common/bus/bus_test_support.h"
+
+namespace bodyschema {
+namespace {
+
+namespace fs = std::filesystem;
+
+const fs::path kRecorded = BODYSCHEMA_LOGS "/arm2_15.lcmlog";
+
+std::string text_of(const fs::path& file) {
+  std::ostringstream text;
+  text << std::ifstream(file).rdbuf();
+  return text.str();
+}
+
+/// A recording of arm2 (samples 4, 9 and 14 are TEST) and a rig that refines every ten.
+class RefinerTest : public testing::Test {
+ protected:
+  RefinerTest() {
+    fs::copy(BODYSCHEMA_CONFIG "/arm2", rig_);
+    set("refine_every: 50", "refine_every: 10");
+    std::set<std::int64_t> known;
+    for (const sample_t& sample : read_log(kRecorded, kSample))
+      if (known.insert(sample.sample_index).second) samples_.push_back(sample);
+    for (const body_schema_t& proposal : read_log(kRecorded, kLearnedSchema))
+      proposals_.push_back(proposal);
+  }
+
+  void set(const std::string& from, const std::string& to) const {
+    const std::string text = text_of(rig_ / "refiner.yaml");
+    ASSERT_NE(text.find(from), std::string::npos);
+    std::ofstream(rig_ / "refiner.yaml") << std::regex_replace(text, std::regex(from), to);
+  }
+  Refiner refiner() const { return Refiner(RefinerSettings::load(rig_ / "refiner.yaml")); }
+  const body_schema_t& proposal_after(std::int64_t sample) const {
+    return *std::find_if(proposals_.begin(), proposals_.end(),
+                         [&](const auto& p) { return p.last_sample_index == sample; });
+  }
+  /// What the process writes from the log `in`.
+  fs::path replay(const fs::path& in, std::vector<std::string> flags = {}) {
+    const fs::path out = folder_ / ("out" + std::to_string(++num_runs_));
+    std::vector<std::string> words = {"refiner",
+                                      "--config",
+                                      rig_ / "refiner.yaml",
+                                      "--in",
+                                      "file://" + in.string() + "?speed=0",
+                                      "--out",
+                                      "file://" + out.string() + "?mode=w"};
+    words.insert(words.end(), flags.begin(), flags.end());
+    std::vector<char*> argv;
+    for (std::string& word : words) argv.push_back(word.data());
+    EXPECT_EQ(run_process<RefinerProcess>("refiner", static_cast<int>(argv.size()), argv.data()),
+              0);
+    return out;
+  }
+
+  test::TemporaryFolder folder_;
+  const fs::path rig_ = folder_ / "rig";
+  std::vector<sample_t> samples_;
+  std::vector<body_schema_t> proposals_;
+  int num_runs_ = 0;
+};
+
+TEST_F(RefinerTest, RefinesTheProposalOfTheFirstTestSampleAfterEveryTen) {
+  Refiner refiner = this->refiner();
+  std::vector<std::int64_t> refined;
+  for (const sample_t& sample : samples_) {
+    refiner.on_sample(sample);
+    for (const body_schema_t& proposal : proposals_)
+      if (proposal.last_sample_index == sample.sample_index) refiner.on_learned_schema(proposal);
+    while (refiner.has_job()) refined.push_back(refiner.take_job()().sample_index);
+  }
+  EXPECT_EQ(refined, std::vector<std::int64_t>{9});
+}
+
+TEST_F(RefinerTest, TheOrderOfSamplesAndProposalsDoesNotMatter) {
+  const auto refined = [&](bool proposals_first) {
+    Refiner refiner = this->refiner();
+    if (proposals_first)
+      for (const body_schema_t& proposal : proposals_) refiner.on_learned_schema(proposal);
+    for (const sample_t& sample : samples_) refiner.on_sample(sample);
+    for (const body_schema_t& proposal : proposals_) refiner.on_learned_schema(proposal);
+    EXPECT_TRUE(refiner.has_job());
+    const RefinedProposal result = refiner.take_job()();
+    EXPECT_FALSE(refiner.has_job());
+    EXPECT_TRUE(result.refinement) << result.problem;
+    return encode(kRefinedSchema, to_message(result.refinement->schema));
+  };
+  EXPECT_EQ(refined(false), refined(true));
+}
+
+TEST_F(RefinerTest, AnIncompleteProposalIsNotRefinedNorOneThatWas) {
+  Refiner refiner = this->refiner();
+  for (const sample_t& sample : samples_) refiner.on_sample(sample);
+  body_schema_t incomplete = proposal_after(9);
+  incomplete.is_complete = 0;
+  refiner.on_learned_schema(incomplete);
+  EXPECT_FALSE(refiner.has_job());
+  refiner.skip(9);
+  refiner.on_learned_schema(proposal_after(9));
+  EXPECT_FALSE(refiner.has_job());
+}
+
+TEST_F(RefinerTest, ARefinementThatFailsSaysWhy) {
+  Refiner refiner = this->refiner();
+  for (sample_t sample : samples_) {
+    sample.calibration_id += 1;
+    refiner.on_sample(sample);
+  }
+  refiner.on_learned_schema(proposal_after(9));
+  const RefinedProposal result = refiner.take_job()();
+  EXPECT_FALSE(result.refinement);
+  EXPECT_NE(result.problem.find("another calibration"), std::string::npos) << result.problem;
+  EXPECT_FALSE(result.is_better());
+}
+
+TEST_F(RefinerTest, AReplayWritesTheSameBytesAndFilesThatGoTogether) {
+  const std::vector<std::string> files = {"--refined", folder_ / "refined.lcmlog", "--proposed",
+                                          folder_ / "proposed"};
+  const auto schemas = read_log(replay(kRecorded, files), kRefinedSchema);
+  ASSERT_EQ(schemas.size(), 1U);
+  EXPECT_EQ(schemas[0].last_sample_index, 9);
+  EXPECT_NE(schemas[0].calibration_id, samples_[0].calibration_id);
+  const auto kept = read_log(folder_ / "refined.lcmlog", kBodySchema);
+  ASSERT_EQ(kept.size(), 1U);
+  EXPECT_EQ(encode(kRefinedSchema, kept[0]), encode(kRefinedSchema, schemas[0]));
+  // With the proposed files the rig is the one that the schema goes with.
+  for (const std::string name : {"markers.yaml", "camera_info.yaml"})
+    fs::copy(folder_ / "proposed" / name, rig_ / name, fs::copy_options::overwrite_existing);
+  EXPECT_EQ(calibration_id(rig_), schemas[0].calibration_id);
+}
+
+TEST_F(RefinerTest, TwoReplaysAreTheSame) {
+  const auto refined = [&] {
+    std::vector<std::vector<std::uint8_t>> bytes;
+    for (const body_schema_t& schema : read_log(replay(kRecorded), kRefinedSchema))
+      bytes.push_back(encode(kRefinedSchema, schema));
+    return bytes;
+  };
+  EXPECT_EQ(refined(), refined());
+}
+
+TEST_F(RefinerTest, SamplesOfAnotherCalibrationAreRefused) {
+  const std::string text = text_of(rig_ / "markers.yaml");
+  std::ofstream(rig_ / "markers.yaml")
+      << std::regex_replace(text, std::regex("size_m: 0.08, part: 1"), "size_m: 0.09, part: 1");
+  const fs::path out = replay(kRecorded);
+  EXPECT_TRUE(read_log(out, kRefinedSchema).empty());
+}
+
+TEST_F(RefinerTest, WhatCannotBeSavedIsPublishedAndCounted) {
+  const fs::path out = replay(kRecorded, {"--refined", folder_ / "no" / "such" / "refined.lcmlog"});
+  EXPECT_EQ(read_log(out, kRefinedSchema).size(), 1U);
+  std::int64_t not_saved = 0;
+  const process_info_t info = read_log(out, kProcessInfo).back();
+  for (const counter_t& counter : info.counters)
+    if (counter.counter_name == "refined schema not saved") not_saved = counter.count;
+  EXPECT_EQ(not_saved, 1);
+}
+
+TEST(RefinerSettings, RefuseAFileThatLeavesNothingToRefine) {
+  test::TemporaryFolder folder;
+  fs::copy(BODYSCHEMA_CONFIG "/arm2", folder / "rig");
+  const std::string text = text_of(folder / "rig" / "refiner.yaml");
+  std::ofstream(folder / "rig" / "refiner.yaml")
+      << std::regex_replace(text, std::regex("(placements|intrinsics): true"), "$1: false");
+  EXPECT_THROW(RefinerSettings::load(folder / "rig" / "refiner.yaml"), ConfigError);
+}
+
+}  // namespace
+}  // namespace bodyschema
