@@ -50,6 +50,7 @@ int main(int argc, char** argv) {
   bodyschema::add_urdf_command(commands);
   bodyschema::add_reach_command(commands);
   bodyschema::add_refine_command(commands);
+  bodyschema::add_adopt_command(commands);
   bodyschema::add_log_command(commands);
   bodyschema::add_operate_commands(commands);
   bodyschema::add_watch_command(commands);
