@@ -69,16 +69,20 @@ void RefinerProcess::on_tick(std::int64_t now_us) {
 
 void RefinerProcess::on_end() {
   if (fit_.valid()) collect();
+  if (refiner_.has_job()) refine_now();
+}
+
+void RefinerProcess::refine_now() {
+  refiner_.drop_older_jobs();
+  fit_ = std::async(std::launch::deferred, refiner_.take_job());
+  collect();
 }
 
 void RefinerProcess::work() {
   if (fit_.valid() && fit_.wait_for(std::chrono::seconds(0)) == std::future_status::ready)
     collect();
   if (process_.bus().is_replay()) {
-    while (refiner_.has_job()) {
-      fit_ = std::async(std::launch::deferred, refiner_.take_job());
-      collect();
-    }
+    if (refiner_.has_job()) refine_now();
   } else if (!fit_.valid() && refiner_.has_job()) {
     refiner_.drop_older_jobs();
     fit_ = std::async(std::launch::async, refiner_.take_job());

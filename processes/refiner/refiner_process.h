@@ -33,6 +33,7 @@ class RefinerProcess {
   void on_tick(std::int64_t now_us);
   void on_end();
   void work();
+  void refine_now();
   void collect();
   void save();
   void say(const RefinedProposal& proposal);

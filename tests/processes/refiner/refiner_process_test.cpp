@@ -147,6 +147,17 @@ TEST_F(RefinerTest, AReplayWritesTheSameBytesAndFilesThatGoTogether) {
   EXPECT_EQ(calibration_id(rig_), schemas[0].calibration_id);
 }
 
+TEST_F(RefinerTest, WhatAnEarlierProcessRefinedIsNotRefinedAgain) {
+  const std::vector<std::string> file = {"--refined", folder_ / "refined.lcmlog"};
+  EXPECT_EQ(read_log(replay(kRecorded, file), kRefinedSchema).size(), 1U);
+  const std::string kept = text_of(folder_ / "refined.lcmlog");
+  EXPECT_TRUE(read_log(replay(kRecorded, file), kRefinedSchema).empty());
+  EXPECT_EQ(text_of(folder_ / "refined.lcmlog"), kept);
+  // A file that is none is no reason to end.
+  std::ofstream(folder_ / "refined.lcmlog") << "no log";
+  EXPECT_EQ(read_log(replay(kRecorded, file), kRefinedSchema).size(), 1U);
+}
+
 TEST_F(RefinerTest, TwoReplaysAreTheSame) {
   const auto refined = [&] {
     std::vector<std::vector<std::uint8_t>> bytes;

@@ -1,0 +1,66 @@
+"""refiner_group_test.py SOURCE BUILD: a group whose rig enables the refiner proposes tags and lens, a replay makes the same schema
+of it, `adopt` writes them into the rig, and the next run begins with the refined schema."""
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+source, build = Path(sys.argv[1]), Path(sys.argv[2])
+
+
+class Failed(Exception):
+    pass
+
+
+def run(work, *words):
+    """./run with logs of its own; what it says."""
+    environment = os.environ | {"BODYSCHEMA_BUILD": str(build), "BODYSCHEMA_LOGS": str(work / "logs")}
+    done = subprocess.run(
+        [source / "run", *map(str, words)], env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=250
+    )
+    if done.returncode != 0:
+        raise Failed(f"./run {' '.join(map(str, words))}: {done.stderr[-2000:]}")
+    return done.stdout
+
+
+def main(work):
+    rig = work / "rig"
+    shutil.copytree(source / "config" / "arm2", rig)
+    settings = (rig / "refiner.yaml").read_text()
+    settings = settings.replace("enabled: false", "enabled: true").replace("refine_every: 50", "refine_every: 10")
+    (rig / "refiner.yaml").write_text(settings)
+    learn = ("--rig", rig, "--seed", 1, "--samples", 15)
+    current = work / "logs" / "current"
+
+    if "refined.lcmlog" not in run(work, *learn):
+        raise Failed("the result does not name the refined schema")
+    first = current.resolve()
+    refined = (first / "refined.lcmlog").read_bytes()
+
+    run(work, "--replay", first / "run.lcmlog.00")
+    if (current / "refined.lcmlog").read_bytes() != refined:
+        raise Failed("a replay refines otherwise")
+
+    if "Written" not in run(work, "adopt", first, "--rig", rig, "--yes"):
+        raise Failed("nothing was adopted")
+    for name in ("markers.yaml", "camera_info.yaml"):
+        if (rig / name).read_bytes() != (first / "proposed" / name).read_bytes():
+            raise Failed(f"{name} was not adopted")
+
+    run(work, *learn, "--initial", first / "refined.lcmlog")
+
+
+if not (build / "bin" / "refiner").exists():
+    print("SKIP: built without Ceres", file=sys.stderr)
+    sys.exit(77)
+if subprocess.run(["unshare", "--user", "--map-root-user", "--net", "true"], capture_output=True).returncode != 0:
+    print("SKIP: this machine allows no network namespaces", file=sys.stderr)
+    sys.exit(77)
+with tempfile.TemporaryDirectory(prefix="refiner group ") as folder:
+    try:
+        main(Path(folder))
+    except Failed as failure:
+        sys.exit(str(failure))
