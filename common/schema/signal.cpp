@@ -56,4 +56,14 @@ Eigen::VectorXd mid_range(const std::vector<Signal>& signals) {
   return action;
 }
 
+Eigen::VectorXd normalized(const std::vector<Signal>& signals, const Eigen::VectorXd& action) {
+  Eigen::VectorXd x(action.size());
+  for (Eigen::Index s = 0; s < x.size(); ++s) {
+    const Signal& signal = signals[static_cast<std::size_t>(s)];
+    const double range = signal.upper - signal.lower;
+    x(s) = range > 0 ? (2 * action(s) - signal.lower - signal.upper) / range : 0;
+  }
+  return x;
+}
+
 }  // namespace bodyschema

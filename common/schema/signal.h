@@ -25,6 +25,9 @@ struct Signal {
 /// The action with every signal in the middle of its range.
 Eigen::VectorXd mid_range(const std::vector<Signal>& signals);
 
+/// Where each signal is in its range, −1..1 between the limits; 0 in a range of no width.
+Eigen::VectorXd normalized(const std::vector<Signal>& signals, const Eigen::VectorXd& action);
+
 /// φ_n(q) = sin(½nπ (1 + x/kWarpReach)), n = 1 … size, with x = −1 … 1 over the signal's range: the
 /// sines that vanish kWarpReach half ranges from the middle. With variances that fall as a
 /// covariance function's spectral density does, they are a Gaussian process (Solin and Särkkä,

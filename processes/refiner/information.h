@@ -33,6 +33,13 @@ class Information {
   const Eigen::MatrixXd& covariance() const { return covariance_; }
   /// Orthonormal columns in parameters scaled to unit information: directions that nothing tells.
   const Eigen::MatrixXd& undetermined() const { return undetermined_; }
+  /// A, over the free directions of all blocks.
+  const Eigen::MatrixXd& curvature() const { return curvature_; }
+  /// What further samples do not average out is in Cov as A⁻¹ X A⁻¹: this X, of the errors that
+  /// poses share and of what is held.
+  const Eigen::MatrixXd& lasting_score() const { return lasting_score_; }
+  /// A further observation is expected to add as many times JᵀJ to A.
+  double worth() const { return worth_; }
   /// Part of a block's covariance in its whole tangent: zero along held directions.
   Eigen::MatrixXd cross_covariance(const ParameterBlock* one, const ParameterBlock* other) const;
 
@@ -45,7 +52,8 @@ class Information {
 
   std::vector<ParameterBlock*> blocks_;
   std::map<const ParameterBlock*, int> offsets_;
-  Eigen::MatrixXd covariance_, undetermined_;
+  Eigen::MatrixXd covariance_, undetermined_, curvature_, lasting_score_;
+  double worth_ = 1;
 };
 
 }  // namespace bodyschema

@@ -16,6 +16,7 @@
 #include "processes/refiner/refined_schema.h"
 #include "processes/refiner/refinement_problem.h"
 #include "processes/refiner/refinement_words.h"
+#include "processes/refiner/wanted_actions.h"
 
 namespace bodyschema {
 namespace {
@@ -201,6 +202,9 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   result.schema = refined_schema(schema, training, problem, information);
   if (result.used_corners)
     result.schema.calibration_id = calibration_id(result.rig.markers, result.rig.camera);
+  result.wanted_actions =
+      wanted_actions(result.schema, result.used_corners ? std::optional(result.rig) : std::nullopt,
+                     training, problem, information);
   const bool judges_corners = rig && has_corners(held_out);
   result.before = held_out_errors(schema, held_out, judges_corners ? rig : std::nullopt);
   result.after = held_out_errors(result.schema, held_out,

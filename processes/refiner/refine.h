@@ -68,6 +68,16 @@ struct JointPlay {
   double slide_m = 0, turn_rad = 0;
 };
 
+/// An action that is expected to tell much.
+struct WantedAction {
+  Eigen::VectorXd action;  ///< one value per signal, command units
+  /// Share by which the worst predicted deviation of a part falls with it and those before it …
+  double fall = 0;
+  /// … and the same of what would go if all wanted actions were taken a hundred times: the rest is
+  /// of what no action tells, above all sizes and placements of tags.
+  double reducible_fall = 0;
+};
+
 struct Refinement {
   BodySchema schema;
   RigCalibration rig;  ///< refined; as claimed where nothing of it was
@@ -85,9 +95,12 @@ struct Refinement {
   std::vector<SignalCoverage> coverage;
   std::vector<JointPlay> plays;   ///< where corners were fitted
   std::vector<std::string> held;  ///< what was not refined, and why
+  /// kMostWantedActions, that of most help first; none where no signal moves what is refined.
+  std::vector<WantedAction> wanted_actions;
   HeldOutErrors before, after;
 };
 inline constexpr double kHighCorrelation = 0.95;
+inline constexpr int kMostWantedActions = 10;
 
 /// Fits all parameters of a schema at once to TRAIN and PROBE samples, with Student-t weights:
 /// where the root stands and every screw. While tags and lens are as the rig says, the data are the

@@ -9,6 +9,7 @@
 #include <cmath>
 #include <memory>
 #include <stdexcept>
+#include <utility>
 
 #include "common/estimation/chi_square.h"
 #include "common/estimation/quantile.h"
@@ -188,72 +189,81 @@ std::vector<ParameterBlock*> RefinementProblem::chain_blocks(int part, std::int6
   return blocks;
 }
 
-void RefinementProblem::add(ceres::CostFunction* cost, const std::vector<ParameterBlock*>& blocks,
-                            Datum datum) {
+void RefinementProblem::add(Cost cost, Datum datum) {
   std::vector<double*> values;
-  for (ParameterBlock* block : blocks) {
+  for (ParameterBlock* block : cost.blocks) {
     values.push_back(memory_of(block));
     used_.insert(block);
   }
-  datum.num_residuals = cost->num_residuals();
+  datum.part = cost.part;
+  datum.num_residuals = cost.function->num_residuals();
   StudentTLoss& loss = datum.num_residuals == 8   ? loss_of_corners_
                        : datum.num_residuals == 6 ? loss_of_poses_
                                                   : loss_of_positions_;
-  datum.id = problem_.AddResidualBlock(cost, &loss, values);
+  datum.id = problem_.AddResidualBlock(cost.function.release(), &loss, values);
   data_.push_back(datum);
+}
+
+std::optional<RefinementProblem::Cost> RefinementProblem::cost_of(const TagSight& sight,
+                                                                  const Eigen::VectorXd& action,
+                                                                  std::int64_t sample_index) {
+  const TagPlacement* tag = rig_->markers.find(sight.tag);
+  if (!tag || !is_usable(tag->part, sample_index) ||
+      has_moved(schema_.moved_tags, sight.tag, sample_index))
+    return std::nullopt;
+  Matrix8d covariance = sight.covariance_px2;
+  if (covariance.isZero(0)) {
+    std::vector<Eigen::Vector2d> corners;
+    for (int c = 0; c < 4; ++c) corners.emplace_back(sight.corners_px.segment<2>(2 * c));
+    covariance = std::pow(options_.corner_noise.sigma_px(corners), 2) * Matrix8d::Identity();
+  }
+  std::vector<ParameterBlock*> blocks = chain_blocks(tag->part, sample_index);
+  blocks.push_back(tags_.at(sight.tag));
+  blocks.push_back(lens_block_);
+  if (!plays_.empty() && !root_moves_) blocks.push_back(instants_.at(sample_index));
+  auto cost = std::make_unique<CornerResidual>(
+      PartChain(paths_.at(tag->part), schema_.displacements(action), first_play_),
+      std::vector<const ParameterBlock*>(blocks.begin(), blocks.end()), tag->size_m, *lens_, sight,
+      covariance, scale_);
+  // Predicted behind the camera: nothing to start from.
+  std::vector<const double*> values;
+  for (const ParameterBlock* block : blocks) values.push_back(block->values.data());
+  Eigen::Matrix<double, 8, 1> residuals;
+  if (!cost->Evaluate(values.data(), residuals.data(), nullptr)) return std::nullopt;
+  return Cost{std::move(cost), std::move(blocks), tag->part};
+}
+
+std::optional<RefinementProblem::Cost> RefinementProblem::cost_of(
+    const PartObservation& observation, const Eigen::VectorXd& action, std::int64_t sample_index) {
+  const int part = observation.part;
+  if (!is_usable(part, sample_index)) return std::nullopt;
+  std::vector<ParameterBlock*> blocks = chain_blocks(part, sample_index);
+  const std::vector<const ParameterBlock*> constant(blocks.begin(), blocks.end());
+  PartChain chain(paths_.at(part), schema_.displacements(action));
+  std::unique_ptr<ceres::CostFunction> cost;
+  if (observation.has_rotation && schema_.has_rotation(part))
+    cost = std::make_unique<PoseResidual>(std::move(chain), constant, observation,
+                                          options_.measurement, scale_);
+  else
+    cost = std::make_unique<PositionResidual>(std::move(chain), constant, observation,
+                                              options_.measurement, scale_);
+  return Cost{std::move(cost), std::move(blocks), part};
 }
 
 void RefinementProblem::add_corners(const RefinerSample& seen) {
   const std::int64_t index = seen.sample.sample_index;
   if (!has_root(index)) return;
-  const Eigen::VectorXd theta = schema_.displacements(seen.sample.action);
-  for (const TagSight& sight : seen.tags) {
-    const TagPlacement* tag = rig_->markers.find(sight.tag);
-    if (!tag || !is_usable(tag->part, index) || has_moved(schema_.moved_tags, sight.tag, index))
-      continue;
-    const std::vector<ParameterBlock*> chain = chain_blocks(tag->part, index);
-    Matrix8d covariance = sight.covariance_px2;
-    if (covariance.isZero(0)) {
-      std::vector<Eigen::Vector2d> corners;
-      for (int c = 0; c < 4; ++c) corners.emplace_back(sight.corners_px.segment<2>(2 * c));
-      covariance = std::pow(options_.corner_noise.sigma_px(corners), 2) * Matrix8d::Identity();
-    }
-    std::vector<ParameterBlock*> blocks = chain;
-    blocks.push_back(tags_.at(sight.tag));
-    blocks.push_back(lens_block_);
-    if (!plays_.empty() && !root_moves_) blocks.push_back(instants_.at(index));
-    auto cost = std::make_unique<CornerResidual>(
-        PartChain(paths_.at(tag->part), theta, first_play_),
-        std::vector<const ParameterBlock*>(blocks.begin(), blocks.end()), tag->size_m, *lens_,
-        sight, covariance, scale_);
-    // Predicted behind the camera: nothing to start from.
-    std::vector<const double*> values;
-    for (const ParameterBlock* block : blocks) values.push_back(block->values.data());
-    Eigen::Matrix<double, 8, 1> residuals;
-    if (!cost->Evaluate(values.data(), residuals.data(), nullptr)) continue;
-    add(cost.release(), blocks, {.sample_index = index, .part = tag->part, .tag = sight.tag});
-  }
+  for (const TagSight& sight : seen.tags)
+    if (auto cost = cost_of(sight, seen.sample.action, index))
+      add(std::move(*cost), {.sample_index = index, .tag = sight.tag});
 }
 
 void RefinementProblem::add_poses(const RefinerSample& seen) {
   const std::int64_t index = seen.sample.sample_index;
   if (!has_root(index)) return;
-  const Eigen::VectorXd theta = schema_.displacements(seen.sample.action);
-  for (const PartObservation& observation : seen.sample.parts) {
-    if (!is_usable(observation.part, index)) continue;
-    const std::vector<ParameterBlock*> blocks = chain_blocks(observation.part, index);
-    const std::vector<const ParameterBlock*> constant(blocks.begin(), blocks.end());
-    PartChain chain(paths_.at(observation.part), theta);
-    ceres::CostFunction* cost = nullptr;
-    if (observation.has_rotation && schema_.has_rotation(observation.part))
-      cost =
-          new PoseResidual(std::move(chain), constant, observation, options_.measurement, scale_);
-    else
-      cost = new PositionResidual(std::move(chain), constant, observation, options_.measurement,
-                                  scale_);
-    add(cost, blocks,
-        {.sample_index = index, .part = observation.part, .observation = &observation});
-  }
+  for (const PartObservation& observation : seen.sample.parts)
+    if (auto cost = cost_of(observation, seen.sample.action, index))
+      add(std::move(*cost), {.sample_index = index, .observation = &observation});
 }
 
 std::vector<ParameterBlock*> RefinementProblem::blocks() {
@@ -280,6 +290,12 @@ std::vector<int> RefinementProblem::frame_tags() const {
                        return a.second < b.second;
                      })->first);
   return result;
+}
+
+bool is_frame(const std::vector<int>& frame_tags, const ParameterBlock& block, int direction) {
+  return block.kind == ParameterBlock::Kind::kTag &&
+         std::find(frame_tags.begin(), frame_tags.end(), block.id) != frame_tags.end() &&
+         (direction < 6 || block.id == frame_tags.back());
 }
 
 Eigen::VectorXd RefinementProblem::prior_of(const ParameterBlock& block) const {

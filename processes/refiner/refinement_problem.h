@@ -5,6 +5,7 @@
 
 #include <deque>
 #include <map>
+#include <memory>
 #include <optional>
 #include <set>
 #include <string>
@@ -39,6 +40,20 @@ class RefinementProblem {
   RefinementProblem(const BodySchema& schema, const std::vector<RefinerSample>& samples,
                     const std::optional<RigCalibration>& rig, const RefineOptions& options,
                     bool root_moves);
+
+  /// An observation as a residual, and the blocks that it depends on.
+  struct Cost {
+    std::unique_ptr<ceres::CostFunction> function;
+    std::vector<ParameterBlock*> blocks;
+    int part = 0;
+  };
+  /// Of a tag's corners at an action; nothing if the rig has no such tag, it had moved by that
+  /// sample, its part cannot be used or is predicted behind the camera.
+  std::optional<Cost> cost_of(const TagSight& sight, const Eigen::VectorXd& action,
+                              std::int64_t sample_index);
+  /// Of a part's pose; nothing if the part cannot be used.
+  std::optional<Cost> cost_of(const PartObservation& observation, const Eigen::VectorXd& action,
+                              std::int64_t sample_index);
 
   /// Levenberg–Marquardt with Student-t weights, the noise's scale estimated between its runs,
   /// until neither changes.
@@ -76,6 +91,10 @@ class RefinementProblem {
   bool has_root(std::int64_t sample_index) const {
     return !root_moves_ || instants_.contains(sample_index);
   }
+  /// The root's pose at a sample that has one, now.
+  Pose X_CR(std::int64_t sample_index) {
+    return pose_at(memory_of(root_moves_ ? instants_.at(sample_index) : root_));
+  }
   /// Blocks of the edges with a block on the way to a part, the root's first (of a sample).
   std::vector<ParameterBlock*> chain_blocks(int part, std::int64_t sample_index);
 
@@ -87,7 +106,7 @@ class RefinementProblem {
   void add_lens();
   void add_corners(const RefinerSample& sample);
   void add_poses(const RefinerSample& sample);
-  void add(ceres::CostFunction* cost, const std::vector<ParameterBlock*>& blocks, Datum datum);
+  void add(Cost cost, Datum datum);
   void add_priors();
   void place_blocks();
   void hold_unseen_frames();
@@ -121,5 +140,9 @@ class RefinementProblem {
   int num_iterations_ = 0;
   ceres::Problem problem_;
 };
+
+/// Is a direction taken as known where parameters are told apart? Placements of these tags, one a
+/// part, and the size of the last, for all lengths have a common factor.
+bool is_frame(const std::vector<int>& frame_tags, const ParameterBlock& block, int direction);
 
 }  // namespace bodyschema

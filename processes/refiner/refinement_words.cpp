@@ -157,18 +157,12 @@ std::string RefinementWords::advice(const Place& one, const Place& other) const 
   return fmt::format("show tag {} while {} moves", tag->block->id, fmt::join(signals, ", "));
 }
 
-// The covariance given the placements of these tags, and one's size: all lengths have a common
-// factor. Zero rows where they are.
+// The covariance given what is_frame() says. Zero rows where that is.
 Eigen::MatrixXd RefinementWords::in_frames_of_tags() const {
   std::vector<Eigen::Index> given;
-  for (std::size_t n = 0; n < places_.size(); ++n) {
-    const Place& place = places_[n];
-    const bool is_given =
-        place.block->kind == Kind::kTag &&
-        std::find(frame_tags_.begin(), frame_tags_.end(), place.block->id) != frame_tags_.end();
-    if (is_given && (place.direction < 6 || place.block->id == frame_tags_.back()))
+  for (std::size_t n = 0; n < places_.size(); ++n)
+    if (is_frame(frame_tags_, *places_[n].block, places_[n].direction))
       given.push_back(static_cast<Eigen::Index>(n));
-  }
   if (given.empty()) return covariance_;
   const Eigen::MatrixXd of_given = covariance_(given, given);
   const Eigen::MatrixXd mixed = covariance_(Eigen::all, given);

@@ -2,6 +2,7 @@
 #include <sys/wait.h>
 #include <unistd.h>
 
+#include <cmath>
 #include <cstdlib>
 #include <filesystem>
 #include <fstream>
@@ -91,8 +92,14 @@ TEST_F(RefineProgramTest, FitsPosesWithoutAnOption) {
   EXPECT_EQ(json.at("samples"), 12);
   EXPECT_LT(json.at("after").at("parts")[0].at("position_rms_m").get<double>(), 0.001);
   EXPECT_FALSE(json.contains("tags"));
+  ASSERT_EQ(json.at("wanted_actions").size(), 10U);
+  for (const Json& wanted : json.at("wanted_actions")) {
+    EXPECT_LE(std::abs(wanted.at("action").at("q2").get<double>()), 60);
+    EXPECT_GT(wanted.at("reducible_fall"), 0);
+  }
   const Outcome text = run("refine schema '" + log_ + "' --out refined");
-  for (const char* words : {"12 samples", "held out, 3 samples", "gain of q1 (2→3)"})
+  for (const char* words : {"12 samples", "held out, 3 samples", "gain of q1 (2→3)",
+                            "actions (q1, q2) that would tell most"})
     EXPECT_NE(text.out.find(words), std::string::npos) << text.out;
 }
 

@@ -146,6 +146,33 @@ std::string findings_text(const Refinement& result) {
   return text;
 }
 
+Json wanted_json(const Refinement& result) {
+  return array_of(result.wanted_actions, [&](const WantedAction& wanted) {
+    Json action = Json::object();
+    for (std::size_t s = 0; s < result.schema.signals.size(); ++s)
+      action[result.schema.signals[s].name] = wanted.action(static_cast<Eigen::Index>(s));
+    return Json{
+        {"action", action}, {"fall", wanted.fall}, {"reducible_fall", wanted.reducible_fall}};
+  });
+}
+
+std::string wanted_text(const Refinement& result) {
+  if (result.wanted_actions.empty()) return "";
+  std::vector<std::string> names;
+  for (const Signal& signal : result.schema.signals) names.push_back(signal.name);
+  std::string text = fmt::format(
+      "  actions ({}) that would tell most; with each and those before it the worst predicted "
+      "deviation falls by, and what actions can tell of it by:\n",
+      fmt::join(names, ", "));
+  for (const WantedAction& wanted : result.wanted_actions) {
+    text += "   ";
+    for (const double value : wanted.action) text += fmt::format(" {:10.4g}", value);
+    text +=
+        fmt::format("   {:5.1f} %  {:5.1f} %\n", 100 * wanted.fall, 100 * wanted.reducible_fall);
+  }
+  return text;
+}
+
 }  // namespace
 
 Json refinement_json(const Refinement& result, const std::optional<RigCalibration>& claimed) {
@@ -183,6 +210,7 @@ Json refinement_json(const Refinement& result, const std::optional<RigCalibratio
         {"joint", play.joint}, {"slide_m", play.slide_m}, {"turn_deg", play.turn_rad / kDegree}};
   });
   json["held"] = result.held;
+  json["wanted_actions"] = wanted_json(result);
   if (result.used_corners && claimed) {
     json["tags"] = array_of(result.rig.markers.tags, tag_json);
     json["lens"] = lens_json(result.rig.camera);
@@ -210,6 +238,7 @@ std::string refinement_text(const Refinement& result,
   text += findings_text(result);
   for (const SignalCoverage& signal : result.coverage)
     text += fmt::format("  {}: {:.0f} % of its range seen\n", signal.signal, 100 * signal.share);
+  text += wanted_text(result);
   return text;
 }
 
