@@ -53,6 +53,9 @@ double first_extent(const Refinement& result, const SyntheticRobot& robot, std::
   return sum / 3;
 }
 
+/// More of a half range than the first three do on the average that nobody chose (0.48 to 0.53).
+constexpr double kFar = 0.55;
+
 TEST(WantedActions, MoveFarTheJointThatHardlyMoved) {
   Rng rng(5);
   const SyntheticRobot robot = test::chapter_robot("c", rng);
@@ -61,7 +64,7 @@ TEST(WantedActions, MoveFarTheJointThatHardlyMoved) {
       const auto samples = poses_of(narrowed(robot, s, share), 30, rng);
       const Refinement result = refine(schema_of(robot), refiner_samples(samples), {}, {});
       ASSERT_EQ(std::ssize(result.wanted_actions), kMostWantedActions);
-      EXPECT_GT(first_extent(result, robot, s), 0.6) << s << " " << share;
+      EXPECT_GT(first_extent(result, robot, s), kFar) << s << " " << share;
       EXPECT_GT(result.wanted_actions.at(2).fall, 0.5) << s << " " << share;
     }
   }
@@ -78,7 +81,7 @@ TEST(WantedActions, OfCornersMoveFarTheJointThatRested) {
     options.placements = options.intrinsics = true;
     const Refinement result = refine(schema_of(robot.robot), samples, robot.truth, options);
     EXPECT_FALSE(result.undetermined.empty());
-    EXPECT_GT(first_extent(result, robot.robot, s), 0.6) << s;
+    EXPECT_GT(first_extent(result, robot.robot, s), kFar) << s;
     EXPECT_GT(result.wanted_actions.at(2).fall, 0.5) << s;
   }
 }
