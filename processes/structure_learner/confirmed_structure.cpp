@@ -66,6 +66,13 @@ bool lacks_data(const LearnedStructure& structure) {
                      [](const auto& record) { return !record.second.undecided.empty(); });
 }
 
+// Valid models were taken back, because their data could not have refuted them: nothing else is
+// there to be found.
+bool has_untold_edges(const LearnedStructure& structure) {
+  return std::any_of(structure.search.records.begin(), structure.search.records.end(),
+                     [](const auto& record) { return !record.second.untold_signals.empty(); });
+}
+
 // A part that rests is always seen from the same side: no bias makes it stray, nor what is fixed to
 // it.
 bool fixes_what_strays(const LearnedStructure& louder, const std::set<int>& resting) {
@@ -145,7 +152,8 @@ LearnedStructure confirmed_structure(const FindStructure& find,
   const bool is_stream = structure.actions.blocks().is_stream();
   if (is_stream) structure = of_stream(std::move(structure), find, connect_soft_parts);
   structure = least_noise(std::move(structure), find);
-  if (!is_stream && !structure.spans() && !structure.is_contested) connect_soft_parts(&structure);
+  if (!is_stream && !structure.spans() && !structure.is_contested && !has_untold_edges(structure))
+    connect_soft_parts(&structure);
   for (const auto& [part_i, part_j] : structure.search.redundant)
     std::erase_if(structure.search.models,
                   [&](const AcceptedModel& edge) { return edge.joins(part_i, part_j); });

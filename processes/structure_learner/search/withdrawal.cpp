@@ -1,10 +1,12 @@
 #include "processes/structure_learner/search/withdrawal.h"
 
 #include <algorithm>
+#include <cmath>
 #include <limits>
 #include <map>
 #include <vector>
 
+#include "common/estimation/quantile.h"
 #include "processes/structure_learner/joints/missing_joint_test.h"
 #include "processes/structure_learner/search/component_tree.h"
 
@@ -57,8 +59,8 @@ void withdraw_untestable(const ComponentTree& tree, PairModels* pairs,
 
 // Takes back the edge whose data tell least of some signal's joint, if that is not enough: the
 // parts that it joined. Otherwise none, and the information on every signal's joint is counted.
-std::vector<int> withdraw_least_told(const ComponentTree& tree, PairModels* pairs,
-                                     ModelForest* forest,
+std::vector<int> withdraw_least_told(const ComponentTree& tree, double usual_turn,
+                                     PairModels* pairs, ModelForest* forest,
                                      std::map<int, double>* joint_information) {
   if (tree.nodes().size() < 2) return {};
   const Eigen::MatrixXd information = missing_joint_information(tree.fit());
@@ -69,7 +71,7 @@ std::vector<int> withdraw_least_told(const ComponentTree& tree, PairModels* pair
   for (int k = 1; k < static_cast<int>(tree.nodes().size()); ++k) {
     const TreeNode& node = tree.nodes()[k];
     const int sightings = std::min(tree.data()[k].size(), tree.data()[node.parent].size());
-    const double turn = sightings < kFewSightings ? kLeastTurn : kCommonTurn;
+    const double turn = std::min(usual_turn, sightings < kFewSightings ? kLeastTurn : kCommonTurn);
     for (std::size_t s = 0; s < moving.size(); ++s) {
       if (node.model.uses(moving[s])) continue;
       const double told = information(k, static_cast<Eigen::Index>(s));
@@ -101,7 +103,16 @@ std::vector<int> withdraw_least_told(const ComponentTree& tree, PairModels* pair
 
 }  // namespace
 
-std::map<int, double> withdraw_untold_edges(PairModels* pairs, ModelForest* forest) {
+double typical_turn(const std::vector<AcceptedModel>& models) {
+  std::vector<double> turns;
+  for (const AcceptedModel& edge : models)
+    for (const LocalModel::Joint& joint : edge.model.joints)
+      if (joint.turn != 0) turns.push_back(std::abs(joint.turn));
+  return turns.empty() ? std::numeric_limits<double>::infinity() : median(std::move(turns));
+}
+
+std::map<int, double> withdraw_untold_edges(double usual_turn, PairModels* pairs,
+                                            ModelForest* forest) {
   std::vector<AcceptedModel> kept = forest->models();
   for (const int part : forest->parts())
     if (forest->component(part) == part)
@@ -116,8 +127,8 @@ std::map<int, double> withdraw_untold_edges(PairModels* pairs, ModelForest* fore
   while (!open.empty()) {
     const int part = open.back();
     open.pop_back();
-    for (const int end :
-         withdraw_least_told(ComponentTree(*forest, part, pairs), pairs, forest, &information))
+    for (const int end : withdraw_least_told(ComponentTree(*forest, part, pairs), usual_turn, pairs,
+                                             forest, &information))
       open.push_back(end);
   }
   return information;
