@@ -362,5 +362,5 @@ WORDS = {
 CONSOLE_WORDS = {
     "halt": ("", "stop the arm at once, until ./run resume"),
     "target|hold|release|fault": ("…", "steer or break the group's arm"),
-    "WORD…": ("", "bodyschema WORD…: learn, predict, show, reach, log, monitor, engineer, urdf"),
+    "WORD…": ("", "bodyschema WORD…: learn, predict, show, reach, log, monitor, refine, adopt, engineer, urdf"),
 }

@@ -61,14 +61,21 @@ std::int64_t calibration_id(const Markers& markers, const CameraCalibration& cam
   return hash.id();
 }
 
+std::int64_t calibration_id(const RigCalibration& calibration) {
+  return calibration_id(calibration.markers, calibration.camera);
+}
+
 std::filesystem::path calibration_file(const std::filesystem::path& rig_folder) {
   const std::filesystem::path file = Yaml::load(rig_folder / "camera.yaml").text("calibration");
   return file.is_relative() ? rig_folder / file : file;
 }
 
+RigCalibration load_calibration(const std::filesystem::path& rig_folder) {
+  return {load_markers(rig_folder), load_camera_calibration(calibration_file(rig_folder))};
+}
+
 std::int64_t calibration_id(const std::filesystem::path& rig_folder) {
-  return calibration_id(load_markers(rig_folder),
-                        load_camera_calibration(calibration_file(rig_folder)));
+  return calibration_id(load_calibration(rig_folder));
 }
 
 }  // namespace bodyschema

@@ -8,6 +8,12 @@
 
 namespace bodyschema {
 
+/// What a rig claims of its tags and its camera.
+struct RigCalibration {
+  Markers markers;
+  CameraCalibration camera;
+};
+
 /// Hash of the calibration that poses rest on, carried by messages: FNV-1a (64 bit) of these int64
 /// numbers, little-endian, in this order:
 ///   1. per tag, ascending id: id; part; size [nm]; 1 and its placement, or 0 where there is none.
@@ -19,11 +25,15 @@ namespace bodyschema {
 /// file writes them, and is the same on every machine. Names (camera, tag family) do not count. It
 /// is never 0, which means "unknown".
 std::int64_t calibration_id(const Markers& markers, const CameraCalibration& camera);
+std::int64_t calibration_id(const RigCalibration& calibration);
 
 /// The file that the rig's camera.yaml names. @throws ConfigError.
 std::filesystem::path calibration_file(const std::filesystem::path& rig_folder);
 
-/// Hash of the rig's markers.yaml and the calibration that camera.yaml names. @throws ConfigError.
+/// The rig's markers.yaml and the calibration that camera.yaml names. @throws ConfigError.
+RigCalibration load_calibration(const std::filesystem::path& rig_folder);
+
+/// Hash of load_calibration(). @throws ConfigError.
 std::int64_t calibration_id(const std::filesystem::path& rig_folder);
 
 }  // namespace bodyschema

@@ -3,6 +3,7 @@
 #include <yaml-cpp/yaml.h>
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <fstream>
 #include <initializer_list>
@@ -110,6 +111,11 @@ Model distortion_model(const CalibrationFile& file, std::size_t num_coefficients
 }
 
 }  // namespace
+
+const char* distortion_model_name(Model model) {
+  constexpr std::array kNames = {"plumb_bob", "rational_polynomial", "equidistant"};
+  return kNames.at(static_cast<std::size_t>(model));
+}
 
 CameraCalibration load_camera_calibration(const std::filesystem::path& path) {
   const CalibrationFile file(path);

@@ -21,6 +21,9 @@ struct CameraCalibration {
   std::vector<double> distortion;
 };
 
+/// ROS's name: "plumb_bob", "rational_polynomial" or "equidistant".
+const char* distortion_model_name(CameraCalibration::Model model);
+
 /// Reads a ROS camera_info YAML (camera_calibration's output: image_width, camera_matrix.data, …)
 /// or an OpenCV FileStorage YAML (camera_matrix as !!opencv-matrix, image_width/image_height).
 /// @throws ConfigError naming file, line, key.

@@ -16,6 +16,7 @@
 #include "common/config/yaml.h"
 #include "common/scene/scene.h"
 #include "processes/camera/camera.h"
+#include "processes/console/adoption.h"
 #include "processes/controller/controller.h"
 #include "processes/marker_estimator/marker_estimator.h"
 #include "processes/model_monitor/model_monitor.h"
@@ -166,7 +167,9 @@ class Check {
     std::error_code problem;
     for (const auto& entry : std::filesystem::directory_iterator(folder_, problem)) {
       const std::string name = entry.path().filename();
-      if (!read_.contains(name)) names.push_back(name);
+      const bool is_replaced = name.ends_with(kReplacedSuffix) &&
+                               read_.contains(name.substr(0, name.rfind(kReplacedSuffix)));
+      if (!read_.contains(name) && !is_replaced) names.push_back(name);
     }
     std::sort(names.begin(), names.end());
     for (const std::string& name : names) {

@@ -2,8 +2,6 @@
 
 #include <fmt/format.h>
 
-#include <array>
-
 #include "common/bus/event_log.h"
 #include "processes/refiner/calibrated_lens.h"
 
@@ -30,8 +28,6 @@ std::string markers_text(const Markers& markers) {
 
 std::string camera_text(const CameraCalibration& found) {
   const CameraCalibration camera = with_all_coefficients(found);
-  constexpr std::array<const char*, 3> kModels = {"plumb_bob", "rational_polynomial",
-                                                  "equidistant"};
   return fmt::format(
       "# Proposed by `bodyschema refine`.\n"
       "image_width: {}\nimage_height: {}\ncamera_name: {}\n"
@@ -39,7 +35,7 @@ std::string camera_text(const CameraCalibration& found) {
       "distortion_model: {}\n"
       "distortion_coefficients:\n  rows: 1\n  cols: {}\n  data: [{}]\n",
       camera.width, camera.height, camera.camera_name.empty() ? "camera" : camera.camera_name,
-      camera.fx, camera.cx, camera.fy, camera.cy, kModels.at(static_cast<int>(camera.model)),
+      camera.fx, camera.cx, camera.fy, camera.cy, distortion_model_name(camera.model),
       camera.distortion.size(), fmt::join(camera.distortion, ", "));
 }
 

@@ -5,20 +5,13 @@
 #include <vector>
 
 #include "common/camera/fit_pose.h"
-#include "common/config/camera_calibration.h"
-#include "common/config/rig.h"
+#include "common/config/calibration_id.h"
 #include "common/estimation/evaluation.h"
 #include "common/schema/body_schema.h"
 #include "processes/refiner/refiner_config.h"
 #include "processes/refiner/refiner_sample.h"
 
 namespace bodyschema {
-
-/// What a rig claims of its tags and its camera.
-struct RigCalibration {
-  Markers markers;
-  CameraCalibration camera;
-};
 
 struct RefineOptions {
   bool placements = false;  ///< also where the tags sit, and how large they are

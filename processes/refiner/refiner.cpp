@@ -24,7 +24,7 @@ RefinerSettings RefinerSettings::load(const std::filesystem::path& file) {
   const RigNoise noise = load_noise(rig);
   settings.options.corner_noise = {noise.corner_noise_px, noise.small_tag_noise_px};
   settings.options.measurement = noise.measurement;
-  settings.rig = {load_markers(rig), load_camera_calibration(calibration_file(rig))};
+  settings.rig = load_calibration(rig);
   return settings;
 }
 

@@ -304,7 +304,7 @@ struct RigRow {
 
 void refine_rig(const std::string& name, const std::filesystem::path& folder, bool is_ideal,
                 int num_seeds, int num_samples) {
-  const RigCalibration rig{load_markers(folder), load_camera_calibration(calibration_file(folder))};
+  const RigCalibration rig = load_calibration(folder);
   const RigNoise noise = load_noise(folder, is_ideal ? "ideal_noise.yaml" : "noise.yaml");
   const Signals signals = load_signals(folder);
   LearnOptions learning;

@@ -10,6 +10,8 @@
 #include <sstream>
 #include <string>
 
+#include "common/bus/convert.h"
+#include "common/bus/event_log.h"
 #include "common/config/camera_calibration.h"
 #include "common/config/rig.h"
 #include "tests/support/synthetic_robot.h"
@@ -103,6 +105,40 @@ TEST_F(RefineProgramTest, FitsPosesWithoutAnOption) {
     EXPECT_NE(text.out.find(words), std::string::npos) << text.out;
 }
 
+TEST_F(RefineProgramTest, WritesTheUrdfThatUrdfMakesOfTheRefinedSchema) {
+  const std::string refine = "refine schema '" + log_ + "' --out refined --urdf r.urdf ";
+  const Json json = json_of(refine + "--placement p.yaml --json");
+  EXPECT_EQ(json.at("urdf").at("file"), "r.urdf");
+  EXPECT_EQ(json.at("urdf").at("moving_joints"), 2);
+  const Outcome urdf = run("urdf refined --out r2.urdf --placement p2.yaml");
+  ASSERT_EQ(urdf.exit_code, 0) << urdf.err;
+  EXPECT_EQ(text_of(folder_ / "r.urdf"), text_of(folder_ / "r2.urdf"));
+  EXPECT_EQ(text_of(folder_ / "p.yaml"), text_of(folder_ / "p2.yaml"));
+  EXPECT_FALSE(text_of(folder_ / "p.yaml").empty());
+  std::filesystem::remove(folder_ / "p.yaml");
+  const Outcome text = run(refine);
+  EXPECT_EQ(text.exit_code, 0) << text.err;
+  EXPECT_NE(text.out.find("\nr.urdf: " + urdf.out.substr(urdf.out.find(' ') + 1)),
+            std::string::npos)
+      << text.out << urdf.out;
+  EXPECT_FALSE(std::filesystem::exists(folder_ / "p.yaml"));
+}
+
+TEST_F(RefineProgramTest, ASchemaThatNoUrdfHasIsRefinedAllTheSame) {
+  BodySchema schema = from_message(read_log(folder_ / "schema", kBodySchema).back());
+  schema.signals.front().warp = {0.1, 0.1, 0.1, 0.1};
+  write_one_event_log(folder_ / "bent", kBodySchema, to_message(schema));
+  const Outcome outcome = run("refine bent '" + log_ + "' --out refined --urdf r.urdf --json");
+  EXPECT_EQ(outcome.exit_code, 1);
+  EXPECT_NE(
+      outcome.err.find("`bodyschema urdf refined --out r.urdf --placement PLACEMENT [--nominal]`"),
+      std::string::npos)
+      << outcome.err;
+  EXPECT_TRUE(Json::parse(outcome.out).at("urdf").is_null());
+  EXPECT_EQ(run("show refined").exit_code, 0);
+  EXPECT_FALSE(std::filesystem::exists(folder_ / "r.urdf"));
+}
+
 TEST_F(RefineProgramTest, FitsTheRowsOfACsv) {
   test::Rng rng(71);
   const test::SyntheticRobot robot = test::chapter_robot("a", rng);
@@ -124,6 +160,9 @@ TEST_F(RefineProgramTest, SaysWhatIsWrong) {
   expect_failure(refine + "--proposed found", 2, "--proposed");
   expect_failure("refine schema '" + log_ + "' --out schema", 1, "is an input itself");
   expect_failure("refine schema '" + log_ + "'", 2, "--out");
+  expect_failure(refine + "--urdf refined", 1, "--urdf: expected another file than --out");
+  expect_failure(refine + "--urdf schema", 1, "--urdf: schema is an input itself");
+  expect_failure(refine + "--placement p.yaml", 2, "--placement requires --urdf");
   expect_failure("refine missing '" + log_ + "' --out refined", 1, "missing");
   EXPECT_FALSE(std::filesystem::exists(folder_ / "refined"));
   std::ofstream(folder_ / "a.csv") << "t,q1,q2,part,x,y,z,qw,qx,qy,qz\n0,nan,0,1,0,0,0,1,0,0,0\n";

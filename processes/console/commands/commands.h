@@ -18,8 +18,8 @@ void add_reach_command(Arguments console);
 /// `refine`: fits all parameters of a schema to a recording, by Ceres; where this was built without
 /// it, says how to get it.
 void add_refine_command(Arguments console);
-/// `adopt`: writes the tags and the lens that a run proposes into the rig, after showing what is
-/// another.
+/// `adopt`: writes the tags and the lens that a run proposes into its rig, with consent, after
+/// showing what is another.
 void add_adopt_command(Arguments console);
 /// `log`: what an LCM log holds, and whether it is whole and of this version.
 void add_log_command(Arguments console);

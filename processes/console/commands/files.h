@@ -30,6 +30,13 @@ Noise noise_given(const std::vector<double>& numbers);
 void check_out(const std::string& out, const std::vector<std::string>& inputs,
                const std::string& option = "--out");
 
+/// A file that a command writes: its option and what was given, "" where nothing was.
+struct OutFile {
+  std::string option, file;
+};
+/// check_out() of each. @throws std::invalid_argument also if two of them are one file.
+void check_outs(const std::vector<OutFile>& outs, const std::vector<std::string>& inputs);
+
 /// Prints the result of a command.
 void print(bool as_json, const Json& json, const std::string& text);
 

@@ -9,6 +9,7 @@
 #include <filesystem>
 #include <fstream>
 #include <iostream>
+#include <map>
 #include <memory>
 #include <stdexcept>
 
@@ -264,6 +265,18 @@ void check_out(const std::string& out, const std::vector<std::string>& inputs,
   const std::filesystem::path folder = std::filesystem::absolute(out).parent_path();
   if (::access(folder.c_str(), W_OK | X_OK) != 0)
     throw std::invalid_argument(option + ": cannot write " + out + ": " + std::strerror(errno));
+}
+
+void check_outs(const std::vector<OutFile>& outs, const std::vector<std::string>& inputs) {
+  std::map<std::filesystem::path, std::string> options;
+  for (const auto& [option, file] : outs) {
+    check_out(file, inputs, option);
+    if (file.empty()) continue;
+    const auto place = std::filesystem::weakly_canonical(std::filesystem::absolute(file));
+    const auto [other, is_first] = options.try_emplace(place, option);
+    if (!is_first)
+      throw std::invalid_argument(option + ": expected another file than " + other->second);
+  }
 }
 
 void print(bool as_json, const Json& json, const std::string& text) {

@@ -13,6 +13,8 @@
 #include "common/config/calibration_id.h"
 #include "processes/console/commands/commands.h"
 #include "processes/console/commands/files.h"
+#include "processes/console/commands/urdf_files.h"
+#include "processes/console/hint.h"
 #include "processes/console/rig_check.h"
 #include "processes/console/views/refinement_view.h"
 #include "processes/refiner/proposed_files.h"
@@ -21,7 +23,7 @@ namespace bodyschema {
 namespace {
 
 struct RefineArguments {
-  std::string schema, samples, out, rig, proposed;
+  std::string schema, samples, out, rig, proposed, urdf, placement;
   std::vector<double> noise;
   bool placements = false, intrinsics = false, json = false;
 };
@@ -60,6 +62,35 @@ MeasurementModel measurement_of(const RefineArguments& arguments, const Recordin
   return measurement;
 }
 
+/// Prints the result, with the URDF where one is asked for. A schema that has none is refined all
+/// the same. @throws std::runtime_error then, after the result.
+void write_urdf_and_print(const RefineArguments& arguments, const Refinement& result,
+                          const std::optional<RigCalibration>& rig) {
+  Json json = refinement_json(result, rig);
+  std::string text = refinement_text(result, rig);
+  std::string problem;
+  if (!arguments.urdf.empty()) {
+    json["urdf"] = nullptr;
+    try {
+      // As the file holds it, so that `urdf` makes the same bytes of that.
+      const BodySchema written = from_message(to_message(result.schema));
+      const UrdfModel model =
+          write_urdf(written, arguments.out, false, arguments.urdf, arguments.placement);
+      json["urdf"] = urdf_json(model, arguments.urdf);
+      text += urdf_text(model, arguments.urdf);
+    } catch (const std::runtime_error& error) {
+      problem = error.what();
+    }
+  }
+  print(arguments.json, json, text);
+  if (problem.empty()) return;
+  const std::string placement = arguments.placement.empty() ? "PLACEMENT" : arguments.placement;
+  throw std::runtime_error(
+      fmt::format("--urdf: {}. The refined schema was written; to make a URDF of it: `{}`", problem,
+                  to_type(fmt::format("urdf {} --out {} --placement {} [--nominal]", arguments.out,
+                                      arguments.urdf, placement))));
+}
+
 void run_refine(const RefineArguments& arguments) {
   if (!arguments.proposed.empty() && !arguments.placements && !arguments.intrinsics)
     refuse_argument("--proposed", "expected with --placements or --intrinsics");
@@ -71,18 +102,20 @@ void run_refine(const RefineArguments& arguments) {
   std::optional<RigCalibration> rig;
   const std::filesystem::path folder = rig_folder(arguments, recording.is_log);
   if (!folder.empty()) {
-    rig = RigCalibration{load_markers(folder), load_camera_calibration(calibration_file(folder))};
+    rig = load_calibration(folder);
     const RigNoise noise = load_noise(folder);
     options.corner_noise = {noise.corner_noise_px, noise.small_tag_noise_px};
     if (std::filesystem::exists(folder / "refiner.yaml"))
       options.config = RefinerConfig::load(folder / "refiner.yaml");
   }
   options.measurement = measurement_of(arguments, recording, schema);
-  check_out(arguments.out, {arguments.schema, arguments.samples});
+  check_outs(
+      {{"--out", arguments.out}, {"--urdf", arguments.urdf}, {"--placement", arguments.placement}},
+      {arguments.schema, arguments.samples});
   const Refinement result = refine(schema, samples_of(arguments, recording), rig, options);
   write_one_event_log(arguments.out, kBodySchema, to_message(result.schema));
   if (!arguments.proposed.empty()) write_proposed_files(result.rig, arguments.proposed);
-  print(arguments.json, refinement_json(result, rig), refinement_text(result, rig));
+  write_urdf_and_print(arguments, result, rig);
 }
 
 }  // namespace
@@ -103,6 +136,13 @@ void add_refine_command(Arguments console) {
   refine.add_option("--out", arguments->out, "Write the refined schema to this file").required();
   refine.add_option("--proposed", arguments->proposed,
                     "Write markers.yaml and camera_info.yaml as found into this folder");
+  const Argument urdf = refine.add_option("--urdf", arguments->urdf,
+                                          "Write the refined schema as a URDF to this file");
+  refine
+      .add_option("--placement", arguments->placement,
+                  "Write where signals and parts are on the URDF to this YAML file, as engineer "
+                  "reads it")
+      .needs(urdf);
   add_noise(refine, arguments->noise, "; of poses");
   refine.add_flag("--json", arguments->json, "Print JSON");
   refine.callback([arguments] { run_refine(*arguments); });

@@ -1,6 +1,5 @@
 #include <fmt/format.h>
 
-#include <filesystem>
 #include <iostream>
 #include <memory>
 #include <stdexcept>
@@ -10,7 +9,7 @@
 #include "common/text/text.h"
 #include "processes/console/commands/commands.h"
 #include "processes/console/commands/files.h"
-#include "processes/console/urdf_model.h"
+#include "processes/console/commands/urdf_files.h"
 
 namespace bodyschema {
 namespace {
@@ -22,29 +21,40 @@ struct UrdfArguments {
 
 void run_urdf(const UrdfArguments& arguments) {
   const BodySchema schema = load_schema(arguments.schema);
-  check_out(arguments.out, {arguments.schema});
-  check_out(arguments.placement, {arguments.schema}, "--placement");
-  const auto place = [](const std::string& file) {
-    return std::filesystem::weakly_canonical(std::filesystem::absolute(file));
-  };
-  if (place(arguments.out) == place(arguments.placement))
-    throw std::invalid_argument("--placement: expected another file than --out");
-  UrdfModel model;
-  try {
-    model = urdf_model(schema, arguments.nominal);
-  } catch (const std::invalid_argument& error) {
-    throw std::runtime_error(arguments.schema + ": " + error.what());
-  }
-  write_file_atomically(arguments.placement, model.placement);
-  write_file_atomically(arguments.out, model.urdf);
-  std::string text =
-      fmt::format("{}: {}, {} that move\n", arguments.out, counted(model.num_links, "link"),
-                  counted(model.num_moving_joints, "joint"));
-  for (const std::string& remark : model.remarks) text += "  " + remark + "\n";
-  std::cout << text << std::flush;
+  check_outs({{"--out", arguments.out}, {"--placement", arguments.placement}}, {arguments.schema});
+  const UrdfModel model =
+      write_urdf(schema, arguments.schema, arguments.nominal, arguments.out, arguments.placement);
+  std::cout << urdf_text(model, arguments.out) << std::flush;
 }
 
 }  // namespace
+
+UrdfModel write_urdf(const BodySchema& schema, const std::string& schema_file, bool nominal,
+                     const std::string& urdf, const std::string& placement) {
+  UrdfModel model;
+  try {
+    model = urdf_model(schema, nominal);
+  } catch (const std::invalid_argument& error) {
+    throw std::runtime_error(schema_file + ": " + error.what());
+  }
+  if (!placement.empty()) write_file_atomically(placement, model.placement);
+  write_file_atomically(urdf, model.urdf);
+  return model;
+}
+
+std::string urdf_text(const UrdfModel& model, const std::string& urdf) {
+  std::string text = fmt::format("{}: {}, {} that move\n", urdf, counted(model.num_links, "link"),
+                                 counted(model.num_moving_joints, "joint"));
+  for (const std::string& remark : model.remarks) text += "  " + remark + "\n";
+  return text;
+}
+
+Json urdf_json(const UrdfModel& model, const std::string& urdf) {
+  return {{"file", urdf},
+          {"links", model.num_links},
+          {"moving_joints", model.num_moving_joints},
+          {"remarks", model.remarks}};
+}
 
 void add_urdf_command(Arguments console) {
   const auto arguments = std::make_shared<UrdfArguments>();
