@@ -137,8 +137,8 @@ UnconnectedPart explain(int part, int num_seen, const std::set<int>& connected,
 }
 
 // Signals that no edge uses although one may have to: they moved too little for a joint of
-// kLeastTurn (over their limits, where these are known), or one as large as those that were found,
-// to show, or a part waits for its edge. And those that a soft edge may use in vain.
+// kLeastTurn (over their limits, where these are known) to show, or a part waits for its edge. And
+// those that a soft edge may use in vain.
 std::vector<int> undecided_signals(const BodySchema& schema, const LearnedStructure& structure) {
   std::set<int> result;
   for (const AcceptedModel& model : structure.search.models)
@@ -150,7 +150,7 @@ std::vector<int> undecided_signals(const BodySchema& schema, const LearnedStruct
       const double range = signal.upper - signal.lower;
       const double share =
           range > 0 ? std::min(1.0, 2 * structure.actions.half_range(s) / range) : 1;
-      const double turn = std::min(share * kLeastTurn, structure.search.usual_turn);
+      const double turn = share * kLeastTurn;
       if (turn * turn * information->second >= kNoticed) continue;
     }
     result.insert(s);
@@ -305,8 +305,6 @@ LearnedStructure find_with_bias(const std::vector<Signal>& signals,
     search_options.max_signals = std::min(search_options.max_signals, kMaxScreenedJoints);
   NormalizedActions actions(samples, num_signals);
   SearchResult search = search_structure(samples, actions, parts, search_options);
-  // A rigid body whose joints are outliers is no reason to see them better.
-  search_options.usual_turn = search.usual_turn;
   if (unknown_bias == 0 && has_far_outliers(search)) {
     search_options.validity.allows_far_outliers = true;
     SearchResult found = search_structure(samples, actions, parts, search_options);

@@ -1,7 +1,5 @@
 #include "processes/structure_learner/structure_search.h"
 
-#include <algorithm>
-
 #include "processes/structure_learner/search/bridging.h"
 #include "processes/structure_learner/search/layered_search.h"
 #include "processes/structure_learner/search/long_chains.h"
@@ -29,8 +27,7 @@ SearchResult search_structure(const std::vector<ActionPoseSample>& samples,
   if (!forest.spans() && connect_long_chains(&pairs, &forest))
     settled = settle_trees(&layers.spare(), &pairs, &forest);
   SearchResult result;
-  result.usual_turn = std::min(options.usual_turn, typical_turn(forest.models()));
-  result.joint_information = withdraw_untold_edges(result.usual_turn, &pairs, &forest);
+  result.joint_information = withdraw_untold_edges(&pairs, &forest);
   result.redundant = redundant_edges(&pairs, forest);
   result.couplings = couplings(&pairs, forest);
   result.models = forest.models();

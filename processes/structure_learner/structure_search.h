@@ -1,6 +1,5 @@
 #pragma once
 
-#include <limits>
 #include <map>
 #include <set>
 #include <utility>
@@ -29,9 +28,6 @@ struct SearchResult {
   /// least (missing_joint_information() [per (rad per half range)²]), edges that have it already
   /// apart. Infinite if there is no edge to judge.
   std::map<int, double> joint_information;
-  /// Median over the joints that were found, edges that were taken back since included, where that
-  /// is less than what the options know [rad per half range]; infinite without one.
-  double usual_turn = std::numeric_limits<double>::infinity();
   int num_screens = 0;  ///< closed-form starts and regressions
   int num_fits = 0;     ///< Levenberg–Marquardt fits, of pairs and of whole trees
 };

@@ -1,6 +1,5 @@
 #pragma once
 
-#include <limits>
 #include <map>
 #include <optional>
 #include <set>
@@ -25,8 +24,6 @@ struct SearchOptions {
   /// Standard deviation of the bias that every marker may have beside measurement.systematic, at
   /// half range of a signal, in those of the noise of one sight.
   double unknown_bias = 0;
-  /// What the body's joints turn, as far as it is known [rad per half range].
-  double usual_turn = std::numeric_limits<double>::infinity();
 };
 
 /// A search's trials between two parts.

@@ -16,9 +16,18 @@ namespace {
 // The joint that an edge's data must have shown [rad per half range]. Of few sightings the smallest
 // there is, of more one that shows after 10 samples in the chapter's noise. Chosen on 30 robots of
 // 2, 4 and 7 joints each: with the smallest one for all, most right structures of chapter noise are
-// taken back at 10 and 15 samples.
+// taken back at 10 and 15 samples. Never more than usual_turn().
 constexpr int kFewSightings = 6;
 constexpr double kCommonTurn = 0.65;
+
+// What the body's joints turn: the median of those that were found [rad per half range].
+double usual_turn(const std::vector<AcceptedModel>& models) {
+  std::vector<double> turns;
+  for (const AcceptedModel& edge : models)
+    for (const LocalModel::Joint& joint : edge.model.joints)
+      if (joint.turn != 0) turns.push_back(std::abs(joint.turn));
+  return turns.empty() ? std::numeric_limits<double>::infinity() : median(std::move(turns));
+}
 
 // Samples in which parts on both sides of each node's edge were seen; a root that rests always is.
 std::vector<std::vector<int>> tied_samples(const ComponentTree& tree) {
@@ -59,8 +68,8 @@ void withdraw_untestable(const ComponentTree& tree, PairModels* pairs,
 
 // Takes back the edge whose data tell least of some signal's joint, if that is not enough: the
 // parts that it joined. Otherwise none, and the information on every signal's joint is counted.
-std::vector<int> withdraw_least_told(const ComponentTree& tree, double usual_turn,
-                                     PairModels* pairs, ModelForest* forest,
+std::vector<int> withdraw_least_told(const ComponentTree& tree, double most_turn, PairModels* pairs,
+                                     ModelForest* forest,
                                      std::map<int, double>* joint_information) {
   if (tree.nodes().size() < 2) return {};
   const Eigen::MatrixXd information = missing_joint_information(tree.fit());
@@ -71,7 +80,7 @@ std::vector<int> withdraw_least_told(const ComponentTree& tree, double usual_tur
   for (int k = 1; k < static_cast<int>(tree.nodes().size()); ++k) {
     const TreeNode& node = tree.nodes()[k];
     const int sightings = std::min(tree.data()[k].size(), tree.data()[node.parent].size());
-    const double turn = std::min(usual_turn, sightings < kFewSightings ? kLeastTurn : kCommonTurn);
+    const double turn = std::min(most_turn, sightings < kFewSightings ? kLeastTurn : kCommonTurn);
     for (std::size_t s = 0; s < moving.size(); ++s) {
       if (node.model.uses(moving[s])) continue;
       const double told = information(k, static_cast<Eigen::Index>(s));
@@ -103,17 +112,9 @@ std::vector<int> withdraw_least_told(const ComponentTree& tree, double usual_tur
 
 }  // namespace
 
-double typical_turn(const std::vector<AcceptedModel>& models) {
-  std::vector<double> turns;
-  for (const AcceptedModel& edge : models)
-    for (const LocalModel::Joint& joint : edge.model.joints)
-      if (joint.turn != 0) turns.push_back(std::abs(joint.turn));
-  return turns.empty() ? std::numeric_limits<double>::infinity() : median(std::move(turns));
-}
-
-std::map<int, double> withdraw_untold_edges(double usual_turn, PairModels* pairs,
-                                            ModelForest* forest) {
+std::map<int, double> withdraw_untold_edges(PairModels* pairs, ModelForest* forest) {
   std::vector<AcceptedModel> kept = forest->models();
+  const double most_turn = usual_turn(kept);
   for (const int part : forest->parts())
     if (forest->component(part) == part)
       withdraw_untestable(ComponentTree(*forest, part, pairs), pairs, &kept);
@@ -127,7 +128,7 @@ std::map<int, double> withdraw_untold_edges(double usual_turn, PairModels* pairs
   while (!open.empty()) {
     const int part = open.back();
     open.pop_back();
-    for (const int end : withdraw_least_told(ComponentTree(*forest, part, pairs), usual_turn, pairs,
+    for (const int end : withdraw_least_told(ComponentTree(*forest, part, pairs), most_turn, pairs,
                                              forest, &information))
       open.push_back(end);
   }

@@ -1,7 +1,6 @@
 #pragma once
 
 #include <map>
-#include <vector>
 
 #include "processes/structure_learner/search/pair_models.h"
 
@@ -11,14 +10,10 @@ namespace bodyschema {
 /// of V2 (check_validity()), a noncentrality of 48 has a power of 97.7 %.
 inline constexpr double kNoticed = 48;
 
-/// Median over the joints that turn [rad per half range]; infinite without one.
-double typical_turn(const std::vector<AcceptedModel>& models);
-
 /// Takes back the edges that their data could not have refuted: with fewer than two poses more than
-/// determine an edge, or where a signal hardly moved, a wrong model agrees by chance. A joint that
-/// would have to show turns no more than the body's joints do, `usual_turn` [rad per half range].
-/// Returns what SearchResult calls joint_information, of the edges that stand.
-std::map<int, double> withdraw_untold_edges(double usual_turn, PairModels* pairs,
-                                            ModelForest* forest);
+/// determine an edge, or where a signal hardly moved, a wrong model agrees by chance. The joint
+/// that would have to show turns no more than those of the forest. Returns what SearchResult calls
+/// joint_information, of the edges that stand.
+std::map<int, double> withdraw_untold_edges(PairModels* pairs, ModelForest* forest);
 
 }  // namespace bodyschema

@@ -1,7 +1,6 @@
 #include <gtest/gtest.h>
 
 #include <cmath>
-#include <limits>
 #include <utility>
 
 #include "common/geometry/angle.h"
@@ -286,22 +285,11 @@ TEST(WithdrawUntoldEdges, AnEdgeIsNotRigidBecauseItsSignalHardlyMovedWhileItWasS
   }
 }
 
-constexpr double kUnknownTurn = std::numeric_limits<double>::infinity();
-
-TEST(WithdrawUntoldEdges, JointsThatTurnLessAreToldByMorePoses) {
-  for (const double usual_turn : {kUnknownTurn, 0.02}) {
-    Case c(1, 40, Regime::kChapter);
-    c.forest.add(c.fitted(2, 3, 0));
-    withdraw_untold_edges(usual_turn, &c.pairs, &c.forest);
-    EXPECT_EQ(c.forest.models().size(), usual_turn == kUnknownTurn ? 1u : 0u);
-  }
-}
-
 TEST(WithdrawUntoldEdges, AnEdgeThatTooFewPosesTellOfIsTakenBack) {
   for (const int num_samples : {3, 40}) {
     Case c(1, num_samples, Regime::kChapter);
     c.forest.add(c.fitted(2, 3, 0));
-    const auto information = withdraw_untold_edges(kUnknownTurn, &c.pairs, &c.forest);
+    const auto information = withdraw_untold_edges(&c.pairs, &c.forest);
     EXPECT_EQ(c.forest.models().size(), num_samples == 3 ? 0u : 1u);
     EXPECT_EQ(c.pairs.record(2, 3).untold_signals.empty(), num_samples == 40);
     EXPECT_EQ(std::isfinite(information.at(0)), num_samples == 40);
@@ -312,7 +300,7 @@ TEST(WithdrawUntoldEdges, AnEdgeNeedsTwoPosesMoreThanDetermineIt) {
   for (const int num_samples : {3, 4}) {
     Case c(Case(1, num_samples, Regime::kFree).samples);
     c.forest.add(c.fitted(1, 2, 1));
-    withdraw_untold_edges(kUnknownTurn, &c.pairs, &c.forest);
+    withdraw_untold_edges(&c.pairs, &c.forest);
     EXPECT_EQ(c.forest.models().size(), num_samples == 4 ? 1u : 0u);
   }
 }
@@ -327,7 +315,7 @@ TEST(WithdrawUntoldEdges, PartsBeyondAnEdgeTellOfItWhileItsOwnEndIsHidden) {
     Case c(samples);
     c.forest.add(c.fitted(1, 3, 1));
     c.forest.add(c.fitted(2, 3, 0));
-    withdraw_untold_edges(kUnknownTurn, &c.pairs, &c.forest);
+    withdraw_untold_edges(&c.pairs, &c.forest);
     const auto is_kept = [&](const AcceptedModel& m) { return m.joins(1, 3); };
     EXPECT_EQ(std::ranges::any_of(c.forest.models(), is_kept), is_other_seen);
   }
