@@ -29,6 +29,12 @@ std::size_t identity(const sample_t& sample) {
 
 }  // namespace
 
+void SampleIntake::Options::add_to(Arguments app) {
+  app.add_option("--samples", samples_file, "The observer's samples.lcmlog, read at start");
+  app.add_flag("--replayed", is_replayed,
+               "The samples are a recording's and no observer runs: what is missing is given up");
+}
+
 SampleIntake::Ask SampleIntake::asking(Process& process, bool has_observer) {
   if (process.bus().is_replay() || !has_observer) return nullptr;
   return [&process](sample_request_t request) {

@@ -10,6 +10,7 @@
 
 #include "bodyschema/sample_request_t.hpp"
 #include "bodyschema/sample_t.hpp"
+#include "common/bus/arguments.h"
 
 namespace bodyschema {
 
@@ -33,6 +34,12 @@ class Process;
 /// SAMPLE") and is refused. Other machines cannot recognise it.
 class SampleIntake {
  public:
+  /// Flags of a process that reads samples.
+  struct Options {
+    std::string samples_file;
+    bool is_replayed = false;
+    void add_to(Arguments app);
+  };
   using Handler = std::function<void(const sample_t&)>;
   /// Publishes a SAMPLE_REQUEST.
   using Ask = std::function<void(sample_request_t request)>;

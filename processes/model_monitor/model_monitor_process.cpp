@@ -19,9 +19,7 @@ std::filesystem::path beside(const std::filesystem::path& file, const char* name
 }  // namespace
 
 void ModelMonitorProcess::Options::add_to(Arguments app) {
-  app.add_option("--samples", samples_file, "The observer's samples.lcmlog, read at start");
-  app.add_flag("--replayed", is_replayed,
-               "The samples are a recording's and no observer runs: what is missing is given up");
+  SampleIntake::Options::add_to(app);
   app.add_option("--schema", schema_file,
                  "Where the body schema is kept, and history.lcmlog beside it; reloaded at start");
   app.add_option("--initial", initial_file,

@@ -20,9 +20,7 @@ namespace bodyschema {
 /// learner's proposal, or what was judged ahead of it would be judged again.
 class ModelMonitorProcess {
  public:
-  struct Options {
-    std::string samples_file;
-    bool is_replayed = false;
+  struct Options : SampleIntake::Options {
     std::filesystem::path schema_file, initial_file;
     void add_to(Arguments app);
   };

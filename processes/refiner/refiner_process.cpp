@@ -14,9 +14,7 @@
 namespace bodyschema {
 
 void RefinerProcess::Options::add_to(Arguments app) {
-  app.add_option("--samples", samples_file, "The observer's samples.lcmlog, read at start");
-  app.add_flag("--replayed", is_replayed,
-               "The samples are a recording's and no observer runs: what is missing is given up");
+  SampleIntake::Options::add_to(app);
   app.add_option("--refined", schema_file,
                  "Where the refined schema is kept; reloaded and repeated at start");
   app.add_option("--proposed", proposed_folder,

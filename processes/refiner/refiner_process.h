@@ -19,9 +19,7 @@ namespace bodyschema {
 /// alone: its calibration is not the rig's until then.
 class RefinerProcess {
  public:
-  struct Options {
-    std::string samples_file;
-    bool is_replayed = false;
+  struct Options : SampleIntake::Options {
     std::filesystem::path schema_file, proposed_folder;
     void add_to(Arguments app);
   };

@@ -22,12 +22,6 @@ bool is_ready(const Future& future, std::chrono::milliseconds within = {}) {
 
 }  // namespace
 
-void StructureLearnerProcess::Options::add_to(Arguments app) {
-  app.add_option("--samples", samples_file, "The observer's samples.lcmlog, read at start");
-  app.add_flag("--replayed", is_replayed,
-               "The samples are a recording's and no observer runs: what is missing is given up");
-}
-
 StructureLearnerProcess::StructureLearnerProcess(Process& process, const Options& options)
     : process_(process),
       door_(process.rig_folder()),

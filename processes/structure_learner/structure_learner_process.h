@@ -16,11 +16,7 @@ namespace bodyschema {
 /// once, the rest at the end, so that it always writes the same messages.
 class StructureLearnerProcess {
  public:
-  struct Options {
-    std::string samples_file;
-    bool is_replayed = false;
-    void add_to(Arguments app);
-  };
+  using Options = SampleIntake::Options;
   StructureLearnerProcess(Process& process, const Options& options);
   StructureLearnerProcess(const StructureLearnerProcess&) = delete;
 

@@ -51,20 +51,10 @@ class ProcessClasses : public testing::Test {
   }
   /// What the process writes from the log `in`.
   template <class Subscriber>
-  fs::path replay(const std::string& name, const fs::path& in, std::vector<std::string> flags = {},
-                  const fs::path& rig = kRig) {
+  fs::path replay(const std::string& name, const fs::path& in,
+                  const std::vector<std::string>& flags = {}, const fs::path& rig = kRig) {
     const fs::path out = folder_ / (name + std::to_string(++num_runs_));
-    std::vector<std::string> words = {name,
-                                      "--config",
-                                      rig / (name + ".yaml"),
-                                      "--in",
-                                      "file://" + in.string() + "?speed=0",
-                                      "--out",
-                                      "file://" + out.string() + "?mode=w"};
-    words.insert(words.end(), flags.begin(), flags.end());
-    std::vector<char*> argv;
-    for (std::string& word : words) argv.push_back(word.data());
-    EXPECT_EQ(run_process<Subscriber>(name, static_cast<int>(argv.size()), argv.data()), 0);
+    EXPECT_EQ(test::run_on_log<Subscriber>(name, rig, in, out, flags), 0);
     return out;
   }
   static std::int64_t counter(const fs::path& log, const std::string& name) {

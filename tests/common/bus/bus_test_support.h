@@ -9,6 +9,7 @@
 #include <vector>
 
 #include "common/bus/bus.h"
+#include "common/bus/process.h"
 
 namespace bodyschema::test {
 
@@ -28,6 +29,25 @@ class TemporaryFolder {
 
 std::vector<std::uint8_t> read_bytes(const std::filesystem::path& file);
 void write_bytes(const std::filesystem::path& file, const std::vector<std::uint8_t>& bytes);
+
+/// A process's class on the log `in`, as its program would be: what it writes is in `out`. Returns
+/// the exit code.
+template <class Subscriber>
+int run_on_log(const std::string& name, const std::filesystem::path& rig,
+               const std::filesystem::path& in, const std::filesystem::path& out,
+               const std::vector<std::string>& flags) {
+  std::vector<std::string> words = {name,
+                                    "--config",
+                                    rig / (name + ".yaml"),
+                                    "--in",
+                                    "file://" + in.string() + "?speed=0",
+                                    "--out",
+                                    "file://" + out.string() + "?mode=w"};
+  words.insert(words.end(), flags.begin(), flags.end());
+  std::vector<char*> argv;
+  for (std::string& word : words) argv.push_back(word.data());
+  return run_process<Subscriber>(name, static_cast<int>(argv.size()), argv.data());
+}
 
 /// Asks `is_done()` between waits of `ask()` until it is true; false after ten seconds.
 template <class Ask, class IsDone>

@@ -54,20 +54,9 @@ class RefinerTest : public testing::Test {
                          [&](const auto& p) { return p.last_sample_index == sample; });
   }
   /// What the process writes from the log `in`.
-  fs::path replay(const fs::path& in, std::vector<std::string> flags = {}) {
+  fs::path replay(const fs::path& in, const std::vector<std::string>& flags = {}) {
     const fs::path out = folder_ / ("out" + std::to_string(++num_runs_));
-    std::vector<std::string> words = {"refiner",
-                                      "--config",
-                                      rig_ / "refiner.yaml",
-                                      "--in",
-                                      "file://" + in.string() + "?speed=0",
-                                      "--out",
-                                      "file://" + out.string() + "?mode=w"};
-    words.insert(words.end(), flags.begin(), flags.end());
-    std::vector<char*> argv;
-    for (std::string& word : words) argv.push_back(word.data());
-    EXPECT_EQ(run_process<RefinerProcess>("refiner", static_cast<int>(argv.size()), argv.data()),
-              0);
+    EXPECT_EQ(test::run_on_log<RefinerProcess>("refiner", rig_, in, out, flags), 0);
     return out;
   }
 
