@@ -145,7 +145,7 @@ def replay(place, log, rig, speed):
     with Session(place, run, lock, True, PRIVATE_BUS, PRIVATE_IMAGES, commands, SAMPLES_FLAGS=flags) as session:
         words = ["--replay", log, "--replay-from", source, "--speed", speed]
         # The recording would be played again.
-        return session.watch(watch_command(place, run, rig, PRIVATE_IMAGES, names, *words), may_restart=not is_played)
+        return session.watch(watch_command(place, run, rig, PRIVATE_IMAGES, commands, *words), may_restart=not is_played)
 
 
 def rig_of_result(file):

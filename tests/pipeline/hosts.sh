@@ -39,9 +39,10 @@ chmod -R u+w "$folder/rig"
 # All processes except robot and camera run on the learning host.
 seeing="camera marker_estimator observer log_images"
 learning=
-for name in $(sed -n 's/^\([a-z_]*?\{0,1\}\) .*/\1/p' "$source/config/group.conf"); do
-  [[ $name != *\? || -f $rig/${name%\?}.yaml ]] || continue
-  [[ " robot_simulator $seeing " == *" ${name%\?} "* ]] || learning+=" ${name%\?}"
+group=$(PYTHONPATH="$source" python3 -B -c 'import pathlib, sys; from launcher import group_file
+print(*group_file.processes(*map(pathlib.Path, sys.argv[1:])))' "$source/config/group.conf" "$rig")
+for name in $group; do
+  [[ " robot_simulator $seeing " == *" $name "* ]] || learning+=" $name"
 done
 list() { echo "[$(tr -s ' ' ',' <<<"${*# }")]"; }
 {

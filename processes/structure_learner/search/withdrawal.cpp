@@ -20,12 +20,20 @@ namespace {
 constexpr int kFewSightings = 6;
 constexpr double kCommonTurn = 0.65;
 
+// A screw whose axis is farther off, or that slides farther in a radian, is a sliding joint whose
+// turn is noise (chosen: longer than a robot's links).
+constexpr double kLongestLever_m = 2;
+
 // What the body's joints turn: the median of those that were found [rad per half range].
 double usual_turn(const std::vector<AcceptedModel>& models) {
   std::vector<double> turns;
   for (const AcceptedModel& edge : models)
-    for (const LocalModel::Joint& joint : edge.model.joints)
-      if (joint.turn != 0) turns.push_back(std::abs(joint.turn));
+    for (const LocalModel::Joint& joint : edge.model.joints) {
+      const double turn = std::abs(joint.turn);
+      const double motion_m =
+          std::hypot(joint.slide, turn * joint.X_after.translation().head<2>().norm());
+      if (motion_m < kLongestLever_m * turn) turns.push_back(turn);
+    }
   return turns.empty() ? std::numeric_limits<double>::infinity() : median(std::move(turns));
 }
 
