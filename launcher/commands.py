@@ -236,7 +236,7 @@ def test(place, arguments):
         place = place.with_build(place.source / "build-asan-ubsan")
         preset = "asan-ubsan"
         ctest = ["ctest", "--preset", preset]
-        arguments = ["-L", "fast", *arguments[1:]]
+        arguments = ["-L", "sanitized", *arguments[1:]]
     else:
         preset = "release"
     if not place.is_build_given:
@@ -341,7 +341,7 @@ WORDS = {
     "test": (
         test,
         "[--sanitize] [ARGS…]",
-        "set up, build, run the tests; --sanitize: the fast ones, under address and",
+        "set up, build, run the tests; --sanitize: those without images and groups, under address and",
         "undefined-behaviour sanitizers; ARGS go to ctest: -R NAME builds and runs what it names",
     ),
     "experiment": (

@@ -785,7 +785,7 @@ TEST_P(FourTagsAPart, NoneHasMovedWhereTheBodyIsWrong) {
   }
 }
 
-INSTANTIATE_TEST_SUITE_P(AdaptationTest, FourTagsAPart, testing::Range(1, 9));
+INSTANTIATE_TEST_SUITE_P(AdaptationTest, FourTagsAPart, testing::Range(1, 4));
 
 /// The root does not turn: both its tags are always in sight.
 class TwoTagsOnTheRoot : public testing::Test {
