@@ -38,7 +38,7 @@ LEARN_USAGES = (
     ),
 )
 # Words of the console that need the group's bus.
-ON_THE_BUS = ("target", "hold", "release", "halt", "resume", "fault")
+ON_THE_BUS = ("target", "where", "hold", "release", "halt", "resume", "fault")
 # Words of `./run` with the console's options.
 OPTIONS_OF_THE_CONSOLE = ("driver-test", "status", "report", "rig")
 # Words whose arguments, --help included, belong to another program.
@@ -246,7 +246,7 @@ def test(place, arguments):
             cmake("--build", place.build, "--target", "build.ninja")
         targets = test_selection.targets(place, arguments)
         build(place, *(["all"] if targets is None else targets), preset=preset)
-    become([*ctest, "--output-on-failure", "-j", num_processors(), *arguments])
+    become([*ctest, "--output-on-failure", "-j", num_processors() + 1, *arguments])
 
 
 def experiment(place, arguments):
@@ -306,7 +306,8 @@ def report(place, arguments):
 
 def console(place, word, arguments):
     """Runs a word of the console; suggests the nearest one for a misspelt word."""
-    if word in ON_THE_BUS and not asks_for_help(arguments):
+    asks_group = word in ON_THE_BUS and not any(argument.split("=")[0] == "--schema" for argument in arguments)
+    if asks_group and not asks_for_help(arguments):
         group = Group.find(place.logs)
         if group:
             exec_in_group(place, group, ["bodyschema", word, *arguments])
@@ -361,6 +362,6 @@ WORDS = {
 # Words of the console, whose own help says more.
 CONSOLE_WORDS = {
     "halt": ("", "stop the arm at once, until ./run resume"),
-    "target|hold|release|fault": ("…", "steer or break the group's arm"),
+    "target|where|hold|release|fault": ("…", "steer or break the group's arm"),
     "WORD…": ("", "bodyschema WORD…: learn, predict, show, reach, log, monitor, refine, adopt, engineer, urdf"),
 }

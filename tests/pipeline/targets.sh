@@ -18,6 +18,16 @@ console() { "$source/run" exec bodyschema "$@" >>"$work/console.txt" 2>&1; }
 "$source/run" --rig arm2 --ideal --seed 3 --samples 30 --keep >"$work/run.txt" 2>&1 || fail "the group did not learn"
 "$source/run" exec targets --rig-folder "$work/logs/current/config" --count 6 --limit-mm 8 >"$work/targets.txt" 2>&1 ||
   fail "the targets were not reached"
+# Where the arm is, by the newest schema: at the target that it reached last.
+"$source/run" where 5 --json >"$work/where.json" || fail "where"
+python3 - "$work/where.json" "$(awk -F'|' '/reached/ && $3 ~ /^ *-?[0-9.]+ / {at = $3} END {print at}' "$work/targets.txt")" <<'END' || fail "where is elsewhere"
+import json, sys
+part = json.load(open(sys.argv[1]))["parts"][0]
+target = [float(word) for word in sys.argv[2].split()]
+position = part["X_RB"]["position_m"]
+assert max(abs(p - t) for p, t in zip(position, target)) < 0.005, (position, target)
+assert all(low <= p <= high for low, p, high in zip(part["lowest_m"], position, part["highest_m"])), part
+END
 console target --part 5 --position 9 9 9 --timeout 30 && fail "a target out of reach was reached"
 grep -q "refused: out of reach" "$work/console.txt" || fail "a target out of reach is not refused"
 console stop && fail "stop did something"

@@ -342,6 +342,17 @@ TEST_F(BodyschemaProgramTest, ReachFindsTheActionOfAPoseOrTheNearest) {
   for (int i = 0; i < 3; ++i)
     EXPECT_NEAR(found["position_m"][i].get<double>(), X_RB["position_m"][i].get<double>(), 1e-3);
 
+  const Json where = run({"where", "5", "--schema", "schema.lcmlog", "--json"}).json();
+  ASSERT_EQ(where["parts"].size(), 1U) << where;
+  EXPECT_EQ(where["parts"][0]["part"], 5);
+  EXPECT_TRUE(where["signals"].is_null());
+  for (int i = 0; i < 3; ++i) {
+    const double at = X_RB["position_m"][i].get<double>();
+    EXPECT_LE(where["parts"][0]["lowest_m"][i].get<double>(), at);
+    EXPECT_GE(where["parts"][0]["highest_m"][i].get<double>(), at);
+  }
+  expect_failure({"where", "77", "--schema", "schema.lcmlog"}, "no part 77");
+
   const Outcome far =
       run({"reach", "schema.lcmlog", "--part", "5", "--json", "--position", "9", "9", "9"});
   EXPECT_EQ(far.exit_code, 1);

@@ -5,7 +5,6 @@
 #include <algorithm>
 #include <cmath>
 #include <ostream>
-#include <set>
 
 #include "common/geometry/angle.h"
 #include "common/kinematics/kinematic_tree.h"
@@ -39,9 +38,16 @@ std::string pose_sd_text(const Noise& sd) {
 
 }  // namespace
 
+std::set<int> moving_signals(const BodySchema& schema, int part) {
+  std::set<int> moving;
+  const KinematicTree tree(schema.edges, schema.root);
+  for (const int node : tree.path_to(tree.node_of(part)))
+    for (const int s : schema.edges[tree.nodes()[node].edge].signals()) moving.insert(s);
+  return moving;
+}
+
 std::vector<PartPrediction> predict_parts(const BodySchema& schema, const Eigen::VectorXd& action) {
   const std::vector<int> outside = signals_outside(schema, action);
-  const KinematicTree tree(schema.edges, schema.root);
   std::vector<PartPrediction> result;
   for (const int part : schema.parts) {
     if (part == schema.root) continue;
@@ -51,25 +57,26 @@ std::vector<PartPrediction> predict_parts(const BodySchema& schema, const Eigen:
     p.part = part;
     p.X_RB = predicted->X_AB;
     p.sd = deviations_of(predicted->covariance);
-    std::set<int> moving;
-    for (const int node : tree.path_to(tree.node_of(part)))
-      for (const int s : schema.edges[tree.nodes()[node].edge].signals()) moving.insert(s);
+    const std::set<int> moving = moving_signals(schema, part);
     std::copy_if(outside.begin(), outside.end(), std::back_inserter(p.outside),
                  [&](int s) { return moving.contains(s); });
   }
   return result;
 }
 
+Json part_json(const BodySchema& schema, const PartPrediction& prediction) {
+  return {{"part", prediction.part},
+          {"X_RB", pose_json(prediction.X_RB)},
+          {"position_sd_m", deviation(prediction.sd.position_m, 1)},
+          {"rotation_sd_deg", deviation(prediction.sd.rotation_rad, kDegree)},
+          {"outside_training", signal_names(schema, prediction.outside)}};
+}
+
 Json prediction_json(const BodySchema& schema, const Eigen::VectorXd& action) {
   Json json = {{"action", Json::object()},
                {"outside_training", signal_names(schema, signals_outside(schema, action))},
-               {"parts", array_of(predict_parts(schema, action), [&](const PartPrediction& p) {
-                  return Json{{"part", p.part},
-                              {"X_RB", pose_json(p.X_RB)},
-                              {"position_sd_m", deviation(p.sd.position_m, 1)},
-                              {"rotation_sd_deg", deviation(p.sd.rotation_rad, kDegree)},
-                              {"outside_training", signal_names(schema, p.outside)}};
-                })}};
+               {"parts", array_of(predict_parts(schema, action),
+                                  [&](const PartPrediction& p) { return part_json(schema, p); })}};
   for (std::size_t s = 0; s < schema.signals.size(); ++s)
     json["action"][schema.signals[s].name] = action(static_cast<Eigen::Index>(s));
   return json;

@@ -1,6 +1,7 @@
 #pragma once
 
 #include <iosfwd>
+#include <set>
 #include <string>
 #include <vector>
 
@@ -9,6 +10,9 @@
 #include "processes/console/views/json.h"
 
 namespace bodyschema {
+
+/// Signals that move a part in the root (indices).
+std::set<int> moving_signals(const BodySchema& schema, int part);
 
 /// Where a schema says that a part is, and how well it knows.
 struct PartPrediction {
@@ -22,6 +26,8 @@ struct PartPrediction {
 /// signal, which are those of the commands of a CSV that was learned from, or the rig's.
 /// @throws std::invalid_argument if `action` does not have one value per signal.
 std::vector<PartPrediction> predict_parts(const BodySchema& schema, const Eigen::VectorXd& action);
+
+Json part_json(const BodySchema& schema, const PartPrediction& prediction);
 
 /// `predict --action`, for programs and for people.
 Json prediction_json(const BodySchema& schema, const Eigen::VectorXd& action);

@@ -5,9 +5,9 @@
 #include <vector>
 
 #include "common/geometry/angle.h"
-#include "common/kinematics/kinematic_tree.h"
 #include "common/schema/standard_deviations.h"
 #include "common/text/text.h"
+#include "processes/console/views/prediction_view.h"
 #include "processes/console/views/structure_view.h"
 
 namespace bodyschema {
@@ -22,18 +22,12 @@ constexpr double kAtLimit = 1e-9;  // of a range
 
 // Signals that move the part and are at an end of their range.
 std::vector<int> at_limits(const BodySchema& schema, int part, const Eigen::VectorXd& action) {
-  std::vector<bool> moves(schema.signals.size());
-  const KinematicTree tree(schema.edges, schema.root);
-  for (const int node : tree.path_to(tree.node_of(part)))
-    for (const int s : schema.edges[tree.nodes()[node].edge].signals())
-      moves[static_cast<std::size_t>(s)] = true;
   std::vector<int> result;
-  for (std::size_t s = 0; s < moves.size(); ++s) {
-    const Signal& signal = schema.signals[s];
-    const double value = action(static_cast<Eigen::Index>(s));
+  for (const int s : moving_signals(schema, part)) {
+    const Signal& signal = schema.signals[static_cast<std::size_t>(s)];
     const double margin = kAtLimit * (signal.upper - signal.lower);
-    if (moves[s] && (value <= signal.lower + margin || value >= signal.upper - margin))
-      result.push_back(static_cast<int>(s));
+    if (action(s) <= signal.lower + margin || action(s) >= signal.upper - margin)
+      result.push_back(s);
   }
   return result;
 }
