@@ -2,13 +2,16 @@
 #include <sys/wait.h>
 #include <unistd.h>
 
+#include <algorithm>
 #include <cmath>
 #include <cstdlib>
 #include <filesystem>
 #include <fstream>
+#include <limits>
 #include <nlohmann/json.hpp>
 #include <sstream>
 #include <string>
+#include <vector>
 
 #include "common/bus/convert.h"
 #include "common/bus/event_log.h"
@@ -150,6 +153,75 @@ TEST_F(RefineProgramTest, FitsTheRowsOfACsv) {
   EXPECT_EQ(json.at("fitted"), "poses");
   EXPECT_TRUE(json.at("before").is_null());
   EXPECT_TRUE(json.at("undetermined").empty());
+}
+
+/// Median distance of a part from where it is in the root, over random actions [m].
+double distance_from_truth(const BodySchema& schema, const BodySchema& truth, int part) {
+  test::Rng rng(72);
+  std::vector<double> distances;
+  for (int n = 0; n < 101; ++n) {
+    Eigen::VectorXd action(static_cast<Eigen::Index>(truth.signals.size()));
+    for (Eigen::Index s = 0; s < action.size(); ++s) {
+      const Signal& signal = truth.signals[static_cast<std::size_t>(s)];
+      action(s) = test::uniform(rng, signal.lower, signal.upper);
+    }
+    const auto predicted = schema.predict(schema.root, part, action);
+    if (!predicted) return std::numeric_limits<double>::infinity();
+    distances.push_back((predicted->X_AB.translation() -
+                         truth.predict(truth.root, part, action)->X_AB.translation())
+                            .norm());
+  }
+  std::nth_element(distances.begin(), distances.begin() + 50, distances.end());
+  return distances[50];
+}
+
+// The job of robot_calibration: the URDF is millimetres and degrees off, and the camera sees the
+// base and the end of seven joints, how the end is turned or not.
+TEST_F(RefineProgramTest, ARobotOfAUrdfIsRefinedFromItsEndAlone) {
+  test::Rng rng(73);
+  const test::SyntheticRobot robot = test::chapter_robot("d", rng);
+  const BodySchema truth = test::true_schema(robot);
+  const int end = truth.edges.back().to;
+  BodySchema nominal = truth;
+  for (Edge& edge : nominal.edges) {
+    Vector6d error;
+    for (int k = 0; k < 6; ++k) error(k) = test::uniform(rng, -1, 1) * (k < 3 ? 0.004 : 0.02);
+    edge.left = edge.left * exp(error);
+  }
+  write_one_event_log(folder_ / "nominal", kBodySchema, to_message(nominal));
+  ASSERT_EQ(run("urdf nominal --out robot.urdf --placement all.yaml --nominal").exit_code, 0);
+  std::ifstream all(folder_ / "all.yaml");
+  std::ofstream placement(folder_ / "ends.yaml");
+  for (std::string line; std::getline(all, line);) {
+    const bool is_part = line.find("{part: ") != std::string::npos;
+    const auto is_of = [&](int part) {
+      return line.find("{part: " + std::to_string(part) + ",") != std::string::npos;
+    };
+    if (!is_part || is_of(truth.root) || is_of(end)) placement << line << "\n";
+  }
+  placement.close();
+  std::vector<ActionPoseSample> samples =
+      test::babble(robot, 100, {.regime = test::Regime::kTagIso}, rng);
+  for (ActionPoseSample& sample : samples)
+    std::erase_if(sample.parts,
+                  [&](const auto& seen) { return seen.part != truth.root && seen.part != end; });
+  for (const bool has_orientation : {true, false}) {
+    SCOPED_TRACE(has_orientation ? "poses" : "positions");
+    std::ofstream csv(folder_ / "samples.csv");
+    test::write_csv(has_orientation ? samples : test::with_positions_alone(samples, {end}), csv);
+    csv.close();
+    const Outcome engineered =
+        run("engineer robot.urdf ends.yaml --samples samples.csv --out begin");
+    ASSERT_EQ(engineered.exit_code, 0) << engineered.err;
+    json_of("refine begin samples.csv --noise 0.003 1 --out refined --json");
+    const auto schema = [&](const char* file) {
+      return from_message(read_log(folder_ / file, kBodySchema).back());
+    };
+    EXPECT_GT(distance_from_truth(schema("begin"), truth, end), 0.008);
+    EXPECT_LT(distance_from_truth(schema("refined"), truth, end), 0.002);
+    std::filesystem::remove(folder_ / "begin");
+    std::filesystem::remove(folder_ / "refined");
+  }
 }
 
 TEST_F(RefineProgramTest, SaysWhatIsWrong) {

@@ -96,9 +96,9 @@ std::string where_text(const BodySchema& schema, const Whereabouts& where) {
            fmt::format("{:<18}{:<18}{}\n", box[0], box[1], box[2]);
   };
   std::string text = fmt::format(
-      "By the schema, in the frame of part {} [m]: {}the box that holds all positions of a\n"
-      "part; not every point of it can be reached.\n",
-      schema.root, where.action ? "where parts are, how well that is known per axis, and\n" : "");
+      "By the schema, in the frame of part {} [m]: {}the box that holds all\n"
+      "positions of a part; not every point of it can be reached.\n",
+      schema.root, where.action ? "where parts are, ± per axis, and " : "");
   text +=
       row("part", fmt::format("{:>7} {:>7} {:>7}  {:>8}", "x", "y", "z", "± mm"), {"x", "y", "z"});
   for (const Whereabouts::Part& p : where.parts) {
