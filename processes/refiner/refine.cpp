@@ -206,9 +206,11 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
       wanted_actions(result.schema, result.used_corners ? std::optional(result.rig) : std::nullopt,
                      training, problem, information);
   const bool judges_corners = rig && has_corners(held_out);
-  result.before = held_out_errors(schema, held_out, judges_corners ? rig : std::nullopt);
+  result.before =
+      held_out_errors(schema, held_out, judges_corners ? rig : std::nullopt, options.corner_noise);
   result.after = held_out_errors(result.schema, held_out,
-                                 judges_corners ? std::optional(result.rig) : std::nullopt);
+                                 judges_corners ? std::optional(result.rig) : std::nullopt,
+                                 options.corner_noise);
   result.seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - begin).count();
   return result;
 }

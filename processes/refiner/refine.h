@@ -53,6 +53,8 @@ struct HeldOutErrors {
   std::vector<PartErrors> parts;    ///< in the root's frame, of all parts but the root
   std::optional<double> px_rms;     ///< per coordinate of a corner; none without corners
   std::optional<double> px_median;  ///< of a corner's distance
+  /// −log likelihood of the corners of each sample that shows some (robust_cost() of their tags).
+  std::vector<double> corner_costs;
 };
 
 /// How far a joint is from its command, 1 σ over the samples: backlash and droop.

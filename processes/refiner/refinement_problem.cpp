@@ -211,12 +211,7 @@ std::optional<RefinementProblem::Cost> RefinementProblem::cost_of(const TagSight
   if (!tag || !is_usable(tag->part, sample_index) ||
       has_moved(schema_.moved_tags, sight.tag, sample_index))
     return std::nullopt;
-  Matrix8d covariance = sight.covariance_px2;
-  if (covariance.isZero(0)) {
-    std::vector<Eigen::Vector2d> corners;
-    for (int c = 0; c < 4; ++c) corners.emplace_back(sight.corners_px.segment<2>(2 * c));
-    covariance = std::pow(options_.corner_noise.sigma_px(corners), 2) * Matrix8d::Identity();
-  }
+  const Matrix8d covariance = covariance_of(sight, options_.corner_noise);
   std::vector<ParameterBlock*> blocks = chain_blocks(tag->part, sample_index);
   blocks.push_back(tags_.at(sight.tag));
   blocks.push_back(lens_block_);

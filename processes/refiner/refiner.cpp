@@ -7,6 +7,7 @@
 #include "bodyschema/action_command_t.hpp"
 #include "common/bus/convert.h"
 #include "common/config/calibration_id.h"
+#include "processes/refiner/held_out.h"
 
 namespace bodyschema {
 namespace {
@@ -32,8 +33,7 @@ Refiner::Refiner(RefinerSettings settings)
     : settings_(std::move(settings)), next_due_(settings_.options.config.refine_every) {}
 
 bool RefinedProposal::is_better() const {
-  return refinement && refinement->before.px_median && refinement->after.px_median &&
-         *refinement->after.px_median < *refinement->before.px_median;
+  return refinement && predicts_corners_better(refinement->after, refinement->before);
 }
 
 void Refiner::on_sample(const sample_t& sample) {

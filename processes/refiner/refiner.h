@@ -31,8 +31,8 @@ struct RefinedProposal {
   std::optional<Refinement> refinement;
   std::string problem;  ///< why there is no refinement, for people
 
-  /// Of the TEST samples' corners more are predicted better than by the proposal and the rig's
-  /// files.
+  /// The corners of TEST samples are predicted better than by the proposal and the rig's files:
+  /// predicts_corners_better().
   bool is_better() const;
 };
 

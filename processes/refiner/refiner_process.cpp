@@ -120,9 +120,12 @@ void RefinerProcess::say(const RefinedProposal& proposal) {
                          proposal.sample_index);
   } else {
     words_ = fmt::format(
-        "sample {}: corners of {} TEST samples {:.3f} → {:.3f} px (median) in {:.1f} s{}",
+        "sample {}: corners of {} TEST samples {:.3f} → {:.3f} px (median), {:.3f} → {:.3f} px "
+        "(rms) "
+        "in {:.1f} s{}",
         proposal.sample_index, r.after.num_samples, *r.before.px_median, *r.after.px_median,
-        r.seconds, proposal.is_better() ? "" : ": no better, nothing is proposed");
+        *r.before.px_rms, *r.after.px_rms, r.seconds,
+        proposal.is_better() ? "" : ": not surely better, nothing is proposed");
   }
   spdlog::info("{}", words_);
   process_.set_activity(process_info_t::PHASE_WORKING, words_);

@@ -1,6 +1,7 @@
 #include "processes/refiner/refiner_sample.h"
 
 #include <algorithm>
+#include <cmath>
 #include <map>
 
 #include "common/bus/convert.h"
@@ -22,6 +23,13 @@ TagSight tag_sight(const tag_corners_t& message) {
 }
 
 }  // namespace
+
+Matrix8d covariance_of(const TagSight& sight, const CornerNoise& corner_noise) {
+  if (!sight.covariance_px2.isZero(0)) return sight.covariance_px2;
+  std::vector<Eigen::Vector2d> corners;
+  for (int c = 0; c < 4; ++c) corners.emplace_back(sight.corners_px.segment<2>(2 * c));
+  return std::pow(corner_noise.sigma_px(corners), 2) * Matrix8d::Identity();
+}
 
 RefinerSample refiner_sample(const sample_t& message) {
   RefinerSample result{from_message(message), {}};

@@ -18,6 +18,9 @@ struct TagSight {
   Matrix8d covariance_px2 = Matrix8d::Zero();
 };
 
+/// Of its corners [px²]; where none is told, as such corners are known.
+Matrix8d covariance_of(const TagSight& sight, const CornerNoise& corner_noise);
+
 /// An action–pose sample with what the camera saw of each tag.
 struct RefinerSample {
   ActionPoseSample sample;

@@ -30,9 +30,9 @@ def main(work):
     rig = work / "rig"
     shutil.copytree(source / "config" / "arm2", rig)
     settings = (rig / "refiner.yaml").read_text()
-    settings = settings.replace("enabled: false", "enabled: true").replace("refine_every: 50", "refine_every: 10")
+    settings = settings.replace("enabled: false", "enabled: true").replace("refine_every: 50", "refine_every: 30")
     (rig / "refiner.yaml").write_text(settings)
-    learn = ("--rig", rig, "--seed", 1, "--samples", 15)
+    learn = ("--rig", rig, "--seed", 1, "--samples", 35)
     current = work / "logs" / "current"
 
     if "refined.lcmlog" not in run(work, *learn):

@@ -22,7 +22,7 @@ namespace {
 
 namespace fs = std::filesystem;
 
-const fs::path kRecorded = BODYSCHEMA_LOGS "/arm2_15.lcmlog";
+const fs::path kArm2 = BODYSCHEMA_LOGS "/arm2_15.lcmlog";
 
 std::string text_of(const fs::path& file) {
   std::ostringstream text;
@@ -30,23 +30,38 @@ std::string text_of(const fs::path& file) {
   return text.str();
 }
 
-/// A recording of arm2 (samples 4, 9 and 14 are TEST) and a rig that refines every ten.
+/// A recording of arm2 in which every second sample, the first one too, is TEST, and a rig that
+/// refines every ten and claims that the tags of part 5 are 1 % larger than they are.
 class RefinerTest : public testing::Test {
  protected:
   RefinerTest() {
     fs::copy(BODYSCHEMA_CONFIG "/arm2", rig_);
-    set("refine_every: 50", "refine_every: 10");
+    set("refiner.yaml", "refine_every: 50", "refine_every: 10");
+    set("markers.yaml", "size_m: 0.08, part: 5", "size_m: 0.0808, part: 5");
     std::set<std::int64_t> known;
-    for (const sample_t& sample : read_log(kRecorded, kSample))
-      if (known.insert(sample.sample_index).second) samples_.push_back(sample);
-    for (const body_schema_t& proposal : read_log(kRecorded, kLearnedSchema))
+    for (const sample_t& sample : read_log(kArm2, kSample)) {
+      if (!known.insert(sample.sample_index).second) continue;
+      samples_.push_back(sample);
+      samples_.back().calibration_id = calibration_id(rig_);
+      samples_.back().purpose = sample.sample_index % 2 == 0 ? action_command_t::PURPOSE_TEST
+                                                             : action_command_t::PURPOSE_TRAIN;
+    }
+    for (const body_schema_t& proposal : read_log(kArm2, kLearnedSchema)) {
       proposals_.push_back(proposal);
+      proposals_.back().calibration_id = calibration_id(rig_);
+    }
+    LogAppender log(recorded_);
+    for (const sample_t& sample : samples_) {
+      log.append(kSample, sample);
+      for (const body_schema_t& proposal : proposals_)
+        if (proposal.last_sample_index == sample.sample_index) log.append(kLearnedSchema, proposal);
+    }
   }
 
-  void set(const std::string& from, const std::string& to) const {
-    const std::string text = text_of(rig_ / "refiner.yaml");
+  void set(const std::string& file, const std::string& from, const std::string& to) const {
+    const std::string text = text_of(rig_ / file);
     ASSERT_NE(text.find(from), std::string::npos);
-    std::ofstream(rig_ / "refiner.yaml") << std::regex_replace(text, std::regex(from), to);
+    std::ofstream(rig_ / file) << std::regex_replace(text, std::regex(from), to);
   }
   Refiner refiner() const { return Refiner(RefinerSettings::load(rig_ / "refiner.yaml")); }
   const body_schema_t& proposal_after(std::int64_t sample) const {
@@ -61,7 +76,7 @@ class RefinerTest : public testing::Test {
   }
 
   test::TemporaryFolder folder_;
-  const fs::path rig_ = folder_ / "rig";
+  const fs::path rig_ = folder_ / "rig", recorded_ = folder_ / "recorded.lcmlog";
   std::vector<sample_t> samples_;
   std::vector<body_schema_t> proposals_;
   int num_runs_ = 0;
@@ -76,7 +91,7 @@ TEST_F(RefinerTest, RefinesTheProposalOfTheFirstTestSampleAfterEveryTen) {
       if (proposal.last_sample_index == sample.sample_index) refiner.on_learned_schema(proposal);
     while (refiner.has_job()) refined.push_back(refiner.take_job()().sample_index);
   }
-  EXPECT_EQ(refined, std::vector<std::int64_t>{9});
+  EXPECT_EQ(refined, std::vector<std::int64_t>{10});
 }
 
 TEST_F(RefinerTest, TheOrderOfSamplesAndProposalsDoesNotMatter) {
@@ -98,12 +113,12 @@ TEST_F(RefinerTest, TheOrderOfSamplesAndProposalsDoesNotMatter) {
 TEST_F(RefinerTest, AnIncompleteProposalIsNotRefinedNorOneThatWas) {
   Refiner refiner = this->refiner();
   for (const sample_t& sample : samples_) refiner.on_sample(sample);
-  body_schema_t incomplete = proposal_after(9);
+  body_schema_t incomplete = proposal_after(10);
   incomplete.is_complete = 0;
   refiner.on_learned_schema(incomplete);
   EXPECT_FALSE(refiner.has_job());
-  refiner.skip(9);
-  refiner.on_learned_schema(proposal_after(9));
+  refiner.skip(10);
+  refiner.on_learned_schema(proposal_after(10));
   EXPECT_FALSE(refiner.has_job());
 }
 
@@ -113,19 +128,32 @@ TEST_F(RefinerTest, ARefinementThatFailsSaysWhy) {
     sample.calibration_id += 1;
     refiner.on_sample(sample);
   }
-  refiner.on_learned_schema(proposal_after(9));
+  refiner.on_learned_schema(proposal_after(10));
   const RefinedProposal result = refiner.take_job()();
   EXPECT_FALSE(result.refinement);
   EXPECT_NE(result.problem.find("another calibration"), std::string::npos) << result.problem;
   EXPECT_FALSE(result.is_better());
 }
 
+TEST_F(RefinerTest, WhatChanceMayHaveDoneIsNoBetter) {
+  Refiner refiner = this->refiner();
+  for (const sample_t& sample : samples_) refiner.on_sample(sample);
+  refiner.on_learned_schema(proposal_after(10));
+  RefinedProposal result = refiner.take_job()();
+  EXPECT_TRUE(result.is_better());
+  // Better in five samples of six.
+  std::vector<double>& after = result.refinement->after.corner_costs;
+  ASSERT_EQ(after.size(), 6U);
+  after[3] = result.refinement->before.corner_costs[3];
+  EXPECT_FALSE(result.is_better());
+}
+
 TEST_F(RefinerTest, AReplayWritesTheSameBytesAndFilesThatGoTogether) {
   const std::vector<std::string> files = {"--refined", folder_ / "refined.lcmlog", "--proposed",
                                           folder_ / "proposed"};
-  const auto schemas = read_log(replay(kRecorded, files), kRefinedSchema);
+  const auto schemas = read_log(replay(recorded_, files), kRefinedSchema);
   ASSERT_EQ(schemas.size(), 1U);
-  EXPECT_EQ(schemas[0].last_sample_index, 9);
+  EXPECT_EQ(schemas[0].last_sample_index, 10);
   EXPECT_NE(schemas[0].calibration_id, samples_[0].calibration_id);
   const auto kept = read_log(folder_ / "refined.lcmlog", kBodySchema);
   ASSERT_EQ(kept.size(), 1U);
@@ -138,19 +166,19 @@ TEST_F(RefinerTest, AReplayWritesTheSameBytesAndFilesThatGoTogether) {
 
 TEST_F(RefinerTest, WhatAnEarlierProcessRefinedIsNotRefinedAgain) {
   const std::vector<std::string> file = {"--refined", folder_ / "refined.lcmlog"};
-  EXPECT_EQ(read_log(replay(kRecorded, file), kRefinedSchema).size(), 1U);
+  EXPECT_EQ(read_log(replay(recorded_, file), kRefinedSchema).size(), 1U);
   const std::string kept = text_of(folder_ / "refined.lcmlog");
-  EXPECT_TRUE(read_log(replay(kRecorded, file), kRefinedSchema).empty());
+  EXPECT_TRUE(read_log(replay(recorded_, file), kRefinedSchema).empty());
   EXPECT_EQ(text_of(folder_ / "refined.lcmlog"), kept);
   // A file that is none is no reason to end.
   std::ofstream(folder_ / "refined.lcmlog") << "no log";
-  EXPECT_EQ(read_log(replay(kRecorded, file), kRefinedSchema).size(), 1U);
+  EXPECT_EQ(read_log(replay(recorded_, file), kRefinedSchema).size(), 1U);
 }
 
 TEST_F(RefinerTest, TwoReplaysAreTheSame) {
   const auto refined = [&] {
     std::vector<std::vector<std::uint8_t>> bytes;
-    for (const body_schema_t& schema : read_log(replay(kRecorded), kRefinedSchema))
+    for (const body_schema_t& schema : read_log(replay(recorded_), kRefinedSchema))
       bytes.push_back(encode(kRefinedSchema, schema));
     return bytes;
   };
@@ -158,15 +186,13 @@ TEST_F(RefinerTest, TwoReplaysAreTheSame) {
 }
 
 TEST_F(RefinerTest, SamplesOfAnotherCalibrationAreRefused) {
-  const std::string text = text_of(rig_ / "markers.yaml");
-  std::ofstream(rig_ / "markers.yaml")
-      << std::regex_replace(text, std::regex("size_m: 0.08, part: 1"), "size_m: 0.09, part: 1");
-  const fs::path out = replay(kRecorded);
+  set("markers.yaml", "size_m: 0.08, part: 1", "size_m: 0.09, part: 1");
+  const fs::path out = replay(recorded_);
   EXPECT_TRUE(read_log(out, kRefinedSchema).empty());
 }
 
 TEST_F(RefinerTest, WhatCannotBeSavedIsPublishedAndCounted) {
-  const fs::path out = replay(kRecorded, {"--refined", folder_ / "no" / "such" / "refined.lcmlog"});
+  const fs::path out = replay(recorded_, {"--refined", folder_ / "no" / "such" / "refined.lcmlog"});
   EXPECT_EQ(read_log(out, kRefinedSchema).size(), 1U);
   std::int64_t not_saved = 0;
   const process_info_t info = read_log(out, kProcessInfo).back();
