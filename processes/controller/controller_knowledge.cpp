@@ -3,6 +3,7 @@
 #include <Eigen/Cholesky>
 
 #include "common/bus/convert.h"
+#include "common/bus/rest_position.h"
 #include "common/estimation/chi_square.h"
 #include "processes/controller/controller.h"
 #include "processes/controller/controller_words.h"
@@ -76,13 +77,8 @@ void Controller::locate() {
     return;
   }
   if (motion_->rest_since_utime != position_rest_utime_) position_.reset();
-  const bool is_whole = motion_->commanded.size() == config_.signals.size();
-  const bool is_settled = motion_->state == motion_status_t::STATE_SETTLED &&
-                          motion_->kind == action_command_t::KIND_MOVE;
-  // A driver that never moved, or that answers a HOLD, may say where it stands.
-  const bool is_told = motion_->action_id < 0 || motion_->kind != action_command_t::KIND_MOVE;
-  if (is_whole && (is_settled || is_told)) {
-    position_ = vector_of(motion_->commanded);
+  if (const auto told = rest_position(*motion_, config_.signals.size())) {
+    position_ = told;
   } else if (!position_ && sample_ && sample_->rest_begin_utime == motion_->rest_since_utime) {
     position_ = vector_of(sample_->action);
   }

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 
 #include "common/camera/fit_pose.h"
 #include "common/estimation/chi_square.h"
@@ -60,7 +61,8 @@ std::optional<Eigen::Matrix<double, 8, 1>> corner_errors(const Pose& X_CM, doubl
 }
 
 struct CornerErrors {
-  std::vector<double> distances_px;
+  int num_tags = 0;
+  std::vector<double> distances_px;  ///< of tags that are predicted before the camera
   double cost = 0;
 };
 
@@ -74,7 +76,11 @@ CornerErrors corner_errors(const BodySchema& schema, const RefinerSample& seen,
     if (!tag || !X_RB.contains(tag->part)) continue;
     const Pose X_CM = schema.X_CR * X_RB.at(tag->part) * tag->X_BM.value_or(Pose::Identity());
     const auto errors = corner_errors(X_CM, tag->size_m, sight, lens);
-    if (!errors) continue;
+    ++result.num_tags;
+    if (!errors) {
+      result.cost = std::numeric_limits<double>::infinity();
+      continue;
+    }
     for (int c = 0; c < 4; ++c) result.distances_px.push_back(errors->segment<2>(2 * c).norm());
     const Matrix8d whitener = whitener_of(covariance_of(sight, corner_noise));
     result.cost += robust_cost((whitener * *errors).squaredNorm(), 8);
@@ -99,7 +105,7 @@ HeldOutErrors held_out_errors(const BodySchema& schema, const std::vector<Refine
     std::vector<double> distances;
     for (const RefinerSample& seen : samples) {
       const CornerErrors here = corner_errors(schema, seen, *rig, lens, corner_noise);
-      if (here.distances_px.empty()) continue;
+      if (here.num_tags == 0) continue;
       errors.corner_costs.push_back(here.cost);
       distances.insert(distances.end(), here.distances_px.begin(), here.distances_px.end());
     }

@@ -115,14 +115,14 @@ void RefinerProcess::save() {
 void RefinerProcess::say(const RefinedProposal& proposal) {
   if (!proposal.refinement) {
     words_ = fmt::format("sample {}: not refined: {}", proposal.sample_index, proposal.problem);
-  } else if (const Refinement& r = *proposal.refinement; !r.before.px_median) {
+  } else if (const Refinement& r = *proposal.refinement;
+             !r.before.px_median || !r.after.px_median) {
     words_ = fmt::format("sample {}: refined, but no TEST sample shows corners to judge it by",
                          proposal.sample_index);
   } else {
     words_ = fmt::format(
         "sample {}: corners of {} TEST samples {:.3f} → {:.3f} px (median), {:.3f} → {:.3f} px "
-        "(rms) "
-        "in {:.1f} s{}",
+        "(rms) in {:.1f} s{}",
         proposal.sample_index, r.after.num_samples, *r.before.px_median, *r.after.px_median,
         *r.before.px_rms, *r.after.px_rms, r.seconds,
         proposal.is_better() ? "" : ": not surely better, nothing is proposed");

@@ -2,6 +2,7 @@
 #include <spdlog/spdlog.h>
 
 #include <chrono>
+#include <iostream>
 #include <memory>
 #include <optional>
 #include <stdexcept>
@@ -10,6 +11,7 @@
 #include "common/bus/bus.h"
 #include "common/bus/channels.h"
 #include "common/bus/convert.h"
+#include "common/bus/rest_position.h"
 #include "common/text/clock.h"
 #include "processes/console/commands/commands.h"
 #include "processes/console/commands/files.h"
@@ -28,19 +30,24 @@ struct WhereArguments {
 };
 
 struct Heard {
-  std::optional<body_schema_t> schema;
+  std::optional<BodySchema> schema;
   std::optional<motion_status_t> motion;
+
+  /// Where the arm is, once that is known.
+  std::optional<Eigen::VectorXd> position() const {
+    if (!schema || !motion) return std::nullopt;
+    return rest_position(*motion, schema->signals.size());
+  }
 };
 
 Heard listen(const std::string& url) {
   Heard heard;
   spdlog::set_level(spdlog::level::err);
   Bus bus(url, "");
-  bus.subscribe(kBodySchema, [&](const body_schema_t& m) { heard.schema = m; });
+  bus.subscribe(kBodySchema, [&](const body_schema_t& m) { heard.schema = from_message(m); });
   bus.subscribe(kMotionStatus, [&](const motion_status_t& m) { heard.motion = m; });
   const std::int64_t end_us = clock_us() + kPatience_us;
-  while (!(heard.schema && heard.motion) && clock_us() < end_us)
-    bus.handle(std::chrono::milliseconds(20));
+  while (!heard.position() && clock_us() < end_us) bus.handle(std::chrono::milliseconds(20));
   if (!heard.schema)
     throw std::runtime_error(
         heard.motion ? "no schema is known yet: it comes with the first samples"
@@ -56,11 +63,12 @@ void run_where(const WhereArguments& arguments) {
   std::optional<Eigen::VectorXd> action;
   if (arguments.schema.empty()) {
     const Heard heard = listen(arguments.in);
-    schema = from_message(*heard.schema);
-    // Where the arm was last commanded to, and is unless something holds it.
-    if (heard.motion && heard.motion->commanded.size() == schema.signals.size())
-      action = Eigen::VectorXd::Map(heard.motion->commanded.data(),
-                                    static_cast<Eigen::Index>(heard.motion->commanded.size()));
+    schema = *heard.schema;
+    action = heard.position();
+    if (!action)
+      std::cerr << (heard.motion ? "the driver tells no place where the arm rests"
+                                 : "no driver is heard")
+                << ": where parts are now is not known\n";
   } else {
     schema = load_schema(arguments.schema);
   }

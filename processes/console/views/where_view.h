@@ -19,7 +19,7 @@ struct Whereabouts {
     std::optional<PartPrediction> now = {};  ///< with an action
   };
   std::vector<Part> parts;                     ///< that hang on the root, ascending
-  std::optional<Eigen::VectorXd> action = {};  ///< where the arm is, as far as that is known
+  std::optional<Eigen::VectorXd> action = {};  ///< where the arm rests, if that is known
 };
 
 /// Of one part, or of all that hang on the root. @throws std::invalid_argument if the part does

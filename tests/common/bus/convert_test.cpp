@@ -4,7 +4,9 @@
 
 #include <random>
 
+#include "bodyschema/action_command_t.hpp"
 #include "common/bus/check.h"
+#include "common/bus/rest_position.h"
 #include "tests/lcmtypes/example_messages.h"
 
 namespace bodyschema::test {
@@ -220,6 +222,30 @@ TEST(Convert, AMatrixGpThatNoMessageHoldsIsRefused) {
 
 TEST(Convert, AnEmptySchemaIsAMessageThatMakesSense) {
   EXPECT_EQ(check(to_message(BodySchema{})), "");
+}
+
+TEST(RestPosition, IsKnownOnlyWhereTheDriverSaysThatTheArmIs) {
+  motion_status_t status{};
+  status.action_id = 7;
+  status.kind = action_command_t::KIND_MOVE;
+  status.rest_since_utime = 1;
+  status.num_signals = 2;
+  status.commanded = {0.5, -2};
+  const auto position = [&](std::int8_t state) {
+    status.state = state;
+    return rest_position(status, 2);
+  };
+  EXPECT_EQ(position(motion_status_t::STATE_SETTLED), Eigen::Vector2d(0.5, -2));
+  // The action of a MOVE that was not carried out is not where the arm is.
+  for (const auto state : {motion_status_t::STATE_REJECTED, motion_status_t::STATE_STOPPED,
+                           motion_status_t::STATE_EXPIRED, motion_status_t::STATE_ACCEPTED})
+    EXPECT_FALSE(position(state));
+  status.rest_since_utime = -1;
+  EXPECT_FALSE(position(motion_status_t::STATE_SETTLED));
+  status.rest_since_utime = 1;
+  status.kind = action_command_t::KIND_HOLD;
+  EXPECT_TRUE(position(motion_status_t::STATE_HOLDING));
+  EXPECT_FALSE(rest_position(status, 3));
 }
 
 }  // namespace

@@ -9,6 +9,7 @@
 #include "common/bus/codec.h"
 #include "common/bus/convert.h"
 #include "common/geometry/angle.h"
+#include "processes/refiner/held_out.h"
 #include "processes/refiner/refine.h"
 #include "tests/processes/refiner/tagged_robot.h"
 
@@ -186,6 +187,17 @@ TEST(RefineCorners, TestSamplesAreJudgedAndNotFitted) {
   const Refinement second = refine(c.start, c.samples, c.rig, all());
   EXPECT_TRUE(first.schema.X_CR.isApprox(second.schema.X_CR, 0));
   EXPECT_GT(*second.after.px_rms, 10 * *first.after.px_rms);
+}
+
+TEST(RefineCorners, WhatIsPredictedBehindTheCameraIsNoBetter) {
+  Case c(5, 40);
+  BodySchema behind = c.start;
+  behind.X_CR.translation().z() -= 50;
+  const RefineOptions options = all();
+  const HeldOutErrors before = held_out_errors(c.start, c.samples, c.rig, options.corner_noise);
+  const HeldOutErrors lost = held_out_errors(behind, c.samples, c.rig, options.corner_noise);
+  EXPECT_FALSE(predicts_corners_better(lost, before));
+  EXPECT_TRUE(predicts_corners_better(before, lost));
 }
 
 TEST(RefineCorners, WrongCornersAreNamedAsOutliersAndHardlyMoveTheModel) {
