@@ -38,7 +38,7 @@ LEARN_USAGES = (
     ),
 )
 # Words of the console that need the group's bus.
-ON_THE_BUS = ("target", "where", "hold", "release", "halt", "resume", "fault")
+ON_THE_BUS = ("target", "follow", "where", "hold", "release", "halt", "resume", "fault")
 # Words of `./run` with the console's options.
 OPTIONS_OF_THE_CONSOLE = ("driver-test", "status", "report", "rig")
 # Words whose arguments, --help included, belong to another program.

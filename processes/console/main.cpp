@@ -57,6 +57,7 @@ int main(int argc, char** argv) {
   bodyschema::add_driver_test_command(commands);
   bodyschema::add_fault_command(commands);
   bodyschema::add_status_command(commands);
+  bodyschema::add_follow_command(commands);
   bodyschema::add_where_command(commands);
   bodyschema::add_report_command(commands);
   try {

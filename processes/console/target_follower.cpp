@@ -23,11 +23,17 @@ constexpr char kDriver[] = "the driver";
 }  // namespace
 
 std::string course_text(const control_status_t& status) {
+  const auto distance = [](double m, double rad) {
+    return rad < 0 ? fmt::format("{:.1f} mm", m * 1e3)
+                   : fmt::format("{:.1f} mm and {:.2f}°", m * 1e3, rad / kDegree);
+  };
   std::string text = counted(status.num_moves, "move");
+  if (status.num_probes > 0) text += ", " + counted(status.num_probes, "probe") + " among them";
   if (status.predicted_error_m >= 0)
-    text += fmt::format(", by the schema {:.1f} mm away", status.predicted_error_m * 1e3);
+    text += ", by the schema " + distance(status.predicted_error_m, status.predicted_error_rad) +
+            " away";
   if (status.observed_error_m >= 0)
-    text += fmt::format(", as seen {:.1f} mm", status.observed_error_m * 1e3);
+    text += ", as seen " + distance(status.observed_error_m, status.observed_error_rad);
   return text;
 }
 
@@ -44,10 +50,11 @@ action_command_t make_console_command(std::int8_t kind, std::int64_t epoch,
   return command;
 }
 
-TargetFollower::TargetFollower(pose_target_t target, std::int64_t timeout_us, double tolerance_m)
-    : target_(std::move(target)), timeout_us_(timeout_us), tolerance_m_(tolerance_m) {
+TargetFollower::TargetFollower(pose_target_t target, std::int64_t timeout_us, Tolerance tolerance)
+    : target_(std::move(target)), timeout_us_(timeout_us), tolerance_(tolerance) {
   status_.target_id = status_.schema_version = status_.target_part = -1;
   status_.predicted_error_m = status_.observed_error_m = -1;
+  status_.predicted_error_rad = status_.observed_error_rad = -1;
 }
 
 void TargetFollower::on_control_status(const control_status_t& status) {
@@ -74,7 +81,9 @@ void TargetFollower::on_control_status(const control_status_t& status) {
     if (state == S::CONTROL_RELEASED) end_ = End::kAsked;
   } else if (state == S::CONTROL_REACHED || state == S::CONTROL_RELEASED) {
     // RELEASED: it was kept for keep_s and given back.
-    end_ = status.observed_error_m > tolerance_m_ ? End::kMissed : End::kAsked;
+    const bool is_missed =
+        status.observed_error_m > tolerance_.m || status.observed_error_rad > tolerance_.rad;
+    end_ = is_missed ? End::kMissed : End::kAsked;
   } else if (state == S::CONTROL_REFUSED || state == S::CONTROL_HOLDING) {
     end_ = End::kRefused;
   }
@@ -139,20 +148,25 @@ std::string TargetFollower::diagnosis() const {
                           : "the controller does not acknowledge the target";
 }
 
-std::string target_json(const control_status_t& status, TargetFollower::End end) {
+Json target_json(const control_status_t& status, TargetFollower::End end) {
   using End = TargetFollower::End;
   const char* state = end == End::kTimedOut      ? "timed out"
                       : end == End::kInterrupted ? "interrupted"
                       : end == End::kMissed      ? "missed"
                                                  : name_in(kControlStates, status.control_state);
-  const Json json = {{"reached", end == End::kAsked},
-                     {"state", state},
-                     {"why", status.why},
-                     {"predicted_error_m", known(status.predicted_error_m)},
-                     {"observed_error_m", known(status.observed_error_m)},
-                     {"moves", status.num_moves},
-                     {"schema_version", status.schema_version}};
-  return json.dump();
+  const auto degrees = [](double rad) -> Json {
+    return rad < 0 ? Json(nullptr) : Json(rad / kDegree);
+  };
+  return {{"reached", end == End::kAsked},
+          {"state", state},
+          {"why", status.why},
+          {"predicted_error_m", known(status.predicted_error_m)},
+          {"observed_error_m", known(status.observed_error_m)},
+          {"predicted_error_deg", degrees(status.predicted_error_rad)},
+          {"observed_error_deg", degrees(status.observed_error_rad)},
+          {"moves", status.num_moves},
+          {"probes", status.num_probes},
+          {"schema_version", status.schema_version}};
 }
 
 LatchFollower::LatchFollower(std::int8_t kind, std::int64_t epoch)

@@ -4,14 +4,19 @@
 #include <map>
 #include <optional>
 #include <string>
+#include <utility>
 
 #include "bodyschema/action_command_t.hpp"
 #include "bodyschema/control_status_t.hpp"
 #include "bodyschema/motion_status_t.hpp"
 #include "bodyschema/pose_target_t.hpp"
 #include "bodyschema/process_info_t.hpp"
+#include "common/geometry/angle.h"
+#include "processes/console/views/json.h"
 
 namespace bodyschema {
+
+inline constexpr double kSeenNear_m = 0.02, kSeenNear_deg = 5;
 
 /// Repeats one POSE_TARGET until CONTROL_STATUS acknowledges it, and follows it to its end.
 class TargetFollower {
@@ -20,13 +25,20 @@ class TargetFollower {
     kOpen,
     kAsked,    ///< reached; for a hold: held; for a release: released
     kRefused,  ///< refused, held or given up for another target: see why()
-    kMissed,   ///< reached by the schema, but seen more than the tolerance away
+    kMissed,   ///< reached by the schema, but seen beyond the tolerance
     kTimedOut,
     kInterrupted,  ///< by the user
   };
 
+  /// How near the part must be seen.
+  struct Tolerance {
+    double m = kSeenNear_m, rad = kSeenNear_deg * kDegree;
+  };
+
   /// `timeout_us`: of the clock, from the first tick.
-  TargetFollower(pose_target_t target, std::int64_t timeout_us, double tolerance_m = 0.02);
+  TargetFollower(pose_target_t target, std::int64_t timeout_us)
+      : TargetFollower(std::move(target), timeout_us, Tolerance{}) {}
+  TargetFollower(pose_target_t target, std::int64_t timeout_us, Tolerance tolerance);
 
   void on_control_status(const control_status_t& status);
   /// Remembered for diagnosis().
@@ -53,7 +65,7 @@ class TargetFollower {
  private:
   const pose_target_t target_;
   const std::int64_t timeout_us_;
-  const double tolerance_m_;
+  const Tolerance tolerance_;
   std::int64_t now_us_ = -1;
   std::int64_t started_us_ = -1;
   std::int64_t sent_us_ = -1;
@@ -89,9 +101,9 @@ inline constexpr std::int64_t kCommandPeriod_us = 200'000;  ///< of what is not 
 /// An ACTION_COMMAND of the console without an action: HOLD, STOP or RESUME.
 action_command_t make_console_command(std::int8_t kind, std::int64_t epoch, std::int64_t action_id);
 
-/// "2 moves, by the schema 0.1 mm away, as seen 1.2 mm": as far as it is known.
+/// "2 moves, by the schema 0.1 mm and 0.01° away, as seen 1.2 mm and 0.20°": as far as it is known.
 std::string course_text(const control_status_t& status);
 /// The output of `target --json`.
-std::string target_json(const control_status_t& status, TargetFollower::End end);
+Json target_json(const control_status_t& status, TargetFollower::End end);
 
 }  // namespace bodyschema

@@ -10,6 +10,7 @@
 #include "common/bus/convert.h"
 #include "common/bus/process.h"
 #include "common/config/yaml.h"
+#include "common/geometry/angle.h"
 #include "processes/controller/controller_words.h"
 
 namespace bodyschema {
@@ -19,7 +20,6 @@ constexpr char kSource[] = "controller";
 constexpr char kWasHalted[] = "the arm was halted; it is resumed: give the target again";
 constexpr char kHeldAsBefore[] = "held as before the restart: ";
 constexpr std::int64_t kRepeat_us = 1'000'000;
-constexpr int kLentForProbe = 8;  // samples: the babbler probes after every fifth, a TEST
 
 std::int64_t microseconds(double seconds) { return std::llround(seconds * 1e6); }
 
@@ -27,7 +27,7 @@ bool is_same(const control_status_t& a, const control_status_t& b) {
   const auto fields = [](const control_status_t& s) {
     return std::tie(s.sender, s.target_epoch, s.target_id, s.control_state, s.owns_arm, s.why,
                     s.schema_version, s.target_part, s.predicted_error_m, s.observed_error_m,
-                    s.num_moves);
+                    s.predicted_error_rad, s.observed_error_rad, s.num_moves, s.num_probes);
   };
   return fields(a) == fields(b) &&
          std::equal(std::begin(a.target_position_m), std::end(a.target_position_m),
@@ -42,8 +42,11 @@ ControllerConfig ControllerConfig::load(const std::filesystem::path& file) {
   config.signals = load_signals(file.parent_path()).signals;
   config.measurement = load_noise(file.parent_path()).measurement;
   config.reached_m = yaml.number("reached_m", 1e-6, 1);
+  config.reached_rad = yaml.number("reached_deg", 1e-4, 180) * kDegree;
   config.max_step = yaml.number("max_step", 1e-3, 1);
   config.slow_step = yaml.number("slow_step", 1e-3, config.max_step);
+  config.search_step = yaml.number("search_step", 1e-3, config.max_step / 2);
+  config.max_searches = static_cast<int>(yaml.integer("max_searches", 0, 1000));
   config.max_corrections = static_cast<int>(yaml.integer("max_corrections", 0, 100));
   config.max_correction_m = yaml.number("max_correction_m", 0, 1);
   config.max_solutions = static_cast<int>(yaml.integer("max_solutions", 1, 1000));
@@ -64,6 +67,7 @@ ControllerConfig ControllerConfig::load(const std::filesystem::path& file) {
   config.inverse_kinematics.max_iterations =
       static_cast<int>(ik.integer("max_iterations", 1, 10'000));
   config.inverse_kinematics.max_starts = static_cast<int>(ik.integer("max_starts", 1, 1000));
+  if (yaml.has("workspace")) config.workspace = Workspace::load(yaml.section("workspace"));
   yaml.finish();
   return config;
 }
@@ -90,7 +94,12 @@ control_status_t Controller::status() const {
             std::begin(status.target_position_m));
   status.predicted_error_m = predicted_error_m_;
   status.observed_error_m = observed_error_m_;
+  status.predicted_error_rad = predicted_error_rad_;
+  status.observed_error_rad = observed_error_rad_;
   status.num_moves = num_moves_;
+  status.num_probes = num_probes_;
+  status.way_point = target_.way_point;
+  status.num_way_points = target_.num_way_points;
   return status;
 }
 
@@ -221,13 +230,8 @@ Controller::Answer Controller::on_marker_poses(const marker_poses_t& poses) {
 Controller::Answer Controller::on_sample(const sample_t& sample) {
   if (!sample_ || !is_same_action(*sample_, sample)) {
     lent_.restart();
-    ++num_lent_samples_;
   }
   sample_ = sample;
-  // A babbler that may probe does so after its next TEST sample.
-  if (state_ == S::CONTROL_LENT &&
-      (sample.purpose == action_command_t::PURPOSE_PROBE || num_lent_samples_ >= kLentForProbe))
-    probed_ = std::max(probed_, sample.sample_index);
   see(sample.utime);
   locate();
   if (awaited_ && sample.source == kSource && sample.epoch == epoch_ &&
@@ -258,6 +262,12 @@ Controller::Answer Controller::on_model_health(const model_health_t& health) {
   return answer(advance());
 }
 
+bool Controller::has_expired(std::int64_t now_us) {
+  const bool is_open = is_active() && state_ != S::CONTROL_REACHED;
+  return is_open && target_.expiry_s > 0 &&
+         expiry_.elapsed_us(now_us) >= microseconds(target_.expiry_s);
+}
+
 Controller::Answer Controller::on_tick(std::int64_t now_us) {
   silent_ = silence(now_us);
   quiet_.elapsed_us(now_us);
@@ -271,7 +281,15 @@ Controller::Answer Controller::on_tick(std::int64_t now_us) {
     schema_.reset();
     goal_.reset();
   }
-  if (is_serving) {
+  if (has_expired(now_us)) {
+    const std::string why =
+        "not reached within " + seconds(microseconds(target_.expiry_s)) + "; " + why_;
+    if (owns_arm_) {
+      command = hold(why);
+    } else {
+      refuse(why);
+    }
+  } else if (is_serving) {
     if (!silent_.empty()) {
       command = hold(silent_);
     } else if (command_) {
@@ -296,11 +314,7 @@ Controller::Answer Controller::on_tick(std::int64_t now_us) {
                   config_.max_body_schema_silence_us});
     if (guard_.elapsed_us(now_us) > patience_us) refuse("not heard: " + unheard());
   } else if (state_ == S::CONTROL_LENT) {
-    if (is_lent_for_probe_ && lent_.elapsed_us(now_us) >= config_.rest_timeout_us) {
-      // Nobody probes: go on with what is known.
-      if (health_) probed_ = std::max(probed_, health_->probe_sample);
-      command = advance();
-    } else if (lent_.elapsed_us(now_us) >= config_.lent_timeout_us) {
+    if (lent_.elapsed_us(now_us) >= config_.lent_timeout_us) {
       refuse("no new SAMPLE for " + seconds(config_.lent_timeout_us) + " while " + why_ +
              "; does the babbler run, or is it done?");
     }

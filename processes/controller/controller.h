@@ -19,6 +19,7 @@
 #include "bodyschema/sample_t.hpp"
 #include "common/config/rig.h"
 #include "processes/controller/inverse_kinematics.h"
+#include "processes/controller/workspace.h"
 
 namespace bodyschema {
 
@@ -26,9 +27,14 @@ struct ControllerConfig {
   std::vector<Signal> signals;
   MeasurementModel measurement;  ///< of noise.yaml
   InverseKinematicsOptions inverse_kinematics;
-  double reached_m = 0;  ///< a target is reached this near, and out of reach if none comes as near
-  double max_step = 0;   ///< of one action, share of each signal's range
-  double slow_step = 0;  ///< the same while an edge on the way is suspect or provisional
+  Workspace workspace;
+  /// A target that asks for no tolerance of its own is reached this near, and out of reach if no
+  /// action comes as near.
+  double reached_m = 0, reached_rad = 0;
+  double max_step = 0;     ///< of one action, share of each signal's range
+  double slow_step = 0;    ///< the same while an edge on the way is suspect or provisional
+  double search_step = 0;  ///< half width of the box searched while one is invalid, share of ranges
+  int max_searches = 0;    ///< actions there, until the arm is lent
   int max_corrections = 0;      ///< by what was seen at the end, if that is not within reached_m
   double max_correction_m = 0;  ///< what is seen farther off is not believed
   int max_solutions = 0;        ///< tried before a target that the driver rejects is refused
@@ -46,19 +52,26 @@ struct ControllerConfig {
   static ControllerConfig load(const std::filesystem::path& file);
 };
 
-/// Brings a body part to a target position by the body schema alone: a sequence of small MOVE
-/// actions towards a solution of inverse kinematics, each answered by the driver and followed by
-/// its SAMPLE before the next is sent, so no step is taken unseen and no sample is lost.
+/// Brings a body part to a target position or pose by the body schema alone: a sequence of small
+/// MOVE actions towards a solution of inverse kinematics, each answered by the driver and followed
+/// by its SAMPLE before the next is sent, so no step is taken unseen and no sample is lost.
 ///
 /// Of all targets the highest (epoch, target_id) counts; a repeated one does nothing. One whose
 /// epoch is more than kClockTolerance_us ahead of the clock is refused: every later one would count
 /// for less than it. The arm is
 /// its own (owns_arm) from the moment that a target can be served until it was reached and kept,
 /// was refused or is released. Taking it waits until the arm rests and the last settled action has
-/// its SAMPLE. While an edge on the way to the part is INVALID, and for a probe that the monitor
-/// wants while one is PROVISIONAL, the arm is lent to the babbler. Neither lasts for ever: an arm
-/// that does not come to rest within rest_timeout, or that is lent for lent_timeout without a new
-/// SAMPLE, ends in a refusal; a probe that nobody makes is done without.
+/// its SAMPLE. A target that is not reached within its expiry is dropped, as by a HOLD.
+///
+/// No part leaves the workspace on the way, by the schema; a solution towards which one would is
+/// dealt with like one that the driver rejects.
+///
+/// A probe that the monitor wants while an edge on the way is PROVISIONAL is made before the next
+/// step, as slowly as steps are then; refused by the driver, it is done without. While an edge is
+/// INVALID the arm is moved a little about the place where that was heard, so that the monitor sees
+/// what changed; where max_searches samples do not mend it, the arm is lent to the babbler. Nothing
+/// lasts for ever: an arm that does not come to rest within rest_timeout, or that is lent for
+/// lent_timeout without a new SAMPLE, ends in a refusal.
 ///
 /// Start guard: nothing is sent before MOTION_STATUS, BODY_SCHEMA and MARKER_POSES of the present
 /// rest were heard, and no MOVE from a position that was not heard: the last settled action of this
@@ -133,8 +146,12 @@ class Controller {
   std::string unheard() const;
   /// "" or which input has been silent for too long.
   std::string silence(std::int64_t now_us);
+  bool has_expired(std::int64_t now_us);
   /// "" or why the schema cannot serve the target, whatever the arm does.
   std::string objection() const;
+  double tolerance_m() const;
+  double tolerance_rad() const;
+  std::optional<Eigen::Quaterniond> wanted_orientation() const;
   /// Worst state of the edges between root and target part.
   EdgeState worst_edge(std::string* name = nullptr) const;
 
@@ -142,16 +159,29 @@ class Controller {
   void locate();
   void forget_plan();
   void observe(const sample_t& sample);
-  double predicted_error_m() const;
+  void update_predicted_errors();
 
   /// Whatever the target needs next, when no command is unanswered.
   Command advance();
   /// Waits until the arm is free, by the clock.
   Command take(std::int64_t now_us);
   Command step();
+  /// The action that the monitor wants to see, one for each signal and within its limits.
+  std::optional<Eigen::VectorXd> wanted_probe() const;
+  Command probe(const Eigen::VectorXd& action);
+  Command search(const std::string& edge);
+  /// From the arm's position towards an action, as far as `share` of the ranges.
+  Eigen::VectorXd towards(const Eigen::VectorXd& action, double share) const;
+  /// None, and the way counts as rejected, where it leads out of the workspace.
+  Command move_to(const Eigen::VectorXd& action, std::int8_t purpose, std::string why);
+  /// The command was none after all.
+  void forget_move();
+  /// What follows from a way that cannot be gone.
+  Command on_rejected(const std::string& why);
   Command arrive();
   Command on_own_answer(const motion_status_t& motion);
   void refuse(const std::string& why);
+  void refuse_unreachable(const InverseKinematicsSolution& nearest);
   /// Nothing moves until another target.
   void halt(const std::string& why);
   /// halt() and tell the driver.
@@ -187,17 +217,18 @@ class Controller {
   std::string rejection_;
   int num_expired_ = 0;
   int num_corrections_ = 0;
-  int num_moves_ = 0;
-  double predicted_error_m_ = -1;
-  double observed_error_m_ = -1;
+  int num_moves_ = 0, num_probes_ = 0;
+  double predicted_error_m_ = -1, predicted_error_rad_ = -1;
+  double observed_error_m_ = -1, observed_error_rad_ = -1;
   Eigen::Vector3d observed_offset_ = Eigen::Vector3d::Zero();  ///< target minus seen position, in R
   bool is_observation_sure_ = false;  ///< unambiguous, and not to be explained by its covariance
   Stopwatch guard_, taking_, quiet_, keep_;
-  Stopwatch idle_;                  ///< its own arm, but nothing is sent or awaited
-  Stopwatch lent_;                  ///< without a new SAMPLE
-  bool is_lent_for_probe_ = false;  ///< not because an edge is INVALID
-  int num_lent_samples_ = 0;
+  Stopwatch idle_;  ///< its own arm, but nothing is sent or awaited
+  Stopwatch lent_;  ///< without a new SAMPLE
+  Stopwatch expiry_;
   std::int64_t probed_ = -1;  ///< probes wanted up to this sample are made, or given up
+  std::optional<Eigen::VectorXd> search_centre_;  ///< where an edge was heard to be invalid
+  int num_searches_ = 0;
 
   // What was sent.
   std::int64_t epoch_ = -1;

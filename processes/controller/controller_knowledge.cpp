@@ -85,14 +85,32 @@ void Controller::locate() {
   position_rest_utime_ = motion_->rest_since_utime;
 }
 
-double Controller::predicted_error_m() const {
-  if (!schema_ || !position_ || target_.target_part < 0) return -1;
+double Controller::tolerance_m() const {
+  return target_.tolerance_m > 0 ? target_.tolerance_m : config_.reached_m;
+}
+
+double Controller::tolerance_rad() const {
+  return target_.tolerance_rad > 0 ? target_.tolerance_rad : config_.reached_rad;
+}
+
+std::optional<Eigen::Quaterniond> Controller::wanted_orientation() const {
+  if (target_.target_kind != pose_target_t::KIND_POSE) return std::nullopt;
+  const double* q = target_.orientation_wxyz;
+  return Eigen::Quaterniond(q[0], q[1], q[2], q[3]).normalized();
+}
+
+void Controller::update_predicted_errors() {
+  predicted_error_m_ = predicted_error_rad_ = -1;
+  if (!schema_ || !position_ || target_.target_part < 0) return;
   const auto X_RB = schema_->predict(schema_->root, target_.target_part, *position_);
-  return X_RB ? (X_RB->X_AB.translation() - position_of(target_)).norm() : -1;
+  if (!X_RB) return;
+  predicted_error_m_ = (X_RB->X_AB.translation() - position_of(target_)).norm();
+  if (const auto q_RT = wanted_orientation())
+    predicted_error_rad_ = q_RT->angularDistance(Eigen::Quaterniond(X_RB->X_AB.linear()));
 }
 
 void Controller::observe(const sample_t& message) {
-  observed_error_m_ = -1;
+  observed_error_m_ = observed_error_rad_ = -1;
   if (!schema_) return;
   ActionPoseSample sample = from_message(message);
   drop_moved_tags(schema_->moved_tags, &sample);
@@ -106,8 +124,11 @@ void Controller::observe(const sample_t& message) {
     const Matrix6d covariance = config_.measurement.covariance(*root) + schema_->X_CR_covariance;
     if (squared_mahalanobis(off, covariance) > kMovedCamera) X_CR = root->X_CB;
   }
-  observed_offset_ = position_of(target_) - X_CR.inverse() * part->X_CB.translation();
+  const Pose X_RB_seen = X_CR.inverse() * part->X_CB;
+  observed_offset_ = position_of(target_) - X_RB_seen.translation();
   observed_error_m_ = observed_offset_.norm();
+  if (const auto q_RT = wanted_orientation(); q_RT && part->has_rotation)
+    observed_error_rad_ = q_RT->angularDistance(Eigen::Quaterniond(X_RB_seen.linear()));
   const auto X_RB = schema_->predict(schema_->root, part->part, sample.action);
   const auto seen = config_.measurement.reading(*part, X_RB ? X_CR * X_RB->X_AB : part->X_CB);
   const Eigen::Matrix3d R_RB = (X_CR.inverse() * seen.X_CB).linear();
@@ -155,6 +176,18 @@ EdgeState Controller::worst_edge(std::string* name) const {
   return worst;
 }
 
+std::optional<Eigen::VectorXd> Controller::wanted_probe() const {
+  if (!health_ || health_->probe_sample <= probed_ || worst_edge() == EdgeState::kOk ||
+      health_->probe_action.size() != config_.signals.size())
+    return std::nullopt;
+  for (std::size_t i = 0; i < config_.signals.size(); ++i) {
+    const Signal& signal = config_.signals[i];
+    const double value = health_->probe_action[i];
+    if (value < signal.lower || value > signal.upper) return std::nullopt;
+  }
+  return vector_of(health_->probe_action);
+}
+
 std::string Controller::objection() const {
   const int part = target_.target_part;
   if (motion_->stop_latched) return kHalted;
@@ -165,6 +198,10 @@ std::string Controller::objection() const {
     return "part " + std::to_string(part) + " is not connected to the root " +
            std::to_string(schema_->root) + " in body schema version " +
            std::to_string(schema_->version) + "; let the babbler go on learning";
+  }
+  if (target_.target_kind == pose_target_t::KIND_POSE && !schema_->has_rotation(part)) {
+    return "of part " + std::to_string(part) +
+           " positions alone are known, no orientation: give a position";
   }
   return "";
 }

@@ -2,12 +2,14 @@
 
 #include <algorithm>
 #include <cmath>
+#include <random>
 #include <sstream>
 #include <tuple>
 #include <utility>
 
 #include "common/bus/convert.h"
 #include "common/bus/process.h"
+#include "common/geometry/angle.h"
 #include "processes/controller/controller.h"
 #include "processes/controller/controller_words.h"
 
@@ -17,11 +19,23 @@ namespace {
 constexpr int kMaxExpired = 3;     // in a row
 constexpr double kArrived = 1e-9;  // of a range
 
-std::string millimetres(double m) {
+std::string in_tenths(double value, const char* unit) {
   std::ostringstream text;
   text.precision(1);
-  text << std::fixed << m * 1e3 << " mm";
+  text << std::fixed << value << unit;
   return text.str();
+}
+
+std::string millimetres(double m) { return in_tenths(m * 1e3, " mm"); }
+std::string degrees(double rad) { return in_tenths(rad / kDegree, "°"); }
+
+bool is_near(const Eigen::VectorXd& a, const Eigen::VectorXd& b,
+             const std::vector<Signal>& signals) {
+  for (std::size_t i = 0; i < signals.size(); ++i) {
+    const auto n = static_cast<Eigen::Index>(i);
+    if (std::abs(a[n] - b[n]) > kArrived * (signals[i].upper - signals[i].lower)) return false;
+  }
+  return true;
 }
 
 }  // namespace
@@ -57,8 +71,10 @@ Controller::Answer Controller::on_pose_target(const pose_target_t& target,
   target_ = target;
   aim_ = position_of(target);
   forget_plan();
-  num_moves_ = num_corrections_ = 0;
-  predicted_error_m_ = observed_error_m_ = -1;
+  num_moves_ = num_probes_ = num_corrections_ = num_searches_ = 0;
+  predicted_error_m_ = predicted_error_rad_ = observed_error_m_ = observed_error_rad_ = -1;
+  search_centre_.reset();
+  expiry_.restart();
   wants_hold_ = false;
   hold_command_.reset();
   switch (target.target_kind) {
@@ -91,19 +107,15 @@ Controller::Command Controller::advance() {
     return std::nullopt;
   }
   std::string edge;
-  const EdgeState worst = worst_edge(&edge);
-  const bool is_probe = worst != EdgeState::kOk && health_ && health_->probe_sample > probed_;
-  if (worst == EdgeState::kInvalid || is_probe) {
+  const bool is_invalid = worst_edge(&edge) == EdgeState::kInvalid;
+  if (!is_invalid) {
+    num_searches_ = 0;
+    search_centre_.reset();
+  } else if (num_searches_ >= config_.max_searches) {
     goal_.reset();
     is_taken_ = false;
-    if (state_ != S::CONTROL_LENT) {
-      lent_.restart();
-      num_lent_samples_ = 0;
-    }
-    is_lent_for_probe_ = worst != EdgeState::kInvalid;
-    enter(S::CONTROL_LENT, false,
-          is_lent_for_probe_ ? edge + " can be told two ways: the babbler has the arm for a probe"
-                             : edge + " is invalid: the babbler has the arm until it is mended");
+    if (state_ != S::CONTROL_LENT) lent_.restart();
+    enter(S::CONTROL_LENT, false, edge + " is invalid: the babbler has the arm until it is mended");
     return std::nullopt;
   }
   if (!owns_arm_ || state_ == S::CONTROL_LENT) {
@@ -113,6 +125,8 @@ Controller::Command Controller::advance() {
   }
   // Until the arm is taken, on_tick goes on.
   if (!is_taken_ || !silent_.empty() || !is_at_rest() || !position_) return std::nullopt;
+  if (is_invalid) return search(edge);
+  if (const auto action = wanted_probe()) return probe(*action);
   return step();
 }
 
@@ -148,59 +162,130 @@ Controller::Command Controller::take(std::int64_t now_us) {
 
 Controller::Command Controller::step() {
   if (!goal_) {
+    InverseKinematicsOptions options = config_.inverse_kinematics;
+    options.tolerance_m = std::min(options.tolerance_m, tolerance_m());
+    options.tolerance_rad = std::min(options.tolerance_rad, tolerance_rad());
     const InverseKinematicsSolution solution =
-        solve_pose(*schema_, target_.target_part, {.p_RT = aim_}, config_.signals, *position_,
-                   config_.inverse_kinematics, rejected_);
-    if (solution.error_m > config_.reached_m) {
-      const std::string after =
-          num_moves_ > 0 ? " (after " + std::to_string(num_moves_) + " moves)" : "";
+        solve_pose(*schema_, target_.target_part, {aim_, wanted_orientation()}, config_.signals,
+                   *position_, options, rejected_);
+    if (solution.error_m > tolerance_m() || solution.error_rad > tolerance_rad()) {
       if (num_corrections_ > 0) {
         aim_ = position_of(target_);  // beyond reach only with the correction
         return arrive();
       }
-      if (rejected_.empty()) {
-        predicted_error_m_ = solution.error_m;
-        refuse("out of reach: within the limits part " + std::to_string(target_.target_part) +
-               " comes no nearer than " + millimetres(solution.error_m) + after);
-      } else {
-        refuse("the driver refuses every way found" + after + ": " + rejection_);
-      }
+      refuse_unreachable(solution);
       return std::nullopt;
     }
     goal_ = solution.action;
   }
-  predicted_error_m_ = predicted_error_m();
-
-  Eigen::ArrayXd range(config_.signals.size()), lower(config_.signals.size());
-  for (std::size_t i = 0; i < config_.signals.size(); ++i) {
-    const Signal& signal = config_.signals[i];
-    lower[static_cast<Eigen::Index>(i)] = signal.lower;
-    range[static_cast<Eigen::Index>(i)] = signal.upper - signal.lower;
-  }
-  const Eigen::ArrayXd way = goal_->array() - position_->array();
-  const double longest = (way / range).abs().maxCoeff();
-  if (longest <= kArrived) return arrive();
+  update_predicted_errors();
   std::string doubtful;
   const bool is_slow = worst_edge(&doubtful) != EdgeState::kOk;
-  const double share = is_slow ? config_.slow_step : config_.max_step;
-  const Eigen::VectorXd action =
-      longest <= share
-          ? *goal_
-          : (position_->array() + way * (share / longest)).max(lower).min(lower + range).matrix();
+  const Eigen::VectorXd action = towards(*goal_, is_slow ? config_.slow_step : config_.max_step);
+  if (is_near(action, *position_, config_.signals)) return arrive();
+  return move_to(action, action_command_t::PURPOSE_CONTROL,
+                 is_slow ? "in small steps: " + doubtful + " is in doubt" : "towards the target");
+}
+
+void Controller::refuse_unreachable(const InverseKinematicsSolution& nearest) {
+  const std::string after =
+      num_moves_ > 0 ? " (after " + std::to_string(num_moves_) + " moves)" : "";
+  if (!rejected_.empty()) {
+    refuse("every way found is refused" + after + ": " + rejection_);
+    return;
+  }
+  predicted_error_m_ = nearest.error_m;
+  std::string left = millimetres(nearest.error_m);
+  if (wanted_orientation()) {
+    predicted_error_rad_ = nearest.error_rad;
+    left += " and " + degrees(nearest.error_rad);
+  }
+  refuse("out of reach: within the limits part " + std::to_string(target_.target_part) +
+         " comes no nearer than " + left + after);
+}
+
+Controller::Command Controller::probe(const Eigen::VectorXd& action) {
+  goal_.reset();
+  const Eigen::VectorXd next = towards(action, config_.slow_step);
+  if (!is_near(next, action, config_.signals)) {
+    return move_to(next, action_command_t::PURPOSE_CONTROL,
+                   "towards an action that tells two explanations of a change apart");
+  }
+  probed_ = health_->probe_sample;  // also if the driver refuses it
+  return move_to(action, action_command_t::PURPOSE_PROBE,
+                 "making the action that tells two explanations of a change apart");
+}
+
+Controller::Command Controller::search(const std::string& edge) {
+  goal_.reset();
+  if (!search_centre_) search_centre_ = position_;
+  ++num_searches_;
+  std::mt19937_64 engine(static_cast<std::uint64_t>(num_searches_));
+  std::uniform_real_distribution<double> share(-config_.search_step, config_.search_step);
+  Eigen::VectorXd action = *search_centre_;
+  for (std::size_t i = 0; i < config_.signals.size(); ++i) {
+    const Signal& signal = config_.signals[i];
+    double& value = action[static_cast<Eigen::Index>(i)];
+    value = std::clamp(value + share(engine) * (signal.upper - signal.lower), signal.lower,
+                       signal.upper);
+  }
+  return move_to(towards(action, config_.max_step), action_command_t::PURPOSE_PROBE,
+                 edge + " is invalid: small moves show what changed");
+}
+
+Eigen::VectorXd Controller::towards(const Eigen::VectorXd& action, double share) const {
+  double longest = 0;
+  for (std::size_t i = 0; i < config_.signals.size(); ++i) {
+    const auto n = static_cast<Eigen::Index>(i);
+    const double range = config_.signals[i].upper - config_.signals[i].lower;
+    if (range > 0) longest = std::max(longest, std::abs(action[n] - (*position_)[n]) / range);
+  }
+  if (longest <= share) return action;
+  return *position_ + (action - *position_) * (share / longest);
+}
+
+Controller::Command Controller::move_to(const Eigen::VectorXd& action, std::int8_t purpose,
+                                        std::string why) {
+  const std::string objection = config_.workspace.objection(*schema_, *position_, action);
+  if (!objection.empty()) return on_rejected(objection);
   command_ = make_command(action_command_t::KIND_MOVE);
+  command_->purpose = purpose;
   set_array(command_->num_signals, command_->action,
             std::vector<double>(action.begin(), action.end()));
   answer_wait_.restart();
   ++num_moves_;
-  enter(S::CONTROL_MOVING, true,
-        is_slow ? "in small steps: " + doubtful + " is in doubt" : "towards the target");
+  num_probes_ += purpose == action_command_t::PURPOSE_PROBE;
+  enter(S::CONTROL_MOVING, true, std::move(why));
   return command_;
+}
+
+void Controller::forget_move() {
+  // The target may be another by now.
+  num_moves_ = std::max(0, num_moves_ - 1);
+  if (command_->purpose == action_command_t::PURPOSE_PROBE)
+    num_probes_ = std::max(0, num_probes_ - 1);
+  command_.reset();
+}
+
+Controller::Command Controller::on_rejected(const std::string& why) {
+  if (!goal_) {  // what was to be seen is done without
+    if (health_) probed_ = std::max(probed_, health_->probe_sample);
+    return advance();
+  }
+  rejection_ = why;
+  rejected_.push_back(*goal_);
+  goal_.reset();
+  if (static_cast<int>(rejected_.size()) >= config_.max_solutions) {
+    refuse(std::to_string(rejected_.size()) + " ways are refused: " + rejection_);
+    return std::nullopt;
+  }
+  return advance();
 }
 
 Controller::Command Controller::arrive() {
   if (sample_ && sample_->rest_begin_utime == motion_->rest_since_utime) observe(*sample_);
-  predicted_error_m_ = predicted_error_m();
-  const bool is_off = observed_error_m_ > config_.reached_m;
+  update_predicted_errors();
+  const bool is_off = observed_error_m_ > tolerance_m();
   if (is_off && is_observation_sure_ && num_corrections_ < config_.max_corrections &&
       observed_error_m_ <= config_.max_correction_m) {
     ++num_corrections_;
@@ -224,31 +309,22 @@ Controller::Command Controller::on_own_answer(const motion_status_t& motion) {
       sample_wait_.restart();
       command_.reset();
       num_expired_ = 0;
-      predicted_error_m_ = predicted_error_m();
+      update_predicted_errors();
       if (sample_ && is_same_action(motion, *sample_)) {
         awaited_.reset();
         observe(*sample_);
       }
       return advance();
     case motion_status_t::STATE_REJECTED:
-      num_moves_ = std::max(0, num_moves_ - 1);  // it was none; the target may be another by now
-      command_.reset();
+      forget_move();
       ++counters_["action rejected"];
       if (!is_at_rest()) {
         why_ = "waiting for the arm to come to rest";
         return std::nullopt;
       }
-      rejection_ = motion.reason;
-      if (goal_) rejected_.push_back(*goal_);
-      goal_.reset();
-      if (static_cast<int>(rejected_.size()) >= config_.max_solutions) {
-        refuse("the driver refused " + std::to_string(rejected_.size()) + " ways: " + rejection_);
-        return std::nullopt;
-      }
-      return advance();
+      return on_rejected(motion.reason);
     case motion_status_t::STATE_EXPIRED:
-      num_moves_ = std::max(0, num_moves_ - 1);
-      command_.reset();
+      forget_move();
       ++counters_["action expired"];
       if (++num_expired_ >= kMaxExpired) {
         refuse("the driver let " + std::to_string(num_expired_) +

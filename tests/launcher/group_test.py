@@ -240,7 +240,7 @@ class HelpNeverActs(GroupTest):
                 out, code = self.run_to_end(words, option)
                 self.assertEqual(code, 0, words)
                 self.assertIn(words, out)
-        for word in ("halt", "target", "where", "hold", "release", "resume", "fault"):
+        for word in ("halt", "target", "follow", "where", "hold", "release", "resume", "fault"):
             out, code = self.run_to_end(word, "--help")
             self.assertEqual((out, code), (f"{word} --help\n", 0))
         self.run_to_end("--rig", "arm2", "--help")

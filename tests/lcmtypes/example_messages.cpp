@@ -417,12 +417,19 @@ pose_target_t example_pose_target() {
   message.sender = "console";
   message.epoch = 1'700'000'000'000'000;
   message.target_id = 4;
-  message.target_kind = pose_target_t::KIND_POSITION;
+  message.target_kind = pose_target_t::KIND_POSE;
   message.target_part = 9;
   message.position_m[0] = 0.3;
   message.position_m[1] = -0.1;
   message.position_m[2] = 0.7;
+  message.orientation_wxyz[0] = 0.6;
+  message.orientation_wxyz[3] = -0.8;
+  message.tolerance_m = 0.002;
+  message.tolerance_rad = 0.01;
+  message.expiry_s = 60;
   message.keep_s = 2.5;
+  message.way_point = 3;
+  message.num_way_points = 20;
   return message;
 }
 
@@ -440,7 +447,12 @@ control_status_t example_control_status() {
   message.target_position_m[0] = 0.3;
   message.predicted_error_m = 0.0001;
   message.observed_error_m = -1;
+  message.predicted_error_rad = 0.0002;
+  message.observed_error_rad = -1;
   message.num_moves = 2;
+  message.num_probes = 1;
+  message.way_point = 3;
+  message.num_way_points = 20;
   return message;
 }
 

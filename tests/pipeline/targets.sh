@@ -1,5 +1,5 @@
 #!/bin/bash
-# targets.sh SOURCE BUILD: a group learns arm2, then the end effector is sent to random positions; the console
+# targets.sh SOURCE BUILD: a group learns arm2, then the end effector is sent to random positions and along a path; the console
 # says halt, resume, hold and release; a target that times out or is interrupted is dropped; the controller is
 # killed with a hold and in the middle of a target and holds.
 set -euo pipefail
@@ -28,6 +28,27 @@ position = part["X_RB"]["position_m"]
 assert max(abs(p - t) for p, t in zip(position, target)) < 0.005, (position, target)
 assert all(low <= p <= high for low, p, high in zip(part["lowest_m"], position, part["highest_m"])), part
 END
+# Along a path: poses of the arm at actions in a row, by the schema. Of two joints these alone are reached.
+schema=$work/logs/current/schema.lcmlog
+{
+  echo x,y,z,qw,qx,qy,qz
+  for q in 0 0.1 0.2; do
+    "$source/run" exec bodyschema predict "$schema" --action "$q" 0.3 --json | python3 -c 'import json, sys
+part = next(part for part in json.load(sys.stdin)["parts"] if part["part"] == 5)
+print(*part["X_RB"]["position_m"], *part["X_RB"]["rotation_wxyz"], sep=",")'
+  done
+} >"$work/path.csv"
+"$source/run" follow "$work/path.csv" --part 5 --step 0.5 --json >"$work/follow.json" 2>>"$work/console.txt" || fail "the path was not followed"
+python3 - "$work/follow.json" <<'END' || fail "the path is not as it is told"
+import json, sys
+path = json.load(open(sys.argv[1]))
+assert path["reached"] and path["of"] == len(path["way_points"]) == 3, path
+assert all(point["predicted_error_deg"] < 1 and point["observed_error_deg"] < 2 for point in path["way_points"]), path
+END
+moves_of() { "$source/run" exec bodyschema status --json | python3 -c 'import json, sys; print(json.load(sys.stdin)["arm"]["action_id"])'; }
+before=$(moves_of)
+printf 'x,y,z\n9,9,9\n' | "$source/run" exec bodyschema follow - --part 5 2>>"$work/console.txt" && fail "a path out of reach was followed"
+grep -q "nothing was moved" "$work/console.txt" && [ "$before" = "$(moves_of)" ] || fail "a path out of reach moved the arm"
 console target --part 5 --position 9 9 9 --timeout 30 && fail "a target out of reach was reached"
 grep -q "refused: out of reach" "$work/console.txt" || fail "a target out of reach is not refused"
 console stop && fail "stop did something"

@@ -36,6 +36,8 @@ void add_watch_command(Arguments console);
 /// and exit with 0 only where the result is what was asked for. `stop` does nothing but say which
 /// of `halt` and `./run stop` may be meant.
 void add_operate_commands(Arguments console);
+/// `follow`: the same along a path of way points.
+void add_follow_command(Arguments console);
 /// `where`: where parts are and can go, by the schema of the group on the bus or of a file.
 void add_where_command(Arguments console);
 /// `fault KIND …`: breaks the simulated arm and says what is broken then.

@@ -288,7 +288,9 @@ Json control_json(const std::optional<control_status_t>& control) {
           {"why", control->why},
           {"target_part", known(control->target_part)},
           {"predicted_error_m", known(control->predicted_error_m)},
-          {"observed_error_m", known(control->observed_error_m)}};
+          {"observed_error_m", known(control->observed_error_m)},
+          {"way_point", control->way_point},
+          {"way_points", control->num_way_points}};
 }
 
 Json edge_json(const EdgeStatus& item) {

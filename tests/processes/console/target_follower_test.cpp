@@ -34,6 +34,7 @@ control_status_t status(std::int8_t state, std::int64_t epoch = 50, std::int64_t
   status.why = "because";
   status.predicted_error_m = 0.001;
   status.observed_error_m = -1;
+  status.predicted_error_rad = status.observed_error_rad = -1;
   return status;
 }
 
@@ -68,11 +69,27 @@ TEST(OperateTest, DistancesThatAreNotKnownAreNotTold) {
   EXPECT_EQ(course_text(told), "1 move, by the schema 1.0 mm away, as seen 2.4 mm");
   told.predicted_error_m = told.observed_error_m = -1;
   EXPECT_EQ(course_text(told), "1 move");
+  told.num_probes = 1;
+  told.predicted_error_m = 0.0002;
+  told.predicted_error_rad = 0.1 * kDegree;
+  EXPECT_EQ(course_text(told), "1 move, 1 probe among them, by the schema 0.2 mm and 0.10° away");
+}
+
+TEST(OperateTest, APartThatIsSeenTurnedAwayIsMissed) {
+  for (const bool is_turned : {false, true}) {
+    TargetFollower follower(target(), 60 * kSecond, {.m = 0.02, .rad = 5 * kDegree});
+    follower.on_tick(0);
+    control_status_t reached = status(S::CONTROL_REACHED);
+    reached.observed_error_m = 0.001;
+    reached.observed_error_rad = (is_turned ? 5.1 : 4.9) * kDegree;
+    follower.on_control_status(reached);
+    EXPECT_EQ(follower.end(), is_turned ? End::kMissed : End::kAsked);
+  }
 }
 
 TEST(OperateTest, ATargetThatIsSeenElsewhereIsMissed) {
   for (const bool is_far : {false, true}) {
-    TargetFollower follower(target(), 60 * kSecond, 0.02);
+    TargetFollower follower(target(), 60 * kSecond, {.m = 0.02});
     follower.on_tick(0);
     control_status_t reached = status(S::CONTROL_REACHED);
     reached.observed_error_m = is_far ? 0.021 : 0.019;
@@ -166,9 +183,7 @@ TEST(OperateTest, AnInterruptEndsWhatIsOpenOnly) {
   follower.interrupt();
   EXPECT_EQ(follower.end(), End::kInterrupted);
   EXPECT_FALSE(follower.on_tick(kSecond));
-  EXPECT_EQ(
-      nlohmann::json::parse(target_json(status(S::CONTROL_MOVING), End::kInterrupted))["state"],
-      "interrupted");
+  EXPECT_EQ(target_json(status(S::CONTROL_MOVING), End::kInterrupted)["state"], "interrupted");
   TargetFollower reached(target(), 5 * kSecond);
   reached.on_tick(0);
   reached.on_control_status(status(S::CONTROL_REACHED));
@@ -177,13 +192,12 @@ TEST(OperateTest, AnInterruptEndsWhatIsOpenOnly) {
 }
 
 TEST(OperateTest, TheResultAsJsonHasNullForWhatIsUnknown) {
-  const auto json = nlohmann::json::parse(target_json(status(S::CONTROL_REACHED), End::kAsked));
+  const auto json = target_json(status(S::CONTROL_REACHED), End::kAsked);
   EXPECT_EQ(json["reached"], true);
   EXPECT_EQ(json["state"], "reached");
   EXPECT_EQ(json["predicted_error_m"], 0.001);
   EXPECT_TRUE(json["observed_error_m"].is_null());
-  EXPECT_EQ(nlohmann::json::parse(target_json(status(S::CONTROL_MOVING), End::kTimedOut))["state"],
-            "timed out");
+  EXPECT_EQ(target_json(status(S::CONTROL_MOVING), End::kTimedOut)["state"], "timed out");
 }
 
 TEST(OperateTest, HaltAndResumeAreRepeatedUntilTheDriverSaysSo) {

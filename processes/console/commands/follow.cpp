@@ -1,0 +1,232 @@
+#include <fmt/format.h>
+
+#include <algorithm>
+#include <cmath>
+#include <fstream>
+#include <iostream>
+#include <iterator>
+#include <memory>
+#include <optional>
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+#include "common/bus/arguments.h"
+#include "common/bus/channels.h"
+#include "common/bus/convert.h"
+#include "common/bus/rest_position.h"
+#include "common/text/text.h"
+#include "processes/console/commands/commands.h"
+#include "processes/console/commands/session.h"
+#include "processes/console/hint.h"
+#include "processes/console/views/reach_view.h"
+#include "processes/console/way_points.h"
+
+namespace bodyschema {
+namespace {
+
+using End = TargetFollower::End;
+
+struct FollowArguments {
+  std::string in = default_url();
+  std::string file;
+  int part = -1;
+  double step_m = 0.02;
+  double timeout_s = 120;
+  double tolerance_m = kSeenNear_m;
+  bool json = false;
+};
+
+/// What became of a way point.
+struct Passed {
+  control_status_t status;
+  End end = End::kOpen;
+};
+
+std::vector<PoseTarget> read_way_points(const std::string& file) {
+  std::ifstream stream;
+  if (file != "-") {
+    stream.open(file);
+    if (!stream) throw WayPointError(file + ": cannot be read");
+  }
+  const std::string text{
+      std::istreambuf_iterator<char>(file == "-" ? std::cin : static_cast<std::istream&>(stream)),
+      {}};
+  return parse_way_points(text, file == "-" ? "stdin" : file);
+}
+
+struct Heard {
+  std::optional<BodySchema> schema;
+  std::optional<motion_status_t> motion;
+};
+
+/// `heard` gets what comes as long as the session lives. @throws std::runtime_error unless a schema
+/// does.
+void listen(Session& session, Heard* heard) {
+  session.bus.subscribe(kBodySchema,
+                        [=](const body_schema_t& m) { heard->schema = from_message(m); });
+  session.bus.subscribe(kMotionStatus, [=](const motion_status_t& m) { heard->motion = m; });
+  session.turn(
+      kPatience_us, [&] { return heard->schema && heard->motion; },
+      [&](std::int64_t) { session.expect_company(); });
+  if (!heard->schema)
+    throw std::runtime_error("no schema is known yet: it comes with the first samples");
+}
+
+/// The steps that end at each way point: one to the first, then straight lines.
+std::vector<std::vector<PoseTarget>> legs_of(const std::vector<PoseTarget>& way_points,
+                                             double step_m) {
+  std::vector<std::vector<PoseTarget>> legs{{way_points.front()}};
+  for (std::size_t n = 1; n < way_points.size(); ++n)
+    legs.push_back(straight_line(way_points[n - 1], way_points[n], step_m));
+  return legs;
+}
+
+/// Every step is within reach from the one before, and known well enough there, or nothing is
+/// begun. @throws std::runtime_error with the first that is not.
+void check_reach(const Heard& heard, const FollowArguments& arguments,
+                 const std::vector<std::vector<PoseTarget>>& legs) {
+  const BodySchema& schema = *heard.schema;
+  const int part = arguments.part;
+  Eigen::VectorXd action(schema.signals.size());
+  for (std::size_t s = 0; s < schema.signals.size(); ++s)
+    action[static_cast<Eigen::Index>(s)] = (schema.signals[s].lower + schema.signals[s].upper) / 2;
+  if (heard.motion)
+    if (const auto position = rest_position(*heard.motion, schema.signals.size()))
+      action = *position;
+  if (!schema.has_part(part) || !schema.predict(schema.root, part, action))
+    throw std::runtime_error(
+        fmt::format("the schema connects no part {} with its root {}", part, schema.root));
+  if (legs.front().front().q_RT && !schema.has_rotation(part))
+    throw std::runtime_error(
+        fmt::format("of part {} positions alone are known: leave out qw,qx,qy,qz", part));
+  for (std::size_t n = 0; n < legs.size(); ++n) {
+    for (const PoseTarget& step : legs[n]) {
+      const Reach reach = reach_of(schema, part, step, action);
+      const bool is_known = reach.sd.position_m <= arguments.tolerance_m;
+      if (!reach.solution.is_within_tolerance || !is_known)
+        throw std::runtime_error(fmt::format(
+            "the way to point {} of {}, at {:.3f} {:.3f} {:.3f}: {}; nothing was moved", n + 1,
+            legs.size(), step.p_RT.x(), step.p_RT.y(), step.p_RT.z(),
+            is_known ? reach.why
+                     : fmt::format("the schema knows the part there within ±{:.1f} mm only",
+                                   reach.sd.position_m * 1e3)));
+      action = reach.solution.action;
+    }
+  }
+}
+
+pose_target_t target_at(const PoseTarget& step, const FollowArguments& arguments) {
+  pose_target_t target =
+      make_target(step.q_RT ? pose_target_t::KIND_POSE : pose_target_t::KIND_POSITION);
+  target.target_part = arguments.part;
+  std::copy(step.p_RT.begin(), step.p_RT.end(), target.position_m);
+  if (const auto& q = step.q_RT) {
+    const double wxyz[] = {q->w(), q->x(), q->y(), q->z()};
+    std::copy(std::begin(wxyz), std::end(wxyz), target.orientation_wxyz);
+  }
+  target.expiry_s = arguments.timeout_s + kExpiryAfterTimeout_s;
+  return target;
+}
+
+/// Goes there step by step; moves and probes are those of all steps.
+Passed pass(Session& session, const std::vector<PoseTarget>& steps, const pose_target_t& first,
+            const FollowArguments& arguments, std::int64_t* next_id) {
+  Passed passed;
+  int num_moves = 0, num_probes = 0;
+  for (const PoseTarget& step : steps) {
+    pose_target_t target = target_at(step, arguments);
+    target.epoch = first.epoch;
+    target.target_id = (*next_id)++;
+    target.way_point = first.way_point;
+    target.num_way_points = first.num_way_points;
+    TargetFollower follower(target, std::llround(arguments.timeout_s * 1e6),
+                            {.m = arguments.tolerance_m});
+    session.follow(follower, nullptr,
+                   fmt::format("way point {} of {} · ", first.way_point, first.num_way_points));
+    passed = {follower.status(), follower.end()};
+    num_moves += passed.status.num_moves;
+    num_probes += passed.status.num_probes;
+    if (passed.end == End::kInterrupted)
+      passed.status.why = "interrupted; " + session.withdraw(follower);
+    if (passed.end == End::kTimedOut)
+      passed.status.why = fmt::format("no end within {} s; {}; {}", arguments.timeout_s,
+                                      follower.diagnosis(), session.withdraw(follower));
+    if (passed.end != End::kAsked && passed.end != End::kMissed) break;
+  }
+  passed.status.num_moves = num_moves;
+  passed.status.num_probes = num_probes;
+  return passed;
+}
+
+Json follow_json(const std::vector<Passed>& passed, std::size_t num_way_points) {
+  int num_moves = 0, num_probes = 0;
+  for (const Passed& one : passed) {
+    num_moves += one.status.num_moves;
+    num_probes += one.status.num_probes;
+  }
+  const bool is_reached =
+      passed.size() == num_way_points &&
+      std::ranges::all_of(passed, [](const Passed& one) { return one.end == End::kAsked; });
+  return {{"reached", is_reached},
+          {"way_points",
+           array_of(passed, [](const Passed& one) { return target_json(one.status, one.end); })},
+          {"of", num_way_points},
+          {"moves", num_moves},
+          {"probes", num_probes}};
+}
+
+void run_follow(const FollowArguments& arguments) {
+  const auto legs = legs_of(read_way_points(arguments.file), arguments.step_m);
+  Heard heard;
+  Session session(arguments.in);
+  listen(session, &heard);
+  check_reach(heard, arguments, legs);
+  std::vector<Passed> passed;
+  pose_target_t target = make_target(pose_target_t::KIND_POSITION);
+  target.num_way_points = static_cast<int>(legs.size());
+  std::int64_t next_id = 0;
+  for (std::size_t n = 0; n < legs.size(); ++n) {
+    target.way_point = static_cast<int>(n) + 1;
+    passed.push_back(pass(session, legs[n], target, arguments, &next_id));
+    const auto& [status, end] = passed.back();
+    if (!arguments.json)
+      std::cout << fmt::format("way point {} of {}: {}{} ({})\n", n + 1, legs.size(),
+                               ending(end, status), status.why, course_text(status))
+                << std::flush;
+    if (end != End::kAsked && end != End::kMissed) break;
+  }
+  const Json json = follow_json(passed, legs.size());
+  if (arguments.json) std::cout << json.dump() << "\n";
+  if (passed.back().status.owns_arm == 1)
+    std::cerr << "The arm stays there until: " << to_type("release") << "\n";
+  if (!json["reached"].get<bool>()) fail();
+}
+
+}  // namespace
+
+void add_follow_command(Arguments console) {
+  const auto arguments = std::make_shared<FollowArguments>();
+  Arguments follow = console.add_subcommand(
+      "follow", "Bring a body part through way points, straight from each to the next");
+  follow
+      .add_option("FILE", arguments->file,
+                  "CSV with x,y,z or x,y,z,qw,qx,qy,qz in the root part [m]; - is stdin")
+      .required();
+  follow.add_option("--in", arguments->in, "URL of the bus");
+  follow.add_option("--part", arguments->part, "Body part").required().in_range(0, 9999);
+  follow.add_option("--step", arguments->step_m, "Longest way between two looks [m]")
+      .check(within(1e-4, 1000), "NUMBER");
+  follow
+      .add_option("--timeout", arguments->timeout_s,
+                  "Of one step [s]; then the path is left and the arm held")
+      .check(within(1e-3, kLongest_s), "NUMBER");
+  follow
+      .add_option("--tolerance", arguments->tolerance_m,
+                  "A way point that is seen farther off [m] was missed; the path goes on")
+      .check(within(1e-6, 1000), "NUMBER");
+  follow.add_flag("--json", arguments->json, "The result as JSON");
+  follow.callback([arguments] { run_follow(*arguments); });
+}
+
+}  // namespace bodyschema

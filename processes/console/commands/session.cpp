@@ -1,0 +1,149 @@
+#include "processes/console/commands/session.h"
+
+#include <fmt/format.h>
+#include <unistd.h>
+
+#include <chrono>
+#include <cstdlib>
+#include <iostream>
+#include <stdexcept>
+
+#include "common/bus/arguments.h"
+#include "common/bus/channels.h"
+#include "common/text/clock.h"
+#include "common/text/text.h"
+#include "processes/console/hint.h"
+#include "processes/console/interruption.h"
+
+namespace bodyschema {
+namespace {
+
+constexpr std::int64_t kAlone_us = 2'500'000;  // twice what the processes of a group repeat in
+constexpr std::chrono::milliseconds kTurn{50};
+
+/// A terminal gets a line that rewrites itself, a file a line for each change.
+class ProgressLine {
+ public:
+  ~ProgressLine() {
+    if (is_terminal_ && !shown_.empty()) std::cerr << "\r\x1b[2K" << std::flush;
+  }
+  void show(const std::string& line) {
+    if (line == shown_) return;
+    shown_ = line;
+    std::cerr << (is_terminal_ ? in_place(line, STDERR_FILENO) : line + "\n") << std::flush;
+  }
+
+ private:
+  const bool is_terminal_ = isatty(STDERR_FILENO) == 1;
+  std::string shown_;
+};
+
+}  // namespace
+
+std::function<std::string(const std::string&)> within(double lowest, double highest) {
+  return [=](const std::string& text) {
+    char* end = nullptr;
+    const auto value = static_cast<double>(std::strtold(text.c_str(), &end));
+    const bool is_number = !text.empty() && *end == '\0';
+    return is_number && value >= lowest && value <= highest
+               ? std::string()
+               : fmt::format("expected a number within {} … {}, found '{}'", lowest, highest,
+                             abbreviated(text));
+  };
+}
+
+void fail() {
+  if (!std::cout.flush()) throw std::runtime_error("stdout: the result could not be written");
+  end_as_failed();
+}
+
+pose_target_t make_target(std::int8_t kind) {
+  pose_target_t target{};
+  target.utime = target.epoch = wall_clock_us();
+  target.sender = kConsole;
+  target.target_kind = kind;
+  target.target_part = -1;
+  target.keep_s = -1;
+  return target;
+}
+
+template <class Message>
+void Session::for_anybody(const Channel<Message>& channel) {
+  bus.subscribe(channel, [this](const Message&) { is_heard_ = true; });
+}
+
+Session::Session(const std::string& url) : bus(url, url), url_(url), start_us_(clock_us()) {
+  catch_interruption();
+  for_anybody(kProcessInfo);
+  for_anybody(kMotionStatus);
+  for_anybody(kControlStatus);
+  bus.subscribe(kControlStatus, [this](const auto& m) {
+    if (follower_) follower_->on_control_status(m);
+  });
+  bus.subscribe(kProcessInfo, [this](const auto& m) {
+    if (follower_) follower_->on_process_info(m);
+  });
+  bus.subscribe(kMotionStatus, [this](const auto& m) {
+    if (follower_) follower_->on_motion_status(m);
+  });
+}
+
+void Session::turn(std::int64_t most_us, const std::function<bool()>& is_done,
+                   const std::function<void(std::int64_t)>& on_turn) {
+  const std::int64_t end_us = clock_us() + most_us;
+  while (!is_done() && clock_us() < end_us && !is_interrupted()) {
+    if (on_turn) on_turn(clock_us());
+    bus.handle(kTurn);
+  }
+}
+
+void Session::follow(TargetFollower& follower, const std::function<void(std::int64_t)>& on_turn,
+                     const std::string& prefix) {
+  follower_ = &follower;
+  ProgressLine line;
+  while (follower.end() == TargetFollower::End::kOpen) {
+    expect_company();
+    if (is_interrupted()) follower.interrupt();
+    if (const auto target = follower.on_tick(clock_us())) bus.publish(kPoseTarget, *target);
+    if (on_turn) on_turn(clock_us());
+    line.show(prefix + follower.progress());
+    bus.handle(kTurn);
+  }
+  follower_ = nullptr;
+}
+
+void Session::expect_company() const {
+  if (is_heard_ || clock_us() - start_us_ < kAlone_us) return;
+  throw std::runtime_error("nothing is heard on " + url_ +
+                           ": no group runs there. ./run --keep starts one, ./run exec bodyschema "
+                           "… speaks to one that runs");
+}
+
+std::string Session::withdraw(const TargetFollower& follower) {
+  clear_interruption();  // a second Ctrl-C ends this too
+  const pose_target_t withdrawal = follower.withdrawal();
+  TargetFollower dropped(withdrawal, kPatience_us);
+  follow(dropped);
+  switch (dropped.end()) {
+    case TargetFollower::End::kAsked:
+      return withdrawal.target_kind == pose_target_t::KIND_HOLD
+                 ? "the target was dropped: the arm is held until another target or: " +
+                       to_type("release")
+                 : "the target was dropped: the arm is the babbler's";
+    case TargetFollower::End::kRefused:
+      return dropped.status().why;
+    default:
+      return "the controller does not say that it dropped the target, so the arm may move; it is "
+             "stopped by: " +
+             to_type("halt");
+  }
+}
+
+const char* ending(TargetFollower::End end, const control_status_t& status) {
+  if (end == TargetFollower::End::kAsked) return "";
+  if (end == TargetFollower::End::kMissed) return "missed: ";
+  if (status.control_state == control_status_t::CONTROL_HOLDING) return "held: ";
+  return status.control_state == control_status_t::CONTROL_REFUSED ? "refused: " : "not reached: ";
+}
+
+}  // namespace bodyschema

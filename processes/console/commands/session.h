@@ -1,0 +1,63 @@
+#pragma once
+
+#include <cstdint>
+#include <functional>
+#include <string>
+
+#include "common/bus/bus.h"
+#include "processes/console/target_follower.h"
+
+namespace bodyschema {
+
+inline constexpr std::int64_t kPatience_us = 5'000'000;  ///< for what is answered at once
+/// Nobody waits longer; microseconds of it are far from overflow [s].
+inline constexpr double kLongest_s = 1e7;
+
+/// A target outlives the timeout of the command that gave it by this, where that was killed.
+inline constexpr double kExpiryAfterTimeout_s = 5;
+
+/// A check of an option; CLI::Range lets "nan" pass.
+std::function<std::string(const std::string&)> within(double lowest, double highest);
+
+/// Exit code 1; the result is on stdout.
+[[noreturn]] void fail();
+
+/// Of the console, as of now, without a part.
+pose_target_t make_target(std::int8_t kind);
+
+/// The bus of a command that somebody must answer: whoever lives there says so once a second.
+class Session {
+ public:
+  explicit Session(const std::string& url);
+
+  /// Turns the bus until `is_done` or Ctrl-C, at most for so long; `on_turn` gets the clock.
+  void turn(std::int64_t most_us, const std::function<bool()>& is_done,
+            const std::function<void(std::int64_t)>& on_turn = nullptr);
+
+  /// Shows the follower's progress, after `prefix`, until it has come to an end; `on_turn` on every
+  /// turn.
+  void follow(TargetFollower& follower, const std::function<void(std::int64_t)>& on_turn = nullptr,
+              const std::string& prefix = "");
+
+  /// Makes the controller drop what `follower` follows no longer; says what became of it.
+  std::string withdraw(const TargetFollower& follower);
+
+  /// @throws std::runtime_error with what to type once nobody can be there.
+  void expect_company() const;
+
+  Bus bus;
+
+ private:
+  template <class Message>
+  void for_anybody(const Channel<Message>& channel);
+
+  const std::string url_;
+  const std::int64_t start_us_;
+  bool is_heard_ = false;
+  TargetFollower* follower_ = nullptr;
+};
+
+/// How a target ended, before the controller's own words, which begin with "reached".
+const char* ending(TargetFollower::End end, const control_status_t& status);
+
+}  // namespace bodyschema

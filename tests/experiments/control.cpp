@@ -1,0 +1,222 @@
+// control: Table 2 of the chapter, with the code that runs. A 4-DOF arm follows 30 way points
+// twice, whole and with its middle link bent by 45° before the first, by a schema that stays as it
+// was or one that is adapted. Prints Markdown: errors of the true end effector at the way points,
+// and the mean error at each of them with --along.
+//
+//   ./run experiment control [--runs 20] [--along]
+
+#include <fmt/format.h>
+
+#include <CLI/CLI.hpp>
+#include <array>
+#include <cmath>
+#include <string>
+#include <vector>
+
+#include "common/geometry/angle.h"
+#include "common/plot/plot.h"
+#include "processes/controller/inverse_kinematics.h"
+#include "processes/structure_learner/learn.h"
+#include "tests/support/broken_arm.h"
+#include "tests/support/steered_arm.h"
+
+using namespace bodyschema;
+using namespace bodyschema::test;
+
+namespace {
+
+constexpr int kWayPoints = 30, kPasses = 2, kSamples = 100;
+constexpr int kRoot = 1, kEndEffector = 5, kMiddle = 3;
+
+/// A closed path of the whole arm's end effector: each joint swings by a third of its range to both
+/// sides, the even ones twice a turn.
+std::vector<Eigen::Vector3d> path_of(const SyntheticRobot& robot) {
+  std::vector<Eigen::Vector3d> path;
+  for (int n = 0; n < kWayPoints; ++n) {
+    const double phase = 2 * M_PI * n / kWayPoints;
+    Eigen::VectorXd action(robot.signals.size());
+    for (std::size_t s = 0; s < robot.signals.size(); ++s) {
+      const Signal& signal = robot.signals[s];
+      const double swing = std::sin(phase * (s % 2 ? 2 : 1) + 0.7 * static_cast<double>(s));
+      action[static_cast<Eigen::Index>(s)] =
+          0.5 * (signal.lower + signal.upper) + swing * (signal.upper - signal.lower) / 3;
+    }
+    const auto X_CB = robot.poses_in_camera(action);
+    path.push_back((X_CB.at(kRoot).inverse() * X_CB.at(kEndEffector)).translation());
+  }
+  return path;
+}
+
+/// The middle link turns by 45° about an axis across it, at the joint that carries it.
+SyntheticRobot bent(SyntheticRobot robot, Rng& rng) {
+  TrueLink& link = robot.links[kMiddle - 1];
+  const Eigen::Vector3d along = link.X_after.translation();
+  const Eigen::Vector3d across = along.cross(random_vector(rng, 1, 1)).normalized();
+  link.X_after =
+      exp((Vector6d() << Eigen::Vector3d::Zero(), across * 45 * kDegree).finished()) * link.X_after;
+  return robot;
+}
+
+struct Arms {
+  SyntheticRobot whole, bent;
+  std::vector<Eigen::Vector3d> path;  ///< of the end effector, in the root's frame [m]
+};
+
+bool reaches(const SyntheticRobot& robot, const std::vector<Eigen::Vector3d>& path) {
+  const InverseKinematicsOptions options{
+      .tolerance_m = 1e-4, .damping_m = 0.05, .max_iterations = 100, .max_starts = 20};
+  const BodySchema schema = true_schema(robot);
+  Eigen::VectorXd action = Eigen::VectorXd::Zero(static_cast<Eigen::Index>(robot.signals.size()));
+  for (const Eigen::Vector3d& p_RT : path) {
+    const auto solution =
+        solve_pose(schema, kEndEffector, {.p_RT = p_RT}, robot.signals, action, options);
+    if (!solution.is_within_tolerance) return false;
+    action = solution.action;
+  }
+  return true;
+}
+
+Arms arms_of(Rng& rng) {
+  for (;;) {
+    Arms arms;
+    arms.whole = chapter_robot("c", rng);
+    arms.bent = bent(arms.whole, rng);
+    arms.path = path_of(arms.whole);
+    if (reaches(arms.whole, arms.path) && reaches(arms.bent, arms.path)) return arms;
+  }
+}
+
+struct Case {
+  const char* name;
+  Regime regime;
+  bool is_learned, is_bent, adapts;
+};
+
+struct Result {
+  std::array<std::vector<double>, kPasses * kWayPoints> errors_m;  ///< one a run that reached it
+  std::vector<double> probes, moves;
+  int num_not_reached = 0;
+};
+
+Result measure(const Case& test, int num_runs, const std::string& rig) {
+  Result result;
+  for (int run = 1; run <= num_runs; ++run) {
+    Rng rng(static_cast<Rng::result_type>(run));
+    const Arms arms = arms_of(rng);
+    const SyntheticRobot& robot = arms.whole;
+    BodySchema schema = true_schema(robot);
+    if (test.is_learned) {
+      LearnOptions learning;
+      learning.measurement = adaptation_options(test.regime).measurement;
+      schema =
+          learn(robot.signals,
+                babble(robot, kSamples, {.regime = test.regime, .with_covariances = true}, rng),
+                learning)
+              .schema;
+    }
+    SteeredArm arm(
+        robot, schema, rig,
+        {.regime = test.regime, .adapts = test.adapts, .seed = static_cast<std::uint64_t>(run)});
+    if (test.is_bent) arm.set_robot(arms.bent);
+    int num_probes = 0;
+    for (std::size_t n = 0; n < result.errors_m.size(); ++n) {
+      const auto [status, error_m] = arm.go_to(kEndEffector, arms.path[n % arms.path.size()]);
+      num_probes += status.num_probes;
+      if (status.control_state == control_status_t::CONTROL_REACHED)
+        result.errors_m[n].push_back(error_m);
+      else
+        ++result.num_not_reached;
+    }
+    result.probes.push_back(num_probes);
+    result.moves.push_back(static_cast<double>(arm.moves().size()));
+  }
+  return result;
+}
+
+double mean(const std::vector<double>& values) {
+  double sum = 0;
+  for (const double value : values) sum += value;
+  return sum / static_cast<double>(values.size());
+}
+
+/// Mean and standard deviation over all runs and the way points [from, to), "0.0071 ± 0.0011".
+std::string cell(const Result& result, int from, int to) {
+  std::vector<double> all;
+  for (int n = from; n < to; ++n) {
+    const auto& errors = result.errors_m[static_cast<std::size_t>(n)];
+    all.insert(all.end(), errors.begin(), errors.end());
+  }
+  if (all.empty()) return "–";
+  double sum = 0;
+  for (const double value : all) sum += (value - mean(all)) * (value - mean(all));
+  return fmt::format("{:.4f} ± {:.4f}", mean(all),
+                     std::sqrt(sum / static_cast<double>(all.size())));
+}
+
+void print_along(const std::vector<Case>& cases, const std::vector<Result>& results) {
+  fmt::print("\n| way point |");
+  for (const Case& test : cases) fmt::print(" {} [mm] |", test.name);
+  fmt::print("\n|---|");
+  for (std::size_t n = 0; n < cases.size(); ++n) fmt::print("---|");
+  for (std::size_t n = 0; n < results.front().errors_m.size(); ++n) {
+    fmt::print("\n| {} |", n + 1);
+    for (const Result& result : results)
+      fmt::print(" {} |", result.errors_m[n].empty()
+                              ? "–"
+                              : fmt::format("{:.2f}", 1e3 * mean(result.errors_m[n])));
+  }
+  fmt::print("\n");
+}
+
+Plot plot_along(const std::vector<Case>& cases, const std::vector<Result>& results) {
+  Plot plot{.width_px = 900, .height_px = 420};
+  plot.script =
+      "set logscale y\nset key outside\nset xlabel 'way point'\nset ylabel 'error [mm]'\nplot ";
+  std::string data;
+  for (std::size_t c = 0; c < cases.size(); ++c) {
+    plot.script +=
+        fmt::format("{}'-' with lines lw 2 title {}", c ? ", " : "", gnuplot_string(cases[c].name));
+    for (std::size_t n = 0; n < results[c].errors_m.size(); ++n)
+      if (!results[c].errors_m[n].empty())
+        data += fmt::format("{} {}\n", n + 1, 1e3 * mean(results[c].errors_m[n]));
+    data += "e\n";
+  }
+  plot.script += "\n" + data;
+  return plot;
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+  int num_runs = 20;
+  bool is_along = false;
+  std::string plot_file;
+  std::string rig = std::string(BODYSCHEMA_CONFIG) + "/arm4";
+  CLI::App app("Table 2: an arm of four joints follows a path, whole and bent");
+  app.add_option("--runs", num_runs, "Arms of other geometry")->check(CLI::PositiveNumber);
+  app.add_option("--rig", rig, "Folder of controller.yaml and model_monitor.yaml");
+  app.add_flag("--along", is_along, "Also the mean error at each way point");
+  app.add_option("--plot", plot_file, "PNG of them");
+  CLI11_PARSE(app, argc, argv);
+  const std::vector<Case> cases = {
+      {"whole, static, engineered", Regime::kTag, false, false, false},
+      {"whole, static, learned", Regime::kTag, true, false, false},
+      {"whole, adaptive, learned", Regime::kTag, true, false, true},
+      {"bent, static, learned", Regime::kTag, true, true, false},
+      {"bent, adaptive, learned", Regime::kTag, true, true, true},
+      {"bent, adaptive, learned, chapter noise", Regime::kChapter, true, true, true}};
+  fmt::print(
+      "| arm and schema | way points 1–3 [m] | 4–30 [m] | second pass [m] | moves | of these "
+      "probes | "
+      "not reached |\n|---|---|---|---|---|---|---|\n");
+  std::vector<Result> results;
+  for (const Case& test : cases) {
+    const Result& result = results.emplace_back(measure(test, num_runs, rig));
+    fmt::print("| {} | {} | {} | {} | {:.0f} | {:.1f} | {} |\n", test.name, cell(result, 0, 3),
+               cell(result, 3, kWayPoints), cell(result, kWayPoints, 2 * kWayPoints),
+               mean(result.moves), mean(result.probes), result.num_not_reached);
+    std::fflush(stdout);
+  }
+  if (is_along) print_along(cases, results);
+  if (!plot_file.empty()) draw_png(plot_along(cases, results), plot_file);
+}
