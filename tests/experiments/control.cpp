@@ -139,7 +139,7 @@ double mean(const std::vector<double>& values) {
   return sum / static_cast<double>(values.size());
 }
 
-/// Mean and standard deviation over all runs and the way points [from, to), "0.0071 ± 0.0011".
+/// Mean and standard deviation over all runs and the way points from ≤ n < to [mm].
 std::string cell(const Result& result, int from, int to) {
   std::vector<double> all;
   for (int n = from; n < to; ++n) {
@@ -149,8 +149,8 @@ std::string cell(const Result& result, int from, int to) {
   if (all.empty()) return "–";
   double sum = 0;
   for (const double value : all) sum += (value - mean(all)) * (value - mean(all));
-  return fmt::format("{:.4f} ± {:.4f}", mean(all),
-                     std::sqrt(sum / static_cast<double>(all.size())));
+  return fmt::format("{:.2f} ± {:.2f}", 1e3 * mean(all),
+                     1e3 * std::sqrt(sum / static_cast<double>(all.size())));
 }
 
 void print_along(const std::vector<Case>& cases, const std::vector<Result>& results) {
@@ -171,7 +171,7 @@ void print_along(const std::vector<Case>& cases, const std::vector<Result>& resu
 Plot plot_along(const std::vector<Case>& cases, const std::vector<Result>& results) {
   Plot plot{.width_px = 900, .height_px = 420};
   plot.script =
-      "set logscale y\nset key outside\nset xlabel 'way point'\nset ylabel 'error [mm]'\nplot ";
+      "set logscale y\nset key below\nset xlabel 'way point'\nset ylabel 'error [mm]'\nplot ";
   std::string data;
   for (std::size_t c = 0; c < cases.size(); ++c) {
     plot.script +=
@@ -206,9 +206,8 @@ int main(int argc, char** argv) {
       {"bent, adaptive, learned", Regime::kTag, true, true, true},
       {"bent, adaptive, learned, chapter noise", Regime::kChapter, true, true, true}};
   fmt::print(
-      "| arm and schema | way points 1–3 [m] | 4–30 [m] | second pass [m] | moves | of these "
-      "probes | "
-      "not reached |\n|---|---|---|---|---|---|---|\n");
+      "| arm and schema | way points 1–3 [mm] | 4–30 [mm] | second pass [mm] | moves | of these "
+      "probes | not reached |\n|---|---|---|---|---|---|---|\n");
   std::vector<Result> results;
   for (const Case& test : cases) {
     const Result& result = results.emplace_back(measure(test, num_runs, rig));
