@@ -17,6 +17,7 @@ namespace bodyschema {
 namespace {
 
 constexpr std::size_t kMaxWaiting = 32;
+constexpr std::int64_t kRefinerTimeout_us = 30'000'000;
 /// TEST samples that judge an edge and a part: the newest. Twice as many are kept, for proposals
 /// that come late.
 constexpr std::size_t kTests = 200;
@@ -43,7 +44,10 @@ ModelMonitorConfig ModelMonitorConfig::load(const std::filesystem::path& file) {
   return config;
 }
 
-ModelMonitor::ModelMonitor(ModelMonitorConfig config) : config_(config) {
+ModelMonitor::ModelMonitor(ModelMonitorConfig config)
+    : config_(config),
+      schedule_(config.refine_every),
+      refinements_(config.refine_every > 0, kRefinerTimeout_us) {
   options_.measurement = config_.measurement;
   options_.least_noise_scale = 1;
   if (config_.false_alarm_rate > 0) options_.false_alarm_rate = config_.false_alarm_rate;
@@ -51,7 +55,7 @@ ModelMonitor::ModelMonitor(ModelMonitorConfig config) : config_(config) {
     health->judged_sample = -1;
     health->worst_position_m = health->worst_rotation_rad = -1;
     health->noise_scale = -1;
-    health->probe_sample = -1;
+    health->probe_sample = health->awaited_refinement = health->wanted_sample = -1;
   }
 }
 
@@ -140,6 +144,7 @@ bool ModelMonitor::on_sample(const sample_t& message) {
   ActionPoseSample sample = from_message(message);
   if (sample.purpose == Purpose::kTest) {
     test_indices_.later.push_back(sample.sample_index);
+    if (schedule_.is_due(sample.sample_index)) due_.insert(sample.sample_index);
     tests_.push_back(sample);
     if (tests_.size() > 2 * kTests) tests_.pop_front();
   }
@@ -160,24 +165,63 @@ bool ModelMonitor::on_sample(const sample_t& message) {
   if (samples_.back().purpose == Purpose::kTest) keep(now_);
   publish();
 
-  bool is_judged = false;
-  while (!waiting_.empty() && waiting_.begin()->first <= last_sample_index_) {
-    is_judged |= on_learned_schema(waiting_.extract(waiting_.begin()).mapped());
-  }
+  const bool is_judged = judge_waiting();
   return is_judged || now_.num_events != num_events ||
          (schema_message_ && schema_message_->schema_version != version);
 }
 
 bool ModelMonitor::on_learned_schema(const body_schema_t& proposal) {
-  if (proposal.last_sample_index > last_sample_index_) {
-    // Those that will be judged first are kept: a proposal from nowhere cannot displace them.
-    waiting_.insert_or_assign(proposal.last_sample_index, proposal);
-    if (waiting_.size() > kMaxWaiting) waiting_.erase(std::prev(waiting_.end()));
-    return false;
-  }
   if (proposal.last_sample_index <= judged_sample_) return false;
-  if (!is_test(proposal.last_sample_index)) return false;
-  judge(proposal);
+  waiting_.insert_or_assign(proposal.last_sample_index, proposal);
+  // Those that will be judged first are kept: a proposal from nowhere cannot displace them.
+  if (waiting_.size() > kMaxWaiting) waiting_.erase(std::prev(waiting_.end()));
+  return judge_waiting();
+}
+
+bool ModelMonitor::judge_waiting() {
+  bool is_judged = false;
+  while (!waiting_.empty() && waiting_.begin()->first <= last_sample_index_ &&
+         !waits_for_refiner(waiting_.begin()->second)) {
+    const body_schema_t proposal = waiting_.extract(waiting_.begin()).mapped();
+    if (proposal.last_sample_index <= judged_sample_ || !is_test(proposal.last_sample_index))
+      continue;
+    judge(proposal);
+    due_.erase(due_.begin(), due_.upper_bound(judged_sample_));
+    is_judged = true;
+  }
+  return is_judged;
+}
+
+bool ModelMonitor::waits_for_refiner(const body_schema_t& proposal) {
+  const std::int64_t index = proposal.last_sample_index;
+  if (proposal.is_complete == 0 || !due_.contains(index)) return false;
+  if (refinements_.question() != index) refinements_.ask(index);
+  is_assessed_ = false;
+  return refinements_.is_waiting();
+}
+
+bool ModelMonitor::on_refined_schema(const body_schema_t& refined) {
+  if (refined_ && refined.last_sample_index <= refined_->last_sample_index) return false;
+  refined_ = from_message(refined);
+  wanted_ = refined.wanted_actions;
+  is_assessed_ = false;
+  refinements_.answer(refined.last_sample_index);
+  judge_waiting();
+  return true;
+}
+
+bool ModelMonitor::are_wanted_for(const BodySchema& schema) const {
+  if (wanted_.empty() || refined_->last_sample_index > judged_sample_) return false;
+  const std::int64_t since = schema.changes.empty() ? 0 : schema.changes.back().since;
+  return body_since(*refined_) == since && has_same_tree(*refined_, schema) &&
+         std::none_of(schema.edges.begin(), schema.edges.end(),
+                      [](const Edge& edge) { return edge.state == EdgeState::kInvalid; });
+}
+
+bool ModelMonitor::on_tick(std::int64_t now_us) {
+  if (!refinements_.on_tick(now_us)) return false;
+  is_assessed_ = false;
+  judge_waiting();
   return true;
 }
 
@@ -328,6 +372,11 @@ const model_health_t& ModelMonitor::health() const {
   const BodySchema* schema = now_.schema();
   health_.utime = judged_utime_;
   health_.judged_sample = judged_sample_;
+  health_.awaited_refinement = awaited_refinement();
+  const bool are_wanted = schema && are_wanted_for(*schema);
+  health_.wanted_sample = are_wanted ? refined_->last_sample_index : -1;
+  set_array(health_.num_wanted, health_.wanted_actions,
+            are_wanted ? wanted_ : std::vector<wanted_action_t>());
   if (judged_sample_ < 0 && !now_.live) return health_;
   assess(schema ? *schema : BodySchema());
   if (!now_.live) return health_;

@@ -6,12 +6,15 @@
 #include <map>
 #include <memory>
 #include <optional>
+#include <set>
 #include <string>
 #include <vector>
 
 #include "bodyschema/body_schema_t.hpp"
 #include "bodyschema/model_health_t.hpp"
 #include "bodyschema/sample_t.hpp"
+#include "common/bus/awaited_answer.h"
+#include "common/config/refinement_schedule.h"
 #include "common/schema/body_schema.h"
 #include "common/schema/sample.h"
 #include "processes/model_monitor/health/baseline_youth.h"
@@ -26,6 +29,9 @@ struct ModelMonitorConfig {
   MeasurementModel measurement;  ///< of noise.yaml
   /// Wished false alarms a sample once a complete schema stands; 0: nothing is adapted.
   double false_alarm_rate = 1e-5;
+  /// A refiner answers the complete proposals on the TEST samples of this RefinementSchedule; 0:
+  /// there is none.
+  std::int64_t refine_every = 0;
 
   /// Reads model_monitor.yaml and the noise.yaml beside it. @throws ConfigError.
   static ModelMonitorConfig load(const std::filesystem::path& file);
@@ -56,6 +62,10 @@ struct ModelMonitorConfig {
 /// however fast the learner is; only what was published for t+1..n in between was provisional.
 /// Version n+1 changed last at sample n.
 ///
+/// A proposal that a refiner answers is judged once its answer is there, so that what moves the arm
+/// need not wait for both; a silent refiner is waited for half a minute, once. The actions that the
+/// answer wants are passed on as long as the body schema is of the same tree and body.
+///
 /// Before the first accepted proposal nothing is published; when inputs stop, the last schema
 /// stands.
 class ModelMonitor {
@@ -73,6 +83,14 @@ class ModelMonitor {
   bool on_sample(const sample_t& sample);
   /// Returns true if the proposal was judged: only those whose last sample is a TEST sample are.
   bool on_learned_schema(const body_schema_t& proposal);
+  /// The refiner's answer to a proposal. Returns true if schema() or health() may have changed.
+  bool on_refined_schema(const body_schema_t& refined);
+  /// `now_us`: the clock. Returns true if a silent refiner is given up.
+  bool on_tick(std::int64_t now_us);
+  /// Last sample of the proposal that waits for the refiner; −1: none does.
+  std::int64_t awaited_refinement() const {
+    return refinements_.is_waiting() ? refinements_.question() : -1;
+  }
 
   /// The body schema; std::nullopt before the first.
   const std::optional<body_schema_t>& schema() const { return schema_message_; }
@@ -136,6 +154,12 @@ class ModelMonitor {
   /// than what stands.
   bool is_passed_over(const BodySchema& proposal, const Standing& standing) const;
   void judge(const body_schema_t& proposal);
+  /// Those whose samples, and whose refinement, are there. Returns true if there were any.
+  bool judge_waiting();
+  bool waits_for_refiner(const body_schema_t& proposal);
+  /// The wanted actions are of the same body.
+  bool are_wanted_for(const BodySchema& schema) const;
+  static std::int64_t body_since(const BodySchema& proposal);
   void set_base(Standing* standing, BodySchema base);
   void publish();
   void assess(const BodySchema& schema) const;
@@ -157,8 +181,13 @@ class ModelMonitor {
   std::int64_t judged_sample_ = -1;
   std::int64_t judged_utime_ = 0;
   std::int64_t restored_sample_ = -1;  ///< where what was restored begins
-  /// Proposals that are ahead of the samples heard here, by their last sample.
+  /// Proposals that are ahead of the samples heard here or of the refiner, by their last sample.
   std::map<std::int64_t, body_schema_t> waiting_;
+  RefinementSchedule schedule_;
+  std::set<std::int64_t> due_;  ///< samples whose complete proposals the refiner answers
+  AwaitedAnswer refinements_;
+  std::optional<BodySchema> refined_;  ///< the newest answer
+  std::vector<wanted_action_t> wanted_;
   Standing now_;
   /// After TEST samples: the newest judged one and those that wait for a verdict.
   std::map<std::int64_t, Standing> kept_;

@@ -1,8 +1,10 @@
-"""refiner_group_test.py SOURCE BUILD: a group whose rig enables the refiner proposes tags and lens, a replay makes the same schema
-of it, `adopt` writes them into the rig, and the next run begins with the refined schema."""
+"""refiner_group_test.py SOURCE BUILD: a group whose rig enables the refiner makes the actions that it wants, the same in every
+run, and proposes tags and lens; a replay makes the same schema of it, `adopt` writes them into the rig, and the next run begins
+with the refined schema."""
 
 import os
 import shutil
+import struct
 import subprocess
 import sys
 import tempfile
@@ -26,19 +28,41 @@ def run(work, *words):
     return done.stdout
 
 
+def payloads(log, channel):
+    return subprocess.run([build / "bin" / "log_payloads", log, channel], capture_output=True, check=True).stdout
+
+
+def wanted_actions(refined):
+    """Of a file with a schema of two signals: what stands before the two numbers at its end."""
+    action = struct.Struct(">i4d")
+    return [action.unpack(refined[n : n + action.size])[1:3] for n in range(len(refined) - 376, len(refined) - 16, action.size)]
+
+
 def main(work):
     rig = work / "rig"
     shutil.copytree(source / "config" / "arm2", rig)
     settings = (rig / "refiner.yaml").read_text()
     settings = settings.replace("enabled: false", "enabled: true").replace("refine_every: 50", "refine_every: 30")
     (rig / "refiner.yaml").write_text(settings)
-    learn = ("--rig", rig, "--seed", 1, "--samples", 35)
+    babbler = (rig / "motor_babbler.yaml").read_text()
+    (rig / "motor_babbler.yaml").write_text(babbler.replace("choice: random", "choice: active"))
+    learn = ("--rig", rig, "--seed", 1, "--samples", 45)
     current = work / "logs" / "current"
 
     if "refined.lcmlog" not in run(work, *learn):
         raise Failed("the result does not name the refined schema")
     first = current.resolve()
     refined = (first / "refined.lcmlog").read_bytes()
+
+    wanted = wanted_actions(refined)
+    samples = payloads(first / "samples.lcmlog", "SAMPLE")
+    missed = [action for action in wanted if samples.count(struct.pack(">i2d", 2, *action)) != 1]
+    if len(set(wanted)) != 10 or missed:
+        raise Failed(f"of the wanted actions {wanted} these were not made once each: {missed}")
+
+    run(work, *learn)
+    if payloads(current / "samples.lcmlog", "SAMPLE") != samples:
+        raise Failed("another run of the same seed has other samples")
 
     run(work, "--replay", first / "run.lcmlog.00")
     if (current / "refined.lcmlog").read_bytes() != refined:

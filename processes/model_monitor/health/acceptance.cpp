@@ -71,6 +71,12 @@ bool ModelMonitor::has_same_tree(const BodySchema& a, const BodySchema& b) {
          });
 }
 
+std::int64_t ModelMonitor::body_since(const BodySchema& proposal) {
+  std::int64_t since = 0;
+  for (const Edge& edge : proposal.edges) since = std::max(since, edge.valid_since_sample);
+  return since;
+}
+
 std::string ModelMonitor::objection(BodySchema* proposal, const Standing& standing,
                                     bool* was_tested) const {
   const std::int64_t index = proposal->last_sample_index;
@@ -101,8 +107,7 @@ bool ModelMonitor::is_passed_over(const BodySchema& proposal, const Standing& st
   const std::int64_t index = proposal.last_sample_index;
   const BodySchema& known = *standing.schema();
   const std::int64_t body_since = known.changes.empty() ? 0 : known.changes.back().since;
-  std::int64_t since = 0;
-  for (const Edge& edge : proposal.edges) since = std::max(since, edge.valid_since_sample);
+  const std::int64_t since = ModelMonitor::body_since(proposal);
   if (body_since != since || known.moved_tags != proposal.moved_tags) return true;
   const auto gain_since = [&](std::int64_t first, std::int64_t story_since) {
     auto tests = tests_between(first, index);
