@@ -109,7 +109,7 @@ MotorBabbler::MotorBabbler(MotorBabblerConfig config, std::int64_t seed)
       seed_(seed),
       single_joint_moves_(config_.signals, config_.single_joint_share),
       wanted_actions_(config_.signals) {
-  health_.judged_sample = health_.wanted_sample = -1;
+  health_.judged_sample = health_.wanted_sample = heard_schema_.schema_version = -1;
 }
 
 bool MotorBabbler::is_mine(const motion_status_t& status) const {
@@ -204,7 +204,7 @@ std::optional<std::vector<double>> MotorBabbler::single_joint_action() const {
 bool MotorBabbler::can_choose() const {
   if (!has_verdict()) return false;
   const bool has_memory = !memory_.empty() && memory_.back().sample_index >= last_sample_;
-  return health_.schema_version == 0 || (schema_version_ == health_.schema_version && has_memory);
+  return !has_schema() || (schema_version_ == health_.schema_version && has_memory);
 }
 
 Eigen::VectorXd MotorBabbler::next_action() {
@@ -212,7 +212,7 @@ Eigen::VectorXd MotorBabbler::next_action() {
     return Eigen::Map<const Eigen::VectorXd>(health_.probe_action.data(), health_.num_probe);
   if (const auto single = single_joint_action())
     return Eigen::Map<const Eigen::VectorXd>(single->data(), std::ssize(*single));
-  if (!is_to_choose() || !can_choose() || health_.schema_version == 0)
+  if (!is_to_choose() || !can_choose() || !has_schema())
     return random_action(config_, seed_, action_id_);
   if (const auto wanted = wanted_actions_.take(health_)) return *wanted;
   const auto candidates = candidate_actions(config_, seed_, action_id_);

@@ -144,6 +144,8 @@ class MotorBabbler {
   /// act(), once everything that the next action rests on has come.
   std::optional<action_command_t> go_on();
   bool has_verdict() const { return health_.judged_sample >= last_test_sample_; }
+  /// There was one at the verdict; that of `--initial` has version 0 until it changes.
+  bool has_schema() const { return health_.schema_version > 0 || health_.num_edges > 0; }
   /// Tells single_joint_moves_ of the verdict on the newest TEST sample once both have come.
   void note_verdict();
   /// The next action is to be chosen, not drawn.
@@ -197,8 +199,8 @@ class MotorBabbler {
   bool done_ = false;
   action_command_t command_{};
   model_health_t health_{};
-  body_schema_t heard_schema_{};     ///< the newest
-  std::int64_t schema_version_ = 0;  ///< of schema_, by which is chosen; 0: none was heard
+  body_schema_t heard_schema_{};      ///< the newest
+  std::int64_t schema_version_ = -1;  ///< of schema_, by which is chosen; −1: none was heard
   BodySchema schema_;
   std::deque<SeenAction> memory_;
   SingleJointMoves single_joint_moves_;

@@ -1098,6 +1098,15 @@ TEST(MotorBabblerTest, WithoutASchemaActionsAreDrawn) {
   EXPECT_EQ(bench.babbler.num_without_schema(), 0);
 }
 
+TEST(MotorBabblerTest, AnInitialSchemaThatStandsIsChosenByToo) {
+  Bench bench = after_first_test();
+  model_health_t health = verdict(4, 0);
+  set_array(health.num_edges, health.edge_health, {edge_health_t{}});
+  EXPECT_FALSE(bench.take(bench.babbler.on_model_health(health)));
+  ASSERT_TRUE(bench.take(bench.babbler.on_body_schema(schema_of(0))));
+  EXPECT_FALSE(is_drawn(bench.last));
+}
+
 TEST(MotorBabblerTest, ASchemaThatDoesNotComeIsGivenUpUntilTheNextTest) {
   Bench bench = after_first_test();
   EXPECT_FALSE(bench.take(bench.babbler.on_model_health(verdict(4, 5))));
