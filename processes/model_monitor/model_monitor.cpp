@@ -7,7 +7,8 @@
 #include <utility>
 
 #include "common/bus/convert.h"
-#include "common/config/rig.h"
+#include "common/camera/calibrated_lens.h"
+#include "common/config/calibration_id.h"
 #include "common/config/yaml.h"
 #include "common/estimation/quantile.h"
 #include "common/geometry/angle.h"
@@ -17,7 +18,6 @@ namespace bodyschema {
 namespace {
 
 constexpr std::size_t kMaxWaiting = 32;
-constexpr std::int64_t kRefinerTimeout_us = 30'000'000;
 /// TEST samples that judge an edge and a part: the newest. Twice as many are kept, for proposals
 /// that come late.
 constexpr std::size_t kTests = 200;
@@ -32,6 +32,14 @@ double median_or_none(std::vector<double> values) {
 }
 
 }  // namespace
+
+TagView TagView::load(const std::filesystem::path& rig_folder) {
+  const RigCalibration calibration = load_calibration(rig_folder);
+  const RigNoise noise = load_noise(rig_folder);
+  return {calibration.markers,
+          lens_of(calibration.camera),
+          {noise.corner_noise_px, noise.small_tag_noise_px}};
+}
 
 ModelMonitorConfig ModelMonitorConfig::load(const std::filesystem::path& file) {
   const Yaml yaml = Yaml::load(file);
@@ -146,7 +154,11 @@ bool ModelMonitor::on_sample(const sample_t& message) {
     test_indices_.later.push_back(sample.sample_index);
     if (schedule_.is_due(sample.sample_index)) due_.insert(sample.sample_index);
     tests_.push_back(sample);
-    if (tests_.size() > 2 * kTests) tests_.pop_front();
+    if (config_.view) sights_.emplace(sample.sample_index, tag_sights(message));
+    if (tests_.size() > 2 * kTests) {
+      sights_.erase(tests_.front().sample_index);
+      tests_.pop_front();
+    }
   }
   samples_.push_back(std::move(sample));
   is_assessed_ = false;
@@ -190,39 +202,6 @@ bool ModelMonitor::judge_waiting() {
     is_judged = true;
   }
   return is_judged;
-}
-
-bool ModelMonitor::waits_for_refiner(const body_schema_t& proposal) {
-  const std::int64_t index = proposal.last_sample_index;
-  if (proposal.is_complete == 0 || !due_.contains(index)) return false;
-  if (refinements_.question() != index) refinements_.ask(index);
-  is_assessed_ = false;
-  return refinements_.is_waiting();
-}
-
-bool ModelMonitor::on_refined_schema(const body_schema_t& refined) {
-  if (refined_ && refined.last_sample_index <= refined_->last_sample_index) return false;
-  refined_ = from_message(refined);
-  wanted_ = refined.wanted_actions;
-  is_assessed_ = false;
-  refinements_.answer(refined.last_sample_index);
-  judge_waiting();
-  return true;
-}
-
-bool ModelMonitor::are_wanted_for(const BodySchema& schema) const {
-  if (wanted_.empty() || refined_->last_sample_index > judged_sample_) return false;
-  const std::int64_t since = schema.changes.empty() ? 0 : schema.changes.back().since;
-  return body_since(*refined_) == since && has_same_tree(*refined_, schema) &&
-         std::none_of(schema.edges.begin(), schema.edges.end(),
-                      [](const Edge& edge) { return edge.state == EdgeState::kInvalid; });
-}
-
-bool ModelMonitor::on_tick(std::int64_t now_us) {
-  if (!refinements_.on_tick(now_us)) return false;
-  is_assessed_ = false;
-  judge_waiting();
-  return true;
 }
 
 std::int64_t ModelMonitor::num_tests(std::int64_t last) const { return test_indices_.up_to(last); }

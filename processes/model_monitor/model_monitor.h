@@ -14,7 +14,10 @@
 #include "bodyschema/model_health_t.hpp"
 #include "bodyschema/sample_t.hpp"
 #include "common/bus/awaited_answer.h"
+#include "common/camera/lens.h"
+#include "common/camera/tag_sight.h"
 #include "common/config/refinement_schedule.h"
+#include "common/config/rig.h"
 #include "common/schema/body_schema.h"
 #include "common/schema/sample.h"
 #include "processes/model_monitor/health/baseline_youth.h"
@@ -22,6 +25,16 @@
 #include "processes/model_monitor/monitor_memory.h"
 
 namespace bodyschema {
+
+/// What the rig's files say of how tags are seen.
+struct TagView {
+  Markers markers;
+  Lens lens;
+  CornerNoise corner_noise;
+
+  /// @throws ConfigError.
+  static TagView load(const std::filesystem::path& rig_folder);
+};
 
 struct ModelMonitorConfig {
   double max_mahalanobis2 = 0;   ///< d² above which a TEST observation counts as refuting
@@ -32,6 +45,8 @@ struct ModelMonitorConfig {
   /// A refiner answers the complete proposals on the TEST samples of this RefinementSchedule; 0:
   /// there is none.
   std::int64_t refine_every = 0;
+  /// What refined schemas are judged by; none: they are not taken.
+  std::optional<TagView> view;
 
   /// Reads model_monitor.yaml and the noise.yaml beside it. @throws ConfigError.
   static ModelMonitorConfig load(const std::filesystem::path& file);
@@ -65,6 +80,11 @@ struct ModelMonitorConfig {
 /// A proposal that a refiner answers is judged once its answer is there, so that what moves the arm
 /// need not wait for both; a silent refiner is waited for half a minute, once. The actions that the
 /// answer wants are passed on as long as the body schema is of the same tree and body.
+///
+/// A refined schema takes the place of the proposal where it predicts the corners of the TEST
+/// samples better (is_likelier()): by the rig's own tags and lens, as all that is seen later is. So
+/// it does where those are as good as its own; else they must be adopted first. From then on, until
+/// the body changes, only what predicts these corners better still may replace it.
 ///
 /// Before the first accepted proposal nothing is published; when inputs stop, the last schema
 /// stands.
@@ -134,6 +154,7 @@ class ModelMonitor {
   /// Edges between the same parts, by the same signals.
   static bool has_same_tree(const BodySchema& a, const BodySchema& b);
   static constexpr std::size_t kMaxEvents = 32;  ///< told at once
+  static constexpr std::int64_t kRefinerTimeout_us = 30'000'000;
   /// What a sample shows of a part, unless it rests on tags that had moved.
   static const PartObservation* sighting(const ActionPoseSample& sample, int part,
                                          const std::vector<MovedTag>& moved);
@@ -160,6 +181,17 @@ class ModelMonitor {
   /// The wanted actions are of the same body.
   bool are_wanted_for(const BodySchema& schema) const;
   static std::int64_t body_since(const BodySchema& proposal);
+  /// The proposal, or the refiner's answer to it if that predicts corners better.
+  BodySchema better_one(BodySchema learned) const;
+  /// A refined schema stands against a proposal that shows no part that it lacks and does not
+  /// predict corners better.
+  bool is_defended(const BodySchema& refined, const BodySchema& proposal) const;
+  /// Those of the parts of both, in the TEST samples of the body of `schema`, up to `last`.
+  bool predicts_corners_better(const BodySchema& schema, const BodySchema& other,
+                               std::int64_t last) const;
+  /// −log likelihood of each TEST sample that shows tags.
+  std::vector<double> corner_costs(const BodySchema& schema, const BodySchema& other,
+                                   std::int64_t first, std::int64_t last) const;
   void set_base(Standing* standing, BodySchema base);
   void publish();
   void assess(const BodySchema& schema) const;
@@ -173,8 +205,9 @@ class ModelMonitor {
 
     std::int64_t up_to(std::int64_t judged_sample);
   };
-  mutable Tally test_indices_;            ///< of TEST samples
-  std::deque<ActionPoseSample> tests_;    ///< the newest
+  mutable Tally test_indices_;                            ///< of TEST samples
+  std::deque<ActionPoseSample> tests_;                    ///< the newest
+  std::map<std::int64_t, std::vector<TagSight>> sights_;  ///< of tests_, by index
   std::deque<ActionPoseSample> samples_;  ///< the newest, back to where anything may begin again
   mutable std::map<int, Tally> seen_in_;  ///< part → samples that show it
   std::int64_t last_sample_index_ = -1;

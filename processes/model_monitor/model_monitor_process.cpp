@@ -16,6 +16,7 @@ constexpr int kMostAtOnce = 100;
 ModelMonitorConfig load_config(const std::filesystem::path& file,
                                const std::filesystem::path& refiner_file) {
   ModelMonitorConfig config = ModelMonitorConfig::load(file);
+  config.view = TagView::load(file.parent_path());
   if (!refiner_file.empty()) config.refine_every = refine_every(Yaml::load(refiner_file));
   return config;
 }

@@ -1,7 +1,8 @@
 """refiner_group_test.py SOURCE BUILD: a group whose rig enables the refiner makes the actions that it wants, the same in every
 run, and proposes tags and lens; a replay makes the same schema of it, `adopt` writes them into the rig, and the next run begins
-with the refined schema."""
+and ends with the refined schema."""
 
+import json
 import os
 import shutil
 import struct
@@ -75,6 +76,8 @@ def main(work):
             raise Failed(f"{name} was not adopted")
 
     run(work, *learn, "--initial", first / "refined.lcmlog")
+    if not json.loads(run(work, "show", current / "schema.lcmlog", "--json"))["refined"]:
+        raise Failed("what the refiner had fitted did not stand against what was learned")
 
 
 if not (build / "bin" / "refiner").exists():

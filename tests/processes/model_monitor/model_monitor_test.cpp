@@ -861,6 +861,19 @@ TEST_F(ModelMonitorTest, AStuckJointIsFoundPublishedAtOnceAndWhatTheLearnerSaysL
   EXPECT_EQ(monitor.health().judged_sample, 44);
 }
 
+TEST_F(ModelMonitorTest, ARefinedSchemaThatChangedIsNoneAnyMore) {
+  break_last_joint(30);
+  body_schema_t refined = proposal(29);
+  refined.is_refined = 1;
+  ModelMonitor monitor(test_config());
+  monitor.start_from(refined);
+  for (std::int64_t i = 0; i < kNumSamples; ++i) {
+    monitor.on_sample(sample(i));
+    EXPECT_EQ(monitor.schema()->is_refined, monitor.schema()->num_changes > 0 ? 0 : 1) << i;
+  }
+  EXPECT_EQ(monitor.schema()->is_refined, 0);
+}
+
 TEST_F(ModelMonitorTest, WhatIsWrongOutlivesItsEventsANewBaseAndARestart) {
   const Edge broken = break_last_joint(30);
   const auto endless = [&](std::int64_t i) {
