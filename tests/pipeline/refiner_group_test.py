@@ -1,14 +1,16 @@
 """refiner_group_test.py SOURCE BUILD: a group whose rig enables the refiner makes the actions that it wants, the same in every
-run, and proposes tags and lens; a replay makes the same schema of it, `adopt` writes them into the rig, and the next run begins
-and ends with the refined schema."""
+run, also where it is killed, and proposes tags and lens; a replay makes the same schema of it, `adopt` writes them into the rig,
+and the next run begins and ends with the refined schema."""
 
 import json
 import os
 import shutil
+import signal
 import struct
 import subprocess
 import sys
 import tempfile
+import threading
 from pathlib import Path
 
 source, build = Path(sys.argv[1]), Path(sys.argv[2])
@@ -18,15 +20,35 @@ class Failed(Exception):
     pass
 
 
-def run(work, *words):
-    """./run with logs of its own; what it says."""
+def run(work, *words, beside=lambda ended: None):
+    """./run with logs of its own; what it says. `beside` runs at the same time, until the event."""
     environment = os.environ | {"BODYSCHEMA_BUILD": str(build), "BODYSCHEMA_LOGS": str(work / "logs")}
-    done = subprocess.run(
-        [source / "run", *map(str, words)], env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=250
-    )
+    ended = threading.Event()
+    thread = threading.Thread(target=beside, args=[ended])
+    thread.start()
+    try:
+        command = [source / "run", *map(str, words)]
+        done = subprocess.run(
+            command, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=250
+        )
+    finally:
+        ended.set()
+        thread.join()
     if done.returncode != 0:
         raise Failed(f"./run {' '.join(map(str, words))}: {done.stderr[-2000:]}")
     return done.stdout
+
+
+def kill_refiners(work, killed, ended):
+    """Those of this test's groups, a few times: the monitor does not wait for ever."""
+    while len(killed) < 5 and not ended.wait(2):
+        for process in Path("/proc").glob("[0-9]*"):
+            try:
+                if (process / "comm").read_text() == "refiner\n" and str(work) in (process / "cmdline").read_text():
+                    os.kill(int(process.name), signal.SIGKILL)
+                    killed.append(process.name)
+            except OSError:
+                pass  # it has ended
 
 
 def payloads(log, channel):
@@ -61,9 +83,10 @@ def main(work):
     if len(set(wanted)) != 10 or missed:
         raise Failed(f"of the wanted actions {wanted} these were not made once each: {missed}")
 
-    run(work, *learn)
-    if payloads(current / "samples.lcmlog", "SAMPLE") != samples:
-        raise Failed("another run of the same seed has other samples")
+    killed = []
+    run(work, *learn, beside=lambda ended: kill_refiners(work, killed, ended))
+    if not killed or payloads(current / "samples.lcmlog", "SAMPLE") != samples:
+        raise Failed(f"another run of the same seed, its refiner killed {len(killed)} times, has other samples")
 
     run(work, "--replay", first / "run.lcmlog.00")
     if (current / "refined.lcmlog").read_bytes() != refined:
