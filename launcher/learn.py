@@ -148,7 +148,8 @@ def replay(place, log, rig, speed):
     # Without an observer missing samples cannot be requested.
     flags = "" if "observer" in names else "--replayed"
     commands = pick(processes(place, folder), names)
-    with Session(place, run, lock, True, PRIVATE_BUS, PRIVATE_IMAGES, commands, SAMPLES_FLAGS=flags, **refiner_file(commands, run)) as session:
+    variables = {"SAMPLES_FLAGS": flags, **refiner_file(commands, run)}
+    with Session(place, run, lock, True, PRIVATE_BUS, PRIVATE_IMAGES, commands, **variables) as session:
         words = ["--replay", log, "--replay-from", source, "--speed", speed]
         # The recording would be played again.
         return session.watch(watch_command(place, run, rig, PRIVATE_IMAGES, commands, *words), may_restart=not is_played)
