@@ -24,6 +24,10 @@ struct OpenPair {
   LocalModel screws;
 };
 
+int count_independent(const PairData& data, const NormalizedActions& actions) {
+  return actions.blocks().count(data.frames, [](const PairFrame& f) { return f.sample; });
+}
+
 // The screws that leave least: rigid, the best joint or the best two.
 LocalModel best_screws(const PairData& pair, const NormalizedActions& actions, int max_signals,
                        SearchResult* counted) {
@@ -57,9 +61,7 @@ void rank_pairs(const std::vector<ActionPoseSample>& samples, const NormalizedAc
                 const SearchOptions& options, std::vector<OpenPair>* pairs, SearchResult* found) {
   for (OpenPair& o : *pairs) {
     const PairData data = make_pair_data(samples, o.i, o.j, options.measurement, kScreenFrames);
-    const int num_independent =
-        actions.blocks().count(data.frames, [](const PairFrame& f) { return f.sample; });
-    if (num_independent < kFewestSoftFrames) {
+    if (count_independent(data, actions) < kFewestSoftFrames) {
       o.cost = std::numeric_limits<double>::infinity();
       continue;
     }
@@ -89,6 +91,21 @@ std::optional<SoftFit> best_soft_fit(const OpenPair& open,
   return best;
 }
 
+// Log density a frame of what the screws leave, with the noise that suits them best.
+double density_of_screws(const OpenPair& open, const std::vector<ActionPoseSample>& samples,
+                         const NormalizedActions& actions, const SearchOptions& options) {
+  const PairData data = make_pair_data(samples, open.i, open.j, options.measurement, kMaxFrames);
+  const Fit screws = fit_local_model(open.screws, data, actions, 15, 1e-2);
+  return log_density_of_screws(screws, data, actions) / count_independent(data, actions);
+}
+
+// A process leaves far less than screws of such a density a frame.
+bool pays(const SoftFit& soft, int num_independent, double density_of_screws) {
+  // Three coordinates of position and three of rotation gain the log of what their deviations
+  // are smaller by.
+  return soft.log_density / num_independent > density_of_screws - 3 * std::log(kExplained);
+}
+
 // The noise of a stream is guessed or claimed: screws may pass where a process on other signals
 // leaves far less. Their models go, and the processes are candidates.
 void withdraw_screws(const std::vector<ActionPoseSample>& samples, const NormalizedActions& actions,
@@ -101,15 +118,10 @@ void withdraw_screws(const std::vector<ActionPoseSample>& samples, const Normali
     if (!soft || soft->verdict != Verdict::kValid) return false;
     const std::set<int> signals(soft->model.signals.begin(), soft->model.signals.end());
     if (signals == signal_set(m.model)) return false;
-    const PairData data =
-        make_pair_data(samples, m.part_i, m.part_j, options.measurement, kMaxFrames);
-    const Fit screws = fit_local_model(m.model, data, actions, 15, 1e-2);
-    const int num_independent =
-        actions.blocks().count(data.frames, [](const PairFrame& f) { return f.sample; });
-    // Three coordinates of position and three of rotation gain the log of what their deviations
-    // are smaller by.
-    if (soft->log_density <=
-        log_density_of_screws(screws, data, actions) - 3 * std::log(kExplained) * num_independent)
+    const int num_independent = count_independent(
+        make_pair_data(samples, m.part_i, m.part_j, options.measurement, kMaxFrames), actions);
+    const OpenPair open{0, m.part_i, m.part_j, m.model};
+    if (!pays(*soft, num_independent, density_of_screws(open, samples, actions, options)))
       return false;
     candidates->push_back({m.part_i, m.part_j, soft->model.screws, soft->score, soft->model.signals,
                            soft->doubtful_signals});
@@ -124,9 +136,10 @@ void withdraw_screws(const std::vector<ActionPoseSample>& samples, const Normali
 
 void connect_soft_parts(const std::vector<ActionPoseSample>& samples,
                         const NormalizedActions& actions, const std::vector<int>& parts,
-                        const SearchOptions& options, SearchResult* found) {
+                        const SearchOptions& options, bool is_noise_guessed, SearchResult* found) {
   const bool is_stream = actions.blocks().is_stream();
   std::vector<AcceptedModel> candidates;
+  std::set<std::pair<int, int>> contested;  // of the candidates, those that do not pay
   if (is_stream) withdraw_screws(samples, actions, options, found, &candidates);
   Components components(parts);
   for (const AcceptedModel& m : found->models) components.join(m.part_i, m.part_j);
@@ -144,20 +157,33 @@ void connect_soft_parts(const std::vector<ActionPoseSample>& samples,
     if (undecided.count(between)) continue;
     rank_pairs(samples, actions, options, &pairs, found);
     if (pairs.size() > kPairsTried) pairs.resize(kPairsTried);
+    // What the screws of the best pair leave may be a bias of which the guess knows nothing.
+    double density = -std::numeric_limits<double>::infinity();
+    for (const OpenPair& o : pairs)
+      if (is_noise_guessed && !is_stream && std::isfinite(o.cost))
+        density = std::max(density, density_of_screws(o, samples, actions, options));
     for (const OpenPair& o : pairs) {
       if (!std::isfinite(o.cost)) continue;
       const std::optional<SoftFit> best = best_soft_fit(o, samples, actions, options, found);
       if (!best || best->verdict != Verdict::kValid) continue;
+      const int num_independent = count_independent(
+          make_pair_data(samples, o.i, o.j, options.measurement, kMaxFrames), actions);
       candidates.push_back(
           {o.i, o.j, best->model.screws, best->score, best->model.signals, best->doubtful_signals});
+      if (pays(*best, num_independent, density)) continue;
+      contested.insert({o.i, o.j});
+      found->records[{o.i, o.j}].contested =
+          ContestedSignals{signal_set(o.screws), best->model.signals};
     }
   }
   std::stable_sort(candidates.begin(), candidates.end(), [](const auto& x, const auto& y) {
     return std::make_tuple(-x.score, x.part_i, x.part_j) <
            std::make_tuple(-y.score, y.part_i, y.part_j);
   });
+  // Screws may be all that is between two parts: a process on the way around them is none either.
   for (AcceptedModel& c : candidates)
-    if (components.join(c.part_i, c.part_j)) found->models.push_back(std::move(c));
+    if (components.join(c.part_i, c.part_j) && !contested.contains({c.part_i, c.part_j}))
+      found->models.push_back(std::move(c));
 }
 
 }  // namespace bodyschema
