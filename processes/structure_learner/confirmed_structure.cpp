@@ -139,7 +139,8 @@ LearnedStructure least_noise(LearnedStructure told, const FindStructure& find) {
     quieter = std::move(louder);
     if (is_guess && !is_explained && !may_be_louder(quieter)) break;
   }
-  return is_explained ? contested(std::move(told), quieter) : told;
+  const bool is_rival = is_explained || (is_guess && quieter.spans());
+  return is_rival ? contested(std::move(told), quieter) : told;
 }
 
 // At the least noise of the steps that spans, if one does.

@@ -67,19 +67,25 @@ std::optional<double> mean_square_motion(const Nodes& nodes, int a, int b, int s
   return sum / pair.size();
 }
 
-// How many signals move node b against node a.
-int num_joints_between(const Nodes& nodes, int a, int b, PairModels* pairs) {
+// How many signals beside this one move node b against node a.
+int num_others_between(const Nodes& nodes, int a, int b, int signal, PairModels* pairs) {
   int count = 0;
-  for (const int signal : pairs->actions().moving()) {
-    const auto moved = mean_square_motion(nodes, a, b, signal, pairs);
+  for (const int other : pairs->actions().moving()) {
+    if (other == signal) continue;
+    const auto moved = mean_square_motion(nodes, a, b, other, pairs);
     count += !moved || *moved >= kNoiseOfOneSight;
   }
   return count;
 }
 
-// A node whose edge to its parent has a joint that it does not need: an edge of fewer joints would
-// do, between the far ends of it and of another edge with that joint.
-std::optional<int> redundant_node(const Nodes& nodes, PairModels* pairs) {
+// A node whose edge to its parent has a joint that it does not need, for the parts at the far ends
+// of it and of another edge with that joint move with its signal by less than `least`: an edge of
+// fewer joints would do between these.
+struct Detour {
+  int node = 0, signal = 0;
+};
+template <typename Least>
+std::optional<Detour> find_detour(const Nodes& nodes, PairModels* pairs, Least&& least) {
   const int n = static_cast<int>(nodes.size());
   for (const int signal : pairs->actions().moving())
     for (int k = 1; k < n; ++k)
@@ -87,10 +93,10 @@ std::optional<int> redundant_node(const Nodes& nodes, PairModels* pairs) {
         if (!nodes[k].model.uses(signal) || !nodes[l].model.uses(signal)) continue;
         const int far = is_below(nodes, l, k) ? nodes[k].parent : k;
         const auto moved = mean_square_motion(nodes, far, l, signal, pairs);
-        if (!moved || *moved >= kNoiseOfOneSight) continue;
+        if (!moved || *moved >= least(signal)) continue;
         const int larger = nodes[k].model.num_joints() > nodes[l].model.num_joints() ? k : l;
-        if (num_joints_between(nodes, far, l, pairs) < nodes[larger].model.num_joints())
-          return larger;
+        if (num_others_between(nodes, far, l, signal, pairs) < nodes[larger].model.num_joints())
+          return Detour{larger, signal};
       }
   return std::nullopt;
 }
@@ -159,6 +165,15 @@ std::vector<Coupling> couplings(PairModels* pairs, const ModelForest& forest) {
       if (is_needless) pairs->record(m.part_i, m.part_j).is_redundant = true;
       result.push_back({m.part_i, m.part_j, signal, is_needless});
     }
+  for (const int part : forest.parts()) {
+    if (forest.component(part) != part) continue;
+    const ComponentTree tree(forest, part, pairs);
+    const auto detour = find_detour(tree.nodes(), pairs,
+                                    [&](int signal) { return kCoupling * largest.at(signal); });
+    if (!detour) continue;
+    const AcceptedModel& m = forest.models()[static_cast<std::size_t>(tree.model_of(detour->node))];
+    result.push_back({m.part_i, m.part_j, detour->signal});
+  }
   return result;
 }
 
@@ -169,7 +184,9 @@ std::vector<std::pair<int, int>> redundant_edges(PairModels* pairs, ModelForest 
     std::optional<int> model;
     if (forest.component(parts[p]) == parts[p]) {
       const ComponentTree tree(forest, parts[p], pairs);
-      if (const auto node = redundant_node(tree.nodes(), pairs)) model = tree.model_of(*node);
+      if (const auto detour =
+              find_detour(tree.nodes(), pairs, [](int /*signal*/) { return kNoiseOfOneSight; }))
+        model = tree.model_of(detour->node);
     }
     if (!model) {
       ++p;

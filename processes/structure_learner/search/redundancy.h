@@ -25,8 +25,9 @@ struct Coupling {
   bool is_needless = false;  ///< adds less than the noise of one sight
   friend auto operator<=>(const Coupling&, const Coupling&) = default;
 };
-/// In the order of the forest's models. One fit for each joint of a signal with several, else
-/// O(E N). The records of edges with needless ones say so.
+/// In the order of the forest's models; then of each tree one joint that an edge on another way
+/// between parts would not have, for these move as little. One fit for each joint of a signal with
+/// several, else O(E² N). The records of edges with needless ones say so.
 std::vector<Coupling> couplings(PairModels* pairs, const ModelForest& forest);
 
 }  // namespace bodyschema
