@@ -4,6 +4,7 @@
 #include <cmath>
 #include <limits>
 #include <map>
+#include <optional>
 #include <set>
 #include <tuple>
 
@@ -26,6 +27,12 @@ struct OpenPair {
 
 int count_independent(const PairData& data, const NormalizedActions& actions) {
   return actions.blocks().count(data.frames, [](const PairFrame& f) { return f.sample; });
+}
+
+int count_independent(const OpenPair& open, const std::vector<ActionPoseSample>& samples,
+                      const NormalizedActions& actions, const SearchOptions& options) {
+  return count_independent(make_pair_data(samples, open.i, open.j, options.measurement, kMaxFrames),
+                           actions);
 }
 
 // The screws that leave least: rigid, the best joint or the best two.
@@ -99,11 +106,45 @@ double density_of_screws(const OpenPair& open, const std::vector<ActionPoseSampl
   return log_density_of_screws(screws, data, actions) / count_independent(data, actions);
 }
 
+// Three coordinates of position and three of rotation gain the log of what their deviations are
+// smaller by where these are at most kExplained of others.
+const double kFarLess = -3 * std::log(kExplained);
+
 // A process leaves far less than screws of such a density a frame.
 bool pays(const SoftFit& soft, int num_independent, double density_of_screws) {
-  // Three coordinates of position and three of rotation gain the log of what their deviations
-  // are smaller by.
-  return soft.log_density / num_independent > density_of_screws - 3 * std::log(kExplained);
+  return soft.log_density / num_independent > density_of_screws + kFarLess;
+}
+
+// Of two components: the largest density, and the signals of the fewest joints that leave not far
+// more. A guess of the noise does not know how large a bias is: all that they leave may be one.
+struct PlausibleScrews {
+  double density = -std::numeric_limits<double>::infinity();
+  std::set<int> signals = {};
+};
+PlausibleScrews plausible_screws(const std::vector<OpenPair>& pairs,
+                                 const std::vector<ActionPoseSample>& samples,
+                                 const NormalizedActions& actions, const SearchOptions& options,
+                                 SearchResult* counted) {
+  PlausibleScrews result;
+  std::vector<std::pair<double, LocalModel>> judged;
+  const auto judge = [&](const OpenPair& o) {
+    judged.emplace_back(density_of_screws(o, samples, actions, options), o.screws);
+    result.density = std::max(result.density, judged.back().first);
+  };
+  for (const OpenPair& o : pairs) {
+    if (!std::isfinite(o.cost)) continue;
+    judge(o);
+    const PairData data = make_pair_data(samples, o.i, o.j, options.measurement, kScreenFrames);
+    for (int k = 0; k < o.screws.num_joints(); ++k)
+      judge({0, o.i, o.j, best_screws(data, actions, k, counted)});
+  }
+  const LocalModel* sparsest = nullptr;
+  for (const auto& [density, screws] : judged)
+    if (density + kFarLess >= result.density &&
+        (!sparsest || screws.num_joints() < sparsest->num_joints()))
+      sparsest = &screws;
+  if (sparsest) result.signals = signal_set(*sparsest);
+  return result;
 }
 
 // The noise of a stream is guessed or claimed: screws may pass where a process on other signals
@@ -118,10 +159,9 @@ void withdraw_screws(const std::vector<ActionPoseSample>& samples, const Normali
     if (!soft || soft->verdict != Verdict::kValid) return false;
     const std::set<int> signals(soft->model.signals.begin(), soft->model.signals.end());
     if (signals == signal_set(m.model)) return false;
-    const int num_independent = count_independent(
-        make_pair_data(samples, m.part_i, m.part_j, options.measurement, kMaxFrames), actions);
     const OpenPair open{0, m.part_i, m.part_j, m.model};
-    if (!pays(*soft, num_independent, density_of_screws(open, samples, actions, options)))
+    if (!pays(*soft, count_independent(open, samples, actions, options),
+              density_of_screws(open, samples, actions, options)))
       return false;
     candidates->push_back({m.part_i, m.part_j, soft->model.screws, soft->score, soft->model.signals,
                            soft->doubtful_signals});
@@ -140,6 +180,8 @@ void connect_soft_parts(const std::vector<ActionPoseSample>& samples,
   const bool is_stream = actions.blocks().is_stream();
   std::vector<AcceptedModel> candidates;
   std::set<std::pair<int, int>> contested;  // of the candidates, those that do not pay
+  // Of each candidate, how many signals suffice: fewer first, as in the search.
+  std::map<std::pair<int, int>, std::size_t> num_needed;
   if (is_stream) withdraw_screws(samples, actions, options, found, &candidates);
   Components components(parts);
   for (const AcceptedModel& m : found->models) components.join(m.part_i, m.part_j);
@@ -157,29 +199,40 @@ void connect_soft_parts(const std::vector<ActionPoseSample>& samples,
     if (undecided.count(between)) continue;
     rank_pairs(samples, actions, options, &pairs, found);
     if (pairs.size() > kPairsTried) pairs.resize(kPairsTried);
-    // What the screws of the best pair leave may be a bias of which the guess knows nothing.
-    double density = -std::numeric_limits<double>::infinity();
-    for (const OpenPair& o : pairs)
-      if (is_noise_guessed && !is_stream && std::isfinite(o.cost))
-        density = std::max(density, density_of_screws(o, samples, actions, options));
+    std::optional<PlausibleScrews> plausible;
+    if (is_noise_guessed && !is_stream)
+      plausible = plausible_screws(pairs, samples, actions, options, found);
+    std::vector<AcceptedModel> paying, others;
     for (const OpenPair& o : pairs) {
       if (!std::isfinite(o.cost)) continue;
       const std::optional<SoftFit> best = best_soft_fit(o, samples, actions, options, found);
       if (!best || best->verdict != Verdict::kValid) continue;
-      const int num_independent = count_independent(
-          make_pair_data(samples, o.i, o.j, options.measurement, kMaxFrames), actions);
-      candidates.push_back(
-          {o.i, o.j, best->model.screws, best->score, best->model.signals, best->doubtful_signals});
-      if (pays(*best, num_independent, density)) continue;
-      contested.insert({o.i, o.j});
-      found->records[{o.i, o.j}].contested =
-          ContestedSignals{signal_set(o.screws), best->model.signals};
+      const std::set<int> signals(best->model.signals.begin(), best->model.signals.end());
+      const bool is_other =
+          plausible && signals != plausible->signals &&
+          !pays(*best, count_independent(o, samples, actions, options), plausible->density);
+      (is_other ? others : paying)
+          .push_back({o.i, o.j, best->model.screws, best->score, best->model.signals,
+                      best->doubtful_signals});
+    }
+    if (paying.empty())
+      for (const AcceptedModel& c : others) {
+        contested.insert({c.part_i, c.part_j});
+        found->records[{c.part_i, c.part_j}].contested =
+            ContestedSignals{plausible->signals, c.soft_signals};
+      }
+    for (AcceptedModel& c : paying.empty() ? others : paying) {
+      if (plausible)
+        num_needed[{c.part_i, c.part_j}] =
+            paying.empty() ? plausible->signals.size() : c.soft_signals.size();
+      candidates.push_back(std::move(c));
     }
   }
-  std::stable_sort(candidates.begin(), candidates.end(), [](const auto& x, const auto& y) {
-    return std::make_tuple(-x.score, x.part_i, x.part_j) <
-           std::make_tuple(-y.score, y.part_i, y.part_j);
-  });
+  const auto rank = [&](const AcceptedModel& c) {
+    return std::tuple(num_needed[{c.part_i, c.part_j}], -c.score, c.part_i, c.part_j);
+  };
+  std::stable_sort(candidates.begin(), candidates.end(),
+                   [&](const auto& x, const auto& y) { return rank(x) < rank(y); });
   // Screws may be all that is between two parts: a process on the way around them is none either.
   for (AcceptedModel& c : candidates)
     if (components.join(c.part_i, c.part_j) && !contested.contains({c.part_i, c.part_j}))
