@@ -362,6 +362,6 @@ WORDS = {
 # Words of the console, whose own help says more.
 CONSOLE_WORDS = {
     "halt": ("", "stop the arm at once, until ./run resume"),
-    "target|where|hold|release|fault": ("…", "steer or break the group's arm"),
+    "target|follow|where|hold|release|fault": ("…", "steer or break the group's arm"),
     "WORD…": ("", "bodyschema WORD…: learn, predict, show, reach, log, monitor, refine, adopt, engineer, urdf"),
 }

@@ -35,6 +35,11 @@ def processes(place, folder):
     return commands
 
 
+def refiner_file(commands, run):
+    """What the monitor of a group with a refiner needs."""
+    return {"REFINER": str(run / "config" / "refiner.yaml")} if "refiner" in commands else {}
+
+
 def pick(commands, names):
     return {name: command for name, command in commands.items() if name in names}
 
@@ -88,6 +93,7 @@ def learn(place, options):
         "SIMULATOR_FLAGS": shlex.join(["--seed", options.seed, *hide, *ideal]),
         "CAMERA_FLAGS": shlex.join(ideal),
         "BABBLER_FLAGS": shlex.join(["--seed", options.seed, *samples]),
+        **refiner_file(commands, run),
     }
     if options.initial:
         variables["INITIAL"] = str(run / "initial.lcmlog")
@@ -142,7 +148,8 @@ def replay(place, log, rig, speed):
     # Without an observer missing samples cannot be requested.
     flags = "" if "observer" in names else "--replayed"
     commands = pick(processes(place, folder), names)
-    with Session(place, run, lock, True, PRIVATE_BUS, PRIVATE_IMAGES, commands, SAMPLES_FLAGS=flags) as session:
+    variables = {"SAMPLES_FLAGS": flags, **refiner_file(commands, run)}
+    with Session(place, run, lock, True, PRIVATE_BUS, PRIVATE_IMAGES, commands, **variables) as session:
         words = ["--replay", log, "--replay-from", source, "--speed", speed]
         # The recording would be played again.
         return session.watch(watch_command(place, run, rig, PRIVATE_IMAGES, commands, *words), may_restart=not is_played)

@@ -5,9 +5,9 @@
 namespace bodyschema {
 
 /// Waits for another process' answers to numbered questions, as learner and monitor do for each
-/// other's in a replay, where nobody else waits for them. After a timeout it no longer waits, until
-/// an answer is heard again. Answers come in order: one to a later question answers all before
-/// it.
+/// other's in a replay, where nobody else waits for them, and the monitor always for the refiner's.
+/// After a timeout it no longer waits, until an answer is heard again. Answers come in order: one
+/// to a later question answers all before it.
 class AwaitedAnswer {
  public:
   AwaitedAnswer(bool is_awaited, std::int64_t timeout_us)

@@ -389,6 +389,9 @@ void check_together(Checker& check, const body_schema_t& m) {
     check.require(tag.moved_found_sample >= previous, "moved_found_sample", "descends");
     previous = tag.moved_found_sample;
   });
+  check.each("wanted_actions", m.wanted_actions, [&](const wanted_action_t& wanted) {
+    check.require(wanted.num_signals == m.num_signals, "num_signals", "is not that of the schema");
+  });
 }
 
 void check_together(Checker& check, const change_size_t& m) {
@@ -401,6 +404,8 @@ void check_together(Checker& check, const change_size_t& m) {
 void check_together(Checker& check, const model_health_t& m) {
   check.require(m.probe_sample < 0 || m.num_probe > 0, "probe_sample",
                 "wants a probe without an action");
+  check.require((m.wanted_sample >= 0) == (m.num_wanted > 0), "wanted_sample",
+                "does not go with num_wanted");
 }
 
 void check_together(Checker& check, const sample_request_t& m) {

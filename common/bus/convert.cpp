@@ -315,6 +315,7 @@ body_schema_t to_message(const BodySchema& schema) {
   message.calibration_id = schema.calibration_id;
   message.num_samples_seen = schema.num_samples;
   message.is_complete = schema.complete ? 1 : 0;
+  message.is_refined = schema.refined ? 1 : 0;
   set_array(message.num_parts, message.part_ids,
             std::vector<std::int32_t>(schema.parts.begin(), schema.parts.end()));
   set_array(message.num_position_parts, message.position_parts,
@@ -382,6 +383,7 @@ BodySchema from_message(const body_schema_t& message) {
   schema.calibration_id = message.calibration_id;
   schema.num_samples = message.num_samples_seen;
   schema.complete = message.is_complete == 1;
+  schema.refined = message.is_refined == 1;
   schema.parts.assign(message.part_ids.begin(), message.part_ids.end());
   schema.position_parts.assign(message.position_parts.begin(), message.position_parts.end());
   schema.root = message.root_part;

@@ -176,6 +176,7 @@ body_schema_t RigDoor::load_initial_schema(const std::filesystem::path& file) co
   std::vector<body_schema_t> schemas = read_log(file, kBodySchema);
   if (schemas.empty()) throw std::runtime_error(file.string() + ": no BODY_SCHEMA in the file");
   body_schema_t schema = std::move(schemas.back());
+  set_array(schema.num_wanted, schema.wanted_actions, {});  // of a refined schema
   if (schema.signals.size() == signals_.signals.size()) {
     for (std::size_t s = 0; s < schema.signals.size(); ++s) {
       if (!schema.signals[s].warp_weights.empty()) continue;

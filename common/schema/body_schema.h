@@ -163,6 +163,7 @@ struct BodySchema {
   std::int64_t calibration_id = 0;
   int num_samples = 0;  ///< samples used
   bool complete = false;
+  bool refined = false;    ///< fitted by the refiner
   std::vector<int> parts;  ///< observed parts, ascending
   /// Those of which positions alone are known, ascending: leaves, whose frames' rotation is
   /// nobody's measurement but turned as their last joint's.

@@ -44,8 +44,8 @@ Eigen::MatrixXd pose_jacobian(const KinematicPath& path, const Eigen::VectorXd& 
 /// Buss 2004) of |Δp|² + (w Δφ)², w = metres_per_radian, in signals scaled by their ranges, the
 /// damping governed as Levenberg and Marquardt do, so that it grows where a singularity lets no
 /// step succeed. A signal at its limit leaves the active set while the step would push it outwards.
-/// Tried from `current`, then from starts ever farther from it, until one converges; start n is the
-/// same in every run. With `avoided` the solution is another than those: at least a tenth of one
+/// Tried from `current`, then from starts ever farther from it, then from the best of 1000 actions
+/// over the ranges, until one converges; start n is the same in every run. With `avoided` the solution is another than those: at least a tenth of one
 /// signal's range away from each. If none converges, the nearest approach; if all are avoided,
 /// `current` with an infinite error.
 ///

@@ -282,9 +282,11 @@ void LiveSchema::update(const ActionPoseSample& sample, std::optional<std::int64
   }
   // What edges have in common holds of those that were fitted together.
   next.frame_covariances = base_.frame_covariances;
+  next.refined = base_.refined && next.X_CR.matrix() == base_.X_CR.matrix();
   if (next.X_CR.matrix() != base_.X_CR.matrix()) next.frame_covariances.erase(next.root);
   for (std::size_t e = 0; e < next.edges.size(); ++e) {
     if (is_same_model(next.edges[e], base_.edges[e])) continue;
+    next.refined = false;
     next.frame_covariances.erase(next.edges[e].from);
     next.frame_covariances.erase(next.edges[e].to);
   }

@@ -1,4 +1,5 @@
-// model_monitor: SAMPLE, LEARNED_SCHEMA -> BODY_SCHEMA, MODEL_HEALTH, SAMPLE_REQUEST
+// model_monitor: SAMPLE, LEARNED_SCHEMA, REFINED_SCHEMA
+//                -> BODY_SCHEMA, MODEL_HEALTH, SAMPLE_REQUEST
 
 #include "processes/model_monitor/model_monitor_process.h"
 

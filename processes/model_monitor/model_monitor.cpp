@@ -7,7 +7,8 @@
 #include <utility>
 
 #include "common/bus/convert.h"
-#include "common/config/rig.h"
+#include "common/camera/calibrated_lens.h"
+#include "common/config/calibration_id.h"
 #include "common/config/yaml.h"
 #include "common/estimation/quantile.h"
 #include "common/geometry/angle.h"
@@ -32,6 +33,14 @@ double median_or_none(std::vector<double> values) {
 
 }  // namespace
 
+TagView TagView::load(const std::filesystem::path& rig_folder) {
+  const RigCalibration calibration = load_calibration(rig_folder);
+  const RigNoise noise = load_noise(rig_folder);
+  return {calibration.markers,
+          lens_of(calibration.camera),
+          {noise.corner_noise_px, noise.small_tag_noise_px}};
+}
+
 ModelMonitorConfig ModelMonitorConfig::load(const std::filesystem::path& file) {
   const Yaml yaml = Yaml::load(file);
   ModelMonitorConfig config;
@@ -43,7 +52,10 @@ ModelMonitorConfig ModelMonitorConfig::load(const std::filesystem::path& file) {
   return config;
 }
 
-ModelMonitor::ModelMonitor(ModelMonitorConfig config) : config_(config) {
+ModelMonitor::ModelMonitor(ModelMonitorConfig config)
+    : config_(config),
+      schedule_(config.refine_every),
+      refinements_(config.refine_every > 0, kRefinerTimeout_us) {
   options_.measurement = config_.measurement;
   options_.least_noise_scale = 1;
   if (config_.false_alarm_rate > 0) options_.false_alarm_rate = config_.false_alarm_rate;
@@ -51,7 +63,7 @@ ModelMonitor::ModelMonitor(ModelMonitorConfig config) : config_(config) {
     health->judged_sample = -1;
     health->worst_position_m = health->worst_rotation_rad = -1;
     health->noise_scale = -1;
-    health->probe_sample = -1;
+    health->probe_sample = health->awaited_refinement = health->wanted_sample = -1;
   }
 }
 
@@ -140,8 +152,13 @@ bool ModelMonitor::on_sample(const sample_t& message) {
   ActionPoseSample sample = from_message(message);
   if (sample.purpose == Purpose::kTest) {
     test_indices_.later.push_back(sample.sample_index);
+    if (schedule_.is_due(sample.sample_index)) due_.insert(sample.sample_index);
     tests_.push_back(sample);
-    if (tests_.size() > 2 * kTests) tests_.pop_front();
+    if (config_.view) sights_.emplace(sample.sample_index, tag_sights(message));
+    if (tests_.size() > 2 * kTests) {
+      sights_.erase(tests_.front().sample_index);
+      tests_.pop_front();
+    }
   }
   samples_.push_back(std::move(sample));
   is_assessed_ = false;
@@ -160,25 +177,31 @@ bool ModelMonitor::on_sample(const sample_t& message) {
   if (samples_.back().purpose == Purpose::kTest) keep(now_);
   publish();
 
-  bool is_judged = false;
-  while (!waiting_.empty() && waiting_.begin()->first <= last_sample_index_) {
-    is_judged |= on_learned_schema(waiting_.extract(waiting_.begin()).mapped());
-  }
+  const bool is_judged = judge_waiting();
   return is_judged || now_.num_events != num_events ||
          (schema_message_ && schema_message_->schema_version != version);
 }
 
 bool ModelMonitor::on_learned_schema(const body_schema_t& proposal) {
-  if (proposal.last_sample_index > last_sample_index_) {
-    // Those that will be judged first are kept: a proposal from nowhere cannot displace them.
-    waiting_.insert_or_assign(proposal.last_sample_index, proposal);
-    if (waiting_.size() > kMaxWaiting) waiting_.erase(std::prev(waiting_.end()));
-    return false;
-  }
   if (proposal.last_sample_index <= judged_sample_) return false;
-  if (!is_test(proposal.last_sample_index)) return false;
-  judge(proposal);
-  return true;
+  waiting_.insert_or_assign(proposal.last_sample_index, proposal);
+  // Those that will be judged first are kept: a proposal from nowhere cannot displace them.
+  if (waiting_.size() > kMaxWaiting) waiting_.erase(std::prev(waiting_.end()));
+  return judge_waiting();
+}
+
+bool ModelMonitor::judge_waiting() {
+  bool is_judged = false;
+  while (!waiting_.empty() && waiting_.begin()->first <= last_sample_index_ &&
+         !waits_for_refiner(waiting_.begin()->second)) {
+    const body_schema_t proposal = waiting_.extract(waiting_.begin()).mapped();
+    if (proposal.last_sample_index <= judged_sample_ || !is_test(proposal.last_sample_index))
+      continue;
+    judge(proposal);
+    due_.erase(due_.begin(), due_.upper_bound(judged_sample_));
+    is_judged = true;
+  }
+  return is_judged;
 }
 
 std::int64_t ModelMonitor::num_tests(std::int64_t last) const { return test_indices_.up_to(last); }
@@ -328,6 +351,11 @@ const model_health_t& ModelMonitor::health() const {
   const BodySchema* schema = now_.schema();
   health_.utime = judged_utime_;
   health_.judged_sample = judged_sample_;
+  health_.awaited_refinement = awaited_refinement();
+  const bool are_wanted = schema && are_wanted_for(*schema);
+  health_.wanted_sample = are_wanted ? refined_->last_sample_index : -1;
+  set_array(health_.num_wanted, health_.wanted_actions,
+            are_wanted ? wanted_ : std::vector<wanted_action_t>());
   if (judged_sample_ < 0 && !now_.live) return health_;
   assess(schema ? *schema : BodySchema());
   if (!now_.live) return health_;

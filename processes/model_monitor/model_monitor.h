@@ -6,12 +6,18 @@
 #include <map>
 #include <memory>
 #include <optional>
+#include <set>
 #include <string>
 #include <vector>
 
 #include "bodyschema/body_schema_t.hpp"
 #include "bodyschema/model_health_t.hpp"
 #include "bodyschema/sample_t.hpp"
+#include "common/bus/awaited_answer.h"
+#include "common/camera/lens.h"
+#include "common/camera/tag_sight.h"
+#include "common/config/refinement_schedule.h"
+#include "common/config/rig.h"
 #include "common/schema/body_schema.h"
 #include "common/schema/sample.h"
 #include "processes/model_monitor/health/baseline_youth.h"
@@ -20,12 +26,27 @@
 
 namespace bodyschema {
 
+/// What the rig's files say of how tags are seen.
+struct TagView {
+  Markers markers;
+  Lens lens;
+  CornerNoise corner_noise;
+
+  /// @throws ConfigError.
+  static TagView load(const std::filesystem::path& rig_folder);
+};
+
 struct ModelMonitorConfig {
   double max_mahalanobis2 = 0;   ///< d² above which a TEST observation counts as refuting
   double max_outlier_share = 0;  ///< an edge is refuted if more than this share of its tests refute
   MeasurementModel measurement;  ///< of noise.yaml
   /// Wished false alarms a sample once a complete schema stands; 0: nothing is adapted.
   double false_alarm_rate = 1e-5;
+  /// A refiner answers the complete proposals on the TEST samples of this RefinementSchedule; 0:
+  /// there is none.
+  std::int64_t refine_every = 0;
+  /// What refined schemas are judged by; none: they are not taken.
+  std::optional<TagView> view;
 
   /// Reads model_monitor.yaml and the noise.yaml beside it. @throws ConfigError.
   static ModelMonitorConfig load(const std::filesystem::path& file);
@@ -56,6 +77,15 @@ struct ModelMonitorConfig {
 /// however fast the learner is; only what was published for t+1..n in between was provisional.
 /// Version n+1 changed last at sample n.
 ///
+/// A proposal that a refiner answers is judged once its answer is there, so that what moves the arm
+/// need not wait for both; a silent refiner is waited for half a minute, once. The actions that the
+/// answer wants are passed on as long as the body schema is of the same tree and body.
+///
+/// A refined schema takes the place of the proposal where it predicts the corners of the TEST
+/// samples better (is_likelier()): by the rig's own tags and lens, as all that is seen later is. So
+/// it does where those are as good as its own; else they must be adopted first. From then on, until
+/// the body changes, only what predicts these corners better still may replace it.
+///
 /// Before the first accepted proposal nothing is published; when inputs stop, the last schema
 /// stands.
 class ModelMonitor {
@@ -73,6 +103,14 @@ class ModelMonitor {
   bool on_sample(const sample_t& sample);
   /// Returns true if the proposal was judged: only those whose last sample is a TEST sample are.
   bool on_learned_schema(const body_schema_t& proposal);
+  /// The refiner's answer to a proposal. Returns true if schema() or health() may have changed.
+  bool on_refined_schema(const body_schema_t& refined);
+  /// `now_us`: the clock. Returns true if a silent refiner is given up.
+  bool on_tick(std::int64_t now_us);
+  /// Last sample of the proposal that waits for the refiner; −1: none does.
+  std::int64_t awaited_refinement() const {
+    return refinements_.is_waiting() ? refinements_.question() : -1;
+  }
 
   /// The body schema; std::nullopt before the first.
   const std::optional<body_schema_t>& schema() const { return schema_message_; }
@@ -116,6 +154,7 @@ class ModelMonitor {
   /// Edges between the same parts, by the same signals.
   static bool has_same_tree(const BodySchema& a, const BodySchema& b);
   static constexpr std::size_t kMaxEvents = 32;  ///< told at once
+  static constexpr std::int64_t kRefinerTimeout_us = 30'000'000;
   /// What a sample shows of a part, unless it rests on tags that had moved.
   static const PartObservation* sighting(const ActionPoseSample& sample, int part,
                                          const std::vector<MovedTag>& moved);
@@ -136,6 +175,23 @@ class ModelMonitor {
   /// than what stands.
   bool is_passed_over(const BodySchema& proposal, const Standing& standing) const;
   void judge(const body_schema_t& proposal);
+  /// Those whose samples, and whose refinement, are there. Returns true if there were any.
+  bool judge_waiting();
+  bool waits_for_refiner(const body_schema_t& proposal);
+  /// The wanted actions are of the same body.
+  bool are_wanted_for(const BodySchema& schema) const;
+  static std::int64_t body_since(const BodySchema& proposal);
+  /// The proposal, or the refiner's answer to it if that predicts corners better.
+  BodySchema better_one(BodySchema learned) const;
+  /// A refined schema stands against a proposal that shows no part that it lacks and does not
+  /// predict corners better.
+  bool is_defended(const BodySchema& refined, const BodySchema& proposal) const;
+  /// Those of the parts of both, in the TEST samples of the body of `schema`, up to `last`.
+  bool predicts_corners_better(const BodySchema& schema, const BodySchema& other,
+                               std::int64_t last) const;
+  /// −log likelihood of each TEST sample that shows tags.
+  std::vector<double> corner_costs(const BodySchema& schema, const BodySchema& other,
+                                   std::int64_t first, std::int64_t last) const;
   void set_base(Standing* standing, BodySchema base);
   void publish();
   void assess(const BodySchema& schema) const;
@@ -149,16 +205,22 @@ class ModelMonitor {
 
     std::int64_t up_to(std::int64_t judged_sample);
   };
-  mutable Tally test_indices_;            ///< of TEST samples
-  std::deque<ActionPoseSample> tests_;    ///< the newest
+  mutable Tally test_indices_;                            ///< of TEST samples
+  std::deque<ActionPoseSample> tests_;                    ///< the newest
+  std::map<std::int64_t, std::vector<TagSight>> sights_;  ///< of tests_, by index
   std::deque<ActionPoseSample> samples_;  ///< the newest, back to where anything may begin again
   mutable std::map<int, Tally> seen_in_;  ///< part → samples that show it
   std::int64_t last_sample_index_ = -1;
   std::int64_t judged_sample_ = -1;
   std::int64_t judged_utime_ = 0;
   std::int64_t restored_sample_ = -1;  ///< where what was restored begins
-  /// Proposals that are ahead of the samples heard here, by their last sample.
+  /// Proposals that are ahead of the samples heard here or of the refiner, by their last sample.
   std::map<std::int64_t, body_schema_t> waiting_;
+  RefinementSchedule schedule_;
+  std::set<std::int64_t> due_;  ///< samples whose complete proposals the refiner answers
+  AwaitedAnswer refinements_;
+  std::optional<BodySchema> refined_;  ///< the newest answer
+  std::vector<wanted_action_t> wanted_;
   Standing now_;
   /// After TEST samples: the newest judged one and those that wait for a verdict.
   std::map<std::int64_t, Standing> kept_;

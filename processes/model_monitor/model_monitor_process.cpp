@@ -5,11 +5,21 @@
 #include <stdexcept>
 #include <utility>
 
+#include "common/config/yaml.h"
+
 namespace bodyschema {
 namespace {
 
 constexpr std::int64_t kProposalTimeout_us = 30'000'000;
 constexpr int kMostAtOnce = 100;
+
+ModelMonitorConfig load_config(const std::filesystem::path& file,
+                               const std::filesystem::path& refiner_file) {
+  ModelMonitorConfig config = ModelMonitorConfig::load(file);
+  config.view = TagView::load(file.parent_path());
+  if (!refiner_file.empty()) config.refine_every = refine_every(Yaml::load(refiner_file));
+  return config;
+}
 
 /// "" where there is no file.
 std::filesystem::path beside(const std::filesystem::path& file, const char* name) {
@@ -25,6 +35,9 @@ void ModelMonitorProcess::Options::add_to(Arguments app) {
   app.add_option("--initial", initial_file,
                  "Body schema to begin with where none is kept: engineered, learned, another run's")
       .existing_file();
+  app.add_option("--refiner", refiner_file,
+                 "refiner.yaml of a refiner on the bus: what it answers is awaited")
+      .existing_file();
 }
 
 ModelMonitorProcess::ModelMonitorProcess(Process& process, const Options& options)
@@ -32,7 +45,7 @@ ModelMonitorProcess::ModelMonitorProcess(Process& process, const Options& option
       door_(process.rig_folder()),
       schema_file_(options.schema_file),
       history_file_(beside(schema_file_, "history.lcmlog")),
-      monitor_(ModelMonitorConfig::load(process.config_file())),
+      monitor_(load_config(process.config_file(), options.refiner_file)),
       saved_schema_(schema_file_, kBodySchema),
       saved_memory_(history_file_),
       trail_(restore(options)),
@@ -51,6 +64,9 @@ ModelMonitorProcess::ModelMonitorProcess(Process& process, const Options& option
   });
   door_.subscribe(process, kLearnedSchema,
                   [this](const body_schema_t& proposal) { on_learned_schema(proposal); });
+  if (!options.refiner_file.empty())
+    process.bus().subscribe(kRefinedSchema,
+                            [this](const body_schema_t& refined) { on_refined_schema(refined); });
   process.on_tick([this](std::int64_t now_us) { on_tick(now_us); });
   process.on_idle([this] { say(); });
 }
@@ -85,11 +101,24 @@ void ModelMonitorProcess::on_learned_schema(const body_schema_t& proposal) {
   publish_news();
 }
 
+void ModelMonitorProcess::on_refined_schema(const body_schema_t& refined) {
+  body_schema_t ours = refined;
+  ours.calibration_id = 0;  // it has tags and lens of its own
+  if (!door_.lets_in(process_, kRefinedSchema, ours)) return;
+  is_news_ |= monitor_.on_refined_schema(refined);
+  publish_news();
+}
+
 void ModelMonitorProcess::on_tick(std::int64_t now_us) {
   intake_.on_tick(now_us);
   if (proposals_.on_tick(now_us))
     spdlog::warn("no proposal of structure_learner on sample {}: goes on without",
                  proposals_.question());
+  const std::int64_t awaited = monitor_.awaited_refinement();
+  if (monitor_.on_tick(now_us)) {
+    spdlog::warn("no REFINED_SCHEMA of sample {}: goes on without", awaited);
+    is_news_ = true;
+  }
   go_on();
   publish_news();
   process_.set_counters(intake_.counters());
@@ -150,7 +179,11 @@ void ModelMonitorProcess::say() {
     process_.set_activity(process_info_t::PHASE_WORKING,
                           "schema version " + std::to_string(monitor_.health().schema_version) +
                               ", judged up to sample " +
-                              std::to_string(monitor_.health().judged_sample));
+                              std::to_string(monitor_.health().judged_sample) +
+                              (monitor_.awaited_refinement() < 0
+                                   ? ""
+                                   : ", waiting for REFINED_SCHEMA of sample " +
+                                         std::to_string(monitor_.awaited_refinement())));
   }
 }
 

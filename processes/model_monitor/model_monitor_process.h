@@ -21,7 +21,7 @@ namespace bodyschema {
 class ModelMonitorProcess {
  public:
   struct Options : SampleIntake::Options {
-    std::filesystem::path schema_file, initial_file;
+    std::filesystem::path schema_file, initial_file, refiner_file;
     void add_to(Arguments app);
   };
   ModelMonitorProcess(Process& process, const Options& options);
@@ -31,6 +31,7 @@ class ModelMonitorProcess {
   /// Restores monitor_. Returns the trail of the samples that it rests on.
   SampleTrail restore(const Options& options);
   void on_learned_schema(const body_schema_t& proposal);
+  void on_refined_schema(const body_schema_t& refined);
   void on_tick(std::int64_t now_us);
   /// Judges waiting samples.
   void go_on();

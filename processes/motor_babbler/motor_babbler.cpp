@@ -107,8 +107,9 @@ std::vector<Eigen::VectorXd> candidate_actions(const MotorBabblerConfig& config,
 MotorBabbler::MotorBabbler(MotorBabblerConfig config, std::int64_t seed)
     : config_(std::move(config)),
       seed_(seed),
-      single_joint_moves_(config_.signals, config_.single_joint_share) {
-  health_.judged_sample = -1;
+      single_joint_moves_(config_.signals, config_.single_joint_share),
+      wanted_actions_(config_.signals) {
+  health_.judged_sample = health_.wanted_sample = heard_schema_.schema_version = -1;
 }
 
 bool MotorBabbler::is_mine(const motion_status_t& status) const {
@@ -203,31 +204,25 @@ std::optional<std::vector<double>> MotorBabbler::single_joint_action() const {
 bool MotorBabbler::can_choose() const {
   if (!has_verdict()) return false;
   const bool has_memory = !memory_.empty() && memory_.back().sample_index >= last_sample_;
-  return health_.schema_version == 0 || (schema_version_ == health_.schema_version && has_memory);
+  return !has_schema() || (schema_version_ == health_.schema_version && has_memory);
 }
 
-Eigen::VectorXd MotorBabbler::next_action() const {
+Eigen::VectorXd MotorBabbler::next_action() {
   if (is_to_probe())
     return Eigen::Map<const Eigen::VectorXd>(health_.probe_action.data(), health_.num_probe);
   if (const auto single = single_joint_action())
     return Eigen::Map<const Eigen::VectorXd>(single->data(), std::ssize(*single));
-  if (!is_to_choose() || !can_choose() || health_.schema_version == 0)
+  if (!is_to_choose() || !can_choose() || !has_schema())
     return random_action(config_, seed_, action_id_);
+  if (const auto wanted = wanted_actions_.take(health_)) return *wanted;
   const auto candidates = candidate_actions(config_, seed_, action_id_);
   return candidates[choose_action(schema_, {memory_.begin(), memory_.end()}, candidates)];
 }
 
 bool MotorBabbler::is_to_probe() const {
-  if (next_purpose() != action_command_t::PURPOSE_TRAIN || !is_seen_ || last_test_sample_ < 0 ||
-      last_sample_ != last_test_sample_ || !has_verdict() || should_stop() ||
-      health_.probe_action.size() != config_.signals.size())
-    return false;
-  for (std::size_t i = 0; i < config_.signals.size(); ++i) {
-    const Signal& signal = config_.signals[i];
-    const double value = health_.probe_action[i];
-    if (!(value >= signal.lower && value <= signal.upper)) return false;
-  }
-  return true;
+  return next_purpose() == action_command_t::PURPOSE_TRAIN && is_seen_ && last_test_sample_ >= 0 &&
+         last_sample_ == last_test_sample_ && has_verdict() && !should_stop() &&
+         is_within_limits(health_.probe_action, config_.signals);
 }
 
 void MotorBabbler::note_verdict() {
@@ -306,8 +301,10 @@ std::optional<action_command_t> MotorBabbler::on_model_health(const model_health
   if (last_sample_ < 0 && !is_restored_) {
     num_samples_ = std::max(num_samples_, health.judged_sample + 1);
   }
-  if (wait_ == Wait::kVerdict) return go_on();
-  return std::nullopt;
+  if (wait_ != Wait::kVerdict) return std::nullopt;
+  // The monitor itself waits, and not for ever.
+  if (health.awaited_refinement == last_test_sample_) wait_since_us_ = -1;
+  return go_on();
 }
 
 std::optional<action_command_t> MotorBabbler::on_control_status(const control_status_t& status) {
@@ -465,7 +462,7 @@ std::string MotorBabbler::state_text() const {
        << ", action_id: " << command_.action_id << ", purpose: " << int{command_.purpose}
        << ", expiry_utime: " << command_.expiry_utime << ", action: " << yaml_list(command_.action)
        << "}\n"
-       << single_joint_moves_.state_text();
+       << single_joint_moves_.state_text() << wanted_actions_.state_text();
   return text.str();
 }
 
@@ -491,6 +488,7 @@ void MotorBabbler::restore(const std::filesystem::path& file) {
   set_array(command_.num_signals, command_.action,
             last.numbers("action", static_cast<int>(config_.signals.size())));
   single_joint_moves_.restore(yaml.section("single_joint_moves"));
+  wanted_actions_.restore(yaml.section("wanted_actions"));
   yaml.finish();
   action_id_ = command_.action_id + 1;
   is_restored_ = true;

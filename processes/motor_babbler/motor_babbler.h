@@ -19,6 +19,7 @@
 #include "common/schema/body_schema.h"
 #include "processes/motor_babbler/action_choice.h"
 #include "processes/motor_babbler/single_joint_moves.h"
+#include "processes/motor_babbler/wanted_actions.h"
 
 namespace bodyschema {
 
@@ -87,7 +88,9 @@ std::vector<Eigen::VectorXd> candidate_actions(const MotorBabblerConfig& config,
 /// actions before the first schema; TEST actions, so that held-out data do not depend on the
 /// schema that they judge; replacements of actions that were refused, cut short or not seen, so
 /// that no refusal is chosen again and again; and the actions up to the next TEST if schema or
-/// verdict did not come within verdict_timeout (counted).
+/// verdict did not come within verdict_timeout (counted). If the verdict came with wanted actions
+/// of the refiner (MODEL_HEALTH), those are taken before any is chosen, each once (WantedActions).
+/// While the monitor itself waits for the refiner, its verdict is waited for.
 ///
 /// If the verdict on a TEST sample comes with a probe (MODEL_HEALTH), the action that tells two
 /// explanations of a change apart, the next action is that one, with purpose PROBE. Refused, it is
@@ -125,6 +128,8 @@ class MotorBabbler {
   std::int64_t num_unseen() const { return num_unseen_; }
   /// TEST samples after which the body schema did not come in time.
   std::int64_t num_without_schema() const { return num_without_schema_; }
+  /// Actions of the refiner that it made.
+  std::int64_t num_wanted_taken() const { return wanted_actions_.num_taken(); }
 
   /// State for a restart, as YAML; to be on disk before a command is sent. "" before the first.
   std::string state_text() const;
@@ -139,6 +144,8 @@ class MotorBabbler {
   /// act(), once everything that the next action rests on has come.
   std::optional<action_command_t> go_on();
   bool has_verdict() const { return health_.judged_sample >= last_test_sample_; }
+  /// There was one at the verdict; that of `--initial` has version 0 until it changes.
+  bool has_schema() const { return health_.schema_version > 0 || health_.num_edges > 0; }
   /// Tells single_joint_moves_ of the verdict on the newest TEST sample once both have come.
   void note_verdict();
   /// The next action is to be chosen, not drawn.
@@ -149,7 +156,7 @@ class MotorBabbler {
   void take_schema();
   /// Makes the probe that the verdict on a TEST sample wants the next action.
   bool is_to_probe() const;
-  Eigen::VectorXd next_action() const;
+  Eigen::VectorXd next_action();
   std::int8_t next_purpose() const;
   /// The next action, if it moves one joint alone.
   std::optional<std::vector<double>> single_joint_action() const;
@@ -192,11 +199,12 @@ class MotorBabbler {
   bool done_ = false;
   action_command_t command_{};
   model_health_t health_{};
-  body_schema_t heard_schema_{};     ///< the newest
-  std::int64_t schema_version_ = 0;  ///< of schema_, by which is chosen; 0: none was heard
+  body_schema_t heard_schema_{};      ///< the newest
+  std::int64_t schema_version_ = -1;  ///< of schema_, by which is chosen; −1: none was heard
   BodySchema schema_;
   std::deque<SeenAction> memory_;
   SingleJointMoves single_joint_moves_;
+  WantedActions wanted_actions_;
   std::int64_t without_schema_since_ = -1;  ///< TEST sample whose verdict or schema was given up
   std::int64_t num_without_schema_ = 0;
 };

@@ -90,7 +90,8 @@ void MotorBabblerProcess::on_idle() {
         "are structure_learner and model_monitor running?");
   process_.set_counters({{"action rejected", babbler_.num_rejected()},
                          {"sample never seen", babbler_.num_unseen()},
-                         {"BODY_SCHEMA not in time", num_late}});
+                         {"BODY_SCHEMA not in time", num_late},
+                         {"wanted action", babbler_.num_wanted_taken()}});
   if (const auto n = state_.num_failed(); n > 0) process_.set_counters({{"state not saved", n}});
 }
 

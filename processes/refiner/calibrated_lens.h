@@ -1,12 +1,10 @@
 #pragma once
 
-#include "common/camera/lens.h"
-#include "common/config/camera_calibration.h"
+#include <Eigen/Core>
+
+#include "common/camera/calibrated_lens.h"
 
 namespace bodyschema {
-
-/// @throws std::invalid_argument if the number of coefficients does not fit the model.
-Lens lens_of(const CameraCalibration& camera);
 
 /// A lens without coefficients with as many zeros as its model has.
 CameraCalibration with_all_coefficients(CameraCalibration camera);

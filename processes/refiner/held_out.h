@@ -15,9 +15,7 @@ HeldOutErrors held_out_errors(const BodySchema& schema, const std::vector<Refine
                               const std::optional<RigCalibration>& rig,
                               const CornerNoise& corner_noise);
 
-/// Are the corners of more of the same samples likelier by a model than by another, and of so many
-/// more that chance does it in 2 % at most (sign test)? A sample counts once: what its corners have
-/// in common, the play of joints, is one draw. Never below six samples.
+/// Is a model likelier than another by the corners of the same samples (is_likelier())?
 bool predicts_corners_better(const HeldOutErrors& model, const HeldOutErrors& other);
 
 }  // namespace bodyschema

@@ -91,6 +91,7 @@ BodySchema refined_schema(const BodySchema& start, const std::vector<RefinerSamp
     }
   }
   schema.frame_covariances = frame_covariances(start, samples, problem, information);
+  schema.refined = true;
   schema.base_version = start.version;
   schema.last_sample_index = std::max(start.last_sample_index, samples.back().sample.sample_index);
   schema.version = std::max(start.version, schema.last_sample_index) + 1;

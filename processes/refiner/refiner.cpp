@@ -30,21 +30,33 @@ RefinerSettings RefinerSettings::load(const std::filesystem::path& file) {
 }
 
 Refiner::Refiner(RefinerSettings settings)
-    : settings_(std::move(settings)), next_due_(settings_.options.config.refine_every) {}
+    : settings_(std::move(settings)), schedule_(settings_.options.config.refine_every) {}
 
 bool RefinedProposal::is_better() const {
   return refinement && predicts_corners_better(refinement->after, refinement->before);
+}
+
+body_schema_t RefinedProposal::answer() const {
+  body_schema_t answer = is_better() ? to_message(refinement->schema) : learned;
+  std::vector<wanted_action_t> wanted;
+  for (const WantedAction& action :
+       refinement ? refinement->wanted_actions : std::vector<WantedAction>()) {
+    wanted_action_t& message = wanted.emplace_back();
+    set_array(message.num_signals, message.wanted_action,
+              std::vector<double>(action.action.begin(), action.action.end()));
+    message.fall = action.fall;
+    message.reducible_fall = action.reducible_fall;
+  }
+  set_array(answer.num_wanted, answer.wanted_actions, std::move(wanted));
+  return answer;
 }
 
 void Refiner::on_sample(const sample_t& sample) {
   if (sample.sample_index <= last_sample_index_) return;
   last_sample_index_ = sample.sample_index;
   samples_.add(std::make_shared<const RefinerSample>(refiner_sample(sample)));
-  const std::int64_t every = settings_.options.config.refine_every;
-  if (sample.purpose == action_command_t::PURPOSE_TEST && sample.sample_index + 1 >= next_due_) {
-    next_due_ = ((sample.sample_index + 1) / every + 1) * every;
+  if (sample.purpose == action_command_t::PURPOSE_TEST && schedule_.is_due(sample.sample_index))
     due_.push_back(sample.sample_index);
-  }
   match();
 }
 
@@ -78,7 +90,7 @@ void Refiner::drop_older_jobs() {
 }
 
 std::function<RefinedProposal()> Refiner::take_job() {
-  const body_schema_t message = std::move(jobs_.front());
+  body_schema_t message = std::move(jobs_.front());
   jobs_.pop_front();
   const BodySchema schema = from_message(message);
   std::int64_t since = 0;
@@ -86,16 +98,16 @@ std::function<RefinedProposal()> Refiner::take_job() {
   std::vector<RefinerSample> samples;
   for (const auto& sample : samples_.between(since, message.last_sample_index))
     samples.push_back(*sample);
-  return [schema, samples = std::move(samples), index = message.last_sample_index,
-          utime = message.utime, rig = settings_.rig, options = settings_.options] {
+  return [schema, samples = std::move(samples), message = std::move(message), rig = settings_.rig,
+          options = settings_.options] {
     RefinedProposal result;
-    result.sample_index = index;
+    result.learned = message;
     try {
       result.refinement = refine(schema, samples, rig, options);
       result.refinement->schema.version = 0;
       result.refinement->schema.base_version = 0;
-      result.refinement->schema.last_sample_index = index;
-      result.refinement->schema.utime = utime;
+      result.refinement->schema.last_sample_index = message.last_sample_index;
+      result.refinement->schema.utime = message.utime;
     } catch (const std::exception& error) {
       result.problem = error.what();
     }

@@ -11,6 +11,7 @@
 
 #include "bodyschema/body_schema_t.hpp"
 #include "bodyschema/sample_t.hpp"
+#include "common/config/refinement_schedule.h"
 #include "common/schema/retained_samples.h"
 #include "processes/refiner/refine.h"
 
@@ -27,17 +28,20 @@ struct RefinerSettings {
 
 /// A proposal of the learner after refine().
 struct RefinedProposal {
-  std::int64_t sample_index = -1;  ///< the last sample that it rests on
+  body_schema_t learned;
   std::optional<Refinement> refinement;
   std::string problem;  ///< why there is no refinement, for people
 
   /// The corners of TEST samples are predicted better than by the proposal and the rig's files:
   /// predicts_corners_better().
   bool is_better() const;
+  /// REFINED_SCHEMA: the refined schema where that is better, else the proposal as it was; and the
+  /// actions that the refinement wants.
+  body_schema_t answer() const;
 };
 
-/// Collects samples and refines some of the learner's proposals: that of the first TEST sample
-/// whenever there were `refine_every` more, if it is complete. The refinement is a pure function of
+/// Collects samples and refines the learner's complete proposals on the TEST samples of
+/// RefinementSchedule. The refinement is a pure function of
 /// the proposal and of the samples up to its last, those of the retained set (Retained).
 class Refiner {
  public:
@@ -64,7 +68,7 @@ class Refiner {
   const RefinerSettings settings_;
   Retained<RefinerSample> samples_;
   std::int64_t last_sample_index_ = -1;
-  std::int64_t next_due_;  ///< number of samples from which on a TEST sample is due
+  RefinementSchedule schedule_;
   std::deque<std::int64_t> due_;
   std::map<std::int64_t, body_schema_t> proposals_;  ///< complete, without a job; the newest
   std::deque<body_schema_t> jobs_;

@@ -1,5 +1,6 @@
 #include "processes/refiner/refiner_config.h"
 
+#include "common/config/refinement_schedule.h"
 #include "common/config/yaml.h"
 
 namespace bodyschema {
@@ -8,7 +9,7 @@ RefinerConfig RefinerConfig::load(const std::filesystem::path& file) {
   const Yaml yaml = Yaml::load(file);
   RefinerConfig config;
   config.enabled = yaml.boolean("enabled");
-  config.refine_every = static_cast<int>(yaml.integer("refine_every", 1, 1'000'000));
+  config.refine_every = bodyschema::refine_every(yaml);
   config.placements = yaml.boolean("placements");
   config.intrinsics = yaml.boolean("intrinsics");
   if (!config.placements && !config.intrinsics)

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <cstdint>
 #include <filesystem>
 
 #include "common/estimation/measurement_model.h"
@@ -10,8 +11,8 @@ namespace bodyschema {
 /// refiner.yaml: what the process refines and when; how far a rig's tags and lens may be from what
 /// its files claim, 1 σ each; how much is fitted. The defaults hold where a rig has no such file.
 struct RefinerConfig {
-  bool enabled = false;   ///< the group has a refiner
-  int refine_every = 50;  ///< samples
+  bool enabled = false;            ///< the group has a refiner
+  std::int64_t refine_every = 50;  ///< samples
   /// What the process fits beside the schema, one of them at least: poses alone would tell it
   /// nothing that the learner does not know.
   bool placements = true, intrinsics = true;

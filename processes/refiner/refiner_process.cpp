@@ -48,7 +48,7 @@ void RefinerProcess::restore() {
   try {
     const auto kept = read_log(schema_file_, kBodySchema);
     if (kept.empty()) return;
-    refined_ = kept.back();
+    answer_ = refined_ = kept.back();
     refiner_.skip(refined_->last_sample_index);
   } catch (const std::exception& error) {
     spdlog::warn("{}: begins without it", error.what());
@@ -62,7 +62,7 @@ void RefinerProcess::on_tick(std::int64_t now_us) {
   if (process_.bus().is_replay() || now_us - sent_us_ < 1'000'000) return;
   sent_us_ = now_us;
   if (unsaved_) save();
-  if (refined_) process_.bus().publish(kRefinedSchema, *refined_);
+  if (answer_) process_.bus().publish(kRefinedSchema, *answer_);
 }
 
 void RefinerProcess::on_end() {
@@ -91,11 +91,13 @@ void RefinerProcess::work() {
 void RefinerProcess::collect() {
   const RefinedProposal proposal = fit_.get();
   say(proposal);
-  if (!proposal.is_better()) return;
-  refined_ = to_message(proposal.refinement->schema);
-  unsaved_ = proposal.refinement->rig;
-  save();
-  process_.bus().publish(kRefinedSchema, *refined_);
+  answer_ = proposal.answer();
+  if (proposal.is_better()) {
+    refined_ = answer_;
+    unsaved_ = proposal.refinement->rig;
+    save();
+  }
+  process_.bus().publish(kRefinedSchema, *answer_);
 }
 
 void RefinerProcess::save() {
@@ -114,17 +116,18 @@ void RefinerProcess::save() {
 
 void RefinerProcess::say(const RefinedProposal& proposal) {
   if (!proposal.refinement) {
-    words_ = fmt::format("sample {}: not refined: {}", proposal.sample_index, proposal.problem);
+    words_ = fmt::format("sample {}: not refined: {}", proposal.learned.last_sample_index,
+                         proposal.problem);
   } else if (const Refinement& r = *proposal.refinement;
              !r.before.px_median || !r.after.px_median) {
     words_ = fmt::format("sample {}: refined, but no TEST sample shows corners to judge it by",
-                         proposal.sample_index);
+                         proposal.learned.last_sample_index);
   } else {
     words_ = fmt::format(
         "sample {}: corners of {} TEST samples {:.3f} → {:.3f} px (median), {:.3f} → {:.3f} px "
         "(rms) in {:.1f} s{}",
-        proposal.sample_index, r.after.num_samples, *r.before.px_median, *r.after.px_median,
-        *r.before.px_rms, *r.after.px_rms, r.seconds,
+        proposal.learned.last_sample_index, r.after.num_samples, *r.before.px_median,
+        *r.after.px_median, *r.before.px_rms, *r.after.px_rms, r.seconds,
         proposal.is_better() ? "" : ": not surely better, nothing is proposed");
   }
   spdlog::info("{}", words_);

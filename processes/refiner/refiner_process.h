@@ -13,7 +13,7 @@
 namespace bodyschema {
 
 /// The refiner on a bus: SAMPLE, LEARNED_SCHEMA → REFINED_SCHEMA. Live, it refines beside the loop
-/// and repeats the newest result at 1 Hz; a replay waits for each. What predicts the held-out
+/// and repeats its newest answer at 1 Hz; a replay waits for each. What predicts the held-out
 /// corners better than the rig's files is kept in files: the schema, and beside it the tags and the
 /// lens as found, which `bodyschema adopt` writes into the rig. The refined schema goes with these
 /// alone: its calibration is not the rig's until then.
@@ -42,7 +42,8 @@ class RefinerProcess {
   Refiner refiner_;
   SampleIntake intake_;
   std::future<RefinedProposal> fit_;
-  std::optional<body_schema_t> refined_;
+  std::optional<body_schema_t> answer_;    ///< the newest
+  std::optional<body_schema_t> refined_;   ///< the newest that is better
   std::optional<RigCalibration> unsaved_;  ///< goes with refined_
   std::string words_;                      ///< of the newest refinement
   std::int64_t sent_us_ = 0;

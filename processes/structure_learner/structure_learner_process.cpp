@@ -53,6 +53,8 @@ void StructureLearnerProcess::learn_from(const sample_t& sample) {
 
 void StructureLearnerProcess::on_model_health(const model_health_t& health) {
   verdicts_.answer(health.judged_sample);
+  // The monitor itself waits, and not for ever.
+  if (health.awaited_refinement == verdicts_.question()) verdicts_.ask(verdicts_.question());
   learner_.skip_judged(std::min(health.judged_sample, resumed_after_));
 }
 

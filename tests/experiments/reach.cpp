@@ -163,7 +163,7 @@ int main(int argc, char** argv) {
     }
     InverseKinematicsOptions more = kOptions;
     more.max_starts = 10 * kStarts;
-    for (int n = 0; n < num_targets / 10; ++n) {
+    for (int n = 0; n < num_targets; ++n) {
       const PoseTarget target{.p_RT = beyond_reach(schema, hand, robot, rng)};
       const auto nearest = [&](const InverseKinematicsOptions& options) {
         return solve_pose(schema, hand, target, schema.signals, centre, options).error_m;

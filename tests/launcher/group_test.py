@@ -94,13 +94,18 @@ class TheRefiner(GroupTest):
         return self.words()
 
     def test_runs_where_the_rig_enables_it(self):
-        self.write_program("refiner", '#!/bin/sh\necho "$@"\nwhile :; do sleep 0.1; done\n')
+        for name in ("refiner", "model_monitor"):
+            self.write_program(name, '#!/bin/sh\necho "$@"\nwhile :; do sleep 0.1; done\n')
         self.words_of_a_run("true")
         self.assertIn("--refined", (self.current / "refiner.log").read_text())
+        self.assertIn(f"--refiner {self.current.resolve()}/config/refiner.yaml", (self.current / "model_monitor.log").read_text())
 
     def test_is_missed_only_where_the_rig_enables_it(self):
+        self.write_program("model_monitor", '#!/bin/sh\necho "$@"\nwhile :; do sleep 0.1; done\n')
         self.assertIn("built without Ceres", self.words_of_a_run("true"))
+        self.assertNotIn("--refiner", (self.current / "model_monitor.log").read_text())
         self.assertNotIn("Ceres", self.words_of_a_run("false"))
+        self.assertNotIn("--refiner", (self.current / "model_monitor.log").read_text())
 
 
 class OthersEndTheGroup(GroupTest):

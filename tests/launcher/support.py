@@ -18,7 +18,7 @@ CONSOLE = """\
 import os, signal, sys, time
 word, *rest = sys.argv[1:]
 if word == "--help":
-    print("A console\\n\\nSubcommands:\\n  learn  …\\n  halt  …\\n  target  …\\n  where  …\\n  hold  …\\n  release  …\\n  resume  …\\n  fault  …")
+    print("A console\\n\\nSubcommands:\\n  learn  …\\n  halt  …\\n  target  …\\n  follow  …\\n  where  …\\n  hold  …\\n  release  …\\n  resume  …\\n  fault  …")
 elif word == "--version":
     print("bodyschema 1.2.3")
 elif "--help" in rest:

@@ -85,6 +85,14 @@ schema_edge_t edge(int from, int to, int num_joints) {
   return edge;
 }
 
+wanted_action_t wanted_action() {
+  wanted_action_t message{};
+  fill(message.num_signals, message.wanted_action, {0.25, -0.75});
+  message.fall = 0.3;
+  message.reducible_fall = 0.4;
+  return message;
+}
+
 schema_edge_t screw_gp_edge(int from, int to) {
   schema_edge_t message = edge(from, to, 1);
   message.base_kind = schema_edge_t::EDGE_SCREW_GP;
@@ -273,6 +281,7 @@ body_schema_t example_body_schema() {
   message.calibration_id = 99;
   message.num_samples_seen = 40;
   message.is_complete = 0;
+  message.is_refined = 1;
   fill(message.num_parts, message.part_ids, {1, 2, 4, 5, 6, 9});
   fill(message.num_position_parts, message.position_parts, {5, 9});
   message.root_part = 2;
@@ -308,6 +317,7 @@ body_schema_t example_body_schema() {
   tag.moved_since_sample = 31;
   tag.moved_until_sample = 45;
   fill(message.num_moved_tags, message.moved_tags, {tag});
+  fill(message.num_wanted, message.wanted_actions, {wanted_action()});
   message.noise_position_m = 0.003;
   message.noise_rotation_rad = 0.017;
   return message;
@@ -342,6 +352,9 @@ model_health_t example_model_health() {
   message.noise_scale = 1.2;
   message.probe_sample = 49;
   fill(message.num_probe, message.probe_action, {0.5, -0.25});
+  message.awaited_refinement = -1;
+  message.wanted_sample = 50;
+  fill(message.num_wanted, message.wanted_actions, {wanted_action()});
   edge_health_t edge{};
   edge.health_from = 2;
   edge.health_to = 4;

@@ -16,10 +16,11 @@ constexpr std::int64_t kTick_us = 100'000;
 constexpr std::int64_t kPatience_us = 600'000'000;
 
 ControllerConfig controller_config(const std::filesystem::path& rig, const SyntheticRobot& robot,
-                                   Regime regime) {
+                                   const SteeredArm::Options& options) {
   ControllerConfig config = ControllerConfig::load(rig / "controller.yaml");
   config.signals = robot.signals;
-  config.measurement = adaptation_options(regime).measurement;
+  config.measurement = adaptation_options(options.regime).measurement;
+  config.max_corrections = options.max_corrections;
   return config;
 }
 
@@ -42,7 +43,7 @@ SteeredArm::SteeredArm(SyntheticRobot robot, const BodySchema& schema,
     : robot_(std::move(robot)),
       options_(options),
       rng_(options.seed),
-      controller_(controller_config(rig, robot_, options.regime)),
+      controller_(controller_config(rig, robot_, options)),
       monitor_(monitor_config(rig, options.regime)),
       first_schema_(told(schema)),
       position_(Eigen::VectorXd::Zero(static_cast<Eigen::Index>(robot_.signals.size()))) {

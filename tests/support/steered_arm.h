@@ -17,7 +17,8 @@ class SteeredArm {
  public:
   struct Options {
     Regime regime = Regime::kTag;
-    bool adapts = true;  ///< else the schema stays as it was
+    bool adapts = true;       ///< else the schema stays as it was
+    int max_corrections = 0;  ///< by what is seen at a target's end
     std::uint64_t seed = 1;
   };
   /// How a target ended.

@@ -82,6 +82,12 @@ std::vector<std::vector<PoseTarget>> legs_of(const std::vector<PoseTarget>& way_
   return legs;
 }
 
+std::string nearest(const Reach& reach) {
+  const InverseKinematicsSolution& solution = reach.solution;
+  return reach.has_orientation ? pose_text(solution.error_m, solution.error_rad, 1)
+                               : fmt::format("{:.1f} mm", solution.error_m * 1e3);
+}
+
 /// Every step is within reach from the one before, and known well enough there, or nothing is
 /// begun. @throws std::runtime_error with the first that is not.
 void check_reach(const Heard& heard, const FollowArguments& arguments,
@@ -108,7 +114,7 @@ void check_reach(const Heard& heard, const FollowArguments& arguments,
         throw std::runtime_error(fmt::format(
             "the way to point {} of {}, at {:.3f} {:.3f} {:.3f}: {}; nothing was moved", n + 1,
             legs.size(), step.p_RT.x(), step.p_RT.y(), step.p_RT.z(),
-            is_known ? reach.why
+            is_known ? fmt::format("out of reach, no nearer than {}", nearest(reach))
                      : fmt::format("the schema knows the part there within ±{:.1f} mm only",
                                    reach.sd.position_m * 1e3)));
       action = reach.solution.action;

@@ -244,6 +244,7 @@ Json errors_json(int num_samples, const JudgedErrors& errors) {
 Json schema_json(const BodySchema& schema) {
   Json json = structure_json(schema, {});
   json.erase("outliers");
+  json["refined"] = schema.refined;
   json["version"] = schema.version;
   json["base_version"] = schema.base_version;
   json["last_sample"] = schema.last_sample_index;

@@ -71,6 +71,12 @@ bool ModelMonitor::has_same_tree(const BodySchema& a, const BodySchema& b) {
          });
 }
 
+std::int64_t ModelMonitor::body_since(const BodySchema& proposal) {
+  std::int64_t since = 0;
+  for (const Edge& edge : proposal.edges) since = std::max(since, edge.valid_since_sample);
+  return since;
+}
+
 std::string ModelMonitor::objection(BodySchema* proposal, const Standing& standing,
                                     bool* was_tested) const {
   const std::int64_t index = proposal->last_sample_index;
@@ -97,12 +103,13 @@ std::string ModelMonitor::objection(BodySchema* proposal, const Standing& standi
 
 bool ModelMonitor::is_passed_over(const BodySchema& proposal, const Standing& standing) const {
   const LiveSchema* live = standing.live.get();
-  if (!live) return false;
   const std::int64_t index = proposal.last_sample_index;
-  const BodySchema& known = *standing.schema();
+  const BodySchema* stands = standing.schema();
+  if (stands && !standing.is_holding_back() && is_defended(*stands, proposal)) return true;
+  if (!live) return false;
+  const BodySchema& known = *stands;
   const std::int64_t body_since = known.changes.empty() ? 0 : known.changes.back().since;
-  std::int64_t since = 0;
-  for (const Edge& edge : proposal.edges) since = std::max(since, edge.valid_since_sample);
+  const std::int64_t since = ModelMonitor::body_since(proposal);
   if (body_since != since || known.moved_tags != proposal.moved_tags) return true;
   const auto gain_since = [&](std::int64_t first, std::int64_t story_since) {
     auto tests = tests_between(first, index);
@@ -121,7 +128,7 @@ bool ModelMonitor::is_passed_over(const BodySchema& proposal, const Standing& st
 }
 
 void ModelMonitor::judge(const body_schema_t& message) {
-  BodySchema proposal = from_message(message);
+  BodySchema proposal = better_one(from_message(message));
   const std::int64_t index = proposal.last_sample_index;
   Standing standing = standing_after(index);
   judged_sample_ = index;
@@ -145,6 +152,7 @@ void ModelMonitor::judge(const body_schema_t& message) {
       event.event_kind = health_event_t::EVENT_SCHEMA_ACCEPTED;
       event.event_text = "version " + std::to_string(proposal.version) + ": " +
                          std::to_string(proposal.edges.size()) + " edges, " +
+                         (proposal.refined ? "refined, " : "") +
                          (proposal.complete ? "complete" : "incomplete");
       standing.add(event);
       set_base(&standing, std::move(proposal));

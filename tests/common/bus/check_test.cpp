@@ -214,6 +214,11 @@ TEST(Check, RefusesFieldsThatContradictEachOther) {
     m.probe_action.clear();
     m.num_probe = 0;
   });
+  expect_refused(example_model_health(), "wanted_sample", [](auto& m) { m.wanted_sample = -1; });
+  expect_refused(example_body_schema(), "wanted_actions[0].num_signals", [](auto& m) {
+    m.wanted_actions[0].wanted_action.pop_back();
+    m.wanted_actions[0].num_signals = 1;
+  });
   expect_refused(example_model_health(), "findings[0].finding_size.num_amounts", [](auto& m) {
     m.findings[0].finding_size.size_kind = change_size_t::SIZE_FACTOR;
   });

@@ -380,7 +380,7 @@ TEST_F(ReportPageTest, WhatIsWrongStandsFirst) {
   EXPECT_EQ(count(page(), "The body is known: 3 parts"), 1);
   model_health_t health{};
   health.judged_sample = 49;
-  health.probe_sample = -1;
+  health.probe_sample = health.awaited_refinement = health.wanted_sample = -1;
   edge_health_t edge{};
   edge.health_from = 1;
   edge.health_to = 2;

@@ -157,9 +157,10 @@ TEST(SchemaJsonTest, ShowHasEveryParameterOfEveryEdge) {
   test::SyntheticRobot robot;
   const BodySchema schema = learned(robot).schema;
   const auto json = schema_json(schema);
-  EXPECT_EQ(keys_of(json), (Keys{"complete", "samples", "parts", "position_parts", "root", "edges",
-                                 "unconnected", "unused_signals", "undecided_signals", "noise",
-                                 "version", "base_version", "last_sample", "X_CR", "signals"}));
+  EXPECT_EQ(keys_of(json),
+            (Keys{"complete", "samples", "parts", "position_parts", "root", "edges", "unconnected",
+                  "unused_signals", "undecided_signals", "noise", "refined", "version",
+                  "base_version", "last_sample", "X_CR", "signals"}));
   EXPECT_EQ(json["signals"].size(), 3U);
   EXPECT_EQ(keys_of(json["signals"][0]), (Keys{"name", "lower", "upper", "warp"}));
   EXPECT_EQ(json["last_sample"], 29);

@@ -993,11 +993,118 @@ TEST(MotorBabblerTest, AProbeBeyondTheLimitsIsNotMade) {
   EXPECT_EQ(bench.last.purpose, action_command_t::PURPOSE_TRAIN);
 }
 
+/// A verdict with `num` actions of the refiner, of which the third is beyond the limits.
+model_health_t wanting(model_health_t health, std::int64_t wanted_sample, int num = 10) {
+  health.wanted_sample = wanted_sample;
+  std::vector<wanted_action_t> wanted(num);
+  for (int n = 0; n < num; ++n) {
+    std::vector<double> action;
+    for (const Signal& signal : active_config().signals)
+      action.push_back(signal.lower + (signal.upper - signal.lower) * (n == 2 ? 1.01 : 0.09 * n) +
+                       1e-3 * double(wanted_sample));
+    set_array(wanted[n].num_signals, wanted[n].wanted_action, action);
+  }
+  set_array(health.num_wanted, health.wanted_actions, wanted);
+  return health;
+}
+/// Takes the verdict on the newest sample, with its schema. Returns the next `num` actions, all of
+/// them TRAIN.
+std::vector<std::vector<double>> actions_after(Bench* bench, const model_health_t& health,
+                                               int num) {
+  bench->babbler.on_body_schema(schema_of(health.schema_version));
+  EXPECT_TRUE(bench->take(bench->babbler.on_model_health(health)));
+  std::vector<std::vector<double>> actions;
+  for (int n = 0; n < num; ++n) {
+    EXPECT_FALSE(bench->is_test());
+    actions.push_back(bench->last.action);
+    bench->make_sample();
+  }
+  return actions;
+}
+
+TEST(MotorBabblerTest, TheActionsThatTheRefinerWantsAreMadeOnceEachAndInOrder) {
+  Bench bench = after_first_test();
+  const model_health_t first = wanting(verdict(4, 5), 4), second = wanting(verdict(9, 10), 4),
+                       third = wanting(verdict(14, 15), 4);
+  std::vector<std::vector<double>> made = actions_after(&bench, first, 4);
+  EXPECT_TRUE(is_drawn(bench.last));  // TEST
+  ASSERT_FALSE(bench.make_sample());
+  for (const auto& action : actions_after(&bench, second, 4)) made.push_back(action);
+  ASSERT_FALSE(bench.make_sample());
+  std::vector<std::vector<double>> wanted;
+  for (int n = 0; n < 10; ++n)
+    if (n != 2) wanted.push_back(first.wanted_actions[n].wanted_action);
+  const auto rest = actions_after(&bench, third, 2);
+  made.push_back(rest[0]);
+  EXPECT_EQ(made, wanted);
+  // None is left.
+  EXPECT_EQ(bench.babbler.num_wanted_taken(), 9);
+  EXPECT_EQ(std::count(wanted.begin(), wanted.end(), rest[1]), 0);
+}
+
+TEST(MotorBabblerTest, AWantedActionThatIsRefusedIsNotTriedAgain) {
+  Bench bench = after_first_test();
+  const model_health_t wants = wanting(verdict(4, 5), 4);
+  bench.babbler.on_body_schema(schema_of(5));
+  ASSERT_TRUE(bench.take(bench.babbler.on_model_health(wants)));
+  EXPECT_EQ(bench.last.action, wants.wanted_actions[0].wanted_action);
+  ASSERT_TRUE(bench.take(
+      bench.babbler.on_motion_status(answer(bench.last, motion_status_t::STATE_REJECTED))));
+  EXPECT_TRUE(is_drawn(bench.last));
+  ASSERT_TRUE(bench.make_sample());
+  EXPECT_EQ(bench.last.action, wants.wanted_actions[1].wanted_action);
+}
+
+TEST(MotorBabblerTest, WantedActionsOfASchemaThatIsGoneAreDroppedForThoseOfANewOne) {
+  Bench bench = after_first_test();
+  actions_after(&bench, wanting(verdict(4, 5), 4), 4);
+  ASSERT_FALSE(bench.make_sample());
+  Bench newer = bench;
+  for (const auto& action : actions_after(&bench, verdict(9, 10), 4))
+    for (const auto& wanted : wanting(verdict(4, 5), 4).wanted_actions)
+      EXPECT_NE(action, wanted.wanted_action);
+  EXPECT_EQ(bench.babbler.num_wanted_taken(), 4);
+
+  const model_health_t others = wanting(verdict(9, 10), 9);
+  EXPECT_EQ(actions_after(&newer, others, 4)[0], others.wanted_actions[0].wanted_action);
+}
+
+TEST(MotorBabblerTest, OnlyWhereActionsAreChosenAreThoseOfTheRefinerMade) {
+  Bench bench;
+  bench.start();
+  bench.run(4);
+  ASSERT_FALSE(bench.make_sample());
+  ASSERT_TRUE(bench.take(bench.babbler.on_model_health(wanting(verdict(4, 5), 4))));
+  EXPECT_TRUE(is_drawn(bench.last, test_config()));
+}
+
+TEST(MotorBabblerTest, AMonitorThatWaitsForTheRefinerIsWaitedFor) {
+  Bench bench = after_first_test();
+  model_health_t waiting = verdict(-1, 0);
+  waiting.awaited_refinement = 4;
+  for (int t = 200; t < 230; ++t) {
+    EXPECT_FALSE(bench.take(bench.babbler.on_tick(t * kSecond)));
+    EXPECT_FALSE(bench.take(bench.babbler.on_model_health(waiting)));
+  }
+  const model_health_t wants = wanting(verdict(4, 5), 4);
+  EXPECT_EQ(actions_after(&bench, wants, 1)[0], wants.wanted_actions[0].wanted_action);
+  EXPECT_EQ(bench.babbler.num_without_schema(), 0);
+}
+
 TEST(MotorBabblerTest, WithoutASchemaActionsAreDrawn) {
   Bench bench = after_first_test();
   ASSERT_TRUE(bench.take(bench.babbler.on_model_health(verdict(4, 0))));
   EXPECT_TRUE(is_drawn(bench.last));
   EXPECT_EQ(bench.babbler.num_without_schema(), 0);
+}
+
+TEST(MotorBabblerTest, AnInitialSchemaThatStandsIsChosenByToo) {
+  Bench bench = after_first_test();
+  model_health_t health = verdict(4, 0);
+  set_array(health.num_edges, health.edge_health, {edge_health_t{}});
+  EXPECT_FALSE(bench.take(bench.babbler.on_model_health(health)));
+  ASSERT_TRUE(bench.take(bench.babbler.on_body_schema(schema_of(0))));
+  EXPECT_FALSE(is_drawn(bench.last));
 }
 
 TEST(MotorBabblerTest, ASchemaThatDoesNotComeIsGivenUpUntilTheNextTest) {
@@ -1216,7 +1323,11 @@ class World {
       if (sample.purpose == action_command_t::PURPOSE_TEST) version = sample.sample_index + 1;
     }
     if (version > 0) tell(babbler_->on_body_schema(schema_of(version)));
-    tell(babbler_->on_model_health(verdict(samples.empty() ? -1 : newest_index(), version)));
+    model_health_t health = verdict(samples.empty() ? -1 : newest_index(), version);
+    // Of every second schema actions are wanted.
+    const std::int64_t wanted_sample = version / 10 * 10 - 1;
+    if (wanted_sample > 0) health = wanting(health, wanted_sample, 3);
+    tell(babbler_->on_model_health(health));
   }
   std::int64_t newest_index() const { return samples.back().sample_index; }
   bool is_killed() {

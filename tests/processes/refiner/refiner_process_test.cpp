@@ -11,6 +11,7 @@
 #include <vector>
 
 #include "common/bus/channels.h"
+#include "common/bus/check.h"
 #include "common/bus/convert.h"
 #include "common/bus/event_log.h"
 #include "common/config/calibration_id.h"
@@ -89,7 +90,7 @@ TEST_F(RefinerTest, RefinesTheProposalOfTheFirstTestSampleAfterEveryTen) {
     refiner.on_sample(sample);
     for (const body_schema_t& proposal : proposals_)
       if (proposal.last_sample_index == sample.sample_index) refiner.on_learned_schema(proposal);
-    while (refiner.has_job()) refined.push_back(refiner.take_job()().sample_index);
+    while (refiner.has_job()) refined.push_back(refiner.take_job()().learned.last_sample_index);
   }
   EXPECT_EQ(refined, std::vector<std::int64_t>{10});
 }
@@ -105,7 +106,7 @@ TEST_F(RefinerTest, TheOrderOfSamplesAndProposalsDoesNotMatter) {
     const RefinedProposal result = refiner.take_job()();
     EXPECT_FALSE(refiner.has_job());
     EXPECT_TRUE(result.refinement) << result.problem;
-    return encode(kRefinedSchema, to_message(result.refinement->schema));
+    return encode(kRefinedSchema, result.answer());
   };
   EXPECT_EQ(refined(false), refined(true));
 }
@@ -146,6 +147,45 @@ TEST_F(RefinerTest, WhatChanceMayHaveDoneIsNoBetter) {
   ASSERT_EQ(after.size(), 6U);
   after[3] = result.refinement->before.corner_costs[3];
   EXPECT_FALSE(result.is_better());
+  // The answer is the proposal as it was; what is wanted is no worse for that.
+  body_schema_t answer = result.answer();
+  EXPECT_EQ(answer.num_wanted, 10);
+  set_array(answer.num_wanted, answer.wanted_actions, {});
+  EXPECT_EQ(encode(kRefinedSchema, answer), encode(kRefinedSchema, proposal_after(10)));
+}
+
+TEST_F(RefinerTest, ItsAnswerHasTheActionsThatTheRefinementWants) {
+  Refiner refiner = this->refiner();
+  for (const sample_t& sample : samples_) refiner.on_sample(sample);
+  refiner.on_learned_schema(proposal_after(10));
+  const RefinedProposal result = refiner.take_job()();
+  const body_schema_t answer = result.answer();
+  EXPECT_EQ(check(answer), "");
+  EXPECT_NE(answer.calibration_id, proposal_after(10).calibration_id);
+  ASSERT_EQ(answer.num_wanted, 10);
+  for (int n = 0; n < 10; ++n) {
+    const WantedAction& wanted = result.refinement->wanted_actions[n];
+    EXPECT_EQ(answer.wanted_actions[n].wanted_action,
+              std::vector<double>(wanted.action.begin(), wanted.action.end()));
+    EXPECT_EQ(answer.wanted_actions[n].fall, wanted.fall);
+    EXPECT_EQ(answer.wanted_actions[n].reducible_fall, wanted.reducible_fall);
+  }
+}
+
+TEST_F(RefinerTest, WhatCouldNotBeRefinedIsAnsweredToo) {
+  // Without samples to learn from.
+  LogAppender log(folder_ / "tests alone.lcmlog");
+  for (sample_t& sample : samples_) {
+    sample.purpose = action_command_t::PURPOSE_TEST;
+    log.append(kSample, sample);
+  }
+  log.append(kLearnedSchema, proposal_after(9));
+  const auto answers =
+      read_log(replay(folder_ / "tests alone.lcmlog", {"--refined", folder_ / "refined.lcmlog"}),
+               kRefinedSchema);
+  ASSERT_EQ(answers.size(), 1U);
+  EXPECT_EQ(encode(kRefinedSchema, answers[0]), encode(kRefinedSchema, proposal_after(9)));
+  EXPECT_FALSE(fs::exists(folder_ / "refined.lcmlog"));
 }
 
 TEST_F(RefinerTest, AReplayWritesTheSameBytesAndFilesThatGoTogether) {
