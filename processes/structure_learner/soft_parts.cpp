@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <iterator>
 #include <limits>
 #include <map>
 #include <optional>
@@ -147,11 +148,60 @@ PlausibleScrews plausible_screws(const std::vector<OpenPair>& pairs,
   return result;
 }
 
+// A process between two components.
+struct SoftCandidate {
+  AcceptedModel model;
+  std::size_t num_needed = 0;  // signals that suffice between them: fewer first, as in the search
+  bool is_contested = false;   // screws of other signals may be all there is
+};
+
+AcceptedModel to_accepted(const OpenPair& open, const SoftFit& soft) {
+  return {open.i, open.j, soft.model.screws, soft.score, soft.model.signals, soft.doubtful_signals};
+}
+
+// Those of the pairs that screws explain best. Contested ones only where no other is.
+std::vector<SoftCandidate> soft_candidates(std::vector<OpenPair> pairs,
+                                           const std::vector<ActionPoseSample>& samples,
+                                           const NormalizedActions& actions,
+                                           const SearchOptions& options, bool is_noise_guessed,
+                                           SearchResult* found) {
+  rank_pairs(samples, actions, options, &pairs, found);
+  if (pairs.size() > kPairsTried) pairs.resize(kPairsTried);
+  std::optional<PlausibleScrews> plausible;
+  if (is_noise_guessed) plausible = plausible_screws(pairs, samples, actions, options, found);
+  std::vector<SoftCandidate> result;
+  for (const OpenPair& o : pairs) {
+    if (!std::isfinite(o.cost)) continue;
+    const std::optional<SoftFit> best = best_soft_fit(o, samples, actions, options, found);
+    if (!best || best->verdict != Verdict::kValid) continue;
+    SoftCandidate c{to_accepted(o, *best)};
+    if (plausible) {
+      const std::set<int> signals(best->model.signals.begin(), best->model.signals.end());
+      c.num_needed = signals.size();
+      c.is_contested =
+          signals != plausible->signals &&
+          !pays(*best, count_independent(o, samples, actions, options), plausible->density);
+    }
+    result.push_back(std::move(c));
+  }
+  const auto is_contested = [](const SoftCandidate& c) { return c.is_contested; };
+  if (!std::ranges::all_of(result, is_contested)) {
+    std::erase_if(result, is_contested);
+    return result;
+  }
+  for (SoftCandidate& c : result) {
+    c.num_needed = plausible->signals.size();
+    found->records[{c.model.part_i, c.model.part_j}].contested =
+        ContestedSignals{plausible->signals, c.model.soft_signals};
+  }
+  return result;
+}
+
 // The noise of a stream is guessed or claimed: screws may pass where a process on other signals
 // leaves far less. Their models go, and the processes are candidates.
 void withdraw_screws(const std::vector<ActionPoseSample>& samples, const NormalizedActions& actions,
                      const SearchOptions& options, SearchResult* found,
-                     std::vector<AcceptedModel>* candidates) {
+                     std::vector<SoftCandidate>* candidates) {
   std::erase_if(found->models, [&](const AcceptedModel& m) {
     if (!m.soft_signals.empty()) return false;
     const auto soft =
@@ -163,8 +213,7 @@ void withdraw_screws(const std::vector<ActionPoseSample>& samples, const Normali
     if (!pays(*soft, count_independent(open, samples, actions, options),
               density_of_screws(open, samples, actions, options)))
       return false;
-    candidates->push_back({m.part_i, m.part_j, soft->model.screws, soft->score, soft->model.signals,
-                           soft->doubtful_signals});
+    candidates->push_back({to_accepted(open, *soft)});
     std::erase(found->redundant, std::pair(m.part_i, m.part_j));
     found->records[{m.part_i, m.part_j}].is_redundant = false;
     found->gave_way = true;
@@ -178,10 +227,7 @@ void connect_soft_parts(const std::vector<ActionPoseSample>& samples,
                         const NormalizedActions& actions, const std::vector<int>& parts,
                         const SearchOptions& options, bool is_noise_guessed, SearchResult* found) {
   const bool is_stream = actions.blocks().is_stream();
-  std::vector<AcceptedModel> candidates;
-  std::set<std::pair<int, int>> contested;  // of the candidates, those that do not pay
-  // Of each candidate, how many signals suffice: fewer first, as in the search.
-  std::map<std::pair<int, int>, std::size_t> num_needed;
+  std::vector<SoftCandidate> candidates;
   if (is_stream) withdraw_screws(samples, actions, options, found, &candidates);
   Components components(parts);
   for (const AcceptedModel& m : found->models) components.join(m.part_i, m.part_j);
@@ -195,48 +241,19 @@ void connect_soft_parts(const std::vector<ActionPoseSample>& samples,
     if (record.num_common >= kFewestSoftFrames)
       open[std::minmax(a, b)].push_back({0, pair.first, pair.second, {}});
   }
-  for (auto& [between, pairs] : open) {
-    if (undecided.count(between)) continue;
-    rank_pairs(samples, actions, options, &pairs, found);
-    if (pairs.size() > kPairsTried) pairs.resize(kPairsTried);
-    std::optional<PlausibleScrews> plausible;
-    if (is_noise_guessed && !is_stream)
-      plausible = plausible_screws(pairs, samples, actions, options, found);
-    std::vector<AcceptedModel> paying, others;
-    for (const OpenPair& o : pairs) {
-      if (!std::isfinite(o.cost)) continue;
-      const std::optional<SoftFit> best = best_soft_fit(o, samples, actions, options, found);
-      if (!best || best->verdict != Verdict::kValid) continue;
-      const std::set<int> signals(best->model.signals.begin(), best->model.signals.end());
-      const bool is_other =
-          plausible && signals != plausible->signals &&
-          !pays(*best, count_independent(o, samples, actions, options), plausible->density);
-      (is_other ? others : paying)
-          .push_back({o.i, o.j, best->model.screws, best->score, best->model.signals,
-                      best->doubtful_signals});
-    }
-    if (paying.empty())
-      for (const AcceptedModel& c : others) {
-        contested.insert({c.part_i, c.part_j});
-        found->records[{c.part_i, c.part_j}].contested =
-            ContestedSignals{plausible->signals, c.soft_signals};
-      }
-    for (AcceptedModel& c : paying.empty() ? others : paying) {
-      if (plausible)
-        num_needed[{c.part_i, c.part_j}] =
-            paying.empty() ? plausible->signals.size() : c.soft_signals.size();
-      candidates.push_back(std::move(c));
-    }
-  }
-  const auto rank = [&](const AcceptedModel& c) {
-    return std::tuple(num_needed[{c.part_i, c.part_j}], -c.score, c.part_i, c.part_j);
+  for (auto& [between, pairs] : open)
+    if (!undecided.contains(between))
+      std::ranges::move(soft_candidates(std::move(pairs), samples, actions, options,
+                                        is_noise_guessed && !is_stream, found),
+                        std::back_inserter(candidates));
+  const auto rank = [](const SoftCandidate& c) {
+    return std::tuple(c.num_needed, -c.model.score, c.model.part_i, c.model.part_j);
   };
-  std::stable_sort(candidates.begin(), candidates.end(),
-                   [&](const auto& x, const auto& y) { return rank(x) < rank(y); });
+  std::ranges::stable_sort(candidates, {}, rank);
   // Screws may be all that is between two parts: a process on the way around them is none either.
-  for (AcceptedModel& c : candidates)
-    if (components.join(c.part_i, c.part_j) && !contested.contains({c.part_i, c.part_j}))
-      found->models.push_back(std::move(c));
+  for (SoftCandidate& c : candidates)
+    if (components.join(c.model.part_i, c.model.part_j) && !c.is_contested)
+      found->models.push_back(std::move(c.model));
 }
 
 }  // namespace bodyschema
