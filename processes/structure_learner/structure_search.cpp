@@ -1,6 +1,7 @@
 #include "processes/structure_learner/structure_search.h"
 
 #include "processes/structure_learner/search/bridging.h"
+#include "processes/structure_learner/search/hidden_bodies.h"
 #include "processes/structure_learner/search/layered_search.h"
 #include "processes/structure_learner/search/long_chains.h"
 #include "processes/structure_learner/search/settling.h"
@@ -23,6 +24,8 @@ SearchResult search_structure(const std::vector<ActionPoseSample>& samples,
     if (!settled.any_refuted) break;
   }
   if (!forest.spans() && bridge(&pairs, &forest))
+    settled = settle_trees(&layers.spare(), &pairs, &forest);
+  if (!forest.spans() && connect_hidden_bodies(&pairs, &forest))
     settled = settle_trees(&layers.spare(), &pairs, &forest);
   if (!forest.spans() && connect_long_chains(&pairs, &forest))
     settled = settle_trees(&layers.spare(), &pairs, &forest);

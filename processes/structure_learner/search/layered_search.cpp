@@ -44,6 +44,18 @@ void sort_by_quality(std::vector<Candidate>* candidates) {
 
 }  // namespace
 
+std::vector<std::vector<double>> known_turns(const ModelForest& forest, int num_signals,
+                                             const std::vector<double>& grid) {
+  std::vector<std::vector<double>> turns(static_cast<std::size_t>(num_signals));
+  for (const AcceptedModel& m : forest.models())
+    for (int d = 0; d < m.model.num_joints(); ++d)
+      if (std::abs(m.model.joints[d].turn) > 0.1)
+        turns[m.model.joints[d].signal].push_back(std::abs(m.model.joints[d].turn));
+  for (auto& t : turns)
+    if (t.empty()) t = grid;
+  return turns;
+}
+
 void LayeredSearch::run(int first_layer) {
   doubtful_.clear();
   for (int k = first_layer;
@@ -158,21 +170,9 @@ void LayeredSearch::layer_one_joint() {
   connect(std::move(candidates));
 }
 
-// Joint ranges of the signals where the forest already knows them, else a grid.
-LayeredSearch::Turns LayeredSearch::known_turns(const std::vector<double>& grid) const {
-  Turns turns(pairs_.actions().num_signals());
-  for (const AcceptedModel& m : forest_.models())
-    for (int d = 0; d < m.model.num_joints(); ++d)
-      if (std::abs(m.model.joints[d].turn) > 0.1)
-        turns[m.model.joints[d].signal].push_back(std::abs(m.model.joints[d].turn));
-  for (auto& t : turns)
-    if (t.empty()) t = grid;
-  return turns;
-}
-
 void LayeredSearch::layer_two_joints() {
   const Turns grid(pairs_.actions().num_signals(), default_turns());
-  const Turns known = known_turns(default_turns());
+  const Turns known = known_turns(forest_, pairs_.actions().num_signals(), default_turns());
   // Where parts are many, few pairs of each component first.
   constexpr std::size_t kMaxParts = 14, kNearPairs = 12, kFarPairs = 300;
   constexpr std::size_t kAllPairs = std::numeric_limits<std::size_t>::max();
@@ -191,7 +191,8 @@ void LayeredSearch::layer_two_joints() {
   // So few frames leave the fits narrow valleys: a finer grid of ranges, where parts are few. More
   // tell joints that turn more than once.
   if (pairs_.actions().num_samples() >= kFewestScanFrames) {
-    two_joints_pass(known_turns(wide_turns()), kAllPairs, false);
+    two_joints_pass(known_turns(forest_, pairs_.actions().num_signals(), wide_turns()), kAllPairs,
+                    false);
   } else {
     std::vector<double> fine;
     for (double turn = 0.25; turn < 3.1; turn *= 1.15) fine.push_back(turn);

@@ -9,6 +9,11 @@
 
 namespace bodyschema {
 
+/// Joint ranges to assume of each signal [rad per half range]: those of its joints where the forest
+/// has some, else `grid`.
+std::vector<std::vector<double>> known_turns(const ModelForest& forest, int num_signals,
+                                             const std::vector<double>& grid);
+
 /// Kruskal on the layers k = 0, 1, … joints: the models that each two parts' own data make valid
 /// (search_structure() says what waits for what).
 class LayeredSearch {
@@ -37,7 +42,6 @@ class LayeredSearch {
   void layer_rigid();
   void layer_one_joint();
   void layer_two_joints();
-  Turns known_turns(const std::vector<double>& grid) const;
   std::vector<std::pair<int, int>> open_pairs(std::size_t most, bool* is_all);
   // Of open_pairs(), without those of two components that a doubtful model joins if they are
   // skipped. True if no pair was left out for their number.

@@ -5,10 +5,10 @@
 namespace bodyschema {
 
 /// Connects components that no model of up to two joints connects by chains of any number of
-/// joints: on the signals that move nothing in the forest, then on all; where they are too many to
-/// be one chain, on none. Of the pairs between two components the chain with the fewest joints.
-/// True if any two were connected. A chain needs kPosesPerJoint independent poses a joint: fewer
-/// are noted as too few data.
+/// joints: on the signals that move nothing in the forest, then on these and one of those that do,
+/// then on all; where they are too many to be one chain, on none. Of the pairs between two
+/// components the chain with the fewest joints. True if any two were connected. A chain needs
+/// kPosesPerJoint independent poses a joint: fewer are noted as too few data.
 bool connect_long_chains(PairModels* pairs, ModelForest* forest);
 
 }  // namespace bodyschema

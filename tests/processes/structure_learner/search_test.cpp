@@ -7,7 +7,9 @@
 #include "processes/structure_learner/learn.h"
 #include "processes/structure_learner/search/bridging.h"
 #include "processes/structure_learner/search/component_tree.h"
+#include "processes/structure_learner/search/hidden_bodies.h"
 #include "processes/structure_learner/search/layered_search.h"
+#include "processes/structure_learner/search/long_chains.h"
 #include "processes/structure_learner/search/settling.h"
 #include "processes/structure_learner/search/withdrawal.h"
 #include "tests/support/synthetic_robot.h"
@@ -253,6 +255,81 @@ TEST(Bridge, InstantsAtWhichOnlyOneOfTwoComponentsIsSeenDoNotSpeakForJoiningThem
 }
 
 // A part on a joint, seen together with the base a few times while its signal hardly moved.
+struct HingedLink {
+  int part, parent, signal;
+  bool is_hidden = false;
+};
+test::SyntheticRobot hinged(const std::vector<HingedLink>& links, int num_signals, Rng& rng) {
+  test::SyntheticRobot robot;
+  robot.X_CR.translation().z() = 2;
+  for (int s = 0; s < num_signals; ++s)
+    robot.signals.push_back({std::string("q") += std::to_string(s + 1), -1, 1});
+  robot.links.push_back({.part = 1});
+  for (const HingedLink& hinge : links) {
+    test::TrueLink link{.part = hinge.part, .parent = hinge.parent};
+    link.X_before = test::random_pose(rng, 0.06, 0.16);
+    link.X_after = test::random_pose(rng, 0.06, 0.16);
+    link.signal = hinge.signal;
+    link.turn = test::uniform(rng, 0.7, 1.2);
+    link.hidden = hinge.is_hidden;
+    robot.links.push_back(link);
+  }
+  return robot;
+}
+
+// 1 –q1– (2) –q2– 3 and (2) –q3– (4) –q4– 5: from the hidden 2, which is known, 5 is two joints
+// away, from any part that is seen three. q5 moves nothing.
+const std::vector<HingedLink> kHiddenBranch{{2, 1, 0, true}, {3, 2, 1}, {4, 2, 2, true}, {5, 4, 3}};
+// 1 –q1– 2 –q2– (3) –q3– (4) –q1– 5.
+const std::vector<HingedLink> kSharedSignal{{2, 1, 0}, {3, 2, 1, true}, {4, 3, 2, true}, {5, 4, 0}};
+
+int count_right(const std::vector<HingedLink>& links, int num_signals, Regime regime) {
+  int num_right = 0;
+  for (std::uint64_t seed = 1; seed <= 10; ++seed) {
+    Rng rng(seed);
+    const test::SyntheticRobot robot = hinged(links, num_signals, rng);
+    const auto samples = test::babble(robot, 25, {.regime = regime, .with_covariances = true}, rng);
+    const test::Rightness rightness = test::judge(learn(robot.signals, samples, {}).schema, robot);
+    EXPECT_NE(rightness, test::Rightness::kWrong) << seed;
+    num_right += rightness == test::Rightness::kRight;
+  }
+  return num_right;
+}
+
+TEST(HiddenBodies, CarryABranchOfThreeJoints) {
+  Rng rng(1);
+  const test::SyntheticRobot robot = hinged(kHiddenBranch, 5, rng);
+  const auto samples = test::babble(robot, 30, {}, rng);
+  const NormalizedActions actions(samples, 5);
+  SearchOptions options;
+  options.measurement.noise = Noise{0.002, 0.02};
+  PairModels pairs(samples, actions, {1, 3, 5}, options);
+  ModelForest forest({1, 3, 5});
+  LayeredSearch(&pairs, &forest).run(0);
+  ASSERT_EQ(forest.models().size(), 1U);
+  EXPECT_EQ(signal_set(forest.models()[0].model), (std::set<int>{0, 1}));
+  EXPECT_TRUE(connect_hidden_bodies(&pairs, &forest));
+  ASSERT_TRUE(forest.spans());
+  const AcceptedModel& branch = forest.models()[1];
+  EXPECT_EQ(branch.part_j, 5);
+  EXPECT_EQ(branch.model.num_joints(), 3);
+  EXPECT_EQ(signal_set(branch.model), (std::set<int>{branch.part_i == 1 ? 0 : 1, 2, 3}));
+}
+
+TEST(HiddenBodies, AreOnlyInModelsOfTwoJoints) {
+  Case c(0.5, 30);
+  EXPECT_FALSE(connect_hidden_bodies(&c.pairs, &c.forest));
+  EXPECT_TRUE(c.forest.models().empty());
+}
+
+TEST(HiddenBodies, AreFoundInTagNoise) {
+  EXPECT_GE(count_right(kHiddenBranch, 5, Regime::kTag), 9);
+}
+
+TEST(LongChains, MayHaveASignalThatMovesOtherPartsToo) {
+  EXPECT_GE(count_right(kSharedSignal, 4, Regime::kTag), 8);
+}
+
 TEST(WithdrawUntoldEdges, AnEdgeIsNotRigidBecauseItsSignalHardlyMovedWhileItWasSeen) {
   Rng rng(81);
   for (const double spread : {0.02, 1.0}) {
