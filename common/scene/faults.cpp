@@ -110,6 +110,13 @@ bool has(const std::vector<Fault>& faults, std::int8_t kind, const std::string& 
   });
 }
 
+std::string unknown_target(const Scene& scene, int tag) {
+  if (scene.markers().is_target(tag)) return "";
+  return "no target tag " + std::to_string(tag) + "; target_tags in robot.yaml: " +
+         listed(scene.markers().target_tags,
+                [](const TargetTag& target) { return std::to_string(target.id); });
+}
+
 }  // namespace
 
 std::string describe(const Fault& fault, const SceneDescription& as_built) {
@@ -133,6 +140,10 @@ std::string describe(const Fault& fault, const SceneDescription& as_built) {
       break;
     case Command::FAULT_CAMERA_BUMP:
       text << "camera-bump";
+      break;
+    case Command::FAULT_TARGET:
+      text << "target " << fault.number << " at " << fault.target_m.x() << ' ' << fault.target_m.y()
+           << ' ' << fault.target_m.z() << " m";
       break;
     default:
       text << "drift " << fault.place << ' ' << fault.amount_deg << " deg per action, "
@@ -220,6 +231,12 @@ std::string add_fault(const fault_command_t& command, const Scene& scene, const 
     }
     case Command::FAULT_CAMERA_BUMP:
       break;
+    case Command::FAULT_TARGET:
+      if (const std::string problem = unknown_target(scene, fault.number); !problem.empty())
+        return problem;
+      std::erase_if(faults, is_same_place);
+      fault.target_m = Eigen::Vector3d(command.target_m);
+      break;
     case Command::FAULT_REPAIR:
       faults.clear();
       return "";
@@ -277,6 +294,9 @@ SceneDescription broken(const SceneDescription& as_built, const std::vector<Faul
         break;
       case Command::FAULT_CAMERA_BUMP:
         robot.X_WC = robot.X_WC * bump(seed, num_bumps++);
+        break;
+      case Command::FAULT_TARGET:
+        robot.X_WM_targets.at(fault.number).translation() = as_built.robot.X_WC * fault.target_m;
         break;
       default:
         break;
