@@ -163,7 +163,7 @@ void add_operate_commands(Arguments console) {
     command.callback([arguments, run] { run(*arguments); });
     return command;
   };
-  Arguments target = add("target", "Bring a body part to a position or a pose", run_target);
+  Arguments target = add("target", "Bring a body part to a position, a pose or a tag", run_target);
   target.add_option("--part", arguments->part, "Body part").required().in_range(0, 9999);
   Argument position = target.add_option("--position", arguments->position_m,
                                         "X Y Z of its origin in the root part [m]");
