@@ -16,6 +16,7 @@ struct InverseKinematicsOptions {
   int max_starts = 0;      ///< the first from the current action, the others seeded
   double tolerance_rad = 0.001;
   double metres_per_radian = 0.2;  ///< what an error of rotation weighs beside one of position
+  int posture_steps = 20;          ///< at most, in the null space of a solution; 0: as it is found
 };
 
 /// Of a part, in the root's frame.
@@ -40,14 +41,25 @@ std::optional<BodySchema> chain_to(const BodySchema& schema, int part);
 /// perturbation, are along the part's).
 Eigen::MatrixXd pose_jacobian(const KinematicPath& path, const Eigen::VectorXd& action);
 
+/// How little room an action leaves, 0 where there is enough: the sum of squares of how far each
+/// signal that moves the part is beyond a twentieth of its range from the limits and from what the
+/// schema's samples covered [twentieths], and of what the part's Jacobian in signals scaled by
+/// their ranges (6 rows if `with_rotation`, metres_per_radian) falls short of a reciprocal
+/// condition number of 0.05 [shares of it].
+double posture_cost(const BodySchema& schema, int part, bool with_rotation,
+                    const std::vector<Signal>& limits, const Eigen::VectorXd& action,
+                    const InverseKinematicsOptions& options);
+
 /// An action that brings `part` to the target: damped least squares (Nakamura and Hanafusa 1986;
 /// Buss 2004) of |Δp|² + (w Δφ)², w = metres_per_radian, in signals scaled by their ranges, the
 /// damping governed as Levenberg and Marquardt do, so that it grows where a singularity lets no
 /// step succeed. A signal at its limit leaves the active set while the step would push it outwards.
 /// Tried from `current`, then from starts ever farther from it, then from the best of 1000 actions
-/// over the ranges, until one converges; start n is the same in every run. With `avoided` the solution is another than those: at least a tenth of one
-/// signal's range away from each. If none converges, the nearest approach; if all are avoided,
-/// `current` with an infinite error.
+/// over the ranges, until one converges; start n is the same in every run. A solution then moves in
+/// its null space (Liégeois 1977) as long as posture_cost() falls. All this first within what the
+/// schema's samples covered, then within the limits. With `avoided`
+/// the solution is another than those: at least a tenth of one signal's range away from each. If
+/// none converges, the nearest approach; if all are avoided, `current` with an infinite error.
 ///
 /// Never NaN. `current` beyond the limits is moved to them. @throws std::invalid_argument if sizes
 /// differ, the part has no way to the root, or an orientation is asked of a part of which positions

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <optional>
 #include <set>
 #include <tuple>
 #include <utility>
@@ -92,6 +93,14 @@ LearnedStructure contested(LearnedStructure structure, const LearnedStructure& r
   return structure;
 }
 
+// A guess of the noise that leaves room for more: what is above any marker's is motion.
+bool may_be_louder(const LearnedStructure& structure) {
+  const MeasurementModel& measurement = structure.options.measurement;
+  return structure.noise_source == NoiseSource::kResiduals && measurement.noise &&
+         !is_above_any_marker({measurement.scale * measurement.noise->position_m,
+                               measurement.scale * measurement.noise->rotation_rad});
+}
+
 // The structure at the least noise that explains it; edges with needless joints are still in it.
 LearnedStructure least_noise(LearnedStructure told, const FindStructure& find) {
   // With more noise the screws would be back.
@@ -101,8 +110,9 @@ LearnedStructure least_noise(LearnedStructure told, const FindStructure& find) {
   const bool is_in_doubt = !told.search.redundant.empty() ||
                            (told.search.residual_scale > kLargestResidual && is_noise_known(told));
   if (is_explained && !is_in_doubt && told.search.couplings.empty()) return told;
-  if (!is_noise_known(told) &&
-      (told.actions.blocks().is_stream() || !told.spans() || !has_doubtful_joints(told)))
+  const bool is_guess = !is_noise_known(told);
+  if (is_guess && (told.actions.blocks().is_stream() ||
+                   (told.spans() ? !has_doubtful_joints(told) : !may_be_louder(told))))
     return told;
   LearnedStructure quieter = told;
   for (double factor = 2; factor <= 2 * kMostNoise; factor *= 2) {
@@ -115,7 +125,7 @@ LearnedStructure least_noise(LearnedStructure told, const FindStructure& find) {
     if (quieter.spans() && !is_soft(quieter) && !has_doubtful_joints(quieter) &&
         signatures_of(quieter) == signatures_of(louder)) {
       if (is_first) return quieter;
-      if (!is_explained && quieter.search.residual_scale < kSmallestResidual) {
+      if (!is_explained && !is_guess && quieter.search.residual_scale < kSmallestResidual) {
         told.is_contested = true;
         return told;
       }
@@ -127,8 +137,10 @@ LearnedStructure least_noise(LearnedStructure told, const FindStructure& find) {
       if (is_explained && !used.contains(s))
         return is_in_doubt ? contested(std::move(told), louder) : told;
     quieter = std::move(louder);
+    if (is_guess && !is_explained && !may_be_louder(quieter)) break;
   }
-  return is_explained ? contested(std::move(told), quieter) : told;
+  const bool is_rival = is_explained || (is_guess && quieter.spans());
+  return is_rival ? contested(std::move(told), quieter) : told;
 }
 
 // At the least noise of the steps that spans, if one does.
@@ -144,6 +156,16 @@ LearnedStructure of_stream(LearnedStructure told, const FindStructure& find,
   return told;
 }
 
+// Edges with joints that are not needed: without them no model is valid.
+void withdraw_needless(LearnedStructure* structure) {
+  std::vector<std::pair<int, int>> needless = structure->search.redundant;
+  for (const Coupling& coupling : structure->search.couplings)
+    if (coupling.is_needless) needless.emplace_back(coupling.part_i, coupling.part_j);
+  for (const auto& [part_i, part_j] : needless)
+    std::erase_if(structure->search.models,
+                  [&](const AcceptedModel& edge) { return edge.joins(part_i, part_j); });
+}
+
 }  // namespace
 
 LearnedStructure confirmed_structure(const FindStructure& find,
@@ -151,12 +173,24 @@ LearnedStructure confirmed_structure(const FindStructure& find,
   LearnedStructure structure = find(1, 0);
   const bool is_stream = structure.actions.blocks().is_stream();
   if (is_stream) structure = of_stream(std::move(structure), find, connect_soft_parts);
-  structure = least_noise(std::move(structure), find);
-  if (!is_stream && !structure.spans() && !structure.is_contested && !has_untold_edges(structure))
-    connect_soft_parts(&structure);
-  for (const auto& [part_i, part_j] : structure.search.redundant)
-    std::erase_if(structure.search.models,
-                  [&](const AcceptedModel& edge) { return edge.joins(part_i, part_j); });
+  const auto is_soft_open = [is_stream](const LearnedStructure& found) {
+    return !is_stream && !found.spans() && !found.is_contested && !has_untold_edges(found);
+  };
+  // Where the noise is a guess, more noise may be the answer only if no process is.
+  std::optional<LearnedStructure> soft;
+  if (is_soft_open(structure) && structure.noise_source == NoiseSource::kResiduals) {
+    soft = structure;
+    connect_soft_parts(&*soft);
+  }
+  if (!soft || !soft->spans()) {
+    structure = least_noise(std::move(structure), find);
+    if (!is_soft_open(structure))
+      soft.reset();
+    else if (!soft)
+      connect_soft_parts(&structure);
+  }
+  if (soft) structure = std::move(*soft);
+  withdraw_needless(&structure);
   return structure;
 }
 

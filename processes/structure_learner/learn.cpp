@@ -75,12 +75,21 @@ std::string wanted_samples(int num_common, const std::set<int>& untold, int num_
   return result;
 }
 
+template <typename Signals>
+std::string names_of(const Signals& signals, const LearnedStructure& structure) {
+  std::string result;
+  for (const int s : signals)
+    result += (result.empty() ? "" : ", ") + structure.signals[static_cast<std::size_t>(s)].name;
+  return result.empty() ? "nothing" : result;
+}
+
 // Why `part`, which was seen, is not connected to the root's component.
 UnconnectedPart explain(int part, int num_seen, const std::set<int>& connected,
                         const LearnedStructure& structure, int max_signals, int num_actions) {
   int common = 0, partner = -1;
   bool undecided = false, was_soft_tried = false, is_redundant = false;
   std::set<int> untold;
+  std::optional<ContestedSignals> contested;
   for (const auto& [pair, record] : structure.search.records) {
     if (pair.first != part && pair.second != part) continue;
     const int other = pair.first == part ? pair.second : pair.first;
@@ -89,6 +98,7 @@ UnconnectedPart explain(int part, int num_seen, const std::set<int>& connected,
     untold.insert(record.untold_signals.begin(), record.untold_signals.end());
     was_soft_tried |= record.was_soft_tried;
     is_redundant |= record.is_redundant;
+    if (record.contested) contested = record.contested;
     if (record.num_common > common) {
       common = record.num_common;
       partner = other;
@@ -124,6 +134,12 @@ UnconnectedPart explain(int part, int num_seen, const std::set<int>& connected,
             seen +
                 "; a model is valid, but has a joint that the others make needless, and without "
                 "it none is: more of the poses are wrong, or further off, than is told"};
+  if (contested)
+    return {part, Unconnected::kNotEnoughData,
+            seen + "; either " + names_of(contested->of_screws, structure) +
+                " moves it and poses are noisier than assumed, or " +
+                names_of(contested->of_process, structure) +
+                " in a way that no joints have: tell the true noise (--noise)"};
   if (!undecided && 6 * common >= 5 * parameters)
     return {part, Unconnected::kNoValidModel,
             seen + "; no model with up to " + std::to_string(max_signals) +
@@ -408,7 +424,7 @@ std::optional<Noise> noise_instead(const LearnedStructure& by_told,
   const SearchResult& search = by_told.search;
   const bool is_refuted = by_told.noise_source == NoiseSource::kGiven && search.residual_scale > 1;
   const bool stands = by_told.spans() && !by_told.is_contested && search.redundant.empty() &&
-                      !has_soft_edge(search) && !is_refuted;
+                      search.couplings.empty() && !has_soft_edge(search) && !is_refuted;
   if (!told || stands || by_told.actions.blocks().is_stream() || !tells_noise(by_told))
     return std::nullopt;
   // Longer chains would be searched in vain where bodies are soft.
@@ -443,7 +459,8 @@ LearnedStructure find_structure(const std::vector<Signal>& signals,
       // With enough noise a screw passes for anything soft: nothing is tried beside it.
       if (!is_guess_too_large(*found))
         connect_soft_parts(displaced(poses, found->signals), found->actions, found->parts,
-                           found->options, &found->search);
+                           found->options, found->noise_source == NoiseSource::kResiduals,
+                           &found->search);
     });
   };
   LearnedStructure structure = confirmed(options);

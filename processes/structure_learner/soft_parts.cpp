@@ -2,8 +2,10 @@
 
 #include <algorithm>
 #include <cmath>
+#include <iterator>
 #include <limits>
 #include <map>
+#include <optional>
 #include <set>
 #include <tuple>
 
@@ -23,6 +25,16 @@ struct OpenPair {
   int i, j;
   LocalModel screws;
 };
+
+int count_independent(const PairData& data, const NormalizedActions& actions) {
+  return actions.blocks().count(data.frames, [](const PairFrame& f) { return f.sample; });
+}
+
+int count_independent(const OpenPair& open, const std::vector<ActionPoseSample>& samples,
+                      const NormalizedActions& actions, const SearchOptions& options) {
+  return count_independent(make_pair_data(samples, open.i, open.j, options.measurement, kMaxFrames),
+                           actions);
+}
 
 // The screws that leave least: rigid, the best joint or the best two.
 LocalModel best_screws(const PairData& pair, const NormalizedActions& actions, int max_signals,
@@ -57,9 +69,7 @@ void rank_pairs(const std::vector<ActionPoseSample>& samples, const NormalizedAc
                 const SearchOptions& options, std::vector<OpenPair>* pairs, SearchResult* found) {
   for (OpenPair& o : *pairs) {
     const PairData data = make_pair_data(samples, o.i, o.j, options.measurement, kScreenFrames);
-    const int num_independent =
-        actions.blocks().count(data.frames, [](const PairFrame& f) { return f.sample; });
-    if (num_independent < kFewestSoftFrames) {
+    if (count_independent(data, actions) < kFewestSoftFrames) {
       o.cost = std::numeric_limits<double>::infinity();
       continue;
     }
@@ -89,11 +99,109 @@ std::optional<SoftFit> best_soft_fit(const OpenPair& open,
   return best;
 }
 
+// Log density a frame of what the screws leave, with the noise that suits them best.
+double density_of_screws(const OpenPair& open, const std::vector<ActionPoseSample>& samples,
+                         const NormalizedActions& actions, const SearchOptions& options) {
+  const PairData data = make_pair_data(samples, open.i, open.j, options.measurement, kMaxFrames);
+  const Fit screws = fit_local_model(open.screws, data, actions, 15, 1e-2);
+  return log_density_of_screws(screws, data, actions) / count_independent(data, actions);
+}
+
+// Three coordinates of position and three of rotation gain the log of what their deviations are
+// smaller by where these are at most kExplained of others.
+const double kFarLess = -3 * std::log(kExplained);
+
+// A process leaves far less than screws of such a density a frame.
+bool pays(const SoftFit& soft, int num_independent, double density_of_screws) {
+  return soft.log_density / num_independent > density_of_screws + kFarLess;
+}
+
+// Of two components: the largest density, and the signals of the fewest joints that leave not far
+// more. A guess of the noise does not know how large a bias is: all that they leave may be one.
+struct PlausibleScrews {
+  double density = -std::numeric_limits<double>::infinity();
+  std::set<int> signals = {};
+};
+PlausibleScrews plausible_screws(const std::vector<OpenPair>& pairs,
+                                 const std::vector<ActionPoseSample>& samples,
+                                 const NormalizedActions& actions, const SearchOptions& options,
+                                 SearchResult* counted) {
+  PlausibleScrews result;
+  std::vector<std::pair<double, LocalModel>> judged;
+  const auto judge = [&](const OpenPair& o) {
+    judged.emplace_back(density_of_screws(o, samples, actions, options), o.screws);
+    result.density = std::max(result.density, judged.back().first);
+  };
+  for (const OpenPair& o : pairs) {
+    if (!std::isfinite(o.cost)) continue;
+    judge(o);
+    const PairData data = make_pair_data(samples, o.i, o.j, options.measurement, kScreenFrames);
+    for (int k = 0; k < o.screws.num_joints(); ++k)
+      judge({0, o.i, o.j, best_screws(data, actions, k, counted)});
+  }
+  const LocalModel* sparsest = nullptr;
+  for (const auto& [density, screws] : judged)
+    if (density + kFarLess >= result.density &&
+        (!sparsest || screws.num_joints() < sparsest->num_joints()))
+      sparsest = &screws;
+  if (sparsest) result.signals = signal_set(*sparsest);
+  return result;
+}
+
+// A process between two components.
+struct SoftCandidate {
+  AcceptedModel model;
+  std::size_t num_needed = 0;  // signals that suffice between them: fewer first, as in the search
+  bool is_contested = false;   // screws of other signals may be all there is
+};
+
+AcceptedModel to_accepted(const OpenPair& open, const SoftFit& soft) {
+  return {open.i, open.j, soft.model.screws, soft.score, soft.model.signals, soft.doubtful_signals};
+}
+
+// Those of the pairs that screws explain best. Contested ones only where no other is.
+std::vector<SoftCandidate> soft_candidates(std::vector<OpenPair> pairs,
+                                           const std::vector<ActionPoseSample>& samples,
+                                           const NormalizedActions& actions,
+                                           const SearchOptions& options, bool is_noise_guessed,
+                                           SearchResult* found) {
+  rank_pairs(samples, actions, options, &pairs, found);
+  if (pairs.size() > kPairsTried) pairs.resize(kPairsTried);
+  std::optional<PlausibleScrews> plausible;
+  if (is_noise_guessed) plausible = plausible_screws(pairs, samples, actions, options, found);
+  std::vector<SoftCandidate> result;
+  for (const OpenPair& o : pairs) {
+    if (!std::isfinite(o.cost)) continue;
+    const std::optional<SoftFit> best = best_soft_fit(o, samples, actions, options, found);
+    if (!best || best->verdict != Verdict::kValid) continue;
+    SoftCandidate c{to_accepted(o, *best)};
+    if (plausible) {
+      const std::set<int> signals(best->model.signals.begin(), best->model.signals.end());
+      c.num_needed = signals.size();
+      c.is_contested =
+          signals != plausible->signals &&
+          !pays(*best, count_independent(o, samples, actions, options), plausible->density);
+    }
+    result.push_back(std::move(c));
+  }
+  const auto is_contested = [](const SoftCandidate& c) { return c.is_contested; };
+  if (!std::ranges::all_of(result, is_contested)) {
+    std::erase_if(result, is_contested);
+    return result;
+  }
+  for (SoftCandidate& c : result) {
+    c.num_needed = plausible->signals.size();
+    found->records[{c.model.part_i, c.model.part_j}].contested =
+        ContestedSignals{plausible->signals, c.model.soft_signals};
+  }
+  return result;
+}
+
 // The noise of a stream is guessed or claimed: screws may pass where a process on other signals
 // leaves far less. Their models go, and the processes are candidates.
 void withdraw_screws(const std::vector<ActionPoseSample>& samples, const NormalizedActions& actions,
                      const SearchOptions& options, SearchResult* found,
-                     std::vector<AcceptedModel>* candidates) {
+                     std::vector<SoftCandidate>* candidates) {
   std::erase_if(found->models, [&](const AcceptedModel& m) {
     if (!m.soft_signals.empty()) return false;
     const auto soft =
@@ -101,18 +209,11 @@ void withdraw_screws(const std::vector<ActionPoseSample>& samples, const Normali
     if (!soft || soft->verdict != Verdict::kValid) return false;
     const std::set<int> signals(soft->model.signals.begin(), soft->model.signals.end());
     if (signals == signal_set(m.model)) return false;
-    const PairData data =
-        make_pair_data(samples, m.part_i, m.part_j, options.measurement, kMaxFrames);
-    const Fit screws = fit_local_model(m.model, data, actions, 15, 1e-2);
-    const int num_independent =
-        actions.blocks().count(data.frames, [](const PairFrame& f) { return f.sample; });
-    // Three coordinates of position and three of rotation gain the log of what their deviations
-    // are smaller by.
-    if (soft->log_density <=
-        log_density_of_screws(screws, data, actions) - 3 * std::log(kExplained) * num_independent)
+    const OpenPair open{0, m.part_i, m.part_j, m.model};
+    if (!pays(*soft, count_independent(open, samples, actions, options),
+              density_of_screws(open, samples, actions, options)))
       return false;
-    candidates->push_back({m.part_i, m.part_j, soft->model.screws, soft->score, soft->model.signals,
-                           soft->doubtful_signals});
+    candidates->push_back({to_accepted(open, *soft)});
     std::erase(found->redundant, std::pair(m.part_i, m.part_j));
     found->records[{m.part_i, m.part_j}].is_redundant = false;
     found->gave_way = true;
@@ -124,9 +225,9 @@ void withdraw_screws(const std::vector<ActionPoseSample>& samples, const Normali
 
 void connect_soft_parts(const std::vector<ActionPoseSample>& samples,
                         const NormalizedActions& actions, const std::vector<int>& parts,
-                        const SearchOptions& options, SearchResult* found) {
+                        const SearchOptions& options, bool is_noise_guessed, SearchResult* found) {
   const bool is_stream = actions.blocks().is_stream();
-  std::vector<AcceptedModel> candidates;
+  std::vector<SoftCandidate> candidates;
   if (is_stream) withdraw_screws(samples, actions, options, found, &candidates);
   Components components(parts);
   for (const AcceptedModel& m : found->models) components.join(m.part_i, m.part_j);
@@ -140,24 +241,19 @@ void connect_soft_parts(const std::vector<ActionPoseSample>& samples,
     if (record.num_common >= kFewestSoftFrames)
       open[std::minmax(a, b)].push_back({0, pair.first, pair.second, {}});
   }
-  for (auto& [between, pairs] : open) {
-    if (undecided.count(between)) continue;
-    rank_pairs(samples, actions, options, &pairs, found);
-    if (pairs.size() > kPairsTried) pairs.resize(kPairsTried);
-    for (const OpenPair& o : pairs) {
-      if (!std::isfinite(o.cost)) continue;
-      const std::optional<SoftFit> best = best_soft_fit(o, samples, actions, options, found);
-      if (!best || best->verdict != Verdict::kValid) continue;
-      candidates.push_back(
-          {o.i, o.j, best->model.screws, best->score, best->model.signals, best->doubtful_signals});
-    }
-  }
-  std::stable_sort(candidates.begin(), candidates.end(), [](const auto& x, const auto& y) {
-    return std::make_tuple(-x.score, x.part_i, x.part_j) <
-           std::make_tuple(-y.score, y.part_i, y.part_j);
-  });
-  for (AcceptedModel& c : candidates)
-    if (components.join(c.part_i, c.part_j)) found->models.push_back(std::move(c));
+  for (auto& [between, pairs] : open)
+    if (!undecided.contains(between))
+      std::ranges::move(soft_candidates(std::move(pairs), samples, actions, options,
+                                        is_noise_guessed && !is_stream, found),
+                        std::back_inserter(candidates));
+  const auto rank = [](const SoftCandidate& c) {
+    return std::tuple(c.num_needed, -c.model.score, c.model.part_i, c.model.part_j);
+  };
+  std::ranges::stable_sort(candidates, {}, rank);
+  // Screws may be all that is between two parts: a process on the way around them is none either.
+  for (SoftCandidate& c : candidates)
+    if (components.join(c.model.part_i, c.model.part_j) && !c.is_contested)
+      found->models.push_back(std::move(c.model));
 }
 
 }  // namespace bodyschema

@@ -35,6 +35,11 @@ void list_edges(int seed, const BodySchema& schema, const ImperfectRobot& robot)
                    joint.gain * joint.turn * range / kDegree,
                    1000 * joint.gain * joint.slide * range);
     }
+    if (edge.residual_gp) {
+      std::fprintf(stderr, " | soft");
+      for (const int s : edge.signals())
+        std::fprintf(stderr, " %s", schema.signals[static_cast<std::size_t>(s)].name.c_str());
+    }
     std::fprintf(stderr, " | true");
     for (const int s : robot.structure().path_signals(edge.from, edge.to))
       std::fprintf(stderr, " %s", schema.signals[static_cast<std::size_t>(s)].name.c_str());

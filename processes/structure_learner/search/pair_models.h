@@ -26,6 +26,12 @@ struct SearchOptions {
   double unknown_bias = 0;
 };
 
+/// Signals of two models of which the data do not tell which one it is.
+struct ContestedSignals {
+  std::set<int> of_screws;      ///< if the noise is larger than assumed
+  std::vector<int> of_process;  ///< if it is not: with a Gaussian process beside the screws
+};
+
 /// A search's trials between two parts.
 struct PairRecord {
   int num_common = 0;  ///< instants at which both were seen
@@ -39,6 +45,7 @@ struct PairRecord {
   std::set<int> untold_signals = {};
   /// A valid model has a joint that its tree does not need: redundant_edges().
   bool is_redundant = false;
+  std::optional<ContestedSignals> contested = {};
 
   void note_undecided(int num_signals, double mean_capped);
 };

@@ -67,19 +67,25 @@ std::optional<double> mean_square_motion(const Nodes& nodes, int a, int b, int s
   return sum / pair.size();
 }
 
-// How many signals move node b against node a.
-int num_joints_between(const Nodes& nodes, int a, int b, PairModels* pairs) {
+// How many signals beside this one move node b against node a.
+int num_others_between(const Nodes& nodes, int a, int b, int signal, PairModels* pairs) {
   int count = 0;
-  for (const int signal : pairs->actions().moving()) {
-    const auto moved = mean_square_motion(nodes, a, b, signal, pairs);
+  for (const int other : pairs->actions().moving()) {
+    if (other == signal) continue;
+    const auto moved = mean_square_motion(nodes, a, b, other, pairs);
     count += !moved || *moved >= kNoiseOfOneSight;
   }
   return count;
 }
 
-// A node whose edge to its parent has a joint that it does not need: an edge of fewer joints would
-// do, between the far ends of it and of another edge with that joint.
-std::optional<int> redundant_node(const Nodes& nodes, PairModels* pairs) {
+// A node whose edge to its parent has a joint that it does not need, for the parts at the far ends
+// of it and of another edge with that joint move with its signal by less than `least`: an edge of
+// fewer joints would do between these.
+struct Detour {
+  int node = 0, signal = 0;
+};
+template <typename Least>
+std::optional<Detour> find_detour(const Nodes& nodes, PairModels* pairs, Least&& least) {
   const int n = static_cast<int>(nodes.size());
   for (const int signal : pairs->actions().moving())
     for (int k = 1; k < n; ++k)
@@ -87,46 +93,87 @@ std::optional<int> redundant_node(const Nodes& nodes, PairModels* pairs) {
         if (!nodes[k].model.uses(signal) || !nodes[l].model.uses(signal)) continue;
         const int far = is_below(nodes, l, k) ? nodes[k].parent : k;
         const auto moved = mean_square_motion(nodes, far, l, signal, pairs);
-        if (!moved || *moved >= kNoiseOfOneSight) continue;
+        if (!moved || *moved >= least(signal)) continue;
         const int larger = nodes[k].model.num_joints() > nodes[l].model.num_joints() ? k : l;
-        if (num_joints_between(nodes, far, l, pairs) < nodes[larger].model.num_joints())
-          return larger;
+        if (num_others_between(nodes, far, l, signal, pairs) < nodes[larger].model.num_joints())
+          return Detour{larger, signal};
       }
   return std::nullopt;
 }
 
-// By joint of the model: mean square of what it moves over the frames, whitened by the noise of one
-// sight.
-std::vector<double> joint_motions(const AcceptedModel& m, PairModels* pairs) {
+// Mean square of what a signal moves one end of a model against the other, whitened by the noise of
+// one sight.
+double mean_square_motion(const AcceptedModel& m, int signal, PairModels* pairs) {
   const PairData& pair = pairs->pair(m.part_i, m.part_j);
-  std::vector<double> result(static_cast<std::size_t>(m.model.num_joints()), 0);
+  double sum = 0;
   for (int t = 0; t < pair.size(); ++t) {
     const int sample = pair.frames[t].sample;
     const MotionJacobian J = motion_jacobian(m.model, pairs->actions(), sample);
-    for (int d = 0; d < m.model.num_joints(); ++d) {
-      const double q = pairs->actions()(sample, m.model.joints[d].signal);
-      result[d] += (pair.primary(t).whitening * (q * J.col(d))).squaredNorm() / pair.size();
-    }
+    Vector6d moved = Vector6d::Zero();
+    for (int d = 0; d < m.model.num_joints(); ++d)
+      if (m.model.joints[d].signal == signal) moved += J.col(d);
+    moved *= pairs->actions()(sample, signal);
+    sum += (pair.primary(t).whitening * moved).squaredNorm();
   }
-  return result;
+  return sum / std::max(pair.size(), 1);
+}
+
+LocalModel without_joint(LocalModel model, int d) {
+  model.transform(d) = model.transform(d) * model.joints[d].X_after;
+  model.joints.erase(model.joints.begin() + d);
+  return model;
+}
+
+// What a joint adds to a model: mean square of how far off its predictions are when all else adapts
+// to do without it, whitened by the noise of one sight.
+double added_motion(const AcceptedModel& m, int joint, PairModels* pairs) {
+  const PairData& pair = pairs->pair(m.part_i, m.part_j);
+  const NormalizedActions& actions = pairs->actions();
+  const LocalModel without =
+      fit_local_model(without_joint(m.model, joint), pair, actions, 40, 1e-2).model;
+  ++pairs->num_fits;
+  double sum = 0;
+  for (int t = 0; t < pair.size(); ++t) {
+    const int sample = pair.frames[t].sample;
+    const Vector6d off =
+        log(without.predict(actions, sample).inverse() * m.model.predict(actions, sample));
+    sum += (pair.primary(t).whitening * off).squaredNorm();
+  }
+  return sum / std::max(pair.size(), 1);
 }
 
 }  // namespace
 
 std::vector<Coupling> couplings(PairModels* pairs, const ModelForest& forest) {
-  std::vector<std::pair<Coupling, double>> joints;
+  std::map<int, int> num_joints;
   std::map<int, double> largest;
   for (const AcceptedModel& m : forest.models()) {
-    const std::vector<double> motions = joint_motions(m, pairs);
-    for (int d = 0; d < m.model.num_joints(); ++d) {
-      const int signal = m.model.joints[d].signal;
-      joints.emplace_back(Coupling{m.part_i, m.part_j, signal}, motions[d]);
-      largest[signal] = std::max(largest[signal], motions[d]);
+    for (const LocalModel::Joint& joint : m.model.joints) ++num_joints[joint.signal];
+    for (const int signal : signal_set(m.model)) {
+      double& most = largest[signal];
+      most = std::max(most, mean_square_motion(m, signal, pairs));
     }
   }
   std::vector<Coupling> result;
-  for (const auto& [joint, motion] : joints)
-    if (motion < kCoupling * largest[joint.signal]) result.push_back(joint);
+  for (const AcceptedModel& m : forest.models())
+    for (int d = 0; d < m.model.num_joints(); ++d) {
+      const int signal = m.model.joints[d].signal;
+      if (num_joints[signal] < 2) continue;
+      const double added = added_motion(m, d, pairs);
+      if (added >= kCoupling * largest[signal]) continue;
+      const bool is_needless = added < kNoiseOfOneSight;
+      if (is_needless) pairs->record(m.part_i, m.part_j).is_redundant = true;
+      result.push_back({m.part_i, m.part_j, signal, is_needless});
+    }
+  for (const int part : forest.parts()) {
+    if (forest.component(part) != part) continue;
+    const ComponentTree tree(forest, part, pairs);
+    const auto detour = find_detour(tree.nodes(), pairs,
+                                    [&](int signal) { return kCoupling * largest.at(signal); });
+    if (!detour) continue;
+    const AcceptedModel& m = forest.models()[static_cast<std::size_t>(tree.model_of(detour->node))];
+    result.push_back({m.part_i, m.part_j, detour->signal});
+  }
   return result;
 }
 
@@ -137,7 +184,9 @@ std::vector<std::pair<int, int>> redundant_edges(PairModels* pairs, ModelForest 
     std::optional<int> model;
     if (forest.component(parts[p]) == parts[p]) {
       const ComponentTree tree(forest, parts[p], pairs);
-      if (const auto node = redundant_node(tree.nodes(), pairs)) model = tree.model_of(*node);
+      if (const auto detour =
+              find_detour(tree.nodes(), pairs, [](int /*signal*/) { return kNoiseOfOneSight; }))
+        model = tree.model_of(detour->node);
     }
     if (!model) {
       ++p;

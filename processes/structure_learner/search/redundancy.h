@@ -16,14 +16,18 @@ namespace bodyschema {
 /// signal and N frames of a pair.
 std::vector<std::pair<int, int>> redundant_edges(PairModels* pairs, ModelForest forest);
 
-/// A joint of a signal that has another one, which moves far more. Arms are rarely built so: it may
-/// be how that motion loads the other joints, or what a view biases.
+/// A joint of a signal that has another one, and that adds far less than the signal moves there:
+/// without it, all else of its edge adapted, predictions are off by so little. Arms are rarely
+/// built so: it may be how that motion loads the other joints, or what a view biases.
 struct Coupling {
   int part_i = 0, part_j = 0;
   int signal = 0;
+  bool is_needless = false;  ///< adds less than the noise of one sight
   friend auto operator<=>(const Coupling&, const Coupling&) = default;
 };
-/// In the order of the forest's models. O(E N).
+/// In the order of the forest's models; then of each tree one joint that an edge on another way
+/// between parts would not have, for these move as little. One fit for each joint of a signal with
+/// several, else O(E² N). The records of edges with needless ones say so.
 std::vector<Coupling> couplings(PairModels* pairs, const ModelForest& forest);
 
 }  // namespace bodyschema

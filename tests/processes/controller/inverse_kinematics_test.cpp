@@ -298,5 +298,80 @@ TEST(InverseKinematicsTest, APartWithoutAWayToTheRootIsRefused) {
                std::invalid_argument);
 }
 
+// A redundant arm: where a solution is near a limit, the null space leads away from it.
+TEST(PostureTest, ASolutionLeavesRoomToTheLimitsAndStaysOne) {
+  const BodySchema schema = seven_joints(3);
+  InverseKinematicsOptions as_found = kOptions;
+  as_found.posture_steps = 0;
+  Rng rng(1);
+  double sum_found = 0, sum_settled = 0;
+  for (int n = 0; n < 200; ++n) {
+    const Eigen::VectorXd current = random_action(schema, rng);
+    const PoseTarget target{.p_RT = position(schema, 8, random_action(schema, rng))};
+    const auto found = solve_pose(schema, 8, target, schema.signals, current, as_found);
+    const auto settled = solve_pose(schema, 8, target, schema.signals, current, kOptions);
+    ASSERT_TRUE(found.is_within_tolerance);
+    ASSERT_TRUE(settled.is_within_tolerance);
+    expect_within_limits(schema, settled.action);
+    const auto cost = [&](const Eigen::VectorXd& action) {
+      return posture_cost(schema, 8, false, schema.signals, action, kOptions);
+    };
+    EXPECT_LE(cost(settled.action), cost(found.action) + 1e-9);
+    if (cost(found.action) == 0) EXPECT_EQ(settled.action, found.action);
+    sum_found += cost(found.action);
+    sum_settled += cost(settled.action);
+  }
+  EXPECT_GT(sum_found, 20);
+  EXPECT_LT(sum_settled, 0.1 * sum_found);
+}
+
+TEST(PostureTest, ASolutionKeepsToWhatSamplesCovered) {
+  BodySchema schema = seven_joints(3);
+  const std::vector<Signal> limits = schema.signals;
+  for (Signal& signal : schema.signals) {  // the middle half
+    const double quarter = (signal.upper - signal.lower) / 4;
+    signal.lower += quarter;
+    signal.upper -= quarter;
+  }
+  Rng rng(2);
+  int num_inside = 0;
+  for (int n = 0; n < 100; ++n) {
+    const PoseTarget target{.p_RT = position(schema, 8, random_action(schema, rng))};
+    Eigen::VectorXd current(limits.size());
+    for (std::size_t i = 0; i < limits.size(); ++i)
+      current[i] = test::uniform(rng, limits[i].lower, limits[i].upper);
+    const auto solution = solve_pose(schema, 8, target, limits, current, kOptions);
+    ASSERT_TRUE(solution.is_within_tolerance);
+    bool is_inside = true;
+    for (std::size_t i = 0; i < limits.size(); ++i)
+      is_inside &= solution.action[i] >= schema.signals[i].lower &&
+                   solution.action[i] <= schema.signals[i].upper;
+    num_inside += is_inside;
+  }
+  EXPECT_GE(num_inside, 90);
+}
+
+TEST(PostureTest, OneThatDoesNotMoveThePartStaysWhereItIs) {
+  const BodySchema schema = seven_joints(3);
+  Rng rng(3);
+  Eigen::VectorXd current = random_action(schema, rng);
+  const PoseTarget target{.p_RT = position(schema, 5, random_action(schema, rng))};
+  current.tail<2>() << schema.signals[5].upper, schema.signals[6].lower;
+  const auto solution = solve_pose(schema, 5, target, schema.signals, current, kOptions);
+  EXPECT_TRUE(solution.is_within_tolerance);
+  EXPECT_EQ(solution.action.tail<2>(), current.tail<2>());
+}
+
+TEST(PostureTest, ASingularOneCosts) {
+  const BodySchema schema = planar();
+  const auto cost = [&](double b) {
+    return posture_cost(schema, 3, false, schema.signals, Eigen::Vector2d(0, b), kOptions);
+  };
+  EXPECT_EQ(cost(0.5), 0);
+  EXPECT_NEAR(cost(0), 1, 1e-9);  // stretched out
+  EXPECT_GT(cost(0.02), 0);
+  EXPECT_GT(cost(0.98), 0);  // at its limit
+}
+
 }  // namespace
 }  // namespace bodyschema

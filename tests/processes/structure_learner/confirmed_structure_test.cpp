@@ -110,6 +110,32 @@ TEST(ConfirmedStructureTest, NoiseThatWasGuessedFromResidualsIsNotRefutedByThem)
   EXPECT_EQ(confirmed({{1, guessed}}).num_searches, 1);
 }
 
+// A guess is that of some parts: others may have more.
+TEST(ConfirmedStructureTest, AGuessThatNothingSpansWithGrowsUntilTwoStructuresAreTheSame) {
+  const auto guessed = [](LearnedStructure found, double factor) {
+    found.noise_source = NoiseSource::kResiduals;
+    found.options.measurement.noise = Noise{factor * 0.004, factor * 1 * kDegree};
+    return found;
+  };
+  Found found = confirmed({{1, guessed(nothing(), 1)},
+                           {2, guessed(structure({0}, 0.4), 2)},
+                           {4, guessed(structure({0}, 0.1), 4)}});
+  EXPECT_EQ(signals_of(found.structure), std::vector<int>({0}));
+  EXPECT_TRUE(found.is_soft);  // tried first
+  EXPECT_FALSE(found.structure.is_contested);
+  // No marker is as noisy as that.
+  found = confirmed({{1, guessed(nothing(), 1)}, {2, guessed(structure({0}, 0.4), 3)}});
+  EXPECT_FALSE(found.structure.spans());
+  EXPECT_EQ(found.num_searches, 2);
+}
+
+TEST(ConfirmedStructureTest, AJointThatAddsLessThanTheNoiseOfOneSightIsNeverInTheAnswer) {
+  LearnedStructure coupled = structure({0, 0}, 0.9);
+  coupled.search.couplings = {{1, 2, 0, true}};
+  const Found found = confirmed({{1, coupled}, {2, nothing()}});
+  EXPECT_TRUE(found.structure.search.models.empty());
+}
+
 TEST(ConfirmedStructureTest, WhatMoreNoiseDoesNotConnectIsLeftAsItIs) {
   const Found found = confirmed({{1, nothing()}, {2, nothing()}});
   EXPECT_EQ(found.num_searches, 2);

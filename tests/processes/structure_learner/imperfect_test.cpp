@@ -208,6 +208,28 @@ TEST(Couplings, WhatLoadsAndViewsAddIsNoJoint) {
   EXPECT_GE(count_right({.name = "bias", .view_bias_m = 0.003, .view_bias_deg = 1.5}, 5), 4);
 }
 
+// What is systematic of one part alone is more than the noise that all parts' residuals show: no
+// reason for a second joint of a signal, nor for a Gaussian process.
+TEST(Couplings, WhatAGuessOfTheNoiseDoesNotKnowIsNoJoint) {
+  struct Case {
+    Imperfection imperfection;
+    int num_joints;
+    std::uint64_t seed;
+    std::optional<Noise> told;
+  };
+  for (const Case& c :
+       {Case{{.name = "backlash", .backlash_deg = 3}, 7, 5, std::nullopt},
+        Case{{.name = "view", .view_bias_m = 0.003, .view_bias_deg = 1.5}, 2, 6, std::nullopt},
+        Case{{.name = "tags", .placement_m = 0.004, .placement_deg = 2}, 2, 6, std::nullopt},
+        Case{{.name = "size", .tag_size = 0.01}, 2, 0, std::nullopt},
+        Case{{.name = "size", .tag_size = 0.01}, 2, 6, kTold}}) {
+    ImperfectRobot robot(c.num_joints, c.seed < 6, c.imperfection, c.seed);
+    const LearnResult result = learn(robot.signals(), robot.babble(60), options_of(c.told));
+    EXPECT_NE(judge(result.schema, robot.structure()), Rightness::kWrong)
+        << c.imperfection.name << " " << c.seed;
+  }
+}
+
 TEST(SerialCorrelation, NoiseThatLastsIsNoJoint) {
   EXPECT_GE(count_right({.name = "correlation ", .correlation = 0.8}, 6), 5);
 }

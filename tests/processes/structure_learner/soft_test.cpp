@@ -294,7 +294,7 @@ TEST(SoftBodies, ScrewsThatLargeNoiseAllowsGiveWayInAStream) {
   SearchResult found;
   found.records[{0, 1}].num_common = 4000;
   found.models.push_back({0, 1, fit_local_model(start.model, pair, actions, 30, 1e-3).model});
-  connect_soft_parts(samples, actions, {0, 1}, options, &found);
+  connect_soft_parts(samples, actions, {0, 1}, options, true, &found);
   ASSERT_EQ(found.models.size(), 1U);
   const std::vector<int>& soft = found.models[0].soft_signals;
   EXPECT_EQ(std::set<int>(soft.begin(), soft.end()), (std::set<int>{0, 1, 2}));
@@ -305,7 +305,7 @@ TEST(SoftBodies, ScrewsThatLargeNoiseAllowsGiveWayInAStream) {
   const auto hinge = one_joint_start(screen_one_joint(relative_motions(rigid, 200), actions)[0],
                                      rigid, actions, 0.03);
   found.models = {{0, 1, fit_local_model(hinge.model, rigid, actions, 30, 1e-3).model}};
-  connect_soft_parts(samples, actions, {0, 1}, options, &found);
+  connect_soft_parts(samples, actions, {0, 1}, options, true, &found);
   ASSERT_EQ(found.models.size(), 1U);
   EXPECT_TRUE(found.models[0].soft_signals.empty());
 }
