@@ -414,8 +414,11 @@ void check_together(Checker& check, const sample_request_t& m) {
 
 void check_together(Checker& check, const pose_target_t& m) {
   const bool is_pose = m.target_kind == pose_target_t::KIND_POSE;
-  check.require((is_pose || m.target_kind == pose_target_t::KIND_POSITION) == (m.target_part >= 0),
-                "target_part", "does not go with target_kind");
+  const bool is_tag = m.target_kind == pose_target_t::KIND_TAG;
+  check.require(
+      (is_pose || is_tag || m.target_kind == pose_target_t::KIND_POSITION) == (m.target_part >= 0),
+      "target_part", "does not go with target_kind");
+  check.require(is_tag || m.target_tag == 0, "target_tag", "does not go with target_kind");
   const double norm = Eigen::Map<const Eigen::Vector4d>(m.orientation_wxyz).norm();
   check.require(std::abs(norm - (is_pose ? 1 : 0)) <= kUnitTolerance, "orientation_wxyz",
                 is_pose ? "is no unit quaternion" : "does not go with target_kind");

@@ -113,11 +113,11 @@ std::string RigDoor::objection(const marker_poses_t& poses) const {
     return fmt::format("camera '{}' is not '{}'", poses.camera_name, camera_.camera_name);
   }
   for (const marker_pose_t& marker : poses.markers) {
-    const TagPlacement* tag = markers_.find(marker.marker_id);
-    if (!tag) return fmt::format("tag {} is not in markers.yaml", marker.marker_id);
-    if (std::abs(marker.size_m - tag->size_m) > 1e-6) {
+    const std::optional<double> size_m = markers_.size_m(marker.marker_id);
+    if (!size_m) return fmt::format("tag {} is not in markers.yaml", marker.marker_id);
+    if (std::abs(marker.size_m - *size_m) > 1e-6) {
       return fmt::format("tag {} is {} m wide, in markers.yaml {} m", marker.marker_id,
-                         marker.size_m, tag->size_m);
+                         marker.size_m, *size_m);
     }
   }
   return objection_to_calibration(poses.calibration_id,

@@ -29,13 +29,50 @@ const TagPlacement* Markers::find(int tag_id) const {
   return tag != tags.end() && tag->id == tag_id ? &*tag : nullptr;
 }
 
+bool Markers::is_target(int tag_id) const {
+  return std::any_of(target_tags.begin(), target_tags.end(),
+                     [&](const TargetTag& tag) { return tag.id == tag_id; });
+}
+
+std::optional<double> Markers::size_m(int tag_id) const {
+  if (const TagPlacement* tag = find(tag_id)) return tag->size_m;
+  for (const TargetTag& tag : target_tags)
+    if (tag.id == tag_id) return tag.size_m;
+  return std::nullopt;
+}
+
+std::vector<int> Markers::ids() const {
+  std::vector<int> ids;
+  for (const TagPlacement& tag : tags) ids.push_back(tag.id);
+  for (const TargetTag& tag : target_tags) ids.push_back(tag.id);
+  return ids;
+}
+
+namespace {
+
+int tag_id(const Yaml& tag) { return static_cast<int>(tag.integer("id", 0, 586)); }
+double tag_size_m(const Yaml& tag) { return tag.number("size_m", 0.001, 10); }
+
+/// Ascending id, each once.
+template <class Tag>
+void sort_tags(const Yaml& yaml, const char* key, std::vector<Tag>& tags) {
+  std::stable_sort(tags.begin(), tags.end(),
+                   [](const auto& a, const auto& b) { return a.id < b.id; });
+  for (std::size_t i = 1; i < tags.size(); ++i) {
+    if (tags[i].id == tags[i - 1].id)
+      throw yaml.error(key, "tag id " + std::to_string(tags[i].id) + " stands twice");
+  }
+}
+
+}  // namespace
+
 std::vector<TagPlacement> load_tags(const Yaml& yaml) {
   std::vector<TagPlacement> tags;
   std::map<int, int> tags_of_part;
   for (const Yaml& tag : yaml.list("tags")) {
     TagPlacement placement;
-    placement.id = static_cast<int>(tag.integer("id", 0, 586));
-    placement.size_m = tag.number("size_m", 0.001, 10);
+    placement.id = tag_id(tag);
+    placement.size_m = tag_size_m(tag);
     placement.part = static_cast<int>(tag.integer("part", 0, 9999));
     // 'none' is a text, a placement a mapping.
     bool is_none = false;
@@ -47,12 +84,7 @@ std::vector<TagPlacement> load_tags(const Yaml& yaml) {
     ++tags_of_part[placement.part];
     tags.push_back(placement);
   }
-  std::stable_sort(tags.begin(), tags.end(),
-                   [](const auto& a, const auto& b) { return a.id < b.id; });
-  for (std::size_t i = 1; i < tags.size(); ++i) {
-    if (tags[i].id == tags[i - 1].id)
-      throw yaml.error("tags", "tag id " + std::to_string(tags[i].id) + " stands twice");
-  }
+  sort_tags(yaml, "tags", tags);
   for (const TagPlacement& tag : tags) {
     if (!tag.X_BM && tags_of_part[tag.part] > 1) {
       throw yaml.error("tags", "part " + std::to_string(tag.part) +
@@ -62,11 +94,29 @@ std::vector<TagPlacement> load_tags(const Yaml& yaml) {
   return tags;
 }
 
+std::vector<TargetTag> load_target_tags(const Yaml& yaml, const std::vector<TagPlacement>& tags,
+                                        std::map<int, Pose>* X_CM) {
+  std::vector<TargetTag> targets;
+  if (!yaml.has("target_tags")) return targets;
+  for (const Yaml& item : yaml.list("target_tags")) {
+    const TargetTag& target = targets.emplace_back(TargetTag{tag_id(item), tag_size_m(item)});
+    if (X_CM) (*X_CM)[target.id] = item.pose("X_CM");
+    for (const TagPlacement& tag : tags) {
+      if (tag.id == target.id)
+        throw item.error("id", "tag " + std::to_string(tag.id) + " is on part " +
+                                   std::to_string(tag.part) + ", so it is no target");
+    }
+  }
+  sort_tags(yaml, "target_tags", targets);
+  return targets;
+}
+
 Markers load_markers(const std::filesystem::path& rig_folder) {
   const Yaml yaml = Yaml::load(rig_folder / "markers.yaml");
   Markers markers;
   markers.family = yaml.choice("family", {"tag36h11"});
   markers.tags = load_tags(yaml);
+  markers.target_tags = load_target_tags(yaml, markers.tags);
   yaml.finish();
   return markers;
 }

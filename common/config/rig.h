@@ -24,12 +24,24 @@ struct TagPlacement {
   std::optional<Pose> X_BM;
 };
 
+/// A tag on no part of the robot: a part can be brought to it (pose_target_t::KIND_TAG).
+struct TargetTag {
+  int id = 0;
+  double size_m = 0;  ///< side of the black square
+};
+
 /// markers.yaml: which tags there are and which body part each belongs to.
 struct Markers {
-  std::string family;              ///< AprilTag family, e.g. "tag36h11"
-  std::vector<TagPlacement> tags;  ///< ascending id
-  std::vector<int> parts() const;  ///< ascending, each once
+  std::string family;                       ///< AprilTag family, e.g. "tag36h11"
+  std::vector<TagPlacement> tags;           ///< ascending id
+  std::vector<TargetTag> target_tags = {};  ///< ascending id, none of `tags`
+  std::vector<int> parts() const;           ///< ascending, each once
   const TagPlacement* find(int tag_id) const;
+  bool is_target(int tag_id) const;
+  /// Of a part's tag or a target; none: there is no such tag.
+  std::optional<double> size_m(int tag_id) const;
+  /// Of all tags: those of parts, then targets.
+  std::vector<int> ids() const;
 };
 
 /// signals.yaml: the action signals and their limits, and what the rig calls its root and its end
@@ -67,6 +79,10 @@ struct Network {
 
 /// The list `tags` of a mapping, as markers.yaml has it, ascending id. @throws ConfigError.
 std::vector<TagPlacement> load_tags(const Yaml& yaml);
+/// The list `target_tags` of a mapping, which may be missing, ascending id; `tags` are those of the
+/// parts. `X_CM`: where robot.yaml has their poses. @throws ConfigError.
+std::vector<TargetTag> load_target_tags(const Yaml& yaml, const std::vector<TagPlacement>& tags,
+                                        std::map<int, Pose>* X_CM = nullptr);
 /// @throws ConfigError.
 Markers load_markers(const std::filesystem::path& rig_folder);
 Signals load_signals(const std::filesystem::path& rig_folder);

@@ -110,6 +110,58 @@ bool has(const std::vector<Fault>& faults, std::int8_t kind, const std::string& 
   });
 }
 
+/// Why there is nothing by the name or number of a command in this scene, naming what there is.
+std::string unknown_place(const fault_command_t& command, const Scene& scene) {
+  const Robot& robot = scene.robot();
+  const auto id_of = [](const auto& tag) { return std::to_string(tag.id); };
+  const std::string number = std::to_string(command.number);
+  switch (command.fault) {
+    case Command::FAULT_STUCK: {
+      const auto& signals = scene.signals().signals;
+      if (std::any_of(signals.begin(), signals.end(),
+                      [&](const Signal& signal) { return signal.name == command.place; }))
+        return "";
+      return "no signal " + name_of(command.place) + "; there are " +
+             listed(signals, [](const Signal& signal) { return signal.name; });
+    }
+    case Command::FAULT_BEND:
+    case Command::FAULT_DRIFT:
+      if (link_index(robot, command.place) >= 0) return "";
+      return "no link " + name_of(command.place) + "; there are " +
+             listed(robot.links, [](const Link& link) { return link.name; });
+    case Command::FAULT_TOOL: {
+      if (!robot.tool_changer) return "the rig has no tools; robot.yaml may list some";
+      const std::vector<Tool>& tools = robot.tool_changer->tools;
+      if (command.number >= 0 && command.number < static_cast<int>(tools.size())) return "";
+      int count = 0;
+      return "no tool " + number + "; there are " + listed(tools, [&](const Tool& tool) {
+               return std::to_string(count++) + " (" + tool.name + ")";
+             });
+    }
+    case Command::FAULT_MARKER_LOST:
+    case Command::FAULT_MARKER_MOVED:
+      if (scene.markers().find(command.number)) return "";
+      return "no tag " + number + "; there are " + listed(scene.markers().tags, id_of);
+    case Command::FAULT_TARGET:
+      if (scene.markers().is_target(command.number)) return "";
+      return "no target tag " + number +
+             "; target_tags in robot.yaml: " + listed(scene.markers().target_tags, id_of);
+    default:
+      return "";
+  }
+}
+
+/// Fault::fallen of a marker that falls off at X_WM.
+Eigen::Vector3d fallen_from(const Pose& X_WM) {
+  Eigen::Vector2d p = X_WM.translation().head<2>();
+  if (p.norm() < kFallenRadius_m) {
+    p = p.norm() > 1e-6 ? Eigen::Vector2d(kFallenRadius_m * p.normalized())
+                        : Eigen::Vector2d(kFallenRadius_m, 0);
+  }
+  const Eigen::Vector3d x = X_WM.linear().col(0);
+  return {p.x(), p.y(), std::atan2(x.y(), x.x())};
+}
+
 }  // namespace
 
 std::string describe(const Fault& fault, const SceneDescription& as_built) {
@@ -134,6 +186,10 @@ std::string describe(const Fault& fault, const SceneDescription& as_built) {
     case Command::FAULT_CAMERA_BUMP:
       text << "camera-bump";
       break;
+    case Command::FAULT_TARGET:
+      text << "target " << fault.number << " at " << fault.target_m.x() << ' ' << fault.target_m.y()
+           << ' ' << fault.target_m.z() << " m";
+      break;
     default:
       text << "drift " << fault.place << ' ' << fault.amount_deg << " deg per action, "
            << fault.bent_deg << " deg so far";
@@ -143,7 +199,7 @@ std::string describe(const Fault& fault, const SceneDescription& as_built) {
 
 std::string add_fault(const fault_command_t& command, const Scene& scene, const mjData& data,
                       std::vector<Fault>& faults) {
-  const Robot& robot = scene.robot();
+  if (const std::string problem = unknown_place(command, scene); !problem.empty()) return problem;
   Fault fault;
   fault.kind = command.fault;
   fault.place = command.place;
@@ -153,22 +209,11 @@ std::string add_fault(const fault_command_t& command, const Scene& scene, const 
     return other.kind == fault.kind && other.place == fault.place && other.number == fault.number;
   };
   switch (command.fault) {
-    case Command::FAULT_STUCK: {
-      const auto& signals = scene.signals().signals;
-      if (std::none_of(signals.begin(), signals.end(),
-                       [&](const Signal& signal) { return signal.name == fault.place; })) {
-        return "no signal " + name_of(fault.place) + "; there are " +
-               listed(signals, [](const Signal& signal) { return signal.name; });
-      }
+    case Command::FAULT_STUCK:
       std::erase_if(faults, is_same_place);
       break;
-    }
     case Command::FAULT_BEND:
-    case Command::FAULT_DRIFT: {
-      if (link_index(robot, fault.place) < 0) {
-        return "no link " + name_of(fault.place) + "; there are " +
-               listed(robot.links, [](const Link& link) { return link.name; });
-      }
+    case Command::FAULT_DRIFT:
       if (std::abs(fault.amount_deg) > 90) return "more than 90 deg is no bend";
       // A link has one bend: bends add up, and so does what a drift has done before.
       for (Fault& other : faults) {
@@ -181,44 +226,22 @@ std::string add_fault(const fault_command_t& command, const Scene& scene, const 
         return "";
       }
       break;
-    }
-    case Command::FAULT_TOOL: {
-      if (!robot.tool_changer) return "the rig has no tools; robot.yaml may list some";
-      const std::vector<Tool>& tools = robot.tool_changer->tools;
-      if (fault.number < 0 || fault.number >= static_cast<int>(tools.size())) {
-        int count = 0;
-        return "no tool " + std::to_string(fault.number) + "; there are " +
-               listed(tools, [&](const Tool& tool) {
-                 return std::to_string(count++) + " (" + tool.name + ")";
-               });
-      }
+    case Command::FAULT_TOOL:
       std::erase_if(faults, [&](const Fault& other) { return other.kind == fault.kind; });
       if (fault.number == 0) return "";
       break;
-    }
     case Command::FAULT_MARKER_LOST:
-    case Command::FAULT_MARKER_MOVED: {
-      if (!scene.markers().find(fault.number)) {
-        return "no tag " + std::to_string(fault.number) + "; there are " +
-               listed(scene.markers().tags,
-                      [](const TagPlacement& tag) { return std::to_string(tag.id); });
-      }
-      if (has(faults, Command::FAULT_MARKER_LOST, fault.place, fault.number)) {
+    case Command::FAULT_MARKER_MOVED:
+      if (has(faults, Command::FAULT_MARKER_LOST, fault.place, fault.number))
         return "tag " + std::to_string(fault.number) + " has fallen off already";
-      }
-      if (fault.kind == Command::FAULT_MARKER_LOST) {
-        const Pose X_WM = scene.marker_pose(data, fault.number);
-        Eigen::Vector2d p = X_WM.translation().head<2>();
-        if (p.norm() < kFallenRadius_m) {
-          p = p.norm() > 1e-6 ? Eigen::Vector2d(kFallenRadius_m * p.normalized())
-                              : Eigen::Vector2d(kFallenRadius_m, 0);
-        }
-        const Eigen::Vector3d x = X_WM.linear().col(0);
-        fault.fallen = {p.x(), p.y(), std::atan2(x.y(), x.x())};
-      }
+      if (fault.kind == Command::FAULT_MARKER_LOST)
+        fault.fallen = fallen_from(scene.marker_pose(data, fault.number));
       break;
-    }
     case Command::FAULT_CAMERA_BUMP:
+      break;
+    case Command::FAULT_TARGET:
+      std::erase_if(faults, is_same_place);
+      fault.target_m = Eigen::Vector3d(command.target_m);
       break;
     case Command::FAULT_REPAIR:
       faults.clear();
@@ -277,6 +300,9 @@ SceneDescription broken(const SceneDescription& as_built, const std::vector<Faul
         break;
       case Command::FAULT_CAMERA_BUMP:
         robot.X_WC = robot.X_WC * bump(seed, num_bumps++);
+        break;
+      case Command::FAULT_TARGET:
+        robot.X_WM_targets.at(fault.number).translation() = as_built.robot.X_WC * fault.target_m;
         break;
       default:
         break;

@@ -20,6 +20,7 @@ namespace bodyschema {
 //   marker-lost    the plate lies on the floor, face up; X_WB unchanged
 //   marker-moved   the plate sits 0.25 sides and 15° off in its plane; X_WB unchanged
 //   camera-bump    X_WC is off by 20 … 30 mm and 1.5 … 2.5°; nothing else changes
+//   target         no fault: a target tag floats elsewhere, facing as before
 
 /// One fault.
 struct Fault {
@@ -30,6 +31,8 @@ struct Fault {
   double bent_deg = 0;                              ///< drift: so far [deg]
   /// Lost marker: x, y [m] of the marker's frame in the world and yaw [rad] of its x axis.
   Eigen::Vector3d fallen = Eigen::Vector3d::Zero();
+  /// Target: the tag's centre in the frame of the camera as built [m].
+  Eigen::Vector3d target_m = Eigen::Vector3d::Zero();
 };
 
 /// For people: "stuck q3", "bend forearm 5 deg".

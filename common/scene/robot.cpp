@@ -213,7 +213,10 @@ Robot load_robot(const std::filesystem::path& rig_folder, const Signals& signals
     throw yaml.error("parts", "must be the parts of markers.yaml, each once");
   }
 
-  robot.markers = {markers.family, load_tags(yaml)};
+  robot.markers.family = markers.family;
+  robot.markers.tags = load_tags(yaml);
+  robot.markers.target_tags = load_target_tags(yaml, robot.markers.tags, &robot.X_WM_targets);
+  for (auto& [id, X_M] : robot.X_WM_targets) X_M = robot.X_WC * X_M;
   for (const TagPlacement& tag : robot.markers.tags) {
     if (!std::binary_search(parts.begin(), parts.end(), tag.part))
       throw yaml.error("tags", "part " + std::to_string(tag.part) + " is not in parts");

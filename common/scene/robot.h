@@ -2,6 +2,7 @@
 
 #include <Eigen/Core>
 #include <filesystem>
+#include <map>
 #include <optional>
 #include <string>
 #include <utility>
@@ -92,6 +93,7 @@ struct Robot {
   std::vector<Link> links;           ///< parents before children
   std::vector<PartPlacement> parts;  ///< ascending part id
   Markers markers;                   ///< as they truly are
+  std::map<int, Pose> X_WM_targets;  ///< by id: where the target tags float
   /// Links that may touch beside parent and child, which always may.
   std::vector<std::pair<std::string, std::string>> may_touch;
   Eigen::VectorXd home;  ///< action of the start pose, command units

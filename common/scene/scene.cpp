@@ -90,8 +90,8 @@ Eigen::Translation3d plate_offset(double front_m, double thickness_m) {
 // A sheet with the tag, its front face in the marker's plane, and a board behind it that shows a
 // plain back: MuJoCo projects a 2-D texture through a box, so the sheet alone would show the tag
 // mirrored on its back.
-void add_plate(XMLElement* body, const TagPlacement& tag, const Pose& X_LM, bool has_fallen) {
-  const double half_m = tag.size_m * 10 / 8 / 2;
+void add_plate(XMLElement* body, int id, double size_m, const Pose& X_LM, bool touches) {
+  const double half_m = size_m * 10 / 8 / 2;
   const auto add_box = [&](const std::string& name, double front_m, double thickness_m) {
     XMLElement* geom = child(body, "geom");
     set(geom, "name", name);
@@ -101,14 +101,14 @@ void add_plate(XMLElement* body, const TagPlacement& tag, const Pose& X_LM, bool
     set(geom, "mass", "0");
     return geom;
   };
-  XMLElement* sheet = add_box(tag_name(tag.id), 0, kSheetThickness_m);
-  set(sheet, "material", tag_name(tag.id));
+  XMLElement* sheet = add_box(tag_name(id), 0, kSheetThickness_m);
+  set(sheet, "material", tag_name(id));
   set(sheet, "contype", "0");
   set(sheet, "conaffinity", "0");
-  XMLElement* board = add_box(tag_name(tag.id) + "_board", kSheetThickness_m, kBackThickness_m);
+  XMLElement* board = add_box(tag_name(id) + "_board", kSheetThickness_m, kBackThickness_m);
   set(board, "material", "solid");
   set_grey(board, 0.35);
-  if (has_fallen) {
+  if (!touches) {
     set(board, "contype", "0");
     set(board, "conaffinity", "0");
   }
@@ -189,10 +189,10 @@ void add_assets(XMLElement* mujoco, const Robot& robot) {
   XMLElement* floor_material = add_material("floor", "floor", 0);
   set(floor_material, "texrepeat", "12 12");
   add_material("solid", "", 0);
-  for (const TagPlacement& tag : robot.markers.tags) {
-    add_texture(tag_name(tag.id), "2d", "flat", kTagTexels, 1, 1);
+  for (const int id : robot.markers.ids()) {
+    add_texture(tag_name(id), "2d", "flat", kTagTexels, 1, 1);
     // Paper scatters light; without emission a plate in shade would lose its contrast.
-    add_material(tag_name(tag.id), tag_name(tag.id), 0.35);
+    add_material(tag_name(id), tag_name(id), 0.35);
   }
 }
 
@@ -248,8 +248,8 @@ void add_geoms(XMLElement* body, const SceneDescription& description, int i) {
     if (part.link != i) continue;
     for (const TagPlacement& tag : robot.markers.tags) {
       if (tag.part == part.part) {
-        add_plate(body, tag, part.X_LB * tag.X_BM.value_or(Pose::Identity()),
-                  description.fallen_tags.contains(tag.id));
+        add_plate(body, tag.id, tag.size_m, part.X_LB * tag.X_BM.value_or(Pose::Identity()),
+                  !description.fallen_tags.contains(tag.id));
       }
     }
   }
@@ -266,6 +266,8 @@ std::string make_mjcf(const SceneDescription& description) {
   add_assets(mujoco, robot);
   XMLElement* world = child(mujoco, "worldbody");
   add_room(world, robot);
+  for (const TargetTag& tag : robot.markers.target_tags)
+    add_plate(world, tag.id, tag.size_m, robot.X_WM_targets.at(tag.id), false);
   std::vector<XMLElement*> bodies;
   const auto body_of = [&](const std::string& link) {
     for (std::size_t i = 0; i < robot.links.size(); ++i) {

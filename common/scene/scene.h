@@ -30,8 +30,8 @@ struct SceneDescription {
 };
 
 /// A rig folder as a MuJoCo model: robot.yaml's links, joints, servos, solids and tags' plates, a
-/// floor and lights. The simulator steps it, SceneRenderer looks at it, and an experiment
-/// may do without either:
+/// floor, lights and target tags, which float and touch nothing. The simulator steps it,
+/// SceneRenderer looks at it, and an experiment may do without either:
 ///
 ///   const Scene scene("config/arm7");
 ///   SceneRenderer renderer("config/arm7");
@@ -73,7 +73,8 @@ class Scene {
 
   /// X_WB of a part.
   Pose part_pose(const mjData& data, int part_index) const;
-  /// X_WM: the marker's frame as it is now, on its part or fallen. @throws std::out_of_range.
+  /// X_WM: the marker's frame as it is now, on its part, fallen or floating. @throws
+  /// std::out_of_range.
   Pose marker_pose(const mjData& data, int tag_id) const;
   /// SIM_STATE of these poses, every geom but those of tools that are not mounted opaque, utime as
   /// in `data`, seed 0 and action_id -1.

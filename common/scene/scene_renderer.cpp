@@ -128,9 +128,9 @@ struct SceneRenderer::Implementation {
   }
 
   void paint_tags() {
-    for (const TagPlacement& tag : scene.markers().tags) {
-      const int texture = mj_name2id(model.get(), mjOBJ_TEXTURE, tag_name(tag.id).c_str());
-      const cv::Mat bitmap = tag_bitmap(tag.id, kTagTexels / 10);
+    for (const int id : scene.markers().ids()) {
+      const int texture = mj_name2id(model.get(), mjOBJ_TEXTURE, tag_name(id).c_str());
+      const cv::Mat bitmap = tag_bitmap(id, kTagTexels / 10);
       mjtByte* texel = model->tex_rgb + model->tex_adr[texture];
       // MuJoCo's texture has its first row at −y of the box, which is the tag's upper edge (y of
       // the marker points down), and its columns along +x, as the tag's.

@@ -47,6 +47,7 @@ class Check {
     read_files();
     if (rig_.signals && rig_.markers) check_parts();
     if (rig_.camera && rig_.observer) check_frames();
+    if (rig_.camera && rig_.markers) check_target_tags();
     remark_unread_files();
     if (rig_.signals) result_.num_signals = static_cast<int>(rig_.signals->signals.size());
     if (rig_.markers) {
@@ -160,6 +161,18 @@ class Check {
                                          taken, needed))
                       .what());
     }
+  }
+
+  /// The controller waits for these frames of a rest.
+  void check_target_tags() {
+    if (!is_simulated() || rig_.markers->target_tags.empty()) return;
+    const int taken = rig_.camera->simulation->frames_per_action;
+    if (taken >= TagTrack::kFrames) return;
+    add_problem(Yaml::load(folder_ / "camera.yaml")
+                    .section("simulation")
+                    .error("frames_per_action",
+                           fmt::format("target tags need {}, not {}", TagTrack::kFrames, taken))
+                    .what());
   }
 
   void remark_unread_files() {

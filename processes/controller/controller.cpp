@@ -41,6 +41,8 @@ ControllerConfig ControllerConfig::load(const std::filesystem::path& file) {
   ControllerConfig config;
   config.signals = load_signals(file.parent_path()).signals;
   config.measurement = load_noise(file.parent_path()).measurement;
+  for (const TargetTag& tag : load_markers(file.parent_path()).target_tags)
+    config.target_tags.push_back(tag.id);
   config.reached_m = yaml.number("reached_m", 1e-6, 1);
   config.reached_rad = yaml.number("reached_deg", 1e-4, 180) * kDegree;
   config.max_step = yaml.number("max_step", 1e-3, 1);
@@ -75,6 +77,7 @@ ControllerConfig ControllerConfig::load(const std::filesystem::path& file) {
 Controller::Controller(ControllerConfig config) : config_(std::move(config)) {
   target_.target_id = -1;
   target_.target_part = -1;
+  for (const int tag : config_.target_tags) tags_[tag];
 }
 
 // ---- what is told
@@ -175,7 +178,7 @@ Controller::Answer Controller::on_motion_status(const motion_status_t& motion) {
   const bool began_anew = (previous && motion.utime < previous->utime) ||
                           (is_mine && !is_refusal && motion.action_id < last_done_id_);
   if (began_anew) {
-    seen_until_utime_ = position_rest_utime_ = -1;
+    seen_until_utime_ = tracked_until_utime_ = position_rest_utime_ = -1;
     position_.reset();
   }
   bool is_news = false;
@@ -224,6 +227,7 @@ Controller::Answer Controller::on_motion_status(const motion_status_t& motion) {
 
 Controller::Answer Controller::on_marker_poses(const marker_poses_t& poses) {
   see(poses.utime);
+  track(poses);
   return answer(advance());
 }
 

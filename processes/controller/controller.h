@@ -19,6 +19,7 @@
 #include "bodyschema/sample_t.hpp"
 #include "common/config/rig.h"
 #include "processes/controller/inverse_kinematics.h"
+#include "processes/controller/tag_track.h"
 #include "processes/controller/workspace.h"
 
 namespace bodyschema {
@@ -26,6 +27,7 @@ namespace bodyschema {
 struct ControllerConfig {
   std::vector<Signal> signals;
   MeasurementModel measurement;  ///< of noise.yaml
+  std::vector<int> target_tags;  ///< of markers.yaml
   InverseKinematicsOptions inverse_kinematics;
   Workspace workspace;
   /// A target that asks for no tolerance of its own is reached this near, and out of reach if no
@@ -48,7 +50,8 @@ struct ControllerConfig {
   std::int64_t max_marker_poses_silence_us = 0;
   std::int64_t max_body_schema_silence_us = 0;
 
-  /// Reads controller.yaml, and signals.yaml and noise.yaml beside it. @throws ConfigError.
+  /// Reads controller.yaml, and signals.yaml, noise.yaml and markers.yaml beside it.
+  /// @throws ConfigError.
   static ControllerConfig load(const std::filesystem::path& file);
 };
 
@@ -81,6 +84,16 @@ struct ControllerConfig {
 /// and the arm held until another target or a release; nothing is resumed by itself. Silence of the
 /// eyes is not measured by the clock alone: in lock-step the driver's time stands still and so do
 /// the images. They are due when the driver's time has gone on.
+///
+/// A tag as target (KIND_TAG) is a KIND_POSITION target at the mean position of the tag over the
+/// frames of MARKER_POSES (TagTrack) of the present rest, and of those after it, in the root's
+/// frame by the schema's X_CR, or by the root's pose in the newest SAMPLE if the camera was moved
+/// since. A mean that has moved by more than reached_m, or the tolerance if that is less, is aimed
+/// at anew. Before each step the newest frame of that rest must show the tag, except where the
+/// part is within the tolerance and may cover it. If it does not, or shows the tag elsewhere by
+/// more than the noise, HOLD is sent, and the target waits, the arm its own, until
+/// TagTrack::kFrames frames at rest show the tag in one place: there it is served anew. A step that
+/// is under way ends first. A target that was reached does not follow its tag.
 ///
 /// Messages must be of the rig (RigDoor): signals are not compared here.
 ///
@@ -155,9 +168,14 @@ class Controller {
   /// Worst state of the edges between root and target part.
   EdgeState worst_edge(std::string* name = nullptr) const;
 
+  bool is_from_far_ahead(std::int64_t frame_utime) const;
   void see(std::int64_t frame_utime);
+  /// Of the target tags, if the arm was at rest.
+  void track(const marker_poses_t& poses);
   void locate();
   void forget_plan();
+  /// The schema's, or by the sample if the camera was moved since.
+  Pose X_CR_at(const ActionPoseSample& sample) const;
   void observe(const sample_t& sample);
   void update_predicted_errors();
 
@@ -166,6 +184,10 @@ class Controller {
   /// Waits until the arm is free, by the clock.
   Command take(std::int64_t now_us);
   Command step();
+  /// Aims at the target's tag. False: it must be seen first.
+  bool aim_at_tag();
+  /// Holds if the tag was aimed at.
+  Command wait_for_tag();
   /// The action that the monitor wants to see, one for each signal and within its limits.
   std::optional<Eigen::VectorXd> wanted_probe() const;
   Command probe(const Eigen::VectorXd& action);
@@ -199,6 +221,9 @@ class Controller {
   std::optional<BodySchema> schema_;
   std::optional<model_health_t> health_;
   std::int64_t seen_until_utime_ = -1;       ///< newest frame
+  std::map<int, TagTrack> tags_;             ///< target tags, by id
+  std::int64_t tracked_until_utime_ = -1;    ///< newest frame in tags_
+  std::int64_t tracked_rest_utime_ = -1;     ///< and its rest
   std::optional<Eigen::VectorXd> position_;  ///< of the present rest, command units
   std::int64_t position_rest_utime_ = -1;
   Stopwatch motion_silence_, eyes_silence_, schema_silence_;
@@ -212,6 +237,7 @@ class Controller {
   std::string why_ = "no target was given since the start";
   bool is_taken_ = false;
   Eigen::Vector3d aim_ = Eigen::Vector3d::Zero();  ///< target, corrected by what was seen
+  std::optional<int> tag_place_;                   ///< of the target's tag: TagTrack::place()
   std::optional<Eigen::VectorXd> goal_;            ///< action that brings the part to aim_
   std::vector<Eigen::VectorXd> rejected_;          ///< goals the driver would not go to
   std::string rejection_;

@@ -1,10 +1,12 @@
 // What class Controller knows of the arm, of what is seen of it and of the schema.
 
 #include <Eigen/Cholesky>
+#include <utility>
 
 #include "common/bus/convert.h"
 #include "common/bus/rest_position.h"
 #include "common/estimation/chi_square.h"
+#include "common/text/text.h"
 #include "processes/controller/controller.h"
 #include "processes/controller/controller_words.h"
 
@@ -30,7 +32,9 @@ bool Controller::is_active() const {
 std::string Controller::unheard() const {
   if (!motion_) return "MOTION_STATUS: does the driver run?";
   if (!schema_) return "BODY_SCHEMA: nothing was learned yet, or does model_monitor run?";
-  if (is_at_rest() && seen_until_utime_ < motion_->rest_since_utime) {
+  const bool needs_tags = target_.target_kind == pose_target_t::KIND_TAG;
+  const std::int64_t known_until_utime = needs_tags ? tracked_until_utime_ : seen_until_utime_;
+  if (is_at_rest() && known_until_utime < motion_->rest_since_utime) {
     return "MARKER_POSES of the arm at rest: do camera and marker_estimator run?";
   }
   return "";
@@ -58,16 +62,42 @@ std::string Controller::silence(std::int64_t now_us) {
   return "";
 }
 
+bool Controller::is_from_far_ahead(std::int64_t frame_utime) const {
+  return frame_utime > motion_->utime + config_.max_motion_status_silence_us +
+                           config_.max_marker_poses_silence_us;
+}
+
 void Controller::see(std::int64_t frame_utime) {
   // A frame from far ahead would make the eyes look open for ever.
-  if (!motion_ || frame_utime > motion_->utime + config_.max_motion_status_silence_us +
-                                    config_.max_marker_poses_silence_us) {
-    return;
-  }
+  if (!motion_ || is_from_far_ahead(frame_utime)) return;
   if (frame_utime <= seen_until_utime_) return;
   seen_until_utime_ = frame_utime;
   if (motion_->utime - frame_utime <= config_.max_marker_poses_silence_us) {
     eyes_silence_.restart();
+  }
+}
+
+void Controller::track(const marker_poses_t& poses) {
+  if (!motion_ || !is_at_rest() || poses.utime < motion_->rest_since_utime ||
+      poses.utime <= tracked_until_utime_ || is_from_far_ahead(poses.utime))
+    return;
+  tracked_until_utime_ = poses.utime;
+  const bool is_new_rest =
+      std::exchange(tracked_rest_utime_, motion_->rest_since_utime) != motion_->rest_since_utime;
+  const bool is_serving = is_active() && state_ != S::CONTROL_REACHED && tag_place_;
+  for (auto& [id, track] : tags_) {
+    if (is_new_rest && !(is_serving && id == target_.target_tag)) track = TagTrack();
+    std::optional<TagTrack::Sight> sight;
+    for (const marker_pose_t& marker : poses.markers) {
+      if (marker.marker_id != id) continue;
+      PartObservation tag;
+      tag.X_CB = from_message(marker.X_CM[0]);
+      tag.covariance = from_message(marker.covariance);
+      const Eigen::Matrix3d R_CM = tag.X_CB.linear();
+      const Matrix6d covariance = config_.measurement.covariance(tag);
+      sight = {tag.X_CB.translation(), R_CM * covariance.topLeftCorner<3, 3>() * R_CM.transpose()};
+    }
+    track.see(sight);
   }
 }
 
@@ -109,6 +139,15 @@ void Controller::update_predicted_errors() {
     predicted_error_rad_ = q_RT->angularDistance(Eigen::Quaterniond(X_RB->X_AB.linear()));
 }
 
+Pose Controller::X_CR_at(const ActionPoseSample& sample) const {
+  // One view of the root is worse than the schema's mean over all: half a degree is 9 mm at 1 m.
+  const PartObservation* root = sample.find(schema_->root);
+  if (root == nullptr || !root->has_rotation) return schema_->X_CR;
+  const Vector6d off = log(schema_->X_CR.inverse() * root->X_CB);
+  const Matrix6d covariance = config_.measurement.covariance(*root) + schema_->X_CR_covariance;
+  return squared_mahalanobis(off, covariance) > kMovedCamera ? root->X_CB : schema_->X_CR;
+}
+
 void Controller::observe(const sample_t& message) {
   observed_error_m_ = observed_error_rad_ = -1;
   if (!schema_) return;
@@ -116,14 +155,7 @@ void Controller::observe(const sample_t& message) {
   drop_moved_tags(schema_->moved_tags, &sample);
   const PartObservation* part = sample.find(target_.target_part);
   if (part == nullptr) return;
-  // One view of the root is worse than the schema's mean over all: half a degree is 9 mm at 1 m.
-  // Unless the camera was moved since.
-  Pose X_CR = schema_->X_CR;
-  if (const PartObservation* root = sample.find(schema_->root); root && root->has_rotation) {
-    const Vector6d off = log(X_CR.inverse() * root->X_CB);
-    const Matrix6d covariance = config_.measurement.covariance(*root) + schema_->X_CR_covariance;
-    if (squared_mahalanobis(off, covariance) > kMovedCamera) X_CR = root->X_CB;
-  }
+  const Pose X_CR = X_CR_at(sample);
   const Pose X_RB_seen = X_CR.inverse() * part->X_CB;
   observed_offset_ = position_of(target_) - X_RB_seen.translation();
   observed_error_m_ = observed_offset_.norm();
@@ -202,6 +234,12 @@ std::string Controller::objection() const {
   if (target_.target_kind == pose_target_t::KIND_POSE && !schema_->has_rotation(part)) {
     return "of part " + std::to_string(part) +
            " positions alone are known, no orientation: give a position";
+  }
+  if (target_.target_kind == pose_target_t::KIND_TAG && !tags_.contains(target_.target_tag)) {
+    return "tag " + std::to_string(target_.target_tag) + " is not in target_tags of markers.yaml" +
+           (tags_.empty() ? ", which has none" : ": " + listed(tags_, [](const auto& tag) {
+                                                   return std::to_string(tag.first);
+                                                 }));
   }
   return "";
 }

@@ -70,6 +70,7 @@ Controller::Answer Controller::on_pose_target(const pose_target_t& target,
   floor_id_ = target.target_id;
   target_ = target;
   aim_ = position_of(target);
+  tag_place_.reset();
   forget_plan();
   num_moves_ = num_probes_ = num_corrections_ = num_searches_ = 0;
   predicted_error_m_ = predicted_error_rad_ = observed_error_m_ = observed_error_rad_ = -1;
@@ -125,6 +126,7 @@ Controller::Command Controller::advance() {
   }
   // Until the arm is taken, on_tick goes on.
   if (!is_taken_ || !silent_.empty() || !is_at_rest() || !position_) return std::nullopt;
+  if (target_.target_kind == pose_target_t::KIND_TAG && !aim_at_tag()) return wait_for_tag();
   if (is_invalid) return search(edge);
   if (const auto action = wanted_probe()) return probe(*action);
   return step();
@@ -158,6 +160,41 @@ Controller::Command Controller::take(std::int64_t now_us) {
   }
   is_taken_ = true;
   return advance();
+}
+
+bool Controller::aim_at_tag() {
+  const TagTrack& tag = tags_.at(target_.target_tag);
+  if (tag_place_) update_predicted_errors();
+  const bool may_be_covered =
+      tag_place_ && predicted_error_m_ >= 0 && predicted_error_m_ <= tolerance_m();
+  if (!tag.is_seen() && may_be_covered) return true;
+  if (!tag.is_known() || (tag_place_ && *tag_place_ != tag.place())) return false;
+  Pose X_CR = schema_->X_CR;
+  if (sample_) {
+    ActionPoseSample sample = from_message(*sample_);
+    drop_moved_tags(schema_->moved_tags, &sample);
+    X_CR = X_CR_at(sample);
+  }
+  const Eigen::Vector3d p_RM = X_CR.inverse() * tag.p_CM();
+  const double moved_m = (p_RM - position_of(target_)).norm();
+  if (!tag_place_ || moved_m > std::min(tolerance_m(), config_.reached_m)) {
+    tag_place_ = tag.place();
+    std::copy(p_RM.begin(), p_RM.end(), target_.position_m);
+    aim_ = p_RM;
+    forget_plan();
+  }
+  return true;
+}
+
+Controller::Command Controller::wait_for_tag() {
+  const bool was_aimed_at = tag_place_.has_value();
+  tag_place_.reset();
+  forget_plan();
+  enter(S::CONTROL_WAITING, true,
+        "target tag " + std::to_string(target_.target_tag) + " " +
+            tags_.at(target_.target_tag).account() + ": the arm holds until " +
+            std::to_string(TagTrack::kFrames) + " frames at rest show it in one place");
+  return was_aimed_at ? send_hold() : std::nullopt;
 }
 
 Controller::Command Controller::step() {

@@ -115,8 +115,8 @@ std::optional<marker_poses_t> MarkerEstimator::on_camera_image(const camera_imag
   ++num_images_;
   std::vector<marker_pose_t> markers;
   for (const TagDetection& detection : detector_.detect(*grey)) {
-    const TagPlacement* tag = markers_.find(detection.id);
-    if (!tag) {
+    const std::optional<double> size_m = markers_.size_m(detection.id);
+    if (!size_m) {
       ++counters_["tag not in markers.yaml"];
       continue;
     }
@@ -124,7 +124,7 @@ std::optional<marker_poses_t> MarkerEstimator::on_camera_image(const camera_imag
       ++counters_["tag seen twice"];
       continue;
     }
-    if (const auto marker = estimate(*grey, detection, tag->size_m)) markers.push_back(*marker);
+    if (const auto marker = estimate(*grey, detection, *size_m)) markers.push_back(*marker);
   }
   marker_poses_t poses;
   poses.utime = image.utime;

@@ -237,6 +237,7 @@ sample_t Observer::sample_from(const Rest& rest, const std::vector<const marker_
   std::map<int, std::set<const marker_poses_t*>> frames_of_part;
   for (const marker_poses_t* frame : frames) {
     for (const marker_pose_t& marker : frame->markers) {
+      if (markers_.is_target(marker.marker_id)) continue;  // the controller's
       const TagPlacement* tag = markers_.find(marker.marker_id);
       if (!tag) {
         ++counters_["tag not in markers.yaml"];

@@ -23,6 +23,9 @@ std::string markers_text(const Markers& markers) {
   for (const TagPlacement& tag : markers.tags)
     text += fmt::format("  - {{id: {}, size_m: {}, part: {}, placement: {}}}\n", tag.id, tag.size_m,
                         tag.part, placement_text(tag.X_BM));
+  if (!markers.target_tags.empty()) text += "target_tags:\n";
+  for (const TargetTag& tag : markers.target_tags)
+    text += fmt::format("  - {{id: {}, size_m: {}}}\n", tag.id, tag.size_m);
   return text;
 }
 

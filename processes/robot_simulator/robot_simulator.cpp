@@ -399,7 +399,8 @@ void RobotSimulator::save(const std::filesystem::path& file) const {
     text << "  - {kind: " << int{fault.kind} << ", place: " << yaml_quoted(fault.place)
          << ", number: " << fault.number
          << ", amount_bent_deg: " << yaml_list({fault.amount_deg, fault.bent_deg})
-         << ", fallen: " << yaml_list({fault.fallen.begin(), fault.fallen.end()}) << "}\n";
+         << ", fallen: " << yaml_list({fault.fallen.begin(), fault.fallen.end()})
+         << ", target_m: " << yaml_list({fault.target_m.begin(), fault.target_m.end()}) << "}\n";
   }
   text << "fault_answer: " << yaml_quoted(fault_answer_) << "\n"
        << "served_faults:" << (served_faults_.empty() ? " []" : "") << "\n";
@@ -442,13 +443,14 @@ void RobotSimulator::restore_from(const Yaml& yaml) {
   std::vector<Fault> faults;
   for (const Yaml& item : yaml.list("faults")) {
     Fault fault;
-    fault.kind = static_cast<std::int8_t>(item.integer("kind", 0, fault_command_t::FAULT_DRIFT));
+    fault.kind = static_cast<std::int8_t>(item.integer("kind", 0, fault_command_t::FAULT_TARGET));
     fault.place = item.text("place");
     fault.number = static_cast<int>(item.integer("number", -1, 1'000'000));
     const std::vector<double> amounts = item.numbers("amount_bent_deg", 2);
     fault.amount_deg = amounts[0];
     fault.bent_deg = amounts[1];
     fault.fallen = item.vector3("fallen");
+    fault.target_m = item.vector3("target_m");
     faults.push_back(fault);
   }
   const std::string fault_answer = yaml.text("fault_answer");

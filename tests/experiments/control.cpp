@@ -1,7 +1,8 @@
 // control: Table 2 of the chapter, with the code that runs. A 4-DOF arm follows 30 way points
 // twice, whole and with its middle link bent by 45° before the first, by a schema that stays as it
 // was or one that is adapted. Prints Markdown: errors of the true end effector at the way points,
-// and the mean error at each of them with --along.
+// and the mean error at each of them with --along. Then the control of Fig. 10: a 2-DOF arm, with
+// targets without noise and with a marker as target.
 //
 //   ./run experiment control [--runs 20] [--along]
 
@@ -11,6 +12,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <random>
 #include <string>
 #include <vector>
 
@@ -204,6 +206,71 @@ std::string cell(const Result& result, int from, int to) {
                      1e3 * std::sqrt(sum / static_cast<double>(all.size())));
 }
 
+/// Rms over the targets of one run [m]; moves per target.
+struct TwoDof {
+  std::vector<double> errors_m, moves;
+  int num_not_reached = 0;
+};
+
+/// Fig. 10: the 2-DOF arm in the chapter's noise is brought to where random actions bring it.
+TwoDof measure_two_dof(bool is_marker, int num_runs, const std::string& rig) {
+  constexpr int kTwoDofSamples = 30, kTargets = 20;
+  constexpr Regime kRegime = Regime::kChapter;
+  // What two joints reach is a surface: by a learned schema, another one.
+  constexpr double kNearestApproach_m = 0.5;
+  TwoDof result;
+  for (int run = 1; run <= num_runs; ++run) {
+    Rng rng(static_cast<Rng::result_type>(run));
+    const SyntheticRobot robot = chapter_robot("a", rng);
+    const auto samples =
+        babble(robot, kTwoDofSamples, {.regime = kRegime, .with_covariances = true}, rng);
+    LearnOptions learning;
+    learning.measurement = adaptation_options(kRegime).measurement;
+    SteeredArm arm(robot, learn(robot.signals, samples, learning).schema, rig,
+                   {.regime = kRegime,
+                    .adapts = false,
+                    .tolerance_m = kNearestApproach_m,
+                    .seed = static_cast<std::uint64_t>(run)});
+    double sum = 0;
+    int num_reached = 0;
+    for (int n = 0; n < kTargets; ++n) {
+      Eigen::VectorXd action(robot.signals.size());
+      for (std::size_t s = 0; s < robot.signals.size(); ++s)
+        action[static_cast<Eigen::Index>(s)] =
+            std::uniform_real_distribution(robot.signals[s].lower, robot.signals[s].upper)(rng);
+      const auto X_CB = robot.poses_in_camera(action);
+      const Eigen::Vector3d p_RT = (X_CB.at(kRoot).inverse() * X_CB.at(kEndEffector)).translation();
+      const auto [status, error_m] =
+          is_marker ? arm.go_to_tag(kEndEffector, p_RT) : arm.go_to(kEndEffector, p_RT);
+      if (status.control_state != control_status_t::CONTROL_REACHED) continue;
+      ++num_reached;
+      sum += error_m * error_m;
+    }
+    result.num_not_reached += kTargets - num_reached;
+    if (num_reached > 0) result.errors_m.push_back(std::sqrt(sum / num_reached));
+    result.moves.push_back(static_cast<double>(arm.moves().size()) / kTargets);
+  }
+  return result;
+}
+
+void print_two_dof(int num_runs, const std::string& rig) {
+  fmt::print(
+      "\n| target of the 2-DOF arm | rms error [mm] | moves a target | not reached |\n"
+      "|---|---|---|---|\n");
+  for (const bool is_marker : {false, true}) {
+    const TwoDof result = measure_two_dof(is_marker, num_runs, rig);
+    double spread = 0;
+    for (const double error_m : result.errors_m)
+      spread += std::pow(error_m - mean(result.errors_m), 2);
+    fmt::print("| {} | {:.1f} ± {:.1f} | {:.1f} | {} |\n",
+               is_marker ? "the same with a target marker instead of a noise-free target"
+                         : "Fig. 10 control, 2-DOF, chapter noise, N = 30",
+               1e3 * mean(result.errors_m),
+               1e3 * std::sqrt(spread / static_cast<double>(result.errors_m.size())),
+               mean(result.moves), result.num_not_reached);
+  }
+}
+
 void print_along(const std::vector<Case>& cases, const std::vector<Result>& results) {
   fmt::print("\n| way point |");
   for (const Case& test : cases) fmt::print(" {} [mm] |", test.name);
@@ -243,7 +310,7 @@ int main(int argc, char** argv) {
   bool is_along = false;
   std::string plot_file;
   std::string rig = std::string(BODYSCHEMA_CONFIG) + "/arm4";
-  CLI::App app("Table 2: an arm of four joints follows a path, whole and bent");
+  CLI::App app("Table 2: an arm of four joints follows a path, whole and bent; control of Fig. 10");
   app.add_option("--runs", num_runs, "Arms of other geometry")->check(CLI::PositiveNumber);
   app.add_option("--rig", rig, "Folder of controller.yaml and model_monitor.yaml");
   app.add_flag("--along", is_along, "Also the mean error at each way point");
@@ -271,5 +338,6 @@ int main(int argc, char** argv) {
     std::fflush(stdout);
   }
   if (is_along) print_along(cases, results);
+  print_two_dof(num_runs, rig);
   if (!plot_file.empty()) draw_png(plot_along(cases, results), plot_file);
 }

@@ -662,6 +662,10 @@ TEST_F(BodyschemaProgramTest, ExitCodesTellWrongUsageFromABadInput) {
            {"learn", csv, "--method", "magic"},
            {"target"},
            {"target", "--part", "-1", "--position", "0", "0", "0"},
+           {"target", "--part", "1"},
+           {"target", "--part", "1", "--tag", "40", "--position", "0", "0", "0"},
+           {"target", "--part", "1", "--tag", "40", "--orientation", "1", "0", "0", "0"},
+           {"target", "--part", "1", "--orientation", "1", "0", "0", "0"},
            {"target", "--part", "1", "--position", "0", "0"},
            {"target", "--part", "1", "--position", "0", "0", std::string(309, '9')},
            {"target", "--part", "1", "--position", "nan", "0", "0"},
@@ -670,6 +674,7 @@ TEST_F(BodyschemaProgramTest, ExitCodesTellWrongUsageFromABadInput) {
            {"target", "--part", "1", "--position", "0", "0", "0", "--keep", "inf"},
            {"log"},
            {"status", "--seconds", "0"},
+           {"fault", "target", "40", "0", "0"},
            {"fault", "melt"}}) {
     const Outcome outcome = run(wrong);
     EXPECT_EQ(outcome.exit_code, 2) << Json(wrong) << outcome.err;
@@ -715,6 +720,7 @@ TEST_F(BodyschemaProgramTest, StopDoesNothingButSayWhichIsMeant) {
 TEST_F(BodyschemaProgramTest, WhereNobodyIsOnTheBusEveryCommandEndsAtOnceAndSaysWhatToType) {
   for (const std::vector<std::string>& command :
        std::vector<std::vector<std::string>>{{"target", "--part", "1", "--position", "0", "0", "0"},
+                                             {"target", "--part", "1", "--tag", "40"},
                                              {"hold"},
                                              {"release"},
                                              {"halt"},

@@ -239,6 +239,25 @@ TEST_F(RigCheckTest, AsManyFramesMustBeTakenAsASampleNeeds) {
   EXPECT_NE(problem_with("observer.yaml", "frames_per_sample: 2", "frames_per_sample: 3"), "");
 }
 
+TEST_F(RigCheckTest, TargetTagsAreCheckedAndNeedTwoFramesOfARest) {
+  const std::string target = "target_tags:\n  - {id: 40, size_m: 0.1}\ntags:";
+  EXPECT_EQ(problem_with("markers.yaml", "tags:", "target_tags:\n  - {id: 19, size_m: 0.1}\ntags:"),
+            "markers.yaml:5: target_tags[0].id: tag 19 is on part 5, so it is no target");
+  restore();
+  std::string observer = text("observer.yaml");
+  const std::string two = "frames_per_sample: 2";
+  write("observer.yaml", observer.replace(observer.find(two), two.size(), "frames_per_sample: 1"));
+  std::string markers = text("markers.yaml");
+  write("markers.yaml", markers.replace(markers.find("tags:"), 5, target));
+  EXPECT_EQ(check_rig(copy_).problems, std::vector<std::string>{});
+  std::string camera = text("camera.yaml");
+  const std::string taken = "frames_per_action: 2";
+  write("camera.yaml", camera.replace(camera.find(taken), taken.size(), "frames_per_action: 1"));
+  EXPECT_EQ(check_rig(copy_).problems,
+            std::vector<std::string>{(copy_ / "camera.yaml:10: ").string() +
+                                     "simulation.frames_per_action: target tags need 2, not 1"});
+}
+
 TEST_F(RigCheckTest, EveryFileIsReadByItsOwnProcess) {
   EXPECT_EQ(problem_with("motor_babbler.yaml", "choice: random", "choice: smart"),
             "motor_babbler.yaml:1: choice: 'smart' is none of: active, random");

@@ -1,6 +1,8 @@
 #include "tests/support/steered_arm.h"
 
+#include <Eigen/Cholesky>
 #include <algorithm>
+#include <random>
 #include <stdexcept>
 #include <utility>
 
@@ -14,6 +16,8 @@ using S = control_status_t;
 
 constexpr std::int64_t kTick_us = 100'000;
 constexpr std::int64_t kPatience_us = 600'000'000;
+constexpr std::int64_t kFrame_us = 33'333;
+constexpr int kTag = 40;
 
 ControllerConfig controller_config(const std::filesystem::path& rig, const SyntheticRobot& robot,
                                    const SteeredArm::Options& options) {
@@ -21,6 +25,7 @@ ControllerConfig controller_config(const std::filesystem::path& rig, const Synth
   config.signals = robot.signals;
   config.measurement = adaptation_options(options.regime).measurement;
   config.max_corrections = options.max_corrections;
+  config.target_tags = {kTag};
   return config;
 }
 
@@ -61,13 +66,31 @@ Eigen::Vector3d SteeredArm::position(int part) const {
 
 SteeredArm::Arrival SteeredArm::go_to(int part, const Eigen::Vector3d& p_RT) {
   pose_target_t target{};
-  target.sender = "test";
-  target.epoch = 1;
-  target.target_id = num_targets_++;
   target.target_kind = pose_target_t::KIND_POSITION;
   target.target_part = part;
   std::copy(p_RT.begin(), p_RT.end(), target.position_m);
+  return serve(target, p_RT);
+}
+
+SteeredArm::Arrival SteeredArm::go_to_tag(int part, const Eigen::Vector3d& p_RT) {
+  // Who puts it there takes a second, so that no frame mixes before and after.
+  motion_.utime += 1'000'000;
+  motion_.rest_since_utime = motion_.utime;
+  p_RM_ = p_RT;
+  tell();
+  pose_target_t target{};
+  target.target_kind = pose_target_t::KIND_TAG;
+  target.target_part = part;
+  target.target_tag = kTag;
+  return serve(target, p_RT);
+}
+
+SteeredArm::Arrival SteeredArm::serve(pose_target_t target, const Eigen::Vector3d& p_RT) {
+  target.sender = "test";
+  target.epoch = 1;
+  target.target_id = num_targets_++;
   target.keep_s = -1;
+  target.tolerance_m = options_.tolerance_m;
   take(controller_.on_pose_target(target));
   const std::int64_t end_us = now_us_ + kPatience_us;
   const auto has_ended = [&] {
@@ -82,7 +105,7 @@ SteeredArm::Arrival SteeredArm::go_to(int part, const Eigen::Vector3d& p_RT) {
     take(controller_.on_tick(now_us_));
     now_us_ += kTick_us;
   }
-  return {status_, (position(part) - p_RT).norm()};
+  return {status_, (position(target.target_part) - p_RT).norm()};
 }
 
 void SteeredArm::take(const Controller::Answer& answer) {
@@ -93,11 +116,37 @@ void SteeredArm::take(const Controller::Answer& answer) {
 /// What repeats once a second.
 void SteeredArm::tell() {
   take(controller_.on_motion_status(motion_));
-  marker_poses_t frame{};
-  frame.utime = motion_.utime + kTick_us;
-  take(controller_.on_marker_poses(frame));
+  if (p_RM_) {
+    show_tag();
+  } else {
+    marker_poses_t frame{};
+    frame.utime = motion_.utime + kTick_us;
+    take(controller_.on_marker_poses(frame));
+  }
   take(controller_.on_body_schema(options_.adapts ? *monitor_.schema() : first_schema_));
   if (options_.adapts) take(controller_.on_model_health(monitor_.health()));
+}
+
+void SteeredArm::show_tag() {
+  const Matrix6d covariance = isotropic(nominal_noise(options_.regime));
+  const Matrix6d factor = covariance.llt().matrixL();
+  Pose X_RM = Pose::Identity();
+  X_RM.translation() = *p_RM_;
+  const Pose X_CM = robot_.poses_in_camera(position_).at(first_schema_.root_part) * X_RM;
+  std::normal_distribution<double> normal;
+  for (int n = 0; n < TagTrack::kFrames; ++n) {
+    Vector6d noise;
+    for (double& value : noise) value = normal(rng_);
+    marker_poses_t frame{};
+    frame.utime = motion_.utime + kTick_us + n * kFrame_us;
+    marker_pose_t marker{};
+    marker.marker_id = kTag;
+    marker.num_hypotheses = 1;
+    marker.X_CM[0] = marker.X_CM[1] = to_message(Pose(X_CM * exp(Vector6d(factor * noise))));
+    to_message(covariance, marker.covariance);
+    set_array(frame.num_markers, frame.markers, {marker});
+    take(controller_.on_marker_poses(frame));
+  }
 }
 
 void SteeredArm::serve(const action_command_t& command) {

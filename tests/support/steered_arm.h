@@ -3,6 +3,7 @@
 #include <Eigen/Core>
 #include <cstdint>
 #include <filesystem>
+#include <optional>
 #include <vector>
 
 #include "processes/controller/controller.h"
@@ -19,6 +20,7 @@ class SteeredArm {
     Regime regime = Regime::kTag;
     bool adapts = true;       ///< else the schema stays as it was
     int max_corrections = 0;  ///< by what is seen at a target's end
+    double tolerance_m = 0;   ///< of targets; 0: as controller.yaml says
     std::uint64_t seed = 1;
   };
   /// How a target ended.
@@ -35,6 +37,8 @@ class SteeredArm {
   void set_robot(SyntheticRobot robot) { robot_ = std::move(robot); }
   /// Serves one target [m, root's frame] until it is reached, refused or held.
   Arrival go_to(int part, const Eigen::Vector3d& p_RT);
+  /// The same with a target tag there, which each rest shows in two frames with the regime's noise.
+  Arrival go_to_tag(int part, const Eigen::Vector3d& p_RT);
   /// By the truth [m, root's frame].
   Eigen::Vector3d position(int part) const;
   /// Commands so far.
@@ -42,6 +46,8 @@ class SteeredArm {
   const model_health_t& health() const { return monitor_.health(); }
 
  private:
+  Arrival serve(pose_target_t target, const Eigen::Vector3d& p_RT);
+  void show_tag();
   void take(const Controller::Answer& answer);
   void tell();
   void serve(const action_command_t& command);
@@ -56,6 +62,7 @@ class SteeredArm {
   motion_status_t motion_{};
   control_status_t status_{};
   std::vector<action_command_t> moves_, unanswered_;
+  std::optional<Eigen::Vector3d> p_RM_;  ///< target tag
   std::int64_t now_us_ = 0, num_samples_ = 0, num_targets_ = 0;
 };
 

@@ -1,11 +1,13 @@
 #include <fmt/format.h>
 
+#include <algorithm>
 #include <chrono>
 #include <cmath>
 #include <cstdlib>
 #include <memory>
 #include <optional>
 #include <stdexcept>
+#include <vector>
 
 #include "common/bus/bus.h"
 #include "common/text/clock.h"
@@ -20,10 +22,12 @@ using SteadyClock = std::chrono::steady_clock;
 struct FaultArguments {
   std::string in = default_url();
   bool json = false;
+  std::vector<double> target_m;
   fault_command_t command{};
 };
 
 void inject(FaultArguments& arguments) {
+  std::copy(arguments.target_m.begin(), arguments.target_m.end(), arguments.command.target_m);
   fault_command_t& command = arguments.command;
   command.utime = command.epoch = wall_clock_us();
   command.sender = "console";
@@ -114,6 +118,15 @@ void add_fault_command(Arguments console) {
       add_place(add("drift", "A link bends more with each action; 0 ends it", Command::FAULT_DRIFT),
                 "LINK", "Name in robot.yaml"),
       "DEG_PER_SAMPLE", "Angle an action [deg]");
+  Arguments target =
+      add("target", "No fault: a target tag is put elsewhere", Command::FAULT_TARGET);
+  add_number(target, "ID", "Of target_tags in robot.yaml");
+  target
+      .add_option("POSITION", arguments->target_m,
+                  "X Y Z of its centre in the camera's frame as built [m]")
+      .required()
+      .expected(3)
+      .in_range(-1000.0, 1000.0);
   add("repair", "As built", Command::FAULT_REPAIR);
 }
 

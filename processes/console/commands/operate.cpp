@@ -24,6 +24,7 @@ namespace {
 struct OperateArguments {
   std::string in = default_url();
   int part = -1;
+  std::optional<int> tag;
   std::vector<double> position_m, orientation;
   double keep_s = -1;
   double timeout_s = 120;
@@ -32,9 +33,12 @@ struct OperateArguments {
 };
 
 void run_target(const OperateArguments& arguments) {
-  const bool is_pose = !arguments.orientation.empty();
-  pose_target_t target =
-      make_target(is_pose ? pose_target_t::KIND_POSE : pose_target_t::KIND_POSITION);
+  if (arguments.tag.has_value() != arguments.position_m.empty())
+    refuse_argument("target", "expected --position X Y Z or --tag ID");
+  pose_target_t target = make_target(arguments.tag                   ? pose_target_t::KIND_TAG
+                                     : arguments.orientation.empty() ? pose_target_t::KIND_POSITION
+                                                                     : pose_target_t::KIND_POSE);
+  target.target_tag = arguments.tag.value_or(0);
   target.target_part = arguments.part;
   std::copy(arguments.position_m.begin(), arguments.position_m.end(), target.position_m);
   std::copy(arguments.orientation.begin(), arguments.orientation.end(), target.orientation_wxyz);
@@ -62,7 +66,11 @@ void run_target(const OperateArguments& arguments) {
             << "\n";
   if (follower.end() != TargetFollower::End::kAsked) fail();
   if (arguments.keep_s < 0)
-    std::cerr << "The arm stays there until: " << to_type("release") << "\n";
+    std::cerr << "The arm stays there until: " << to_type("release")
+              << (arguments.tag ? "; it does not follow the tag: where that was moved, give the "
+                                  "target again"
+                                : "")
+              << "\n";
 }
 
 void run_hold(const OperateArguments& arguments) {
@@ -155,17 +163,20 @@ void add_operate_commands(Arguments console) {
     command.callback([arguments, run] { run(*arguments); });
     return command;
   };
-  Arguments target = add("target", "Bring a body part to a position or a pose", run_target);
+  Arguments target = add("target", "Bring a body part to a position, a pose or a tag", run_target);
   target.add_option("--part", arguments->part, "Body part").required().in_range(0, 9999);
-  target.add_option("--position", arguments->position_m, "X Y Z of its origin in the root part [m]")
-      .required()
-      .expected(3)
-      .check(within(-1000, 1000), "NUMBER");
+  Argument position = target.add_option("--position", arguments->position_m,
+                                        "X Y Z of its origin in the root part [m]");
+  position.expected(3).check(within(-1000, 1000), "NUMBER");
+  Argument orientation = target.add_option("--orientation", arguments->orientation,
+                                           "W X Y Z: unit quaternion, in the root part");
+  orientation.expected(4).check(within(-1, 1), "NUMBER");
   target
-      .add_option("--orientation", arguments->orientation,
-                  "W X Y Z: unit quaternion, in the root part")
-      .expected(4)
-      .check(within(-1, 1), "NUMBER");
+      .add_option("--tag", arguments->tag,
+                  "Instead of --position: to where this tag of target_tags in markers.yaml is seen")
+      .in_range(0, 586)
+      .excludes(position)
+      .excludes(orientation);
   target
       .add_option("--keep", arguments->keep_s,
                   "Stay so long [s] before the babbler gets the arm; default: until released")

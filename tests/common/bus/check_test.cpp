@@ -207,6 +207,7 @@ TEST(Check, RefusesFieldsThatContradictEachOther) {
                  [](auto& m) { m.target_kind = pose_target_t::KIND_POSITION; });
   expect_refused(example_pose_target(), "orientation_wxyz",
                  [](auto& m) { m.orientation_wxyz[0] = 0.9; });
+  expect_refused(example_pose_target(), "target_tag", [](auto& m) { m.target_tag = 40; });
   expect_refused(example_pose_target(), "way_point", [](auto& m) { m.way_point = 21; });
   expect_refused(example_process_info(), "counters[1].counter_name",
                  [](auto& m) { m.counters[1].counter_name = m.counters[0].counter_name; });

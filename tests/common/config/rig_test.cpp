@@ -101,6 +101,32 @@ TEST_F(RigTest, ATagIdStandsOnce) {
             "markers.yaml:2: tags: tag id 4 stands twice");
 }
 
+TEST_F(RigTest, TargetTagsAreNoPartsTags) {
+  const std::string tags = "  - {id: 4, size_m: 0.05, part: 1, placement: none}\n";
+  EXPECT_TRUE(markers(tags).target_tags.empty());
+  const Markers read =
+      markers(tags + "target_tags:\n  - {id: 41, size_m: 0.1}\n  - {id: 40, size_m: 0.12}\n");
+  EXPECT_EQ(read.ids(), (std::vector<int>{4, 40, 41}));
+  EXPECT_EQ(read.parts(), std::vector<int>{1});
+  EXPECT_EQ(read.find(40), nullptr);
+  EXPECT_EQ(read.size_m(40), 0.12);
+  EXPECT_EQ(read.size_m(4), 0.05);
+  EXPECT_EQ(read.size_m(5), std::nullopt);
+  EXPECT_TRUE(read.is_target(41));
+  EXPECT_FALSE(read.is_target(4));
+  const auto problem_of = [&](const std::string& targets) {
+    return error_of([&] { markers(tags + "target_tags:\n" + targets); });
+  };
+  EXPECT_EQ(problem_of("  - {id: 4, size_m: 0.1}\n"),
+            "markers.yaml:5: target_tags[0].id: tag 4 is on part 1, so it is no target");
+  EXPECT_EQ(problem_of("  - {id: 40, size_m: 0.1}\n  - {id: 40, size_m: 0.1}\n"),
+            "markers.yaml:4: target_tags: tag id 40 stands twice");
+  EXPECT_EQ(problem_of("  - {id: 40}\n"),
+            "markers.yaml:5: target_tags[0].size_m: this key is missing");
+  EXPECT_EQ(problem_of("  - {id: 40, size_m: 0.1, part: 2}\n").substr(0, 35),
+            "markers.yaml:5: target_tags[0].part");
+}
+
 TEST_F(RigTest, BrokenMarkersPointAtTheKey) {
   EXPECT_EQ(error_of([&] { markers("  - {id: 4, size_m: 0.05, part: 1}\n"); }),
             "markers.yaml:3: tags[0].placement: this key is missing");

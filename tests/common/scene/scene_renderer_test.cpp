@@ -14,6 +14,7 @@
 #include "common/geometry/angle.h"
 #include "common/scene/faults.h"
 #include "common/scene/scene.h"
+#include "tests/support/target_rig.h"
 
 namespace bodyschema {
 namespace {
@@ -77,8 +78,8 @@ Comparison compare(const Scene& scene, const CameraCalibration& calibration,
   Comparison result;
   const Pose X_CW = from_message(state.X_WC).inverse();
   for (const auto& [id, corners] : detect(image)) {
-    const TagPlacement* tag = scene.markers().find(id);
-    if (!tag) {
+    const std::optional<double> size_m = scene.markers().size_m(id);
+    if (!size_m) {
       ADD_FAILURE() << "tag " << id << " is not in the scene";
       continue;
     }
@@ -86,7 +87,7 @@ Comparison compare(const Scene& scene, const CameraCalibration& calibration,
                       Eigen::Translation3d(0, 0, -kSheetThickness_m / 2);
     const double cosine = X_CM.translation().normalized().dot(X_CM.linear().col(2));
     if (cosine < std::cos(max_tilt_deg * kDegree)) continue;
-    const Corners expected = project(calibration, X_CM, tag->size_m);
+    const Corners expected = project(calibration, X_CM, *size_m);
     for (int k = 0; k < 4; ++k) {
       const Eigen::Vector2d error = corners[k] - expected[k];
       result.worst_px = std::max(result.worst_px, error.norm());
@@ -388,6 +389,31 @@ TEST(SceneRenderer, ShowsAFallenMarkerOnTheFloor) {
       compare(whole, renderer.calibration(), state, renderer.render(state, 0), 45);
   EXPECT_TRUE(detect(renderer.render(state, 0)).contains(15));
   EXPECT_LT(from_above.worst_px, 0.5);
+}
+
+TEST(SceneRenderer, ShowsATargetTagWhereItFloatsAndWhereItIsPut) {
+  const test::TargetRig rig(kConfig / "arm2", "0.4, -0.2, 1.7");
+  const SceneDescription as_built = SceneDescription::load(rig.folder());
+  const Scene scene(as_built);
+  SceneRenderer renderer(rig.folder());
+  const auto corner_px = [&](const std::vector<Fault>& faults) {
+    const Scene now(
+        broken(as_built, faults, as_built.robot.joint_positions(as_built.robot.home), 1));
+    const sim_state_t state = now.state_at(as_built.robot.home, 1, 0);
+    const cv::Mat image = renderer.render(state, 0);
+    EXPECT_LT(compare(scene, renderer.calibration(), state, image, 60).mean_px, 0.25);
+    const auto found = detect(image);
+    EXPECT_TRUE(found.contains(0) && found.contains(40));
+    return found.at(40)[0];
+  };
+  const Eigen::Vector2d before = corner_px({});
+  Fault put;
+  put.kind = fault_command_t::FAULT_TARGET;
+  put.number = 40;
+  put.target_m = Eigen::Vector3d(0.3, -0.1, 1.7);
+  const Eigen::Vector2d shift = corner_px({put}) - before;
+  EXPECT_NEAR(shift.x(), -0.1 / 1.7 * 1104.6, 1);
+  EXPECT_NEAR(shift.y(), 0.1 / 1.7 * 1098.9, 1);
 }
 
 TEST(SceneRenderer, RefusesTheStateOfAnotherRig) {

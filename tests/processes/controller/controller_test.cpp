@@ -7,6 +7,8 @@
 #include <fstream>
 #include <functional>
 #include <limits>
+#include <map>
+#include <optional>
 #include <random>
 #include <set>
 
@@ -23,6 +25,7 @@ using Target = pose_target_t;
 
 constexpr std::int64_t kSecond = 1'000'000;
 constexpr std::int64_t kTick = kSecond / 10;
+constexpr std::int64_t kFrame = 33'333;
 
 ControllerConfig test_config() {
   ControllerConfig config;
@@ -44,6 +47,7 @@ ControllerConfig test_config() {
   config.sample_timeout_us = 5 * kSecond;
   config.rest_timeout_us = 20 * kSecond;
   config.lent_timeout_us = 50 * kSecond;
+  config.target_tags = {40, 41};
   config.max_motion_status_silence_us = 3 * kSecond;
   config.max_marker_poses_silence_us = 3 * kSecond;
   config.max_body_schema_silence_us = 3 * kSecond;
@@ -155,9 +159,45 @@ class Bench {
     take(controller.on_body_schema(message));
   }
   void show_frame() {
+    if (num_frames > 0) return show_tags();
     marker_poses_t poses{};
     poses.utime = motion.utime + kTick;
     take(controller.on_marker_poses(poses));
+  }
+  /// The frames of a rest, with the target tags that are in sight.
+  void show_tags() {
+    for (int frame = 0; frame < num_frames; ++frame) {
+      marker_poses_t poses{};
+      poses.utime = motion.utime + kTick + frame * kFrame;
+      std::vector<marker_pose_t> markers;
+      for (const auto& [id, p_RM] : p_RM_of_tag) {
+        if (covers_tags && (part_position() - p_RM).norm() < 0.01) continue;
+        marker_pose_t& marker = markers.emplace_back();
+        marker.marker_id = id;
+        marker.size_m = 0.1;
+        Pose X_RM = Pose::Identity();
+        X_RM.translation() = p_RM;
+        if (frame % 2) X_RM.translation().x() += tag_jitter_m;
+        marker.X_CM[0] = marker.X_CM[1] = to_message(Pose(X_CC_moved * planar().X_CR * X_RM));
+        marker.num_hypotheses = 1;
+        to_message(Matrix6d(Matrix6d::Identity() * 1e-6), marker.covariance);
+        to_message(Matrix8d(Matrix8d::Identity()), marker.corner_covariance);
+      }
+      set_array(poses.num_markers, poses.markers, markers);
+      ASSERT_EQ(check(poses), "");
+      take(controller.on_marker_poses(poses));
+    }
+  }
+  /// As the simulator does: the time goes on by a second, so that new frames come.
+  void put_tag(int id, std::optional<Eigen::Vector3d> p_RM) {
+    p_RM_of_tag.erase(id);
+    if (p_RM) p_RM_of_tag[id] = *p_RM;
+    motion_status_t message = motion;
+    message.utime += kSecond;
+    message.rest_since_utime = message.utime;
+    set_array(message.num_signals, message.commanded, arm);
+    say(message);
+    show_frame();
   }
   void repeat() {
     say(motion);
@@ -274,6 +314,10 @@ class Bench {
   bool is_ambiguous = false;
   int tag = -1;  ///< by which part 4 is seen
   Pose X_CC_moved = Pose::Identity();
+  int num_frames = 0;  ///< of a rest that show the target tags; 0: one without tags
+  std::map<int, Eigen::Vector3d> p_RM_of_tag;  ///< those in sight
+  bool covers_tags = false;                    ///< the part, where it comes to them
+  double tag_jitter_m = 0;                     ///< of every second frame
   std::int64_t now = 1000 * kSecond;
   std::int64_t num_samples = 0;
   std::vector<action_command_t> moves;  ///< as served, each once
@@ -431,6 +475,185 @@ TEST(ControllerTest, APoseIsReachedInPositionAndOrientation) {
   ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
   EXPECT_EQ(bench.status.predicted_error_rad, -1);
   EXPECT_EQ(bench.status.observed_error_rad, -1);
+}
+
+// ---- a tag as target
+
+Target tag_target(std::int64_t id, int tag = 40) {
+  Target target = position_target(id, Eigen::Vector3d::Zero());
+  target.target_kind = Target::KIND_TAG;
+  target.target_tag = tag;
+  return target;
+}
+
+/// At rest, with tag 40 in sight.
+Bench bench_with_tag(const Eigen::Vector3d& p_RM, ControllerConfig config = test_config()) {
+  Bench bench(std::move(config));
+  bench.num_frames = TagTrack::kFrames;
+  bench.p_RM_of_tag[40] = p_RM;
+  bench.start();
+  return bench;
+}
+
+TEST(ControllerTest, ATagIsReachedWhereItIsSeen) {
+  Bench bench = bench_with_tag(kFar);
+  bench.give(tag_target(0));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+  EXPECT_LT((bench.part_position() - kFar).norm(), 1e-4);
+  EXPECT_LT((Eigen::Vector3d(bench.status.target_position_m) - kFar).norm(), 1e-9);
+  EXPECT_EQ(bench.num_holds, 0);
+  // It is not followed, but given again.
+  const std::size_t num_moves = bench.moves.size();
+  bench.put_tag(40, kNear);
+  bench.run(5);
+  EXPECT_EQ(bench.status.control_state, S::CONTROL_REACHED);
+  EXPECT_EQ(bench.moves.size(), num_moves);
+  bench.give(tag_target(1));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+  EXPECT_LT((bench.part_position() - kNear).norm(), 1e-4);
+}
+
+TEST(ControllerTest, TheMeanOfTheFramesIsTheTagsPlace) {
+  Bench bench(test_config());
+  bench.num_frames = TagTrack::kFrames;
+  bench.p_RM_of_tag[40] = kFar;
+  bench.tag_jitter_m = 0.002;
+  bench.start();
+  bench.give(tag_target(0));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+  EXPECT_LT((bench.part_position() - kFar - Eigen::Vector3d(0.001, 0, 0)).norm(), 1e-4);
+}
+
+TEST(ControllerTest, ATagIsSeenFromWhereTheCameraIsNow) {
+  Bench bench(test_config());
+  bench.num_frames = TagTrack::kFrames;
+  bench.p_RM_of_tag[40] = kFar;
+  bench.X_CC_moved.translation() = Eigen::Vector3d(0.05, 0, 0);
+  bench.start();
+  bench.settle("motor_babbler", 1, 0, bench.arm);
+  bench.give(tag_target(0));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+  EXPECT_LT((bench.part_position() - kFar).norm(), 1e-4);
+}
+
+TEST(ControllerTest, ATagThatIsNoTargetIsRefused) {
+  Bench bench = bench_with_tag(kFar);
+  bench.give(tag_target(0, 7));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REFUSED));
+  EXPECT_TRUE(bench.has_why("tag 7 is not in target_tags of markers.yaml: 40, 41"))
+      << bench.status.why;
+  ControllerConfig config = test_config();
+  config.target_tags.clear();
+  Bench without = bench_with_tag(kFar, config);
+  without.give(tag_target(0));
+  ASSERT_TRUE(without.run_until_state(S::CONTROL_REFUSED));
+  EXPECT_TRUE(without.has_why("which has none")) << without.status.why;
+}
+
+TEST(ControllerTest, ATagThatIsNotSeenMovesNothingAndIsGivenUpInTheEnd) {
+  Bench bench = bench_with_tag(kFar);
+  bench.give(tag_target(0, 41));
+  bench.run(10);
+  EXPECT_EQ(bench.status.control_state, S::CONTROL_WAITING);
+  EXPECT_TRUE(bench.has_why("target tag 41 is not seen: the arm holds until 2 frames"))
+      << bench.status.why;
+  EXPECT_TRUE(bench.run_until_state(S::CONTROL_REFUSED));
+  EXPECT_TRUE(bench.has_why("given up after 20 s: target tag 41 is not seen")) << bench.status.why;
+  EXPECT_TRUE(bench.moves.empty());
+}
+
+TEST(ControllerTest, ATagThatIsSeenInOneFrameAloneIsNotATarget) {
+  Bench bench(test_config());
+  bench.num_frames = 1;
+  bench.p_RM_of_tag[40] = kFar;
+  bench.start();
+  bench.give(tag_target(0));
+  bench.run(5);
+  EXPECT_TRUE(bench.moves.empty());
+  EXPECT_TRUE(bench.has_why("is seen in 1 frame")) << bench.status.why;
+  bench.put_tag(40, kFar);  // another rest, another mean
+  bench.run(5);
+  EXPECT_TRUE(bench.moves.empty());
+}
+
+TEST(ControllerTest, ATagThatIsLostOnTheWayMakesItHoldUntilItIsSeenAgain) {
+  Bench bench = bench_with_tag(kFar);
+  bench.give(tag_target(0));
+  ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 1; }));
+  bench.p_RM_of_tag.clear();
+  bench.run(5);
+  EXPECT_EQ(bench.moves.size(), 1U);
+  EXPECT_EQ(bench.num_holds, 1);
+  EXPECT_EQ(bench.status.control_state, S::CONTROL_WAITING);
+  EXPECT_EQ(bench.status.owns_arm, 1);
+  EXPECT_TRUE(bench.has_why("target tag 40 is not seen: the arm holds")) << bench.status.why;
+  bench.put_tag(40, kNear);
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+  EXPECT_LT((bench.part_position() - kNear).norm(), 1e-4);
+  EXPECT_EQ(bench.num_holds, 1);
+}
+
+TEST(ControllerTest, ATagThatJumpsOnTheWayMakesItHoldAndIsServedAnewAtItsNewPlace) {
+  Bench bench = bench_with_tag(kFar);
+  bench.give(tag_target(0));
+  ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 1; }));
+  bench.num_frames = 1;  // so that it waits for another rest
+  bench.p_RM_of_tag[40] = kNear;
+  bench.run(5);
+  EXPECT_EQ(bench.moves.size(), 1U);
+  EXPECT_EQ(bench.num_holds, 1);
+  EXPECT_TRUE(bench.has_why("target tag 40 moved by ")) << bench.status.why;
+  bench.num_frames = TagTrack::kFrames;
+  bench.put_tag(40, kNear);
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+  EXPECT_LT((bench.part_position() - kNear).norm(), 1e-4);
+}
+
+TEST(ControllerTest, ATagThatJumpsWhileItsMoveIsUnderWayHoldsToo) {
+  Bench bench = bench_with_tag(kFar);
+  bench.give(tag_target(0));
+  ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 1; }));
+  bench.p_RM_of_tag[40] = kNear;  // both frames of the next rest show it there
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+  EXPECT_EQ(bench.num_holds, 1);
+  EXPECT_LT((bench.part_position() - kNear).norm(), 1e-4);
+}
+
+TEST(ControllerTest, APartThatHasComeToItsTagMayCoverIt) {
+  Bench bench = bench_with_tag(kFar);
+  bench.covers_tags = true;
+  bench.give(tag_target(0));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+  EXPECT_LT((bench.part_position() - kFar).norm(), 1e-4);
+  bench.put_tag(40, std::nullopt);
+  bench.run(5);
+  EXPECT_EQ(bench.status.control_state, S::CONTROL_REACHED);
+  EXPECT_EQ(bench.num_holds, 0);
+}
+
+TEST(ControllerTest, ATagsTargetExpiresAndFallsSilentAsAnyOther) {
+  Bench bench = bench_with_tag(kFar);
+  Target target = tag_target(0, 41);
+  target.expiry_s = 4;
+  bench.give(target);
+  bench.run(3);
+  EXPECT_EQ(bench.status.control_state, S::CONTROL_WAITING);
+  bench.run(2);
+  EXPECT_EQ(bench.status.control_state, S::CONTROL_HOLDING);
+  EXPECT_TRUE(bench.has_why("not reached within 4 s; target tag 41 is not seen"))
+      << bench.status.why;
+  EXPECT_TRUE(bench.moves.empty());
+  bench.give(tag_target(1));
+  bench.driver_speaks = false;
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_HOLDING));
+  EXPECT_TRUE(bench.has_why("no MOTION_STATUS")) << bench.status.why;
+}
+
+TEST(ControllerTest, ATagOutOfReachIsRefused) {
+  Bench bench = bench_with_tag(kBeyond);
+  bench.give(tag_target(0));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REFUSED));
+  EXPECT_TRUE(bench.has_why("out of reach")) << bench.status.why;
 }
 
 TEST(ControllerTest, AnOrientationOutOfReachIsRefusedUnlessTheTargetToleratesIt) {
@@ -1686,7 +1909,13 @@ TEST(ControllerTest, WhateverHappensItsCommandsAreLawful) {
     if (rng() % 4) bench.start();
     std::int64_t target_id = 0, babble_id = 0;
     for (int event = 0; event < 60 && !testing::Test::HasFatalFailure(); ++event) {
-      switch (rng() % 16) {
+      switch (rng() % 17) {
+        case 16:
+          bench.num_frames = static_cast<int>(rng() % 3);
+          bench.p_RM_of_tag[40] = rng() % 2 ? kNear : kFar;
+          if (rng() % 4 == 0) bench.p_RM_of_tag.clear();
+          bench.give(tag_target(target_id++, 40 + static_cast<int>(rng() % 8 == 0)));
+          break;
         case 0:
         case 1:
           bench.give(rng() % 4 == 0 ? pose_target(target_id++, {40, -0.5, 6})

@@ -34,6 +34,7 @@ Markers markers() {
   Markers markers;
   markers.family = "tag36h11";
   for (const int id : {3, 7, 11}) markers.tags.push_back({id, 0.08, id, std::nullopt});
+  markers.target_tags = {{40, 0.12}};
   return markers;
 }
 
@@ -226,6 +227,18 @@ TEST(MarkerEstimator, SortsItsTagsAndIgnoresAndCountsThoseOfNobody) {
   EXPECT_EQ(poses.markers[0].marker_id, 3);
   EXPECT_EQ(poses.markers[1].marker_id, 11);
   EXPECT_EQ(estimator.counted("tag not in markers.yaml"), 1);
+}
+
+TEST(MarkerEstimator, TellsWhereATargetTagIsByItsOwnSize) {
+  Estimator estimator;
+  const Pose X_CM = marker_pose(0.8, 0.4, 0, 0, 0.2);
+  const auto poses = estimator.see({{40, 0.12, X_CM}}, pinhole_camera());
+  ASSERT_EQ(poses.num_markers, 1);
+  EXPECT_EQ(poses.markers[0].marker_id, 40);
+  EXPECT_EQ(poses.markers[0].size_m, 0.12);
+  EXPECT_LT((from_message(poses.markers[0].X_CM[0]).translation() - X_CM.translation()).norm(),
+            0.002);
+  EXPECT_EQ(estimator.counted("tag not in markers.yaml"), 0);
 }
 
 TEST(MarkerEstimator, KeepsTheClearerOfTwoTagsWithOneId) {

@@ -375,6 +375,40 @@ TEST(Observer, MakesASampleWithoutPartsWhereNothingIsSeen) {
   EXPECT_EQ(sample->num_parts, 0);
 }
 
+TEST(Observer, TargetTagsAreNothingToIt) {
+  Markers with_target = markers();
+  with_target.target_tags = {{40, 0.08}};
+  Observer without = calibrated(), with(config(), with_target, 99);
+  with.on_camera_info(camera());
+  std::optional<sample_t> samples[2];
+  int n = 0;
+  for (Observer* observer : {&without, &with}) {
+    Scene scene;
+    observer->on_motion_status(settled(0));
+    for (const std::int64_t utime : {kRest_us, kRest_us + 33'333}) {
+      marker_poses_t frame = scene.frame(utime);
+      if (observer == &with) {
+        std::vector<marker_pose_t> seen = frame.markers;
+        Pose X_CM = X_CB2();
+        X_CM.translation().x() += utime == kRest_us ? 0.2 : 0.3;  // it may move
+        std::mt19937 random(1);
+        seen.push_back(sight_of(40, X_CM, 0, random));
+        set_array(frame.num_markers, frame.markers, std::move(seen));
+      }
+      samples[n] = observer->on_marker_poses(frame);
+    }
+    ++n;
+  }
+  ASSERT_TRUE(samples[0] && samples[1]);
+  const auto bytes = [](const sample_t& sample) {
+    std::vector<std::uint8_t> result(sample.getEncodedSize());
+    sample.encode(result.data(), 0, static_cast<int>(result.size()));
+    return result;
+  };
+  EXPECT_EQ(bytes(*samples[0]), bytes(*samples[1]));
+  EXPECT_EQ(without.counters(), with.counters());
+}
+
 TEST(Observer, LeavesOutATagThatMovedBetweenTheFrames) {
   Observer observer = calibrated();
   Scene scene;

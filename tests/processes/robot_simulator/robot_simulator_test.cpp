@@ -13,6 +13,7 @@
 #include "common/bus/convert.h"
 #include "common/config/yaml.h"
 #include "common/geometry/angle.h"
+#include "tests/support/target_rig.h"
 
 namespace bodyschema {
 namespace {
@@ -637,6 +638,47 @@ TEST(RobotSimulator, ABumpedCameraIsElsewhereTheSameForASeed) {
   EXPECT_FALSE(from_message(one.state().X_WC).isApprox(from_message(other.state().X_WC), 1e-6));
   one.on_fault(fault(2, Broken::FAULT_REPAIR));
   EXPECT_TRUE(from_message(one.state().X_WC).isApprox(X_WC, 1e-12));
+}
+
+TEST(RobotSimulator, ATargetTagIsPutElsewhereAndBackByRepair) {
+  const test::TargetRig rig(kConfig / "arm2", "0.4, -0.2, 1.7");
+  RobotSimulatorConfig configured =
+      RobotSimulatorConfig::load(rig.folder() / "robot_simulator.yaml");
+  configured.is_ideal = true;
+  RobotSimulator simulator(configured);
+  simulator.on_command(move_to(0, {0.3, 10}));
+  const auto p_CM = [](const RobotSimulator& of) {
+    const int geom = of.scene().tag_geom(40);
+    const Pose X_WM =
+        from_message(of.state().X_WG[geom]) * Eigen::Translation3d(0, 0, -kSheetThickness_m / 2);
+    return Eigen::Vector3d(from_message(of.state().X_WC).inverse() * X_WM.translation());
+  };
+  EXPECT_LT((p_CM(simulator) - Eigen::Vector3d(0.4, -0.2, 1.7)).norm(), 1e-9);
+  fault_command_t put = fault(0, Broken::FAULT_TARGET, "", 40);
+  const Eigen::Vector3d there(-0.2, 0.1, 1.5);
+  std::copy(there.begin(), there.end(), put.target_m);
+  const sim_state_t before = simulator.state();
+  const auto answer = simulator.on_fault(put);
+  EXPECT_EQ(answer.state->faults.at(0), "target 40 at -0.2 0.1 1.5 m");
+  EXPECT_EQ(answer.state->utime, before.utime + 1'000'000);
+  EXPECT_EQ(answer.statuses.at(0).rest_since_utime, answer.state->utime);
+  EXPECT_LT((p_CM(simulator) - there).norm(), 1e-9);
+  EXPECT_EQ(part_in_world(simulator.state(), 5).matrix(), part_in_world(before, 5).matrix());
+  // A bump of the camera leaves it where it is in the world.
+  simulator.on_fault(fault(1, Broken::FAULT_CAMERA_BUMP));
+  EXPECT_GT((p_CM(simulator) - there).norm(), 0.01);
+  const std::filesystem::path file = scratch_file("target.yaml");
+  simulator.save(file);
+  RobotSimulator restarted(configured);
+  restarted.restore(file);
+  std::filesystem::remove(file);
+  EXPECT_EQ(bytes(restarted.state()), bytes(simulator.state()));
+  put.number = 41;
+  put.fault_id = 2;
+  EXPECT_EQ(simulator.on_fault(put).state->fault_answer,
+            "no target tag 41; target_tags in robot.yaml: 40");
+  simulator.on_fault(fault(3, Broken::FAULT_REPAIR));
+  EXPECT_LT((p_CM(simulator) - Eigen::Vector3d(0.4, -0.2, 1.7)).norm(), 1e-9);
 }
 
 TEST(RobotSimulator, AllFaultsTogetherSurviveARestartBitByBit) {

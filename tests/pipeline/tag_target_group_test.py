@@ -1,0 +1,176 @@
+"""tag_target_group_test.py SOURCE BUILD: a group that has learned arm2 brings the end effector to a tag that floats before the camera, and after it
+was put elsewhere to it there, within 3 mm by the truth. A tag that is not seen is waited for."""
+
+import json
+import math
+import os
+import shutil
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+source, build = Path(sys.argv[1]), Path(sys.argv[2])
+TAG, END_EFFECTOR = 40, 5
+LIMIT_M = 0.003
+
+
+class Failed(Exception):
+    pass
+
+
+def environment(work):
+    """Of a ./run with logs of its own."""
+    return os.environ | {"BODYSCHEMA_BUILD": str(build), "BODYSCHEMA_LOGS": str(work / "logs")}
+
+
+def run(work, *words, codes=(0,)):
+    """What it says, on stdout and stderr."""
+    done = subprocess.run(
+        [source / "run", *map(str, words)], env=environment(work), stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=250
+    )
+    if done.returncode not in codes:
+        raise Failed(f"./run {' '.join(map(str, words))}: {done.stdout[-2000:]} {done.stderr[-2000:]}")
+    return done.stdout, done.stderr
+
+
+def rig_with_tag(work):
+    rig = work / "arm2"
+    shutil.copytree(source / "config" / "arm2", rig)
+    for file, pose in ("markers.yaml", ""), ("robot.yaml", ", X_CM: {position_m: [0.6, -0.45, 1.9]}"):
+        with open(rig / file, "a") as text:
+            text.write(f"\ntarget_tags:\n  - {{id: {TAG}, size_m: 0.12{pose}}}\n")
+    return rig
+
+
+class Payload:
+    """A message as LCM writes it, from its first field on."""
+
+    def __init__(self, data):
+        self.data, self.at = data, 8
+
+    def take(self, code, count=1):
+        values = struct.unpack_from(f">{count}{code}", self.data, self.at)
+        self.at += struct.calcsize(f">{count}{code}")
+        return list(values)
+
+    def text(self):
+        length = self.take("i")[0]
+        self.at += length
+
+    def pose(self):
+        return self.take("d", 3), self.take("d", 4)
+
+
+def rotated(wxyz, v):
+    w, *u = wxyz
+
+    def cross(a, b):
+        return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+
+    t = [2 * c for c in cross(u, v)]
+    return [a + w * b + c for a, b, c in zip(v, t, cross(u, t))]
+
+
+def true_state(work):
+    """(action_id, p_CB of the end effector) of the newest SIM_STATE: the fields of sim_state_t.lcm in their order."""
+    log = work / "logs" / "current" / "run.lcmlog.00"
+    state = Payload(subprocess.run([build / "bin/log_payloads", log, "SIM_STATE", "--last"], capture_output=True, check=True).stdout)
+    _, action_id, _ = state.take("q", 3)
+    state.take("b")
+    state.take("q", 2)
+    state.text()
+    for _ in range(state.take("i")[0]):
+        state.text()
+    p_WC, q_WC = state.pose()
+    num_geoms = state.take("i")[0]
+    for _ in range(num_geoms):
+        state.pose()
+    state.take("f", num_geoms)
+    parts = state.take("i", state.take("i")[0])
+    poses = [state.pose() for _ in parts]
+    p_WB = poses[parts.index(END_EFFECTOR)][0]
+    q_CW = [q_WC[0], *(-c for c in q_WC[1:])]
+    return action_id, rotated(q_CW, [b - c for b, c in zip(p_WB, p_WC)])
+
+
+def error_m(work, p_CM):
+    """From the end effector to the tag, by the truth of where the arm rests now."""
+    action_id = json.loads(run(work, "exec", "bodyschema", "status", "--json")[0])["arm"]["action_id"]
+    for _ in range(50):
+        at, p_CB = true_state(work)
+        if at == action_id:
+            return math.dist(p_CB, p_CM)
+        time.sleep(0.1)  # until the logger has written it
+    raise Failed(f"SIM_STATE of action {action_id} is not in the log")
+
+
+def position(work, *action):
+    """Of the end effector in the root's and in the camera's frame, by the schema."""
+    schema = work / "logs" / "current" / "schema.lcmlog"
+    parts = json.loads(run(work, "predict", schema, "--action", *action, "--json")[0])["parts"]
+    p_RB = next(part["X_RB"]["position_m"] for part in parts if part["part"] == END_EFFECTOR)
+    X_CR = json.loads(run(work, "show", schema, "--json")[0])["X_CR"]
+    return p_RB, [c + r for c, r in zip(X_CR["position_m"], rotated(X_CR["rotation_wxyz"], p_RB))]
+
+
+def wait_for_tag(work, p_CM):
+    """A target whose tag stands behind the camera is served once it is put to p_CM."""
+    run(work, "fault", "target", TAG, 0, 0, -1)
+    with open(work / "wait.txt", "w+") as says:
+        words = [source / "run", "target", "--part", str(END_EFFECTOR), "--tag", str(TAG)]
+        target = subprocess.Popen(words, env=environment(work), stdin=subprocess.DEVNULL, stdout=says, stderr=says)
+        for _ in range(200):
+            if "is not seen: the arm holds until 2 frames" in (work / "wait.txt").read_text():
+                break
+            time.sleep(0.1)
+        run(work, "fault", "target", TAG, *(f"{c:.6f}" for c in p_CM))
+        code = target.wait(timeout=60)
+    text = (work / "wait.txt").read_text()
+    if code != 0 or "is not seen: the arm holds until 2 frames" not in text:
+        raise Failed(f"the tag was not waited for: {text}")
+
+
+def main(work):
+    rig = rig_with_tag(work)
+    run(work, "rig", rig)
+    run(work, "--rig", rig, "--ideal", "--seed", 4, "--samples", 30, "--keep")
+    p_RB, _ = position(work, 0, 0)
+    run(work, "target", "--part", END_EFFECTOR, "--position", *p_RB)
+    errors = []
+    for action in (0, 29), (0, 0):  # one step each, from which the arm does not hide the tag
+        _, p_CM = position(work, *action)
+        moved = run(work, "fault", "target", TAG, *(f"{c:.6f}" for c in p_CM))[0]
+        if f"target {TAG} at " not in moved:
+            raise Failed(f"the tag was not put there: {moved}")
+        out, err = run(work, "target", "--part", END_EFFECTOR, "--tag", TAG, "--json", codes=(0, 1))
+        result = json.loads(out)
+        errors.append(error_m(work, p_CM))
+        if not result["reached"] or errors[-1] > LIMIT_M:
+            raise Failed(f"{errors} m off: {result} {err}")
+        if "give the target again" not in err:
+            raise Failed(f"it does not say what to do next: {err}")
+    _, p_CM = position(work, 0, 29)
+    wait_for_tag(work, p_CM)
+    errors.append(error_m(work, p_CM))
+    if errors[-1] > LIMIT_M:
+        raise Failed(f"{errors} m off")
+    print("errors [mm]:", [round(error * 1e3, 2) for error in errors])
+    _, err = run(work, "target", "--part", END_EFFECTOR, "--tag", 7, "--timeout", 20, codes=(1,))
+    if f"tag 7 is not in target_tags of markers.yaml: {TAG}" not in _ + err:
+        raise Failed(f"a part's tag is no target: {_} {err}")
+    run(work, "release")
+
+
+if subprocess.run(["unshare", "--user", "--map-root-user", "--net", "true"], capture_output=True).returncode != 0:
+    print("SKIP: this machine allows no network namespaces", file=sys.stderr)
+    sys.exit(77)
+with tempfile.TemporaryDirectory(prefix="tag target ") as folder:
+    try:
+        main(Path(folder))
+    except Failed as failure:
+        sys.exit(str(failure))
+    finally:
+        run(Path(folder), "stop", codes=(0, 1, 2))
