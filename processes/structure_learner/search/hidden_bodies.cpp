@@ -6,6 +6,7 @@
 #include <utility>
 
 #include "processes/structure_learner/search/layered_search.h"
+#include "processes/structure_learner/search/long_chains.h"
 
 namespace bodyschema {
 namespace {
@@ -91,7 +92,8 @@ class HiddenBodySearch {
     int num_fits = 0;
     for (const auto& [score, part_i, part_j, start] : starts(screened(of_x, of_y))) {
       if (num_fits++ >= kMaxFits) break;
-      if (auto c = pairs_.try_start(part_i, part_j, start)) valid.push_back(*std::move(c));
+      auto c = pairs_.try_start(part_i, part_j, start);
+      if (c && !c->doubtful) valid.push_back(*std::move(c));
     }
     if (valid.empty()) return std::nullopt;
     const auto rank = [](const Candidate& c) { return std::tuple(c.model.num_joints(), -c.score); };
@@ -106,10 +108,20 @@ class HiddenBodySearch {
           .note_undecided(best.model.num_joints(), best.mean_capped);
       return std::nullopt;
     }
-    return best;
+    return settled(best);
   }
 
  private:
+  // In the order that the poses prefer, or with the joints numbered whose order they leave open.
+  std::optional<Candidate> settled(const Candidate& c) {
+    const PairData& pair = pairs_.pair(c.part_i, c.part_j);
+    const Fit fit = fit_local_model(c.model, pair, pairs_.actions(), 15, 1e-2);
+    const auto ordered =
+        pairs_.try_start(c.part_i, c.part_j, with_settled_order(fit, pair, pairs_.actions()).model);
+    if (!ordered) return std::nullopt;
+    return with_searched_order(*ordered, &pairs_);
+  }
+
   struct WholeStart {
     double score;
     int part_i, part_j;

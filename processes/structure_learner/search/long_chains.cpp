@@ -100,7 +100,8 @@ std::optional<Candidate> best_extended(std::vector<Pair> between, std::map<Pair,
       all.insert(std::ranges::upper_bound(all, s), s);
       auto c = chain_between(ij, all, JointOrder::kListed, pairs, &cost);
       // With fewer joints the layers have searched for it.
-      if (c && c->model.num_joints() > kMaxScreenedJoints) found.push_back(*std::move(c));
+      if (c && !c->doubtful && c->model.num_joints() > kMaxScreenedJoints)
+        found.push_back(*std::move(c));
     }
   }
   if (found.empty()) return std::nullopt;
@@ -115,7 +116,7 @@ std::optional<Candidate> best_extended(std::vector<Pair> between, std::map<Pair,
       return std::nullopt;
     }
   }
-  return best;
+  return with_searched_order(best, pairs);
 }
 
 // A soft body, too, moves like a chain of many joints, roughly: where a Gaussian process predicts
@@ -133,6 +134,14 @@ bool is_rather_soft(const Candidate& chain, const PairModels& pairs) {
 }
 
 }  // namespace
+
+Candidate with_searched_order(const Candidate& chain, PairModels* pairs) {
+  double cost = 0;
+  const std::set<int> signals = signal_set(chain.model);
+  auto searched = chain_between({chain.part_i, chain.part_j}, {signals.begin(), signals.end()},
+                                JointOrder::kUnknown, pairs, &cost);
+  return searched && rank(*searched) < rank(chain) ? *std::move(searched) : chain;
+}
 
 bool connect_long_chains(PairModels* pairs, ModelForest* forest) {
   const int max_joints = std::min(pairs->options().max_signals, kMaxChainJoints);

@@ -11,4 +11,7 @@ namespace bodyschema {
 /// kPosesPerJoint independent poses a joint: fewer are noted as too few data.
 bool connect_long_chains(PairModels* pairs, ModelForest* forest);
 
+/// The chain, or a better one of its signals in another order. Each signal has one joint.
+Candidate with_searched_order(const Candidate& chain, PairModels* pairs);
+
 }  // namespace bodyschema
