@@ -57,9 +57,9 @@ double posture_cost(const BodySchema& schema, int part, bool with_rotation,
 /// Tried from `current`, then from starts ever farther from it, then from the best of 1000 actions
 /// over the ranges, until one converges; start n is the same in every run. A solution then moves in
 /// its null space (Liégeois 1977) as long as posture_cost() falls. All this first within what the
-/// schema's samples covered, then within the limits. With `avoided`
-/// the solution is another than those: at least a tenth of one signal's range away from each. If
-/// none converges, the nearest approach; if all are avoided, `current` with an infinite error.
+/// schema's samples covered, then within the limits. With `avoided` the solution is another than
+/// those: at least a tenth of one signal's range away from each. If none converges, the nearest
+/// approach; if all are avoided, `current` with an infinite error.
 ///
 /// Never NaN. `current` beyond the limits is moved to them. @throws std::invalid_argument if sizes
 /// differ, the part has no way to the root, or an orientation is asked of a part of which positions

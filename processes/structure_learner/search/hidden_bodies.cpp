@@ -1,8 +1,8 @@
 #include "processes/structure_learner/search/hidden_bodies.h"
 
 #include <algorithm>
+#include <iterator>
 #include <limits>
-#include <tuple>
 #include <utility>
 
 #include "processes/structure_learner/search/layered_search.h"
@@ -11,8 +11,6 @@
 namespace bodyschema {
 namespace {
 
-// More gaps have another reason than hidden parts.
-constexpr std::size_t kMaxComponents = 6;
 // Of two components, those whose best joint leaves least.
 constexpr std::size_t kMaxScreened = 8;
 constexpr int kMaxFits = 24;
@@ -48,21 +46,17 @@ std::vector<Body> bodies_of(const ModelForest& forest, int component) {
   return bodies;
 }
 
-// The poses of body b in body a.
+// The poses of body b in body a, whose part is the lower one.
 PairData between(const Body& a, const Body& b, PairModels* pairs) {
-  const bool is_ordered = a.part < b.part;
-  const int part_i = std::min(a.part, b.part), part_j = std::max(a.part, b.part);
-  const Body& of_i = is_ordered ? a : b;
-  const Body& of_j = is_ordered ? b : a;
-  PairData data = pairs->pair(part_i, part_j);
+  PairData data = pairs->pair(a.part, b.part);
   for (const PairFrame& frame : data.frames) {
-    const Pose from_i = of_i.way.predict(pairs->actions(), frame.sample).inverse();
-    const Pose from_j = of_j.way.predict(pairs->actions(), frame.sample);
-    const Matrix6d carried = adjoint(from_j);
+    const Pose from_a = a.way.predict(pairs->actions(), frame.sample).inverse();
+    const Pose from_b = b.way.predict(pairs->actions(), frame.sample);
+    const Matrix6d carried = adjoint(from_b);
     for (int h = 0; h < frame.num_hypotheses; ++h) {
       PairHypothesis& hypothesis =
           data.hypotheses[static_cast<std::size_t>(frame.first_hypothesis + h)];
-      hypothesis.z = from_i * hypothesis.z * from_j;
+      hypothesis.z = from_a * hypothesis.z * from_b;
       hypothesis.whitening = hypothesis.whitening * carried;
     }
   }
@@ -95,20 +89,8 @@ class HiddenBodySearch {
       auto c = pairs_.try_start(part_i, part_j, start);
       if (c && !c->doubtful) valid.push_back(*std::move(c));
     }
-    if (valid.empty()) return std::nullopt;
-    const auto rank = [](const Candidate& c) { return std::tuple(c.model.num_joints(), -c.score); };
-    const Candidate best = *std::ranges::min_element(valid, {}, rank);
-    for (const Candidate& other : valid) {
-      if (other.model.num_joints() != best.model.num_joints() ||
-          !other.joins(best.part_i, best.part_j) ||
-          signal_set(other.model) == signal_set(best.model) ||
-          (best.score - other.score) * best.num_frames >= kAmbiguityMargin)
-        continue;
-      pairs_.record(best.part_i, best.part_j)
-          .note_undecided(best.model.num_joints(), best.mean_capped);
-      return std::nullopt;
-    }
-    return settled(best);
+    const std::optional<Candidate> best = pairs_.only_best(valid);
+    return best ? settled(*best) : std::nullopt;
   }
 
  private:
@@ -189,7 +171,7 @@ bool connect_hidden_bodies(PairModels* pairs, ModelForest* forest) {
     is_new = false;
     std::set<int> components;
     for (const int part : forest->parts()) components.insert(forest->component(part));
-    if (components.size() > kMaxComponents) break;
+    if (components.size() > kMaxChainedComponents) break;
     HiddenBodySearch search(pairs, *forest);
     std::vector<Candidate> found;
     for (const int x : components)
@@ -197,8 +179,7 @@ bool connect_hidden_bodies(PairModels* pairs, ModelForest* forest) {
         if (x < y)
           if (auto c = search.best(bodies_of(*forest, x), bodies_of(*forest, y)))
             found.push_back(*std::move(c));
-    std::ranges::stable_sort(
-        found, {}, [](const Candidate& c) { return std::tuple(c.model.num_joints(), -c.score); });
+    std::ranges::stable_sort(found, {}, rank);
     for (Candidate& c : found) {
       if (forest->connected(c.part_i, c.part_j) || !pairs->confirm_on_all_data(&c)) continue;
       forest->add(c);

@@ -4,7 +4,6 @@
 #include <cmath>
 #include <limits>
 #include <map>
-#include <tuple>
 
 #include "processes/structure_learner/long_chain/long_chain.h"
 #include "processes/structure_learner/residual_fit.h"
@@ -15,10 +14,9 @@ namespace {
 
 // Pairs of two components that are tried, those seen together most often first.
 constexpr std::size_t kMaxPairs = 12;
-// Components that lie apart. More gaps than kMaxComponents have another reason than hidden parts:
-// the noise told, or soft parts. Beyond kMaxSearched no order of joints is searched for: what falls
-// into many pieces is no arm that is seen at its ends, and each two of them would cost a second.
-constexpr std::size_t kMaxComponents = 6, kMaxSearched = 3;
+// Components that lie apart, beyond which no order of joints is searched for: what falls into many
+// pieces is no arm that is seen at its ends, and each two of them would cost a second.
+constexpr std::size_t kMaxSearched = 3;
 // Pairs for which one more signal is tried, those that the others explain best, and such signals.
 constexpr std::size_t kMaxExtended = 3, kMaxMore = 10;
 
@@ -54,8 +52,6 @@ std::optional<Candidate> chain_between(const Pair& ij, const std::vector<int>& s
   *cost = pairs->last_cost();
   return chain;
 }
-
-std::tuple<int, double> rank(const Candidate& c) { return {c.model.num_joints(), -c.score}; }
 
 // Of the pairs. `costs` gets what the chains leave.
 std::optional<Candidate> best_chain(const std::vector<Pair>& between,
@@ -104,19 +100,8 @@ std::optional<Candidate> best_extended(std::vector<Pair> between, std::map<Pair,
         found.push_back(*std::move(c));
     }
   }
-  if (found.empty()) return std::nullopt;
-  const Candidate best = *std::ranges::min_element(found, {}, rank);
-  for (const Candidate& other : found) {
-    if (other.joins(best.part_i, best.part_j) &&
-        other.model.num_joints() == best.model.num_joints() &&
-        signal_set(other.model) != signal_set(best.model) &&
-        (best.score - other.score) * best.num_frames < kAmbiguityMargin) {
-      pairs->record(best.part_i, best.part_j)
-          .note_undecided(best.model.num_joints(), best.mean_capped);
-      return std::nullopt;
-    }
-  }
-  return with_searched_order(best, pairs);
+  const std::optional<Candidate> best = pairs->only_best(found);
+  return best ? std::optional(with_searched_order(*best, pairs)) : std::nullopt;
 }
 
 // A soft body, too, moves like a chain of many joints, roughly: where a Gaussian process predicts
@@ -148,7 +133,7 @@ bool connect_long_chains(PairModels* pairs, ModelForest* forest) {
   if (max_joints <= kMaxScreenedJoints) return false;
   if (pairs->options().unknown_bias > 0 && pairs->actions().blocks().is_stream()) return false;
   const std::size_t num_components = forest->parts().size() - forest->models().size();
-  if (num_components > kMaxComponents) return false;
+  if (num_components > kMaxChainedComponents) return false;
   const bool are_few = num_components <= kMaxSearched;
   std::map<Pair, std::vector<Pair>> open;  // by components
   for (const auto& [ij, record] : pairs->records())

@@ -1,8 +1,14 @@
 #pragma once
 
+#include <cstddef>
+
 #include "processes/structure_learner/search/pair_models.h"
 
 namespace bodyschema {
+
+/// Components that lie apart and are searched for chains of more than two joints. More gaps have
+/// another reason than hidden parts: the noise told, or soft parts.
+inline constexpr std::size_t kMaxChainedComponents = 6;
 
 /// Connects components that no model of up to two joints connects by chains of any number of
 /// joints: on the signals that move nothing in the forest, then on these and one of those that do,

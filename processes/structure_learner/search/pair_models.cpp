@@ -19,6 +19,10 @@ void PairRecord::note_undecided(int num_signals, double mean_capped) {
   if (!is_new) it->second = std::min(it->second, mean_capped);
 }
 
+std::tuple<int, double> rank(const Candidate& candidate) {
+  return {candidate.model.num_joints(), -candidate.score};
+}
+
 PairModels::PairModels(const std::vector<ActionPoseSample>& samples,
                        const NormalizedActions& actions, const std::vector<int>& parts,
                        const SearchOptions& options)
@@ -97,6 +101,20 @@ bool PairModels::confirm_on_all_data(Candidate* candidate) {
   candidate->on_all_data = true;
   candidate->is_valid = validity.verdict == Verdict::kValid;
   return candidate->is_valid;
+}
+
+std::optional<Candidate> PairModels::only_best(const std::vector<Candidate>& candidates) {
+  if (candidates.empty()) return std::nullopt;
+  const Candidate& best = *std::ranges::min_element(candidates, {}, rank);
+  const auto is_rival = [&best](const Candidate& other) {
+    return other.joins(best.part_i, best.part_j) &&
+           other.model.num_joints() == best.model.num_joints() &&
+           signal_set(other.model) != signal_set(best.model) &&
+           (best.score - other.score) * best.num_frames < kAmbiguityMargin;
+  };
+  if (std::ranges::none_of(candidates, is_rival)) return best;
+  record(best.part_i, best.part_j).note_undecided(best.model.num_joints(), best.mean_capped);
+  return std::nullopt;
 }
 
 std::vector<NearMiss> PairModels::near_misses() const {

@@ -60,6 +60,9 @@ struct Candidate : AcceptedModel {
   bool is_valid = true;  ///< on all data, once it was judged there
 };
 
+/// Fewer joints first, then the better score.
+std::tuple<int, double> rank(const Candidate& candidate);
+
 /// A model that its pair's own data refuted, at a cost that a true one may have.
 struct NearMiss {
   int part_i = 0, part_j = 0;
@@ -95,6 +98,10 @@ class PairModels {
   double last_cost() const { return last_cost_; }
   /// Fits and tests a candidate on all data of its pair, once.
   bool confirm_on_all_data(Candidate* candidate);
+
+  /// The first by rank(); std::nullopt if there is none, or if another signal set of as many joints
+  /// explains its pair as well, which is then undecided.
+  std::optional<Candidate> only_best(const std::vector<Candidate>& candidates);
 
   /// All markers together spoke against this model.
   void refute(const AcceptedModel& m) { refuted_.insert(key(m.part_i, m.part_j, m.model)); }
