@@ -278,10 +278,18 @@ test::SyntheticRobot hinged(const std::vector<HingedLink>& links, int num_signal
 }
 
 // 1 –q1– (2) –q2– 3 and (2) –q3– (4) –q4– 5: from the hidden 2, which is known, 5 is two joints
-// away, from any part that is seen three. q5 moves nothing.
+// away, from any part that is seen three.
 const std::vector<HingedLink> kHiddenBranch{{2, 1, 0, true}, {3, 2, 1}, {4, 2, 2, true}, {5, 4, 3}};
+
+// With so many other parts that 25 poses are too few for a chain on all signals. The hidden 2 and 4
+// have a joint between them and carry two seen parts each: 1 –q1– (2) –q2– 3, 5 –q4– (4) –q5– 6.
+const std::vector<HingedLink> kTwoHiddenBodies{{2, 1, 0, true}, {3, 2, 1}, {4, 2, 2, true},
+                                               {5, 4, 3},       {6, 4, 4}, {7, 1, 5},
+                                               {8, 7, 6},       {9, 8, 7}, {10, 9, 8}};
 // 1 –q1– 2 –q2– (3) –q3– (4) –q1– 5.
-const std::vector<HingedLink> kSharedSignal{{2, 1, 0}, {3, 2, 1, true}, {4, 3, 2, true}, {5, 4, 0}};
+const std::vector<HingedLink> kSharedSignal{{2, 1, 0},  {3, 2, 1, true}, {4, 3, 2, true}, {5, 4, 0},
+                                            {6, 1, 3},  {7, 6, 4},       {8, 7, 5},       {9, 8, 6},
+                                            {10, 9, 7}, {11, 10, 8}};
 
 int count_right(const std::vector<HingedLink>& links, int num_signals, Regime regime) {
   int num_right = 0;
@@ -323,11 +331,12 @@ TEST(HiddenBodies, AreOnlyInModelsOfTwoJoints) {
 }
 
 TEST(HiddenBodies, AreFoundInTagNoise) {
-  EXPECT_GE(count_right(kHiddenBranch, 5, Regime::kTag), 9);
+  EXPECT_GE(count_right(kTwoHiddenBodies, 9, Regime::kTag), 8);
 }
 
 TEST(LongChains, MayHaveASignalThatMovesOtherPartsToo) {
-  EXPECT_GE(count_right(kSharedSignal, 4, Regime::kTag), 8);
+  // Only where the two parts are among those that are seen together most often.
+  EXPECT_GE(count_right(kSharedSignal, 9, Regime::kTag), 3);
 }
 
 TEST(WithdrawUntoldEdges, AnEdgeIsNotRigidBecauseItsSignalHardlyMovedWhileItWasSeen) {
