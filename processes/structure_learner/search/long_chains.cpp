@@ -157,7 +157,9 @@ bool connect_long_chains(PairModels* pairs, ModelForest* forest) {
     if (between.size() > kMaxPairs) between.resize(kMaxPairs);
     std::map<Pair, double> costs, ignored;
     std::optional<Candidate> chain;
-    if (is_possible(idle.size())) chain = best_chain(between, idle, are_few, pairs, &costs);
+    if (is_possible(idle.size()) || is_extended)
+      chain = best_chain(between, idle, are_few, pairs, &costs);
+    if (chain && !is_possible(idle.size())) chain.reset();  // of the layers
     if (!chain && is_extended && is_possible(idle.size() + 1))
       chain = best_extended(between, costs, idle, std::vector(used.begin(), used.end()), pairs);
     if (!chain && idle != moving && is_possible(moving.size()))

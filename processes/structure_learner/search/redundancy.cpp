@@ -7,6 +7,7 @@
 #include <vector>
 
 #include "common/geometry/pose.h"
+#include "processes/structure_learner/noise_estimate.h"
 #include "processes/structure_learner/search/component_tree.h"
 
 namespace bodyschema {
@@ -19,6 +20,15 @@ constexpr double kNoiseOfOneSight = 6;
 constexpr double kCoupling = 1.0 / 36;
 
 using Nodes = std::vector<TreeNode>;
+
+// d² of a motion as large as an error of one sight may be: by its noise, but of a noise that is
+// told to be louder than any marker's no systematic error need be as large.
+double squared_size(const Vector6d& moved, const PairHypothesis& sight) {
+  const double of_errors =
+      moved.head<3>().squaredNorm() / (kLoudestMarker.position_m * kLoudestMarker.position_m) +
+      moved.tail<3>().squaredNorm() / (kLoudestMarker.rotation_rad * kLoudestMarker.rotation_rad);
+  return std::max((sight.whitening * moved).squaredNorm(), of_errors);
+}
 
 bool is_below(const Nodes& nodes, int node, int ancestor) {
   for (; node >= 0; node = nodes[node].parent)
@@ -62,7 +72,7 @@ std::optional<double> mean_square_motion(const Nodes& nodes, int a, int b, int s
     const Pose X_ba = of_b.X.inverse() * of_a.X;
     const Vector6d moved =
         (of_b.by_signal - adjoint(X_ba) * of_a.by_signal) * actions(sample, signal);
-    sum += (pair.primary(t).whitening * moved).squaredNorm();
+    sum += squared_size(moved, pair.primary(t));
   }
   return sum / pair.size();
 }
@@ -113,7 +123,7 @@ double mean_square_motion(const AcceptedModel& m, int signal, PairModels* pairs)
     for (int d = 0; d < m.model.num_joints(); ++d)
       if (m.model.joints[d].signal == signal) moved += J.col(d);
     moved *= pairs->actions()(sample, signal);
-    sum += (pair.primary(t).whitening * moved).squaredNorm();
+    sum += squared_size(moved, pair.primary(t));
   }
   return sum / std::max(pair.size(), 1);
 }
@@ -137,7 +147,7 @@ double added_motion(const AcceptedModel& m, int joint, PairModels* pairs) {
     const int sample = pair.frames[t].sample;
     const Vector6d off =
         log(without.predict(actions, sample).inverse() * m.model.predict(actions, sample));
-    sum += (pair.primary(t).whitening * off).squaredNorm();
+    sum += squared_size(off, pair.primary(t));
   }
   return sum / std::max(pair.size(), 1);
 }

@@ -9,11 +9,12 @@
 namespace bodyschema {
 
 /// Edges with a signal that the tree does not need: two edges use it, but the parts at the far ends
-/// of both, as these models predict them, do not move with it by more than the noise of one sight.
-/// So there is an edge of fewer joints between those parts, and that the data refuted it has
-/// another reason than motion: outliers, or a bias of views. Of the two edges the one with more
-/// joints is returned, by its parts, and its record says so. O(E² N) for E edges that share a
-/// signal and N frames of a pair.
+/// of both, as these models predict them, do not move with it by more than the noise of one sight
+/// (that of the loudest marker, if more is told: no systematic error is as large). So there is an
+/// edge of fewer joints between those parts, and that the data refuted it has another reason than
+/// motion: outliers, or a bias of views. Of the two edges the one with more joints is returned, by
+/// its parts, and its record says so. O(E² N) for E edges that share a signal and N frames of a
+/// pair.
 std::vector<std::pair<int, int>> redundant_edges(PairModels* pairs, ModelForest forest);
 
 /// A joint of a signal that has another one, and that adds far less than the signal moves there:

@@ -335,8 +335,19 @@ TEST(HiddenBodies, AreFoundInTagNoise) {
 }
 
 TEST(LongChains, MayHaveASignalThatMovesOtherPartsToo) {
-  // Only where the two parts are among those that are seen together most often.
-  EXPECT_GE(count_right(kSharedSignal, 9, Regime::kTag), 3);
+  EXPECT_GE(count_right(kSharedSignal, 9, Regime::kTag), 6);
+}
+
+// Four of the random trees with a joint that moves less than the noise of one sight, 25 mm and 6°:
+// poses that say so are no sign of a systematic error as large.
+TEST(RedundantEdges, AreNoneForAJointThatLoudNoiseHidesInOneSight) {
+  for (const std::uint64_t seed : {1001, 1015, 1034, 1055}) {
+    Rng rng(seed);
+    const test::SyntheticRobot robot = test::random_tree({}, rng);
+    const auto samples =
+        test::babble(robot, 20, {.regime = Regime::kChapter, .with_covariances = true}, rng);
+    EXPECT_TRUE(test::is_right(learn(robot.signals, samples).schema, robot)) << seed;
+  }
 }
 
 TEST(WithdrawUntoldEdges, AnEdgeIsNotRigidBecauseItsSignalHardlyMovedWhileItWasSeen) {
