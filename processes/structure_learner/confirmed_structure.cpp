@@ -28,9 +28,7 @@ constexpr double kUnknownBias = 0.5;
 using EdgeSignature = std::tuple<int, int, std::multiset<int>, std::vector<int>>;
 
 EdgeSignature signature_of(const AcceptedModel& edge) {
-  std::multiset<int> signals;
-  for (const LocalModel::Joint& joint : edge.model.joints) signals.insert(joint.signal);
-  return {edge.part_i, edge.part_j, signals, edge.soft_signals};
+  return {edge.part_i, edge.part_j, signals_of_joints(edge.model), edge.soft_signals};
 }
 
 std::set<EdgeSignature> signatures_of(const LearnedStructure& structure) {

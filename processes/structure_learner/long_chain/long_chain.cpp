@@ -289,6 +289,7 @@ Fit with_settled_order(Fit fit, const PairData& pair, const NormalizedActions& a
   const int last = fit.model.num_joints() - 1;
   std::vector<bool> is_open(std::max(last, 0));
   for (int d = 0; d < last; ++d) {
+    if (fit.model.joints[d].signal == fit.model.joints[d + 1].signal) continue;
     const Fit exchanged = evaluate(with_exchanged(fit.model, d), pair, actions);
     // Joints that commute, as far as the poses tell, have no order.
     if (std::abs(exchanged.cost - fit.cost) < kSettledMargin) continue;

@@ -35,8 +35,8 @@ Fit without_idle_joints(Fit fit, const PairData& pair, const NormalizedActions& 
 /// far away moves alike.
 Fit with_pure_slides(Fit fit, const PairData& pair, const NormalizedActions& actions);
 
-/// Exchanges neighbouring joints while that lowers the cost, and numbers those whose order the
-/// poses leave open: LocalModel::Joint::order_group.
+/// Exchanges neighbouring joints of two signals while that lowers the cost, and numbers those whose
+/// order the poses leave open: LocalModel::Joint::order_group.
 Fit with_settled_order(Fit fit, const PairData& pair, const NormalizedActions& actions);
 
 }  // namespace bodyschema

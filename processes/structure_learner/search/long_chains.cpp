@@ -27,32 +27,6 @@ std::vector<int> without(const std::vector<int>& signals, const std::set<int>& u
   return result;
 }
 
-using Pair = std::pair<int, int>;
-
-// A chain on some of the signals, valid by the pair's own data. `cost`: what it leaves a frame.
-std::optional<Candidate> chain_between(const Pair& ij, const std::vector<int>& signals,
-                                       JointOrder order, PairModels* pairs, double* cost) {
-  const auto [part_i, part_j] = ij;
-  *cost = std::numeric_limits<double>::infinity();
-  const PairData& pair = pairs->pair(part_i, part_j);
-  const NormalizedActions& actions = pairs->actions();
-  const int num_independent =
-      actions.blocks().count(pair.frames, [](const PairFrame& frame) { return frame.sample; });
-  if (num_independent < kPosesPerJoint * static_cast<int>(signals.size())) {
-    pairs->record(part_i, part_j).note_undecided(static_cast<int>(signals.size()), 0);
-    return std::nullopt;
-  }
-  const double sigma_rad = pairs->motions(part_i, part_j).sigma_rad;
-  std::optional<Fit> fit = fit_long_chain(pair, actions, signals, order, sigma_rad);
-  ++pairs->num_fits;
-  if (!fit) return std::nullopt;
-  fit = without_idle_joints(with_pure_slides(*std::move(fit), pair, actions), pair, actions);
-  fit = with_settled_order(*std::move(fit), pair, actions);
-  std::optional<Candidate> chain = pairs->try_start(part_i, part_j, fit->model);
-  *cost = pairs->last_cost();
-  return chain;
-}
-
 // Of the pairs. `costs` gets what the chains leave.
 std::optional<Candidate> best_chain(const std::vector<Pair>& between,
                                     const std::vector<int>& signals, bool are_few,
@@ -69,14 +43,6 @@ std::optional<Candidate> best_chain(const std::vector<Pair>& between,
   return best;
 }
 
-// Of so many hypotheses one fits by chance unless the least joint that is looked for would show by
-// far. Chosen: at 17 poses that is 24 σ of tags, 5 σ of the chapter's noise, where it is wrong as
-// often as right.
-bool shows_any_joint(const PairData& pair, double sigma_rad) {
-  constexpr double kClear = 10;
-  return kLeastTurn / std::sqrt(3.0) * std::sqrt(pair.size()) > kClear * sigma_rad;
-}
-
 // With one more joint, of a signal that moves other parts, too: those of a hidden one that carries
 // them. None if another signal does as well.
 std::optional<Candidate> best_extended(std::vector<Pair> between, std::map<Pair, double> costs,
@@ -88,9 +54,7 @@ std::optional<Candidate> best_extended(std::vector<Pair> between, std::map<Pair,
   std::vector<Candidate> found;
   double cost = 0;
   for (const Pair& ij : between) {
-    if (!shows_any_joint(pairs->pair(ij.first, ij.second),
-                         pairs->motions(ij.first, ij.second).sigma_rad))
-      continue;
+    if (!shows_any_joint(ij, pairs)) continue;
     for (const int s : more) {
       std::vector<int> all = signals;
       all.insert(std::ranges::upper_bound(all, s), s);
@@ -120,6 +84,57 @@ bool is_rather_soft(const Candidate& chain, const PairModels& pairs) {
 
 }  // namespace
 
+std::map<Pair, std::vector<Pair>> pairs_between_components(PairModels* pairs,
+                                                           const ModelForest& forest) {
+  std::map<Pair, std::vector<Pair>> result;
+  for (const auto& [ij, record] : pairs->records())
+    if (!forest.connected(ij.first, ij.second) && record.num_common > 0)
+      result[std::minmax(forest.component(ij.first), forest.component(ij.second))].push_back(ij);
+  return result;
+}
+
+std::optional<Candidate> chain_between(const Pair& ij, const std::vector<int>& signals,
+                                       JointOrder order, PairModels* pairs, double* cost) {
+  const auto [part_i, part_j] = ij;
+  *cost = std::numeric_limits<double>::infinity();
+  const PairData& pair = pairs->pair(part_i, part_j);
+  const NormalizedActions& actions = pairs->actions();
+  const int num_independent =
+      actions.blocks().count(pair.frames, [](const PairFrame& frame) { return frame.sample; });
+  if (num_independent < kPosesPerJoint * static_cast<int>(signals.size())) {
+    pairs->record(part_i, part_j).note_undecided(static_cast<int>(signals.size()), 0);
+    return std::nullopt;
+  }
+  const double sigma_rad = pairs->motions(part_i, part_j).sigma_rad;
+  std::optional<Fit> fit = fit_long_chain(pair, actions, signals, order, sigma_rad);
+  ++pairs->num_fits;
+  if (!fit) return std::nullopt;
+  fit = without_idle_joints(with_pure_slides(*std::move(fit), pair, actions), pair, actions);
+  fit = with_settled_order(*std::move(fit), pair, actions);
+  std::optional<Candidate> chain = pairs->try_start(part_i, part_j, fit->model);
+  *cost = pairs->last_cost();
+  return chain;
+}
+
+bool shows_any_joint(const Pair& ij, PairModels* pairs) {
+  constexpr double kClear = 10;
+  const auto [part_i, part_j] = ij;
+  return kLeastTurn / std::sqrt(3.0) * std::sqrt(pairs->pair(part_i, part_j).size()) >
+         kClear * pairs->motions(part_i, part_j).sigma_rad;
+}
+
+bool add_chains(std::vector<Candidate> chains, PairModels* pairs, ModelForest* forest) {
+  bool any = false;
+  for (Candidate& c : chains) {
+    if (forest->connected(c.part_i, c.part_j) || !pairs->confirm_on_all_data(&c) ||
+        is_rather_soft(c, *pairs))
+      continue;
+    forest->add(c);
+    any = true;
+  }
+  return any;
+}
+
 Candidate with_searched_order(const Candidate& chain, PairModels* pairs) {
   double cost = 0;
   const std::set<int> signals = signal_set(chain.model);
@@ -135,12 +150,7 @@ bool connect_long_chains(PairModels* pairs, ModelForest* forest) {
   const std::size_t num_components = forest->parts().size() - forest->models().size();
   if (num_components > kMaxChainedComponents) return false;
   const bool are_few = num_components <= kMaxSearched;
-  std::map<Pair, std::vector<Pair>> open;  // by components
-  for (const auto& [ij, record] : pairs->records())
-    if (!forest->connected(ij.first, ij.second) && record.num_common > 0)
-      open[std::minmax(forest->component(ij.first), forest->component(ij.second))].push_back(ij);
-  std::set<int> used;
-  for (const AcceptedModel& m : forest->models()) used.merge(signal_set(m.model));
+  const std::set<int> used = forest->used_signals();
   const std::vector<int>& moving = pairs->actions().moving();
   const std::vector<int> idle = without(moving, used);
   const bool is_extended = are_few && !forest->models().empty() && !idle.empty() &&
@@ -149,7 +159,7 @@ bool connect_long_chains(PairModels* pairs, ModelForest* forest) {
     return static_cast<int>(m) > kMaxScreenedJoints && static_cast<int>(m) <= max_joints;
   };
   std::vector<Candidate> found;
-  for (auto& [components, between] : open) {
+  for (auto& [components, between] : pairs_between_components(pairs, *forest)) {
     std::stable_sort(between.begin(), between.end(), [&](const auto& x, const auto& y) {
       return pairs->record(x.first, x.second).num_common >
              pairs->record(y.first, y.second).num_common;
@@ -169,15 +179,7 @@ bool connect_long_chains(PairModels* pairs, ModelForest* forest) {
   std::stable_sort(found.begin(), found.end(), [](const Candidate& x, const Candidate& y) {
     return x.model.num_joints() < y.model.num_joints();
   });
-  bool any = false;
-  for (Candidate& c : found) {
-    if (forest->connected(c.part_i, c.part_j) || !pairs->confirm_on_all_data(&c) ||
-        is_rather_soft(c, *pairs))
-      continue;
-    forest->add(c);
-    any = true;
-  }
-  return any;
+  return add_chains(std::move(found), pairs, forest);
 }
 
 }  // namespace bodyschema

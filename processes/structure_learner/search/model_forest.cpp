@@ -11,6 +11,12 @@ std::set<int> signal_set(const LocalModel& model) {
   return signals;
 }
 
+std::multiset<int> signals_of_joints(const LocalModel& model) {
+  std::multiset<int> signals;
+  for (const LocalModel::Joint& joint : model.joints) signals.insert(joint.signal);
+  return signals;
+}
+
 std::vector<std::pair<int, int>> ends_of(const std::vector<AcceptedModel>& models) {
   std::vector<std::pair<int, int>> ends;
   for (const AcceptedModel& m : models) ends.emplace_back(m.part_i, m.part_j);
@@ -30,11 +36,16 @@ int ModelForest::num_joints() const {
   return sum;
 }
 
+std::set<int> ModelForest::used_signals() const {
+  std::set<int> used;
+  for (const AcceptedModel& m : models_) used.merge(signal_set(m.model));
+  return used;
+}
+
 std::set<int> ModelForest::idle_signals(const std::vector<int>& signals) const {
   if (!spans()) return {};
   std::set<int> idle(signals.begin(), signals.end());
-  for (const AcceptedModel& m : models_)
-    for (const int signal : signal_set(m.model)) idle.erase(signal);
+  for (const int signal : used_signals()) idle.erase(signal);
   return idle;
 }
 

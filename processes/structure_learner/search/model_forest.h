@@ -27,6 +27,8 @@ struct AcceptedModel {
 };
 
 std::set<int> signal_set(const LocalModel& model);
+/// As often as joints are on them.
+std::multiset<int> signals_of_joints(const LocalModel& model);
 
 /// The parts (i, j) of each: a KinematicTree's edges.
 std::vector<std::pair<int, int>> ends_of(const std::vector<AcceptedModel>& models);
@@ -73,6 +75,7 @@ class ModelForest {
   std::vector<int> members(int part) const;
   bool spans() const { return components_.is_one(); }
   int num_joints() const;
+  std::set<int> used_signals() const;
   /// The signals among these that move nothing in a forest that spans; none in another.
   std::set<int> idle_signals(const std::vector<int>& signals) const;
 

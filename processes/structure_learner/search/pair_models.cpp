@@ -109,7 +109,7 @@ std::optional<Candidate> PairModels::only_best(const std::vector<Candidate>& can
   const auto is_rival = [&best](const Candidate& other) {
     return other.joins(best.part_i, best.part_j) &&
            other.model.num_joints() == best.model.num_joints() &&
-           signal_set(other.model) != signal_set(best.model) &&
+           signals_of_joints(other.model) != signals_of_joints(best.model) &&
            (best.score - other.score) * best.num_frames < kAmbiguityMargin;
   };
   if (std::ranges::none_of(candidates, is_rival)) return best;

@@ -99,8 +99,8 @@ class PairModels {
   /// Fits and tests a candidate on all data of its pair, once.
   bool confirm_on_all_data(Candidate* candidate);
 
-  /// The first by rank(); std::nullopt if there is none, or if another signal set of as many joints
-  /// explains its pair as well, which is then undecided.
+  /// The first by rank(); std::nullopt if there is none, or if as many joints on other signals
+  /// explain its pair as well, which is then undecided.
   std::optional<Candidate> only_best(const std::vector<Candidate>& candidates);
 
   /// All markers together spoke against this model.
@@ -115,9 +115,9 @@ class PairModels {
   int num_fits = 0;     ///< Levenberg–Marquardt fits, of pairs and of whole trees
 
  private:
-  using Key = std::tuple<int, int, std::set<int>>;
+  using Key = std::tuple<int, int, std::multiset<int>>;  // the signals of the joints
   static Key key(int part_i, int part_j, const LocalModel& model) {
-    return {part_i, part_j, signal_set(model)};
+    return {part_i, part_j, signals_of_joints(model)};
   }
 
   const std::vector<ActionPoseSample>& samples_;

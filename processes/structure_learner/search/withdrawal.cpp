@@ -4,11 +4,13 @@
 #include <cmath>
 #include <limits>
 #include <map>
+#include <optional>
 #include <vector>
 
 #include "common/estimation/quantile.h"
 #include "processes/structure_learner/joints/missing_joint_test.h"
 #include "processes/structure_learner/search/component_tree.h"
+#include "processes/structure_learner/tree_fit_normal.h"
 
 namespace bodyschema {
 namespace {
@@ -74,6 +76,49 @@ void withdraw_untestable(const ComponentTree& tree, PairModels* pairs,
   }
 }
 
+// Of what a joint moves, one standard deviation: within 5 % at two.
+constexpr double kLargestGainError = 0.025;
+
+// The largest, over the joints of a node's edge, of the standard deviation of a joint's turn or
+// slide over its size, whichever is less.
+double gain_error(const TreeNode& node, Eigen::Index offset, const Eigen::MatrixXd& covariance) {
+  double largest = 0;
+  for (int d = 0; d < node.model.num_joints(); ++d) {
+    const LocalModel::Joint& joint = node.model.joints[d];
+    const auto relative = [&](Eigen::Index at, double size) {
+      return size == 0 ? std::numeric_limits<double>::infinity()
+                       : std::sqrt(covariance(at, at)) / std::abs(size);
+    };
+    largest =
+        std::max(largest, std::min(relative(offset + ScrewChainLayout::turn(d), joint.turn),
+                                   relative(offset + ScrewChainLayout::slide(d), joint.slide)));
+  }
+  return largest;
+}
+
+// Joints of a chain explain each other's motion: poses that it predicts well may not tell how far
+// each of them moves.
+void withdraw_unknown_gains(const ComponentTree& tree, PairModels* pairs,
+                            std::vector<AcceptedModel>* kept) {
+  const auto is_chain = [](const TreeNode& node) {
+    return node.parent >= 0 && node.model.num_joints() > kMaxScreenedJoints;
+  };
+  if (std::ranges::none_of(tree.nodes(), is_chain)) return;
+  const TreeFit fit = tree.fit();
+  const TreeFit::Normal normal = fit.normal_equations();
+  const std::optional<Eigen::MatrixXd> inverse = normal.inverse();
+  for (std::size_t k = 1; k < fit.nodes().size(); ++k) {
+    const TreeNode& node = fit.nodes()[k];
+    if (!is_chain(node) ||
+        (inverse &&
+         gain_error(node, normal.offset[k], *inverse * normal.noise_scale()) <= kLargestGainError))
+      continue;
+    const int part_i = fit.nodes()[static_cast<std::size_t>(node.parent)].part;
+    pairs->record(part_i, node.part).undecided.emplace(node.model.num_joints(), 0.0);
+    std::erase_if(*kept, [&](const AcceptedModel& m) { return m.joins(part_i, node.part); });
+  }
+}
+
 // Takes back the edge whose data tell least of some signal's joint, if that is not enough: the
 // parts that it joined. Otherwise none, and the information on every signal's joint is counted.
 std::vector<int> withdraw_least_told(const ComponentTree& tree, double most_turn, PairModels* pairs,
@@ -123,9 +168,12 @@ std::vector<int> withdraw_least_told(const ComponentTree& tree, double most_turn
 std::map<int, double> withdraw_untold_edges(PairModels* pairs, ModelForest* forest) {
   std::vector<AcceptedModel> kept = forest->models();
   const double most_turn = usual_turn(kept);
-  for (const int part : forest->parts())
-    if (forest->component(part) == part)
-      withdraw_untestable(ComponentTree(*forest, part, pairs), pairs, &kept);
+  for (const int part : forest->parts()) {
+    if (forest->component(part) != part) continue;
+    const ComponentTree tree(*forest, part, pairs);
+    withdraw_untestable(tree, pairs, &kept);
+    withdraw_unknown_gains(tree, pairs, &kept);
+  }
   forest->set_models(std::move(kept));
   std::map<int, double> information;
   for (const int signal : pairs->actions().moving())

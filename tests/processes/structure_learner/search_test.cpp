@@ -291,6 +291,13 @@ const std::vector<HingedLink> kSharedSignal{{2, 1, 0},  {3, 2, 1, true}, {4, 3, 
                                             {6, 1, 3},  {7, 6, 4},       {8, 7, 5},       {9, 8, 6},
                                             {10, 9, 7}, {11, 10, 8}};
 
+// 1 –q1– 2 –q2– (3) –q2– 4, and 1 –q1– 2 –q2– (3) –q2– (4) –q3– 5.
+const std::vector<HingedLink> kMimicJoint{{2, 1, 0}, {3, 2, 1, true}, {4, 3, 1}};
+const std::vector<HingedLink> kMimicAndOther{
+    {2, 1, 0}, {3, 2, 1, true}, {4, 3, 1, true}, {5, 4, 2}};
+// 1 –q1– (2) –q2– (3) –q3– 4 –q4– 5.
+const std::vector<HingedLink> kChain{{2, 1, 0, true}, {3, 2, 1, true}, {4, 3, 2}, {5, 4, 3}};
+
 int count_right(const std::vector<HingedLink>& links, int num_signals, Regime regime) {
   int num_right = 0;
   for (std::uint64_t seed = 1; seed <= 10; ++seed) {
@@ -348,6 +355,17 @@ TEST(RedundantEdges, AreNoneForAJointThatLoudNoiseHidesInOneSight) {
         test::babble(robot, 20, {.regime = Regime::kChapter, .with_covariances = true}, rng);
     EXPECT_TRUE(test::is_right(learn(robot.signals, samples).schema, robot)) << seed;
   }
+}
+
+TEST(MimicJoints, AreFoundWithNothingSeenBetween) {
+  EXPECT_GE(count_right(kMimicJoint, 2, Regime::kTag), 9);
+  EXPECT_GE(count_right(kMimicAndOther, 3, Regime::kFree), 9);
+}
+
+// In loud noise four of ten gains would be wrong.
+TEST(WithdrawUntoldEdges, AChainWhosePosesDoNotTellHowFarEachJointMoves) {
+  EXPECT_GE(count_right(kChain, 4, Regime::kChapter), 1);
+  EXPECT_GE(count_right(kChain, 4, Regime::kTag), 9);
 }
 
 TEST(WithdrawUntoldEdges, AnEdgeIsNotRigidBecauseItsSignalHardlyMovedWhileItWasSeen) {
