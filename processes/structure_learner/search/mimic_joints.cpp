@@ -19,15 +19,11 @@ constexpr std::size_t kMaxComponents = 3, kMaxIdle = 4;
 // joints of one signal do.
 constexpr std::size_t kMaxPairs = 12, kMaxPairsOfThree = 3;
 
-using Word = std::vector<int>;  // signals in the order of the joints
+// A frame, above which another order of the joints is no remedy either (chosen: a right model
+// costs 4 to 7 nats, one without the second joint of a signal 20).
+constexpr double kHopelessCost = 16;
 
-std::vector<Word> words_of_three(const std::vector<int>& signals) {
-  std::vector<Word> words;
-  for (const int a : signals)
-    for (const int b : signals)
-      if (a != b) words.insert(words.end(), {{a, a, b}, {a, b, a}, {b, a, a}});
-  return words;
-}
+using Word = std::vector<int>;  // signals in the order of the joints
 
 double one_joint_score(const Pair& ij, PairModels* pairs) {
   const auto regressions = screen_one_joint(pairs->motions(ij.first, ij.second), pairs->actions());
@@ -44,32 +40,58 @@ void keep_least(std::vector<Pair>* between, std::size_t most, Score&& score) {
   if (between->size() > most) between->resize(most);
 }
 
-// Valid and not doubtful, into `valid`; what the best of them leaves a frame.
-double try_words(const Pair& ij, const std::vector<Word>& words, PairModels* pairs,
-                 std::vector<Candidate>* valid) {
-  double least = std::numeric_limits<double>::infinity();
-  for (const Word& word : words) {
-    double cost = 0;
-    std::optional<Candidate> c = chain_between(ij, word, JointOrder::kListed, pairs, &cost);
-    least = std::min(least, cost);
-    if (c && !c->doubtful) valid->push_back(*std::move(c));
-  }
-  return least;
-}
+class MimicSearch {
+ public:
+  MimicSearch(const std::vector<int>& idle, PairModels* pairs) : idle_(idle), pairs_(*pairs) {}
 
-std::optional<Candidate> best_between(std::vector<Pair> between, const std::vector<int>& idle,
-                                      PairModels* pairs) {
-  std::erase_if(between, [&](const Pair& ij) { return !shows_any_joint(ij, pairs); });
-  keep_least(&between, kMaxPairs, [&](const Pair& ij) { return one_joint_score(ij, pairs); });
-  std::vector<Word> twice;
-  for (const int a : idle) twice.push_back({a, a});
-  std::vector<Candidate> valid;
-  keep_least(&between, kMaxPairsOfThree,
-             [&](const Pair& ij) { return try_words(ij, twice, pairs, &valid); });
-  if (valid.empty() && pairs->options().max_signals > 2)
-    for (const Pair& ij : between) try_words(ij, words_of_three(idle), pairs, &valid);
-  return pairs->only_best(valid);
-}
+  std::optional<Candidate> best(std::vector<Pair> between) {
+    std::erase_if(between, [&](const Pair& ij) { return !shows_any_joint(ij, &pairs_); });
+    keep_least(&between, kMaxPairs, [&](const Pair& ij) { return one_joint_score(ij, &pairs_); });
+    keep_least(&between, kMaxPairsOfThree, [&](const Pair& ij) { return try_two(ij); });
+    if (valid_.empty() && pairs_.options().max_signals > 2)
+      for (const Pair& ij : between) try_three(ij);
+    return pairs_.only_best(valid_);
+  }
+
+ private:
+  // What the chain leaves a frame. If it is valid and not doubtful, it is kept.
+  double try_word(const Pair& ij, const Word& word) {
+    double cost = 0;
+    std::optional<Candidate> c = chain_between(ij, word, JointOrder::kListed, &pairs_, &cost);
+    if (c && !c->doubtful) valid_.push_back(*std::move(c));
+    return cost;
+  }
+
+  double try_two(const Pair& ij) {
+    double least = std::numeric_limits<double>::infinity();
+    for (const int a : idle_) least = std::min(least, try_word(ij, {a, a}));
+    return least;
+  }
+
+  // On the two signals of which single joints leave least; in another order where the first one
+  // leaves little.
+  void try_three(const Pair& ij) {
+    std::optional<std::pair<int, int>> signals;
+    double least = std::numeric_limits<double>::infinity(), cost = 0;
+    for (std::size_t k = 0; k < idle_.size(); ++k)
+      for (std::size_t l = k + 1; l < idle_.size(); ++l) {
+        chain_between(ij, {idle_[k], idle_[l]}, JointOrder::kListed, &pairs_, &cost);
+        if (cost >= least) continue;
+        least = cost;
+        signals = {idle_[k], idle_[l]};
+      }
+    if (!signals) return;
+    for (const auto& [a, b] : {*signals, std::pair(signals->second, signals->first)}) {
+      if (try_word(ij, {a, a, b}) > kHopelessCost) continue;
+      try_word(ij, {a, b, a});
+      try_word(ij, {b, a, a});
+    }
+  }
+
+  const std::vector<int>& idle_;
+  PairModels& pairs_;
+  std::vector<Candidate> valid_;
+};
 
 }  // namespace
 
@@ -78,11 +100,15 @@ bool connect_mimic_joints(PairModels* pairs, ModelForest* forest) {
   std::vector<int> idle = pairs->actions().moving();
   std::erase_if(idle, [used = forest->used_signals()](int s) { return used.contains(s); });
   if (num_components > kMaxComponents || idle.size() > kMaxIdle ||
-      pairs->options().max_signals < 2 || pairs->actions().blocks().is_stream())
+      pairs->options().max_signals < 2 || pairs->options().unknown_bias > 0 ||
+      pairs->actions().blocks().is_stream())
     return false;
+  const std::map<Pair, PairRecord> records = pairs->records();
   std::vector<Candidate> found;
   for (const auto& [components, between] : pairs_between_components(pairs, *forest))
-    if (auto best = best_between(between, idle, pairs)) found.push_back(*std::move(best));
+    if (auto best = MimicSearch(idle, pairs).best(between)) found.push_back(*std::move(best));
+  // What is left undecided here is no reason to look for nothing else.
+  pairs->records() = records;
   std::ranges::stable_sort(found, {}, rank);
   return add_chains(std::move(found), pairs, forest);
 }
