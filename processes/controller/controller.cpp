@@ -4,6 +4,7 @@
 #include <cmath>
 #include <cstring>
 #include <sstream>
+#include <stdexcept>
 #include <tuple>
 #include <utility>
 
@@ -88,8 +89,8 @@ control_status_t Controller::status() const {
   status.sender = target_.sender;
   status.target_epoch = target_.epoch;
   status.target_id = target_.target_id;
-  status.control_state = state_;
-  status.owns_arm = owns_arm_;
+  status.control_state = info(phase_).control_state;
+  status.owns_arm = owns_arm();
   status.why = why_;
   status.schema_version = schema_ ? schema_->version : -1;
   status.target_part = target_.target_part;
@@ -106,8 +107,9 @@ control_status_t Controller::status() const {
   return status;
 }
 
-Controller::Answer Controller::answer(Command command, std::int64_t now_us) {
-  Answer result{std::move(command), std::nullopt};
+Controller::Answer Controller::answer(std::int64_t now_us) {
+  if (motion_) fire(Event::kDriverHeard);
+  Answer result{std::exchange(out_, std::nullopt), std::nullopt};
   const control_status_t status = this->status();
   const bool is_due = now_us >= 0 && status_age_.elapsed_us(now_us) >= kRepeat_us;
   if (is_due || !told_ || !is_same(*told_, status)) {
@@ -117,38 +119,26 @@ Controller::Answer Controller::answer(Command command, std::int64_t now_us) {
   return result;
 }
 
-void Controller::enter(std::int8_t control_state, bool owns_arm, std::string why) {
-  state_ = control_state;
-  owns_arm_ = owns_arm;
+bool Controller::fire(Event event, std::string why) {
+  const Reaction& reaction = bodyschema::reaction(phase_, event);
+  switch (reaction.kind) {
+    case Reaction::Kind::kImpossible:
+      throw std::logic_error("controller: \"" + std::string(info(event).name) + "\" in phase \"" +
+                             std::string(info(phase_).name) + "\"");
+    case Reaction::Kind::kIgnored:
+      return false;
+    case Reaction::Kind::kStays:
+      why_ = std::move(why);
+      return false;
+    case Reaction::Kind::kGoes:
+      break;
+  }
+  phase_ = reaction.next;
   why_ = std::move(why);
-}
-
-void Controller::refuse(const std::string& why) {
-  forget_plan();
-  is_taken_ = false;
-  enter(S::CONTROL_REFUSED, false, why);
-}
-
-void Controller::halt(const std::string& why) {
-  forget_plan();
-  command_.reset();
-  awaited_.reset();
-  is_taken_ = false;
-  enter(S::CONTROL_HOLDING, true, why);
-}
-
-Controller::Command Controller::hold(const std::string& why) {
-  halt(why);
-  return send_hold();
-}
-
-Controller::Command Controller::send_hold() {
-  wants_hold_ = true;
-  if (!motion_) return std::nullopt;
-  wants_hold_ = false;
-  hold_command_ = make_command(action_command_t::KIND_HOLD);
-  hold_wait_.restart();
-  return hold_command_;
+  phase_time_.restart();
+  if (reaction.sends == Sends::kHold) sent_ = make_command(action_command_t::KIND_HOLD);
+  out_ = reaction.sends == Sends::kNothing ? std::nullopt : sent_;
+  return true;
 }
 
 action_command_t Controller::make_command(std::int8_t kind) {
@@ -189,68 +179,55 @@ Controller::Answer Controller::on_motion_status(const motion_status_t& motion) {
     if (is_news) quiet_.restart();
   }
   locate();
-  if (state_ == S::CONTROL_REFUSED && why_ == kHalted && !motion.stop_latched) why_ = kWasHalted;
-  if (hold_command_ && is_mine && motion.action_id == hold_command_->action_id) {
-    hold_command_.reset();
-  }
-  if (wants_hold_) return answer(send_hold());
-  if (!is_active()) return answer(std::nullopt);
+  const bool is_answer = is_mine && sent_ && motion.action_id == sent_->action_id;
+  if (is_answer && sent_->kind == action_command_t::KIND_HOLD) fire(Event::kHoldAnswered);
+  on_driver(motion, is_news && previous && !is_mine, began_anew);
+  if (is_answer && sent_->kind == action_command_t::KIND_MOVE) on_move_answer(motion);
+  decide();
+  return answer();
+}
 
+void Controller::on_driver(const motion_status_t& motion, bool is_foreign, bool began_anew) {
   if (motion.stop_latched) {
-    if (state_ == S::CONTROL_WAITING && !owns_arm_) {
-      refuse(kHalted);
-    } else {
-      halt(motion.reason + "; after ./run resume give another target, or release the arm");
-    }
-    return answer(std::nullopt);
+    fire(Event::kStopped,
+         phase_ == Phase::kListening
+             ? kHalted
+             : motion.reason + "; after ./run resume give another target, or release the arm");
+    return;
   }
-  if (owns_arm_ && began_anew) {
+  fire(Event::kResumed, kWasHalted);
+  if (began_anew &&
+      fire(Event::kDriverRestarted, "the driver began anew: its time or its answers went back"))
     ++counters_["driver began anew"];
-    return answer(hold("the driver began anew: its time or its answers went back"));
-  }
-  if (owns_arm_ && is_news && previous && !is_mine) {
-    if (motion.kind == action_command_t::KIND_HOLD) {
-      halt(motion.source + " told the driver to hold");
-      return answer(std::nullopt);
-    }
-    if (motion.kind == action_command_t::KIND_MOVE && state_ != S::CONTROL_REACHED) {
-      is_taken_ = false;  // somebody else moved it; what was planned no longer begins here
-      goal_.reset();
-      taking_.restart();
-    }
-  }
-  if (is_mine && command_ && motion.action_id == command_->action_id) {
-    return answer(on_own_answer(motion));
-  }
-  return answer(advance());
+  if (is_foreign && motion.kind == action_command_t::KIND_HOLD)
+    fire(Event::kForeignHold, motion.source + " told the driver to hold");
+  if (is_foreign && motion.kind == action_command_t::KIND_MOVE &&
+      fire(Event::kForeignMove, motion.source + " moved the arm: taking it anew"))
+    goal_.reset();
 }
 
 Controller::Answer Controller::on_marker_poses(const marker_poses_t& poses) {
   see(poses.utime);
   track(poses);
-  return answer(advance());
+  decide();
+  return answer();
 }
 
 Controller::Answer Controller::on_sample(const sample_t& sample) {
-  if (!sample_ || !is_same_action(*sample_, sample)) {
-    lent_.restart();
-  }
+  if (!sample_ || !is_same_action(*sample_, sample)) fire(Event::kNewSample);
   sample_ = sample;
   see(sample.utime);
   locate();
-  if (awaited_ && sample.source == kSource && sample.epoch == epoch_ &&
-      sample.action_id == *awaited_) {
-    awaited_.reset();
-    observe(sample);
-  }
-  return answer(advance());
+  on_own_sample(sample);
+  decide();
+  return answer();
 }
 
 Controller::Answer Controller::on_body_schema(const body_schema_t& message) {
   // An older version counts only when the newer one has fallen silent.
   if (schema_ && message.schema_version < schema_->version) {
     ++counters_["older BODY_SCHEMA"];
-    return answer(std::nullopt);
+    return answer();
   }
   schema_silence_.restart();
   if (!schema_ || message.schema_version != schema_->version) {
@@ -258,86 +235,72 @@ Controller::Answer Controller::on_body_schema(const body_schema_t& message) {
     goal_.reset();
     rejected_.clear();
   }
-  return answer(advance());
+  decide();
+  return answer();
 }
 
 Controller::Answer Controller::on_model_health(const model_health_t& health) {
   health_ = health;
-  return answer(advance());
-}
-
-bool Controller::has_expired(std::int64_t now_us) {
-  const bool is_open = is_active() && state_ != S::CONTROL_REACHED;
-  return is_open && target_.expiry_s > 0 &&
-         expiry_.elapsed_us(now_us) >= microseconds(target_.expiry_s);
+  decide();
+  return answer();
 }
 
 Controller::Answer Controller::on_tick(std::int64_t now_us) {
   silent_ = silence(now_us);
   quiet_.elapsed_us(now_us);
-  const bool is_serving =
-      owns_arm_ && (state_ == S::CONTROL_WAITING || state_ == S::CONTROL_MOVING);
-  if (!is_serving || command_ || awaited_) idle_.restart(now_us);
-  Command command;
-  if (schema_ && !owns_arm_ &&
+  if (!concerns(Event::kGivenUp)) idle_.restart(now_us);
+  if (schema_ && !owns_arm() &&
       schema_silence_.elapsed_us(now_us) > config_.max_body_schema_silence_us) {
     // Nobody stands behind it any more; the next that is heard counts, whatever its version.
     schema_.reset();
     goal_.reset();
   }
-  if (has_expired(now_us)) {
-    const std::string why =
-        "not reached within " + seconds(microseconds(target_.expiry_s)) + "; " + why_;
-    if (owns_arm_) {
-      command = hold(why);
-    } else {
-      refuse(why);
-    }
-  } else if (is_serving) {
-    if (!silent_.empty()) {
-      command = hold(silent_);
-    } else if (command_) {
-      if (answer_wait_.elapsed_us(now_us) >= config_.resend_us) {
-        answer_wait_.restart(now_us);
-        command = command_;
-      }
-    } else if (awaited_) {
-      why_ = "waiting for the SAMPLE of " + name_of(*awaited_, kSource);
-      if (sample_wait_.elapsed_us(now_us) >= config_.sample_timeout_us) {
-        command = hold("no SAMPLE of " + name_of(*awaited_, kSource) + " within " +
-                       seconds(config_.sample_timeout_us) + ": is the observer alive?");
-      }
-    } else if (idle_.elapsed_us(now_us) >= config_.rest_timeout_us) {
-      refuse("given up after " + seconds(config_.rest_timeout_us) + ": " + why_);
-    } else if (!is_taken_) {
-      command = take(now_us);
-    }
-  } else if (state_ == S::CONTROL_WAITING) {
-    const std::int64_t patience_us =
-        std::max({config_.max_motion_status_silence_us, config_.max_marker_poses_silence_us,
-                  config_.max_body_schema_silence_us});
-    if (guard_.elapsed_us(now_us) > patience_us) refuse("not heard: " + unheard());
-  } else if (state_ == S::CONTROL_LENT) {
-    if (lent_.elapsed_us(now_us) >= config_.lent_timeout_us) {
-      refuse("no new SAMPLE for " + seconds(config_.lent_timeout_us) + " while " + why_ +
-             "; does the babbler run, or is it done?");
-    }
-  } else if (state_ == S::CONTROL_REACHED && target_.keep_s >= 0 &&
-             keep_.elapsed_us(now_us) >= microseconds(target_.keep_s)) {
-    enter(S::CONTROL_RELEASED, false, why_ + "; kept for " + seconds(microseconds(target_.keep_s)));
-  } else if (hold_command_ && hold_wait_.elapsed_us(now_us) >= config_.resend_us) {
-    hold_wait_.restart(now_us);
-    command = hold_command_;
+  see_time(now_us);
+  return answer(now_us);
+}
+
+void Controller::see_time(std::int64_t now_us) {
+  const std::int64_t elapsed_us = phase_time_.elapsed_us(now_us);
+  const std::int64_t expiry_us = microseconds(target_.expiry_s);
+  if (is_open() && expiry_us > 0 && expiry_.elapsed_us(now_us) >= expiry_us) {
+    fire(Event::kTargetExpired, "not reached within " + seconds(expiry_us) + "; " + why_);
+    return;
   }
-  return answer(std::move(command), now_us);
+  if (!silent_.empty() && fire(Event::kInputSilent, silent_)) return;
+  if (elapsed_us >= config_.resend_us && fire(Event::kUnanswered)) {
+    phase_time_.restart(now_us);
+    return;
+  }
+  if (concerns(Event::kGivenUp) && idle_.elapsed_us(now_us) >= config_.rest_timeout_us) {
+    fire(Event::kGivenUp, "given up after " + seconds(config_.rest_timeout_us) + ": " + why_);
+    return;
+  }
+  if (phase_ == Phase::kTaking) return take(now_us);
+  if (concerns(Event::kNoSample)) {
+    const std::string name = "SAMPLE of " + name_of(sent_->action_id, kSource);
+    why_ = "waiting for the " + name;
+    if (elapsed_us >= config_.sample_timeout_us)
+      fire(Event::kNoSample, "no " + name + " within " + seconds(config_.sample_timeout_us) +
+                                 ": is the observer alive?");
+  } else if (elapsed_us > std::max({config_.max_motion_status_silence_us,
+                                    config_.max_marker_poses_silence_us,
+                                    config_.max_body_schema_silence_us}) &&
+             concerns(Event::kNotHeard)) {
+    fire(Event::kNotHeard, "not heard: " + unheard());
+  } else if (elapsed_us >= config_.lent_timeout_us && concerns(Event::kLentInVain)) {
+    fire(Event::kLentInVain, "no new SAMPLE for " + seconds(config_.lent_timeout_us) + " while " +
+                                 why_ + "; does the babbler run, or is it done?");
+  } else if (target_.keep_s >= 0 && elapsed_us >= microseconds(target_.keep_s)) {
+    fire(Event::kKept, why_ + "; kept for " + seconds(microseconds(target_.keep_s)));
+  }
 }
 
 // ---- what survives
 
 std::string Controller::state_text() const {
   // A target that is kept until another is a hold as well.
-  const bool holds =
-      state_ == S::CONTROL_HOLDING || (state_ == S::CONTROL_REACHED && target_.keep_s < 0);
+  const bool holds = info(phase_).control_state == control_status_t::CONTROL_HOLDING ||
+                     (phase_ == Phase::kKeeping && target_.keep_s < 0);
   std::ostringstream text;
   text << "# controller: its own action ids, the newest target, whether the arm is its own.\n"
        << "epoch: " << epoch_ << "\n"
@@ -345,7 +308,7 @@ std::string Controller::state_text() const {
        << "target: {sender: " << yaml_quoted(target_.sender) << ", epoch: " << floor_epoch_
        << ", target_id: " << floor_id_ << "}\n"
        << "was_served: " << (is_active() ? "false" : "true") << "\n"
-       << "owns_arm: " << (owns_arm_ ? "true" : "false") << "\n"
+       << "owns_arm: " << (owns_arm() ? "true" : "false") << "\n"
        << "holds: " << (holds ? "true" : "false") << "\n"
        << "why: " << yaml_quoted(holds ? why_ : "") << "\n";
   return text.str();
@@ -378,7 +341,8 @@ void Controller::restore(const std::filesystem::path& file, std::int64_t wall_cl
     target_.epoch = epoch;
     target_.target_id = id;
     if (why.starts_with(kHeldAsBefore)) why.erase(0, std::strlen(kHeldAsBefore));
-    hold(holds ? kHeldAsBefore + why
+    fire(Event::kRestored,
+         holds ? kHeldAsBefore + why
                : "restarted in the middle of " + name + ": give another, or release the arm");
   } else if (id >= 0) {
     why_ = was_served ? "restarted; no target is open"

@@ -18,6 +18,7 @@
 #include "bodyschema/pose_target_t.hpp"
 #include "bodyschema/sample_t.hpp"
 #include "common/config/rig.h"
+#include "processes/controller/controller_states.h"
 #include "processes/controller/inverse_kinematics.h"
 #include "processes/controller/tag_track.h"
 #include "processes/controller/workspace.h"
@@ -59,12 +60,14 @@ struct ControllerConfig {
 /// MOVE actions towards a solution of inverse kinematics, each answered by the driver and followed
 /// by its SAMPLE before the next is sent, so no step is taken unseen and no sample is lost.
 ///
+/// What follows from what in which phase is one table (controller_states.h; for people states.md).
+///
 /// Of all targets the highest (epoch, target_id) counts; a repeated one does nothing. One whose
 /// epoch is more than kClockTolerance_us ahead of the clock is refused: every later one would count
-/// for less than it. The arm is
-/// its own (owns_arm) from the moment that a target can be served until it was reached and kept,
-/// was refused or is released. Taking it waits until the arm rests and the last settled action has
-/// its SAMPLE. A target that is not reached within its expiry is dropped, as by a HOLD.
+/// for less than it. The arm is its own (owns_arm) from the moment that a target can be served
+/// until it was reached and kept, was refused or is released. Taking it waits until the arm rests
+/// and the last settled action has its SAMPLE. A target that is not reached within its expiry is
+/// dropped, as by a HOLD.
 ///
 /// No part leaves the workspace on the way, by the schema; a solution towards which one would is
 /// dealt with like one that the driver rejects.
@@ -121,6 +124,7 @@ class Controller {
   Answer on_tick(std::int64_t now_us);
 
   control_status_t status() const;
+  Phase phase() const { return phase_; }
   /// Messages that came too late and commands that were in vain, since the start.
   const std::map<std::string, std::int64_t>& counters() const { return counters_; }
 
@@ -131,7 +135,6 @@ class Controller {
   void restore(const std::filesystem::path& file, std::int64_t wall_clock_us = -1);
 
  private:
-  using Command = std::optional<action_command_t>;
   /// Source, epoch, action id and state of an answer.
   using Deed = std::tuple<std::string, std::int64_t, std::int64_t, std::int8_t>;
 
@@ -149,9 +152,18 @@ class Controller {
   };
 
   /// `now_us` ≥ 0: the clock; then the status is repeated when it is due.
-  Answer answer(Command command, std::int64_t now_us = -1);
-  void enter(std::int8_t control_state, bool owns_arm, std::string why);
-  bool is_active() const;
+  Answer answer(std::int64_t now_us = -1);
+  /// Looks the event up in the transition table (controller_states.h): the one place that changes
+  /// the phase. True if the phase began, or began again. @throws std::logic_error: impossible.
+  bool fire(Event event, std::string why);
+  bool fire(Event event) { return fire(event, why_); }
+  /// Whether fire() would be true.
+  bool concerns(Event event) const { return reaction(phase_, event).kind == Reaction::Kind::kGoes; }
+  bool owns_arm() const { return info(phase_).owns_arm; }
+  /// A target is served or kept.
+  bool is_active() const { return concerns(Event::kStopped); }
+  /// It was not reached yet.
+  bool is_open() const { return concerns(Event::kTargetExpired); }
   bool is_at_rest() const { return motion_ && motion_->rest_since_utime >= 0; }
   bool is_newer(const pose_target_t& target) const;
   static bool is_from_ahead(std::int64_t epoch, std::int64_t wall_clock_us);
@@ -159,7 +171,6 @@ class Controller {
   std::string unheard() const;
   /// "" or which input has been silent for too long.
   std::string silence(std::int64_t now_us);
-  bool has_expired(std::int64_t now_us);
   /// "" or why the schema cannot serve the target, whatever the arm does.
   std::string objection() const;
   double tolerance_m() const;
@@ -179,36 +190,34 @@ class Controller {
   void observe(const sample_t& sample);
   void update_predicted_errors();
 
+  /// What the clock brings about.
+  void see_time(std::int64_t now_us);
   /// Whatever the target needs next, when no command is unanswered.
-  Command advance();
+  void decide();
   /// Waits until the arm is free, by the clock.
-  Command take(std::int64_t now_us);
-  Command step();
+  void take(std::int64_t now_us);
+  void step();
   /// Aims at the target's tag. False: it must be seen first.
   bool aim_at_tag();
-  /// Holds if the tag was aimed at.
-  Command wait_for_tag();
+  void wait_for_tag();
   /// The action that the monitor wants to see, one for each signal and within its limits.
   std::optional<Eigen::VectorXd> wanted_probe() const;
-  Command probe(const Eigen::VectorXd& action);
-  Command search(const std::string& edge);
+  void probe(const Eigen::VectorXd& action);
+  void search(const std::string& edge);
   /// From the arm's position towards an action, as far as `share` of the ranges.
   Eigen::VectorXd towards(const Eigen::VectorXd& action, double share) const;
-  /// None, and the way counts as rejected, where it leads out of the workspace.
-  Command move_to(const Eigen::VectorXd& action, std::int8_t purpose, std::string why);
+  /// The way counts as rejected where it leads out of the workspace.
+  void move_to(const Eigen::VectorXd& action, std::int8_t purpose, std::string why);
   /// The command was none after all.
   void forget_move();
-  /// What follows from a way that cannot be gone.
-  Command on_rejected(const std::string& why);
-  Command arrive();
-  Command on_own_answer(const motion_status_t& motion);
-  void refuse(const std::string& why);
-  void refuse_unreachable(const InverseKinematicsSolution& nearest);
-  /// Nothing moves until another target.
-  void halt(const std::string& why);
-  /// halt() and tell the driver.
-  Command hold(const std::string& why);
-  Command send_hold();
+  /// The way to the goal, or to what was to be seen, cannot be gone.
+  void strike(const std::string& why);
+  void arrive();
+  /// STOP, a driver that began anew, and what others had it do.
+  void on_driver(const motion_status_t& motion, bool is_foreign, bool began_anew);
+  void on_move_answer(const motion_status_t& motion);
+  void on_own_sample(const sample_t& sample);
+  void fail_unreachable(const InverseKinematicsSolution& nearest);
   action_command_t make_command(std::int8_t kind);
 
   const ControllerConfig config_;
@@ -232,10 +241,8 @@ class Controller {
   // The newest target, and how far it is.
   pose_target_t target_{};
   std::int64_t floor_epoch_ = 0, floor_id_ = -1;  ///< older targets are ignored
-  std::int8_t state_ = control_status_t::CONTROL_IDLE;
-  bool owns_arm_ = false;
+  Phase phase_ = Phase::kIdle;
   std::string why_ = "no target was given since the start";
-  bool is_taken_ = false;
   Eigen::Vector3d aim_ = Eigen::Vector3d::Zero();  ///< target, corrected by what was seen
   std::optional<int> tag_place_;                   ///< of the target's tag: TagTrack::place()
   std::optional<Eigen::VectorXd> goal_;            ///< action that brings the part to aim_
@@ -248,9 +255,9 @@ class Controller {
   double observed_error_m_ = -1, observed_error_rad_ = -1;
   Eigen::Vector3d observed_offset_ = Eigen::Vector3d::Zero();  ///< target minus seen position, in R
   bool is_observation_sure_ = false;  ///< unambiguous, and not to be explained by its covariance
-  Stopwatch guard_, taking_, quiet_, keep_;
-  Stopwatch idle_;  ///< its own arm, but nothing is sent or awaited
-  Stopwatch lent_;  ///< without a new SAMPLE
+  Stopwatch phase_time_;              ///< since the phase began
+  Stopwatch quiet_;                   ///< since the driver's last news
+  Stopwatch idle_;                    ///< its own arm, but nothing is sent or awaited
   Stopwatch expiry_;
   std::int64_t probed_ = -1;  ///< probes wanted up to this sample are made, or given up
   std::optional<Eigen::VectorXd> search_centre_;  ///< where an edge was heard to be invalid
@@ -259,12 +266,10 @@ class Controller {
   // What was sent.
   std::int64_t epoch_ = -1;
   std::int64_t next_action_id_ = 0;
-  std::int64_t last_done_id_ = -1;                ///< of its own, newest that was not refused
-  std::optional<action_command_t> command_;       ///< MOVE without a final answer
-  std::optional<action_command_t> hold_command_;  ///< HOLD without an answer
-  bool wants_hold_ = false;
-  std::optional<std::int64_t> awaited_;  ///< action whose SAMPLE has not come
-  Stopwatch answer_wait_, hold_wait_, sample_wait_, status_age_;
+  std::int64_t last_done_id_ = -1;        ///< of its own, newest that was not refused
+  std::optional<action_command_t> sent_;  ///< the newest command
+  std::optional<action_command_t> out_;   ///< to be sent with the next answer
+  Stopwatch status_age_;
   std::optional<control_status_t> told_;
 };
 

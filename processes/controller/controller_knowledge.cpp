@@ -24,11 +24,6 @@ Eigen::VectorXd vector_of(const std::vector<double>& values) {
 
 }  // namespace
 
-bool Controller::is_active() const {
-  return state_ == S::CONTROL_WAITING || state_ == S::CONTROL_MOVING ||
-         state_ == S::CONTROL_REACHED || state_ == S::CONTROL_LENT;
-}
-
 std::string Controller::unheard() const {
   if (!motion_) return "MOTION_STATUS: does the driver run?";
   if (!schema_) return "BODY_SCHEMA: nothing was learned yet, or does model_monitor run?";
@@ -84,7 +79,7 @@ void Controller::track(const marker_poses_t& poses) {
   tracked_until_utime_ = poses.utime;
   const bool is_new_rest =
       std::exchange(tracked_rest_utime_, motion_->rest_since_utime) != motion_->rest_since_utime;
-  const bool is_serving = is_active() && state_ != S::CONTROL_REACHED && tag_place_;
+  const bool is_serving = is_open() && tag_place_;
   for (auto& [id, track] : tags_) {
     if (is_new_rest && !(is_serving && id == target_.target_tag)) track = TagTrack();
     std::optional<TagTrack::Sight> sight;
@@ -222,7 +217,6 @@ std::optional<Eigen::VectorXd> Controller::wanted_probe() const {
 
 std::string Controller::objection() const {
   const int part = target_.target_part;
-  if (motion_->stop_latched) return kHalted;
   if (!schema_->has_part(part)) {
     return "the body schema has no part " + std::to_string(part) + "; see: ./run status";
   }

@@ -59,12 +59,12 @@ Controller::Answer Controller::on_pose_target(const pose_target_t& target,
                                               std::int64_t wall_clock_us) {
   if (is_from_ahead(target.epoch, wall_clock_us)) {
     ++counters_["POSE_TARGET from a clock ahead"];
-    return answer(std::nullopt);
+    return answer();
   }
   if (!is_newer(target)) {
     const bool is_repeated = target.epoch == floor_epoch_ && target.target_id == floor_id_;
     if (!is_repeated) ++counters_["older POSE_TARGET"];
-    return answer(std::nullopt);
+    return answer();
   }
   floor_epoch_ = target.epoch;
   floor_id_ = target.target_id;
@@ -76,36 +76,35 @@ Controller::Answer Controller::on_pose_target(const pose_target_t& target,
   predicted_error_m_ = predicted_error_rad_ = observed_error_m_ = observed_error_rad_ = -1;
   search_centre_.reset();
   expiry_.restart();
-  wants_hold_ = false;
-  hold_command_.reset();
+  idle_.restart();
   switch (target.target_kind) {
     case pose_target_t::KIND_HOLD:
-      return answer(hold("hold, asked for by " + target.sender));
+      fire(Event::kHoldAsked, "hold, asked for by " + target.sender);
+      break;
     case pose_target_t::KIND_RELEASE:
-      command_.reset();
-      awaited_.reset();
-      is_taken_ = false;
-      enter(S::CONTROL_RELEASED, false, "released by " + target.sender);
-      return answer(std::nullopt);
+      fire(Event::kReleaseAsked, "released by " + target.sender);
+      break;
     default:
-      // An action that is under way is waited for; the arm may be the controller's already.
-      guard_.restart();
-      taking_.restart();
-      idle_.restart();
-      enter(S::CONTROL_WAITING, owns_arm_, "taking up the target");
-      return answer(advance());
+      if (motion_ && motion_->stop_latched) {
+        fire(Event::kTargetWhileHalted, kHalted);
+      } else {
+        fire(Event::kTarget, "taking up the target");
+        decide();
+      }
   }
+  return answer();
 }
 
-Controller::Command Controller::advance() {
-  if (!is_active() || state_ == S::CONTROL_REACHED || command_ || awaited_) return std::nullopt;
+void Controller::decide() {
+  // Of the phases in which an action is under way, or a target is over, none decides.
+  if (reaction(phase_, Event::kInputMissing).kind == Reaction::Kind::kImpossible) return;
   if (const std::string input = unheard(); !input.empty()) {
-    why_ = "waiting for " + input;
-    return std::nullopt;
+    fire(Event::kInputMissing, "waiting for " + input);
+    return;
   }
   if (const std::string why = objection(); !why.empty()) {
-    refuse(why);
-    return std::nullopt;
+    fire(Event::kUnservable, why);
+    return;
   }
   std::string edge;
   const bool is_invalid = worst_edge(&edge) == EdgeState::kInvalid;
@@ -114,52 +113,44 @@ Controller::Command Controller::advance() {
     search_centre_.reset();
   } else if (num_searches_ >= config_.max_searches) {
     goal_.reset();
-    is_taken_ = false;
-    if (state_ != S::CONTROL_LENT) lent_.restart();
-    enter(S::CONTROL_LENT, false, edge + " is invalid: the babbler has the arm until it is mended");
-    return std::nullopt;
+    fire(Event::kBroken, edge + " is invalid: the babbler has the arm until it is mended");
+    return;
   }
-  if (!owns_arm_ || state_ == S::CONTROL_LENT) {
-    is_taken_ = false;
-    taking_.restart();
-    enter(S::CONTROL_WAITING, true, "taking the arm");
-  }
+  fire(Event::kServable, "taking the arm");
   // Until the arm is taken, on_tick goes on.
-  if (!is_taken_ || !silent_.empty() || !is_at_rest() || !position_) return std::nullopt;
-  if (target_.target_kind == pose_target_t::KIND_TAG && !aim_at_tag()) return wait_for_tag();
+  if (phase_ == Phase::kTaking || !silent_.empty() || !is_at_rest() || !position_) return;
+  if (target_.target_kind == pose_target_t::KIND_TAG) {
+    if (!aim_at_tag()) return wait_for_tag();
+    fire(Event::kTagSeen, "the target tag is seen");
+  }
   if (is_invalid) return search(edge);
   if (const auto action = wanted_probe()) return probe(*action);
-  return step();
+  step();
 }
 
-Controller::Command Controller::take(std::int64_t now_us) {
-  const std::int64_t waited_us = taking_.elapsed_us(now_us);
+void Controller::take(std::int64_t now_us) {
+  const std::int64_t waited_us = phase_time_.elapsed_us(now_us);
   if (!is_at_rest()) {
     why_ = "waiting for the arm to come to rest";
-    taking_.restart(now_us);
-    return std::nullopt;
+    phase_time_.restart(now_us);
+    return;
   }
-  if (quiet_.elapsed_us(now_us) < config_.take_us || waited_us < config_.take_us) {
-    return std::nullopt;
-  }
+  if (quiet_.elapsed_us(now_us) < config_.take_us || waited_us < config_.take_us) return;
   const bool has_patience = waited_us < config_.sample_timeout_us;
   const bool is_settled = motion_->state == motion_status_t::STATE_SETTLED &&
                           motion_->kind == action_command_t::KIND_MOVE;
   if (is_settled && has_patience && !(sample_ && is_same_action(*motion_, *sample_))) {
     why_ = "waiting for the SAMPLE of " + name_of(motion_->action_id, motion_->source);
-    return std::nullopt;
-  }
-  if (!position_) {
+  } else if (position_) {
+    fire(Event::kArmFree);
+    decide();
+  } else if (has_patience) {
     why_ = "waiting to hear where the arm is";
-    if (!has_patience) {
-      refuse(
-          "where the arm is was not heard: neither MOTION_STATUS nor SAMPLE tell the action it "
-          "rests at; release the arm, so that the babbler moves it");
-    }
-    return std::nullopt;
+  } else {
+    fire(Event::kPositionUnknown,
+         "where the arm is was not heard: neither MOTION_STATUS nor SAMPLE tell the action it "
+         "rests at; release the arm, so that the babbler moves it");
   }
-  is_taken_ = true;
-  return advance();
 }
 
 bool Controller::aim_at_tag() {
@@ -186,18 +177,17 @@ bool Controller::aim_at_tag() {
   return true;
 }
 
-Controller::Command Controller::wait_for_tag() {
+void Controller::wait_for_tag() {
   const bool was_aimed_at = tag_place_.has_value();
   tag_place_.reset();
   forget_plan();
-  enter(S::CONTROL_WAITING, true,
-        "target tag " + std::to_string(target_.target_tag) + " " +
-            tags_.at(target_.target_tag).account() + ": the arm holds until " +
-            std::to_string(TagTrack::kFrames) + " frames at rest show it in one place");
-  return was_aimed_at ? send_hold() : std::nullopt;
+  fire(was_aimed_at ? Event::kTagLost : Event::kTagUnseen,
+       "target tag " + std::to_string(target_.target_tag) + " " +
+           tags_.at(target_.target_tag).account() + ": the arm holds until " +
+           std::to_string(TagTrack::kFrames) + " frames at rest show it in one place");
 }
 
-Controller::Command Controller::step() {
+void Controller::step() {
   if (!goal_) {
     InverseKinematicsOptions options = config_.inverse_kinematics;
     options.tolerance_m = std::min(options.tolerance_m, tolerance_m());
@@ -210,8 +200,7 @@ Controller::Command Controller::step() {
         aim_ = position_of(target_);  // beyond reach only with the correction
         return arrive();
       }
-      refuse_unreachable(solution);
-      return std::nullopt;
+      return fail_unreachable(solution);
     }
     goal_ = solution.action;
   }
@@ -224,11 +213,11 @@ Controller::Command Controller::step() {
                  is_slow ? "in small steps: " + doubtful + " is in doubt" : "towards the target");
 }
 
-void Controller::refuse_unreachable(const InverseKinematicsSolution& nearest) {
+void Controller::fail_unreachable(const InverseKinematicsSolution& nearest) {
   const std::string after =
       num_moves_ > 0 ? " (after " + std::to_string(num_moves_) + " moves)" : "";
   if (!rejected_.empty()) {
-    refuse("every way found is refused" + after + ": " + rejection_);
+    fire(Event::kUnreachable, "every way found is refused" + after + ": " + rejection_);
     return;
   }
   predicted_error_m_ = nearest.error_m;
@@ -237,11 +226,12 @@ void Controller::refuse_unreachable(const InverseKinematicsSolution& nearest) {
     predicted_error_rad_ = nearest.error_rad;
     left += " and " + degrees(nearest.error_rad);
   }
-  refuse("out of reach: within the limits part " + std::to_string(target_.target_part) +
-         " comes no nearer than " + left + after);
+  fire(Event::kUnreachable, "out of reach: within the limits part " +
+                                std::to_string(target_.target_part) + " comes no nearer than " +
+                                left + after);
 }
 
-Controller::Command Controller::probe(const Eigen::VectorXd& action) {
+void Controller::probe(const Eigen::VectorXd& action) {
   goal_.reset();
   const Eigen::VectorXd next = towards(action, config_.slow_step);
   if (!is_near(next, action, config_.signals)) {
@@ -253,7 +243,7 @@ Controller::Command Controller::probe(const Eigen::VectorXd& action) {
                  "making the action that tells two explanations of a change apart");
 }
 
-Controller::Command Controller::search(const std::string& edge) {
+void Controller::search(const std::string& edge) {
   goal_.reset();
   if (!search_centre_) search_centre_ = position_;
   ++num_searches_;
@@ -281,45 +271,40 @@ Eigen::VectorXd Controller::towards(const Eigen::VectorXd& action, double share)
   return *position_ + (action - *position_) * (share / longest);
 }
 
-Controller::Command Controller::move_to(const Eigen::VectorXd& action, std::int8_t purpose,
-                                        std::string why) {
+void Controller::move_to(const Eigen::VectorXd& action, std::int8_t purpose, std::string why) {
   const std::string objection = config_.workspace.objection(*schema_, *position_, action);
-  if (!objection.empty()) return on_rejected(objection);
-  command_ = make_command(action_command_t::KIND_MOVE);
-  command_->purpose = purpose;
-  set_array(command_->num_signals, command_->action,
-            std::vector<double>(action.begin(), action.end()));
-  answer_wait_.restart();
+  if (!objection.empty()) {
+    strike(objection);
+    return decide();
+  }
+  sent_ = make_command(action_command_t::KIND_MOVE);
+  sent_->purpose = purpose;
+  set_array(sent_->num_signals, sent_->action, std::vector<double>(action.begin(), action.end()));
   ++num_moves_;
   num_probes_ += purpose == action_command_t::PURPOSE_PROBE;
-  enter(S::CONTROL_MOVING, true, std::move(why));
-  return command_;
+  fire(Event::kStep, std::move(why));
 }
 
 void Controller::forget_move() {
   // The target may be another by now.
   num_moves_ = std::max(0, num_moves_ - 1);
-  if (command_->purpose == action_command_t::PURPOSE_PROBE)
-    num_probes_ = std::max(0, num_probes_ - 1);
-  command_.reset();
+  if (sent_->purpose == action_command_t::PURPOSE_PROBE) num_probes_ = std::max(0, num_probes_ - 1);
 }
 
-Controller::Command Controller::on_rejected(const std::string& why) {
+void Controller::strike(const std::string& why) {
   if (!goal_) {  // what was to be seen is done without
     if (health_) probed_ = std::max(probed_, health_->probe_sample);
-    return advance();
+    return;
   }
   rejection_ = why;
   rejected_.push_back(*goal_);
   goal_.reset();
-  if (static_cast<int>(rejected_.size()) >= config_.max_solutions) {
-    refuse(std::to_string(rejected_.size()) + " ways are refused: " + rejection_);
-    return std::nullopt;
-  }
-  return advance();
+  if (static_cast<int>(rejected_.size()) >= config_.max_solutions)
+    fire(Event::kUnreachable,
+         std::to_string(rejected_.size()) + " ways are refused: " + rejection_);
 }
 
-Controller::Command Controller::arrive() {
+void Controller::arrive() {
   if (sample_ && sample_->rest_begin_utime == motion_->rest_since_utime) observe(*sample_);
   update_predicted_errors();
   const bool is_off = observed_error_m_ > tolerance_m();
@@ -330,52 +315,48 @@ Controller::Command Controller::arrive() {
     goal_.reset();
     return step();
   }
-  enter(S::CONTROL_REACHED, true,
-        observed_error_m_ < 0 ? "reached by the schema; the part is not seen there"
-        : is_off ? "reached by the schema, but seen " + millimetres(observed_error_m_) + " away"
-                 : "reached, and seen there");
-  keep_.restart();
-  return std::nullopt;
+  fire(Event::kReached,
+       observed_error_m_ < 0 ? "reached by the schema; the part is not seen there"
+       : is_off ? "reached by the schema, but seen " + millimetres(observed_error_m_) + " away"
+                : "reached, and seen there");
 }
 
-Controller::Command Controller::on_own_answer(const motion_status_t& motion) {
-  answer_wait_.restart();
+void Controller::on_move_answer(const motion_status_t& motion) {
   switch (motion.state) {
     case motion_status_t::STATE_SETTLED:
-      awaited_ = command_->action_id;
-      sample_wait_.restart();
-      command_.reset();
+      if (!fire(Event::kSettled)) return;
       num_expired_ = 0;
       update_predicted_errors();
-      if (sample_ && is_same_action(motion, *sample_)) {
-        awaited_.reset();
-        observe(*sample_);
-      }
-      return advance();
+      if (sample_) on_own_sample(*sample_);
+      return;
     case motion_status_t::STATE_REJECTED:
+      if (!fire(Event::kRejected, is_at_rest() ? why_ : "waiting for the arm to come to rest"))
+        return;
       forget_move();
       ++counters_["action rejected"];
-      if (!is_at_rest()) {
-        why_ = "waiting for the arm to come to rest";
-        return std::nullopt;
-      }
-      return on_rejected(motion.reason);
+      if (phase_ == Phase::kDeciding && is_at_rest()) strike(motion.reason);
+      return;
     case motion_status_t::STATE_EXPIRED:
+      if (!fire(Event::kExpired)) return;
       forget_move();
       ++counters_["action expired"];
-      if (++num_expired_ >= kMaxExpired) {
-        refuse("the driver let " + std::to_string(num_expired_) +
-               " actions expire; is its clock right? " + motion.reason);
-        return std::nullopt;
-      }
-      return advance();
+      if (++num_expired_ >= kMaxExpired)
+        fire(Event::kUnservable, "the driver let " + std::to_string(num_expired_) +
+                                     " actions expire; is its clock right? " + motion.reason);
+      return;
     case motion_status_t::STATE_STOPPED:
     case motion_status_t::STATE_HOLDING:
-      halt("the driver ended the motion. " + motion.reason);
-      return std::nullopt;
+      fire(Event::kEnded, "the driver ended the motion. " + motion.reason);
+      return;
     default:
-      return std::nullopt;
+      fire(Event::kUnderWay);
   }
+}
+
+void Controller::on_own_sample(const sample_t& sample) {
+  if (sent_ && sample.source == sent_->source && sample.epoch == sent_->epoch &&
+      sample.action_id == sent_->action_id && fire(Event::kSampleCame))
+    observe(sample);
 }
 
 }  // namespace bodyschema

@@ -4,7 +4,6 @@
 #include <sstream>
 #include <string>
 
-#include "bodyschema/control_status_t.hpp"
 #include "bodyschema/motion_status_t.hpp"
 #include "bodyschema/pose_target_t.hpp"
 #include "bodyschema/sample_t.hpp"
@@ -12,8 +11,6 @@
 // What the files of class Controller share.
 
 namespace bodyschema {
-
-using S = control_status_t;
 
 inline constexpr char kHalted[] = "the arm is halted; first: ./run resume (or bodyschema resume)";
 

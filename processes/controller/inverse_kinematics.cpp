@@ -19,8 +19,13 @@ constexpr double kLeastDamping_m = 1e-4;
 constexpr double kGreatestDamping_m = 1e3;
 constexpr double kLeastProgress_m = 1e-8;
 constexpr double kDifferent = 0.1;  // of a range
-constexpr int kScattered = 1000;    // actions: of 100 starts alone the worst nearest was 17 mm off
-constexpr double kRoom = 0.05;      // of a range, to a limit
+// Actions that are looked at, and how far beyond the limits they are drawn before they are moved to
+// them: where a target is out of reach, some signals end there. Measured by `./run experiment
+// reach`: of 1000 nearest points 4 are missed with 1000 actions and 0 of a range, 1 with 0.3, none
+// with 1000 to 5000 actions and 0.5.
+constexpr int kScattered = 3000;
+constexpr double kBeyond = 0.5;            // of a range
+constexpr double kRoom = 0.05;             // of a range, to a limit
 constexpr double kWellConditioned = 0.05;  // smallest of largest singular value
 constexpr double kFirstPostureStep = 0.1, kLeastPostureStep = 0.005;  // of a range
 
@@ -213,11 +218,11 @@ Eigen::VectorXd start_near(const Eigen::VectorXd& u, int n) {
 std::vector<Eigen::VectorXd> scattered_starts(const KinematicPath& path, const Scale& scale,
                                               const Residual& residual, int count) {
   std::mt19937_64 engine(0);
-  std::uniform_real_distribution<double> unit(0, 1);
+  std::uniform_real_distribution<double> wide(-kBeyond, 1 + kBeyond);
   std::vector<std::pair<double, Eigen::VectorXd>> starts(kScattered);
   for (auto& [left, u] : starts) {
     u.resize(scale.range.size());
-    for (double& value : u) value = unit(engine);
+    for (double& value : u) value = std::clamp(wide(engine), 0.0, 1.0);
     left = residual(path.predict(scale.action(u))).norm();
   }
   count = std::min(count, kScattered);
@@ -264,10 +269,12 @@ InverseKinematicsSolution solve_within(const KinematicPath& path, const PoseTarg
       if (!is_avoided(better)) u = better;
     }
     const Eigen::VectorXd error = residual(path.predict(scale.action(u)));
-    if (!(error.norm() < least)) continue;
-    least = error.norm();
+    const bool is_within_tolerance = residual.is_within_tolerance(error);
+    if (!is_within_tolerance && !(error.norm() < least)) continue;
+    // Nearer by less than the tolerance is no reason to go elsewhere.
+    least = error.norm() - (n == 0 ? options.tolerance_m : 0);
     best = {scale.action(u), error.head<3>().norm(), residual.angle_rad(error),
-            residual.is_within_tolerance(error)};
+            is_within_tolerance};
   }
   return best;
 }

@@ -54,12 +54,13 @@ double posture_cost(const BodySchema& schema, int part, bool with_rotation,
 /// Buss 2004) of |Δp|² + (w Δφ)², w = metres_per_radian, in signals scaled by their ranges, the
 /// damping governed as Levenberg and Marquardt do, so that it grows where a singularity lets no
 /// step succeed. A signal at its limit leaves the active set while the step would push it outwards.
-/// Tried from `current`, then from starts ever farther from it, then from the best of 1000 actions
-/// over the ranges, until one converges; start n is the same in every run. A solution then moves in
-/// its null space (Liégeois 1977) as long as posture_cost() falls. All this first within what the
-/// schema's samples covered, then within the limits. With `avoided` the solution is another than
-/// those: at least a tenth of one signal's range away from each. If none converges, the nearest
-/// approach; if all are avoided, `current` with an infinite error.
+/// Tried from `current`, then from starts ever farther from it, then from the best of 3000 actions
+/// over the ranges and at their ends, until one converges; start n is the same in every run. A
+/// solution then moves in its null space (Liégeois 1977) as long as posture_cost() falls. All this
+/// first within what the schema's samples covered, then within the limits. With `avoided` the
+/// solution is another than those: at least a tenth of one signal's range away from each. If none
+/// converges, the nearest approach, that from `current` if no other is nearer by tolerance_m; if
+/// all are avoided, `current` with an infinite error.
 ///
 /// Never NaN. `current` beyond the limits is moved to them. @throws std::invalid_argument if sizes
 /// differ, the part has no way to the root, or an orientation is asked of a part of which positions

@@ -3,43 +3,24 @@ bent by 30°, and four way points later the hand is within 3 mm of each again.""
 
 import json
 import math
-import os
-import subprocess
-import sys
-import tempfile
-from pathlib import Path
 
-source, build = Path(sys.argv[1]), Path(sys.argv[2])
+from group_run import Failed, in_a_folder, run
+
 HAND = 5
 WAY_POINTS = 20
 BENT_AFTER = 8
 
 
-class Failed(Exception):
-    pass
-
-
-def run(work, *words, codes=(0,)):
-    """./run with logs of its own; what it says."""
-    environment = os.environ | {"BODYSCHEMA_BUILD": str(build), "BODYSCHEMA_LOGS": str(work / "logs")}
-    done = subprocess.run(
-        [source / "run", *map(str, words)], env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=250
-    )
-    if done.returncode not in codes:
-        raise Failed(f"./run {' '.join(map(str, words))}: {done.stdout[-2000:]} {done.stderr[-2000:]}")
-    return done.stdout
-
-
 def position(work, *action):
     """Of the hand by the schema, well inside of what it reaches."""
-    parts = json.loads(run(work, "predict", work / "logs" / "current" / "schema.lcmlog", "--action", *action, "--json"))["parts"]
+    parts = json.loads(run(work, "predict", work / "logs" / "current" / "schema.lcmlog", "--action", *action, "--json")[0])["parts"]
     return next(part["X_RB"]["position_m"] for part in parts if part["part"] == HAND)
 
 
 def follow(work, path):
     file = work / "path.csv"
     file.write_text("\n".join(["x,y,z", *(",".join(map(str, point)) for point in path), ""]))
-    return json.loads(run(work, "follow", file, "--part", HAND, "--json", codes=(0, 1)))
+    return json.loads(run(work, "follow", file, "--part", HAND, "--json", codes=(0, 1))[0])
 
 
 def main(work):
@@ -63,13 +44,4 @@ def main(work):
     run(work, "release")
 
 
-if subprocess.run(["unshare", "--user", "--map-root-user", "--net", "true"], capture_output=True).returncode != 0:
-    print("SKIP: this machine allows no network namespaces", file=sys.stderr)
-    sys.exit(77)
-with tempfile.TemporaryDirectory(prefix="path group ") as folder:
-    try:
-        main(Path(folder))
-    except Failed as failure:
-        sys.exit(str(failure))
-    finally:
-        run(Path(folder), "stop", codes=(0, 1, 2))
+in_a_folder(main)

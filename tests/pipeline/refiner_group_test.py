@@ -9,27 +9,21 @@ import signal
 import struct
 import subprocess
 import sys
-import tempfile
 import threading
 from pathlib import Path
 
-source, build = Path(sys.argv[1]), Path(sys.argv[2])
-
-
-class Failed(Exception):
-    pass
+from group_run import Failed, build, environment, in_a_folder, source
 
 
 def run(work, *words, beside=lambda ended: None):
     """./run with logs of its own; what it says. `beside` runs at the same time, until the event."""
-    environment = os.environ | {"BODYSCHEMA_BUILD": str(build), "BODYSCHEMA_LOGS": str(work / "logs")}
     ended = threading.Event()
     thread = threading.Thread(target=beside, args=[ended])
     thread.start()
     try:
         command = [source / "run", *map(str, words)]
         done = subprocess.run(
-            command, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=250
+            command, env=environment(work), stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=250
         )
     finally:
         ended.set()
@@ -106,11 +100,4 @@ def main(work):
 if not (build / "bin" / "refiner").exists():
     print("SKIP: built without Ceres", file=sys.stderr)
     sys.exit(77)
-if subprocess.run(["unshare", "--user", "--map-root-user", "--net", "true"], capture_output=True).returncode != 0:
-    print("SKIP: this machine allows no network namespaces", file=sys.stderr)
-    sys.exit(77)
-with tempfile.TemporaryDirectory(prefix="refiner group ") as folder:
-    try:
-        main(Path(folder))
-    except Failed as failure:
-        sys.exit(str(failure))
+in_a_folder(main)

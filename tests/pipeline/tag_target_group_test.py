@@ -3,37 +3,15 @@ was put elsewhere to it there, within 3 mm by the truth. A tag that is not seen 
 
 import json
 import math
-import os
 import shutil
 import struct
 import subprocess
-import sys
-import tempfile
 import time
-from pathlib import Path
 
-source, build = Path(sys.argv[1]), Path(sys.argv[2])
+from group_run import Failed, build, environment, in_a_folder, run, source
+
 TAG, END_EFFECTOR = 40, 5
 LIMIT_M = 0.003
-
-
-class Failed(Exception):
-    pass
-
-
-def environment(work):
-    """Of a ./run with logs of its own."""
-    return os.environ | {"BODYSCHEMA_BUILD": str(build), "BODYSCHEMA_LOGS": str(work / "logs")}
-
-
-def run(work, *words, codes=(0,)):
-    """What it says, on stdout and stderr."""
-    done = subprocess.run(
-        [source / "run", *map(str, words)], env=environment(work), stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=250
-    )
-    if done.returncode not in codes:
-        raise Failed(f"./run {' '.join(map(str, words))}: {done.stdout[-2000:]} {done.stderr[-2000:]}")
-    return done.stdout, done.stderr
 
 
 def rig_with_tag(work):
@@ -164,13 +142,4 @@ def main(work):
     run(work, "release")
 
 
-if subprocess.run(["unshare", "--user", "--map-root-user", "--net", "true"], capture_output=True).returncode != 0:
-    print("SKIP: this machine allows no network namespaces", file=sys.stderr)
-    sys.exit(77)
-with tempfile.TemporaryDirectory(prefix="tag target ") as folder:
-    try:
-        main(Path(folder))
-    except Failed as failure:
-        sys.exit(str(failure))
-    finally:
-        run(Path(folder), "stop", codes=(0, 1, 2))
+in_a_folder(main)

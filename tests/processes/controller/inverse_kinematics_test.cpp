@@ -222,6 +222,21 @@ TEST(InverseKinematicsTest, OutOfReachTheNearestApproachIsTold) {
   }
 }
 
+// Behind the arm it comes as near to the left as to the right, but for this much.
+TEST(InverseKinematicsTest, OutOfReachNearerByLessThanTheToleranceIsNoReasonToGoElsewhere) {
+  BodySchema schema = planar();
+  schema.edges[1].joints[0].turn = M_PI;
+  for (const double side : {-1, 1}) {
+    for (const double nearer_m : {1e-5, 1e-3}) {
+      const PoseTarget target{.p_RT = Eigen::Vector3d(-3, -side * nearer_m, 0)};
+      const auto solution = solve_pose(schema, 3, target, schema.signals,
+                                       Eigen::Vector2d(80 * side, 0.5 * side), kOptions);
+      const bool stays = nearer_m < kOptions.tolerance_m;
+      EXPECT_NEAR(solution.action[0], stays ? 90 * side : -90 * side, 1e-6) << nearer_m;
+    }
+  }
+}
+
 TEST(InverseKinematicsTest, TheStretchedArmLeavesItsSingularity) {
   const BodySchema schema = planar();
   for (const double reach : {1.5, 1.4999, 1.3, 1.2}) {
