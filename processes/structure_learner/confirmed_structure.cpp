@@ -154,14 +154,22 @@ LearnedStructure of_stream(LearnedStructure told, const FindStructure& find,
   return told;
 }
 
-// Edges with joints that are not needed: without them no model is valid.
-void withdraw_needless(LearnedStructure* structure) {
+// Edges with joints that are not needed: without them no model is valid. And chains whose gains
+// more samples would tell.
+void withdraw_doubtful(LearnedStructure* structure) {
   std::vector<std::pair<int, int>> needless = structure->search.redundant;
   for (const Coupling& coupling : structure->search.couplings)
     if (coupling.is_needless) needless.emplace_back(coupling.part_i, coupling.part_j);
   for (const auto& [part_i, part_j] : needless)
     std::erase_if(structure->search.models,
                   [&](const AcceptedModel& edge) { return edge.joins(part_i, part_j); });
+  for (const auto& ends : structure->search.unknown_gains) {
+    const auto removed = std::erase_if(structure->search.models, [&](const AcceptedModel& edge) {
+      return edge.joins(ends.first, ends.second);
+    });
+    if (removed > 0)
+      structure->search.records.at(ends).undecided.emplace(kMaxScreenedJoints + 1, 0);
+  }
 }
 
 }  // namespace
@@ -188,7 +196,7 @@ LearnedStructure confirmed_structure(const FindStructure& find,
       connect_soft_parts(&structure);
   }
   if (soft) structure = std::move(*soft);
-  withdraw_needless(&structure);
+  withdraw_doubtful(&structure);
   return structure;
 }
 

@@ -26,9 +26,9 @@ using ConnectSoftParts = std::function<void(LearnedStructure*)>;
 /// connects no more parts. Where a signal that the first structure
 /// uses is used no more with larger noise, size alone does not tell a small joint from a bias: what
 /// the two do not share is left open (LearnedStructure::is_contested). So are redundant edges of
-/// the answer, and soft parts that screws describe with noise of which the residuals show less than
-/// half. Parts that screws do not connect are soft only where more noise is no answer; where the
-/// noise is a guess, it is the other way round.
+/// the answer, chains with unknown gains, and soft parts that screws describe with noise of which
+/// the residuals show less than half. Parts that screws do not connect are soft only where more
+/// noise is no answer; where the noise is a guess, it is the other way round.
 ///
 /// Noise of a stream that was estimated from residuals is raised by a fifth, at most twice, until a
 /// structure spans.

@@ -34,6 +34,7 @@ SearchResult search_structure(const std::vector<ActionPoseSample>& samples,
     settled = settle_trees(&layers.spare(), &pairs, &forest);
   SearchResult result;
   result.joint_information = withdraw_untold_edges(&pairs, &forest);
+  result.unknown_gains = chains_with_unknown_gains(&pairs, forest);
   result.redundant = redundant_edges(&pairs, forest);
   result.couplings = couplings(&pairs, forest);
   result.models = forest.models();

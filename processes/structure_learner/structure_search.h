@@ -15,6 +15,8 @@ struct SearchResult {
   /// Of the models, by their parts: those with joints that the forest does not need
   /// (redundant_edges()).
   std::vector<std::pair<int, int>> redundant;
+  /// Of the models, by their parts (chains_with_unknown_gains()).
+  std::vector<std::pair<int, int>> unknown_gains;
   std::vector<Coupling> couplings;  ///< joints of the models that may be none
   bool gave_way = false;            ///< screws to soft models (connect_soft_parts())
   std::map<std::pair<int, int>, PairRecord> records;

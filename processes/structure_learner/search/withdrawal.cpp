@@ -5,6 +5,7 @@
 #include <limits>
 #include <map>
 #include <optional>
+#include <utility>
 #include <vector>
 
 #include "common/estimation/quantile.h"
@@ -96,10 +97,8 @@ double gain_error(const TreeNode& node, Eigen::Index offset, const Eigen::Matrix
   return largest;
 }
 
-// Joints of a chain explain each other's motion: poses that it predicts well may not tell how far
-// each of them moves.
-void withdraw_unknown_gains(const ComponentTree& tree, PairModels* pairs,
-                            std::vector<AcceptedModel>* kept) {
+// Into `result`, by their parts, the chains of a tree.
+void find_unknown_gains(const ComponentTree& tree, std::vector<std::pair<int, int>>* result) {
   const auto is_chain = [](const TreeNode& node) {
     return node.parent >= 0 && node.model.num_joints() > kMaxScreenedJoints;
   };
@@ -109,13 +108,11 @@ void withdraw_unknown_gains(const ComponentTree& tree, PairModels* pairs,
   const std::optional<Eigen::MatrixXd> inverse = normal.inverse();
   for (std::size_t k = 1; k < fit.nodes().size(); ++k) {
     const TreeNode& node = fit.nodes()[k];
-    if (!is_chain(node) ||
-        (inverse &&
-         gain_error(node, normal.offset[k], *inverse * normal.noise_scale()) <= kLargestGainError))
-      continue;
-    const int part_i = fit.nodes()[static_cast<std::size_t>(node.parent)].part;
-    pairs->record(part_i, node.part).undecided.emplace(node.model.num_joints(), 0.0);
-    std::erase_if(*kept, [&](const AcceptedModel& m) { return m.joins(part_i, node.part); });
+    if (is_chain(node) &&
+        (!inverse ||
+         gain_error(node, normal.offset[k], *inverse * normal.noise_scale()) > kLargestGainError))
+      result->emplace_back(
+          std::minmax(fit.nodes()[static_cast<std::size_t>(node.parent)].part, node.part));
   }
 }
 
@@ -168,12 +165,9 @@ std::vector<int> withdraw_least_told(const ComponentTree& tree, double most_turn
 std::map<int, double> withdraw_untold_edges(PairModels* pairs, ModelForest* forest) {
   std::vector<AcceptedModel> kept = forest->models();
   const double most_turn = usual_turn(kept);
-  for (const int part : forest->parts()) {
-    if (forest->component(part) != part) continue;
-    const ComponentTree tree(*forest, part, pairs);
-    withdraw_untestable(tree, pairs, &kept);
-    withdraw_unknown_gains(tree, pairs, &kept);
-  }
+  for (const int part : forest->parts())
+    if (forest->component(part) == part)
+      withdraw_untestable(ComponentTree(*forest, part, pairs), pairs, &kept);
   forest->set_models(std::move(kept));
   std::map<int, double> information;
   for (const int signal : pairs->actions().moving())
@@ -189,6 +183,15 @@ std::map<int, double> withdraw_untold_edges(PairModels* pairs, ModelForest* fore
       open.push_back(end);
   }
   return information;
+}
+
+std::vector<std::pair<int, int>> chains_with_unknown_gains(PairModels* pairs,
+                                                           const ModelForest& forest) {
+  std::vector<std::pair<int, int>> result;
+  for (const int part : forest.parts())
+    if (forest.component(part) == part)
+      find_unknown_gains(ComponentTree(forest, part, pairs), &result);
+  return result;
 }
 
 }  // namespace bodyschema

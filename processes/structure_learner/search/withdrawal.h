@@ -1,6 +1,8 @@
 #pragma once
 
 #include <map>
+#include <utility>
+#include <vector>
 
 #include "processes/structure_learner/search/pair_models.h"
 
@@ -15,5 +17,10 @@ inline constexpr double kNoticed = 48;
 /// that would have to show turns no more than those of the forest. Returns what SearchResult calls
 /// joint_information, of the edges that stand.
 std::map<int, double> withdraw_untold_edges(PairModels* pairs, ModelForest* forest);
+
+/// The chains of three joints and more, by their parts, whose poses do not tell how far each joint
+/// moves, within 5 % at two standard deviations: joints of a chain explain each other's motion.
+std::vector<std::pair<int, int>> chains_with_unknown_gains(PairModels* pairs,
+                                                           const ModelForest& forest);
 
 }  // namespace bodyschema

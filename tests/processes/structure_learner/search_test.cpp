@@ -363,7 +363,7 @@ TEST(MimicJoints, AreFoundWithNothingSeenBetween) {
 }
 
 // In loud noise four of ten gains would be wrong.
-TEST(WithdrawUntoldEdges, AChainWhosePosesDoNotTellHowFarEachJointMoves) {
+TEST(ChainsWithUnknownGains, AreInNoStructure) {
   EXPECT_GE(count_right(kChain, 4, Regime::kChapter), 1);
   EXPECT_GE(count_right(kChain, 4, Regime::kTag), 9);
 }
