@@ -196,7 +196,7 @@ constexpr Rule kRules[] = {
     to(E::kInputSilent, kChoosing | kActing, P::kHoldDue),
     ignore(E::kInputSilent, kOver | kHolds | kNotOwned | kKeeping),
     to(E::kUnanswered, only(P::kMoving), P::kMoving, Sends::kAgain),
-    to(E::kUnanswered, only(P::kMovingOvertaken), P::kMovingOvertaken, Sends::kAgain),
+    to(E::kUnanswered, only(P::kMovingOvertaken), P::kTaking),  // planned from another place
     to(E::kUnanswered, only(P::kHoldSent), P::kHoldSent, Sends::kAgain),
     ignore(E::kUnanswered, kAll & ~kAwaitsAnswer & ~only(P::kHoldSent)),
     to(E::kNoSample, kAwaitsSample, P::kHoldDue),

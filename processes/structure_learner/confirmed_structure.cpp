@@ -163,13 +163,12 @@ void withdraw_doubtful(LearnedStructure* structure) {
   for (const auto& [part_i, part_j] : needless)
     std::erase_if(structure->search.models,
                   [&](const AcceptedModel& edge) { return edge.joins(part_i, part_j); });
-  for (const auto& ends : structure->search.unknown_gains) {
-    const auto removed = std::erase_if(structure->search.models, [&](const AcceptedModel& edge) {
-      return edge.joins(ends.first, ends.second);
+  for (const auto& ends : structure->search.unknown_gains)
+    std::erase_if(structure->search.models, [&](const AcceptedModel& edge) {
+      if (!edge.joins(ends.first, ends.second)) return false;
+      structure->search.records.at(ends).note_undecided(edge.model.num_joints(), 0);
+      return true;
     });
-    if (removed > 0)
-      structure->search.records.at(ends).undecided.emplace(kMaxScreenedJoints + 1, 0);
-  }
 }
 
 }  // namespace

@@ -167,10 +167,11 @@ bool connect_long_chains(PairModels* pairs, ModelForest* forest) {
     if (between.size() > kMaxPairs) between.resize(kMaxPairs);
     std::map<Pair, double> costs, ignored;
     std::optional<Candidate> chain;
-    if (is_possible(idle.size()) || is_extended)
+    const bool may_extend = is_extended && is_possible(idle.size() + 1);
+    if (is_possible(idle.size()) || may_extend)
       chain = best_chain(between, idle, are_few, pairs, &costs);
-    if (chain && !is_possible(idle.size())) chain.reset();  // of the layers
-    if (!chain && is_extended && is_possible(idle.size() + 1))
+    if (chain && !is_possible(idle.size())) chain.reset();  // LayeredSearch has them
+    if (!chain && may_extend)
       chain = best_extended(between, costs, idle, std::vector(used.begin(), used.end()), pairs);
     if (!chain && idle != moving && is_possible(moving.size()))
       chain = best_chain(between, moving, are_few, pairs, &ignored);

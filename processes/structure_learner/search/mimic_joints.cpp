@@ -8,6 +8,7 @@
 #include <vector>
 
 #include "processes/structure_learner/search/long_chains.h"
+#include "processes/structure_learner/search/redundancy.h"
 
 namespace bodyschema {
 namespace {
@@ -50,10 +51,19 @@ class MimicSearch {
     keep_least(&between, kMaxPairsOfThree, [&](const Pair& ij) { return try_two(ij); });
     if (valid_.empty() && pairs_.options().max_signals > 2)
       for (const Pair& ij : between) try_three(ij);
-    return pairs_.only_best(valid_);
+    std::optional<Candidate> best = pairs_.only_best(valid_);
+    if (best && is_coupled(*best)) best.reset();
+    return best;
   }
 
  private:
+  // A second joint of a signal that adds little is how one joint is imperfect.
+  bool is_coupled(const Candidate& c) {
+    ModelForest alone({c.part_i, c.part_j});
+    alone.add(c);
+    return !couplings(&pairs_, alone).empty();
+  }
+
   // What the chain leaves a frame. If it is valid and not doubtful, it is kept.
   double try_word(const Pair& ij, const Word& word) {
     double cost = 0;
@@ -99,7 +109,7 @@ bool connect_mimic_joints(PairModels* pairs, ModelForest* forest) {
   const std::size_t num_components = forest->parts().size() - forest->models().size();
   std::vector<int> idle = pairs->actions().moving();
   std::erase_if(idle, [used = forest->used_signals()](int s) { return used.contains(s); });
-  if (num_components > kMaxComponents || idle.size() > kMaxIdle ||
+  if (num_components > kMaxComponents || idle.empty() || idle.size() > kMaxIdle ||
       pairs->options().max_signals < 2 || pairs->options().unknown_bias > 0 ||
       pairs->actions().blocks().is_stream())
     return false;
@@ -107,7 +117,7 @@ bool connect_mimic_joints(PairModels* pairs, ModelForest* forest) {
   std::vector<Candidate> found;
   for (const auto& [components, between] : pairs_between_components(pairs, *forest))
     if (auto best = MimicSearch(idle, pairs).best(between)) found.push_back(*std::move(best));
-  // What is left undecided here is no reason to look for nothing else.
+  // Pairs left undecided here do not stop the search for other models.
   pairs->records() = records;
   std::ranges::stable_sort(found, {}, rank);
   return add_chains(std::move(found), pairs, forest);

@@ -24,9 +24,9 @@ using Nodes = std::vector<TreeNode>;
 // d² of a motion as large as an error of one sight may be: by its noise, but of a noise that is
 // told to be louder than any marker's no systematic error need be as large.
 double squared_size(const Vector6d& moved, const PairHypothesis& sight) {
-  const double of_errors =
-      moved.head<3>().squaredNorm() / (kLoudestMarker.position_m * kLoudestMarker.position_m) +
-      moved.tail<3>().squaredNorm() / (kLoudestMarker.rotation_rad * kLoudestMarker.rotation_rad);
+  double of_errors = (moved.head<3>() / kLoudestMarker.position_m).squaredNorm();
+  if (sight.num_residuals == 6)
+    of_errors += (moved.tail<3>() / kLoudestMarker.rotation_rad).squaredNorm();
   return std::max((sight.whitening * moved).squaredNorm(), of_errors);
 }
 
@@ -57,7 +57,7 @@ Motion motion_of(const Nodes& nodes, int node, int signal, const NormalizedActio
 }
 
 // Mean square, over the frames of both, of how far the signal moves one node against the other,
-// whitened by the noise of one sight.
+// in the noise of one sight (squared_size()).
 std::optional<double> mean_square_motion(const Nodes& nodes, int a, int b, int signal,
                                          PairModels* pairs) {
   if (nodes[a].part > nodes[b].part) std::swap(a, b);
@@ -135,7 +135,7 @@ LocalModel without_joint(LocalModel model, int d) {
 }
 
 // What a joint adds to a model: mean square of how far off its predictions are when all else adapts
-// to do without it, whitened by the noise of one sight.
+// to do without it, in the noise of one sight (squared_size()).
 double added_motion(const AcceptedModel& m, int joint, PairModels* pairs) {
   const PairData& pair = pairs->pair(m.part_i, m.part_j);
   const NormalizedActions& actions = pairs->actions();

@@ -23,7 +23,7 @@ std::vector<std::pair<int, int>> redundant_edges(PairModels* pairs, ModelForest 
 struct Coupling {
   int part_i = 0, part_j = 0;
   int signal = 0;
-  bool is_needless = false;  ///< adds less than the noise of one sight
+  bool is_needless = false;  ///< adds less than that noise
   friend auto operator<=>(const Coupling&, const Coupling&) = default;
 };
 /// In the order of the forest's models; then of each tree one joint that an edge on another way

@@ -77,7 +77,8 @@ void withdraw_untestable(const ComponentTree& tree, PairModels* pairs,
   }
 }
 
-// Of what a joint moves, one standard deviation: within 5 % at two.
+// Of what a joint moves, one standard deviation. Derived: 5 %, by which gains are called right, at
+// two.
 constexpr double kLargestGainError = 0.025;
 
 // The largest, over the joints of a node's edge, of the standard deviation of a joint's turn or
@@ -87,8 +88,9 @@ double gain_error(const TreeNode& node, Eigen::Index offset, const Eigen::Matrix
   for (int d = 0; d < node.model.num_joints(); ++d) {
     const LocalModel::Joint& joint = node.model.joints[d];
     const auto relative = [&](Eigen::Index at, double size) {
-      return size == 0 ? std::numeric_limits<double>::infinity()
-                       : std::sqrt(covariance(at, at)) / std::abs(size);
+      const double variance = covariance(at, at);  // 0 where nothing is known
+      return variance > 0 && size != 0 ? std::sqrt(variance) / std::abs(size)
+                                       : std::numeric_limits<double>::infinity();
     };
     largest =
         std::max(largest, std::min(relative(offset + ScrewChainLayout::turn(d), joint.turn),

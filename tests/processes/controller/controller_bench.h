@@ -346,6 +346,13 @@ class Bench {
     ASSERT_EQ(motion.stop_latched, 0);
     ASSERT_NE(status.target_id, last_ended_id_) << "moves for a target that is over";
     ASSERT_GT(command.expiry_utime, motion.utime);
+    for (std::size_t i = 0; i < arm.size(); ++i) {
+      const Signal& signal = config_.signals[i];
+      ASSERT_GE(command.action[i], signal.lower);
+      ASSERT_LE(command.action[i], signal.upper);
+      ASSERT_LE(std::abs(command.action[i] - arm[i]),
+                (config_.max_step + 1e-9) * (signal.upper - signal.lower));
+    }
     if (!moves.empty() && moves.back().action_id == command.action_id) {
       ASSERT_EQ(moves.back().action, command.action);
       ++num_repeats;
@@ -354,13 +361,6 @@ class Bench {
     ASSERT_EQ(status.control_state, S::CONTROL_MOVING);
     if (!moves.empty()) {
       ASSERT_GT(command.action_id, moves.back().action_id);
-    }
-    for (std::size_t i = 0; i < arm.size(); ++i) {
-      const Signal& signal = config_.signals[i];
-      ASSERT_GE(command.action[i], signal.lower);
-      ASSERT_LE(command.action[i], signal.upper);
-      ASSERT_LE(std::abs(command.action[i] - arm[i]),
-                (config_.max_step + 1e-9) * (signal.upper - signal.lower));
     }
     moves.push_back(command);
   }

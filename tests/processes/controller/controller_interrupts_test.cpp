@@ -212,6 +212,17 @@ TEST(ControllerInterruptsTest, AMoveRejectedAfterSomebodyElseMovedTheArmIsDecide
   EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
 }
 
+TEST(ControllerInterruptsTest, AMoveThatNobodyAnsweredIsNotSentAgainAfterSomebodyElseMovedTheArm) {
+  Bench bench;
+  kWays.at(Phase::kMovingOvertaken)(bench);
+  const std::int64_t id = bench.moves.back().action_id;
+  const int num_repeats = bench.num_repeats;
+  bench.driver_serves = true;
+  EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+  EXPECT_EQ(bench.num_repeats, num_repeats);
+  EXPECT_GT(bench.moves.back().action_id, id);
+}
+
 TEST(ControllerInterruptsTest, AfterItsSampleAnArmThatSomebodyElseMovedIsTakenAnew) {
   Bench bench;
   kWays.at(Phase::kObservingOvertaken)(bench);
