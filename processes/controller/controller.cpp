@@ -90,7 +90,7 @@ control_status_t Controller::status() const {
   status.target_epoch = target_.epoch;
   status.target_id = target_.target_id;
   status.control_state = info(phase_).control_state;
-  status.owns_arm = owns_arm();
+  status.owns_arm = owns_arm(phase_);
   status.why = why_;
   status.schema_version = schema_ ? schema_->version : -1;
   status.target_part = target_.target_part;
@@ -120,8 +120,8 @@ Controller::Answer Controller::answer(std::int64_t now_us) {
 }
 
 bool Controller::fire(Event event, std::string why) {
-  const Reaction& reaction = bodyschema::reaction(phase_, event);
-  switch (reaction.kind) {
+  const Reaction& wanted = reaction(phase_, event);
+  switch (wanted.kind) {
     case Reaction::Kind::kImpossible:
       throw std::logic_error("controller: \"" + std::string(info(event).name) + "\" in phase \"" +
                              std::string(info(phase_).name) + "\"");
@@ -133,11 +133,11 @@ bool Controller::fire(Event event, std::string why) {
     case Reaction::Kind::kGoes:
       break;
   }
-  phase_ = reaction.next;
+  phase_ = wanted.next;
   why_ = std::move(why);
   phase_time_.restart();
-  if (reaction.sends == Sends::kHold) sent_ = make_command(action_command_t::KIND_HOLD);
-  out_ = reaction.sends == Sends::kNothing ? std::nullopt : sent_;
+  if (wanted.sends == Sends::kHold) sent_ = make_command(action_command_t::KIND_HOLD);
+  out_ = wanted.sends == Sends::kNothing ? std::nullopt : sent_;
   return true;
 }
 
@@ -202,7 +202,9 @@ void Controller::on_driver(const motion_status_t& motion, bool is_foreign, bool 
   if (is_foreign && motion.kind == action_command_t::KIND_HOLD)
     fire(Event::kForeignHold, motion.source + " told the driver to hold");
   if (is_foreign && motion.kind == action_command_t::KIND_MOVE &&
-      fire(Event::kForeignMove, motion.source + " moved the arm: taking it anew"))
+      fire(Event::kForeignMove,
+           motion.source + (phase_ == Phase::kKeeping ? " moved the arm away from the target"
+                                                      : " moved the arm: taking it anew")))
     goal_.reset();
 }
 
@@ -249,7 +251,7 @@ Controller::Answer Controller::on_tick(std::int64_t now_us) {
   silent_ = silence(now_us);
   quiet_.elapsed_us(now_us);
   if (!concerns(Event::kGivenUp)) idle_.restart(now_us);
-  if (schema_ && !owns_arm() &&
+  if (schema_ && !owns_arm(phase_) &&
       schema_silence_.elapsed_us(now_us) > config_.max_body_schema_silence_us) {
     // Nobody stands behind it any more; the next that is heard counts, whatever its version.
     schema_.reset();
@@ -262,7 +264,7 @@ Controller::Answer Controller::on_tick(std::int64_t now_us) {
 void Controller::see_time(std::int64_t now_us) {
   const std::int64_t elapsed_us = phase_time_.elapsed_us(now_us);
   const std::int64_t expiry_us = microseconds(target_.expiry_s);
-  if (is_open() && expiry_us > 0 && expiry_.elapsed_us(now_us) >= expiry_us) {
+  if (is_open(phase_) && expiry_us > 0 && expiry_.elapsed_us(now_us) >= expiry_us) {
     fire(Event::kTargetExpired, "not reached within " + seconds(expiry_us) + "; " + why_);
     return;
   }
@@ -307,8 +309,8 @@ std::string Controller::state_text() const {
        << "next_action_id: " << next_action_id_ << "\n"
        << "target: {sender: " << yaml_quoted(target_.sender) << ", epoch: " << floor_epoch_
        << ", target_id: " << floor_id_ << "}\n"
-       << "was_served: " << (is_active() ? "false" : "true") << "\n"
-       << "owns_arm: " << (owns_arm() ? "true" : "false") << "\n"
+       << "was_served: " << (is_active(phase_) ? "false" : "true") << "\n"
+       << "owns_arm: " << (owns_arm(phase_) ? "true" : "false") << "\n"
        << "holds: " << (holds ? "true" : "false") << "\n"
        << "why: " << yaml_quoted(holds ? why_ : "") << "\n";
   return text.str();

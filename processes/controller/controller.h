@@ -138,6 +138,9 @@ class Controller {
   /// Source, epoch, action id and state of an answer.
   using Deed = std::tuple<std::string, std::int64_t, std::int64_t, std::int8_t>;
 
+  /// What a MOVE is for.
+  enum class Serves : std::uint8_t { kTarget, kProbe, kSearch };
+
   /// Clock time since restart(), as ticks see it.
   class Stopwatch {
    public:
@@ -159,11 +162,6 @@ class Controller {
   bool fire(Event event) { return fire(event, why_); }
   /// Whether fire() would be true.
   bool concerns(Event event) const { return reaction(phase_, event).kind == Reaction::Kind::kGoes; }
-  bool owns_arm() const { return info(phase_).owns_arm; }
-  /// A target is served or kept.
-  bool is_active() const { return concerns(Event::kStopped); }
-  /// It was not reached yet.
-  bool is_open() const { return concerns(Event::kTargetExpired); }
   bool is_at_rest() const { return motion_ && motion_->rest_since_utime >= 0; }
   bool is_newer(const pose_target_t& target) const;
   static bool is_from_ahead(std::int64_t epoch, std::int64_t wall_clock_us);
@@ -207,10 +205,10 @@ class Controller {
   /// From the arm's position towards an action, as far as `share` of the ranges.
   Eigen::VectorXd towards(const Eigen::VectorXd& action, double share) const;
   /// The way counts as rejected where it leads out of the workspace.
-  void move_to(const Eigen::VectorXd& action, std::int8_t purpose, std::string why);
+  void move_to(const Eigen::VectorXd& action, Serves serves, std::int8_t purpose, std::string why);
   /// The command was none after all.
   void forget_move();
-  /// The way to the goal, or to what was to be seen, cannot be gone.
+  /// What the newest MOVE, sent or not, was to serve is done in another way or without.
   void strike(const std::string& why);
   void arrive();
   /// STOP, a driver that began anew, and what others had it do.
@@ -268,6 +266,7 @@ class Controller {
   std::int64_t next_action_id_ = 0;
   std::int64_t last_done_id_ = -1;        ///< of its own, newest that was not refused
   std::optional<action_command_t> sent_;  ///< the newest command
+  Serves serves_ = Serves::kTarget;       ///< the newest MOVE
   std::optional<action_command_t> out_;   ///< to be sent with the next answer
   Stopwatch status_age_;
   std::optional<control_status_t> told_;

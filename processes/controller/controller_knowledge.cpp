@@ -79,7 +79,7 @@ void Controller::track(const marker_poses_t& poses) {
   tracked_until_utime_ = poses.utime;
   const bool is_new_rest =
       std::exchange(tracked_rest_utime_, motion_->rest_since_utime) != motion_->rest_since_utime;
-  const bool is_serving = is_open() && tag_place_;
+  const bool is_serving = is_open(phase_) && tag_place_;
   for (auto& [id, track] : tags_) {
     if (is_new_rest && !(is_serving && id == target_.target_tag)) track = TagTrack();
     std::optional<TagTrack::Sight> sight;

@@ -96,8 +96,7 @@ Controller::Answer Controller::on_pose_target(const pose_target_t& target,
 }
 
 void Controller::decide() {
-  // Of the phases in which an action is under way, or a target is over, none decides.
-  if (reaction(phase_, Event::kInputMissing).kind == Reaction::Kind::kImpossible) return;
+  if (!decides(phase_)) return;
   if (const std::string input = unheard(); !input.empty()) {
     fire(Event::kInputMissing, "waiting for " + input);
     return;
@@ -209,7 +208,7 @@ void Controller::step() {
   const bool is_slow = worst_edge(&doubtful) != EdgeState::kOk;
   const Eigen::VectorXd action = towards(*goal_, is_slow ? config_.slow_step : config_.max_step);
   if (is_near(action, *position_, config_.signals)) return arrive();
-  return move_to(action, action_command_t::PURPOSE_CONTROL,
+  return move_to(action, Serves::kTarget, action_command_t::PURPOSE_CONTROL,
                  is_slow ? "in small steps: " + doubtful + " is in doubt" : "towards the target");
 }
 
@@ -235,11 +234,11 @@ void Controller::probe(const Eigen::VectorXd& action) {
   goal_.reset();
   const Eigen::VectorXd next = towards(action, config_.slow_step);
   if (!is_near(next, action, config_.signals)) {
-    return move_to(next, action_command_t::PURPOSE_CONTROL,
+    return move_to(next, Serves::kProbe, action_command_t::PURPOSE_CONTROL,
                    "towards an action that tells two explanations of a change apart");
   }
   probed_ = health_->probe_sample;  // also if the driver refuses it
-  return move_to(action, action_command_t::PURPOSE_PROBE,
+  return move_to(action, Serves::kProbe, action_command_t::PURPOSE_PROBE,
                  "making the action that tells two explanations of a change apart");
 }
 
@@ -256,7 +255,8 @@ void Controller::search(const std::string& edge) {
     value = std::clamp(value + share(engine) * (signal.upper - signal.lower), signal.lower,
                        signal.upper);
   }
-  return move_to(towards(action, config_.max_step), action_command_t::PURPOSE_PROBE,
+  return move_to(towards(action, config_.max_step), Serves::kSearch,
+                 action_command_t::PURPOSE_PROBE,
                  edge + " is invalid: small moves show what changed");
 }
 
@@ -271,7 +271,9 @@ Eigen::VectorXd Controller::towards(const Eigen::VectorXd& action, double share)
   return *position_ + (action - *position_) * (share / longest);
 }
 
-void Controller::move_to(const Eigen::VectorXd& action, std::int8_t purpose, std::string why) {
+void Controller::move_to(const Eigen::VectorXd& action, Serves serves, std::int8_t purpose,
+                         std::string why) {
+  serves_ = serves;
   const std::string objection = config_.workspace.objection(*schema_, *position_, action);
   if (!objection.empty()) {
     strike(objection);
@@ -292,10 +294,9 @@ void Controller::forget_move() {
 }
 
 void Controller::strike(const std::string& why) {
-  if (!goal_) {  // what was to be seen is done without
-    if (health_) probed_ = std::max(probed_, health_->probe_sample);
-    return;
-  }
+  if (serves_ == Serves::kProbe && health_) probed_ = std::max(probed_, health_->probe_sample);
+  // A new target or schema has no goal yet; a search goes on elsewhere.
+  if (serves_ != Serves::kTarget || !goal_) return;
   rejection_ = why;
   rejected_.push_back(*goal_);
   goal_.reset();

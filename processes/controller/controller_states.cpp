@@ -12,29 +12,28 @@ using P = Phase;
 using E = Event;
 
 constexpr std::array<PhaseInfo, kNumPhases> kPhases{{
-    {P::kIdle, "idle", S::CONTROL_IDLE, false, "no target was served since the start"},
-    {P::kListening, "listening", S::CONTROL_WAITING, false, "an input was not heard yet"},
-    {P::kTaking, "taking", S::CONTROL_WAITING, true, "until the arm rests and is free"},
-    {P::kDeciding, "deciding", S::CONTROL_WAITING, true,
+    {P::kIdle, "idle", S::CONTROL_IDLE, "no target was served since the start"},
+    {P::kListening, "listening", S::CONTROL_WAITING, "an input was not heard yet"},
+    {P::kTaking, "taking", S::CONTROL_WAITING, "until the arm rests and is free"},
+    {P::kDeciding, "deciding", S::CONTROL_WAITING,
      "the arm is taken; the next action is decided once it rests and all inputs speak"},
-    {P::kTagAwaited, "tag awaited", S::CONTROL_WAITING, true,
+    {P::kTagAwaited, "tag awaited", S::CONTROL_WAITING,
      "as deciding, once the target tag is seen in one place"},
-    {P::kMoving, "moving", S::CONTROL_MOVING, true, "a MOVE is unanswered"},
-    {P::kObserving, "observing", S::CONTROL_MOVING, true, "it settled; its SAMPLE is awaited"},
-    {P::kMovingOvertaken, "moving, overtaken", S::CONTROL_MOVING, true,
-     "as moving; somebody else moved the arm, which is taken anew afterwards"},
-    {P::kObservingOvertaken, "observing, overtaken", S::CONTROL_MOVING, true,
-     "as observing, then so"},
-    {P::kKeeping, "keeping", S::CONTROL_REACHED, true, "the target is reached and kept"},
-    {P::kLent, "lent", S::CONTROL_LENT, false, "the babbler may probe an edge that is INVALID"},
-    {P::kRefused, "refused", S::CONTROL_REFUSED, false, "the target is over, the arm given back"},
-    {P::kRefusedHalted, "refused, halted", S::CONTROL_REFUSED, false,
+    {P::kMoving, "moving", S::CONTROL_MOVING, "a MOVE was sent and has not ended"},
+    {P::kObserving, "observing", S::CONTROL_MOVING, "it settled; its SAMPLE is awaited"},
+    {P::kMovingPreempted, "moving, preempted", S::CONTROL_MOVING,
+     "as moving, but somebody else moved the arm: it is taken anew afterwards"},
+    {P::kObservingPreempted, "observing, preempted", S::CONTROL_MOVING, "as observing, then so"},
+    {P::kKeeping, "keeping", S::CONTROL_REACHED, "the target is reached and kept"},
+    {P::kLent, "lent", S::CONTROL_LENT, "the babbler may probe an edge that is INVALID"},
+    {P::kRefused, "refused", S::CONTROL_REFUSED, "the target is over, the arm given back"},
+    {P::kRefusedHalted, "refused, halted", S::CONTROL_REFUSED,
      "as refused, because the driver is stopped"},
-    {P::kHoldDue, "hold due", S::CONTROL_HOLDING, true,
+    {P::kHoldDue, "hold due", S::CONTROL_HOLDING,
      "the target is over; HOLD is sent once the driver was heard"},
-    {P::kHoldSent, "hold sent", S::CONTROL_HOLDING, true, "HOLD is unanswered"},
-    {P::kHeld, "held", S::CONTROL_HOLDING, true, "the target is over, the arm stays held"},
-    {P::kReleased, "released", S::CONTROL_RELEASED, false, "the target is over, as was asked"},
+    {P::kHoldSent, "hold sent", S::CONTROL_HOLDING, "HOLD is unanswered"},
+    {P::kHeld, "held", S::CONTROL_HOLDING, "the target is over, the arm stays held"},
+    {P::kReleased, "released", S::CONTROL_RELEASED, "the target is over, as was asked"},
 }};
 
 constexpr std::array<EventInfo, kNumEvents> kEvents{{
@@ -68,7 +67,7 @@ constexpr std::array<EventInfo, kNumEvents> kEvents{{
     {E::kTagLost, "tag lost", "the tag that was aimed at is not seen, or elsewhere"},
     {E::kTagSeen, "tag seen", "in one place"},
     {E::kStep, "step", "the next action is decided"},
-    {E::kReached, "reached", "no action comes nearer"},
+    {E::kReached, "reached", "the arm is at the action that was planned"},
     {E::kUnreachable, "unreachable", "no way is left"},
     {E::kInputSilent, "input silent", "MOTION_STATUS, MARKER_POSES or BODY_SCHEMA, too long"},
     {E::kUnanswered, "unanswered", "for resend_s"},
@@ -83,17 +82,24 @@ constexpr std::array<EventInfo, kNumEvents> kEvents{{
 using PhaseSet = std::uint32_t;
 constexpr PhaseSet only(P phase) { return PhaseSet{1} << static_cast<int>(phase); }
 
-// Every phase is in one of the six.
+// Every phase is in one of six sets.
 constexpr PhaseSet kOver =
     only(P::kIdle) | only(P::kRefused) | only(P::kRefusedHalted) | only(P::kReleased);
 constexpr PhaseSet kHolds = only(P::kHoldDue) | only(P::kHoldSent) | only(P::kHeld);
-constexpr PhaseSet kNotOwned = only(P::kListening) | only(P::kLent);  // and open
+constexpr PhaseSet kAsking = only(P::kListening) | only(P::kLent);
 constexpr PhaseSet kChoosing = only(P::kTaking) | only(P::kDeciding) | only(P::kTagAwaited);
-constexpr PhaseSet kAwaitsAnswer = only(P::kMoving) | only(P::kMovingOvertaken);
-constexpr PhaseSet kAwaitsSample = only(P::kObserving) | only(P::kObservingOvertaken);
+constexpr PhaseSet kAwaitsAnswer = only(P::kMoving) | only(P::kMovingPreempted);
+constexpr PhaseSet kAwaitsSample = only(P::kObserving) | only(P::kObservingPreempted);
 constexpr PhaseSet kActing = kAwaitsAnswer | kAwaitsSample;
 constexpr PhaseSet kKeeping = only(P::kKeeping);
 constexpr PhaseSet kAll = (PhaseSet{1} << kNumPhases) - 1;
+static_assert((kOver | kHolds | kAsking | kChoosing | kActing | kKeeping) == kAll);
+static_assert(kOver + kHolds + kAsking + kChoosing + kActing + kKeeping == kAll, "disjoint");
+
+constexpr PhaseSet kDecides = kAsking | kChoosing;
+constexpr PhaseSet kOpen = kDecides | kActing;
+constexpr PhaseSet kActive = kOpen | kKeeping;
+constexpr PhaseSet kOwnsArm = kHolds | kChoosing | kActing | kKeeping;
 
 /// What an event does in some phases.
 struct Rule {
@@ -111,13 +117,14 @@ constexpr Rule never(E event, PhaseSet in) { return {event, in, {Reaction::Kind:
 
 // For each event all phases, each once.
 constexpr Rule kRules[] = {
-    to(E::kTarget, (kOver & ~only(P::kRefusedHalted)) | kNotOwned, P::kListening),
+    to(E::kTarget, (kOver & ~only(P::kRefusedHalted)) | kAsking, P::kListening),
     to(E::kTarget, kHolds | only(P::kTaking), P::kTaking),
     to(E::kTarget, only(P::kDeciding) | only(P::kTagAwaited) | kKeeping, P::kDeciding),
     stay(E::kTarget, kActing),  // the action that is under way ends first
     never(E::kTarget, only(P::kRefusedHalted)),
-    to(E::kTargetWhileHalted, kOver | only(P::kHoldSent) | only(P::kHeld), P::kRefusedHalted),
-    never(E::kTargetWhileHalted, only(P::kHoldDue) | kNotOwned | kChoosing | kActing | kKeeping),
+    to(E::kTargetWhileHalted, kOver, P::kRefusedHalted),
+    stay(E::kTargetWhileHalted, only(P::kHoldSent) | only(P::kHeld)),  // refused, but held
+    never(E::kTargetWhileHalted, only(P::kHoldDue) | kActive),
     to(E::kHoldAsked, kAll, P::kHoldDue),
     to(E::kReleaseAsked, kAll, P::kReleased),
     to(E::kRestored, only(P::kIdle), P::kHoldDue),
@@ -126,32 +133,33 @@ constexpr Rule kRules[] = {
     to(E::kDriverHeard, only(P::kHoldDue), P::kHoldSent, Sends::kHold),
     ignore(E::kDriverHeard, kAll & ~only(P::kHoldDue)),
     to(E::kStopped, only(P::kListening), P::kRefusedHalted),
-    to(E::kStopped, only(P::kLent) | kChoosing | kActing | kKeeping, P::kHeld),
+    to(E::kStopped, kActive & ~only(P::kListening), P::kHeld),
     ignore(E::kStopped, kOver | kHolds),
     to(E::kResumed, only(P::kRefusedHalted), P::kRefused),
     ignore(E::kResumed, kAll & ~only(P::kRefusedHalted)),
     to(E::kDriverRestarted, kChoosing | kActing | kKeeping, P::kHoldDue),
-    ignore(E::kDriverRestarted, kOver | kHolds | kNotOwned),
-    to(E::kForeignHold, kChoosing | kActing | kKeeping, P::kHeld),
-    ignore(E::kForeignHold, kOver | kHolds | kNotOwned),
+    ignore(E::kDriverRestarted, kOver | kHolds | kAsking),
+    to(E::kForeignHold, kActive, P::kHeld),
+    ignore(E::kForeignHold, kOver | kHolds),
     to(E::kForeignMove, kChoosing, P::kTaking),  // what was planned no longer begins here
-    to(E::kForeignMove, only(P::kMoving), P::kMovingOvertaken),
-    to(E::kForeignMove, only(P::kObserving), P::kObservingOvertaken),
-    ignore(E::kForeignMove, only(P::kMovingOvertaken) | only(P::kObservingOvertaken)),
-    ignore(E::kForeignMove, kOver | kHolds | kNotOwned | kKeeping),
+    to(E::kForeignMove, only(P::kMoving), P::kMovingPreempted),
+    to(E::kForeignMove, only(P::kObserving), P::kObservingPreempted),
+    ignore(E::kForeignMove, only(P::kMovingPreempted) | only(P::kObservingPreempted)),
+    to(E::kForeignMove, kKeeping, P::kHeld),  // nobody drives it back unasked
+    ignore(E::kForeignMove, kOver | kHolds | kAsking),
 
     // Answers are repeated, and may come late.
     to(E::kUnderWay, only(P::kMoving), P::kMoving),
-    to(E::kUnderWay, only(P::kMovingOvertaken), P::kMovingOvertaken),
+    to(E::kUnderWay, only(P::kMovingPreempted), P::kMovingPreempted),
     ignore(E::kUnderWay, kAll & ~kAwaitsAnswer),
     to(E::kSettled, only(P::kMoving), P::kObserving),
-    to(E::kSettled, only(P::kMovingOvertaken), P::kObservingOvertaken),
+    to(E::kSettled, only(P::kMovingPreempted), P::kObservingPreempted),
     ignore(E::kSettled, kAll & ~kAwaitsAnswer),
     to(E::kRejected, only(P::kMoving), P::kDeciding),
-    to(E::kRejected, only(P::kMovingOvertaken), P::kTaking),
+    to(E::kRejected, only(P::kMovingPreempted), P::kTaking),
     ignore(E::kRejected, kAll & ~kAwaitsAnswer),
     to(E::kExpired, only(P::kMoving), P::kDeciding),
-    to(E::kExpired, only(P::kMovingOvertaken), P::kTaking),
+    to(E::kExpired, only(P::kMovingPreempted), P::kTaking),
     ignore(E::kExpired, kAll & ~kAwaitsAnswer),
     to(E::kEnded, kAwaitsAnswer, P::kHeld),
     ignore(E::kEnded, kAll & ~kAwaitsAnswer),
@@ -159,21 +167,21 @@ constexpr Rule kRules[] = {
     ignore(E::kHoldAnswered, kAll & ~only(P::kHoldSent)),
 
     to(E::kSampleCame, only(P::kObserving), P::kDeciding),
-    to(E::kSampleCame, only(P::kObservingOvertaken), P::kTaking),
+    to(E::kSampleCame, only(P::kObservingPreempted), P::kTaking),
     ignore(E::kSampleCame, kAll & ~kAwaitsSample),
     to(E::kNewSample, only(P::kLent), P::kLent),
     ignore(E::kNewSample, kAll & ~only(P::kLent)),
 
-    stay(E::kInputMissing, kNotOwned | kChoosing),
-    never(E::kInputMissing, kOver | kHolds | kActing | kKeeping),
-    to(E::kUnservable, kNotOwned | kChoosing, P::kRefused),
-    never(E::kUnservable, kOver | kHolds | kActing | kKeeping),
+    stay(E::kInputMissing, kDecides),
+    never(E::kInputMissing, kAll & ~kDecides),
+    to(E::kUnservable, kDecides, P::kRefused),
+    never(E::kUnservable, kAll & ~kDecides),
     to(E::kBroken, only(P::kListening) | kChoosing, P::kLent),
     stay(E::kBroken, only(P::kLent)),
-    never(E::kBroken, kOver | kHolds | kActing | kKeeping),
-    to(E::kServable, kNotOwned, P::kTaking),
+    never(E::kBroken, kAll & ~kDecides),
+    to(E::kServable, kAsking, P::kTaking),
     ignore(E::kServable, kChoosing),
-    never(E::kServable, kOver | kHolds | kActing | kKeeping),
+    never(E::kServable, kAll & ~kDecides),
     to(E::kArmFree, only(P::kTaking), P::kDeciding),
     never(E::kArmFree, kAll & ~only(P::kTaking)),
     to(E::kPositionUnknown, only(P::kTaking), P::kRefused),
@@ -194,15 +202,15 @@ constexpr Rule kRules[] = {
     never(E::kUnreachable, kAll & ~only(P::kDeciding)),
 
     to(E::kInputSilent, kChoosing | kActing, P::kHoldDue),
-    ignore(E::kInputSilent, kOver | kHolds | kNotOwned | kKeeping),
+    ignore(E::kInputSilent, kOver | kHolds | kAsking | kKeeping),
     to(E::kUnanswered, only(P::kMoving), P::kMoving, Sends::kAgain),
-    to(E::kUnanswered, only(P::kMovingOvertaken), P::kTaking),  // planned from another place
+    to(E::kUnanswered, only(P::kMovingPreempted), P::kTaking),  // planned from another place
     to(E::kUnanswered, only(P::kHoldSent), P::kHoldSent, Sends::kAgain),
     ignore(E::kUnanswered, kAll & ~kAwaitsAnswer & ~only(P::kHoldSent)),
     to(E::kNoSample, kAwaitsSample, P::kHoldDue),
     ignore(E::kNoSample, kAll & ~kAwaitsSample),
     to(E::kTargetExpired, kChoosing | kActing, P::kHoldDue),
-    to(E::kTargetExpired, kNotOwned, P::kRefused),
+    to(E::kTargetExpired, kAsking, P::kRefused),
     ignore(E::kTargetExpired, kOver | kHolds | kKeeping),
     to(E::kGivenUp, kChoosing, P::kRefused),
     ignore(E::kGivenUp, kAll & ~kChoosing),
@@ -258,5 +266,10 @@ constexpr Table kTable = make_table();
 const Reaction& reaction(Phase phase, Event event) { return kTable[index(phase)][index(event)]; }
 const PhaseInfo& info(Phase phase) { return kPhases[index(phase)]; }
 const EventInfo& info(Event event) { return kEvents[index(event)]; }
+
+bool owns_arm(Phase phase) { return kOwnsArm & only(phase); }
+bool is_active(Phase phase) { return kActive & only(phase); }
+bool is_open(Phase phase) { return kOpen & only(phase); }
+bool decides(Phase phase) { return kDecides & only(phase); }
 
 }  // namespace bodyschema

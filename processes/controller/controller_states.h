@@ -6,7 +6,7 @@
 namespace bodyschema {
 
 /// What class Controller does between two events. controller_states.cpp says of each what it means,
-/// which CONTROL_STATUS it is and whether the arm is the controller's own; states.md shows it.
+/// and which CONTROL_STATUS it is; states.md shows it.
 enum class Phase : std::uint8_t {
   kIdle,
   kListening,
@@ -15,8 +15,8 @@ enum class Phase : std::uint8_t {
   kTagAwaited,
   kMoving,
   kObserving,
-  kMovingOvertaken,
-  kObservingOvertaken,
+  kMovingPreempted,
+  kObservingPreempted,
   kKeeping,
   kLent,
   kRefused,
@@ -105,10 +105,17 @@ struct PhaseInfo {
   Phase phase;
   std::string_view name;
   std::int8_t control_state;  ///< CONTROL_STATUS.control_state
-  bool owns_arm;
   std::string_view meaning;
 };
 const PhaseInfo& info(Phase phase);
+
+bool owns_arm(Phase phase);
+/// A target is served or kept.
+bool is_active(Phase phase);
+/// It was not reached yet.
+bool is_open(Phase phase);
+/// What the target needs next is decided as soon as the inputs allow it.
+bool decides(Phase phase);
 
 struct EventInfo {
   Event event;

@@ -157,7 +157,7 @@ std::optional<sample_t> Observer::make_sample() {
     const auto frames = frames_of(*rest);
     if (frames.size() < static_cast<std::size_t>(config_.frames_per_sample)) continue;
     const Rest complete = *rest;
-    // Earlier rests were overtaken and get no more frames.
+    // Earlier rests were preempted and get no more frames.
     counters_["action never seen"] += rest - rests_.begin();
     rests_.erase(rests_.begin(), rest + 1);
     remember(key_of(complete.status));

@@ -2,13 +2,15 @@
 // twice, whole and with its middle link bent by 45° before the first, by a schema that stays as it
 // was or one that is adapted. Prints Markdown: errors of the true end effector at the way points,
 // and the mean error at each of them with --along. Then the control of Fig. 10: a 2-DOF arm, with
-// targets without noise and with a marker as target.
+// targets without noise and with a marker as target. --plot draws where the first arm went (Fig.
+// 14 of the chapter) beside the errors along the way.
 //
-//   ./run experiment control [--runs 20] [--along]
+//   ./run experiment control [--runs 20] [--along] [--plot FILE.png]
 
 #include <fmt/format.h>
 
 #include <CLI/CLI.hpp>
+#include <Eigen/SVD>
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -127,6 +129,7 @@ Eigen::VectorXd descend(const BodySchema& schema, const Eigen::Vector3d& p_RT,
 }
 
 struct Result {
+  std::vector<Eigen::Vector3d> first;  ///< where the first arm's end effector came [m]
   std::array<std::vector<double>, kPasses * kWayPoints> errors_m;  ///< one a run that reached it
   std::vector<double> probes, moves;
   int num_not_reached = 0;
@@ -174,6 +177,7 @@ Result measure(const Case& test, int num_runs, const std::string& rig) {
     for (std::size_t n = 0; n < result.errors_m.size(); ++n) {
       const auto [status, error_m] = arm.go_to(kEndEffector, arms.path[n % arms.path.size()]);
       num_probes += status.num_probes;
+      if (run == 1) result.first.push_back(arm.position(kEndEffector));
       if (status.control_state == control_status_t::CONTROL_REACHED)
         result.errors_m[n].push_back(error_m);
       else
@@ -286,20 +290,59 @@ void print_along(const std::vector<Case>& cases, const std::vector<Result>& resu
   fmt::print("\n");
 }
 
-Plot plot_along(const std::vector<Case>& cases, const std::vector<Result>& results) {
-  Plot plot{.width_px = 900, .height_px = 420};
-  plot.script =
-      "set logscale y\nset key below\nset xlabel 'way point'\nset ylabel 'error [mm]'\nplot ";
+/// Points [m] in a plane, as gnuplot's data.
+std::string in_plane(const std::vector<Eigen::Vector3d>& points,
+                     const Eigen::Matrix<double, 2, 3>& plane) {
   std::string data;
+  for (const Eigen::Vector3d& point : points) {
+    const Eigen::Vector2d p = plane * point;
+    data += fmt::format("{} {}\n", p.x(), p.y());
+  }
+  return data + "e\n";
+}
+
+/// The two directions in which the points spread most.
+Eigen::Matrix<double, 2, 3> plane_of(const std::vector<Eigen::Vector3d>& points) {
+  Eigen::Matrix3Xd spread(3, points.size());
+  for (std::size_t n = 0; n < points.size(); ++n)
+    spread.col(static_cast<Eigen::Index>(n)) = points[n];
+  spread.colwise() -= spread.rowwise().mean().eval();
+  return spread.jacobiSvd(Eigen::ComputeFullU).matrixU().leftCols<2>().transpose();
+}
+
+/// Where the first arm's end effector came in both passes; the errors of all arms.
+Plot plot_of(const std::vector<Case>& cases, const std::vector<Result>& results) {
+  Plot plot{.width_px = 1300, .height_px = 560};
+  Rng rng(1);
+  std::vector<Eigen::Vector3d> path = arms_of(rng).path;
+  path.push_back(path.front());
+  const Eigen::Matrix<double, 2, 3> plane = plane_of(path);
+  plot.script =
+      "set multiplot layout 1,2\nset key below\nset size ratio -1\nset title 'the first arm'\n"
+      "set xlabel '[m], in the plane of the path'\nset ylabel '[m]'\n"
+      "plot '-' with lines lw 6 lc rgb '#cccccc' title 'path'";
+  std::string data = in_plane(path, plane);
   for (std::size_t c = 0; c < cases.size(); ++c) {
-    plot.script +=
-        fmt::format("{}'-' with lines lw 2 title {}", c ? ", " : "", gnuplot_string(cases[c].name));
+    if (results[c].first.empty() || cases[c].regime == Regime::kChapter ||
+        cases[c].control == Control::kCorrected)
+      continue;
+    plot.script += fmt::format(", '-' with linespoints lw 1 pt 7 ps 0.6 lc {} title {}", c + 1,
+                               gnuplot_string(cases[c].name));
+    data += in_plane(results[c].first, plane);
+  }
+  plot.script += "\n" + data +
+                 "set size noratio\nset title 'all arms, mean'\nset logscale y\n"
+                 "set xlabel 'way point'\nset ylabel 'error [mm]'\nplot ";
+  data.clear();
+  for (std::size_t c = 0; c < cases.size(); ++c) {
+    plot.script += fmt::format("{}'-' with lines lw 2 lc {} title {}", c ? ", " : "", c + 1,
+                               gnuplot_string(cases[c].name));
     for (std::size_t n = 0; n < results[c].errors_m.size(); ++n)
       if (!results[c].errors_m[n].empty())
         data += fmt::format("{} {}\n", n + 1, 1e3 * mean(results[c].errors_m[n]));
     data += "e\n";
   }
-  plot.script += "\n" + data;
+  plot.script += "\n" + data + "unset multiplot\n";
   return plot;
 }
 
@@ -314,7 +357,7 @@ int main(int argc, char** argv) {
   app.add_option("--runs", num_runs, "Arms of other geometry")->check(CLI::PositiveNumber);
   app.add_option("--rig", rig, "Folder of controller.yaml and model_monitor.yaml");
   app.add_flag("--along", is_along, "Also the mean error at each way point");
-  app.add_option("--plot", plot_file, "PNG of them");
+  app.add_option("--plot", plot_file, "PNG: the way of the first arm, and the errors");
   CLI11_PARSE(app, argc, argv);
   const std::vector<Case> cases = {
       {"whole, static, engineered", Regime::kTag, false, false, Control::kStatic},
@@ -339,5 +382,5 @@ int main(int argc, char** argv) {
   }
   if (is_along) print_along(cases, results);
   print_two_dof(num_runs, rig);
-  if (!plot_file.empty()) draw_png(plot_along(cases, results), plot_file);
+  if (!plot_file.empty()) draw_png(plot_of(cases, results), plot_file);
 }

@@ -102,6 +102,17 @@ inline Target position_target(std::int64_t id, const Eigen::Vector3d& p_RT, doub
   return target;
 }
 
+/// Where the arm's last link is at an action, as a target.
+inline Target pose_target(std::int64_t id, const Eigen::Vector3d& action) {
+  const Pose X_RB = planar().predict(1, 4, action)->X_AB;
+  Target target = position_target(id, X_RB.translation());
+  target.target_kind = Target::KIND_POSE;
+  const Eigen::Quaterniond q(X_RB.linear());
+  const double wxyz[] = {q.w(), q.x(), q.y(), q.z()};
+  std::copy(std::begin(wxyz), std::end(wxyz), target.orientation_wxyz);
+  return target;
+}
+
 inline Target other_target(std::int64_t id, std::int8_t kind) {
   Target target{};
   target.sender = "operator";

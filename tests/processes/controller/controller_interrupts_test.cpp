@@ -68,12 +68,12 @@ const std::map<Phase, Act> kWays = {
      }},
     {Phase::kMoving, be_moving},
     {Phase::kObserving, be_observing},
-    {Phase::kMovingOvertaken,
+    {Phase::kMovingPreempted,
      [](Bench& b) {
        be_moving(b);
        move_by_another(b);
      }},
-    {Phase::kObservingOvertaken,
+    {Phase::kObservingPreempted,
      [](Bench& b) {
        be_observing(b);
        move_by_another(b);
@@ -156,8 +156,26 @@ void lose_part(Bench& bench) {
   bench.show_schema();
 }
 
+void answer(Bench& bench, std::int8_t state) {
+  if (!bench.moves.empty()) bench.answer_last_move(state, "because");
+}
+
+void show_own_sample(Bench& bench) {
+  if (bench.moves.empty()) return;
+  bench.motion.source = bench.moves.back().source;
+  bench.motion.epoch = bench.moves.back().epoch;
+  bench.motion.action_id = bench.moves.back().action_id;
+  bench.show_sample();
+}
+
 /// What brings each event about, at once.
 const std::map<Event, Act> kInterrupts = {
+    {Event::kTarget, [](Bench& b) { b.give(position_target(9, kFar)); }},
+    {Event::kForeignMove, move_by_another},
+    {Event::kSettled, [](Bench& b) { answer(b, motion_status_t::STATE_SETTLED); }},
+    {Event::kRejected, [](Bench& b) { answer(b, motion_status_t::STATE_REJECTED); }},
+    {Event::kExpired, [](Bench& b) { answer(b, motion_status_t::STATE_EXPIRED); }},
+    {Event::kSampleCame, show_own_sample},
     {Event::kHoldAsked, [](Bench& b) { b.give(other_target(9, Target::KIND_HOLD)); }},
     {Event::kReleaseAsked, [](Bench& b) { b.give(other_target(9, Target::KIND_RELEASE)); }},
     {Event::kStopped, [](Bench& b) { b.stop(); }},
@@ -171,6 +189,32 @@ const std::map<Event, Act> kInterrupts = {
     {Event::kTargetExpired, [](Bench& b) { b.controller.on_tick(b.now + 100 * kSecond); }},
     {Event::kInputSilent, [](Bench& b) { b.controller.on_tick(b.now + 10 * kSecond); }},
 };
+
+/// Where the controller is in the end: what follows from an event at once is the next event.
+Phase end_of(Phase phase, Event event, const Bench& bench) {
+  const Reaction& wanted = reaction(phase, event);
+  const Phase next = wanted.kind == Reaction::Kind::kGoes ? wanted.next : phase;
+  switch (next) {
+    case Phase::kHoldDue:
+      return bench.controller.status().utime > 0 ? Phase::kHoldSent : next;
+    case Phase::kRefusedHalted:
+      return bench.motion.stop_latched ? next : Phase::kRefused;
+    case Phase::kListening:
+      if (!bench.monitor_speaks || bench.controller.status().utime == 0) return next;
+      return bench.schema.edges[1].state == EdgeState::kInvalid ? Phase::kLent : Phase::kTaking;
+    case Phase::kDeciding:
+      return bench.motion.rest_since_utime < 0 ? next : Phase::kMoving;
+    default:
+      return next;
+  }
+}
+
+Sends sent_by(const Bench& bench, std::size_t num_moves, int num_holds, int num_repeats) {
+  return bench.moves.size() > num_moves    ? Sends::kMove
+         : bench.num_holds > num_holds     ? Sends::kHold
+         : bench.num_repeats > num_repeats ? Sends::kAgain
+                                           : Sends::kNothing;
+}
 
 TEST(ControllerInterruptsTest, EachPhaseIsLeftAsTheTableSays) {
   int num_left = 0;
@@ -187,25 +231,89 @@ TEST(ControllerInterruptsTest, EachPhaseIsLeftAsTheTableSays) {
       const bool is_of_clock = event == Event::kTargetExpired || event == Event::kInputSilent;
       if (!goes && is_of_clock) continue;  // the clock may bring about something else
       num_left += goes;
+      const std::size_t num_moves = bench.moves.size();
+      const int num_holds = bench.num_holds, num_repeats = bench.num_repeats;
+      // With STOP latched a target is another event.
+      const bool is_halted = event == Event::kTarget && bench.motion.stop_latched;
       act(bench);
-      Phase next = goes ? wanted.next : phase;
-      // HOLD is sent at once, if the driver was heard.
-      const bool is_heard = bench.controller.status().utime > 0;
-      if (next == Phase::kHoldDue && is_heard) next = Phase::kHoldSent;
-      // After a restart of the driver no STOP is latched any more.
-      if (phase == Phase::kRefusedHalted && bench.motion.stop_latched == 0 &&
-          next == Phase::kRefusedHalted)
-        next = Phase::kRefused;
+      const Event told = is_halted ? Event::kTargetWhileHalted : event;
+      const Phase next = end_of(phase, told, bench);
       EXPECT_EQ(info(bench.controller.phase()).name, info(next).name) << name;
+      if (is_of_clock) continue;  // its answer was not taken
+      const Reaction& reacted = reaction(phase, told);
+      const bool was_due = phase == Phase::kHoldDue || reacted.next == Phase::kHoldDue;
+      const Sends sends = was_due && next == Phase::kHoldSent ? Sends::kHold
+                          : reacted.next == Phase::kDeciding && next == Phase::kMoving
+                              ? Sends::kMove
+                              : reacted.sends;
+      EXPECT_EQ(sent_by(bench, num_moves, num_holds, num_repeats), sends) << name;
     }
   }
   EXPECT_EQ(kWays.size(), static_cast<std::size_t>(kNumPhases));
-  EXPECT_GT(num_left, 80);
+  EXPECT_GT(num_left, 100);
+}
+
+TEST(ControllerInterruptsTest, WhileHaltedATargetIsRefusedAndWhatIsHeldStaysHeld) {
+  for (const auto& [phase, bring] : kWays) {
+    if (phase == Phase::kHoldDue) continue;  // the driver was not heard
+    Bench bench;
+    bring(bench);
+    bench.stop();
+    const Phase stopped = bench.controller.phase();
+    bench.give(position_target(9, kNear));
+    EXPECT_EQ(bench.controller.phase(), end_of(stopped, Event::kTargetWhileHalted, bench))
+        << info(phase).name;
+    EXPECT_TRUE(bench.has_why("the arm is halted")) << bench.status.why;
+    const int was_owned = bench.status.owns_arm;
+    EXPECT_EQ(was_owned, owns_arm(stopped));
+    const std::size_t num_moves = bench.moves.size();
+    bench.stop(false);
+    bench.run(20);
+    EXPECT_EQ(bench.status.owns_arm, was_owned) << info(phase).name;
+    EXPECT_EQ(bench.moves.size(), num_moves) << info(phase).name;
+  }
+}
+
+TEST(ControllerInterruptsTest, ATargetThatSomebodyMovedTheArmAwayFromIsNotGoneBackToUnasked) {
+  Bench bench;
+  kWays.at(Phase::kKeeping)(bench);
+  const std::size_t num_moves = bench.moves.size();
+  bench.arm = {10, 0.1, 2};
+  bench.observer_works = false;
+  move_by_another(bench);
+  EXPECT_EQ(bench.status.control_state, S::CONTROL_HOLDING);
+  EXPECT_TRUE(bench.has_why("away from the target")) << bench.status.why;
+  bench.run(20);
+  EXPECT_EQ(bench.moves.size(), num_moves);
+  // The next target waits for what that move shows.
+  bench.give(position_target(1, kFar));
+  bench.run(2);
+  EXPECT_EQ(bench.controller.phase(), Phase::kTaking);
+  bench.observer_works = true;
+  bench.show_sample();
+  EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+}
+
+// What a rejection is about was settled when the MOVE was sent.
+TEST(ControllerInterruptsTest, ARejectionOfAnOlderTargetsMoveDoesNotDropAProbe) {
+  Bench bench;
+  bench.driver_serves = false;
+  bench.start();
+  give_and_send(bench);
+  bench.health = health_of(1, 2, 3, schema_edge_t::EDGE_PROVISIONAL);
+  bench.health->probe_sample = 7;
+  set_array(bench.health->num_probe, bench.health->probe_action, {5.0, 0.1, 1.0});
+  bench.repeat();
+  bench.give(expiring(position_target(1, kFar)));
+  bench.answer_last_move(motion_status_t::STATE_REJECTED, "no");
+  bench.driver_serves = true;
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+  EXPECT_EQ(bench.status.num_probes, 1);
 }
 
 TEST(ControllerInterruptsTest, AMoveRejectedAfterSomebodyElseMovedTheArmIsDecidedAnewFromThere) {
   Bench bench;
-  kWays.at(Phase::kMovingOvertaken)(bench);
+  kWays.at(Phase::kMovingPreempted)(bench);
   bench.answer_last_move(motion_status_t::STATE_REJECTED, "no");
   EXPECT_EQ(bench.controller.phase(), Phase::kTaking);
   bench.driver_serves = true;
@@ -214,7 +322,7 @@ TEST(ControllerInterruptsTest, AMoveRejectedAfterSomebodyElseMovedTheArmIsDecide
 
 TEST(ControllerInterruptsTest, AMoveThatNobodyAnsweredIsNotSentAgainAfterSomebodyElseMovedTheArm) {
   Bench bench;
-  kWays.at(Phase::kMovingOvertaken)(bench);
+  kWays.at(Phase::kMovingPreempted)(bench);
   const std::int64_t id = bench.moves.back().action_id;
   const int num_repeats = bench.num_repeats;
   bench.driver_serves = true;
@@ -225,11 +333,8 @@ TEST(ControllerInterruptsTest, AMoveThatNobodyAnsweredIsNotSentAgainAfterSomebod
 
 TEST(ControllerInterruptsTest, AfterItsSampleAnArmThatSomebodyElseMovedIsTakenAnew) {
   Bench bench;
-  kWays.at(Phase::kObservingOvertaken)(bench);
-  bench.motion.source = bench.moves.back().source;
-  bench.motion.epoch = bench.moves.back().epoch;
-  bench.motion.action_id = bench.moves.back().action_id;
-  bench.show_sample();
+  kWays.at(Phase::kObservingPreempted)(bench);
+  show_own_sample(bench);
   EXPECT_EQ(bench.controller.phase(), Phase::kTaking);
 }
 

@@ -2,10 +2,13 @@
 
 #include <gtest/gtest.h>
 
+#include <algorithm>
 #include <fstream>
 #include <map>
 #include <set>
 #include <sstream>
+#include <string>
+#include <utility>
 #include <vector>
 
 #include "bodyschema/control_status_t.hpp"
@@ -29,7 +32,7 @@ std::vector<Event> all_events() {
   return events;
 }
 
-/// Those of one CONTROL_STATUS, and of one owner if it is given.
+/// Those of one CONTROL_STATUS.
 Phases phases_of(std::int8_t control_state) {
   Phases phases;
   for (const Phase phase : all_phases())
@@ -60,7 +63,7 @@ std::string named(Phase phase, Event event) {
 Phases served() {
   Phases phases = phases_of(S::CONTROL_MOVING);
   phases.merge(phases_of(S::CONTROL_WAITING));
-  std::erase_if(phases, [](Phase phase) { return !info(phase).owns_arm; });
+  std::erase_if(phases, [](Phase phase) { return !owns_arm(phase); });
   return phases;
 }
 
@@ -103,7 +106,7 @@ TEST(ControllerStatesTest, AMoveIsSentWhereItIsDecidedAloneAndSentAgainOnlyWhile
                 is_step)
           << named(phase, event);
       if (r.sends == Sends::kNothing) continue;
-      EXPECT_TRUE(info(r.next).owns_arm) << named(phase, event);
+      EXPECT_TRUE(owns_arm(r.next)) << named(phase, event);
       if (r.sends == Sends::kAgain) {
         EXPECT_EQ(r.next, phase);
         EXPECT_TRUE(phase == Phase::kHoldSent ||
@@ -129,8 +132,8 @@ TEST(ControllerStatesTest, WhereATargetIsOverNothingMovesUntilAnother) {
 
 TEST(ControllerStatesTest, WhatMustHoldTheArmSendsHoldAsSoonAsTheDriverIsHeard) {
   std::map<Event, Phases> holding;
-  const Phases moving{Phase::kMoving, Phase::kMovingOvertaken};
-  const Phases observing{Phase::kObserving, Phase::kObservingOvertaken};
+  const Phases moving{Phase::kMoving, Phase::kMovingPreempted};
+  const Phases observing{Phase::kObserving, Phase::kObservingPreempted};
   Phases owned = served();
   holding[Event::kInputSilent] = holding[Event::kTargetExpired] = owned;
   owned.insert(Phase::kKeeping);
@@ -157,11 +160,38 @@ TEST(ControllerStatesTest, WhatOthersStopIsOverAndTheDriverIsToldNothing) {
   Phases owned = served();
   owned.insert(Phase::kKeeping);
   const Reaction held{Kind::kGoes, Phase::kHeld, Sends::kNothing};
+  owned.insert(Phase::kLent);
   for (const Phase phase : owned)
     for (const Event event : {Event::kStopped, Event::kForeignHold})
       EXPECT_EQ(reaction(phase, event), held) << named(phase, event);
-  EXPECT_EQ(reaction(Phase::kLent, Event::kStopped), held);
+  EXPECT_EQ(reaction(Phase::kListening, Event::kForeignHold), held);
   EXPECT_EQ(reaction(Phase::kListening, Event::kStopped).next, Phase::kRefusedHalted);
+  EXPECT_EQ(reaction(Phase::kKeeping, Event::kForeignMove), held);
+}
+
+TEST(ControllerStatesTest, AnArmThatIsHeldIsGivenBackWhereThatIsAskedForAlone) {
+  for (const Phase phase : phases_of(S::CONTROL_HOLDING)) {
+    for (const Event event : all_events()) {
+      const Reaction& r = reaction(phase, event);
+      if (r.kind != Kind::kGoes || event == Event::kReleaseAsked) continue;
+      EXPECT_TRUE(owns_arm(r.next)) << named(phase, event);
+    }
+  }
+}
+
+TEST(ControllerStatesTest, WhoOwnsTheArmAndWhatIsOpenFollowsFromTheStateThatIsTold) {
+  for (const Phase phase : all_phases()) {
+    const std::int8_t state = info(phase).control_state;
+    const bool is_over = state == S::CONTROL_IDLE || state == S::CONTROL_REFUSED ||
+                         state == S::CONTROL_HOLDING || state == S::CONTROL_RELEASED;
+    EXPECT_EQ(is_active(phase), !is_over) << info(phase).name;
+    EXPECT_EQ(is_open(phase), !is_over && state != S::CONTROL_REACHED) << info(phase).name;
+    EXPECT_EQ(decides(phase), is_open(phase) && state != S::CONTROL_MOVING) << info(phase).name;
+    if (is_over || state == S::CONTROL_LENT)
+      EXPECT_EQ(owns_arm(phase), state == S::CONTROL_HOLDING) << info(phase).name;
+    else if (phase != Phase::kListening)
+      EXPECT_TRUE(owns_arm(phase)) << info(phase).name;
+  }
 }
 
 TEST(ControllerStatesTest, NoAnswerIsImpossibleHoweverLate) {
@@ -192,7 +222,7 @@ std::string markdown() {
           "| phase | CONTROL_STATUS | owns the arm | meaning |\n| --- | --- | --- | --- |\n";
   for (const Phase phase : all_phases())
     text << "| " << info(phase).name << " | " << kStates[info(phase).control_state] << " | "
-         << (info(phase).owns_arm ? "yes" : "no") << " | " << info(phase).meaning << " |\n";
+         << (owns_arm(phase) ? "yes" : "no") << " | " << info(phase).meaning << " |\n";
   text << "\n| event | meaning | in | goes to | sends |\n| --- | --- | --- | --- | --- |\n";
   for (const Event event : all_events()) {
     std::vector<std::pair<Reaction, std::vector<Phase>>> groups;

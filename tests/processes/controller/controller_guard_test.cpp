@@ -1,0 +1,444 @@
+// Class Controller: what must be heard before and while it moves anything.
+
+#include <gtest/gtest.h>
+
+#include <functional>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "tests/processes/controller/controller_bench.h"
+
+namespace bodyschema::test {
+namespace {
+
+TEST(ControllerTest, NothingIsSentBeforeEveryInputWasHeard) {
+  const struct {
+    const char* input;
+    std::function<void(Bench&)> mute;
+  } cases[] = {{"MOTION_STATUS", [](Bench& b) { b.driver_speaks = false; }},
+               {"BODY_SCHEMA", [](Bench& b) { b.monitor_speaks = false; }},
+               {"MARKER_POSES", [](Bench& b) { b.eyes_open = false; }}};
+  for (const auto& c : cases) {
+    Bench bench;
+    c.mute(bench);
+    bench.start();
+    bench.give(position_target(0, kNear));
+    bench.run(2);
+    EXPECT_EQ(bench.status.control_state, S::CONTROL_WAITING) << c.input;
+    EXPECT_TRUE(bench.has_why(c.input)) << bench.status.why;
+    EXPECT_EQ(bench.status.owns_arm, 0) << "the babbler may be what is missing";
+    bench.run(2);
+    EXPECT_EQ(bench.status.control_state, S::CONTROL_REFUSED) << c.input;
+    EXPECT_TRUE(bench.has_why(c.input)) << bench.status.why;
+    // What comes later does not revive it.
+    bench.driver_speaks = bench.monitor_speaks = bench.eyes_open = true;
+    bench.start();
+    bench.run(10);
+    EXPECT_TRUE(bench.moves.empty());
+    EXPECT_EQ(bench.num_holds, 0);
+    EXPECT_EQ(bench.status.control_state, S::CONTROL_REFUSED);
+  }
+}
+
+TEST(ControllerTest, AnInputThatComesInTimeIsWaitedFor) {
+  Bench bench;
+  bench.monitor_speaks = false;
+  bench.start();
+  bench.give(position_target(0, kNear));
+  bench.run(2);
+  bench.monitor_speaks = true;
+  EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+}
+
+TEST(ControllerTest, AHoldBeforeTheDriverIsHeardIsSentAsSoonAsItIs) {
+  Bench bench;
+  bench.driver_speaks = false;
+  bench.run(2);
+  bench.give(other_target(0, Target::KIND_HOLD));
+  bench.run(5);
+  EXPECT_EQ(bench.num_holds, 0);
+  EXPECT_EQ(bench.status.owns_arm, 1);
+  bench.driver_speaks = true;
+  bench.repeat();
+  EXPECT_EQ(bench.num_holds, 1);
+}
+
+TEST(ControllerTest, FromAPositionThatWasNotHeardItDoesNotMove) {
+  // A restarted controller hears the answer to a rejection, which says nothing about the arm.
+  const auto rejected = [](Bench& bench) {
+    motion_status_t message = bench.motion;
+    message.source = "motor_babbler";
+    message.action_id = 12;
+    message.state = motion_status_t::STATE_REJECTED;
+    message.reason = "collision";
+    bench.motion = message;
+  };
+  Bench bench;
+  rejected(bench);
+  bench.start();
+  bench.give(position_target(0, kNear));
+  bench.run(20);
+  EXPECT_TRUE(bench.moves.empty());
+  EXPECT_EQ(bench.status.control_state, S::CONTROL_REFUSED);
+  EXPECT_TRUE(bench.has_why("where the arm is")) << bench.status.why;
+
+  // The SAMPLE of this rest tells it.
+  Bench second;
+  rejected(second);
+  second.motion.commanded = {-30, 0.2, 1};
+  second.start();
+  second.show_sample();
+  second.give(position_target(0, kNear));
+  EXPECT_TRUE(second.run_until_state(S::CONTROL_REACHED)) << second.status.why;
+}
+
+TEST(ControllerTest, TakingTheArmWaitsForRestAndForTheBabblersSample) {
+  Bench bench;
+  bench.start();
+  bench.observer_works = false;
+  bench.arm = {20, 0.1, 4};
+  bench.settle("motor_babbler", 1, 12, bench.arm);
+  motion_status_t moving = bench.motion;
+  moving.state = motion_status_t::STATE_MOVING;
+  moving.rest_since_utime = -1;
+  const motion_status_t settled = bench.motion;
+  bench.say(moving);
+  bench.give(position_target(0, kNear));
+  bench.run(2);
+  EXPECT_EQ(bench.status.owns_arm, 1);
+  EXPECT_TRUE(bench.has_why("rest")) << bench.status.why;
+  bench.say(settled);
+  bench.run(2);
+  EXPECT_TRUE(bench.has_why("SAMPLE of action 12 of motor_babbler")) << bench.status.why;
+  EXPECT_TRUE(bench.moves.empty());
+  bench.observer_works = true;
+  bench.show_sample();
+  EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+}
+
+TEST(ControllerTest, AnArmThatNeverRestsIsGivenBack) {
+  for (const bool in_the_middle : {false, true}) {
+    Bench bench;
+    bench.start();
+    bench.driver_serves = false;
+    if (in_the_middle) {
+      bench.give(position_target(0, kFar));
+      ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 1; }));
+    }
+    const std::size_t num_moves = bench.moves.size();
+    bench.motion.rest_since_utime = -1;
+    if (in_the_middle) {
+      bench.answer_last_move(motion_status_t::STATE_REJECTED, "the arm moves");
+    } else {
+      bench.motion.source = "motor_babbler";
+      bench.motion.action_id = 12;
+      bench.motion.kind = action_command_t::KIND_MOVE;
+      bench.motion.state = motion_status_t::STATE_MOVING;
+      bench.say(bench.motion);
+      bench.give(position_target(0, kFar));
+    }
+    bench.run(19.5);
+    EXPECT_EQ(bench.status.owns_arm, 1) << bench.status.why;
+    EXPECT_TRUE(bench.has_why("rest")) << bench.status.why;
+    bench.run(1);
+    EXPECT_EQ(bench.status.control_state, S::CONTROL_REFUSED);
+    EXPECT_EQ(bench.status.owns_arm, 0);
+    EXPECT_TRUE(bench.has_why("given up after 20 s: waiting for the arm to come to rest"))
+        << bench.status.why;
+    EXPECT_EQ(bench.moves.size(), num_moves);
+  }
+}
+
+TEST(ControllerTest, ASampleThatNeverComesDoesNotBlockTheArmForEver) {
+  Bench bench;
+  bench.start();
+  bench.observer_works = false;
+  bench.arm = {20, 0.1, 4};
+  bench.settle("motor_babbler", 1, 12, bench.arm);
+  bench.give(position_target(0, kNear));
+  bench.run(4.5);
+  EXPECT_TRUE(bench.moves.empty());
+  bench.observer_works = true;
+  EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+}
+
+TEST(ControllerTest, WhoMovesTheArmInBetweenIsFollowedFromWhereItIsThen) {
+  Bench bench;
+  bench.start();
+  bench.give(position_target(0, kFar));
+  ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 2; }));
+  bench.arm = {60, -0.5, 9};
+  bench.settle("motor_babbler", 1, 30, bench.arm);
+  // The bench insists on steps from there of at most max_step.
+  EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+}
+
+// ---- what cannot be served
+
+TEST(ControllerTest, WhatCannotBeServedIsRefusedAndTheArmIsNotMoved) {
+  Target unknown = position_target(0, kNear), unconnected = unknown;
+  unknown.target_part = 42;
+  unconnected.target_part = 5;
+  const struct {
+    Target target;
+    const char* why;
+  } cases[] = {{unknown, "no part 42"},
+               {unconnected, "not connected"},
+               {position_target(0, kBeyond), "no nearer than 900.0 mm"}};
+  for (const auto& c : cases) {
+    Bench bench;
+    bench.start();
+    bench.give(c.target);
+    bench.run(2);
+    EXPECT_EQ(bench.status.control_state, S::CONTROL_REFUSED);
+    EXPECT_TRUE(bench.has_why(c.why)) << bench.status.why;
+    EXPECT_EQ(bench.status.owns_arm, 0);
+    EXPECT_EQ(bench.status.num_moves, 0);
+    EXPECT_TRUE(bench.moves.empty());
+    EXPECT_EQ(bench.num_holds, 0);
+  }
+  Bench bench;
+  bench.start();
+  bench.give(position_target(0, kBeyond));
+  bench.run(2);
+  EXPECT_NEAR(bench.status.predicted_error_m, 0.9, 1e-3);
+}
+
+TEST(ControllerTest, ARejectedWayIsReplacedByAnother) {
+  Bench bench;
+  bench.start();
+  int num_rejections = 0;
+  std::optional<std::vector<double>> first;
+  bench.rejects = [&](const action_command_t& command) -> std::string {
+    if (!first) first = command.action;
+    return num_rejections++ < 2 ? "link2 touches link4" : "";
+  };
+  bench.give(position_target(0, kNear));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+  EXPECT_GT(num_rejections, 2);
+  EXPECT_NE(bench.arm, *first);
+  EXPECT_LT((bench.part_position() - kNear).norm(), 1e-4);
+  EXPECT_EQ(bench.controller.counters().at("action rejected"), 2);
+  EXPECT_EQ(bench.status.num_moves, static_cast<int>(bench.moves.size()) - 2);
+}
+
+// Many a driver says a refusal once and repeats what the arm does: a HOLD, its last move.
+TEST(ControllerTest, WhatADriverRepeatsAfterARefusalIsNoNews) {
+  for (const bool held_before : {false, true}) {
+    Bench bench;
+    bench.start();
+    bench.give(position_target(0, kNear));
+    ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED));
+    if (held_before) {
+      motion_status_t held = bench.motion;
+      held.source = "console";
+      held.kind = action_command_t::KIND_HOLD;
+      held.state = motion_status_t::STATE_HOLDING;
+      bench.say(held);
+      ASSERT_EQ(bench.status.control_state, S::CONTROL_HOLDING);
+    }
+    const motion_status_t doing = bench.motion;
+    int num_rejections = 0;
+    bench.rejects = [&](const auto&) -> std::string {
+      return num_rejections++ < 2 ? "link2 touches link4" : "";
+    };
+    bench.give(position_target(1, kFar));
+    ASSERT_TRUE(bench.run_until([&] { return num_rejections == 1; }));
+    bench.say(doing);
+    ASSERT_TRUE(bench.run_until([&] { return num_rejections == 2; }));
+    bench.say(doing);
+    EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+    EXPECT_EQ(bench.controller.counters().count("driver began anew"), 0U);
+  }
+}
+
+TEST(ControllerTest, ADriverThatRejectsEveryWayIsNotAskedForEver) {
+  Bench bench;
+  bench.start();
+  bench.rejects = [](const auto&) { return "link2 touches link4"; };
+  bench.give(position_target(0, kNear));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REFUSED));
+  EXPECT_LE(bench.moves.size(), 4U);
+  EXPECT_GE(bench.moves.size(), 2U);
+  EXPECT_TRUE(bench.has_why("link2 touches link4")) << bench.status.why;
+  EXPECT_EQ(bench.status.owns_arm, 0);
+  EXPECT_EQ(bench.status.num_moves, 0);
+}
+
+TEST(ControllerTest, AnExpiredActionIsGivenAgainWithAnotherIdAFewTimes) {
+  Bench bench;
+  bench.start();
+  bench.driver_serves = false;
+  bench.give(position_target(0, kNear));
+  ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 1; }));
+  bench.answer_last_move(motion_status_t::STATE_EXPIRED, "expired 5 us ago");
+  ASSERT_EQ(bench.moves.size(), 2U);
+  bench.answer_last_move(motion_status_t::STATE_EXPIRED, "expired 5 us ago");
+  ASSERT_EQ(bench.moves.size(), 3U);
+  bench.answer_last_move(motion_status_t::STATE_EXPIRED, "expired 5 us ago");
+  EXPECT_EQ(bench.moves.size(), 3U);
+  EXPECT_EQ(bench.status.control_state, S::CONTROL_REFUSED);
+  EXPECT_TRUE(bench.has_why("expire")) << bench.status.why;
+}
+
+TEST(ControllerTest, AnActionWithoutAnAnswerIsSentAgainWithTheSameId) {
+  Bench bench;
+  bench.start();
+  bench.driver_serves = false;
+  bench.give(position_target(0, kNear));
+  ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 1; }));
+  bench.run(10);  // the driver goes on repeating its status
+  EXPECT_EQ(bench.moves.size(), 1U);
+  EXPECT_EQ(bench.num_repeats, 9);
+  bench.driver_serves = true;
+  EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED));
+}
+
+struct Silence {
+  const char* input;
+  std::function<void(Bench&, bool speaks)> set;
+};
+
+const Silence kSilences[] = {
+    {"MOTION_STATUS", [](Bench& b, bool speaks) { b.driver_speaks = speaks; }},
+    {"BODY_SCHEMA", [](Bench& b, bool speaks) { b.monitor_speaks = speaks; }},
+    {"MARKER_POSES", [](Bench& b, bool speaks) { b.eyes_open = speaks; }},
+    {"SAMPLE", [](Bench& b, bool speaks) { b.observer_works = speaks; }}};
+
+TEST(ControllerTest, WhenAnInputFallsSilentTheArmIsHeldAndStaysSo) {
+  for (const Silence& silence : kSilences) {
+    Bench bench;
+    bench.start();
+    bench.give(position_target(0, kFar));
+    ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 1; }));
+    // Without an answer or a sample of the next step it cannot go on anyway; for the schema the
+    // arm must be kept busy.
+    silence.set(bench, false);
+    const bool is_schema = std::string(silence.input) == "BODY_SCHEMA";
+    if (is_schema) bench.driver_serves = false;
+    const std::int64_t silent_since = bench.now;
+    ASSERT_TRUE(bench.run_until([&] { return bench.num_holds > 0; })) << silence.input;
+    const double waited_s = static_cast<double>(bench.now - silent_since) / kSecond;
+    EXPECT_GE(waited_s, 1.9) << silence.input;  // it was heard up to a second before
+    EXPECT_LE(waited_s, std::string(silence.input) == "SAMPLE" ? 5.3 : 3.3) << silence.input;
+    EXPECT_EQ(bench.status.control_state, S::CONTROL_HOLDING);
+    EXPECT_EQ(bench.status.owns_arm, 1);
+    EXPECT_TRUE(bench.has_why(silence.input)) << bench.status.why;
+    // No automatic resume.
+    const std::size_t num_moves = bench.moves.size();
+    silence.set(bench, true);
+    bench.driver_serves = true;
+    bench.repeat();
+    bench.show_frame();
+    bench.run(20);
+    EXPECT_EQ(bench.moves.size(), num_moves) << silence.input;
+    EXPECT_EQ(bench.status.control_state, S::CONTROL_HOLDING);
+    // The same target repeated does not resume it either; a new one does.
+    bench.give(position_target(0, kFar));
+    bench.run(5);
+    EXPECT_EQ(bench.moves.size(), num_moves) << silence.input;
+    bench.arm = bench.motion.commanded.size() == 3 ? bench.motion.commanded : bench.arm;
+    bench.give(position_target(1, kFar));
+    EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << silence.input << bench.status.why;
+  }
+}
+
+TEST(ControllerTest, SilenceWhileNothingIsServedDoesNothing) {
+  for (const Silence& silence : kSilences) {
+    Bench bench;
+    bench.start();
+    silence.set(bench, false);
+    bench.run(60);
+    EXPECT_EQ(bench.status.control_state, S::CONTROL_IDLE);
+    EXPECT_EQ(bench.num_holds, 0);
+    silence.set(bench, true);
+    bench.repeat();
+    bench.run(1);
+    bench.give(position_target(0, kFar));
+    EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << silence.input << bench.status.why;
+  }
+}
+
+TEST(ControllerTest, WhatFellSilentBeforeTheTargetCameIsNotMovedBy) {
+  for (const int which : {0, 1}) {
+    Bench bench;
+    bench.start();
+    bench.give(position_target(0, kNear));
+    ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED));
+    const std::size_t num_moves = bench.moves.size();
+    kSilences[which].set(bench, false);
+    bench.run(5);
+    bench.give(position_target(1, kFar));
+    bench.run(5);
+    EXPECT_EQ(bench.moves.size(), num_moves);
+    EXPECT_EQ(bench.status.control_state, S::CONTROL_HOLDING);
+    EXPECT_TRUE(bench.has_why(kSilences[which].input)) << bench.status.why;
+  }
+}
+
+// A live driver's time runs on at rest; frames must keep up with it.
+TEST(ControllerTest, InLiveTimeEyesThatLagOrCloseAreSeenByTheDriversTime) {
+  for (const bool lag : {false, true}) {
+    Bench bench;
+    bench.start();
+    bench.observer_works = false;  // keeps the target open: its sample does not come
+    bench.arm = {0, 0, 0};
+    bench.settle("motor_babbler", 1, 5, bench.arm);
+    bench.give(position_target(0, kFar));
+    const std::int64_t closed = bench.now;
+    std::int64_t num_frames = 0;
+    while (bench.num_holds == 0 && bench.now < closed + 10 * kSecond) {
+      bench.motion.utime += kTick;
+      bench.say(bench.motion);
+      if (lag) {
+        marker_poses_t poses{};
+        poses.utime = bench.motion.utime - 4 * kSecond;
+        poses.image_seq = num_frames++;
+        bench.controller.on_marker_poses(poses);
+      }
+      bench.run(0.1);
+    }
+    EXPECT_EQ(bench.num_holds, 1) << lag;
+    EXPECT_TRUE(bench.has_why("MARKER_POSES")) << bench.status.why;
+    EXPECT_LE(bench.now - closed, 35 * kTick);
+  }
+}
+
+TEST(ControllerTest, AFrameFromFarAheadDoesNotOpenTheEyes) {
+  Bench bench;
+  bench.start();
+  marker_poses_t poses{};
+  poses.utime = std::int64_t{1} << 60;
+  bench.controller.on_marker_poses(poses);
+  bench.give(position_target(0, kFar));
+  ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 1; }));
+  bench.eyes_open = false;
+  EXPECT_TRUE(bench.run_until_state(S::CONTROL_HOLDING));
+  EXPECT_TRUE(bench.has_why("MARKER_POSES")) << bench.status.why;
+}
+
+TEST(ControllerTest, WhileTheMarkerOfThePartOrTheCameraMovedTheArmIsLentAndOthersDoNotMatter) {
+  for (const int part : {1, 2, 4}) {
+    Bench bench;
+    bench.start();
+    model_health_t health = health_of(bench.schema.version, 2, 3, schema_edge_t::EDGE_OK);
+    part_health_t moved{};
+    moved.health_part = part;
+    moved.part_state = schema_edge_t::EDGE_INVALID;
+    moved.position_median_m = moved.rotation_median_rad = -1;
+    set_array(health.num_parts, health.part_health, {moved});
+    bench.health = health;
+    bench.repeat();
+    bench.give(position_target(0, kFar));
+    const bool concerns = part != 2;
+    EXPECT_EQ(bench.run_until_state(S::CONTROL_LENT), concerns) << part;
+    if (!concerns) continue;
+    EXPECT_EQ(bench.status.owns_arm, 0);
+    EXPECT_TRUE(bench.has_why("the marker of part " + std::to_string(part) + " is invalid"))
+        << bench.status.why;
+  }
+}
+
+}  // namespace
+}  // namespace bodyschema::test

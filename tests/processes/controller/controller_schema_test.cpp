@@ -1,0 +1,302 @@
+// Class Controller: the schema changes on the way, and what is seen corrects it.
+
+#include <gtest/gtest.h>
+
+#include <cmath>
+#include <vector>
+
+#include "common/geometry/angle.h"
+#include "tests/processes/controller/controller_bench.h"
+
+namespace bodyschema::test {
+namespace {
+
+TEST(ControllerTest, WithAnInvalidEdgeOnTheWayTheArmIsLentAndTakenBack) {
+  for (const bool by_monitor : {false, true}) {
+    Bench bench;
+    bench.start();
+    bench.give(position_target(0, kFar));
+    ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 1; }));
+    if (by_monitor) {
+      bench.health = health_of(1, 2, 3, schema_edge_t::EDGE_INVALID);
+    } else {
+      bench.schema.version = 2;
+      bench.schema.edges[1].state = EdgeState::kInvalid;
+    }
+    bench.repeat();
+    ASSERT_TRUE(bench.run_until_state(S::CONTROL_LENT));  // the action under way is finished
+    const std::size_t num_moves = bench.moves.size();
+    EXPECT_LE(num_moves, 2U);
+    EXPECT_EQ(bench.status.owns_arm, 0);
+    EXPECT_TRUE(bench.has_why("2–3")) << bench.status.why;
+    // The babbler probes.
+    for (int i = 0; i < 3; ++i) {
+      bench.arm = {10.0 * i, 0.1 * i, 1.0 * i};
+      bench.settle("motor_babbler", 1, 20 + i, bench.arm);
+      bench.run(1);
+    }
+    EXPECT_EQ(bench.moves.size(), num_moves);
+    EXPECT_EQ(bench.num_holds, 0);
+    bench.health.reset();
+    bench.schema = planar(3);
+    bench.repeat();
+    EXPECT_EQ(bench.status.owns_arm, 1);
+    EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+    EXPECT_EQ(bench.status.target_id, 0);
+  }
+}
+
+TEST(ControllerTest, AProbeIsMadeInSmallStepsBeforeTheNextStepOrDoneWithout) {
+  for (const bool is_refused : {false, true}) {
+    Bench bench;
+    bench.start();
+    bench.give(position_target(0, kFar));
+    ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 1; }));
+    bench.health = health_of(1, 2, 3, schema_edge_t::EDGE_PROVISIONAL);
+    bench.health->probe_sample = bench.num_samples;
+    const std::vector<double> wanted{5.0, 0.9, 1.0};
+    set_array(bench.health->num_probe, bench.health->probe_action, wanted);
+    bench.rejects = [&](const action_command_t& command) {
+      return is_refused && command.purpose == action_command_t::PURPOSE_PROBE ? "a wall" : "";
+    };
+    std::vector<double> before = bench.moves[0].action;
+    bench.repeat();
+    ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+    EXPECT_EQ(bench.status.num_probes, is_refused ? 0 : 1);
+    int num_probes = 0;
+    for (std::size_t n = 1; n < bench.moves.size(); ++n) {
+      const action_command_t& move = bench.moves[n];
+      for (std::size_t i = 0; i < 3; ++i) {
+        const Signal& signal = bench.config_.signals[i];
+        EXPECT_LE(std::abs(move.action[i] - before[i]), 0.0501 * (signal.upper - signal.lower));
+      }
+      const bool is_probe = move.purpose == action_command_t::PURPOSE_PROBE;
+      num_probes += is_probe;
+      if (is_probe) {
+        EXPECT_EQ(move.action, wanted);
+      }
+      if (!is_probe || !is_refused) before = move.action;
+    }
+    EXPECT_EQ(num_probes, 1);
+  }
+}
+
+TEST(ControllerTest, AProbeBeyondTheLimitsIsNotMade) {
+  Bench bench;
+  bench.start();
+  bench.health = health_of(1, 2, 3, schema_edge_t::EDGE_PROVISIONAL);
+  bench.health->probe_sample = 1;
+  set_array(bench.health->num_probe, bench.health->probe_action, {95.0, 0.1, 1.0});
+  bench.repeat();
+  bench.give(position_target(0, kFar));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+  EXPECT_EQ(bench.status.num_probes, 0);
+}
+
+TEST(ControllerTest, WithAnInvalidEdgeItMovesALittleAndLendsTheArmOnlyWhereThatDoesNotMendIt) {
+  for (const bool is_mended : {true, false}) {
+    ControllerConfig config = test_config();
+    config.max_searches = 6;
+    Bench bench(config);
+    bench.start();
+    bench.give(position_target(0, kFar));
+    ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 1; }));
+    bench.health = health_of(1, 2, 3, schema_edge_t::EDGE_INVALID);
+    bench.repeat();
+    ASSERT_TRUE(bench.run_until([&] { return bench.status.num_probes >= 1; }));
+    const std::vector<double> centre = bench.moves[0].action;
+    ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 5; }));
+    if (is_mended) bench.health = health_of(1, 2, 3, schema_edge_t::EDGE_OK);
+    bench.repeat();
+    ASSERT_TRUE(bench.run_until_state(is_mended ? S::CONTROL_REACHED : S::CONTROL_LENT))
+        << bench.status.why;
+    EXPECT_LE(bench.status.num_probes, 6);
+    EXPECT_GE(bench.status.num_probes, is_mended ? 4 : 6);
+    for (std::size_t n = 1; n < 5; ++n) {
+      EXPECT_EQ(bench.moves[n].purpose, action_command_t::PURPOSE_PROBE);
+      for (std::size_t i = 0; i < 3; ++i) {
+        const Signal& signal = config.signals[i];
+        EXPECT_LE(std::abs(bench.moves[n].action[i] - centre[i]),
+                  0.1001 * (signal.upper - signal.lower));
+      }
+    }
+    EXPECT_NE(bench.moves[1].action, bench.moves[2].action);
+  }
+}
+
+TEST(ControllerTest, AnArmThatIsLentInVainEndsTheTarget) {
+  Bench bench;
+  bench.schema.edges[1].state = EdgeState::kInvalid;
+  bench.start();
+  bench.give(position_target(0, kFar));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_LENT));
+  // As long as there are new samples it may still be mended.
+  for (int i = 0; i < 3; ++i) {
+    bench.run(40);
+    bench.settle("motor_babbler", 1, i, {10.0 * i, 0.1 * i, 1.0 * i});
+  }
+  bench.run(25);
+  const std::int64_t newest = bench.num_samples - 1;
+  bench.num_samples = newest;
+  bench.show_sample();  // the same again
+  bench.run(24);
+  EXPECT_EQ(bench.status.control_state, S::CONTROL_LENT);
+  bench.run(2);
+  EXPECT_EQ(bench.status.control_state, S::CONTROL_REFUSED);
+  EXPECT_TRUE(bench.has_why("edge 2–3 is invalid")) << bench.status.why;
+  EXPECT_TRUE(bench.has_why("does the babbler run")) << bench.status.why;
+  EXPECT_TRUE(bench.moves.empty());
+}
+
+TEST(ControllerTest, AnInvalidEdgeBesideTheWayDoesNotMatter) {
+  Bench bench;
+  bench.schema.edges[2].state = EdgeState::kInvalid;
+  bench.start();
+  Target target = position_target(
+      0, {0.7 * std::cos(0.4) + 1 * std::cos(0.1), 0.7 * std::sin(0.4) + 1 * std::sin(0.1), 0});
+  target.target_part = 3;
+  bench.give(target);
+  EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+}
+
+TEST(ControllerTest, WithADoubtfulEdgeItGoesInSmallSteps) {
+  for (const auto state : {EdgeState::kSuspect, EdgeState::kProvisional}) {
+    Bench bench;
+    bench.schema.edges[0].state = state;
+    bench.start();
+    bench.give(position_target(0, kFar));
+    std::vector<double> before = bench.arm;
+    ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED));
+    for (const action_command_t& move : bench.moves) {
+      for (std::size_t i = 0; i < 3; ++i) {
+        const Signal& signal = bench.config_.signals[i];
+        EXPECT_LE(std::abs(move.action[i] - before[i]), 0.0501 * (signal.upper - signal.lower));
+      }
+      before = move.action;
+    }
+  }
+}
+
+TEST(ControllerTest, ANewSchemaInTheMiddleIsPlannedWithAnew) {
+  Bench bench;
+  bench.start();
+  bench.give(position_target(0, kFar));
+  ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 1; }));
+  bench.schema.version = 2;
+  bench.schema.edges[2].right.translation().x() = 0.5;  // a longer tool
+  bench.hidden = {4};
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED));
+  EXPECT_EQ(bench.status.schema_version, 2);
+  const auto X_RB = bench.schema.predict(1, 4, Eigen::Vector3d(bench.arm.data()));
+  EXPECT_LT((X_RB->X_AB.translation() - kFar).norm(), 1e-4);
+  EXPECT_EQ(bench.status.observed_error_m, -1);
+  EXPECT_TRUE(bench.has_why("not seen")) << bench.status.why;
+}
+
+TEST(ControllerTest, APartThatIsLostInTheMiddleEndsTheTarget) {
+  Bench bench;
+  bench.start();
+  bench.give(position_target(0, kFar));
+  ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 1; }));
+  bench.schema.version = 2;
+  bench.schema.edges.pop_back();
+  UnconnectedPart lost;
+  lost.part = 4;
+  bench.schema.unconnected.push_back(lost);
+  bench.repeat();
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REFUSED));
+  EXPECT_LE(bench.moves.size(), 2U);
+  EXPECT_EQ(bench.status.owns_arm, 0);
+  EXPECT_TRUE(bench.has_why("not connected")) << bench.status.why;
+}
+
+TEST(ControllerTest, AnOlderSchemaCountsOnlyAfterTheNewerFellSilent) {
+  Bench bench;
+  bench.schema = planar(7);
+  bench.start();
+  bench.schema = planar(2);
+  bench.run(2);
+  EXPECT_EQ(bench.controller.status().schema_version, 7);
+  bench.run(5);
+  EXPECT_EQ(bench.controller.status().schema_version, 2);
+}
+
+// ---- what is seen at the end
+
+TEST(ControllerTest, WhatIsSeenAtTheEndCorrectsOnce) {
+  Bench bench;
+  bench.bend_m = Eigen::Vector3d(0.01, -0.005, 0);
+  bench.start();
+  bench.give(position_target(0, kNear));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED));
+  EXPECT_LT(bench.status.observed_error_m, 0.001);
+  EXPECT_NEAR(bench.status.predicted_error_m, bench.bend_m.norm(), 0.001);
+  EXPECT_TRUE(bench.has_why("seen there")) << bench.status.why;
+}
+
+TEST(ControllerTest, WhatIsSeenUnsurelyCorrectsNothing) {
+  for (const bool is_ambiguous : {false, true}) {
+    Bench bench;
+    bench.bend_m = Eigen::Vector3d(0.01, -0.005, 0);
+    bench.is_ambiguous = is_ambiguous;
+    if (!is_ambiguous) bench.observation_sd_m = 0.01;
+    bench.start();
+    bench.give(position_target(0, kNear));
+    ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED));
+    EXPECT_NEAR(bench.status.observed_error_m, bench.bend_m.norm(), 1e-3);
+    EXPECT_LT(bench.status.predicted_error_m, 1e-4);
+  }
+}
+
+TEST(ControllerTest, ASystematicErrorNeitherMovesTheCameraNorCorrects) {
+  ControllerConfig config = test_config();
+  config.measurement.systematic = {0.02, 2 * kDegree};
+  Bench bench(config);
+  bench.X_CC_moved.translation() = Eigen::Vector3d(0.02, 0, 0);
+  bench.bend_m = Eigen::Vector3d(0.01, -0.005, 0);
+  bench.start();
+  bench.give(position_target(0, kNear));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED));
+  const Eigen::Vector3d seen_off = bench.X_CC_moved.translation() + bench.bend_m;
+  EXPECT_NEAR(bench.status.observed_error_m, seen_off.norm(), 1e-3);
+  EXPECT_LT(bench.status.predicted_error_m, 1e-4);
+}
+
+TEST(ControllerTest, ACameraThatWasMovedIsSeenByTheRoot) {
+  Bench bench;
+  bench.X_CC_moved.translation() = Eigen::Vector3d(0.2, 0, 0.1);
+  bench.start();
+  bench.give(position_target(0, kNear));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED));
+  EXPECT_LT(bench.status.observed_error_m, 1e-4);
+}
+
+TEST(ControllerTest, ATagThatMovedOnItsPartNeitherJudgesNorCorrects) {
+  constexpr int kTag = 41;
+  for (const bool has_moved : {false, true}) {
+    Bench bench;
+    bench.bend_m = Eigen::Vector3d(0.01, -0.005, 0);
+    bench.tag = kTag;
+    if (has_moved) bench.schema.moved_tags = {{.tag = kTag, .found = 0, .since = 0, .until = -1}};
+    bench.start();
+    bench.give(position_target(0, kNear));
+    ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED));
+    EXPECT_EQ(bench.status.observed_error_m < 0, has_moved);
+    EXPECT_EQ(bench.status.predicted_error_m < 1e-4, has_moved);
+    EXPECT_EQ(bench.has_why("not seen there"), has_moved) << bench.status.why;
+  }
+}
+
+TEST(ControllerTest, WhatIsSeenTooFarOffIsToldButNotBelieved) {
+  Bench bench;
+  bench.bend_m = Eigen::Vector3d(0.3, 0, 0);
+  bench.start();
+  bench.give(position_target(0, kNear));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED));
+  EXPECT_NEAR(bench.status.observed_error_m, 0.3, 1e-4);
+  EXPECT_LT(bench.status.predicted_error_m, 1e-4);
+  EXPECT_TRUE(bench.has_why("300.0 mm away")) << bench.status.why;
+}
+
+}  // namespace
+}  // namespace bodyschema::test
