@@ -312,7 +312,7 @@ Eigen::Matrix<double, 2, 3> plane_of(const std::vector<Eigen::Vector3d>& points)
 
 /// Where the first arm's end effector came in both passes; the errors of all arms.
 Plot plot_of(const std::vector<Case>& cases, const std::vector<Result>& results) {
-  Plot plot{.width_px = 1300, .height_px = 560};
+  Plot plot{.width_px = 1300, .height_px = 640};
   Rng rng(1);
   std::vector<Eigen::Vector3d> path = arms_of(rng).path;
   path.push_back(path.front());

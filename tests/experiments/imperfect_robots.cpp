@@ -3,7 +3,7 @@
 // ones that are called complete; prints Markdown.
 //
 //   imperfect_robots [--robots 12] [--samples 20 50 100] [--told 1 | --estimate-noise]
-//     [--outlier-rate 0.03] [--cell WORDS...]
+//     [--outlier-rate 0.03] [--cell WORDS...] [--stream 100] [--ends]
 
 #include <CLI/CLI.hpp>
 #include <algorithm>
@@ -48,6 +48,14 @@ void list_edges(int seed, const BodySchema& schema, const ImperfectRobot& robot)
   std::fprintf(stderr, "\n");
 }
 
+void leave_ends(SyntheticRobot* robot, std::vector<ActionPoseSample>* samples) {
+  const int last = robot->links.back().part;
+  const auto is_end = [&](int part) { return part == 1 || part == last; };
+  for (TrueLink& link : robot->links) link.hidden = !is_end(link.part);
+  for (ActionPoseSample& sample : *samples)
+    std::erase_if(sample.parts, [&](const PartObservation& o) { return !is_end(o.part); });
+}
+
 }  // namespace
 
 int main(int argc, char** argv) {
@@ -55,7 +63,8 @@ int main(int argc, char** argv) {
   std::vector<int> nums_samples = {20, 50, 100};
   bool is_noise_estimated = false;
   double told = 1;
-  bool are_wrong_listed = false;
+  bool are_wrong_listed = false, are_ends_alone = false;
+  double period = 0;
   double outlier_rate = MeasurementModel().outlier_rate;
   std::vector<std::string> cells;
   CLI::App app("Robots that are not as our models are");
@@ -64,6 +73,8 @@ int main(int argc, char** argv) {
   app.add_option("--told", told, "Times the true noise, 3 mm and 1°")->check(CLI::PositiveNumber);
   app.add_option("--outlier-rate", outlier_rate, "Told, of a marker")->check(CLI::Range(0.0, 0.5));
   app.add_flag("--estimate-noise", is_noise_estimated, "Its 3 mm and 1° are not told");
+  app.add_option("--stream", period, "Smooth motion: samples of a swing; 0: random poses");
+  app.add_flag("--ends", are_ends_alone, "Chains, of which the root and the last part are seen");
   app.add_flag("--list-wrong", are_wrong_listed, "Their edges, on stderr");
   app.add_option("--cell", cells, "Rows whose name has one of these words alone");
   CLI11_PARSE(app, argc, argv);
@@ -82,14 +93,18 @@ int main(int argc, char** argv) {
     for (const int num_samples : nums_samples) {
       int num_right = 0, num_incomplete = 0, num_wrong = 0, num_complete = 0;
       for (int r = 0; r < num_robots; ++r) {
-        ImperfectRobot robot(2 + r % 6, r / 6 % 2 == 0, imperfection,
+        ImperfectRobot robot(2 + r % 6, are_ends_alone || r / 6 % 2 == 0, imperfection,
                              static_cast<std::uint64_t>(r));
+        std::vector<ActionPoseSample> samples =
+            period > 0 ? robot.wander(num_samples, period) : robot.babble(num_samples);
+        SyntheticRobot truth = robot.structure();
+        if (are_ends_alone) leave_ends(&truth, &samples);
         LearnOptions options;
         options.root = 1;
         options.measurement.outlier_rate = outlier_rate;
         if (!is_noise_estimated) options.measurement.noise = Noise{told * 0.003, told * kDegree};
-        const BodySchema schema = learn(robot.signals(), robot.babble(num_samples), options).schema;
-        const Rightness rightness = judge(schema, robot.structure());
+        const BodySchema schema = learn(robot.signals(), samples, options).schema;
+        const Rightness rightness = judge(schema, truth);
         num_right += rightness == Rightness::kRight;
         num_incomplete += rightness == Rightness::kIncomplete;
         num_wrong += rightness == Rightness::kWrong;

@@ -241,6 +241,32 @@ ActionPoseSample ImperfectRobot::go(const Eigen::VectorXd& action) {
   return sample;
 }
 
+std::vector<ActionPoseSample> ImperfectRobot::wander(int num_samples, double period) {
+  // Three sines a signal, of half to twice the period.
+  constexpr int kSines = 3;
+  const auto num_signals = static_cast<Eigen::Index>(signals().size());
+  Eigen::MatrixXd rate(num_signals, kSines), phase(num_signals, kSines), share(num_signals, kSines);
+  for (Eigen::Index s = 0; s < num_signals; ++s)
+    for (int k = 0; k < kSines; ++k) {
+      rate(s, k) = 2 * M_PI / period * std::exp2(uniform(rng_, -1, 1));
+      phase(s, k) = uniform(rng_, 0, 2 * M_PI);
+      share(s, k) = uniform(rng_, 0.5, 1);
+    }
+  std::vector<ActionPoseSample> samples;
+  for (int n = 0; n < num_samples; ++n) {
+    Eigen::VectorXd action(num_signals);
+    for (Eigen::Index s = 0; s < num_signals; ++s) {
+      const Signal& signal = signals()[static_cast<std::size_t>(s)];
+      double swing = 0;
+      for (int k = 0; k < kSines; ++k)
+        swing += share(s, k) / share.row(s).sum() * std::sin(rate(s, k) * n + phase(s, k));
+      action[s] = 0.5 * (signal.lower + signal.upper) + 0.5 * swing * (signal.upper - signal.lower);
+    }
+    samples.push_back(go(action));
+  }
+  return samples;
+}
+
 std::vector<ActionPoseSample> ImperfectRobot::babble(int num_samples) {
   std::vector<ActionPoseSample> samples;
   for (int n = 0; n < num_samples; ++n) samples.push_back(go(random_action()));

@@ -50,6 +50,8 @@ class ImperfectRobot {
   /// Carries out an action and returns its observation.
   ActionPoseSample go(const Eigen::VectorXd& action);
   std::vector<ActionPoseSample> babble(int num_samples);
+  /// A recording of smooth motion: every joint swings to and fro in about `period` samples.
+  std::vector<ActionPoseSample> wander(int num_samples, double period);
   /// The link of a part bends, behind its joint: by so much in a random direction each.
   void bend(int part, double position_m, double rotation_rad);
   /// Pose of part n + 1 at the last action, in the camera's frame.
