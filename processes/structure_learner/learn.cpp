@@ -307,17 +307,15 @@ LearnedStructure find_with_bias(const std::vector<Signal>& signals,
   search_options.unknown_bias = unknown_bias;
   MeasurementModel& measurement = search_options.measurement;
   NoiseSource noise_source = NoiseSource::kCovariances;
-  bool is_systematic = false;
   const auto set_noise = [&](const std::vector<ActionPoseSample>& of) {
     if (!options.measurement.noise && has_covariances(of)) return;
     const SourcedNoise noise = marker_noise(of, num_signals, options);
     measurement.noise = noise;
     noise_source = noise.source;
-    is_systematic = noise.is_systematic;
   };
   set_noise(samples);
   // What many joints leave by that much is no noise either.
-  if (is_systematic || is_guess_too_large(measurement, noise_source))
+  if (is_guess_too_large(measurement, noise_source))
     search_options.max_signals = std::min(search_options.max_signals, kMaxScreenedJoints);
   NormalizedActions actions(samples, num_signals);
   SearchResult search = search_structure(samples, actions, parts, search_options);
@@ -415,8 +413,8 @@ bool tells_noise(const LearnedStructure& structure) {
   });
 }
 
-// Poses at rest whose parts no screws connect with the noise that is told, nor with multiples of
-// it, or not surely: the noise that the markers themselves show, where that refutes the told one.
+// Where no screws connect the parts with the noise that is told, nor with multiples of it, or not
+// surely: the noise that the markers themselves show, where that refutes the told one.
 std::optional<Noise> noise_instead(const LearnedStructure& by_told,
                                    const std::vector<ActionPoseSample>& samples,
                                    const LearnOptions& options) {
@@ -425,11 +423,13 @@ std::optional<Noise> noise_instead(const LearnedStructure& by_told,
   const bool is_refuted = by_told.noise_source == NoiseSource::kGiven && search.residual_scale > 1;
   const bool stands = by_told.spans() && !by_told.is_contested && search.redundant.empty() &&
                       search.couplings.empty() && !has_soft_edge(search) && !is_refuted;
-  if (!told || stands || by_told.actions.blocks().is_stream() || !tells_noise(by_told))
-    return std::nullopt;
-  // Longer chains would be searched in vain where bodies are soft.
-  const auto shown = estimate_noise(samples, static_cast<int>(by_told.signals.size()),
-                                    std::min(options.max_signals, kMaxScreenedJoints));
+  if (!told || stands || !tells_noise(by_told)) return std::nullopt;
+  // The order of longer chains would be searched for in vain where bodies are soft; of a stream
+  // none is.
+  const int max_signals = by_told.actions.blocks().is_stream()
+                              ? options.max_signals
+                              : std::min(options.max_signals, kMaxScreenedJoints);
+  const auto shown = estimate_noise(samples, static_cast<int>(by_told.signals.size()), max_signals);
   if (!shown || shown->source != NoiseSource::kResiduals || is_above_any_marker(*shown) ||
       (shown->position_m < kRefutes * told->position_m &&
        shown->rotation_rad < kRefutes * told->rotation_rad))

@@ -37,9 +37,6 @@ enum class NoiseSource {
 
 struct SourcedNoise : Noise {
   NoiseSource source = NoiseSource::kAssumed;
-  /// Of a stream: much larger than what jumps from frame to frame. A stiff arm of many joints would
-  /// leave less; a soft one moves like such an arm, roughly.
-  bool is_systematic = false;
 };
 
 /// Samples of one action each, up to a millionth of the ranges, in the order of the actions. None
@@ -59,7 +56,8 @@ std::vector<std::vector<int>> repeats(const NormalizedActions& actions);
 /// too large: too small a noise rejects true models, too large a noise by that factor costs nearly
 /// nothing. Never below kNoiseFloor or above kNoiseCeiling. Of a stream, the jitter from frame to
 /// frame is a lower bound and no more, unless no model explains its motion: then it is not taken
-/// for noise. std::nullopt: too few data.
+/// for noise. Parts whose pose never changes a bit define the frame of the others and say nothing.
+/// std::nullopt: too few data.
 std::optional<SourcedNoise> estimate_noise(const std::vector<ActionPoseSample>& samples,
                                            int num_signals, int max_signals = kMaxChainJoints);
 

@@ -48,14 +48,6 @@ void list_edges(int seed, const BodySchema& schema, const ImperfectRobot& robot)
   std::fprintf(stderr, "\n");
 }
 
-void leave_ends(SyntheticRobot* robot, std::vector<ActionPoseSample>* samples) {
-  const int last = robot->links.back().part;
-  const auto is_end = [&](int part) { return part == 1 || part == last; };
-  for (TrueLink& link : robot->links) link.hidden = !is_end(link.part);
-  for (ActionPoseSample& sample : *samples)
-    std::erase_if(sample.parts, [&](const PartObservation& o) { return !is_end(o.part); });
-}
-
 }  // namespace
 
 int main(int argc, char** argv) {
@@ -98,7 +90,7 @@ int main(int argc, char** argv) {
         std::vector<ActionPoseSample> samples =
             period > 0 ? robot.wander(num_samples, period) : robot.babble(num_samples);
         SyntheticRobot truth = robot.structure();
-        if (are_ends_alone) leave_ends(&truth, &samples);
+        if (are_ends_alone) hide_all_but_ends(&truth, &samples);
         LearnOptions options;
         options.root = 1;
         options.measurement.outlier_rate = outlier_rate;

@@ -363,6 +363,14 @@ bool is_right(const BodySchema& schema, const SyntheticRobot& truth) {
   return judge(schema, truth) == Rightness::kRight;
 }
 
+void hide_all_but_ends(SyntheticRobot* robot, std::vector<ActionPoseSample>* samples) {
+  const int first = robot->links.front().part, last = robot->links.back().part;
+  const auto is_end = [&](int part) { return part == first || part == last; };
+  for (TrueLink& link : robot->links) link.hidden = !is_end(link.part);
+  for (ActionPoseSample& sample : *samples)
+    std::erase_if(sample.parts, [&](const PartObservation& o) { return !is_end(o.part); });
+}
+
 void write_csv(const std::vector<ActionPoseSample>& samples, std::ostream& out) {
   out << "t";
   if (!samples.empty())

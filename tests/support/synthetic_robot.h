@@ -140,6 +140,9 @@ SyntheticRobot random_tree(const RandomTreeOptions& options, Rng& rng);
 Rightness judge(const BodySchema& schema, const SyntheticRobot& truth);
 bool is_right(const BodySchema& schema, const SyntheticRobot& truth);
 
+/// Of a chain: from now on all parts between the root and the last one are hidden.
+void hide_all_but_ends(SyntheticRobot* robot, std::vector<ActionPoseSample>* samples);
+
 /// Columns t, q1..qm, part, x, y, z, qw, qx, qy, qz; metres, unit quaternions, which are empty
 /// where positions alone are known.
 void write_csv(const std::vector<ActionPoseSample>& samples, std::ostream& out);

@@ -263,5 +263,28 @@ TEST(SerialCorrelation, WhatLastsAsLongAsTheNoiseIsExplainedByItTheMost) {
   EXPECT_LT(variance_inflation(slow, samples, 0.5), variance_inflation(slow, samples, 0.9));
 }
 
+// A chain of which the ends alone are seen, in smooth motion.
+Rightness learned_from_ends(int num_joints, const Imperfection& imperfection, std::uint64_t seed,
+                            std::optional<Noise> told) {
+  ImperfectRobot robot(num_joints, true, imperfection, seed);
+  auto samples = robot.wander(2000, 100);
+  test::SyntheticRobot truth = robot.structure();
+  hide_all_but_ends(&truth, &samples);
+  return judge(learn(robot.signals(), samples, options_of(told)).schema, truth);
+}
+
+TEST(Streams, NoiseThatLastsMakesNoArmSoft) {
+  const Imperfection lasting{.name = "lasting", .correlation = 0.9};
+  for (const int num_joints : {3, 5, 7})
+    EXPECT_EQ(learned_from_ends(num_joints, lasting, 1, std::nullopt), Rightness::kRight)
+        << num_joints;
+}
+
+TEST(Streams, PlayBeyondTheNoiseThatIsToldMakesNoArmSoft) {
+  const Imperfection play{.name = "play", .backlash_deg = 3};
+  for (const int num_joints : {4, 6})
+    EXPECT_EQ(learned_from_ends(num_joints, play, 2, kTold), Rightness::kRight) << num_joints;
+}
+
 }  // namespace
 }  // namespace bodyschema

@@ -44,6 +44,34 @@ TEST(NoiseEstimate, RepeatsAtOnePoseDecideWhereThereAreAny) {
   EXPECT_NEAR(noise->rotation_rad, 1.2 * kDegree, 0.005);
 }
 
+// As trackers tell poses: in the frame of one body, whose own is always the identity.
+void give_in_frame_of_first(std::vector<ActionPoseSample>* samples) {
+  for (ActionPoseSample& sample : *samples) {
+    const Pose X_1C = sample.parts.front().X_CB.inverse();
+    for (PartObservation& o : sample.parts) o.X_CB = X_1C * o.X_CB;
+    sample.parts.front().X_CB = Pose::Identity();
+  }
+}
+
+TEST(NoiseEstimate, APartThatDefinesTheFrameHasNoNoiseToTell) {
+  Rng rng(2);
+  const auto robot = test::chapter_robot("a", rng);
+  auto samples = test::babble(robot, 10, {Regime::kTagIso}, rng);
+  const Eigen::VectorXd action = robot.random_action(rng);
+  for (int n = 0; n < 10; ++n)
+    samples.push_back(test::observe(robot, action, {Regime::kTagIso}, 10 + n, rng));
+  for (ActionPoseSample& sample : samples)
+    std::erase_if(sample.parts, [&](const PartObservation& o) {
+      return o.part != sample.parts.front().part && o.part != sample.parts.back().part;
+    });
+  give_in_frame_of_first(&samples);
+  const auto noise = estimate_noise(samples, 2);
+  ASSERT_TRUE(noise);
+  EXPECT_EQ(noise->source, NoiseSource::kRepeats);
+  EXPECT_GT(noise->rotation_rad, 1.2 * kDegree);  // that of two markers
+  EXPECT_LT(noise->rotation_rad, 2.5 * kDegree);
+}
+
 TEST(NoiseEstimate, OfExactDataIsTheFloor) {
   Rng rng(3);
   const auto robot = test::chapter_robot("co", rng);
@@ -87,7 +115,6 @@ TEST(NoiseEstimate, OfAStreamTheJitterIsALowerBoundAndNoMore) {
       estimate_noise(door_in_a_stream([](double s) { return 0.7 * std::sin(0.7 * s); }), 1);
   ASSERT_TRUE(noise);
   EXPECT_EQ(noise->source, NoiseSource::kResiduals);
-  EXPECT_TRUE(noise->is_systematic);
   EXPECT_GT(noise->position_m, 0.7e-3);
   EXPECT_LT(noise->position_m, 3e-3);
   EXPECT_GT(noise->rotation_rad, 0.15 * kDegree);
@@ -101,6 +128,16 @@ TEST(NoiseEstimate, OfAStreamMotionThatNoModelExplainsIsNoNoise) {
   EXPECT_EQ(noise->source, NoiseSource::kFrames);
   EXPECT_LT(noise->position_m, 0.6e-3);
   EXPECT_LT(noise->rotation_rad, 0.2 * kDegree);
+}
+
+TEST(NoiseEstimate, OfAStreamThePartThatDefinesTheFrameHasNoJitter) {
+  auto samples = door_in_a_stream([](double s) { return 0.5 * std::sin(1.9 * s); });
+  give_in_frame_of_first(&samples);
+  const auto noise = estimate_noise(samples, 1);
+  ASSERT_TRUE(noise);
+  EXPECT_EQ(noise->source, NoiseSource::kFrames);
+  EXPECT_GT(noise->position_m, 0.3e-3);  // 4 × that of white noise
+  EXPECT_LT(noise->position_m, 2e-3);
 }
 
 TEST(NoiseEstimate, NeedsTwoParts) { EXPECT_FALSE(estimate_noise({}, 2)); }
