@@ -10,7 +10,6 @@
 #include "common/bus/channels.h"
 #include "common/bus/convert.h"
 #include "common/bus/event_log.h"
-#include "common/config/calibration_id.h"
 #include "processes/console/commands/commands.h"
 #include "processes/console/commands/files.h"
 #include "processes/console/commands/urdf_files.h"
@@ -18,6 +17,7 @@
 #include "processes/console/rig_check.h"
 #include "processes/console/views/refinement_view.h"
 #include "processes/refiner/proposed_files.h"
+#include "processes/refiner/refiner_settings.h"
 
 namespace bodyschema {
 namespace {
@@ -97,17 +97,17 @@ void run_refine(const RefineArguments& arguments) {
   const BodySchema schema = load_schema(arguments.schema);
   const Recording recording = load_for(arguments.samples, schema);
   RefineOptions options;
-  options.placements = arguments.placements;
-  options.intrinsics = arguments.intrinsics;
   std::optional<RigCalibration> rig;
   const std::filesystem::path folder = rig_folder(arguments, recording.is_log);
   if (!folder.empty()) {
-    rig = load_calibration(folder);
-    const RigNoise noise = load_noise(folder);
-    options.corner_noise = {noise.corner_noise_px, noise.small_tag_noise_px};
-    if (std::filesystem::exists(folder / "refiner.yaml"))
-      options.config = RefinerConfig::load(folder / "refiner.yaml");
+    const std::filesystem::path file = folder / "refiner.yaml";
+    const RefinerSettings settings = RefinerSettings::load(
+        folder, std::filesystem::exists(file) ? RefinerConfig::load(file) : RefinerConfig());
+    options = settings.options;
+    rig = settings.rig;
   }
+  options.placements = arguments.placements;
+  options.intrinsics = arguments.intrinsics;
   options.measurement = measurement_of(arguments, recording, schema);
   check_outs(
       {{"--out", arguments.out}, {"--urdf", arguments.urdf}, {"--placement", arguments.placement}},
