@@ -16,8 +16,8 @@ namespace bodyschema {
 /// rotation [rad]), right perturbation; that of a scalar is itself.
 struct ParameterBlock {
   /// kInstant: of one sample, the root's pose if it moves, and how far each joint is from its
-  /// command.
-  enum class Kind { kInstant, kRoot, kEdge, kTag, kLens };
+  /// command. kElasticity: a compliance of each joint, in the order of the edges.
+  enum class Kind { kInstant, kRoot, kEdge, kElasticity, kTag, kLens };
   static constexpr int kPoseSize = 16;
 
   Kind kind = Kind::kRoot;

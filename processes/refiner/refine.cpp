@@ -11,6 +11,7 @@
 #include "common/estimation/chi_square.h"
 #include "common/estimation/quantile.h"
 #include "processes/refiner/calibrated_lens.h"
+#include "processes/refiner/elasticity.h"
 #include "processes/refiner/held_out.h"
 #include "processes/refiner/information.h"
 #include "processes/refiner/refined_schema.h"
@@ -117,8 +118,7 @@ std::vector<JointPlay> plays_of(const BodySchema& schema, const RefinementProble
     const ScrewJoint& joint = edge->joints[d];
     const double sd = std::abs(joint.gain) * problem.play_sd()(static_cast<Eigen::Index>(n));
     result.push_back(
-        {fmt::format("{} ({}→{})", schema.signals.at(joint.signal).name, edge->from, edge->to),
-         sd * std::abs(joint.slide), sd * std::abs(joint.turn)});
+        {joint_name(schema, *edge, joint), sd * std::abs(joint.slide), sd * std::abs(joint.turn)});
   }
   return result;
 }
@@ -184,7 +184,9 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   result.coverage = coverage_of(schema, training);
   result.held = held_things(schema, options, result.used_corners);
 
-  RefinementProblem problem(schema, training, used_rig, options, result.root_moves);
+  RefineOptions stiff = options;
+  stiff.joint_loads = nullptr;
+  RefinementProblem problem(schema, training, used_rig, stiff, result.root_moves);
   for (const int part : problem.unseen_parts())
     result.held.push_back(fmt::format("the frame of part {}: it was never seen", part));
   problem.solve();
@@ -205,6 +207,10 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   result.wanted_actions =
       wanted_actions(result.schema, result.used_corners ? std::optional(result.rig) : std::nullopt,
                      training, problem, information);
+  if (options.joint_loads && !result.used_corners)
+    result.elasticity = fit_elasticity(result.schema, training, held_out, options, problem);
+  if (options.joint_loads && !result.elasticity)
+    result.held.emplace_back("compliances of joints: no load of them changes");
   const bool judges_corners = rig && has_corners(held_out);
   result.before =
       held_out_errors(schema, held_out, judges_corners ? rig : std::nullopt, options.corner_noise);

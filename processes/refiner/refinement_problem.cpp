@@ -40,6 +40,7 @@ RefinementProblem::RefinementProblem(const BodySchema& schema,
       problem_(problem_options()) {
   add_paths();
   add_plays();
+  add_elasticity(samples);
   add_instants(samples);
   if (rig_) {
     add_tags();
@@ -117,6 +118,28 @@ void RefinementProblem::add_plays() {
     }
   }
   play_sd_ = play_start_ = Eigen::Map<const Eigen::VectorXd>(sd.data(), std::ssize(sd));
+}
+
+void RefinementProblem::add_elasticity(const std::vector<RefinerSample>& samples) {
+  if (rig_ || !options_.joint_loads) return;
+  ParameterBlock block;
+  block.kind = ParameterBlock::Kind::kElasticity;
+  for (const Edge& edge : schema_.edges) {
+    first_play_[&edge] = static_cast<int>(block.values.size());
+    for (std::size_t d = 0; d < edge.joints.size(); ++d) block.add(0.0);
+  }
+  Eigen::VectorXd least = options_.joint_loads(samples.front().sample.action), most = least;
+  for (const RefinerSample& seen : samples) {
+    const Eigen::VectorXd loads = options_.joint_loads(seen.sample.action);
+    least = least.cwiseMin(loads);
+    most = most.cwiseMax(loads);
+  }
+  // What a constant load does is an offset.
+  constexpr double kLeastShare = 1e-6;
+  const double largest = std::max(most.maxCoeff(), -least.minCoeff());
+  for (int n = 0; n < static_cast<int>(least.size()); ++n)
+    if (most(n) - least(n) > kLeastShare * largest) block.free.push_back(n);
+  if (!block.free.empty()) elasticity_ = &storage_.emplace_back(std::move(block));
 }
 
 // Of a root that moves: where its parts say that it was.
@@ -233,15 +256,17 @@ std::optional<RefinementProblem::Cost> RefinementProblem::cost_of(
   const int part = observation.part;
   if (!is_usable(part, sample_index)) return std::nullopt;
   std::vector<ParameterBlock*> blocks = chain_blocks(part, sample_index);
+  if (elasticity_) blocks.push_back(elasticity_);
   const std::vector<const ParameterBlock*> constant(blocks.begin(), blocks.end());
-  PartChain chain(paths_.at(part), schema_.displacements(action));
+  PartChain chain(paths_.at(part), schema_.displacements(action), first_play_);
+  const Eigen::VectorXd loads = elasticity_ ? options_.joint_loads(action) : Eigen::VectorXd();
   std::unique_ptr<ceres::CostFunction> cost;
   if (observation.has_rotation && schema_.has_rotation(part))
     cost = std::make_unique<PoseResidual>(std::move(chain), constant, observation,
-                                          options_.measurement, scale_);
+                                          options_.measurement, scale_, loads);
   else
     cost = std::make_unique<PositionResidual>(std::move(chain), constant, observation,
-                                              options_.measurement, scale_);
+                                              options_.measurement, scale_, loads);
   return Cost{std::move(cost), std::move(blocks), part};
 }
 
@@ -270,6 +295,7 @@ std::vector<ParameterBlock*> RefinementProblem::blocks() {
   add_all(instants_);
   if (root_ && used_.contains(root_)) result.push_back(root_);
   add_all(edges_);
+  if (elasticity_) result.push_back(elasticity_);
   add_all(tags_);
   if (lens_block_) result.push_back(lens_block_);
   return result;
@@ -337,6 +363,15 @@ std::vector<double> RefinementProblem::squared_distances() {
     result.push_back(sum);
   }
   return result;
+}
+
+double RefinementProblem::log_likelihood() {
+  const std::vector<double> d2 = squared_distances();
+  double sum = 0;
+  for (std::size_t n = 0; n < d2.size(); ++n)
+    sum -= robust_cost(d2[n], data_[n].num_residuals) +
+           data_[n].num_residuals * std::log(scale_.value);
+  return sum;
 }
 
 // Maximum likelihood of the scale given the residuals, by the fixed point of its own weights.

@@ -82,6 +82,10 @@ class RefinementProblem {
   const std::vector<int>& unseen_parts() const { return unseen_parts_; }
   /// As if every joint had gone where it was told.
   void leave_out_play();
+  /// Of the data now, given the scale; up to a constant.
+  double log_likelihood();
+  /// The joints' compliances; null: they are stiff.
+  const ParameterBlock* elasticity() const { return elasticity_; }
   /// d² of each datum now.
   std::vector<double> squared_distances();
   /// Standard deviations of a block's whole tangent beforehand; empty: nothing is known.
@@ -101,6 +105,7 @@ class RefinementProblem {
  private:
   void add_paths();
   void add_plays();
+  void add_elasticity(const std::vector<RefinerSample>& samples);
   void add_instants(const std::vector<RefinerSample>& samples);
   void add_tags();
   void add_lens();
@@ -128,6 +133,7 @@ class RefinementProblem {
   std::map<const Edge*, int> first_play_;
   Eigen::VectorXd play_sd_, play_start_;
   std::map<int, ParameterBlock*> edges_, tags_;  // by index, by id
+  ParameterBlock* elasticity_ = nullptr;
   ParameterBlock* lens_block_ = nullptr;
   std::vector<double> memory_;
   std::map<const ParameterBlock*, std::size_t> memory_offsets_;

@@ -76,6 +76,8 @@ std::string RefinementWords::thing_of(const ParameterBlock& block) const {
       const Edge& edge = schema_.edges[block.id];
       return fmt::format("{}→{}", edge.from, edge.to);
     }
+    case Kind::kElasticity:
+      return "compliances";
     case Kind::kTag:
       return fmt::format("tag {}", block.id);
     case Kind::kLens:
@@ -109,6 +111,8 @@ std::string RefinementWords::name_of(const ParameterBlock& block, int direction)
       return fmt::format("{}, {}", thing_of(block), kPoseWords[direction]);
     case Kind::kEdge:
       return edge_name(block, direction);
+    case Kind::kElasticity:
+      break;
     case Kind::kTag:
       if (direction == 6) return fmt::format("size of tag {}", block.id);
       return fmt::format("placement of tag {}, {}", block.id, kPoseWords[direction]);
