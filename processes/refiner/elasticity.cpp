@@ -46,10 +46,10 @@ std::vector<JointCompliance> compliances(const BodySchema& schema,
                                          const std::vector<RefinerSample>& samples,
                                          const JointLoads& loads, const RefinementProblem& problem,
                                          const Information& information, double num_residuals) {
-  const ParameterBlock& block = *problem.elasticity();
+  const ParameterBlock& block = *problem.drive();
   const Eigen::VectorXd sd =
       information.cross_covariance(&block, &block).diagonal().cwiseMax(0).cwiseSqrt();
-  Eigen::VectorXd largest = Eigen::VectorXd::Zero(sd.size());
+  Eigen::VectorXd largest = loads(samples.front().sample.action).cwiseAbs();
   for (const RefinerSample& seen : samples)
     largest = largest.cwiseMax(loads(seen.sample.action).cwiseAbs());
   std::vector<JointCompliance> result;
@@ -81,14 +81,19 @@ std::optional<Elasticity> fit_elasticity(const BodySchema& schema,
                                          const std::vector<RefinerSample>& held_out,
                                          const RefineOptions& options, RefinementProblem& stiff) {
   RefinementProblem problem(schema, training, std::nullopt, options, stiff.root_moves());
-  if (!problem.elasticity()) return std::nullopt;
+  const auto num_joints = options.joint_loads(training.front().sample.action).size();
+  const ParameterBlock* drive = problem.drive();
+  const auto num_free = drive ? std::count_if(drive->free.begin(), drive->free.end(),
+                                              [&](int n) { return n < num_joints; })
+                              : 0;
+  if (num_free == 0) return std::nullopt;
   problem.solve();
   const double gain = problem.log_likelihood() - stiff.log_likelihood();
   double num_residuals = 0;
   for (const auto& datum : problem.data()) num_residuals += datum.num_residuals;
   const Information information(problem, options.measurement);
   Elasticity result;
-  result.evidence = gain - problem.elasticity()->num_free() * std::log(num_residuals) / 2;
+  result.evidence = gain - static_cast<double>(num_free) * std::log(num_residuals) / 2;
   result.schema = refined_schema(schema, training, problem, information);
   result.joints = compliances(result.schema, training, options.joint_loads, problem, information,
                               num_residuals);
@@ -102,9 +107,7 @@ std::optional<Elasticity> fit_elasticity(const BodySchema& schema,
     };
     return Elasticity::Errors{noise_scale, errors(training), errors(held_out)};
   };
-  const std::vector<double>& values = problem.elasticity()->values;
-  const Eigen::VectorXd found =
-      Eigen::Map<const Eigen::VectorXd>(values.data(), std::ssize(values));
+  const Eigen::VectorXd found = Eigen::Map<const Eigen::VectorXd>(drive->values.data(), num_joints);
   result.stiff = errors_of(schema, Eigen::VectorXd::Zero(found.size()), stiff.scale());
   result.elastic = errors_of(result.schema, found, problem.scale());
   return result;

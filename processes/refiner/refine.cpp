@@ -145,8 +145,9 @@ std::vector<std::string> held_things(const BodySchema& schema, const RefineOptio
   for (const Edge& edge : schema.edges)
     if (!PartChain::has_block(edge))
       result.push_back(fmt::format("{}→{}: its Gaussian process", edge.from, edge.to));
+  const bool holds_bends = has_corners || !result.empty();
   for (const Signal& signal : schema.signals)
-    if (!signal.warp.empty())
+    if (holds_bends && !signal.warp.empty())
       result.push_back(fmt::format("{}: the bend of its command", signal.name));
   if (has_corners && !options.placements)
     result.push_back("tags: as the rig's files say, within their priors");

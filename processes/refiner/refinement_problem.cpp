@@ -37,10 +37,11 @@ RefinementProblem::RefinementProblem(const BodySchema& schema,
       rig_(rig),
       options_(options),
       root_moves_(root_moves),
+      drive_model_(schema, options.joint_loads, samples),
       problem_(problem_options()) {
   add_paths();
   add_plays();
-  add_elasticity(samples);
+  add_drive();
   add_instants(samples);
   if (rig_) {
     add_tags();
@@ -120,26 +121,10 @@ void RefinementProblem::add_plays() {
   play_sd_ = play_start_ = Eigen::Map<const Eigen::VectorXd>(sd.data(), std::ssize(sd));
 }
 
-void RefinementProblem::add_elasticity(const std::vector<RefinerSample>& samples) {
-  if (rig_ || !options_.joint_loads) return;
-  ParameterBlock block;
-  block.kind = ParameterBlock::Kind::kElasticity;
-  for (const Edge& edge : schema_.edges) {
-    first_play_[&edge] = static_cast<int>(block.values.size());
-    for (std::size_t d = 0; d < edge.joints.size(); ++d) block.add(0.0);
-  }
-  Eigen::VectorXd least = options_.joint_loads(samples.front().sample.action), most = least;
-  for (const RefinerSample& seen : samples) {
-    const Eigen::VectorXd loads = options_.joint_loads(seen.sample.action);
-    least = least.cwiseMin(loads);
-    most = most.cwiseMax(loads);
-  }
-  // What a constant load does is an offset.
-  constexpr double kLeastShare = 1e-6;
-  const double largest = std::max(most.maxCoeff(), -least.minCoeff());
-  for (int n = 0; n < static_cast<int>(least.size()); ++n)
-    if (most(n) - least(n) > kLeastShare * largest) block.free.push_back(n);
-  if (!block.free.empty()) elasticity_ = &storage_.emplace_back(std::move(block));
+void RefinementProblem::add_drive() {
+  if (rig_) return;
+  ParameterBlock block = drive_model_.block();
+  if (!block.free.empty()) drive_ = &storage_.emplace_back(std::move(block));
 }
 
 // Of a root that moves: where its parts say that it was.
@@ -256,17 +241,19 @@ std::optional<RefinementProblem::Cost> RefinementProblem::cost_of(
   const int part = observation.part;
   if (!is_usable(part, sample_index)) return std::nullopt;
   std::vector<ParameterBlock*> blocks = chain_blocks(part, sample_index);
-  if (elasticity_) blocks.push_back(elasticity_);
+  if (drive_) blocks.push_back(drive_);
   const std::vector<const ParameterBlock*> constant(blocks.begin(), blocks.end());
-  PartChain chain(paths_.at(part), schema_.displacements(action), first_play_);
-  const Eigen::VectorXd loads = elasticity_ ? options_.joint_loads(action) : Eigen::VectorXd();
+  PartChain chain(paths_.at(part),
+                  drive_ ? drive_model_.displacements(action) : schema_.displacements(action),
+                  drive_model_.first_joints());
+  const Eigen::MatrixXd effects = drive_ ? drive_model_.effects(action) : Eigen::MatrixXd();
   std::unique_ptr<ceres::CostFunction> cost;
   if (observation.has_rotation && schema_.has_rotation(part))
     cost = std::make_unique<PoseResidual>(std::move(chain), constant, observation,
-                                          options_.measurement, scale_, loads);
+                                          options_.measurement, scale_, effects);
   else
     cost = std::make_unique<PositionResidual>(std::move(chain), constant, observation,
-                                              options_.measurement, scale_, loads);
+                                              options_.measurement, scale_, effects);
   return Cost{std::move(cost), std::move(blocks), part};
 }
 
@@ -295,7 +282,7 @@ std::vector<ParameterBlock*> RefinementProblem::blocks() {
   add_all(instants_);
   if (root_ && used_.contains(root_)) result.push_back(root_);
   add_all(edges_);
-  if (elasticity_) result.push_back(elasticity_);
+  if (drive_) result.push_back(drive_);
   add_all(tags_);
   if (lens_block_) result.push_back(lens_block_);
   return result;
@@ -327,6 +314,7 @@ Eigen::VectorXd RefinementProblem::prior_of(const ParameterBlock& block) const {
         Eigen::Vector3d::Constant(config.tags.rotation_rad), config.tags.size_share;
     return sd;
   }
+  if (block.kind == ParameterBlock::Kind::kDrive) return drive_model_.prior_sd();
   if (block.kind != ParameterBlock::Kind::kLens) return {};
   Eigen::VectorXd sd =
       Eigen::VectorXd::Constant(static_cast<Eigen::Index>(block.values.size()), config.distortion);
@@ -343,7 +331,9 @@ void RefinementProblem::add_priors() {
       problem_.AddResidualBlock(new PlayResidual(*block, play_sd_), nullptr, memory_of(block));
     const Eigen::VectorXd sd = prior_of(*block);
     if (sd.size() == 0) continue;
-    problem_.AddResidualBlock(new PriorResidual(*block, sd), nullptr, memory_of(block));
+    ParameterBlock mean = *block;
+    if (block->kind == ParameterBlock::Kind::kDrive) std::ranges::fill(mean.start, 0);
+    problem_.AddResidualBlock(new PriorResidual(mean, sd), nullptr, memory_of(block));
   }
 }
 

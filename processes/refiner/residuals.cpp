@@ -30,8 +30,8 @@ void StudentTLoss::Evaluate(double s, double rho[3]) const {
 }
 
 ChainResidual::ChainResidual(PartChain chain, const std::vector<const ParameterBlock*>& blocks,
-                             int num_residuals, const NoiseScale& scale, Eigen::VectorXd loads)
-    : chain_(std::move(chain)), blocks_(blocks), scale_(scale), loads_(std::move(loads)) {
+                             int num_residuals, const NoiseScale& scale, Eigen::MatrixXd effects)
+    : chain_(std::move(chain)), blocks_(blocks), scale_(scale), effects_(std::move(effects)) {
   set_num_residuals(num_residuals);
   for (const ParameterBlock* block : blocks_)
     mutable_parameter_block_sizes()->push_back(static_cast<int>(block->values.size()));
@@ -39,13 +39,13 @@ ChainResidual::ChainResidual(PartChain chain, const std::vector<const ParameterB
 
 Pose ChainResidual::pose(double const* const* parameters,
                          std::vector<PartChain::Jacobian>* by_block) const {
-  if (loads_.size() == 0) return chain_.pose(parameters, Pose::Identity(), by_block);
-  const Eigen::VectorXd play = loads_.cwiseProduct(
-      Eigen::Map<const Eigen::VectorXd>(parameters[chain_.num_blocks()], loads_.size()));
-  PartChain::Jacobian by_play = PartChain::Jacobian::Zero(6, loads_.size());
+  if (effects_.size() == 0) return chain_.pose(parameters, Pose::Identity(), by_block);
+  const Eigen::VectorXd play = effects_ * Eigen::Map<const Eigen::VectorXd>(
+                                              parameters[chain_.num_blocks()], effects_.cols());
+  PartChain::Jacobian by_play = PartChain::Jacobian::Zero(6, effects_.rows());
   const Pose X = chain_.pose(parameters, Pose::Identity(), by_block, play.data(),
                              by_block ? &by_play : nullptr);
-  if (by_block) by_block->emplace_back(by_play * loads_.asDiagonal());
+  if (by_block) by_block->emplace_back(by_play * effects_);
   return X;
 }
 
@@ -158,8 +158,8 @@ bool CornerResidual::Evaluate(double const* const* parameters, double* residuals
 
 PoseResidual::PoseResidual(PartChain chain, const std::vector<const ParameterBlock*>& blocks,
                            const PartObservation& observation, const MeasurementModel& measurement,
-                           const NoiseScale& scale, const Eigen::VectorXd& loads)
-    : ChainResidual(std::move(chain), blocks, 6, scale, loads) {
+                           const NoiseScale& scale, const Eigen::MatrixXd& effects)
+    : ChainResidual(std::move(chain), blocks, 6, scale, effects) {
   const Matrix6d covariance = measurement.covariance(observation);
   readings_.push_back({observation.X_CB, whitener_from(covariance)});
   if (observation.X_CB_other && observation.error_ratio <= measurement.max_error_ratio)
@@ -192,8 +192,8 @@ PositionResidual::PositionResidual(PartChain chain,
                                    const std::vector<const ParameterBlock*>& blocks,
                                    const PartObservation& observation,
                                    const MeasurementModel& measurement, const NoiseScale& scale,
-                                   const Eigen::VectorXd& loads)
-    : ChainResidual(std::move(chain), blocks, 3, scale, loads),
+                                   const Eigen::MatrixXd& effects)
+    : ChainResidual(std::move(chain), blocks, 3, scale, effects),
       p_CB_(observation.X_CB.translation()),
       whitener_(whitener_from(
           Eigen::Matrix3d(measurement.covariance(observation).topLeftCorner<3, 3>()))) {}
