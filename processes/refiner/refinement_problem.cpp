@@ -440,7 +440,7 @@ ceres::Solver::Options RefinementProblem::solver_options() {
   // Each residual has one instant and one tag: either can be eliminated.
   const auto eliminated =
       instants_.empty() ? ParameterBlock::Kind::kTag : ParameterBlock::Kind::kInstant;
-  options.linear_solver_type = ceres::DENSE_NORMAL_CHOLESKY;
+  options.linear_solver_type = ceres::SPARSE_NORMAL_CHOLESKY;
   options.linear_solver_ordering = std::make_shared<ceres::ParameterBlockOrdering>();
   for (ParameterBlock* block : blocks()) {
     options.linear_solver_ordering->AddElementToGroup(memory_of(block),
