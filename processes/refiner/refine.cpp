@@ -6,6 +6,7 @@
 #include <chrono>
 #include <cmath>
 #include <stdexcept>
+#include <utility>
 
 #include "common/config/calibration_id.h"
 #include "common/estimation/chi_square.h"
@@ -156,14 +157,9 @@ std::vector<std::string> held_things(const BodySchema& schema, const RefineOptio
   return result;
 }
 
-}  // namespace
-
-Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
-                  const std::optional<RigCalibration>& claimed, const RefineOptions& options) {
-  std::optional<RigCalibration> rig = claimed;
-  if (rig && options.intrinsics) rig->camera = with_all_coefficients(rig->camera);
-  const auto begin = std::chrono::steady_clock::now();
-  check(schema, samples);
+/// Samples that are learned from and TEST samples, both in order.
+std::pair<std::vector<RefinerSample>, std::vector<RefinerSample>> split(
+    std::vector<RefinerSample> samples) {
   std::stable_sort(samples.begin(), samples.end(), [](const auto& a, const auto& b) {
     return a.sample.sample_index < b.sample.sample_index;
   });
@@ -173,6 +169,18 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
     if (seen.sample.purpose == Purpose::kTest) held_out.push_back(seen);
   }
   if (training.empty()) throw std::invalid_argument("there are no TRAIN samples");
+  return {training, held_out};
+}
+
+}  // namespace
+
+Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
+                  const std::optional<RigCalibration>& claimed, const RefineOptions& options) {
+  std::optional<RigCalibration> rig = claimed;
+  if (rig && options.intrinsics) rig->camera = with_all_coefficients(rig->camera);
+  const auto begin = std::chrono::steady_clock::now();
+  check(schema, samples);
+  auto [training, held_out] = split(std::move(samples));
   Refinement result;
   check_calibration(training, rig, options);
   result.used_corners = options.placements || options.intrinsics;

@@ -2,7 +2,7 @@
 // the numbers of samples and of parts. Prints Markdown.
 //
 //   refinement_limits elastic [--robots 30]
-//   refinement_limits bend [--robots 40]
+//   refinement_limits bend [--robots 30] [--kinds a c]
 //   refinement_limits cost
 
 #include <CLI/CLI.hpp>
@@ -148,13 +148,13 @@ void compare_bend(const std::string& kind, int num_samples, int num_robots) {
   std::fflush(stdout);
 }
 
-void run_bend(int num_robots) {
+void run_bend(const std::vector<std::string>& kinds, int num_robots) {
   std::printf(
       "Robots whose joints go to q + 0.1 sin 3q, beside the same whose joints go to q; tag noise, "
       "learned and refined, rms over robots and test poses of the end effector's position.\n\n"
       "| robot | N | right | straight mm | bent mm | bent / straight |\n"
       "| --- | --- | --- | --- | --- | --- |\n");
-  for (const char* kind : {"a", "c", "d"})
+  for (const std::string& kind : kinds)
     for (const int size : {30, 100}) compare_bend(kind, size, num_robots);
 }
 
@@ -225,9 +225,11 @@ int main(int argc, char** argv) {
   elastic->add_option("--robots", num_robots);
   CLI::App* bend = app.add_subcommand("bend", "bent commands");
   bend->add_option("--robots", num_robots);
+  std::vector<std::string> kinds = {"a", "c"};
+  bend->add_option("--kinds", kinds, "chapter_robot()");
   CLI::App* cost = app.add_subcommand("cost", "against samples and parts");
   CLI11_PARSE(app, argc, argv);
   if (*elastic) run_elastic(num_robots);
-  if (*bend) run_bend(num_robots);
+  if (*bend) run_bend(kinds, num_robots);
   if (*cost) run_cost();
 }
