@@ -1,50 +1,23 @@
 #include "processes/console/engineered_model.h"
 
-#include <urdf_model/model.h>
-#include <urdf_parser/urdf_parser.h>
-
-#include <algorithm>
-#include <fstream>
 #include <map>
 #include <set>
-#include <sstream>
-#include <stdexcept>
 #include <utility>
 #include <vector>
 
 #include "common/config/yaml.h"
 #include "common/estimation/measurement_model.h"
 #include "common/geometry/angle.h"
+#include "processes/console/urdf_drives.h"
 
 namespace bodyschema {
 namespace {
-
-Pose from_urdf(const urdf::Pose& X) {
-  return make_pose({X.rotation.w, X.rotation.x, X.rotation.y, X.rotation.z},
-                   {X.position.x, X.position.y, X.position.z});
-}
-
-urdf::ModelInterfaceSharedPtr read_urdf(const std::filesystem::path& file) {
-  std::ifstream stream(file);
-  if (!stream) throw std::runtime_error(file.string() + ": cannot be read");
-  std::stringstream text;
-  text << stream.rdbuf();
-  const auto model = urdf::parseURDF(text.str());
-  if (!model) throw std::runtime_error(file.string() + ": expected a URDF, see the lines above");
-  return model;
-}
-
-/// An action signal and the joint that it moves.
-struct Drive {
-  int signal = 0;
-  double gain = 1;    ///< [rad or m per command unit]
-  double offset = 0;  ///< [rad or m]
-};
 
 /// The joints between the last part and the place where a walk over the links stands.
 struct Way {
   Pose left = Pose::Identity();
   std::vector<ScrewJoint> joints;
+  std::vector<std::string> names;  ///< of the joints
 
   void move(const Pose& X) {
     Pose& last = joints.empty() ? left : joints.back().X_after;
@@ -54,14 +27,13 @@ struct Way {
 
 class Walk {
  public:
-  Walk(const urdf::ModelInterface& model, const std::filesystem::path& urdf, const Yaml& yaml)
-      : model_(model), urdf_(urdf) {
-    for (const Yaml& entry : yaml.list("signals")) read_signal(entry);
+  Walk(const UrdfDrives& drives, const Yaml& yaml) : drives_(drives), model_(drives.model()) {
+    schema_.signals = drives.signals();
     std::set<int> parts;
     for (const Yaml& entry : yaml.list("parts")) {
       const int part = static_cast<int>(entry.integer("part", 0, 1'000'000));
       const std::string link = entry.text("link");
-      if (!model.getLink(link)) throw entry.error("link", "the URDF has no link " + link);
+      if (!model_.getLink(link)) throw entry.error("link", "the URDF has no link " + link);
       if (!parts.insert(part).second)
         throw entry.error("part", "part " + std::to_string(part) + " stands twice");
       parts_on_[link].emplace_back(part, entry.pose("X_LB"));
@@ -86,32 +58,9 @@ class Walk {
     schema_.complete = schema_.edges.size() + 1 == schema_.parts.size();
     return schema_;
   }
+  const std::vector<std::string>& joints() const { return joints_; }
 
  private:
-  void read_signal(const Yaml& entry) {
-    Signal signal;
-    signal.name = entry.text("name");
-    signal.lower = entry.number("lower");
-    signal.upper = entry.number("upper", signal.lower);
-    if (entry.has("joint")) read_drive(entry);
-    schema_.signals.push_back(std::move(signal));
-  }
-
-  void read_drive(const Yaml& entry) {
-    const std::string joint = entry.text("joint");
-    const auto known = model_.getJoint(joint);
-    if (!known) throw entry.error("joint", "the URDF has no joint " + joint);
-    if (known->type == urdf::Joint::FIXED)
-      throw entry.error("joint", "joint " + joint + " is fixed");
-    Drive drive;
-    drive.signal = static_cast<int>(schema_.signals.size());
-    drive.gain = entry.number("gain");
-    if (drive.gain == 0) throw entry.error("gain", "expected another number than 0");
-    drive.offset = entry.number("offset");
-    if (!drives_.emplace(joint, drive).second)
-      throw entry.error("joint", "joint " + joint + " has a signal already");
-  }
-
   /// From `link` to all its neighbours but the one that the walk came by. `from` is the last part.
   void visit(const urdf::Link& link, const urdf::Joint* came_by, int from, Way way) {
     if (const auto on = parts_on_.find(link.name); on != parts_on_.end()) {
@@ -147,43 +96,23 @@ class Walk {
   void cross(const urdf::Joint& joint, double sense, Way* way) const {
     if (joint.type == urdf::Joint::FIXED) return;
     const bool slides = joint.type == urdf::Joint::PRISMATIC;
-    const auto refuse = [&](const std::string& why) {
-      throw std::runtime_error(urdf_.string() + ": joint " + joint.name + ": " + why);
-    };
-    if (!slides && joint.type != urdf::Joint::REVOLUTE && joint.type != urdf::Joint::CONTINUOUS)
-      refuse("expected revolute, continuous, prismatic or fixed");
-    const Eigen::Vector3d axis(joint.axis.x, joint.axis.y, joint.axis.z);
-    if (!(axis.norm() > 1e-9)) refuse("its axis is 0");
-    // The joint that a mimic follows, and how.
-    const urdf::Joint* leader = &joint;
-    double gain = 1, offset = 0;
-    for (int hops = 0; leader->mimic; ++hops) {
-      const auto next = model_.getJoint(leader->mimic->joint_name);
-      if (!next || hops > 100) refuse("mimics nothing");
-      offset += gain * leader->mimic->offset;
-      gain *= leader->mimic->multiplier;
-      leader = next.get();
-    }
+    const Drive drive = drives_.drive_of(joint);
     Pose X_JZ = Pose::Identity();  // z along the axis
-    X_JZ.linear() = rotation_of_z_to(axis);
-    const auto drive = drives_.find(leader->name);
-    if (drive != drives_.end()) {
-      offset += gain * drive->second.offset;
-      gain *= drive->second.gain;
-    }
+    X_JZ.linear() = rotation_of_z_to(drives_.axis_of(joint));
     way->move(X_JZ);
-    if (drive == drives_.end() || gain == 0) {  // stands still
+    if (drive.signal < 0) {  // stands still
       Vector6d twist = Vector6d::Zero();
-      twist(slides ? 2 : 5) = sense * offset;
+      twist(slides ? 2 : 5) = sense * drive.offset;
       way->move(exp(twist) * X_JZ.inverse());
       return;
     }
     ScrewJoint screw;
-    screw.signal = drive->second.signal;
-    screw.offset = offset / gain;
-    (slides ? screw.slide : screw.turn) = sense * gain;
+    screw.signal = drive.signal;
+    screw.offset = drive.offset / drive.gain;
+    (slides ? screw.slide : screw.turn) = sense * drive.gain;
     screw.X_after = X_JZ.inverse();
     way->joints.push_back(screw);
+    way->names.push_back(joint.name);
   }
 
   void add_edge(int from, int to, const Way& way) {
@@ -196,12 +125,13 @@ class Walk {
     edge.parameter_covariance = Eigen::MatrixXd::Zero(size, size);
     edge.parameter_covariance.bottomRightCorner<6, 6>() = isotropic(uncertainty_);
     schema_.edges.push_back(std::move(edge));
+    joints_.insert(joints_.end(), way.names.begin(), way.names.end());
   }
 
+  const UrdfDrives& drives_;
   const urdf::ModelInterface& model_;
-  const std::filesystem::path urdf_;
   BodySchema schema_;
-  std::map<std::string, Drive> drives_;                                // by joint
+  std::vector<std::string> joints_;                                    // of all edges
   std::map<std::string, std::vector<std::pair<int, Pose>>> parts_on_;  // by link
   Noise uncertainty_;                                                  // of an edge, per axis
 };
@@ -209,12 +139,15 @@ class Walk {
 }  // namespace
 
 BodySchema engineered_model(const std::filesystem::path& urdf,
-                            const std::filesystem::path& placement) {
-  const auto model = read_urdf(urdf);
+                            const std::filesystem::path& placement,
+                            std::vector<std::string>* joints) {
   const Yaml yaml = Yaml::load(placement);
-  Walk walk(*model, urdf, yaml);
+  const UrdfDrives drives(urdf, yaml);
+  Walk walk(drives, yaml);
   yaml.finish();
-  return walk.run();
+  BodySchema schema = walk.run();
+  if (joints) *joints = walk.joints();
+  return schema;
 }
 
 }  // namespace bodyschema

@@ -1,6 +1,8 @@
 #pragma once
 
 #include <filesystem>
+#include <string>
+#include <vector>
 
 #include "common/schema/body_schema.h"
 
@@ -18,10 +20,12 @@ namespace bodyschema {
 ///     - {part: 1, link: base, X_LB: {position_m: [0, 0, 0.1], rpy_deg: [0, 0, 0]}}
 ///
 /// Joints are in rad and m; what no signal moves stands at 0. X_CR is left unknown: identity with
-/// a covariance of 0.
+/// a covariance of 0. `joints`, if given, receives the URDF's names of the joints, in the order of
+/// the edges.
 /// @throws ConfigError, std::runtime_error if the URDF cannot be read or has a joint that no screw
 /// is.
 BodySchema engineered_model(const std::filesystem::path& urdf,
-                            const std::filesystem::path& placement);
+                            const std::filesystem::path& placement,
+                            std::vector<std::string>* joints = nullptr);
 
 }  // namespace bodyschema

@@ -17,7 +17,6 @@
 namespace bodyschema {
 namespace {
 
-constexpr std::size_t kMaxWaiting = 32;
 /// TEST samples that judge an edge and a part: the newest. Twice as many are kept, for proposals
 /// that come late.
 constexpr std::size_t kTests = 200;
@@ -162,6 +161,7 @@ bool ModelMonitor::on_sample(const sample_t& message) {
   }
   samples_.push_back(std::move(sample));
   is_assessed_ = false;
+  take_answers();
   if (last_sample_index_ < restored_sample_) {
     if (samples_.size() > kPast) samples_.pop_front();
     return false;

@@ -153,7 +153,8 @@ class ModelMonitor {
   std::vector<const ActionPoseSample*> tests_between(std::int64_t first, std::int64_t last) const;
   /// Edges between the same parts, by the same signals.
   static bool has_same_tree(const BodySchema& a, const BodySchema& b);
-  static constexpr std::size_t kMaxEvents = 32;  ///< told at once
+  static constexpr std::size_t kMaxEvents = 32;   ///< told at once
+  static constexpr std::size_t kMaxWaiting = 32;  ///< proposals, and answers
   static constexpr std::int64_t kRefinerTimeout_us = 30'000'000;
   /// What a sample shows of a part, unless it rests on tags that had moved.
   static const PartObservation* sighting(const ActionPoseSample& sample, int part,
@@ -178,6 +179,9 @@ class ModelMonitor {
   /// Those whose samples, and whose refinement, are there. Returns true if there were any.
   bool judge_waiting();
   bool waits_for_refiner(const body_schema_t& proposal);
+  /// Those whose samples are there, and which were asked for: a forged one displaces none. Returns
+  /// true if there were any.
+  bool take_answers();
   /// The wanted actions are of the same body.
   bool are_wanted_for(const BodySchema& schema) const;
   static std::int64_t body_since(const BodySchema& proposal);
@@ -219,6 +223,8 @@ class ModelMonitor {
   RefinementSchedule schedule_;
   std::set<std::int64_t> due_;  ///< samples whose complete proposals the refiner answers
   AwaitedAnswer refinements_;
+  /// Answers that are ahead of the samples heard here, by their last sample.
+  std::map<std::int64_t, body_schema_t> answers_;
   std::optional<BodySchema> refined_;  ///< the newest answer
   std::vector<wanted_action_t> wanted_;
   Standing now_;

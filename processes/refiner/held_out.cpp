@@ -42,6 +42,20 @@ Pose solved_anew(const PartObservation& observation, const std::vector<TagSight>
   return fit ? fit->X_CB : observation.X_CB;
 }
 
+/// A root that is never seen is where the schema has it.
+void see_root(const BodySchema& schema, std::vector<ActionPoseSample>* samples) {
+  if (std::any_of(samples->begin(), samples->end(),
+                  [&](const auto& sample) { return sample.find(schema.root); }))
+    return;
+  PartObservation root;
+  root.part = schema.root;
+  root.X_CB = schema.X_CR;
+  for (ActionPoseSample& sample : *samples)
+    sample.parts.insert(std::lower_bound(sample.parts.begin(), sample.parts.end(), root.part,
+                                         [](const auto& seen, int id) { return seen.part < id; }),
+                        root);
+}
+
 }  // namespace
 
 HeldOutErrors held_out_errors(const BodySchema& schema, const std::vector<RefinerSample>& samples,
@@ -71,6 +85,7 @@ HeldOutErrors held_out_errors(const BodySchema& schema, const std::vector<Refine
       errors.px_median = median(distances);
     }
   }
+  see_root(schema, &poses);
   errors.parts = evaluate(schema, poses);
   return errors;
 }

@@ -16,13 +16,14 @@ namespace bodyschema {
 /// rotation [rad]), right perturbation; that of a scalar is itself.
 struct ParameterBlock {
   /// kInstant: of one sample, the root's pose if it moves, and how far each joint is from its
-  /// command.
-  enum class Kind { kInstant, kRoot, kEdge, kTag, kLens };
+  /// command. kDrive: of all joints, how they miss commands: see DriveModel.
+  enum class Kind { kInstant, kRoot, kEdge, kDrive, kTag, kLens };
   static constexpr int kPoseSize = 16;
 
   Kind kind = Kind::kRoot;
-  int id = 0;            ///< index of the edge, id of the tag
-  std::string elements;  ///< 'X' a pose, 's' a scalar
+  int id = 0;                      ///< index of the edge, id of the tag
+  std::string elements;            ///< 'X' a pose, 's' a scalar
+  std::vector<std::string> names;  ///< of the scalars of kDrive
   std::vector<double> values;
   std::vector<double> start;  ///< values before the refinement
   /// Directions that may move: ascending indices into the tangent of all elements.

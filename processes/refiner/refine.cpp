@@ -6,11 +6,13 @@
 #include <chrono>
 #include <cmath>
 #include <stdexcept>
+#include <utility>
 
 #include "common/config/calibration_id.h"
 #include "common/estimation/chi_square.h"
 #include "common/estimation/quantile.h"
 #include "processes/refiner/calibrated_lens.h"
+#include "processes/refiner/elasticity.h"
 #include "processes/refiner/held_out.h"
 #include "processes/refiner/information.h"
 #include "processes/refiner/refined_schema.h"
@@ -117,8 +119,7 @@ std::vector<JointPlay> plays_of(const BodySchema& schema, const RefinementProble
     const ScrewJoint& joint = edge->joints[d];
     const double sd = std::abs(joint.gain) * problem.play_sd()(static_cast<Eigen::Index>(n));
     result.push_back(
-        {fmt::format("{} ({}→{})", schema.signals.at(joint.signal).name, edge->from, edge->to),
-         sd * std::abs(joint.slide), sd * std::abs(joint.turn)});
+        {joint_name(schema, *edge, joint), sd * std::abs(joint.slide), sd * std::abs(joint.turn)});
   }
   return result;
 }
@@ -145,14 +146,30 @@ std::vector<std::string> held_things(const BodySchema& schema, const RefineOptio
   for (const Edge& edge : schema.edges)
     if (!PartChain::has_block(edge))
       result.push_back(fmt::format("{}→{}: its Gaussian process", edge.from, edge.to));
+  const bool holds_bends = has_corners || !result.empty();
   for (const Signal& signal : schema.signals)
-    if (!signal.warp.empty())
+    if (holds_bends && !signal.warp.empty())
       result.push_back(fmt::format("{}: the bend of its command", signal.name));
   if (has_corners && !options.placements)
     result.push_back("tags: as the rig's files say, within their priors");
   if (has_corners && !options.intrinsics)
     result.push_back("lens: as the rig's files say, within its priors");
   return result;
+}
+
+/// Samples that are learned from and TEST samples, both in order.
+std::pair<std::vector<RefinerSample>, std::vector<RefinerSample>> split(
+    std::vector<RefinerSample> samples) {
+  std::stable_sort(samples.begin(), samples.end(), [](const auto& a, const auto& b) {
+    return a.sample.sample_index < b.sample.sample_index;
+  });
+  std::vector<RefinerSample> training, held_out;
+  for (const RefinerSample& seen : samples) {
+    if (is_learned_from(seen.sample)) training.push_back(seen);
+    if (seen.sample.purpose == Purpose::kTest) held_out.push_back(seen);
+  }
+  if (training.empty()) throw std::invalid_argument("there are no TRAIN samples");
+  return {training, held_out};
 }
 
 }  // namespace
@@ -163,15 +180,7 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   if (rig && options.intrinsics) rig->camera = with_all_coefficients(rig->camera);
   const auto begin = std::chrono::steady_clock::now();
   check(schema, samples);
-  std::stable_sort(samples.begin(), samples.end(), [](const auto& a, const auto& b) {
-    return a.sample.sample_index < b.sample.sample_index;
-  });
-  std::vector<RefinerSample> training, held_out;
-  for (const RefinerSample& seen : samples) {
-    if (is_learned_from(seen.sample)) training.push_back(seen);
-    if (seen.sample.purpose == Purpose::kTest) held_out.push_back(seen);
-  }
-  if (training.empty()) throw std::invalid_argument("there are no TRAIN samples");
+  auto [training, held_out] = split(std::move(samples));
   Refinement result;
   check_calibration(training, rig, options);
   result.used_corners = options.placements || options.intrinsics;
@@ -184,7 +193,9 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   result.coverage = coverage_of(schema, training);
   result.held = held_things(schema, options, result.used_corners);
 
-  RefinementProblem problem(schema, training, used_rig, options, result.root_moves);
+  RefineOptions stiff = options;
+  stiff.joint_loads = nullptr;
+  RefinementProblem problem(schema, training, used_rig, stiff, result.root_moves);
   for (const int part : problem.unseen_parts())
     result.held.push_back(fmt::format("the frame of part {}: it was never seen", part));
   problem.solve();
@@ -205,6 +216,10 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   result.wanted_actions =
       wanted_actions(result.schema, result.used_corners ? std::optional(result.rig) : std::nullopt,
                      training, problem, information);
+  if (options.joint_loads && !result.used_corners)
+    result.elasticity = fit_elasticity(result.schema, training, held_out, options, problem);
+  if (options.joint_loads && !result.elasticity)
+    result.held.emplace_back("compliances of joints: no load of them changes");
   const bool judges_corners = rig && has_corners(held_out);
   result.before =
       held_out_errors(schema, held_out, judges_corners ? rig : std::nullopt, options.corner_noise);

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <functional>
 #include <optional>
 #include <string>
 #include <vector>
@@ -13,12 +14,19 @@
 
 namespace bodyschema {
 
+/// By how many command units gravity moves each joint at an action per unit of its compliance, in
+/// the order of the schema's edges and their joints: the torque [N m] about its axis over its gain;
+/// of a joint that slides alone the force [N].
+using JointLoads = std::function<Eigen::VectorXd(const Eigen::VectorXd& action)>;
+
 struct RefineOptions {
   bool placements = false;  ///< also where the tags sit, and how large they are
   bool intrinsics = false;  ///< also focal lengths, centre and distortion
   RefinerConfig config;
   CornerNoise corner_noise;      ///< of corners without a covariance of their own
   MeasurementModel measurement;  ///< of poses, where these are fitted
+  /// Where poses are fitted: also fit joints that give way to these loads.
+  JointLoads joint_loads;
 };
 
 /// A parameter after the refinement.
@@ -73,6 +81,29 @@ struct WantedAction {
   double reducible_fall = 0;
 };
 
+/// How far a joint gives way to its load.
+struct JointCompliance {
+  std::string joint;  ///< "q5 (5→6)"
+  std::string unit;   ///< "rad/(N m)" or "m/N"
+  double value = 0;
+  double sd = 0;        ///< 0: its load does not change, it was not fitted
+  double evidence = 0;  ///< [nats] of its own against a stiff joint, by its value and sd (BIC)
+  double droop = 0;     ///< its largest displacement by the load at a fitted sample [rad, m]
+};
+
+/// Joints that give way to gravity beside stiff ones, each with a geometry of its own.
+struct Elasticity {
+  BodySchema schema;  ///< of the unloaded robot
+  std::vector<JointCompliance> joints;
+  double evidence = 0;  ///< [nats] of all compliances against stiff joints (BIC)
+  struct Errors {
+    double noise_scale = 1;          ///< Refinement::noise_scale
+    std::vector<PartErrors> fitted;  ///< on the fitted samples
+    std::vector<PartErrors> held_out;
+  };
+  Errors stiff, elastic;
+};
+
 struct Refinement {
   BodySchema schema;
   RigCalibration rig;  ///< refined; as claimed where nothing of it was
@@ -88,8 +119,9 @@ struct Refinement {
   std::vector<ParameterCorrelation> correlations;  ///< above kHighCorrelation, the highest first
   std::vector<RefinementOutlier> outliers;         ///< the farthest first
   std::vector<SignalCoverage> coverage;
-  std::vector<JointPlay> plays;   ///< where corners were fitted
-  std::vector<std::string> held;  ///< what was not refined, and why
+  std::vector<JointPlay> plays;          ///< where corners were fitted
+  std::optional<Elasticity> elasticity;  ///< where loads were given that change
+  std::vector<std::string> held;         ///< what was not refined, and why
   /// kMostWantedActions, that of most help first; none where no signal moves what is refined.
   std::vector<WantedAction> wanted_actions;
   HeldOutErrors before, after;
@@ -102,8 +134,9 @@ inline constexpr int kMostWantedActions = 10;
 /// parts' poses, which were made by these. With tags or lens among the parameters, the data are the
 /// corners' pixels, the rig's claims are priors, and at every sample each joint may be off its
 /// command (backlash, droop) by what is estimated to be usual. Edges with a Gaussian process,
-/// command warps and signals' limits stay as they are. TEST samples are judged alone. The order of
-/// samples changes nothing.
+/// signals' limits stay as they are, bent commands where corners are fitted or where there is such
+/// an edge. Loads of the joints are fitted beside: the refined schema has stiff joints, for a
+/// schema knows no loads. TEST samples are judged alone. The order of samples changes nothing.
 ///
 /// Gauge: a part's frame is where its tags are closest to the rig's claims, and the scale is the
 /// mean of all tags' sizes, all weighed by their priors, for images tell neither.

@@ -90,6 +90,7 @@ BodySchema refined_schema(const BodySchema& start, const std::vector<RefinerSamp
       edge.parameter_covariance = information.cross_covariance(block, block);
     }
   }
+  if (problem.drive()) problem.drive_model().set_warps(*problem.drive(), &schema);
   schema.frame_covariances = frame_covariances(start, samples, problem, information);
   schema.refined = true;
   schema.base_version = start.version;

@@ -37,9 +37,11 @@ RefinementProblem::RefinementProblem(const BodySchema& schema,
       rig_(rig),
       options_(options),
       root_moves_(root_moves),
+      drive_model_(schema, options.joint_loads, samples),
       problem_(problem_options()) {
   add_paths();
   add_plays();
+  add_drive();
   add_instants(samples);
   if (rig_) {
     add_tags();
@@ -117,6 +119,12 @@ void RefinementProblem::add_plays() {
     }
   }
   play_sd_ = play_start_ = Eigen::Map<const Eigen::VectorXd>(sd.data(), std::ssize(sd));
+}
+
+void RefinementProblem::add_drive() {
+  if (rig_) return;
+  ParameterBlock block = drive_model_.block();
+  if (!block.free.empty()) drive_ = &storage_.emplace_back(std::move(block));
 }
 
 // Of a root that moves: where its parts say that it was.
@@ -233,15 +241,19 @@ std::optional<RefinementProblem::Cost> RefinementProblem::cost_of(
   const int part = observation.part;
   if (!is_usable(part, sample_index)) return std::nullopt;
   std::vector<ParameterBlock*> blocks = chain_blocks(part, sample_index);
+  if (drive_) blocks.push_back(drive_);
   const std::vector<const ParameterBlock*> constant(blocks.begin(), blocks.end());
-  PartChain chain(paths_.at(part), schema_.displacements(action));
+  PartChain chain(paths_.at(part),
+                  drive_ ? drive_model_.displacements(action) : schema_.displacements(action),
+                  drive_model_.first_joints());
+  const Eigen::MatrixXd effects = drive_ ? drive_model_.effects(action) : Eigen::MatrixXd();
   std::unique_ptr<ceres::CostFunction> cost;
   if (observation.has_rotation && schema_.has_rotation(part))
     cost = std::make_unique<PoseResidual>(std::move(chain), constant, observation,
-                                          options_.measurement, scale_);
+                                          options_.measurement, scale_, effects);
   else
     cost = std::make_unique<PositionResidual>(std::move(chain), constant, observation,
-                                              options_.measurement, scale_);
+                                              options_.measurement, scale_, effects);
   return Cost{std::move(cost), std::move(blocks), part};
 }
 
@@ -270,6 +282,7 @@ std::vector<ParameterBlock*> RefinementProblem::blocks() {
   add_all(instants_);
   if (root_ && used_.contains(root_)) result.push_back(root_);
   add_all(edges_);
+  if (drive_) result.push_back(drive_);
   add_all(tags_);
   if (lens_block_) result.push_back(lens_block_);
   return result;
@@ -301,6 +314,7 @@ Eigen::VectorXd RefinementProblem::prior_of(const ParameterBlock& block) const {
         Eigen::Vector3d::Constant(config.tags.rotation_rad), config.tags.size_share;
     return sd;
   }
+  if (block.kind == ParameterBlock::Kind::kDrive) return drive_model_.prior_sd();
   if (block.kind != ParameterBlock::Kind::kLens) return {};
   Eigen::VectorXd sd =
       Eigen::VectorXd::Constant(static_cast<Eigen::Index>(block.values.size()), config.distortion);
@@ -317,7 +331,9 @@ void RefinementProblem::add_priors() {
       problem_.AddResidualBlock(new PlayResidual(*block, play_sd_), nullptr, memory_of(block));
     const Eigen::VectorXd sd = prior_of(*block);
     if (sd.size() == 0) continue;
-    problem_.AddResidualBlock(new PriorResidual(*block, sd), nullptr, memory_of(block));
+    ParameterBlock mean = *block;
+    if (block->kind == ParameterBlock::Kind::kDrive) std::ranges::fill(mean.start, 0);
+    problem_.AddResidualBlock(new PriorResidual(mean, sd), nullptr, memory_of(block));
   }
 }
 
@@ -337,6 +353,15 @@ std::vector<double> RefinementProblem::squared_distances() {
     result.push_back(sum);
   }
   return result;
+}
+
+double RefinementProblem::log_likelihood() {
+  const std::vector<double> d2 = squared_distances();
+  double sum = 0;
+  for (std::size_t n = 0; n < d2.size(); ++n)
+    sum -= robust_cost(d2[n], data_[n].num_residuals) +
+           data_[n].num_residuals * std::log(scale_.value);
+  return sum;
 }
 
 // Maximum likelihood of the scale given the residuals, by the fixed point of its own weights.
@@ -415,7 +440,7 @@ ceres::Solver::Options RefinementProblem::solver_options() {
   // Each residual has one instant and one tag: either can be eliminated.
   const auto eliminated =
       instants_.empty() ? ParameterBlock::Kind::kTag : ParameterBlock::Kind::kInstant;
-  options.linear_solver_type = ceres::DENSE_NORMAL_CHOLESKY;
+  options.linear_solver_type = ceres::SPARSE_NORMAL_CHOLESKY;
   options.linear_solver_ordering = std::make_shared<ceres::ParameterBlockOrdering>();
   for (ParameterBlock* block : blocks()) {
     options.linear_solver_ordering->AddElementToGroup(memory_of(block),

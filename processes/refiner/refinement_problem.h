@@ -13,6 +13,7 @@
 
 #include "common/camera/lens.h"
 #include "common/config/rig.h"
+#include "processes/refiner/drive_model.h"
 #include "processes/refiner/parameter_block.h"
 #include "processes/refiner/part_chain.h"
 #include "processes/refiner/refine.h"
@@ -82,6 +83,11 @@ class RefinementProblem {
   const std::vector<int>& unseen_parts() const { return unseen_parts_; }
   /// As if every joint had gone where it was told.
   void leave_out_play();
+  /// Of the data now, given the scale; up to a constant.
+  double log_likelihood();
+  /// What drive_model() adds to the commands; null: nothing.
+  const ParameterBlock* drive() const { return drive_; }
+  const DriveModel& drive_model() const { return drive_model_; }
   /// d² of each datum now.
   std::vector<double> squared_distances();
   /// Standard deviations of a block's whole tangent beforehand; empty: nothing is known.
@@ -101,6 +107,7 @@ class RefinementProblem {
  private:
   void add_paths();
   void add_plays();
+  void add_drive();
   void add_instants(const std::vector<RefinerSample>& samples);
   void add_tags();
   void add_lens();
@@ -119,6 +126,7 @@ class RefinementProblem {
   const std::optional<RigCalibration>& rig_;
   const RefineOptions& options_;
   const bool root_moves_;
+  const DriveModel drive_model_;
   std::optional<Lens> lens_;
   std::map<int, std::vector<const Edge*>> paths_;     // by part
   std::deque<ParameterBlock> storage_;                // addresses stay
@@ -128,6 +136,7 @@ class RefinementProblem {
   std::map<const Edge*, int> first_play_;
   Eigen::VectorXd play_sd_, play_start_;
   std::map<int, ParameterBlock*> edges_, tags_;  // by index, by id
+  ParameterBlock* drive_ = nullptr;
   ParameterBlock* lens_block_ = nullptr;
   std::vector<double> memory_;
   std::map<const ParameterBlock*, std::size_t> memory_offsets_;

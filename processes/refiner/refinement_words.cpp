@@ -76,6 +76,8 @@ std::string RefinementWords::thing_of(const ParameterBlock& block) const {
       const Edge& edge = schema_.edges[block.id];
       return fmt::format("{}→{}", edge.from, edge.to);
     }
+    case Kind::kDrive:
+      return "commands";
     case Kind::kTag:
       return fmt::format("tag {}", block.id);
     case Kind::kLens:
@@ -109,6 +111,8 @@ std::string RefinementWords::name_of(const ParameterBlock& block, int direction)
       return fmt::format("{}, {}", thing_of(block), kPoseWords[direction]);
     case Kind::kEdge:
       return edge_name(block, direction);
+    case Kind::kDrive:
+      return block.names.at(direction);
     case Kind::kTag:
       if (direction == 6) return fmt::format("size of tag {}", block.id);
       return fmt::format("placement of tag {}, {}", block.id, kPoseWords[direction]);
@@ -124,6 +128,7 @@ std::string RefinementWords::name_of(const ParameterBlock& block, int direction)
 
 std::string RefinementWords::unit_of(const ParameterBlock& block, int direction) const {
   if (block.kind == Kind::kLens) return direction < 4 ? "px" : "1";
+  if (block.kind == Kind::kDrive) return "unit";
   if (block.kind == Kind::kTag && direction == 6) return "1";
   const int component = block.kind == Kind::kEdge ? direction % 8 : direction;
   constexpr std::array<const char*, 8> kUnits = {"m",   "m",   "m",      "rad",

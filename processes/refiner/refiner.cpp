@@ -6,7 +6,6 @@
 
 #include "bodyschema/action_command_t.hpp"
 #include "common/bus/convert.h"
-#include "common/config/calibration_id.h"
 #include "processes/refiner/held_out.h"
 
 namespace bodyschema {
@@ -15,19 +14,6 @@ namespace {
 constexpr std::size_t kMostProposals = 64;
 
 }  // namespace
-
-RefinerSettings RefinerSettings::load(const std::filesystem::path& file) {
-  const std::filesystem::path rig = file.parent_path();
-  RefinerSettings settings;
-  settings.options.config = RefinerConfig::load(file);
-  settings.options.placements = settings.options.config.placements;
-  settings.options.intrinsics = settings.options.config.intrinsics;
-  const RigNoise noise = load_noise(rig);
-  settings.options.corner_noise = {noise.corner_noise_px, noise.small_tag_noise_px};
-  settings.options.measurement = noise.measurement;
-  settings.rig = load_calibration(rig);
-  return settings;
-}
 
 Refiner::Refiner(RefinerSettings settings)
     : settings_(std::move(settings)), schedule_(settings_.options.config.refine_every) {}

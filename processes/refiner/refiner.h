@@ -3,7 +3,6 @@
 #include <algorithm>
 #include <cstdint>
 #include <deque>
-#include <filesystem>
 #include <functional>
 #include <map>
 #include <optional>
@@ -13,18 +12,9 @@
 #include "bodyschema/sample_t.hpp"
 #include "common/config/refinement_schedule.h"
 #include "common/schema/retained_samples.h"
-#include "processes/refiner/refine.h"
+#include "processes/refiner/refiner_settings.h"
 
 namespace bodyschema {
-
-struct RefinerSettings {
-  RefineOptions options;
-  RigCalibration rig;
-
-  /// Reads refiner.yaml, and beside it markers.yaml, noise.yaml and the calibration that
-  /// camera.yaml names. @throws ConfigError.
-  static RefinerSettings load(const std::filesystem::path& file);
-};
 
 /// A proposal of the learner after refine().
 struct RefinedProposal {

@@ -26,7 +26,8 @@ RefinerProcess::RefinerProcess(Process& process, const Options& options)
       door_(process.rig_folder()),
       schema_file_(options.schema_file),
       proposed_folder_(options.proposed_folder),
-      refiner_(RefinerSettings::load(process.config_file())),
+      refiner_(
+          RefinerSettings::load(process.rig_folder(), RefinerConfig::load(process.config_file()))),
       intake_(
           options.samples_file,
           [this](const sample_t& sample) {

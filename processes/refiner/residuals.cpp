@@ -30,11 +30,23 @@ void StudentTLoss::Evaluate(double s, double rho[3]) const {
 }
 
 ChainResidual::ChainResidual(PartChain chain, const std::vector<const ParameterBlock*>& blocks,
-                             int num_residuals, const NoiseScale& scale)
-    : chain_(std::move(chain)), blocks_(blocks), scale_(scale) {
+                             int num_residuals, const NoiseScale& scale, Eigen::MatrixXd effects)
+    : chain_(std::move(chain)), blocks_(blocks), scale_(scale), effects_(std::move(effects)) {
   set_num_residuals(num_residuals);
   for (const ParameterBlock* block : blocks_)
     mutable_parameter_block_sizes()->push_back(static_cast<int>(block->values.size()));
+}
+
+Pose ChainResidual::pose(double const* const* parameters,
+                         std::vector<PartChain::Jacobian>* by_block) const {
+  if (effects_.size() == 0) return chain_.pose(parameters, Pose::Identity(), by_block);
+  const Eigen::VectorXd play = effects_ * Eigen::Map<const Eigen::VectorXd>(
+                                              parameters[chain_.num_blocks()], effects_.cols());
+  PartChain::Jacobian by_play = PartChain::Jacobian::Zero(6, effects_.rows());
+  const Pose X = chain_.pose(parameters, Pose::Identity(), by_block, play.data(),
+                             by_block ? &by_play : nullptr);
+  if (by_block) by_block->emplace_back(by_play * effects_);
+  return X;
 }
 
 void ChainResidual::write(double** jacobians, int block, const Derivative& derivative) const {
@@ -49,7 +61,7 @@ void ChainResidual::write(double** jacobians, int block, const Derivative& deriv
 
 void ChainResidual::write_chain(double** jacobians, const Derivative& by_pose,
                                 const std::vector<PartChain::Jacobian>& by_block) const {
-  for (int block = 0; block < chain_.num_blocks(); ++block)
+  for (int block = 0; block < static_cast<int>(by_block.size()); ++block)
     if (jacobians && jacobians[block])
       write(jacobians, block, by_pose.lazyProduct(by_block[block]));
 }
@@ -146,8 +158,8 @@ bool CornerResidual::Evaluate(double const* const* parameters, double* residuals
 
 PoseResidual::PoseResidual(PartChain chain, const std::vector<const ParameterBlock*>& blocks,
                            const PartObservation& observation, const MeasurementModel& measurement,
-                           const NoiseScale& scale)
-    : ChainResidual(std::move(chain), blocks, 6, scale) {
+                           const NoiseScale& scale, const Eigen::MatrixXd& effects)
+    : ChainResidual(std::move(chain), blocks, 6, scale, effects) {
   const Matrix6d covariance = measurement.covariance(observation);
   readings_.push_back({observation.X_CB, whitener_from(covariance)});
   if (observation.X_CB_other && observation.error_ratio <= measurement.max_error_ratio)
@@ -158,7 +170,7 @@ PoseResidual::PoseResidual(PartChain chain, const std::vector<const ParameterBlo
 bool PoseResidual::Evaluate(double const* const* parameters, double* residuals,
                             double** jacobians) const {
   std::vector<PartChain::Jacobian> by_block;
-  const Pose X_CB = chain_.pose(parameters, Pose::Identity(), jacobians ? &by_block : nullptr);
+  const Pose X_CB = pose(parameters, jacobians ? &by_block : nullptr);
   Vector6d best, error = Vector6d::Zero();
   const Reading* reading = nullptr;
   for (const Reading& candidate : readings_) {
@@ -179,8 +191,9 @@ bool PoseResidual::Evaluate(double const* const* parameters, double* residuals,
 PositionResidual::PositionResidual(PartChain chain,
                                    const std::vector<const ParameterBlock*>& blocks,
                                    const PartObservation& observation,
-                                   const MeasurementModel& measurement, const NoiseScale& scale)
-    : ChainResidual(std::move(chain), blocks, 3, scale),
+                                   const MeasurementModel& measurement, const NoiseScale& scale,
+                                   const Eigen::MatrixXd& effects)
+    : ChainResidual(std::move(chain), blocks, 3, scale, effects),
       p_CB_(observation.X_CB.translation()),
       whitener_(whitener_from(
           Eigen::Matrix3d(measurement.covariance(observation).topLeftCorner<3, 3>()))) {}
@@ -188,7 +201,7 @@ PositionResidual::PositionResidual(PartChain chain,
 bool PositionResidual::Evaluate(double const* const* parameters, double* residuals,
                                 double** jacobians) const {
   std::vector<PartChain::Jacobian> by_block;
-  const Pose X_CB = chain_.pose(parameters, Pose::Identity(), jacobians ? &by_block : nullptr);
+  const Pose X_CB = pose(parameters, jacobians ? &by_block : nullptr);
   const Eigen::Matrix3d whitener = whitener_ / scale_.value;
   Eigen::Map<Eigen::Vector3d>(residuals, 3) = whitener * (X_CB.translation() - p_CB_);
   if (!jacobians) return true;

@@ -31,11 +31,14 @@ struct NoiseScale {
 };
 
 /// Base of what depends on a part's pose: blocks are those of the chain, then those of the tag and
-/// the lens where there are any.
+/// the lens, or that of the drive, where there are any.
 class ChainResidual : public ceres::CostFunction {
  protected:
   ChainResidual(PartChain chain, const std::vector<const ParameterBlock*>& blocks,
-                int num_residuals, const NoiseScale& scale);
+                int num_residuals, const NoiseScale& scale, Eigen::MatrixXd effects = {});
+  /// The pose of a chain whose joints go farther than they are told by effects · drive. `by_block`,
+  /// if given, receives also the derivative by the drive.
+  Pose pose(double const* const* parameters, std::vector<PartChain::Jacobian>* by_block) const;
 
   using Derivative = Eigen::Ref<const Eigen::MatrixXd>;
   /// Writes the free columns of ∂r/∂tangent of a block into Ceres' array for it, if it wants one.
@@ -46,6 +49,7 @@ class ChainResidual : public ceres::CostFunction {
   const PartChain chain_;
   const std::vector<const ParameterBlock*> blocks_;
   const NoiseScale& scale_;
+  const Eigen::MatrixXd effects_;  ///< of the drive, joint by scalar; empty: there is none
 };
 
 /// Corners of a tag M on part B, 8 whitened residuals [σ]: predicted minus measured.
@@ -85,7 +89,7 @@ class PoseResidual final : public ChainResidual {
  public:
   PoseResidual(PartChain chain, const std::vector<const ParameterBlock*>& blocks,
                const PartObservation& observation, const MeasurementModel& measurement,
-               const NoiseScale& scale);
+               const NoiseScale& scale, const Eigen::MatrixXd& effects = {});
   bool Evaluate(double const* const* parameters, double* residuals,
                 double** jacobians) const override;
 
@@ -102,7 +106,7 @@ class PositionResidual final : public ChainResidual {
  public:
   PositionResidual(PartChain chain, const std::vector<const ParameterBlock*>& blocks,
                    const PartObservation& observation, const MeasurementModel& measurement,
-                   const NoiseScale& scale);
+                   const NoiseScale& scale, const Eigen::MatrixXd& effects = {});
   bool Evaluate(double const* const* parameters, double* residuals,
                 double** jacobians) const override;
 
@@ -133,7 +137,7 @@ class PriorResidual final : public ceres::CostFunction {
                 double** jacobians) const override;
 
  private:
-  const ParameterBlock& block_;
+  const ParameterBlock block_;
   Eigen::VectorXd sd_;
 };
 

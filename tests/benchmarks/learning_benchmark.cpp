@@ -11,6 +11,9 @@
 #include <stdexcept>
 
 #include "common/kinematics/kinematic_path.h"
+#ifdef BODYSCHEMA_HAS_REFINER
+#include "processes/refiner/refine.h"
+#endif
 #include "processes/structure_learner/baseline/fit_matrix_gp.h"
 #include "processes/structure_learner/baseline/learn_baseline.h"
 #include "processes/structure_learner/online_learner.h"
@@ -159,6 +162,23 @@ void Predict(benchmark::State& state) {
   for (Eigen::Index t = 0; auto _ : state)
     benchmark::DoNotOptimize(arm().path.predict(actions.col(t++ % actions.cols())));
 }
+
+#ifdef BODYSCHEMA_HAS_REFINER
+/// The same path of a schema refined from 100 noisy samples: its joints turn and slide.
+void PredictRefined(benchmark::State& state) {
+  static const BodySchema schema = [] {
+    const Recording run = seven_dof(100);
+    return refine(learn(run.robot.signals, run.samples).schema, refiner_samples(run.samples), {},
+                  {})
+        .schema;
+  }();
+  const auto path = KinematicPath::between(schema, kRoot, kFinger);
+  const Eigen::MatrixXd& actions = arm().actions;
+  for (Eigen::Index t = 0; auto _ : state)
+    benchmark::DoNotOptimize(path->predict(actions.col(t++ % actions.cols())));
+}
+BENCHMARK(PredictRefined);
+#endif
 
 void PredictByKdl(benchmark::State& state) {
   KDL::ChainFkSolverPos_recursive solver(kdl_arm().chain);
@@ -338,6 +358,7 @@ int main(int argc, char** argv) {
   benchmark::Initialize(&argc, argv);
   bodyschema::test::kdl_arm();  // or say that it is not the same arm
   bodyschema::test::RatioReporter reporter({{"Predict", "PredictByKdl"},
+                                            {"PredictRefined", "PredictByKdl"},
                                             {"PredictAndJacobian", "PredictAndJacobianByKdl"},
                                             {"PredictAndJacobian", "JacobianByKdl"},
                                             {"FitMatrixGp/25", "FitScrew/25"},

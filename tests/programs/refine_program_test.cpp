@@ -110,7 +110,7 @@ TEST_F(RefineProgramTest, FitsPosesWithoutAnOption) {
 
 TEST_F(RefineProgramTest, WritesTheUrdfThatUrdfMakesOfTheRefinedSchema) {
   const std::string refine = "refine schema '" + log_ + "' --out refined --urdf r.urdf ";
-  const Json json = json_of(refine + "--placement p.yaml --json");
+  const Json json = json_of(refine + "--urdf-placement p.yaml --json");
   EXPECT_EQ(json.at("urdf").at("file"), "r.urdf");
   EXPECT_EQ(json.at("urdf").at("moving_joints"), 2);
   const Outcome urdf = run("urdf refined --out r2.urdf --placement p2.yaml");
@@ -175,41 +175,53 @@ double distance_from_truth(const BodySchema& schema, const BodySchema& truth, in
   return distances[50];
 }
 
-// The job of robot_calibration: the URDF is millimetres and degrees off, and the camera sees the
-// base and the end of seven joints, how the end is turned or not.
-TEST_F(RefineProgramTest, ARobotOfAUrdfIsRefinedFromItsEndAlone) {
-  test::Rng rng(73);
-  const test::SyntheticRobot robot = test::chapter_robot("d", rng);
-  const BodySchema truth = test::true_schema(robot);
-  const int end = truth.edges.back().to;
-  BodySchema nominal = truth;
-  for (Edge& edge : nominal.edges) {
-    Vector6d error;
-    for (int k = 0; k < 6; ++k) error(k) = test::uniform(rng, -1, 1) * (k < 3 ? 0.004 : 0.02);
-    edge.left = edge.left * exp(error);
+// The job of robot_calibration: the URDF, robot.urdf with ends.yaml, is millimetres and degrees
+// off, and the camera sees the base and the end of seven joints, how the end is turned or not.
+class RefineKnownStructureTest : public RefineProgramTest {
+ protected:
+  RefineKnownStructureTest() {
+    BodySchema nominal = truth_;
+    for (Edge& edge : nominal.edges) {
+      Vector6d error;
+      for (int k = 0; k < 6; ++k) error(k) = test::uniform(rng_, -1, 1) * (k < 3 ? 0.004 : 0.02);
+      edge.left = edge.left * exp(error);
+    }
+    write_one_event_log(folder_ / "nominal", kBodySchema, to_message(nominal));
+    EXPECT_EQ(run("urdf nominal --out robot.urdf --placement all.yaml --nominal").exit_code, 0);
+    std::ifstream all(folder_ / "all.yaml");
+    std::ofstream placement(folder_ / "ends.yaml");
+    for (std::string line; std::getline(all, line);) {
+      const bool is_part = line.find("{part: ") != std::string::npos;
+      const auto is_of = [&](int part) {
+        return line.find("{part: " + std::to_string(part) + ",") != std::string::npos;
+      };
+      if (!is_part || is_of(truth_.root) || is_of(end_)) placement << line << "\n";
+    }
+    placement.close();
+    samples_ = test::babble(robot_, 100, {.regime = test::Regime::kTagIso}, rng_);
+    for (ActionPoseSample& sample : samples_)
+      std::erase_if(sample.parts, [&](const auto& seen) {
+        return seen.part != truth_.root && seen.part != end_;
+      });
   }
-  write_one_event_log(folder_ / "nominal", kBodySchema, to_message(nominal));
-  ASSERT_EQ(run("urdf nominal --out robot.urdf --placement all.yaml --nominal").exit_code, 0);
-  std::ifstream all(folder_ / "all.yaml");
-  std::ofstream placement(folder_ / "ends.yaml");
-  for (std::string line; std::getline(all, line);) {
-    const bool is_part = line.find("{part: ") != std::string::npos;
-    const auto is_of = [&](int part) {
-      return line.find("{part: " + std::to_string(part) + ",") != std::string::npos;
-    };
-    if (!is_part || is_of(truth.root) || is_of(end)) placement << line << "\n";
+  void write_samples(const std::vector<ActionPoseSample>& samples, bool has_orientation) const {
+    std::ofstream csv(folder_ / "samples.csv");
+    test::write_csv(has_orientation ? samples : test::with_positions_alone(samples, {end_}), csv);
   }
-  placement.close();
-  std::vector<ActionPoseSample> samples =
-      test::babble(robot, 100, {.regime = test::Regime::kTagIso}, rng);
-  for (ActionPoseSample& sample : samples)
-    std::erase_if(sample.parts,
-                  [&](const auto& seen) { return seen.part != truth.root && seen.part != end; });
+
+  test::Rng rng_{73};
+  const test::SyntheticRobot robot_ = test::chapter_robot("d", rng_);
+  const BodySchema truth_ = test::true_schema(robot_);
+  const int end_ = truth_.edges.back().to;
+  std::vector<ActionPoseSample> samples_;
+};
+
+TEST_F(RefineKnownStructureTest, ARobotOfAUrdfIsRefinedFromItsEndAlone) {
+  const BodySchema& truth = truth_;
+  const int end = end_;
   for (const bool has_orientation : {true, false}) {
     SCOPED_TRACE(has_orientation ? "poses" : "positions");
-    std::ofstream csv(folder_ / "samples.csv");
-    test::write_csv(has_orientation ? samples : test::with_positions_alone(samples, {end}), csv);
-    csv.close();
+    write_samples(samples_, has_orientation);
     const Outcome engineered =
         run("engineer robot.urdf ends.yaml --samples samples.csv --out begin");
     ASSERT_EQ(engineered.exit_code, 0) << engineered.err;
@@ -219,9 +231,83 @@ TEST_F(RefineProgramTest, ARobotOfAUrdfIsRefinedFromItsEndAlone) {
     };
     EXPECT_GT(distance_from_truth(schema("begin"), truth, end), 0.008);
     EXPECT_LT(distance_from_truth(schema("refined"), truth, end), 0.002);
+    // Both in one command.
+    json_of(
+        "refine --structure robot.urdf --placement ends.yaml samples.csv --noise 0.003 1 --out "
+        "one --json");
+    const Eigen::VectorXd action = robot_.random_action(rng_);
+    const BodySchema one = schema("one"), two = schema("refined");
+    EXPECT_EQ(one.position_parts.empty(), has_orientation);
+    EXPECT_EQ(one.position_parts, two.position_parts);
+    for (const auto& [part, X_RB] : two.predict_all(action))
+      EXPECT_LT(log(X_RB.inverse() * one.predict_all(action).at(part)).norm(), 1e-9) << part;
+    EXPECT_LT(log(one.X_CR.inverse() * two.X_CR).norm(), 1e-9);
     std::filesystem::remove(folder_ / "begin");
     std::filesystem::remove(folder_ / "refined");
   }
+}
+
+// Nothing else is seen: where the root stands in the camera's frame is not known either.
+TEST_F(RefineKnownStructureTest, ASinglePartIsEnough) {
+  for (ActionPoseSample& sample : samples_)
+    std::erase_if(sample.parts, [&](const auto& seen) { return seen.part != end_; });
+  for (const bool has_orientation : {true, false}) {
+    SCOPED_TRACE(has_orientation ? "poses" : "positions");
+    write_samples(samples_, has_orientation);
+    const Json json = json_of(
+        "refine samples.csv --structure robot.urdf --placement ends.yaml --noise 0.003 1 --out "
+        "refined --json");
+    EXPECT_EQ(json.at("held").size(), 1U) << json.at("held");
+    EXPECT_TRUE(json.at("undetermined").empty()) << json.at("undetermined");
+    const BodySchema refined = from_message(read_log(folder_ / "refined", kBodySchema).back());
+    std::vector<double> distances;
+    for (int n = 0; n < 101; ++n) {
+      const Eigen::VectorXd action = robot_.random_action(rng_);
+      const Pose X_CE = refined.X_CR * refined.predict(refined.root, end_, action)->X_AB;
+      distances.push_back(
+          (X_CE.translation() - robot_.poses_in_camera(action).at(end_).translation()).norm());
+    }
+    std::nth_element(distances.begin(), distances.begin() + 50, distances.end());
+    EXPECT_LT(distances[50], 0.002);
+  }
+}
+
+TEST_F(RefineKnownStructureTest, JointsThatGiveWayAreFittedByTheMassesOfTheUrdf) {
+  write_samples(samples_, true);
+  const std::string refine =
+      "refine samples.csv --structure robot.urdf --placement ends.yaml --noise 0.003 1 --out "
+      "refined --elastic unloaded";
+  const Json elasticity = json_of(refine + " --json").at("elasticity");
+  // The arm is stiff.
+  EXPECT_LT(elasticity.at("evidence"), 0);
+  EXPECT_EQ(elasticity.at("joints").size(), 7U);
+  EXPECT_LE(elasticity.at("elastic").at("noise_scale"), elasticity.at("stiff").at("noise_scale"));
+  EXPECT_LT(elasticity.at("elastic").at("noise_scale"), 1.1);
+  EXPECT_EQ(run("show unloaded").exit_code, 0);
+  const Outcome text = run(refine);
+  EXPECT_NE(text.out.find("gravity are less likely than stiff ones"), std::string::npos)
+      << text.out;
+  std::string urdf = text_of(folder_ / "robot.urdf");
+  for (auto at = urdf.find("<mass"); at != std::string::npos; at = urdf.find("<mass", at))
+    urdf.erase(at, urdf.find('>', at) + 1 - at);
+  for (auto at = urdf.find("<inertial"); at != std::string::npos; at = urdf.find("<inertial", at))
+    urdf.erase(at, urdf.find("</inertial>", at) + 11 - at);
+  std::ofstream(folder_ / "robot.urdf") << urdf;
+  expect_failure(refine, 1, "no link has a mass");
+}
+
+TEST_F(RefineKnownStructureTest, SaysWhatIsWrongWithIt) {
+  write_samples(samples_, true);
+  const std::string files = "--structure robot.urdf --placement ends.yaml ";
+  expect_failure("refine samples.csv --out refined --structure robot.urdf", 2, "--placement");
+  expect_failure("refine samples.csv --out refined --placement ends.yaml", 2, "--structure");
+  expect_failure("refine samples.csv --out refined", 2, "SAMPLES");
+  expect_failure("refine schema samples.csv --out refined " + files, 2, "SCHEMA");
+  expect_failure("refine --out refined " + files, 2, "SAMPLES");
+  expect_failure("refine samples.csv --out robot.urdf --noise 0.003 1 " + files, 1,
+                 "is an input itself");
+  expect_failure("refine schema samples.csv --out refined --elastic e", 2, "--structure");
+  expect_failure("refine samples.csv --out refined " + files, 1, "--noise");
 }
 
 TEST_F(RefineProgramTest, SaysWhatIsWrong) {
@@ -234,7 +320,7 @@ TEST_F(RefineProgramTest, SaysWhatIsWrong) {
   expect_failure("refine schema '" + log_ + "'", 2, "--out");
   expect_failure(refine + "--urdf refined", 1, "--urdf: expected another file than --out");
   expect_failure(refine + "--urdf schema", 1, "--urdf: schema is an input itself");
-  expect_failure(refine + "--placement p.yaml", 2, "--placement requires --urdf");
+  expect_failure(refine + "--urdf-placement p.yaml", 2, "--urdf-placement requires --urdf");
   expect_failure("refine missing '" + log_ + "' --out refined", 1, "missing");
   EXPECT_FALSE(std::filesystem::exists(folder_ / "refined"));
   std::ofstream(folder_ / "a.csv") << "t,q1,q2,part,x,y,z,qw,qx,qy,qz\n0,nan,0,1,0,0,0,1,0,0,0\n";

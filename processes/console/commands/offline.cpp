@@ -22,6 +22,7 @@
 #include "processes/console/commands/commands.h"
 #include "processes/console/commands/files.h"
 #include "processes/console/engineered_model.h"
+#include "processes/console/engineered_place.h"
 #include "processes/console/rig_check.h"
 #include "processes/console/views/prediction_view.h"
 #include "processes/console/views/structure_view.h"
@@ -29,7 +30,6 @@
 #include "processes/structure_learner/learn.h"
 #include "processes/structure_learner/pair_data.h"
 #include "processes/structure_learner/recording/recording.h"
-#include "processes/structure_learner/root_pose.h"
 
 namespace bodyschema {
 namespace {
@@ -158,13 +158,7 @@ struct EngineerArguments {
 void run_engineer(const EngineerArguments& arguments) {
   BodySchema schema = engineered_model(arguments.urdf, arguments.placement);
   const Recording recording = load_for(arguments.samples, schema);
-  MeasurementModel measurement = recording.measurement;
-  if (!recording.has_noise) measurement.noise = Noise{0.001, 0.2 * kDegree};  // weights alone
-  estimate_root_pose(recording.samples, measurement, &schema);
-  schema.calibration_id = recording.samples.front().calibration_id;
-  if (schema.X_CR_covariance.isZero(0))
-    throw std::runtime_error(
-        fmt::format("{}: the root, part {}, is never seen", arguments.samples, schema.root));
+  place_in_camera(recording, &schema);
   check_out(arguments.out, {arguments.samples, arguments.urdf, arguments.placement});
   write_one_event_log(arguments.out, kBodySchema, to_message(schema));
   print(arguments.json, schema_json(schema), structure_text(schema));

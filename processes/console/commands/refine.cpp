@@ -10,23 +10,55 @@
 #include "common/bus/channels.h"
 #include "common/bus/convert.h"
 #include "common/bus/event_log.h"
-#include "common/config/calibration_id.h"
 #include "processes/console/commands/commands.h"
 #include "processes/console/commands/files.h"
 #include "processes/console/commands/urdf_files.h"
+#include "processes/console/engineered_model.h"
+#include "processes/console/engineered_place.h"
+#include "processes/console/gravity_load.h"
 #include "processes/console/hint.h"
 #include "processes/console/rig_check.h"
 #include "processes/console/views/refinement_view.h"
 #include "processes/refiner/proposed_files.h"
+#include "processes/refiner/refiner_settings.h"
 
 namespace bodyschema {
 namespace {
 
 struct RefineArguments {
-  std::string schema, samples, out, rig, proposed, urdf, placement;
+  std::string schema, samples, out, rig, proposed, urdf, urdf_placement;
+  std::string structure, placement, elastic;  ///< of a robot whose structure is known
   std::vector<double> noise;
   bool placements = false, intrinsics = false, json = false;
+
+  std::vector<std::string> inputs() const {
+    return structure.empty() ? std::vector{schema, samples}
+                             : std::vector{structure, placement, samples};
+  }
 };
+
+/// Where the refinement begins, and what it is fitted to.
+struct Start {
+  BodySchema schema;
+  Recording recording;
+  JointLoads loads;  ///< where they are asked for
+};
+
+Start begin_with(const RefineArguments& arguments) {
+  Start start;
+  if (arguments.structure.empty()) {
+    start.schema = load_schema(arguments.schema);
+    start.recording = load_for(arguments.samples, start.schema);
+    return start;
+  }
+  std::vector<std::string> joints;
+  start.schema = engineered_model(arguments.structure, arguments.placement, &joints);
+  if (!arguments.elastic.empty())
+    start.loads = GravityLoad(arguments.structure, arguments.placement, joints);
+  start.recording = load_for(arguments.samples, start.schema);
+  place_in_camera(start.recording, &start.schema);
+  return start;
+}
 
 /// The rig's folder: that which is told, else the run's own beside a log.
 std::filesystem::path rig_folder(const RefineArguments& arguments, bool is_log) {
@@ -75,7 +107,7 @@ void write_urdf_and_print(const RefineArguments& arguments, const Refinement& re
       // As the file holds it, so that `urdf` makes the same bytes of that.
       const BodySchema written = from_message(to_message(result.schema));
       const UrdfModel model =
-          write_urdf(written, arguments.out, false, arguments.urdf, arguments.placement);
+          write_urdf(written, arguments.out, false, arguments.urdf, arguments.urdf_placement);
       json["urdf"] = urdf_json(model, arguments.urdf);
       text += urdf_text(model, arguments.urdf);
     } catch (const std::runtime_error& error) {
@@ -84,7 +116,8 @@ void write_urdf_and_print(const RefineArguments& arguments, const Refinement& re
   }
   print(arguments.json, json, text);
   if (problem.empty()) return;
-  const std::string placement = arguments.placement.empty() ? "PLACEMENT" : arguments.placement;
+  const std::string placement =
+      arguments.urdf_placement.empty() ? "PLACEMENT" : arguments.urdf_placement;
   throw std::runtime_error(
       fmt::format("--urdf: {}. The refined schema was written; to make a URDF of it: `{}`", problem,
                   to_type(fmt::format("urdf {} --out {} --placement {} [--nominal]", arguments.out,
@@ -94,26 +127,33 @@ void write_urdf_and_print(const RefineArguments& arguments, const Refinement& re
 void run_refine(const RefineArguments& arguments) {
   if (!arguments.proposed.empty() && !arguments.placements && !arguments.intrinsics)
     refuse_argument("--proposed", "expected with --placements or --intrinsics");
-  const BodySchema schema = load_schema(arguments.schema);
-  const Recording recording = load_for(arguments.samples, schema);
+  if (!arguments.elastic.empty() && (arguments.placements || arguments.intrinsics))
+    refuse_argument("--elastic",
+                    "expected without --placements and --intrinsics: poses are fitted");
+  const auto [schema, recording, loads] = begin_with(arguments);
   RefineOptions options;
-  options.placements = arguments.placements;
-  options.intrinsics = arguments.intrinsics;
   std::optional<RigCalibration> rig;
   const std::filesystem::path folder = rig_folder(arguments, recording.is_log);
   if (!folder.empty()) {
-    rig = load_calibration(folder);
-    const RigNoise noise = load_noise(folder);
-    options.corner_noise = {noise.corner_noise_px, noise.small_tag_noise_px};
-    if (std::filesystem::exists(folder / "refiner.yaml"))
-      options.config = RefinerConfig::load(folder / "refiner.yaml");
+    const std::filesystem::path file = folder / "refiner.yaml";
+    const RefinerSettings settings = RefinerSettings::load(
+        folder, std::filesystem::exists(file) ? RefinerConfig::load(file) : RefinerConfig());
+    options = settings.options;
+    rig = settings.rig;
   }
+  options.placements = arguments.placements;
+  options.intrinsics = arguments.intrinsics;
   options.measurement = measurement_of(arguments, recording, schema);
-  check_outs(
-      {{"--out", arguments.out}, {"--urdf", arguments.urdf}, {"--placement", arguments.placement}},
-      {arguments.schema, arguments.samples});
+  options.joint_loads = loads;
+  check_outs({{"--out", arguments.out},
+              {"--elastic", arguments.elastic},
+              {"--urdf", arguments.urdf},
+              {"--urdf-placement", arguments.urdf_placement}},
+             arguments.inputs());
   const Refinement result = refine(schema, samples_of(arguments, recording), rig, options);
   write_one_event_log(arguments.out, kBodySchema, to_message(result.schema));
+  if (result.elasticity)
+    write_one_event_log(arguments.elastic, kBodySchema, to_message(result.elasticity->schema));
   if (!arguments.proposed.empty()) write_proposed_files(result.rig, arguments.proposed);
   write_urdf_and_print(arguments, result, rig);
 }
@@ -124,8 +164,21 @@ void add_refine_command(Arguments console) {
   const auto arguments = std::make_shared<RefineArguments>();
   Arguments refine =
       console.add_subcommand("refine", "Fit all parameters of a schema at once to a recording");
-  refine.add_option("SCHEMA", arguments->schema, "Schema file: where to begin").required();
-  refine.add_option("SAMPLES", arguments->samples, "Recording (LCM log or CSV)").required();
+  refine.add_option("SCHEMA", arguments->schema,
+                    "Schema file: where to begin; left out with --structure");
+  refine.add_option("SAMPLES", arguments->samples, "Recording (LCM log or CSV)");
+  Argument structure = refine.add_option("--structure", arguments->structure,
+                                         "Begin with the robot of this URDF, as engineer does");
+  Argument placement =
+      refine.add_option("--placement", arguments->placement,
+                        "YAML: root, signals, parts on links of that URDF, as engineer reads it");
+  structure.needs(placement);
+  placement.needs(structure);
+  refine
+      .add_option("--elastic", arguments->elastic,
+                  "Also fit joints that give way to gravity, by the masses of that URDF; write the "
+                  "schema of the unloaded robot to this file")
+      .needs(structure);
   refine.add_option("--rig", arguments->rig,
                     "Folder of the rig that the samples are of, or name of one in config/: its "
                     "tags and lens; the run's own if not given");
@@ -139,13 +192,22 @@ void add_refine_command(Arguments console) {
   const Argument urdf = refine.add_option("--urdf", arguments->urdf,
                                           "Write the refined schema as a URDF to this file");
   refine
-      .add_option("--placement", arguments->placement,
+      .add_option("--urdf-placement", arguments->urdf_placement,
                   "Write where signals and parts are on the URDF to this YAML file, as engineer "
                   "reads it")
       .needs(urdf);
   add_noise(refine, arguments->noise, "; of poses");
   refine.add_flag("--json", arguments->json, "Print JSON");
-  refine.callback([arguments] { run_refine(*arguments); });
+  refine.callback([arguments] {
+    if (!arguments->structure.empty()) {
+      if (!arguments->samples.empty()) refuse_argument("SCHEMA", "expected none with --structure");
+      std::swap(arguments->schema, arguments->samples);
+    } else if (arguments->schema.empty()) {
+      refuse_argument("SCHEMA", "expected, or --structure");
+    }
+    if (arguments->samples.empty()) refuse_argument("SAMPLES", "expected");
+    run_refine(*arguments);
+  });
 }
 
 }  // namespace bodyschema

@@ -22,6 +22,8 @@ Shown shown(const std::string& unit) {
   if (unit == "m/unit") return {1e3, "mm/unit"};
   if (unit == "rad") return {1 / kDegree, "°"};
   if (unit == "rad/unit") return {1 / kDegree, "°/unit"};
+  if (unit == "rad/(N m)") return {1 / kDegree, "°/(N m)"};
+  if (unit == "m/N") return {1e3, "mm/N"};
   if (unit == "1") return {100, "%"};
   return {1, unit};
 }
@@ -63,9 +65,9 @@ std::string gauge_text(const Refinement& result) {
 }
 
 /// Over all parts, root mean squares.
-Noise total_of(const HeldOutErrors& errors) {
+Noise total_of(const std::vector<PartErrors>& parts) {
   double position = 0, rotation = 0, count = 0, turned = 0;
-  for (const PartErrors& part : errors.parts) {
+  for (const PartErrors& part : parts) {
     position += part.count * part.position_rms_m * part.position_rms_m;
     count += part.count;
     if (!part.has_rotation) continue;
@@ -82,7 +84,7 @@ std::string held_out_text(const Refinement& result) {
   std::string text = fmt::format("  held out, {}:", counted(result.before.num_samples, "sample"));
   for (const auto& [name, errors] :
        {std::pair{"before", &result.before}, {"after", &result.after}}) {
-    const Noise total = total_of(*errors);
+    const Noise total = total_of(errors->parts);
     text += fmt::format("\n    {:<7} rms {:.3f} mm, {:.4f}° over all parts", name,
                         total.position_m * 1e3, total.rotation_rad / kDegree);
     if (errors->px_rms)
@@ -128,6 +130,58 @@ std::string plays_text(const std::vector<JointPlay>& plays) {
   for (const JointPlay& play : plays)
     text += fmt::format("  {} is off its command by {:.4f}°, {:.4f} mm (1 σ)\n", play.joint,
                         play.turn_rad / kDegree, play.slide_m * 1e3);
+  return text;
+}
+
+Json elastic_errors_json(const Elasticity::Errors& errors) {
+  const Noise fitted = total_of(errors.fitted), held_out = total_of(errors.held_out);
+  Json json = {{"noise_scale", errors.noise_scale},
+               {"fitted_rms_m", fitted.position_m},
+               {"fitted_rms_deg", fitted.rotation_rad / kDegree}};
+  json["held_out_rms_m"] = errors.held_out.empty() ? Json() : Json(held_out.position_m);
+  json["held_out_rms_deg"] =
+      errors.held_out.empty() ? Json() : Json(held_out.rotation_rad / kDegree);
+  return json;
+}
+
+Json elasticity_json(const Elasticity& elasticity) {
+  return {{"evidence", elasticity.evidence},
+          {"stiff", elastic_errors_json(elasticity.stiff)},
+          {"elastic", elastic_errors_json(elasticity.elastic)},
+          {"joints", array_of(elasticity.joints, [](const JointCompliance& joint) {
+             return Json{
+                 {"joint", joint.joint},       {"unit", joint.unit},
+                 {"compliance", joint.value},  {"sd", joint.sd > 0 ? Json(joint.sd) : Json()},
+                 {"evidence", joint.evidence}, {"largest_droop", joint.droop}};
+           })}};
+}
+
+std::string elasticity_text(const std::optional<Elasticity>& elasticity) {
+  if (!elasticity) return "";
+  std::string text = fmt::format(
+      "  joints that give way to gravity are {} by {:.1f} nats (BIC)\n",
+      elasticity->evidence > 0 ? "likelier than stiff ones" : "less likely than stiff ones",
+      std::abs(elasticity->evidence));
+  for (const auto& [name, errors] :
+       {std::pair{"stiff", &elasticity->stiff}, {"elastic", &elasticity->elastic}}) {
+    const Noise fitted = total_of(errors->fitted);
+    text += fmt::format("    {:<7} rms {:.3f} mm, {:.4f}° on the fitted samples", name,
+                        fitted.position_m * 1e3, fitted.rotation_rad / kDegree);
+    if (!errors->held_out.empty())
+      text += fmt::format(", {:.3f} mm held out", total_of(errors->held_out).position_m * 1e3);
+    text += fmt::format("; {:.2f} times the noise\n", errors->noise_scale);
+  }
+  for (const JointCompliance& joint : elasticity->joints) {
+    const Shown unit = shown(joint.unit);
+    if (joint.sd == 0) {
+      text += fmt::format("    {}: its load does not change\n", joint.joint);
+      continue;
+    }
+    const bool is_turning = joint.unit == "rad/(N m)";
+    text += fmt::format("    {} gives way by {:.5f} ± {:.5f} {}, {:.3f} {} at most; {:+.1f} nats\n",
+                        joint.joint, joint.value * unit.factor, joint.sd * unit.factor, unit.unit,
+                        joint.droop * unit.factor, is_turning ? "°" : "mm", joint.evidence);
+  }
   return text;
 }
 
@@ -210,6 +264,7 @@ Json refinement_json(const Refinement& result, const std::optional<RigCalibratio
         {"joint", play.joint}, {"slide_m", play.slide_m}, {"turn_deg", play.turn_rad / kDegree}};
   });
   json["held"] = result.held;
+  json["elasticity"] = result.elasticity ? elasticity_json(*result.elasticity) : Json();
   json["wanted_actions"] = wanted_json(result);
   if (result.used_corners && claimed) {
     json["tags"] = array_of(result.rig.markers.tags, tag_json);
@@ -235,6 +290,7 @@ std::string refinement_text(const Refinement& result,
   text += parameters_text(result.parameters);
   text += tags_text(result, claimed);
   text += plays_text(result.plays);
+  text += elasticity_text(result.elasticity);
   text += findings_text(result);
   for (const SignalCoverage& signal : result.coverage)
     text += fmt::format("  {}: {:.0f} % of its range seen\n", signal.signal, 100 * signal.share);

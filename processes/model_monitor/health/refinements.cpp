@@ -18,12 +18,27 @@ bool ModelMonitor::waits_for_refiner(const body_schema_t& proposal) {
 
 bool ModelMonitor::on_refined_schema(const body_schema_t& refined) {
   if (refined_ && refined.last_sample_index <= refined_->last_sample_index) return false;
-  refined_ = from_message(refined);
-  wanted_ = refined.wanted_actions;
-  is_assessed_ = false;
-  refinements_.answer(refined.last_sample_index);
+  answers_.insert_or_assign(refined.last_sample_index, refined);
+  // Those of use first are kept, as of proposals.
+  if (answers_.size() > kMaxWaiting) answers_.erase(std::prev(answers_.end()));
+  if (!take_answers()) return false;
   judge_waiting();
   return true;
+}
+
+bool ModelMonitor::take_answers() {
+  bool is_taken = false;
+  while (!answers_.empty() && answers_.begin()->first <= last_sample_index_) {
+    const body_schema_t answer = answers_.extract(answers_.begin()).mapped();
+    const std::int64_t index = answer.last_sample_index;
+    if (index > judged_sample_ && !due_.contains(index)) continue;
+    refined_ = from_message(answer);
+    wanted_ = answer.wanted_actions;
+    refinements_.answer(index);
+    is_taken = true;
+  }
+  if (is_taken) is_assessed_ = false;
+  return is_taken;
 }
 
 bool ModelMonitor::on_tick(std::int64_t now_us) {

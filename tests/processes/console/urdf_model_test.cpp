@@ -19,6 +19,7 @@
 #include "common/geometry/angle.h"
 #include "common/scene/mujoco.h"
 #include "processes/console/engineered_model.h"
+#include "processes/console/gravity_load.h"
 #include "processes/console/pure_joints.h"
 #include "tests/support/synthetic_robot.h"
 
@@ -294,6 +295,52 @@ TEST_F(UrdfModelTest, MuJoCoAgrees) {
                                Eigen::Map<const Eigen::Vector3d>(data->xpos + 3 * body));
       EXPECT_LT(log(X_RB.inverse() * X).norm(), kExact) << "part " << part;
     }
+  }
+}
+
+TEST_F(UrdfModelTest, MuJoCoAgreesOnWhatGravityDoes) {
+  install_mujoco_handlers();
+  Rng rng(7);
+  for (int n = 0; n < kNumRobots; ++n) {
+    const BodySchema schema = random_schema(rng);
+    UrdfModel files = urdf_model(schema, false);
+    const std::string kMass = "<mass value=\"";
+    for (auto at = files.urdf.find(kMass); at != std::string::npos;
+         at = files.urdf.find(kMass, at + 1)) {
+      const Eigen::Vector3d centre = test::random_vector(rng, 0, 0.3);
+      const std::string origin = "<origin xyz=\"" + std::to_string(centre.x()) + " " +
+                                 std::to_string(centre.y()) + " " + std::to_string(centre.z()) +
+                                 "\"/>";
+      files.urdf.insert(at, origin);
+      at += origin.size() + kMass.size();
+      files.urdf.replace(at, files.urdf.find('"', at) - at,
+                         std::to_string(test::uniform(rng, 1, 9)));
+    }
+    std::vector<std::string> joints;
+    write(files);
+    const BodySchema engineered = engineered_model(urdf(), placement(), &joints);
+    const MjModelPtr model = load_mujoco(urdf());
+    ASSERT_TRUE(model);
+    Eigen::Map<Eigen::Vector3d>(model->opt.gravity) << 0, 0, -9.80665;
+    const MjDataPtr data(mj_makeData(model.get()));
+    const auto robot = urdf::parseURDFFile(urdf());
+    const Eigen::VectorXd action = random_action(schema, rng);
+    for (const auto& [name, position] : joint_positions(*robot, Yaml::load(placement()), action))
+      data->qpos[model->jnt_qposadr[mj_name2id(model.get(), mjOBJ_JOINT, name.c_str())]] = position;
+    mj_forward(model.get(), data.get());
+    const Eigen::VectorXd loads = GravityLoad(urdf(), placement(), joints)(action);
+    std::size_t at = 0;
+    for (const Edge& edge : engineered.edges)
+      for (const ScrewJoint& joint : edge.joints) {
+        const int id = mj_name2id(model.get(), mjOBJ_JOINT, joints.at(at).c_str());
+        const double expected =
+            -data->qfrc_bias[model->jnt_dofadr[id]] / (joint.slide + joint.turn);
+        EXPECT_NEAR(loads(static_cast<Eigen::Index>(at)), expected, 1e-9 * (1 + std::abs(expected)))
+            << joints[at];
+        ++at;
+      }
+    EXPECT_EQ(loads.size(), std::ssize(joints));
+    EXPECT_EQ(at, joints.size());
   }
 }
 

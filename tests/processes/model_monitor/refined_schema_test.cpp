@@ -106,6 +106,25 @@ TEST_F(RefinedSchemaTest, AnAnswerThatIsNoRefinementIsNoneEitherNorIsOneWithoutA
   EXPECT_EQ(this->monitor(5e-4, 0).schema()->is_refined, 0);
 }
 
+TEST_F(RefinedSchemaTest, OfASampleThatIsNotThereOrNotDueDisplacesNone) {
+  const auto of_sample = [&](std::int64_t index) {
+    body_schema_t forged = refined(14, 1e-3);
+    forged.last_sample_index = index;
+    return forged;
+  };
+  for (const std::int64_t index : {std::int64_t{12}, std::int64_t{1} << 40}) {
+    ModelMonitor monitor(config_);
+    for (std::int64_t i = 0; i <= 12; ++i) monitor.on_sample(samples_.at(i));
+    for (int n = 0; n < 100; ++n)
+      EXPECT_FALSE(monitor.on_refined_schema(of_sample(index + (index > 12 ? n : 0))));
+    EXPECT_FALSE(monitor.on_learned_schema(learned(10, 5e-4)));
+    EXPECT_EQ(monitor.health().awaited_refinement, 10);
+    EXPECT_TRUE(monitor.on_refined_schema(refined(10, 0)));
+    EXPECT_EQ(monitor.schema()->is_refined, 1);
+    EXPECT_EQ(length(*monitor.schema()), length(learned(10, 0)));
+  }
+}
+
 TEST_F(RefinedSchemaTest, StandsUntilAProposalPredictsCornersBetter) {
   ModelMonitor monitor = this->monitor(1e-3, 5e-4);
   const Bytes before = bytes_of(monitor);

@@ -141,6 +141,27 @@ TEST(Residuals, OfPosesAndPositionsHaveTheirDerivatives) {
   expect_right_derivatives(position, robot.blocks, 1e-6);
 }
 
+TEST(Residuals, OfElasticJointsHaveTheirDerivatives) {
+  Rng rng(3);
+  ThreeEdges robot(rng);
+  ParameterBlock compliances;
+  compliances.kind = ParameterBlock::Kind::kDrive;
+  for (int n = 0; n < 4; ++n) compliances.add(0.01 * test::gaussian(rng));
+  compliances.free = {0, 2, 3};
+  Eigen::Matrix4d effects = Eigen::Vector4d(3, 5, -4, 6).asDiagonal();
+  effects(1, 3) = effects(2, 0) = 0.7;
+  const PartChain chain({&robot.edges[0], &robot.edges[1], &robot.edges[2]}, robot.theta,
+                        {{&robot.edges[1], 0}, {&robot.edges[2], 3}});
+  robot.blocks.push_back(&compliances);
+  PartObservation observation;
+  observation.X_CB = robot.X_CB() * exp(Vector6d(0.1 * test::gaussian6(rng)));
+  observation.covariance = isotropic({0.003, 0.02});
+  const PoseResidual pose(chain, robot.blocks, observation, {}, robot.scale, effects);
+  expect_right_derivatives(pose, robot.blocks, 1e-6);
+  const PositionResidual position(chain, robot.blocks, observation, {}, robot.scale, effects);
+  expect_right_derivatives(position, robot.blocks, 1e-6);
+}
+
 TEST(Residuals, OfAFlippedPoseAreThoseOfItsOtherReading) {
   Rng rng(4);
   const ThreeEdges robot(rng);

@@ -64,7 +64,9 @@ class RefinerTest : public testing::Test {
     ASSERT_NE(text.find(from), std::string::npos);
     std::ofstream(rig_ / file) << std::regex_replace(text, std::regex(from), to);
   }
-  Refiner refiner() const { return Refiner(RefinerSettings::load(rig_ / "refiner.yaml")); }
+  Refiner refiner() const {
+    return Refiner(RefinerSettings::load(rig_, RefinerConfig::load(rig_ / "refiner.yaml")));
+  }
   const body_schema_t& proposal_after(std::int64_t sample) const {
     return *std::find_if(proposals_.begin(), proposals_.end(),
                          [&](const auto& p) { return p.last_sample_index == sample; });
@@ -241,13 +243,13 @@ TEST_F(RefinerTest, WhatCannotBeSavedIsPublishedAndCounted) {
   EXPECT_EQ(not_saved, 1);
 }
 
-TEST(RefinerSettings, RefuseAFileThatLeavesNothingToRefine) {
+TEST(RefinerConfig, RefusesAFileThatLeavesNothingToRefine) {
   test::TemporaryFolder folder;
   fs::copy(BODYSCHEMA_CONFIG "/arm2", folder / "rig");
   const std::string text = text_of(folder / "rig" / "refiner.yaml");
   std::ofstream(folder / "rig" / "refiner.yaml")
       << std::regex_replace(text, std::regex("(placements|intrinsics): true"), "$1: false");
-  EXPECT_THROW(RefinerSettings::load(folder / "rig" / "refiner.yaml"), ConfigError);
+  EXPECT_THROW(RefinerConfig::load(folder / "rig" / "refiner.yaml"), ConfigError);
 }
 
 }  // namespace

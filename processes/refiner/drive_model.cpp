@@ -1,0 +1,139 @@
+#include "processes/refiner/drive_model.h"
+
+#include <fmt/format.h>
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <utility>
+
+#include "processes/refiner/part_chain.h"
+
+namespace bodyschema {
+namespace {
+
+/// Variances of the weights of a process of amplitude 1, over the half range (warp_basis()).
+Eigen::ArrayXd spectrum(double length, Eigen::Index size) {
+  const Eigen::ArrayXd omega =
+      Eigen::ArrayXd::LinSpaced(size, 1, static_cast<double>(size)) * M_PI / (2 * kWarpReach);
+  return std::sqrt(2 * M_PI) * length * (-0.5 * (omega * length).square()).exp() / kWarpReach;
+}
+
+/// Standard deviations under which weights are likeliest. Of a process's weights those that its
+/// spectrum makes smaller than kLeastShare of the largest are 0.
+Eigen::VectorXd weight_sd(const std::vector<double>& warp) {
+  constexpr double kLeastShare = 1e-4;
+  const Eigen::ArrayXd w2 =
+      Eigen::Map<const Eigen::ArrayXd>(warp.data(), std::ssize(warp)).square();
+  double best = -std::numeric_limits<double>::infinity();
+  Eigen::VectorXd result;
+  for (const double length : {0.25, 0.4, 0.7}) {  // as estimate_warps()
+    Eigen::ArrayXd variance = spectrum(length, w2.size());
+    const Eigen::Array<bool, Eigen::Dynamic, 1> is_used =
+        variance > kLeastShare * variance.maxCoeff();
+    const double num = static_cast<double>(is_used.count());
+    variance *= std::max((is_used.select(w2 / variance, 0)).sum() / num, 1e-12);
+    const double log_likelihood =
+        -0.5 * is_used.select(variance.log() + w2 / variance, 0).sum() / num;
+    if (log_likelihood <= best) continue;
+    best = log_likelihood;
+    result = is_used.select(variance, 0).sqrt();
+  }
+  return result;
+}
+
+}  // namespace
+
+DriveModel::DriveModel(const BodySchema& schema, JointLoads loads,
+                       const std::vector<RefinerSample>& samples)
+    : schema_(schema), loads_(std::move(loads)) {
+  for (const Edge& edge : schema.edges) {
+    first_joints_[&edge] = static_cast<int>(signals_.size());
+    for (const ScrewJoint& joint : edge.joints) signals_.push_back(joint.signal);
+  }
+  if (loads_) {
+    num_scalars_ = static_cast<int>(signals_.size());
+    find_changing_loads(samples);
+  }
+  if (!std::all_of(schema.edges.begin(), schema.edges.end(), PartChain::has_block)) return;
+  for (std::size_t s = 0; s < schema.signals.size(); ++s) {
+    if (schema.signals[s].warp.empty()) continue;
+    first_weights_[static_cast<int>(s)] = num_scalars_;
+    num_scalars_ += static_cast<int>(schema.signals[s].warp.size());
+  }
+}
+
+void DriveModel::find_changing_loads(const std::vector<RefinerSample>& samples) {
+  Eigen::VectorXd least = loads_(samples.front().sample.action), most = least;
+  for (const RefinerSample& seen : samples) {
+    const Eigen::VectorXd loads = loads_(seen.sample.action);
+    least = least.cwiseMin(loads);
+    most = most.cwiseMax(loads);
+  }
+  constexpr double kLeastShare = 1e-6;
+  const double largest = std::max(most.maxCoeff(), -least.minCoeff());
+  for (int n = 0; n < static_cast<int>(least.size()); ++n)
+    if (most(n) - least(n) > kLeastShare * largest) changing_loads_.push_back(n);
+}
+
+ParameterBlock DriveModel::block() const {
+  ParameterBlock block;
+  block.kind = ParameterBlock::Kind::kDrive;
+  if (loads_) {
+    for (const int signal : signals_) {
+      block.add(0.0);
+      block.names.push_back("compliance of " + schema_.signals.at(signal).name);
+    }
+    block.free = changing_loads_;
+  }
+  const Eigen::VectorXd sd = prior_sd();
+  for (const auto& [signal, first] : first_weights_) {
+    const Signal& bent = schema_.signals[signal];
+    for (std::size_t k = 0; k < bent.warp.size(); ++k) {
+      if (sd(std::ssize(block.values)) > 0)
+        block.free.push_back(static_cast<int>(block.values.size()));
+      block.add(bent.warp[k]);
+      block.names.push_back(fmt::format("bend of {}, term {}", bent.name, k + 1));
+    }
+  }
+  return block;
+}
+
+Eigen::VectorXd DriveModel::displacements(const Eigen::VectorXd& action) const {
+  Eigen::VectorXd theta = schema_.displacements(action);
+  for (const auto& [signal, first] : first_weights_) theta(signal) = action(signal);
+  return theta;
+}
+
+Eigen::MatrixXd DriveModel::effects(const Eigen::VectorXd& action) const {
+  Eigen::MatrixXd effects = Eigen::MatrixXd::Zero(std::ssize(signals_), num_scalars_);
+  if (loads_) effects.leftCols(std::ssize(signals_)).diagonal() = loads_(action);
+  const Eigen::VectorXd x = normalized(schema_.signals, action);
+  for (std::size_t n = 0; n < signals_.size(); ++n) {
+    const auto first = first_weights_.find(signals_[n]);
+    if (first == first_weights_.end()) continue;
+    const int size = static_cast<int>(schema_.signals[signals_[n]].warp.size());
+    effects.row(static_cast<Eigen::Index>(n)).segment(first->second, size) =
+        warp_basis(std::clamp(x(signals_[n]), -1.0, 1.0), size);
+  }
+  return effects;
+}
+
+Eigen::VectorXd DriveModel::prior_sd() const {
+  Eigen::VectorXd sd =
+      Eigen::VectorXd::Constant(num_scalars_, std::numeric_limits<double>::infinity());
+  for (const auto& [signal, first] : first_weights_) {
+    const Eigen::VectorXd of_signal = weight_sd(schema_.signals[signal].warp);
+    sd.segment(first, of_signal.size()) = of_signal;
+  }
+  return sd;
+}
+
+void DriveModel::set_warps(const ParameterBlock& block, BodySchema* schema) const {
+  for (const auto& [signal, first] : first_weights_) {
+    std::vector<double>& warp = schema->signals[signal].warp;
+    std::copy_n(block.values.begin() + first, warp.size(), warp.begin());
+  }
+}
+
+}  // namespace bodyschema

@@ -1,0 +1,235 @@
+// What the refiner's accuracy and cost depend on: joints that give way to gravity, bent commands,
+// the numbers of samples and of parts. Prints Markdown.
+//
+//   refinement_limits elastic [--robots 30]
+//   refinement_limits bend [--robots 30] [--kinds a c]
+//   refinement_limits cost
+
+#include <CLI/CLI.hpp>
+#include <cmath>
+#include <cstdio>
+#include <ctime>
+#include <functional>
+#include <string>
+#include <vector>
+
+#include "common/estimation/quantile.h"
+#include "common/geometry/angle.h"
+#include "processes/refiner/refine.h"
+#include "processes/structure_learner/learn.h"
+#include "tests/experiments/figures/robots.h"
+#include "tests/processes/refiner/tagged_robot.h"
+#include "tests/support/elastic_arm.h"
+
+using namespace bodyschema;
+
+namespace {
+
+/// Off by 5 mm and 1° per axis, 1 σ.
+Pose as_built(const Pose& X, test::Rng& rng) {
+  Vector6d step = test::gaussian6(rng);
+  step.head<3>() *= 0.005;
+  step.tail<3>() *= kDegree;
+  return X * exp(step);
+}
+
+// ---- joints that give way
+
+/// The schema of an arm as built, between base and hand, of which positions alone are seen.
+BodySchema arm_as_built(const test::SyntheticRobot& robot, test::Rng& rng) {
+  const int base = robot.links.front().part, hand = robot.links.back().part;
+  BodySchema schema = test::true_schema(robot);
+  schema.X_CR = robot.X_CR;
+  schema.parts = {base, hand};
+  schema.position_parts = {hand};
+  schema.edges = {robot.true_edge(base, hand)};
+  schema.edges[0].left = as_built(schema.edges[0].left, rng);
+  for (ScrewJoint& joint : schema.edges[0].joints) joint.X_after = as_built(joint.X_after, rng);
+  return schema;
+}
+
+struct ElasticRow {
+  double noise = 0, stiff = 0, elastic = 0, sigmas = 0;  ///< sums of squares
+  int num = 0, num_joints = 0, num_likelier = 0, num_undetermined = 0;
+  double seconds = 0;
+
+  void add(double droop_m, int num_samples, int seed) {
+    test::Rng rng(seed);
+    const test::ElasticArm arm = test::elastic_arm(7, droop_m, rng);
+    const BodySchema built = arm_as_built(arm.robot, rng);
+    constexpr int kHeldOut = 100;
+    auto samples = test::with_positions_alone(test::babble(arm, num_samples + kHeldOut, rng),
+                                              {arm.robot.links.back().part});
+    for (int n = 0; n < kHeldOut; ++n) {
+      ActionPoseSample& sample = samples[num_samples + n];
+      sample.purpose = Purpose::kTest;
+      for (const PartObservation& seen : sample.parts) {
+        noise += seen.covariance.topLeftCorner<3, 3>().trace();
+        ++num;
+      }
+    }
+    RefineOptions options;
+    options.joint_loads = [&](const Eigen::VectorXd& action) {
+      return arm.loads(built.edges[0], action);
+    };
+    const std::clock_t begin = std::clock();
+    const Refinement result = refine(built, refiner_samples(samples), {}, options);
+    seconds += static_cast<double>(std::clock() - begin) / CLOCKS_PER_SEC;
+    const auto squares = [](const Elasticity::Errors& errors) {
+      const PartErrors& part = errors.held_out.at(0);
+      return part.count * part.position_rms_m * part.position_rms_m;
+    };
+    stiff += squares(result.elasticity->stiff);
+    elastic += squares(result.elasticity->elastic);
+    num_likelier += result.elasticity->evidence > 0 ? 1 : 0;
+    num_undetermined += static_cast<int>(result.undetermined.size());
+    for (int d = 0; d < 7; ++d) {
+      const JointCompliance& joint = result.elasticity->joints[d];
+      if (joint.sd == 0) continue;
+      sigmas += std::pow((joint.value - arm.compliance_rad_per_Nm(d)) / joint.sd, 2);
+      ++num_joints;
+    }
+  }
+  void print(double droop_m, int num_samples, int num_robots) const {
+    const auto rms_mm = [&](double sum) { return 1e3 * std::sqrt(sum / num); };
+    std::printf("| %.0f | %d | %d | %.3f | %.3f | %.2f | %.3f | %.2f | %d | %.2f | %d | %.0f |\n",
+                droop_m * 1e3, num_samples, num_robots, rms_mm(noise), rms_mm(stiff),
+                std::sqrt(stiff / noise), rms_mm(elastic), std::sqrt(elastic / noise), num_likelier,
+                std::sqrt(sigmas / std::max(num_joints, 1)), num_undetermined,
+                1e3 * seconds / num_robots);
+    std::fflush(stdout);
+  }
+};
+
+void run_elastic(int num_robots) {
+  std::printf(
+      "Arms of seven joints as built (off by 5 mm and 1° per axis and link), whose hand alone is "
+      "seen, its position alone, in tag noise; joints give way to gravity, the hand by so much at "
+      "most. Rms over robots and 100 held-out samples of observed minus predicted position; "
+      "compliances: rms of their errors in standard deviations; robots where joints that give way "
+      "are likelier than stiff ones (BIC).\n\n"
+      "| droop mm | N | robots | noise mm | stiff mm | stiff / noise | elastic mm | elastic / "
+      "noise "
+      "| likelier | compliances σ | undetermined | ms |\n"
+      "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |\n");
+  for (const auto& [droop_m, num_samples] :
+       {std::pair{0.0, 200}, {0.005, 200}, {0.02, 60}, {0.02, 100}, {0.02, 200}}) {
+    ElasticRow row;
+    for (int seed = 1; seed <= num_robots; ++seed) row.add(droop_m, num_samples, seed);
+    row.print(droop_m, num_samples, num_robots);
+  }
+}
+
+// ---- bent commands
+
+/// Of one kind of robot, straight and bent: robots whose structure was found in both.
+void compare_bend(const std::string& kind, int num_samples, int num_robots) {
+  double squares[2] = {0, 0};
+  int num_right = 0;
+  for (int seed = 1; seed <= num_robots; ++seed) {
+    double errors[2] = {0, 0};
+    bool is_right = true;
+    for (const bool is_bent : {false, true}) {
+      const experiments::Trial trial =
+          experiments::make_trial(kind, test::Regime::kTag, num_samples, seed, is_bent ? 0.1 : 0);
+      const BodySchema schema = learn(trial.robot.signals, trial.samples).schema;
+      is_right = is_right && test::is_right(schema, trial.robot);
+      if (!is_right) break;
+      const auto refined = refine(schema, refiner_samples(trial.samples), {}, {}).schema;
+      errors[is_bent ? 1 : 0] = experiments::end_effector_errors(refined, trial)->position_rms_m;
+    }
+    if (!is_right) continue;
+    ++num_right;
+    for (int k = 0; k < 2; ++k) squares[k] += errors[k] * errors[k];
+  }
+  const auto rms_mm = [&](int k) { return 1e3 * std::sqrt(squares[k] / std::max(num_right, 1)); };
+  std::printf("| %s | %d | %d of %d | %.3f | %.3f | %.2f |\n", kind.c_str(), num_samples, num_right,
+              num_robots, rms_mm(0), rms_mm(1), rms_mm(1) / rms_mm(0));
+  std::fflush(stdout);
+}
+
+void run_bend(const std::vector<std::string>& kinds, int num_robots) {
+  std::printf(
+      "Robots whose joints go to q + 0.1 sin 3q, beside the same whose joints go to q; tag noise, "
+      "learned and refined, rms over robots and test poses of the end effector's position.\n\n"
+      "| robot | N | right | straight mm | bent mm | bent / straight |\n"
+      "| --- | --- | --- | --- | --- | --- |\n");
+  for (const std::string& kind : kinds)
+    for (const int size : {30, 100}) compare_bend(kind, size, num_robots);
+}
+
+// ---- cost
+
+/// Seconds of processor time, the least of three.
+double cost_of(const std::function<void()>& run) {
+  double least = INFINITY;
+  for (int n = 0; n < 3; ++n) {
+    const std::clock_t begin = std::clock();
+    run();
+    least = std::min(least, static_cast<double>(std::clock() - begin) / CLOCKS_PER_SEC);
+  }
+  return least;
+}
+
+void print_cost(int num_parts, int num_samples) {
+  test::Rng rng(1);
+  test::RandomTreeOptions tree;
+  tree.num_parts = num_parts;
+  tree.num_hidden = 1;
+  const test::SyntheticRobot robot = test::random_tree(tree, rng);
+  BodySchema schema = test::true_schema(robot);
+  schema.X_CR = robot.X_CR;
+  RefineOptions poses;
+  poses.config.max_samples = 100'000;
+  const auto samples = refiner_samples(test::babble(
+      robot, num_samples, {.regime = test::Regime::kTag, .with_covariances = true}, rng));
+  int num_iterations = 0;
+  const double of_poses =
+      cost_of([&] { num_iterations = refine(schema, samples, {}, poses).num_iterations; });
+  RefineOptions corners = poses;
+  corners.placements = corners.intrinsics = true;
+  const test::TaggedRobot tagged = test::tagged(robot, 2, rng);
+  const RigCalibration claimed = test::claimed(tagged, {.tags = {5e-4, 0.3 * kDegree, 3e-3}}, rng);
+  const auto seen = test::seen_corners(tagged, claimed, num_samples, 0.05, rng);
+  int num_corner_iterations = 0;
+  const double of_corners = cost_of(
+      [&] { num_corner_iterations = refine(schema, seen, claimed, corners).num_iterations; });
+  std::printf("| %d | %d | %.0f | %d | %.2f | %.0f | %d | %.2f |\n", num_parts, num_samples,
+              1e3 * of_poses, num_iterations, 1e3 * of_poses / num_iterations / num_samples,
+              1e3 * of_corners, num_corner_iterations,
+              1e3 * of_corners / num_corner_iterations / num_samples);
+  std::fflush(stdout);
+}
+
+void run_cost() {
+  std::printf(
+      "Random trees from the true structure, processor time of one core, the least of three; "
+      "poses, "
+      "and corners of two tags a part with placements and intrinsics. With all parts of the "
+      "answer, "
+      "also the wanted actions.\n\n"
+      "| parts | N | poses ms | iterations | ms / (iteration · N) | corners ms | iterations | ms / "
+      "(iteration · N) |\n"
+      "| --- | --- | --- | --- | --- | --- | --- | --- |\n");
+  for (const int num_samples : {50, 100, 200, 400}) print_cost(8, num_samples);
+  for (const int num_parts : {4, 16, 32}) print_cost(num_parts, 100);
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+  CLI::App app("what the refiner's accuracy and cost depend on");
+  app.require_subcommand(1);
+  int num_robots = 30;
+  CLI::App* elastic = app.add_subcommand("elastic", "joints that give way to gravity");
+  elastic->add_option("--robots", num_robots);
+  CLI::App* bend = app.add_subcommand("bend", "bent commands");
+  bend->add_option("--robots", num_robots);
+  std::vector<std::string> kinds = {"a", "c"};
+  bend->add_option("--kinds", kinds, "chapter_robot()");
+  CLI::App* cost = app.add_subcommand("cost", "against samples and parts");
+  CLI11_PARSE(app, argc, argv);
+  if (*elastic) run_elastic(num_robots);
+  if (*bend) run_bend(kinds, num_robots);
+  if (*cost) run_cost();
+}

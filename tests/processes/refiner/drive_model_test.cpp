@@ -1,0 +1,92 @@
+#include "processes/refiner/drive_model.h"
+
+#include <gtest/gtest.h>
+
+#include <cmath>
+
+#include "processes/structure_learner/learn.h"
+#include "tests/experiments/figures/robots.h"
+
+namespace bodyschema {
+namespace {
+
+using test::Rng;
+
+/// Three signals, the second one bent; it moves two of the four joints.
+BodySchema bent_schema(Rng& rng) {
+  BodySchema schema;
+  schema.parts = {1, 2, 3};
+  schema.root = 1;
+  schema.signals = {{"q1", -1, 1}, {"q2", -2, 1}, {"q3", 0, 1}};
+  schema.signals[1].warp = {0.1, -0.05, 0.02, 0.001};
+  schema.edges = {test::random_edge(1, 2, {0, 1}, rng), test::random_edge(2, 3, {1, 2}, rng)};
+  return schema;
+}
+
+TEST(DriveModel, GoesWithItsWeightsWhereTheSchemaGoes) {
+  Rng rng(1);
+  const BodySchema schema = bent_schema(rng);
+  const DriveModel model(schema, nullptr, {});
+  const ParameterBlock block = model.block();
+  ASSERT_EQ(block.values.size(), 4U);
+  EXPECT_EQ(block.names.at(1), "bend of q2, term 2");
+  const Eigen::Map<const Eigen::VectorXd> weights(block.values.data(), 4);
+  for (const double q2 : {-3.0, -2.0, -0.4, 0.9, 1.5}) {  // also beyond its limits
+    const Eigen::Vector3d action(0.3, q2, 0.7);
+    const Eigen::VectorXd theta = model.displacements(action);
+    EXPECT_EQ(theta, action);
+    const Eigen::VectorXd more = model.effects(action) * weights;
+    const Eigen::VectorXd bent = schema.displacements(action);
+    EXPECT_EQ(more(0), 0);
+    EXPECT_NEAR(theta(1) + more(1), bent(1), 1e-12);
+    EXPECT_NEAR(theta(1) + more(2), bent(1), 1e-12);
+    EXPECT_EQ(more(3), 0);
+  }
+  EXPECT_EQ(model.first_joints().at(&schema.edges[1]), 2);
+}
+
+TEST(DriveModel, PutsWeightsAfterCompliances) {
+  Rng rng(2);
+  const BodySchema schema = bent_schema(rng);
+  const JointLoads loads = [](const Eigen::VectorXd& action) {
+    return Eigen::Vector4d(1, action(0), 2, 3 * action(2));
+  };
+  std::vector<RefinerSample> samples(2);
+  samples[0].sample.action = Eigen::Vector3d(0, 0, 0);
+  samples[1].sample.action = Eigen::Vector3d(1, 1, 1);
+  const DriveModel model(schema, loads, samples);
+  ParameterBlock block = model.block();
+  EXPECT_EQ(block.names.at(3), "compliance of q3");
+  EXPECT_EQ(block.free, (std::vector<int>{1, 3, 4, 5, 6, 7}));
+  const Eigen::VectorXd sd = model.prior_sd();
+  EXPECT_TRUE(std::isinf(sd(3)));
+  EXPECT_GT(sd(4), sd(7));
+  EXPECT_GT(sd(7), 0);
+  EXPECT_EQ(model.effects(samples[1].sample.action).topLeftCorner(4, 4).diagonal(),
+            Eigen::Vector4d(1, 1, 2, 3));
+  block.values[5] = 0.5;
+  BodySchema moved = schema;
+  model.set_warps(block, &moved);
+  EXPECT_EQ(moved.signals[1].warp, (std::vector<double>{0.1, 0.5, 0.02, 0.001}));
+}
+
+TEST(DriveModel, RefinesBentCommandsWithTheRest) {
+  double learned_squares = 0, refined_squares = 0;
+  for (int seed = 1; seed <= 3; ++seed) {
+    const auto trial = experiments::make_trial("a", test::Regime::kTag, 60, seed, 0.1);
+    const BodySchema learned = learn(trial.robot.signals, trial.samples).schema;
+    ASSERT_TRUE(test::is_right(learned, trial.robot));
+    const Refinement result = refine(learned, refiner_samples(trial.samples), {}, {});
+    EXPECT_TRUE(result.held.empty());
+    EXPECT_TRUE(result.undetermined.empty());
+    const auto rms = [&](const BodySchema& schema) {
+      return experiments::end_effector_errors(schema, trial)->position_rms_m;
+    };
+    learned_squares += std::pow(rms(learned), 2);
+    refined_squares += std::pow(rms(result.schema), 2);
+  }
+  EXPECT_LT(refined_squares, 0.7 * learned_squares);
+}
+
+}  // namespace
+}  // namespace bodyschema
