@@ -169,6 +169,8 @@ std::vector<SoftCandidate> soft_candidates(std::vector<OpenPair> pairs,
   if (pairs.size() > kPairsTried) pairs.resize(kPairsTried);
   std::optional<PlausibleScrews> plausible;
   if (is_noise_guessed) plausible = plausible_screws(pairs, samples, actions, options, found);
+  // In a stream, what passes for rigid moves so little that only a process tells how.
+  if (plausible && plausible->signals.empty() && actions.blocks().is_stream()) plausible.reset();
   std::vector<SoftCandidate> result;
   for (const OpenPair& o : pairs) {
     if (!std::isfinite(o.cost)) continue;
@@ -244,7 +246,7 @@ void connect_soft_parts(const std::vector<ActionPoseSample>& samples,
   for (auto& [between, pairs] : open)
     if (!undecided.contains(between))
       std::ranges::move(soft_candidates(std::move(pairs), samples, actions, options,
-                                        is_noise_guessed && !is_stream, found),
+                                        is_noise_guessed, found),
                         std::back_inserter(candidates));
   const auto rank = [](const SoftCandidate& c) {
     return std::tuple(c.num_needed, -c.model.score, c.model.part_i, c.model.part_j);
