@@ -304,6 +304,46 @@ Edge from_message(const schema_edge_t& message) {
   return edge;
 }
 
+signal_t to_message(const Signal& signal) {
+  signal_t message{};
+  message.signal_name = signal.name;
+  message.lower_limit = signal.lower;
+  message.upper_limit = signal.upper;
+  set_array(message.num_warp, message.warp_weights, signal.warp);
+  return message;
+}
+
+unconnected_part_t to_message(const UnconnectedPart& part) {
+  unconnected_part_t message{};
+  message.unconnected_part = part.part;
+  message.reason = static_cast<std::int8_t>(part.reason);
+  message.detail = part.detail;
+  return message;
+}
+
+body_change_t to_message(const KnownChange& change) {
+  body_change_t message{};
+  message.found_sample = change.found;
+  message.since_sample = change.since;
+  return message;
+}
+
+moved_tag_t to_message(const MovedTag& tag) {
+  moved_tag_t message{};
+  message.moved_tag_id = tag.tag;
+  message.moved_found_sample = tag.found;
+  message.moved_since_sample = tag.since;
+  message.moved_until_sample = tag.until;
+  return message;
+}
+
+template <class T>
+auto to_messages(const std::vector<T>& all) {
+  std::vector<decltype(to_message(all[0]))> messages;
+  for (const T& each : all) messages.push_back(to_message(each));
+  return messages;
+}
+
 }  // namespace
 
 body_schema_t to_message(const BodySchema& schema) {
@@ -323,18 +363,8 @@ body_schema_t to_message(const BodySchema& schema) {
   message.root_part = schema.root;
   message.X_CR = to_message(schema.X_CR);
   to_message(schema.X_CR_covariance, message.X_CR_covariance);
-  std::vector<signal_t> signals;
-  for (const Signal& signal : schema.signals) {
-    signal_t& out = signals.emplace_back();
-    out.signal_name = signal.name;
-    out.lower_limit = signal.lower;
-    out.upper_limit = signal.upper;
-    set_array(out.num_warp, out.warp_weights, signal.warp);
-  }
-  set_array(message.num_signals, message.signals, std::move(signals));
-  std::vector<schema_edge_t> edges;
-  for (const Edge& edge : schema.edges) edges.push_back(to_message(edge));
-  set_array(message.num_edges, message.edges, std::move(edges));
+  set_array(message.num_signals, message.signals, to_messages(schema.signals));
+  set_array(message.num_edges, message.edges, to_messages(schema.edges));
   std::vector<part_frame_t> frames;
   for (const auto& [part, covariance] : schema.frame_covariances) {
     part_frame_t& out = frames.emplace_back();
@@ -342,33 +372,12 @@ body_schema_t to_message(const BodySchema& schema) {
     to_message(covariance, out.frame_covariance);
   }
   set_array(message.num_frames, message.frames, std::move(frames));
-  std::vector<unconnected_part_t> unconnected;
-  for (const UnconnectedPart& part : schema.unconnected) {
-    unconnected_part_t& out = unconnected.emplace_back();
-    out.unconnected_part = part.part;
-    out.reason = static_cast<std::int8_t>(part.reason);
-    out.detail = part.detail;
-  }
-  set_array(message.num_unconnected, message.unconnected, std::move(unconnected));
+  set_array(message.num_unconnected, message.unconnected, to_messages(schema.unconnected));
   set_array(
       message.num_undecided, message.undecided_signals,
       std::vector<std::int32_t>(schema.undecided_signals.begin(), schema.undecided_signals.end()));
-  std::vector<body_change_t> changes;
-  for (const KnownChange& change : schema.changes) {
-    body_change_t& out = changes.emplace_back();
-    out.found_sample = change.found;
-    out.since_sample = change.since;
-  }
-  set_array(message.num_changes, message.changes, std::move(changes));
-  std::vector<moved_tag_t> moved_tags;
-  for (const MovedTag& tag : schema.moved_tags) {
-    moved_tag_t& out = moved_tags.emplace_back();
-    out.moved_tag_id = tag.tag;
-    out.moved_found_sample = tag.found;
-    out.moved_since_sample = tag.since;
-    out.moved_until_sample = tag.until;
-  }
-  set_array(message.num_moved_tags, message.moved_tags, std::move(moved_tags));
+  set_array(message.num_changes, message.changes, to_messages(schema.changes));
+  set_array(message.num_moved_tags, message.moved_tags, to_messages(schema.moved_tags));
   message.noise_position_m = schema.noise.position_m;
   message.noise_rotation_rad = schema.noise.rotation_rad;
   return message;

@@ -190,6 +190,22 @@ bool LogReader::next_recorded() {
   }
 }
 
+/// If no event follows, the next event or the length of this one is damaged; a damaged length
+/// would swallow whole events. A checksum decides it.
+LogReader::Found LogReader::look_behind(std::int64_t end) {
+  std::array<std::uint8_t, 4> next{};
+  if (::fseeko(file_, end, SEEK_SET) != 0) return Found::kTruncated;
+  const std::size_t next_read = std::fread(next.data(), 1, next.size(), file_);
+  if (!std::equal(next.begin(), next.begin() + next_read, kSyncBytes.begin())) {
+    const auto inside = find_event(position_ + static_cast<std::int64_t>(kHeaderSize));
+    if (inside && *inside < end) return Found::kDamaged;
+  }
+  if (::fseeko(file_, position_ + static_cast<std::int64_t>(kHeaderSize), SEEK_SET) != 0) {
+    return Found::kTruncated;
+  }
+  return Found::kEvent;
+}
+
 LogReader::Found LogReader::read_event(bool looks_behind) {
   std::array<std::uint8_t, kHeaderSize> header;
   const std::size_t header_read = std::fread(header.data(), 1, header.size(), file_);
@@ -223,19 +239,8 @@ LogReader::Found LogReader::read_event(bool looks_behind) {
 
   const auto event_number = read_big_endian<std::uint64_t>(&header[kChecksum]);
   const auto checksum = static_cast<std::uint32_t>(event_number >> 32);
-  // If no event follows, the next event or the length of this one is damaged; a damaged length
-  // would swallow whole events. A checksum decides it.
   if (looks_behind && checksum == 0 && end < file_size) {
-    std::array<std::uint8_t, 4> next{};
-    if (::fseeko(file_, end, SEEK_SET) != 0) return Found::kTruncated;
-    const std::size_t next_read = std::fread(next.data(), 1, next.size(), file_);
-    if (!std::equal(next.begin(), next.begin() + next_read, kSyncBytes.begin())) {
-      const auto inside = find_event(position_ + static_cast<std::int64_t>(kHeaderSize));
-      if (inside && *inside < end) return Found::kDamaged;
-    }
-    if (::fseeko(file_, position_ + static_cast<std::int64_t>(kHeaderSize), SEEK_SET) != 0) {
-      return Found::kTruncated;
-    }
+    if (const Found behind = look_behind(end); behind != Found::kEvent) return behind;
   }
 
   event_.event_number = static_cast<std::uint32_t>(event_number);

@@ -110,6 +110,7 @@ class LogReader {
   enum class Found { kEvent, kEnd, kTruncated, kDamaged, kWrongChecksum };
   bool next_recorded();
   Found read_event(bool looks_behind);
+  Found look_behind(std::int64_t end);
   std::optional<std::int64_t> find_event(std::int64_t from);
 
   std::filesystem::path path_;

@@ -7,6 +7,16 @@
 
 namespace bodyschema {
 
+/// BFGS: after a step `s` the gradient is larger by `y`. An empty Hessian is begun.
+static void update(const Eigen::VectorXd& s, const Eigen::VectorXd& y, Eigen::MatrixXd* hessian) {
+  const double curvature = s.dot(y);
+  if (!(curvature > 1e-10 * s.norm() * y.norm())) return;
+  if (hessian->size() == 0)
+    *hessian = y.squaredNorm() / curvature * Eigen::MatrixXd::Identity(s.size(), s.size());
+  const Eigen::VectorXd Bs = *hessian * s;
+  *hessian += y * y.transpose() / curvature - Bs * Bs.transpose() / s.dot(Bs);
+}
+
 BoxMinimum minimize_in_box(const Objective& objective, const Eigen::VectorXd& start,
                            const Eigen::VectorXd& lower, const Eigen::VectorXd& upper,
                            double tolerance, double max_step, int max_iterations) {
@@ -56,14 +66,7 @@ BoxMinimum minimize_in_box(const Objective& objective, const Eigen::VectorXd& st
     if (!is_lower) break;
     value = objective(x, &next_gradient);
     if (!next_gradient.allFinite()) break;
-    const Eigen::VectorXd s = x - best.x, y = next_gradient - gradient;
-    const double curvature = s.dot(y);
-    if (curvature > 1e-10 * s.norm() * y.norm()) {
-      if (hessian.size() == 0)
-        hessian = y.squaredNorm() / curvature * Eigen::MatrixXd::Identity(n, n);
-      const Eigen::VectorXd Bs = hessian * s;
-      hessian += y * y.transpose() / curvature - Bs * Bs.transpose() / s.dot(Bs);
-    }
+    update(x - best.x, next_gradient - gradient, &hessian);
     best.x = x;
     best.value = value;
     gradient = next_gradient;

@@ -109,6 +109,68 @@ ToolChanger load_tool_changer(const Yaml& yaml, const std::vector<std::string>& 
   return changer;
 }
 
+/// All links and their joints. Returns the links' names.
+std::vector<std::string> load_links(const Yaml& yaml, const Servo& servo, const Signals& signals,
+                                    Robot* robot) {
+  std::vector<std::string> names{"world"};
+  std::set<std::string> joint_names;
+  std::set<int> driving;
+  for (const Yaml& item : yaml.list("links")) {
+    Link link;
+    link.name = item.text("name");
+    link.parent = item.choice("parent", names);
+    if (std::find(names.begin(), names.end(), link.name) != names.end()) {
+      throw item.error("name", "this name stands twice");
+    }
+    names.push_back(link.name);
+    link.X_PL = pose_or_identity(item, "X_PL");
+    if (item.has("joint")) {
+      const Yaml section = item.section("joint");
+      robot->joints.push_back(load_joint(section, servo, signals));
+      if (!joint_names.insert(robot->joints.back().name).second) {
+        throw section.error("name", "this name stands twice");
+      }
+      driving.insert(robot->joints.back().signal);
+      link.joint = static_cast<int>(robot->joints.size()) - 1;
+    }
+    double mass_kg = 0;
+    for (const Yaml& shape : item.list("shapes")) {
+      link.shapes.push_back(load_shape(shape));
+      mass_kg += link.shapes.back().mass_kg;
+    }
+    if (link.joint && mass_kg <= 0) throw item.error("shapes", "a moving link needs a mass");
+    robot->links.push_back(std::move(link));
+  }
+  for (std::size_t i = 0; i < signals.signals.size(); ++i) {
+    if (!driving.contains(static_cast<int>(i))) {
+      throw yaml.error("links", "no joint is driven by signal " + signals.signals[i].name);
+    }
+  }
+  return {names.begin() + 1, names.end()};
+}
+
+/// Where the parts are. Returns their numbers, which ascend.
+std::vector<int> load_parts(const Yaml& yaml, const Markers& markers,
+                            const std::vector<std::string>& link_names, Robot* robot) {
+  for (const Yaml& item : yaml.list("parts")) {
+    PartPlacement part;
+    part.part = static_cast<int>(item.integer("part", 0, 9999));
+    const std::string link = item.choice("link", link_names);
+    part.link = static_cast<int>(std::find(link_names.begin(), link_names.end(), link) -
+                                 link_names.begin());
+    part.X_LB = item.pose("X_LB");
+    robot->parts.push_back(part);
+  }
+  std::stable_sort(robot->parts.begin(), robot->parts.end(),
+                   [](const auto& a, const auto& b) { return a.part < b.part; });
+  std::vector<int> parts;
+  for (const PartPlacement& part : robot->parts) parts.push_back(part.part);
+  if (parts != markers.parts()) {
+    throw yaml.error("parts", "must be the parts of markers.yaml, each once");
+  }
+  return parts;
+}
+
 }  // namespace
 
 Eigen::VectorXd Robot::joint_positions(const Eigen::VectorXd& action) const {
@@ -160,58 +222,8 @@ Robot load_robot(const std::filesystem::path& rig_folder, const Signals& signals
     }
   }
 
-  std::vector<std::string> names{"world"};
-  std::set<std::string> joint_names;
-  std::set<int> driving;
-  for (const Yaml& item : yaml.list("links")) {
-    Link link;
-    link.name = item.text("name");
-    link.parent = item.choice("parent", names);
-    if (std::find(names.begin(), names.end(), link.name) != names.end()) {
-      throw item.error("name", "this name stands twice");
-    }
-    names.push_back(link.name);
-    link.X_PL = pose_or_identity(item, "X_PL");
-    if (item.has("joint")) {
-      const Yaml section = item.section("joint");
-      robot.joints.push_back(load_joint(section, servo, signals));
-      if (!joint_names.insert(robot.joints.back().name).second) {
-        throw section.error("name", "this name stands twice");
-      }
-      driving.insert(robot.joints.back().signal);
-      link.joint = static_cast<int>(robot.joints.size()) - 1;
-    }
-    double mass_kg = 0;
-    for (const Yaml& shape : item.list("shapes")) {
-      link.shapes.push_back(load_shape(shape));
-      mass_kg += link.shapes.back().mass_kg;
-    }
-    if (link.joint && mass_kg <= 0) throw item.error("shapes", "a moving link needs a mass");
-    robot.links.push_back(std::move(link));
-  }
-  for (std::size_t i = 0; i < signals.signals.size(); ++i) {
-    if (!driving.contains(static_cast<int>(i))) {
-      throw yaml.error("links", "no joint is driven by signal " + signals.signals[i].name);
-    }
-  }
-
-  const std::vector<std::string> link_names(names.begin() + 1, names.end());
-  for (const Yaml& item : yaml.list("parts")) {
-    PartPlacement part;
-    part.part = static_cast<int>(item.integer("part", 0, 9999));
-    const std::string link = item.choice("link", link_names);
-    part.link = static_cast<int>(std::find(link_names.begin(), link_names.end(), link) -
-                                 link_names.begin());
-    part.X_LB = item.pose("X_LB");
-    robot.parts.push_back(part);
-  }
-  std::stable_sort(robot.parts.begin(), robot.parts.end(),
-                   [](const auto& a, const auto& b) { return a.part < b.part; });
-  std::vector<int> parts;
-  for (const PartPlacement& part : robot.parts) parts.push_back(part.part);
-  if (parts != markers.parts()) {
-    throw yaml.error("parts", "must be the parts of markers.yaml, each once");
-  }
+  const std::vector<std::string> link_names = load_links(yaml, servo, signals, &robot);
+  const std::vector<int> parts = load_parts(yaml, markers, link_names, &robot);
 
   robot.markers.family = markers.family;
   robot.markers.tags = load_tags(yaml);

@@ -174,6 +174,23 @@ bool Capture::sleep(const std::stop_token& stop, std::int64_t duration_us) {
   return !stop.stop_requested();
 }
 
+void Capture::hand_on(const cv::Mat& frame, std::int64_t utime) {
+  try {
+    on_frame_(frame, utime);
+  } catch (const std::invalid_argument& refusal) {
+    // A camera that came back with another mode may change it again.
+    const std::lock_guard lock(mutex_);
+    ++state_.num_refused;
+    state_.phase = Phase::kLost;
+    state_.text = "refuses the frames of " + config_.device + ": " + refusal.what();
+    return;
+  }
+  const std::lock_guard lock(mutex_);
+  ++state_.num_frames;
+  if (state_.phase != Phase::kRunning) state_.text = "captures " + config_.device;
+  state_.phase = Phase::kRunning;
+}
+
 void Capture::run(const std::stop_token& stop) {
   const SourceKind kind = kind_of(config_.device);
   const bool is_recording = kind == SourceKind::kFile || kind == SourceKind::kSequence;
@@ -202,20 +219,7 @@ void Capture::run(const std::stop_token& stop) {
       }
       due_us = std::max(due_us + period_us, clock_us());
       retry_us = kFirstRetry_us;
-      try {
-        on_frame_(frame, utime);
-      } catch (const std::invalid_argument& refusal) {
-        // A camera that came back with another mode may change it again.
-        const std::lock_guard lock(mutex_);
-        ++state_.num_refused;
-        state_.phase = Phase::kLost;
-        state_.text = "refuses the frames of " + config_.device + ": " + refusal.what();
-        continue;
-      }
-      const std::lock_guard lock(mutex_);
-      ++state_.num_frames;
-      if (state_.phase != Phase::kRunning) state_.text = "captures " + config_.device;
-      state_.phase = Phase::kRunning;
+      hand_on(frame, utime);
       continue;
     }
     if (is_recording) {

@@ -52,6 +52,7 @@ class Capture {
 
  private:
   void run(const std::stop_token& stop);
+  void hand_on(const cv::Mat& frame, std::int64_t utime);
   bool sleep(const std::stop_token& stop, std::int64_t duration_us);
   void set_phase(Phase phase, const std::string& text);
 

@@ -12,6 +12,27 @@
 
 namespace bodyschema::corner_fit {
 
+constexpr int kNumNodes = 6;
+
+/// Chebyshev's k-th point along so many points of a lattice.
+static double node(int k, int size) {
+  return 0.5 * (size - 1) * (1 - std::cos((k + 0.5) * M_PI / kNumNodes));
+}
+
+/// Row p: Lagrange's polynomials at the p-th of so many points of a lattice.
+static Eigen::Matrix<double, Eigen::Dynamic, kNumNodes> lagrange(int size) {
+  Eigen::Matrix<double, Eigen::Dynamic, kNumNodes> W(size, kNumNodes);
+  for (int p = 0; p < size; ++p) {
+    for (int k = 0; k < kNumNodes; ++k) {
+      W(p, k) = 1;
+      for (int m = 0; m < kNumNodes; ++m) {
+        if (m != k) W(p, k) *= (p - node(m, size)) / (node(k, size) - node(m, size));
+      }
+    }
+  }
+  return W;
+}
+
 void Refiner::make_lattice(const cv::Rect& region, int block_px) {
   block_px_ = block_px;
   origin_ = {region.x / block_px * block_px, region.y / block_px * block_px};
@@ -25,11 +46,8 @@ void Refiner::make_lattice(const cv::Rect& region, int block_px) {
   };
   // Inverting a lens takes iterations, but over a tag it is smooth: a polynomial of the fifth
   // degree in either direction, through Chebyshev's points.
-  constexpr int n = 6;
+  constexpr int n = kNumNodes;
   Eigen::Matrix<double, n, n> x, y;
-  std::array<double, n> share;
-  for (int k = 0; k < n; ++k) share[k] = 1 - std::cos((k + 0.5) * M_PI / n);
-  const auto node = [&](int k, int size) { return 0.5 * (size - 1) * share[k]; };
   bool is_smooth = true;
   for (int j = 0; j < n; ++j) {
     for (int i = 0; i < n; ++i) {
@@ -41,21 +59,9 @@ void Refiner::make_lattice(const cv::Rect& region, int block_px) {
       }
     }
   }
-  // Row p: Lagrange's polynomials at the p-th point of the lattice.
-  const auto weights = [&](int size) {
-    Eigen::Matrix<double, Eigen::Dynamic, n> W(size, n);
-    for (int p = 0; p < size; ++p) {
-      for (int k = 0; k < n; ++k) {
-        W(p, k) = 1;
-        for (int m = 0; m < n; ++m) {
-          if (m != k) W(p, k) *= (p - node(m, size)) / (node(k, size) - node(m, size));
-        }
-      }
-    }
-    return W;
-  };
   if (is_smooth) {
-    const Eigen::Matrix<double, Eigen::Dynamic, n> along_u = weights(cols), along_v = weights(rows);
+    const Eigen::Matrix<double, Eigen::Dynamic, n> along_u = lagrange(cols),
+                                                   along_v = lagrange(rows);
     const Eigen::MatrixXd all_x = along_v * x * along_u.transpose();
     const Eigen::MatrixXd all_y = along_v * y * along_u.transpose();
     // In a corner of the lattice, where the error is largest.
@@ -149,6 +155,62 @@ std::optional<Refiner::BlockMap> Refiner::map_of_block(int bu, int bv,
   return c;
 }
 
+namespace {
+
+int stride_of(Pixels pixels) {
+  if (pixels.grid == Pixels::Grid::kLattice) return pixels.spacing;
+  return pixels.grid == Pixels::Grid::kAll ? 1 : 2;
+}
+
+/// The first pixel of line v that a look visits, from u0 on.
+int first_u(Pixels pixels, int u0, int v) {
+  if (pixels.grid == Pixels::Grid::kHalf) return u0 + v % 2;
+  if (pixels.grid != Pixels::Grid::kLattice) return u0;
+  const auto past =
+      static_cast<int>((u0 + static_cast<std::int64_t>(pixels.offset) * v) % pixels.spacing);
+  return past == 0 ? u0 : u0 + pixels.spacing - past;
+}
+
+void count_saturated(float print, uchar pixel, Sums& sums) {
+  if (print > 0.9F) {
+    ++sums.num_white;
+    sums.num_saturated_white += pixel == 255;
+  } else if (print < 0.1F) {
+    ++sums.num_black;
+    sums.num_saturated_black += pixel == 0;
+  }
+}
+
+/// By the distances from the outline's sides.
+void count_sides(const std::array<float, 4>& distances, bool is_covered, Sums& sums) {
+  for (int side = 0; side < 4; ++side) {
+    const bool is_near = std::abs(distances[side]) < 0.5F;
+    sums.side_seen[side] += is_near;
+    sums.side_covered[side] += is_near && is_covered;
+  }
+}
+
+/// Shares of a pixel's row: of the weight, and with it of what light and ink make of a pixel.
+struct Weighted {
+  float weight, bright, ink, contrast;
+};
+
+/// The residual `r` and its derivatives, weighted. `a`: cells per pixel; `at`: place on the tag;
+/// `g`: gradient there.
+inline Row row_of(const Smoothed& m, const Eigen::Matrix2f& a, const Eigen::Vector2f& at,
+                  const Eigen::Vector2f& g, const Weighted& w, float r) {
+  const float X = at.x(), Y = at.y(), gx = g.x(), gy = g.y(), both = gx * X + gy * Y;
+  const float a00 = a(0, 0), a01 = a(0, 1), a10 = a(1, 0), a11 = a(1, 1);
+  return {Lane{-gx * X, -gx * Y, -gx, -gy * X}, Lane{-gy * Y, -gy, both * X, both * Y},
+          Lane{w.bright, w.bright * m.m, w.ink * X, w.ink * Y},
+          Lane{w.contrast * (0.5F * (a00 * a00 * m.xx + a10 * a10 * m.yy) + a00 * a10 * m.xy),
+               w.contrast * (a00 * a01 * m.xx + a10 * a11 * m.yy + (a00 * a11 + a01 * a10) * m.xy),
+               w.contrast * (0.5F * (a01 * a01 * m.xx + a11 * a11 * m.yy) + a01 * a11 * m.xy),
+               w.weight * r}};
+}
+
+}  // namespace
+
 // One loop, though long: what it needs of the block stays in registers.
 void Refiner::look_at_block(int bu, int bv, const Eigen::Matrix3d& to_tag, double robust_cut,
                             Pixels pixels, std::vector<Row>& rows, Sums& sums) const {
@@ -166,9 +228,8 @@ void Refiner::look_at_block(int bu, int bv, const Eigen::Matrix3d& to_tag, doubl
   const auto width = static_cast<float>(cells_.width);
   const float high_limit[2] = {width - low_limit[0], width - low_limit[1]};
 
-  const float a00 = static_cast<float>(A(0, 0)), a01 = static_cast<float>(A(0, 1));
-  const float a10 = static_cast<float>(A(1, 0)), a11 = static_cast<float>(A(1, 1));
   const Eigen::Matrix<float, kLight, 1> light = model_.light.cast<float>();
+  const Eigen::Matrix2f a = A.cast<float>();
   const auto cut = static_cast<float>(robust_cut);
   const float inverse_half = static_cast<float>(1 / half_border_);
   const float gradient_scale = static_cast<float>(half_border_);
@@ -178,14 +239,7 @@ void Refiner::look_at_block(int bu, int bv, const Eigen::Matrix3d& to_tag, doubl
   const int u1 = std::min(u0 + block_px_, grey_.cols), v1 = std::min(v0 + block_px_, grey_.rows);
   const auto first = static_cast<float>(0.5 - half_px), per_half = static_cast<float>(1 / half_px);
   const bool is_lattice = pixels.grid == Pixels::Grid::kLattice;
-  const int stride = is_lattice ? pixels.spacing : pixels.grid == Pixels::Grid::kAll ? 1 : 2;
-  const auto first_u = [&](int v) {
-    if (pixels.grid == Pixels::Grid::kHalf) return u0 + v % 2;
-    if (!is_lattice) return u0;
-    const auto past =
-        static_cast<int>((u0 + static_cast<std::int64_t>(pixels.offset) * v) % stride);
-    return past == 0 ? u0 : u0 + stride - past;
-  };
+  const int stride = stride_of(pixels);
   // An eleventh of an edge's steepest slope: pixels with less hold 1 % of its information.
   const float least_gradient2 = std::pow(0.035F / smooth.widest(), 2.0F);
   rows.clear();
@@ -196,7 +250,7 @@ void Refiner::look_at_block(int bu, int bv, const Eigen::Matrix3d& to_tag, doubl
     const uchar* line = grey_.ptr<uchar>(v);
     if (pixels.grid == Pixels::Grid::kQuarter && v % 2) continue;
     // A block begins at an even pixel.
-    for (int u = first_u(v); u < u1; u += stride) {
+    for (int u = first_u(pixels, u0, v); u < u1; u += stride) {
       const float s = (static_cast<float>(u - u0) + first) * per_half;
       const float x = k[0].x() + s * (k[1].x() + s * k[2].x());
       const float y = k[0].y() + s * (k[1].y() + s * k[2].y());
@@ -215,13 +269,7 @@ void Refiner::look_at_block(int bu, int bv, const Eigen::Matrix3d& to_tag, doubl
       const float ink = light[0] + light[1] * m.m;
       const float expected = bright * ink;
       const uchar pixel = line[u];
-      if (m.m > 0.9F) {
-        ++sums.num_white;
-        sums.num_saturated_white += pixel == 255;
-      } else if (m.m < 0.1F) {
-        ++sums.num_black;
-        sums.num_saturated_black += pixel == 0;
-      }
+      count_saturated(m.m, pixel, sums);
       if ((pixel == 255 && expected > 254.5F) || (pixel == 0 && expected < 0.5F)) continue;
       const float r = static_cast<float>(pixel) - std::clamp(expected, 0.0F, 255.0F);
       float weight = 1;
@@ -229,26 +277,14 @@ void Refiner::look_at_block(int bu, int bv, const Eigen::Matrix3d& to_tag, doubl
       const bool is_covered = std::abs(r) > cut;
       if (is_covered) weight = cut / std::abs(r);
       sums.num_covered += is_covered && !is_flat;
-      const float sides[4] = {std::abs(y - border_high), std::abs(x - border_high),
-                              std::abs(y - border_low), std::abs(x - border_low)};
-      for (int side = 0; side < 4; ++side) {
-        sums.side_seen[side] += sides[side] < 0.5F;
-        sums.side_covered[side] += sides[side] < 0.5F && is_covered;
-      }
+      count_sides({y - border_high, x - border_high, y - border_low, x - border_low}, is_covered,
+                  sums);
       if (expected < 0 || expected > 255) continue;
       sums.num_pixels += weight * weight;
       sums.absolute += weight * std::abs(r);
-      const float gx = weight * contrast * m.x * gradient_scale;
-      const float gy = weight * contrast * m.y * gradient_scale;
-      const float both = gx * X + gy * Y;
       const float wc = weight * contrast;
-      rows.push_back(
-          {Lane{-gx * X, -gx * Y, -gx, -gy * X}, Lane{-gy * Y, -gy, both * X, both * Y},
-           Lane{weight * bright, weight * bright * m.m, weight * ink * X, weight * ink * Y},
-           Lane{wc * (0.5F * (a00 * a00 * m.xx + a10 * a10 * m.yy) + a00 * a10 * m.xy),
-                wc * (a00 * a01 * m.xx + a10 * a11 * m.yy + (a00 * a11 + a01 * a10) * m.xy),
-                wc * (0.5F * (a01 * a01 * m.xx + a11 * a11 * m.yy) + a01 * a11 * m.xy),
-                weight * r}});
+      rows.push_back(row_of(m, a, {X, Y}, {wc * m.x * gradient_scale, wc * m.y * gradient_scale},
+                            {weight, weight * bright, weight * ink, wc}, r));
     }
   }
   if (rows.empty()) return;

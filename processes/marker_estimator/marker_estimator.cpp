@@ -144,6 +144,23 @@ std::optional<marker_poses_t> MarkerEstimator::on_camera_image(const camera_imag
   return poses;
 }
 
+/// What is known of a marker before its pose.
+static marker_pose_t marker_seen(const TagDetection& detection, double size_m,
+                                 const std::vector<Eigen::Vector2d>& corners_px,
+                                 const Matrix8d& covariance_px2) {
+  marker_pose_t marker;
+  marker.marker_id = detection.id;
+  marker.size_m = size_m;
+  for (int i = 0; i < 4; ++i) {
+    marker.corner_px[i][0] = corners_px[i].x();
+    marker.corner_px[i][1] = corners_px[i].y();
+  }
+  to_message(covariance_px2, marker.corner_covariance);
+  marker.decision_margin = detection.decision_margin;
+  marker.hamming = static_cast<std::int8_t>(detection.hamming);
+  return marker;
+}
+
 std::optional<marker_pose_t> MarkerEstimator::estimate(const cv::Mat& grey,
                                                        const TagDetection& detection,
                                                        double size_m) {
@@ -188,14 +205,7 @@ std::optional<marker_pose_t> MarkerEstimator::estimate(const cv::Mat& grey,
   const auto covariance = covariance_from(minima[0].information);
   if (!covariance) return refuse("tag without a pose");
 
-  marker_pose_t marker;
-  marker.marker_id = detection.id;
-  marker.size_m = size_m;
-  for (int i = 0; i < 4; ++i) {
-    marker.corner_px[i][0] = corners_px[i].x();
-    marker.corner_px[i][1] = corners_px[i].y();
-  }
-  to_message(covariance_px2, marker.corner_covariance);
+  marker_pose_t marker = marker_seen(detection, size_m, corners_px, covariance_px2);
   marker.num_hypotheses = static_cast<std::int8_t>(minima.size());
   for (int h = 0; h < 2; ++h) {
     const PoseFit& fit = minima[std::min<std::size_t>(h, minima.size() - 1)];
@@ -205,8 +215,6 @@ std::optional<marker_pose_t> MarkerEstimator::estimate(const cv::Mat& grey,
         h == 0 ? least_error_px : std::max(least_error_px, error_px(fit));
   }
   to_message(*covariance, marker.covariance);
-  marker.decision_margin = detection.decision_margin;
-  marker.hamming = static_cast<std::int8_t>(detection.hamming);
   return marker;
 }
 

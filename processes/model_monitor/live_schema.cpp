@@ -242,6 +242,19 @@ void LiveSchema::watch_flips(const ActionPoseSample& sample) {
   }
 }
 
+void LiveSchema::rate(std::int64_t sample_index, Edge* edge) const {
+  const EdgeState state = state_of(*edge);
+  if (state == EdgeState::kInvalid) {
+    edge->state = state;
+    edge->confidence = 0;
+  } else if (state == EdgeState::kProvisional) {
+    // As sure as it is old.
+    edge->state = state;
+    const double age = static_cast<double>(sample_index - edge->valid_since_sample + 1);
+    edge->confidence = std::clamp(age / adaptation_.options().settled_after, 0.0, 1.0);
+  }
+}
+
 void LiveSchema::update(const ActionPoseSample& sample, std::optional<std::int64_t> changed_since,
                         std::optional<int> unchanged_part, std::optional<int> drifting_part) {
   BodySchema next = adaptation_.schema();
@@ -262,16 +275,7 @@ void LiveSchema::update(const ActionPoseSample& sample, std::optional<std::int64
       edge.valid_since_sample = original.valid_since_sample;
     edge.state = original.state;
     edge.confidence = original.confidence;
-    const EdgeState state = state_of(edge);
-    if (state == EdgeState::kInvalid) {
-      edge.state = state;
-      edge.confidence = 0;
-    } else if (state == EdgeState::kProvisional) {
-      // As sure as it is old.
-      edge.state = state;
-      const double age = static_cast<double>(sample.sample_index - edge.valid_since_sample + 1);
-      edge.confidence = std::clamp(age / adaptation_.options().settled_after, 0.0, 1.0);
-    }
+    rate(sample.sample_index, &edge);
   }
   if (next.X_CR.matrix() != schema_.X_CR.matrix()) {
     const bool is_drift_elsewhere = drifting_part && *drifting_part != next.root;

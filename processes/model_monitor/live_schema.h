@@ -63,6 +63,8 @@ class LiveSchema {
   void stamp(BodySchema* schema) const;
   void watch_flips(const ActionPoseSample& sample);
   EdgeState state_of(const Edge& edge) const;
+  /// State and confidence of an edge that changed or is suspected.
+  void rate(std::int64_t sample_index, Edge* edge) const;
   void update(const ActionPoseSample& sample, std::optional<std::int64_t> changed_since,
               std::optional<int> unchanged_part, std::optional<int> drifting_part);
 

@@ -176,6 +176,7 @@ class ModelMonitor {
   /// than what stands.
   bool is_passed_over(const BodySchema& proposal, const Standing& standing) const;
   void judge(const body_schema_t& proposal);
+  void remember_refusal(const health_event_t& event);
   /// Those whose samples, and whose refinement, are there. Returns true if there were any.
   bool judge_waiting();
   bool waits_for_refiner(const body_schema_t& proposal);

@@ -178,10 +178,8 @@ void RobotDriver::save(Answer& answer) {
   }
 }
 
-RobotDriver::Answer RobotDriver::on_command(const Command& command, Now now) {
-  advance_time(now);
-  Answer answer;
-  // R8. Backwards: a MOVE has several answers, the newest holds.
+std::optional<Status> RobotDriver::answer_again(const Command& command) const {
+  // Backwards: a MOVE has several answers, the newest holds.
   for (auto served = served_.rbegin(); served != served_.rend(); ++served) {
     if (served->source != command.source || served->epoch != command.epoch ||
         served->action_id != command.action_id) {
@@ -202,7 +200,16 @@ RobotDriver::Answer RobotDriver::on_command(const Command& command, Now now) {
     if (again.kind != Command::KIND_MOVE) {
       set_array(again.num_signals, again.commanded, position_);  // where the arm is
     }
-    answer.statuses.push_back(again);
+    return again;
+  }
+  return std::nullopt;
+}
+
+RobotDriver::Answer RobotDriver::on_command(const Command& command, Now now) {
+  advance_time(now);
+  Answer answer;
+  if (const auto again = answer_again(command)) {  // R8
+    answer.statuses.push_back(*again);
     return answer;
   }
 

@@ -87,6 +87,8 @@ class RobotDriver {
   std::string go(const std::vector<double>& action);
   std::string halt();
 
+  /// Of a command that was answered already.
+  std::optional<motion_status_t> answer_again(const action_command_t& command) const;
   std::string refusal(const action_command_t& command) const;
   motion_status_t make_status(const action_command_t& command, std::int8_t state,
                               const std::string& reason) const;

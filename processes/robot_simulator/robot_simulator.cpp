@@ -44,6 +44,19 @@ bool is_same_command(const motion_status_t& status, const std::string& source, s
   return status.action_id == action_id && status.epoch == epoch && status.source == source;
 }
 
+Fault load_fault(const Yaml& yaml) {
+  Fault fault;
+  fault.kind = static_cast<std::int8_t>(yaml.integer("kind", 0, fault_command_t::FAULT_TARGET));
+  fault.place = yaml.text("place");
+  fault.number = static_cast<int>(yaml.integer("number", -1, 1'000'000));
+  const std::vector<double> amounts = yaml.numbers("amount_bent_deg", 2);
+  fault.amount_deg = amounts[0];
+  fault.bent_deg = amounts[1];
+  fault.fallen = yaml.vector3("fallen");
+  fault.target_m = yaml.vector3("target_m");
+  return fault;
+}
+
 }  // namespace
 
 RobotSimulatorConfig RobotSimulatorConfig::load(const std::filesystem::path& file) {
@@ -441,18 +454,7 @@ void RobotSimulator::restore_from(const Yaml& yaml) {
   std::deque<motion_status_t> served;
   for (const Yaml& item : yaml.list("served")) served.push_back(load_status(item));
   std::vector<Fault> faults;
-  for (const Yaml& item : yaml.list("faults")) {
-    Fault fault;
-    fault.kind = static_cast<std::int8_t>(item.integer("kind", 0, fault_command_t::FAULT_TARGET));
-    fault.place = item.text("place");
-    fault.number = static_cast<int>(item.integer("number", -1, 1'000'000));
-    const std::vector<double> amounts = item.numbers("amount_bent_deg", 2);
-    fault.amount_deg = amounts[0];
-    fault.bent_deg = amounts[1];
-    fault.fallen = item.vector3("fallen");
-    fault.target_m = item.vector3("target_m");
-    faults.push_back(fault);
-  }
+  for (const Yaml& item : yaml.list("faults")) faults.push_back(load_fault(item));
   const std::string fault_answer = yaml.text("fault_answer");
   std::deque<FaultKey> served_faults;
   for (const Yaml& item : yaml.list("served_faults")) {

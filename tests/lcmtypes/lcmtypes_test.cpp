@@ -6,7 +6,6 @@
 #include <filesystem>
 #include <fstream>
 #include <iomanip>
-#include <iterator>
 #include <map>
 #include <regex>
 #include <set>
@@ -20,6 +19,7 @@
 #include "common/bus/codec.h"
 #include "tests/lcmtypes/example_messages.h"
 #include "tests/lcmtypes/lcm_definitions.h"
+#include "tests/support/text_of.h"
 
 namespace bodyschema::test {
 namespace {
@@ -27,11 +27,6 @@ namespace {
 const std::filesystem::path kSources = LCMTYPES_SOURCES;
 const std::filesystem::path kHeaders = LCMTYPES_HEADERS;
 const std::filesystem::path kFingerprints = FINGERPRINTS_FILE;
-
-std::string read_text(const std::filesystem::path& file) {
-  std::ifstream stream(file);
-  return {std::istreambuf_iterator<char>(stream), {}};
-}
 
 /// By type, the parts of messages included.
 std::map<std::string, std::string> fingerprints() {
@@ -160,7 +155,7 @@ TEST(GeneratedHeaders, EveryAllocationIsPrecededByTheHardenedCheck) {
   int num_resizes = 0;
   int num_strings = 0;
   for (const auto& [name, type] : read_definitions(kSources)) {
-    std::istringstream header(read_text(kHeaders / (name + ".hpp")));
+    std::istringstream header(text_of(kHeaders / (name + ".hpp")));
     std::string previous;
     for (std::string line; std::getline(header, line); previous = line) {
       if (line.find(".resize(") != std::string::npos) {
@@ -178,7 +173,7 @@ TEST(GeneratedHeaders, EveryAllocationIsPrecededByTheHardenedCheck) {
 }
 
 TEST(GeneratedHeaders, DescribeEveryField) {
-  const std::string header = read_text(kHeaders / "message_fields.h");
+  const std::string header = text_of(kHeaders / "message_fields.h");
   for (const auto& [name, type] : read_definitions(kSources)) {
     std::size_t at = header.find("Is<" + name + ">");
     const std::size_t end = header.find("}\n\n", at);
@@ -190,7 +185,7 @@ TEST(GeneratedHeaders, DescribeEveryField) {
 }
 
 TEST(CauseNames, AreTheConstantsInSmallLetters) {
-  const std::string definition = read_text(kSources / "health_event_t.lcm");
+  const std::string definition = text_of(kSources / "health_event_t.lcm");
   const std::regex constant(R"(CAUSE_([A-Z_]+) = (\d+))");
   std::size_t num_constants = 0;
   for (std::sregex_iterator i(definition.begin(), definition.end(), constant), end; i != end; ++i) {
@@ -231,7 +226,7 @@ TEST(Fingerprints, CoverEveryDefinition) {
 TEST(Channels, AreThoseOfTheTableInTheReadme) {
   const std::regex row(R"(\| `([A-Z0-9_]+)` \| `(\w+)` \|.*)");
   std::map<std::string, std::string> table;
-  std::istringstream readme(read_text(kSources / "README.md"));
+  std::istringstream readme(text_of(kSources / "README.md"));
   for (std::string line; std::getline(readme, line);) {
     std::smatch match;
     if (std::regex_match(line, match, row)) table[match[1]] = match[2];
@@ -244,7 +239,7 @@ TEST(Channels, AreThoseOfTheTableInTheReadme) {
 }
 
 TEST(Channels, OfTheHeaderAreAllTested) {
-  const std::string header = read_text(kSources.parent_path() / "common/bus/channels.h");
+  const std::string header = text_of(kSources.parent_path() / "common/bus/channels.h");
   const std::regex constant(R"re(Channel<\w+> k\w+\{"([A-Z0-9_]+)"\})re");
   std::set<std::string> declared;
   for (std::sregex_iterator i(header.begin(), header.end(), constant), end; i != end; ++i) {

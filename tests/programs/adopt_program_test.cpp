@@ -8,22 +8,17 @@
 #include <fstream>
 #include <functional>
 #include <regex>
-#include <sstream>
 #include <string>
 
 #include "common/config/calibration_id.h"
 #include "tests/common/bus/bus_test_support.h"
+#include "tests/support/text_of.h"
 
 namespace bodyschema {
 namespace {
 
 namespace fs = std::filesystem;
-
-std::string text_of(const fs::path& file) {
-  std::stringstream text;
-  text << std::ifstream(file).rdbuf();
-  return text.str();
-}
+using test::text_of;
 
 void edit(const fs::path& file, const std::string& from, const std::string& to) {
   const std::string text = text_of(file);

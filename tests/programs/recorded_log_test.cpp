@@ -23,20 +23,17 @@
 #include "processes/structure_learner/structure_learner.h"
 #include "tests/common/bus/bus_test_support.h"
 #include "tests/support/rig_truth.h"
+#include "tests/support/text_of.h"
 
 namespace bodyschema {
 namespace {
 
 namespace fs = std::filesystem;
+using test::text_of;
 
 const fs::path kLog = BODYSCHEMA_LOGS "/arm2_15.lcmlog";
 const fs::path kRig = BODYSCHEMA_CONFIG "/arm2";
 const std::string kBin = BODYSCHEMA_BIN "/";
-
-std::string text_of(const fs::path& file) {
-  const auto bytes = test::read_bytes(file);
-  return {bytes.begin(), bytes.end()};
-}
 
 class RecordedLogTest : public testing::Test {
  protected:

@@ -1,15 +1,9 @@
 #include <gtest/gtest.h>
-#include <sys/wait.h>
-#include <unistd.h>
 
 #include <algorithm>
 #include <cmath>
-#include <cstdlib>
-#include <filesystem>
 #include <fstream>
 #include <limits>
-#include <nlohmann/json.hpp>
-#include <sstream>
 #include <string>
 #include <vector>
 
@@ -17,56 +11,22 @@
 #include "common/bus/event_log.h"
 #include "common/config/camera_calibration.h"
 #include "common/config/rig.h"
+#include "tests/programs/program_test.h"
 #include "tests/support/synthetic_robot.h"
 
-namespace bodyschema {
+namespace bodyschema::test {
 namespace {
 
-using Json = nlohmann::json;
-
-std::string text_of(const std::filesystem::path& file) {
-  std::stringstream text;
-  text << std::ifstream(file, std::ios::binary).rdbuf();
-  return text.str();
-}
-
-struct Outcome {
-  int exit_code = 0;
-  std::string out, err;
-};
-
 /// `bodyschema refine` on the recorded log of arm2, in a folder of its own.
-class RefineProgramTest : public testing::Test {
+class RefineProgramTest : public ProgramTest {
  protected:
-  RefineProgramTest() {
-    const auto* test = testing::UnitTest::GetInstance()->current_test_info();
-    folder_ = std::filesystem::path(testing::TempDir()) /
-              ("refine program " + std::to_string(getpid()) + test->name());
-    std::filesystem::create_directories(folder_);
-    EXPECT_EQ(run("learn '" + log_ + "' --out schema").exit_code, 0);
-  }
-  ~RefineProgramTest() override { std::filesystem::remove_all(folder_); }
+  RefineProgramTest() { EXPECT_EQ(run("learn '" + log_ + "' --out schema").exit_code, 0); }
 
-  Outcome run(const std::string& arguments) const {
-    const std::string command = "cd '" + folder_.string() + "' && '" BODYSCHEMA_PROGRAM "' " +
-                                arguments + " >stdout.txt 2>stderr.txt </dev/null";
-    const int status = std::system(command.c_str());
-    EXPECT_TRUE(WIFEXITED(status)) << command;
-    return {WEXITSTATUS(status), text_of(folder_ / "stdout.txt"), text_of(folder_ / "stderr.txt")};
-  }
-  Json json_of(const std::string& arguments) const {
-    const Outcome outcome = run(arguments);
-    EXPECT_EQ(outcome.exit_code, 0) << outcome.err;
-    return Json::parse(outcome.out, nullptr, false);
-  }
+  Json json_of(const std::string& arguments) const { return run(arguments).json(); }
   void expect_failure(const std::string& arguments, int exit_code, const std::string& what) const {
-    const Outcome outcome = run(arguments);
-    EXPECT_EQ(outcome.exit_code, exit_code) << outcome.err;
-    EXPECT_EQ(outcome.out, "");
-    EXPECT_NE(outcome.err.find(what), std::string::npos) << outcome.err;
+    ProgramTest::expect_failure(arguments, what, exit_code);
   }
 
-  std::filesystem::path folder_;
   const std::string log_ = BODYSCHEMA_LOGS "/arm2_15.lcmlog";
   const std::string rig_ = "--rig '" BODYSCHEMA_CONFIG "/arm2'";
 };
@@ -139,14 +99,14 @@ TEST_F(RefineProgramTest, ASchemaThatNoUrdfHasIsRefinedAllTheSame) {
       << outcome.err;
   EXPECT_TRUE(Json::parse(outcome.out).at("urdf").is_null());
   EXPECT_EQ(run("show refined").exit_code, 0);
-  EXPECT_FALSE(std::filesystem::exists(folder_ / "r.urdf"));
+  EXPECT_FALSE(exists("r.urdf"));
 }
 
 TEST_F(RefineProgramTest, FitsTheRowsOfACsv) {
-  test::Rng rng(71);
-  const test::SyntheticRobot robot = test::chapter_robot("a", rng);
+  Rng rng(71);
+  const SyntheticRobot robot = chapter_robot("a", rng);
   std::ofstream csv(folder_ / "samples.csv");
-  test::write_csv(test::babble(robot, 30, {.regime = test::Regime::kTagIso}, rng), csv);
+  write_csv(babble(robot, 30, {.regime = Regime::kTagIso}, rng), csv);
   csv.close();
   ASSERT_EQ(run("learn samples.csv --out of_csv --noise 0.003 1").exit_code, 0);
   const Json json = json_of("refine of_csv samples.csv --out refined --json");
@@ -157,13 +117,13 @@ TEST_F(RefineProgramTest, FitsTheRowsOfACsv) {
 
 /// Median distance of a part from where it is in the root, over random actions [m].
 double distance_from_truth(const BodySchema& schema, const BodySchema& truth, int part) {
-  test::Rng rng(72);
+  Rng rng(72);
   std::vector<double> distances;
   for (int n = 0; n < 101; ++n) {
     Eigen::VectorXd action(static_cast<Eigen::Index>(truth.signals.size()));
     for (Eigen::Index s = 0; s < action.size(); ++s) {
       const Signal& signal = truth.signals[static_cast<std::size_t>(s)];
-      action(s) = test::uniform(rng, signal.lower, signal.upper);
+      action(s) = uniform(rng, signal.lower, signal.upper);
     }
     const auto predicted = schema.predict(schema.root, part, action);
     if (!predicted) return std::numeric_limits<double>::infinity();
@@ -183,7 +143,7 @@ class RefineKnownStructureTest : public RefineProgramTest {
     BodySchema nominal = truth_;
     for (Edge& edge : nominal.edges) {
       Vector6d error;
-      for (int k = 0; k < 6; ++k) error(k) = test::uniform(rng_, -1, 1) * (k < 3 ? 0.004 : 0.02);
+      for (int k = 0; k < 6; ++k) error(k) = uniform(rng_, -1, 1) * (k < 3 ? 0.004 : 0.02);
       edge.left = edge.left * exp(error);
     }
     write_one_event_log(folder_ / "nominal", kBodySchema, to_message(nominal));
@@ -198,7 +158,7 @@ class RefineKnownStructureTest : public RefineProgramTest {
       if (!is_part || is_of(truth_.root) || is_of(end_)) placement << line << "\n";
     }
     placement.close();
-    samples_ = test::babble(robot_, 100, {.regime = test::Regime::kTagIso}, rng_);
+    samples_ = babble(robot_, 100, {.regime = Regime::kTagIso}, rng_);
     for (ActionPoseSample& sample : samples_)
       std::erase_if(sample.parts, [&](const auto& seen) {
         return seen.part != truth_.root && seen.part != end_;
@@ -206,12 +166,12 @@ class RefineKnownStructureTest : public RefineProgramTest {
   }
   void write_samples(const std::vector<ActionPoseSample>& samples, bool has_orientation) const {
     std::ofstream csv(folder_ / "samples.csv");
-    test::write_csv(has_orientation ? samples : test::with_positions_alone(samples, {end_}), csv);
+    write_csv(has_orientation ? samples : with_positions_alone(samples, {end_}), csv);
   }
 
-  test::Rng rng_{73};
-  const test::SyntheticRobot robot_ = test::chapter_robot("d", rng_);
-  const BodySchema truth_ = test::true_schema(robot_);
+  Rng rng_{73};
+  const SyntheticRobot robot_ = chapter_robot("d", rng_);
+  const BodySchema truth_ = true_schema(robot_);
   const int end_ = truth_.edges.back().to;
   std::vector<ActionPoseSample> samples_;
 };
@@ -322,10 +282,10 @@ TEST_F(RefineProgramTest, SaysWhatIsWrong) {
   expect_failure(refine + "--urdf schema", 1, "--urdf: schema is an input itself");
   expect_failure(refine + "--urdf-placement p.yaml", 2, "--urdf-placement requires --urdf");
   expect_failure("refine missing '" + log_ + "' --out refined", 1, "missing");
-  EXPECT_FALSE(std::filesystem::exists(folder_ / "refined"));
+  EXPECT_FALSE(exists("refined"));
   std::ofstream(folder_ / "a.csv") << "t,q1,q2,part,x,y,z,qw,qx,qy,qz\n0,nan,0,1,0,0,0,1,0,0,0\n";
   expect_failure("refine schema a.csv --out refined", 1, "a.csv:2:3");
 }
 
 }  // namespace
-}  // namespace bodyschema
+}  // namespace bodyschema::test

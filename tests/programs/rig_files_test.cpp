@@ -2,7 +2,6 @@
 // soon as it is there; a new kind of file needs a line in the table below.
 
 #include <gtest/gtest.h>
-#include <unistd.h>
 
 #include <algorithm>
 #include <filesystem>
@@ -10,7 +9,6 @@
 #include <functional>
 #include <map>
 #include <regex>
-#include <sstream>
 
 #include "common/config/camera_calibration.h"
 #include "common/config/rig.h"
@@ -26,6 +24,8 @@
 #include "processes/refiner/refiner_config.h"
 #include "processes/robot_simulator/robot_simulator.h"
 #include "processes/structure_learner/structure_learner.h"
+#include "tests/support/temporary_folder.h"
+#include "tests/support/text_of.h"
 
 namespace bodyschema {
 namespace {
@@ -106,8 +106,8 @@ TEST_P(RigFilesTest, RootAndEndEffectorAreParts) {
 
 // A process that ignores unknown keys would run with the default of a misspelt key.
 TEST_P(RigFilesTest, AnUnknownKeyInAnyFileIsRefused) {
-  const path copy = path(testing::TempDir()) /
-                    ("rig_files_" + std::to_string(getpid()) + GetParam().filename().string());
+  const test::TemporaryFolder folder;
+  const path& copy = folder.path();
   for (const auto& [name, reader] : kReaders) {
     if (!std::filesystem::exists(GetParam() / name)) continue;
     // Its makers' tools put keys of their own into a calibration.
@@ -123,16 +123,12 @@ TEST_P(RigFilesTest, AnUnknownKeyInAnyFileIsRefused) {
       EXPECT_NE(std::string(error.what()).find("no_such_key"), std::string::npos) << error.what();
     }
   }
-  std::filesystem::remove_all(copy);
 }
 
 // The other way round: whichever key is removed or damaged, the reader throws a ConfigError or
 // does without the key.
 TEST_P(RigFilesTest, AFileWithALineLessIsRefusedWithAConfigErrorOrRead) {
-  const path copy = path(testing::TempDir()) /
-                    ("rig_lines_" + std::to_string(getpid()) + GetParam().filename().string());
-  std::filesystem::remove_all(copy);
-  std::filesystem::copy(GetParam(), copy);
+  const test::TemporaryFolder copy(GetParam());
   int num_refused = 0;
   for (const auto& [name, reader] : kReaders) {
     if (!std::filesystem::exists(GetParam() / name)) continue;
@@ -157,7 +153,6 @@ TEST_P(RigFilesTest, AFileWithALineLessIsRefusedWithAConfigErrorOrRead) {
                                std::filesystem::copy_options::overwrite_existing);
   }
   EXPECT_GT(num_refused, 40);
-  std::filesystem::remove_all(copy);
 }
 
 TEST_P(RigFilesTest, TheCheckFindsItGood) {
@@ -172,23 +167,13 @@ TEST_P(RigFilesTest, TheCheckFindsItGood) {
 /// A rig that is damaged in one place.
 class RigCheckTest : public testing::Test {
  protected:
-  RigCheckTest()
-      : copy_(path(testing::TempDir()) /
-              ("rig_check_" + std::to_string(getpid()) +
-               testing::UnitTest::GetInstance()->current_test_info()->name())) {
-    restore();
-  }
-  ~RigCheckTest() override { std::filesystem::remove_all(copy_); }
+  RigCheckTest() { restore(); }
 
   void restore() {
     std::filesystem::remove_all(copy_);
     std::filesystem::copy(path(BODYSCHEMA_CONFIG) / "arm2", copy_);
   }
-  std::string text(const std::string& name) const {
-    std::stringstream text;
-    text << std::ifstream(copy_ / name).rdbuf();
-    return text.str();
-  }
+  std::string text(const std::string& name) const { return test::text_of(copy_ / name); }
   void write(const std::string& name, const std::string& text) const {
     std::ofstream(copy_ / name, std::ios::trunc) << text;
   }
@@ -208,7 +193,8 @@ class RigCheckTest : public testing::Test {
     return problem.substr(copy_.string().size() + 1);
   }
 
-  const path copy_;
+  const test::TemporaryFolder folder_;
+  const path copy_ = folder_.path();
 };
 
 TEST_F(RigCheckTest, WhatOneFileSaysOfAnotherMustBeThere) {

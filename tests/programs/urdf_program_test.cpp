@@ -1,56 +1,26 @@
 // `bodyschema urdf` and `engineer` as their users run them, on schemas learned from recordings.
 #include <gtest/gtest.h>
-#include <sys/wait.h>
-#include <unistd.h>
 
 #include <algorithm>
 #include <cmath>
-#include <cstdlib>
-#include <filesystem>
-#include <fstream>
-#include <sstream>
 #include <string>
 
 #include "common/bus/convert.h"
 #include "common/bus/event_log.h"
+#include "tests/programs/program_test.h"
 #include "tests/support/synthetic_robot.h"
 
-namespace bodyschema {
+namespace bodyschema::test {
 namespace {
 
-std::string text_of(const std::filesystem::path& file) {
-  std::stringstream text;
-  text << std::ifstream(file, std::ios::binary).rdbuf();
-  return text.str();
-}
-
-class UrdfProgramTest : public testing::Test {
+class UrdfProgramTest : public ProgramTest {
  protected:
-  UrdfProgramTest() {
-    const auto* test = testing::UnitTest::GetInstance()->current_test_info();
-    folder_ = std::filesystem::path(testing::TempDir()) /
-              ("urdf program " + std::to_string(getpid()) + test->name());
-    std::filesystem::remove_all(folder_);
-    std::filesystem::create_directories(folder_);
-  }
-  ~UrdfProgramTest() override { std::filesystem::remove_all(folder_); }
-
-  /// The exit code; stdout and stderr are in files of these names.
-  int run(const std::string& arguments) const {
-    const std::string command = "cd '" + folder_.string() + "' && '" BODYSCHEMA_PROGRAM "' " +
-                                arguments + " >stdout 2>stderr </dev/null";
-    const int status = std::system(command.c_str());
-    EXPECT_TRUE(WIFEXITED(status)) << command << " was killed";
-    return WIFEXITED(status) ? WEXITSTATUS(status) : -1;
-  }
   void expect_success(const std::string& arguments) const {
-    EXPECT_EQ(run(arguments), 0) << arguments << "\n" << text_of(folder_ / "stderr");
+    const Outcome outcome = run(arguments);
+    EXPECT_EQ(outcome.exit_code, 0) << arguments << "\n" << outcome.err;
   }
   void expect_failure(const std::string& arguments, const std::string& what) const {
-    EXPECT_EQ(run(arguments), 1) << arguments;
-    EXPECT_NE(text_of(folder_ / "stderr").find(what), std::string::npos)
-        << text_of(folder_ / "stderr");
-    EXPECT_EQ(text_of(folder_ / "stdout"), "");
+    ProgramTest::expect_failure(arguments, what, 1);
   }
   BodySchema read(const std::string& schema) const {
     return from_message(read_log(folder_ / schema, kBodySchema).back());
@@ -58,9 +28,6 @@ class UrdfProgramTest : public testing::Test {
   void write(const std::string& name, const BodySchema& schema) const {
     write_one_event_log(folder_ / name, kBodySchema, to_message(schema));
   }
-  bool exists(const std::string& name) const { return std::filesystem::exists(folder_ / name); }
-
-  std::filesystem::path folder_;
 };
 
 /// Largest differences of what two schemas predict of the parts in the root, over the commands.
@@ -69,14 +36,10 @@ struct Difference {
   double distance = 0;  ///< Mahalanobis, by the covariance of the first one's mean
 };
 Difference difference(const BodySchema& a, const BodySchema& b) {
-  test::Rng rng(1);
+  Rng rng(1);
   Difference most;
   for (int n = 0; n < 50; ++n) {
-    Eigen::VectorXd action(static_cast<Eigen::Index>(a.signals.size()));
-    for (Eigen::Index s = 0; s < action.size(); ++s) {
-      const Signal& signal = a.signals[static_cast<std::size_t>(s)];
-      action(s) = test::uniform(rng, signal.lower, signal.upper);
-    }
+    const Eigen::VectorXd action = random_action(a.signals, rng);
     for (const auto& [part, X] : b.predict_all(action)) {
       if (part == a.root) continue;
       const PosePrediction expected = *a.predict(a.root, part, action);
@@ -94,7 +57,7 @@ TEST_F(UrdfProgramTest, OfARecordingTheUrdfPredictsWhatTheSchemaDoes) {
     const std::string recording = BODYSCHEMA_RECORDINGS "/" + name + ".lcmlog";
     expect_success("learn '" + recording + "' --out learned.lcmlog");
     expect_success("urdf learned.lcmlog --out r.urdf --placement p.yaml");
-    EXPECT_NE(text_of(folder_ / "stdout").find("r.urdf: "), std::string::npos);
+    EXPECT_NE(text_of(folder_ / "stdout.txt").find("r.urdf: "), std::string::npos);
     expect_success("engineer r.urdf p.yaml --samples '" + recording + "' --out built.lcmlog");
     // What the learned screws slide is no more than the samples leave open.
     const Difference learned = difference(read("learned.lcmlog"), read("built.lcmlog"));
@@ -108,11 +71,11 @@ TEST_F(UrdfProgramTest, OfARecordingTheUrdfPredictsWhatTheSchemaDoes) {
 }
 
 TEST_F(UrdfProgramTest, WhatIsRefusedIsNamedAndWritesNothing) {
-  test::Rng rng(2);
-  test::RandomTreeOptions options;
+  Rng rng(2);
+  RandomTreeOptions options;
   options.share_prismatic = options.share_fixed = 0;
   options.share_helical = 1;
-  BodySchema schema = test::true_schema(test::random_tree(options, rng));
+  BodySchema schema = true_schema(random_tree(options, rng));
   write("s.lcmlog", schema);
   expect_failure("urdf s.lcmlog --out r.urdf --placement p.yaml",
                  "s.lcmlog: a URDF has no such joints: ");
@@ -130,4 +93,4 @@ TEST_F(UrdfProgramTest, WhatIsRefusedIsNamedAndWritesNothing) {
 }
 
 }  // namespace
-}  // namespace bodyschema
+}  // namespace bodyschema::test

@@ -59,15 +59,14 @@ BodySchema engineered_model(const SyntheticRobot& robot, Rng& rng) {
   return schema;
 }
 
-/// A displacement of given size, in a random direction.
+}  // namespace
+
 Pose displacement(Rng& rng, double position_m, double rotation_rad) {
   Pose T = Pose::Identity();
   T.linear() = exp_so3(random_rotation(rng).col(0) * rotation_rad);
   T.translation() = random_rotation(rng).col(0) * position_m;
   return T;
 }
-
-}  // namespace
 
 BrokenArm::BrokenArm(const Scenario& scenario, Regime regime, int block_length, int seed)
     : scenario_(scenario),
@@ -76,6 +75,17 @@ BrokenArm::BrokenArm(const Scenario& scenario, Regime regime, int block_length, 
       rng_(static_cast<Rng::result_type>(seed)),
       healthy_(chain(rng_, scenario.range_rad)),
       broken_(healthy_) {
+  break_as_told();
+  drift_axis_ = random_rotation(rng_).col(0);
+  engineered_ = engineered_model(healthy_, rng_);
+  for (int n = 0; n < kTestActions; ++n) test_actions_.push_back(healthy_.random_action(rng_));
+  if (scenario_.fault == Fault::kIntermittent)
+    for (int at = block_length_; at < num_samples(); at += static_cast<int>(uniform(rng_, 3, 13)))
+      turns_.push_back(at);
+}
+
+// One switch, though long: each fault in a few lines.
+void BrokenArm::break_as_told() {
   const auto link = [this](int part) -> TrueLink& { return broken_.links[part - 1]; };
   const auto stick = [&](int part) {
     Vector6d at = Vector6d::Zero();
@@ -151,12 +161,6 @@ BrokenArm::BrokenArm(const Scenario& scenario, Regime regime, int block_length, 
       changes_.push_back({4, true, false, {"new_model"}});
       break;
   }
-  drift_axis_ = random_rotation(rng_).col(0);
-  engineered_ = engineered_model(healthy_, rng_);
-  for (int n = 0; n < kTestActions; ++n) test_actions_.push_back(healthy_.random_action(rng_));
-  if (scenario_.fault == Fault::kIntermittent)
-    for (int at = block_length_; at < num_samples(); at += static_cast<int>(uniform(rng_, 3, 13)))
-      turns_.push_back(at);
 }
 
 bool BrokenArm::is_broken(int index) const {

@@ -45,8 +45,8 @@ struct Scenario {
   double drift_deg = 0.05;  ///< kDrift: a sample, from the second block on …
   /// … until it has come so far.
   double most_drift_deg = std::numeric_limits<double>::infinity();
-  double size = 1;  ///< of kTool, kBend, kOffset, kMarker and kCamera, as a share
-  int joint = 4;    ///< kOffset, kGain, kReversed: that moves this part
+  double size = 1;          ///< of kTool, kBend, kOffset, kMarker and kCamera, as a share
+  int joint = 4;            ///< kOffset, kGain, kReversed: that moves this part
   double range_rad = 1.35;  ///< of every joint, to both sides
 };
 
@@ -78,6 +78,8 @@ class BrokenArm {
   bool is_near(int part) const;
 
  private:
+  /// Makes the scenario's fault, in `broken_` and `changes_`.
+  void break_as_told();
   SyntheticRobot robot_at(int index) const;
   bool is_broken(int index) const;
 
@@ -92,6 +94,9 @@ class BrokenArm {
   std::vector<TrueChange> changes_;
   std::vector<int> turns_;  ///< kIntermittent: samples at which it breaks or is whole again
 };
+
+/// A displacement of given size, in a random direction.
+Pose displacement(Rng& rng, double position_m, double rotation_rad);
 
 /// Assumed noise is `noise_factor` times the true one. In tag noise it comes with the observations
 /// (and the factor must be 1).

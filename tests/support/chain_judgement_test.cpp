@@ -14,13 +14,6 @@ namespace {
 
 const std::filesystem::path kConfig = BODYSCHEMA_CONFIG;
 
-Eigen::VectorXd random_action(const std::vector<Signal>& signals, Rng& rng) {
-  Eigen::VectorXd action(std::ssize(signals));
-  for (Eigen::Index s = 0; s < action.size(); ++s)
-    action(s) = uniform(rng, signals[s].lower, signals[s].upper);
-  return action;
-}
-
 TEST(TrueEdge, IsTheMotionOfTheSimulatedRig) {
   Rng rng(1);
   for (const char* name : {"arm2", "arm4", "arm6_ends", "arm7"}) {

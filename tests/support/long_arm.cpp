@@ -73,13 +73,6 @@ BodySchema schema_of(const SyntheticRobot& robot, Rng& rng) {
   return schema;
 }
 
-Pose displacement(Rng& rng, double position_m, double rotation_rad) {
-  Pose T = Pose::Identity();
-  T.linear() = exp_so3(random_rotation(rng).col(0) * rotation_rad);
-  T.translation() = random_rotation(rng).col(0) * position_m;
-  return T;
-}
-
 }  // namespace
 
 const char* name_of(LongFault fault) {

@@ -53,21 +53,41 @@ std::set<int> facing_parts(const SyntheticRobot& robot, const Eigen::VectorXd& a
   return result;
 }
 
+/// A planar marker read in its other way: tilted about an axis in its plane.
+static Pose flipped(const Pose& X, Rng& rng) {
+  const double direction = uniform(rng, 0, 2 * M_PI);
+  const Eigen::Vector3d axis(std::cos(direction), std::sin(direction), 0);
+  Pose result = X;
+  result.linear() = X.linear() * exp_so3(uniform(rng, 10, 60) * kDegree * axis);
+  return result;
+}
+
+/// A root of the noise's covariance, root · rootᵀ.
+static Matrix6d noise_root(Regime regime, const Pose& X_CB) {
+  Matrix6d root = Matrix6d::Zero();
+  if (regime == Regime::kTag) {
+    const Eigen::Vector3d sight = X_CB.translation().normalized();
+    Eigen::Matrix3d R_CS;  // line of sight along z
+    R_CS.col(2) = sight;
+    R_CS.col(0) = sight.unitOrthogonal();
+    R_CS.col(1) = sight.cross(R_CS.col(0));
+    root.topLeftCorner<3, 3>() =
+        X_CB.linear().transpose() * R_CS * Eigen::Vector3d(0.0008, 0.0008, 0.0028).asDiagonal();
+    root.diagonal().tail<3>() << 0.67 * kDegree, 0.67 * kDegree, 0.3 * kDegree;
+  } else {
+    const Noise noise = nominal_noise(regime);
+    root.diagonal().head<3>().setConstant(noise.position_m);
+    root.diagonal().tail<3>().setConstant(noise.rotation_rad);
+  }
+  return root;
+}
+
 ActionPoseSample observe(const SyntheticRobot& robot, const Eigen::VectorXd& action,
                          const ObservationOptions& options, std::int64_t sample_index, Rng& rng) {
   ActionPoseSample sample;
   sample.sample_index = sample_index;
   sample.utime = 1000000 * sample_index;
   sample.action = action;
-  // A planar marker read in its other way: tilted about an axis in its plane.
-  const auto flipped = [&rng](const Pose& X) {
-    const double direction = uniform(rng, 0, 2 * M_PI);
-    const Eigen::Vector3d axis(std::cos(direction), std::sin(direction), 0);
-    Pose result = X;
-    result.linear() = X.linear() * exp_so3(uniform(rng, 10, 60) * kDegree * axis);
-    return result;
-  };
-  const Noise noise = nominal_noise(options.regime);
   const bool tags = options.regime == Regime::kTag;
   const auto poses = robot.poses_in_camera(action);
   const std::set<int> facing = facing_parts(robot, action, options.max_view_angle_rad);
@@ -75,20 +95,7 @@ ActionPoseSample observe(const SyntheticRobot& robot, const Eigen::VectorXd& act
     if (!facing.count(link.part)) continue;
     if (tags && uniform(rng, 0, 1) < 0.15) continue;
     const Pose& X_true = poses.at(link.part);
-    Matrix6d root = Matrix6d::Zero();  // covariance = root · rootᵀ
-    if (tags) {
-      const Eigen::Vector3d sight = X_true.translation().normalized();
-      Eigen::Matrix3d R_CS;  // line of sight along z
-      R_CS.col(2) = sight;
-      R_CS.col(0) = sight.unitOrthogonal();
-      R_CS.col(1) = sight.cross(R_CS.col(0));
-      root.topLeftCorner<3, 3>() =
-          X_true.linear().transpose() * R_CS * Eigen::Vector3d(0.0008, 0.0008, 0.0028).asDiagonal();
-      root.diagonal().tail<3>() << 0.67 * kDegree, 0.67 * kDegree, 0.3 * kDegree;
-    } else {
-      root.diagonal().head<3>().setConstant(noise.position_m);
-      root.diagonal().tail<3>().setConstant(noise.rotation_rad);
-    }
+    const Matrix6d root = noise_root(options.regime, X_true);
     PartObservation o;
     o.part = link.part;
     o.X_CB = X_true;
@@ -104,7 +111,7 @@ ActionPoseSample observe(const SyntheticRobot& robot, const Eigen::VectorXd& act
         o.X_CB.translation().z() += 2;
       }
     }
-    const Pose other = flipped(o.X_CB);
+    const Pose other = flipped(o.X_CB, rng);
     if (options.with_other_hypothesis) {
       o.X_CB_other = flip ? o.X_CB : other;
       o.error_ratio = uniform(rng, 1, 4);

@@ -187,7 +187,7 @@ std::vector<int> SyntheticRobot::visible_parts() const {
   return result;
 }
 
-Eigen::VectorXd SyntheticRobot::random_action(Rng& rng) const {
+Eigen::VectorXd random_action(const std::vector<Signal>& signals, Rng& rng) {
   Eigen::VectorXd action(signals.size());
   for (std::size_t s = 0; s < signals.size(); ++s)
     action(s) = uniform(rng, signals[s].lower, signals[s].upper);
@@ -250,6 +250,39 @@ SyntheticRobot chapter_robot(const std::string& name, Rng& rng) {
   return robot;
 }
 
+/// Hides inner parts, no two next to each other unless that is wanted.
+static void hide_inner_parts(const RandomTreeOptions& options, const std::vector<int>& parents,
+                             const std::vector<int>& num_children, SyntheticRobot* robot,
+                             Rng& rng) {
+  const int n = options.num_parts;
+  std::vector<int> inner;
+  for (int k = 1; k < n; ++k)
+    if (num_children[k] > 0) inner.push_back(k);
+  for (std::size_t k = inner.size(); k > 1; --k)
+    std::swap(inner[k - 1], inner[static_cast<std::size_t>(uniform(rng, 0, k))]);
+  int hidden = 0;
+  for (const int k : inner) {
+    if (hidden == options.num_hidden) break;
+    bool free = !robot->links[parents[k]].hidden;
+    // Two joints on one signal with nothing visible between them are no local model of ours.
+    for (int c = 1; c < n; ++c)
+      free &= !(parents[c] == k && robot->links[c].signal >= 0 &&
+                robot->links[c].signal == robot->links[k].signal);
+    for (int c = 1; c < n; ++c) free &= !(parents[c] == k && robot->links[c].hidden);
+    // Siblings below a hidden parent are two joints apart already.
+    if (!free) continue;
+    robot->links[k].hidden = true;
+    ++hidden;
+    if (options.adjacent_hidden) {
+      for (int c = 1; c < n; ++c)
+        if (parents[c] == k && num_children[c] > 0) {
+          robot->links[c].hidden = true;
+          break;
+        }
+    }
+  }
+}
+
 SyntheticRobot random_tree(const RandomTreeOptions& options, Rng& rng) {
   SyntheticRobot robot;
   robot.name = "tree";
@@ -294,33 +327,7 @@ SyntheticRobot random_tree(const RandomTreeOptions& options, Rng& rng) {
     link.zero = uniform(rng, -0.5, 0.5);
     robot.links.push_back(link);
   }
-  // Hide inner parts, no two next to each other unless that is wanted.
-  std::vector<int> inner;
-  for (int k = 1; k < n; ++k)
-    if (num_children[k] > 0) inner.push_back(k);
-  for (std::size_t k = inner.size(); k > 1; --k)
-    std::swap(inner[k - 1], inner[static_cast<std::size_t>(uniform(rng, 0, k))]);
-  int hidden = 0;
-  for (const int k : inner) {
-    if (hidden == options.num_hidden) break;
-    bool free = !robot.links[parents[k]].hidden;
-    // Two joints on one signal with nothing visible between them are no local model of ours.
-    for (int c = 1; c < n; ++c)
-      free &= !(parents[c] == k && robot.links[c].signal >= 0 &&
-                robot.links[c].signal == robot.links[k].signal);
-    for (int c = 1; c < n; ++c) free &= !(parents[c] == k && robot.links[c].hidden);
-    // Siblings below a hidden parent are two joints apart already.
-    if (!free) continue;
-    robot.links[k].hidden = true;
-    ++hidden;
-    if (options.adjacent_hidden) {
-      for (int c = 1; c < n; ++c)
-        if (parents[c] == k && num_children[c] > 0) {
-          robot.links[c].hidden = true;
-          break;
-        }
-    }
-  }
+  hide_inner_parts(options, parents, num_children, &robot, rng);
   if (options.idle_signal) robot.signals.push_back({"idle", -1, 1});
   return robot;
 }

@@ -24,6 +24,8 @@ Eigen::Matrix3d random_rotation(Rng& rng);
 Eigen::Vector3d random_vector(Rng& rng, double min_m, double max_m);
 /// Uniform rotation, translation of a length in [min_m, max_m].
 Pose random_pose(Rng& rng, double min_m, double max_m);
+/// Within the signals' limits.
+Eigen::VectorXd random_action(const std::vector<Signal>& signals, Rng& rng);
 /// ∂pose/∂q of `predict`, 6×|q|, right perturbation, by central differences.
 template <typename Predict>
 Eigen::MatrixXd numeric_jacobian(const Predict& predict, const Eigen::VectorXd& q,
@@ -75,7 +77,7 @@ struct SyntheticRobot {
   /// Signals of the joints on the path between two parts.
   std::set<int> path_signals(int part_a, int part_b) const;
   std::vector<int> visible_parts() const;
-  Eigen::VectorXd random_action(Rng& rng) const;
+  Eigen::VectorXd random_action(Rng& rng) const { return test::random_action(signals, rng); }
 };
 
 /// The robot as a schema without noise, with gains and offsets as learned ones have them.

@@ -10,7 +10,6 @@
 #include <stdexcept>
 
 #include "common/camera/fit_pose.h"
-#include "common/camera/lens.h"
 #include "common/scene/tag_bitmap.h"
 
 namespace bodyschema::test {
@@ -71,32 +70,9 @@ camera_info_t camera_around(const Plate& plate, const camera_info_t& camera) {
   return around;
 }
 
-TagView::TagView(const Plate& plate, const camera_info_t& camera, const TagViewOptions& options)
-    : camera_(camera), options_(options) {
-  if (options.rays_per_px < 4) throw std::invalid_argument("rays_per_px below 4");
-  const Lens lens(camera);
-  corners_px_ = project(plate, lens, plate.size_m);
-  const double half_m = plate.size_m / 2;
-  Eigen::Matrix3d from_tag;
-  from_tag << plate.X_CM.linear().col(0) * half_m, plate.X_CM.linear().col(1) * half_m,
-      plate.X_CM.translation();
-  to_tag_ = from_tag.inverse();
-
-  const int n = options.rays_per_px;
-  const int cols = camera.image_width, rows = camera.image_height;
-  // Value of the print; −1: beyond the plate.
-  const cv::Mat bitmap = tag_bitmap(plate.id, 1);
-  const auto cell = [&](const Eigen::Vector2d& p) {
-    const Eigen::Vector2d c = 4 * p + Eigen::Vector2d::Constant(kCells / 2.0);
-    if (!(c.minCoeff() >= 0 && c.maxCoeff() < kCells)) return -1;
-    return static_cast<int>(c.y()) * kCells + static_cast<int>(c.x());
-  };
-  const double dark = options.black, contrast = options.white - options.black;
-  const double beyond = (options.background - dark) / contrast;
-  const auto ink = [&](int c) {
-    return c < 0 ? beyond : bitmap.at<uchar>(c / kCells, c % kCells) ? 1.0 : 0.0;
-  };
-  // Positions of the pixels' corners on the tag; within a pixel the map is bilinear.
+/// Positions of the pixels' corners on the tag; within a pixel the map is bilinear.
+std::vector<Eigen::Vector2d> TagView::lattice_on_tag(const Lens& lens) const {
+  const int cols = camera_.image_width, rows = camera_.image_height;
   std::vector<Eigen::Vector2d> lattice(static_cast<std::size_t>(cols + 1) * (rows + 1));
   for (int v = 0; v <= rows; ++v) {
     for (int u = 0; u <= cols; ++u) {
@@ -106,6 +82,24 @@ TagView::TagView(const Plate& plate, const camera_info_t& camera, const TagViewO
                 : Eigen::Vector2d(100, 100);
     }
   }
+  return lattice;
+}
+
+/// The picture of unit contrast at `rays_per_px` times the resolution, `beyond` the plate's edges;
+/// also finds the plate's pixels.
+cv::Mat TagView::many_rays(int id, const std::vector<Eigen::Vector2d>& lattice, double beyond) {
+  const int n = options_.rays_per_px;
+  const int cols = camera_.image_width, rows = camera_.image_height;
+  // Value of the print; −1: beyond the plate.
+  const cv::Mat bitmap = tag_bitmap(id, 1);
+  const auto cell = [&](const Eigen::Vector2d& p) {
+    const Eigen::Vector2d c = 4 * p + Eigen::Vector2d::Constant(kCells / 2.0);
+    if (!(c.minCoeff() >= 0 && c.maxCoeff() < kCells)) return -1;
+    return static_cast<int>(c.y()) * kCells + static_cast<int>(c.x());
+  };
+  const auto ink = [&](int c) {
+    return c < 0 ? beyond : bitmap.at<uchar>(c / kCells, c % kCells) ? 1.0 : 0.0;
+  };
   const auto points = hammersley();
   cv::Mat fine(rows * n, cols * n, CV_64FC1);
   is_plate_ = cv::Mat::zeros(rows, cols, CV_8UC1);
@@ -133,6 +127,24 @@ TagView::TagView(const Plate& plate, const camera_info_t& camera, const TagViewO
       }
     }
   }
+  return fine;
+}
+
+TagView::TagView(const Plate& plate, const camera_info_t& camera, const TagViewOptions& options)
+    : camera_(camera), options_(options) {
+  if (options.rays_per_px < 4) throw std::invalid_argument("rays_per_px below 4");
+  const Lens lens(camera);
+  corners_px_ = project(plate, lens, plate.size_m);
+  const double half_m = plate.size_m / 2;
+  Eigen::Matrix3d from_tag;
+  from_tag << plate.X_CM.linear().col(0) * half_m, plate.X_CM.linear().col(1) * half_m,
+      plate.X_CM.translation();
+  to_tag_ = from_tag.inverse();
+
+  const int n = options.rays_per_px;
+  const int cols = camera.image_width, rows = camera.image_height;
+  const double dark = options.black, contrast = options.white - options.black;
+  cv::Mat fine = many_rays(plate.id, lattice_on_tag(lens), (options.background - dark) / contrast);
   if (options.blur_px > 0) {
     const int reach = static_cast<int>(std::ceil(6 * options.blur_px * n));
     cv::GaussianBlur(fine, fine, {2 * reach + 1, 2 * reach + 1}, options.blur_px * n,

@@ -6,6 +6,7 @@
 #include <vector>
 
 #include "bodyschema/camera_info_t.hpp"
+#include "common/camera/lens.h"
 #include "tests/support/tag_image.h"
 
 namespace bodyschema::test {
@@ -50,6 +51,9 @@ class TagView {
   Eigen::Matrix<double, 8, 8> cramer_rao_px2(double noise_sd) const;
 
  private:
+  std::vector<Eigen::Vector2d> lattice_on_tag(const Lens& lens) const;
+  cv::Mat many_rays(int id, const std::vector<Eigen::Vector2d>& lattice, double beyond);
+
   std::vector<Eigen::Vector2d> corners_px_;
   cv::Mat exact_;
   cv::Mat

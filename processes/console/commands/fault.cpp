@@ -67,6 +67,7 @@ void inject(FaultArguments& arguments) {
 
 }  // namespace
 
+// Long, but a list: one subcommand a fault.
 void add_fault_command(Arguments console) {
   const auto arguments = std::make_shared<FaultArguments>();
   Arguments fault =

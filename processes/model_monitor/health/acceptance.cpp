@@ -127,6 +127,15 @@ bool ModelMonitor::is_passed_over(const BodySchema& proposal, const Standing& st
   return since > 0 && gain_since(since, 0) <= 0;
 }
 
+void ModelMonitor::remember_refusal(const health_event_t& event) {
+  std::vector<health_event_t> verdicts = std::move(memory_.verdicts.events);
+  if (verdicts.size() == kMaxEvents) verdicts.erase(verdicts.begin());
+  verdicts.push_back(event);
+  verdicts.back().event_number =
+      verdicts.size() > 1 ? verdicts[verdicts.size() - 2].event_number + 1 : 0;
+  set_array(memory_.verdicts.num_events, memory_.verdicts.events, std::move(verdicts));
+}
+
 void ModelMonitor::judge(const body_schema_t& message) {
   BodySchema proposal = better_one(from_message(message));
   const std::int64_t index = proposal.last_sample_index;
@@ -162,12 +171,7 @@ void ModelMonitor::judge(const body_schema_t& message) {
       event.event_text = why_not;
       standing.add(event);
       is_changed = true;
-      std::vector<health_event_t> verdicts = std::move(memory_.verdicts.events);
-      if (verdicts.size() == kMaxEvents) verdicts.erase(verdicts.begin());
-      verdicts.push_back(event);
-      verdicts.back().event_number =
-          verdicts.size() > 1 ? verdicts[verdicts.size() - 2].event_number + 1 : 0;
-      set_array(memory_.verdicts.num_events, memory_.verdicts.events, std::move(verdicts));
+      remember_refusal(event);
     }
   }
   if (!is_new_base && standing.is_holding_back() && standing.youth.is_story_believed()) {

@@ -99,7 +99,7 @@ void Findings::confirm(const Adaptation& adaptation, const AdaptationEvent& even
   }
 }
 
-void Findings::hear(const Adaptation& adaptation, const AdaptationEvent& event) {
+static Finding finding_of(const AdaptationEvent& event) {
   Finding finding;
   finding.from = event.from;
   finding.to = event.to;
@@ -109,6 +109,11 @@ void Findings::hear(const Adaptation& adaptation, const AdaptationEvent& event) 
   finding.size = event.size;
   finding.found = event.sample_index;
   finding.since = event.since >= 0 ? event.since : event.sample_index;
+  return finding;
+}
+
+void Findings::hear(const Adaptation& adaptation, const AdaptationEvent& event) {
+  Finding finding = finding_of(event);
   const bool is_aside = event.tag >= 0 || event.cause == "marker_missing";
   // Some other form may turn out to be a body of before.
   const bool is_restored =

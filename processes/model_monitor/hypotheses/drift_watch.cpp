@@ -86,6 +86,45 @@ Line fit_line(const std::vector<TimedReading>& readings, double ended = 0, int r
   return line;
 }
 
+/// Fills in ξ: about the reading nearest to all others, in the end about the line's own value of
+/// now. Returns that pose, and the line.
+std::pair<Pose, Line> line_through(const std::vector<Pose>& T,
+                                   std::vector<TimedReading>* readings) {
+  Pose reference = T[T.size() / 2];
+  const auto refer = [&] {
+    for (std::size_t n = 0; n < T.size(); ++n) (*readings)[n].xi = log(reference.inverse() * T[n]);
+  };
+  Line line;
+  for (int round = 0; round < 3; ++round) {
+    refer();
+    line = fit_line(*readings);
+    reference = reference * exp(line.ab.head<6>());
+  }
+  refer();
+  line.ab.head<6>().setZero();
+  return {reference, line};
+}
+
+/// A drift that lasts, or has ended.
+struct Course {
+  Line line;
+  int ended;  // samples ago
+  double log_weight;
+};
+
+std::vector<Course> courses_of(const Line& line, const std::vector<TimedReading>& readings) {
+  std::vector<Course> courses{{line, 0, -line.cost}};
+  for (int ended = 1; ended <= kLatestEnd; ++ended) {
+    const auto num_before =
+        std::count_if(readings.begin(), readings.end(),
+                      [ended](const TimedReading& r) { return r.time <= -ended; });
+    if (num_before < static_cast<std::ptrdiff_t>(kFewestFollowed)) break;
+    const Line stopped = fit_line(readings, -ended, 3);
+    courses.push_back({stopped, ended, std::log(kEnds) - stopped.cost});
+  }
+  return courses;
+}
+
 TreeFilter::Instant with_exact_models(TreeFilter::Instant instant) {
   for (Matrix6d& covariance : instant.edge_covariance) covariance = 1e-12 * Matrix6d::Identity();
   return instant;
@@ -264,30 +303,8 @@ std::optional<Drift> DriftWatch::follow(const BodySchema& schema, int part) cons
       readings.push_back(
           {static_cast<double>(m.sample_index - now), Vector6d::Zero(), information});
     }
-    // About the reading nearest to all others, in the end about the line's own value of now.
-    Pose reference = T[T.size() / 2];
-    Line line;
-    for (int round = 0; round < 3; ++round) {
-      for (std::size_t n = 0; n < T.size(); ++n) readings[n].xi = log(reference.inverse() * T[n]);
-      line = fit_line(readings);
-      reference = reference * exp(line.ab.head<6>());
-    }
-    for (std::size_t n = 0; n < T.size(); ++n) readings[n].xi = log(reference.inverse() * T[n]);
-    line.ab.head<6>().setZero();
-    struct Course {
-      Line line;
-      int ended;  // samples ago
-      double log_weight;
-    };
-    std::vector<Course> courses{{line, 0, -line.cost}};
-    for (int ended = 1; ended <= kLatestEnd; ++ended) {
-      const auto num_before =
-          std::count_if(readings.begin(), readings.end(),
-                        [ended](const TimedReading& r) { return r.time <= -ended; });
-      if (num_before < static_cast<std::ptrdiff_t>(kFewestFollowed)) break;
-      const Line stopped = fit_line(readings, -ended, 3);
-      courses.push_back({stopped, ended, std::log(kEnds) - stopped.cost});
-    }
+    const auto [reference, line] = line_through(T, &readings);
+    const std::vector<Course> courses = courses_of(line, readings);
     double highest = courses.front().log_weight, sum = 0;
     for (const Course& course : courses) highest = std::max(highest, course.log_weight);
     for (const Course& course : courses) sum += std::exp(course.log_weight - highest);
@@ -344,22 +361,23 @@ double BegunDrift::log_likelihood(const BodySchema& before, const MeasurementMod
   return sum + bodyschema::log_likelihood(before, measurement, unmoved);
 }
 
-std::vector<BegunDrift> begun_drifts(const BodySchema& before, const MeasurementModel& measurement,
+namespace {
+
+/// The links of the edge to a part, and what is read of each.
+struct Places {
+  int part, node;
+  const Edge* edge;
+  std::vector<std::vector<TimedReading>> links;
+};
+
+std::vector<Places> readings_by_link(const BodySchema& before, const MeasurementModel& measurement,
                                      const std::vector<int>& parts,
-                                     const std::vector<const ActionPoseSample*>& samples,
-                                     std::int64_t since) {
+                                     const std::vector<const ActionPoseSample*>& samples) {
   const TreeFilter filter(before, measurement);
-  struct Places {
-    int part, node;
-    const Edge* edge;
-    std::vector<std::vector<TimedReading>> links;
-  };
   std::vector<Places> places;
   for (const int part : parts)
     if (const int node = filter.node_of(part); node >= 0)
       places.push_back({part, node, edge_to(before, part), {}});
-  std::vector<BegunDrift> result;
-  if (samples.empty()) return result;
   for (const ActionPoseSample* sample : samples) {
     const TreeFilter::Instant instant = filter.prepare(*sample);
     const Eigen::VectorXd displacements = before.displacements(sample->action);
@@ -376,9 +394,20 @@ std::vector<BegunDrift> begun_drifts(const BodySchema& before, const Measurement
       }
     }
   }
+  return places;
+}
+
+}  // namespace
+
+std::vector<BegunDrift> begun_drifts(const BodySchema& before, const MeasurementModel& measurement,
+                                     const std::vector<int>& parts,
+                                     const std::vector<const ActionPoseSample*>& samples,
+                                     std::int64_t since) {
+  std::vector<BegunDrift> result;
+  if (samples.empty()) return result;
   const std::int64_t now = samples.back()->sample_index;
   const std::int64_t earliest = std::max(since - kLongestUnseen, samples.front()->sample_index - 1);
-  for (const Places& place : places) {
+  for (const Places& place : readings_by_link(before, measurement, parts, samples)) {
     std::optional<BegunDrift> best;
     for (std::size_t link = place.links.size(); link-- > 0;) {
       const std::vector<TimedReading>& readings = place.links[link];

@@ -11,6 +11,7 @@
 #include <random>
 
 #include "common/bus/event_log.h"
+#include "tests/support/temporary_folder.h"
 
 namespace bodyschema {
 namespace {
@@ -25,14 +26,6 @@ sample_t sample(std::int64_t index) {
 
 class SampleIntakeTest : public testing::Test {
  protected:
-  SampleIntakeTest() {
-    const auto* test = testing::UnitTest::GetInstance()->current_test_info();
-    file_ = std::filesystem::path(testing::TempDir()) /
-            ("sample_intake_" + std::to_string(getpid()) + test->name() + ".lcmlog");
-    std::filesystem::remove(file_);
-  }
-  ~SampleIntakeTest() override { std::filesystem::remove(file_); }
-
   void record(const std::vector<std::int64_t>& indices) const {
     LogAppender log(file_, LogAppender::Mode::kAppend, LogAppender::Durability::kToKernel);
     for (const std::int64_t index : indices) log.append(kSample, sample(index));
@@ -60,7 +53,8 @@ class SampleIntakeTest : public testing::Test {
   using Indices = std::vector<std::int64_t>;
   using Requests = std::vector<std::pair<std::int64_t, std::int64_t>>;
   Requests asked_;
-  std::filesystem::path file_;
+  test::TemporaryFolder folder_;
+  std::filesystem::path file_ = folder_ / "samples.lcmlog";
   std::optional<SampleIntake> intake_;
   Indices heard_;
 };

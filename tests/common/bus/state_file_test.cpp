@@ -1,23 +1,18 @@
 #include "common/bus/state_file.h"
 
 #include <gtest/gtest.h>
-#include <unistd.h>
 
-#include <fstream>
-#include <iterator>
+#include "tests/support/temporary_folder.h"
+#include "tests/support/text_of.h"
 
 namespace bodyschema {
 namespace {
 
 class StateFileTest : public testing::Test {
  protected:
-  ~StateFileTest() override { std::filesystem::remove_all(folder_); }
-  std::string content() const {
-    std::ifstream file(file_);
-    return {std::istreambuf_iterator<char>(file), {}};
-  }
-  const std::filesystem::path folder_ =
-      std::filesystem::path(testing::TempDir()) / ("state_file_" + std::to_string(getpid()));
+  std::string content() const { return test::text_of(file_); }
+  const test::TemporaryFolder temporary_;
+  const std::filesystem::path folder_ = temporary_ / "state";
   const std::filesystem::path file_ = folder_ / "state.yaml";  // no folder yet: cannot be written
 };
 

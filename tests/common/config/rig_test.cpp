@@ -1,13 +1,13 @@
 #include "common/config/rig.h"
 
 #include <gtest/gtest.h>
-#include <unistd.h>
 
 #include <filesystem>
 #include <fstream>
 #include <functional>
 
 #include "common/config/yaml.h"
+#include "tests/support/temporary_folder.h"
 
 namespace bodyschema {
 namespace {
@@ -15,14 +15,6 @@ namespace {
 /// A folder of its own for every test.
 class RigTest : public testing::Test {
  protected:
-  RigTest() {
-    const auto* test = testing::UnitTest::GetInstance()->current_test_info();
-    folder_ = std::filesystem::path(testing::TempDir()) /
-              ("rig_" + std::to_string(getpid()) + test->name());
-    std::filesystem::create_directories(folder_);
-  }
-  ~RigTest() override { std::filesystem::remove_all(folder_); }
-
   void write(const std::string& name, const std::string& text) const {
     std::ofstream(folder_ / name) << text;
   }
@@ -51,7 +43,8 @@ class RigTest : public testing::Test {
     return load_network(folder_, group);
   }
 
-  std::filesystem::path folder_;
+  test::TemporaryFolder temporary_;
+  std::filesystem::path folder_ = temporary_.path();
 };
 
 TEST_F(RigTest, MarkersAreSortedByIdAndFoundByIt) {

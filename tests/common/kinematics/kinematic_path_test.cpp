@@ -224,6 +224,34 @@ Eigen::MatrixXd by_frames(const Edge& edge) {
   return G;
 }
 
+/// Edges about those of `schema`: their parameters, with these roots of the covariances, and the
+/// frames of the parts.
+void draw_edges(const BodySchema& schema, const std::vector<Eigen::MatrixXd>& roots,
+                BodySchema* robot, Rng& rng) {
+  std::map<int, Vector6d> frames;
+  for (const auto& [part, covariance] : schema.frame_covariances)
+    frames[part] = Eigen::LLT<Matrix6d>(covariance).matrixL() *
+                   Vector6d::NullaryExpr([&] { return test::gaussian(rng); });
+  for (std::size_t e = 0; e < schema.edges.size(); ++e) {
+    Edge& edge = robot->edges[e];
+    edge = schema.edges[e];
+    Eigen::VectorXd delta = roots[e] * Eigen::VectorXd::NullaryExpr(
+                                           roots[e].rows(), [&] { return test::gaussian(rng); });
+    if (!frames.empty()) {
+      Eigen::VectorXd of_both(12);
+      of_both << frames.at(edge.from), frames.at(edge.to);
+      delta += by_frames(edge) * of_both;
+    }
+    edge.left = edge.left * exp(delta.head<6>());
+    for (std::size_t d = 0; d < edge.joints.size(); ++d) {
+      const auto first = 6 + 8 * static_cast<Eigen::Index>(d);
+      edge.joints[d].slide += delta(first);
+      edge.joints[d].turn += delta(first + 1);
+      edge.joints[d].X_after = edge.joints[d].X_after * exp(delta.segment<6>(first + 2));
+    }
+  }
+}
+
 // Forty thousand robots whose parameters are drawn from the covariance that each edge states;
 // then also the frames of the parts, which the edges that meet there share.
 TEST(KinematicPath, FirstOrderCovarianceIsThatOfDrawnParameters) {
@@ -257,29 +285,7 @@ TEST(KinematicPath, FirstOrderCovarianceIsThatOfDrawnParameters) {
     constexpr int kDraws = 40'000;
     BodySchema robot = schema;
     for (int n = 0; n < kDraws; ++n) {
-      std::map<int, Vector6d> frames;
-      for (const auto& [part, covariance] : schema.frame_covariances)
-        frames[part] = Eigen::LLT<Matrix6d>(covariance).matrixL() *
-                       Vector6d::NullaryExpr([&] { return test::gaussian(rng); });
-      for (std::size_t e = 0; e < schema.edges.size(); ++e) {
-        Edge& edge = robot.edges[e];
-        edge = schema.edges[e];
-        Eigen::VectorXd delta = roots[e] * Eigen::VectorXd::NullaryExpr(roots[e].rows(), [&] {
-                                  return test::gaussian(rng);
-                                });
-        if (in_common) {
-          Eigen::VectorXd of_both(12);
-          of_both << frames.at(edge.from), frames.at(edge.to);
-          delta += by_frames(edge) * of_both;
-        }
-        edge.left = edge.left * exp(delta.head<6>());
-        for (std::size_t d = 0; d < edge.joints.size(); ++d) {
-          const auto first = 6 + 8 * static_cast<Eigen::Index>(d);
-          edge.joints[d].slide += delta(first);
-          edge.joints[d].turn += delta(first + 1);
-          edge.joints[d].X_after = edge.joints[d].X_after * exp(delta.segment<6>(first + 2));
-        }
-      }
+      draw_edges(schema, roots, &robot, rng);
       const Pose X_64 = robot.edges[3].predict(theta).inverse() *
                         robot.edges[1].predict(theta).inverse() * robot.edges[2].predict(theta);
       const Vector6d e = log(inverse * X_64);

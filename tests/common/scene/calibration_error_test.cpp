@@ -1,16 +1,16 @@
 #include "common/scene/calibration_error.h"
 
 #include <gtest/gtest.h>
-#include <unistd.h>
 
 #include <cmath>
 #include <fstream>
-#include <sstream>
 #include <vector>
 
 #include "common/config/yaml.h"
 #include "common/geometry/angle.h"
 #include "common/scene/scene.h"
+#include "tests/support/temporary_folder.h"
+#include "tests/support/text_of.h"
 
 namespace bodyschema {
 namespace {
@@ -114,15 +114,10 @@ TEST(CalibrationError, OfOneTagHangsOnNoOther) {
 
 // A lab's own files change only what the group assumes; the robot stays as it is.
 TEST(CalibrationError, MovesWithNothingThatTheRigClaims) {
-  const std::filesystem::path rig =
-      std::filesystem::path(testing::TempDir()) / ("bodyschema_claims_" + std::to_string(getpid()));
-  std::filesystem::remove_all(rig);
-  std::filesystem::copy(kConfig / "arm4", rig, std::filesystem::copy_options::recursive);
+  const test::TemporaryFolder rig(kConfig / "arm4");
   const auto replace = [&](const std::string& file, const std::string& from,
                            const std::string& to) {
-    std::stringstream text;
-    text << std::ifstream(rig / file).rdbuf();
-    std::string content = text.str();
+    std::string content = test::text_of(rig / file);
     ASSERT_NE(content.find(from), std::string::npos);
     content.replace(content.find(from), from.size(), to);
     std::ofstream(rig / file) << content;
@@ -130,9 +125,8 @@ TEST(CalibrationError, MovesWithNothingThatTheRigClaims) {
   replace("markers.yaml", "size_m: 0.08", "size_m: 0.081");
   replace("markers.yaml", "[0.056, 0, 0]", "[0.057, 0, 0]");
   replace("camera_info.yaml", "1092.4", "1095.4");
-  EXPECT_TRUE(is_same(robot_of(rig), robot_of(kConfig / "arm4")));
-  EXPECT_TRUE(is_same(robot_of(rig, 5), robot_of(kConfig / "arm4", 5)));
-  std::filesystem::remove_all(rig);
+  EXPECT_TRUE(is_same(robot_of(rig.path()), robot_of(kConfig / "arm4")));
+  EXPECT_TRUE(is_same(robot_of(rig.path(), 5), robot_of(kConfig / "arm4", 5)));
 }
 
 TEST(CalibrationError, PlayIsOnTheSideThatTheJointCameFrom) {

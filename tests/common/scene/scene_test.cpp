@@ -5,11 +5,11 @@
 #include <algorithm>
 #include <filesystem>
 #include <fstream>
-#include <sstream>
 
 #include "common/bus/convert.h"
 #include "common/config/camera_calibration.h"
 #include "common/config/yaml.h"
+#include "tests/support/text_of.h"
 
 namespace bodyschema {
 namespace {
@@ -105,9 +105,7 @@ std::filesystem::path changed_rig(const std::string& name, const std::string& fi
       std::filesystem::path(testing::TempDir()) / ("bodyschema_" + name);
   std::filesystem::remove_all(folder);
   std::filesystem::copy(kConfig / "arm2", folder, std::filesystem::copy_options::recursive);
-  std::stringstream text;
-  text << std::ifstream(folder / file).rdbuf();
-  std::string content = text.str();
+  std::string content = test::text_of(folder / file);
   const std::size_t at = content.find(from);
   EXPECT_NE(at, std::string::npos) << from;
   content.replace(at, from.size(), to);
@@ -131,9 +129,7 @@ TEST(Scene, AToolThatIsNotMountedHasNoMassAndIsNotSeen) {
   const auto rig = std::filesystem::path(testing::TempDir()) / "bodyschema_no_tools";
   std::filesystem::remove_all(rig);
   std::filesystem::copy(kConfig / "arm2", rig, std::filesystem::copy_options::recursive);
-  std::stringstream text;
-  text << std::ifstream(rig / "robot.yaml").rdbuf();
-  const std::string whole = text.str();
+  const std::string whole = test::text_of(rig / "robot.yaml");
   std::ofstream(rig / "robot.yaml") << whole.substr(0, whole.find("tools:"));
   const Scene without(rig);
   ASSERT_EQ(with.model().ngeom, without.model().ngeom + 1);
@@ -175,9 +171,7 @@ TEST(Scene, TakesTheTagItselfForThePartWherePlacementIsNone) {
   const auto rig = changed_rig("no_placement", "robot.yaml", "name: arm2", "name: arm2");
   // Leave one tag a part, without placement.
   const Scene scene(kConfig / "arm2");
-  std::stringstream text;
-  text << std::ifstream(rig / "robot.yaml").rdbuf();
-  std::string content = text.str();
+  std::string content = test::text_of(rig / "robot.yaml");
   const std::size_t begin = content.find("tags:\n"), end = content.find("\n\n", begin);
   std::string tags = "tags:";
   for (const int part : scene.markers().parts()) {

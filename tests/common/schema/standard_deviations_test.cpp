@@ -9,6 +9,40 @@
 namespace bodyschema {
 namespace {
 
+/// Standard deviations: of the first axis' tilt, of its position where that is known best, and of
+/// the last joint's displacement.
+struct Drawn {
+  double tilt = 0, across = 0, turned = 0;
+};
+
+/// Of edges of two joints whose parameters have `root` as a root of their covariance.
+Drawn draw(const Edge& edge, const Eigen::MatrixXd& root, double last_displacement,
+           test::Rng& rng) {
+  // The last joint's displacement in terms of the end alone: the end's twist along its axis.
+  constexpr int kDraws = 20'000;
+  // Heights along the axis, of which one is that where its position is known best.
+  std::vector<double> across(200, 0.0);
+  double tilt = 0, turned = 0;
+  const Matrix6d to_axis = adjoint(edge.joints[1].X_after);
+  for (int n = 0; n < kDraws; ++n) {
+    const Eigen::VectorXd delta =
+        root * Eigen::VectorXd::NullaryExpr(root.rows(), [&] { return test::gaussian(rng); });
+    const Pose X = exp(delta.head<6>());
+    const Eigen::Vector3d z = X.linear().col(2);
+    tilt += z.head<2>().squaredNorm() / 2 / kDraws;
+    for (std::size_t i = 0; i < across.size(); ++i) {
+      const Eigen::Vector3d at(0, 0, -2 + 0.02 * static_cast<double>(i));
+      across[i] += (X * at - at).head<2>().squaredNorm() / 2 / kDraws;
+    }
+    // Exp(δ) before the joint and after it, along the axis that both share.
+    const double along = delta.segment<6>(8)(5) + last_displacement * delta(15) +
+                         (to_axis * delta.segment<6>(16))(5);
+    turned += along * along / kDraws;
+  }
+  return {std::sqrt(tilt), std::sqrt(*std::min_element(across.begin(), across.end())),
+          std::sqrt(turned)};
+}
+
 // Drawn edges: where the first axis lies and how it leans, and how far each joint has gone.
 TEST(StandardDeviations, OfAJointAreThoseOfDrawnEdgesHoweverItsFrameIsTurned) {
   test::Rng rng(3);
@@ -29,31 +63,10 @@ TEST(StandardDeviations, OfAJointAreThoseOfDrawnEdgesHoweverItsFrameIsTurned) {
   const auto deviations = joint_deviations(edge, theta);
   ASSERT_EQ(deviations.size(), 2U);
 
-  // The last joint's displacement in terms of the end alone: the end's twist along its axis.
-  constexpr int kDraws = 20'000;
-  // Heights along the axis, of which one is that where its position is known best.
-  std::vector<double> across(200, 0.0);
-  double tilt = 0, turned = 0;
-  const Matrix6d to_axis = adjoint(edge.joints[1].X_after);
-  for (int n = 0; n < kDraws; ++n) {
-    const Eigen::VectorXd delta =
-        root * Eigen::VectorXd::NullaryExpr(kSize, [&] { return test::gaussian(rng); });
-    const Pose X = exp(delta.head<6>());
-    const Eigen::Vector3d z = X.linear().col(2);
-    tilt += z.head<2>().squaredNorm() / 2 / kDraws;
-    for (std::size_t i = 0; i < across.size(); ++i) {
-      const Eigen::Vector3d at(0, 0, -2 + 0.02 * static_cast<double>(i));
-      across[i] += (X * at - at).head<2>().squaredNorm() / 2 / kDraws;
-    }
-    // Exp(δ) before the joint and after it, along the axis that both share.
-    const double along =
-        delta.segment<6>(8)(5) + theta(1) * delta(15) + (to_axis * delta.segment<6>(16))(5);
-    turned += along * along / kDraws;
-  }
-  EXPECT_NEAR(deviations[0].axis_tilt_rad, std::sqrt(tilt), 0.02 * std::sqrt(tilt));
-  const double least = std::sqrt(*std::min_element(across.begin(), across.end()));
-  EXPECT_NEAR(deviations[0].axis_position_m, least, 0.02 * least);
-  EXPECT_NEAR(deviations[1].displacement_rad, std::sqrt(turned), 0.02 * std::sqrt(turned));
+  const Drawn drawn = draw(edge, root, theta(1), rng);
+  EXPECT_NEAR(deviations[0].axis_tilt_rad, drawn.tilt, 0.02 * drawn.tilt);
+  EXPECT_NEAR(deviations[0].axis_position_m, drawn.across, 0.02 * drawn.across);
+  EXPECT_NEAR(deviations[1].displacement_rad, drawn.turned, 0.02 * drawn.turned);
 
   // The screw frame turned about its axis by 30° and slid along it by 0.1 m: another gauge.
   const auto gauge = [&](double slide, double turn) {

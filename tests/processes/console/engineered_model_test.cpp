@@ -1,13 +1,13 @@
 #include "processes/console/engineered_model.h"
 
 #include <gtest/gtest.h>
-#include <unistd.h>
 
 #include <fstream>
 #include <string>
 
 #include "common/config/yaml.h"
 #include "common/geometry/angle.h"
+#include "tests/support/temporary_folder.h"
 
 namespace bodyschema {
 namespace {
@@ -60,13 +60,6 @@ Pose rpy(double r, double p, double y) {
 
 class EngineeredModelTest : public testing::Test {
  protected:
-  EngineeredModelTest() {
-    folder_ =
-        std::filesystem::path(testing::TempDir()) / ("engineered_model" + std::to_string(getpid()));
-    std::filesystem::create_directories(folder_);
-  }
-  ~EngineeredModelTest() override { std::filesystem::remove_all(folder_); }
-
   BodySchema model(const std::string& urdf, const std::string& placement) const {
     std::ofstream(folder_ / "robot.urdf") << urdf;
     std::ofstream(folder_ / "placement.yaml") << placement;
@@ -82,7 +75,7 @@ class EngineeredModelTest : public testing::Test {
     }
   }
 
-  std::filesystem::path folder_;
+  test::TemporaryFolder folder_;
 };
 
 std::string replaced(std::string text, const std::string& from, const std::string& to) {

@@ -1,7 +1,6 @@
 #include "processes/console/urdf_model.h"
 
 #include <gmock/gmock.h>
-#include <unistd.h>
 #include <urdf_model/model.h>
 #include <urdf_parser/urdf_parser.h>
 
@@ -22,6 +21,7 @@
 #include "processes/console/gravity_load.h"
 #include "processes/console/pure_joints.h"
 #include "tests/support/synthetic_robot.h"
+#include "tests/support/temporary_folder.h"
 
 namespace bodyschema {
 namespace {
@@ -32,15 +32,6 @@ using testing::HasSubstr;
 constexpr double kExact = 1e-9;
 constexpr int kNumRobots = 20;
 constexpr int kNumActions = 5;
-
-Eigen::VectorXd random_action(const BodySchema& schema, Rng& rng) {
-  Eigen::VectorXd action(static_cast<Eigen::Index>(schema.signals.size()));
-  for (Eigen::Index s = 0; s < action.size(); ++s) {
-    const Signal& signal = schema.signals[static_cast<std::size_t>(s)];
-    action(s) = test::uniform(rng, signal.lower, signal.upper);
-  }
-  return action;
-}
 
 /// Edges of 0 to 3 joints, each revolute, prismatic or, now and then, stuck; five signals for all
 /// of them, in units of their own; the last part shows its position alone.
@@ -73,12 +64,6 @@ BodySchema random_schema(Rng& rng, int num_parts = 8) {
 
 class UrdfModelTest : public testing::Test {
  protected:
-  UrdfModelTest() {
-    folder_ = std::filesystem::path(testing::TempDir()) / ("urdf_model" + std::to_string(getpid()));
-    std::filesystem::create_directories(folder_);
-  }
-  ~UrdfModelTest() override { std::filesystem::remove_all(folder_); }
-
   void write(const UrdfModel& model) const {
     std::ofstream(urdf()) << model.urdf;
     std::ofstream(placement()) << model.placement;
@@ -91,14 +76,14 @@ class UrdfModelTest : public testing::Test {
     return engineered_model(urdf(), placement());
   }
 
-  std::filesystem::path folder_;
+  test::TemporaryFolder folder_;
 };
 
 void expect_same(const BodySchema& a, const BodySchema& b, Rng& rng) {
   EXPECT_EQ(a.parts, b.parts);
   EXPECT_EQ(a.root, b.root);
   for (int n = 0; n < kNumActions; ++n) {
-    const Eigen::VectorXd action = random_action(a, rng);
+    const Eigen::VectorXd action = test::random_action(a.signals, rng);
     const std::map<int, Pose> A = a.predict_all(action), B = b.predict_all(action);
     ASSERT_EQ(A.size(), B.size());
     for (const auto& [part, X] : A)
@@ -240,7 +225,7 @@ TEST_F(UrdfModelTest, KdlAgrees) {
     KDL::Tree tree(root);
     add_children(*robot, root, &tree);
     KDL::TreeFkSolverPos_recursive kinematics(tree);
-    const Eigen::VectorXd action = random_action(schema, rng);
+    const Eigen::VectorXd action = test::random_action(schema.signals, rng);
     KDL::JntArray q(tree.getNrOfJoints());
     for (const auto& [name, position] : joint_positions(*robot, yaml, action))
       q(tree.getSegment(robot->getJoint(name)->child_link_name)->second.q_nr) = position;
@@ -278,7 +263,7 @@ TEST_F(UrdfModelTest, MuJoCoAgrees) {
     ASSERT_TRUE(model);
     const MjDataPtr data(mj_makeData(model.get()));
     const auto robot = urdf::parseURDFFile(urdf());
-    const Eigen::VectorXd action = random_action(schema, rng);
+    const Eigen::VectorXd action = test::random_action(schema.signals, rng);
     for (const auto& [name, position] : joint_positions(*robot, Yaml::load(placement()), action)) {
       const int joint = mj_name2id(model.get(), mjOBJ_JOINT, name.c_str());
       ASSERT_GE(joint, 0) << name;
@@ -324,7 +309,7 @@ TEST_F(UrdfModelTest, MuJoCoAgreesOnWhatGravityDoes) {
     Eigen::Map<Eigen::Vector3d>(model->opt.gravity) << 0, 0, -9.80665;
     const MjDataPtr data(mj_makeData(model.get()));
     const auto robot = urdf::parseURDFFile(urdf());
-    const Eigen::VectorXd action = random_action(schema, rng);
+    const Eigen::VectorXd action = test::random_action(schema.signals, rng);
     for (const auto& [name, position] : joint_positions(*robot, Yaml::load(placement()), action))
       data->qpos[model->jnt_qposadr[mj_name2id(model.get(), mjOBJ_JOINT, name.c_str())]] = position;
     mj_forward(model.get(), data.get());

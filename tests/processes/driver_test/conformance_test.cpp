@@ -166,23 +166,25 @@ class FakeDriver {
     if (sin_ != Sin::kForgetsTheInterrupted) conclude(moved, Status::STATE_STOPPED, reason);
   }
 
+  void answer_again(const Command& c, Status again) {
+    again.utime = now_ - offset_;
+    again.rest_since_utime = rest_since_;
+    again.stop_latched = latched_;
+    again.source = c.source;
+    again.epoch = c.epoch;
+    if (again.state == Status::STATE_SETTLED && again.commanded != at_ &&
+        sin_ != Sin::kSettledForEver) {
+      again.state = Status::STATE_STOPPED;
+      again.reason = "moved on";
+    }
+    out_.push_back(again);
+  }
+
   void on_command(const Command& c) {
     if (sin_ == Sin::kMute) return;
     if (const auto found = served_.find(key(c)); found != served_.end()) {
       if (sin_ == Sin::kMovesAgain && c.kind == Command::KIND_MOVE && !motion_) return begin(c);
-      Status again = found->second;
-      again.utime = now_ - offset_;
-      again.rest_since_utime = rest_since_;
-      again.stop_latched = latched_;
-      again.source = c.source;
-      again.epoch = c.epoch;
-      if (again.state == Status::STATE_SETTLED && again.commanded != at_ &&
-          sin_ != Sin::kSettledForEver) {
-        again.state = Status::STATE_STOPPED;
-        again.reason = "moved on";
-      }
-      out_.push_back(again);
-      return;
+      return answer_again(c, found->second);
     }
     switch (c.kind) {
       case Command::KIND_HOLD:

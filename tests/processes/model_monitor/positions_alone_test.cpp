@@ -7,10 +7,8 @@
 
 #include "common/estimation/chi_square.h"
 #include "common/estimation/quantile.h"
-#include "processes/model_monitor/adaptation.h"
 #include "processes/model_monitor/likelihood/tree_filter.h"
-#include "tests/support/broken_arm.h"
-#include "tests/support/synthetic_robot.h"
+#include "tests/processes/model_monitor/adaptation_life.h"
 
 namespace bodyschema {
 namespace {
@@ -47,11 +45,6 @@ class PositionsAlone : public testing::TestWithParam<int> {
     return worst;
   }
 
-  static std::string text(const AdaptationEvent& e) {
-    return std::to_string(e.sample_index) + " " + name_of(e.kind) + " " + std::to_string(e.from) +
-           "-" + std::to_string(e.to) + " part " + std::to_string(e.part) + " " + e.cause;
-  }
-
   Rng rng_{static_cast<std::uint64_t>(GetParam())};
   test::SyntheticRobot robot_ = test::chapter_robot("c", rng_);
   const int leaf_ = robot_.visible_parts().back();
@@ -80,7 +73,7 @@ TEST_P(PositionsAlone, AreJudgedByThreeResiduals) {
 TEST_P(PositionsAlone, AHealthyBodyHasNoEvents) {
   Adaptation adaptation(schema_, test::adaptation_options(Regime::kTagIso));
   for (const ActionPoseSample& sample : babble(300, 0, Regime::kTagIso))
-    for (const AdaptationEvent& e : adaptation.on_sample(sample)) ADD_FAILURE() << text(e);
+    for (const AdaptationEvent& e : adaptation.on_sample(sample)) ADD_FAILURE() << test::text(e);
   EXPECT_NEAR(adaptation.noise_scale(), 1, 0.15);
 }
 
@@ -88,13 +81,13 @@ TEST_P(PositionsAlone, AnExchangedToolIsFoundAndLearned) {
   Adaptation adaptation(schema_, test::adaptation_options(Regime::kTagIso));
   constexpr int kHealthy = 80;
   for (const ActionPoseSample& sample : babble(kHealthy, 0, Regime::kTagIso))
-    for (const AdaptationEvent& e : adaptation.on_sample(sample)) ADD_FAILURE() << text(e);
+    for (const AdaptationEvent& e : adaptation.on_sample(sample)) ADD_FAILURE() << test::text(e);
   robot_.links.back().X_after.translation() += Eigen::Vector3d(0.05, 0.03, 0);
   std::string events;
   for (const ActionPoseSample& sample : babble(60, kHealthy, Regime::kTagIso))
     for (const AdaptationEvent& e : adaptation.on_sample(sample)) {
-      events += text(e) + "\n";
-      EXPECT_TRUE(e.part == leaf_ || e.to == leaf_) << text(e);
+      events += test::text(e) + "\n";
+      EXPECT_TRUE(e.part == leaf_ || e.to == leaf_) << test::text(e);
     }
   EXPECT_NE(events, "");
   EXPECT_LT(leaf_error_m(adaptation.schema()), 0.01) << events;

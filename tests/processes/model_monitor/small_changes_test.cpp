@@ -10,10 +10,8 @@
 #include <vector>
 
 #include "common/geometry/angle.h"
-#include "processes/model_monitor/adaptation.h"
 #include "processes/model_monitor/hypotheses/drift_watch.h"
-#include "tests/support/broken_arm.h"
-#include "tests/support/synthetic_robot.h"
+#include "tests/processes/model_monitor/adaptation_life.h"
 
 namespace bodyschema {
 namespace {
@@ -25,11 +23,6 @@ using test::Fault;
 using test::Regime;
 
 constexpr int kHealthy = 100;
-
-std::string text(const AdaptationEvent& e) {
-  return std::to_string(e.sample_index) + " " + name_of(e.kind) + " " + std::to_string(e.from) +
-         "-" + std::to_string(e.to) + " part " + std::to_string(e.part) + " " + e.cause + "\n";
-}
 
 struct SmallFault {
   const char* name;
@@ -50,7 +43,7 @@ TEST_P(EverySmallFault, IsFoundWithinFortySamplesAndNothingElseIs) {
     bool is_explained = false;
     for (int t = 0; t < kHealthy + 40; ++t)
       for (const AdaptationEvent& event : adaptation.on_sample(arm.observe(t))) {
-        log += text(event);
+        log += test::text(event) + "\n";
         EXPECT_GE(t, kHealthy) << log;
         EXPECT_TRUE(arm.is_near(event.part >= 0 ? event.part : event.to)) << log;
         is_explained |= event.kind == Kind::kCandidate || event.kind == Kind::kDrift;
@@ -75,7 +68,7 @@ TEST(IntermittentFault, IsToldOnceAndNothingIsAdoptedForItAnyMore) {
     std::vector<AdaptationEvent> told, later;
     for (int t = 0; t < 3 * kHealthy; ++t)
       for (const AdaptationEvent& event : adaptation.on_sample(arm.observe(t))) {
-        log += text(event);
+        log += test::text(event) + "\n";
         if (event.cause == "intermittent")
           told.push_back(event);
         else if (!told.empty() && event.kind != Kind::kReverted)
@@ -108,7 +101,7 @@ TEST(IntermittentFault, IsOverOnceItStaysAway) {
     ActionPoseSample sample = whole.observe(n);
     sample.sample_index = t + n;
     for (const AdaptationEvent& event : adaptation.on_sample(sample)) {
-      log += text(event);
+      log += test::text(event) + "\n";
       is_over |= event.kind == Kind::kRecovered && event.cause == "intermittent";
     }
   }

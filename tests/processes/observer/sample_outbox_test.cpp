@@ -1,11 +1,12 @@
 #include "processes/observer/sample_outbox.h"
 
 #include <gtest/gtest.h>
-#include <unistd.h>
 
 #include <cmath>
 #include <fstream>
 #include <optional>
+
+#include "tests/support/temporary_folder.h"
 
 namespace bodyschema {
 namespace {
@@ -32,16 +33,6 @@ sample_request_t request(std::int64_t first, std::int64_t last) {
 class SampleOutboxTest : public testing::Test {
  protected:
   using Indices = std::vector<std::int64_t>;
-
-  SampleOutboxTest() {
-    folder_ = std::filesystem::path(testing::TempDir()) /
-              ("outbox_" + std::to_string(getpid()) +
-               testing::UnitTest::GetInstance()->current_test_info()->name());
-    std::filesystem::remove_all(folder_);
-    std::filesystem::create_directories(folder_);
-    file_ = folder_ / "samples.lcmlog";
-  }
-  ~SampleOutboxTest() override { std::filesystem::remove_all(folder_); }
 
   SampleOutbox& start() {
     outbox_.reset();
@@ -72,8 +63,8 @@ class SampleOutboxTest : public testing::Test {
     }
   }
 
-  std::filesystem::path folder_;
-  std::filesystem::path file_;
+  test::TemporaryFolder folder_;
+  std::filesystem::path file_ = folder_ / "samples.lcmlog";
   std::optional<SampleOutbox> outbox_;
   Indices sent_;
   std::int64_t now_us_ = 1'700'000'000 * kSecond;

@@ -6,7 +6,6 @@
 #include <fstream>
 #include <regex>
 #include <set>
-#include <sstream>
 #include <string>
 #include <vector>
 
@@ -17,19 +16,15 @@
 #include "common/config/calibration_id.h"
 #include "common/config/yaml.h"
 #include "tests/common/bus/bus_test_support.h"
+#include "tests/support/text_of.h"
 
 namespace bodyschema {
 namespace {
 
 namespace fs = std::filesystem;
+using test::text_of;
 
 const fs::path kArm2 = BODYSCHEMA_LOGS "/arm2_15.lcmlog";
-
-std::string text_of(const fs::path& file) {
-  std::ostringstream text;
-  text << std::ifstream(file).rdbuf();
-  return text.str();
-}
 
 /// A recording of arm2 in which every second sample, the first one too, is TEST, and a rig that
 /// refines every ten and claims that the tags of part 5 are 1 % larger than they are.
