@@ -9,6 +9,8 @@
 #include <set>
 #include <tuple>
 
+#include "common/estimation/chi_square.h"
+#include "common/estimation/quantile.h"
 #include "processes/structure_learner/noise_estimate.h"
 #include "processes/structure_learner/residual_fit.h"
 #include "processes/structure_learner/screen.h"
@@ -64,12 +66,27 @@ LocalModel best_screws(const PairData& pair, const NormalizedActions& actions, i
   return best->model;
 }
 
+// What moves less than that, in standard deviations of its noise, may follow any few of the signals
+// that move it. Chosen: arms of 3 to 7 joints with a range of 4°, seen at their ends with 3 mm and
+// 1°, have 1.0 to 1.7, the parts of `soft_bodies` 10 and more.
+constexpr double kLeastMotion = 2;
+
+// Of poses at rest: about the rigid body that suits them best. (A stream may rest most of the
+// time.)
+bool moves_enough(const PairData& pair, const NormalizedActions& actions) {
+  if (actions.blocks().is_stream()) return true;
+  std::vector<double> distances;
+  for (const FrameFit& frame : evaluate(screen_rigid(pair, actions).model, pair, actions).frames)
+    distances.push_back(frame.squared_distance);
+  return upper_median(std::move(distances)) > kLeastMotion * kLeastMotion * chi_square_median(6);
+}
+
 // The pairs of two components by what the best screws leave of them, least first.
 void rank_pairs(const std::vector<ActionPoseSample>& samples, const NormalizedActions& actions,
                 const SearchOptions& options, std::vector<OpenPair>* pairs, SearchResult* found) {
   for (OpenPair& o : *pairs) {
     const PairData data = make_pair_data(samples, o.i, o.j, options.measurement, kScreenFrames);
-    if (count_independent(data, actions) < kFewestSoftFrames) {
+    if (count_independent(data, actions) < kFewestSoftFrames || !moves_enough(data, actions)) {
       o.cost = std::numeric_limits<double>::infinity();
       continue;
     }
@@ -245,9 +262,9 @@ void connect_soft_parts(const std::vector<ActionPoseSample>& samples,
   }
   for (auto& [between, pairs] : open)
     if (!undecided.contains(between))
-      std::ranges::move(soft_candidates(std::move(pairs), samples, actions, options,
-                                        is_noise_guessed, found),
-                        std::back_inserter(candidates));
+      std::ranges::move(
+          soft_candidates(std::move(pairs), samples, actions, options, is_noise_guessed, found),
+          std::back_inserter(candidates));
   const auto rank = [](const SoftCandidate& c) {
     return std::tuple(c.num_needed, -c.model.score, c.model.part_i, c.model.part_j);
   };

@@ -294,5 +294,17 @@ TEST(Streams, WhereAJointExplainsNearlyAsMuchNoOtherSignalBendsIt) {
   EXPECT_EQ(judge(schema, robot.structure()), Rightness::kRight);
 }
 
+TEST(SmallRanges, AnArmSeenAtItsEndsIsNoSoftBody) {
+  const Imperfection small{.name = "small", .range_deg = 4};
+  for (std::uint64_t seed = 2; seed < 5; ++seed) {
+    ImperfectRobot robot(2 + static_cast<int>(seed), true, small, seed);
+    auto samples = robot.babble(60);
+    test::SyntheticRobot truth = robot.structure();
+    hide_all_but_ends(&truth, &samples);
+    const BodySchema schema = learn(robot.signals(), samples, options_of(kTold)).schema;
+    EXPECT_NE(judge(schema, truth), Rightness::kWrong) << seed;
+  }
+}
+
 }  // namespace
 }  // namespace bodyschema
