@@ -98,6 +98,8 @@ struct ControllerConfig {
 /// TagTrack::kFrames frames at rest show the tag in one place: there it is served anew. A step that
 /// is under way ends first. A target that was reached does not follow its tag.
 ///
+/// A target that is kept is over when somebody else moves the arm away: nothing drives it back.
+///
 /// Messages must be of the rig (RigDoor): signals are not compared here.
 ///
 /// After a restart that owned the arm it is held, and the target that was in progress is over: it
