@@ -7,8 +7,10 @@
 
 namespace bodyschema {
 
+namespace {
+
 /// BFGS: after a step `s` the gradient is larger by `y`. An empty Hessian is begun.
-static void update(const Eigen::VectorXd& s, const Eigen::VectorXd& y, Eigen::MatrixXd* hessian) {
+void update(const Eigen::VectorXd& s, const Eigen::VectorXd& y, Eigen::MatrixXd* hessian) {
   const double curvature = s.dot(y);
   if (!(curvature > 1e-10 * s.norm() * y.norm())) return;
   if (hessian->size() == 0)
@@ -16,6 +18,8 @@ static void update(const Eigen::VectorXd& s, const Eigen::VectorXd& y, Eigen::Ma
   const Eigen::VectorXd Bs = *hessian * s;
   *hessian += y * y.transpose() / curvature - Bs * Bs.transpose() / s.dot(Bs);
 }
+
+}  // namespace
 
 BoxMinimum minimize_in_box(const Objective& objective, const Eigen::VectorXd& start,
                            const Eigen::VectorXd& lower, const Eigen::VectorXd& upper,

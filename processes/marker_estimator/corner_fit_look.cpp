@@ -14,13 +14,15 @@ namespace bodyschema::corner_fit {
 
 constexpr int kNumNodes = 6;
 
+namespace {
+
 /// Chebyshev's k-th point along so many points of a lattice.
-static double node(int k, int size) {
+double node(int k, int size) {
   return 0.5 * (size - 1) * (1 - std::cos((k + 0.5) * M_PI / kNumNodes));
 }
 
 /// Row p: Lagrange's polynomials at the p-th of so many points of a lattice.
-static Eigen::Matrix<double, Eigen::Dynamic, kNumNodes> lagrange(int size) {
+Eigen::Matrix<double, Eigen::Dynamic, kNumNodes> lagrange(int size) {
   Eigen::Matrix<double, Eigen::Dynamic, kNumNodes> W(size, kNumNodes);
   for (int p = 0; p < size; ++p) {
     for (int k = 0; k < kNumNodes; ++k) {
@@ -32,6 +34,8 @@ static Eigen::Matrix<double, Eigen::Dynamic, kNumNodes> lagrange(int size) {
   }
   return W;
 }
+
+}  // namespace
 
 void Refiner::make_lattice(const cv::Rect& region, int block_px) {
   block_px_ = block_px;

@@ -144,10 +144,12 @@ std::optional<marker_poses_t> MarkerEstimator::on_camera_image(const camera_imag
   return poses;
 }
 
+namespace {
+
 /// What is known of a marker before its pose.
-static marker_pose_t marker_seen(const TagDetection& detection, double size_m,
-                                 const std::vector<Eigen::Vector2d>& corners_px,
-                                 const Matrix8d& covariance_px2) {
+marker_pose_t marker_seen(const TagDetection& detection, double size_m,
+                          const std::vector<Eigen::Vector2d>& corners_px,
+                          const Matrix8d& covariance_px2) {
   marker_pose_t marker;
   marker.marker_id = detection.id;
   marker.size_m = size_m;
@@ -160,6 +162,8 @@ static marker_pose_t marker_seen(const TagDetection& detection, double size_m,
   marker.hamming = static_cast<std::int8_t>(detection.hamming);
   return marker;
 }
+
+}  // namespace
 
 std::optional<marker_pose_t> MarkerEstimator::estimate(const cv::Mat& grey,
                                                        const TagDetection& detection,

@@ -7,17 +7,11 @@
 #include <limits>
 #include <utility>
 
+#include "common/schema/warp_spectrum.h"
 #include "processes/refiner/part_chain.h"
 
 namespace bodyschema {
 namespace {
-
-/// Variances of the weights of a process of amplitude 1, over the half range (warp_basis()).
-Eigen::ArrayXd spectrum(double length, Eigen::Index size) {
-  const Eigen::ArrayXd omega =
-      Eigen::ArrayXd::LinSpaced(size, 1, static_cast<double>(size)) * M_PI / (2 * kWarpReach);
-  return std::sqrt(2 * M_PI) * length * (-0.5 * (omega * length).square()).exp() / kWarpReach;
-}
 
 /// Standard deviations under which weights are likeliest. Of a process's weights those that its
 /// spectrum makes smaller than kLeastShare of the largest are 0.
@@ -27,8 +21,8 @@ Eigen::VectorXd weight_sd(const std::vector<double>& warp) {
       Eigen::Map<const Eigen::ArrayXd>(warp.data(), std::ssize(warp)).square();
   double best = -std::numeric_limits<double>::infinity();
   Eigen::VectorXd result;
-  for (const double length : {0.25, 0.4, 0.7}) {  // as estimate_warps()
-    Eigen::ArrayXd variance = spectrum(length, w2.size());
+  for (const double length : kWarpLengths) {
+    Eigen::ArrayXd variance = warp_spectrum(length, w2.size());
     const Eigen::Array<bool, Eigen::Dynamic, 1> is_used =
         variance > kLeastShare * variance.maxCoeff();
     const double num = static_cast<double>(is_used.count());

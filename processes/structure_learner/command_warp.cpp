@@ -7,6 +7,7 @@
 #include <map>
 #include <set>
 
+#include "common/schema/warp_spectrum.h"
 #include "processes/structure_learner/screen.h"
 
 namespace bodyschema {
@@ -155,14 +156,10 @@ Regression regress(const std::vector<const std::vector<Reading>*>& models,
   Eigen::VectorXd mean;
   const double straight = evidence(Eigen::VectorXd::Constant(num_lines, kFree * kFree), &mean);
   best.evidence = -std::numeric_limits<double>::infinity();
-  for (const double length : {0.25, 0.4, 0.7}) {
+  for (const double length : kWarpLengths) {
     for (const double amplitude : {0.003, 0.01, 0.03, 0.1, 0.3}) {
       Eigen::VectorXd variance = Eigen::VectorXd::Constant(size, kFree * kFree);
-      for (int n = 0; n < kBasis; ++n) {
-        const double omega = (n + 1) * M_PI / (2 * kWarpReach);
-        variance(num_lines + n) = amplitude * amplitude * std::sqrt(2 * M_PI) * length *
-                                  std::exp(-0.5 * std::pow(omega * length, 2)) / kWarpReach;
-      }
+      variance.tail(kBasis) = amplitude * amplitude * warp_spectrum(length, kBasis);
       const double ratio = evidence(variance, &mean) - straight;
       if (ratio <= best.evidence) continue;
       double slope = 0;

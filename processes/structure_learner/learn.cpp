@@ -87,7 +87,7 @@ std::string names_of(const Signals& signals, const LearnedStructure& structure) 
 UnconnectedPart explain(int part, int num_seen, const std::set<int>& connected,
                         const LearnedStructure& structure, int max_signals, int num_actions) {
   int common = 0, partner = -1;
-  bool undecided = false, was_soft_tried = false, is_redundant = false;
+  bool undecided = false, was_soft_tried = false, is_redundant = false, moves_little = false;
   std::set<int> untold;
   std::optional<ContestedSignals> contested;
   for (const auto& [pair, record] : structure.search.records) {
@@ -97,6 +97,7 @@ UnconnectedPart explain(int part, int num_seen, const std::set<int>& connected,
     undecided |= !record.undecided.empty();
     untold.insert(record.untold_signals.begin(), record.untold_signals.end());
     was_soft_tried |= record.was_soft_tried;
+    moves_little |= record.moves_little;
     is_redundant |= record.is_redundant;
     if (record.contested) contested = record.contested;
     if (record.num_common > common) {
@@ -140,6 +141,11 @@ UnconnectedPart explain(int part, int num_seen, const std::set<int>& connected,
                 " moves it and poses are noisier than assumed, or " +
                 names_of(contested->of_process, structure) +
                 " in a way that no joints have: tell the true noise (--noise)"};
+  if (moves_little)
+    return {part, Unconnected::kNotEnoughData,
+            seen +
+                "; it moves too little beside its noise to tell which signals move it: move all "
+                "joints farther"};
   if (!undecided && 6 * common >= 5 * parameters)
     return {part, Unconnected::kNoValidModel,
             seen + "; no model with up to " + std::to_string(max_signals) +

@@ -86,7 +86,10 @@ void rank_pairs(const std::vector<ActionPoseSample>& samples, const NormalizedAc
                 const SearchOptions& options, std::vector<OpenPair>* pairs, SearchResult* found) {
   for (OpenPair& o : *pairs) {
     const PairData data = make_pair_data(samples, o.i, o.j, options.measurement, kScreenFrames);
-    if (count_independent(data, actions) < kFewestSoftFrames || !moves_enough(data, actions)) {
+    const bool is_short = count_independent(data, actions) < kFewestSoftFrames;
+    const bool moves_little = !is_short && !moves_enough(data, actions);
+    found->records[{o.i, o.j}].moves_little = moves_little;
+    if (is_short || moves_little) {
       o.cost = std::numeric_limits<double>::infinity();
       continue;
     }

@@ -36,6 +36,19 @@ EdgeState state_at(const Adaptation& adaptation, const Finding& finding) {
              : marker;
 }
 
+Finding finding_of(const AdaptationEvent& event) {
+  Finding finding;
+  finding.from = event.from;
+  finding.to = event.to;
+  finding.part = event.part;
+  finding.tag = event.tag;
+  finding.cause = event.cause;
+  finding.size = event.size;
+  finding.found = event.sample_index;
+  finding.since = event.since >= 0 ? event.since : event.sample_index;
+  return finding;
+}
+
 }  // namespace
 
 Finding* Findings::newest(const AdaptationEvent& event, State state) {
@@ -97,19 +110,6 @@ void Findings::confirm(const Adaptation& adaptation, const AdaptationEvent& even
     adopted->num_confirming = event.num_samples;
     if (event.size.kind != ChangeSize::Kind::kUnknown) adopted->size = event.size;
   }
-}
-
-static Finding finding_of(const AdaptationEvent& event) {
-  Finding finding;
-  finding.from = event.from;
-  finding.to = event.to;
-  finding.part = event.part;
-  finding.tag = event.tag;
-  finding.cause = event.cause;
-  finding.size = event.size;
-  finding.found = event.sample_index;
-  finding.since = event.since >= 0 ? event.since : event.sample_index;
-  return finding;
 }
 
 void Findings::hear(const Adaptation& adaptation, const AdaptationEvent& event) {

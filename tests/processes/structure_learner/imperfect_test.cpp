@@ -5,6 +5,7 @@
 #include <cmath>
 #include <cstdint>
 #include <optional>
+#include <string>
 #include <vector>
 
 #include "common/geometry/angle.h"
@@ -303,6 +304,9 @@ TEST(SmallRanges, AnArmSeenAtItsEndsIsNoSoftBody) {
     hide_all_but_ends(&truth, &samples);
     const BodySchema schema = learn(robot.signals(), samples, options_of(kTold)).schema;
     EXPECT_NE(judge(schema, truth), Rightness::kWrong) << seed;
+    ASSERT_EQ(schema.unconnected.size(), 1U) << seed;
+    EXPECT_NE(schema.unconnected[0].detail.find("moves too little"), std::string::npos)
+        << schema.unconnected[0].detail;
   }
 }
 
