@@ -144,8 +144,8 @@ UnconnectedPart explain(int part, int num_seen, const std::set<int>& connected,
   if (moves_little)
     return {part, Unconnected::kNotEnoughData,
             seen +
-                "; it moves too little beside its noise to tell which signals move it: move all "
-                "joints farther"};
+                "; it moves too little beside its noise to tell the joints that move it: move all "
+                "signals farther"};
   if (!undecided && 6 * common >= 5 * parameters)
     return {part, Unconnected::kNoValidModel,
             seen + "; no model with up to " + std::to_string(max_signals) +

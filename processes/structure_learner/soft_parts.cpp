@@ -11,6 +11,7 @@
 
 #include "common/estimation/chi_square.h"
 #include "common/estimation/quantile.h"
+#include "processes/structure_learner/long_chain/long_chain.h"
 #include "processes/structure_learner/noise_estimate.h"
 #include "processes/structure_learner/residual_fit.h"
 #include "processes/structure_learner/screen.h"
@@ -66,30 +67,12 @@ LocalModel best_screws(const PairData& pair, const NormalizedActions& actions, i
   return best->model;
 }
 
-// What moves less than that, in standard deviations of its noise, may follow any few of the signals
-// that move it. Chosen: arms of 3 to 7 joints with a range of 4°, seen at their ends with 3 mm and
-// 1°, have 1.0 to 1.7, the parts of `soft_bodies` 10 and more.
-constexpr double kLeastMotion = 2;
-
-// Of poses at rest: about the rigid body that suits them best. (A stream may rest most of the
-// time.)
-bool moves_enough(const PairData& pair, const NormalizedActions& actions) {
-  if (actions.blocks().is_stream()) return true;
-  std::vector<double> distances;
-  for (const FrameFit& frame : evaluate(screen_rigid(pair, actions).model, pair, actions).frames)
-    distances.push_back(frame.squared_distance);
-  return upper_median(std::move(distances)) > kLeastMotion * kLeastMotion * chi_square_median(6);
-}
-
 // The pairs of two components by what the best screws leave of them, least first.
 void rank_pairs(const std::vector<ActionPoseSample>& samples, const NormalizedActions& actions,
                 const SearchOptions& options, std::vector<OpenPair>* pairs, SearchResult* found) {
   for (OpenPair& o : *pairs) {
     const PairData data = make_pair_data(samples, o.i, o.j, options.measurement, kScreenFrames);
-    const bool is_short = count_independent(data, actions) < kFewestSoftFrames;
-    const bool moves_little = !is_short && !moves_enough(data, actions);
-    found->records[{o.i, o.j}].moves_little = moves_little;
-    if (is_short || moves_little) {
+    if (count_independent(data, actions) < kFewestSoftFrames) {
       o.cost = std::numeric_limits<double>::infinity();
       continue;
     }
@@ -117,6 +100,22 @@ std::optional<SoftFit> best_soft_fit(const OpenPair& open,
     if (fit && (!best || fit->log_density > best->log_density)) best = fit;
   }
   return best;
+}
+
+// A chain of the process's own signals leaves as little, and as little as a right one does, but has
+// joints that do not pay by themselves: they move too little.
+bool is_rather_a_chain(const SoftFit& soft, const OpenPair& open,
+                       const std::vector<ActionPoseSample>& samples,
+                       const NormalizedActions& actions, const SearchOptions& options) {
+  std::vector<int> signals = soft.model.signals;
+  std::ranges::sort(signals);
+  const PairData data = make_pair_data(samples, open.i, open.j, options.measurement, kMaxFrames);
+  const auto chain = fit_long_chain(data, actions, signals, JointOrder::kListed,
+                                    relative_motions(data, 300).sigma_rad);
+  if (!chain || chain->cost >= kRightCost * data.size()) return false;
+  return log_density_of_screws(*chain, data, actions) > soft.log_density &&
+         without_idle_joints(*chain, data, actions).model.num_joints() <
+             static_cast<int>(signals.size());
 }
 
 // Log density a frame of what the screws leave, with the noise that suits them best.
@@ -196,6 +195,10 @@ std::vector<SoftCandidate> soft_candidates(std::vector<OpenPair> pairs,
     if (!std::isfinite(o.cost)) continue;
     const std::optional<SoftFit> best = best_soft_fit(o, samples, actions, options, found);
     if (!best || best->verdict != Verdict::kValid) continue;
+    if (is_rather_a_chain(*best, o, samples, actions, options)) {
+      found->records[{o.i, o.j}].moves_little = true;
+      continue;
+    }
     SoftCandidate c{to_accepted(o, *best)};
     if (plausible) {
       const std::set<int> signals(best->model.signals.begin(), best->model.signals.end());

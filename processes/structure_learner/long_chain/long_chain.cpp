@@ -28,8 +28,6 @@ constexpr double kTypicalTurn = 1.2;
 constexpr double kMaySlide = 0.12;
 // Links are shorter than that [m]: what the poses do not tell of them stays small.
 constexpr double kLongestLink = 1;
-// A right model costs 4 to 7 nats a frame.
-constexpr double kRightCost = 8;
 // Nats between two orders that are told apart.
 constexpr double kSettledMargin = 3;
 // Nats a sight.

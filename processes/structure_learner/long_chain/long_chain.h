@@ -13,6 +13,9 @@ inline constexpr int kMaxChainJoints = 12;
 /// Independent poses a joint below which no chain of three or more is looked for.
 inline constexpr int kPosesPerJoint = 3;
 
+/// A right model costs 4 to 7 nats a frame.
+inline constexpr double kRightCost = 8;
+
 /// Signals in the order of the joints, or not.
 enum class JointOrder { kListed, kUnknown };
 

@@ -39,7 +39,7 @@ struct PairRecord {
   /// of the best, by k.
   std::map<int, double> undecided;
   bool has_far_outliers = false;  ///< of a model, see Validity
-  bool moves_little = false;      ///< beside its noise: no Gaussian process was tried
+  bool moves_little = false;      ///< beside its noise: to tell joints from a Gaussian process
   bool was_soft_tried = false;    ///< a Gaussian process on the screws' rest was fitted too
   /// Signals that moved too little while both were seen to tell whether they move the one against
   /// the other: why a model was taken back.

@@ -295,6 +295,12 @@ TEST(Streams, WhereAJointExplainsNearlyAsMuchNoOtherSignalBendsIt) {
   EXPECT_EQ(judge(schema, robot.structure()), Rightness::kRight);
 }
 
+TEST(Streams, WhatItsJointsExplainAsWellIsNoSoftBody) {
+  const Imperfection small{.name = "small", .range_deg = 4};
+  for (const int num_joints : {3, 5, 7})
+    EXPECT_NE(learned_from_ends(num_joints, small, 2, kTold), Rightness::kWrong) << num_joints;
+}
+
 TEST(SmallRanges, AnArmSeenAtItsEndsIsNoSoftBody) {
   const Imperfection small{.name = "small", .range_deg = 4};
   for (std::uint64_t seed = 2; seed < 5; ++seed) {

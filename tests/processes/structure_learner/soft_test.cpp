@@ -442,7 +442,7 @@ TEST(SoftParts, ASignalThatMayHaveNoEffectIsTold) {
     EXPECT_EQ(strong.edges[0].signals().size(), 3u);
     EXPECT_TRUE(strong.undecided_signals.empty());
 
-    const BodySchema weak = segment_of_three(0.035, seed);
+    const BodySchema weak = segment_of_three(0.03, seed);
     ASSERT_EQ(weak.edges.size(), 1u);
     if (weak.edges[0].signals().size() < 3) continue;
     ++num_used;
