@@ -180,7 +180,8 @@ Controller::Answer Controller::on_motion_status(const motion_status_t& motion) {
   }
   locate();
   const bool is_answer = is_mine && sent_ && motion.action_id == sent_->action_id;
-  if (is_answer && sent_->kind == action_command_t::KIND_HOLD) fire(Event::kHoldAnswered);
+  if (is_answer && sent_->kind == action_command_t::KIND_HOLD && !is_refusal)
+    fire(Event::kHoldAnswered);
   on_driver(motion, is_news && previous && !is_mine, began_anew);
   if (is_answer && sent_->kind == action_command_t::KIND_MOVE) on_move_answer(motion);
   decide();
@@ -236,6 +237,7 @@ Controller::Answer Controller::on_body_schema(const body_schema_t& message) {
     schema_ = from_message(message);
     goal_.reset();
     rejected_.clear();
+    offset_.reset();  // it was the other schema's
   }
   decide();
   return answer();

@@ -156,6 +156,17 @@ class Controller {
     std::int64_t begin_us_ = -1;
   };
 
+  /// By how much the schema misplaces the part near the target: its position by the schema minus
+  /// the seen one, in R.
+  struct Offset {
+    Eigen::Vector3d mean_m;
+    Eigen::Matrix3d covariance;
+  };
+  struct RootPose {
+    Pose X_CR;
+    Matrix6d covariance;
+  };
+
   /// `now_us` ≥ 0: the clock; then the status is repeated when it is due.
   Answer answer(std::int64_t now_us = -1);
   /// Looks the event up in the transition table (controller_states.h): the one place that changes
@@ -186,7 +197,11 @@ class Controller {
   void locate();
   void forget_plan();
   /// The schema's, or by the sample if the camera was moved since.
-  Pose X_CR_at(const ActionPoseSample& sample) const;
+  RootPose X_CR_at(const ActionPoseSample& sample) const;
+  /// Where the part is brought by the schema, so that it is at the target, in R.
+  Eigen::Vector3d aim() const;
+  /// offset_ with what is seen [its mean and covariance]. std::nullopt: that is noise.
+  std::optional<Offset> updated_offset(const Offset& seen) const;
   void observe(const sample_t& sample);
   void update_predicted_errors();
 
@@ -243,21 +258,20 @@ class Controller {
   std::int64_t floor_epoch_ = 0, floor_id_ = -1;  ///< older targets are ignored
   Phase phase_ = Phase::kIdle;
   std::string why_ = "no target was given since the start";
-  Eigen::Vector3d aim_ = Eigen::Vector3d::Zero();  ///< target, corrected by what was seen
-  std::optional<int> tag_place_;                   ///< of the target's tag: TagTrack::place()
-  std::optional<Eigen::VectorXd> goal_;            ///< action that brings the part to aim_
-  std::vector<Eigen::VectorXd> rejected_;          ///< goals the driver would not go to
+  std::optional<int> tag_place_;           ///< of the target's tag: TagTrack::place()
+  std::optional<Offset> offset_;           ///< corrected for
+  std::optional<Eigen::VectorXd> goal_;    ///< action that brings the part to aim()
+  std::vector<Eigen::VectorXd> rejected_;  ///< goals the driver would not go to
   std::string rejection_;
   int num_expired_ = 0;
   int num_corrections_ = 0;
   int num_moves_ = 0, num_probes_ = 0;
   double predicted_error_m_ = -1, predicted_error_rad_ = -1;
   double observed_error_m_ = -1, observed_error_rad_ = -1;
-  Eigen::Vector3d observed_offset_ = Eigen::Vector3d::Zero();  ///< target minus seen position, in R
-  bool is_observation_sure_ = false;  ///< unambiguous, and not to be explained by its covariance
-  Stopwatch phase_time_;              ///< since the phase began
-  Stopwatch quiet_;                   ///< since the driver's last news
-  Stopwatch idle_;                    ///< its own arm, but nothing is sent or awaited
+  std::optional<Offset> observed_offset_;  ///< by the newest SAMPLE; none: noise, or ambiguous
+  Stopwatch phase_time_;                   ///< since the phase began
+  Stopwatch quiet_;                        ///< since the driver's last news
+  Stopwatch idle_;                         ///< its own arm, but nothing is sent or awaited
   Stopwatch expiry_;
   std::int64_t probed_ = -1;  ///< probes wanted up to this sample are made, or given up
   std::optional<Eigen::VectorXd> search_centre_;  ///< where an edge was heard to be invalid

@@ -134,26 +134,46 @@ void Controller::update_predicted_errors() {
     predicted_error_rad_ = q_RT->angularDistance(Eigen::Quaterniond(X_RB->X_AB.linear()));
 }
 
-Pose Controller::X_CR_at(const ActionPoseSample& sample) const {
+Controller::RootPose Controller::X_CR_at(const ActionPoseSample& sample) const {
+  const RootPose by_schema{schema_->X_CR, schema_->X_CR_covariance};
   // One view of the root is worse than the schema's mean over all: half a degree is 9 mm at 1 m.
   const PartObservation* root = sample.find(schema_->root);
-  if (root == nullptr || !root->has_rotation) return schema_->X_CR;
-  const Vector6d off = log(schema_->X_CR.inverse() * root->X_CB);
-  const Matrix6d covariance = config_.measurement.covariance(*root) + schema_->X_CR_covariance;
-  return squared_mahalanobis(off, covariance) > kMovedCamera ? root->X_CB : schema_->X_CR;
+  if (root == nullptr || !root->has_rotation) return by_schema;
+  const RootPose seen{root->X_CB, config_.measurement.covariance(*root)};
+  const Vector6d off = log(by_schema.X_CR.inverse() * seen.X_CR);
+  const bool was_moved =
+      squared_mahalanobis(off, seen.covariance + by_schema.covariance) > kMovedCamera;
+  return was_moved ? seen : by_schema;
+}
+
+Eigen::Vector3d Controller::aim() const {
+  return position_of(target_) + (offset_ ? offset_->mean_m : Eigen::Vector3d::Zero());
+}
+
+std::optional<Controller::Offset> Controller::updated_offset(const Offset& seen) const {
+  const Eigen::Vector3d before = offset_ ? offset_->mean_m : Eigen::Vector3d::Zero();
+  const Eigen::Matrix3d P = offset_ ? offset_->covariance : Eigen::Matrix3d::Zero();
+  const Eigen::Vector3d surprise = seen.mean_m - before;
+  const Eigen::LDLT<Eigen::Matrix3d> S(P + seen.covariance);
+  if (surprise.dot(S.solve(surprise)) <= kSurprise) return std::nullopt;
+  // Before anything refuted the schema, nothing was known of the offset.
+  if (!offset_) return seen;
+  const Eigen::Matrix3d K = S.solve(P).transpose();
+  return Offset{before + K * surprise, P - K * P};
 }
 
 void Controller::observe(const sample_t& message) {
   observed_error_m_ = observed_error_rad_ = -1;
+  observed_offset_.reset();
   if (!schema_) return;
   ActionPoseSample sample = from_message(message);
   drop_moved_tags(schema_->moved_tags, &sample);
   const PartObservation* part = sample.find(target_.target_part);
   if (part == nullptr) return;
-  const Pose X_CR = X_CR_at(sample);
+  const auto [X_CR, root_covariance] = X_CR_at(sample);
   const Pose X_RB_seen = X_CR.inverse() * part->X_CB;
-  observed_offset_ = position_of(target_) - X_RB_seen.translation();
-  observed_error_m_ = observed_offset_.norm();
+  const Eigen::Vector3d p_RB = X_RB_seen.translation();
+  observed_error_m_ = (position_of(target_) - p_RB).norm();
   if (const auto q_RT = wanted_orientation(); q_RT && part->has_rotation)
     observed_error_rad_ = q_RT->angularDistance(Eigen::Quaterniond(X_RB_seen.linear()));
   const auto X_RB = schema_->predict(schema_->root, part->part, sample.action);
@@ -162,10 +182,12 @@ void Controller::observe(const sample_t& message) {
   Eigen::Matrix3d covariance = seen.covariance.topLeftCorner<3, 3>();
   if (X_RB) covariance += X_RB->covariance.topLeftCorner<3, 3>();
   covariance = (R_RB * covariance * R_RB.transpose()).eval();
+  // p_RB by a pose of the root that is off by exp(ξ), ξ = (translation, rotation).
+  Eigen::Matrix<double, 3, 6> J;
+  J << -Eigen::Matrix3d::Identity(), skew(p_RB);
+  covariance += J * root_covariance * J.transpose();
   // By the schema the part is at the aim.
-  const Eigen::Vector3d surprise = observed_offset_ - (position_of(target_) - aim_);
-  is_observation_sure_ =
-      !part->X_CB_other && surprise.dot(covariance.ldlt().solve(surprise)) > kSurprise;
+  if (!part->X_CB_other) observed_offset_ = updated_offset({aim() - p_RB, covariance});
 }
 
 EdgeState Controller::worst_edge(std::string* name) const {

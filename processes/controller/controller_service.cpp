@@ -16,8 +16,9 @@
 namespace bodyschema {
 namespace {
 
-constexpr int kMaxExpired = 3;     // in a row
-constexpr double kArrived = 1e-9;  // of a range
+constexpr int kMaxExpired = 3;  // in a row
+// Of a range: a driver that counts in other units says what it was told within 1e-6 (DRIVER.md).
+constexpr double kArrived = 2e-6;
 
 std::string in_tenths(double value, const char* unit) {
   std::ostringstream text;
@@ -69,8 +70,8 @@ Controller::Answer Controller::on_pose_target(const pose_target_t& target,
   floor_epoch_ = target.epoch;
   floor_id_ = target.target_id;
   target_ = target;
-  aim_ = position_of(target);
   tag_place_.reset();
+  offset_.reset();
   forget_plan();
   num_moves_ = num_probes_ = num_corrections_ = num_searches_ = 0;
   predicted_error_m_ = predicted_error_rad_ = observed_error_m_ = observed_error_rad_ = -1;
@@ -163,14 +164,14 @@ bool Controller::aim_at_tag() {
   if (sample_) {
     ActionPoseSample sample = from_message(*sample_);
     drop_moved_tags(schema_->moved_tags, &sample);
-    X_CR = X_CR_at(sample);
+    X_CR = X_CR_at(sample).X_CR;
   }
   const Eigen::Vector3d p_RM = X_CR.inverse() * tag.p_CM();
   const double moved_m = (p_RM - position_of(target_)).norm();
   if (!tag_place_ || moved_m > std::min(tolerance_m(), config_.reached_m)) {
     tag_place_ = tag.place();
     std::copy(p_RM.begin(), p_RM.end(), target_.position_m);
-    aim_ = p_RM;
+    offset_.reset();
     forget_plan();
   }
   return true;
@@ -192,14 +193,12 @@ void Controller::step() {
     options.tolerance_m = std::min(options.tolerance_m, tolerance_m());
     options.tolerance_rad = std::min(options.tolerance_rad, tolerance_rad());
     const InverseKinematicsSolution solution =
-        solve_pose(*schema_, target_.target_part, {aim_, wanted_orientation()}, config_.signals,
+        solve_pose(*schema_, target_.target_part, {aim(), wanted_orientation()}, config_.signals,
                    *position_, options, rejected_);
     if (solution.error_m > tolerance_m() || solution.error_rad > tolerance_rad()) {
-      if (num_corrections_ > 0) {
-        aim_ = position_of(target_);  // beyond reach only with the correction
-        return arrive();
-      }
-      return fail_unreachable(solution);
+      if (!offset_) return fail_unreachable(solution);
+      offset_.reset();  // beyond reach only with the correction
+      return step();
     }
     goal_ = solution.action;
   }
@@ -268,7 +267,13 @@ Eigen::VectorXd Controller::towards(const Eigen::VectorXd& action, double share)
     if (range > 0) longest = std::max(longest, std::abs(action[n] - (*position_)[n]) / range);
   }
   if (longest <= share) return action;
-  return *position_ + (action - *position_) * (share / longest);
+  Eigen::VectorXd next = *position_ + (action - *position_) * (share / longest);
+  // A held arm may rest beyond a limit: nothing is commanded there.
+  for (std::size_t i = 0; i < config_.signals.size(); ++i) {
+    double& value = next[static_cast<Eigen::Index>(i)];
+    value = std::clamp(value, config_.signals[i].lower, config_.signals[i].upper);
+  }
+  return next;
 }
 
 void Controller::move_to(const Eigen::VectorXd& action, Serves serves, std::int8_t purpose,
@@ -309,17 +314,22 @@ void Controller::arrive() {
   if (sample_ && sample_->rest_begin_utime == motion_->rest_since_utime) observe(*sample_);
   update_predicted_errors();
   const bool is_off = observed_error_m_ > tolerance_m();
-  if (is_off && is_observation_sure_ && num_corrections_ < config_.max_corrections &&
+  const bool is_turned = observed_error_rad_ > tolerance_rad();
+  if (is_off && observed_offset_ && num_corrections_ < config_.max_corrections &&
       observed_error_m_ <= config_.max_correction_m) {
     ++num_corrections_;
-    aim_ += observed_offset_;
+    offset_ = observed_offset_;
     goal_.reset();
     return step();
   }
-  fire(Event::kReached,
-       observed_error_m_ < 0 ? "reached by the schema; the part is not seen there"
-       : is_off ? "reached by the schema, but seen " + millimetres(observed_error_m_) + " away"
-                : "reached, and seen there");
+  std::string seen = "reached, and seen there";
+  if (is_off || is_turned) {
+    seen = "reached by the schema, but seen " + millimetres(observed_error_m_);
+    if (is_turned) seen += " and " + degrees(observed_error_rad_);
+    seen += " away";
+  }
+  fire(Event::kReached, observed_error_m_ < 0 ? "reached by the schema; the part is not seen there"
+                                              : std::move(seen));
 }
 
 void Controller::on_move_answer(const motion_status_t& motion) {

@@ -53,7 +53,7 @@ constexpr std::array<EventInfo, kNumEvents> kEvents{{
     {E::kRejected, "rejected", "the driver does not make the MOVE"},
     {E::kExpired, "expired", "the MOVE came too late to the driver"},
     {E::kEnded, "ended", "the driver stopped or holds in the middle of the MOVE"},
-    {E::kHoldAnswered, "hold answered", "any answer to the HOLD"},
+    {E::kHoldAnswered, "hold answered", "the driver serves the HOLD"},
     {E::kSampleCame, "sample came", "the SAMPLE of the MOVE"},
     {E::kNewSample, "new sample", "the SAMPLE of any action"},
     {E::kInputMissing, "input missing", "MOTION_STATUS, BODY_SCHEMA or frames of this rest"},

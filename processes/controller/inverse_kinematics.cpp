@@ -31,15 +31,19 @@ constexpr double kFirstPostureStep = 0.1, kLeastPostureStep = 0.005;  // of a ra
 
 /// Signals as shares of their ranges, 0..1.
 struct Scale {
-  Eigen::ArrayXd lower, range;
+  Eigen::ArrayXd lower, upper, range;
 
-  explicit Scale(const std::vector<Signal>& limits) : lower(limits.size()), range(limits.size()) {
+  explicit Scale(const std::vector<Signal>& limits) : lower(limits.size()), upper(limits.size()) {
     for (std::size_t i = 0; i < limits.size(); ++i) {
       lower[static_cast<Eigen::Index>(i)] = limits[i].lower;
-      range[static_cast<Eigen::Index>(i)] = limits[i].upper - limits[i].lower;
+      upper[static_cast<Eigen::Index>(i)] = limits[i].upper;
     }
+    range = upper - lower;
   }
-  Eigen::VectorXd action(const Eigen::VectorXd& u) const { return lower + range * u.array(); }
+  /// Never beyond a limit, not by rounding either: a driver refuses that.
+  Eigen::VectorXd action(const Eigen::VectorXd& u) const {
+    return (lower + range * u.array()).max(lower).min(upper);
+  }
   Eigen::VectorXd share(const Eigen::VectorXd& action) const {
     return (range > 0).select((action.array() - lower) / range, 0);
   }

@@ -167,6 +167,7 @@ class Bench {
     take(controller.on_body_schema(message));
   }
   void show_frame() {
+    last_sight_utime_ = motion.utime + kTick;
     if (num_frames > 0) return show_tags();
     marker_poses_t poses{};
     poses.utime = motion.utime + kTick;
@@ -242,7 +243,7 @@ class Bench {
   }
   void show_sample() {
     sample_t sample{};
-    sample.utime = motion.utime + kTick;
+    last_sight_utime_ = sample.utime = motion.utime + kTick;
     sample.sample_index = num_samples++;
     sample.source = motion.source;
     sample.epoch = motion.epoch;
@@ -261,6 +262,8 @@ class Bench {
       seen.has_rotation = 1;
       Pose X_CB = X_CC_moved * planar().X_CR * X_RB;
       if (part == 4) X_CB.translation() += bend_m;
+      if (part == 4)
+        X_CB.linear() = X_CB.linear() * Eigen::AngleAxisd(turn_rad, Eigen::Vector3d::UnitZ());
       seen.X_CB = seen.X_CB_other = to_message(X_CB);
       const double variance = part == 4 ? observation_sd_m * observation_sd_m : 1e-6;
       to_message(Matrix6d(Matrix6d::Identity() * variance), seen.covariance);
@@ -315,9 +318,12 @@ class Bench {
   std::optional<model_health_t> health;
   bool driver_speaks = true, eyes_open = true, monitor_speaks = true, observer_works = true;
   bool driver_serves = true;
+  bool driver_rounds = false;  ///< it counts in floats
+  int num_holds_refused = 0;   ///< of the next HOLDs
   std::function<std::string(const action_command_t&)> rejects = [](const auto&) { return ""; };
   std::set<int> hidden;
   Eigen::Vector3d bend_m = Eigen::Vector3d::Zero();
+  double turn_rad = 0;  ///< of part 4, too
   double observation_sd_m = 0.001;
   bool is_ambiguous = false;
   int tag = -1;  ///< by which part 4 is seen
@@ -387,7 +393,9 @@ class Bench {
       held.epoch = command.epoch;
       held.action_id = command.action_id;
       held.kind = command.kind;
-      held.state = motion_status_t::STATE_HOLDING;
+      held.state =
+          num_holds_refused > 0 ? motion_status_t::STATE_REJECTED : motion_status_t::STATE_HOLDING;
+      num_holds_refused = std::max(0, num_holds_refused - 1);
       set_array(held.num_signals, held.commanded, std::vector<double>{});
       say(held);
     } else if (const std::string reason =
@@ -396,7 +404,9 @@ class Bench {
       answer_last_move(motion_status_t::STATE_REJECTED, reason);
     } else {
       arm = command.action;
-      settle(command.source, command.epoch, command.action_id, command.action, command.purpose);
+      if (driver_rounds)
+        for (double& value : arm) value = static_cast<float>(value);
+      settle(command.source, command.epoch, command.action_id, arm, command.purpose);
     }
   }
 
@@ -406,13 +416,16 @@ class Bench {
                                                      status.control_state == S::CONTROL_MOVING);
     if (driver_speaks || !is_serving) driver_since_ = now;
     if (monitor_speaks || !is_serving) monitor_since_ = now;
+    if (last_sight_utime_ >= motion.utime || !is_serving) eyes_since_ = now;
+    ASSERT_LE(now - eyes_since_, config_.max_marker_poses_silence_us + 2 * kTick);
     ASSERT_LE(now - driver_since_, config_.max_motion_status_silence_us + 2 * kTick);
     ASSERT_LE(now - monitor_since_, config_.max_body_schema_silence_us + 2 * kTick);
   }
 
   std::deque<action_command_t> commands_;
   std::int64_t last_ended_id_ = -1;
-  std::int64_t driver_since_ = now, monitor_since_ = now;
+  std::int64_t driver_since_ = now, monitor_since_ = now, eyes_since_ = now;
+  std::int64_t last_sight_utime_ = -1;
 };
 
 inline Target tag_target(std::int64_t id, int tag = 40) {

@@ -10,8 +10,8 @@ namespace bodyschema::test {
 namespace {
 
 // Anything in any order: Bench asserts that every message makes sense, that nothing moves an arm
-// that is not the controller's or for a target that is over, that ids are new and steps small, and
-// that no target is served while the driver or the monitor is silent.
+// that is not the controller's or for a target that is over, that ids are new, steps small and
+// actions within the limits, and that no target is served while driver, eyes or monitor are silent.
 TEST(ControllerTest, WhateverHappensItsCommandsAreLawful) {
   std::mt19937_64 rng(8);
   std::size_t num_moves = 0, num_holds = 0;
@@ -21,7 +21,13 @@ TEST(ControllerTest, WhateverHappensItsCommandsAreLawful) {
   for (int run = 0; run < num_sequences && !testing::Test::HasFatalFailure(); ++run) {
     ControllerConfig config = test_config();
     config.max_searches = run % 2 ? 5 : 0;
+    if (run % 3 == 0)
+      config.workspace.keep_out = {{Eigen::Vector3d(1, -1, -1), Eigen::Vector3d(1.3, -0.9, 1)}};
     Bench bench(config);
+    bench.driver_rounds = run % 4 == 0;
+    if (run % 5 == 0) bench.bend_m = Eigen::Vector3d(0.01, -0.005, 0);
+    if (run % 7 == 0) bench.arm = {-90.4, 0.2, 10.03};  // rests beyond two limits
+    set_array(bench.motion.num_signals, bench.motion.commanded, bench.arm);
     if (rng() % 4) bench.start();
     std::int64_t target_id = 0, babble_id = 0;
     for (int event = 0; event < 60 && !testing::Test::HasFatalFailure(); ++event) {
@@ -33,14 +39,17 @@ TEST(ControllerTest, WhateverHappensItsCommandsAreLawful) {
           bench.give(tag_target(target_id++, 40 + static_cast<int>(rng() % 8 == 0)));
           break;
         case 0:
-        case 1:
-          bench.give(rng() % 4 == 0 ? pose_target(target_id++, {40, -0.5, 6})
-                                    : position_target(target_id++,
-                                                      rng() % 3   ? kFar
-                                                      : rng() % 2 ? kNear
-                                                                  : kBeyond,
-                                                      rng() % 2 ? -1 : 1));
+        case 1: {
+          Target target = rng() % 4 == 0 ? pose_target(target_id++, {40, -0.5, 6})
+                                         : position_target(target_id++,
+                                                           rng() % 3   ? kFar
+                                                           : rng() % 2 ? kNear
+                                                                       : kBeyond,
+                                                           rng() % 2 ? -1 : 1);
+          if (rng() % 3 == 0) target.expiry_s = static_cast<double>(1 + rng() % 20);
+          bench.give(target);
           break;
+        }
         case 2:
           bench.give(other_target(target_id++, Target::KIND_HOLD));
           break;

@@ -234,6 +234,45 @@ TEST(ControllerTest, WhatIsSeenAtTheEndCorrectsOnce) {
   EXPECT_TRUE(bench.has_why("seen there")) << bench.status.why;
 }
 
+TEST(ControllerTest, ACorrectionIsForgottenWithTheSchemaThatNeededIt) {
+  Bench bench;
+  bench.bend_m = Eigen::Vector3d(0.01, -0.005, 0);
+  bench.start();
+  bench.give(position_target(0, kNear));
+  ASSERT_TRUE(bench.run_until([&] {
+    return bench.status.observed_error_m > 0.005 && bench.status.control_state == S::CONTROL_MOVING;
+  }));
+  bench.bend_m.setZero();  // and version 2 knows it
+  bench.schema.version = 2;
+  bench.show_schema();
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+  EXPECT_LT(bench.status.observed_error_m, 1e-4);
+  EXPECT_LT(bench.status.predicted_error_m, 1e-4);
+}
+
+TEST(ControllerTest, AnOrientationThatIsSeenOffIsTold) {
+  Bench bench;
+  bench.turn_rad = 20 * kDegree;
+  bench.start();
+  bench.give(pose_target(0, {40, -0.5, 6}));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+  EXPECT_TRUE(bench.has_why("20.0° away")) << bench.status.why;
+}
+
+// Half a degree of the root's pose is 17 mm at the end of an arm of two metres.
+TEST(ControllerTest, WhatThePoseOfTheRootExplainsCorrectsNothing) {
+  for (const double sd_rad : {1e-4, 0.5 * kDegree}) {
+    Bench bench;
+    bench.schema.X_CR_covariance.bottomRightCorner<3, 3>() =
+        Eigen::Matrix3d::Identity() * sd_rad * sd_rad;
+    bench.bend_m = Eigen::Vector3d(0, 0.01, 0);
+    bench.start();
+    bench.give(position_target(0, kNear));
+    ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED));
+    EXPECT_EQ(bench.status.predicted_error_m<1e-4, sd_rad> 1e-3);
+  }
+}
+
 TEST(ControllerTest, WhatIsSeenUnsurelyCorrectsNothing) {
   for (const bool is_ambiguous : {false, true}) {
     Bench bench;

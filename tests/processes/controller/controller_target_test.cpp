@@ -111,9 +111,11 @@ TEST(ControllerTest, NoPartLeavesTheWorkspaceOnTheWay) {
   ControllerConfig config = test_config();
   config.signals[1] = {"b", 0, 0};
   config.signals[2] = {"c", 0, 0};
-  for (const bool is_walled : {false, true}) {
+  for (const double half_m : {0.0, 0.3, 0.003}) {
+    const bool is_walled = half_m > 0;
     if (is_walled)
-      config.workspace.keep_out = {{Eigen::Vector3d(2, -0.3, -1), Eigen::Vector3d(3, 0.3, 1)}};
+      config.workspace.keep_out = {
+          {Eigen::Vector3d(2, -half_m, -1), Eigen::Vector3d(3, half_m, 1)}};
     Bench bench(config);
     bench.schema.signals = config.signals;
     bench.arm = {-30, 0, 0};
@@ -129,6 +131,38 @@ TEST(ControllerTest, NoPartLeavesTheWorkspaceOnTheWay) {
     bench.give(position_target(1, swing(-20)));
     EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
   }
+}
+
+TEST(ControllerTest, ADriverThatRoundsIsThereWhereItWasSent) {
+  Bench bench;
+  bench.driver_rounds = true;
+  bench.start();
+  bench.give(position_target(0, kNear));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+  EXPECT_LT(bench.moves.size(), 12U);
+}
+
+// The bench asserts that every MOVE is within the limits.
+TEST(ControllerTest, AnArmThatRestsBeyondALimitIsBroughtBackInside) {
+  Bench bench;
+  bench.arm = {-90.9, 1.01, 0};
+  set_array(bench.motion.num_signals, bench.motion.commanded, bench.arm);
+  bench.start();
+  bench.give(pose_target(0, {-90, 1, 9}));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+  EXPECT_GT(bench.moves.size(), 3U);
+}
+
+TEST(ControllerTest, AHoldThatIsRefusedIsGivenAgain) {
+  Bench bench;
+  bench.num_holds_refused = 1;
+  bench.start();
+  bench.give(position_target(0, kFar));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_MOVING));
+  bench.give(other_target(1, Target::KIND_HOLD));
+  bench.run(5);
+  EXPECT_EQ(bench.num_holds, 2);
+  EXPECT_EQ(bench.controller.phase(), Phase::kHeld);
 }
 
 TEST(ControllerTest, APartThatIsOutsideTheWorkspaceMayComeBack) {
