@@ -271,6 +271,9 @@ void check_together(Checker& check, const sample_t& m) {
 
 void check_together(Checker& check, const signal_t& m) {
   check.require(m.lower_limit <= m.upper_limit, "upper_limit", "is below lower_limit");
+  check.require(m.lower_limit <= m.covered_lower && m.covered_upper <= m.upper_limit,
+                "covered_lower", "or covered_upper is beyond the limits");
+  check.require(m.covered_lower <= m.covered_upper, "covered_upper", "is below covered_lower");
 }
 
 // A Gaussian process that passes can be factorised again.

@@ -309,6 +309,9 @@ signal_t to_message(const Signal& signal) {
   message.signal_name = signal.name;
   message.lower_limit = signal.lower;
   message.upper_limit = signal.upper;
+  const Signal::Range covered = signal.known_range();
+  message.covered_lower = std::clamp(covered.lower, signal.lower, signal.upper);
+  message.covered_upper = std::clamp(covered.upper, signal.lower, signal.upper);
   set_array(message.num_warp, message.warp_weights, signal.warp);
   return message;
 }
@@ -399,8 +402,9 @@ BodySchema from_message(const body_schema_t& message) {
   schema.X_CR = from_message(message.X_CR);
   schema.X_CR_covariance = from_message(message.X_CR_covariance);
   for (const signal_t& signal : message.signals) {
-    schema.signals.push_back(
-        {signal.signal_name, signal.lower_limit, signal.upper_limit, signal.warp_weights});
+    schema.signals.push_back({signal.signal_name, signal.lower_limit, signal.upper_limit,
+                              signal.warp_weights,
+                              Signal::Range{signal.covered_lower, signal.covered_upper}});
   }
   for (const schema_edge_t& edge : message.edges) schema.edges.push_back(from_message(edge));
   for (const part_frame_t& frame : message.frames)

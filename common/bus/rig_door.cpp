@@ -180,8 +180,13 @@ body_schema_t RigDoor::load_initial_schema(const std::filesystem::path& file) co
   if (schema.signals.size() == signals_.signals.size()) {
     for (std::size_t s = 0; s < schema.signals.size(); ++s) {
       if (!schema.signals[s].warp_weights.empty()) continue;
-      schema.signals[s].lower_limit = signals_.signals[s].lower;
-      schema.signals[s].upper_limit = signals_.signals[s].upper;
+      signal_t& signal = schema.signals[s];
+      signal.lower_limit = signals_.signals[s].lower;
+      signal.upper_limit = signals_.signals[s].upper;
+      signal.covered_lower =
+          std::clamp(signal.covered_lower, signal.lower_limit, signal.upper_limit);
+      signal.covered_upper =
+          std::clamp(signal.covered_upper, signal.lower_limit, signal.upper_limit);
     }
   }
   if (const std::string why = objection(schema); !why.empty())

@@ -1,6 +1,7 @@
 #pragma once
 
 #include <Eigen/Core>
+#include <optional>
 #include <string>
 #include <vector>
 
@@ -15,6 +16,14 @@ struct Signal {
   /// What bends the command, w in θ(q) = q + φ(q)ᵀw [command units]; empty: linear. θ, and not q,
   /// is what moves the joints on this signal. See warp_basis().
   std::vector<double> warp = {};
+  /// What the samples that a schema rests on covered of it [command units]: beyond, it was never
+  /// seen to hold. std::nullopt: nobody said.
+  struct Range {
+    double lower = 0, upper = 0;
+  };
+  std::optional<Range> covered = {};
+  /// `covered`, or the limits.
+  Range known_range() const { return covered.value_or(Range{lower, upper}); }
 
   /// Displacement θ(q) that belongs to the command q, both in command units.
   double displacement(double q) const;

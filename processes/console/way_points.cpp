@@ -93,4 +93,19 @@ std::vector<PoseTarget> straight_line(const PoseTarget& from, const PoseTarget& 
   return line;
 }
 
+double leaves_line_by_m(const BodySchema& schema, int part, const Eigen::VectorXd& from,
+                        const Eigen::VectorXd& to, const Eigen::Vector3d& end) {
+  const auto position_at = [&](double share) -> Eigen::Vector3d {
+    return schema.predict(schema.root, part, from + share * (to - from))->X_AB.translation();
+  };
+  const Eigen::Vector3d begin = position_at(0), along = end - begin;
+  double farthest = 0;
+  for (const double share : {0.25, 0.5, 0.75}) {
+    const Eigen::Vector3d off = position_at(share) - begin;
+    const double done = std::clamp(off.dot(along) / std::max(along.squaredNorm(), 1e-12), 0.0, 1.0);
+    farthest = std::max(farthest, (off - done * along).norm());
+  }
+  return farthest;
+}
+
 }  // namespace bodyschema

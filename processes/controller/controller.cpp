@@ -276,7 +276,7 @@ void Controller::see_time(std::int64_t now_us) {
     return;
   }
   if (concerns(Event::kGivenUp) && idle_.elapsed_us(now_us) >= config_.rest_timeout_us) {
-    fire(Event::kGivenUp, "given up after " + seconds(config_.rest_timeout_us) + ": " + why_);
+    fail(Event::kGivenUp, "given up after " + seconds(config_.rest_timeout_us) + ": " + why_);
     return;
   }
   if (phase_ == Phase::kTaking) return take(now_us);

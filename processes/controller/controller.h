@@ -232,6 +232,8 @@ class Controller {
   void on_driver(const motion_status_t& motion, bool is_foreign, bool began_anew);
   void on_move_answer(const motion_status_t& motion);
   void on_own_sample(const sample_t& sample);
+  /// The target is over: `event`, but the arm stays held where it was held before or was moved.
+  void fail(Event event, std::string why);
   void fail_unreachable(const InverseKinematicsSolution& nearest);
   action_command_t make_command(std::int8_t kind);
 
@@ -259,6 +261,7 @@ class Controller {
   Phase phase_ = Phase::kIdle;
   std::string why_ = "no target was given since the start";
   std::optional<int> tag_place_;           ///< of the target's tag: TagTrack::place()
+  bool was_its_own_ = false;               ///< the arm, before the target came
   std::optional<Offset> offset_;           ///< corrected for
   std::optional<Eigen::VectorXd> goal_;    ///< action that brings the part to aim()
   std::vector<Eigen::VectorXd> rejected_;  ///< goals the driver would not go to

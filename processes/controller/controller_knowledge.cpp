@@ -242,6 +242,9 @@ std::string Controller::objection() const {
   if (!schema_->has_part(part)) {
     return "the body schema has no part " + std::to_string(part) + "; see: ./run status";
   }
+  if (part == schema_->root) {
+    return "part " + std::to_string(part) + " is the root, which nothing moves";
+  }
   if (!chain_to(*schema_, part)) {
     return "part " + std::to_string(part) + " is not connected to the root " +
            std::to_string(schema_->root) + " in body schema version " +
@@ -257,7 +260,8 @@ std::string Controller::objection() const {
                                                    return std::to_string(tag.first);
                                                  }));
   }
-  return "";
+  const bool is_placed = target_.target_kind != pose_target_t::KIND_TAG || tag_place_;
+  return is_placed ? config_.workspace.objection(position_of(target_)) : "";
 }
 
 }  // namespace bodyschema

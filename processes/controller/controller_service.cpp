@@ -74,6 +74,7 @@ Controller::Answer Controller::on_pose_target(const pose_target_t& target,
   offset_.reset();
   forget_plan();
   num_moves_ = num_probes_ = num_corrections_ = num_searches_ = 0;
+  was_its_own_ = owns_arm(phase_);
   predicted_error_m_ = predicted_error_rad_ = observed_error_m_ = observed_error_rad_ = -1;
   search_centre_.reset();
   expiry_.restart();
@@ -103,7 +104,7 @@ void Controller::decide() {
     return;
   }
   if (const std::string why = objection(); !why.empty()) {
-    fire(Event::kUnservable, why);
+    fail(Event::kUnservable, why);
     return;
   }
   std::string edge;
@@ -147,7 +148,7 @@ void Controller::take(std::int64_t now_us) {
   } else if (has_patience) {
     why_ = "waiting to hear where the arm is";
   } else {
-    fire(Event::kPositionUnknown,
+    fail(Event::kPositionUnknown,
          "where the arm is was not heard: neither MOTION_STATUS nor SAMPLE tell the action it "
          "rests at; release the arm, so that the babbler moves it");
   }
@@ -201,6 +202,12 @@ void Controller::step() {
       return step();
     }
     goal_ = solution.action;
+    if (const std::string why = config_.workspace.objection(*schema_, *position_, *goal_);
+        !why.empty()) {
+      serves_ = Serves::kTarget;
+      strike(why);
+      return decide();
+    }
   }
   update_predicted_errors();
   std::string doubtful;
@@ -211,11 +218,18 @@ void Controller::step() {
                  is_slow ? "in small steps: " + doubtful + " is in doubt" : "towards the target");
 }
 
+void Controller::fail(Event event, std::string why) {
+  if (owns_arm(phase_) && (was_its_own_ || num_moves_ > 0))
+    fire(Event::kFailed, std::move(why) + "; the arm stays here");
+  else
+    fire(event, std::move(why));
+}
+
 void Controller::fail_unreachable(const InverseKinematicsSolution& nearest) {
   const std::string after =
       num_moves_ > 0 ? " (after " + std::to_string(num_moves_) + " moves)" : "";
   if (!rejected_.empty()) {
-    fire(Event::kUnreachable, "every way found is refused" + after + ": " + rejection_);
+    fail(Event::kUnreachable, "every way found is refused" + after + ": " + rejection_);
     return;
   }
   predicted_error_m_ = nearest.error_m;
@@ -224,7 +238,7 @@ void Controller::fail_unreachable(const InverseKinematicsSolution& nearest) {
     predicted_error_rad_ = nearest.error_rad;
     left += " and " + degrees(nearest.error_rad);
   }
-  fire(Event::kUnreachable, "out of reach: within the limits part " +
+  fail(Event::kUnreachable, "out of reach: within the limits part " +
                                 std::to_string(target_.target_part) + " comes no nearer than " +
                                 left + after);
 }
@@ -306,7 +320,7 @@ void Controller::strike(const std::string& why) {
   rejected_.push_back(*goal_);
   goal_.reset();
   if (static_cast<int>(rejected_.size()) >= config_.max_solutions)
-    fire(Event::kUnreachable,
+    fail(Event::kUnreachable,
          std::to_string(rejected_.size()) + " ways are refused: " + rejection_);
 }
 
@@ -352,7 +366,7 @@ void Controller::on_move_answer(const motion_status_t& motion) {
       forget_move();
       ++counters_["action expired"];
       if (++num_expired_ >= kMaxExpired)
-        fire(Event::kUnservable, "the driver let " + std::to_string(num_expired_) +
+        fail(Event::kUnservable, "the driver let " + std::to_string(num_expired_) +
                                      " actions expire; is its clock right? " + motion.reason);
       return;
     case motion_status_t::STATE_STOPPED:

@@ -69,6 +69,10 @@ constexpr std::array<EventInfo, kNumEvents> kEvents{{
     {E::kStep, "step", "the next action is decided"},
     {E::kReached, "reached", "the arm is at the action that was planned"},
     {E::kUnreachable, "unreachable", "no way is left"},
+    {E::kFailed, "failed",
+     "unservable, position unknown, unreachable or given up, of an arm that is its own since "
+     "before "
+     "the target, or was moved for it"},
     {E::kInputSilent, "input silent", "MOTION_STATUS, MARKER_POSES or BODY_SCHEMA, too long"},
     {E::kUnanswered, "unanswered", "for resend_s"},
     {E::kNoSample, "no sample", "for sample_timeout_s"},
@@ -200,6 +204,8 @@ constexpr Rule kRules[] = {
     never(E::kReached, kAll & ~only(P::kDeciding)),
     to(E::kUnreachable, only(P::kDeciding), P::kRefused),
     never(E::kUnreachable, kAll & ~only(P::kDeciding)),
+    to(E::kFailed, kChoosing, P::kHoldDue),  // nobody gets the arm unasked
+    never(E::kFailed, kAll & ~kChoosing),
 
     to(E::kInputSilent, kChoosing | kActing, P::kHoldDue),
     ignore(E::kInputSilent, kOver | kHolds | kAsking | kKeeping),

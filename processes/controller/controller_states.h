@@ -65,6 +65,7 @@ enum class Event : std::uint8_t {
   kStep,
   kReached,
   kUnreachable,
+  kFailed,
   // Of the clock.
   kInputSilent,
   kUnanswered,

@@ -8,6 +8,7 @@
 #include <limits>
 #include <random>
 #include <stdexcept>
+#include <utility>
 
 #include "common/kinematics/kinematic_tree.h"
 
@@ -134,11 +135,15 @@ Eigen::VectorXd converge(const KinematicPath& path, const Scale& scale, const Re
 class Posture {
  public:
   Posture(const KinematicPath& path, const Scale& scale, const Residual& residual,
-          const std::vector<Signal>& seen)
-      : path_(path), scale_(scale), residual_(residual), lower_(seen.size()), upper_(seen.size()) {
-    for (std::size_t i = 0; i < seen.size(); ++i) {
-      lower_[static_cast<Eigen::Index>(i)] = seen[i].lower;
-      upper_[static_cast<Eigen::Index>(i)] = seen[i].upper;
+          const std::vector<Signal>& covered)
+      : path_(path),
+        scale_(scale),
+        residual_(residual),
+        lower_(covered.size()),
+        upper_(covered.size()) {
+    for (std::size_t i = 0; i < covered.size(); ++i) {
+      lower_[static_cast<Eigen::Index>(i)] = covered[i].lower;
+      upper_[static_cast<Eigen::Index>(i)] = covered[i].upper;
     }
     lower_ = clamped(scale.share(lower_));
     upper_ = clamped(scale.share(upper_));
@@ -241,13 +246,13 @@ std::vector<Eigen::VectorXd> scattered_starts(const KinematicPath& path, const S
 /// solve_pose() within `limits`.
 InverseKinematicsSolution solve_within(const KinematicPath& path, const PoseTarget& target,
                                        const std::vector<Signal>& limits,
-                                       const std::vector<Signal>& seen,
+                                       const std::vector<Signal>& covered,
                                        const Eigen::VectorXd& current,
                                        const InverseKinematicsOptions& options,
                                        const std::vector<Eigen::VectorXd>& avoided) {
   const Scale scale(limits);
   const Residual residual(target, options);
-  const Posture posture(path, scale, residual, seen);
+  const Posture posture(path, scale, residual, covered);
   const auto is_avoided = [&](const Eigen::VectorXd& u) {
     return std::any_of(avoided.begin(), avoided.end(), [&](const Eigen::VectorXd& action) {
       return (scale.share(action) - u).cwiseAbs().maxCoeff() < kDifferent;
@@ -285,6 +290,16 @@ InverseKinematicsSolution solve_within(const KinematicPath& path, const PoseTarg
 
 }  // namespace
 
+std::vector<Signal> covered_limits(const BodySchema& schema, std::vector<Signal> limits) {
+  for (std::size_t i = 0; i < limits.size(); ++i) {
+    const Signal::Range covered = schema.signals[i].known_range();
+    const double lower = limits[i].lower, upper = limits[i].upper;
+    limits[i].lower = std::clamp(covered.lower, lower, upper);
+    limits[i].upper = std::clamp(covered.upper, lower, upper);
+  }
+  return limits;
+}
+
 std::optional<BodySchema> chain_to(const BodySchema& schema, int part) {
   const KinematicTree tree(schema.edges, schema.root);
   const int end = tree.node_of(part);
@@ -315,7 +330,7 @@ double posture_cost(const BodySchema& schema, int part, bool with_rotation,
   if (with_rotation) target.q_RT = Eigen::Quaterniond::Identity();
   const Scale scale(limits);
   const Residual residual(target, options);
-  return Posture(*path, scale, residual, schema.signals).cost(scale.share(action));
+  return Posture(*path, scale, residual, covered_limits(schema, limits)).cost(scale.share(action));
 }
 
 InverseKinematicsSolution solve_pose(const BodySchema& schema, int part, const PoseTarget& target,
@@ -331,15 +346,9 @@ InverseKinematicsSolution solve_pose(const BodySchema& schema, int part, const P
       current.size() != static_cast<Eigen::Index>(limits.size())) {
     throw std::invalid_argument("limits and action must have one value per signal");
   }
-  std::vector<Signal> covered = limits;
-  bool is_narrower = false;
-  for (std::size_t i = 0; i < limits.size(); ++i) {
-    const Signal& seen = schema.signals[i];
-    covered[i].lower = std::clamp(seen.lower, limits[i].lower, limits[i].upper);
-    covered[i].upper = std::clamp(seen.upper, limits[i].lower, limits[i].upper);
-    is_narrower |= covered[i].lower > limits[i].lower || covered[i].upper < limits[i].upper;
-  }
-  if (is_narrower) {
+  const std::vector<Signal> covered = covered_limits(schema, limits);
+  const auto range = [](const Signal& signal) { return std::pair(signal.lower, signal.upper); };
+  if (!std::ranges::equal(covered, limits, {}, range, range)) {
     const auto solution = solve_within(*path, target, covered, covered, current, options, avoided);
     if (solution.is_within_tolerance) return solution;
   }

@@ -32,6 +32,9 @@ struct InverseKinematicsSolution {
   bool is_within_tolerance = false;
 };
 
+/// The limits, no wider than what the samples covered that the schema rests on.
+std::vector<Signal> covered_limits(const BodySchema& schema, std::vector<Signal> limits);
+
 /// The edges from the root to one part and nothing else, without covariances. std::nullopt if the
 /// part has no way to the root.
 std::optional<BodySchema> chain_to(const BodySchema& schema, int part);

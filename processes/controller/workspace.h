@@ -19,11 +19,13 @@ struct Workspace {
   static Workspace load(const Yaml& yaml);
 
   /// "" or which part would leave it, by the schema, where all signals move evenly from one action
-  /// to another: looked at in steps of at most a hundredth of each signal's range and
-  /// of 5 mm of each part's origin. A part that is outside already may be, so that the arm can be
-  /// brought back.
+  /// to another: looked at in steps of at most a hundredth of each signal's range and of 5 mm of
+  /// each part's origin. A part that is outside, or in a box, may go no deeper, and once back
+  /// stays.
   std::string objection(const BodySchema& schema, const Eigen::VectorXd& from,
                         const Eigen::VectorXd& to) const;
+  /// "" or why nothing may be brought there, in R [m].
+  std::string objection(const Eigen::Vector3d& p_RT) const;
 };
 
 }  // namespace bodyschema

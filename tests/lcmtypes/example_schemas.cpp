@@ -177,6 +177,8 @@ body_schema_t example_body_schema() {
     signals[n].signal_name = n == 0 ? "shoulder" : "elbow";
     signals[n].lower_limit = -1.5 - n;
     signals[n].upper_limit = 1.5;
+    signals[n].covered_lower = -1.25;
+    signals[n].covered_upper = 1.25;
     fill(signals[n].num_warp, signals[n].warp_weights, {0.1, -0.1});
   }
   fill(message.num_signals, message.signals, signals);

@@ -15,6 +15,7 @@
 #include "common/bus/channels.h"
 #include "common/bus/convert.h"
 #include "common/bus/rest_position.h"
+#include "common/geometry/angle.h"
 #include "common/text/text.h"
 #include "processes/console/commands/commands.h"
 #include "processes/console/commands/session.h"
@@ -26,6 +27,9 @@ namespace bodyschema {
 namespace {
 
 using End = TargetFollower::End;
+
+/// As near as controllers go by the schema.
+constexpr double kNear_m = 5e-3, kNear_rad = 1 * kDegree;
 
 struct FollowArguments {
   std::string in = default_url();
@@ -88,8 +92,9 @@ std::string nearest(const Reach& reach) {
                                : fmt::format("{:.1f} mm", solution.error_m * 1e3);
 }
 
-/// Every step is within reach from the one before, and known well enough there, or nothing is
-/// begun. @throws std::runtime_error with the first that is not.
+/// Every step is within reach from the one before, on a way that is straight within a step, and
+/// known well enough there, or nothing is begun. @throws std::runtime_error with the first that is
+/// not.
 void check_reach(const Heard& heard, const FollowArguments& arguments,
                  const std::vector<std::vector<PoseTarget>>& legs) {
   const BodySchema& schema = *heard.schema;
@@ -109,14 +114,24 @@ void check_reach(const Heard& heard, const FollowArguments& arguments,
   for (std::size_t n = 0; n < legs.size(); ++n) {
     for (const PoseTarget& step : legs[n]) {
       const Reach reach = reach_of(schema, part, step, action);
-      const bool is_known = reach.sd.position_m <= arguments.tolerance_m;
-      if (!reach.solution.is_within_tolerance || !is_known)
-        throw std::runtime_error(fmt::format(
-            "the way to point {} of {}, at {:.3f} {:.3f} {:.3f}: {}; nothing was moved", n + 1,
-            legs.size(), step.p_RT.x(), step.p_RT.y(), step.p_RT.z(),
-            is_known ? fmt::format("out of reach, no nearer than {}", nearest(reach))
-                     : fmt::format("the schema knows the part there within ±{:.1f} mm only",
-                                   reach.sd.position_m * 1e3)));
+      const double off_m =
+          n > 0 ? leaves_line_by_m(schema, part, action, reach.solution.action, step.p_RT) : 0;
+      std::string why;
+      if (reach.sd.position_m > arguments.tolerance_m)
+        why = fmt::format("the schema knows the part there within ±{:.1f} mm only",
+                          reach.sd.position_m * 1e3);
+      else if (reach.solution.error_m > std::min(arguments.tolerance_m, kNear_m) ||
+               reach.solution.error_rad > kNear_rad)
+        why = fmt::format("out of reach, no nearer than {}", nearest(reach));
+      else if (off_m > arguments.step_m)
+        why = fmt::format(
+            "the arm would have to turn over and leave the line by {:.0f} mm: begin elsewhere, or "
+            "go round by another point",
+            off_m * 1e3);
+      if (!why.empty())
+        throw std::runtime_error(
+            fmt::format("the way to point {} of {}, at {:.3f} {:.3f} {:.3f}: {}; nothing was moved",
+                        n + 1, legs.size(), step.p_RT.x(), step.p_RT.y(), step.p_RT.z(), why));
       action = reach.solution.action;
     }
   }
@@ -204,7 +219,8 @@ void run_follow(const FollowArguments& arguments) {
   }
   const Json json = follow_json(passed, legs.size());
   if (arguments.json) std::cout << json.dump() << "\n";
-  if (passed.back().status.owns_arm == 1)
+  const End end = passed.back().end;
+  if (passed.back().status.owns_arm == 1 && (end == End::kAsked || end == End::kMissed))
     std::cerr << "The arm stays there until: " << to_type("release") << "\n";
   if (!json["reached"].get<bool>()) fail();
 }

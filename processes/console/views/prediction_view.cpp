@@ -18,17 +18,6 @@ namespace {
 // What is lost when a command is written as text.
 constexpr double kRounding = 1e-6;
 
-std::vector<int> signals_outside(const BodySchema& schema, const Eigen::VectorXd& action) {
-  std::vector<int> result;
-  for (Eigen::Index s = 0; s < action.size(); ++s) {
-    const Signal& signal = schema.signals[static_cast<std::size_t>(s)];
-    const double margin = kRounding * std::max(std::abs(signal.lower), std::abs(signal.upper));
-    if (action(s) < signal.lower - margin || action(s) > signal.upper + margin)
-      result.push_back(static_cast<int>(s));
-  }
-  return result;
-}
-
 Json deviation(double value, double unit) { return value > 0 ? Json(value / unit) : Json(); }
 
 std::string pose_sd_text(const Noise& sd) {
@@ -44,6 +33,17 @@ std::set<int> moving_signals(const BodySchema& schema, int part) {
   for (const int node : tree.path_to(tree.node_of(part)))
     for (const int s : schema.edges[tree.nodes()[node].edge].signals()) moving.insert(s);
   return moving;
+}
+
+std::vector<int> signals_outside(const BodySchema& schema, const Eigen::VectorXd& action) {
+  std::vector<int> result;
+  for (Eigen::Index s = 0; s < action.size(); ++s) {
+    const auto [lower, upper] = schema.signals[static_cast<std::size_t>(s)].known_range();
+    const double margin = kRounding * std::max(std::abs(lower), std::abs(upper));
+    if (action(s) < lower - margin || action(s) > upper + margin)
+      result.push_back(static_cast<int>(s));
+  }
+  return result;
 }
 
 std::vector<PartPrediction> predict_parts(const BodySchema& schema, const Eigen::VectorXd& action) {

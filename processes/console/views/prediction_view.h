@@ -22,9 +22,11 @@ struct PartPrediction {
   std::vector<int> outside;  ///< signals that move the part, beyond what was seen in training
 };
 
-/// All parts that hang on the root, ascending, without the root. Outside: beyond the limits of a
-/// signal, which are those of the commands of a CSV that was learned from, or the rig's.
-/// @throws std::invalid_argument if `action` does not have one value per signal.
+/// Signals beyond what the samples covered that the schema rests on (indices).
+std::vector<int> signals_outside(const BodySchema& schema, const Eigen::VectorXd& action);
+
+/// All parts that hang on the root, ascending, without the root. @throws std::invalid_argument if
+/// `action` does not have one value per signal.
 std::vector<PartPrediction> predict_parts(const BodySchema& schema, const Eigen::VectorXd& action);
 
 Json part_json(const BodySchema& schema, const PartPrediction& prediction);

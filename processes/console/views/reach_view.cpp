@@ -2,6 +2,7 @@
 
 #include <fmt/format.h>
 
+#include <set>
 #include <vector>
 
 #include "common/geometry/angle.h"
@@ -32,6 +33,14 @@ std::vector<int> at_limits(const BodySchema& schema, int part, const Eigen::Vect
   return result;
 }
 
+// Signals that move the part and are where the schema's samples were not.
+std::vector<int> not_covered(const BodySchema& schema, int part, const Eigen::VectorXd& action) {
+  const std::set<int> moving = moving_signals(schema, part);
+  std::vector<int> result = signals_outside(schema, action);
+  std::erase_if(result, [&](int s) { return !moving.contains(s); });
+  return result;
+}
+
 }  // namespace
 
 Reach reach_of(const BodySchema& schema, int part, const PoseTarget& target,
@@ -45,6 +54,9 @@ Reach reach_of(const BodySchema& schema, int part, const PoseTarget& target,
     reach.sd = deviations_of(predicted->covariance);
   if (reach.solution.is_within_tolerance) {
     reach.why = "reached";
+    if (const auto beyond = not_covered(schema, part, action); !beyond.empty())
+      reach.why +=
+          ", but beyond what the samples covered of " + listed(signal_names(schema, beyond));
     return reach;
   }
   const std::vector<int> limits = at_limits(schema, part, action);

@@ -17,8 +17,9 @@ struct Reach {
   std::string why;  ///< it is reached, or not
 };
 
-/// Within 0.1 mm and 0.01° by the schema, or the nearest of a hundred starts; within the limits of
-/// the signals, so that nothing is outside training. Deterministic. @throws as solve_pose().
+/// Within 0.1 mm and 0.01° by the schema, or the nearest of a hundred starts; where the
+/// schema's samples were if it is there, else within the limits. Deterministic. @throws as
+/// solve_pose().
 Reach reach_of(const BodySchema& schema, int part, const PoseTarget& target,
                const Eigen::VectorXd& start);
 

@@ -365,6 +365,8 @@ TEST(Check, RefusesASchemaWhoseFieldsContradictEachOther) {
     expect_refused(example_body_schema(), field, change);
   };
   refused("signals[0].upper_limit", [](auto& m) { m.signals[0].upper_limit = -2; });
+  refused("signals[0].covered_lower", [](auto& m) { m.signals[0].covered_upper = 2; });
+  refused("signals[0].covered_upper", [](auto& m) { m.signals[0].covered_upper = -1.3; });
   refused("changes[0].since_sample", [](auto& m) { m.changes[0].since_sample = 33; });
   refused("moved_tags[0].moved_since_sample",
           [](auto& m) { m.moved_tags[0].moved_since_sample = 35; });

@@ -37,8 +37,8 @@ body_schema_t schema_of(const std::filesystem::path& rig) {
   for (const Signal& signal : load_signals(rig).signals) {
     signal_t& message = signals.emplace_back();
     message.signal_name = signal.name;
-    message.lower_limit = signal.lower;
-    message.upper_limit = signal.upper;
+    message.lower_limit = message.covered_lower = signal.lower;
+    message.upper_limit = message.covered_upper = signal.upper;
   }
   set_array(schema.num_signals, schema.signals, std::move(signals));
   set_array(schema.num_parts, schema.part_ids, load_markers(rig).parts());

@@ -162,7 +162,7 @@ TEST(SchemaJsonTest, ShowHasEveryParameterOfEveryEdge) {
                   "unused_signals", "undecided_signals", "noise", "refined", "version",
                   "base_version", "last_sample", "X_CR", "signals"}));
   EXPECT_EQ(json["signals"].size(), 3U);
-  EXPECT_EQ(keys_of(json["signals"][0]), (Keys{"name", "lower", "upper", "warp"}));
+  EXPECT_EQ(keys_of(json["signals"][0]), (Keys{"name", "lower", "upper", "covered", "warp"}));
   EXPECT_EQ(json["last_sample"], 29);
   EXPECT_EQ(keys_of(json["X_CR"]),
             (Keys{"position_m", "rotation_wxyz", "position_sd_m", "rotation_sd_deg"}));

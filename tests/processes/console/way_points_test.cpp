@@ -65,5 +65,27 @@ TEST(WayPointsTest, ALineTurnsInSmallStepsAlongTheShorterWay) {
   EXPECT_NEAR(before.angularDistance(*to.q_RT), 0, 1e-9);
 }
 
+// Two links of 1 m in a plane, turning by their commands.
+TEST(WayPointsTest, AnArmThatTurnsOverLeavesTheLine) {
+  BodySchema schema;
+  schema.parts = {1, 2, 3};
+  schema.root = 1;
+  schema.signals = {{"a", -2, 2}, {"b", -2, 2}};
+  for (const int joint : {0, 1}) {
+    Edge& edge = schema.edges.emplace_back();
+    edge.from = joint + 1;
+    edge.to = joint + 2;
+    edge.joints.push_back({.signal = joint, .turn = 1});
+    edge.right.translation() = Eigen::Vector3d(1, 0, 0);
+  }
+  const auto position = [&](const Eigen::Vector2d& q) -> Eigen::Vector3d {
+    return schema.predict(1, 3, q)->X_AB.translation();
+  };
+  const Eigen::Vector2d from(0.5, -1), to(0.52, -1.01), over(-0.49, 1.01);
+  ASSERT_LT((position(to) - position(over)).norm(), 0.02);
+  EXPECT_LT(leaves_line_by_m(schema, 3, from, to, position(to)), 1e-4);
+  EXPECT_GT(leaves_line_by_m(schema, 3, from, over, position(over)), 0.1);
+}
+
 }  // namespace
 }  // namespace bodyschema

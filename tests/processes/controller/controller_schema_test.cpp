@@ -193,7 +193,7 @@ TEST(ControllerTest, ANewSchemaInTheMiddleIsPlannedWithAnew) {
   EXPECT_TRUE(bench.has_why("not seen")) << bench.status.why;
 }
 
-TEST(ControllerTest, APartThatIsLostInTheMiddleEndsTheTarget) {
+TEST(ControllerTest, APartThatIsLostInTheMiddleEndsTheTargetAndTheArmStaysHeld) {
   Bench bench;
   bench.start();
   bench.give(position_target(0, kFar));
@@ -204,9 +204,9 @@ TEST(ControllerTest, APartThatIsLostInTheMiddleEndsTheTarget) {
   lost.part = 4;
   bench.schema.unconnected.push_back(lost);
   bench.repeat();
-  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REFUSED));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_HOLDING));
   EXPECT_LE(bench.moves.size(), 2U);
-  EXPECT_EQ(bench.status.owns_arm, 0);
+  EXPECT_EQ(bench.status.owns_arm, 1);
   EXPECT_TRUE(bench.has_why("not connected")) << bench.status.why;
 }
 

@@ -140,6 +140,7 @@ TEST(ControllerStatesTest, WhatMustHoldTheArmSendsHoldAsSoonAsTheDriverIsHeard) 
   holding[Event::kDriverRestarted] = owned;
   holding[Event::kNoSample] = observing;
   holding[Event::kRestored] = {Phase::kIdle};
+  holding[Event::kFailed] = {Phase::kTaking, Phase::kDeciding, Phase::kTagAwaited};
   for (const Phase phase : all_phases()) holding[Event::kHoldAsked].insert(phase);
   for (const Phase phase : all_phases()) {
     for (const Event event : all_events()) {

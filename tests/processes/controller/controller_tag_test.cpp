@@ -105,16 +105,17 @@ TEST(ControllerTest, ATagThatIsLostOnTheWayMakesItHoldUntilItIsSeenAgain) {
   EXPECT_EQ(bench.num_holds, 1);
 }
 
-TEST(ControllerTest, AnArmThatWasGivenBackIsNotHeldAnyMoreForATagThatWasLost) {
+TEST(ControllerTest, ATagThatStaysLostEndsTheTargetAndTheArmStaysHeld) {
   Bench bench = bench_with_tag(kFar);
   bench.give(tag_target(0));
   ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 1; }));
   bench.p_RM_of_tag.clear();
   ASSERT_TRUE(bench.run_until([&] { return bench.num_holds == 1; }));
-  bench.driver_serves = false;  // its HOLD is never answered
-  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REFUSED)) << bench.status.why;
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_HOLDING)) << bench.status.why;
   bench.run(5);
-  EXPECT_EQ(bench.num_holds, 1);
+  EXPECT_EQ(bench.num_holds, 2);
+  EXPECT_EQ(bench.status.owns_arm, 1);
+  EXPECT_TRUE(bench.has_why("given up")) << bench.status.why;
 }
 
 TEST(ControllerTest, ATagThatJumpsOnTheWayMakesItHoldAndIsServedAnewAtItsNewPlace) {

@@ -125,7 +125,8 @@ TEST(ControllerTest, NoPartLeavesTheWorkspaceOnTheWay) {
     ASSERT_TRUE(bench.run_until_state(is_walled ? S::CONTROL_REFUSED : S::CONTROL_REACHED))
         << bench.status.why;
     if (is_walled) {
-      EXPECT_TRUE(bench.has_why("part 4 would leave the workspace")) << bench.status.why;
+      EXPECT_TRUE(bench.has_why("part 4 would be in keep_out box 1")) << bench.status.why;
+      EXPECT_TRUE(bench.moves.empty());
     }
     // On this side of it the arm may move.
     bench.give(position_target(1, swing(-20)));
@@ -173,8 +174,55 @@ TEST(ControllerTest, APartThatIsOutsideTheWorkspaceMayComeBack) {
   ASSERT_LT(bench.part_position().y(), -0.5);
   bench.give(position_target(0, kNear));
   EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+  const std::size_t num_moves = bench.moves.size();
   bench.give(position_target(1, kFar));
-  EXPECT_TRUE(bench.run_until_state(S::CONTROL_REFUSED)) << bench.status.why;
+  EXPECT_TRUE(bench.run_until_state(S::CONTROL_HOLDING)) << bench.status.why;
+  EXPECT_TRUE(bench.has_why("the target is outside the workspace")) << bench.status.why;
+  EXPECT_EQ(bench.moves.size(), num_moves);
+}
+
+TEST(WorkspaceTest, APartThatIsInABoxGoesNoDeeperAndIntoNoOther) {
+  const BodySchema schema = planar();
+  const auto at = [&](double degrees) { return Eigen::Vector3d(degrees, 0, 0); };
+  const auto box_at = [&](double from, double to) {  // of part 4's way about the root
+    Eigen::AlignedBox3d box;
+    for (const double degrees : {from, to})
+      box.extend(schema.predict(1, 4, at(degrees))->X_AB.translation());
+    box.min().z() = -1;
+    box.max().z() = 1;
+    return box;
+  };
+  Workspace workspace;
+  workspace.keep_out = {box_at(-10, 10), box_at(30, 50)};
+  workspace.keep_out[0].extend(Eigen::Vector3d(2.2, 0, 0));
+  EXPECT_EQ(workspace.objection(schema, at(20), at(25)), "");
+  EXPECT_EQ(workspace.objection(schema, at(5), at(20)), "");
+  EXPECT_NE(workspace.objection(schema, at(8), at(0)), "");
+  EXPECT_NE(workspace.objection(schema, at(5), at(40)), "");
+  EXPECT_NE(workspace.objection(schema, at(20), at(5)), "");
+  EXPECT_NE(workspace.objection(schema.predict(1, 4, at(5))->X_AB.translation()), "");
+  EXPECT_EQ(workspace.objection(schema.predict(1, 4, at(20))->X_AB.translation()), "");
+}
+
+// Nobody gets an arm unasked: a slip of the tongue does not set the babbler free.
+TEST(ControllerTest, AnArmThatWasHeldStaysSoWhereATargetIsRefused) {
+  for (const bool is_kept : {false, true}) {
+    Bench bench;
+    bench.start();
+    bench.give(is_kept ? position_target(0, kNear) : other_target(0, Target::KIND_HOLD));
+    ASSERT_TRUE(bench.run_until_state(is_kept ? S::CONTROL_REACHED : S::CONTROL_HOLDING));
+    const std::size_t num_moves = bench.moves.size();
+    Target wrong = position_target(1, kBeyond);
+    for (const int part : {4, 7, 5, 1}) {
+      wrong.target_id = 10 + part;
+      wrong.target_part = part;
+      bench.give(wrong);
+      ASSERT_TRUE(bench.run_until_state(S::CONTROL_HOLDING)) << bench.status.why;
+      EXPECT_TRUE(bench.has_why("the arm stays here")) << bench.status.why;
+      EXPECT_EQ(bench.status.owns_arm, 1);
+    }
+    EXPECT_EQ(bench.moves.size(), num_moves);
+  }
 }
 
 TEST(ControllerTest, TheWorkspaceIsRead) {
