@@ -9,6 +9,8 @@ constexpr std::int64_t kBlock_us = 1'000'000;
 constexpr std::int64_t kLongestInterval_us = 250'000;
 constexpr double kLargestStep = 0.1;  // of a signal's range
 
+}  // namespace
+
 bool is_small_step(const Eigen::VectorXd& from, const Eigen::VectorXd& to,
                    const std::vector<Signal>& signals) {
   for (std::size_t s = 0; s < signals.size(); ++s) {
@@ -18,8 +20,6 @@ bool is_small_step(const Eigen::VectorXd& from, const Eigen::VectorXd& to,
   }
   return true;
 }
-
-}  // namespace
 
 bool SampleStream::repeats(const ActionPoseSample& sample, const std::vector<Signal>& signals) {
   const bool is_repeated = last_ && sample.utime > last_->utime &&

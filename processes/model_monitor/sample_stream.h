@@ -12,6 +12,11 @@
 
 namespace bodyschema {
 
+/// No signal moves by more than a tenth of its range: what cameras, tags and joints are off by all
+/// the time is about the same before and after.
+bool is_small_step(const Eigen::VectorXd& from, const Eigen::VectorXd& to,
+                   const std::vector<Signal>& signals);
+
 /// Which samples say something new. An arm that goes from rest to rest brings independent ones. A
 /// stream of frames does not: what a soft body's model does not know (hysteresis, creep, a bend
 /// that it was never shown) and a marker that is read turned over are the same for many frames, and

@@ -223,7 +223,10 @@ TEST_F(MonitorRestartTest, AHistoryOfOtherSamplesIsSetAside) {
 TEST_F(MonitorRestartTest, BeginsWithAnInitialSchemaWhateverLimitsItsRecordingHad) {
   body_schema_t initial = proposals_[4];
   initial.schema_version = 7;
-  for (signal_t& signal : initial.signals) signal.upper_limit -= 0.01;
+  for (signal_t& signal : initial.signals) {
+    signal.upper_limit -= 0.01;
+    signal.covered_upper = std::min(signal.covered_upper, signal.upper_limit);
+  }
   const fs::path file = folder_ / "initial.lcmlog";
   const auto begin = [&](const std::string& name) {
     write_one_event_log(file, kBodySchema, initial);

@@ -241,8 +241,8 @@ void HypothesisTracker::want_probe(std::int64_t now, std::vector<AdaptationEvent
     const Replacement& other = rival.changes.back().what;
     const double lead = std::abs(log_odds() - rival.log_odds);
     // Of two functions the samples to come decide.
-    if (lead > options_.ambiguity || one.element != other.element ||
-        is_same_explanation(one, other) || one.fitted.change.is_learned() || is_asked(one, other))
+    if (lead > options_.ambiguity || is_same_explanation(one, other) ||
+        one.fitted.change.is_learned() || is_asked(one, other))
       continue;
     const Eigen::VectorXd probe = most_telling_action(schema(), rival.body, options_.tolerance);
     if (probe.size() == 0) continue;
