@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <filesystem>
 #include <fstream>
 #include <iostream>
 #include <iterator>
@@ -20,6 +21,7 @@
 #include "processes/console/commands/commands.h"
 #include "processes/console/commands/session.h"
 #include "processes/console/hint.h"
+#include "processes/console/views/prediction_view.h"
 #include "processes/console/views/reach_view.h"
 #include "processes/console/way_points.h"
 
@@ -50,6 +52,7 @@ struct Passed {
 std::vector<PoseTarget> read_way_points(const std::string& file) {
   std::ifstream stream;
   if (file != "-") {
+    if (std::filesystem::is_directory(file)) throw WayPointError(file + ": is a folder");
     stream.open(file);
     if (!stream) throw WayPointError(file + ": cannot be read");
   }
@@ -105,9 +108,8 @@ void check_reach(const Heard& heard, const FollowArguments& arguments,
   if (heard.motion)
     if (const auto position = rest_position(*heard.motion, schema.signals.size()))
       action = *position;
-  if (!schema.has_part(part) || !schema.predict(schema.root, part, action))
-    throw std::runtime_error(
-        fmt::format("the schema connects no part {} with its root {}", part, schema.root));
+  if (!schema.has_part(part) || part == schema.root || !schema.predict(schema.root, part, action))
+    throw std::runtime_error(no_way_text(schema, part));
   if (legs.front().front().q_RT && !schema.has_rotation(part))
     throw std::runtime_error(
         fmt::format("of part {} positions alone are known: leave out qw,qx,qy,qz", part));

@@ -8,6 +8,7 @@
 #include "common/geometry/angle.h"
 #include "processes/console/commands/commands.h"
 #include "processes/console/commands/files.h"
+#include "processes/console/views/prediction_view.h"
 #include "processes/console/views/reach_view.h"
 
 namespace bodyschema {
@@ -59,8 +60,7 @@ void run_reach(const ReachArguments& arguments) {
   const PoseTarget target = target_of(arguments);
   if (!schema.has_part(arguments.part) || arguments.part == schema.root ||
       !schema.predict(schema.root, arguments.part, start_of(arguments, schema)))
-    refuse_argument("--part", fmt::format("the schema connects no part {} with its root {}",
-                                          arguments.part, schema.root));
+    refuse_argument("--part", no_way_text(schema, arguments.part));
   if (target.q_RT && !schema.has_rotation(arguments.part))
     refuse_argument("--orientation",
                     fmt::format("of part {} positions alone are known", arguments.part));

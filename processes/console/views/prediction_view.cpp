@@ -35,6 +35,12 @@ std::set<int> moving_signals(const BodySchema& schema, int part) {
   return moving;
 }
 
+std::string no_way_text(const BodySchema& schema, int part) {
+  return part == schema.root
+             ? fmt::format("part {} is the root, in whose frame the others move", part)
+             : fmt::format("the schema connects no part {} with its root {}", part, schema.root);
+}
+
 std::vector<int> signals_outside(const BodySchema& schema, const Eigen::VectorXd& action) {
   std::vector<int> result;
   for (Eigen::Index s = 0; s < action.size(); ++s) {

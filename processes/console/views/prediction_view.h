@@ -14,6 +14,9 @@ namespace bodyschema {
 /// Signals that move a part in the root (indices).
 std::set<int> moving_signals(const BodySchema& schema, int part);
 
+/// Why no signal moves the part in the root.
+std::string no_way_text(const BodySchema& schema, int part);
+
 /// Where a schema says that a part is, and how well it knows.
 struct PartPrediction {
   int part = 0;

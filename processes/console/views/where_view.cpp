@@ -61,8 +61,7 @@ Whereabouts whereabouts_of(const BodySchema& schema, std::optional<int> part,
     if (predicted != now.end()) p.now = *predicted;
   }
   if (part && where.parts.empty())
-    throw std::invalid_argument(
-        fmt::format("the schema connects no part {} with its root {}", *part, schema.root));
+    throw std::invalid_argument(no_way_text(schema, *part));
   return where;
 }
 
