@@ -1,8 +1,8 @@
 // How class Controller serves a target: action by action, each seen before the next.
 
 #include <algorithm>
+#include <bit>
 #include <cmath>
-#include <random>
 #include <sstream>
 #include <tuple>
 #include <utility>
@@ -258,15 +258,16 @@ void Controller::probe(const Eigen::VectorXd& action) {
 void Controller::search(const std::string& edge) {
   goal_.reset();
   if (!search_centre_) search_centre_ = position_;
-  ++num_searches_;
-  std::mt19937_64 engine(static_cast<std::uint64_t>(num_searches_));
-  std::uniform_real_distribution<double> share(-config_.search_step, config_.search_step);
+  // Up and down by the signs of a screening design (Plackett and Burman 1946; Walsh functions of the
+  // move's number): whatever the signals are, after a power of two of moves they are told apart.
+  const auto move = static_cast<unsigned>(num_searches_++);
   Eigen::VectorXd action = *search_centre_;
   for (std::size_t i = 0; i < config_.signals.size(); ++i) {
     const Signal& signal = config_.signals[i];
+    const bool is_up = std::popcount(move & static_cast<unsigned>(i + 1)) % 2 == 0;
+    const double step = (is_up ? 1 : -1) * config_.search_step * (signal.upper - signal.lower);
     double& value = action[static_cast<Eigen::Index>(i)];
-    value = std::clamp(value + share(engine) * (signal.upper - signal.lower), signal.lower,
-                       signal.upper);
+    value = std::clamp(value + step, signal.lower, signal.upper);
   }
   return move_to(towards(action, config_.max_step), Serves::kSearch,
                  action_command_t::PURPOSE_PROBE,

@@ -17,7 +17,7 @@ TEST(ControllerTest, WhateverHappensItsCommandsAreLawful) {
   std::size_t num_moves = 0, num_holds = 0;
   std::set<Phase> phases;
   const char* wanted = std::getenv("BODYSCHEMA_SEQUENCES");
-  const int num_sequences = wanted ? std::atoi(wanted) : 400;
+  const int num_sequences = wanted ? std::atoi(wanted) : 3000;
   for (int run = 0; run < num_sequences && !testing::Test::HasFatalFailure(); ++run) {
     ControllerConfig config = test_config();
     config.max_searches = run % 2 ? 5 : 0;
