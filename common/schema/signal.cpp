@@ -49,6 +49,12 @@ double Signal::displacement_rate(double q) const {
   return 1 + 0.5 * M_PI / kWarpReach * (b1 * cosine - b2) / half;
 }
 
+void Signal::cover(double q) {
+  if (!covered) covered = {q, q};
+  covered->lower = std::min(covered->lower, q);
+  covered->upper = std::max(covered->upper, q);
+}
+
 Eigen::VectorXd mid_range(const std::vector<Signal>& signals) {
   Eigen::VectorXd action(static_cast<Eigen::Index>(signals.size()));
   for (std::size_t s = 0; s < signals.size(); ++s)

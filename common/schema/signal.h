@@ -17,11 +17,13 @@ struct Signal {
   /// is what moves the joints on this signal. See warp_basis().
   std::vector<double> warp = {};
   /// What the samples that a schema rests on covered of it [command units]: beyond, it was never
-  /// seen to hold. std::nullopt: nobody said.
+  /// seen to hold. std::nullopt: nobody said (messages and files then have the limits).
   struct Range {
     double lower = 0, upper = 0;
   };
   std::optional<Range> covered = {};
+  /// `covered` with one value more.
+  void cover(double q);
   /// `covered`, or the limits.
   Range known_range() const { return covered.value_or(Range{lower, upper}); }
 

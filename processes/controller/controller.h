@@ -65,9 +65,9 @@ struct ControllerConfig {
 /// Of all targets the highest (epoch, target_id) counts; a repeated one does nothing. One whose
 /// epoch is more than kClockTolerance_us ahead of the clock is refused: every later one would count
 /// for less than it. The arm is its own (owns_arm) from the moment that a target can be served
-/// until it was reached and kept, was refused or is released. Taking it waits until the arm rests
-/// and the last settled action has its SAMPLE. A target that is not reached within its expiry is
-/// dropped, as by a HOLD.
+/// until it was reached and kept, is released, or was refused before it moved the arm. Taking it
+/// waits until the arm rests and the last settled action has its SAMPLE. A target that is not
+/// reached within its expiry is dropped, as by a HOLD.
 ///
 /// No part leaves the workspace on the way, by the schema; a solution towards which one would is
 /// dealt with like one that the driver rejects.
@@ -77,7 +77,7 @@ struct ControllerConfig {
 /// INVALID the arm is moved a little about the place where that was heard, so that the monitor sees
 /// what changed; where max_searches samples do not mend it, the arm is lent to the babbler. Nothing
 /// lasts for ever: an arm that does not come to rest within rest_timeout, or that is lent for
-/// lent_timeout without a new SAMPLE, ends in a refusal.
+/// lent_timeout without a new SAMPLE, ends the target.
 ///
 /// Start guard: nothing is sent before MOTION_STATUS, BODY_SCHEMA and MARKER_POSES of the present
 /// rest were heard, and no MOVE from a position that was not heard: the last settled action of this
@@ -262,6 +262,7 @@ class Controller {
   std::string why_ = "no target was given since the start";
   std::optional<int> tag_place_;           ///< of the target's tag: TagTrack::place()
   bool was_its_own_ = false;               ///< the arm, before the target came
+  std::optional<Offset> served_offset_;    ///< what was corrected for where the arm is
   std::optional<Offset> offset_;           ///< corrected for
   std::optional<Eigen::VectorXd> goal_;    ///< action that brings the part to aim()
   std::vector<Eigen::VectorXd> rejected_;  ///< goals the driver would not go to

@@ -186,8 +186,8 @@ void Controller::observe(const sample_t& message) {
   Eigen::Matrix<double, 3, 6> J;
   J << -Eigen::Matrix3d::Identity(), skew(p_RB);
   covariance += J * root_covariance * J.transpose();
-  // By the schema the part is at the aim.
-  if (!part->X_CB_other) observed_offset_ = updated_offset({aim() - p_RB, covariance});
+  if (X_RB && !part->X_CB_other)
+    observed_offset_ = updated_offset({X_RB->X_AB.translation() - p_RB, covariance});
 }
 
 EdgeState Controller::worst_edge(std::string* name) const {

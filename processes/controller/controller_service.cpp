@@ -17,7 +17,7 @@ namespace bodyschema {
 namespace {
 
 constexpr int kMaxExpired = 3;  // in a row
-// Of a range: a driver that counts in other units says what it was told within 1e-6 (DRIVER.md).
+// Of a range: a driver that counts in other units says what it was told within 1e-6.
 constexpr double kArrived = 2e-6;
 
 std::string in_tenths(double value, const char* unit) {
@@ -196,10 +196,13 @@ void Controller::step() {
     const InverseKinematicsSolution solution =
         solve_pose(*schema_, target_.target_part, {aim(), wanted_orientation()}, config_.signals,
                    *position_, options, rejected_);
-    if (solution.error_m > tolerance_m() || solution.error_rad > tolerance_rad()) {
+    const bool is_refused = offset_ && static_cast<int>(rejected_.size()) >= config_.max_solutions;
+    if (is_refused || solution.error_m > tolerance_m() || solution.error_rad > tolerance_rad()) {
       if (!offset_) return fail_unreachable(solution);
-      offset_.reset();  // beyond reach only with the correction
-      return step();
+      // Beyond reach only with the correction: it stays where it is.
+      offset_ = served_offset_;
+      num_corrections_ = config_.max_corrections;
+      return arrive();
     }
     goal_ = solution.action;
     if (const std::string why = config_.workspace.objection(*schema_, *position_, *goal_);
@@ -258,8 +261,9 @@ void Controller::probe(const Eigen::VectorXd& action) {
 void Controller::search(const std::string& edge) {
   goal_.reset();
   if (!search_centre_) search_centre_ = position_;
-  // Up and down by the signs of a screening design (Plackett and Burman 1946; Walsh functions of the
-  // move's number): whatever the signals are, after a power of two of moves they are told apart.
+  // Up and down by the signs of a screening design (Plackett and Burman 1946; Walsh functions of
+  // the move's number): after eight moves up to seven signals are told apart, after sixteen
+  // fifteen.
   const auto move = static_cast<unsigned>(num_searches_++);
   Eigen::VectorXd action = *search_centre_;
   for (std::size_t i = 0; i < config_.signals.size(); ++i) {
@@ -320,7 +324,7 @@ void Controller::strike(const std::string& why) {
   rejection_ = why;
   rejected_.push_back(*goal_);
   goal_.reset();
-  if (static_cast<int>(rejected_.size()) >= config_.max_solutions)
+  if (static_cast<int>(rejected_.size()) >= config_.max_solutions && !offset_)
     fail(Event::kUnreachable,
          std::to_string(rejected_.size()) + " ways are refused: " + rejection_);
 }
@@ -333,7 +337,7 @@ void Controller::arrive() {
   if (is_off && observed_offset_ && num_corrections_ < config_.max_corrections &&
       observed_error_m_ <= config_.max_correction_m) {
     ++num_corrections_;
-    offset_ = observed_offset_;
+    served_offset_ = std::exchange(offset_, observed_offset_);
     goal_.reset();
     return step();
   }

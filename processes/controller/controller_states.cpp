@@ -211,7 +211,7 @@ constexpr Rule kRules[] = {
     ignore(E::kInputSilent, kOver | kHolds | kAsking | kKeeping),
     to(E::kUnanswered, only(P::kMoving), P::kMoving, Sends::kAgain),
     to(E::kUnanswered, only(P::kMovingPreempted), P::kTaking),  // planned from another place
-    to(E::kUnanswered, only(P::kHoldSent), P::kHoldSent, Sends::kAgain),
+    to(E::kUnanswered, only(P::kHoldSent), P::kHoldSent, Sends::kHold),  // a refused id stays so
     ignore(E::kUnanswered, kAll & ~kAwaitsAnswer & ~only(P::kHoldSent)),
     to(E::kNoSample, kAwaitsSample, P::kHoldDue),
     ignore(E::kNoSample, kAll & ~kAwaitsSample),

@@ -345,15 +345,9 @@ std::vector<AdaptationEvent> Adaptation::on_new_sample(ActionPoseSample sample) 
   if (num_samples_ >= options_.calibration_samples) drop_fallen(&sample, &events);
   watch_visibility(seen, sample, &events);
   const TreeFilter::Instant instant = tracker_.filter().prepare(sample);
-  // Along a path, what is off by all the time repeats, which is neither noise nor a change: of what
-  // is nearly one place the first sample counts.
-  const bool is_near_last = watched_action_.size() > 0 && !stream_.is_dense() && !drifting_ &&
-                            is_small_step(watched_action_, sample.action, schema_.signals);
-  if (!is_near_last) {
-    watched_action_ = sample.action;
-    drift_watch_.add(tracker_.filter(), instant, tracker_.schema(),
-                     schema_.displacements(sample.action), sample.sample_index);
-  }
+  drift_watch_.add(tracker_.filter(), instant, tracker_.schema(),
+                   schema_.displacements(sample.action), sample.sample_index,
+                   stream_.is_dense() || drifting_);
   if (++num_samples_ <= options_.calibration_samples) {
     tracker_.add_silently(sample);
     if (num_samples_ == options_.calibration_samples) calibrate(tracker_.recent());

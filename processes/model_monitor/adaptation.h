@@ -133,7 +133,6 @@ class Adaptation {
   std::vector<MovedTag> moved_tags_;
   BodySchema schema_;  ///< the tracker's, with the moved tags
   SampleStream stream_;
-  Eigen::VectorXd watched_action_;  ///< of the sample that drift_watch_ saw last
   DriftWatch drift_watch_;
   std::optional<int> drifting_;  ///< the edge to this part
   BodySchema before_;            ///< the schema without the drift, or without what comes and goes

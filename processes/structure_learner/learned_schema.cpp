@@ -7,28 +7,15 @@
 
 namespace bodyschema {
 
-namespace {
-
-void cover(const std::vector<ActionPoseSample>& samples, std::vector<Signal>* signals) {
-  for (std::size_t s = 0; s < signals->size(); ++s) {
-    std::optional<Signal::Range>& covered = (*signals)[s].covered;
-    covered.reset();
-    for (const ActionPoseSample& sample : samples) {
-      const double value = sample.action[static_cast<Eigen::Index>(s)];
-      if (!covered) covered = {value, value};
-      covered->lower = std::min(covered->lower, value);
-      covered->upper = std::max(covered->upper, value);
-    }
-  }
-}
-
-}  // namespace
-
 BodySchema start_schema(const std::vector<Signal>& signals,
                         const std::vector<ActionPoseSample>& samples, std::optional<int> root) {
   BodySchema schema;
   schema.signals = signals;
-  cover(samples, &schema.signals);
+  for (std::size_t s = 0; s < signals.size(); ++s) {
+    schema.signals[s].covered.reset();
+    for (const ActionPoseSample& sample : samples)
+      schema.signals[s].cover(sample.action[static_cast<Eigen::Index>(s)]);
+  }
   schema.num_samples = static_cast<int>(samples.size());
   for (const ActionPoseSample& sample : samples)
     schema.last_sample_index = std::max(schema.last_sample_index, sample.sample_index);

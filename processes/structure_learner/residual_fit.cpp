@@ -34,8 +34,9 @@ constexpr double kMissed = 10, kMissedErrors = 2;
 constexpr double kSureErrors = 4;
 // A line that explains what is left as well as this by chance is one in the signal. Motion of about
 // the noise is told so, by all frames, where kShapeSamples tell nothing. Measured: signals with an
-// effect that arms of 3 to 7 joints with a range of 4° have at their ends, 4e-4 and less; those
-// that `soft_bodies` and `trunk_c11` drop for good, 3e-3 and more.
+// effect that arms of 3 to 7 joints with a range of 4° have at their ends, 3e-5 and less, but for
+// two that are missed anyway; those that `soft_bodies` and `trunk_c11` drop for good, 3e-3 and
+// more. Chosen: from a hundredth of it on it is sure.
 const double kLogChance = std::log(1e-4), kSureLogChance = std::log(1e-6);
 // Trace of the whitened covariance of a prediction: 6 is that of a measurement.
 constexpr double kLargestUncertainty = 6;

@@ -30,7 +30,7 @@ namespace {
 
 using End = TargetFollower::End;
 
-/// As near as controllers go by the schema.
+/// A step is reached so near by the schema.
 constexpr double kNear_m = 5e-3, kNear_rad = 1 * kDegree;
 
 struct FollowArguments {
@@ -148,6 +148,8 @@ pose_target_t target_at(const PoseTarget& step, const FollowArguments& arguments
     const double wxyz[] = {q->w(), q->x(), q->y(), q->z()};
     std::copy(std::begin(wxyz), std::end(wxyz), target.orientation_wxyz);
   }
+  target.tolerance_m = std::min(arguments.tolerance_m, kNear_m);
+  target.tolerance_rad = kNear_rad;
   target.expiry_s = arguments.timeout_s + kExpiryAfterTimeout_s;
   return target;
 }

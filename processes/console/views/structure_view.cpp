@@ -253,12 +253,12 @@ Json schema_json(const BodySchema& schema) {
   json["X_CR"]["position_sd_m"] = axes_json(variances.head<3>(), 1);
   json["X_CR"]["rotation_sd_deg"] = axes_json(variances.tail<3>(), kDegree);
   json["signals"] = array_of(schema.signals, [](const Signal& signal) -> Json {
-    return {
-        {"name", signal.name},
-        {"lower", signal.lower},
-        {"upper", signal.upper},
-        {"covered", signal.covered ? Json({signal.covered->lower, signal.covered->upper}) : Json()},
-        {"warp", signal.warp}};
+    const auto [from, to] = signal.known_range();
+    return {{"name", signal.name},
+            {"lower", signal.lower},
+            {"upper", signal.upper},
+            {"covered", {from, to}},
+            {"warp", signal.warp}};
   });
   const Eigen::VectorXd middle = schema.displacements(mid_range(schema.signals));
   for (std::size_t i = 0; i < schema.edges.size(); ++i)

@@ -13,6 +13,7 @@
 #include "processes/model_monitor/changes/drift.h"
 #include "processes/model_monitor/hypotheses/change_fit.h"
 #include "processes/model_monitor/hypotheses/schema_difference.h"
+#include "processes/model_monitor/sample_stream.h"
 
 namespace bodyschema {
 namespace {
@@ -218,11 +219,15 @@ std::optional<DriftWatch::Measured> DriftWatch::measure(const TreeFilter& filter
 
 void DriftWatch::add(const TreeFilter& filter, const TreeFilter::Instant& instant,
                      const BodySchema& schema, const Eigen::VectorXd& displacements,
-                     std::int64_t sample_index) {
+                     std::int64_t sample_index, bool counts_near) {
   if (!is_same(schema, schema_)) {
     before_.clear();
     schema_ = schema;
   }
+  if (!counts_near && last_.size() == displacements.size() &&
+      is_small_step(last_, displacements, schema.signals))
+    return;
+  last_ = displacements;
   const TreeFilter::Instant exact = with_exact_models(instant);
   const auto add = [&](const ElementId& element, int node, Measure how) {
     auto measured = measure(filter, instant, exact, node, how);
@@ -273,6 +278,7 @@ void DriftWatch::forget(int part, std::int64_t before) {
 }
 
 void DriftWatch::forget_all() {
+  last_.resize(0);
   measured_.clear();
   before_.clear();
 }

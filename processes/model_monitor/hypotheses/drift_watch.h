@@ -66,9 +66,12 @@ class DriftWatch {
  public:
   explicit DriftWatch(double false_alarm_rate);
 
-  /// The sample as `filter` sees it, of the schema as it stands.
+  /// The sample as `filter` sees it, of the schema as it stands. Along a path, what is off by all
+  /// the time repeats, which is neither noise nor a change: unless `counts_near`, of what is nearly
+  /// one place the first sample counts.
   void add(const TreeFilter& filter, const TreeFilter::Instant& instant, const BodySchema& schema,
-           const Eigen::VectorXd& displacements, std::int64_t sample_index);
+           const Eigen::VectorXd& displacements, std::int64_t sample_index,
+           bool counts_near = true);
   /// Measurements of the edge to a part that are older than this say nothing of the present one.
   void forget(int part, std::int64_t before);
   void forget_all();
@@ -137,6 +140,7 @@ class DriftWatch {
 
   const double log_sure_;
   std::map<ElementId, std::deque<Measured>> measured_;
+  Eigen::VectorXd last_;  ///< displacements of the sample that was added last
   std::map<ElementId, std::vector<Mean>> before_;  ///< of what is older, by link, under schema_
   BodySchema schema_;
   /// Sums of products of a marker's whitened residuals, some samples apart; they fade.

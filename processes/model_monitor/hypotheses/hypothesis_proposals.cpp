@@ -3,7 +3,9 @@
 
 #include <algorithm>
 #include <cmath>
+#include <span>
 #include <utility>
+#include <vector>
 
 #include "processes/model_monitor/hypotheses/hypothesis_tracker.h"
 #include "processes/model_monitor/hypotheses/schema_difference.h"
@@ -235,25 +237,30 @@ void HypothesisTracker::want_probe(std::int64_t now, std::vector<AdaptationEvent
   const std::int64_t age = now - newest_adopted();
   if (age != 0 && !is_in(age, kRefits)) return;
   const Replacement& one = changes().back().what;
-  for (std::size_t n = 1; n < beam_.size(); ++n) {
-    const Hypothesis& rival = beam_[n];
-    if (rival.changes.size() != changes().size()) continue;
-    const Replacement& other = rival.changes.back().what;
-    const double lead = std::abs(log_odds() - rival.log_odds);
-    // Of two functions the samples to come decide.
-    if (lead > options_.ambiguity || is_same_explanation(one, other) ||
-        one.fitted.change.is_learned() || is_asked(one, other))
-      continue;
-    const Eigen::VectorXd probe = most_telling_action(schema(), rival.body, options_.tolerance);
+  // Of two functions the samples to come decide.
+  if (one.fitted.change.is_learned()) return;
+  const auto lead_of = [this](const Hypothesis* h) { return std::abs(log_odds() - h->log_odds); };
+  std::vector<const Hypothesis*> rivals;
+  for (const Hypothesis& h : std::span(beam_).subspan(1))
+    if (h.changes.size() == changes().size() && lead_of(&h) <= options_.ambiguity &&
+        !is_same_explanation(one, h.changes.back().what) && !is_asked(one, h.changes.back().what))
+      rivals.push_back(&h);
+  std::ranges::stable_sort(rivals, {}, lead_of);
+  // One at a time, about the nearest.
+  for (const Hypothesis* rival : rivals) {
+    const Replacement& other = rival->changes.back().what;
+    const Eigen::VectorXd probe = most_telling_action(schema(), rival->body, options_.tolerance);
     if (probe.size() == 0) continue;
     AdaptationEvent wanted = event(Kind::kProbeWanted, now, one.element);
     wanted.cause = one.fitted.change.cause(settled_);
     wanted.other_cause = other.fitted.change.cause(settled_);
-    if (wanted.other_cause == wanted.cause) wanted.other_cause.clear();
-    wanted.margin = lead;
+    if (wanted.other_cause == wanted.cause && other.element == one.element)
+      wanted.other_cause.clear();
+    wanted.margin = lead_of(rival);
     wanted.probe = probe;
     asked_.emplace_back(one, other);
     events->push_back(std::move(wanted));
+    return;
   }
 }
 

@@ -134,7 +134,7 @@ Eigen::VectorXd most_telling_action(const BodySchema& a, const BodySchema& b,
     for (const auto& [part, X_RB] : X) {
       const auto it = Y.find(part);
       if (it == Y.end()) continue;
-      const Pose difference = X_RB.inverse() * it->second;
+      const Pose difference = (a.X_CR * X_RB).inverse() * (b.X_CR * it->second);
       const double size = difference.translation().norm() / tolerance.position_m +
                           rotation_angle(difference) / tolerance.rotation_rad;
       if (size <= most) continue;

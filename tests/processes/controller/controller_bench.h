@@ -393,9 +393,12 @@ class Bench {
       held.epoch = command.epoch;
       held.action_id = command.action_id;
       held.kind = command.kind;
-      held.state =
-          num_holds_refused > 0 ? motion_status_t::STATE_REJECTED : motion_status_t::STATE_HOLDING;
-      num_holds_refused = std::max(0, num_holds_refused - 1);
+      if (num_holds_refused > 0) {
+        --num_holds_refused;
+        refused_holds_.insert(command.action_id);
+      }
+      held.state = refused_holds_.contains(command.action_id) ? motion_status_t::STATE_REJECTED
+                                                              : motion_status_t::STATE_HOLDING;
       set_array(held.num_signals, held.commanded, std::vector<double>{});
       say(held);
     } else if (const std::string reason =
@@ -423,6 +426,7 @@ class Bench {
   }
 
   std::deque<action_command_t> commands_;
+  std::set<std::int64_t> refused_holds_;  // an answered command is answered again
   std::int64_t last_ended_id_ = -1;
   std::int64_t driver_since_ = now, monitor_since_ = now, eyes_since_ = now;
   std::int64_t last_sight_utime_ = -1;

@@ -151,8 +151,7 @@ TEST(ControllerStatesTest, WhatMustHoldTheArmSendsHoldAsSoonAsTheDriverIsHeard) 
   }
   const Reaction sends_hold{Kind::kGoes, Phase::kHoldSent, Sends::kHold};
   EXPECT_EQ(reaction(Phase::kHoldDue, Event::kDriverHeard), sends_hold);
-  const Reaction again{Kind::kGoes, Phase::kHoldSent, Sends::kAgain};
-  EXPECT_EQ(reaction(Phase::kHoldSent, Event::kUnanswered), again);
+  EXPECT_EQ(reaction(Phase::kHoldSent, Event::kUnanswered), sends_hold);
   const Reaction waits_for_tag{Kind::kGoes, Phase::kTagAwaited, Sends::kHold};
   EXPECT_EQ(reaction(Phase::kDeciding, Event::kTagLost), waits_for_tag);
 }
