@@ -26,8 +26,6 @@ constexpr double kMoreOutliers = 1.2, kMostOutliers = 0.35;
 constexpr double kSameNoise = 0.15;
 /// Samples from one look at them to the next.
 constexpr int kUpdateEach = 8;
-/// Samples that a suspicion is given to prove right before the noise is told anew.
-constexpr std::int64_t kFreshSuspicion = 16;
 /// Newest samples of an earlier time that the noise is estimated from.
 constexpr std::size_t kMostPast = 96;
 constexpr double kLargestScale = 5;
@@ -379,11 +377,7 @@ std::vector<AdaptationEvent> Adaptation::on_new_sample(ActionPoseSample sample) 
   if (is_settled()) {
     count_outliers(judgement);
     if (tracker_.suspects().empty()) watch_noise(judgement);
-    // CUSUMs that begin anew forget what they suspect.
-    const std::int64_t since = tracker_.trouble_since();
-    const bool is_fresh =
-        since <= sample.sample_index && since > sample.sample_index - kFreshSuspicion;
-    if (num_samples_ % kUpdateEach == 0 && !is_fresh) update_measurement();
+    if (num_samples_ % kUpdateEach == 0) update_measurement();
   }
   watch_misreadings(sample, events);
   const auto is_reverted = [](const AdaptationEvent& e) {
