@@ -133,7 +133,8 @@ Eigen::VectorXd most_telling_action(const BodySchema& a, const BodySchema& b,
     const auto X = a.predict_all(action), Y = b.predict_all(action);
     for (const auto& [part, X_RB] : X) {
       const auto it = Y.find(part);
-      if (it == Y.end()) continue;
+      if (it == Y.end() || part == a.root)
+        continue;  // the root is where it is, whatever the action
       const Pose difference = (a.X_CR * X_RB).inverse() * (b.X_CR * it->second);
       const double size = difference.translation().norm() / tolerance.position_m +
                           rotation_angle(difference) / tolerance.rotation_rad;

@@ -74,6 +74,11 @@ TEST(RefineSchemas, WithSevenJointsOnOneEdge) {
   const Refinement result = refine(displaced(start), refiner_samples(samples), {}, {});
   EXPECT_LT(worst_error_m(result.schema, robot, samples), 1e-6) << result.num_iterations;
   EXPECT_EQ(result.schema.edges.front().parameter_covariance.rows(), 6 + 8 * 7);
+  // It rests on these samples alone, whatever the start rested on.
+  for (const ActionPoseSample& sample : samples) start.signals[0].cover(sample.action(0));
+  ASSERT_TRUE(result.schema.signals[0].covered);
+  EXPECT_EQ(result.schema.signals[0].covered->lower, start.signals[0].covered->lower);
+  EXPECT_EQ(result.schema.signals[0].covered->upper, start.signals[0].covered->upper);
 }
 
 TEST(RefineSchemas, OfSevenEdgesWhosePartsWereNeverSeen) {
