@@ -14,8 +14,6 @@ namespace {
 
 constexpr double kFarthest_m = 1000;  // what POSE_TARGET carries
 constexpr double kUnitTolerance = 1e-2;
-constexpr double kTurn_rad = 0.1;
-constexpr std::size_t kMostSteps = 1'000'000;
 
 std::vector<std::string> cells_of(const std::string& line) {
   std::vector<std::string> cells;
@@ -76,36 +74,6 @@ std::vector<PoseTarget> parse_way_points(const std::string& text, const std::str
   }
   if (way_points.empty()) throw WayPointError(name + ": no way point");
   return way_points;
-}
-
-std::vector<PoseTarget> straight_line(const PoseTarget& from, const PoseTarget& to, double step_m) {
-  double num_steps = std::ceil((to.p_RT - from.p_RT).norm() / step_m);
-  if (to.q_RT)
-    num_steps = std::max(num_steps, std::ceil(from.q_RT->angularDistance(*to.q_RT) / kTurn_rad));
-  const auto n = std::clamp<std::size_t>(static_cast<std::size_t>(num_steps), 1, kMostSteps);
-  std::vector<PoseTarget> line;
-  for (std::size_t i = 1; i <= n; ++i) {
-    const double share = static_cast<double>(i) / static_cast<double>(n);
-    PoseTarget step{.p_RT = from.p_RT + share * (to.p_RT - from.p_RT)};
-    if (to.q_RT) step.q_RT = from.q_RT->slerp(share, *to.q_RT);
-    line.push_back(step);
-  }
-  return line;
-}
-
-double leaves_line_by_m(const BodySchema& schema, int part, const Eigen::VectorXd& from,
-                        const Eigen::VectorXd& to, const Eigen::Vector3d& end) {
-  const auto position_at = [&](double share) -> Eigen::Vector3d {
-    return schema.predict(schema.root, part, from + share * (to - from))->X_AB.translation();
-  };
-  const Eigen::Vector3d begin = position_at(0), along = end - begin;
-  double farthest = 0;
-  for (const double share : {0.25, 0.5, 0.75}) {
-    const Eigen::Vector3d off = position_at(share) - begin;
-    const double done = std::clamp(off.dot(along) / std::max(along.squaredNorm(), 1e-12), 0.0, 1.0);
-    farthest = std::max(farthest, (off - done * along).norm());
-  }
-  return farthest;
 }
 
 }  // namespace bodyschema

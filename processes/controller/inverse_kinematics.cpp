@@ -11,6 +11,7 @@
 #include <utility>
 
 #include "common/kinematics/kinematic_tree.h"
+#include "common/schema/standard_deviations.h"
 
 namespace bodyschema {
 namespace {
@@ -135,10 +136,11 @@ Eigen::VectorXd converge(const KinematicPath& path, const Scale& scale, const Re
 class Posture {
  public:
   Posture(const KinematicPath& path, const Scale& scale, const Residual& residual,
-          const std::vector<Signal>& covered)
+          const std::vector<Signal>& covered, double uncertain_m)
       : path_(path),
         scale_(scale),
         residual_(residual),
+        uncertain_m_(uncertain_m),
         lower_(covered.size()),
         upper_(covered.size()) {
     for (std::size_t i = 0; i < covered.size(); ++i) {
@@ -165,7 +167,9 @@ class Posture {
       const double condition = singular[rank - 1] / std::max(singular[0], 1e-12);
       sum += std::pow(std::max(0.0, 1 - condition / kWellConditioned), 2);
     }
-    return sum;
+    const double sd_m =
+        deviations_of(path_.covariance(scale_.action(u), Variance::kFirstOrder)).position_m;
+    return sum + std::pow(std::max(0.0, sd_m / uncertain_m_ - 1), 2);
   }
   /// Down the null space of J.
   Eigen::VectorXd descent(const Eigen::VectorXd& u) const {
@@ -185,6 +189,7 @@ class Posture {
   const KinematicPath& path_;
   const Scale& scale_;
   const Residual& residual_;
+  const double uncertain_m_;
   Eigen::VectorXd lower_, upper_;
 };
 
@@ -252,7 +257,7 @@ InverseKinematicsSolution solve_within(const KinematicPath& path, const PoseTarg
                                        const std::vector<Eigen::VectorXd>& avoided) {
   const Scale scale(limits);
   const Residual residual(target, options);
-  const Posture posture(path, scale, residual, covered);
+  const Posture posture(path, scale, residual, covered, options.uncertain_m);
   const auto is_avoided = [&](const Eigen::VectorXd& u) {
     return std::any_of(avoided.begin(), avoided.end(), [&](const Eigen::VectorXd& action) {
       return (scale.share(action) - u).cwiseAbs().maxCoeff() < kDifferent;
@@ -330,7 +335,8 @@ double posture_cost(const BodySchema& schema, int part, bool with_rotation,
   if (with_rotation) target.q_RT = Eigen::Quaterniond::Identity();
   const Scale scale(limits);
   const Residual residual(target, options);
-  return Posture(*path, scale, residual, covered_limits(schema, limits)).cost(scale.share(action));
+  return Posture(*path, scale, residual, covered_limits(schema, limits), options.uncertain_m)
+      .cost(scale.share(action));
 }
 
 InverseKinematicsSolution solve_pose(const BodySchema& schema, int part, const PoseTarget& target,

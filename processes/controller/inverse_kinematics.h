@@ -5,6 +5,7 @@
 #include <optional>
 #include <vector>
 
+#include "common/geometry/angle.h"
 #include "common/kinematics/kinematic_path.h"
 
 namespace bodyschema {
@@ -17,7 +18,16 @@ struct InverseKinematicsOptions {
   double tolerance_rad = 0.001;
   double metres_per_radian = 0.2;  ///< what an error of rotation weighs beside one of position
   int posture_steps = 20;          ///< at most, in the null space of a solution; 0: as it is found
+  double uncertain_m = 0.005;      ///< standard deviation of a position that is too much
 };
+
+/// Where no controller.yaml says otherwise and time does not matter.
+inline constexpr InverseKinematicsOptions kThoroughInverseKinematics{
+    .tolerance_m = 1e-4,
+    .damping_m = 0.05,
+    .max_iterations = 100,
+    .max_starts = 100,
+    .tolerance_rad = 0.01 * kDegree};
 
 /// Of a part, in the root's frame.
 struct PoseTarget {
@@ -44,11 +54,12 @@ std::optional<BodySchema> chain_to(const BodySchema& schema, int part);
 /// perturbation, are along the part's).
 Eigen::MatrixXd pose_jacobian(const KinematicPath& path, const Eigen::VectorXd& action);
 
-/// How little room an action leaves, 0 where there is enough: the sum of squares of how far each
-/// signal that moves the part is beyond a twentieth of its range from the limits and from what the
-/// schema's samples covered [twentieths], and of what the part's Jacobian in signals scaled by
-/// their ranges (6 rows if `with_rotation`, metres_per_radian) falls short of a reciprocal
-/// condition number of 0.05 [shares of it].
+/// How badly an action is chosen, 0 where it is well: the sum of squares of how far each signal
+/// that moves the part is beyond a twentieth of its range from the limits and from what the
+/// schema's samples covered [twentieths], of what the part's Jacobian in signals scaled by their
+/// ranges (6 rows if `with_rotation`, metres_per_radian) falls short of a reciprocal condition
+/// number of 0.05 [shares of it], and of what the part's position is uncertain by beyond
+/// uncertain_m [shares of it; the standard deviation per axis, of first order].
 double posture_cost(const BodySchema& schema, int part, bool with_rotation,
                     const std::vector<Signal>& limits, const Eigen::VectorXd& action,
                     const InverseKinematicsOptions& options);

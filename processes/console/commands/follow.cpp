@@ -22,8 +22,8 @@
 #include "processes/console/commands/session.h"
 #include "processes/console/hint.h"
 #include "processes/console/views/prediction_view.h"
-#include "processes/console/views/reach_view.h"
 #include "processes/console/way_points.h"
+#include "processes/controller/trajectory.h"
 
 namespace bodyschema {
 namespace {
@@ -80,26 +80,9 @@ void listen(Session& session, Heard* heard) {
     throw std::runtime_error("no schema is known yet: it comes with the first samples");
 }
 
-/// The steps that end at each way point: one to the first, then straight lines.
-std::vector<std::vector<PoseTarget>> legs_of(const std::vector<PoseTarget>& way_points,
-                                             double step_m) {
-  std::vector<std::vector<PoseTarget>> legs{{way_points.front()}};
-  for (std::size_t n = 1; n < way_points.size(); ++n)
-    legs.push_back(straight_line(way_points[n - 1], way_points[n], step_m));
-  return legs;
-}
-
-std::string nearest(const Reach& reach) {
-  const InverseKinematicsSolution& solution = reach.solution;
-  return reach.has_orientation ? pose_text(solution.error_m, solution.error_rad, 1)
-                               : fmt::format("{:.1f} mm", solution.error_m * 1e3);
-}
-
-/// Every step is within reach from the one before, on a way that is straight within a step, and
-/// known well enough there, or nothing is begun. @throws std::runtime_error with the first that is
-/// not.
+/// Nothing is begun that cannot be ended. @throws std::runtime_error that says why not.
 void check_reach(const Heard& heard, const FollowArguments& arguments,
-                 const std::vector<std::vector<PoseTarget>>& legs) {
+                 const Trajectory& trajectory) {
   const BodySchema& schema = *heard.schema;
   const int part = arguments.part;
   Eigen::VectorXd action(schema.signals.size());
@@ -110,33 +93,15 @@ void check_reach(const Heard& heard, const FollowArguments& arguments,
       action = *position;
   if (!schema.has_part(part) || part == schema.root || !schema.predict(schema.root, part, action))
     throw std::runtime_error(no_way_text(schema, part));
-  if (legs.front().front().q_RT && !schema.has_rotation(part))
+  if (trajectory.leg(0).front().q_RT && !schema.has_rotation(part))
     throw std::runtime_error(
         fmt::format("of part {} positions alone are known: leave out qw,qx,qy,qz", part));
-  for (std::size_t n = 0; n < legs.size(); ++n) {
-    for (const PoseTarget& step : legs[n]) {
-      const Reach reach = reach_of(schema, part, step, action);
-      const double off_m =
-          n > 0 ? leaves_line_by_m(schema, part, action, reach.solution.action, step.p_RT) : 0;
-      std::string why;
-      if (reach.sd.position_m > arguments.tolerance_m)
-        why = fmt::format("the schema knows the part there within ±{:.1f} mm only",
-                          reach.sd.position_m * 1e3);
-      else if (reach.solution.error_m > std::min(arguments.tolerance_m, kNear_m) ||
-               reach.solution.error_rad > kNear_rad)
-        why = fmt::format("out of reach, no nearer than {}", nearest(reach));
-      else if (off_m > arguments.step_m)
-        why = fmt::format(
-            "the arm would have to turn over and leave the line by {:.0f} mm: begin elsewhere, or "
-            "go round by another point",
-            off_m * 1e3);
-      if (!why.empty())
-        throw std::runtime_error(
-            fmt::format("the way to point {} of {}, at {:.3f} {:.3f} {:.3f}: {}; nothing was moved",
-                        n + 1, legs.size(), step.p_RT.x(), step.p_RT.y(), step.p_RT.z(), why));
-      action = reach.solution.action;
-    }
-  }
+  const std::string why = trajectory.objection(schema, part, action,
+                                               {.position_sd_m = arguments.tolerance_m,
+                                                .error_m = std::min(arguments.tolerance_m, kNear_m),
+                                                .error_rad = kNear_rad,
+                                                .off_line_m = arguments.step_m});
+  if (!why.empty()) throw std::runtime_error(why + "; nothing was moved");
 }
 
 pose_target_t target_at(const PoseTarget& step, const FollowArguments& arguments) {
@@ -202,26 +167,27 @@ Json follow_json(const std::vector<Passed>& passed, std::size_t num_way_points) 
 }
 
 void run_follow(const FollowArguments& arguments) {
-  const auto legs = legs_of(read_way_points(arguments.file), arguments.step_m);
+  const Trajectory trajectory(read_way_points(arguments.file), arguments.step_m);
+  const std::size_t num_way_points = trajectory.num_way_points();
   Heard heard;
   Session session(arguments.in);
   listen(session, &heard);
-  check_reach(heard, arguments, legs);
+  check_reach(heard, arguments, trajectory);
   std::vector<Passed> passed;
   pose_target_t target = make_target(pose_target_t::KIND_POSITION);
-  target.num_way_points = static_cast<int>(legs.size());
+  target.num_way_points = static_cast<int>(num_way_points);
   std::int64_t next_id = 0;
-  for (std::size_t n = 0; n < legs.size(); ++n) {
+  for (std::size_t n = 0; n < num_way_points; ++n) {
     target.way_point = static_cast<int>(n) + 1;
-    passed.push_back(pass(session, legs[n], target, arguments, &next_id));
+    passed.push_back(pass(session, trajectory.leg(n), target, arguments, &next_id));
     const auto& [status, end] = passed.back();
     if (!arguments.json)
-      std::cout << fmt::format("way point {} of {}: {}{} ({})\n", n + 1, legs.size(),
+      std::cout << fmt::format("way point {} of {}: {}{} ({})\n", n + 1, num_way_points,
                                ending(end, status), status.why, course_text(status))
                 << std::flush;
     if (end != End::kAsked && end != End::kMissed) break;
   }
-  const Json json = follow_json(passed, legs.size());
+  const Json json = follow_json(passed, num_way_points);
   if (arguments.json) std::cout << json.dump() << "\n";
   const End end = passed.back().end;
   if (passed.back().status.owns_arm == 1 && (end == End::kAsked || end == End::kMissed))

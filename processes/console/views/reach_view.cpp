@@ -14,11 +14,6 @@
 namespace bodyschema {
 namespace {
 
-constexpr InverseKinematicsOptions kOptions{.tolerance_m = 1e-4,
-                                            .damping_m = 0.05,
-                                            .max_iterations = 100,
-                                            .max_starts = 100,
-                                            .tolerance_rad = 0.01 * kDegree};
 constexpr double kAtLimit = 1e-9;  // of a range
 
 // Signals that move the part and are at an end of their range.
@@ -48,7 +43,8 @@ Reach reach_of(const BodySchema& schema, int part, const PoseTarget& target,
   Reach reach;
   reach.part = part;
   reach.has_orientation = target.q_RT.has_value();
-  reach.solution = solve_pose(schema, part, target, schema.signals, start, kOptions);
+  reach.solution =
+      solve_pose(schema, part, target, schema.signals, start, kThoroughInverseKinematics);
   const Eigen::VectorXd& action = reach.solution.action;
   if (const auto predicted = schema.predict(schema.root, part, action))
     reach.sd = deviations_of(predicted->covariance);
@@ -60,7 +56,8 @@ Reach reach_of(const BodySchema& schema, int part, const PoseTarget& target,
     return reach;
   }
   const std::vector<int> limits = at_limits(schema, part, action);
-  reach.why = fmt::format("out of reach; this is the nearest of {} starts", kOptions.max_starts);
+  reach.why = fmt::format("out of reach; this is the nearest of {} starts",
+                          kThoroughInverseKinematics.max_starts);
   if (!limits.empty()) reach.why += ", at the limits of " + listed(signal_names(schema, limits));
   return reach;
 }

@@ -159,7 +159,9 @@ class Bench {
   }
   void say(const motion_status_t& message) {
     motion = message;
-    if (driver_speaks) take(controller.on_motion_status(motion));
+    if (!driver_speaks) return;
+    driver_was_heard_ = true;
+    take(controller.on_motion_status(motion));
   }
   void show_schema() {
     body_schema_t message = to_message(schema);
@@ -370,6 +372,7 @@ class Bench {
       ASSERT_LE(std::abs(command.action[i] - arm[i]),
                 (config_.max_step + 1e-9) * (signal.upper - signal.lower));
     }
+    expect_keeps_out(command);
     if (!moves.empty() && moves.back().action_id == command.action_id) {
       ASSERT_EQ(moves.back().action, command.action);
       ++num_repeats;
@@ -380,6 +383,24 @@ class Bench {
       ASSERT_GT(command.action_id, moves.back().action_id);
     }
     moves.push_back(command);
+  }
+  /// No part that is outside a keep-out box comes into it on the way, by more than its origin
+  /// moves between two looks.
+  void expect_keeps_out(const action_command_t& command) {
+    const Eigen::Vector3d from(arm.data()), to(command.action.data());
+    for (Eigen::AlignedBox3d box : config_.workspace.keep_out) {
+      const Eigen::AlignedBox3d whole = box;
+      box.min().array() += 5e-3;
+      box.max().array() -= 5e-3;
+      for (const int part : {2, 3, 4}) {
+        const auto origin_at = [&](double share) -> Eigen::Vector3d {
+          return planar().predict(1, part, from + share * (to - from))->X_AB.translation();
+        };
+        if (whole.contains(origin_at(0))) continue;
+        for (int n = 1; n <= 50; ++n)
+          ASSERT_FALSE(box.contains(origin_at(n / 50.0))) << "part " << part << " in a box";
+      }
+    }
   }
   /// The driver answers one command a tick.
   void serve() {
@@ -419,7 +440,8 @@ class Bench {
                                                      status.control_state == S::CONTROL_MOVING);
     if (driver_speaks || !is_serving) driver_since_ = now;
     if (monitor_speaks || !is_serving) monitor_since_ = now;
-    if (last_sight_utime_ >= motion.utime || !is_serving) eyes_since_ = now;
+    // Before the driver's time is known no image is due.
+    if (last_sight_utime_ >= motion.utime || !is_serving || !driver_was_heard_) eyes_since_ = now;
     ASSERT_LE(now - eyes_since_, config_.max_marker_poses_silence_us + 2 * kTick);
     ASSERT_LE(now - driver_since_, config_.max_motion_status_silence_us + 2 * kTick);
     ASSERT_LE(now - monitor_since_, config_.max_body_schema_silence_us + 2 * kTick);
@@ -428,6 +450,7 @@ class Bench {
   std::deque<action_command_t> commands_;
   std::set<std::int64_t> refused_holds_;  // an answered command is answered again
   std::int64_t last_ended_id_ = -1;
+  bool driver_was_heard_ = false;
   std::int64_t driver_since_ = now, monitor_since_ = now, eyes_since_ = now;
   std::int64_t last_sight_utime_ = -1;
 };

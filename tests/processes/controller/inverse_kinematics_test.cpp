@@ -5,6 +5,7 @@
 #include <random>
 
 #include "common/geometry/angle.h"
+#include "common/schema/standard_deviations.h"
 #include "tests/support/synthetic_robot.h"
 
 namespace bodyschema {
@@ -401,6 +402,31 @@ TEST(PostureTest, ASingularOneCosts) {
   EXPECT_NEAR(cost(0), 1, 1e-9);  // stretched out
   EXPECT_GT(cost(0.02), 0);
   EXPECT_GT(cost(0.98), 0);  // at its limit
+}
+
+// The gain of the second joint is hardly known: far from its zero the part may be anywhere.
+TEST(PostureTest, ASolutionAvoidsWhereThePartIsHardlyKnown) {
+  const BodySchema sure = seven_joints(3);
+  BodySchema schema = sure;
+  Edge& edge = schema.edges[1];
+  const Eigen::Index turn = 7;
+  edge.parameter_covariance.setZero(edge.num_parameters(), edge.num_parameters());
+  edge.parameter_covariance(turn, turn) = std::pow(0.3 * edge.joints[0].turn, 2);
+  const auto sd_m = [&](const Eigen::VectorXd& action) {
+    return deviations_of(schema.predict(1, 8, action)->covariance).position_m;
+  };
+  Rng rng(4);
+  double sum_sure = 0, sum = 0;
+  for (int n = 0; n < 100; ++n) {
+    const Eigen::VectorXd current = random_action(schema, rng);
+    const PoseTarget target{.p_RT = position(schema, 8, random_action(schema, rng))};
+    const auto solution = solve_pose(schema, 8, target, schema.signals, current, kOptions);
+    ASSERT_TRUE(solution.is_within_tolerance);
+    sum += sd_m(solution.action);
+    sum_sure += sd_m(solve_pose(sure, 8, target, sure.signals, current, kOptions).action);
+  }
+  EXPECT_GT(sum_sure / 100, 2 * kOptions.uncertain_m);
+  EXPECT_LT(sum, 0.7 * sum_sure);
 }
 
 }  // namespace
