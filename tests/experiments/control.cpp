@@ -14,13 +14,14 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <limits>
 #include <random>
 #include <string>
 #include <vector>
 
 #include "common/geometry/angle.h"
 #include "common/plot/plot.h"
-#include "processes/controller/inverse_kinematics.h"
+#include "processes/controller/trajectory.h"
 #include "processes/structure_learner/learn.h"
 #include "tests/support/broken_arm.h"
 #include "tests/support/steered_arm.h"
@@ -31,6 +32,7 @@ using namespace bodyschema::test;
 namespace {
 
 constexpr int kWayPoints = 30, kPasses = 2, kSamples = 100;
+constexpr double kStep_m = 0.02;
 constexpr int kRoot = 1, kEndEffector = 5, kMiddle = 3;
 
 /// A closed path of the whole arm's end effector: each joint swings by a third of its range to both
@@ -103,6 +105,7 @@ struct Case {
   Regime regime;
   bool is_learned, is_bent;
   Control control;
+  bool is_straight = false;  ///< in steps of kStep_m from way point to way point, as `follow` goes
 };
 
 /// Descends the distance to a target from an action, as after Eq. 19 of the chapter; a step is
@@ -147,6 +150,31 @@ void descend_along(const Arms& arms, bool is_bent, const BodySchema& schema, Res
   }
 }
 
+/// All way points of all passes; each step is a target of its own.
+void steer_along(const Arms& arms, const Case& test, SteeredArm* arm, bool is_first,
+                 Result* result) {
+  std::vector<PoseTarget> way_points;
+  for (std::size_t n = 0; n < result->errors_m.size(); ++n)
+    way_points.push_back({.p_RT = arms.path[n % arms.path.size()]});
+  const double infinity = std::numeric_limits<double>::infinity();
+  const Trajectory trajectory(way_points, test.is_straight ? kStep_m : infinity);
+  int num_probes = 0;
+  for (std::size_t n = 0; n < trajectory.num_way_points(); ++n) {
+    SteeredArm::Arrival arrival;
+    for (const PoseTarget& step : trajectory.leg(n)) {
+      arrival = arm->go_to(kEndEffector, step.p_RT);
+      num_probes += arrival.status.num_probes;
+    }
+    if (is_first) result->first.push_back(arm->position(kEndEffector));
+    if (arrival.status.control_state == control_status_t::CONTROL_REACHED)
+      result->errors_m[n].push_back(arrival.error_m);
+    else
+      ++result->num_not_reached;
+  }
+  result->probes.push_back(num_probes);
+  result->moves.push_back(static_cast<double>(arm->moves().size()));
+}
+
 Result measure(const Case& test, int num_runs, const std::string& rig) {
   Result result;
   for (int run = 1; run <= num_runs; ++run) {
@@ -173,18 +201,7 @@ Result measure(const Case& test, int num_runs, const std::string& rig) {
                     .max_corrections = test.control == Control::kCorrected ? 3 : 0,
                     .seed = static_cast<std::uint64_t>(run)});
     if (test.is_bent) arm.set_robot(arms.bent);
-    int num_probes = 0;
-    for (std::size_t n = 0; n < result.errors_m.size(); ++n) {
-      const auto [status, error_m] = arm.go_to(kEndEffector, arms.path[n % arms.path.size()]);
-      num_probes += status.num_probes;
-      if (run == 1) result.first.push_back(arm.position(kEndEffector));
-      if (status.control_state == control_status_t::CONTROL_REACHED)
-        result.errors_m[n].push_back(error_m);
-      else
-        ++result.num_not_reached;
-    }
-    result.probes.push_back(num_probes);
-    result.moves.push_back(static_cast<double>(arm.moves().size()));
+    steer_along(arms, test, &arm, run == 1, &result);
   }
   return result;
 }
@@ -318,14 +335,13 @@ Plot plot_of(const std::vector<Case>& cases, const std::vector<Result>& results)
   path.push_back(path.front());
   const Eigen::Matrix<double, 2, 3> plane = plane_of(path);
   plot.script =
-      "set multiplot layout 1,2\nset key below\nset size ratio -1\nset title 'the first arm'\n"
+      "set multiplot layout 1,2\nset key below\nset size ratio -1\nset title 'the first arm, "
+      "bent'\n"
       "set xlabel '[m], in the plane of the path'\nset ylabel '[m]'\n"
       "plot '-' with lines lw 6 lc rgb '#cccccc' title 'path'";
   std::string data = in_plane(path, plane);
   for (std::size_t c = 0; c < cases.size(); ++c) {
-    if (results[c].first.empty() || cases[c].regime == Regime::kChapter ||
-        cases[c].control == Control::kCorrected)
-      continue;
+    if (!cases[c].is_bent || cases[c].is_straight || cases[c].regime == Regime::kChapter) continue;
     plot.script += fmt::format(", '-' with linespoints lw 1 pt 7 ps 0.6 lc {} title {}", c + 1,
                                gnuplot_string(cases[c].name));
     data += in_plane(results[c].first, plane);
@@ -335,8 +351,8 @@ Plot plot_of(const std::vector<Case>& cases, const std::vector<Result>& results)
                  "set xlabel 'way point'\nset ylabel 'error [mm]'\nplot ";
   data.clear();
   for (std::size_t c = 0; c < cases.size(); ++c) {
-    plot.script += fmt::format("{}'-' with lines lw 2 lc {} title {}", c ? ", " : "", c + 1,
-                               gnuplot_string(cases[c].name));
+    plot.script += fmt::format("{}'-' with lines lw 2 lc {} dt {} title {}", c ? ", " : "", c + 1,
+                               c < 8 ? 1 : 2, gnuplot_string(cases[c].name));
     for (std::size_t n = 0; n < results[c].errors_m.size(); ++n)
       if (!results[c].errors_m[n].empty())
         data += fmt::format("{} {}\n", n + 1, 1e3 * mean(results[c].errors_m[n]));
@@ -368,6 +384,8 @@ int main(int argc, char** argv) {
       {"whole, adaptive, learned", Regime::kTag, true, false, Control::kAdaptive},
       {"bent, static, learned", Regime::kTag, true, true, Control::kStatic},
       {"bent, adaptive, learned", Regime::kTag, true, true, Control::kAdaptive},
+      {"bent, adaptive, learned, in straight lines", Regime::kTag, true, true, Control::kAdaptive,
+       true},
       {"bent, adaptive, learned, chapter noise", Regime::kChapter, true, true, Control::kAdaptive}};
   fmt::print(
       "| arm and schema | way points 1–3 [mm] | 4–30 [mm] | second pass [mm] | moves | of these "
