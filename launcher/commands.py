@@ -254,7 +254,7 @@ def experiment(place, arguments):
     name = arguments[0] if arguments else ""
     script = folders[0] / f"{name}.sh"
     if script.is_file():
-        build(place, "all")
+        build(place, *re.search(r"^# Needs: (.*)$", script.read_text(), re.M)[1].split())
         os.environ["BODYSCHEMA_BUILD"] = str(place.build)
         become([script, *arguments[1:]])
     if not any((folder / f"{name}.cpp").is_file() for folder in folders):

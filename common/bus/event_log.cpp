@@ -135,6 +135,8 @@ LogReader::LogReader(const std::filesystem::path& path, OnDamage on_damage, std:
     : path_(path), on_damage_(on_damage), pieces_(pieces), position_(from_byte) {
   std::error_code error;
   if (std::filesystem::is_directory(path, error)) throw file_error(path, "is a folder, not a log");
+  if (std::filesystem::exists(path, error) && !std::filesystem::is_regular_file(path, error))
+    throw file_error(path, "is no file but a device or a pipe, in which a reader cannot go back");
   file_ = std::fopen(path.c_str(), "rbe");
   if (file_ == nullptr) throw system_error(path, "cannot read the log");
   if (from_byte > 0 && ::fseeko(file_, from_byte, SEEK_SET) != 0) {

@@ -1,5 +1,6 @@
 #!/bin/bash
 # hosts.sh [RIG [SAMPLES]]: cost of several hosts and of lost frames. Markdown to stdout.
+# Needs: programs judge_hosts
 set -euo pipefail
 tests=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 rig=${1:-arm7} samples=${2:-100}

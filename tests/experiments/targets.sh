@@ -1,6 +1,7 @@
 #!/bin/bash
 # targets.sh [RIG [TARGETS [ARGUMENT...]]]: learns RIG as ./run does with the arguments (--ideal --samples 60), then sends its end
 # effector to random positions and compares with the simulator's truth. Fails if the median is above 5 mm.
+# Needs: programs targets
 set -euo pipefail
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/../.." && pwd)
 rig=${1:-arm7} count=${2:-20}

@@ -116,6 +116,18 @@ TEST_F(BodyschemaProgramTest, WhereNobodyIsOnTheBusEveryCommandEndsAtOnceAndSays
   }
 }
 
+TEST_F(BodyschemaProgramTest, AToleranceOfAnOrientationThatIsNotAskedIsRefused) {
+  expect_failure({"target", "--part", "1", "--position", "0", "0", "0", "--tolerance-deg", "1"},
+                 "--orientation");
+}
+
+TEST_F(BodyschemaProgramTest, OfASchemaThatIsCutOffTheByteIsTold) {
+  const auto schema = folder_ / "schema.lcmlog";
+  run({"learn", write_robot("s.csv"), "--noise", "0.001", "0.3", "--out", schema.string()});
+  std::filesystem::resize_file(schema, std::filesystem::file_size(schema) - 1);
+  expect_failure({"show", schema.string()}, "ends within the event at byte", 1);
+}
+
 TEST_F(BodyschemaProgramTest, ANoiseThatIsNoneIsAskedBack) {
   const auto csv = write_robot("s.csv");
   ASSERT_EQ(run({"learn", csv, "--out", "schema.lcmlog"}).exit_code, 0);

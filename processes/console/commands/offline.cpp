@@ -205,9 +205,15 @@ void run_rig(const RigArguments& arguments) {
 }  // namespace
 
 BodySchema load_schema(const std::filesystem::path& file) {
-  const std::vector<body_schema_t> schemas = read_log(file, kBodySchema);
+  LogReport report;
+  const std::vector<body_schema_t> schemas = read_log(file, kBodySchema, &report);
   if (schemas.empty())
-    throw std::runtime_error(file.string() + ": expected a schema, found no BODY_SCHEMA");
+    throw std::runtime_error(
+        file.string() + ": expected a schema, found no BODY_SCHEMA" +
+        (report.truncated_at_byte
+             ? fmt::format("; it ends within the event at byte {}: copy it again",
+                           *report.truncated_at_byte)
+             : ""));
   return from_message(schemas.back());
 }
 

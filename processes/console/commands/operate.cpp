@@ -35,6 +35,8 @@ struct OperateArguments {
 void run_target(const OperateArguments& arguments) {
   if (arguments.tag.has_value() != arguments.position_m.empty())
     refuse_argument("target", "expected --position X Y Z or --tag ID");
+  if (arguments.tolerance_deg > 0 && arguments.orientation.empty())
+    refuse_argument("--tolerance-deg", "without --orientation W X Y Z nothing is turned");
   pose_target_t target = make_target(arguments.tag                   ? pose_target_t::KIND_TAG
                                      : arguments.orientation.empty() ? pose_target_t::KIND_POSITION
                                                                      : pose_target_t::KIND_POSE);

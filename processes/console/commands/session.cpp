@@ -19,6 +19,7 @@ namespace bodyschema {
 namespace {
 
 constexpr std::int64_t kAlone_us = 2'500'000;  // twice what the processes of a group repeat in
+constexpr std::int64_t kGone_us = 10'000'000;  // everybody was heard once, and nobody for so long
 constexpr std::chrono::milliseconds kTurn{50};
 
 /// A terminal gets a line that rewrites itself, a file a line for each change.
@@ -69,7 +70,7 @@ pose_target_t make_target(std::int8_t kind) {
 
 template <class Message>
 void Session::for_anybody(const Channel<Message>& channel) {
-  bus.subscribe(channel, [this](const Message&) { is_heard_ = true; });
+  bus.subscribe(channel, [this](const Message&) { heard_us_ = clock_us(); });
 }
 
 Session::Session(const std::string& url) : bus(url, url), url_(url), start_us_(clock_us()) {
@@ -102,18 +103,23 @@ void Session::follow(TargetFollower& follower, const std::function<void(std::int
   follower_ = &follower;
   ProgressLine line;
   while (follower.end() == TargetFollower::End::kOpen) {
-    expect_company();
     if (is_interrupted()) follower.interrupt();
     if (const auto target = follower.on_tick(clock_us())) bus.publish(kPoseTarget, *target);
     if (on_turn) on_turn(clock_us());
     line.show(prefix + follower.progress());
     bus.handle(kTurn);
+    expect_company();
   }
   follower_ = nullptr;
 }
 
 void Session::expect_company() const {
-  if (is_heard_ || clock_us() - start_us_ < kAlone_us) return;
+  if (heard_us_ >= 0 && clock_us() - heard_us_ >= kGone_us)
+    throw std::runtime_error(fmt::format(
+        "the group on {} fell silent: nothing was heard for {:.0f} s. Was it stopped? ./run --keep "
+        "starts one",
+        url_, static_cast<double>(kGone_us) * 1e-6));
+  if (heard_us_ >= 0 || clock_us() - start_us_ < kAlone_us) return;
   throw std::runtime_error("nothing is heard on " + url_ +
                            ": no group runs there. ./run --keep starts one, ./run exec bodyschema "
                            "… speaks to one that runs");

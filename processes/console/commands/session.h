@@ -42,7 +42,7 @@ class Session {
   /// Makes the controller drop what `follower` follows no longer; says what became of it.
   std::string withdraw(const TargetFollower& follower);
 
-  /// @throws std::runtime_error with what to type once nobody can be there.
+  /// @throws std::runtime_error with what to type once nobody can be there, or no longer.
   void expect_company() const;
 
   Bus bus;
@@ -53,7 +53,7 @@ class Session {
 
   const std::string url_;
   const std::int64_t start_us_;
-  bool is_heard_ = false;
+  std::int64_t heard_us_ = -1;  ///< anybody, last; the clock
   TargetFollower* follower_ = nullptr;
 };
 

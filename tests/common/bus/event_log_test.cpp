@@ -190,6 +190,7 @@ TEST(EventLog, ErrorsSayWhatIsWrongAndWhere) {
   const TemporaryFolder folder;
   EXPECT_NE(reason_to_refuse(folder / "none").find("No such file"), std::string::npos);
   EXPECT_NE(reason_to_refuse(folder.path()).find("is a folder"), std::string::npos);
+  EXPECT_NE(reason_to_refuse("/dev/zero").find("a device or a pipe"), std::string::npos);
   write_bytes(folder / "text", {'h', 'e', 'l', 'l', 'o', ',', ' ', 'w', 'o', 'r', 'l', 'd'});
   EXPECT_NE(reason_to_refuse(folder / "text").find("is not an LCM log"), std::string::npos);
   write_bytes(folder / "zeros", std::vector<std::uint8_t>(1000, 0));
