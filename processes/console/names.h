@@ -33,7 +33,7 @@ inline constexpr std::array kNoiseSourceWords = {"given",
                                                  "estimated from repeated actions",
                                                  "estimated from what jumps between frames",
                                                  "estimated from what the best models leave",
-                                                 "assumed: too few samples to estimate it"};
+                                                 "assumed: the samples do not tell it"};
 
 /// Whether a counter of PROCESS_INFO tells of normal traffic.
 inline bool is_traffic(const std::string& counter) {

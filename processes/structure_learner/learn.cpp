@@ -153,6 +153,8 @@ UnconnectedPart explain(int part, int num_seen, const std::set<int>& connected,
                 (was_soft_tried ? ", nor any with a Gaussian process beside its joints" : "") +
                 (is_guess_too_large(structure)
                      ? "; their noise is guessed from what these models leave: tell it (--noise)"
+                 : structure.noise_source == NoiseSource::kAssumed
+                     ? "; how noisy poses are is not known: tell it (--noise)"
                      : "")};
   return {part, Unconnected::kNotEnoughData,
           seen + "; " + wanted_samples(common, untold, num_actions, max_signals, structure)};

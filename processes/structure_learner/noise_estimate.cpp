@@ -461,21 +461,26 @@ std::optional<SourcedNoise> estimate_noise(const std::vector<ActionPoseSample>& 
   std::vector<const ScaledFit*> all, explaining;
   for (const auto& ij : tree) {
     all.push_back(&fits[ij]);
-    if (jitter && fits[ij].explains_motion()) explaining.push_back(&fits[ij]);
+    if (fits[ij].explains_motion()) explaining.push_back(&fits[ij]);
   }
-  const auto pooled = residuals_of_quiet(explaining.empty() ? all : explaining, jitter.has_value());
+  const bool is_any_explained = !explaining.empty();
+  const auto pooled =
+      residuals_of_quiet(jitter && is_any_explained ? explaining : all, jitter.has_value());
   if (pooled.size() < 6) return std::nullopt;
   SourcedNoise noise{noise_from(pooled, model_noise.quantile()), NoiseSource::kResiduals};
+  // What no model explains is motion; of a stream, also what is above any marker but does not jump.
+  const bool is_loud = is_above_any_marker(noise);
   if (jitter) {
     const Noise most = floored(*jitter, kLargestBias);
     const bool is_above =
         noise.position_m > most.position_m || noise.rotation_rad > most.rotation_rad;
-    // What no model explains is motion.
-    if (is_above && explaining.empty()) {
+    if (is_above && (is_loud || !is_any_explained)) {
       noise.position_m = std::min(noise.position_m, most.position_m);
       noise.rotation_rad = std::min(noise.rotation_rad, most.rotation_rad);
       noise.source = NoiseSource::kFrames;
     }
+  } else if (is_loud && !is_any_explained) {
+    noise = {kLoudestMarker, NoiseSource::kAssumed};
   }
   static_cast<Noise&>(noise) = believable(noise);
   return noise;

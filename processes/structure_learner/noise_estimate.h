@@ -32,7 +32,7 @@ enum class NoiseSource {
   kRepeats,      ///< estimated from poses seen again under the same action
   kFrames,       ///< of a stream that no model explains: a few times what jumps between frames
   kResiduals,    ///< estimated from what the best models leave
-  kAssumed,      ///< too few data: the floor
+  kAssumed,      ///< the data do not tell it
 };
 
 struct SourcedNoise : Noise {
@@ -54,10 +54,11 @@ std::vector<std::vector<int>> repeats(const NormalizedActions& actions);
 /// rests for much of its time, the upper quartile); position and rotation apart (the rotation noise
 /// of part i reaches the position of z_ij through the lever arm). The estimate is returned 1.2 ×
 /// too large: too small a noise rejects true models, too large a noise by that factor costs nearly
-/// nothing. Never below kNoiseFloor or above kNoiseCeiling. Of a stream, the jitter from frame to
-/// frame is a lower bound and no more, unless no model explains its motion: then it is not taken
-/// for noise. Parts whose pose never changes a bit define the frame of the others and say nothing.
-/// std::nullopt: too few data.
+/// nothing. Never below kNoiseFloor or above kNoiseCeiling. What no model explains is motion, not
+/// noise, where it is above kLoudestMarker: then that is assumed. Of a stream, the jitter from
+/// frame to frame is a lower bound and no more, unless no model explains its motion, or what the
+/// best one leaves is above kLoudestMarker: then that is not taken for noise. Parts whose pose
+/// never changes a bit define the frame of the others and say nothing. std::nullopt: too few data.
 std::optional<SourcedNoise> estimate_noise(const std::vector<ActionPoseSample>& samples,
                                            int num_signals, int max_signals = kMaxChainJoints);
 

@@ -34,6 +34,28 @@ void hide(int part, std::vector<ActionPoseSample>* samples) {
     std::erase_if(sample.parts, [part](const PartObservation& o) { return o.part == part; });
 }
 
+/// Poses and commands as they are, but not those of one instant.
+std::vector<ActionPoseSample> with_actions_of_others(std::vector<ActionPoseSample> samples) {
+  const std::vector<ActionPoseSample> others = samples;
+  constexpr std::size_t kStride = 37;  // no divisor of their number
+  for (std::size_t n = 0; n < samples.size(); ++n)
+    samples[n].action = others[(n * kStride + 11) % others.size()].action;
+  return samples;
+}
+
+// How noisy poses are nobody tells: all that moves could be noise.
+TEST(UnrelatedCommands, MoveNothing) {
+  for (const int num_joints : {2, 3})
+    for (const bool has_ends_alone : {false, true})
+      for (std::uint64_t seed = 0; seed < 3; ++seed) {
+        ImperfectRobot robot(num_joints, true, {.name = "none"}, seed);
+        auto samples = with_actions_of_others(robot.babble(100));
+        for (int part = 2; has_ends_alone && part <= num_joints; ++part) hide(part, &samples);
+        const BodySchema schema = learn(robot.signals(), samples, options_of(std::nullopt)).schema;
+        EXPECT_FALSE(schema.complete) << num_joints << " joints, seed " << seed;
+      }
+}
+
 Imperfection sweep(double half_range_rad) {
   return {.name = "sweep", .range_deg = 2 * half_range_rad / kDegree};
 }
