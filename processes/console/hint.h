@@ -5,7 +5,7 @@
 #include <optional>
 #include <string>
 
-#include "common/geometry/angle.h"
+#include "common/text/pose_text.h"
 #include "common/text/text.h"
 
 namespace bodyschema {
@@ -18,11 +18,6 @@ std::string to_type(const std::string& words);
 template <class Items>
 std::string in_braces(const Items& items) {
   return fmt::format("{{{}}}", fmt::join(items, ","));
-}
-
-/// "3.21 mm 0.41°".
-inline std::string pose_text(double position_m, double rotation_rad, int decimals_mm = 2) {
-  return fmt::format("{:.{}f} mm {:.2f}°", position_m * 1e3, decimals_mm, rotation_rad / kDegree);
 }
 
 /// A time for people: "95 s", "12 min", "2.5 h".

@@ -275,6 +275,10 @@ void Controller::see_time(std::int64_t now_us) {
     phase_time_.restart(now_us);
     return;
   }
+  if (concerns(Event::kEndless) && under_way_.elapsed_us(now_us) >= config_.rest_timeout_us) {
+    fire(Event::kEndless, "the driver has been moving for " + seconds(config_.rest_timeout_us));
+    return;
+  }
   if (concerns(Event::kGivenUp) && idle_.elapsed_us(now_us) >= config_.rest_timeout_us) {
     fail(Event::kGivenUp, "given up after " + seconds(config_.rest_timeout_us) + ": " + why_);
     return;

@@ -76,8 +76,8 @@ struct ControllerConfig {
 /// step, as slowly as steps are then; refused by the driver, it is done without. While an edge is
 /// INVALID the arm is moved a little about the place where that was heard, so that the monitor sees
 /// what changed; where max_searches samples do not mend it, the arm is lent to the babbler. Nothing
-/// lasts for ever: an arm that does not come to rest within rest_timeout, or that is lent for
-/// lent_timeout without a new SAMPLE, ends the target.
+/// lasts for ever: an arm that does not come to rest within rest_timeout, a MOVE that does not end
+/// within it, or an arm that is lent for lent_timeout without a new SAMPLE, ends the target.
 ///
 /// Start guard: nothing is sent before MOTION_STATUS, BODY_SCHEMA and MARKER_POSES of the present
 /// rest were heard, and no MOVE from a position that was not heard: the last settled action of this
@@ -219,6 +219,8 @@ class Controller {
   std::optional<Eigen::VectorXd> wanted_probe() const;
   void probe(const Eigen::VectorXd& action);
   void search(const std::string& edge);
+  /// Where the search for what changed goes, place by place.
+  Eigen::VectorXd searched(int place) const;
   /// From the arm's position towards an action, as far as `share` of the ranges.
   Eigen::VectorXd towards(const Eigen::VectorXd& action, double share) const;
   /// The way counts as rejected where it leads out of the workspace.
@@ -277,9 +279,11 @@ class Controller {
   Stopwatch quiet_;                        ///< since the driver's last news
   Stopwatch idle_;                         ///< its own arm, but nothing is sent or awaited
   Stopwatch expiry_;
+  Stopwatch under_way_;       ///< since the newest MOVE was decided
   std::int64_t probed_ = -1;  ///< probes wanted up to this sample are made, or given up
   std::optional<Eigen::VectorXd> search_centre_;  ///< where an edge was heard to be invalid
-  int num_searches_ = 0;
+  int search_place_ = 0;                          ///< of searched()
+  int num_searches_ = 0;                          ///< actions
 
   // What was sent.
   std::int64_t epoch_ = -1;

@@ -73,7 +73,7 @@ Controller::Answer Controller::on_pose_target(const pose_target_t& target,
   tag_place_.reset();
   offset_.reset();
   forget_plan();
-  num_moves_ = num_probes_ = num_corrections_ = num_searches_ = 0;
+  num_moves_ = num_probes_ = num_corrections_ = num_searches_ = search_place_ = 0;
   was_its_own_ = owns_arm(phase_);
   predicted_error_m_ = predicted_error_rad_ = observed_error_m_ = observed_error_rad_ = -1;
   search_centre_.reset();
@@ -110,7 +110,7 @@ void Controller::decide() {
   std::string edge;
   const bool is_invalid = worst_edge(&edge) == EdgeState::kInvalid;
   if (!is_invalid) {
-    num_searches_ = 0;
+    num_searches_ = search_place_ = 0;
     search_centre_.reset();
   } else if (num_searches_ >= config_.max_searches) {
     goal_.reset();
@@ -193,6 +193,7 @@ void Controller::step() {
     InverseKinematicsOptions options = config_.inverse_kinematics;
     options.tolerance_m = std::min(options.tolerance_m, tolerance_m());
     options.tolerance_rad = std::min(options.tolerance_rad, tolerance_rad());
+    options.uncertain_m = tolerance_m();
     const InverseKinematicsSolution solution =
         solve_pose(*schema_, target_.target_part, {aim(), wanted_orientation()}, config_.signals,
                    *position_, options, rejected_);
@@ -261,21 +262,28 @@ void Controller::probe(const Eigen::VectorXd& action) {
 void Controller::search(const std::string& edge) {
   goal_.reset();
   if (!search_centre_) search_centre_ = position_;
+  ++num_searches_;
+  Eigen::VectorXd action = searched(search_place_);
+  if (is_near(action, *position_, config_.signals)) action = searched(++search_place_);
+  return move_to(towards(action, config_.slow_step), Serves::kSearch,
+                 action_command_t::PURPOSE_PROBE,
+                 edge + " is invalid: small moves show what changed");
+}
+
+Eigen::VectorXd Controller::searched(int place) const {
   // Up and down by the signs of a screening design (Plackett and Burman 1946; Walsh functions of
-  // the move's number): after eight moves up to seven signals are told apart, after sixteen
+  // the place's number): after eight places up to seven signals are told apart, after sixteen
   // fifteen.
-  const auto move = static_cast<unsigned>(num_searches_++);
   Eigen::VectorXd action = *search_centre_;
   for (std::size_t i = 0; i < config_.signals.size(); ++i) {
     const Signal& signal = config_.signals[i];
-    const bool is_up = std::popcount(move & static_cast<unsigned>(i + 1)) % 2 == 0;
+    const bool is_up =
+        std::popcount(static_cast<unsigned>(place) & static_cast<unsigned>(i + 1)) % 2 == 0;
     const double step = (is_up ? 1 : -1) * config_.search_step * (signal.upper - signal.lower);
     double& value = action[static_cast<Eigen::Index>(i)];
     value = std::clamp(value + step, signal.lower, signal.upper);
   }
-  return move_to(towards(action, config_.max_step), Serves::kSearch,
-                 action_command_t::PURPOSE_PROBE,
-                 edge + " is invalid: small moves show what changed");
+  return action;
 }
 
 Eigen::VectorXd Controller::towards(const Eigen::VectorXd& action, double share) const {
@@ -306,6 +314,7 @@ void Controller::move_to(const Eigen::VectorXd& action, Serves serves, std::int8
   sent_ = make_command(action_command_t::KIND_MOVE);
   sent_->purpose = purpose;
   set_array(sent_->num_signals, sent_->action, std::vector<double>(action.begin(), action.end()));
+  under_way_.restart();
   ++num_moves_;
   num_probes_ += purpose == action_command_t::PURPOSE_PROBE;
   fire(Event::kStep, std::move(why));
@@ -319,6 +328,7 @@ void Controller::forget_move() {
 
 void Controller::strike(const std::string& why) {
   if (serves_ == Serves::kProbe && health_) probed_ = std::max(probed_, health_->probe_sample);
+  if (serves_ == Serves::kSearch) ++search_place_;
   // A new target or schema has no goal yet; a search goes on elsewhere.
   if (serves_ != Serves::kTarget || !goal_) return;
   rejection_ = why;

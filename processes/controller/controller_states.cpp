@@ -71,10 +71,10 @@ constexpr std::array<EventInfo, kNumEvents> kEvents{{
     {E::kUnreachable, "unreachable", "no way is left"},
     {E::kFailed, "failed",
      "unservable, position unknown, unreachable or given up, of an arm that is its own since "
-     "before "
-     "the target, or was moved for it"},
+     "before the target, or was moved for it"},
     {E::kInputSilent, "input silent", "MOTION_STATUS, MARKER_POSES or BODY_SCHEMA, too long"},
     {E::kUnanswered, "unanswered", "for resend_s"},
+    {E::kEndless, "endless", "the MOVE has not ended for rest_timeout_s"},
     {E::kNoSample, "no sample", "for sample_timeout_s"},
     {E::kTargetExpired, "target expired", "not reached within its expiry_s"},
     {E::kGivenUp, "given up", "nothing to send for rest_timeout_s"},
@@ -213,6 +213,8 @@ constexpr Rule kRules[] = {
     to(E::kUnanswered, only(P::kMovingPreempted), P::kTaking),  // planned from another place
     to(E::kUnanswered, only(P::kHoldSent), P::kHoldSent, Sends::kHold),  // a refused id stays so
     ignore(E::kUnanswered, kAll & ~kAwaitsAnswer & ~only(P::kHoldSent)),
+    to(E::kEndless, kAwaitsAnswer, P::kHoldDue),
+    ignore(E::kEndless, kAll & ~kAwaitsAnswer),
     to(E::kNoSample, kAwaitsSample, P::kHoldDue),
     ignore(E::kNoSample, kAll & ~kAwaitsSample),
     to(E::kTargetExpired, kChoosing | kActing, P::kHoldDue),

@@ -69,6 +69,7 @@ enum class Event : std::uint8_t {
   // Of the clock.
   kInputSilent,
   kUnanswered,
+  kEndless,
   kNoSample,
   kTargetExpired,
   kGivenUp,

@@ -9,31 +9,35 @@
 
 namespace bodyschema {
 
-/// Way points of a part in the root's frame, straight from each to the next in steps small enough
-/// that what happens within one does not matter: each is a target of its own, at which the arm is
-/// seen.
+/// Way points of a part in the root's frame, and steps straight from each to the next. Each step is
+/// a target of its own, at which the arm is seen.
 class Trajectory {
  public:
-  /// What a trajectory must keep to by the schema.
+  /// What every step must keep to, by the schema.
   struct Limits {
-    double position_sd_m = 0;  ///< of the part at a step, at most
-    double error_m = 0, error_rad = 0;
-    double off_line_m = 0;  ///< of the part within a step; the way to the first point is free
+    double position_sd_m = 0;           ///< of the part's position; what is unknown counts as 0
+    double error_m = 0, error_rad = 0;  ///< of the solution, to the step
+    double off_line_m = 0;  ///< of the part on its way; to the first way point it goes as it likes
   };
 
-  /// One step to the first way point; then straight lines in equal steps of at most `step_m` > 0,
-  /// the rotation about one axis by at most 0.1 rad a step. All way points or none have an
-  /// orientation.
-  Trajectory(std::vector<PoseTarget> way_points, double step_m);
+  /// One step to the first way point; then straight lines in equal steps of at most `step_m`, the
+  /// rotation about one axis by at most 0.1 rad a step. @throws std::invalid_argument if there is
+  /// no way point, if some have an orientation and others none, unless step_m > 0, or if there are
+  /// more than kMostSteps steps.
+  Trajectory(const std::vector<PoseTarget>& way_points, double step_m);
+  static constexpr std::size_t kMostSteps = 20'000;  ///< 400 m in steps of 20 mm
 
   std::size_t num_way_points() const { return legs_.size(); }
   /// The steps that end at way point n = 0, 1, …
   const std::vector<PoseTarget>& leg(std::size_t n) const { return legs_[n]; }
 
   /// "" or which step an arm at `action` cannot make, and why: every one is solved by the schema
-  /// from the solution of the one before. `part` hangs on the root. @throws as solve_pose().
-  std::string objection(const BodySchema& schema, int part, Eigen::VectorXd action,
+  /// from the solution of the one before. @throws as solve_pose().
+  std::string objection(const BodySchema& schema, int part, const Eigen::VectorXd& action,
                         const Limits& limits) const;
+  /// The same of leg `n` alone, from where the arm is before it.
+  std::string objection_to_leg(std::size_t n, const BodySchema& schema, int part,
+                               const Eigen::VectorXd& action, const Limits& limits) const;
 
  private:
   std::vector<std::vector<PoseTarget>> legs_;

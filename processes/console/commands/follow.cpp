@@ -6,6 +6,7 @@
 #include <fstream>
 #include <iostream>
 #include <iterator>
+#include <limits>
 #include <memory>
 #include <optional>
 #include <stdexcept>
@@ -62,6 +63,14 @@ std::vector<PoseTarget> read_way_points(const std::string& file) {
   return parse_way_points(text, file == "-" ? "stdin" : file);
 }
 
+Trajectory read_trajectory(const FollowArguments& arguments) {
+  try {
+    return Trajectory(read_way_points(arguments.file), arguments.step_m);
+  } catch (const std::invalid_argument& error) {
+    throw WayPointError(arguments.file + ": " + error.what());
+  }
+}
+
 struct Heard {
   std::optional<BodySchema> schema;
   std::optional<motion_status_t> motion;
@@ -80,28 +89,45 @@ void listen(Session& session, Heard* heard) {
     throw std::runtime_error("no schema is known yet: it comes with the first samples");
 }
 
-/// Nothing is begun that cannot be ended. @throws std::runtime_error that says why not.
+/// Where the arm rests, if that was heard.
+std::optional<Eigen::VectorXd> position_of(const Heard& heard) {
+  return heard.motion ? rest_position(*heard.motion, heard.schema->signals.size()) : std::nullopt;
+}
+
+Trajectory::Limits limits_of(const FollowArguments& arguments) {
+  return {.position_sd_m = arguments.tolerance_m,
+          .error_m = std::min(arguments.tolerance_m, kNear_m),
+          .error_rad = kNear_rad,
+          .off_line_m = arguments.step_m};
+}
+
+/// Nothing is begun that the schema says cannot be ended. @throws std::runtime_error that says why
+/// not.
 void check_reach(const Heard& heard, const FollowArguments& arguments,
                  const Trajectory& trajectory) {
   const BodySchema& schema = *heard.schema;
   const int part = arguments.part;
-  Eigen::VectorXd action(schema.signals.size());
-  for (std::size_t s = 0; s < schema.signals.size(); ++s)
-    action[static_cast<Eigen::Index>(s)] = (schema.signals[s].lower + schema.signals[s].upper) / 2;
-  if (heard.motion)
-    if (const auto position = rest_position(*heard.motion, schema.signals.size()))
-      action = *position;
+  const Eigen::VectorXd action = position_of(heard).value_or(mid_range(schema.signals));
   if (!schema.has_part(part) || part == schema.root || !schema.predict(schema.root, part, action))
     throw std::runtime_error(no_way_text(schema, part));
   if (trajectory.leg(0).front().q_RT && !schema.has_rotation(part))
     throw std::runtime_error(
         fmt::format("of part {} positions alone are known: leave out qw,qx,qy,qz", part));
-  const std::string why = trajectory.objection(schema, part, action,
-                                               {.position_sd_m = arguments.tolerance_m,
-                                                .error_m = std::min(arguments.tolerance_m, kNear_m),
-                                                .error_rad = kNear_rad,
-                                                .off_line_m = arguments.step_m});
+  const std::string why = trajectory.objection(schema, part, action, limits_of(arguments));
   if (!why.empty()) throw std::runtime_error(why + "; nothing was moved");
+}
+
+/// "" or why the arm cannot go on to way point `n` from where it is, by what the schema is by now:
+/// the first way point may have been reached in another posture than was foreseen, or a link is
+/// bent. How well the part is known, and its reach, are the controller's there.
+std::string objection_to_leg(const Heard& heard, const FollowArguments& arguments,
+                             const Trajectory& trajectory, std::size_t n) {
+  const auto position = position_of(heard);
+  if (n == 0 || !position) return "";
+  const double infinity = std::numeric_limits<double>::infinity();
+  Trajectory::Limits limits = limits_of(arguments);
+  limits.position_sd_m = infinity;
+  return trajectory.objection_to_leg(n, *heard.schema, arguments.part, *position, limits);
 }
 
 pose_target_t target_at(const PoseTarget& step, const FollowArguments& arguments) {
@@ -167,7 +193,7 @@ Json follow_json(const std::vector<Passed>& passed, std::size_t num_way_points) 
 }
 
 void run_follow(const FollowArguments& arguments) {
-  const Trajectory trajectory(read_way_points(arguments.file), arguments.step_m);
+  const Trajectory trajectory = read_trajectory(arguments);
   const std::size_t num_way_points = trajectory.num_way_points();
   Heard heard;
   Session session(arguments.in);
@@ -177,9 +203,17 @@ void run_follow(const FollowArguments& arguments) {
   pose_target_t target = make_target(pose_target_t::KIND_POSITION);
   target.num_way_points = static_cast<int>(num_way_points);
   std::int64_t next_id = 0;
+  std::string left;  // why the path was left
   for (std::size_t n = 0; n < num_way_points; ++n) {
+    left = objection_to_leg(heard, arguments, trajectory, n);
+    if (!left.empty()) break;
     target.way_point = static_cast<int>(n) + 1;
-    passed.push_back(pass(session, trajectory.leg(n), target, arguments, &next_id));
+    try {
+      passed.push_back(pass(session, trajectory.leg(n), target, arguments, &next_id));
+    } catch (const std::runtime_error& error) {
+      left = error.what();
+      break;
+    }
     const auto& [status, end] = passed.back();
     if (!arguments.json)
       std::cout << fmt::format("way point {} of {}: {}{} ({})\n", n + 1, num_way_points,
@@ -187,10 +221,12 @@ void run_follow(const FollowArguments& arguments) {
                 << std::flush;
     if (end != End::kAsked && end != End::kMissed) break;
   }
-  const Json json = follow_json(passed, num_way_points);
+  Json json = follow_json(passed, num_way_points);
+  if (!left.empty()) json["why"] = left;
   if (arguments.json) std::cout << json.dump() << "\n";
-  const End end = passed.back().end;
-  if (passed.back().status.owns_arm == 1 && (end == End::kAsked || end == End::kMissed))
+  if (!left.empty()) std::cerr << "The path is left: " << left << "\n";
+  const End end = passed.empty() ? End::kOpen : passed.back().end;
+  if ((end == End::kAsked || end == End::kMissed) && passed.back().status.owns_arm == 1)
     std::cerr << "The arm stays there until: " << to_type("release") << "\n";
   if (!json["reached"].get<bool>()) fail();
 }

@@ -41,18 +41,13 @@ PoseTarget target_of(const ReachArguments& arguments) {
 }
 
 Eigen::VectorXd start_of(const ReachArguments& arguments, const BodySchema& schema) {
-  const auto num_signals = static_cast<Eigen::Index>(schema.signals.size());
-  Eigen::VectorXd start(num_signals);
-  for (Eigen::Index s = 0; s < num_signals; ++s) {
-    const Signal& signal = schema.signals[static_cast<std::size_t>(s)];
-    start(s) = 0.5 * (signal.lower + signal.upper);
-  }
-  if (arguments.from.empty()) return start;
+  if (arguments.from.empty()) return mid_range(schema.signals);
   require_finite("--from", arguments.from);
   if (arguments.from.size() != schema.signals.size())
     refuse_argument(
         "--from", fmt::format("expected {} values, in the schema's order", schema.signals.size()));
-  return Eigen::VectorXd::Map(arguments.from.data(), num_signals);
+  return Eigen::VectorXd::Map(arguments.from.data(),
+                              static_cast<Eigen::Index>(arguments.from.size()));
 }
 
 void run_reach(const ReachArguments& arguments) {

@@ -155,6 +155,8 @@ class Bench {
   }
   void give(const Target& target) {
     ASSERT_EQ(check(target), "");
+    given_ = target;
+    given_at_ = now;
     take(controller.on_pose_target(target));
   }
   void say(const motion_status_t& message) {
@@ -352,6 +354,7 @@ class Bench {
     if (!answer.command) return;
     const action_command_t& command = *answer.command;
     ASSERT_EQ(check(command), "");
+    last_kind_ = command.kind;
     ASSERT_EQ(command.source, "controller");
     ASSERT_TRUE(command.purpose == action_command_t::PURPOSE_CONTROL ||
                 command.purpose == action_command_t::PURPOSE_PROBE);
@@ -436,6 +439,17 @@ class Bench {
 
   /// Whoever falls silent while a target is served, the arm is held within the limit.
   void expect_no_service_in_silence() {
+    // A hold that is due is sent as soon as there is a driver.
+    ASSERT_TRUE(controller.phase() != Phase::kHoldDue || !driver_was_heard_);
+    if (controller.phase() == Phase::kHoldSent) {
+      ASSERT_EQ(last_kind_, action_command_t::KIND_HOLD);
+    }
+    const bool is_open = status.control_state == S::CONTROL_WAITING ||
+                         status.control_state == S::CONTROL_MOVING ||
+                         status.control_state == S::CONTROL_LENT;
+    if (is_open && given_.expiry_s > 0 && status.target_id == given_.target_id) {
+      ASSERT_LE(now - given_at_, std::llround(given_.expiry_s * 1e6) + 2 * kTick);
+    }
     const bool is_serving = status.owns_arm == 1 && (status.control_state == S::CONTROL_WAITING ||
                                                      status.control_state == S::CONTROL_MOVING);
     if (driver_speaks || !is_serving) driver_since_ = now;
@@ -450,6 +464,9 @@ class Bench {
   std::deque<action_command_t> commands_;
   std::set<std::int64_t> refused_holds_;  // an answered command is answered again
   std::int64_t last_ended_id_ = -1;
+  std::int8_t last_kind_ = -1;
+  Target given_{};
+  std::int64_t given_at_ = 0;
   bool driver_was_heard_ = false;
   std::int64_t driver_since_ = now, monitor_since_ = now, eyes_since_ = now;
   std::int64_t last_sight_utime_ = -1;

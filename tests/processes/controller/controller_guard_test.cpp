@@ -117,6 +117,31 @@ TEST(ControllerTest, TakingTheArmWaitsForRestAndForTheBabblersSample) {
   EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
 }
 
+TEST(ControllerTest, AMoveThatNeverEndsIsHeld) {
+  Bench bench;
+  bench.start();
+  bench.driver_serves = false;
+  bench.give(position_target(0, kFar));
+  ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 1; }));
+  bench.motion.rest_since_utime = -1;
+  bench.answer_last_move(motion_status_t::STATE_MOVING);
+  const auto go_on = [&](double seconds) {
+    for (int n = 0; n < 2 * seconds; ++n) {
+      bench.motion.utime += kSecond / 2;
+      bench.answer_last_move(motion_status_t::STATE_MOVING);
+      bench.show_frame();
+      bench.run(0.5);
+    }
+  };
+  go_on(19);
+  EXPECT_EQ(bench.status.control_state, S::CONTROL_MOVING) << bench.status.why;
+  EXPECT_EQ(bench.num_holds, 0);
+  bench.driver_serves = true;
+  go_on(2);
+  EXPECT_EQ(bench.num_holds, 1);
+  EXPECT_EQ(bench.status.control_state, S::CONTROL_HOLDING) << bench.status.why;
+}
+
 TEST(ControllerTest, AnArmThatNeverRestsIsGivenBack) {
   for (const bool in_the_middle : {false, true}) {
     Bench bench;

@@ -139,6 +139,7 @@ TEST(ControllerStatesTest, WhatMustHoldTheArmSendsHoldAsSoonAsTheDriverIsHeard) 
   owned.insert(Phase::kKeeping);
   holding[Event::kDriverRestarted] = owned;
   holding[Event::kNoSample] = observing;
+  holding[Event::kEndless] = moving;
   holding[Event::kRestored] = {Phase::kIdle};
   holding[Event::kFailed] = {Phase::kTaking, Phase::kDeciding, Phase::kTagAwaited};
   for (const Phase phase : all_phases()) holding[Event::kHoldAsked].insert(phase);

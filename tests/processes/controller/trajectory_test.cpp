@@ -3,6 +3,8 @@
 #include <gtest/gtest.h>
 
 #include <cmath>
+#include <limits>
+#include <stdexcept>
 #include <utility>
 
 namespace bodyschema {
@@ -64,6 +66,28 @@ TEST(TrajectoryTest, ALegTurnsInSmallStepsAlongTheShorterWay) {
   EXPECT_NEAR(before.angularDistance(*to.q_RT), 0, 1e-9);
 }
 
+TEST(TrajectoryTest, OfOneWayPointOrOfStepsWithoutEndEachLegIsOneStep) {
+  const PoseTarget here{.p_RT = {0, 0, 0}}, there{.p_RT = {9, 0, 0}};
+  const Trajectory one({here}, 0.02);
+  EXPECT_EQ(one.num_way_points(), 1U);
+  const Trajectory far({here, there}, std::numeric_limits<double>::infinity());
+  ASSERT_EQ(far.leg(1).size(), 1U);
+  EXPECT_EQ(far.leg(1)[0].p_RT, there.p_RT);
+}
+
+TEST(TrajectoryTest, WhatIsNoneIsRefused) {
+  const PoseTarget here{.p_RT = {0, 0, 0}}, there{.p_RT = {500, 0, 0}};
+  PoseTarget turned = here;
+  turned.q_RT = Eigen::Quaterniond::Identity();
+  using Points = std::vector<PoseTarget>;
+  EXPECT_THROW(Trajectory(Points{}, 0.02), std::invalid_argument);
+  EXPECT_THROW(Trajectory({here, here}, 0), std::invalid_argument);
+  EXPECT_THROW(Trajectory({here, here}, std::nan("")), std::invalid_argument);
+  EXPECT_THROW(Trajectory({here, turned}, 0.02), std::invalid_argument);
+  EXPECT_THROW(Trajectory({here, there}, 0.02), std::invalid_argument) << "in millimetres";
+  EXPECT_THROW(Trajectory({here, there}, 1e-300), std::invalid_argument);
+}
+
 TEST(TrajectoryTest, WhatIsWithinReachHasNoObjection) {
   const BodySchema schema = two_links();
   const Eigen::Vector2d from(0.5, -1);
@@ -91,6 +115,10 @@ TEST(TrajectoryTest, AnArmThatWouldHaveToTurnOverIsNamed) {
   schema.signals[0].upper = 0.35;
   const std::string why = objection(schema, begin, arc);
   EXPECT_NE(why.find("the way to point 4 of 5"), std::string::npos) << why;
+  // From where the elbow is to the left already, that leg is none to object to.
+  const Trajectory trajectory(arc, 0.02);
+  EXPECT_NE(trajectory.objection_to_leg(3, schema, 3, Eigen::Vector2d(0.3, -0.6), kLimits), "");
+  EXPECT_EQ(trajectory.objection_to_leg(3, schema, 3, Eigen::Vector2d(-0.3, 0.6), kLimits), "");
   EXPECT_NE(why.find("turn over and leave the line by"), std::string::npos) << why;
 }
 
