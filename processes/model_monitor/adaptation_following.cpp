@@ -147,6 +147,9 @@ void Adaptation::watch_small_means(std::int64_t sample_index,
   if (step_lead > needed && step_lead > drift_lead + over_drift) {
     tracker_.adopt(*step, sample_index, events);
   } else if (moved->is_sure && drift_lead >= step_lead) {
+    // Likelihoods take the models' own errors for noise, means leave them out (before_): an edge
+    // drifts where both say so, else more samples tell.
+    if (drift && !moved->element.is_tag() && drift->drift.part != moved->element.id) return;
     begin_drift(drift ? drift->drift.part : moved->element.id, sample_index, sample_index, events);
   }
 }

@@ -6,7 +6,7 @@ std::optional<Alternations::Found> Alternations::look(const std::vector<Adaptati
   using Kind = AdaptationEvent::Kind;
   struct Seen {
     std::int64_t sample = 0;
-    bool is_away = false, is_back = false;
+    bool is_away = false, is_back = false, is_undone = false;
   };
   std::map<int, Seen> seen;
   for (const AdaptationEvent& event : events) {
@@ -14,12 +14,15 @@ std::optional<Alternations::Found> Alternations::look(const std::vector<Adaptati
     Seen& there = seen[event.to];
     there.sample = event.sample_index;
     there.is_away |= event.kind == Kind::kCandidate;
-    there.is_back |= event.kind == Kind::kRestored || event.kind == Kind::kReverted;
+    there.is_back |= event.kind == Kind::kRestored;
+    there.is_undone |= event.kind == Kind::kReverted;
   }
   for (const auto& [part, now] : seen) {
-    // One form instead of another is no change of the body.
-    if (now.is_away == now.is_back) continue;
     std::deque<Change>& changes = changes_[part];
+    // A guess that is taken back was no change of the body, one form instead of another is none.
+    if (now.is_undone && !now.is_away && !now.is_back && !changes.empty() && changes.back().is_away)
+      changes.pop_back();
+    if (now.is_away == now.is_back || (now.is_away && now.is_undone)) continue;
     if (!changes.empty() && changes.back().is_away == now.is_away) continue;
     changes.push_back({now.sample, now.is_away});
     while (changes.front().sample <= now.sample - kWithin) changes.pop_front();

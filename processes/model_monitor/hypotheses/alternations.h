@@ -20,7 +20,8 @@ class Alternations {
     std::int64_t since = 0;  ///< its first change
   };
   /// Events of one sample, samples in their order. Finds an edge at its kChanges-th change, away
-  /// and back in turn, within kWithin samples, and forgets all others then.
+  /// and back in turn, within kWithin samples, and forgets all others then. A guess that is taken
+  /// back is no change.
   std::optional<Found> look(const std::vector<AdaptationEvent>& events);
 
   /// Chosen: a fault is found and repaired, or explained otherwise once, in fewer.
@@ -30,7 +31,7 @@ class Alternations {
  private:
   struct Change {
     std::int64_t sample = 0;
-    bool is_away = false;  ///< a changed model was adopted; else one from before, or it was undone
+    bool is_away = false;  ///< a changed model was adopted; else one from before
   };
   std::map<int, std::deque<Change>> changes_;  ///< by part; away and back in turn
 };

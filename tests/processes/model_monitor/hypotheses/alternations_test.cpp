@@ -23,11 +23,23 @@ TEST(AlternationsTest, AnEdgeThatChangesToAndFroIsFoundAtItsFourthChange) {
   EXPECT_FALSE(alternations.look(change(18, Kind::kRestored, 3, 4)));
   EXPECT_FALSE(alternations.look(change(20, Kind::kCandidate, 4, 5)));
   EXPECT_FALSE(alternations.look(change(30, Kind::kCandidate, 3, 4)));
-  const auto found = alternations.look(change(41, Kind::kReverted, 3, 4));
+  const auto found = alternations.look(change(41, Kind::kRestored, 3, 4));
   ASSERT_TRUE(found);
   EXPECT_EQ(found->part, 4);
   EXPECT_EQ(found->since, 10);
   EXPECT_FALSE(alternations.look(change(45, Kind::kCandidate, 3, 4)));
+}
+
+TEST(AlternationsTest, AGuessThatIsTakenBackIsNoChange) {
+  Alternations alternations;
+  EXPECT_FALSE(alternations.look(change(103, Kind::kCandidate, 3, 4)));
+  EXPECT_FALSE(alternations.look(change(105, Kind::kReverted, 3, 4)));
+  EXPECT_FALSE(alternations.look(change(108, Kind::kCandidate, 3, 4)));
+  EXPECT_FALSE(alternations.look(change(111, Kind::kRestored, 3, 4)));
+  EXPECT_FALSE(alternations.look(change(115, Kind::kCandidate, 3, 4)));
+  const auto found = alternations.look(change(120, Kind::kRestored, 3, 4));
+  ASSERT_TRUE(found);
+  EXPECT_EQ(found->since, 108);
 }
 
 TEST(AlternationsTest, AFaultThatIsRepairedAndComesAgainLaterIsNoAlternation) {
