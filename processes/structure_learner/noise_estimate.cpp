@@ -7,6 +7,7 @@
 #include <set>
 
 #include "common/geometry/angle.h"
+#include "processes/structure_learner/long_chain/coupled_joints.h"
 #include "processes/structure_learner/long_chain/long_chain.h"
 #include "processes/structure_learner/residual_fit.h"
 #include "processes/structure_learner/screen.h"
@@ -285,7 +286,21 @@ class ModelNoise {
         actions_.blocks().is_stream() ? JointOrder::kListed : JointOrder::kUnknown;
     const auto fit = fit_long_chain(pair, actions_, signals, order, kLargestRotationNoise);
     if (!fit) return;
-    best->replace_if_explained(refine(fit->model, part_i, part_j, kRough));
+    ScaledFit chain = refine(fit->model, part_i, part_j, kRough);
+    const Noise noise = floored(chain.noise, 1);
+    best->replace_if_explained(std::move(chain));
+    offer_coupled(fit->model, part_i, part_j, noise, best);
+  }
+
+  // The chain with joints that a second signal moves, too.
+  void offer_coupled(const LocalModel& chain, int part_i, int part_j, const Noise& noise,
+                     ScaledFit* best) const {
+    if (actions_.blocks().is_stream()) return;
+    const PairData pair = pair_data(part_i, part_j, noise);
+    const Fit coupled =
+        with_coupled_joints(fit_local_model(chain, pair, actions_, 15, 1e-2), pair, actions_);
+    if (coupled.model.num_joints() > chain.num_joints())
+      best->replace_if_explained(refine(coupled.model, part_i, part_j, noise));
   }
 
  private:

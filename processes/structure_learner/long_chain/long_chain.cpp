@@ -259,6 +259,8 @@ std::optional<Fit> fit_long_chain(const PairData& pair, const NormalizedActions&
   return ordered.cost < fit.cost ? ordered : fit;
 }
 
+double price_of_joint(const PairData& pair) { return price(6, pair); }
+
 Fit without_idle_joints(Fit fit, const PairData& pair, const NormalizedActions& actions) {
   while (fit.model.num_joints() > 0) {
     std::optional<Fit> best;
@@ -266,7 +268,7 @@ Fit without_idle_joints(Fit fit, const PairData& pair, const NormalizedActions& 
       Fit without = fit_local_model(without_joint(fit.model, d), pair, actions, 15, 1e-1);
       if (!best || without.cost < best->cost) best = std::move(without);
     }
-    if (best->cost - fit.cost > price(6, pair)) break;
+    if (best->cost - fit.cost > price_of_joint(pair)) break;
     fit = fit_local_model(best->model, pair, actions, kFitIterations, 1e-2);
   }
   return fit;

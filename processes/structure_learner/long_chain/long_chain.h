@@ -29,6 +29,10 @@ std::optional<Fit> fit_long_chain(const PairData& pair, const NormalizedActions&
                                   const std::vector<int>& signals, JointOrder order,
                                   double noise_rad);
 
+/// What a joint more must explain [nats]: more than chance (Schwarz 1978), and more than what is
+/// below the noise of every single sight.
+double price_of_joint(const PairData& pair);
+
 /// Without the joints that do not pay, one by one, the least first: what a joint explains must be
 /// more than its parameters are worth by chance (Schwarz 1978) and, for a sight, more than
 /// `kLeastPay`.

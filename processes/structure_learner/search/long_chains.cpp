@@ -5,6 +5,7 @@
 #include <limits>
 #include <map>
 
+#include "processes/structure_learner/long_chain/coupled_joints.h"
 #include "processes/structure_learner/long_chain/long_chain.h"
 #include "processes/structure_learner/residual_fit.h"
 #include "processes/structure_learner/screen.h"
@@ -111,6 +112,8 @@ std::optional<Candidate> chain_between(const Pair& ij, const std::vector<int>& s
   if (!fit) return std::nullopt;
   fit = without_idle_joints(with_pure_slides(*std::move(fit), pair, actions), pair, actions);
   fit = with_settled_order(*std::move(fit), pair, actions);
+  if (order == JointOrder::kUnknown && fit->cost > kRightCost * pair.size())
+    fit = with_coupled_joints(*std::move(fit), pair, actions);
   std::optional<Candidate> chain = pairs->try_start(part_i, part_j, fit->model);
   *cost = pairs->last_cost();
   return chain;

@@ -8,6 +8,7 @@
 #include "common/geometry/angle.h"
 #include "processes/structure_learner/learn.h"
 #include "processes/structure_learner/long_chain/chain_rotations.h"
+#include "processes/structure_learner/long_chain/coupled_joints.h"
 #include "tests/support/random_arm.h"
 
 namespace bodyschema {
@@ -175,6 +176,42 @@ TEST(Learn, AChainOfWhichAJointHasNoSignalIsIncomplete) {
       EXPECT_FALSE(learn(signals, samples, options).schema.complete) << missing;
     }
   }
+}
+
+// As commands are told where signal 1 drives joint 2 as well, by `share`: a cable that leads over
+// joint 1, or a parallelogram.
+std::vector<ActionPoseSample> with_coupling(std::vector<ActionPoseSample> samples, double share) {
+  for (ActionPoseSample& sample : samples) sample.action(2) -= share * sample.action(1);
+  return samples;
+}
+
+TEST(CoupledJoints, AreFoundAtTheEndsOfAnArm) {
+  for (const double share : {0.5, -0.4})
+    for (const bool is_told : {true, false}) {
+      Rng rng(is_told ? 0 : 1);
+      const auto robot = test::random_arm({.num_joints = 4, .share_sliding = 0}, rng);
+      const auto samples = with_coupling(noisy_babble(robot, 100, kNoise, rng), share);
+      LearnOptions options;
+      options.root = 1;
+      if (is_told) options.measurement.noise = kNoise;
+      const BodySchema schema = learn(robot.signals, samples, options).schema;
+      ASSERT_TRUE(schema.complete) << share << " told " << is_told;
+      ASSERT_EQ(schema.edges.size(), 1U);
+      EXPECT_FALSE(schema.edges[0].residual_gp);
+      EXPECT_EQ(schema.edges[0].joints.size(), 5U);
+      for (const ActionPoseSample& sample :
+           with_coupling(noisy_babble(robot, 20, {1e-6, 1e-6}, rng), share)) {
+        const Pose X_seen = sample.find(1)->X_CB.inverse() * sample.find(5)->X_CB;
+        const Pose X = schema.predict(1, 5, sample.action)->X_AB;
+        EXPECT_LT((X.translation() - X_seen.translation()).norm(), 0.01);
+      }
+    }
+}
+
+TEST(CoupledJoints, AreNoneWhereEachSignalMovesOne) {
+  const Case c({.num_joints = 4, .share_sliding = 0}, 60, 1);
+  EXPECT_EQ(with_coupled_joints(c.fit(JointOrder::kListed), c.pair, c.actions).model.num_joints(),
+            4);
 }
 
 }  // namespace
