@@ -8,12 +8,6 @@
 namespace bodyschema::test {
 namespace {
 
-#if defined(__SANITIZE_ADDRESS__) || defined(__SANITIZE_THREAD__)
-constexpr int kSequences = 300;  // under sanitizers
-#else
-constexpr int kSequences = 10'000;
-#endif
-
 class ControllerPropertyTest : public testing::TestWithParam<int> {};
 
 // Anything in any order: Bench asserts that every message makes sense, that nothing moves an arm
@@ -24,7 +18,7 @@ TEST_P(ControllerPropertyTest, WhateverHappensItsCommandsAreLawful) {
   std::mt19937_64 rng(static_cast<std::uint64_t>(GetParam()));
   std::size_t num_moves = 0, num_holds = 0;
   std::set<Phase> phases;
-  for (int run = 0; run < kSequences && !testing::Test::HasFatalFailure(); ++run) {
+  for (int run = 0; run < BODYSCHEMA_SEQUENCES && !testing::Test::HasFatalFailure(); ++run) {
     ControllerConfig config = test_config();
     config.max_searches = run % 2 ? 5 : 0;
     if (run % 8) config.inverse_kinematics.max_starts = 1;  // the time goes into others
@@ -114,8 +108,8 @@ TEST_P(ControllerPropertyTest, WhateverHappensItsCommandsAreLawful) {
     num_moves += bench.moves.size();
     num_holds += bench.num_holds;
   }
-  EXPECT_GT(num_moves, kSequences * 1U);
-  EXPECT_GT(num_holds, kSequences * 1U);
+  EXPECT_GT(num_moves, BODYSCHEMA_SEQUENCES * 1U);
+  EXPECT_GT(num_holds, BODYSCHEMA_SEQUENCES * 1U);
   EXPECT_EQ(phases.size(), static_cast<std::size_t>(kNumPhases)) << "every phase was there";
 }
 
