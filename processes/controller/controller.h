@@ -67,7 +67,8 @@ struct ControllerConfig {
 /// for less than it. The arm is its own (owns_arm) from the moment that a target can be served
 /// until it was reached and kept, is released, or was refused before it moved the arm. Taking it
 /// waits until the arm rests and the last settled action has its SAMPLE. A target that is not
-/// reached within its expiry is dropped, as by a HOLD.
+/// reached within its expiry is dropped, as by a HOLD. The next step of a path (num_way_points,
+/// same sender and epoch) is refused once the arm is held.
 ///
 /// No part leaves the workspace on the way, by the schema; a solution towards which one would is
 /// dealt with like one that the driver rejects.

@@ -67,6 +67,8 @@ Controller::Answer Controller::on_pose_target(const pose_target_t& target,
     if (!is_repeated) ++counters_["older POSE_TARGET"];
     return answer();
   }
+  const bool continues_path =
+      target.num_way_points > 0 && target.epoch == target_.epoch && target.sender == target_.sender;
   floor_epoch_ = target.epoch;
   floor_id_ = target.target_id;
   target_ = target;
@@ -89,6 +91,11 @@ Controller::Answer Controller::on_pose_target(const pose_target_t& target,
     default:
       if (motion_ && motion_->stop_latched) {
         fire(Event::kTargetWhileHalted, kHalted);
+      } else if (continues_path &&
+                 info(phase_).control_state == control_status_t::CONTROL_HOLDING) {
+        // Whoever gives it may have slept when the arm was halted.
+        fire(Event::kTargetWhileHalted,
+             "the arm was held on this path: nothing goes on by itself, follow it anew");
       } else {
         fire(Event::kTarget, "taking up the target");
         decide();

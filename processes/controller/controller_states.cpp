@@ -38,7 +38,9 @@ constexpr std::array<PhaseInfo, kNumPhases> kPhases{{
 
 constexpr std::array<EventInfo, kNumEvents> kEvents{{
     {E::kTarget, "target", "a newer POSE_TARGET of a position, a pose or a tag"},
-    {E::kTargetWhileHalted, "target while halted", "the same while the driver's STOP is latched"},
+    {E::kTargetWhileHalted, "target while halted",
+     "the same while the driver's STOP is latched, or the next step of a path on which the arm "
+     "was held"},
     {E::kHoldAsked, "hold asked", "KIND_HOLD: the target is withdrawn"},
     {E::kReleaseAsked, "release asked", "KIND_RELEASE"},
     {E::kRestored, "restored", "a restart; the arm was its own before"},
@@ -127,8 +129,8 @@ constexpr Rule kRules[] = {
     stay(E::kTarget, kActing),  // the action that is under way ends first
     never(E::kTarget, only(P::kRefusedHalted)),
     to(E::kTargetWhileHalted, kOver, P::kRefusedHalted),
-    stay(E::kTargetWhileHalted, only(P::kHoldSent) | only(P::kHeld)),  // refused, but held
-    never(E::kTargetWhileHalted, only(P::kHoldDue) | kActive),
+    stay(E::kTargetWhileHalted, kHolds),  // refused, but held
+    never(E::kTargetWhileHalted, kActive),
     to(E::kHoldAsked, kAll, P::kHoldDue),
     to(E::kReleaseAsked, kAll, P::kReleased),
     to(E::kRestored, only(P::kIdle), P::kHoldDue),

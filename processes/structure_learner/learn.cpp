@@ -134,7 +134,8 @@ UnconnectedPart explain(int part, int num_seen, const std::set<int>& connected,
     return {part, Unconnected::kNoValidModel,
             seen +
                 "; a model is valid, but has a joint that the others make needless, and without "
-                "it none is: more of the poses are wrong, or further off, than is told"};
+                "it none is: more of the poses are wrong, or further off, than is told, or its "
+                "marker is of another size"};
   if (contested)
     return {part, Unconnected::kNotEnoughData,
             seen + "; either " + names_of(contested->of_screws, structure) +

@@ -53,7 +53,8 @@ struct Passed {
 std::vector<PoseTarget> read_way_points(const std::string& file) {
   std::ifstream stream;
   if (file != "-") {
-    if (std::filesystem::is_directory(file)) throw WayPointError(file + ": is a folder");
+    if (std::filesystem::exists(file) && !std::filesystem::is_regular_file(file))
+      throw WayPointError(file + ": is a folder, a device or a pipe, no file");
     stream.open(file);
     if (!stream) throw WayPointError(file + ": cannot be read");
   }
@@ -181,9 +182,11 @@ Json follow_json(const std::vector<Passed>& passed, std::size_t num_way_points) 
     num_moves += one.status.num_moves;
     num_probes += one.status.num_probes;
   }
+  // Reached by the schema is not enough: seen there.
   const bool is_reached =
-      passed.size() == num_way_points &&
-      std::ranges::all_of(passed, [](const Passed& one) { return one.end == End::kAsked; });
+      passed.size() == num_way_points && std::ranges::all_of(passed, [](const Passed& one) {
+        return one.end == End::kAsked && one.status.observed_error_m >= 0;
+      });
   return {{"reached", is_reached},
           {"way_points",
            array_of(passed, [](const Passed& one) { return target_json(one.status, one.end); })},
@@ -198,8 +201,15 @@ void run_follow(const FollowArguments& arguments) {
   Heard heard;
   Session session(arguments.in);
   listen(session, &heard);
-  check_reach(heard, arguments, trajectory);
   std::vector<Passed> passed;
+  try {
+    check_reach(heard, arguments, trajectory);
+  } catch (const std::runtime_error& error) {
+    Json json = follow_json(passed, num_way_points);
+    json["why"] = error.what();
+    if (arguments.json) std::cout << json.dump() << "\n";
+    throw;
+  }
   pose_target_t target = make_target(pose_target_t::KIND_POSITION);
   target.num_way_points = static_cast<int>(num_way_points);
   std::int64_t next_id = 0;
@@ -226,7 +236,8 @@ void run_follow(const FollowArguments& arguments) {
   if (arguments.json) std::cout << json.dump() << "\n";
   if (!left.empty()) std::cerr << "The path is left: " << left << "\n";
   const End end = passed.empty() ? End::kOpen : passed.back().end;
-  if ((end == End::kAsked || end == End::kMissed) && passed.back().status.owns_arm == 1)
+  const bool is_followed = end == End::kAsked || end == End::kMissed;
+  if (session.is_in_company() && is_followed && passed.back().status.owns_arm == 1)
     std::cerr << "The arm stays there until: " << to_type("release") << "\n";
   if (!json["reached"].get<bool>()) fail();
 }

@@ -113,8 +113,10 @@ void Session::follow(TargetFollower& follower, const std::function<void(std::int
   follower_ = nullptr;
 }
 
+bool Session::is_in_company() const { return heard_us_ >= 0 && clock_us() - heard_us_ < kGone_us; }
+
 void Session::expect_company() const {
-  if (heard_us_ >= 0 && clock_us() - heard_us_ >= kGone_us)
+  if (heard_us_ >= 0 && !is_in_company())
     throw std::runtime_error(fmt::format(
         "the group on {} fell silent: nothing was heard for {:.0f} s. Was it stopped? ./run --keep "
         "starts one",

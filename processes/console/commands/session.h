@@ -44,6 +44,8 @@ class Session {
 
   /// @throws std::runtime_error with what to type once nobody can be there, or no longer.
   void expect_company() const;
+  /// Somebody was heard, and not long ago.
+  bool is_in_company() const;
 
   Bus bus;
 

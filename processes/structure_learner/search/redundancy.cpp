@@ -21,9 +21,12 @@ constexpr double kCoupling = 1.0 / 36;
 
 using Nodes = std::vector<TreeNode>;
 
+enum class MotionOf { kPose, kRotation };
+
 // d² of a motion as large as an error of one sight may be: by its noise, but of a noise that is
 // told to be louder than any marker's no systematic error need be as large.
-double squared_size(const Vector6d& moved, const PairHypothesis& sight) {
+double squared_size(Vector6d moved, const PairHypothesis& sight, MotionOf of = MotionOf::kPose) {
+  if (of == MotionOf::kRotation) moved.head<3>().setZero();
   double of_errors = (moved.head<3>() / kLoudestMarker.position_m).squaredNorm();
   if (sight.num_residuals == 6)
     of_errors += (moved.tail<3>() / kLoudestMarker.rotation_rad).squaredNorm();
@@ -59,7 +62,7 @@ Motion motion_of(const Nodes& nodes, int node, int signal, const NormalizedActio
 // Mean square, over the frames of both, of how far the signal moves one node against the other,
 // in the noise of one sight (squared_size()).
 std::optional<double> mean_square_motion(const Nodes& nodes, int a, int b, int signal,
-                                         PairModels* pairs) {
+                                         PairModels* pairs, MotionOf of = MotionOf::kPose) {
   if (nodes[a].part > nodes[b].part) std::swap(a, b);
   const PairData& pair = pairs->pair(nodes[a].part, nodes[b].part);
   if (pair.size() == 0) return std::nullopt;
@@ -72,7 +75,7 @@ std::optional<double> mean_square_motion(const Nodes& nodes, int a, int b, int s
     const Pose X_ba = of_b.X.inverse() * of_a.X;
     const Vector6d moved =
         (of_b.by_signal - adjoint(X_ba) * of_a.by_signal) * actions(sample, signal);
-    sum += squared_size(moved, pair.primary(t));
+    sum += squared_size(moved, pair.primary(t), of);
   }
   return sum / pair.size();
 }
@@ -108,6 +111,28 @@ std::optional<Detour> find_detour(const Nodes& nodes, PairModels* pairs, Least&&
         if (num_others_between(nodes, far, l, signal, pairs) < nodes[larger].model.num_joints())
           return Detour{larger, signal};
       }
+  return std::nullopt;
+}
+
+// A node at the end of a chain of many joints of which one of a signal only turns the node as
+// another edge turns its end: by the rotations that joint is not needed. Positions that say
+// otherwise are wrong in a way of their own, as by a marker of another size than is told.
+std::optional<Detour> find_turned_alike(const Nodes& nodes, PairModels* pairs) {
+  const auto turns = [&](int a, int b, int signal) {
+    return mean_square_motion(nodes, a, b, signal, pairs, MotionOf::kRotation)
+               .value_or(kNoiseOfOneSight) >= kNoiseOfOneSight;
+  };
+  const int n = static_cast<int>(nodes.size());
+  for (int l = 1; l < n; ++l) {
+    if (nodes[l].model.num_joints() <= kMaxScreenedJoints) continue;
+    for (const int signal : signal_set(nodes[l].model))
+      for (int k = 1; k < n; ++k) {
+        if (k == l || !nodes[k].model.uses(signal) || nodes[k].parent != nodes[l].parent) continue;
+        if (turns(k, nodes[k].parent, signal) && turns(l, nodes[l].parent, signal) &&
+            !turns(k, l, signal))
+          return Detour{l, signal};
+      }
+  }
   return std::nullopt;
 }
 
@@ -194,9 +219,10 @@ std::vector<std::pair<int, int>> redundant_edges(PairModels* pairs, ModelForest 
     std::optional<int> model;
     if (forest.component(parts[p]) == parts[p]) {
       const ComponentTree tree(forest, parts[p], pairs);
-      if (const auto detour =
-              find_detour(tree.nodes(), pairs, [](int /*signal*/) { return kNoiseOfOneSight; }))
-        model = tree.model_of(detour->node);
+      auto detour =
+          find_detour(tree.nodes(), pairs, [](int /*signal*/) { return kNoiseOfOneSight; });
+      if (!detour) detour = find_turned_alike(tree.nodes(), pairs);
+      if (detour) model = tree.model_of(detour->node);
     }
     if (!model) {
       ++p;

@@ -177,6 +177,16 @@ TEST(Check, AcceptsEveryExample) {
   });
 }
 
+// What is wrong somewhere is told as an event first, then as a finding.
+TEST(Check, AFindingMayHaveTheCauseOfAnyEvent) {
+  for (int cause = 0; cause < 100; ++cause) {
+    model_health_t of_event = example_model_health(), of_finding = of_event;
+    of_event.events[0].event_cause = static_cast<std::int8_t>(cause);
+    of_finding.findings[0].finding_cause = static_cast<std::int8_t>(cause);
+    EXPECT_EQ(check(of_event).empty(), check(of_finding).empty()) << cause;
+  }
+}
+
 TEST(Check, RefusesFieldsThatContradictEachOther) {
   expect_refused(example_sample(), "rest_end_utime",
                  [](auto& m) { m.rest_end_utime = m.rest_begin_utime - 1; });

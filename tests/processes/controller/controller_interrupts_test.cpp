@@ -338,5 +338,39 @@ TEST(ControllerInterruptsTest, AfterItsSampleAnArmThatSomebodyElseMovedIsTakenAn
   EXPECT_EQ(bench.controller.phase(), Phase::kTaking);
 }
 
+// A console that slept meanwhile does not know of it.
+TEST(ControllerTest, APathOnWhichTheArmWasHeldDoesNotGoOn) {
+  for (const bool is_stop : {true, false}) {
+    Bench bench;
+    bench.start();
+    Target step = position_target(0, kNear);
+    step.way_point = 1;
+    step.num_way_points = 3;
+    bench.give(step);
+    ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED));
+    if (is_stop) {
+      bench.stop(true);
+      bench.run(1);
+      bench.stop(false);
+    } else {
+      bench.give(other_target(1, Target::KIND_HOLD));
+    }
+    bench.run(2);
+    const std::size_t num_moves = bench.moves.size();
+    step.target_id = 2;
+    step.way_point = 2;
+    std::copy(kFar.begin(), kFar.end(), step.position_m);
+    bench.give(step);
+    bench.run(5);
+    EXPECT_EQ(bench.moves.size(), num_moves);
+    EXPECT_EQ(bench.status.control_state, S::CONTROL_HOLDING);
+    EXPECT_EQ(bench.status.target_id, 2);
+    step.epoch += 1;
+    step.target_id = 3;
+    bench.give(step);
+    EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << "a path of its own";
+  }
+}
+
 }  // namespace
 }  // namespace bodyschema::test

@@ -56,6 +56,21 @@ TEST(UnrelatedCommands, MoveNothing) {
       }
 }
 
+// The hand's marker is 3 % larger than told: a chain from the root on all signals fits all the
+// same.
+TEST(WrongMarkerSize, IsNoOtherTree) {
+  for (const std::optional<Noise> told :
+       {std::optional(Noise{0.003, 1 * kDegree}), std::optional<Noise>()})
+    for (std::uint64_t seed = 0; seed < 2; ++seed) {
+      ImperfectRobot robot(3, true, {.name = "none"}, seed);
+      auto samples = robot.babble(80);
+      for (ActionPoseSample& sample : samples)
+        for (PartObservation& seen : sample.parts)
+          if (seen.part == 4) seen.X_CB.translation() *= 1.03;
+      EXPECT_FALSE(learn(robot.signals(), samples, options_of(told)).schema.complete) << seed;
+    }
+}
+
 Imperfection sweep(double half_range_rad) {
   return {.name = "sweep", .range_deg = 2 * half_range_rad / kDegree};
 }
