@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <map>
 #include <optional>
+#include <set>
 #include <utility>
 #include <vector>
 
@@ -114,8 +115,8 @@ std::optional<Detour> find_detour(const Nodes& nodes, PairModels* pairs, Least&&
   return std::nullopt;
 }
 
-// A node at the end of a chain of many joints of which one of a signal only turns the node as
-// another edge turns its end: by the rotations that joint is not needed. Positions that say
+// A node at the end of a chain of three or more joints that turn, while by the rotations at most
+// one signal turns it against another node: one joint between these would do. Positions that say
 // otherwise are wrong in a way of their own, as by a marker of another size than is told.
 std::optional<Detour> find_turned_alike(const Nodes& nodes, PairModels* pairs) {
   const auto turns = [&](int a, int b, int signal) {
@@ -124,14 +125,15 @@ std::optional<Detour> find_turned_alike(const Nodes& nodes, PairModels* pairs) {
   };
   const int n = static_cast<int>(nodes.size());
   for (int l = 1; l < n; ++l) {
-    if (nodes[l].model.num_joints() <= kMaxScreenedJoints) continue;
-    for (const int signal : signal_set(nodes[l].model))
-      for (int k = 1; k < n; ++k) {
-        if (k == l || !nodes[k].model.uses(signal) || nodes[k].parent != nodes[l].parent) continue;
-        if (turns(k, nodes[k].parent, signal) && turns(l, nodes[l].parent, signal) &&
-            !turns(k, l, signal))
-          return Detour{l, signal};
-      }
+    const std::set<int> signals = signal_set(nodes[l].model);
+    if (signals.size() <= kMaxScreenedJoints ||
+        !std::ranges::all_of(signals, [&](int s) { return turns(l, nodes[l].parent, s); }))
+      continue;
+    for (int k = 1; k < n; ++k)
+      if (k != l && !is_below(nodes, k, l) &&
+          std::ranges::count_if(pairs->actions().moving(), [&](int s) { return turns(k, l, s); }) <=
+              1)
+        return Detour{l, *signals.begin()};
   }
   return std::nullopt;
 }

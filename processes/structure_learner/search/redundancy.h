@@ -14,8 +14,9 @@ namespace bodyschema {
 /// edge of fewer joints between those parts, and that the data refuted it has another reason than
 /// motion: outliers, or a bias of views. Of the two edges the one with more joints is returned, by
 /// its parts, and its record says so. O(E² N) for E edges that share a signal and N frames of a
-/// pair. And chains of more than two joints of which one turns its end just as another edge of the
-/// same part does: their positions have an error of another kind, as of a marker of another size.
+/// pair. And chains of more than two joints that turn to a part that, by the rotations, one joint
+/// would hang on another: its positions have an error of another kind, as of a marker of another
+/// size. O(N) for each such chain, node and signal.
 std::vector<std::pair<int, int>> redundant_edges(PairModels* pairs, ModelForest forest);
 
 /// A joint of a signal that has another one, and that adds far less than the signal moves there:
