@@ -70,7 +70,7 @@ def run(place, arguments):
         return learn(place, learn_options(arguments))
     name, *rest = arguments
     if asks_for_help(rest if name not in PASSED_ON else rest[:1]):
-        return show_help(place, name)
+        return show_help(place, name, rest)
     if name in WORDS:
         return WORDS[name][0](place, rest)
     return console(place, name, rest)
@@ -86,10 +86,10 @@ def asks_for_help(arguments):
     return "-h" in arguments or "--help" in arguments
 
 
-def show_help(place, name):
+def show_help(place, name, arguments):
     """Prints the help of a word; that of the console's words only if the console is built, because help builds nothing."""
     if (name not in WORDS or name in OPTIONS_OF_THE_CONSOLE) and place.console.exists():
-        return console(place, name, ["--help"])
+        return console(place, name, arguments)
     if name not in WORDS:
         raise Failure(f"{name} --help is known once there is a build: ./run --build-only")
     print(usage(name, WORDS[name][1:]))

@@ -9,14 +9,14 @@ namespace bodyschema {
 namespace {
 
 constexpr double kLongestInterval_us = 1e6;
-constexpr Eigen::Index kLeastInstants = 50;
 constexpr Eigen::Index kLeastLag = 3;
 
 }  // namespace
 
-TimeBlocks::TimeBlocks(const std::vector<std::int64_t>& utimes, const Eigen::MatrixXd& actions) {
+TimeBlocks::TimeBlocks(const std::vector<std::int64_t>& utimes, const Eigen::MatrixXd& actions,
+                       Eigen::Index least_instants) {
   const Eigen::Index N = actions.cols();
-  if (N < kLeastInstants || static_cast<Eigen::Index>(utimes.size()) != N) return;
+  if (N < least_instants || static_cast<Eigen::Index>(utimes.size()) != N) return;
   std::vector<double> intervals;
   for (std::size_t t = 1; t < utimes.size(); ++t)
     intervals.push_back(static_cast<double>(utimes[t] - utimes[t - 1]));

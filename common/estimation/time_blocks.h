@@ -19,8 +19,10 @@ class TimeBlocks {
   /// and moves slowly compared with that: the mean square of the difference of actions `lag`
   /// instants apart reaches half of that of two random instants only at a lag above 2. A block is
   /// twice that lag long; at least two blocks. `actions` is m×N, any units that make the signals
-  /// comparable; instants ascend in time, else they are no stream.
-  TimeBlocks(const std::vector<std::int64_t>& utimes, const Eigen::MatrixXd& actions);
+  /// comparable; instants ascend in time, and are `least_instants` or more, else they are no
+  /// stream.
+  TimeBlocks(const std::vector<std::int64_t>& utimes, const Eigen::MatrixXd& actions,
+             Eigen::Index least_instants = 50);
 
   bool is_stream() const { return length_ > 1; }
   int length() const { return length_; }  ///< [instants]

@@ -4,6 +4,7 @@
 
 #include <CLI/CLI.hpp>
 #include <algorithm>
+#include <cctype>
 #include <cstdio>
 #include <exception>
 #include <iostream>
@@ -34,6 +35,15 @@ std::string unknown_command(const CLI::App& console) {
   return fmt::format("{}: unknown command '{}'; there are:{}\n", app->get_name(),
                      bodyschema::fit(*word, 40), names);
 }
+
+/// What was typed, the last word first, as CLI11 takes it; of it "-.5" would be an option.
+std::vector<std::string> words_of(int argc, char** argv) {
+  std::vector<std::string> words(argv + std::min(argc, 1), argv + argc);
+  for (std::string& word : words)
+    if (word.size() > 2 && word.starts_with("-.") && std::isdigit(word[2])) word.insert(1, "0");
+  std::reverse(words.begin(), words.end());
+  return words;
+}
 }  // namespace
 
 int main(int argc, char** argv) {
@@ -61,7 +71,7 @@ int main(int argc, char** argv) {
   bodyschema::add_where_command(commands);
   bodyschema::add_report_command(commands);
   try {
-    console.parse(argc, argv);
+    console.parse(words_of(argc, argv));
     // A full disk must not look like a result.
     if (!std::cout.flush()) throw std::runtime_error("stdout: the result could not be written");
   } catch (const CLI::RuntimeError& error) {

@@ -6,6 +6,7 @@
 #include <charconv>
 #include <cmath>
 #include <sstream>
+#include <string_view>
 
 #include "common/text/text.h"
 
@@ -50,7 +51,9 @@ PoseTarget way_point(const std::vector<std::string>& cells, const std::string& w
 }  // namespace
 
 std::vector<PoseTarget> parse_way_points(const std::string& text, const std::string& name) {
-  std::istringstream stream(text);
+  constexpr std::string_view kByteOrderMark = "\xEF\xBB\xBF";
+  std::istringstream stream(
+      text.substr(text.starts_with(kByteOrderMark) ? kByteOrderMark.size() : 0));
   std::vector<PoseTarget> way_points;
   std::size_t num_columns = 0;
   int number = 0;

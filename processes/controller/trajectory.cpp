@@ -124,11 +124,14 @@ Trajectory::Trajectory(const std::vector<PoseTarget>& way_points, double step_m)
 }
 
 std::string Trajectory::objection(const BodySchema& schema, int part, const Eigen::VectorXd& action,
-                                  const Limits& limits) const {
+                                  const Limits& limits,
+                                  const std::function<void(std::size_t)>& on_way_point) const {
   Solver solver(schema, part, action, limits);
-  for (std::size_t n = 0; n < legs_.size(); ++n)
+  for (std::size_t n = 0; n < legs_.size(); ++n) {
+    if (on_way_point) on_way_point(n);
     if (std::string why = objection_to(legs_[n], n, legs_.size(), &solver); !why.empty())
       return why;
+  }
   return "";
 }
 

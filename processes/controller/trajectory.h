@@ -1,6 +1,7 @@
 #pragma once
 
 #include <Eigen/Core>
+#include <functional>
 #include <string>
 #include <vector>
 
@@ -32,9 +33,11 @@ class Trajectory {
   const std::vector<PoseTarget>& leg(std::size_t n) const { return legs_[n]; }
 
   /// "" or which step an arm at `action` cannot make, and why: every one is solved by the schema
-  /// from the solution of the one before. @throws as solve_pose().
+  /// from the solution of the one before. `on_way_point` gets n before each. @throws as
+  /// solve_pose() and on_way_point.
   std::string objection(const BodySchema& schema, int part, const Eigen::VectorXd& action,
-                        const Limits& limits) const;
+                        const Limits& limits,
+                        const std::function<void(std::size_t n)>& on_way_point = nullptr) const;
   /// The same of leg `n` alone, from where the arm is before it.
   std::string objection_to_leg(std::size_t n, const BodySchema& schema, int part,
                                const Eigen::VectorXd& action, const Limits& limits) const;

@@ -14,6 +14,8 @@
 #include "processes/structure_learner/root_pose.h"
 #include "processes/structure_learner/search/withdrawal.h"
 #include "processes/structure_learner/soft_parts.h"
+#include "processes/structure_learner/surrogate_commands.h"
+#include "processes/structure_learner/unconnected.h"
 
 namespace bodyschema {
 namespace {
@@ -45,149 +47,6 @@ Noise typical_noise(const std::vector<ActionPoseSample>& samples) {
   }
   if (count == 0) return {};
   return {std::sqrt(position / count), std::sqrt(rotation / std::max(num_rotations, 1))};
-}
-
-bool is_guess_too_large(const MeasurementModel& measurement, NoiseSource source) {
-  return source == NoiseSource::kResiduals && is_above_any_marker(*measurement.noise);
-}
-bool is_guess_too_large(const LearnedStructure& structure) {
-  return is_guess_too_large(structure.options.measurement, structure.noise_source);
-}
-
-// What would tell how a part hangs on the others: more of the same is not always enough.
-std::string wanted_samples(int num_common, const std::set<int>& untold, int num_actions,
-                           int max_signals, const LearnedStructure& structure) {
-  if (num_common == 0) return "samples are needed in which it is seen together with another part";
-  if (structure.actions.moving().empty())
-    return "no signal moved: samples at other actions are needed to trust a model";
-  // So many poses determine a joint on every signal; two more test it.
-  if (num_actions < max_signals + 3)
-    return "samples at other actions are needed to trust a model: there are " +
-           std::to_string(num_actions);
-  std::string result = "more samples are needed to trust a model";
-  for (const int s : untold) {
-    result +=
-        s == *untold.begin()
-            ? ", or such in which these signals move farther; not told yet is what moves with "
-            : ", ";
-    result += structure.signals[static_cast<std::size_t>(s)].name;
-  }
-  return result;
-}
-
-template <typename Signals>
-std::string names_of(const Signals& signals, const LearnedStructure& structure) {
-  std::string result;
-  for (const int s : signals)
-    result += (result.empty() ? "" : ", ") + structure.signals[static_cast<std::size_t>(s)].name;
-  return result.empty() ? "nothing" : result;
-}
-
-// Why `part`, which was seen, is not connected to the root's component.
-UnconnectedPart explain(int part, int num_seen, const std::set<int>& connected,
-                        const LearnedStructure& structure, int max_signals, int num_actions) {
-  int common = 0, partner = -1;
-  bool undecided = false, was_soft_tried = false, is_redundant = false, moves_little = false;
-  std::set<int> untold;
-  std::optional<ContestedSignals> contested;
-  for (const auto& [pair, record] : structure.search.records) {
-    if (pair.first != part && pair.second != part) continue;
-    const int other = pair.first == part ? pair.second : pair.first;
-    if (!connected.count(other)) continue;
-    undecided |= !record.undecided.empty();
-    untold.insert(record.untold_signals.begin(), record.untold_signals.end());
-    was_soft_tried |= record.was_soft_tried;
-    moves_little |= record.moves_little;
-    is_redundant |= record.is_redundant;
-    if (record.contested) contested = record.contested;
-    if (record.num_common > common) {
-      common = record.num_common;
-      partner = other;
-    }
-  }
-  if (!structure.position_parts.empty() && connected.empty())
-    return {part, Unconnected::kNotEnoughData,
-            "the root has positions alone: give its orientations, or choose another root"};
-  if (std::binary_search(structure.position_parts.begin(), structure.position_parts.end(), part)) {
-    const auto leaf = structure.open_leaves.find(part);
-    const OpenLeaf why =
-        leaf != structure.open_leaves.end()
-            ? leaf->second
-            : OpenLeaf{true,
-                       "the part that it hangs on is not connected, or its model is not valid "
-                       "any more"};
-    return {part, why.is_data_missing ? Unconnected::kNotEnoughData : Unconnected::kNoValidModel,
-            "seen " + std::to_string(num_seen) + " times without orientation; " + why.reason};
-  }
-  // With fewer numbers than five a parameter of the largest model, its refusal says little.
-  const int parameters = 6 + 6 * max_signals;
-  const std::string seen =
-      "seen " + (num_seen == 1 ? "once" : std::to_string(num_seen) + " times") + ", at most " +
-      std::to_string(common) + " of them together with one connected part" +
-      (partner >= 0 ? " (" + std::to_string(partner) + ")" : "");
-  if (structure.is_contested)
-    return {part, Unconnected::kNotEnoughData,
-            seen +
-                "; another structure fits if the noise is larger than it is said to be: tell "
-                "the true noise, or give more samples"};
-  if (is_redundant)
-    return {part, Unconnected::kNoValidModel,
-            seen +
-                "; a model is valid, but has a joint that the others make needless, and without "
-                "it none is: more of the poses are wrong, or further off, than is told, or its "
-                "marker is of another size"};
-  if (contested)
-    return {part, Unconnected::kNotEnoughData,
-            seen + "; either " + names_of(contested->of_screws, structure) +
-                " moves it and poses are noisier than assumed, or " +
-                names_of(contested->of_process, structure) +
-                " in a way that no joints have: tell the true noise (--noise)"};
-  if (moves_little)
-    return {part, Unconnected::kNotEnoughData,
-            seen +
-                "; it moves too little beside its noise to tell the joints that move it: move all "
-                "signals farther"};
-  if (!undecided && 6 * common >= 5 * parameters)
-    return {part, Unconnected::kNoValidModel,
-            seen + "; no model with up to " + std::to_string(max_signals) +
-                " signals is valid to any connected part" +
-                (was_soft_tried ? ", nor any with a Gaussian process beside its joints" : "") +
-                (is_guess_too_large(structure)
-                     ? "; their noise is guessed from what these models leave: tell it (--noise)"
-                 : structure.noise_source == NoiseSource::kAssumed
-                     ? "; how noisy poses are is not known: tell it (--noise)"
-                     : "")};
-  return {part, Unconnected::kNotEnoughData,
-          seen + "; " + wanted_samples(common, untold, num_actions, max_signals, structure)};
-}
-
-// Signals that no edge uses although one may have to: they moved too little for a joint of
-// kLeastTurn (over their limits, where these are known) to show, or a part waits for its edge. And
-// those that a soft edge may use in vain.
-std::vector<int> undecided_signals(const BodySchema& schema, const LearnedStructure& structure) {
-  std::set<int> result;
-  for (const AcceptedModel& model : structure.search.models)
-    result.insert(model.doubtful_signals.begin(), model.doubtful_signals.end());
-  for (const int s : schema.unused_signals()) {
-    const auto information = structure.search.joint_information.find(s);
-    if (schema.complete && information != structure.search.joint_information.end()) {
-      const Signal& signal = schema.signals[static_cast<std::size_t>(s)];
-      const double range = signal.upper - signal.lower;
-      const double share =
-          range > 0 ? std::min(1.0, 2 * structure.actions.half_range(s) / range) : 1;
-      const double turn = share * kLeastTurn;
-      if (turn * turn * information->second >= kNoticed) continue;
-    }
-    result.insert(s);
-  }
-  return {result.begin(), result.end()};
-}
-
-int count_actions(const std::vector<ActionPoseSample>& samples) {
-  std::set<std::vector<double>> actions;
-  for (const ActionPoseSample& sample : samples)
-    actions.emplace(sample.action.begin(), sample.action.end());
-  return static_cast<int>(actions.size());
 }
 
 int check_actions(const std::vector<ActionPoseSample>& samples, std::size_t num_signals) {
@@ -250,8 +109,8 @@ LearnResult fit_tree(const LearnedStructure& structure,
       options.expected_parts,
       [&](int part) {
         const int num_moving = static_cast<int>(actions.moving().size());
-        return explain(part, count_common(samples, part, part), connected, structure,
-                       std::min(options.max_signals, num_moving), count_actions(samples));
+        return explain_unconnected(part, samples, connected, structure,
+                                   std::min(options.max_signals, num_moving));
       },
       &schema);
   schema.undecided_signals = undecided_signals(schema, structure);
@@ -324,7 +183,7 @@ LearnedStructure find_with_bias(const std::vector<Signal>& signals,
   };
   set_noise(samples);
   // What many joints leave by that much is no noise either.
-  if (is_guess_too_large(measurement, noise_source))
+  if (noise_source == NoiseSource::kResiduals && is_above_any_marker(*measurement.noise))
     search_options.max_signals = std::min(search_options.max_signals, kMaxScreenedJoints);
   NormalizedActions actions(samples, num_signals);
   SearchResult search = search_structure(samples, actions, parts, search_options);
@@ -447,6 +306,19 @@ std::optional<Noise> noise_instead(const LearnedStructure& by_told,
                std::max(told->rotation_rad, shown->rotation_rad)};
 }
 
+// Takes back the edges whose motion the commands of other times explain nearly as well.
+void withdraw_what_is_by_chance(const std::vector<ActionPoseSample>& samples,
+                                LearnedStructure* structure) {
+  const std::vector<ActionPoseSample> moved = displaced(samples, structure->signals);
+  const SurrogateCommands others(moved, static_cast<int>(structure->signals.size()),
+                                 structure->options.measurement);
+  std::erase_if(structure->search.models, [&](const AcceptedModel& model) {
+    if (others.are_worse(model)) return false;
+    structure->search.records.at(std::minmax(model.part_i, model.part_j)).is_by_chance = true;
+    return true;
+  });
+}
+
 }  // namespace
 
 LearnedStructure find_structure(const std::vector<Signal>& signals,
@@ -466,7 +338,7 @@ LearnedStructure find_structure(const std::vector<Signal>& signals,
     };
     return confirmed_structure(find, [&](LearnedStructure* found) {
       // With enough noise a screw passes for anything soft: nothing is tried beside it.
-      if (!is_guess_too_large(*found))
+      if (!found->is_noise_guessed_too_large())
         connect_soft_parts(displaced(poses, found->signals), found->actions, found->parts,
                            found->options, found->noise_source == NoiseSource::kResiduals,
                            &found->search);
@@ -480,6 +352,7 @@ LearnedStructure find_structure(const std::vector<Signal>& signals,
     found.noise_source = NoiseSource::kResiduals;
     if (!has_soft_edge(found.search)) structure = std::move(found);
   }
+  withdraw_what_is_by_chance(poses, &structure);
   structure.position_parts = alone;
   if (!alone.empty()) attach_leaves(distinct, options, &structure);
   return structure;

@@ -77,6 +77,11 @@ struct LearnedStructure {
 
   /// The edges span all parts seen.
   bool spans() const { return search.models.size() + 1 >= parts.size(); }
+  /// What the best models leave is above any marker's noise.
+  bool is_noise_guessed_too_large() const {
+    return noise_source == NoiseSource::kResiduals &&
+           is_above_any_marker(*options.measurement.noise);
+  }
 };
 /// Where the residuals refute the noise told, a larger one (see confirmed_structure.h); of poses at
 /// rest where no multiple of it stands, the estimate of noise_estimate.h if that is much more.

@@ -248,6 +248,7 @@ class HelpNeverActs(GroupTest):
         for word in ("halt", "target", "follow", "where", "hold", "release", "resume", "fault"):
             out, code = self.run_to_end(word, "--help")
             self.assertEqual((out, code), (f"{word} --help\n", 0))
+        self.assertEqual(self.run_to_end("fault", "bend", "--help")[0], "fault bend --help\n")
         self.run_to_end("--rig", "arm2", "--help")
         self.run_to_end("stop", "--now")
         self.assertFalse(self.group().has_ended())

@@ -94,6 +94,12 @@ TEST_F(BodyschemaProgramTest, ReachFindsTheActionOfAPoseOrTheNearest) {
   EXPECT_GT(nearest["position_error_m"].get<double>(), 5);
   EXPECT_NE(nearest["why"].get<std::string>().find("out of reach"), std::string::npos);
 
+  const auto reach_at = [&](const char* x) {
+    return run({"reach", "schema.lcmlog", "--part", "5", "--json", "--position", x, "0", "-.5"})
+        .out;
+  };
+  EXPECT_EQ(reach_at("-.25"), reach_at("-0.25"));
+
   const std::vector<std::string> of_none = {
       "reach", "schema.lcmlog", "--part", "77", "--position", "0", "0", "0"};
   expect_failure(of_none, "--part");
@@ -105,6 +111,9 @@ TEST_F(BodyschemaProgramTest, ReachFindsTheActionOfAPoseOrTheNearest) {
   expect_failure(
       {"reach", "schema.lcmlog", "--part", "5", "--position", "0", "0", "0", "--from", "1"},
       "--from");
+  expect_failure(
+      {"reach", "schema.lcmlog", "--part", "5", "--position", "0", "0", "0", "--from", "1e9", "0"},
+      "beyond its limits");
 }
 
 TEST_F(BodyschemaProgramTest, APredictionSaysHowWellItIsKnownAndWhatWasNeverTried) {

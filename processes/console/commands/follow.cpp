@@ -22,6 +22,8 @@
 #include "processes/console/commands/commands.h"
 #include "processes/console/commands/session.h"
 #include "processes/console/hint.h"
+#include "processes/console/interruption.h"
+#include "processes/console/progress_line.h"
 #include "processes/console/views/prediction_view.h"
 #include "processes/console/way_points.h"
 #include "processes/controller/trajectory.h"
@@ -114,7 +116,13 @@ void check_reach(const Heard& heard, const FollowArguments& arguments,
   if (trajectory.leg(0).front().q_RT && !schema.has_rotation(part))
     throw std::runtime_error(
         fmt::format("of part {} positions alone are known: leave out qw,qx,qy,qz", part));
-  const std::string why = trajectory.objection(schema, part, action, limits_of(arguments));
+  ProgressLine line;
+  const auto show = [&](std::size_t n) {
+    if (is_interrupted()) throw std::runtime_error("interrupted; nothing was moved");
+    line.show(
+        fmt::format("looking at the way to point {} of {}", n + 1, trajectory.num_way_points()));
+  };
+  const std::string why = trajectory.objection(schema, part, action, limits_of(arguments), show);
   if (!why.empty()) throw std::runtime_error(why + "; nothing was moved");
 }
 

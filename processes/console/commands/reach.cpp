@@ -46,6 +46,12 @@ Eigen::VectorXd start_of(const ReachArguments& arguments, const BodySchema& sche
   if (arguments.from.size() != schema.signals.size())
     refuse_argument(
         "--from", fmt::format("expected {} values, in the schema's order", schema.signals.size()));
+  for (std::size_t s = 0; s < schema.signals.size(); ++s) {
+    const Signal& signal = schema.signals[s];
+    if (arguments.from[s] < signal.lower || arguments.from[s] > signal.upper)
+      refuse_argument("--from", fmt::format("{} = {} is beyond its limits {} … {}", signal.name,
+                                            arguments.from[s], signal.lower, signal.upper));
+  }
   return Eigen::VectorXd::Map(arguments.from.data(),
                               static_cast<Eigen::Index>(arguments.from.size()));
 }

@@ -14,6 +14,7 @@
 #include "common/text/text.h"
 #include "processes/console/hint.h"
 #include "processes/console/interruption.h"
+#include "processes/console/progress_line.h"
 
 namespace bodyschema {
 namespace {
@@ -21,23 +22,6 @@ namespace {
 constexpr std::int64_t kAlone_us = 2'500'000;  // twice what the processes of a group repeat in
 constexpr std::int64_t kGone_us = 10'000'000;  // everybody was heard once, and nobody for so long
 constexpr std::chrono::milliseconds kTurn{50};
-
-/// A terminal gets a line that rewrites itself, a file a line for each change.
-class ProgressLine {
- public:
-  ~ProgressLine() {
-    if (is_terminal_ && !shown_.empty()) std::cerr << "\r\x1b[2K" << std::flush;
-  }
-  void show(const std::string& line) {
-    if (line == shown_) return;
-    shown_ = line;
-    std::cerr << (is_terminal_ ? in_place(line, STDERR_FILENO) : line + "\n") << std::flush;
-  }
-
- private:
-  const bool is_terminal_ = isatty(STDERR_FILENO) == 1;
-  std::string shown_;
-};
 
 }  // namespace
 

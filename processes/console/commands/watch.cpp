@@ -29,6 +29,7 @@
 #include "processes/console/hint.h"
 #include "processes/console/interruption.h"
 #include "processes/console/picture.h"
+#include "processes/console/progress_line.h"
 #include "processes/console/run_watch.h"
 #include "processes/console/views/run_result.h"
 #include "processes/motor_babbler/motor_babbler.h"
@@ -50,27 +51,6 @@ struct WatchArguments {
   std::string replay;
   std::string replay_from;
   double speed = 0;
-};
-
-class ProgressLine {
- public:
-  void show(const std::string& line, bool now) {
-    // A terminal gets a line that rewrites itself, a file one line every five seconds.
-    if (!now && clock_us() - shown_us_ < (is_terminal_ ? 100'000 : 5'000'000)) return;
-    shown_us_ = clock_us();
-    if (is_terminal_) {
-      std::cerr << in_place(line, STDERR_FILENO) << std::flush;
-    } else {
-      std::cerr << line << std::endl;
-    }
-  }
-  void end() {
-    if (is_terminal_) std::cerr << std::endl;
-  }
-
- private:
-  const bool is_terminal_ = isatty(STDERR_FILENO);
-  std::int64_t shown_us_ = 0;
 };
 
 /// Plays a recording onto the bus with lcm-logplayer: what the learning half of the group needs,
@@ -208,10 +188,10 @@ class WatchSession {
       bus_.handle(std::chrono::milliseconds(50));
       intake_.on_tick(clock_us());
       note_progress();
-      line_.show(progress_line(), false);
+      line_.show_at_times(progress_line());
       tell_of_trouble();
     }
-    line_.show(progress_line(), true);
+    line_.show(progress_line());
     line_.end();
     finish();
     if (is_interrupted()) throw std::runtime_error("interrupted before the end");

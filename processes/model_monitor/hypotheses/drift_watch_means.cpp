@@ -182,7 +182,7 @@ void DriftWatch::correlate(const ElementId& tag) {
 }
 
 std::optional<double> DriftWatch::worth() const {
-  double no_correlation = 0;
+  double no_correlation = 0, variance = 0;
   std::array<double, kLags.size()> correlation{};
   for (std::size_t lag = 0; lag < kLags.size(); ++lag) {
     double products = 0, squares = 0, size = 0;
@@ -196,13 +196,14 @@ std::optional<double> DriftWatch::worth() const {
     }
     if (size < kFewestProducts || squares <= 0) return std::nullopt;
     correlation[lag] = products / squares;
+    variance = std::clamp(squares / (6 * size), 1e-3, 1.0);
     no_correlation = std::max(kNoCorrelation, 3 / std::sqrt(6 * size));
   }
   const auto [near, far] = correlation;
   if (near < no_correlation) return 1;
   const double ratio = std::clamp(far / near, 1e-3, 0.99);
   const double phi = std::pow(ratio, 1.0 / static_cast<double>(kLags[1] - kLags[0]));
-  return 1 / (1 + 2 * near / (1 - phi));
+  return std::min(1.0, 1 / (variance * (1 + 2 * near / (1 - phi))));
 }
 
 }  // namespace bodyschema

@@ -46,6 +46,7 @@ struct PairRecord {
   std::set<int> untold_signals = {};
   /// A valid model has a joint that its tree does not need: redundant_edges().
   bool is_redundant = false;
+  bool is_by_chance = false;  ///< commands of other times explain its motion nearly as well
   std::optional<ContestedSignals> contested = {};
 
   void note_undecided(int num_signals, double mean_capped);

@@ -20,6 +20,7 @@ TEST(WayPointsTest, PositionsAndPosesAreReadAsTheyStand) {
   EXPECT_EQ(positions[0].p_RT, Eigen::Vector3d(0.1, -0.2, 0.3));
   EXPECT_FALSE(positions[0].q_RT);
   EXPECT_EQ(positions[1].p_RT, Eigen::Vector3d(0.4, 0.5, 0.6));
+  EXPECT_EQ(parse_way_points("\xEF\xBB\xBFx,y,z\n1,2,3\n", "").size(), 1U);
   const auto poses = parse_way_points("x,y,z,qw,qx,qy,qz\n0,0,1,0.6,0,0,-0.8\n", "");
   ASSERT_EQ(poses.size(), 1U);
   ASSERT_TRUE(poses[0].q_RT);

@@ -94,6 +94,20 @@ TEST(TrajectoryTest, WhatIsWithinReachHasNoObjection) {
   EXPECT_EQ(objection(schema, from, {at(schema, {0.4, -0.8}), at(schema, {0.3, -1.2})}), "");
 }
 
+TEST(TrajectoryTest, ALongLookCanBeEnded) {
+  const BodySchema schema = two_links();
+  const Eigen::Vector2d from(0.5, -1);
+  const Trajectory trajectory(
+      {at(schema, {0.4, -0.8}), at(schema, {0.3, -1.2}), at(schema, {0.4, -0.8})}, 0.02);
+  std::size_t newest = 0;
+  const auto end = [&](std::size_t n) {
+    newest = n;
+    if (n == 1) throw std::runtime_error("interrupted");
+  };
+  EXPECT_THROW(trajectory.objection(schema, 3, from, kLimits, end), std::runtime_error);
+  EXPECT_EQ(newest, 1U);
+}
+
 TEST(TrajectoryTest, ALegThatLeavesTheReachIsNamedThoughItsEndsAreWithin) {
   // The first link turns by ±2 rad only: what is straight behind the arm is out of reach.
   const BodySchema schema = two_links();

@@ -139,25 +139,42 @@ class OddNoise {
   std::map<int, Vector6d> errors_;  ///< by part, the newest
 };
 
+/// What 200 samples of noise say, where it is taken to be `scale` times as large.
+std::optional<double> worth_of_noise(double correlation, double scale) {
+  BrokenArm arm({Fault::kNone, "", 1}, Regime::kFree, 75, 1);
+  const BodySchema& schema = arm.engineered();
+  MeasurementModel measurement = adaptation_options(Regime::kTagIso).measurement;
+  measurement.scale = scale;
+  const TreeFilter filter(schema, measurement);
+  DriftWatch watch(1e-5);
+  OddNoise noise(correlation, 0, 5);
+  EXPECT_FALSE(watch.worth());
+  for (int t = 0; t < 200; ++t) {
+    ActionPoseSample sample = arm.observe(t);
+    noise.add_to(&sample);
+    watch.add(filter, filter.prepare(sample), schema, schema.displacements(sample.action), t);
+  }
+  return watch.worth();
+}
+
 TEST(OddNoiseTest, CorrelatedSamplesAreWorthFewer) {
   for (const double correlation : {0.0, 0.9}) {
-    BrokenArm arm({Fault::kNone, "", 1}, Regime::kFree, 75, 1);
-    const BodySchema& schema = arm.engineered();
-    const TreeFilter filter(schema, adaptation_options(Regime::kTagIso).measurement);
-    DriftWatch watch(1e-5);
-    OddNoise noise(correlation, 0, 5);
-    EXPECT_FALSE(watch.worth());
-    for (int t = 0; t < 200; ++t) {
-      ActionPoseSample sample = arm.observe(t);
-      noise.add_to(&sample);
-      watch.add(filter, filter.prepare(sample), schema, schema.displacements(sample.action), t);
-    }
-    ASSERT_TRUE(watch.worth());
+    const std::optional<double> worth = worth_of_noise(correlation, 1);
+    ASSERT_TRUE(worth);
     // (1 − r)/(1 + r) = 0.053 of a marker alone; a part of what it is compared with turns with the
     // arm from sample to sample.
-    EXPECT_LE(*watch.worth(), correlation > 0 ? 0.2 : 1);
-    EXPECT_GE(*watch.worth(), correlation > 0 ? 0.03 : 1);
+    EXPECT_LE(*worth, correlation > 0 ? 0.2 : 1);
+    EXPECT_GE(*worth, correlation > 0 ? 0.03 : 1);
   }
+}
+
+// What is counted is the variance of a mean: told three times as large as it is, that of nine
+// correlated samples is what one was told to have.
+TEST(OddNoiseTest, CorrelatedNoiseThatIsSmallerThanToldHidesLittle) {
+  const std::optional<double> true_to_size = worth_of_noise(0.9, 1);
+  const std::optional<double> smaller = worth_of_noise(0.9, 3);
+  ASSERT_TRUE(true_to_size && smaller);
+  EXPECT_NEAR(*smaller, std::min(1.0, 9 * *true_to_size), 0.2);
 }
 
 // tests/experiments/results/imperfect_streams.md has whole rows.
@@ -185,6 +202,28 @@ TEST(OddNoiseTest, AHealthyArmIsLeftInPeaceAndABentOneIsFound) {
     // One false episode, of three events; 14 events and more while neither correlations nor the
     // rate of outliers were estimated.
     EXPECT_LE(num_false, 3) << c.correlation << ", " << c.student_nu;
+  }
+}
+
+// What a model is off by repeats along a path: correlated, and far below the noise that is told.
+TEST(OddNoiseTest, ABendAmongSmallCorrelatedNoiseIsFoundAtOnce) {
+  constexpr int kHealthy = 120;
+  for (const int seed : {1, 2, 3}) {
+    BrokenArm arm({Fault::kBend, "", 1, 0, 0, 0.5}, Regime::kFree, kHealthy, seed);
+    AdaptationOptions options = adaptation_options(Regime::kTagIso, 4);
+    options.least_noise_scale = 1;
+    Adaptation adaptation(arm.engineered(), options);
+    OddNoise noise(0.95, 0, seed);
+    int found = 1000;
+    for (int t = 0; t < kHealthy + 40; ++t) {
+      ActionPoseSample sample = arm.observe(t);
+      noise.add_to(&sample);
+      for (const AdaptationEvent& event : adaptation.on_sample(sample)) {
+        EXPECT_GE(t, kHealthy) << test::text(event);
+        if (event.to == 5) found = std::min(found, t - kHealthy + 1);
+      }
+    }
+    EXPECT_LE(found, 6) << "seed " << seed;
   }
 }
 

@@ -56,6 +56,25 @@ TEST(UnrelatedCommands, MoveNothing) {
       }
 }
 
+// What is slow in commands and poses agrees by chance; of short streams more than of long ones.
+TEST(UnrelatedCommands, OfAStreamMoveNothing) {
+  struct Case {
+    int num_samples;
+    double period;
+    std::uint64_t seed;
+  };
+  for (const Case& c : {Case{300, 60, 1}, Case{300, 60, 4}, Case{40, 30, 0}, Case{40, 30, 1}}) {
+    ImperfectRobot robot(2, true, {.name = "none"}, c.seed);
+    auto samples = robot.wander(c.num_samples, c.period);
+    const BodySchema right = learn(robot.signals(), samples, options_of(std::nullopt)).schema;
+    EXPECT_TRUE(is_right(right, robot.structure())) << c.num_samples << " seed " << c.seed;
+    for (std::size_t first = 0, last = samples.size() - 1; first < last; ++first, --last)
+      std::swap(samples[first].action, samples[last].action);
+    const BodySchema wrong = learn(robot.signals(), samples, options_of(std::nullopt)).schema;
+    EXPECT_FALSE(wrong.complete) << c.num_samples << " seed " << c.seed;
+  }
+}
+
 // The hand's marker is 3 % larger than told: a chain from the root on all signals fits all the
 // same.
 TEST(WrongMarkerSize, IsNoOtherTree) {

@@ -1,0 +1,29 @@
+#pragma once
+
+#include <cstdint>
+#include <string>
+
+namespace bodyschema {
+
+/// What a command is at, on stderr: a terminal gets a line that rewrites itself, a file one line
+/// after another.
+class ProgressLine {
+ public:
+  /// The line is gone from a terminal.
+  ~ProgressLine();
+  /// Each change.
+  void show(const std::string& line);
+  /// For what changes all the time: a terminal gets it ten times a second, a file every five
+  /// seconds.
+  void show_at_times(const std::string& line);
+  /// The line stays.
+  void end();
+
+ private:
+  const bool is_terminal_ = is_on_terminal();
+  static bool is_on_terminal();
+  std::string shown_;
+  std::int64_t shown_us_ = 0;
+};
+
+}  // namespace bodyschema
