@@ -2,6 +2,7 @@
 
 import argparse
 import difflib
+import itertools
 import os
 import re
 import signal
@@ -89,7 +90,8 @@ def asks_for_help(arguments):
 def show_help(place, name, arguments):
     """Prints the help of a word; that of the console's words only if the console is built, because help builds nothing."""
     if (name not in WORDS or name in OPTIONS_OF_THE_CONSOLE) and place.console.exists():
-        return console(place, name, arguments)
+        words = itertools.takewhile(lambda argument: not argument.startswith("-"), arguments)
+        return console(place, name, [*words, "--help"])
     if name not in WORDS:
         raise Failure(f"{name} --help is known once there is a build: ./run --build-only")
     print(usage(name, WORDS[name][1:]))
@@ -310,7 +312,8 @@ def console(place, word, arguments):
     if asks_group and not asks_for_help(arguments):
         group = Group.find(place.logs)
         if group:
-            exec_in_group(place, group, ["bodyschema", word, *arguments])
+            rig = ["--rig", str(group.run / "config")] if word == "follow" and "--rig" not in arguments else []
+            exec_in_group(place, group, ["bodyschema", word, *arguments, *rig])
         # The user names the bus of a lab's own group.
         if "LCM_DEFAULT_URL" not in os.environ and "--in" not in arguments:
             raise Failure(f"no group runs here; start one with ./run --keep, or name a bus: LCM_DEFAULT_URL=URL ./run {word} …")

@@ -4,8 +4,8 @@
 
 #include <CLI/CLI.hpp>
 #include <algorithm>
-#include <cctype>
 #include <cstdio>
+#include <cstdlib>
 #include <exception>
 #include <iostream>
 #include <stdexcept>
@@ -36,11 +36,19 @@ std::string unknown_command(const CLI::App& console) {
                      bodyschema::fit(*word, 40), names);
 }
 
-/// What was typed, the last word first, as CLI11 takes it; of it "-.5" would be an option.
+bool is_number(const std::string& word) {
+  char* end = nullptr;
+  std::strtod(word.c_str(), &end);
+  return !word.empty() && *end == '\0';
+}
+
+/// What was typed, the last word first, as CLI11 takes it: to it "-.5" would be an option.
 std::vector<std::string> words_of(int argc, char** argv) {
   std::vector<std::string> words(argv + std::min(argc, 1), argv + argc);
-  for (std::string& word : words)
-    if (word.size() > 2 && word.starts_with("-.") && std::isdigit(word[2])) word.insert(1, "0");
+  for (std::string& word : words) {
+    if (word == "--") break;
+    if (word.starts_with("-.") && is_number(word)) word.insert(1, "0");
+  }
   std::reverse(words.begin(), words.end());
   return words;
 }

@@ -27,7 +27,7 @@ void ProgressLine::show(const std::string& line) {
   std::cerr << (is_terminal_ ? in_place(line, STDERR_FILENO) : line + "\n") << std::flush;
 }
 
-void ProgressLine::show_at_times(const std::string& line) {
+void ProgressLine::show_throttled(const std::string& line) {
   if (clock_us() - shown_us_ >= (is_terminal_ ? kOnTerminal_us : kInFile_us)) show(line);
 }
 

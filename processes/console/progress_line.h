@@ -9,13 +9,16 @@ namespace bodyschema {
 /// after another.
 class ProgressLine {
  public:
+  ProgressLine() = default;
+  ProgressLine(const ProgressLine&) = delete;
+  ProgressLine& operator=(const ProgressLine&) = delete;
   /// The line is gone from a terminal.
   ~ProgressLine();
   /// Each change.
   void show(const std::string& line);
-  /// For what changes all the time: a terminal gets it ten times a second, a file every five
-  /// seconds.
-  void show_at_times(const std::string& line);
+  /// For what changes all the time: a terminal gets it at most ten times a second, a file every
+  /// five seconds.
+  void show_throttled(const std::string& line);
   /// The line stays.
   void end();
 

@@ -73,6 +73,7 @@ void TargetFollower::on_control_status(const control_status_t& status) {
     return;
   }
   is_acknowledged_ = true;
+  had_arm_ |= status.owns_arm == 1;
   status_ = status;
   const std::int8_t state = status.control_state;
   if (target_.target_kind == pose_target_t::KIND_HOLD) {
@@ -118,7 +119,8 @@ pose_target_t TargetFollower::withdrawal() const {
   target.target_part = -1;
   target.keep_s = -1;
   // A controller that did not acknowledge may have the arm, and the target in its queue.
-  const bool is_babblers = is_acknowledged_ && status_.owns_arm == 0;
+  // Nor does it go back to the babbler because it is lent to it.
+  const bool is_babblers = is_acknowledged_ && !had_arm_ && status_.owns_arm == 0;
   target.target_kind = is_babblers ? pose_target_t::KIND_RELEASE : pose_target_t::KIND_HOLD;
   return target;
 }

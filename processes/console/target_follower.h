@@ -70,6 +70,7 @@ class TargetFollower {
   std::int64_t started_us_ = -1;
   std::int64_t sent_us_ = -1;
   bool is_acknowledged_ = false;
+  bool had_arm_ = false;  ///< the controller, for this target
   End end_ = End::kOpen;
   control_status_t status_{};
   bool has_controller_ = false;

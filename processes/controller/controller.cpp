@@ -197,6 +197,7 @@ void Controller::on_driver(const motion_status_t& motion, bool is_foreign, bool 
     return;
   }
   fire(Event::kResumed, kWasHalted);
+  if (why_ == kHalted) why_ = kWasHalted;
   if (began_anew &&
       fire(Event::kDriverRestarted, "the driver began anew: its time or its answers went back"))
     ++counters_["driver began anew"];

@@ -76,9 +76,10 @@ struct ControllerConfig {
 /// A probe that the monitor wants while an edge on the way is PROVISIONAL is made before the next
 /// step, as slowly as steps are then; refused by the driver, it is done without. While an edge is
 /// INVALID the arm is moved a little about the place where that was heard, so that the monitor sees
-/// what changed; where max_searches samples do not mend it, the arm is lent to the babbler. Nothing
-/// lasts for ever: an arm that does not come to rest within rest_timeout, a MOVE that does not end
-/// within it, or an arm that is lent for lent_timeout without a new SAMPLE, ends the target.
+/// what changed; where max_searches samples do not mend it, the arm is lent to the babbler, on a
+/// path held. Nothing lasts for ever: an arm that does not come to rest within rest_timeout, a MOVE
+/// that does not end within it, or an arm that is lent for lent_timeout without a new SAMPLE, ends
+/// the target.
 ///
 /// Start guard: nothing is sent before MOTION_STATUS, BODY_SCHEMA and MARKER_POSES of the present
 /// rest were heard, and no MOVE from a position that was not heard: the last settled action of this
@@ -203,6 +204,8 @@ class Controller {
   Eigen::Vector3d aim() const;
   /// offset_ with what is seen [its mean and covariance]. std::nullopt: that is noise.
   std::optional<Offset> updated_offset(const Offset& seen) const;
+  /// Nothing was seen at this rest.
+  void forget_sight();
   void observe(const sample_t& sample);
   void update_predicted_errors();
 

@@ -162,9 +162,13 @@ std::optional<Controller::Offset> Controller::updated_offset(const Offset& seen)
   return Offset{before + K * surprise, P - K * P};
 }
 
-void Controller::observe(const sample_t& message) {
+void Controller::forget_sight() {
   observed_error_m_ = observed_error_rad_ = -1;
   observed_offset_.reset();
+}
+
+void Controller::observe(const sample_t& message) {
+  forget_sight();
   if (!schema_) return;
   ActionPoseSample sample = from_message(message);
   drop_moved_tags(schema_->moved_tags, &sample);

@@ -121,6 +121,12 @@ void Controller::decide() {
     search_centre_.reset();
   } else if (num_searches_ >= config_.max_searches) {
     goal_.reset();
+    // Nobody moves at random in the middle of a path.
+    if (target_.num_way_points > 0)
+      return fail(Event::kUnservable,
+                  edge + " is invalid, and " + std::to_string(num_searches_) +
+                      " actions did not mend it: release the arm, so that it is learned anew, then "
+                      "follow the path again");
     fire(Event::kBroken, edge + " is invalid: the babbler has the arm until it is mended");
     return;
   }
@@ -347,7 +353,10 @@ void Controller::strike(const std::string& why) {
 }
 
 void Controller::arrive() {
-  if (sample_ && sample_->rest_begin_utime == motion_->rest_since_utime) observe(*sample_);
+  if (sample_ && sample_->rest_begin_utime == motion_->rest_since_utime)
+    observe(*sample_);
+  else
+    forget_sight();
   update_predicted_errors();
   const bool is_off = observed_error_m_ > tolerance_m();
   const bool is_turned = observed_error_rad_ > tolerance_rad();

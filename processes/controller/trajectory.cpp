@@ -81,6 +81,10 @@ class Solver {
           "the arm would have to turn over and leave the line by {:.0f} mm: begin elsewhere, or go "
           "round by another point",
           off_m * 1e3);
+    if (std::string why = limits_.workspace.objection(step.p_RT); !why.empty()) return why;
+    if (std::string why = limits_.workspace.objection(schema_, action_, solution.action);
+        !why.empty())
+      return why;
     action_ = solution.action;
     return "";
   }
@@ -96,11 +100,14 @@ class Solver {
 
 /// "" or to which step of a leg there is an objection.
 std::string objection_to(const std::vector<PoseTarget>& leg, std::size_t n, std::size_t num_legs,
-                         Solver* solver) {
-  for (const PoseTarget& step : leg)
+                         Solver* solver,
+                         const std::function<void(std::size_t)>& on_step = nullptr) {
+  for (const PoseTarget& step : leg) {
+    if (on_step) on_step(n);
     if (const std::string why = solver->objection(step, n > 0); !why.empty())
       return fmt::format("the way to point {} of {}, at {:.3f} {:.3f} {:.3f}: {}", n + 1, num_legs,
                          step.p_RT.x(), step.p_RT.y(), step.p_RT.z(), why);
+  }
   return "";
 }
 
@@ -125,13 +132,11 @@ Trajectory::Trajectory(const std::vector<PoseTarget>& way_points, double step_m)
 
 std::string Trajectory::objection(const BodySchema& schema, int part, const Eigen::VectorXd& action,
                                   const Limits& limits,
-                                  const std::function<void(std::size_t)>& on_way_point) const {
+                                  const std::function<void(std::size_t)>& on_step) const {
   Solver solver(schema, part, action, limits);
-  for (std::size_t n = 0; n < legs_.size(); ++n) {
-    if (on_way_point) on_way_point(n);
-    if (std::string why = objection_to(legs_[n], n, legs_.size(), &solver); !why.empty())
+  for (std::size_t n = 0; n < legs_.size(); ++n)
+    if (std::string why = objection_to(legs_[n], n, legs_.size(), &solver, on_step); !why.empty())
       return why;
-  }
   return "";
 }
 

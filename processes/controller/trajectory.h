@@ -7,6 +7,7 @@
 
 #include "common/schema/body_schema.h"
 #include "processes/controller/inverse_kinematics.h"
+#include "processes/controller/workspace.h"
 
 namespace bodyschema {
 
@@ -19,6 +20,7 @@ class Trajectory {
     double position_sd_m = 0;           ///< of the part's position; what is unknown counts as 0
     double error_m = 0, error_rad = 0;  ///< of the solution, to the step
     double off_line_m = 0;  ///< of the part on its way; to the first way point it goes as it likes
+    Workspace workspace = {};  ///< of all parts on their way
   };
 
   /// One step to the first way point; then straight lines in equal steps of at most `step_m`, the
@@ -33,11 +35,11 @@ class Trajectory {
   const std::vector<PoseTarget>& leg(std::size_t n) const { return legs_[n]; }
 
   /// "" or which step an arm at `action` cannot make, and why: every one is solved by the schema
-  /// from the solution of the one before. `on_way_point` gets n before each. @throws as
-  /// solve_pose() and on_way_point.
+  /// from the solution of the one before. `on_step` gets n before each step to way point n. @throws
+  /// as solve_pose() and on_step.
   std::string objection(const BodySchema& schema, int part, const Eigen::VectorXd& action,
                         const Limits& limits,
-                        const std::function<void(std::size_t n)>& on_way_point = nullptr) const;
+                        const std::function<void(std::size_t n)>& on_step = nullptr) const;
   /// The same of leg `n` alone, from where the arm is before it.
   std::string objection_to_leg(std::size_t n, const BodySchema& schema, int part,
                                const Eigen::VectorXd& action, const Limits& limits) const;

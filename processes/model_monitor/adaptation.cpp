@@ -138,7 +138,9 @@ std::int64_t Adaptation::since() const {
 }
 
 void Adaptation::set_noise_scale(double scale) {
+  const double before = measurement_.scale;
   measurement_.scale = std::clamp(scale, options_.least_noise_scale, kLargestScale);
+  drift_watch_.rescale_noise(measurement_.scale / before);
 }
 
 void Adaptation::calibrate(const std::vector<ActionPoseSample>& samples) {

@@ -306,16 +306,25 @@ std::optional<Noise> noise_instead(const LearnedStructure& by_told,
                std::max(told->rotation_rad, shown->rotation_rad)};
 }
 
-// Takes back the edges whose motion the commands of other times explain nearly as well.
+// Takes back the edges that may be by chance, after the search: what they kept out is
+// not tried.
 void withdraw_what_is_by_chance(const std::vector<ActionPoseSample>& samples,
                                 LearnedStructure* structure) {
   const std::vector<ActionPoseSample> moved = displaced(samples, structure->signals);
   const SurrogateCommands others(moved, static_cast<int>(structure->signals.size()),
                                  structure->options.measurement);
+  // Poses at rest are independent: the noise that is known says enough.
+  const bool is_assumed = structure->noise_source == NoiseSource::kAssumed;
+  if (!others.is_stream() && structure->noise_source != NoiseSource::kResiduals && !is_assumed)
+    return;
+  const bool is_doubtful = is_assumed || structure->is_noise_guessed_too_large();
   std::erase_if(structure->search.models, [&](const AcceptedModel& model) {
-    if (others.are_worse(model)) return false;
-    structure->search.records.at(std::minmax(model.part_i, model.part_j)).is_by_chance = true;
-    return true;
+    PairRecord& record = structure->search.records.at(std::minmax(model.part_i, model.part_j));
+    record.is_too_short |= others.is_short() && !model.soft_signals.empty();
+    record.is_by_chance |= others.explain_as_well(model, is_doubtful);
+    // Nothing says that what a rigid one leaves is no motion.
+    const bool is_motion = is_doubtful && model.model.joints.empty();
+    return record.is_too_short || record.is_by_chance || (is_motion && model.soft_signals.empty());
   });
 }
 

@@ -140,7 +140,13 @@ NormalizedActions::NormalizedActions(const std::vector<ActionPoseSample>& sample
   }
   std::vector<std::int64_t> utimes;
   for (const ActionPoseSample& sample : samples) utimes.push_back(sample.utime);
-  blocks_ = TimeBlocks(utimes, values_(moving_, Eigen::all));
+  blocks_ = TimeBlocks(utimes, moving_values());
+}
+
+NormalizedActions NormalizedActions::reordered(const std::vector<int>& order) const {
+  NormalizedActions result = *this;
+  result.values_ = values_(Eigen::all, order).eval();
+  return result;
 }
 
 std::vector<int> seen_parts(const std::vector<ActionPoseSample>& samples) {

@@ -26,6 +26,10 @@ class NormalizedActions {
   /// The signals that took more than one value, ascending. The others can explain nothing.
   const std::vector<int>& moving() const { return moving_; }
   const TimeBlocks& blocks() const { return blocks_; }
+  /// The commands of sample order[n] at sample n.
+  NormalizedActions reordered(const std::vector<int>& order) const;
+  /// Of the signals that move, signals × samples.
+  Eigen::MatrixXd moving_values() const { return values_(moving_, Eigen::all); }
 
  private:
   Eigen::MatrixXd values_;  // signals × samples

@@ -1,8 +1,6 @@
 #include "processes/structure_learner/unconnected.h"
 
 #include <algorithm>
-#include <cmath>
-#include <map>
 #include <optional>
 #include <set>
 #include <string>
@@ -53,7 +51,7 @@ int count_actions(const std::vector<ActionPoseSample>& samples) {
 struct TriedModels {
   int num_common = 0, partner = -1;  ///< most instants with one of them
   bool undecided = false, was_soft_tried = false;
-  bool is_redundant = false, is_by_chance = false, moves_little = false;
+  bool is_redundant = false, moves_little = false, is_by_chance = false, is_too_short = false;
   std::set<int> untold;
   std::optional<ContestedSignals> contested;
 };
@@ -62,6 +60,9 @@ TriedModels tried_models(int part, const std::set<int>& connected, const SearchR
   TriedModels tried;
   for (const auto& [pair, record] : search.records) {
     if (pair.first != part && pair.second != part) continue;
+    // What is by chance may have connected both.
+    tried.is_by_chance |= record.is_by_chance;
+    tried.is_too_short |= record.is_too_short;
     const int other = pair.first == part ? pair.second : pair.first;
     if (!connected.count(other)) continue;
     tried.undecided |= !record.undecided.empty();
@@ -69,7 +70,6 @@ TriedModels tried_models(int part, const std::set<int>& connected, const SearchR
     tried.was_soft_tried |= record.was_soft_tried;
     tried.moves_little |= record.moves_little;
     tried.is_redundant |= record.is_redundant;
-    tried.is_by_chance |= record.is_by_chance;
     if (record.contested) tried.contested = record.contested;
     if (record.num_common > tried.num_common) {
       tried.num_common = record.num_common;
@@ -104,6 +104,9 @@ std::string why_taken_back(const TriedModels& tried, const LearnedStructure& str
   if (tried.is_by_chance)
     return "commands of other times explain its motion nearly as well: record for longer, and "
            "check that each action is of the time of its poses";
+  if (tried.is_too_short)
+    return "no joints explain its motion, and the recording is too short to tell whether anything "
+           "else does: record for longer";
   if (tried.contested)
     return "either " + names_of(tried.contested->of_screws, structure) +
            " moves it and poses are noisier than assumed, or " +

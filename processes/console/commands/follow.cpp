@@ -26,6 +26,7 @@
 #include "processes/console/progress_line.h"
 #include "processes/console/views/prediction_view.h"
 #include "processes/console/way_points.h"
+#include "processes/controller/controller.h"
 #include "processes/controller/trajectory.h"
 
 namespace bodyschema {
@@ -43,6 +44,8 @@ struct FollowArguments {
   double step_m = 0.02;
   double timeout_s = 120;
   double tolerance_m = kSeenNear_m;
+  std::string rig;
+  Workspace workspace;  ///< of the rig
   bool json = false;
 };
 
@@ -101,7 +104,8 @@ Trajectory::Limits limits_of(const FollowArguments& arguments) {
   return {.position_sd_m = arguments.tolerance_m,
           .error_m = std::min(arguments.tolerance_m, kNear_m),
           .error_rad = kNear_rad,
-          .off_line_m = arguments.step_m};
+          .off_line_m = arguments.step_m,
+          .workspace = arguments.workspace};
 }
 
 /// Nothing is begun that the schema says cannot be ended. @throws std::runtime_error that says why
@@ -203,7 +207,10 @@ Json follow_json(const std::vector<Passed>& passed, std::size_t num_way_points) 
           {"probes", num_probes}};
 }
 
-void run_follow(const FollowArguments& arguments) {
+void run_follow(FollowArguments arguments) {
+  if (!arguments.rig.empty())
+    arguments.workspace =
+        ControllerConfig::load(std::filesystem::path(arguments.rig) / "controller.yaml").workspace;
   const Trajectory trajectory = read_trajectory(arguments);
   const std::size_t num_way_points = trajectory.num_way_points();
   Heard heard;
@@ -272,6 +279,9 @@ void add_follow_command(Arguments console) {
       .add_option("--tolerance", arguments->tolerance_m,
                   "A way point that is seen farther off [m] was missed; the path goes on")
       .check(within(1e-6, 1000), "NUMBER");
+  follow.add_option("--rig", arguments->rig,
+                    "Folder of the rig whose workspace is looked at beforehand; ./run follow names "
+                    "that of its group");
   follow.add_flag("--json", arguments->json, "The result as JSON");
   follow.callback([arguments] { run_follow(*arguments); });
 }

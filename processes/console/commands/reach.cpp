@@ -48,7 +48,8 @@ Eigen::VectorXd start_of(const ReachArguments& arguments, const BodySchema& sche
         "--from", fmt::format("expected {} values, in the schema's order", schema.signals.size()));
   for (std::size_t s = 0; s < schema.signals.size(); ++s) {
     const Signal& signal = schema.signals[s];
-    if (arguments.from[s] < signal.lower || arguments.from[s] > signal.upper)
+    const double rounding = 1e-3 * (signal.upper - signal.lower);
+    if (arguments.from[s] < signal.lower - rounding || arguments.from[s] > signal.upper + rounding)
       refuse_argument("--from", fmt::format("{} = {} is beyond its limits {} … {}", signal.name,
                                             arguments.from[s], signal.lower, signal.upper));
   }

@@ -1,7 +1,6 @@
 #include "processes/console/commands/session.h"
 
 #include <fmt/format.h>
-#include <unistd.h>
 
 #include <chrono>
 #include <cstdlib>

@@ -188,7 +188,7 @@ class WatchSession {
       bus_.handle(std::chrono::milliseconds(50));
       intake_.on_tick(clock_us());
       note_progress();
-      line_.show_at_times(progress_line());
+      line_.show_throttled(progress_line());
       tell_of_trouble();
     }
     line_.show(progress_line());

@@ -91,9 +91,11 @@ class DriftWatch {
   std::optional<Moved> moved(const BodySchema& schema) const;
   /// Independent samples that one is worth: MeasurementModel::worth, of the markers' noise; unknown
   /// as long as few were added. The correlations of residuals some samples apart, ρ_k = ρ₁ φ^(k −
-  /// 1), add up to 1 + 2 ρ₁ / (1 − φ) samples for one; and more where their variance is below what
-  /// is assumed, since it is the variance of the mean that counts.
+  /// 1), add up to 1 + 2 ρ₁ / (1 − φ) samples for one; and more where the variance of all markers
+  /// is below what is assumed, since it is the variance of the mean that counts.
   std::optional<double> worth() const;
+  /// The standard deviations that are assumed of the markers are so many times what they were.
+  void rescale_noise(double factor);
   /// How far the pose of an edge's part is from where `schema` has it, in the newest measurements.
   struct Spread {
     Matrix6d second_moment = Matrix6d::Zero();  ///< of ξ, right perturbation, without the farthest

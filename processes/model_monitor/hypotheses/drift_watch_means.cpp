@@ -164,6 +164,15 @@ void DriftWatch::Products::add(const Vector6d& residual, const Vector6d& earlier
   size = kFading * size + 1;
 }
 
+void DriftWatch::rescale_noise(double factor) {
+  for (auto& [tag, lags] : products_)
+    for (Products& of : lags) {
+      of.sum /= factor;
+      of.products /= factor * factor;
+      of.squares /= factor * factor;
+    }
+}
+
 void DriftWatch::correlate(const ElementId& tag) {
   const std::deque<Measured>& queue = measured_[tag];
   const auto whitened = [](const Measured& m) -> Vector6d {
@@ -182,12 +191,14 @@ void DriftWatch::correlate(const ElementId& tag) {
 }
 
 std::optional<double> DriftWatch::worth() const {
-  double no_correlation = 0, variance = 0;
+  double no_correlation = 0, largest_variance = 0;
   std::array<double, kLags.size()> correlation{};
   for (std::size_t lag = 0; lag < kLags.size(); ++lag) {
     double products = 0, squares = 0, size = 0;
     for (const auto& [tag, lags] : products_) {
       const Products& of = lags[lag];
+      if (of.size >= kFewestProducts)
+        largest_variance = std::max(largest_variance, of.squares / (6 * of.size));
       // What the model is off by all the time is no noise.
       const double constant = of.size > 0 ? of.sum.squaredNorm() / of.size : 0;
       products += of.products - constant;
@@ -196,13 +207,14 @@ std::optional<double> DriftWatch::worth() const {
     }
     if (size < kFewestProducts || squares <= 0) return std::nullopt;
     correlation[lag] = products / squares;
-    variance = std::clamp(squares / (6 * size), 1e-3, 1.0);
     no_correlation = std::max(kNoCorrelation, 3 / std::sqrt(6 * size));
   }
   const auto [near, far] = correlation;
   if (near < no_correlation) return 1;
   const double ratio = std::clamp(far / near, 1e-3, 0.99);
   const double phi = std::pow(ratio, 1.0 / static_cast<double>(kLags[1] - kLags[0]));
+  // More than is assumed is for the scale of the noise.
+  const double variance = largest_variance > 0 ? std::min(largest_variance, 1.0) : 1;
   return std::min(1.0, 1 / (variance * (1 + 2 * near / (1 - phi))));
 }
 

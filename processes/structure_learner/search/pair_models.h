@@ -46,7 +46,9 @@ struct PairRecord {
   std::set<int> untold_signals = {};
   /// A valid model has a joint that its tree does not need: redundant_edges().
   bool is_redundant = false;
-  bool is_by_chance = false;  ///< commands of other times explain its motion nearly as well
+  /// A valid model was taken back: time-shifted commands explain the motion nearly as well, or it is
+  /// a Gaussian process on a stream too short for one.
+  bool is_by_chance = false, is_too_short = false;
   std::optional<ContestedSignals> contested = {};
 
   void note_undecided(int num_signals, double mean_capped);

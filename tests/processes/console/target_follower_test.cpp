@@ -125,7 +125,7 @@ TEST(OperateTest, ANewerTargetEndsIt) {
   follower.on_tick(0);
   follower.on_control_status(status(S::CONTROL_REACHED, 50, 1));
   EXPECT_EQ(follower.end(), End::kRefused);
-  EXPECT_NE(follower.status().why.find("newer target"), std::string::npos);
+  EXPECT_NE(follower.status().why.find("another target"), std::string::npos);
 }
 
 TEST(OperateTest, AfterATimeoutItSaysWhoIsSilent) {
@@ -170,11 +170,16 @@ TEST(OperateTest, ATargetThatNobodyFollowsIsWithdrawn) {
   follower.on_tick(5 * kSecond);
   EXPECT_EQ(follower.end(), End::kTimedOut);
   expect(pose_target_t::KIND_HOLD);
-  // An arm lent to the babbler stays its own.
+  // An arm that was the babbler's stays its own, one that was lent to it does not.
   TargetFollower lent(target(), 5 * kSecond);
   lent.on_tick(0);
   lent.on_control_status(status(S::CONTROL_LENT));
   EXPECT_EQ(lent.withdrawal().target_kind, pose_target_t::KIND_RELEASE);
+  TargetFollower taken(target(), 5 * kSecond);
+  taken.on_tick(0);
+  taken.on_control_status(moving);
+  taken.on_control_status(status(S::CONTROL_LENT));
+  EXPECT_EQ(taken.withdrawal().target_kind, pose_target_t::KIND_HOLD);
 }
 
 TEST(OperateTest, AnInterruptEndsWhatIsOpenOnly) {

@@ -124,6 +124,24 @@ TEST(ControllerTest, WithAnInvalidEdgeItMovesALittleAndLendsTheArmOnlyWhereThatD
   }
 }
 
+TEST(ControllerTest, OnAPathAnArmWithAnInvalidEdgeIsNotLentButHeld) {
+  ControllerConfig config = test_config();
+  config.max_searches = 3;
+  Bench bench(config);
+  bench.start();
+  pose_target_t step = position_target(0, kFar);
+  step.way_point = 1;
+  step.num_way_points = 2;
+  bench.give(step);
+  ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 1; }));
+  bench.health = health_of(1, 2, 3, schema_edge_t::EDGE_INVALID);
+  bench.repeat();
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_HOLDING)) << bench.status.why;
+  EXPECT_EQ(bench.status.num_probes, 3);
+  EXPECT_EQ(bench.status.owns_arm, 1);
+  EXPECT_NE(bench.status.why.find("release the arm"), std::string::npos) << bench.status.why;
+}
+
 TEST(ControllerTest, AnArmThatIsLentInVainEndsTheTarget) {
   Bench bench;
   bench.schema.edges[1].state = EdgeState::kInvalid;

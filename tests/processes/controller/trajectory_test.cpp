@@ -2,6 +2,7 @@
 
 #include <gtest/gtest.h>
 
+#include <algorithm>
 #include <cmath>
 #include <limits>
 #include <stdexcept>
@@ -30,7 +31,7 @@ PoseTarget at(const BodySchema& schema, const Eigen::Vector2d& action) {
   return {.p_RT = schema.predict(1, 3, action)->X_AB.translation()};
 }
 
-constexpr Trajectory::Limits kLimits{
+const Trajectory::Limits kLimits{
     .position_sd_m = 0.01, .error_m = 0.005, .error_rad = 0.02, .off_line_m = 0.02};
 
 std::string objection(const BodySchema& schema, const Eigen::Vector2d& from,
@@ -99,13 +100,27 @@ TEST(TrajectoryTest, ALongLookCanBeEnded) {
   const Eigen::Vector2d from(0.5, -1);
   const Trajectory trajectory(
       {at(schema, {0.4, -0.8}), at(schema, {0.3, -1.2}), at(schema, {0.4, -0.8})}, 0.02);
-  std::size_t newest = 0;
-  const auto end = [&](std::size_t n) {
-    newest = n;
+  std::vector<std::size_t> met;
+  const auto note = [&](std::size_t n) { met.push_back(n); };
+  EXPECT_EQ(trajectory.objection(schema, 3, from, kLimits, note), "");
+  EXPECT_TRUE(std::is_sorted(met.begin(), met.end()));
+  EXPECT_EQ(met.front(), 0U);
+  EXPECT_EQ(met.back(), 2U);
+  EXPECT_EQ(met.size(), 1 + trajectory.leg(1).size() + trajectory.leg(2).size());
+  const auto end = [](std::size_t n) {
     if (n == 1) throw std::runtime_error("interrupted");
   };
   EXPECT_THROW(trajectory.objection(schema, 3, from, kLimits, end), std::runtime_error);
-  EXPECT_EQ(newest, 1U);
+}
+
+TEST(TrajectoryTest, WhatIsKeptOutIsNamedBeforehand) {
+  const BodySchema schema = two_links();
+  const Eigen::Vector2d from(0.5, -1), to(0.3, -1.2);
+  const Trajectory trajectory({at(schema, {0.4, -0.8}), at(schema, to)}, 0.02);
+  Trajectory::Limits limits = kLimits;
+  const Eigen::Vector3d half(0.01, 0.01, 0.01), end = at(schema, to).p_RT;
+  limits.workspace.keep_out = {Eigen::AlignedBox3d(end - half, end + half)};
+  EXPECT_NE(trajectory.objection(schema, 3, from, limits).find("keep_out"), std::string::npos);
 }
 
 TEST(TrajectoryTest, ALegThatLeavesTheReachIsNamedThoughItsEndsAreWithin) {

@@ -56,6 +56,19 @@ TEST(UnrelatedCommands, MoveNothing) {
       }
 }
 
+// Each pose has the command of the next: few samples, whose noise is guessed from what is left.
+TEST(UnrelatedCommands, OfTheNextPoseMoveNothing) {
+  for (const int num_samples : {20, 40})
+    for (std::uint64_t seed = 0; seed < 12; ++seed) {
+      ImperfectRobot robot(2, true, {.name = "none"}, seed);
+      auto samples = robot.babble(num_samples);
+      for (std::size_t n = 0; n + 1 < samples.size(); ++n)
+        samples[n].action = samples[n + 1].action;
+      const BodySchema schema = learn(robot.signals(), samples, options_of(std::nullopt)).schema;
+      EXPECT_FALSE(schema.complete) << num_samples << " samples, seed " << seed;
+    }
+}
+
 // What is slow in commands and poses agrees by chance; of short streams more than of long ones.
 TEST(UnrelatedCommands, OfAStreamMoveNothing) {
   struct Case {
@@ -73,6 +86,33 @@ TEST(UnrelatedCommands, OfAStreamMoveNothing) {
     const BodySchema wrong = learn(robot.signals(), samples, options_of(std::nullopt)).schema;
     EXPECT_FALSE(wrong.complete) << c.num_samples << " seed " << c.seed;
   }
+}
+
+TEST(RelatedCommands, ThatRepeatThemselvesOrAreSeenAtTimesMoveWhatTheyMove) {
+  constexpr int kNumSamples = 800;
+  for (const int num_cycles : {3, 8, 16}) {
+    ImperfectRobot robot(2, true, {.name = "none"}, 1);
+    std::vector<ActionPoseSample> samples;
+    for (int n = 0; n < kNumSamples; ++n) {
+      Eigen::VectorXd action(2);
+      for (int s = 0; s < 2; ++s) {
+        const Signal& signal = robot.signals()[static_cast<std::size_t>(s)];
+        const double phase = 2 * M_PI * num_cycles * (s + 1) * n / kNumSamples;
+        action(s) = 0.5 * (signal.lower + signal.upper) +
+                    0.4 * (signal.upper - signal.lower) * std::sin(phase + 0.3 * s);
+      }
+      samples.push_back(robot.go(action));
+    }
+    const BodySchema schema = learn(robot.signals(), samples, options_of(kTold)).schema;
+    EXPECT_TRUE(is_right(schema, robot.structure())) << num_cycles << " cycles";
+  }
+  ImperfectRobot robot(2, true, {.name = "none"}, 1);
+  auto samples = robot.wander(2400, 60);
+  for (std::size_t n = 0; n < samples.size(); ++n)
+    if (n % 40 != 0)
+      std::erase_if(samples[n].parts, [](const PartObservation& o) { return o.part == 3; });
+  const BodySchema schema = learn(robot.signals(), samples, options_of(kTold)).schema;
+  EXPECT_TRUE(is_right(schema, robot.structure())) << "the hand at every fortieth instant";
 }
 
 // The hand's marker is 3 % larger than told: a chain from the root on all signals fits all the
