@@ -313,15 +313,14 @@ void withdraw_what_is_by_chance(const std::vector<ActionPoseSample>& samples,
   const std::vector<ActionPoseSample> moved = displaced(samples, structure->signals);
   const SurrogateCommands others(moved, static_cast<int>(structure->signals.size()),
                                  structure->options.measurement);
-  // Poses at rest are independent: the noise that is known says enough.
-  const bool is_assumed = structure->noise_source == NoiseSource::kAssumed;
-  if (!others.is_stream() && structure->noise_source != NoiseSource::kResiduals && !is_assumed)
-    return;
-  const bool is_doubtful = is_assumed || structure->is_noise_guessed_too_large();
+  // Poses at rest are independent: noise as markers have it is no motion.
+  const bool is_doubtful =
+      structure->noise_source == NoiseSource::kAssumed || structure->is_noise_guessed_too_large();
+  if (!others.is_stream() && !is_doubtful) return;
   std::erase_if(structure->search.models, [&](const AcceptedModel& model) {
     PairRecord& record = structure->search.records.at(std::minmax(model.part_i, model.part_j));
     record.is_too_short |= others.is_short() && !model.soft_signals.empty();
-    record.is_by_chance |= others.explain_as_well(model, is_doubtful);
+    record.is_by_chance |= others.explain_as_well(model);
     // Nothing says that what a rigid one leaves is no motion.
     const bool is_motion = is_doubtful && model.model.joints.empty();
     return record.is_too_short || record.is_by_chance || (is_motion && model.soft_signals.empty());

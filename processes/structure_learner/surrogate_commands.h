@@ -23,9 +23,8 @@ class SurrogateCommands {
   /// of a stream mostly, where what is new in every frame is noise and does not count; of poses at
   /// rest sometimes. (Chains of three joints and more are refined from the model alone, which
   /// leaves too much: that is lenient.) False of a stream where too few frames follow each other
-  /// to tell, and of rigid and of soft models. `is_noise_doubtful`: as large as no marker's, so
-  /// that of poses at rest much less must be left.
-  bool explain_as_well(const AcceptedModel& accepted, bool is_noise_doubtful) const;
+  /// to tell, and of rigid and of soft models.
+  bool explain_as_well(const AcceptedModel& accepted) const;
   bool is_stream() const { return blocks_.is_stream(); }
   /// The stream is too short for TimeBlocks: a frame's neighbours tell its pose, so that a Gaussian
   /// process cannot be judged.
