@@ -318,12 +318,12 @@ void withdraw_what_is_by_chance(const std::vector<ActionPoseSample>& samples,
       structure->noise_source == NoiseSource::kAssumed || structure->is_noise_guessed_too_large();
   if (!others.is_stream() && !is_doubtful) return;
   std::erase_if(structure->search.models, [&](const AcceptedModel& model) {
-    PairRecord& record = structure->search.records.at(std::minmax(model.part_i, model.part_j));
+    PairRecord& record = structure->search.records[std::minmax(model.part_i, model.part_j)];
     record.is_too_short |= others.is_short() && !model.soft_signals.empty();
     record.is_by_chance |= others.explain_as_well(model);
     // Nothing says that what a rigid one leaves is no motion.
-    const bool is_motion = is_doubtful && model.model.joints.empty();
-    return record.is_too_short || record.is_by_chance || (is_motion && model.soft_signals.empty());
+    const bool is_rigid = model.model.joints.empty() && model.soft_signals.empty();
+    return record.is_too_short || record.is_by_chance || (is_doubtful && is_rigid);
   });
 }
 

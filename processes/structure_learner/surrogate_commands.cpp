@@ -31,8 +31,8 @@ constexpr int kIterations = 30;
 /// true models leave up to 0.06 of about 55 blocks; of 4 blocks mostly below 0.005, unrelated
 /// commands from 0.02 on.
 constexpr double kMostLeft = 0.12, kEnoughBlocks = 15;
-/// Of poses at rest: of the least that so many orders leave. Of 80 recordings with the command of
-/// the next pose the accepted models leave 0.49 and more.
+/// Of poses at rest: of the least that so many orders leave. Of 90 recordings with the command of
+/// another pose, models in noise above any marker's leave 0.49 and more.
 constexpr int kShuffled = 15, kFewestPoses = 8;
 constexpr double kMostLeftAtRest = 0.35;
 
