@@ -1,11 +1,12 @@
 // control: Table 2 of the chapter, with the code that runs. A 4-DOF arm follows 30 way points
 // twice, whole and with its middle link bent by 45° before the first, by a schema that stays as it
 // was or one that is adapted. Prints Markdown: errors of the true end effector at the way points,
-// and the mean error at each of them with --along. Then the control of Fig. 10: a 2-DOF arm, with
-// targets without noise and with a marker as target. --plot draws where the first arm went (Fig.
-// 14 of the chapter) beside the errors along the way.
+// and the mean error at each of them with --along. Whole but for a longer hand: what correcting by
+// the pose seen is good for. Then the control of Fig. 10: a 2-DOF arm, with targets without noise
+// and with a marker as target. --plot draws where the first arm went (Fig. 14 of the chapter)
+// beside the errors along the way; --geometry writes the arms and paths down.
 //
-//   ./run experiment control [--runs 20] [--along] [--plot FILE.png]
+//   ./run experiment control [--runs 20] [--along] [--plot FILE.png] [--geometry FILE.jsonl]
 
 #include <fmt/format.h>
 
@@ -15,10 +16,12 @@
 #include <array>
 #include <cmath>
 #include <limits>
+#include <nlohmann/json.hpp>
 #include <random>
 #include <string>
 #include <vector>
 
+#include "common/bus/event_log.h"
 #include "common/geometry/angle.h"
 #include "common/plot/plot.h"
 #include "processes/controller/trajectory.h"
@@ -32,7 +35,7 @@ using namespace bodyschema::test;
 namespace {
 
 constexpr int kWayPoints = 30, kPasses = 2, kSamples = 100;
-constexpr double kStep_m = 0.02;
+constexpr double kStep_m = 0.02, kLonger_m = 0.01;
 constexpr int kRoot = 1, kEndEffector = 5, kMiddle = 3;
 
 /// A closed path of the whole arm's end effector: each joint swings by a third of its range to both
@@ -64,9 +67,22 @@ SyntheticRobot bent(SyntheticRobot robot, Rng& rng) {
   return robot;
 }
 
+/// The hand is farther out, as with another tool.
+SyntheticRobot lengthened(SyntheticRobot robot) {
+  robot.links.back().X_after.translation() +=
+      kLonger_m * robot.links.back().X_after.translation().normalized();
+  return robot;
+}
+
+enum class Body { kWhole, kBent, kLonger };
+
 struct Arms {
-  SyntheticRobot whole, bent;
+  SyntheticRobot whole, bent, longer;
   std::vector<Eigen::Vector3d> path;  ///< of the end effector, in the root's frame [m]
+
+  const SyntheticRobot& of(Body body) const {
+    return body == Body::kWhole ? whole : body == Body::kBent ? bent : longer;
+  }
 };
 
 bool reaches(const SyntheticRobot& robot, const std::vector<Eigen::Vector3d>& path) {
@@ -88,6 +104,7 @@ Arms arms_of(Rng& rng) {
     Arms arms;
     arms.whole = chapter_robot("c", rng);
     arms.bent = bent(arms.whole, rng);
+    arms.longer = lengthened(arms.whole);
     arms.path = path_of(arms.whole);
     if (reaches(arms.whole, arms.path) && reaches(arms.bent, arms.path)) return arms;
   }
@@ -103,7 +120,8 @@ enum class Control {
 struct Case {
   const char* name;
   Regime regime;
-  bool is_learned, is_bent;
+  bool is_learned;
+  Body body;  ///< since it was learned
   Control control;
   bool is_straight = false;  ///< in steps of kStep_m from way point to way point, as `follow` goes
 };
@@ -139,12 +157,12 @@ struct Result {
 };
 
 /// Errors at all way points.
-void descend_along(const Arms& arms, bool is_bent, const BodySchema& schema, Result* result) {
+void descend_along(const Arms& arms, Body body, const BodySchema& schema, Result* result) {
   Eigen::VectorXd action = Eigen::VectorXd::Zero(static_cast<Eigen::Index>(schema.signals.size()));
   for (std::size_t n = 0; n < result->errors_m.size(); ++n) {
     const Eigen::Vector3d& p_RT = arms.path[n % arms.path.size()];
     action = descend(schema, p_RT, action);
-    const auto X_CB = (is_bent ? arms.bent : arms.whole).poses_in_camera(action);
+    const auto X_CB = arms.of(body).poses_in_camera(action);
     result->errors_m[n].push_back(
         ((X_CB.at(kRoot).inverse() * X_CB.at(kEndEffector)).translation() - p_RT).norm());
   }
@@ -192,7 +210,7 @@ Result measure(const Case& test, int num_runs, const std::string& rig) {
               .schema;
     }
     if (test.control == Control::kGradient) {
-      descend_along(arms, test.is_bent, schema, &result);
+      descend_along(arms, test.body, schema, &result);
       continue;
     }
     SteeredArm arm(robot, schema, rig,
@@ -200,7 +218,7 @@ Result measure(const Case& test, int num_runs, const std::string& rig) {
                     .adapts = test.control == Control::kAdaptive,
                     .max_corrections = test.control == Control::kCorrected ? 3 : 0,
                     .seed = static_cast<std::uint64_t>(run)});
-    if (test.is_bent) arm.set_robot(arms.bent);
+    arm.set_robot(arms.of(test.body));
     steer_along(arms, test, &arm, run == 1, &result);
   }
   return result;
@@ -225,6 +243,39 @@ std::string cell(const Result& result, int from, int to) {
   for (const double value : all) sum += (value - mean(all)) * (value - mean(all));
   return fmt::format("{:.2f} ± {:.2f}", 1e3 * mean(all),
                      1e3 * std::sqrt(sum / static_cast<double>(all.size())));
+}
+
+nlohmann::json json_of(const Pose& X) {
+  const Eigen::Vector3d p = X.translation();
+  const Eigen::Quaterniond q(X.linear());
+  return {{"p_m", {p.x(), p.y(), p.z()}}, {"q_wxyz", {q.w(), q.x(), q.y(), q.z()}}};
+}
+
+/// The arms of Table 2, one a line: each part hangs on the one before it, part 2 on part 1, by
+/// X_before · Rot_z(q) · X_after; bent, part 3 by another X_after; and the way points of part 5 in
+/// part 1.
+void write_geometry(int num_runs, const std::string& file) {
+  std::string text;
+  for (int run = 1; run <= num_runs; ++run) {
+    Rng rng(static_cast<Rng::result_type>(run));
+    const Arms arms = arms_of(rng);
+    nlohmann::json links, path;
+    for (const TrueLink& link : arms.whole.links) {
+      if (link.parent < 0) continue;
+      const Signal& signal = arms.whole.signals[static_cast<std::size_t>(link.signal)];
+      links.push_back({{"part", link.part},
+                       {"X_before", json_of(link.X_before)},
+                       {"X_after", json_of(link.X_after)},
+                       {"limits_rad", {signal.lower, signal.upper}}});
+    }
+    for (const Eigen::Vector3d& p : arms.path) path.push_back({p.x(), p.y(), p.z()});
+    const nlohmann::json line = {{"arm", run},
+                                 {"links", links},
+                                 {"bent_X_after", json_of(arms.bent.links[kMiddle - 1].X_after)},
+                                 {"path_m", path}};
+    text += line.dump() + "\n";
+  }
+  write_file_atomically(file, text);
 }
 
 /// Rms over the targets of one run [m]; moves per target.
@@ -341,7 +392,8 @@ Plot plot_of(const std::vector<Case>& cases, const std::vector<Result>& results)
       "plot '-' with lines lw 6 lc rgb '#cccccc' title 'path'";
   std::string data = in_plane(path, plane);
   for (std::size_t c = 0; c < cases.size(); ++c) {
-    if (!cases[c].is_bent || cases[c].is_straight || cases[c].regime == Regime::kChapter) continue;
+    if (cases[c].body != Body::kBent || cases[c].is_straight || cases[c].regime == Regime::kChapter)
+      continue;
     plot.script += fmt::format(", '-' with linespoints lw 1 pt 7 ps 0.6 lc {} title {}", c + 1,
                                gnuplot_string(cases[c].name));
     data += in_plane(results[c].first, plane);
@@ -367,35 +419,46 @@ Plot plot_of(const std::vector<Case>& cases, const std::vector<Result>& results)
 int main(int argc, char** argv) {
   int num_runs = 20;
   bool is_along = false;
-  std::string plot_file;
+  std::string plot_file, geometry_file;
   std::string rig = std::string(BODYSCHEMA_CONFIG) + "/arm4";
   CLI::App app("Table 2: an arm of four joints follows a path, whole and bent; control of Fig. 10");
   app.add_option("--runs", num_runs, "Arms of other geometry")->check(CLI::PositiveNumber);
   app.add_option("--rig", rig, "Folder of controller.yaml and model_monitor.yaml");
   app.add_flag("--along", is_along, "Also the mean error at each way point");
   app.add_option("--plot", plot_file, "PNG: the way of the first arm, and the errors");
+  app.add_option("--geometry", geometry_file,
+                 "Joints of the arms and their paths, a JSON object a line");
   CLI11_PARSE(app, argc, argv);
+  if (!geometry_file.empty()) write_geometry(num_runs, geometry_file);
   const std::vector<Case> cases = {
-      {"whole, static, engineered", Regime::kTag, false, false, Control::kStatic},
-      {"whole, static, learned", Regime::kTag, true, false, Control::kStatic},
-      {"the same, corrected by what is seen", Regime::kTag, true, false, Control::kCorrected},
-      {"whole, static, learned, gradient descent (Eq. 19)", Regime::kTag, true, false,
+      {"whole, static, engineered", Regime::kTag, false, Body::kWhole, Control::kStatic},
+      {"whole, static, learned", Regime::kTag, true, Body::kWhole, Control::kStatic},
+      {"the same, corrected by what is seen", Regime::kTag, true, Body::kWhole,
+       Control::kCorrected},
+      {"hand 10 mm longer, static, learned", Regime::kTag, true, Body::kLonger, Control::kStatic},
+      {"longer hand, corrected by what is seen", Regime::kTag, true, Body::kLonger,
+       Control::kCorrected},
+      {"whole, static, learned, gradient descent (Eq. 19)", Regime::kTag, true, Body::kWhole,
        Control::kGradient},
-      {"whole, adaptive, learned", Regime::kTag, true, false, Control::kAdaptive},
-      {"bent, static, learned", Regime::kTag, true, true, Control::kStatic},
-      {"bent, adaptive, learned", Regime::kTag, true, true, Control::kAdaptive},
-      {"bent, adaptive, learned, in straight lines", Regime::kTag, true, true, Control::kAdaptive,
-       true},
-      {"bent, adaptive, learned, chapter noise", Regime::kChapter, true, true, Control::kAdaptive}};
+      {"whole, adaptive, learned", Regime::kTag, true, Body::kWhole, Control::kAdaptive},
+      {"bent, static, learned", Regime::kTag, true, Body::kBent, Control::kStatic},
+      {"bent, adaptive, learned", Regime::kTag, true, Body::kBent, Control::kAdaptive},
+      {"bent, adaptive, learned, in straight lines", Regime::kTag, true, Body::kBent,
+       Control::kAdaptive, true},
+      {"bent, adaptive, learned, chapter noise", Regime::kChapter, true, Body::kBent,
+       Control::kAdaptive}};
   fmt::print(
       "| arm and schema | way points 1–3 [mm] | 4–30 [mm] | second pass [mm] | moves | of these "
       "probes | not reached |\n|---|---|---|---|---|---|---|\n");
   std::vector<Result> results;
   for (const Case& test : cases) {
     const Result& result = results.emplace_back(measure(test, num_runs, rig));
-    fmt::print("| {} | {} | {} | {} | {:.0f} | {:.1f} | {} |\n", test.name, cell(result, 0, 3),
+    const bool goes_by_controller = !result.moves.empty();
+    fmt::print("| {} | {} | {} | {} | {} | {} | {} |\n", test.name, cell(result, 0, 3),
                cell(result, 3, kWayPoints), cell(result, kWayPoints, 2 * kWayPoints),
-               mean(result.moves), mean(result.probes), result.num_not_reached);
+               goes_by_controller ? fmt::format("{:.0f}", mean(result.moves)) : "–",
+               goes_by_controller ? fmt::format("{:.1f}", mean(result.probes)) : "–",
+               result.num_not_reached);
     std::fflush(stdout);
   }
   if (is_along) print_along(cases, results);
