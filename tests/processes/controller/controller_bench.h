@@ -346,6 +346,12 @@ class Bench {
   void take(const Controller::Answer& answer) {
     if (answer.status) {
       ASSERT_EQ(check(*answer.status), "");
+      const bool is_on_path = answer.status->num_way_points > 0;
+      ASSERT_FALSE(is_on_path && answer.status->control_state == S::CONTROL_LENT);
+      if (status.control_state == S::CONTROL_HOLDING && is_on_path &&
+          answer.status->target_epoch == status.target_epoch &&
+          answer.status->target_id != status.target_id)
+        left_path_id_ = answer.status->target_id;
       status = *answer.status;
       if (status.control_state == S::CONTROL_HOLDING ||
           status.control_state == S::CONTROL_REFUSED || status.control_state == S::CONTROL_RELEASED)
@@ -367,6 +373,7 @@ class Bench {
     ASSERT_EQ(command.kind, action_command_t::KIND_MOVE);
     ASSERT_EQ(motion.stop_latched, 0);
     ASSERT_NE(status.target_id, last_ended_id_) << "moves for a target that is over";
+    ASSERT_NE(status.target_id, left_path_id_) << "goes on along a path on which it was held";
     ASSERT_GT(command.expiry_utime, motion.utime);
     for (std::size_t i = 0; i < arm.size(); ++i) {
       const Signal& signal = config_.signals[i];
@@ -463,7 +470,7 @@ class Bench {
 
   std::deque<action_command_t> commands_;
   std::set<std::int64_t> refused_holds_;  // an answered command is answered again
-  std::int64_t last_ended_id_ = -1;
+  std::int64_t last_ended_id_ = -1, left_path_id_ = -1;
   std::int8_t last_kind_ = -1;
   Target given_{};
   std::int64_t given_at_ = 0;

@@ -13,7 +13,8 @@ class ControllerPropertyTest : public testing::TestWithParam<int> {};
 // Anything in any order: Bench asserts that every message makes sense, that nothing moves an arm
 // that is not the controller's or for a target that is over, that ids are new, steps small, actions
 // within the limits and no part in a keep-out box, and that no target is served while driver, eyes
-// or monitor are silent.
+// or monitor are silent; that on a path the arm is never lent, and that one on which it was held
+// does not go on.
 TEST_P(ControllerPropertyTest, WhateverHappensItsCommandsAreLawful) {
   std::mt19937_64 rng(static_cast<std::uint64_t>(GetParam()));
   std::size_t num_moves = 0, num_holds = 0;
@@ -48,6 +49,7 @@ TEST_P(ControllerPropertyTest, WhateverHappensItsCommandsAreLawful) {
                                                                        : kBeyond,
                                                            rng() % 2 ? -1 : 1);
           if (rng() % 3 == 0) target.expiry_s = static_cast<double>(1 + rng() % 20);
+          if (rng() % 3 == 0) target.way_point = target.num_way_points = 3;
           bench.give(target);
           break;
         }
