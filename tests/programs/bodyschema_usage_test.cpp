@@ -51,6 +51,8 @@ TEST_F(BodyschemaProgramTest, ExitCodesTellWrongUsageFromABadInput) {
            {"target", "--part", "1", "--tag", "40", "--position", "0", "0", "0"},
            {"target", "--part", "1", "--tag", "40", "--orientation", "1", "0", "0", "0"},
            {"target", "--part", "1", "--orientation", "1", "0", "0", "0"},
+           {"target", "--part", "1", "--position", "0", "0", "0", "--orientation", "0", "0", "0",
+            "0"},
            {"target", "--part", "1", "--position", "0", "0"},
            {"target", "--part", "1", "--position", "0", "0", std::string(309, '9')},
            {"target", "--part", "1", "--position", "nan", "0", "0"},

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <Eigen/Geometry>
 #include <filesystem>
 #include <string>
 #include <vector>
@@ -15,8 +16,12 @@ namespace bodyschema {
 /// @throws std::runtime_error.
 BodySchema load_schema(const std::filesystem::path& file);
 
-/// Reads a recording whose actions are those of the schema, in its order. What keeps it from being
-/// whole is said on stderr. @throws std::runtime_error.
+/// Reads a recording; what keeps it from being whole, and hints, are said on stderr.
+/// @throws RecordingError.
+Recording load_and_warn(const std::string& file);
+
+/// Reads a recording whose actions are those of the schema, in its order, as
+/// load_and_warn(). @throws std::runtime_error.
 Recording load_for(const std::string& file, const BodySchema& schema);
 
 /// Adds `--noise POS_M ROT_DEG`.
@@ -24,6 +29,9 @@ void add_noise(Arguments& command, std::vector<double>& numbers, const std::stri
 /// Its two numbers. @throws as refuse_argument() where they are not above 0 or no noise of a
 /// marker, and may be in another unit.
 Noise noise_given(const std::vector<double>& numbers);
+
+/// W X Y Z of an option, of a norm within 1 % of 1, normalized. @throws as refuse_argument().
+Eigen::Quaterniond unit_quaternion(const std::string& option, const std::vector<double>& wxyz);
 
 /// @throws std::invalid_argument if `out` would be written over one of `inputs`, or cannot be
 /// written; `option` stands in the error.

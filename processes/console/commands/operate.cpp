@@ -4,6 +4,7 @@
 #include <cmath>
 #include <functional>
 #include <iostream>
+#include <iterator>
 #include <memory>
 #include <stdexcept>
 #include <vector>
@@ -14,6 +15,7 @@
 #include "common/text/clock.h"
 #include "common/text/text.h"
 #include "processes/console/commands/commands.h"
+#include "processes/console/commands/files.h"
 #include "processes/console/commands/session.h"
 #include "processes/console/hint.h"
 #include "processes/console/target_follower.h"
@@ -43,7 +45,11 @@ void run_target(const OperateArguments& arguments) {
   target.target_tag = arguments.tag.value_or(0);
   target.target_part = arguments.part;
   std::copy(arguments.position_m.begin(), arguments.position_m.end(), target.position_m);
-  std::copy(arguments.orientation.begin(), arguments.orientation.end(), target.orientation_wxyz);
+  if (!arguments.orientation.empty()) {
+    const Eigen::Quaterniond q = unit_quaternion("--orientation", arguments.orientation);
+    const double wxyz[] = {q.w(), q.x(), q.y(), q.z()};
+    std::copy(std::begin(wxyz), std::end(wxyz), target.orientation_wxyz);
+  }
   target.tolerance_m = arguments.tolerance_m;
   target.tolerance_rad = arguments.tolerance_deg * kDegree;
   target.expiry_s = arguments.timeout_s + kExpiryAfterTimeout_s;

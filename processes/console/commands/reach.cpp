@@ -28,15 +28,10 @@ void require_finite(const std::string& option, const std::vector<double>& number
 
 PoseTarget target_of(const ReachArguments& arguments) {
   require_finite("--position", arguments.position);
-  require_finite("--orientation", arguments.orientation);
   PoseTarget target;
   target.p_RT = Eigen::Vector3d::Map(arguments.position.data());
   if (arguments.orientation.empty()) return target;
-  const std::vector<double>& q = arguments.orientation;
-  target.q_RT = Eigen::Quaterniond(q[0], q[1], q[2], q[3]);
-  if (std::abs(target.q_RT->norm() - 1) > 0.01)
-    refuse_argument("--orientation", "expected a unit quaternion w x y z");
-  target.q_RT->normalize();
+  target.q_RT = unit_quaternion("--orientation", arguments.orientation);
   return target;
 }
 
