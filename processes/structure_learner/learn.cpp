@@ -6,6 +6,7 @@
 #include <stdexcept>
 #include <tuple>
 
+#include "processes/structure_learner/command_lag.h"
 #include "processes/structure_learner/command_warp.h"
 #include "processes/structure_learner/confirmed_structure.h"
 #include "processes/structure_learner/edge_fit.h"
@@ -75,6 +76,7 @@ LearnResult fit_tree(const LearnedStructure& structure,
 
   LearnResult result;
   result.noise_source = structure.noise_source;
+  result.command_lag_us = structure.command_lag_us;
   result.num_screens = search.num_screens;
   result.num_fits = search.num_fits;
   BodySchema& schema = result.schema;
@@ -327,15 +329,11 @@ void withdraw_what_is_by_chance(const std::vector<ActionPoseSample>& samples,
   });
 }
 
-}  // namespace
-
-LearnedStructure find_structure(const std::vector<Signal>& signals,
-                                const std::vector<ActionPoseSample>& samples,
-                                const LearnOptions& options) {
-  const std::vector<int> alone = parts_without_rotation(samples);
-  const std::vector<ActionPoseSample> distinct =
-      with_uniform_parts(without_repetitions(samples), alone);
-  std::vector<ActionPoseSample> poses = distinct;
+// Of distinct samples of uniform parts, those in `alone` without rotation.
+LearnedStructure find_in_step(const std::vector<Signal>& signals,
+                              const std::vector<ActionPoseSample>& samples,
+                              const std::vector<int>& alone, const LearnOptions& options) {
+  std::vector<ActionPoseSample> poses = samples;
   for (ActionPoseSample& sample : poses)
     std::erase_if(sample.parts, [](const PartObservation& o) { return !o.has_rotation; });
   const auto confirmed = [&](const LearnOptions& by) {
@@ -362,25 +360,58 @@ LearnedStructure find_structure(const std::vector<Signal>& signals,
   }
   withdraw_what_is_by_chance(poses, &structure);
   structure.position_parts = alone;
-  if (!alone.empty()) attach_leaves(distinct, options, &structure);
+  if (!alone.empty()) attach_leaves(samples, options, &structure);
   return structure;
+}
+
+// What everything that is learned sees.
+std::vector<ActionPoseSample> in_step(const std::vector<ActionPoseSample>& samples,
+                                      const LearnedStructure& structure) {
+  return with_commands_of_before(
+      with_uniform_parts(without_repetitions(samples), structure.position_parts),
+      structure.command_lag_us);
+}
+
+}  // namespace
+
+LearnedStructure find_structure(const std::vector<Signal>& signals,
+                                const std::vector<ActionPoseSample>& samples,
+                                const LearnOptions& options) {
+  const int num_signals = check_actions(samples, signals.size());
+  const std::vector<int> alone = parts_without_rotation(samples);
+  const std::vector<ActionPoseSample> distinct =
+      with_uniform_parts(without_repetitions(samples), alone);
+  const auto find = [&](std::int64_t lag_us) {
+    LearnedStructure found =
+        find_in_step(signals, with_commands_of_before(distinct, lag_us), alone, options);
+    found.command_lag_us = lag_us;
+    return found;
+  };
+  const CommandLag lag = command_lag(distinct, num_signals);
+  LearnedStructure structure = find(lag.is_significant ? lag.us : 0);
+  if (!structure.spans() && lag.us != 0) {
+    LearnedStructure other = find(lag.is_significant ? 0 : lag.us);
+    if (other.search.models.size() > structure.search.models.size()) structure = std::move(other);
+  }
+  const std::int64_t refined_us =
+      refined_lag_us(distinct, num_signals, structure.search.models, structure.options.measurement,
+                     structure.command_lag_us);
+  if (refined_us == structure.command_lag_us) return structure;
+  LearnedStructure found = find(refined_us);
+  return found.search.models.size() >= structure.search.models.size() ? found : structure;
 }
 
 LearnResult fit_structure(const LearnedStructure& structure,
                           const std::vector<ActionPoseSample>& samples,
                           const LearnOptions& options) {
-  LearnResult result = fit_tree(
-      structure, with_uniform_parts(without_repetitions(samples), structure.position_parts),
-      options, false);
+  LearnResult result = fit_tree(structure, in_step(samples, structure), options, false);
   result.schema.num_samples = static_cast<int>(samples.size());
   return result;
 }
 
 LearnResult relearn(const LearnedStructure& structure, const std::vector<ActionPoseSample>& samples,
                     const LearnOptions& options) {
-  LearnResult result = fit_tree(
-      structure, with_uniform_parts(without_repetitions(samples), structure.position_parts),
-      options, true);
+  LearnResult result = fit_tree(structure, in_step(samples, structure), options, true);
   result.schema.num_samples = static_cast<int>(samples.size());
   return result;
 }

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <cstdint>
 #include <map>
 #include <optional>
 #include <vector>
@@ -35,9 +36,10 @@ struct LearnResult {
   BodySchema schema;
   std::vector<Outlier> outliers;  ///< ascending by sample, then part
   NoiseSource noise_source = NoiseSource::kAssumed;
-  bool is_one_cluster = false;  ///< see one_cluster.h
-  int num_screens = 0;          ///< closed-form hypotheses looked at
-  int num_fits = 0;             ///< Levenberg–Marquardt fits of the search
+  bool is_one_cluster = false;      ///< see one_cluster.h
+  std::int64_t command_lag_us = 0;  ///< of a stream's poses behind its commands, taken into account
+  int num_screens = 0;              ///< closed-form hypotheses looked at
+  int num_fits = 0;                 ///< Levenberg–Marquardt fits of the search
 };
 
 /// Learns the body schema from scratch: structure and local models (Sections 3.1 and 3.2). Where
@@ -74,6 +76,7 @@ struct LearnedStructure {
   bool is_contested = false;
   std::vector<int> position_parts = {};      ///< parts_without_rotation()
   std::map<int, OpenLeaf> open_leaves = {};  ///< those of them without an edge
+  std::int64_t command_lag_us = 0;           ///< see command_lag.h; the models are without it
 
   /// The edges span all parts seen.
   bool spans() const { return search.models.size() + 1 >= parts.size(); }
@@ -86,7 +89,8 @@ struct LearnedStructure {
 /// Where the residuals refute the noise told, a larger one (see confirmed_structure.h); of poses at
 /// rest where no multiple of it stands, the estimate of noise_estimate.h if that is much more.
 /// Parts that have positions alone are put in when the parts that have poses are
-/// (position_leaves.h).
+/// (position_leaves.h). Where the poses of a stream come after their commands (command_lag.h), each
+/// counts with the command that brought it there.
 /// @throws std::invalid_argument as learn().
 LearnedStructure find_structure(const std::vector<Signal>& signals,
                                 const std::vector<ActionPoseSample>& samples,

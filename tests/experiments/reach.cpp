@@ -149,6 +149,7 @@ class KdlArm {
     KDL::ChainFkSolverPos_recursive forward(chain_);
     KDL::ChainIkSolverVel_wdls velocity(chain_);
     velocity.setWeightTS(position_alone().asDiagonal().toDenseMatrix());
+    velocity.setLambda(kOptions.damping_m);  // in singular directions
     KDL::ChainIkSolverPos_NR_JL solver(chain_, lower_, upper_, forward, velocity, 1, kTolerance);
     const KDL::Vector wanted(p_RT.x(), p_RT.y(), p_RT.z());
     for (int n = 0; n < kStarts; ++n) {

@@ -10,7 +10,9 @@
 
 #include "common/bus/convert.h"
 #include "common/bus/event_log.h"
+#include "common/geometry/angle.h"
 #include "tests/programs/bodyschema_program.h"
+#include "tests/support/imperfect_robot.h"
 
 namespace bodyschema::test {
 namespace {
@@ -170,6 +172,31 @@ TEST_F(BodyschemaProgramTest, WildPosesAreSeenWhateverRateTheRigBesideALogTells)
   write("config/noise.yaml", "tag_position_m: 0\noutlier_rate: often\n");
   expect_failure({"learn", "run.lcmlog"}, "noise.yaml");
   expect_failure({"report", "run.lcmlog"}, "noise.yaml");
+}
+
+TEST_F(BodyschemaProgramTest, AStreamWhosePosesComeLateIsLearnedAndMonitored) {
+  constexpr std::size_t kLate = 3;
+  const auto recorded = [&](const char* name, double bend_rad) {
+    const auto commands = ImperfectRobot(3, true, {}, 5).wander(1200, 120);
+    ImperfectRobot robot(3, true, {}, 5);
+    std::vector<ActionPoseSample> samples;
+    for (std::size_t n = 0; n + kLate < commands.size(); ++n) {
+      if (n == 600) robot.bend(2, 0, bend_rad);
+      samples.push_back(robot.go(commands[n].action));
+      samples.back().action = commands[n + kLate].action;
+    }
+    return write(name, samples);
+  };
+  const Outcome learned =
+      run({"learn", recorded("late.csv", 0), "--json", "--out", "schema.lcmlog"});
+  EXPECT_TRUE(learned.json()["complete"].get<bool>()) << learned.out;
+  EXPECT_NEAR(learned.json()["command_lag_s"].get<double>(), kLate, 0.1);  // at 1 Hz
+  const Outcome healthy = run({"monitor", "schema.lcmlog", "late.csv", "--json"});
+  EXPECT_EQ(healthy.out, "");
+  EXPECT_NE(healthy.err.find("late.csv: the poses come "), std::string::npos) << healthy.err;
+  const Outcome bent =
+      run({"monitor", "schema.lcmlog", recorded("bent.csv", 10 * kDegree), "--json"});
+  EXPECT_NE(bent.out.find("\"geometry\""), std::string::npos) << bent.out;
 }
 
 TEST_F(BodyschemaProgramTest, MonitorRefusesWhatDoesNotBelongTogether) {

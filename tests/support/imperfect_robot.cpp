@@ -87,6 +87,8 @@ const std::vector<Imperfection>& imperfections() {
       {.name = "tag sizes 1 %", .tag_size = 0.01},
       {.name = "focal length 2 %", .focal_length = 0.02},
       {.name = "distortion 2 %", .distortion = 0.02},
+      {.name = "poses 1.5 samples late", .lag = 1.5},
+      {.name = "poses 8 samples late", .lag = 8},
   };
   return all;
 }
@@ -252,8 +254,7 @@ std::vector<ActionPoseSample> ImperfectRobot::wander(int num_samples, double per
       phase(s, k) = uniform(rng_, 0, 2 * M_PI);
       share(s, k) = uniform(rng_, 0.5, 1);
     }
-  std::vector<ActionPoseSample> samples;
-  for (int n = 0; n < num_samples; ++n) {
+  const auto action_at = [&](double n) {
     Eigen::VectorXd action(num_signals);
     for (Eigen::Index s = 0; s < num_signals; ++s) {
       const Signal& signal = signals()[static_cast<std::size_t>(s)];
@@ -262,7 +263,12 @@ std::vector<ActionPoseSample> ImperfectRobot::wander(int num_samples, double per
         swing += share(s, k) / share.row(s).sum() * std::sin(rate(s, k) * n + phase(s, k));
       action[s] = 0.5 * (signal.lower + signal.upper) + 0.5 * swing * (signal.upper - signal.lower);
     }
-    samples.push_back(go(action));
+    return action;
+  };
+  std::vector<ActionPoseSample> samples;
+  for (int n = 0; n < num_samples; ++n) {
+    samples.push_back(go(action_at(n)));
+    samples.back().action = action_at(n + is_.lag);
   }
   return samples;
 }

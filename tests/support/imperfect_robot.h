@@ -30,6 +30,7 @@ struct Imperfection {
   double tag_size = 0;       ///< 1 σ: a tag is this share larger than assumed
   double focal_length = 0;   ///< the lens is this share longer than assumed
   double distortion = 0;     ///< at 45° from the optical axis a ray is off by this share
+  double lag = 0;            ///< of the poses of wander() behind their commands [samples]
 };
 
 /// One imperfection a cell, and a perfect robot.

@@ -13,6 +13,7 @@
 #include "common/bus/convert.h"
 #include "common/bus/event_log.h"
 #include "common/geometry/angle.h"
+#include "processes/structure_learner/command_lag.h"
 #include "processes/structure_learner/noise_estimate.h"
 
 namespace bodyschema {
@@ -38,6 +39,13 @@ BodySchema load_schema(const std::filesystem::path& file) {
   return from_message(schemas.back());
 }
 
+std::string lag_text(std::int64_t lag_us) {
+  return fmt::format(
+      "the poses come {:.3f} s {} their commands: each counts with the command that brought it "
+      "there",
+      static_cast<double>(std::abs(lag_us)) * 1e-6, lag_us > 0 ? "after" : "before");
+}
+
 Recording load_for(const std::string& file, const BodySchema& schema) {
   Recording recording = load_and_warn(file);
   try {
@@ -46,6 +54,11 @@ Recording load_for(const std::string& file, const BodySchema& schema) {
     throw RecordingError(file + ": " + error.what());
   }
   recording.signals = schema.signals;
+  const CommandLag lag = command_lag(recording.samples, static_cast<int>(schema.signals.size()));
+  if (!lag.is_significant) return recording;
+  const std::int64_t lag_us = refined_lag_us(recording.samples, schema, lag.us);
+  recording.samples = with_commands_of_before(recording.samples, lag_us);
+  std::cerr << "bodyschema: " << file << ": " << lag_text(lag_us) << "\n";
   return recording;
 }
 

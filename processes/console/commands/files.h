@@ -1,6 +1,7 @@
 #pragma once
 
 #include <Eigen/Geometry>
+#include <cstdint>
 #include <filesystem>
 #include <string>
 #include <vector>
@@ -20,8 +21,12 @@ BodySchema load_schema(const std::filesystem::path& file);
 /// @throws RecordingError.
 Recording load_and_warn(const std::string& file);
 
-/// Reads a recording whose actions are those of the schema, in its order, as
-/// load_and_warn(). @throws std::runtime_error.
+/// Of a stream's poses behind their commands (command_lag.h), in words.
+std::string lag_text(std::int64_t lag_us);
+
+/// Reads a recording whose actions are those of the schema, in its order, as load_and_warn(). Where
+/// its poses come after their commands each gets the command that brought it there, and that is
+/// said on stderr. @throws std::runtime_error.
 Recording load_for(const std::string& file, const BodySchema& schema);
 
 /// Adds `--noise POS_M ROT_DEG`.

@@ -1,0 +1,331 @@
+#include "processes/structure_learner/command_lag.h"
+
+#include <Eigen/Cholesky>
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstddef>
+#include <limits>
+#include <optional>
+
+#include "common/estimation/quantile.h"
+#include "common/estimation/student_t.h"
+#include "common/geometry/pose.h"
+#include "processes/structure_learner/edge_fit.h"
+#include "processes/structure_learner/local_model.h"
+#include "processes/structure_learner/noise_estimate.h"
+#include "processes/structure_learner/pair_data.h"
+
+namespace bodyschema {
+namespace {
+
+/// Lags are looked for up to so far, or to so many intervals, but no farther than a share of the
+/// stream. Chosen.
+constexpr double kFarthest_us = 600'000, kFarthestIntervals = 12, kShareOfStream = 0.125;
+/// Of independent blocks of time, by which a lag must explain more than none [nats]. Chosen.
+constexpr double kEvidence = 3;
+constexpr double kLeastIntervals = 0.25;
+/// Motions of a regression, at most; of more parts those with neighbouring ids alone. Chosen.
+constexpr std::size_t kMostMotions = 400, kMostPaired = 10;
+constexpr std::size_t kFewestMotions = 40;
+/// Residuals below are no information [m, rad].
+constexpr double kFloor = 1e-5;
+/// Of the median squared distance; flips and false detections are beyond. Chosen.
+constexpr double kWild = 8;
+constexpr int kFitted = 300, kIterations = 20;
+
+double time_of(const ActionPoseSample& sample) { return static_cast<double>(sample.utime); }
+
+/// Commands between those of the samples, linear in time.
+class CommandTrack {
+ public:
+  explicit CommandTrack(const std::vector<ActionPoseSample>& samples) : samples_(samples) {}
+
+  /// std::nullopt before the first and after the last.
+  std::optional<Eigen::VectorXd> at(double time_us) const {
+    const auto after = std::ranges::lower_bound(samples_, time_us, {}, time_of);
+    if (after == samples_.end()) return std::nullopt;
+    if (time_of(*after) == time_us) return after->action;
+    if (after == samples_.begin()) return std::nullopt;
+    const auto before = after - 1;
+    const double share = (time_us - time_of(*before)) / (time_of(*after) - time_of(*before));
+    return before->action + share * (after->action - before->action);
+  }
+
+ private:
+  const std::vector<ActionPoseSample>& samples_;
+};
+
+/// log(z(t_a)⁻¹ z(t_b)) of a pair of parts.
+struct Motion {
+  double from_us, to_us;
+  Vector6d twist;
+};
+
+std::vector<Motion> motions_of(const std::vector<ActionPoseSample>& samples, int part_i, int part_j,
+                               double interval_us, int num_intervals) {
+  struct Seen {
+    double time_us;
+    Pose z;
+  };
+  std::vector<Seen> seen;
+  for (const ActionPoseSample& sample : samples) {
+    const PartObservation *i = sample.find(part_i), *j = sample.find(part_j);
+    if (i && j && i->has_rotation && j->has_rotation)
+      seen.push_back({time_of(sample), i->X_CB.inverse() * j->X_CB});
+  }
+  std::vector<Motion> motions;
+  std::size_t b = 0;
+  for (const Seen& from : seen) {
+    while (b < seen.size() && seen[b].time_us < from.time_us + (num_intervals - 0.5) * interval_us)
+      ++b;
+    if (b == seen.size()) break;
+    if (seen[b].time_us > from.time_us + 2 * num_intervals * interval_us) continue;
+    motions.push_back({from.time_us, seen[b].time_us, log(from.z.inverse() * seen[b].z)});
+  }
+  if (motions.size() <= kMostMotions) return motions;
+  std::vector<Motion> some;
+  for (std::size_t n = 0; n < kMostMotions; ++n)
+    some.push_back(motions[n * motions.size() / kMostMotions]);
+  return some;
+}
+
+/// What the commands of `lag_us` before say about one pair's motions.
+class MotionRegression {
+ public:
+  MotionRegression(std::vector<Motion> motions, const CommandTrack& track,
+                   const NormalizedActions& actions)
+      : motions_(std::move(motions)), track_(track), actions_(actions) {}
+
+  std::size_t num_motions() const { return motions_.size(); }
+
+  /// log |S| of the residuals' covariance S, negative and halved: nats a motion.
+  double log_likelihood(double lag_us) const {
+    const Eigen::MatrixXd residuals = residuals_at(lag_us);
+    return -0.5 * log_det(covariance(residuals));
+  }
+
+  /// Without what is wild at this lag.
+  void drop_wild(double lag_us) {
+    const Eigen::MatrixXd residuals = residuals_at(lag_us);
+    const Eigen::MatrixXd whitened = covariance(residuals).llt().matrixL().solve(residuals);
+    const Eigen::VectorXd distances = whitened.colwise().squaredNorm();
+    const double most = kWild * upper_median({distances.begin(), distances.end()});
+    std::vector<Motion> kept;
+    for (std::size_t n = 0; n < motions_.size(); ++n)
+      if (distances[static_cast<Eigen::Index>(n)] <= most) kept.push_back(motions_[n]);
+    motions_ = std::move(kept);
+  }
+
+ private:
+  static Matrix6d covariance(const Eigen::MatrixXd& residuals) {
+    return residuals * residuals.transpose() / static_cast<double>(residuals.cols()) +
+           kFloor * kFloor * Matrix6d::Identity();
+  }
+  static double log_det(const Matrix6d& S) {
+    return 2 * Matrix6d(S.llt().matrixL()).diagonal().array().log().sum();
+  }
+
+  Eigen::MatrixXd residuals_at(double lag_us) const {
+    const std::vector<int>& moving = actions_.moving();
+    const auto m = static_cast<Eigen::Index>(moving.size());
+    const auto num = static_cast<Eigen::Index>(motions_.size());
+    Eigen::MatrixXd steps(m, num), twists(6, num);
+    for (Eigen::Index n = 0; n < num; ++n) {
+      const Motion& motion = motions_[static_cast<std::size_t>(n)];
+      const auto from = track_.at(motion.from_us - lag_us), to = track_.at(motion.to_us - lag_us);
+      for (Eigen::Index s = 0; s < m; ++s) {
+        const int signal = moving[static_cast<std::size_t>(s)];
+        steps(s, n) = ((*to)[signal] - (*from)[signal]) / actions_.half_range(signal);
+      }
+      twists.col(n) = motion.twist;
+    }
+    Eigen::MatrixXd normal = steps * steps.transpose();
+    normal.diagonal().array() += 1e-9 * normal.trace() / static_cast<double>(normal.rows());
+    return twists - twists * steps.transpose() * normal.ldlt().solve(steps);
+  }
+
+  std::vector<Motion> motions_;
+  const CommandTrack& track_;
+  const NormalizedActions& actions_;
+};
+
+double median_interval_us(const std::vector<ActionPoseSample>& samples) {
+  std::vector<double> intervals;
+  for (std::size_t n = 1; n < samples.size(); ++n)
+    intervals.push_back(time_of(samples[n]) - time_of(samples[n - 1]));
+  return intervals.empty() ? 0 : upper_median(std::move(intervals));
+}
+
+double num_blocks(std::size_t num_samples, const NormalizedActions& actions) {
+  return static_cast<double>(num_samples) / static_cast<double>(actions.blocks().length());
+}
+
+/// Of three values at −1, 0, 1, where their parabola has its least; within ±1.
+double vertex(double before, double at, double after) {
+  const double bend = before - 2 * at + after;
+  return bend > 0 ? std::clamp(0.5 * (before - after) / bend, -1.0, 1.0) : 0;
+}
+
+/// At a lag − step, at it and at it + step, of the same frames.
+template <class CostOf>
+std::array<double, 3> costs_about(std::int64_t lag_us, std::int64_t step_us,
+                                  const std::vector<ActionPoseSample>& samples,
+                                  const CostOf& cost_of) {
+  const std::int64_t margin_us = std::abs(lag_us) + std::abs(step_us);
+  std::array<double, 3> costs;
+  for (const int n : {-1, 0, 1}) {
+    std::vector<ActionPoseSample> lagged = with_commands_of_before(samples, lag_us + n * step_us);
+    std::erase_if(lagged, [&](const ActionPoseSample& sample) {
+      return sample.utime < samples.front().utime + margin_us ||
+             sample.utime > samples.back().utime - margin_us;
+    });
+    costs[static_cast<std::size_t>(n + 1)] = cost_of(lagged);
+  }
+  return costs;
+}
+
+/// Where `costs_at` (at a lag − step, at it, at it + step) has its least, downhill from `lag_us`.
+template <class CostsAt>
+std::int64_t least_at(std::int64_t lag_us, std::int64_t step_us, const CostsAt& costs_at) {
+  constexpr int kMostSteps = 20;
+  for (int n = 0; n < kMostSteps; ++n) {
+    const auto [before, at, after] = costs_at(lag_us);
+    const double share = vertex(before, at, after);
+    lag_us += std::llround(share * static_cast<double>(step_us));
+    if (std::abs(share) < 1) break;
+  }
+  return lag_us;
+}
+
+std::vector<MotionRegression> regressions_of(const std::vector<ActionPoseSample>& samples,
+                                             const CommandTrack& track,
+                                             const NormalizedActions& actions, double interval_us,
+                                             double farthest_us) {
+  // Frames whose commands are known at every lag.
+  std::vector<ActionPoseSample> inner;
+  for (const ActionPoseSample& sample : samples)
+    if (time_of(sample) >= time_of(samples.front()) + farthest_us &&
+        time_of(sample) <= time_of(samples.back()) - farthest_us)
+      inner.push_back(sample);
+  const int num_intervals = std::max(1, actions.blocks().length() / 4);
+  const std::vector<int> parts = seen_parts(inner);
+  std::vector<MotionRegression> regressions;
+  for (std::size_t i = 0; i < parts.size(); ++i) {
+    const std::size_t end =
+        parts.size() <= kMostPaired ? parts.size() : std::min(i + 2, parts.size());
+    for (std::size_t j = i + 1; j < end; ++j) {
+      MotionRegression regression(motions_of(inner, parts[i], parts[j], interval_us, num_intervals),
+                                  track, actions);
+      if (regression.num_motions() >= kFewestMotions) regressions.push_back(std::move(regression));
+    }
+  }
+  return regressions;
+}
+
+}  // namespace
+
+CommandLag command_lag(const std::vector<ActionPoseSample>& samples, int num_signals) {
+  const NormalizedActions actions(samples, num_signals);
+  if (!actions.blocks().is_stream() || actions.moving().empty()) return {};
+  const double interval_us = median_interval_us(samples);
+  const double num_intervals = (time_of(samples.back()) - time_of(samples.front())) / interval_us;
+  const int most = static_cast<int>(std::min(
+      std::max(kFarthest_us / interval_us, kFarthestIntervals), kShareOfStream * num_intervals));
+  const CommandTrack track(samples);
+  std::vector<MotionRegression> regressions =
+      regressions_of(samples, track, actions, interval_us, most * interval_us);
+  if (regressions.empty()) return {};
+  std::vector<double> sums;  // of log-likelihoods, at −most … most
+  int best = 0;
+  const auto sum_at = [&](int k) { return sums[static_cast<std::size_t>(k + most)]; };
+  const auto look = [&] {
+    sums.assign(static_cast<std::size_t>(2 * most + 1), 0);
+    for (int k = -most; k <= most; ++k)
+      for (const MotionRegression& regression : regressions)
+        sums[static_cast<std::size_t>(k + most)] += regression.log_likelihood(k * interval_us);
+    best = static_cast<int>(std::ranges::max_element(sums) - sums.begin()) - most;
+  };
+  look();
+  for (MotionRegression& regression : regressions) regression.drop_wild(best * interval_us);
+  look();
+  if (std::abs(best) == most) return {};
+  const double lag = best + vertex(-sum_at(best - 1), -sum_at(best), -sum_at(best + 1));
+  if (std::abs(lag) < kLeastIntervals) return {};
+  // Of n (n − 1) / 2 pairs n − 1 say something of their own.
+  const double num_parts = static_cast<double>(seen_parts(samples).size());
+  const double gain = (sum_at(best) - sum_at(0)) * num_blocks(samples.size(), actions) *
+                      std::min(1.0, (num_parts - 1) / static_cast<double>(regressions.size()));
+  return {std::llround(lag * interval_us), gain >= kEvidence};
+}
+
+std::int64_t refined_lag_us(const std::vector<ActionPoseSample>& samples, int num_signals,
+                            const std::vector<AcceptedModel>& models,
+                            const MeasurementModel& measurement, std::int64_t lag_us) {
+  const NormalizedActions of_models(with_commands_of_before(samples, lag_us), num_signals);
+  if (!of_models.blocks().is_stream()) return lag_us;
+  const auto step_us = static_cast<std::int64_t>(median_interval_us(samples) / 2);
+  const auto cost_of = [&](const std::vector<ActionPoseSample>& lagged) {
+    const NormalizedActions actions(lagged, num_signals);
+    double cost = 0, num_frames = 0;
+    for (const AcceptedModel& accepted : models) {
+      if (accepted.model.joints.empty()) continue;
+      const PairData pair =
+          make_pair_data(lagged, accepted.part_i, accepted.part_j, measurement, kFitted);
+      const LocalModel start = rescaled(accepted.model, of_models, actions);
+      cost += fit_local_model(start, pair, actions, kIterations, 1e-3).cost;
+      num_frames += static_cast<double>(pair.frames.size());
+    }
+    // A model's frames count as many as there are blocks.
+    return num_frames == 0 ? 0
+                           : cost * num_blocks(samples.size(), of_models) *
+                                 static_cast<double>(models.size()) / num_frames;
+  };
+  const std::int64_t least = least_at(lag_us, step_us, [&](std::int64_t lag) {
+    return costs_about(lag, step_us, samples, cost_of);
+  });
+  const auto costs = costs_about(lag_us, least - lag_us, samples, cost_of);
+  return costs[1] - costs[2] < kEvidence ? lag_us : least;
+}
+
+std::int64_t refined_lag_us(const std::vector<ActionPoseSample>& samples, const BodySchema& schema,
+                            std::int64_t lag_us) {
+  const double position_m = std::max(schema.noise.position_m, kNoiseFloor.position_m);
+  const double rotation_rad = std::max(schema.noise.rotation_rad, kNoiseFloor.rotation_rad);
+  const auto step_us = static_cast<std::int64_t>(median_interval_us(samples) / 2);
+  const auto cost_of = [&](const std::vector<ActionPoseSample>& lagged) {
+    double cost = 0;
+    for (const ActionPoseSample& sample : lagged) {
+      const PartObservation* root = sample.find(schema.root);
+      if (!root || !root->has_rotation) continue;
+      for (const auto& [part, X_RB] : schema.predict_all(sample.action)) {
+        const PartObservation* seen = sample.find(part);
+        if (!seen || part == schema.root) continue;
+        const Pose error = (root->X_CB * X_RB).inverse() * seen->X_CB;
+        double squared = error.translation().squaredNorm() / (2 * position_m * position_m);
+        if (seen->has_rotation)
+          squared += log(error).tail<3>().squaredNorm() / (2 * rotation_rad * rotation_rad);
+        cost += robust_cost(squared, seen->has_rotation ? 6 : 3);
+      }
+    }
+    return cost;
+  };
+  return least_at(lag_us, step_us,
+                  [&](std::int64_t lag) { return costs_about(lag, step_us, samples, cost_of); });
+}
+
+std::vector<ActionPoseSample> with_commands_of_before(const std::vector<ActionPoseSample>& samples,
+                                                      std::int64_t lag_us) {
+  if (lag_us == 0) return samples;
+  const CommandTrack track(samples);
+  std::vector<ActionPoseSample> lagged;
+  for (const ActionPoseSample& sample : samples)
+    if (std::optional<Eigen::VectorXd> action =
+            track.at(time_of(sample) - static_cast<double>(lag_us))) {
+      lagged.push_back(sample);
+      lagged.back().action = *std::move(action);
+    }
+  return lagged;
+}
+
+}  // namespace bodyschema

@@ -1,0 +1,106 @@
+#include "processes/structure_learner/command_lag.h"
+
+#include <gtest/gtest.h>
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <vector>
+
+#include "common/geometry/angle.h"
+#include "processes/structure_learner/learn.h"
+#include "tests/support/imperfect_robot.h"
+
+namespace bodyschema {
+namespace {
+
+using test::ImperfectRobot;
+using test::Rightness;
+
+constexpr int kSamples = 1000;
+constexpr double kPeriod = 60;
+
+std::vector<ActionPoseSample> stream_of(ImperfectRobot& robot) {
+  return robot.wander(kSamples, kPeriod);
+}
+
+double interval_us(const std::vector<ActionPoseSample>& samples) {
+  return static_cast<double>(samples.back().utime - samples.front().utime) / (kSamples - 1);
+}
+
+TEST(CommandLag, IsFoundToAShareOfTheInterval) {
+  for (const double lag : {-4.0, -1.5, 0.5, 1.5, 8.0})
+    for (std::uint64_t seed = 0; seed < 3; ++seed) {
+      ImperfectRobot robot(3, true, {.lag = lag}, seed);
+      const auto samples = stream_of(robot);
+      const CommandLag found = command_lag(samples, 3);
+      EXPECT_TRUE(found.is_significant || std::abs(lag) < 1) << lag << ", seed " << seed;
+      EXPECT_NEAR(static_cast<double>(found.us) / interval_us(samples), lag, 0.1) << seed;
+    }
+}
+
+TEST(CommandLag, IsNoneWhereThereIsNone) {
+  for (const test::Imperfection& is :
+       std::vector<test::Imperfection>{{},
+                                       {.droop_deg = 2},
+                                       {.view_bias_m = 0.003, .view_bias_deg = 1.5},
+                                       {.correlation = 0.9},
+                                       {.student_nu = 2.2},
+                                       {.flip_share = 0.1},
+                                       {.missing_share = 0.6}})
+    for (std::uint64_t seed = 0; seed < 3; ++seed) {
+      ImperfectRobot robot(3, seed % 2, is, seed);
+      EXPECT_FALSE(command_lag(stream_of(robot), 3).is_significant) << is.name << ", seed " << seed;
+    }
+}
+
+TEST(CommandLag, IsNoneOfPosesAtRest) {
+  ImperfectRobot robot(3, true, {}, 1);
+  EXPECT_EQ(command_lag(robot.babble(200), 3).us, 0);
+  EXPECT_EQ(command_lag({}, 0).us, 0);
+  EXPECT_EQ(command_lag(robot.babble(1), 3).us, 0);
+}
+
+TEST(CommandLag, CommandsOfBeforeAreLinearBetweenTwo) {
+  std::vector<ActionPoseSample> samples(3);
+  for (int n = 0; n < 3; ++n) {
+    samples[static_cast<std::size_t>(n)].utime = 1000 * n;
+    samples[static_cast<std::size_t>(n)].action = Eigen::VectorXd::Constant(1, n * n);
+  }
+  const auto late = with_commands_of_before(samples, 250);
+  ASSERT_EQ(late.size(), 2U);
+  EXPECT_EQ(late[0].utime, 1000);
+  EXPECT_DOUBLE_EQ(late[0].action[0], 0.75);
+  EXPECT_DOUBLE_EQ(late[1].action[0], 3.25);
+  const auto early = with_commands_of_before(samples, -1000);
+  ASSERT_EQ(early.size(), 2U);
+  EXPECT_DOUBLE_EQ(early[1].action[0], 4);
+  EXPECT_TRUE(with_commands_of_before(samples, 5000).empty());
+}
+
+// What is learned is where a command leads, not where the arm is when it is given.
+TEST(CommandLag, IsTakenIntoAccount) {
+  for (const double lag : {1.5, 8.0})
+    for (const bool is_chain : {true, false}) {
+      ImperfectRobot robot(3, is_chain, {.lag = lag}, 2);
+      LearnOptions options;
+      options.root = 1;
+      const LearnResult late = learn(robot.signals(), stream_of(robot), options);
+      EXPECT_EQ(judge(late.schema, robot.structure()), Rightness::kRight) << lag;
+      EXPECT_TRUE(late.schema.complete);
+      ImperfectRobot punctual(3, is_chain, {}, 2);
+      const auto samples = stream_of(punctual);
+      const LearnResult right = learn(punctual.signals(), samples, options);
+      EXPECT_EQ(right.command_lag_us, 0);
+      EXPECT_NEAR(static_cast<double>(late.command_lag_us) / interval_us(samples), lag, 0.05);
+      for (std::size_t n = 0; n < samples.size(); n += 100) {
+        const auto a = late.schema.predict(1, 4, samples[n].action);
+        const auto b = right.schema.predict(1, 4, samples[n].action);
+        ASSERT_TRUE(a && b);
+        EXPECT_LT((a->X_AB.translation() - b->X_AB.translation()).norm(), 0.001) << lag;
+      }
+    }
+}
+
+}  // namespace
+}  // namespace bodyschema
