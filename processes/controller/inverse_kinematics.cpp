@@ -156,7 +156,28 @@ class Posture {
     return residual_.jacobian(pose_jacobian(path_, scale_.action(u))) *
            scale_.range.matrix().asDiagonal();
   }
-  double cost(const Eigen::VectorXd& u) const {
+  double cost(const Eigen::VectorXd& u) const { return cost_of_room(u) + cost_of_doubt(u); }
+  /// Down the null space of J.
+  Eigen::VectorXd descent(const Eigen::VectorXd& u) const {
+    constexpr double kDifference = 1e-5;
+    // Where the part is known well it is so nearby, too: that takes the most time.
+    const bool is_in_doubt = cost_of_doubt(u) > 0;
+    const auto cost_at = [&](const Eigen::VectorXd& at) {
+      return cost_of_room(at) + (is_in_doubt ? cost_of_doubt(at) : 0);
+    };
+    const double here = cost_at(u);
+    Eigen::VectorXd gradient(u.size());
+    for (Eigen::Index i = 0; i < u.size(); ++i) {
+      Eigen::VectorXd there = u;
+      there[i] += kDifference;
+      gradient[i] = (cost_at(there) - here) / kDifference;
+    }
+    const Eigen::MatrixXd J = jacobian(u);
+    return J.completeOrthogonalDecomposition().solve(J * gradient) - gradient;
+  }
+
+ private:
+  double cost_of_room(const Eigen::VectorXd& u) const {
     const Eigen::MatrixXd J = jacobian(u);
     const Eigen::Array<bool, Eigen::Dynamic, 1> moves =
         J.colwise().squaredNorm().transpose().array() > 0;
@@ -167,25 +188,14 @@ class Posture {
       const double condition = singular[rank - 1] / std::max(singular[0], 1e-12);
       sum += std::pow(std::max(0.0, 1 - condition / kWellConditioned), 2);
     }
+    return sum;
+  }
+  double cost_of_doubt(const Eigen::VectorXd& u) const {
     const double sd_m =
         deviations_of(path_.covariance(scale_.action(u), Variance::kFirstOrder)).position_m;
-    return sum + std::pow(std::max(0.0, sd_m / uncertain_m_ - 1), 2);
-  }
-  /// Down the null space of J.
-  Eigen::VectorXd descent(const Eigen::VectorXd& u) const {
-    constexpr double kDifference = 1e-5;
-    const double here = cost(u);
-    Eigen::VectorXd gradient(u.size());
-    for (Eigen::Index i = 0; i < u.size(); ++i) {
-      Eigen::VectorXd there = u;
-      there[i] += kDifference;
-      gradient[i] = (cost(there) - here) / kDifference;
-    }
-    const Eigen::MatrixXd J = jacobian(u);
-    return J.completeOrthogonalDecomposition().solve(J * gradient) - gradient;
+    return std::pow(std::max(0.0, sd_m / uncertain_m_ - 1), 2);
   }
 
- private:
   const KinematicPath& path_;
   const Scale& scale_;
   const Residual& residual_;

@@ -249,6 +249,9 @@ class HelpNeverActs(GroupTest):
             out, code = self.run_to_end(word, "--help")
             self.assertEqual((out, code), (f"{word} --help\n", 0))
         self.assertEqual(self.run_to_end("fault", "bend", "--help")[0], "fault bend --help\n")
+        # The workspace that the group's controller keeps to.
+        self.assertIn(f"follow path.csv --rig {self.current.resolve() / 'config'}\n", self.run_to_end("follow", "path.csv")[0])
+        self.assertNotIn("--rig", self.run_to_end("hold")[0])
         self.run_to_end("--rig", "arm2", "--help")
         self.run_to_end("stop", "--now")
         self.assertFalse(self.group().has_ended())

@@ -271,7 +271,25 @@ TEST(ControllerInterruptsTest, WhileHaltedATargetIsRefusedAndWhatIsHeldStaysHeld
     bench.run(20);
     EXPECT_EQ(bench.status.owns_arm, was_owned) << info(phase).name;
     EXPECT_EQ(bench.moves.size(), num_moves) << info(phase).name;
+    EXPECT_FALSE(bench.has_why("is halted")) << bench.status.why;
   }
+}
+
+TEST(ControllerInterruptsTest, WhatWasSeenAtAnotherRestIsNotSeenHere) {
+  Bench bench;
+  bench.start();
+  bench.give(position_target(0, kNear));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED));
+  EXPECT_GE(bench.status.observed_error_m, 0);
+  bench.give(other_target(1, Target::KIND_RELEASE));
+  bench.observer_works = false;
+  bench.arm = {10, 0.1, 2};
+  move_by_another(bench);
+  bench.give(position_target(2, bench.part_position()));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+  EXPECT_EQ(bench.status.num_moves, 0);
+  EXPECT_LT(bench.status.observed_error_m, 0);
+  EXPECT_TRUE(bench.has_why("the part is not seen there")) << bench.status.why;
 }
 
 TEST(ControllerInterruptsTest, ATargetThatSomebodyMovedTheArmAwayFromIsNotGoneBackToUnasked) {
