@@ -33,27 +33,58 @@ constexpr double kFloor = 1e-5;
 /// Of the median squared distance; flips and false detections are beyond. Chosen.
 constexpr double kWild = 8;
 constexpr int kFitted = 300, kIterations = 20;
+constexpr std::size_t kMostFrames = 1000;
+/// Commands farther apart, in median intervals, tell nothing of those between them. Chosen.
+constexpr double kMostApart = 4;
 
 double time_of(const ActionPoseSample& sample) { return static_cast<double>(sample.utime); }
 
-/// Commands between those of the samples, linear in time.
+double median_interval_us(const std::vector<ActionPoseSample>& samples) {
+  std::vector<double> intervals;
+  for (std::size_t n = 1; n < samples.size(); ++n)
+    intervals.push_back(time_of(samples[n]) - time_of(samples[n - 1]));
+  return intervals.empty() ? 0 : upper_median(std::move(intervals));
+}
+
+/// The commands of a stream and those between them, linear in time. Keeps a reference.
 class CommandTrack {
  public:
-  explicit CommandTrack(const std::vector<ActionPoseSample>& samples) : samples_(samples) {}
+  explicit CommandTrack(const std::vector<ActionPoseSample>& samples)
+      : samples_(samples), most_apart_us_(kMostApart * median_interval_us(samples)) {}
 
-  /// std::nullopt before the first and after the last.
+  /// std::nullopt before the first, after the last, and where too far from the next.
   std::optional<Eigen::VectorXd> at(double time_us) const {
     const auto after = std::ranges::lower_bound(samples_, time_us, {}, time_of);
     if (after == samples_.end()) return std::nullopt;
     if (time_of(*after) == time_us) return after->action;
     if (after == samples_.begin()) return std::nullopt;
     const auto before = after - 1;
-    const double share = (time_us - time_of(*before)) / (time_of(*after) - time_of(*before));
+    const double apart_us = time_of(*after) - time_of(*before);
+    if (apart_us > most_apart_us_) return std::nullopt;
+    const double share = (time_us - time_of(*before)) / apart_us;
     return before->action + share * (after->action - before->action);
   }
 
+  /// The samples around which it is known everywhere within `margin_us`.
+  std::vector<std::size_t> within(double margin_us) const {
+    const auto is_behind_gap = [&](std::size_t n) {
+      return n == 0 || time_of(samples_[n]) - time_of(samples_[n - 1]) > most_apart_us_;
+    };
+    std::vector<std::size_t> inner;
+    for (std::size_t begin = 0, end = 0; begin < samples_.size(); begin = end) {
+      for (end = begin + 1; end < samples_.size() && !is_behind_gap(end);) ++end;
+      for (std::size_t n = begin; n < end; ++n)
+        if (time_of(samples_[n]) - margin_us >= time_of(samples_[begin]) &&
+            time_of(samples_[n]) + margin_us <= time_of(samples_[end - 1]))
+          inner.push_back(n);
+    }
+    return inner;
+  }
+  const std::vector<ActionPoseSample>& samples() const { return samples_; }
+
  private:
   const std::vector<ActionPoseSample>& samples_;
+  const double most_apart_us_;
 };
 
 /// log(z(t_a)⁻¹ z(t_b)) of a pair of parts.
@@ -62,14 +93,16 @@ struct Motion {
   Vector6d twist;
 };
 
-std::vector<Motion> motions_of(const std::vector<ActionPoseSample>& samples, int part_i, int part_j,
+std::vector<Motion> motions_of(const std::vector<ActionPoseSample>& samples,
+                               const std::vector<std::size_t>& inner, int part_i, int part_j,
                                double interval_us, int num_intervals) {
   struct Seen {
     double time_us;
     Pose z;
   };
   std::vector<Seen> seen;
-  for (const ActionPoseSample& sample : samples) {
+  for (const std::size_t n : inner) {
+    const ActionPoseSample& sample = samples[n];
     const PartObservation *i = sample.find(part_i), *j = sample.find(part_j);
     if (i && j && i->has_rotation && j->has_rotation)
       seen.push_back({time_of(sample), i->X_CB.inverse() * j->X_CB});
@@ -150,13 +183,6 @@ class MotionRegression {
   const NormalizedActions& actions_;
 };
 
-double median_interval_us(const std::vector<ActionPoseSample>& samples) {
-  std::vector<double> intervals;
-  for (std::size_t n = 1; n < samples.size(); ++n)
-    intervals.push_back(time_of(samples[n]) - time_of(samples[n - 1]));
-  return intervals.empty() ? 0 : upper_median(std::move(intervals));
-}
-
 double num_blocks(std::size_t num_samples, const NormalizedActions& actions) {
   return static_cast<double>(num_samples) / static_cast<double>(actions.blocks().length());
 }
@@ -170,16 +196,16 @@ double vertex(double before, double at, double after) {
 /// At a lag − step, at it and at it + step, of the same frames.
 template <class CostOf>
 std::array<double, 3> costs_about(std::int64_t lag_us, std::int64_t step_us,
-                                  const std::vector<ActionPoseSample>& samples,
-                                  const CostOf& cost_of) {
-  const std::int64_t margin_us = std::abs(lag_us) + std::abs(step_us);
+                                  const CommandTrack& track, const CostOf& cost_of) {
+  const auto farthest_us = static_cast<double>(std::abs(lag_us) + std::abs(step_us));
+  const std::vector<std::size_t> inner = track.within(farthest_us);
+  std::vector<ActionPoseSample> lagged;
+  for (std::size_t k = 0, count = std::min(kMostFrames, inner.size()); k < count; ++k)
+    lagged.push_back(track.samples()[inner[k * inner.size() / count]]);
   std::array<double, 3> costs;
   for (const int n : {-1, 0, 1}) {
-    std::vector<ActionPoseSample> lagged = with_commands_of_before(samples, lag_us + n * step_us);
-    std::erase_if(lagged, [&](const ActionPoseSample& sample) {
-      return sample.utime < samples.front().utime + margin_us ||
-             sample.utime > samples.back().utime - margin_us;
-    });
+    for (std::size_t k = 0; k < lagged.size(); ++k)
+      lagged[k].action = *track.at(time_of(lagged[k]) - static_cast<double>(lag_us + n * step_us));
     costs[static_cast<std::size_t>(n + 1)] = cost_of(lagged);
   }
   return costs;
@@ -202,21 +228,18 @@ std::vector<MotionRegression> regressions_of(const std::vector<ActionPoseSample>
                                              const CommandTrack& track,
                                              const NormalizedActions& actions, double interval_us,
                                              double farthest_us) {
-  // Frames whose commands are known at every lag.
-  std::vector<ActionPoseSample> inner;
-  for (const ActionPoseSample& sample : samples)
-    if (time_of(sample) >= time_of(samples.front()) + farthest_us &&
-        time_of(sample) <= time_of(samples.back()) - farthest_us)
-      inner.push_back(sample);
+  // Their commands are known at every lag.
+  const std::vector<std::size_t> inner = track.within(farthest_us);
   const int num_intervals = std::max(1, actions.blocks().length() / 4);
-  const std::vector<int> parts = seen_parts(inner);
+  const std::vector<int> parts = seen_parts(samples);
   std::vector<MotionRegression> regressions;
   for (std::size_t i = 0; i < parts.size(); ++i) {
     const std::size_t end =
         parts.size() <= kMostPaired ? parts.size() : std::min(i + 2, parts.size());
     for (std::size_t j = i + 1; j < end; ++j) {
-      MotionRegression regression(motions_of(inner, parts[i], parts[j], interval_us, num_intervals),
-                                  track, actions);
+      MotionRegression regression(
+          motions_of(samples, inner, parts[i], parts[j], interval_us, num_intervals), track,
+          actions);
       if (regression.num_motions() >= kFewestMotions) regressions.push_back(std::move(regression));
     }
   }
@@ -264,6 +287,7 @@ std::int64_t refined_lag_us(const std::vector<ActionPoseSample>& samples, int nu
                             const MeasurementModel& measurement, std::int64_t lag_us) {
   const NormalizedActions of_models(with_commands_of_before(samples, lag_us), num_signals);
   if (!of_models.blocks().is_stream()) return lag_us;
+  const CommandTrack track(samples);
   const auto step_us = static_cast<std::int64_t>(median_interval_us(samples) / 2);
   const auto cost_of = [&](const std::vector<ActionPoseSample>& lagged) {
     const NormalizedActions actions(lagged, num_signals);
@@ -281,10 +305,9 @@ std::int64_t refined_lag_us(const std::vector<ActionPoseSample>& samples, int nu
                            : cost * num_blocks(samples.size(), of_models) *
                                  static_cast<double>(models.size()) / num_frames;
   };
-  const std::int64_t least = least_at(lag_us, step_us, [&](std::int64_t lag) {
-    return costs_about(lag, step_us, samples, cost_of);
-  });
-  const auto costs = costs_about(lag_us, least - lag_us, samples, cost_of);
+  const std::int64_t least = least_at(
+      lag_us, step_us, [&](std::int64_t lag) { return costs_about(lag, step_us, track, cost_of); });
+  const auto costs = costs_about(lag_us, least - lag_us, track, cost_of);
   return costs[1] - costs[2] < kEvidence ? lag_us : least;
 }
 
@@ -292,6 +315,7 @@ std::int64_t refined_lag_us(const std::vector<ActionPoseSample>& samples, const 
                             std::int64_t lag_us) {
   const double position_m = std::max(schema.noise.position_m, kNoiseFloor.position_m);
   const double rotation_rad = std::max(schema.noise.rotation_rad, kNoiseFloor.rotation_rad);
+  const CommandTrack track(samples);
   const auto step_us = static_cast<std::int64_t>(median_interval_us(samples) / 2);
   const auto cost_of = [&](const std::vector<ActionPoseSample>& lagged) {
     double cost = 0;
@@ -311,7 +335,7 @@ std::int64_t refined_lag_us(const std::vector<ActionPoseSample>& samples, const 
     return cost;
   };
   return least_at(lag_us, step_us,
-                  [&](std::int64_t lag) { return costs_about(lag, step_us, samples, cost_of); });
+                  [&](std::int64_t lag) { return costs_about(lag, step_us, track, cost_of); });
 }
 
 std::vector<ActionPoseSample> with_commands_of_before(const std::vector<ActionPoseSample>& samples,

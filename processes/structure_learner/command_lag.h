@@ -32,8 +32,8 @@ std::int64_t refined_lag_us(const std::vector<ActionPoseSample>& samples, int nu
 std::int64_t refined_lag_us(const std::vector<ActionPoseSample>& samples, const BodySchema& schema,
                             std::int64_t lag_us);
 
-/// Each sample with the command of `lag_us` before it, linear between two; those that have none are
-/// left out.
+/// Each sample with the command of `lag_us` before it, linear between two; those that have none, at
+/// the ends and behind gaps, are left out.
 std::vector<ActionPoseSample> with_commands_of_before(const std::vector<ActionPoseSample>& samples,
                                                       std::int64_t lag_us);
 

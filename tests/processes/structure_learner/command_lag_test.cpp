@@ -76,6 +76,10 @@ TEST(CommandLag, CommandsOfBeforeAreLinearBetweenTwo) {
   ASSERT_EQ(early.size(), 2U);
   EXPECT_DOUBLE_EQ(early[1].action[0], 4);
   EXPECT_TRUE(with_commands_of_before(samples, 5000).empty());
+  // Of the time of a gap nothing is known.
+  ActionPoseSample& late_one = samples.emplace_back(samples.back());
+  late_one.utime = 9000;
+  EXPECT_EQ(with_commands_of_before(samples, 250).size(), 2U);
 }
 
 // What is learned is where a command leads, not where the arm is when it is given.
