@@ -7,10 +7,13 @@
 #include <cstddef>
 #include <limits>
 #include <optional>
+#include <set>
+#include <utility>
 
 #include "common/estimation/quantile.h"
 #include "common/estimation/student_t.h"
 #include "common/geometry/pose.h"
+#include "processes/structure_learner/command_warp.h"
 #include "processes/structure_learner/edge_fit.h"
 #include "processes/structure_learner/local_model.h"
 #include "processes/structure_learner/noise_estimate.h"
@@ -20,22 +23,28 @@ namespace bodyschema {
 namespace {
 
 /// Lags are looked for up to so far, or to so many intervals, but no farther than a share of the
-/// stream. Chosen.
+/// stream, in so many steps at most to either side. Chosen.
 constexpr double kFarthest_us = 600'000, kFarthestIntervals = 12, kShareOfStream = 0.125;
-/// Of independent blocks of time, by which a lag must explain more than none [nats]. Chosen.
-constexpr double kEvidence = 3;
+constexpr double kMostSteps = 40;
+/// By which a lag must explain more than none to be true, or to be tried [nats, of blocks of time];
+/// the best of many lags by the log of their number more. Chosen: numpy's streams of 13 to 30 s,
+/// command_lag_test.cpp.
+constexpr double kEvidence = 3, kLeastEvidence = 0.1;
+/// Smaller ones the models tell.
 constexpr double kLeastIntervals = 0.25;
-/// Motions of a regression, at most; of more parts those with neighbouring ids alone. Chosen.
-constexpr std::size_t kMostMotions = 400, kMostPaired = 10;
-constexpr std::size_t kFewestMotions = 40;
+/// Motions of a regression: at most, and at least, also for each signal; of more parts those with
+/// neighbouring ids alone. Chosen.
+constexpr std::size_t kMostMotions = 400, kFewestMotions = 40, kFewestOfSignal = 5,
+                      kMostPaired = 10;
 /// Residuals below are no information [m, rad].
 constexpr double kFloor = 1e-5;
 /// Of the median squared distance; flips and false detections are beyond. Chosen.
 constexpr double kWild = 8;
-constexpr int kFitted = 300, kIterations = 20;
-constexpr std::size_t kMostFrames = 1000;
 /// Commands farther apart, in median intervals, tell nothing of those between them. Chosen.
 constexpr double kMostApart = 4;
+/// Of a fit by models, and by a schema. Chosen.
+constexpr int kFitted = 300, kIterations = 20;
+constexpr std::size_t kMostFrames = 500;
 
 double time_of(const ActionPoseSample& sample) { return static_cast<double>(sample.utime); }
 
@@ -90,6 +99,7 @@ class CommandTrack {
 /// log(z(t_a)⁻¹ z(t_b)) of a pair of parts.
 struct Motion {
   double from_us, to_us;
+  std::size_t sample;  ///< at its begin
   Vector6d twist;
 };
 
@@ -98,6 +108,7 @@ std::vector<Motion> motions_of(const std::vector<ActionPoseSample>& samples,
                                double interval_us, int num_intervals) {
   struct Seen {
     double time_us;
+    std::size_t sample;
     Pose z;
   };
   std::vector<Seen> seen;
@@ -105,7 +116,7 @@ std::vector<Motion> motions_of(const std::vector<ActionPoseSample>& samples,
     const ActionPoseSample& sample = samples[n];
     const PartObservation *i = sample.find(part_i), *j = sample.find(part_j);
     if (i && j && i->has_rotation && j->has_rotation)
-      seen.push_back({time_of(sample), i->X_CB.inverse() * j->X_CB});
+      seen.push_back({time_of(sample), n, i->X_CB.inverse() * j->X_CB});
   }
   std::vector<Motion> motions;
   std::size_t b = 0;
@@ -114,7 +125,8 @@ std::vector<Motion> motions_of(const std::vector<ActionPoseSample>& samples,
       ++b;
     if (b == seen.size()) break;
     if (seen[b].time_us > from.time_us + 2 * num_intervals * interval_us) continue;
-    motions.push_back({from.time_us, seen[b].time_us, log(from.z.inverse() * seen[b].z)});
+    motions.push_back(
+        {from.time_us, seen[b].time_us, from.sample, log(from.z.inverse() * seen[b].z)});
   }
   if (motions.size() <= kMostMotions) return motions;
   std::vector<Motion> some;
@@ -130,12 +142,15 @@ class MotionRegression {
                    const NormalizedActions& actions)
       : motions_(std::move(motions)), track_(track), actions_(actions) {}
 
-  std::size_t num_motions() const { return motions_.size(); }
+  bool is_enough() const {
+    return motions_.size() >= std::max(kFewestMotions, kFewestOfSignal * actions_.moving().size());
+  }
 
-  /// log |S| of the residuals' covariance S, negative and halved: nats a motion.
+  /// Of residuals of covariance S: −½ log |S| for each block of time.
   double log_likelihood(double lag_us) const {
-    const Eigen::MatrixXd residuals = residuals_at(lag_us);
-    return -0.5 * log_det(covariance(residuals));
+    const int num_blocks = actions_.blocks().count(
+        motions_, [](const Motion& motion) { return static_cast<int>(motion.sample); });
+    return -0.5 * num_blocks * log_det(covariance(residuals_at(lag_us)));
   }
 
   /// Without what is wild at this lag.
@@ -183,8 +198,8 @@ class MotionRegression {
   const NormalizedActions& actions_;
 };
 
-double num_blocks(std::size_t num_samples, const NormalizedActions& actions) {
-  return static_cast<double>(num_samples) / static_cast<double>(actions.blocks().length());
+double num_blocks(const NormalizedActions& actions) {
+  return static_cast<double>(actions.num_samples()) / actions.blocks().length();
 }
 
 /// Of three values at −1, 0, 1, where their parabola has its least; within ±1.
@@ -193,54 +208,70 @@ double vertex(double before, double at, double after) {
   return bend > 0 ? std::clamp(0.5 * (before - after) / bend, -1.0, 1.0) : 0;
 }
 
-/// At a lag − step, at it and at it + step, of the same frames.
+/// Where `cost_of` the samples with the commands of that time before them [nats] has its least,
+/// downhill from `lag_us`; `without_us` where that is hardly less than there.
 template <class CostOf>
-std::array<double, 3> costs_about(std::int64_t lag_us, std::int64_t step_us,
-                                  const CommandTrack& track, const CostOf& cost_of) {
-  const auto farthest_us = static_cast<double>(std::abs(lag_us) + std::abs(step_us));
-  const std::vector<std::size_t> inner = track.within(farthest_us);
-  std::vector<ActionPoseSample> lagged;
-  for (std::size_t k = 0, count = std::min(kMostFrames, inner.size()); k < count; ++k)
-    lagged.push_back(track.samples()[inner[k * inner.size() / count]]);
-  std::array<double, 3> costs;
-  for (const int n : {-1, 0, 1}) {
-    for (std::size_t k = 0; k < lagged.size(); ++k)
-      lagged[k].action = *track.at(time_of(lagged[k]) - static_cast<double>(lag_us + n * step_us));
-    costs[static_cast<std::size_t>(n + 1)] = cost_of(lagged);
-  }
-  return costs;
-}
-
-/// Where `costs_at` (at a lag − step, at it, at it + step) has its least, downhill from `lag_us`.
-template <class CostsAt>
-std::int64_t least_at(std::int64_t lag_us, std::int64_t step_us, const CostsAt& costs_at) {
-  constexpr int kMostSteps = 20;
-  for (int n = 0; n < kMostSteps; ++n) {
-    const auto [before, at, after] = costs_at(lag_us);
-    const double share = vertex(before, at, after);
+std::int64_t least_near(std::int64_t lag_us, std::int64_t without_us,
+                        const std::vector<ActionPoseSample>& samples, const CostOf& cost_of) {
+  constexpr int kMostRounds = 20;
+  const CommandTrack track(samples);
+  // Of the same frames at all lags.
+  const auto costs_at = [&](const std::vector<std::int64_t>& lags_us) {
+    std::int64_t farthest_us = 0;
+    for (const std::int64_t lag : lags_us) farthest_us = std::max(farthest_us, std::abs(lag));
+    const std::vector<std::size_t> inner = track.within(static_cast<double>(farthest_us));
+    std::vector<ActionPoseSample> lagged;
+    for (std::size_t k = 0, count = std::min(kMostFrames, inner.size()); k < count; ++k)
+      lagged.push_back(samples[inner[k * inner.size() / count]]);
+    std::vector<double> costs;
+    for (const std::int64_t lag : lags_us) {
+      for (ActionPoseSample& sample : lagged)
+        sample.action = *track.at(static_cast<double>(sample.utime) - static_cast<double>(lag));
+      costs.push_back(cost_of(lagged));
+    }
+    return costs;
+  };
+  const auto step_us = static_cast<std::int64_t>(median_interval_us(samples) / 2);
+  for (int n = 0; n < kMostRounds; ++n) {
+    const auto costs = costs_at({lag_us - step_us, lag_us, lag_us + step_us});
+    const double share = vertex(costs[0], costs[1], costs[2]);
     lag_us += std::llround(share * static_cast<double>(step_us));
     if (std::abs(share) < 1) break;
   }
-  return lag_us;
+  const auto costs = costs_at({without_us, lag_us});
+  return costs[0] - costs[1] < kEvidence ? without_us : lag_us;
 }
 
-std::vector<MotionRegression> regressions_of(const std::vector<ActionPoseSample>& samples,
-                                             const CommandTrack& track,
-                                             const NormalizedActions& actions, double interval_us,
-                                             double farthest_us) {
+struct Regressions {
+  std::vector<MotionRegression> of_pairs;
+  std::set<int> parts;
+
+  double log_likelihood(double lag_us) const {
+    double sum = 0;
+    for (const MotionRegression& of_pair : of_pairs) sum += of_pair.log_likelihood(lag_us);
+    // Of n (n − 1) / 2 pairs n − 1 say something of their own.
+    return sum * std::min(1.0, static_cast<double>(parts.size() - 1) /
+                                   static_cast<double>(of_pairs.size()));
+  }
+};
+
+Regressions regressions_of(const std::vector<ActionPoseSample>& samples, const CommandTrack& track,
+                           const NormalizedActions& actions, double farthest_us) {
   // Their commands are known at every lag.
   const std::vector<std::size_t> inner = track.within(farthest_us);
   const int num_intervals = std::max(1, actions.blocks().length() / 4);
   const std::vector<int> parts = seen_parts(samples);
-  std::vector<MotionRegression> regressions;
+  Regressions regressions;
   for (std::size_t i = 0; i < parts.size(); ++i) {
     const std::size_t end =
         parts.size() <= kMostPaired ? parts.size() : std::min(i + 2, parts.size());
     for (std::size_t j = i + 1; j < end; ++j) {
-      MotionRegression regression(
-          motions_of(samples, inner, parts[i], parts[j], interval_us, num_intervals), track,
-          actions);
-      if (regression.num_motions() >= kFewestMotions) regressions.push_back(std::move(regression));
+      MotionRegression of_pair(motions_of(samples, inner, parts[i], parts[j],
+                                          median_interval_us(samples), num_intervals),
+                               track, actions);
+      if (!of_pair.is_enough()) continue;
+      regressions.of_pairs.push_back(std::move(of_pair));
+      regressions.parts.insert({parts[i], parts[j]});
     }
   }
   return regressions;
@@ -252,71 +283,65 @@ CommandLag command_lag(const std::vector<ActionPoseSample>& samples, int num_sig
   const NormalizedActions actions(samples, num_signals);
   if (!actions.blocks().is_stream() || actions.moving().empty()) return {};
   const double interval_us = median_interval_us(samples);
-  const double num_intervals = (time_of(samples.back()) - time_of(samples.front())) / interval_us;
-  const int most = static_cast<int>(std::min(
-      std::max(kFarthest_us / interval_us, kFarthestIntervals), kShareOfStream * num_intervals));
+  const double farthest_us =
+      std::min(std::max(kFarthest_us, kFarthestIntervals * interval_us),
+               kShareOfStream * (time_of(samples.back()) - time_of(samples.front())));
+  const double step_us = std::max(interval_us, farthest_us / kMostSteps);
+  const int most = static_cast<int>(farthest_us / step_us);
   const CommandTrack track(samples);
-  std::vector<MotionRegression> regressions =
-      regressions_of(samples, track, actions, interval_us, most * interval_us);
-  if (regressions.empty()) return {};
-  std::vector<double> sums;  // of log-likelihoods, at −most … most
+  Regressions regressions = regressions_of(samples, track, actions, most * step_us);
+  if (regressions.of_pairs.empty()) return {};
+  std::vector<double> gains;  // at −most … most
   int best = 0;
-  const auto sum_at = [&](int k) { return sums[static_cast<std::size_t>(k + most)]; };
+  const auto gain_at = [&](int k) { return gains[static_cast<std::size_t>(k + most)]; };
   const auto look = [&] {
-    sums.assign(static_cast<std::size_t>(2 * most + 1), 0);
+    gains.clear();
+    const double without = regressions.log_likelihood(0);
     for (int k = -most; k <= most; ++k)
-      for (const MotionRegression& regression : regressions)
-        sums[static_cast<std::size_t>(k + most)] += regression.log_likelihood(k * interval_us);
-    best = static_cast<int>(std::ranges::max_element(sums) - sums.begin()) - most;
+      gains.push_back(regressions.log_likelihood(k * step_us) - without);
+    best = static_cast<int>(std::ranges::max_element(gains) - gains.begin()) - most;
   };
   look();
-  for (MotionRegression& regression : regressions) regression.drop_wild(best * interval_us);
+  for (MotionRegression& of_pair : regressions.of_pairs) of_pair.drop_wild(best * step_us);
   look();
   if (std::abs(best) == most) return {};
-  const double lag = best + vertex(-sum_at(best - 1), -sum_at(best), -sum_at(best + 1));
-  if (std::abs(lag) < kLeastIntervals) return {};
-  // Of n (n − 1) / 2 pairs n − 1 say something of their own.
-  const double num_parts = static_cast<double>(seen_parts(samples).size());
-  const double gain = (sum_at(best) - sum_at(0)) * num_blocks(samples.size(), actions) *
-                      std::min(1.0, (num_parts - 1) / static_cast<double>(regressions.size()));
-  return {std::llround(lag * interval_us), gain >= kEvidence};
+  const double lag_us =
+      step_us * (best + vertex(-gain_at(best - 1), -gain_at(best), -gain_at(best + 1)));
+  if (std::abs(lag_us) < kLeastIntervals * interval_us || gain_at(best) < kLeastEvidence) return {};
+  return {std::llround(lag_us), gain_at(best) >= kEvidence + std::log(2 * most + 1)};
 }
 
-std::int64_t refined_lag_us(const std::vector<ActionPoseSample>& samples, int num_signals,
+std::int64_t refined_lag_us(const std::vector<ActionPoseSample>& samples,
+                            const std::vector<Signal>& signals, const NormalizedActions& actions,
                             const std::vector<AcceptedModel>& models,
                             const MeasurementModel& measurement, std::int64_t lag_us) {
-  const NormalizedActions of_models(with_commands_of_before(samples, lag_us), num_signals);
-  if (!of_models.blocks().is_stream()) return lag_us;
-  const CommandTrack track(samples);
-  const auto step_us = static_cast<std::int64_t>(median_interval_us(samples) / 2);
+  if (!actions.blocks().is_stream()) return lag_us;
   const auto cost_of = [&](const std::vector<ActionPoseSample>& lagged) {
-    const NormalizedActions actions(lagged, num_signals);
-    double cost = 0, num_frames = 0;
+    const std::vector<ActionPoseSample> moved = displaced(lagged, signals);
+    const NormalizedActions actions_here(moved, actions.num_signals());
+    double cost = 0, num_frames = 0, num_models = 0;
     for (const AcceptedModel& accepted : models) {
       if (accepted.model.joints.empty()) continue;
       const PairData pair =
-          make_pair_data(lagged, accepted.part_i, accepted.part_j, measurement, kFitted);
-      const LocalModel start = rescaled(accepted.model, of_models, actions);
-      cost += fit_local_model(start, pair, actions, kIterations, 1e-3).cost;
+          make_pair_data(moved, accepted.part_i, accepted.part_j, measurement, kFitted);
+      const LocalModel start = rescaled(accepted.model, actions, actions_here);
+      cost += fit_local_model(start, pair, actions_here, kIterations, 1e-3).cost;
       num_frames += static_cast<double>(pair.frames.size());
+      ++num_models;
     }
     // A model's frames count as many as there are blocks.
-    return num_frames == 0 ? 0
-                           : cost * num_blocks(samples.size(), of_models) *
-                                 static_cast<double>(models.size()) / num_frames;
+    return num_frames == 0 ? 0 : cost * num_blocks(actions) * num_models / num_frames;
   };
-  const std::int64_t least = least_at(
-      lag_us, step_us, [&](std::int64_t lag) { return costs_about(lag, step_us, track, cost_of); });
-  const auto costs = costs_about(lag_us, least - lag_us, track, cost_of);
-  return costs[1] - costs[2] < kEvidence ? lag_us : least;
+  return least_near(lag_us, lag_us, samples, cost_of);
 }
 
-std::int64_t refined_lag_us(const std::vector<ActionPoseSample>& samples, const BodySchema& schema,
-                            std::int64_t lag_us) {
+std::int64_t command_lag_us(const std::vector<ActionPoseSample>& samples,
+                            const BodySchema& schema) {
+  const int num_signals = static_cast<int>(schema.signals.size());
+  const NormalizedActions actions(samples, num_signals);
+  if (!actions.blocks().is_stream()) return 0;
   const double position_m = std::max(schema.noise.position_m, kNoiseFloor.position_m);
   const double rotation_rad = std::max(schema.noise.rotation_rad, kNoiseFloor.rotation_rad);
-  const CommandTrack track(samples);
-  const auto step_us = static_cast<std::int64_t>(median_interval_us(samples) / 2);
   const auto cost_of = [&](const std::vector<ActionPoseSample>& lagged) {
     double cost = 0;
     for (const ActionPoseSample& sample : lagged) {
@@ -325,17 +350,17 @@ std::int64_t refined_lag_us(const std::vector<ActionPoseSample>& samples, const 
       for (const auto& [part, X_RB] : schema.predict_all(sample.action)) {
         const PartObservation* seen = sample.find(part);
         if (!seen || part == schema.root) continue;
+        const bool has_rotation = seen->has_rotation && schema.has_rotation(part);
         const Pose error = (root->X_CB * X_RB).inverse() * seen->X_CB;
         double squared = error.translation().squaredNorm() / (2 * position_m * position_m);
-        if (seen->has_rotation)
+        if (has_rotation)
           squared += log(error).tail<3>().squaredNorm() / (2 * rotation_rad * rotation_rad);
-        cost += robust_cost(squared, seen->has_rotation ? 6 : 3);
+        cost += robust_cost(squared, has_rotation ? 6 : 3);
       }
     }
-    return cost;
+    return lagged.empty() ? 0 : cost * num_blocks(actions) / static_cast<double>(lagged.size());
   };
-  return least_at(lag_us, step_us,
-                  [&](std::int64_t lag) { return costs_about(lag, step_us, track, cost_of); });
+  return least_near(command_lag(samples, num_signals).us, 0, samples, cost_of);
 }
 
 std::vector<ActionPoseSample> with_commands_of_before(const std::vector<ActionPoseSample>& samples,

@@ -391,11 +391,12 @@ LearnedStructure find_structure(const std::vector<Signal>& signals,
   LearnedStructure structure = find(lag.is_significant ? lag.us : 0);
   if (!structure.spans() && lag.us != 0) {
     LearnedStructure other = find(lag.is_significant ? 0 : lag.us);
-    if (other.search.models.size() > structure.search.models.size()) structure = std::move(other);
+    const std::size_t least = structure.search.models.size() + (lag.is_significant ? 0 : 1);
+    if (other.search.models.size() >= least) structure = std::move(other);
   }
   const std::int64_t refined_us =
-      refined_lag_us(distinct, num_signals, structure.search.models, structure.options.measurement,
-                     structure.command_lag_us);
+      refined_lag_us(distinct, structure.signals, structure.actions, structure.search.models,
+                     structure.options.measurement, structure.command_lag_us);
   if (refined_us == structure.command_lag_us) return structure;
   LearnedStructure found = find(refined_us);
   return found.search.models.size() >= structure.search.models.size() ? found : structure;

@@ -223,7 +223,8 @@ TEST(ImperfectRobotTest, EveryRowOfTheTableHasANameAndIsAnImperfection) {
                   seen.size() != seen_perfect.size() ||
                   !seen[0].X_CB.isApprox(seen_perfect[0].X_CB, 1e-9);
     }
-    is_other |= robot.wander(2, 10)[0].action != perfect.wander(2, 10)[0].action;
+    ImperfectRobot wanderer(3, true, all[a], 1), other(3, true, {}, 1);
+    is_other |= wanderer.wander(2, 10)[0].action != other.wander(2, 10)[0].action;
     const Signal is = robot.signals()[0], was = perfect.signals()[0];
     EXPECT_TRUE(is_other || is.upper != was.upper) << all[a].name;
   }

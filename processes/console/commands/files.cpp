@@ -54,11 +54,10 @@ Recording load_for(const std::string& file, const BodySchema& schema) {
     throw RecordingError(file + ": " + error.what());
   }
   recording.signals = schema.signals;
-  const CommandLag lag = command_lag(recording.samples, static_cast<int>(schema.signals.size()));
-  if (!lag.is_significant) return recording;
-  const std::int64_t lag_us = refined_lag_us(recording.samples, schema, lag.us);
-  recording.samples = with_commands_of_before(recording.samples, lag_us);
-  std::cerr << "bodyschema: " << file << ": " << lag_text(lag_us) << "\n";
+  if (const std::int64_t lag_us = command_lag_us(recording.samples, schema); lag_us != 0) {
+    recording.samples = with_commands_of_before(recording.samples, lag_us);
+    std::cerr << "bodyschema: " << file << ": " << lag_text(lag_us) << "\n";
+  }
   return recording;
 }
 

@@ -145,16 +145,15 @@ void run_monitor(const MonitorArguments& arguments) {
         std::cout << fmt::format("sample {:5} {:9.2f} s  {}\n", event.sample_index, seconds(sample),
                                  text_of(event, schema.signals));
     }
-    if (!evaluation) continue;
-    const auto errors = evaluate(adapted(), evaluation->samples);
-    if (arguments.json) {
+    if (evaluation && arguments.json) {
+      const auto errors = evaluate(adapted(), evaluation->samples);
       Json line = {{"sample", sample.sample_index}, {"t", seconds(sample)}};
       line.update(errors_json(static_cast<int>(evaluation->samples.size()), errors));
       std::cout << line.dump() << '\n';
-    } else if (sample.sample_index + 1 == std::ssize(recording.samples)) {
-      std::cout << errors_text({.parts = errors});
     }
   }
+  if (evaluation && !arguments.json)
+    std::cout << errors_text({.parts = evaluate(adapted(), evaluation->samples)});
   if (!arguments.json)
     std::cout << fmt::format("{} samples, {} events\n", recording.samples.size(), num_events);
   std::cout << std::flush;
