@@ -8,6 +8,7 @@
 #include <limits>
 #include <optional>
 #include <set>
+#include <tuple>
 #include <utility>
 
 #include "common/estimation/quantile.h"
@@ -26,10 +27,10 @@ namespace {
 /// stream, in so many steps at most to either side. Chosen.
 constexpr double kFarthest_us = 600'000, kFarthestIntervals = 12, kShareOfStream = 0.125;
 constexpr double kMostSteps = 40;
-/// By which a lag must explain more than none to be true, or to be tried [nats, of blocks of time];
-/// the best of many lags by the log of their number more. Chosen: numpy's streams of 13 to 30 s,
-/// command_lag_test.cpp.
-constexpr double kEvidence = 3, kLeastEvidence = 0.1;
+/// By which a lag must explain more than none to be true, or to be tried, and a delay by models and
+/// schemas [nats, of blocks of time]; the best of many lags by the log of their number more. Chosen
+/// by numpy's streams of 13 to 30 s.
+constexpr double kEvidence = 3, kLeastEvidence = 0.1, kModelEvidence = 0.5;
 /// Smaller ones the models tell.
 constexpr double kLeastIntervals = 0.25;
 /// Motions of a regression: at most, and at least, also for each signal; of more parts those with
@@ -72,6 +73,17 @@ class CommandTrack {
     if (apart_us > most_apart_us_) return std::nullopt;
     const double share = (time_us - time_of(*before)) / apart_us;
     return before->action + share * (after->action - before->action);
+  }
+
+  /// That brought the arm where it is at a time.
+  std::optional<Eigen::VectorXd> at(double time_us, const CommandDelay& delay) const {
+    const auto smear_us = static_cast<double>(delay.smear_us);
+    time_us -= static_cast<double>(delay.lag_us);
+    auto before = at(time_us - smear_us);
+    if (smear_us == 0) return before;
+    const auto after = at(time_us + smear_us);
+    if (!before || !after) return std::nullopt;
+    return Eigen::VectorXd(0.5 * (*before + *after));
   }
 
   /// The samples around which it is known everywhere within `margin_us`.
@@ -202,44 +214,64 @@ double num_blocks(const NormalizedActions& actions) {
   return static_cast<double>(actions.num_samples()) / actions.blocks().length();
 }
 
-/// Of three values at −1, 0, 1, where their parabola has its least; within ±1.
+/// Of three values at −1, 0, 1, where their parabola has its least, within ±1; where it has none,
+/// downhill.
 double vertex(double before, double at, double after) {
   const double bend = before - 2 * at + after;
-  return bend > 0 ? std::clamp(0.5 * (before - after) / bend, -1.0, 1.0) : 0;
+  if (bend > 0) return std::clamp(0.5 * (before - after) / bend, -1.0, 1.0);
+  if (std::min(before, after) >= at) return 0;
+  return before < after ? -1 : 1;
 }
 
-/// Where `cost_of` the samples with the commands of that time before them [nats] has its least,
-/// downhill from `lag_us`; `without_us` where that is hardly less than there.
+/// Where `cost_of` the samples with the commands that brought them there [nats] has its least,
+/// downhill from a delay; `without` where that is hardly less than there.
 template <class CostOf>
-std::int64_t least_near(std::int64_t lag_us, std::int64_t without_us,
+CommandDelay least_near(const CommandDelay& start, const CommandDelay& without,
                         const std::vector<ActionPoseSample>& samples, const CostOf& cost_of) {
   constexpr int kMostRounds = 20;
   const CommandTrack track(samples);
-  // Of the same frames at all lags.
-  const auto costs_at = [&](const std::vector<std::int64_t>& lags_us) {
+  // Of the same frames at all.
+  const auto costs_at = [&](const std::vector<CommandDelay>& delays) {
     std::int64_t farthest_us = 0;
-    for (const std::int64_t lag : lags_us) farthest_us = std::max(farthest_us, std::abs(lag));
+    for (const CommandDelay& d : delays)
+      farthest_us = std::max(farthest_us, std::abs(d.lag_us) + d.smear_us);
     const std::vector<std::size_t> inner = track.within(static_cast<double>(farthest_us));
-    std::vector<ActionPoseSample> lagged;
+    std::vector<ActionPoseSample> moved;
     for (std::size_t k = 0, count = std::min(kMostFrames, inner.size()); k < count; ++k)
-      lagged.push_back(samples[inner[k * inner.size() / count]]);
+      moved.push_back(samples[inner[k * inner.size() / count]]);
     std::vector<double> costs;
-    for (const std::int64_t lag : lags_us) {
-      for (ActionPoseSample& sample : lagged)
-        sample.action = *track.at(static_cast<double>(sample.utime) - static_cast<double>(lag));
-      costs.push_back(cost_of(lagged));
+    for (const CommandDelay& d : delays) {
+      for (ActionPoseSample& sample : moved) sample.action = *track.at(time_of(sample), d);
+      costs.push_back(cost_of(moved));
     }
     return costs;
   };
   const auto step_us = static_cast<std::int64_t>(median_interval_us(samples) / 2);
-  for (int n = 0; n < kMostRounds; ++n) {
-    const auto costs = costs_at({lag_us - step_us, lag_us, lag_us + step_us});
+  // One of the two, the other as it is.
+  const auto moved_by = [&](CommandDelay at, std::int64_t CommandDelay::*what) {
+    CommandDelay before = at, after = at;
+    before.*what = std::abs(at.*what - step_us);
+    if (what == &CommandDelay::lag_us) before.*what = at.*what - step_us;
+    after.*what += step_us;
+    const auto costs = costs_at({before, at, after});
     const double share = vertex(costs[0], costs[1], costs[2]);
-    lag_us += std::llround(share * static_cast<double>(step_us));
-    if (std::abs(share) < 1) break;
-  }
-  const auto costs = costs_at({without_us, lag_us});
-  return costs[0] - costs[1] < kEvidence ? without_us : lag_us;
+    at.*what += std::llround(share * static_cast<double>(step_us));
+    return std::pair(at, std::abs(share) < 1);
+  };
+  const auto downhill = [&](CommandDelay at, bool is_smeared) {
+    for (int n = 0; n < kMostRounds; ++n) {
+      bool is_there = false, is_smooth = true;
+      std::tie(at, is_there) = moved_by(at, &CommandDelay::lag_us);
+      if (is_smeared) std::tie(at, is_smooth) = moved_by(at, &CommandDelay::smear_us);
+      if (is_there && is_smooth) break;
+    }
+    return at;
+  };
+  const CommandDelay sharp = downhill(start, false), smeared = downhill(sharp, true);
+  const auto costs = costs_at({without, sharp, smeared});
+  const bool is_smeared = costs[1] - costs[2] >= kModelEvidence;
+  if (costs[0] - costs[is_smeared ? 2 : 1] < kModelEvidence) return without;
+  return is_smeared ? smeared : sharp;
 }
 
 struct Regressions {
@@ -311,11 +343,11 @@ CommandLag command_lag(const std::vector<ActionPoseSample>& samples, int num_sig
   return {std::llround(lag_us), gain_at(best) >= kEvidence + std::log(2 * most + 1)};
 }
 
-std::int64_t refined_lag_us(const std::vector<ActionPoseSample>& samples,
-                            const std::vector<Signal>& signals, const NormalizedActions& actions,
-                            const std::vector<AcceptedModel>& models,
-                            const MeasurementModel& measurement, std::int64_t lag_us) {
-  if (!actions.blocks().is_stream()) return lag_us;
+CommandDelay refined_delay(const std::vector<ActionPoseSample>& samples,
+                           const std::vector<Signal>& signals, const NormalizedActions& actions,
+                           const std::vector<AcceptedModel>& models,
+                           const MeasurementModel& measurement, const CommandDelay& delay) {
+  if (!actions.blocks().is_stream()) return delay;
   const auto cost_of = [&](const std::vector<ActionPoseSample>& lagged) {
     const std::vector<ActionPoseSample> moved = displaced(lagged, signals);
     const NormalizedActions actions_here(moved, actions.num_signals());
@@ -332,14 +364,13 @@ std::int64_t refined_lag_us(const std::vector<ActionPoseSample>& samples,
     // A model's frames count as many as there are blocks.
     return num_frames == 0 ? 0 : cost * num_blocks(actions) * num_models / num_frames;
   };
-  return least_near(lag_us, lag_us, samples, cost_of);
+  return least_near(delay, delay, samples, cost_of);
 }
 
-std::int64_t command_lag_us(const std::vector<ActionPoseSample>& samples,
-                            const BodySchema& schema) {
+CommandDelay command_delay(const std::vector<ActionPoseSample>& samples, const BodySchema& schema) {
   const int num_signals = static_cast<int>(schema.signals.size());
   const NormalizedActions actions(samples, num_signals);
-  if (!actions.blocks().is_stream()) return 0;
+  if (!actions.blocks().is_stream()) return {};
   const double position_m = std::max(schema.noise.position_m, kNoiseFloor.position_m);
   const double rotation_rad = std::max(schema.noise.rotation_rad, kNoiseFloor.rotation_rad);
   const auto cost_of = [&](const std::vector<ActionPoseSample>& lagged) {
@@ -360,21 +391,20 @@ std::int64_t command_lag_us(const std::vector<ActionPoseSample>& samples,
     }
     return lagged.empty() ? 0 : cost * num_blocks(actions) / static_cast<double>(lagged.size());
   };
-  return least_near(command_lag(samples, num_signals).us, 0, samples, cost_of);
+  return least_near({.lag_us = command_lag(samples, num_signals).us}, {}, samples, cost_of);
 }
 
 std::vector<ActionPoseSample> with_commands_of_before(const std::vector<ActionPoseSample>& samples,
-                                                      std::int64_t lag_us) {
-  if (lag_us == 0) return samples;
+                                                      const CommandDelay& delay) {
+  if (delay == CommandDelay{}) return samples;
   const CommandTrack track(samples);
-  std::vector<ActionPoseSample> lagged;
+  std::vector<ActionPoseSample> moved;
   for (const ActionPoseSample& sample : samples)
-    if (std::optional<Eigen::VectorXd> action =
-            track.at(time_of(sample) - static_cast<double>(lag_us))) {
-      lagged.push_back(sample);
-      lagged.back().action = *std::move(action);
+    if (std::optional<Eigen::VectorXd> action = track.at(time_of(sample), delay)) {
+      moved.push_back(sample);
+      moved.back().action = *std::move(action);
     }
-  return lagged;
+  return moved;
 }
 
 }  // namespace bodyschema

@@ -10,10 +10,19 @@
 
 namespace bodyschema {
 
-/// By how much the poses of a stream come after their commands: drives, filters and exposure take
-/// time, and clocks differ.
+/// How the poses of a stream come after their commands: drives, filters and exposure take time, and
+/// clocks differ. The arm is where the mean of two commands leads, `lag_us` ± `smear_us` before: to
+/// the second order of time that is a delay, or a drive of the first order, of which both are the
+/// time constant.
+struct CommandDelay {
+  std::int64_t lag_us = 0;    ///< below 0: before them
+  std::int64_t smear_us = 0;  ///< ≥ 0
+
+  bool operator==(const CommandDelay&) const = default;
+};
+
 struct CommandLag {
-  std::int64_t us = 0;          ///< below 0: before them
+  std::int64_t us = 0;
   bool is_significant = false;  ///< much more is explained than without it
 };
 
@@ -22,20 +31,20 @@ struct CommandLag {
 /// quarter of the frames' interval or explains nothing more, and of poses at rest.
 CommandLag command_lag(const std::vector<ActionPoseSample>& samples, int num_signals);
 
-/// Near `lag_us`, at which the models over `actions` were found, the one by which they, fitted
-/// again, leave least; `lag_us` where that is hardly less.
-std::int64_t refined_lag_us(const std::vector<ActionPoseSample>& samples,
-                            const std::vector<Signal>& signals, const NormalizedActions& actions,
-                            const std::vector<AcceptedModel>& models,
-                            const MeasurementModel& measurement, std::int64_t lag_us);
+/// Near `delay`, at which the models over `actions` were found, the one by which they, fitted
+/// again, leave least; `delay` where that is hardly less.
+CommandDelay refined_delay(const std::vector<ActionPoseSample>& samples,
+                           const std::vector<Signal>& signals, const NormalizedActions& actions,
+                           const std::vector<AcceptedModel>& models,
+                           const MeasurementModel& measurement, const CommandDelay& delay);
 
-/// Of a recording that is held against a schema as it is: by which it leaves least; 0 where that is
-/// hardly less than without.
-std::int64_t command_lag_us(const std::vector<ActionPoseSample>& samples, const BodySchema& schema);
+/// Of a recording that is held against a schema as it is: by which it leaves least; none where that
+/// is hardly less than without.
+CommandDelay command_delay(const std::vector<ActionPoseSample>& samples, const BodySchema& schema);
 
-/// Each sample with the command of `lag_us` before it, linear between two; those that have none, at
+/// Each sample with the command that brought it there, linear between two; those that have none, at
 /// the ends and behind gaps, are left out.
 std::vector<ActionPoseSample> with_commands_of_before(const std::vector<ActionPoseSample>& samples,
-                                                      std::int64_t lag_us);
+                                                      const CommandDelay& delay);
 
 }  // namespace bodyschema

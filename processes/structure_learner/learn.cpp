@@ -76,7 +76,7 @@ LearnResult fit_tree(const LearnedStructure& structure,
 
   LearnResult result;
   result.noise_source = structure.noise_source;
-  result.command_lag_us = structure.command_lag_us;
+  result.command_delay = structure.command_delay;
   result.num_screens = search.num_screens;
   result.num_fits = search.num_fits;
   BodySchema& schema = result.schema;
@@ -369,7 +369,7 @@ std::vector<ActionPoseSample> in_step(const std::vector<ActionPoseSample>& sampl
                                       const LearnedStructure& structure) {
   return with_commands_of_before(
       with_uniform_parts(without_repetitions(samples), structure.position_parts),
-      structure.command_lag_us);
+      structure.command_delay);
 }
 
 }  // namespace
@@ -381,25 +381,30 @@ LearnedStructure find_structure(const std::vector<Signal>& signals,
   const std::vector<int> alone = parts_without_rotation(samples);
   const std::vector<ActionPoseSample> distinct =
       with_uniform_parts(without_repetitions(samples), alone);
-  const auto find = [&](std::int64_t lag_us) {
+  const auto find = [&](const CommandDelay& delay) {
     LearnedStructure found =
-        find_in_step(signals, with_commands_of_before(distinct, lag_us), alone, options);
-    found.command_lag_us = lag_us;
+        find_in_step(signals, with_commands_of_before(distinct, delay), alone, options);
+    found.command_delay = delay;
     return found;
   };
   const CommandLag lag = command_lag(distinct, num_signals);
-  LearnedStructure structure = find(lag.is_significant ? lag.us : 0);
+  const CommandDelay late{.lag_us = lag.us}, none;
+  LearnedStructure structure = find(lag.is_significant ? late : none);
   if (!structure.spans() && lag.us != 0) {
-    LearnedStructure other = find(lag.is_significant ? 0 : lag.us);
+    LearnedStructure other = find(lag.is_significant ? none : late);
     const std::size_t least = structure.search.models.size() + (lag.is_significant ? 0 : 1);
     if (other.search.models.size() >= least) structure = std::move(other);
   }
-  const std::int64_t refined_us =
-      refined_lag_us(distinct, structure.signals, structure.actions, structure.search.models,
-                     structure.options.measurement, structure.command_lag_us);
-  if (refined_us == structure.command_lag_us) return structure;
-  LearnedStructure found = find(refined_us);
-  return found.search.models.size() >= structure.search.models.size() ? found : structure;
+  const auto refined = [&](const LearnedStructure& by) {
+    return refined_delay(distinct, by.signals, by.actions, by.search.models, by.options.measurement,
+                         by.command_delay);
+  };
+  const CommandDelay delay = refined(structure);
+  if (delay == structure.command_delay) return structure;
+  LearnedStructure found = find(delay);
+  if (found.search.models.size() < structure.search.models.size()) return structure;
+  found.command_delay = refined(found);
+  return found;
 }
 
 LearnResult fit_structure(const LearnedStructure& structure,

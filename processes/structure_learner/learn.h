@@ -1,6 +1,5 @@
 #pragma once
 
-#include <cstdint>
 #include <map>
 #include <optional>
 #include <vector>
@@ -8,6 +7,7 @@
 #include "common/geometry/angle.h"
 #include "common/schema/body_schema.h"
 #include "common/schema/sample.h"
+#include "processes/structure_learner/command_lag.h"
 #include "processes/structure_learner/noise_estimate.h"
 #include "processes/structure_learner/outlier_attribution.h"
 #include "processes/structure_learner/positions/position_leaves.h"
@@ -36,10 +36,10 @@ struct LearnResult {
   BodySchema schema;
   std::vector<Outlier> outliers;  ///< ascending by sample, then part
   NoiseSource noise_source = NoiseSource::kAssumed;
-  bool is_one_cluster = false;      ///< see one_cluster.h
-  std::int64_t command_lag_us = 0;  ///< of a stream's poses behind its commands, taken into account
-  int num_screens = 0;              ///< closed-form hypotheses looked at
-  int num_fits = 0;                 ///< Levenberg–Marquardt fits of the search
+  bool is_one_cluster = false;  ///< see one_cluster.h
+  CommandDelay command_delay;   ///< of a stream's poses, taken into account
+  int num_screens = 0;          ///< closed-form hypotheses looked at
+  int num_fits = 0;             ///< Levenberg–Marquardt fits of the search
 };
 
 /// Learns the body schema from scratch: structure and local models (Sections 3.1 and 3.2). Where
@@ -76,7 +76,7 @@ struct LearnedStructure {
   bool is_contested = false;
   std::vector<int> position_parts = {};      ///< parts_without_rotation()
   std::map<int, OpenLeaf> open_leaves = {};  ///< those of them without an edge
-  std::int64_t command_lag_us = 0;           ///< see command_lag.h; the models are without it
+  CommandDelay command_delay = {};           ///< of a stream's poses; `actions` are without it
 
   /// The edges span all parts seen.
   bool spans() const { return search.models.size() + 1 >= parts.size(); }

@@ -81,7 +81,8 @@ int main(int argc, char** argv) {
       return imperfection.name.find(words) != std::string::npos;
     };
     if (!cells.empty() && std::none_of(cells.begin(), cells.end(), is_named)) continue;
-    if (imperfection.lag != 0 && period == 0) continue;  // of poses at rest there is none
+    if (imperfection.lag + imperfection.drive != 0 && period == 0)
+      continue;  // of poses at rest there is none
     std::printf("| %s |", imperfection.name.c_str());
     for (const int num_samples : nums_samples) {
       int num_right = 0, num_incomplete = 0, num_wrong = 0, num_complete = 0;

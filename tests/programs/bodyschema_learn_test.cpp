@@ -105,10 +105,10 @@ TEST_F(BodyschemaProgramTest, LearnPrintsTheKeysThatAreDocumented) {
   const Json json = outcome.json();
   for (const char* key : {"complete", "samples", "parts", "position_parts", "root", "edges",
                           "unconnected", "unused_signals", "undecided_signals", "outliers", "noise",
-                          "one_cluster", "command_lag_s"}) {
+                          "one_cluster", "command_lag_s", "command_smear_s"}) {
     EXPECT_TRUE(json.contains(key)) << key;
   }
-  EXPECT_EQ(json.size(), 13U);
+  EXPECT_EQ(json.size(), 14U);
   EXPECT_TRUE(json["complete"].get<bool>());
   ASSERT_EQ(json["edges"].size(), 4U);
   for (const Json& edge : json["edges"]) {

@@ -89,6 +89,7 @@ const std::vector<Imperfection>& imperfections() {
       {.name = "distortion 2 %", .distortion = 0.02},
       {.name = "poses 1.5 samples late", .lag = 1.5},
       {.name = "poses 8 samples late", .lag = 8},
+      {.name = "drives that follow in 4 samples", .drive = 4},
   };
   return all;
 }
@@ -265,9 +266,16 @@ std::vector<ActionPoseSample> ImperfectRobot::wander(int num_samples, double per
     }
     return action;
   };
+  // Where the drives are; they have been on the way for long.
+  constexpr int kSteps = 10, kBefore = 200;
+  Eigen::VectorXd reached = action_at(-kBefore);
+  const double gone = is_.drive > 0 ? -std::expm1(-1 / (kSteps * is_.drive)) : 1;
   std::vector<ActionPoseSample> samples;
-  for (int n = 0; n < num_samples; ++n) {
-    samples.push_back(go(action_at(n)));
+  for (int step = -kSteps * kBefore; step <= kSteps * (num_samples - 1); ++step) {
+    const double n = static_cast<double>(step) / kSteps;
+    reached += gone * (action_at(n) - reached);
+    if (step < 0 || step % kSteps != 0) continue;
+    samples.push_back(go(reached));
     samples.back().action = action_at(n + is_.lag);
   }
   return samples;

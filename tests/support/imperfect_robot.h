@@ -31,6 +31,7 @@ struct Imperfection {
   double focal_length = 0;   ///< the lens is this share longer than assumed
   double distortion = 0;     ///< at 45° from the optical axis a ray is off by this share
   double lag = 0;            ///< of the poses of wander() behind their commands [samples]
+  double drive = 0;          ///< time constant by which these follow, of first order [samples]
 };
 
 /// One imperfection a cell, and a perfect robot.

@@ -39,11 +39,13 @@ BodySchema load_schema(const std::filesystem::path& file) {
   return from_message(schemas.back());
 }
 
-std::string lag_text(std::int64_t lag_us) {
-  return fmt::format(
-      "the poses come {:.3f} s {} their commands: each counts with the command that brought it "
-      "there",
-      static_cast<double>(std::abs(lag_us)) * 1e-6, lag_us > 0 ? "after" : "before");
+std::string delay_text(const CommandDelay& delay) {
+  const auto seconds = [](std::int64_t us) { return static_cast<double>(std::abs(us)) * 1e-6; };
+  std::string text = fmt::format("the poses come {:.3f} s {} their commands", seconds(delay.lag_us),
+                                 delay.lag_us < 0 ? "before" : "after");
+  if (delay.smear_us != 0)
+    text += fmt::format(", smoothed over ± {:.3f} s", seconds(delay.smear_us));
+  return text + ": each counts with the command that brought it there";
 }
 
 Recording load_for(const std::string& file, const BodySchema& schema) {
@@ -54,9 +56,10 @@ Recording load_for(const std::string& file, const BodySchema& schema) {
     throw RecordingError(file + ": " + error.what());
   }
   recording.signals = schema.signals;
-  if (const std::int64_t lag_us = command_lag_us(recording.samples, schema); lag_us != 0) {
-    recording.samples = with_commands_of_before(recording.samples, lag_us);
-    std::cerr << "bodyschema: " << file << ": " << lag_text(lag_us) << "\n";
+  if (const CommandDelay delay = command_delay(recording.samples, schema);
+      delay != CommandDelay{}) {
+    recording.samples = with_commands_of_before(recording.samples, delay);
+    std::cerr << "bodyschema: " << file << ": " << delay_text(delay) << "\n";
   }
   return recording;
 }

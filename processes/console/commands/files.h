@@ -1,7 +1,6 @@
 #pragma once
 
 #include <Eigen/Geometry>
-#include <cstdint>
 #include <filesystem>
 #include <string>
 #include <vector>
@@ -9,6 +8,7 @@
 #include "common/bus/arguments.h"
 #include "common/schema/body_schema.h"
 #include "processes/console/views/json.h"
+#include "processes/structure_learner/command_lag.h"
 #include "processes/structure_learner/recording/recording.h"
 
 namespace bodyschema {
@@ -21,8 +21,7 @@ BodySchema load_schema(const std::filesystem::path& file);
 /// @throws RecordingError.
 Recording load_and_warn(const std::string& file);
 
-/// Of a stream's poses behind their commands (command_lag.h), in words.
-std::string lag_text(std::int64_t lag_us);
+std::string delay_text(const CommandDelay& delay);
 
 /// Reads a recording whose actions are those of the schema, in its order, as load_and_warn(). Where
 /// its poses come after their commands each gets the command that brought it there, and that is

@@ -85,9 +85,11 @@ void run_learn(const LearnArguments& arguments) {
   }
   Json json = structure_json(result.schema, result.outliers, result.noise_source);
   json["one_cluster"] = result.is_one_cluster;
-  json["command_lag_s"] = static_cast<double>(result.command_lag_us) * 1e-6;
+  json["command_lag_s"] = static_cast<double>(result.command_delay.lag_us) * 1e-6;
+  json["command_smear_s"] = static_cast<double>(result.command_delay.smear_us) * 1e-6;
   std::string text = structure_text(result.schema, result.noise_source);
-  if (result.command_lag_us != 0) text += "  " + lag_text(result.command_lag_us) + "\n";
+  if (result.command_delay != CommandDelay{})
+    text += "  " + delay_text(result.command_delay) + "\n";
   if (result.is_one_cluster)
     text +=
         "  the poses are one cluster: what is learned holds near them alone; move all joints "

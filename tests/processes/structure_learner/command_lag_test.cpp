@@ -67,19 +67,19 @@ TEST(CommandLag, CommandsOfBeforeAreLinearBetweenTwo) {
     samples[static_cast<std::size_t>(n)].utime = 1000 * n;
     samples[static_cast<std::size_t>(n)].action = Eigen::VectorXd::Constant(1, n * n);
   }
-  const auto late = with_commands_of_before(samples, 250);
+  const auto late = with_commands_of_before(samples, {.lag_us = 250});
   ASSERT_EQ(late.size(), 2U);
   EXPECT_EQ(late[0].utime, 1000);
   EXPECT_DOUBLE_EQ(late[0].action[0], 0.75);
   EXPECT_DOUBLE_EQ(late[1].action[0], 3.25);
-  const auto early = with_commands_of_before(samples, -1000);
+  const auto early = with_commands_of_before(samples, {.lag_us = -1000});
   ASSERT_EQ(early.size(), 2U);
   EXPECT_DOUBLE_EQ(early[1].action[0], 4);
-  EXPECT_TRUE(with_commands_of_before(samples, 5000).empty());
+  EXPECT_TRUE(with_commands_of_before(samples, {.lag_us = 5000}).empty());
   // Of the time of a gap nothing is known.
   ActionPoseSample& late_one = samples.emplace_back(samples.back());
   late_one.utime = 9000;
-  EXPECT_EQ(with_commands_of_before(samples, 250).size(), 2U);
+  EXPECT_EQ(with_commands_of_before(samples, {.lag_us = 250}).size(), 2U);
 }
 
 // What is learned is where a command leads, not where the arm is when it is given.
@@ -95,13 +95,13 @@ TEST(CommandLag, IsTakenIntoAccount) {
       ImperfectRobot punctual(3, is_chain, {}, 2);
       const auto samples = stream_of(punctual);
       const LearnResult right = learn(punctual.signals(), samples, options);
-      EXPECT_EQ(right.command_lag_us, 0);
-      EXPECT_NEAR(static_cast<double>(late.command_lag_us) / interval_us(samples), lag, 0.06);
+      EXPECT_EQ(right.command_delay, CommandDelay{});
+      EXPECT_NEAR(static_cast<double>(late.command_delay.lag_us) / interval_us(samples), lag, 0.06);
       // Held against the schema the recording is taken in the same way.
       ImperfectRobot again(3, is_chain, {.lag = lag}, 2);
-      EXPECT_NEAR(static_cast<double>(command_lag_us(stream_of(again), late.schema)),
-                  static_cast<double>(late.command_lag_us), 0.06 * interval_us(samples));
-      EXPECT_EQ(command_lag_us(samples, right.schema), 0);
+      EXPECT_NEAR(static_cast<double>(command_delay(stream_of(again), late.schema).lag_us),
+                  static_cast<double>(late.command_delay.lag_us), 0.06 * interval_us(samples));
+      EXPECT_EQ(command_delay(samples, right.schema), CommandDelay{});
       for (std::size_t n = 0; n < samples.size(); n += 100) {
         const auto a = late.schema.predict(1, 4, samples[n].action);
         const auto b = right.schema.predict(1, 4, samples[n].action);
@@ -109,6 +109,26 @@ TEST(CommandLag, IsTakenIntoAccount) {
         EXPECT_LT((a->X_AB.translation() - b->X_AB.translation()).norm(), 0.001) << lag;
       }
     }
+}
+
+TEST(CommandLag, OfDrivesThatFollowIsTheirTimeConstantAndSmeared) {
+  constexpr double kDrive = 4;
+  LearnOptions options;
+  options.root = 1;
+  ImperfectRobot slow(3, true, {.drive = kDrive}, 2), quick(3, true, {}, 2);
+  const auto samples = slow.wander(kSamples, 100), right = quick.wander(kSamples, 100);
+  const LearnResult late = learn(slow.signals(), samples, options);
+  EXPECT_EQ(judge(late.schema, slow.structure()), Rightness::kRight);
+  EXPECT_NEAR(static_cast<double>(late.command_delay.lag_us) / interval_us(samples), kDrive, 0.3);
+  EXPECT_NEAR(static_cast<double>(late.command_delay.smear_us) / interval_us(samples), kDrive, 1);
+  const BodySchema schema = learn(quick.signals(), right, options).schema;
+  std::vector<double> apart_m;
+  for (const ActionPoseSample& sample : right)
+    apart_m.push_back((late.schema.predict(1, 4, sample.action)->X_AB.translation() -
+                       schema.predict(1, 4, sample.action)->X_AB.translation())
+                          .norm());
+  std::ranges::nth_element(apart_m, apart_m.begin() + kSamples / 2);
+  EXPECT_LT(apart_m[kSamples / 2], 0.002);
 }
 
 }  // namespace
