@@ -401,8 +401,8 @@ LearnedStructure find_structure(const std::vector<Signal>& signals,
   };
   const CommandDelay delay = refined(structure);
   if (delay == structure.command_delay) return structure;
+  // Fewer edges too: what stood by a worse delay was not the body.
   LearnedStructure found = find(delay);
-  if (found.search.models.size() < structure.search.models.size()) return structure;
   found.command_delay = refined(found);
   return found;
 }
