@@ -71,7 +71,8 @@ struct ControllerConfig {
 /// same sender and epoch) is refused once the arm is held.
 ///
 /// No part leaves the workspace on the way, by the schema; a solution towards which one would is
-/// dealt with like one that the driver rejects.
+/// dealt with like one that the driver rejects: another is tried, but not on the line from one way
+/// point to the next, where that ends the path.
 ///
 /// A probe that the monitor wants while an edge on the way is PROVISIONAL is made before the next
 /// step, as slowly as steps are then; refused by the driver, it is done without. While an edge is

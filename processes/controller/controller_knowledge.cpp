@@ -230,8 +230,8 @@ EdgeState Controller::worst_edge(std::string* name) const {
 }
 
 std::optional<Eigen::VectorXd> Controller::wanted_probe() const {
-  if (!health_ || health_->probe_sample <= probed_ || worst_edge() == EdgeState::kOk ||
-      health_->probe_action.size() != config_.signals.size())
+  if (!health_ || health_->schema_version != schema_->version || health_->probe_sample <= probed_ ||
+      worst_edge() == EdgeState::kOk || health_->probe_action.size() != config_.signals.size())
     return std::nullopt;
   for (std::size_t i = 0; i < config_.signals.size(); ++i) {
     const Signal& signal = config_.signals[i];

@@ -344,6 +344,9 @@ void Controller::strike(const std::string& why) {
   if (serves_ == Serves::kSearch) ++search_place_;
   // A new target or schema has no goal yet; a search goes on elsewhere.
   if (serves_ != Serves::kTarget || !goal_) return;
+  // Another solution would swing the arm off the line from the way point before.
+  if (target_.way_point > 1)
+    return fail(Event::kUnreachable, "the way along the line is refused: " + why);
   rejection_ = why;
   rejected_.push_back(*goal_);
   goal_.reset();

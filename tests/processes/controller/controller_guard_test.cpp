@@ -291,6 +291,22 @@ TEST(ControllerTest, ADriverThatRejectsEveryWayIsNotAskedForEver) {
   EXPECT_EQ(bench.status.num_moves, 0);
 }
 
+// To the first way point the arm goes as it likes.
+TEST(ControllerTest, OnALineNoOtherWayIsTriedThanTheOneThatIsRejected) {
+  for (const int way_point : {1, 2}) {
+    Bench bench;
+    bench.start();
+    bench.rejects = [](const auto&) { return "link2 touches link4"; };
+    Target step = position_target(0, kNear);
+    step.way_point = way_point;
+    step.num_way_points = 3;
+    bench.give(step);
+    ASSERT_TRUE(bench.run_until_state(S::CONTROL_REFUSED));
+    EXPECT_EQ(bench.moves.size() == 1, way_point > 1);
+    EXPECT_TRUE(bench.has_why("link2 touches link4")) << bench.status.why;
+  }
+}
+
 TEST(ControllerTest, AnExpiredActionIsGivenAgainWithAnotherIdAFewTimes) {
   Bench bench;
   bench.start();

@@ -93,6 +93,23 @@ TEST(ControllerTest, AProbeBeyondTheLimitsIsNotMade) {
   EXPECT_EQ(bench.status.num_probes, 0);
 }
 
+// What was to be told apart may be told by a newer schema.
+TEST(ControllerTest, AProbeThatWasWantedOfAnotherSchemaIsNotMade) {
+  for (const bool is_of_another : {false, true}) {
+    Bench bench;
+    bench.start();
+    bench.schema.edges[1].state = EdgeState::kProvisional;
+    bench.health = health_of(bench.schema.version, 2, 3, schema_edge_t::EDGE_PROVISIONAL);
+    bench.health->probe_sample = 1;
+    set_array(bench.health->num_probe, bench.health->probe_action, {5.0, 0.9, 1.0});
+    bench.schema.version += is_of_another;
+    bench.repeat();
+    bench.give(position_target(0, kFar));
+    ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+    EXPECT_EQ(bench.status.num_probes, is_of_another ? 0 : 1);
+  }
+}
+
 TEST(ControllerTest, WithAnInvalidEdgeItMovesALittleAndLendsTheArmOnlyWhereThatDoesNotMendIt) {
   for (const bool is_mended : {true, false}) {
     ControllerConfig config = test_config();
