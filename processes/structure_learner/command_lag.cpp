@@ -347,7 +347,8 @@ CommandDelay refined_delay(const std::vector<ActionPoseSample>& samples,
                            const std::vector<Signal>& signals, const NormalizedActions& actions,
                            const std::vector<AcceptedModel>& models,
                            const MeasurementModel& measurement, const CommandDelay& delay) {
-  if (!actions.blocks().is_stream()) return delay;
+  const auto is_soft = [](const AcceptedModel& model) { return !model.soft_signals.empty(); };
+  if (!actions.blocks().is_stream() || std::ranges::any_of(models, is_soft)) return delay;
   const auto cost_of = [&](const std::vector<ActionPoseSample>& lagged) {
     const std::vector<ActionPoseSample> moved = displaced(lagged, signals);
     const NormalizedActions actions_here(moved, actions.num_signals());
@@ -371,6 +372,10 @@ CommandDelay command_delay(const std::vector<ActionPoseSample>& samples, const B
   const int num_signals = static_cast<int>(schema.signals.size());
   const NormalizedActions actions(samples, num_signals);
   if (!actions.blocks().is_stream()) return {};
+  const CommandLag lag = command_lag(samples, num_signals);
+  const auto is_soft = [](const Edge& edge) { return edge.residual_gp != nullptr; };
+  if (std::ranges::any_of(schema.edges, is_soft))
+    return {.lag_us = lag.is_significant ? lag.us : 0};
   const double position_m = std::max(schema.noise.position_m, kNoiseFloor.position_m);
   const double rotation_rad = std::max(schema.noise.rotation_rad, kNoiseFloor.rotation_rad);
   const auto cost_of = [&](const std::vector<ActionPoseSample>& lagged) {
@@ -391,7 +396,7 @@ CommandDelay command_delay(const std::vector<ActionPoseSample>& samples, const B
     }
     return lagged.empty() ? 0 : cost * num_blocks(actions) / static_cast<double>(lagged.size());
   };
-  return least_near({.lag_us = command_lag(samples, num_signals).us}, {}, samples, cost_of);
+  return least_near({.lag_us = lag.us}, {}, samples, cost_of);
 }
 
 std::vector<ActionPoseSample> with_commands_of_before(const std::vector<ActionPoseSample>& samples,

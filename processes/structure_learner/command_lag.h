@@ -32,7 +32,8 @@ struct CommandLag {
 CommandLag command_lag(const std::vector<ActionPoseSample>& samples, int num_signals);
 
 /// Near `delay`, at which the models over `actions` were found, the one by which they, fitted
-/// again, leave least; `delay` where that is hardly less.
+/// again, leave least; `delay` where that is hardly less, and of soft models, whose motion has more
+/// of a past than a delay.
 CommandDelay refined_delay(const std::vector<ActionPoseSample>& samples,
                            const std::vector<Signal>& signals, const NormalizedActions& actions,
                            const std::vector<AcceptedModel>& models,

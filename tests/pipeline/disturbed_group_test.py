@@ -74,7 +74,14 @@ class Run:
 
 def processes(group):
     """Process id → program, without the loggers, which end on a full disk and wait for space, and what has just ended, which has no command."""
-    programs = {pid: Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode() for pid in group.pids()}
+
+    def program_of(pid):
+        try:
+            return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode()
+        except FileNotFoundError:
+            return ""
+
+    programs = {pid: program_of(pid) for pid in group.pids()}
     return {pid: program for pid, program in programs.items() if program and "lcm-logger" not in program and not program.startswith("sleep")}
 
 
