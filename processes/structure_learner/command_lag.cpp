@@ -256,7 +256,12 @@ CommandDelay least_near(const CommandDelay& start, const CommandDelay& without,
     const auto costs = costs_at({before, at, after});
     const double share = vertex(costs[0], costs[1], costs[2]);
     at.*what += std::llround(share * static_cast<double>(step_us));
-    return std::pair(at, std::abs(share) < 1);
+    // What acts on the past alone is hardly wider than it is late: else a joint that goes less far
+    // would pass for it.
+    const std::int64_t widest_us = std::max<std::int64_t>(0, at.lag_us);
+    const bool is_widest = at.smear_us > widest_us;
+    if (is_widest) at.smear_us = widest_us;
+    return std::pair(at, is_widest || std::abs(share) < 1);
   };
   const auto downhill = [&](CommandDelay at, bool is_smeared) {
     for (int n = 0; n < kMostRounds; ++n) {

@@ -16,7 +16,7 @@ namespace bodyschema {
 /// time constant.
 struct CommandDelay {
   std::int64_t lag_us = 0;    ///< below 0: before them
-  std::int64_t smear_us = 0;  ///< ≥ 0
+  std::int64_t smear_us = 0;  ///< 0 … max(0, lag_us)
 
   bool operator==(const CommandDelay&) const = default;
 };

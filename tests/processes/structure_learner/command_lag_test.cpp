@@ -131,5 +131,16 @@ TEST(CommandLag, OfDrivesThatFollowIsTheirTimeConstantAndSmeared) {
   EXPECT_LT(apart_m[kSamples / 2], 0.002);
 }
 
+TEST(CommandLag, AJointThatGoesLessFarIsNoSlowDrive) {
+  LearnOptions options;
+  options.root = 1;
+  ImperfectRobot robot(2, true, {}, 2);
+  const auto samples = stream_of(robot);
+  const BodySchema schema = learn(robot.signals(), samples, options).schema;
+  auto farther = samples;  // the commands; so the joints go 0.9 times as far
+  for (ActionPoseSample& sample : farther) sample.action /= 0.9;
+  EXPECT_EQ(command_delay(farther, schema).smear_us, 0);
+}
+
 }  // namespace
 }  // namespace bodyschema
