@@ -3,6 +3,7 @@
 #include <Eigen/Core>
 #include <cstdint>
 #include <filesystem>
+#include <functional>
 #include <map>
 #include <optional>
 #include <string>
@@ -130,6 +131,8 @@ class Controller {
 
   control_status_t status() const;
   Phase phase() const { return phase_; }
+  /// `told` gets each event and the phase in which it came, before what it brings about.
+  void trace(std::function<void(Phase, Event)> told) { trace_ = std::move(told); }
   /// Messages that came too late and commands that were in vain, since the start.
   const std::map<std::string, std::int64_t>& counters() const { return counters_; }
 
@@ -246,6 +249,7 @@ class Controller {
 
   const ControllerConfig config_;
   std::map<std::string, std::int64_t> counters_;
+  std::function<void(Phase, Event)> trace_;
 
   // What was heard.
   std::optional<motion_status_t> motion_;

@@ -283,13 +283,23 @@ class DenseSearch {
   Eigen::Matrix3Xd positions_m_;
 };
 
-/// A point that no action of an arm reaches: well beyond the farthest of many.
-Eigen::Vector3d beyond_reach(const BodySchema& schema, int part, const SyntheticRobot& robot,
-                             Rng& rng) {
+/// How far the farthest of many actions brings the part [m].
+double reach_of(const BodySchema& schema, int part, const SyntheticRobot& robot, Rng& rng) {
   double farthest = 0;
   for (int n = 0; n < 1000; ++n)
     farthest = std::max(farthest, target_at(schema, part, robot.random_action(rng)).p_RT.norm());
-  return random_vector(rng, 1.2 * farthest, 2 * farthest);
+  return farthest;
+}
+
+/// A point at least 20 mm from where any action brings the part, but within its reach: behind a
+/// limit, or in a hollow. None if none is found.
+std::optional<Eigen::Vector3d> hollow(const DenseSearch& dense, double reach_m, Rng& rng) {
+  constexpr double kOff_m = 0.02;
+  for (int n = 0; n < 1000; ++n) {
+    const Eigen::Vector3d p_RT = random_vector(rng, 0, 0.9 * reach_m);
+    if (dense.nearest_m(p_RT) > kOff_m) return p_RT;
+  }
+  return std::nullopt;
 }
 
 struct OutOfReach {
@@ -331,12 +341,12 @@ struct OutOfReach {
     for (Farther* farther : {&true_arm, &by_nr_jl, &by_damped_nr_jl, &by_lma})
       farther->by_m.back() -= true_m;
   }
-  void print() const {
+  void print(const char* name) const {
     fmt::print(
-        "\n| positions out of reach | number | within 1 mm of the nearest | farther, median [mm] | "
+        "\n| positions {} | number | within 1 mm of the nearest | farther, median [mm] | "
         "worst [mm] | ms of CPU, mean | asked again from there: elsewhere / farther |\n"
         "|---|---|---|---|---|---|---|\n{}{}{}{}{}",
-        learned.row("learned arm"), true_arm.row("true arm"),
+        name, learned.row("learned arm"), true_arm.row("true arm"),
         by_nr_jl.row("true arm, KDL's NR_JL: the best last iterate"),
         by_damped_nr_jl.row(
             fmt::format("the same, damped everywhere by {} m/rad", kBestDamping).c_str()),
@@ -356,7 +366,7 @@ int main(int argc, char** argv) {
   CLI11_PARSE(app, argc, argv);
 
   Count positions, poses, positions_of_kdl, poses_of_kdl;
-  OutOfReach out_of_reach;
+  OutOfReach beyond, hollows;
   int num_not_learned = 0;
   for (int seed = first_seed; seed < first_seed + num_arms; ++seed) {
     Rng rng(static_cast<Rng::result_type>(seed));
@@ -386,14 +396,19 @@ int main(int argc, char** argv) {
       positions_of_kdl.add([&] { return kdl.reaches(X.translation().eval()); });
     }
     const DenseSearch dense(schema, hand, rng), true_dense(truth, hand, rng);
-    for (int n = 0; n < num_targets; ++n)
-      out_of_reach.add(schema, dense, truth, true_dense, kdl, hand,
-                       beyond_reach(schema, hand, robot, rng));
+    const double reach_m = reach_of(schema, hand, robot, rng);
+    for (int n = 0; n < num_targets; ++n) {
+      beyond.add(schema, dense, truth, true_dense, kdl, hand,
+                 random_vector(rng, 1.2 * reach_m, 2 * reach_m));
+      if (const auto p_RT = hollow(dense, reach_m, rng))
+        hollows.add(schema, dense, truth, true_dense, kdl, hand, *p_RT);
+    }
   }
   fmt::print("| targets | number | reached | ms of CPU, mean | largest |\n|---|---|---|---|---|\n");
   fmt::print("{}{}{}{}", positions.row("positions"),
              positions_of_kdl.row("positions, KDL on the true arm"), poses.row("full poses"),
              poses_of_kdl.row("full poses, KDL on the true arm"));
-  out_of_reach.print();
+  beyond.print("beyond reach");
+  hollows.print("within reach, but not reached: behind limits, in hollows");
   fmt::print("\n{} of {} arms were not learned.\n", num_not_learned, num_arms);
 }

@@ -3,10 +3,14 @@
 #include <gtest/gtest.h>
 
 #include <deque>
+#include <filesystem>
+#include <fstream>
 #include <functional>
 #include <map>
+#include <memory>
 #include <optional>
 #include <set>
+#include <utility>
 
 #include "common/bus/check.h"
 #include "common/bus/convert.h"
@@ -162,17 +166,24 @@ class Bench {
   void say(const motion_status_t& message) {
     motion = message;
     if (!driver_speaks) return;
+    ASSERT_EQ(check(motion), "");
     driver_was_heard_ = true;
+    driver_since_ = now;
+    if (motion.state == motion_status_t::STATE_MOVING) settled_at_ = now;
     take(controller.on_motion_status(motion));
   }
   void show_schema() {
     body_schema_t message = to_message(schema);
     ASSERT_EQ(check(message), "");
+    schema_was_heard_ = true;
+    monitor_since_ = now;
     take(controller.on_body_schema(message));
   }
   void show_frame() {
     last_sight_utime_ = motion.utime + kTick;
+    eyes_since_ = now;
     if (num_frames > 0) return show_tags();
+    tags_seen_.clear();
     marker_poses_t poses{};
     poses.utime = motion.utime + kTick;
     take(controller.on_marker_poses(poses));
@@ -183,8 +194,10 @@ class Bench {
       marker_poses_t poses{};
       poses.utime = motion.utime + kTick + frame * kFrame;
       std::vector<marker_pose_t> markers;
+      tags_seen_.clear();
       for (const auto& [id, p_RM] : p_RM_of_tag) {
         if (covers_tags && (part_position() - p_RM).norm() < 0.01) continue;
+        tags_seen_.insert(id);
         marker_pose_t& marker = markers.emplace_back();
         marker.marker_id = id;
         marker.size_m = 0.1;
@@ -215,7 +228,9 @@ class Bench {
   void repeat() {
     say(motion);
     if (monitor_speaks) show_schema();
-    if (health && monitor_speaks) take(controller.on_model_health(*health));
+    if (!health || !monitor_speaks) return;
+    heard_health_ = health;
+    take(controller.on_model_health(*health));
   }
   /// Everything heard, arm at rest at the start.
   void start() {
@@ -248,6 +263,7 @@ class Bench {
   void show_sample() {
     sample_t sample{};
     last_sight_utime_ = sample.utime = motion.utime + kTick;
+    eyes_since_ = now;
     sample.sample_index = num_samples++;
     sample.source = motion.source;
     sample.epoch = motion.epoch;
@@ -281,11 +297,14 @@ class Bench {
       parts.push_back(seen);
     }
     set_array(sample.num_parts, sample.parts, parts);
+    last_sampled_id_ = sample.action_id;
     take(controller.on_sample(sample));
   }
   void answer_last_move(std::int8_t state, const std::string& reason = "") {
+    answer_move(moves.back(), state, reason);
+  }
+  void answer_move(action_command_t command, std::int8_t state, const std::string& reason) {
     motion_status_t result = motion;
-    const action_command_t& command = moves.back();
     result.source = command.source;
     result.epoch = command.epoch;
     result.action_id = command.action_id;
@@ -293,6 +312,8 @@ class Bench {
     result.purpose = command.purpose;
     result.state = state;
     result.reason = reason;
+    if (state == motion_status_t::STATE_REJECTED || state == motion_status_t::STATE_EXPIRED)
+      refused_moves_[command.action_id] = state;
     set_array(result.num_signals, result.commanded, command.action);
     say(result);
   }
@@ -307,6 +328,52 @@ class Bench {
     message.stop_latched = latched;
     set_array(message.num_signals, message.commanded, std::vector<double>{});
     say(message);
+  }
+  /// Somebody pushes the arm by hand, or lets it rest: nobody tells where.
+  void push(bool is_moving) {
+    motion_status_t message = motion;
+    message.utime += kSecond;
+    message.rest_since_utime = is_moving ? -1 : message.utime;
+    set_array(message.num_signals, message.commanded, std::vector<double>{});
+    say(message);
+  }
+  /// From now on events are `met`.
+  void note_events() {
+    controller.trace([this](Phase phase, Event event) { met.emplace(phase, event); });
+  }
+  /// Somebody else tells the driver to hold.
+  void hold(std::int64_t id) {
+    motion_status_t message = motion;
+    message.source = "operator";
+    message.epoch = 1;
+    message.action_id = id;
+    message.kind = action_command_t::KIND_HOLD;
+    message.state = motion_status_t::STATE_HOLDING;
+    set_array(message.num_signals, message.commanded, std::vector<double>{});
+    say(message);
+  }
+  /// The driver begins anew: its time goes back.
+  void set_back() {
+    motion_status_t message = motion;
+    message.utime = std::max<std::int64_t>(0, motion.utime - kSecond);
+    message.rest_since_utime = std::min(motion.rest_since_utime, message.utime);
+    say(message);
+  }
+  /// The controller is killed and begins anew with what it kept.
+  void restart(const std::filesystem::path& file) {
+    std::ofstream(file) << controller.state_text();
+    std::destroy_at(&controller);
+    std::construct_at(&controller, config_);
+    note_events();
+    controller.restore(file);
+    commands_.clear();
+    driver_was_heard_ = schema_was_heard_ = false;
+    heard_health_.reset();
+    tags_seen_.clear();
+    last_sight_utime_ = -1;
+    driver_since_ = monitor_since_ = eyes_since_ = now;
+    given_.expiry_s = 0;
+    status = controller.status();
   }
   /// Where the schema says that the part is now.
   Eigen::Vector3d part_position() const {
@@ -341,6 +408,7 @@ class Bench {
   std::vector<action_command_t> moves;  ///< as served, each once
   int num_holds = 0, num_repeats = 0;
   std::vector<double> arm = {-30, 0.2, 1};
+  std::set<std::pair<Phase, Event>> met;  ///< events, and the phases in which they came
 
  private:
   void take(const Controller::Answer& answer) {
@@ -382,35 +450,68 @@ class Bench {
       ASSERT_LE(std::abs(command.action[i] - arm[i]),
                 (config_.max_step + 1e-9) * (signal.upper - signal.lower));
     }
-    expect_keeps_out(command);
+    expect_stays_inside(command);
     if (!moves.empty() && moves.back().action_id == command.action_id) {
       ASSERT_EQ(moves.back().action, command.action);
       ++num_repeats;
       return;
     }
     ASSERT_EQ(status.control_state, S::CONTROL_MOVING);
+    expect_is_guarded();
+    expect_is_slow_in_doubt(command);
     if (!moves.empty()) {
       ASSERT_GT(command.action_id, moves.back().action_id);
     }
     moves.push_back(command);
   }
-  /// No part that is outside a keep-out box comes into it on the way, by more than its origin
+  /// All inputs of the present rest were heard, and what moved the arm before has its SAMPLE or
+  /// was waited for.
+  void expect_is_guarded() const {
+    ASSERT_TRUE(driver_was_heard_ && schema_was_heard_);
+    ASSERT_GE(motion.rest_since_utime, 0) << "moves an arm that moves";
+    ASSERT_GE(last_sight_utime_, motion.rest_since_utime) << "moves unseen";
+    const bool is_settled = motion.kind == action_command_t::KIND_MOVE &&
+                            motion.state == motion_status_t::STATE_SETTLED;
+    if (is_settled && last_sampled_id_ != motion.action_id) {
+      ASSERT_GE(now - settled_at_, config_.sample_timeout_us) << "a sample is lost";
+    }
+    if (given_.target_kind != Target::KIND_TAG || status.target_id != given_.target_id) return;
+    const Eigen::Vector3d p_RT(status.target_position_m);
+    ASSERT_TRUE(tags_seen_.contains(given_.target_tag) ||
+                (part_position() - p_RT).norm() <= config_.reached_m)
+        << "moves to a tag that is not seen";
+  }
+  /// Small steps where an edge on the way is not OK.
+  void expect_is_slow_in_doubt(const action_command_t& command) const {
+    const bool is_in_doubt = heard_health_ && heard_health_->schema_version == schema.version &&
+                             heard_health_->edge_health[0].edge_state != schema_edge_t::EDGE_OK;
+    if (!is_in_doubt && command.purpose != action_command_t::PURPOSE_PROBE) return;
+    for (std::size_t i = 0; i < arm.size(); ++i) {
+      const Signal& signal = config_.signals[i];
+      ASSERT_LE(std::abs(command.action[i] - arm[i]),
+                (config_.slow_step + 1e-6) * (signal.upper - signal.lower));
+    }
+  }
+  /// On the way no part leaves the workspace or comes into a keep-out box, by more than its origin
   /// moves between two looks.
-  void expect_keeps_out(const action_command_t& command) {
+  void expect_stays_inside(const action_command_t& command) {
     const Eigen::Vector3d from(arm.data()), to(command.action.data());
-    for (Eigen::AlignedBox3d box : config_.workspace.keep_out) {
+    const auto expect = [&](Eigen::AlignedBox3d box, bool is_inside) {
       const Eigen::AlignedBox3d whole = box;
-      box.min().array() += 5e-3;
-      box.max().array() -= 5e-3;
+      const double margin = is_inside ? 5e-3 : -5e-3;
+      box.min().array() -= margin;
+      box.max().array() += margin;
       for (const int part : {2, 3, 4}) {
         const auto origin_at = [&](double share) -> Eigen::Vector3d {
           return planar().predict(1, part, from + share * (to - from))->X_AB.translation();
         };
-        if (whole.contains(origin_at(0))) continue;
+        if (whole.contains(origin_at(0)) != is_inside) continue;
         for (int n = 1; n <= 50; ++n)
-          ASSERT_FALSE(box.contains(origin_at(n / 50.0))) << "part " << part << " in a box";
+          ASSERT_EQ(box.contains(origin_at(n / 50.0)), is_inside) << "part " << part;
       }
-    }
+    };
+    for (const Eigen::AlignedBox3d& box : config_.workspace.keep_out) expect(box, false);
+    if (!config_.workspace.within.isEmpty()) expect(config_.workspace.within, true);
   }
   /// The driver answers one command a tick.
   void serve() {
@@ -432,10 +533,13 @@ class Bench {
                                                               : motion_status_t::STATE_HOLDING;
       set_array(held.num_signals, held.commanded, std::vector<double>{});
       say(held);
+    } else if (const auto refused = refused_moves_.find(command.action_id);
+               refused != refused_moves_.end()) {
+      answer_move(command, refused->second, "as before");
     } else if (const std::string reason =
                    motion.stop_latched ? "halted: resume first" : rejects(command);
                !reason.empty()) {
-      answer_last_move(motion_status_t::STATE_REJECTED, reason);
+      answer_move(command, motion_status_t::STATE_REJECTED, reason);
     } else {
       arm = command.action;
       if (driver_rounds)
@@ -469,12 +573,17 @@ class Bench {
   }
 
   std::deque<action_command_t> commands_;
-  std::set<std::int64_t> refused_holds_;  // an answered command is answered again
+  // An answered command is answered again.
+  std::set<std::int64_t> refused_holds_;
+  std::map<std::int64_t, std::int8_t> refused_moves_;
   std::int64_t last_ended_id_ = -1, left_path_id_ = -1;
   std::int8_t last_kind_ = -1;
   Target given_{};
   std::int64_t given_at_ = 0;
-  bool driver_was_heard_ = false;
+  bool driver_was_heard_ = false, schema_was_heard_ = false;
+  std::optional<model_health_t> heard_health_;
+  std::set<int> tags_seen_;  // in the newest frame
+  std::int64_t last_sampled_id_ = -1, settled_at_ = 0;
   std::int64_t driver_since_ = now, monitor_since_ = now, eyes_since_ = now;
   std::int64_t last_sight_utime_ = -1;
 };

@@ -379,7 +379,7 @@ TEST(ControllerTest, AWithdrawnTargetMovesTheArmNoFartherButNotAnothersTarget) {
   EXPECT_EQ(bench.status.sender, "planner");
 }
 
-TEST(ControllerTest, AHoldThatTheDriverDoesNotAnswerIsSentAgainWithTheSameId) {
+TEST(ControllerTest, AHoldThatTheDriverDoesNotAnswerIsSentAgain) {
   Bench bench;
   bench.start();
   bench.driver_serves = false;
