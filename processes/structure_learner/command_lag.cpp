@@ -37,6 +37,10 @@ constexpr double kLeastIntervals = 0.25;
 /// neighbouring ids alone. Chosen.
 constexpr std::size_t kMostMotions = 400, kFewestMotions = 40, kFewestOfSignal = 5,
                       kMostPaired = 10;
+/// Shares of the farthest lag, and of the squares of what commands change by in such a while: less
+/// that is no mixture of the present ones is one rhythm. Chosen.
+constexpr std::array kWhiles{0.25, 0.5, 1.0};
+constexpr double kLeastNews = 0.01;
 /// Residuals below are no information [m, rad].
 constexpr double kFloor = 1e-5;
 /// Of the median squared distance; flips and false detections are beyond. Chosen.
@@ -54,6 +58,11 @@ double median_interval_us(const std::vector<ActionPoseSample>& samples) {
   for (std::size_t n = 1; n < samples.size(); ++n)
     intervals.push_back(time_of(samples[n]) - time_of(samples[n - 1]));
   return intervals.empty() ? 0 : upper_median(std::move(intervals));
+}
+
+double farthest_lag_us(const std::vector<ActionPoseSample>& samples, double interval_us) {
+  return std::min(std::max(kFarthest_us, kFarthestIntervals * interval_us),
+                  kShareOfStream * (time_of(samples.back()) - time_of(samples.front())));
 }
 
 /// The commands of a stream and those between them, linear in time. Keeps a reference.
@@ -316,13 +325,40 @@ Regressions regressions_of(const std::vector<ActionPoseSample>& samples, const C
 
 }  // namespace
 
+bool is_one_rhythm(const std::vector<ActionPoseSample>& samples, int num_signals) {
+  const NormalizedActions actions(samples, num_signals);
+  const std::vector<int>& moving = actions.moving();
+  if (!actions.blocks().is_stream() || moving.size() < 2) return false;
+  const CommandTrack track(samples);
+  const double farthest_us = farthest_lag_us(samples, median_interval_us(samples));
+  const auto m = static_cast<Eigen::Index>(moving.size());
+  return std::ranges::all_of(kWhiles, [&](double share) {
+    const double while_us = share * farthest_us;
+    const std::vector<std::size_t> inner = track.within(while_us);
+    if (inner.size() < kFewestMotions) return false;
+    Eigen::MatrixXd now(m + 1, inner.size()), change(m, inner.size());
+    for (Eigen::Index n = 0; n < now.cols(); ++n) {
+      const ActionPoseSample& sample = samples[inner[static_cast<std::size_t>(n)]];
+      const auto before = track.at(time_of(sample) - while_us);
+      if (!before) return false;
+      now(m, n) = 1;
+      for (Eigen::Index s = 0; s < m; ++s) {
+        const int signal = moving[static_cast<std::size_t>(s)];
+        now(s, n) = (sample.action[signal] - actions.centre(signal)) / actions.half_range(signal);
+        change(s, n) = ((*before)[signal] - sample.action[signal]) / actions.half_range(signal);
+      }
+    }
+    const Eigen::MatrixXd left =
+        change - now.transpose().colPivHouseholderQr().solve(change.transpose()).transpose() * now;
+    return left.squaredNorm() < kLeastNews * change.squaredNorm();
+  });
+}
+
 CommandLag command_lag(const std::vector<ActionPoseSample>& samples, int num_signals) {
   const NormalizedActions actions(samples, num_signals);
   if (!actions.blocks().is_stream() || actions.moving().empty()) return {};
   const double interval_us = median_interval_us(samples);
-  const double farthest_us =
-      std::min(std::max(kFarthest_us, kFarthestIntervals * interval_us),
-               kShareOfStream * (time_of(samples.back()) - time_of(samples.front())));
+  const double farthest_us = farthest_lag_us(samples, interval_us);
   const double step_us = std::max(interval_us, farthest_us / kMostSteps);
   const int most = static_cast<int>(farthest_us / step_us);
   const CommandTrack track(samples);

@@ -31,6 +31,11 @@ struct CommandLag {
 /// quarter of the frames' interval or explains nothing more, and of poses at rest.
 CommandLag command_lag(const std::vector<ActionPoseSample>& samples, int num_signals);
 
+/// Whether the commands of a while before are mixtures of those of now, whatever the while: all
+/// signals follow one sine or one line. Then nothing tells a delay from joints that several signals
+/// move.
+bool is_one_rhythm(const std::vector<ActionPoseSample>& samples, int num_signals);
+
 /// Near `delay`, at which the models over `actions` were found, the one by which they, fitted
 /// again, leave least; `delay` where that is hardly less, and of soft models, whose motion has more
 /// of a past than a delay.

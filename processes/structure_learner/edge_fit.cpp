@@ -7,6 +7,7 @@
 #include "processes/structure_learner/joint_scatter.h"
 #include "processes/structure_learner/residual_fit.h"
 #include "processes/structure_learner/root_pose.h"
+#include "processes/structure_learner/serial_correlation.h"
 #include "processes/structure_learner/tree_fit.h"
 
 namespace bodyschema {
@@ -101,10 +102,15 @@ void fit_screw_edge(const LocalModel& start, const PairData& pair, const EdgeDat
   double weight = 0;
   for (int t = 0; t < pair.size(); ++t)
     if (!result->outlying[t]) weight += fit.frames[t].weight();
+  const double lasting =
+      data.actions.blocks().is_stream()
+          ? correlation_time(scores(fit, pair, data.actions), loo.parameter_covariance)
+          : 1;
   // The robust weights are relative: an inlier counts as one measurement, on the average.
   if (inliers > 0)
     result->edge.parameter_covariance =
-        weight / inliers * in_command_units(loo.parameter_covariance, fit.model, data.actions);
+        lasting * weight / inliers *
+        in_command_units(loo.parameter_covariance, fit.model, data.actions);
 }
 
 }  // namespace

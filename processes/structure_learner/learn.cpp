@@ -319,13 +319,16 @@ void withdraw_what_is_by_chance(const std::vector<ActionPoseSample>& samples,
   const bool is_doubtful =
       structure->noise_source == NoiseSource::kAssumed || structure->is_noise_guessed_too_large();
   if (!others.is_stream() && !is_doubtful) return;
+  const bool has_one_rhythm = is_one_rhythm(moved, static_cast<int>(structure->signals.size()));
   std::erase_if(structure->search.models, [&](const AcceptedModel& model) {
     PairRecord& record = structure->search.records[std::minmax(model.part_i, model.part_j)];
     record.is_too_short |= others.is_short() && !model.soft_signals.empty();
     record.is_by_chance |= others.explain_as_well(model);
+    record.has_one_rhythm |= has_one_rhythm && model.model.num_joints() > 1;
     // Nothing says that what a rigid one leaves is no motion.
     const bool is_rigid = model.model.joints.empty() && model.soft_signals.empty();
-    return record.is_too_short || record.is_by_chance || (is_doubtful && is_rigid);
+    return record.is_too_short || record.is_by_chance || record.has_one_rhythm ||
+           (is_doubtful && is_rigid);
   });
 }
 

@@ -266,4 +266,16 @@ LeaveOneOut leave_one_out(const Fit& fit, const PairData& pair, const Normalized
   return result;
 }
 
+Eigen::MatrixXd scores(const Fit& fit, const PairData& pair, const NormalizedActions& actions) {
+  Eigen::MatrixXd result(fit.model.num_parameters(), pair.size());
+  ParameterJacobian J;
+  for (int t = 0; t < pair.size(); ++t) {
+    const FrameFit& frame = fit.frames[t];
+    const Pose prediction = predict_with_jacobian(fit.model, actions, pair.frames[t].sample, &J);
+    whitened_jacobian(pair.hypotheses[frame.hypothesis], frame.error, prediction, &J);
+    result.col(t) = frame.weight() * J.transpose() * frame.residual;
+  }
+  return result;
+}
+
 }  // namespace bodyschema

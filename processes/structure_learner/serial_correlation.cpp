@@ -43,4 +43,20 @@ double variance_inflation(const std::vector<double>& x, const std::vector<int>& 
   return 1 + std::max(squares > 0 ? 2 * products / squares : 0, large);
 }
 
+double correlation_time(const Eigen::MatrixXd& scores, const Eigen::MatrixXd& covariance) {
+  const Eigen::Index n = scores.cols();
+  const Eigen::MatrixXd weighted = covariance * scores;
+  const auto product_at = [&](Eigen::Index lag) {
+    return scores.leftCols(n - lag).cwiseProduct(weighted.rightCols(n - lag)).sum();
+  };
+  const double squares = product_at(0);
+  double sum = squares;
+  for (Eigen::Index lag = 1; lag < n / 2; ++lag) {
+    const double product = product_at(lag);
+    if (!(product > 0)) break;
+    sum += 2 * product;
+  }
+  return squares > 0 ? sum / squares : 1;
+}
+
 }  // namespace bodyschema

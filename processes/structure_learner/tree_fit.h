@@ -45,7 +45,7 @@ class TreeFit {
   /// score, by what is told of the measurements, between two inverse Hessians (the sandwich of an
   /// M-estimator). What does not average out: the errors of a tag, which all its sights share; of
   /// near-identical views of a part its systematic error and `view_share` of the variance of its
-  /// noise.
+  /// noise. Of a stream, noise that lasts is found in what the fit leaves.
   struct Covariance {
     Matrix6d root = Matrix6d::Zero();     ///< of root_pose()
     std::vector<ParameterMatrix> models;  ///< by node
@@ -84,7 +84,8 @@ class TreeFit {
   std::vector<int> views_of(int node) const;
   Eigen::MatrixXd with_fixed_gauge(const Normal& normal) const;
   Eigen::MatrixXd score_covariance(const Normal& normal, const MeasurementModel& measurement,
-                                   double view_share) const;
+                                   double view_share, double correlation_time) const;
+  Eigen::MatrixXd scores(const Normal& normal) const;
   std::vector<Matrix6d> frame_covariances(const Normal& normal, const Eigen::MatrixXd& joint) const;
   void add_composites(const Normal& normal, std::vector<Matrix6d> own, Eigen::MatrixXd* sum) const;
 

@@ -5,6 +5,7 @@
 #include <utility>
 
 #include "common/geometry/angle.h"
+#include "processes/structure_learner/serial_correlation.h"
 #include "processes/structure_learner/tree_fit.h"
 #include "processes/structure_learner/tree_fit_normal.h"
 
@@ -83,9 +84,20 @@ Eigen::MatrixXd TreeFit::with_fixed_gauge(const Normal& normal) const {
   return H;
 }
 
+// Jᵀ W e of each frame, in columns.
+Eigen::MatrixXd TreeFit::scores(const Normal& normal) const {
+  Eigen::MatrixXd result = Eigen::MatrixXd::Zero(normal.H.rows(), num_frames());
+  for (int t = 0; t < num_frames(); ++t)
+    for (int k = 0; k < static_cast<int>(nodes_.size()); ++k) {
+      const ParameterJacobian& S = normal.S[at(t, k)];
+      result.col(t).segment(normal.offset[k], S.cols()) = S.transpose() * normal.gradient[at(t, k)];
+    }
+  return result;
+}
+
 // Covariance of Σ Jᵀ W e over all markers.
 Eigen::MatrixXd TreeFit::score_covariance(const Normal& normal, const MeasurementModel& measurement,
-                                          double view_share) const {
+                                          double view_share, double correlation_time) const {
   const auto size = normal.H.rows();
   Eigen::MatrixXd score = Eigen::MatrixXd::Zero(size, size);
   // The share that averages out, by the marker.
@@ -123,8 +135,9 @@ Eigen::MatrixXd TreeFit::score_covariance(const Normal& normal, const Measuremen
                         static_cast<double>(tags.size()) * tag * tag.transpose());
       const bool is_alone = sizes.at(views[frame]) == 1;
       const double share = is_alone ? 0 : view_share;
-      own[at(t, k)] =
-          twist * ((1 - share) * noise + (is_alone ? 1 : 0) * systematic) * twist.transpose();
+      own[at(t, k)] = twist *
+                      ((1 - share) * correlation_time * noise + (is_alone ? 1 : 0) * systematic) *
+                      twist.transpose();
       if (!is_alone)
         add(twist * Eigen::LLT<Matrix6d>(systematic + share * noise).matrixL().toDenseMatrix(),
             &of_view[views[frame]]);
@@ -173,7 +186,11 @@ std::optional<TreeFit::Covariance> TreeFit::covariance(const MeasurementModel& m
   if (llt.info() != Eigen::Success) return std::nullopt;
   const Eigen::MatrixXd inverse = unit.asDiagonal() * llt.solve(Eigen::MatrixXd(unit.asDiagonal()));
   // The prior added to H is a measurement like others.
-  const Eigen::MatrixXd score = H - normal.H + score_covariance(normal, measurement, view_share);
+  const bool is_stream = actions_.blocks().is_stream();
+  const Eigen::MatrixXd score =
+      H - normal.H +
+      score_covariance(normal, measurement, view_share,
+                       is_stream ? correlation_time(scores(normal), inverse) : 1);
   const Eigen::MatrixXd joint = inverse * score * inverse;
   Covariance result;
   result.models.resize(nodes_.size());

@@ -51,7 +51,8 @@ int count_actions(const std::vector<ActionPoseSample>& samples) {
 struct TriedModels {
   int num_common = 0, partner = -1;  ///< most instants with one of them
   bool undecided = false, was_soft_tried = false;
-  bool is_redundant = false, moves_little = false, is_by_chance = false, is_too_short = false;
+  bool is_redundant = false, moves_little = false, is_by_chance = false, is_too_short = false,
+       has_one_rhythm = false;
   std::set<int> untold;
   std::optional<ContestedSignals> contested;
 };
@@ -63,6 +64,7 @@ TriedModels tried_models(int part, const std::set<int>& connected, const SearchR
     // What is by chance may have connected both.
     tried.is_by_chance |= record.is_by_chance;
     tried.is_too_short |= record.is_too_short;
+    tried.has_one_rhythm |= record.has_one_rhythm;
     const int other = pair.first == part ? pair.second : pair.first;
     if (!connected.count(other)) continue;
     tried.undecided |= !record.undecided.empty();
@@ -104,6 +106,10 @@ std::string why_taken_back(const TriedModels& tried, const LearnedStructure& str
   if (tried.is_by_chance)
     return "commands of other times explain its motion nearly as well: record for longer, and "
            "check that each action is of the time of its poses";
+  if (tried.has_one_rhythm)
+    return "all signals follow one rhythm, in which poses that come late look like joints that "
+           "several signals move: move each signal in a rhythm of its own, or hold the arm still "
+           "at each pose";
   if (tried.is_too_short)
     return "no joints explain its motion, and the recording is too short to tell whether anything "
            "else does: record for longer";

@@ -46,9 +46,10 @@ struct PairRecord {
   std::set<int> untold_signals = {};
   /// A valid model has a joint that its tree does not need: redundant_edges().
   bool is_redundant = false;
-  /// A valid model was taken back: time-shifted commands explain the motion nearly as well, or it is
-  /// a Gaussian process on a stream too short for one.
-  bool is_by_chance = false, is_too_short = false;
+  /// A valid model was taken back: time-shifted commands explain the motion nearly as well, it is a
+  /// Gaussian process on a stream too short for one, or has several joints where all signals follow
+  /// one rhythm.
+  bool is_by_chance = false, is_too_short = false, has_one_rhythm = false;
   std::optional<ContestedSignals> contested = {};
 
   void note_undecided(int num_signals, double mean_capped);

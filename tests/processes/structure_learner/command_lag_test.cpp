@@ -82,6 +82,37 @@ TEST(CommandLag, CommandsOfBeforeAreLinearBetweenTwo) {
   EXPECT_EQ(with_commands_of_before(samples, {.lag_us = 250}).size(), 2U);
 }
 
+// A sine of before is a mixture of two of now: late poses look like joints that both move.
+TEST(CommandLag, OfOneRhythmIsNotKnown) {
+  constexpr int kNum = 600, kLate = 6;
+  for (std::uint64_t seed = 0; seed < 4; ++seed) {
+    ImperfectRobot robot(2, true, {}, seed);
+    const auto action_at = [&](int n) {
+      Eigen::VectorXd action(2);
+      for (Eigen::Index s = 0; s < 2; ++s) {
+        const Signal& signal = robot.signals()[static_cast<std::size_t>(s)];
+        action[s] = 0.5 * (signal.lower + signal.upper) +
+                    0.4 * (signal.upper - signal.lower) *
+                        std::sin(2 * M_PI * n / 90 + 1.3 * static_cast<double>(s));
+      }
+      return action;
+    };
+    std::vector<ActionPoseSample> samples;
+    for (int n = 0; n < kNum; ++n) {
+      samples.push_back(robot.go(action_at(n - kLate)));
+      samples.back().action = action_at(n);
+    }
+    EXPECT_TRUE(is_one_rhythm(samples, 2));
+    const BodySchema schema = learn(robot.signals(), samples).schema;
+    EXPECT_FALSE(schema.complete && judge(schema, robot.structure()) == Rightness::kWrong) << seed;
+  }
+  for (const bool is_chain : {false, true}) {
+    ImperfectRobot robot(2, is_chain, {}, 1);
+    EXPECT_FALSE(is_one_rhythm(stream_of(robot), 2));
+    EXPECT_FALSE(is_one_rhythm(robot.babble(200), 2));
+  }
+}
+
 // What is learned is where a command leads, not where the arm is when it is given.
 TEST(CommandLag, IsTakenIntoAccount) {
   for (const double lag : {-4.0, 0.2, 1.5, 8.0})

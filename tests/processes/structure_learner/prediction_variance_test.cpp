@@ -5,6 +5,7 @@
 
 #include "common/kinematics/kinematic_path.h"
 #include "processes/structure_learner/learn.h"
+#include "tests/support/imperfect_robot.h"
 #include "tests/support/synthetic_robot.h"
 
 namespace bodyschema {
@@ -92,6 +93,33 @@ TEST(PredictionVariance, OfALearnedRobotIsWhatItSaysOnSamplesNotLearnedFrom) {
   // What two edges have in common with opposite sign is taken out: added up as if independent they
   // gave half of it. (150 robots: 6.2 ± 0.2.)
   EXPECT_NEAR(mean(first_order), 6, 1.2);
+}
+
+// 600 samples of smooth motion, whose noise keeps nine tenths from one to the next: as if it were
+// new at each, a mean of 6 would be 19 times that, (1 + 0.9)/(1 − 0.9).
+TEST(PredictionVariance, OfAStreamCountsNoiseThatLasts) {
+  constexpr int kRobots = 12, kActions = 100, kRoot = 1, kHand = 4;
+  constexpr Noise kNoise{0.003, M_PI / 180};  // of ImperfectRobot
+  std::vector<double> distances;
+  for (int seed = 1; seed <= kRobots; ++seed) {
+    test::ImperfectRobot robot(3, true, {.correlation = 0.9}, static_cast<std::uint64_t>(seed));
+    LearnOptions options;
+    options.measurement.noise = kNoise;
+    const BodySchema schema = learn(robot.signals(), robot.wander(600, 60), options).schema;
+    const auto path = KinematicPath::between(schema, kRoot, kHand);
+    ASSERT_TRUE(path) << seed;
+    double sum = 0;
+    for (int n = 0; n < kActions; ++n) {
+      const Eigen::VectorXd q = robot.random_action();
+      robot.go(q);
+      const Pose X_RH = robot.poses()[kRoot - 1].inverse() * robot.poses()[kHand - 1];
+      const Vector6d e = log(path->predict(q).inverse() * X_RH);
+      sum += e.dot(path->covariance(q, Variance::kFirstOrder).ldlt().solve(e)) / kActions;
+    }
+    distances.push_back(sum);
+  }
+  EXPECT_GT(mean(distances), 4);
+  EXPECT_LT(mean(distances), 10);
 }
 
 }  // namespace
