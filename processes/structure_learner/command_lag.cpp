@@ -84,22 +84,8 @@ class CommandTrack {
     return before->action + share * (after->action - before->action);
   }
 
-  /// That brought the arm where it is at a time.
-  std::optional<Eigen::VectorXd> at(double time_us, const CommandDelay& delay) const {
-    const auto smear_us = static_cast<double>(delay.smear_us);
-    time_us -= static_cast<double>(delay.lag_us);
-    auto before = at(time_us - smear_us);
-    if (smear_us == 0) return before;
-    const auto after = at(time_us + smear_us);
-    if (!before || !after) return std::nullopt;
-    return Eigen::VectorXd(0.5 * (*before + *after));
-  }
-
   /// The samples around which it is known everywhere within `margin_us`.
   std::vector<std::size_t> within(double margin_us) const {
-    const auto is_behind_gap = [&](std::size_t n) {
-      return n == 0 || time_of(samples_[n]) - time_of(samples_[n - 1]) > most_apart_us_;
-    };
     std::vector<std::size_t> inner;
     for (std::size_t begin = 0, end = 0; begin < samples_.size(); begin = end) {
       for (end = begin + 1; end < samples_.size() && !is_behind_gap(end);) ++end;
@@ -111,10 +97,78 @@ class CommandTrack {
     return inner;
   }
   const std::vector<ActionPoseSample>& samples() const { return samples_; }
+  /// Nothing is known of what is between sample n and the one before.
+  bool is_behind_gap(std::size_t n) const {
+    return n == 0 || time_of(samples_[n]) - time_of(samples_[n - 1]) > most_apart_us_;
+  }
 
  private:
   const std::vector<ActionPoseSample>& samples_;
   const double most_apart_us_;
+};
+
+/// Where the commands of a track have brought an arm that follows them with a delay.
+class Drive {
+ public:
+  Drive(const CommandTrack& track, const CommandDelay& delay)
+      : track_(track),
+        dead_us_(static_cast<double>(delay.lag_us - delay.smear_us)),
+        constant_us_(static_cast<double>(delay.smear_us)) {
+    if (delay.smear_us == 0) return;
+    const std::vector<ActionPoseSample>& samples = track.samples();
+    for (std::size_t n = 0; n < samples.size(); ++n) {
+      const bool begins = track.is_behind_gap(n);
+      if (begins) begin_us_ = time_of(samples[n]);
+      begins_us_.push_back(begin_us_);
+      // As if it had moved evenly before.
+      const bool is_alone = n + 1 == samples.size() || track.is_behind_gap(n + 1);
+      states_.push_back(!begins ? followed(n - 1, time_of(samples[n]))
+                        : is_alone
+                            ? samples[n].action
+                            : Eigen::VectorXd(samples[n].action - constant_us_ * rate_after(n)));
+    }
+  }
+
+  /// How far around a sample commands must be known.
+  double margin_us() const { return std::abs(dead_us_) + kForgotten * constant_us_; }
+
+  /// std::nullopt where too little is known of the commands before.
+  std::optional<Eigen::VectorXd> at(double time_us) const {
+    time_us -= dead_us_;
+    if (states_.empty()) return track_.at(time_us);
+    const std::vector<ActionPoseSample>& samples = track_.samples();
+    const auto after = std::ranges::lower_bound(samples, time_us, {}, time_of);
+    if (after == samples.end()) return std::nullopt;
+    const auto n = static_cast<std::size_t>(after - samples.begin());
+    if (time_us - begins_us_[n] < kForgotten * constant_us_) return std::nullopt;
+    return time_of(*after) == time_us ? states_[n] : followed(n - 1, time_us);
+  }
+
+ private:
+  /// In time constants: what it was before is forgotten to e⁻³ = 5 %.
+  static constexpr double kForgotten = 3;
+
+  Eigen::VectorXd rate_after(std::size_t n) const {
+    const ActionPoseSample &from = track_.samples()[n], &to = track_.samples()[n + 1];
+    const double apart_us = time_of(to) - time_of(from);
+    if (apart_us <= 0) return Eigen::VectorXd::Zero(from.action.size());
+    return (to.action - from.action) / apart_us;
+  }
+  /// From sample n on, its commands being linear up to the next.
+  Eigen::VectorXd followed(std::size_t n, double time_us) const {
+    const ActionPoseSample& from = track_.samples()[n];
+    const double passed_us = time_us - time_of(from);
+    const Eigen::VectorXd rate = rate_after(n);
+    const double kept = std::exp(-passed_us / constant_us_);
+    return from.action + rate * (passed_us - constant_us_) +
+           kept * (states_[n] - from.action + constant_us_ * rate);
+  }
+
+  const CommandTrack& track_;
+  const double dead_us_, constant_us_;
+  double begin_us_ = 0;
+  std::vector<double> begins_us_;        // by sample: of the commands known without a gap
+  std::vector<Eigen::VectorXd> states_;  // by sample: without the dead time
 };
 
 /// log(z(t_a)⁻¹ z(t_b)) of a pair of parts.
@@ -238,46 +292,57 @@ template <class CostOf>
 CommandDelay least_near(const CommandDelay& start, const CommandDelay& without,
                         const std::vector<ActionPoseSample>& samples, const CostOf& cost_of) {
   constexpr int kMostRounds = 20;
+  constexpr double kThere = 0.1;  // of half an interval
   const CommandTrack track(samples);
   // Of the same frames at all.
   const auto costs_at = [&](const std::vector<CommandDelay>& delays) {
-    std::int64_t farthest_us = 0;
-    for (const CommandDelay& d : delays)
-      farthest_us = std::max(farthest_us, std::abs(d.lag_us) + d.smear_us);
-    const std::vector<std::size_t> inner = track.within(static_cast<double>(farthest_us));
+    std::vector<Drive> drives;
+    double margin_us = 0;
+    for (const CommandDelay& d : delays) {
+      drives.emplace_back(track, d);
+      margin_us = std::max(margin_us, drives.back().margin_us());
+    }
+    const std::vector<std::size_t> inner = track.within(margin_us);
     std::vector<ActionPoseSample> moved;
     for (std::size_t k = 0, count = std::min(kMostFrames, inner.size()); k < count; ++k)
       moved.push_back(samples[inner[k * inner.size() / count]]);
     std::vector<double> costs;
-    for (const CommandDelay& d : delays) {
-      for (ActionPoseSample& sample : moved) sample.action = *track.at(time_of(sample), d);
+    for (const Drive& drive : drives) {
+      for (ActionPoseSample& sample : moved) sample.action = *drive.at(time_of(sample));
       costs.push_back(cost_of(moved));
     }
     return costs;
   };
   const auto step_us = static_cast<std::int64_t>(median_interval_us(samples) / 2);
-  // One of the two, the other as it is.
-  const auto moved_by = [&](CommandDelay at, std::int64_t CommandDelay::*what) {
-    CommandDelay before = at, after = at;
-    before.*what = std::abs(at.*what - step_us);
-    if (what == &CommandDelay::lag_us) before.*what = at.*what - step_us;
-    after.*what += step_us;
-    const auto costs = costs_at({before, at, after});
+  // In a direction of both.
+  const auto moved_by = [&](CommandDelay at, std::int64_t lag_us, std::int64_t smear_us) {
+    const auto at_share = [&](double share) {
+      CommandDelay there = at;
+      there.lag_us += std::llround(share * static_cast<double>(lag_us));
+      there.smear_us =
+          std::abs(there.smear_us + std::llround(share * static_cast<double>(smear_us)));
+      return there;
+    };
+    const auto costs = costs_at({at_share(-1), at, at_share(1)});
     const double share = vertex(costs[0], costs[1], costs[2]);
-    at.*what += std::llround(share * static_cast<double>(step_us));
-    // What acts on the past alone is hardly wider than it is late: else a joint that goes less far
-    // would pass for it.
-    const std::int64_t widest_us = std::max<std::int64_t>(0, at.lag_us);
+    at = at_share(share);
+    // No dead time below 0, but by half an interval, where a command is of the end of the interval
+    // in which it acts: else a joint that goes less far would pass for a slow drive.
+    const std::int64_t late_us = std::max<std::int64_t>(0, at.lag_us);
+    const std::int64_t widest_us = late_us + std::min(late_us / 4, step_us);
     const bool is_widest = at.smear_us > widest_us;
     if (is_widest) at.smear_us = widest_us;
-    return std::pair(at, is_widest || std::abs(share) < 1);
+    return std::pair(at, is_widest || std::abs(share) < kThere);
   };
   const auto downhill = [&](CommandDelay at, bool is_smeared) {
     for (int n = 0; n < kMostRounds; ++n) {
-      bool is_there = false, is_smooth = true;
-      std::tie(at, is_there) = moved_by(at, &CommandDelay::lag_us);
-      if (is_smeared) std::tie(at, is_smooth) = moved_by(at, &CommandDelay::smear_us);
-      if (is_there && is_smooth) break;
+      bool is_there = false, is_smooth = true, is_slow = true;
+      std::tie(at, is_there) = moved_by(at, step_us, 0);
+      if (is_smeared) {
+        std::tie(at, is_smooth) = moved_by(at, 0, step_us);
+        std::tie(at, is_slow) = moved_by(at, step_us, step_us);  // of the same dead time
+      }
+      if (is_there && is_smooth && is_slow) break;
     }
     return at;
   };
@@ -444,9 +509,10 @@ std::vector<ActionPoseSample> with_commands_of_before(const std::vector<ActionPo
                                                       const CommandDelay& delay) {
   if (delay == CommandDelay{}) return samples;
   const CommandTrack track(samples);
+  const Drive drive(track, delay);
   std::vector<ActionPoseSample> moved;
   for (const ActionPoseSample& sample : samples)
-    if (std::optional<Eigen::VectorXd> action = track.at(time_of(sample), delay)) {
+    if (std::optional<Eigen::VectorXd> action = drive.at(time_of(sample))) {
       moved.push_back(sample);
       moved.back().action = *std::move(action);
     }

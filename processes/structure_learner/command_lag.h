@@ -11,12 +11,11 @@
 namespace bodyschema {
 
 /// How the poses of a stream come after their commands: drives, filters and exposure take time, and
-/// clocks differ. The arm is where the mean of two commands leads, `lag_us` ± `smear_us` before: to
-/// the second order of time that is a delay, or a drive of the first order, of which both are the
-/// time constant.
+/// clocks differ. A drive of first order after a dead time (the process control model of that name,
+/// FOPDT), between commands that are linear in time.
 struct CommandDelay {
-  std::int64_t lag_us = 0;    ///< below 0: before them
-  std::int64_t smear_us = 0;  ///< 0 … max(0, lag_us)
+  std::int64_t lag_us = 0;    ///< both together, the mean delay; below 0: before them
+  std::int64_t smear_us = 0;  ///< time constant of the drive: 0 … 1.25 lag_us
 
   bool operator==(const CommandDelay&) const = default;
 };
@@ -48,8 +47,8 @@ CommandDelay refined_delay(const std::vector<ActionPoseSample>& samples,
 /// is hardly less than without.
 CommandDelay command_delay(const std::vector<ActionPoseSample>& samples, const BodySchema& schema);
 
-/// Each sample with the command that brought it there, linear between two; those that have none, at
-/// the ends and behind gaps, are left out.
+/// Each sample with the command that brought it there; those that have none, at the ends and behind
+/// gaps, are left out.
 std::vector<ActionPoseSample> with_commands_of_before(const std::vector<ActionPoseSample>& samples,
                                                       const CommandDelay& delay);
 

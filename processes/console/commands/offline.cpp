@@ -85,8 +85,8 @@ void run_learn(const LearnArguments& arguments) {
   }
   Json json = structure_json(result.schema, result.outliers, result.noise_source);
   json["one_cluster"] = result.is_one_cluster;
-  json["command_lag_s"] = static_cast<double>(result.command_delay.lag_us) * 1e-6;
-  json["command_smear_s"] = static_cast<double>(result.command_delay.smear_us) * 1e-6;
+  json["command_lag_s"] = static_cast<double>(result.command_delay.lag_us) / 1e6;
+  json["command_smear_s"] = static_cast<double>(result.command_delay.smear_us) / 1e6;
   std::string text = structure_text(result.schema, result.noise_source);
   if (result.command_delay != CommandDelay{})
     text += "  " + delay_text(result.command_delay) + "\n";

@@ -162,6 +162,38 @@ TEST(CommandLag, OfDrivesThatFollowIsTheirTimeConstantAndSmeared) {
   EXPECT_LT(apart_m[kSamples / 2], 0.002);
 }
 
+// One that swings in twice its time constant goes less than a third as far as its command.
+TEST(CommandLag, DrivesAreFollowedHoweverFastCommandsAre) {
+  constexpr double kDrive_us = 200'000, kInterval_us = 33'333;
+  constexpr int kNum = 400, kPeriod_us = 400'000;
+  std::vector<ActionPoseSample> samples(kNum);
+  std::vector<double> truth(kNum);  // of the commands linear between two, in fine steps
+  const auto command_at = [](double us) { return std::sin(2 * M_PI * us / kPeriod_us); };
+  double joint = 0;
+  for (int n = 0; n < kNum; ++n) {
+    samples[n].utime = std::llround(n * kInterval_us);
+    samples[n].action = Eigen::VectorXd::Constant(1, command_at(n * kInterval_us));
+    constexpr int kFine = 1000;
+    for (int k = 0; n > 0 && k < kFine; ++k) {
+      const double share = (k + 0.5) / kFine;
+      const double input = (1 - share) * samples[n - 1].action[0] + share * samples[n].action[0];
+      joint += (input - joint) * kInterval_us / kFine / kDrive_us;
+    }
+    truth[n] = joint;
+  }
+  const auto moved = with_commands_of_before(
+      samples, {.lag_us = std::llround(kDrive_us), .smear_us = std::llround(kDrive_us)});
+  ASSERT_GT(moved.size(), kNum - 20U);
+  double largest = 0;
+  const std::size_t skipped = samples.size() - moved.size();
+  for (std::size_t n = 100; n < moved.size(); ++n) {
+    EXPECT_NEAR(moved[n].action[0], truth[n + skipped], 1e-3);
+    largest = std::max(largest, moved[n].action[0]);
+  }
+  EXPECT_LT(largest, 0.33);
+  EXPECT_GT(largest, 0.25);
+}
+
 TEST(CommandLag, AJointThatGoesLessFarIsNoSlowDrive) {
   LearnOptions options;
   options.root = 1;
