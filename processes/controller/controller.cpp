@@ -345,7 +345,7 @@ void Controller::restore(const std::filesystem::path& file, std::int64_t wall_cl
   }
   floor_epoch_ = epoch;
   // A sender repeats what was not acknowledged: then the same target counts again.
-  floor_id_ = owns_arm || was_served ? id : id - 1;
+  floor_id_ = owns_arm || was_served || id < 0 ? id : id - 1;
   if (owns_arm) {
     target_.sender = sender;
     target_.epoch = epoch;

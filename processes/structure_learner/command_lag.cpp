@@ -37,8 +37,8 @@ constexpr double kLeastIntervals = 0.25;
 /// neighbouring ids alone. Chosen.
 constexpr std::size_t kMostMotions = 400, kFewestMotions = 40, kFewestOfSignal = 5,
                       kMostPaired = 10;
-/// Shares of the farthest lag, and of the squares of what commands change by in such a while: less
-/// that is no mixture of the present ones is one rhythm. Chosen.
+/// Time shifts tried, as shares of the farthest lag; and the share of the squared change of the
+/// commands below which what the present commands leave unexplained is nothing. Chosen.
 constexpr std::array kWhiles{0.25, 0.5, 1.0};
 constexpr double kLeastNews = 0.01;
 /// Residuals below are no information [m, rad].
@@ -85,13 +85,14 @@ class CommandTrack {
   }
 
   /// The samples around which it is known everywhere within `margin_us`.
-  std::vector<std::size_t> within(double margin_us) const {
+  std::vector<std::size_t> within(double margin_us) const { return within(margin_us, margin_us); }
+  std::vector<std::size_t> within(double past_us, double future_us) const {
     std::vector<std::size_t> inner;
     for (std::size_t begin = 0, end = 0; begin < samples_.size(); begin = end) {
       for (end = begin + 1; end < samples_.size() && !is_behind_gap(end);) ++end;
       for (std::size_t n = begin; n < end; ++n)
-        if (time_of(samples_[n]) - margin_us >= time_of(samples_[begin]) &&
-            time_of(samples_[n]) + margin_us <= time_of(samples_[end - 1]))
+        if (time_of(samples_[n]) - past_us >= time_of(samples_[begin]) &&
+            time_of(samples_[n]) + future_us <= time_of(samples_[end - 1]))
           inner.push_back(n);
     }
     return inner;
@@ -116,10 +117,11 @@ class Drive {
         constant_us_(static_cast<double>(delay.smear_us)) {
     if (delay.smear_us == 0) return;
     const std::vector<ActionPoseSample>& samples = track.samples();
+    double begin_us = 0;
     for (std::size_t n = 0; n < samples.size(); ++n) {
       const bool begins = track.is_behind_gap(n);
-      if (begins) begin_us_ = time_of(samples[n]);
-      begins_us_.push_back(begin_us_);
+      if (begins) begin_us = time_of(samples[n]);
+      begins_us_.push_back(begin_us);
       // As if it had moved evenly before.
       const bool is_alone = n + 1 == samples.size() || track.is_behind_gap(n + 1);
       states_.push_back(!begins ? followed(n - 1, time_of(samples[n]))
@@ -129,8 +131,9 @@ class Drive {
     }
   }
 
-  /// How far around a sample commands must be known.
-  double margin_us() const { return std::abs(dead_us_) + kForgotten * constant_us_; }
+  /// How far before and after a sample commands must be known.
+  double past_us() const { return std::max(0.0, dead_us_) + kForgotten * constant_us_; }
+  double future_us() const { return std::max(0.0, -dead_us_); }
 
   /// std::nullopt where too little is known of the commands before.
   std::optional<Eigen::VectorXd> at(double time_us) const {
@@ -145,7 +148,7 @@ class Drive {
   }
 
  private:
-  /// In time constants: what it was before is forgotten to e⁻³ = 5 %.
+  /// In time constants: the error of the assumed start has decayed to e⁻³ = 5 %. Chosen.
   static constexpr double kForgotten = 3;
 
   Eigen::VectorXd rate_after(std::size_t n) const {
@@ -166,7 +169,6 @@ class Drive {
 
   const CommandTrack& track_;
   const double dead_us_, constant_us_;
-  double begin_us_ = 0;
   std::vector<double> begins_us_;        // by sample: of the commands known without a gap
   std::vector<Eigen::VectorXd> states_;  // by sample: without the dead time
 };
@@ -294,15 +296,18 @@ CommandDelay least_near(const CommandDelay& start, const CommandDelay& without,
   constexpr int kMostRounds = 20;
   constexpr double kThere = 0.1;  // of half an interval
   const CommandTrack track(samples);
-  // Of the same frames at all.
+  // All delays are compared on the same frames; alike where these are too few.
   const auto costs_at = [&](const std::vector<CommandDelay>& delays) {
     std::vector<Drive> drives;
-    double margin_us = 0;
+    double past_us = 0, future_us = 0;
     for (const CommandDelay& d : delays) {
       drives.emplace_back(track, d);
-      margin_us = std::max(margin_us, drives.back().margin_us());
+      past_us = std::max(past_us, drives.back().past_us());
+      future_us = std::max(future_us, drives.back().future_us());
     }
-    const std::vector<std::size_t> inner = track.within(margin_us);
+    const std::vector<std::size_t> inner = track.within(past_us, future_us);
+    if (inner.size() < std::min(kFewestMotions, samples.size() / 4))
+      return std::vector<double>(delays.size(), 0.0);
     std::vector<ActionPoseSample> moved;
     for (std::size_t k = 0, count = std::min(kMostFrames, inner.size()); k < count; ++k)
       moved.push_back(samples[inner[k * inner.size() / count]]);
@@ -326,8 +331,9 @@ CommandDelay least_near(const CommandDelay& start, const CommandDelay& without,
     const auto costs = costs_at({at_share(-1), at, at_share(1)});
     const double share = vertex(costs[0], costs[1], costs[2]);
     at = at_share(share);
-    // No dead time below 0, but by half an interval, where a command is of the end of the interval
-    // in which it acts: else a joint that goes less far would pass for a slow drive.
+    // The dead time is not below 0, except by half an interval, since a command may be of the end of
+    // the interval in which it acts. Otherwise a joint that moves less than commanded would pass for
+    // a slow drive.
     const std::int64_t late_us = std::max<std::int64_t>(0, at.lag_us);
     const std::int64_t widest_us = late_us + std::min(late_us / 4, step_us);
     const bool is_widest = at.smear_us > widest_us;
@@ -347,10 +353,13 @@ CommandDelay least_near(const CommandDelay& start, const CommandDelay& without,
     return at;
   };
   const CommandDelay sharp = downhill(start, false), smeared = downhill(sharp, true);
-  const auto costs = costs_at({without, sharp, smeared});
-  const bool is_smeared = costs[1] - costs[2] >= kModelEvidence;
-  if (costs[0] - costs[is_smeared ? 2 : 1] < kModelEvidence) return without;
-  return is_smeared ? smeared : sharp;
+  // Each on the frames that it has: a smeared one needs more of the past.
+  const auto best_of = [&](const CommandDelay& simple, const CommandDelay& other) {
+    const auto costs = costs_at({simple, other});
+    return costs[0] - costs[1] < kModelEvidence ? simple : other;
+  };
+  const CommandDelay best = best_of(sharp, smeared);
+  return best_of(best_of(without, sharp), best);
 }
 
 struct Regressions {
@@ -397,6 +406,8 @@ bool is_one_rhythm(const std::vector<ActionPoseSample>& samples, int num_signals
   const CommandTrack track(samples);
   const double farthest_us = farthest_lag_us(samples, median_interval_us(samples));
   const auto m = static_cast<Eigen::Index>(moving.size());
+  // Few blocks of time are mixtures of anything.
+  if (num_blocks(actions) <= 2 * static_cast<double>(m + 1)) return false;
   return std::ranges::all_of(kWhiles, [&](double share) {
     const double while_us = share * farthest_us;
     const std::vector<std::size_t> inner = track.within(while_us);
@@ -508,6 +519,13 @@ CommandDelay command_delay(const std::vector<ActionPoseSample>& samples, const B
 std::vector<ActionPoseSample> with_commands_of_before(const std::vector<ActionPoseSample>& samples,
                                                       const CommandDelay& delay) {
   if (delay == CommandDelay{}) return samples;
+  if (!std::ranges::is_sorted(samples, {}, time_of)) {
+    std::vector<ActionPoseSample> ascending;
+    for (const ActionPoseSample& sample : samples)
+      if (ascending.empty() || time_of(sample) >= time_of(ascending.back()))
+        ascending.push_back(sample);
+    return with_commands_of_before(ascending, delay);
+  }
   const CommandTrack track(samples);
   const Drive drive(track, delay);
   std::vector<ActionPoseSample> moved;

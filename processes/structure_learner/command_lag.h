@@ -14,7 +14,7 @@ namespace bodyschema {
 /// clocks differ. A drive of first order after a dead time (the process control model of that name,
 /// FOPDT), between commands that are linear in time.
 struct CommandDelay {
-  std::int64_t lag_us = 0;    ///< both together, the mean delay; below 0: before them
+  std::int64_t lag_us = 0;    ///< dead time + time constant; below 0: before them
   std::int64_t smear_us = 0;  ///< time constant of the drive: 0 … 1.25 lag_us
 
   bool operator==(const CommandDelay&) const = default;
@@ -30,9 +30,9 @@ struct CommandLag {
 /// quarter of the frames' interval or explains nothing more, and of poses at rest.
 CommandLag command_lag(const std::vector<ActionPoseSample>& samples, int num_signals);
 
-/// Whether the commands of a while before are mixtures of those of now, whatever the while: all
-/// signals follow one sine or one line. Then nothing tells a delay from joints that several signals
-/// move.
+/// Whether the commands of a while before are mixtures of those of now, whatever the while: as of
+/// sines of one frequency in several phases. Then nothing tells a delay from joints that several
+/// signals move.
 bool is_one_rhythm(const std::vector<ActionPoseSample>& samples, int num_signals);
 
 /// Near `delay`, at which the models over `actions` were found, the one by which they, fitted
@@ -48,7 +48,7 @@ CommandDelay refined_delay(const std::vector<ActionPoseSample>& samples,
 CommandDelay command_delay(const std::vector<ActionPoseSample>& samples, const BodySchema& schema);
 
 /// Each sample with the command that brought it there; those that have none, at the ends and behind
-/// gaps, are left out.
+/// gaps, are left out, and those of a time before one that came earlier.
 std::vector<ActionPoseSample> with_commands_of_before(const std::vector<ActionPoseSample>& samples,
                                                       const CommandDelay& delay);
 

@@ -101,7 +101,7 @@ struct LeaveOneOut {
 };
 LeaveOneOut leave_one_out(const Fit& fit, const PairData& pair, const NormalizedActions& actions);
 
-/// What each frame adds to the gradient of a fit, Jᵀ W e: parameters × frames.
+/// What each frame adds to the gradient of a fit, Jᵀ W r: parameters × frames.
 Eigen::MatrixXd scores(const Fit& fit, const PairData& pair, const NormalizedActions& actions);
 
 }  // namespace bodyschema

@@ -45,18 +45,19 @@ double variance_inflation(const std::vector<double>& x, const std::vector<int>& 
 
 double correlation_time(const Eigen::MatrixXd& scores, const Eigen::MatrixXd& covariance) {
   const Eigen::Index n = scores.cols();
+  if (n == 0) return 1;
   const Eigen::MatrixXd weighted = covariance * scores;
   const auto product_at = [&](Eigen::Index lag) {
     return scores.leftCols(n - lag).cwiseProduct(weighted.rightCols(n - lag)).sum();
   };
   const double squares = product_at(0);
-  double sum = squares;
-  for (Eigen::Index lag = 1; lag < n / 2; ++lag) {
-    const double product = product_at(lag);
-    if (!(product > 0)) break;
-    sum += 2 * product;
+  double sum = -squares;
+  for (Eigen::Index lag = 0; lag + 1 < n / 2; lag += 2) {
+    const double pair = product_at(lag) + product_at(lag + 1);
+    if (!(pair > 0)) break;
+    sum += 2 * pair;
   }
-  return squares > 0 ? sum / squares : 1;
+  return squares > 0 ? std::max(sum / squares, 1.0) : 1;
 }
 
 }  // namespace bodyschema

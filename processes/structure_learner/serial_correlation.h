@@ -27,10 +27,10 @@ class SerialCorrelation {
 double variance_inflation(const std::vector<double>& x, const std::vector<int>& samples,
                           double coefficient);
 
-/// How many successive samples tell as much as one whose noise is new: 1 + 2 Σ ρ_lag of their
-/// scores Jᵀ W e (columns) at the optimum, in the metric of the parameters' covariance, up to the
-/// first lag without correlation (the initial positive sequence of Geyer 1992). What the model does
-/// not say lasts as well, and counts.
+/// How many successive samples tell as much as one whose noise is new, at least 1: 1 + 2 Σ ρ_lag of
+/// their scores Jᵀ W r (columns) at the optimum, in the metric of the parameters' covariance, while
+/// the sum over pairs of lags is positive (Geyer 1992, initial positive sequence). What the model
+/// does not say lasts as well, and counts.
 double correlation_time(const Eigen::MatrixXd& scores, const Eigen::MatrixXd& covariance);
 
 }  // namespace bodyschema

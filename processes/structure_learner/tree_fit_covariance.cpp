@@ -84,7 +84,7 @@ Eigen::MatrixXd TreeFit::with_fixed_gauge(const Normal& normal) const {
   return H;
 }
 
-// Jᵀ W e of each frame, in columns.
+// Jᵀ W r of each frame, in columns.
 Eigen::MatrixXd TreeFit::scores(const Normal& normal) const {
   Eigen::MatrixXd result = Eigen::MatrixXd::Zero(normal.H.rows(), num_frames());
   for (int t = 0; t < num_frames(); ++t)

@@ -183,6 +183,10 @@ TEST_P(ControllerPropertyTest, WhateverHappensItsCommandsAreLawful) {
   }
   EXPECT_GT(num_moves, BODYSCHEMA_SEQUENCES * 1U);
   EXPECT_GT(num_holds, BODYSCHEMA_SEQUENCES * 1U);
+  std::filesystem::remove(kept);
+  std::set<Phase> phases;
+  for (const auto& [phase, event] : met) phases.insert(phase);
+  EXPECT_EQ(phases.size(), static_cast<std::size_t>(kNumPhases)) << "every phase was there";
   if (BODYSCHEMA_SEQUENCES < 10'000) return;
   for (int p = 0; p < kNumPhases; ++p) {
     for (int e = 0; e < kNumEvents; ++e) {

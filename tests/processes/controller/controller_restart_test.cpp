@@ -7,6 +7,7 @@
 #include <fstream>
 #include <functional>
 #include <limits>
+#include <memory>
 
 #include "common/config/yaml.h"
 #include "tests/processes/controller/controller_bench.h"
@@ -247,6 +248,44 @@ TEST(ControllerTest, AKeptTargetFromAClockAheadIsForgottenAndTheArmStaysHeld) {
   other.restore(state_file(), kNow + kSecond);
   EXPECT_EQ(other.counters().count("POSE_TARGET from a clock ahead"), 0U);
   std::filesystem::remove(state_file());
+}
+
+/// A controller that begins anew with what another kept.
+std::unique_ptr<Controller> restarted(const Controller& before, std::int64_t wall_clock_us = -1) {
+  std::ofstream(state_file()) << before.state_text();
+  auto after = std::make_unique<Controller>(test_config());
+  after->restore(state_file(), wall_clock_us);
+  std::filesystem::remove(state_file());
+  return after;
+}
+
+TEST(ControllerTest, RestartsAsOftenAsOneLikes) {
+  auto without_target = std::make_unique<Controller>(test_config());
+  Bench listening;
+  Target target = position_target(4, kFar);
+  target.epoch = 1'700'000'000 * kSecond;  // the clock is set back afterwards
+  listening.give(target);
+  ASSERT_EQ(listening.controller.phase(), Phase::kListening);
+  auto ahead = restarted(listening.controller, 1'600'000'000 * kSecond);
+  for (int n = 0; n < 3; ++n) {
+    without_target = restarted(*without_target);
+    ahead = restarted(*ahead);
+  }
+}
+
+TEST(ControllerTest, ATargetOfBeforeDoesNotCountAgainAfterTwoRestarts) {
+  Bench before;
+  before.start();
+  before.give(position_target(4, kNear));
+  ASSERT_TRUE(before.run_until_state(S::CONTROL_REACHED));
+  before.give(other_target(5, Target::KIND_RELEASE));
+  const auto after = restarted(*restarted(before.controller));
+  for (const std::int64_t id : {4, 5}) {
+    after->on_pose_target(position_target(id, kNear));
+    EXPECT_EQ(after->phase(), Phase::kIdle) << id;
+  }
+  after->on_pose_target(position_target(6, kNear));
+  EXPECT_EQ(after->phase(), Phase::kListening);
 }
 
 TEST(ControllerTest, AStateFileOfSomethingElseIsRefused) {

@@ -5,6 +5,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <string>
 #include <vector>
 
 #include "common/geometry/angle.h"
@@ -104,13 +105,17 @@ TEST(CommandLag, OfOneRhythmIsNotKnown) {
     }
     EXPECT_TRUE(is_one_rhythm(samples, 2));
     const BodySchema schema = learn(robot.signals(), samples).schema;
-    EXPECT_FALSE(schema.complete && judge(schema, robot.structure()) == Rightness::kWrong) << seed;
+    EXPECT_NE(judge(schema, robot.structure()), Rightness::kWrong) << seed;
+    ASSERT_FALSE(schema.unconnected.empty()) << seed;
+    EXPECT_NE(schema.unconnected.front().detail.find("one rhythm"), std::string::npos) << seed;
   }
   for (const bool is_chain : {false, true}) {
     ImperfectRobot robot(2, is_chain, {}, 1);
     EXPECT_FALSE(is_one_rhythm(stream_of(robot), 2));
     EXPECT_FALSE(is_one_rhythm(robot.babble(200), 2));
   }
+  ImperfectRobot long_arm(7, true, {}, 1);
+  EXPECT_FALSE(is_one_rhythm(long_arm.wander(300, kPeriod), 7)) << "few blocks of time";
 }
 
 // What is learned is where a command leads, not where the arm is when it is given.
@@ -192,6 +197,28 @@ TEST(CommandLag, DrivesAreFollowedHoweverFastCommandsAre) {
   }
   EXPECT_LT(largest, 0.33);
   EXPECT_GT(largest, 0.25);
+}
+
+// Of even motion the lag is all that a drive makes; behind a gap it is not known for a while.
+TEST(CommandLag, BehindAGapADriveIsNotKnownForThreeTimeConstants) {
+  constexpr std::int64_t kStep_us = 20'000, kDead_us = 200'000, kConstant_us = 100'000;
+  constexpr int kNum = 100;
+  std::vector<ActionPoseSample> samples;
+  const auto command_at = [](std::int64_t us) { return 1e-6 * static_cast<double>(us); };
+  for (const std::int64_t begin_us : {0, 10'000'000})
+    for (int n = 0; n < kNum; ++n) {
+      samples.emplace_back().utime = begin_us + n * kStep_us;
+      samples.back().action = Eigen::VectorXd::Constant(1, command_at(samples.back().utime));
+    }
+  const CommandDelay delay{.lag_us = kDead_us + kConstant_us, .smear_us = kConstant_us};
+  const auto moved = with_commands_of_before(samples, delay);
+  const int left_out = (kDead_us + 3 * kConstant_us) / kStep_us;
+  EXPECT_EQ(moved.size(), 2 * (kNum - left_out) * 1U);
+  for (const ActionPoseSample& sample : moved)
+    EXPECT_NEAR(sample.action[0], command_at(sample.utime - delay.lag_us), 1e-9);
+  // A time that goes back is left out.
+  samples.push_back(samples.front());
+  EXPECT_EQ(with_commands_of_before(samples, delay).size(), moved.size());
 }
 
 TEST(CommandLag, AJointThatGoesLessFarIsNoSlowDrive) {

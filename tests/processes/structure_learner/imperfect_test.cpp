@@ -346,6 +346,29 @@ TEST(SerialCorrelation, IsThatOfTheNoiseAndOfWhiteNoiseNone) {
   }
 }
 
+TEST(CorrelationTime, IsThatOfTheScores) {
+  test::Rng rng(1);
+  constexpr Eigen::Index kNum = 20'000;
+  const auto time_of = [](const Eigen::MatrixXd& scores) {
+    return correlation_time(scores, Eigen::MatrixXd::Identity(scores.rows(), scores.rows()));
+  };
+  for (const double kept : {0.0, 0.5, 0.9}) {
+    Eigen::MatrixXd scores(3, kNum), halves = Eigen::MatrixXd::Zero(6, 2 * kNum);
+    Eigen::Vector3d last = Eigen::Vector3d::Zero();
+    for (Eigen::Index n = 0; n < kNum; ++n) {
+      last = kept * last + std::sqrt(1 - kept * kept) * test::gaussian3(rng);
+      scores.col(n) = last;
+      halves.col(2 * n).head<3>() = last;
+    }
+    EXPECT_NEAR(time_of(scores), (1 + kept) / (1 - kept), 0.2 * (1 + kept) / (1 - kept)) << kept;
+    // Parts that are seen in turn.
+    EXPECT_NEAR(time_of(halves), time_of(scores), 0.2 * time_of(scores)) << kept;
+  }
+  EXPECT_EQ(time_of(Eigen::MatrixXd(3, 0)), 1);
+  EXPECT_EQ(time_of(Eigen::MatrixXd::Ones(3, 1)), 1);
+  EXPECT_EQ(time_of(Eigen::MatrixXd::Zero(3, 10)), 1);
+}
+
 TEST(SerialCorrelation, WhatLastsAsLongAsTheNoiseIsExplainedByItTheMost) {
   std::vector<double> fast, slow;
   std::vector<int> samples;
