@@ -356,7 +356,7 @@ TEST(CorrelationTime, IsThatOfTheScores) {
     Eigen::MatrixXd scores(3, kNum), halves = Eigen::MatrixXd::Zero(6, 2 * kNum);
     Eigen::Vector3d last = Eigen::Vector3d::Zero();
     for (Eigen::Index n = 0; n < kNum; ++n) {
-      last = kept * last + std::sqrt(1 - kept * kept) * test::gaussian3(rng);
+      last = kept * last + std::sqrt(1 - kept * kept) * test::gaussian6(rng).head<3>();
       scores.col(n) = last;
       halves.col(2 * n).head<3>() = last;
     }
