@@ -251,16 +251,19 @@ def test(place, arguments):
     become([*ctest, "--output-on-failure", "-j", num_processors() + 1, *arguments])
 
 
-def experiment(place, arguments):
+def experiment_names(place):
     folders = [place.source / "tests" / "experiments", place.source / "tests" / "benchmarks"]
+    return {file.stem for folder in folders for file in folder.iterdir() if file.suffix in (".cpp", ".sh")}
+
+
+def experiment(place, arguments):
     name = arguments[0] if arguments else ""
-    script = folders[0] / f"{name}.sh"
+    script = place.source / "tests" / "experiments" / f"{name}.sh"
     if script.is_file():
         build(place, *re.search(r"^# Needs: (.*)$", script.read_text(), re.M)[1].split())
         os.environ["BODYSCHEMA_BUILD"] = str(place.build)
         become([script, *arguments[1:]])
-    if not any((folder / f"{name}.cpp").is_file() for folder in folders):
-        names = {file.stem for folder in folders for file in folder.iterdir() if file.suffix in (".cpp", ".sh")}
+    if name not in (names := experiment_names(place)):
         raise UsageError("experiment wants a name: " + " ".join(sorted(names)))
     build(place, name)
     os.chdir(place.source)
@@ -268,6 +271,8 @@ def experiment(place, arguments):
 
 
 def experiments(place, arguments):
+    if arguments and arguments[0] in experiment_names(place):
+        experiment(place, arguments)
     build(place, "experiments")
     if not any(argument.split("=")[0] == "--out" for argument in arguments):
         arguments = ["--out", place.logs / "experiments", *arguments]

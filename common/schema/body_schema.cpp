@@ -1,7 +1,9 @@
 #include "common/schema/body_schema.h"
 
 #include <algorithm>
+#include <set>
 #include <stdexcept>
+#include <utility>
 
 #include "common/kinematics/kinematic_path.h"
 #include "common/kinematics/kinematic_tree.h"
@@ -9,6 +11,38 @@
 
 namespace bodyschema {
 namespace {
+
+/// Those that show a part on either side of an edge.
+std::vector<const ActionPoseSample*> samples_across(const Edge& edge,
+                                                    const std::vector<Edge>& edges,
+                                                    const std::vector<ActionPoseSample>& samples) {
+  std::vector<std::pair<int, int>> others;
+  for (const Edge& e : edges)
+    if (&e != &edge) others.emplace_back(e.from, e.to);
+  const auto parts_beside = [&](int end) {
+    const KinematicTree side(others, end);
+    std::set<int> parts;
+    for (const KinematicTree::Node& node : side.nodes()) parts.insert(node.part);
+    return parts;
+  };
+  const std::set<int> before = parts_beside(edge.from), beyond = parts_beside(edge.to);
+  const auto shows = [](const ActionPoseSample& sample, const std::set<int>& side) {
+    return std::ranges::any_of(sample.parts,
+                               [&](const auto& seen) { return side.contains(seen.part); });
+  };
+  std::vector<const ActionPoseSample*> result;
+  for (const ActionPoseSample& sample : samples)
+    if (shows(sample, before) && shows(sample, beyond)) result.push_back(&sample);
+  return result;
+}
+
+/// What two edges saw of one signal; what one of them never saw does not count.
+std::optional<Signal::Range> by_both(const std::optional<Signal::Range>& a,
+                                     const std::optional<Signal::Range>& b) {
+  if (!a || !b) return a ? a : b;
+  const double lower = std::max(a->lower, b->lower);
+  return Signal::Range{lower, std::max(lower, std::min(a->upper, b->upper))};
+}
 
 // The chain left · ∏ Exp(ŝ ϑ) X_after of an edge at an action.
 auto chain_of(const Edge& edge, const Eigen::VectorXd& theta) {
@@ -179,6 +213,25 @@ std::vector<int> BodySchema::unused_signals() const {
   for (std::size_t s = 0; s < used.size(); ++s)
     if (!used[s]) result.push_back(static_cast<int>(s));
   return result;
+}
+
+void BodySchema::set_covered(const std::vector<ActionPoseSample>& samples) {
+  for (Signal& signal : signals) signal.covered.reset();
+  for (const Edge& edge : edges) {
+    const auto across = samples_across(edge, edges, samples);
+    for (const int s : edge.signals()) {
+      Signal by_edge = signals[static_cast<std::size_t>(s)];
+      by_edge.covered.reset();
+      for (const ActionPoseSample* sample : across) by_edge.cover(sample->action[s]);
+      auto& covered = signals[static_cast<std::size_t>(s)].covered;
+      covered = by_both(covered, by_edge.covered);
+    }
+  }
+  for (std::size_t s = 0; s < signals.size(); ++s) {
+    if (signals[s].covered) continue;
+    for (const ActionPoseSample& sample : samples)
+      signals[s].cover(sample.action[static_cast<Eigen::Index>(s)]);
+  }
 }
 
 Eigen::VectorXd BodySchema::displacements(const Eigen::VectorXd& action) const {

@@ -197,6 +197,10 @@ struct BodySchema {
   /// Signals that no edge uses, and none would: what is undecided is not among them (indices).
   std::vector<int> unused_signals() const;
 
+  /// Sets what of each signal `samples` covered, where every edge that it moves lay between two
+  /// parts that were seen; of a signal that moves none, or one never so seen, all of them.
+  void set_covered(const std::vector<ActionPoseSample>& samples);
+
   /// θ of every signal, in command units: what edges take.
   /// @throws std::invalid_argument if `action` does not have one value per signal.
   Eigen::VectorXd displacements(const Eigen::VectorXd& action) const;

@@ -16,8 +16,9 @@ struct Signal {
   /// What bends the command, w in θ(q) = q + φ(q)ᵀw [command units]; empty: linear. θ, and not q,
   /// is what moves the joints on this signal. See warp_basis().
   std::vector<double> warp = {};
-  /// What the samples that a schema rests on covered of it [command units]: beyond, it was never
-  /// seen to hold. std::nullopt: nobody said (messages and files then have the limits).
+  /// What the samples that a schema rests on covered of it [command units], see
+  /// BodySchema::set_covered(): beyond, it was never seen to hold. std::nullopt: nobody said
+  /// (messages and files then have the limits).
   struct Range {
     double lower = 0, upper = 0;
   };

@@ -98,11 +98,9 @@ BodySchema refined_schema(const BodySchema& start, const std::vector<RefinerSamp
   schema.version = std::max(start.version, schema.last_sample_index) + 1;
   schema.utime = std::max(start.utime, samples.back().sample.utime);
   schema.num_samples = static_cast<int>(samples.size());
-  for (std::size_t s = 0; s < schema.signals.size(); ++s) {
-    schema.signals[s].covered.reset();
-    for (const RefinerSample& seen : samples)
-      schema.signals[s].cover(seen.sample.action[static_cast<Eigen::Index>(s)]);
-  }
+  std::vector<ActionPoseSample> seen;
+  for (const RefinerSample& sample : samples) seen.push_back(sample.sample);
+  schema.set_covered(seen);
   return schema;
 }
 

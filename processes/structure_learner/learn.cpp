@@ -105,6 +105,7 @@ LearnResult fit_tree(const LearnedStructure& structure,
   if (schema.has_part(schema.root) && schema.has_rotation(schema.root))
     fit_jointly(data, &fitted, &schema);
   for (const FittedEdge& f : fitted) schema.edges.push_back(f.edge);
+  schema.set_covered(samples);
 
   const std::set<int> connected = connected_to_root(schema);
   report_unconnected(

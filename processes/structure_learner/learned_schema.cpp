@@ -11,11 +11,6 @@ BodySchema start_schema(const std::vector<Signal>& signals,
                         const std::vector<ActionPoseSample>& samples, std::optional<int> root) {
   BodySchema schema;
   schema.signals = signals;
-  for (std::size_t s = 0; s < signals.size(); ++s) {
-    schema.signals[s].covered.reset();
-    for (const ActionPoseSample& sample : samples)
-      schema.signals[s].cover(sample.action[static_cast<Eigen::Index>(s)]);
-  }
   schema.num_samples = static_cast<int>(samples.size());
   for (const ActionPoseSample& sample : samples)
     schema.last_sample_index = std::max(schema.last_sample_index, sample.sample_index);

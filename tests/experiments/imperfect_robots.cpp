@@ -1,17 +1,21 @@
 // Structures that learn() finds for robots that no model of ours describes: chains and trees of 2
 // to 7 joints, one imperfection a row. Counts right, incomplete and wrong structures, and wrong
-// ones that are called complete; prints Markdown.
+// ones that are called complete; with --errors also how far the complete ones predict parts from
+// where they are at rest, and how many standard deviations of theirs that is. Prints Markdown.
 //
 //   imperfect_robots [--robots 12] [--samples 20 50 100] [--told 1 | --estimate-noise]
 //     [--outlier-rate 0.03] [--cell WORDS...] [--stream 100] [--ends]
+//     [--errors]
 
 #include <CLI/CLI.hpp>
 #include <algorithm>
+#include <cmath>
 #include <cstdio>
 #include <string>
 #include <vector>
 
 #include "common/geometry/angle.h"
+#include "common/schema/standard_deviations.h"
 #include "processes/structure_learner/learn.h"
 #include "tests/support/imperfect_robot.h"
 
@@ -48,6 +52,40 @@ void list_edges(int seed, const BodySchema& schema, const ImperfectRobot& robot)
   std::fprintf(stderr, "\n");
 }
 
+/// Of a schema's predictions, rms over the parts and actions at rest.
+struct Errors {
+  double position_m = 0;
+  double in_deviations = 0;  ///< of one axis; 1: as large as told
+};
+
+Errors errors_of(const BodySchema& schema, const std::vector<ActionPoseSample>& samples,
+                 ImperfectRobot& robot) {
+  double sum = 0, sum_in_deviations = 0;
+  int count = 0;
+  for (const ActionPoseSample& sample : samples) {
+    robot.go(sample.action);
+    const auto& poses = robot.poses();
+    const auto& X_CR = poses[static_cast<std::size_t>(schema.root) - 1];
+    for (const int part : schema.parts) {
+      if (part == schema.root) continue;
+      const auto predicted = schema.predict(schema.root, part, sample.action);
+      const Eigen::Vector3d p_RB =
+          X_CR.inverse() * poses[static_cast<std::size_t>(part) - 1].translation();
+      const double squared = (predicted->X_AB.translation() - p_RB).squaredNorm();
+      const double sd_m = deviations_of(predicted->covariance).position_m;
+      sum += squared;
+      sum_in_deviations += squared / (3 * sd_m * sd_m);
+      ++count;
+    }
+  }
+  return {std::sqrt(sum / count), std::sqrt(sum_in_deviations / count)};
+}
+
+double median_of(std::vector<double> values) {
+  std::ranges::sort(values);
+  return values.empty() ? NAN : values[values.size() / 2];
+}
+
 }  // namespace
 
 int main(int argc, char** argv) {
@@ -55,7 +93,7 @@ int main(int argc, char** argv) {
   std::vector<int> nums_samples = {20, 50, 100};
   bool is_noise_estimated = false;
   double told = 1;
-  bool are_wrong_listed = false, are_ends_alone = false;
+  bool are_wrong_listed = false, are_ends_alone = false, are_errors_told = false;
   double period = 0;
   double outlier_rate = MeasurementModel().outlier_rate;
   std::vector<std::string> cells;
@@ -68,13 +106,19 @@ int main(int argc, char** argv) {
   app.add_option("--stream", period, "Smooth motion: samples of a swing; 0: random poses");
   app.add_flag("--ends", are_ends_alone, "Chains, of which the root and the last part are seen");
   app.add_flag("--list-wrong", are_wrong_listed, "Their edges, on stderr");
+  app.add_flag("--errors", are_errors_told, "Of what complete schemas predict");
   app.add_option("--cell", cells, "Rows whose name has one of these words alone");
   CLI11_PARSE(app, argc, argv);
 
   std::printf("| imperfection |");
-  for (const int n : nums_samples) std::printf(" %d: right / incomplete / wrong (complete) |", n);
+  for (const int n : nums_samples) {
+    std::printf(" %d: right / incomplete / wrong (complete) |", n);
+    if (are_errors_told)
+      std::printf(" error of a complete one, median [mm] | in its standard deviations | worst |");
+  }
   std::printf("\n| --- |");
-  for (std::size_t n = 0; n < nums_samples.size(); ++n) std::printf(" --- |");
+  for (std::size_t n = 0; n < nums_samples.size(); ++n)
+    std::printf("%s", are_errors_told ? " --- | --- | --- | --- |" : " --- |");
   std::printf("\n");
   for (const Imperfection& imperfection : imperfections()) {
     const auto is_named = [&](const std::string& words) {
@@ -86,11 +130,14 @@ int main(int argc, char** argv) {
     std::printf("| %s |", imperfection.name.c_str());
     for (const int num_samples : nums_samples) {
       int num_right = 0, num_incomplete = 0, num_wrong = 0, num_complete = 0;
+      std::vector<double> errors_mm, in_deviations;
       for (int r = 0; r < num_robots; ++r) {
         ImperfectRobot robot(2 + r % 6, are_ends_alone || r / 6 % 2 == 0, imperfection,
                              static_cast<std::uint64_t>(r));
-        std::vector<ActionPoseSample> samples =
-            period > 0 ? robot.wander(num_samples, period) : robot.babble(num_samples);
+        const auto record = [&](int n) {
+          return period > 0 ? robot.wander(n, period) : robot.babble(n);
+        };
+        std::vector<ActionPoseSample> samples = record(num_samples);
         SyntheticRobot truth = robot.structure();
         if (are_ends_alone) hide_all_but_ends(&truth, &samples);
         LearnOptions options;
@@ -103,9 +150,18 @@ int main(int argc, char** argv) {
         num_incomplete += rightness == Rightness::kIncomplete;
         num_wrong += rightness == Rightness::kWrong;
         num_complete += rightness == Rightness::kWrong && schema.complete;
+        if (are_errors_told && schema.complete) {
+          constexpr int kHeldOut = 200;
+          const Errors errors = errors_of(schema, record(kHeldOut), robot);
+          errors_mm.push_back(1e3 * errors.position_m);
+          in_deviations.push_back(errors.in_deviations);
+        }
         if (are_wrong_listed && rightness == Rightness::kWrong) list_edges(r, schema, robot);
       }
       std::printf(" %d / %d / %d (%d) |", num_right, num_incomplete, num_wrong, num_complete);
+      if (are_errors_told)
+        std::printf(" %.2f | %.1f | %.1f |", median_of(errors_mm), median_of(in_deviations),
+                    in_deviations.empty() ? NAN : std::ranges::max(in_deviations));
       std::fflush(stdout);
     }
     std::printf("\n");

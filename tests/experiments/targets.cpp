@@ -22,6 +22,7 @@
 #include "common/config/rig.h"
 #include "common/estimation/evaluation.h"
 #include "common/text/clock.h"
+#include "common/text/pose_text.h"
 #include "processes/console/target_follower.h"
 
 using namespace bodyschema;
@@ -63,6 +64,10 @@ double median(std::vector<double> values) {
   std::sort(values.begin(), values.end());
   const std::size_t half = values.size() / 2;
   return values.size() % 2 ? values[half] : (values[half - 1] + values[half]) / 2;
+}
+
+std::string size_text(const Pose& X) {
+  return pose_text(X.translation().norm(), Eigen::AngleAxisd(X.linear()).angle(), 2);
 }
 
 std::string millimetres(double m) {
@@ -195,7 +200,8 @@ int main(int argc, char** argv) {
     const double worst_m =
         errors_m.empty() ? NAN : *std::max_element(errors_m.begin(), errors_m.end());
     std::vector<double> aligned_m;
-    if (const auto alignment = align(*schema, truth))
+    const auto alignment = align(*schema, truth);
+    if (alignment)
       for (const Arrival& a : arrivals)
         aligned_m.push_back(
             (alignment->aligned(part, a.X_RB_wanted).translation() - a.X_RB_true.translation())
@@ -208,6 +214,10 @@ int main(int argc, char** argv) {
         count, errors_m.size(), num_refused, num_held, millimetres(median(errors_m)).c_str(),
         millimetres(worst_m).c_str(), millimetres(median(aligned_m)).c_str(),
         millimetres(median(observed_m)).c_str());
+    if (alignment)
+      std::printf("\nAligned by %s at the root, %s at the part, scale %.4f.\n",
+                  size_text(alignment->X_RS).c_str(), size_text(alignment->X_PB.at(part)).c_str(),
+                  alignment->scale);
     const bool is_good = 2 * errors_m.size() >= static_cast<std::size_t>(count) &&
                          median(state->is_ideal ? errors_m : aligned_m) * 1e3 <= limit_mm;
     return std::isinf(limit_mm) || is_good ? 0 : 1;

@@ -236,6 +236,16 @@ class TheTestsThatAreSelected(Folder):
             commands.test(replace(self.place, is_build_given=True), ["-R", "alone"])
             become.assert_called_once()
 
+    def test_an_experiment_is_found_by_either_word(self):
+        for function in commands.experiment, commands.experiments:
+            with mock.patch.object(commands, "become") as become, mock.patch.object(commands, "build") as built:
+                become.side_effect = SystemExit  # as another program
+                self.addCleanup(os.chdir, os.getcwd())
+                with self.assertRaises(SystemExit):
+                    function(replace(self.place, source=SOURCE), ["control", "--seed", "2"])
+            self.assertEqual(built.call_args.args[1:], ("control",))
+            self.assertEqual(become.call_args.args[0][1:], ["--seed", "2"])
+
     def test_are_all_wanted_if_the_name_is_no_regular_expression_of_ours(self):
         self.assertIsNone(self.of("-R", "(["))
 

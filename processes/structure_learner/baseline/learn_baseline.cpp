@@ -108,6 +108,7 @@ class BaselineSearch {
       schema.edges.push_back(make_edge(from, to, forest[static_cast<std::size_t>(edge)].signals));
       return true;
     });
+    schema.set_covered(samples_);
     report_unconnected(
         options_.expected_parts, [&](int part) { return explain(part); }, &schema);
     estimate_root_pose();

@@ -151,6 +151,34 @@ TEST(BodySchema, SignalsThatNoEdgeUsesAreListed) {
   EXPECT_EQ(random_schema(rng).unused_signals(), std::vector<int>{3});
 }
 
+// 1 → 2 → 3, 2 → 4: in the first half of the range everything is seen, beyond it the root alone and
+// 3, at the end 1 and 2.
+TEST(BodySchema, ASignalIsCoveredWhereEveryEdgeThatItMovesLayBetweenSeenParts) {
+  Rng rng(3);
+  BodySchema schema = random_schema(rng);
+  std::vector<ActionPoseSample> samples;
+  for (const double q : {-1.0, -0.5, 0.0, 0.5, 1.0}) {
+    ActionPoseSample& sample = samples.emplace_back();
+    sample.action = Eigen::VectorXd::Constant(4, q);
+    for (const int part : q <= 0  ? std::vector{1, 2, 3, 4}
+                          : q < 1 ? std::vector{1, 3}
+                                  : std::vector{1, 2})
+      sample.parts.push_back({.part = part, .X_CB = Pose::Identity()});
+  }
+  schema.set_covered(samples);
+  const auto upper = [&](int s) {
+    return schema.signals[static_cast<std::size_t>(s)].covered->upper;
+  };
+  EXPECT_EQ(upper(0), 0);    // 2 → 4 was not seen beyond
+  EXPECT_EQ(upper(1), 0.5);  // 2 was not, but 1 and 3 were
+  EXPECT_EQ(upper(3), 1);    // moves nothing
+  for (const Signal& signal : schema.signals) EXPECT_EQ(signal.covered->lower, -1);
+
+  schema.edges.pop_back();
+  schema.set_covered(samples);
+  EXPECT_EQ(upper(0), 1);
+}
+
 TEST(ActionPoseSample, FindsAPartOrNothing) {
   ActionPoseSample sample;
   sample.parts.resize(2);
