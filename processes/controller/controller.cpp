@@ -255,7 +255,7 @@ Controller::Answer Controller::on_tick(std::int64_t now_us) {
   silent_ = silence(now_us);
   quiet_.elapsed_us(now_us);
   if (!concerns(Event::kGivenUp)) idle_.restart(now_us);
-  if (schema_ && !owns_arm(phase_) &&
+  if (schema_ && !concerns(Event::kInputSilent) &&
       schema_silence_.elapsed_us(now_us) > config_.max_body_schema_silence_us) {
     // Nobody stands behind it any more; the next that is heard counts, whatever its version.
     schema_.reset();

@@ -237,6 +237,8 @@ class Controller {
   void forget_move();
   /// What the newest MOVE, sent or not, was to serve is done in another way or without.
   void strike(const std::string& why);
+  /// Aims again where it did before the newest correction, which cannot be served.
+  void take_back_correction();
   void arrive();
   /// STOP, a driver that began anew, and what others had it do.
   void on_driver(const motion_status_t& motion, bool is_foreign, bool began_anew);
@@ -280,6 +282,7 @@ class Controller {
   std::string rejection_;
   int num_expired_ = 0;
   int num_corrections_ = 0;
+  bool has_left_line_ = false;  ///< for a probe or a search on the way to this target
   int num_moves_ = 0, num_probes_ = 0;
   double predicted_error_m_ = -1, predicted_error_rad_ = -1;
   double observed_error_m_ = -1, observed_error_rad_ = -1;

@@ -76,6 +76,7 @@ Controller::Answer Controller::on_pose_target(const pose_target_t& target,
   offset_.reset();
   forget_plan();
   num_moves_ = num_probes_ = num_corrections_ = num_searches_ = search_place_ = 0;
+  has_left_line_ = false;
   was_its_own_ = owns_arm(phase_);
   predicted_error_m_ = predicted_error_rad_ = observed_error_m_ = observed_error_rad_ = -1;
   search_centre_.reset();
@@ -123,10 +124,10 @@ void Controller::decide() {
     goal_.reset();
     // Nobody moves at random in the middle of a path.
     if (target_.num_way_points > 0)
-      return fail(Event::kUnservable,
-                  edge + " is invalid, and " + std::to_string(num_searches_) +
-                      " actions did not mend it: release the arm, so that it is learned anew, then "
-                      "follow the path again");
+      return fail(Event::kUnservable, edge + " is invalid, and " + std::to_string(num_searches_) +
+                                          " tries at actions that show what changed did not mend "
+                                          "it: release the arm, so that it is learned anew, then "
+                                          "follow the path again");
     fire(Event::kBroken, edge + " is invalid: the babbler has the arm until it is mended");
     return;
   }
@@ -136,6 +137,7 @@ void Controller::decide() {
   if (target_.target_kind == pose_target_t::KIND_TAG) {
     if (!aim_at_tag()) return wait_for_tag();
     fire(Event::kTagSeen, "the target tag is seen");
+    if (!tags_.at(target_.target_tag).is_seen()) return arrive();  // near enough, and may cover it
   }
   if (is_invalid) return search(edge);
   if (const auto action = wanted_probe()) return probe(*action);
@@ -210,13 +212,10 @@ void Controller::step() {
     const InverseKinematicsSolution solution =
         solve_pose(*schema_, target_.target_part, {aim(), wanted_orientation()}, config_.signals,
                    *position_, options, rejected_);
-    const bool is_refused = offset_ && static_cast<int>(rejected_.size()) >= config_.max_solutions;
-    if (is_refused || solution.error_m > tolerance_m() || solution.error_rad > tolerance_rad()) {
+    if (solution.error_m > tolerance_m() || solution.error_rad > tolerance_rad()) {
       if (!offset_) return fail_unreachable(solution);
-      // Beyond reach only with the correction: it stays where it is.
-      offset_ = served_offset_;
-      num_corrections_ = config_.max_corrections;
-      return arrive();
+      take_back_correction();
+      return decide();
     }
     goal_ = solution.action;
     if (const std::string why = config_.workspace.objection(*schema_, *position_, *goal_);
@@ -326,6 +325,7 @@ void Controller::move_to(const Eigen::VectorXd& action, Serves serves, std::int8
   }
   sent_ = make_command(action_command_t::KIND_MOVE);
   sent_->purpose = purpose;
+  has_left_line_ |= serves != Serves::kTarget;
   set_array(sent_->num_signals, sent_->action, std::vector<double>(action.begin(), action.end()));
   under_way_.restart();
   ++num_moves_;
@@ -344,15 +344,23 @@ void Controller::strike(const std::string& why) {
   if (serves_ == Serves::kSearch) ++search_place_;
   // A new target or schema has no goal yet; a search goes on elsewhere.
   if (serves_ != Serves::kTarget || !goal_) return;
-  // Another solution would swing the arm off the line from the way point before.
-  if (target_.way_point > 1)
-    return fail(Event::kUnreachable, "the way along the line is refused: " + why);
   rejection_ = why;
   rejected_.push_back(*goal_);
   goal_.reset();
-  if (static_cast<int>(rejected_.size()) >= config_.max_solutions && !offset_)
-    fail(Event::kUnreachable,
-         std::to_string(rejected_.size()) + " ways are refused: " + rejection_);
+  // Another solution would swing the arm off the line from the way point before.
+  const bool is_on_line = target_.way_point > 1 && !has_left_line_;
+  if (!is_on_line && static_cast<int>(rejected_.size()) < config_.max_solutions) return;
+  if (offset_) return take_back_correction();
+  fail(Event::kUnreachable, is_on_line
+                                ? "the way along the line is refused: " + why
+                                : std::to_string(rejected_.size()) + " ways are refused: " + why);
+}
+
+void Controller::take_back_correction() {
+  offset_ = std::exchange(served_offset_, std::nullopt);
+  num_corrections_ = config_.max_corrections;
+  rejected_.clear();
+  goal_.reset();
 }
 
 void Controller::arrive() {

@@ -5,6 +5,7 @@
 #include <Eigen/SVD>
 #include <algorithm>
 #include <cmath>
+#include <functional>
 #include <limits>
 #include <random>
 #include <stdexcept>
@@ -264,16 +265,10 @@ InverseKinematicsSolution solve_within(const KinematicPath& path, const PoseTarg
                                        const std::vector<Signal>& covered,
                                        const Eigen::VectorXd& current,
                                        const InverseKinematicsOptions& options,
-                                       const std::vector<Eigen::VectorXd>& avoided) {
+                                       const std::function<bool(const Eigen::VectorXd&)>& may_be) {
   const Scale scale(limits);
   const Residual residual(target, options);
   const Posture posture(path, scale, residual, covered, options.uncertain_m);
-  const auto is_avoided = [&](const Eigen::VectorXd& u) {
-    return std::any_of(avoided.begin(), avoided.end(), [&](const Eigen::VectorXd& action) {
-      return (scale.share(action) - u).cwiseAbs().maxCoeff() < kDifferent;
-    });
-  };
-
   const Eigen::VectorXd u_current = clamped(scale.share(current));
   const double infinity = std::numeric_limits<double>::infinity();
   InverseKinematicsSolution best{scale.action(u_current), infinity, target.q_RT ? infinity : 0,
@@ -287,10 +282,10 @@ InverseKinematicsSolution solve_within(const KinematicPath& path, const PoseTarg
     const auto start =
         n < num_near ? start_near(u_current, n) : scattered[static_cast<std::size_t>(n - num_near)];
     Eigen::VectorXd u = converge(path, scale, residual, options, start);
-    if (is_avoided(u)) continue;
+    if (!may_be(scale.action(u))) continue;
     if (residual.is_within_tolerance(residual(path.predict(scale.action(u))))) {
       const Eigen::VectorXd better = settled(path, scale, residual, options, posture, u);
-      if (!is_avoided(better)) u = better;
+      if (may_be(scale.action(better))) u = better;
     }
     const Eigen::VectorXd error = residual(path.predict(scale.action(u)));
     const bool is_within_tolerance = residual.is_within_tolerance(error);
@@ -362,13 +357,19 @@ InverseKinematicsSolution solve_pose(const BodySchema& schema, int part, const P
       current.size() != static_cast<Eigen::Index>(limits.size())) {
     throw std::invalid_argument("limits and action must have one value per signal");
   }
+  const Scale ranges(limits);
+  const auto may_be = [&](const Eigen::VectorXd& action) {
+    return std::ranges::none_of(avoided, [&](const Eigen::VectorXd& other) {
+      return (ranges.share(other) - ranges.share(action)).cwiseAbs().maxCoeff() < kDifferent;
+    });
+  };
   const std::vector<Signal> covered = covered_limits(schema, limits);
   const auto range = [](const Signal& signal) { return std::pair(signal.lower, signal.upper); };
   if (!std::ranges::equal(covered, limits, {}, range, range)) {
-    const auto solution = solve_within(*path, target, covered, covered, current, options, avoided);
+    const auto solution = solve_within(*path, target, covered, covered, current, options, may_be);
     if (solution.is_within_tolerance) return solution;
   }
-  return solve_within(*path, target, limits, covered, current, options, avoided);
+  return solve_within(*path, target, limits, covered, current, options, may_be);
 }
 
 }  // namespace bodyschema

@@ -34,6 +34,10 @@ CommandLag command_lag(const std::vector<ActionPoseSample>& samples, int num_sig
 /// sines of one frequency in several phases. Then nothing tells a delay from joints that several
 /// signals move.
 bool is_one_rhythm(const std::vector<ActionPoseSample>& samples, int num_signals);
+/// Why a part hangs on nothing then.
+inline constexpr const char* kOneRhythm =
+    "all signals follow one rhythm, in which poses that come late look like joints that several "
+    "signals move: move each signal in a rhythm of its own, or hold the arm still at each pose";
 
 /// Near `delay`, at which the models over `actions` were found, the one by which they, fitted
 /// again, leave least; `delay` where that is hardly less, and of soft models, whose motion has more

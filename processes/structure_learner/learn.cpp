@@ -264,7 +264,13 @@ void attach_leaves(const std::vector<ActionPoseSample>& samples, const LearnOpti
   }
   PositionLeaves leaves = find_position_leaves(moved, structure->actions, root, structure->signals,
                                                structure->options, &structure->search);
-  for (AcceptedModel& model : leaves.models) structure->search.models.push_back(std::move(model));
+  const bool has_one_rhythm = is_one_rhythm(moved, static_cast<int>(structure->signals.size()));
+  for (AcceptedModel& model : leaves.models) {
+    if (has_one_rhythm && model.model.num_joints() > 1)
+      leaves.open[model.part_j] = {true, kOneRhythm};
+    else
+      structure->search.models.push_back(std::move(model));
+  }
   structure->open_leaves = std::move(leaves.open);
 }
 

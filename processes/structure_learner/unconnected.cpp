@@ -6,6 +6,7 @@
 #include <string>
 #include <utility>
 
+#include "processes/structure_learner/command_lag.h"
 #include "processes/structure_learner/search/withdrawal.h"
 
 namespace bodyschema {
@@ -106,10 +107,7 @@ std::string why_taken_back(const TriedModels& tried, const LearnedStructure& str
   if (tried.is_by_chance)
     return "commands of other times explain its motion nearly as well: record for longer, and "
            "check that each action is of the time of its poses";
-  if (tried.has_one_rhythm)
-    return "all signals follow one rhythm, in which poses that come late look like joints that "
-           "several signals move: move each signal in a rhythm of its own, or hold the arm still "
-           "at each pose";
+  if (tried.has_one_rhythm) return kOneRhythm;
   if (tried.is_too_short)
     return "no joints explain its motion, and the recording is too short to tell whether anything "
            "else does: record for longer";

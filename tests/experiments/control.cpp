@@ -184,8 +184,10 @@ void steer_along(const Arms& arms, const Case& test, SteeredArm* arm, bool is_fi
   int num_probes = 0;
   for (std::size_t n = 0; n < trajectory.num_way_points(); ++n) {
     SteeredArm::Arrival arrival;
+    const int num_way_points = test.is_straight ? static_cast<int>(trajectory.num_way_points()) : 0;
     for (const PoseTarget& step : trajectory.leg(n)) {
-      arrival = arm->go_to(kEndEffector, step.p_RT);
+      arrival = arm->go_to(kEndEffector, step.p_RT, num_way_points ? static_cast<int>(n) + 1 : 0,
+                           num_way_points);
       num_probes += arrival.status.num_probes;
     }
     if (is_first) result->first.push_back(arm->position(kEndEffector));

@@ -4,7 +4,8 @@
 // nearest point that a dense search finds; there KDL has no answer: of NR_JL the best of its last
 // iterates counts, with a velocity solver that leaves the rotation free, as it is and with the
 // damping by which it comes nearest, and of LMA, which knows no
-// limits, the best of its results moved to the limits. Prints Markdown.
+// limits, the best of its results moved to the limits. Prints Markdown; exit code 1 where something must
+// be reached that is not.
 //
 //   reach [--arms 10] [--targets 100] [--joints 7] [--seed 1]
 
@@ -76,6 +77,11 @@ struct Count {
     return fmt::format("| {} | {} | {:.1f} % | {} | {:.0f} |\n", name, time.num_targets,
                        100.0 * num_reached / time.num_targets, time.mean_ms(),
                        1e3 * time.largest_s);
+  }
+  /// So large a share, and as many as another one in no more time.
+  bool reaches(double share, const Count& other) const {
+    return num_reached >= share * time.num_targets && num_reached >= other.num_reached &&
+           time.cpu_s <= other.time.cpu_s;
   }
 };
 
@@ -352,6 +358,13 @@ struct OutOfReach {
             fmt::format("the same, damped everywhere by {} m/rad", kBestDamping).c_str()),
         by_lma.row("true arm, KDL's LMA: the best, moved to the limits"));
   }
+  /// All are within 1 mm of the nearest point, and stay so.
+  bool is_met() const {
+    const auto is_near = [](double m) { return m < 1e-3; };
+    return std::ranges::all_of(learned.by_m, is_near) &&
+           std::ranges::all_of(true_arm.by_m, is_near) && learned.num_farther == 0 &&
+           true_arm.num_farther == 0;
+  }
 };
 
 }  // namespace
@@ -411,4 +424,7 @@ int main(int argc, char** argv) {
   beyond.print("beyond reach");
   hollows.print("within reach, but not reached: behind limits, in hollows");
   fmt::print("\n{} of {} arms were not learned.\n", num_not_learned, num_arms);
+  const bool is_met = num_not_learned == 0 && positions.reaches(0.999, positions_of_kdl) &&
+                      poses.reaches(0.99, poses_of_kdl) && beyond.is_met() && hollows.is_met();
+  return is_met ? 0 : 1;
 }

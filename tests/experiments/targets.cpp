@@ -158,7 +158,7 @@ int main(int argc, char** argv) {
       const control_status_t& status = here.status();
       double error_m = NAN;
       std::string result = "reached";
-      if (here.end() == TargetFollower::End::kAsked) {
+      if (here.end() == TargetFollower::End::kAsked || here.end() == TargetFollower::End::kMissed) {
         wait("SIM_STATE of the arm at the target", [&] { return state->utime >= status.utime; });
         if (const auto X_RB_true = relative_pose(true_sample(*state, {}), schema->root, part)) {
           error_m = (X_RB_true->translation() - p_RT).norm();

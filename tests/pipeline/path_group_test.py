@@ -1,5 +1,5 @@
-"""path_group_test.py SOURCE BUILD RIG: a group that has learned RIG brings its hand along 20 way points; in their middle, while the arm is on
-its way, the forearm is bent by 30°, and four way points later the hand is within 3 mm of each again, as it is seen and by the truth."""
+"""path_group_test.py SOURCE BUILD RIG: a group that has learned RIG brings its hand along 20 way points; in their middle the forearm
+is bent by 30°, and four way points later the hand is within 3 mm of each again, as it is seen and by the truth."""
 
 import json
 import math
@@ -68,8 +68,10 @@ def main(work):
     def bend(way_point, console):
         if way_point == BENT_AFTER:
             console.send_signal(signal.SIGSTOP)  # else the arm goes on while the command starts
-            run(work, "fault", "bend", "forearm", 30)
-            console.send_signal(signal.SIGCONT)
+            try:
+                run(work, "fault", "bend", "forearm", 30)
+            finally:
+                console.send_signal(signal.SIGCONT)
 
     seen_mm, num_probes = follow(work, path, bend)
     status = run(work, "status")[0]

@@ -155,7 +155,7 @@ def jump_on_the_way(work):
     code, text = aim_while(work, "jump.txt", jump, "--tolerance", 2 * BESIDE_M)
     if code != 0:
         raise Failed(f"the tag that jumped was not reached: {text}")
-    if "the arm holds until 2 frames" not in text:
+    if f"target tag {TAG} moved by" not in text:
         raise Failed(f"the arm did not hold when the tag jumped: {text}")
     error = error_m(work, right)
     run(work, "stop")

@@ -37,6 +37,7 @@ int main(int argc, char** argv) {
     std::optional<sim_state_t> state;
     std::optional<int> root;
     struct Arrival {
+      std::int64_t target_id;
       double error_m;
       int num_faults;
     };
@@ -51,8 +52,13 @@ int main(int argc, char** argv) {
       const auto X_WR = X_WB(*state, *root), X_WP = X_WB(*state, part);
       if (!X_WR || !X_WP) return;
       const Eigen::Vector3d p_RT(status->target_position_m);
-      arrivals[{status->target_epoch, status->way_point}] = {
-          ((X_WR->inverse() * *X_WP).translation() - p_RT).norm(), state->num_faults};
+      const auto key = std::tuple(status->target_epoch, status->way_point);
+      // It is told again once a second, whatever becomes of the arm meanwhile.
+      if (const auto last = arrivals.find(key);
+          last != arrivals.end() && last->second.target_id == status->target_id)
+        return;
+      arrivals[key] = {status->target_id, ((X_WR->inverse() * *X_WP).translation() - p_RT).norm(),
+                       state->num_faults};
     });
     for (const auto& [_, arrival] : arrivals)
       std::printf("%.3f %d\n", arrival.error_m * 1e3, arrival.num_faults);

@@ -64,8 +64,11 @@ Eigen::Vector3d SteeredArm::position(int part) const {
   return (X_CB.at(first_schema_.root_part).inverse() * X_CB.at(part)).translation();
 }
 
-SteeredArm::Arrival SteeredArm::go_to(int part, const Eigen::Vector3d& p_RT) {
+SteeredArm::Arrival SteeredArm::go_to(int part, const Eigen::Vector3d& p_RT, int way_point,
+                                      int num_way_points) {
   pose_target_t target{};
+  target.way_point = way_point;
+  target.num_way_points = num_way_points;
   target.target_kind = pose_target_t::KIND_POSITION;
   target.target_part = part;
   std::copy(p_RT.begin(), p_RT.end(), target.position_m);

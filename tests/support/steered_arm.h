@@ -36,7 +36,8 @@ class SteeredArm {
   /// From now on the arm is another.
   void set_robot(SyntheticRobot robot) { robot_ = std::move(robot); }
   /// Serves one target [m, root's frame] until it is reached, refused or held.
-  Arrival go_to(int part, const Eigen::Vector3d& p_RT);
+  /// The target is way point `way_point` of so many on a straight path; 0: of none.
+  Arrival go_to(int part, const Eigen::Vector3d& p_RT, int way_point = 0, int num_way_points = 0);
   /// The same with a target tag there, which each rest shows in two frames with the regime's noise.
   Arrival go_to_tag(int part, const Eigen::Vector3d& p_RT);
   /// By the truth [m, root's frame].

@@ -132,14 +132,17 @@ void check_reach(const Heard& heard, const FollowArguments& arguments,
 
 /// "" or why the arm cannot go on to way point `n` from where it is, by what the schema is by now:
 /// the first way point may have been reached in another posture than was foreseen, or a link is
-/// bent. How well the part is known, and its reach, are the controller's there.
+/// bent. While an edge is in doubt the part is known badly everywhere: there the controller goes in
+/// small steps, and its probes end the doubt.
 std::string objection_to_leg(const Heard& heard, const FollowArguments& arguments,
                              const Trajectory& trajectory, std::size_t n) {
   const auto position = position_of(heard);
   if (n == 0 || !position) return "";
-  const double infinity = std::numeric_limits<double>::infinity();
   Trajectory::Limits limits = limits_of(arguments);
-  limits.position_sd_m = infinity;
+  const auto chain = chain_to(*heard.schema, arguments.part);
+  if (chain && std::ranges::any_of(chain->edges,
+                                   [](const Edge& edge) { return edge.state != EdgeState::kOk; }))
+    limits.position_sd_m = std::numeric_limits<double>::infinity();
   return trajectory.objection_to_leg(n, *heard.schema, arguments.part, *position, limits);
 }
 

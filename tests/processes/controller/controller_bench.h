@@ -420,7 +420,13 @@ class Bench {
           answer.status->target_epoch == status.target_epoch &&
           answer.status->target_id != status.target_id)
         left_path_id_ = answer.status->target_id;
+      const bool has_arrived = status.control_state != S::CONTROL_REACHED &&
+                               answer.status->control_state == S::CONTROL_REACHED;
       status = *answer.status;
+      const double tolerance_m = given_.tolerance_m > 0 ? given_.tolerance_m : config_.reached_m;
+      ASSERT_TRUE(!has_arrived ||
+                  status.predicted_error_m < tolerance_m + 1.1 * config_.max_correction_m)
+          << "reached, but " << status.predicted_error_m << " m away";
       if (status.control_state == S::CONTROL_HOLDING ||
           status.control_state == S::CONTROL_REFUSED || status.control_state == S::CONTROL_RELEASED)
         last_ended_id_ = status.target_id;

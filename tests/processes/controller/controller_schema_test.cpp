@@ -81,6 +81,36 @@ TEST(ControllerTest, AProbeIsMadeInSmallStepsBeforeTheNextStepOrDoneWithout) {
   }
 }
 
+// The way back from a probe is none along the line.
+TEST(ControllerTest, OnAPathAnotherWayBackFromAProbeIsTakenIfOneIsRefused) {
+  for (const bool is_probe_wanted : {false, true}) {
+    Bench bench;
+    bench.start();
+    pose_target_t step = position_target(0, kFar);
+    step.way_point = step.num_way_points = 2;
+    bench.give(step);
+    ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 2; }));
+    bench.health = health_of(1, 2, 3, schema_edge_t::EDGE_PROVISIONAL);
+    bench.health->probe_sample = is_probe_wanted ? bench.num_samples : -1;
+    set_array(bench.health->num_probe, bench.health->probe_action,
+              std::vector<double>{bench.arm[0], 0.9, 1.0});
+    bool is_refused = false;
+    bench.rejects = [&](const action_command_t& command) {
+      const bool is_first = !is_refused && bench.status.num_probes == is_probe_wanted &&
+                            command.purpose == action_command_t::PURPOSE_CONTROL;
+      is_refused |= is_first;
+      return is_first ? "a wall" : "";
+    };
+    bench.repeat();
+    ASSERT_TRUE(bench.run_until(
+        [&] { return is_refused && bench.status.control_state != S::CONTROL_MOVING; }));
+    bench.run(30);
+    EXPECT_EQ(bench.status.num_probes, is_probe_wanted);
+    EXPECT_EQ(bench.status.control_state, is_probe_wanted ? S::CONTROL_REACHED : S::CONTROL_HOLDING)
+        << bench.status.why;
+  }
+}
+
 TEST(ControllerTest, AProbeBeyondTheLimitsIsNotMade) {
   Bench bench;
   bench.start();
@@ -256,6 +286,20 @@ TEST(ControllerTest, AnOlderSchemaCountsOnlyAfterTheNewerFellSilent) {
   EXPECT_EQ(bench.controller.status().schema_version, 2);
 }
 
+TEST(ControllerTest, AnOlderSchemaCountsThenAlsoWhereTheArmIsItsOwn) {
+  Bench bench;
+  bench.schema = planar(7);
+  bench.start();
+  bench.give(position_target(0, kNear));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED));
+  bench.schema = planar(2);
+  bench.run(7);
+  EXPECT_EQ(bench.status.owns_arm, 1);
+  bench.give(position_target(1, kFar));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+  EXPECT_EQ(bench.status.schema_version, 2);
+}
+
 // ---- what is seen at the end
 
 TEST(ControllerTest, WhatIsSeenAtTheEndCorrectsOnce) {
@@ -267,6 +311,36 @@ TEST(ControllerTest, WhatIsSeenAtTheEndCorrectsOnce) {
   EXPECT_LT(bench.status.observed_error_m, 0.001);
   EXPECT_NEAR(bench.status.predicted_error_m, bench.bend_m.norm(), 0.001);
   EXPECT_TRUE(bench.has_why("seen there")) << bench.status.why;
+}
+
+// Also where another posture would have served it, and the arm is on the way to that already.
+TEST(ControllerTest, WhereACorrectionIsRefusedItIsTakenBackAndTheArmStaysThereOrComesBack) {
+  for (const bool is_on_path : {false, true}) {
+    for (const int num_steps_allowed : {0, 1}) {
+      ControllerConfig config = test_config();
+      config.max_step = 0.05;  // other postures are farther
+      Bench bench(config);
+      bench.bend_m = Eigen::Vector3d(0.01, -0.005, 0);
+      bench.start();
+      pose_target_t target = position_target(0, kNear);
+      target.way_point = target.num_way_points = is_on_path ? 2 : 0;
+      bool has_arrived = false;
+      int num_refused = 0, num_allowed = 0;
+      bench.rejects = [&](const auto&) {
+        has_arrived |= (bench.part_position() - kNear).norm() < 0.001;
+        if (!has_arrived || num_refused == bench.config_.max_solutions) return "";
+        if (num_refused > 0 && num_allowed++ < num_steps_allowed) return "";
+        ++num_refused;
+        return "a wall";
+      };
+      bench.give(target);
+      ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+      EXPECT_EQ(num_refused, is_on_path ? 1 : bench.config_.max_solutions);
+      EXPECT_EQ(num_allowed > num_steps_allowed, !is_on_path);
+      EXPECT_LT(bench.status.predicted_error_m, 0.001);
+      EXPECT_GT(bench.status.observed_error_m, 0.005);
+    }
+  }
 }
 
 TEST(ControllerTest, ACorrectionIsForgottenWithTheSchemaThatNeededIt) {

@@ -156,6 +156,18 @@ TEST(ControllerTest, APartThatHasComeToItsTagMayCoverIt) {
   EXPECT_EQ(bench.num_holds, 0);
 }
 
+TEST(ControllerTest, APartThatIsNearEnoughGoesNoFartherWhereItsTagIsLost) {
+  Bench bench = bench_with_tag(kFar);
+  Target target = tag_target(0);
+  target.tolerance_m = 1.5;
+  bench.give(target);
+  ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 1; }));
+  bench.p_RM_of_tag.clear();
+  bench.run(5);
+  EXPECT_EQ(bench.moves.size(), 1U);
+  EXPECT_EQ(bench.status.control_state, S::CONTROL_REACHED) << bench.status.why;
+}
+
 TEST(ControllerTest, ATagsTargetExpiresAndFallsSilentAsAnyOther) {
   Bench bench = bench_with_tag(kFar);
   Target target = tag_target(0, 41);

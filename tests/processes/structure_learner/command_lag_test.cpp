@@ -86,6 +86,7 @@ TEST(CommandLag, CommandsOfBeforeAreLinearBetweenTwo) {
 // A sine of before is a mixture of two of now: late poses look like joints that both move.
 TEST(CommandLag, OfOneRhythmIsNotKnown) {
   constexpr int kNum = 600, kLate = 6;
+  int num_leaves_told = 0;
   for (std::uint64_t seed = 0; seed < 4; ++seed) {
     ImperfectRobot robot(2, true, {}, seed);
     const auto action_at = [&](int n) {
@@ -108,7 +109,18 @@ TEST(CommandLag, OfOneRhythmIsNotKnown) {
     EXPECT_NE(judge(schema, robot.structure()), Rightness::kWrong) << seed;
     ASSERT_FALSE(schema.unconnected.empty()) << seed;
     EXPECT_NE(schema.unconnected.front().detail.find("one rhythm"), std::string::npos) << seed;
+    // Nor by the position of the hand alone.
+    test::SyntheticRobot ends = robot.structure();
+    test::hide_all_but_ends(&ends, &samples);
+    const int hand = ends.visible_parts().back();
+    const auto positions = test::with_positions_alone(std::move(samples), {hand});
+    const BodySchema of_positions = learn(robot.signals(), positions).schema;
+    EXPECT_FALSE(of_positions.complete) << seed;
+    ASSERT_FALSE(of_positions.unconnected.empty()) << seed;
+    num_leaves_told +=
+        of_positions.unconnected.front().detail.find(kOneRhythm) != std::string::npos;
   }
+  EXPECT_GE(num_leaves_told, 3);
   for (const bool is_chain : {false, true}) {
     ImperfectRobot robot(2, is_chain, {}, 1);
     EXPECT_FALSE(is_one_rhythm(stream_of(robot), 2));
