@@ -181,17 +181,20 @@ Matrix6d KinematicPath::covariance(const Eigen::Ref<const Eigen::VectorXd>& acti
   Matrix6d sum = Matrix6d::Zero();
   for (const Leg& leg : legs_) {
     Pose X = leg.edge.predict(theta);
-    Matrix6d covariance = variance == Variance::kFirstOrder ? leg.edge.prediction_covariance(theta)
-                                                            : leg.edge.empirical_covariance();
+    Matrix6d covariance = variance == Variance::kEmpirical ? leg.edge.empirical_covariance()
+                                                           : leg.edge.prediction_covariance(theta);
+    Matrix6d scatter = Matrix6d::Zero();
+    if (variance == Variance::kOneAction) scatter = leg.edge.scatter_covariance(theta);
     if (!leg.is_forward) {
       covariance = turned(covariance, X);
+      scatter = turned(scatter, X);
       X = X.inverse();
     }
-    if (leg.start && variance == Variance::kFirstOrder) {
+    if (leg.start && variance != Variance::kEmpirical) {
       sum = without(sum, *leg.start);
       covariance = turned(without(turned(covariance, X), *leg.start), X.inverse());
     }
-    sum = turned(sum, X.inverse()) + covariance;
+    sum = turned(sum, X.inverse()) + covariance + scatter;
   }
   return sum;
 }

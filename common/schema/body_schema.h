@@ -40,6 +40,9 @@ enum class Variance {
   /// Of the mean: what the samples left open about the parameters, to first order. Small where the
   /// model is right, and too small where it is not.
   kFirstOrder,
+  /// Of where the part is at one action: kFirstOrder, and what the joints on the way scatter from
+  /// one action to the next, see ScrewJoint::scatter.
+  kOneAction,
   /// Of what will be seen: mean squares of the edges' leave-one-out residuals (the chapter prefers
   /// variances estimated from the data, Section 3.3). The noise of two markers is in every edge, so
   /// along a path this is an upper bound; see empirical_covariance() in kinematic_path.h for that

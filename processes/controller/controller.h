@@ -233,9 +233,10 @@ class Controller {
   Eigen::VectorXd towards(const Eigen::VectorXd& action, double share) const;
   /// The way counts as rejected where it leads out of the workspace.
   void move_to(const Eigen::VectorXd& action, Serves serves, std::int8_t purpose, std::string why);
-  /// The command was none after all.
+  /// Takes back the counts of a MOVE that was not made.
   void forget_move();
-  /// What the newest MOVE, sent or not, was to serve is done in another way or without.
+  /// The newest MOVE is refused, by the driver or before it was sent: the target is reached in
+  /// another way, a probe is given up, a search goes on elsewhere.
   void strike(const std::string& why);
   /// Aims again where it did before the newest correction, which cannot be served.
   void take_back_correction();

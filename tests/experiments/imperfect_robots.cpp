@@ -68,7 +68,7 @@ Errors errors_of(const BodySchema& schema, const std::vector<ActionPoseSample>& 
     const auto& X_CR = poses[static_cast<std::size_t>(schema.root) - 1];
     for (const int part : schema.parts) {
       if (part == schema.root) continue;
-      const auto predicted = schema.predict(schema.root, part, sample.action);
+      const auto predicted = schema.predict(schema.root, part, sample.action, Variance::kOneAction);
       const Eigen::Vector3d p_RB =
           X_CR.inverse() * poses[static_cast<std::size_t>(part) - 1].translation();
       const double squared = (predicted->X_AB.translation() - p_RB).squaredNorm();

@@ -57,7 +57,7 @@ std::vector<PartPrediction> predict_parts(const BodySchema& schema, const Eigen:
   std::vector<PartPrediction> result;
   for (const int part : schema.parts) {
     if (part == schema.root) continue;
-    const auto predicted = schema.predict(schema.root, part, action);
+    const auto predicted = schema.predict(schema.root, part, action, Variance::kOneAction);
     if (!predicted) continue;
     PartPrediction& p = result.emplace_back();
     p.part = part;

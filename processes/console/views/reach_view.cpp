@@ -46,7 +46,7 @@ Reach reach_of(const BodySchema& schema, int part, const PoseTarget& target,
   reach.solution =
       solve_pose(schema, part, target, schema.signals, start, kThoroughInverseKinematics);
   const Eigen::VectorXd& action = reach.solution.action;
-  if (const auto predicted = schema.predict(schema.root, part, action))
+  if (const auto predicted = schema.predict(schema.root, part, action, Variance::kOneAction))
     reach.sd = deviations_of(predicted->covariance);
   if (reach.solution.is_within_tolerance) {
     reach.why = "reached";

@@ -60,8 +60,7 @@ Whereabouts whereabouts_of(const BodySchema& schema, std::optional<int> part,
         now.begin(), now.end(), [&](const PartPrediction& n) { return n.part == candidate; });
     if (predicted != now.end()) p.now = *predicted;
   }
-  if (part && where.parts.empty())
-    throw std::invalid_argument(no_way_text(schema, *part));
+  if (part && where.parts.empty()) throw std::invalid_argument(no_way_text(schema, *part));
   return where;
 }
 

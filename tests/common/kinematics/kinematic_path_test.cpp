@@ -248,17 +248,21 @@ void draw_edges(const BodySchema& schema, const std::vector<Eigen::MatrixXd>& ro
       edge.joints[d].slide += delta(first);
       edge.joints[d].turn += delta(first + 1);
       edge.joints[d].X_after = edge.joints[d].X_after * exp(delta.segment<6>(first + 2));
+      edge.joints[d].offset += edge.joints[d].scatter * test::gaussian(rng);
     }
   }
 }
 
 // Forty thousand robots whose parameters are drawn from the covariance that each edge states;
-// then also the frames of the parts, which the edges that meet there share.
-TEST(KinematicPath, FirstOrderCovarianceIsThatOfDrawnParameters) {
-  for (const bool in_common : {false, true}) {
+// then also the frames of the parts, which the edges that meet there share; then joints scatter,
+// too.
+TEST(KinematicPath, CovarianceIsThatOfDrawnParametersAndOfJointsThatScatter) {
+  for (const auto& [in_common, scatter] : {std::pair(false, 0.0), {true, 0.0}, {true, 5e-4}}) {
     Rng rng(4);
     BodySchema schema = random_schema(rng);
     schema.edges.pop_back();
+    for (Edge& edge : schema.edges)
+      for (ScrewJoint& joint : edge.joints) joint.scatter = scatter;
     const Eigen::VectorXd q = random_action(rng), theta = schema.displacements(q);
     std::vector<Eigen::MatrixXd> roots;
     for (const Edge& edge : schema.edges)
@@ -293,7 +297,7 @@ TEST(KinematicPath, FirstOrderCovarianceIsThatOfDrawnParameters) {
     }
     // Relative to the drawn one the eigenvalues are 1, within 5 standard deviations of √(2/n).
     const Eigen::GeneralizedSelfAdjointEigenSolver<Matrix6d> ratio(
-        path->covariance(q, Variance::kFirstOrder), drawn);
+        path->covariance(q, scatter > 0 ? Variance::kOneAction : Variance::kFirstOrder), drawn);
     EXPECT_GT(ratio.eigenvalues().minCoeff(), 0.965) << in_common;
     EXPECT_LT(ratio.eigenvalues().maxCoeff(), 1.035) << in_common;
   }
