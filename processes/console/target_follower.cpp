@@ -67,7 +67,7 @@ void TargetFollower::on_control_status(const control_status_t& status) {
     is_acknowledged_ = false;
     if (newest > mine) {
       status_ = status;
-      status_.why = "another target came after it, from " + status.sender;
+      status_.why = "another target, a hold or a release came after it, from " + status.sender;
       end_ = End::kRefused;
     }
     return;

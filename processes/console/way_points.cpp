@@ -13,7 +13,6 @@
 namespace bodyschema {
 namespace {
 
-constexpr double kFarthest_m = 1000;  // what POSE_TARGET carries
 constexpr double kUnitTolerance = 1e-2;
 
 std::vector<std::string> cells_of(const std::string& line) {
@@ -30,9 +29,10 @@ std::vector<std::string> cells_of(const std::string& line) {
 double number_in(const std::string& cell, const std::string& where) {
   double value = 0;
   const auto [end, error] = std::from_chars(cell.data(), cell.data() + cell.size(), value);
-  if (error != std::errc() || end != cell.data() + cell.size() || !(std::abs(value) <= kFarthest_m))
+  if (error != std::errc() || end != cell.data() + cell.size() ||
+      !(std::abs(value) <= kFarthestTarget_m))
     throw WayPointError(fmt::format("{}: expected a number within ±{}, found '{}'", where,
-                                    kFarthest_m, abbreviated(cell)));
+                                    kFarthestTarget_m, abbreviated(cell)));
   return value;
 }
 

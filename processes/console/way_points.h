@@ -8,6 +8,8 @@
 
 namespace bodyschema {
 
+inline constexpr double kFarthestTarget_m = 1000;  ///< per coordinate: what POSE_TARGET carries
+
 struct WayPointError : std::runtime_error {
   using std::runtime_error::runtime_error;
 };

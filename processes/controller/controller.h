@@ -241,6 +241,8 @@ class Controller {
   /// Aims again where it did before the newest correction, which cannot be served.
   void take_back_correction();
   void arrive();
+  /// The newest SAMPLE is of the present rest.
+  bool is_seen_here() const;
   /// STOP, a driver that began anew, and what others had it do.
   void on_driver(const motion_status_t& motion, bool is_foreign, bool began_anew);
   void on_move_answer(const motion_status_t& motion);

@@ -209,6 +209,8 @@ void Controller::step() {
     options.tolerance_m = std::min(options.tolerance_m, tolerance_m());
     options.tolerance_rad = std::min(options.tolerance_rad, tolerance_rad());
     options.uncertain_m = tolerance_m();
+    // So that the nearest approach is the one by what is tolerated.
+    options.metres_per_radian = tolerance_m() / tolerance_rad();
     const InverseKinematicsSolution solution =
         solve_pose(*schema_, target_.target_part, {aim(), wanted_orientation()}, config_.signals,
                    *position_, options, rejected_);
@@ -229,7 +231,11 @@ void Controller::step() {
   std::string doubtful;
   const bool is_slow = worst_edge(&doubtful) != EdgeState::kOk;
   const Eigen::VectorXd action = towards(*goal_, is_slow ? config_.slow_step : config_.max_step);
-  if (is_near(action, *position_, config_.signals)) return arrive();
+  if (is_near(action, *position_, config_.signals)) {
+    if (num_moves_ > 0 || is_seen_here()) return arrive();
+    return move_to(*goal_, Serves::kTarget, action_command_t::PURPOSE_CONTROL,
+                   "the arm is there already: its SAMPLE is made, to see whether the part is");
+  }
   return move_to(action, Serves::kTarget, action_command_t::PURPOSE_CONTROL,
                  is_slow ? "in small steps: " + doubtful + " is in doubt" : "towards the target");
 }
@@ -363,8 +369,12 @@ void Controller::take_back_correction() {
   goal_.reset();
 }
 
+bool Controller::is_seen_here() const {
+  return sample_ && sample_->rest_begin_utime == motion_->rest_since_utime;
+}
+
 void Controller::arrive() {
-  if (sample_ && sample_->rest_begin_utime == motion_->rest_since_utime)
+  if (is_seen_here())
     observe(*sample_);
   else
     forget_sight();

@@ -61,6 +61,10 @@ TEST_F(BodyschemaProgramTest, ReachFindsTheActionOfAPoseOrTheNearest) {
                                     "5",     "--json",        "--position"};
   reach = add(reach, X_RB["position_m"]);
   EXPECT_TRUE(run(reach).json()["rotation_error_deg"].is_null());
+  const Outcome too_far =
+      run({"reach", "schema.lcmlog", "--part", "5", "--position", "1e300", "0", "0", "--json"});
+  EXPECT_EQ(too_far.exit_code, 2);
+  EXPECT_NE(too_far.err.find("within ±1000"), std::string::npos) << too_far.err;
   reach.push_back("--orientation");
   reach = add(reach, X_RB["rotation_wxyz"]);
   const Outcome reached = run(reach);

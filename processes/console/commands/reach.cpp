@@ -10,6 +10,7 @@
 #include "processes/console/commands/files.h"
 #include "processes/console/views/prediction_view.h"
 #include "processes/console/views/reach_view.h"
+#include "processes/console/way_points.h"
 
 namespace bodyschema {
 namespace {
@@ -28,6 +29,9 @@ void require_finite(const std::string& option, const std::vector<double>& number
 
 PoseTarget target_of(const ReachArguments& arguments) {
   require_finite("--position", arguments.position);
+  for (const double coordinate : arguments.position)
+    if (std::abs(coordinate) > kFarthestTarget_m)
+      refuse_argument("--position", fmt::format("expected metres, within ±{}", kFarthestTarget_m));
   PoseTarget target;
   target.p_RT = Eigen::Vector3d::Map(arguments.position.data());
   if (arguments.orientation.empty()) return target;

@@ -90,6 +90,41 @@ TEST(ControllerTest, AnOrientationOutOfReachIsRefusedUnlessTheTargetToleratesIt)
   EXPECT_NEAR(bench.status.predicted_error_rad, 0.1, 0.01);
 }
 
+// Of an orientation that hardly matters the position is not traded for it.
+TEST(ControllerTest, TheNearestApproachIsTheOneByWhatIsTolerated) {
+  Bench bench;
+  bench.start();
+  Target target = pose_target(0, Eigen::Vector3d(20, -0.4, 6));
+  const Eigen::Quaterniond sideways(Eigen::AngleAxisd(1.5, Eigen::Vector3d::UnitX()));
+  const double wxyz[] = {sideways.w(), sideways.x(), sideways.y(), sideways.z()};
+  std::copy(std::begin(wxyz), std::end(wxyz), target.orientation_wxyz);
+  target.position_m[0] = 2.0;
+  target.position_m[1] = 0.4;
+  target.tolerance_m = 0.01;
+  target.tolerance_rad = M_PI;
+  bench.give(target);
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+  EXPECT_LT(bench.status.predicted_error_m, 0.01);
+}
+
+// What changed at rest is seen by a SAMPLE alone.
+TEST(ControllerTest, AnArmThatIsThereAlreadyIsLookedAt) {
+  Bench bench;
+  bench.start();
+  bench.give(position_target(0, kNear));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED));
+  const std::vector<double> before = bench.arm;
+  bench.bend_m = Eigen::Vector3d(0.1, 0, 0);
+  bench.put_tag(40, std::nullopt);  // another rest, of which there is no SAMPLE
+  bench.give(position_target(1, kNear));
+  ASSERT_TRUE(
+      bench.run_until([&] { return bench.status.target_id == 1 && bench.status.num_moves == 1; }));
+  ASSERT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+  EXPECT_EQ(bench.status.num_moves, 1);
+  for (std::size_t i = 0; i < before.size(); ++i) EXPECT_NEAR(bench.arm[i], before[i], 1e-3);
+  EXPECT_NEAR(bench.status.observed_error_m, 0.1, 0.01);
+}
+
 TEST(ControllerTest, AToleranceLetsANearestApproachCount) {
   Bench bench;
   bench.start();
