@@ -272,7 +272,7 @@ def experiment(place, arguments):
 
 def experiments(place, arguments):
     if arguments and arguments[0] in experiment_names(place):
-        experiment(place, arguments)
+        return experiment(place, arguments)
     build(place, "experiments")
     if not any(argument.split("=")[0] == "--out" for argument in arguments):
         arguments = ["--out", place.logs / "experiments", *arguments]

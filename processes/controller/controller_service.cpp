@@ -135,9 +135,11 @@ void Controller::decide() {
   // Until the arm is taken, on_tick goes on.
   if (phase_ == Phase::kTaking || !silent_.empty() || !is_at_rest() || !position_) return;
   if (target_.target_kind == pose_target_t::KIND_TAG) {
-    if (!aim_at_tag()) return wait_for_tag();
+    // A part that is near enough may cover it; by an edge that is invalid nothing is near.
+    const bool is_lost = !tags_.at(target_.target_tag).is_seen();
+    if (!aim_at_tag() || (is_lost && is_invalid)) return wait_for_tag();
     fire(Event::kTagSeen, "the target tag is seen");
-    if (!tags_.at(target_.target_tag).is_seen()) return arrive();  // near enough, and may cover it
+    if (is_lost) return arrive();
   }
   if (is_invalid) return search(edge);
   if (const auto action = wanted_probe()) return probe(*action);
@@ -331,7 +333,6 @@ void Controller::move_to(const Eigen::VectorXd& action, Serves serves, std::int8
   }
   sent_ = make_command(action_command_t::KIND_MOVE);
   sent_->purpose = purpose;
-  has_left_line_ |= serves != Serves::kTarget;
   set_array(sent_->num_signals, sent_->action, std::vector<double>(action.begin(), action.end()));
   under_way_.restart();
   ++num_moves_;
@@ -402,6 +403,7 @@ void Controller::on_move_answer(const motion_status_t& motion) {
   switch (motion.state) {
     case motion_status_t::STATE_SETTLED:
       if (!fire(Event::kSettled)) return;
+      has_left_line_ |= serves_ != Serves::kTarget;
       num_expired_ = 0;
       update_predicted_errors();
       if (sample_) on_own_sample(*sample_);

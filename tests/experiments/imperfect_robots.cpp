@@ -14,6 +14,7 @@
 #include <string>
 #include <vector>
 
+#include "common/estimation/quantile.h"
 #include "common/geometry/angle.h"
 #include "common/schema/standard_deviations.h"
 #include "processes/structure_learner/learn.h"
@@ -81,9 +82,8 @@ Errors errors_of(const BodySchema& schema, const std::vector<ActionPoseSample>& 
   return {std::sqrt(sum / count), std::sqrt(sum_in_deviations / count)};
 }
 
-double median_of(std::vector<double> values) {
-  std::ranges::sort(values);
-  return values.empty() ? NAN : values[values.size() / 2];
+double median_of(const std::vector<double>& values) {
+  return values.empty() ? NAN : median(values);
 }
 
 }  // namespace

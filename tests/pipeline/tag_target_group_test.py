@@ -139,7 +139,8 @@ def wait_for_tag(work, p_CM):
 
 def jump_on_the_way(work):
     """The tag is put elsewhere between two of many steps. It floats beside what the hand reaches, so that the arm never hides it."""
-    rig = rig_with_tag(work, "small_steps", (("max_step: 0.25", "max_step: 0.02"), ("slow_step: 0.05", "slow_step: 0.02"), ("search_step: 0.1", "search_step: 0.01")))
+    steps = ("max_step: 0.25", "max_step: 0.02"), ("slow_step: 0.05", "slow_step: 0.02"), ("search_step: 0.1", "search_step: 0.01")
+    rig = rig_with_tag(work, "small_steps", steps)
     run(work, "rig", rig)
     run(work, "--rig", rig, "--ideal", "--seed", 4, "--samples", 30, "--keep")
     (p_RB, right), (_, left) = position(work, 0, 29), position(work, 0, -29)

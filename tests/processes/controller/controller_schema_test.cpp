@@ -81,33 +81,40 @@ TEST(ControllerTest, AProbeIsMadeInSmallStepsBeforeTheNextStepOrDoneWithout) {
   }
 }
 
-// The way back from a probe is none along the line.
+// The way back from a probe is none along the line; a probe that was refused left none.
 TEST(ControllerTest, OnAPathAnotherWayBackFromAProbeIsTakenIfOneIsRefused) {
-  for (const bool is_probe_wanted : {false, true}) {
+  enum class Probe { kNotWanted, kRefused, kMade };
+  for (const Probe probe : {Probe::kNotWanted, Probe::kRefused, Probe::kMade}) {
     Bench bench;
     bench.start();
     pose_target_t step = position_target(0, kFar);
     step.way_point = step.num_way_points = 2;
     bench.give(step);
-    ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 2; }));
+    ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 1; }));
     bench.health = health_of(1, 2, 3, schema_edge_t::EDGE_PROVISIONAL);
-    bench.health->probe_sample = is_probe_wanted ? bench.num_samples : -1;
-    set_array(bench.health->num_probe, bench.health->probe_action,
-              std::vector<double>{bench.arm[0], 0.9, 1.0});
-    bool is_refused = false;
+    bench.health->probe_sample = probe == Probe::kNotWanted ? -1 : bench.num_samples;
+    std::vector<double> wanted = bench.moves.back().action;
+    wanted[1] += wanted[1] > 0 ? -0.05 : 0.05;  // in one step from there, within the limits
+    set_array(bench.health->num_probe, bench.health->probe_action, wanted);
+    bool is_probed = probe == Probe::kNotWanted, is_refused = false;
     bench.rejects = [&](const action_command_t& command) {
-      const bool is_first = !is_refused && bench.status.num_probes == is_probe_wanted &&
-                            command.purpose == action_command_t::PURPOSE_CONTROL;
+      if (command.purpose == action_command_t::PURPOSE_PROBE) {
+        is_probed = true;
+        return probe == Probe::kRefused ? "a wall" : "";
+      }
+      const bool is_first = is_probed && !is_refused;
       is_refused |= is_first;
       return is_first ? "a wall" : "";
     };
     bench.repeat();
-    ASSERT_TRUE(bench.run_until(
-        [&] { return is_refused && bench.status.control_state != S::CONTROL_MOVING; }));
+    ASSERT_TRUE(bench.run_until([&] {
+      return is_refused && bench.status.control_state != S::CONTROL_MOVING;
+    })) << bench.status.why;
     bench.run(30);
-    EXPECT_EQ(bench.status.num_probes, is_probe_wanted);
-    EXPECT_EQ(bench.status.control_state, is_probe_wanted ? S::CONTROL_REACHED : S::CONTROL_HOLDING)
+    EXPECT_EQ(bench.status.num_probes, probe == Probe::kMade);
+    EXPECT_EQ(bench.status.control_state == S::CONTROL_REACHED, probe == Probe::kMade)
         << bench.status.why;
+    EXPECT_EQ(bench.has_why("along the line is refused"), probe != Probe::kMade);
   }
 }
 

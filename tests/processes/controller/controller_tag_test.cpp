@@ -168,6 +168,23 @@ TEST(ControllerTest, APartThatIsNearEnoughGoesNoFartherWhereItsTagIsLost) {
   EXPECT_EQ(bench.status.control_state, S::CONTROL_REACHED) << bench.status.why;
 }
 
+TEST(ControllerTest, ByAnInvalidEdgeNoPartIsNearATagThatIsLost) {
+  ControllerConfig config = test_config();
+  config.max_searches = 3;
+  Bench bench = bench_with_tag(kFar, config);
+  Target target = tag_target(0);
+  target.tolerance_m = 1.5;
+  bench.give(target);
+  ASSERT_TRUE(bench.run_until([&] { return bench.moves.size() == 1; }));
+  bench.p_RM_of_tag.clear();
+  bench.health = health_of(1, 2, 3, schema_edge_t::EDGE_INVALID);
+  bench.repeat();
+  bench.run(5);
+  EXPECT_EQ(bench.moves.size(), 1U);
+  EXPECT_EQ(bench.num_holds, 1);
+  EXPECT_EQ(bench.status.control_state, S::CONTROL_WAITING) << bench.status.why;
+}
+
 TEST(ControllerTest, ATagsTargetExpiresAndFallsSilentAsAnyOther) {
   Bench bench = bench_with_tag(kFar);
   Target target = tag_target(0, 41);
