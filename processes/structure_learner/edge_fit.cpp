@@ -30,6 +30,26 @@ Edge to_edge(const LocalModel& model, const NormalizedActions& actions) {
   return edge;
 }
 
+// `scatter` [half ranges] by joint.
+void set_scatter(const Eigen::VectorXd& scatter, const NormalizedActions& actions, Edge* edge) {
+  for (Eigen::Index d = 0; d < scatter.size(); ++d) {
+    ScrewJoint& joint = edge->joints[static_cast<std::size_t>(d)];
+    joint.scatter = scatter(d) * actions.half_range(joint.signal);
+  }
+}
+
+// [half ranges], of the joints of `nodes` in their order.
+Eigen::VectorXd scatter_of(const std::vector<FittedEdge>& fitted,
+                           const std::vector<TreeNode>& nodes, const NormalizedActions& actions) {
+  std::vector<double> result;
+  for (std::size_t k = 1; k < nodes.size(); ++k)
+    for (const FittedEdge& f : fitted)
+      if (f.edge.to == nodes[k].part)
+        for (const ScrewJoint& joint : f.edge.joints)
+          result.push_back(joint.scatter / actions.half_range(joint.signal));
+  return Eigen::Map<const Eigen::VectorXd>(result.data(), static_cast<Eigen::Index>(result.size()));
+}
+
 // The covariance of a model's parameters, for to_edge().
 Eigen::MatrixXd in_command_units(const ParameterMatrix& covariance, const LocalModel& model,
                                  const NormalizedActions& actions) {
@@ -94,10 +114,7 @@ void fit_screw_edge(const LocalModel& start, const PairData& pair, const EdgeDat
   result->edge = to_edge(fit.model, data.actions);
   const PairData told = make_pair_data(data.samples, pair.part_i, pair.part_j, data.told,
                                        std::numeric_limits<int>::max());
-  const Eigen::VectorXd scatter = joint_scatter(fit, loo, pair, told, data.actions);
-  for (int d = 0; d < fit.model.num_joints(); ++d)
-    result->edge.joints[static_cast<std::size_t>(d)].scatter =
-        scatter(d) * data.actions.half_range(fit.model.joints[d].signal);
+  set_scatter(joint_scatter(fit, loo, pair, told, data.actions), data.actions, &result->edge);
   const int inliers = judge(pair, loo.squared_distance, loo.residual, result);
   double weight = 0;
   for (int t = 0; t < pair.size(); ++t)
@@ -111,6 +128,27 @@ void fit_screw_edge(const LocalModel& start, const PairData& pair, const EdgeDat
     result->edge.parameter_covariance =
         lasting * weight / inliers *
         in_command_units(loo.parameter_covariance, fit.model, data.actions);
+}
+
+// Edges whose parts are elsewhere than the joint fit has them at most instants: they were accepted
+// from a few instants that their own two parts share, which any model fits. Chosen: "elsewhere" is
+// ten times as far as an outlier, beyond any noise that is told wrongly.
+bool drop_contradicted(const TreeFit& fit, std::vector<FittedEdge>* fitted) {
+  const auto is_contradicted = [&](const FittedEdge& edge) {
+    for (int k = 1; k < static_cast<int>(fit.nodes().size()); ++k) {
+      if (fit.nodes()[k].part != edge.edge.to) continue;
+      int readings = 0, elsewhere = 0;
+      for (int t = 0; t < fit.num_frames(); ++t) {
+        const FrameFit* reading = fit.reading(t, k);
+        if (!reading) continue;
+        ++readings;
+        elsewhere += reading->squared_distance > 10 * outlier_threshold(reading->num_residuals);
+      }
+      return 2 * elsewhere > readings;
+    }
+    return false;
+  };
+  return std::erase_if(*fitted, is_contradicted) > 0;
 }
 
 }  // namespace
@@ -151,7 +189,9 @@ void fit_jointly(const EdgeData& data, std::vector<FittedEdge>* fitted, BodySche
   constexpr int kMaxFrames = 2500;
   constexpr std::size_t kTooMany = 6000;
   if (data.samples.size() > kTooMany) return;
+  std::vector<PairData> told;
   const auto seen = [&](int part) {
+    told.push_back(make_part_data(data.samples, part, data.told, kMaxFrames));
     return make_part_data(data.samples, part, data.measurement, kMaxFrames);
   };
   std::vector<TreeNode> nodes{{schema->root, -1, {}}};
@@ -166,20 +206,26 @@ void fit_jointly(const EdgeData& data, std::vector<FittedEdge>* fitted, BodySche
     poses.push_back(seen(f.edge.to));
   }
   if (nodes.size() < 2) return;
+  const Eigen::VectorXd of_pairs = scatter_of(*fitted, nodes, data.actions);
   TreeFit fit(std::move(nodes), std::move(poses), data.actions, true);
   fit.fit(20, 1e-6);
+  if (drop_contradicted(fit, fitted)) {
+    fit_jointly(data, fitted, schema);
+    return;
+  }
+  const Eigen::VectorXd scatter = joint_scatter(fit, told, of_pairs);
   const auto covariance = fit.covariance(data.measurement, view_share(data.measurement));
+  Eigen::Index next = 0;
   for (std::size_t k = 1; k < fit.nodes().size(); ++k) {
     const TreeNode& node = fit.nodes()[k];
+    const Eigen::VectorXd of_node = scatter.segment(next, node.model.num_joints());
+    next += node.model.num_joints();
     for (FittedEdge& f : *fitted) {
       if (f.edge.to != node.part) continue;
       const Edge moved = to_edge(node.model, data.actions);
       f.edge.left = moved.left;
-      for (std::size_t d = 0; d < moved.joints.size(); ++d) {
-        const double scatter = f.edge.joints[d].scatter;
-        f.edge.joints[d] = moved.joints[d];
-        f.edge.joints[d].scatter = scatter;
-      }
+      f.edge.joints = moved.joints;
+      set_scatter(of_node, data.actions, &f.edge);
       if (covariance)
         f.edge.parameter_covariance =
             in_command_units(covariance->models[k], node.model, data.actions);

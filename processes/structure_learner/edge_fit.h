@@ -34,8 +34,9 @@ FittedEdge fit_edge(const AcceptedModel& accepted, int from, int to, const EdgeD
 
 /// The edges of the root's component fitted to all of its markers at once: a root that rests and
 /// everything on the way from it are witnesses too, beside the two markers that each edge was
-/// fitted to before. X_CR with them. Left alone where the root moves or an edge is no chain of
-/// screws.
+/// fitted to before. X_CR with them, and the scatter of the joints. An edge whose part is elsewhere
+/// than all of them say, at most instants, goes. Left alone where the root moves or an edge is no
+/// chain of screws.
 void fit_jointly(const EdgeData& data, std::vector<FittedEdge>* fitted, BodySchema* schema);
 
 }  // namespace bodyschema

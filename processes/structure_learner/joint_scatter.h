@@ -1,6 +1,9 @@
 #pragma once
 
+#include <vector>
+
 #include "processes/structure_learner/local_model.h"
+#include "processes/structure_learner/tree_fit.h"
 
 namespace bodyschema {
 
@@ -15,5 +18,11 @@ namespace bodyschema {
 /// explains more than scatter does, scatter is what that factor leaves.
 Eigen::VectorXd joint_scatter(const Fit& fit, const LeaveOneOut& loo, const PairData& pair,
                               const PairData& told, const NormalizedActions& actions);
+
+/// The same of all joints of a tree whose root rests, in the order of its nodes: every part beyond
+/// a joint is a witness of what it is off by, where a pair has two noisy ones. Readings that are
+/// outliers even so are left out; `start` says what is scatter at first. `told` as TreeFit's data.
+Eigen::VectorXd joint_scatter(const TreeFit& fit, const std::vector<PairData>& told,
+                              const Eigen::VectorXd& start);
 
 }  // namespace bodyschema

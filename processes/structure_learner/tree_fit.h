@@ -66,6 +66,11 @@ class TreeFit {
   /// In the camera's frame.
   const Pose& pose(int frame, int node) const { return poses_[at(frame, node)]; }
   bool is_seen(int node) const { return data_[node].size() > 0; }
+  /// nullptr where the frame did not see the node.
+  const FrameFit* reading(int frame, int node) const {
+    const int index = at(frame, node);
+    return frame_index_[index] < 0 ? nullptr : &fits_[index];
+  }
   bool is_below(int node, int ancestor) const;  ///< or the same
   /// Index of a frame and node in Normal.
   int at(int frame, int node) const { return frame * static_cast<int>(nodes_.size()) + node; }

@@ -3,6 +3,7 @@
 #include <gtest/gtest.h>
 
 #include <cmath>
+#include <string>
 #include <vector>
 
 #include "processes/structure_learner/learn.h"
@@ -97,6 +98,77 @@ TEST(JointScatter, IsInTheLearnedSchema) {
   ASSERT_EQ(schema.edges[0].joints.size(), 1U);
   const ScrewJoint& joint = schema.edges[0].joints[0];
   EXPECT_NEAR(joint.scatter * std::abs(joint.turn), 1.5 * noise_rad, 0.5 * noise_rad);
+}
+
+// A chain of hinges (±1 rad), each of which misses its command by `scatter_rad`, less than two
+// markers tell of one pose.
+std::vector<ActionPoseSample> samples_of_chain(int num_joints, double scatter_rad, int num_samples,
+                                               int seed, double outlier_share,
+                                               std::vector<Signal>* signals) {
+  Rng rng(static_cast<Rng::result_type>(seed));
+  test::SyntheticRobot robot;
+  robot.X_CR.translation().z() = 2;
+  robot.links.push_back({.part = 1});
+  for (int n = 0; n < num_joints; ++n) {
+    robot.signals.push_back({"q" + std::to_string(n), -1, 1});
+    robot.links.push_back({.part = n + 2,
+                           .parent = n + 1,
+                           .X_before = test::random_pose(rng, 0.06, 0.16),
+                           .X_after = test::random_pose(rng, 0.06, 0.16),
+                           .signal = n,
+                           .turn = 1});
+  }
+  std::vector<ActionPoseSample> samples;
+  for (int t = 0; t < num_samples; ++t) {
+    const Eigen::VectorXd command = robot.random_action(rng);
+    Eigen::VectorXd reached = command;
+    for (double& q : reached) q += scatter_rad * test::gaussian(rng);
+    samples.push_back(test::observe(robot, reached, {Regime::kChapter}, t, rng));
+    samples.back().action = command;
+    for (PartObservation& o : samples.back().parts)
+      if (test::uniform(rng, 0, 1) < outlier_share) o.X_CB = test::random_pose(rng, 0.2, 1);
+  }
+  *signals = robot.signals;
+  return samples;
+}
+
+// All parts beyond a joint are its witnesses. Pairs alone find none of these.
+TEST(JointScatter, OfAChainIsFoundBelowTheNoiseOfItsPairs) {
+  const double noise_rad = test::nominal_noise(Regime::kChapter).rotation_rad;
+  const double scatter_rad = 0.6 * noise_rad;
+  for (const double outlier_share : {0.0, 0.05}) {
+    double sum = 0;
+    int num_joints = 0;
+    for (int seed = 1; seed <= 5; ++seed) {
+      LearnOptions options;
+      options.measurement.noise = test::nominal_noise(Regime::kChapter);
+      std::vector<Signal> signals;
+      const auto samples = samples_of_chain(6, scatter_rad, 100, seed, outlier_share, &signals);
+      const BodySchema schema = learn(signals, samples, options).schema;
+      if (!schema.complete) continue;
+      for (const Edge& edge : schema.edges)
+        if (edge.to <= 4)  // the first half, which many witness
+          for (const ScrewJoint& joint : edge.joints) {
+            sum += joint.scatter * std::abs(joint.turn);
+            ++num_joints;
+          }
+    }
+    ASSERT_GE(num_joints, 9) << outlier_share;
+    EXPECT_NEAR(sum / num_joints, scatter_rad, 0.35 * scatter_rad) << outlier_share;
+  }
+}
+
+TEST(JointScatter, OfAnExactChainIsZero) {
+  int zero = 0;
+  for (int seed = 1; seed <= 10; ++seed) {
+    LearnOptions options;
+    options.measurement.noise = test::nominal_noise(Regime::kChapter);
+    std::vector<Signal> signals;
+    const auto samples = samples_of_chain(4, 0, 40, seed, 0, &signals);
+    for (const Edge& edge : learn(signals, samples, options).schema.edges)
+      for (const ScrewJoint& joint : edge.joints) zero += joint.scatter == 0;
+  }
+  EXPECT_GE(zero, 37);  // of 40
 }
 
 }  // namespace

@@ -1,0 +1,78 @@
+#include "processes/structure_learner/edge_fit.h"
+
+#include <gtest/gtest.h>
+
+#include <vector>
+
+#include "tests/support/synthetic_robot.h"
+
+namespace bodyschema {
+namespace {
+
+using test::Regime;
+
+// Parts 1 – 2 – 3 in a row, hinges q0 and q1; q2 moves nothing.
+test::SyntheticRobot two_hinges(test::Rng& rng) {
+  test::SyntheticRobot robot;
+  robot.signals = {{"q0", -1, 1}, {"q1", -1, 1}, {"q2", -1, 1}};
+  robot.X_CR.translation().z() = 2;
+  robot.links.push_back({.part = 1});
+  for (int n = 0; n < 2; ++n)
+    robot.links.push_back({.part = n + 2,
+                           .parent = n + 1,
+                           .X_before = test::random_pose(rng, 0.06, 0.16),
+                           .X_after = test::random_pose(rng, 0.06, 0.16),
+                           .signal = n,
+                           .turn = 1});
+  return robot;
+}
+
+// A hinge on `signal` anywhere.
+LocalModel hinge(int signal, test::Rng& rng) {
+  LocalModel model;
+  model.first = test::random_pose(rng, 0.06, 0.16);
+  LocalModel::Joint joint;
+  joint.signal = signal;
+  joint.turn = 1;
+  joint.X_after = test::random_pose(rng, 0.06, 0.16);
+  model.joints.push_back(joint);
+  return model;
+}
+
+// Parts 2 and 3 are seen together twice alone: any model of one joint fits that exactly.
+TEST(FitJointly, DropsAnEdgeThatTheOtherPartsContradict) {
+  for (const int signal : {1, 2}) {
+    test::Rng rng(5);
+    const test::SyntheticRobot robot = two_hinges(rng);
+    std::vector<ActionPoseSample> samples;
+    for (int t = 0; t < 40; ++t) {
+      samples.push_back(test::observe(robot, robot.random_action(rng), {Regime::kTagIso}, t, rng));
+      if (t >= 2)
+        std::erase_if(samples.back().parts,
+                      [t](const PartObservation& o) { return o.part == 2 + t % 2; });
+    }
+    const NormalizedActions actions(samples, 3);
+    const MeasurementModel measurement{.noise = test::nominal_noise(Regime::kTagIso)};
+    const EdgeData data{samples, actions, measurement, measurement, {}};
+    LocalModel true_first = hinge(0, rng), last = hinge(signal, rng);
+    const Edge of_2 = robot.true_edge(1, 2), of_3 = robot.true_edge(2, 3);
+    true_first.first = of_2.left;
+    true_first.joints[0].X_after = of_2.joints[0].X_after;
+    true_first.joints[0].turn = of_2.joints[0].turn;
+    last.first = of_3.left;
+    last.joints[0].X_after = of_3.joints[0].X_after;
+    std::vector<FittedEdge> fitted{
+        fit_edge({.part_i = 1, .part_j = 2, .model = true_first}, 1, 2, data, false),
+        fit_edge({.part_i = 2, .part_j = 3, .model = last}, 2, 3, data, false)};
+    ASSERT_EQ(fitted[1].frames.size(), 2U);
+    BodySchema schema;
+    schema.root = 1;
+    schema.signals = robot.signals;
+    fit_jointly(data, &fitted, &schema);
+    ASSERT_EQ(fitted.size(), signal == 1 ? 2U : 1U) << signal;
+    EXPECT_EQ(fitted[0].edge.to, 2);
+  }
+}
+
+}  // namespace
+}  // namespace bodyschema
