@@ -21,4 +21,12 @@ inline double median(std::vector<double> values) {
   return 0.5 * (*std::max_element(values.begin(), middle) + *middle);
 }
 
+/// The value that a share of `tail` exceeds, 0 ≤ tail < 1. There must be a value. O(n).
+inline double exceeded_by(double tail, std::vector<double> values) {
+  const auto rank = static_cast<std::ptrdiff_t>((1 - tail) * static_cast<double>(values.size()));
+  const auto at = values.begin() + std::min(rank, std::ssize(values) - 1);
+  std::nth_element(values.begin(), at, values.end());
+  return *at;
+}
+
 }  // namespace bodyschema

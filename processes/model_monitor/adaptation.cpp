@@ -20,7 +20,7 @@ constexpr double kTurnedOver_rad = 120 * kDegree;
 /// Outliers are counted over about 500 readings of markers; the told rate weighs like 100 of them.
 /// A little more are expected than were counted, as those that look like inliers were not. Chosen.
 constexpr double kFading = 0.998;
-constexpr double kPriorReadings = 100;
+constexpr double kPriorReadings = 100, kMostReadings = 500;
 constexpr double kMoreOutliers = 1.2, kMostOutliers = 0.35;
 /// Rates and worths nearer than this are the same [log], since the CUSUMs begin anew with another.
 constexpr double kSameNoise = 0.15;
@@ -32,6 +32,7 @@ constexpr double kLargestScale = 5;
 constexpr std::size_t kFewestDistances = 20;
 /// Quiet samples after which the noise is looked at again.
 constexpr int kQuietSamples = 32;
+constexpr double kTail = 0.05;
 
 /// What two fits of one edge to tags may differ by, anywhere in its range: a body of the history
 /// that is as near to the first is the first, learned again. Chosen: an order of magnitude above
@@ -86,7 +87,16 @@ Adaptation::Adaptation(BodySchema schema, AdaptationOptions options)
       tags_(schema.moved_tags),
       moved_tags_(schema.moved_tags),
       schema_(std::move(schema)),
-      drift_watch_(options.false_alarm_rate) {}
+      drift_watch_(options.false_alarm_rate) {
+  // What was learned from had outliers as well: of an edge one of two markers is wild.
+  for (const Edge& edge : schema_.edges) {
+    num_read_ += 2 * edge.num_samples;
+    num_outliers_ += edge.num_outliers;
+  }
+  const double share = std::min(1.0, kMostReadings / std::max(num_read_, 1.0));
+  num_read_ *= share;
+  num_outliers_ *= share;
+}
 
 Adaptation::Adaptation(BodySchema schema, AdaptationOptions options,
                        std::vector<BodySchema> history, const std::vector<ActionPoseSample>& past)
@@ -144,6 +154,7 @@ void Adaptation::set_noise_scale(double scale) {
 }
 
 void Adaptation::calibrate(const std::vector<ActionPoseSample>& samples) {
+  measurement_.outlier_rate = outlier_rate();
   // The filter's own beliefs depend on the scale: a few rounds.
   for (int round = 0; round < 4; ++round) {
     std::vector<double> distances;
@@ -158,6 +169,8 @@ void Adaptation::calibrate(const std::vector<ActionPoseSample>& samples) {
     // A few samples tell no better than this.
     if (round == 3 && std::abs(std::log(measurement_.scale)) < 0.15)
       measurement_.scale = options_.measurement.scale;
+    // Of noise that lasts it is less than all of it.
+    if (round == 3) measurement_.scale = std::max(measurement_.scale, options_.measurement.scale);
   }
   tracker_.begin(BodySchema(tracker_.settled()), measurement_);
 }
@@ -166,7 +179,10 @@ void Adaptation::watch_noise(const TreeFilter::Judgement& judgement) {
   for (std::size_t n = 0; n < judgement.believed.size(); ++n)
     if (judgement.believed[n] == 1) quiet_distances_.push_back(judgement.squared_distance[n]);
   if (++num_quiet_ < kQuietSamples || quiet_distances_.size() < kFewestDistances) return;
-  const double scale = std::sqrt(upper_median(quiet_distances_) / chi_square_median(6));
+  // What a view biases has more of large distances than a Gaussian.
+  const double scale =
+      std::sqrt(std::max(upper_median(quiet_distances_) / chi_square_median(6),
+                         exceeded_by(kTail, quiet_distances_) / chi_square_quantile(6, kTail)));
   quiet_distances_.clear();
   num_quiet_ = 0;
   if (std::abs(std::log(scale)) < 0.05) return;
@@ -182,10 +198,14 @@ void Adaptation::count_outliers(const TreeFilter::Judgement& judgement) {
   }
 }
 
-void Adaptation::update_measurement() {
+double Adaptation::outlier_rate() const {
   const double told = options_.measurement.outlier_rate;
   const double seen = (kPriorReadings * told + num_outliers_) / (kPriorReadings + num_read_);
-  const double rate = std::clamp(kMoreOutliers * seen, told, kMostOutliers);
+  return std::clamp(kMoreOutliers * seen, told, kMostOutliers);
+}
+
+void Adaptation::update_measurement() {
+  const double rate = outlier_rate();
   const double worth = drift_watch_.worth().value_or(1);
   if (std::abs(std::log(rate / measurement_.outlier_rate)) < kSameNoise &&
       std::abs(std::log(worth / measurement_.worth)) < kSameNoise)

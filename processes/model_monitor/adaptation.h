@@ -83,6 +83,8 @@ class Adaptation {
   void calibrate(const std::vector<ActionPoseSample>& samples);
   void set_noise_scale(double scale);
   void watch_noise(const TreeFilter::Judgement& judgement);
+  /// As the told one and those counted make it.
+  double outlier_rate() const;
   void count_outliers(const TreeFilter::Judgement& judgement);
   /// How rare outliers are, and how much correlated samples are worth, as seen so far.
   void update_measurement();

@@ -183,12 +183,12 @@ FittedEdge fit_edge(const AcceptedModel& accepted, int from, int to, const EdgeD
   return result;
 }
 
-void fit_jointly(const EdgeData& data, std::vector<FittedEdge>* fitted, BodySchema* schema) {
+double fit_jointly(const EdgeData& data, std::vector<FittedEdge>* fitted, BodySchema* schema) {
   // More instants than this are thinned; so many more that thinning costs what the joint fit gains
   // are left to the pairs.
   constexpr int kMaxFrames = 2500;
   constexpr std::size_t kTooMany = 6000;
-  if (data.samples.size() > kTooMany) return;
+  if (data.samples.size() > kTooMany) return 0;
   std::vector<PairData> told;
   const auto seen = [&](int part) {
     told.push_back(make_part_data(data.samples, part, data.told, kMaxFrames));
@@ -196,25 +196,22 @@ void fit_jointly(const EdgeData& data, std::vector<FittedEdge>* fitted, BodySche
   };
   std::vector<TreeNode> nodes{{schema->root, -1, {}}};
   std::vector<PairData> poses{seen(schema->root)};
-  if (poses[0].size() < 2 || !is_at_rest(poses[0], data.actions, data.validity)) return;
+  if (poses[0].size() < 2 || !is_at_rest(poses[0], data.actions, data.validity)) return 0;
   for (const FittedEdge& f : *fitted) {
     const auto parent = std::find_if(
         nodes.begin(), nodes.end(), [&](const TreeNode& node) { return node.part == f.edge.from; });
     if (parent == nodes.end()) continue;  // another component
-    if (f.edge.residual_gp) return;       // no chain of screws
+    if (f.edge.residual_gp) return 0;     // no chain of screws
     nodes.push_back({f.edge.to, static_cast<int>(parent - nodes.begin()), f.model});
     poses.push_back(seen(f.edge.to));
   }
-  if (nodes.size() < 2) return;
+  if (nodes.size() < 2) return 0;
   const Eigen::VectorXd of_pairs = scatter_of(*fitted, nodes, data.actions);
   TreeFit fit(std::move(nodes), std::move(poses), data.actions, true);
   fit.fit(20, 1e-6);
-  if (drop_contradicted(fit, fitted)) {
-    fit_jointly(data, fitted, schema);
-    return;
-  }
+  if (drop_contradicted(fit, fitted)) return fit_jointly(data, fitted, schema);
   const Eigen::VectorXd scatter = joint_scatter(fit, told, of_pairs);
-  const auto covariance = fit.covariance(data.measurement, view_share(data.measurement));
+  const auto covariance = fit.covariance(data.measurement, view_share(data.measurement), scatter);
   Eigen::Index next = 0;
   for (std::size_t k = 1; k < fit.nodes().size(); ++k) {
     const TreeNode& node = fit.nodes()[k];
@@ -232,11 +229,13 @@ void fit_jointly(const EdgeData& data, std::vector<FittedEdge>* fitted, BodySche
     }
   }
   schema->X_CR = fit.root_pose();
-  if (!covariance) return;
-  schema->X_CR_covariance = covariance->root;
-  for (std::size_t k = 0; k < fit.nodes().size(); ++k)
-    if (!covariance->frames[k].isZero(0))
-      schema->frame_covariances[fit.nodes()[k].part] = covariance->frames[k];
+  if (covariance) {
+    schema->X_CR_covariance = covariance->root;
+    for (std::size_t k = 0; k < fit.nodes().size(); ++k)
+      if (!covariance->frames[k].isZero(0))
+        schema->frame_covariances[fit.nodes()[k].part] = covariance->frames[k];
+  }
+  return fit.serial_correlation();
 }
 
 }  // namespace bodyschema

@@ -36,7 +36,7 @@ FittedEdge fit_edge(const AcceptedModel& accepted, int from, int to, const EdgeD
 /// everything on the way from it are witnesses too, beside the two markers that each edge was
 /// fitted to before. X_CR with them, and the scatter of the joints. An edge whose part is elsewhere
 /// than all of them say, at most instants, goes. Left alone where the root moves or an edge is no
-/// chain of screws.
-void fit_jointly(const EdgeData& data, std::vector<FittedEdge>* fitted, BodySchema* schema);
+/// chain of screws. Returns TreeFit::serial_correlation(); 0 where it left them alone.
+double fit_jointly(const EdgeData& data, std::vector<FittedEdge>* fitted, BodySchema* schema);
 
 }  // namespace bodyschema

@@ -151,36 +151,22 @@ double price_of(int num_frames, double num_independent) {
   return 0.5 * std::log(num_independent) * num_frames / num_independent;
 }
 
-// The joints of a tree, and what moves each in a frame.
-struct TreeJoints {
-  explicit TreeJoints(const TreeFit& fit) : first(fit.nodes().size()) {
-    for (std::size_t k = 0; k < fit.nodes().size(); ++k) {
-      first[k] = count;
-      if (k > 0) count += fit.nodes()[k].model.num_joints();
-    }
-  }
-
-  /// Of the joints of each edge, twists in the camera's frame.
-  std::vector<MotionJacobian> twists(const TreeFit& fit, int t) const {
-    std::vector<MotionJacobian> result(first.size(), MotionJacobian(6, 0));
-    for (int k = 1; k < static_cast<int>(first.size()); ++k)
-      result[k] = adjoint(fit.pose(t, k)) *
-                  motion_jacobian(fit.nodes()[k].model, fit.actions(), fit.sample(t));
-    return result;
-  }
-
-  std::vector<int> first;  ///< by node: the index of its edge's first joint
-  int count = 0;
-};
+// By node: the index of its edge's first joint among all joints of the tree; then their number.
+std::vector<int> first_joints(const TreeFit& fit) {
+  std::vector<int> result{0, 0};
+  for (std::size_t k = 1; k < fit.nodes().size(); ++k)
+    result.push_back(result.back() + fit.nodes()[k].model.num_joints());
+  return result;
+}
 
 // What the readings of a frame say that are no outliers where the joints scatter by `S`.
-Term term_of(const TreeFit& fit, const std::vector<PairData>& told, const TreeJoints& joints,
+Term term_of(const TreeFit& fit, const std::vector<PairData>& told, const std::vector<int>& first,
              const Eigen::VectorXd& S, double dof, int t) {
-  Term term{.A = Eigen::MatrixXd::Zero(joints.count, joints.count),
-            .b = Eigen::VectorXd::Zero(joints.count),
+  Term term{.A = Eigen::MatrixXd::Zero(first.back(), first.back()),
+            .b = Eigen::VectorXd::Zero(first.back()),
             .num_residuals = 0,
             .bound = std::numeric_limits<double>::infinity()};
-  const std::vector<MotionJacobian> twists = joints.twists(fit, t);
+  const std::vector<MotionJacobian> twists = fit.joint_twists(t);
   const int n = static_cast<int>(twists.size());
   std::vector<Matrix6d> information(n, Matrix6d::Zero());  // of the parts from there on
   std::vector<Vector6d> gradient(n, Vector6d::Zero());
@@ -193,7 +179,7 @@ Term term_of(const TreeFit& fit, const std::vector<PairData>& told, const TreeJo
       Matrix6d C = Matrix6d::Identity();
       for (int e = k; e > 0; e = fit.nodes()[e].parent) {
         const MotionJacobian U = A * twists[e];
-        C += U * S.segment(joints.first[e], U.cols()).asDiagonal() * U.transpose();
+        C += U * S.segment(first[e], U.cols()).asDiagonal() * U.transpose();
       }
       if (r.dot(C.llt().solve(r)) < outlier_threshold(reading->num_residuals)) {
         information[k] += A.transpose() * A;
@@ -206,13 +192,12 @@ Term term_of(const TreeFit& fit, const std::vector<PairData>& told, const TreeJo
     const int parent = fit.nodes()[k].parent;
     information[parent] += information[k];
     gradient[parent] += gradient[k];
-    term.b.segment(joints.first[k], twists[k].cols()) = twists[k].transpose() * gradient[k];
+    term.b.segment(first[k], twists[k].cols()) = twists[k].transpose() * gradient[k];
     const MotionJacobian IT = information[k] * twists[k];
     for (int e = k; e > 0; e = fit.nodes()[e].parent) {
       const Eigen::MatrixXd block = twists[e].transpose() * IT;
-      term.A.block(joints.first[e], joints.first[k], block.rows(), block.cols()) = block;
-      term.A.block(joints.first[k], joints.first[e], block.cols(), block.rows()) =
-          block.transpose();
+      term.A.block(first[e], first[k], block.rows(), block.cols()) = block;
+      term.A.block(first[k], first[e], block.cols(), block.rows()) = block.transpose();
     }
   }
   return term;
@@ -232,7 +217,7 @@ Eigen::VectorXd joint_scatter(const Fit& fit, const LeaveOneOut& loo, const Pair
 
 Eigen::VectorXd joint_scatter(const TreeFit& fit, const std::vector<PairData>& told,
                               const Eigen::VectorXd& start) {
-  const TreeJoints joints(fit);
+  const std::vector<int> first = first_joints(fit);
   std::vector<int> samples;
   int num_residuals = 0, num_parameters = 6;
   for (int t = 0; t < fit.num_frames(); ++t) {
@@ -243,7 +228,7 @@ Eigen::VectorXd joint_scatter(const TreeFit& fit, const std::vector<PairData>& t
   }
   for (std::size_t k = 1; k < told.size(); ++k)
     num_parameters += 6 + 6 * fit.nodes()[k].model.num_joints();
-  if (joints.count == 0 || num_residuals <= num_parameters) return start;
+  if (first.back() == 0 || num_residuals <= num_parameters) return start;
   const double dof = std::sqrt(num_residuals / static_cast<double>(num_residuals - num_parameters));
   const double num_independent = fit.actions().blocks().count(samples, [](int s) { return s; });
   const double price = price_of(fit.num_frames(), num_independent);
@@ -251,7 +236,7 @@ Eigen::VectorXd joint_scatter(const TreeFit& fit, const std::vector<PairData>& t
   for (int round = 0; round < kRounds; ++round) {
     std::vector<Term> terms;
     for (int t = 0; t < fit.num_frames(); ++t)
-      terms.push_back(term_of(fit, told, joints, S, dof, t));
+      terms.push_back(term_of(fit, told, first, S, dof, t));
     S = beside_the_noise(std::move(terms), price);
   }
   return S.cwiseSqrt();

@@ -103,7 +103,7 @@ LearnResult fit_tree(const LearnedStructure& structure,
   });
   estimate_root_pose(samples, measurement, &schema);
   if (schema.has_part(schema.root) && schema.has_rotation(schema.root))
-    fit_jointly(data, &fitted, &schema);
+    result.serial_correlation = fit_jointly(data, &fitted, &schema);
   for (const FittedEdge& f : fitted) schema.edges.push_back(f.edge);
   schema.set_covered(samples);
 

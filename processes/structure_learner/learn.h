@@ -37,9 +37,11 @@ struct LearnResult {
   std::vector<Outlier> outliers;  ///< ascending by sample, then part
   NoiseSource noise_source = NoiseSource::kAssumed;
   bool is_one_cluster = false;  ///< see one_cluster.h
-  CommandDelay command_delay;   ///< of a stream's poses, taken into account
-  int num_screens = 0;          ///< closed-form hypotheses looked at
-  int num_fits = 0;             ///< Levenberg–Marquardt fits of the search
+  /// Of poses at rest: what the joint fit leaves has this correlation from one sample to the next.
+  double serial_correlation = 0;
+  CommandDelay command_delay;  ///< of a stream's poses, taken into account
+  int num_screens = 0;         ///< closed-form hypotheses looked at
+  int num_fits = 0;            ///< Levenberg–Marquardt fits of the search
 };
 
 /// Learns the body schema from scratch: structure and local models (Sections 3.1 and 3.2). Where

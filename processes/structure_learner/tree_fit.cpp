@@ -270,6 +270,14 @@ void TreeFit::fit(int max_iterations, double tolerance) {
   }
 }
 
+std::vector<MotionJacobian> TreeFit::joint_twists(int frame) const {
+  std::vector<MotionJacobian> result(nodes_.size(), MotionJacobian(6, 0));
+  for (int k = 1; k < static_cast<int>(nodes_.size()); ++k)
+    result[k] =
+        adjoint(pose(frame, k)) * motion_jacobian(nodes_[k].model, actions_, samples_[frame]);
+  return result;
+}
+
 double TreeFit::log_likelihood() const {
   double sum = -cost_;
   for (int t = 0; t < num_frames(); ++t)

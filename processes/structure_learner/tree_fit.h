@@ -45,7 +45,7 @@ class TreeFit {
   /// score, by what is told of the measurements, between two inverse Hessians (the sandwich of an
   /// M-estimator). What does not average out: the errors of a tag, which all its sights share; of
   /// near-identical views of a part its systematic error and `view_share` of the variance of its
-  /// noise. Of a stream, noise that lasts is found in what the fit leaves.
+  /// noise. Noise that lasts is found in what the fit leaves.
   struct Covariance {
     Matrix6d root = Matrix6d::Zero();     ///< of root_pose()
     std::vector<ParameterMatrix> models;  ///< by node
@@ -53,9 +53,10 @@ class TreeFit {
     /// sign, for the part's frame is where its markers were seen. Zero at leaves.
     std::vector<Matrix6d> frames;
   };
-  /// std::nullopt if the root moves, or the data do not determine the tree.
-  std::optional<Covariance> covariance(const MeasurementModel& measurement,
-                                       double view_share) const;
+  /// std::nullopt if the root moves, or the data do not determine the tree. `scatter`
+  /// [half ranges]: of the joints of all nodes in their order, joint_scatter(); or empty.
+  std::optional<Covariance> covariance(const MeasurementModel& measurement, double view_share,
+                                       const Eigen::VectorXd& scatter = {}) const;
 
   /// Of the noise, from one sample to the next; 0 in a stream, whose blocks have it already.
   double serial_correlation() const;
@@ -66,6 +67,8 @@ class TreeFit {
   /// In the camera's frame.
   const Pose& pose(int frame, int node) const { return poses_[at(frame, node)]; }
   bool is_seen(int node) const { return data_[node].size() > 0; }
+  /// By node: twists of the joints of its edge in the camera's frame, a column each.
+  std::vector<MotionJacobian> joint_twists(int frame) const;
   /// nullptr where the frame did not see the node.
   const FrameFit* reading(int frame, int node) const {
     const int index = at(frame, node);
@@ -90,6 +93,11 @@ class TreeFit {
   Eigen::MatrixXd with_fixed_gauge(const Normal& normal) const;
   Eigen::MatrixXd score_covariance(const Normal& normal, const MeasurementModel& measurement,
                                    double view_share, double correlation_time) const;
+  void add_lasting(const Normal& normal, int node,
+                   const std::vector<std::pair<int, Matrix6d>>& effects, double coefficient,
+                   Eigen::MatrixXd* sum) const;
+  void add_scatter(const Normal& normal, const Eigen::VectorXd& scatter,
+                   Eigen::MatrixXd* sum) const;
   Eigen::MatrixXd scores(const Normal& normal) const;
   std::vector<Matrix6d> frame_covariances(const Normal& normal, const Eigen::MatrixXd& joint) const;
   void add_composites(const Normal& normal, std::vector<Matrix6d> own, Eigen::MatrixXd* sum) const;

@@ -100,6 +100,7 @@ Eigen::MatrixXd TreeFit::score_covariance(const Normal& normal, const Measuremen
                                           double view_share, double correlation_time) const {
   const auto size = normal.H.rows();
   Eigen::MatrixXd score = Eigen::MatrixXd::Zero(size, size);
+  const double lasting = serial_correlation();
   // The share that averages out, by the marker.
   std::vector<Matrix6d> own(frame_index_.size(), Matrix6d::Zero());
   for (int k = 0; k < static_cast<int>(nodes_.size()); ++k) {
@@ -108,6 +109,7 @@ Eigen::MatrixXd TreeFit::score_covariance(const Normal& normal, const Measuremen
     for (const int view : views) ++sizes[view];
     // What is common to a view and to all sights of a tag, parameters × effects.
     std::map<int, Eigen::MatrixXd> of_view, of_tag;
+    std::vector<std::pair<int, Matrix6d>> lasting_effects;  // by frame
     for (int t = 0; t < num_frames(); ++t) {
       const int frame = frame_index_[at(t, k)];
       if (frame < 0) continue;
@@ -138,15 +140,81 @@ Eigen::MatrixXd TreeFit::score_covariance(const Normal& normal, const Measuremen
       own[at(t, k)] = twist *
                       ((1 - share) * correlation_time * noise + (is_alone ? 1 : 0) * systematic) *
                       twist.transpose();
+      if (lasting > 0) {
+        const Eigen::SelfAdjointEigenSolver<Matrix6d> eigen(noise);
+        const Matrix6d root = eigen.eigenvectors() *
+                              eigen.eigenvalues().cwiseMax(0).cwiseSqrt().asDiagonal() *
+                              eigen.eigenvectors().transpose();
+        lasting_effects.emplace_back(t, twist * std::sqrt(1 - share) * root);
+      }
       if (!is_alone)
         add(twist * Eigen::LLT<Matrix6d>(systematic + share * noise).matrixL().toDenseMatrix(),
             &of_view[views[frame]]);
     }
     for (const auto* common : {&of_view, &of_tag})
       for (const auto& [id, G] : *common) score += G * G.transpose();
+    add_lasting(normal, k, lasting_effects, lasting, &score);
   }
   add_composites(normal, std::move(own), &score);
   return score;
+}
+
+// Of a marker's errors of which `coefficient` lasts from one sample to the next, what two of them
+// have in common: Σ ρ^(t − u) (G_u G_tᵀ + G_t G_uᵀ) over u < t, with G_t = Sᵀ · effect of frame t.
+void TreeFit::add_lasting(const Normal& normal, int node,
+                          const std::vector<std::pair<int, Matrix6d>>& effects, double coefficient,
+                          Eigen::MatrixXd* sum) const {
+  if (effects.size() < 2) return;
+  std::vector<int> edges;  // that lead to the marker
+  std::vector<Eigen::Index> first{0};
+  for (int e = node; e >= 0; e = nodes_[e].parent) {
+    edges.push_back(e);
+    first.push_back(first.back() + normal.S[at(0, e)].cols());
+  }
+  const Eigen::Index size = first.back();
+  Eigen::MatrixXd cross = Eigen::MatrixXd::Zero(size, size), now(size, 6),
+                  past = Eigen::MatrixXd::Zero(size, 6);  // Σ ρ^(t − u) G_u
+  int before = samples_[effects.front().first];
+  for (const auto& [t, effect] : effects) {
+    for (std::size_t n = 0; n < edges.size(); ++n)
+      now.middleRows(first[n], first[n + 1] - first[n]) =
+          normal.S[at(t, edges[n])].transpose().lazyProduct(effect);
+    past *= std::pow(coefficient, samples_[t] - before);
+    cross.noalias() += past * now.transpose();
+    past += now;
+    before = samples_[t];
+  }
+  cross += Eigen::MatrixXd(cross.transpose());
+  for (std::size_t n = 0; n < edges.size(); ++n)
+    for (std::size_t m = 0; m < edges.size(); ++m) {
+      const Eigen::Index rows = first[n + 1] - first[n], cols = first[m + 1] - first[m];
+      sum->block(normal.offset[edges[n]], normal.offset[edges[m]], rows, cols) +=
+          cross.block(first[n], first[m], rows, cols);
+    }
+}
+
+// What a joint is off by in a frame is in all markers beyond it.
+void TreeFit::add_scatter(const Normal& normal, const Eigen::VectorXd& scatter,
+                          Eigen::MatrixXd* sum) const {
+  if (scatter.isZero(0)) return;
+  const int n = static_cast<int>(nodes_.size());
+  for (int t = 0; t < num_frames(); ++t) {
+    const std::vector<MotionJacobian> twists = joint_twists(t);
+    Eigen::Index d = 0;
+    for (int k = 1; k < n; ++k)
+      for (Eigen::Index of_edge = 0; of_edge < twists[k].cols(); ++of_edge, ++d) {
+        if (scatter(d) == 0) continue;
+        const Vector6d off = scatter(d) * twists[k].col(of_edge);
+        Eigen::VectorXd score = Eigen::VectorXd::Zero(sum->rows());
+        for (int e = 0; e < n; ++e) {
+          if (!is_below(e, k) && !is_below(k, e)) continue;
+          const ParameterJacobian& S = normal.S[at(t, e)];
+          const Vector6d moved = normal.I[at(t, std::max(e, k))] * off;
+          score.segment(normal.offset[e], S.cols()) = S.transpose() * moved;
+        }
+        *sum += score * score.transpose();
+      }
+  }
 }
 
 // An error of a part's frame is in the edge to it and, with opposite sign, in those from it.
@@ -174,7 +242,8 @@ std::vector<Matrix6d> TreeFit::frame_covariances(const Normal& normal,
 }
 
 std::optional<TreeFit::Covariance> TreeFit::covariance(const MeasurementModel& measurement,
-                                                       double view_share) const {
+                                                       double view_share,
+                                                       const Eigen::VectorXd& scatter) const {
   if (!root_rests_) return std::nullopt;
   const Normal normal = normal_equations();
   const Eigen::MatrixXd H = with_fixed_gauge(normal);
@@ -187,10 +256,11 @@ std::optional<TreeFit::Covariance> TreeFit::covariance(const MeasurementModel& m
   const Eigen::MatrixXd inverse = unit.asDiagonal() * llt.solve(Eigen::MatrixXd(unit.asDiagonal()));
   // The prior added to H is a measurement like others.
   const bool is_stream = actions_.blocks().is_stream();
-  const Eigen::MatrixXd score =
+  Eigen::MatrixXd score =
       H - normal.H +
       score_covariance(normal, measurement, view_share,
                        is_stream ? correlation_time(scores(normal), inverse) : 1);
+  add_scatter(normal, scatter, &score);
   const Eigen::MatrixXd joint = inverse * score * inverse;
   Covariance result;
   result.models.resize(nodes_.size());

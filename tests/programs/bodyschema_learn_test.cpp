@@ -103,9 +103,10 @@ TEST_F(BodyschemaProgramTest, LearnPrintsTheKeysThatAreDocumented) {
   const Outcome outcome = run({"learn", write_robot("s.csv"), "--json"});
   EXPECT_EQ(outcome.err, "");
   const Json json = outcome.json();
-  for (const char* key : {"complete", "samples", "parts", "position_parts", "root", "edges",
-                          "unconnected", "unused_signals", "undecided_signals", "outliers", "noise",
-                          "one_cluster", "command_lag_s", "command_smear_s"}) {
+  for (const char* key :
+       {"complete", "samples", "parts", "position_parts", "root", "edges", "unconnected",
+        "unused_signals", "undecided_signals", "outliers", "noise", "one_cluster",
+        "serial_correlation", "command_lag_s", "command_smear_s"}) {
     EXPECT_TRUE(json.contains(key)) << key;
   }
   EXPECT_EQ(json.size(), 14U);

@@ -13,6 +13,7 @@
 #include "common/config/rig.h"
 #include "common/estimation/evaluation.h"
 #include "common/geometry/angle.h"
+#include "common/text/pose_text.h"
 #include "processes/console/commands/commands.h"
 #include "processes/console/commands/files.h"
 #include "processes/console/engineered_model.h"
@@ -36,6 +37,10 @@ struct LearnArguments {
   std::string method = "screw";
   bool json = false;
 };
+
+/// Correlations of the noise above it are told. Noise of AR(1) 0.5 is below it with 60 poses, a
+/// camera that drifts by a few times the noise above 0.8.
+constexpr double kMuchLeft = 0.6;
 
 /// The chapter's own method: a result to compare with.
 LearnResult learn_as_the_chapter(const Recording& recording,
@@ -85,11 +90,20 @@ void run_learn(const LearnArguments& arguments) {
   }
   Json json = structure_json(result.schema, result.outliers, result.noise_source);
   json["one_cluster"] = result.is_one_cluster;
+  json["serial_correlation"] = result.serial_correlation;
   json["command_lag_s"] = static_cast<double>(result.command_delay.lag_us) / 1e6;
   json["command_smear_s"] = static_cast<double>(result.command_delay.smear_us) / 1e6;
   std::string text = structure_text(result.schema, result.noise_source);
   if (result.command_delay != CommandDelay{})
     text += "  " + delay_text(result.command_delay) + "\n";
+  if (noise && result.noise_source == NoiseSource::kResiduals)
+    text += fmt::format("  --noise {} is too small: the best models leave more\n",
+                        pose_text(noise->position_m, noise->rotation_rad));
+  if (result.serial_correlation > kMuchLeft)
+    text += fmt::format(
+        "  what the models leave lasts from one pose to the next (correlation {:.2f}): if the "
+        "camera or what it stands on moved meanwhile, learn from before and from after it\n",
+        result.serial_correlation);
   if (result.is_one_cluster)
     text +=
         "  the poses are one cluster: what is learned holds near them alone; move all joints "

@@ -20,6 +20,9 @@ constexpr double kClearLead = 1;
 constexpr std::int64_t kLongestUnclear = 3;
 /// Samples below which nothing is found out where an edge is soft.
 constexpr int kFewestSoft = 3;
+/// Where outliers are more frequent by this factor than told, a change is not found from fewer of
+/// them than come in a row by chance: some agree, as flips in like views do.
+constexpr double kMoreOutliers = 2;
 /// What the settled body is off by from the start, as a share of what a change explains.
 constexpr double kSystematicShare = 0.03;
 /// Samples from one fit of what has settled to the next.
@@ -220,12 +223,34 @@ void HypothesisTracker::offer(Hypothesis hypothesis) {
   beam_.erase(least);
 }
 
+bool HypothesisTracker::may_be_outliers(const ElementId& element, std::int64_t since) const {
+  const double rate = measurement_.outlier_rate;
+  if (rate < kMoreOutliers * options_.measurement.outlier_rate) return false;
+  const auto is_concerned = [&](int node) {
+    if (element.is_camera() || element.id == filter().part(node)) return true;
+    if (element.is_tag()) return false;
+    while (node > 0 && filter().part(node) != element.id) node = filter().parent(node);
+    return node > 0;
+  };
+  int num_outliers = 0;
+  for (const Seen& seen : recent_) {
+    if (seen.sample.sample_index < since) continue;
+    const auto believed = filter().judge(filter().prepare(seen.sample)).believed;
+    for (int node = 0; node < filter().num_nodes(); ++node)
+      num_outliers += believed[static_cast<std::size_t>(node)] == 0 && is_concerned(node);
+  }
+  return std::pow(rate, num_outliers) > options_.false_alarm_rate;
+}
+
 double HypothesisTracker::needed_lead(const Hypothesis& other, std::int64_t now) const {
   const double systematic = kSystematicShare * std::max(0.0, log_odds());
   const auto is_learned = [](const Change& c) { return c.what.fitted.change.is_learned(); };
   bool is_new = other.changes.size() > changes().size();
   for (const Change& c : other.changes) {
-    is_new |= !last_at(changes(), c.what.element);
+    const bool is_at_new_place = !last_at(changes(), c.what.element);
+    is_new |= is_at_new_place;
+    if (is_at_new_place && may_be_outliers(c.what.element, c.since))
+      return std::numeric_limits<double>::infinity();
     is_new |= is_learned(c) && std::none_of(changes().begin(), changes().end(), is_learned);
     if (is_soft_ && now - c.since + 1 < kFewestSoft) return std::numeric_limits<double>::infinity();
   }
@@ -297,7 +322,9 @@ void HypothesisTracker::detect(std::int64_t now, std::vector<AdaptationEvent>* e
     return;
   }
   const auto [cusum, second] = tests_->highest();
-  if (cusum.value <= tests_->alarm() || (detected_ && is_told_)) return;
+  if (cusum.value <= tests_->alarm() || (detected_ && is_told_) ||
+      may_be_outliers(elements.front(), cusum.since))
+    return;
   // What a young explanation leaves elsewhere may be its own fault.
   const auto is_beside = [&](const Change& c) {
     return is_in(elements_around(filter(), c.what.element.id), elements.front());

@@ -140,6 +140,8 @@ class HypothesisTracker {
   /// Another form, or element, of a change; std::nullopt if there is none.
   std::optional<Replacement> best_form(const Hypothesis& of, const Change& change,
                                        const BodySchema& others, std::int64_t now);
+  /// Of the parts that it moves no more outliers, since then, than come in a row by chance.
+  bool may_be_outliers(const ElementId& element, std::int64_t since) const;
   double needed_lead(const Hypothesis& other, std::int64_t now) const;
   void choose(std::int64_t now, std::vector<AdaptationEvent>* events);
   void stand(Hypothesis next, std::int64_t now, std::vector<AdaptationEvent>* events);

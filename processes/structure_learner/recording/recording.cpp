@@ -281,6 +281,10 @@ struct Instant {
 };
 using Instants = std::map<double, Instant>;  ///< by t
 
+bool is_same(const PartObservation& a, const PartObservation& b) {
+  return a.has_rotation == b.has_rotation && a.X_CB.matrix() == b.X_CB.matrix();
+}
+
 void add_row(const Row& row, std::size_t number, const Header& header, Instants& instants,
              Recording& recording) {
   const double t = row.number(0, "t");
@@ -306,9 +310,12 @@ void add_row(const Row& row, std::size_t number, const Header& header, Instants&
                                        header.signals[i], instant.line));
   }
   auto& parts = recording.samples[instant.sample].parts;
-  if (recording.samples[instant.sample].find(observation.part))
+  if (const PartObservation* known_part =
+          recording.samples[instant.sample].find(observation.part)) {
+    if (is_same(*known_part, observation)) return;  // a row written twice
     throw row.error(header.part,
                     fmt::format("part {} stands twice at this instant", observation.part));
+  }
   parts.push_back(std::move(observation));
 }
 

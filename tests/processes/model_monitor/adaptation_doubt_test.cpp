@@ -8,7 +8,9 @@
 #include <set>
 
 #include "common/geometry/angle.h"
+#include "processes/structure_learner/learn.h"
 #include "tests/processes/model_monitor/adaptation_life.h"
+#include "tests/support/imperfect_robot.h"
 
 namespace bodyschema::test {
 namespace {
@@ -48,6 +50,46 @@ TEST(AdaptationTest, WhatIsRestoredIsToldInAllItsPlacesAndNotWhereAMarkerIsAnOut
     }
     EXPECT_EQ(provisional, changed);
   }
+}
+
+/// Nothing is told of a healthy robot, but where a link bends after that.
+void expect_bend_alone(const Imperfection& imperfection, int num_joints, int seed,
+                       int num_healthy) {
+  SCOPED_TRACE(std::to_string(num_joints) + " joints, seed " + std::to_string(seed));
+  ImperfectRobot robot(num_joints, true, imperfection, static_cast<std::uint64_t>(seed));
+  LearnOptions learning;
+  learning.root = 1;
+  learning.measurement.noise = Noise{0.003, 1 * kDegree};
+  AdaptationOptions options;
+  options.measurement.noise = learning.measurement.noise;
+  Adaptation adaptation(learn(robot.signals(), robot.babble(100), learning).schema, options);
+  for (int n = 0; n < num_healthy; ++n)
+    for (const AdaptationEvent& e : adaptation.on_sample(robot.go(robot.random_action())))
+      EXPECT_EQ(e.kind, Kind::kProbeWanted) << text(e);
+  const int bent = 2 + num_joints / 2;
+  robot.bend(bent, 0.03, 20 * kDegree);
+  bool is_found = false;
+  for (int n = 0; n < 20; ++n)
+    for (const AdaptationEvent& e : adaptation.on_sample(robot.go(robot.random_action())))
+      is_found |= part_of(e) == bent;
+  EXPECT_TRUE(is_found);
+}
+
+// A fifth of all readings: some flips come in a row, in like views, and agree.
+TEST(AdaptationTest, FlipsInARowAreNoChange) {
+  for (const int num_joints : {3, 4, 5, 6})
+    expect_bend_alone({.flip_share = 0.2}, num_joints, 497 + num_joints, 500);
+}
+
+TEST(AdaptationTest, WhatAViewBiasesIsNoChange) {
+  for (const int seed : {504, 509})
+    expect_bend_alone({.view_bias_m = 0.004, .view_bias_deg = 2}, 7, seed, 200);
+}
+
+// The first samples show little of noise that lasts.
+TEST(AdaptationTest, NoiseThatLastsIsNoChange) {
+  for (const int seed : {504, 507, 509})
+    expect_bend_alone({.correlation = 0.9}, 3 + (seed - 500) % 5, seed, 60);
 }
 
 TEST(AdaptationTest, AnAmbiguousEdgeIsReportedOnceItIsLocalised) {

@@ -127,6 +127,13 @@ TEST(RecordingTest, AnInstantIsATimeWhereverItsRowsStand) {
 }
 
 // Slightly different ones would make two instants with half of the parts each.
+TEST(RecordingTest, ARowWrittenTwiceCountsOnce) {
+  const std::string row = "0,1,2,1,0,0,0,1,0,0,0\n";
+  const Recording recording = parse_csv(kHeader + row + "0,1,2,2,0,0,1,1,0,0,0\n" + row, "f");
+  ASSERT_EQ(recording.samples.size(), 1U);
+  EXPECT_EQ(recording.samples[0].parts.size(), 2U);
+}
+
 TEST(RecordingTest, OneInstantHasOneAction) {
   EXPECT_EQ(error_of(kHeader + "0,1,2,1,0,0,0,1,0,0,0\n\n0,1,2.000001,2,0,0,0,1,0,0,0\n"),
             "f.csv:4:5: q2: expected the value of line 2, which has the same t: one instant has "
@@ -298,7 +305,7 @@ TEST(RecordingTest, ABrokenRowIsPointedAtWithWhatWasExpected) {
             "f.csv:2:7: part: expected a whole number from 0, found '-1'");
   EXPECT_EQ(error_of(kHeader + "0,1,2,99999999999,0,0,0,1,0,0,0\n"),
             "f.csv:2:7: part: expected a whole number from 0, found '99999999999'");
-  EXPECT_EQ(error_of(kHeader + row + "0,1,2,1,0,0,0,1,0,0,0\n"),
+  EXPECT_EQ(error_of(kHeader + row + "0,1,2,1,0,0,1,1,0,0,0\n"),
             "f.csv:3:7: part 1 stands twice at this instant");
   EXPECT_EQ(error_of(kHeader + "0,1,2,1,0,0,0,1,1,0,0\n"),
             "f.csv:2:15: qw,qx,qy,qz: expected a unit quaternion, found norm 1.414214");
