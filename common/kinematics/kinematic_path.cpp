@@ -47,7 +47,7 @@ std::optional<KinematicPath> KinematicPath::between(const BodySchema& schema, in
     const bool is_forward = tree.nodes()[node].is_forward;
     const Edge* const edge = &schema.edges[tree.nodes()[node].edge];
     const auto start = schema.frame_covariances.find(is_forward ? edge->from : edge->to);
-    path.legs_.push_back({*edge, is_forward});
+    path.legs_.push_back({*edge, is_forward, std::nullopt, schema.noise});
     if (path.legs_.size() > 1 && start != schema.frame_covariances.end())
       path.legs_.back().start = start->second;
     if (!is_screw_chain(*edge)) {
@@ -184,7 +184,8 @@ Matrix6d KinematicPath::covariance(const Eigen::Ref<const Eigen::VectorXd>& acti
     Matrix6d covariance = variance == Variance::kEmpirical ? leg.edge.empirical_covariance()
                                                            : leg.edge.prediction_covariance(theta);
     Matrix6d scatter = Matrix6d::Zero();
-    if (variance == Variance::kOneAction) scatter = leg.edge.scatter_covariance(theta);
+    if (variance == Variance::kOneAction)
+      scatter = leg.edge.scatter_covariance(theta) + leg.edge.unexplained_covariance(X, leg.noise);
     if (!leg.is_forward) {
       covariance = turned(covariance, X);
       scatter = turned(scatter, X);

@@ -48,6 +48,7 @@ class KinematicPath {
     bool is_forward = true;
     /// BodySchema::frame_covariances of the part between the leg before and this one.
     std::optional<Matrix6d> start = std::nullopt;
+    Noise noise = {};  ///< BodySchema::noise
   };
   /// A motion, and the constant transform X_after up to the next one: a screw motion along
   /// and about z, or else a leg of another kind, asked as a whole.

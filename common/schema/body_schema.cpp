@@ -8,6 +8,7 @@
 #include "common/kinematics/kinematic_path.h"
 #include "common/kinematics/kinematic_tree.h"
 #include "common/kinematics/screw_chain.h"
+#include "common/schema/standard_deviations.h"
 
 namespace bodyschema {
 namespace {
@@ -158,6 +159,12 @@ Matrix6d Edge::scatter_covariance(const Eigen::VectorXd& theta) const {
       .predict_by_displacements(&twists,
                                 residual_gp ? Residual(*residual_gp, theta, right).suffix : right);
   return twists * variances.asDiagonal() * twists.transpose();
+}
+
+Matrix6d Edge::unexplained_covariance(const Pose& X, const Noise& noise) const {
+  if (!residual_gp) return Matrix6d::Zero();
+  const Vector6d whole = empirical_covariance().diagonal();
+  return (whole - noise_of_pair(X, noise)).cwiseMax(0).asDiagonal();
 }
 
 Matrix6d Edge::empirical_covariance() const {

@@ -32,6 +32,12 @@ struct ScrewJoint {
   double scatter = 0;
 };
 
+/// Noise of one marker per axis, as configured or estimated.
+struct Noise {
+  double position_m = 0;
+  double rotation_rad = 0;
+};
+
 /// Derivative of a pose by an action, 6×m: (translation [m], rotation [rad]) per command unit.
 using PoseJacobian = Eigen::Matrix<double, 6, Eigen::Dynamic>;
 
@@ -41,7 +47,8 @@ enum class Variance {
   /// model is right, and too small where it is not.
   kFirstOrder,
   /// Of where the part is at one action: kFirstOrder, and what the joints on the way scatter from
-  /// one action to the next, see ScrewJoint::scatter.
+  /// one action to the next, see ScrewJoint::scatter; of soft edges what they leave beside the
+  /// noise.
   kOneAction,
   /// Of what will be seen: mean squares of the edges' leave-one-out residuals (the chapter prefers
   /// variances estimated from the data, Section 3.3). The noise of two markers is in every edge, so
@@ -105,6 +112,10 @@ struct Edge {
   /// What the scatter of the joints adds to the covariance of one pose (right perturbation in the
   /// frame of `to`): Σ_d scatter_d² t_d t_dᵀ with t_d the twist of joint d.
   Matrix6d scatter_covariance(const Eigen::VectorXd& theta) const;
+  /// Of a residual GP: what it leaves that the noise of its two markers does not explain, with the
+  /// parts `X` apart: hysteresis, what is no function of the action. From position_rms_m and
+  /// rotation_rms_rad, alike along all axes.
+  Matrix6d unexplained_covariance(const Pose& X, const Noise& noise) const;
   /// Covariance of an observed pose about the predicted one, from position_rms_m and
   /// rotation_rms_rad, alike along all axes; the same everywhere.
   Matrix6d empirical_covariance() const;
@@ -125,12 +136,6 @@ struct UnconnectedPart {
   Unconnected reason = Unconnected::kNotEnoughData;
   /// For people: what was tried and what is missing.
   std::string detail;
-};
-
-/// Noise of one marker per axis, as configured or estimated.
-struct Noise {
-  double position_m = 0;
-  double rotation_rad = 0;
 };
 
 /// From sample `found` on it was known that the body is as it is since `since` only.

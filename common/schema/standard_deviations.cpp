@@ -46,4 +46,13 @@ Noise deviations_of(const Matrix6d& covariance) {
           std::sqrt(covariance.bottomRightCorner<3, 3>().trace() / 3)};
 }
 
+Vector6d noise_of_pair(const Pose& X, const Noise& noise) {
+  const double rotation = noise.rotation_rad * noise.rotation_rad;
+  const double position =
+      2 * noise.position_m * noise.position_m + 2.0 / 3 * rotation * X.translation().squaredNorm();
+  Vector6d result;
+  result << Eigen::Vector3d::Constant(position), Eigen::Vector3d::Constant(2 * rotation);
+  return result;
+}
+
 }  // namespace bodyschema

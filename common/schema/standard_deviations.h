@@ -21,6 +21,11 @@ struct JointDeviation {
 /// Of each joint in the frame of the one before (the first: of `from`). Empty without a covariance.
 std::vector<JointDeviation> joint_deviations(const Edge& edge, const Eigen::VectorXd& theta);
 
+/// Variances per axis, (translation [m²], rotation [rad²]), of the pose of one part in another,
+/// seen with this noise `X` apart: the rotation of the one moves the other, across the line between
+/// them.
+Vector6d noise_of_pair(const Pose& X, const Noise& noise);
+
 /// Root mean square over three axes: translation [m], rotation [rad].
 Noise deviations_of(const Matrix6d& covariance);
 

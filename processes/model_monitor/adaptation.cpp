@@ -29,6 +29,9 @@ constexpr int kUpdateEach = 8;
 /// Newest samples of an earlier time that the noise is estimated from.
 constexpr std::size_t kMostPast = 96;
 constexpr double kLargestScale = 5;
+/// Chosen: with 1 noise of correlation 0.9 has 1.8 false events in 1000 samples, with 0 it has 0.6,
+/// and of noise told twice too large 96 samples do not show it.
+constexpr double kShareDown = 2.0 / 3;
 constexpr std::size_t kFewestDistances = 20;
 /// Quiet samples after which the noise is looked at again.
 constexpr int kQuietSamples = 32;
@@ -169,8 +172,9 @@ void Adaptation::calibrate(const std::vector<ActionPoseSample>& samples) {
     // A few samples tell no better than this.
     if (round == 3 && std::abs(std::log(measurement_.scale)) < 0.15)
       measurement_.scale = options_.measurement.scale;
-    // Of noise that lasts it is less than all of it.
-    if (round == 3) measurement_.scale = std::max(measurement_.scale, options_.measurement.scale);
+    // Of noise that lasts they show a part: a part of the way down, the rest by watch_noise().
+    const double less = measurement_.scale / options_.measurement.scale;
+    if (round == 3 && less < 1) measurement_.scale *= std::pow(less, kShareDown - 1);
   }
   tracker_.begin(BodySchema(tracker_.settled()), measurement_);
 }

@@ -331,9 +331,9 @@ CommandDelay least_near(const CommandDelay& start, const CommandDelay& without,
     const auto costs = costs_at({at_share(-1), at, at_share(1)});
     const double share = vertex(costs[0], costs[1], costs[2]);
     at = at_share(share);
-    // The dead time is not below 0, except by half an interval, since a command may be of the end of
-    // the interval in which it acts. Otherwise a joint that moves less than commanded would pass for
-    // a slow drive.
+    // The dead time is not below 0, except by half an interval, since a command may be of the end
+    // of the interval in which it acts. Otherwise a joint that moves less than commanded would pass
+    // for a slow drive.
     const std::int64_t late_us = std::max<std::int64_t>(0, at.lag_us);
     const std::int64_t widest_us = late_us + std::min(late_us / 4, step_us);
     const bool is_widest = at.smear_us > widest_us;

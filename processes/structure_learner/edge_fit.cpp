@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <numeric>
 
 #include "processes/structure_learner/joint_scatter.h"
 #include "processes/structure_learner/residual_fit.h"
@@ -151,6 +152,90 @@ bool drop_contradicted(const TreeFit& fit, std::vector<FittedEdge>* fitted) {
   return std::erase_if(*fitted, is_contradicted) > 0;
 }
 
+// Whether so many outliers stand one after the other where the frames are in the order of one of
+// the edge's signals that chance does not explain it: there it is the model that is wrong.
+bool is_wrong_at_some_commands(const LocalModel& model, const std::vector<int>& samples,
+                               const std::vector<bool>& outlying,
+                               const NormalizedActions& actions) {
+  constexpr double kLeastChance = 1e-4;
+  const auto n = samples.size();
+  const double share = static_cast<double>(std::count(outlying.begin(), outlying.end(), true)) /
+                       static_cast<double>(n);
+  std::vector<std::size_t> order(n);
+  for (const LocalModel::Joint& joint : model.joints) {
+    std::iota(order.begin(), order.end(), 0);
+    std::stable_sort(order.begin(), order.end(), [&](std::size_t a, std::size_t b) {
+      return actions(samples[a], joint.signal) < actions(samples[b], joint.signal);
+    });
+    int run = 0, longest = 0;
+    for (const std::size_t t : order) longest = std::max(longest, run = outlying[t] ? run + 1 : 0);
+    if (static_cast<double>(n) * std::pow(share, longest) < kLeastChance) return true;
+  }
+  return false;
+}
+
+// Edges that the joint fit has wrong at one end of a command's range, or in between.
+bool drop_wrong_at_some_commands(const TreeFit& fit, std::vector<FittedEdge>* fitted) {
+  // In a stream outliers last.
+  if (fit.actions().blocks().is_stream()) return false;
+  const auto is_wrong = [&](const FittedEdge& edge) {
+    for (int k = 1; k < static_cast<int>(fit.nodes().size()); ++k) {
+      if (fit.nodes()[k].part != edge.edge.to) continue;
+      std::vector<int> samples;
+      std::vector<bool> outlying;
+      for (int t = 0; t < fit.num_frames(); ++t)
+        if (const FrameFit* reading = fit.reading(t, k)) {
+          samples.push_back(fit.sample(t));
+          outlying.push_back(reading->squared_distance > outlier_threshold(reading->num_residuals));
+        }
+      return is_wrong_at_some_commands(fit.nodes()[k].model, samples, outlying, fit.actions());
+    }
+    return false;
+  };
+  return std::erase_if(*fitted, is_wrong) > 0;
+}
+
+// Without the joint that is told least from none, if that is by no more than what another joint of
+// its edge scatters by makes of it: the search took that for a joint.
+bool drop_weak_joint(const TreeFit& fit, const TreeFit::Covariance& covariance,
+                     const Eigen::VectorXd& scatter, const EdgeData& data,
+                     std::vector<FittedEdge>* fitted) {
+  constexpr double kLeastSigmas = 4;
+  double least = kLeastSigmas * kLeastSigmas;
+  int weak_node = -1, weak_joint = -1;
+  Eigen::Index first = 0;
+  for (int k = 1; k < static_cast<int>(fit.nodes().size()); ++k) {
+    const LocalModel& model = fit.nodes()[k].model;
+    const Eigen::VectorXd of_edge = scatter.segment(first, model.num_joints());
+    first += model.num_joints();
+    for (int d = 0; d < model.num_joints(); ++d) {
+      if (!(of_edge.sum() > of_edge(d))) continue;
+      const Eigen::Vector2d motion(model.joints[d].slide, model.joints[d].turn);
+      const int at = ScrewChainLayout::slide(d);
+      const Eigen::Matrix2d C = covariance.models[k].block<2, 2>(at, at);
+      const double sigmas2 = motion.dot(C.ldlt().solve(motion));
+      if (!(sigmas2 < least)) continue;
+      least = sigmas2;
+      weak_node = k;
+      weak_joint = d;
+    }
+  }
+  if (weak_node < 0) return false;
+  const TreeNode& node = fit.nodes()[weak_node];
+  AcceptedModel rest;
+  rest.model = node.model;
+  rest.model.transform(weak_joint) =
+      rest.model.transform(weak_joint) * rest.model.joints[weak_joint].X_after;
+  rest.model.joints.erase(rest.model.joints.begin() + weak_joint);
+  for (FittedEdge& f : *fitted) {
+    if (f.edge.to != node.part) continue;
+    rest.part_i = f.edge.from;
+    rest.part_j = f.edge.to;
+    f = fit_edge(rest, f.edge.from, f.edge.to, data, false);
+  }
+  return true;
+}
+
 }  // namespace
 
 LocalModel rescaled(LocalModel model, const NormalizedActions& from, const NormalizedActions& to) {
@@ -209,9 +294,12 @@ double fit_jointly(const EdgeData& data, std::vector<FittedEdge>* fitted, BodySc
   const Eigen::VectorXd of_pairs = scatter_of(*fitted, nodes, data.actions);
   TreeFit fit(std::move(nodes), std::move(poses), data.actions, true);
   fit.fit(20, 1e-6);
-  if (drop_contradicted(fit, fitted)) return fit_jointly(data, fitted, schema);
+  if (drop_contradicted(fit, fitted) || drop_wrong_at_some_commands(fit, fitted))
+    return fit_jointly(data, fitted, schema);
   const Eigen::VectorXd scatter = joint_scatter(fit, told, of_pairs);
   const auto covariance = fit.covariance(data.measurement, view_share(data.measurement), scatter);
+  if (covariance && drop_weak_joint(fit, *covariance, scatter, data, fitted))
+    return fit_jointly(data, fitted, schema);
   Eigen::Index next = 0;
   for (std::size_t k = 1; k < fit.nodes().size(); ++k) {
     const TreeNode& node = fit.nodes()[k];

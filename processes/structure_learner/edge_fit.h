@@ -35,8 +35,9 @@ FittedEdge fit_edge(const AcceptedModel& accepted, int from, int to, const EdgeD
 /// The edges of the root's component fitted to all of its markers at once: a root that rests and
 /// everything on the way from it are witnesses too, beside the two markers that each edge was
 /// fitted to before. X_CR with them, and the scatter of the joints. An edge whose part is elsewhere
-/// than all of them say, at most instants, goes. Left alone where the root moves or an edge is no
-/// chain of screws. Returns TreeFit::serial_correlation(); 0 where it left them alone.
+/// than all of them say, at most instants or at some of its commands, goes, and so does a joint
+/// that by its own deviation may be none. Left alone where the root moves or an edge is no chain of
+/// screws. Returns TreeFit::serial_correlation(); 0 where it left them alone.
 double fit_jointly(const EdgeData& data, std::vector<FittedEdge>* fitted, BodySchema* schema);
 
 }  // namespace bodyschema

@@ -156,7 +156,8 @@ AnglesAboutAxis::Turns AnglesAboutAxis::scan(const NormalizedActions& actions, i
   };
   if (n == 0) return best;
   const std::vector<double> none{0};
-  const std::vector<double> all = turns_around(0, kMostTurn, kTurnStep);
+  const bool is_wide = b < 0 && n >= kFewestWideScanFrames;
+  const std::vector<double> all = turns_around(0, is_wide ? kMostTurnOfOne : kMostTurn, kTurnStep);
   sweep(all, b < 0 ? none : all, true);
   const double coarse = best.power;
   for (const double step : {kTurnStep / 4, kFineStep})

@@ -7,8 +7,11 @@
 
 namespace bodyschema {
 
-/// The largest joint that is looked for [rad per half range]: 4.5 turns over the range.
-inline constexpr double kMostTurn = 14;
+/// The largest joint that is looked for [rad per half range]: 4.5 turns over the range; of one
+/// signal alone 25, where so many frames tell one turn from another: that some turn explains 40
+/// angles at random to kLeastScanPower happens once in 10 000 scans.
+inline constexpr double kMostTurn = 14, kMostTurnOfOne = 80;
+inline constexpr std::size_t kFewestWideScanFrames = 40;
 /// Between two turns of a scan: 14° at the ends of the range when the truth is midway.
 inline constexpr double kTurnStep = 0.5;
 /// With fewer frames than this some turn of so many explains any angles.
@@ -49,9 +52,9 @@ class AnglesAboutAxis {
     double phase = 0;     ///< ψ at q = 0
     double power = 0;  ///< |mean of e^{i(ψ − a q_a − b q_b)}|: 1 if these explain all angles
   };
-  /// The turns of largest power up to kMostTurn either way: a periodogram at arbitrary times (Lomb,
-  /// Scargle), of the angles on one signal (`b` −1) or on the sum of two. Power 0 where other turns
-  /// do as well, as with commands in few equal steps.
+  /// The turns of largest power up to kMostTurn, or kMostTurnOfOne, either way: a periodogram at
+  /// arbitrary times (Lomb, Scargle), of the angles on one signal (`b` −1) or on the sum of two.
+  /// Power 0 where other turns do as well, as with commands in few equal steps.
   Turns scan(const NormalizedActions& actions, int a, int b) const;
 
   const Eigen::Matrix3d& before() const { return before_; }

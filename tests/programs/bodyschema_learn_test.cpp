@@ -109,7 +109,7 @@ TEST_F(BodyschemaProgramTest, LearnPrintsTheKeysThatAreDocumented) {
         "serial_correlation", "command_lag_s", "command_smear_s"}) {
     EXPECT_TRUE(json.contains(key)) << key;
   }
-  EXPECT_EQ(json.size(), 14U);
+  EXPECT_EQ(json.size(), 15U);
   EXPECT_TRUE(json["complete"].get<bool>());
   ASSERT_EQ(json["edges"].size(), 4U);
   for (const Json& edge : json["edges"]) {

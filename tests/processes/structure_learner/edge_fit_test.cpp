@@ -2,6 +2,7 @@
 
 #include <gtest/gtest.h>
 
+#include <algorithm>
 #include <vector>
 
 #include "tests/support/synthetic_robot.h"
@@ -71,6 +72,64 @@ TEST(FitJointly, DropsAnEdgeThatTheOtherPartsContradict) {
     fit_jointly(data, &fitted, &schema);
     ASSERT_EQ(fitted.size(), signal == 1 ? 2U : 1U) << signal;
     EXPECT_EQ(fitted[0].edge.to, 2);
+  }
+}
+
+// The joints of an edge as the joint fit of parts 1 and 2 leaves it, by signal; none: it was
+// dropped.
+std::vector<int> joints_left(const test::SyntheticRobot& robot,
+                             const std::vector<ActionPoseSample>& samples, LocalModel start) {
+  const NormalizedActions actions(samples, 3);
+  const MeasurementModel measurement{.noise = test::nominal_noise(Regime::kTagIso)};
+  const EdgeData data{samples, actions, measurement, measurement, {}};
+  const Edge truth = robot.true_edge(1, 2);
+  start.first = truth.left;
+  start.joints.back().X_after = truth.joints[0].X_after;
+  std::vector<FittedEdge> fitted{
+      fit_edge({.part_i = 1, .part_j = 2, .model = start}, 1, 2, data, false)};
+  BodySchema schema;
+  schema.root = 1;
+  schema.signals = robot.signals;
+  fit_jointly(data, &fitted, &schema);
+  std::vector<int> signals;
+  if (!fitted.empty())
+    for (const ScrewJoint& joint : fitted[0].edge.joints) signals.push_back(joint.signal);
+  return signals;
+}
+
+// What a motor misses its command by passes for a little joint of an idle signal.
+TEST(FitJointly, DropsAJointThatMayBeNone) {
+  test::Rng rng(6);
+  const test::SyntheticRobot robot = two_hinges(rng);
+  std::vector<ActionPoseSample> samples;
+  for (int t = 0; t < 60; ++t) {
+    const Eigen::VectorXd command = robot.random_action(rng);
+    Eigen::VectorXd reached = command;
+    reached(0) += 0.03 * test::gaussian(rng);
+    samples.push_back(test::observe(robot, reached, {Regime::kTagIso}, t, rng));
+    samples.back().action = command;
+  }
+  LocalModel two = hinge(2, rng);
+  two.joints[0].turn = 0.01;
+  two.joints[0].X_after = Pose::Identity();
+  two.joints.push_back(hinge(0, rng).joints[0]);
+  EXPECT_EQ(joints_left(robot, samples, two), std::vector<int>{0});
+}
+
+// A hinge that turns steeply at the end of its range: what is not seen is not wrong there.
+TEST(FitJointly, DropsAnEdgeThatIsWrongAtOneEndOfACommand) {
+  for (const double steep : {0.0, 2.0}) {
+    test::Rng rng(7);
+    const test::SyntheticRobot robot = two_hinges(rng);
+    std::vector<ActionPoseSample> samples;
+    for (int t = 0; t < 80; ++t) {
+      const Eigen::VectorXd command = robot.random_action(rng);
+      Eigen::VectorXd reached = command;
+      reached(0) += steep * std::min(command(0) + 0.8, 0.0);
+      samples.push_back(test::observe(robot, reached, {Regime::kTagIso}, t, rng));
+      samples.back().action = command;
+    }
+    EXPECT_EQ(joints_left(robot, samples, hinge(0, rng)).size(), steep == 0 ? 1U : 0U);
   }
 }
 

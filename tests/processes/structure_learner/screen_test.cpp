@@ -157,6 +157,23 @@ TEST(WideJointScreen, LeadsAFitToTheTurnOfAWheelEitherWay) {
   }
 }
 
+TEST(WideJointScreen, ManyFramesLeadToManyTurns) {
+  for (const double sweep : {30.0, -75.0})
+    for (int seed = 1; seed <= 5; ++seed) {
+      Rng rng(seed);
+      const auto robot = wheel(sweep, Joint::kRevolute, rng);
+      const auto samples = test::babble(robot, 60, {Regime::kTagIso}, rng);
+      const NormalizedActions actions(samples, 4);
+      const PairData pair =
+          make_pair_data(samples, 1, 2, {test::nominal_noise(Regime::kTagIso), {}}, 100);
+      const auto starts = screen_wide_joint(pair, actions, relative_motions(pair, 300));
+      ASSERT_FALSE(starts.empty()) << sweep << " seed " << seed;
+      const Fit fit = fit_local_model(starts.front().model, pair, actions, 60);
+      EXPECT_NEAR(std::abs(fit.model.joints[0].turn) / actions.half_range(1) * 200, std::abs(sweep),
+                  0.05);
+    }
+}
+
 TEST(WideJointScreen, OfTurnsThatFewEqualStepsDoNotTellApartNoneIsTaken) {
   Rng rng(4);
   const auto robot = wheel(5, Joint::kRevolute, rng);

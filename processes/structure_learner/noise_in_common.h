@@ -1,0 +1,25 @@
+#pragma once
+
+#include <optional>
+#include <vector>
+
+#include "common/schema/body_schema.h"
+#include "common/schema/sample.h"
+
+namespace bodyschema {
+
+/// Noise per axis of one marker, as what the residuals of two edges have in common that meet at its
+/// part: there an error of the marker is in both, an error of the body in one. So it tells them
+/// apart where the noise is not known otherwise, as what the edges leave does not.
+///
+/// Residuals of the fit are enlarged to the leave-one-out residuals. `displaced`: samples whose
+/// actions are displacements. std::nullopt: no two edges meet, or too few samples show both.
+std::optional<Noise> noise_in_common(const BodySchema& schema,
+                                     const std::vector<ActionPoseSample>& displaced);
+
+/// Adds to the covariance of each edge of screws what it leaves that neither this noise nor the
+/// scatter of its joints explains: what it stands on moves, or it gives way. At the edge's end,
+/// alike along all axes.
+void add_unexplained(const Noise& noise, BodySchema* schema);
+
+}  // namespace bodyschema
