@@ -152,20 +152,21 @@ bool drop_contradicted(const TreeFit& fit, std::vector<FittedEdge>* fitted) {
   return std::erase_if(*fitted, is_contradicted) > 0;
 }
 
-// Whether so many outliers stand one after the other where the frames are in the order of one of
+// Whether so many outliers stand one after the other where the samples are in the order of one of
 // the edge's signals that chance does not explain it: there it is the model that is wrong.
-bool is_wrong_at_some_commands(const LocalModel& model, const std::vector<int>& samples,
+bool is_wrong_at_some_commands(const std::vector<int>& signals, const std::vector<int>& samples,
                                const std::vector<bool>& outlying,
                                const NormalizedActions& actions) {
   constexpr double kLeastChance = 1e-4;
+  if (actions.blocks().is_stream()) return false;  // there outliers last
   const auto n = samples.size();
   const double share = static_cast<double>(std::count(outlying.begin(), outlying.end(), true)) /
                        static_cast<double>(n);
   std::vector<std::size_t> order(n);
-  for (const LocalModel::Joint& joint : model.joints) {
+  for (const int signal : signals) {
     std::iota(order.begin(), order.end(), 0);
     std::stable_sort(order.begin(), order.end(), [&](std::size_t a, std::size_t b) {
-      return actions(samples[a], joint.signal) < actions(samples[b], joint.signal);
+      return actions(samples[a], signal) < actions(samples[b], signal);
     });
     int run = 0, longest = 0;
     for (const std::size_t t : order) longest = std::max(longest, run = outlying[t] ? run + 1 : 0);
@@ -176,8 +177,6 @@ bool is_wrong_at_some_commands(const LocalModel& model, const std::vector<int>& 
 
 // Edges that the joint fit has wrong at one end of a command's range, or in between.
 bool drop_wrong_at_some_commands(const TreeFit& fit, std::vector<FittedEdge>* fitted) {
-  // In a stream outliers last.
-  if (fit.actions().blocks().is_stream()) return false;
   const auto is_wrong = [&](const FittedEdge& edge) {
     for (int k = 1; k < static_cast<int>(fit.nodes().size()); ++k) {
       if (fit.nodes()[k].part != edge.edge.to) continue;
@@ -188,7 +187,7 @@ bool drop_wrong_at_some_commands(const TreeFit& fit, std::vector<FittedEdge>* fi
           samples.push_back(fit.sample(t));
           outlying.push_back(reading->squared_distance > outlier_threshold(reading->num_residuals));
         }
-      return is_wrong_at_some_commands(fit.nodes()[k].model, samples, outlying, fit.actions());
+      return is_wrong_at_some_commands(edge.edge.signals(), samples, outlying, fit.actions());
     }
     return false;
   };
@@ -251,6 +250,10 @@ LocalModel rescaled(LocalModel model, const NormalizedActions& from, const Norma
     model.joints[d].turn *= ratio;
   }
   return model;
+}
+
+bool is_wrong_at_some_commands(const FittedEdge& fitted, const NormalizedActions& actions) {
+  return is_wrong_at_some_commands(fitted.edge.signals(), fitted.frames, fitted.outlying, actions);
 }
 
 FittedEdge fit_edge(const AcceptedModel& accepted, int from, int to, const EdgeData& data,

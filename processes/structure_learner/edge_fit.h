@@ -32,6 +32,10 @@ LocalModel rescaled(LocalModel model, const NormalizedActions& from, const Norma
 FittedEdge fit_edge(const AcceptedModel& accepted, int from, int to, const EdgeData& data,
                     bool must_be_valid);
 
+/// Where an edge has outliers one after the other, in the order of one of its signals, that chance
+/// does not explain, its model is wrong and not its poses. False in a stream, where outliers last.
+bool is_wrong_at_some_commands(const FittedEdge& fitted, const NormalizedActions& actions);
+
 /// The edges of the root's component fitted to all of its markers at once: a root that rests and
 /// everything on the way from it are witnesses too, beside the two markers that each edge was
 /// fitted to before. X_CR with them, and the scatter of the joints. An edge whose part is elsewhere

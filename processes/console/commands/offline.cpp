@@ -97,7 +97,7 @@ void run_learn(const LearnArguments& arguments) {
   if (result.command_delay != CommandDelay{})
     text += "  " + delay_text(result.command_delay) + "\n";
   if (noise && result.noise_source == NoiseSource::kResiduals)
-    text += fmt::format("  --noise {} is too small: the best models leave more\n",
+    text += fmt::format("  the best models leave more than --noise says, {}\n",
                         pose_text(noise->position_m, noise->rotation_rad));
   if (result.serial_correlation > kMuchLeft)
     text += fmt::format(

@@ -133,5 +133,26 @@ TEST(FitJointly, DropsAnEdgeThatIsWrongAtOneEndOfACommand) {
   }
 }
 
+TEST(IsWrongAtSomeCommands, WhereOutliersStandTogetherAndNotWhereTheyAreScattered) {
+  std::vector<ActionPoseSample> samples(60);
+  test::Rng rng(8);
+  for (ActionPoseSample& sample : samples)
+    sample.action = Eigen::Vector2d(test::uniform(rng, -1, 1), test::uniform(rng, -1, 1));
+  const NormalizedActions actions(samples, 2);
+  FittedEdge fitted;
+  fitted.edge.joints.push_back({.signal = 0});
+  for (const bool is_together : {false, true}) {
+    fitted.frames.clear();
+    fitted.outlying.clear();
+    for (int t = 0; t < 60; ++t) {
+      fitted.frames.push_back(t);
+      fitted.outlying.push_back(is_together ? samples[t].action(0) < -0.6 : t % 5 == 0);
+    }
+    EXPECT_EQ(is_wrong_at_some_commands(fitted, actions), is_together);
+  }
+  fitted.edge.joints[0].signal = 1;
+  EXPECT_FALSE(is_wrong_at_some_commands(fitted, actions));
+}
+
 }  // namespace
 }  // namespace bodyschema
