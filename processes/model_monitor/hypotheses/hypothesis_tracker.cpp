@@ -23,6 +23,7 @@ constexpr int kFewestSoft = 3;
 /// Where outliers are more frequent by this factor than told, a change is not found from fewer of
 /// them than come in a row by chance: some agree, as flips in like views do.
 constexpr double kMoreOutliers = 2;
+constexpr double kLeastChanceOfRow = 1e-4;
 /// What the settled body is off by from the start, as a share of what a change explains.
 constexpr double kSystematicShare = 0.03;
 /// Samples from one fit of what has settled to the next.
@@ -239,7 +240,7 @@ bool HypothesisTracker::may_be_outliers(const ElementId& element, std::int64_t s
     for (int node = 0; node < filter().num_nodes(); ++node)
       num_outliers += believed[static_cast<std::size_t>(node)] == 0 && is_concerned(node);
   }
-  return std::pow(rate, num_outliers) > options_.false_alarm_rate;
+  return std::pow(rate, num_outliers) > kLeastChanceOfRow;
 }
 
 double HypothesisTracker::needed_lead(const Hypothesis& other, std::int64_t now) const {
