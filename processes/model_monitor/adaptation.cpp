@@ -35,6 +35,7 @@ constexpr double kShareDown = 2.0 / 3;
 constexpr std::size_t kFewestDistances = 20;
 /// Quiet samples after which the noise is looked at again.
 constexpr int kQuietSamples = 32;
+/// Share of the distances that is the tail of the noise: 8 of the 160 of five parts (chosen).
 constexpr double kTail = 0.05;
 
 /// What two fits of one edge to tags may differ by, anywhere in its range: a body of the history

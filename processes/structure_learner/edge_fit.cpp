@@ -1,7 +1,6 @@
 #include "processes/structure_learner/edge_fit.h"
 
 #include <algorithm>
-#include <array>
 #include <cmath>
 #include <limits>
 #include <numeric>
@@ -255,31 +254,6 @@ LocalModel rescaled(LocalModel model, const NormalizedActions& from, const Norma
 
 bool is_wrong_at_some_commands(const FittedEdge& fitted, const NormalizedActions& actions) {
   return is_wrong_at_some_commands(fitted.edge.signals(), fitted.frames, fitted.outlying, actions);
-}
-
-bool is_wrong_for_some_time(const FittedEdge& fitted) {
-  // Of so many pieces of the recording those with an outlier before some time and after it, as two
-  // rates beside one [nats]: a burst of outliers is in one piece or two.
-  constexpr std::size_t kPieces = 16;
-  constexpr double kEvidence = 9;
-  const std::size_t n = fitted.outlying.size();
-  if (n < 4 * kPieces) return false;
-  std::array<bool, kPieces> has_outlier{};
-  for (std::size_t t = 0; t < n; ++t)
-    if (fitted.outlying[t]) has_outlier[t * kPieces / n] = true;
-  const auto log_likelihood = [&](std::size_t first, std::size_t last) {
-    const auto all = static_cast<double>(last - first);
-    const auto with = static_cast<double>(
-        std::count(has_outlier.begin() + static_cast<std::ptrdiff_t>(first),
-                   has_outlier.begin() + static_cast<std::ptrdiff_t>(last), true));
-    const auto term = [all](double count) { return count > 0 ? count * std::log(count / all) : 0; };
-    return term(with) + term(all - with);
-  };
-  for (std::size_t split = 1; split < kPieces; ++split)
-    if (log_likelihood(0, split) + log_likelihood(split, kPieces) >
-        log_likelihood(0, kPieces) + kEvidence)
-      return true;
-  return false;
 }
 
 FittedEdge fit_edge(const AcceptedModel& accepted, int from, int to, const EdgeData& data,

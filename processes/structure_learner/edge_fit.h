@@ -36,10 +36,6 @@ FittedEdge fit_edge(const AcceptedModel& accepted, int from, int to, const EdgeD
 /// does not explain, its model is wrong and not its poses. False in a stream, where outliers last.
 bool is_wrong_at_some_commands(const FittedEdge& fitted, const NormalizedActions& actions);
 
-/// Where the outliers of an edge begin or end at some time: since then, or until then, its parts,
-/// or what they are seen by, were otherwise.
-bool is_wrong_for_some_time(const FittedEdge& fitted);
-
 /// The edges of the root's component fitted to all of its markers at once: a root that rests and
 /// everything on the way from it are witnesses too, beside the two markers that each edge was
 /// fitted to before. X_CR with them, and the scatter of the joints. An edge whose part is elsewhere

@@ -112,8 +112,7 @@ LearnResult fit_tree(const LearnedStructure& structure,
     AcceptedModel start = search.models[static_cast<std::size_t>(edge)];
     start.model = rescaled(start.model, structure.actions, actions);
     FittedEdge fit = fit_edge(start, from, to, data, must_be_valid);
-    if (!fit.is_valid || is_wrong_at_some_commands(fit, actions) || is_wrong_for_some_time(fit))
-      return false;
+    if (!fit.is_valid || is_wrong_at_some_commands(fit, actions)) return false;
     fitted.push_back(std::move(fit));
     return true;
   });

@@ -9,7 +9,7 @@ namespace bodyschema {
 
 /// The largest joint that is looked for [rad per half range]: 4.5 turns over the range; of one
 /// signal alone 25, where so many frames tell one turn from another: that some turn explains 40
-/// angles at random to kLeastScanPower happens once in 10 000 scans.
+/// angles at random to kLeastScanPower has the chance 320 exp(−40 · 0.6²), 2 in 10 000.
 inline constexpr double kMostTurn = 14, kMostTurnOfOne = 80;
 inline constexpr std::size_t kFewestWideScanFrames = 40;
 /// Between two turns of a scan: 14° at the ends of the range when the truth is midway.

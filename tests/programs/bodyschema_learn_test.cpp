@@ -171,6 +171,28 @@ TEST_F(BodyschemaProgramTest, WithoutJsonPeopleReadIt) {
   EXPECT_FALSE(Json::accept(outcome.out));
 }
 
+// The camera drifts while the pose of its base, part 1, is given as a constant.
+TEST_F(BodyschemaProgramTest, LearnSaysWhereWhatIsLeftLasts) {
+  test::Rng rng(5);
+  const auto robot = test::chapter_robot("a", rng);
+  for (const double drift_m : {0.0, 0.02}) {
+    auto samples = test::babble(robot, 80, {.regime = test::Regime::kTagIso}, rng);
+    for (std::size_t t = 0; t < samples.size(); ++t)
+      for (PartObservation& o : samples[t].parts) {
+        if (o.part == 1)
+          o.X_CB = robot.X_CR;
+        else
+          o.X_CB.translation().x() += drift_m * static_cast<double>(t) / 80;
+      }
+    std::ofstream file(folder_ / "drift.csv");
+    test::write_csv(samples, file);
+    file.close();
+    const Outcome outcome = run({"learn", "drift.csv", "--noise", "0.008", "1"});
+    EXPECT_EQ(outcome.out.find("lasts from one pose to the next") != std::string::npos, drift_m > 0)
+        << outcome.out;
+  }
+}
+
 TEST_F(BodyschemaProgramTest, TheSameRecordingGivesTheSameBytes) {
   const auto csv = write_robot("s.csv");
   const Outcome first = run({"learn", csv, "--out", "1.lcmlog", "--json"});

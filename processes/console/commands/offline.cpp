@@ -38,9 +38,10 @@ struct LearnArguments {
   bool json = false;
 };
 
-/// Correlations of the noise above it are told. Noise of AR(1) 0.5 is below it with 60 poses, a
-/// camera that drifts by a few times the noise above 0.8.
-constexpr double kMuchLeft = 0.6;
+/// Correlations of the noise above it are told. Chosen: cameras that drift or are bumped have 0.45
+/// to 0.57 in five recordings of `foreign_robots`, robots whose camera rests at most 0.18 in
+/// twelve.
+constexpr double kMuchLeft = 0.35;
 
 /// The chapter's own method: a result to compare with.
 LearnResult learn_as_the_chapter(const Recording& recording,

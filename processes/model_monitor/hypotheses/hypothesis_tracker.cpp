@@ -23,7 +23,7 @@ constexpr int kFewestSoft = 3;
 /// Where outliers are more frequent by this factor than told, a change is not found from fewer of
 /// them than come in a row by chance: some agree, as flips in like views do.
 constexpr double kMoreOutliers = 2;
-constexpr double kLeastChanceOfRow = 1e-4;
+constexpr double kLeastChanceOfRow = 1e-4;  // chosen: a moved marker of the trunk needs 4 samples
 /// What the settled body is off by from the start, as a share of what a change explains.
 constexpr double kSystematicShare = 0.03;
 /// Samples from one fit of what has settled to the next.

@@ -154,19 +154,5 @@ TEST(IsWrongAtSomeCommands, WhereOutliersStandTogetherAndNotWhereTheyAreScattere
   EXPECT_FALSE(is_wrong_at_some_commands(fitted, actions));
 }
 
-TEST(IsWrongForSomeTime, WhereOutliersBeginOrEndAndNotWhereTheyComeInBursts) {
-  const auto is_wrong = [](auto is_outlier) {
-    FittedEdge fitted;
-    for (int t = 0; t < 640; ++t) fitted.outlying.push_back(is_outlier(t));
-    return is_wrong_for_some_time(fitted);
-  };
-  EXPECT_TRUE(is_wrong([](int t) { return t > 300 && t % 11 == 0; }));
-  EXPECT_TRUE(is_wrong([](int t) { return t < 200 && t % 11 == 0; }));
-  EXPECT_FALSE(is_wrong([](int t) { return t % 11 == 0; }));
-  EXPECT_FALSE(is_wrong([](int t) { return t > 300 && t < 360; }));
-  EXPECT_FALSE(is_wrong([](int t) { return t > 300 && t % 150 < 40; }));
-  EXPECT_FALSE(is_wrong([](int) { return false; }));
-}
-
 }  // namespace
 }  // namespace bodyschema
