@@ -99,6 +99,18 @@ struct Told {
   int num_complete = 0;
   double error2 = 0, variance = 0;  ///< of positions, summed
   double ratio() const { return std::sqrt(error2 / variance); }
+  /// Of part `part` in the root, at samples not learned from; nothing of an incomplete schema.
+  void add(const BodySchema& schema, int root, int part,
+           const std::vector<ActionPoseSample>& samples) {
+    if (!schema.complete) return;
+    ++num_complete;
+    for (const ActionPoseSample& sample : samples) {
+      const auto predicted = schema.predict(root, part, sample.action, Variance::kOneAction);
+      const Pose seen = sample.find(root)->X_CB.inverse() * sample.find(part)->X_CB;
+      error2 += (predicted->X_AB.translation() - seen.translation()).squaredNorm();
+      variance += predicted->covariance.topLeftCorner<3, 3>().trace();
+    }
+  }
 };
 
 // A base that moves while its own pose is given as a constant: what stands on it is off by that.
@@ -113,14 +125,7 @@ TEST(PredictionVariance, OfABaseThatMovesCountsThat) {
       return result;
     };
     const BodySchema schema = learn(robot.signals, samples()).schema;
-    if (!schema.complete) continue;
-    ++told.num_complete;
-    for (const ActionPoseSample& sample : samples()) {
-      const auto predicted = schema.predict(1, 2, sample.action, Variance::kOneAction);
-      const Pose seen = sample.find(1)->X_CB.inverse() * sample.find(2)->X_CB;
-      told.error2 += (predicted->X_AB.translation() - seen.translation()).squaredNorm();
-      told.variance += predicted->covariance.topLeftCorner<3, 3>().trace();
-    }
+    told.add(schema, 1, 2, samples());
   }
   ASSERT_GE(told.num_complete, 2);
   EXPECT_LT(told.ratio(), 2);
@@ -139,14 +144,7 @@ TEST(PredictionVariance, OfASoftArmWithPlayCountsThat) {
       return result;
     };
     const BodySchema schema = learn(arm.signals(), samples()).schema;
-    if (!schema.complete) continue;
-    ++told.num_complete;
-    for (const ActionPoseSample& sample : samples()) {
-      const auto predicted = schema.predict(0, 2, sample.action, Variance::kOneAction);
-      const Pose seen = sample.find(0)->X_CB.inverse() * sample.find(2)->X_CB;
-      told.error2 += (predicted->X_AB.translation() - seen.translation()).squaredNorm();
-      told.variance += predicted->covariance.topLeftCorner<3, 3>().trace();
-    }
+    told.add(schema, 0, 2, samples());
   }
   ASSERT_GE(told.num_complete, 1);
   EXPECT_LT(told.ratio(), 2);
