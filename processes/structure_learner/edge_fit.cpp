@@ -131,10 +131,19 @@ void fit_screw_edge(const LocalModel& start, const PairData& pair, const EdgeDat
         in_command_units(loo.parameter_covariance, fit.model, data.actions);
 }
 
+template <class IsRefused>
+bool drop(IsRefused&& is_refused, Refusal why, std::vector<FittedEdge>* fitted, Refusals* refused) {
+  return std::erase_if(*fitted, [&](const FittedEdge& f) {
+           const bool is = is_refused(f);
+           if (is) (*refused)[std::minmax(f.edge.from, f.edge.to)] = why;
+           return is;
+         }) > 0;
+}
+
 // Edges whose parts are elsewhere than the joint fit has them at most instants: they were accepted
 // from a few instants that their own two parts share, which any model fits. Chosen: "elsewhere" is
 // ten times as far as an outlier, beyond any noise that is told wrongly.
-bool drop_contradicted(const TreeFit& fit, std::vector<FittedEdge>* fitted) {
+bool drop_contradicted(const TreeFit& fit, std::vector<FittedEdge>* fitted, Refusals* refused) {
   const auto is_contradicted = [&](const FittedEdge& edge) {
     for (int k = 1; k < static_cast<int>(fit.nodes().size()); ++k) {
       if (fit.nodes()[k].part != edge.edge.to) continue;
@@ -149,7 +158,7 @@ bool drop_contradicted(const TreeFit& fit, std::vector<FittedEdge>* fitted) {
     }
     return false;
   };
-  return std::erase_if(*fitted, is_contradicted) > 0;
+  return drop(is_contradicted, Refusal::kContradicted, fitted, refused);
 }
 
 // Whether so many outliers stand one after the other where the samples are in the order of one of
@@ -176,7 +185,8 @@ bool is_wrong_at_some_commands(const std::vector<int>& signals, const std::vecto
 }
 
 // Edges that the joint fit has wrong at one end of a command's range, or in between.
-bool drop_wrong_at_some_commands(const TreeFit& fit, std::vector<FittedEdge>* fitted) {
+bool drop_wrong_at_some_commands(const TreeFit& fit, std::vector<FittedEdge>* fitted,
+                                 Refusals* refused) {
   const auto is_wrong = [&](const FittedEdge& edge) {
     for (int k = 1; k < static_cast<int>(fit.nodes().size()); ++k) {
       if (fit.nodes()[k].part != edge.edge.to) continue;
@@ -191,7 +201,7 @@ bool drop_wrong_at_some_commands(const TreeFit& fit, std::vector<FittedEdge>* fi
     }
     return false;
   };
-  return std::erase_if(*fitted, is_wrong) > 0;
+  return drop(is_wrong, Refusal::kWrongAtSomeCommands, fitted, refused);
 }
 
 // Without the joint that is told least from none, if that is by no more than what another joint of
@@ -271,7 +281,8 @@ FittedEdge fit_edge(const AcceptedModel& accepted, int from, int to, const EdgeD
   return result;
 }
 
-double fit_jointly(const EdgeData& data, std::vector<FittedEdge>* fitted, BodySchema* schema) {
+double fit_jointly(const EdgeData& data, std::vector<FittedEdge>* fitted, BodySchema* schema,
+                   Refusals* refused) {
   // More instants than this are thinned; so many more that thinning costs what the joint fit gains
   // are left to the pairs.
   constexpr int kMaxFrames = 2500;
@@ -297,12 +308,12 @@ double fit_jointly(const EdgeData& data, std::vector<FittedEdge>* fitted, BodySc
   const Eigen::VectorXd of_pairs = scatter_of(*fitted, nodes, data.actions);
   TreeFit fit(std::move(nodes), std::move(poses), data.actions, true);
   fit.fit(20, 1e-6);
-  if (drop_contradicted(fit, fitted) || drop_wrong_at_some_commands(fit, fitted))
-    return fit_jointly(data, fitted, schema);
+  if (drop_contradicted(fit, fitted, refused) || drop_wrong_at_some_commands(fit, fitted, refused))
+    return fit_jointly(data, fitted, schema, refused);
   const Eigen::VectorXd scatter = joint_scatter(fit, told, of_pairs);
   const auto covariance = fit.covariance(data.measurement, view_share(data.measurement), scatter);
   if (covariance && drop_weak_joint(fit, *covariance, scatter, data, fitted))
-    return fit_jointly(data, fitted, schema);
+    return fit_jointly(data, fitted, schema, refused);
   Eigen::Index next = 0;
   for (std::size_t k = 1; k < fit.nodes().size(); ++k) {
     const TreeNode& node = fit.nodes()[k];

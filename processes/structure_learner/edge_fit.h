@@ -1,5 +1,7 @@
 #pragma once
 
+#include <map>
+#include <utility>
 #include <vector>
 
 #include "processes/structure_learner/search/model_forest.h"
@@ -24,6 +26,15 @@ struct FittedEdge {
   LocalModel model;      ///< what of the edge is screws
 };
 
+/// Why an edge that the search accepted is none.
+enum class Refusal {
+  kNotValid,             ///< on all of its data
+  kWrongAtSomeCommands,  ///< is_wrong_at_some_commands()
+  kContradicted,         ///< by all other parts, at most instants
+};
+/// By the edge's parts, the lower first.
+using Refusals = std::map<std::pair<int, int>, Refusal>;
+
 /// The same model over actions that are scaled otherwise.
 LocalModel rescaled(LocalModel model, const NormalizedActions& from, const NormalizedActions& to);
 
@@ -42,6 +53,7 @@ bool is_wrong_at_some_commands(const FittedEdge& fitted, const NormalizedActions
 /// than all of them say, at most instants or at some of its commands, goes, and so does a joint
 /// that by its own deviation may be none. Left alone where the root moves or an edge is no chain of
 /// screws. Returns TreeFit::serial_correlation(); 0 where it left them alone.
-double fit_jointly(const EdgeData& data, std::vector<FittedEdge>* fitted, BodySchema* schema);
+double fit_jointly(const EdgeData& data, std::vector<FittedEdge>* fitted, BodySchema* schema,
+                   Refusals* refused);
 
 }  // namespace bodyschema

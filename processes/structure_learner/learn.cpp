@@ -108,17 +108,22 @@ LearnResult fit_tree(const LearnedStructure& structure,
   if (options.measurement.noise || has_covariances(samples)) told.scale = options.measurement.scale;
   const EdgeData data{moved, actions, measurement, told, structure.options.validity};
   std::vector<FittedEdge> fitted;
+  Refusals refused;
   visit_outwards(ends_of(search.models), schema, [&](int edge, int from, int to) {
     AcceptedModel start = search.models[static_cast<std::size_t>(edge)];
     start.model = rescaled(start.model, structure.actions, actions);
     FittedEdge fit = fit_edge(start, from, to, data, must_be_valid);
-    if (!fit.is_valid || is_wrong_at_some_commands(fit, actions)) return false;
+    if (!fit.is_valid || is_wrong_at_some_commands(fit, actions)) {
+      refused[std::minmax(from, to)] =
+          fit.is_valid ? Refusal::kWrongAtSomeCommands : Refusal::kNotValid;
+      return false;
+    }
     fitted.push_back(std::move(fit));
     return true;
   });
   estimate_root_pose(samples, measurement, &schema);
   if (schema.has_part(schema.root) && schema.has_rotation(schema.root))
-    result.serial_correlation = fit_jointly(data, &fitted, &schema);
+    result.serial_correlation = fit_jointly(data, &fitted, &schema, &refused);
   for (const FittedEdge& f : fitted) schema.edges.push_back(f.edge);
   if (structure.noise_source == NoiseSource::kResiduals) tell_noise_from_body(moved, &schema);
   schema.set_covered(samples);
@@ -128,7 +133,7 @@ LearnResult fit_tree(const LearnedStructure& structure,
       options.expected_parts,
       [&](int part) {
         const int num_moving = static_cast<int>(actions.moving().size());
-        return explain_unconnected(part, samples, connected, structure,
+        return explain_unconnected(part, samples, connected, structure, refused,
                                    std::min(options.max_signals, num_moving));
       },
       &schema);

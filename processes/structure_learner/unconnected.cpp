@@ -122,6 +122,42 @@ std::string why_taken_back(const TriedModels& tried, const LearnedStructure& str
   return "";
 }
 
+/// Where the edge by which a part hangs on the others was refused: why. Empty if none was.
+std::string why_refused(int part, const LearnedStructure& structure, const Refusals& refused) {
+  if (refused.empty()) return "";
+  Components components(structure.parts);
+  for (const AcceptedModel& m : structure.search.models)
+    if (!refused.contains(std::minmax(m.part_i, m.part_j))) components.join(m.part_i, m.part_j);
+  for (const AcceptedModel& m : structure.search.models) {
+    const auto refusal = refused.find(std::minmax(m.part_i, m.part_j));
+    if (refusal == refused.end()) continue;
+    if (!m.joins_part(part)) {
+      for (const int end : {m.part_i, m.part_j})
+        if (components.of(end) == components.of(part))
+          return "it hangs on part " + std::to_string(end) + ", which is not connected";
+      continue;
+    }
+    const std::set<int> signals = signal_set(m.model);
+    const std::string model =
+        (signals.empty() ? "a rigid edge" : "a model with " + names_of(signals, structure)) +
+        " to part " + std::to_string(m.part_i + m.part_j - part);
+    switch (refusal->second) {
+      case Refusal::kNotValid:
+        return model + " is not valid any more";
+      case Refusal::kWrongAtSomeCommands:
+        return model +
+               " is right at most commands and wrong at others that lie together: the body meets a "
+               "stop there, or the command is bent more steeply than its samples tell: give more "
+               "of them there, or leave those out";
+      case Refusal::kContradicted:
+        return model +
+               " holds where both are seen, and not where other parts tell where they are: show "
+               "them together more often";
+    }
+  }
+  return "";
+}
+
 std::string why_none_is_valid(const TriedModels& tried, const LearnedStructure& structure,
                               int max_signals) {
   return "no model with up to " + std::to_string(max_signals) +
@@ -138,7 +174,8 @@ std::string why_none_is_valid(const TriedModels& tried, const LearnedStructure& 
 
 UnconnectedPart explain_unconnected(int part, const std::vector<ActionPoseSample>& samples,
                                     const std::set<int>& connected,
-                                    const LearnedStructure& structure, int max_signals) {
+                                    const LearnedStructure& structure, const Refusals& refused,
+                                    int max_signals) {
   if (!structure.position_parts.empty() && connected.empty())
     return {part, Unconnected::kNotEnoughData,
             "the root has positions alone: give its orientations, or choose another root"};
@@ -150,6 +187,8 @@ UnconnectedPart explain_unconnected(int part, const std::vector<ActionPoseSample
       "seen " + (num_seen == 1 ? "once" : std::to_string(num_seen) + " times") + ", at most " +
       std::to_string(tried.num_common) + " of them together with one connected part" +
       (tried.partner >= 0 ? " (" + std::to_string(tried.partner) + ")" : "") + "; ";
+  if (const std::string why = why_refused(part, structure, refused); !why.empty())
+    return {part, Unconnected::kNoValidModel, seen + why};
   const std::string taken_back = why_taken_back(tried, structure);
   if (!taken_back.empty()) {
     const bool is_refused = tried.is_redundant && !structure.is_contested;

@@ -5,15 +5,17 @@
 
 #include "common/schema/body_schema.h"
 #include "common/schema/sample.h"
+#include "processes/structure_learner/edge_fit.h"
 #include "processes/structure_learner/learn.h"
 
 namespace bodyschema {
 
 /// Why `part`, which was seen in `samples`, is not `connected` to the root, and what would help.
-/// `max_signals`: of the models that were tried.
+/// `refused`: what became of the structure's edges. `max_signals`: of the models that were tried.
 UnconnectedPart explain_unconnected(int part, const std::vector<ActionPoseSample>& samples,
                                     const std::set<int>& connected,
-                                    const LearnedStructure& structure, int max_signals);
+                                    const LearnedStructure& structure, const Refusals& refused,
+                                    int max_signals);
 
 /// Signals that no edge uses although one may have to: they moved too little for a joint of
 /// kLeastTurn (over their limits, where these are known) to show, or a part waits for its edge. And

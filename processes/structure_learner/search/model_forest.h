@@ -21,6 +21,7 @@ struct AcceptedModel {
   /// Of these, those that may have no effect (SoftFit::doubtful_signals).
   std::vector<int> doubtful_signals = {};
 
+  bool joins_part(int part) const { return part == part_i || part == part_j; }
   bool joins(int part_a, int part_b) const {
     return std::minmax(part_a, part_b) == std::minmax(part_i, part_j);
   }

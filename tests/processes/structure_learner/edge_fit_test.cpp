@@ -69,8 +69,10 @@ TEST(FitJointly, DropsAnEdgeThatTheOtherPartsContradict) {
     BodySchema schema;
     schema.root = 1;
     schema.signals = robot.signals;
-    fit_jointly(data, &fitted, &schema);
+    Refusals refused;
+    fit_jointly(data, &fitted, &schema, &refused);
     ASSERT_EQ(fitted.size(), signal == 1 ? 2U : 1U) << signal;
+    if (signal != 1) EXPECT_EQ(refused.at({2, 3}), Refusal::kContradicted);
     EXPECT_EQ(fitted[0].edge.to, 2);
   }
 }
@@ -90,7 +92,9 @@ std::vector<int> joints_left(const test::SyntheticRobot& robot,
   BodySchema schema;
   schema.root = 1;
   schema.signals = robot.signals;
-  fit_jointly(data, &fitted, &schema);
+  Refusals refused;
+  fit_jointly(data, &fitted, &schema, &refused);
+  EXPECT_EQ(refused.empty(), !fitted.empty());
   std::vector<int> signals;
   if (!fitted.empty())
     for (const ScrewJoint& joint : fitted[0].edge.joints) signals.push_back(joint.signal);
