@@ -112,8 +112,8 @@ bool is_order_x_y_z_w(const std::vector<ActionPoseSample>& samples,
   constexpr std::size_t kMostParts = 12;
   // Noise, and joints beside the origin, make disorder of about this size in either order.
   constexpr double kUnremarkable = 0.1;
-  // Evidence of all parts, in nats of disorder. Measured by recording_test.cpp: 1500 recordings
-  // that are right have at most 0.35.
+  // Evidence of all parts, in nats of disorder. Measured by recording_hints_test.cpp: 1500
+  // recordings that are right have at most 0.35.
   constexpr double kEvidence = 1;
   const std::size_t stride = std::max<std::size_t>(1, samples.size() / kMost);
   std::map<int, std::pair<double, double>> least;  // disorder of each part as read, reordered
