@@ -5,8 +5,7 @@
 #include <array>
 #include <cmath>
 #include <cstddef>
-#include <limits>
-#include <optional>
+#include <functional>
 #include <set>
 #include <tuple>
 #include <utility>
@@ -45,133 +44,14 @@ constexpr double kLeastNews = 0.01;
 constexpr double kFloor = 1e-5;
 /// Of the median squared distance; flips and false detections are beyond. Chosen.
 constexpr double kWild = 8;
-/// Commands farther apart, in median intervals, tell nothing of those between them. Chosen.
-constexpr double kMostApart = 4;
 /// Of a fit by models, and by a schema. Chosen.
 constexpr int kFitted = 300, kIterations = 20;
 constexpr std::size_t kMostFrames = 500;
-
-double time_of(const ActionPoseSample& sample) { return static_cast<double>(sample.utime); }
-
-double median_interval_us(const std::vector<ActionPoseSample>& samples) {
-  std::vector<double> intervals;
-  for (std::size_t n = 1; n < samples.size(); ++n)
-    intervals.push_back(time_of(samples[n]) - time_of(samples[n - 1]));
-  return intervals.empty() ? 0 : upper_median(std::move(intervals));
-}
 
 double farthest_lag_us(const std::vector<ActionPoseSample>& samples, double interval_us) {
   return std::min(std::max(kFarthest_us, kFarthestIntervals * interval_us),
                   kShareOfStream * (time_of(samples.back()) - time_of(samples.front())));
 }
-
-/// The commands of a stream and those between them, linear in time. Keeps a reference.
-class CommandTrack {
- public:
-  explicit CommandTrack(const std::vector<ActionPoseSample>& samples)
-      : samples_(samples), most_apart_us_(kMostApart * median_interval_us(samples)) {}
-
-  /// std::nullopt before the first, after the last, and where too far from the next.
-  std::optional<Eigen::VectorXd> at(double time_us) const {
-    const auto after = std::ranges::lower_bound(samples_, time_us, {}, time_of);
-    if (after == samples_.end()) return std::nullopt;
-    if (time_of(*after) == time_us) return after->action;
-    if (after == samples_.begin()) return std::nullopt;
-    const auto before = after - 1;
-    const double apart_us = time_of(*after) - time_of(*before);
-    if (apart_us > most_apart_us_) return std::nullopt;
-    const double share = (time_us - time_of(*before)) / apart_us;
-    return before->action + share * (after->action - before->action);
-  }
-
-  /// The samples around which it is known everywhere within `margin_us`.
-  std::vector<std::size_t> within(double margin_us) const { return within(margin_us, margin_us); }
-  std::vector<std::size_t> within(double past_us, double future_us) const {
-    std::vector<std::size_t> inner;
-    for (std::size_t begin = 0, end = 0; begin < samples_.size(); begin = end) {
-      for (end = begin + 1; end < samples_.size() && !is_behind_gap(end);) ++end;
-      for (std::size_t n = begin; n < end; ++n)
-        if (time_of(samples_[n]) - past_us >= time_of(samples_[begin]) &&
-            time_of(samples_[n]) + future_us <= time_of(samples_[end - 1]))
-          inner.push_back(n);
-    }
-    return inner;
-  }
-  const std::vector<ActionPoseSample>& samples() const { return samples_; }
-  /// Nothing is known of what is between sample n and the one before.
-  bool is_behind_gap(std::size_t n) const {
-    return n == 0 || time_of(samples_[n]) - time_of(samples_[n - 1]) > most_apart_us_;
-  }
-
- private:
-  const std::vector<ActionPoseSample>& samples_;
-  const double most_apart_us_;
-};
-
-/// Where the commands of a track have brought an arm that follows them with a delay.
-class Drive {
- public:
-  Drive(const CommandTrack& track, const CommandDelay& delay)
-      : track_(track),
-        dead_us_(static_cast<double>(delay.lag_us - delay.smear_us)),
-        constant_us_(static_cast<double>(delay.smear_us)) {
-    if (delay.smear_us == 0) return;
-    const std::vector<ActionPoseSample>& samples = track.samples();
-    double begin_us = 0;
-    for (std::size_t n = 0; n < samples.size(); ++n) {
-      const bool begins = track.is_behind_gap(n);
-      if (begins) begin_us = time_of(samples[n]);
-      begins_us_.push_back(begin_us);
-      // As if it had moved evenly before.
-      const bool is_alone = n + 1 == samples.size() || track.is_behind_gap(n + 1);
-      states_.push_back(!begins ? followed(n - 1, time_of(samples[n]))
-                        : is_alone
-                            ? samples[n].action
-                            : Eigen::VectorXd(samples[n].action - constant_us_ * rate_after(n)));
-    }
-  }
-
-  /// How far before and after a sample commands must be known.
-  double past_us() const { return std::max(0.0, dead_us_) + kForgotten * constant_us_; }
-  double future_us() const { return std::max(0.0, -dead_us_); }
-
-  /// std::nullopt where too little is known of the commands before.
-  std::optional<Eigen::VectorXd> at(double time_us) const {
-    time_us -= dead_us_;
-    if (states_.empty()) return track_.at(time_us);
-    const std::vector<ActionPoseSample>& samples = track_.samples();
-    const auto after = std::ranges::lower_bound(samples, time_us, {}, time_of);
-    if (after == samples.end()) return std::nullopt;
-    const auto n = static_cast<std::size_t>(after - samples.begin());
-    if (time_us - begins_us_[n] < kForgotten * constant_us_) return std::nullopt;
-    return time_of(*after) == time_us ? states_[n] : followed(n - 1, time_us);
-  }
-
- private:
-  /// In time constants: the error of the assumed start has decayed to e⁻³ = 5 %. Chosen.
-  static constexpr double kForgotten = 3;
-
-  Eigen::VectorXd rate_after(std::size_t n) const {
-    const ActionPoseSample &from = track_.samples()[n], &to = track_.samples()[n + 1];
-    const double apart_us = time_of(to) - time_of(from);
-    if (apart_us <= 0) return Eigen::VectorXd::Zero(from.action.size());
-    return (to.action - from.action) / apart_us;
-  }
-  /// From sample n on, its commands being linear up to the next.
-  Eigen::VectorXd followed(std::size_t n, double time_us) const {
-    const ActionPoseSample& from = track_.samples()[n];
-    const double passed_us = time_us - time_of(from);
-    const Eigen::VectorXd rate = rate_after(n);
-    const double kept = std::exp(-passed_us / constant_us_);
-    return from.action + rate * (passed_us - constant_us_) +
-           kept * (states_[n] - from.action + constant_us_ * rate);
-  }
-
-  const CommandTrack& track_;
-  const double dead_us_, constant_us_;
-  std::vector<double> begins_us_;        // by sample: of the commands known without a gap
-  std::vector<Eigen::VectorXd> states_;  // by sample: without the dead time
-};
 
 /// log(z(t_a)⁻¹ z(t_b)) of a pair of parts.
 struct Motion {
@@ -288,39 +168,53 @@ double vertex(double before, double at, double after) {
   return before < after ? -1 : 1;
 }
 
-/// Where `cost_of` the samples with the commands that brought them there [nats] has its least,
-/// downhill from a delay; `without` where that is hardly less than there.
-template <class CostOf>
-CommandDelay least_near(const CommandDelay& start, const CommandDelay& without,
-                        const std::vector<ActionPoseSample>& samples, const CostOf& cost_of) {
-  constexpr int kMostRounds = 20;
-  constexpr double kThere = 0.1;  // of half an interval
-  const CommandTrack track(samples);
+/// Of delays the one at which the samples, with the commands that brought them there, cost least.
+/// Keeps references.
+class DelaySearch {
+ public:
+  using CostOf = std::function<double(const std::vector<ActionPoseSample>&)>;  ///< [nats]
+
+  DelaySearch(const std::vector<ActionPoseSample>& samples, CostOf cost_of)
+      : samples_(samples),
+        track_(samples),
+        cost_of_(std::move(cost_of)),
+        step_us_(static_cast<std::int64_t>(median_interval_us(samples) / 2)) {}
+
+  /// Downhill from a delay; `without` where that is hardly less than there.
+  CommandDelay least_near(const CommandDelay& start, const CommandDelay& without) const {
+    const CommandDelay sharp = downhill(start, false), smeared = downhill(sharp, true);
+    const CommandDelay best = best_of(sharp, smeared);
+    return best_of(best_of(without, sharp), best);
+  }
+
+ private:
   // All delays are compared on the same frames; alike where these are too few.
-  const auto costs_at = [&](const std::vector<CommandDelay>& delays) {
+  std::vector<double> costs_at(const std::vector<CommandDelay>& delays) const {
     std::vector<Drive> drives;
     double past_us = 0, future_us = 0;
     for (const CommandDelay& d : delays) {
-      drives.emplace_back(track, d);
+      drives.emplace_back(track_, d);
       past_us = std::max(past_us, drives.back().past_us());
       future_us = std::max(future_us, drives.back().future_us());
     }
-    const std::vector<std::size_t> inner = track.within(past_us, future_us);
-    if (inner.size() < std::min(kFewestMotions, samples.size() / 4))
+    const std::vector<std::size_t> inner = track_.within(past_us, future_us);
+    if (inner.size() < std::min(kFewestMotions, samples_.size() / 4))
       return std::vector<double>(delays.size(), 0.0);
     std::vector<ActionPoseSample> moved;
     for (std::size_t k = 0, count = std::min(kMostFrames, inner.size()); k < count; ++k)
-      moved.push_back(samples[inner[k * inner.size() / count]]);
+      moved.push_back(samples_[inner[k * inner.size() / count]]);
     std::vector<double> costs;
     for (const Drive& drive : drives) {
       for (ActionPoseSample& sample : moved) sample.action = *drive.at(time_of(sample));
-      costs.push_back(cost_of(moved));
+      costs.push_back(cost_of_(moved));
     }
     return costs;
-  };
-  const auto step_us = static_cast<std::int64_t>(median_interval_us(samples) / 2);
-  // In a direction of both.
-  const auto moved_by = [&](CommandDelay at, std::int64_t lag_us, std::int64_t smear_us) {
+  }
+
+  // One step in a direction of both, and whether it was none.
+  std::pair<CommandDelay, bool> moved_by(CommandDelay at, std::int64_t lag_us,
+                                         std::int64_t smear_us) const {
+    constexpr double kThere = 0.1;  // of half an interval
     const auto at_share = [&](double share) {
       CommandDelay there = at;
       there.lag_us += std::llround(share * static_cast<double>(lag_us));
@@ -335,32 +229,37 @@ CommandDelay least_near(const CommandDelay& start, const CommandDelay& without,
     // of the interval in which it acts. Otherwise a joint that moves less than commanded would pass
     // for a slow drive.
     const std::int64_t late_us = std::max<std::int64_t>(0, at.lag_us);
-    const std::int64_t widest_us = late_us + std::min(late_us / 4, step_us);
+    const std::int64_t widest_us = late_us + std::min(late_us / 4, step_us_);
     const bool is_widest = at.smear_us > widest_us;
     if (is_widest) at.smear_us = widest_us;
-    return std::pair(at, is_widest || std::abs(share) < kThere);
-  };
-  const auto downhill = [&](CommandDelay at, bool is_smeared) {
+    return {at, is_widest || std::abs(share) < kThere};
+  }
+
+  CommandDelay downhill(CommandDelay at, bool is_smeared) const {
+    constexpr int kMostRounds = 20;
     for (int n = 0; n < kMostRounds; ++n) {
       bool is_there = false, is_smooth = true, is_slow = true;
-      std::tie(at, is_there) = moved_by(at, step_us, 0);
+      std::tie(at, is_there) = moved_by(at, step_us_, 0);
       if (is_smeared) {
-        std::tie(at, is_smooth) = moved_by(at, 0, step_us);
-        std::tie(at, is_slow) = moved_by(at, step_us, step_us);  // of the same dead time
+        std::tie(at, is_smooth) = moved_by(at, 0, step_us_);
+        std::tie(at, is_slow) = moved_by(at, step_us_, step_us_);  // of the same dead time
       }
       if (is_there && is_smooth && is_slow) break;
     }
     return at;
-  };
-  const CommandDelay sharp = downhill(start, false), smeared = downhill(sharp, true);
+  }
+
   // Each on the frames that it has: a smeared one needs more of the past.
-  const auto best_of = [&](const CommandDelay& simple, const CommandDelay& other) {
+  CommandDelay best_of(const CommandDelay& simple, const CommandDelay& other) const {
     const auto costs = costs_at({simple, other});
     return costs[0] - costs[1] < kModelEvidence ? simple : other;
-  };
-  const CommandDelay best = best_of(sharp, smeared);
-  return best_of(best_of(without, sharp), best);
-}
+  }
+
+  const std::vector<ActionPoseSample>& samples_;
+  const CommandTrack track_;
+  const CostOf cost_of_;
+  const std::int64_t step_us_;
+};
 
 struct Regressions {
   std::vector<MotionRegression> of_pairs;
@@ -482,7 +381,7 @@ CommandDelay refined_delay(const std::vector<ActionPoseSample>& samples,
     // A model's frames count as many as there are blocks.
     return num_frames == 0 ? 0 : cost * num_blocks(actions) * num_models / num_frames;
   };
-  return least_near(delay, delay, samples, cost_of);
+  return DelaySearch(samples, cost_of).least_near(delay, delay);
 }
 
 CommandDelay command_delay(const std::vector<ActionPoseSample>& samples, const BodySchema& schema) {
@@ -513,28 +412,7 @@ CommandDelay command_delay(const std::vector<ActionPoseSample>& samples, const B
     }
     return lagged.empty() ? 0 : cost * num_blocks(actions) / static_cast<double>(lagged.size());
   };
-  return least_near({.lag_us = lag.us}, {}, samples, cost_of);
-}
-
-std::vector<ActionPoseSample> with_commands_of_before(const std::vector<ActionPoseSample>& samples,
-                                                      const CommandDelay& delay) {
-  if (delay == CommandDelay{}) return samples;
-  if (!std::ranges::is_sorted(samples, {}, time_of)) {
-    std::vector<ActionPoseSample> ascending;
-    for (const ActionPoseSample& sample : samples)
-      if (ascending.empty() || time_of(sample) >= time_of(ascending.back()))
-        ascending.push_back(sample);
-    return with_commands_of_before(ascending, delay);
-  }
-  const CommandTrack track(samples);
-  const Drive drive(track, delay);
-  std::vector<ActionPoseSample> moved;
-  for (const ActionPoseSample& sample : samples)
-    if (std::optional<Eigen::VectorXd> action = drive.at(time_of(sample))) {
-      moved.push_back(sample);
-      moved.back().action = *std::move(action);
-    }
-  return moved;
+  return DelaySearch(samples, cost_of).least_near({.lag_us = lag.us}, {});
 }
 
 }  // namespace bodyschema

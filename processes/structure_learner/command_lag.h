@@ -6,19 +6,10 @@
 #include "common/estimation/measurement_model.h"
 #include "common/schema/body_schema.h"
 #include "common/schema/sample.h"
+#include "processes/structure_learner/command_track.h"
 #include "processes/structure_learner/search/model_forest.h"
 
 namespace bodyschema {
-
-/// How the poses of a stream come after their commands: drives, filters and exposure take time, and
-/// clocks differ. A drive of first order after a dead time (the process control model of that name,
-/// FOPDT), between commands that are linear in time.
-struct CommandDelay {
-  std::int64_t lag_us = 0;    ///< dead time + time constant; below 0: before them
-  std::int64_t smear_us = 0;  ///< time constant of the drive: 0 … 1.25 lag_us
-
-  bool operator==(const CommandDelay&) const = default;
-};
 
 struct CommandLag {
   std::int64_t us = 0;
@@ -50,10 +41,5 @@ CommandDelay refined_delay(const std::vector<ActionPoseSample>& samples,
 /// Of a recording that is held against a schema as it is: by which it leaves least; none where that
 /// is hardly less than without.
 CommandDelay command_delay(const std::vector<ActionPoseSample>& samples, const BodySchema& schema);
-
-/// Each sample with the command that brought it there; those that have none, at the ends and behind
-/// gaps, are left out, and those of a time before one that came earlier.
-std::vector<ActionPoseSample> with_commands_of_before(const std::vector<ActionPoseSample>& samples,
-                                                      const CommandDelay& delay);
 
 }  // namespace bodyschema

@@ -9,6 +9,7 @@
 #include "common/geometry/angle.h"
 #include "processes/structure_learner/long_chain/coupled_joints.h"
 #include "processes/structure_learner/long_chain/long_chain.h"
+#include "processes/structure_learner/model_free_noise.h"
 #include "processes/structure_learner/residual_fit.h"
 #include "processes/structure_learner/screen.h"
 #include "processes/structure_learner/search/model_forest.h"
@@ -17,64 +18,11 @@
 namespace bodyschema {
 namespace {
 
-// A quantile of what is left, and that of χ²₃.
-struct Quantile {
-  double share, chi3;
-  double of(std::vector<double> values) const {
-    const auto n = static_cast<std::ptrdiff_t>(share * static_cast<double>(values.size()));
-    std::nth_element(values.begin(), values.begin() + n, values.end());
-    return values[static_cast<std::size_t>(n)];
-  }
-};
-constexpr Quantile kMedian{0.5, 2.366};
-// A stream rests, or moves slowly, for much of its time: what a model leaves in motion shows in the
-// upper quarter. A marker that flips at a fifth of the instants is outside.
-constexpr Quantile kUpper{0.75, 4.108};
 constexpr double kSafety = 1.2;
 constexpr int kFramesOfAPair = 120, kFramesOfAStream = 400, kFramesOfASoftPair = 400;
-constexpr int kMinRepeats = 5;
 // Of a pair, per axis: any tag's or tracker's is below.
 constexpr double kLargestRotationNoise = 1.5 * kDegree;
 constexpr double kLargestBias = 4;  // of a stream, in standard deviations of its white noise
-
-// A residual log(Δ̂⁻¹ z) of a relative pose with the lever arm that carries the rotation noise of
-// part i into its position; 0 for a single marker (`markers` 1), and for what a soft body leaves,
-// whose position and rotation err together.
-struct NoiseResidual {
-  Vector6d residual;
-  Eigen::Vector3d lever = Eigen::Vector3d::Zero();
-  double markers = 2;
-};
-
-// Noise per axis of one marker from residuals whose covariance is `markers`·σ² plus the lever's
-// part.
-Noise noise_from(const std::vector<NoiseResidual>& residuals, const Quantile& quantile = kMedian) {
-  Noise noise;
-  std::vector<double> values;
-  for (const auto& r : residuals) values.push_back(r.residual.tail<3>().squaredNorm() / r.markers);
-  noise.rotation_rad = std::sqrt(quantile.of(values) / quantile.chi3);
-  const double rotation_variance = noise.rotation_rad * noise.rotation_rad;
-  // The position variance that brings the quantile of the whitened position residuals to that of
-  // χ²₃: the covariance is v·m along the lever and v·m + |lever|²σ_r² across it.
-  const auto quantile_at = [&](double v) {
-    values.clear();
-    for (const auto& r : residuals) {
-      const double l2 = r.lever.squaredNorm();
-      const double along2 = l2 > 0 ? std::pow(r.residual.head<3>().dot(r.lever), 2) / l2 : 0.0;
-      const double across2 = r.residual.head<3>().squaredNorm() - along2;
-      values.push_back(along2 / (v * r.markers) +
-                       across2 / (v * r.markers + l2 * rotation_variance));
-    }
-    return quantile.of(values);
-  };
-  double low = 1e-20, high = 1e2;  // [m²]
-  for (int n = 0; n < 60; ++n) {
-    const double middle = std::sqrt(low * high);
-    (quantile_at(middle) > quantile.chi3 ? low : high) = middle;
-  }
-  noise.position_m = std::sqrt(high);
-  return noise;
-}
 
 Noise floored(Noise noise, double factor) {
   noise.position_m = std::max(noise.position_m * factor, kNoiseFloor.position_m);
@@ -87,85 +35,6 @@ Noise believable(Noise noise) {
   noise.position_m = std::min(noise.position_m, kNoiseCeiling.position_m);
   noise.rotation_rad = std::min(noise.rotation_rad, kNoiseCeiling.rotation_rad);
   return noise;
-}
-
-// Median pose: iteratively re-weighted mean with weights 1/|residual|.
-Pose robust_mean(const std::vector<Pose>& poses) {
-  Pose mean = poses[poses.size() / 2];
-  for (int round = 0; round < 20; ++round) {
-    Eigen::Vector3d dv = Eigen::Vector3d::Zero(), dw = Eigen::Vector3d::Zero();
-    double sv = 0, sw = 0;
-    for (const Pose& pose : poses) {
-      const Vector6d r = log(mean.inverse() * pose);
-      const double wv = 1 / std::max(r.head<3>().norm(), 1e-9);
-      const double ww = 1 / std::max(r.tail<3>().norm(), 1e-9);
-      dv += wv * r.head<3>();
-      dw += ww * r.tail<3>();
-      sv += wv;
-      sw += ww;
-    }
-    Vector6d step;
-    step << dv / sv, dw / sw;
-    mean = mean * exp(step);
-  }
-  return mean;
-}
-
-// Those whose pose is always the same to the last bit: they are the frame that the others are given
-// in, and have no noise.
-std::set<int> parts_that_define_the_frame(const std::vector<ActionPoseSample>& samples) {
-  std::map<int, Pose> first;
-  std::set<int> result, moved;
-  for (const ActionPoseSample& sample : samples)
-    for (const PartObservation& o : sample.parts) {
-      const auto [it, is_new] = first.try_emplace(o.part, o.X_CB);
-      if (it->second.matrix() != o.X_CB.matrix()) moved.insert(o.part);
-    }
-  for (const auto& [part, pose] : first)
-    if (!moved.contains(part)) result.insert(part);
-  return result;
-}
-
-std::optional<Noise> noise_from_repeats(const std::vector<ActionPoseSample>& samples,
-                                        const NormalizedActions& actions) {
-  const std::set<int> defining = parts_that_define_the_frame(samples);
-  std::vector<NoiseResidual> residuals;
-  for (const std::vector<int>& members : repeats(actions)) {
-    std::map<int, std::vector<Pose>> poses;
-    for (const int t : members)
-      for (const PartObservation& o : samples[t].parts)
-        if (!defining.contains(o.part)) poses[o.part].push_back(o.X_CB);
-    for (const auto& [part, of_part] : poses) {
-      const double n = static_cast<double>(of_part.size());
-      if (n < kMinRepeats) continue;
-      const Pose mean = robust_mean(of_part);
-      for (const Pose& pose : of_part)
-        residuals.push_back(
-            {std::sqrt(n / (n - 1)) * log(mean.inverse() * pose), Eigen::Vector3d::Zero(), 1.0});
-    }
-  }
-  if (residuals.size() < 10) return std::nullopt;
-  return noise_from(residuals);
-}
-
-// The white part of a stream's noise, whatever the model: from what is left of three successive
-// poses of a part when its motion is taken to be uniform.
-std::optional<Noise> noise_from_neighbours(const std::vector<ActionPoseSample>& samples,
-                                           const NormalizedActions& actions) {
-  if (!actions.blocks().is_stream()) return std::nullopt;
-  const std::set<int> defining = parts_that_define_the_frame(samples);
-  std::vector<NoiseResidual> residuals;
-  for (std::size_t t = 1; t + 1 < samples.size(); ++t)
-    for (const PartObservation& o : samples[t].parts) {
-      const PartObservation* before = samples[t - 1].find(o.part);
-      const PartObservation* after = samples[t + 1].find(o.part);
-      if (!before || !after || defining.contains(o.part)) continue;
-      const Pose inverse = o.X_CB.inverse();
-      residuals.push_back({log(inverse * before->X_CB) + log(inverse * after->X_CB),
-                           Eigen::Vector3d::Zero(), 6.0});  // variance of (1, −2, 1)
-    }
-  if (residuals.size() < 10) return std::nullopt;
-  return noise_from(residuals);
 }
 
 double scale_of(const Noise& noise) {
@@ -194,8 +63,8 @@ class ModelNoise {
   ModelNoise(const std::vector<ActionPoseSample>& samples, const NormalizedActions& actions)
       : samples_(samples),
         actions_(actions),
-        quantile_(actions.blocks().is_stream() ? kUpper : kMedian) {}
-  const Quantile& quantile() const { return quantile_; }
+        quantile_(actions.blocks().is_stream() ? kUpperQuantile : kMedianQuantile) {}
+  const NoiseQuantile& quantile() const { return quantile_; }
 
   // The start refined at its own noise: whitening and model in turn.
   ScaledFit refine(LocalModel model, int part_i, int part_j, Noise noise) const {
@@ -324,7 +193,7 @@ class ModelNoise {
 
   const std::vector<ActionPoseSample>& samples_;
   const NormalizedActions& actions_;
-  const Quantile quantile_;
+  const NoiseQuantile quantile_;
 };
 
 // Prim's minimum spanning tree by scale: every part by the partner that predicts it best.
@@ -369,7 +238,7 @@ std::vector<std::pair<int, int>> near_pairs(const std::vector<ActionPoseSample>&
       for (const auto& m : relative_motions(pair, kMotions).motions)
         moved.push_back(m.log.head<3>().norm() + kMetresPerRadian * m.log.tail<3>().norm());
       if (moved.empty()) continue;
-      const double typical = kMedian.of(std::move(moved));
+      const double typical = kMedianQuantile.of(std::move(moved));
       motion[{i, j}].scale = typical;
       near[i].emplace_back(typical, j);
       near[j].emplace_back(typical, i);
@@ -438,19 +307,6 @@ std::vector<NoiseResidual> residuals_of_quiet(const std::vector<const ScaledFit*
 bool is_above_any_marker(const Noise& noise) {
   return noise.position_m > kLoudestMarker.position_m ||
          noise.rotation_rad > kLoudestMarker.rotation_rad;
-}
-
-std::vector<std::vector<int>> repeats(const NormalizedActions& actions) {
-  if (actions.moving().empty() || actions.blocks().is_stream()) return {};
-  std::map<std::vector<long>, std::vector<int>> groups;
-  for (int t = 0; t < actions.num_samples(); ++t) {
-    std::vector<long> key;
-    for (const int s : actions.moving()) key.push_back(std::lround(actions(t, s) * 1e6));
-    groups[key].push_back(t);
-  }
-  std::vector<std::vector<int>> result;
-  for (auto& [key, members] : groups) result.push_back(std::move(members));
-  return result;
 }
 
 std::optional<SourcedNoise> estimate_noise(const std::vector<ActionPoseSample>& samples,

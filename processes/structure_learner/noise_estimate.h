@@ -39,10 +39,6 @@ struct SourcedNoise : Noise {
   NoiseSource source = NoiseSource::kAssumed;
 };
 
-/// Samples of one action each, up to a millionth of the ranges, in the order of the actions. None
-/// where no signal moves, and none of a stream: one that rests says the same thing many times.
-std::vector<std::vector<int>> repeats(const NormalizedActions& actions);
-
 /// Noise per axis of one marker, for data that bring neither noise nor covariances.
 ///
 /// From repeats where an action recurs at least five times, unless it is a stream that rests:

@@ -10,33 +10,21 @@
 #include "common/estimation/student_t.h"
 
 namespace bodyschema {
+namespace {
 
-double view_share(const MeasurementModel& measurement) {
-  // With it d² of X_CR has the mean 2.2 over 60 views of ideal rigs
-  // (`./run experiment rig_table … --move-camera`).
-  constexpr double kViewShare = 0.1;
-  const Noise& systematic = measurement.systematic;
-  return systematic.position_m > 0 || systematic.rotation_rad > 0 ? kViewShare : 0;
+struct Reading {
+  Pose X;
+  Matrix6d information;
+  const std::vector<int>* tags;
+};
+
+double squared_distance(const Reading& r, const Pose& X) {
+  const Vector6d e = log(X.inverse() * r.X);
+  return e.dot(r.information * e);
 }
 
-void estimate_root_pose(const std::vector<ActionPoseSample>& samples,
-                        const MeasurementModel& measurement, BodySchema* schema) {
-  struct Reading {
-    Pose X;
-    Matrix6d information;
-    const std::vector<int>* tags;
-  };
-  std::vector<Reading> readings;
-  for (const auto& sample : samples) {
-    const PartObservation* o = sample.find(schema->root);
-    if (!o || !o->has_rotation) continue;
-    readings.push_back({o->X_CB, measurement.covariance(*o).inverse(), &o->tags});
-  }
-  if (readings.empty()) return;
-  const auto squared_distance = [&](const Reading& r, const Pose& X) {
-    const Vector6d e = log(X.inverse() * r.X);
-    return e.dot(r.information * e);
-  };
+// Of at most 16 readings the one in the middle of all.
+Pose best_reading(const std::vector<Reading>& readings) {
   const auto cost = [&](const Pose& X) {
     double sum = 0;
     for (const Reading& r : readings) sum += std::log1p(squared_distance(r, X) / kStudentNu);
@@ -53,6 +41,46 @@ void estimate_root_pose(const std::vector<ActionPoseSample>& samples,
       mean = X;
     }
   }
+  return mean;
+}
+
+// Σ G Gᵀ over the tags, G the weighed effect of a tag's error on all readings by it.
+Matrix6d effect_of_tags(const std::vector<Reading>& readings, const Pose& mean,
+                        const MeasurementModel& measurement) {
+  // What is off of a tag is the same at all its sights: no number of them averages it out.
+  std::map<int, Eigen::Matrix<double, 6, 7>> of_tag;
+  for (const Reading& r : readings) {
+    const double w = robust_weight(squared_distance(r, mean));
+    for (const int id : *r.tags) {
+      auto& sum = of_tag.try_emplace(id, Eigen::Matrix<double, 6, 7>::Zero()).first->second;
+      sum += w * r.information * measurement.effect_of_tag(r.X, r.tags->size());
+    }
+  }
+  Matrix6d of_tags = Matrix6d::Zero();
+  for (const auto& [id, sum] : of_tag) of_tags += sum * sum.transpose();
+  return of_tags;
+}
+
+}  // namespace
+
+double view_share(const MeasurementModel& measurement) {
+  // With it d² of X_CR has the mean 2.2 over 60 views of ideal rigs
+  // (`./run experiment rig_table … --move-camera`).
+  constexpr double kViewShare = 0.1;
+  const Noise& systematic = measurement.systematic;
+  return systematic.position_m > 0 || systematic.rotation_rad > 0 ? kViewShare : 0;
+}
+
+void estimate_root_pose(const std::vector<ActionPoseSample>& samples,
+                        const MeasurementModel& measurement, BodySchema* schema) {
+  std::vector<Reading> readings;
+  for (const auto& sample : samples) {
+    const PartObservation* o = sample.find(schema->root);
+    if (!o || !o->has_rotation) continue;
+    readings.push_back({o->X_CB, measurement.covariance(*o).inverse(), &o->tags});
+  }
+  if (readings.empty()) return;
+  Pose mean = best_reading(readings);
   Matrix6d H;
   double weight = 1;  // mean of the inliers'
   for (int iteration = 0; iteration < 30; ++iteration) {
@@ -79,18 +107,8 @@ void estimate_root_pose(const std::vector<ActionPoseSample>& samples,
   }
   schema->X_CR = mean;
   const double views = 1 + view_share(measurement) * static_cast<double>(readings.size());
-  // What is off of a tag is the same at all its sights: no number of them averages it out.
-  std::map<int, Eigen::Matrix<double, 6, 7>> of_tag;
-  for (const Reading& r : readings) {
-    const double w = robust_weight(squared_distance(r, mean));
-    for (const int id : *r.tags) {
-      auto& sum = of_tag.try_emplace(id, Eigen::Matrix<double, 6, 7>::Zero()).first->second;
-      sum += w * r.information * measurement.effect_of_tag(r.X, r.tags->size());
-    }
-  }
   const Matrix6d inverse = H.inverse();
-  Matrix6d of_tags = Matrix6d::Zero();
-  for (const auto& [id, sum] : of_tag) of_tags += sum * sum.transpose();
+  const Matrix6d of_tags = effect_of_tags(readings, mean, measurement);
   schema->X_CR_covariance =
       views * weight * inverse + inverse * of_tags * inverse + measurement.systematic_covariance();
 }

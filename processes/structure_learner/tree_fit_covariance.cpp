@@ -23,6 +23,13 @@ Matrix6d positive_part(const Matrix6d& matrix) {
   return V * eigen.eigenvalues().cwiseMax(0).asDiagonal() * V.transpose();
 }
 
+/// Symmetric, without the negative eigenvalues.
+Matrix6d square_root(const Matrix6d& matrix) {
+  const Eigen::SelfAdjointEigenSolver<Matrix6d> eigen(matrix);
+  return eigen.eigenvectors() * eigen.eigenvalues().cwiseMax(0).cwiseSqrt().asDiagonal() *
+         eigen.eigenvectors().transpose();
+}
+
 /// Where a part was, to within which its views are alike: pixels of a tag change with less, what a
 /// lens adds changes slowly. Chosen; a part that rests has one view, one that moves many.
 constexpr double kSamePosition_m = 5e-3, kSameRotation_rad = 2 * kDegree;
@@ -140,13 +147,8 @@ Eigen::MatrixXd TreeFit::score_covariance(const Normal& normal, const Measuremen
       own[at(t, k)] = twist *
                       ((1 - share) * correlation_time * noise + (is_alone ? 1 : 0) * systematic) *
                       twist.transpose();
-      if (lasting > 0) {
-        const Eigen::SelfAdjointEigenSolver<Matrix6d> eigen(noise);
-        const Matrix6d root = eigen.eigenvectors() *
-                              eigen.eigenvalues().cwiseMax(0).cwiseSqrt().asDiagonal() *
-                              eigen.eigenvectors().transpose();
-        lasting_effects.emplace_back(t, twist * std::sqrt(1 - share) * root);
-      }
+      if (lasting > 0)
+        lasting_effects.emplace_back(t, twist * std::sqrt(1 - share) * square_root(noise));
       if (!is_alone)
         add(twist * Eigen::LLT<Matrix6d>(systematic + share * noise).matrixL().toDenseMatrix(),
             &of_view[views[frame]]);

@@ -155,6 +155,12 @@ void add_sliding_pairs(const std::vector<int>& moving,
       hypotheses->push_back({moving[s], moving[r], JointType::kSliding, JointType::kSliding});
 }
 
+bool hardly_turns(const PrincipalAxis& principal, double variance) {
+  std::vector<double> squares;
+  for (const double psi : principal.along) squares.push_back(psi * psi / variance);
+  return upper_median(std::move(squares)) < kAxisGate;
+}
+
 // All rotation about one fixed axis: parallel turning joints, or a turning and a sliding one in
 // either order. None at all: two sliding joints.
 std::vector<RotationHypothesis> single_axis_hypotheses(const StartFrames& frames,
@@ -169,9 +175,7 @@ std::vector<RotationHypothesis> single_axis_hypotheses(const StartFrames& frames
   const std::vector<int>& moving = actions.moving();
 
   RotationHypothesis h;
-  std::vector<double> squares;
-  for (const double psi : principal.along) squares.push_back(psi * psi / variance);
-  if (upper_median(std::move(squares)) < kAxisGate) {
+  if (hardly_turns(principal, variance)) {
     add_sliding_pairs(moving, &hypotheses);
     return hypotheses;
   }

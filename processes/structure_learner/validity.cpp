@@ -165,6 +165,54 @@ bool are_scattered(const Validity& validity, int num_frames) {
   return num_frames * std::pow(share, validity.longest_run) > kLeastChanceOfRun;
 }
 
+struct Outliers {
+  int most = 0;                 // that a true model has
+  bool are_far = false;         // wild readings, few of them near
+  bool are_suspicious = false;  // too many, and not allowed
+};
+
+// Sets whether the model is doubtful, too.
+Outliers judge_outliers(int num_independent, int num_frames, const ValidityOptions& options,
+                        Validity* validity) {
+  const double share = static_cast<double>(num_independent) / num_frames;
+  const double rate = pair_outlier_rate(options);
+  Outliers result;
+  result.most = std::min(
+      static_cast<int>(
+          binomial_quantile(num_independent, rate, options.lenient ? 0.99999 : 0.9997) / share),
+      static_cast<int>(0.35 * num_frames));
+  // With few frames a true model may meet more outliers than the bound by bad luck: then it is not
+  // refuted, only not to be trusted yet.
+  const int inliers = num_frames - validity->num_outliers;
+  result.are_far = num_independent >= kFewestFarFrames && validity->num_near <= result.most &&
+                   inliers >= kFewestInliers * num_frames && are_scattered(*validity, num_frames);
+  const bool are_allowed = options.allows_far_outliers && result.are_far;
+  result.are_suspicious = validity->num_outliers > result.most && !are_allowed;
+  validity->doubtful =
+      num_independent < kFewFrames && (are_allowed ? validity->num_near : validity->num_outliers) >
+                                          binomial_quantile(num_independent, rate, 0.8) / share;
+  return result;
+}
+
+// Of the inliers' d², with so many degrees of freedom left.
+double largest_mean_of(double dof, int num_residuals, double correlation,
+                       const ValidityOptions& options) {
+  // Squares of noise that lasts: the sum of ρ^2k over all lags either way.
+  const double lasts = (1 + correlation * correlation) / (1 - correlation * correlation);
+  const double max_mean =
+      largest_inlier_mean(dof / num_residuals / lasts, options.lenient ? 5 : 3, num_residuals);
+  return std::min(max_mean, 0.75 * outlier_threshold(num_residuals));
+}
+
+// Of one of all candidates with so many joints.
+bool is_improbable_by_chance(const Fit& fit, const PairData& pair, const NormalizedActions& actions,
+                             double dof) {
+  const double num_candidates =
+      1.0 +
+      std::pow(std::max(static_cast<int>(actions.moving().size()), 1), fit.model.num_joints());
+  return dof * log_spread(fit, pair) > std::log(num_candidates) + 7;
+}
+
 }  // namespace
 
 double largest_inlier_mean(double num_inliers, double sigmas, int num_residuals) {
@@ -196,20 +244,8 @@ Validity check_validity(const Fit& fit, const LeaveOneOut& loo, const PairData& 
   const double share = static_cast<double>(num_independent) / n;
 
   // V1
-  const double rate = pair_outlier_rate(options);
-  const int max_outliers = std::min(
-      static_cast<int>(
-          binomial_quantile(num_independent, rate, options.lenient ? 0.99999 : 0.9997) / share),
-      static_cast<int>(0.35 * n));
-  // With few frames a true model may meet more outliers than the bound by bad luck: then it is not
-  // refuted, only not to be trusted yet.
-  const bool are_far = num_independent >= kFewestFarFrames && result.num_near <= max_outliers &&
-                       inliers >= kFewestInliers * n && are_scattered(result, n);
-  const bool are_allowed = options.allows_far_outliers && are_far;
-  const bool suspicious = result.num_outliers > max_outliers && !are_allowed;
-  result.doubtful =
-      num_independent < kFewFrames && (are_allowed ? result.num_near : result.num_outliers) >
-                                          binomial_quantile(num_independent, rate, 0.8) / share;
+  const Outliers outliers = judge_outliers(num_independent, n, options, &result);
+  const bool suspicious = outliers.are_suspicious;
   const double independent_inliers = share * inliers;
   const int num_residuals = pair.num_residuals();
   const double dof = num_residuals * independent_inliers - p;
@@ -219,17 +255,13 @@ Validity check_validity(const Fit& fit, const LeaveOneOut& loo, const PairData& 
     return result;
   }
   const double correlation = serial_correlation(fit, pair, actions);
-  // Squares of noise that lasts: the sum of ρ^2k over all lags either way.
-  const double lasts = (1 + correlation * correlation) / (1 - correlation * correlation);
-  const double max_mean =
-      largest_inlier_mean(dof / num_residuals / lasts, options.lenient ? 5 : 3, num_residuals);
-  const double largest_mean = std::min(max_mean, 0.75 * outlier_threshold(num_residuals));
+  const double largest_mean = largest_mean_of(dof, num_residuals, correlation, options);
   if (result.mean_inlier > largest_mean) return result;
-  result.has_far_outliers = suspicious && are_far;
+  result.has_far_outliers = suspicious && outliers.are_far;
   if (suspicious && (n >= kFewFrames || 2 * result.num_outliers > n)) {
     // So many wild readings say nothing against it, nor for it. (By chance a wrong model has fewer
     // inliers without more that are near.)
-    if (options.allows_far_outliers && result.num_near <= max_outliers && 4 * inliers > n)
+    if (options.allows_far_outliers && result.num_near <= outliers.most && 4 * inliers > n)
       result.verdict = Verdict::kNotEnoughData;
     return result;
   }
@@ -244,15 +276,13 @@ Validity check_validity(const Fit& fit, const LeaveOneOut& loo, const PairData& 
   }
 
   const int k = fit.model.num_joints();
-  const double num_candidates =
-      1.0 + std::pow(std::max(static_cast<int>(actions.moving().size()), 1), k);
   result.verdict = Verdict::kValid;
   if (suspicious) result.verdict = Verdict::kNotEnoughData;
   // Few readings of a joint that happened to move little look rigid, the more so with some set
   // aside.
   if (k == 0 && independent_inliers < 4 + share * result.num_outliers)
     result.verdict = Verdict::kNotEnoughData;
-  const bool improbable_by_chance = dof * log_spread(fit, pair) > std::log(num_candidates) + 7;
+  const bool improbable_by_chance = is_improbable_by_chance(fit, pair, actions, dof);
   if (k > 0 && dof < 2 * p && !improbable_by_chance) result.verdict = Verdict::kNotEnoughData;
   return result;
 }

@@ -17,16 +17,14 @@
 #include <array>
 #include <cmath>
 #include <limits>
-#include <nlohmann/json.hpp>
 #include <random>
 #include <string>
 #include <vector>
 
-#include "common/bus/event_log.h"
-#include "common/geometry/angle.h"
 #include "common/plot/plot.h"
 #include "processes/controller/trajectory.h"
 #include "processes/structure_learner/learn.h"
+#include "tests/experiments/control_arms.h"
 #include "tests/support/broken_arm.h"
 #include "tests/support/steered_arm.h"
 
@@ -35,82 +33,8 @@ using namespace bodyschema::test;
 
 namespace {
 
-constexpr int kWayPoints = 30, kPasses = 2, kSamples = 100;
-constexpr double kStep_m = 0.02, kLonger_m = 0.01;
-constexpr int kRoot = 1, kEndEffector = 5, kMiddle = 3;
-
-/// A closed path of the whole arm's end effector: each joint swings by a third of its range to both
-/// sides, the even ones twice a turn.
-std::vector<Eigen::Vector3d> path_of(const SyntheticRobot& robot) {
-  std::vector<Eigen::Vector3d> path;
-  for (int n = 0; n < kWayPoints; ++n) {
-    const double phase = 2 * M_PI * n / kWayPoints;
-    Eigen::VectorXd action(robot.signals.size());
-    for (std::size_t s = 0; s < robot.signals.size(); ++s) {
-      const Signal& signal = robot.signals[s];
-      const double swing = std::sin(phase * (s % 2 ? 2 : 1) + 0.7 * static_cast<double>(s));
-      action[static_cast<Eigen::Index>(s)] =
-          0.5 * (signal.lower + signal.upper) + swing * (signal.upper - signal.lower) / 3;
-    }
-    const auto X_CB = robot.poses_in_camera(action);
-    path.push_back((X_CB.at(kRoot).inverse() * X_CB.at(kEndEffector)).translation());
-  }
-  return path;
-}
-
-/// The middle link turns by 45° about an axis across it, at the joint that carries it.
-SyntheticRobot bent(SyntheticRobot robot, Rng& rng) {
-  TrueLink& link = robot.links[kMiddle - 1];
-  const Eigen::Vector3d along = link.X_after.translation();
-  const Eigen::Vector3d across = along.cross(random_vector(rng, 1, 1)).normalized();
-  link.X_after =
-      exp((Vector6d() << Eigen::Vector3d::Zero(), across * 45 * kDegree).finished()) * link.X_after;
-  return robot;
-}
-
-/// The hand is farther out, as with another tool.
-SyntheticRobot lengthened(SyntheticRobot robot) {
-  robot.links.back().X_after.translation() +=
-      kLonger_m * robot.links.back().X_after.translation().normalized();
-  return robot;
-}
-
-enum class Body { kWhole, kBent, kLonger };
-
-struct Arms {
-  SyntheticRobot whole, bent, longer;
-  std::vector<Eigen::Vector3d> path;  ///< of the end effector, in the root's frame [m]
-
-  const SyntheticRobot& of(Body body) const {
-    return body == Body::kWhole ? whole : body == Body::kBent ? bent : longer;
-  }
-};
-
-bool reaches(const SyntheticRobot& robot, const std::vector<Eigen::Vector3d>& path) {
-  const InverseKinematicsOptions options{
-      .tolerance_m = 1e-4, .damping_m = 0.05, .max_iterations = 100, .max_starts = 20};
-  const BodySchema schema = true_schema(robot);
-  Eigen::VectorXd action = Eigen::VectorXd::Zero(static_cast<Eigen::Index>(robot.signals.size()));
-  for (const Eigen::Vector3d& p_RT : path) {
-    const auto solution =
-        solve_pose(schema, kEndEffector, {.p_RT = p_RT}, robot.signals, action, options);
-    if (!solution.is_within_tolerance) return false;
-    action = solution.action;
-  }
-  return true;
-}
-
-Arms arms_of(Rng& rng) {
-  for (;;) {
-    Arms arms;
-    arms.whole = chapter_robot("c", rng);
-    arms.bent = bent(arms.whole, rng);
-    arms.longer = lengthened(arms.whole);
-    arms.path = path_of(arms.whole);
-    if (reaches(arms.whole, arms.path) && reaches(arms.bent, arms.path)) return arms;
-  }
-}
-
+constexpr int kPasses = 2, kSamples = 100;
+constexpr double kStep_m = 0.02;
 constexpr double kNone = std::numeric_limits<double>::infinity();
 
 enum class Control {
@@ -261,39 +185,6 @@ std::string cell(const Result& result, int from, int to) {
                      1e3 * std::sqrt(sum / static_cast<double>(all.size())));
 }
 
-nlohmann::json json_of(const Pose& X) {
-  const Eigen::Vector3d p = X.translation();
-  const Eigen::Quaterniond q(X.linear());
-  return {{"p_m", {p.x(), p.y(), p.z()}}, {"q_wxyz", {q.w(), q.x(), q.y(), q.z()}}};
-}
-
-/// The arms of Table 2, one a line: each part hangs on the one before it, part 2 on part 1, by
-/// X_before · Rot_z(q) · X_after; bent, part 3 by another X_after; and the way points of part 5 in
-/// part 1.
-void write_geometry(int num_runs, const std::string& file) {
-  std::string text;
-  for (int run = 1; run <= num_runs; ++run) {
-    Rng rng(static_cast<Rng::result_type>(run));
-    const Arms arms = arms_of(rng);
-    nlohmann::json links, path;
-    for (const TrueLink& link : arms.whole.links) {
-      if (link.parent < 0) continue;
-      const Signal& signal = arms.whole.signals[static_cast<std::size_t>(link.signal)];
-      links.push_back({{"part", link.part},
-                       {"X_before", json_of(link.X_before)},
-                       {"X_after", json_of(link.X_after)},
-                       {"limits_rad", {signal.lower, signal.upper}}});
-    }
-    for (const Eigen::Vector3d& p : arms.path) path.push_back({p.x(), p.y(), p.z()});
-    const nlohmann::json line = {{"arm", run},
-                                 {"links", links},
-                                 {"bent_X_after", json_of(arms.bent.links[kMiddle - 1].X_after)},
-                                 {"path_m", path}};
-    text += line.dump() + "\n";
-  }
-  write_file_atomically(file, text);
-}
-
 /// Rms over the targets of one run [m]; moves per target.
 struct TwoDof {
   std::vector<double> errors_m, moves;
@@ -437,23 +328,8 @@ Plot plot_of(const std::vector<Case>& cases, const std::vector<Result>& results)
   return plot;
 }
 
-}  // namespace
-
-int main(int argc, char** argv) {
-  int num_runs = 20;
-  bool is_along = false;
-  std::string plot_file, geometry_file;
-  std::string rig = std::string(BODYSCHEMA_CONFIG) + "/arm4";
-  CLI::App app("Table 2: an arm of four joints follows a path, whole and bent; control of Fig. 10");
-  app.add_option("--runs", num_runs, "Arms of other geometry")->check(CLI::PositiveNumber);
-  app.add_option("--rig", rig, "Folder of controller.yaml and model_monitor.yaml");
-  app.add_flag("--along", is_along, "Also the mean error at each way point");
-  app.add_option("--plot", plot_file, "PNG: the way of the first arm, and the errors");
-  app.add_option("--geometry", geometry_file,
-                 "Joints of the arms and their paths, a JSON object a line");
-  CLI11_PARSE(app, argc, argv);
-  if (!geometry_file.empty()) write_geometry(num_runs, geometry_file);
-  const std::vector<Case> cases = {
+std::vector<Case> all_cases() {
+  return {
       {"whole, static, engineered", Regime::kTag, false, Body::kWhole, Control::kStatic, false,
        "7 ± 11", 0.5, 0.5},
       {"whole, static, learned", Regime::kTag, true, Body::kWhole, Control::kStatic, false,
@@ -474,6 +350,25 @@ int main(int argc, char** argv) {
        Control::kAdaptive, true, "15 ± 2", 3, 1.5},
       {"bent, adaptive, learned, chapter noise", Regime::kChapter, true, Body::kBent,
        Control::kAdaptive, false, "–", 15, 15}};
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+  int num_runs = 20;
+  bool is_along = false;
+  std::string plot_file, geometry_file;
+  std::string rig = std::string(BODYSCHEMA_CONFIG) + "/arm4";
+  CLI::App app("Table 2: an arm of four joints follows a path, whole and bent; control of Fig. 10");
+  app.add_option("--runs", num_runs, "Arms of other geometry")->check(CLI::PositiveNumber);
+  app.add_option("--rig", rig, "Folder of controller.yaml and model_monitor.yaml");
+  app.add_flag("--along", is_along, "Also the mean error at each way point");
+  app.add_option("--plot", plot_file, "PNG: the way of the first arm, and the errors");
+  app.add_option("--geometry", geometry_file,
+                 "Joints of the arms and their paths, a JSON object a line");
+  CLI11_PARSE(app, argc, argv);
+  if (!geometry_file.empty()) write_geometry(num_runs, geometry_file);
+  const std::vector<Case> cases = all_cases();
   fmt::print(
       "| arm and schema | way points 1–3 [mm] | 4–30 [mm] | second pass [mm] | chapter | must | "
       "moves | of these probes | not reached |\n|---|---|---|---|---|---|---|---|---|\n");

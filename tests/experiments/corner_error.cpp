@@ -125,101 +125,141 @@ struct Errors {
   double over_bound() const { return std::sqrt(squares_over_bound / num_over_bound); }
 };
 
-void print_row(const std::string& name, const Cell& cell, int num_views, int num_frames,
-               std::uint64_t seed) {
-  TagDetector detector("tag36h11", 1, 20);
-  std::mt19937_64 random(seed);
-  std::uniform_real_distribution<double> uniform(0, 1);
-  Errors april, sub_pixel, edges, photometric;
-  int unseen = 0, num = 0;
-  double bound2 = 0, time_us = 0;
-  std::map<std::string, int> refusals;
-  for (int i = 0; i < num_views; ++i) {
-    Plate plate;
-    plate.id = static_cast<int>(uniform(random) * 587);
-    plate.size_m = kSize_m;
-    const camera_info_t camera = camera_of(cell);
-    const double distance_m = camera.fx * kSize_m / cell.side_px;
-    const double off = cell.is_distorted ? 1 : 0.3;
-    plate.X_CM = marker_pose(distance_m, cell.tilt_deg * kDegree, 2 * M_PI * uniform(random),
-                             2 * M_PI * uniform(random), off * (0.3 + 0.01 * uniform(random)),
-                             off * (0.2 + 0.01 * uniform(random)));
-    TagViewOptions options;
-    options.blur_px = cell.blur_px;
-    options.white = cell.white;
-    const double way = 2 * M_PI * uniform(random);
-    options.motion_px = cell.motion_px * Eigen::Vector2d(std::cos(way), std::sin(way));
-    const double light = 2 * M_PI * uniform(random);
-    options.light_gradient =
-        cell.light_change / cell.side_px * Eigen::Vector2d(std::cos(light), std::sin(light));
-    options.rays_per_px = cell.side_px > 120 ? 4 : 8;
+Plate random_plate(const Cell& cell, const camera_info_t& camera,
+                   const std::function<double()>& uniform) {
+  Plate plate;
+  plate.id = static_cast<int>(uniform() * 587);
+  plate.size_m = kSize_m;
+  const double distance_m = camera.fx * kSize_m / cell.side_px;
+  const double off = cell.is_distorted ? 1 : 0.3;
+  plate.X_CM =
+      marker_pose(distance_m, cell.tilt_deg * kDegree, 2 * M_PI * uniform(), 2 * M_PI * uniform(),
+                  off * (0.3 + 0.01 * uniform()), off * (0.2 + 0.01 * uniform()));
+  return plate;
+}
+
+TagViewOptions random_options(const Cell& cell, const std::function<double()>& uniform) {
+  TagViewOptions options;
+  options.blur_px = cell.blur_px;
+  options.white = cell.white;
+  const double way = 2 * M_PI * uniform();
+  options.motion_px = cell.motion_px * Eigen::Vector2d(std::cos(way), std::sin(way));
+  const double light = 2 * M_PI * uniform();
+  options.light_gradient =
+      cell.light_change / cell.side_px * Eigen::Vector2d(std::cos(light), std::sin(light));
+  options.rays_per_px = cell.side_px > 120 ? 4 : 8;
+  return options;
+}
+
+std::vector<Eigen::Vector2d> sub_pixel_corners(const cv::Mat& image,
+                                               const std::vector<Eigen::Vector2d>& corners_px,
+                                               double side_px) {
+  const int window = std::max(2, static_cast<int>(side_px / 16));
+  std::vector<cv::Point2f> points;
+  for (const auto& p : corners_px)
+    points.emplace_back(static_cast<float>(p.x()), static_cast<float>(p.y()));
+  cv::cornerSubPix(image, points, {window, window}, {-1, -1},
+                   {cv::TermCriteria::COUNT | cv::TermCriteria::EPS, 50, 1e-4});
+  std::vector<Eigen::Vector2d> moved;
+  for (const auto& p : points) moved.emplace_back(p.x, p.y);
+  return moved;
+}
+
+/// All corner detectors on the images of one cell.
+class Comparison {
+ public:
+  explicit Comparison(const Cell& cell) : cell_(cell) {}
+
+  void add_view(const Plate& plate, const camera_info_t& camera, const TagViewOptions& options,
+                int num_frames, std::uint64_t first_seed, int num_views) {
     const camera_info_t around = camera_around(plate, camera);
     const Lens lens(around);
     const TagView view(plate, around, options);
-    const Matrix8d bound = view.cramer_rao_px2(std::hypot(cell.noise_sd, std::sqrt(1.0 / 12)));
-    bound2 += bound.trace() / 8 / num_views;
-    for (Errors* errors : {&april, &sub_pixel, &edges, &photometric}) errors->views.emplace_back();
-    for (int f = 0; f < num_frames; ++f, ++num) {
-      const cv::Mat image =
-          view.taken(cell.noise_sd, seed * 1000003 + i * 1009 + f, cell.jpeg_quality);
-      const auto found = detector.detect(image);
+    const Matrix8d bound = view.cramer_rao_px2(std::hypot(cell_.noise_sd, std::sqrt(1.0 / 12)));
+    bound2_ += bound.trace() / 8 / num_views;
+    for (Errors* errors : {&april_, &sub_pixel_, &edges_, &photometric_})
+      errors->views.emplace_back();
+    for (int f = 0; f < num_frames; ++f, ++num_) {
+      const cv::Mat image = view.taken(cell_.noise_sd, first_seed + f, cell_.jpeg_quality);
+      const auto found = detector_.detect(image);
       const auto it = std::find_if(found.begin(), found.end(),
                                    [&](const TagDetection& d) { return d.id == plate.id; });
-      if (it == found.end()) {
-        ++unseen;
-        continue;
-      }
-      april.add(it->corners_px, view, bound);
-      const int window = std::max(2, static_cast<int>(cell.side_px / 16));
-      std::vector<cv::Point2f> points;
-      for (const auto& p : it->corners_px) {
-        points.emplace_back(static_cast<float>(p.x()), static_cast<float>(p.y()));
-      }
-      cv::cornerSubPix(image, points, {window, window}, {-1, -1},
-                       {cv::TermCriteria::COUNT | cv::TermCriteria::EPS, 50, 1e-4});
-      std::vector<Eigen::Vector2d> moved;
-      for (const auto& p : points) moved.emplace_back(p.x, p.y);
-      sub_pixel.add(moved, view, bound);
-      if (const auto corners = edge_corners(image, lens, 8, it->corners_px)) {
-        edges.add(*corners, view, bound);
-      } else {
-        ++edges.failed;
-      }
-      const TagCells& cells = detector.cells(plate.id);
-      const auto begin = std::chrono::steady_clock::now();
-      const CornerRefinement fit = refine_corners(image, lens, cells, it->corners_px);
-      time_us += std::chrono::duration<double, std::micro>(std::chrono::steady_clock::now() - begin)
-                     .count();
-      if (fit.corners) {
-        photometric.add(*fit.corners, view, bound);
-      } else {
-        ++photometric.failed;
-        ++refusals[name_of(fit.refusal)];
-        april.judge(it->corners_px, view,
-                    detected_covariance_px2(kDetected, cells, it->corners_px, fit));
-      }
+      if (it == found.end())
+        ++unseen_;
+      else
+        add_frame(image, *it, view, lens, bound);
     }
   }
-  std::string why;
-  for (const auto& [reason, n] : refusals) why += " " + reason;
-  const double seen = num - unseen;
-  char line[512];
-  std::snprintf(line, sizeof line,
-                "| %s | %.0f | %.3f, %.3f | %.3f, %.3f | %.3f, %.3f, %.2f, %.1f | "
-                "%.4f, %.4f, %.2f, %.1f, %.1f | %.4f | %.0f%s | %.1f | %.0f |",
-                name.c_str(), 100 * seen / num, april.bias(), april.rms(), sub_pixel.bias(),
-                sub_pixel.rms(), edges.bias(), edges.rms(), edges.over_bound(), edges.mean_d2(),
-                photometric.bias(), photometric.rms(), photometric.over_bound(),
-                photometric.mean_d2(), photometric.d2_quantile(0.95), std::sqrt(bound2),
-                100 * photometric.failed / seen, why.c_str(), april.mean_d2(), time_us / seen);
-  // A detector that found nothing has no figure.
-  std::string row = line;
-  for (const char* none : {"-nan", "nan"}) {
-    for (std::size_t at; (at = row.find(none)) != std::string::npos;) {
-      row.replace(at, std::string(none).size(), "–");
+
+  std::string row(const std::string& name) const {
+    std::string why;
+    for (const auto& [reason, n] : refusals_) why += " " + reason;
+    const double seen = num_ - unseen_;
+    char line[512];
+    std::snprintf(line, sizeof line,
+                  "| %s | %.0f | %.3f, %.3f | %.3f, %.3f | %.3f, %.3f, %.2f, %.1f | "
+                  "%.4f, %.4f, %.2f, %.1f, %.1f | %.4f | %.0f%s | %.1f | %.0f |",
+                  name.c_str(), 100 * seen / num_, april_.bias(), april_.rms(), sub_pixel_.bias(),
+                  sub_pixel_.rms(), edges_.bias(), edges_.rms(), edges_.over_bound(),
+                  edges_.mean_d2(), photometric_.bias(), photometric_.rms(),
+                  photometric_.over_bound(), photometric_.mean_d2(), photometric_.d2_quantile(0.95),
+                  std::sqrt(bound2_), 100 * photometric_.failed / seen, why.c_str(),
+                  april_.mean_d2(), time_us_ / seen);
+    // A detector that found nothing has no figure.
+    std::string row = line;
+    for (const char* none : {"-nan", "nan"}) {
+      for (std::size_t at; (at = row.find(none)) != std::string::npos;) {
+        row.replace(at, std::string(none).size(), "–");
+      }
+    }
+    return row;
+  }
+
+ private:
+  void add_frame(const cv::Mat& image, const TagDetection& found, const TagView& view,
+                 const Lens& lens, const Matrix8d& bound) {
+    april_.add(found.corners_px, view, bound);
+    sub_pixel_.add(sub_pixel_corners(image, found.corners_px, cell_.side_px), view, bound);
+    if (const auto corners = edge_corners(image, lens, 8, found.corners_px)) {
+      edges_.add(*corners, view, bound);
+    } else {
+      ++edges_.failed;
+    }
+    const TagCells& cells = detector_.cells(found.id);
+    const auto begin = std::chrono::steady_clock::now();
+    const CornerRefinement fit = refine_corners(image, lens, cells, found.corners_px);
+    time_us_ +=
+        std::chrono::duration<double, std::micro>(std::chrono::steady_clock::now() - begin).count();
+    if (fit.corners) {
+      photometric_.add(*fit.corners, view, bound);
+    } else {
+      ++photometric_.failed;
+      ++refusals_[name_of(fit.refusal)];
+      april_.judge(found.corners_px, view,
+                   detected_covariance_px2(kDetected, cells, found.corners_px, fit));
     }
   }
-  std::puts(row.c_str());
+
+  const Cell cell_;
+  TagDetector detector_{"tag36h11", 1, 20};
+  Errors april_, sub_pixel_, edges_, photometric_;
+  int unseen_ = 0, num_ = 0;
+  double bound2_ = 0, time_us_ = 0;
+  std::map<std::string, int> refusals_;
+};
+
+void print_row(const std::string& name, const Cell& cell, int num_views, int num_frames,
+               std::uint64_t seed) {
+  std::mt19937_64 random(seed);
+  const auto uniform = [&] { return std::uniform_real_distribution<double>(0, 1)(random); };
+  const camera_info_t camera = camera_of(cell);
+  Comparison comparison(cell);
+  for (int i = 0; i < num_views; ++i) {
+    const Plate plate = random_plate(cell, camera, uniform);
+    comparison.add_view(plate, camera, random_options(cell, uniform), num_frames,
+                        seed * 1000003 + i * 1009, num_views);
+  }
+  std::puts(comparison.row(name).c_str());
   std::fflush(stdout);
 }
 
@@ -238,38 +278,26 @@ std::string text(const char* format, double value) {
   return buffer;
 }
 
-}  // namespace
-
-int main(int argc, char** argv) {
+struct Arguments {
   int num_views = 12, num_frames = 12;
   std::uint64_t seed = 1;
   std::vector<std::string> only;
-  CLI::App app("Errors of tag corners against the truth");
-  app.add_option("--views", num_views)->check(CLI::PositiveNumber);
-  app.add_option("--frames", num_frames)->check(CLI::PositiveNumber);
-  app.add_option("--seed", seed);
-  app.add_option("--only", only,
-                 "Tables: side, tilt, sharp, blur, motion, noise, jpeg, light, white, lens");
-  CLI11_PARSE(app, argc, argv);
-  const auto wanted = [&](const char* table) {
-    return only.empty() || std::find(only.begin(), only.end(), table) != only.end();
-  };
+};
+
+void print_tables(const Arguments& arguments) {
   const auto table = [&](const char* name, const std::string& title, const char* format,
                          const std::vector<double>& values,
                          const std::function<void(Cell&, double)>& set) {
-    if (!wanted(name)) return;
+    const auto& only = arguments.only;
+    if (!only.empty() && std::find(only.begin(), only.end(), name) == only.end()) return;
     print_header(title);
     for (const double value : values) {
       Cell cell;
       set(cell, value);
-      print_row(text(format, value), cell, num_views, num_frames, seed);
+      print_row(text(format, value), cell, arguments.num_views, arguments.num_frames,
+                arguments.seed);
     }
   };
-  std::printf(
-      "All in px, over %d views × %d frames; side 50 px, tilt 35°, blur 0.7 px, noise 2 grey "
-      "levels, "
-      "contrast 195, where nothing else is said. d² has 8 degrees of freedom (95 %%: 15.5).\n",
-      num_views, num_frames);
   table("side", "side", "%g px", {12, 16, 20, 25, 35, 50, 80, 120, 200},
         [](Cell& c, double v) { c.side_px = v; });
   table("tilt", "tilt", "%g°", {0, 15, 30, 45, 60, 70, 75},
@@ -311,5 +339,24 @@ int main(int argc, char** argv) {
     c.is_distorted = true;
     c.side_px = v;
   });
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+  Arguments arguments;
+  CLI::App app("Errors of tag corners against the truth");
+  app.add_option("--views", arguments.num_views)->check(CLI::PositiveNumber);
+  app.add_option("--frames", arguments.num_frames)->check(CLI::PositiveNumber);
+  app.add_option("--seed", arguments.seed);
+  app.add_option("--only", arguments.only,
+                 "Tables: side, tilt, sharp, blur, motion, noise, jpeg, light, white, lens");
+  CLI11_PARSE(app, argc, argv);
+  std::printf(
+      "All in px, over %d views × %d frames; side 50 px, tilt 35°, blur 0.7 px, noise 2 grey "
+      "levels, "
+      "contrast 195, where nothing else is said. d² has 8 degrees of freedom (95 %%: 15.5).\n",
+      arguments.num_views, arguments.num_frames);
+  print_tables(arguments);
   return 0;
 }

@@ -183,6 +183,42 @@ void print_row(const std::string& name, const Outcome& outcome) {
               1e3 * outcome.end_effector_m, outcome.seconds);
 }
 
+/// The k-th kill comes after a share k/num_kills of the samples, except their last twentieth, so
+/// that the run does not end before the last kill. Kills by program.
+std::map<std::string, int> kill_all_along(Run* run, std::int64_t num_samples, int num_kills,
+                                          std::uint64_t seed) {
+  std::mt19937_64 random(seed);
+  std::map<std::string, int> killed;
+  std::vector<std::string> victims;
+  for (int k = 0; k < num_kills; ++k) {
+    const std::int64_t after = k * (num_samples - num_samples / 20) / num_kills;
+    const bool is_due = becomes_true(std::chrono::seconds(120), [&] {
+      return run->has_ended() || static_cast<std::int64_t>(run->samples().size()) >= after;
+    });
+    if (!is_due || run->has_ended()) break;
+    if (victims.empty()) {
+      // Those that this version of the group has.
+      becomes_true(std::chrono::seconds(30), [&] { return !run->processes("lcm-logger").empty(); });
+      for (const std::string& name : kVictims) {
+        if (fs::exists(kBuild / "bin" / name) || name == "lcm-logger") victims.push_back(name);
+      }
+    }
+    std::this_thread::sleep_for(
+        std::chrono::milliseconds(std::uniform_int_distribution<int>(0, 400)(random)));
+    const std::string& victim =
+        victims[std::uniform_int_distribution<std::size_t>(0, victims.size() - 1)(random)];
+    const std::uint64_t which = random();
+    std::vector<pid_t> pids;
+    becomes_true(std::chrono::seconds(60), [&] {
+      pids = run->processes(victim);
+      return !pids.empty() || run->has_ended();
+    });
+    if (pids.empty()) break;
+    if (::kill(pids[which % pids.size()], SIGKILL) == 0) ++killed[victim];
+  }
+  return killed;
+}
+
 }  // namespace
 
 int main(int argc, char** argv) {
@@ -213,42 +249,10 @@ int main(int argc, char** argv) {
   }
   const Outcome undisturbed = judge(calm, rig, num_samples);
 
-  // The k-th kill comes after a share k/num_kills of the samples, except their last twentieth, so
-  // that the run does not end before the last kill.
-  std::mt19937_64 random(seed);
-  std::map<std::string, int> killed;
-  int num_killed = 0;
   Run run(folder / "killed", arguments);
-  std::vector<std::string> victims;
-  for (int k = 0; k < num_kills; ++k) {
-    const std::int64_t after = k * (num_samples - num_samples / 20) / num_kills;
-    const bool is_due = becomes_true(std::chrono::seconds(120), [&] {
-      return run.has_ended() || static_cast<std::int64_t>(run.samples().size()) >= after;
-    });
-    if (!is_due || run.has_ended()) break;
-    if (victims.empty()) {
-      // Those that this version of the group has.
-      becomes_true(std::chrono::seconds(30), [&] { return !run.processes("lcm-logger").empty(); });
-      for (const std::string& name : kVictims) {
-        if (fs::exists(kBuild / "bin" / name) || name == "lcm-logger") victims.push_back(name);
-      }
-    }
-    std::this_thread::sleep_for(
-        std::chrono::milliseconds(std::uniform_int_distribution<int>(0, 400)(random)));
-    const std::string& victim =
-        victims[std::uniform_int_distribution<std::size_t>(0, victims.size() - 1)(random)];
-    const std::uint64_t which = random();
-    std::vector<pid_t> pids;
-    becomes_true(std::chrono::seconds(60), [&] {
-      pids = run.processes(victim);
-      return !pids.empty() || run.has_ended();
-    });
-    if (pids.empty()) break;
-    if (::kill(pids[which % pids.size()], SIGKILL) == 0) {
-      ++killed[victim];
-      ++num_killed;
-    }
-  }
+  const std::map<std::string, int> killed = kill_all_along(&run, num_samples, num_kills, seed);
+  int num_killed = 0;
+  for (const auto& [name, count] : killed) num_killed += count;
   const bool has_ended = becomes_true(std::chrono::seconds(300), [&] { return run.has_ended(); });
   const Outcome disturbed = judge(run, rig, num_samples);
 

@@ -195,6 +195,84 @@ class Soak {
   bool is_complete_ = false;
 };
 
+using UsageOf = std::map<std::string, Usage>;        // by program
+using UsageAfter = std::map<std::int64_t, UsageOf>;  // by the number of samples
+
+/// Since `before`, after so many samples.
+void print_row(std::int64_t n, const UsageOf& now, std::int64_t printed, const UsageOf& before) {
+  double sum = 0;
+  std::printf("| %lld |", static_cast<long long>(n));
+  for (const auto& [name, u] : now) {
+    const Usage& then = before.at(name);
+    const auto num_new = static_cast<double>(n - printed);
+    std::printf(" %.0f | %.1f | %.2f |", u.memory_mb, (u.read_kb - then.read_kb) / num_new,
+                (u.processor_ms - then.processor_ms) / num_new);
+    sum += u.memory_mb;
+  }
+  std::printf(" %.0f |\n", sum);
+  std::fflush(stdout);
+}
+
+/// Prints the table.
+UsageAfter run(Soak* soak, std::int64_t num_samples) {
+  UsageAfter usage;
+  std::printf("| samples |");
+  for (const auto& [name, u] : soak->usage())
+    std::printf(" %s MB | kB read a sample | ms a sample |", name.c_str());
+  std::printf(" all MB |\n| --- |");
+  for (std::size_t i = 0; i < soak->usage().size(); ++i) std::printf(" --- | --- | --- |");
+  std::printf(" --- |\n");
+  std::map<std::string, Usage> before = soak->usage();
+  std::map<std::string, std::deque<double>> recent_mb;
+  std::int64_t printed = 0;
+  for (std::int64_t n = 1; n <= num_samples; ++n) {
+    soak->step(n - 1);
+    for (const auto& [name, u] : soak->usage()) {
+      std::deque<double>& memory = recent_mb[name];
+      memory.push_back(u.memory_mb);
+      if (std::ssize(memory) > kMoment) memory.pop_front();
+    }
+    if (n % std::max<std::int64_t>(500, num_samples / 20) != 0 && n != kFull / 2 && n != kFull &&
+        n != num_samples)
+      continue;
+    usage[n] = soak->usage();
+    for (auto& [name, u] : usage[n]) u.memory_mb = *std::ranges::min_element(recent_mb.at(name));
+    print_row(n, usage[n], printed, before);
+    before = usage[n];
+    printed = n;
+  }
+  return usage;
+}
+
+/// What grows; "": nothing.
+std::string problems_of(const UsageAfter& usage, std::int64_t num_samples) {
+  std::string problems;
+  const double doublings = std::log2(static_cast<double>(num_samples) / kFull);
+  const auto& full = usage.at(kFull);
+  double sum_mb = 0;
+  for (const auto& [name, last] : usage.at(num_samples)) {
+    sum_mb += last.memory_mb;
+    const double growth = last.memory_mb - full.at(name).memory_mb;
+    if (growth > kMaxGrowthMb + kMaxGrowthMbADoubling * doublings)
+      problems += name + " grew by " + std::to_string(growth) + " MB; ";
+    const Usage& half = usage.at(kFull / 2).at(name);
+    const double first_kb = (full.at(name).read_kb - half.read_kb) / (kFull / 2);
+    const double later_kb =
+        (last.read_kb - full.at(name).read_kb) / static_cast<double>(num_samples - kFull);
+    if (later_kb > 1.5 * first_kb + 1)
+      problems += name + " reads " + std::to_string(later_kb) + " kB a sample after " +
+                  std::to_string(first_kb) + "; ";
+    const double first_ms = (full.at(name).processor_ms - half.processor_ms) / (kFull / 2);
+    const double later_ms =
+        (last.processor_ms - full.at(name).processor_ms) / static_cast<double>(num_samples - kFull);
+    if (name != "structure_learner" && later_ms > 2 * first_ms + 1)
+      problems += name + " takes " + std::to_string(later_ms) + " ms a sample after " +
+                  std::to_string(first_ms) + "; ";
+  }
+  if (sum_mb > kMaxSumMb) problems += "all processes hold " + std::to_string(sum_mb) + " MB; ";
+  return problems;
+}
+
 }  // namespace
 
 int main(int argc, char** argv) {
@@ -211,69 +289,10 @@ int main(int argc, char** argv) {
   const test::TemporaryFolder temporary;
   try {
     Soak soak(keep.empty() ? temporary.path() : fs::path(keep), robot);
-    std::map<std::int64_t, std::map<std::string, Usage>> usage;
-    std::printf("| samples |");
-    for (const auto& [name, u] : soak.usage())
-      std::printf(" %s MB | kB read a sample | ms a sample |", name.c_str());
-    std::printf(" all MB |\n| --- |");
-    for (std::size_t i = 0; i < soak.usage().size(); ++i) std::printf(" --- | --- | --- |");
-    std::printf(" --- |\n");
-    std::map<std::string, Usage> before = soak.usage();
-    std::map<std::string, std::deque<double>> recent_mb;
-    std::int64_t printed = 0;
-    for (std::int64_t n = 1; n <= num_samples; ++n) {
-      soak.step(n - 1);
-      for (const auto& [name, u] : soak.usage()) {
-        std::deque<double>& memory = recent_mb[name];
-        memory.push_back(u.memory_mb);
-        if (std::ssize(memory) > kMoment) memory.pop_front();
-      }
-      if (n % std::max<std::int64_t>(500, num_samples / 20) != 0 && n != kFull / 2 && n != kFull &&
-          n != num_samples)
-        continue;
-      usage[n] = soak.usage();
-      for (auto& [name, u] : usage[n]) u.memory_mb = *std::ranges::min_element(recent_mb.at(name));
-      double sum = 0;
-      std::printf("| %lld |", static_cast<long long>(n));
-      for (const auto& [name, u] : usage[n]) {
-        const Usage& then = before.at(name);
-        const auto num_new = static_cast<double>(n - printed);
-        std::printf(" %.0f | %.1f | %.2f |", u.memory_mb, (u.read_kb - then.read_kb) / num_new,
-                    (u.processor_ms - then.processor_ms) / num_new);
-        sum += u.memory_mb;
-      }
-      std::printf(" %.0f |\n", sum);
-      std::fflush(stdout);
-      before = usage[n];
-      printed = n;
-    }
+    const UsageAfter usage = run(&soak, num_samples);
     soak.end();
-
-    std::string problems;
-    if (!soak.is_complete()) problems += "the body was not learned; ";
-    const double doublings = std::log2(static_cast<double>(num_samples) / kFull);
-    const auto& full = usage.at(kFull);
-    double sum_mb = 0;
-    for (const auto& [name, last] : usage.at(num_samples)) {
-      sum_mb += last.memory_mb;
-      const double growth = last.memory_mb - full.at(name).memory_mb;
-      if (growth > kMaxGrowthMb + kMaxGrowthMbADoubling * doublings)
-        problems += name + " grew by " + std::to_string(growth) + " MB; ";
-      const Usage& half = usage.at(kFull / 2).at(name);
-      const double first_kb = (full.at(name).read_kb - half.read_kb) / (kFull / 2);
-      const double later_kb =
-          (last.read_kb - full.at(name).read_kb) / static_cast<double>(num_samples - kFull);
-      if (later_kb > 1.5 * first_kb + 1)
-        problems += name + " reads " + std::to_string(later_kb) + " kB a sample after " +
-                    std::to_string(first_kb) + "; ";
-      const double first_ms = (full.at(name).processor_ms - half.processor_ms) / (kFull / 2);
-      const double later_ms = (last.processor_ms - full.at(name).processor_ms) /
-                              static_cast<double>(num_samples - kFull);
-      if (name != "structure_learner" && later_ms > 2 * first_ms + 1)
-        problems += name + " takes " + std::to_string(later_ms) + " ms a sample after " +
-                    std::to_string(first_ms) + "; ";
-    }
-    if (sum_mb > kMaxSumMb) problems += "all processes hold " + std::to_string(sum_mb) + " MB; ";
+    std::string problems = soak.is_complete() ? "" : "the body was not learned; ";
+    problems += problems_of(usage, num_samples);
     if (problems.empty()) return 0;
     std::fprintf(stderr, "soak: %s\n", problems.c_str());
   } catch (const std::exception& error) {

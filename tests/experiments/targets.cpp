@@ -11,6 +11,7 @@
 #include <chrono>
 #include <cmath>
 #include <cstdio>
+#include <functional>
 #include <optional>
 #include <random>
 #include <stdexcept>
@@ -76,6 +77,144 @@ std::string millimetres(double m) {
   return m < 0 || std::isnan(m) ? "–" : text;
 }
 
+/// A group that runs, its truth, and the target that it serves.
+class Group {
+ public:
+  explicit Group(const std::string& url) : bus_(url, url) {
+    bus_.subscribe<body_schema_t>(kBodySchema,
+                                  [this](const body_schema_t& m) { schema_ = from_message(m); });
+    bus_.subscribe<sim_state_t>(kSimState, [this](const sim_state_t& m) { state_ = m; });
+    bus_.subscribe<sample_t>(kSample, [this](const sample_t& m) {
+      if (state_ && state_->action_id == m.action_id)
+        truth_.push_back(true_sample(*state_, from_message(m).action));
+    });
+    bus_.subscribe<control_status_t>(kControlStatus, [this](const control_status_t& m) {
+      if (follower_) follower_->on_control_status(m);
+    });
+    bus_.subscribe<process_info_t>(kProcessInfo, [this](const process_info_t& m) {
+      if (follower_) follower_->on_process_info(m);
+    });
+    bus_.subscribe<motion_status_t>(kMotionStatus, [this](const motion_status_t& m) {
+      if (follower_) follower_->on_motion_status(m);
+    });
+    wait("BODY_SCHEMA", [&] { return schema_.has_value(); });
+    wait("SIM_STATE", [&] { return state_.has_value(); });
+    epoch_ = wall_clock_us();
+  }
+
+  const BodySchema& schema() const { return *schema_; }
+  const sim_state_t& state() const { return *state_; }
+  /// Of all rests so far.
+  const std::vector<ActionPoseSample>& truth() const { return truth_; }
+
+  /// Serves the target to its end, as a new one of one sender.
+  const TargetFollower& serve(pose_target_t target, double timeout_s) {
+    target.utime = target.epoch = epoch_;
+    target.sender = "targets";
+    target.target_id = next_id_++;
+    follower_.emplace(target, std::llround(timeout_s * 1e6));
+    while (follower_->end() == TargetFollower::End::kOpen) {
+      if (const auto message = follower_->on_tick(clock_us())) bus_.publish(kPoseTarget, *message);
+      bus_.handle(std::chrono::milliseconds(20));
+    }
+    return *follower_;
+  }
+
+  /// @throws std::runtime_error after 10 s.
+  void wait(const char* what, const std::function<bool()>& is_there) {
+    const std::int64_t end_us = clock_us() + 10'000'000;
+    while (!is_there()) {
+      if (clock_us() > end_us) throw std::runtime_error(std::string("no ") + what + " for 10 s");
+      bus_.handle(std::chrono::milliseconds(50));
+    }
+  }
+
+ private:
+  Bus bus_;
+  std::optional<BodySchema> schema_;
+  std::optional<sim_state_t> state_;
+  std::vector<ActionPoseSample> truth_;
+  std::optional<TargetFollower> follower_;
+  std::int64_t epoch_ = 0, next_id_ = 0;
+};
+
+struct Outcome {
+  std::vector<double> errors_m, observed_m;
+  std::vector<Arrival> arrivals;
+  int num_refused = 0, num_held = 0;
+};
+
+/// Brings the part to where a random action would; prints a row.
+void steer(int number, int part, const Eigen::VectorXd& action, double timeout_s, Group* group,
+           Outcome* outcome) {
+  const int root = group->schema().root;
+  const auto X_RB = group->schema().predict(root, part, action);
+  if (!X_RB) throw std::runtime_error("the end effector is not connected to the root");
+  const Eigen::Vector3d p_RT = X_RB->X_AB.translation();
+  pose_target_t target{};
+  target.target_kind = pose_target_t::KIND_POSITION;
+  target.target_part = part;
+  std::copy(p_RT.begin(), p_RT.end(), target.position_m);
+  target.keep_s = -1;
+  const TargetFollower& here = group->serve(target, timeout_s);
+  const control_status_t& status = here.status();
+  double error_m = NAN;
+  std::string result = "reached";
+  if (here.end() == TargetFollower::End::kAsked || here.end() == TargetFollower::End::kMissed) {
+    group->wait("SIM_STATE of the arm at the target",
+                [&] { return group->state().utime >= status.utime; });
+    if (const auto X_RB_true = relative_pose(true_sample(group->state(), {}), root, part)) {
+      error_m = (X_RB_true->translation() - p_RT).norm();
+      outcome->errors_m.push_back(error_m);
+      Pose wanted = X_RB->X_AB;
+      if (!group->truth().empty())
+        wanted = group->schema().predict(root, part, group->truth().back().action)->X_AB;
+      wanted.translation() = p_RT;
+      outcome->arrivals.push_back({wanted, *X_RB_true});
+    }
+    if (status.observed_error_m >= 0) outcome->observed_m.push_back(status.observed_error_m);
+  } else if (here.end() == TargetFollower::End::kTimedOut) {
+    ++outcome->num_held;
+    result = "no end: " + here.diagnosis();
+  } else {
+    const bool is_refused = status.control_state == control_status_t::CONTROL_REFUSED;
+    ++(is_refused ? outcome->num_refused : outcome->num_held);
+    result = (is_refused ? "refused: " : "held: ") + status.why;
+  }
+  std::printf("| %d | %.3f %.3f %.3f | %s | %d | %s | %s | %s |\n", number, p_RT.x(), p_RT.y(),
+              p_RT.z(), result.c_str(), status.num_moves,
+              millimetres(status.predicted_error_m).c_str(),
+              millimetres(status.observed_error_m).c_str(), millimetres(error_m).c_str());
+  std::fflush(stdout);
+}
+
+/// Prints all targets in one row. Median of the errors that count [m].
+double summarise(int count, int part, const Group& group, const Outcome& outcome) {
+  const std::vector<double>& errors_m = outcome.errors_m;
+  const double worst_m =
+      errors_m.empty() ? NAN : *std::max_element(errors_m.begin(), errors_m.end());
+  std::vector<double> aligned_m;
+  const auto alignment = align(group.schema(), group.truth());
+  if (alignment)
+    for (const Arrival& a : outcome.arrivals)
+      aligned_m.push_back(
+          (alignment->aligned(part, a.X_RB_wanted).translation() - a.X_RB_true.translation())
+              .norm());
+  std::printf(
+      "\n| targets | reached | refused | held | median | max | aligned, median | as seen, median "
+      "|\n"
+      "| --- | --- | --- | --- | --- | --- | --- | --- |\n"
+      "| %d | %zu | %d | %d | %s | %s | %s | %s |\n",
+      count, errors_m.size(), outcome.num_refused, outcome.num_held,
+      millimetres(median(errors_m)).c_str(), millimetres(worst_m).c_str(),
+      millimetres(median(aligned_m)).c_str(), millimetres(median(outcome.observed_m)).c_str());
+  if (alignment)
+    std::printf("\nAligned by %s at the root, %s at the part, scale %.4f.\n",
+                size_text(alignment->X_RS).c_str(), size_text(alignment->X_PB.at(part)).c_str(),
+                alignment->scale);
+  return median(group.state().is_ideal ? errors_m : aligned_m);
+}
+
 }  // namespace
 
 int main(int argc, char** argv) {
@@ -97,129 +236,21 @@ int main(int argc, char** argv) {
   try {
     const Signals signals = load_signals(rig_folder);
     const int part = signals.end_effector_part;
-    Bus bus(in, in);
-    std::optional<BodySchema> schema;
-    std::optional<sim_state_t> state;
-    TargetFollower* follower = nullptr;
-    bus.subscribe<body_schema_t>(kBodySchema,
-                                 [&](const body_schema_t& m) { schema = from_message(m); });
-    bus.subscribe<sim_state_t>(kSimState, [&](const sim_state_t& m) { state = m; });
-    std::vector<ActionPoseSample> truth;
-    bus.subscribe<sample_t>(kSample, [&](const sample_t& m) {
-      if (state && state->action_id == m.action_id)
-        truth.push_back(true_sample(*state, from_message(m).action));
-    });
-    bus.subscribe<control_status_t>(kControlStatus, [&](const control_status_t& m) {
-      if (follower) follower->on_control_status(m);
-    });
-    bus.subscribe<process_info_t>(kProcessInfo, [&](const process_info_t& m) {
-      if (follower) follower->on_process_info(m);
-    });
-    bus.subscribe<motion_status_t>(kMotionStatus, [&](const motion_status_t& m) {
-      if (follower) follower->on_motion_status(m);
-    });
-    const auto wait = [&](const char* what, auto is_there) {
-      const std::int64_t end_us = clock_us() + 10'000'000;
-      while (!is_there()) {
-        if (clock_us() > end_us) throw std::runtime_error(std::string("no ") + what + " for 10 s");
-        bus.handle(std::chrono::milliseconds(50));
-      }
-    };
-    wait("BODY_SCHEMA", [&] { return schema.has_value(); });
-    wait("SIM_STATE", [&] { return state.has_value(); });
-
-    const std::int64_t epoch = wall_clock_us();
+    Group group(in);
     std::mt19937_64 engine(seed);
-    std::vector<double> errors_m, observed_m;
-    std::vector<Arrival> arrivals;
-    std::int64_t target_id = 0;
-    int num_refused = 0, num_held = 0;
+    Outcome outcome;
     std::printf(
         "| target | x y z | result | moves | by the schema | as seen | true |\n"
         "| --- | --- | --- | --- | --- | --- | --- |\n");
-    for (int i = 0; i < count; ++i) {
-      const auto X_RB = schema->predict(schema->root, part, random_action(signals.signals, engine));
-      if (!X_RB) throw std::runtime_error("the end effector is not connected to the root");
-      const Eigen::Vector3d p_RT = X_RB->X_AB.translation();
-      pose_target_t target{};
-      target.utime = target.epoch = epoch;
-      target.sender = "targets";
-      target.target_id = target_id++;
-      target.target_kind = pose_target_t::KIND_POSITION;
-      target.target_part = part;
-      std::copy(p_RT.begin(), p_RT.end(), target.position_m);
-      target.keep_s = -1;
-      TargetFollower here(target, std::llround(timeout_s * 1e6));
-      follower = &here;
-      while (here.end() == TargetFollower::End::kOpen) {
-        if (const auto message = here.on_tick(clock_us())) bus.publish(kPoseTarget, *message);
-        bus.handle(std::chrono::milliseconds(20));
-      }
-      const control_status_t& status = here.status();
-      double error_m = NAN;
-      std::string result = "reached";
-      if (here.end() == TargetFollower::End::kAsked || here.end() == TargetFollower::End::kMissed) {
-        wait("SIM_STATE of the arm at the target", [&] { return state->utime >= status.utime; });
-        if (const auto X_RB_true = relative_pose(true_sample(*state, {}), schema->root, part)) {
-          error_m = (X_RB_true->translation() - p_RT).norm();
-          errors_m.push_back(error_m);
-          Pose wanted = X_RB->X_AB;
-          if (!truth.empty())
-            wanted = schema->predict(schema->root, part, truth.back().action)->X_AB;
-          wanted.translation() = p_RT;
-          arrivals.push_back({wanted, *X_RB_true});
-        }
-        if (status.observed_error_m >= 0) observed_m.push_back(status.observed_error_m);
-      } else if (here.end() == TargetFollower::End::kTimedOut) {
-        ++num_held;
-        result = "no end: " + here.diagnosis();
-      } else {
-        const bool is_refused = status.control_state == control_status_t::CONTROL_REFUSED;
-        ++(is_refused ? num_refused : num_held);
-        result = (is_refused ? "refused: " : "held: ") + status.why;
-      }
-      std::printf("| %d | %.3f %.3f %.3f | %s | %d | %s | %s | %s |\n", i, p_RT.x(), p_RT.y(),
-                  p_RT.z(), result.c_str(), status.num_moves,
-                  millimetres(status.predicted_error_m).c_str(),
-                  millimetres(status.observed_error_m).c_str(), millimetres(error_m).c_str());
-      std::fflush(stdout);
-    }
-    follower = nullptr;
+    for (int i = 0; i < count; ++i)
+      steer(i, part, random_action(signals.signals, engine), timeout_s, &group, &outcome);
     pose_target_t release{};
-    release.utime = release.epoch = epoch;
-    release.sender = "targets";
-    release.target_id = target_id;
     release.target_kind = pose_target_t::KIND_RELEASE;
     release.target_part = -1;
-    TargetFollower given_back(release, 5'000'000);
-    follower = &given_back;
-    while (given_back.end() == TargetFollower::End::kOpen) {
-      if (const auto message = given_back.on_tick(clock_us())) bus.publish(kPoseTarget, *message);
-      bus.handle(std::chrono::milliseconds(20));
-    }
-    const double worst_m =
-        errors_m.empty() ? NAN : *std::max_element(errors_m.begin(), errors_m.end());
-    std::vector<double> aligned_m;
-    const auto alignment = align(*schema, truth);
-    if (alignment)
-      for (const Arrival& a : arrivals)
-        aligned_m.push_back(
-            (alignment->aligned(part, a.X_RB_wanted).translation() - a.X_RB_true.translation())
-                .norm());
-    std::printf(
-        "\n| targets | reached | refused | held | median | max | aligned, median | as seen, median "
-        "|\n"
-        "| --- | --- | --- | --- | --- | --- | --- | --- |\n"
-        "| %d | %zu | %d | %d | %s | %s | %s | %s |\n",
-        count, errors_m.size(), num_refused, num_held, millimetres(median(errors_m)).c_str(),
-        millimetres(worst_m).c_str(), millimetres(median(aligned_m)).c_str(),
-        millimetres(median(observed_m)).c_str());
-    if (alignment)
-      std::printf("\nAligned by %s at the root, %s at the part, scale %.4f.\n",
-                  size_text(alignment->X_RS).c_str(), size_text(alignment->X_PB.at(part)).c_str(),
-                  alignment->scale);
-    const bool is_good = 2 * errors_m.size() >= static_cast<std::size_t>(count) &&
-                         median(state->is_ideal ? errors_m : aligned_m) * 1e3 <= limit_mm;
+    group.serve(release, 5);
+    const double median_m = summarise(count, part, group, outcome);
+    const bool is_good = 2 * outcome.errors_m.size() >= static_cast<std::size_t>(count) &&
+                         median_m * 1e3 <= limit_mm;
     return std::isinf(limit_mm) || is_good ? 0 : 1;
   } catch (const std::exception& error) {
     std::fprintf(stderr, "targets: %s\n", error.what());

@@ -97,113 +97,152 @@ double seconds_since(std::chrono::steady_clock::time_point start) {
   return std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
 }
 
-}  // namespace
-
-int main(int argc, char** argv) {
-  CLI::App app("Visibility of the body parts of a rig");
+struct Arguments {
   std::filesystem::path rig;
   int num_poses = 300;
   std::int64_t seed = 1;
   int num_pictures = 0;
   std::string picture_prefix = "pose";
   ImageEffects effects;
-  app.add_option("rig", rig, "Folder of the rig")->required()->check(CLI::ExistingDirectory);
-  app.add_option("--poses", num_poses, "Accepted poses to look at");
-  app.add_option("--seed", seed, "Of actions and noise");
-  app.add_option("--pictures", num_pictures, "Write the first poses as PNG");
-  app.add_option("--prefix", picture_prefix, "Of the pictures' names");
-  app.add_option("--pixel-samples", effects.pixel_samples, "Along each side of a pixel");
-  app.add_flag("--shadows", effects.shadows, "Draw shadows");
-  CLI11_PARSE(app, argc, argv);
+};
 
-  RobotSimulatorConfig config = RobotSimulatorConfig::load(rig / "robot_simulator.yaml");
-  config.seed = seed;
+RobotSimulatorConfig ideal(const Arguments& arguments) {
+  RobotSimulatorConfig config = RobotSimulatorConfig::load(arguments.rig / "robot_simulator.yaml");
+  config.seed = arguments.seed;
   config.is_ideal = true;
-  RobotSimulator simulator(config);
-  const Scene& scene = simulator.scene();
-  SceneRenderer renderer(rig, effects);
-  Detector detector;
-  std::mt19937_64 engine(seed);
-  std::uniform_real_distribution<double> unit(0, 1);
-  const std::vector<Signal>& signals = scene.signals().signals;
+  return config;
+}
 
-  std::map<int, Tally> tallies;
-  std::map<bool, Errors> errors_of;  // tilt below 60°
-  std::map<std::string, int> reasons;
-  int accepted = 0, asked = 0, unknown = 0;
-  double simulate_s = 0, render_s = 0, detect_s = 0;
-  while (accepted < num_poses) {
+class Visibility {
+ public:
+  explicit Visibility(const Arguments& arguments)
+      : arguments_(arguments),
+        simulator_(ideal(arguments)),
+        renderer_(arguments.rig, arguments.effects),
+        engine_(arguments.seed) {}
+
+  void measure() {
+    while (accepted_ < arguments_.num_poses) {
+      const action_command_t command = next_command();
+      auto start = std::chrono::steady_clock::now();
+      const RobotSimulator::Answer answer = simulator_.on_command(command);
+      simulate_s_ += seconds_since(start);
+      if (!answer.state) {
+        ++reasons_[answer.statuses.back().reason];
+        continue;
+      }
+      start = std::chrono::steady_clock::now();
+      const cv::Mat image = renderer_.render(*answer.state, 0);
+      render_s_ += seconds_since(start);
+      start = std::chrono::steady_clock::now();
+      const auto found = detector_.find(image);
+      detect_s_ += seconds_since(start);
+      if (accepted_ < arguments_.num_pictures) {
+        cv::imwrite(arguments_.picture_prefix + "_" + std::to_string(accepted_) + ".png", image);
+      }
+      ++accepted_;
+      tally(*answer.state, found);
+    }
+  }
+
+  void print() {
+    const Scene& scene = simulator_.scene();
+    std::printf("%s: %d poses, %.0f %% of %d actions accepted, tags that the rig has not: %d\n\n",
+                scene.robot().name.c_str(), accepted_, 100.0 * accepted_ / asked_, asked_,
+                unknown_);
+    std::printf("| part | seen | two tags or more | tags a pose | mean tilt |\n");
+    std::printf("| --- | --- | --- | --- | --- |\n");
+    for (const int part : scene.markers().parts()) {
+      const Tally& tally = tallies_[part];
+      std::printf("| %d | %.0f %% | %.0f %% | %.1f | %.0f° |\n", part,
+                  100.0 * tally.seen / accepted_, 100.0 * tally.several / accepted_,
+                  static_cast<double>(tally.tags) / accepted_,
+                  tally.tags ? tally.tilt_deg / tally.tags : 0.0);
+    }
+    std::printf("\nCorners, rms per coordinate: %.3f px below 60° of tilt, %.3f px above\n",
+                errors_of_[true].rms_px(), errors_of_[false].rms_px());
+    std::printf("A pose: simulate %.1f ms, render %.1f ms, detect %.1f ms\n",
+                1e3 * simulate_s_ / accepted_, 1e3 * render_s_ / accepted_,
+                1e3 * detect_s_ / accepted_);
+    for (const auto& [reason, count] : reasons_)
+      std::fprintf(stderr, "%5d %s\n", count, reason.c_str());
+  }
+
+ private:
+  action_command_t next_command() {
+    std::uniform_real_distribution<double> unit(0, 1);
     action_command_t command{};
     command.source = "visibility";
-    command.action_id = asked++;
-    command.utime = command.expiry_utime = simulator.status().utime;
-    const bool is_extreme = unit(engine) < 0.5;
-    for (const Signal& signal : signals) {
-      double x = 2 * unit(engine) - 1;
+    command.action_id = asked_++;
+    command.utime = command.expiry_utime = simulator_.status().utime;
+    const bool is_extreme = unit(engine_) < 0.5;
+    for (const Signal& signal : simulator_.scene().signals().signals) {
+      double x = 2 * unit(engine_) - 1;
       if (is_extreme) x = std::copysign(0.7 + 0.3 * std::abs(x), x);
       command.action.push_back(0.5 * (signal.lower + signal.upper) +
                                0.5 * (signal.upper - signal.lower) * x);
     }
     command.num_signals = static_cast<std::int32_t>(command.action.size());
-    auto start = std::chrono::steady_clock::now();
-    const RobotSimulator::Answer answer = simulator.on_command(command);
-    simulate_s += seconds_since(start);
-    if (!answer.state) {
-      ++reasons[answer.statuses.back().reason];
-      continue;
-    }
-    start = std::chrono::steady_clock::now();
-    const cv::Mat image = renderer.render(*answer.state, 0);
-    render_s += seconds_since(start);
-    start = std::chrono::steady_clock::now();
-    const auto found = detector.find(image);
-    detect_s += seconds_since(start);
-    if (accepted < num_pictures) {
-      cv::imwrite(picture_prefix + "_" + std::to_string(accepted) + ".png", image);
-    }
-    ++accepted;
+    return command;
+  }
 
+  void tally(const sim_state_t& state, const std::map<int, std::vector<cv::Point2d>>& found) {
+    const Scene& scene = simulator_.scene();
     std::map<int, int> tags_of_part;
-    const Pose X_WC = from_message(answer.state->X_WC);
+    const Pose X_WC = from_message(state.X_WC);
     for (const auto& [id, corners] : found) {
       const TagPlacement* tag = scene.markers().find(id);
       if (!tag) {
-        ++unknown;
+        ++unknown_;
         continue;
       }
       ++tags_of_part[tag->part];
-      const Pose X_CM = X_WC.inverse() * from_message(answer.state->X_WG[scene.tag_geom(id)]) *
+      const Pose X_CM = X_WC.inverse() * from_message(state.X_WG[scene.tag_geom(id)]) *
                         Eigen::Translation3d(0, 0, -kSheetThickness_m / 2);
       const double tilt_deg =
           std::acos(
               std::clamp(X_CM.translation().normalized().dot(X_CM.linear().col(2)), -1.0, 1.0)) *
           (1 / kDegree);
-      tallies[tag->part].tilt_deg += tilt_deg;
-      Errors& errors = errors_of[tilt_deg < 60];
-      errors.sum += squared_error(renderer.calibration(), X_CM, tag->size_m, corners);
+      tallies_[tag->part].tilt_deg += tilt_deg;
+      Errors& errors = errors_of_[tilt_deg < 60];
+      errors.sum += squared_error(renderer_.calibration(), X_CM, tag->size_m, corners);
       ++errors.tags;
     }
     for (const auto& [part, tags] : tags_of_part) {
-      tallies[part].seen += 1;
-      tallies[part].tags += tags;
-      tallies[part].several += tags > 1;
+      tallies_[part].seen += 1;
+      tallies_[part].tags += tags;
+      tallies_[part].several += tags > 1;
     }
   }
 
-  std::printf("%s: %d poses, %.0f %% of %d actions accepted, tags that the rig has not: %d\n\n",
-              scene.robot().name.c_str(), accepted, 100.0 * accepted / asked, asked, unknown);
-  std::printf("| part | seen | two tags or more | tags a pose | mean tilt |\n");
-  std::printf("| --- | --- | --- | --- | --- |\n");
-  for (const int part : scene.markers().parts()) {
-    const Tally& tally = tallies[part];
-    std::printf("| %d | %.0f %% | %.0f %% | %.1f | %.0f° |\n", part, 100.0 * tally.seen / accepted,
-                100.0 * tally.several / accepted, static_cast<double>(tally.tags) / accepted,
-                tally.tags ? tally.tilt_deg / tally.tags : 0.0);
-  }
-  std::printf("\nCorners, rms per coordinate: %.3f px below 60° of tilt, %.3f px above\n",
-              errors_of[true].rms_px(), errors_of[false].rms_px());
-  std::printf("A pose: simulate %.1f ms, render %.1f ms, detect %.1f ms\n",
-              1e3 * simulate_s / accepted, 1e3 * render_s / accepted, 1e3 * detect_s / accepted);
-  for (const auto& [reason, count] : reasons)
-    std::fprintf(stderr, "%5d %s\n", count, reason.c_str());
+  const Arguments arguments_;
+  RobotSimulator simulator_;
+  SceneRenderer renderer_;
+  Detector detector_;
+  std::mt19937_64 engine_;
+  std::map<int, Tally> tallies_;
+  std::map<bool, Errors> errors_of_;  // tilt below 60°
+  std::map<std::string, int> reasons_;
+  int accepted_ = 0, asked_ = 0, unknown_ = 0;
+  double simulate_s_ = 0, render_s_ = 0, detect_s_ = 0;
+};
+
+}  // namespace
+
+int main(int argc, char** argv) {
+  CLI::App app("Visibility of the body parts of a rig");
+  Arguments arguments;
+  app.add_option("rig", arguments.rig, "Folder of the rig")
+      ->required()
+      ->check(CLI::ExistingDirectory);
+  app.add_option("--poses", arguments.num_poses, "Accepted poses to look at");
+  app.add_option("--seed", arguments.seed, "Of actions and noise");
+  app.add_option("--pictures", arguments.num_pictures, "Write the first poses as PNG");
+  app.add_option("--prefix", arguments.picture_prefix, "Of the pictures' names");
+  app.add_option("--pixel-samples", arguments.effects.pixel_samples, "Along each side of a pixel");
+  app.add_flag("--shadows", arguments.effects.shadows, "Draw shadows");
+  CLI11_PARSE(app, argc, argv);
+  Visibility visibility(arguments);
+  visibility.measure();
+  visibility.print();
 }

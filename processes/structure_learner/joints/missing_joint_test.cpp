@@ -341,6 +341,27 @@ Eigen::VectorXd explained_noise(const TreeFit& fit, const TreeFit::Normal& norma
   return result;
 }
 
+// The edges whose parameters a node's motion has in common: where the root rests, those on its path
+// and beyond it.
+std::vector<int> edges_in_common(const TreeFit& fit, int node) {
+  const bool rests = fit.root_rests();
+  std::vector<int> edges;
+  for (int e = rests ? 0 : 1; e < static_cast<int>(fit.nodes().size()); ++e)
+    if (!rests || fit.is_below(e, node) || fit.is_below(node, e)) edges.push_back(e);
+  return edges;
+}
+
+// Those of the edges' parameters.
+std::vector<int> columns_of(const std::vector<int>& edges, const TreeFit& fit,
+                            const TreeFit::Normal& normal) {
+  std::vector<int> columns;
+  for (const int e : edges) {
+    const int p = e == 0 ? 6 : fit.nodes()[e].model.num_parameters();
+    for (int c = 0; c < p; ++c) columns.push_back(normal.offset[e] + c);
+  }
+  return columns;
+}
+
 }  // namespace
 
 std::vector<MissingJoint> missing_joints(const TreeFit& fit, const Noise& bias,
@@ -404,15 +425,8 @@ Eigen::MatrixXd missing_joint_information(const TreeFit& fit) {
   const Eigen::MatrixXd q2 = q.cwiseProduct(q);
   const Eigen::VectorXd noise = explained_noise(fit, normal, q);
   for (int k = 1; k < n; ++k) {
-    // The edges whose parameters the node's motion has in common: where the root rests, those on
-    // its path and beyond it.
-    std::vector<int> edges, columns;
-    for (int e = rests ? 0 : 1; e < n; ++e) {
-      if (rests && !fit.is_below(e, k) && !fit.is_below(k, e)) continue;
-      edges.push_back(e);
-      const int p = e == 0 ? 6 : fit.nodes()[e].model.num_parameters();
-      for (int c = 0; c < p; ++c) columns.push_back(normal.offset[e] + c);
-    }
+    const std::vector<int> edges = edges_in_common(fit, k);
+    const std::vector<int> columns = columns_of(edges, fit, normal);
     const auto size = static_cast<Eigen::Index>(columns.size());
     // Stacked over the frames, for q = 1: what the three axes share with each other and with the
     // parameters of these edges.

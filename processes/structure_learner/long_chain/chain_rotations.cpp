@@ -40,6 +40,40 @@ double loss(double chord2) {
 }
 double weight(double chord2) { return 1 / (1 + chord2 / (kLossScale * kLossScale)); }
 
+// How each joint's parameters move its axis: 3×2 where lengths are held, else 3×3.
+std::vector<Eigen::MatrixXd> axis_bases(const ChainRotations& chain, bool holds_lengths) {
+  std::vector<Eigen::MatrixXd> bases(chain.axes.size(), Matrix3d::Identity());
+  for (std::size_t j = 0; holds_lengths && j < bases.size(); ++j) {
+    const double length = chain.axes[j].norm();
+    const Vector3d u = chain.axes[j] / std::max(length, 1e-12);
+    const Vector3d across = u.unitOrthogonal();
+    bases[j].resize(3, 2);
+    bases[j] << length * across, length * u.cross(across);
+  }
+  return bases;
+}
+
+// By the parameters of each axis, then those of R_end.
+ChainRotations moved_by(const Eigen::VectorXd& step, const ChainRotations& chain,
+                        const std::vector<Eigen::MatrixXd>& bases, bool holds_lengths) {
+  ChainRotations moved = chain;
+  Eigen::Index at = 0;
+  for (std::size_t j = 0; j < bases.size(); ++j) {
+    const Eigen::VectorXd own = step.segment(at, bases[j].cols());
+    at += bases[j].cols();
+    if (holds_lengths) {
+      const double length = chain.axes[j].norm();
+      const double shrink = std::min(1.0, kLargestStep / std::max(own.norm(), 1e-12));
+      moved.axes[j] += shrink * bases[j] * own;
+      moved.axes[j] *= length / std::max(moved.axes[j].norm(), 1e-12);
+    } else {
+      moved.axes[j] += own;
+    }
+  }
+  moved.R_end = chain.R_end * exp_so3(step.tail<3>());
+  return moved;
+}
+
 }  // namespace
 
 RotationSearch::RotationSearch(const PairData& pair, const NormalizedActions& actions,
@@ -96,22 +130,13 @@ ChainRotations RotationSearch::fit(ChainRotations chain, bool holds_lengths,
   const int m = static_cast<int>(chain.axes.size());
   const int width = holds_lengths ? 2 : 3;
   const int size = width * m + 3;
-  std::vector<Eigen::MatrixXd> basis(m);  // 3 × width: how a joint's parameters move its axis
   std::vector<Matrix3d> steps, suffixes;
   Eigen::MatrixXd H(size, size), J(3, size);
   Eigen::VectorXd g(size);
   LevenbergMarquardt optimizer(1e-3, 1e-9, 6);
   evaluate(&chain);
   for (int iteration = 0; iteration < max_iterations; ++iteration) {
-    for (int j = 0; j < m; ++j) {
-      basis[j] = Matrix3d::Identity();
-      if (!holds_lengths) continue;
-      const double length = chain.axes[j].norm();
-      const Vector3d u = chain.axes[j] / std::max(length, 1e-12);
-      const Vector3d across = u.unitOrthogonal();
-      basis[j].resize(3, 2);
-      basis[j] << length * across, length * u.cross(across);
-    }
+    const std::vector<Eigen::MatrixXd> bases = axis_bases(chain, holds_lengths);
     H.setZero();
     g.setZero();
     for (int t = 0; t < num_frames(); ++t) {
@@ -120,7 +145,7 @@ ChainRotations RotationSearch::fit(ChainRotations chain, bool holds_lengths,
       for (int j = 0; j < m; ++j) {
         const double q = q_(chain.signals[j], t);
         J.middleCols(width * j, width).noalias() =
-            suffixes[j + 1].transpose() * (q * right_jacobian(chain.axes[j] * q)) * basis[j];
+            suffixes[j + 1].transpose() * (q * right_jacobian(chain.axes[j] * q)) * bases[j];
       }
       J.rightCols<3>().setIdentity();
       const double w = weight(squared_chord(error));
@@ -130,19 +155,7 @@ ChainRotations RotationSearch::fit(ChainRotations chain, bool holds_lengths,
     H = Eigen::MatrixXd(H.selfadjointView<Eigen::Lower>());
     double decrease = 0;
     const bool improved = optimizer.step(H, g, [&](const Eigen::VectorXd& step) {
-      ChainRotations moved = chain;
-      for (int j = 0; j < m; ++j) {
-        const Eigen::VectorXd own = step.segment(width * j, width);
-        if (holds_lengths) {
-          const double length = chain.axes[j].norm();
-          const double shrink = std::min(1.0, kLargestStep / std::max(own.norm(), 1e-12));
-          moved.axes[j] += shrink * basis[j] * own;
-          moved.axes[j] *= length / std::max(moved.axes[j].norm(), 1e-12);
-        } else {
-          moved.axes[j] += own;
-        }
-      }
-      moved.R_end = chain.R_end * exp_so3(step.tail<3>());
+      ChainRotations moved = moved_by(step, chain, bases, holds_lengths);
       if (!(evaluate(&moved) < chain.cost)) return false;
       decrease = chain.cost - moved.cost;
       chain = std::move(moved);

@@ -13,6 +13,7 @@
 #include "common/geometry/angle.h"
 #include "common/kinematics/kinematic_tree.h"
 #include "common/text/text.h"
+#include "processes/structure_learner/model_free_noise.h"
 #include "processes/structure_learner/positions/position_screen.h"
 #include "processes/structure_learner/search/withdrawal.h"
 #include "processes/structure_learner/tree_fit.h"

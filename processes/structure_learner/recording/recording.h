@@ -77,4 +77,7 @@ bool looks_like_radians(const Noise& noise);
 /// only when read as x y z w. No evidence, no hint; none changes what is read.
 std::vector<std::string> hints_of(const Recording& recording);
 
+/// Adds a hint for each part seen with and without orientation: the rarer kind is left out.
+void add_mixture_hint(Recording& recording);
+
 }  // namespace bodyschema

@@ -1,9 +1,12 @@
+#include <fmt/format.h>
+
 #include <algorithm>
 #include <cmath>
 #include <map>
 #include <utility>
 
 #include "common/estimation/quantile.h"
+#include "processes/structure_learner/pair_data.h"
 #include "processes/structure_learner/recording/recording.h"
 
 namespace bodyschema {
@@ -109,8 +112,8 @@ bool is_order_x_y_z_w(const std::vector<ActionPoseSample>& samples,
   constexpr std::size_t kMostParts = 12;
   // Noise, and joints beside the origin, make disorder of about this size in either order.
   constexpr double kUnremarkable = 0.1;
-  // Evidence of all parts, in nats of disorder. Measured by recording_test.cpp: 1500 recordings
-  // that are right have at most 0.35.
+  // Evidence of all parts, in nats of disorder. Measured by recording_hints_test.cpp: 1500
+  // recordings that are right have at most 0.35.
   constexpr double kEvidence = 1;
   const std::size_t stride = std::max<std::size_t>(1, samples.size() / kMost);
   std::map<int, std::pair<double, double>> least;  // disorder of each part as read, reordered
@@ -175,6 +178,24 @@ std::vector<std::string> hints_of(const Recording& recording) {
   if (is_order_x_y_z_w(recording.samples, posed_tracks))
     hints.emplace_back("the quaternion column order looks like x y z w; expected qw,qx,qy,qz");
   return hints;
+}
+
+void add_mixture_hint(Recording& recording) {
+  const std::vector<int> alone = parts_without_rotation(recording.samples);
+  for (const int part : seen_parts(recording.samples)) {
+    const bool is_alone = std::binary_search(alone.begin(), alone.end(), part);
+    int num_left_out = 0, num_seen = 0;
+    for (const ActionPoseSample& sample : recording.samples)
+      if (const PartObservation* o = sample.find(part)) {
+        ++num_seen;
+        num_left_out += o->has_rotation == is_alone;
+      }
+    if (num_left_out > 0)
+      recording.hints.push_back(fmt::format(
+          "part {}: {} of {} observations are left out, which have {} orientation: a part is "
+          "learned by the kind that it has more of",
+          part, num_left_out, num_seen, is_alone ? "an" : "no"));
+  }
 }
 
 }  // namespace bodyschema

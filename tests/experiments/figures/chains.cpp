@@ -145,6 +145,11 @@ Curve angle_curve(const Measurement& m, const std::string& title, int colour) {
   return curve;
 }
 
+void add(Panel* panel, Curve curve, bool is_dashed = false) {
+  curve.is_dashed = is_dashed;
+  panel->curves.push_back(std::move(curve));
+}
+
 constexpr Regime kRegimes[] = {Regime::kFree, Regime::kChapter, Regime::kTag, Regime::kTagIso};
 
 /// Figs. 7 and 8: robot c, or co.
@@ -187,16 +192,11 @@ Findings four_dof(const Setup& setup, const std::string& robot, const std::strin
     examples +=
         fmt::format("- {}, seed 1, N = {}: ours {}; baseline {}\n", test::name_of(regime),
                     sizes.back(), us.answers.back()[0].structure, them.answers.back()[0].structure);
-    structure.curves.push_back(
-        right_curve(us, fmt::format("ours, {}", test::name_of(regime)), colour));
-    Curve base = right_curve(them, fmt::format("baseline, {}", test::name_of(regime)), colour);
-    base.is_dashed = true;
-    structure.curves.push_back(base);
-    accuracy.curves.push_back(
-        position_curve(us, fmt::format("ours, {}", test::name_of(regime)), colour));
-    base = position_curve(them, fmt::format("baseline, {}", test::name_of(regime)), colour);
-    base.is_dashed = true;
-    accuracy.curves.push_back(base);
+    const std::string name = test::name_of(regime);
+    add(&structure, right_curve(us, "ours, " + name, colour));
+    add(&structure, right_curve(them, "baseline, " + name, colour), true);
+    add(&accuracy, position_curve(us, "ours, " + name, colour));
+    add(&accuracy, position_curve(them, "baseline, " + name, colour), true);
     ++colour;
   }
   draw(setup, file, {structure, accuracy}, 2);
@@ -208,6 +208,85 @@ Findings four_dof(const Setup& setup, const std::string& robot, const std::strin
       "found).\n\n{}\n{}",
       num_robots, num_baseline, kTestPoses, table.markdown(), examples);
   return findings;
+}
+
+struct SevenDofPanels {
+  Panel structure{.title = "Fig. 11: 7-DOF robot, 10 parts, x4 never seen: structure",
+                  .x_label = "samples N",
+                  .y_label = "structure right [% of robots]",
+                  .references = {{"chapter: after 10, free", 100}},
+                  .log_x = true,
+                  .y_range = {-5, 105},
+                  .shift = 0.007};
+  Panel position{.title = "position, noise-free; baseline on the true structure",
+                 .x_label = "samples N",
+                 .y_label = "mean position error of the end effector [mm]",
+                 .references = {{"chapter: 1 mm after 100", 1}},
+                 .log_x = true,
+                 .log_y = true};
+  Panel noisy{.title = "position, in noise; baseline on the true structure",
+              .x_label = position.x_label,
+              .y_label = position.y_label,
+              .log_x = true,
+              .log_y = true};
+  Panel angle{.title = "angle, in noise; baseline on the true structure",
+              .x_label = "samples N",
+              .y_label = "mean angle error of the end effector [°]",
+              .log_x = true,
+              .log_y = true};
+
+  void add_curves(Regime regime, const Measurement& us, const Measurement& found,
+                  const Measurement& models, int colour) {
+    const std::string name = test::name_of(regime);
+    add(&structure, right_curve(us, "ours, " + name, colour));
+    add(&structure, right_curve(found, "baseline, " + name, colour), true);
+    Panel* const of_position = regime == Regime::kFree ? &position : &noisy;
+    add(of_position, position_curve(us, "ours, " + name, colour));
+    add(of_position, position_curve(models, "baseline, " + name, colour), true);
+    if (regime == Regime::kFree) return;
+    add(&angle, angle_curve(us, "ours, " + name, colour));
+    add(&angle, angle_curve(models, "baseline, " + name, colour), true);
+  }
+};
+
+/// Of the 7-DOF robot.
+void add_musts(const Setup& setup, Regime regime, int N, const Cell& u, Findings* findings) {
+  const std::string name = test::name_of(regime);
+  const Spread p = spread_of(u.position_m), a = spread_of(u.angle_rad);
+  const auto must_be_right = [&](double share) {
+    findings->musts.push_back(
+        {fmt::format("7-DOF, {}, N = {}: structure right ≥ {:.0f} %", name, N, 100 * share),
+         u.structure.text(),
+         share == 1 ? u.structure.right == u.num_robots
+                    : wilson_lower_bound(u.structure.right, u.num_robots) >= share});
+  };
+  const auto must_be_near = [&](double position_m, double angle_deg) {
+    findings->musts.push_back(
+        {angle_deg > 0 ? fmt::format("7-DOF, {}, N = {}: ≤ {:g} mm, {:g}°", name, N,
+                                     position_m * 1e3, angle_deg)
+                       : fmt::format("7-DOF, {}, N = {}: ≤ {:g} mm", name, N, position_m * 1e3),
+         u.errors_text(),
+         p.count > 0 && p.mean <= position_m && (angle_deg == 0 || a.mean <= angle_deg * kDegree)});
+  };
+  if (regime == Regime::kFree && N == 5) must_be_right(1);
+  if (regime == Regime::kFree && N == 10) must_be_near(1e-9, 0);
+  if (setup.quick) return;  // five robots prove no percentage
+  if (regime == Regime::kChapter) {
+    if (N == 15) must_be_right(0.97);
+    if (N == 20) must_be_near(0.050, 0);
+    if (N == 100) must_be_near(0.022, 0);
+  }
+  if (regime == Regime::kTag) {
+    if (N == 15) must_be_right(0.93);
+    if (N == 20) must_be_right(0.97);
+    if (N == 20) must_be_near(0.004, 1.1);
+    if (N == 100) must_be_near(0.0018, 0.5);
+    if (N >= 20)
+      findings->musts.push_back(
+          {fmt::format("7-DOF, tag, N = {}: wrong but called complete ≤ 2 %", N),
+           short_number(100.0 * u.false_complete / u.num_robots) + " %",
+           u.false_complete <= 0.02 * u.num_robots});
+  }
 }
 
 }  // namespace
@@ -233,26 +312,7 @@ Findings seven_dof(const Setup& setup) {
   Table table({"regime", "N", "chapter", "baseline: structure right %", "fits",
                "baseline on the true structure", "ours: structure right %", "wrong but complete %",
                "fits", "ours"});
-  Panel structure{.title = "Fig. 11: 7-DOF robot, 10 parts, x4 never seen: structure",
-                  .x_label = "samples N",
-                  .y_label = "structure right [% of robots]",
-                  .references = {{"chapter: after 10, free", 100}},
-                  .log_x = true,
-                  .y_range = {-5, 105},
-                  .shift = 0.007};
-  Panel position{.title = "position",
-                 .x_label = "samples N",
-                 .y_label = "mean position error of the end effector [mm]",
-                 .references = {{"chapter: 1 mm after 100", 1}},
-                 .log_x = true,
-                 .log_y = true};
-  Panel noisy = position;
-  noisy.title = "position, in noise; baseline on the true structure";
-  Panel angle{.title = "angle, in noise; baseline on the true structure",
-              .x_label = "samples N",
-              .y_label = "mean angle error of the end effector [°]",
-              .log_x = true,
-              .log_y = true};
+  SevenDofPanels panels;
   int colour = 1;
   for (const Regime regime : kRegimes) {
     const std::string name = test::name_of(regime);
@@ -263,7 +323,6 @@ Findings seven_dof(const Setup& setup) {
                                        num_models, ask_baseline_models);
     for (const int N : sizes) {
       const Cell u = us.cell(N), f = found.cell(N), m = models.cell(N);
-      const Spread p = spread_of(u.position_m), a = spread_of(u.angle_rad);
       table.add(
           {name, std::to_string(N),
            N == 10    ? "structure right (noise-free)"
@@ -272,62 +331,12 @@ Findings seven_dof(const Setup& setup) {
            f.structure.text(), f.structure.total() > 0 ? std::to_string(f.fits / num_search) : "–",
            m.errors_text(), u.structure.text(), short_number(100.0 * u.false_complete / num_robots),
            std::to_string(u.fits / num_robots), u.errors_text()});
-      const auto must_be_right = [&](double share) {
-        findings.musts.push_back(
-            {fmt::format("7-DOF, {}, N = {}: structure right ≥ {:.0f} %", name, N, 100 * share),
-             u.structure.text(),
-             share == 1 ? u.structure.right == num_robots
-                        : wilson_lower_bound(u.structure.right, num_robots) >= share});
-      };
-      const auto must_be_near = [&](double position_m, double angle_deg) {
-        findings.musts.push_back(
-            {angle_deg > 0 ? fmt::format("7-DOF, {}, N = {}: ≤ {:g} mm, {:g}°", name, N,
-                                         position_m * 1e3, angle_deg)
-                           : fmt::format("7-DOF, {}, N = {}: ≤ {:g} mm", name, N, position_m * 1e3),
-             u.errors_text(),
-             p.count > 0 && p.mean <= position_m &&
-                 (angle_deg == 0 || a.mean <= angle_deg * kDegree)});
-      };
-      if (regime == Regime::kFree && N == 5) must_be_right(1);
-      if (regime == Regime::kFree && N == 10) must_be_near(1e-9, 0);
-      if (setup.quick) continue;  // five robots prove no percentage
-      if (regime == Regime::kChapter) {
-        if (N == 15) must_be_right(0.97);
-        if (N == 20) must_be_near(0.050, 0);
-        if (N == 100) must_be_near(0.022, 0);
-      }
-      if (regime == Regime::kTag) {
-        if (N == 15) must_be_right(0.93);
-        if (N == 20) must_be_right(0.97);
-        if (N == 20) must_be_near(0.004, 1.1);
-        if (N == 100) must_be_near(0.0018, 0.5);
-        if (N >= 20)
-          findings.musts.push_back(
-              {fmt::format("7-DOF, tag, N = {}: wrong but called complete ≤ 2 %", N),
-               short_number(100.0 * u.false_complete / num_robots) + " %",
-               u.false_complete <= 0.02 * num_robots});
-      }
+      add_musts(setup, regime, N, u, &findings);
     }
-    const auto also = [&](Panel& panel, Curve curve, bool dashed) {
-      curve.is_dashed = dashed;
-      panel.curves.push_back(std::move(curve));
-    };
-    also(structure, right_curve(us, "ours, " + name, colour), false);
-    also(structure, right_curve(found, "baseline, " + name, colour), true);
-    if (regime == Regime::kFree) {
-      also(position, position_curve(us, "ours, " + name, colour), false);
-      also(position, position_curve(models, "baseline, " + name, colour), true);
-    } else {
-      also(noisy, position_curve(us, "ours, " + name, colour), false);
-      also(noisy, position_curve(models, "baseline, " + name, colour), true);
-      also(angle, angle_curve(us, "ours, " + name, colour), false);
-      also(angle, angle_curve(models, "baseline, " + name, colour), true);
-    }
+    panels.add_curves(regime, us, found, models, colour);
     ++colour;
   }
-  position.title = "position, noise-free; baseline on the true structure";
-  noisy.references.clear();
-  draw(setup, "seven_dof.png", {structure, position, noisy, angle}, 2);
+  draw(setup, "seven_dof.png", {panels.structure, panels.position, panels.noisy, panels.angle}, 2);
   findings.markdown = fmt::format(
       "{} robots (baseline: search {}, local models on the true structure {}). Structure: right "
       "with "

@@ -5,6 +5,7 @@
 #include <algorithm>
 #include <cmath>
 #include <map>
+#include <utility>
 
 #include "common/geometry/angle.h"
 #include "processes/controller/inverse_kinematics.h"
@@ -88,24 +89,31 @@ std::string errors_text(const Column& column, int num_robots) {
          mean_and_error(spread_of(column.angle), kDegree) + "°" + of;
 }
 
-}  // namespace
+/// By robot, by size.
+using Results = std::vector<std::vector<Result>>;
 
-Findings two_dof_noise(const Setup& setup) {
-  const std::vector<int> sizes = setup.quick ? std::vector<int>{5, 12, 30}
-                                             : std::vector<int>{5, 8, 10, 12, 15, 20, 30, 50, 100};
-  const int num_robots = setup.robots(200, 6), num_baseline = setup.robots(40, 2);
-  const int num_targets = setup.robots(20, 5), num_baseline_targets = setup.robots(5, 2);
-  const std::size_t S = sizes.size();
+Column column_of(const Results& results, std::size_t s) {
+  Column c;
+  for (const auto& robot : results) {
+    if (robot[s].rightness) c.structure.add(*robot[s].rightness);
+    c.add(robot[s].errors);
+    if (std::isfinite(robot[s].control_m)) c.control.push_back(robot[s].control_m);
+  }
+  return c;
+}
 
-  std::vector<std::vector<Result>> ours(num_robots, std::vector<Result>(S));
-  std::vector<std::vector<double>> bounds(num_robots, std::vector<double>(S));
+/// `bounds`: Cramér–Rao, by robot, by size [m].
+Results ours_in_noise(const Setup& setup, const std::vector<int>& sizes, int num_robots,
+                      int num_targets, std::vector<std::vector<double>>* bounds) {
+  Results ours(num_robots, std::vector<Result>(sizes.size()));
+  bounds->assign(num_robots, std::vector<double>(sizes.size()));
   for_each_robot(setup, "ours", num_robots, [&](int n) {
     const Trial trial = make_trial("a", Regime::kChapter, sizes.back(), n + 1);
     CramerRao bound(trial.robot);
     int added = 0;
-    for (std::size_t s = 0; s < S; ++s) {
+    for (std::size_t s = 0; s < sizes.size(); ++s) {
       for (; added < sizes[s]; ++added) bound.add(trial.samples[added]);
-      bounds[n][s] =
+      (*bounds)[n][s] =
           position_bound_rms(bound, trial.root(), trial.end_effector(), trial.test_actions);
       const BodySchema schema = learn(trial.robot.signals, trial.first(sizes[s])).schema;
       Result& result = ours[n][s];
@@ -114,53 +122,64 @@ Findings two_dof_noise(const Setup& setup) {
       if (result.errors) result.control_m = control_error_rms(schema, trial, num_targets);
     }
   });
-  std::vector<std::vector<Result>> baseline(num_baseline, std::vector<Result>(S));
-  for_each_robot(setup, "baseline", num_baseline, [&](int n) {
+  return ours;
+}
+
+Results baseline_in_noise(const Setup& setup, const std::vector<int>& sizes, int num_robots,
+                          int num_targets) {
+  Results baseline(num_robots, std::vector<Result>(sizes.size()));
+  for_each_robot(setup, "baseline", num_robots, [&](int n) {
     const Trial trial = make_trial("a", Regime::kChapter, sizes.back(), n + 1);
-    for (std::size_t s = 0; s < S; ++s) {
+    for (std::size_t s = 0; s < sizes.size(); ++s) {
       const auto samples = trial.first(sizes[s]);
       Result& result = baseline[n][s];
       if (sizes[s] <= kLargestSearch) result.rightness = rightness_of_baseline(trial, samples);
       const BodySchema schema = baseline_on_true_structure(trial, samples);
       result.errors = end_effector_errors(schema, trial);
-      if (result.errors) result.control_m = control_error_rms(schema, trial, num_baseline_targets);
+      if (result.errors) result.control_m = control_error_rms(schema, trial, num_targets);
     }
   });
+  return baseline;
+}
 
-  const auto column = [](const std::vector<std::vector<Result>>& results, std::size_t s) {
-    Column c;
-    for (const auto& robot : results) {
-      if (robot[s].rightness) c.structure.add(*robot[s].rightness);
-      c.add(robot[s].errors);
-      if (std::isfinite(robot[s].control_m)) c.control.push_back(robot[s].control_m);
-    }
-    return c;
-  };
-  Findings findings;
-  Table table({"N", "chapter", "baseline: structure right %",
-               "baseline on the true structure: rms mm", "control mm", "ours: structure right %",
-               "ours: rms mm", "ours: mean mm", "control mm", "Cramér–Rao rms mm",
-               "ours over the bound"});
+void add_musts_in_noise(int N, const Spread& rms, const Spread& bound, Findings* findings) {
+  if (N == 12)
+    findings->musts.push_back({"2-DOF, chapter noise, N = 12: rms below the markers' 44 mm",
+                               short_number(rms.mean / kMillimetre) + " mm",
+                               rms.mean < kMarkerNoise});
+  if (N == 100)
+    findings->musts.push_back(
+        {"2-DOF, chapter noise, N = 100: within 1.6 × the Cramér–Rao bound",
+         fmt::format("rms {} mm, bound {} mm: {} ×", short_number(rms.mean / kMillimetre),
+                     short_number(bound.mean / kMillimetre), short_number(rms.mean / bound.mean)),
+         rms.mean < 1.6 * bound.mean});
+}
+
+/// The curves of the figure, and a row of the table for each N.
+std::vector<Curve> curves_in_noise(const std::vector<int>& sizes, const Results& ours,
+                                   const Results& baseline,
+                                   const std::vector<std::vector<double>>& bounds, Table* table,
+                                   Findings* findings) {
   Curve prediction{.title = "ours, prediction", .colour = 1},
       control{.title = "ours, control", .colour = 5},
       base_prediction{.title = "baseline, prediction", .colour = 0},
       base_control{.title = "baseline, control", .colour = 4},
       bound_curve{.title = "Cramér–Rao bound", .colour = 3};
-  for (std::size_t s = 0; s < S; ++s) {
-    const Column us = column(ours, s), them = column(baseline, s);
+  for (std::size_t s = 0; s < sizes.size(); ++s) {
+    const Column us = column_of(ours, s), them = column_of(baseline, s);
     std::vector<double> bound;
     for (const auto& robot : bounds) bound.push_back(robot[s]);
     const Spread rms = spread_of(us.rms), limit = spread_of(bound);
     const int N = sizes[s];
-    table.add({std::to_string(N),
-               N < 15    ? "converges within 10"
-               : N == 15 ? "below marker noise (44 mm)"
-                         : "control about 50 mm",
-               them.right(), mean_and_error(spread_of(them.rms), kMillimetre),
-               mean_and_error(spread_of(them.control), kMillimetre), us.structure.text(),
-               mean_and_error(rms, kMillimetre), mean_and_error(spread_of(us.mean), kMillimetre),
-               mean_and_error(spread_of(us.control), kMillimetre),
-               mean_and_error(limit, kMillimetre), short_number(rms.mean / limit.mean)});
+    table->add({std::to_string(N),
+                N < 15    ? "converges within 10"
+                : N == 15 ? "below marker noise (44 mm)"
+                          : "control about 50 mm",
+                them.right(), mean_and_error(spread_of(them.rms), kMillimetre),
+                mean_and_error(spread_of(them.control), kMillimetre), us.structure.text(),
+                mean_and_error(rms, kMillimetre), mean_and_error(spread_of(us.mean), kMillimetre),
+                mean_and_error(spread_of(us.control), kMillimetre),
+                mean_and_error(limit, kMillimetre), short_number(rms.mean / limit.mean)});
     const auto also = [N](Curve& curve, const std::vector<double>& values) {
       const Spread spread = spread_of(values);
       curve.x.push_back(N);
@@ -172,22 +191,76 @@ Findings two_dof_noise(const Setup& setup) {
     also(base_prediction, them.rms);
     also(base_control, them.control);
     also(bound_curve, bound);
-    if (N == 12)
-      findings.musts.push_back({"2-DOF, chapter noise, N = 12: rms below the markers' 44 mm",
-                                short_number(rms.mean / kMillimetre) + " mm",
-                                rms.mean < kMarkerNoise});
-    if (N == 100)
-      findings.musts.push_back(
-          {"2-DOF, chapter noise, N = 100: within 1.6 × the Cramér–Rao bound",
-           fmt::format("rms {} mm, bound {} mm: {} ×", short_number(rms.mean / kMillimetre),
-                       short_number(limit.mean / kMillimetre), short_number(rms.mean / limit.mean)),
-           rms.mean < 1.6 * limit.mean});
+    add_musts_in_noise(N, rms, limit, findings);
   }
+  return {base_prediction, base_control, prediction, control, bound_curve};
+}
+
+/// Ours and the baseline without noise.
+std::pair<Results, Results> measure_free(const Setup& setup, const std::vector<int>& sizes,
+                                         double bend, const std::string& command, int num_robots,
+                                         int num_baseline) {
+  Results ours(num_robots, std::vector<Result>(sizes.size())),
+      baseline(num_baseline, std::vector<Result>(sizes.size()));
+  const auto trial_of = [&](int n) {
+    return make_trial("a", Regime::kFree, sizes.back(), n + 1, bend);
+  };
+  for_each_robot(setup, "ours, " + command, num_robots, [&](int n) {
+    const Trial trial = trial_of(n);
+    for (std::size_t s = 0; s < sizes.size(); ++s) {
+      const BodySchema schema = learn(trial.robot.signals, trial.first(sizes[s])).schema;
+      ours[n][s] = {end_effector_errors(schema, trial), NAN, test::judge(schema, trial.robot)};
+    }
+  });
+  for_each_robot(setup, "baseline, " + command, num_baseline, [&](int n) {
+    const Trial trial = trial_of(n);
+    for (std::size_t s = 0; s < sizes.size(); ++s) {
+      const auto samples = trial.first(sizes[s]);
+      Result& result = baseline[n][s];
+      if (sizes[s] <= kLargestSearch) result.rightness = rightness_of_baseline(trial, samples);
+      result.errors = end_effector_errors(baseline_on_true_structure(trial, samples), trial);
+    }
+  });
+  return {ours, baseline};
+}
+
+void add_musts_free(double bend, int N, const Column& ours, int num_robots, Findings* findings) {
+  const Spread position = spread_of(ours.mean), angle = spread_of(ours.angle);
+  const bool all = position.count == num_robots;
+  const std::string measured = errors_text(ours, num_robots);
+  if (bend == 0 && N == 5) {
+    const double worst = *std::max_element(ours.mean.begin(), ours.mean.end());
+    findings->musts.push_back({"2-DOF, free, straight commands, N = 5: < 1e-9 m",
+                               fmt::format("{}, worst robot {:.1e} m", measured, worst),
+                               all && position.mean < 1e-9});
+  }
+  if (bend != 0 && N == 20)
+    findings->musts.push_back({"2-DOF, free, bent commands, N = 20: < 1 mm, 0.2°", measured,
+                               all && position.mean < kMillimetre && angle.mean < 0.2 * kDegree});
+}
+
+}  // namespace
+
+Findings two_dof_noise(const Setup& setup) {
+  const std::vector<int> sizes = setup.quick ? std::vector<int>{5, 12, 30}
+                                             : std::vector<int>{5, 8, 10, 12, 15, 20, 30, 50, 100};
+  const int num_robots = setup.robots(200, 6), num_baseline = setup.robots(40, 2);
+  const int num_targets = setup.robots(20, 5), num_baseline_targets = setup.robots(5, 2);
+  std::vector<std::vector<double>> bounds;
+  const Results ours = ours_in_noise(setup, sizes, num_robots, num_targets, &bounds);
+  const Results baseline = baseline_in_noise(setup, sizes, num_baseline, num_baseline_targets);
+  Findings findings;
+  Table table({"N", "chapter", "baseline: structure right %",
+               "baseline on the true structure: rms mm", "control mm", "ours: structure right %",
+               "ours: rms mm", "ours: mean mm", "control mm", "Cramér–Rao rms mm",
+               "ours over the bound"});
+  const std::vector<Curve> curves =
+      curves_in_noise(sizes, ours, baseline, bounds, &table, &findings);
   draw(setup, "two_dof_noise.png",
        {{.title = "Fig. 10: 2-DOF robot, 44 mm of noise; baseline on the true structure",
          .x_label = "samples N",
          .y_label = "position error of the end effector, rms [mm]",
-         .curves = {base_prediction, base_control, prediction, control, bound_curve},
+         .curves = curves,
          .references = {{"chapter: 44 mm, after 15", 44}, {"chapter: control 50 mm", 50}},
          .log_x = true,
          .log_y = true}},
@@ -210,45 +283,17 @@ Findings two_dof_free(const Setup& setup) {
   const std::vector<int> sizes =
       setup.quick ? std::vector<int>{5, 20} : std::vector<int>{3, 4, 5, 10, 20, 50, 100};
   const int num_robots = setup.robots(200, 10), num_baseline = setup.robots(40, 3);
-  const std::size_t S = sizes.size();
   Findings findings;
   Table table({"command", "N", "chapter", "baseline: structure right %",
                "baseline on the true structure", "ours: structure right %", "ours"});
   std::vector<Panel> panels;
   for (const double bend : {0.0, 0.1}) {
     const char* command = bend == 0 ? "θ = q" : "θ = q + 0.1 sin 3q";
-    std::vector<std::vector<Result>> ours(num_robots, std::vector<Result>(S)),
-        baseline(num_baseline, std::vector<Result>(S));
-    const auto trial_of = [&](int n) {
-      return make_trial("a", Regime::kFree, sizes.back(), n + 1, bend);
-    };
-    for_each_robot(setup, std::string("ours, ") + command, num_robots, [&](int n) {
-      const Trial trial = trial_of(n);
-      for (std::size_t s = 0; s < S; ++s) {
-        const BodySchema schema = learn(trial.robot.signals, trial.first(sizes[s])).schema;
-        ours[n][s] = {end_effector_errors(schema, trial), NAN, test::judge(schema, trial.robot)};
-      }
-    });
-    for_each_robot(setup, std::string("baseline, ") + command, num_baseline, [&](int n) {
-      const Trial trial = trial_of(n);
-      for (std::size_t s = 0; s < S; ++s) {
-        const auto samples = trial.first(sizes[s]);
-        Result& result = baseline[n][s];
-        if (sizes[s] <= kLargestSearch) result.rightness = rightness_of_baseline(trial, samples);
-        result.errors = end_effector_errors(baseline_on_true_structure(trial, samples), trial);
-      }
-    });
+    const auto [ours, baseline] =
+        measure_free(setup, sizes, bend, command, num_robots, num_baseline);
     Curve us{.title = "ours", .colour = 1}, them{.title = "baseline", .colour = 0};
-    for (std::size_t s = 0; s < S; ++s) {
-      Column our_column, their_column;
-      for (const auto& robot : ours) {
-        if (robot[s].rightness) our_column.structure.add(*robot[s].rightness);
-        our_column.add(robot[s].errors);
-      }
-      for (const auto& robot : baseline) {
-        if (robot[s].rightness) their_column.structure.add(*robot[s].rightness);
-        their_column.add(robot[s].errors);
-      }
+    for (std::size_t s = 0; s < sizes.size(); ++s) {
+      const Column our_column = column_of(ours, s), their_column = column_of(baseline, s);
       const int N = sizes[s];
       table.add({command, std::to_string(N),
                  N == 20    ? "< 2 mm, 1°"
@@ -256,23 +301,11 @@ Findings two_dof_free(const Setup& setup) {
                             : "–",
                  their_column.right(), errors_text(their_column, num_baseline),
                  our_column.structure.text(), errors_text(our_column, num_robots)});
-      const Spread position = spread_of(our_column.mean), angle = spread_of(our_column.angle);
       us.x.push_back(N);
-      us.y.push_back(position.mean / kMillimetre);
+      us.y.push_back(spread_of(our_column.mean).mean / kMillimetre);
       them.x.push_back(N);
       them.y.push_back(spread_of(their_column.mean).mean / kMillimetre);
-      const bool all = position.count == num_robots;
-      const std::string measured = errors_text(our_column, num_robots);
-      if (bend == 0 && N == 5) {
-        const double worst = *std::max_element(our_column.mean.begin(), our_column.mean.end());
-        findings.musts.push_back({"2-DOF, free, straight commands, N = 5: < 1e-9 m",
-                                  fmt::format("{}, worst robot {:.1e} m", measured, worst),
-                                  all && position.mean < 1e-9});
-      }
-      if (bend != 0 && N == 20)
-        findings.musts.push_back(
-            {"2-DOF, free, bent commands, N = 20: < 1 mm, 0.2°", measured,
-             all && position.mean < kMillimetre && angle.mean < 0.2 * kDegree});
+      add_musts_free(bend, N, our_column, num_robots, &findings);
     }
     panels.push_back(
         {.title = std::string("2-DOF, noise-free, ") + command + "; baseline on the true structure",
