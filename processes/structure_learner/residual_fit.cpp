@@ -36,18 +36,10 @@ const double kLogChance = std::log(1e-4), kSureLogChance = std::log(1e-6);
 // Trace of the whitened covariance of a prediction: 6 is that of a measurement.
 constexpr double kLargestUncertainty = 6;
 
-// Without the signal at this place in signals().
-std::optional<Fitter> without(const Fitter& full, int place) {
-  std::vector<int> fewer = full.signals();
-  fewer.erase(fewer.begin() + place);
-  Shape shape = full.shape();
-  const Eigen::VectorXd& lengths = full.shape().log_lengths;
-  shape.log_lengths.resize(lengths.size() - 1);
-  shape.log_lengths << lengths.head(place), lengths.tail(lengths.size() - 1 - place);
-  Fitter result = full;
-  if (!result.fit(fewer, &shape, kDropIterations)) return std::nullopt;
-  return result;
+bool is_missed(const Gain& gain) {
+  return gain.sum > kMissed && gain.sum > kMissedErrors * gain.error;
 }
+bool is_sure(const Gain& gain) { return gain.sum > kSureErrors * gain.error; }
 
 // Backwards: of those with the longest length scales the signal that is missed least goes first, of
 // the others only where these are missed. Returns those that stay though it is not sure that they
@@ -60,20 +52,21 @@ std::vector<int> drop_signals(Fitter* fitter) {
     std::stable_sort(places.begin(), places.end(),
                      [&](int x, int y) { return lengths(x) > lengths(y); });
     std::optional<Fitter> best;
+    bool is_best_missed = false;
     std::vector<int> doubtful;
     for (std::size_t n = 0; n < places.size(); ++n) {
-      if (n >= kDropCandidates && best && !fitter->gain_over(*best).is_missed()) break;
-      std::optional<Fitter> fewer = without(*fitter, places[n]);
-      if (!fewer) continue;
-      const Gain gain = fitter->gain_over(*fewer);
-      const double chance = fewer->log_chance_of_line(fitter->signals()[places[n]]);
-      if (!gain.is_sure() && chance > kSureLogChance)
-        doubtful.push_back(fitter->signals()[places[n]]);
+      if (n >= kDropCandidates && best && !is_best_missed) break;
+      const int signal = fitter->signals()[places[n]];
+      Fitter fewer = fitter->without(places[n], kDropIterations);
+      const Gain gain = fitter->gain_over(fewer);
+      const double chance = fewer.log_chance_of_line(signal);
+      if (!is_sure(gain) && chance > kSureLogChance) doubtful.push_back(signal);
       if (chance < kLogChance) continue;
-      if (!best || fewer->judged().log_density > best->judged().log_density)
-        best = std::move(fewer);
+      if (best && fewer.judged().log_density <= best->judged().log_density) continue;
+      is_best_missed = is_missed(gain) && !fitter->is_straight(places[n]);
+      best = std::move(fewer);
     }
-    if (!best || fitter->gain_over(*best).is_missed()) return doubtful;
+    if (!best || is_best_missed) return doubtful;
     *fitter = std::move(*best);
   }
   return {};
@@ -94,9 +87,6 @@ Verdict verdict_of(const SoftFit& fit, int num_independent, const ValidityOption
 }
 
 }  // namespace
-
-bool Gain::is_missed() const { return sum > kMissed && sum > kMissedErrors * error; }
-bool Gain::is_sure() const { return sum > kSureErrors * error; }
 
 double log_density_of_screws(const Fit& fit, const PairData& pair,
                              const NormalizedActions& actions) {
@@ -133,7 +123,11 @@ std::optional<SoftFit> fit_soft_model(const LocalModel& screws, const PairData& 
   const Shape shape = fitter.shape();
   if (!fitter.fit(chosen, &shape, kIterations)) return std::nullopt;
   const std::vector<int> doubtful = signals.empty() ? drop_signals(&fitter) : std::vector<int>{};
-  chosen = fitter.signals();
+  if (fitter.signals().size() < chosen.size()) {
+    chosen = fitter.signals();
+    const Shape of_kept = fitter.shape();
+    fitter.fit(chosen, &of_kept, kDropIterations);
+  }
 
   SoftFit result = fitter.judged();
   result.verdict = verdict_of(result, num_independent, options);

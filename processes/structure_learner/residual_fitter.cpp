@@ -18,6 +18,8 @@ constexpr std::size_t kLeastSamples = 10;
 // Instants that tell hyper-parameters and signals. Chosen: each step costs the cube of their
 // number.
 constexpr std::size_t kShapeSamples = 64;
+// Longest length scale [half ranges]: over the range the kernel falls by 0.2 %.
+constexpr double kLongest = 30;
 
 // At most so many instants that cover the inputs (D×n) evenly: each the one farthest from all
 // before.
@@ -122,16 +124,38 @@ ResidualFitter::Gain ResidualFitter::gain_over(const ResidualFitter& fewer) cons
                    0.0, squares - sum * sum / static_cast<double>(block_density_.size())))};
 }
 
-bool ResidualFitter::fit(const std::vector<int>& signals, const Shape* start, int max_iterations) {
+void ResidualFitter::set_signals(const std::vector<int>& signals) {
   signals_ = signals;
   inputs_.resize(static_cast<Eigen::Index>(signals.size()), pair_->size());
   for (std::size_t d = 0; d < signals.size(); ++d)
     inputs_.row(static_cast<Eigen::Index>(d)) = input_row(signals[d]).transpose();
+}
+
+bool ResidualFitter::fit(const std::vector<int>& signals, const Shape* start, int max_iterations) {
+  set_signals(signals);
   choose_samples(kShapeSamples);
   if (samples_.size() < kLeastSamples) return false;
   maximize(start, max_iterations);
   judge();
   return true;
+}
+
+ResidualFitter ResidualFitter::without(int place, int max_iterations) const {
+  ResidualFitter result = *this;
+  std::vector<int> fewer = signals_;
+  fewer.erase(fewer.begin() + place);
+  result.set_signals(fewer);
+  Shape start = shape_;
+  const Eigen::Index rest = shape_.log_lengths.size() - 1 - place;
+  start.log_lengths.resize(rest + place);
+  start.log_lengths << shape_.log_lengths.head(place), shape_.log_lengths.tail(rest);
+  result.maximize(&start, max_iterations);
+  result.judge();
+  return result;
+}
+
+bool ResidualFitter::is_straight(int place) const {
+  return shape_.log_lengths(place) > std::log(0.9 * kLongest);
 }
 
 double ResidualFitter::log_chance_of_line(int signal) const {
@@ -248,7 +272,7 @@ void ResidualFitter::maximize(const Shape* start, int max_iterations) {
   };
   Eigen::VectorXd lower(D + 7), upper(D + 7), v(D + 7);
   lower.head(D).setConstant(std::log(0.3));
-  upper.head(D).setConstant(std::log(30.0));
+  upper.head(D).setConstant(std::log(kLongest));
   for (int c = 0; c < 6; ++c) {
     const double largest = std::max(spread(c), targets_.noise(c));
     lower(D + c) = std::log(1e-3 * targets_.noise(c));

@@ -28,8 +28,6 @@ class ResidualFitter {
   /// What a signal gains [nats], and the standard error of that.
   struct Gain {
     double sum = 0, error = 0;
-    bool is_missed() const;  ///< where signals are dropped: residual_fit.cpp
-    bool is_sure() const;
   };
 
   /// Weights are those of the screws' residuals, by their own spread.
@@ -43,6 +41,9 @@ class ResidualFitter {
   /// Hyper-parameters and judgement for this Q, from `start` (nullptr: from several lengths).
   /// False: too few instants are no outliers.
   bool fit(const std::vector<int>& signals, const Shape* start, int max_iterations);
+  /// Without the signal at this place in signals(), from the same samples: others make a difference
+  /// of their own.
+  ResidualFitter without(int place, int max_iterations) const;
   /// As many samples as a process takes, with the hyper-parameters as they are.
   void use_all_samples();
   /// Readings and weights from the judgement.
@@ -52,6 +53,8 @@ class ResidualFitter {
   const Shape& shape() const { return shape_; }
   const SoftFit& judged() const { return judged_; }
   const std::vector<int>& signals() const { return signals_; }
+  /// No bend in the signal at this place in signals(): at most a line.
+  bool is_straight(int place) const;
   std::shared_ptr<const ResidualGp> residual_gp() const;
 
   /// What the left-out blocks, taken together, gain by the signals that `fewer` is without.
@@ -80,6 +83,7 @@ class ResidualFitter {
   Eigen::VectorXd noise_scales() const;
   // Among the frames that are no outliers, as far as one can tell.
   void choose_samples(std::size_t most);
+  void set_signals(const std::vector<int>& signals);
   void maximize(const Shape* start, int max_iterations);
   // Mean and variance of every coordinate at every frame (6×n), without the frame's block, in
   // closed form: with P = K⁻¹, the precision of the remaining samples is P_RR − P_RB P_BB⁻¹ P_BR.
