@@ -190,7 +190,7 @@ class DelaySearch {
  private:
   // All delays are compared on the same frames; alike where these are too few.
   std::vector<double> costs_at(const std::vector<CommandDelay>& delays) const {
-    std::vector<Drive> drives;
+    std::vector<DelayedTrack> drives;
     double past_us = 0, future_us = 0;
     for (const CommandDelay& d : delays) {
       drives.emplace_back(track_, d);
@@ -204,7 +204,7 @@ class DelaySearch {
     for (std::size_t k = 0, count = std::min(kMostFrames, inner.size()); k < count; ++k)
       moved.push_back(samples_[inner[k * inner.size() / count]]);
     std::vector<double> costs;
-    for (const Drive& drive : drives) {
+    for (const DelayedTrack& drive : drives) {
       for (ActionPoseSample& sample : moved) sample.action = *drive.at(time_of(sample));
       costs.push_back(cost_of_(moved));
     }

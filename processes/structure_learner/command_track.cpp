@@ -56,7 +56,7 @@ bool CommandTrack::is_behind_gap(std::size_t n) const {
   return n == 0 || time_of(samples_[n]) - time_of(samples_[n - 1]) > most_apart_us_;
 }
 
-Drive::Drive(const CommandTrack& track, const CommandDelay& delay)
+DelayedTrack::DelayedTrack(const CommandTrack& track, const CommandDelay& delay)
     : track_(track),
       dead_us_(static_cast<double>(delay.lag_us - delay.smear_us)),
       constant_us_(static_cast<double>(delay.smear_us)) {
@@ -76,10 +76,10 @@ Drive::Drive(const CommandTrack& track, const CommandDelay& delay)
   }
 }
 
-double Drive::past_us() const { return std::max(0.0, dead_us_) + kForgotten * constant_us_; }
-double Drive::future_us() const { return std::max(0.0, -dead_us_); }
+double DelayedTrack::past_us() const { return std::max(0.0, dead_us_) + kForgotten * constant_us_; }
+double DelayedTrack::future_us() const { return std::max(0.0, -dead_us_); }
 
-std::optional<Eigen::VectorXd> Drive::at(double time_us) const {
+std::optional<Eigen::VectorXd> DelayedTrack::at(double time_us) const {
   time_us -= dead_us_;
   if (states_.empty()) return track_.at(time_us);
   const std::vector<ActionPoseSample>& samples = track_.samples();
@@ -90,14 +90,14 @@ std::optional<Eigen::VectorXd> Drive::at(double time_us) const {
   return time_of(*after) == time_us ? states_[n] : followed(n - 1, time_us);
 }
 
-Eigen::VectorXd Drive::rate_after(std::size_t n) const {
+Eigen::VectorXd DelayedTrack::rate_after(std::size_t n) const {
   const ActionPoseSample &from = track_.samples()[n], &to = track_.samples()[n + 1];
   const double apart_us = time_of(to) - time_of(from);
   if (apart_us <= 0) return Eigen::VectorXd::Zero(from.action.size());
   return (to.action - from.action) / apart_us;
 }
 
-Eigen::VectorXd Drive::followed(std::size_t n, double time_us) const {
+Eigen::VectorXd DelayedTrack::followed(std::size_t n, double time_us) const {
   const ActionPoseSample& from = track_.samples()[n];
   const double passed_us = time_us - time_of(from);
   const Eigen::VectorXd rate = rate_after(n);
@@ -117,7 +117,7 @@ std::vector<ActionPoseSample> with_commands_of_before(const std::vector<ActionPo
     return with_commands_of_before(ascending, delay);
   }
   const CommandTrack track(samples);
-  const Drive drive(track, delay);
+  const DelayedTrack drive(track, delay);
   std::vector<ActionPoseSample> moved;
   for (const ActionPoseSample& sample : samples)
     if (std::optional<Eigen::VectorXd> action = drive.at(time_of(sample))) {

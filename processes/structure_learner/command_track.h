@@ -47,9 +47,9 @@ class CommandTrack {
 
 /// Where the commands of a track have brought an arm that follows them with a delay. Keeps a
 /// reference.
-class Drive {
+class DelayedTrack {
  public:
-  Drive(const CommandTrack& track, const CommandDelay& delay);
+  DelayedTrack(const CommandTrack& track, const CommandDelay& delay);
 
   /// How far before and after a sample commands must be known.
   double past_us() const;
