@@ -52,6 +52,41 @@ Eigen::Matrix3d homography(const std::vector<Eigen::Vector2d>& rays) {
   return H;
 }
 
+/// Robust by Huber's weights.
+EdgeLine line_through(const std::vector<Eigen::Vector2d>& points) {
+  std::vector<double> weights(points.size(), 1.0);
+  EdgeLine line;
+  for (int round = 0; round < 5; ++round) {
+    double total = 0;
+    Eigen::Vector2d mean = Eigen::Vector2d::Zero();
+    for (std::size_t i = 0; i < points.size(); ++i) {
+      total += weights[i];
+      mean += weights[i] * points[i];
+    }
+    mean /= total;
+    Eigen::Matrix2d scatter = Eigen::Matrix2d::Zero();
+    for (std::size_t i = 0; i < points.size(); ++i) {
+      scatter += weights[i] * (points[i] - mean) * (points[i] - mean).transpose();
+    }
+    const Eigen::SelfAdjointEigenSolver<Eigen::Matrix2d> eigen(scatter);
+    line.point = mean;
+    line.normal = eigen.eigenvectors().col(0);
+    line.along = eigen.eigenvectors().col(1);
+    std::vector<double> distances;
+    for (const auto& p : points) distances.push_back(std::abs(line.normal.dot(p - mean)));
+    std::vector<double> sorted = distances;
+    std::nth_element(sorted.begin(), sorted.begin() + sorted.size() / 2, sorted.end());
+    const double sd = std::max(1.4826 * sorted[sorted.size() / 2], 1e-9);
+    // Neighbouring profiles share pixels: each is worth about half a measurement.
+    line.covariance =
+        Eigen::Vector2d(2 * sd * sd / total, 2 * sd * sd / eigen.eigenvalues()[1]).asDiagonal();
+    for (std::size_t i = 0; i < points.size(); ++i) {
+      weights[i] = std::min(1.0, 2 * sd / std::max(distances[i], 1e-12));
+    }
+  }
+  return line;
+}
+
 /// The line through the centroids on side k, from corner k to the next.
 std::optional<EdgeLine> fit_edge(const cv::Mat& grey, const Lens& lens, int border,
                                  const Eigen::Matrix3d& H, int k) {
@@ -92,37 +127,7 @@ std::optional<EdgeLine> fit_edge(const cv::Mat& grey, const Lens& lens, int bord
     points.push_back((H * (place + d * outward).homogeneous()).hnormalized());
   }
   if (points.size() < 6) return std::nullopt;
-  std::vector<double> weights(points.size(), 1.0);
-  EdgeLine line;
-  for (int round = 0; round < 5; ++round) {
-    double total = 0;
-    Eigen::Vector2d mean = Eigen::Vector2d::Zero();
-    for (std::size_t i = 0; i < points.size(); ++i) {
-      total += weights[i];
-      mean += weights[i] * points[i];
-    }
-    mean /= total;
-    Eigen::Matrix2d scatter = Eigen::Matrix2d::Zero();
-    for (std::size_t i = 0; i < points.size(); ++i) {
-      scatter += weights[i] * (points[i] - mean) * (points[i] - mean).transpose();
-    }
-    const Eigen::SelfAdjointEigenSolver<Eigen::Matrix2d> eigen(scatter);
-    line.point = mean;
-    line.normal = eigen.eigenvectors().col(0);
-    line.along = eigen.eigenvectors().col(1);
-    std::vector<double> distances;
-    for (const auto& p : points) distances.push_back(std::abs(line.normal.dot(p - mean)));
-    std::vector<double> sorted = distances;
-    std::nth_element(sorted.begin(), sorted.begin() + sorted.size() / 2, sorted.end());
-    const double sd = std::max(1.4826 * sorted[sorted.size() / 2], 1e-9);
-    // Neighbouring profiles share pixels: each is worth about half a measurement.
-    line.covariance =
-        Eigen::Vector2d(2 * sd * sd / total, 2 * sd * sd / eigen.eigenvalues()[1]).asDiagonal();
-    for (std::size_t i = 0; i < points.size(); ++i) {
-      weights[i] = std::min(1.0, 2 * sd / std::max(distances[i], 1e-12));
-    }
-  }
-  return line;
+  return line_through(points);
 }
 
 }  // namespace

@@ -86,9 +86,7 @@ double median_of(const std::vector<double>& values) {
   return values.empty() ? NAN : median(values);
 }
 
-}  // namespace
-
-int main(int argc, char** argv) {
+struct Arguments {
   int num_robots = 12;
   std::vector<int> nums_samples = {20, 50, 100};
   bool is_noise_estimated = false;
@@ -97,71 +95,89 @@ int main(int argc, char** argv) {
   double period = 0;
   double outlier_rate = MeasurementModel().outlier_rate;
   std::vector<std::string> cells;
+};
+
+/// Learns so many robots; prints what came out.
+void print_cell(const Imperfection& imperfection, int num_samples, const Arguments& arguments) {
+  int num_right = 0, num_incomplete = 0, num_wrong = 0, num_complete = 0;
+  std::vector<double> errors_mm, in_deviations;
+  for (int r = 0; r < arguments.num_robots; ++r) {
+    ImperfectRobot robot(2 + r % 6, arguments.are_ends_alone || r / 6 % 2 == 0, imperfection,
+                         static_cast<std::uint64_t>(r));
+    const auto record = [&](int n) {
+      return arguments.period > 0 ? robot.wander(n, arguments.period) : robot.babble(n);
+    };
+    std::vector<ActionPoseSample> samples = record(num_samples);
+    SyntheticRobot truth = robot.structure();
+    if (arguments.are_ends_alone) hide_all_but_ends(&truth, &samples);
+    LearnOptions options;
+    options.root = 1;
+    options.measurement.outlier_rate = arguments.outlier_rate;
+    if (!arguments.is_noise_estimated)
+      options.measurement.noise = Noise{arguments.told * 0.003, arguments.told * kDegree};
+    const BodySchema schema = learn(robot.signals(), samples, options).schema;
+    const Rightness rightness = judge(schema, truth);
+    num_right += rightness == Rightness::kRight;
+    num_incomplete += rightness == Rightness::kIncomplete;
+    num_wrong += rightness == Rightness::kWrong;
+    num_complete += rightness == Rightness::kWrong && schema.complete;
+    if (arguments.are_errors_told && schema.complete) {
+      constexpr int kHeldOut = 200;
+      const Errors errors = errors_of(schema, record(kHeldOut), robot);
+      errors_mm.push_back(1e3 * errors.position_m);
+      in_deviations.push_back(errors.in_deviations);
+    }
+    if (arguments.are_wrong_listed && rightness == Rightness::kWrong) list_edges(r, schema, robot);
+  }
+  std::printf(" %d / %d / %d (%d) |", num_right, num_incomplete, num_wrong, num_complete);
+  if (arguments.are_errors_told)
+    std::printf(" %.2f | %.1f | %.1f |", median_of(errors_mm), median_of(in_deviations),
+                in_deviations.empty() ? NAN : std::ranges::max(in_deviations));
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+  Arguments arguments;
   CLI::App app("Robots that are not as our models are");
-  app.add_option("--robots", num_robots, "A row")->check(CLI::PositiveNumber);
-  app.add_option("--samples", nums_samples)->check(CLI::PositiveNumber);
-  app.add_option("--told", told, "Times the true noise, 3 mm and 1°")->check(CLI::PositiveNumber);
-  app.add_option("--outlier-rate", outlier_rate, "Told, of a marker")->check(CLI::Range(0.0, 0.5));
-  app.add_flag("--estimate-noise", is_noise_estimated, "Its 3 mm and 1° are not told");
-  app.add_option("--stream", period, "Smooth motion: samples of a swing; 0: random poses");
-  app.add_flag("--ends", are_ends_alone, "Chains, of which the root and the last part are seen");
-  app.add_flag("--list-wrong", are_wrong_listed, "Their edges, on stderr");
-  app.add_flag("--errors", are_errors_told, "Of what complete schemas predict");
-  app.add_option("--cell", cells, "Rows whose name has one of these words alone");
+  app.add_option("--robots", arguments.num_robots, "A row")->check(CLI::PositiveNumber);
+  app.add_option("--samples", arguments.nums_samples)->check(CLI::PositiveNumber);
+  app.add_option("--told", arguments.told, "Times the true noise, 3 mm and 1°")
+      ->check(CLI::PositiveNumber);
+  app.add_option("--outlier-rate", arguments.outlier_rate, "Told, of a marker")
+      ->check(CLI::Range(0.0, 0.5));
+  app.add_flag("--estimate-noise", arguments.is_noise_estimated, "Its 3 mm and 1° are not told");
+  app.add_option("--stream", arguments.period,
+                 "Smooth motion: samples of a swing; 0: random poses");
+  app.add_flag("--ends", arguments.are_ends_alone,
+               "Chains, of which the root and the last part are seen");
+  app.add_flag("--list-wrong", arguments.are_wrong_listed, "Their edges, on stderr");
+  app.add_flag("--errors", arguments.are_errors_told, "Of what complete schemas predict");
+  app.add_option("--cell", arguments.cells, "Rows whose name has one of these words alone");
   CLI11_PARSE(app, argc, argv);
 
   std::printf("| imperfection |");
-  for (const int n : nums_samples) {
+  for (const int n : arguments.nums_samples) {
     std::printf(" %d: right / incomplete / wrong (complete) |", n);
-    if (are_errors_told)
+    if (arguments.are_errors_told)
       std::printf(" error of a complete one, median [mm] | in its standard deviations | worst |");
   }
   std::printf("\n| --- |");
-  for (std::size_t n = 0; n < nums_samples.size(); ++n)
-    std::printf("%s", are_errors_told ? " --- | --- | --- | --- |" : " --- |");
+  for (std::size_t n = 0; n < arguments.nums_samples.size(); ++n)
+    std::printf("%s", arguments.are_errors_told ? " --- | --- | --- | --- |" : " --- |");
   std::printf("\n");
   for (const Imperfection& imperfection : imperfections()) {
     const auto is_named = [&](const std::string& words) {
       return imperfection.name.find(words) != std::string::npos;
     };
-    if (!cells.empty() && std::none_of(cells.begin(), cells.end(), is_named)) continue;
-    if (imperfection.lag + imperfection.drive != 0 && period == 0)
+    if (!arguments.cells.empty() &&
+        std::none_of(arguments.cells.begin(), arguments.cells.end(), is_named))
+      continue;
+    if (imperfection.lag + imperfection.drive != 0 && arguments.period == 0)
       continue;  // of poses at rest there is none
     std::printf("| %s |", imperfection.name.c_str());
-    for (const int num_samples : nums_samples) {
-      int num_right = 0, num_incomplete = 0, num_wrong = 0, num_complete = 0;
-      std::vector<double> errors_mm, in_deviations;
-      for (int r = 0; r < num_robots; ++r) {
-        ImperfectRobot robot(2 + r % 6, are_ends_alone || r / 6 % 2 == 0, imperfection,
-                             static_cast<std::uint64_t>(r));
-        const auto record = [&](int n) {
-          return period > 0 ? robot.wander(n, period) : robot.babble(n);
-        };
-        std::vector<ActionPoseSample> samples = record(num_samples);
-        SyntheticRobot truth = robot.structure();
-        if (are_ends_alone) hide_all_but_ends(&truth, &samples);
-        LearnOptions options;
-        options.root = 1;
-        options.measurement.outlier_rate = outlier_rate;
-        if (!is_noise_estimated) options.measurement.noise = Noise{told * 0.003, told * kDegree};
-        const BodySchema schema = learn(robot.signals(), samples, options).schema;
-        const Rightness rightness = judge(schema, truth);
-        num_right += rightness == Rightness::kRight;
-        num_incomplete += rightness == Rightness::kIncomplete;
-        num_wrong += rightness == Rightness::kWrong;
-        num_complete += rightness == Rightness::kWrong && schema.complete;
-        if (are_errors_told && schema.complete) {
-          constexpr int kHeldOut = 200;
-          const Errors errors = errors_of(schema, record(kHeldOut), robot);
-          errors_mm.push_back(1e3 * errors.position_m);
-          in_deviations.push_back(errors.in_deviations);
-        }
-        if (are_wrong_listed && rightness == Rightness::kWrong) list_edges(r, schema, robot);
-      }
-      std::printf(" %d / %d / %d (%d) |", num_right, num_incomplete, num_wrong, num_complete);
-      if (are_errors_told)
-        std::printf(" %.2f | %.1f | %.1f |", median_of(errors_mm), median_of(in_deviations),
-                    in_deviations.empty() ? NAN : std::ranges::max(in_deviations));
+    for (const int num_samples : arguments.nums_samples) {
+      print_cell(imperfection, num_samples, arguments);
       std::fflush(stdout);
     }
     std::printf("\n");

@@ -111,6 +111,74 @@ double best_tilt(const part_observation_t& part, const Pose& X_CB, const Markers
   return best;
 }
 
+/// Errors by all that they may depend on.
+class Tables {
+ public:
+  Tables(const std::filesystem::path& rig, const MeasurementModel& measurement)
+      : markers_(load_markers(rig)), measurement_(measurement) {}
+
+  void add(const test::RenderedRun::Step& step) {
+    for (std::size_t k = 0; k < step.sample.parts.size(); ++k) {
+      const PartObservation& part = step.sample.parts[k];
+      const Pose& truth = step.truth.at(part.part);
+      ++seen_[part.part];
+      all_.add(part, truth);
+      by_part_[part.part].add(part, truth);
+      const part_observation_t& message = step.message.parts[k];
+      by_tilt_[bin(best_tilt(message, truth, markers_) / kDegree, {10, 20, 30, 40, 50, 60, 70},
+                   "°")]
+          .add(part, truth);
+      by_distance_[bin(truth.translation().norm(), {1.6, 1.8, 2.0, 2.2, 2.4}, "m")].add(part,
+                                                                                        truth);
+      by_tags_[std::to_string(message.num_tags)].add(part, truth);
+      for (std::size_t j = 0; j < k; ++j) {
+        const PartObservation& other = step.sample.parts[j];
+        const Pose z = other.X_CB.inverse() * part.X_CB;
+        const Pose z_true = step.truth.at(other.part).inverse() * truth;
+        const Vector6d error = log(z_true.inverse() * z);
+        const auto d2 = [&](const MeasurementModel& model) {
+          return mahalanobis2(
+              error, relative_covariance(z, model.covariance(other), model.covariance(part)));
+        };
+        pair_d2_.push_back(d2({}));
+        pair_d2_by_model_.push_back(d2(measurement_));
+      }
+    }
+  }
+
+  void print(int num_samples) {
+    print_header("part");
+    for (const auto& [part, errors] : by_part_) {
+      char name[64];
+      std::snprintf(name, sizeof name, "%d, seen %.1f %%", part, 100.0 * seen_[part] / num_samples);
+      errors.print(name);
+    }
+    all_.print("all");
+    print_header("tilt of the best tag");
+    for (const auto& [name, errors] : by_tilt_) errors.print(name);
+    print_header("distance");
+    for (const auto& [name, errors] : by_distance_) errors.print(name);
+    print_header("tags of the part");
+    for (const auto& [name, errors] : by_tags_) errors.print(name);
+
+    std::printf(
+        "\n| all pairs of parts: d² by | median (%.2f) | 95 %% (12.59) | d² > %.2f, %% |\n"
+        "| --- | --- | --- | --- |\n",
+        kChi2Median, kChi2Outlier);
+    print_distances("the images and markers.yaml", pair_d2_);
+    print_distances("noise.yaml too", pair_d2_by_model_);
+  }
+
+ private:
+  const Markers markers_;
+  const MeasurementModel measurement_;
+  Errors all_;
+  std::map<int, Errors> by_part_;
+  std::map<std::string, Errors> by_tilt_, by_distance_, by_tags_;
+  std::vector<double> pair_d2_, pair_d2_by_model_;
+  std::map<int, int> seen_;
+};
+
 }  // namespace
 
 int main(int argc, char** argv) {
@@ -126,65 +194,14 @@ int main(int argc, char** argv) {
                "With the rig's calibration errors, as ./run without --ideal");
   CLI11_PARSE(app, argc, argv);
 
-  const Markers markers = load_markers(rig);
   const MeasurementModel measurement =
       load_noise(rig, is_honest ? "noise.yaml" : "ideal_noise.yaml").measurement;
   test::RenderedRun run(rig, seed, {}, std::nullopt, !is_honest);
-  Errors all;
-  std::map<int, Errors> by_part;
-  std::map<std::string, Errors> by_tilt, by_distance, by_tags;
-  std::vector<double> pair_d2, pair_d2_by_model;
-  std::map<int, int> seen;
-  for (int i = 0; i < num_samples; ++i) {
-    const auto step = run.next();
-    for (std::size_t k = 0; k < step.sample.parts.size(); ++k) {
-      const PartObservation& part = step.sample.parts[k];
-      const Pose& truth = step.truth.at(part.part);
-      ++seen[part.part];
-      all.add(part, truth);
-      by_part[part.part].add(part, truth);
-      const part_observation_t& message = step.message.parts[k];
-      by_tilt[bin(best_tilt(message, truth, markers) / kDegree, {10, 20, 30, 40, 50, 60, 70}, "°")]
-          .add(part, truth);
-      by_distance[bin(truth.translation().norm(), {1.6, 1.8, 2.0, 2.2, 2.4}, "m")].add(part, truth);
-      by_tags[std::to_string(message.num_tags)].add(part, truth);
-      for (std::size_t j = 0; j < k; ++j) {
-        const PartObservation& other = step.sample.parts[j];
-        const Pose z = other.X_CB.inverse() * part.X_CB;
-        const Pose z_true = step.truth.at(other.part).inverse() * truth;
-        const Vector6d error = log(z_true.inverse() * z);
-        const auto d2 = [&](const MeasurementModel& model) {
-          return mahalanobis2(
-              error, relative_covariance(z, model.covariance(other), model.covariance(part)));
-        };
-        pair_d2.push_back(d2({}));
-        pair_d2_by_model.push_back(d2(measurement));
-      }
-    }
-  }
-
+  Tables tables(rig, measurement);
+  for (int i = 0; i < num_samples; ++i) tables.add(run.next());
   std::printf("%s, %s, seed %lld, %d samples, %d actions refused\n", rig.c_str(),
               is_honest ? "with calibration errors" : "ideal", static_cast<long long>(seed),
               num_samples, run.num_rejected());
-  print_header("part");
-  for (const auto& [part, errors] : by_part) {
-    char name[64];
-    std::snprintf(name, sizeof name, "%d, seen %.1f %%", part, 100.0 * seen[part] / num_samples);
-    errors.print(name);
-  }
-  all.print("all");
-  print_header("tilt of the best tag");
-  for (const auto& [name, errors] : by_tilt) errors.print(name);
-  print_header("distance");
-  for (const auto& [name, errors] : by_distance) errors.print(name);
-  print_header("tags of the part");
-  for (const auto& [name, errors] : by_tags) errors.print(name);
-
-  std::printf(
-      "\n| all pairs of parts: d² by | median (%.2f) | 95 %% (12.59) | d² > %.2f, %% |\n"
-      "| --- | --- | --- | --- |\n",
-      kChi2Median, kChi2Outlier);
-  print_distances("the images and markers.yaml", pair_d2);
-  print_distances("noise.yaml too", pair_d2_by_model);
+  tables.print(num_samples);
   return 0;
 }

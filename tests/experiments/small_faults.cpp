@@ -31,6 +31,25 @@ struct Cell {
   double range_rad = 1.35;
 };
 
+const std::vector<Cell> kCells{
+    {"nothing", Fault::kNone, 1},
+    {"joint offset 1°", Fault::kOffset, 0.05},
+    {"joint offset 1.5°", Fault::kOffset, 0.075},
+    {"joint offset 2°", Fault::kOffset, 0.1},
+    {"link bent by 1°, 0.7 mm", Fault::kBend, 1 / 45.0},
+    {"link bent by 2°, 1.3 mm", Fault::kBend, 2 / 45.0},
+    {"tool off by 1°, 3 mm", Fault::kTool, 1 / 80.0},
+    {"tool off by 2°, 6 mm", Fault::kTool, 2 / 80.0},
+    {"marker moved by 1.1°, 1 mm", Fault::kMarker, 0.02},
+    {"marker moved by 2.3°, 2 mm", Fault::kMarker, 0.04},
+    {"camera off by 1°, 7 mm", Fault::kCamera, 1 / 15.0},
+    {"wrist's offset 5°", Fault::kOffset, 0.25, 7},
+    {"wrist's offset 20°", Fault::kOffset, 1, 7},
+    {"joint reversed, ±77°", Fault::kReversed, 1},
+    {"joint reversed, ±160°", Fault::kReversed, 1, 4, 2.8},
+    {"wrist reversed, ±160°", Fault::kReversed, 1, 7, 2.8},
+    {"link bent by 10°, 7 mm, on and off", Fault::kIntermittent, 10 / 45.0}};
+
 struct Count {
   int num_runs = 0, num_found = 0, num_placed = 0, num_named = 0;
   int num_early = 0, num_elsewhere = 0;  ///< events
@@ -103,32 +122,13 @@ int main(int argc, char** argv) {
   app.add_flag("--chapter", is_chapter, "In the chapter's noise instead of tag_iso");
   CLI11_PARSE(app, argc, argv);
 
-  const std::vector<Cell> cells{
-      {"nothing", Fault::kNone, 1},
-
-      {"joint offset 1°", Fault::kOffset, 0.05},
-      {"joint offset 1.5°", Fault::kOffset, 0.075},
-      {"joint offset 2°", Fault::kOffset, 0.1},
-      {"link bent by 1°, 0.7 mm", Fault::kBend, 1 / 45.0},
-      {"link bent by 2°, 1.3 mm", Fault::kBend, 2 / 45.0},
-      {"tool off by 1°, 3 mm", Fault::kTool, 1 / 80.0},
-      {"tool off by 2°, 6 mm", Fault::kTool, 2 / 80.0},
-      {"marker moved by 1.1°, 1 mm", Fault::kMarker, 0.02},
-      {"marker moved by 2.3°, 2 mm", Fault::kMarker, 0.04},
-      {"camera off by 1°, 7 mm", Fault::kCamera, 1 / 15.0},
-      {"wrist's offset 5°", Fault::kOffset, 0.25, 7},
-      {"wrist's offset 20°", Fault::kOffset, 1, 7},
-      {"joint reversed, ±77°", Fault::kReversed, 1},
-      {"joint reversed, ±160°", Fault::kReversed, 1, 4, 2.8},
-      {"wrist reversed, ±160°", Fault::kReversed, 1, 7, 2.8},
-      {"link bent by 10°, 7 mm, on and off", Fault::kIntermittent, 10 / 45.0}};
   std::printf(
       "| fault | found within %d | samples, median (95 %%) | mended after, median (95 %%) | in the "
       "end: place right | cause right | called a moved marker | events before it, in 1000 | events "
       "elsewhere, in a run | ms a sample |\n"
       "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |\n",
       within);
-  for (const Cell& cell : cells) {
+  for (const Cell& cell : kCells) {
     if (cell.name.find(words) == std::string::npos) continue;
     Count count;
     for (int seed = 1; seed <= num_runs; ++seed)

@@ -79,6 +79,55 @@ void describe(const BodySchema& schema, const SyntheticRobot& robot) {
   std::printf("    noise %.3g m %.3g rad\n", schema.noise.position_m, schema.noise.rotation_rad);
 }
 
+struct Seeds {
+  int first, num;
+};
+
+void print_row(const std::string& robot_name, const std::string& regime_name,
+               const std::string& noise, int n, const Seeds& seeds, bool verbose) {
+  int counts[3] = {0, 0, 0};
+  int num_detectable = 0, num_right = 0;  // and right
+  double search_seconds = 0, learn_seconds = 0;
+  long fits = 0;
+  for (int seed = seeds.first; seed < seeds.first + seeds.num; ++seed) {
+    Rng rng(seed);
+    const SyntheticRobot robot = make_robot(robot_name, rng);
+    ObservationOptions observation;
+    for (const Regime r : {Regime::kFree, Regime::kChapter, Regime::kTag, Regime::kTagIso})
+      if (regime_name == name_of(r)) observation.regime = r;
+    observation.with_covariances = noise == "covariance" || noise == "other";
+    observation.with_other_hypothesis = noise == "other";
+    LearnOptions options;
+    if (noise == "given") options.measurement.noise = nominal_noise(observation.regime);
+    const auto samples = babble(robot, n, observation, rng);
+    const std::clock_t start = std::clock();
+    const LearnedStructure structure = find_structure(robot.signals, samples, options);
+    search_seconds += static_cast<double>(std::clock() - start) / CLOCKS_PER_SEC;
+    const LearnResult result = fit_structure(structure, samples, options);
+    learn_seconds += static_cast<double>(std::clock() - start) / CLOCKS_PER_SEC;
+    fits += result.num_fits;
+    const Rightness rightness = judge(result.schema, robot);
+    ++counts[static_cast<int>(rightness)];
+    if (is_detectable(robot, observation.regime, n)) {
+      ++num_detectable;
+      num_right += rightness == Rightness::kRight;
+    }
+    if (verbose && rightness != Rightness::kRight) {
+      std::printf("  seed %d: %s\n", seed, rightness == Rightness::kWrong ? "wrong" : "incomplete");
+      describe(result.schema, robot);
+    }
+  }
+  std::printf(
+      "| %s | %s | %s | %d | %.1f / %.1f / %.1f | %.0f, %.1f | %.0f | %.0f | "
+      "%.0f |\n",
+      robot_name.c_str(), regime_name.c_str(), noise.c_str(), n, 100.0 * counts[0] / seeds.num,
+      100.0 * counts[1] / seeds.num, 100.0 * counts[2] / seeds.num,
+      100.0 * num_detectable / seeds.num, 100.0 * num_right / std::max(num_detectable, 1),
+      1e3 * search_seconds / seeds.num, 1e3 * learn_seconds / seeds.num,
+      static_cast<double>(fits) / seeds.num);
+  std::fflush(stdout);
+}
+
 }  // namespace
 
 int main(int argc, char** argv) {
@@ -86,7 +135,7 @@ int main(int argc, char** argv) {
     std::cerr << "usage: structure_table ROBOTS REGIMES NOISE NS FIRST_SEED NUM_SEEDS [verbose]\n";
     return 2;
   }
-  const int first_seed = std::stoi(argv[5]), num_seeds = std::stoi(argv[6]);
+  const Seeds seeds{std::stoi(argv[5]), std::stoi(argv[6])};
   const bool verbose = argc > 7;
   std::printf(
       "| robot | regime | noise | N | right / incomplete / wrong %% | detectable, right of these "
@@ -96,51 +145,8 @@ int main(int argc, char** argv) {
   for (const std::string& robot_name : split(argv[1])) {
     for (const std::string& regime_name : split(argv[2])) {
       for (const std::string& noise : split(argv[3])) {
-        for (const std::string& n_text : split(argv[4])) {
-          const int n = std::stoi(n_text);
-          int counts[3] = {0, 0, 0};
-          int num_detectable = 0, num_right = 0;  // and right
-          double search_seconds = 0, learn_seconds = 0;
-          long fits = 0;
-          for (int seed = first_seed; seed < first_seed + num_seeds; ++seed) {
-            Rng rng(seed);
-            const SyntheticRobot robot = make_robot(robot_name, rng);
-            ObservationOptions observation;
-            for (const Regime r : {Regime::kFree, Regime::kChapter, Regime::kTag, Regime::kTagIso})
-              if (regime_name == name_of(r)) observation.regime = r;
-            observation.with_covariances = noise == "covariance" || noise == "other";
-            observation.with_other_hypothesis = noise == "other";
-            LearnOptions options;
-            if (noise == "given") options.measurement.noise = nominal_noise(observation.regime);
-            const auto samples = babble(robot, n, observation, rng);
-            const std::clock_t start = std::clock();
-            const LearnedStructure structure = find_structure(robot.signals, samples, options);
-            search_seconds += static_cast<double>(std::clock() - start) / CLOCKS_PER_SEC;
-            const LearnResult result = fit_structure(structure, samples, options);
-            learn_seconds += static_cast<double>(std::clock() - start) / CLOCKS_PER_SEC;
-            fits += result.num_fits;
-            const Rightness rightness = judge(result.schema, robot);
-            ++counts[static_cast<int>(rightness)];
-            if (is_detectable(robot, observation.regime, n)) {
-              ++num_detectable;
-              num_right += rightness == Rightness::kRight;
-            }
-            if (verbose && rightness != Rightness::kRight) {
-              std::printf("  seed %d: %s\n", seed,
-                          rightness == Rightness::kWrong ? "wrong" : "incomplete");
-              describe(result.schema, robot);
-            }
-          }
-          std::printf(
-              "| %s | %s | %s | %d | %.1f / %.1f / %.1f | %.0f, %.1f | %.0f | %.0f | "
-              "%.0f |\n",
-              robot_name.c_str(), regime_name.c_str(), noise.c_str(), n,
-              100.0 * counts[0] / num_seeds, 100.0 * counts[1] / num_seeds,
-              100.0 * counts[2] / num_seeds, 100.0 * num_detectable / num_seeds,
-              100.0 * num_right / std::max(num_detectable, 1), 1e3 * search_seconds / num_seeds,
-              1e3 * learn_seconds / num_seeds, static_cast<double>(fits) / num_seeds);
-          std::fflush(stdout);
-        }
+        for (const std::string& n_text : split(argv[4]))
+          print_row(robot_name, regime_name, noise, std::stoi(n_text), seeds, verbose);
       }
     }
   }

@@ -103,7 +103,12 @@ TEST_F(BodyschemaProgramTest, ReachFindsTheActionOfAPoseOrTheNearest) {
         .out;
   };
   EXPECT_EQ(reach_at("-.25"), reach_at("-0.25"));
+}
 
+TEST_F(BodyschemaProgramTest, ReachRefusesWhatMakesNoSense) {
+  ASSERT_EQ(
+      run({"learn", write_robot("train.csv", Regime::kFree), "--out", "schema.lcmlog"}).exit_code,
+      0);
   const std::vector<std::string> of_none = {
       "reach", "schema.lcmlog", "--part", "77", "--position", "0", "0", "0"};
   expect_failure(of_none, "--part");

@@ -69,13 +69,49 @@ TEST(CramerRao, IsInfiniteWhereNothingWasSeen) {
   EXPECT_TRUE(std::isinf(at_one_pose.bound(1, 4, trial.test_actions[0])(0, 0)));
 }
 
+/// Errors of all marker poses, `seen` by sample, in standard deviations.
+Eigen::VectorXd whitened(const SyntheticRobot& model, const std::vector<ActionPoseSample>& samples,
+                         const std::vector<std::map<int, Pose>>& seen, const Vector6d& variances) {
+  const Vector6d whitening = variances.cwiseSqrt().cwiseInverse();
+  Eigen::VectorXd result(6 * 5 * static_cast<Eigen::Index>(samples.size()));
+  Eigen::Index row = 0;
+  for (std::size_t t = 0; t < samples.size(); ++t) {
+    const auto X = model.poses_in_camera(samples[t].action);
+    for (const auto& [part, y] : seen[t]) {
+      result.segment<6>(row) = whitening.cwiseProduct(log(X.at(part).inverse() * y));
+      row += 6;
+    }
+  }
+  return result;
+}
+
+SyntheticRobot fitted(SyntheticRobot model, const std::vector<ActionPoseSample>& samples,
+                      const std::vector<std::map<int, Pose>>& seen, const Vector6d& variances) {
+  constexpr double kStep = 1e-6;
+  for (int iteration = 0; iteration < 2; ++iteration) {
+    const CramerRao parameters(model);
+    const Eigen::VectorXd r = whitened(model, samples, seen, variances);
+    Eigen::MatrixXd J(r.size(), parameters.num_parameters());
+    for (int n = 0; n < parameters.num_parameters(); ++n) {
+      const Eigen::VectorXd step = kStep * Eigen::VectorXd::Unit(parameters.num_parameters(), n);
+      J.col(n) = (whitened(parameters.perturbed(step), samples, seen, variances) - r) / kStep;
+    }
+    // Along the gauge the step of least norm; numeric derivatives there are noise.
+    Eigen::CompleteOrthogonalDecomposition<Eigen::MatrixXd> solver;
+    solver.setThreshold(1e-5);
+    solver.compute(J);
+    model = parameters.perturbed(-solver.solve(r));
+  }
+  return model;
+}
+
 // Maximum likelihood attains the bound where noise is small: Gauss–Newton with numeric derivatives
 // over all marker poses, on the same actions again and again.
 TEST(CramerRao, IsWhatMaximumLikelihoodReaches) {
   Rng rng(9);
   const SyntheticRobot robot = test::chapter_robot("a", rng);
   constexpr int kSamples = 8, kRuns = 300;
-  constexpr double kPosition = 0.002, kRotation = 0.005, kStep = 1e-6;
+  constexpr double kPosition = 0.002, kRotation = 0.005;
   Vector6d variances;
   variances << Eigen::Vector3d::Constant(kPosition * kPosition),
       Eigen::Vector3d::Constant(kRotation * kRotation);
@@ -94,20 +130,6 @@ TEST(CramerRao, IsWhatMaximumLikelihoodReaches) {
   const Eigen::VectorXd q_test = robot.random_action(rng);
   const Matrix6d expected = bound.bound(1, 5, q_test);
 
-  const Vector6d whitening = variances.cwiseSqrt().cwiseInverse();
-  const auto residuals = [&](const SyntheticRobot& model,
-                             const std::vector<std::map<int, Pose>>& seen) {
-    Eigen::VectorXd result(6 * 5 * kSamples);
-    Eigen::Index row = 0;
-    for (int t = 0; t < kSamples; ++t) {
-      const auto X = model.poses_in_camera(samples[t].action);
-      for (const auto& [part, y] : seen[t]) {
-        result.segment<6>(row) = whitening.cwiseProduct(log(X.at(part).inverse() * y));
-        row += 6;
-      }
-    }
-    return result;
-  };
   Matrix6d scatter = Matrix6d::Zero();
   const auto truth = robot.poses_in_camera(q_test);
   const Pose X_true = truth.at(1).inverse() * truth.at(5);
@@ -116,21 +138,7 @@ TEST(CramerRao, IsWhatMaximumLikelihoodReaches) {
     for (int t = 0; t < kSamples; ++t)
       for (const auto& [part, X] : robot.poses_in_camera(samples[t].action))
         seen[t][part] = X * exp(variances.cwiseSqrt().cwiseProduct(test::gaussian6(rng)));
-    SyntheticRobot model = robot;
-    for (int iteration = 0; iteration < 2; ++iteration) {
-      const CramerRao parameters(model);
-      const Eigen::VectorXd r = residuals(model, seen);
-      Eigen::MatrixXd J(r.size(), parameters.num_parameters());
-      for (int n = 0; n < parameters.num_parameters(); ++n) {
-        const Eigen::VectorXd step = kStep * Eigen::VectorXd::Unit(parameters.num_parameters(), n);
-        J.col(n) = (residuals(parameters.perturbed(step), seen) - r) / kStep;
-      }
-      // Along the gauge the step of least norm; numeric derivatives there are noise.
-      Eigen::CompleteOrthogonalDecomposition<Eigen::MatrixXd> solver;
-      solver.setThreshold(1e-5);
-      solver.compute(J);
-      model = parameters.perturbed(-solver.solve(r));
-    }
+    const SyntheticRobot model = fitted(robot, samples, seen, variances);
     const auto X = model.poses_in_camera(q_test);
     const Vector6d error = log(X_true.inverse() * (X.at(1).inverse() * X.at(5)));
     scatter += error * error.transpose() / kRuns;

@@ -22,6 +22,38 @@ std::string number(double value) {
   return std::isfinite(value) ? fmt::format("{:.8g}", value) : "NaN";
 }
 
+/// What `plot` draws of a block of data.
+std::vector<std::string> plots_of(const Curve& curve, const std::string& block) {
+  const std::string style =
+      fmt::format("lc rgb '{}'", kColours[curve.colour % std::size(kColours)]);
+  std::vector<std::string> plots;
+  const std::string title =
+      curve.title.empty() ? "notitle" : "title " + gnuplot_string(curve.title);
+  switch (curve.kind) {
+    case Curve::Kind::kBand:
+      plots.push_back(
+          fmt::format("{} using 1:($2-$3):($2+$3) with filledcurves fs transparent solid 0.18 "
+                      "noborder {} notitle",
+                      block, style));
+      plots.push_back(fmt::format("{} using 1:2 with lines lw 2 {} {}", block, style, title));
+      break;
+    case Curve::Kind::kLine:
+      if (!curve.error.empty())
+        plots.push_back(fmt::format("{} using 1:2:3 with yerrorbars pt 7 ps 0.1 lw 1 {} notitle",
+                                    block, style));
+      // The rings of the dashed are seen around the dots of the others.
+      plots.push_back(fmt::format("{} using 1:2 with linespoints pt {} ps {} lw 2 dt {} {} {}",
+                                  block, curve.is_dashed ? 6 : 7, curve.is_dashed ? 1.2 : 0.7,
+                                  curve.is_dashed ? 3 : 1, style, title));
+      break;
+    case Curve::Kind::kPoints:
+      plots.push_back(
+          fmt::format("{} using 1:2 with points pt 7 ps 0.6 {} {}", block, style, title));
+      break;
+  }
+  return plots;
+}
+
 std::string script_of(const Panel& panel, int index) {
   double low = INFINITY, high = -INFINITY;
   for (const Curve& curve : panel.curves) {
@@ -39,9 +71,6 @@ std::string script_of(const Panel& panel, int index) {
   const auto also = [&curves](const std::string& what) {
     curves += (curves.empty() ? "plot " : ", \\\n     ") + what;
   };
-  const auto style = [](int colour) {
-    return fmt::format("lc rgb '{}'", kColours[colour % std::size(kColours)]);
-  };
   for (std::size_t c = 0; c < panel.curves.size(); ++c) {
     const Curve& curve = panel.curves[c];
     const std::string block = fmt::format("$data_{}_{}", index, c);
@@ -50,30 +79,7 @@ std::string script_of(const Panel& panel, int index) {
       data += fmt::format("{} {} {}\n", number(shifted(curve.x[n], c)), number(curve.y[n]),
                           number(curve.error.empty() ? 0 : curve.error[n]));
     data += "END\n";
-    const std::string title =
-        curve.title.empty() ? "notitle" : "title " + gnuplot_string(curve.title);
-    switch (curve.kind) {
-      case Curve::Kind::kBand:
-        also(
-            fmt::format("{} using 1:($2-$3):($2+$3) with filledcurves fs transparent solid 0.18 "
-                        "noborder {} notitle",
-                        block, style(curve.colour)));
-        also(fmt::format("{} using 1:2 with lines lw 2 {} {}", block, style(curve.colour), title));
-        break;
-      case Curve::Kind::kLine:
-        if (!curve.error.empty())
-          also(fmt::format("{} using 1:2:3 with yerrorbars pt 7 ps 0.1 lw 1 {} notitle", block,
-                           style(curve.colour)));
-        // The rings of the dashed are seen around the dots of the others.
-        also(fmt::format("{} using 1:2 with linespoints pt {} ps {} lw 2 dt {} {} {}", block,
-                         curve.is_dashed ? 6 : 7, curve.is_dashed ? 1.2 : 0.7,
-                         curve.is_dashed ? 3 : 1, style(curve.colour), title));
-        break;
-      case Curve::Kind::kPoints:
-        also(fmt::format("{} using 1:2 with points pt 7 ps 0.6 {} {}", block, style(curve.colour),
-                         title));
-        break;
-    }
+    for (const std::string& plot : plots_of(curve, block)) also(plot);
   }
   int dash = 2;
   for (const Reference& reference : panel.references)

@@ -82,6 +82,30 @@ double baseline_share(Regime regime, int num_samples, int seed) {
   return static_cast<double>(invalid) / num_samples;
 }
 
+Watch sum_of(const std::vector<Watch>& watches) {
+  Watch all;
+  for (const Watch& w : watches) {
+    all.num_alarms += w.num_alarms;
+    for (const auto& [kind, count] : w.kinds) all.kinds[kind] += count;
+    for (std::size_t b = 0; b < w.above.size(); ++b) all.above[b] += w.above[b];
+    all.seconds_first += w.seconds_first;
+    all.seconds_last += w.seconds_last;
+    all.seconds += w.seconds;
+  }
+  return all;
+}
+
+/// Shares of `total` samples.
+Curve curve_of(const Watch& all, const std::string& name, int colour, int total) {
+  Curve curve{.title = name, .colour = colour};
+  for (int b = 0; b < kBins; ++b) {
+    if (all.above[static_cast<std::size_t>(b)] == 0) break;
+    curve.x.push_back(b * kBinNats);
+    curve.y.push_back(static_cast<double>(all.above[static_cast<std::size_t>(b)]) / total);
+  }
+  return curve;
+}
+
 }  // namespace
 
 Findings false_alarms(const Setup& setup) {
@@ -114,15 +138,7 @@ Findings false_alarms(const Setup& setup) {
       watches[static_cast<std::size_t>(n)] = watch(c.regime, c.noise_factor, num_samples, 1000 + n);
     });
     const double theirs = 100 * baseline_share(c.regime, std::min(num_samples, 2000), 1000);
-    Watch all;
-    for (const Watch& w : watches) {
-      all.num_alarms += w.num_alarms;
-      for (const auto& [kind, count] : w.kinds) all.kinds[kind] += count;
-      for (std::size_t b = 0; b < w.above.size(); ++b) all.above[b] += w.above[b];
-      all.seconds_first += w.seconds_first;
-      all.seconds_last += w.seconds_last;
-      all.seconds += w.seconds;
-    }
+    const Watch all = sum_of(watches);
     const int total = num_robots * num_samples;
     const std::string kinds = listed(
         all.kinds, [](const auto& kind) { return fmt::format("{} {}", kind.second, kind.first); });
@@ -141,13 +157,7 @@ Findings false_alarms(const Setup& setup) {
            fmt::format("{:.2f} ms, last quarter / first {:.2f}", 1e3 * all.seconds / total, ratio),
            ratio < 1.3 && all.seconds / total < 0.005});
     }
-    Curve curve{.title = name, .colour = colour++};
-    for (int b = 0; b < kBins; ++b) {
-      if (all.above[static_cast<std::size_t>(b)] == 0) break;
-      curve.x.push_back(b * kBinNats);
-      curve.y.push_back(static_cast<double>(all.above[static_cast<std::size_t>(b)]) / total);
-    }
-    panel.curves.push_back(std::move(curve));
+    panel.curves.push_back(curve_of(all, name, colour++, total));
   }
   draw(setup, "false_alarms.png", {panel}, 1);
   findings.markdown = fmt::format(

@@ -149,6 +149,25 @@ Panel panel_of(const Learned& learned, const Trial& trial, int signal, const std
   return panel;
 }
 
+/// A method, by robot.
+struct Side {
+  std::vector<double> position, rotation;
+  std::vector<char> valid;
+  explicit Side(int count) : position(count), rotation(count), valid(count) {}
+  void set(int n, const Learned& learned) {
+    position[n] = learned.position_rms();
+    rotation[n] = learned.rotation_rms();
+    valid[n] = learned.is_valid;
+  }
+  int num_valid() const {
+    return static_cast<int>(std::count(valid.begin(), valid.end(), char{1}));
+  }
+  std::string rms() const {
+    return mean_and_error(spread_of(position), kMillimetre) + " mm, " +
+           mean_and_error(spread_of(rotation), kDegree) + "°";
+  }
+};
+
 }  // namespace
 
 Findings local_model(const Setup& setup) {
@@ -159,23 +178,6 @@ Findings local_model(const Setup& setup) {
                "ours: valid %", "leave-one-out rms"});
   for (const Regime regime : {Regime::kFree, Regime::kChapter, Regime::kTag}) {
     for (const int signal : {kRightSignal, kWrongSignal}) {
-      struct Side {
-        std::vector<double> position, rotation;
-        std::vector<char> valid;
-        explicit Side(int count) : position(count), rotation(count), valid(count) {}
-        void set(int n, const Learned& learned) {
-          position[n] = learned.position_rms();
-          rotation[n] = learned.rotation_rms();
-          valid[n] = learned.is_valid;
-        }
-        int num_valid() const {
-          return static_cast<int>(std::count(valid.begin(), valid.end(), char{1}));
-        }
-        std::string rms() const {
-          return mean_and_error(spread_of(position), kMillimetre) + " mm, " +
-                 mean_and_error(spread_of(rotation), kDegree) + "°";
-        }
-      };
       const std::string name = test::name_of(regime);
       const std::string what = signal == kRightSignal ? "q1 (moves it)" : "q2 (does not)";
       Side ours(num_robots), baseline(num_baseline);

@@ -52,6 +52,35 @@ std::string shares(const std::vector<Said>& all) {
                      share(Said::kNothing), share(Said::kOther));
 }
 
+using Answers = std::vector<std::vector<Said>>;  ///< by size, by robot
+
+Panel panel_of(const std::string& name, const std::vector<int>& sizes, const Answers& baseline,
+               const Answers& ours) {
+  Panel panel{
+      .title = "Fig. 6, " + name + fmt::format(": q2 moves from sample {} on", kResting + 1),
+      .x_label = "samples N",
+      .y_label = "robots [%]",
+      .references = {{"chapter: {q1}, then both", 100}},
+      .y_range = {-5, 105},
+      .shift = 0.008};
+  for (const auto* side : {&baseline, &ours}) {
+    for (const Said what : {Said::kOne, Said::kBoth}) {
+      Curve curve{.title = std::string(side == &ours ? "ours" : "baseline") +
+                           (what == Said::kOne ? " {q1}" : " {q1, q2}"),
+                  .colour = what == Said::kOne ? 2 : 1};
+      curve.is_dashed = side == &baseline;
+      for (std::size_t s = 0; s < sizes.size(); ++s) {
+        const auto& all = (*side)[s];
+        curve.x.push_back(sizes[s]);
+        curve.y.push_back(100.0 * static_cast<double>(std::count(all.begin(), all.end(), what)) /
+                          static_cast<double>(all.size()));
+      }
+      panel.curves.push_back(std::move(curve));
+    }
+  }
+  return panel;
+}
+
 }  // namespace
 
 Findings spherical(const Setup& setup) {
@@ -65,7 +94,7 @@ Findings spherical(const Setup& setup) {
   std::vector<Panel> panels;
   for (const Regime regime : {Regime::kFree, Regime::kChapter, Regime::kTag}) {
     const std::string name = test::name_of(regime);
-    std::vector<std::vector<Said>> ours(sizes.size(), std::vector<Said>(num_robots)),
+    Answers ours(sizes.size(), std::vector<Said>(num_robots)),
         baseline(sizes.size(), std::vector<Said>(num_baseline));
     for_each_robot(setup, "ours, " + name, num_robots, [&](int n) {
       const Trial trial = spherical_trial(regime, sizes.back(), n + 1);
@@ -79,29 +108,7 @@ Findings spherical(const Setup& setup) {
             learn_baseline(trial.robot.signals, trial.first(sizes[s]), baseline_options(regime))
                 .schema);
     });
-    Panel panel{
-        .title = "Fig. 6, " + name + fmt::format(": q2 moves from sample {} on", kResting + 1),
-        .x_label = "samples N",
-        .y_label = "robots [%]",
-        .references = {{"chapter: {q1}, then both", 100}},
-        .y_range = {-5, 105},
-        .shift = 0.008};
-    for (const auto* side : {&baseline, &ours}) {
-      for (const Said what : {Said::kOne, Said::kBoth}) {
-        Curve curve{.title = std::string(side == &ours ? "ours" : "baseline") +
-                             (what == Said::kOne ? " {q1}" : " {q1, q2}"),
-                    .colour = what == Said::kOne ? 2 : 1};
-        curve.is_dashed = side == &baseline;
-        for (std::size_t s = 0; s < sizes.size(); ++s) {
-          const auto& all = (*side)[s];
-          curve.x.push_back(sizes[s]);
-          curve.y.push_back(100.0 * static_cast<double>(std::count(all.begin(), all.end(), what)) /
-                            static_cast<double>(all.size()));
-        }
-        panel.curves.push_back(std::move(curve));
-      }
-    }
-    panels.push_back(std::move(panel));
+    panels.push_back(panel_of(name, sizes, baseline, ours));
     for (std::size_t s = 0; s < sizes.size(); ++s) {
       const int N = sizes[s];
       table.add({name, std::to_string(N), N <= kResting ? "{q1}" : "{q1, q2} in the end",
