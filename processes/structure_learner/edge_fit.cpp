@@ -3,7 +3,6 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
-#include <numeric>
 
 #include "processes/structure_learner/joint_scatter.h"
 #include "processes/structure_learner/residual_fit.h"
@@ -161,29 +160,6 @@ bool drop_contradicted(const TreeFit& fit, std::vector<FittedEdge>* fitted, Refu
   return drop(is_contradicted, Refusal::kContradicted, fitted, refused);
 }
 
-// Whether so many outliers stand one after the other where the samples are in the order of one of
-// the edge's signals that chance does not explain it: there it is the model that is wrong.
-bool is_wrong_at_some_commands(const std::vector<int>& signals, const std::vector<int>& samples,
-                               const std::vector<bool>& outlying,
-                               const NormalizedActions& actions) {
-  constexpr double kLeastChance = 1e-4;
-  if (actions.blocks().is_stream()) return false;  // there outliers last
-  const auto n = samples.size();
-  const double share = static_cast<double>(std::count(outlying.begin(), outlying.end(), true)) /
-                       static_cast<double>(n);
-  std::vector<std::size_t> order(n);
-  for (const int signal : signals) {
-    std::iota(order.begin(), order.end(), 0);
-    std::stable_sort(order.begin(), order.end(), [&](std::size_t a, std::size_t b) {
-      return actions(samples[a], signal) < actions(samples[b], signal);
-    });
-    int run = 0, longest = 0;
-    for (const std::size_t t : order) longest = std::max(longest, run = outlying[t] ? run + 1 : 0);
-    if (static_cast<double>(n) * std::pow(share, longest) < kLeastChance) return true;
-  }
-  return false;
-}
-
 // Edges that the joint fit has wrong at one end of a command's range, or in between.
 bool drop_wrong_at_some_commands(const TreeFit& fit, std::vector<FittedEdge>* fitted,
                                  Refusals* refused) {
@@ -264,6 +240,28 @@ LocalModel rescaled(LocalModel model, const NormalizedActions& from, const Norma
 
 bool is_wrong_at_some_commands(const FittedEdge& fitted, const NormalizedActions& actions) {
   return is_wrong_at_some_commands(fitted.edge.signals(), fitted.frames, fitted.outlying, actions);
+}
+
+bool is_wrong_at_an_end(const FittedEdge& fitted, const TimeBlocks& blocks) {
+  constexpr int kFewest = 3;
+  constexpr double kLeastChance = 1e-4;
+  std::vector<bool> outlying;  // by block that was seen: at all of its instants
+  int previous = -1;
+  for (std::size_t t = 0; t < fitted.frames.size(); ++t) {
+    const int block = blocks.block_of(fitted.frames[t]);
+    if (block != previous) outlying.push_back(true);
+    if (!fitted.outlying[t]) outlying.back() = false;
+    previous = block;
+  }
+  const auto n = static_cast<double>(outlying.size());
+  const auto num_outliers = static_cast<double>(std::count(outlying.begin(), outlying.end(), true));
+  const auto begins_wrong = [&](auto first, auto last) {
+    const auto run = static_cast<double>(std::find(first, last, false) - first);
+    const double rate = (num_outliers - run + 1) / (n - run + 2);  // the rule of succession
+    return run >= kFewest && std::pow(rate, run) < kLeastChance;
+  };
+  return begins_wrong(outlying.begin(), outlying.end()) ||
+         begins_wrong(outlying.rbegin(), outlying.rend());
 }
 
 FittedEdge fit_edge(const AcceptedModel& accepted, int from, int to, const EdgeData& data,

@@ -30,6 +30,7 @@ struct FittedEdge {
 enum class Refusal {
   kNotValid,             ///< on all of its data
   kWrongAtSomeCommands,  ///< is_wrong_at_some_commands()
+  kWrongAtAnEnd,         ///< is_wrong_at_an_end()
   kContradicted,         ///< by all other parts, at most instants
 };
 /// By the edge's parts, the lower first.
@@ -46,6 +47,11 @@ FittedEdge fit_edge(const AcceptedModel& accepted, int from, int to, const EdgeD
 /// Where an edge has outliers one after the other, in the order of one of its signals, that chance
 /// does not explain, its model is wrong and not its poses. False in a stream, where outliers last.
 bool is_wrong_at_some_commands(const FittedEdge& fitted, const NormalizedActions& actions);
+
+/// Where the first or the last samples of an edge are outliers in a row that chance, at the rate of
+/// the others, does not explain: one of its markers, or what bears it, was moved meanwhile. Of a
+/// stream a block of time counts as one sample.
+bool is_wrong_at_an_end(const FittedEdge& fitted, const TimeBlocks& blocks);
 
 /// The edges of the root's component fitted to all of its markers at once: a root that rests and
 /// everything on the way from it are witnesses too, beside the two markers that each edge was

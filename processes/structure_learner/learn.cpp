@@ -113,9 +113,15 @@ LearnResult fit_tree(const LearnedStructure& structure,
     AcceptedModel start = search.models[static_cast<std::size_t>(edge)];
     start.model = rescaled(start.model, structure.actions, actions);
     FittedEdge fit = fit_edge(start, from, to, data, must_be_valid);
-    if (!fit.is_valid || is_wrong_at_some_commands(fit, actions)) {
-      refused[std::minmax(from, to)] =
-          fit.is_valid ? Refusal::kWrongAtSomeCommands : Refusal::kNotValid;
+    std::optional<Refusal> why;
+    if (!fit.is_valid)
+      why = Refusal::kNotValid;
+    else if (is_wrong_at_some_commands(fit, actions))
+      why = Refusal::kWrongAtSomeCommands;
+    else if (!options.is_monitored && is_wrong_at_an_end(fit, actions.blocks()))
+      why = Refusal::kWrongAtAnEnd;
+    if (why) {
+      refused[std::minmax(from, to)] = *why;
       return false;
     }
     fitted.push_back(std::move(fit));
@@ -189,9 +195,12 @@ bool connects_more_simply(const SearchResult& x, const SearchResult& y) {
   return std::tuple(x.models.size(), -num_joints(x)) > std::tuple(y.models.size(), -num_joints(y));
 }
 
+enum class Commands { kStraight, kMayBeBent };
+
 LearnedStructure find_with_bias(const std::vector<Signal>& signals,
                                 const std::vector<ActionPoseSample>& samples,
-                                const LearnOptions& options, double unknown_bias) {
+                                const LearnOptions& options, double unknown_bias,
+                                Commands commands) {
   if (options.max_signals < 0) throw std::invalid_argument("max_signals must not be below 0");
   const int num_signals = check_actions(samples, signals.size());
   const std::vector<int> parts = seen_parts(samples);
@@ -222,8 +231,8 @@ LearnedStructure find_with_bias(const std::vector<Signal>& signals,
   LearnedStructure result{signals,           parts,       search_options, std::move(actions),
                           std::move(search), noise_source};
   // Everything that is fitted sees displacements; which commands are bent shows only by a model.
-  constexpr int kMaxWarpRounds = 3;
-  for (int round = 0; round < kMaxWarpRounds; ++round) {
+  const int max_warp_rounds = commands == Commands::kStraight ? 0 : 3;
+  for (int round = 0; round < max_warp_rounds; ++round) {
     std::vector<Signal> bent = result.signals;
     if (!estimate_warps(samples, parts, result.search, search_options, &bent)) break;
     const std::vector<ActionPoseSample> again = displaced(samples, bent);
@@ -367,11 +376,11 @@ LearnedStructure find_in_step(const std::vector<Signal>& signals,
   std::vector<ActionPoseSample> poses = samples;
   for (ActionPoseSample& sample : poses)
     std::erase_if(sample.parts, [](const PartObservation& o) { return !o.has_rotation; });
-  const auto confirmed = [&](const LearnOptions& by) {
+  const auto confirmed = [&](const LearnOptions& by, Commands commands = Commands::kMayBeBent) {
     const auto find = [&](double factor, double unknown_bias) {
       LearnOptions louder = by;
       louder.measurement.scale *= factor;
-      return find_with_bias(signals, poses, louder, unknown_bias);
+      return find_with_bias(signals, poses, louder, unknown_bias, commands);
     };
     return confirmed_structure(find, [&](LearnedStructure* found) {
       // With enough noise a screw passes for anything soft: nothing is tried beside it.
@@ -382,6 +391,13 @@ LearnedStructure find_in_step(const std::vector<Signal>& signals,
     });
   };
   LearnedStructure structure = confirmed(options);
+  // All joints on a signal share its bend: one of a single joint keeps out the others.
+  const auto is_bent = [](const Signal& signal) { return !signal.warp.empty(); };
+  if (!structure.spans() && std::ranges::any_of(structure.signals, is_bent)) {
+    LearnedStructure straight = confirmed(options, Commands::kStraight);
+    if (straight.search.models.size() > structure.search.models.size())
+      structure = std::move(straight);
+  }
   if (const std::optional<Noise> shown = noise_instead(structure, poses, options)) {
     LearnOptions louder = options;
     louder.measurement.noise = shown;

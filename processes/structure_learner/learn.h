@@ -30,6 +30,9 @@ struct LearnOptions {
   MeasurementModel measurement;
   /// Largest number of joints in one local model.
   int max_signals = kMaxChainJoints;
+  /// A monitor tells what changed, and since when. Else an edge whose first or last samples are
+  /// elsewhere is not valid: is_wrong_at_an_end().
+  bool is_monitored = false;
 };
 
 struct LearnResult {

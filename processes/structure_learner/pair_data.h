@@ -1,5 +1,7 @@
 #pragma once
 
+#include <optional>
+#include <utility>
 #include <vector>
 
 #include "common/estimation/measurement_model.h"
@@ -25,6 +27,10 @@ class NormalizedActions {
   double half_range(int signal) const { return half_range_(signal); }
   /// The signals that took more than one value, ascending. The others can explain nothing.
   const std::vector<int>& moving() const { return moving_; }
+  /// Two signals that move alike, by a gain and an offset, to a thousandth of their ranges at all
+  /// of at least ten samples: a command and what a drive reports of it, or sides that are always
+  /// moved together. No pose tells which of them moves the body. O(D² N).
+  std::optional<std::pair<int, int>> alike() const;
   const TimeBlocks& blocks() const { return blocks_; }
   /// The commands of sample order[n] at sample n.
   NormalizedActions reordered(const std::vector<int>& order) const;

@@ -73,7 +73,10 @@ std::vector<int> drop_signals(Fitter* fitter) {
 }
 
 // As V1 judges screws, and by how much of the prediction is known.
-Verdict verdict_of(const SoftFit& fit, int num_independent, const ValidityOptions& options) {
+Verdict verdict_of(const Fitter& fitter, const PairData& pair, const NormalizedActions& actions,
+                   const ValidityOptions& options) {
+  const SoftFit& fit = fitter.judged();
+  const int num_independent = fitter.num_blocks();
   const auto num_frames = static_cast<double>(fit.frames.size());
   const double share = num_independent / num_frames;
   const double inliers = num_frames - fit.num_outliers;
@@ -82,6 +85,8 @@ Verdict verdict_of(const SoftFit& fit, int num_independent, const ValidityOption
                0.35 * num_frames);
   if (fit.num_outliers > max_outliers ||
       fit.mean_inlier > largest_inlier_mean(std::max(1.0, share * inliers), 3))
+    return Verdict::kRefuted;
+  if (is_wrong_at_some_commands(fitter.signals(), pair, fit.squared_distance, actions))
     return Verdict::kRefuted;
   return fit.mean_uncertainty > kLargestUncertainty ? Verdict::kNotEnoughData : Verdict::kValid;
 }
@@ -110,8 +115,7 @@ std::optional<SoftFit> fit_soft_model(const LocalModel& screws, const PairData& 
                                       const std::vector<int>& signals) {
   if (actions.moving().empty() || pair.size() == 0) return std::nullopt;
   Fitter fitter(screws, pair, actions);
-  const int num_independent = fitter.num_blocks();
-  if (num_independent < kFewestSoftFrames) return std::nullopt;
+  if (fitter.num_blocks() < kFewestSoftFrames) return std::nullopt;
   std::vector<int> chosen = signals;
   if (chosen.empty()) {
     chosen = fitter.ranked_signals();
@@ -130,11 +134,11 @@ std::optional<SoftFit> fit_soft_model(const LocalModel& screws, const PairData& 
   }
 
   SoftFit result = fitter.judged();
-  result.verdict = verdict_of(result, num_independent, options);
+  result.verdict = verdict_of(fitter, pair, actions, options);
   // Errors that last longer than from one sample to the next make more samples worse.
   Fitter more = fitter;
   more.use_all_samples();
-  const Verdict verdict_of_more = verdict_of(more.judged(), num_independent, options);
+  const Verdict verdict_of_more = verdict_of(more, pair, actions, options);
   if (more.judged().log_density > result.log_density &&
       (verdict_of_more == Verdict::kValid || result.verdict != Verdict::kValid)) {
     result = more.judged();

@@ -18,6 +18,7 @@ StructureLearnerConfig StructureLearnerConfig::load(const std::filesystem::path&
   config.options.expected_parts = load_markers(file.parent_path()).parts();
   config.options.max_signals = static_cast<int>(yaml.integer("max_signals", 0, kMaxChainJoints));
   config.options.measurement = load_noise(file.parent_path()).measurement;
+  config.options.is_monitored = true;
   yaml.finish();
   return config;
 }

@@ -97,13 +97,19 @@ UnconnectedPart explain_leaf(int part, int num_seen, const LearnedStructure& str
 /// Where a valid model was taken back, or another explanation contends with it: that. Empty if none
 /// was.
 std::string why_taken_back(const TriedModels& tried, const LearnedStructure& structure) {
+  const auto alike = structure.actions.alike();
+  if (alike && tried.num_common > 0)
+    return names_of(std::vector{alike->first, alike->second}, structure) +
+           " move alike at all samples, and which of them moves it cannot be told: move them "
+           "apart, "
+           "or leave one of them out";
   if (structure.is_contested)
     return "another structure fits if the noise is larger than it is said to be: tell the true "
            "noise, or give more samples";
   if (tried.is_redundant)
     return "a model is valid, but has a joint that the others make needless, and without it none "
-           "is: more of the poses are wrong, or further off, than is told, or its marker is of "
-           "another size";
+           "is: more of the poses are wrong, or further off, than is told, its marker is of "
+           "another size, or something moves it that is no signal";
   if (tried.is_by_chance)
     return "commands of other times explain its motion nearly as well: record for longer, and "
            "check that each action is of the time of its poses";
@@ -137,7 +143,8 @@ std::string why_refused(int part, const LearnedStructure& structure, const Refus
           return "it hangs on part " + std::to_string(end) + ", which is not connected";
       continue;
     }
-    const std::set<int> signals = signal_set(m.model);
+    std::set<int> signals = signal_set(m.model);
+    signals.insert(m.soft_signals.begin(), m.soft_signals.end());
     const std::string model =
         (signals.empty() ? "a rigid edge" : "a model with " + names_of(signals, structure)) +
         " to part " + std::to_string(m.part_i + m.part_j - part);
@@ -149,10 +156,14 @@ std::string why_refused(int part, const LearnedStructure& structure, const Refus
                " is right at most commands and wrong at others that lie together: the body meets a "
                "stop there, or the command is bent more steeply than its samples tell: give more "
                "of them there, or leave those out";
+      case Refusal::kWrongAtAnEnd:
+        return model +
+               " is right but for the first or the last samples, one after the other: a marker, or "
+               "what bears it, was moved meanwhile: learn from samples of before or of after it";
       case Refusal::kContradicted:
         return model +
-               " holds where both are seen, and not where other parts tell where they are: show "
-               "them together more often";
+               " is contradicted by what the other parts tell of it at most samples: show the two "
+               "together more often";
     }
   }
   return "";

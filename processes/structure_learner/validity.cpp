@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <numeric>
 
 #include "common/estimation/quantile.h"
 #include "processes/structure_learner/serial_correlation.h"
@@ -215,6 +216,38 @@ bool is_improbable_by_chance(const Fit& fit, const PairData& pair, const Normali
 
 }  // namespace
 
+bool is_wrong_at_some_commands(const std::vector<int>& signals, const std::vector<int>& samples,
+                               const std::vector<bool>& outlying,
+                               const NormalizedActions& actions) {
+  constexpr double kLeastChance = 1e-4;
+  if (actions.blocks().is_stream()) return false;
+  const auto n = static_cast<double>(samples.size());
+  const double share = static_cast<double>(std::count(outlying.begin(), outlying.end(), true)) / n;
+  std::vector<std::size_t> order(samples.size());
+  for (const int signal : signals) {
+    std::iota(order.begin(), order.end(), 0);
+    std::stable_sort(order.begin(), order.end(), [&](std::size_t a, std::size_t b) {
+      return actions(samples[a], signal) < actions(samples[b], signal);
+    });
+    int run = 0, longest = 0;
+    for (const std::size_t t : order) longest = std::max(longest, run = outlying[t] ? run + 1 : 0);
+    if (n * std::pow(share, longest) < kLeastChance) return true;
+  }
+  return false;
+}
+
+bool is_wrong_at_some_commands(const std::vector<int>& signals, const PairData& pair,
+                               const std::vector<double>& squared_distance,
+                               const NormalizedActions& actions) {
+  std::vector<int> samples;
+  std::vector<bool> outlying;
+  for (int t = 0; t < pair.size(); ++t) {
+    samples.push_back(pair.frames[t].sample);
+    outlying.push_back(squared_distance[t] > outlier_threshold(pair.num_residuals()));
+  }
+  return is_wrong_at_some_commands(signals, samples, outlying, actions);
+}
+
 double largest_inlier_mean(double num_inliers, double sigmas, int num_residuals) {
   static const ChiSquareMoments of_pose = chi_square_below(outlier_threshold(6), 6),
                                 of_position = chi_square_below(outlier_threshold(3), 3);
@@ -257,6 +290,10 @@ Validity check_validity(const Fit& fit, const LeaveOneOut& loo, const PairData& 
   const double correlation = serial_correlation(fit, pair, actions);
   const double largest_mean = largest_mean_of(dof, num_residuals, correlation, options);
   if (result.mean_inlier > largest_mean) return result;
+  std::vector<int> signals;
+  for (const LocalModel::Joint& joint : fit.model.joints) signals.push_back(joint.signal);
+  if (!options.lenient && is_wrong_at_some_commands(signals, pair, loo.squared_distance, actions))
+    return result;
   result.has_far_outliers = suspicious && outliers.are_far;
   if (suspicious && (n >= kFewFrames || 2 * result.num_outliers > n)) {
     // So many wild readings say nothing against it, nor for it. (By chance a wrong model has fewer

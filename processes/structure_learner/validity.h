@@ -1,5 +1,7 @@
 #pragma once
 
+#include <vector>
+
 #include "common/estimation/chi_square.h"
 #include "processes/structure_learner/local_model.h"
 
@@ -44,8 +46,9 @@ struct Validity {
 /// residuals, which any flexible model makes small):
 ///
 /// V1, no more left than noise: the outliers' number is below the 99.97 % binomial bound for the
-/// known outlier rate (a robot has many edges, all of which must pass) and below 35 %, the fit has
-/// degrees of freedom left, and the mean inlier d² lies within its sampling error.
+/// known outlier rate (a robot has many edges, all of which must pass) and below 35 %, they do not
+/// stand together at some commands, the fit has degrees of freedom left, and the mean inlier d²
+/// lies within its sampling error.
 ///
 /// V2, nothing left to explain: for every moving signal g outside Q the whitened residuals are
 /// regressed on q_g times a basis over Q; the explained sum of squares must stay within χ². This
@@ -58,6 +61,17 @@ struct Validity {
 /// candidates and ν is below twice the number of parameters.
 Validity check_validity(const Fit& fit, const LeaveOneOut& loo, const PairData& pair,
                         const NormalizedActions& actions, const ValidityOptions& options);
+
+/// Whether so many outliers stand one after the other in the order of one of a model's signals that
+/// chance does not explain it: there the model is wrong, and not its poses. `outlying`: by sample
+/// of `samples`. False in a stream, where outliers last.
+bool is_wrong_at_some_commands(const std::vector<int>& signals, const std::vector<int>& samples,
+                               const std::vector<bool>& outlying,
+                               const NormalizedActions& actions);
+/// `squared_distance`: by frame of the pair.
+bool is_wrong_at_some_commands(const std::vector<int>& signals, const PairData& pair,
+                               const std::vector<double>& squared_distance,
+                               const NormalizedActions& actions);
 
 /// Expected share of frames of a pair with an outlier among its two markers.
 double pair_outlier_rate(const ValidityOptions& options);

@@ -158,5 +158,23 @@ TEST(IsWrongAtSomeCommands, WhereOutliersStandTogetherAndNotWhereTheyAreScattere
   EXPECT_FALSE(is_wrong_at_some_commands(fitted, actions));
 }
 
+TEST(IsWrongAtAnEnd, WhereOutliersFollowOneAnotherThereAndNotElsewhere) {
+  const auto is_wrong = [](auto is_outlier) {
+    FittedEdge fitted;
+    for (int t = 0; t < 100; ++t) {
+      fitted.frames.push_back(t);
+      fitted.outlying.push_back(is_outlier(t));
+    }
+    return is_wrong_at_an_end(fitted, TimeBlocks());
+  };
+  EXPECT_TRUE(is_wrong([](int t) { return t >= 97; }));
+  EXPECT_TRUE(is_wrong([](int t) { return t < 3; }));
+  EXPECT_TRUE(is_wrong([](int t) { return t % 5 == 0 || t > 90; }));
+  EXPECT_FALSE(is_wrong([](int t) { return t >= 98; }));
+  EXPECT_FALSE(is_wrong([](int t) { return t >= 60 && t < 75; }));
+  EXPECT_FALSE(is_wrong([](int t) { return t % 3 == 0 || t > 95; }));
+  EXPECT_FALSE(is_wrong([](int) { return false; }));
+}
+
 }  // namespace
 }  // namespace bodyschema

@@ -151,6 +151,20 @@ TEST(LocalModel, TheFitTakesTheLikelierReadingOfAPlanarMarker) {
   for (const FrameFit& frame : fit.frames) EXPECT_LT(frame.squared_distance, 1e-6);
 }
 
+TEST(NormalizedActions, TellWhichSignalsMoveAlike) {
+  for (const double gain : {0.0, 2.0, -180.0}) {
+    Rng rng(3);
+    auto samples = random_actions(40, rng);
+    for (auto& s : samples)
+      if (gain != 0) s.action(1) = 7 + gain * s.action(0) + test::uniform(rng, -0.01, 0.01);
+    const auto alike = NormalizedActions(samples, 2).alike();
+    EXPECT_EQ(alike.has_value(), gain != 0) << gain;
+    if (alike) EXPECT_EQ(*alike, std::pair(0, 1));
+    samples.resize(9);
+    EXPECT_FALSE(NormalizedActions(samples, 2).alike());
+  }
+}
+
 TEST(NormalizedActions, ConstantSignalsDoNotMove) {
   Rng rng(7);
   auto samples = random_actions(5, rng);
