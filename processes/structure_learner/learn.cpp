@@ -65,6 +65,7 @@ SearchOptions search_options_of(const LearnOptions& options) {
   result.max_signals = options.max_signals;
   result.validity.outlier_rate = options.measurement.outlier_rate;
   result.measurement = options.measurement;
+  result.unconnectable = options.unconnectable;
   return result;
 }
 
@@ -108,7 +109,7 @@ LearnResult fit_tree(const LearnedStructure& structure,
   if (options.measurement.noise || has_covariances(samples)) told.scale = options.measurement.scale;
   const EdgeData data{moved, actions, measurement, told, structure.options.validity};
   std::vector<FittedEdge> fitted;
-  Refusals refused;
+  Refusals& refused = result.refused;
   visit_outwards(ends_of(search.models), schema, [&](int edge, int from, int to) {
     AcceptedModel start = search.models[static_cast<std::size_t>(edge)];
     start.model = rescaled(start.model, structure.actions, actions);
@@ -471,7 +472,14 @@ LearnResult relearn(const LearnedStructure& structure, const std::vector<ActionP
 
 LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPoseSample>& samples,
                   const LearnOptions& options) {
-  return fit_structure(find_structure(signals, samples, options), samples, options);
+  LearnResult result = fit_structure(find_structure(signals, samples, options), samples, options);
+  // What all parts together refuse two of them may hide: an edge that is right.
+  LearnOptions others = options;
+  for (const auto& [ends, why] : result.refused)
+    if (why != Refusal::kWrongAtAnEnd) others.unconnectable.insert(ends);
+  if (others.unconnectable == options.unconnectable) return result;
+  LearnResult other = fit_structure(find_structure(signals, samples, others), samples, others);
+  return other.schema.edges.size() > result.schema.edges.size() ? other : result;
 }
 
 }  // namespace bodyschema

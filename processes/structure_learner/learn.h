@@ -2,12 +2,15 @@
 
 #include <map>
 #include <optional>
+#include <set>
+#include <utility>
 #include <vector>
 
 #include "common/geometry/angle.h"
 #include "common/schema/body_schema.h"
 #include "common/schema/sample.h"
 #include "processes/structure_learner/command_lag.h"
+#include "processes/structure_learner/edge_fit.h"
 #include "processes/structure_learner/noise_estimate.h"
 #include "processes/structure_learner/outlier_attribution.h"
 #include "processes/structure_learner/positions/position_leaves.h"
@@ -33,11 +36,14 @@ struct LearnOptions {
   /// A monitor tells what changed, and since when. Else an edge whose first or last samples are
   /// elsewhere is not valid: is_wrong_at_an_end().
   bool is_monitored = false;
+  /// Parts between which there is no edge, the lower first: of these others say more.
+  std::set<std::pair<int, int>> unconnectable = {};
 };
 
 struct LearnResult {
   BodySchema schema;
   std::vector<Outlier> outliers;  ///< ascending by sample, then part
+  Refusals refused;               ///< edges that the search accepted
   NoiseSource noise_source = NoiseSource::kAssumed;
   bool is_one_cluster = false;  ///< see one_cluster.h
   /// Of poses at rest: what the joint fit leaves has this correlation from one sample to the next.

@@ -56,7 +56,14 @@ std::optional<Noise> noise_in_common(const BodySchema& schema,
                                      const std::vector<ActionPoseSample>& displaced) {
   std::vector<Residuals> residuals;
   for (const Edge& edge : schema.edges) residuals.push_back(residuals_of(edge, displaced));
-  Noise squares;
+  // Of the products, x and y being off by the same.
+  struct Sums {
+    double once = 0, squared = 0;
+    void add(double product) {
+      once += product;
+      squared += product * product;
+    }
+  } position, rotation;
   int count = 0;
   for (std::size_t a = 0; a < residuals.size(); ++a)
     for (std::size_t b = a + 1; b < residuals.size(); ++b)
@@ -69,17 +76,19 @@ std::optional<Noise> noise_in_common(const BodySchema& schema,
           const Vector6d x = ends_there ? of_a->at_to : of_a->at_from;
           const Vector6d y = schema.edges[b].to == part ? of_b->at_to : of_b->at_from;
           const double share = residuals[a].share * residuals[b].share;
-          squares.position_m += x.head<3>().dot(y.head<3>()) / share;
-          squares.rotation_rad += x.tail<3>().dot(y.tail<3>()) / share;
+          position.add(x.head<3>().dot(y.head<3>()) / share);
+          rotation.add(x.tail<3>().dot(y.tail<3>()) / share);
           ++count;
         }
       }
   if (count < kFewest) return std::nullopt;
-  const auto deviation = [count](double sum, double least) {
-    return std::sqrt(std::max(sum / (3 * count), least * least));
+  // The largest that two standard errors of the mean allow.
+  const auto deviation = [count](const Sums& sums, double least) {
+    const double most = (sums.once + 2 * std::sqrt(sums.squared)) / (3 * count);
+    return std::sqrt(std::max(most, least * least));
   };
-  return Noise{deviation(squares.position_m, kNoiseFloor.position_m),
-               deviation(squares.rotation_rad, kNoiseFloor.rotation_rad)};
+  return Noise{deviation(position, kNoiseFloor.position_m),
+               deviation(rotation, kNoiseFloor.rotation_rad)};
 }
 
 void add_unexplained(const Noise& noise, BodySchema* schema) {

@@ -171,6 +171,9 @@ std::string why_refused(int part, const LearnedStructure& structure, const Refus
 
 std::string why_none_is_valid(const TriedModels& tried, const LearnedStructure& structure,
                               int max_signals) {
+  if (structure.actions.moving().empty())
+    return "no signal moved, and it is not rigid with any connected part: tell the signals that "
+           "move it";
   return "no model with up to " + std::to_string(max_signals) +
          " signals is valid to any connected part" +
          (tried.was_soft_tried ? ", nor any with a Gaussian process beside its joints" : "") +

@@ -29,7 +29,9 @@ PairModels::PairModels(const std::vector<ActionPoseSample>& samples,
     : samples_(samples), actions_(actions), options_(options) {
   for (const int i : parts)
     for (const int j : parts)
-      if (i < j) records_[{i, j}].num_common = count_common(samples, i, j);
+      if (i < j)
+        records_[{i, j}].num_common =
+            options_.unconnectable.contains({i, j}) ? 0 : count_common(samples, i, j);
   const int num_pairs = std::max(1, static_cast<int>(records_.size()));
   max_frames_ = std::clamp(40000 / num_pairs, 60, 80);
   max_motions_ = num_pairs > 200 ? 150 : 300;
@@ -37,8 +39,7 @@ PairModels::PairModels(const std::vector<ActionPoseSample>& samples,
 
 const PairData& PairModels::pair(int part_i, int part_j) {
   const auto [it, is_new] = pairs_.try_emplace({part_i, part_j});
-  if (is_new)
-    it->second = make_pair_data(samples_, part_i, part_j, options_.measurement, max_frames_);
+  if (is_new) it->second = pair_data(part_i, part_j, max_frames_);
   return it->second;
 }
 
@@ -53,7 +54,9 @@ PairData PairModels::part_data(int part) const {
 }
 
 PairData PairModels::pair_data(int part_i, int part_j, int max_frames) const {
-  return make_pair_data(samples_, part_i, part_j, options_.measurement, max_frames);
+  const bool may_be_edge = !options_.unconnectable.contains(std::minmax(part_i, part_j));
+  return make_pair_data(samples_, part_i, part_j, options_.measurement,
+                        may_be_edge ? max_frames : 0);
 }
 
 bool PairModels::rests(int part) {

@@ -24,6 +24,8 @@ struct SearchOptions {
   /// Standard deviation of the bias that every marker may have beside measurement.systematic, at
   /// half range of a signal, in those of the noise of one sight.
   double unknown_bias = 0;
+  /// Between which there is no edge, the lower first.
+  std::set<std::pair<int, int>> unconnectable = {};
 };
 
 /// Signals of two models of which the data do not tell which one it is.

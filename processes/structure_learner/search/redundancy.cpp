@@ -115,9 +115,26 @@ std::optional<Detour> find_detour(const Nodes& nodes, PairModels* pairs, Least&&
   return std::nullopt;
 }
 
-// A node at the end of a chain of three or more joints that turn, while by the rotations at most
-// one signal turns it against another node: one joint between these would do. Positions that say
-// otherwise are wrong in a way of their own, as by a marker of another size than is told.
+// Whether a signal moves the position of node b against a by more than a share of how far it moves
+// b that the size of no marker is off by.
+bool moves_apart(const Nodes& nodes, int a, int b, int signal, PairModels* pairs) {
+  constexpr double kSizeError = 0.1;
+  const NormalizedActions& actions = pairs->actions();
+  double apart = 0, moved = 0;
+  for (int t = 0; t < actions.num_samples(); ++t) {
+    const Motion of_a = motion_of(nodes, a, signal, actions, t);
+    const Motion of_b = motion_of(nodes, b, signal, actions, t);
+    const Vector6d relative = of_b.by_signal - adjoint(of_b.X.inverse() * of_a.X) * of_a.by_signal;
+    const double square = actions(t, signal) * actions(t, signal);
+    apart += square * relative.head<3>().squaredNorm();
+    moved += square * of_b.by_signal.head<3>().squaredNorm();
+  }
+  return apart > kSizeError * kSizeError * moved;
+}
+
+// A node at the end of a chain of three or more joints that turn, while at most one signal turns it
+// against another node or moves it as far as that: one joint between these would do. Positions that
+// say otherwise are wrong in a way of their own, as by a marker of another size than is told.
 std::optional<Detour> find_turned_alike(const Nodes& nodes, PairModels* pairs) {
   const auto turns = [&](int a, int b, int signal) {
     return mean_square_motion(nodes, a, b, signal, pairs, MotionOf::kRotation)
@@ -131,8 +148,9 @@ std::optional<Detour> find_turned_alike(const Nodes& nodes, PairModels* pairs) {
       continue;
     for (int k = 1; k < n; ++k)
       if (k != l && !is_below(nodes, k, l) &&
-          std::ranges::count_if(pairs->actions().moving(), [&](int s) { return turns(k, l, s); }) <=
-              1)
+          std::ranges::count_if(pairs->actions().moving(), [&](int s) {
+            return turns(k, l, s) || moves_apart(nodes, k, l, s, pairs);
+          }) <= 1)
         return Detour{l, *signals.begin()};
   }
   return std::nullopt;
