@@ -1,14 +1,11 @@
 #include "processes/console/hint.h"
 
-#include <fmt/format.h>
 #include <sys/ioctl.h>
 #include <unistd.h>
 
 #include <algorithm>
 #include <cstdlib>
 #include <sstream>
-
-#include "common/text/text.h"
 
 namespace bodyschema {
 

@@ -5,7 +5,6 @@
 #include <algorithm>
 #include <exception>
 #include <functional>
-#include <map>
 #include <optional>
 #include <set>
 #include <stdexcept>

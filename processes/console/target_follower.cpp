@@ -4,12 +4,10 @@
 
 #include <limits>
 #include <tuple>
-#include <utility>
 #include <vector>
 
 #include "processes/console/hint.h"
 #include "processes/console/names.h"
-#include "processes/console/views/json.h"
 
 namespace bodyschema {
 namespace {

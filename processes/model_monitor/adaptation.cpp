@@ -4,7 +4,6 @@
 #include <cmath>
 #include <map>
 #include <stdexcept>
-#include <utility>
 
 #include "common/estimation/chi_square.h"
 #include "common/estimation/quantile.h"

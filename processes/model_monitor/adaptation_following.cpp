@@ -11,7 +11,6 @@
 #include "processes/model_monitor/adaptation.h"
 #include "processes/model_monitor/changes/change_family.h"
 #include "processes/model_monitor/changes/drift.h"
-#include "processes/model_monitor/hypotheses/schema_difference.h"
 
 namespace bodyschema {
 namespace {

@@ -4,7 +4,6 @@
 #include <deque>
 #include <map>
 #include <optional>
-#include <string>
 #include <vector>
 
 #include "bodyschema/finding_t.hpp"

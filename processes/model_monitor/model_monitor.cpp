@@ -1,9 +1,6 @@
 #include "processes/model_monitor/model_monitor.h"
 
 #include <algorithm>
-#include <cmath>
-#include <limits>
-#include <stdexcept>
 #include <utility>
 
 #include "common/bus/convert.h"
@@ -11,7 +8,6 @@
 #include "common/config/calibration_id.h"
 #include "common/config/yaml.h"
 #include "common/estimation/quantile.h"
-#include "common/geometry/angle.h"
 #include "common/kinematics/kinematic_path.h"
 
 namespace bodyschema {

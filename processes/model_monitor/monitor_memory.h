@@ -9,7 +9,6 @@
 #include <vector>
 
 #include "bodyschema/body_schema_t.hpp"
-#include "bodyschema/health_event_t.hpp"
 #include "bodyschema/model_health_t.hpp"
 #include "processes/model_monitor/sample_trail.h"
 

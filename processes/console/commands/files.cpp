@@ -13,7 +13,6 @@
 #include "common/bus/convert.h"
 #include "common/bus/event_log.h"
 #include "common/geometry/angle.h"
-#include "processes/structure_learner/command_lag.h"
 #include "processes/structure_learner/noise_estimate.h"
 
 namespace bodyschema {

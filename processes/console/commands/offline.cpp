@@ -12,7 +12,6 @@
 #include "common/bus/rig_door.h"
 #include "common/config/rig.h"
 #include "common/estimation/evaluation.h"
-#include "common/geometry/angle.h"
 #include "common/text/pose_text.h"
 #include "processes/console/commands/commands.h"
 #include "processes/console/commands/files.h"

@@ -5,7 +5,6 @@
 #include <string>
 #include <vector>
 
-#include "common/geometry/angle.h"
 #include "processes/console/commands/commands.h"
 #include "processes/console/commands/files.h"
 #include "processes/console/views/prediction_view.h"

@@ -21,7 +21,6 @@
 #include "processes/console/views/health_view.h"
 #include "processes/console/views/structure_view.h"
 #include "processes/structure_learner/learn.h"
-#include "processes/structure_learner/recording/recording.h"
 
 namespace bodyschema {
 namespace {

@@ -7,8 +7,6 @@
 #include <cmath>
 #include <stdexcept>
 
-#include "common/geometry/angle.h"
-#include "processes/console/views/structure_view.h"
 #include "processes/controller/reachable_box.h"
 
 namespace bodyschema {

@@ -4,9 +4,8 @@
 #include <map>
 #include <optional>
 
-#include "common/schema/body_schema.h"
+#include "common/estimation/measurement_model.h"
 #include "common/schema/sample.h"
-#include "processes/model_monitor/likelihood/tree_filter.h"
 
 namespace bodyschema {
 

@@ -4,7 +4,6 @@
 #include <Eigen/Eigenvalues>
 #include <algorithm>
 #include <cmath>
-#include <ranges>
 #include <utility>
 
 #include "common/estimation/chi_square.h"
