@@ -48,7 +48,8 @@ action_command_t make_console_command(std::int8_t kind, std::int64_t epoch,
   return command;
 }
 
-TargetFollower::TargetFollower(pose_target_t target, std::int64_t timeout_us, Tolerance tolerance)
+TargetFollower::TargetFollower(pose_target_t target, std::int64_t timeout_us,
+                               SeenTolerance tolerance)
     : target_(std::move(target)), timeout_us_(timeout_us), tolerance_(tolerance) {
   status_.target_id = status_.schema_version = status_.target_part = -1;
   status_.predicted_error_m = status_.observed_error_m = -1;

@@ -27,7 +27,7 @@ struct FaultArguments {
 };
 
 void inject(FaultArguments& arguments) {
-  std::copy(arguments.target_m.begin(), arguments.target_m.end(), arguments.command.target_m);
+  std::ranges::copy(arguments.target_m, arguments.command.target_m);
   fault_command_t& command = arguments.command;
   command.utime = command.epoch = wall_clock_us();
   command.sender = "console";

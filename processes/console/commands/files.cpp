@@ -43,8 +43,8 @@ std::string delay_text(const CommandDelay& delay) {
   std::string text = fmt::format("the poses come {:.3f} s {} their commands", seconds(delay.lag_us),
                                  delay.lag_us < 0 ? "before" : "after");
   if (delay.smear_us != 0)
-    text += fmt::format(", drives follow with a time constant of {:.3f} s",
-                        seconds(delay.smear_us));
+    text +=
+        fmt::format(", drives follow with a time constant of {:.3f} s", seconds(delay.smear_us));
   return text + ": each counts with the command that brought it there";
 }
 

@@ -5,7 +5,6 @@
 #include <iostream>
 #include <list>
 #include <map>
-#include <memory>
 #include <set>
 #include <stdexcept>
 #include <tuple>
@@ -34,8 +33,7 @@ struct LogArguments {
   std::string copy;
 };
 
-/// The channel from which a replay starts: MARKER_POSES, from which the observer makes the samples
-/// again, or SAMPLE.
+/// The channel from which a replay starts: MARKER_POSES or SAMPLE.
 std::string replay_start(const LogSummary& summary, const std::string& file) {
   const auto has = [&](const std::string& channel) {
     const auto found = summary.channels.find(channel);
@@ -77,8 +75,7 @@ void copy_channels(const std::string& file, const std::vector<std::string>& chan
   LogReader reader(file);
   for (std::int64_t i = 0; i < num_good && reader.next(); ++i) {
     const LogEvent& event = reader.event();
-    if (std::count(channels.begin(), channels.end(), event.channel) > 0 &&
-        problem_of(event).empty())
+    if (std::ranges::count(channels, event.channel) > 0 && problem_of(event).empty())
       copy.add(event);
   }
   copy.write(to);
@@ -241,24 +238,23 @@ void run_log(const LogArguments& arguments) {
 }  // namespace
 
 void add_log_command(Arguments console) {
-  const auto arguments = std::make_shared<LogArguments>();
-  Arguments log = console.add_subcommand("log", "What an LCM log holds, and what is wrong with it");
-  log.add_option("FILE", arguments->file, "LCM log").required();
-  log.add_flag("--json", arguments->json, "Print JSON");
-  log.add_flag("--check", arguments->check,
+  auto [log, arguments] =
+      console.add_command("log", "What an LCM log holds, and what is wrong with it", run_log);
+  log.add_option("FILE", arguments.file, "LCM log").required();
+  log.add_flag("--json", arguments.json, "Print JSON");
+  log.add_flag("--check", arguments.check,
                "Fail unless it is whole and every message of ours can be read");
-  log.add_flag("--replay-from", arguments->replay_from,
+  log.add_flag("--replay-from", arguments.replay_from,
                "Print the channel from which a replay can learn: MARKER_POSES or SAMPLE");
-  log.add_option("--rig-of", arguments->rigs,
+  log.add_option("--rig-of", arguments.rigs,
                  "Print the name of the rig in this folder that was recorded")
       .type_name("FOLDER");
-  log.add_option("--thin", arguments->thin,
+  log.add_option("--thin", arguments.thin,
                  "Write a small copy: no images, no ground truth, nothing twice")
       .type_name("FILE");
-  const Argument to = log.add_option("--to", arguments->copy, "Copy to a new log …");
-  log.add_option("--copy", arguments->channels, "… the messages of these channels that can be read")
+  const Argument to = log.add_option("--to", arguments.copy, "Copy to a new log …");
+  log.add_option("--copy", arguments.channels, "… the messages of these channels that can be read")
       .needs(to);
-  log.callback([arguments] { run_log(*arguments); });
 }
 
 }  // namespace bodyschema
