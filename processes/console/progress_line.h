@@ -5,8 +5,7 @@
 
 namespace bodyschema {
 
-/// What a command is at, on stderr: a terminal gets a line that rewrites itself, a file one line
-/// after another.
+/// Progress on stderr: a terminal gets a line that rewrites itself, a file one line after another.
 class ProgressLine {
  public:
   ProgressLine() = default;

@@ -185,7 +185,7 @@ std::set<std::string> RunWatch::silent(const std::set<std::string>& expected,
 
 bool RunWatch::are_listening(const std::set<std::string>& expected, std::int64_t now_us) const {
   if (!silent(expected, now_us).empty()) return false;
-  return std::all_of(expected.begin(), expected.end(), [&](const std::string& name) {
+  return std::ranges::all_of(expected, [&](const std::string& name) {
     return processes_.at(name).info.phase != process_info_t::PHASE_STARTING;
   });
 }

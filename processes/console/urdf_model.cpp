@@ -111,7 +111,7 @@ std::vector<Hop> hops_of(const Edge& edge) {
   }
   if (hops.empty()) hops.emplace_back();
   hops.back().X_before = edge.left * X_JN;
-  std::reverse(hops.begin(), hops.end());
+  std::ranges::reverse(hops);
   return hops;
 }
 
@@ -333,7 +333,7 @@ class Writer {
   void add_idle_signals() {
     for (std::size_t s = 0; s < leaders_.size(); ++s) {
       const auto& open = schema_.undecided_signals;
-      const bool is_open = std::count(open.begin(), open.end(), static_cast<int>(s)) > 0;
+      const bool is_open = std::ranges::count(open, static_cast<int>(s)) > 0;
       if (!leaders_[s])
         remark(fmt::format("{}: moves nothing{}", schema_.signals[s].name,
                            is_open ? ", as far as the samples tell" : ""));

@@ -137,7 +137,7 @@ std::vector<BodyMark> body_marks(const RunRecord& record) {
         if (sample.utime < change.utime) continue;
         std::vector<std::string> added = change.faults;
         std::erase_if(added, [&](const std::string& fault) {
-          return std::find(before.begin(), before.end(), fault) != before.end();
+          return std::ranges::find(before, fault) != before.end();
         });
         add(sample.sample_index, added.empty() ? "repair" : listed(added));
         break;
@@ -196,7 +196,7 @@ std::vector<VersionErrors> version_errors(const std::map<std::int64_t, BodySchem
       }
       if (medians.empty()) continue;
       errors.median_position_m = quantile(medians, 0.5);
-      errors.worst_position_m = *std::max_element(medians.begin(), medians.end());
+      errors.worst_position_m = *std::ranges::max_element(medians);
       result.push_back(errors);
     }
   }
