@@ -86,6 +86,10 @@ class TreeFilter {
     std::vector<int> believed;
   };
   Judgement judge(const Instant& instant, const Alternative& alternative = {}) const;
+  /// That of a sample, without alternatives.
+  double log_likelihood(const ActionPoseSample& sample) const {
+    return judge(prepare(sample)).log_likelihood;
+  }
 
   /// The pose of `node` in its parent (root: in the camera), from the markers on either side of its
   /// edge alone. std::nullopt if a side saw nothing.
@@ -115,17 +119,6 @@ class TreeFilter {
 
 /// log N(ξ; 0, S) in six dimensions; −∞ if S is not positive definite.
 double log_normal_density(const Vector6d& xi, const Matrix6d& S);
-
-/// log [(1 − ρ) N(ξ; 0, S) + ρ g(ξ)] of a marker's pose `X_CB` under a belief `X` with S = P + Σ_y;
-/// `marker_covariance` is Σ_y; half of g is where the marker was `misread` before, in its part's
-/// frame. Sets whether the marker is to be believed.
-double log_marker_density(const Pose& X, const Pose& X_CB, const Matrix6d& S,
-                          const Matrix6d& marker_covariance, double outlier_rate,
-                          const std::vector<Pose>& misread, bool* is_inlier,
-                          double* squared_distance);
-/// log g alone.
-double log_outlier_density(const Pose& X, const Pose& X_CB, const Matrix6d& S,
-                           const Matrix6d& marker_covariance);
 
 /// Density of a pose anywhere in the room: 1/(8π² V), V = 8 m³.
 double log_flat_density();
