@@ -27,11 +27,10 @@ std::vector<VisibilityWatch::Finding> VisibilityWatch::look(const std::vector<in
     for (const auto* observations : {&seen.parts, &seen.contradictions})
       for (const PartObservation& o : *observations)
         if (o.part == part)
-          std::copy_if(o.tags.begin(), o.tags.end(), std::inserter(tags, tags.end()),
-                       [&](int tag) { return !moved.is_lying(tag); });
-    const bool is_seen = used.find(part) || std::any_of(tags.begin(), tags.end(), [&](int tag) {
-                           return moved.has_moved(tag);
-                         });
+          std::ranges::copy_if(o.tags, std::inserter(tags, tags.end()),
+                               [&](int tag) { return !moved.is_lying(tag); });
+    const bool is_seen =
+        used.find(part) || std::ranges::any_of(tags, [&](int tag) { return moved.has_moved(tag); });
     count(part, kAnyTag, is_seen, &findings);
     // An arm that holds still or is led shows one side of its parts for as long.
     if (!is_seen || seen.purpose == Purpose::kControl) continue;
