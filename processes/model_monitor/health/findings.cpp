@@ -66,10 +66,6 @@ Finding* Findings::newest(const AdaptationEvent& event, State state) {
   return it == findings_.rend() ? nullptr : &*it;
 }
 
-void Findings::erase(const AdaptationEvent& event) {
-  std::erase_if(findings_, [&](const Finding& finding) { return finding.is_at(event); });
-}
-
 void Findings::update(const Adaptation& adaptation, const std::vector<AdaptationEvent>& events,
                       std::int64_t sample_index) {
   for (Finding& finding : findings_) {
@@ -138,7 +134,7 @@ void Findings::hear(const Adaptation& adaptation, const AdaptationEvent& event) 
       }
       break;
     case Kind::kRestored:
-      erase(event);
+      std::erase_if(findings_, [&](const Finding& known) { return known.is_at(event); });
       if (is_aside || event.is_normal) break;
       // Another body of before: what that was is not in the event.
       tell_difference(adaptation, &finding);

@@ -49,7 +49,6 @@ class Findings {
 
  private:
   Finding* newest(const AdaptationEvent& event, Finding::State state);
-  void erase(const AdaptationEvent& event);
   void hear(const Adaptation& adaptation, const AdaptationEvent& event);
   /// What is known at the event's place in this state.
   void forget(const AdaptationEvent& event, Finding::State state);

@@ -5,6 +5,7 @@
 #include <cmath>
 #include <limits>
 #include <memory>
+#include <span>
 
 #include "processes/model_monitor/likelihood/tree_filter.h"
 
@@ -92,18 +93,11 @@ class ProcessFit {
         cells.push_back(std::move(cell));
       }
     };
-    Eigen::VectorXd lengths(half_.size());
-    for (const double first : kLengths) {
-      lengths(0) = first * half_(0);
-      if (half_.size() == 1) {
-        try_lengths(lengths);
-        continue;
-      }
-      for (const double second : kLengths) {
-        lengths(1) = second * half_(1);
-        try_lengths(lengths);
-      }
-    }
+    const std::span seconds =
+        std::span(kLengths).first(half_.size() == 1 ? 1 : std::size(kLengths));
+    for (const double first : kLengths)
+      for (const double second : seconds)
+        try_lengths(half_.cwiseProduct(Eigen::Vector2d(first, second).head(half_.size())));
     // Among cells about as likely, the one least sure of itself where no sample is.
     cell_ = *std::ranges::max_element(cells, [&](const Cell& a, const Cell& b) {
       return std::pair(a.log_likelihood > best - kAsLikely, a.doubt()) <

@@ -212,7 +212,7 @@ class TreeFilter::Walk {
       behind_cut(0);
       return;
     }
-    Belief belief = descend({Pose::Identity(), Matrix6d::Zero()}, 0);
+    Belief belief = descend({}, 0);
     subtree(0, &belief);
   }
 
