@@ -133,10 +133,9 @@ class Check {
       add_problem("signals.yaml", "signals", "expected one action signal or more");
     if (parts.size() < 2) add_problem("markers.yaml", "tags", "expected tags on two parts or more");
     const int end_effector = rig_.signals->end_effector_part;
-    if (!has_tag(end_effector)) {
+    if (!has_tag(end_effector))
       add_problem("signals.yaml", "end_effector_part",
                   fmt::format("part {} has no tag in markers.yaml", end_effector));
-    }
     if (!rig_.signals->root_part) return;
     const int root = *rig_.signals->root_part;
     if (!has_tag(root))

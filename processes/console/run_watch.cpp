@@ -202,10 +202,9 @@ std::int64_t RunWatch::counter(const std::string& process, const std::string& co
 std::string RunWatch::diagnosis(const std::set<std::string>& expected, std::int64_t now_us) const {
   const std::set<std::string> silent_ones = silent(expected, now_us);
   std::string text;
-  for (const std::string& name : expected) {
+  for (const std::string& name : expected)
     text += fmt::format("  {:<18} {}\n", name,
                         silent_ones.count(name) ? "is silent" : processes_.at(name).info.activity);
-  }
   return text;
 }
 

@@ -125,10 +125,9 @@ pose_target_t TargetFollower::withdrawal() const {
 }
 
 std::string TargetFollower::progress() const {
-  if (!is_acknowledged_) {
+  if (!is_acknowledged_)
     return has_controller_ ? "waiting for the controller to take up the target"
                            : "waiting for the controller";
-  }
   return fmt::format("{} · {} · {}", name_in(kControlStates, status_.control_state),
                      course_text(status_), status_.why);
 }

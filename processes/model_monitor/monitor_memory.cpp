@@ -24,9 +24,8 @@ std::string text_of(const MonitorMemory& memory, const std::vector<SampleMark>& 
   add(kModelHealth, memory.at_base);
   add(kModelHealth, memory.verdicts);
   std::string lines;
-  for (const SampleMark& mark : marks) {
+  for (const SampleMark& mark : marks)
     lines += fmt::format("{} {:08x}\n", mark.sample_index, mark.checksum);
-  }
   const auto* bytes = reinterpret_cast<const std::uint8_t*>(lines.data());
   const auto event =
       encode_event(kMarksChannel, {bytes, lines.size()}, memory.verdicts.utime, number);

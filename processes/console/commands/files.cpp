@@ -77,14 +77,12 @@ Noise noise_given(const std::vector<double>& numbers) {
   for (const double number : numbers)
     if (!std::isfinite(number) || number <= 0) refuse("expected two standard deviations above 0");
   const Noise noise{numbers[0], numbers[1] * kDegree};
-  if (noise.position_m > kNoiseCeiling.position_m) {
+  if (noise.position_m > kNoiseCeiling.position_m)
     refuse(fmt::format("{} m is no noise of a marker; did you mean: --noise {} {}", numbers[0],
                        numbers[0] / 1000, numbers[1]));
-  }
-  if (noise.rotation_rad > kNoiseCeiling.rotation_rad) {
+  if (noise.rotation_rad > kNoiseCeiling.rotation_rad)
     refuse(fmt::format("{} degrees are no noise of a marker; at most {:.0f} are", numbers[1],
                        kNoiseCeiling.rotation_rad / kDegree));
-  }
   if (looks_like_radians(noise))
     std::cerr << fmt::format("bodyschema: --noise {} {} looks like radians; expected degrees\n",
                              numbers[0], numbers[1]);

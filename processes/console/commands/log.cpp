@@ -128,10 +128,9 @@ std::filesystem::path rig_of(const std::filesystem::path& log, const std::filesy
   }
   if (num_judged == 0)
     throw std::runtime_error(log.string() + ": says nothing of its rig; type --rig RIG");
-  if (candidates.empty()) {
+  if (candidates.empty())
     throw std::runtime_error(fmt::format("{}: of none of the rigs in {}; type --rig RIG{}",
                                          log.string(), rigs.string(), against));
-  }
   if (candidates.size() > 1) {
     const std::string names =
         listed(candidates, [](const Candidate& one) { return one.folder.filename().string(); });
@@ -147,13 +146,12 @@ Json log_json(const LogSummary& summary) {
                {"bytes", summary.file_bytes},        {"unread_bytes", summary.unread_bytes},
                {"damage", summary.damage},           {"unreadable", summary.unreadable()},
                {"versions", summary.versions},       {"channels", Json::object()}};
-  for (const auto& [name, channel] : summary.channels) {
+  for (const auto& [name, channel] : summary.channels)
     json["channels"][name] = {
         {"events", channel.events},         {"bytes", channel.bytes},
         {"known", channel.is_known},        {"unreadable", channel.unreadable},
         {"problem", channel.first_problem}, {"first_utime", channel.first_utime},
         {"last_utime", channel.last_utime}};
-  }
   return json;
 }
 
@@ -167,14 +165,13 @@ std::string log_text(const LogSummary& summary) {
                         static_cast<double>(summary.file_bytes) * 1e-6);
     text += "  channel            events  unreadable       kB   first    last\n";
   }
-  for (const auto& [name, channel] : summary.channels) {
+  for (const auto& [name, channel] : summary.channels)
     text +=
         fmt::format("  {:<18} {:>6}  {:>10} {:>8.0f} {:>6.1f}s {:>6.1f}s\n", name, channel.events,
                     channel.is_known ? std::to_string(channel.unreadable) : "not ours",
                     static_cast<double>(channel.bytes) * 1e-3,
                     seconds(channel.first_utime - summary.first_utime),
                     seconds(channel.last_utime - summary.first_utime));
-  }
   const std::string flaws = flaws_text(summary);
   return text + (flaws.empty() ? "whole, and every message can be read\n" : flaws);
 }

@@ -88,10 +88,9 @@ std::string ModelMonitor::objection(BodySchema* proposal, const Standing& standi
     edge.state = edge_test.num_tests > 0 ? EdgeState::kOk : EdgeState::kProvisional;
     // One refuting test may be an outlier however small the share that is tolerated.
     const double tolerated = std::max(1.0, config_.max_outlier_share * edge_test.num_tests);
-    if (edge_test.num_refuting > tolerated) {
+    if (edge_test.num_refuting > tolerated)
       objection = fmt::format("edge {}-{} refuted by {} of {} tests", edge.from, edge.to,
                               edge_test.num_refuting, edge_test.num_tests);
-    }
   }
   const BodySchema* previous = standing.schema();
   if (objection.empty() && !*was_tested) objection = "no test sample yet";

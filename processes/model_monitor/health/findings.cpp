@@ -68,10 +68,9 @@ Finding* Findings::newest(const AdaptationEvent& event, State state) {
 
 void Findings::update(const Adaptation& adaptation, const std::vector<AdaptationEvent>& events,
                       std::int64_t sample_index) {
-  for (Finding& finding : findings_) {
+  for (Finding& finding : findings_)
     finding.num_confirming +=
         finding.state == State::kConfirmed && state_at(adaptation, finding) == EdgeState::kOk;
-  }
   for (const AdaptationEvent& event : events) hear(adaptation, event);
   agree_with(adaptation, sample_index);
   if (findings_.size() > kMost)
