@@ -86,8 +86,7 @@ class ModelMonitor {
  public:
   explicit ModelMonitor(ModelMonitorConfig config);
 
-  /// What an earlier run of this process remembered, before the samples are gone through again: the
-  /// state after them is then as if nothing had happened.
+  /// Before the samples are gone through again: the state after them is as if there was no restart.
   void restore(const MonitorMemory& memory);
   /// Begins with a schema of this run whose memory was lost: it holds for the samples after its
   /// last. Of another run's, or an engineered one, last_sample_index must be −1.
@@ -158,8 +157,8 @@ class ModelMonitor {
   /// `standing` one sample later. Verdicts that a restart remembers are spoken again.
   void advance(Standing* standing, const ActionPoseSample& sample) const;
   Standing standing_after(std::int64_t sample_index) const;
-  /// Everything from a state on that is final: that after a judged sample. `is_changed`: the
-  /// verdict made it another than it was, so that later samples are gone through again.
+  /// From the state after a judged sample, which is final. `is_changed`, by the verdict: later
+  /// samples are gone through again.
   void go_on_from(Standing standing, bool is_changed);
   void keep(const Standing& standing);
   std::shared_ptr<const LiveSchema> begin(BodySchema base, std::vector<BodySchema> history,
@@ -173,16 +172,14 @@ class ModelMonitor {
   /// Those whose samples, and whose refinement, are there. Returns true if there were any.
   bool judge_waiting();
   bool waits_for_refiner(const body_schema_t& proposal);
-  /// Those whose samples are there, and which were asked for: a forged one displaces none. Returns
-  /// true if there were any.
+  /// Those whose samples are there, and which were asked for. Returns true if there were any.
   bool take_answers();
   /// The wanted actions are of the same body.
   bool are_wanted_for(const BodySchema& schema) const;
   static std::int64_t body_since(const BodySchema& proposal);
   /// The proposal, or the refiner's answer to it if that predicts corners better.
   BodySchema better_one(BodySchema learned) const;
-  /// A refined schema stands against a proposal that shows no part that it lacks and does not
-  /// predict corners better.
+  /// The proposal shows no part that the refined schema lacks, nor predicts corners better.
   bool is_defended(const BodySchema& refined, const BodySchema& proposal) const;
   /// Those of the parts of both, in the TEST samples of the body of `schema`, up to `last`.
   bool predicts_corners_better(const BodySchema& schema, const BodySchema& other,

@@ -14,8 +14,7 @@
 
 namespace bodyschema {
 
-/// What the monitor cannot find again from the samples: which of the learner's proposals became the
-/// body schema, the schemas before it, and what was decided on others.
+/// What the monitor cannot find again from the samples: accepted proposals and other verdicts.
 struct MonitorMemory {
   /// Of the history, oldest first; the last one is the base, that the samples after its
   /// last_sample_index changed since. Empty before the first accepted proposal.

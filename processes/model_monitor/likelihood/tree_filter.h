@@ -37,11 +37,10 @@ struct VirtualMeasurement {
 /// starts at the root with X_CR and goes outwards: X ← X·Δ_e(q), P ← F P Fᵀ + Σ_e(q) with F =
 /// Ad(Δ⁻¹) and Σ_e = model_covariance(). A visible marker y has the density
 ///   (1 − ρ) N(ξ; 0, S) + ρ g(ξ),   ξ = log(X⁻¹ y), S = P + Σ_y,
-/// with an outlier density g that is shaped as the outliers of planar markers are: flips, tilts of
-/// unknown direction, wide errors and a floor. (A uniform g makes every flip of a leaf's marker
-/// speak for a broken edge.) Where a marker was misread before it is expected again
-/// (MeasurementModel::misread). A second reading of a planar marker counts as one in ten. Where the
-/// first term is the larger one the marker corrects the belief.
+/// with an outlier density g shaped as the outliers of planar markers are: flips, tilts of unknown
+/// direction, wide errors and a floor. (With a uniform g every flip of a leaf's marker would speak
+/// for a broken edge.) Misreadings are expected again (MeasurementModel::misread). A second reading
+/// counts as one in ten. Where the first term is the larger one the marker corrects the belief.
 /// What a branch learns goes back to its parent by the smoother's gain P Fᵀ P_child⁻¹, so that
 /// siblings profit from each other.
 class TreeFilter {
