@@ -1,7 +1,9 @@
 #pragma once
 
 #include <functional>
+#include <memory>
 #include <string>
+#include <utility>
 #include <vector>
 
 namespace CLI {
@@ -49,6 +51,15 @@ class Arguments {
   Argument add_flag(const std::string& name, bool& value, const std::string& help);
 
   Arguments add_subcommand(const std::string& name, const std::string& help);
+  /// A subcommand that runs `run`, and what that gets: its options are to be stored in it.
+  template <class Given>
+  std::pair<Arguments, Given&> add_command(const std::string& name, const std::string& help,
+                                           void (*run)(const Given&)) {
+    const auto given = std::make_shared<Given>();
+    Arguments command = add_subcommand(name, help);
+    command.callback([given, run] { run(*given); });
+    return {command, *given};
+  }
   Arguments& require_subcommand(int count);
   /// Options of the command above may come last.
   Arguments& fallthrough();

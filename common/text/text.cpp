@@ -1,6 +1,9 @@
 #include "common/text/text.h"
 
 #include <algorithm>
+#include <fstream>
+#include <sstream>
+#include <stdexcept>
 
 namespace bodyschema {
 namespace {
@@ -79,6 +82,14 @@ std::string fit(const std::string& text, int width) {
     i += size;
   }
   return line;
+}
+
+std::string read_file(const std::filesystem::path& file) {
+  std::ifstream stream(file);
+  std::ostringstream text;
+  text << stream.rdbuf();
+  if (!stream) throw std::runtime_error(file.string() + ": cannot be read");
+  return text.str();
 }
 
 }  // namespace bodyschema

@@ -1,6 +1,7 @@
 #pragma once
 
 #include <cstdint>
+#include <filesystem>
 #include <string>
 #include <string_view>
 
@@ -21,6 +22,9 @@ std::string fit(const std::string& text, int width);
 
 /// `text` for an error: fit() for 41 characters, with "?" for what is not UTF-8.
 std::string abbreviated(std::string_view text);
+
+/// The bytes of a file. @throws std::runtime_error if it cannot be read.
+std::string read_file(const std::filesystem::path& file);
 
 // Texts for people.
 

@@ -2,13 +2,12 @@
 
 #include <fmt/format.h>
 
-#include <fstream>
 #include <optional>
-#include <sstream>
 #include <stdexcept>
 
 #include "common/bus/channels.h"
 #include "common/bus/event_log.h"
+#include "common/text/text.h"
 #include "processes/console/hint.h"
 #include "processes/console/views/adoption_view.h"
 
@@ -16,14 +15,6 @@ namespace bodyschema {
 namespace {
 
 using std::filesystem::path;
-
-std::string text_of(const path& file) {
-  std::ifstream stream(file);
-  std::ostringstream text;
-  text << stream.rdbuf();
-  if (!stream) throw std::runtime_error(file.string() + ": cannot be read");
-  return text.str();
-}
 
 /// What RUN/proposed holds of the two files, with the text that was parsed.
 struct Proposal {
@@ -35,11 +26,11 @@ Proposal proposal_of(const path& folder, const RigCalibration& recorded) {
   const path markers = folder / "markers.yaml", camera = folder / "camera_info.yaml";
   Proposal proposal{{}, {}, recorded};
   if (std::filesystem::exists(markers)) {
-    proposal.markers_text = text_of(markers);
+    proposal.markers_text = read_file(markers);
     proposal.calibration.markers = load_markers(folder);
   }
   if (std::filesystem::exists(camera)) {
-    proposal.camera_text = text_of(camera);
+    proposal.camera_text = read_file(camera);
     proposal.calibration.camera = load_camera_calibration(camera);
   }
   if (!proposal.markers_text && !proposal.camera_text)
@@ -51,8 +42,8 @@ Proposal proposal_of(const path& folder, const RigCalibration& recorded) {
                             "{}",
                             folder.string()))));
   // A group's refiner may replace them at any time.
-  if ((proposal.markers_text && text_of(markers) != *proposal.markers_text) ||
-      (proposal.camera_text && text_of(camera) != *proposal.camera_text))
+  if ((proposal.markers_text && read_file(markers) != *proposal.markers_text) ||
+      (proposal.camera_text && read_file(camera) != *proposal.camera_text))
     throw std::runtime_error(folder.string() + ": is being written; ask again");
   return proposal;
 }
@@ -132,7 +123,7 @@ Adoption plan_adoption(const path& run, const path& rig) {
 
   const auto add = [&](const path& file, const std::string& after) {
     const path target = std::filesystem::canonical(file);
-    adoption.files.push_back({target, text_of(target), after});
+    adoption.files.push_back({target, read_file(target), after});
   };
   if (!other_tags.empty()) add(rig / "markers.yaml", *proposal.markers_text);
   if (!other_lens.empty()) add(lens_file, *proposal.camera_text);
@@ -141,7 +132,7 @@ Adoption plan_adoption(const path& run, const path& rig) {
 
 void adopt(const Adoption& adoption) {
   for (const Adoption::File& file : adoption.files)
-    if (text_of(file.path) != file.before)
+    if (read_file(file.path) != file.before)
       throw std::runtime_error(file.path.string() +
                                ": was changed in the meantime; nothing was written");
   for (const Adoption::File& file : adoption.files)

@@ -23,11 +23,10 @@ struct Adoption {
 
 /// Reads RUN/proposed (markers.yaml, camera_info.yaml or one of them), RUN/config and a rig, and
 /// compares them by their values.
-/// @throws std::runtime_error for people, with every reason in a line: nothing is proposed; the
-/// proposal has another family of tags, other tags or parts, another image size or model of
-/// distortion than the run; the rig's markers or its camera calibration are neither the run's nor
-/// those proposed (an adoption that was cut short); the run's samples were not seen through
-/// RUN/config; the rig is RUN/config. ConfigError.
+/// @throws std::runtime_error, with every reason in a line: nothing is proposed; the proposal has
+/// another family of tags, other tags or parts, another image size or model of distortion than the
+/// run; the rig's markers or camera calibration are neither the run's nor those proposed; the run's
+/// samples were not seen through RUN/config; the rig is RUN/config. ConfigError.
 Adoption plan_adoption(const std::filesystem::path& run, const std::filesystem::path& rig);
 
 /// Copies the old files beside themselves (kReplacedSuffix), then replaces them, each durably and

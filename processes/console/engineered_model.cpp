@@ -3,7 +3,6 @@
 #include <map>
 #include <set>
 #include <utility>
-#include <vector>
 
 #include "common/config/yaml.h"
 #include "common/estimation/measurement_model.h"

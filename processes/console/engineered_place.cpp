@@ -85,9 +85,8 @@ void place_in_camera(const Recording& recording, BodySchema* schema) {
   schema->calibration_id = recording.samples.front().calibration_id;
   const std::vector<int> alone = parts_without_rotation(recording.samples);
   for (const int part : schema->parts)
-    if (part != schema->root && std::binary_search(alone.begin(), alone.end(), part) &&
-        std::none_of(schema->edges.begin(), schema->edges.end(),
-                     [&](const Edge& edge) { return edge.from == part; }))
+    if (part != schema->root && std::ranges::binary_search(alone, part) &&
+        std::ranges::none_of(schema->edges, [&](const Edge& edge) { return edge.from == part; }))
       schema->position_parts.push_back(part);
   estimate_root_pose(recording.samples, measurement, schema);
   if (!schema->X_CR_covariance.isZero(0)) return;

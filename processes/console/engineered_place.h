@@ -5,11 +5,9 @@
 
 namespace bodyschema {
 
-/// Completes an engineered model by a recording: X_CR, calibration_id and position_parts.
-///
-/// X_CR is the robust mean of the root's poses (estimate_root_pose()). Of a recording that never
-/// shows these, it is where all parts fit what was seen of them best, without a covariance: it
-/// defines the root's frame, and what is off of it is in the edges.
+/// Completes an engineered model by a recording: X_CR, calibration_id and position_parts. X_CR is
+/// the robust mean of the root's poses (estimate_root_pose()); where these are never seen, the best
+/// fit of all parts, without a covariance: it defines the root's frame.
 /// @throws std::runtime_error if the recording does not tell how the camera stands.
 void place_in_camera(const Recording& recording, BodySchema* schema);
 

@@ -14,7 +14,7 @@ GravityLoad::GravityLoad(const std::filesystem::path& urdf, const std::filesyste
                          const std::vector<std::string>& joints)
     : drives_(urdf, Yaml::load(placement)), joints_(joints) {
   const auto& links = drives_.model().links_;
-  if (std::none_of(links.begin(), links.end(), [](const auto& entry) {
+  if (std::ranges::none_of(links, [](const auto& entry) {
         return entry.second->inertial && entry.second->inertial->mass > 0;
       }))
     throw std::runtime_error(urdf.string() + ": no link has a mass");

@@ -1,14 +1,11 @@
 #include "processes/console/hint.h"
 
-#include <fmt/format.h>
 #include <sys/ioctl.h>
 #include <unistd.h>
 
 #include <algorithm>
 #include <cstdlib>
 #include <sstream>
-
-#include "common/text/text.h"
 
 namespace bodyschema {
 
@@ -25,9 +22,8 @@ std::string duration(double s) {
 
 std::string wrap(const std::string& text, int width, int indent) {
   const auto columns = [](const std::string& word) {
-    return static_cast<int>(std::count_if(word.begin(), word.end(), [](char c) {
-      return (static_cast<unsigned char>(c) & 0xC0) != 0x80;
-    }));
+    return static_cast<int>(std::ranges::count_if(
+        word, [](char c) { return (static_cast<unsigned char>(c) & 0xC0) != 0x80; }));
   };
   std::string result, line(static_cast<std::size_t>(indent), ' ');
   bool is_begun = false;

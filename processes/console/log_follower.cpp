@@ -31,10 +31,9 @@ bool LogFollower::read(const std::filesystem::path& file, const Visit& visit) {
         }
         progress.position = reader.position();
       }
-      if (reader.report().truncated_at_byte) {
+      if (reader.report().truncated_at_byte)
         summary.damage =
             fmt::format("is cut off in the middle of an event at byte {}", progress.position);
-      }
     } catch (const std::runtime_error& error) {
       progress.is_damaged = true;
       const std::string& damage = reader.report().damage;

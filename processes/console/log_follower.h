@@ -17,10 +17,9 @@ class LogFollower {
   using Visit = std::function<void(const LogEvent& event, const std::filesystem::path& file,
                                    std::int64_t byte)>;
 
-  /// Reads what `file` got since the last time. A file that is not there yet, or empty, is no
-  /// error; one that is damaged or no log is read up to there and says so in its summary.
-  /// A message in pieces is one event, at the byte of its last piece.
-  /// Returns whether there was a new event.
+  /// Reads what `file` got since the last time; returns whether there was a new event. A file that
+  /// is not there yet, or empty, is no error; one that is damaged or no log is read up to there and
+  /// says so in its summary. A message in pieces is one event, at the byte of its last piece.
   bool read(const std::filesystem::path& file, const Visit& visit);
 
   /// Summaries of what was read so far, by file. A torn event at the end, which may still be

@@ -27,8 +27,8 @@ std::string unknown_command(const CLI::App& console) {
   const CLI::App* app = &console;
   while (!app->get_subcommands().empty()) app = app->get_subcommands().front();
   const std::vector<std::string> rest = app->remaining();
-  const auto word = std::find_if(rest.begin(), rest.end(),
-                                 [](const std::string& text) { return !text.starts_with("-"); });
+  const auto word =
+      std::ranges::find_if(rest, [](const std::string& text) { return !text.starts_with("-"); });
   if (app->get_require_subcommand_min() == 0 || word == rest.end()) return "";
   std::string names;
   for (const CLI::App* command : app->get_subcommands(nullptr)) names += " " + command->get_name();
@@ -49,7 +49,7 @@ std::vector<std::string> words_of(int argc, char** argv) {
     if (word == "--") break;
     if (word.starts_with("-.") && is_number(word)) word.insert(1, "0");
   }
-  std::reverse(words.begin(), words.end());
+  std::ranges::reverse(words);
   return words;
 }
 }  // namespace

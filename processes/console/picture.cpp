@@ -3,7 +3,6 @@
 #include <opencv2/imgcodecs.hpp>
 #include <opencv2/imgproc.hpp>
 #include <stdexcept>
-#include <string>
 #include <vector>
 
 #include "common/bus/convert.h"

@@ -14,7 +14,7 @@ constexpr std::int64_t kOnTerminal_us = 100'000, kInFile_us = 5'000'000;
 
 }  // namespace
 
-bool ProgressLine::is_on_terminal() { return isatty(STDERR_FILENO) == 1; }
+ProgressLine::ProgressLine() : is_terminal_(isatty(STDERR_FILENO) == 1) {}
 
 ProgressLine::~ProgressLine() {
   if (is_terminal_ && !shown_.empty()) std::cerr << "\r\x1b[2K" << std::flush;

@@ -5,11 +5,10 @@
 
 namespace bodyschema {
 
-/// What a command is at, on stderr: a terminal gets a line that rewrites itself, a file one line
-/// after another.
+/// Progress on stderr: a terminal gets a line that rewrites itself, a file one line after another.
 class ProgressLine {
  public:
-  ProgressLine() = default;
+  ProgressLine();
   ProgressLine(const ProgressLine&) = delete;
   ProgressLine& operator=(const ProgressLine&) = delete;
   /// The line is gone from a terminal.
@@ -23,8 +22,7 @@ class ProgressLine {
   void end();
 
  private:
-  const bool is_terminal_ = is_on_terminal();
-  static bool is_on_terminal();
+  const bool is_terminal_;
   std::string shown_;
   std::int64_t shown_us_ = 0;
 };

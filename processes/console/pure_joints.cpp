@@ -60,11 +60,10 @@ class Purification {
       make_pure();
     }
     for (std::size_t s = 0; s < pure_.schema.signals.size(); ++s) straighten(static_cast<int>(s));
-    if (!refusals_.empty()) {
+    if (!refusals_.empty())
       throw std::invalid_argument(
           fmt::format("a URDF has no such joints: {}; --nominal writes the nearest that it has",
                       fmt::join(refusals_, "; ")));
-    }
     return std::move(pure_);
   }
 

@@ -8,8 +8,8 @@
 
 namespace bodyschema {
 
-/// A schema all joints of which are revolute, prismatic or stuck, and in what it differs from the
-/// one that it was made from. For people; names of signals and parts are in the texts.
+/// A schema all joints of which are revolute, prismatic or stuck, and how it differs from the one
+/// that it was made from, for people.
 struct PureJoints {
   BodySchema schema;
   std::vector<std::string> about_signals;

@@ -4,8 +4,9 @@
 
 #include <algorithm>
 #include <exception>
+#include <fstream>
 #include <functional>
-#include <map>
+#include <nlohmann/json.hpp>
 #include <optional>
 #include <set>
 #include <stdexcept>
@@ -15,6 +16,7 @@
 #include "common/config/rig.h"
 #include "common/config/yaml.h"
 #include "common/scene/scene.h"
+#include "common/text/text.h"
 #include "processes/camera/camera.h"
 #include "processes/console/adoption.h"
 #include "processes/controller/controller.h"
@@ -46,8 +48,9 @@ class Check {
   RigCheck run() {
     read_files();
     if (rig_.signals && rig_.markers) check_parts();
-    if (rig_.camera && rig_.observer) check_frames();
-    if (rig_.camera && rig_.markers) check_target_tags();
+    if (is_simulated() && rig_.observer) check_frames(rig_.camera->simulation->frames_per_action);
+    if (is_simulated() && rig_.markers)
+      check_target_tags(rig_.camera->simulation->frames_per_action);
     remark_unread_files();
     if (rig_.signals) result_.num_signals = static_cast<int>(rig_.signals->signals.size());
     if (rig_.markers) {
@@ -63,8 +66,7 @@ class Check {
 
   /// Every problem once: signals.yaml is read by several processes.
   void add_problem(const std::string& problem) {
-    if (std::find(result_.problems.begin(), result_.problems.end(), problem) ==
-        result_.problems.end())
+    if (std::ranges::find(result_.problems, problem) == result_.problems.end())
       result_.problems.push_back(problem);
   }
 
@@ -126,17 +128,14 @@ class Check {
 
   void check_parts() {
     const std::vector<int> parts = rig_.markers->parts();
-    const auto has_tag = [&](int part) {
-      return std::binary_search(parts.begin(), parts.end(), part);
-    };
+    const auto has_tag = [&](int part) { return std::ranges::binary_search(parts, part); };
     if (rig_.signals->signals.empty())
       add_problem("signals.yaml", "signals", "expected one action signal or more");
     if (parts.size() < 2) add_problem("markers.yaml", "tags", "expected tags on two parts or more");
     const int end_effector = rig_.signals->end_effector_part;
-    if (!has_tag(end_effector)) {
+    if (!has_tag(end_effector))
       add_problem("signals.yaml", "end_effector_part",
                   fmt::format("part {} has no tag in markers.yaml", end_effector));
-    }
     if (!rig_.signals->root_part) return;
     const int root = *rig_.signals->root_part;
     if (!has_tag(root))
@@ -148,31 +147,23 @@ class Check {
 
   /// The simulated camera takes frames_per_action images of a rest and then waits for the next
   /// action, which the babbler does not send before the SAMPLE: both would wait for ever.
-  void check_frames() {
-    if (!is_simulated()) return;
-    const int taken = rig_.camera->simulation->frames_per_action;
+  void check_frames(int taken) {
     const int needed = rig_.observer->frames_per_sample;
-    if (taken < needed) {
-      const Yaml yaml = Yaml::load(folder_ / "camera.yaml");
-      add_problem(yaml.section("simulation")
-                      .error("frames_per_action",
-                             fmt::format("{} is below frames_per_sample of observer.yaml, {}: no "
-                                         "sample would be made",
-                                         taken, needed))
-                      .what());
-    }
+    if (taken < needed)
+      add_frames_problem(
+          fmt::format("{} is below frames_per_sample of observer.yaml, {}: no sample would be made",
+                      taken, needed));
   }
 
   /// The controller waits for these frames of a rest.
-  void check_target_tags() {
-    if (!is_simulated() || rig_.markers->target_tags.empty()) return;
-    const int taken = rig_.camera->simulation->frames_per_action;
-    if (taken >= TagTrack::kFrames) return;
-    add_problem(Yaml::load(folder_ / "camera.yaml")
-                    .section("simulation")
-                    .error("frames_per_action",
-                           fmt::format("target tags need {}, not {}", TagTrack::kFrames, taken))
-                    .what());
+  void check_target_tags(int taken) {
+    if (!rig_.markers->target_tags.empty() && taken < TagTrack::kFrames)
+      add_frames_problem(fmt::format("target tags need {}, not {}", TagTrack::kFrames, taken));
+  }
+
+  void add_frames_problem(const std::string& problem) {
+    const Yaml yaml = Yaml::load(folder_ / "camera.yaml");
+    add_problem(yaml.section("simulation").error("frames_per_action", problem).what());
   }
 
   void remark_unread_files() {
@@ -184,7 +175,7 @@ class Check {
                                read_.contains(name.substr(0, name.rfind(kReplacedSuffix)));
       if (!read_.contains(name) && !is_replaced) names.push_back(name);
     }
-    std::sort(names.begin(), names.end());
+    std::ranges::sort(names);
     for (const std::string& name : names) {
       const bool may_be_misspelt = path(name).extension() == ".yaml";
       result_.remarks.push_back((folder_ / name).string() + ": no process reads this file" +
@@ -217,6 +208,13 @@ path rigs_folder() {
        {path("config"), program.parent_path().parent_path().parent_path() / "config"})
     if (std::filesystem::is_directory(folder, none)) return folder;
   return {};
+}
+
+std::string rig_name_of(const path& run) {
+  std::ifstream stream(run / "result.json");
+  const auto result = nlohmann::json::parse(stream, nullptr, false);
+  if (!result.is_object() || !result.contains("rig") || !result["rig"].is_string()) return "";
+  return as_text(result["rig"].get<std::string>());
 }
 
 path find_rig(const std::string& rig) {

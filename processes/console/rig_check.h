@@ -27,6 +27,9 @@ RigCheck check_rig(const std::filesystem::path& folder);
 /// @throws std::runtime_error naming the rigs that there are.
 std::filesystem::path find_rig(const std::string& rig);
 
+/// The name of the rig in result.json of a run; "" where that is not told.
+std::string rig_name_of(const std::filesystem::path& run);
+
 /// The folder whose rigs find_rig() knows by their bare names; empty if there is none.
 std::filesystem::path rigs_folder();
 

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <ranges>
 
 #include "common/bus/channels.h"
 #include "common/bus/convert.h"
@@ -154,9 +155,8 @@ void RunRecord::on_health_event(const health_event_t& event) {
 }
 
 void RunRecord::on_image(std::int64_t utime, const Place& place) {
-  const auto awaited = std::find_if(awaited_.begin(), awaited_.end(), [&](const Picture& picture) {
-    return picture.markers.utime == utime;
-  });
+  const auto awaited = std::ranges::find_if(
+      awaited_, [&](const Picture& picture) { return picture.markers.utime == utime; });
   if (awaited == awaited_.end()) {
     image_places_.insert(utime, place);
     return;
@@ -201,9 +201,8 @@ void RunRecord::on_markers(const marker_poses_t& markers) {
 }
 
 std::vector<health_event_t> RunRecord::events() const {
-  std::vector<health_event_t> result;
-  for (const auto& [key, event] : events_) result.push_back(event);
-  return result;
+  const auto events = std::views::values(events_);
+  return {events.begin(), events.end()};
 }
 
 std::vector<RunRecord::Process> RunRecord::processes() const {

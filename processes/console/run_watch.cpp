@@ -3,7 +3,6 @@
 #include <fmt/format.h>
 
 #include <algorithm>
-#include <cmath>
 #include <iterator>
 #include <span>
 
@@ -186,7 +185,7 @@ std::set<std::string> RunWatch::silent(const std::set<std::string>& expected,
 
 bool RunWatch::are_listening(const std::set<std::string>& expected, std::int64_t now_us) const {
   if (!silent(expected, now_us).empty()) return false;
-  return std::all_of(expected.begin(), expected.end(), [&](const std::string& name) {
+  return std::ranges::all_of(expected, [&](const std::string& name) {
     return processes_.at(name).info.phase != process_info_t::PHASE_STARTING;
   });
 }
@@ -203,10 +202,9 @@ std::int64_t RunWatch::counter(const std::string& process, const std::string& co
 std::string RunWatch::diagnosis(const std::set<std::string>& expected, std::int64_t now_us) const {
   const std::set<std::string> silent_ones = silent(expected, now_us);
   std::string text;
-  for (const std::string& name : expected) {
+  for (const std::string& name : expected)
     text += fmt::format("  {:<18} {}\n", name,
                         silent_ones.count(name) ? "is silent" : processes_.at(name).info.activity);
-  }
   return text;
 }
 

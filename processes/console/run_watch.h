@@ -37,8 +37,7 @@ struct SampleGoal {
 };
 
 /// Follows a learning run from outside and sums it up. It alone compares the schema with the
-/// simulator's truth, and tells nobody. Memory is bounded: of the samples it keeps the retained
-/// set, as the learner does.
+/// simulator's truth. Memory is bounded: it keeps the retained samples, as the learner does.
 class RunWatch {
  public:
   void on_sample(const sample_t& sample);
@@ -67,17 +66,15 @@ class RunWatch {
   bool are_listening(const std::set<std::string>& expected, std::int64_t now_us) const;
   /// The newest count of the process's counter; 0 if it did not.
   std::int64_t counter(const std::string& process, const std::string& counter) const;
-  /// The activity of every process, and which one is silent; for the moment when nothing
-  /// goes on.
+  /// The activity of every process, and which one is silent.
   std::string diagnosis(const std::set<std::string>& expected, std::int64_t now_us) const;
 
   const std::optional<BodySchema>& schema() const { return schema_; }
   const std::optional<model_health_t>& health() const { return health_; }
   /// The retained samples, TEST included.
   std::vector<ActionPoseSample> samples() const;
-  /// The TEST samples among those retained of the ones from `since` on: with the noise-free poses
-  /// of the simulator where there is
-  /// one, else as the camera saw them.
+  /// Of the retained TEST samples those from `since` on: with the simulator's noise-free poses
+  /// where there is one, else as the camera saw them.
   std::vector<ActionPoseSample> held_out(std::int64_t since = 0) const;
   /// First sample of the body as it is now, as far as the monitor knows; 0: it never changed.
   std::int64_t body_since() const;

@@ -4,7 +4,6 @@
 #include <fmt/ranges.h>
 
 #include <algorithm>
-#include <set>
 #include <utility>
 
 #include "common/text/clock.h"
@@ -19,7 +18,7 @@ namespace {
 const char* const kLosses[] = {"malformed", "senseless", "skipped", "refused", "dropped", "lost"};
 
 bool is_loss_on(const std::string& counter, const std::set<std::string>& channels) {
-  return std::any_of(std::begin(kLosses), std::end(kLosses), [&](const std::string& loss) {
+  return std::ranges::any_of(kLosses, [&](const std::string& loss) {
     return counter.starts_with(loss + " ") && channels.contains(counter.substr(loss.size() + 1));
   });
 }
@@ -60,6 +59,15 @@ void StatusBoard::on_message(const process_info_t& info) {
   heard->second.newest = info;
 }
 
+void StatusBoard::on_body_schema(const body_schema_t& schema) {
+  newest_.schema = schema;
+  newest_.is_accepted = true;
+}
+
+void StatusBoard::on_learned_schema(const body_schema_t& schema) {
+  if (!newest_.is_accepted) newest_.schema = schema;
+}
+
 void StatusBoard::on_own_counters(const std::map<std::string, std::int64_t>& counters) {
   for (const auto& [name, count] : counters) own_counters_[name] += count;
 }
@@ -83,7 +91,7 @@ std::vector<std::string> StatusBoard::missing() const {
   for (const std::string& name : expected_) {
     const Heard* heard = find(name);
     if (heard && !heard->has_ended()) continue;
-    if (name == "robot_simulator" && motion_) continue;  // a lab's own driver
+    if (name == "robot_simulator" && newest_.motion) continue;  // a lab's own driver
     names.push_back(name);
   }
   return names;
@@ -145,12 +153,13 @@ std::map<std::string, std::int64_t> StatusBoard::dropped(const std::string& chan
 
 std::string StatusBoard::activity() const {
   const Heard* babbler = find("motor_babbler");
-  if (!motion_) return "Waits for a driver: nobody sends MOTION_STATUS.";
-  if (motion_->stop_latched == 1) return "Halted: nothing moves until `" + to_type("resume") + "`.";
-  if (control_ && control_->owns_arm == 1) {
+  const auto& motion = newest_.motion;
+  const auto& control = newest_.control;
+  if (!motion) return "Waits for a driver: nobody sends MOTION_STATUS.";
+  if (motion->stop_latched == 1) return "Halted: nothing moves until `" + to_type("resume") + "`.";
+  if (control && control->owns_arm == 1)
     return fmt::format("The controller has the arm, {}: {}",
-                       name_in(kControlStates, control_->control_state), control_->why);
-  }
+                       name_in(kControlStates, control->control_state), control->why);
   if (babbler && !babbler->has_ended()) {
     const process_info_t& info = babbler->newest;
     if (info.phase == process_info_t::PHASE_DONE) return "Done: " + info.activity;
@@ -176,7 +185,7 @@ std::string StatusBoard::headline() const {
   // At first all wait for each other, and a controller waits for a target.
   for (const auto& [key, heard] : processes_) {
     const process_info_t& info = heard.newest;
-    if (schema_ && info.phase == process_info_t::PHASE_WAITING &&
+    if (newest_.is_accepted && info.phase == process_info_t::PHASE_WAITING &&
         info.process_name != "motor_babbler" && info.process_name != "controller")
       line += fmt::format(" {} {}{}.", info.process_name,
                           info.activity.starts_with("waits") ? "" : "waits: ", info.activity);
@@ -186,7 +195,7 @@ std::string StatusBoard::headline() const {
 }
 
 GroupStatus StatusBoard::status() const {
-  GroupStatus status;
+  GroupStatus status = newest_;
   status.headline = headline();
   status.missing = missing();
   status.twins = twins();
@@ -214,13 +223,6 @@ GroupStatus StatusBoard::status() const {
         process.other_counters.push_back(counter);
     }
   }
-  status.motion = motion_;
-  status.control = control_;
-  status.sample = sample_;
-  status.sim_state = sim_state_;
-  status.schema = schema_ ? schema_ : proposal_;
-  status.is_accepted = schema_.has_value();
-  status.health = health_;
   return status;
 }
 

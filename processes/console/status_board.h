@@ -41,8 +41,7 @@ struct GroupStatus {
   std::optional<model_health_t> health;
 };
 
-/// Listens to a group for a moment and says how it is. Whole state is repeated at 1 Hz on the bus,
-/// so two seconds show everything.
+/// Listens to a group and says how it is. State is repeated at 1 Hz, so two seconds show all of it.
 class StatusBoard {
  public:
   /// Processes that a group should have; robot_simulator is not missed where another driver
@@ -54,14 +53,14 @@ class StatusBoard {
   /// Any message of the channel arrived.
   void on_arrival(const std::string& channel, std::int64_t now_us);
   void on_message(const process_info_t& info);
-  void on_message(const motion_status_t& status) { motion_ = status; }
-  void on_message(const control_status_t& status) { control_ = status; }
-  void on_message(const sample_t& sample) { sample_ = sample; }
+  void on_message(const motion_status_t& status) { newest_.motion = status; }
+  void on_message(const control_status_t& status) { newest_.control = status; }
+  void on_message(const sample_t& sample) { newest_.sample = sample; }
   /// BODY_SCHEMA; a proposal counts while there is none.
-  void on_body_schema(const body_schema_t& schema) { schema_ = schema; }
-  void on_learned_schema(const body_schema_t& schema) { proposal_ = schema; }
-  void on_message(const model_health_t& health) { health_ = health; }
-  void on_message(const sim_state_t& state) { sim_state_ = state; }
+  void on_body_schema(const body_schema_t& schema);
+  void on_learned_schema(const body_schema_t& schema);
+  void on_message(const model_health_t& health) { newest_.health = health; }
+  void on_message(const sim_state_t& state) { newest_.sim_state = state; }
   /// Messages that this listener itself had to drop: Bus::counters().
   void on_own_counters(const std::map<std::string, std::int64_t>& counters);
   void end(std::int64_t now_us) { end_us_ = now_us; }
@@ -110,12 +109,7 @@ class StatusBoard {
   std::map<std::string, Arrivals> arrivals_;
   std::map<std::string, std::int64_t> own_counters_;
   std::map<Key, Heard> processes_;
-  std::optional<motion_status_t> motion_;
-  std::optional<control_status_t> control_;
-  std::optional<sample_t> sample_;
-  std::optional<body_schema_t> schema_, proposal_;
-  std::optional<model_health_t> health_;
-  std::optional<sim_state_t> sim_state_;
+  GroupStatus newest_;  ///< messages alone
 };
 
 }  // namespace bodyschema

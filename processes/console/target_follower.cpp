@@ -4,12 +4,10 @@
 
 #include <limits>
 #include <tuple>
-#include <utility>
 #include <vector>
 
 #include "processes/console/hint.h"
 #include "processes/console/names.h"
-#include "processes/console/views/json.h"
 
 namespace bodyschema {
 namespace {
@@ -50,7 +48,8 @@ action_command_t make_console_command(std::int8_t kind, std::int64_t epoch,
   return command;
 }
 
-TargetFollower::TargetFollower(pose_target_t target, std::int64_t timeout_us, Tolerance tolerance)
+TargetFollower::TargetFollower(pose_target_t target, std::int64_t timeout_us,
+                               SeenTolerance tolerance)
     : target_(std::move(target)), timeout_us_(timeout_us), tolerance_(tolerance) {
   status_.target_id = status_.schema_version = status_.target_part = -1;
   status_.predicted_error_m = status_.observed_error_m = -1;
@@ -126,10 +125,9 @@ pose_target_t TargetFollower::withdrawal() const {
 }
 
 std::string TargetFollower::progress() const {
-  if (!is_acknowledged_) {
+  if (!is_acknowledged_)
     return has_controller_ ? "waiting for the controller to take up the target"
                            : "waiting for the controller";
-  }
   return fmt::format("{} · {} · {}", name_in(kControlStates, status_.control_state),
                      course_text(status_), status_.why);
 }

@@ -18,6 +18,11 @@ namespace bodyschema {
 
 inline constexpr double kSeenNear_m = 0.02, kSeenNear_deg = 5;
 
+/// How near the part must be seen.
+struct SeenTolerance {
+  double m = kSeenNear_m, rad = kSeenNear_deg * kDegree;
+};
+
 /// Repeats one POSE_TARGET until CONTROL_STATUS acknowledges it, and follows it to its end.
 class TargetFollower {
  public:
@@ -30,15 +35,8 @@ class TargetFollower {
     kInterrupted,  ///< by the user
   };
 
-  /// How near the part must be seen.
-  struct Tolerance {
-    double m = kSeenNear_m, rad = kSeenNear_deg * kDegree;
-  };
-
   /// `timeout_us`: of the clock, from the first tick.
-  TargetFollower(pose_target_t target, std::int64_t timeout_us)
-      : TargetFollower(std::move(target), timeout_us, Tolerance{}) {}
-  TargetFollower(pose_target_t target, std::int64_t timeout_us, Tolerance tolerance);
+  TargetFollower(pose_target_t target, std::int64_t timeout_us, SeenTolerance tolerance = {});
 
   void on_control_status(const control_status_t& status);
   /// Remembered for diagnosis().
@@ -48,9 +46,8 @@ class TargetFollower {
   std::optional<pose_target_t> on_tick(std::int64_t now_us);
   /// Ends what is open.
   void interrupt();
-  /// The message that makes the controller drop the target when nobody follows it any longer: a
-  /// hold, or a release where the arm is the babbler's meanwhile. It is newer than this target
-  /// only, so that another sender's stays.
+  /// Makes the controller drop the target: a hold, or a release where the arm is the babbler's. It
+  /// is newer than this target only, so that another sender's stays.
   pose_target_t withdrawal() const;
 
   End end() const { return end_; }
@@ -65,7 +62,7 @@ class TargetFollower {
  private:
   const pose_target_t target_;
   const std::int64_t timeout_us_;
-  const Tolerance tolerance_;
+  const SeenTolerance tolerance_;
   std::int64_t now_us_ = -1;
   std::int64_t started_us_ = -1;
   std::int64_t sent_us_ = -1;

@@ -2,20 +2,16 @@
 
 #include <urdf_parser/urdf_parser.h>
 
-#include <fstream>
-#include <sstream>
 #include <stdexcept>
 #include <utility>
+
+#include "common/text/text.h"
 
 namespace bodyschema {
 namespace {
 
 std::shared_ptr<const urdf::ModelInterface> read_urdf(const std::filesystem::path& file) {
-  std::ifstream stream(file);
-  if (!stream) throw std::runtime_error(file.string() + ": cannot be read");
-  std::stringstream text;
-  text << stream.rdbuf();
-  const auto model = urdf::parseURDF(text.str());
+  const auto model = urdf::parseURDF(read_file(file));
   if (!model) throw std::runtime_error(file.string() + ": expected a URDF, see the lines above");
   return model;
 }

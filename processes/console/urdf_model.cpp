@@ -111,7 +111,7 @@ std::vector<Hop> hops_of(const Edge& edge) {
   }
   if (hops.empty()) hops.emplace_back();
   hops.back().X_before = edge.left * X_JN;
-  std::reverse(hops.begin(), hops.end());
+  std::ranges::reverse(hops);
   return hops;
 }
 
@@ -220,18 +220,16 @@ class Writer {
                         edge.to, edge.from, sd.position_m * 1e3, rotation));
     if (edge.state != EdgeState::kOk)
       remark(fmt::format("{}→{}: {}", edge.from, edge.to, name_in(kEdgeStateWords, edge.state)));
-    if (!schema_.has_rotation(edge.to)) {
+    if (!schema_.has_rotation(edge.to))
       remark(
           fmt::format("part {}: its position alone is known; link {} is turned as its last joint",
                       edge.to, link_of(edge.to)));
-    }
     std::map<int, std::vector<std::string>> open;
     for (const ScrewJoint& joint : edge.joints)
       if (joint.order_group >= 0) open[joint.order_group].push_back(signal_of(joint).name);
-    for (const auto& [group, names] : open) {
+    for (const auto& [group, names] : open)
       remark(fmt::format("{}→{}: the samples leave the order of {} open", edge.from, edge.to,
                          listed(names)));
-    }
     if (const auto about = pure_.about_edges.find(index); about != pure_.about_edges.end())
       for (const std::string& text : about->second) remark(text);
   }
@@ -333,7 +331,7 @@ class Writer {
   void add_idle_signals() {
     for (std::size_t s = 0; s < leaders_.size(); ++s) {
       const auto& open = schema_.undecided_signals;
-      const bool is_open = std::count(open.begin(), open.end(), static_cast<int>(s)) > 0;
+      const bool is_open = std::ranges::count(open, static_cast<int>(s)) > 0;
       if (!leaders_[s])
         remark(fmt::format("{}: moves nothing{}", schema_.signals[s].name,
                            is_open ? ", as far as the samples tell" : ""));
@@ -382,12 +380,11 @@ class Writer {
 void check_complete(const BodySchema& schema) {
   if (schema.complete) return;
   std::string why = "its edges do not span its parts";
-  if (!schema.unconnected.empty()) {
+  if (!schema.unconnected.empty())
     why = listed(schema.unconnected, [](const UnconnectedPart& part) {
       const std::string reason = name_in(kUnconnectedReasons, part.reason);
       return fmt::format("part {}: {}", part.part, part.detail.empty() ? reason : part.detail);
     });
-  }
   throw std::invalid_argument("the schema is incomplete: " + why);
 }
 

@@ -23,15 +23,12 @@ struct UrdfModel {
 ///
 /// Link part_<id> is the frame of the part; the root part's link is the root. Each joint before a
 /// part moves a link of its own, part_<id>_link_<n>, unless it can move the part's link itself.
-/// Frames are canonical, whatever frames the schema's screws have: with joint positions of 0 a link
-/// is turned as the part that follows; the origin of a turning link is the point of its axis
-/// nearest to the next origin, that of a sliding one is the next origin. Joint positions are the
-/// schema's, (slide or turn) · (gain·θ + offset): those of the robot's own URDF where the schema
-/// began with it and has its root. The first joint of a signal (parts by depth, then id) has its
-/// name; the others mimic it. Turning joints of a signal without a range are continuous. A stuck
-/// joint is fixed.
-///
-/// Comments hold standard deviations, what is open, and what was left out.
+/// Frames are canonical: with joint positions of 0 a link is turned as the part that follows; the
+/// origin of a turning link is the point of its axis nearest to the next origin, that of a sliding
+/// one is the next origin. Joint positions are the schema's, (slide or turn) · (gain·θ + offset).
+/// The first joint of a signal (parts by depth, then id) has its name; the others mimic it. Turning
+/// joints of a signal without a range are continuous, stuck joints fixed. Comments hold standard
+/// deviations, what is open, and what was left out.
 /// @throws std::invalid_argument if the schema is incomplete, and as pure_joints().
 UrdfModel urdf_model(const BodySchema& schema, bool nominal);
 

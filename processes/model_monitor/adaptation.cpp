@@ -4,7 +4,6 @@
 #include <cmath>
 #include <map>
 #include <stdexcept>
-#include <utility>
 
 #include "common/estimation/chi_square.h"
 #include "common/estimation/quantile.h"
@@ -72,15 +71,14 @@ void believe_nearest(const BodySchema& schema, const MeasurementModel& measureme
     if (!is_new && d2 < known->second.first) known->second = {d2, &o};
   }
   for (const auto& [part, of_part] : nearest) sample->parts.push_back(*of_part.second);
-  std::sort(sample->parts.begin(), sample->parts.end(),
-            [](const PartObservation& a, const PartObservation& b) { return a.part < b.part; });
+  std::ranges::sort(sample->parts, {}, &PartObservation::part);
 }
 
 }  // namespace
 
 Adaptation::Adaptation(BodySchema schema, AdaptationOptions options)
-    : is_soft_(std::any_of(schema.edges.begin(), schema.edges.end(),
-                           [](const Edge& edge) { return edge.residual_gp != nullptr; })),
+    : is_soft_(std::ranges::any_of(schema.edges,
+                                   [](const Edge& edge) { return edge.residual_gp != nullptr; })),
       options_([&] {
         if (is_soft_) options.least_noise_scale = std::max(options.least_noise_scale, 1.0);
         return options;
@@ -126,7 +124,7 @@ EdgeState Adaptation::state_of(const ElementId& element) const {
   if (tracker_.detected() == element) return EdgeState::kInvalid;
   for (const HypothesisTracker::Change& c : tracker_.changes()) {
     const std::vector<ElementId>& also = c.what.also;
-    if (c.what.element == element || std::find(also.begin(), also.end(), element) != also.end())
+    if (c.what.element == element || std::ranges::find(also, element) != also.end())
       return EdgeState::kProvisional;
   }
   if (!element.is_tag() && is_followed(element.id)) return EdgeState::kProvisional;
@@ -222,10 +220,7 @@ void Adaptation::update_measurement() {
 
 void Adaptation::watch_misreadings(const ActionPoseSample& sample,
                                    const std::vector<AdaptationEvent>& events) {
-  const auto has_settled = [](const AdaptationEvent& e) {
-    return e.kind == AdaptationEvent::Kind::kRecovered;
-  };
-  if (std::any_of(events.begin(), events.end(), has_settled)) misreadings_.forget_open();
+  if (has_kind(events, AdaptationEvent::Kind::kRecovered)) misreadings_.forget_open();
   if (!is_settled() || !misreadings_.look(sample, tracker_.settled(), measurement_)) return;
   measurement_.misread = misreadings_.places();
   tracker_.begin(BodySchema(tracker_.settled()), measurement_);
@@ -388,13 +383,13 @@ std::vector<AdaptationEvent> Adaptation::on_new_sample(ActionPoseSample sample) 
     return e.tag < 0 && (e.kind == AdaptationEvent::Kind::kCandidate ||
                          e.kind == AdaptationEvent::Kind::kRestored);
   };
-  if (std::any_of(events.begin(), events.end(), is_change)) visibility_.forget_tags();
+  if (std::ranges::any_of(events, is_change)) visibility_.forget_tags();
   if (tracker_.changes().empty()) {
     const auto has_settled = [](const AdaptationEvent& e) {
       return e.kind == AdaptationEvent::Kind::kRecovered && e.tag < 0 &&
              e.cause != "marker_missing" && e.cause != "unexplained";
     };
-    if (std::any_of(events.begin(), events.end(), has_settled)) tags_.begin_anew();
+    if (std::ranges::any_of(events, has_settled)) tags_.begin_anew();
     watch_drift(sample.sample_index, &events);
   } else {
     drifting_.reset();
@@ -407,10 +402,7 @@ std::vector<AdaptationEvent> Adaptation::on_new_sample(ActionPoseSample sample) 
     if (num_samples_ % kUpdateEach == 0) update_measurement();
   }
   watch_misreadings(sample, events);
-  const auto is_reverted = [](const AdaptationEvent& e) {
-    return e.kind == AdaptationEvent::Kind::kReverted;
-  };
-  if (std::any_of(events.begin(), events.end(), is_reverted)) drift_watch_.forget_all();
+  if (has_kind(events, AdaptationEvent::Kind::kReverted)) drift_watch_.forget_all();
   schema_ = tracker_.schema();
   schema_.moved_tags = moved_tags_;
   return events;

@@ -20,20 +20,18 @@ namespace bodyschema {
 /// Keeps a complete body schema true while the body changes (Section 4 of the chapter).
 ///
 /// A sample is first cleaned of what no change of the body explains: markers that fell, tags that
-/// moved on their part (FallenMarkers, MovedTags). Which changes the body made is for
-/// HypothesisTracker. What changes all the time looks like one step after another: a drift from
-/// nothing at a constant rate (begun_drifts) competes with the steps by its evidence, and is then
-/// followed by DriftWatch until it moves no more. What is too small for the CUSUMs, a step or a
-/// slow drift, DriftWatch finds by means over many samples. An edge that comes and goes
-/// (Alternations) is told once, and cut until it is over.
+/// moved on their part (FallenMarkers, MovedTags). HypothesisTracker finds which changes the body
+/// made. A drift looks like one step after another: it competes with the steps by its evidence
+/// (begun_drifts), and is then followed by DriftWatch until it moves no more. Steps and drifts too
+/// small for the CUSUMs are found by DriftWatch's means over many samples. An edge that comes and
+/// goes (Alternations) is told once, and cut until it is over.
 ///
 /// The noise is taken as it is seen: its size, the rate of outliers, where they lie (Misreadings),
-/// and how many independent samples one is worth where it is correlated.
+/// and how many independent samples one is worth where it is correlated. Repetitions of a sample
+/// (SampleStream) are neither looked at nor counted.
 ///
-/// What repeats another sample (SampleStream) is neither looked at nor counted. Where an edge is
-/// soft the assumed noise has room for what its model leaves, so noise_scale() stays at 1 or above,
-/// and nothing is found out from fewer than three samples, however loud: a bend that was never
-/// shown may be wrong by many standard deviations.
+/// A soft edge may be wrong by many standard deviations in a bend that was never shown: then
+/// noise_scale() stays at 1 or above, and nothing is found out from fewer than three samples.
 class Adaptation {
  public:
   Adaptation(BodySchema schema, AdaptationOptions options);
@@ -92,7 +90,7 @@ class Adaptation {
                          const std::vector<AdaptationEvent>& events);
   /// The same small change again soon after, or beside it, is a drift that was not understood yet.
   void watch_small_changes(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
-  /// What changes all the time looks like one step after another: an edge in trouble may drift.
+  /// An edge in trouble may drift.
   void try_drift(std::int64_t sample_index, std::vector<AdaptationEvent>* events);
   /// What is too small for the CUSUMs: a step, or a drift.
   void watch_small_means(std::int64_t sample_index, std::vector<AdaptationEvent>* events);

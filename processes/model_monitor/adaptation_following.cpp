@@ -11,7 +11,6 @@
 #include "processes/model_monitor/adaptation.h"
 #include "processes/model_monitor/changes/change_family.h"
 #include "processes/model_monitor/changes/drift.h"
-#include "processes/model_monitor/hypotheses/schema_difference.h"
 
 namespace bodyschema {
 namespace {
@@ -53,8 +52,7 @@ void Adaptation::watch_small_changes(std::int64_t sample_index,
   if (!again) return;
   // Small changes that have not settled were this drift as well.
   const std::vector<HypothesisTracker::Change>& changes = tracker_.changes();
-  if (std::all_of(changes.begin(), changes.end(),
-                  [](const auto& c) { return c.what.fitted.change.small; }))
+  if (std::ranges::all_of(changes, [](const auto& c) { return c.what.fitted.change.small; }))
     tracker_.take_back_all(sample_index, events);
   else
     tracker_.keep_all();
@@ -185,7 +183,7 @@ void Adaptation::watch_alternations(std::int64_t sample_index,
   const auto is_at_it = [this](const HypothesisTracker::Change& c) {
     return !c.what.element.is_tag() && c.what.element.id == *intermittent_;
   };
-  if (std::any_of(tracker_.changes().begin(), tracker_.changes().end(), is_at_it)) {
+  if (std::ranges::any_of(tracker_.changes(), is_at_it)) {
     intermittent_.reset();
     return;
   }

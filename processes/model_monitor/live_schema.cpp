@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <ranges>
 
 #include "common/bus/cause_names.h"
 #include "common/bus/codec.h"
@@ -17,29 +18,8 @@ constexpr std::ptrdiff_t kManyFlips = 5;
 
 using Kind = AdaptationEvent::Kind;
 
-std::int8_t wire(Kind kind) {
-  switch (kind) {
-    case Kind::kMismatch:
-      return health_event_t::EVENT_MISMATCH;
-    case Kind::kCandidate:
-      return health_event_t::EVENT_CANDIDATE;
-    case Kind::kRefined:
-      return health_event_t::EVENT_REFINED;
-    case Kind::kRestored:
-      return health_event_t::EVENT_RESTORED;
-    case Kind::kReverted:
-      return health_event_t::EVENT_REVERTED;
-    case Kind::kRecovered:
-      return health_event_t::EVENT_RECOVERED;
-    case Kind::kDrift:
-      return health_event_t::EVENT_DRIFT;
-    case Kind::kMissing:
-      return health_event_t::EVENT_MISSING;
-    case Kind::kProbeWanted:
-      return health_event_t::EVENT_PROBE_WANTED;
-  }
-  return health_event_t::EVENT_MISMATCH;
-}
+static_assert(static_cast<int>(Kind::kMismatch) == health_event_t::EVENT_MISMATCH);
+static_assert(static_cast<int>(Kind::kProbeWanted) == health_event_t::EVENT_PROBE_WANTED);
 
 change_size_t to_message(const ChangeSize& size) {
   change_size_t message{};
@@ -97,8 +77,7 @@ bool is_same_model(const Edge& a, const Edge& b) {
            is_same(x.X_after, y.X_after);
   };
   return is_same(a.left, b.left) && is_same(a.right, b.right) && a.has_process_of(b) &&
-         std::equal(a.joints.begin(), a.joints.end(), b.joints.begin(), b.joints.end(),
-                    is_same_joint);
+         std::ranges::equal(a.joints, b.joints, is_same_joint);
 }
 
 /// What a receiver sees, its stamps apart.
@@ -114,7 +93,7 @@ health_event_t to_message(const AdaptationEvent& event, const std::vector<Signal
   health_event_t message{};
   message.utime = utime;
   message.event_sample = event.sample_index;
-  message.event_kind = wire(event.kind);
+  message.event_kind = static_cast<std::int8_t>(event.kind);
   message.event_from = event.from;
   message.event_to = event.to;
   message.event_part = event.part;
@@ -178,11 +157,8 @@ void LiveSchema::stamp(BodySchema* schema) const {
   std::vector<KnownChange>& changes = schema->changes;
   for (KnownChange& change : changes) change.found = std::max(change.found, known_from_);
   // Of those that became known together the last says since when the body is as it is.
-  for (std::size_t n = 1; n < changes.size();)
-    if (changes[n - 1].found == changes[n].found)
-      changes.erase(changes.begin() + static_cast<std::ptrdiff_t>(n) - 1);
-    else
-      ++n;
+  const auto together = std::ranges::unique(changes | std::views::reverse, {}, &KnownChange::found);
+  changes.erase(changes.begin(), together.begin().base());
   for (MovedTag& tag : schema->moved_tags) {
     tag.found = std::max(tag.found, known_from_);
     if (tag.until >= 0) tag.until = std::max(tag.until, tag.found + 1);
@@ -191,7 +167,7 @@ void LiveSchema::stamp(BodySchema* schema) const {
 
 bool LiveSchema::is_in_doubt() const {
   return !adaptation_.is_settled() || !adaptation_.missing_parts().empty() ||
-         std::any_of(schema_.parts.begin(), schema_.parts.end(), [&](int part) {
+         std::ranges::any_of(schema_.parts, [&](int part) {
            return adaptation_.edge_state(part) != EdgeState::kOk ||
                   adaptation_.marker_state(part) != EdgeState::kOk;
          });
@@ -277,17 +253,18 @@ void LiveSchema::update(const ActionPoseSample& sample, std::optional<std::int64
     edge.confidence = original.confidence;
     rate(sample.sample_index, &edge);
   }
+  const bool is_camera_as_in_base = next.X_CR.matrix() == base_.X_CR.matrix();
   if (next.X_CR.matrix() != schema_.X_CR.matrix()) {
     const bool is_drift_elsewhere = drifting_part && *drifting_part != next.root;
-    if (changed_since && !(is_drift_elsewhere && next.X_CR.matrix() == base_.X_CR.matrix()))
+    if (changed_since && !(is_drift_elsewhere && is_camera_as_in_base))
       camera_since_ = *changed_since;
-    else if (next.X_CR.matrix() == base_.X_CR.matrix())
+    else if (is_camera_as_in_base)
       camera_since_ = base_.changes.empty() ? 0 : base_.changes.back().since;
   }
   // What edges have in common holds of those that were fitted together.
   next.frame_covariances = base_.frame_covariances;
-  next.refined = base_.refined && next.X_CR.matrix() == base_.X_CR.matrix();
-  if (next.X_CR.matrix() != base_.X_CR.matrix()) next.frame_covariances.erase(next.root);
+  next.refined = base_.refined && is_camera_as_in_base;
+  if (!is_camera_as_in_base) next.frame_covariances.erase(next.root);
   for (std::size_t e = 0; e < next.edges.size(); ++e) {
     if (is_same_model(next.edges[e], base_.edges[e])) continue;
     next.refined = false;
@@ -320,7 +297,7 @@ EdgeState LiveSchema::state_of(const Edge& edge) const {
   const EdgeState states[] = {adaptation_.edge_state(edge.to), adaptation_.marker_state(edge.to),
                               adaptation_.marker_state(edge.from)};
   for (const EdgeState worst : {EdgeState::kInvalid, EdgeState::kProvisional})
-    if (std::find(std::begin(states), std::end(states), worst) != std::end(states)) return worst;
+    if (std::ranges::find(states, worst) != std::end(states)) return worst;
   return adaptation_.edge_state(edge.to);
 }
 
@@ -336,7 +313,7 @@ void LiveSchema::describe(model_health_t* health) const {
   health->noise_scale = adaptation_.noise_scale();
   health->probe_sample = probe_sample_;
   std::vector<double> probe;
-  if (probe_sample_ >= 0) probe.assign(probe_.data(), probe_.data() + probe_.size());
+  if (probe_sample_ >= 0) probe.assign(probe_.begin(), probe_.end());
   set_array(health->num_probe, health->probe_action, std::move(probe));
   for (edge_health_t& item : health->edge_health) {
     const Edge* edge = edge_to(schema_, item.health_to);
@@ -357,11 +334,10 @@ void LiveSchema::describe(model_health_t* health) const {
     }
     item.part_state = static_cast<std::int8_t>(state);
     item.marker_cusum = adaptation_.marker_statistic(part);
-    item.is_unseen = std::find(missing.begin(), missing.end(), part) != missing.end();
+    item.is_unseen = std::ranges::find(missing, part) != missing.end();
     const auto flipped = flipped_.find(part);
     item.is_flipping =
-        flipped != flipped_.end() &&
-        std::count(flipped->second.begin(), flipped->second.end(), true) >= kManyFlips;
+        flipped != flipped_.end() && std::ranges::count(flipped->second, true) >= kManyFlips;
   }
 }
 

@@ -4,7 +4,6 @@
 #include <deque>
 #include <map>
 #include <optional>
-#include <string>
 #include <vector>
 
 #include "bodyschema/finding_t.hpp"
@@ -17,11 +16,9 @@
 
 namespace bodyschema {
 
-/// The body schema from a complete one on, the base, that the held-out samples had confirmed: what
-/// Adaptation finds, with what the wire says of it: versions, states, since when an edge holds.
-///
-/// A pure function of the base, the history, what was found before, and the samples, those of
-/// `past` included.
+/// The body schema from a complete and confirmed one on, the base: what Adaptation finds, with what
+/// the wire says of it: versions, states, since when an edge holds. A pure function of what it was
+/// made with and the samples.
 class LiveSchema {
  public:
   /// `past`: the newest samples up to the base's last. `findings`: what was wrong by then.

@@ -1,9 +1,6 @@
 #include "processes/model_monitor/model_monitor.h"
 
 #include <algorithm>
-#include <cmath>
-#include <limits>
-#include <stdexcept>
 #include <utility>
 
 #include "common/bus/convert.h"
@@ -11,7 +8,6 @@
 #include "common/config/calibration_id.h"
 #include "common/config/yaml.h"
 #include "common/estimation/quantile.h"
-#include "common/geometry/angle.h"
 #include "common/kinematics/kinematic_path.h"
 
 namespace bodyschema {
@@ -207,7 +203,7 @@ bool ModelMonitor::judge_waiting() {
 std::int64_t ModelMonitor::num_tests(std::int64_t last) const { return test_indices_.up_to(last); }
 
 bool ModelMonitor::is_test(std::int64_t sample_index) const {
-  return std::binary_search(test_indices_.later.begin(), test_indices_.later.end(), sample_index);
+  return std::ranges::binary_search(test_indices_.later, sample_index);
 }
 
 std::vector<const ActionPoseSample*> ModelMonitor::tests_between(std::int64_t first,
@@ -263,9 +259,8 @@ void ModelMonitor::go_on_from(Standing standing, bool is_changed) {
     kept_.erase(kept_.begin(), kept_.upper_bound(standing.sample_index));
   kept_.emplace(standing.sample_index, standing);
   // Nothing begins before it any more.
-  const auto later = std::find_if(samples_.begin(), samples_.end(), [&](const auto& sample) {
-    return sample.sample_index > standing.sample_index;
-  });
+  const auto later = std::ranges::find_if(
+      samples_, [&](const auto& sample) { return sample.sample_index > standing.sample_index; });
   const auto num_before = static_cast<std::size_t>(later - samples_.begin());
   if (num_before > kPast)
     samples_.erase(samples_.begin(),

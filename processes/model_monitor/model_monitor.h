@@ -54,37 +54,31 @@ struct ModelMonitorConfig {
 
 /// The only publisher of BODY_SCHEMA.
 ///
-/// A proposal of the learner becomes the body schema when none of its edges is refuted by the TEST
-/// samples up to the proposal's last sample, data that it was not trained on, and when it is not a
-/// step back from a complete schema to an incomplete one. An edge that no TEST sample could judge
-/// yet is marked provisional.
+/// A proposal of the learner becomes the body schema when the TEST samples up to its last sample,
+/// which it was not trained on, refute none of its edges, and when it is no step back from a
+/// complete schema to an incomplete one. Edges that no TEST sample judged yet are provisional.
 ///
-/// The first complete one is the end of the learner's lead: from then on every sample is judged at
-/// once (LiveSchema), and a change of the body changes the schema. As long as none was found nor is
-/// suspected, later proposals go on to replace the schema, which is judged from there on. After a
-/// change those that rest on the samples since it alone may do so, where their tree is the same and
-/// they predict its TEST samples better; what rests on samples of two bodies is passed over.
+/// From the first complete one on every sample is judged at once (LiveSchema), and a change of the
+/// body changes the schema. Until one is found or suspected, later proposals replace the schema.
+/// After a change they must rest on the samples since it alone, have the same tree and predict its
+/// TEST samples better.
 ///
-/// As long as it is young (BaselineYouth), that it was wrong from the start is likelier than that
-/// the body changed. What is found then is held back, so that the learner goes on with all samples,
-/// and competes with each of its proposals: the proposal becomes the base, or the change is told,
+/// As long as the schema is young (BaselineYouth), that it was wrong from the start is likelier
+/// than that the body changed: a change is held back and competes with each proposal of the
+/// learner, which goes on with all samples. The proposal becomes the base, or the change is told,
 /// or both wait.
 ///
-/// The schema after sample n is a pure function of the samples 0..n. A proposal is one of its last
-/// sample t, a TEST sample (the learner leaves none of these out), and is judged by the state after
-/// t, which is kept until then: a proposal that comes when t+1..n were heard already is judged as
-/// if it had been there in time, and these samples are gone through again. So it is the same
-/// however fast the learner is; only what was published for t+1..n in between was provisional.
-/// Version n+1 changed last at sample n.
+/// The schema after sample n is a pure function of the samples 0..n, however fast the learner is: a
+/// proposal on samples up to t, a TEST sample, is judged by the state after t, which is kept until
+/// then, and the samples since are gone through again. What was published for these in between was
+/// provisional. Version n+1 changed last at sample n.
 ///
-/// A proposal that a refiner answers is judged once its answer is there, so that what moves the arm
-/// need not wait for both; a silent refiner is waited for half a minute, once. The actions that the
-/// answer wants are passed on as long as the body schema is of the same tree and body.
-///
-/// A refined schema takes the place of the proposal where it predicts the corners of the TEST
-/// samples better (is_likelier()): by the rig's own tags and lens, as all that is seen later is. So
-/// it does where those are as good as its own; else they must be adopted first. From then on, until
-/// the body changes, only what predicts these corners better still may replace it.
+/// A proposal that a refiner answers is judged once its answer is there; a silent refiner is waited
+/// for half a minute, once. The actions that the answer wants are passed on as long as the body
+/// schema is of the same tree and body. The refined schema takes the place of the proposal where it
+/// predicts the corners of the TEST samples better (is_likelier()) by the rig's own tags and lens;
+/// where those are worse than its own, they must be adopted first. Until the body changes, only
+/// what predicts these corners better still may replace it.
 ///
 /// Before the first accepted proposal nothing is published; when inputs stop, the last schema
 /// stands.
@@ -92,8 +86,7 @@ class ModelMonitor {
  public:
   explicit ModelMonitor(ModelMonitorConfig config);
 
-  /// What an earlier run of this process remembered, before the samples are gone through again: the
-  /// state after them is then as if nothing had happened.
+  /// Before the samples are gone through again: the state after them is as if there was no restart.
   void restore(const MonitorMemory& memory);
   /// Begins with a schema of this run whose memory was lost: it holds for the samples after its
   /// last. Of another run's, or an engineered one, last_sample_index must be −1.
@@ -164,32 +157,29 @@ class ModelMonitor {
   /// `standing` one sample later. Verdicts that a restart remembers are spoken again.
   void advance(Standing* standing, const ActionPoseSample& sample) const;
   Standing standing_after(std::int64_t sample_index) const;
-  /// Everything from a state on that is final: that after a judged sample. `is_changed`: the
-  /// verdict made it another than it was, so that later samples are gone through again.
+  /// From the state after a judged sample, which is final. `is_changed`, by the verdict: later
+  /// samples are gone through again.
   void go_on_from(Standing standing, bool is_changed);
   void keep(const Standing& standing);
   std::shared_ptr<const LiveSchema> begin(BodySchema base, std::vector<BodySchema> history,
                                           std::int64_t up_to_sample) const;
   /// "" or why the proposal is not better than what stands; sets the states of its edges.
   std::string objection(BodySchema* proposal, const Standing& standing, bool* was_tested) const;
-  /// It rests on samples of a body that is no more, or hides that it may be so, or explains less
-  /// than what stands.
+  /// It rests, or may rest, on samples of an earlier body, or explains less than what stands.
   bool is_passed_over(const BodySchema& proposal, const Standing& standing) const;
   void judge(const body_schema_t& proposal);
   void remember_refusal(const health_event_t& event);
   /// Those whose samples, and whose refinement, are there. Returns true if there were any.
   bool judge_waiting();
   bool waits_for_refiner(const body_schema_t& proposal);
-  /// Those whose samples are there, and which were asked for: a forged one displaces none. Returns
-  /// true if there were any.
+  /// Those whose samples are there, and which were asked for. Returns true if there were any.
   bool take_answers();
   /// The wanted actions are of the same body.
   bool are_wanted_for(const BodySchema& schema) const;
   static std::int64_t body_since(const BodySchema& proposal);
   /// The proposal, or the refiner's answer to it if that predicts corners better.
   BodySchema better_one(BodySchema learned) const;
-  /// A refined schema stands against a proposal that shows no part that it lacks and does not
-  /// predict corners better.
+  /// The proposal shows no part that the refined schema lacks, nor predicts corners better.
   bool is_defended(const BodySchema& refined, const BodySchema& proposal) const;
   /// Those of the parts of both, in the TEST samples of the body of `schema`, up to `last`.
   bool predicts_corners_better(const BodySchema& schema, const BodySchema& other,

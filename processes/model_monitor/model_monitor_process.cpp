@@ -162,9 +162,8 @@ void ModelMonitorProcess::publish() {
     process_.bus().publish(kBodySchema, *monitor_.schema());
   }
   process_.bus().publish(kModelHealth, monitor_.health());
-  if (!not_saved.empty() && problem_.empty()) {
+  if (!not_saved.empty() && problem_.empty())
     spdlog::warn("{}; tried again every second", not_saved);
-  }
   if (!not_saved.empty()) process_.count("schema not saved");
   problem_ = not_saved;
 }
@@ -176,14 +175,13 @@ void ModelMonitorProcess::say() {
   } else if (!monitor_.schema() && monitor_.health().judged_sample < 0) {
     process_.set_activity(process_info_t::PHASE_WAITING, "waiting for LEARNED_SCHEMA");
   } else {
-    process_.set_activity(process_info_t::PHASE_WORKING,
-                          "schema version " + std::to_string(monitor_.health().schema_version) +
-                              ", judged up to sample " +
-                              std::to_string(monitor_.health().judged_sample) +
-                              (monitor_.awaited_refinement() < 0
-                                   ? ""
-                                   : ", waiting for REFINED_SCHEMA of sample " +
-                                         std::to_string(monitor_.awaited_refinement())));
+    const std::int64_t awaited = monitor_.awaited_refinement();
+    process_.set_activity(
+        process_info_t::PHASE_WORKING,
+        fmt::format(
+            "schema version {}, judged up to sample {}{}", monitor_.health().schema_version,
+            monitor_.health().judged_sample,
+            awaited < 0 ? "" : fmt::format(", waiting for REFINED_SCHEMA of sample {}", awaited)));
   }
 }
 

@@ -2,6 +2,7 @@
 
 #include <sstream>
 #include <stdexcept>
+#include <utility>
 
 #include "common/bus/event_log.h"
 #include "processes/model_monitor/saved_message.h"
@@ -23,9 +24,8 @@ std::string text_of(const MonitorMemory& memory, const std::vector<SampleMark>& 
   add(kModelHealth, memory.at_base);
   add(kModelHealth, memory.verdicts);
   std::string lines;
-  for (const SampleMark& mark : marks) {
+  for (const SampleMark& mark : marks)
     lines += fmt::format("{} {:08x}\n", mark.sample_index, mark.checksum);
-  }
   const auto* bytes = reinterpret_cast<const std::uint8_t*>(lines.data());
   const auto event =
       encode_event(kMarksChannel, {bytes, lines.size()}, memory.verdicts.utime, number);
@@ -52,35 +52,27 @@ bool MonitorMemory::operator==(const MonitorMemory& other) const {
 
 std::optional<MonitorMemory> MemoryFile::load(const Objection& objection,
                                               const std::filesystem::path& samples_file) {
-  if (file_.empty() || !std::filesystem::exists(file_)) return std::nullopt;
-  std::string problem;
-  try {
-    MonitorMemory memory;
+  MonitorMemory memory;
+  std::vector<SampleMark> marks;
+  const bool is_of_use = use_or_set_aside(file_, [&]() -> std::string {
     LogReport report;
     memory.schemas = read_log(file_, kBodySchema, &report);
     const std::vector<model_health_t> health = read_log(file_, kModelHealth);
     // It is replaced as a whole, so no writer tears its tail.
-    if (report.truncated_at_byte || health.size() != 2) problem = "is not whole";
+    if (report.truncated_at_byte || health.size() != 2) return "is not whole";
     for (const body_schema_t& schema : memory.schemas)
-      if (problem.empty()) problem = objection(schema);
-    std::vector<SampleMark> marks = marks_in(file_);
-    if (problem.empty()) {
-      problem = contradiction(samples_file, health[1].judged_sample, marks);
-      rests_on_other_samples_ = !problem.empty();
-    }
-    if (problem.empty()) {
-      memory.at_base = health[0];
-      memory.verdicts = health[1];
-      marks_ = std::move(marks);
-      saved_ = text_of(memory, marks_);
-      return memory;
-    }
-    problem = file_.string() + ": " + problem;
-  } catch (const std::runtime_error& error) {
-    problem = error.what();
-  }
-  set_aside(file_, problem);
-  return std::nullopt;
+      if (std::string problem = objection(schema); !problem.empty()) return problem;
+    memory.at_base = health[0];
+    memory.verdicts = health[1];
+    marks = marks_in(file_);
+    std::string problem = contradiction(samples_file, memory.verdicts.judged_sample, marks);
+    rests_on_other_samples_ = !problem.empty();
+    return problem;
+  });
+  if (!is_of_use) return std::nullopt;
+  marks_ = std::move(marks);
+  saved_ = text_of(memory, marks_);
+  return memory;
 }
 
 std::string MemoryFile::save(const MonitorMemory& memory, const std::vector<SampleMark>& marks) {

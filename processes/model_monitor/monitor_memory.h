@@ -9,14 +9,12 @@
 #include <vector>
 
 #include "bodyschema/body_schema_t.hpp"
-#include "bodyschema/health_event_t.hpp"
 #include "bodyschema/model_health_t.hpp"
 #include "processes/model_monitor/sample_trail.h"
 
 namespace bodyschema {
 
-/// What the monitor cannot find again from the samples: which of the learner's proposals became the
-/// body schema, the schemas before it, and what was decided on others.
+/// What the monitor cannot find again from the samples: accepted proposals and other verdicts.
 struct MonitorMemory {
   /// Of the history, oldest first; the last one is the base, that the samples after its
   /// last_sample_index changed since. Empty before the first accepted proposal.
@@ -41,10 +39,8 @@ class MemoryFile {
   explicit MemoryFile(std::filesystem::path file) : file_(std::move(file)) {}
 
   using Objection = std::function<std::string(const body_schema_t&)>;
-  /// std::nullopt if there is none. One that cannot be used (damaged, `objection` to a schema is
-  /// not
-  /// "", or it does not rest on the samples in `samples_file`) is set aside as FILE.bad-1 with a
-  /// warning: it is found out again from the samples.
+  /// std::nullopt if there is none that can be used: whole, without an `objection` to a schema, and
+  /// resting on the samples in `samples_file`. See use_or_set_aside().
   std::optional<MonitorMemory> load(const Objection& objection,
                                     const std::filesystem::path& samples_file);
   bool rests_on_other_samples() const { return rests_on_other_samples_; }

@@ -17,12 +17,10 @@ namespace bodyschema {
 bool is_small_step(const Eigen::VectorXd& from, const Eigen::VectorXd& to,
                    const std::vector<Signal>& signals);
 
-/// Which samples say something new. An arm that goes from rest to rest brings independent ones. A
-/// stream of frames does not: what a soft body's model does not know (hysteresis, creep, a bend
-/// that it was never shown) and a marker that is read turned over are the same for many frames, and
-/// tests that add up evidence would count one deviation a hundred times. Of a stream one sample a
-/// second is judged, the shortest block of time that counts for one in learning (see
-/// time_blocks.h).
+/// Which samples say something new. In a stream of frames what a soft body's model does not know
+/// (hysteresis, creep, a bend that it was never shown) and a marker that is read turned over are
+/// the same for many frames, and would count a hundred times. So of a stream one sample a second is
+/// judged, the shortest block of time that counts for one in learning (time_blocks.h).
 class SampleStream {
  public:
   /// Whether the sample repeats the one judged last: it is at most a second later, and from there

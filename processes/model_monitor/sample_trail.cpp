@@ -14,9 +14,8 @@ std::string SampleTrail::add(const sample_t& sample) {
   // The checksum before, then the sample's: so each costs its own length, however many there are.
   std::vector<std::uint8_t> bytes = encode(kSample, sample);
   const std::uint32_t before = marks_.empty() ? 0 : marks_.back().checksum;
-  for (int shift = 0; shift < 32; shift += 8) {
+  for (int shift = 0; shift < 32; shift += 8)
     bytes.push_back(static_cast<std::uint8_t>(before >> shift));
-  }
   const SampleMark mark{sample.sample_index, crc32c(bytes)};
   if (marks_.size() > 1) marks_.pop_back();
   marks_.push_back(mark);
@@ -47,10 +46,9 @@ std::string contradiction(const std::filesystem::path& samples_file, std::int64_
     return "";  // no log: the observer says so, and does not begin
   }
   const std::int64_t claimed = marks.empty() ? newest : std::max(newest, marks.back().sample_index);
-  if (problem.empty() && trail.newest() < claimed) {
+  if (problem.empty() && trail.newest() < claimed)
     problem = fmt::format("rests on samples up to {}, the newest in {} is {}", claimed,
                           samples_file.filename().string(), trail.newest());
-  }
   return problem;
 }
 

@@ -19,8 +19,8 @@ struct SampleMark {
 };
 
 /// Follows the samples that a memory rests on, so that a memory and samples that do not belong
-/// together are noticed at the next start: with the samples of another run, or fewer of them, the
-/// monitor would go on from what never happened. Costs the same for every sample.
+/// together (another run's, or fewer) are noticed at the next start. Costs the same for every
+/// sample.
 class SampleTrail {
  public:
   /// `claimed`: marks that these samples must have, ascending.

@@ -21,6 +21,24 @@ inline void set_aside(const std::filesystem::path& file, const std::string& prob
   spdlog::warn("{}; set aside as {}", problem, aside.filename().string());
 }
 
+/// Whether `read` could use the file: it returns "" or why not, or throws std::runtime_error. One
+/// that cannot be used is set aside as FILE.bad-1 with a warning: what it held is found out again
+/// from the samples, and nobody stumbles over it at each start. False without a file.
+inline bool use_or_set_aside(const std::filesystem::path& file,
+                             const std::function<std::string()>& read) {
+  if (file.empty() || !std::filesystem::exists(file)) return false;
+  std::string problem;
+  try {
+    problem = read();
+    if (problem.empty()) return true;
+    problem = file.string() + ": " + problem;
+  } catch (const std::runtime_error& error) {
+    problem = error.what();
+  }
+  set_aside(file, problem);
+  return false;
+}
+
 /// A message that outlives its process: a log of one event, replaced atomically. Without a file
 /// nothing is kept.
 template <class Message>
@@ -29,26 +47,18 @@ class SavedMessage {
   SavedMessage(std::filesystem::path file, Channel<Message> channel)
       : file_(std::move(file)), channel_(channel) {}
 
-  /// What was saved; std::nullopt if nothing was. A file that cannot be used (damaged, empty, or
-  /// `objection` is not "") is set aside as FILE.bad-1 with a warning: what it held is found out
-  /// again from the samples, and nobody stumbles over it at each start.
+  /// What was saved; std::nullopt if nothing was that can be used: undamaged, and without an
+  /// `objection`. See use_or_set_aside().
   std::optional<Message> load(const std::function<std::string(const Message&)>& objection) {
-    if (file_.empty() || !std::filesystem::exists(file_)) return std::nullopt;
-    std::string problem;
-    try {
-      std::vector<Message> messages = read_log(file_, channel_);
-      problem =
-          messages.empty() ? std::string("holds no ") + channel_.name : objection(messages.back());
-      if (problem.empty()) {
-        saved_ = encode(channel_, messages.back());
-        return std::move(messages.back());
-      }
-      problem = file_.string() + ": " + problem;
-    } catch (const std::runtime_error& error) {
-      problem = error.what();
-    }
-    set_aside(file_, problem);
-    return std::nullopt;
+    std::vector<Message> messages;
+    const bool is_of_use = use_or_set_aside(file_, [&] {
+      messages = read_log(file_, channel_);
+      return messages.empty() ? std::string("holds no ") + channel_.name
+                              : objection(messages.back());
+    });
+    if (!is_of_use) return std::nullopt;
+    saved_ = encode(channel_, messages.back());
+    return std::move(messages.back());
   }
 
   /// Writes the message unless it is what was written last. Returns "" or why it could not be

@@ -2,10 +2,7 @@
 #include <unistd.h>
 
 #include <filesystem>
-#include <fstream>
 #include <iostream>
-#include <memory>
-#include <nlohmann/json.hpp>
 #include <stdexcept>
 #include <string>
 
@@ -31,11 +28,9 @@ struct AdoptArguments {
 path rig_of(const AdoptArguments& arguments) {
   if (!arguments.rig.empty()) return find_rig(arguments.rig);
   const path file = path(arguments.run) / "result.json";
-  std::ifstream stream(file);
-  const auto result = nlohmann::json::parse(stream, nullptr, false);
-  if (!result.is_object() || !result.contains("rig") || !result["rig"].is_string())
+  const std::string name = rig_name_of(arguments.run);
+  if (name.empty())
     throw std::runtime_error(file.string() + ": does not tell the run's rig; give --rig");
-  const std::string name = as_text(result["rig"].get<std::string>());
   const path folder = rigs_folder() / name;
   // Of a rig in another place the run knows the name alone.
   if (rigs_folder().empty() || !std::filesystem::exists(folder / "signals.yaml"))
@@ -98,14 +93,13 @@ void run_adopt(const AdoptArguments& arguments) {
 }  // namespace
 
 void add_adopt_command(Arguments console) {
-  const auto arguments = std::make_shared<AdoptArguments>();
-  Arguments adopt = console.add_subcommand(
-      "adopt", "Write the tags and the lens that a run proposes into its rig, after showing them");
-  adopt.add_option("RUN", arguments->run, "Folder of the run, e.g. logs/current").required();
-  adopt.add_option("--rig", arguments->rig,
+  auto [adopt, arguments] = console.add_command(
+      "adopt", "Write the tags and the lens that a run proposes into its rig, after showing them",
+      run_adopt);
+  adopt.add_option("RUN", arguments.run, "Folder of the run, e.g. logs/current").required();
+  adopt.add_option("--rig", arguments.rig,
                    "Folder of the rig, or name of one in config/; the run's if not given");
-  adopt.add_flag("--yes", arguments->yes, "Do not ask before writing");
-  adopt.callback([arguments] { run_adopt(*arguments); });
+  adopt.add_flag("--yes", arguments.yes, "Do not ask before writing");
 }
 
 }  // namespace bodyschema

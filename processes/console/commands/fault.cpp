@@ -27,7 +27,7 @@ struct FaultArguments {
 };
 
 void inject(FaultArguments& arguments) {
-  std::copy(arguments.target_m.begin(), arguments.target_m.end(), arguments.command.target_m);
+  std::ranges::copy(arguments.target_m, arguments.command.target_m);
   fault_command_t& command = arguments.command;
   command.utime = command.epoch = wall_clock_us();
   command.sender = "console";
@@ -50,13 +50,12 @@ void inject(FaultArguments& arguments) {
     }
     bus.handle(std::chrono::milliseconds(50));
   }
-  if (!done) {
+  if (!done)
     throw std::runtime_error(
         is_heard ? "the simulator is heard but did not acknowledge within 10 s; its log says why"
                  : "no simulator is heard on " + arguments.in +
                        " within 4 s; faults are for simulated rigs, in a group that runs "
                        "(./run --keep)");
-  }
   if (!done->fault_answer.empty()) throw std::runtime_error("refused: " + done->fault_answer);
   const bool is_repair = command.fault == fault_command_t::FAULT_REPAIR;
   print(arguments.json, {{"faults", done->faults}, {"utime", done->utime}},

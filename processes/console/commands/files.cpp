@@ -13,7 +13,6 @@
 #include "common/bus/convert.h"
 #include "common/bus/event_log.h"
 #include "common/geometry/angle.h"
-#include "processes/structure_learner/command_lag.h"
 #include "processes/structure_learner/noise_estimate.h"
 
 namespace bodyschema {
@@ -44,8 +43,8 @@ std::string delay_text(const CommandDelay& delay) {
   std::string text = fmt::format("the poses come {:.3f} s {} their commands", seconds(delay.lag_us),
                                  delay.lag_us < 0 ? "before" : "after");
   if (delay.smear_us != 0)
-    text += fmt::format(", drives follow with a time constant of {:.3f} s",
-                        seconds(delay.smear_us));
+    text +=
+        fmt::format(", drives follow with a time constant of {:.3f} s", seconds(delay.smear_us));
   return text + ": each counts with the command that brought it there";
 }
 
@@ -78,14 +77,12 @@ Noise noise_given(const std::vector<double>& numbers) {
   for (const double number : numbers)
     if (!std::isfinite(number) || number <= 0) refuse("expected two standard deviations above 0");
   const Noise noise{numbers[0], numbers[1] * kDegree};
-  if (noise.position_m > kNoiseCeiling.position_m) {
+  if (noise.position_m > kNoiseCeiling.position_m)
     refuse(fmt::format("{} m is no noise of a marker; did you mean: --noise {} {}", numbers[0],
                        numbers[0] / 1000, numbers[1]));
-  }
-  if (noise.rotation_rad > kNoiseCeiling.rotation_rad) {
+  if (noise.rotation_rad > kNoiseCeiling.rotation_rad)
     refuse(fmt::format("{} degrees are no noise of a marker; at most {:.0f} are", numbers[1],
                        kNoiseCeiling.rotation_rad / kDegree));
-  }
   if (looks_like_radians(noise))
     std::cerr << fmt::format("bodyschema: --noise {} {} looks like radians; expected degrees\n",
                              numbers[0], numbers[1]);

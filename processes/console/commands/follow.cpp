@@ -7,7 +7,6 @@
 #include <iostream>
 #include <iterator>
 #include <limits>
-#include <memory>
 #include <optional>
 #include <stdexcept>
 #include <string>
@@ -15,8 +14,6 @@
 
 #include "common/bus/arguments.h"
 #include "common/bus/channels.h"
-#include "common/bus/convert.h"
-#include "common/bus/rest_position.h"
 #include "common/geometry/angle.h"
 #include "common/text/text.h"
 #include "processes/console/commands/commands.h"
@@ -77,27 +74,15 @@ Trajectory read_trajectory(const FollowArguments& arguments) {
   }
 }
 
-struct Heard {
-  std::optional<BodySchema> schema;
-  std::optional<motion_status_t> motion;
-};
-
 /// `heard` gets what comes as long as the session lives. @throws std::runtime_error unless a schema
 /// does.
 void listen(Session& session, Heard* heard) {
-  session.bus.subscribe(kBodySchema,
-                        [=](const body_schema_t& m) { heard->schema = from_message(m); });
-  session.bus.subscribe(kMotionStatus, [=](const motion_status_t& m) { heard->motion = m; });
+  heard->listen(session.bus);
   session.turn(
       kPatience_us, [&] { return heard->schema && heard->motion; },
       [&](std::int64_t) { session.expect_company(); });
   if (!heard->schema)
     throw std::runtime_error("no schema is known yet: it comes with the first samples");
-}
-
-/// Where the arm rests, if that was heard.
-std::optional<Eigen::VectorXd> position_of(const Heard& heard) {
-  return heard.motion ? rest_position(*heard.motion, heard.schema->signals.size()) : std::nullopt;
 }
 
 Trajectory::Limits limits_of(const FollowArguments& arguments) {
@@ -114,7 +99,7 @@ void check_reach(const Heard& heard, const FollowArguments& arguments,
                  const Trajectory& trajectory) {
   const BodySchema& schema = *heard.schema;
   const int part = arguments.part;
-  const Eigen::VectorXd action = position_of(heard).value_or(mid_range(schema.signals));
+  const Eigen::VectorXd action = heard.position().value_or(mid_range(schema.signals));
   if (!schema.has_part(part) || part == schema.root || !schema.predict(schema.root, part, action))
     throw std::runtime_error(no_way_text(schema, part));
   if (trajectory.leg(0).front().q_RT && !schema.has_rotation(part))
@@ -130,13 +115,12 @@ void check_reach(const Heard& heard, const FollowArguments& arguments,
   if (!why.empty()) throw std::runtime_error(why + "; nothing was moved");
 }
 
-/// "" or why the arm cannot go on to way point `n` from where it is, by what the schema is by now:
-/// the first way point may have been reached in another posture than was foreseen, or a link is
-/// bent. While an edge is in doubt the part is known badly everywhere: there the controller goes in
-/// small steps, and its probes end the doubt.
+/// "" or why the arm cannot go on to way point `n` from where it is, by the schema as it is now:
+/// the posture may be another than was foreseen, or a link bent. How well the part is known does
+/// not count while an edge is in doubt: the controller's small steps and probes end the doubt.
 std::string objection_to_leg(const Heard& heard, const FollowArguments& arguments,
                              const Trajectory& trajectory, std::size_t n) {
-  const auto position = position_of(heard);
+  const auto position = heard.position();
   if (n == 0 || !position) return "";
   Trajectory::Limits limits = limits_of(arguments);
   const auto chain = chain_to(*heard.schema, arguments.part);
@@ -150,10 +134,10 @@ pose_target_t target_at(const PoseTarget& step, const FollowArguments& arguments
   pose_target_t target =
       make_target(step.q_RT ? pose_target_t::KIND_POSE : pose_target_t::KIND_POSITION);
   target.target_part = arguments.part;
-  std::copy(step.p_RT.begin(), step.p_RT.end(), target.position_m);
+  std::ranges::copy(step.p_RT, target.position_m);
   if (const auto& q = step.q_RT) {
     const double wxyz[] = {q->w(), q->x(), q->y(), q->z()};
-    std::copy(std::begin(wxyz), std::end(wxyz), target.orientation_wxyz);
+    std::ranges::copy(wxyz, target.orientation_wxyz);
   }
   target.tolerance_m = std::min(arguments.tolerance_m, kNear_m);
   target.tolerance_rad = kNear_rad;
@@ -174,16 +158,12 @@ Passed pass(Session& session, const std::vector<PoseTarget>& steps, const pose_t
     target.num_way_points = first.num_way_points;
     TargetFollower follower(target, std::llround(arguments.timeout_s * 1e6),
                             {.m = arguments.tolerance_m});
-    session.follow(follower, nullptr,
-                   fmt::format("way point {} of {} · ", first.way_point, first.num_way_points));
-    passed = {follower.status(), follower.end()};
+    passed.status = session.follow_to_end(
+        follower, arguments.timeout_s,
+        fmt::format("way point {} of {} · ", first.way_point, first.num_way_points));
+    passed.end = follower.end();
     num_moves += passed.status.num_moves;
     num_probes += passed.status.num_probes;
-    if (passed.end == End::kInterrupted)
-      passed.status.why = "interrupted; " + session.withdraw(follower);
-    if (passed.end == End::kTimedOut)
-      passed.status.why = fmt::format("no end within {} s; {}; {}", arguments.timeout_s,
-                                      follower.diagnosis(), session.withdraw(follower));
     if (passed.end != End::kAsked && passed.end != End::kMissed) break;
   }
   passed.status.num_moves = num_moves;
@@ -210,7 +190,8 @@ Json follow_json(const std::vector<Passed>& passed, std::size_t num_way_points) 
           {"probes", num_probes}};
 }
 
-void run_follow(FollowArguments arguments) {
+void run_follow(const FollowArguments& given) {
+  FollowArguments arguments = given;
   if (!arguments.rig.empty())
     arguments.workspace =
         ControllerConfig::load(std::filesystem::path(arguments.rig) / "controller.yaml").workspace;
@@ -263,30 +244,28 @@ void run_follow(FollowArguments arguments) {
 }  // namespace
 
 void add_follow_command(Arguments console) {
-  const auto arguments = std::make_shared<FollowArguments>();
-  Arguments follow = console.add_subcommand(
-      "follow", "Bring a body part through way points, straight from each to the next");
+  auto [follow, arguments] = console.add_command(
+      "follow", "Bring a body part through way points, straight from each to the next", run_follow);
   follow
-      .add_option("FILE", arguments->file,
+      .add_option("FILE", arguments.file,
                   "CSV with x,y,z or x,y,z,qw,qx,qy,qz in the root part [m]; - is stdin")
       .required();
-  follow.add_option("--in", arguments->in, "URL of the bus");
-  follow.add_option("--part", arguments->part, "Body part").required().in_range(0, 9999);
-  follow.add_option("--step", arguments->step_m, "Longest way between two looks [m]")
+  follow.add_option("--in", arguments.in, "URL of the bus");
+  follow.add_option("--part", arguments.part, "Body part").required().in_range(0, 9999);
+  follow.add_option("--step", arguments.step_m, "Longest way between two looks [m]")
       .check(within(1e-4, 1000), "NUMBER");
   follow
-      .add_option("--timeout", arguments->timeout_s,
+      .add_option("--timeout", arguments.timeout_s,
                   "Of one step [s]; then the path is left and the arm held")
       .check(within(1e-3, kLongest_s), "NUMBER");
   follow
-      .add_option("--tolerance", arguments->tolerance_m,
+      .add_option("--tolerance", arguments.tolerance_m,
                   "A way point that is seen farther off [m] was missed; the path goes on")
       .check(within(1e-6, 1000), "NUMBER");
-  follow.add_option("--rig", arguments->rig,
+  follow.add_option("--rig", arguments.rig,
                     "Folder of the rig whose workspace is looked at beforehand; ./run follow names "
                     "that of its group");
-  follow.add_flag("--json", arguments->json, "The result as JSON");
-  follow.callback([arguments] { run_follow(*arguments); });
+  follow.add_flag("--json", arguments.json, "The result as JSON");
 }
 
 }  // namespace bodyschema

@@ -5,7 +5,6 @@
 #include <iostream>
 #include <list>
 #include <map>
-#include <memory>
 #include <set>
 #include <stdexcept>
 #include <tuple>
@@ -34,8 +33,7 @@ struct LogArguments {
   std::string copy;
 };
 
-/// The channel from which a replay starts: MARKER_POSES, from which the observer makes the samples
-/// again, or SAMPLE.
+/// The channel from which a replay starts: MARKER_POSES or SAMPLE.
 std::string replay_start(const LogSummary& summary, const std::string& file) {
   const auto has = [&](const std::string& channel) {
     const auto found = summary.channels.find(channel);
@@ -77,8 +75,7 @@ void copy_channels(const std::string& file, const std::vector<std::string>& chan
   LogReader reader(file);
   for (std::int64_t i = 0; i < num_good && reader.next(); ++i) {
     const LogEvent& event = reader.event();
-    if (std::count(channels.begin(), channels.end(), event.channel) > 0 &&
-        problem_of(event).empty())
+    if (std::ranges::count(channels, event.channel) > 0 && problem_of(event).empty())
       copy.add(event);
   }
   copy.write(to);
@@ -131,10 +128,9 @@ std::filesystem::path rig_of(const std::filesystem::path& log, const std::filesy
   }
   if (num_judged == 0)
     throw std::runtime_error(log.string() + ": says nothing of its rig; type --rig RIG");
-  if (candidates.empty()) {
+  if (candidates.empty())
     throw std::runtime_error(fmt::format("{}: of none of the rigs in {}; type --rig RIG{}",
                                          log.string(), rigs.string(), against));
-  }
   if (candidates.size() > 1) {
     const std::string names =
         listed(candidates, [](const Candidate& one) { return one.folder.filename().string(); });
@@ -150,13 +146,12 @@ Json log_json(const LogSummary& summary) {
                {"bytes", summary.file_bytes},        {"unread_bytes", summary.unread_bytes},
                {"damage", summary.damage},           {"unreadable", summary.unreadable()},
                {"versions", summary.versions},       {"channels", Json::object()}};
-  for (const auto& [name, channel] : summary.channels) {
+  for (const auto& [name, channel] : summary.channels)
     json["channels"][name] = {
         {"events", channel.events},         {"bytes", channel.bytes},
         {"known", channel.is_known},        {"unreadable", channel.unreadable},
         {"problem", channel.first_problem}, {"first_utime", channel.first_utime},
         {"last_utime", channel.last_utime}};
-  }
   return json;
 }
 
@@ -170,14 +165,13 @@ std::string log_text(const LogSummary& summary) {
                         static_cast<double>(summary.file_bytes) * 1e-6);
     text += "  channel            events  unreadable       kB   first    last\n";
   }
-  for (const auto& [name, channel] : summary.channels) {
+  for (const auto& [name, channel] : summary.channels)
     text +=
         fmt::format("  {:<18} {:>6}  {:>10} {:>8.0f} {:>6.1f}s {:>6.1f}s\n", name, channel.events,
                     channel.is_known ? std::to_string(channel.unreadable) : "not ours",
                     static_cast<double>(channel.bytes) * 1e-3,
                     seconds(channel.first_utime - summary.first_utime),
                     seconds(channel.last_utime - summary.first_utime));
-  }
   const std::string flaws = flaws_text(summary);
   return text + (flaws.empty() ? "whole, and every message can be read\n" : flaws);
 }
@@ -241,24 +235,23 @@ void run_log(const LogArguments& arguments) {
 }  // namespace
 
 void add_log_command(Arguments console) {
-  const auto arguments = std::make_shared<LogArguments>();
-  Arguments log = console.add_subcommand("log", "What an LCM log holds, and what is wrong with it");
-  log.add_option("FILE", arguments->file, "LCM log").required();
-  log.add_flag("--json", arguments->json, "Print JSON");
-  log.add_flag("--check", arguments->check,
+  auto [log, arguments] =
+      console.add_command("log", "What an LCM log holds, and what is wrong with it", run_log);
+  log.add_option("FILE", arguments.file, "LCM log").required();
+  log.add_flag("--json", arguments.json, "Print JSON");
+  log.add_flag("--check", arguments.check,
                "Fail unless it is whole and every message of ours can be read");
-  log.add_flag("--replay-from", arguments->replay_from,
+  log.add_flag("--replay-from", arguments.replay_from,
                "Print the channel from which a replay can learn: MARKER_POSES or SAMPLE");
-  log.add_option("--rig-of", arguments->rigs,
+  log.add_option("--rig-of", arguments.rigs,
                  "Print the name of the rig in this folder that was recorded")
       .type_name("FOLDER");
-  log.add_option("--thin", arguments->thin,
+  log.add_option("--thin", arguments.thin,
                  "Write a small copy: no images, no ground truth, nothing twice")
       .type_name("FILE");
-  const Argument to = log.add_option("--to", arguments->copy, "Copy to a new log …");
-  log.add_option("--copy", arguments->channels, "… the messages of these channels that can be read")
+  const Argument to = log.add_option("--to", arguments.copy, "Copy to a new log …");
+  log.add_option("--copy", arguments.channels, "… the messages of these channels that can be read")
       .needs(to);
-  log.callback([arguments] { run_log(*arguments); });
 }
 
 }  // namespace bodyschema

@@ -1,9 +1,7 @@
 #include <fmt/format.h>
 
 #include <algorithm>
-#include <cmath>
 #include <iostream>
-#include <memory>
 #include <optional>
 #include <stdexcept>
 #include <string>
@@ -106,9 +104,9 @@ Method method_of(const std::string& name, const AdaptationOptions& options,
 
 /// Whether any of the parts of the schema is seen.
 bool shows_any_part(const std::vector<ActionPoseSample>& samples, const BodySchema& schema) {
-  return std::any_of(samples.begin(), samples.end(), [&](const ActionPoseSample& sample) {
-    return std::any_of(sample.parts.begin(), sample.parts.end(),
-                       [&](const auto& seen) { return schema.has_part(seen.part); });
+  return std::ranges::any_of(samples, [&](const ActionPoseSample& sample) {
+    return std::ranges::any_of(sample.parts,
+                               [&](const auto& seen) { return schema.has_part(seen.part); });
   });
 }
 
@@ -168,23 +166,21 @@ void run_monitor(const MonitorArguments& arguments) {
 }  // namespace
 
 void add_monitor_command(Arguments console) {
-  const auto arguments = std::make_shared<MonitorArguments>();
-  Arguments monitor = console.add_subcommand(
-      "monitor", "Keep a schema true over a recording in which the body changes");
-  monitor.add_option("SCHEMA", arguments->schema, "Schema file to start from").required();
-  monitor.add_option("SAMPLES", arguments->samples, "Recording (LCM log or CSV)").required();
-  monitor.add_option("--out", arguments->out, "Write the schema as it is in the end to this file");
-  monitor.add_option("--evaluate", arguments->evaluate,
+  auto [monitor, arguments] = console.add_command(
+      "monitor", "Keep a schema true over a recording in which the body changes", run_monitor);
+  monitor.add_option("SCHEMA", arguments.schema, "Schema file to start from").required();
+  monitor.add_option("SAMPLES", arguments.samples, "Recording (LCM log or CSV)").required();
+  monitor.add_option("--out", arguments.out, "Write the schema as it is in the end to this file");
+  monitor.add_option("--evaluate", arguments.evaluate,
                      "Compare the schema with this recording after every sample");
-  add_noise(monitor, arguments->noise);
+  add_noise(monitor, arguments.noise);
   monitor
       .add_option(
-          "--method", arguments->method,
+          "--method", arguments.method,
           "evidence, or the chapter's procedure: a window of 15, 3 sigma (its own, or --noise)")
       .one_of({"evidence", "chapter"})
       .capture_default_str();
-  monitor.add_flag("--json", arguments->json, "Print one JSON line an event (and a sample)");
-  monitor.callback([arguments] { run_monitor(*arguments); });
+  monitor.add_flag("--json", arguments.json, "Print one JSON line an event (and a sample)");
 }
 
 }  // namespace bodyschema

@@ -4,7 +4,6 @@
 #include <filesystem>
 #include <fstream>
 #include <iostream>
-#include <memory>
 #include <stdexcept>
 
 #include "common/bus/convert.h"
@@ -12,7 +11,6 @@
 #include "common/bus/rig_door.h"
 #include "common/config/rig.h"
 #include "common/estimation/evaluation.h"
-#include "common/geometry/angle.h"
 #include "common/text/pose_text.h"
 #include "processes/console/commands/commands.h"
 #include "processes/console/commands/files.h"
@@ -78,7 +76,7 @@ void run_learn(const LearnArguments& arguments) {
   check_out(arguments.out, {arguments.samples});
   const std::vector<ActionPoseSample> training = recording.training();
   const auto shows_root = [&](const auto& sample) { return sample.find(*options.root); };
-  if (options.root && std::none_of(training.begin(), training.end(), shows_root))
+  if (options.root && std::ranges::none_of(training, shows_root))
     throw std::invalid_argument(
         fmt::format("--root: part {} is never seen in {}", *options.root, arguments.samples));
   const LearnResult result = arguments.method == "chapter"
@@ -192,8 +190,7 @@ void run_rig(const RigArguments& arguments) {
   if (!check.problems.empty())
     throw std::runtime_error(fmt::format("{}", fmt::join(check.problems, "\n")));
   const std::vector<int> parts = load_markers(folder).parts();
-  if (arguments.hidden_part &&
-      !std::binary_search(parts.begin(), parts.end(), *arguments.hidden_part))
+  if (arguments.hidden_part && !std::ranges::binary_search(parts, *arguments.hidden_part))
     throw std::invalid_argument(
         fmt::format("--hide: {} has no part {}", folder.string(), *arguments.hidden_part));
   if (!arguments.initial.empty()) RigDoor(folder).load_initial_schema(arguments.initial);
@@ -210,66 +207,58 @@ void run_rig(const RigArguments& arguments) {
 }  // namespace
 
 void add_offline_commands(Arguments console) {
-  const auto learning = std::make_shared<LearnArguments>();
-  Arguments learn =
-      console.add_subcommand("learn", "Learn a body schema from a recording (LCM log or CSV)");
-  learn.add_option("SAMPLES", learning->samples, "Recording; - reads stdin").required();
-  learn.add_option("--out", learning->out, "Write the schema to this file");
-  learn.add_option("--root", learning->root, "Root part; the lowest id if not given");
-  add_noise(learn, learning->noise, "; estimated if neither this nor the recording says it");
+  auto [learn, learning] = console.add_command(
+      "learn", "Learn a body schema from a recording (LCM log or CSV)", run_learn);
+  learn.add_option("SAMPLES", learning.samples, "Recording; - reads stdin").required();
+  learn.add_option("--out", learning.out, "Write the schema to this file");
+  learn.add_option("--root", learning.root, "Root part; the lowest id if not given");
+  add_noise(learn, learning.noise, "; estimated if neither this nor the recording says it");
   learn
-      .add_option("--method", learning->method,
+      .add_option("--method", learning.method,
                   "screw, or chapter: matrix GPs, and thresholds on mean errors at three times the "
                   "noise, for comparison")
       .one_of({"screw", "chapter"});
-  learn.add_flag("--json", learning->json, "Print JSON");
-  learn.callback([learning] { run_learn(*learning); });
+  learn.add_flag("--json", learning.json, "Print JSON");
 
-  const auto predicting = std::make_shared<SchemaArguments>();
-  Arguments predict = console.add_subcommand(
-      "predict", "A schema's predictions: of one action, or compared with a recording");
-  predict.add_option("SCHEMA", predicting->schema, "Schema file").required();
-  predict.add_option("SAMPLES", predicting->samples, "Recording");
-  predict.add_option("--action", predicting->action,
+  auto [predict, predicting] = console.add_command(
+      "predict", "A schema's predictions: of one action, or compared with a recording",
+      run_predict);
+  predict.add_option("SCHEMA", predicting.schema, "Schema file").required();
+  predict.add_option("SAMPLES", predicting.samples, "Recording");
+  predict.add_option("--action", predicting.action,
                      "Instead of SAMPLES: a value for each signal, in the schema's order");
-  predict.add_option("--out", predicting->out,
+  predict.add_option("--out", predicting.out,
                      "Write the prediction for each sample and part to this CSV file");
-  predict.add_flag("--json", predicting->json, "Print JSON");
-  predict.callback([predicting] { run_predict(*predicting); });
+  predict.add_flag("--json", predicting.json, "Print JSON");
 
-  const auto showing = std::make_shared<SchemaArguments>();
-  Arguments show = console.add_subcommand("show", "Print a schema file");
-  show.add_option("SCHEMA", showing->schema, "Schema file").required();
-  show.add_flag("--json", showing->json, "Print JSON");
-  show.callback([showing] { run_show(*showing); });
+  auto [show, showing] = console.add_command("show", "Print a schema file", run_show);
+  show.add_option("SCHEMA", showing.schema, "Schema file").required();
+  show.add_flag("--json", showing.json, "Print JSON");
 
-  const auto checking = std::make_shared<RigArguments>();
-  Arguments rig = console.add_subcommand(
+  auto [rig, checking] = console.add_command(
       "rig",
       "Check every file of a rig by its process's own reader, and against the others; print its "
-      "network (kind, bus, images, this host, its processes) and what it has");
-  rig.add_option("RIG", checking->rig, "Folder, or name of one in config/").required();
-  rig.add_option("--hide", checking->hidden_part, "A part that is to be hidden: is there one?");
-  rig.add_option("--group", checking->group, "All processes; each must run on exactly one host");
-  rig.add_option("--host", checking->host, "Host of network.yaml; this machine if not given");
-  rig.add_option("--initial", checking->initial, "A schema to begin with: is it of this rig?");
-  rig.callback([checking] { run_rig(*checking); });
+      "network (kind, bus, images, this host, its processes) and what it has",
+      run_rig);
+  rig.add_option("RIG", checking.rig, "Folder, or name of one in config/").required();
+  rig.add_option("--hide", checking.hidden_part, "A part that is to be hidden: is there one?");
+  rig.add_option("--group", checking.group, "All processes; each must run on exactly one host");
+  rig.add_option("--host", checking.host, "Host of network.yaml; this machine if not given");
+  rig.add_option("--initial", checking.initial, "A schema to begin with: is it of this rig?");
 }
 
 void add_engineer_command(Arguments console) {
-  const auto arguments = std::make_shared<EngineerArguments>();
-  Arguments engineer = console.add_subcommand(
-      "engineer", "A schema from a URDF and where the parts are on its links");
-  engineer.add_option("URDF", arguments->urdf, "The robot").required();
-  engineer.add_option("PLACEMENT", arguments->placement, "YAML: root, signals, parts on links")
+  auto [engineer, arguments] = console.add_command(
+      "engineer", "A schema from a URDF and where the parts are on its links", run_engineer);
+  engineer.add_option("URDF", arguments.urdf, "The robot").required();
+  engineer.add_option("PLACEMENT", arguments.placement, "YAML: root, signals, parts on links")
       .required();
   engineer
-      .add_option("--samples", arguments->samples,
+      .add_option("--samples", arguments.samples,
                   "A recording that shows where the root stands in the camera's frame")
       .required();
-  engineer.add_option("--out", arguments->out, "Write the schema to this file").required();
-  engineer.add_flag("--json", arguments->json, "Print JSON");
-  engineer.callback([arguments] { run_engineer(*arguments); });
+  engineer.add_option("--out", arguments.out, "Write the schema to this file").required();
+  engineer.add_flag("--json", arguments.json, "Print JSON");
 }
 
 }  // namespace bodyschema

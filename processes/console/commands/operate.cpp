@@ -2,7 +2,6 @@
 
 #include <algorithm>
 #include <cmath>
-#include <functional>
 #include <iostream>
 #include <iterator>
 #include <memory>
@@ -44,11 +43,11 @@ void run_target(const OperateArguments& arguments) {
                                                                      : pose_target_t::KIND_POSE);
   target.target_tag = arguments.tag.value_or(0);
   target.target_part = arguments.part;
-  std::copy(arguments.position_m.begin(), arguments.position_m.end(), target.position_m);
+  std::ranges::copy(arguments.position_m, target.position_m);
   if (!arguments.orientation.empty()) {
     const Eigen::Quaterniond q = unit_quaternion("--orientation", arguments.orientation);
     const double wxyz[] = {q.w(), q.x(), q.y(), q.z()};
-    std::copy(std::begin(wxyz), std::end(wxyz), target.orientation_wxyz);
+    std::ranges::copy(wxyz, target.orientation_wxyz);
   }
   target.tolerance_m = arguments.tolerance_m;
   target.tolerance_rad = arguments.tolerance_deg * kDegree;
@@ -61,13 +60,7 @@ void run_target(const OperateArguments& arguments) {
       target, std::llround(arguments.timeout_s * 1e6),
       {.m = arguments.tolerance_m > 0 ? arguments.tolerance_m : kSeenNear_m,
        .rad = (arguments.tolerance_deg > 0 ? arguments.tolerance_deg : kSeenNear_deg) * kDegree});
-  session.follow(follower);
-  control_status_t status = follower.status();
-  if (follower.end() == TargetFollower::End::kInterrupted)
-    status.why = "interrupted; " + session.withdraw(follower);
-  if (follower.end() == TargetFollower::End::kTimedOut)
-    status.why = fmt::format("no end within {} s; {}; {}", arguments.timeout_s,
-                             follower.diagnosis(), session.withdraw(follower));
+  const control_status_t status = session.follow_to_end(follower, arguments.timeout_s);
   std::cout << (arguments.json ? target_json(status, follower.end()).dump()
                                : fmt::format("{}{} ({})", ending(follower.end(), status),
                                              status.why, course_text(status)))

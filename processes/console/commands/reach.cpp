@@ -1,11 +1,9 @@
 #include <fmt/format.h>
 
 #include <cmath>
-#include <memory>
 #include <string>
 #include <vector>
 
-#include "common/geometry/angle.h"
 #include "processes/console/commands/commands.h"
 #include "processes/console/commands/files.h"
 #include "processes/console/views/prediction_view.h"
@@ -73,23 +71,21 @@ void run_reach(const ReachArguments& arguments) {
 }  // namespace
 
 void add_reach_command(Arguments console) {
-  const auto arguments = std::make_shared<ReachArguments>();
-  Arguments reach = console.add_subcommand(
-      "reach", "An action that brings a part to a pose by a schema, or the nearest");
-  reach.add_option("SCHEMA", arguments->schema, "Schema file").required();
-  reach.add_option("--part", arguments->part, "Which part").required();
-  reach.add_option("--position", arguments->position, "In the root's frame [m]")
+  auto [reach, arguments] = console.add_command(
+      "reach", "An action that brings a part to a pose by a schema, or the nearest", run_reach);
+  reach.add_option("SCHEMA", arguments.schema, "Schema file").required();
+  reach.add_option("--part", arguments.part, "Which part").required();
+  reach.add_option("--position", arguments.position, "In the root's frame [m]")
       .expected(3)
       .type_name("X Y Z")
       .required();
-  reach.add_option("--orientation", arguments->orientation, "Unit quaternion, in the root's frame")
+  reach.add_option("--orientation", arguments.orientation, "Unit quaternion, in the root's frame")
       .expected(4)
       .type_name("W X Y Z");
-  reach.add_option("--from", arguments->from,
+  reach.add_option("--from", arguments.from,
                    "The action that it begins at, a value for each signal; of several answers one "
                    "near it is found first; the middle of the ranges if not given");
-  reach.add_flag("--json", arguments->json, "Print JSON");
-  reach.callback([arguments] { run_reach(*arguments); });
+  reach.add_flag("--json", arguments.json, "Print JSON");
 }
 
 }  // namespace bodyschema

@@ -4,7 +4,6 @@
 
 #include <filesystem>
 #include <iostream>
-#include <memory>
 #include <stdexcept>
 
 #include "common/bus/channels.h"
@@ -124,7 +123,15 @@ void write_urdf_and_print(const RefineArguments& arguments, const Refinement& re
                                       arguments.urdf, placement))));
 }
 
-void run_refine(const RefineArguments& arguments) {
+void run_refine(const RefineArguments& given) {
+  RefineArguments arguments = given;
+  if (!arguments.structure.empty()) {
+    if (!arguments.samples.empty()) refuse_argument("SCHEMA", "expected none with --structure");
+    std::swap(arguments.schema, arguments.samples);
+  } else if (arguments.schema.empty()) {
+    refuse_argument("SCHEMA", "expected, or --structure");
+  }
+  if (arguments.samples.empty()) refuse_argument("SAMPLES", "expected");
   if (!arguments.proposed.empty() && !arguments.placements && !arguments.intrinsics)
     refuse_argument("--proposed", "expected with --placements or --intrinsics");
   if (!arguments.elastic.empty() && (arguments.placements || arguments.intrinsics))
@@ -161,53 +168,41 @@ void run_refine(const RefineArguments& arguments) {
 }  // namespace
 
 void add_refine_command(Arguments console) {
-  const auto arguments = std::make_shared<RefineArguments>();
-  Arguments refine =
-      console.add_subcommand("refine", "Fit all parameters of a schema at once to a recording");
-  refine.add_option("SCHEMA", arguments->schema,
+  auto [refine, arguments] = console.add_command(
+      "refine", "Fit all parameters of a schema at once to a recording", run_refine);
+  refine.add_option("SCHEMA", arguments.schema,
                     "Schema file: where to begin; left out with --structure");
-  refine.add_option("SAMPLES", arguments->samples, "Recording (LCM log or CSV)");
-  Argument structure = refine.add_option("--structure", arguments->structure,
+  refine.add_option("SAMPLES", arguments.samples, "Recording (LCM log or CSV)");
+  Argument structure = refine.add_option("--structure", arguments.structure,
                                          "Begin with the robot of this URDF, as engineer does");
   Argument placement =
-      refine.add_option("--placement", arguments->placement,
+      refine.add_option("--placement", arguments.placement,
                         "YAML: root, signals, parts on links of that URDF, as engineer reads it");
   structure.needs(placement);
   placement.needs(structure);
   refine
-      .add_option("--elastic", arguments->elastic,
+      .add_option("--elastic", arguments.elastic,
                   "Also fit joints that give way to gravity, by the masses of that URDF; write the "
                   "schema of the unloaded robot to this file")
       .needs(structure);
-  refine.add_option("--rig", arguments->rig,
+  refine.add_option("--rig", arguments.rig,
                     "Folder of the rig that the samples are of, or name of one in config/: its "
                     "tags and lens; the run's own if not given");
-  refine.add_flag("--placements", arguments->placements,
+  refine.add_flag("--placements", arguments.placements,
                   "Also where the tags sit on their parts, and their sizes, by the tags' corners");
-  refine.add_flag("--intrinsics", arguments->intrinsics,
-                  "Also focal length, centre and distortion");
-  refine.add_option("--out", arguments->out, "Write the refined schema to this file").required();
-  refine.add_option("--proposed", arguments->proposed,
+  refine.add_flag("--intrinsics", arguments.intrinsics, "Also focal length, centre and distortion");
+  refine.add_option("--out", arguments.out, "Write the refined schema to this file").required();
+  refine.add_option("--proposed", arguments.proposed,
                     "Write markers.yaml and camera_info.yaml as found into this folder");
-  const Argument urdf = refine.add_option("--urdf", arguments->urdf,
+  const Argument urdf = refine.add_option("--urdf", arguments.urdf,
                                           "Write the refined schema as a URDF to this file");
   refine
-      .add_option("--urdf-placement", arguments->urdf_placement,
+      .add_option("--urdf-placement", arguments.urdf_placement,
                   "Write where signals and parts are on the URDF to this YAML file, as engineer "
                   "reads it")
       .needs(urdf);
-  add_noise(refine, arguments->noise, "; of poses");
-  refine.add_flag("--json", arguments->json, "Print JSON");
-  refine.callback([arguments] {
-    if (!arguments->structure.empty()) {
-      if (!arguments->samples.empty()) refuse_argument("SCHEMA", "expected none with --structure");
-      std::swap(arguments->schema, arguments->samples);
-    } else if (arguments->schema.empty()) {
-      refuse_argument("SCHEMA", "expected, or --structure");
-    }
-    if (arguments->samples.empty()) refuse_argument("SAMPLES", "expected");
-    run_refine(*arguments);
-  });
+  add_noise(refine, arguments.noise, "; of poses");
+  refine.add_flag("--json", arguments.json, "Print JSON");
 }
 
 }  // namespace bodyschema

@@ -1,4 +1,3 @@
-#include <memory>
 #include <stdexcept>
 
 #include "processes/console/commands/commands.h"

@@ -1,14 +1,10 @@
-#include <fmt/format.h>
 #include <poll.h>
 #include <sys/resource.h>
 
 #include <algorithm>
 #include <chrono>
 #include <filesystem>
-#include <fstream>
 #include <iostream>
-#include <memory>
-#include <nlohmann/json.hpp>
 #include <stdexcept>
 #include <vector>
 
@@ -18,6 +14,7 @@
 #include "processes/console/log_follower.h"
 #include "processes/console/picture.h"
 #include "processes/console/report/report_page.h"
+#include "processes/console/rig_check.h"
 #include "processes/console/run_record.h"
 #include "processes/structure_learner/recording/recording.h"
 
@@ -113,19 +110,16 @@ class Source {
         found.push_back(entry.path());
     }
     // images.lcmlog.NN before run.lcmlog.NN; each in the order of its numbers.
-    std::sort(found.begin(), found.end());
+    std::ranges::sort(found);
     found.insert(found.begin(), path_ / "samples.lcmlog");
     return found;
   }
 
   std::string title() const {
-    std::string name = fs::canonical(path_).filename().string();
+    const std::string name = fs::canonical(path_).filename().string();
     // Written at the end of a run; a report does without.
-    std::ifstream stream(path_ / "result.json");
-    const auto result = nlohmann::json::parse(stream, nullptr, false);
-    if (is_folder_ && result.is_object() && result.contains("rig") && result["rig"].is_string())
-      name = result["rig"].get<std::string>() + " · " + name;
-    return name;
+    const std::string rig = is_folder_ ? rig_name_of(path_) : "";
+    return rig.empty() ? name : rig + " · " + name;
   }
 
   std::optional<std::string> picture() const {
@@ -197,18 +191,16 @@ void run_report(const ReportArguments& arguments) {
 }  // namespace
 
 void add_report_command(Arguments console) {
-  const auto arguments = std::make_shared<ReportArguments>();
-  Arguments report =
-      console.add_subcommand("report", "What a run tells, as one HTML file that needs no network");
-  report.add_option("RUN", arguments->source, "Run folder, or an LCM log with SAMPLEs")
+  auto [report, arguments] = console.add_command(
+      "report", "What a run tells, as one HTML file that needs no network", run_report);
+  report.add_option("RUN", arguments.source, "Run folder, or an LCM log with SAMPLEs")
       .envname("BODYSCHEMA_RUN")
       .required();
-  report.add_option("--out", arguments->out, "The file; default: report.html in the run folder");
-  report.add_flag("--follow", arguments->follow,
+  report.add_option("--out", arguments.out, "The file; default: report.html in the run folder");
+  report.add_flag("--follow", arguments.follow,
                   "Write it again while the run goes on, until SIGTERM");
-  report.add_flag("--growing", arguments->grows,
+  report.add_flag("--growing", arguments.grows,
                   "The run goes on: an event that is cut off at the end is still being written");
-  report.callback([arguments] { run_report(*arguments); });
 }
 
 }  // namespace bodyschema

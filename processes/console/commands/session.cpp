@@ -9,6 +9,8 @@
 
 #include "common/bus/arguments.h"
 #include "common/bus/channels.h"
+#include "common/bus/convert.h"
+#include "common/bus/rest_position.h"
 #include "common/text/clock.h"
 #include "common/text/text.h"
 #include "processes/console/hint.h"
@@ -51,25 +53,27 @@ pose_target_t make_target(std::int8_t kind) {
   return target;
 }
 
-template <class Message>
-void Session::for_anybody(const Channel<Message>& channel) {
-  bus.subscribe(channel, [this](const Message&) { heard_us_ = clock_us(); });
+void Heard::listen(Bus& bus) {
+  bus.subscribe(kBodySchema, [this](const body_schema_t& m) { schema = from_message(m); });
+  bus.subscribe(kMotionStatus, [this](const motion_status_t& m) { motion = m; });
+}
+
+std::optional<Eigen::VectorXd> Heard::position() const {
+  if (!schema || !motion) return std::nullopt;
+  return rest_position(*motion, schema->signals.size());
 }
 
 Session::Session(const std::string& url) : bus(url, url), url_(url), start_us_(clock_us()) {
   catch_interruption();
-  for_anybody(kProcessInfo);
-  for_anybody(kMotionStatus);
-  for_anybody(kControlStatus);
-  bus.subscribe(kControlStatus, [this](const auto& m) {
-    if (follower_) follower_->on_control_status(m);
-  });
-  bus.subscribe(kProcessInfo, [this](const auto& m) {
-    if (follower_) follower_->on_process_info(m);
-  });
-  bus.subscribe(kMotionStatus, [this](const auto& m) {
-    if (follower_) follower_->on_motion_status(m);
-  });
+  const auto hear = [this](const auto& channel, auto on_message) {
+    bus.subscribe(channel, [this, on_message](const auto& m) {
+      heard_us_ = clock_us();
+      if (follower_) (follower_->*on_message)(m);
+    });
+  };
+  hear(kControlStatus, &TargetFollower::on_control_status);
+  hear(kProcessInfo, &TargetFollower::on_process_info);
+  hear(kMotionStatus, &TargetFollower::on_motion_status);
 }
 
 void Session::turn(std::int64_t most_us, const std::function<bool()>& is_done,
@@ -94,6 +98,18 @@ void Session::follow(TargetFollower& follower, const std::function<void(std::int
     expect_company();
   }
   follower_ = nullptr;
+}
+
+control_status_t Session::follow_to_end(TargetFollower& follower, double timeout_s,
+                                        const std::string& prefix) {
+  follow(follower, nullptr, prefix);
+  control_status_t status = follower.status();
+  if (follower.end() == TargetFollower::End::kInterrupted)
+    status.why = "interrupted; " + withdraw(follower);
+  if (follower.end() == TargetFollower::End::kTimedOut)
+    status.why = fmt::format("no end within {} s; {}; {}", timeout_s, follower.diagnosis(),
+                             withdraw(follower));
+  return status;
 }
 
 bool Session::is_in_company() const { return heard_us_ >= 0 && clock_us() - heard_us_ < kGone_us; }

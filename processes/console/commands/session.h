@@ -2,9 +2,11 @@
 
 #include <cstdint>
 #include <functional>
+#include <optional>
 #include <string>
 
 #include "common/bus/bus.h"
+#include "common/schema/body_schema.h"
 #include "processes/console/target_follower.h"
 
 namespace bodyschema {
@@ -25,6 +27,17 @@ std::function<std::string(const std::string&)> within(double lowest, double high
 /// Of the console, as of now, without a part.
 pose_target_t make_target(std::int8_t kind);
 
+/// The newest that was heard of a group.
+struct Heard {
+  std::optional<BodySchema> schema;
+  std::optional<motion_status_t> motion;
+
+  /// Hears what comes on the bus, as long as both live.
+  void listen(Bus& bus);
+  /// Where the arm rests, once that is known.
+  std::optional<Eigen::VectorXd> position() const;
+};
+
 /// The bus of a command that somebody must answer: whoever lives there says so once a second.
 class Session {
  public:
@@ -39,8 +52,10 @@ class Session {
   void follow(TargetFollower& follower, const std::function<void(std::int64_t)>& on_turn = nullptr,
               const std::string& prefix = "");
 
-  /// Makes the controller drop what `follower` follows no longer; says what became of it.
-  std::string withdraw(const TargetFollower& follower);
+  /// The same of a target that has `timeout_s`. Where it was interrupted or timed out it is
+  /// withdrawn. Returns its last status, with why it ended.
+  control_status_t follow_to_end(TargetFollower& follower, double timeout_s,
+                                 const std::string& prefix = "");
 
   /// @throws std::runtime_error with what to type once nobody can be there, or no longer.
   void expect_company() const;
@@ -50,8 +65,8 @@ class Session {
   Bus bus;
 
  private:
-  template <class Message>
-  void for_anybody(const Channel<Message>& channel);
+  /// Makes the controller drop what `follower` follows no longer; says what became of it.
+  std::string withdraw(const TargetFollower& follower);
 
   const std::string url_;
   const std::int64_t start_us_;

@@ -3,7 +3,6 @@
 #include <unistd.h>
 
 #include <chrono>
-#include <memory>
 #include <set>
 #include <stdexcept>
 #include <string>
@@ -70,18 +69,17 @@ void run_status(const StatusArguments& arguments) {
 }  // namespace
 
 void add_status_command(Arguments console) {
-  const auto arguments = std::make_shared<StatusArguments>();
-  Arguments status = console.add_subcommand("status", "How the group on the bus is");
-  status.add_option("--in", arguments->in, "URL of the bus").capture_default_str();
-  status.add_option("--images", arguments->images,
+  auto [status, arguments] =
+      console.add_command("status", "How the group on the bus is", run_status);
+  status.add_option("--in", arguments.in, "URL of the bus").capture_default_str();
+  status.add_option("--images", arguments.images,
                     "URL of the images' bus; default: the next port of --in");
-  status.add_option("--processes", arguments->processes,
+  status.add_option("--processes", arguments.processes,
                     "Processes that should be heard of; says which is not");
-  status.add_option("--seconds", arguments->seconds, "How long to listen [s]")
+  status.add_option("--seconds", arguments.seconds, "How long to listen [s]")
       .in_range(0.1, 3600.0)
       .capture_default_str();
-  status.add_flag("--json", arguments->json, "Print JSON");
-  status.callback([arguments] { run_status(*arguments); });
+  status.add_flag("--json", arguments.json, "Print JSON");
 }
 
 }  // namespace bodyschema

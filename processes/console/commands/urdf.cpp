@@ -1,7 +1,6 @@
 #include <fmt/format.h>
 
 #include <iostream>
-#include <memory>
 #include <stdexcept>
 #include <string>
 
@@ -57,19 +56,18 @@ Json urdf_json(const UrdfModel& model, const std::string& urdf) {
 }
 
 void add_urdf_command(Arguments console) {
-  const auto arguments = std::make_shared<UrdfArguments>();
-  Arguments urdf = console.add_subcommand(
+  auto [urdf, arguments] = console.add_command(
       "urdf",
-      "A URDF from a schema, and where signals and parts are on it; the inverse of engineer");
-  urdf.add_option("SCHEMA", arguments->schema, "Schema file").required();
-  urdf.add_option("--out", arguments->out, "Write the URDF to this file").required();
-  urdf.add_option("--placement", arguments->placement,
+      "A URDF from a schema, and where signals and parts are on it; the inverse of engineer",
+      run_urdf);
+  urdf.add_option("SCHEMA", arguments.schema, "Schema file").required();
+  urdf.add_option("--out", arguments.out, "Write the URDF to this file").required();
+  urdf.add_option("--placement", arguments.placement,
                   "Write signals and parts to this YAML file, as engineer reads it")
       .required();
-  urdf.add_flag("--nominal", arguments->nominal,
+  urdf.add_flag("--nominal", arguments.nominal,
                 "Write the nearest pure joint for what a URDF does not have: helical joints, bent "
                 "commands, Gaussian processes");
-  urdf.callback([arguments] { run_urdf(*arguments); });
 }
 
 }  // namespace bodyschema

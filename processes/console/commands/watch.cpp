@@ -12,7 +12,6 @@
 #include <fstream>
 #include <iostream>
 #include <iterator>
-#include <memory>
 #include <set>
 #include <system_error>
 #include <utility>
@@ -53,8 +52,7 @@ struct WatchArguments {
   double speed = 0;
 };
 
-/// Plays a recording onto the bus with lcm-logplayer: what the learning half of the group needs,
-/// never a command.
+/// Plays onto the bus, with lcm-logplayer, what learning needs of a recording.
 class LogPlayer {
  public:
   ~LogPlayer() {
@@ -108,8 +106,7 @@ void for_each_readable(const std::string& log, const std::function<void(const Lo
   }
 }
 
-/// The body schema is the monitor's where it accepted one; a schema does not carry its outliers, so
-/// learning again from the same samples names them.
+/// The schema is the monitor's where it accepted one; its outliers are found by learning again.
 void learn_again(const RunWatch& watch, const WatchArguments& arguments, RunResult* result) {
   const StructureLearnerConfig config = StructureLearnerConfig::load(
       std::filesystem::path(arguments.rig_folder) / "structure_learner.yaml");
@@ -119,7 +116,7 @@ void learn_again(const RunWatch& watch, const WatchArguments& arguments, RunResu
   const auto shows_root = [&](const auto& sample) {
     return options.root && sample.find(*options.root);
   };
-  if (std::none_of(training.begin(), training.end(), shows_root)) options.root.reset();
+  if (std::ranges::none_of(training, shows_root)) options.root.reset();
   const LearnResult learned = learn(config.signals, training, options);
   result->schema = watch.schema().value_or(learned.schema);
   result->outliers = learned.outliers;
@@ -136,8 +133,8 @@ std::optional<SampleGoal> goal_of(const WatchArguments& arguments) {
   return SampleGoal{MotorBabblerConfig::load(file).stop.max_samples, false};
 }
 
-/// Tells once of each process that ended (it is heard again and again as it starts). @throws
-/// std::runtime_error if the rig's files are to blame: those do not mend themselves.
+/// Tells once of each process that ended. @throws std::runtime_error if the rig's files are to
+/// blame: those do not mend themselves.
 void tell_of_failures(const WatchArguments& arguments, std::set<std::string>* told) {
   for (const std::string& name : arguments.processes) {
     std::ifstream file(std::filesystem::path(arguments.out) / (name + ".log"));
@@ -352,31 +349,30 @@ void run_watch(const WatchArguments& arguments) {
 }  // namespace
 
 void add_watch_command(Arguments console) {
-  const auto arguments = std::make_shared<WatchArguments>();
-  Arguments watch = console.add_subcommand("watch", "Follow a learning run and sum it up");
-  watch.add_option("--in", arguments->in, "URL of the bus");
-  watch.add_option("--images", arguments->images, "URL of the images' bus");
-  watch.add_option("--rig-folder", arguments->rig_folder, "The rig's configuration").required();
-  watch.add_option("--rig", arguments->rig, "Name of the rig").required();
-  watch.add_option("--out", arguments->out, "Folder for result.json and detections.png").required();
-  watch.add_option("--seed", arguments->seed, "Seed of the run, for the record");
-  watch.add_option("--samples", arguments->samples,
+  auto [watch, arguments] =
+      console.add_command("watch", "Follow a learning run and sum it up", run_watch);
+  watch.add_option("--in", arguments.in, "URL of the bus");
+  watch.add_option("--images", arguments.images, "URL of the images' bus");
+  watch.add_option("--rig-folder", arguments.rig_folder, "The rig's configuration").required();
+  watch.add_option("--rig", arguments.rig, "Name of the rig").required();
+  watch.add_option("--out", arguments.out, "Folder for result.json and detections.png").required();
+  watch.add_option("--seed", arguments.seed, "Seed of the run, for the record");
+  watch.add_option("--samples", arguments.samples,
                    "How many samples the run is to have; default: at most as many as the rig's "
                    "motor_babbler.yaml says");
-  watch.add_option("--patience-s", arguments->patience_s,
+  watch.add_option("--patience-s", arguments.patience_s,
                    "Give up after so long without a new sample or proposal [s]");
-  watch.add_option("--processes", arguments->processes,
+  watch.add_option("--processes", arguments.processes,
                    "Processes that should be heard of; says who is silent when nothing goes on");
   const Argument replay = watch.add_option(
-      "--replay", arguments->replay, "The recording that is replayed; then there is no babbler");
+      "--replay", arguments.replay, "The recording that is replayed; then there is no babbler");
   watch
-      .add_option("--speed", arguments->speed,
+      .add_option("--speed", arguments.speed,
                   "Play the recording so many times faster than it was; 0: somebody else does")
       .needs(replay);
-  watch.add_option("--replay-from", arguments->replay_from, "What is played, as `log` says")
+  watch.add_option("--replay-from", arguments.replay_from, "What is played, as `log` says")
       .one_of({kMarkerPoses.name, kSample.name})
       .needs(replay);
-  watch.callback([arguments] { run_watch(*arguments); });
 }
 
 }  // namespace bodyschema

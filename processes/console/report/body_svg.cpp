@@ -4,7 +4,6 @@
 #include <cmath>
 #include <map>
 #include <set>
-#include <utility>
 
 #include "processes/console/hint.h"
 #include "processes/console/names.h"

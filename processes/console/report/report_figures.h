@@ -41,9 +41,9 @@ struct VersionErrors {
   std::optional<double> end_effector_m;  ///< median of the end effector
 };
 
-/// At most `most` versions of each body, the last one included, each on all held-out samples of
-/// that body; of one that changed also the version which stood when it did. A version that connects
-/// no part, or whose signals are others, is left out.
+/// At most `most` versions of each body, the last one included, and that which stood before it,
+/// each on all held-out samples of that body; without those that connect no part or have other
+/// signals.
 std::vector<VersionErrors> version_errors(const std::map<std::int64_t, BodySchema>& versions,
                                           const std::vector<ActionPoseSample>& held_out,
                                           const std::vector<BodyMark>& marks,
@@ -52,11 +52,10 @@ std::vector<VersionErrors> version_errors(const std::map<std::int64_t, BodySchem
 std::optional<Plot> version_plot(const std::vector<VersionErrors>& versions,
                                  const std::vector<BodyMark>& marks);
 
-/// A local model over one of its signals (the chapter's Fig. 5). The other signal of an edge of two
-/// is held in the middle of its range; observations are carried there by the model, which keeps
-/// their residuals. The noise is the mean of the observations' own covariances, the schema's where
-/// they have none. Components: x y z [mm] of `to` in `from`, and the rotation vector [deg] from the
-/// pose in the middle of the range.
+/// A local model over one of its signals (the chapter's Fig. 5), other signals in the middle of
+/// their ranges; observations are carried there by the model, which keeps their residuals. The
+/// noise is the mean of the observations' own covariances, else the schema's. Components: x y z
+/// [mm] of `to` in `from`, and the rotation vector [deg] from the pose in the middle of the range.
 struct EdgeSlice {
   int signal = 0;
   struct Point {

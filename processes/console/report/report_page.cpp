@@ -21,7 +21,6 @@
 #include "processes/console/views/health_view.h"
 #include "processes/console/views/structure_view.h"
 #include "processes/structure_learner/learn.h"
-#include "processes/structure_learner/recording/recording.h"
 
 namespace bodyschema {
 namespace {
@@ -216,11 +215,10 @@ class Page {
     if (worst)
       add("Worst part", millimetres(worst->position_median_m),
           fmt::format("part {}, {}{}", worst->part, degrees(worst->rotation_median_rad), against));
-    if (const auto begin = record_.begin_utime()) {
+    if (const auto begin = record_.begin_utime())
       add("Recorded", duration(record_.duration_s()),
           fmt::format("{:%Y-%m-%d %H:%M}",
                       fmt::gmtime(static_cast<std::time_t>(*begin / 1'000'000))));
-    }
     return items;
   }
 
@@ -367,10 +365,9 @@ class Page {
               fmt::format(", {}, observations carried there",
                           num_signals == 2 ? "the other signal in the middle of its range"
                                            : "the other signals in the middle of their ranges");
-        if (std::isfinite(slice.coverage)) {
+        if (std::isfinite(slice.coverage))
           caption += fmt::format("; {:.0f} % of {} lie within the band", slice.coverage * 100,
                                  counted(std::ssize(slice.observations), "observation"));
-        }
         if (drawn.num_beyond > 0) caption += fmt::format("; {} beyond the axes", drawn.num_beyond);
         if (drawn.num_left_out > 0) caption += fmt::format("; {} not drawn", drawn.num_left_out);
         figures.push_back({{"plot", plot(drawn.plot)}, {"caption", caption}});

@@ -88,10 +88,9 @@ std::string curve_block(const EdgeSlice& slice) {
   std::string block = "$curve << EOD\n";
   for (const EdgeSlice::Point& point : slice.curve) {
     block += number(point.q);
-    for (int c = 0; c < 6; ++c) {
+    for (int c = 0; c < 6; ++c)
       block += fmt::format(" {} {} {}", number(point.mean[c]), number(2 * point.sigma_model[c]),
                            number(2 * point.sigma[c]));
-    }
     block += "\n";
   }
   return block + "EOD\n";
@@ -137,7 +136,7 @@ std::vector<BodyMark> body_marks(const RunRecord& record) {
         if (sample.utime < change.utime) continue;
         std::vector<std::string> added = change.faults;
         std::erase_if(added, [&](const std::string& fault) {
-          return std::find(before.begin(), before.end(), fault) != before.end();
+          return std::ranges::find(before, fault) != before.end();
         });
         add(sample.sample_index, added.empty() ? "repair" : listed(added));
         break;
@@ -196,7 +195,7 @@ std::vector<VersionErrors> version_errors(const std::map<std::int64_t, BodySchem
       }
       if (medians.empty()) continue;
       errors.median_position_m = quantile(medians, 0.5);
-      errors.worst_position_m = *std::max_element(medians.begin(), medians.end());
+      errors.worst_position_m = *std::ranges::max_element(medians);
       result.push_back(errors);
     }
   }
@@ -237,13 +236,12 @@ std::optional<Plot> version_plot(const std::vector<VersionErrors>& versions,
       "2000)\n"
       "set key outside top right horizontal samplen 1.5 textcolor rgb 'black'\n",
       versions.back().num_samples + 1, number(lowest * 0.7e3), number(highest * 1.4e3));
-  for (std::size_t i = 0; i < marks.size(); ++i) {
+  for (std::size_t i = 0; i < marks.size(); ++i)
     script += fmt::format(
         "set arrow {0} from {1}, graph 0 to {1}, graph 1 nohead lw 0.8 dt 2 lc rgb '{2}'\n"
         "set label {3} {4} at {1}, graph 0.97 right rotate by 90 offset 0.6,0 font ',8' "
         "textcolor rgb '{2}'\n",
         i + 1, marks[i].sample, kRed, i + 2, gnuplot_string(marks[i].label));
-  }
   script += fmt::format(
       "plot $errors using 1:3 {0} lc rgb '{1}' title 'worst part', "
       "$errors using 1:2 {0} lc rgb '{2}' title 'median of the parts'",
@@ -267,10 +265,9 @@ std::vector<Plot> load_plots(const std::vector<RunRecord::Process>& processes) {
   for (const RunRecord::Process& process : processes) {
     if (process.load.size() < 2) continue;
     data += fmt::format("$p{} << EOD\n", names.size());
-    for (const RunRecord::Load& load : process.load) {
+    for (const RunRecord::Load& load : process.load)
       data += fmt::format("{} {} {}\n", number(load.at_s), number(load.cpu_percent),
                           number(load.memory_mb));
-    }
     data += "EOD\n";
     names.push_back(process.newest.process_name);
   }
@@ -283,11 +280,10 @@ std::vector<Plot> load_plots(const std::vector<RunRecord::Process>& processes) {
   for (int column = 2; column <= 3; ++column) {
     std::string plot =
         fmt::format("set ylabel '{}' offset 1\nplot ", column == 2 ? "% of a core" : "memory [MB]");
-    for (std::size_t i = 0; i < names.size(); ++i) {
+    for (std::size_t i = 0; i < names.size(); ++i)
       plot += fmt::format("{}$p{} using 1:{} with lines lw 1.5 lc rgb '{}' dt {} title {}",
                           i ? ", " : "", i, column, kColours[i % std::size(kColours)],
                           i < std::size(kColours) ? 1 : 2, gnuplot_string(names[i]));
-    }
     plots.push_back({.height_px = 220, .script = script + plot + "\n"});
   }
   return plots;

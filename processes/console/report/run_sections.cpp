@@ -78,9 +78,8 @@ Json events_data(const RunRecord& record) {
     return fmt::format("{:.1f} s", seconds(utime - samples.front().utime));
   };
   const auto fault_row = [&](const RunRecord::FaultChange& change) -> Json {
-    const auto first = std::find_if(samples.begin(), samples.end(), [&](const auto& sample) {
-      return sample.utime >= change.utime;
-    });
+    const auto first = std::ranges::find_if(
+        samples, [&](const auto& sample) { return sample.utime >= change.utime; });
     return {{"sample", first == samples.end() ? "–" : std::to_string(first->sample_index)},
             {"time", time(change.utime)},
             {"broken", change.faults.empty() ? "nothing: repaired" : listed(change.faults)}};

@@ -1,5 +1,6 @@
 #include "processes/console/report/template.h"
 
+#include <map>
 #include <stdexcept>
 #include <vector>
 
@@ -63,27 +64,15 @@ std::string render(std::string_view text, const Sections& sections) {
 }  // namespace
 
 std::string escape_html(const std::string& text) {
+  static const std::map<char, const char*> kEntities = {
+      {'&', "&amp;"}, {'<', "&lt;"}, {'>', "&gt;"}, {'"', "&quot;"}, {'\'', "&#39;"}};
   std::string result;
   for (const char c : text) {
-    switch (c) {
-      case '&':
-        result += "&amp;";
-        break;
-      case '<':
-        result += "&lt;";
-        break;
-      case '>':
-        result += "&gt;";
-        break;
-      case '"':
-        result += "&quot;";
-        break;
-      case '\'':
-        result += "&#39;";
-        break;
-      default:
-        result += static_cast<unsigned char>(c) < 0x20 && c != '\n' && c != '\t' ? ' ' : c;
-    }
+    const bool is_control = static_cast<unsigned char>(c) < 0x20 && c != '\n' && c != '\t';
+    if (const auto entity = kEntities.find(c); entity != kEntities.end())
+      result += entity->second;
+    else
+      result += is_control ? ' ' : c;
   }
   return result;
 }

@@ -10,8 +10,7 @@ namespace bodyschema {
 /// `text` for an HTML page: no character of it is markup, control characters are spaces.
 std::string escape_html(const std::string& text);
 
-/// Fills in a mustache template: {{key}} escaped, {{{key}}} as it is, {{.}} the value of the
-/// section,
+/// Fills in a mustache template: {{key}} escaped, {{{key}}} as it is, {{.}} the section's value,
 /// {{#key}}…{{/key}} for each of an array or once, {{^key}}…{{/key}} for nothing. Nothing is null,
 /// false, "" or an empty array; a key that no section around has is null. Not of the standard:
 /// white space around sections stays, and no section stands in one of its own name.

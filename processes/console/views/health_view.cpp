@@ -4,6 +4,7 @@
 
 #include <algorithm>
 
+#include "bodyschema/schema_edge_t.hpp"
 #include "common/bus/cause_names.h"
 #include "common/geometry/angle.h"
 #include "processes/console/hint.h"
@@ -71,9 +72,9 @@ Json finding_json(const finding_t& finding, const std::vector<std::string>& sign
 
 const edge_health_t* health_of(const std::optional<model_health_t>& health, int from, int to) {
   if (!health) return nullptr;
-  const auto found = std::find_if(
-      health->edge_health.begin(), health->edge_health.end(),
-      [&](const auto& edge) { return edge.health_from == from && edge.health_to == to; });
+  const auto found = std::ranges::find_if(health->edge_health, [&](const auto& edge) {
+    return edge.health_from == from && edge.health_to == to;
+  });
   return found == health->edge_health.end() ? nullptr : &*found;
 }
 

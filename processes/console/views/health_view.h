@@ -3,7 +3,6 @@
 #include <string>
 #include <vector>
 
-#include "bodyschema/body_schema_t.hpp"
 #include "bodyschema/model_health_t.hpp"
 #include "processes/console/views/json.h"
 

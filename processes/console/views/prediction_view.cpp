@@ -18,8 +18,6 @@ namespace {
 // What is lost when a command is written as text.
 constexpr double kRounding = 1e-6;
 
-Json deviation(double value, double unit) { return value > 0 ? Json(value / unit) : Json(); }
-
 std::string pose_sd_text(const Noise& sd) {
   if (!(sd.position_m > 0)) return "    not known";
   return fmt::format("{:7.2f} mm {:6.3f}°", sd.position_m * 1e3, sd.rotation_rad / kDegree);
@@ -41,31 +39,27 @@ std::string no_way_text(const BodySchema& schema, int part) {
              : fmt::format("the schema connects no part {} with its root {}", part, schema.root);
 }
 
-std::vector<int> signals_outside(const BodySchema& schema, const Eigen::VectorXd& action) {
+std::vector<int> signals_outside(const BodySchema& schema, const Eigen::VectorXd& action,
+                                 std::optional<int> part) {
+  const std::set<int> moving = part ? moving_signals(schema, *part) : std::set<int>();
   std::vector<int> result;
-  for (Eigen::Index s = 0; s < action.size(); ++s) {
+  for (int s = 0; s < action.size(); ++s) {
     const auto [lower, upper] = schema.signals[static_cast<std::size_t>(s)].known_range();
     const double margin = kRounding * std::max(std::abs(lower), std::abs(upper));
-    if (action(s) < lower - margin || action(s) > upper + margin)
-      result.push_back(static_cast<int>(s));
+    const bool is_outside = action(s) < lower - margin || action(s) > upper + margin;
+    if (is_outside && (!part || moving.contains(s))) result.push_back(s);
   }
   return result;
 }
 
 std::vector<PartPrediction> predict_parts(const BodySchema& schema, const Eigen::VectorXd& action) {
-  const std::vector<int> outside = signals_outside(schema, action);
   std::vector<PartPrediction> result;
   for (const int part : schema.parts) {
     if (part == schema.root) continue;
     const auto predicted = schema.predict(schema.root, part, action, Variance::kOneAction);
     if (!predicted) continue;
-    PartPrediction& p = result.emplace_back();
-    p.part = part;
-    p.X_RB = predicted->X_AB;
-    p.sd = deviations_of(predicted->covariance);
-    const std::set<int> moving = moving_signals(schema, part);
-    std::copy_if(outside.begin(), outside.end(), std::back_inserter(p.outside),
-                 [&](int s) { return moving.contains(s); });
+    result.push_back({part, predicted->X_AB, deviations_of(predicted->covariance),
+                      signals_outside(schema, action, part)});
   }
   return result;
 }
@@ -73,19 +67,16 @@ std::vector<PartPrediction> predict_parts(const BodySchema& schema, const Eigen:
 Json part_json(const BodySchema& schema, const PartPrediction& prediction) {
   return {{"part", prediction.part},
           {"X_RB", pose_json(prediction.X_RB)},
-          {"position_sd_m", deviation(prediction.sd.position_m, 1)},
-          {"rotation_sd_deg", deviation(prediction.sd.rotation_rad, kDegree)},
+          {"position_sd_m", deviation_json(prediction.sd.position_m)},
+          {"rotation_sd_deg", deviation_json(prediction.sd.rotation_rad, kDegree)},
           {"outside_training", signal_names(schema, prediction.outside)}};
 }
 
 Json prediction_json(const BodySchema& schema, const Eigen::VectorXd& action) {
-  Json json = {{"action", Json::object()},
-               {"outside_training", signal_names(schema, signals_outside(schema, action))},
-               {"parts", array_of(predict_parts(schema, action),
-                                  [&](const PartPrediction& p) { return part_json(schema, p); })}};
-  for (std::size_t s = 0; s < schema.signals.size(); ++s)
-    json["action"][schema.signals[s].name] = action(static_cast<Eigen::Index>(s));
-  return json;
+  return {{"action", action_json(schema, action)},
+          {"outside_training", signal_names(schema, signals_outside(schema, action))},
+          {"parts", array_of(predict_parts(schema, action),
+                             [&](const PartPrediction& p) { return part_json(schema, p); })}};
 }
 
 std::string prediction_text(const BodySchema& schema, const Eigen::VectorXd& action) {
@@ -136,8 +127,8 @@ void add_summary(const BodySchema& schema, const PredictionSummary& summary, Jso
   for (Json& json : (*errors)["parts"])
     for (const PredictionSummary::Part& part : summary.parts) {
       if (json["part"] != part.part) continue;
-      json["position_sd_m"] = deviation(part.sd.position_m, 1);
-      json["rotation_sd_deg"] = deviation(part.sd.rotation_rad, kDegree);
+      json["position_sd_m"] = deviation_json(part.sd.position_m);
+      json["rotation_sd_deg"] = deviation_json(part.sd.rotation_rad, kDegree);
       json["outside_training"] = part.num_outside;
     }
 }

@@ -1,6 +1,7 @@
 #pragma once
 
 #include <iosfwd>
+#include <optional>
 #include <set>
 #include <string>
 #include <vector>
@@ -25,8 +26,10 @@ struct PartPrediction {
   std::vector<int> outside;  ///< signals that move the part, beyond what was seen in training
 };
 
-/// Signals beyond what the samples covered that the schema rests on (indices).
-std::vector<int> signals_outside(const BodySchema& schema, const Eigen::VectorXd& action);
+/// Signals beyond what the samples covered that the schema rests on (indices); with a `part` those
+/// that move it.
+std::vector<int> signals_outside(const BodySchema& schema, const Eigen::VectorXd& action,
+                                 std::optional<int> part = std::nullopt);
 
 /// All parts that hang on the root, ascending, without the root. @throws std::invalid_argument if
 /// `action` does not have one value per signal.

@@ -2,7 +2,6 @@
 
 #include <fmt/format.h>
 
-#include <set>
 #include <vector>
 
 #include "common/geometry/angle.h"
@@ -28,14 +27,6 @@ std::vector<int> at_limits(const BodySchema& schema, int part, const Eigen::Vect
   return result;
 }
 
-// Signals that move the part and are where the schema's samples were not.
-std::vector<int> not_covered(const BodySchema& schema, int part, const Eigen::VectorXd& action) {
-  const std::set<int> moving = moving_signals(schema, part);
-  std::vector<int> result = signals_outside(schema, action);
-  std::erase_if(result, [&](int s) { return !moving.contains(s); });
-  return result;
-}
-
 }  // namespace
 
 Reach reach_of(const BodySchema& schema, int part, const PoseTarget& target,
@@ -50,7 +41,7 @@ Reach reach_of(const BodySchema& schema, int part, const PoseTarget& target,
     reach.sd = deviations_of(predicted->covariance);
   if (reach.solution.is_within_tolerance) {
     reach.why = "reached";
-    if (const auto beyond = not_covered(schema, part, action); !beyond.empty())
+    if (const auto beyond = signals_outside(schema, action, part); !beyond.empty())
       reach.why +=
           ", but beyond what the samples covered of " + listed(signal_names(schema, beyond));
     return reach;
@@ -63,18 +54,14 @@ Reach reach_of(const BodySchema& schema, int part, const PoseTarget& target,
 }
 
 Json reach_json(const BodySchema& schema, const Reach& reach) {
-  const auto known = [](double value) { return value > 0 ? Json(value) : Json(); };
-  Json json = {{"reached", reach.solution.is_within_tolerance},
-               {"why", reach.why},
-               {"action", Json::object()},
-               {"position_error_m", reach.solution.error_m},
-               {"rotation_error_deg",
-                reach.has_orientation ? Json(reach.solution.error_rad / kDegree) : Json()},
-               {"position_sd_m", known(reach.sd.position_m)},
-               {"rotation_sd_deg", known(reach.sd.rotation_rad / kDegree)}};
-  for (std::size_t s = 0; s < schema.signals.size(); ++s)
-    json["action"][schema.signals[s].name] = reach.solution.action(static_cast<Eigen::Index>(s));
-  return json;
+  return {{"reached", reach.solution.is_within_tolerance},
+          {"why", reach.why},
+          {"action", action_json(schema, reach.solution.action)},
+          {"position_error_m", reach.solution.error_m},
+          {"rotation_error_deg",
+           reach.has_orientation ? Json(reach.solution.error_rad / kDegree) : Json()},
+          {"position_sd_m", deviation_json(reach.sd.position_m)},
+          {"rotation_sd_deg", deviation_json(reach.sd.rotation_rad, kDegree)}};
 }
 
 std::string reach_text(const BodySchema& schema, const Reach& reach) {

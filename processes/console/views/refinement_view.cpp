@@ -2,7 +2,6 @@
 
 #include <fmt/format.h>
 
-#include <algorithm>
 #include <cmath>
 
 #include "common/geometry/angle.h"
@@ -135,13 +134,12 @@ std::string plays_text(const std::vector<JointPlay>& plays) {
 
 Json elastic_errors_json(const Elasticity::Errors& errors) {
   const Noise fitted = total_of(errors.fitted), held_out = total_of(errors.held_out);
-  Json json = {{"noise_scale", errors.noise_scale},
-               {"fitted_rms_m", fitted.position_m},
-               {"fitted_rms_deg", fitted.rotation_rad / kDegree}};
-  json["held_out_rms_m"] = errors.held_out.empty() ? Json() : Json(held_out.position_m);
-  json["held_out_rms_deg"] =
-      errors.held_out.empty() ? Json() : Json(held_out.rotation_rad / kDegree);
-  return json;
+  const bool is_known = !errors.held_out.empty();
+  return {{"noise_scale", errors.noise_scale},
+          {"fitted_rms_m", fitted.position_m},
+          {"fitted_rms_deg", fitted.rotation_rad / kDegree},
+          {"held_out_rms_m", is_known ? Json(held_out.position_m) : Json()},
+          {"held_out_rms_deg", is_known ? Json(held_out.rotation_rad / kDegree) : Json()}};
 }
 
 Json elasticity_json(const Elasticity& elasticity) {
@@ -202,22 +200,18 @@ std::string findings_text(const Refinement& result) {
 
 Json wanted_json(const Refinement& result) {
   return array_of(result.wanted_actions, [&](const WantedAction& wanted) {
-    Json action = Json::object();
-    for (std::size_t s = 0; s < result.schema.signals.size(); ++s)
-      action[result.schema.signals[s].name] = wanted.action(static_cast<Eigen::Index>(s));
-    return Json{
-        {"action", action}, {"fall", wanted.fall}, {"reducible_fall", wanted.reducible_fall}};
+    return Json{{"action", action_json(result.schema, wanted.action)},
+                {"fall", wanted.fall},
+                {"reducible_fall", wanted.reducible_fall}};
   });
 }
 
 std::string wanted_text(const Refinement& result) {
   if (result.wanted_actions.empty()) return "";
-  std::vector<std::string> names;
-  for (const Signal& signal : result.schema.signals) names.push_back(signal.name);
   std::string text = fmt::format(
       "  actions ({}) that would tell most; with each and those before it the worst predicted "
       "deviation falls by, and what actions can tell of it by:\n",
-      fmt::join(names, ", "));
+      listed(signal_names(result.schema)));
   for (const WantedAction& wanted : result.wanted_actions) {
     text += "   ";
     for (const double value : wanted.action) text += fmt::format(" {:10.4g}", value);
@@ -286,16 +280,11 @@ std::string refinement_text(const Refinement& result,
                         result.noise_scale);
   text += "  " + gauge_text(result) + "\n";
   for (const std::string& held : result.held) text += "  held: " + held + "\n";
-  text += held_out_text(result);
-  text += parameters_text(result.parameters);
-  text += tags_text(result, claimed);
-  text += plays_text(result.plays);
-  text += elasticity_text(result.elasticity);
-  text += findings_text(result);
+  text += held_out_text(result) + parameters_text(result.parameters) + tags_text(result, claimed) +
+          plays_text(result.plays) + elasticity_text(result.elasticity) + findings_text(result);
   for (const SignalCoverage& signal : result.coverage)
     text += fmt::format("  {}: {:.0f} % of its range seen\n", signal.signal, 100 * signal.share);
-  text += wanted_text(result);
-  return text;
+  return text + wanted_text(result);
 }
 
 }  // namespace bodyschema

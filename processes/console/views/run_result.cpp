@@ -30,12 +30,11 @@ std::string held_out_text(const RunResult& result) {
           ? fmt::format(", since the body last changed (sample {})", result.held_out_since)
           : "",
       errors_text(result.held_out));
-  if (result.has_truth && result.health && result.health->worst_position_m >= 0) {
+  if (result.has_truth && result.health && result.health->worst_position_m >= 0)
     text += fmt::format(
         "(The line of progress and `status` go by what the camera sees, noise and bias of the "
         "markers included: worst part {}.)\n",
         pose_text(result.health->worst_position_m, result.health->worst_rotation_rad, 1));
-  }
   return text;
 }
 
@@ -100,11 +99,10 @@ std::string run_result_text(const RunResult& result, const std::filesystem::path
     text += verdict.sentence + "\n\n";
   }
   text += losses_text(result);
-  if (!result.is_accepted) {
+  if (!result.is_accepted)
     text +=
         "The monitor accepted no body schema: too few samples, or each proposal was refuted. The "
         "newest proposal:\n";
-  }
   return text + structure_text(result.schema) + held_out_text(result) + files_text(folder);
 }
 

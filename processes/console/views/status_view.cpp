@@ -33,8 +33,7 @@ std::vector<EdgeStatus> edges_of(const GroupStatus& status) {
         EdgeStatus{edge, health_of(status.health, edge.from_part, edge.to_part), {}});
     for (const screw_joint_t& joint : edge.joints) {
       const std::string& name = status.schema->signals.at(joint.signal_index).signal_name;
-      if (std::find(item.signals.begin(), item.signals.end(), name) == item.signals.end())
-        item.signals.push_back(name);
+      if (std::ranges::find(item.signals, name) == item.signals.end()) item.signals.push_back(name);
     }
   }
   return edges;
@@ -88,10 +87,9 @@ class StatusText {
     std::size_t host_width = 4;
     for (const GroupStatus::Process& process : status_.processes)
       host_width = std::clamp(process.info.host.size(), host_width, std::size_t{12});
-    if (!status_.processes.empty()) {
+    if (!status_.processes.empty())
       line(fmt::format("  {:<17} {:<{}} {:>6} {:<8} {:>6} {:>5} {:>6}  {}", "process", "host",
                        host_width, "pid", "phase", "up", "cpu", "memory", "activity"));
-    }
     for (const GroupStatus::Process& process : status_.processes) {
       const process_info_t& info = process.info;
       line(fmt::format("  {:<17} {:<{}} {:>6} {:<8} {:>6} {:>3.0f} % {:>3.0f} MB  {}",
@@ -150,10 +148,9 @@ class StatusText {
       if (!control->why.empty()) text += "; " + control->why;
       line(text);
     }
-    if (status_.sample) {
+    if (status_.sample)
       line(fmt::format("sample   {}: {} parts seen", status_.sample->sample_index,
                        status_.sample->num_parts));
-    }
     if (status_.sim_state) {
       const std::vector<std::string>& faults = status_.sim_state->faults;
       line(fmt::format("faults   {}   (ground truth of the simulation)",
@@ -169,13 +166,12 @@ class StatusText {
                                          : "none accepted yet; proposal",
                      schema.is_complete == 1 ? "complete" : "incomplete", schema.num_parts,
                      schema.num_edges, schema.num_samples_seen));
-    if (const auto& health = status_.health; health && health->worst_position_m >= 0) {
+    if (const auto& health = status_.health; health && health->worst_position_m >= 0)
       line(
           fmt::format("         worst part off by {} (median, as the camera sees it) in {} "
                       "held-out samples",
                       pose_text(health->worst_position_m, health->worst_rotation_rad, 1),
                       health->num_test_samples));
-    }
     for (const moved_tag_t& tag : schema.moved_tags)
       if (tag.moved_until_sample < 0)
         line(fmt::format("         tag {} is set aside since sample {}: not where it was, or lost",

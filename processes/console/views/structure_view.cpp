@@ -56,13 +56,9 @@ Json matrix_gp_json(const BodySchema& schema, const MatrixGp& gp) {
           {"entries", entries}};
 }
 
-/// One standard deviation; null where it is not known.
-Json deviation(double value, double unit = 1) {
-  return std::isfinite(value) && value > 0 ? Json(value / unit) : Json();
-}
-
 Json axes_json(const Eigen::Vector3d& variances, double unit) {
-  return array_of(variances, [&](double variance) { return deviation(std::sqrt(variance), unit); });
+  return array_of(variances,
+                  [&](double variance) { return deviation_json(std::sqrt(variance), unit); });
 }
 
 Json joint_json(const BodySchema& schema, const ScrewJoint& joint, const JointDeviation* sd) {
@@ -76,12 +72,13 @@ Json joint_json(const BodySchema& schema, const ScrewJoint& joint, const JointDe
                {"X_after", pose_json(joint.X_after)},
                {"sd", nullptr}};
   if (sd)
-    json["sd"] = {{"axis_position_m", joint.turn == 0 ? Json() : deviation(sd->axis_position_m)},
-                  {"axis_tilt_deg", deviation(sd->axis_tilt_rad, kDegree)},
-                  {"displacement_m", deviation(sd->displacement_m)},
-                  {"displacement_deg", deviation(sd->displacement_rad, kDegree)},
-                  {"slide_m", deviation(sd->slide)},
-                  {"turn_rad", deviation(sd->turn)}};
+    json["sd"] = {
+        {"axis_position_m", joint.turn == 0 ? Json() : deviation_json(sd->axis_position_m)},
+        {"axis_tilt_deg", deviation_json(sd->axis_tilt_rad, kDegree)},
+        {"displacement_m", deviation_json(sd->displacement_m)},
+        {"displacement_deg", deviation_json(sd->displacement_rad, kDegree)},
+        {"slide_m", deviation_json(sd->slide)},
+        {"turn_rad", deviation_json(sd->turn)}};
   return json;
 }
 
@@ -98,9 +95,9 @@ void add_parameters(const BodySchema& schema, const Edge& edge, const Eigen::Vec
                 {"confidence", edge.confidence},
                 {"valid_since_sample", edge.valid_since_sample},
                 {"left", pose_json(edge.left)},
-                {"position_sd_m", deviation(sd.position_m)},
+                {"position_sd_m", deviation_json(sd.position_m)},
                 {"rotation_sd_deg",
-                 schema.has_rotation(edge.to) ? deviation(sd.rotation_rad, kDegree) : Json()},
+                 schema.has_rotation(edge.to) ? deviation_json(sd.rotation_rad, kDegree) : Json()},
                 {"joints", joints}});
   if (edge.residual_gp) (*json)["residual_gp"] = residual_gp_json(schema, *edge.residual_gp);
   if (edge.matrix_gp) (*json)["matrix_gp"] = matrix_gp_json(schema, *edge.matrix_gp);
@@ -169,6 +166,17 @@ Json pose_json(const Pose& X) {
   const Eigen::Quaterniond q(X.linear());
   return {{"position_m", {X.translation().x(), X.translation().y(), X.translation().z()}},
           {"rotation_wxyz", {q.w(), q.x(), q.y(), q.z()}}};
+}
+
+Json action_json(const BodySchema& schema, const Eigen::VectorXd& action) {
+  Json json = Json::object();
+  for (std::size_t s = 0; s < schema.signals.size(); ++s)
+    json[schema.signals[s].name] = action(static_cast<Eigen::Index>(s));
+  return json;
+}
+
+Json deviation_json(double value, double unit) {
+  return std::isfinite(value) && value > 0 ? Json(value / unit) : Json();
 }
 
 std::vector<std::string> signal_names(const BodySchema& schema) {

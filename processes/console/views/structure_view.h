@@ -17,6 +17,10 @@ std::vector<std::string> signal_names(const BodySchema& schema, const std::vecto
 // The JSON that the console prints with --json. docs/json.md documents every key.
 
 Json pose_json(const Pose& X);
+/// A value by the name of each signal.
+Json action_json(const BodySchema& schema, const Eigen::VectorXd& action);
+/// One standard deviation in a unit; null where it is not known.
+Json deviation_json(double value, double unit = 1);
 
 /// `learn --json`, and `structure` in result.json.
 Json structure_json(const BodySchema& schema, const std::vector<Outlier>& outliers,

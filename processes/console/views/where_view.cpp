@@ -7,8 +7,6 @@
 #include <cmath>
 #include <stdexcept>
 
-#include "common/geometry/angle.h"
-#include "processes/console/views/structure_view.h"
 #include "processes/controller/reachable_box.h"
 
 namespace bodyschema {
@@ -56,8 +54,8 @@ Whereabouts whereabouts_of(const BodySchema& schema, std::optional<int> part,
     Whereabouts::Part& p = where.parts.emplace_back();
     p.part = candidate;
     p.reachable = box;
-    const auto predicted = std::find_if(
-        now.begin(), now.end(), [&](const PartPrediction& n) { return n.part == candidate; });
+    const auto predicted =
+        std::ranges::find_if(now, [&](const PartPrediction& n) { return n.part == candidate; });
     if (predicted != now.end()) p.now = *predicted;
   }
   if (part && where.parts.empty()) throw std::invalid_argument(no_way_text(schema, *part));

@@ -42,7 +42,7 @@ ChapterAdaptation::ChapterAdaptation(BodySchema schema, ChapterAdaptationOptions
     pair.models.push_back(std::move(given));
     for (int k = 0; k <= options_.max_signals; ++k) {
       auto sets = signal_sets(static_cast<int>(schema_.signals.size()), k);
-      std::stable_sort(sets.begin(), sets.end(), [&](const auto& a, const auto& b) {
+      std::ranges::stable_sort(sets, [&](const auto& a, const auto& b) {
         return structural_proximity(a, edge.signals()) > structural_proximity(b, edge.signals());
       });
       pair.candidates.insert(pair.candidates.end(), sets.begin(), sets.end());
@@ -52,7 +52,7 @@ ChapterAdaptation::ChapterAdaptation(BodySchema schema, ChapterAdaptationOptions
 }
 
 bool ChapterAdaptation::has_valid_tree() const {
-  return std::all_of(pairs_.begin(), pairs_.end(), [](const Pair& pair) { return pair.is_valid; });
+  return std::ranges::all_of(pairs_, [](const Pair& pair) { return pair.is_valid; });
 }
 
 std::size_t ChapterAdaptation::num_models() const {

@@ -31,10 +31,9 @@ struct ChapterAdaptationOptions {
 /// new one as soon as its newest is refuted: those with fewer signals first, among these by
 /// structural proximity to the model they replace.
 ///
-/// What the chapter leaves open was chosen so that its Table 1 comes out: the windows hold samples
-/// from before a model was sampled, and those that it learned from; the count of samples without a
-/// tree goes on while models are being tried; errors are root mean squares. Of models that never
-/// served the oldest is forgotten where there are too many.
+/// Chosen so that the chapter's Table 1 comes out: the windows hold samples from before a model was
+/// sampled, and those that it learned from; the count of samples without a tree goes on while
+/// models are being tried; errors are root mean squares.
 class ChapterAdaptation {
  public:
   /// Learns a local model of Δ_from,to on the signals (indices) from samples in which both parts
@@ -71,7 +70,6 @@ class ChapterAdaptation {
     std::deque<Residual> residuals;  ///< of the newest samples of the window
     double error = 0;  ///< the larger of the two root mean squares, in units of 3 σ_z
     bool is_tested = false;
-    bool is_valid() const { return !is_tested || error < 1; }
   };
   /// All there is for one pair of neighbours.
   struct Pair {

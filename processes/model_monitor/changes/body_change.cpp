@@ -13,10 +13,9 @@ namespace bodyschema {
 /// fewest samples, widths. All chosen.
 ///
 /// Log odds of the form against no change, where one is suspected: what was there before, breaks
-/// often or is told by few numbers comes first; what contains another form comes after it, as the
-/// evidence charges only for the width of θ. A sample is worth several nats, so that they decide
-/// while there are few. An edge of many joints has as much as one of one joint to share out among
-/// its joints, and among its links as much as two.
+/// often or has few numbers comes first; what contains another form comes after it. A sample is
+/// worth several nats, so they decide while there are few. The joints of an edge share the odds of
+/// one joint, its links those of two.
 /// Fewest samples: as many as determine θ with something left to judge it by.
 /// Widths: a transform goes about as far as a link is long, those of kBoth together as far as one
 /// (0.3 m / √2), one in a joint's stead also as far as that went; a displacement goes by a third of

@@ -72,8 +72,7 @@ struct BodyChange {
   double log_odds() const;
   /// Samples below which a form is not told from another.
   int fewest_samples() const;
-  /// "joint_stuck", "joint_offset", "joint_gain", "joint_nonlinear", "geometry", "new_model",
-  /// "marker_moved", "camera_moved", …
+  /// As in common/bus/cause_names.h.
   std::string cause(const BodySchema& schema) const;
 
   bool operator==(const BodyChange&) const = default;

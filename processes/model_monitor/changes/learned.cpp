@@ -42,11 +42,7 @@ void residual_of(const Edge& edge, const PlaceMeasurement& m, Vector6d* rho, Mat
 ProcessTargets all_coordinates(const BodyChange& change, const Edge& edge,
                                const std::vector<PlaceMeasurement>& measurements) {
   const auto n = static_cast<Eigen::Index>(measurements.size());
-  ProcessTargets targets;
-  targets.change = change;
-  targets.edge = edge;
-  targets.into = Matrix6d::Identity();
-  targets.y.resize(6, n);
+  ProcessTargets targets{change, edge, Matrix6d::Identity(), Eigen::MatrixXd(6, n)};
   targets.log_rest = targets.distance_rest = Eigen::VectorXd::Zero(n);
   Eigen::MatrixXd variances(6, n);
   for (Eigen::Index t = 0; t < n; ++t) {
@@ -68,12 +64,7 @@ ProcessTargets one_displacement(const BodyChange& change, const Edge& edge,
   const auto n = static_cast<Eigen::Index>(measurements.size());
   const ScrewJoint& joint = edge.joints.back();
   const Vector6d along = displacement_twist(joint);
-  ProcessTargets targets;
-  targets.change = change;
-  targets.edge = edge;
-  targets.into = along;
-  targets.y.resize(1, n);
-  targets.noise.resize(1);
+  ProcessTargets targets{change, edge, along, Eigen::MatrixXd(1, n), Eigen::VectorXd(1)};
   targets.scales = targets.log_rest = targets.distance_rest = Eigen::VectorXd(n);
   for (Eigen::Index t = 0; t < n; ++t) {
     Vector6d rho;
@@ -256,7 +247,7 @@ std::vector<LearnedEdge> learn_edge(const BodySchema& base, int part,
 
 double structural_proximity(const std::vector<int>& signals, const std::vector<int>& other) {
   const std::set<int> a(signals.begin(), signals.end()), b(other.begin(), other.end());
-  const auto num_shared = std::count_if(a.begin(), a.end(), [&](int s) { return b.contains(s); });
+  const auto num_shared = std::ranges::count_if(a, [&](int s) { return b.contains(s); });
   const auto num_all = std::ssize(a) + std::ssize(b) - num_shared;
   return (2 + static_cast<double>(num_shared)) / (2 + static_cast<double>(num_all));
 }

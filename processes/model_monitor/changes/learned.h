@@ -28,12 +28,11 @@ inline constexpr std::size_t kMostMeasurements = 64;
 /// g and ρ are Gaussian processes of one or two signals. g too becomes a residual GP: of a screw at
 /// the end of the chain, Exp(ŝ(θ + g)) X_after = Exp(ŝθ) X_after · Exp(Ad(X_after⁻¹) ŝ g).
 ///
-/// All signal sets are screened by one factorisation each, fewer signals first and, of as many,
-/// those nearest to the edge's own (structural_proximity()), which are the prior odds. The
-/// likeliest are fitted: length scales and variances by marginal likelihood on a small grid, whose
-/// number of cells is paid for. A measurement that the others make less likely (leave-one-out) than
-/// an outlier is one, and is not trained on. A model must halve, by leave-one-out, what the old one
-/// is off by (Student-t); else it is none.
+/// All signal sets are screened by one factorisation each; prior odds favour few signals and those
+/// nearest to the edge's own (structural_proximity()). The likeliest are fitted: length scales and
+/// variances by marginal likelihood on a small grid, whose number of cells is paid for, without
+/// measurements that the others make less likely (leave-one-out) than an outlier. A model must
+/// halve, by leave-one-out, what the old one is off by (Student-t).
 ///
 /// The best of every kind, most evidence first; none if there are fewer measurements than
 /// BodyChange::fewest_samples(), or more than kMostMeasurements. An edge that has a process already

@@ -1,5 +1,7 @@
 // Whether ModelMonitor takes a schema that the learner proposes.
 
+#include <spdlog/fmt/fmt.h>
+
 #include <algorithm>
 #include <cmath>
 #include <limits>
@@ -62,9 +64,8 @@ ModelMonitor::EdgeTest ModelMonitor::test(const BodySchema& schema, const Edge& 
 }
 
 bool ModelMonitor::has_same_tree(const BodySchema& a, const BodySchema& b) {
-  return a.edges.size() == b.edges.size() &&
-         std::all_of(a.edges.begin(), a.edges.end(), [&b](const Edge& edge) {
-           return std::any_of(b.edges.begin(), b.edges.end(), [&edge](const Edge& other) {
+  return a.edges.size() == b.edges.size() && std::ranges::all_of(a.edges, [&b](const Edge& edge) {
+           return std::ranges::any_of(b.edges, [&edge](const Edge& other) {
              return edge.from == other.from && edge.to == other.to &&
                     edge.signals() == other.signals();
            });
@@ -87,17 +88,14 @@ std::string ModelMonitor::objection(BodySchema* proposal, const Standing& standi
     edge.state = edge_test.num_tests > 0 ? EdgeState::kOk : EdgeState::kProvisional;
     // One refuting test may be an outlier however small the share that is tolerated.
     const double tolerated = std::max(1.0, config_.max_outlier_share * edge_test.num_tests);
-    if (edge_test.num_refuting > tolerated) {
-      objection = "edge " + std::to_string(edge.from) + "-" + std::to_string(edge.to) +
-                  " refuted by " + std::to_string(edge_test.num_refuting) + " of " +
-                  std::to_string(edge_test.num_tests) + " tests";
-    }
+    if (edge_test.num_refuting > tolerated)
+      objection = fmt::format("edge {}-{} refuted by {} of {} tests", edge.from, edge.to,
+                              edge_test.num_refuting, edge_test.num_tests);
   }
   const BodySchema* previous = standing.schema();
   if (objection.empty() && !*was_tested) objection = "no test sample yet";
-  if (objection.empty() && previous && previous->complete && !proposal->complete) {
-    objection = "incomplete, where version " + std::to_string(previous->version) + " is complete";
-  }
+  if (objection.empty() && previous && previous->complete && !proposal->complete)
+    objection = fmt::format("incomplete, where version {} is complete", previous->version);
   return objection;
 }
 
@@ -159,10 +157,9 @@ void ModelMonitor::judge(const body_schema_t& message) {
       proposal.version = index + 1;
       if (live) proposal.changes = standing.schema()->changes;
       event.event_kind = health_event_t::EVENT_SCHEMA_ACCEPTED;
-      event.event_text = "version " + std::to_string(proposal.version) + ": " +
-                         std::to_string(proposal.edges.size()) + " edges, " +
-                         (proposal.refined ? "refined, " : "") +
-                         (proposal.complete ? "complete" : "incomplete");
+      event.event_text = fmt::format("version {}: {} edges, {}{}", proposal.version,
+                                     proposal.edges.size(), proposal.refined ? "refined, " : "",
+                                     proposal.complete ? "complete" : "incomplete");
       standing.add(event);
       set_base(&standing, std::move(proposal));
       is_new_base = is_changed = true;

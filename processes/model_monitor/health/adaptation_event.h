@@ -1,8 +1,10 @@
 #pragma once
 
 #include <Eigen/Core>
+#include <algorithm>
 #include <cstdint>
 #include <string>
+#include <vector>
 
 #include "common/estimation/measurement_model.h"
 #include "processes/model_monitor/changes/change_size.h"
@@ -33,8 +35,9 @@ struct AdaptationOptions {
 
 /// Something that the adaptation decided at one sample.
 struct AdaptationEvent {
-  enum class Kind {
-    kMismatch,
+  /// The values are those of health_event_t.
+  enum class Kind : std::int8_t {
+    kMismatch = 2,
     kCandidate,
     kRefined,
     kRestored,
@@ -61,6 +64,13 @@ struct AdaptationEvent {
   /// kProbeWanted: the action at which the two likeliest explanations disagree most; else empty.
   Eigen::VectorXd probe;
 };
-const char* name_of(AdaptationEvent::Kind kind);
+inline bool has_kind(const std::vector<AdaptationEvent>& events, AdaptationEvent::Kind kind) {
+  return std::ranges::find(events, kind, &AdaptationEvent::kind) != events.end();
+}
+inline const char* name_of(AdaptationEvent::Kind kind) {
+  constexpr const char* kNames[] = {"mismatch",  "candidate", "refined", "restored",    "reverted",
+                                    "recovered", "drift",     "missing", "probe_wanted"};
+  return kNames[static_cast<int>(kind) - static_cast<int>(AdaptationEvent::Kind::kMismatch)];
+}
 
 }  // namespace bodyschema

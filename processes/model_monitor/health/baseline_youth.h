@@ -7,14 +7,12 @@
 
 namespace bodyschema {
 
-/// Whether a change of the body is believed, or the baseline that it is a change of was wrong from
-/// the start.
+/// Whether a change of the body is believed, or that its baseline was wrong from the start.
 ///
-/// A wrong baseline fails at some unknown rate, however long ago it was proposed: with a uniform
-/// prior of that rate the probability of k mismatches and n samples without one is
-/// B(k + 1, n + 1), Laplace's rule of succession. A right one fails when the body changes, which is
-/// rare. So a mismatch in the first samples speaks against the baseline, one after many quiet
-/// samples for a change, and one mismatch after the other against the baseline again.
+/// A wrong baseline fails at some unknown rate: with a uniform prior of it the probability of k
+/// mismatches and n samples without one is B(k + 1, n + 1), Laplace's rule of succession. A right
+/// one fails when the body changes, which is rare. So a mismatch in the first samples, or one after
+/// the other, speaks against the baseline, one after many quiet samples for a change.
 ///
 /// While the baseline is young, what was decided on changes is held back. A part whose marker is
 /// not seen is told at once: no structure is needed to know that.

@@ -4,17 +4,14 @@
 #include <map>
 #include <optional>
 
-#include "common/schema/body_schema.h"
+#include "common/estimation/measurement_model.h"
 #include "common/schema/sample.h"
-#include "processes/model_monitor/likelihood/tree_filter.h"
 
 namespace bodyschema {
 
 /// Finds markers that fell off their parts and lie in sight: read at one place again and again
-/// while the part that they were on moves; of several tags of a part each at its own. No change of
-/// the body explains them, so they are told apart before anything is judged. A joint that is stuck
-/// holds a part still as well, but where the schema has it at some action, and all parts beyond;
-/// that is found from the first sample on.
+/// while the part that they were on moves; of several tags of a part each at its own. (A joint that
+/// is stuck holds a part still as well, but where the schema has it at some action.)
 class FallenMarkers {
  public:
   /// Looks at what the sample shows of `part`. Returns the first sample that showed its marker

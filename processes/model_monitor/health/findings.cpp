@@ -20,7 +20,7 @@ ElementId element_of(const Finding& finding, const BodySchema& schema) {
 bool is_as_at_first(const Finding& finding, const BodySchema& schema, const BodySchema& first) {
   if (finding.from >= 0) return !differ_at(schema, first, finding.to);
   return !differ_at(schema, first, finding.part) &&
-         std::none_of(schema.edges.begin(), schema.edges.end(), [&](const Edge& edge) {
+         std::ranges::none_of(schema.edges, [&](const Edge& edge) {
            return edge.from == finding.part && differ_at(schema, first, edge.to);
          });
 }
@@ -49,6 +49,14 @@ Finding finding_of(const AdaptationEvent& event) {
   return finding;
 }
 
+/// Cause and size of what no event tells.
+void tell_difference(const Adaptation& adaptation, Finding* finding) {
+  const FoundDifference difference = difference_at(
+      adaptation.history().front(), adaptation.schema(), element_of(*finding, adaptation.schema()));
+  finding->cause = difference.cause;
+  finding->size = difference.size;
+}
+
 }  // namespace
 
 Finding* Findings::newest(const AdaptationEvent& event, State state) {
@@ -58,16 +66,11 @@ Finding* Findings::newest(const AdaptationEvent& event, State state) {
   return it == findings_.rend() ? nullptr : &*it;
 }
 
-void Findings::erase(const AdaptationEvent& event) {
-  std::erase_if(findings_, [&](const Finding& finding) { return finding.is_at(event); });
-}
-
 void Findings::update(const Adaptation& adaptation, const std::vector<AdaptationEvent>& events,
                       std::int64_t sample_index) {
-  for (Finding& finding : findings_) {
+  for (Finding& finding : findings_)
     finding.num_confirming +=
         finding.state == State::kConfirmed && state_at(adaptation, finding) == EdgeState::kOk;
-  }
   for (const AdaptationEvent& event : events) hear(adaptation, event);
   agree_with(adaptation, sample_index);
   if (findings_.size() > kMost)
@@ -94,15 +97,10 @@ void Findings::adopt(const AdaptationEvent& event, Finding finding) {
   *adopted = finding;
 }
 
-void Findings::confirm(const Adaptation& adaptation, const AdaptationEvent& event,
-                       const Finding& finding) {
+void Findings::confirm(const Adaptation& adaptation, const AdaptationEvent& event) {
   if (Finding* followed = newest(event, State::kFollowed)) {
-    const FoundDifference difference =
-        difference_at(adaptation.history().front(), adaptation.schema(),
-                      element_of(finding, adaptation.schema()));
     followed->state = State::kConfirmed;
-    followed->cause = difference.cause;
-    followed->size = difference.size;
+    tell_difference(adaptation, followed);
     followed->adopted = event.sample_index;
     followed->num_confirming = event.num_samples;
   } else if (Finding* adopted = newest(event, State::kAdopted)) {
@@ -134,20 +132,15 @@ void Findings::hear(const Adaptation& adaptation, const AdaptationEvent& event) 
         adopt(event, finding);
       }
       break;
-    case Kind::kRestored: {
-      erase(event);
+    case Kind::kRestored:
+      std::erase_if(findings_, [&](const Finding& known) { return known.is_at(event); });
       if (is_aside || event.is_normal) break;
       // Another body of before: what that was is not in the event.
-      const FoundDifference difference =
-          difference_at(adaptation.history().front(), adaptation.schema(),
-                        element_of(finding, adaptation.schema()));
+      tell_difference(adaptation, &finding);
       finding.state = State::kAdopted;
       finding.adopted = event.sample_index;
-      finding.cause = difference.cause;
-      finding.size = difference.size;
       findings_.push_back(finding);
       break;
-    }
     case Kind::kReverted:
       if (const Finding* adopted = newest(event, State::kAdopted))
         findings_.erase(findings_.begin() + (adopted - findings_.data()));
@@ -157,11 +150,10 @@ void Findings::hear(const Adaptation& adaptation, const AdaptationEvent& event) 
       findings_.push_back(finding);
       break;
     case Kind::kRecovered:
-      if (is_aside) {
+      if (is_aside)
         forget(event, State::kAside);
-      } else {
-        confirm(adaptation, event, finding);
-      }
+      else
+        confirm(adaptation, event);
       break;
     case Kind::kProbeWanted:
       break;
@@ -177,11 +169,10 @@ void Findings::agree_with(const Adaptation& adaptation, std::int64_t sample_inde
       case State::kFound:
         return state_at(adaptation, finding) != EdgeState::kInvalid;
       case State::kAside:
-        if (finding.tag < 0)
-          return std::find(missing.begin(), missing.end(), finding.part) == missing.end();
-        return std::none_of(
-            schema.moved_tags.begin(), schema.moved_tags.end(),
-            [&](const MovedTag& moved) { return moved.tag == finding.tag && moved.until < 0; });
+        if (finding.tag < 0) return std::ranges::find(missing, finding.part) == missing.end();
+        return std::ranges::none_of(schema.moved_tags, [&](const MovedTag& moved) {
+          return moved.tag == finding.tag && moved.until < 0;
+        });
       case State::kFollowed:
         return !adaptation.is_followed(finding.to >= 0 ? finding.to : finding.part);
       default:
@@ -198,11 +189,10 @@ void Findings::agree_with(const Adaptation& adaptation, std::int64_t sample_inde
   // Known to be wrong, though not where: an event comes once that is clear.
   const auto add = [&](Finding finding) {
     finding.since = finding.found = sample_index;
-    const bool is_known =
-        std::any_of(findings_.begin(), findings_.end(), [&](const Finding& known) {
-          return known.state == State::kFound && known.from == finding.from &&
-                 known.to == finding.to && known.part == finding.part;
-        });
+    const bool is_known = std::ranges::any_of(findings_, [&](const Finding& known) {
+      return known.state == State::kFound && known.from == finding.from && known.to == finding.to &&
+             known.part == finding.part;
+    });
     if (!is_known && state_at(adaptation, finding) == EdgeState::kInvalid)
       findings_.push_back(finding);
   };
@@ -210,7 +200,7 @@ void Findings::agree_with(const Adaptation& adaptation, std::int64_t sample_inde
   for (const int part : schema.parts) add({.part = part});
   for (const MovedTag& moved : schema.moved_tags) {
     const auto is_it = [&](const Finding& known) { return known.tag == moved.tag; };
-    if (moved.until >= 0 || std::any_of(findings_.begin(), findings_.end(), is_it)) continue;
+    if (moved.until >= 0 || std::ranges::any_of(findings_, is_it)) continue;
     // Of a schema whose findings were lost.
     findings_.push_back({.state = State::kAside,
                          .tag = moved.tag,

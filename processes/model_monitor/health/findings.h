@@ -33,8 +33,7 @@ struct Finding {
   }
 };
 
-/// What is wrong with the body, kept until it is as it was. Events tell what becomes of it, and
-/// what the adaptation holds now overrules them.
+/// What is wrong with the body until it is as it was, by the events and the adaptation's state.
 class Findings {
  public:
   static constexpr std::size_t kMost = 64;
@@ -50,14 +49,13 @@ class Findings {
 
  private:
   Finding* newest(const AdaptationEvent& event, Finding::State state);
-  void erase(const AdaptationEvent& event);
   void hear(const Adaptation& adaptation, const AdaptationEvent& event);
   /// What is known at the event's place in this state.
   void forget(const AdaptationEvent& event, Finding::State state);
   /// `finding`, or what stands there already, is in the schema.
   void adopt(const AdaptationEvent& event, Finding finding);
   /// What was followed or adopted there is confirmed.
-  void confirm(const Adaptation& adaptation, const AdaptationEvent& event, const Finding& finding);
+  void confirm(const Adaptation& adaptation, const AdaptationEvent& event);
   void agree_with(const Adaptation& adaptation, std::int64_t sample_index);
 
   std::vector<Finding> findings_;

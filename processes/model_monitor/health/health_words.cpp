@@ -75,7 +75,7 @@ std::string what(const Told& told, const std::vector<Signal>& signals) {
     const bool is_on_part = told.cause == "marker_moved";
     return place + (is_on_part ? " elsewhere on it" : " not where it was, or lost");
   }
-  const auto words = std::find_if(std::begin(kWords), std::end(kWords), [&told](const Words& w) {
+  const auto words = std::ranges::find_if(kWords, [&told](const Words& w) {
     return w.cause == told.cause && w.is_of_edge == (told.from >= 0);
   });
   if (words == std::end(kWords)) return place + " not as known";

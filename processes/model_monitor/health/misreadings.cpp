@@ -30,7 +30,7 @@ bool Misreadings::look(const ActionPoseSample& sample, const BodySchema& schema,
     // It is back. What is misread several times in a row counts once.
     std::vector<Pose> excursion;
     const auto is_in = [&](const std::vector<Pose>& places, const Pose& place) {
-      return std::any_of(places.begin(), places.end(), [&](const Pose& other) {
+      return std::ranges::any_of(places, [&](const Pose& other) {
         return distance(place, other) < ReadingDistance::kSame;
       });
     };

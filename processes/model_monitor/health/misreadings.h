@@ -9,10 +9,10 @@
 
 namespace bodyschema {
 
-/// Finds where a part's marker is read from time to time while it stays where it was: a marker that
-/// rests flips to one and the same second reading. What was read at one place twice, and each time
-/// where it belongs afterwards, is expected there again (MeasurementModel::misread); three flips in
-/// a row would pass for a marker that moved. A marker that did move does not come back.
+/// Finds where a part's marker is misread from time to time, as one that rests flips to one and the
+/// same second reading: three flips in a row would pass for a marker that moved. What was read at
+/// one place twice, and each time where it belongs afterwards, is expected there again
+/// (MeasurementModel::misread).
 class Misreadings {
  public:
   /// Looks at the markers that `sample` shows; `schema` has them where they belong. Returns true if

@@ -2,7 +2,6 @@
 
 #include <algorithm>
 #include <cmath>
-#include <set>
 
 namespace bodyschema {
 namespace {
@@ -63,13 +62,6 @@ void MovedTags::begin_anew() {
 std::vector<MovedTags::Finding> MovedTags::look(const ActionPoseSample& sample,
                                                 const BodySchema& schema,
                                                 const BodySchema& standing,
-                                                const MeasurementModel& measurement) {
-  return look(sample, schema, standing, measurement, false);
-}
-
-std::vector<MovedTags::Finding> MovedTags::look(const ActionPoseSample& sample,
-                                                const BodySchema& schema,
-                                                const BodySchema& standing,
                                                 const MeasurementModel& measurement, bool is_past) {
   std::vector<Finding> findings;
   const auto X_RB = schema.predict_all(sample.action);
@@ -96,8 +88,8 @@ std::vector<MovedTags::Finding> MovedTags::look(const ActionPoseSample& sample,
     std::set<int> in_sight;
     for (const Reading& r : readings) in_sight.insert(r.seen->tags.begin(), r.seen->tags.end());
     in_sight_[part].insert(in_sight.begin(), in_sight.end());
-    const auto in_place = std::find_if(readings.begin(), readings.end(),
-                                       [](const Reading& r) { return r.far_off < kSame; });
+    const auto in_place =
+        std::ranges::find_if(readings, [](const Reading& r) { return r.far_off < kSame; });
     if (in_place != readings.end()) {
       for (const int tag : in_sight_[part]) {
         const auto track = tracks_.find(tag);
@@ -122,8 +114,8 @@ bool MovedTags::are_alone(const std::vector<Reading>& readings, const ActionPose
   std::vector<int> shown_by;
   for (const Reading& reading : readings) {
     const std::vector<int>& tags = reading.seen->tags;
-    if (std::any_of(tags.begin(), tags.end(), [this](int tag) { return is_lying(tag); })) continue;
-    if (std::none_of(tags.begin(), tags.end(), [this](int tag) { return has_moved(tag); })) {
+    if (std::ranges::any_of(tags, [this](int tag) { return is_lying(tag); })) continue;
+    if (std::ranges::none_of(tags, [this](int tag) { return has_moved(tag); })) {
       num_alone_[reading.seen->part] = 0;
       return false;
     }
@@ -161,8 +153,7 @@ void MovedTags::look_elsewhere(const Reading& reading, const Pose& X_CB, bool is
                                std::int64_t sample_index, std::vector<Finding>* findings) {
   const PartObservation& seen = *reading.seen;
   if (seen.tags.size() > 1) {
-    if (std::none_of(seen.tags.begin(), seen.tags.end(),
-                     [this](int tag) { return has_moved(tag); }))
+    if (std::ranges::none_of(seen.tags, [this](int tag) { return has_moved(tag); }))
       count_elsewhere(seen);
     return;
   }

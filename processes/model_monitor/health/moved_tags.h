@@ -13,13 +13,11 @@
 namespace bodyschema {
 
 /// Finds tags that moved on their part, or fell off it and lie in sight, where others of the part
-/// stayed. No change of the body explains that. A tag has moved once it was seen in one wrong place
-/// again and again (on the part, or lying in the room), never in the right one, and other tags of
-/// the part in theirs, in the same picture or between. Where these, too, are now here and now
-/// there, or a change of the body that was found meanwhile explains it all, the body is wrong. Once
-/// it is seen in its place again, it is back; so with a tag that was lost, which may have been put
-/// elsewhere. Where a babbling arm shows a part for long by such tags alone that move with it, they
-/// are what there is of it: they are taken for back.
+/// stayed. A tag has moved once it was seen in one wrong place again and again (on the part, or
+/// lying in the room), never in the right one, and other tags of the part in theirs. Where these,
+/// too, are now here and now there, or a change of the body that was found meanwhile explains it
+/// all, the body is wrong. A tag that moved or was lost is back once it is seen in its place again,
+/// or where a babbling arm shows the part for long by such tags alone that move with it.
 class MovedTags {
  public:
   /// `moved`: those known already.
@@ -33,9 +31,11 @@ class MovedTags {
     bool is_on_part = false;  ///< moved on it; else it was lost, and maybe lies in sight
     bool is_back = false;     ///< it is where it was, or all that there is
   };
-  /// `schema`: the body before anything was wrong; `standing`: as it is now thought to be.
+  /// `schema`: the body before anything was wrong; `standing`: as it is now thought to be. Of a
+  /// sample of the past no tag is taken for back because it is alone.
   std::vector<Finding> look(const ActionPoseSample& sample, const BodySchema& schema,
-                            const BodySchema& standing, const MeasurementModel& measurement);
+                            const BodySchema& standing, const MeasurementModel& measurement,
+                            bool is_past = false);
   /// Samples of the past: what they say of those known.
   void look_back(const ActionPoseSample& sample, const BodySchema& schema,
                  const MeasurementModel& measurement);
@@ -68,9 +68,6 @@ class MovedTags {
     double far_off = 0;         ///< d² from the body before anything was wrong
     bool is_explained = false;  ///< by the body as it is now thought to be
   };
-  std::vector<Finding> look(const ActionPoseSample& sample, const BodySchema& schema,
-                            const BodySchema& standing, const MeasurementModel& measurement,
-                            bool is_past);
   /// Whether such tags alone show the part for long: they are taken for back.
   bool are_alone(const std::vector<Reading>& readings, const ActionPoseSample& sample, bool is_past,
                  std::vector<Finding>* findings);

@@ -52,8 +52,8 @@ bool ModelMonitor::are_wanted_for(const BodySchema& schema) const {
   if (wanted_.empty() || refined_->last_sample_index > judged_sample_) return false;
   const std::int64_t since = schema.changes.empty() ? 0 : schema.changes.back().since;
   return body_since(*refined_) == since && has_same_tree(*refined_, schema) &&
-         std::none_of(schema.edges.begin(), schema.edges.end(),
-                      [](const Edge& edge) { return edge.state == EdgeState::kInvalid; });
+         std::ranges::none_of(schema.edges,
+                              [](const Edge& edge) { return edge.state == EdgeState::kInvalid; });
 }
 
 std::vector<double> ModelMonitor::corner_costs(const BodySchema& schema, const BodySchema& other,
@@ -84,9 +84,7 @@ bool ModelMonitor::predicts_corners_better(const BodySchema& schema, const BodyS
 }
 
 bool ModelMonitor::is_defended(const BodySchema& refined, const BodySchema& proposal) const {
-  return refined.refined &&
-         std::includes(refined.parts.begin(), refined.parts.end(), proposal.parts.begin(),
-                       proposal.parts.end()) &&
+  return refined.refined && std::ranges::includes(refined.parts, proposal.parts) &&
          !predicts_corners_better(proposal, refined, proposal.last_sample_index);
 }
 

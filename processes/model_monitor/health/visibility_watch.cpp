@@ -3,7 +3,6 @@
 #include <algorithm>
 #include <cmath>
 #include <iterator>
-#include <numeric>
 #include <set>
 
 namespace bodyschema {
@@ -27,11 +26,10 @@ std::vector<VisibilityWatch::Finding> VisibilityWatch::look(const std::vector<in
     for (const auto* observations : {&seen.parts, &seen.contradictions})
       for (const PartObservation& o : *observations)
         if (o.part == part)
-          std::copy_if(o.tags.begin(), o.tags.end(), std::inserter(tags, tags.end()),
-                       [&](int tag) { return !moved.is_lying(tag); });
-    const bool is_seen = used.find(part) || std::any_of(tags.begin(), tags.end(), [&](int tag) {
-                           return moved.has_moved(tag);
-                         });
+          std::ranges::copy_if(o.tags, std::inserter(tags, tags.end()),
+                               [&](int tag) { return !moved.is_lying(tag); });
+    const bool is_seen =
+        used.find(part) || std::ranges::any_of(tags, [&](int tag) { return moved.has_moved(tag); });
     count(part, kAnyTag, is_seen, &findings);
     // An arm that holds still or is led shows one side of its parts for as long.
     if (!is_seen || seen.purpose == Purpose::kControl) continue;
@@ -59,9 +57,8 @@ void VisibilityWatch::count(int part, int tag, bool is_seen, std::vector<Finding
   }
   ++c.num_missed;
   if (c.is_missing || c.num_seen < kFewestSightings) return;
-  const auto num = std::accumulate(
-      counts_.begin(), counts_.end(), std::size_t{0},
-      [](std::size_t sum, const auto& of_part) { return sum + of_part.second.size(); });
+  std::size_t num = 0;
+  for (const auto& [_, of_part] : counts_) num += of_part.size();
   // What was in sight in its first ten samples is not known to be seen always.
   const double a = c.num_seen + 0.5, b = c.num_asked - c.num_seen + 0.5;
   const double chance = std::exp(log_beta(a + 1, b + c.num_missed) - log_beta(a, b));

@@ -1,6 +1,5 @@
 #pragma once
 
-#include <cstdint>
 #include <map>
 #include <vector>
 
@@ -9,10 +8,9 @@
 
 namespace bodyschema {
 
-/// Counts how often every part, and every tag of a part that has several, is seen, and finds what
-/// has not been seen for longer than chance explains: a run of m misses begins at any sample with
-/// probability v (1 − v)^m, where v is the share of samples that show it: its mean over what v may
-/// be (Jeffreys' prior).
+/// Finds parts, and tags of parts that have several, that have not been seen for longer than chance
+/// explains: a run of m misses begins at any sample with probability v (1 − v)^m, v the share of
+/// samples that show it: its mean over what v may be (Jeffreys' prior).
 class VisibilityWatch {
  public:
   /// `false_alarm_rate`: a sample, over all parts and tags together.
@@ -25,8 +23,8 @@ class VisibilityWatch {
     bool is_missing = false;  ///< else it is seen again
     int num_missed = 0;       ///< samples in a row
   };
-  /// `seen`: all of a sample; `used`: without what is not believed, which says that a part was not
-  /// seen unless one of the `moved` tags shows it. Those are not looked for.
+  /// `seen`: all of a sample; `used`: without what is not believed. One of the `moved` tags shows
+  /// its part as well; these tags are not looked for.
   std::vector<Finding> look(const std::vector<int>& parts, const ActionPoseSample& seen,
                             const ActionPoseSample& used, const MovedTags& moved);
   /// A part that lies somewhere: its marker is missing, and was in the last `num_missed` samples.

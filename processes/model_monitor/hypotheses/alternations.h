@@ -11,8 +11,7 @@
 namespace bodyschema {
 
 /// Finds an edge that changes to and fro: a loose screw, a cable that catches now and then, or a
-/// transmission with more play than its model has room for. One explanation after another would be
-/// adopted and undone.
+/// transmission with more play than its model has room for.
 class Alternations {
  public:
   struct Found {

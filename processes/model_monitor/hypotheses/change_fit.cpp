@@ -67,8 +67,7 @@ double log_likelihood(const BodySchema& schema, const MeasurementModel& measurem
                       const std::vector<const ActionPoseSample*>& samples) {
   const TreeFilter filter(schema, measurement);
   double sum = 0;
-  for (const ActionPoseSample* sample : samples)
-    sum += filter.judge(filter.prepare(*sample)).log_likelihood;
+  for (const ActionPoseSample* sample : samples) sum += filter.log_likelihood(*sample);
   return sum;
 }
 

@@ -53,9 +53,8 @@ class PlaceEvidence {
                             Eigen::MatrixXd* jacobian = nullptr) const;
 
   /// The most probable θ: Gauss-Newton on the virtual measurements from several starts, with
-  /// Student-t weights first and the outlier mixture's then. Its evidence is that of all
-  /// observations under the changed schema. std::nullopt if there are fewer usable samples than the
-  /// form needs.
+  /// Student-t weights first and the outlier mixture's then; the evidence is that of all
+  /// observations. std::nullopt if there are fewer usable samples than the form needs.
   std::optional<FittedChange> fit(const BodyChange& change) const;
   /// Those of the changes that may be the best one: what the place's own measurements speak clearly
   /// against is not held against all the observations.

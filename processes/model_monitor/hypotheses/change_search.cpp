@@ -1,9 +1,7 @@
 #include "processes/model_monitor/hypotheses/change_search.h"
 
 #include <algorithm>
-#include <optional>
 #include <utility>
-#include <vector>
 
 #include "processes/model_monitor/hypotheses/schema_difference.h"
 

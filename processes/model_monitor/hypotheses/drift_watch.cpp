@@ -4,7 +4,7 @@
 #include <Eigen/Eigenvalues>
 #include <algorithm>
 #include <cmath>
-#include <ranges>
+#include <functional>
 #include <utility>
 
 #include "common/estimation/chi_square.h"
@@ -116,9 +116,8 @@ struct Course {
 std::vector<Course> courses_of(const Line& line, const std::vector<TimedReading>& readings) {
   std::vector<Course> courses{{line, 0, -line.cost}};
   for (int ended = 1; ended <= kLatestEnd; ++ended) {
-    const auto num_before =
-        std::count_if(readings.begin(), readings.end(),
-                      [ended](const TimedReading& r) { return r.time <= -ended; });
+    const auto num_before = std::ranges::count_if(
+        readings, [ended](const TimedReading& r) { return r.time <= -ended; });
     if (num_before < static_cast<std::ptrdiff_t>(kFewestFollowed)) break;
     const Line stopped = fit_line(readings, -ended, 3);
     courses.push_back({stopped, ended, std::log(kEnds) - stopped.cost});
@@ -141,41 +140,35 @@ std::pair<Pose, Matrix6d> displaced(const Pose& at, const Pose& X, const Virtual
 
 std::size_t num_links(const Edge* edge) { return edge ? edge->joints.size() + 1 : 1; }
 
-/// ξ(t) = rate · (t − begin) from `begin` on, and 0 before.
-struct BegunLine {
-  Vector6d rate = Vector6d::Zero();
-  Matrix6d covariance;
-  double log_prior = 0, gain = 0;  // as in BegunDrift
-  bool is_good = false;
-};
-
-/// std::nullopt if too little of it was seen. From time `since` on it is to explain the readings.
-std::optional<BegunLine> fit_begun(const std::vector<TimedReading>& readings, double begin,
-                                   double since) {
+/// ξ(t) = rate · (t − begin) from `begin` on, and 0 before. std::nullopt if too little of it was
+/// seen. From time `since` on it is to explain the readings. Neither place nor T is set.
+std::optional<BegunDrift> fit_begun(const std::vector<TimedReading>& readings, double begin,
+                                    double since) {
   int num_moved = 0;
   for (const TimedReading& r : readings) num_moved += r.time > begin;
   if (num_moved < kFewestMoved) return std::nullopt;
   const Matrix6d prior = rate_information();
-  BegunLine line;
+  BegunDrift line;
+  Vector6d& rate = line.drift.rate;
   Matrix6d H;
   for (int round = 0; round < 6; ++round) {
     H = prior;
-    Vector6d g = -prior * line.rate;
+    Vector6d g = -prior * rate;
     for (const TimedReading& r : readings) {
       const double elapsed = r.time - begin;
       if (elapsed <= 0) continue;
       // T is far from 1 where it drifted for long: exact residuals, and Jacobians of small ones.
-      const Vector6d e = round == 0 ? r.xi : log(exp(-elapsed * line.rate) * exp(r.xi));
+      const Vector6d e = round == 0 ? r.xi : log(exp(-elapsed * rate) * exp(r.xi));
       const Matrix6d I = (round == 0 ? 1 : robust_weight(e.dot(r.information * e))) * r.information;
       H += elapsed * elapsed * I;
       g += elapsed * I * e;
     }
-    line.rate += H.ldlt().solve(g);
+    rate += H.ldlt().solve(g);
   }
-  line.covariance = H.inverse();
+  line.drift.rate_covariance = H.inverse();
   const Eigen::LLT<Matrix6d> llt(H), of_prior(prior);
-  if (llt.info() != Eigen::Success || !line.rate.allFinite()) return std::nullopt;
-  line.log_prior = kSmallLogOdds - 0.5 * line.rate.dot(prior * line.rate) +
+  if (llt.info() != Eigen::Success || !rate.allFinite()) return std::nullopt;
+  line.log_prior = kSmallLogOdds - 0.5 * rate.dot(prior * rate) +
                    of_prior.matrixLLT().diagonal().array().log().sum() -
                    llt.matrixLLT().diagonal().array().log().sum() -
                    std::log(static_cast<double>(kLongestUnseen));
@@ -185,7 +178,7 @@ std::optional<BegunLine> fit_begun(const std::vector<TimedReading>& readings, do
   for (const TimedReading& r : readings) {
     const double elapsed = r.time - begin;
     if (elapsed <= 0) continue;
-    const Vector6d e = log(exp(-elapsed * line.rate) * exp(r.xi));
+    const Vector6d e = log(exp(-elapsed * rate) * exp(r.xi));
     const double d2 = e.dot(r.information * e);
     line.gain += robust_cost(r.xi.dot(r.information * r.xi)) - robust_cost(d2);
     if (r.time < since) continue;
@@ -418,25 +411,18 @@ std::vector<BegunDrift> begun_drifts(const BodySchema& before, const Measurement
     for (std::size_t link = place.links.size(); link-- > 0;) {
       const std::vector<TimedReading>& readings = place.links[link];
       const auto try_begin = [&](std::int64_t begin) -> std::optional<double> {
-        const auto line =
-            fit_begun(readings, static_cast<double>(begin), static_cast<double>(since));
+        auto line = fit_begun(readings, static_cast<double>(begin), static_cast<double>(since));
         if (!line) return std::nullopt;
-        if (best && line->gain <= best->gain) return line->gain;
-        best.emplace();
-        best->drift.part = place.part;
-        best->drift.link = static_cast<int>(link);
-        best->drift.rate = line->rate;
-        best->drift.rate_covariance = line->covariance;
-        best->drift.significance = squared_mahalanobis(line->rate, line->covariance);
+        const double gain = line->gain;
+        if (best && gain <= best->gain) return gain;
         const auto elapsed = static_cast<double>(now - begin);
-        best->drift.T = exp(elapsed * line->rate);
-        best->drift.covariance = elapsed * elapsed * line->covariance;
-        best->begin = begin;
-        best->now = now;
-        best->log_prior = line->log_prior;
-        best->gain = line->gain;
-        best->is_good = line->is_good;
-        return line->gain;
+        line->begin = begin;
+        line->drift.part = place.part;
+        line->drift.link = static_cast<int>(link);
+        line->drift.T = exp(elapsed * line->drift.rate);
+        line->drift.covariance = elapsed * elapsed * line->drift.rate_covariance;
+        best = std::move(line);
+        return gain;
       };
       std::int64_t likeliest = since;
       std::optional<double> most;
@@ -452,8 +438,7 @@ std::vector<BegunDrift> begun_drifts(const BodySchema& before, const Measurement
     }
     if (best) result.push_back(std::move(*best));
   }
-  std::stable_sort(result.begin(), result.end(),
-                   [](const BegunDrift& a, const BegunDrift& b) { return a.gain > b.gain; });
+  std::ranges::stable_sort(result, std::greater(), &BegunDrift::gain);
   return result;
 }
 

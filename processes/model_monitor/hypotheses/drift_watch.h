@@ -34,7 +34,6 @@ struct Drift {
 struct BegunDrift {
   Drift drift;
   std::int64_t begin = 0;
-  std::int64_t now = 0;  ///< the sample that drift.T is of
   /// log of the prior of what was fitted, its odds, and the width of the likelihood's peak
   /// (Laplace) [nats].
   double log_prior = 0;
@@ -56,19 +55,17 @@ std::vector<BegunDrift> begun_drifts(const BodySchema& before, const Measurement
                                      const std::vector<const ActionPoseSample*>& samples,
                                      std::int64_t since);
 
-/// Finds what is too small, or changes too slowly, for a CUSUM: means of the virtual measurements
-/// of every edge, and of every marker in its part, over the newest samples. The bend of a link by
-/// 0.05° a sample is below the noise of each of them, and ten standard deviations of their mean.
+/// Finds what is too small, or changes too slowly, for a CUSUM, by means of the virtual
+/// measurements of every edge, and of every marker in its part, over the newest samples.
 ///
-/// Follows what drifts, slowly or fast: the mean, by their probabilities, of a straight line
-/// through the newest measurements and of lines that ended some samples ago.
+/// Follows what drifts: the mean, by their probabilities, of a straight line through the newest
+/// measurements and of lines that ended some samples ago.
 class DriftWatch {
  public:
   explicit DriftWatch(double false_alarm_rate);
 
-  /// The sample as `filter` sees it, of the schema as it stands. Along a path, what is off by all
-  /// the time repeats, which is neither noise nor a change: unless `counts_near`, of what is nearly
-  /// one place the first sample counts.
+  /// The sample as `filter` sees it, of the schema as it stands. Along a path errors of the model
+  /// repeat: unless `counts_near`, of what is nearly one place the first sample counts.
   void add(const TreeFilter& filter, const TreeFilter::Instant& instant, const BodySchema& schema,
            const Eigen::VectorXd& displacements, std::int64_t sample_index,
            bool counts_near = true);

@@ -59,8 +59,7 @@ void HypothesisTracker::tell_difference(const Hypothesis& before, const Hypothes
     const Change* old = last_at(before.changes, c.what.element);
     if (old && is_same_change(*old, c)) continue;
     const auto is_old = [old](const Change& other) { return is_same_change(other, *old); };
-    const bool is_superseded =
-        old && std::any_of(after.changes.begin(), after.changes.end(), is_old);
+    const bool is_superseded = old && std::ranges::any_of(after.changes, is_old);
     const bool is_learned_anew =
         old && c.what.fitted.change.is_learned() && !old->what.fitted.change.is_learned();
     const bool is_refined = old && !is_superseded && !is_learned_anew && c.since <= old->since;

@@ -25,7 +25,7 @@ constexpr int kManySamples = 8;
 constexpr std::int64_t kNewest = 5;
 
 bool is_in(std::int64_t value, const auto& values) {
-  return std::find(std::begin(values), std::end(values), value) != std::end(values);
+  return std::ranges::find(values, value) != std::end(values);
 }
 
 bool is_worth_learning(std::int64_t age) {
@@ -99,7 +99,7 @@ void HypothesisTracker::propose_learned(std::int64_t now) {
     return;
   std::vector<int> parts;
   const auto add = [&](const ElementId& element) {
-    const bool is_new = std::find(parts.begin(), parts.end(), element.id) == parts.end();
+    const bool is_new = std::ranges::find(parts, element.id) == parts.end();
     if (!element.is_tag() && edge_to(settled_, element.id) && is_new) parts.push_back(element.id);
   };
   for (const Change& c : changes()) add(c.what.element);
@@ -157,8 +157,7 @@ std::optional<Replacement> HypothesisTracker::best_form(const Hypothesis& of, co
   if (is_young && of.changes.size() == 1) {
     std::vector<ElementId> around = elements_around(*of.filter, change.what.element.id);
     for (const ElementId& element : suspects_of_settled(change.since))
-      if (std::find(around.begin(), around.end(), element) == around.end())
-        around.push_back(element);
+      if (std::ranges::find(around, element) == around.end()) around.push_back(element);
     std::erase(around, change.what.element);
     FoundChanges there = search(others, around, samples, nullptr);
     if (there.best && (!found.best || there.best->fitted.log_evidence >
@@ -225,7 +224,7 @@ void HypothesisTracker::propose_again(std::int64_t now, std::vector<AdaptationEv
 
 void HypothesisTracker::want_probe(std::int64_t now, std::vector<AdaptationEvent>* events) {
   const auto is_asked = [this](const Replacement& a, const Replacement& b) {
-    return std::any_of(asked_.begin(), asked_.end(), [&](const auto& pair) {
+    return std::ranges::any_of(asked_, [&](const auto& pair) {
       return (is_same_explanation(pair.first, a) && is_same_explanation(pair.second, b)) ||
              (is_same_explanation(pair.first, b) && is_same_explanation(pair.second, a));
     });

@@ -34,7 +34,7 @@ constexpr int kWorkPerSample = 4;
 constexpr int kMostWork = 1000;
 
 bool is_in(const std::vector<ElementId>& elements, const ElementId& element) {
-  return std::find(elements.begin(), elements.end(), element) != elements.end();
+  return std::ranges::find(elements, element) != elements.end();
 }
 
 }  // namespace
@@ -50,11 +50,12 @@ HypothesisTracker::HypothesisTracker(BodySchema settled, const MeasurementModel&
   begin(BodySchema(settled_), measurement);
 }
 
-void HypothesisTracker::set_settled(const BodySchema& settled) {
+void HypothesisTracker::set_settled(const BodySchema& settled, std::int64_t since) {
   settled_ = settled;
   settled_filter_ = std::make_shared<TreeFilter>(settled_, measurement_);
   for (Seen& seen : recent_)
-    seen.settled = settled_filter_->judge(settled_filter_->prepare(seen.sample)).log_likelihood;
+    if (seen.sample.sample_index >= since)
+      seen.settled = settled_filter_->log_likelihood(seen.sample);
   beam_.assign(1, {{}, settled_, settled_filter_, 0});
 }
 
@@ -66,14 +67,10 @@ void HypothesisTracker::begin(const BodySchema& settled, const MeasurementModel&
 }
 
 void HypothesisTracker::follow(const BodySchema& settled, int part) {
-  settled_ = settled;
-  settled_filter_ = std::make_shared<TreeFilter>(settled_, measurement_);
   // What is suspected elsewhere is judged by the body as it is now.
   const SequentialTests::Cusum cusum = tests_->highest().cusum;
-  for (Seen& seen : recent_)
-    if (&seen == &recent_.back() || (cusum.value > 0 && seen.sample.sample_index >= cusum.since))
-      seen.settled = settled_filter_->judge(settled_filter_->prepare(seen.sample)).log_likelihood;
-  beam_.assign(1, {{}, settled_, settled_filter_, 0});
+  const std::int64_t newest = recent_.empty() ? 0 : recent_.back().sample.sample_index;
+  set_settled(settled, cusum.value > 0 ? std::min(cusum.since, newest) : newest);
   tests_->clear(settled_filter_->node_of(part));
 }
 
@@ -95,8 +92,7 @@ std::int64_t HypothesisTracker::trouble_since() const {
 }
 
 bool HypothesisTracker::was_adopted_at(std::int64_t sample) const {
-  return std::any_of(changes().begin(), changes().end(),
-                     [sample](const Change& c) { return c.adopted == sample; });
+  return std::ranges::any_of(changes(), [sample](const Change& c) { return c.adopted == sample; });
 }
 
 double HypothesisTracker::most_log_odds() const {
@@ -196,20 +192,18 @@ double HypothesisTracker::log_odds_of(const std::vector<Change>& changes) const 
     const TreeFilter filter(body, measurement_);
     for (const Seen& seen : recent_)
       if (seen.sample.sample_index >= changes[n].since && seen.sample.sample_index < until)
-        odds += filter.judge(filter.prepare(seen.sample)).log_likelihood - seen.settled;
+        odds += filter.log_likelihood(seen.sample) - seen.settled;
   }
   return odds;
 }
 
 bool HypothesisTracker::is_standing(const std::vector<Change>& changes) const {
-  return std::equal(changes.begin(), changes.end(), standing().changes.begin(),
-                    standing().changes.end(), is_same_change);
+  return std::ranges::equal(changes, standing().changes, is_same_change);
 }
 
 void HypothesisTracker::offer(Hypothesis hypothesis) {
   const auto is_it = [&](const Hypothesis& other) {
-    return std::equal(other.changes.begin(), other.changes.end(), hypothesis.changes.begin(),
-                      hypothesis.changes.end(), is_same_change);
+    return std::ranges::equal(other.changes, hypothesis.changes, is_same_change);
   };
   beam_.erase(std::remove_if(beam_.begin() + 1, beam_.end(), is_it), beam_.end());
   if (is_standing(hypothesis.changes)) return;
@@ -252,7 +246,7 @@ double HypothesisTracker::needed_lead(const Hypothesis& other, std::int64_t now)
     is_new |= is_at_new_place;
     if (is_at_new_place && may_be_outliers(c.what.element, c.since))
       return std::numeric_limits<double>::infinity();
-    is_new |= is_learned(c) && std::none_of(changes().begin(), changes().end(), is_learned);
+    is_new |= is_learned(c) && std::ranges::none_of(changes(), is_learned);
     if (is_soft_ && now - c.since + 1 < kFewestSoft) return std::numeric_limits<double>::infinity();
   }
   if (is_new) return options_.acceptance + systematic;
@@ -280,10 +274,9 @@ void HypothesisTracker::stand(Hypothesis next, std::int64_t now,
                               std::vector<AdaptationEvent>* events) {
   bool is_another = next.changes.size() != changes().size();
   for (Change& c : next.changes) {
-    const auto standing_one =
-        std::find_if(changes().begin(), changes().end(), [&](const Change& other) {
-          return other.what.element == c.what.element && other.since == c.since;
-        });
+    const auto standing_one = std::ranges::find_if(changes(), [&](const Change& other) {
+      return other.what.element == c.what.element && other.since == c.since;
+    });
     c.adopted = standing_one == changes().end() ? now : standing_one->adopted;
     is_another |= standing_one == changes().end() || !is_same_change(*standing_one, c);
   }
@@ -331,7 +324,7 @@ void HypothesisTracker::detect(std::int64_t now, std::vector<AdaptationEvent>* e
     return is_in(elements_around(filter(), c.what.element.id), elements.front());
   };
   if (!changes().empty() && now - newest_adopted() <= kUnexplained &&
-      std::none_of(changes().begin(), changes().end(), is_beside))
+      std::ranges::none_of(changes(), is_beside))
     return;
   // Edges between which nothing was seen are suspected alike: which one it is is told later, if
   // there is more evidence of it. (A lead may also come from evidence against all of them.)
@@ -379,8 +372,8 @@ void HypothesisTracker::settle(std::int64_t now, std::vector<AdaptationEvent>* e
         (*events)[n].num_samples = static_cast<int>(now - c.adopted);
     }
   // Of a drift, which may look like small changes, the mean of many samples is not what is now.
-  const bool any_small = std::any_of(changes().begin(), changes().end(),
-                                     [](const Change& c) { return c.what.fitted.change.small; });
+  const bool any_small =
+      std::ranges::any_of(changes(), [](const Change& c) { return c.what.fitted.change.small; });
   maturing_.reset();
   if (!any_small) maturing_ = {settled_, changes(), newest_adopted()};
   set_settled(BodySchema(schema()));
@@ -425,7 +418,7 @@ void HypothesisTracker::take_back(const std::function<bool(const ElementId&)>& i
   for (Seen& seen : recent_) {
     if (seen.sample.sample_index < since) continue;
     clean(&seen.sample);
-    seen.settled = settled_filter_->judge(settled_filter_->prepare(seen.sample)).log_likelihood;
+    seen.settled = settled_filter_->log_likelihood(seen.sample);
   }
   const auto is_of_it = [&](const Change& c) { return c.since >= since && is_at(c.what.element); };
   std::vector<Change> rest = changes();
@@ -442,10 +435,9 @@ void HypothesisTracker::take_back(const std::function<bool(const ElementId&)>& i
 
 void HypothesisTracker::remember(const BodySchema& schema) {
   const auto is_cut = [](const Edge& edge) { return edge.state == EdgeState::kInvalid; };
-  if (std::any_of(schema.edges.begin(), schema.edges.end(), is_cut)) return;
-  const auto alike = std::find_if(history_.begin(), history_.end(), [&](const BodySchema& stored) {
-    return is_alike(stored, schema);
-  });
+  if (std::ranges::any_of(schema.edges, is_cut)) return;
+  const auto alike = std::ranges::find_if(
+      history_, [&](const BodySchema& stored) { return is_alike(stored, schema); });
   if (alike != history_.end()) {
     if (alike == history_.begin()) return;
     history_.erase(alike);
@@ -463,13 +455,10 @@ TreeFilter::Judgement HypothesisTracker::on_sample(const ActionPoseSample& sampl
                                                    std::vector<AdaptationEvent>* events) {
   work_budget_ = std::min(work_budget_ + kWorkPerSample, kMostWork);
   const std::int64_t now = sample.sample_index;
-  const auto judge = [&](const TreeFilter& filter) {
-    return filter.judge(filter.prepare(sample)).log_likelihood;
-  };
   add_silently(sample);
-  recent_.back().settled = judge(*settled_filter_);
+  const double settled = recent_.back().settled = settled_filter_->log_likelihood(sample);
   for (Hypothesis& h : beam_)
-    if (!h.changes.empty()) h.log_odds += judge(*h.filter) - recent_.back().settled;
+    if (!h.changes.empty()) h.log_odds += h.filter->log_likelihood(sample) - settled;
   const TreeFilter::Judgement judgement = tests_->update(filter(), filter().prepare(sample), now);
   propose_again(now, events);
   propose_more(now);

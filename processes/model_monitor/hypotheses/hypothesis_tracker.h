@@ -17,14 +17,13 @@ namespace bodyschema {
 
 /// Which changes the body made since it settled last: a beam of weighted hypotheses.
 ///
-/// A hypothesis is the settled body with changes on it, oldest first; without any, that nothing
-/// changed. Its weight are log odds against that one: priors of its changes, and of every sample
-/// the log-likelihood ratio of the tree filter. CUSUMs of the standing hypothesis propose others:
-/// one change more, another form or element of one, one less, an edge learned anew.
-/// Each sample adds to all weights. Another takes the place of the standing one when it leads by
-/// enough, fitted to all its samples: by `acceptance` for what is new, by nothing for what is less.
-/// Events are the difference of the two. Once a hypothesis has stood unchanged for `settled_after`
-/// samples it is the settled body, and a candidate for what comes after (the history).
+/// A hypothesis is the settled body with changes on it, oldest first, or none. Its weight are log
+/// odds against the one without: priors of its changes, and of every sample the log-likelihood
+/// ratio of the tree filter. CUSUMs of the standing hypothesis propose others: one change more,
+/// another form or element of one, one less, an edge learned anew. Another takes the place of the
+/// standing one when it leads by enough, fitted to all its samples: by `acceptance` for what is
+/// new, by nothing for what is less; events are the difference of the two. What has stood unchanged
+/// for `settled_after` samples is the settled body, and joins the history.
 class HypothesisTracker {
  public:
   /// A change of the settled body.
@@ -160,7 +159,8 @@ class HypothesisTracker {
   void begin_tests(std::int64_t since);
   /// Suspected under the settled body by the samples from `since` on.
   std::vector<ElementId> suspects_of_settled(std::int64_t since) const;
-  void set_settled(const BodySchema& settled);
+  /// The samples from `since` on are judged by it.
+  void set_settled(const BodySchema& settled, std::int64_t since = 0);
 
   const AdaptationOptions options_;
   const bool is_soft_;

@@ -5,6 +5,7 @@
 #include <cmath>
 #include <limits>
 #include <memory>
+#include <span>
 
 #include "processes/model_monitor/likelihood/tree_filter.h"
 
@@ -67,14 +68,19 @@ class ProcessFit {
     return K;
   }
 
+  // Of the inliers, for a variance of 1.
+  Eigen::MatrixXd unit_covariance(const Eigen::VectorXd& lengths) const {
+    const Eigen::MatrixXd x = x_(Eigen::all, inliers_);
+    return Kernel(SquaredExponential{1, lengths}).covariance(x, x);
+  }
+
   // Functions of the inliers, over the whole grid.
   void maximize() {
-    const Eigen::MatrixXd x = x_(Eigen::all, inliers_);
     const auto n = static_cast<double>(inliers_.size());
     std::vector<Cell> cells;  // from short to long
     double best = -std::numeric_limits<double>::infinity();
     const auto try_lengths = [&](const Eigen::VectorXd& lengths) {
-      const Eigen::MatrixXd unit = Kernel(SquaredExponential{1, lengths}).covariance(x, x);
+      const Eigen::MatrixXd unit = unit_covariance(lengths);
       for (const double factor : kVariances) {
         Cell cell{lengths, factor, 0};
         for (Eigen::Index c = 0; c < targets_.num_functions(); ++c) {
@@ -87,20 +93,13 @@ class ProcessFit {
         cells.push_back(std::move(cell));
       }
     };
-    Eigen::VectorXd lengths(half_.size());
-    for (const double first : kLengths) {
-      lengths(0) = first * half_(0);
-      if (half_.size() == 1) {
-        try_lengths(lengths);
-        continue;
-      }
-      for (const double second : kLengths) {
-        lengths(1) = second * half_(1);
-        try_lengths(lengths);
-      }
-    }
+    const std::span seconds =
+        std::span(kLengths).first(half_.size() == 1 ? 1 : std::size(kLengths));
+    for (const double first : kLengths)
+      for (const double second : seconds)
+        try_lengths(half_.cwiseProduct(Eigen::Vector2d(first, second).head(half_.size())));
     // Among cells about as likely, the one least sure of itself where no sample is.
-    cell_ = *std::max_element(cells.begin(), cells.end(), [&](const Cell& a, const Cell& b) {
+    cell_ = *std::ranges::max_element(cells, [&](const Cell& a, const Cell& b) {
       return std::pair(a.log_likelihood > best - kAsLikely, a.doubt()) <
              std::pair(b.log_likelihood > best - kAsLikely, b.doubt());
     });
@@ -108,8 +107,7 @@ class ProcessFit {
 
   // Each predicted by the other inliers (Rasmussen and Williams, eq. 5.12): k×n.
   void leave_one_out(Eigen::MatrixXd* residual, Eigen::MatrixXd* variance) const {
-    const Eigen::MatrixXd x = x_(Eigen::all, inliers_);
-    const Eigen::MatrixXd unit = Kernel(SquaredExponential{1, cell_.lengths}).covariance(x, x);
+    const Eigen::MatrixXd unit = unit_covariance(cell_.lengths);
     const auto n = static_cast<Eigen::Index>(inliers_.size());
     residual->resize(targets_.num_functions(), n);
     variance->resize(targets_.num_functions(), n);
@@ -156,7 +154,7 @@ class ProcessFit {
     std::vector<std::pair<double, Eigen::Index>> refuted;
     for (Eigen::Index t = 0; t < n; ++t)
       if (log_density(t) < log_outlier_) refuted.emplace_back(log_density(t), inliers_[t]);
-    std::sort(refuted.begin(), refuted.end());
+    std::ranges::sort(refuted);
     // One outlier makes its neighbours look like some.
     const std::size_t num = std::min({refuted.size(), std::max<std::size_t>(1, refuted.size() / 2),
                                       most > num_out ? most - num_out : 0});
@@ -167,8 +165,7 @@ class ProcessFit {
   LearnedEdge result() const {
     LearnedEdge learned;
     learned.change = targets_.change;
-    const Eigen::MatrixXd x = x_(Eigen::all, inliers_);
-    const Eigen::MatrixXd unit = Kernel(SquaredExponential{1, cell_.lengths}).covariance(x, x);
+    const Eigen::MatrixXd unit = unit_covariance(cell_.lengths);
     learned.log_prior = targets_.change.log_odds() - std::log(num_cells());
     for (Eigen::Index c = 0; c < targets_.num_functions(); ++c) {
       const Eigen::MatrixXd K = covariance(unit, cell_, c);

@@ -19,12 +19,12 @@ struct ProcessTargets {
   Edge edge;                                      ///< without the functions
   Eigen::Matrix<double, 6, Eigen::Dynamic> into;  ///< 6×k: ρ of the functions' values
   Eigen::MatrixXd y;                              ///< k×n
-  Eigen::VectorXd noise;                          ///< k, variances
-  Eigen::VectorXd scales;                         ///< n: of the noise of each measurement
+  Eigen::VectorXd noise = {};                     ///< k, variances
+  Eigen::VectorXd scales = {};                    ///< n: of the noise of each measurement
   /// n: log density of what the functions say nothing of, and its squared distance.
-  Eigen::VectorXd log_rest, distance_rest;
+  Eigen::VectorXd log_rest = {}, distance_rest = {};
   /// n: student_cost() of what stood.
-  Eigen::VectorXd old_cost;
+  Eigen::VectorXd old_cost = {};
 
   Eigen::Index num_functions() const { return y.rows(); }
   Eigen::Index num_samples() const { return y.cols(); }

@@ -111,7 +111,7 @@ std::vector<ElementId> differences(const BodySchema& a, const BodySchema& b) {
       if (edge.from == part) children.push_back(edge.to);
     if (!edges.contains(part) || children.empty()) continue;
     const Pose X_a = pose_in_parent(a, part), X_b = pose_in_parent(b, part);
-    const bool only_the_marker = std::all_of(children.begin(), children.end(), [&](int child) {
+    const bool only_the_marker = std::ranges::all_of(children, [&](int child) {
       return edges.contains(child) &&
              (X_a * pose_in_parent(a, child)).isApprox(X_b * pose_in_parent(b, child), 1e-6);
     });

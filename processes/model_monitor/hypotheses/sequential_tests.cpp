@@ -2,7 +2,9 @@
 
 #include <algorithm>
 #include <cmath>
+#include <functional>
 #include <iterator>
+#include <utility>
 
 namespace bodyschema {
 namespace {
@@ -30,10 +32,9 @@ TreeFilter::Judgement SequentialTests::update(const TreeFilter& filter,
                                               std::int64_t sample_index) {
   const TreeFilter::Judgement now = filter.judge(instant);
   const auto is_zero = [](const Cusum& c) { return c.value == 0; };
-  const bool is_clear = std::all_of(now.squared_distance.begin(), now.squared_distance.end(),
-                                    [](double d2) { return d2 < kClear; });
-  if (is_clear && std::all_of(edges_.begin(), edges_.end(), is_zero) &&
-      std::all_of(markers_.begin(), markers_.end(), is_zero))
+  const bool is_clear =
+      std::ranges::all_of(now.squared_distance, [](double d2) { return d2 < kClear; });
+  if (is_clear && std::ranges::all_of(edges_, is_zero) && std::ranges::all_of(markers_, is_zero))
     return now;
   const auto ratio = [&](const Alternative& alternative) {
     return filter.judge(instant, alternative).log_likelihood - now.log_likelihood;
@@ -70,25 +71,19 @@ SequentialTests::Highest SequentialTests::highest() const {
 }
 
 std::vector<ElementId> SequentialTests::suspects(const TreeFilter& filter, double suspicion) const {
-  struct Scored {
-    double value;
-    ElementId element;
-  };
-  std::vector<Scored> scored;
+  std::vector<std::pair<double, ElementId>> scored;
   for (int node = 0; node < filter.num_nodes(); ++node) {
-    scored.push_back({edge(node).value, edge_element(filter.part(node), filter.part(0))});
-    scored.push_back({marker(node).value, tag_element(filter.part(node))});
+    scored.emplace_back(edge(node).value, edge_element(filter.part(node), filter.part(0)));
+    scored.emplace_back(marker(node).value, tag_element(filter.part(node)));
   }
-  std::erase_if(scored, [suspicion](const Scored& s) { return !(s.value > suspicion); });
-  std::stable_sort(scored.begin(), scored.end(),
-                   [](const Scored& a, const Scored& b) { return a.value > b.value; });
+  std::erase_if(scored, [suspicion](const auto& s) { return !(s.first > suspicion); });
+  std::ranges::stable_sort(scored, std::greater(), [](const auto& s) { return s.first; });
   if (scored.size() > kMostSuspects) scored.resize(kMostSuspects);
   std::vector<ElementId> elements;
-  for (const Scored& s : scored) elements.push_back(s.element);
+  for (const auto& [value, element] : scored) elements.push_back(element);
   if (elements.empty()) return elements;
   for (const ElementId& element : elements_around(filter, elements.front().id))
-    if (std::find(elements.begin(), elements.end(), element) == elements.end())
-      elements.push_back(element);
+    if (std::ranges::find(elements, element) == elements.end()) elements.push_back(element);
   return elements;
 }
 

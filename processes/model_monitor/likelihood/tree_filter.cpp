@@ -3,7 +3,7 @@
 #include <Eigen/Cholesky>
 #include <algorithm>
 #include <cmath>
-#include <map>
+#include <limits>
 #include <set>
 
 #include "common/estimation/chi_square.h"
@@ -26,7 +26,7 @@ constexpr std::size_t kMaxStarters = 3;
 constexpr double kMuchLikelier = 3;
 
 double log_sum_exp(const std::vector<double>& terms) {
-  const double largest = *std::max_element(terms.begin(), terms.end());
+  const double largest = *std::ranges::max_element(terms);
   if (!std::isfinite(largest)) return largest;
   double sum = 0;
   for (const double term : terms) sum += std::exp(term - largest);
@@ -54,16 +54,30 @@ Matrix6d model_covariance(const Edge& edge, const Eigen::VectorXd& theta) {
   return covariance;
 }
 
+namespace {
+
+/// log N(x; 0, S), and xᵀ S⁻¹ x; `llt` of S.
+template <int size>
+std::pair<double, double> log_normal(const Eigen::Vector<double, size>& x,
+                                     const Eigen::LLT<Eigen::Matrix<double, size, size>>& llt) {
+  const double d2 = llt.matrixL().solve(x).squaredNorm();
+  const double log_det = 2 * llt.matrixLLT().diagonal().array().log().sum();
+  return {-0.5 * (d2 + log_det + size * std::log(2 * M_PI)), d2};
+}
+
+}  // namespace
+
 double log_flat_density() { return -std::log(8 * M_PI * M_PI * kRoom_m3); }
 
 double log_normal_density(const Vector6d& xi, const Matrix6d& S) {
   const Eigen::LLT<Matrix6d> llt(S);
-  if (llt.info() != Eigen::Success) return -std::numeric_limits<double>::infinity();
-  const double d2 = llt.matrixL().solve(xi).squaredNorm();
-  const double log_det = 2 * llt.matrixLLT().diagonal().array().log().sum();
-  return -0.5 * (d2 + log_det + 6 * std::log(2 * M_PI));
+  return llt.info() == Eigen::Success ? log_normal(xi, llt).first
+                                      : -std::numeric_limits<double>::infinity();
 }
 
+namespace {
+
+/// log g of a marker's pose `X_CB` under a belief `X` with S = P + Σ_y; `marker_covariance`: Σ_y.
 double log_outlier_density(const Pose& X, const Pose& X_CB, const Matrix6d& S,
                            const Matrix6d& marker_covariance) {
   const Vector6d xi = log(X.inverse() * X_CB);
@@ -78,9 +92,7 @@ double log_outlier_density(const Pose& X, const Pose& X_CB, const Matrix6d& S,
       S.topLeftCorner<3, 3>() + 100 * Eigen::Matrix3d(variances.topLeftCorner<3, 3>());
   const Eigen::LLT<Eigen::Matrix3d> llt(near);
   const double log_near =
-      -0.5 * (llt.matrixL().solve(xi.head<3>()).squaredNorm() +
-              2 * llt.matrixLLT().diagonal().array().log().sum() + 3 * std::log(2 * M_PI)) -
-      std::log(8 * M_PI * M_PI);
+      log_normal(Eigen::Vector3d(xi.head<3>()), llt).first - std::log(8 * M_PI * M_PI);
   const double quarter = std::log(0.25), eighth = std::log(0.125);
   // A flip is mirrored exactly, or nearly so.
   const Vector6d from_flip = log(flipped(X).inverse() * X_CB);
@@ -91,15 +103,15 @@ double log_outlier_density(const Pose& X, const Pose& X_CB, const Matrix6d& S,
        eighth + log_flat_density()});
 }
 
+/// log [(1 − ρ) N(ξ; 0, S) + ρ g(ξ)] of the same; half of g is where the marker was `misread`
+/// before, in its part's frame. Sets whether the marker is to be believed.
 double log_marker_density(const Pose& X, const Pose& X_CB, const Matrix6d& S,
                           const Matrix6d& marker_covariance, double outlier_rate,
                           const std::vector<Pose>& misread, bool* is_inlier,
                           double* squared_distance) {
   const Vector6d xi = log(X.inverse() * X_CB);
-  const Eigen::LLT<Matrix6d> llt(S);
-  const double d2 = llt.matrixL().solve(xi).squaredNorm();
-  const double log_det = 2 * llt.matrixLLT().diagonal().array().log().sum();
-  const double inlier = std::log1p(-outlier_rate) - 0.5 * (d2 + log_det + 6 * std::log(2 * M_PI));
+  const auto [log_density, d2] = log_normal(xi, Eigen::LLT<Matrix6d>(S));
+  const double inlier = std::log1p(-outlier_rate) + log_density;
   *squared_distance = d2;
   *is_inlier = true;
   if (d2 < kClearInlier) return inlier;
@@ -113,6 +125,8 @@ double log_marker_density(const Pose& X, const Pose& X_CB, const Matrix6d& S,
   *is_inlier = inlier >= outlier;
   return log_sum_exp({inlier, outlier});
 }
+
+}  // namespace
 
 TreeFilter::TreeFilter(const BodySchema& schema, const MeasurementModel& measurement)
     : schema_(schema), measurement_(measurement) {
@@ -189,8 +203,7 @@ class TreeFilter::Walk {
 
   bool is_cut(int node) const {
     return filter_.nodes_[node].is_cut ||
-           std::find(alternative_.cut_edges.begin(), alternative_.cut_edges.end(), node) !=
-               alternative_.cut_edges.end();
+           std::ranges::find(alternative_.cut_edges, node) != alternative_.cut_edges.end();
   }
 
   /// Everything from the camera on.
@@ -199,7 +212,7 @@ class TreeFilter::Walk {
       behind_cut(0);
       return;
     }
-    Belief belief = descend({Pose::Identity(), Matrix6d::Zero()}, 0);
+    Belief belief = descend({}, 0);
     subtree(0, &belief);
   }
 
@@ -386,40 +399,24 @@ std::optional<VirtualMeasurement> TreeFilter::measure_edge(const Instant& instan
   // parent, side branches on the way.
   std::vector<int> path;
   for (int n = nodes_[node].parent; n >= 0; n = nodes_[n].parent) path.push_back(n);
-  std::reverse(path.begin(), path.end());
+  std::ranges::reverse(path);
   Walk left(*this, instant, as_it_is);
   std::optional<Belief> belief = Belief{};
+  bool is_whole = false;  // the belief has all markers below in it
   for (std::size_t k = 0; k < path.size(); ++k) {
-    const int next = k + 1 < path.size() ? path[k + 1] : node;
     if (left.is_cut(path[k])) {
       // Nothing from above: what is below begins anew, without the branch in question.
       const Alternative above{.cut_edges = {node}};
-      Walk anew(*this, instant, above);
-      belief = anew.behind_cut(path[k]);
+      belief = Walk(*this, instant, above).behind_cut(path[k]);
       if (!belief) return std::nullopt;
-      if (k + 1 == path.size()) break;
-      // That belief is on path[k] and has the whole subtree in it: go down without further markers.
-      for (std::size_t m = k + 1; m < path.size(); ++m) {
-        if (left.is_cut(path[m])) {
-          belief.reset();
-          k = m - 1;
-          break;
-        }
-        belief = left.descend(*belief, path[m]);
-        k = m;
-      }
-      if (belief) break;
+      is_whole = true;
       continue;
     }
     belief = left.descend(*belief, path[k]);
-    left.subtree(path[k], &*belief, next);
+    if (!is_whole) left.subtree(path[k], &*belief, k + 1 < path.size() ? path[k + 1] : node);
   }
-  if (!belief) return std::nullopt;
-  VirtualMeasurement result;
-  result.z = belief->X.inverse() * child->X;
-  const Matrix6d A = adjoint(result.z.inverse());
-  result.covariance = child->P + A * belief->P * A.transpose();
-  return result;
+  const Pose z = belief->X.inverse() * child->X;
+  return VirtualMeasurement{z, relative_covariance(z, belief->P, child->P)};
 }
 
 std::optional<VirtualMeasurement> TreeFilter::measure_marker(const Instant& instant,
@@ -436,17 +433,14 @@ std::optional<VirtualMeasurement> TreeFilter::measure_marker(const Instant& inst
     if (walk.is_cut(n)) return std::nullopt;
     path.push_back(n);
   }
-  std::reverse(path.begin(), path.end());
+  std::ranges::reverse(path);
   Belief belief;
   for (std::size_t k = 0; k < path.size(); ++k) {
     belief = walk.descend(belief, path[k]);
     walk.subtree(path[k], &belief, k + 1 < path.size() ? path[k + 1] : -1);
   }
-  VirtualMeasurement result;
-  result.z = belief.X.inverse() * seen->X_CB;
-  const Matrix6d A = adjoint(result.z.inverse());
-  result.covariance = seen->covariance + A * belief.P * A.transpose();
-  return result;
+  const Pose z = belief.X.inverse() * seen->X_CB;
+  return VirtualMeasurement{z, relative_covariance(z, belief.P, seen->covariance)};
 }
 
 }  // namespace bodyschema

@@ -1,6 +1,5 @@
 #pragma once
 
-#include <limits>
 #include <optional>
 #include <vector>
 
@@ -38,11 +37,10 @@ struct VirtualMeasurement {
 /// starts at the root with X_CR and goes outwards: X ← X·Δ_e(q), P ← F P Fᵀ + Σ_e(q) with F =
 /// Ad(Δ⁻¹) and Σ_e = model_covariance(). A visible marker y has the density
 ///   (1 − ρ) N(ξ; 0, S) + ρ g(ξ),   ξ = log(X⁻¹ y), S = P + Σ_y,
-/// with an outlier density g that is shaped as the outliers of planar markers are: flips, tilts of
-/// unknown direction, wide errors and a floor. (A uniform g makes every flip of a leaf's marker
-/// speak for a broken edge.) Where a marker was misread before it is expected again
-/// (MeasurementModel::misread). A second reading of a planar marker counts as one in ten. Where the
-/// first term is the larger one the marker corrects the belief.
+/// with an outlier density g shaped as the outliers of planar markers are: flips, tilts of unknown
+/// direction, wide errors and a floor. (With a uniform g every flip of a leaf's marker would speak
+/// for a broken edge.) Misreadings are expected again (MeasurementModel::misread). A second reading
+/// counts as one in ten. Where the first term is the larger one the marker corrects the belief.
 /// What a branch learns goes back to its parent by the smoother's gain P Fᵀ P_child⁻¹, so that
 /// siblings profit from each other.
 class TreeFilter {
@@ -87,6 +85,10 @@ class TreeFilter {
     std::vector<int> believed;
   };
   Judgement judge(const Instant& instant, const Alternative& alternative = {}) const;
+  /// That of a sample, without alternatives.
+  double log_likelihood(const ActionPoseSample& sample) const {
+    return judge(prepare(sample)).log_likelihood;
+  }
 
   /// The pose of `node` in its parent (root: in the camera), from the markers on either side of its
   /// edge alone. std::nullopt if a side saw nothing.
@@ -116,17 +118,6 @@ class TreeFilter {
 
 /// log N(ξ; 0, S) in six dimensions; −∞ if S is not positive definite.
 double log_normal_density(const Vector6d& xi, const Matrix6d& S);
-
-/// log [(1 − ρ) N(ξ; 0, S) + ρ g(ξ)] of a marker's pose `X_CB` under a belief `X` with S = P + Σ_y;
-/// `marker_covariance` is Σ_y; half of g is where the marker was `misread` before, in its part's
-/// frame. Sets whether the marker is to be believed.
-double log_marker_density(const Pose& X, const Pose& X_CB, const Matrix6d& S,
-                          const Matrix6d& marker_covariance, double outlier_rate,
-                          const std::vector<Pose>& misread, bool* is_inlier,
-                          double* squared_distance);
-/// log g alone.
-double log_outlier_density(const Pose& X, const Pose& X_CB, const Matrix6d& S,
-                           const Matrix6d& marker_covariance);
 
 /// Density of a pose anywhere in the room: 1/(8π² V), V = 8 m³.
 double log_flat_density();
