@@ -354,6 +354,37 @@ def _(rng, seed):
     rec.position_sd, rec.rotation_sd = np.array([rec.position_sd * np.sqrt(11 / 3), rec.rotation_sd]) * np.sqrt(np.mean(squares))
     return rec
 family("25 industrial, hysteresis, wrist not seen")(lambda rng, seed: industrial(rng, seed, 5))
+@family("26 eyes, version and vergence")
+def _(rng, seed):
+    """A neck of two joints; both eyes tilt by q3 and turn by q4 and half of q5 to either side."""
+    tags = [placed(rng, .02) for _ in range(4)]
+    def body(q):
+        head = pose([0, 0, .1]) @ pose(w=np.outer(q[:, 0], Y)) @ pose(w=np.outer(q[:, 1], Z))
+        eye = lambda side: head @ pose([.05, .035 * side, .06]) @ pose(w=np.outer(q[:, 2], Y)) @ pose(w=np.outer(q[:, 3] + side * q[:, 4] / 2, Z))
+        return {part: T @ tag for part, (T, tag) in enumerate(zip([np.broadcast_to(np.eye(4), head.shape), head, eye(1), eye(-1)], tags), 1)}
+    return record(rng, seed, body, [-.5, -1, -.4, -.5, 0], [.5, 1, .4, .5, .4], noise=(5e-4, .4 * DEG), distance=.8)
+@family("27 part that hangs")
+def _(rng, seed):
+    """From a hook of the last of four links; odd seeds: it turns about the vertical with the hook."""
+    joints, tag = serial_joints(rng, 4), placed(rng, .03)
+    arm = marked(rng, joints)
+    def body(q):
+        hook = frames_of(joints, q)[4] @ pose([.02, 0, .1])
+        yaw = np.arctan2(hook[:, 1, 0], hook[:, 0, 0]) if seed % 2 else 0 * q[:, 0]
+        return arm(q) | {6: pose(hook[:, :3, 3], np.outer(yaw, Z)) @ pose([0, 0, -.12]) @ tag}
+    return record(rng, seed, body, [-1.1] * 4, 1.1)
+def moved_by_hand(rng, seed, parts):
+    """In the last 3 to 15 % of the recording: the base under these parts, or the marker of the only one."""
+    rec = record(rng, seed, marked(rng, serial_joints(rng, 4)), [-1.2] * 4, 1.2)
+    late = np.arange(len(rec.times)) > len(rec.times) * (1 - rng.uniform(.03, .15))
+    X_CB, moved = rec.seen[1][0], pose(rng.choice([8e-3, 15e-3, 30e-3]) * unit(rng), rng.uniform(2, 6) * DEG * unit(rng))
+    for part in parts:
+        T = rec.seen[part]
+        rec.seen[part] = np.where(late[:, None, None], T @ moved if len(parts) == 1 else X_CB @ moved @ np.linalg.inv(X_CB) @ T, T)
+        rec.read[part] = noisy(rng, rec.seen[part], rec.position_sd, rec.rotation_sd)
+    return rec
+family("28 base moved late")(lambda rng, seed: moved_by_hand(rng, seed, [2, 3, 4, 5]))
+family("29 marker moved late")(lambda rng, seed: moved_by_hand(rng, seed, [3]))
 
 # --- Judge
 
