@@ -82,9 +82,9 @@ std::optional<Noise> noise_in_common(const BodySchema& schema,
         }
       }
   if (count < kFewest) return std::nullopt;
-  // The largest that two standard errors of the mean allow.
+  // The largest that one standard error of the mean allows.
   const auto deviation = [count](const Sums& sums, double least) {
-    const double most = (sums.once + 2 * std::sqrt(sums.squared)) / (3 * count);
+    const double most = (sums.once + std::sqrt(sums.squared)) / (3 * count);
     return std::sqrt(std::max(most, least * least));
   };
   return Noise{deviation(position, kNoiseFloor.position_m),

@@ -11,7 +11,7 @@ namespace bodyschema {
 /// Noise per axis of one marker, as what the residuals of two edges have in common that meet at its
 /// part: there an error of the marker is in both, an error of the body in one. So it tells them
 /// apart where the noise is not known otherwise, as what the edges leave does not. The largest that
-/// two standard errors allow: where a body is off by much the mean itself may be any, below 0 too.
+/// one standard error allows: where a body is off by much the mean itself may be any, below 0 too.
 ///
 /// Residuals of the fit are enlarged to the leave-one-out residuals. `displaced`: samples whose
 /// actions are displacements. std::nullopt: no two edges meet, or too few samples show both.
