@@ -392,7 +392,7 @@ LearnedStructure find_in_step(const std::vector<Signal>& signals,
     });
   };
   LearnedStructure structure = confirmed(options);
-  // All joints on a signal share its bend: one of a single joint keeps out the others.
+  // All joints on a signal share its bend: one that a single joint has keeps out the others.
   const auto is_bent = [](const Signal& signal) { return !signal.warp.empty(); };
   if (!structure.spans() && std::ranges::any_of(structure.signals, is_bent)) {
     LearnedStructure straight = confirmed(options, Commands::kStraight);
@@ -473,7 +473,7 @@ LearnResult relearn(const LearnedStructure& structure, const std::vector<ActionP
 LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPoseSample>& samples,
                   const LearnOptions& options) {
   LearnResult result = fit_structure(find_structure(signals, samples, options), samples, options);
-  // What all parts together refuse two of them may hide: an edge that is right.
+  // An edge that all parts together refuse may have kept out a right one.
   LearnOptions others = options;
   for (const auto& [ends, why] : result.refused)
     if (why != Refusal::kWrongAtAnEnd) others.unconnectable.insert(ends);

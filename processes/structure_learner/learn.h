@@ -36,14 +36,14 @@ struct LearnOptions {
   /// A monitor tells what changed, and since when. Else an edge whose first or last samples are
   /// elsewhere is not valid: is_wrong_at_an_end().
   bool is_monitored = false;
-  /// Parts between which there is no edge, the lower first: of these others say more.
+  /// Two parts between which no edge is looked for, the lower first.
   std::set<std::pair<int, int>> unconnectable = {};
 };
 
 struct LearnResult {
   BodySchema schema;
   std::vector<Outlier> outliers;  ///< ascending by sample, then part
-  Refusals refused;               ///< edges that the search accepted
+  Refusals refused;               ///< what the search accepted, and the fit to all parts did not
   NoiseSource noise_source = NoiseSource::kAssumed;
   bool is_one_cluster = false;  ///< see one_cluster.h
   /// Of poses at rest: what the joint fit leaves has this correlation from one sample to the next.

@@ -24,7 +24,7 @@ struct SearchOptions {
   /// Standard deviation of the bias that every marker may have beside measurement.systematic, at
   /// half range of a signal, in those of the noise of one sight.
   double unknown_bias = 0;
-  /// Between which there is no edge, the lower first.
+  /// Two parts between which no edge is looked for, the lower first.
   std::set<std::pair<int, int>> unconnectable = {};
 };
 

@@ -115,8 +115,8 @@ std::optional<Detour> find_detour(const Nodes& nodes, PairModels* pairs, Least&&
   return std::nullopt;
 }
 
-// Whether a signal moves the position of node b against a by more than a share of how far it moves
-// b that the size of no marker is off by.
+// Whether a signal moves the position of node b against a by more than the share of its motion that
+// the size of a marker may be off by.
 bool moves_apart(const Nodes& nodes, int a, int b, int signal, PairModels* pairs) {
   constexpr double kSizeError = 0.1;
   const NormalizedActions& actions = pairs->actions();
