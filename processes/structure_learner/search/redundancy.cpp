@@ -115,21 +115,26 @@ std::optional<Detour> find_detour(const Nodes& nodes, PairModels* pairs, Least&&
   return std::nullopt;
 }
 
-// Whether a signal moves the position of node b against a by more than the share of its motion that
-// the size of a marker may be off by.
+// Whether a signal moves the position of node b against a by more than a marker of another size
+// than is told explains: at a distance d from the camera it stands off by a share of d, which the
+// turn of a moves, and moves by the same share too far.
 bool moves_apart(const Nodes& nodes, int a, int b, int signal, PairModels* pairs) {
-  constexpr double kSizeError = 0.1;
+  constexpr double kSizeError = 0.05;
   const NormalizedActions& actions = pairs->actions();
-  double apart = 0, moved = 0;
-  for (int t = 0; t < actions.num_samples(); ++t) {
-    const Motion of_a = motion_of(nodes, a, signal, actions, t);
-    const Motion of_b = motion_of(nodes, b, signal, actions, t);
+  const PairData seen = pairs->part_data(nodes[b].part);
+  double apart = 0, explained = 0;
+  for (int t = 0; t < seen.size(); ++t) {
+    const int sample = seen.frames[t].sample;
+    const Motion of_a = motion_of(nodes, a, signal, actions, sample);
+    const Motion of_b = motion_of(nodes, b, signal, actions, sample);
     const Vector6d relative = of_b.by_signal - adjoint(of_b.X.inverse() * of_a.X) * of_a.by_signal;
-    const double square = actions(t, signal) * actions(t, signal);
+    const double square = actions(sample, signal) * actions(sample, signal);
     apart += square * relative.head<3>().squaredNorm();
-    moved += square * of_b.by_signal.head<3>().squaredNorm();
+    explained += square * (of_b.by_signal.head<3>().squaredNorm() +
+                           seen.primary(t).z.translation().squaredNorm() *
+                               of_a.by_signal.tail<3>().squaredNorm());
   }
-  return apart > kSizeError * kSizeError * moved;
+  return apart > kSizeError * kSizeError * explained;
 }
 
 // A node at the end of a chain of three or more joints that turn, while at most one signal turns it
