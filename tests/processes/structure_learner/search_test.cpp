@@ -397,22 +397,6 @@ TEST(RedundantEdges, AreNoneForAPartThatHangs) {
   }
 }
 
-TEST(Learn, FindsAnotherWayAroundPartsThatAreSaidToShareNoEdge) {
-  Rng rng(3);
-  const test::SyntheticRobot robot = test::chapter_robot("c", rng);
-  const auto samples =
-      test::babble(robot, 60, {.regime = Regime::kTagIso, .with_covariances = true}, rng);
-  LearnOptions options;
-  const BodySchema direct = learn(robot.signals, samples, options).schema;
-  ASSERT_TRUE(direct.complete);
-  const Edge& last = direct.edges.back();
-  options.unconnectable = {std::minmax(last.from, last.to)};
-  const BodySchema around = learn(robot.signals, samples, options).schema;
-  EXPECT_TRUE(around.complete);
-  for (const Edge& edge : around.edges)
-    EXPECT_NE(std::minmax(edge.from, edge.to), std::minmax(last.from, last.to));
-}
-
 TEST(MimicJoints, AreFoundWithNothingSeenBetween) {
   EXPECT_GE(count_right(kMimicJoint, 2, Regime::kTag), 9);
   // Of three the second joint adds so little that it may be how one joint is imperfect.

@@ -441,6 +441,9 @@ TEST(SoftParts, ASignalThatMayHaveNoEffectIsTold) {
     ASSERT_EQ(strong.edges.size(), 1u);
     EXPECT_EQ(strong.edges[0].signals().size(), 3u);
     EXPECT_TRUE(strong.undecided_signals.empty());
+    const BodySchema none = segment_of_three(0, seed);
+    ASSERT_EQ(none.edges.size(), 1u);
+    EXPECT_EQ(none.edges[0].signals().size(), 2u);
 
     const BodySchema weak = segment_of_three(0.03, seed);
     ASSERT_EQ(weak.edges.size(), 1u);

@@ -1,0 +1,125 @@
+#include "processes/structure_learner/unconnected.h"
+
+#include <gtest/gtest.h>
+
+#include <algorithm>
+#include <cmath>
+#include <string>
+#include <vector>
+
+#include "tests/support/synthetic_robot.h"
+
+namespace bodyschema {
+namespace {
+
+using test::Regime;
+using test::Rng;
+
+bool contains(const std::vector<UnconnectedPart>& parts, const std::string& words) {
+  return std::ranges::any_of(parts, [&](const UnconnectedPart& part) {
+    return part.detail.find(words) != std::string::npos;
+  });
+}
+
+// Of 80 samples the last eight are of a base that was moved, or of none: poses of part 1.
+LearnResult learned_with_a_moved_base(bool is_moved, bool is_monitored) {
+  Rng rng(4);
+  const test::SyntheticRobot robot = test::chapter_robot("c", rng);
+  auto samples = test::babble(robot, 80, {.regime = Regime::kTagIso}, rng);
+  const Pose by = test::random_pose(rng, 0.02, 0.02);
+  for (std::size_t n = samples.size() - 8; is_moved && n < samples.size(); ++n)
+    for (PartObservation& o : samples[n].parts)
+      if (o.part == 1) o.X_CB = o.X_CB * by;
+  LearnOptions options;
+  options.measurement.noise = test::nominal_noise(Regime::kTagIso);
+  options.is_monitored = is_monitored;
+  return learn(robot.signals, samples, options);
+}
+
+TEST(Refused, IsAnEdgeWhoseBaseWasMovedLateAndThePartsThatHangOnItAreTold) {
+  EXPECT_TRUE(learned_with_a_moved_base(false, false).schema.complete);
+  EXPECT_TRUE(learned_with_a_moved_base(true, true).schema.complete);
+  const LearnResult result = learned_with_a_moved_base(true, false);
+  EXPECT_FALSE(result.schema.complete);
+  ASSERT_EQ(result.refused.size(), 1u);
+  EXPECT_EQ(result.refused.begin()->second, Refusal::kWrongAtAnEnd);
+  EXPECT_TRUE(contains(result.schema.unconnected, "was moved meanwhile"));
+  EXPECT_TRUE(contains(result.schema.unconnected, "it hangs on part"));
+}
+
+TEST(Learn, FindsAnotherWayAroundPartsThatAreSaidToShareNoEdge) {
+  Rng rng(3);
+  const test::SyntheticRobot robot = test::chapter_robot("c", rng);
+  const auto samples =
+      test::babble(robot, 60, {.regime = Regime::kTagIso, .with_covariances = true}, rng);
+  LearnOptions options;
+  const BodySchema direct = learn(robot.signals, samples, options).schema;
+  ASSERT_TRUE(direct.complete);
+  const Edge& last = direct.edges.back();
+  options.unconnectable = {std::minmax(last.from, last.to)};
+  const BodySchema around = learn(robot.signals, samples, options).schema;
+  EXPECT_TRUE(around.complete);
+  for (const Edge& edge : around.edges)
+    EXPECT_NE(std::minmax(edge.from, edge.to), std::minmax(last.from, last.to));
+}
+
+// Three hinges on one signal, each bent in its own way: no bend of the command is that of all.
+TEST(Learn, FindsJointsThatBendOneCommandUnalike) {
+  for (unsigned seed = 1; seed <= 2; ++seed) {
+    Rng rng(seed);
+    const Noise noise{3e-4, 0.006};
+    std::vector<Pose> markers;
+    for (int part = 1; part <= 4; ++part) markers.push_back(test::random_pose(rng, 0.005, 0.01));
+    std::vector<ActionPoseSample> samples(120);
+    for (ActionPoseSample& sample : samples) {
+      sample.sample_index = &sample - samples.data();
+      sample.utime = 2'000'000 * sample.sample_index;
+      const double s = test::uniform(rng, 0, 1);
+      sample.action = Eigen::VectorXd::Constant(1, 0.03 * s);
+      const double angles[] = {1.5 * (1 - std::exp(-2.5 * s)), 1.7 * s * s,
+                               0.15 * std::log1p(std::exp(12 * (s - 0.5)))};
+      Pose X = Pose::Identity();
+      X.translation().z() = 0.4;
+      for (int part = 1; part <= 4; ++part) {
+        if (part > 1)
+          X = X * Eigen::Translation3d(0.06, 0, 0) *
+              Eigen::AngleAxisd(angles[part - 2], Eigen::Vector3d::UnitY());
+        Vector6d e = test::gaussian6(rng);
+        e.head<3>() *= noise.position_m;
+        e.tail<3>() *= noise.rotation_rad;
+        PartObservation o;
+        o.part = part;
+        o.X_CB = X * markers[part - 1] * exp(e);
+        sample.parts.push_back(o);
+      }
+    }
+    LearnOptions options;
+    options.measurement.noise = noise;
+    EXPECT_TRUE(learn({{"tendon", 0, 0.03}}, samples, options).schema.complete) << seed;
+  }
+}
+
+// A command, and what the drive reports of it.
+TEST(Unconnected, PartsOfSignalsThatMoveAlikeAreToldSo) {
+  Rng rng(5);
+  const test::SyntheticRobot robot = test::chapter_robot("c", rng);
+  auto samples = test::babble(robot, 30, {.regime = Regime::kTagIso}, rng);
+  std::vector<Signal> signals = robot.signals;
+  signals.push_back({"reported", -200, 200});
+  const auto n = static_cast<Eigen::Index>(robot.signals.size());
+  for (ActionPoseSample& sample : samples) {
+    // The last part is elsewhere each time: nothing explains it.
+    for (PartObservation& o : sample.parts)
+      if (o.part == 5) o.X_CB = o.X_CB * test::random_pose(rng, 0.2, 0.3);
+    sample.action.conservativeResize(n + 1);
+    sample.action(n) = 57 * sample.action(0) + 3;
+  }
+  LearnOptions options;
+  options.measurement.noise = test::nominal_noise(Regime::kTagIso);
+  const BodySchema schema = learn(signals, samples, options).schema;
+  EXPECT_TRUE(
+      contains(schema.unconnected, robot.signals[0].name + ", reported move alike at all samples"));
+}
+
+}  // namespace
+}  // namespace bodyschema
