@@ -7,6 +7,7 @@
 
 #include "common/bus/channels.h"
 #include "common/bus/event_log.h"
+#include "common/config/proposed_calibration.h"
 #include "common/text/text.h"
 #include "processes/console/hint.h"
 #include "processes/console/views/adoption_view.h"
@@ -21,6 +22,11 @@ struct Proposal {
   std::optional<std::string> markers_text, camera_text;
   RigCalibration calibration;  ///< the run's where nothing is proposed
 };
+
+/// The first line where it says which refinement a file is of, else "".
+std::string mark_of(const std::string& text) {
+  return text.starts_with(kProposalMark) ? text.substr(0, text.find('\n')) : "";
+}
 
 Proposal proposal_of(const path& folder, const RigCalibration& recorded) {
   const path markers = folder / "markers.yaml", camera = folder / "camera_info.yaml";
@@ -41,6 +47,12 @@ Proposal proposal_of(const path& folder, const RigCalibration& recorded) {
         to_type(fmt::format("refine SCHEMA LOG --placements --intrinsics --out SCHEMA2 --proposed "
                             "{}",
                             folder.string()))));
+  if (proposal.markers_text && proposal.camera_text &&
+      mark_of(*proposal.markers_text) != mark_of(*proposal.camera_text))
+    throw std::runtime_error(
+        fmt::format("{}: the two files are of two refinements: the refiner was stopped between "
+                    "them; refine again",
+                    folder.string()));
   // A group's refiner may replace them at any time.
   if ((proposal.markers_text && read_file(markers) != *proposal.markers_text) ||
       (proposal.camera_text && read_file(camera) != *proposal.camera_text))

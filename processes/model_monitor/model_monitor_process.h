@@ -8,10 +8,10 @@
 #include "common/bus/awaited_answer.h"
 #include "common/bus/rig_door.h"
 #include "common/bus/sample_intake.h"
+#include "common/bus/sample_trail.h"
+#include "common/bus/saved_message.h"
 #include "processes/model_monitor/model_monitor.h"
 #include "processes/model_monitor/monitor_memory.h"
-#include "processes/model_monitor/sample_trail.h"
-#include "processes/model_monitor/saved_message.h"
 
 namespace bodyschema {
 

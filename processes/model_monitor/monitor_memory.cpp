@@ -5,7 +5,7 @@
 #include <utility>
 
 #include "common/bus/event_log.h"
-#include "processes/model_monitor/saved_message.h"
+#include "common/bus/saved_message.h"
 
 namespace bodyschema {
 namespace {

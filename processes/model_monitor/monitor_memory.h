@@ -10,7 +10,7 @@
 
 #include "bodyschema/body_schema_t.hpp"
 #include "bodyschema/model_health_t.hpp"
-#include "processes/model_monitor/sample_trail.h"
+#include "common/bus/sample_trail.h"
 
 namespace bodyschema {
 

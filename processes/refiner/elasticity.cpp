@@ -80,7 +80,8 @@ std::optional<Elasticity> fit_elasticity(const BodySchema& schema,
                                          const std::vector<RefinerSample>& training,
                                          const std::vector<RefinerSample>& held_out,
                                          const RefineOptions& options, RefinementProblem& stiff) {
-  RefinementProblem problem(schema, training, std::nullopt, options, stiff.root_moves());
+  const std::optional<RigCalibration> no_rig;
+  RefinementProblem problem(schema, training, no_rig, options, stiff.root_moves());
   const auto num_joints = options.joint_loads(training.front().sample.action).size();
   const ParameterBlock* drive = problem.drive();
   const auto num_free = drive ? std::count_if(drive->free.begin(), drive->free.end(),

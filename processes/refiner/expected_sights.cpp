@@ -103,23 +103,29 @@ std::vector<ExpectedSights::Tag> ExpectedSights::tags(const Eigen::VectorXd& act
   return result;
 }
 
+std::map<int, Pose> ExpectedSights::poses(const Eigen::VectorXd& action) const {
+  std::map<int, Pose> poses = schema_.predict_all(action);
+  for (auto& [part, X] : poses) X = X_CR_ * X;
+  return poses;
+}
+
 std::vector<ExpectedSights::Part> ExpectedSights::parts(const Eigen::VectorXd& action) const {
   std::vector<Part> result;
-  const std::map<int, Pose> X_RB = schema_.predict_all(action);
+  const std::map<int, Pose> X_CB = poses(action);
   const std::map<int, double> probabilities = visibility_->probabilities(action);
   for (const auto& [part, observations] : parts_) {
-    const auto predicted = X_RB.find(part);
-    if (predicted == X_RB.end()) continue;
-    const Pose X_CB = X_CR_ * predicted->second;
+    const auto predicted = X_CB.find(part);
+    if (predicted == X_CB.end()) continue;
     const auto likeness = [&](const PartObservation* o) {
-      return view_direction(o->X_CB, o->has_rotation).dot(view_direction(X_CB, o->has_rotation));
+      return view_direction(o->X_CB, o->has_rotation)
+          .dot(view_direction(predicted->second, o->has_rotation));
     };
     const PartObservation* nearest =
         *std::max_element(observations.begin(), observations.end(),
                           [&](const auto* a, const auto* b) { return likeness(a) < likeness(b); });
     Part& expected = result.emplace_back(Part{*nearest, probabilities.at(part)});
     expected.observation.X_CB_other.reset();
-    expected.observation.X_CB = X_CB;
+    expected.observation.X_CB = predicted->second;
     if (!nearest->has_rotation) expected.observation.X_CB.linear().setIdentity();
   }
   return result;

@@ -38,6 +38,9 @@ class ExpectedSights {
   /// the tags of the sight from the most similar direction.
   std::vector<Part> parts(const Eigen::VectorXd& action) const;
 
+  /// X_CB of all parts.
+  std::map<int, Pose> poses(const Eigen::VectorXd& action) const;
+
   /// The sample at which a further one is taken to be: the last that has a root.
   std::int64_t sample_index() const { return last_->sample_index; }
   const Eigen::VectorXd& last_action() const { return last_->action; }

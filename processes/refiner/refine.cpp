@@ -15,6 +15,7 @@
 #include "processes/refiner/elasticity.h"
 #include "processes/refiner/held_out.h"
 #include "processes/refiner/information.h"
+#include "processes/refiner/informative_samples.h"
 #include "processes/refiner/refined_schema.h"
 #include "processes/refiner/refinement_problem.h"
 #include "processes/refiner/refinement_words.h"
@@ -65,14 +66,14 @@ void check_calibration(const std::vector<RefinerSample>& samples,
   if (is_asked && !has_corners(samples))
     throw std::invalid_argument(
         fmt::format("{} are refined by the tags' corners, which the samples do not have", asked));
-  if (!rig) return;
-  const std::int64_t id = calibration_id(rig->markers, rig->camera);
+  const std::int64_t first = samples.front().sample.calibration_id;
+  const std::int64_t id = rig ? calibration_id(rig->markers, rig->camera) : first;
   for (const RefinerSample& seen : samples)
     if (seen.sample.calibration_id != 0 && seen.sample.calibration_id != id)
       throw std::invalid_argument(
           fmt::format("sample {} was seen through another calibration of tags and lens than the "
-                      "rig's: its markers.yaml or camera calibration is another",
-                      seen.sample.sample_index));
+                      "{}: its markers.yaml or camera calibration is another",
+                      seen.sample.sample_index, rig ? "rig's" : "first one"));
 }
 
 /// Do the observed poses of the root differ by more than their noise?
@@ -104,7 +105,8 @@ std::vector<RefinementOutlier> outliers_of(RefinementProblem& problem) {
   for (std::size_t n = 0; n < squared.size(); ++n) {
     const auto& datum = problem.data()[n];
     if (squared[n] > chi_square_quantile(datum.num_residuals, 1e-4))
-      result.push_back({datum.sample_index, datum.part, datum.tag, std::sqrt(squared[n])});
+      result.push_back(
+          {datum.sample_index, datum.part, datum.tag, datum.utime, std::sqrt(squared[n])});
   }
   std::stable_sort(result.begin(), result.end(),
                    [](const auto& a, const auto& b) { return a.distance > b.distance; });
@@ -187,14 +189,14 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   const std::optional<RigCalibration> used_rig = result.used_corners ? rig : std::nullopt;
   if (rig) result.rig = *rig;
   result.num_available = static_cast<int>(training.size());
-  training = thinned(std::move(training), static_cast<std::size_t>(options.config.max_samples));
-  result.num_samples = static_cast<int>(training.size());
+  RefineOptions stiff = options;
+  stiff.joint_loads = nullptr;
   result.root_moves = root_moves(schema, training, options.measurement);
+  training = informative(std::move(training), schema, used_rig, stiff, result.root_moves);
+  result.num_samples = static_cast<int>(training.size());
   result.coverage = coverage_of(schema, training);
   result.held = held_things(schema, options, result.used_corners);
 
-  RefineOptions stiff = options;
-  stiff.joint_loads = nullptr;
   RefinementProblem problem(schema, training, used_rig, stiff, result.root_moves);
   for (const int part : problem.unseen_parts())
     result.held.push_back(fmt::format("the frame of part {}: it was never seen", part));
@@ -211,8 +213,10 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   result.plays = plays_of(schema, problem);
   if (result.used_corners) result.rig = refined_rig(problem, *rig);
   result.schema = refined_schema(schema, training, problem, information);
-  if (result.used_corners)
-    result.schema.calibration_id = calibration_id(result.rig.markers, result.rig.camera);
+  // Fitted to poses, the schema is of the calibration that these rest on, whatever it began with.
+  result.schema.calibration_id = result.used_corners
+                                     ? calibration_id(result.rig.markers, result.rig.camera)
+                                     : training.front().sample.calibration_id;
   result.wanted_actions =
       wanted_actions(result.schema, result.used_corners ? std::optional(result.rig) : std::nullopt,
                      training, problem, information);

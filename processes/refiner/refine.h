@@ -32,6 +32,7 @@ struct RefineOptions {
 /// A parameter after the refinement.
 struct RefinedParameter {
   std::string name;          ///< "offset of q5 (5→6)", "placement of tag 12, about z"
+  int tag = -1;              ///< that it is of; −1: of the root, an edge or the lens
   std::string unit;          ///< "m", "rad", "px", "1", "m/unit", "rad/unit"
   double change = 0;         ///< since the start, in `unit`
   std::optional<double> sd;  ///< none: the samples do not determine it
@@ -46,8 +47,9 @@ struct ParameterCorrelation {
 struct RefinementOutlier {
   std::int64_t sample_index = 0;
   int part = 0;
-  int tag = -1;         ///< −1: a pose
-  double distance = 0;  ///< Mahalanobis distance [σ]
+  int tag = -1;                  ///< −1: a pose
+  std::int64_t image_utime = 0;  ///< [us] of the sample's last image
+  double distance = 0;           ///< Mahalanobis distance [σ]
 };
 
 struct SignalCoverage {
@@ -89,6 +91,9 @@ struct JointCompliance {
   double sd = 0;        ///< 0: its load does not change, it was not fitted
   double evidence = 0;  ///< [nats] of its own against a stiff joint, by its value and sd (BIC)
   double droop = 0;     ///< its largest displacement by the load at a fitted sample [rad, m]
+
+  /// It moves against its load: no joint does, but a drive that makes up for too much of it.
+  bool rises() const { return value < 0 && evidence > 0; }
 };
 
 /// Joints that give way to gravity beside stiff ones, each with a geometry of its own.

@@ -1,18 +1,13 @@
 #include "processes/refiner/refinement_problem.h"
 
-#include <ceres/crs_matrix.h>
-#include <ceres/solver.h>
-#include <glog/logging.h>
-
 #include <Eigen/Cholesky>
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <memory>
 #include <stdexcept>
 #include <utility>
 
-#include "common/estimation/chi_square.h"
-#include "common/estimation/quantile.h"
 #include "common/estimation/student_t.h"
 #include "common/kinematics/kinematic_tree.h"
 #include "processes/refiner/calibrated_lens.h"
@@ -127,6 +122,41 @@ void RefinementProblem::add_drive() {
   if (!block.free.empty()) drive_ = &storage_.emplace_back(std::move(block));
 }
 
+// By the reading of a part that the other parts agree with best: a first one may be flipped.
+std::optional<Pose> RefinementProblem::root_seen_in(const ActionPoseSample& sample) const {
+  const std::map<int, Pose> X_RB = schema_.predict_all(sample.action);
+  std::vector<std::vector<Pose>> readings;  // of the root, by part
+  std::vector<Matrix6d> covariances;        // of the part
+  for (const PartObservation& seen : sample.parts) {
+    if (!seen.has_rotation || !X_RB.contains(seen.part) ||
+        !is_usable(seen.part, sample.sample_index))
+      continue;
+    const Pose X_BR = X_RB.at(seen.part).inverse();
+    std::vector<Pose>& of_part = readings.emplace_back();
+    of_part.push_back(seen.X_CB * X_BR);
+    if (seen.X_CB_other) of_part.push_back(*seen.X_CB_other * X_BR);
+    const Matrix6d to_root = adjoint(X_BR.inverse());
+    covariances.push_back(to_root * options_.measurement.covariance(seen) * to_root.transpose());
+  }
+  std::optional<Pose> best;
+  double least = std::numeric_limits<double>::infinity();
+  for (const std::vector<Pose>& of_part : readings)
+    for (const Pose& X_CR : of_part) {
+      double cost = 0;
+      for (std::size_t n = 0; n < readings.size(); ++n) {
+        double nearest = std::numeric_limits<double>::infinity();
+        for (const Pose& other : readings[n])
+          nearest =
+              std::min(nearest, squared_mahalanobis(log(X_CR.inverse() * other), covariances[n]));
+        cost += robust_cost(nearest, 6);
+      }
+      if (cost >= least) continue;
+      least = cost;
+      best = X_CR;
+    }
+  return best;
+}
+
 // Of a root that moves: where its parts say that it was.
 void RefinementProblem::add_instants(const std::vector<RefinerSample>& samples) {
   if (!root_moves_) {
@@ -139,13 +169,9 @@ void RefinementProblem::add_instants(const std::vector<RefinerSample>& samples) 
     ParameterBlock block;
     block.kind = ParameterBlock::Kind::kInstant;
     if (root_moves_) {
-      const std::map<int, Pose> X_RB = schema_.predict_all(seen.sample.action);
-      const auto& parts = seen.sample.parts;
-      const auto witness = std::find_if(parts.begin(), parts.end(), [&](const auto& observation) {
-        return observation.has_rotation && X_RB.contains(observation.part);
-      });
-      if (witness == parts.end()) continue;
-      block.add(Pose(witness->X_CB * X_RB.at(witness->part).inverse()));
+      const auto X_CR = root_seen_in(seen.sample);
+      if (!X_CR) continue;
+      block.add(*X_CR);
     }
     for (std::size_t n = 0; n < plays_.size(); ++n) block.add(0.0);
     for (int n = 0; n < block.tangent_size(); ++n) block.free.push_back(n);
@@ -262,7 +288,7 @@ void RefinementProblem::add_corners(const RefinerSample& seen) {
   if (!has_root(index)) return;
   for (const TagSight& sight : seen.tags)
     if (auto cost = cost_of(sight, seen.sample.action, index))
-      add(std::move(*cost), {.sample_index = index, .tag = sight.tag});
+      add(std::move(*cost), {.sample_index = index, .utime = seen.sample.utime, .tag = sight.tag});
 }
 
 void RefinementProblem::add_poses(const RefinerSample& seen) {
@@ -270,7 +296,8 @@ void RefinementProblem::add_poses(const RefinerSample& seen) {
   if (!has_root(index)) return;
   for (const PartObservation& observation : seen.sample.parts)
     if (auto cost = cost_of(observation, seen.sample.action, index))
-      add(std::move(*cost), {.sample_index = index, .observation = &observation});
+      add(std::move(*cost),
+          {.sample_index = index, .utime = seen.sample.utime, .observation = &observation});
 }
 
 std::vector<ParameterBlock*> RefinementProblem::blocks() {
@@ -364,121 +391,11 @@ double RefinementProblem::log_likelihood() {
   return sum;
 }
 
-// Maximum likelihood of the scale given the residuals, by the fixed point of its own weights.
-double RefinementProblem::estimated_scale() {
-  const std::vector<double> d2 = squared_distances();
-  double ratio = 1;  // of the squares, to the scale that they are whitened with
-  double num = 0;
-  for (const Datum& datum : data_) num += datum.num_residuals;
-  for (int iteration = 0; iteration < 100; ++iteration) {
-    double sum = 0;
-    for (std::size_t n = 0; n < d2.size(); ++n)
-      sum += robust_weight(d2[n] / ratio, data_[n].num_residuals) * d2[n];
-    const double next = std::max(sum / num, 1e-30);
-    const bool is_done = std::abs(next / ratio - 1) < 1e-9;
-    ratio = next;
-    if (is_done) break;
-  }
-  return scale_.value * std::sqrt(ratio);
-}
-
-// Evidence (MacKay 1992): the sum of squares of a joint's plays over the number of them that the
-// data determine. Returns the largest change, a share.
-double RefinementProblem::estimate_play() {
-  if (plays_.empty()) return 0;
-  std::vector<ParameterBlock*> instants;
-  for (ParameterBlock* block : blocks())
-    if (block->kind == ParameterBlock::Kind::kInstant) instants.push_back(block);
-  ceres::Problem::EvaluateOptions options;
-  options.num_threads = 1;
-  for (ParameterBlock* block : instants) options.parameter_blocks.push_back(memory_of(block));
-  ceres::CRSMatrix J;  // of all residuals, also the priors', with the loss's weights
-  if (!problem_.Evaluate(options, nullptr, nullptr, nullptr, &J))
-    throw std::runtime_error("the refined model cannot be evaluated");
-  const int size = instants.front()->num_free();
-  const auto num = static_cast<int>(plays_.size());
-  std::vector<Eigen::MatrixXd> information(instants.size(), Eigen::MatrixXd::Zero(size, size));
-  for (int row = 0; row < J.num_rows; ++row) {
-    const int begin = J.rows[row], end = J.rows[row + 1];
-    if (begin == end) continue;
-    const Eigen::Map<const Eigen::VectorXd> values(&J.values[begin], end - begin);
-    information[J.cols[begin] / size] += values * values.transpose();
-  }
-  Eigen::ArrayXd squares = Eigen::ArrayXd::Zero(num), determined = Eigen::ArrayXd::Zero(num);
-  for (std::size_t n = 0; n < instants.size(); ++n) {
-    const double* play = memory_of(instants[n]) + instants[n]->values.size() - num;
-    const Eigen::MatrixXd covariance =
-        information[n].llt().solve(Eigen::MatrixXd::Identity(size, size));
-    squares += Eigen::Map<const Eigen::ArrayXd>(play, num).square();
-    determined += 1 - covariance.diagonal().tail(num).array() / play_sd_.array().square();
-  }
-  // Of no play at all, a hundredth of what it began with.
-  const Eigen::ArrayXd next = (squares / determined.max(1e-6))
-                                  .sqrt()
-                                  .max(play_start_.array() / 100)
-                                  .min(play_start_.array() * 100);
-  const double change = (next / play_sd_.array()).log().abs().maxCoeff();
-  play_sd_ = next;
-  return change;
-}
-
 void RefinementProblem::leave_out_play() {
   for (const auto& [index, block] : instants_) {
     const auto num = std::ssize(plays_);
     std::fill_n(memory_of(block) + std::ssize(block->values) - num, num, 0);
   }
-}
-
-ceres::Solver::Options RefinementProblem::solver_options() {
-  // A step for which Cholesky fails is tried again with more damping; glog would tell the user.
-  FLAGS_minloglevel = google::GLOG_ERROR;
-  ceres::Solver::Options options;
-  options.logging_type = ceres::SILENT;
-  options.num_threads = 1;
-  options.gradient_tolerance = 1e-12;
-  options.parameter_tolerance = 1e-12;
-  // Each residual has one instant and one tag: either can be eliminated.
-  const auto eliminated =
-      instants_.empty() ? ParameterBlock::Kind::kTag : ParameterBlock::Kind::kInstant;
-  options.linear_solver_type = ceres::SPARSE_NORMAL_CHOLESKY;
-  options.linear_solver_ordering = std::make_shared<ceres::ParameterBlockOrdering>();
-  for (ParameterBlock* block : blocks()) {
-    options.linear_solver_ordering->AddElementToGroup(memory_of(block),
-                                                      block->kind == eliminated ? 0 : 1);
-    if (block->kind == eliminated && block->is_refined)
-      options.linear_solver_type = ceres::DENSE_SCHUR;
-  }
-  return options;
-}
-
-void RefinementProblem::solve() {
-  ceres::Solver::Options options = solver_options();
-  const auto run = [&](double tolerance, int max_iterations) {
-    options.function_tolerance = tolerance;
-    options.max_num_iterations = max_iterations;
-    ceres::Solver::Summary summary;
-    ceres::Solve(options, &problem_, &summary);
-    num_iterations_ += static_cast<int>(summary.iterations.size());
-    if (!summary.IsSolutionUsable()) throw std::runtime_error("the fit failed: " + summary.message);
-  };
-  // Far from the minimum all residuals are large: with the scale that they have none is an outlier.
-  std::vector<double> shares;
-  const std::vector<double> start = squared_distances();
-  for (std::size_t n = 0; n < start.size(); ++n)
-    shares.push_back(start[n] / chi_square_median(data_[n].num_residuals));
-  scale_.value = std::max(1.0, std::sqrt(median(shares)));
-  constexpr int kMaxRounds = 20;
-  for (int round = 0; round < kMaxRounds; ++round) {
-    run(1e-5, 10);
-    const double scale = std::max(1.0, estimated_scale());
-    const double change = std::abs(scale / scale_.value - 1);
-    scale_.value = scale;
-    const double change_of_play = estimate_play();
-    if (change < 0.01 && change_of_play < 0.2) break;
-  }
-  run(1e-9, 200);
-  for (ParameterBlock* block : blocks())
-    std::copy_n(memory_of(block), block->values.size(), block->values.begin());
 }
 
 }  // namespace bodyschema

@@ -29,7 +29,7 @@ class RefinementProblem {
   struct Datum {
     ceres::ResidualBlockId id = nullptr;
     int num_residuals = 0;
-    std::int64_t sample_index = 0;
+    std::int64_t sample_index = 0, utime = 0;
     int part = 0;
     int tag = -1;                                  ///< −1: of a pose
     const PartObservation* observation = nullptr;  ///< of a pose
@@ -117,6 +117,7 @@ class RefinementProblem {
   void add_priors();
   void place_blocks();
   void hold_unseen_frames();
+  std::optional<Pose> root_seen_in(const ActionPoseSample& sample) const;
   bool is_usable(int part, std::int64_t sample_index) const;
   ceres::Solver::Options solver_options();
   double estimated_scale();

@@ -58,8 +58,8 @@ void RefinementWords::add(const ParameterBlock& block) {
   for (int n = 0; n < block.num_free(); ++n) {
     const int direction = block.free[n];
     places_.push_back({&block, direction, name_of(block, direction)});
-    RefinedParameter parameter{places_.back().element, unit_of(block, direction), change(direction),
-                               std::nullopt};
+    RefinedParameter parameter{places_.back().element, block.kind == Kind::kTag ? block.id : -1,
+                               unit_of(block, direction), change(direction), std::nullopt};
     if (undetermined_shares_(first + n) < kNamedShare)
       parameter.sd = std::sqrt(std::max(covariance_(first + n, first + n), 0.0));
     parameters_.push_back(std::move(parameter));

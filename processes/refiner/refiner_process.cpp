@@ -8,7 +8,7 @@
 
 #include "common/bus/channels.h"
 #include "common/bus/convert.h"
-#include "common/bus/event_log.h"
+#include "common/bus/sample_trail.h"
 #include "processes/refiner/proposed_files.h"
 
 namespace bodyschema {
@@ -24,8 +24,8 @@ void RefinerProcess::Options::add_to(Arguments app) {
 RefinerProcess::RefinerProcess(Process& process, const Options& options)
     : process_(process),
       door_(process.rig_folder()),
-      schema_file_(options.schema_file),
       proposed_folder_(options.proposed_folder),
+      saved_(options.schema_file, kBodySchema),
       refiner_(
           RefinerSettings::load(process.rig_folder(), RefinerConfig::load(process.config_file()))),
       intake_(
@@ -35,7 +35,7 @@ RefinerProcess::RefinerProcess(Process& process, const Options& options)
           },
           SampleIntake::asking(process, !options.is_replayed)) {
   process.set_activity(process_info_t::PHASE_WAITING, "waiting for LEARNED_SCHEMA");
-  restore();
+  restore(options.samples_file);
   door_.subscribe(process, kSample, [this](const sample_t& sample) { intake_.on_sample(sample); });
   door_.subscribe(process, kLearnedSchema,
                   [this](const body_schema_t& proposal) { refiner_.on_learned_schema(proposal); });
@@ -44,16 +44,13 @@ RefinerProcess::RefinerProcess(Process& process, const Options& options)
   process.on_end([this] { on_end(); });
 }
 
-void RefinerProcess::restore() {
-  if (schema_file_.empty() || !std::filesystem::exists(schema_file_)) return;
-  try {
-    const auto kept = read_log(schema_file_, kBodySchema);
-    if (kept.empty()) return;
-    answer_ = refined_ = kept.back();
-    refiner_.skip(refined_->last_sample_index);
-  } catch (const std::exception& error) {
-    spdlog::warn("{}: begins without it", error.what());
-  }
+void RefinerProcess::restore(const std::filesystem::path& samples_file) {
+  answer_ = refined_ = saved_.load([&](body_schema_t kept) {
+    kept.calibration_id = 0;  // it has tags and lens of its own
+    const std::string why = door_.objection(kept);
+    return why.empty() ? contradiction(samples_file, kept.last_sample_index, {}) : why;
+  });
+  if (refined_) refiner_.skip(refined_->last_sample_index);
 }
 
 void RefinerProcess::on_tick(std::int64_t now_us) {
@@ -102,17 +99,21 @@ void RefinerProcess::collect() {
 }
 
 void RefinerProcess::save() {
+  std::string problem;
   try {
     if (!proposed_folder_.empty()) write_proposed_files(*unsaved_, proposed_folder_);
-    if (!schema_file_.empty()) write_one_event_log(schema_file_, kBodySchema, *refined_);
+    problem = saved_.save(*refined_);
+  } catch (const std::exception& error) {
+    problem = error.what();
+  }
+  if (problem.empty()) {
     unsaved_.reset();
     process_.set_activity(process_info_t::PHASE_WORKING, words_);
-  } catch (const std::exception& error) {
-    if (process_.count("refined schema not saved") == 1)
-      spdlog::warn("{}; tried again every second", error.what());
-    process_.set_activity(process_info_t::PHASE_WAITING,
-                          std::string("cannot save: ") + error.what());
+    return;
   }
+  if (process_.count("refined schema not saved") == 1)
+    spdlog::warn("{}; tried again every second", problem);
+  process_.set_activity(process_info_t::PHASE_WAITING, "cannot save: " + problem);
 }
 
 void RefinerProcess::say(const RefinedProposal& proposal) {

@@ -8,6 +8,7 @@
 
 #include "common/bus/rig_door.h"
 #include "common/bus/sample_intake.h"
+#include "common/bus/saved_message.h"
 #include "processes/refiner/refiner.h"
 
 namespace bodyschema {
@@ -27,7 +28,7 @@ class RefinerProcess {
   RefinerProcess(const RefinerProcess&) = delete;
 
  private:
-  void restore();
+  void restore(const std::filesystem::path& samples_file);
   void on_tick(std::int64_t now_us);
   void on_end();
   void work();
@@ -38,7 +39,8 @@ class RefinerProcess {
 
   Process& process_;
   const RigDoor door_;
-  const std::filesystem::path schema_file_, proposed_folder_;
+  const std::filesystem::path proposed_folder_;
+  SavedMessage<body_schema_t> saved_;
   Refiner refiner_;
   SampleIntake intake_;
   std::future<RefinedProposal> fit_;

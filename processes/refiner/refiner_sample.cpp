@@ -1,7 +1,5 @@
 #include "processes/refiner/refiner_sample.h"
 
-#include <map>
-
 #include "common/bus/convert.h"
 
 namespace bodyschema {
@@ -10,17 +8,14 @@ RefinerSample refiner_sample(const sample_t& message) {
   return {from_message(message), tag_sights(message)};
 }
 
-std::vector<RefinerSample> refiner_samples(const std::vector<ActionPoseSample>& samples) {
+std::vector<RefinerSample> refiner_samples(const std::vector<ActionPoseSample>& samples,
+                                           const std::vector<std::vector<TagSight>>& sights) {
   std::vector<RefinerSample> result;
-  for (const ActionPoseSample& sample : samples) result.push_back({sample, {}});
-  return result;
-}
-
-std::vector<RefinerSample> refiner_samples(const std::vector<sample_t>& messages) {
-  std::map<std::int64_t, const sample_t*> by_index;
-  for (const sample_t& message : messages) by_index.try_emplace(message.sample_index, &message);
-  std::vector<RefinerSample> result;
-  for (const auto& [index, message] : by_index) result.push_back(refiner_sample(*message));
+  for (const ActionPoseSample& sample : samples) {
+    result.push_back({sample, {}});
+    if (!sights.empty())
+      result.back().tags = sights.at(static_cast<std::size_t>(sample.sample_index));
+  }
   return result;
 }
 

@@ -18,10 +18,9 @@ struct RefinerSample {
 inline std::int64_t index_of(const RefinerSample& seen) { return seen.sample.sample_index; }
 
 RefinerSample refiner_sample(const sample_t& message);
-/// Samples without corners.
-std::vector<RefinerSample> refiner_samples(const std::vector<ActionPoseSample>& samples);
-/// Those of a log: each index once, the first that was recorded.
-std::vector<RefinerSample> refiner_samples(const std::vector<sample_t>& messages);
+/// `sights`: of single tags, by sample_index (Recording); none: samples without corners.
+std::vector<RefinerSample> refiner_samples(const std::vector<ActionPoseSample>& samples,
+                                           const std::vector<std::vector<TagSight>>& sights = {});
 
 /// At most `most` of them, evenly spaced in their order, the first among them.
 std::vector<RefinerSample> thinned(std::vector<RefinerSample> samples, std::size_t most);

@@ -8,16 +8,15 @@
 #include <map>
 #include <utility>
 
+#include "processes/refiner/expected_information.h"
 #include "processes/refiner/expected_sights.h"
 
 namespace bodyschema {
 namespace {
 
-using Kind = ParameterBlock::Kind;
 using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
-using RowMajor = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>;
 
 /// Each action is the best of a tenth of them, a spread sequence of its own: a sample of all
 /// candidates is enough (Mirzasoleiman et al., Lazier than lazy greedy, 2015). Over five robots "c"
@@ -26,8 +25,6 @@ using RowMajor = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::Ro
 constexpr int kNumCandidates = 200;
 constexpr int kNumPredicted = 20;  // actions whose predictions are judged
 constexpr double kRadian_m = 0.2;  // what a radian weighs, as for `reach`
-constexpr double kLeastProbability = 0.01;
-constexpr double kInstantPrior = 1;  // m and rad, of a moving root
 
 constexpr double kInfinite = std::numeric_limits<double>::infinity();
 constexpr double kManyTimes = 100;  // as Refinement says; more would be lost in rounding
@@ -77,191 +74,6 @@ std::vector<VectorXd> spread_actions(const std::vector<Signal>& signals,
   return result;
 }
 
-/// Places of the free directions of all blocks: the core (root, edges, lens), then the tags, both
-/// in units in which a prior, weak or real, is 1.
-struct Layout {
-  std::vector<Index> core, tags;                               ///< rows of the information
-  std::map<const ParameterBlock*, std::vector<Index>> places;  ///< by free direction; −1: known
-  VectorXd units;                                              ///< by row of the information
-  VectorXd prior;  ///< information of the weak prior, by place in the core
-
-  Layout(const BodySchema& schema, RefinementProblem& problem, const Information& information);
-};
-
-double unit_of(const ParameterBlock& block, int direction, const BodySchema& schema,
-               const VectorXd& prior_sd) {
-  if (prior_sd.size() > 0) return prior_sd(direction);
-  if (block.kind != Kind::kEdge || direction % 8 < 6) return 1;
-  const ScrewJoint& joint = schema.edges[static_cast<std::size_t>(block.id)]
-                                .joints[static_cast<std::size_t>(direction / 8)];
-  const Signal& signal = schema.signals[static_cast<std::size_t>(joint.signal)];
-  const double range = signal.upper - signal.lower;
-  return 1 / (std::abs(joint.gain) * (range > 0 ? 0.5 * range : 1));
-}
-
-Layout::Layout(const BodySchema& schema, RefinementProblem& problem, const Information& information)
-    : units(information.curvature().rows()) {
-  const std::vector<int> frame_tags = problem.frame_tags();
-  std::vector<double> weak;
-  for (const ParameterBlock* block : information.blocks()) {
-    const VectorXd prior_sd = problem.prior_of(*block);
-    std::vector<Index>& at = places[block];
-    Index row = information.offset(block);
-    for (const int direction : block->free) {
-      units(row) = unit_of(*block, direction, schema, prior_sd);
-      if (is_frame(frame_tags, *block, direction)) {
-        at.push_back(-1);
-      } else if (block->kind == Kind::kTag) {
-        at.push_back(std::ssize(tags));
-        tags.push_back(row);
-      } else {
-        at.push_back(std::ssize(core));
-        core.push_back(row);
-        weak.push_back(prior_sd.size() > 0 ? 0 : 1);
-      }
-      ++row;
-    }
-  }
-  prior = Eigen::Map<const VectorXd>(weak.data(), std::ssize(weak));
-}
-
-/// The derivative of what an action is expected to show.
-struct Expectation {
-  struct TagRows {
-    Index row = 0, column = 0;  ///< of the first
-    MatrixXd J;
-  };
-  MatrixXd core;  ///< r × core, rows whitened
-  std::vector<TagRows> tags;
-  MatrixXd noise;  ///< r × r, with what belongs to the instant
-  bool has_instant = false;
-};
-
-/// Blocks' derivatives of one residual, free directions alone.
-struct Derivative {
-  std::vector<RowMajor> J;
-  int num_rows = 0;
-};
-
-std::optional<Derivative> derivative_of(const RefinementProblem::Cost& cost,
-                                        RefinementProblem& problem) {
-  Derivative result;
-  result.num_rows = cost.function->num_residuals();
-  std::vector<const double*> values;
-  std::vector<double*> jacobians;
-  for (const ParameterBlock* block : cost.blocks) {
-    values.push_back(problem.memory_of(block));
-    result.J.emplace_back(result.num_rows, std::ssize(block->values));
-  }
-  for (std::size_t b = 0; b < cost.blocks.size(); ++b) {
-    const bool is_wanted = cost.blocks[b]->is_refined && !cost.blocks[b]->free.empty();
-    jacobians.push_back(is_wanted ? result.J[b].data() : nullptr);
-  }
-  VectorXd residuals(result.num_rows);
-  if (!cost.function->Evaluate(values.data(), residuals.data(), jacobians.data()))
-    return std::nullopt;
-  return result;
-}
-
-/// Makes Expectations of actions.
-class Forecast {
- public:
-  Forecast(const Layout& layout, const ExpectedSights& sights, RefinementProblem& problem,
-           bool has_corners, double worth)
-      : layout_(layout),
-        sights_(sights),
-        problem_(problem),
-        has_corners_(has_corners),
-        worth_(worth) {}
-
-  Expectation at(const VectorXd& action) const {
-    Rows rows;
-    const std::int64_t index = sights_.sample_index();
-    if (has_corners_) {
-      for (const auto& [sight, probability] : sights_.tags(action))
-        add(problem_.cost_of(sight, action, index), probability, &rows);
-    } else {
-      for (const auto& [observation, probability] : sights_.parts(action))
-        add(problem_.cost_of(observation, action, index), probability, &rows);
-    }
-    return assembled(rows);
-  }
-
- private:
-  struct Row {
-    RefinementProblem::Cost cost;
-    Derivative derivative;
-    double weight = 0;  // of the square
-  };
-  using Rows = std::vector<Row>;
-
-  void add(std::optional<RefinementProblem::Cost> cost, double probability, Rows* rows) const {
-    if (!cost || probability < kLeastProbability) return;
-    auto derivative = derivative_of(*cost, problem_);
-    if (derivative)
-      rows->push_back({std::move(*cost), std::move(*derivative), worth_ * probability});
-  }
-
-  Expectation assembled(const Rows& rows) const {
-    Index num_rows = 0;
-    for (const Row& row : rows) num_rows += row.derivative.num_rows;
-    Expectation result;
-    result.core = MatrixXd::Zero(num_rows, std::ssize(layout_.core));
-    MatrixXd instant;
-    Index first = 0;
-    for (const Row& row : rows) {
-      const double weight = std::sqrt(row.weight);
-      for (std::size_t b = 0; b < row.cost.blocks.size(); ++b) {
-        const ParameterBlock* block = row.cost.blocks[b];
-        const Eigen::MatrixXd J = weight * row.derivative.J[b].leftCols(block->num_free());
-        if (block->kind == Kind::kInstant) {
-          if (instant.size() == 0) instant = MatrixXd::Zero(num_rows, J.cols());
-          instant.middleRows(first, J.rows()) = J * instant_sd(J.cols()).asDiagonal();
-        } else if (const auto places = layout_.places.find(block); places != layout_.places.end()) {
-          place(J, *block, places->second, first, &result);
-        }
-      }
-      first += row.derivative.num_rows;
-    }
-    result.noise = MatrixXd::Identity(num_rows, num_rows);
-    result.has_instant = instant.size() > 0;
-    if (result.has_instant) result.noise += instant * instant.transpose();
-    return result;
-  }
-
-  void place(const MatrixXd& J, const ParameterBlock& block, const std::vector<Index>& places,
-             Index first, Expectation* result) const {
-    const bool is_tag = block.kind == Kind::kTag;
-    Expectation::TagRows tag{first, -1, MatrixXd(J.rows(), 0)};
-    for (Index n = 0; n < J.cols(); ++n) {
-      const Index at = places[static_cast<std::size_t>(n)];
-      if (at < 0) continue;
-      const double unit = layout_.units((is_tag ? layout_.tags : layout_.core)[at]);
-      if (!is_tag) {
-        result->core.col(at).segment(first, J.rows()) = unit * J.col(n);
-        continue;
-      }
-      if (tag.column < 0) tag.column = at;
-      tag.J.conservativeResize(Eigen::NoChange, tag.J.cols() + 1);
-      tag.J.rightCols<1>() = unit * J.col(n);
-    }
-    if (tag.column >= 0) result->tags.push_back(std::move(tag));
-  }
-
-  /// Prior deviations of an instant's block: a moving root's pose, then the plays.
-  VectorXd instant_sd(Index size) const {
-    VectorXd sd = VectorXd::Constant(size, kInstantPrior);
-    sd.tail(problem_.play_sd().size()) = problem_.play_sd();
-    return sd;
-  }
-
-  const Layout& layout_;
-  const ExpectedSights& sights_;
-  RefinementProblem& problem_;
-  const bool has_corners_;
-  const double worth_;
-};
-
 /// A part's predicted pose in the root at some action: its derivative by some places of the core,
 /// translation [m] and rotation, a radian as kRadian_m.
 struct Prediction {
@@ -269,7 +81,7 @@ struct Prediction {
   MatrixXd G;
 };
 
-std::vector<Prediction> predictions(const BodySchema& schema, const Layout& layout,
+std::vector<Prediction> predictions(const BodySchema& schema, const InformationLayout& layout,
                                     RefinementProblem& problem, std::int64_t sample_index,
                                     const std::vector<VectorXd>& actions) {
   std::vector<Prediction> result;
@@ -307,18 +119,16 @@ std::vector<Prediction> predictions(const BodySchema& schema, const Layout& layo
 /// The information of the samples and of the actions added, and what predictions owe to it.
 class Design {
  public:
-  Design(const Layout& layout, const Information& information, std::vector<Prediction> predictions)
+  Design(const InformationLayout& layout, const Information& information,
+         std::vector<Prediction> predictions)
       : predictions_(std::move(predictions)) {
-    const auto scaled = [&](const MatrixXd& matrix) -> MatrixXd {
-      return layout.units.asDiagonal() * matrix * layout.units.asDiagonal();
-    };
-    const MatrixXd A = scaled(information.curvature());
+    const MatrixXd A = layout.scaled(information.curvature());
     core_ = A(layout.core, layout.core);
     core_.diagonal() += layout.prior;
     mixed_ = A(layout.tags, layout.core);
     tags_ = A(layout.tags, layout.tags);
     set_root_of_M();
-    set_lasting(layout, scaled(information.lasting_score()));
+    set_lasting(layout, layout.scaled(information.lasting_score()));
   }
 
   /// tr(M A⁻¹) with what an action is expected to show: the mean variance of predictions, what no
@@ -389,7 +199,7 @@ class Design {
     root_of_M_ = eigen.eigenvectors().rightCols(rank) * values.tail(rank).cwiseSqrt().asDiagonal();
   }
 
-  void set_lasting(const Layout& layout, const MatrixXd& score) {
+  void set_lasting(const InformationLayout& layout, const MatrixXd& score) {
     lasting_ = VectorXd::Zero(std::ssize(predictions_));
     if (score.isZero(0)) return;
     std::vector<Index> rows = layout.core;
@@ -451,7 +261,7 @@ std::vector<WantedAction> wanted_actions(const BodySchema& refined,
   const std::vector<Index> moving = moving_signals(refined);
   if (moving.empty()) return {};
   const ExpectedSights sights(refined, rig, samples, problem);
-  const Layout layout(refined, problem, information);
+  const InformationLayout layout(refined, problem, information);
   const auto spread = [&](int first, int num) {
     return spread_actions(refined.signals, moving, sights.last_action(), first, num);
   };

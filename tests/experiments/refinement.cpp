@@ -28,6 +28,7 @@
 #include "common/geometry/angle.h"
 #include "common/scene/calibration_error.h"
 #include "common/scene/robot.h"
+#include "processes/refiner/proposed_files.h"
 #include "processes/refiner/refine.h"
 #include "processes/structure_learner/learn.h"
 #include "processes/structure_learner/recording/recording.h"
@@ -186,11 +187,16 @@ void run_nominal(int num_robots) {
   for (const int size : {30, 60, 100}) refine_nominal(size, num_robots);
 }
 
-/// A copy of a rig whose joints go where they are told: tags and lens alone are off.
-std::filesystem::path rig_copy(const std::filesystem::path& rig) {
-  const auto folder = std::filesystem::temp_directory_path() / "refinement_rig";
+std::filesystem::path copy_of(const std::filesystem::path& rig, const std::string& name) {
+  const auto folder = std::filesystem::temp_directory_path() / name;
   std::filesystem::remove_all(folder);
   std::filesystem::copy(rig, folder, std::filesystem::copy_options::recursive);
+  return folder;
+}
+
+/// A copy of a rig whose joints go where they are told: tags and lens alone are off.
+std::filesystem::path without_backlash(const std::filesystem::path& rig) {
+  const auto folder = copy_of(rig, "refinement_rig");
   std::ifstream in(folder / "robot.yaml");
   std::string text, line;
   while (std::getline(in, line)) {
@@ -209,8 +215,11 @@ struct Seen {
   std::vector<ActionPoseSample> truth, held_out;
 };
 
-Seen run_of(const std::filesystem::path& rig, int seed, bool is_ideal, int num_samples) {
+/// `first`: so many samples of the run are passed over.
+Seen run_of(const std::filesystem::path& rig, int seed, bool is_ideal, int num_samples,
+            int first = 0) {
   test::RenderedRun run(rig, seed, {}, std::nullopt, is_ideal);
+  for (int n = 0; n < first; ++n) run.next();
   Seen seen;
   for (int n = 0; n < num_samples; ++n) {
     const test::RenderedRun::Step step = run.next();
@@ -307,19 +316,22 @@ void refine_rig(const std::string& name, const std::filesystem::path& folder, bo
   const RigCalibration rig = load_calibration(folder);
   const RigNoise noise = load_noise(folder, is_ideal ? "ideal_noise.yaml" : "noise.yaml");
   const Signals signals = load_signals(folder);
-  LearnOptions learning;
-  learning.root = signals.root_part;
-  learning.measurement = noise.measurement;
-  RigRow learned, refined, all;
+  const auto learned_from = [&](const Seen& seen) {
+    std::vector<ActionPoseSample> training;
+    for (const RefinerSample& sample : seen.samples)
+      if (is_learned_from(sample.sample)) training.push_back(sample.sample);
+    LearnOptions learning;
+    learning.root = signals.root_part;
+    learning.measurement = noise.measurement;
+    return learn(signals.signals, training, learning).schema;
+  };
+  RigRow learned, refined, all, next;
   for (int seed = 1; seed <= num_seeds; ++seed) {
     const Seen seen = run_of(folder, seed, is_ideal, num_samples);
     Robot truth = load_robot(folder, signals, rig.markers);
     if (!is_ideal) truth = with_calibration_error(truth, seed);
-    std::vector<ActionPoseSample> training;
-    for (const RefinerSample& sample : seen.samples)
-      if (is_learned_from(sample.sample)) training.push_back(sample.sample);
     const std::clock_t begin = std::clock();
-    const BodySchema schema = learn(signals.signals, training, learning).schema;
+    const BodySchema schema = learned_from(seen);
     learned.seconds.push_back(seconds_since(begin));
     learned.add_errors(schema, seen, signals.end_effector_part);
     for (const bool is_all : {false, true}) {
@@ -335,11 +347,17 @@ void refine_rig(const std::string& name, const std::filesystem::path& folder, bo
       row.px.push_back(result.after.px_rms.value_or(NAN));
       if (!is_all) learned.px.push_back(result.before.px_rms.value_or(NAN));
       row.tags.add(result.rig, truth, seen.samples);
+      if (!is_all || is_ideal) continue;
+      const auto adopted = copy_of(folder, "refinement_adopted");
+      write_proposed_files(result.rig, adopted);
+      const Seen more = run_of(adopted, seed, false, num_samples, num_samples);
+      next.add_errors(learned_from(more), more, signals.end_effector_part);
     }
   }
   learned.print(name + ", learned");
   refined.print(name + ", refined");
   all.print(name + ", with placements and intrinsics");
+  if (!is_ideal) next.print(name + ", these adopted, learned from the next samples");
 }
 
 void run_rig(const std::filesystem::path& rig, int num_seeds, int num_samples) {
@@ -354,7 +372,7 @@ void run_rig(const std::filesystem::path& rig, int num_seeds, int num_samples) {
       "| --- | --- | --- | --- | --- | --- | --- | --- | --- |\n",
       rig.filename().c_str(), num_samples, num_seeds);
   refine_rig("ideal", rig, true, num_seeds, num_samples);
-  refine_rig("tags and lens", rig_copy(rig), false, num_seeds, num_samples);
+  refine_rig("tags and lens", without_backlash(rig), false, num_seeds, num_samples);
   refine_rig("also backlash and droop", rig, false, num_seeds, num_samples);
 }
 

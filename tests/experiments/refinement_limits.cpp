@@ -10,12 +10,14 @@
 #include <cstdio>
 #include <ctime>
 #include <functional>
+#include <optional>
 #include <string>
 #include <vector>
 
 #include "common/estimation/quantile.h"
 #include "common/geometry/angle.h"
 #include "processes/refiner/refine.h"
+#include "processes/refiner/refinement_problem.h"
 #include "processes/structure_learner/learn.h"
 #include "tests/experiments/figures/robots.h"
 #include "tests/processes/refiner/tagged_robot.h"
@@ -171,11 +173,26 @@ double cost_of(const std::function<void()>& run) {
   return least;
 }
 
-void print_cost(int num_parts, int num_samples) {
+/// Milliseconds: of the fit alone, of the whole answer.
+struct Cost {
+  double fit_ms = 0, all_ms = 0;
+  int num_iterations = 0;
+};
+
+Cost cost_of(const BodySchema& schema, const std::vector<RefinerSample>& samples,
+             const std::optional<RigCalibration>& rig, const RefineOptions& options) {
+  Cost cost;
+  cost.fit_ms = 1e3 * cost_of([&] {
+                  RefinementProblem problem(schema, samples, rig, options, false);
+                  problem.solve();
+                  cost.num_iterations = problem.num_iterations();
+                });
+  cost.all_ms = 1e3 * cost_of([&] { refine(schema, samples, rig, options); });
+  return cost;
+}
+
+void print_cost(const std::string& body, int num_samples, const test::RandomTreeOptions& tree) {
   test::Rng rng(1);
-  test::RandomTreeOptions tree;
-  tree.num_parts = num_parts;
-  tree.num_hidden = 1;
   const test::SyntheticRobot robot = test::random_tree(tree, rng);
   BodySchema schema = test::true_schema(robot);
   schema.X_CR = robot.X_CR;
@@ -183,36 +200,35 @@ void print_cost(int num_parts, int num_samples) {
   poses.config.max_samples = 100'000;
   const auto samples = refiner_samples(test::babble(
       robot, num_samples, {.regime = test::Regime::kTag, .with_covariances = true}, rng));
-  int num_iterations = 0;
-  const double of_poses =
-      cost_of([&] { num_iterations = refine(schema, samples, {}, poses).num_iterations; });
+  const Cost of_poses = cost_of(schema, samples, {}, poses);
   RefineOptions corners = poses;
   corners.placements = corners.intrinsics = true;
   const test::TaggedRobot tagged = test::tagged(robot, 2, rng);
   const RigCalibration claimed = test::claimed(tagged, {.tags = {5e-4, 0.3 * kDegree, 3e-3}}, rng);
   const auto seen = test::seen_corners(tagged, claimed, num_samples, 0.05, rng);
-  int num_corner_iterations = 0;
-  const double of_corners = cost_of(
-      [&] { num_corner_iterations = refine(schema, seen, claimed, corners).num_iterations; });
-  std::printf("| %d | %d | %.0f | %d | %.2f | %.0f | %d | %.2f |\n", num_parts, num_samples,
-              1e3 * of_poses, num_iterations, 1e3 * of_poses / num_iterations / num_samples,
-              1e3 * of_corners, num_corner_iterations,
-              1e3 * of_corners / num_corner_iterations / num_samples);
+  const Cost of_corners = cost_of(schema, seen, claimed, corners);
+  std::printf("| %s | %d | %d |", body.c_str(), tree.num_parts, num_samples);
+  for (const Cost& cost : {of_poses, of_corners})
+    std::printf(" %.0f | %d | %.1f | %.0f |", cost.fit_ms, cost.num_iterations,
+                1e3 * cost.fit_ms / cost.num_iterations / num_samples / tree.num_parts,
+                cost.all_ms);
+  std::printf("\n");
   std::fflush(stdout);
 }
 
 void run_cost() {
   std::printf(
-      "Random trees from the true structure, processor time of one core, the least of three; "
-      "poses, "
-      "and corners of two tags a part with placements and intrinsics. With all parts of the "
-      "answer, "
-      "also the wanted actions.\n\n"
-      "| parts | N | poses ms | iterations | ms / (iteration · N) | corners ms | iterations | ms / "
-      "(iteration · N) |\n"
-      "| --- | --- | --- | --- | --- | --- | --- | --- |\n");
-  for (const int num_samples : {50, 100, 200, 400}) print_cost(8, num_samples);
-  for (const int num_parts : {4, 16, 32}) print_cost(num_parts, 100);
+      "Bodies from the true structure, processor time of one core, the least of three: the fit, "
+      "and the whole answer with covariances and wanted actions. Poses; corners of two tags a part "
+      "with placements and intrinsics, where each joint may be off its command at each sample.\n\n"
+      "| body | parts | N | poses: fit ms | iterations | µs / (iteration · N · part) | answer ms | "
+      "corners: fit ms | iterations | µs / (iteration · N · part) | answer ms |\n"
+      "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |\n");
+  for (const int num_samples : {50, 100, 200, 400})
+    print_cost("tree", num_samples, {.num_parts = 8});
+  for (const int num_limbs : {1, 2, 4, 8})
+    print_cost("limbs of 4", 100, {.num_parts = 1 + 4 * num_limbs, .limb_length = 4});
+  for (const int num_parts : {4, 16, 32}) print_cost("tree", 100, {.num_parts = num_parts});
 }
 
 }  // namespace

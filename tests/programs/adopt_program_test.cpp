@@ -11,6 +11,7 @@
 #include <string>
 
 #include "common/config/calibration_id.h"
+#include "common/config/proposed_calibration.h"
 #include "tests/common/bus/bus_test_support.h"
 #include "tests/support/text_of.h"
 
@@ -123,6 +124,19 @@ TEST_F(AdoptProgramTest, WritesWithConsentAndKeepsTheOldFiles) {
 
 TEST_F(AdoptProgramTest, FinishesWhatWasCutShort) {
   fs::copy(proposed_ / "markers.yaml", rig_ / "markers.yaml", fs::copy_options::overwrite_existing);
+  EXPECT_EQ(adopt(rig_flag() + "--yes"), 0) << said_;
+  EXPECT_TRUE(is_adopted());
+}
+
+TEST_F(AdoptProgramTest, RefusesFilesOfTwoRefinements) {
+  const auto mark = [&](const std::string& name, const std::string& id) {
+    const std::string text = text_of(proposed_ / name);
+    std::ofstream(proposed_ / name) << kProposalMark << " " << id << "\n" << text;
+  };
+  mark("markers.yaml", "1");
+  mark("camera_info.yaml", "2");
+  expect_refusal("two refinements");
+  mark("camera_info.yaml", "1");
   EXPECT_EQ(adopt(rig_flag() + "--yes"), 0) << said_;
   EXPECT_TRUE(is_adopted());
 }

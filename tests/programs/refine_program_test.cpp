@@ -51,6 +51,33 @@ TEST_F(RefineProgramTest, FitsCornersAndProposesFilesThatReadBack) {
   EXPECT_EQ(shown.at("base_version"), json_of("show schema --json").at("version"));
 }
 
+// A packed log has corners as well, and samples are counted from 0, whatever the log calls them.
+TEST_F(RefineProgramTest, FitsTheCornersOfAPackedLogWhoseFirstSamplesAreMissing) {
+  LogAppender later(folder_ / "later");
+  for (const sample_t& sample : read_log(log_, kSample))
+    if (sample.sample_index >= 2) later.append(kSample, sample);
+  ASSERT_EQ(std::system(("gzip -k '" + (folder_ / "later").string() + "'").c_str()), 0);
+  ASSERT_EQ(run("learn later --out schema").exit_code, 0);
+  const std::string rest = " --out refined " + rig_ + " --placements --json";
+  const Json json = json_of("refine schema later.gz" + rest);
+  EXPECT_EQ(json.at("fitted"), "corners");
+  Json plain = json_of("refine schema later" + rest);
+  plain["seconds"] = json.at("seconds");
+  EXPECT_EQ(plain, json);
+  for (const Json& outlier : json.at("outliers")) EXPECT_LT(outlier.at("sample"), 13);
+}
+
+// What was fitted to poses is of their calibration, whatever it began with.
+TEST_F(RefineProgramTest, OfPosesHasTheCalibrationOfTheSamples) {
+  BodySchema other = from_message(read_log(folder_ / "schema", kBodySchema).back());
+  const std::int64_t id = other.calibration_id;
+  ASSERT_NE(id, 0);
+  other.calibration_id = id + 1;
+  write_one_event_log(folder_ / "other", kBodySchema, to_message(other));
+  ASSERT_EQ(run("refine other '" + log_ + "' --out refined").exit_code, 0);
+  EXPECT_EQ(read_log(folder_ / "refined", kBodySchema).back().calibration_id, id);
+}
+
 TEST_F(RefineProgramTest, FitsPosesWithoutAnOption) {
   const Json json = json_of("refine schema '" + log_ + "' --out refined --json");
   EXPECT_EQ(json.at("fitted"), "poses");
@@ -254,6 +281,16 @@ TEST_F(RefineKnownStructureTest, JointsThatGiveWayAreFittedByTheMassesOfTheUrdf)
     urdf.erase(at, urdf.find("</inertial>", at) + 11 - at);
   std::ofstream(folder_ / "robot.urdf") << urdf;
   expect_failure(refine, 1, "no link has a mass");
+}
+
+TEST_F(RefineKnownStructureTest, SaysThatNoLoadChanges) {
+  for (ActionPoseSample& sample : samples_) sample.action = samples_.front().action;
+  write_samples(samples_, true);
+  expect_failure(
+      "refine samples.csv --structure robot.urdf --placement ends.yaml --noise 0.003 1 --out "
+      "refined --elastic unloaded",
+      1, "unloaded was not written");
+  EXPECT_FALSE(exists("unloaded"));
 }
 
 TEST_F(RefineKnownStructureTest, SaysWhatIsWrongWithIt) {

@@ -292,6 +292,7 @@ SyntheticRobot random_tree(const RandomTreeOptions& options, Rng& rng) {
   for (int k = 1; k < n; ++k) {
     // Mostly a chain, with branches.
     parents[k] = uniform(rng, 0, 1) < 0.7 ? k - 1 : static_cast<int>(uniform(rng, 0, k));
+    if (options.limb_length > 0) parents[k] = (k - 1) % options.limb_length == 0 ? 0 : k - 1;
     ++num_children[parents[k]];
   }
   robot.links.push_back({.part = 1});

@@ -124,6 +124,7 @@ SyntheticRobot chapter_robot(const std::string& name, Rng& rng);
 struct RandomTreeOptions {
   int num_parts = 9;
   int num_hidden = 1;
+  int limb_length = 0;  ///< parts of each chain that hangs on the root; 0: branches anywhere
   bool adjacent_hidden = false;  ///< two hidden parts in a row: an edge of three signals
   double share_prismatic = 0.15;
   double share_helical = 0.05;

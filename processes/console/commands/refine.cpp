@@ -66,19 +66,6 @@ std::filesystem::path rig_folder(const RefineArguments& arguments, bool is_log) 
   return is_log && std::filesystem::exists(own / "markers.yaml") ? own : std::filesystem::path();
 }
 
-/// With corners where it is a log that is not packed.
-std::vector<RefinerSample> samples_of(const RefineArguments& arguments,
-                                      const Recording& recording) {
-  if (!recording.is_log) return refiner_samples(recording.samples);
-  try {
-    return refiner_samples(read_log(arguments.samples, kSample));
-  } catch (const std::runtime_error&) {
-    std::cerr << "bodyschema: " << arguments.samples
-              << ": corners are read from a log that is not packed; poses are fitted\n";
-    return refiner_samples(recording.samples);
-  }
-}
-
 /// Of poses: as told, as the recording says, else as the schema was learned with.
 MeasurementModel measurement_of(const RefineArguments& arguments, const Recording& recording,
                                 const BodySchema& schema) {
@@ -157,12 +144,17 @@ void run_refine(const RefineArguments& given) {
               {"--urdf", arguments.urdf},
               {"--urdf-placement", arguments.urdf_placement}},
              arguments.inputs());
-  const Refinement result = refine(schema, samples_of(arguments, recording), rig, options);
+  const Refinement result =
+      refine(schema, refiner_samples(recording.samples, recording.sights), rig, options);
   write_one_event_log(arguments.out, kBodySchema, to_message(result.schema));
   if (result.elasticity)
     write_one_event_log(arguments.elastic, kBodySchema, to_message(result.elasticity->schema));
   if (!arguments.proposed.empty()) write_proposed_files(result.rig, arguments.proposed);
   write_urdf_and_print(arguments, result, rig);
+  if (!arguments.elastic.empty() && !result.elasticity)
+    throw std::runtime_error(
+        fmt::format("--elastic: {} was not written: no joint's load changes over the samples",
+                    arguments.elastic));
 }
 
 }  // namespace

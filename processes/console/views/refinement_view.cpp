@@ -97,7 +97,7 @@ std::string held_out_text(const Refinement& result) {
 std::string parameters_text(const std::vector<RefinedParameter>& parameters) {
   std::string text = fmt::format("  {:<40} {:>10} {:>10}\n", "parameter", "change", "sd");
   for (const RefinedParameter& parameter : parameters) {
-    if (parameter.name.find(" tag ") != std::string::npos) continue;
+    if (parameter.tag >= 0) continue;
     const Shown unit = shown(parameter.unit);
     const std::string sd =
         parameter.sd ? fmt::format("{:.4f}", *parameter.sd * unit.factor) : std::string("not told");
@@ -179,6 +179,11 @@ std::string elasticity_text(const std::optional<Elasticity>& elasticity) {
     text += fmt::format("    {} gives way by {:.5f} ± {:.5f} {}, {:.3f} {} at most; {:+.1f} nats\n",
                         joint.joint, joint.value * unit.factor, joint.sd * unit.factor, unit.unit,
                         joint.droop * unit.factor, is_turning ? "°" : "mm", joint.evidence);
+    if (joint.rises())
+      text +=
+          "      against its load: its drive makes up for more than gravity, or the URDF's masses "
+          "are "
+          "too large\n";
   }
   return text;
 }
@@ -248,6 +253,7 @@ Json refinement_json(const Refinement& result, const std::optional<RigCalibratio
     return Json{{"sample", outlier.sample_index},
                 {"part", outlier.part},
                 {"tag", known(outlier.tag)},
+                {"image_utime", outlier.image_utime},
                 {"distance", outlier.distance}};
   });
   json["coverage"] = array_of(result.coverage, [](const SignalCoverage& signal) {
@@ -273,7 +279,8 @@ std::string refinement_text(const Refinement& result,
       fmt::format("refined: {} of {} fitted, {} of {}, {:.1f} s\n",
                   counted(result.num_samples, "sample"), result.num_available,
                   result.num_observations, result.used_corners ? "tags" : "poses", result.seconds);
-  if (!result.used_corners && claimed) text += "  the samples have no corners: poses were fitted\n";
+  if (!result.used_corners && claimed)
+    text += "  poses were fitted; --placements and --intrinsics fit the corners of the tags\n";
   if (result.root_moves) text += "  the root moves: it has a pose at every sample\n";
   if (result.noise_scale > 1.05)
     text += fmt::format("  residuals are {:.2f} times as large as the noise that is told\n",

@@ -135,7 +135,8 @@ void ModelMonitor::remember_refusal(const health_event_t& event) {
 }
 
 void ModelMonitor::judge(const body_schema_t& message) {
-  BodySchema proposal = better_one(from_message(message));
+  const BodySchema learned = from_message(message);
+  BodySchema proposal = better_one(learned);
   const std::int64_t index = proposal.last_sample_index;
   Standing standing = standing_after(index);
   judged_sample_ = index;
@@ -150,7 +151,12 @@ void ModelMonitor::judge(const body_schema_t& message) {
   const LiveSchema* live = standing.live.get();
   if (!is_passed_over(proposal, standing)) {
     bool was_tested = false;
-    const std::string why_not = objection(&proposal, standing, &was_tested);
+    std::string why_not = objection(&proposal, standing, &was_tested);
+    // Poses may refute what corners prefer: the learned schema may stand all the same.
+    if (!why_not.empty() && proposal.refined && !is_passed_over(learned, standing)) {
+      proposal = learned;
+      why_not = objection(&proposal, standing, &was_tested);
+    }
     if (why_not.empty()) {
       // base_version stays the proposal's: which version stood here before depends on the speed of
       // the learner.

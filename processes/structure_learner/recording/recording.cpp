@@ -127,6 +127,7 @@ Recording read_samples(const std::filesystem::path& file, const std::string& nam
       throw RecordingError(fmt::format("{}: sample {} has {} action signals, the first one {}",
                                        name, index, sample.action.size(), first.action.size()));
     sample.sample_index = std::ssize(recording.samples) - 1;
+    recording.sights.push_back(tag_sights(*message));
   }
   add_mixture_hint(recording);
   const auto num_signals = recording.samples.front().action.size();

@@ -5,6 +5,7 @@
 #include <string>
 #include <vector>
 
+#include "common/camera/tag_sight.h"
 #include "common/estimation/measurement_model.h"
 #include "common/schema/body_schema.h"
 #include "common/schema/sample.h"
@@ -23,6 +24,8 @@ struct Recording {
   std::vector<Signal> signals;
   /// sample_index counts the instants of the file from 0.
   std::vector<ActionPoseSample> samples;
+  /// Of a log: what each instant shows of single tags, by sample_index; of a CSV empty.
+  std::vector<std::vector<TagSight>> sights;
   /// Whether the file says how noisy each observation is.
   bool has_noise = false;
   /// Whether the poses are those of camera markers, recorded by our observer.

@@ -93,6 +93,27 @@ TEST_F(RefinedSchemaTest, ThatPredictsCornersWorseIsNot) {
   EXPECT_EQ(length(*monitor.schema()), length(learned(10, 0)));
 }
 
+// The root is seen beside where its corners are, which the learned schema rests on.
+TEST_F(RefinedSchemaTest, ThatPosesRefuteLeavesTheLearnedOne) {
+  Pose bias = Pose::Identity();
+  bias.translation().x() = 0.03;
+  const body_schema_t exact = learned(10, 0);
+  for (sample_t& sample : samples_)
+    for (part_observation_t& part : sample.parts)
+      if (part.part_id == exact.root) part.X_CB = to_message(from_message(part.X_CB) * bias);
+  BodySchema biased = from_message(exact);
+  biased.X_CR = biased.X_CR * bias;
+  for (Edge& edge : biased.edges)
+    if (edge.from == biased.root) edge.left = bias.inverse() * edge.left;
+  ModelMonitor monitor(config_);
+  for (std::int64_t i = 0; i <= 10; ++i) monitor.on_sample(samples_.at(i));
+  monitor.on_refined_schema(refined(10, 0));
+  monitor.on_learned_schema(to_message(biased));
+  ASSERT_TRUE(monitor.schema());
+  EXPECT_EQ(monitor.schema()->is_refined, 0);
+  EXPECT_EQ(monitor.schema()->schema_version, 11);
+}
+
 TEST_F(RefinedSchemaTest, AnAnswerThatIsNoRefinementIsNoneEitherNorIsOneWithoutAViewOfTheTags) {
   body_schema_t answer = refined(10, 0);
   answer.is_refined = 0;

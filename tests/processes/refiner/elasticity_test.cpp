@@ -94,6 +94,20 @@ TEST(Elasticity, OfStiffJointsIsLessLikely) {
     EXPECT_LT(std::abs(joint.value), 4 * joint.sd) << joint.joint;
 }
 
+TEST(Elasticity, OfJointsThatRiseUnderTheirLoadsIsNegativeAndToldSo) {
+  Rng rng(5);
+  ElasticArm arm = test::elastic_arm(6, 0.02, rng);
+  arm.compliance_rad_per_Nm *= -1;
+  const Elasticity elasticity = elasticity_of(arm, true, rng);
+  EXPECT_GT(elasticity.evidence, 20);
+  int num_rising = 0;
+  for (const JointCompliance& joint : elasticity.joints) {
+    EXPECT_EQ(joint.rises(), joint.evidence > 0) << joint.joint;
+    num_rising += joint.rises() ? 1 : 0;
+  }
+  EXPECT_GT(num_rising, 0);
+}
+
 TEST(Elasticity, OfAJointWhoseLoadDoesNotChangeIsNotFitted) {
   Rng rng(7);
   const ElasticArm arm = test::elastic_arm(3, 0.02, rng);

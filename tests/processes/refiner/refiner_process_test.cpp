@@ -212,6 +212,22 @@ TEST_F(RefinerTest, WhatAnEarlierProcessRefinedIsNotRefinedAgain) {
   EXPECT_EQ(read_log(replay(recorded_, file), kRefinedSchema).size(), 1U);
 }
 
+TEST_F(RefinerTest, WhatRestsOnSamplesThatAreNotThereIsSetAside) {
+  const std::vector<std::string> file = {"--refined", folder_ / "refined.lcmlog"};
+  EXPECT_EQ(read_log(replay(recorded_, file), kRefinedSchema).size(), 1U);
+  LogAppender(folder_ / "samples.lcmlog").append(kSample, samples_.front());
+  const std::vector<std::string> anew = {"--refined", folder_ / "refined.lcmlog", "--samples",
+                                         folder_ / "samples.lcmlog"};
+  EXPECT_EQ(read_log(replay(recorded_, anew), kRefinedSchema).size(), 1U);
+  EXPECT_TRUE(fs::exists(folder_ / "refined.lcmlog.bad-1"));
+  // So is one of another rig.
+  body_schema_t other = proposal_after(10);
+  other.signals.front().signal_name = "other";
+  write_one_event_log(folder_ / "refined.lcmlog", kBodySchema, other);
+  EXPECT_EQ(read_log(replay(recorded_, file), kRefinedSchema).size(), 1U);
+  EXPECT_TRUE(fs::exists(folder_ / "refined.lcmlog.bad-2"));
+}
+
 TEST_F(RefinerTest, TwoReplaysAreTheSame) {
   const auto refined = [&] {
     std::vector<std::vector<std::uint8_t>> bytes;

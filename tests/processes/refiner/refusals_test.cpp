@@ -1,11 +1,14 @@
 #include <gtest/gtest.h>
 
+#include <algorithm>
 #include <filesystem>
 #include <fstream>
 #include <limits>
+#include <set>
 #include <stdexcept>
 #include <string>
 
+#include "processes/refiner/informative_samples.h"
 #include "processes/refiner/refine.h"
 #include "processes/refiner/refiner_config.h"
 #include "tests/processes/refiner/tagged_robot.h"
@@ -115,6 +118,34 @@ TEST(RefinerSamples, AreThinnedEvenly) {
   ASSERT_EQ(few.size(), 5U);
   for (int n = 0; n < 5; ++n) EXPECT_EQ(few[n].sample.sample_index, 2 * n);
   EXPECT_EQ(thinned(samples, 20).size(), 10U);
+}
+
+// Nine of ten samples are of one action. Evenly spaced, hardly any other would be fitted.
+TEST(RefinerSamples, ThatTellMostAreFitted) {
+  test::Rng rng(4);
+  const test::SyntheticRobot robot = test::chapter_robot("a", rng);
+  const test::ObservationOptions noise{.regime = test::Regime::kTagIso, .with_covariances = true};
+  std::vector<ActionPoseSample> samples = test::babble(robot, 400, noise, rng);
+  std::set<std::int64_t> others;
+  for (ActionPoseSample& sample : samples) {
+    if (sample.sample_index % 10 == 1)
+      others.insert(sample.sample_index);
+    else
+      sample = test::observe(robot, samples.front().action, noise, sample.sample_index, rng);
+  }
+  BodySchema schema = test::true_schema(robot);
+  schema.X_CR = robot.X_CR;
+  RefineOptions options;
+  options.config.max_samples = 60;
+  const auto chosen = informative(refiner_samples(samples), schema, {}, options, false);
+  EXPECT_LE(chosen.size(), 60U);
+  EXPECT_GE(chosen.size(), 55U);
+  const auto num_others = std::ranges::count_if(
+      chosen, [&](const auto& seen) { return others.contains(seen.sample.sample_index); });
+  EXPECT_GE(num_others, 36);  // of 40
+  const Refinement result = refine(schema, refiner_samples(samples), {}, options);
+  EXPECT_EQ(result.num_samples, static_cast<int>(chosen.size()));
+  EXPECT_EQ(result.num_available, 400);
 }
 
 }  // namespace

@@ -64,6 +64,30 @@ bool names(const std::vector<std::string>& sentences, const std::string& words) 
   });
 }
 
+// Tags of an instant's first part turn over, and every root begins where the others say.
+TEST(RefineSchemas, WhoseRootMovesAndWhoseFirstPartIsTurnedOver) {
+  Rng rng(2);
+  SyntheticRobot robot = test::chapter_robot("c", rng);
+  const BodySchema start = displaced(true_start(robot));
+  std::vector<ActionPoseSample> samples;
+  for (int n = 0; n < 40; ++n) {
+    Vector6d step;
+    step << 0.05 * test::gaussian6(rng).head<3>(), 0.3 * test::gaussian6(rng).head<3>();
+    SyntheticRobot moved = robot;
+    moved.X_CR = robot.X_CR * exp(step);
+    ActionPoseSample& sample =
+        samples.emplace_back(test::observe(moved, robot.random_action(rng), {}, n, rng));
+    for (PartObservation& seen : sample.parts) seen.covariance = isotropic(kNoise);
+    PartObservation& first = sample.parts.front();
+    first.X_CB_other = first.X_CB;
+    first.error_ratio = 1.1;
+    first.X_CB.linear() *= exp_so3(Eigen::Vector3d(1.5, 0, 0));
+  }
+  const Refinement result = refine(start, refiner_samples(samples), {}, {});
+  EXPECT_TRUE(result.root_moves);
+  EXPECT_LT(worst_error_m(result.schema, robot, samples), 1e-6) << result.num_iterations;
+}
+
 TEST(RefineSchemas, WithSevenJointsOnOneEdge) {
   Rng rng(2);
   const SyntheticRobot robot = test::random_arm({.num_joints = 7}, rng);

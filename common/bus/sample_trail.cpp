@@ -1,4 +1,4 @@
-#include "processes/model_monitor/sample_trail.h"
+#include "common/bus/sample_trail.h"
 
 #include <spdlog/fmt/fmt.h>
 

@@ -1,4 +1,4 @@
-#include "processes/model_monitor/saved_message.h"
+#include "common/bus/saved_message.h"
 
 #include <gtest/gtest.h>
 
