@@ -100,7 +100,7 @@ TEST_F(RefinedSchemaTest, ThatPosesRefuteLeavesTheLearnedOne) {
   const body_schema_t exact = learned(10, 0);
   for (sample_t& sample : samples_)
     for (part_observation_t& part : sample.parts)
-      if (part.part_id == exact.root) part.X_CB = to_message(from_message(part.X_CB) * bias);
+      if (part.part_id == exact.root_part) part.X_CB = to_message(from_message(part.X_CB) * bias);
   BodySchema biased = from_message(exact);
   biased.X_CR = biased.X_CR * bias;
   for (Edge& edge : biased.edges)

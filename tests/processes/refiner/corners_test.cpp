@@ -145,7 +145,7 @@ TEST(RefineCorners, WithoutOptionsPosesAreFittedAndTagsAndLensStayAsClaimed) {
   const Refinement result = refine(c.start, c.samples, c.rig, options);
   EXPECT_FALSE(result.used_corners);
   EXPECT_LT(*result.after.px_rms, 0.1 * *result.before.px_rms);
-  EXPECT_EQ(result.schema.calibration_id, c.start.calibration_id);
+  EXPECT_EQ(result.schema.calibration_id, c.samples.front().sample.calibration_id);
   EXPECT_EQ(result.rig.camera.fx, c.rig.camera.fx);
 }
 
