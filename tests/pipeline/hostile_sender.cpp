@@ -105,6 +105,7 @@ void add_nonsense(std::vector<Hostile>& all) {
   });
   add(kLearnedSchema, example_body_schema(), [](auto& m) { m.root_part = 4711; });
   add(kLearnedSchema, example_body_schema(), [](auto& m) { m.X_CR.rotation_wxyz[0] = 9; });
+  add(kRefinedSchema, example_body_schema(), [](auto& m) { m.X_CR.position_m[1] = kNan; });
   add(kBodySchema, example_body_schema(), [](auto& m) { m.noise_position_m = kNan; });
   add(kModelHealth, example_model_health(), [](auto& m) { m.part_health.at(0).visibility = kNan; });
   add(kPoseTarget, example_pose_target(), [](auto& m) { m.position_m[2] = kNan; });
@@ -114,6 +115,7 @@ void add_nonsense(std::vector<Hostile>& all) {
   add(kCameraImage, example_camera_image(), [](auto& m) { m.width = 31; });
   // Well-formed and sensible, but of no shipped rig.
   add(kLearnedSchema, example_body_schema(), [](auto&) {});
+  add(kRefinedSchema, example_body_schema(), [](auto& m) { m.last_sample_index = 1'000'000'000; });
   add(kSample, example_sample(), [](auto& m) { m.sample_index = 1'000'000'000; });
   add(kMarkerPoses, example_marker_poses(), [](auto&) {});
   add(kCameraInfo, example_camera_info(), [](auto&) {});
