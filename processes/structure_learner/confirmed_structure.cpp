@@ -100,7 +100,8 @@ bool may_be_louder(const LearnedStructure& structure) {
 }
 
 // The structure at the least noise that explains it; edges with needless joints are still in it.
-LearnedStructure least_noise(LearnedStructure told, const FindStructure& find) {
+LearnedStructure least_noise(LearnedStructure told, const FindStructure& find,
+                             const ConnectSoftParts& connect_soft_parts) {
   // With more noise the screws would be back.
   if (lacks_data(told) || told.search.gave_way) return told;
   const bool is_explained = told.spans() && !is_soft(told);
@@ -124,6 +125,10 @@ LearnedStructure least_noise(LearnedStructure told, const FindStructure& find) {
         signatures_of(quieter) == signatures_of(louder)) {
       if (is_first) return quieter;
       if (!is_explained && !is_guess && quieter.search.residual_scale < kSmallestResidual) {
+        // Nor is it too small for all: what the screws leave may be a function of the signals.
+        LearnedStructure soft = told;
+        connect_soft_parts(&soft);
+        if (soft.spans()) return soft;
         told.is_contested = true;
         return told;
       }
@@ -188,7 +193,7 @@ LearnedStructure confirmed_structure(const FindStructure& find,
     connect_soft_parts(&*soft);
   }
   if (!soft || !soft->spans()) {
-    structure = least_noise(std::move(structure), find);
+    structure = least_noise(std::move(structure), find, connect_soft_parts);
     if (!is_soft_open(structure))
       soft.reset();
     else if (!soft)
