@@ -7,6 +7,8 @@
 //   refinement rig config/arm7 [--seeds 10]
 //   refinement recording CSV
 
+#include <fmt/format.h>
+
 #include <CLI/CLI.hpp>
 #include <algorithm>
 #include <cmath>
@@ -301,12 +303,15 @@ struct RigRow {
     const auto of = [](const std::vector<double>& values) {
       return values.empty() ? NAN : median(values);
     };
+    const auto known = [&](const std::vector<double>& values) {
+      return values.empty() ? std::string("–") : fmt::format("{:.3f}", median(values));
+    };
     const double worst =
         aligned_m.empty() ? NAN : *std::max_element(aligned_m.begin(), aligned_m.end());
-    std::printf("| %s | %.3f mm, %.4f° | %.3f mm | %.3f mm | %.5f | %.1f | %.3f | %s | %.2f |\n",
+    std::printf("| %s | %.4f mm, %.4f° | %.4f mm | %.3f mm | %.5f | %.1f | %s | %s | %s |\n",
                 name.c_str(), of(aligned_m) * 1e3, of(aligned_rad) / kDegree, worst * 1e3,
-                of(unaligned_m) * 1e3, of(scale), of(squared), of(px), tags.text().c_str(),
-                of(seconds));
+                of(unaligned_m) * 1e3, of(scale), of(squared), known(px).c_str(),
+                tags.text().c_str(), known(seconds).c_str());
     std::fflush(stdout);
   }
 };

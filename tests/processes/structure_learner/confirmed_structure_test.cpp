@@ -34,14 +34,21 @@ struct Found {
   LearnedStructure structure = {.actions = NormalizedActions({}, 0)};
 };
 
-Found confirmed(const std::map<double, LearnedStructure>& by_factor) {
+/// `process`: of these signals, connects parts 1 and 2; without signals none does.
+Found confirmed(const std::map<double, LearnedStructure>& by_factor,
+                const std::vector<int>& process = {}) {
   Found found;
   const auto find = [&](double factor, double unknown_bias) {
     ++found.num_searches;
     EXPECT_EQ(unknown_bias > 0, factor > 1);
     return by_factor.at(factor);
   };
-  found.structure = confirmed_structure(find, [&](LearnedStructure*) { found.is_soft = true; });
+  found.structure = confirmed_structure(find, [&](LearnedStructure* open) {
+    found.is_soft = true;
+    if (process.empty()) return;
+    open->parts = {1, 2};
+    open->search.models = {{.part_i = 1, .part_j = 2, .soft_signals = process}};
+  });
   return found;
 }
 
@@ -156,14 +163,19 @@ TEST(ConfirmedStructureTest, AnExtraJointOfASignalThatIsUsedAnywayGoes) {
   EXPECT_EQ(found.structure.noise_source, NoiseSource::kResiduals);
 }
 
-TEST(ConfirmedStructureTest, NoiseThatIsMoreThanTheResidualsSayConnectsNothing) {
-  const Found found = confirmed({{1, nothing()},
-                                 {2, structure({0, 0}, 0.6)},
-                                 {4, structure({0}, 0.16)},
-                                 {8, structure({0}, 0.04)}});
+TEST(ConfirmedStructureTest, NoiseThatIsMoreThanTheResidualsSayConnectsNothingButAProcessMay) {
+  const std::map<double, LearnedStructure> by_factor = {{1, nothing()},
+                                                        {2, structure({0, 0}, 0.6)},
+                                                        {4, structure({0}, 0.16)},
+                                                        {8, structure({0}, 0.04)}};
+  const Found found = confirmed(by_factor);
   EXPECT_FALSE(found.structure.spans());
   EXPECT_TRUE(found.structure.is_contested);
-  EXPECT_FALSE(found.is_soft);
+  EXPECT_TRUE(found.is_soft);
+  const Found soft = confirmed(by_factor, {0});
+  EXPECT_TRUE(soft.structure.spans());
+  EXPECT_FALSE(soft.structure.is_contested);
+  EXPECT_EQ(soft.structure.noise_source, NoiseSource::kGiven);
 }
 
 TEST(ConfirmedStructureTest, MoreNoiseFixesNothingToAPartThatRests) {
