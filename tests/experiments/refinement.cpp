@@ -405,7 +405,8 @@ void run_recording(const std::string& file) {
       "| part | edges | learned rms mm | learned rms ° | refined rms mm | refined rms ° |\n"
       "| --- | --- | --- | --- | --- | --- |\n",
       std::filesystem::path(file).filename().c_str(), training.size(), held_out.size());
-  for (const auto& [name, start] : {std::pair{"screws", &screws}, {"as learned", &schema}}) {
+  for (const auto& [name, start] :
+       {std::pair<const char*, const BodySchema*>{"screws", &screws}, {"as learned", &schema}}) {
     const Refinement result = refine(*start, samples, {}, refining);
     for (std::size_t p = 0; p < result.after.parts.size(); ++p) {
       const PartErrors &before = result.before.parts[p], &after = result.after.parts[p];
