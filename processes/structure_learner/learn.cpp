@@ -11,6 +11,7 @@
 #include "processes/structure_learner/confirmed_structure.h"
 #include "processes/structure_learner/edge_fit.h"
 #include "processes/structure_learner/learned_schema.h"
+#include "processes/structure_learner/model_free_noise.h"
 #include "processes/structure_learner/noise_in_common.h"
 #include "processes/structure_learner/one_cluster.h"
 #include "processes/structure_learner/root_pose.h"
@@ -69,11 +70,26 @@ SearchOptions search_options_of(const LearnOptions& options) {
   return result;
 }
 
+// What processes leave in a stream beside its jitter lasts: a soft body remembers.
+std::optional<Noise> noise_beside_soft_edges(const std::vector<ActionPoseSample>& displaced,
+                                             const NormalizedActions& actions,
+                                             const BodySchema& schema) {
+  const bool all_soft = std::ranges::all_of(
+      schema.edges, [](const Edge& edge) { return edge.residual_gp != nullptr; });
+  if (!all_soft) return std::nullopt;
+  std::optional<Noise> jitter = noise_from_neighbours(displaced, actions);
+  if (!jitter) return std::nullopt;
+  return Noise{std::max(jitter->position_m, kNoiseFloor.position_m),
+               std::max(jitter->rotation_rad, kNoiseFloor.rotation_rad)};
+}
+
 // What models leave is noise, or the body's.
-void tell_noise_from_body(const std::vector<ActionPoseSample>& displaced, BodySchema* schema) {
+void tell_noise_from_body(const std::vector<ActionPoseSample>& displaced,
+                          const NormalizedActions& actions, BodySchema* schema) {
   // The estimate is 1.2 times too large; known to a fifth.
   constexpr double kRefuted = 1.5;
-  const std::optional<Noise> common = noise_in_common(*schema, displaced);
+  std::optional<Noise> common = noise_beside_soft_edges(displaced, actions, *schema);
+  if (!common) common = noise_in_common(*schema, displaced);
   Noise& noise = schema->noise;
   if (!common || (noise.position_m < kRefuted * common->position_m &&
                   noise.rotation_rad < kRefuted * common->rotation_rad))
@@ -132,7 +148,8 @@ LearnResult fit_tree(const LearnedStructure& structure,
   if (schema.has_part(schema.root) && schema.has_rotation(schema.root))
     result.serial_correlation = fit_jointly(data, &fitted, &schema, &refused);
   for (const FittedEdge& f : fitted) schema.edges.push_back(f.edge);
-  if (structure.noise_source == NoiseSource::kResiduals) tell_noise_from_body(moved, &schema);
+  if (structure.noise_source == NoiseSource::kResiduals)
+    tell_noise_from_body(moved, actions, &schema);
   schema.set_covered(samples);
 
   const std::set<int> connected = connected_to_root(schema);
