@@ -99,6 +99,23 @@ bool may_be_louder(const LearnedStructure& structure) {
                                measurement.scale * measurement.noise->rotation_rad});
 }
 
+// A structure with bent commands that needs less than `factor` times the noise once these are
+// known.
+std::optional<LearnedStructure> with_less_noise(const LearnedStructure& louder, double factor,
+                                                const FindStructure& find) {
+  if (std::ranges::all_of(louder.signals, [](const Signal& s) { return s.warp.empty(); }))
+    return std::nullopt;
+  for (double less = 1; less < factor; less *= 2) {
+    LearnedStructure found = find({less, less > 1 ? kUnknownBias : 0, louder.signals});
+    if (!found.spans() || has_doubtful_joints(found) ||
+        signatures_of(found) != signatures_of(louder))
+      continue;
+    if (less > 1) found.noise_source = NoiseSource::kResiduals;
+    return found;
+  }
+  return std::nullopt;
+}
+
 // The structure at the least noise that explains it; edges with needless joints are still in it.
 LearnedStructure least_noise(LearnedStructure told, const FindStructure& find,
                              const ConnectSoftParts& connect_soft_parts) {
@@ -115,7 +132,7 @@ LearnedStructure least_noise(LearnedStructure told, const FindStructure& find,
     return told;
   LearnedStructure quieter = told;
   for (double factor = 2; factor <= 2 * kMostNoise; factor *= 2) {
-    LearnedStructure louder = find(factor, kUnknownBias);
+    LearnedStructure louder = find({factor, kUnknownBias});
     const bool is_first = factor == 2;
     if (is_first && is_explained && !louder.spans()) return told;
     // What more noise does not help to connect has another reason.
@@ -125,6 +142,7 @@ LearnedStructure least_noise(LearnedStructure told, const FindStructure& find,
         signatures_of(quieter) == signatures_of(louder)) {
       if (is_first) return quieter;
       if (!is_explained && !is_guess && quieter.search.residual_scale < kSmallestResidual) {
+        if (auto with_bends = with_less_noise(quieter, factor, find)) return *std::move(with_bends);
         // Nor is it too small for all: what the screws leave may be a function of the signals.
         LearnedStructure soft = told;
         connect_soft_parts(&soft);
@@ -152,7 +170,7 @@ LearnedStructure of_stream(LearnedStructure told, const FindStructure& find,
   connect_soft_parts(&told);
   if (told.noise_source != NoiseSource::kResiduals || told.search.models.empty()) return told;
   for (int step = 1; step <= kSteps && !told.spans() && !lacks_data(told); ++step) {
-    LearnedStructure louder = find(std::pow(kStep, step), 0);
+    LearnedStructure louder = find({.factor = std::pow(kStep, step)});
     connect_soft_parts(&louder);
     if (louder.spans()) told = std::move(louder);
   }
@@ -180,7 +198,7 @@ void withdraw_doubtful(LearnedStructure* structure) {
 
 LearnedStructure confirmed_structure(const FindStructure& find,
                                      const ConnectSoftParts& connect_soft_parts) {
-  LearnedStructure structure = find(1, 0);
+  LearnedStructure structure = find({});
   const bool is_stream = structure.actions.blocks().is_stream();
   if (is_stream) structure = of_stream(std::move(structure), find, connect_soft_parts);
   const auto is_soft_open = [is_stream](const LearnedStructure& found) {

@@ -1,14 +1,20 @@
 #pragma once
 
 #include <functional>
+#include <vector>
 
 #include "processes/structure_learner/learn.h"
 
 namespace bodyschema {
 
-/// Searches with all standard deviations of the noise `factor` times as large, where every marker
-/// may have a bias that nobody told (SearchOptions::unknown_bias).
-using FindStructure = std::function<LearnedStructure(double factor, double unknown_bias)>;
+/// How to search: with all standard deviations of the noise `factor` times as large, where every
+/// marker may have a bias that nobody told (SearchOptions::unknown_bias), beginning with commands
+/// that are bent like these; none: with straight ones.
+struct StructureQuery {
+  double factor = 1, unknown_bias = 0;
+  std::vector<Signal> bent = {};
+};
+using FindStructure = std::function<LearnedStructure(const StructureQuery&)>;
 /// Connects what no screws do, with Gaussian processes beside them.
 using ConnectSoftParts = std::function<void(LearnedStructure*)>;
 
@@ -27,8 +33,10 @@ using ConnectSoftParts = std::function<void(LearnedStructure*)>;
 /// uses is used no more with larger noise, size alone does not tell a small joint from a bias: what
 /// the two do not share is left open (LearnedStructure::is_contested). So are redundant edges of
 /// the answer, chains with unknown gains, and soft parts that screws describe with noise of which
-/// the residuals show less than half. Parts that screws do not connect are soft only where more
-/// noise is no answer; where the noise is a guess, it is the other way round.
+/// the residuals show less than half, unless these are screws with bent commands, which show only
+/// by a model: with these it is searched with less noise again. Parts that screws do not connect
+/// are soft only where more noise is no answer; where the noise is a guess, it is the other way
+/// round.
 ///
 /// Noise of a stream that was estimated from residuals is raised by a fifth, at most twice, until a
 /// structure spans.

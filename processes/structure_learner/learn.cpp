@@ -215,6 +215,7 @@ bool connects_more_simply(const SearchResult& x, const SearchResult& y) {
 
 enum class Commands { kStraight, kMayBeBent };
 
+// Begins with the bends of `signals`.
 LearnedStructure find_with_bias(const std::vector<Signal>& signals,
                                 const std::vector<ActionPoseSample>& samples,
                                 const LearnOptions& options, double unknown_bias,
@@ -232,15 +233,16 @@ LearnedStructure find_with_bias(const std::vector<Signal>& signals,
     measurement.noise = noise;
     noise_source = noise.source;
   };
-  set_noise(samples);
+  const std::vector<ActionPoseSample> moved = displaced(samples, signals);
+  set_noise(moved);
   // What many joints leave by that much is no noise either.
   if (noise_source == NoiseSource::kResiduals && is_above_any_marker(*measurement.noise))
     search_options.max_signals = std::min(search_options.max_signals, kMaxScreenedJoints);
-  NormalizedActions actions(samples, num_signals);
-  SearchResult search = search_structure(samples, actions, parts, search_options);
+  NormalizedActions actions(moved, num_signals);
+  SearchResult search = search_structure(moved, actions, parts, search_options);
   if (unknown_bias == 0 && has_far_outliers(search)) {
     search_options.validity.allows_far_outliers = true;
-    SearchResult found = search_structure(samples, actions, parts, search_options);
+    SearchResult found = search_structure(moved, actions, parts, search_options);
     found.num_screens += search.num_screens;
     found.num_fits += search.num_fits;
     search_options.validity.allows_far_outliers = connects_more_simply(found, search);
@@ -349,11 +351,9 @@ std::optional<Noise> noise_instead(const LearnedStructure& by_told,
   const bool stands = by_told.spans() && !by_told.is_contested && search.redundant.empty() &&
                       search.couplings.empty() && !has_soft_edge(search) && !is_refuted;
   if (!told || stands || !tells_noise(by_told)) return std::nullopt;
-  // The order of longer chains would be searched for in vain where bodies are soft; of a stream
-  // none is.
-  const int max_signals = by_told.actions.blocks().is_stream()
-                              ? options.max_signals
-                              : std::min(options.max_signals, kMaxScreenedJoints);
+  // Where bodies are soft, the order of longer chains would be searched for in vain.
+  const int max_signals = has_soft_edge(search) ? std::min(options.max_signals, kMaxScreenedJoints)
+                                                : options.max_signals;
   const auto shown = estimate_noise(samples, static_cast<int>(by_told.signals.size()), max_signals);
   if (!shown || shown->source != NoiseSource::kResiduals || is_above_any_marker(*shown) ||
       (shown->position_m < kRefutes * told->position_m &&
@@ -395,10 +395,11 @@ LearnedStructure find_in_step(const std::vector<Signal>& signals,
   for (ActionPoseSample& sample : poses)
     std::erase_if(sample.parts, [](const PartObservation& o) { return !o.has_rotation; });
   const auto confirmed = [&](const LearnOptions& by, Commands commands = Commands::kMayBeBent) {
-    const auto find = [&](double factor, double unknown_bias) {
+    const auto find = [&](const StructureQuery& query) {
       LearnOptions louder = by;
-      louder.measurement.scale *= factor;
-      return find_with_bias(signals, poses, louder, unknown_bias, commands);
+      louder.measurement.scale *= query.factor;
+      return find_with_bias(query.bent.empty() ? signals : query.bent, poses, louder,
+                            query.unknown_bias, commands);
     };
     return confirmed_structure(find, [&](LearnedStructure* found) {
       // With enough noise a screw passes for anything soft: nothing is tried beside it.
@@ -487,9 +488,30 @@ LearnResult relearn(const LearnedStructure& structure, const std::vector<ActionP
   return result;
 }
 
+namespace {
+
+// What the best models leave at most commands says too little of the others.
+bool is_refused_by_guessed_noise(const LearnResult& result) {
+  return result.noise_source == NoiseSource::kResiduals &&
+         std::ranges::any_of(result.refused, [](const auto& refusal) {
+           return refusal.second == Refusal::kWrongAtSomeCommands;
+         });
+}
+
+}  // namespace
+
 LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPoseSample>& samples,
                   const LearnOptions& options) {
   LearnResult result = fit_structure(find_structure(signals, samples, options), samples, options);
+  if (is_refused_by_guessed_noise(result)) {
+    LearnOptions louder = options;
+    louder.measurement.noise =
+        Noise{2 * result.schema.noise.position_m, 2 * result.schema.noise.rotation_rad};
+    LearnedStructure structure = find_structure(signals, samples, louder);
+    structure.noise_source = NoiseSource::kResiduals;
+    LearnResult found = fit_structure(structure, samples, louder);
+    if (found.schema.edges.size() > result.schema.edges.size()) return found;
+  }
   // An edge that all parts together refuse may have kept out a right one.
   LearnOptions others = options;
   for (const auto& [ends, why] : result.refused)

@@ -38,10 +38,10 @@ struct Found {
 Found confirmed(const std::map<double, LearnedStructure>& by_factor,
                 const std::vector<int>& process = {}) {
   Found found;
-  const auto find = [&](double factor, double unknown_bias) {
+  const auto find = [&](const StructureQuery& query) {
     ++found.num_searches;
-    EXPECT_EQ(unknown_bias > 0, factor > 1);
-    return by_factor.at(factor);
+    EXPECT_EQ(query.unknown_bias > 0, query.factor > 1);
+    return by_factor.at(query.factor);
   };
   found.structure = confirmed_structure(find, [&](LearnedStructure* open) {
     found.is_soft = true;
