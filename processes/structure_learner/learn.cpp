@@ -18,17 +18,11 @@
 #include "processes/structure_learner/search/withdrawal.h"
 #include "processes/structure_learner/soft_parts.h"
 #include "processes/structure_learner/surrogate_commands.h"
+#include "processes/structure_learner/told_noise.h"
 #include "processes/structure_learner/unconnected.h"
 
 namespace bodyschema {
 namespace {
-
-bool has_covariances(const std::vector<ActionPoseSample>& samples) {
-  for (const auto& sample : samples)
-    for (const auto& o : sample.parts)
-      if (!o.covariance.isZero(0)) return true;
-  return false;
-}
 
 // Above so many times the told noise an estimate refutes it. Where it is told right,
 // `imperfect_robots --samples 60` has 1.0 to 1.35 (the estimate is 1.2 times too large), where tags
@@ -36,21 +30,6 @@ bool has_covariances(const std::vector<ActionPoseSample>& samples) {
 constexpr double kRefutes = 1.4;
 // Samples of a part together with another that tell its noise (chosen).
 constexpr int kFewestTelling = 20;
-
-Noise typical_noise(const std::vector<ActionPoseSample>& samples) {
-  double position = 0, rotation = 0;
-  int count = 0, num_rotations = 0;
-  for (const auto& sample : samples) {
-    for (const auto& o : sample.parts) {
-      position += o.covariance.topLeftCorner<3, 3>().trace() / 3;
-      rotation += o.covariance.bottomRightCorner<3, 3>().trace() / 3;
-      ++count;
-      num_rotations += o.has_rotation;
-    }
-  }
-  if (count == 0) return {};
-  return {std::sqrt(position / count), std::sqrt(rotation / std::max(num_rotations, 1))};
-}
 
 int check_actions(const std::vector<ActionPoseSample>& samples, std::size_t num_signals) {
   for (const auto& sample : samples)
@@ -76,11 +55,7 @@ std::optional<Noise> noise_beside_soft_edges(const std::vector<ActionPoseSample>
                                              const BodySchema& schema) {
   const bool all_soft = std::ranges::all_of(
       schema.edges, [](const Edge& edge) { return edge.residual_gp != nullptr; });
-  if (!all_soft) return std::nullopt;
-  std::optional<Noise> jitter = noise_from_neighbours(displaced, actions);
-  if (!jitter) return std::nullopt;
-  return Noise{std::max(jitter->position_m, kNoiseFloor.position_m),
-               std::max(jitter->rotation_rad, kNoiseFloor.rotation_rad)};
+  return all_soft ? noise_from_neighbours(displaced, actions) : std::nullopt;
 }
 
 // What models leave is noise, or the body's.
@@ -94,8 +69,9 @@ void tell_noise_from_body(const std::vector<ActionPoseSample>& displaced,
   if (!common || (noise.position_m < kRefuted * common->position_m &&
                   noise.rotation_rad < kRefuted * common->rotation_rad))
     return;
-  noise.position_m = std::min(noise.position_m, common->position_m);
-  noise.rotation_rad = std::min(noise.rotation_rad, common->rotation_rad);
+  noise.position_m = std::clamp(common->position_m, kNoiseFloor.position_m, noise.position_m);
+  noise.rotation_rad =
+      std::clamp(common->rotation_rad, kNoiseFloor.rotation_rad, noise.rotation_rad);
   add_unexplained(noise, schema);
 }
 
