@@ -60,11 +60,13 @@ std::optional<Noise> noise_beside_soft_edges(const std::vector<ActionPoseSample>
 
 // What models leave is noise, or the body's.
 void tell_noise_from_body(const std::vector<ActionPoseSample>& displaced,
-                          const NormalizedActions& actions, BodySchema* schema) {
+                          const NormalizedActions& actions, const std::optional<Noise>& told,
+                          BodySchema* schema) {
   // The estimate is 1.2 times too large; known to a fifth.
   constexpr double kRefuted = 1.5;
   std::optional<Noise> common = noise_beside_soft_edges(displaced, actions, *schema);
   if (!common) common = noise_in_common(*schema, displaced);
+  if (!common) common = told;
   Noise& noise = schema->noise;
   if (!common || (noise.position_m < kRefuted * common->position_m &&
                   noise.rotation_rad < kRefuted * common->rotation_rad))
@@ -125,7 +127,7 @@ LearnResult fit_tree(const LearnedStructure& structure,
     result.serial_correlation = fit_jointly(data, &fitted, &schema, &refused);
   for (const FittedEdge& f : fitted) schema.edges.push_back(f.edge);
   if (structure.noise_source == NoiseSource::kResiduals)
-    tell_noise_from_body(moved, actions, &schema);
+    tell_noise_from_body(moved, actions, options.measurement.noise, &schema);
   schema.set_covered(samples);
 
   const std::set<int> connected = connected_to_root(schema);

@@ -23,7 +23,8 @@ Recording recorded(std::uint64_t seed, double gear_error_rad) {
   Recording recording{.robot = test::random_arm({.num_joints = 6, .share_sliding = 0}, rng)};
   test::SyntheticRobot& robot = recording.robot;
   robot.bend = gear_error_rad;
-  const std::vector<ActionPoseSample> samples = test::babble(robot, 2 * kSamples, kNoise, rng);
+  const std::vector<ActionPoseSample> samples =
+      test::noisy_babble(robot, 2 * kSamples, kNoise, rng);
   recording.training.assign(samples.begin(), samples.begin() + kSamples);
   recording.held_out.assign(samples.begin() + kSamples, samples.end());
   return recording;
