@@ -33,12 +33,13 @@ std::optional<Candidate> best_chain(const std::vector<Pair>& between,
                                     const std::vector<int>& signals, bool are_few,
                                     PairModels* pairs, std::map<Pair, double>* costs) {
   // What moves as a stream is often soft: no order is searched for where none may fit.
-  const bool is_searched = are_few && between.size() == 1 && !pairs->actions().blocks().is_stream();
+  const bool is_only_pair = are_few && between.size() == 1;
+  const bool is_searched = is_only_pair && !pairs->actions().blocks().is_stream();
   std::optional<Candidate> best;
   for (const Pair& ij : between) {
     std::optional<Candidate> found =
         chain_between(ij, signals, is_searched ? JointOrder::kUnknown : JointOrder::kListed, pairs,
-                      &(*costs)[ij]);
+                      &(*costs)[ij], is_only_pair);
     if (found && (!best || rank(*found) < rank(*best))) best = std::move(found);
   }
   return best;
@@ -95,7 +96,8 @@ std::map<Pair, std::vector<Pair>> pairs_between_components(PairModels* pairs,
 }
 
 std::optional<Candidate> chain_between(const Pair& ij, const std::vector<int>& signals,
-                                       JointOrder order, PairModels* pairs, double* cost) {
+                                       JointOrder order, PairModels* pairs, double* cost,
+                                       bool may_be_coupled) {
   const auto [part_i, part_j] = ij;
   *cost = std::numeric_limits<double>::infinity();
   const PairData& pair = pairs->pair(part_i, part_j);
@@ -112,7 +114,7 @@ std::optional<Candidate> chain_between(const Pair& ij, const std::vector<int>& s
   if (!fit) return std::nullopt;
   fit = without_idle_joints(with_pure_slides(*std::move(fit), pair, actions), pair, actions);
   fit = with_settled_order(*std::move(fit), pair, actions);
-  if (order == JointOrder::kUnknown && fit->cost > kRightCost * pair.size())
+  if ((order == JointOrder::kUnknown || may_be_coupled) && fit->cost > kRightCost * pair.size())
     fit = with_coupled_joints(*std::move(fit), pair, actions);
   std::optional<Candidate> chain = pairs->try_start(part_i, part_j, fit->model);
   *cost = pairs->last_cost();

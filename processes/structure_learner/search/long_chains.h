@@ -22,10 +22,12 @@ std::map<Pair, std::vector<Pair>> pairs_between_components(PairModels* pairs,
                                                            const ModelForest& forest);
 
 /// A chain on `signals`, valid by the pair's own data, without the joints that do not pay and in
-/// the order that the poses prefer. `cost`: what it leaves a frame; infinite if there are too few
-/// frames to fit it, which is noted.
+/// the order that the poses prefer; where that is unknown, or `may_be_coupled`, a second signal may
+/// move a joint, too (with_coupled_joints()). `cost`: what it leaves a frame; infinite if there are
+/// too few frames to fit it, which is noted.
 std::optional<Candidate> chain_between(const Pair& ij, const std::vector<int>& signals,
-                                       JointOrder order, PairModels* pairs, double* cost);
+                                       JointOrder order, PairModels* pairs, double* cost,
+                                       bool may_be_coupled = false);
 
 /// Of many hypotheses one fits by chance unless the least joint that is looked for would show by
 /// far. Chosen: at 17 poses that is 24 σ of tags, 5 σ of the chapter's noise, where it is wrong as
