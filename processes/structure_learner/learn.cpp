@@ -13,6 +13,7 @@
 #include "processes/structure_learner/learned_schema.h"
 #include "processes/structure_learner/model_free_noise.h"
 #include "processes/structure_learner/noise_in_common.h"
+#include "processes/structure_learner/noise_instead.h"
 #include "processes/structure_learner/one_cluster.h"
 #include "processes/structure_learner/root_pose.h"
 #include "processes/structure_learner/search/withdrawal.h"
@@ -23,13 +24,6 @@
 
 namespace bodyschema {
 namespace {
-
-// Above so many times the told noise an estimate refutes it. Where it is told right,
-// `imperfect_robots --samples 60` has 1.0 to 1.35 (the estimate is 1.2 times too large), where tags
-// are not as told 1.3 to 4.
-constexpr double kRefutes = 1.4;
-// Samples of a part together with another that tell its noise (chosen).
-constexpr int kFewestTelling = 20;
 
 int check_actions(const std::vector<ActionPoseSample>& samples, std::size_t num_signals) {
   for (const auto& sample : samples)
@@ -300,45 +294,6 @@ void attach_leaves(const std::vector<ActionPoseSample>& samples, const LearnOpti
       structure->search.models.push_back(std::move(model));
   }
   structure->open_leaves = std::move(leaves.open);
-}
-
-bool has_soft_edge(const SearchResult& search) {
-  return std::any_of(search.models.begin(), search.models.end(),
-                     [](const AcceptedModel& m) { return !m.soft_signals.empty(); });
-}
-
-// Every part was seen together with some other so often that what models leave tells the noise.
-bool tells_noise(const LearnedStructure& structure) {
-  return std::all_of(structure.parts.begin(), structure.parts.end(), [&](int part) {
-    const auto& records = structure.search.records;
-    return std::any_of(records.begin(), records.end(), [&](const auto& of) {
-      return (of.first.first == part || of.first.second == part) &&
-             of.second.num_common >= kFewestTelling;
-    });
-  });
-}
-
-// Where no screws connect the parts with the noise that is told, nor with multiples of it, or not
-// surely: the noise that the markers themselves show, where that refutes the told one.
-std::optional<Noise> noise_instead(const LearnedStructure& by_told,
-                                   const std::vector<ActionPoseSample>& samples,
-                                   const LearnOptions& options) {
-  const std::optional<Noise>& told = options.measurement.noise;
-  const SearchResult& search = by_told.search;
-  const bool is_refuted = by_told.noise_source == NoiseSource::kGiven && search.residual_scale > 1;
-  const bool stands = by_told.spans() && !by_told.is_contested && search.redundant.empty() &&
-                      search.couplings.empty() && !has_soft_edge(search) && !is_refuted;
-  if (!told || stands || !tells_noise(by_told)) return std::nullopt;
-  // Where bodies are soft, the order of longer chains would be searched for in vain.
-  const int max_signals = has_soft_edge(search) ? std::min(options.max_signals, kMaxScreenedJoints)
-                                                : options.max_signals;
-  const auto shown = estimate_noise(samples, static_cast<int>(by_told.signals.size()), max_signals);
-  if (!shown || shown->source != NoiseSource::kResiduals || is_above_any_marker(*shown) ||
-      (shown->position_m < kRefutes * told->position_m &&
-       shown->rotation_rad < kRefutes * told->rotation_rad))
-    return std::nullopt;
-  return Noise{std::max(told->position_m, shown->position_m),
-               std::max(told->rotation_rad, shown->rotation_rad)};
 }
 
 // Takes back the edges that may be by chance, after the search: what they kept out is

@@ -164,7 +164,6 @@ class ModelNoise {
   // The chain with joints that a second signal moves, too.
   void offer_coupled(const LocalModel& chain, int part_i, int part_j, const Noise& noise,
                      ScaledFit* best) const {
-    if (actions_.blocks().is_stream()) return;
     const PairData pair = pair_data(part_i, part_j, noise);
     const Fit coupled =
         with_coupled_joints(fit_local_model(chain, pair, actions_, 15, 1e-2), pair, actions_);

@@ -4,6 +4,7 @@
 #include <gtest/gtest.h>
 
 #include "common/geometry/angle.h"
+#include "common/schema/standard_deviations.h"
 #include "processes/structure_learner/learn.h"
 #include "tests/support/random_arm.h"
 
@@ -48,7 +49,8 @@ int num_right(double gear_error_rad, const std::optional<Noise>& told) {
       const Pose X = truth.at(recording.robot.links.front().part).inverse() *
                      truth.at(recording.robot.links.back().part);
       squares += (predicted->X_AB.translation() - X.translation()).squaredNorm();
-      told_squares += predicted->covariance.topLeftCorner<3, 3>().trace();
+      told_squares += predicted->covariance.topLeftCorner<3, 3>().trace() +
+                      noise_of_pair(X, schema.noise).head<3>().sum();
     }
     EXPECT_LT(squares, 9 * told_squares) << "seed " << seed;
   }

@@ -214,5 +214,40 @@ TEST(CoupledJoints, AreNoneWhereEachSignalMovesOne) {
             4);
 }
 
+// A wrist whose cables run over the joint before, in smooth motion.
+TEST(LongChain, JointsThatASecondSignalMovesAreFoundInAStream) {
+  Rng rng(12);
+  test::SyntheticRobot robot = test::random_arm({.num_joints = 4, .share_sliding = 0}, rng);
+  robot.links[3].also = robot.links[4].signal;
+  robot.links[3].also_gain = 0.5;
+  constexpr Noise kTracker{2e-4, 0.1 * kDegree};
+  std::vector<ActionPoseSample> samples = test::noisy_babble(robot, 1500, kTracker, rng);
+  for (ActionPoseSample& sample : samples) {
+    const auto t = static_cast<double>(sample.sample_index);
+    sample.utime = 20'000 * sample.sample_index;
+    for (Eigen::Index s = 0; s < sample.action.size(); ++s) {
+      const Signal& signal = robot.signals[static_cast<std::size_t>(s)];
+      const double wave =
+          0.5 * (std::sin((0.031 + 0.007 * s) * t + s) + std::sin(0.013 * t * (s + 1)));
+      sample.action(s) = 0.5 * (signal.lower + signal.upper + wave * (signal.upper - signal.lower));
+    }
+    const auto truth = robot.poses_in_camera(sample.action);
+    for (PartObservation& seen : sample.parts) {
+      Vector6d error = test::gaussian6(rng);
+      error.head<3>() *= kTracker.position_m;
+      error.tail<3>() *= kTracker.rotation_rad;
+      seen.X_CB = truth.at(seen.part) * exp(error);
+    }
+  }
+  for (const std::optional<Noise>& told : {std::optional(kTracker), std::optional<Noise>()}) {
+    LearnOptions options;
+    options.measurement.noise = told;
+    const BodySchema schema = learn(robot.signals, samples, options).schema;
+    ASSERT_EQ(schema.edges.size(), 1U);
+    EXPECT_EQ(schema.edges[0].joints.size(), 5U);
+    EXPECT_LT(schema.edges[0].rotation_rms_rad, 0.4 * kDegree);
+  }
+}
+
 }  // namespace
 }  // namespace bodyschema

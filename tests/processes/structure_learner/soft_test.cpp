@@ -453,5 +453,34 @@ TEST(SoftParts, ASignalThatMayHaveNoEffectIsTold) {
   EXPECT_GE(num_told, 2);
 }
 
+// A segment that creeps: a third of its bend follows within two seconds.
+TEST(SoftBodies, WhatAStreamRemembersIsInWhatIsPredicted) {
+  Rng rng(815);
+  std::vector<ActionPoseSample> samples = stream(4000, 2, rng);
+  Eigen::Vector2d memory = Eigen::Vector2d::Zero();
+  observe(
+      &samples, 2,
+      [&](int part, const Eigen::VectorXd& q) {
+        if (part == 0) memory += (q.head<2>() - memory) / 200;
+        const Pose base = make_pose(Eigen::Quaterniond::Identity(), Eigen::Vector3d(0, 0, 1));
+        return part == 0 ? base : Pose(base * segment(q(0) + memory(0), q(1) + memory(1)));
+      },
+      rng);
+  const LearnResult learned = learn({{"q1"}, {"q2"}}, {samples.begin(), samples.begin() + 2000});
+  const BodySchema& schema = learned.schema;
+  ASSERT_TRUE(schema.complete);
+  EXPECT_LT(schema.noise.position_m, 2 * kNoise.position_m);
+  EXPECT_EQ(learned.noise_source, NoiseSource::kResiduals);
+  double squares = 0, told = 0;
+  for (std::size_t t = 2000; t < samples.size(); ++t) {
+    const auto predicted = schema.predict(0, 1, samples[t].action);
+    const Pose X = samples[t].parts[0].X_CB.inverse() * samples[t].parts[1].X_CB;
+    squares += log(predicted->X_AB.inverse() * X).tail<3>().squaredNorm();
+    told += predicted->covariance.bottomRightCorner<3, 3>().trace();
+  }
+  EXPECT_LT(squares, 4 * told);
+  EXPECT_GT(squares, 0.2 * told);
+}
+
 }  // namespace
 }  // namespace bodyschema
