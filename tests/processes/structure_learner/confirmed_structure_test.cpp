@@ -34,14 +34,16 @@ struct Found {
   LearnedStructure structure = {.actions = NormalizedActions({}, 0)};
 };
 
-/// `process`: of these signals, connects parts 1 and 2; without signals none does.
+/// `process`: of these signals, connects parts 1 and 2; without signals none does. `with_bends`:
+/// what is found where it is known which commands are bent.
 Found confirmed(const std::map<double, LearnedStructure>& by_factor,
-                const std::vector<int>& process = {}) {
+                const std::vector<int>& process = {},
+                const std::map<double, LearnedStructure>& with_bends = {}) {
   Found found;
   const auto find = [&](const StructureQuery& query) {
     ++found.num_searches;
     EXPECT_EQ(query.unknown_bias > 0, query.factor > 1);
-    return by_factor.at(query.factor);
+    return (query.bent.empty() ? by_factor : with_bends).at(query.factor);
   };
   found.structure = confirmed_structure(find, [&](LearnedStructure* open) {
     found.is_soft = true;
@@ -176,6 +178,23 @@ TEST(ConfirmedStructureTest, NoiseThatIsMoreThanTheResidualsSayConnectsNothingBu
   EXPECT_TRUE(soft.structure.spans());
   EXPECT_FALSE(soft.structure.is_contested);
   EXPECT_EQ(soft.structure.noise_source, NoiseSource::kGiven);
+}
+
+TEST(ConfirmedStructureTest, BendsThatOnlyMoreNoiseShowsMakeLessNoiseEnough) {
+  LearnedStructure bent = structure({0, 1}, 0.16);
+  bent.signals = {{.name = "q1", .warp = {0.1}}, {.name = "q2"}};
+  const std::map<double, LearnedStructure> by_factor = {
+      {1, nothing()}, {2, bent}, {4, bent}, {8, bent}};
+  Found found = confirmed(by_factor, {}, {{1, structure({0, 1}, 0.9)}});
+  EXPECT_EQ(signals_of(found.structure), std::vector<int>({0, 1}));
+  EXPECT_EQ(found.structure.noise_source, NoiseSource::kGiven);
+  EXPECT_FALSE(found.is_soft);
+  // With some more noise than is told, or not at all.
+  found = confirmed(by_factor, {}, {{1, nothing()}, {2, structure({0, 1}, 0.6)}});
+  EXPECT_TRUE(found.structure.spans());
+  EXPECT_EQ(found.structure.noise_source, NoiseSource::kResiduals);
+  found = confirmed(by_factor, {}, {{1, structure({0}, 0.9)}, {2, structure({0}, 0.6)}});
+  EXPECT_TRUE(found.structure.is_contested);
 }
 
 TEST(ConfirmedStructureTest, MoreNoiseFixesNothingToAPartThatRests) {

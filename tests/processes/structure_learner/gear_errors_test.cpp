@@ -61,8 +61,9 @@ TEST(GearErrors, OfEndsAreBentCommandsWhereTheNoiseIsTold) {
   EXPECT_EQ(num_right(0.1 * kDegree, kNoise), 4);
 }
 
+// One is refused by the noise that its bends leave at most commands, and stands by twice that.
 TEST(GearErrors, OfEndsAreBentCommandsWhereTheNoiseIsNotTold) {
-  EXPECT_EQ(num_right(0.1 * kDegree, std::nullopt), 4);
+  EXPECT_EQ(num_right(0.2 * kDegree, std::nullopt), 4);
 }
 
 // Twice five times: straight commands are refuted at once and explained with much more.
