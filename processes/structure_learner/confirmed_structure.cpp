@@ -37,6 +37,20 @@ std::set<EdgeSignature> signatures_of(const LearnedStructure& structure) {
   return result;
 }
 
+// Edges between the same parts, by the same signals, be they those of joints or of processes.
+bool has_same_signals(const LearnedStructure& a, const LearnedStructure& b) {
+  const auto edges_of = [](const LearnedStructure& structure) {
+    std::set<std::tuple<int, int, std::set<int>>> result;
+    for (const AcceptedModel& edge : structure.search.models) {
+      std::set<int> signals = signal_set(edge.model);
+      signals.insert(edge.soft_signals.begin(), edge.soft_signals.end());
+      result.emplace(edge.part_i, edge.part_j, std::move(signals));
+    }
+    return result;
+  };
+  return edges_of(a) == edges_of(b);
+}
+
 bool is_soft(const LearnedStructure& structure) {
   return std::any_of(structure.search.models.begin(), structure.search.models.end(),
                      [](const AcceptedModel& edge) { return !edge.soft_signals.empty(); });
@@ -143,10 +157,10 @@ LearnedStructure least_noise(LearnedStructure told, const FindStructure& find,
       if (is_first) return quieter;
       if (!is_explained && !is_guess && quieter.search.residual_scale < kSmallestResidual) {
         if (auto with_bends = with_less_noise(quieter, factor, find)) return *std::move(with_bends);
-        // Nor is it too small for all: what the screws leave may be a function of the signals.
+        // Nor is it too small for all: what the screws leave may be a function of their signals.
         LearnedStructure soft = told;
         connect_soft_parts(&soft);
-        if (soft.spans()) return soft;
+        if (soft.spans() && has_same_signals(soft, quieter)) return soft;
         told.is_contested = true;
         return told;
       }

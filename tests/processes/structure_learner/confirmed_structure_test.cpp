@@ -178,6 +178,8 @@ TEST(ConfirmedStructureTest, NoiseThatIsMoreThanTheResidualsSayConnectsNothingBu
   EXPECT_TRUE(soft.structure.spans());
   EXPECT_FALSE(soft.structure.is_contested);
   EXPECT_EQ(soft.structure.noise_source, NoiseSource::kGiven);
+  // Of another signal it would explain what the screws do not leave.
+  EXPECT_TRUE(confirmed(by_factor, {0, 1}).structure.is_contested);
 }
 
 TEST(ConfirmedStructureTest, BendsThatOnlyMoreNoiseShowsMakeLessNoiseEnough) {
