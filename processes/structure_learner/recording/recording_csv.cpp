@@ -17,7 +17,8 @@
 namespace bodyschema {
 namespace {
 
-constexpr double kUnitTolerance = 1e-3;
+/// Of the norm: numbers with two decimals are off by 0.01. It is normalized.
+constexpr double kUnitTolerance = 0.02;
 /// Largest number of any column. Squares, sums and microseconds of what is larger would overflow.
 constexpr double kLargest = 1e12;
 const std::vector<std::string> kPoseColumns = {"x", "y", "z", "qw", "qx", "qy", "qz"};
@@ -50,11 +51,12 @@ class Row {
     return RecordingError(fmt::format("{}:{}:{}: {}", file_, number_, column, expected));
   }
 
-  double number(std::size_t i, const std::string& name) const {
+  double number(std::size_t i, const std::string& name,
+                const std::string& what = "a number") const {
     const auto value = parsed<double>(i);
     if (!value || !std::isfinite(*value)) throw error(i, name + ": expected a finite number", true);
     if (std::abs(*value) > kLargest)
-      throw error(i, name + ": expected a number within ±1e12", true);
+      throw error(i, name + ": expected " + what + " within ±1e12", true);
     return *value;
   }
 
@@ -204,7 +206,7 @@ bool is_same(const PartObservation& a, const PartObservation& b) {
 
 void add_row(const Row& row, std::size_t number, const Header& header, Instants& instants,
              Recording& recording) {
-  const double t = row.number(0, "t");
+  const double t = row.number(0, "t", "seconds");
   Eigen::VectorXd action(header.signals.size());
   for (std::size_t i = 0; i < header.signals.size(); ++i) {
     action[i] = row.number(i + 1, header.signals[i]);
