@@ -26,6 +26,8 @@ namespace {
 
 /// Chosen: what a person reads.
 constexpr std::size_t kMostCorrelations = 20, kMostOutliers = 50;
+/// Chosen: degrees are 57 times as many as radians.
+constexpr double kAbsurdShare = 10;
 
 bool is_finite(const RefinerSample& seen) {
   if (!seen.sample.action.allFinite()) return false;
@@ -62,7 +64,7 @@ void check_calibration(const std::vector<RefinerSample>& samples,
   const bool is_asked = options.placements || options.intrinsics;
   if (is_asked && !rig)
     throw std::invalid_argument(
-        fmt::format("{} are refined against a rig's files: none given", asked));
+        fmt::format("{} are refined against a rig's files: none given (--rig)", asked));
   if (is_asked && !has_corners(samples))
     throw std::invalid_argument(
         fmt::format("{} are refined by the tags' corners, which the samples do not have", asked));
@@ -76,9 +78,9 @@ void check_calibration(const std::vector<RefinerSample>& samples,
                       seen.sample.sample_index, rig ? "rig's" : "first one"));
 }
 
-/// Do the observed poses of the root differ by more than their noise?
-bool root_moves(const BodySchema& schema, const std::vector<RefinerSample>& samples,
-                const MeasurementModel& measurement) {
+/// Do the observed poses of the root differ by more than their noise is told to be?
+bool root_differs(const BodySchema& schema, const std::vector<RefinerSample>& samples,
+                  const MeasurementModel& measurement) {
   std::vector<const PartObservation*> seen;
   for (const RefinerSample& sample : samples)
     if (const PartObservation* o = sample.sample.find(schema.root); o && o->has_rotation)
@@ -97,6 +99,25 @@ bool root_moves(const BodySchema& schema, const std::vector<RefinerSample>& samp
   }
   // Twice: both poses have noise.
   return best > 2 * chi_square_quantile(6, 1e-4);
+}
+
+/// Where the root differs: whether a pose of it at every sample is worth its parameters (Schwarz
+/// 1978), with the noise as large as either fit leaves; told too small, a root that rests differs,
+/// too, but the other parts do not go with it.
+bool root_moves(const BodySchema& schema, const std::vector<RefinerSample>& samples,
+                const std::optional<RigCalibration>& rig, const RefineOptions& options) {
+  if (!root_differs(schema, samples, options.measurement)) return false;
+  double log_likelihoods[2];
+  double num_residuals = 0;
+  for (const bool moves : {false, true}) {
+    RefinementProblem problem(schema, samples, rig, options, moves);
+    problem.solve();
+    log_likelihoods[moves ? 1 : 0] = problem.log_likelihood();
+    num_residuals = 0;
+    for (const auto& datum : problem.data()) num_residuals += datum.num_residuals;
+  }
+  const double num_more = 6 * (static_cast<double>(samples.size()) - 1);
+  return log_likelihoods[1] - log_likelihoods[0] > num_more * std::log(num_residuals) / 2;
 }
 
 std::vector<RefinementOutlier> outliers_of(RefinementProblem& problem) {
@@ -191,10 +212,17 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   result.num_available = static_cast<int>(training.size());
   RefineOptions stiff = options;
   stiff.joint_loads = nullptr;
-  result.root_moves = root_moves(schema, training, options.measurement);
+  result.root_moves =
+      root_moves(schema, thinned(training, static_cast<std::size_t>(options.config.max_samples)),
+                 used_rig, stiff);
   training = informative(std::move(training), schema, used_rig, stiff, result.root_moves);
   result.num_samples = static_cast<int>(training.size());
   result.coverage = coverage_of(schema, training);
+  for (const SignalCoverage& signal : result.coverage)
+    if (signal.share > kAbsurdShare)
+      throw std::invalid_argument(
+          fmt::format("{} spans {:.0f} times the range that the schema gives it: another unit?",
+                      signal.signal, signal.share));
   result.held = held_things(schema, options, result.used_corners);
 
   RefinementProblem problem(schema, training, used_rig, stiff, result.root_moves);

@@ -270,6 +270,7 @@ TEST_F(RefineKnownStructureTest, JointsThatGiveWayAreFittedByTheMassesOfTheUrdf)
   EXPECT_EQ(elasticity.at("joints").size(), 7U);
   EXPECT_LE(elasticity.at("elastic").at("noise_scale"), elasticity.at("stiff").at("noise_scale"));
   EXPECT_LT(elasticity.at("elastic").at("noise_scale"), 1.1);
+  EXPECT_TRUE(elasticity.at("elastic").at("held_out_rms_m").is_null());
   EXPECT_EQ(run("show unloaded").exit_code, 0);
   const Outcome text = run(refine);
   EXPECT_NE(text.out.find("gravity are less likely than stiff ones"), std::string::npos)
@@ -315,6 +316,7 @@ TEST_F(RefineProgramTest, SaysWhatIsWrong) {
   expect_failure(refine + "--placements --rig '" BODYSCHEMA_CONFIG "/arm7'", 1,
                  "another calibration");
   expect_failure(refine + "--proposed found", 2, "--proposed");
+  expect_failure(refine + rig_ + " --placements --proposed schema", 2, "schema is no folder");
   expect_failure("refine schema '" + log_ + "' --out schema", 1, "is an input itself");
   expect_failure("refine schema '" + log_ + "'", 2, "--out");
   expect_failure(refine + "--urdf refined", 1, "--urdf: expected another file than --out");

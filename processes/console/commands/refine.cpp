@@ -121,6 +121,9 @@ void run_refine(const RefineArguments& given) {
   if (arguments.samples.empty()) refuse_argument("SAMPLES", "expected");
   if (!arguments.proposed.empty() && !arguments.placements && !arguments.intrinsics)
     refuse_argument("--proposed", "expected with --placements or --intrinsics");
+  if (std::filesystem::exists(arguments.proposed) &&
+      !std::filesystem::is_directory(arguments.proposed))
+    refuse_argument("--proposed", arguments.proposed + " is no folder");
   if (!arguments.elastic.empty() && (arguments.placements || arguments.intrinsics))
     refuse_argument("--elastic",
                     "expected without --placements and --intrinsics: poses are fitted");

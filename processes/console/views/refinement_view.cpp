@@ -2,6 +2,7 @@
 
 #include <fmt/format.h>
 
+#include <algorithm>
 #include <cmath>
 
 #include "common/geometry/angle.h"
@@ -132,9 +133,13 @@ std::string plays_text(const std::vector<JointPlay>& plays) {
   return text;
 }
 
+bool has_any(const std::vector<PartErrors>& parts) {
+  return std::ranges::any_of(parts, [](const PartErrors& part) { return part.count > 0; });
+}
+
 Json elastic_errors_json(const Elasticity::Errors& errors) {
   const Noise fitted = total_of(errors.fitted), held_out = total_of(errors.held_out);
-  const bool is_known = !errors.held_out.empty();
+  const bool is_known = has_any(errors.held_out);
   return {{"noise_scale", errors.noise_scale},
           {"fitted_rms_m", fitted.position_m},
           {"fitted_rms_deg", fitted.rotation_rad / kDegree},
@@ -165,7 +170,7 @@ std::string elasticity_text(const std::optional<Elasticity>& elasticity) {
     const Noise fitted = total_of(errors->fitted);
     text += fmt::format("    {:<7} rms {:.3f} mm, {:.4f}° on the fitted samples", name,
                         fitted.position_m * 1e3, fitted.rotation_rad / kDegree);
-    if (!errors->held_out.empty())
+    if (has_any(errors->held_out))
       text += fmt::format(", {:.3f} mm held out", total_of(errors->held_out).position_m * 1e3);
     text += fmt::format("; {:.2f} times the noise\n", errors->noise_scale);
   }

@@ -8,6 +8,7 @@
 #include <stdexcept>
 #include <string>
 
+#include "common/geometry/angle.h"
 #include "processes/refiner/informative_samples.h"
 #include "processes/refiner/refine.h"
 #include "processes/refiner/refiner_config.h"
@@ -47,6 +48,11 @@ class RefineRefuses : public testing::Test {
 };
 
 TEST_F(RefineRefuses, NothingThatIsRight) { EXPECT_EQ(refusal(robot_.truth), ""); }
+
+TEST_F(RefineRefuses, CommandsInAnotherUnit) {
+  for (RefinerSample& seen : samples_) seen.sample.action /= kDegree;
+  expect_refusal("another unit", robot_.truth);
+}
 
 TEST_F(RefineRefuses, PlacementsWithoutARig) { expect_refusal("rig", std::nullopt); }
 

@@ -64,6 +64,19 @@ bool names(const std::vector<std::string>& sentences, const std::string& words) 
   });
 }
 
+// A tenth of the noise is told: the root's poses differ by far more, but the parts do not go along.
+TEST(RefineSchemas, WhoseNoiseIsToldTooSmallHaveARootThatRests) {
+  Rng rng(5);
+  const SyntheticRobot robot = test::chapter_robot("a", rng);
+  std::vector<ActionPoseSample> samples =
+      test::babble(robot, 60, {.regime = test::Regime::kTagIso, .with_covariances = true}, rng);
+  for (ActionPoseSample& sample : samples)
+    for (PartObservation& seen : sample.parts) seen.covariance /= 100;
+  const Refinement result = refine(true_start(robot), refiner_samples(samples), {}, {});
+  EXPECT_FALSE(result.root_moves);
+  EXPECT_NEAR(result.noise_scale, 10, 2);
+}
+
 // Tags of an instant's first part turn over, and every root begins where the others say.
 TEST(RefineSchemas, WhoseRootMovesAndWhoseFirstPartIsTurnedOver) {
   Rng rng(2);
