@@ -142,7 +142,8 @@ std::optional<Alignment> align(const BodySchema& schema,
     for (const auto& [part, predicted] : schema.predict_all(sample.action)) {
       const PartObservation* seen = sample.find(part);
       if (!seen || part == schema.root) continue;
-      pairs.push_back({part, predicted, root->X_CB.inverse() * seen->X_CB, seen->has_rotation});
+      pairs.push_back({part, predicted, root->X_CB.inverse() * seen->X_CB,
+                       seen->has_rotation && schema.has_rotation(part)});
       result.X_PB[part] = Pose::Identity();
     }
   }
@@ -185,7 +186,8 @@ std::vector<PartErrors> evaluate(const BodySchema& schema,
       const Pose error =
           alignment.aligned(part, predicted.at(part)).inverse() * root->X_CB.inverse() * seen->X_CB;
       of_part.position_m.push_back(error.translation().norm());
-      if (seen->has_rotation) of_part.rotation_rad.push_back(rotation_angle(error));
+      if (seen->has_rotation && schema.has_rotation(part))
+        of_part.rotation_rad.push_back(rotation_angle(error));
     }
   }
   std::vector<PartErrors> result;

@@ -206,6 +206,8 @@ class RefineKnownStructureTest : public RefineProgramTest {
 TEST_F(RefineKnownStructureTest, ARobotOfAUrdfIsRefinedFromItsEndAlone) {
   const BodySchema& truth = truth_;
   const int end = end_;
+  write_samples(samples_, true);
+  std::filesystem::rename(folder_ / "samples.csv", folder_ / "full.csv");
   for (const bool has_orientation : {true, false}) {
     SCOPED_TRACE(has_orientation ? "poses" : "positions");
     write_samples(samples_, has_orientation);
@@ -225,6 +227,10 @@ TEST_F(RefineKnownStructureTest, ARobotOfAUrdfIsRefinedFromItsEndAlone) {
     const Eigen::VectorXd action = robot_.random_action(rng_);
     const BodySchema one = schema("one"), two = schema("refined");
     EXPECT_EQ(one.position_parts.empty(), has_orientation);
+    // How a part is turned of which positions alone are known is not told, not even beside poses.
+    const Json part = json_of("predict refined full.csv --json").at("parts")[0];
+    EXPECT_EQ(part.at("rotation_sd_deg").is_null(), !has_orientation) << part;
+    EXPECT_EQ(part.at("rotation_rms_deg").is_null(), !has_orientation) << part;
     EXPECT_EQ(one.position_parts, two.position_parts);
     for (const auto& [part, X_RB] : two.predict_all(action))
       EXPECT_LT(log(X_RB.inverse() * one.predict_all(action).at(part)).norm(), 1e-9) << part;

@@ -20,6 +20,7 @@ constexpr double kRounding = 1e-6;
 
 std::string pose_sd_text(const Noise& sd) {
   if (!(sd.position_m > 0)) return "    not known";
+  if (!(sd.rotation_rad > 0)) return fmt::format("{:7.2f} mm      –", sd.position_m * 1e3);
   return fmt::format("{:7.2f} mm {:6.3f}°", sd.position_m * 1e3, sd.rotation_rad / kDegree);
 }
 
@@ -58,8 +59,9 @@ std::vector<PartPrediction> predict_parts(const BodySchema& schema, const Eigen:
     if (part == schema.root) continue;
     const auto predicted = schema.predict(schema.root, part, action, Variance::kOneAction);
     if (!predicted) continue;
-    result.push_back({part, predicted->X_AB, deviations_of(predicted->covariance),
-                      signals_outside(schema, action, part)});
+    Noise sd = deviations_of(predicted->covariance);
+    if (!schema.has_rotation(part)) sd.rotation_rad = 0;
+    result.push_back({part, predicted->X_AB, sd, signals_outside(schema, action, part)});
   }
   return result;
 }
@@ -155,9 +157,10 @@ void write_predictions(const BodySchema& schema, const std::vector<ActionPoseSam
       std::string row = fmt::format("{}", static_cast<double>(sample.utime) * 1e-6);
       for (const double value : sample.action) row += fmt::format(",{}", value);
       row += fmt::format(",{}", p.part);
-      for (const double value : {x.x(), x.y(), x.z(), q.w(), q.x(), q.y(), q.z(), p.sd.position_m,
-                                 p.sd.rotation_rad / kDegree})
+      for (const double value : {x.x(), x.y(), x.z(), q.w(), q.x(), q.y(), q.z()})
         row += fmt::format(",{}", value);
+      for (const double sd : {p.sd.position_m, p.sd.rotation_rad / kDegree})
+        row += sd > 0 ? fmt::format(",{}", sd) : ",";
       out << row << "," << fmt::format("{}", fmt::join(signal_names(schema, p.outside), " "))
           << "\n";
     }

@@ -33,6 +33,7 @@ std::vector<int> signals_outside(const BodySchema& schema, const Eigen::VectorXd
 
 /// All parts that hang on the root, ascending, without the root. @throws std::invalid_argument if
 /// `action` does not have one value per signal.
+/// `sd.rotation_rad` is 0, as where it is not known, of parts of which positions alone are known.
 std::vector<PartPrediction> predict_parts(const BodySchema& schema, const Eigen::VectorXd& action);
 
 Json part_json(const BodySchema& schema, const PartPrediction& prediction);
