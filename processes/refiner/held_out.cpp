@@ -56,7 +56,54 @@ void see_root(const BodySchema& schema, std::vector<ActionPoseSample>* samples) 
                         root);
 }
 
+/// The samples with all poses solved anew.
+std::vector<ActionPoseSample> poses_through(const RigCalibration& rig,
+                                            const std::vector<RefinerSample>& samples) {
+  const Lens lens = lens_of(rig.camera);
+  std::vector<ActionPoseSample> result;
+  for (const RefinerSample& seen : samples)
+    for (PartObservation& observation : result.emplace_back(seen.sample).parts)
+      observation.X_CB = solved_anew(observation, seen.tags, rig, lens);
+  return result;
+}
+
+/// Root mean square of those below kWild times the median.
+double inlier_rms(const std::vector<double>& errors) {
+  constexpr double kWild = 4;  // chosen
+  const double limit = kWild * median(errors);
+  double squares = 0;
+  int count = 0;
+  for (const double error : errors) {
+    if (error > limit) continue;
+    squares += error * error;
+    ++count;
+  }
+  return std::sqrt(squares / std::max(count, 1));
+}
+
 }  // namespace
+
+void set_residuals(const std::vector<RefinerSample>& samples, const RigCalibration& rig,
+                   BodySchema* schema) {
+  const std::vector<ActionPoseSample> poses = poses_through(rig, samples);
+  for (Edge& edge : schema->edges) {
+    std::vector<double> position, rotation;
+    for (const ActionPoseSample& sample : poses) {
+      const PartObservation *from = sample.find(edge.from), *to = sample.find(edge.to);
+      if (!from || !to || !from->has_rotation || !to->has_rotation) continue;
+      const Pose X = edge.predict(schema->displacements(sample.action));
+      const Vector6d error = log(X.inverse() * from->X_CB.inverse() * to->X_CB);
+      position.push_back(error.head<3>().norm());
+      rotation.push_back(error.tail<3>().norm());
+    }
+    const double num = 6 * static_cast<double>(position.size());
+    const auto num_fitted = static_cast<double>(edge.num_parameters());
+    if (num <= 2 * num_fitted) continue;
+    const double lost = std::sqrt(num / (num - num_fitted));
+    edge.position_rms_m = lost * inlier_rms(position);
+    edge.rotation_rms_rad = lost * inlier_rms(rotation);
+  }
+}
 
 HeldOutErrors held_out_errors(const BodySchema& schema, const std::vector<RefinerSample>& samples,
                               const std::optional<RigCalibration>& rig,
@@ -66,10 +113,8 @@ HeldOutErrors held_out_errors(const BodySchema& schema, const std::vector<Refine
   std::vector<ActionPoseSample> poses;
   for (const RefinerSample& seen : samples) poses.push_back(seen.sample);
   if (rig) {
+    poses = poses_through(*rig, samples);
     const Lens lens = lens_of(rig->camera);
-    for (std::size_t n = 0; n < samples.size(); ++n)
-      for (PartObservation& observation : poses[n].parts)
-        observation.X_CB = solved_anew(observation, samples[n].tags, *rig, lens);
     std::vector<double> distances;
     for (const RefinerSample& seen : samples) {
       const CornerErrors here =

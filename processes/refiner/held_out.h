@@ -15,6 +15,12 @@ HeldOutErrors held_out_errors(const BodySchema& schema, const std::vector<Refine
                               const std::optional<RigCalibration>& rig,
                               const CornerNoise& corner_noise);
 
+/// Sets position_rms_m and rotation_rms_rad of every edge both of whose parts are seen: what it
+/// leaves of their poses, solved anew by the rig's tags and lens, of the inliers, for the degrees
+/// of freedom that the edge took.
+void set_residuals(const std::vector<RefinerSample>& samples, const RigCalibration& rig,
+                   BodySchema* schema);
+
 /// Is a model likelier than another by the corners of the same samples (is_likelier())?
 bool predicts_corners_better(const HeldOutErrors& model, const HeldOutErrors& other);
 

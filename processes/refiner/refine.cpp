@@ -241,6 +241,7 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   result.plays = plays_of(schema, problem);
   if (result.used_corners) result.rig = refined_rig(problem, *rig);
   result.schema = refined_schema(schema, training, problem, information);
+  if (result.used_corners) set_residuals(training, result.rig, &result.schema);
   // Fitted to poses, the schema is of the calibration that these rest on, whatever it began with.
   result.schema.calibration_id = result.used_corners
                                      ? calibration_id(result.rig.markers, result.rig.camera)

@@ -136,6 +136,12 @@ TEST(RefineCorners, ReachTheNoise) {
   EXPECT_LT(worst.rotation_rad, 0.15 * kDegree);
   EXPECT_TRUE(result.undetermined.empty()) << result.undetermined.front();
   EXPECT_NE(result.schema.calibration_id, c.samples.front().sample.calibration_id);
+  // What edges leave is that of the tags and the lens that were found.
+  for (const Edge& edge : result.schema.edges) {
+    EXPECT_GT(edge.position_rms_m, 0);
+    EXPECT_LT(edge.position_rms_m, 5e-4);
+    EXPECT_LT(edge.rotation_rms_rad, 0.1 * kDegree);
+  }
 }
 
 TEST(RefineCorners, WithoutOptionsPosesAreFittedAndTagsAndLensStayAsClaimed) {
