@@ -80,10 +80,10 @@ TEST_F(ModelMonitorTest, ASilentRefinerIsGivenUpOnceUntilItIsHeardAgain) {
   EXPECT_FALSE(monitor.on_tick(100 * kSecond));
   // The learner repeats itself.
   EXPECT_FALSE(monitor.on_learned_schema(proposal(9)));
-  EXPECT_FALSE(monitor.on_tick(130 * kSecond));
-  EXPECT_TRUE(monitor.on_tick(131 * kSecond));
+  EXPECT_FALSE(monitor.on_tick(220 * kSecond));
+  EXPECT_TRUE(monitor.on_tick(221 * kSecond));
   EXPECT_EQ(monitor.health().judged_sample, 9);
-  EXPECT_FALSE(monitor.on_tick(200 * kSecond));
+  EXPECT_FALSE(monitor.on_tick(400 * kSecond));
   EXPECT_TRUE(monitor.on_learned_schema(proposal(19)));
   EXPECT_TRUE(monitor.on_refined_schema(answer_to(proposal(19))));
   EXPECT_FALSE(monitor.on_learned_schema(proposal(29)));
