@@ -136,12 +136,16 @@ TEST(RefineCorners, ReachTheNoise) {
   EXPECT_LT(worst.rotation_rad, 0.15 * kDegree);
   EXPECT_TRUE(result.undetermined.empty()) << result.undetermined.front();
   EXPECT_NE(result.schema.calibration_id, c.samples.front().sample.calibration_id);
-  // What edges leave is that of the tags and the lens that were found.
-  for (const Edge& edge : result.schema.edges) {
-    EXPECT_GT(edge.position_rms_m, 0);
-    EXPECT_LT(edge.position_rms_m, 5e-4);
-    EXPECT_LT(edge.rotation_rms_rad, 0.1 * kDegree);
+  // What edges leave is that of the tags and the lens that were found, not of the claims.
+  BodySchema by_claims = result.schema;
+  set_residuals(c.samples, c.rig, &by_claims);
+  double found = 0, claimed = 0;
+  for (std::size_t e = 0; e < by_claims.edges.size(); ++e) {
+    found += result.schema.edges[e].rotation_rms_rad;
+    claimed += by_claims.edges[e].rotation_rms_rad;
   }
+  EXPECT_GT(found, 0);
+  EXPECT_LT(found, 0.9 * claimed);
 }
 
 TEST(RefineCorners, WithoutOptionsPosesAreFittedAndTagsAndLensStayAsClaimed) {
