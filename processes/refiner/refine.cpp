@@ -158,7 +158,12 @@ std::vector<SignalCoverage> coverage_of(const BodySchema& schema,
       high = std::max(high, seen.sample.action(s));
     }
     const double range = signal.upper - signal.lower;
-    result.push_back({signal.name, range > 0 ? (high - low) / range : 0});
+    const double share = range > 0 ? (high - low) / range : 0;
+    if (share > kAbsurdShare)
+      throw std::invalid_argument(
+          fmt::format("{} spans {:.0f} times the range that the schema gives it: another unit?",
+                      signal.name, share));
+    result.push_back({signal.name, share});
   }
   return result;
 }
@@ -218,11 +223,6 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   training = informative(std::move(training), schema, used_rig, stiff, result.root_moves);
   result.num_samples = static_cast<int>(training.size());
   result.coverage = coverage_of(schema, training);
-  for (const SignalCoverage& signal : result.coverage)
-    if (signal.share > kAbsurdShare)
-      throw std::invalid_argument(
-          fmt::format("{} spans {:.0f} times the range that the schema gives it: another unit?",
-                      signal.signal, signal.share));
   result.held = held_things(schema, options, result.used_corners);
 
   RefinementProblem problem(schema, training, used_rig, stiff, result.root_moves);
