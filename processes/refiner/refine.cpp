@@ -58,6 +58,13 @@ bool has_corners(const std::vector<RefinerSample>& samples) {
                      [](const RefinerSample& seen) { return !seen.tags.empty(); });
 }
 
+/// Of the first sample that tells it; 0: none does.
+std::int64_t calibration_of(const std::vector<RefinerSample>& samples) {
+  const auto telling = std::ranges::find_if(
+      samples, [](const RefinerSample& seen) { return seen.sample.calibration_id != 0; });
+  return telling == samples.end() ? 0 : telling->sample.calibration_id;
+}
+
 void check_calibration(const std::vector<RefinerSample>& samples,
                        const std::optional<RigCalibration>& rig, const RefineOptions& options) {
   const char* const asked = options.placements ? "placements" : "intrinsics";
@@ -68,8 +75,7 @@ void check_calibration(const std::vector<RefinerSample>& samples,
   if (is_asked && !has_corners(samples))
     throw std::invalid_argument(
         fmt::format("{} are refined by the tags' corners, which the samples do not have", asked));
-  const std::int64_t first = samples.front().sample.calibration_id;
-  const std::int64_t id = rig ? calibration_id(rig->markers, rig->camera) : first;
+  const std::int64_t id = rig ? calibration_id(rig->markers, rig->camera) : calibration_of(samples);
   for (const RefinerSample& seen : samples)
     if (seen.sample.calibration_id != 0 && seen.sample.calibration_id != id)
       throw std::invalid_argument(
@@ -245,7 +251,7 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   // Fitted to poses, the schema is of the calibration that these rest on, whatever it began with.
   result.schema.calibration_id = result.used_corners
                                      ? calibration_id(result.rig.markers, result.rig.camera)
-                                     : training.front().sample.calibration_id;
+                                     : calibration_of(training);
   result.wanted_actions =
       wanted_actions(result.schema, result.used_corners ? std::optional(result.rig) : std::nullopt,
                      training, problem, information);

@@ -47,8 +47,10 @@ SearchOptions search_options_of(const LearnOptions& options) {
 std::optional<Noise> noise_beside_soft_edges(const std::vector<ActionPoseSample>& displaced,
                                              const NormalizedActions& actions,
                                              const BodySchema& schema) {
-  const bool all_soft = std::ranges::all_of(
-      schema.edges, [](const Edge& edge) { return edge.residual_gp != nullptr; });
+  const bool all_soft =
+      !schema.edges.empty() && std::ranges::all_of(schema.edges, [](const Edge& edge) {
+        return edge.residual_gp != nullptr;
+      });
   return all_soft ? noise_from_neighbours(displaced, actions) : std::nullopt;
 }
 

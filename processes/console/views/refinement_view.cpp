@@ -187,8 +187,7 @@ std::string elasticity_text(const std::optional<Elasticity>& elasticity) {
     if (joint.rises())
       text +=
           "      against its load: its drive makes up for more than gravity, or the URDF's masses "
-          "are "
-          "too large\n";
+          "are too large\n";
   }
   return text;
 }
