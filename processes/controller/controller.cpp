@@ -57,6 +57,7 @@ ControllerConfig ControllerConfig::load(const std::filesystem::path& file) {
   config.resend_us = microseconds(yaml.number("resend_s", 0.1, 3600));
   config.take_us = microseconds(yaml.number("take_s", 0, 60));
   config.sample_timeout_us = microseconds(yaml.number("sample_timeout_s", 0.1, 3600));
+  config.verdict_timeout_us = microseconds(yaml.number("verdict_timeout_s", 0.1, 3600));
   config.rest_timeout_us = microseconds(yaml.number("rest_timeout_s", 1, 3600));
   config.lent_timeout_us = microseconds(yaml.number("lent_timeout_s", 1, 36'000));
   const Yaml silence = yaml.section("silence");
@@ -219,7 +220,10 @@ Controller::Answer Controller::on_marker_poses(const marker_poses_t& poses) {
 }
 
 Controller::Answer Controller::on_sample(const sample_t& sample) {
-  if (!sample_ || !is_same_action(*sample_, sample)) fire(Event::kNewSample);
+  if (!sample_ || !is_same_action(*sample_, sample)) {
+    fire(Event::kNewSample);
+    sample_age_.restart();
+  }
   sample_ = sample;
   see(sample.utime);
   locate();
@@ -254,6 +258,7 @@ Controller::Answer Controller::on_model_health(const model_health_t& health) {
 Controller::Answer Controller::on_tick(std::int64_t now_us) {
   silent_ = silence(now_us);
   quiet_.elapsed_us(now_us);
+  sample_age_.elapsed_us(now_us);
   if (!concerns(Event::kGivenUp)) idle_.restart(now_us);
   if (schema_ && !concerns(Event::kInputSilent) &&
       schema_silence_.elapsed_us(now_us) > config_.max_body_schema_silence_us) {

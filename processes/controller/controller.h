@@ -45,9 +45,10 @@ struct ControllerConfig {
   std::int64_t expiry_us = 0;   ///< of a command, driver's time
   std::int64_t resend_us = 0;   ///< a command without an answer is sent again after this
   std::int64_t take_us = 0;     ///< the arm is taken when MOTION_STATUS did not change for so long
-  std::int64_t sample_timeout_us = 0;  ///< a settled action's SAMPLE is awaited this long
-  std::int64_t rest_timeout_us = 0;    ///< an arm that cannot be moved from is given up after this
-  std::int64_t lent_timeout_us = 0;    ///< lent so long without a new SAMPLE, a target is refused
+  std::int64_t sample_timeout_us = 0;   ///< a settled action's SAMPLE is awaited this long
+  std::int64_t verdict_timeout_us = 0;  ///< a TEST sample's MODEL_HEALTH is awaited this long
+  std::int64_t rest_timeout_us = 0;     ///< an arm that cannot be moved from is given up after this
+  std::int64_t lent_timeout_us = 0;     ///< lent so long without a new SAMPLE, a target is refused
   std::int64_t max_motion_status_silence_us = 0;
   std::int64_t max_marker_poses_silence_us = 0;
   std::int64_t max_body_schema_silence_us = 0;
@@ -67,9 +68,11 @@ struct ControllerConfig {
 /// epoch is more than kClockTolerance_us ahead of the clock is refused: every later one would count
 /// for less than it. The arm is its own (owns_arm) from the moment that a target can be served
 /// until it was reached and kept, is released, or was refused before it moved the arm. Taking it
-/// waits until the arm rests and the last settled action has its SAMPLE. A target that is not
-/// reached within its expiry is dropped, as by a HOLD. The next step of a path (num_way_points,
-/// same sender and epoch) is refused once the arm is held.
+/// waits until the arm rests, the last settled action has its SAMPLE and the monitor, as long as it
+/// waits for the refiner itself, has judged that if it is TEST: the verdict is the same however
+/// fast learner and refiner are. A target that is not reached within its expiry is dropped, as by a
+/// HOLD. The next step of a path (num_way_points, same sender and epoch) is refused once the arm is
+/// held.
 ///
 /// No part leaves the workspace on the way, by the schema; a solution towards which one would is
 /// dealt with like one that the driver rejects: another is tried, but not on the line from one way
@@ -219,6 +222,8 @@ class Controller {
   void decide();
   /// Waits until the arm is free, by the clock.
   void take(std::int64_t now_us);
+  /// The newest SAMPLE is a TEST sample that the monitor has yet to judge.
+  bool awaits_verdict(std::int64_t now_us);
   void step();
   /// Aims at the target's tag. False: it must be seen first.
   bool aim_at_tag();
@@ -294,6 +299,7 @@ class Controller {
   Stopwatch quiet_;                        ///< since the driver's last news
   Stopwatch idle_;                         ///< its own arm, but nothing is sent or awaited
   Stopwatch expiry_;
+  Stopwatch sample_age_;      ///< since the newest SAMPLE, or the monitor waited for its refinement
   Stopwatch under_way_;       ///< since the newest MOVE was decided
   std::int64_t probed_ = -1;  ///< probes wanted up to this sample are made, or given up
   std::optional<Eigen::VectorXd> search_centre_;  ///< where an edge was heard to be invalid

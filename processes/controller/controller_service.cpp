@@ -159,6 +159,8 @@ void Controller::take(std::int64_t now_us) {
                           motion_->kind == action_command_t::KIND_MOVE;
   if (is_settled && has_patience && !(sample_ && is_same_action(*motion_, *sample_))) {
     why_ = "waiting for the SAMPLE of " + name_of(motion_->action_id, motion_->source);
+  } else if (awaits_verdict(now_us)) {
+    why_ = "waiting for the monitor's verdict on sample " + std::to_string(sample_->sample_index);
   } else if (position_) {
     fire(Event::kArmFree);
     decide();
@@ -169,6 +171,18 @@ void Controller::take(std::int64_t now_us) {
          "where the arm is was not heard: neither MOTION_STATUS nor SAMPLE tell the action it "
          "rests at; release the arm, so that the babbler moves it");
   }
+}
+
+bool Controller::awaits_verdict(std::int64_t now_us) {
+  if (!sample_ || sample_->purpose != action_command_t::PURPOSE_TEST || !health_ ||
+      health_->judged_sample >= sample_->sample_index)
+    return false;
+  // The monitor itself waits, and not for ever.
+  if (health_->awaited_refinement == sample_->sample_index) {
+    sample_age_.restart(now_us);
+    idle_.restart(now_us);
+  }
+  return sample_age_.elapsed_us(now_us) < config_.verdict_timeout_us;
 }
 
 bool Controller::aim_at_tag() {

@@ -180,7 +180,7 @@ std::vector<std::string> held_things(const BodySchema& schema, const RefineOptio
   for (const Edge& edge : schema.edges)
     if (!PartChain::has_block(edge))
       result.push_back(fmt::format("{}→{}: its Gaussian process", edge.from, edge.to));
-  const bool holds_bends = has_corners || !result.empty();
+  const bool holds_bends = !result.empty();
   for (const Signal& signal : schema.signals)
     if (holds_bends && !signal.warp.empty())
       result.push_back(fmt::format("{}: the bend of its command", signal.name));

@@ -138,10 +138,10 @@ inline constexpr int kMostWantedActions = 10;
 /// where the root stands and every screw. While tags and lens are as the rig says, the data are the
 /// parts' poses, which were made by these. With tags or lens among the parameters, the data are the
 /// corners' pixels, the rig's claims are priors, and at every sample each joint may be off its
-/// command (backlash, droop) by what is estimated to be usual. Edges with a Gaussian process,
-/// signals' limits stay as they are, bent commands where corners are fitted or where there is such
-/// an edge. Loads of the joints are fitted beside: the refined schema has stiff joints, for a
-/// schema knows no loads. TEST samples are judged alone. The order of samples changes nothing.
+/// command (backlash, droop) by what is estimated to be usual. Edges with a Gaussian process and
+/// signals' limits stay as they are, and bent commands where there is such an edge. Loads of the
+/// joints are fitted beside: the refined schema has stiff joints, for a schema knows no loads. TEST
+/// samples are judged alone. The order of samples changes nothing.
 ///
 /// Gauge: a part's frame is where its tags are closest to the rig's claims, and the scale is the
 /// mean of all tags' sizes, all weighed by their priors, for images tell neither.

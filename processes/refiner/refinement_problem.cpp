@@ -117,7 +117,6 @@ void RefinementProblem::add_plays() {
 }
 
 void RefinementProblem::add_drive() {
-  if (rig_) return;
   ParameterBlock block = drive_model_.block();
   if (!block.free.empty()) drive_ = &storage_.emplace_back(std::move(block));
 }
@@ -223,6 +222,14 @@ std::vector<ParameterBlock*> RefinementProblem::chain_blocks(int part, std::int6
   return blocks;
 }
 
+Eigen::VectorXd RefinementProblem::displacements(const Eigen::VectorXd& action) const {
+  return drive_ ? drive_model_.displacements(action) : schema_.displacements(action);
+}
+
+Eigen::MatrixXd RefinementProblem::effects(const Eigen::VectorXd& action) const {
+  return drive_ ? drive_model_.effects(action) : Eigen::MatrixXd();
+}
+
 void RefinementProblem::add(Cost cost, Datum datum) {
   std::vector<double*> values;
   for (ParameterBlock* block : cost.blocks) {
@@ -250,10 +257,12 @@ std::optional<RefinementProblem::Cost> RefinementProblem::cost_of(const TagSight
   blocks.push_back(tags_.at(sight.tag));
   blocks.push_back(lens_block_);
   if (!plays_.empty() && !root_moves_) blocks.push_back(instants_.at(sample_index));
+  if (drive_) blocks.push_back(drive_);
+  // With bent commands all edges are of screws: their joints are those of the drive.
   auto cost = std::make_unique<CornerResidual>(
-      PartChain(paths_.at(tag->part), schema_.displacements(action), first_play_),
+      PartChain(paths_.at(tag->part), displacements(action), first_play_),
       std::vector<const ParameterBlock*>(blocks.begin(), blocks.end()), tag->size_m, *lens_, sight,
-      covariance, scale_);
+      covariance, scale_, effects(action));
   // Predicted behind the camera: nothing to start from.
   std::vector<const double*> values;
   for (const ParameterBlock* block : blocks) values.push_back(block->values.data());
@@ -269,17 +278,14 @@ std::optional<RefinementProblem::Cost> RefinementProblem::cost_of(
   std::vector<ParameterBlock*> blocks = chain_blocks(part, sample_index);
   if (drive_) blocks.push_back(drive_);
   const std::vector<const ParameterBlock*> constant(blocks.begin(), blocks.end());
-  PartChain chain(paths_.at(part),
-                  drive_ ? drive_model_.displacements(action) : schema_.displacements(action),
-                  drive_model_.first_joints());
-  const Eigen::MatrixXd effects = drive_ ? drive_model_.effects(action) : Eigen::MatrixXd();
+  PartChain chain(paths_.at(part), displacements(action), drive_model_.first_joints());
   std::unique_ptr<ceres::CostFunction> cost;
   if (observation.has_rotation && schema_.has_rotation(part))
     cost = std::make_unique<PoseResidual>(std::move(chain), constant, observation,
-                                          options_.measurement, scale_, effects);
+                                          options_.measurement, scale_, effects(action));
   else
     cost = std::make_unique<PositionResidual>(std::move(chain), constant, observation,
-                                              options_.measurement, scale_, effects);
+                                              options_.measurement, scale_, effects(action));
   return Cost{std::move(cost), std::move(blocks), part};
 }
 

@@ -105,6 +105,9 @@ class RefinementProblem {
   std::vector<ParameterBlock*> chain_blocks(int part, std::int64_t sample_index);
 
  private:
+  /// θ of every signal, and what the drive's scalars add to each joint; empty: there is no drive.
+  Eigen::VectorXd displacements(const Eigen::VectorXd& action) const;
+  Eigen::MatrixXd effects(const Eigen::VectorXd& action) const;
   void add_paths();
   void add_plays();
   void add_drive();

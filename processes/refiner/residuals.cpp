@@ -68,8 +68,9 @@ void ChainResidual::write_chain(double** jacobians, const Derivative& by_pose,
 
 CornerResidual::CornerResidual(PartChain chain, const std::vector<const ParameterBlock*>& blocks,
                                double size_m, const Lens& lens, const TagSight& sight,
-                               const Matrix8d& covariance_px2, const NoiseScale& scale)
-    : ChainResidual(std::move(chain), blocks, 8, scale),
+                               const Matrix8d& covariance_px2, const NoiseScale& scale,
+                               const Eigen::MatrixXd& effects)
+    : ChainResidual(std::move(chain), blocks, 8, scale, effects),
       play_(find_play()),
       size_m_(size_m),
       lens_(lens),
@@ -77,16 +78,26 @@ CornerResidual::CornerResidual(PartChain chain, const std::vector<const Paramete
       whitener_(whitener_from(covariance_px2)) {}
 
 CornerResidual::Play CornerResidual::find_play() const {
-  for (const int b : {0, static_cast<int>(blocks_.size()) - 1}) {
-    const ParameterBlock& block = *blocks_[b];
-    if (block.kind != ParameterBlock::Kind::kInstant) continue;
-    const bool has_root = block.elements.starts_with("X");
-    return {.block = b,
-            .value = has_root ? ParameterBlock::kPoseSize : 0,
-            .tangent = has_root ? 6 : 0,
-            .num = static_cast<int>(block.elements.size()) - (has_root ? 1 : 0)};
-  }
-  return {};
+  const auto found = std::ranges::find(blocks_, ParameterBlock::Kind::kInstant,
+                                       [](const ParameterBlock* block) { return block->kind; });
+  if (found == blocks_.end()) return {};
+  const std::string& elements = (*found)->elements;
+  const bool has_root = elements.starts_with("X");
+  return {.block = static_cast<int>(found - blocks_.begin()),
+          .value = has_root ? ParameterBlock::kPoseSize : 0,
+          .tangent = has_root ? 6 : 0,
+          .num = static_cast<int>(elements.size()) - (has_root ? 1 : 0)};
+}
+
+// Of all joints what they are off at the instant and what the drive adds to it.
+Eigen::VectorXd CornerResidual::beyond(double const* const* parameters) const {
+  Eigen::VectorXd sum = Eigen::VectorXd::Zero(std::max<Eigen::Index>(play_.num, effects_.rows()));
+  if (play_.num > 0)
+    sum += Eigen::Map<const Eigen::VectorXd>(parameters[play_.block] + play_.value, play_.num);
+  if (effects_.size() > 0)
+    sum += effects_ *
+           Eigen::Map<const Eigen::VectorXd>(parameters[blocks_.size() - 1], effects_.cols());
+  return sum;
 }
 
 Eigen::Matrix<double, 2, Eigen::Dynamic> CornerResidual::by_lens(const Eigen::VectorXd& lens,
@@ -113,10 +124,12 @@ bool CornerResidual::Evaluate(double const* const* parameters, double* residuals
   if (!(size_m > 0 && lens_parameters.head<2>().minCoeff() > 0)) return false;
   const Lens lens = lens_.with(lens_parameters);
   std::vector<PartChain::Jacobian> by_block;
-  PartChain::Jacobian by_play = PartChain::Jacobian::Zero(6, play_.num);
-  const double* play = play_.num > 0 ? parameters[play_.block] + play_.value : nullptr;
-  const Pose X_CM = chain_.pose(parameters, X_BM, jacobians ? &by_block : nullptr, play,
-                                jacobians && play ? &by_play : nullptr);
+  const Eigen::VectorXd play = beyond(parameters);
+  PartChain::Jacobian by_play = PartChain::Jacobian::Zero(6, play.size());
+  const bool has_play = play.size() > 0;
+  const Pose X_CM =
+      chain_.pose(parameters, X_BM, jacobians ? &by_block : nullptr,
+                  has_play ? play.data() : nullptr, jacobians && has_play ? &by_play : nullptr);
 
   Eigen::Matrix<double, 8, 1> error;
   Eigen::Matrix<double, 8, 7> by_tag;  // pose of the tag, then the size's factor
@@ -151,6 +164,9 @@ bool CornerResidual::Evaluate(double const* const* parameters, double* residuals
     }
   }
   write_chain(jacobians, whitened.leftCols<6>(), by_block);
+  if (effects_.size() > 0)
+    write(jacobians, static_cast<int>(blocks_.size()) - 1,
+          whitened.leftCols<6>() * by_play * effects_);
   write(jacobians, tag, whitened);
   if (jacobians[lens_block]) write(jacobians, lens_block, whitener * by_lens_parameters);
   return true;

@@ -57,11 +57,11 @@ class CornerResidual final : public ChainResidual {
  public:
   /// Blocks: those of the chain, the tag's (X_BM and the size's factor), the lens's
   /// (Lens::parameters()). Where there is a block of the instant it has the joints' plays last: it
-  /// is the chain's first if the root moves, else another one at the end. `covariance_px2` is
-  /// positive definite.
+  /// is the chain's first if the root moves, else it follows the lens's. The drive's, where there
+  /// is one, comes last. `covariance_px2` is positive definite.
   CornerResidual(PartChain chain, const std::vector<const ParameterBlock*>& blocks, double size_m,
                  const Lens& lens, const TagSight& sight, const Matrix8d& covariance_px2,
-                 const NoiseScale& scale);
+                 const NoiseScale& scale, const Eigen::MatrixXd& effects = {});
   /// False if a corner lies behind the camera.
   bool Evaluate(double const* const* parameters, double* residuals,
                 double** jacobians) const override;
@@ -76,6 +76,7 @@ class CornerResidual final : public ChainResidual {
     int block = -1, value = 0, tangent = 0, num = 0;
   };
   Play find_play() const;
+  Eigen::VectorXd beyond(double const* const* parameters) const;
 
   const Play play_;
   const double size_m_;

@@ -95,6 +95,17 @@ TEST_F(RefineProgramTest, FitsPosesWithoutAnOption) {
     EXPECT_NE(text.out.find(words), std::string::npos) << text.out;
 }
 
+// The same bytes on one processor with one thread as on all with many.
+TEST_F(RefineProgramTest, TheNumberOfThreadsChangesNothing) {
+  const std::string refine =
+      "refine schema '" + log_ + "' " + rig_ + " --placements --intrinsics --proposed found --out ";
+  ASSERT_EQ(run(refine + "one", "OMP_NUM_THREADS=1 taskset -c 0 ").exit_code, 0);
+  const std::string found = text_of(folder_ / "found" / "markers.yaml");
+  ASSERT_EQ(run(refine + "many", "OMP_NUM_THREADS=8 ").exit_code, 0);
+  EXPECT_EQ(text_of(folder_ / "one"), text_of(folder_ / "many"));
+  EXPECT_EQ(text_of(folder_ / "found" / "markers.yaml"), found);
+}
+
 TEST_F(RefineProgramTest, WritesTheUrdfThatUrdfMakesOfTheRefinedSchema) {
   const std::string refine = "refine schema '" + log_ + "' --out refined --urdf r.urdf ";
   const Json json = json_of(refine + "--urdf-placement p.yaml --json");

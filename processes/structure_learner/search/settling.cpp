@@ -43,6 +43,52 @@ bool exchange(const ComponentTree& tree, int signal, double cost, std::vector<Ca
   return true;
 }
 
+// Three parts of which one signal moves each against the others, an edge between the first and the
+// second and one between the second and the third: a spare model between the first and the third.
+std::optional<Candidate> across(const AcceptedModel& one, const AcceptedModel& other,
+                                const std::vector<Candidate>& spare, PairModels* pairs) {
+  if (one.model.num_joints() != 1 || signal_set(one.model) != signal_set(other.model) ||
+      other.model.num_joints() != 1)
+    return std::nullopt;
+  std::set<int> ends = {one.part_i, one.part_j};
+  for (const int part : {other.part_i, other.part_j})
+    if (!ends.insert(part).second) ends.erase(part);
+  if (ends.size() != 2) return std::nullopt;
+  for (Candidate c : spare)
+    if (c.joins(*ends.begin(), *ends.rbegin()) && signal_set(c.model) == signal_set(one.model) &&
+        c.model.num_joints() == 1 && !pairs->is_refuted(c.part_i, c.part_j, c.model) &&
+        pairs->confirm_on_all_data(&c))
+      return c;
+  return std::nullopt;
+}
+
+// Two fingers on one signal turn against each other about no fixed axis, yet in noise one screw may
+// pass for it. Of the two edges between three such parts, those with which all poses cost least.
+// False if they stay.
+bool exchange_siblings(const ComponentTree& tree, double cost, const std::vector<Candidate>& spare,
+                       PairModels* pairs, ModelForest* forest) {
+  const int root = tree.nodes().front().part;
+  const std::vector<AcceptedModel>& present = forest->models();
+  std::vector<AcceptedModel> best;
+  for (std::size_t m = 0; m < present.size(); ++m)
+    for (std::size_t n = 0; n < present.size(); ++n) {
+      if (m == n || !forest->connected(root, present[m].part_i)) continue;
+      const auto third = across(present[m], present[n], spare, pairs);
+      if (!third) continue;
+      std::vector<AcceptedModel> models = present;
+      models[n] = *third;
+      ModelForest other = *forest;
+      other.set_models(models);
+      const double other_cost = ComponentTree(other, root, pairs).fit().cost();
+      if (other_cost >= cost) continue;
+      cost = other_cost;
+      best = std::move(models);
+    }
+  if (best.empty()) return false;
+  forest->set_models(std::move(best));
+  return true;
+}
+
 // A part's component, settled, as all markers see it.
 TreeFit settle_tree(int part, std::vector<Candidate>* spare, PairModels* pairs, ModelForest* forest,
                     std::vector<AcceptedModel>* refuted) {
@@ -52,6 +98,8 @@ TreeFit settle_tree(int part, std::vector<Candidate>* spare, PairModels* pairs, 
     TreeFit fit = tree.fit();
     const auto worst =
         tree.nodes().size() < 2 ? std::nullopt : missing_joint(*forest, *pairs, &fit);
+    if (!worst && round < kMaxSplits && exchange_siblings(tree, fit.cost(), *spare, pairs, forest))
+      continue;
     if (!worst || round == kMaxSplits) return fit;
     if (exchange(tree, worst->signal, fit.cost(), spare, pairs, forest)) continue;
     if (const auto edges = insert_joint(fit.nodes(), *worst)) {

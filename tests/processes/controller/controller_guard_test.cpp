@@ -117,6 +117,41 @@ TEST(ControllerTest, TakingTheArmWaitsForRestAndForTheBabblersSample) {
   EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
 }
 
+// So that what is learned and refined does not depend on when a target was given.
+TEST(ControllerTest, TakingTheArmWaitsForTheVerdictOnATestSample) {
+  Bench bench;
+  bench.health = health_of(1, 2, 3, schema_edge_t::EDGE_OK);
+  bench.health->judged_sample = bench.health->awaited_refinement = -1;
+  bench.start();
+  bench.arm = {20, 0.1, 4};
+  bench.settle("motor_babbler", 1, 12, bench.arm, action_command_t::PURPOSE_TEST);
+  bench.give(position_target(0, kNear));
+  bench.run(5);
+  EXPECT_TRUE(bench.moves.empty());
+  EXPECT_EQ(bench.status.owns_arm, 1);
+  EXPECT_TRUE(bench.has_why("verdict on sample 0")) << bench.status.why;
+  // As long as the monitor waits for the refiner.
+  bench.health->awaited_refinement = 0;
+  bench.run(60);
+  EXPECT_TRUE(bench.moves.empty());
+  bench.health->judged_sample = 0;
+  bench.health->awaited_refinement = -1;
+  EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+}
+
+TEST(ControllerTest, AVerdictIsNotAwaitedForEver) {
+  Bench bench;
+  bench.health = health_of(1, 2, 3, schema_edge_t::EDGE_OK);
+  bench.health->judged_sample = bench.health->awaited_refinement = -1;
+  bench.start();
+  bench.arm = {20, 0.1, 4};
+  bench.settle("motor_babbler", 1, 12, bench.arm, action_command_t::PURPOSE_TEST);
+  bench.give(position_target(0, kNear));
+  bench.run(8);
+  EXPECT_TRUE(bench.moves.empty());
+  EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+}
+
 TEST(ControllerTest, AMoveThatNeverEndsIsHeld) {
   Bench bench;
   bench.start();

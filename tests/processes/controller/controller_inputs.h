@@ -37,6 +37,7 @@ inline ControllerConfig test_config() {
   config.resend_us = 1 * kSecond;
   config.take_us = 3 * kTick;
   config.sample_timeout_us = 5 * kSecond;
+  config.verdict_timeout_us = 10 * kSecond;
   config.rest_timeout_us = 20 * kSecond;
   config.lent_timeout_us = 50 * kSecond;
   config.target_tags = {40, 41};

@@ -11,6 +11,7 @@
 #include "common/geometry/angle.h"
 #include "processes/refiner/held_out.h"
 #include "processes/refiner/refine.h"
+#include "processes/structure_learner/learn.h"
 #include "tests/processes/refiner/tagged_robot.h"
 
 namespace bodyschema {
@@ -99,6 +100,29 @@ TEST(RefineCorners, FindPlacementsAndLensFromExactCorners) {
     mean += tag.size_m / c.rig.markers.find(tag.id)->size_m /
             static_cast<double>(c.rig.markers.tags.size());
   EXPECT_NEAR(mean, 1, 2e-4);
+}
+
+// As exactly as those of straight commands, though each joint may be off its command as well.
+TEST(RefineCorners, BendCommandsWithTheRest) {
+  Rng rng(3);
+  TaggedRobot robot = test::tagged(test::chapter_robot("a", rng), 4, rng);
+  robot.robot.bend = 0.1;
+  const RigCalibration rig = test::claimed(robot, kRigError, rng);
+  const auto samples = test::seen_corners(robot, rig, 100, 0.05, rng);
+  std::vector<ActionPoseSample> training;
+  for (const RefinerSample& seen : samples)
+    if (is_learned_from(seen.sample)) training.push_back(seen.sample);
+  LearnOptions learning;
+  learning.measurement.systematic = {0.002, 0.01};
+  const BodySchema learned = learn(robot.robot.signals, training, learning).schema;
+  ASSERT_TRUE(test::is_right(learned, robot.robot));
+  ASSERT_FALSE(learned.signals[0].warp.empty());
+  const Refinement result = refine(learned, samples, rig, all());
+  EXPECT_TRUE(result.held.empty());
+  EXPECT_TRUE(result.undetermined.empty());
+  EXPECT_NE(result.schema.signals[0].warp, learned.signals[0].warp);
+  EXPECT_LT(*result.after.px_rms, 0.06);
+  EXPECT_GT(*result.before.px_rms, 0.2);
 }
 
 TEST(RefineCorners, PutThePartsFramesWhereTheirTagsAreClosestToTheClaims) {

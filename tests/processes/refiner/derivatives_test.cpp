@@ -102,6 +102,17 @@ TEST(Residuals, OfCornersHaveTheirDerivatives) {
   Rng rng(2);
   ThreeEdges robot(rng);
   const RigCalibration rig = test::tagged(test::chapter_robot("a", rng), 1, rng).truth;
+  ParameterBlock plays, drive;
+  plays.kind = ParameterBlock::Kind::kInstant;
+  drive.kind = ParameterBlock::Kind::kDrive;
+  plays.free = {0, 1, 2, 3};
+  drive.free = {0, 1};
+  for (int n = 0; n < 4; ++n) plays.add(0.01 * test::gaussian(rng));
+  for (int n = 0; n < 2; ++n) drive.add(0.1 * test::gaussian(rng));
+  Eigen::MatrixXd effects(4, 2);
+  effects << 0.3, 0, 0.2, 0.5, 0, -0.4, 0.1, 0.7;
+  const PartChain moved({&robot.edges[0], &robot.edges[1], &robot.edges[2]}, robot.theta,
+                        {{&robot.edges[1], 0}, {&robot.edges[2], 3}});
   for (const auto model :
        {CameraCalibration::Model::kPlumbBob, CameraCalibration::Model::kFisheye}) {
     CameraCalibration camera = rig.camera;
@@ -123,9 +134,18 @@ TEST(Residuals, OfCornersHaveTheirDerivatives) {
     sight.corners_px.setConstant(600);
     Matrix8d covariance = 0.01 * Matrix8d::Identity();
     covariance(0, 3) = covariance(3, 0) = 0.004;
-    const CornerResidual cost(robot.chain(), robot.blocks, 0.06, lens, sight, covariance,
-                              robot.scale);
-    expect_right_derivatives(cost, robot.blocks, 1e-6);
+    const auto expect_right = [&](const PartChain& chain, const Eigen::MatrixXd& by_drive) {
+      const CornerResidual cost(chain, robot.blocks, 0.06, lens, sight, covariance, robot.scale,
+                                by_drive);
+      expect_right_derivatives(cost, robot.blocks, 1e-6);
+    };
+    expect_right(robot.chain(), {});
+    robot.blocks.push_back(&plays);
+    expect_right(moved, {});
+    robot.blocks.push_back(&drive);
+    expect_right(moved, effects);
+    robot.blocks.erase(robot.blocks.end() - 2);
+    expect_right(moved, effects);
   }
 }
 
