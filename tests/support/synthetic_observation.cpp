@@ -124,6 +124,16 @@ ActionPoseSample observe(const SyntheticRobot& robot, const Eigen::VectorXd& act
   return sample;
 }
 
+PartObservation seen_at(int part, const Pose& X_CB, const Noise& noise, Rng& rng) {
+  Vector6d error = gaussian6(rng);
+  error.head<3>() *= noise.position_m;
+  error.tail<3>() *= noise.rotation_rad;
+  PartObservation seen;
+  seen.part = part;
+  seen.X_CB = X_CB * exp(error);
+  return seen;
+}
+
 std::vector<ActionPoseSample> with_positions_alone(std::vector<ActionPoseSample> samples,
                                                    const std::set<int>& parts) {
   for (ActionPoseSample& sample : samples)

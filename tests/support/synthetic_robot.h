@@ -110,6 +110,9 @@ ActionPoseSample observe(const SyntheticRobot& robot, const Eigen::VectorXd& act
 std::vector<ActionPoseSample> babble(const SyntheticRobot& robot, int num_samples,
                                      const ObservationOptions& options, Rng& rng);
 
+/// A part that is at X_CB, seen in Gaussian noise, without a covariance.
+PartObservation seen_at(int part, const Pose& X_CB, const Noise& noise, Rng& rng);
+
 /// As if `parts` had been seen without their orientations.
 std::vector<ActionPoseSample> with_positions_alone(std::vector<ActionPoseSample> samples,
                                                    const std::set<int>& parts);

@@ -101,16 +101,23 @@ void CramerRao::factorize() const {
   is_factorized_ = true;
 }
 
-Matrix6d CramerRao::bound(int from, int to, const Eigen::VectorXd& action) const {
+Matrix6d CramerRao::bound_of(const Eigen::MatrixXd& G) const {
   factorize();
-  const auto X = robot_.poses_in_camera(action);
-  const Pose X_FT = X.at(from).inverse() * X.at(to);
-  const Eigen::MatrixXd G =
-      pose_jacobian(to, action) - adjoint(X_FT.inverse()) * pose_jacobian(from, action);
   if ((G * gauge_).norm() > 1e-5 * G.norm())
     return Matrix6d::Constant(std::numeric_limits<double>::infinity());
   const Eigen::MatrixXd half = G * root_;
   return half * half.transpose();
+}
+
+Matrix6d CramerRao::bound(int from, int to, const Eigen::VectorXd& action) const {
+  const auto X = robot_.poses_in_camera(action);
+  const Pose X_FT = X.at(from).inverse() * X.at(to);
+  return bound_of(pose_jacobian(to, action) -
+                  adjoint(X_FT.inverse()) * pose_jacobian(from, action));
+}
+
+Matrix6d CramerRao::bound_in_camera(int part, const Eigen::VectorXd& action) const {
+  return bound_of(pose_jacobian(part, action));
 }
 
 double position_bound_rms(const CramerRao& bound, int from, int to,

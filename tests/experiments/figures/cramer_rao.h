@@ -33,6 +33,8 @@ class CramerRao {
   /// 6×6 lower bound of the covariance of the pose of `to` in `from`; right perturbation in the
   /// frame of `to`. Infinite if the samples leave the pose open.
   Matrix6d bound(int from, int to, const Eigen::VectorXd& action) const;
+  /// The same of its pose in the camera's frame.
+  Matrix6d bound_in_camera(int part, const Eigen::VectorXd& action) const;
 
   /// 6 × number of parameters: derivative of a part's pose in the camera frame.
   Eigen::MatrixXd pose_jacobian(int part, const Eigen::VectorXd& action) const;
@@ -43,6 +45,8 @@ class CramerRao {
 
  private:
   void factorize() const;
+  /// Of what has the derivative `G`.
+  Matrix6d bound_of(const Eigen::MatrixXd& G) const;
 
   const test::SyntheticRobot& robot_;
   std::vector<int> first_parameter_;  // of each link

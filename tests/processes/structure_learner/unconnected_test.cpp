@@ -84,13 +84,7 @@ TEST(Learn, FindsJointsThatBendOneCommandUnalike) {
         if (part > 1)
           X = X * Eigen::Translation3d(0.06, 0, 0) *
               Eigen::AngleAxisd(angles[part - 2], Eigen::Vector3d::UnitY());
-        Vector6d e = test::gaussian6(rng);
-        e.head<3>() *= noise.position_m;
-        e.tail<3>() *= noise.rotation_rad;
-        PartObservation o;
-        o.part = part;
-        o.X_CB = X * markers[part - 1] * exp(e);
-        sample.parts.push_back(o);
+        sample.parts.push_back(test::seen_at(part, X * markers[part - 1], noise, rng));
       }
     }
     LearnOptions options;
