@@ -152,14 +152,22 @@ std::vector<std::string> RefinementWords::undetermined() const {
 }
 
 std::string RefinementWords::advice(const Place& one, const Place& other) const {
-  const Place* tag = one.block->kind == Kind::kTag ? &one : &other;
-  const Place* edge = one.block->kind == Kind::kTag ? &other : &one;
-  if (tag->block->kind != Kind::kTag || edge->block->kind != Kind::kEdge) return "";
+  std::set<int> tags;
   std::set<std::string> signals;
-  for (const ScrewJoint& joint : schema_.edges[edge->block->id].joints)
-    signals.insert(schema_.signals.at(joint.signal).name);
+  for (const ParameterBlock* block : {one.block, other.block}) {
+    if (block->kind == Kind::kLens)
+      return "show tags nearer and farther, and at the image's border";
+    if (block->kind == Kind::kTag) tags.insert(block->id);
+    if (block->kind != Kind::kEdge) continue;
+    for (const ScrewJoint& joint : schema_.edges[block->id].joints)
+      signals.insert(schema_.signals.at(joint.signal).name);
+  }
+  if (tags.size() > 1) return fmt::format("show tags {} in one image", fmt::join(tags, ", "));
   if (signals.empty()) return "";
-  return fmt::format("show tag {} while {} moves", tag->block->id, fmt::join(signals, ", "));
+  const std::string names = fmt::format("{}", fmt::join(signals, ", "));
+  if (!tags.empty()) return fmt::format("show tag {} while {} moves", *tags.begin(), names);
+  return fmt::format("move {} farther{}", names,
+                     signals.size() > 1 ? " and in other combinations" : "");
 }
 
 // The covariance given what is_frame() says. Zero rows where that is.

@@ -17,6 +17,7 @@
 #include "processes/structure_learner/one_cluster.h"
 #include "processes/structure_learner/root_pose.h"
 #include "processes/structure_learner/search/withdrawal.h"
+#include "processes/structure_learner/signal_rates.h"
 #include "processes/structure_learner/soft_parts.h"
 #include "processes/structure_learner/surrogate_commands.h"
 #include "processes/structure_learner/told_noise.h"
@@ -373,6 +374,36 @@ std::vector<ActionPoseSample> in_step(const std::vector<ActionPoseSample>& sampl
       structure.command_delay);
 }
 
+// Of distinct samples of uniform parts that may come after their commands.
+LearnedStructure find_delayed(const std::vector<Signal>& signals,
+                              const std::vector<ActionPoseSample>& samples,
+                              const std::vector<int>& alone, const LearnOptions& options) {
+  const auto find = [&](const CommandDelay& delay) {
+    LearnedStructure found =
+        find_in_step(signals, with_commands_of_before(samples, delay), alone, options);
+    found.command_delay = delay;
+    return found;
+  };
+  const CommandLag lag = command_lag(samples, static_cast<int>(signals.size()));
+  const CommandDelay late{.lag_us = lag.us}, none;
+  LearnedStructure structure = find(lag.is_significant ? late : none);
+  if (!structure.spans() && lag.us != 0) {
+    LearnedStructure other = find(lag.is_significant ? none : late);
+    const std::size_t least = structure.search.models.size() + (lag.is_significant ? 0 : 1);
+    if (other.search.models.size() >= least) structure = std::move(other);
+  }
+  const auto refined = [&](const LearnedStructure& by) {
+    return refined_delay(samples, by.signals, by.actions, by.search.models, by.options.measurement,
+                         by.command_delay);
+  };
+  const CommandDelay delay = refined(structure);
+  if (delay == structure.command_delay) return structure;
+  // Fewer edges too: what stood by a worse delay was not the body.
+  LearnedStructure found = find(delay);
+  found.command_delay = refined(found);
+  return found;
+}
+
 }  // namespace
 
 LearnedStructure find_structure(const std::vector<Signal>& signals,
@@ -382,30 +413,16 @@ LearnedStructure find_structure(const std::vector<Signal>& signals,
   const std::vector<int> alone = parts_without_rotation(samples);
   const std::vector<ActionPoseSample> distinct =
       with_uniform_parts(without_repetitions(samples), alone);
-  const auto find = [&](const CommandDelay& delay) {
-    LearnedStructure found =
-        find_in_step(signals, with_commands_of_before(distinct, delay), alone, options);
-    found.command_delay = delay;
-    return found;
-  };
-  const CommandLag lag = command_lag(distinct, num_signals);
-  const CommandDelay late{.lag_us = lag.us}, none;
-  LearnedStructure structure = find(lag.is_significant ? late : none);
-  if (!structure.spans() && lag.us != 0) {
-    LearnedStructure other = find(lag.is_significant ? none : late);
-    const std::size_t least = structure.search.models.size() + (lag.is_significant ? 0 : 1);
-    if (other.search.models.size() >= least) structure = std::move(other);
+  std::optional<LearnedStructure> without;
+  if (const std::vector<int> rates = rates_of_others(distinct, num_signals); !rates.empty()) {
+    without = find_delayed(signals, held_still(distinct, rates), alone, options);
+    without->rates = rates;
+    if (without->spans()) return *std::move(without);
   }
-  const auto refined = [&](const LearnedStructure& by) {
-    return refined_delay(distinct, by.signals, by.actions, by.search.models, by.options.measurement,
-                         by.command_delay);
-  };
-  const CommandDelay delay = refined(structure);
-  if (delay == structure.command_delay) return structure;
-  // Fewer edges too: what stood by a worse delay was not the body.
-  LearnedStructure found = find(delay);
-  found.command_delay = refined(found);
-  return found;
+  LearnedStructure structure = find_delayed(signals, distinct, alone, options);
+  if (without && without->search.models.size() >= structure.search.models.size())
+    return *std::move(without);
+  return structure;
 }
 
 LearnResult fit_structure(const LearnedStructure& structure,

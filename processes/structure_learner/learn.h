@@ -88,6 +88,7 @@ struct LearnedStructure {
   std::vector<int> position_parts = {};      ///< parts_without_rotation()
   std::map<int, OpenLeaf> open_leaves = {};  ///< those of them without an edge
   CommandDelay command_delay = {};           ///< of a stream's poses; `actions` are without it
+  std::vector<int> rates = {};               ///< signals that were left out (signal_rates.h)
 
   /// The edges span all parts seen.
   bool spans() const { return search.models.size() + 1 >= parts.size(); }
@@ -101,7 +102,8 @@ struct LearnedStructure {
 /// rest where no multiple of it stands, the estimate of noise_estimate.h if that is much more.
 /// Parts that have positions alone are put in when the parts that have poses are
 /// (position_leaves.h). Where the poses of a stream come after their commands (command_lag.h), each
-/// counts with the command that brought it there.
+/// counts with the command that brought it there. Signals that are the rates of others are left out
+/// where the structure spans without them.
 /// @throws std::invalid_argument as learn().
 LearnedStructure find_structure(const std::vector<Signal>& signals,
                                 const std::vector<ActionPoseSample>& samples,

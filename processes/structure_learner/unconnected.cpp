@@ -224,6 +224,8 @@ std::vector<int> undecided_signals(const BodySchema& schema, const LearnedStruct
   for (const AcceptedModel& model : structure.search.models)
     result.insert(model.doubtful_signals.begin(), model.doubtful_signals.end());
   for (const int s : schema.unused_signals()) {
+    // What nothing is left to be explained by.
+    if (schema.complete && std::ranges::count(structure.rates, s) > 0) continue;
     const auto information = structure.search.joint_information.find(s);
     if (schema.complete && information != structure.search.joint_information.end()) {
       const Signal& signal = schema.signals[static_cast<std::size_t>(s)];

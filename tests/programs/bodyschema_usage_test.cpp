@@ -142,6 +142,7 @@ TEST_F(BodyschemaProgramTest, ANoiseThatIsNoneIsAskedBack) {
       expect_failure(arguments, what, 2);
     };
     expect("3", "1", "3 m is no noise of a marker; did you mean: --noise 0.003 1");
+    expect("1e6", "1", "1000000 m is no noise of a marker; at most");
     expect("0.003", "57", "57 degrees are no noise of a marker");
     expect(std::string(309, '9'), "1", "--noise");
   }

@@ -40,6 +40,9 @@ TEST_F(RefineProgramTest, FitsCornersAndProposesFilesThatReadBack) {
   EXPECT_LT(json.at("after").at("corner_rms_px"), json.at("before").at("corner_rms_px"));
   for (const char* key : {"parameters", "correlations", "coverage", "plays", "tags", "lens"})
     EXPECT_FALSE(json.at(key).empty()) << key;
+  EXPECT_TRUE(std::ranges::any_of(json.at("correlations"), [](const Json& c) {
+    return c.at("advice") == "show tags 0, 1 in one image";
+  }));
   const Markers markers = load_markers(folder_ / "found");
   ASSERT_EQ(markers.tags.size(), json.at("tags").size());
   for (std::size_t n = 0; n < markers.tags.size(); ++n)

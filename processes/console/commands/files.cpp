@@ -77,6 +77,9 @@ Noise noise_given(const std::vector<double>& numbers) {
   for (const double number : numbers)
     if (!std::isfinite(number) || number <= 0) refuse("expected two standard deviations above 0");
   const Noise noise{numbers[0], numbers[1] * kDegree};
+  if (noise.position_m > 1000 * kNoiseCeiling.position_m)
+    refuse(fmt::format("{} m is no noise of a marker; at most {} are", numbers[0],
+                       kNoiseCeiling.position_m));
   if (noise.position_m > kNoiseCeiling.position_m)
     refuse(fmt::format("{} m is no noise of a marker; did you mean: --noise {} {}", numbers[0],
                        numbers[0] / 1000, numbers[1]));
