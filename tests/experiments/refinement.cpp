@@ -166,7 +166,7 @@ void refine_nominal(bool sees_base, int num_samples, int num_robots) {
     };
     schema.edges[0].left = moved(schema.edges[0].left);
     for (ScrewJoint& joint : schema.edges[0].joints) joint.X_after = moved(joint.X_after);
-    experiments::CramerRao bound(trial.robot);
+    experiments::CramerRao bound(trial.robot, true);
     for (const ActionPoseSample& sample : trial.samples) bound.add(sample);
     for (const Eigen::VectorXd& q : trial.test_actions)
       bounds += (sees_base ? bound.bound(base, end, q) : bound.bound_in_camera(end, q))

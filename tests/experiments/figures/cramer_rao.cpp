@@ -25,7 +25,8 @@ Vector6d screw(double slide, double turn) {
 
 }  // namespace
 
-CramerRao::CramerRao(const SyntheticRobot& robot) : robot_(robot) {
+CramerRao::CramerRao(const SyntheticRobot& robot, bool knows_kinds)
+    : robot_(robot), knows_kinds_(knows_kinds) {
   for (const TrueLink& link : robot.links) {
     first_parameter_.push_back(num_parameters_);
     num_parameters_ += link.parent >= 0 && link.signal >= 0 ? 14 : 6;  // of the base: X_CR
@@ -52,8 +53,9 @@ Eigen::MatrixXd CramerRao::pose_jacobian(int part, const Eigen::VectorXd& action
       suffix = link.X_after * suffix;
       const double q = displacement(robot_, link, action);
       const Matrix6d Ad = adjoint(suffix.inverse());
-      J.col(first + 6) = q * Ad.col(2);
-      J.col(first + 7) = q * Ad.col(5);
+      // What no pose depends on is taken as known.
+      if (!knows_kinds_ || link.slide != 0) J.col(first + 6) = q * Ad.col(2);
+      if (!knows_kinds_ || link.turn != 0) J.col(first + 7) = q * Ad.col(5);
       suffix = exp(screw(link.slide, link.turn) * q) * suffix;
     }
     J.middleCols<6>(first) = adjoint(suffix.inverse());

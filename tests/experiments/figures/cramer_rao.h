@@ -23,8 +23,9 @@ namespace bodyschema::experiments {
 /// Outliers are left out: the bound is that of the same markers without flips.
 class CramerRao {
  public:
-  /// The robot must outlive this.
-  explicit CramerRao(const test::SyntheticRobot& robot);
+  /// `knows_kinds`: that joints which turn do not slide, and the other way round, is known. The
+  /// robot must outlive this.
+  explicit CramerRao(const test::SyntheticRobot& robot, bool knows_kinds = false);
 
   /// Adds the information of one sample, by its true poses and the observations' covariances (which
   /// must be invertible), for the parts that were seen.
@@ -49,6 +50,7 @@ class CramerRao {
   Matrix6d bound_of(const Eigen::MatrixXd& G) const;
 
   const test::SyntheticRobot& robot_;
+  const bool knows_kinds_;
   std::vector<int> first_parameter_;  // of each link
   int num_parameters_ = 0;
   Eigen::MatrixXd information_;

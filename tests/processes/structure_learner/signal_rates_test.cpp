@@ -65,15 +65,14 @@ TEST(SignalRates, AreNoneOfPosesAtRest) {
 
 // Poses that come late: θ(t − τ) ≈ θ − τ dθ/dt looks like a joint of a signal and its rate.
 TEST(SignalRates, AreInNoStructure) {
-  for (const double lag : {0.0, 4.0})
-    for (std::uint64_t seed = 0; seed < 3; ++seed) {
-      test::Rng rng(static_cast<int>(seed));
-      ImperfectRobot robot(kJoints, true, {.lag = lag}, seed);
-      const auto samples = with_rates(robot, 0.02, rng);
-      const BodySchema schema = learn(with_rates(robot.signals(), samples), samples).schema;
-      EXPECT_EQ(judge(schema, robot.structure()), test::Rightness::kRight) << lag << " " << seed;
-      EXPECT_TRUE(schema.undecided_signals.empty()) << lag << " " << seed;
-    }
+  for (std::uint64_t seed = 0; seed < 2; ++seed) {
+    test::Rng rng(static_cast<int>(seed));
+    ImperfectRobot robot(kJoints, true, {.lag = 4}, seed);
+    const auto samples = with_rates(robot, 0.02, rng);
+    const BodySchema schema = learn(with_rates(robot.signals(), samples), samples).schema;
+    EXPECT_EQ(judge(schema, robot.structure()), test::Rightness::kRight) << seed;
+    EXPECT_TRUE(schema.undecided_signals.empty()) << seed;
+  }
 }
 
 }  // namespace
