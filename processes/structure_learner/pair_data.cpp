@@ -143,17 +143,10 @@ NormalizedActions::NormalizedActions(const std::vector<ActionPoseSample>& sample
   blocks_ = TimeBlocks(utimes, moving_values());
 }
 
-std::optional<std::pair<int, int>> NormalizedActions::alike() const {
-  // Of a joint of 1 rad less than markers tell.
-  constexpr double kAlike = 1e-3;
-  if (num_samples() < 10) return std::nullopt;
-  const auto differ = [&](int a, int b, int sign) {
-    return (values_.row(a) - sign * values_.row(b)).cwiseAbs().maxCoeff() > kAlike;
-  };
-  for (const int a : moving_)
-    for (const int b : moving_)
-      if (a < b && !(differ(a, b, 1) && differ(a, b, -1))) return std::pair(a, b);
-  return std::nullopt;
+double NormalizedActions::correlation(int a, int b) const {
+  const Eigen::ArrayXd x = values_.row(a).array() - values_.row(a).mean();
+  const Eigen::ArrayXd y = values_.row(b).array() - values_.row(b).mean();
+  return (x * y).sum() / std::sqrt(x.square().sum() * y.square().sum());
 }
 
 NormalizedActions NormalizedActions::reordered(const std::vector<int>& order) const {

@@ -27,10 +27,12 @@ class NormalizedActions {
   double half_range(int signal) const { return half_range_(signal); }
   /// The signals that took more than one value, ascending. The others can explain nothing.
   const std::vector<int>& moving() const { return moving_; }
-  /// Two signals that move alike, by a gain and an offset, to a thousandth of their ranges at all
-  /// of at least ten samples: a command and what a drive reports of it, or sides that are always
-  /// moved together. No pose tells which of them moves the body. O(D² N).
-  std::optional<std::pair<int, int>> alike() const;
+  /// Of two signals that move over all samples, −1 … 1.
+  double correlation(int a, int b) const;
+  /// They move alike, as a command and what a drive reports of it, or sides that are always moved
+  /// together. Chosen: a joint of ± 60° and a drive that misses it by 3° have 0.996; of signals
+  /// that are moved independently ten samples rarely have 0.9.
+  bool are_alike(int a, int b) const { return std::abs(correlation(a, b)) > 0.99; }
   const TimeBlocks& blocks() const { return blocks_; }
   /// The commands of sample order[n] at sample n.
   NormalizedActions reordered(const std::vector<int>& order) const;

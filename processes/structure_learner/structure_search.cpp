@@ -4,6 +4,7 @@
 #include "processes/structure_learner/search/hidden_bodies.h"
 #include "processes/structure_learner/search/layered_search.h"
 #include "processes/structure_learner/search/long_chains.h"
+#include "processes/structure_learner/search/look_alikes.h"
 #include "processes/structure_learner/search/mimic_joints.h"
 #include "processes/structure_learner/search/settling.h"
 #include "processes/structure_learner/search/withdrawal.h"
@@ -32,6 +33,7 @@ SearchResult search_structure(const std::vector<ActionPoseSample>& samples,
     settled = settle_trees(&layers.spare(), &pairs, &forest);
   if (!forest.spans() && connect_mimic_joints(&pairs, &forest))
     settled = settle_trees(&layers.spare(), &pairs, &forest);
+  settle_look_alikes(&pairs, &forest);
   SearchResult result;
   result.joint_information = withdraw_untold_edges(&pairs, &forest);
   result.unknown_gains = chains_with_unknown_gains(&pairs, forest);

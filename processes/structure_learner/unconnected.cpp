@@ -54,7 +54,7 @@ struct TriedModels {
   bool undecided = false, was_soft_tried = false;
   bool is_redundant = false, moves_little = false, is_by_chance = false, is_too_short = false,
        has_one_rhythm = false;
-  std::set<int> untold;
+  std::set<int> untold, look_alikes;
   std::optional<ContestedSignals> contested;
 };
 
@@ -70,6 +70,7 @@ TriedModels tried_models(int part, const std::set<int>& connected, const SearchR
     if (!connected.count(other)) continue;
     tried.undecided |= !record.undecided.empty();
     tried.untold.insert(record.untold_signals.begin(), record.untold_signals.end());
+    tried.look_alikes.insert(record.look_alikes.begin(), record.look_alikes.end());
     tried.was_soft_tried |= record.was_soft_tried;
     tried.moves_little |= record.moves_little;
     tried.is_redundant |= record.is_redundant;
@@ -97,12 +98,10 @@ UnconnectedPart explain_leaf(int part, int num_seen, const LearnedStructure& str
 /// Where a valid model was taken back, or another explanation contends with it: that. Empty if none
 /// was.
 std::string why_taken_back(const TriedModels& tried, const LearnedStructure& structure) {
-  const auto alike = structure.actions.alike();
-  if (alike && tried.num_common > 0)
-    return names_of(std::vector{alike->first, alike->second}, structure) +
+  if (!tried.look_alikes.empty())
+    return names_of(tried.look_alikes, structure) +
            " move alike at all samples, and which of them moves it cannot be told: move them "
-           "apart, "
-           "or leave one of them out";
+           "apart, or leave one of them out";
   if (structure.is_contested)
     return "another structure fits if the noise is larger than it is said to be: tell the true "
            "noise, or give more samples";

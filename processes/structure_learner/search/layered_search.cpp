@@ -81,6 +81,7 @@ void LayeredSearch::decide(std::vector<Candidate> valid, std::vector<Candidate>*
     if ((best.score - other.score) * best.num_frames < kAmbiguityMargin) {
       pairs_.record(best.part_i, best.part_j)
           .note_undecided(other.model.num_joints(), other.mean_capped);
+      pairs_.note_look_alikes(best, other);
       return;
     }
   }

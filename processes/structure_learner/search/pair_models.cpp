@@ -1,6 +1,7 @@
 #include "processes/structure_learner/search/pair_models.h"
 
 #include <algorithm>
+#include <iterator>
 #include <limits>
 
 #include "processes/structure_learner/tree_fit.h"
@@ -115,9 +116,19 @@ std::optional<Candidate> PairModels::only_best(const std::vector<Candidate>& can
            signals_of_joints(other.model) != signals_of_joints(best.model) &&
            (best.score - other.score) * best.num_frames < kAmbiguityMargin;
   };
-  if (std::ranges::none_of(candidates, is_rival)) return best;
+  const auto rival = std::ranges::find_if(candidates, is_rival);
+  if (rival == candidates.end()) return best;
   record(best.part_i, best.part_j).note_undecided(best.model.num_joints(), best.mean_capped);
+  note_look_alikes(best, *rival);
   return std::nullopt;
+}
+
+void PairModels::note_look_alikes(const Candidate& best, const Candidate& other) {
+  std::vector<int> differ;
+  std::ranges::set_symmetric_difference(signal_set(best.model), signal_set(other.model),
+                                        std::back_inserter(differ));
+  if (differ.size() == 2 && actions_.are_alike(differ[0], differ[1]))
+    record(best.part_i, best.part_j).look_alikes.insert(differ.begin(), differ.end());
 }
 
 std::vector<NearMiss> PairModels::near_misses() const {

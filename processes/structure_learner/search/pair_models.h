@@ -46,6 +46,9 @@ struct PairRecord {
   /// Signals that moved too little while both were seen to tell whether they move the one against
   /// the other: why a model was taken back.
   std::set<int> untold_signals = {};
+  /// Signals that move alike, of which no pose tells which one moves the one part against the
+  /// other: why a model was taken back.
+  std::set<int> look_alikes = {};
   /// A valid model has a joint that its tree does not need: redundant_edges().
   bool is_redundant = false;
   /// A valid model was taken back: time-shifted commands explain the motion nearly as well, it is a
@@ -106,6 +109,8 @@ class PairModels {
   /// Fits and tests a candidate on all data of its pair, once.
   bool confirm_on_all_data(Candidate* candidate);
 
+  /// The pair is undecided between two models: because their signals move alike?
+  void note_look_alikes(const Candidate& best, const Candidate& other);
   /// The first by rank(); std::nullopt if there is none, or if as many joints on other signals
   /// explain its pair as well, which is then undecided.
   std::optional<Candidate> only_best(const std::vector<Candidate>& candidates);

@@ -115,5 +115,29 @@ TEST(Unconnected, PartsOfSignalsThatMoveAlikeAreToldSo) {
       contains(schema.unconnected, robot.signals[0].name + ", reported move alike at all samples"));
 }
 
+// Of which of two signals that move alike a joint is, no pose tells, be its model found between its
+// own parts or by all of them; of signals that differ by what poses show it is.
+TEST(Unconnected, AreJointsOfASignalThatAnotherOneFollows) {
+  for (const double miss : {0.0, 0.0005, 0.02})
+    for (int seed = 1; seed <= 6; ++seed) {
+      Rng rng(seed);
+      const test::SyntheticRobot robot = test::chapter_robot("c", rng);
+      auto samples = test::babble(robot, 60, {.regime = Regime::kTagIso}, rng);
+      std::vector<Signal> signals = robot.signals;
+      for (const Signal& signal : robot.signals) signals.push_back(signal);
+      const auto n = static_cast<Eigen::Index>(robot.signals.size());
+      for (ActionPoseSample& sample : samples) {
+        sample.action.conservativeResize(2 * n);
+        for (Eigen::Index s = 0; s < n; ++s)
+          sample.action(n + s) = sample.action(s) + miss * test::gaussian(rng);
+      }
+      LearnOptions options;
+      options.measurement.noise = test::nominal_noise(Regime::kTagIso);
+      const BodySchema schema = learn(signals, samples, options).schema;
+      if (miss < 0.01) EXPECT_TRUE(schema.edges.empty()) << miss << " " << seed;
+      if (miss > 0.01) EXPECT_EQ(judge(schema, robot), test::Rightness::kRight) << seed;
+    }
+}
+
 }  // namespace
 }  // namespace bodyschema
