@@ -251,6 +251,10 @@ void withdraw_screws(const std::vector<ActionPoseSample>& samples, const Normali
 void connect_soft_parts(const std::vector<ActionPoseSample>& samples,
                         const NormalizedActions& actions, const std::vector<int>& parts,
                         const SearchOptions& options, bool is_noise_guessed, SearchResult* found) {
+  // Nor would a process tell which of the signals it is.
+  if (std::ranges::any_of(found->records,
+                          [](const auto& record) { return !record.second.look_alikes.empty(); }))
+    return;
   const bool is_stream = actions.blocks().is_stream();
   std::vector<SoftCandidate> candidates;
   if (is_stream) withdraw_screws(samples, actions, options, found, &candidates);
@@ -262,8 +266,7 @@ void connect_soft_parts(const std::vector<ActionPoseSample>& samples,
     const int a = components.of(pair.first), b = components.of(pair.second);
     if (a == b) continue;
     // What screws need more data for is no reason to wait where they give way to a process anyway.
-    if (!record.look_alikes.empty() || (!record.undecided.empty() && !is_stream))
-      undecided.insert(std::minmax(a, b));
+    if (!record.undecided.empty() && !is_stream) undecided.insert(std::minmax(a, b));
     if (record.num_common >= kFewestSoftFrames)
       open[std::minmax(a, b)].push_back({0, pair.first, pair.second, {}});
   }

@@ -54,7 +54,8 @@ struct TriedModels {
   bool undecided = false, was_soft_tried = false;
   bool is_redundant = false, moves_little = false, is_by_chance = false, is_too_short = false,
        has_one_rhythm = false;
-  std::set<int> untold, look_alikes;
+  std::set<int> untold;
+  std::set<std::pair<int, int>> look_alikes;
   std::optional<ContestedSignals> contested;
 };
 
@@ -98,8 +99,11 @@ UnconnectedPart explain_leaf(int part, int num_seen, const LearnedStructure& str
 /// Where a valid model was taken back, or another explanation contends with it: that. Empty if none
 /// was.
 std::string why_taken_back(const TriedModels& tried, const LearnedStructure& structure) {
-  if (!tried.look_alikes.empty())
-    return names_of(tried.look_alikes, structure) +
+  std::string alike;
+  for (const auto& [one, other] : tried.look_alikes)
+    alike += (alike.empty() ? "" : "; ") + names_of(std::vector{one, other}, structure);
+  if (!alike.empty())
+    return alike +
            " move alike at all samples, and which of them moves it cannot be told: move them "
            "apart, or leave one of them out";
   if (structure.is_contested)

@@ -43,7 +43,7 @@ void settle_look_alikes(PairModels* pairs, ModelForest* forest) {
     for (const int signal : signal_set(forest->models()[m].model)) {
       const auto others = look_alikes.find(signal);
       if (others == look_alikes.end()) continue;
-      std::set<int> as_likely;
+      std::set<std::pair<int, int>> as_likely;
       const AcceptedModel present = forest->models()[m];
       for (const int other : others->second) {
         if (present.model.uses(other)) continue;
@@ -53,7 +53,8 @@ void settle_look_alikes(PairModels* pairs, ModelForest* forest) {
         changed.set_models(std::move(models));
         const double changed_cost = ComponentTree(changed, part, pairs).fit().cost();
         if (changed_cost < cost - kAmbiguityMargin) as_likely.clear();
-        if (std::abs(changed_cost - cost) < kAmbiguityMargin) as_likely.insert({signal, other});
+        if (std::abs(changed_cost - cost) < kAmbiguityMargin)
+          as_likely.insert(std::minmax(signal, other));
         if (changed_cost >= cost) continue;
         cost = changed_cost;
         *forest = std::move(changed);

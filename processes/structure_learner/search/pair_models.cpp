@@ -128,7 +128,7 @@ void PairModels::note_look_alikes(const Candidate& best, const Candidate& other)
   std::ranges::set_symmetric_difference(signal_set(best.model), signal_set(other.model),
                                         std::back_inserter(differ));
   if (differ.size() == 2 && actions_.are_alike(differ[0], differ[1]))
-    record(best.part_i, best.part_j).look_alikes.insert(differ.begin(), differ.end());
+    record(best.part_i, best.part_j).look_alikes.emplace(differ[0], differ[1]);
 }
 
 std::vector<NearMiss> PairModels::near_misses() const {

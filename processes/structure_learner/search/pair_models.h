@@ -46,9 +46,9 @@ struct PairRecord {
   /// Signals that moved too little while both were seen to tell whether they move the one against
   /// the other: why a model was taken back.
   std::set<int> untold_signals = {};
-  /// Signals that move alike, of which no pose tells which one moves the one part against the
-  /// other: why a model was taken back.
-  std::set<int> look_alikes = {};
+  /// Each two signals that move alike, of which no pose tells which one moves the one part against
+  /// the other: why a model was taken back.
+  std::set<std::pair<int, int>> look_alikes = {};
   /// A valid model has a joint that its tree does not need: redundant_edges().
   bool is_redundant = false;
   /// A valid model was taken back: time-shifted commands explain the motion nearly as well, it is a
