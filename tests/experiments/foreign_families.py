@@ -419,3 +419,16 @@ def _(rng, seed):
     body = tree(joints, {1: (0, placed(rng)), 2: (6, placed(rng, .02))})
     low, high = np.array([-1, -.7, 0, -2, -1, -1]), np.array([1, .7, .2, 2, 1, 1])
     return record(rng, seed, body, low, high, n=250, noise=(2e-4, .09 * DEG), drive=lambda u: u @ mix, distance=1)
+@family("34 stream, delay, velocities beside positions")
+def _(rng, seed):
+    rec = record_stream(rng, seed, .08, 0)
+    q, t = rec.commands[rec.train], rec.times[rec.train]
+    rates = np.gradient(q, t, axis=0) * (1 + .02 * rng.normal(0, 1, q.shape))
+    rec.commands = np.hstack([rec.commands, np.vstack([rates, np.zeros((len(rec.times) - len(t), 4))])])
+    return rec
+@family("35 commands and encoders")
+def _(rng, seed):
+    """Drives miss their commands by 0.02 to 0.5 degrees, as encoders report; by the last four signals the body moves."""
+    arm, u = marked(rng, serial_joints(rng, 4)), rng.uniform(-1.2, 1.2, (200, 4))
+    inputs = np.hstack([u, u + rng.choice([.02, .1, .5]) * DEG * rng.normal(0, 1, u.shape)])
+    return record(rng, seed, lambda q: arm(q[:, 4:]), [-1.2] * 8, 1.2, inputs=inputs)
