@@ -222,7 +222,7 @@ Controller::Answer Controller::on_marker_poses(const marker_poses_t& poses) {
 Controller::Answer Controller::on_sample(const sample_t& sample) {
   if (!sample_ || !is_same_action(*sample_, sample)) {
     fire(Event::kNewSample);
-    sample_age_.restart();
+    verdict_time_.restart();
   }
   sample_ = sample;
   see(sample.utime);
@@ -251,6 +251,11 @@ Controller::Answer Controller::on_body_schema(const body_schema_t& message) {
 
 Controller::Answer Controller::on_model_health(const model_health_t& health) {
   health_ = health;
+  // The monitor itself waits for the refiner, and not for ever.
+  if (sample_ && health.awaited_refinement == sample_->sample_index) {
+    verdict_time_.restart();
+    idle_.restart();
+  }
   decide();
   return answer();
 }
@@ -258,7 +263,7 @@ Controller::Answer Controller::on_model_health(const model_health_t& health) {
 Controller::Answer Controller::on_tick(std::int64_t now_us) {
   silent_ = silence(now_us);
   quiet_.elapsed_us(now_us);
-  sample_age_.elapsed_us(now_us);
+  verdict_time_.elapsed_us(now_us);
   if (!concerns(Event::kGivenUp)) idle_.restart(now_us);
   if (schema_ && !concerns(Event::kInputSilent) &&
       schema_silence_.elapsed_us(now_us) > config_.max_body_schema_silence_us) {

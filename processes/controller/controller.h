@@ -67,12 +67,11 @@ struct ControllerConfig {
 /// Of all targets the highest (epoch, target_id) counts; a repeated one does nothing. One whose
 /// epoch is more than kClockTolerance_us ahead of the clock is refused: every later one would count
 /// for less than it. The arm is its own (owns_arm) from the moment that a target can be served
-/// until it was reached and kept, is released, or was refused before it moved the arm. Taking it
-/// waits until the arm rests, the last settled action has its SAMPLE and the monitor, as long as it
-/// waits for the refiner itself, has judged that if it is TEST: the verdict is the same however
-/// fast learner and refiner are. A target that is not reached within its expiry is dropped, as by a
-/// HOLD. The next step of a path (num_way_points, same sender and epoch) is refused once the arm is
-/// held.
+/// until it was reached and kept, is released, or was refused before it moved the arm. Before it
+/// takes the arm it waits until the arm rests, the last settled action has its SAMPLE and, if that
+/// is TEST, the monitor has judged it (verdict_timeout, not counted while the monitor waits for the
+/// refiner). A target that is not reached within its expiry is dropped, as by a HOLD. The next step
+/// of a path (num_way_points, same sender and epoch) is refused once the arm is held.
 ///
 /// No part leaves the workspace on the way, by the schema; a solution towards which one would is
 /// dealt with like one that the driver rejects: another is tried, but not on the line from one way
@@ -299,7 +298,7 @@ class Controller {
   Stopwatch quiet_;                        ///< since the driver's last news
   Stopwatch idle_;                         ///< its own arm, but nothing is sent or awaited
   Stopwatch expiry_;
-  Stopwatch sample_age_;      ///< since the newest SAMPLE, or the monitor waited for its refinement
+  Stopwatch verdict_time_;    ///< since the newest SAMPLE, or the refiner was last waited for
   Stopwatch under_way_;       ///< since the newest MOVE was decided
   std::int64_t probed_ = -1;  ///< probes wanted up to this sample are made, or given up
   std::optional<Eigen::VectorXd> search_centre_;  ///< where an edge was heard to be invalid

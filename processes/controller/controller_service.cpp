@@ -174,15 +174,9 @@ void Controller::take(std::int64_t now_us) {
 }
 
 bool Controller::awaits_verdict(std::int64_t now_us) {
-  if (!sample_ || sample_->purpose != action_command_t::PURPOSE_TEST || !health_ ||
-      health_->judged_sample >= sample_->sample_index)
-    return false;
-  // The monitor itself waits, and not for ever.
-  if (health_->awaited_refinement == sample_->sample_index) {
-    sample_age_.restart(now_us);
-    idle_.restart(now_us);
-  }
-  return sample_age_.elapsed_us(now_us) < config_.verdict_timeout_us;
+  if (!sample_ || sample_->purpose != action_command_t::PURPOSE_TEST) return false;
+  const bool is_judged = health_ && health_->judged_sample >= sample_->sample_index;
+  return !is_judged && verdict_time_.elapsed_us(now_us) < config_.verdict_timeout_us;
 }
 
 bool Controller::aim_at_tag() {

@@ -91,7 +91,7 @@ BodySchema refined_schema(const BodySchema& start, const std::vector<RefinerSamp
     }
   }
   if (problem.drive()) problem.drive_model().set_warps(*problem.drive(), &schema);
-  schema.frame_covariances = frame_covariances(start, samples, problem, information);
+  schema.frame_covariances = frame_covariances(schema, samples, problem, information);
   schema.refined = true;
   schema.base_version = start.version;
   schema.last_sample_index = std::max(start.last_sample_index, samples.back().sample.sample_index);

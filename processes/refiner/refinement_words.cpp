@@ -86,13 +86,18 @@ std::string RefinementWords::thing_of(const ParameterBlock& block) const {
   return "";
 }
 
+const ScrewJoint& RefinementWords::joint_of(const ParameterBlock& block, int direction) const {
+  const std::vector<ScrewJoint>& joints = schema_.edges[block.id].joints;
+  return joints[std::min(static_cast<std::size_t>(direction / 8), joints.size() - 1)];
+}
+
 std::string RefinementWords::edge_name(const ParameterBlock& block, int direction) const {
   const Edge& edge = schema_.edges[block.id];
   const std::string thing = thing_of(block);
   if (edge.joints.empty()) return fmt::format("{}, {}", thing, kPoseWords[direction]);
   const int d = direction / 8, component = direction % 8;
   const int num_joints = static_cast<int>(edge.joints.size());
-  const ScrewJoint& joint = edge.joints[std::min(d, num_joints - 1)];
+  const ScrewJoint& joint = joint_of(block, direction);
   const std::string& signal = schema_.signals.at(joint.signal).name;
   if (d == num_joints) {
     if (component == 5 && joint.turn != 0) return fmt::format("offset of {} ({})", signal, thing);
@@ -154,13 +159,12 @@ std::vector<std::string> RefinementWords::undetermined() const {
 std::string RefinementWords::advice(const Place& one, const Place& other) const {
   std::set<int> tags;
   std::set<std::string> signals;
-  for (const ParameterBlock* block : {one.block, other.block}) {
-    if (block->kind == Kind::kLens)
-      return "show tags nearer and farther, and at the image's border";
-    if (block->kind == Kind::kTag) tags.insert(block->id);
-    if (block->kind != Kind::kEdge) continue;
-    for (const ScrewJoint& joint : schema_.edges[block->id].joints)
-      signals.insert(schema_.signals.at(joint.signal).name);
+  for (const Place& place : {one, other}) {
+    const ParameterBlock& block = *place.block;
+    if (block.kind == Kind::kLens) return "show tags nearer and farther, and at the image's border";
+    if (block.kind == Kind::kTag) tags.insert(block.id);
+    if (block.kind != Kind::kEdge || schema_.edges[block.id].joints.empty()) continue;
+    signals.insert(schema_.signals.at(joint_of(block, place.direction).signal).name);
   }
   if (tags.size() > 1) return fmt::format("show tags {} in one image", fmt::join(tags, ", "));
   if (signals.empty()) return "";

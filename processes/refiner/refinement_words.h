@@ -34,6 +34,8 @@ class RefinementWords {
   };
   void add(const ParameterBlock& block);
   std::string name_of(const ParameterBlock& block, int direction) const;
+  /// The joint of an edge that a direction is of; of the last link the last one.
+  const ScrewJoint& joint_of(const ParameterBlock& block, int direction) const;
   std::string edge_name(const ParameterBlock& block, int direction) const;
   std::string unit_of(const ParameterBlock& block, int direction) const;
   std::string thing_of(const ParameterBlock& block) const;

@@ -75,7 +75,10 @@ CornerResidual::CornerResidual(PartChain chain, const std::vector<const Paramete
       size_m_(size_m),
       lens_(lens),
       measured_px_(sight.corners_px),
-      whitener_(whitener_from(covariance_px2)) {}
+      whitener_(whitener_from(covariance_px2)) {
+  if (effects_.size() > 0 && effects_.rows() != play_.num)
+    throw std::logic_error("the drive has other joints than those that are off their commands");
+}
 
 CornerResidual::Play CornerResidual::find_play() const {
   const auto found = std::ranges::find(blocks_, ParameterBlock::Kind::kInstant,
@@ -85,13 +88,11 @@ CornerResidual::Play CornerResidual::find_play() const {
   const bool has_root = elements.starts_with("X");
   return {.block = static_cast<int>(found - blocks_.begin()),
           .value = has_root ? ParameterBlock::kPoseSize : 0,
-          .tangent = has_root ? 6 : 0,
           .num = static_cast<int>(elements.size()) - (has_root ? 1 : 0)};
 }
 
-// Of all joints what they are off at the instant and what the drive adds to it.
-Eigen::VectorXd CornerResidual::beyond(double const* const* parameters) const {
-  Eigen::VectorXd sum = Eigen::VectorXd::Zero(std::max<Eigen::Index>(play_.num, effects_.rows()));
+Eigen::VectorXd CornerResidual::joint_offsets(double const* const* parameters) const {
+  Eigen::VectorXd sum = Eigen::VectorXd::Zero(play_.num);
   if (play_.num > 0)
     sum += Eigen::Map<const Eigen::VectorXd>(parameters[play_.block] + play_.value, play_.num);
   if (effects_.size() > 0)
@@ -124,7 +125,7 @@ bool CornerResidual::Evaluate(double const* const* parameters, double* residuals
   if (!(size_m > 0 && lens_parameters.head<2>().minCoeff() > 0)) return false;
   const Lens lens = lens_.with(lens_parameters);
   std::vector<PartChain::Jacobian> by_block;
-  const Eigen::VectorXd play = beyond(parameters);
+  const Eigen::VectorXd play = joint_offsets(parameters);
   PartChain::Jacobian by_play = PartChain::Jacobian::Zero(6, play.size());
   const bool has_play = play.size() > 0;
   const Pose X_CM =

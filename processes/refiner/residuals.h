@@ -71,12 +71,13 @@ class CornerResidual final : public ChainResidual {
   Eigen::Matrix<double, 2, Eigen::Dynamic> by_lens(const Eigen::VectorXd& lens,
                                                    const Eigen::Vector2d& ray) const;
 
-  /// Which block has the plays, and where they begin in its values and in its tangent.
+  /// Which block has the plays, and where they begin in its values.
   struct Play {
-    int block = -1, value = 0, tangent = 0, num = 0;
+    int block = -1, value = 0, num = 0;
   };
   Play find_play() const;
-  Eigen::VectorXd beyond(double const* const* parameters) const;
+  /// By how far each joint goes beyond its command: its play at the instant, and the drive's.
+  Eigen::VectorXd joint_offsets(double const* const* parameters) const;
 
   const Play play_;
   const double size_m_;

@@ -94,7 +94,8 @@ LearnResult fit_tree(const LearnedStructure& structure,
   schema.noise.rotation_rad *= measurement.scale;
 
   // Everything that is fitted sees displacements.
-  const std::vector<ActionPoseSample> moved = displaced(samples, structure.signals);
+  const std::vector<ActionPoseSample> moved =
+      displaced(held_still(samples, structure.rates), structure.signals);
   const NormalizedActions actions(moved, num_signals);
   MeasurementModel told = measurement;
   if (options.measurement.noise || has_covariances(samples)) told.scale = options.measurement.scale;
@@ -413,16 +414,15 @@ LearnedStructure find_structure(const std::vector<Signal>& signals,
   const std::vector<int> alone = parts_without_rotation(samples);
   const std::vector<ActionPoseSample> distinct =
       with_uniform_parts(without_repetitions(samples), alone);
-  std::optional<LearnedStructure> without;
-  if (const std::vector<int> rates = rates_of_others(distinct, num_signals); !rates.empty()) {
-    without = find_delayed(signals, held_still(distinct, rates), alone, options);
-    without->rates = rates;
-    if (without->spans()) return *std::move(without);
-  }
+  const std::vector<int> rates = rates_of_others(distinct, num_signals);
+  if (rates.empty()) return find_delayed(signals, distinct, alone, options);
+  LearnedStructure without_rates =
+      find_delayed(signals, held_still(distinct, rates), alone, options);
+  without_rates.rates = rates;
+  if (without_rates.spans()) return without_rates;
   LearnedStructure structure = find_delayed(signals, distinct, alone, options);
-  if (without && without->search.models.size() >= structure.search.models.size())
-    return *std::move(without);
-  return structure;
+  const bool is_worse = structure.search.models.size() < without_rates.search.models.size();
+  return is_worse ? without_rates : structure;
 }
 
 LearnResult fit_structure(const LearnedStructure& structure,

@@ -103,7 +103,7 @@ struct LearnedStructure {
 /// Parts that have positions alone are put in when the parts that have poses are
 /// (position_leaves.h). Where the poses of a stream come after their commands (command_lag.h), each
 /// counts with the command that brought it there. Signals that are the rates of others are left out
-/// where the structure spans without them.
+/// where the structure spans without them, or has more edges.
 /// @throws std::invalid_argument as learn().
 LearnedStructure find_structure(const std::vector<Signal>& signals,
                                 const std::vector<ActionPoseSample>& samples,

@@ -1,6 +1,7 @@
 #include "processes/structure_learner/signal_rates.h"
 
 #include <Eigen/Core>
+#include <algorithm>
 
 #include "processes/structure_learner/command_track.h"
 #include "processes/structure_learner/pair_data.h"
@@ -8,48 +9,50 @@
 namespace bodyschema {
 namespace {
 
-/// Samples over which a rate is summed: at 30 Hz a quarter of a second, over which what encoders
-/// round averages out.
+/// Samples over which a rate is summed. Chosen: a quarter of a second at 30 Hz, over which what
+/// encoders round averages out.
 constexpr std::size_t kWindow = 8;
-/// Correlation from which on one is the rate of the other. Chosen: of a rate that has noise of a
-/// tenth of itself and comes 50 ms late, 0.99; of joints that swing at random in rhythms of their
-/// own, at most 0.5 within a minute.
-constexpr double kIsRate = 0.97;
+/// Chosen: rates with noise of a tenth of themselves have 0.99 (test SignalRates), joints that
+/// swing in rhythms of their own at most 0.5.
+constexpr double kLeastCorrelation = 0.97;
+
+/// Of the rows of x and y about 0, and about their means: the less of both.
+double correlation(const Eigen::ArrayXd& x, const Eigen::ArrayXd& y) {
+  const auto of = [](const Eigen::ArrayXd& a, const Eigen::ArrayXd& b) {
+    const double squares = a.square().sum() * b.square().sum();
+    return squares > 0 ? (a * b).sum() / std::sqrt(squares) : 0.0;
+  };
+  return std::min(of(x, y), of(x - x.mean(), y - y.mean()));
+}
 
 }  // namespace
 
 std::vector<int> rates_of_others(const std::vector<ActionPoseSample>& samples, int num_signals) {
-  if (samples.size() <= kWindow || !NormalizedActions(samples, num_signals).blocks().is_stream())
+  if (samples.size() <= kWindow || !std::ranges::is_sorted(samples, {}, time_of) ||
+      !NormalizedActions(samples, num_signals).blocks().is_stream())
     return {};
   const CommandTrack track(samples);
-  // Over every window without a gap: by what each signal moves, and what it sums up to.
-  std::vector<Eigen::VectorXd> steps, sums;
+  // Of every window without a gap: what each signal sums up to, and by what it moves.
+  Eigen::MatrixXd sums(num_signals, std::ssize(samples)), steps = sums;
+  Eigen::MatrixXd areas = Eigen::MatrixXd::Zero(num_signals, std::ssize(samples));
+  Eigen::Index num_windows = 0;
   std::size_t num_in_row = 0;
-  Eigen::MatrixXd area =
-      Eigen::MatrixXd::Zero(num_signals, std::ssize(samples));  // since the start
   for (std::size_t n = 1; n < samples.size(); ++n) {
-    const auto column = static_cast<Eigen::Index>(n);
+    const auto now = static_cast<Eigen::Index>(n);
     const double apart_s = 1e-6 * (time_of(samples[n]) - time_of(samples[n - 1]));
-    area.col(column) =
-        area.col(column - 1) + 0.5 * apart_s * (samples[n].action + samples[n - 1].action);
+    areas.col(now) =
+        areas.col(now - 1) + 0.5 * apart_s * (samples[n].action + samples[n - 1].action);
     num_in_row = track.is_behind_gap(n) ? 0 : num_in_row + 1;
     if (num_in_row < kWindow) continue;
-    steps.emplace_back(samples[n].action - samples[n - kWindow].action);
-    sums.emplace_back(area.col(column) - area.col(column - static_cast<Eigen::Index>(kWindow)));
+    steps.col(num_windows) = samples[n].action - samples[n - kWindow].action;
+    sums.col(num_windows++) = areas.col(now) - areas.col(now - static_cast<Eigen::Index>(kWindow));
   }
-  if (steps.empty()) return {};
-  Eigen::MatrixXd S(num_signals, std::ssize(steps)), A = S;
-  for (std::size_t n = 0; n < steps.size(); ++n) {
-    S.col(static_cast<Eigen::Index>(n)) = steps[n];
-    A.col(static_cast<Eigen::Index>(n)) = sums[n];
-  }
-  // A rate has no offset of its own, but windows may be of various lengths.
-  const Eigen::VectorXd of_steps = S.rowwise().norm(), of_sums = A.rowwise().norm();
   std::vector<int> rates;
   for (int rate = 0; rate < num_signals; ++rate)
     for (int signal = 0; signal < num_signals; ++signal)
-      if (signal != rate && of_steps(signal) > 0 && of_sums(rate) > 0 &&
-          A.row(rate).dot(S.row(signal)) > kIsRate * of_sums(rate) * of_steps(signal)) {
+      if (signal != rate && num_windows > 0 &&
+          correlation(sums.row(rate).head(num_windows), steps.row(signal).head(num_windows)) >
+              kLeastCorrelation) {
         rates.push_back(rate);
         break;
       }

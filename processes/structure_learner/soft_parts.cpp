@@ -15,6 +15,7 @@
 #include "processes/structure_learner/noise_estimate.h"
 #include "processes/structure_learner/residual_fit.h"
 #include "processes/structure_learner/screen.h"
+#include "processes/structure_learner/search/look_alikes.h"
 
 namespace bodyschema {
 namespace {
@@ -251,10 +252,6 @@ void withdraw_screws(const std::vector<ActionPoseSample>& samples, const Normali
 void connect_soft_parts(const std::vector<ActionPoseSample>& samples,
                         const NormalizedActions& actions, const std::vector<int>& parts,
                         const SearchOptions& options, bool is_noise_guessed, SearchResult* found) {
-  // Nor would a process tell which of the signals it is.
-  if (std::ranges::any_of(found->records,
-                          [](const auto& record) { return !record.second.look_alikes.empty(); }))
-    return;
   const bool is_stream = actions.blocks().is_stream();
   std::vector<SoftCandidate> candidates;
   if (is_stream) withdraw_screws(samples, actions, options, found, &candidates);
@@ -280,9 +277,14 @@ void connect_soft_parts(const std::vector<ActionPoseSample>& samples,
   };
   std::ranges::stable_sort(candidates, {}, rank);
   // Screws may be all that is between two parts: a process on the way around them is none either.
-  for (SoftCandidate& c : candidates)
-    if (components.join(c.model.part_i, c.model.part_j) && !c.is_contested)
+  for (SoftCandidate& c : candidates) {
+    if (!components.join(c.model.part_i, c.model.part_j) || c.is_contested) continue;
+    const auto alike = look_alikes_of(c.model, actions);
+    if (alike.empty())
       found->models.push_back(std::move(c.model));
+    else
+      found->records[{c.model.part_i, c.model.part_j}].look_alikes = alike;
+  }
 }
 
 }  // namespace bodyschema

@@ -33,7 +33,8 @@ SearchResult search_structure(const std::vector<ActionPoseSample>& samples,
     settled = settle_trees(&layers.spare(), &pairs, &forest);
   if (!forest.spans() && connect_mimic_joints(&pairs, &forest))
     settled = settle_trees(&layers.spare(), &pairs, &forest);
-  settle_look_alikes(&pairs, &forest);
+  if (std::vector<Candidate> none; settle_look_alikes(&pairs, &forest))
+    settled = settle_trees(&none, &pairs, &forest);
   SearchResult result;
   result.joint_information = withdraw_untold_edges(&pairs, &forest);
   result.unknown_gains = chains_with_unknown_gains(&pairs, forest);

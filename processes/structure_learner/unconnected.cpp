@@ -64,6 +64,7 @@ TriedModels tried_models(int part, const std::set<int>& connected, const SearchR
   for (const auto& [pair, record] : search.records) {
     if (pair.first != part && pair.second != part) continue;
     // What is by chance may have connected both.
+    tried.look_alikes.insert(record.look_alikes.begin(), record.look_alikes.end());
     tried.is_by_chance |= record.is_by_chance;
     tried.is_too_short |= record.is_too_short;
     tried.has_one_rhythm |= record.has_one_rhythm;
@@ -71,7 +72,6 @@ TriedModels tried_models(int part, const std::set<int>& connected, const SearchR
     if (!connected.count(other)) continue;
     tried.undecided |= !record.undecided.empty();
     tried.untold.insert(record.untold_signals.begin(), record.untold_signals.end());
-    tried.look_alikes.insert(record.look_alikes.begin(), record.look_alikes.end());
     tried.was_soft_tried |= record.was_soft_tried;
     tried.moves_little |= record.moves_little;
     tried.is_redundant |= record.is_redundant;
@@ -104,8 +104,8 @@ std::string why_taken_back(const TriedModels& tried, const LearnedStructure& str
     alike += (alike.empty() ? "" : "; ") + names_of(std::vector{one, other}, structure);
   if (!alike.empty())
     return alike +
-           " move alike at all samples, and which of them moves it cannot be told: move them "
-           "apart, or leave one of them out";
+           " move alike at all samples, or nearly so, and which of them moves it cannot be told: "
+           "move them apart, or leave one of them out";
   if (structure.is_contested)
     return "another structure fits if the noise is larger than it is said to be: tell the true "
            "noise, or give more samples";
@@ -227,7 +227,7 @@ std::vector<int> undecided_signals(const BodySchema& schema, const LearnedStruct
   for (const AcceptedModel& model : structure.search.models)
     result.insert(model.doubtful_signals.begin(), model.doubtful_signals.end());
   for (const int s : schema.unused_signals()) {
-    // What nothing is left to be explained by.
+    // The structure is complete without the rates.
     if (schema.complete && std::ranges::count(structure.rates, s) > 0) continue;
     const auto information = structure.search.joint_information.find(s);
     if (schema.complete && information != structure.search.joint_information.end()) {

@@ -78,7 +78,7 @@ Noise noise_given(const std::vector<double>& numbers) {
     if (!std::isfinite(number) || number <= 0) refuse("expected two standard deviations above 0");
   const Noise noise{numbers[0], numbers[1] * kDegree};
   if (noise.position_m > 1000 * kNoiseCeiling.position_m)
-    refuse(fmt::format("{} m is no noise of a marker; at most {} are", numbers[0],
+    refuse(fmt::format("{} m is no noise of a marker; at most {} m are", numbers[0],
                        kNoiseCeiling.position_m));
   if (noise.position_m > kNoiseCeiling.position_m)
     refuse(fmt::format("{} m is no noise of a marker; did you mean: --noise {} {}", numbers[0],

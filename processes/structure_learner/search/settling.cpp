@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <optional>
+#include <set>
 
 #include "common/kinematics/kinematic_tree.h"
 #include "processes/structure_learner/search/component_tree.h"
@@ -43,46 +44,54 @@ bool exchange(const ComponentTree& tree, int signal, double cost, std::vector<Ca
   return true;
 }
 
-// Three parts of which one signal moves each against the others, an edge between the first and the
-// second and one between the second and the third: a spare model between the first and the third.
-std::optional<Candidate> across(const AcceptedModel& one, const AcceptedModel& other,
-                                const std::vector<Candidate>& spare, PairModels* pairs) {
-  if (one.model.num_joints() != 1 || signal_set(one.model) != signal_set(other.model) ||
-      other.model.num_joints() != 1)
-    return std::nullopt;
+bool is_one_joint_on(int signal, const LocalModel& model) {
+  return model.num_joints() == 1 && model.uses(signal);
+}
+
+// Of three parts that one signal moves against each other, two edges given: a spare model for the
+// third one.
+const Candidate* closing_candidate(const AcceptedModel& one, const AcceptedModel& other,
+                                   std::vector<Candidate>* spare, PairModels* pairs) {
+  if (one.model.num_joints() != 1) return nullptr;
+  const int signal = one.model.joints.front().signal;
+  if (!is_one_joint_on(signal, other.model)) return nullptr;
   std::set<int> ends = {one.part_i, one.part_j};
   for (const int part : {other.part_i, other.part_j})
     if (!ends.insert(part).second) ends.erase(part);
-  if (ends.size() != 2) return std::nullopt;
-  for (Candidate c : spare)
-    if (c.joins(*ends.begin(), *ends.rbegin()) && signal_set(c.model) == signal_set(one.model) &&
-        c.model.num_joints() == 1 && !pairs->is_refuted(c.part_i, c.part_j, c.model) &&
-        pairs->confirm_on_all_data(&c))
-      return c;
-  return std::nullopt;
+  if (ends.size() != 2) return nullptr;
+  for (Candidate& c : *spare)
+    if (c.joins(*ends.begin(), *ends.rbegin()) && is_one_joint_on(signal, c.model) &&
+        !pairs->is_refuted(c.part_i, c.part_j, c.model) && pairs->confirm_on_all_data(&c))
+      return &c;
+  return nullptr;
 }
 
-// Two fingers on one signal turn against each other about no fixed axis, yet in noise one screw may
-// pass for it. Of the two edges between three such parts, those with which all poses cost least.
-// False if they stay.
-bool exchange_siblings(const ComponentTree& tree, double cost, const std::vector<Candidate>& spare,
-                       PairModels* pairs, ModelForest* forest) {
+// Two fingers on one signal turn against each other about an axis that moves; in noise one screw
+// may pass for that, and pairs do not tell which two of the three edges are right. Takes those with
+// which the poses of the tree cost least, by whatever little: one of the three is as simple as the
+// other. False if they stay.
+bool exchange_siblings(const ComponentTree& tree, std::vector<Candidate>* spare, PairModels* pairs,
+                       ModelForest* forest) {
   const int root = tree.nodes().front().part;
-  const std::vector<AcceptedModel>& present = forest->models();
+  const std::vector<AcceptedModel> present = forest->models();
+  double cost = -1;
   std::vector<AcceptedModel> best;
   for (std::size_t m = 0; m < present.size(); ++m)
-    for (std::size_t n = 0; n < present.size(); ++n) {
-      if (m == n || !forest->connected(root, present[m].part_i)) continue;
-      const auto third = across(present[m], present[n], spare, pairs);
+    for (std::size_t n = 0; n < m; ++n) {
+      if (!forest->connected(root, present[m].part_i)) continue;
+      const Candidate* third = closing_candidate(present[m], present[n], spare, pairs);
       if (!third) continue;
-      std::vector<AcceptedModel> models = present;
-      models[n] = *third;
-      ModelForest other = *forest;
-      other.set_models(models);
-      const double other_cost = ComponentTree(other, root, pairs).fit().cost();
-      if (other_cost >= cost) continue;
-      cost = other_cost;
-      best = std::move(models);
+      if (cost < 0) cost = tree.fit().cost();
+      for (const std::size_t replaced : {m, n}) {
+        std::vector<AcceptedModel> models = present;
+        models[replaced] = *third;
+        ModelForest other = *forest;
+        other.set_models(models);
+        const double other_cost = ComponentTree(other, root, pairs).fit().cost();
+        if (other_cost >= cost) continue;
+        cost = other_cost;
+        best = std::move(models);
+      }
     }
   if (best.empty()) return false;
   forest->set_models(std::move(best));
@@ -93,14 +102,14 @@ bool exchange_siblings(const ComponentTree& tree, double cost, const std::vector
 TreeFit settle_tree(int part, std::vector<Candidate>* spare, PairModels* pairs, ModelForest* forest,
                     std::vector<AcceptedModel>* refuted) {
   constexpr int kMaxSplits = 12;
-  for (int round = 1;; ++round) {
+  for (int num_splits = 0;;) {
     const ComponentTree tree(*forest, part, pairs);
     TreeFit fit = tree.fit();
     const auto worst =
         tree.nodes().size() < 2 ? std::nullopt : missing_joint(*forest, *pairs, &fit);
-    if (!worst && round < kMaxSplits && exchange_siblings(tree, fit.cost(), *spare, pairs, forest))
-      continue;
-    if (!worst || round == kMaxSplits) return fit;
+    // Each time it costs less: it ends.
+    if (!worst && exchange_siblings(tree, spare, pairs, forest)) continue;
+    if (!worst || ++num_splits == kMaxSplits) return fit;
     if (exchange(tree, worst->signal, fit.cost(), spare, pairs, forest)) continue;
     if (const auto edges = insert_joint(fit.nodes(), *worst)) {
       tree.replace_edges(*edges, forest);

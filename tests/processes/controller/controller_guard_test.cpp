@@ -140,16 +140,22 @@ TEST(ControllerTest, TakingTheArmWaitsForTheVerdictOnATestSample) {
 }
 
 TEST(ControllerTest, AVerdictIsNotAwaitedForEver) {
-  Bench bench;
-  bench.health = health_of(1, 2, 3, schema_edge_t::EDGE_OK);
-  bench.health->judged_sample = bench.health->awaited_refinement = -1;
-  bench.start();
-  bench.arm = {20, 0.1, 4};
-  bench.settle("motor_babbler", 1, 12, bench.arm, action_command_t::PURPOSE_TEST);
-  bench.give(position_target(0, kNear));
-  bench.run(8);
-  EXPECT_TRUE(bench.moves.empty());
-  EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+  // Nobody judges; or who waited for the refiner is heard no more.
+  for (const std::int64_t awaited : {-1, 0}) {
+    Bench bench;
+    bench.health = health_of(1, 2, 3, schema_edge_t::EDGE_OK);
+    bench.health->judged_sample = bench.health->awaited_refinement = -1;
+    bench.start();
+    bench.arm = {20, 0.1, 4};
+    bench.settle("motor_babbler", 1, 12, bench.arm, action_command_t::PURPOSE_TEST);
+    bench.health->awaited_refinement = awaited;
+    bench.repeat();
+    bench.give(position_target(0, kNear));
+    if (awaited == 0) bench.health.reset();
+    bench.run(8);
+    EXPECT_TRUE(bench.moves.empty());
+    EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
+  }
 }
 
 TEST(ControllerTest, AMoveThatNeverEndsIsHeld) {

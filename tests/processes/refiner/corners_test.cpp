@@ -102,7 +102,7 @@ TEST(RefineCorners, FindPlacementsAndLensFromExactCorners) {
   EXPECT_NEAR(mean, 1, 2e-4);
 }
 
-// As exactly as those of straight commands, though each joint may be off its command as well.
+// To the noise of the corners, though each joint may be off its command at every sample as well.
 TEST(RefineCorners, BendCommandsWithTheRest) {
   Rng rng(3);
   TaggedRobot robot = test::tagged(test::chapter_robot("a", rng), 4, rng);

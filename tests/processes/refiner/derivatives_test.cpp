@@ -2,6 +2,7 @@
 
 #include <Eigen/Core>
 #include <memory>
+#include <utility>
 #include <vector>
 
 #include "common/geometry/angle.h"
@@ -144,8 +145,17 @@ TEST(Residuals, OfCornersHaveTheirDerivatives) {
     expect_right(moved, {});
     robot.blocks.push_back(&drive);
     expect_right(moved, effects);
+    // Of a root that moves, the plays are in its block.
+    ParameterBlock instant =
+        pose_block(ParameterBlock::Kind::kInstant, pose_at(robot.root.values.data()));
+    for (int n = 0; n < 4; ++n) {
+      instant.free.push_back(6 + n);
+      instant.add(0.01 * test::gaussian(rng));
+    }
+    const ParameterBlock* const rests = std::exchange(robot.blocks[0], &instant);
     robot.blocks.erase(robot.blocks.end() - 2);
     expect_right(moved, effects);
+    robot.blocks[0] = rests;
   }
 }
 

@@ -1,6 +1,7 @@
 #include <gtest/gtest.h>
 
 #include <cmath>
+#include <set>
 #include <utility>
 
 #include "common/geometry/angle.h"
@@ -10,6 +11,7 @@
 #include "processes/structure_learner/search/hidden_bodies.h"
 #include "processes/structure_learner/search/layered_search.h"
 #include "processes/structure_learner/search/long_chains.h"
+#include "processes/structure_learner/search/look_alikes.h"
 #include "processes/structure_learner/search/settling.h"
 #include "processes/structure_learner/search/withdrawal.h"
 #include "tests/support/synthetic_robot.h"
@@ -327,6 +329,35 @@ int count_right(const std::vector<HingedLink>& links, int num_signals, Regime re
     num_right += rightness == test::Rightness::kRight;
   }
   return num_right;
+}
+
+// Of three signals one differs by far more than the poses miss, and two by less.
+TEST(SettleLookAlikes, NamesThoseThatAreAsLikely) {
+  Rng rng(4);
+  auto samples =
+      test::babble(hinge(1, rng), 40, {.regime = Regime::kTagIso, .with_covariances = true}, rng);
+  for (ActionPoseSample& sample : samples) {
+    const double q = sample.action(0);
+    sample.action.resize(3);
+    sample.action << q + test::uniform(rng, -0.1, 0.1), -q, -q + test::uniform(rng, -1e-4, 1e-4);
+  }
+  const NormalizedActions actions(samples, 3);
+  SearchOptions options;
+  PairModels pairs(samples, actions, {1, 2, 3}, options);
+  const auto fitted = [&](int i, int j, int signal) {
+    LocalModel start = screen_rigid(pairs.pair(i, j), actions).model;
+    for (const ScrewRegression& r : screen_one_joint(pairs.motions(i, j), actions))
+      if (r.signal == signal) start = one_joint_start(r, pairs.pair(i, j), actions, 1e-9).model;
+    return AcceptedModel{i, j, fit_local_model(start, pairs.pair(i, j), actions, 40).model};
+  };
+  ModelForest forest({1, 2, 3});
+  forest.add(fitted(1, 2, 0));
+  forest.add(fitted(2, 3, -1));
+  EXPECT_TRUE(settle_look_alikes(&pairs, &forest));
+  ASSERT_EQ(forest.models().size(), 1u);
+  EXPECT_TRUE(forest.models()[0].joins(2, 3));
+  EXPECT_EQ(pairs.record(1, 2).look_alikes, (std::set{std::pair(1, 2)}));
+  EXPECT_FALSE(settle_look_alikes(&pairs, &forest));
 }
 
 TEST(HiddenBodies, CarryABranchOfThreeJoints) {

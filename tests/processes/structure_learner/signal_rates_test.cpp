@@ -3,7 +3,9 @@
 #include <gtest/gtest.h>
 
 #include <algorithm>
+#include <cmath>
 #include <cstdint>
+#include <utility>
 #include <vector>
 
 #include "processes/structure_learner/learn.h"
@@ -54,6 +56,33 @@ TEST(SignalRates, AreFoundBesideTheirSignals) {
         << seed;
     EXPECT_TRUE(rates_of_others(robot.wander(1000, 60), kJoints).empty()) << seed;
   }
+}
+
+// A signal that hardly varies, beside one that always goes the same way; and beside one that goes
+// to and fro as it does, a quarter of a turn later.
+TEST(SignalRates, AreNoneThatOnlyHaveTheSameSign) {
+  std::vector<ActionPoseSample> samples(1000);
+  test::Rng rng(1);
+  double level = 0;
+  for (std::size_t n = 0; n < samples.size(); ++n) {
+    samples[n].sample_index = static_cast<std::int64_t>(n);
+    samples[n].utime = 33'333 * static_cast<std::int64_t>(n);
+    const double t = 0.033 * static_cast<double>(n);
+    level += 0.1 * (test::gaussian(rng) - level);
+    samples[n].action = Eigen::Vector3d(0.3 * t, 0.5 + 0.1 * level, std::sin(t));
+  }
+  EXPECT_TRUE(rates_of_others(samples, 3).empty());
+  std::swap(samples[500], samples[501]);
+  EXPECT_TRUE(rates_of_others(samples, 3).empty());
+}
+
+TEST(SignalRates, AreFoundAroundGaps) {
+  test::Rng rng(2);
+  ImperfectRobot robot(kJoints, true, {}, 2);
+  std::vector<ActionPoseSample> samples = with_rates(robot, 0, rng);
+  for (std::size_t n = 300; n < samples.size(); ++n) samples[n].utime += 100'000'000;
+  samples.erase(samples.begin() + 600, samples.begin() + 700);
+  EXPECT_EQ(rates_of_others(samples, 2 * kJoints), (std::vector<int>{3, 4, 5}));
 }
 
 TEST(SignalRates, AreNoneOfPosesAtRest) {

@@ -115,11 +115,11 @@ TEST(Unconnected, PartsOfSignalsThatMoveAlikeAreToldSo) {
       contains(schema.unconnected, robot.signals[0].name + ", reported move alike at all samples"));
 }
 
-// Of which of two signals that move alike a joint is, no pose tells, be its model found between its
-// own parts or by all of them; of signals that differ by what poses show it is.
+// Where signals that move alike explain a joint as well as each other, its edge is left open, be it
+// found between its own parts or by all of them; where they differ by what poses show, it is told.
 TEST(Unconnected, AreJointsOfASignalThatAnotherOneFollows) {
   for (const double miss : {0.0, 0.0005, 0.02})
-    for (int seed = 1; seed <= 3; ++seed) {
+    for (int seed = 1; seed <= 2; ++seed) {
       Rng rng(seed);
       const test::SyntheticRobot robot = test::chapter_robot("c", rng);
       auto samples = test::babble(robot, 60, {.regime = Regime::kTagIso}, rng);
