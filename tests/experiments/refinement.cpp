@@ -193,7 +193,7 @@ void run_nominal(int num_robots) {
       "Arms of seven joints, tag noise, base and end seen or the end alone; the model as built is "
       "off by 5 mm and 1° per axis and link. Rms over robots and test poses of the end's position "
       "in the base's frame, or in the camera's where the base was never seen; coverage of the "
-      "predicted ellipsoids of 95 %%; directions that the samples do not tell.\n\n"
+      "predicted ellipsoids of 95 %%; edges with a direction that the samples do not tell.\n\n"
       "| seen | N | robots | bound mm | as built mm | refined mm | refined / bound | coverage %% | "
       "undetermined | ms |\n"
       "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |\n");
