@@ -173,7 +173,7 @@ bool drop_wrong_at_some_commands(const TreeFit& fit, std::vector<FittedEdge>* fi
           samples.push_back(fit.sample(t));
           outlying.push_back(reading->squared_distance > outlier_threshold(reading->num_residuals));
         }
-      return is_wrong_at_some_commands(edge.edge.signals(), samples, outlying, fit.actions());
+      return is_wrong_at_some_commands(samples, outlying, fit.actions());
     }
     return false;
   };
@@ -239,7 +239,7 @@ LocalModel rescaled(LocalModel model, const NormalizedActions& from, const Norma
 }
 
 bool is_wrong_at_some_commands(const FittedEdge& fitted, const NormalizedActions& actions) {
-  return is_wrong_at_some_commands(fitted.edge.signals(), fitted.frames, fitted.outlying, actions);
+  return is_wrong_at_some_commands(fitted.frames, fitted.outlying, actions);
 }
 
 bool is_wrong_at_an_end(const FittedEdge& fitted, const TimeBlocks& blocks) {

@@ -31,6 +31,7 @@ enum class Refusal {
   kNotValid,             ///< on all of its data
   kWrongAtSomeCommands,  ///< is_wrong_at_some_commands()
   kWrongAtAnEnd,         ///< is_wrong_at_an_end()
+  kSecondPlace,          ///< keeps_to_second_place()
   kContradicted,         ///< by all other parts, at most instants
 };
 /// By the edge's parts, the lower first.

@@ -17,6 +17,7 @@
 #include "processes/structure_learner/one_cluster.h"
 #include "processes/structure_learner/root_pose.h"
 #include "processes/structure_learner/search/withdrawal.h"
+#include "processes/structure_learner/second_place.h"
 #include "processes/structure_learner/signal_rates.h"
 #include "processes/structure_learner/soft_parts.h"
 #include "processes/structure_learner/surrogate_commands.h"
@@ -113,6 +114,8 @@ LearnResult fit_tree(const LearnedStructure& structure,
       why = Refusal::kWrongAtSomeCommands;
     else if (!options.is_monitored && is_wrong_at_an_end(fit, actions.blocks()))
       why = Refusal::kWrongAtAnEnd;
+    else if (!options.is_monitored && keeps_to_second_place(fit, data))
+      why = Refusal::kSecondPlace;
     if (why) {
       refused[std::minmax(from, to)] = *why;
       return false;
@@ -467,7 +470,8 @@ LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPo
   // An edge that all parts together refuse may have kept out a right one.
   LearnOptions others = options;
   for (const auto& [ends, why] : result.refused)
-    if (why != Refusal::kWrongAtAnEnd) others.unconnectable.insert(ends);
+    if (why != Refusal::kWrongAtAnEnd && why != Refusal::kSecondPlace)
+      others.unconnectable.insert(ends);
   if (others.unconnectable == options.unconnectable) return result;
   LearnResult other = fit_structure(find_structure(signals, samples, others), samples, others);
   return other.schema.edges.size() > result.schema.edges.size() ? other : result;

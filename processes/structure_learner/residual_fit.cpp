@@ -87,8 +87,7 @@ Verdict verdict_of(const Fitter& fitter, const PairData& pair, const NormalizedA
   if (fit.num_outliers > max_outliers ||
       fit.mean_inlier > largest_inlier_mean(std::max(1.0, share * inliers), 3))
     return Verdict::kRefuted;
-  if (is_wrong_at_some_commands(fitter.signals(), pair, fit.squared_distance, actions))
-    return Verdict::kRefuted;
+  if (is_wrong_at_some_commands(pair, fit.squared_distance, actions)) return Verdict::kRefuted;
   return fit.mean_uncertainty > kLargestUncertainty ? Verdict::kNotEnoughData : Verdict::kValid;
 }
 

@@ -263,7 +263,8 @@ void connect_soft_parts(const std::vector<ActionPoseSample>& samples,
     const int a = components.of(pair.first), b = components.of(pair.second);
     if (a == b) continue;
     // What screws need more data for is no reason to wait where they give way to a process anyway.
-    if (!record.undecided.empty() && !is_stream) undecided.insert(std::minmax(a, b));
+    if (!record.open_order.empty() || (!record.undecided.empty() && !is_stream))
+      undecided.insert(std::minmax(a, b));
     if (record.num_common >= kFewestSoftFrames)
       open[std::minmax(a, b)].push_back({0, pair.first, pair.second, {}});
   }

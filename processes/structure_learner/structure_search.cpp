@@ -6,6 +6,7 @@
 #include "processes/structure_learner/search/long_chains.h"
 #include "processes/structure_learner/search/look_alikes.h"
 #include "processes/structure_learner/search/mimic_joints.h"
+#include "processes/structure_learner/search/open_orders.h"
 #include "processes/structure_learner/search/settling.h"
 #include "processes/structure_learner/search/withdrawal.h"
 
@@ -33,7 +34,9 @@ SearchResult search_structure(const std::vector<ActionPoseSample>& samples,
     settled = settle_trees(&layers.spare(), &pairs, &forest);
   if (!forest.spans() && connect_mimic_joints(&pairs, &forest))
     settled = settle_trees(&layers.spare(), &pairs, &forest);
-  if (std::vector<Candidate> none; settle_look_alikes(&pairs, &forest))
+  const bool has_other_signals = settle_look_alikes(&pairs, &forest);
+  const bool has_other_orders = withdraw_open_orders(&pairs, &forest);
+  if (std::vector<Candidate> none; has_other_signals || has_other_orders)
     settled = settle_trees(&none, &pairs, &forest);
   SearchResult result;
   result.joint_information = withdraw_untold_edges(&pairs, &forest);

@@ -55,7 +55,8 @@ struct SearchResult {
 /// so the layers run again. Components that narrowly refuted models keep apart are joined by
 /// bridge(). In the end an edge stands only if its data could have refuted it:
 /// withdraw_untold_edges() takes the others back, and more samples are needed; and only if no
-/// signal that moves as its own explains it as well (settle_look_alikes()).
+/// signal that moves as its own explains it as well (settle_look_alikes()), nor another order of
+/// its joints (withdraw_open_orders()).
 ///
 /// Hypotheses are screened and fitted on an even subset of the instants, and so are trees. What a
 /// layer is about to accept must be valid on all of them; what the fits of trees put in or join is

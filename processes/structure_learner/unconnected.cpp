@@ -56,6 +56,7 @@ struct TriedModels {
        has_one_rhythm = false;
   std::set<int> untold;
   std::set<std::pair<int, int>> look_alikes;
+  std::set<int> open_order;
   std::optional<ContestedSignals> contested;
 };
 
@@ -65,6 +66,7 @@ TriedModels tried_models(int part, const std::set<int>& connected, const SearchR
     if (pair.first != part && pair.second != part) continue;
     // What is by chance may have connected both.
     tried.look_alikes.insert(record.look_alikes.begin(), record.look_alikes.end());
+    tried.open_order.insert(record.open_order.begin(), record.open_order.end());
     tried.is_by_chance |= record.is_by_chance;
     tried.is_too_short |= record.is_too_short;
     tried.has_one_rhythm |= record.has_one_rhythm;
@@ -106,6 +108,9 @@ std::string why_taken_back(const TriedModels& tried, const LearnedStructure& str
     return alike +
            " move alike at all samples, or nearly so, and which of them moves it cannot be told: "
            "move them apart, or leave one of them out";
+  if (!tried.open_order.empty())
+    return "the order of the joints of " + names_of(tried.open_order, structure) +
+           " is not told, for one rests while the other moves: move them together";
   if (structure.is_contested)
     return "another structure fits if the noise is larger than it is said to be: tell the true "
            "noise, or give more samples";
@@ -163,6 +168,10 @@ std::string why_refused(int part, const LearnedStructure& structure, const Refus
         return model +
                " is right but for the first or the last samples, one after the other: a marker, or "
                "what bears it, was moved meanwhile: learn from samples of before or of after it";
+      case Refusal::kSecondPlace:
+        return model +
+               " is right but at samples at which the part keeps to one other place: it is held "
+               "there, or another marker is read for its own: leave those samples out";
       case Refusal::kContradicted:
         return model +
                " is contradicted by what the other parts tell of it at most samples: show the two "

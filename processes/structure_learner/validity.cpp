@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <numeric>
 
 #include "common/estimation/quantile.h"
@@ -214,30 +215,55 @@ bool is_improbable_by_chance(const Fit& fit, const PairData& pair, const Normali
   return dof * log_spread(fit, pair) > std::log(num_candidates) + 7;
 }
 
+// log of the chance that of so many drawn from `total`, `marked` of which are marked, so many are.
+double log_hypergeometric(int drawn_marked, int drawn, int marked, int total) {
+  const auto log_choose = [](int n, int k) {
+    return k < 0 || k > n ? -std::numeric_limits<double>::infinity()
+                          : std::lgamma(n + 1) - std::lgamma(k + 1) - std::lgamma(n - k + 1);
+  };
+  return log_choose(marked, drawn_marked) + log_choose(total - marked, drawn - drawn_marked) -
+         log_choose(total, drawn);
+}
+
 }  // namespace
 
-bool is_wrong_at_some_commands(const std::vector<int>& signals, const std::vector<int>& samples,
-                               const std::vector<bool>& outlying,
+bool is_wrong_at_some_commands(const std::vector<int>& samples, const std::vector<bool>& outlying,
                                const NormalizedActions& actions) {
   constexpr double kLeastChance = 1e-4;
-  if (actions.blocks().is_stream()) return false;
-  const auto n = static_cast<double>(samples.size());
-  const double share = static_cast<double>(std::count(outlying.begin(), outlying.end(), true)) / n;
-  std::vector<std::size_t> order(samples.size());
-  for (const int signal : signals) {
+  // Chosen: of views from which a tag is read badly, fewer are wrong.
+  constexpr double kLeastShare = 0.7;
+  constexpr int kFewest = 3;
+  const int n = static_cast<int>(samples.size());
+  const auto num_outliers = static_cast<int>(std::count(outlying.begin(), outlying.end(), true));
+  if (num_outliers < kFewest || actions.blocks().is_stream()) return false;
+  const double num_signals = static_cast<double>(actions.moving().size());
+  std::vector<int> order(samples.size()), places;  // of the outliers in that order
+  for (const int signal : actions.moving()) {
     std::iota(order.begin(), order.end(), 0);
-    std::stable_sort(order.begin(), order.end(), [&](std::size_t a, std::size_t b) {
-      return actions(samples[a], signal) < actions(samples[b], signal);
+    std::stable_sort(order.begin(), order.end(), [&](int a, int b) {
+      return actions(samples[static_cast<std::size_t>(a)], signal) <
+             actions(samples[static_cast<std::size_t>(b)], signal);
     });
-    int run = 0, longest = 0;
-    for (const std::size_t t : order) longest = std::max(longest, run = outlying[t] ? run + 1 : 0);
-    if (n * std::pow(share, longest) < kLeastChance) return true;
+    places.clear();
+    for (int t = 0; t < n; ++t)
+      if (outlying[static_cast<std::size_t>(order[static_cast<std::size_t>(t)])])
+        places.push_back(t);
+    for (int first = 0; first < num_outliers; ++first)
+      for (int last = first + kFewest - 1; last < num_outliers; ++last) {
+        const int length =
+            places[static_cast<std::size_t>(last)] - places[static_cast<std::size_t>(first)] + 1;
+        const int inside = last - first + 1;
+        if (inside < kLeastShare * length) continue;
+        // As many places for a stretch as there are samples, as many lengths, as many signals.
+        const double log_chance = log_hypergeometric(inside, length, num_outliers, n) +
+                                  std::log(n * static_cast<double>(length) * num_signals);
+        if (log_chance < std::log(kLeastChance)) return true;
+      }
   }
   return false;
 }
 
-bool is_wrong_at_some_commands(const std::vector<int>& signals, const PairData& pair,
-                               const std::vector<double>& squared_distance,
+bool is_wrong_at_some_commands(const PairData& pair, const std::vector<double>& squared_distance,
                                const NormalizedActions& actions) {
   std::vector<int> samples;
   std::vector<bool> outlying;
@@ -245,7 +271,7 @@ bool is_wrong_at_some_commands(const std::vector<int>& signals, const PairData& 
     samples.push_back(pair.frames[t].sample);
     outlying.push_back(squared_distance[t] > outlier_threshold(pair.num_residuals()));
   }
-  return is_wrong_at_some_commands(signals, samples, outlying, actions);
+  return is_wrong_at_some_commands(samples, outlying, actions);
 }
 
 double largest_inlier_mean(double num_inliers, double sigmas, int num_residuals) {
@@ -290,9 +316,7 @@ Validity check_validity(const Fit& fit, const LeaveOneOut& loo, const PairData& 
   const double correlation = serial_correlation(fit, pair, actions);
   const double largest_mean = largest_mean_of(dof, num_residuals, correlation, options);
   if (result.mean_inlier > largest_mean) return result;
-  std::vector<int> signals;
-  for (const LocalModel::Joint& joint : fit.model.joints) signals.push_back(joint.signal);
-  if (!options.lenient && is_wrong_at_some_commands(signals, pair, loo.squared_distance, actions))
+  if (!options.lenient && is_wrong_at_some_commands(pair, loo.squared_distance, actions))
     return result;
   result.has_far_outliers = suspicious && outliers.are_far;
   if (suspicious && (n >= kFewFrames || 2 * result.num_outliers > n)) {

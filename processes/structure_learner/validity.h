@@ -62,15 +62,14 @@ struct Validity {
 Validity check_validity(const Fit& fit, const LeaveOneOut& loo, const PairData& pair,
                         const NormalizedActions& actions, const ValidityOptions& options);
 
-/// Whether so many outliers stand one after the other in the order of one of a model's signals that
-/// chance does not explain it: there the model is wrong, and not its poses. `outlying`: by sample
-/// of `samples`. False in a stream, where outliers last.
-bool is_wrong_at_some_commands(const std::vector<int>& signals, const std::vector<int>& samples,
-                               const std::vector<bool>& outlying,
+/// Whether in the order of one of the signals that moved, be it one of the model's or not, so many
+/// outliers stand together that chance does not explain it (hypergeometric): there the model is
+/// wrong, and not its poses. `outlying`: by sample of `samples`. False in a stream, where outliers
+/// last. O(D K²) of K outliers and D signals.
+bool is_wrong_at_some_commands(const std::vector<int>& samples, const std::vector<bool>& outlying,
                                const NormalizedActions& actions);
 /// `squared_distance`: by frame of the pair.
-bool is_wrong_at_some_commands(const std::vector<int>& signals, const PairData& pair,
-                               const std::vector<double>& squared_distance,
+bool is_wrong_at_some_commands(const PairData& pair, const std::vector<double>& squared_distance,
                                const NormalizedActions& actions);
 
 /// Expected share of frames of a pair with an outlier among its two markers.

@@ -3,7 +3,9 @@
 #include <Eigen/Cholesky>
 #include <algorithm>
 #include <cmath>
+#include <random>
 
+#include "common/estimation/quantile.h"
 #include "processes/structure_learner/long_chain/chain_rotations.h"
 #include "processes/structure_learner/placed_screw.h"
 #include "processes/structure_learner/screen.h"
@@ -207,15 +209,57 @@ LocalModel without_joint(const LocalModel& model, int d) {
   return result;
 }
 
-// Joints d and d + 1 in the other order, each about its own axis as it is at mid-range.
-LocalModel with_exchanged(const LocalModel& model, int d) {
+Pose screw_pose(const LocalModel::Joint& joint, double q) {
+  return Eigen::Translation3d(0, 0, joint.slide * q) *
+         Eigen::AngleAxisd(joint.turn * q, Vector3d::UnitZ());
+}
+
+// Joints d and d + 1 in the other order, each about its own axis as it is where both signals have
+// the values `rest`: the same motion as long as one of them does.
+LocalModel with_exchanged(const LocalModel& model, int d, const Eigen::Vector2d& rest) {
   LocalModel result = model;
-  const Pose between = model.joints[d].X_after;
+  const LocalModel::Joint &one = model.joints[d], &other = model.joints[d + 1];
+  const Pose between = screw_pose(one, rest(0)) * one.X_after;
   result.transform(d) = result.transform(d) * between;
   std::swap(result.joints[d], result.joints[d + 1]);
-  result.joints[d].X_after = between.inverse();
-  result.joints[d + 1].X_after = between * model.joints[d + 1].X_after;
+  result.joints[d].X_after = screw_pose(other, -rest(1)) * between.inverse();
+  result.joints[d + 1].X_after =
+      screw_pose(one, -rest(0)) * between * screw_pose(other, rest(1)) * other.X_after;
   return result;
+}
+
+// What a signal is at most frames.
+double usual_value(int signal, const PairData& pair, const NormalizedActions& actions) {
+  std::vector<double> values;
+  for (const PairFrame& frame : pair.frames) values.push_back(actions(frame.sample, signal));
+  return median(std::move(values));
+}
+
+// Whether two models of the same signals are one wherever these move within their ranges, as far as
+// a marker's noise tells.
+bool predict_alike(const LocalModel& one, const LocalModel& other, const PairData& pair) {
+  constexpr int kActions = 64;
+  std::mt19937 rng(1);
+  std::vector<ActionPoseSample> samples(kActions);
+  int num_signals = 0;
+  for (const LocalModel::Joint& joint : one.joints)
+    num_signals = std::max(num_signals, joint.signal + 1);
+  for (int n = 0; n < kActions; ++n) {
+    samples[n].action.resize(num_signals);
+    // The ends first: they are the range that NormalizedActions scales by.
+    for (double& value : samples[n].action)
+      value = n < 2 ? 2 * n - 1 : 2.0 * static_cast<double>(rng()) / std::mt19937::max() - 1;
+  }
+  const NormalizedActions actions(samples, num_signals);
+  const RelativeMotions noise = relative_motions(pair, 1);
+  double sum = 0;
+  for (int n = 0; n < kActions; ++n) {
+    const Vector6d apart = log(one.predict(actions, n).inverse() * other.predict(actions, n));
+    sum += (apart.head<3>() / noise.sigma_m).squaredNorm() / 3;
+    if (!one.is_position) sum += (apart.tail<3>() / noise.sigma_rad).squaredNorm() / 3;
+  }
+  constexpr double kAlike = 2;  // standard deviations; chosen
+  return sum < kAlike * kAlike * (one.is_position ? 1 : 2) * kActions;
 }
 
 // Joint d without its turn, in the direction in which it moves what follows it.
@@ -289,18 +333,22 @@ Fit with_settled_order(Fit fit, const PairData& pair, const NormalizedActions& a
   const int last = fit.model.num_joints() - 1;
   std::vector<bool> is_open(std::max(last, 0));
   for (int d = 0; d < last; ++d) {
-    if (fit.model.joints[d].signal == fit.model.joints[d + 1].signal) continue;
-    const Fit exchanged = evaluate(with_exchanged(fit.model, d), pair, actions);
-    // Joints that commute, as far as the poses tell, have no order.
-    if (std::abs(exchanged.cost - fit.cost) < kSettledMargin) continue;
-    Fit other = fit_local_model(exchanged.model, pair, actions, kFitIterations, 1e-2);
-    if (other.cost < fit.cost - kSettledMargin) {
-      fit = std::move(other);
+    const int one = fit.model.joints[d].signal, other = fit.model.joints[d + 1].signal;
+    if (one == other) continue;
+    const LocalModel exchanged = with_exchanged(
+        fit.model, d, {usual_value(one, pair, actions), usual_value(other, pair, actions)});
+    // Joints that commute have no order.
+    if (predict_alike(fit.model, exchanged, pair)) continue;
+    Fit rival = fit_local_model(exchanged, pair, actions, kFitIterations, 1e-2);
+    if (rival.cost < fit.cost - kSettledMargin) {
+      fit = std::move(rival);
       d = std::max(d - 2, -1);  // what is in front may have to move on
       continue;
     }
-    is_open[d] = other.cost < fit.cost + kSettledMargin;
+    is_open[d] =
+        rival.cost < fit.cost + kSettledMargin && !predict_alike(fit.model, rival.model, pair);
   }
+  for (LocalModel::Joint& joint : fit.model.joints) joint.order_group = -1;
   int group = -1;
   for (int d = 0; d < last; ++d) {
     if (!is_open[d]) continue;

@@ -43,7 +43,8 @@ Fit without_idle_joints(Fit fit, const PairData& pair, const NormalizedActions& 
 Fit with_pure_slides(Fit fit, const PairData& pair, const NormalizedActions& actions);
 
 /// Exchanges neighbouring joints of two signals while that lowers the cost, and numbers those whose
-/// order the poses leave open: LocalModel::Joint::order_group.
+/// order the poses leave open, as where one signal rests while the other moves:
+/// LocalModel::Joint::order_group. Joints that commute have no order.
 Fit with_settled_order(Fit fit, const PairData& pair, const NormalizedActions& actions);
 
 }  // namespace bodyschema

@@ -43,6 +43,8 @@ struct PairRecord {
   bool has_far_outliers = false;  ///< of a model, see Validity
   bool moves_little = false;      ///< beside its noise: to tell joints from a Gaussian process
   bool was_soft_tried = false;    ///< a Gaussian process on the screws' rest was fitted too
+  /// Signals whose joints are in an order that the poses do not tell: why a model was taken back.
+  std::set<int> open_order = {};
   /// Signals that moved too little while both were seen to tell whether they move the one against
   /// the other: why a model was taken back.
   std::set<int> untold_signals = {};

@@ -154,8 +154,12 @@ TEST(IsWrongAtSomeCommands, WhereOutliersStandTogetherAndNotWhereTheyAreScattere
     }
     EXPECT_EQ(is_wrong_at_some_commands(fitted, actions), is_together);
   }
-  fitted.edge.joints[0].signal = 1;
-  EXPECT_FALSE(is_wrong_at_some_commands(fitted, actions));
+  // Be it a command of the model's own signals or not; and with some poses right there, too.
+  fitted.edge.joints.clear();
+  EXPECT_TRUE(is_wrong_at_some_commands(fitted, actions));
+  const auto wrong = std::ranges::find(fitted.outlying, true);
+  *std::find(wrong + 1, fitted.outlying.end(), true) = false;
+  EXPECT_TRUE(is_wrong_at_some_commands(fitted, actions));
 }
 
 TEST(IsWrongAtAnEnd, WhereOutliersFollowOneAnotherThereAndNotElsewhere) {

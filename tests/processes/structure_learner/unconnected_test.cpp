@@ -140,5 +140,56 @@ TEST(Unconnected, AreJointsOfASignalThatAnotherOneFollows) {
     }
 }
 
+// Of two joints with nothing seen between them, each moved while the other rests, either may come
+// first; some poses in which both are moved tell it.
+TEST(Unconnected, AreJointsWhoseOrderIsNotTold) {
+  for (const int num_together : {0, 8})
+    for (int seed = 1; seed <= 4; ++seed) {
+      Rng rng(seed);
+      const test::SyntheticRobot robot = test::chapter_robot("co", rng);
+      const auto num_signals = static_cast<Eigen::Index>(robot.signals.size());
+      std::vector<ActionPoseSample> samples;
+      for (int n = 0; n < 80 + num_together; ++n) {
+        Eigen::VectorXd action = robot.random_action(rng);
+        for (Eigen::Index s = 0; n < 80 && s < num_signals; ++s)
+          if (s != n % num_signals) action(s) = 0.2;
+        samples.push_back(test::observe(robot, action, {Regime::kTagIso}, n, rng));
+      }
+      LearnOptions options;
+      options.measurement.noise = test::nominal_noise(Regime::kTagIso);
+      const BodySchema schema = learn(robot.signals, samples, options).schema;
+      if (num_together > 0)
+        EXPECT_EQ(judge(schema, robot), test::Rightness::kRight) << seed;
+      else
+        EXPECT_TRUE(contains(schema.unconnected, "the order of the joints of ")) << seed;
+    }
+}
+
+// An object that is in the hand at most samples, and on a table else; and one that is always in the
+// hand, whose tag is read turned over as often.
+TEST(Unconnected, IsAPartThatKeepsToASecondPlace) {
+  for (const bool is_on_table : {false, true})
+    for (int seed = 1; seed <= 4; ++seed) {
+      Rng rng(seed);
+      const test::SyntheticRobot robot = test::chapter_robot("c", rng);
+      auto samples = test::babble(robot, 100, {.regime = Regime::kTagIso}, rng);
+      const Noise noise = test::nominal_noise(Regime::kTagIso);
+      const Pose X_CT = robot.X_CR * test::random_pose(rng, 0.3, 0.5);
+      for (std::size_t n = 0; n < samples.size(); n += 6)
+        for (PartObservation& o : samples[n].parts)
+          if (o.part == 5)
+            o = is_on_table
+                    ? test::seen_at(5, X_CT, noise, rng)
+                    : test::seen_at(5, o.X_CB * Eigen::AngleAxisd(0.6, Eigen::Vector3d::UnitX()),
+                                    noise, rng);
+      LearnOptions options;
+      options.measurement.noise = noise;
+      options.measurement.outlier_rate = 0.1;
+      const BodySchema schema = learn(robot.signals, samples, options).schema;
+      EXPECT_EQ(contains(schema.unconnected, "keeps to one other place"), is_on_table) << seed;
+      EXPECT_EQ(schema.complete, !is_on_table) << seed;
+    }
+}
+
 }  // namespace
 }  // namespace bodyschema
