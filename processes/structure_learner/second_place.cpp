@@ -1,6 +1,7 @@
 #include "processes/structure_learner/second_place.h"
 
 #include <algorithm>
+#include <iterator>
 #include <limits>
 #include <set>
 #include <vector>

@@ -150,7 +150,7 @@ TEST(IsWrongAtSomeCommands, WhereOutliersStandTogetherAndNotWhereTheyAreScattere
     fitted.outlying.clear();
     for (int t = 0; t < 60; ++t) {
       fitted.frames.push_back(t);
-      fitted.outlying.push_back(is_together ? samples[t].action(0) < -0.6 : t % 5 == 0);
+      fitted.outlying.push_back(is_together ? samples[t].action(0) < -0.4 : t % 5 == 0);
     }
     EXPECT_EQ(is_wrong_at_some_commands(fitted, actions), is_together);
   }
