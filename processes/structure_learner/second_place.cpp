@@ -6,7 +6,6 @@
 #include <set>
 #include <vector>
 
-#include "common/estimation/quantile.h"
 #include "processes/structure_learner/screen.h"
 
 namespace bodyschema {
@@ -20,33 +19,39 @@ constexpr double kLeastInPlace = 0.5, kMostByChance = 0.1;
 // Standard deviations of its position from which on it is another place, and no turn of the tag.
 constexpr double kApart = 5;
 
-PairData pair_of(int part, int other, const EdgeData& data) {
-  return make_pair_data(data.samples, part, other, data.measurement,
-                        std::numeric_limits<int>::max());
+// A part as seen from something, at a sample.
+struct Sight {
+  int sample = 0;
+  Pose X;
+  const PairHypothesis* reading = nullptr;
+};
+
+// As far as noise tells, both having it.
+bool is_same_place(const Sight& one, const Sight& other) {
+  const Vector6d apart = log(one.X.inverse() * other.X);
+  return other.reading->whitened(apart, one.X).squaredNorm() <
+         2 * outlier_threshold(other.reading->num_residuals);
 }
 
-const PairHypothesis& reading(const PairData& pair, int frame) {
-  return pair.hypotheses[static_cast<std::size_t>(
-      pair.frames[static_cast<std::size_t>(frame)].first_hypothesis)];
-}
-
-// Frames among these that are where one of them is, as far as noise tells: the most there are.
-std::vector<int> largest_group(const PairData& pair, const std::vector<int>& frames,
-                               const std::vector<int>& among) {
-  std::vector<int> largest;
-  for (const int centre : among) {
-    std::vector<int> group;
-    for (const int frame : frames) {
-      const PairHypothesis& h = reading(pair, frame);
-      const Pose inverse = reading(pair, centre).z.inverse();
-      // Both have noise.
-      if (h.whitened(h.error(inverse), inverse.inverse()).squaredNorm() <
-          2 * outlier_threshold(h.num_residuals))
-        group.push_back(frame);
-    }
+// The most of these that are in one place.
+std::vector<Sight> largest_group(const std::vector<Sight>& sights) {
+  std::vector<Sight> largest;
+  for (const Sight& centre : sights) {
+    std::vector<Sight> group;
+    std::ranges::copy_if(sights, std::back_inserter(group),
+                         [&](const Sight& sight) { return is_same_place(centre, sight); });
     if (group.size() > largest.size()) largest = std::move(group);
   }
   return largest;
+}
+
+std::vector<Sight> sights_of(const PairData& pair) {
+  std::vector<Sight> sights;
+  for (const PairFrame& frame : pair.frames) {
+    const PairHypothesis& h = pair.hypotheses[static_cast<std::size_t>(frame.first_hypothesis)];
+    sights.push_back({frame.sample, h.z, &h});
+  }
+  return sights;
 }
 
 }  // namespace
@@ -60,31 +65,36 @@ bool keeps_to_second_place(const FittedEdge& fitted, const EdgeData& data) {
       data.actions.blocks().is_stream())
     return false;
   const Edge& edge = fitted.edge;
-  const PairData own = pair_of(edge.from, edge.to, data);
-  const double apart_m = kApart * relative_motions(own, 1).sigma_m;
   std::set<int> elsewhere;  // of the outliers, by their positions
-  for (int t = 0; t < own.size(); ++t) {
-    const int sample = own.frames[static_cast<std::size_t>(t)].sample;
-    const Pose X = edge.predict(data.samples[static_cast<std::size_t>(sample)].action);
-    if (outlying.contains(sample) &&
-        (X.translation() - reading(own, t).z.translation()).norm() > apart_m)
-      elsewhere.insert(sample);
+  const auto has_second_place = [&](const std::vector<Sight>& sights) {
+    std::vector<Sight> wrong, right;
+    for (const Sight& sight : sights) {
+      if (elsewhere.contains(sight.sample)) wrong.push_back(sight);
+      if (!outlying.contains(sight.sample)) right.push_back(sight);
+    }
+    const std::vector<Sight> group = largest_group(wrong);
+    if (static_cast<double>(group.size()) < std::max<double>(kFewest, kLeastInPlace * num))
+      return false;
+    const auto by_chance = std::ranges::count_if(
+        right, [&](const Sight& sight) { return is_same_place(group.front(), sight); });
+    return static_cast<double>(by_chance) < kMostByChance * static_cast<double>(right.size());
+  };
+  constexpr int kAll = std::numeric_limits<int>::max();
+  const PairData own = make_pair_data(data.samples, edge.from, edge.to, data.measurement, kAll);
+  const double apart_m = kApart * relative_motions(own, 1).sigma_m;
+  // As seen from where the model has it.
+  std::vector<Sight> beside = sights_of(own);
+  for (Sight& sight : beside) {
+    const Pose X = edge.predict(data.samples[static_cast<std::size_t>(sight.sample)].action);
+    sight.X = X.inverse() * sight.X;
+    if (outlying.contains(sight.sample) && sight.X.translation().norm() > apart_m)
+      elsewhere.insert(sight.sample);
   }
+  if (has_second_place(beside)) return true;
   for (const int part : seen_parts(data.samples)) {
     if (part == edge.to) continue;
-    const PairData pair = part == edge.from ? own : pair_of(part, edge.to, data);
-    std::vector<int> wrong, right;
-    for (int t = 0; t < pair.size(); ++t) {
-      const int sample = pair.frames[static_cast<std::size_t>(t)].sample;
-      if (elsewhere.contains(sample)) wrong.push_back(t);
-      if (!outlying.contains(sample)) right.push_back(t);
-    }
-    const std::vector<int> group = largest_group(pair, wrong, wrong);
-    if (static_cast<double>(group.size()) < std::max<double>(kFewest, kLeastInPlace * num))
-      continue;
-    const std::vector<int> by_chance = largest_group(pair, right, {group.front()});
-    if (static_cast<double>(by_chance.size()) < kMostByChance * static_cast<double>(right.size()))
-      return true;
+    const PairData pair = make_pair_data(data.samples, part, edge.to, data.measurement, kAll);
+    if (has_second_place(sights_of(pair))) return true;
   }
   return false;
 }

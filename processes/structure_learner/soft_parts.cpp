@@ -263,8 +263,7 @@ void connect_soft_parts(const std::vector<ActionPoseSample>& samples,
     const int a = components.of(pair.first), b = components.of(pair.second);
     if (a == b) continue;
     // What screws need more data for is no reason to wait where they give way to a process anyway.
-    if (!record.open_order.empty() || (!record.undecided.empty() && !is_stream))
-      undecided.insert(std::minmax(a, b));
+    if (!record.undecided.empty() && !is_stream) undecided.insert(std::minmax(a, b));
     if (record.num_common >= kFewestSoftFrames)
       open[std::minmax(a, b)].push_back({0, pair.first, pair.second, {}});
   }
@@ -277,9 +276,16 @@ void connect_soft_parts(const std::vector<ActionPoseSample>& samples,
     return std::tuple(c.num_needed, -c.model.score, c.model.part_i, c.model.part_j);
   };
   std::ranges::stable_sort(candidates, {}, rank);
+  // Nor does a process tell in which order joints follow one another.
+  std::set<int> open_order;
+  for (const auto& [pair, record] : found->records)
+    open_order.insert(record.open_order.begin(), record.open_order.end());
   // Screws may be all that is between two parts: a process on the way around them is none either.
   for (SoftCandidate& c : candidates) {
     if (!components.join(c.model.part_i, c.model.part_j) || c.is_contested) continue;
+    std::set<int> signals = signal_set(c.model.model);
+    signals.insert(c.model.soft_signals.begin(), c.model.soft_signals.end());
+    if (std::ranges::any_of(signals, [&](int s) { return open_order.contains(s); })) continue;
     const auto alike = look_alikes_of(c.model, actions);
     if (alike.empty())
       found->models.push_back(std::move(c.model));

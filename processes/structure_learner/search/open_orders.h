@@ -5,8 +5,7 @@
 namespace bodyschema {
 
 /// Takes the models back whose joints may be in another order, which would predict other poses
-/// where signals move together (PairRecord::open_order). Of two joints the order is compared anew:
-/// screens are of few frames. Returns true if anything changed.
+/// where signals move together (PairRecord::open_order). Returns true if anything changed.
 bool withdraw_open_orders(PairModels* pairs, ModelForest* forest);
 
 }  // namespace bodyschema
