@@ -235,6 +235,18 @@ double usual_value(int signal, const PairData& pair, const NormalizedActions& ac
   return median(std::move(values));
 }
 
+// By how much one fit costs more than another where either has the pose: by how far both are off at
+// the others they are not told apart.
+double excess_cost(const Fit& one, const Fit& other) {
+  double sum = 0;
+  for (std::size_t t = 0; t < one.frames.size(); ++t) {
+    const FrameFit &a = one.frames[t], &b = other.frames[t];
+    if (std::min(a.squared_distance, b.squared_distance) < outlier_threshold(a.num_residuals))
+      sum += a.cost() - b.cost();
+  }
+  return sum;
+}
+
 // Whether two models of the same signals are one wherever these move within their ranges, as far as
 // a marker's noise tells.
 bool predict_alike(const LocalModel& one, const LocalModel& other, const PairData& pair) {
@@ -340,13 +352,13 @@ Fit with_settled_order(Fit fit, const PairData& pair, const NormalizedActions& a
     // Joints that commute have no order.
     if (predict_alike(fit.model, exchanged, pair)) continue;
     Fit rival = fit_local_model(exchanged, pair, actions, kFitIterations, 1e-2);
-    if (rival.cost < fit.cost - kSettledMargin) {
+    const double excess = excess_cost(rival, fit);
+    if (excess < -kSettledMargin) {
       fit = std::move(rival);
       d = std::max(d - 2, -1);  // what is in front may have to move on
       continue;
     }
-    is_open[d] =
-        rival.cost < fit.cost + kSettledMargin && !predict_alike(fit.model, rival.model, pair);
+    is_open[d] = excess < kSettledMargin && !predict_alike(fit.model, rival.model, pair);
   }
   for (LocalModel::Joint& joint : fit.model.joints) joint.order_group = -1;
   int group = -1;
