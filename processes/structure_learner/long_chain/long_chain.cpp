@@ -5,6 +5,7 @@
 #include <cmath>
 #include <random>
 
+#include "common/estimation/chi_square.h"
 #include "common/estimation/quantile.h"
 #include "processes/structure_learner/long_chain/chain_rotations.h"
 #include "processes/structure_learner/placed_screw.h"
