@@ -33,6 +33,8 @@ constexpr double kMaySlide = 0.12;
 constexpr double kLongestLink = 1;
 // Nats between two orders that are told apart.
 constexpr double kSettledMargin = 3;
+// Nats below which an order is open. Chosen: where all joints move at random it costs hundreds.
+constexpr double kOpenMargin = 10;
 // Nats a sight.
 constexpr double kLeastPay = 0.5;
 
@@ -353,13 +355,13 @@ Fit with_settled_order(Fit fit, const PairData& pair, const NormalizedActions& a
     // Joints that commute have no order.
     if (predict_alike(fit.model, exchanged, pair)) continue;
     Fit rival = fit_local_model(exchanged, pair, actions, kFitIterations, 1e-2);
-    const double excess = excess_cost(rival, fit);
-    if (excess < -kSettledMargin) {
+    const double excess = std::min(rival.cost - fit.cost, excess_cost(rival, fit));
+    if (rival.cost < fit.cost - kSettledMargin) {
       fit = std::move(rival);
       d = std::max(d - 2, -1);  // what is in front may have to move on
       continue;
     }
-    is_open[d] = excess < kSettledMargin && !predict_alike(fit.model, rival.model, pair);
+    is_open[d] = excess < kOpenMargin && !predict_alike(fit.model, rival.model, pair);
   }
   for (LocalModel::Joint& joint : fit.model.joints) joint.order_group = -1;
   int group = -1;
