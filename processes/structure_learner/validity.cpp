@@ -229,14 +229,17 @@ double log_hypergeometric(int drawn_marked, int drawn, int marked, int total) {
 
 bool is_wrong_at_some_commands(const std::vector<int>& samples, const std::vector<bool>& outlying,
                                const NormalizedActions& actions) {
-  constexpr double kLeastChance = 1e-4;
-  // Chosen: of views from which a tag is read badly, fewer are wrong.
-  constexpr double kLeastShare = 0.7;
-  constexpr int kFewest = 3;
+  constexpr double kLogLeastChance = -9.2;  // 1e-4
+  // Of a stretch with some poses right; chosen: of views from which a tag is read badly fewer are
+  // wrong, and where a command is bent steeply fewer lie together.
+  constexpr double kLeastInside = 0.7, kLeastShare = 0.08;
+  constexpr int kFewestInside = 8;
   const int n = static_cast<int>(samples.size());
   const auto num_outliers = static_cast<int>(std::count(outlying.begin(), outlying.end(), true));
-  if (num_outliers < kFewest || actions.blocks().is_stream()) return false;
-  const double num_signals = static_cast<double>(actions.moving().size());
+  if (num_outliers == 0 || actions.blocks().is_stream()) return false;
+  const double log_trials = std::log(n * static_cast<double>(actions.moving().size()));
+  const double log_share = std::log(num_outliers / static_cast<double>(n));
+  const int fewest = std::max(kFewestInside, static_cast<int>(kLeastShare * n));
   std::vector<int> order(samples.size()), places;  // of the outliers in that order
   for (const int signal : actions.moving()) {
     std::iota(order.begin(), order.end(), 0);
@@ -249,15 +252,16 @@ bool is_wrong_at_some_commands(const std::vector<int>& samples, const std::vecto
       if (outlying[static_cast<std::size_t>(order[static_cast<std::size_t>(t)])])
         places.push_back(t);
     for (int first = 0; first < num_outliers; ++first)
-      for (int last = first + kFewest - 1; last < num_outliers; ++last) {
+      for (int last = first; last < num_outliers; ++last) {
+        const int inside = last - first + 1;
         const int length =
             places[static_cast<std::size_t>(last)] - places[static_cast<std::size_t>(first)] + 1;
-        const int inside = last - first + 1;
-        if (inside < kLeastShare * length) continue;
-        // As many places for a stretch as there are samples, as many lengths, as many signals.
-        const double log_chance = log_hypergeometric(inside, length, num_outliers, n) +
-                                  std::log(n * static_cast<double>(length) * num_signals);
-        if (log_chance < std::log(kLeastChance)) return true;
+        const bool is_run = inside == length;
+        if (is_run && log_trials + inside * log_share < kLogLeastChance) return true;
+        if (inside >= fewest && inside >= kLeastInside * length &&
+            log_trials + std::log(length) + log_hypergeometric(inside, length, num_outliers, n) <
+                kLogLeastChance)
+          return true;
       }
   }
   return false;

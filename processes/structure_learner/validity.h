@@ -63,9 +63,10 @@ Validity check_validity(const Fit& fit, const LeaveOneOut& loo, const PairData& 
                         const NormalizedActions& actions, const ValidityOptions& options);
 
 /// Whether in the order of one of the signals that moved, be it one of the model's or not, so many
-/// outliers stand together that chance does not explain it (hypergeometric): there the model is
-/// wrong, and not its poses. `outlying`: by sample of `samples`. False in a stream, where outliers
-/// last. O(D K²) of K outliers and D signals.
+/// outliers stand together that chance does not explain it, one after the other or many with few
+/// others between (hypergeometric): there the model is wrong, and not its poses. `outlying`: by
+/// sample of `samples`. False in a stream, where outliers last. O(D K²) of K outliers and D
+/// signals.
 bool is_wrong_at_some_commands(const std::vector<int>& samples, const std::vector<bool>& outlying,
                                const NormalizedActions& actions);
 /// `squared_distance`: by frame of the pair.
