@@ -232,7 +232,7 @@ bool is_wrong_at_some_commands(const std::vector<int>& samples, const std::vecto
   constexpr double kLogLeastChance = -9.2;  // 1e-4
   // Of a stretch with some poses right; chosen: of views from which a tag is read badly fewer are
   // wrong, and where a command is bent steeply fewer lie together.
-  constexpr double kLeastInside = 0.7, kLeastShare = 0.08;
+  constexpr double kLeastInside = 0.7, kLeastShare = 0.1;
   constexpr int kFewestInside = 8;
   const int n = static_cast<int>(samples.size());
   const auto num_outliers = static_cast<int>(std::count(outlying.begin(), outlying.end(), true));
