@@ -432,3 +432,25 @@ def _(rng, seed):
     arm, u = marked(rng, serial_joints(rng, 4)), rng.uniform(-1.2, 1.2, (200, 4))
     inputs = np.hstack([u, u + rng.choice([.02, .1, .5]) * DEG * rng.normal(0, 1, u.shape)])
     return record(rng, seed, lambda q: arm(q[:, 4:]), [-1.2] * 8, 1.2, inputs=inputs)
+@family("36 hard stop")
+def _(rng, seed):
+    """The second joint stops for a part of its range."""
+    arm, stop = marked(rng, serial_joints(rng, 4)), rng.uniform(-.6, .6)
+    return record(rng, seed, lambda q: arm(np.column_stack([q[:, 0], np.maximum(q[:, 1], stop), q[:, 2:]])), [-1.2] * 4, 1.2)
+@family("37 one joint at a time, ends only")
+def _(rng, seed):
+    """A range check to learn from; joints are not in the order of the columns, and rest where they begin. Odd seeds: a few poses of all joints too."""
+    order, few = rng.permutation(3), 4 * (seed % 2)
+    arm = marked(rng, serial_joints(rng, 3), frames=[0, 3])
+    sweeps = np.vstack([np.linspace(-1, 1, 30)[:, None] * np.eye(3)[j] for j in range(3)])
+    inputs = np.vstack([sweeps, rng.uniform(-.5, .5, (few, 3)), rng.uniform(-.9, .9, (100, 3))])
+    rec = record(rng, seed, lambda q: arm(q[:, order]), [0] * 3, 1, inputs=inputs)
+    rec.train = np.arange(len(inputs)) < 90 + few
+    return rec
+@family("38 object in the hand or on the table")
+def _(rng, seed):
+    rec = record(rng, seed, marked(rng, serial_joints(rng, 4)), [-1.2] * 4, 1.2)
+    laid, table = rng.random(len(rec.times)) < rng.uniform(.1, .45), rec.seen[1] @ placed(rng, .4)
+    rec.seen[5] = np.where(laid[:, None, None], table, rec.seen[5])
+    rec.read[5] = noisy(rng, rec.seen[5], rec.position_sd, rec.rotation_sd)
+    return rec
