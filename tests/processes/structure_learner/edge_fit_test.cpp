@@ -160,6 +160,14 @@ TEST(IsWrongAtSomeCommands, WhereOutliersStandTogetherAndNotWhereTheyAreScattere
   const auto wrong = std::ranges::find(fitted.outlying, true);
   *std::find(wrong + 1, fitted.outlying.end(), true) = false;
   EXPECT_TRUE(is_wrong_at_some_commands(fitted, actions));
+  // Few, if they are all in a row.
+  std::vector<int> order = fitted.frames;
+  std::ranges::sort(order, {}, [&](int t) { return samples[t].action(1); });
+  std::ranges::fill(fitted.outlying, false);
+  for (int n = 0; n < 7; ++n) fitted.outlying[order[n]] = true;
+  EXPECT_TRUE(is_wrong_at_some_commands(fitted, actions));
+  fitted.outlying[order[3]] = false;
+  EXPECT_FALSE(is_wrong_at_some_commands(fitted, actions));
 }
 
 TEST(IsWrongAtAnEnd, WhereOutliersFollowOneAnotherThereAndNotElsewhere) {
