@@ -163,7 +163,7 @@ TEST(IsWrongAtSomeCommands, WhereOutliersStandTogetherAndNotWhereTheyAreScattere
   // Few, if they are all in a row.
   std::vector<int> order = fitted.frames;
   std::ranges::sort(order, {}, [&](int t) { return samples[t].action(1); });
-  std::ranges::fill(fitted.outlying, false);
+  fitted.outlying.assign(samples.size(), false);
   for (int n = 0; n < 7; ++n) fitted.outlying[order[n]] = true;
   EXPECT_TRUE(is_wrong_at_some_commands(fitted, actions));
   fitted.outlying[order[3]] = false;
