@@ -13,7 +13,7 @@ namespace {
 
 // Chosen: wild readings of fewer samples, or of a smaller share, cost a model little.
 constexpr int kFewest = 5;
-constexpr double kLeastShare = 0.08;
+constexpr double kLeastShare = 0.03;
 // Of the outliers that are in the place, and most of the other samples that may be there by chance.
 constexpr double kLeastInPlace = 0.5, kMostByChance = 0.1;
 // Standard deviations of its position from which on it is another place, and no turn of the tag.
