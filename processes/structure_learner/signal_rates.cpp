@@ -12,8 +12,8 @@ namespace {
 /// Samples over which a rate is summed. Chosen: a quarter of a second at 30 Hz, over which what
 /// encoders round averages out.
 constexpr std::size_t kWindow = 8;
-/// Chosen: rates with noise of a tenth of themselves have 0.99 (test SignalRates), joints that
-/// swing in rhythms of their own at most 0.5.
+/// Chosen: rates with noise of a tenth of themselves have more, joints that swing in rhythms of
+/// their own less (test SignalRates).
 constexpr double kLeastCorrelation = 0.97;
 
 /// Of the rows of x and y about 0, and about their means: the less of both.

@@ -33,7 +33,8 @@ constexpr double kMaySlide = 0.12;
 constexpr double kLongestLink = 1;
 // Nats between two orders that are told apart.
 constexpr double kSettledMargin = 3;
-// Nats below which an order is open. Chosen: where all joints move at random it costs hundreds.
+// Nats below which an order is open. Chosen: of a range check with two poses of all joints, which
+// are wrong in both orders, these differ by 1 to 9.5.
 constexpr double kOpenMargin = 10;
 // Nats a sight.
 constexpr double kLeastPay = 0.5;

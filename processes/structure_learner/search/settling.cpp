@@ -11,6 +11,13 @@
 namespace bodyschema {
 namespace {
 
+// Of all poses of the root's component, were these the forest's models.
+double cost_with(const std::vector<AcceptedModel>& models, int root, ModelForest forest,
+                 PairModels* pairs) {
+  forest.set_models(models);
+  return ComponentTree(forest, root, pairs).fit().cost();
+}
+
 // Pairs do not tell two models of one size apart that their markers together do. Of the spare
 // models with the signal of which a joint is missing, the one with which all poses cost least, and
 // less than `cost`. False if there is none.
@@ -31,9 +38,7 @@ bool exchange(const ComponentTree& tree, int signal, double cost, std::vector<Ca
           !pairs->confirm_on_all_data(&c))
         continue;
       present = c;
-      ModelForest other = *forest;
-      other.set_models(models);
-      const double other_cost = ComponentTree(other, root, pairs).fit().cost();
+      const double other_cost = cost_with(models, root, *forest, pairs);
       if (other_cost >= cost) continue;
       cost = other_cost;
       best = std::move(models);
@@ -85,9 +90,7 @@ bool exchange_siblings(const ComponentTree& tree, std::vector<Candidate>* spare,
       for (const std::size_t replaced : {m, n}) {
         std::vector<AcceptedModel> models = present;
         models[replaced] = *third;
-        ModelForest other = *forest;
-        other.set_models(models);
-        const double other_cost = ComponentTree(other, root, pairs).fit().cost();
+        const double other_cost = cost_with(models, root, *forest, pairs);
         if (other_cost >= cost) continue;
         cost = other_cost;
         best = std::move(models);

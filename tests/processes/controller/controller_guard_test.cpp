@@ -117,14 +117,20 @@ TEST(ControllerTest, TakingTheArmWaitsForRestAndForTheBabblersSample) {
   EXPECT_TRUE(bench.run_until_state(S::CONTROL_REACHED)) << bench.status.why;
 }
 
-// So that what is learned and refined does not depend on when a target was given.
-TEST(ControllerTest, TakingTheArmWaitsForTheVerdictOnATestSample) {
+// The babbler's newest action is a TEST, which the monitor has yet to judge.
+Bench bench_with_unjudged_test() {
   Bench bench;
   bench.health = health_of(1, 2, 3, schema_edge_t::EDGE_OK);
   bench.health->judged_sample = bench.health->awaited_refinement = -1;
   bench.start();
   bench.arm = {20, 0.1, 4};
   bench.settle("motor_babbler", 1, 12, bench.arm, action_command_t::PURPOSE_TEST);
+  return bench;
+}
+
+// So that what is learned and refined does not depend on when a target was given.
+TEST(ControllerTest, TakingTheArmWaitsForTheVerdictOnATestSample) {
+  Bench bench = bench_with_unjudged_test();
   bench.give(position_target(0, kNear));
   bench.run(5);
   EXPECT_TRUE(bench.moves.empty());
@@ -142,12 +148,7 @@ TEST(ControllerTest, TakingTheArmWaitsForTheVerdictOnATestSample) {
 TEST(ControllerTest, AVerdictIsNotAwaitedForEver) {
   // Nobody judges; or who waited for the refiner is heard no more.
   for (const std::int64_t awaited : {-1, 0}) {
-    Bench bench;
-    bench.health = health_of(1, 2, 3, schema_edge_t::EDGE_OK);
-    bench.health->judged_sample = bench.health->awaited_refinement = -1;
-    bench.start();
-    bench.arm = {20, 0.1, 4};
-    bench.settle("motor_babbler", 1, 12, bench.arm, action_command_t::PURPOSE_TEST);
+    Bench bench = bench_with_unjudged_test();
     bench.health->awaited_refinement = awaited;
     bench.repeat();
     bench.give(position_target(0, kNear));
