@@ -7,16 +7,25 @@
 #include <limits>
 #include <utility>
 
-#include "common/schema/warp_spectrum.h"
+#include "common/schema/warp_process.h"
 #include "processes/refiner/part_chain.h"
 
 namespace bodyschema {
 namespace {
 
-/// Standard deviations under which weights are likeliest. Of a process's weights those that its
-/// spectrum makes smaller than kLeastShare of the largest are 0.
-Eigen::VectorXd weight_sd(const std::vector<double>& warp) {
-  constexpr double kLeastShare = 1e-4;
+/// Of a process's weights those that its spectrum makes smaller than this share of the largest are
+/// 0.
+constexpr double kLeastShare = 1e-4;
+
+/// Standard deviations under which a signal's weights are likeliest; of weights of 0, which tell
+/// nothing, those of the widest process.
+Eigen::VectorXd weight_sd(const Signal& signal) {
+  const std::vector<double>& warp = signal.warp;
+  if (std::ranges::all_of(warp, [](double weight) { return weight == 0; })) {
+    const Eigen::ArrayXd variance = warp_spectrum(kWarpLengths.front(), std::ssize(warp));
+    const double amplitude = kWarpAmplitudes.back() * 0.5 * (signal.upper - signal.lower);
+    return amplitude * (variance > kLeastShare * variance.maxCoeff()).select(variance, 0).sqrt();
+  }
   const Eigen::ArrayXd w2 =
       Eigen::Map<const Eigen::ArrayXd>(warp.data(), std::ssize(warp)).square();
   double best = -std::numeric_limits<double>::infinity();
@@ -117,10 +126,17 @@ Eigen::VectorXd DriveModel::prior_sd() const {
   Eigen::VectorXd sd =
       Eigen::VectorXd::Constant(num_scalars_, std::numeric_limits<double>::infinity());
   for (const auto& [signal, first] : first_weights_) {
-    const Eigen::VectorXd of_signal = weight_sd(schema_.signals[signal].warp);
+    const Eigen::VectorXd of_signal = weight_sd(schema_.signals[signal]);
     sd.segment(first, of_signal.size()) = of_signal;
   }
   return sd;
+}
+
+int DriveModel::signal_of(int weight) const {
+  int result = -1;
+  for (const auto& [signal, first] : first_weights_)
+    if (first <= weight) result = signal;
+  return result;
 }
 
 void DriveModel::set_warps(const ParameterBlock& block, BodySchema* schema) const {

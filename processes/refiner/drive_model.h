@@ -25,6 +25,9 @@ class DriveModel {
   Eigen::VectorXd displacements(const Eigen::VectorXd& action) const;
   /// What the block's scalars add to each joint [command units], joints in the order of the edges.
   Eigen::MatrixXd effects(const Eigen::VectorXd& action) const;
+  /// Whether a scalar of the block is a weight, and the index of the signal that it bends.
+  bool is_weight(int scalar) const { return signal_of(scalar) >= 0; }
+  int signal_of(int weight) const;
   /// Place of each edge's first joint among all joints.
   const std::map<const Edge*, int>& first_joints() const { return first_joints_; }
   /// Standard deviations of the scalars, which have the mean 0; infinite for compliances. Those of

@@ -2,6 +2,7 @@
 
 #include <fmt/format.h>
 
+#include <Eigen/QR>
 #include <algorithm>
 #include <chrono>
 #include <cmath>
@@ -11,6 +12,7 @@
 #include "common/config/calibration_id.h"
 #include "common/estimation/chi_square.h"
 #include "common/estimation/quantile.h"
+#include "processes/refiner/bends.h"
 #include "processes/refiner/calibrated_lens.h"
 #include "processes/refiner/elasticity.h"
 #include "processes/refiner/held_out.h"
@@ -206,6 +208,17 @@ std::pair<std::vector<RefinerSample>, std::vector<RefinerSample>> split(
   return {training, held_out};
 }
 
+/// Over the signal's range, from the line that is nearest to its displacements.
+RefinedBend told_bend(const Signal& signal, double evidence) {
+  constexpr int kPoints = 101;
+  const Eigen::VectorXd q = Eigen::VectorXd::LinSpaced(kPoints, signal.lower, signal.upper);
+  const Eigen::VectorXd theta = q.unaryExpr([&](double x) { return signal.displacement(x); });
+  Eigen::MatrixX2d line(kPoints, 2);
+  line << Eigen::VectorXd::Ones(kPoints), q;
+  const Eigen::VectorXd left = theta - line * line.colPivHouseholderQr().solve(theta);
+  return {signal.name, evidence, left.cwiseAbs().maxCoeff()};
+}
+
 }  // namespace
 
 Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
@@ -217,7 +230,7 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   auto [training, held_out] = split(std::move(samples));
   Refinement result;
   check_calibration(training, rig, options);
-  result.used_corners = options.placements || options.intrinsics;
+  result.used_corners = rig && has_corners(training) && !options.joint_loads;
   const std::optional<RigCalibration> used_rig = result.used_corners ? rig : std::nullopt;
   if (rig) result.rig = *rig;
   result.num_available = static_cast<int>(training.size());
@@ -231,13 +244,17 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   result.coverage = coverage_of(schema, training);
   result.held = held_things(schema, options, result.used_corners);
 
-  RefinementProblem problem(schema, training, used_rig, stiff, result.root_moves);
+  // Loads are told apart from bends, which would take their part, by whoever gives them.
+  const BentSchema bent = options.joint_loads
+                              ? BentSchema{schema, {}}
+                              : with_bends(schema, training, stiff, result.root_moves);
+  RefinementProblem problem(bent.schema, training, used_rig, stiff, result.root_moves);
   for (const int part : problem.unseen_parts())
     result.held.push_back(fmt::format("the frame of part {}: it was never seen", part));
   problem.solve();
   result.outliers = outliers_of(problem);
   const Information information(problem, options.measurement);
-  const RefinementWords words(schema, information, problem.frame_tags());
+  const RefinementWords words(bent.schema, information, problem.frame_tags());
   result.num_observations = static_cast<int>(problem.data().size());
   result.num_iterations = problem.num_iterations();
   result.noise_scale = problem.scale();
@@ -246,7 +263,9 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   result.correlations = words.correlations(kMostCorrelations);
   result.plays = plays_of(schema, problem);
   if (result.used_corners) result.rig = refined_rig(problem, *rig);
-  result.schema = refined_schema(schema, training, problem, information);
+  result.schema = refined_schema(bent.schema, training, problem, information);
+  for (const FoundBend& bend : bent.bends)
+    result.bends.push_back(told_bend(result.schema.signals[bend.signal], bend.evidence));
   if (result.used_corners) set_residuals(training, result.rig, &result.schema);
   // Fitted to poses, the schema is of the calibration that these rest on, whatever it began with.
   result.schema.calibration_id = result.used_corners

@@ -25,7 +25,7 @@ struct RefineOptions {
   RefinerConfig config;
   CornerNoise corner_noise;      ///< of corners without a covariance of their own
   MeasurementModel measurement;  ///< of poses, where these are fitted
-  /// Where poses are fitted: also fit joints that give way to these loads.
+  /// Also fit joints that give way to these loads, to poses.
   JointLoads joint_loads;
 };
 
@@ -71,6 +71,13 @@ struct HeldOutErrors {
 struct JointPlay {
   std::string joint;  ///< "q5 (5→6)"
   double slide_m = 0, turn_rad = 0;
+};
+
+/// A command that was linear before the refinement, and is bent.
+struct RefinedBend {
+  std::string signal;
+  double evidence = 0;  ///< [nats] over a linear command, all else free
+  double largest = 0;   ///< farthest from a line over the range [command units]
 };
 
 /// An action that is expected to tell much.
@@ -125,6 +132,7 @@ struct Refinement {
   std::vector<RefinementOutlier> outliers;         ///< the farthest first
   std::vector<SignalCoverage> coverage;
   std::vector<JointPlay> plays;          ///< where corners were fitted
+  std::vector<RefinedBend> bends;        ///< in the order in which they were found
   std::optional<Elasticity> elasticity;  ///< where loads were given that change
   std::vector<std::string> held;         ///< what was not refined, and why
   /// kMostWantedActions, that of most help first; none where no signal moves what is refined.
@@ -135,12 +143,13 @@ inline constexpr double kHighCorrelation = 0.95;
 inline constexpr int kMostWantedActions = 10;
 
 /// Fits all parameters of a schema at once to TRAIN and PROBE samples, with Student-t weights:
-/// where the root stands and every screw. While tags and lens are as the rig says, the data are the
-/// parts' poses, which were made by these. With tags or lens among the parameters, the data are the
-/// corners' pixels, the rig's claims are priors, and at every sample each joint may be off its
-/// command (backlash, droop) by what is estimated to be usual. Edges with a Gaussian process and
-/// signals' limits stay as they are, and bent commands where there is such an edge. Loads of the
-/// joints are fitted beside: the refined schema has stiff joints, for a schema knows no loads. TEST
+/// where the root stands, every screw, and the bends of commands, new ones where the samples show
+/// them (kWarpEvidence). With a rig the data are the corners' pixels, the rig's claims are priors,
+/// and at every sample each joint may be off its command (backlash, droop) by what is estimated to
+/// be usual; without one, where no sample has corners, and where loads are given the data are the
+/// parts' poses. Edges with a Gaussian process and signals' limits stay as they are, and bent
+/// commands where there is such an edge. Loads of the joints are fitted beside, commands then bend
+/// no more than they did: the refined schema has stiff joints, for a schema knows no loads. TEST
 /// samples are judged alone. The order of samples changes nothing.
 ///
 /// Gauge: a part's frame is where its tags are closest to the rig's claims, and the scale is the

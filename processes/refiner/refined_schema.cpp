@@ -1,9 +1,12 @@
 #include "processes/refiner/refined_schema.h"
 
 #include <Eigen/Eigenvalues>
+#include <Eigen/QR>
 #include <algorithm>
+#include <array>
 #include <cmath>
 
+#include "common/kinematics/screw_chain.h"
 #include "processes/refiner/calibrated_lens.h"
 
 namespace bodyschema {
@@ -22,6 +25,84 @@ Matrix6d positive_part(const Matrix6d& matrix) {
   const Matrix6d V = unit.asDiagonal() * eigen.eigenvectors();
   return V * eigen.eigenvalues().cwiseMax(0).asDiagonal() * V.transpose();
 }
+
+/// Covariances of root and edges as a schema has them, which has none of its bends: what is open of
+/// a bend along a joint's line is open of the joint's gain and offset, with what they have in
+/// common with it; the rest is one more variance of the offset, its mean over the samples.
+class EdgeCovariances {
+ public:
+  /// All arguments must outlive this. `start`: that of the problem.
+  EdgeCovariances(const BodySchema& start, const std::vector<RefinerSample>& samples,
+                  const RefinementProblem& problem, const Information& information)
+      : information_(information), drive_(problem.drive()) {
+    if (!drive_) return;
+    const Eigen::MatrixXd weights = information.cross_covariance(drive_, drive_);
+    for (const ParameterBlock* block : information.blocks())
+      if (block->kind == ParameterBlock::Kind::kEdge)
+        add(start.edges[block->id], thinned(samples, kMostForMeans), problem.drive_model(), weights,
+            block);
+  }
+
+  Eigen::MatrixXd between(const ParameterBlock* one, const ParameterBlock* other) const {
+    Eigen::MatrixXd result = information_.cross_covariance(one, other);
+    if (!drive_) return result;
+    const Share mine = share_of(one), others = share_of(other);
+    result +=
+        mine.by_drive * information_.cross_covariance(drive_, other) +
+        information_.cross_covariance(one, drive_) * others.by_drive.transpose() +
+        mine.by_drive * information_.cross_covariance(drive_, drive_) * others.by_drive.transpose();
+    if (one == other) result += mine.rest;
+    return result;
+  }
+
+ private:
+  struct Share {
+    Eigen::MatrixXd by_drive;  // ∂(edge's tangent)/∂(drive), along the joints' lines
+    Eigen::MatrixXd rest;
+  };
+
+  Share share_of(const ParameterBlock* block) const {
+    const auto found = shares_.find(block);
+    if (found != shares_.end()) return found->second;
+    const int size = block->tangent_size();
+    return {Eigen::MatrixXd::Zero(size, drive_->tangent_size()), Eigen::MatrixXd::Zero(size, size)};
+  }
+
+  void add(const Edge& edge, const std::vector<RefinerSample>& samples, const DriveModel& model,
+           const Eigen::MatrixXd& weights, const ParameterBlock* block) {
+    Share share = share_of(block);
+    const auto num = std::ssize(samples);
+    for (int d = 0; d < std::ssize(edge.joints); ++d) {
+      const ScrewJoint& joint = edge.joints[d];
+      Eigen::MatrixX2d line(num, 2);  // of the joint's displacement
+      Eigen::MatrixXd beyond(num, weights.rows());
+      for (Eigen::Index n = 0; n < num; ++n) {
+        const Eigen::VectorXd& action = samples[n].sample.action;
+        line.row(n) << 1, joint.gain * model.displacements(action)(joint.signal) + joint.offset;
+        beyond.row(n) = joint.gain * model.effects(action).row(model.first_joints().at(&edge) + d);
+      }
+      for (int k = 0; k < weights.rows(); ++k)
+        if (!model.is_weight(k)) beyond.col(k).setZero();
+      const Eigen::MatrixXd by_line = line.completeOrthogonalDecomposition().solve(beyond);
+      beyond -= line * by_line;
+      const double variance =
+          (beyond * weights).cwiseProduct(beyond).sum() / static_cast<double>(num);
+      const Eigen::Map<const Eigen::Vector2d> screw(&block->values[value_of_slide(d)]);
+      const int before = ScrewChainLayout::transform(d);
+      const std::array<int, 2> offset = {before + 2, before + 5};  // along and about z
+      for (int k = 0; k < 2; ++k) {
+        share.by_drive.row(offset[k]) += screw(k) * by_line.row(0);
+        share.by_drive.row(ScrewChainLayout::slide(d) + k) += screw(k) * by_line.row(1);
+      }
+      share.rest(offset, offset) += variance * screw * screw.transpose();
+    }
+    shares_[block] = std::move(share);
+  }
+
+  const Information& information_;
+  const ParameterBlock* drive_;
+  std::map<const ParameterBlock*, Share> shares_;
+};
 
 /// The blocks on the way to a part, and how the part's pose depends on each at one sample.
 struct ChainAt {
@@ -42,17 +123,17 @@ ChainAt chain_at(RefinementProblem& problem, const BodySchema& schema, int part,
 }
 
 /// −(what the edge to a part and an edge from it have in common), as errors of the part's frame.
-Matrix6d shared_at(const ChainAt& parent, const ChainAt& child, const Information& information) {
+Matrix6d shared_at(const ChainAt& parent, const ChainAt& child,
+                   const EdgeCovariances& covariances) {
   const Matrix6d to_parent = adjoint(parent.X_CB.inverse() * child.X_CB);
-  return -parent.jacobians.back() *
-         information.cross_covariance(parent.blocks.back(), child.blocks.back()) *
+  return -parent.jacobians.back() * covariances.between(parent.blocks.back(), child.blocks.back()) *
          (to_parent * child.jacobians.back()).transpose();
 }
 
 std::map<int, Matrix6d> frame_covariances(const BodySchema& schema,
                                           const std::vector<RefinerSample>& samples,
                                           RefinementProblem& problem,
-                                          const Information& information) {
+                                          const EdgeCovariances& covariances) {
   std::map<int, Matrix6d> result;
   for (const int part : schema.parts) {
     if (!problem.paths().contains(part) || (problem.root_moves() && part == schema.root)) continue;
@@ -67,7 +148,7 @@ std::map<int, Matrix6d> frame_covariances(const BodySchema& schema,
       if (!problem.has_root(seen.sample.sample_index)) continue;
       const ChainAt parent = chain_at(problem, schema, part, seen.sample);
       for (const int child : children)
-        sum += shared_at(parent, chain_at(problem, schema, child, seen.sample), information);
+        sum += shared_at(parent, chain_at(problem, schema, child, seen.sample), covariances);
       count += static_cast<int>(children.size());
     }
     if (count > 0) result[part] = positive_part(sum / count);
@@ -80,18 +161,19 @@ std::map<int, Matrix6d> frame_covariances(const BodySchema& schema,
 BodySchema refined_schema(const BodySchema& start, const std::vector<RefinerSample>& samples,
                           RefinementProblem& problem, const Information& information) {
   BodySchema schema = start;
+  if (problem.drive()) problem.drive_model().set_warps(*problem.drive(), &schema);
+  const EdgeCovariances covariances(start, samples, problem, information);
   for (const ParameterBlock* block : problem.blocks()) {
     if (block->kind == ParameterBlock::Kind::kRoot && !problem.root_moves()) {
       schema.X_CR = pose_at(block->values.data());
-      schema.X_CR_covariance = information.cross_covariance(block, block);
+      schema.X_CR_covariance = covariances.between(block, block);
     } else if (block->kind == ParameterBlock::Kind::kEdge) {
       Edge& edge = schema.edges[block->id];
       edge = edge_from(*block, edge);
-      edge.parameter_covariance = information.cross_covariance(block, block);
+      edge.parameter_covariance = covariances.between(block, block);
     }
   }
-  if (problem.drive()) problem.drive_model().set_warps(*problem.drive(), &schema);
-  schema.frame_covariances = frame_covariances(schema, samples, problem, information);
+  schema.frame_covariances = frame_covariances(schema, samples, problem, covariances);
   schema.refined = true;
   schema.base_version = start.version;
   schema.last_sample_index = std::max(start.last_sample_index, samples.back().sample.sample_index);
@@ -106,6 +188,7 @@ BodySchema refined_schema(const BodySchema& start, const std::vector<RefinerSamp
 
 RigCalibration refined_rig(RefinementProblem& problem, RigCalibration rig) {
   for (const ParameterBlock* block : problem.blocks()) {
+    if (!block->is_refined) continue;
     if (block->kind == ParameterBlock::Kind::kLens) {
       rig.camera = calibration_with(
           rig.camera,

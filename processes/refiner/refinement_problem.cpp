@@ -226,8 +226,13 @@ Eigen::VectorXd RefinementProblem::displacements(const Eigen::VectorXd& action) 
   return drive_ ? drive_model_.displacements(action) : schema_.displacements(action);
 }
 
-Eigen::MatrixXd RefinementProblem::effects(const Eigen::VectorXd& action) const {
-  return drive_ ? drive_model_.effects(action) : Eigen::MatrixXd();
+DriveEffects RefinementProblem::effects(const Eigen::VectorXd& action) {
+  if (!drive_) return nullptr;
+  if (!last_effects_ || last_action_ != action) {
+    last_action_ = action;
+    last_effects_ = std::make_shared<const Eigen::MatrixXd>(drive_model_.effects(action));
+  }
+  return last_effects_;
 }
 
 void RefinementProblem::add(Cost cost, Datum datum) {
@@ -395,6 +400,16 @@ double RefinementProblem::log_likelihood() {
     sum -= robust_cost(d2[n], data_[n].num_residuals) +
            data_[n].num_residuals * std::log(scale_.value);
   return sum;
+}
+
+Eigen::VectorXd RefinementProblem::score(const std::vector<ParameterBlock*>& blocks) {
+  ceres::Problem::EvaluateOptions options;
+  options.num_threads = 1;
+  for (const ParameterBlock* block : blocks) options.parameter_blocks.push_back(memory_of(block));
+  std::vector<double> gradient;  // of −log
+  if (!problem_.Evaluate(options, nullptr, nullptr, &gradient, nullptr))
+    throw std::runtime_error("the refined model cannot be evaluated");
+  return -Eigen::Map<const Eigen::VectorXd>(gradient.data(), std::ssize(gradient));
 }
 
 void RefinementProblem::leave_out_play() {

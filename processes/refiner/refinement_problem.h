@@ -56,6 +56,8 @@ class RefinementProblem {
   std::optional<Cost> cost_of(const PartObservation& observation, const Eigen::VectorXd& action,
                               std::int64_t sample_index);
 
+  /// Begins where another problem of the same samples is now, its drive by the scalars' names.
+  void begin_at(RefinementProblem& other);
   /// Levenberg–Marquardt with Student-t weights, the noise's scale estimated between its runs,
   /// until neither changes.
   void solve();
@@ -86,8 +88,10 @@ class RefinementProblem {
   /// Of the data now, given the scale; up to a constant.
   double log_likelihood();
   /// What drive_model() adds to the commands; null: nothing.
-  const ParameterBlock* drive() const { return drive_; }
+  ParameterBlock* drive() const { return drive_; }
   const DriveModel& drive_model() const { return drive_model_; }
+  /// Derivative of the log posterior by the free directions of these blocks, now.
+  Eigen::VectorXd score(const std::vector<ParameterBlock*>& blocks);
   /// d² of each datum now.
   std::vector<double> squared_distances();
   /// Standard deviations of a block's whole tangent beforehand; empty: nothing is known.
@@ -105,9 +109,9 @@ class RefinementProblem {
   std::vector<ParameterBlock*> chain_blocks(int part, std::int64_t sample_index);
 
  private:
-  /// θ of every signal, and what the drive's scalars add to each joint; empty: there is no drive.
+  /// θ of every signal, and what the drive's scalars add to each joint.
   Eigen::VectorXd displacements(const Eigen::VectorXd& action) const;
-  Eigen::MatrixXd effects(const Eigen::VectorXd& action) const;
+  DriveEffects effects(const Eigen::VectorXd& action);
   void add_paths();
   void add_plays();
   void add_drive();
@@ -141,6 +145,8 @@ class RefinementProblem {
   Eigen::VectorXd play_sd_, play_start_;
   std::map<int, ParameterBlock*> edges_, tags_;  // by index, by id
   ParameterBlock* drive_ = nullptr;
+  Eigen::VectorXd last_action_;  // that last_effects_ are of
+  DriveEffects last_effects_;
   ParameterBlock* lens_block_ = nullptr;
   std::vector<double> memory_;
   std::map<const ParameterBlock*, std::size_t> memory_offsets_;

@@ -75,6 +75,28 @@ double RefinementProblem::estimate_play() {
   return change;
 }
 
+void RefinementProblem::begin_at(RefinementProblem& other) {
+  const auto take = [](const double* from, std::size_t num, double* to) {
+    std::copy_n(from, num, to);
+  };
+  std::vector<ParameterBlock*> from = other.blocks();
+  std::erase(from, other.drive_);
+  auto next = from.begin();
+  for (ParameterBlock* block : blocks()) {
+    if (block != drive_) {
+      take(other.memory_of(*next++), block->values.size(), memory_of(block));
+      continue;
+    }
+    for (std::size_t n = 0; other.drive_ && n < block->names.size(); ++n) {
+      const auto same = std::ranges::find(other.drive_->names, block->names[n]);
+      if (same != other.drive_->names.end())
+        memory_of(block)[n] = other.memory_of(other.drive_)[same - other.drive_->names.begin()];
+    }
+  }
+  scale_ = other.scale_;
+  play_sd_ = other.play_sd_;
+}
+
 ceres::Solver::Options RefinementProblem::solver_options() {
   ceres::Solver::Options options;
   options.logging_type = ceres::SILENT;

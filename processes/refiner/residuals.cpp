@@ -30,7 +30,7 @@ void StudentTLoss::Evaluate(double s, double rho[3]) const {
 }
 
 ChainResidual::ChainResidual(PartChain chain, const std::vector<const ParameterBlock*>& blocks,
-                             int num_residuals, const NoiseScale& scale, Eigen::MatrixXd effects)
+                             int num_residuals, const NoiseScale& scale, DriveEffects effects)
     : chain_(std::move(chain)), blocks_(blocks), scale_(scale), effects_(std::move(effects)) {
   set_num_residuals(num_residuals);
   for (const ParameterBlock* block : blocks_)
@@ -39,13 +39,13 @@ ChainResidual::ChainResidual(PartChain chain, const std::vector<const ParameterB
 
 Pose ChainResidual::pose(double const* const* parameters,
                          std::vector<PartChain::Jacobian>* by_block) const {
-  if (effects_.size() == 0) return chain_.pose(parameters, Pose::Identity(), by_block);
-  const Eigen::VectorXd play = effects_ * Eigen::Map<const Eigen::VectorXd>(
-                                              parameters[chain_.num_blocks()], effects_.cols());
-  PartChain::Jacobian by_play = PartChain::Jacobian::Zero(6, effects_.rows());
+  if (!effects_) return chain_.pose(parameters, Pose::Identity(), by_block);
+  const Eigen::VectorXd play = *effects_ * Eigen::Map<const Eigen::VectorXd>(
+                                               parameters[chain_.num_blocks()], effects_->cols());
+  PartChain::Jacobian by_play = PartChain::Jacobian::Zero(6, effects_->rows());
   const Pose X = chain_.pose(parameters, Pose::Identity(), by_block, play.data(),
                              by_block ? &by_play : nullptr);
-  if (by_block) by_block->emplace_back(by_play * effects_);
+  if (by_block) by_block->emplace_back(by_play * *effects_);
   return X;
 }
 
@@ -69,14 +69,14 @@ void ChainResidual::write_chain(double** jacobians, const Derivative& by_pose,
 CornerResidual::CornerResidual(PartChain chain, const std::vector<const ParameterBlock*>& blocks,
                                double size_m, const Lens& lens, const TagSight& sight,
                                const Matrix8d& covariance_px2, const NoiseScale& scale,
-                               const Eigen::MatrixXd& effects)
-    : ChainResidual(std::move(chain), blocks, 8, scale, effects),
+                               DriveEffects effects)
+    : ChainResidual(std::move(chain), blocks, 8, scale, std::move(effects)),
       play_(find_play()),
       size_m_(size_m),
       lens_(lens),
       measured_px_(sight.corners_px),
       whitener_(whitener_from(covariance_px2)) {
-  if (effects_.size() > 0 && effects_.rows() != play_.num)
+  if (effects_ && effects_->rows() != play_.num)
     throw std::logic_error("the drive has other joints than those that are off their commands");
 }
 
@@ -95,9 +95,9 @@ Eigen::VectorXd CornerResidual::joint_offsets(double const* const* parameters) c
   Eigen::VectorXd sum = Eigen::VectorXd::Zero(play_.num);
   if (play_.num > 0)
     sum += Eigen::Map<const Eigen::VectorXd>(parameters[play_.block] + play_.value, play_.num);
-  if (effects_.size() > 0)
-    sum += effects_ *
-           Eigen::Map<const Eigen::VectorXd>(parameters[blocks_.size() - 1], effects_.cols());
+  if (effects_)
+    sum += *effects_ *
+           Eigen::Map<const Eigen::VectorXd>(parameters[blocks_.size() - 1], effects_->cols());
   return sum;
 }
 
@@ -165,9 +165,9 @@ bool CornerResidual::Evaluate(double const* const* parameters, double* residuals
     }
   }
   write_chain(jacobians, whitened.leftCols<6>(), by_block);
-  if (effects_.size() > 0)
+  if (effects_)
     write(jacobians, static_cast<int>(blocks_.size()) - 1,
-          whitened.leftCols<6>() * by_play * effects_);
+          whitened.leftCols<6>() * by_play * *effects_);
   write(jacobians, tag, whitened);
   if (jacobians[lens_block]) write(jacobians, lens_block, whitener * by_lens_parameters);
   return true;
@@ -175,8 +175,8 @@ bool CornerResidual::Evaluate(double const* const* parameters, double* residuals
 
 PoseResidual::PoseResidual(PartChain chain, const std::vector<const ParameterBlock*>& blocks,
                            const PartObservation& observation, const MeasurementModel& measurement,
-                           const NoiseScale& scale, const Eigen::MatrixXd& effects)
-    : ChainResidual(std::move(chain), blocks, 6, scale, effects) {
+                           const NoiseScale& scale, DriveEffects effects)
+    : ChainResidual(std::move(chain), blocks, 6, scale, std::move(effects)) {
   const Matrix6d covariance = measurement.covariance(observation);
   readings_.push_back({observation.X_CB, whitener_from(covariance)});
   if (observation.X_CB_other && observation.error_ratio <= measurement.max_error_ratio)
@@ -209,8 +209,8 @@ PositionResidual::PositionResidual(PartChain chain,
                                    const std::vector<const ParameterBlock*>& blocks,
                                    const PartObservation& observation,
                                    const MeasurementModel& measurement, const NoiseScale& scale,
-                                   const Eigen::MatrixXd& effects)
-    : ChainResidual(std::move(chain), blocks, 3, scale, effects),
+                                   DriveEffects effects)
+    : ChainResidual(std::move(chain), blocks, 3, scale, std::move(effects)),
       p_CB_(observation.X_CB.translation()),
       whitener_(whitener_from(
           Eigen::Matrix3d(measurement.covariance(observation).topLeftCorner<3, 3>()))) {}

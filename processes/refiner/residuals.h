@@ -4,6 +4,7 @@
 #include <ceres/loss_function.h>
 
 #include <Eigen/Core>
+#include <memory>
 #include <optional>
 #include <vector>
 
@@ -30,12 +31,16 @@ struct NoiseScale {
   double value = 1;
 };
 
+/// What the drive's scalars add to each joint at an action, joint by scalar; the observations of a
+/// sample share one. Null: there is no drive.
+using DriveEffects = std::shared_ptr<const Eigen::MatrixXd>;
+
 /// Base of what depends on a part's pose: blocks are those of the chain, then those of the tag and
 /// the lens, or that of the drive, where there are any.
 class ChainResidual : public ceres::CostFunction {
  protected:
   ChainResidual(PartChain chain, const std::vector<const ParameterBlock*>& blocks,
-                int num_residuals, const NoiseScale& scale, Eigen::MatrixXd effects = {});
+                int num_residuals, const NoiseScale& scale, DriveEffects effects);
   /// The pose of a chain whose joints go farther than they are told by effects · drive. `by_block`,
   /// if given, receives also the derivative by the drive.
   Pose pose(double const* const* parameters, std::vector<PartChain::Jacobian>* by_block) const;
@@ -49,7 +54,7 @@ class ChainResidual : public ceres::CostFunction {
   const PartChain chain_;
   const std::vector<const ParameterBlock*> blocks_;
   const NoiseScale& scale_;
-  const Eigen::MatrixXd effects_;  ///< of the drive, joint by scalar; empty: there is none
+  const DriveEffects effects_;
 };
 
 /// Corners of a tag M on part B, 8 whitened residuals [σ]: predicted minus measured.
@@ -61,7 +66,7 @@ class CornerResidual final : public ChainResidual {
   /// is one, comes last. `covariance_px2` is positive definite.
   CornerResidual(PartChain chain, const std::vector<const ParameterBlock*>& blocks, double size_m,
                  const Lens& lens, const TagSight& sight, const Matrix8d& covariance_px2,
-                 const NoiseScale& scale, const Eigen::MatrixXd& effects = {});
+                 const NoiseScale& scale, DriveEffects effects = nullptr);
   /// False if a corner lies behind the camera.
   bool Evaluate(double const* const* parameters, double* residuals,
                 double** jacobians) const override;
@@ -91,7 +96,7 @@ class PoseResidual final : public ChainResidual {
  public:
   PoseResidual(PartChain chain, const std::vector<const ParameterBlock*>& blocks,
                const PartObservation& observation, const MeasurementModel& measurement,
-               const NoiseScale& scale, const Eigen::MatrixXd& effects = {});
+               const NoiseScale& scale, DriveEffects effects = nullptr);
   bool Evaluate(double const* const* parameters, double* residuals,
                 double** jacobians) const override;
 
@@ -108,7 +113,7 @@ class PositionResidual final : public ChainResidual {
  public:
   PositionResidual(PartChain chain, const std::vector<const ParameterBlock*>& blocks,
                    const PartObservation& observation, const MeasurementModel& measurement,
-                   const NoiseScale& scale, const Eigen::MatrixXd& effects = {});
+                   const NoiseScale& scale, DriveEffects effects = nullptr);
   bool Evaluate(double const* const* parameters, double* residuals,
                 double** jacobians) const override;
 

@@ -81,19 +81,39 @@ struct Prediction {
   MatrixXd G;
 };
 
+/// The chain to a part at an action, and how its pose depends on its blocks, that of the drive
+/// last.
+struct Dependence {
+  std::vector<ParameterBlock*> blocks;
+  std::vector<PartChain::Jacobian> jacobians;
+};
+
+Dependence dependence(const BodySchema& schema, RefinementProblem& problem, int part,
+                      std::int64_t sample_index, const VectorXd& action) {
+  Dependence result;
+  result.blocks = problem.chain_blocks(part, sample_index);
+  std::vector<const double*> values;
+  for (const ParameterBlock* block : result.blocks) values.push_back(problem.memory_of(block));
+  const MatrixXd effects = problem.drive_model().effects(action);
+  const VectorXd no_play = VectorXd::Zero(effects.rows());
+  PartChain::Jacobian by_play = PartChain::Jacobian::Zero(6, effects.rows());
+  PartChain(problem.paths().at(part), schema.displacements(action),
+            problem.drive_model().first_joints())
+      .pose(values.data(), Pose::Identity(), &result.jacobians, no_play.data(), &by_play);
+  if (!problem.drive()) return result;
+  result.blocks.push_back(problem.drive());
+  result.jacobians.emplace_back(by_play * effects);
+  return result;
+}
+
 std::vector<Prediction> predictions(const BodySchema& schema, const InformationLayout& layout,
                                     RefinementProblem& problem, std::int64_t sample_index,
                                     const std::vector<VectorXd>& actions) {
   std::vector<Prediction> result;
   for (const VectorXd& action : actions) {
-    const VectorXd theta = schema.displacements(action);
     for (const auto& [part, path] : problem.paths()) {
       if (part == schema.root || !schema.has_part(part)) continue;
-      const std::vector<ParameterBlock*> blocks = problem.chain_blocks(part, sample_index);
-      std::vector<const double*> values;
-      for (const ParameterBlock* block : blocks) values.push_back(problem.memory_of(block));
-      std::vector<PartChain::Jacobian> jacobians;
-      PartChain(path, theta).pose(values.data(), Pose::Identity(), &jacobians);
+      const auto [blocks, jacobians] = dependence(schema, problem, part, sample_index, action);
       Prediction& prediction = result.emplace_back();
       const Index num_rows = schema.has_rotation(part) ? 6 : 3;
       std::vector<VectorXd> columns;

@@ -6,28 +6,20 @@
 #include <limits>
 #include <map>
 #include <set>
+#include <utility>
 
-#include "common/schema/warp_spectrum.h"
+#include "common/schema/warp_process.h"
 #include "processes/structure_learner/screen.h"
 
 namespace bodyschema {
 namespace {
 
-constexpr int kBasis = 20;
 constexpr int kWarpFrames = 150;      // a pair, evenly chosen
 constexpr int kMaxModelsASignal = 4;  // the most precise ones
 constexpr int kMaxRounds = 12;
 /// Slack along the motion, in half ranges: far more than any warp, far less than the range. Of a
 /// joint, in radians: no more than its motion is straight for.
 constexpr double kSlack = 0.3, kMostSlack_rad = 0.8;
-/// Positions of a signal, so far apart [half ranges], below which its command is taken to be
-/// linear: a line and a process of unknown amplitude and length go through any few. A repeated
-/// position tells nothing of what is between. Chosen: of 20 random positions 18 are so far apart.
-constexpr int kFewestPositions = 15;
-constexpr double kApart = 0.01;
-/// A parameter of a model's own line is free within this many half ranges.
-constexpr double kFree = 10;
-
 /// The pair with Σ_z + J σ² Jᵀ in place of Σ_z.
 PairData with_slack(const PairData& pair, const LocalModel& model,
                     const NormalizedActions& actions) {
@@ -125,7 +117,7 @@ struct Regression {
 Regression regress(const std::vector<const std::vector<Reading>*>& models,
                    const std::vector<double>& x_of_sample) {
   const int num_lines = 2 * static_cast<int>(models.size());
-  const int size = num_lines + kBasis;
+  const int size = num_lines + kWarpSize;
   Eigen::MatrixXd A = Eigen::MatrixXd::Zero(size, size);
   Eigen::VectorXd b = Eigen::VectorXd::Zero(size), row(size);
   for (std::size_t m = 0; m < models.size(); ++m) {
@@ -134,57 +126,29 @@ Regression regress(const std::vector<const std::vector<Reading>*>& models,
       row.setZero();
       row(2 * static_cast<Eigen::Index>(m)) = 1;
       row(2 * static_cast<Eigen::Index>(m) + 1) = x;
-      row.tail(kBasis) = warp_basis(x, kBasis);
+      row.tail(kWarpSize) = warp_basis(x, kWarpSize);
       A.selfadjointView<Eigen::Lower>().rankUpdate(row, reading.precision);
       b += reading.precision * reading.theta * row;
     }
   }
   A = A.selfadjointView<Eigen::Lower>();
-
-  const auto evidence = [&](const Eigen::VectorXd& prior_variance, Eigen::VectorXd* mean) {
-    const auto p = prior_variance.size();
-    const Eigen::VectorXd root = prior_variance.cwiseSqrt();
-    Eigen::MatrixXd H = root.asDiagonal() * A.topLeftCorner(p, p) * root.asDiagonal();
-    H.diagonal().array() += 1;
-    const Eigen::LLT<Eigen::MatrixXd> llt(H);
-    const Eigen::VectorXd c = root.cwiseProduct(b.head(p));
-    const Eigen::VectorXd solved = llt.solve(c);
-    *mean = root.cwiseProduct(solved);
-    return 0.5 * c.dot(solved) - llt.matrixLLT().diagonal().array().log().sum();
-  };
   Regression best;
-  Eigen::VectorXd mean;
-  const double straight = evidence(Eigen::VectorXd::Constant(num_lines, kFree * kFree), &mean);
   best.evidence = -std::numeric_limits<double>::infinity();
-  for (const double length : kWarpLengths) {
-    for (const double amplitude : {0.003, 0.01, 0.03, 0.1, 0.3}) {
-      Eigen::VectorXd variance = Eigen::VectorXd::Constant(size, kFree * kFree);
-      variance.tail(kBasis) = amplitude * amplitude * warp_spectrum(length, kBasis);
-      const double ratio = evidence(variance, &mean) - straight;
-      if (ratio <= best.evidence) continue;
-      double slope = 0;
-      for (int m = 0; m < num_lines / 2; ++m) slope += mean(2 * m + 1) / (num_lines / 2);
-      if (slope > 0) best = {mean.tail(kBasis) / slope, ratio};
-    }
+  for (const auto& [mean, evidence] : warp_processes(A, b, num_lines)) {
+    if (evidence <= best.evidence) continue;
+    double slope = 0;
+    for (int m = 0; m < num_lines / 2; ++m) slope += mean(2 * m + 1) / (num_lines / 2);
+    if (slope > 0) best = {mean.tail(kWarpSize) / slope, evidence};
   }
   return best;
 }
 
-/// Number of positions at least kApart from each other that have readings.
 int count_positions(const std::vector<const std::vector<Reading>*>& models,
                     const std::vector<double>& x_of_sample) {
   std::vector<double> x;
   for (const auto* readings : models)
     for (const Reading& reading : *readings) x.push_back(x_of_sample[reading.sample]);
-  std::sort(x.begin(), x.end());
-  int count = 0;
-  double last = -std::numeric_limits<double>::infinity();
-  for (const double position : x) {
-    if (position - last < kApart) continue;
-    ++count;
-    last = position;
-  }
-  return count;
+  return num_positions_apart(std::move(x));
 }
 
 class WarpEstimate {
@@ -257,7 +221,7 @@ class WarpEstimate {
       if (!(signals_[s].upper > signals_[s].lower)) continue;
       const auto models = witnesses_of(s, witnesses);
       const std::vector<double> x = positions(s);
-      if (count_positions(models, x) >= kFewestPositions) result[s] = regress(models, x);
+      if (count_positions(models, x) >= kFewestWarpPositions) result[s] = regress(models, x);
     }
     return result;
   }

@@ -28,9 +28,6 @@ bool estimate_warps(const std::vector<ActionPoseSample>& samples, const std::vec
                     const SearchResult& found, const SearchOptions& options,
                     std::vector<Signal>* signals);
 
-/// Log marginal likelihood that a warp must gain over the linear command [nats].
-inline constexpr double kWarpEvidence = 10;
-
 /// The samples with θ(q) in place of q.
 std::vector<ActionPoseSample> displaced(std::vector<ActionPoseSample> samples,
                                         const std::vector<Signal>& signals);

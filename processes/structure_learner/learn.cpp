@@ -6,6 +6,7 @@
 #include <stdexcept>
 #include <tuple>
 
+#include "common/schema/warp_process.h"
 #include "processes/structure_learner/command_lag.h"
 #include "processes/structure_learner/command_warp.h"
 #include "processes/structure_learner/confirmed_structure.h"

@@ -59,7 +59,8 @@ Json tag_json(const TagPlacement& tag) {
 }
 
 std::string gauge_text(const Refinement& result) {
-  if (!result.used_corners) return "a part's frame is where its poses are seen";
+  if (!result.used_corners)
+    return "a part's frame is where its poses are seen; the scale is that of the poses";
   return "a part's frame is where its tags are closest to where the rig says that they sit; the "
          "scale is the mean of all tags' sizes, weighed by their priors";
 }
@@ -130,6 +131,14 @@ std::string plays_text(const std::vector<JointPlay>& plays) {
   for (const JointPlay& play : plays)
     text += fmt::format("  {} is off its command by {:.4f}°, {:.4f} mm (1 σ)\n", play.joint,
                         play.turn_rad / kDegree, play.slide_m * 1e3);
+  return text;
+}
+
+std::string bends_text(const std::vector<RefinedBend>& bends) {
+  std::string text;
+  for (const RefinedBend& bend : bends)
+    text += fmt::format("  the command {} is bent: up to {:.4g} from a line, by {:.1f} nats\n",
+                        bend.signal, bend.largest, bend.evidence);
   return text;
 }
 
@@ -267,6 +276,9 @@ Json refinement_json(const Refinement& result, const std::optional<RigCalibratio
     return Json{
         {"joint", play.joint}, {"slide_m", play.slide_m}, {"turn_deg", play.turn_rad / kDegree}};
   });
+  json["bends"] = array_of(result.bends, [](const RefinedBend& bend) {
+    return Json{{"signal", bend.signal}, {"evidence", bend.evidence}, {"largest", bend.largest}};
+  });
   json["held"] = result.held;
   json["elasticity"] = result.elasticity ? elasticity_json(*result.elasticity) : Json();
   json["wanted_actions"] = wanted_json(result);
@@ -284,7 +296,9 @@ std::string refinement_text(const Refinement& result,
                   counted(result.num_samples, "sample"), result.num_available,
                   result.num_observations, result.used_corners ? "tags" : "poses", result.seconds);
   if (!result.used_corners && claimed)
-    text += "  poses were fitted; --placements and --intrinsics fit the corners of the tags\n";
+    text += fmt::format("  poses were fitted: {}\n",
+                        result.elasticity ? "joints that give way are fitted to poses"
+                                          : "the samples have no corners");
   if (result.root_moves) text += "  the root moves: it has a pose at every sample\n";
   if (result.noise_scale > 1.05)
     text += fmt::format("  residuals are {:.2f} times as large as the noise that is told\n",
@@ -292,7 +306,8 @@ std::string refinement_text(const Refinement& result,
   text += "  " + gauge_text(result) + "\n";
   for (const std::string& held : result.held) text += "  held: " + held + "\n";
   text += held_out_text(result) + parameters_text(result.parameters) + tags_text(result, claimed) +
-          plays_text(result.plays) + elasticity_text(result.elasticity) + findings_text(result);
+          plays_text(result.plays) + bends_text(result.bends) + elasticity_text(result.elasticity) +
+          findings_text(result);
   for (const SignalCoverage& signal : result.coverage)
     text += fmt::format("  {}: {:.0f} % of its range seen\n", signal.signal, 100 * signal.share);
   return text + wanted_text(result);

@@ -172,15 +172,18 @@ TEST(RefineCorners, ReachTheNoise) {
   EXPECT_LT(found, 0.9 * claimed);
 }
 
-TEST(RefineCorners, WithoutOptionsPosesAreFittedAndTagsAndLensStayAsClaimed) {
+TEST(RefineCorners, WithoutOptionsTagsAndLensStayAsClaimed) {
   const Case c(3, 40, 0.05, {});
   RefineOptions options = all();
   options.placements = options.intrinsics = false;
   const Refinement result = refine(c.start, c.samples, c.rig, options);
-  EXPECT_FALSE(result.used_corners);
+  EXPECT_TRUE(result.used_corners);
   EXPECT_LT(*result.after.px_rms, 0.1 * *result.before.px_rms);
   EXPECT_EQ(result.schema.calibration_id, c.samples.front().sample.calibration_id);
-  EXPECT_EQ(result.rig.camera.fx, c.rig.camera.fx);
+  EXPECT_EQ(calibration_id(result.rig.markers, result.rig.camera),
+            calibration_id(c.rig.markers, c.rig.camera));
+  EXPECT_EQ(result.held.size(), 2U);
+  EXPECT_FALSE(refine(c.start, c.samples, std::nullopt, options).used_corners);
 }
 
 TEST(RefineCorners, AloneTheLensIsFoundAmongTagsAsClaimed) {

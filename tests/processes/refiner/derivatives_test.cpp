@@ -110,8 +110,8 @@ TEST(Residuals, OfCornersHaveTheirDerivatives) {
   drive.free = {0, 1};
   for (int n = 0; n < 4; ++n) plays.add(0.01 * test::gaussian(rng));
   for (int n = 0; n < 2; ++n) drive.add(0.1 * test::gaussian(rng));
-  Eigen::MatrixXd effects(4, 2);
-  effects << 0.3, 0, 0.2, 0.5, 0, -0.4, 0.1, 0.7;
+  const Eigen::MatrixXd of_drive{{0.3, 0}, {0.2, 0.5}, {0, -0.4}, {0.1, 0.7}};
+  const auto effects = std::make_shared<const Eigen::MatrixXd>(of_drive);
   const PartChain moved({&robot.edges[0], &robot.edges[1], &robot.edges[2]}, robot.theta,
                         {{&robot.edges[1], 0}, {&robot.edges[2], 3}});
   for (const auto model :
@@ -135,7 +135,7 @@ TEST(Residuals, OfCornersHaveTheirDerivatives) {
     sight.corners_px.setConstant(600);
     Matrix8d covariance = 0.01 * Matrix8d::Identity();
     covariance(0, 3) = covariance(3, 0) = 0.004;
-    const auto expect_right = [&](const PartChain& chain, const Eigen::MatrixXd& by_drive) {
+    const auto expect_right = [&](const PartChain& chain, const DriveEffects& by_drive) {
       const CornerResidual cost(chain, robot.blocks, 0.06, lens, sight, covariance, robot.scale,
                                 by_drive);
       expect_right_derivatives(cost, robot.blocks, 1e-6);
@@ -186,9 +186,10 @@ TEST(Residuals, OfElasticJointsHaveTheirDerivatives) {
   PartObservation observation;
   observation.X_CB = robot.X_CB() * exp(Vector6d(0.1 * test::gaussian6(rng)));
   observation.covariance = isotropic({0.003, 0.02});
-  const PoseResidual pose(chain, robot.blocks, observation, {}, robot.scale, effects);
+  const auto shared = std::make_shared<const Eigen::MatrixXd>(effects);
+  const PoseResidual pose(chain, robot.blocks, observation, {}, robot.scale, shared);
   expect_right_derivatives(pose, robot.blocks, 1e-6);
-  const PositionResidual position(chain, robot.blocks, observation, {}, robot.scale, effects);
+  const PositionResidual position(chain, robot.blocks, observation, {}, robot.scale, shared);
   expect_right_derivatives(position, robot.blocks, 1e-6);
 }
 

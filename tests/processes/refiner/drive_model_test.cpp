@@ -3,7 +3,10 @@
 #include <gtest/gtest.h>
 
 #include <cmath>
+#include <iostream>
 
+#include "common/estimation/evaluation.h"
+#include "common/schema/warp_process.h"
 #include "processes/structure_learner/learn.h"
 #include "tests/experiments/figures/robots.h"
 
@@ -68,6 +71,71 @@ TEST(DriveModel, PutsWeightsAfterCompliances) {
   BodySchema moved = schema;
   model.set_warps(block, &moved);
   EXPECT_EQ(moved.signals[1].warp, (std::vector<double>{0.1, 0.5, 0.02, 0.001}));
+}
+
+TEST(DriveModel, OfBendsThatNothingTellsIsTheWidestProcess) {
+  Rng rng(3);
+  BodySchema schema = bent_schema(rng);
+  schema.signals[1].warp.assign(20, 0.0);
+  const DriveModel model(schema, nullptr, {});
+  const Eigen::VectorXd sd = model.prior_sd();
+  EXPECT_NEAR(sd(0), 0.3 * 1.5 * std::sqrt(warp_spectrum(0.25, 20)(0)), 1e-12);
+  EXPECT_EQ(sd(19), 0);
+  EXPECT_EQ(model.signal_of(19), 1);
+}
+
+/// A model as built: linear commands.
+BodySchema as_built(const experiments::Trial& trial) {
+  BodySchema schema = test::true_schema(trial.robot);
+  schema.X_CR = trial.robot.X_CR;
+  Vector6d step;
+  step << 0.003, -0.002, 0.004, 0.02, -0.01, 0.01;
+  for (Edge& edge : schema.edges) edge.left = edge.left * exp(step);
+  return schema;
+}
+
+TEST(RefineBends, FindsThoseThatTheStartDoesNotHave) {
+  for (int seed = 1; seed <= 3; ++seed) {
+    const auto trial = experiments::make_trial("c", test::Regime::kTag, 60, seed, 0.1);
+    const Refinement result = refine(as_built(trial), refiner_samples(trial.samples), {}, {});
+    ASSERT_EQ(result.bends.size(), 4U) << seed;
+    for (const RefinedBend& bend : result.bends) {
+      EXPECT_GT(bend.evidence, kWarpEvidence);
+      EXPECT_NEAR(bend.largest, 0.1, 0.03) << bend.signal;
+    }
+    EXPECT_LT(experiments::end_effector_errors(result.schema, trial)->position_rms_m, 0.004);
+  }
+}
+
+// A schema has no covariance of its bends: those of gains and offsets hold what is open of them.
+TEST(RefineBends, PredictedDeviationsAreThoseOfTheErrors) {
+  double sum = 0;
+  int num = 0;
+  for (int seed = 1; seed <= 6; ++seed) {
+    const auto trial = experiments::make_trial("a", test::Regime::kTag, 60, seed, 0.1);
+    const Refinement result = refine(as_built(trial), refiner_samples(trial.samples), {}, {});
+    for (const Eigen::VectorXd& action : trial.test_actions) {
+      const auto truth = trial.robot.poses_in_camera(action);
+      const auto predicted = result.schema.predict(trial.root(), trial.end_effector(), action);
+      const Vector6d error = log(predicted->X_AB.inverse() * (truth.at(trial.root()).inverse() *
+                                                              truth.at(trial.end_effector())));
+      sum += squared_mahalanobis(error, predicted->covariance) / 6;
+      ++num;
+    }
+  }
+  std::cout << "mean squared error over what is predicted: " << sum / num << "\n";
+  EXPECT_GT(sum / num, 0.6);
+  EXPECT_LT(sum / num, 1.3);
+}
+
+TEST(RefineBends, FindsNoneInLinearCommandsNorInFewSamples) {
+  for (int seed = 1; seed <= 5; ++seed) {
+    const auto straight = experiments::make_trial("c", test::Regime::kTag, 60, seed);
+    EXPECT_TRUE(
+        refine(as_built(straight), refiner_samples(straight.samples), {}, {}).bends.empty());
+    const auto few = experiments::make_trial("c", test::Regime::kTag, 14, seed, 0.1);
+    EXPECT_TRUE(refine(as_built(few), refiner_samples(few.samples), {}, {}).bends.empty());
+  }
 }
 
 TEST(DriveModel, RefinesBentCommandsWithTheRest) {
