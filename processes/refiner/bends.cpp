@@ -108,20 +108,23 @@ std::optional<Candidate> likeliest_bend(Solved& straight, const std::vector<int>
     return block->kind == ParameterBlock::Kind::kInstant || !block->is_refined;
   });
   const VectorXd score = problem.score(blocks);
-  const Information information(problem, options.measurement);
-  const VectorXd prior_sd = problem.prior_of(drive);
-  const Index first = information.offset(&drive);
-
-  std::vector<Index> others;             // that are free beside the weights of one signal
   std::map<int, std::vector<int>> free;  // of the drive's free scalars, by signal
-  for (Index row = 0; row < information.curvature().rows(); ++row)
-    if (row < first || row >= first + drive.num_free()) others.push_back(row);
+  int num_free = 0;
   for (int n = 0; n < drive.num_free(); ++n) {
     const int signal = problem.drive_model().signal_of(drive.free[n]);
-    if (std::ranges::find(signals, signal) == signals.end())
-      others.push_back(first + n);
-    else
-      free[signal].push_back(n);
+    if (std::ranges::find(signals, signal) == signals.end()) continue;
+    free[signal].push_back(n);
+    ++num_free;
+  }
+  const Information information(problem, options.measurement, num_free);
+  const VectorXd prior_sd = problem.prior_of(drive);
+  const Index first = information.offset(&drive);
+  std::vector<Index> others;  // that are free beside the weights of one signal
+  for (Index row = 0; row < information.curvature().rows(); ++row) {
+    const Index n = row - first;
+    if (n < 0 || n >= drive.num_free() ||
+        !free.contains(problem.drive_model().signal_of(drive.free[n])))
+      others.push_back(row);
   }
   std::optional<Candidate> best;
   for (const auto& [s, places] : free) {

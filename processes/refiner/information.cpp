@@ -81,8 +81,9 @@ struct Information::Weights {
   }
 };
 
-Information::Information(RefinementProblem& problem, const MeasurementModel& measurement) {
-  double num_fitted = 0;
+Information::Information(RefinementProblem& problem, const MeasurementModel& measurement,
+                         int num_at_start) {
+  double num_fitted = -num_at_start;
   for (const ParameterBlock* block : problem.blocks())
     num_fitted += block->is_refined ? block->num_free() : 0;
   const Weights weights(problem.data(), problem.squared_distances(), num_fitted);

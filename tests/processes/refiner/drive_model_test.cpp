@@ -9,6 +9,7 @@
 #include "common/schema/warp_process.h"
 #include "processes/structure_learner/learn.h"
 #include "tests/experiments/figures/robots.h"
+#include "tests/support/random_arm.h"
 
 namespace bodyschema {
 namespace {
@@ -135,6 +136,24 @@ TEST(RefineBends, FindsNoneInLinearCommandsNorInFewSamples) {
         refine(as_built(straight), refiner_samples(straight.samples), {}, {}).bends.empty());
     const auto few = experiments::make_trial("c", test::Regime::kTag, 14, seed, 0.1);
     EXPECT_TRUE(refine(as_built(few), refiner_samples(few.samples), {}, {}).bends.empty());
+  }
+}
+
+// 30 poses of the hand alone have hardly more numbers than an arm of seven joints.
+TEST(RefineBends, FindsNoneWhereParametersAreMany) {
+  for (const int seed : {17, 20, 27, 43}) {
+    Rng rng(seed);
+    const test::SyntheticRobot arm = test::random_arm({.num_joints = 7, .share_sliding = 0}, rng);
+    const int base = arm.visible_parts().front(), hand = arm.visible_parts().back();
+    auto samples =
+        test::babble(arm, 30, {.regime = test::Regime::kTag, .with_covariances = true}, rng);
+    for (ActionPoseSample& sample : samples)
+      std::erase_if(sample.parts, [&](const PartObservation& o) { return o.part != hand; });
+    BodySchema start = test::true_schema(arm);
+    start.X_CR = arm.X_CR;
+    start.parts = {base, hand};
+    start.edges = {arm.true_edge(base, hand)};
+    EXPECT_TRUE(refine(start, refiner_samples(samples), {}, {}).bends.empty()) << seed;
   }
 }
 
