@@ -23,7 +23,7 @@ WarpProcess posterior(const Eigen::MatrixXd& A, const Eigen::VectorXd& b,
   const Eigen::LLT<Eigen::MatrixXd> llt(H);
   const Eigen::VectorXd c = root.cwiseProduct(b.head(p));
   const Eigen::VectorXd solved = llt.solve(c);
-  return {root.cwiseProduct(solved),
+  return {root.cwiseProduct(solved), prior_variance,
           0.5 * c.dot(solved) - llt.matrixLLT().diagonal().array().log().sum()};
 }
 

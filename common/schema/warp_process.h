@@ -29,8 +29,9 @@ Eigen::ArrayXd warp_spectrum(double length, Eigen::Index size);
 
 /// A process that may have bent a command, by what the data tell.
 struct WarpProcess {
-  Eigen::VectorXd mean;  ///< of all parameters, the weights last
-  double evidence = 0;   ///< log marginal likelihood over that without weights [nats]
+  Eigen::VectorXd mean;            ///< of all parameters, the weights last
+  Eigen::VectorXd prior_variance;  ///< of the same
+  double evidence = 0;             ///< log marginal likelihood over that without weights [nats]
 };
 
 /// Processes of all lengths and amplitudes, for a log likelihood bᵀx − ½ xᵀAx of parameters x, in

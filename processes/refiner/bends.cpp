@@ -19,131 +19,174 @@ using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
+const std::optional<RigCalibration> kNoRig;
+
+/// A schema, and the problem of poses that begins with it.
+struct FitToPoses {
+  FitToPoses(BodySchema start, const std::vector<RefinerSample>& samples,
+             const RefineOptions& options, bool root_moves)
+      : schema(std::move(start)), problem(schema, samples, kNoRig, options, root_moves) {}
+  BodySchema schema;
+  RefinementProblem problem;
+};
+
 double half_range(const Signal& signal) { return 0.5 * (signal.upper - signal.lower); }
 
-/// Linear signals of joints that were read at enough positions.
-std::vector<int> candidates(const BodySchema& schema, const std::vector<RefinerSample>& samples) {
-  const bool has_poses = std::ranges::any_of(
-      samples, [](const RefinerSample& seen) { return !seen.sample.parts.empty(); });
-  if (!has_poses || !std::ranges::all_of(schema.edges, PartChain::has_block)) return {};
+bool moves(const Edge& edge, int signal) {
+  return std::ranges::any_of(edge.joints, [&](const ScrewJoint& joint) {
+    return joint.signal == signal && joint.gain != 0 && (joint.slide != 0 || joint.turn != 0);
+  });
+}
+
+/// Linear signals whose joints moved parts that were seen, at enough positions.
+std::vector<int> candidates(const FitToPoses& fit, const std::vector<RefinerSample>& samples) {
+  std::map<std::int64_t, VectorXd> positions;  // by sample
+  for (const RefinerSample& seen : samples)
+    positions[seen.sample.sample_index] = normalized(fit.schema.signals, seen.sample.action);
   std::vector<int> result;
-  for (int s = 0; s < std::ssize(schema.signals); ++s) {
-    const Signal& signal = schema.signals[s];
-    const bool moves = std::ranges::any_of(schema.edges, [&](const Edge& edge) {
-      return std::ranges::any_of(edge.joints,
-                                 [&](const ScrewJoint& joint) { return joint.signal == s; });
-    });
-    if (!moves || !signal.warp.empty() || !(half_range(signal) > 0)) continue;
-    std::vector<double> positions;
-    for (const RefinerSample& seen : samples)
-      positions.push_back(normalized(schema.signals, seen.sample.action)(s));
-    if (num_positions_apart(std::move(positions)) >= kFewestWarpPositions) result.push_back(s);
+  for (int s = 0; s < std::ssize(fit.schema.signals); ++s) {
+    const Signal& signal = fit.schema.signals[s];
+    if (!signal.warp.empty() || !(half_range(signal) > 0)) continue;
+    std::vector<double> read;
+    for (const auto& datum : fit.problem.data())
+      if (std::ranges::any_of(fit.problem.paths().at(datum.part),
+                              [&](const Edge* edge) { return moves(*edge, s); }))
+        read.push_back(positions.at(datum.sample_index)(s));
+    if (num_positions_apart(std::move(read)) >= kFewestWarpPositions) result.push_back(s);
   }
   return result;
 }
 
-/// A quadratic log likelihood of a signal's weights: bᵀx − ½ xᵀAx.
+/// A log likelihood bᵀx − ½ xᵀAx.
 struct Quadratic {
   MatrixXd A;
   VectorXd b;
 };
 
-/// That of the kept parameters where bᵀx − ½ xᵀAx is that of all, the others eliminated (Schur
-/// complement), without the information `known` of the kept ones. Left out is what rounding leaves
-/// of directions that nothing tells.
-Quadratic eliminated(const MatrixXd& A, const VectorXd& b, const std::vector<Index>& kept,
-                     const std::vector<Index>& others, const VectorXd& known) {
+/// That of the kept parameters, the others free (Schur complement). Directions that nothing tells
+/// have the information 0, not what rounding makes of it.
+Quadratic without(const std::vector<Index>& others, const std::vector<Index>& kept,
+                  const Quadratic& all) {
   constexpr double kLeast = 1e-9;  // of a unit diagonal; rounding leaves 1e-14
   const VectorXd unit =
-      A.diagonal().unaryExpr([](double x) { return x > 0 ? 1 / std::sqrt(x) : 1.0; });
-  const MatrixXd scaled = unit.asDiagonal() * A * unit.asDiagonal();
-  const VectorXd score = unit.cwiseProduct(b);
-  const Eigen::SelfAdjointEigenSolver<MatrixXd> of_others(scaled(others, others));
-  const MatrixXd half = of_others.eigenvalues()
-                            .unaryExpr([](double x) { return x > kLeast ? 1 / std::sqrt(x) : 0.0; })
-                            .asDiagonal() *
-                        of_others.eigenvectors().transpose();
-  const MatrixXd mixed = half * scaled(others, kept);
-  const VectorXd of_kept = unit(kept);
-  MatrixXd left = scaled(kept, kept) - mixed.transpose() * mixed;
-  left.diagonal() -= known.cwiseProduct(of_kept.cwiseAbs2());
-  const Eigen::SelfAdjointEigenSolver<MatrixXd> eigen(left);
-  const auto num_told = (eigen.eigenvalues().array() > kLeast).count();
-  const MatrixXd V = eigen.eigenvectors().rightCols(num_told);
-  const MatrixXd back = of_kept.cwiseInverse().asDiagonal() * V;
-  return {back * eigen.eigenvalues().tail(num_told).asDiagonal() * back.transpose(),
-          back * (V.transpose() * (score(kept) - mixed.transpose() * (half * score(others))))};
+      all.A.diagonal().unaryExpr([](double x) { return x > 0 ? 1 / std::sqrt(x) : 1.0; });
+  const MatrixXd A = unit.asDiagonal() * all.A * unit.asDiagonal();
+  const VectorXd b = unit.cwiseProduct(all.b);
+  const Eigen::SelfAdjointEigenSolver<MatrixXd> of_others(A(others, others));
+  const MatrixXd root_of_inverse =
+      of_others.eigenvalues()
+          .unaryExpr([](double x) { return x > kLeast ? 1 / std::sqrt(x) : 0.0; })
+          .asDiagonal() *
+      of_others.eigenvectors().transpose();
+  const MatrixXd mixed = root_of_inverse * A(others, kept);
+  const Eigen::SelfAdjointEigenSolver<MatrixXd> rest(
+      MatrixXd(A(kept, kept) - mixed.transpose() * mixed));
+  const auto num_told = (rest.eigenvalues().array() > kLeast).count();
+  const MatrixXd V = rest.eigenvectors().rightCols(num_told);
+  const MatrixXd back = unit(kept).cwiseInverse().asDiagonal() * V;
+  return {back * rest.eigenvalues().tail(num_told).asDiagonal() * back.transpose(),
+          back * (V.transpose() * (b(kept) - mixed.transpose() * (root_of_inverse * b(others))))};
 }
-
-const std::optional<RigCalibration> kNoRig;
-
-/// A problem of poses that begins with its schema, solved.
-struct Solved {
-  Solved(BodySchema start, const std::vector<RefinerSample>& samples, const RefineOptions& options,
-         bool root_moves)
-      : schema(std::move(start)), problem(schema, samples, kNoRig, options, root_moves) {
-    problem.solve();
-  }
-  BodySchema schema;
-  RefinementProblem problem;
-};
 
 struct Candidate {
   FoundBend found;
-  std::vector<double> warp;  // Signal::warp
+  WarpProcess process;  ///< [half ranges]
 };
 
-/// Of these signals the one whose command is most surely bent.
-std::optional<Candidate> likeliest_bend(Solved& straight, const std::vector<int>& signals,
-                                        const std::vector<RefinerSample>& samples,
-                                        const RefineOptions& options) {
-  if (signals.empty()) return std::nullopt;
-  BodySchema bendable = straight.schema;
-  for (const int s : signals) bendable.signals[s].warp.assign(kWarpSize, 0.0);
-  RefinementProblem problem(bendable, samples, kNoRig, options, straight.problem.root_moves());
-  problem.begin_at(straight.problem);
-  const ParameterBlock& drive = *problem.drive();
-  std::vector<ParameterBlock*> blocks = problem.blocks();
-  std::erase_if(blocks, [](const ParameterBlock* block) {
-    return block->kind == ParameterBlock::Kind::kInstant || !block->is_refined;
-  });
-  const VectorXd score = problem.score(blocks);
-  std::map<int, std::vector<int>> free;  // of the drive's free scalars, by signal
-  int num_free = 0;
-  for (int n = 0; n < drive.num_free(); ++n) {
-    const int signal = problem.drive_model().signal_of(drive.free[n]);
-    if (std::ranges::find(signals, signal) == signals.end()) continue;
-    free[signal].push_back(n);
-    ++num_free;
+/// What a solved fit tells of the weights of linear commands, were they free.
+class FreeWeights {
+ public:
+  FreeWeights(FitToPoses& fit, const std::vector<int>& linear,
+              const std::vector<RefinerSample>& samples, const RefineOptions& options) {
+    BodySchema bendable = fit.schema;
+    for (const int s : linear) bendable.signals[s].warp.assign(kWarpSize, 0.0);
+    RefinementProblem problem(bendable, samples, kNoRig, options, fit.problem.root_moves());
+    problem.begin_at(fit.problem);
+    const ParameterBlock& drive = *problem.drive();
+    std::map<int, std::vector<int>> free;  // the drive's scalars, by linear signal
+    int num_free = 0;
+    for (int n = 0; n < drive.num_free(); ++n) {
+      const int s = problem.drive_model().signal_of(drive.free[n]);
+      if (std::ranges::find(linear, s) == linear.end()) continue;
+      free[s].push_back(n);
+      ++num_free;
+    }
+    std::vector<ParameterBlock*> blocks = problem.blocks();
+    std::erase_if(blocks, [](const ParameterBlock* block) {
+      return block->kind == ParameterBlock::Kind::kInstant;
+    });
+    all_.b = problem.score(blocks);
+    const Information information(problem, options.measurement, num_free);
+    all_.A = information.curvature();
+    const VectorXd prior_sd = problem.prior_of(drive);
+    std::vector<bool> is_weight(static_cast<std::size_t>(all_.A.rows()), false);
+    for (const auto& [s, places] : free) {
+      Weights& weights = weights_[s];
+      weights.half_range = half_range(bendable.signals[s]);
+      for (const int n : places) {
+        const Index row = information.offset(&drive) + n;
+        weights.rows.push_back(row);
+        is_weight[static_cast<std::size_t>(row)] = true;
+        // Of the data alone.
+        all_.A(row, row) -= std::pow(prior_sd(drive.free[n]), -2);
+      }
+    }
+    for (Index row = 0; row < all_.A.rows(); ++row)
+      if (!is_weight[static_cast<std::size_t>(row)]) others_.push_back(row);
   }
-  const Information information(problem, options.measurement, num_free);
-  const VectorXd prior_sd = problem.prior_of(drive);
-  const Index first = information.offset(&drive);
-  std::vector<Index> others;  // that are free beside the weights of one signal
-  for (Index row = 0; row < information.curvature().rows(); ++row) {
-    const Index n = row - first;
-    if (n < 0 || n >= drive.num_free() ||
-        !free.contains(problem.drive_model().signal_of(drive.free[n])))
-      others.push_back(row);
+
+  /// Nothing if no signal beats its line by kWarpEvidence.
+  std::optional<Candidate> likeliest() const {
+    std::optional<Candidate> best;
+    for (const auto& [s, weights] : weights_) {
+      const double half = weights.half_range;
+      const Quadratic told = without(others_, weights.rows, all_);
+      for (WarpProcess& process : warp_processes(half * half * told.A, half * told.b, 0))
+        if (process.evidence > (best ? best->process.evidence : kWarpEvidence))
+          best = Candidate{{s, process.evidence}, std::move(process)};
+    }
+    return best;
   }
-  std::optional<Candidate> best;
-  for (const auto& [s, places] : free) {
-    const double half = half_range(bendable.signals[s]);
+
+  /// From now on its weights are free, by its process.
+  void add(const Candidate& bend) {
+    const Weights& weights = weights_.at(bend.found.signal);
+    for (std::size_t k = 0; k < weights.rows.size(); ++k) {
+      const Index row = weights.rows[k];
+      all_.A(row, row) += 1 / (std::pow(weights.half_range, 2) *
+                               bend.process.prior_variance(static_cast<Index>(k)));
+      others_.push_back(row);
+    }
+    weights_.erase(bend.found.signal);
+  }
+
+ private:
+  struct Weights {
     std::vector<Index> rows;
-    VectorXd known(std::ssize(places));
-    for (const int place : places) {
-      known(std::ssize(rows)) = std::pow(prior_sd(drive.free[place]), -2);
-      rows.push_back(first + place);
-    }
-    const auto [A, b] = eliminated(information.curvature(), score, rows, others, known);
-    for (const WarpProcess& process : warp_processes(half * half * A, half * b, 0)) {
-      if (process.evidence <= (best ? best->found.evidence : kWarpEvidence)) continue;
-      best = Candidate{{s, process.evidence}, std::vector<double>(kWarpSize, 0.0)};
-      for (Index k = 0; k < process.mean.size(); ++k)
-        best->warp[static_cast<std::size_t>(k)] = half * process.mean(k);
-    }
+    double half_range = 1;
+  };
+  Quadratic all_;
+  std::map<int, Weights> weights_;  // by signal
+  std::vector<Index> others_;
+};
+
+std::vector<Candidate> likely_bends(FreeWeights weights) {
+  std::vector<Candidate> result;
+  while (auto bend = weights.likeliest()) {
+    weights.add(*bend);
+    result.push_back(std::move(*bend));
   }
-  return best;
+  return result;
+}
+
+BodySchema bent(BodySchema schema, const std::vector<Candidate>& bends) {
+  for (const auto& [found, process] : bends) {
+    Signal& signal = schema.signals[found.signal];
+    signal.warp.assign(kWarpSize, 0.0);
+    for (Index k = 0; k < process.mean.size(); ++k)
+      signal.warp[static_cast<std::size_t>(k)] = half_range(signal) * process.mean(k);
+  }
+  return schema;
 }
 
 }  // namespace
@@ -151,20 +194,39 @@ std::optional<Candidate> likeliest_bend(Solved& straight, const std::vector<int>
 BentSchema with_bends(const BodySchema& schema, const std::vector<RefinerSample>& samples,
                       const RefineOptions& options, bool root_moves) {
   BentSchema result{schema, {}};
-  std::vector<int> linear = candidates(schema, samples);
-  if (linear.empty()) return result;
-  auto now = std::make_unique<Solved>(schema, samples, options, root_moves);
-  while (const auto bend = likeliest_bend(*now, linear, samples, options)) {
-    BodySchema bent = now->schema;
-    bent.signals[bend->found.signal].warp = bend->warp;
-    auto next = std::make_unique<Solved>(std::move(bent), samples, options, root_moves);
-    const double gain = next->problem.log_likelihood() - now->problem.log_likelihood();
-    if (!(gain > kWarpEvidence)) break;
-    now = std::move(next);
-    result.bends.push_back(bend->found);
-    std::erase(linear, bend->found.signal);
+  const bool has_poses = std::ranges::any_of(
+      samples, [](const RefinerSample& seen) { return !seen.sample.parts.empty(); });
+  if (!has_poses || !std::ranges::all_of(schema.edges, PartChain::has_block)) return result;
+  auto fit = std::make_unique<FitToPoses>(schema, samples, options, root_moves);
+  std::vector<int> linear = candidates(*fit, samples);
+  if (!linear.empty()) fit->problem.solve();
+  while (!linear.empty()) {
+    std::vector<Candidate> bends = likely_bends(FreeWeights(*fit, linear, samples, options));
+    std::unique_ptr<FitToPoses> next;
+    const auto is_likelier_with_bends = [&] {
+      next = std::make_unique<FitToPoses>(bent(fit->schema, bends), samples, options, root_moves);
+      next->problem.solve();
+      const double gain = next->problem.log_likelihood() - fit->problem.log_likelihood();
+      return gain > kWarpEvidence * static_cast<double>(bends.size());
+    };
+    if (bends.empty()) break;
+    const int likeliest = bends.front().found.signal;
+    bool is_likelier = is_likelier_with_bends();
+    if (!is_likelier && bends.size() > 1) {
+      bends.resize(1);
+      is_likelier = is_likelier_with_bends();
+    }
+    if (!is_likelier) {
+      std::erase(linear, likeliest);
+      continue;
+    }
+    fit = std::move(next);
+    for (const Candidate& bend : bends) {
+      result.bends.push_back(bend.found);
+      std::erase(linear, bend.found.signal);
+    }
   }
-  result.schema = now->schema;
+  result.schema = fit->schema;
   return result;
 }
 

@@ -6,7 +6,7 @@
 
 namespace bodyschema {
 
-/// A command that is linear in a schema and that samples show to be bent.
+/// A command that is linear in a schema and bent in the samples.
 struct FoundBend {
   int signal = 0;       ///< index
   double evidence = 0;  ///< [nats] over a linear command
@@ -17,14 +17,15 @@ struct BentSchema {
   std::vector<FoundBend> bends;  ///< in the order in which they were found
 };
 
-/// Adds bends to a schema whose edges are of screws alone, one at a time, the likeliest first:
-/// where commands go together, one that bends makes others seem to. At a fit to the parts' poses
-/// the log likelihood of a signal's weights, all other parameters free, is quadratic, and that of
-/// warp_processes(). A bend must beat the line by kWarpEvidence, there and when all is fitted with
-/// it, and its command be read at kFewestWarpPositions.
+/// Adds bends to a schema whose edges are of screws alone. Where a fit to the parts' poses has its
+/// best, the log likelihood of a signal's weights (Signal::warp), all other parameters free, is
+/// quadratic: warp_processes() tell how much likelier the weights of a process are than none. Bends
+/// that beat the line by kWarpEvidence are added, the likeliest first, each with those before it
+/// free. A fit with them must be as much likelier, else the likeliest alone is tried. A signal is
+/// linear where parts beyond its joints were seen at fewer than kFewestWarpPositions.
 ///
-/// Of poses, for where corners are fitted joints may be off their commands at every sample, and
-/// what droops would do so by bends.
+/// To poses also where corners are fitted: with joints that may be off their commands at every
+/// sample the evidence of bends is not that of the commands, but that of the joints' droop.
 BentSchema with_bends(const BodySchema& schema, const std::vector<RefinerSample>& samples,
                       const RefineOptions& options, bool root_moves);
 

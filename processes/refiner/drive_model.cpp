@@ -139,6 +139,12 @@ int DriveModel::signal_of(int weight) const {
   return result;
 }
 
+void DriveModel::copy_weights(const DriveModel& other, const double* from, double* to) const {
+  for (const auto& [signal, first] : first_weights_)
+    if (const auto same = other.first_weights_.find(signal); same != other.first_weights_.end())
+      std::copy_n(from + same->second, schema_.signals[signal].warp.size(), to + first);
+}
+
 void DriveModel::set_warps(const ParameterBlock& block, BodySchema* schema) const {
   for (const auto& [signal, first] : first_weights_) {
     std::vector<double>& warp = schema->signals[signal].warp;

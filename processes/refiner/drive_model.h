@@ -28,6 +28,8 @@ class DriveModel {
   /// Whether a scalar of the block is a weight, and the index of the signal that it bends.
   bool is_weight(int scalar) const { return signal_of(scalar) >= 0; }
   int signal_of(int weight) const;
+  /// Copies the weights of the signals that both bend, by as many each.
+  void copy_weights(const DriveModel& other, const double* from, double* to) const;
   /// Place of each edge's first joint among all joints.
   const std::map<const Edge*, int>& first_joints() const { return first_joints_; }
   /// Standard deviations of the scalars, which have the mean 0; infinite for compliances. Those of

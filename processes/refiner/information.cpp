@@ -82,8 +82,8 @@ struct Information::Weights {
 };
 
 Information::Information(RefinementProblem& problem, const MeasurementModel& measurement,
-                         int num_at_start) {
-  double num_fitted = -num_at_start;
+                         int num_not_fitted) {
+  double num_fitted = -num_not_fitted;
   for (const ParameterBlock* block : problem.blocks())
     num_fitted += block->is_refined ? block->num_free() : 0;
   const Weights weights(problem.data(), problem.squared_distances(), num_fitted);

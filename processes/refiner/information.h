@@ -21,9 +21,9 @@ namespace bodyschema {
 /// refined ones.
 class Information {
  public:
-  /// `measurement`: of poses. `num_at_start`: of the free directions so many were never moved.
+  /// `measurement`: of poses. `num_not_fitted`: free directions that the fit did not move.
   Information(RefinementProblem& problem, const MeasurementModel& measurement,
-              int num_at_start = 0);
+              int num_not_fitted = 0);
 
   /// Blocks of `covariance`: refined ones, those of instants left out.
   const std::vector<ParameterBlock*>& blocks() const { return blocks_; }

@@ -186,11 +186,16 @@ std::vector<std::string> held_things(const BodySchema& schema, const RefineOptio
   for (const Signal& signal : schema.signals)
     if (holds_bends && !signal.warp.empty())
       result.push_back(fmt::format("{}: the bend of its command", signal.name));
-  if (has_corners && !options.placements)
-    result.push_back("tags: as the rig's files say, within their priors");
-  if (has_corners && !options.intrinsics)
-    result.push_back("lens: as the rig's files say, within its priors");
+  if (has_corners && !options.placements) result.push_back("tags: as the rig's files say");
+  if (has_corners && !options.intrinsics) result.push_back("lens: as the rig's files say");
   return result;
+}
+
+void leave_out_those_without_corners(std::vector<RefinerSample>* samples,
+                                     std::vector<std::string>* held) {
+  const auto removed =
+      std::erase_if(*samples, [](const RefinerSample& seen) { return seen.tags.empty(); });
+  if (removed > 0) held->push_back(fmt::format("{} samples without corners: not fitted", removed));
 }
 
 /// Samples that are learned from and TEST samples, both in order.
@@ -230,7 +235,8 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   auto [training, held_out] = split(std::move(samples));
   Refinement result;
   check_calibration(training, rig, options);
-  result.used_corners = rig && has_corners(training) && !options.joint_loads;
+  result.used_corners = options.placements || options.intrinsics;
+  if (result.used_corners) leave_out_those_without_corners(&training, &result.held);
   const std::optional<RigCalibration> used_rig = result.used_corners ? rig : std::nullopt;
   if (rig) result.rig = *rig;
   result.num_available = static_cast<int>(training.size());
@@ -242,7 +248,8 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   training = informative(std::move(training), schema, used_rig, stiff, result.root_moves);
   result.num_samples = static_cast<int>(training.size());
   result.coverage = coverage_of(schema, training);
-  result.held = held_things(schema, options, result.used_corners);
+  for (std::string& thing : held_things(schema, options, result.used_corners))
+    result.held.push_back(std::move(thing));
 
   // Loads are told apart from bends, which would take their part, by whoever gives them.
   const BentSchema bent = options.joint_loads

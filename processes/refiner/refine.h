@@ -24,8 +24,8 @@ struct RefineOptions {
   bool intrinsics = false;  ///< also focal lengths, centre and distortion
   RefinerConfig config;
   CornerNoise corner_noise;      ///< of corners without a covariance of their own
-  MeasurementModel measurement;  ///< of poses, where these are fitted
-  /// Also fit joints that give way to these loads, to poses.
+  MeasurementModel measurement;  ///< of poses
+  /// Where poses are fitted: also fit joints that give way to these loads.
   JointLoads joint_loads;
 };
 
@@ -144,13 +144,15 @@ inline constexpr int kMostWantedActions = 10;
 
 /// Fits all parameters of a schema at once to TRAIN and PROBE samples, with Student-t weights:
 /// where the root stands, every screw, and the bends of commands, new ones where the samples show
-/// them (kWarpEvidence). With a rig the data are the corners' pixels, the rig's claims are priors,
-/// and at every sample each joint may be off its command (backlash, droop) by what is estimated to
-/// be usual; without one, where no sample has corners, and where loads are given the data are the
-/// parts' poses. Edges with a Gaussian process and signals' limits stay as they are, and bent
-/// commands where there is such an edge. Loads of the joints are fitted beside, commands then bend
-/// no more than they did: the refined schema has stiff joints, for a schema knows no loads. TEST
-/// samples are judged alone. The order of samples changes nothing.
+/// them (kWarpEvidence). While tags and lens are as the rig says, the data are the parts' poses,
+/// which were made by these: their covariances know of errors of tags and lens, corners do not.
+/// With tags or lens among the parameters, the data are the corners' pixels, the rig's claims are
+/// priors, and at every sample each joint may be off its command (backlash, droop) by what is
+/// estimated to be usual; samples without corners are not fitted then. Edges with a Gaussian
+/// process and signals' limits stay as they are, and all bends where there is such an edge. Loads
+/// of the joints are fitted beside, commands then bend no more than they did: the refined schema
+/// has stiff joints, for a schema knows no loads. TEST samples are judged alone. The order of
+/// samples changes nothing.
 ///
 /// Gauge: a part's frame is where its tags are closest to the rig's claims, and the scale is the
 /// mean of all tags' sizes, all weighed by their priors, for images tell neither.

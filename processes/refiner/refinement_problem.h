@@ -56,7 +56,7 @@ class RefinementProblem {
   std::optional<Cost> cost_of(const PartObservation& observation, const Eigen::VectorXd& action,
                               std::int64_t sample_index);
 
-  /// Begins where another problem of the same samples is now, its drive by the scalars' names.
+  /// Begins where another problem of the same samples is now, its bends where both have them.
   void begin_at(RefinementProblem& other);
   /// Levenberg–Marquardt with Student-t weights, the noise's scale estimated between its runs,
   /// until neither changes.

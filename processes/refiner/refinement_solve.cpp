@@ -76,21 +76,15 @@ double RefinementProblem::estimate_play() {
 }
 
 void RefinementProblem::begin_at(RefinementProblem& other) {
-  const auto take = [](const double* from, std::size_t num, double* to) {
-    std::copy_n(from, num, to);
-  };
   std::vector<ParameterBlock*> from = other.blocks();
   std::erase(from, other.drive_);
   auto next = from.begin();
   for (ParameterBlock* block : blocks()) {
     if (block != drive_) {
-      take(other.memory_of(*next++), block->values.size(), memory_of(block));
-      continue;
-    }
-    for (std::size_t n = 0; other.drive_ && n < block->names.size(); ++n) {
-      const auto same = std::ranges::find(other.drive_->names, block->names[n]);
-      if (same != other.drive_->names.end())
-        memory_of(block)[n] = other.memory_of(other.drive_)[same - other.drive_->names.begin()];
+      std::copy_n(other.memory_of(*next++), block->values.size(), memory_of(block));
+    } else if (other.drive_) {
+      drive_model_.copy_weights(other.drive_model_, other.memory_of(other.drive_),
+                                memory_of(drive_));
     }
   }
   scale_ = other.scale_;

@@ -25,7 +25,7 @@ struct RefinerConfig {
   /// How far joints may be from their commands at a sample (backlash, droop), where the search
   /// begins: it is estimated. Sliding joints: position_m, others: rotation_rad.
   TagCalibration joint_play = {.position_m = 2e-4, .rotation_rad = 0.05 * kDegree};
-  /// Of more training samples as many are fitted, evenly spaced.
+  /// Of more training samples as many are fitted, those that tell most.
   int max_samples = 400;
 
   /// @throws ConfigError.

@@ -134,11 +134,11 @@ Regression regress(const std::vector<const std::vector<Reading>*>& models,
   A = A.selfadjointView<Eigen::Lower>();
   Regression best;
   best.evidence = -std::numeric_limits<double>::infinity();
-  for (const auto& [mean, evidence] : warp_processes(A, b, num_lines)) {
-    if (evidence <= best.evidence) continue;
+  for (const WarpProcess& process : warp_processes(A, b, num_lines)) {
+    if (process.evidence <= best.evidence) continue;
     double slope = 0;
-    for (int m = 0; m < num_lines / 2; ++m) slope += mean(2 * m + 1) / (num_lines / 2);
-    if (slope > 0) best = {mean.tail(kWarpSize) / slope, evidence};
+    for (int m = 0; m < num_lines / 2; ++m) slope += process.mean(2 * m + 1) / (num_lines / 2);
+    if (slope > 0) best = {process.mean.tail(kWarpSize) / slope, process.evidence};
   }
   return best;
 }

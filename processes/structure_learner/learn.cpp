@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <map>
 #include <set>
 #include <stdexcept>
 #include <tuple>
@@ -193,13 +194,32 @@ bool connects_more_simply(const SearchResult& x, const SearchResult& y) {
   return std::tuple(x.models.size(), -num_joints(x)) > std::tuple(y.models.size(), -num_joints(y));
 }
 
+// The markers' noise in the same samples by how their commands are bent: each estimated once, for a
+// structure may be looked for with noise several times as large.
+class NoiseByBends {
+ public:
+  const SourcedNoise& at(const std::vector<Signal>& signals,
+                         const std::vector<ActionPoseSample>& displaced_by_these,
+                         const LearnOptions& options) {
+    std::vector<std::vector<double>> bends;
+    for (const Signal& signal : signals) bends.push_back(signal.warp);
+    const auto [known, is_new] = known_.try_emplace(std::move(bends));
+    if (is_new)
+      known->second = marker_noise(displaced_by_these, static_cast<int>(signals.size()), options);
+    return known->second;
+  }
+
+ private:
+  std::map<std::vector<std::vector<double>>, SourcedNoise> known_;
+};
+
 enum class Commands { kStraight, kMayBeBent };
 
 // Begins with the bends of `signals`.
 LearnedStructure find_with_bias(const std::vector<Signal>& signals,
                                 const std::vector<ActionPoseSample>& samples,
-                                const LearnOptions& options, double unknown_bias,
-                                Commands commands) {
+                                const LearnOptions& options, double unknown_bias, Commands commands,
+                                NoiseByBends* noise_by_bends) {
   if (options.max_signals < 0) throw std::invalid_argument("max_signals must not be below 0");
   const int num_signals = check_actions(samples, signals.size());
   const std::vector<int> parts = seen_parts(samples);
@@ -207,14 +227,15 @@ LearnedStructure find_with_bias(const std::vector<Signal>& signals,
   search_options.unknown_bias = unknown_bias;
   MeasurementModel& measurement = search_options.measurement;
   NoiseSource noise_source = NoiseSource::kCovariances;
-  const auto set_noise = [&](const std::vector<ActionPoseSample>& of) {
+  const auto set_noise = [&](const std::vector<Signal>& bent,
+                             const std::vector<ActionPoseSample>& of) {
     if (!options.measurement.noise && has_covariances(of)) return;
-    const SourcedNoise noise = marker_noise(of, num_signals, options);
+    const SourcedNoise& noise = noise_by_bends->at(bent, of, options);
     measurement.noise = noise;
     noise_source = noise.source;
   };
   const std::vector<ActionPoseSample> moved = displaced(samples, signals);
-  set_noise(moved);
+  set_noise(signals, moved);
   // What many joints leave by that much is no noise either.
   if (noise_source == NoiseSource::kResiduals && is_above_any_marker(*measurement.noise))
     search_options.max_signals = std::min(search_options.max_signals, kMaxScreenedJoints);
@@ -236,7 +257,7 @@ LearnedStructure find_with_bias(const std::vector<Signal>& signals,
     std::vector<Signal> bent = result.signals;
     if (!estimate_warps(samples, parts, result.search, search_options, &bent)) break;
     const std::vector<ActionPoseSample> again = displaced(samples, bent);
-    set_noise(again);
+    set_noise(bent, again);
     NormalizedActions actions_again(again, num_signals);
     SearchResult found = search_structure(again, actions_again, parts, search_options);
     found.num_screens += result.search.num_screens;
@@ -335,12 +356,13 @@ LearnedStructure find_in_step(const std::vector<Signal>& signals,
   std::vector<ActionPoseSample> poses = samples;
   for (ActionPoseSample& sample : poses)
     std::erase_if(sample.parts, [](const PartObservation& o) { return !o.has_rotation; });
-  const auto confirmed = [&](const LearnOptions& by, Commands commands = Commands::kMayBeBent) {
+  const auto confirmed = [&](const LearnOptions& by, NoiseByBends* noise,
+                             Commands commands = Commands::kMayBeBent) {
     const auto find = [&](const StructureQuery& query) {
       LearnOptions louder = by;
       louder.measurement.scale *= query.factor;
       return find_with_bias(query.bent.empty() ? signals : query.bent, poses, louder,
-                            query.unknown_bias, commands);
+                            query.unknown_bias, commands, noise);
     };
     return confirmed_structure(find, [&](LearnedStructure* found) {
       // With enough noise a screw passes for anything soft: nothing is tried beside it.
@@ -350,18 +372,19 @@ LearnedStructure find_in_step(const std::vector<Signal>& signals,
                            &found->search);
     });
   };
-  LearnedStructure structure = confirmed(options);
+  NoiseByBends noise, louder_noise;
+  LearnedStructure structure = confirmed(options, &noise);
   // All joints on a signal share its bend: one that a single joint has keeps out the others.
   const auto is_bent = [](const Signal& signal) { return !signal.warp.empty(); };
   if (!structure.spans() && std::ranges::any_of(structure.signals, is_bent)) {
-    LearnedStructure straight = confirmed(options, Commands::kStraight);
+    LearnedStructure straight = confirmed(options, &noise, Commands::kStraight);
     if (straight.search.models.size() > structure.search.models.size())
       structure = std::move(straight);
   }
   if (const std::optional<Noise> shown = noise_instead(structure, poses, options)) {
     LearnOptions louder = options;
     louder.measurement.noise = shown;
-    LearnedStructure found = confirmed(louder);
+    LearnedStructure found = confirmed(louder, &louder_noise);
     found.noise_source = NoiseSource::kResiduals;
     if (!has_soft_edge(found.search)) structure = std::move(found);
   }

@@ -296,9 +296,7 @@ std::string refinement_text(const Refinement& result,
                   counted(result.num_samples, "sample"), result.num_available,
                   result.num_observations, result.used_corners ? "tags" : "poses", result.seconds);
   if (!result.used_corners && claimed)
-    text += fmt::format("  poses were fitted: {}\n",
-                        result.elasticity ? "joints that give way are fitted to poses"
-                                          : "the samples have no corners");
+    text += "  poses were fitted; --placements and --intrinsics fit the corners of the tags\n";
   if (result.root_moves) text += "  the root moves: it has a pose at every sample\n";
   if (result.noise_scale > 1.05)
     text += fmt::format("  residuals are {:.2f} times as large as the noise that is told\n",

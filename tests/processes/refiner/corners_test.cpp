@@ -125,6 +125,18 @@ TEST(RefineCorners, BendCommandsWithTheRest) {
   EXPECT_GT(*result.before.px_rms, 0.2);
 }
 
+// Tags and lens that are off bend no command.
+TEST(RefineCorners, FindNoBendsByWrongTagsAndLens) {
+  for (int seed = 1; seed <= 4; ++seed) {
+    const Case c(seed);
+    RefineOptions options = all();
+    options.measurement.systematic = {0.002, 0.01};
+    EXPECT_TRUE(refine(c.start, c.samples, c.rig, options).bends.empty());
+    options.placements = options.intrinsics = false;
+    EXPECT_TRUE(refine(c.start, c.samples, c.rig, options).bends.empty());
+  }
+}
+
 TEST(RefineCorners, PutThePartsFramesWhereTheirTagsAreClosestToTheClaims) {
   const Case c(1, 60, 0);
   const RefineOptions options = all();
@@ -172,18 +184,26 @@ TEST(RefineCorners, ReachTheNoise) {
   EXPECT_LT(found, 0.9 * claimed);
 }
 
-TEST(RefineCorners, WithoutOptionsTagsAndLensStayAsClaimed) {
+TEST(RefineCorners, WithoutOptionsPosesAreFittedAndTagsAndLensStayAsClaimed) {
   const Case c(3, 40, 0.05, {});
   RefineOptions options = all();
   options.placements = options.intrinsics = false;
   const Refinement result = refine(c.start, c.samples, c.rig, options);
-  EXPECT_TRUE(result.used_corners);
+  EXPECT_FALSE(result.used_corners);
   EXPECT_LT(*result.after.px_rms, 0.1 * *result.before.px_rms);
   EXPECT_EQ(result.schema.calibration_id, c.samples.front().sample.calibration_id);
   EXPECT_EQ(calibration_id(result.rig.markers, result.rig.camera),
             calibration_id(c.rig.markers, c.rig.camera));
-  EXPECT_EQ(result.held.size(), 2U);
-  EXPECT_FALSE(refine(c.start, c.samples, std::nullopt, options).used_corners);
+}
+
+TEST(RefineCorners, SamplesWithoutCornersAreNamedAndNotCounted) {
+  Case c(3, 40);
+  for (std::size_t n = 0; n < c.samples.size(); n += 5) c.samples[n].tags.clear();
+  const Refinement result = refine(c.start, c.samples, c.rig, all());
+  EXPECT_EQ(result.num_available, 32 - 8);
+  EXPECT_EQ(result.num_samples, 32 - 8);
+  ASSERT_EQ(result.held.size(), 1U);
+  EXPECT_EQ(result.held.front(), "8 samples without corners: not fitted");
 }
 
 TEST(RefineCorners, AloneTheLensIsFoundAmongTagsAsClaimed) {

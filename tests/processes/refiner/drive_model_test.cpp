@@ -3,7 +3,6 @@
 #include <gtest/gtest.h>
 
 #include <cmath>
-#include <iostream>
 
 #include "common/estimation/evaluation.h"
 #include "common/schema/warp_process.h"
@@ -112,8 +111,8 @@ TEST(RefineBends, FindsThoseThatTheStartDoesNotHave) {
 TEST(RefineBends, PredictedDeviationsAreThoseOfTheErrors) {
   double sum = 0;
   int num = 0;
-  for (int seed = 1; seed <= 6; ++seed) {
-    const auto trial = experiments::make_trial("a", test::Regime::kTag, 60, seed, 0.1);
+  for (int seed = 1; seed <= 8; ++seed) {
+    const auto trial = experiments::make_trial("c", test::Regime::kTag, 60, seed, 0.1);
     const Refinement result = refine(as_built(trial), refiner_samples(trial.samples), {}, {});
     for (const Eigen::VectorXd& action : trial.test_actions) {
       const auto truth = trial.robot.poses_in_camera(action);
@@ -124,9 +123,9 @@ TEST(RefineBends, PredictedDeviationsAreThoseOfTheErrors) {
       ++num;
     }
   }
-  std::cout << "mean squared error over what is predicted: " << sum / num << "\n";
+  // Measured: 0.90; 0.32 by the edges' own covariances, 1.44 without what no line explains.
   EXPECT_GT(sum / num, 0.6);
-  EXPECT_LT(sum / num, 1.3);
+  EXPECT_LT(sum / num, 1.2);
 }
 
 TEST(RefineBends, FindsNoneInLinearCommandsNorInFewSamples) {

@@ -156,6 +156,26 @@ TEST(WantedActions, HelpMoreThanAsManyAtRandom) {
   expect_more_help("d", 60 * kDegree, {.rms = 0.92, .worst = 0.87});
 }
 
+// Of a command that may bend the samples tell nothing where it was not read.
+TEST(WantedActions, GoWhereABentCommandWasNotRead) {
+  for (int seed = 1; seed <= 6; ++seed) {
+    Rng rng(seed);
+    SyntheticRobot robot = test::chapter_robot("c", rng);
+    const BodySchema start = schema_of(robot);
+    const Signal& whole = robot.signals[0];
+    robot.bend = 0.05;
+    SyntheticRobot lower = robot;
+    lower.signals[0].upper = whole.lower + 0.6 * (whole.upper - whole.lower);
+    const Refinement result = refine(start, refiner_samples(poses_of(lower, 60, rng)), {}, {});
+    ASSERT_EQ(result.bends.size(), 4U);
+    double share = 0;
+    for (int n = 0; n < 5; ++n)
+      share +=
+          (result.wanted_actions.at(n).action(0) - whole.lower) / (whole.upper - whole.lower) / 5;
+    EXPECT_GT(share, 0.8);  // 0.44 to 0.91 if gains and offsets alone count
+  }
+}
+
 TEST(WantedActions, OrderOfSamplesChangesNothing) {
   Rng rng(13);
   const TaggedRobot robot = test::tagged(test::chapter_robot("c", rng), 3, rng);
