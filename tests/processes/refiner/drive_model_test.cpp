@@ -138,6 +138,19 @@ TEST(RefineBends, FindsNoneInLinearCommandsNorInFewSamples) {
   }
 }
 
+// The end effector, which the last signal alone moves, was seen at 12 of 60 positions.
+TEST(RefineBends, AreReadWhereAPartBeyondTheJointWasSeen) {
+  for (int seed = 1; seed <= 5; ++seed) {
+    auto trial = experiments::make_trial("c", test::Regime::kTag, 60, seed, 0.1);
+    for (std::size_t n = 12; n < trial.samples.size(); ++n)
+      std::erase_if(trial.samples[n].parts,
+                    [&](const PartObservation& o) { return o.part == trial.end_effector(); });
+    const Refinement result = refine(as_built(trial), refiner_samples(trial.samples), {}, {});
+    EXPECT_EQ(result.bends.size(), 3U);
+    for (const RefinedBend& bend : result.bends) EXPECT_NE(bend.signal, "q4");
+  }
+}
+
 // 30 poses of the hand alone have hardly more numbers than an arm of seven joints.
 TEST(RefineBends, FindsNoneWhereParametersAreMany) {
   for (const int seed : {17, 20, 27, 43}) {
