@@ -2,7 +2,7 @@
 // Cramér–Rao bound, with the coverage of the ellipsoids that they predict; the rig arm7 from
 // rendered images, with errors of its tags and its lens; a real recording. Prints Markdown.
 //
-//   refinement robots [--robots 100]
+//   refinement robots [--robots 100] [--kinds a c d]
 //   refinement nominal [--robots 100]
 //   refinement rig config/arm7 [--seeds 10]
 //   refinement recording CSV
@@ -122,14 +122,14 @@ void compare(const std::string& kind, test::Regime regime, bool has_flips, int n
   }
 }
 
-void run_robots(int num_robots) {
+void run_robots(const std::vector<std::string>& kinds, int num_robots) {
   std::printf(
       "Robots of the chapter whose structure was found; rms over robots and test poses of the end "
       "effector's position, coverage of the predicted ellipsoids of 95 %%.\n\n"
       "| robot | noise | N | robots | bound mm | learned mm | refined mm | learned / bound | "
       "refined / bound | coverage learned %% | coverage refined %% | ms |\n"
       "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |\n");
-  for (const char* kind : {"a", "c", "d"}) {
+  for (const std::string& kind : kinds) {
     compare(kind, test::Regime::kTag, false, num_robots);
     compare(kind, test::Regime::kTag, true, num_robots);
     compare(kind, test::Regime::kChapter, false, num_robots);
@@ -436,8 +436,10 @@ int main(int argc, char** argv) {
   app.require_subcommand(1);
   int num_robots = 100, num_seeds = 10, num_samples = 100;
   std::string rig, file;
+  std::vector<std::string> kinds{"a", "c", "d"};
   CLI::App* robots = app.add_subcommand("robots", "random robots beside the Cramér–Rao bound");
   robots->add_option("--robots", num_robots);
+  robots->add_option("--kinds", kinds, "chapter_robot()");
   CLI::App* nominal = app.add_subcommand("nominal", "models as built, base and end seen");
   nominal->add_option("--robots", num_robots);
   CLI::App* rigs = app.add_subcommand("rig", "a rig from rendered images");
@@ -447,7 +449,7 @@ int main(int argc, char** argv) {
   CLI::App* recording = app.add_subcommand("recording", "a CSV, 70 % of it for training");
   recording->add_option("CSV", file)->required();
   CLI11_PARSE(app, argc, argv);
-  if (*robots) run_robots(num_robots);
+  if (*robots) run_robots(kinds, num_robots);
   if (*nominal) run_nominal(num_robots);
   if (*rigs) run_rig(rig, num_seeds, num_samples);
   if (*recording) run_recording(file);

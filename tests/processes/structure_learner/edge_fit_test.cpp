@@ -5,6 +5,8 @@
 #include <algorithm>
 #include <vector>
 
+#include "common/geometry/angle.h"
+#include "processes/structure_learner/learn.h"
 #include "tests/support/synthetic_robot.h"
 
 namespace bodyschema {
@@ -168,6 +170,62 @@ TEST(IsWrongAtSomeCommands, WhereOutliersStandTogetherAndNotWhereTheyAreScattere
   EXPECT_TRUE(is_wrong_at_some_commands(fitted, actions));
   fitted.outlying[order[3]] = false;
   EXPECT_FALSE(is_wrong_at_some_commands(fitted, actions));
+}
+
+TEST(IsWrongAtSomeCommands, WhereOutliersAreAllPosesAtWhichASignalMoved) {
+  test::Rng rng(4);
+  std::vector<ActionPoseSample> samples(60);
+  std::vector<int> frames;
+  for (int t = 0; t < 60; ++t) {
+    samples[t].action = Eigen::Vector2d(test::uniform(rng, -1, 1), 1e-4 * test::gaussian(rng));
+    frames.push_back(t);
+  }
+  samples[20].action(1) = 0.4;
+  samples[40].action(1) = -0.7;
+  const NormalizedActions actions(samples, 2);
+  std::vector<bool> outlying(60, false);
+  outlying[5] = outlying[20] = true;
+  EXPECT_FALSE(is_wrong_at_some_commands(frames, outlying, actions));
+  outlying[40] = true;
+  EXPECT_TRUE(is_wrong_at_some_commands(frames, outlying, actions));
+}
+
+TEST(IsWrongAtSomeCommands, WhereFiveOutliersAreThoseAtAnEnd) {
+  test::Rng rng(5);
+  std::vector<ActionPoseSample> samples(75);
+  std::vector<int> frames;
+  for (int t = 0; t < 75; ++t) {
+    samples[t].action = Eigen::Vector2d(test::uniform(rng, -1, 1), test::uniform(rng, -1, 1));
+    frames.push_back(t);
+  }
+  const NormalizedActions actions(samples, 2);
+  std::vector<int> order = frames;
+  std::ranges::sort(order, {}, [&](int t) { return samples[t].action(1); });
+  for (const int first : {0, 35, 70}) {
+    std::vector<bool> outlying(75, false);
+    for (int n = first; n < first + 5; ++n) outlying[order[n]] = true;
+    EXPECT_EQ(is_wrong_at_some_commands(frames, outlying, actions), first != 35) << first;
+  }
+}
+
+// A hinge that rests at most poses is no rigid edge whose markers are misread at the others.
+TEST(FitJointly, LeavesNoHingeThatMovedInFewPosesRigid) {
+  for (int seed = 1; seed <= 4; ++seed) {
+    test::Rng rng(seed);
+    const test::SyntheticRobot robot = two_hinges(rng);
+    std::vector<ActionPoseSample> samples;
+    for (int t = 0; t < 70; ++t) {
+      Eigen::VectorXd action = robot.random_action(rng);
+      if (t % 30 != 9) action(1) = 0;
+      samples.push_back(test::observe(robot, action, {Regime::kTagIso}, t, rng));
+    }
+    LearnOptions options;
+    options.measurement.noise = Noise{0.003, 1 * kDegree};
+    const LearnResult result = learn(robot.signals, samples, options);
+    for (const Edge& edge : result.schema.edges)
+      if (edge.from != robot.visible_parts()[0] || edge.to != robot.visible_parts()[1])
+        EXPECT_FALSE(edge.joints.empty()) << seed;
+  }
 }
 
 TEST(IsWrongAtAnEnd, WhereOutliersFollowOneAnotherThereAndNotElsewhere) {
