@@ -454,3 +454,9 @@ def _(rng, seed):
     rec.seen[5] = np.where(laid[:, None, None], table, rec.seen[5])
     rec.read[5] = noisy(rng, rec.seen[5], rec.position_sd, rec.rotation_sd)
     return rec
+@family("39 joint that moves in few poses")
+def _(rng, seed):
+    """One joint rests but for 5 to 14 % of the poses."""
+    inputs, j = rng.uniform(-1.2, 1.2, (200, 4)), seed % 4
+    inputs[:, j] = np.where(rng.random(200) < rng.uniform(.05, .14), inputs[:, j], 0)
+    return record(rng, seed, marked(rng, serial_joints(rng, 4)), [-1.2] * 4, 1.2, inputs=inputs)
