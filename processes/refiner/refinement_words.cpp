@@ -142,24 +142,45 @@ std::string RefinementWords::unit_of(const ParameterBlock& block, int direction)
 }
 
 std::vector<std::string> RefinementWords::undetermined() const {
+  const Eigen::MatrixXd& open = information_.undetermined();
+  const Eigen::MatrixXd shared = open * open.transpose();
+  std::vector<std::vector<Eigen::Index>> groups;  // of blocks that share open directions
+  for (Eigen::Index n = 0; n < std::ssize(places_); ++n) {
+    if (undetermined_shares_(n) < kNamedShare) continue;
+    std::vector<Eigen::Index> group = {n};
+    std::erase_if(groups, [&](const std::vector<Eigen::Index>& other) {
+      const bool is_same = std::ranges::any_of(other, [&](Eigen::Index m) {
+        return places_[m].block == places_[n].block || std::abs(shared(n, m)) >= kNamedShare;
+      });
+      if (is_same) group.insert(group.begin(), other.begin(), other.end());
+      return is_same;
+    });
+    groups.push_back(std::move(group));
+  }
   std::vector<std::string> result;
-  for (const ParameterBlock* block : information_.blocks()) {
+  for (const std::vector<Eigen::Index>& group : groups) {
+    std::vector<Place> places;
     std::vector<std::string> names;
-    for (std::size_t n = 0; n < places_.size(); ++n)
-      if (places_[n].block == block &&
-          undetermined_shares_(static_cast<Eigen::Index>(n)) >= kNamedShare)
-        names.push_back(places_[n].element);
-    if (names.empty()) continue;
-    result.push_back(
-        fmt::format("the samples do not tell {}: {}", thing_of(*block), fmt::join(names, "; ")));
+    for (const Eigen::Index n : group) {
+      places.push_back(places_[n]);
+      names.push_back(places_[n].element);
+    }
+    const bool is_of_one = std::ranges::all_of(
+        places, [&](const Place& place) { return place.block == places.front().block; });
+    const std::string listed = fmt::format("{}", fmt::join(names, "; "));
+    std::string sentence = is_of_one ? fmt::format("the samples do not tell {}: {}",
+                                                   thing_of(*places.front().block), listed)
+                                     : fmt::format("the samples do not tell apart {}", listed);
+    if (const std::string more = advice(places); !more.empty()) sentence += ": " + more;
+    result.push_back(std::move(sentence));
   }
   return result;
 }
 
-std::string RefinementWords::advice(const Place& one, const Place& other) const {
+std::string RefinementWords::advice(const std::vector<Place>& places) const {
   std::set<int> tags;
   std::set<std::string> signals;
-  for (const Place& place : {one, other}) {
+  for (const Place& place : places) {
     const ParameterBlock& block = *place.block;
     if (block.kind == Kind::kLens) return "show tags nearer and farther, and at the image's border";
     if (block.kind == Kind::kTag) tags.insert(block.id);
@@ -200,7 +221,7 @@ std::vector<ParameterCorrelation> RefinementWords::correlations(std::size_t most
       const double correlation = covariance(i, j) / (sd(i) * sd(j));
       if (!(std::abs(correlation) > kHighCorrelation)) continue;
       const Place &one = places_[j], &other = places_[i];
-      result.push_back({one.element, other.element, correlation, advice(one, other)});
+      result.push_back({one.element, other.element, correlation, advice({one, other})});
     }
   }
   std::stable_sort(result.begin(), result.end(), [](const auto& a, const auto& b) {

@@ -21,7 +21,8 @@ class RefinementWords {
                   std::vector<int> frame_tags);
 
   std::vector<RefinedParameter> parameters() const { return parameters_; }
-  /// Directions that nothing tells, one sentence an edge, tag or camera.
+  /// Directions that nothing tells, one sentence an edge, tag or camera or for those that share
+  /// one, with what would tell them.
   std::vector<std::string> undetermined() const;
   /// Those above kHighCorrelation, the highest first, at most `most`.
   std::vector<ParameterCorrelation> correlations(std::size_t most) const;
@@ -40,7 +41,8 @@ class RefinementWords {
   std::string unit_of(const ParameterBlock& block, int direction) const;
   std::string thing_of(const ParameterBlock& block) const;
   Eigen::MatrixXd in_frames_of_tags() const;
-  std::string advice(const Place& one, const Place& other) const;
+  /// Which further samples would tell these; "" if unknown.
+  std::string advice(const std::vector<Place>& places) const;
 
   const BodySchema& schema_;
   const Information& information_;
