@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <functional>
 #include <limits>
 #include <numeric>
 #include <optional>
@@ -238,34 +239,25 @@ std::optional<double> usual_value(std::vector<double> values) {
   return std::nullopt;
 }
 
-// Outliers where a signal is farthest: at an end of its range, or away from the value that it
-// usually has; or at all poses where it is away from that, so that no pose tells what it does.
-bool are_outliers_farthest(const std::vector<double>& values, const std::vector<bool>& outlying,
-                           int num_outliers, double log_trials) {
+// Outliers where a signal is farthest from the value that it usually has; or at all poses where it
+// is away from that, so that no pose tells what it does.
+bool are_outliers_where_it_moved(const std::vector<double>& values,
+                                 const std::vector<bool>& outlying, int num_outliers,
+                                 double log_trials) {
   constexpr double kLogLeastChance = -6.9;  // 1e-3
-  const int n = static_cast<int>(values.size());
-  std::vector<int> order(values.size());
-  const auto num_first = [&](const auto& distance) {
-    std::iota(order.begin(), order.end(), 0);
-    std::stable_sort(order.begin(), order.end(),
-                     [&](int a, int b) { return distance(a) > distance(b); });
-    const auto inlier =
-        std::ranges::find_if(order, [&](int t) { return !outlying[static_cast<std::size_t>(t)]; });
-    return static_cast<int>(inlier - order.begin());
-  };
-  const auto is_no_chance = [&](int num) {
-    return log_trials + log_hypergeometric(num, num, num_outliers, n) < kLogLeastChance;
-  };
-  const auto value = [&](int t) { return values[static_cast<std::size_t>(t)]; };
-  if (is_no_chance(num_first(value)) || is_no_chance(num_first([&](int t) { return -value(t); })))
-    return true;
   const auto usual = usual_value(values);
   if (!usual) return false;
-  const auto away = [&](int t) { return std::abs(value(t) - *usual); };
-  const int num = num_first(away);
+  const auto away = [&](int t) { return std::abs(values[static_cast<std::size_t>(t)] - *usual); };
+  std::vector<int> order(values.size());
+  std::iota(order.begin(), order.end(), 0);
+  std::ranges::stable_sort(order, std::ranges::greater(), away);
+  const auto inlier =
+      std::ranges::find_if(order, [&](int t) { return !outlying[static_cast<std::size_t>(t)]; });
+  const auto num = static_cast<int>(inlier - order.begin());
   if (num == 0 || away(order.front()) <= kUsual) return false;
-  const bool is_all = num == n || away(order[static_cast<std::size_t>(num)]) <= kUsual;
-  return is_all || is_no_chance(num);
+  const int n = static_cast<int>(values.size());
+  return inlier == order.end() || away(*inlier) <= kUsual ||
+         log_trials + log_hypergeometric(num, num, num_outliers, n) < kLogLeastChance;
 }
 
 }  // namespace
@@ -284,11 +276,11 @@ bool is_wrong_at_some_commands(const std::vector<int>& samples, const std::vecto
   const double log_share = std::log(num_outliers / static_cast<double>(n));
   const int fewest = std::max(kFewestInside, static_cast<int>(kLeastShare * n));
   std::vector<int> order(samples.size()), places;  // of the outliers in that order
-  const double log_ends = std::log(3 * static_cast<double>(actions.moving().size()));
+  const double log_signals = std::log(static_cast<double>(actions.moving().size()));
   for (const int signal : actions.moving()) {
     std::vector<double> values;
     for (const int sample : samples) values.push_back(actions(sample, signal));
-    if (are_outliers_farthest(values, outlying, num_outliers, log_ends)) return true;
+    if (are_outliers_where_it_moved(values, outlying, num_outliers, log_signals)) return true;
     std::iota(order.begin(), order.end(), 0);
     std::stable_sort(order.begin(), order.end(), [&](int a, int b) {
       return actions(samples[static_cast<std::size_t>(a)], signal) <

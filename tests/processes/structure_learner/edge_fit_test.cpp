@@ -190,24 +190,6 @@ TEST(IsWrongAtSomeCommands, WhereOutliersAreAllPosesAtWhichASignalMoved) {
   EXPECT_TRUE(is_wrong_at_some_commands(frames, outlying, actions));
 }
 
-TEST(IsWrongAtSomeCommands, WhereFiveOutliersAreThoseAtAnEnd) {
-  test::Rng rng(5);
-  std::vector<ActionPoseSample> samples(75);
-  std::vector<int> frames;
-  for (int t = 0; t < 75; ++t) {
-    samples[t].action = Eigen::Vector2d(test::uniform(rng, -1, 1), test::uniform(rng, -1, 1));
-    frames.push_back(t);
-  }
-  const NormalizedActions actions(samples, 2);
-  std::vector<int> order = frames;
-  std::ranges::sort(order, {}, [&](int t) { return samples[t].action(1); });
-  for (const int first : {0, 35, 70}) {
-    std::vector<bool> outlying(75, false);
-    for (int n = first; n < first + 5; ++n) outlying[order[n]] = true;
-    EXPECT_EQ(is_wrong_at_some_commands(frames, outlying, actions), first != 35) << first;
-  }
-}
-
 // A hinge that rests at most poses is no rigid edge whose markers are misread at the others.
 TEST(FitJointly, LeavesNoHingeThatMovedInFewPosesRigid) {
   for (int seed = 1; seed <= 4; ++seed) {
