@@ -6,6 +6,8 @@
 #include <algorithm>
 #include <chrono>
 #include <cmath>
+#include <map>
+#include <set>
 #include <stdexcept>
 #include <utility>
 
@@ -27,7 +29,13 @@ namespace bodyschema {
 namespace {
 
 /// Chosen: what a person reads.
-constexpr std::size_t kMostCorrelations = 20, kMostOutliers = 50;
+constexpr std::size_t kMostCorrelations = 20;
+/// Share of a part's observations above which they refute the model; chosen: with 35 % of wild
+/// poses arms are still refined right, and models of another body leave more than half.
+constexpr double kRefutedShare = 0.4;
+/// Chosen: with fewer numbers a parameter, fits to as many numbers as parameters were up to ten
+/// times worse than the model that they began with.
+constexpr double kFewNumbers = 2;
 /// Chosen: degrees are 57 times as many as radians.
 constexpr double kAbsurdShare = 10;
 
@@ -128,6 +136,7 @@ bool root_moves(const BodySchema& schema, const std::vector<RefinerSample>& samp
   return log_likelihoods[1] - log_likelihoods[0] > num_more * std::log(num_residuals) / 2;
 }
 
+/// All, the farthest first.
 std::vector<RefinementOutlier> outliers_of(RefinementProblem& problem) {
   std::vector<RefinementOutlier> result;
   const std::vector<double> squared = problem.squared_distances();
@@ -139,7 +148,55 @@ std::vector<RefinementOutlier> outliers_of(RefinementProblem& problem) {
   }
   std::stable_sort(result.begin(), result.end(),
                    [](const auto& a, const auto& b) { return a.distance > b.distance; });
-  if (result.size() > kMostOutliers) result.resize(kMostOutliers);
+  return result;
+}
+
+std::vector<std::string> warnings_of(RefinementProblem& problem,
+                                     const std::vector<RefinementOutlier>& outliers) {
+  std::vector<std::string> result;
+  std::map<int, int> num_seen, num_refuted;  // by part
+  double num_numbers = 0, num_parameters = 0;
+  for (const auto& datum : problem.data()) {
+    ++num_seen[datum.part];
+    num_numbers += datum.num_residuals;
+  }
+  for (const RefinementOutlier& outlier : outliers) ++num_refuted[outlier.part];
+  for (const auto& [part, num] : num_refuted)
+    if (num > kRefutedShare * num_seen.at(part))
+      result.push_back(fmt::format(
+          "{} of {} observations of part {} refute the refined model: another body, columns in "
+          "another order, other units, or joints that are off their commands",
+          num, num_seen.at(part), part));
+  for (const ParameterBlock* block : problem.blocks())
+    if (block->is_refined && problem.prior_of(*block).size() == 0)
+      num_parameters += block->num_free();
+  if (num_numbers < kFewNumbers * num_parameters)
+    result.push_back(fmt::format(
+        "{:.0f} numbers are fitted by {:.0f} parameters: the model may be worse than before, and "
+        "deviations are told too small: more samples",
+        num_numbers, num_parameters));
+  return result;
+}
+
+/// Edges that nothing tells, and parts that the schema does not have.
+std::vector<std::string> things_not_seen(const BodySchema& schema,
+                                         const std::vector<RefinerSample>& samples,
+                                         const RefinementProblem& problem) {
+  std::vector<std::string> result;
+  std::set<const Edge*> told;
+  for (const auto& datum : problem.data()) {
+    const auto& path = problem.paths().at(datum.part);
+    told.insert(path.begin(), path.end());
+  }
+  for (const Edge& edge : schema.edges)
+    if (!told.contains(&edge))
+      result.push_back(fmt::format("{}→{}: no part beyond it was seen", edge.from, edge.to));
+  std::set<int> others;
+  for (const RefinerSample& seen : samples)
+    for (const PartObservation& o : seen.sample.parts)
+      if (!schema.has_part(o.part)) others.insert(o.part);
+  for (const int part : others)
+    result.push_back(fmt::format("part {}: the schema does not have it", part));
   return result;
 }
 
@@ -259,7 +316,12 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   for (const int part : problem.unseen_parts())
     result.held.push_back(fmt::format("the frame of part {}: it was never seen", part));
   problem.solve();
+  for (std::string& thing : things_not_seen(bent.schema, training, problem))
+    result.held.push_back(std::move(thing));
   result.outliers = outliers_of(problem);
+  result.warnings = warnings_of(problem, result.outliers);
+  result.num_outliers = static_cast<int>(result.outliers.size());
+  if (result.outliers.size() > kMostOutliers) result.outliers.resize(kMostOutliers);
   const Information information(problem, options.measurement);
   const RefinementWords words(bent.schema, information, problem.frame_tags());
   result.num_observations = static_cast<int>(problem.data().size());

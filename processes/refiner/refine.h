@@ -129,7 +129,9 @@ struct Refinement {
   std::vector<RefinedParameter> parameters;
   std::vector<std::string> undetermined;           ///< directions, in words
   std::vector<ParameterCorrelation> correlations;  ///< above kHighCorrelation, the highest first
-  std::vector<RefinementOutlier> outliers;         ///< the farthest first
+  int num_outliers = 0;
+  std::vector<RefinementOutlier> outliers;  ///< the farthest kMostOutliers first
+  std::vector<std::string> warnings;        ///< why the answer is not to be trusted
   std::vector<SignalCoverage> coverage;
   std::vector<JointPlay> plays;          ///< where corners were fitted
   std::vector<RefinedBend> bends;        ///< in the order in which they were found
@@ -140,6 +142,7 @@ struct Refinement {
   HeldOutErrors before, after;
 };
 inline constexpr double kHighCorrelation = 0.95;
+inline constexpr std::size_t kMostOutliers = 50;  ///< chosen: what a person reads
 inline constexpr int kMostWantedActions = 10;
 
 /// Fits all parameters of a schema at once to TRAIN and PROBE samples, with Student-t weights:

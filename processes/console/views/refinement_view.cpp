@@ -208,7 +208,9 @@ std::string findings_text(const Refinement& result) {
     text +=
         fmt::format("  {} and {} can hardly be told apart (correlation {:.3f}){}\n", pair.one,
                     pair.other, pair.correlation, pair.advice.empty() ? "" : ": " + pair.advice);
-  if (!result.outliers.empty()) text += fmt::format("  outliers, {}:\n", result.outliers.size());
+  if (!result.outliers.empty())
+    text += fmt::format("  outliers, {} of {}{}:\n", result.num_outliers, result.num_observations,
+                        std::ssize(result.outliers) < result.num_outliers ? ", the farthest" : "");
   for (const RefinementOutlier& outlier : result.outliers)
     text +=
         fmt::format("    sample {}, part {}{}: {:.1f} σ\n", outlier.sample_index, outlier.part,
@@ -262,6 +264,8 @@ Json refinement_json(const Refinement& result, const std::optional<RigCalibratio
                 {"correlation", pair.correlation},
                 {"advice", pair.advice}};
   });
+  json["num_outliers"] = result.num_outliers;
+  json["warnings"] = result.warnings;
   json["outliers"] = array_of(result.outliers, [](const RefinementOutlier& outlier) {
     return Json{{"sample", outlier.sample_index},
                 {"part", outlier.part},
@@ -301,6 +305,7 @@ std::string refinement_text(const Refinement& result,
   if (result.noise_scale > 1.05)
     text += fmt::format("  residuals are {:.2f} times as large as the noise that is told\n",
                         result.noise_scale);
+  for (const std::string& warning : result.warnings) text += "  warning: " + warning + "\n";
   text += "  " + gauge_text(result) + "\n";
   for (const std::string& held : result.held) text += "  held: " + held + "\n";
   text += held_out_text(result) + parameters_text(result.parameters) + tags_text(result, claimed) +

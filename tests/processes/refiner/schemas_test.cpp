@@ -1,6 +1,7 @@
 // Schemas of every kind: long edges, positions alone, Gaussian processes, parts never seen,
 // changes.
 
+#include <fmt/format.h>
 #include <gtest/gtest.h>
 
 #include <algorithm>
@@ -201,6 +202,48 @@ TEST(RefineSchemas, FitAnEvenSubsetOfThousandsOfSamples) {
   EXPECT_EQ(result.num_samples, 400);
   EXPECT_EQ(result.num_available, 3000);
   EXPECT_LT(result.seconds, 5);
+}
+
+TEST(RefineSchemas, WarnWhereObservationsRefuteTheModelAndNotWhereSomeAreWild) {
+  Rng rng(11);
+  const SyntheticRobot robot = test::chapter_robot("c", rng);
+  auto samples = exact(robot, 60, rng);
+  for (std::size_t n = 0; n < samples.size(); n += 4)
+    for (PartObservation& o : samples[n].parts) o.X_CB.translation().x() += 0.3;
+  const BodySchema start = displaced(true_start(robot));
+  EXPECT_TRUE(refine(start, refiner_samples(samples), {}, {}).warnings.empty());
+  for (ActionPoseSample& sample : samples) std::swap(sample.action(0), sample.action(1));
+  const Refinement result = refine(start, refiner_samples(samples), {}, {});
+  ASSERT_FALSE(result.warnings.empty());
+  EXPECT_NE(result.warnings.front().find("refute the refined model"), std::string::npos);
+  EXPECT_GT(result.num_outliers, static_cast<int>(kMostOutliers));
+  EXPECT_EQ(result.outliers.size(), kMostOutliers);
+}
+
+TEST(RefineSchemas, WarnOfFewNumbers) {
+  Rng rng(12);
+  const SyntheticRobot robot = test::chapter_robot("c", rng);
+  const BodySchema start = displaced(true_start(robot));
+  const auto warnings = [&](int num_samples) {
+    return refine(start, refiner_samples(exact(robot, num_samples, rng)), {}, {}).warnings;
+  };
+  ASSERT_EQ(warnings(2).size(), 1U);
+  EXPECT_NE(warnings(2).front().find("more samples"), std::string::npos);
+  EXPECT_TRUE(warnings(20).empty());
+}
+
+TEST(RefineSchemas, NamePartsThatAreNotInThemAndEdgesThatNothingTells) {
+  Rng rng(13);
+  const SyntheticRobot robot = test::chapter_robot("c", rng);
+  auto samples = exact(robot, 40, rng);
+  const int end = robot.visible_parts().back();
+  for (ActionPoseSample& sample : samples)
+    for (PartObservation& o : sample.parts)
+      if (o.part == end) o.part = 99;
+  const Refinement result = refine(true_start(robot), refiner_samples(samples), {}, {});
+  ASSERT_EQ(result.held.size(), 2U);
+  EXPECT_TRUE(result.held.front().ends_with(fmt::format("→{}: no part beyond it was seen", end)));
+  EXPECT_EQ(result.held.back(), "part 99: the schema does not have it");
 }
 
 }  // namespace
