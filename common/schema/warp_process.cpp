@@ -8,8 +8,8 @@
 namespace bodyschema {
 namespace {
 
-constexpr double kApart = 0.01;
-/// A parameter beside the weights is free within this many half ranges.
+constexpr double kApart = 0.01;  // half ranges; chosen: far less than the shortest of kWarpLengths
+/// A parameter beside the weights is free within this many half ranges; chosen: far more than any.
 constexpr double kFree = 10;
 
 /// Mean and log marginal likelihood, up to what all variances have in common, of as many

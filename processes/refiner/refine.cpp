@@ -167,9 +167,15 @@ std::vector<std::string> warnings_of(RefinementProblem& problem,
           "{} of {} observations of part {} refute the refined model: another body, columns in "
           "another order, other units, or joints that are off their commands",
           num, num_seen.at(part), part));
-  for (const ParameterBlock* block : problem.blocks())
-    if (block->is_refined && problem.prior_of(*block).size() == 0)
+  // Plays have priors; a moving root's pose takes numbers of its own sample, which more samples
+  // have, too.
+  constexpr int kPoseNumbers = 6;
+  for (const ParameterBlock* block : problem.blocks()) {
+    if (block->kind == ParameterBlock::Kind::kInstant)
+      num_numbers -= problem.root_moves() ? kPoseNumbers : 0;
+    else if (block->is_refined && problem.prior_of(*block).size() == 0)
       num_parameters += block->num_free();
+  }
   if (num_numbers < kFewNumbers * num_parameters)
     result.push_back(fmt::format(
         "{:.0f} numbers are fitted by {:.0f} parameters: the model may be worse than before, and "

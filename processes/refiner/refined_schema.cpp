@@ -37,10 +37,10 @@ class EdgeCovariances {
       : information_(information), drive_(problem.drive()) {
     if (!drive_) return;
     const Eigen::MatrixXd weights = information.cross_covariance(drive_, drive_);
+    const std::vector<RefinerSample> some = thinned(samples, kMostForMeans);
     for (const ParameterBlock* block : information.blocks())
       if (block->kind == ParameterBlock::Kind::kEdge)
-        add(start.edges[block->id], thinned(samples, kMostForMeans), problem.drive_model(), weights,
-            block);
+        add(start.edges[block->id], some, problem.drive_model(), weights, block);
   }
 
   Eigen::MatrixXd between(const ParameterBlock* one, const ParameterBlock* other) const {

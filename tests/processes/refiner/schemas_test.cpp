@@ -232,6 +232,26 @@ TEST(RefineSchemas, WarnOfFewNumbers) {
   EXPECT_TRUE(warnings(20).empty());
 }
 
+// Each sample brings the numbers that its own pose of the root takes.
+TEST(RefineSchemas, DoNotWarnOfFewNumbersForAMovingRootAndTheEndSeen) {
+  Rng rng(14);
+  const SyntheticRobot robot = test::random_arm({.num_joints = 4, .share_sliding = 0}, rng);
+  const int base = robot.visible_parts().front(), end = robot.visible_parts().back();
+  BodySchema start = true_start(robot);
+  start.parts = {base, end};
+  start.edges = {robot.true_edge(base, end)};
+  std::vector<ActionPoseSample> samples;
+  for (int n = 0; n < 60; ++n) {
+    SyntheticRobot moved = robot;
+    moved.X_CR = robot.X_CR * exp(Vector6d(0.05 * test::gaussian6(rng)));
+    samples.push_back(test::observe(moved, robot.random_action(rng), {}, n, rng));
+    for (PartObservation& seen : samples.back().parts) seen.covariance = isotropic(kNoise);
+  }
+  const Refinement result = refine(displaced(start), refiner_samples(samples), {}, {});
+  EXPECT_TRUE(result.root_moves);
+  EXPECT_TRUE(result.warnings.empty());
+}
+
 TEST(RefineSchemas, NamePartsThatAreNotInThemAndEdgesThatNothingTells) {
   Rng rng(13);
   const SyntheticRobot robot = test::chapter_robot("c", rng);
