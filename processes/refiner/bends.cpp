@@ -46,7 +46,7 @@ std::vector<int> candidates(const FitToPoses& fit, const std::vector<RefinerSamp
   std::vector<int> result;
   for (int s = 0; s < std::ssize(fit.schema.signals); ++s) {
     const Signal& signal = fit.schema.signals[s];
-    if (!signal.warp.empty() || !(half_range(signal) > 0)) continue;
+    if (!signal.warp.empty() || !(half_range(signal) > 0) || !is_bendable(fit.schema, s)) continue;
     std::vector<double> read;
     for (const auto& datum : fit.problem.data())
       if (std::ranges::any_of(fit.problem.paths().at(datum.part),
@@ -196,7 +196,7 @@ BentSchema with_bends(const BodySchema& schema, const std::vector<RefinerSample>
   BentSchema result{schema, {}};
   const bool has_poses = std::ranges::any_of(
       samples, [](const RefinerSample& seen) { return !seen.sample.parts.empty(); });
-  if (!has_poses || !std::ranges::all_of(schema.edges, PartChain::has_block)) return result;
+  if (!has_poses) return result;
   auto fit = std::make_unique<FitToPoses>(schema, samples, options, root_moves);
   std::vector<int> linear = candidates(*fit, samples);
   if (!linear.empty()) fit->problem.solve();

@@ -17,7 +17,7 @@ struct BentSchema {
   std::vector<FoundBend> bends;  ///< in the order in which they were found
 };
 
-/// Adds bends to a schema whose edges are of screws alone. Where a fit to the parts' poses has its
+/// Adds bends to a schema, of signals that are bendable. Where a fit to the parts' poses has its
 /// best, the log likelihood of a signal's weights (Signal::warp), all other parameters free, is
 /// quadratic: warp_processes() tell how much likelier the weights of a process are than none. Bends
 /// that beat the line by kWarpEvidence are added, the likeliest first, each with those before it

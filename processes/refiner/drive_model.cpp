@@ -47,10 +47,19 @@ Eigen::VectorXd weight_sd(const Signal& signal) {
 
 }  // namespace
 
+bool is_bendable(const BodySchema& schema, int signal) {
+  return std::ranges::all_of(schema.edges, [&](const Edge& edge) {
+    if (PartChain::has_block(edge)) return true;
+    const std::vector<int> signals = edge.signals();
+    return std::ranges::find(signals, signal) == signals.end();
+  });
+}
+
 DriveModel::DriveModel(const BodySchema& schema, JointLoads loads,
                        const std::vector<RefinerSample>& samples)
     : schema_(schema), loads_(std::move(loads)) {
   for (const Edge& edge : schema.edges) {
+    if (!PartChain::has_block(edge)) continue;
     first_joints_[&edge] = static_cast<int>(signals_.size());
     for (const ScrewJoint& joint : edge.joints) signals_.push_back(joint.signal);
   }
@@ -58,11 +67,11 @@ DriveModel::DriveModel(const BodySchema& schema, JointLoads loads,
     num_scalars_ = static_cast<int>(signals_.size());
     find_changing_loads(samples);
   }
-  if (!std::all_of(schema.edges.begin(), schema.edges.end(), PartChain::has_block)) return;
-  for (std::size_t s = 0; s < schema.signals.size(); ++s) {
-    if (schema.signals[s].warp.empty()) continue;
-    first_weights_[static_cast<int>(s)] = num_scalars_;
-    num_scalars_ += static_cast<int>(schema.signals[s].warp.size());
+  for (int s = 0; s < std::ssize(schema.signals); ++s) {
+    const std::vector<double>& warp = schema.signals[s].warp;
+    if (warp.empty() || !is_bendable(schema, s)) continue;
+    first_weights_[s] = num_scalars_;
+    num_scalars_ += static_cast<int>(warp.size());
   }
 }
 

@@ -9,9 +9,13 @@
 
 namespace bodyschema {
 
+/// Whether a signal's bend may be refined: no edge with a Gaussian process, which stays as it is,
+/// is moved by it.
+bool is_bendable(const BodySchema& schema, int signal);
+
 /// How far joints go beyond their commands, linear in the scalars of one block: a compliance of
-/// each joint, where loads are given; then the weights of each bent command (Signal::warp), where
-/// all edges are of screws alone.
+/// each joint of edges of screws, where loads are given; then the weights of each bent command
+/// (Signal::warp) that is bendable.
 class DriveModel {
  public:
   /// `loads`: those at the actions of `samples` are fitted; none: joints are stiff. `schema` must
@@ -30,7 +34,7 @@ class DriveModel {
   int signal_of(int weight) const;
   /// Copies the weights of the signals that both bend, by as many each.
   void copy_weights(const DriveModel& other, const double* from, double* to) const;
-  /// Place of each edge's first joint among all joints.
+  /// Place of the first joint of each edge of screws among all their joints.
   const std::map<const Edge*, int>& first_joints() const { return first_joints_; }
   /// Standard deviations of the scalars, which have the mean 0; infinite for compliances. Those of
   /// weights fall as a Gaussian process's spectral density does; its length and amplitude are the

@@ -73,7 +73,10 @@ std::vector<JointCompliance> compliances(const BodySchema& schema,
 }  // namespace
 
 std::string joint_name(const BodySchema& schema, const Edge& edge, const ScrewJoint& joint) {
-  return fmt::format("{} ({}→{})", schema.signals.at(joint.signal).name, edge.from, edge.to);
+  std::string thing = fmt::format("{}→{}", edge.from, edge.to);
+  if (std::ranges::count(edge.joints, joint.signal, &ScrewJoint::signal) > 1)
+    thing += fmt::format(", joint {}", &joint - edge.joints.data() + 1);
+  return fmt::format("{} ({})", schema.signals.at(joint.signal).name, thing);
 }
 
 std::optional<Elasticity> fit_elasticity(const BodySchema& schema,

@@ -38,6 +38,7 @@ constexpr double kRefutedShare = 0.4;
 constexpr double kFewNumbers = 2;
 /// Chosen: degrees are 57 times as many as radians.
 constexpr double kAbsurdShare = 10;
+constexpr double kTinyShare = 1.0 / 30;  ///< of limits in degrees, of commands in radians
 
 bool is_finite(const RefinerSample& seen) {
   if (!seen.sample.action.allFinite()) return false;
@@ -76,6 +77,7 @@ std::int64_t calibration_of(const std::vector<RefinerSample>& samples) {
 }
 
 void check_calibration(const std::vector<RefinerSample>& samples,
+                       const std::vector<RefinerSample>& held_out,
                        const std::optional<RigCalibration>& rig, const RefineOptions& options) {
   const char* const asked = options.placements ? "placements" : "intrinsics";
   const bool is_asked = options.placements || options.intrinsics;
@@ -86,12 +88,13 @@ void check_calibration(const std::vector<RefinerSample>& samples,
     throw std::invalid_argument(
         fmt::format("{} are refined by the tags' corners, which the samples do not have", asked));
   const std::int64_t id = rig ? calibration_id(rig->markers, rig->camera) : calibration_of(samples);
-  for (const RefinerSample& seen : samples)
-    if (seen.sample.calibration_id != 0 && seen.sample.calibration_id != id)
-      throw std::invalid_argument(
-          fmt::format("sample {} was seen through another calibration of tags and lens than the "
-                      "{}: its markers.yaml or camera calibration is another",
-                      seen.sample.sample_index, rig ? "rig's" : "first one"));
+  for (const auto* all : {&samples, &held_out})
+    for (const RefinerSample& seen : *all)
+      if (seen.sample.calibration_id != 0 && seen.sample.calibration_id != id)
+        throw std::invalid_argument(
+            fmt::format("sample {} was seen through another calibration of tags and lens than the "
+                        "{}: its markers.yaml or camera calibration is another",
+                        seen.sample.sample_index, rig ? "rig's" : "first one"));
 }
 
 /// Do the observed poses of the root differ by more than their noise is told to be?
@@ -239,16 +242,25 @@ std::vector<SignalCoverage> coverage_of(const BodySchema& schema,
   return result;
 }
 
+/// Limits in degrees, commands in radians.
+std::optional<std::string> warning_of_units(const std::vector<SignalCoverage>& coverage) {
+  double most = 0;
+  for (const SignalCoverage& signal : coverage) most = std::max(most, signal.share);
+  if (!(most > 0 && most < kTinyShare)) return std::nullopt;
+  return fmt::format(
+      "the commands span at most {:.1f} % of the ranges that the schema gives them: another unit?",
+      100 * most);
+}
+
 std::vector<std::string> held_things(const BodySchema& schema, const RefineOptions& options,
                                      bool has_corners) {
   std::vector<std::string> result;
   for (const Edge& edge : schema.edges)
     if (!PartChain::has_block(edge))
       result.push_back(fmt::format("{}→{}: its Gaussian process", edge.from, edge.to));
-  const bool holds_bends = !result.empty();
-  for (const Signal& signal : schema.signals)
-    if (holds_bends && !signal.warp.empty())
-      result.push_back(fmt::format("{}: the bend of its command", signal.name));
+  for (int s = 0; s < std::ssize(schema.signals); ++s)
+    if (!schema.signals[s].warp.empty() && !is_bendable(schema, s))
+      result.push_back(fmt::format("{}: the bend of its command", schema.signals[s].name));
   if (has_corners && !options.placements) result.push_back("tags: as the rig's files say");
   if (has_corners && !options.intrinsics) result.push_back("lens: as the rig's files say");
   return result;
@@ -297,7 +309,7 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   check(schema, samples);
   auto [training, held_out] = split(std::move(samples));
   Refinement result;
-  check_calibration(training, rig, options);
+  check_calibration(training, held_out, rig, options);
   result.used_corners = options.placements || options.intrinsics;
   if (result.used_corners) leave_out_those_without_corners(&training, &result.held);
   const std::optional<RigCalibration> used_rig = result.used_corners ? rig : std::nullopt;
@@ -327,9 +339,11 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   result.outliers = outliers_of(problem);
   result.warnings = warnings_of(problem, result.outliers);
   result.num_outliers = static_cast<int>(result.outliers.size());
+  if (auto warning = warning_of_units(result.coverage))
+    result.warnings.push_back(std::move(*warning));
   if (result.outliers.size() > kMostOutliers) result.outliers.resize(kMostOutliers);
   const Information information(problem, options.measurement);
-  const RefinementWords words(bent.schema, information, problem.frame_tags());
+  const RefinementWords words(bent.schema, information, problem.frame_tags(), result.coverage);
   result.num_observations = static_cast<int>(problem.data().size());
   result.num_iterations = problem.num_iterations();
   result.noise_scale = problem.scale();

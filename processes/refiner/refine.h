@@ -15,8 +15,8 @@
 namespace bodyschema {
 
 /// By how many command units gravity moves each joint at an action per unit of its compliance, in
-/// the order of the schema's edges and their joints: the torque [N m] about its axis over its gain;
-/// of a joint that slides alone the force [N].
+/// the order of the schema's edges of screws and their joints: the torque [N m] about its axis over
+/// its gain; of a joint that slides alone the force [N].
 using JointLoads = std::function<Eigen::VectorXd(const Eigen::VectorXd& action)>;
 
 struct RefineOptions {
@@ -152,10 +152,10 @@ inline constexpr int kMostWantedActions = 10;
 /// With tags or lens among the parameters, the data are the corners' pixels, the rig's claims are
 /// priors, and at every sample each joint may be off its command (backlash, droop) by what is
 /// estimated to be usual; samples without corners are not fitted then. Edges with a Gaussian
-/// process and signals' limits stay as they are, and all bends where there is such an edge. Loads
-/// of the joints are fitted beside, commands then bend no more than they did: the refined schema
-/// has stiff joints, for a schema knows no loads. TEST samples are judged alone. The order of
-/// samples changes nothing.
+/// process, the bends of what moves them, and signals' limits stay as they are. Loads of the joints
+/// are fitted beside, commands then bend no more than they did: the refined schema has stiff
+/// joints, for a schema knows no loads. TEST samples are judged alone. The order of samples changes
+/// nothing.
 ///
 /// Gauge: a part's frame is where its tags are closest to the rig's claims, and the scale is the
 /// mean of all tags' sizes, all weighed by their priors, for images tell neither.

@@ -43,7 +43,10 @@ RefinementProblem::RefinementProblem(const BodySchema& schema,
     add_lens();
   }
   place_blocks();
-  for (const RefinerSample& sample : samples) rig_ ? add_corners(sample) : add_poses(sample);
+  for (const RefinerSample& sample : samples) {
+    actions_[sample.sample.sample_index] = sample.sample.action;
+    rig_ ? add_corners(sample) : add_poses(sample);
+  }
   if (data_.empty())
     throw std::invalid_argument(
         rig_ ? "no sample shows a tag of the rig on a part of the schema"
@@ -263,7 +266,6 @@ std::optional<RefinementProblem::Cost> RefinementProblem::cost_of(const TagSight
   blocks.push_back(lens_block_);
   if (!plays_.empty() && !root_moves_) blocks.push_back(instants_.at(sample_index));
   if (drive_) blocks.push_back(drive_);
-  // With bent commands all edges are of screws: their joints are those of the drive.
   auto cost = std::make_unique<CornerResidual>(
       PartChain(paths_.at(tag->part), displacements(action), first_play_),
       std::vector<const ParameterBlock*>(blocks.begin(), blocks.end()), tag->size_m, *lens_, sight,

@@ -59,7 +59,7 @@ class RefinementProblem {
   /// Begins where another problem of the same samples is now, its bends where both have them.
   void begin_at(RefinementProblem& other);
   /// Levenberg–Marquardt with Student-t weights, the noise's scale estimated between its runs,
-  /// until neither changes.
+  /// until neither changes. A joint that rested stays as it was.
   void solve();
 
   /// Those that a residual depends on: instants, root, edges, tags ascending, lens.
@@ -129,6 +129,11 @@ class RefinementProblem {
   ceres::Solver::Options solver_options();
   double estimated_scale();
   double estimate_play();
+  /// Whether a signal hardly moved where parts beyond the edge were seen.
+  bool rests(const Edge& edge, int signal) const;
+  void set_free(ParameterBlock* block, const std::vector<int>& directions);
+  /// Returns what was free in their blocks.
+  std::map<ParameterBlock*, std::vector<int>> hold_joints_at_rest();
 
   const BodySchema& schema_;
   const std::optional<RigCalibration>& rig_;
@@ -136,6 +141,7 @@ class RefinementProblem {
   const bool root_moves_;
   const DriveModel drive_model_;
   std::optional<Lens> lens_;
+  std::map<std::int64_t, Eigen::VectorXd> actions_;   // by sample
   std::map<int, std::vector<const Edge*>> paths_;     // by part
   std::deque<ParameterBlock> storage_;                // addresses stay
   ParameterBlock* root_ = nullptr;                    // that rests

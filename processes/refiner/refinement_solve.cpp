@@ -13,6 +13,7 @@
 #include "common/estimation/chi_square.h"
 #include "common/estimation/quantile.h"
 #include "common/estimation/student_t.h"
+#include "common/kinematics/screw_chain.h"
 #include "processes/refiner/refinement_problem.h"
 
 namespace bodyschema {
@@ -111,9 +112,54 @@ ceres::Solver::Options RefinementProblem::solver_options() {
   return options;
 }
 
+bool RefinementProblem::rests(const Edge& edge, int signal) const {
+  // Chosen: over less of its range noise says how far a joint goes.
+  constexpr double kRestingShare = 1e-3;
+  double least = std::numeric_limits<double>::infinity(), most = -least;
+  for (const Datum& datum : data_) {
+    const std::vector<const Edge*>& path = paths_.at(datum.part);
+    if (std::ranges::find(path, &edge) == path.end()) continue;
+    const double command = actions_.at(datum.sample_index)(signal);
+    least = std::min(least, command);
+    most = std::max(most, command);
+  }
+  const Signal& limits = schema_.signals[signal];
+  return most - least <= kRestingShare * (limits.upper - limits.lower);
+}
+
+void RefinementProblem::set_free(ParameterBlock* block, const std::vector<int>& directions) {
+  double* const memory = memory_of(block);
+  block->free = directions;
+  problem_.SetManifold(memory, &manifolds_.emplace_back(*block));
+  if (directions.empty())
+    problem_.SetParameterBlockConstant(memory);
+  else
+    problem_.SetParameterBlockVariable(memory);
+}
+
+// Nothing tells the axis and the gain of a joint at rest from what follows it, which is enough.
+std::map<ParameterBlock*, std::vector<int>> RefinementProblem::hold_joints_at_rest() {
+  std::map<ParameterBlock*, std::vector<int>> free_before;
+  if (options_.joint_loads) return free_before;  // which move joints at rest
+  for (const auto& [index, block] : edges_) {
+    const Edge& edge = schema_.edges[index];
+    std::vector<int> free = block->free;
+    for (int d = 0; used_.contains(block) && d < std::ssize(edge.joints); ++d) {
+      const int axis = ScrewChainLayout::transform(d);
+      if (rests(edge, edge.joints[d].signal))
+        std::erase_if(free, [&](int n) { return n >= axis && n <= ScrewChainLayout::turn(d); });
+    }
+    if (free == block->free) continue;
+    free_before[block] = block->free;
+    set_free(block, free);
+  }
+  return free_before;
+}
+
 void RefinementProblem::solve() {
   // A step for which Cholesky fails is tried again with more damping; glog would tell the user.
   FLAGS_minloglevel = google::GLOG_ERROR;
+  const auto free_before = hold_joints_at_rest();
   ceres::Solver::Options options = solver_options();
   const auto run = [&](double tolerance, int max_iterations) {
     options.function_tolerance = tolerance;
@@ -141,6 +187,7 @@ void RefinementProblem::solve() {
     if (change < kSettledScale && change_of_play < kSettledPlay) break;
   }
   run(1e-9, 200);
+  for (const auto& [block, directions] : free_before) set_free(block, directions);
   for (ParameterBlock* block : blocks())
     std::copy_n(memory_of(block), block->values.size(), block->values.begin());
 }

@@ -19,6 +19,11 @@ constexpr std::array<const char*, 6> kPoseWords = {"x", "y", "z", "about x", "ab
 /// A parameter that has more of it than this is named with a direction that nothing tells: chosen,
 /// a direction of many parameters has a hundredth of each.
 constexpr double kNamedShare = 0.01;
+/// With a larger deviation [rad] a turn, a gain's over half its range, is not told: chosen, errors
+/// are no longer linear in it.
+constexpr double kLargestDeviation_rad = 0.5;
+/// A signal that spans more of its range need not move farther; chosen.
+constexpr double kFarShare = 0.5;
 
 /// The last transform of an edge with joints, and where it is in the tangent; −1: none.
 int last_transform(const Edge& edge) {
@@ -28,10 +33,11 @@ int last_transform(const Edge& edge) {
 }  // namespace
 
 RefinementWords::RefinementWords(const BodySchema& start, const Information& information,
-                                 std::vector<int> frame_tags)
+                                 std::vector<int> frame_tags, std::vector<SignalCoverage> coverage)
     : schema_(start),
       information_(information),
       frame_tags_(std::move(frame_tags)),
+      coverage_(std::move(coverage)),
       covariance_(information.covariance()) {
   const Eigen::MatrixXd& open = information.undetermined();
   undetermined_shares_ = open.cols() > 0 ? Eigen::VectorXd(open.rowwise().squaredNorm())
@@ -60,10 +66,24 @@ void RefinementWords::add(const ParameterBlock& block) {
     places_.push_back({&block, direction, name_of(block, direction)});
     RefinedParameter parameter{places_.back().element, block.kind == Kind::kTag ? block.id : -1,
                                unit_of(block, direction), change(direction), std::nullopt};
-    if (undetermined_shares_(first + n) < kNamedShare)
-      parameter.sd = std::sqrt(std::max(covariance_(first + n, first + n), 0.0));
+    told_.push_back(is_told(places_.back(), first + n));
+    if (told_.back()) parameter.sd = std::sqrt(std::max(covariance_(first + n, first + n), 0.0));
     parameters_.push_back(std::move(parameter));
   }
+}
+
+bool RefinementWords::is_told(const Place& place, Eigen::Index row) const {
+  if (undetermined_shares_(row) >= kNamedShare) return false;
+  const std::string unit = unit_of(*place.block, place.direction);
+  double reach = 0;
+  if (unit == "rad") {
+    reach = 1;
+  } else if (unit == "rad/unit") {
+    const ScrewJoint& joint = joint_of(*place.block, place.direction);
+    const Signal& signal = schema_.signals.at(joint.signal);
+    reach = 0.5 * std::abs(joint.gain) * (signal.upper - signal.lower);
+  }
+  return reach * std::sqrt(std::max(covariance_(row, row), 0.0)) <= kLargestDeviation_rad;
 }
 
 std::string RefinementWords::thing_of(const ParameterBlock& block) const {
@@ -93,12 +113,14 @@ const ScrewJoint& RefinementWords::joint_of(const ParameterBlock& block, int dir
 
 std::string RefinementWords::edge_name(const ParameterBlock& block, int direction) const {
   const Edge& edge = schema_.edges[block.id];
-  const std::string thing = thing_of(block);
+  std::string thing = thing_of(block);
   if (edge.joints.empty()) return fmt::format("{}, {}", thing, kPoseWords[direction]);
   const int d = direction / 8, component = direction % 8;
   const int num_joints = static_cast<int>(edge.joints.size());
   const ScrewJoint& joint = joint_of(block, direction);
   const std::string& signal = schema_.signals.at(joint.signal).name;
+  if (std::ranges::count(edge.joints, joint.signal, &ScrewJoint::signal) > 1)
+    thing += fmt::format(", joint {}", std::min(d, num_joints - 1) + 1);
   if (d == num_joints) {
     if (component == 5 && joint.turn != 0) return fmt::format("offset of {} ({})", signal, thing);
     return fmt::format("link after {} ({}), {}", signal, thing, kPoseWords[component]);
@@ -146,7 +168,7 @@ std::vector<std::string> RefinementWords::undetermined() const {
   const Eigen::MatrixXd shared = open * open.transpose();
   std::vector<std::vector<Eigen::Index>> groups;  // of blocks that share open directions
   for (Eigen::Index n = 0; n < std::ssize(places_); ++n) {
-    if (undetermined_shares_(n) < kNamedShare) continue;
+    if (told_[n]) continue;
     std::vector<Eigen::Index> group = {n};
     std::erase_if(groups, [&](const std::vector<Eigen::Index>& other) {
       const bool is_same = std::ranges::any_of(other, [&](Eigen::Index m) {
@@ -180,17 +202,21 @@ std::vector<std::string> RefinementWords::undetermined() const {
 std::string RefinementWords::advice(const std::vector<Place>& places) const {
   std::set<int> tags;
   std::set<std::string> signals;
+  bool moved_far = true;
   for (const Place& place : places) {
     const ParameterBlock& block = *place.block;
     if (block.kind == Kind::kLens) return "show tags nearer and farther, and at the image's border";
     if (block.kind == Kind::kTag) tags.insert(block.id);
     if (block.kind != Kind::kEdge || schema_.edges[block.id].joints.empty()) continue;
-    signals.insert(schema_.signals.at(joint_of(block, place.direction).signal).name);
+    const SignalCoverage& signal = coverage_.at(joint_of(block, place.direction).signal);
+    signals.insert(signal.signal);
+    moved_far &= signal.share > kFarShare;
   }
   if (tags.size() > 1) return fmt::format("show tags {} in one image", fmt::join(tags, ", "));
   if (signals.empty()) return "";
   const std::string names = fmt::format("{}", fmt::join(signals, ", "));
   if (!tags.empty()) return fmt::format("show tag {} while {} moves", *tags.begin(), names);
+  if (moved_far) return "show a part farther from the axis of " + names;
   return fmt::format("move {} farther{}", names,
                      signals.size() > 1 ? " and in other combinations" : "");
 }
@@ -216,11 +242,12 @@ std::vector<ParameterCorrelation> RefinementWords::correlations(std::size_t most
   const Eigen::VectorXd sd = covariance.diagonal().cwiseMax(0).cwiseSqrt();
   for (Eigen::Index i = 0; i < covariance.rows(); ++i) {
     for (Eigen::Index j = 0; j < i; ++j) {
-      if (undetermined_shares_(i) >= kNamedShare || undetermined_shares_(j) >= kNamedShare)
-        continue;
+      if (!told_[i] || !told_[j]) continue;
       const double correlation = covariance(i, j) / (sd(i) * sd(j));
       if (!(std::abs(correlation) > kHighCorrelation)) continue;
       const Place &one = places_[j], &other = places_[i];
+      // Terms of one curve.
+      if (one.block->kind == Kind::kDrive && other.block->kind == Kind::kDrive) continue;
       result.push_back({one.element, other.element, correlation, advice({one, other})});
     }
   }

@@ -16,13 +16,14 @@ namespace bodyschema {
 class RefinementWords {
  public:
   /// `frame_tags`: a tag of each part, by which correlations are told: as if it were known where it
-  /// sits on the part. That a part's frame moves with all its tags is no news.
+  /// sits on the part. That a part's frame moves with all its tags is no news. `coverage`: of each
+  /// signal.
   RefinementWords(const BodySchema& start, const Information& information,
-                  std::vector<int> frame_tags);
+                  std::vector<int> frame_tags, std::vector<SignalCoverage> coverage);
 
   std::vector<RefinedParameter> parameters() const { return parameters_; }
-  /// Directions that nothing tells, one sentence an edge, tag or camera or for those that share
-  /// one, with what would tell them.
+  /// Directions that nothing tells, or noise alone, one sentence an edge, tag or camera or for
+  /// those that share one, with what would tell them.
   std::vector<std::string> undetermined() const;
   /// Those above kHighCorrelation, the highest first, at most `most`.
   std::vector<ParameterCorrelation> correlations(std::size_t most) const;
@@ -40,6 +41,7 @@ class RefinementWords {
   std::string edge_name(const ParameterBlock& block, int direction) const;
   std::string unit_of(const ParameterBlock& block, int direction) const;
   std::string thing_of(const ParameterBlock& block) const;
+  bool is_told(const Place& place, Eigen::Index row) const;
   Eigen::MatrixXd in_frames_of_tags() const;
   /// Which further samples would tell these; "" if unknown.
   std::string advice(const std::vector<Place>& places) const;
@@ -47,7 +49,9 @@ class RefinementWords {
   const BodySchema& schema_;
   const Information& information_;
   const std::vector<int> frame_tags_;
+  const std::vector<SignalCoverage> coverage_;
   std::vector<Place> places_;
+  std::vector<bool> told_;  // of each place
   std::vector<RefinedParameter> parameters_;
   Eigen::MatrixXd covariance_;           // in the frames that are told
   Eigen::VectorXd undetermined_shares_;  // of each place, 0 … 1

@@ -301,6 +301,7 @@ std::vector<WantedAction> wanted_actions(const BodySchema& refined,
     double least = kInfinite;
     for (int n = k; n < kNumCandidates; n += kMostWantedActions) {
       Expectation expected = forecast.at(actions[n]);
+      if (expected.core.rows() == 0) continue;  // it shows nothing
       const double variance = design.mean_variance_with(expected);
       if (!(variance < least)) continue;
       least = variance;

@@ -154,6 +154,13 @@ TEST_F(RefineProgramTest, FitsTheRowsOfACsv) {
   EXPECT_EQ(json.at("fitted"), "poses");
   EXPECT_TRUE(json.at("before").is_null());
   EXPECT_TRUE(json.at("undetermined").empty());
+  // Another recording tells the error, and is not fitted.
+  std::ofstream other(folder_ / "other.csv");
+  write_csv(babble(robot, 10, {.regime = Regime::kTagIso}, rng), other);
+  other.close();
+  const Json judged = json_of("refine of_csv samples.csv --test other.csv --out judged --json");
+  EXPECT_EQ(judged.at("after").at("samples"), 10);
+  EXPECT_EQ(judged.at("parameters"), json.at("parameters"));
 }
 
 /// Median distance of a part from where it is in the root, over random actions [m].

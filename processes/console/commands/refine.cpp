@@ -25,14 +25,14 @@ namespace bodyschema {
 namespace {
 
 struct RefineArguments {
-  std::string schema, samples, out, rig, proposed, urdf, urdf_placement;
+  std::string schema, samples, test, out, rig, proposed, urdf, urdf_placement;
   std::string structure, placement, elastic;  ///< of a robot whose structure is known
   std::vector<double> noise;
   bool placements = false, intrinsics = false, json = false;
 
   std::vector<std::string> inputs() const {
-    return structure.empty() ? std::vector{schema, samples}
-                             : std::vector{structure, placement, samples};
+    return structure.empty() ? std::vector{schema, samples, test}
+                             : std::vector{structure, placement, samples, test};
   }
 };
 
@@ -59,6 +59,21 @@ Start begin_with(const RefineArguments& arguments) {
   return start;
 }
 
+/// Those that are fitted, and judged by after them those of --test.
+std::vector<RefinerSample> samples_of(const RefineArguments& arguments, const BodySchema& schema,
+                                      const Recording& recording) {
+  std::vector<RefinerSample> samples = refiner_samples(recording.samples, recording.sights);
+  if (arguments.test.empty()) return samples;
+  const Recording test = load_for(arguments.test, schema);
+  const std::int64_t first = samples.empty() ? 0 : index_of(samples.back()) + 1;
+  for (RefinerSample& seen : refiner_samples(test.samples, test.sights)) {
+    seen.sample.purpose = Purpose::kTest;
+    seen.sample.sample_index += first;
+    samples.push_back(std::move(seen));
+  }
+  return samples;
+}
+
 /// The rig's folder: that which is told, else the run's own beside a log.
 std::filesystem::path rig_folder(const RefineArguments& arguments, bool is_log) {
   if (!arguments.rig.empty()) return find_rig(arguments.rig);
@@ -80,12 +95,32 @@ MeasurementModel measurement_of(const RefineArguments& arguments, const Recordin
   return measurement;
 }
 
+/// What to do with it.
+std::string next_steps(const RefineArguments& arguments, const Refinement& result) {
+  std::string text;
+  if (!arguments.structure.empty() && arguments.elastic.empty() && !result.bends.empty())
+    text +=
+        "  joints that give way to gravity look like bent commands: --elastic SCHEMA3 fits "
+        "compliances in their place\n";
+  if (arguments.proposed.empty()) return text;
+  std::filesystem::path folder = std::filesystem::path(arguments.proposed).lexically_normal();
+  if (!folder.has_filename()) folder = folder.parent_path();
+  const std::filesystem::path run = folder.parent_path();
+  if (folder.filename() == "proposed" && std::filesystem::is_directory(run / "config"))
+    return text + fmt::format("  to write tags and lens into the rig: `{}`\n",
+                              to_type("adopt " + run.string()));
+  return text + fmt::format(
+                    "  tags and lens as found are in {}; `adopt RUN` writes those of RUN/proposed "
+                    "into the rig\n",
+                    arguments.proposed);
+}
+
 /// Prints the result, with the URDF where one is asked for. A schema that has none is refined all
 /// the same. @throws std::runtime_error then, after the result.
 void write_urdf_and_print(const RefineArguments& arguments, const Refinement& result,
                           const std::optional<RigCalibration>& rig) {
   Json json = refinement_json(result, rig);
-  std::string text = refinement_text(result, rig);
+  std::string text = refinement_text(result, rig) + next_steps(arguments, result);
   std::string problem;
   if (!arguments.urdf.empty()) {
     json["urdf"] = nullptr;
@@ -147,8 +182,7 @@ void run_refine(const RefineArguments& given) {
               {"--urdf", arguments.urdf},
               {"--urdf-placement", arguments.urdf_placement}},
              arguments.inputs());
-  const Refinement result =
-      refine(schema, refiner_samples(recording.samples, recording.sights), rig, options);
+  const Refinement result = refine(schema, samples_of(arguments, schema, recording), rig, options);
   write_one_event_log(arguments.out, kBodySchema, to_message(result.schema));
   if (result.elasticity)
     write_one_event_log(arguments.elastic, kBodySchema, to_message(result.elasticity->schema));
@@ -168,6 +202,8 @@ void add_refine_command(Arguments console) {
   refine.add_option("SCHEMA", arguments.schema,
                     "Schema file: where to begin; left out with --structure");
   refine.add_option("SAMPLES", arguments.samples, "Recording (LCM log or CSV)");
+  refine.add_option("--test", arguments.test,
+                    "Also tell the error on this recording, which is not fitted");
   Argument structure = refine.add_option("--structure", arguments.structure,
                                          "Begin with the robot of this URDF, as engineer does");
   Argument placement =

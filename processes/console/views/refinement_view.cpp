@@ -81,7 +81,7 @@ Noise total_of(const std::vector<PartErrors>& parts) {
 
 std::string held_out_text(const Refinement& result) {
   if (result.before.num_samples == 0)
-    return "  no TEST samples: nothing tells the error on samples that were not fitted\n";
+    return "  no TEST samples: nothing tells the error on samples that were not fitted (--test)\n";
   std::string text = fmt::format("  held out, {}:", counted(result.before.num_samples, "sample"));
   for (const auto& [name, errors] :
        {std::pair{"before", &result.before}, {"after", &result.after}}) {

@@ -3,6 +3,7 @@
 #include <gtest/gtest.h>
 
 #include <cmath>
+#include <memory>
 
 #include "common/estimation/evaluation.h"
 #include "common/schema/warp_process.h"
@@ -105,6 +106,28 @@ TEST(RefineBends, FindsThoseThatTheStartDoesNotHave) {
     }
     EXPECT_LT(experiments::end_effector_errors(result.schema, trial)->position_rms_m, 0.004);
   }
+}
+
+TEST(RefineBends, FindsThoseBesideAnEdgeWithAGaussianProcess) {
+  auto trial = experiments::make_trial("c", test::Regime::kTag, 60, 1, 0.1);
+  for (ActionPoseSample& sample : trial.samples)
+    std::erase_if(sample.parts, [](const PartObservation& seen) { return seen.part == 5; });
+  BodySchema start = as_built(trial);
+  Edge& last = start.edges.back();
+  ASSERT_EQ(last.to, 5);
+  ResidualGp::Prior prior;
+  prior.length_scales = Eigen::VectorXd::Ones(1);
+  last.residual_gp = std::make_shared<ResidualGp>(
+      std::vector<int>{last.joints.front().signal}, Eigen::MatrixXd::Zero(1, 1),
+      ResidualGp::Residuals::Zero(6, 1), Eigen::VectorXd::Ones(1), prior);
+  const Refinement found = refine(start, refiner_samples(trial.samples), {}, {});
+  EXPECT_EQ(found.bends.size(), 3U);
+  // What is bent already is refined, and the edge stays.
+  const Refinement again = refine(found.schema, refiner_samples(trial.samples), {}, {});
+  EXPECT_TRUE(again.bends.empty());
+  EXPECT_TRUE(again.schema.edges.back().left.isApprox(last.left, 0));
+  for (const std::string& held : again.held)
+    EXPECT_EQ(held.find("bend"), std::string::npos) << held;
 }
 
 // A schema has no covariance of its bends: those of gains and offsets hold what is open of them.

@@ -6,6 +6,7 @@
 
 #include <algorithm>
 #include <memory>
+#include <set>
 #include <string>
 
 #include "common/geometry/angle.h"
@@ -139,6 +140,54 @@ TEST(RefineSchemas, WhosePositionsAloneAreKnown) {
   EXPECT_TRUE(result.undetermined.empty()) << result.undetermined.front();
 }
 
+// A target in the hand's axis: its turns move it by what noise says.
+TEST(RefineSchemas, NameAJointInWhoseAxisTheOnlyTargetIs) {
+  Rng rng(3);
+  SyntheticRobot robot = test::chapter_robot("c", rng);
+  robot.links.back().X_after = Pose(Eigen::Translation3d(0, 0, 0.1));
+  const int last = robot.links.back().part;
+  auto samples = test::babble(robot, 60, {.regime = test::Regime::kTagIso}, rng);
+  for (ActionPoseSample& sample : samples)
+    for (PartObservation& seen : sample.parts) seen.covariance = isotropic({0.003, kDegree});
+  samples = test::with_positions_alone(std::move(samples), {last});
+  BodySchema start = displaced(true_start(robot));
+  start.position_parts = {last};
+  const Refinement result = refine(start, refiner_samples(samples), {}, {});
+  ASSERT_EQ(result.undetermined.size(), 1U);
+  EXPECT_TRUE(names(result.undetermined, "gain of q4"));
+  EXPECT_TRUE(names(result.undetermined, "show a part farther from the axis of q4"));
+}
+
+TEST(RefineSchemas, LeaveAJointThatRestedAsItWas) {
+  Rng rng(3);
+  SyntheticRobot robot = test::chapter_robot("c", rng);
+  const BodySchema start = displaced(true_start(robot));
+  robot.signals[1].lower = robot.signals[1].upper = 0.7;
+  const auto samples = exact(robot, 40, rng);
+  const Refinement result = refine(start, refiner_samples(samples), {}, {});
+  const ScrewJoint &before = start.edges[1].joints.front(),
+                   &after = result.schema.edges[1].joints.front();
+  EXPECT_EQ(after.turn, before.turn);
+  EXPECT_EQ(after.slide, before.slide);
+  EXPECT_TRUE(result.schema.edges[1].left.isApprox(start.edges[1].left, 1e-12));
+  EXPECT_LT(worst_error_m(result.schema, robot, samples), 1e-6);
+  EXPECT_TRUE(names(result.undetermined, "gain of q2"));
+}
+
+TEST(RefineSchemas, TellTheJointsOfOneSignalApart) {
+  Rng rng(4);
+  SyntheticRobot robot = test::random_arm({.num_joints = 3}, rng);
+  robot.links[2].signal = robot.links[1].signal;
+  const auto samples = exact(robot, 60, rng);
+  BodySchema start = true_start(robot);
+  start.parts = {1, 4};
+  start.edges = {robot.true_edge(1, 4)};
+  const Refinement result = refine(start, refiner_samples(samples), {}, {});
+  std::set<std::string> found;
+  for (const RefinedParameter& parameter : result.parameters)
+    EXPECT_TRUE(found.insert(parameter.name).second) << parameter.name;
+}
+
 TEST(RefineSchemas, HoldEdgesWithAGaussianProcessAndRefineTheRest) {
   Rng rng(4);
   const SyntheticRobot robot = test::chapter_robot("c", rng);
@@ -218,6 +267,19 @@ TEST(RefineSchemas, WarnWhereObservationsRefuteTheModelAndNotWhereSomeAreWild) {
   EXPECT_NE(result.warnings.front().find("refute the refined model"), std::string::npos);
   EXPECT_GT(result.num_outliers, static_cast<int>(kMostOutliers));
   EXPECT_EQ(result.outliers.size(), kMostOutliers);
+}
+
+TEST(RefineSchemas, WarnOfLimitsInAnotherUnit) {
+  Rng rng(3);
+  const SyntheticRobot robot = test::chapter_robot("c", rng);
+  const auto samples = exact(robot, 40, rng);
+  BodySchema start = true_start(robot);
+  EXPECT_FALSE(names(refine(start, refiner_samples(samples), {}, {}).warnings, "another unit"));
+  for (Signal& signal : start.signals) {
+    signal.lower /= kDegree;
+    signal.upper /= kDegree;
+  }
+  EXPECT_TRUE(names(refine(start, refiner_samples(samples), {}, {}).warnings, "another unit"));
 }
 
 TEST(RefineSchemas, WarnOfFewNumbers) {

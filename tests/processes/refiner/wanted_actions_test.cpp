@@ -73,17 +73,31 @@ TEST(WantedActions, MoveFarTheJointThatHardlyMoved) {
 TEST(WantedActions, OfCornersMoveFarTheJointThatRested) {
   Rng rng(7);
   const TaggedRobot robot = test::tagged(test::chapter_robot("c", rng), 3, rng);
+  const BodySchema start = schema_of(robot.robot);
+  double extents = 0;
   for (std::size_t s = 0; s < robot.robot.signals.size(); ++s) {
     TaggedRobot resting = robot;
     resting.robot = narrowed(robot.robot, s, 0);
     const auto samples = test::seen_corners(resting, robot.truth, 25, 0.05, rng);
     RefineOptions options;
     options.placements = options.intrinsics = true;
-    const Refinement result = refine(schema_of(robot.robot), samples, robot.truth, options);
+    const Refinement result = refine(start, samples, robot.truth, options);
     EXPECT_FALSE(result.undetermined.empty());
-    EXPECT_GT(first_extent(result, robot.robot, s), kFar) << s;
-    EXPECT_GT(result.wanted_actions.at(2).fall, 0.5) << s;
+    EXPECT_EQ(result.schema.edges[s].joints[0].turn, start.edges[s].joints[0].turn);
+    extents += first_extent(result, robot.robot, s);
+    EXPECT_GT(result.wanted_actions.at(2).fall, 0.95) << s;
   }
+  EXPECT_GT(extents / static_cast<double>(robot.robot.signals.size()), kFar);
+}
+
+// Tags that face away at most actions.
+TEST(WantedActions, AreNoneThatShowNothing) {
+  Rng rng(8);
+  const TaggedRobot robot = test::tagged(test::chapter_robot("c", rng), 1, rng);
+  const auto samples = test::seen_corners(robot, robot.truth, 40, 0.05, rng);
+  const Refinement result = refine(schema_of(robot.robot), samples, robot.truth,
+                                   {.placements = true, .intrinsics = true});
+  EXPECT_FALSE(result.wanted_actions.empty());
 }
 
 /// Predicted deviations at actions that nobody chose by: root mean square and worst, of positions.
