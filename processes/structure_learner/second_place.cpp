@@ -6,6 +6,7 @@
 #include <set>
 #include <vector>
 
+#include "common/kinematics/screw_chain.h"
 #include "processes/structure_learner/screen.h"
 
 namespace bodyschema {
@@ -24,13 +25,45 @@ struct Sight {
   int sample = 0;
   Pose X;
   const PairHypothesis* reading = nullptr;
+  Pose X_SB = Pose::Identity();  // of the part in the frame that X ends in
 };
+
+Matrix6d covariance_of(const Sight& sight) {
+  const Matrix6d& W = sight.reading->whitening;
+  const Matrix6d Ad = adjoint(sight.X_SB);
+  return Ad * (W.transpose() * W).inverse() * Ad.transpose();
+}
 
 // As far as noise tells, both having it.
 bool is_same_place(const Sight& one, const Sight& other) {
   const Vector6d apart = log(one.X.inverse() * other.X);
-  return other.reading->whitened(apart, one.X).squaredNorm() <
-         2 * outlier_threshold(other.reading->num_residuals);
+  const int num_residuals = other.reading->num_residuals;
+  if (num_residuals == 6 && one.reading->num_residuals == 6)
+    return squared_mahalanobis(apart, covariance_of(one) + covariance_of(other)) <
+           outlier_threshold(6);
+  return other.reading->whitened(apart, one.X).squaredNorm() < 2 * outlier_threshold(num_residuals);
+}
+
+// By what each link of an edge but the last would have to be off for the part to be where it was
+// seen, Δ in X = B Δ X_SB. `beside`: the same of the last.
+std::vector<std::vector<Sight>> changes_of_links(const Edge& edge, const EdgeData& data,
+                                                 const std::vector<Sight>& beside) {
+  std::vector<std::vector<Sight>> result(edge.joints.size(), beside);
+  for (std::size_t n = 0; n < beside.size(); ++n) {
+    const Eigen::VectorXd& theta = data.samples[static_cast<std::size_t>(beside[n].sample)].action;
+    const Pose X = edge.predict(theta);
+    Pose B = edge.left;
+    for (std::size_t d = 0; d < edge.joints.size(); ++d) {
+      Sight& sight = result[d][n];
+      sight.X_SB = B.inverse() * X;
+      sight.X = sight.X_SB * beside[n].X * sight.X_SB.inverse();
+      const ScrewJoint& joint = edge.joints[d];
+      Screw{joint.slide, joint.turn}.append_motion(joint.gain * theta(joint.signal) + joint.offset,
+                                                   B.linear(), B.translation());
+      B = B * joint.X_after;
+    }
+  }
+  return result;
 }
 
 // The most of these that are in one place.
@@ -91,6 +124,9 @@ bool keeps_to_second_place(const FittedEdge& fitted, const EdgeData& data) {
       elsewhere.insert(sight.sample);
   }
   if (has_second_place(beside)) return true;
+  if (own.num_residuals() == 6 &&
+      std::ranges::any_of(changes_of_links(edge, data, beside), has_second_place))
+    return true;
   for (const int part : seen_parts(data.samples)) {
     if (part == edge.to) continue;
     const PairData pair = make_pair_data(data.samples, part, edge.to, data.measurement, kAll);

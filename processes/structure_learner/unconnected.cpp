@@ -171,7 +171,8 @@ std::string why_refused(int part, const LearnedStructure& structure, const Refus
       case Refusal::kSecondPlace:
         return model +
                " is right but at samples at which the part keeps to one other place: it is held "
-               "there, or another marker is read for its own: leave those samples out";
+               "there, another marker is read for its own, or a joint that is not recorded is "
+               "elsewhere: leave those samples out";
       case Refusal::kContradicted:
         return model +
                " is contradicted by what the other parts tell of it at most samples: show the two "

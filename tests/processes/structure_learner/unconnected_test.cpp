@@ -191,5 +191,28 @@ TEST(Unconnected, IsAPartThatKeepsToASecondPlace) {
     }
 }
 
+// Between the two joints of an edge, and at every sixth sample alone.
+TEST(Unconnected, IsAPartBeyondAJointThatIsNotRecorded) {
+  for (const double turn : {0.0, 0.4})
+    for (int seed = 1; seed <= 4; ++seed) {
+      Rng rng(seed);
+      const test::SyntheticRobot robot = test::chapter_robot("co", rng);
+      test::SyntheticRobot turned = robot;
+      const auto hidden = std::ranges::find(turned.links, true, &test::TrueLink::hidden);
+      hidden->X_after = hidden->X_after * Eigen::AngleAxisd(turn, Eigen::Vector3d::UnitX());
+      std::vector<ActionPoseSample> samples;
+      for (int n = 0; n < 100; ++n)
+        samples.push_back(test::observe(n % 6 == 0 ? turned : robot, robot.random_action(rng),
+                                        {.regime = Regime::kFree}, n, rng));
+      LearnOptions options;
+      options.measurement.noise = Noise{0.001, 0.005};
+      options.measurement.outlier_rate = 0.1;
+      const BodySchema schema = learn(robot.signals, samples, options).schema;
+      EXPECT_EQ(contains(schema.unconnected, "a joint that is not recorded is elsewhere"), turn > 0)
+          << seed;
+      EXPECT_EQ(schema.complete, turn == 0) << seed;
+    }
+}
+
 }  // namespace
 }  // namespace bodyschema
