@@ -120,7 +120,7 @@ class PairModels {
   /// All markers together spoke against this model.
   void refute(const AcceptedModel& m) { refuted_.insert(key(m.part_i, m.part_j, m.model)); }
   bool is_refuted(int part_i, int part_j, const LocalModel& model) const {
-    return refuted_.count(key(part_i, part_j, model)) > 0;
+    return refuted_.contains(key(part_i, part_j, model));
   }
   /// The best one of each two parts and signal set, by joints and cost.
   std::vector<NearMiss> near_misses() const;
