@@ -92,9 +92,10 @@ struct LearnedStructure {
 
   /// The edges span all parts seen.
   bool spans() const { return search.models.size() + 1 >= parts.size(); }
-  /// What the best models leave is above any marker's noise.
+  /// What the best models leave is above any marker's noise. Not so of covariances that a factor
+  /// makes larger: these are no guess.
   bool is_noise_guessed_too_large() const {
-    return noise_source == NoiseSource::kResiduals &&
+    return noise_source == NoiseSource::kResiduals && options.measurement.noise &&
            is_above_any_marker(*options.measurement.noise);
   }
 };

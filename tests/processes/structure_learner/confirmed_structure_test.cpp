@@ -107,6 +107,16 @@ TEST(ConfirmedStructureTest, ASmallJointOfASignalThatHasALargeOneGoesIfMoreNoise
   }
 }
 
+// Observations that have covariances go without a noise that is told.
+TEST(ConfirmedStructureTest, CovariancesMadeLargerAreNoGuessOfTheNoise) {
+  LearnedStructure found = structure({0}, 0.9);
+  found.noise_source = NoiseSource::kResiduals;
+  found.options.measurement.noise = Noise{1, 1};
+  EXPECT_TRUE(found.is_noise_guessed_too_large());
+  found.options.measurement.noise.reset();
+  EXPECT_FALSE(found.is_noise_guessed_too_large());
+}
+
 TEST(ConfirmedStructureTest, TooFewDataAreNoReasonForMoreNoise) {
   LearnedStructure few = nothing();
   few.search.records[{2, 3}].undecided.emplace(1, 5.0);
