@@ -24,17 +24,44 @@ constexpr int kSteps = 2;
 // right with 0, all with 0.5, 1 and 2.
 constexpr double kUnknownBias = 0.5;
 
-// Ends, signals with their multiplicity, and those of a Gaussian process.
+// Two bodies, signals with their multiplicity, and those of a Gaussian process.
 using EdgeSignature = std::tuple<int, int, std::multiset<int>, std::vector<int>>;
 
-EdgeSignature signature_of(const AcceptedModel& edge) {
-  return {edge.part_i, edge.part_j, signals_of_joints(edge.model), edge.soft_signals};
+bool is_rigid(const AcceptedModel& edge) {
+  return edge.model.joints.empty() && edge.soft_signals.empty();
 }
 
-std::set<EdgeSignature> signatures_of(const LearnedStructure& structure) {
-  std::set<EdgeSignature> result;
-  for (const AcceptedModel& edge : structure.search.models) result.insert(signature_of(edge));
-  return result;
+// What a structure says of bodies. Parts that are fixed to each other are one body: by which of
+// these a joint hangs on it is left to how noisy they are.
+class Bodies {
+ public:
+  explicit Bodies(const LearnedStructure& structure) : components_(structure.parts) {
+    for (const AcceptedModel& edge : structure.search.models)
+      if (is_rigid(edge)) components_.join(edge.part_i, edge.part_j);
+    for (const AcceptedModel& edge : structure.search.models)
+      if (!is_rigid(edge)) edges_.insert(signature_of(edge));
+  }
+  bool have(const AcceptedModel& edge) const {
+    return is_rigid(edge) ? components_.of(edge.part_i) == components_.of(edge.part_j)
+                          : edges_.contains(signature_of(edge));
+  }
+  bool have_all(const LearnedStructure& structure) const {
+    return std::ranges::all_of(structure.search.models,
+                               [this](const AcceptedModel& edge) { return have(edge); });
+  }
+
+ private:
+  EdgeSignature signature_of(const AcceptedModel& edge) const {
+    const auto [a, b] = std::minmax({components_.of(edge.part_i), components_.of(edge.part_j)});
+    return {a, b, signals_of_joints(edge.model), edge.soft_signals};
+  }
+
+  Components components_;
+  std::set<EdgeSignature> edges_;
+};
+
+bool are_same(const LearnedStructure& a, const LearnedStructure& b) {
+  return Bodies(a).have_all(b) && Bodies(b).have_all(a);
 }
 
 // Edges between the same parts, by the same signals, be they those of joints or of processes.
@@ -89,18 +116,16 @@ bool has_untold_edges(const LearnedStructure& structure) {
 // A part that rests is always seen from the same side: no bias makes it stray, nor what is fixed to
 // it.
 bool fixes_what_strays(const LearnedStructure& louder, const std::set<int>& resting) {
-  return std::any_of(louder.search.models.begin(), louder.search.models.end(),
-                     [&](const AcceptedModel& edge) {
-                       return edge.model.num_joints() == 0 && edge.soft_signals.empty() &&
-                              resting.contains(edge.part_i) != resting.contains(edge.part_j);
-                     });
+  return std::any_of(
+      louder.search.models.begin(), louder.search.models.end(), [&](const AcceptedModel& edge) {
+        return is_rigid(edge) && resting.contains(edge.part_i) != resting.contains(edge.part_j);
+      });
 }
 
 LearnedStructure contested(LearnedStructure structure, const LearnedStructure& rival) {
-  const std::set<EdgeSignature> shared = signatures_of(rival);
-  const auto removed = std::erase_if(structure.search.models, [&](const AcceptedModel& edge) {
-    return !shared.contains(signature_of(edge));
-  });
+  const Bodies of_rival(rival);
+  const auto removed = std::erase_if(
+      structure.search.models, [&](const AcceptedModel& edge) { return !of_rival.have(edge); });
   structure.is_contested = removed > 0;
   return structure;
 }
@@ -121,9 +146,7 @@ std::optional<LearnedStructure> with_less_noise(const LearnedStructure& louder, 
     return std::nullopt;
   for (double less = 1; less < factor; less *= 2) {
     LearnedStructure found = find({less, less > 1 ? kUnknownBias : 0, louder.signals});
-    if (!found.spans() || has_doubtful_joints(found) ||
-        signatures_of(found) != signatures_of(louder))
-      continue;
+    if (!found.spans() || has_doubtful_joints(found) || !are_same(found, louder)) continue;
     if (less > 1) found.noise_source = NoiseSource::kResiduals;
     return found;
   }
@@ -153,7 +176,7 @@ LearnedStructure least_noise(LearnedStructure told, const FindStructure& find,
     if (!louder.spans() && louder.search.models.size() <= quieter.search.models.size()) break;
     if (fixes_what_strays(louder, told.search.resting)) break;
     if (quieter.spans() && !is_soft(quieter) && !has_doubtful_joints(quieter) &&
-        signatures_of(quieter) == signatures_of(louder)) {
+        are_same(quieter, louder)) {
       if (is_first) return quieter;
       if (!is_explained && !is_guess && quieter.search.residual_scale < kSmallestResidual) {
         if (auto with_bends = with_less_noise(quieter, factor, find)) return *std::move(with_bends);

@@ -26,17 +26,17 @@ using ConnectSoftParts = std::function<void(LearnedStructure*)>;
 /// So where the residuals are larger than the noise explains, or edges have joints that they do not
 /// need (SearchResult::redundant) or that may be none (SearchResult::couplings), or no structure
 /// spans although data are enough, the noise is doubled until two structures in a row are the same
-/// and without such joints; that of the smaller noise, at most four times the told one, is the
-/// answer. Noise that was guessed from residuals is doubled where edges have such joints, or where
-/// neither screws nor processes span, and then only up to kLoudestMarker. It ends where more noise
-/// connects no more parts. Where a signal that the first structure
-/// uses is used no more with larger noise, size alone does not tell a small joint from a bias: what
-/// the two do not share is left open (LearnedStructure::is_contested). So are redundant edges of
-/// the answer, chains with unknown gains, and soft parts that screws describe with noise of which
-/// the residuals show less than half, unless these are screws with bent commands, which show only
-/// by a model: with these it is searched with less noise again. Parts that screws do not connect
-/// are soft only where more noise is no answer; where the noise is a guess, it is the other way
-/// round.
+/// (parts that are fixed to each other are one body, whichever of them bears a joint) and without
+/// such joints; that of the smaller noise, at most four times the told one, is the answer. Noise
+/// that was guessed from residuals is doubled where edges have such joints, or where neither screws
+/// nor processes span, and then only up to kLoudestMarker. It ends where more noise connects no
+/// more parts. Where a signal that the first structure uses is used no more with larger noise, size
+/// alone does not tell a small joint from a bias: what the two do not share is left open
+/// (LearnedStructure::is_contested). So are redundant edges of the answer, chains with unknown
+/// gains, and soft parts that screws describe with noise of which the residuals show less than
+/// half, unless these are screws with bent commands, which show only by a model: with these it is
+/// searched with less noise again. Parts that screws do not connect are soft only where more noise
+/// is no answer; where the noise is a guess, it is the other way round.
 ///
 /// Noise of a stream that was estimated from residuals is raised by a fifth, at most twice, until a
 /// structure spans.

@@ -62,6 +62,16 @@ std::vector<int> signals_of(const LearnedStructure& found) {
   return result;
 }
 
+// Parts 1 and 2, fixed to each other, and part 3, which a joint hangs on `parent`.
+LearnedStructure third_on(int parent) {
+  LearnedStructure result = structure({}, 0.9);
+  result.parts = {1, 2, 3};
+  AcceptedModel edge{.part_i = parent, .part_j = 3};
+  edge.model.joints.push_back({.signal = 0});
+  result.search.models.push_back(edge);
+  return result;
+}
+
 TEST(ConfirmedStructureTest, ToldNoiseThatResidualsDoNotRefuteStandsAfterOneSearch) {
   const Found found = confirmed({{1, structure({0}, 0.95)}});
   EXPECT_EQ(found.num_searches, 1);
@@ -115,6 +125,21 @@ TEST(ConfirmedStructureTest, CovariancesMadeLargerAreNoGuessOfTheNoise) {
   EXPECT_TRUE(found.is_noise_guessed_too_large());
   found.options.measurement.noise.reset();
   EXPECT_FALSE(found.is_noise_guessed_too_large());
+}
+
+TEST(ConfirmedStructureTest, PartsThatAreFixedToEachOtherAreOneBody) {
+  LearnedStructure coupled = third_on(1);
+  coupled.search.models.back().model.joints.push_back({.signal = 0});
+  coupled.search.couplings = {{1, 3, 0}};
+  const Found found = confirmed({{1, coupled}, {2, third_on(1)}, {4, third_on(2)}});
+  EXPECT_EQ(found.num_searches, 3);
+  EXPECT_EQ(found.structure.search.models.size(), 2U);
+  EXPECT_EQ(signals_of(found.structure), std::vector<int>({0}));
+  EXPECT_FALSE(found.structure.is_contested);
+  // Edges of the answer that more noise hangs on the other part are not contested either.
+  const Found small = confirmed({{1, coupled}, {2, third_on(1)}, {4, coupled}, {8, third_on(2)}});
+  EXPECT_EQ(signals_of(small.structure), std::vector<int>());
+  EXPECT_EQ(small.structure.search.models.size(), 1U);
 }
 
 TEST(ConfirmedStructureTest, TooFewDataAreNoReasonForMoreNoise) {
