@@ -5,6 +5,7 @@
 #include <cmath>
 #include <limits>
 #include <map>
+#include <optional>
 #include <set>
 #include <utility>
 
@@ -44,8 +45,14 @@ PairData with_slack(const PairData& pair, const LocalModel& model,
 /// A model's measurement of θ of one of its signals at one instant.
 struct Reading {
   int sample = 0;
-  double theta = 0;      ///< [half ranges], in the model's own line
-  double precision = 0;  ///< [1 / half range²]
+  double theta = 0;             ///< [half ranges], in the model's own line
+  double precision = 0;         ///< [1 / half range²]
+  double squared_distance = 0;  ///< of its pose, across the motion
+
+  /// Heavy-tailed: of a pose that is so far from where its model and that displacement have it.
+  double weight(double theta_error) const {
+    return robust_weight(squared_distance + precision * theta_error * theta_error);
+  }
 };
 
 /// A local model that is asked for the displacements of its signals.
@@ -59,7 +66,7 @@ struct Witness {
     const auto found = readings.find(signal);
     if (found == readings.end()) return 0;
     double sum = 0;
-    for (const Reading& r : found->second) sum += r.precision;
+    for (const Reading& r : found->second) sum += r.weight(0) * r.precision;
     return sum;
   }
 };
@@ -96,11 +103,11 @@ bool ask(const NormalizedActions& actions, Witness* witness) {
     const Eigen::VectorXd delta = ldlt.solve(V.transpose() * r);
     const Eigen::MatrixXd covariance =
         ldlt.solve(Eigen::MatrixXd::Identity(model.num_joints(), model.num_joints()));
-    const double weight = robust_weight(fit.frames[t].squared_distance);
     for (int d = 0; d < model.num_joints(); ++d) {
       if (!(covariance(d, d) > 0)) continue;
       witness->readings[model.joints[d].signal].push_back(
-          {sample, actions(sample, model.joints[d].signal) + delta(d), weight / covariance(d, d)});
+          {sample, actions(sample, model.joints[d].signal) + delta(d), 1 / covariance(d, d),
+           fit.frames[t].squared_distance});
     }
   }
   return true;
@@ -112,35 +119,83 @@ struct Regression {
   double evidence = 0;  ///< log marginal likelihood over that of lines alone [nats]
 };
 
+/// Readings of one signal by several models: those of one model after the other.
+class Readings {
+ public:
+  Readings(const std::vector<const std::vector<Reading>*>& models,
+           const std::vector<double>& x_of_sample)
+      : num_lines_(2 * static_cast<Eigen::Index>(models.size())) {
+    for (const auto* of_model : models)
+      readings_.insert(readings_.end(), of_model->begin(), of_model->end());
+    const auto n = static_cast<Eigen::Index>(readings_.size());
+    rows_ = Eigen::MatrixXd::Zero(n, num_lines_ + kWarpSize);
+    theta_.resize(n);
+    for (Eigen::Index m = 0, r = 0; 2 * m < num_lines_; ++m)
+      for (const Reading& reading : *models[static_cast<std::size_t>(m)]) {
+        const double x = x_of_sample[reading.sample];
+        rows_(r, 2 * m) = 1;
+        rows_(r, 2 * m + 1) = x;
+        rows_.row(r).tail(kWarpSize) = warp_basis(x, kWarpSize).transpose();
+        theta_(r++) = reading.theta;
+      }
+  }
+  Eigen::Index size() const { return theta_.size(); }
+  Eigen::VectorXd errors(const Eigen::VectorXd& mean) const { return theta_ - rows_ * mean; }
+  /// Of the poses, by how far the readings are off.
+  Eigen::VectorXd weights(const Eigen::VectorXd& errors) const {
+    Eigen::VectorXd result(errors.size());
+    for (Eigen::Index r = 0; r < errors.size(); ++r)
+      result(r) = readings_[static_cast<std::size_t>(r)].weight(errors(r));
+    return result;
+  }
+  /// The process with the largest marginal likelihood, if one rises with its command.
+  std::optional<WarpProcess> likeliest(Eigen::VectorXd weights) const {
+    for (Eigen::Index r = 0; r < weights.size(); ++r)
+      weights(r) *= readings_[static_cast<std::size_t>(r)].precision;
+    const Eigen::MatrixXd A = rows_.transpose() * weights.asDiagonal() * rows_;
+    const Eigen::VectorXd b = rows_.transpose() * weights.cwiseProduct(theta_);
+    std::optional<WarpProcess> best;
+    for (WarpProcess& process : warp_processes(A, b, static_cast<int>(num_lines_)))
+      if (mean_slope(process) > 0 && (!best || process.evidence > best->evidence))
+        best = std::move(process);
+    return best;
+  }
+  /// Of the models' lines.
+  double mean_slope(const WarpProcess& process) const {
+    double sum = 0;
+    for (Eigen::Index m = 1; m < num_lines_; m += 2) sum += process.mean(m);
+    return 2 * sum / static_cast<double>(num_lines_);
+  }
+
+ private:
+  Eigen::Index num_lines_;
+  std::vector<Reading> readings_;
+  Eigen::MatrixXd rows_;  // readings × (two of each line, then the weights)
+  Eigen::VectorXd theta_;
+};
+
 /// θ_m(q) = a_m + b_m q + φ(q)ᵀw over the readings of all models m: the amplitude and length of the
-/// process with the largest marginal likelihood.
+/// process with the largest marginal likelihood. A wild pose whose error is along the motion, where
+/// the slack hides it, shows only by how far its reading is from the others': it counts by that,
+/// too.
 Regression regress(const std::vector<const std::vector<Reading>*>& models,
                    const std::vector<double>& x_of_sample) {
-  const int num_lines = 2 * static_cast<int>(models.size());
-  const int size = num_lines + kWarpSize;
-  Eigen::MatrixXd A = Eigen::MatrixXd::Zero(size, size);
-  Eigen::VectorXd b = Eigen::VectorXd::Zero(size), row(size);
-  for (std::size_t m = 0; m < models.size(); ++m) {
-    for (const Reading& reading : *models[m]) {
-      const double x = x_of_sample[reading.sample];
-      row.setZero();
-      row(2 * static_cast<Eigen::Index>(m)) = 1;
-      row(2 * static_cast<Eigen::Index>(m) + 1) = x;
-      row.tail(kWarpSize) = warp_basis(x, kWarpSize);
-      A.selfadjointView<Eigen::Lower>().rankUpdate(row, reading.precision);
-      b += reading.precision * reading.theta * row;
-    }
+  // The most that is worth the time; weights of at most 2.5 are as good as still sooner.
+  constexpr int kMaxReweighings = 10;
+  constexpr double kSmallChange = 1e-3;
+  const Readings readings(models, x_of_sample);
+  Regression result;
+  result.evidence = -std::numeric_limits<double>::infinity();
+  Eigen::VectorXd weights = readings.weights(Eigen::VectorXd::Zero(readings.size()));
+  for (int n = 0; n < kMaxReweighings; ++n) {
+    const std::optional<WarpProcess> process = readings.likeliest(weights);
+    if (!process) break;
+    result = {process->mean.tail(kWarpSize) / readings.mean_slope(*process), process->evidence};
+    const Eigen::VectorXd before =
+        std::exchange(weights, readings.weights(readings.errors(process->mean)));
+    if ((weights - before).cwiseAbs().maxCoeff() < kSmallChange) break;
   }
-  A = A.selfadjointView<Eigen::Lower>();
-  Regression best;
-  best.evidence = -std::numeric_limits<double>::infinity();
-  for (const WarpProcess& process : warp_processes(A, b, num_lines)) {
-    if (process.evidence <= best.evidence) continue;
-    double slope = 0;
-    for (int m = 0; m < num_lines / 2; ++m) slope += process.mean(2 * m + 1) / (num_lines / 2);
-    if (slope > 0) best = {process.mean.tail(kWarpSize) / slope, process.evidence};
-  }
-  return best;
+  return result;
 }
 
 int count_positions(const std::vector<const std::vector<Reading>*>& models,

@@ -14,9 +14,10 @@ namespace bodyschema {
 /// motion (Σ_z + J σ² Jᵀ, J = ∂Δ/∂θ), and what is left along J, with the precision JᵀΣ_z⁻¹J, is a
 /// measurement of θ. What of it depends on q beyond a line (gain and offset of the model, free for
 /// each) is regressed on the warp's basis; amplitude and length of the process are those of
-/// largest marginal likelihood. Both steps are repeated until the warp stands still. A signal is
-/// bent if that beats the straight line by kWarpEvidence and was read at 15 positions or more.
-/// Beyond the positions seen the process returns to the line.
+/// largest marginal likelihood. A reading weighs as its pose does in a fit (student_t.h), by what
+/// is off across the motion and along it. Both steps are repeated until the warp stands still. A
+/// signal is bent if that beats the straight line by kWarpEvidence and was read at 15 positions or
+/// more. Beyond the positions seen the process returns to the line.
 ///
 /// The models are those of `found`; where these leave parts unconnected, or where one of them
 /// already speaks for a bent command, the best single joint of every pair as well: a linear command

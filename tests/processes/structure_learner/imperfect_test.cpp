@@ -253,6 +253,42 @@ TEST(Warp, BeyondTheAnglesSeenACommandIsLinear) {
   }
 }
 
+// At every twelfth sample the joint is elsewhere on its way: nothing across the motion says so.
+TEST(Warp, WildPosesAlongTheMotionDoNotBendIt) {
+  double squares = 0;
+  int num = 0;
+  for (std::uint64_t seed = 0; seed < 4; ++seed) {
+    test::Rng rng(seed);
+    auto robot = hinge(90, rng);
+    robot.links[1].turn = 1;
+    robot.signals[0] = {"q", -1.5, 1.5};
+    robot.bend = 0.1;
+    std::vector<ActionPoseSample> samples;
+    for (int n = 0; n < 72; ++n) {
+      const Eigen::VectorXd action = Eigen::VectorXd::Constant(1, test::uniform(rng, -1.5, 1.5));
+      const Eigen::VectorXd off = Eigen::VectorXd::Constant(1, n % 12 == 5 ? 0.5 : 0);
+      samples.push_back(test::observe(robot, action + off, {test::Regime::kTagIso}, n, rng));
+      samples.back().action = action;
+    }
+    const BodySchema schema =
+        learn(robot.signals, samples, options_of(test::nominal_noise(test::Regime::kTagIso)))
+            .schema;
+    ASSERT_EQ(schema.edges.size(), 1U);
+    EXPECT_FALSE(schema.signals[0].warp.empty()) << seed;
+    for (double q = -1.3; q < 1.35; q += 0.1) {
+      const Eigen::VectorXd action = Eigen::VectorXd::Constant(1, q);
+      const auto truth = robot.poses_in_camera(action);
+      const auto predicted = schema.predict(1, 2, action);
+      ASSERT_TRUE(predicted);
+      const double error =
+          rotation_angle(predicted->X_AB.inverse() * truth.at(1).inverse() * truth.at(2));
+      squares += error * error;
+      ++num;
+    }
+  }
+  EXPECT_LT(std::sqrt(squares / num), 1 * kDegree);
+}
+
 // How many of so many robots are right; none may be wrong.
 int count_right(const Imperfection& imperfection, int num_robots,
                 const std::optional<Noise>& told = kTold) {

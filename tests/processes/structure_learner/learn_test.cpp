@@ -3,6 +3,7 @@
 #include <gtest/gtest.h>
 
 #include <sstream>
+#include <utility>
 
 #include "common/geometry/angle.h"
 #include "tests/support/synthetic_robot.h"
@@ -78,6 +79,24 @@ TEST(Learn, UnbendsACommandThatIsNotLinearInTheJoint) {
   }
   EXPECT_LT(position, 1e-3);
   EXPECT_LT(rotation, 0.2 * kDegree);
+}
+
+// Of a, a joint hangs on one or the other of two parts that are fixed to each other, by how large
+// the noise is taken to be; of c, a wild pose bends a command.
+TEST(Learn, BentCommandsInTheNoiseOfTagsAreNoSoftParts) {
+  const std::pair<const char*, int> robots[] = {{"a", 26}, {"c", 19}};
+  for (const auto& [name, seed] : robots) {
+    Rng rng(static_cast<Rng::result_type>(seed));
+    auto robot = test::chapter_robot(name, rng);
+    robot.bend = 0.1;
+    const auto samples =
+        test::babble(robot, 100, {.regime = Regime::kTag, .with_covariances = true}, rng);
+    const BodySchema schema = learn(robot.signals, samples).schema;
+    EXPECT_TRUE(is_right(schema, robot)) << name;
+    for (const Signal& signal : schema.signals) EXPECT_FALSE(signal.warp.empty()) << name;
+    for (const Edge& edge : schema.edges) EXPECT_EQ(edge.residual_gp, nullptr) << name;
+    EXPECT_LT(end_effector_error(schema, robot, rng).first, 0.002) << name;
+  }
 }
 
 TEST(Learn, LeavesAStraightCommandStraight) {
