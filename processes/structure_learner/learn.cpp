@@ -2,7 +2,6 @@
 
 #include <algorithm>
 #include <cmath>
-#include <map>
 #include <set>
 #include <stdexcept>
 #include <tuple>
@@ -14,6 +13,7 @@
 #include "processes/structure_learner/edge_fit.h"
 #include "processes/structure_learner/learned_schema.h"
 #include "processes/structure_learner/model_free_noise.h"
+#include "processes/structure_learner/noise_by_bends.h"
 #include "processes/structure_learner/noise_in_common.h"
 #include "processes/structure_learner/noise_instead.h"
 #include "processes/structure_learner/one_cluster.h"
@@ -193,25 +193,6 @@ bool connects_more_simply(const SearchResult& x, const SearchResult& y) {
   };
   return std::tuple(x.models.size(), -num_joints(x)) > std::tuple(y.models.size(), -num_joints(y));
 }
-
-// The markers' noise in the same samples by how their commands are bent: each estimated once, for a
-// structure may be looked for with noise several times as large.
-class NoiseByBends {
- public:
-  const SourcedNoise& at(const std::vector<Signal>& signals,
-                         const std::vector<ActionPoseSample>& displaced_by_these,
-                         const LearnOptions& options) {
-    std::vector<std::vector<double>> bends;
-    for (const Signal& signal : signals) bends.push_back(signal.warp);
-    const auto [known, is_new] = known_.try_emplace(std::move(bends));
-    if (is_new)
-      known->second = marker_noise(displaced_by_these, static_cast<int>(signals.size()), options);
-    return known->second;
-  }
-
- private:
-  std::map<std::vector<std::vector<double>>, SourcedNoise> known_;
-};
 
 enum class Commands { kStraight, kMayBeBent };
 
