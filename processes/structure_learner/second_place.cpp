@@ -45,9 +45,10 @@ bool is_same_place(const Sight& one, const Sight& other) {
 }
 
 // By what each link of an edge but the last would have to be off for the part to be where it was
-// seen, Δ in X = B Δ X_SB. `beside`: the same of the last.
+// seen, Δ in X = B Δ X_SB; of the first without those that turn the part that it begins at, whose
+// tag may be read turned over. `beside`: the same of the last.
 std::vector<std::vector<Sight>> changes_of_links(const Edge& edge, const EdgeData& data,
-                                                 const std::vector<Sight>& beside) {
+                                                 const std::vector<Sight>& beside, double apart_m) {
   std::vector<std::vector<Sight>> result(edge.joints.size(), beside);
   for (std::size_t n = 0; n < beside.size(); ++n) {
     const Eigen::VectorXd& theta = data.samples[static_cast<std::size_t>(beside[n].sample)].action;
@@ -63,6 +64,10 @@ std::vector<std::vector<Sight>> changes_of_links(const Edge& edge, const EdgeDat
       B = B * joint.X_after;
     }
   }
+  if (!result.empty())
+    std::erase_if(result.front(), [&](const Sight& sight) {
+      return (edge.left * sight.X * edge.left.inverse()).translation().norm() <= apart_m;
+    });
   return result;
 }
 
@@ -125,7 +130,7 @@ bool keeps_to_second_place(const FittedEdge& fitted, const EdgeData& data) {
   }
   if (has_second_place(beside)) return true;
   if (own.num_residuals() == 6 &&
-      std::ranges::any_of(changes_of_links(edge, data, beside), has_second_place))
+      std::ranges::any_of(changes_of_links(edge, data, beside, apart_m), has_second_place))
     return true;
   for (const int part : seen_parts(data.samples)) {
     if (part == edge.to) continue;
