@@ -161,6 +161,7 @@ TEST_F(RefineProgramTest, FitsTheRowsOfACsv) {
   const Json judged = json_of("refine of_csv samples.csv --test other.csv --out judged --json");
   EXPECT_EQ(judged.at("after").at("samples"), 10);
   EXPECT_EQ(judged.at("parameters"), json.at("parameters"));
+  EXPECT_EQ(run("refine of_csv samples.csv --test samples.csv --out judged").exit_code, 2);
 }
 
 /// Median distance of a part from where it is in the root, over random actions [m].

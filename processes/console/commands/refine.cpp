@@ -154,6 +154,9 @@ void run_refine(const RefineArguments& given) {
     refuse_argument("SCHEMA", "expected, or --structure");
   }
   if (arguments.samples.empty()) refuse_argument("SAMPLES", "expected");
+  std::error_code is_new;
+  if (std::filesystem::equivalent(arguments.test, arguments.samples, is_new) && !is_new)
+    refuse_argument("--test", arguments.test + " is the recording that is fitted");
   if (!arguments.proposed.empty() && !arguments.placements && !arguments.intrinsics)
     refuse_argument("--proposed", "expected with --placements or --intrinsics");
   if (std::filesystem::exists(arguments.proposed) &&
