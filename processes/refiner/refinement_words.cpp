@@ -201,8 +201,7 @@ std::vector<std::string> RefinementWords::undetermined() const {
 
 std::string RefinementWords::advice(const std::vector<Place>& places) const {
   std::set<int> tags;
-  std::set<std::string> signals;
-  bool moved_far = true;
+  std::set<std::string> signals, hardly_moved;
   for (const Place& place : places) {
     const ParameterBlock& block = *place.block;
     if (block.kind == Kind::kLens) return "show tags nearer and farther, and at the image's border";
@@ -210,15 +209,15 @@ std::string RefinementWords::advice(const std::vector<Place>& places) const {
     if (block.kind != Kind::kEdge || schema_.edges[block.id].joints.empty()) continue;
     const SignalCoverage& signal = coverage_.at(joint_of(block, place.direction).signal);
     signals.insert(signal.signal);
-    moved_far &= signal.share > kFarShare;
+    if (signal.share <= kFarShare) hardly_moved.insert(signal.signal);
   }
   if (tags.size() > 1) return fmt::format("show tags {} in one image", fmt::join(tags, ", "));
   if (signals.empty()) return "";
   const std::string names = fmt::format("{}", fmt::join(signals, ", "));
   if (!tags.empty()) return fmt::format("show tag {} while {} moves", *tags.begin(), names);
-  if (moved_far) return "show a part farther from the axis of " + names;
-  return fmt::format("move {} farther{}", names,
-                     signals.size() > 1 ? " and in other combinations" : "");
+  if (hardly_moved.empty()) return "show a part farther from the axis of " + names;
+  return fmt::format("move {} farther{}", fmt::join(hardly_moved, ", "),
+                     hardly_moved.size() > 1 ? " and in other combinations" : "");
 }
 
 // The covariance given what is_frame() says. Zero rows where that is.

@@ -172,6 +172,8 @@ TEST(RefineSchemas, LeaveAJointThatRestedAsItWas) {
   EXPECT_TRUE(result.schema.edges[1].left.isApprox(start.edges[1].left, 1e-12));
   EXPECT_LT(worst_error_m(result.schema, robot, samples), 1e-6);
   EXPECT_TRUE(names(result.undetermined, "gain of q2"));
+  ASSERT_EQ(result.undetermined.size(), 1U);
+  EXPECT_TRUE(result.undetermined.front().ends_with(": move q2 farther"));
 }
 
 TEST(RefineSchemas, TellTheJointsOfOneSignalApart) {
