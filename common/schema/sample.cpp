@@ -54,4 +54,14 @@ void ActionPoseSample::leave_out(const std::function<bool(int tag)>& is_such) {
   });
 }
 
+std::vector<double> numbers_of(const ActionPoseSample& sample) {
+  std::vector<double> result(sample.action.begin(), sample.action.end());
+  for (const PartObservation& o : sample.parts) {
+    result.push_back(o.part);
+    const auto X = o.X_CB.matrix();
+    result.insert(result.end(), X.reshaped().begin(), X.reshaped().end());
+  }
+  return result;
+}
+
 }  // namespace bodyschema

@@ -57,6 +57,10 @@ struct ActionPoseSample {
   void leave_out(const std::function<bool(int tag)>& is_such);
 };
 
+/// Of the action and the parts' poses. Noise never repeats itself: samples of the same numbers are
+/// one, told twice.
+std::vector<double> numbers_of(const ActionPoseSample& sample);
+
 /// TEST samples judge, those of the controller follow its model.
 inline bool is_learned_from(const ActionPoseSample& sample) {
   return sample.purpose == Purpose::kTrain || sample.purpose == Purpose::kProbe;

@@ -83,9 +83,13 @@ struct Information::Weights {
 
 Information::Information(RefinementProblem& problem, const MeasurementModel& measurement,
                          int num_not_fitted) {
-  double num_fitted = -num_not_fitted;
-  for (const ParameterBlock* block : problem.blocks())
-    num_fitted += block->is_refined ? block->num_free() : 0;
+  double num_fitted = problem.num_determined_plays() - num_not_fitted;
+  for (const ParameterBlock* block : problem.blocks()) {
+    if (!block->is_refined) continue;
+    const bool has_plays = block->kind == ParameterBlock::Kind::kInstant;
+    num_fitted += static_cast<double>(block->num_free()) -
+                  static_cast<double>(has_plays ? problem.plays().size() : 0);
+  }
   const Weights weights(problem.data(), problem.squared_distances(), num_fitted);
   // A joint that rested would seem to have moved by its play.
   problem.leave_out_play();

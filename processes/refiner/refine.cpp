@@ -7,6 +7,7 @@
 #include <chrono>
 #include <cmath>
 #include <map>
+#include <memory>
 #include <set>
 #include <stdexcept>
 #include <utility>
@@ -139,6 +140,26 @@ bool root_moves(const BodySchema& schema, const std::vector<RefinerSample>& samp
   return log_likelihoods[1] - log_likelihoods[0] > num_more * std::log(num_residuals) / 2;
 }
 
+/// Solved. `may_have_plays`: poses are fitted, joints are off their commands if that is likelier
+/// (Schwarz 1978).
+std::unique_ptr<RefinementProblem> solved_problem(const BodySchema& schema,
+                                                  const std::vector<RefinerSample>& samples,
+                                                  const std::optional<RigCalibration>& rig,
+                                                  const RefineOptions& options, bool root_moves,
+                                                  bool may_have_plays) {
+  auto exact = std::make_unique<RefinementProblem>(schema, samples, rig, options, root_moves);
+  exact->solve();
+  if (!may_have_plays) return exact;
+  auto loose = std::make_unique<RefinementProblem>(schema, samples, rig, options, root_moves, true);
+  loose->solve();
+  const auto num_shown = (loose->shown_play_sd().array() > 0).count();
+  double num_residuals = 0;
+  for (const auto& datum : exact->data()) num_residuals += datum.num_residuals;
+  const double gain = loose->log_likelihood_without_plays() - exact->log_likelihood();
+  const double penalty = static_cast<double>(num_shown) * std::log(num_residuals) / 2;
+  return num_shown > 0 && gain > penalty ? std::move(loose) : std::move(exact);
+}
+
 /// All, the farthest first.
 std::vector<RefinementOutlier> outliers_of(RefinementProblem& problem) {
   std::vector<RefinementOutlier> result;
@@ -211,10 +232,11 @@ std::vector<std::string> things_not_seen(const BodySchema& schema,
 
 std::vector<JointPlay> plays_of(const BodySchema& schema, const RefinementProblem& problem) {
   std::vector<JointPlay> result;
+  const Eigen::VectorXd play_sd = problem.shown_play_sd();
   for (std::size_t n = 0; n < problem.plays().size(); ++n) {
     const auto& [edge, d] = problem.plays()[n];
     const ScrewJoint& joint = edge->joints[d];
-    const double sd = std::abs(joint.gain) * problem.play_sd()(static_cast<Eigen::Index>(n));
+    const double sd = std::abs(joint.gain) * play_sd(static_cast<Eigen::Index>(n));
     result.push_back(
         {joint_name(schema, *edge, joint), sd * std::abs(joint.slide), sd * std::abs(joint.turn)});
   }
@@ -266,6 +288,18 @@ std::vector<std::string> held_things(const BodySchema& schema, const RefineOptio
   return result;
 }
 
+void leave_out_repetitions(std::vector<RefinerSample>* samples, std::vector<std::string>* held) {
+  std::set<std::vector<double>> met;
+  const auto removed = std::erase_if(*samples, [&](const RefinerSample& seen) {
+    std::vector<double> numbers = numbers_of(seen.sample);
+    for (const TagSight& sight : seen.tags)
+      numbers.insert(numbers.end(), sight.corners_px.begin(), sight.corners_px.end());
+    return !met.insert(std::move(numbers)).second;
+  });
+  if (removed > 0)
+    held->push_back(fmt::format("{} samples that repeat others exactly: not fitted", removed));
+}
+
 void leave_out_those_without_corners(std::vector<RefinerSample>* samples,
                                      std::vector<std::string>* held) {
   const auto removed =
@@ -314,6 +348,7 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   if (result.used_corners) leave_out_those_without_corners(&training, &result.held);
   const std::optional<RigCalibration> used_rig = result.used_corners ? rig : std::nullopt;
   if (rig) result.rig = *rig;
+  leave_out_repetitions(&training, &result.held);
   result.num_available = static_cast<int>(training.size());
   RefineOptions stiff = options;
   stiff.joint_loads = nullptr;
@@ -330,10 +365,12 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   const BentSchema bent = options.joint_loads
                               ? BentSchema{schema, {}}
                               : with_bends(schema, training, stiff, result.root_moves);
-  RefinementProblem problem(bent.schema, training, used_rig, stiff, result.root_moves);
+  // So are loads and plays.
+  const auto solved = solved_problem(bent.schema, training, used_rig, stiff, result.root_moves,
+                                     !used_rig && !options.joint_loads);
+  RefinementProblem& problem = *solved;
   for (const int part : problem.unseen_parts())
     result.held.push_back(fmt::format("the frame of part {}: it was never seen", part));
-  problem.solve();
   for (std::string& thing : things_not_seen(bent.schema, training, problem))
     result.held.push_back(std::move(thing));
   result.outliers = outliers_of(problem);

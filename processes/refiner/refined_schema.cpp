@@ -156,6 +156,15 @@ std::map<int, Matrix6d> frame_covariances(const BodySchema& schema,
   return result;
 }
 
+void set_scatter(const BodySchema& start, const RefinementProblem& problem, BodySchema* schema) {
+  const Eigen::VectorXd play_sd = problem.shown_play_sd();
+  for (std::size_t n = 0; n < problem.plays().size(); ++n) {
+    const auto& [edge, d] = problem.plays()[n];
+    ScrewJoint& joint = schema->edges[edge - start.edges.data()].joints[d];
+    joint.scatter = std::abs(joint.gain) * play_sd(static_cast<Eigen::Index>(n));
+  }
+}
+
 }  // namespace
 
 BodySchema refined_schema(const BodySchema& start, const std::vector<RefinerSample>& samples,
@@ -173,6 +182,7 @@ BodySchema refined_schema(const BodySchema& start, const std::vector<RefinerSamp
       edge.parameter_covariance = covariances.between(block, block);
     }
   }
+  if (problem.poses_have_plays()) set_scatter(start, problem, &schema);
   schema.frame_covariances = frame_covariances(schema, samples, problem, covariances);
   schema.refined = true;
   schema.base_version = start.version;

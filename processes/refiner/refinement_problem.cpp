@@ -27,11 +27,13 @@ ceres::Problem::Options problem_options() {
 RefinementProblem::RefinementProblem(const BodySchema& schema,
                                      const std::vector<RefinerSample>& samples,
                                      const std::optional<RigCalibration>& rig,
-                                     const RefineOptions& options, bool root_moves)
+                                     const RefineOptions& options, bool root_moves,
+                                     bool poses_have_plays)
     : schema_(schema),
       rig_(rig),
       options_(options),
       root_moves_(root_moves),
+      poses_have_plays_(poses_have_plays),
       drive_model_(schema, options.joint_loads, samples),
       problem_(problem_options()) {
   add_paths();
@@ -101,9 +103,10 @@ void RefinementProblem::add_paths() {
   }
 }
 
-// Poses have errors of joints in their covariances.
 void RefinementProblem::add_plays() {
-  if (!rig_) return;
+  if (!rig_ && !poses_have_plays_) return;
+  // Of poses the search begins wide: from far too little it would take many rounds.
+  const double times = rig_ ? 1 : 10;
   std::vector<double> sd;
   for (const Edge& edge : schema_.edges) {
     if (!PartChain::has_block(edge) || edge.joints.empty()) continue;
@@ -113,7 +116,9 @@ void RefinementProblem::add_plays() {
       const TagCalibration& play = options_.config.joint_play;
       const double turn = std::abs(joint.gain * joint.turn);
       const double slide = std::abs(joint.gain * joint.slide);
-      sd.push_back(turn > 0 ? play.rotation_rad / turn : slide > 0 ? play.position_m / slide : 1);
+      sd.push_back(times * (turn > 0    ? play.rotation_rad / turn
+                            : slide > 0 ? play.position_m / slide
+                                        : 1));
     }
   }
   play_sd_ = play_start_ = Eigen::Map<const Eigen::VectorXd>(sd.data(), std::ssize(sd));
@@ -283,6 +288,7 @@ std::optional<RefinementProblem::Cost> RefinementProblem::cost_of(
   const int part = observation.part;
   if (!is_usable(part, sample_index)) return std::nullopt;
   std::vector<ParameterBlock*> blocks = chain_blocks(part, sample_index);
+  if (!plays_.empty() && !root_moves_) blocks.push_back(instants_.at(sample_index));
   if (drive_) blocks.push_back(drive_);
   const std::vector<const ParameterBlock*> constant(blocks.begin(), blocks.end());
   PartChain chain(paths_.at(part), displacements(action), drive_model_.first_joints());

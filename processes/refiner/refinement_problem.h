@@ -37,10 +37,12 @@ class RefinementProblem {
 
   /// `samples`: those to fit, ascending. `rig`: none where poses are fitted. What cannot be
   /// used (a part that hangs on nothing, a tag that moved, a sample before an edge was valid) is
-  /// passed over. All arguments must outlive this. @throws std::invalid_argument.
+  /// passed over. `poses_have_plays`: joints may be off their commands also where poses are fitted,
+  /// whose covariances else hold that. All arguments must outlive this.
+  /// @throws std::invalid_argument.
   RefinementProblem(const BodySchema& schema, const std::vector<RefinerSample>& samples,
                     const std::optional<RigCalibration>& rig, const RefineOptions& options,
-                    bool root_moves);
+                    bool root_moves, bool poses_have_plays = false);
 
   /// An observation as a residual, and the blocks that it depends on.
   struct Cost {
@@ -80,6 +82,7 @@ class RefinementProblem {
     int joint = 0;
   };
   const std::vector<Play>& plays() const { return plays_; }
+  bool poses_have_plays() const { return poses_have_plays_; }
   const Eigen::VectorXd& play_sd() const { return play_sd_; }
   /// Parts on the way to others that were never seen: their frames are held.
   const std::vector<int>& unseen_parts() const { return unseen_parts_; }
@@ -87,6 +90,14 @@ class RefinementProblem {
   void leave_out_play();
   /// Of the data now, given the scale; up to a constant.
   double log_likelihood();
+  /// The same, integrated over the joints' plays (Laplace).
+  double log_likelihood_without_plays();
+  /// Without any play its deviation is this share of what it began with.
+  static constexpr double kLeastPlay = 0.01;
+  /// Of each of plays(), 0 where the data show none.
+  Eigen::VectorXd shown_play_sd() const;
+  /// How many numbers of the data the plays took: the rest of each is its prior's.
+  double num_determined_plays() const { return num_determined_plays_; }
   /// What drive_model() adds to the commands; null: nothing.
   ParameterBlock* drive() const { return drive_; }
   const DriveModel& drive_model() const { return drive_model_; }
@@ -129,6 +140,8 @@ class RefinementProblem {
   ceres::Solver::Options solver_options();
   double estimated_scale();
   double estimate_play();
+  /// Of each instant, given everything else: the data's and the plays' priors', instants ascending.
+  std::vector<Eigen::MatrixXd> information_of_instants();
   /// Whether a signal hardly moved where parts beyond the edge were seen.
   bool rests(const Edge& edge, int signal) const;
   void set_free(ParameterBlock* block, const std::vector<int>& directions);
@@ -138,7 +151,7 @@ class RefinementProblem {
   const BodySchema& schema_;
   const std::optional<RigCalibration>& rig_;
   const RefineOptions& options_;
-  const bool root_moves_;
+  const bool root_moves_, poses_have_plays_;
   const DriveModel drive_model_;
   std::optional<Lens> lens_;
   std::map<std::int64_t, Eigen::VectorXd> actions_;   // by sample
@@ -149,6 +162,7 @@ class RefinementProblem {
   std::vector<Play> plays_;
   std::map<const Edge*, int> first_play_;
   Eigen::VectorXd play_sd_, play_start_;
+  double num_determined_plays_ = 0;
   std::map<int, ParameterBlock*> edges_, tags_;  // by index, by id
   ParameterBlock* drive_ = nullptr;
   Eigen::VectorXd last_action_;  // that last_effects_ are of

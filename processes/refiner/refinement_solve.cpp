@@ -36,44 +36,82 @@ double RefinementProblem::estimated_scale() {
   return scale_.value * std::sqrt(ratio);
 }
 
-// Evidence (MacKay 1992): the sum of squares of a joint's plays over the number of them that the
-// data determine. Returns the largest change, a share.
-double RefinementProblem::estimate_play() {
-  if (plays_.empty()) return 0;
-  std::vector<ParameterBlock*> instants;
-  for (ParameterBlock* block : blocks())
-    if (block->kind == ParameterBlock::Kind::kInstant) instants.push_back(block);
+std::vector<Eigen::MatrixXd> RefinementProblem::information_of_instants() {
   ceres::Problem::EvaluateOptions options;
   options.num_threads = 1;
-  for (ParameterBlock* block : instants) options.parameter_blocks.push_back(memory_of(block));
+  std::size_t num_instants = 0;
+  int size = 0;
+  for (ParameterBlock* block : blocks()) {
+    if (block->kind != ParameterBlock::Kind::kInstant) continue;
+    options.parameter_blocks.push_back(memory_of(block));
+    size = block->num_free();
+    ++num_instants;
+  }
   ceres::CRSMatrix J;  // of all residuals, also the priors', with the loss's weights
   if (!problem_.Evaluate(options, nullptr, nullptr, nullptr, &J))
     throw std::runtime_error("the refined model cannot be evaluated");
-  const int size = instants.front()->num_free();
-  const auto num = static_cast<int>(plays_.size());
-  std::vector<Eigen::MatrixXd> information(instants.size(), Eigen::MatrixXd::Zero(size, size));
+  std::vector<Eigen::MatrixXd> information(num_instants, Eigen::MatrixXd::Zero(size, size));
   for (int row = 0; row < J.num_rows; ++row) {
     const int begin = J.rows[row], end = J.rows[row + 1];
     if (begin == end) continue;
     const Eigen::Map<const Eigen::VectorXd> values(&J.values[begin], end - begin);
     information[J.cols[begin] / size] += values * values.transpose();
   }
+  return information;
+}
+
+// Evidence (MacKay 1992): the sum of squares of a joint's plays over the number of them that the
+// data determine. Returns the largest change, a share.
+double RefinementProblem::estimate_play() {
+  if (plays_.empty()) return 0;
+  const auto num = std::ssize(plays_);
   Eigen::ArrayXd squares = Eigen::ArrayXd::Zero(num), determined = Eigen::ArrayXd::Zero(num);
-  for (std::size_t n = 0; n < instants.size(); ++n) {
-    const double* play = memory_of(instants[n]) + instants[n]->values.size() - num;
+  for (const Eigen::MatrixXd& information : information_of_instants()) {
     const Eigen::MatrixXd covariance =
-        information[n].llt().solve(Eigen::MatrixXd::Identity(size, size));
-    squares += Eigen::Map<const Eigen::ArrayXd>(play, num).square();
+        information.llt().solve(Eigen::MatrixXd::Identity(information.rows(), information.cols()));
     determined += 1 - covariance.diagonal().tail(num).array() / play_sd_.array().square();
   }
-  // Of no play at all, a hundredth of what it began with.
+  for (const ParameterBlock* block : blocks())
+    if (block->kind == ParameterBlock::Kind::kInstant)
+      squares +=
+          Eigen::Map<const Eigen::ArrayXd>(memory_of(block) + std::ssize(block->values) - num, num)
+              .square();
   const Eigen::ArrayXd next = (squares / determined.max(1e-6))
                                   .sqrt()
-                                  .max(play_start_.array() / 100)
-                                  .min(play_start_.array() * 100);
+                                  .max(kLeastPlay * play_start_.array())
+                                  .min(play_start_.array() / kLeastPlay);
+  num_determined_plays_ = determined.sum();
   const double change = (next / play_sd_.array()).log().abs().maxCoeff();
   play_sd_ = next;
   return change;
+}
+
+Eigen::VectorXd RefinementProblem::shown_play_sd() const {
+  return (play_sd_.array() > 2 * kLeastPlay * play_start_.array()).select(play_sd_, 0);
+}
+
+// ½ log |2πC| of each instant's plays, of a moving root's pose less that without plays.
+double RefinementProblem::log_likelihood_without_plays() {
+  double sum = log_likelihood();
+  if (plays_.empty()) return sum;
+  const auto num = std::ssize(plays_);
+  for (const ParameterBlock* block : blocks())
+    if (block->kind == ParameterBlock::Kind::kInstant)
+      sum -= 0.5 * Eigen::Map<const Eigen::ArrayXd>(
+                       memory_of(block) + std::ssize(block->values) - num, num)
+                       .cwiseQuotient(play_sd_.array())
+                       .square()
+                       .sum();
+  const auto log_determinant = [](const Eigen::MatrixXd& matrix) {
+    return 2 * matrix.llt().matrixL().toDenseMatrix().diagonal().array().log().sum();
+  };
+  for (const Eigen::MatrixXd& information : information_of_instants()) {
+    const auto num_others = information.rows() - num;
+    sum -= 0.5 * log_determinant(information) + play_sd_.array().log().sum();
+    if (num_others > 0)
+      sum += 0.5 * log_determinant(information.topLeftCorner(num_others, num_others));
+  }
+  return sum;
 }
 
 void RefinementProblem::begin_at(RefinementProblem& other) {

@@ -31,22 +31,46 @@ void StudentTLoss::Evaluate(double s, double rho[3]) const {
 
 ChainResidual::ChainResidual(PartChain chain, const std::vector<const ParameterBlock*>& blocks,
                              int num_residuals, const NoiseScale& scale, DriveEffects effects)
-    : chain_(std::move(chain)), blocks_(blocks), scale_(scale), effects_(std::move(effects)) {
+    : chain_(std::move(chain)),
+      blocks_(blocks),
+      scale_(scale),
+      effects_(std::move(effects)),
+      play_(find_play()) {
+  if (effects_ && play_.num > 0 && effects_->rows() != play_.num)
+    throw std::logic_error("the drive has other joints than those that are off their commands");
   set_num_residuals(num_residuals);
   for (const ParameterBlock* block : blocks_)
     mutable_parameter_block_sizes()->push_back(static_cast<int>(block->values.size()));
 }
 
-Pose ChainResidual::pose(double const* const* parameters,
-                         std::vector<PartChain::Jacobian>* by_block) const {
-  if (!effects_) return chain_.pose(parameters, Pose::Identity(), by_block);
-  const Eigen::VectorXd play = *effects_ * Eigen::Map<const Eigen::VectorXd>(
-                                               parameters[chain_.num_blocks()], effects_->cols());
-  PartChain::Jacobian by_play = PartChain::Jacobian::Zero(6, effects_->rows());
-  const Pose X = chain_.pose(parameters, Pose::Identity(), by_block, play.data(),
-                             by_block ? &by_play : nullptr);
-  if (by_block) by_block->emplace_back(by_play * *effects_);
-  return X;
+ChainResidual::Play ChainResidual::find_play() const {
+  const auto found = std::ranges::find(blocks_, ParameterBlock::Kind::kInstant,
+                                       [](const ParameterBlock* block) { return block->kind; });
+  if (found == blocks_.end()) return {};
+  const std::string& elements = (*found)->elements;
+  const bool has_root = elements.starts_with("X");
+  return {.block = static_cast<int>(found - blocks_.begin()),
+          .value = has_root ? ParameterBlock::kPoseSize : 0,
+          .num = static_cast<int>(elements.size()) - (has_root ? 1 : 0)};
+}
+
+Eigen::VectorXd ChainResidual::joint_offsets(double const* const* parameters) const {
+  Eigen::VectorXd sum = Eigen::VectorXd::Zero(effects_ ? effects_->rows() : play_.num);
+  if (play_.num > 0)
+    sum += Eigen::Map<const Eigen::VectorXd>(parameters[play_.block] + play_.value, play_.num);
+  if (effects_)
+    sum += *effects_ *
+           Eigen::Map<const Eigen::VectorXd>(parameters[blocks_.size() - 1], effects_->cols());
+  return sum;
+}
+
+Pose ChainResidual::pose(double const* const* parameters, const Pose& suffix,
+                         std::vector<PartChain::Jacobian>* by_chain,
+                         PartChain::Jacobian* by_joints) const {
+  const Eigen::VectorXd beyond = joint_offsets(parameters);
+  if (beyond.size() == 0) return chain_.pose(parameters, suffix, by_chain);
+  if (by_joints) by_joints->setZero(6, beyond.size());
+  return chain_.pose(parameters, suffix, by_chain, beyond.data(), by_joints);
 }
 
 void ChainResidual::write(double** jacobians, int block, const Derivative& derivative) const {
@@ -60,10 +84,18 @@ void ChainResidual::write(double** jacobians, int block, const Derivative& deriv
 }
 
 void ChainResidual::write_chain(double** jacobians, const Derivative& by_pose,
-                                const std::vector<PartChain::Jacobian>& by_block) const {
-  for (int block = 0; block < static_cast<int>(by_block.size()); ++block)
-    if (jacobians && jacobians[block])
-      write(jacobians, block, by_pose.lazyProduct(by_block[block]));
+                                std::vector<PartChain::Jacobian> by_chain,
+                                const PartChain::Jacobian& by_joints) const {
+  if (!jacobians) return;
+  if (play_.num > 0 && play_.block == 0) {
+    by_chain[0].conservativeResize(6, 6 + play_.num);
+    by_chain[0].rightCols(play_.num) = by_joints;
+  }
+  for (int block = 0; block < static_cast<int>(by_chain.size()); ++block)
+    if (jacobians[block]) write(jacobians, block, by_pose.lazyProduct(by_chain[block]));
+  if (play_.num > 0 && play_.block > 0) write(jacobians, play_.block, by_pose * by_joints);
+  if (effects_)
+    write(jacobians, static_cast<int>(blocks_.size()) - 1, by_pose * by_joints * *effects_);
 }
 
 CornerResidual::CornerResidual(PartChain chain, const std::vector<const ParameterBlock*>& blocks,
@@ -71,35 +103,10 @@ CornerResidual::CornerResidual(PartChain chain, const std::vector<const Paramete
                                const Matrix8d& covariance_px2, const NoiseScale& scale,
                                DriveEffects effects)
     : ChainResidual(std::move(chain), blocks, 8, scale, std::move(effects)),
-      play_(find_play()),
       size_m_(size_m),
       lens_(lens),
       measured_px_(sight.corners_px),
-      whitener_(whitener_from(covariance_px2)) {
-  if (effects_ && effects_->rows() != play_.num)
-    throw std::logic_error("the drive has other joints than those that are off their commands");
-}
-
-CornerResidual::Play CornerResidual::find_play() const {
-  const auto found = std::ranges::find(blocks_, ParameterBlock::Kind::kInstant,
-                                       [](const ParameterBlock* block) { return block->kind; });
-  if (found == blocks_.end()) return {};
-  const std::string& elements = (*found)->elements;
-  const bool has_root = elements.starts_with("X");
-  return {.block = static_cast<int>(found - blocks_.begin()),
-          .value = has_root ? ParameterBlock::kPoseSize : 0,
-          .num = static_cast<int>(elements.size()) - (has_root ? 1 : 0)};
-}
-
-Eigen::VectorXd CornerResidual::joint_offsets(double const* const* parameters) const {
-  Eigen::VectorXd sum = Eigen::VectorXd::Zero(play_.num);
-  if (play_.num > 0)
-    sum += Eigen::Map<const Eigen::VectorXd>(parameters[play_.block] + play_.value, play_.num);
-  if (effects_)
-    sum += *effects_ *
-           Eigen::Map<const Eigen::VectorXd>(parameters[blocks_.size() - 1], effects_->cols());
-  return sum;
-}
+      whitener_(whitener_from(covariance_px2)) {}
 
 Eigen::Matrix<double, 2, Eigen::Dynamic> CornerResidual::by_lens(const Eigen::VectorXd& lens,
                                                                  const Eigen::Vector2d& ray) const {
@@ -124,13 +131,10 @@ bool CornerResidual::Evaluate(double const* const* parameters, double* residuals
       parameters[lens_block], static_cast<Eigen::Index>(blocks_[lens_block]->values.size()));
   if (!(size_m > 0 && lens_parameters.head<2>().minCoeff() > 0)) return false;
   const Lens lens = lens_.with(lens_parameters);
-  std::vector<PartChain::Jacobian> by_block;
-  const Eigen::VectorXd play = joint_offsets(parameters);
-  PartChain::Jacobian by_play = PartChain::Jacobian::Zero(6, play.size());
-  const bool has_play = play.size() > 0;
+  std::vector<PartChain::Jacobian> by_chain;
+  PartChain::Jacobian by_joints;
   const Pose X_CM =
-      chain_.pose(parameters, X_BM, jacobians ? &by_block : nullptr,
-                  has_play ? play.data() : nullptr, jacobians && has_play ? &by_play : nullptr);
+      pose(parameters, X_BM, jacobians ? &by_chain : nullptr, jacobians ? &by_joints : nullptr);
 
   Eigen::Matrix<double, 8, 1> error;
   Eigen::Matrix<double, 8, 7> by_tag;  // pose of the tag, then the size's factor
@@ -156,18 +160,7 @@ bool CornerResidual::Evaluate(double const* const* parameters, double* residuals
   Eigen::Map<Eigen::Matrix<double, 8, 1>>(residuals, 8) = whitener * error;
   if (!jacobians) return true;
   const Eigen::Matrix<double, 8, 7> whitened = whitener * by_tag;
-  if (play_.num > 0) {
-    if (play_.block == 0) {
-      by_block[0].conservativeResize(6, 6 + play_.num);
-      by_block[0].rightCols(play_.num) = by_play;
-    } else {
-      write(jacobians, play_.block, whitened.leftCols<6>() * by_play);
-    }
-  }
-  write_chain(jacobians, whitened.leftCols<6>(), by_block);
-  if (effects_)
-    write(jacobians, static_cast<int>(blocks_.size()) - 1,
-          whitened.leftCols<6>() * by_play * *effects_);
+  write_chain(jacobians, whitened.leftCols<6>(), std::move(by_chain), by_joints);
   write(jacobians, tag, whitened);
   if (jacobians[lens_block]) write(jacobians, lens_block, whitener * by_lens_parameters);
   return true;
@@ -186,8 +179,10 @@ PoseResidual::PoseResidual(PartChain chain, const std::vector<const ParameterBlo
 
 bool PoseResidual::Evaluate(double const* const* parameters, double* residuals,
                             double** jacobians) const {
-  std::vector<PartChain::Jacobian> by_block;
-  const Pose X_CB = pose(parameters, jacobians ? &by_block : nullptr);
+  std::vector<PartChain::Jacobian> by_chain;
+  PartChain::Jacobian by_joints;
+  const Pose X_CB = pose(parameters, Pose::Identity(), jacobians ? &by_chain : nullptr,
+                         jacobians ? &by_joints : nullptr);
   Vector6d best, error = Vector6d::Zero();
   const Reading* reading = nullptr;
   for (const Reading& candidate : readings_) {
@@ -201,7 +196,7 @@ bool PoseResidual::Evaluate(double const* const* parameters, double* residuals,
   Eigen::Map<Vector6d>(residuals, 6) = best;
   if (jacobians)
     write_chain(jacobians, -(reading->whitener / scale_.value) * right_jacobian_inverse(-error),
-                by_block);
+                std::move(by_chain), by_joints);
   return true;
 }
 
@@ -217,14 +212,16 @@ PositionResidual::PositionResidual(PartChain chain,
 
 bool PositionResidual::Evaluate(double const* const* parameters, double* residuals,
                                 double** jacobians) const {
-  std::vector<PartChain::Jacobian> by_block;
-  const Pose X_CB = pose(parameters, jacobians ? &by_block : nullptr);
+  std::vector<PartChain::Jacobian> by_chain;
+  PartChain::Jacobian by_joints;
+  const Pose X_CB = pose(parameters, Pose::Identity(), jacobians ? &by_chain : nullptr,
+                         jacobians ? &by_joints : nullptr);
   const Eigen::Matrix3d whitener = whitener_ / scale_.value;
   Eigen::Map<Eigen::Vector3d>(residuals, 3) = whitener * (X_CB.translation() - p_CB_);
   if (!jacobians) return true;
   Eigen::Matrix<double, 3, 6> by_pose = Eigen::Matrix<double, 3, 6>::Zero();
   by_pose.leftCols<3>() = whitener * X_CB.linear();
-  write_chain(jacobians, by_pose, by_block);
+  write_chain(jacobians, by_pose, std::move(by_chain), by_joints);
   return true;
 }
 

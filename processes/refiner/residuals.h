@@ -36,34 +36,48 @@ struct NoiseScale {
 using DriveEffects = std::shared_ptr<const Eigen::MatrixXd>;
 
 /// Base of what depends on a part's pose: blocks are those of the chain, then those of the tag and
-/// the lens, or that of the drive, where there are any.
+/// the lens, where there are any. Where there is a block of the instant it has the joints' plays
+/// last: it is the chain's first if the root moves, else it comes then. The drive's, where there is
+/// one, comes last.
 class ChainResidual : public ceres::CostFunction {
  protected:
   ChainResidual(PartChain chain, const std::vector<const ParameterBlock*>& blocks,
                 int num_residuals, const NoiseScale& scale, DriveEffects effects);
-  /// The pose of a chain whose joints go farther than they are told by effects · drive. `by_block`,
-  /// if given, receives also the derivative by the drive.
-  Pose pose(double const* const* parameters, std::vector<PartChain::Jacobian>* by_block) const;
+  /// The pose of the chain, times `suffix`. `by_chain`, if given, receives the derivatives by the
+  /// blocks of the chain, `by_joints` by how far the joints go beyond their commands.
+  Pose pose(double const* const* parameters, const Pose& suffix,
+            std::vector<PartChain::Jacobian>* by_chain, PartChain::Jacobian* by_joints) const;
 
   using Derivative = Eigen::Ref<const Eigen::MatrixXd>;
   /// Writes the free columns of ∂r/∂tangent of a block into Ceres' array for it, if it wants one.
   void write(double** jacobians, int block, const Derivative& derivative) const;
+  /// Of the blocks of the chain, of the instant and of the drive, by what pose() gave.
   void write_chain(double** jacobians, const Derivative& by_pose,
-                   const std::vector<PartChain::Jacobian>& by_block) const;
+                   std::vector<PartChain::Jacobian> by_chain,
+                   const PartChain::Jacobian& by_joints) const;
+
+  /// Which block has the plays, and where they begin in its values.
+  struct Play {
+    int block = -1, value = 0, num = 0;
+  };
 
   const PartChain chain_;
   const std::vector<const ParameterBlock*> blocks_;
   const NoiseScale& scale_;
   const DriveEffects effects_;
+  const Play play_;
+
+ private:
+  Play find_play() const;
+  /// By how far each joint goes beyond its command: its play at the instant, and the drive's.
+  Eigen::VectorXd joint_offsets(double const* const* parameters) const;
 };
 
 /// Corners of a tag M on part B, 8 whitened residuals [σ]: predicted minus measured.
 class CornerResidual final : public ChainResidual {
  public:
-  /// Blocks: those of the chain, the tag's (X_BM and the size's factor), the lens's
-  /// (Lens::parameters()). Where there is a block of the instant it has the joints' plays last: it
-  /// is the chain's first if the root moves, else it follows the lens's. The drive's, where there
-  /// is one, comes last. `covariance_px2` is positive definite.
+  /// Blocks after the chain's: the tag's (X_BM and the size's factor), the lens's
+  /// (Lens::parameters()). `covariance_px2` is positive definite.
   CornerResidual(PartChain chain, const std::vector<const ParameterBlock*>& blocks, double size_m,
                  const Lens& lens, const TagSight& sight, const Matrix8d& covariance_px2,
                  const NoiseScale& scale, DriveEffects effects = nullptr);
@@ -76,15 +90,6 @@ class CornerResidual final : public ChainResidual {
   Eigen::Matrix<double, 2, Eigen::Dynamic> by_lens(const Eigen::VectorXd& lens,
                                                    const Eigen::Vector2d& ray) const;
 
-  /// Which block has the plays, and where they begin in its values.
-  struct Play {
-    int block = -1, value = 0, num = 0;
-  };
-  Play find_play() const;
-  /// By how far each joint goes beyond its command: its play at the instant, and the drive's.
-  Eigen::VectorXd joint_offsets(double const* const* parameters) const;
-
-  const Play play_;
   const double size_m_;
   const Lens lens_;
   const Eigen::Matrix<double, 8, 1> measured_px_;

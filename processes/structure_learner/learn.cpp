@@ -153,15 +153,8 @@ LearnResult fit_tree(const LearnedStructure& structure,
 std::vector<ActionPoseSample> without_repetitions(const std::vector<ActionPoseSample>& samples) {
   std::set<std::vector<double>> met;
   std::vector<ActionPoseSample> result;
-  for (const ActionPoseSample& sample : samples) {
-    std::vector<double> numbers(sample.action.begin(), sample.action.end());
-    for (const PartObservation& o : sample.parts) {
-      numbers.push_back(o.part);
-      const auto X = o.X_CB.matrix();
-      numbers.insert(numbers.end(), X.reshaped().begin(), X.reshaped().end());
-    }
-    if (met.insert(std::move(numbers)).second) result.push_back(sample);
-  }
+  for (const ActionPoseSample& sample : samples)
+    if (met.insert(numbers_of(sample)).second) result.push_back(sample);
   return result;
 }
 

@@ -64,8 +64,7 @@ struct LearnResult {
 LearnResult learn(const std::vector<Signal>& signals, const std::vector<ActionPoseSample>& samples,
                   const LearnOptions& options = {});
 
-/// The samples without exact repetitions: instants of an action and poses that were there already
-/// say nothing new. Noise never repeats itself.
+/// The samples without exact repetitions (numbers_of()).
 std::vector<ActionPoseSample> without_repetitions(const std::vector<ActionPoseSample>& samples);
 
 /// Noise per axis of one marker that learn() goes by: `options.measurement.noise`; else the mean of

@@ -129,8 +129,9 @@ std::string tags_text(const Refinement& result, const std::optional<RigCalibrati
 std::string plays_text(const std::vector<JointPlay>& plays) {
   std::string text;
   for (const JointPlay& play : plays)
-    text += fmt::format("  {} is off its command by {:.4f}°, {:.4f} mm (1 σ)\n", play.joint,
-                        play.turn_rad / kDegree, play.slide_m * 1e3);
+    if (play.turn_rad > 0 || play.slide_m > 0)
+      text += fmt::format("  {} is off its command by {:.4f}°, {:.4f} mm (1 σ)\n", play.joint,
+                          play.turn_rad / kDegree, play.slide_m * 1e3);
   return text;
 }
 

@@ -191,6 +191,14 @@ TEST(Residuals, OfElasticJointsHaveTheirDerivatives) {
   expect_right_derivatives(pose, robot.blocks, 1e-6);
   const PositionResidual position(chain, robot.blocks, observation, {}, robot.scale, shared);
   expect_right_derivatives(position, robot.blocks, 1e-6);
+  // With joints that are off their commands, too.
+  ParameterBlock plays;
+  plays.kind = ParameterBlock::Kind::kInstant;
+  for (int n = 0; n < 4; ++n) plays.add(0.01 * test::gaussian(rng));
+  plays.free = {0, 1, 2, 3};
+  robot.blocks.insert(robot.blocks.end() - 1, &plays);
+  const PoseResidual loose(chain, robot.blocks, observation, {}, robot.scale, shared);
+  expect_right_derivatives(loose, robot.blocks, 1e-6);
 }
 
 TEST(Residuals, OfAFlippedPoseAreThoseOfItsOtherReading) {

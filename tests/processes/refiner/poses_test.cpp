@@ -99,6 +99,7 @@ void expect_near_the_bound(const std::string& kind, int num_samples, double most
         if (has_flips && test::uniform(rng, 0, 1) < 0.1)
           observation.X_CB.linear() *= exp_so3(Eigen::Vector3d(0.6, 0, 0));
     const Refinement result = refine(start_of(trial, rng), refiner_samples(samples), {}, {});
+    EXPECT_TRUE(result.plays.empty()) << kind << " " << num_samples << " " << seed;
     const Judgement judgement = judge(result.schema, trial);
     squares += judgement.rms_m * judgement.rms_m;
     all.num_inside += judgement.num_inside;
@@ -119,6 +120,44 @@ TEST(Refine, ComesNearTheCramerRaoBound) {
 }
 
 TEST(Refine, ComesNearTheCramerRaoBoundAmongFlips) { expect_near_the_bound("c", 30, 1.35, true); }
+
+// Of the end alone, too: by which joint it is off tells how that depends on where the others are.
+TEST(Refine, TellsByHowMuchJointsAreOffTheirCommands) {
+  constexpr double kScatter = 0.01;  // of the commands [rad]
+  constexpr int kRobots = 8, kSamples = 60;
+  for (const bool is_end_alone : {false, true}) {
+    Judgement all;
+    double told = 0, truth = 0;
+    for (int seed = 1; seed <= kRobots; ++seed) {
+      Rng rng(seed);
+      Trial trial = experiments::make_trial("c", Regime::kTag, 0, seed);
+      for (int n = 0; n < kSamples; ++n) {
+        const Eigen::VectorXd action = trial.robot.random_action(rng);
+        Eigen::VectorXd reached = action;
+        for (double& q : reached) q += kScatter * test::gaussian(rng);
+        ActionPoseSample& sample = trial.samples.emplace_back(test::observe(
+            trial.robot, reached, {.regime = Regime::kTag, .with_covariances = true}, n, rng));
+        sample.action = action;
+        std::erase_if(sample.parts, [&](const PartObservation& seen) {
+          return is_end_alone && seen.part != trial.root() && seen.part != trial.end_effector();
+        });
+      }
+      const Refinement result =
+          refine(start_of(trial, rng), refiner_samples(trial.samples), {}, {});
+      const Judgement judgement = judge(result.schema, trial);
+      all.num_inside += judgement.num_inside;
+      all.num += judgement.num;
+      for (const Edge& edge : result.schema.edges)
+        for (const ScrewJoint& joint : edge.joints) {
+          told += joint.scatter;
+          truth += kScatter * std::abs(joint.gain);
+        }
+      EXPECT_TRUE(result.warnings.empty()) << result.warnings.front();
+    }
+    EXPECT_NEAR(told / truth, 0.9, 0.2) << is_end_alone;
+    EXPECT_GT(all.num_inside, 0.93 * all.num) << is_end_alone;
+  }
+}
 
 }  // namespace
 }  // namespace bodyschema

@@ -271,6 +271,25 @@ TEST(RefineSchemas, WarnWhereObservationsRefuteTheModelAndNotWhereSomeAreWild) {
   EXPECT_EQ(result.outliers.size(), kMostOutliers);
 }
 
+TEST(RefineSchemas, OfSamplesThatRepeatEachOtherAreThoseOfTheSamplesOnce) {
+  Rng rng(4);
+  const SyntheticRobot robot = test::chapter_robot("c", rng);
+  const auto samples =
+      test::babble(robot, 25, {.regime = test::Regime::kTagIso, .with_covariances = true}, rng);
+  auto thrice = samples;
+  for (int n = 0; n < 2; ++n) thrice.insert(thrice.end(), samples.begin(), samples.end());
+  const BodySchema start = displaced(true_start(robot));
+  const Refinement once = refine(start, refiner_samples(samples), {}, {});
+  const Refinement again = refine(start, refiner_samples(thrice), {}, {});
+  EXPECT_EQ(again.num_available, 25);
+  EXPECT_TRUE(names(again.held, "50 samples that repeat others exactly"));
+  ASSERT_EQ(again.parameters.size(), once.parameters.size());
+  for (std::size_t n = 0; n < once.parameters.size(); ++n) {
+    EXPECT_EQ(again.parameters[n].change, once.parameters[n].change);
+    EXPECT_EQ(again.parameters[n].sd, once.parameters[n].sd);
+  }
+}
+
 TEST(RefineSchemas, WarnOfLimitsInAnotherUnit) {
   Rng rng(3);
   const SyntheticRobot robot = test::chapter_robot("c", rng);
