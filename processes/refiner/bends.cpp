@@ -6,6 +6,7 @@
 #include <map>
 #include <memory>
 #include <optional>
+#include <tuple>
 #include <utility>
 
 #include "common/schema/warp_process.h"
@@ -38,12 +39,14 @@ bool moves(const Edge& edge, int signal) {
   });
 }
 
-/// Linear signals whose joints moved parts that were seen, at enough positions.
-std::vector<int> candidates(const FitToPoses& fit, const std::vector<RefinerSample>& samples) {
+/// Linear signals whose joints moved parts that were seen: those read at enough positions, and the
+/// others.
+std::pair<std::vector<int>, std::vector<int>> candidates(
+    const FitToPoses& fit, const std::vector<RefinerSample>& samples) {
   std::map<std::int64_t, VectorXd> positions;  // by sample
   for (const RefinerSample& seen : samples)
     positions[seen.sample.sample_index] = normalized(fit.schema.signals, seen.sample.action);
-  std::vector<int> result;
+  std::pair<std::vector<int>, std::vector<int>> result;
   for (int s = 0; s < std::ssize(fit.schema.signals); ++s) {
     const Signal& signal = fit.schema.signals[s];
     if (!signal.warp.empty() || !(half_range(signal) > 0) || !is_bendable(fit.schema, s)) continue;
@@ -52,7 +55,11 @@ std::vector<int> candidates(const FitToPoses& fit, const std::vector<RefinerSamp
       if (std::ranges::any_of(fit.problem.paths().at(datum.part),
                               [&](const Edge* edge) { return moves(*edge, s); }))
         read.push_back(positions.at(datum.sample_index)(s));
-    if (num_positions_apart(std::move(read)) >= kFewestWarpPositions) result.push_back(s);
+    const int num_positions = num_positions_apart(std::move(read));
+    if (num_positions >= kFewestWarpPositions)
+      result.first.push_back(s);
+    else if (num_positions > 1)
+      result.second.push_back(s);
   }
   return result;
 }
@@ -193,12 +200,13 @@ BodySchema bent(BodySchema schema, const std::vector<Candidate>& bends) {
 
 BentSchema with_bends(const BodySchema& schema, const std::vector<RefinerSample>& samples,
                       const RefineOptions& options, bool root_moves) {
-  BentSchema result{schema, {}};
+  BentSchema result{schema, {}, {}};
   const bool has_poses = std::ranges::any_of(
       samples, [](const RefinerSample& seen) { return !seen.sample.parts.empty(); });
   if (!has_poses) return result;
   auto fit = std::make_unique<FitToPoses>(schema, samples, options, root_moves);
-  std::vector<int> linear = candidates(*fit, samples);
+  std::vector<int> linear;
+  std::tie(linear, result.hardly_read) = candidates(*fit, samples);
   if (!linear.empty()) fit->problem.solve();
   while (!linear.empty()) {
     std::vector<Candidate> bends = likely_bends(FreeWeights(*fit, linear, samples, options));

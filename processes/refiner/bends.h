@@ -15,6 +15,8 @@ struct FoundBend {
 struct BentSchema {
   BodySchema schema;             ///< with the bends, its other parameters as they were
   std::vector<FoundBend> bends;  ///< in the order in which they were found
+  /// Signals that moved, but were read at too few positions for bends of theirs to be looked for.
+  std::vector<int> hardly_read;
 };
 
 /// Adds bends to a schema, of signals that are bendable. Where a fit to the parts' poses has its

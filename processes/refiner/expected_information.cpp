@@ -14,17 +14,6 @@ using RowMajor = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::Ro
 constexpr double kLeastProbability = 0.01;
 constexpr double kInstantPrior = 1;  // m and rad, of a moving root
 
-double unit_of(const ParameterBlock& block, int direction, const BodySchema& schema,
-               const VectorXd& prior_sd) {
-  if (prior_sd.size() > 0) return prior_sd(direction);
-  if (block.kind != Kind::kEdge || direction % 8 < 6) return 1;
-  const ScrewJoint& joint = schema.edges[static_cast<std::size_t>(block.id)]
-                                .joints[static_cast<std::size_t>(direction / 8)];
-  const Signal& signal = schema.signals[static_cast<std::size_t>(joint.signal)];
-  const double range = signal.upper - signal.lower;
-  return 1 / (std::abs(joint.gain) * (range > 0 ? 0.5 * range : 1));
-}
-
 /// Blocks' derivatives of one residual, free directions alone.
 struct Derivative {
   std::vector<RowMajor> J;
@@ -53,8 +42,7 @@ std::optional<Derivative> derivative_of(const RefinementProblem::Cost& cost,
 
 }  // namespace
 
-InformationLayout::InformationLayout(const BodySchema& schema, RefinementProblem& problem,
-                                     const Information& information)
+InformationLayout::InformationLayout(RefinementProblem& problem, const Information& information)
     : units(information.curvature().rows()) {
   const std::vector<int> frame_tags = problem.frame_tags();
   std::vector<double> weak;
@@ -63,7 +51,7 @@ InformationLayout::InformationLayout(const BodySchema& schema, RefinementProblem
     std::vector<Index>& at = places[block];
     Index row = information.offset(block);
     for (const int direction : block->free) {
-      units(row) = unit_of(*block, direction, schema, prior_sd);
+      units(row) = prior_sd.size() > 0 ? prior_sd(direction) : problem.weak_sd(*block, direction);
       if (is_frame(frame_tags, *block, direction)) {
         at.push_back(-1);
       } else if (block->kind == Kind::kTag) {

@@ -22,8 +22,7 @@ struct InformationLayout {
   Eigen::VectorXd units;  ///< by row of the information
   Eigen::VectorXd prior;  ///< information of the weak prior, by place in the core
 
-  InformationLayout(const BodySchema& schema, RefinementProblem& problem,
-                    const Information& information);
+  InformationLayout(RefinementProblem& problem, const Information& information);
 
   /// The information in these units, over its rows.
   Eigen::MatrixXd scaled(const Eigen::MatrixXd& information) const {

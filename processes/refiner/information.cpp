@@ -86,9 +86,9 @@ Information::Information(RefinementProblem& problem, const MeasurementModel& mea
   double num_fitted = problem.num_determined_plays() - num_not_fitted;
   for (const ParameterBlock* block : problem.blocks()) {
     if (!block->is_refined) continue;
-    const bool has_plays = block->kind == ParameterBlock::Kind::kInstant;
-    num_fitted += static_cast<double>(block->num_free()) -
-                  static_cast<double>(has_plays ? problem.plays().size() : 0);
+    num_fitted += problem.num_fitted(*block);
+    if (block->kind == ParameterBlock::Kind::kInstant)
+      num_fitted -= static_cast<double>(problem.plays().size());
   }
   const Weights weights(problem.data(), problem.squared_distances(), num_fitted);
   // A joint that rested would seem to have moved by its play.
@@ -211,14 +211,13 @@ void Information::invert(const RefinementProblem& problem, const Sums& sums,
   std::vector<Eigen::Index> refined, held;
   std::vector<double> prior;  // information, by column of H
   for (ParameterBlock* block : sums.blocks) {
-    const Eigen::VectorXd sd = problem.prior_of(*block);
     if (block->is_refined) {
       offsets_[block] = static_cast<int>(refined.size());
       blocks_.push_back(block);
     }
     for (const int direction : block->free) {
       (block->is_refined ? refined : held).push_back(std::ssize(prior));
-      prior.push_back(sd.size() > 0 ? std::pow(sd(direction), -2) : 0);
+      prior.push_back(problem.prior_information(*block, direction));
     }
   }
   const Eigen::VectorXd P = Eigen::Map<const Eigen::VectorXd>(prior.data(), std::ssize(prior));

@@ -33,7 +33,7 @@ std::vector<RefinerSample> informative(std::vector<RefinerSample> samples, const
   const std::vector<RefinerSample> even = thinned(samples, most);
   RefinementProblem problem(schema, even, rig, options, root_moves);
   const Information information(problem, options.measurement);
-  const InformationLayout layout(schema, problem, information);
+  const InformationLayout layout(problem, information);
   const ExpectedSights sights(schema, rig, even, problem);
   const Forecast forecast(layout, sights, problem, rig.has_value(), information.worth());
   Eigen::MatrixXd A = layout.scaled(information.curvature())(layout.core, layout.core);

@@ -1,6 +1,7 @@
 #include "processes/refiner/refine.h"
 
 #include <fmt/format.h>
+#include <fmt/ranges.h>
 
 #include <Eigen/QR>
 #include <algorithm>
@@ -15,6 +16,7 @@
 #include "common/config/calibration_id.h"
 #include "common/estimation/chi_square.h"
 #include "common/estimation/quantile.h"
+#include "common/schema/warp_process.h"
 #include "processes/refiner/bends.h"
 #include "processes/refiner/calibrated_lens.h"
 #include "processes/refiner/elasticity.h"
@@ -198,7 +200,7 @@ std::vector<std::string> warnings_of(RefinementProblem& problem,
     if (block->kind == ParameterBlock::Kind::kInstant)
       num_numbers -= problem.root_moves() ? kPoseNumbers : 0;
     else if (block->is_refined && problem.prior_of(*block).size() == 0)
-      num_parameters += block->num_free();
+      num_parameters += problem.num_fitted(*block);
   }
   if (num_numbers < kFewNumbers * num_parameters)
     result.push_back(fmt::format(
@@ -208,7 +210,7 @@ std::vector<std::string> warnings_of(RefinementProblem& problem,
   return result;
 }
 
-/// Edges that nothing tells, and parts that the schema does not have.
+/// Edges that nothing tells, parts that the schema does not have, joints that rested.
 std::vector<std::string> things_not_seen(const BodySchema& schema,
                                          const std::vector<RefinerSample>& samples,
                                          const RefinementProblem& problem) {
@@ -227,6 +229,9 @@ std::vector<std::string> things_not_seen(const BodySchema& schema,
       if (!schema.has_part(o.part)) others.insert(o.part);
   for (const int part : others)
     result.push_back(fmt::format("part {}: the schema does not have it", part));
+  for (const auto& [edge, d] : problem.joints_at_rest())
+    result.push_back(
+        fmt::format("axis and gain of {}: it rested", joint_name(schema, *edge, edge->joints[d])));
   return result;
 }
 
@@ -260,6 +265,24 @@ std::vector<SignalCoverage> coverage_of(const BodySchema& schema,
           fmt::format("{} spans {:.0f} times the range that the schema gives it: another unit?",
                       signal.name, share));
     result.push_back({signal.name, share});
+  }
+  return result;
+}
+
+/// Parts that held-out samples refute the refined model of more than the one before.
+std::vector<std::string> warnings_of_worse(const HeldOutErrors& before,
+                                           const HeldOutErrors& after) {
+  constexpr double kWorse = 1.2;     // chosen: chance makes either better by some per cent
+  constexpr int kFewestSamples = 5;  // chosen
+  std::vector<std::string> result;
+  for (const PartErrors& now : after.parts) {
+    const auto then = std::ranges::find(before.parts, now.part, &PartErrors::part);
+    if (now.count < kFewestSamples || then == before.parts.end()) continue;
+    if (now.position_median_m > kWorse * then->position_median_m)
+      result.push_back(fmt::format(
+          "held-out positions of part {} are off by {:.2f} mm, by the model before by {:.2f} mm "
+          "(medians): more samples, and over more of the range of each joint",
+          now.part, 1e3 * now.position_median_m, 1e3 * then->position_median_m));
   }
   return result;
 }
@@ -363,7 +386,7 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
 
   // Loads are told apart from bends, which would take their part, by whoever gives them.
   const BentSchema bent = options.joint_loads
-                              ? BentSchema{schema, {}}
+                              ? BentSchema{schema, {}, {}}
                               : with_bends(schema, training, stiff, result.root_moves);
   // So are loads and plays.
   const auto solved = solved_problem(bent.schema, training, used_rig, stiff, result.root_moves,
@@ -380,6 +403,12 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
     result.warnings.push_back(std::move(*warning));
   if (result.outliers.size() > kMostOutliers) result.outliers.resize(kMostOutliers);
   const Information information(problem, options.measurement);
+  if (!bent.hardly_read.empty()) {
+    std::vector<std::string> names;
+    for (const int s : bent.hardly_read) names.push_back(schema.signals[s].name);
+    result.held.push_back(fmt::format("bends of {}: read at fewer than {} positions",
+                                      fmt::join(names, ", "), kFewestWarpPositions));
+  }
   const RefinementWords words(bent.schema, information, problem.frame_tags(), result.coverage);
   result.num_observations = static_cast<int>(problem.data().size());
   result.num_iterations = problem.num_iterations();
@@ -390,6 +419,7 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   result.plays = plays_of(schema, problem);
   if (result.used_corners) result.rig = refined_rig(problem, *rig);
   result.schema = refined_schema(bent.schema, training, problem, information);
+  if (options.measurement.noise) result.schema.noise = *options.measurement.noise;
   for (const FoundBend& bend : bent.bends)
     result.bends.push_back(told_bend(result.schema.signals[bend.signal], bend.evidence));
   if (result.used_corners) set_residuals(training, result.rig, &result.schema);
@@ -410,6 +440,8 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   result.after = held_out_errors(result.schema, held_out,
                                  judges_corners ? std::optional(result.rig) : std::nullopt,
                                  options.corner_noise);
+  for (std::string& warning : warnings_of_worse(result.before, result.after))
+    result.warnings.push_back(std::move(warning));
   result.seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - begin).count();
   return result;
 }

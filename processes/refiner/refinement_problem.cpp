@@ -371,6 +371,20 @@ Eigen::VectorXd RefinementProblem::prior_of(const ParameterBlock& block) const {
   return sd;
 }
 
+double RefinementProblem::weak_sd(const ParameterBlock& block, int direction) const {
+  if (block.kind != ParameterBlock::Kind::kEdge || direction % 8 < 6) return 1;
+  const ScrewJoint& joint = schema_.edges[block.id].joints[direction / 8];
+  const Signal& signal = schema_.signals[joint.signal];
+  const double range = signal.upper - signal.lower;
+  return 1 / (std::abs(joint.gain) * (range > 0 ? 0.5 * range : 1));
+}
+
+double RefinementProblem::prior_information(const ParameterBlock& block, int direction) const {
+  const Eigen::VectorXd sd = prior_of(block);
+  if (sd.size() > 0) return std::pow(sd(direction), -2);
+  return is_at_rest(block, direction) ? std::pow(weak_sd(block, direction), -2) : 0;
+}
+
 void RefinementProblem::add_priors() {
   for (ParameterBlock* block : blocks()) {
     if (block->kind == ParameterBlock::Kind::kInstant && !plays_.empty())

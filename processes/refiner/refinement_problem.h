@@ -76,14 +76,21 @@ class RefinementProblem {
   /// Of each part the tag that was seen most often.
   std::vector<int> frame_tags() const;
   bool root_moves() const { return root_moves_; }
-  /// Joints that may be off their command at every sample, and by how much, 1 σ [command units].
-  struct Play {
+  struct Joint {
     const Edge* edge = nullptr;
-    int joint = 0;
+    int d = 0;
   };
-  const std::vector<Play>& plays() const { return plays_; }
+  /// Joints that may be off their command at every sample, and by how much, 1 σ [command units].
+  const std::vector<Joint>& plays() const { return plays_; }
   bool poses_have_plays() const { return poses_have_plays_; }
   const Eigen::VectorXd& play_sd() const { return play_sd_; }
+  /// Those that rested: solve() leaves their axes and gains as they were, which nothing tells.
+  const std::vector<Joint>& joints_at_rest() const { return joints_at_rest_; }
+  /// How many directions of a refined block solve() moves.
+  int num_fitted(const ParameterBlock& block) const;
+  /// Deviation of a direction of which nothing is known: 1 m, 1 rad, of a gain as much over half
+  /// of its signal's range.
+  double weak_sd(const ParameterBlock& block, int direction) const;
   /// Parts on the way to others that were never seen: their frames are held.
   const std::vector<int>& unseen_parts() const { return unseen_parts_; }
   /// As if every joint had gone where it was told.
@@ -107,6 +114,8 @@ class RefinementProblem {
   std::vector<double> squared_distances();
   /// Standard deviations of a block's whole tangent beforehand; empty: nothing is known.
   Eigen::VectorXd prior_of(const ParameterBlock& block) const;
+  /// Information beforehand of a direction, also by weak_sd() of what rested.
+  double prior_information(const ParameterBlock& block, int direction) const;
   const std::map<int, std::vector<const Edge*>>& paths() const { return paths_; }
   /// Whether the sample's root has a pose: always where it rests.
   bool has_root(std::int64_t sample_index) const {
@@ -144,6 +153,7 @@ class RefinementProblem {
   std::vector<Eigen::MatrixXd> information_of_instants();
   /// Whether a signal hardly moved where parts beyond the edge were seen.
   bool rests(const Edge& edge, int signal) const;
+  bool is_at_rest(const ParameterBlock& block, int direction) const;
   void set_free(ParameterBlock* block, const std::vector<int>& directions);
   /// Returns what was free in their blocks.
   std::map<ParameterBlock*, std::vector<int>> hold_joints_at_rest();
@@ -159,7 +169,7 @@ class RefinementProblem {
   std::deque<ParameterBlock> storage_;                // addresses stay
   ParameterBlock* root_ = nullptr;                    // that rests
   std::map<std::int64_t, ParameterBlock*> instants_;  // by sample
-  std::vector<Play> plays_;
+  std::vector<Joint> plays_, joints_at_rest_;
   std::map<const Edge*, int> first_play_;
   Eigen::VectorXd play_sd_, play_start_;
   double num_determined_plays_ = 0;

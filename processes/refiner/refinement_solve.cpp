@@ -165,6 +165,20 @@ bool RefinementProblem::rests(const Edge& edge, int signal) const {
   return most - least <= kRestingShare * (limits.upper - limits.lower);
 }
 
+bool RefinementProblem::is_at_rest(const ParameterBlock& block, int direction) const {
+  if (block.kind != ParameterBlock::Kind::kEdge) return false;
+  return std::ranges::any_of(joints_at_rest_, [&](const Joint& joint) {
+    return joint.edge == &schema_.edges[block.id] &&
+           direction >= ScrewChainLayout::transform(joint.d) &&
+           direction <= ScrewChainLayout::turn(joint.d);
+  });
+}
+
+int RefinementProblem::num_fitted(const ParameterBlock& block) const {
+  return static_cast<int>(std::ranges::count_if(
+      block.free, [&](int direction) { return !is_at_rest(block, direction); }));
+}
+
 void RefinementProblem::set_free(ParameterBlock* block, const std::vector<int>& directions) {
   double* const memory = memory_of(block);
   block->free = directions;
@@ -178,15 +192,14 @@ void RefinementProblem::set_free(ParameterBlock* block, const std::vector<int>& 
 // Nothing tells the axis and the gain of a joint at rest from what follows it, which is enough.
 std::map<ParameterBlock*, std::vector<int>> RefinementProblem::hold_joints_at_rest() {
   std::map<ParameterBlock*, std::vector<int>> free_before;
+  joints_at_rest_.clear();
   if (options_.joint_loads) return free_before;  // which move joints at rest
   for (const auto& [index, block] : edges_) {
     const Edge& edge = schema_.edges[index];
+    for (int d = 0; used_.contains(block) && d < std::ssize(edge.joints); ++d)
+      if (rests(edge, edge.joints[d].signal)) joints_at_rest_.push_back({&edge, d});
     std::vector<int> free = block->free;
-    for (int d = 0; used_.contains(block) && d < std::ssize(edge.joints); ++d) {
-      const int axis = ScrewChainLayout::transform(d);
-      if (rests(edge, edge.joints[d].signal))
-        std::erase_if(free, [&](int n) { return n >= axis && n <= ScrewChainLayout::turn(d); });
-    }
+    std::erase_if(free, [&](int direction) { return is_at_rest(*block, direction); });
     if (free == block->free) continue;
     free_before[block] = block->free;
     set_free(block, free);

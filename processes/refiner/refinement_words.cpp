@@ -19,9 +19,9 @@ constexpr std::array<const char*, 6> kPoseWords = {"x", "y", "z", "about x", "ab
 /// A parameter that has more of it than this is named with a direction that nothing tells: chosen,
 /// a direction of many parameters has a hundredth of each.
 constexpr double kNamedShare = 0.01;
-/// With a larger deviation [rad] a turn, a gain's over half its range, is not told: chosen, errors
-/// are no longer linear in it.
-constexpr double kLargestDeviation_rad = 0.5;
+/// With a larger deviation a turn or a length, a gain's over half its range, is not told: chosen,
+/// errors are no longer linear in such a turn, and no arm is built so badly.
+constexpr double kLargestDeviation_rad = 0.5, kLargestDeviation_m = 0.1;
 /// A signal that spans more of its range need not move farther; chosen.
 constexpr double kFarShare = 0.5;
 
@@ -75,15 +75,15 @@ void RefinementWords::add(const ParameterBlock& block) {
 bool RefinementWords::is_told(const Place& place, Eigen::Index row) const {
   if (undetermined_shares_(row) >= kNamedShare) return false;
   const std::string unit = unit_of(*place.block, place.direction);
-  double reach = 0;
-  if (unit == "rad") {
-    reach = 1;
-  } else if (unit == "rad/unit") {
+  double reach = 1;
+  if (unit.ends_with("/unit")) {
     const ScrewJoint& joint = joint_of(*place.block, place.direction);
     const Signal& signal = schema_.signals.at(joint.signal);
     reach = 0.5 * std::abs(joint.gain) * (signal.upper - signal.lower);
   }
-  return reach * std::sqrt(std::max(covariance_(row, row), 0.0)) <= kLargestDeviation_rad;
+  const double sd = reach * std::sqrt(std::max(covariance_(row, row), 0.0));
+  if (unit.starts_with("rad")) return sd <= kLargestDeviation_rad;
+  return !unit.starts_with("m") || sd <= kLargestDeviation_m;
 }
 
 std::string RefinementWords::thing_of(const ParameterBlock& block) const {

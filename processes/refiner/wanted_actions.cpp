@@ -281,7 +281,7 @@ std::vector<WantedAction> wanted_actions(const BodySchema& refined,
   const std::vector<Index> moving = moving_signals(refined);
   if (moving.empty()) return {};
   const ExpectedSights sights(refined, rig, samples, problem);
-  const InformationLayout layout(refined, problem, information);
+  const InformationLayout layout(problem, information);
   const auto spread = [&](int first, int num) {
     return spread_actions(refined.signals, moving, sights.last_action(), first, num);
   };

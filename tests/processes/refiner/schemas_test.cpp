@@ -176,6 +176,24 @@ TEST(RefineSchemas, LeaveAJointThatRestedAsItWas) {
   EXPECT_TRUE(result.undetermined.front().ends_with(": move q2 farther"));
 }
 
+TEST(RefineSchemas, KnowWhereAJointThatRestedIsAndNotWhereItGoes) {
+  Rng rng(3);
+  SyntheticRobot robot = test::chapter_robot("c", rng);
+  const BodySchema start = displaced(true_start(robot));
+  robot.signals[1].lower = robot.signals[1].upper = 0.7;
+  const auto samples =
+      test::babble(robot, 40, {.regime = test::Regime::kTagIso, .with_covariances = true}, rng);
+  const Refinement result = refine(start, refiner_samples(samples), {}, {});
+  const auto sd_m = [&](double q2) {
+    const auto predicted = result.schema.predict(robot.visible_parts().back(), result.schema.root,
+                                                 Eigen::Vector4d(0.3, q2, -0.2, 0.4));
+    return std::sqrt(predicted->covariance.topLeftCorner<3, 3>().trace());
+  };
+  EXPECT_LT(sd_m(0.7), 0.005);
+  EXPECT_GT(sd_m(1.4), 0.2);
+  EXPECT_TRUE(names(result.held, "axis and gain of q2 (2→3)"));
+}
+
 TEST(RefineSchemas, TellTheJointsOfOneSignalApart) {
   Rng rng(4);
   SyntheticRobot robot = test::random_arm({.num_joints = 3}, rng);
