@@ -287,6 +287,19 @@ std::vector<std::string> warnings_of_worse(const HeldOutErrors& before,
   return result;
 }
 
+std::vector<std::string> warnings_of_reversed(const BodySchema& before, const BodySchema& after) {
+  std::vector<std::string> result;
+  for (std::size_t e = 0; e < before.edges.size(); ++e)
+    for (std::size_t d = 0; d < before.edges[e].joints.size(); ++d) {
+      const ScrewJoint &then = before.edges[e].joints[d], &now = after.edges[e].joints[d];
+      const double same_way = then.turn != 0 ? then.turn * now.turn : then.slide * now.slide;
+      if (same_way < 0)
+        result.push_back(fmt::format("{} goes the other way round than in the model before",
+                                     joint_name(before, before.edges[e], then)));
+    }
+  return result;
+}
+
 /// Limits in degrees, commands in radians.
 std::optional<std::string> warning_of_units(const std::vector<SignalCoverage>& coverage) {
   double most = 0;
@@ -440,8 +453,9 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   result.after = held_out_errors(result.schema, held_out,
                                  judges_corners ? std::optional(result.rig) : std::nullopt,
                                  options.corner_noise);
-  for (std::string& warning : warnings_of_worse(result.before, result.after))
-    result.warnings.push_back(std::move(warning));
+  for (auto& warnings :
+       {warnings_of_reversed(schema, result.schema), warnings_of_worse(result.before, result.after)})
+    result.warnings.insert(result.warnings.end(), warnings.begin(), warnings.end());
   result.seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - begin).count();
   return result;
 }

@@ -190,8 +190,21 @@ TEST(RefineSchemas, KnowWhereAJointThatRestedIsAndNotWhereItGoes) {
     return std::sqrt(predicted->covariance.topLeftCorner<3, 3>().trace());
   };
   EXPECT_LT(sd_m(0.7), 0.005);
+  EXPECT_LT(sd_m(0.75), 0.15);
   EXPECT_GT(sd_m(1.4), 0.2);
   EXPECT_TRUE(names(result.held, "axis and gain of q2 (2→3)"));
+}
+
+TEST(RefineSchemas, NameAJointThatTurnsTheOtherWayRound) {
+  Rng rng(3);
+  const SyntheticRobot robot = test::chapter_robot("c", rng);
+  BodySchema start = displaced(true_start(robot));
+  start.edges[2].joints.front().turn *= -1;
+  const auto samples = exact(robot, 40, rng);
+  const Refinement result = refine(start, refiner_samples(samples), {}, {});
+  EXPECT_LT(worst_error_m(result.schema, robot, samples), 1e-6);
+  ASSERT_EQ(result.warnings.size(), 1U);
+  EXPECT_EQ(result.warnings.front(), "q3 (3→4) goes the other way round than in the model before");
 }
 
 TEST(RefineSchemas, TellTheJointsOfOneSignalApart) {
