@@ -151,12 +151,18 @@ std::unique_ptr<RefinementProblem> solved_problem(const BodySchema& schema,
                                                   bool may_have_plays) {
   auto exact = std::make_unique<RefinementProblem>(schema, samples, rig, options, root_moves);
   exact->solve();
-  if (!may_have_plays) return exact;
-  auto loose = std::make_unique<RefinementProblem>(schema, samples, rig, options, root_moves, true);
-  loose->solve();
-  const auto num_shown = (loose->shown_play_sd().array() > 0).count();
+  const bool has_joints = std::ranges::any_of(schema.edges, [](const Edge& edge) {
+    return PartChain::has_block(edge) && !edge.joints.empty();
+  });
+  if (!may_have_plays || !has_joints || exact->data().empty()) return exact;
   double num_residuals = 0;
   for (const auto& datum : exact->data()) num_residuals += datum.num_residuals;
+  auto loose = std::make_unique<RefinementProblem>(schema, samples, rig, options, root_moves, true);
+  loose->begin_at(*exact);
+  // As much as one play costs.
+  if (loose->play_score() < std::sqrt(std::log(num_residuals))) return exact;
+  loose->solve();
+  const auto num_shown = (loose->shown_play_sd().array() > 0).count();
   const double gain = loose->log_likelihood_without_plays() - exact->log_likelihood();
   const double penalty = static_cast<double>(num_shown) * std::log(num_residuals) / 2;
   return num_shown > 0 && gain > penalty ? std::move(loose) : std::move(exact);
@@ -453,8 +459,8 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   result.after = held_out_errors(result.schema, held_out,
                                  judges_corners ? std::optional(result.rig) : std::nullopt,
                                  options.corner_noise);
-  for (auto& warnings :
-       {warnings_of_reversed(schema, result.schema), warnings_of_worse(result.before, result.after)})
+  for (auto& warnings : {warnings_of_reversed(schema, result.schema),
+                         warnings_of_worse(result.before, result.after)})
     result.warnings.insert(result.warnings.end(), warnings.begin(), warnings.end());
   result.seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - begin).count();
   return result;

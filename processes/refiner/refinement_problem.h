@@ -58,7 +58,8 @@ class RefinementProblem {
   std::optional<Cost> cost_of(const PartObservation& observation, const Eigen::VectorXd& action,
                               std::int64_t sample_index);
 
-  /// Begins where another problem of the same samples is now, its bends where both have them.
+  /// Begins where another problem of the same samples is now, its bends and plays where both have
+  /// them.
   void begin_at(RefinementProblem& other);
   /// Levenberg–Marquardt with Student-t weights, the noise's scale estimated between its runs,
   /// until neither changes. A joint that rested stays as it was.
@@ -99,6 +100,9 @@ class RefinementProblem {
   double log_likelihood();
   /// The same, integrated over the joints' plays (Laplace).
   double log_likelihood_without_plays();
+  /// How much likelier, by the noise as told, a little play of a joint would make the data, of that
+  /// joint for which it is most [σ] (Rao's score statistic); without plays N(0, 1).
+  double play_score();
   /// Without any play its deviation is this share of what it began with.
   static constexpr double kLeastPlay = 0.01;
   /// Of each of plays(), 0 where the data show none.
@@ -149,6 +153,9 @@ class RefinementProblem {
   ceres::Solver::Options solver_options();
   double estimated_scale();
   double estimate_play();
+  std::vector<ParameterBlock*> used_instants();
+  /// How far each joint is beyond its command there, now.
+  Eigen::Map<const Eigen::ArrayXd> plays_at(const ParameterBlock& instant);
   /// Of each instant, given everything else: the data's and the plays' priors', instants ascending.
   std::vector<Eigen::MatrixXd> information_of_instants();
   /// Whether a signal hardly moved where parts beyond the edge were seen.

@@ -7,8 +7,10 @@
 #include <Eigen/Cholesky>
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <memory>
 #include <stdexcept>
+#include <utility>
 
 #include "common/estimation/chi_square.h"
 #include "common/estimation/quantile.h"
@@ -36,21 +38,29 @@ double RefinementProblem::estimated_scale() {
   return scale_.value * std::sqrt(ratio);
 }
 
+std::vector<ParameterBlock*> RefinementProblem::used_instants() {
+  std::vector<ParameterBlock*> result = blocks();
+  std::erase_if(result, [](const ParameterBlock* block) {
+    return block->kind != ParameterBlock::Kind::kInstant;
+  });
+  return result;
+}
+
+Eigen::Map<const Eigen::ArrayXd> RefinementProblem::plays_at(const ParameterBlock& instant) {
+  const auto num = std::ssize(plays_);
+  return {memory_of(&instant) + std::ssize(instant.values) - num, num};
+}
+
 std::vector<Eigen::MatrixXd> RefinementProblem::information_of_instants() {
+  const std::vector<ParameterBlock*> instants = used_instants();
+  const int size = instants.front()->num_free();
   ceres::Problem::EvaluateOptions options;
   options.num_threads = 1;
-  std::size_t num_instants = 0;
-  int size = 0;
-  for (ParameterBlock* block : blocks()) {
-    if (block->kind != ParameterBlock::Kind::kInstant) continue;
-    options.parameter_blocks.push_back(memory_of(block));
-    size = block->num_free();
-    ++num_instants;
-  }
+  for (const ParameterBlock* block : instants) options.parameter_blocks.push_back(memory_of(block));
   ceres::CRSMatrix J;  // of all residuals, also the priors', with the loss's weights
   if (!problem_.Evaluate(options, nullptr, nullptr, nullptr, &J))
     throw std::runtime_error("the refined model cannot be evaluated");
-  std::vector<Eigen::MatrixXd> information(num_instants, Eigen::MatrixXd::Zero(size, size));
+  std::vector<Eigen::MatrixXd> information(instants.size(), Eigen::MatrixXd::Zero(size, size));
   for (int row = 0; row < J.num_rows; ++row) {
     const int begin = J.rows[row], end = J.rows[row + 1];
     if (begin == end) continue;
@@ -71,11 +81,7 @@ double RefinementProblem::estimate_play() {
         information.llt().solve(Eigen::MatrixXd::Identity(information.rows(), information.cols()));
     determined += 1 - covariance.diagonal().tail(num).array() / play_sd_.array().square();
   }
-  for (const ParameterBlock* block : blocks())
-    if (block->kind == ParameterBlock::Kind::kInstant)
-      squares +=
-          Eigen::Map<const Eigen::ArrayXd>(memory_of(block) + std::ssize(block->values) - num, num)
-              .square();
+  for (const ParameterBlock* block : used_instants()) squares += plays_at(*block).square();
   const Eigen::ArrayXd next = (squares / determined.max(1e-6))
                                   .sqrt()
                                   .max(kLeastPlay * play_start_.array())
@@ -95,13 +101,8 @@ double RefinementProblem::log_likelihood_without_plays() {
   double sum = log_likelihood();
   if (plays_.empty()) return sum;
   const auto num = std::ssize(plays_);
-  for (const ParameterBlock* block : blocks())
-    if (block->kind == ParameterBlock::Kind::kInstant)
-      sum -= 0.5 * Eigen::Map<const Eigen::ArrayXd>(
-                       memory_of(block) + std::ssize(block->values) - num, num)
-                       .cwiseQuotient(play_sd_.array())
-                       .square()
-                       .sum();
+  for (const ParameterBlock* block : used_instants())
+    sum -= 0.5 * (plays_at(*block) / play_sd_.array()).square().sum();
   const auto log_determinant = [](const Eigen::MatrixXd& matrix) {
     return 2 * matrix.llt().matrixL().toDenseMatrix().diagonal().array().log().sum();
   };
@@ -117,17 +118,63 @@ double RefinementProblem::log_likelihood_without_plays() {
 void RefinementProblem::begin_at(RefinementProblem& other) {
   std::vector<ParameterBlock*> from = other.blocks();
   std::erase(from, other.drive_);
+  const auto is_of_plays = [](const RefinementProblem& problem, const ParameterBlock* block) {
+    return block->kind == ParameterBlock::Kind::kInstant && !problem.root_moves_;
+  };
+  std::erase_if(from, [&](const ParameterBlock* block) { return is_of_plays(other, block); });
   auto next = from.begin();
   for (ParameterBlock* block : blocks()) {
+    if (is_of_plays(*this, block)) continue;
     if (block != drive_) {
-      std::copy_n(other.memory_of(*next++), block->values.size(), memory_of(block));
+      const ParameterBlock* same = *next++;
+      std::copy_n(other.memory_of(same), std::min(same->values.size(), block->values.size()),
+                  memory_of(block));
     } else if (other.drive_) {
       drive_model_.copy_weights(other.drive_model_, other.memory_of(other.drive_),
                                 memory_of(drive_));
     }
   }
   scale_ = other.scale_;
-  play_sd_ = other.play_sd_;
+  if (play_sd_.size() == other.play_sd_.size()) play_sd_ = other.play_sd_;
+}
+
+// The derivative of the log likelihood, integrated over the plays, by each joint's variance of
+// them at 0, over its deviation: ½ Σ (tᵀr)² − tᵀt over the samples, t by a play, r with weights.
+double RefinementProblem::play_score() {
+  ceres::Problem::EvaluateOptions options;
+  options.apply_loss_function = false;
+  options.num_threads = 1;
+  const std::vector<ParameterBlock*> instants = used_instants();
+  for (const ParameterBlock* block : instants) options.parameter_blocks.push_back(memory_of(block));
+  for (const Datum& datum : data_) options.residual_blocks.push_back(datum.id);
+  const double scale = std::exchange(scale_.value, 1.0);
+  std::vector<double> residuals;
+  ceres::CRSMatrix J;
+  if (!problem_.Evaluate(options, nullptr, &residuals, nullptr, &J))
+    throw std::runtime_error("the refined model cannot be evaluated");
+  scale_.value = scale;
+  const auto num = std::ssize(plays_);
+  const int size = instants.front()->num_free();
+  Eigen::MatrixXd gradient = Eigen::MatrixXd::Zero(num, std::ssize(instants)), square = gradient;
+  int row = 0;
+  for (const Datum& datum : data_) {
+    const Eigen::Map<const Eigen::VectorXd> r(&residuals[row], datum.num_residuals);
+    const double w = robust_weight(r.squaredNorm(), datum.num_residuals);
+    for (const int end = row + datum.num_residuals; row < end; ++row)
+      for (int n = J.rows[row]; n < J.rows[row + 1]; ++n) {
+        const Eigen::Index play = J.cols[n] % size - (size - num);
+        if (play < 0) continue;
+        gradient(play, J.cols[n] / size) += w * J.values[n] * residuals[row];
+        square(play, J.cols[n] / size) += w * J.values[n] * J.values[n];
+      }
+  }
+  double best = -std::numeric_limits<double>::infinity();
+  for (Eigen::Index play = 0; play < num; ++play) {
+    const double deviation = std::sqrt(2 * square.row(play).squaredNorm());
+    const double score = gradient.row(play).squaredNorm() - square.row(play).sum();
+    if (deviation > 0) best = std::max(best, score / deviation);
+  }
+  return best;
 }
 
 ceres::Solver::Options RefinementProblem::solver_options() {
