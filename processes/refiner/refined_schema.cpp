@@ -122,14 +122,32 @@ ChainAt chain_at(RefinementProblem& problem, const BodySchema& schema, int part,
   return chain;
 }
 
-/// −(what the edge to a part and an edge from it have in common), as errors of the part's frame.
-Matrix6d shared_at(const ChainAt& parent, const ChainAt& child,
-                   const EdgeCovariances& covariances) {
-  const Matrix6d to_parent = adjoint(parent.X_CB.inverse() * child.X_CB);
-  return -parent.jacobians.back() * covariances.between(parent.blocks.back(), child.blocks.back()) *
-         (to_parent * child.jacobians.back()).transpose();
+/// Mean over the samples of how a part's frame moves with a block.
+struct MeanEffect {
+  const ParameterBlock* block = nullptr;
+  PartChain::Jacobian by_block;
+};
+
+/// Of the last edge on the way to `end`.
+MeanEffect mean_effect(RefinementProblem& problem, const BodySchema& schema,
+                       const std::vector<RefinerSample>& samples, int end, int part) {
+  MeanEffect effect;
+  int count = 0;
+  for (const RefinerSample& seen : thinned(samples, kMostForMeans)) {
+    if (!problem.has_root(seen.sample.sample_index)) continue;
+    const ChainAt chain = chain_at(problem, schema, end, seen.sample);
+    const Pose X_CP = chain_at(problem, schema, part, seen.sample).X_CB;
+    const PartChain::Jacobian J = adjoint(X_CP.inverse() * chain.X_CB) * chain.jacobians.back();
+    effect.block = chain.blocks.back();
+    if (++count == 1) effect.by_block = PartChain::Jacobian::Zero(6, J.cols());
+    effect.by_block += (J - effect.by_block) / count;
+  }
+  return effect;
 }
 
+/// −(what the edge to a part and those from it have in common), of their mean errors over the
+/// samples: an error of the frame is the same at every action. Joints on one signal in both edges
+/// have more in common, which depends on the action: it stays in the predictions' covariances.
 std::map<int, Matrix6d> frame_covariances(const BodySchema& schema,
                                           const std::vector<RefinerSample>& samples,
                                           RefinementProblem& problem,
@@ -142,16 +160,15 @@ std::map<int, Matrix6d> frame_covariances(const BodySchema& schema,
       if (edge.from == part && PartChain::has_block(edge)) children.push_back(edge.to);
     const auto& path = problem.paths().at(part);
     if (children.empty() || (!path.empty() && !PartChain::has_block(*path.back()))) continue;
+    const MeanEffect parent = mean_effect(problem, schema, samples, part, part);
+    if (!parent.block) continue;
     Matrix6d sum = Matrix6d::Zero();
-    int count = 0;
-    for (const RefinerSample& seen : thinned(samples, kMostForMeans)) {
-      if (!problem.has_root(seen.sample.sample_index)) continue;
-      const ChainAt parent = chain_at(problem, schema, part, seen.sample);
-      for (const int child : children)
-        sum += shared_at(parent, chain_at(problem, schema, child, seen.sample), covariances);
-      count += static_cast<int>(children.size());
+    for (const int to : children) {
+      const MeanEffect child = mean_effect(problem, schema, samples, to, part);
+      sum -= parent.by_block * covariances.between(parent.block, child.block) *
+             child.by_block.transpose();
     }
-    if (count > 0) result[part] = positive_part(sum / count);
+    result[part] = positive_part(sum / static_cast<double>(children.size()));
   }
   return result;
 }

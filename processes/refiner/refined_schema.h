@@ -9,7 +9,7 @@
 namespace bodyschema {
 
 /// The schema with the problem's values and their covariances, also what edges that meet at a part
-/// have in common (BodySchema::frame_covariances), a mean over `samples`.
+/// have in common (BodySchema::frame_covariances), of their mean errors over `samples`.
 BodySchema refined_schema(const BodySchema& start, const std::vector<RefinerSample>& samples,
                           RefinementProblem& problem, const Information& information);
 

@@ -219,7 +219,8 @@ void TreeFit::add_scatter(const Normal& normal, const Eigen::VectorXd& scatter,
   }
 }
 
-// An error of a part's frame is in the edge to it and, with opposite sign, in those from it.
+// An error of a part's frame is in the edge to it and, with opposite sign, in those from it, the
+// same in every frame: of the mean errors.
 std::vector<Matrix6d> TreeFit::frame_covariances(const Normal& normal,
                                                  const Eigen::MatrixXd& joint) const {
   const int n = static_cast<int>(nodes_.size());
@@ -229,13 +230,13 @@ std::vector<Matrix6d> TreeFit::frame_covariances(const Normal& normal,
     const int parent = nodes_[k].parent;
     const auto p = normal.S[at(0, parent)].cols(), c = normal.S[at(0, k)].cols();
     const Eigen::MatrixXd cross = joint.block(normal.offset[parent], normal.offset[k], p, c);
-    Matrix6d sum = Matrix6d::Zero();
+    Eigen::MatrixXd by_parent = Eigen::MatrixXd::Zero(6, p), by_child = Eigen::MatrixXd::Zero(6, c);
     for (int t = 0; t < num_frames(); ++t) {
-      const Matrix6d to_parent = adjoint(poses_[at(t, parent)].inverse());
-      sum -= to_parent * normal.S[at(t, parent)] * cross * normal.S[at(t, k)].transpose() *
-             to_parent.transpose();
+      const Matrix6d to_parent = adjoint(poses_[at(t, parent)].inverse()) / num_frames();
+      by_parent += to_parent * normal.S[at(t, parent)];
+      by_child += to_parent * normal.S[at(t, k)];
     }
-    result[parent] += sum / num_frames();
+    result[parent] -= by_parent * cross * by_child.transpose();
     ++children[parent];
   }
   for (int k = 0; k < n; ++k)

@@ -80,6 +80,25 @@ TEST(Refine, FindsExactPosesExactly) {
   }
 }
 
+TEST(Refine, PredictedEllipsoidsHoldWhereASignalMovesTwoJoints) {
+  Judgement all;
+  for (int seed = 1; seed <= 30; ++seed) {
+    Rng rng(seed);
+    Trial trial;
+    trial.robot = test::chapter_robot("c", rng);
+    trial.robot.links[4].signal = trial.robot.links[3].signal;
+    const test::ObservationOptions seen{.regime = Regime::kChapter, .with_covariances = true};
+    trial.samples = test::babble(trial.robot, 20, seen, rng);
+    for (int n = 0; n < 50; ++n) trial.test_actions.push_back(trial.robot.random_action(rng));
+    const Refinement result = refine(start_of(trial, rng), refiner_samples(trial.samples), {}, {});
+    const Judgement judgement = judge(result.schema, trial);
+    all.num_inside += judgement.num_inside;
+    all.num += judgement.num;
+  }
+  // 87 % if the mean of what the two edges have in common at each action is taken out.
+  EXPECT_GT(static_cast<double>(all.num_inside) / all.num, 0.92);
+}
+
 /// Root mean squares over robots of the error and of the Cramér–Rao bound, and the coverage.
 void expect_near_the_bound(const std::string& kind, int num_samples, double most, bool has_flips) {
   constexpr int kRobots = 12;
