@@ -6,7 +6,6 @@
 #include <map>
 #include <memory>
 #include <optional>
-#include <tuple>
 #include <utility>
 
 #include "common/schema/warp_process.h"
@@ -39,14 +38,16 @@ bool moves(const Edge& edge, int signal) {
   });
 }
 
-/// Linear signals whose joints moved parts that were seen: those read at enough positions, and the
-/// others.
-std::pair<std::vector<int>, std::vector<int>> candidates(
-    const FitToPoses& fit, const std::vector<RefinerSample>& samples) {
+/// Linear signals whose joints moved parts that were seen, by at how many positions.
+struct Candidates {
+  std::vector<int> well_read, hardly_read;
+};
+
+Candidates candidates(const FitToPoses& fit, const std::vector<RefinerSample>& samples) {
   std::map<std::int64_t, VectorXd> positions;  // by sample
   for (const RefinerSample& seen : samples)
     positions[seen.sample.sample_index] = normalized(fit.schema.signals, seen.sample.action);
-  std::pair<std::vector<int>, std::vector<int>> result;
+  Candidates result;
   for (int s = 0; s < std::ssize(fit.schema.signals); ++s) {
     const Signal& signal = fit.schema.signals[s];
     if (!signal.warp.empty() || !(half_range(signal) > 0) || !is_bendable(fit.schema, s)) continue;
@@ -57,9 +58,9 @@ std::pair<std::vector<int>, std::vector<int>> candidates(
         read.push_back(positions.at(datum.sample_index)(s));
     const int num_positions = num_positions_apart(std::move(read));
     if (num_positions >= kFewestWarpPositions)
-      result.first.push_back(s);
+      result.well_read.push_back(s);
     else if (num_positions > 1)
-      result.second.push_back(s);
+      result.hardly_read.push_back(s);
   }
   return result;
 }
@@ -205,8 +206,8 @@ BentSchema with_bends(const BodySchema& schema, const std::vector<RefinerSample>
       samples, [](const RefinerSample& seen) { return !seen.sample.parts.empty(); });
   if (!has_poses) return result;
   auto fit = std::make_unique<FitToPoses>(schema, samples, options, root_moves);
-  std::vector<int> linear;
-  std::tie(linear, result.hardly_read) = candidates(*fit, samples);
+  auto [linear, hardly_read] = candidates(*fit, samples);
+  result.hardly_read = std::move(hardly_read);
   if (!linear.empty()) fit->problem.solve();
   while (!linear.empty()) {
     std::vector<Candidate> bends = likely_bends(FreeWeights(*fit, linear, samples, options));

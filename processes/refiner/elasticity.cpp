@@ -93,8 +93,7 @@ std::optional<Elasticity> fit_elasticity(const BodySchema& schema,
   if (num_free == 0) return std::nullopt;
   problem.solve();
   const double gain = problem.log_likelihood() - stiff.log_likelihood();
-  double num_residuals = 0;
-  for (const auto& datum : problem.data()) num_residuals += datum.num_residuals;
+  const double num_residuals = problem.num_residuals();
   const Information information(problem, options.measurement);
   Elasticity result;
   result.evidence = gain - static_cast<double>(num_free) * std::log(num_residuals) / 2;

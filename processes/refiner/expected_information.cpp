@@ -60,7 +60,7 @@ InformationLayout::InformationLayout(RefinementProblem& problem, const Informati
       } else {
         at.push_back(std::ssize(core));
         core.push_back(row);
-        weak.push_back(prior_sd.size() > 0 ? 0 : 1);
+        weak.push_back(problem.prior_information(*block, direction) > 0 ? 0 : 1);
       }
       ++row;
     }

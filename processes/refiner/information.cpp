@@ -86,9 +86,8 @@ Information::Information(RefinementProblem& problem, const MeasurementModel& mea
   double num_fitted = problem.num_determined_plays() - num_not_fitted;
   for (const ParameterBlock* block : problem.blocks()) {
     if (!block->is_refined) continue;
-    num_fitted += problem.num_fitted(*block);
-    if (block->kind == ParameterBlock::Kind::kInstant)
-      num_fitted -= static_cast<double>(problem.plays().size());
+    const bool has_plays = block->kind == ParameterBlock::Kind::kInstant;  // counted before
+    num_fitted += problem.num_fitted(*block) - (has_plays ? std::ssize(problem.plays()) : 0);
   }
   const Weights weights(problem.data(), problem.squared_distances(), num_fitted);
   // A joint that rested would seem to have moved by its play.

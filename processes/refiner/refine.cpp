@@ -16,6 +16,7 @@
 #include "common/config/calibration_id.h"
 #include "common/estimation/chi_square.h"
 #include "common/estimation/quantile.h"
+#include "common/kinematics/screw_chain.h"
 #include "common/schema/warp_process.h"
 #include "processes/refiner/bends.h"
 #include "processes/refiner/calibrated_lens.h"
@@ -135,37 +136,32 @@ bool root_moves(const BodySchema& schema, const std::vector<RefinerSample>& samp
     RefinementProblem problem(schema, samples, rig, options, moves);
     problem.solve();
     log_likelihoods[moves ? 1 : 0] = problem.log_likelihood();
-    num_residuals = 0;
-    for (const auto& datum : problem.data()) num_residuals += datum.num_residuals;
+    num_residuals = problem.num_residuals();
   }
   const double num_more = 6 * (static_cast<double>(samples.size()) - 1);
   return log_likelihoods[1] - log_likelihoods[0] > num_more * std::log(num_residuals) / 2;
 }
 
-/// Solved. `may_have_plays`: poses are fitted, joints are off their commands if that is likelier
-/// (Schwarz 1978).
+/// Solved. With `has_plays`, joints of poses have those that gain more than BIC's price (Schwarz
+/// 1978). All arguments must outlive it.
 std::unique_ptr<RefinementProblem> solved_problem(const BodySchema& schema,
                                                   const std::vector<RefinerSample>& samples,
                                                   const std::optional<RigCalibration>& rig,
                                                   const RefineOptions& options, bool root_moves,
-                                                  bool may_have_plays) {
+                                                  bool has_plays) {
   auto exact = std::make_unique<RefinementProblem>(schema, samples, rig, options, root_moves);
   exact->solve();
-  const bool has_joints = std::ranges::any_of(schema.edges, [](const Edge& edge) {
-    return PartChain::has_block(edge) && !edge.joints.empty();
-  });
-  if (!may_have_plays || !has_joints || exact->data().empty()) return exact;
-  double num_residuals = 0;
-  for (const auto& datum : exact->data()) num_residuals += datum.num_residuals;
+  if (!has_plays) return exact;
   auto loose = std::make_unique<RefinementProblem>(schema, samples, rig, options, root_moves, true);
+  const double price = std::log(exact->num_residuals()) / 2;
   loose->begin_at(*exact);
-  // As much as one play costs.
-  if (loose->play_score() < std::sqrt(std::log(num_residuals))) return exact;
-  loose->solve();
-  const auto num_shown = (loose->shown_play_sd().array() > 0).count();
-  const double gain = loose->log_likelihood_without_plays() - exact->log_likelihood();
-  const double penalty = static_cast<double>(num_shown) * std::log(num_residuals) / 2;
-  return num_shown > 0 && gain > penalty ? std::move(loose) : std::move(exact);
+  if (loose->plays().empty() || loose->play_score() < std::sqrt(2 * price)) return exact;
+  do loose->solve();
+  while (loose->drop_plays(price));
+  const auto num_plays = (loose->shown_play_sd().array() > 0).count();
+  const double gain = loose->log_marginal_likelihood() - exact->log_marginal_likelihood();
+  return num_plays > 0 && gain > price * static_cast<double>(num_plays) ? std::move(loose)
+                                                                        : std::move(exact);
 }
 
 /// All, the farthest first.
@@ -216,10 +212,11 @@ std::vector<std::string> warnings_of(RefinementProblem& problem,
   return result;
 }
 
-/// Edges that nothing tells, parts that the schema does not have, joints that rested.
-std::vector<std::string> things_not_seen(const BodySchema& schema,
+/// Edges that nothing tells, parts that the schema does not have, joints that rested, bends.
+std::vector<std::string> things_not_told(const BentSchema& bent,
                                          const std::vector<RefinerSample>& samples,
                                          const RefinementProblem& problem) {
+  const BodySchema& schema = bent.schema;
   std::vector<std::string> result;
   std::set<const Edge*> told;
   for (const auto& datum : problem.data()) {
@@ -235,9 +232,15 @@ std::vector<std::string> things_not_seen(const BodySchema& schema,
       if (!schema.has_part(o.part)) others.insert(o.part);
   for (const int part : others)
     result.push_back(fmt::format("part {}: the schema does not have it", part));
-  for (const auto& [edge, d] : problem.joints_at_rest())
-    result.push_back(
-        fmt::format("axis and gain of {}: it rested", joint_name(schema, *edge, edge->joints[d])));
+  for (const auto& [e, d] : problem.joints_at_rest())
+    result.push_back(fmt::format("axis and gain of {}: it rested",
+                                 joint_name(schema, schema.edges[e], schema.edges[e].joints[d])));
+  if (!bent.hardly_read.empty()) {
+    std::vector<std::string> names;
+    for (const int s : bent.hardly_read) names.push_back(schema.signals[s].name);
+    result.push_back(fmt::format("bends of {}: read at fewer than {} positions",
+                                 fmt::join(names, ", "), kFewestWarpPositions));
+  }
   return result;
 }
 
@@ -245,11 +248,11 @@ std::vector<JointPlay> plays_of(const BodySchema& schema, const RefinementProble
   std::vector<JointPlay> result;
   const Eigen::VectorXd play_sd = problem.shown_play_sd();
   for (std::size_t n = 0; n < problem.plays().size(); ++n) {
-    const auto& [edge, d] = problem.plays()[n];
-    const ScrewJoint& joint = edge->joints[d];
+    const Edge& edge = schema.edges[problem.plays()[n].edge];
+    const ScrewJoint& joint = edge.joints[problem.plays()[n].joint];
     const double sd = std::abs(joint.gain) * play_sd(static_cast<Eigen::Index>(n));
     result.push_back(
-        {joint_name(schema, *edge, joint), sd * std::abs(joint.slide), sd * std::abs(joint.turn)});
+        {joint_name(schema, edge, joint), sd * std::abs(joint.slide), sd * std::abs(joint.turn)});
   }
   return result;
 }
@@ -278,13 +281,16 @@ std::vector<SignalCoverage> coverage_of(const BodySchema& schema,
 /// Parts that held-out samples refute the refined model of more than the one before.
 std::vector<std::string> warnings_of_worse(const HeldOutErrors& before,
                                            const HeldOutErrors& after) {
-  constexpr double kWorse = 1.2;     // chosen: chance makes either better by some per cent
-  constexpr int kFewestSamples = 5;  // chosen
+  // Chosen: chance makes either better by some per cent, and three standard errors of a median,
+  // which is known to its value over the root of as many samples.
+  constexpr double kWorse = 1.2, kSure = 3, kLeast_m = 1e-6;
   std::vector<std::string> result;
   for (const PartErrors& now : after.parts) {
     const auto then = std::ranges::find(before.parts, now.part, &PartErrors::part);
-    if (now.count < kFewestSamples || then == before.parts.end()) continue;
-    if (now.position_median_m > kWorse * then->position_median_m)
+    if (then == before.parts.end()) continue;
+    const double chance = kSure * now.position_median_m / std::sqrt(now.count);
+    if (now.position_median_m > kWorse * then->position_median_m + kLeast_m &&
+        now.position_median_m - then->position_median_m > chance)
       result.push_back(fmt::format(
           "held-out positions of part {} are off by {:.2f} mm, by the model before by {:.2f} mm "
           "(medians): more samples, and over more of the range of each joint",
@@ -293,15 +299,35 @@ std::vector<std::string> warnings_of_worse(const HeldOutErrors& before,
   return result;
 }
 
+/// How a joint moves by its command in the frame of the part that its edge begins at, the others in
+/// the middle of their ranges.
+Vector6d joint_twist(const BodySchema& schema, const Edge& edge, std::size_t joint) {
+  Pose X = edge.left;
+  for (std::size_t d = 0; d < joint; ++d) {
+    const ScrewJoint& before = edge.joints[d];
+    const Signal& signal = schema.signals[before.signal];
+    const double middle = signal.displacement(0.5 * (signal.lower + signal.upper));
+    Screw{before.slide, before.turn}.append_motion(before.gain * middle + before.offset, X.linear(),
+                                                   X.translation());
+    X = X * before.X_after;
+  }
+  Vector6d twist = Vector6d::Zero();
+  twist(2) = edge.joints[joint].gain * edge.joints[joint].slide;
+  twist(5) = edge.joints[joint].gain * edge.joints[joint].turn;
+  return adjoint(X) * twist;
+}
+
 std::vector<std::string> warnings_of_reversed(const BodySchema& before, const BodySchema& after) {
   std::vector<std::string> result;
   for (std::size_t e = 0; e < before.edges.size(); ++e)
     for (std::size_t d = 0; d < before.edges[e].joints.size(); ++d) {
-      const ScrewJoint &then = before.edges[e].joints[d], &now = after.edges[e].joints[d];
-      const double same_way = then.turn != 0 ? then.turn * now.turn : then.slide * now.slide;
-      if (same_way < 0)
+      const ScrewJoint& joint = before.edges[e].joints[d];
+      const Vector6d then = joint_twist(before, before.edges[e], d),
+                     now = joint_twist(after, after.edges[e], d);
+      const int part = std::abs(joint.turn) > std::abs(joint.slide) ? 3 : 0;  // a metre a radian
+      if (then.segment<3>(part).dot(now.segment<3>(part)) < 0)
         result.push_back(fmt::format("{} goes the other way round than in the model before",
-                                     joint_name(before, before.edges[e], then)));
+                                     joint_name(before, before.edges[e], joint)));
     }
   return result;
 }
@@ -334,8 +360,10 @@ void leave_out_repetitions(std::vector<RefinerSample>* samples, std::vector<std:
   std::set<std::vector<double>> met;
   const auto removed = std::erase_if(*samples, [&](const RefinerSample& seen) {
     std::vector<double> numbers = numbers_of(seen.sample);
-    for (const TagSight& sight : seen.tags)
+    for (const TagSight& sight : seen.tags) {
+      numbers.push_back(sight.tag);
       numbers.insert(numbers.end(), sight.corners_px.begin(), sight.corners_px.end());
+    }
     return !met.insert(std::move(numbers)).second;
   });
   if (removed > 0)
@@ -403,17 +431,16 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   for (std::string& thing : held_things(schema, options, result.used_corners))
     result.held.push_back(std::move(thing));
 
-  // Loads are told apart from bends, which would take their part, by whoever gives them.
+  // Whoever gives loads says that droop is elastic: neither bends nor plays are looked for.
   const BentSchema bent = options.joint_loads
                               ? BentSchema{schema, {}, {}}
                               : with_bends(schema, training, stiff, result.root_moves);
-  // So are loads and plays.
   const auto solved = solved_problem(bent.schema, training, used_rig, stiff, result.root_moves,
                                      !used_rig && !options.joint_loads);
   RefinementProblem& problem = *solved;
   for (const int part : problem.unseen_parts())
     result.held.push_back(fmt::format("the frame of part {}: it was never seen", part));
-  for (std::string& thing : things_not_seen(bent.schema, training, problem))
+  for (std::string& thing : things_not_told(bent, training, problem))
     result.held.push_back(std::move(thing));
   result.outliers = outliers_of(problem);
   result.warnings = warnings_of(problem, result.outliers);
@@ -422,12 +449,6 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
     result.warnings.push_back(std::move(*warning));
   if (result.outliers.size() > kMostOutliers) result.outliers.resize(kMostOutliers);
   const Information information(problem, options.measurement);
-  if (!bent.hardly_read.empty()) {
-    std::vector<std::string> names;
-    for (const int s : bent.hardly_read) names.push_back(schema.signals[s].name);
-    result.held.push_back(fmt::format("bends of {}: read at fewer than {} positions",
-                                      fmt::join(names, ", "), kFewestWarpPositions));
-  }
   const RefinementWords words(bent.schema, information, problem.frame_tags(), result.coverage);
   result.num_observations = static_cast<int>(problem.data().size());
   result.num_iterations = problem.num_iterations();
@@ -438,7 +459,9 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   result.plays = plays_of(schema, problem);
   if (result.used_corners) result.rig = refined_rig(problem, *rig);
   result.schema = refined_schema(bent.schema, training, problem, information);
-  if (options.measurement.noise) result.schema.noise = *options.measurement.noise;
+  if (!options.joint_loads) set_scatter(problem, &result.schema);
+  if (options.measurement.noise && !result.used_corners)
+    result.schema.noise = *options.measurement.noise;
   for (const FoundBend& bend : bent.bends)
     result.bends.push_back(told_bend(result.schema.signals[bend.signal], bend.evidence));
   if (result.used_corners) set_residuals(training, result.rig, &result.schema);

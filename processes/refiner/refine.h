@@ -67,8 +67,8 @@ struct HeldOutErrors {
   std::vector<double> corner_costs;
 };
 
-/// How far a joint is from its command, 1 σ over the samples: backlash and droop. 0: no more than
-/// noise hides.
+/// How far a joint is from its command, 1 σ over the samples: backlash and droop. 0: the
+/// samples are no likelier with it.
 struct JointPlay {
   std::string joint;  ///< "q5 (5→6)"
   double slide_m = 0, turn_rad = 0;
@@ -152,12 +152,12 @@ inline constexpr int kMostWantedActions = 10;
 /// which were made by these: their covariances know of errors of tags and lens, corners do not.
 /// With tags or lens among the parameters, the data are the corners' pixels, the rig's claims are
 /// priors, and at every sample each joint may be off its command (backlash, droop) by what is
-/// estimated to be usual; samples without corners are not fitted then. Where poses are fitted,
-/// joints are so, and have a scatter, if the evidence is for it (BIC of the plays' Laplace
-/// approximation), and no loads are given. Edges with a Gaussian process, the bends of what moves
-/// them, and signals' limits stay as they are. Loads of the joints are fitted beside, commands then
-/// bend no more than they did: the refined schema has stiff joints, for a schema knows no loads.
-/// TEST samples are judged alone. The order of samples changes nothing.
+/// estimated to be usual; samples without corners are not fitted then. Where poses are fitted
+/// and no loads are given, joints are so if the marginal likelihood (Laplace) gains more than BIC
+/// asks; these plays become ScrewJoint::scatter. Edges with a Gaussian process, the bends of what
+/// moves them, and signals' limits stay as they are. Loads of the joints are fitted beside,
+/// commands then bend no more than they did: the refined schema has stiff joints, for a schema
+/// knows no loads. TEST samples are judged alone. The order of samples changes nothing.
 ///
 /// Gauge: a part's frame is where its tags are closest to the rig's claims, and the scale is the
 /// mean of all tags' sizes, all weighed by their priors, for images tell neither.

@@ -133,7 +133,7 @@ MeanEffect mean_effect(RefinementProblem& problem, const BodySchema& schema,
                        const std::vector<RefinerSample>& samples, int end, int part) {
   MeanEffect effect;
   int count = 0;
-  for (const RefinerSample& seen : thinned(samples, kMostForMeans)) {
+  for (const RefinerSample& seen : samples) {
     if (!problem.has_root(seen.sample.sample_index)) continue;
     const ChainAt chain = chain_at(problem, schema, end, seen.sample);
     const Pose X_CP = chain_at(problem, schema, part, seen.sample).X_CB;
@@ -153,6 +153,7 @@ std::map<int, Matrix6d> frame_covariances(const BodySchema& schema,
                                           RefinementProblem& problem,
                                           const EdgeCovariances& covariances) {
   std::map<int, Matrix6d> result;
+  const std::vector<RefinerSample> some = thinned(samples, kMostForMeans);
   for (const int part : schema.parts) {
     if (!problem.paths().contains(part) || (problem.root_moves() && part == schema.root)) continue;
     std::vector<int> children;
@@ -160,26 +161,17 @@ std::map<int, Matrix6d> frame_covariances(const BodySchema& schema,
       if (edge.from == part && PartChain::has_block(edge)) children.push_back(edge.to);
     const auto& path = problem.paths().at(part);
     if (children.empty() || (!path.empty() && !PartChain::has_block(*path.back()))) continue;
-    const MeanEffect parent = mean_effect(problem, schema, samples, part, part);
+    const MeanEffect parent = mean_effect(problem, schema, some, part, part);
     if (!parent.block) continue;
     Matrix6d sum = Matrix6d::Zero();
     for (const int to : children) {
-      const MeanEffect child = mean_effect(problem, schema, samples, to, part);
+      const MeanEffect child = mean_effect(problem, schema, some, to, part);
       sum -= parent.by_block * covariances.between(parent.block, child.block) *
              child.by_block.transpose();
     }
     result[part] = positive_part(sum / static_cast<double>(children.size()));
   }
   return result;
-}
-
-void set_scatter(const BodySchema& start, const RefinementProblem& problem, BodySchema* schema) {
-  const Eigen::VectorXd play_sd = problem.shown_play_sd();
-  for (std::size_t n = 0; n < problem.plays().size(); ++n) {
-    const auto& [edge, d] = problem.plays()[n];
-    ScrewJoint& joint = schema->edges[edge - start.edges.data()].joints[d];
-    joint.scatter = std::abs(joint.gain) * play_sd(static_cast<Eigen::Index>(n));
-  }
 }
 
 }  // namespace
@@ -199,7 +191,6 @@ BodySchema refined_schema(const BodySchema& start, const std::vector<RefinerSamp
       edge.parameter_covariance = covariances.between(block, block);
     }
   }
-  if (problem.poses_have_plays()) set_scatter(start, problem, &schema);
   schema.frame_covariances = frame_covariances(schema, samples, problem, covariances);
   schema.refined = true;
   schema.base_version = start.version;
@@ -211,6 +202,18 @@ BodySchema refined_schema(const BodySchema& start, const std::vector<RefinerSamp
   for (const RefinerSample& sample : samples) seen.push_back(sample.sample);
   schema.set_covered(seen);
   return schema;
+}
+
+void set_scatter(const RefinementProblem& problem, BodySchema* schema) {
+  for (Edge& edge : schema->edges)
+    if (PartChain::has_block(edge))
+      for (ScrewJoint& joint : edge.joints) joint.scatter = 0;
+  const Eigen::VectorXd play_sd = problem.shown_play_sd();
+  for (std::size_t n = 0; n < problem.plays().size(); ++n) {
+    const auto& [e, d] = problem.plays()[n];
+    ScrewJoint& joint = schema->edges[e].joints[d];
+    joint.scatter = std::abs(joint.gain) * play_sd(static_cast<Eigen::Index>(n));
+  }
 }
 
 RigCalibration refined_rig(RefinementProblem& problem, RigCalibration rig) {

@@ -13,6 +13,9 @@ namespace bodyschema {
 BodySchema refined_schema(const BodySchema& start, const std::vector<RefinerSample>& samples,
                           RefinementProblem& problem, const Information& information);
 
+/// ScrewJoint::scatter by the problem's plays; 0 of joints that have none.
+void set_scatter(const RefinementProblem& problem, BodySchema* schema);
+
 /// The rig with the problem's tags and lens.
 RigCalibration refined_rig(RefinementProblem& problem, RigCalibration rig);
 

@@ -105,14 +105,15 @@ void RefinementProblem::add_paths() {
 
 void RefinementProblem::add_plays() {
   if (!rig_ && !poses_have_plays_) return;
-  // Of poses the search begins wide: from far too little it would take many rounds.
+  // Chosen: of poses the search begins wide, for from far too little it takes many rounds.
   const double times = rig_ ? 1 : 10;
   std::vector<double> sd;
-  for (const Edge& edge : schema_.edges) {
-    if (!PartChain::has_block(edge) || edge.joints.empty()) continue;
-    first_play_[&edge] = static_cast<int>(plays_.size());
-    for (const ScrewJoint& joint : edge.joints) {
-      plays_.push_back({&edge, static_cast<int>(sd.size()) - first_play_[&edge]});
+  for (int e = 0; e < std::ssize(schema_.edges); ++e) {
+    const Edge& edge = schema_.edges[e];
+    if (!PartChain::has_block(edge)) continue;
+    for (int d = 0; d < std::ssize(edge.joints); ++d) {
+      const ScrewJoint& joint = edge.joints[d];
+      plays_.push_back({e, d});
       const TagCalibration& play = options_.config.joint_play;
       const double turn = std::abs(joint.gain * joint.turn);
       const double slide = std::abs(joint.gain * joint.slide);
@@ -122,6 +123,7 @@ void RefinementProblem::add_plays() {
     }
   }
   play_sd_ = play_start_ = Eigen::Map<const Eigen::VectorXd>(sd.data(), std::ssize(sd));
+  is_exact_.assign(plays_.size(), false);
 }
 
 void RefinementProblem::add_drive() {
@@ -272,7 +274,7 @@ std::optional<RefinementProblem::Cost> RefinementProblem::cost_of(const TagSight
   if (!plays_.empty() && !root_moves_) blocks.push_back(instants_.at(sample_index));
   if (drive_) blocks.push_back(drive_);
   auto cost = std::make_unique<CornerResidual>(
-      PartChain(paths_.at(tag->part), displacements(action), first_play_),
+      PartChain(paths_.at(tag->part), displacements(action), drive_model_.first_joints()),
       std::vector<const ParameterBlock*>(blocks.begin(), blocks.end()), tag->size_m, *lens_, sight,
       covariance, scale_, effects(action));
   // Predicted behind the camera: nothing to start from.
@@ -413,6 +415,12 @@ std::vector<double> RefinementProblem::squared_distances() {
     result.push_back(sum);
   }
   return result;
+}
+
+double RefinementProblem::num_residuals() const {
+  double sum = 0;
+  for (const Datum& datum : data_) sum += datum.num_residuals;
+  return sum;
 }
 
 double RefinementProblem::log_likelihood() {

@@ -58,8 +58,8 @@ class RefinementProblem {
   std::optional<Cost> cost_of(const PartObservation& observation, const Eigen::VectorXd& action,
                               std::int64_t sample_index);
 
-  /// Begins where another problem of the same samples is now, its bends and plays where both have
-  /// them.
+  /// Begins where another problem of the same samples is now, with bends, and plays, where both
+  /// have them.
   void begin_at(RefinementProblem& other);
   /// Levenberg–Marquardt with Student-t weights, the noise's scale estimated between its runs,
   /// until neither changes. A joint that rested stays as it was.
@@ -68,6 +68,7 @@ class RefinementProblem {
   /// Those that a residual depends on: instants, root, edges, tags ascending, lens.
   std::vector<ParameterBlock*> blocks();
   const std::vector<Datum>& data() const { return data_; }
+  double num_residuals() const;
   ceres::Problem& problem() { return problem_; }
   /// Where Ceres knows a block's values. All are in one array, in the order of the blocks: Ceres
   /// orders blocks by address, and the same samples shall give the same bytes.
@@ -78,12 +79,10 @@ class RefinementProblem {
   std::vector<int> frame_tags() const;
   bool root_moves() const { return root_moves_; }
   struct Joint {
-    const Edge* edge = nullptr;
-    int d = 0;
+    int edge = 0, joint = 0;  ///< indices into the schema's edges, and the edge's joints
   };
   /// Joints that may be off their command at every sample, and by how much, 1 σ [command units].
   const std::vector<Joint>& plays() const { return plays_; }
-  bool poses_have_plays() const { return poses_have_plays_; }
   const Eigen::VectorXd& play_sd() const { return play_sd_; }
   /// Those that rested: solve() leaves their axes and gains as they were, which nothing tells.
   const std::vector<Joint>& joints_at_rest() const { return joints_at_rest_; }
@@ -98,14 +97,15 @@ class RefinementProblem {
   void leave_out_play();
   /// Of the data now, given the scale; up to a constant.
   double log_likelihood();
-  /// The same, integrated over the joints' plays (Laplace).
-  double log_likelihood_without_plays();
-  /// How much likelier, by the noise as told, a little play of a joint would make the data, of that
-  /// joint for which it is most [σ] (Rao's score statistic); without plays N(0, 1).
+  /// The same, integrated over the instants: plays, and poses of a moving root (Laplace).
+  double log_marginal_likelihood();
+  /// Largest standardised score (Rao) of a joint's variance of plays at 0, by the noise as told;
+  /// about N(0, 1) for each joint without plays. Some joint must have plays, now 0.
   double play_score();
-  /// Without any play its deviation is this share of what it began with.
-  static constexpr double kLeastPlay = 0.01;
-  /// Of each of plays(), 0 where the data show none.
+  /// After solve(): takes as exact the worse half of the joints whose plays gain less than this
+  /// [nats] over none, the others' estimated. Returns whether there were some.
+  bool drop_plays(double least_evidence);
+  /// play_sd(), 0 of joints that are taken as exact.
   Eigen::VectorXd shown_play_sd() const;
   /// How many numbers of the data the plays took: the rest of each is its prior's.
   double num_determined_plays() const { return num_determined_plays_; }
@@ -154,6 +154,8 @@ class RefinementProblem {
   double estimated_scale();
   double estimate_play();
   std::vector<ParameterBlock*> used_instants();
+  Eigen::ArrayXd determined_plays();
+  Eigen::ArrayXd play_evidence();
   /// How far each joint is beyond its command there, now.
   Eigen::Map<const Eigen::ArrayXd> plays_at(const ParameterBlock& instant);
   /// Of each instant, given everything else: the data's and the plays' priors', instants ascending.
@@ -177,7 +179,7 @@ class RefinementProblem {
   ParameterBlock* root_ = nullptr;                    // that rests
   std::map<std::int64_t, ParameterBlock*> instants_;  // by sample
   std::vector<Joint> plays_, joints_at_rest_;
-  std::map<const Edge*, int> first_play_;
+  std::vector<bool> is_exact_;  // by play
   Eigen::VectorXd play_sd_, play_start_;
   double num_determined_plays_ = 0;
   std::map<int, ParameterBlock*> edges_, tags_;  // by index, by id

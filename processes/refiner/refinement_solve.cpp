@@ -1,16 +1,13 @@
 // How RefinementProblem is solved.
 
-#include <ceres/crs_matrix.h>
 #include <ceres/solver.h>
 #include <glog/logging.h>
 
-#include <Eigen/Cholesky>
 #include <algorithm>
 #include <cmath>
 #include <limits>
 #include <memory>
 #include <stdexcept>
-#include <utility>
 
 #include "common/estimation/chi_square.h"
 #include "common/estimation/quantile.h"
@@ -19,13 +16,20 @@
 #include "processes/refiner/refinement_problem.h"
 
 namespace bodyschema {
+namespace {
+
+// Of an edge's tangent: of the axis or the gain of its d-th joint.
+bool moves_joint(int direction, int d) {
+  return direction >= ScrewChainLayout::transform(d) && direction <= ScrewChainLayout::turn(d);
+}
+
+}  // namespace
 
 // Maximum likelihood of the scale given the residuals, by the fixed point of its own weights.
 double RefinementProblem::estimated_scale() {
   const std::vector<double> d2 = squared_distances();
   double ratio = 1;  // of the squares, to the scale that they are whitened with
-  double num = 0;
-  for (const Datum& datum : data_) num += datum.num_residuals;
+  const double num = num_residuals();
   for (int iteration = 0; iteration < 100; ++iteration) {
     double sum = 0;
     for (std::size_t n = 0; n < d2.size(); ++n)
@@ -38,143 +42,26 @@ double RefinementProblem::estimated_scale() {
   return scale_.value * std::sqrt(ratio);
 }
 
-std::vector<ParameterBlock*> RefinementProblem::used_instants() {
-  std::vector<ParameterBlock*> result = blocks();
-  std::erase_if(result, [](const ParameterBlock* block) {
-    return block->kind != ParameterBlock::Kind::kInstant;
-  });
-  return result;
-}
-
-Eigen::Map<const Eigen::ArrayXd> RefinementProblem::plays_at(const ParameterBlock& instant) {
-  const auto num = std::ssize(plays_);
-  return {memory_of(&instant) + std::ssize(instant.values) - num, num};
-}
-
-std::vector<Eigen::MatrixXd> RefinementProblem::information_of_instants() {
-  const std::vector<ParameterBlock*> instants = used_instants();
-  const int size = instants.front()->num_free();
-  ceres::Problem::EvaluateOptions options;
-  options.num_threads = 1;
-  for (const ParameterBlock* block : instants) options.parameter_blocks.push_back(memory_of(block));
-  ceres::CRSMatrix J;  // of all residuals, also the priors', with the loss's weights
-  if (!problem_.Evaluate(options, nullptr, nullptr, nullptr, &J))
-    throw std::runtime_error("the refined model cannot be evaluated");
-  std::vector<Eigen::MatrixXd> information(instants.size(), Eigen::MatrixXd::Zero(size, size));
-  for (int row = 0; row < J.num_rows; ++row) {
-    const int begin = J.rows[row], end = J.rows[row + 1];
-    if (begin == end) continue;
-    const Eigen::Map<const Eigen::VectorXd> values(&J.values[begin], end - begin);
-    information[J.cols[begin] / size] += values * values.transpose();
-  }
-  return information;
-}
-
-// Evidence (MacKay 1992): the sum of squares of a joint's plays over the number of them that the
-// data determine. Returns the largest change, a share.
-double RefinementProblem::estimate_play() {
-  if (plays_.empty()) return 0;
-  const auto num = std::ssize(plays_);
-  Eigen::ArrayXd squares = Eigen::ArrayXd::Zero(num), determined = Eigen::ArrayXd::Zero(num);
-  for (const Eigen::MatrixXd& information : information_of_instants()) {
-    const Eigen::MatrixXd covariance =
-        information.llt().solve(Eigen::MatrixXd::Identity(information.rows(), information.cols()));
-    determined += 1 - covariance.diagonal().tail(num).array() / play_sd_.array().square();
-  }
-  for (const ParameterBlock* block : used_instants()) squares += plays_at(*block).square();
-  const Eigen::ArrayXd next = (squares / determined.max(1e-6))
-                                  .sqrt()
-                                  .max(kLeastPlay * play_start_.array())
-                                  .min(play_start_.array() / kLeastPlay);
-  num_determined_plays_ = determined.sum();
-  const double change = (next / play_sd_.array()).log().abs().maxCoeff();
-  play_sd_ = next;
-  return change;
-}
-
-Eigen::VectorXd RefinementProblem::shown_play_sd() const {
-  return (play_sd_.array() > 2 * kLeastPlay * play_start_.array()).select(play_sd_, 0);
-}
-
-// ½ log |2πC| of each instant's plays, of a moving root's pose less that without plays.
-double RefinementProblem::log_likelihood_without_plays() {
-  double sum = log_likelihood();
-  if (plays_.empty()) return sum;
-  const auto num = std::ssize(plays_);
-  for (const ParameterBlock* block : used_instants())
-    sum -= 0.5 * (plays_at(*block) / play_sd_.array()).square().sum();
-  const auto log_determinant = [](const Eigen::MatrixXd& matrix) {
-    return 2 * matrix.llt().matrixL().toDenseMatrix().diagonal().array().log().sum();
-  };
-  for (const Eigen::MatrixXd& information : information_of_instants()) {
-    const auto num_others = information.rows() - num;
-    sum -= 0.5 * log_determinant(information) + play_sd_.array().log().sum();
-    if (num_others > 0)
-      sum += 0.5 * log_determinant(information.topLeftCorner(num_others, num_others));
-  }
-  return sum;
-}
-
 void RefinementProblem::begin_at(RefinementProblem& other) {
-  std::vector<ParameterBlock*> from = other.blocks();
-  std::erase(from, other.drive_);
-  const auto is_of_plays = [](const RefinementProblem& problem, const ParameterBlock* block) {
-    return block->kind == ParameterBlock::Kind::kInstant && !problem.root_moves_;
+  const auto copy = [&](const ParameterBlock* from, const ParameterBlock* to) {
+    if (from && to && other.used_.contains(from) && used_.contains(to))
+      std::copy_n(other.memory_of(from), std::min(from->values.size(), to->values.size()),
+                  memory_of(to));
   };
-  std::erase_if(from, [&](const ParameterBlock* block) { return is_of_plays(other, block); });
-  auto next = from.begin();
-  for (ParameterBlock* block : blocks()) {
-    if (is_of_plays(*this, block)) continue;
-    if (block != drive_) {
-      const ParameterBlock* same = *next++;
-      std::copy_n(other.memory_of(same), std::min(same->values.size(), block->values.size()),
-                  memory_of(block));
-    } else if (other.drive_) {
-      drive_model_.copy_weights(other.drive_model_, other.memory_of(other.drive_),
-                                memory_of(drive_));
-    }
-  }
+  const auto copy_all = [&](const auto& from, const auto& to) {
+    for (const auto& [id, block] : to)
+      if (const auto same = from.find(id); same != from.end()) copy(same->second, block);
+  };
+  copy(other.root_, root_);
+  // Where one problem alone has plays, they come after the pose.
+  if (root_moves_ || plays_.size() == other.plays_.size()) copy_all(other.instants_, instants_);
+  copy_all(other.edges_, edges_);
+  copy_all(other.tags_, tags_);
+  copy(other.lens_block_, lens_block_);
+  if (drive_ && other.drive_)
+    drive_model_.copy_weights(other.drive_model_, other.memory_of(other.drive_), memory_of(drive_));
   scale_ = other.scale_;
-  if (play_sd_.size() == other.play_sd_.size()) play_sd_ = other.play_sd_;
-}
-
-// The derivative of the log likelihood, integrated over the plays, by each joint's variance of
-// them at 0, over its deviation: ½ Σ (tᵀr)² − tᵀt over the samples, t by a play, r with weights.
-double RefinementProblem::play_score() {
-  ceres::Problem::EvaluateOptions options;
-  options.apply_loss_function = false;
-  options.num_threads = 1;
-  const std::vector<ParameterBlock*> instants = used_instants();
-  for (const ParameterBlock* block : instants) options.parameter_blocks.push_back(memory_of(block));
-  for (const Datum& datum : data_) options.residual_blocks.push_back(datum.id);
-  const double scale = std::exchange(scale_.value, 1.0);
-  std::vector<double> residuals;
-  ceres::CRSMatrix J;
-  if (!problem_.Evaluate(options, nullptr, &residuals, nullptr, &J))
-    throw std::runtime_error("the refined model cannot be evaluated");
-  scale_.value = scale;
-  const auto num = std::ssize(plays_);
-  const int size = instants.front()->num_free();
-  Eigen::MatrixXd gradient = Eigen::MatrixXd::Zero(num, std::ssize(instants)), square = gradient;
-  int row = 0;
-  for (const Datum& datum : data_) {
-    const Eigen::Map<const Eigen::VectorXd> r(&residuals[row], datum.num_residuals);
-    const double w = robust_weight(r.squaredNorm(), datum.num_residuals);
-    for (const int end = row + datum.num_residuals; row < end; ++row)
-      for (int n = J.rows[row]; n < J.rows[row + 1]; ++n) {
-        const Eigen::Index play = J.cols[n] % size - (size - num);
-        if (play < 0) continue;
-        gradient(play, J.cols[n] / size) += w * J.values[n] * residuals[row];
-        square(play, J.cols[n] / size) += w * J.values[n] * J.values[n];
-      }
-  }
-  double best = -std::numeric_limits<double>::infinity();
-  for (Eigen::Index play = 0; play < num; ++play) {
-    const double deviation = std::sqrt(2 * square.row(play).squaredNorm());
-    const double score = gradient.row(play).squaredNorm() - square.row(play).sum();
-    if (deviation > 0) best = std::max(best, score / deviation);
-  }
-  return best;
+  if (plays_.size() == other.plays_.size()) play_sd_ = other.play_sd_;
 }
 
 ceres::Solver::Options RefinementProblem::solver_options() {
@@ -213,12 +100,10 @@ bool RefinementProblem::rests(const Edge& edge, int signal) const {
 }
 
 bool RefinementProblem::is_at_rest(const ParameterBlock& block, int direction) const {
-  if (block.kind != ParameterBlock::Kind::kEdge) return false;
-  return std::ranges::any_of(joints_at_rest_, [&](const Joint& joint) {
-    return joint.edge == &schema_.edges[block.id] &&
-           direction >= ScrewChainLayout::transform(joint.d) &&
-           direction <= ScrewChainLayout::turn(joint.d);
-  });
+  return block.kind == ParameterBlock::Kind::kEdge &&
+         std::ranges::any_of(joints_at_rest_, [&](const Joint& joint) {
+           return joint.edge == block.id && moves_joint(direction, joint.joint);
+         });
 }
 
 int RefinementProblem::num_fitted(const ParameterBlock& block) const {
@@ -243,10 +128,11 @@ std::map<ParameterBlock*, std::vector<int>> RefinementProblem::hold_joints_at_re
   if (options_.joint_loads) return free_before;  // which move joints at rest
   for (const auto& [index, block] : edges_) {
     const Edge& edge = schema_.edges[index];
-    for (int d = 0; used_.contains(block) && d < std::ssize(edge.joints); ++d)
-      if (rests(edge, edge.joints[d].signal)) joints_at_rest_.push_back({&edge, d});
     std::vector<int> free = block->free;
-    std::erase_if(free, [&](int direction) { return is_at_rest(*block, direction); });
+    for (int d = 0; used_.contains(block) && d < std::ssize(edge.joints); ++d)
+      if (rests(edge, edge.joints[d].signal) &&
+          std::erase_if(free, [&](int direction) { return moves_joint(direction, d); }) > 0)
+        joints_at_rest_.push_back({index, d});
     if (free == block->free) continue;
     free_before[block] = block->free;
     set_free(block, free);
@@ -285,6 +171,7 @@ void RefinementProblem::solve() {
     if (change < kSettledScale && change_of_play < kSettledPlay) break;
   }
   run(1e-9, 200);
+  num_determined_plays_ = plays_.empty() ? 0 : determined_plays().sum();
   for (const auto& [block, directions] : free_before) set_free(block, directions);
   for (ParameterBlock* block : blocks())
     std::copy_n(memory_of(block), block->values.size(), block->values.begin());

@@ -44,9 +44,11 @@ std::optional<Noise> noise_instead(const LearnedStructure& by_told,
   const bool stands = by_told.spans() && !by_told.is_contested && search.redundant.empty() &&
                       search.couplings.empty() && !has_soft_edge(search) && !is_refuted;
   if (!told || stands || !tells_noise(by_told)) return std::nullopt;
-  // Where bodies are soft, the order of longer chains would be searched for in vain.
-  const int max_signals = has_soft_edge(search) ? std::min(options.max_signals, kMaxScreenedJoints)
-                                                : options.max_signals;
+  // Where bodies are soft, the order of longer chains would be searched for in vain; of a stream
+  // none is searched for.
+  const bool is_vain = has_soft_edge(search) && !by_told.actions.blocks().is_stream();
+  const int max_signals =
+      is_vain ? std::min(options.max_signals, kMaxScreenedJoints) : options.max_signals;
   const auto shown = estimate_noise(samples, static_cast<int>(by_told.signals.size()), max_signals);
   if (!shown || shown->source != NoiseSource::kResiduals || is_above_any_marker(*shown) ||
       (shown->position_m < kRefutes * told->position_m &&

@@ -232,11 +232,11 @@ std::vector<Matrix6d> TreeFit::frame_covariances(const Normal& normal,
     const Eigen::MatrixXd cross = joint.block(normal.offset[parent], normal.offset[k], p, c);
     Eigen::MatrixXd by_parent = Eigen::MatrixXd::Zero(6, p), by_child = Eigen::MatrixXd::Zero(6, c);
     for (int t = 0; t < num_frames(); ++t) {
-      const Matrix6d to_parent = adjoint(poses_[at(t, parent)].inverse()) / num_frames();
+      const Matrix6d to_parent = adjoint(poses_[at(t, parent)].inverse());
       by_parent += to_parent * normal.S[at(t, parent)];
       by_child += to_parent * normal.S[at(t, k)];
     }
-    result[parent] -= by_parent * cross * by_child.transpose();
+    result[parent] -= by_parent * cross * by_child.transpose() / std::pow(num_frames(), 2);
     ++children[parent];
   }
   for (int k = 0; k < n; ++k)

@@ -198,13 +198,43 @@ TEST(RefineSchemas, KnowWhereAJointThatRestedIsAndNotWhereItGoes) {
 TEST(RefineSchemas, NameAJointThatTurnsTheOtherWayRound) {
   Rng rng(3);
   const SyntheticRobot robot = test::chapter_robot("c", rng);
-  BodySchema start = displaced(true_start(robot));
-  start.edges[2].joints.front().turn *= -1;
   const auto samples = exact(robot, 40, rng);
-  const Refinement result = refine(start, refiner_samples(samples), {}, {});
-  EXPECT_LT(worst_error_m(result.schema, robot, samples), 1e-6);
-  ASSERT_EQ(result.warnings.size(), 1U);
-  EXPECT_EQ(result.warnings.front(), "q3 (3→4) goes the other way round than in the model before");
+  const Pose over(Eigen::AngleAxisd(M_PI, Eigen::Vector3d::UnitX()));
+  const auto refined = [&](bool reverses_turn, bool turns_axis_over) {
+    BodySchema start = displaced(true_start(robot));
+    ScrewJoint& joint = start.edges[2].joints.front();
+    if (reverses_turn) joint.turn *= -1;
+    if (turns_axis_over) {
+      start.edges[2].left = start.edges[2].left * over;
+      joint.X_after = over * joint.X_after;
+    }
+    return refine(start, refiner_samples(samples), {}, {});
+  };
+  const std::vector<std::string> named = {
+      "q3 (3→4) goes the other way round than in the model before"};
+  for (const Refinement& result : {refined(true, false), refined(false, true)}) {
+    EXPECT_LT(worst_error_m(result.schema, robot, samples), 1e-6);
+    EXPECT_EQ(result.warnings, named);
+  }
+  // Both: the same motion.
+  EXPECT_TRUE(refined(true, true).warnings.empty());
+}
+
+TEST(RefineSchemas, WarnWherePredictionsAreWorseThanBefore) {
+  Rng rng(5);
+  const SyntheticRobot robot = test::chapter_robot("c", rng);
+  const auto refined = [&](std::vector<ActionPoseSample> samples) {
+    for (ActionPoseSample held_out : exact(robot, 20, rng)) {
+      held_out.sample_index += std::ssize(samples);
+      held_out.purpose = Purpose::kTest;
+      samples.push_back(held_out);
+    }
+    return refine(true_start(robot), refiner_samples(samples), {}, {});
+  };
+  const auto few =
+      test::babble(robot, 4, {.regime = test::Regime::kTagIso, .with_covariances = true}, rng);
+  EXPECT_TRUE(names(refined(few).warnings, "held-out positions of part 5 are off by"));
+  EXPECT_TRUE(refined(exact(robot, 30, rng)).warnings.empty());
 }
 
 TEST(RefineSchemas, TellTheJointsOfOneSignalApart) {
