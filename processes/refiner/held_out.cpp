@@ -5,6 +5,7 @@
 
 #include "common/camera/corner_likelihood.h"
 #include "common/camera/fit_pose.h"
+#include "common/estimation/chi_square.h"
 #include "common/estimation/quantile.h"
 #include "processes/refiner/calibrated_lens.h"
 
@@ -133,6 +134,34 @@ HeldOutErrors held_out_errors(const BodySchema& schema, const std::vector<Refine
   see_root(schema, &poses);
   errors.parts = evaluate(schema, poses);
   return errors;
+}
+
+std::map<int, double> held_out_surprise(const BodySchema& schema,
+                                        const std::vector<RefinerSample>& samples,
+                                        const MeasurementModel& measurement, double noise_scale) {
+  constexpr std::size_t kFewest = 10;  // chosen
+  std::map<int, std::vector<double>> squares;
+  for (const RefinerSample& seen : samples) {
+    const PartObservation* root = seen.sample.find(schema.root);
+    if (!root || !root->has_rotation) continue;
+    for (const PartObservation& o : seen.sample.parts) {
+      if (o.part == schema.root || !o.has_rotation || !schema.has_rotation(o.part)) continue;
+      const auto predicted =
+          schema.predict(schema.root, o.part, seen.sample.action, Variance::kOneAction);
+      if (!predicted) continue;
+      const Pose X_RB = root->X_CB.inverse() * o.X_CB;
+      const Matrix6d to_part = adjoint(X_RB.inverse());
+      const Matrix6d noise =
+          measurement.covariance(o) + to_part * measurement.covariance(*root) * to_part.transpose();
+      squares[o.part].push_back(
+          squared_mahalanobis(log(predicted->X_AB.inverse() * X_RB),
+                              predicted->covariance + std::pow(noise_scale, 2) * noise));
+    }
+  }
+  std::map<int, double> result;
+  for (const auto& [part, d2] : squares)
+    if (d2.size() >= kFewest) result[part] = std::sqrt(median(d2) / chi_square_median(6));
+  return result;
 }
 
 bool predicts_corners_better(const HeldOutErrors& model, const HeldOutErrors& other) {

@@ -40,6 +40,10 @@ constexpr double kRefutedShare = 0.4;
 /// Chosen: with fewer numbers a parameter, fits to as many numbers as parameters were up to ten
 /// times worse than the model that they began with.
 constexpr double kFewNumbers = 2;
+/// Of held-out poses, medians; chosen: of ten right ones it is below with 99.9 %.
+constexpr double kSurprising = 1.5;
+/// Of the noise; chosen: noise that is told by hand is hardly right to half of it.
+constexpr double kLargeScale = 3;
 /// Chosen: degrees are 57 times as many as radians.
 constexpr double kAbsurdShare = 10;
 constexpr double kTinyShare = 1.0 / 30;  ///< of limits in degrees, of commands in radians
@@ -195,6 +199,11 @@ std::vector<std::string> warnings_of(RefinementProblem& problem,
           "{} of {} observations of part {} refute the refined model: another body, columns in "
           "another order, other units, or joints that are off their commands",
           num, num_seen.at(part), part));
+  if (problem.scale() > kLargeScale)
+    result.push_back(fmt::format(
+        "residuals are {:.1f} times as large as the noise is told to be: another body, columns in "
+        "another order, a base that moves, or too small a --noise",
+        problem.scale()));
   // Plays have priors; a moving root's pose takes numbers of its own sample, which more samples
   // have, too.
   constexpr int kPoseNumbers = 6;
@@ -435,12 +444,25 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   const BentSchema bent = options.joint_loads
                               ? BentSchema{schema, {}, {}}
                               : with_bends(schema, training, stiff, result.root_moves);
-  const auto solved = solved_problem(bent.schema, training, used_rig, stiff, result.root_moves,
-                                     !used_rig && !options.joint_loads);
+  const bool may_have_plays = !used_rig && !options.joint_loads;
+  auto solved =
+      solved_problem(bent.schema, training, used_rig, stiff, result.root_moves, may_have_plays);
+  const BentSchema straight{schema, {}, bent.hardly_read};
+  const BentSchema* start = &bent;
+  if (may_have_plays && !bent.bends.empty() && !solved->plays().empty()) {
+    // Bends were the likelier, as long as no joint was off its command.
+    auto other = solved_problem(straight.schema, training, used_rig, stiff, result.root_moves,
+                                may_have_plays);
+    if (solved->log_marginal_likelihood() - other->log_marginal_likelihood() <
+        kWarpEvidence * static_cast<double>(bent.bends.size())) {
+      solved = std::move(other);
+      start = &straight;
+    }
+  }
   RefinementProblem& problem = *solved;
   for (const int part : problem.unseen_parts())
     result.held.push_back(fmt::format("the frame of part {}: it was never seen", part));
-  for (std::string& thing : things_not_told(bent, training, problem))
+  for (std::string& thing : things_not_told(*start, training, problem))
     result.held.push_back(std::move(thing));
   result.outliers = outliers_of(problem);
   result.warnings = warnings_of(problem, result.outliers);
@@ -449,7 +471,7 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
     result.warnings.push_back(std::move(*warning));
   if (result.outliers.size() > kMostOutliers) result.outliers.resize(kMostOutliers);
   const Information information(problem, options.measurement);
-  const RefinementWords words(bent.schema, information, problem.frame_tags(), result.coverage);
+  const RefinementWords words(start->schema, information, problem.frame_tags(), result.coverage);
   result.num_observations = static_cast<int>(problem.data().size());
   result.num_iterations = problem.num_iterations();
   result.noise_scale = problem.scale();
@@ -458,11 +480,11 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   result.correlations = words.correlations(kMostCorrelations);
   result.plays = plays_of(schema, problem);
   if (result.used_corners) result.rig = refined_rig(problem, *rig);
-  result.schema = refined_schema(bent.schema, training, problem, information);
+  result.schema = refined_schema(start->schema, training, problem, information);
   if (!options.joint_loads) set_scatter(problem, &result.schema);
   if (options.measurement.noise && !result.used_corners)
     result.schema.noise = *options.measurement.noise;
-  for (const FoundBend& bend : bent.bends)
+  for (const FoundBend& bend : start->bends)
     result.bends.push_back(told_bend(result.schema.signals[bend.signal], bend.evidence));
   if (result.used_corners) set_residuals(training, result.rig, &result.schema);
   // Fitted to poses, the schema is of the calibration that these rest on, whatever it began with.
@@ -485,6 +507,14 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   for (auto& warnings : {warnings_of_reversed(schema, result.schema),
                          warnings_of_worse(result.before, result.after)})
     result.warnings.insert(result.warnings.end(), warnings.begin(), warnings.end());
+  if (!result.used_corners)
+    for (const auto& [part, times] :
+         held_out_surprise(result.schema, held_out, options.measurement, result.noise_scale))
+      if (times > kSurprising)
+        result.warnings.push_back(
+            fmt::format("held-out poses of part {} are {:.1f} times as far off as is told: the "
+                        "deviations are too small, the model lacks something",
+                        part, times));
   result.seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - begin).count();
   return result;
 }

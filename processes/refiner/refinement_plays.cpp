@@ -9,6 +9,7 @@
 #include <stdexcept>
 #include <utility>
 
+#include "common/estimation/chi_square.h"
 #include "common/estimation/student_t.h"
 #include "processes/refiner/refinement_problem.h"
 
@@ -17,6 +18,8 @@ namespace {
 
 /// Least and largest deviation of plays, as shares of what the search begins with; chosen.
 constexpr double kLeastPlay = 0.01, kMostPlay = 100;
+/// Of residuals that are bounded in the score; chosen.
+constexpr double kWildProbability = 1e-3;
 /// Information of a moving root's pose beforehand [1/m², 1/rad²].
 constexpr double kPosePrior = 1;
 
@@ -42,6 +45,18 @@ Eigen::Map<const Eigen::ArrayXd> RefinementProblem::plays_at(const ParameterBloc
   return {memory_of(&instant) + std::ssize(instant.values) - num, num};
 }
 
+double RefinementProblem::curvature_share() {
+  const std::vector<double> d2 = squared_distances();
+  double curvature = 0, weights = 0;
+  for (std::size_t n = 0; n < d2.size(); ++n) {
+    const int num = data_[n].num_residuals;
+    const double w = robust_weight(d2[n], num);
+    curvature += w * num - 2 * w * d2[n] / (kStudentNu + d2[n]);
+    weights += w * num;
+  }
+  return curvature / weights;
+}
+
 std::vector<Eigen::MatrixXd> RefinementProblem::information_of_instants() {
   const std::vector<ParameterBlock*> instants = used_instants();
   if (instants.empty()) return {};
@@ -59,8 +74,16 @@ std::vector<Eigen::MatrixXd> RefinementProblem::information_of_instants() {
     const Eigen::Map<const Eigen::VectorXd> t(&J.values[begin], end - begin);
     result[J.cols[begin] / size] += t * t.transpose();
   }
-  for (Eigen::MatrixXd& information : result)
-    information.diagonal().head(size - std::ssize(plays_)).array() += kPosePrior;
+  // The curvature of Student's t is less than that of its weights.
+  const double alpha = curvature_share();
+  Eigen::VectorXd prior = Eigen::VectorXd::Constant(size, kPosePrior);
+  if (!plays_.empty()) prior.tail(std::ssize(plays_)) = play_sd_.array().square().inverse();
+  for (Eigen::MatrixXd& information : result) {
+    if (!plays_.empty())
+      information.diagonal().tail(std::ssize(plays_)) -= prior.tail(std::ssize(plays_));
+    information *= alpha;
+    information.diagonal() += prior;
+  }
   return result;
 }
 
@@ -145,7 +168,8 @@ Eigen::VectorXd RefinementProblem::shown_play_sd() const {
 
 // The derivative of the log marginal likelihood by the variance of a joint's plays at 0, over its
 // deviation: ½ Σ g² − s over the instants, g the gradient by the play and s its information, both
-// given what a moving root's pose makes of them.
+// given what a moving root's pose makes of them. Of Gaussian noise, wild residuals bounded (Huber
+// 1964): by Student's weights what is far off its command would count less than what is not.
 double RefinementProblem::play_score() {
   ceres::Problem::EvaluateOptions options;
   options.apply_loss_function = false;
@@ -166,11 +190,12 @@ double RefinementProblem::play_score() {
   int row = 0;
   for (const Datum& datum : data_) {
     const Eigen::Map<const Eigen::VectorXd> r(&residuals[row], datum.num_residuals);
-    const double w = robust_weight(r.squaredNorm(), datum.num_residuals);
+    const double most = chi_square_quantile(datum.num_residuals, kWildProbability);
+    const double w = std::min(1.0, std::sqrt(most / r.squaredNorm()));
     for (const int end = row + datum.num_residuals; row < end; ++row) {
       const int begin = J.rows[row];
       const Eigen::Map<const Eigen::VectorXd> t(&J.values[begin], J.rows[row + 1] - begin);
-      A[J.cols[begin] / size] += w * t * t.transpose();
+      A[J.cols[begin] / size] += t * t.transpose();
       g[J.cols[begin] / size] += w * residuals[row] * t;
     }
   }

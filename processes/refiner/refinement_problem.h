@@ -154,6 +154,7 @@ class RefinementProblem {
   double estimated_scale();
   double estimate_play();
   std::vector<ParameterBlock*> used_instants();
+  double curvature_share();
   Eigen::ArrayXd determined_plays();
   Eigen::ArrayXd play_evidence();
   /// How far each joint is beyond its command there, now.

@@ -160,7 +160,8 @@ void RefinementProblem::solve() {
     shares.push_back(start[n] / chi_square_median(data_[n].num_residuals));
   scale_.value = std::max(1.0, std::sqrt(median(shares)));
   // Chosen: scale and plays are estimates from few residuals, known to no more than these shares.
-  constexpr double kSettledScale = 0.01, kSettledPlay = 0.2;
+  constexpr double kSettledScale = 0.01;
+  const double settled_play = rig_ ? 0.2 : 0.05;  // poses are compared by it
   constexpr int kMaxRounds = 20;
   for (int round = 0; round < kMaxRounds; ++round) {
     run(1e-5, 10);
@@ -168,7 +169,7 @@ void RefinementProblem::solve() {
     const double change = std::abs(scale / scale_.value - 1);
     scale_.value = scale;
     const double change_of_play = estimate_play();
-    if (change < kSettledScale && change_of_play < kSettledPlay) break;
+    if (change < kSettledScale && change_of_play < settled_play) break;
   }
   run(1e-9, 200);
   num_determined_plays_ = plays_.empty() ? 0 : determined_plays().sum();

@@ -77,6 +77,7 @@ TEST(RefineSchemas, WhoseNoiseIsToldTooSmallHaveARootThatRests) {
   const Refinement result = refine(true_start(robot), refiner_samples(samples), {}, {});
   EXPECT_FALSE(result.root_moves);
   EXPECT_NEAR(result.noise_scale, 10, 2);
+  EXPECT_TRUE(names(result.warnings, "times as large as the noise is told to be"));
 }
 
 // Tags of an instant's first part turn over, and every root begins where the others say.
@@ -218,6 +219,29 @@ TEST(RefineSchemas, NameAJointThatTurnsTheOtherWayRound) {
   }
   // Both: the same motion.
   EXPECT_TRUE(refined(true, true).warnings.empty());
+}
+
+// Joints that scatter in the held-out samples alone.
+TEST(RefineSchemas, WarnWhereHeldOutPosesAreFartherOffThanIsTold) {
+  Rng rng(5);
+  const SyntheticRobot robot = test::chapter_robot("c", rng);
+  const test::ObservationOptions noisy{.regime = test::Regime::kTagIso, .with_covariances = true};
+  for (const double scatter : {0.0, 0.05}) {
+    auto samples = test::babble(robot, 60, noisy, rng);
+    for (std::size_t n = 30; n < samples.size(); ++n) {
+      Eigen::VectorXd reached = samples[n].action;
+      for (double& q : reached) q += scatter * test::gaussian(rng);
+      ActionPoseSample held_out =
+          test::observe(robot, reached, noisy, samples[n].sample_index, rng);
+      held_out.action = samples[n].action;
+      held_out.purpose = Purpose::kTest;
+      samples[n] = held_out;
+    }
+    const Refinement result =
+        refine(displaced(true_start(robot)), refiner_samples(samples), {}, {});
+    EXPECT_EQ(names(result.warnings, "held-out poses of part 5 are"), scatter > 0);
+    EXPECT_EQ(result.warnings.empty(), scatter == 0);
+  }
 }
 
 TEST(RefineSchemas, WarnWherePredictionsAreWorseThanBefore) {
