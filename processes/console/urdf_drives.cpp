@@ -2,6 +2,7 @@
 
 #include <urdf_parser/urdf_parser.h>
 
+#include <algorithm>
 #include <stdexcept>
 #include <utility>
 
@@ -28,6 +29,8 @@ UrdfDrives::UrdfDrives(const std::filesystem::path& urdf, const Yaml& placement)
   for (const Yaml& entry : placement.list("signals")) {
     Signal signal;
     signal.name = entry.text("name");
+    if (std::ranges::find(signals_, signal.name, &Signal::name) != signals_.end())
+      throw entry.error("name", "another signal is called " + signal.name);
     signal.lower = entry.number("lower");
     signal.upper = entry.number("upper", signal.lower);
     if (entry.has("joint")) read_drive(entry);

@@ -48,12 +48,14 @@ struct Information::Weights {
   double alpha = 0, beta = 0, mean = 0;
 
   Weights(const std::vector<RefinementProblem::Datum>& data, std::vector<double> squared,
-          double num_fitted) {
+          double num_parameters, double num_plays) {
     double num_residuals = 0;
     for (const auto& datum : data) num_residuals += datum.num_residuals;
     // Residuals of a fit are smaller than errors by the degrees of freedom that it took.
-    const double lost = num_residuals / std::max(num_residuals - num_fitted, 1.0);
-    for (double& d2 : squared) d2 *= lost;
+    const auto lost = [&](double num_fitted) {
+      return num_residuals / std::max(num_residuals - num_fitted, 1.0);
+    };
+    for (double& d2 : squared) d2 *= lost(num_parameters + num_plays);
     double total = 0, second = 0, score = 0, inlier_total = 0, num_inliers = 0;
     const auto is_inlier = [&](std::size_t n) {
       return squared[n] < chi_square_quantile(data[n].num_residuals, 0.0027);
@@ -77,19 +79,21 @@ struct Information::Weights {
     mean = total / num_residuals;
     // Once more for what weights, derivatives and the fit owe to the same few samples: without it
     // the ellipsoids of 95 % hold 89 to 91 % at 10 samples (`./run experiment refinement robots`).
-    beta = lost * score / total;
+    // Plays are drawn anew in each sample, as noise is.
+    beta = lost(num_parameters) * score / total;
   }
 };
 
 Information::Information(RefinementProblem& problem, const MeasurementModel& measurement,
                          int num_not_fitted) {
-  double num_fitted = problem.num_determined_plays() - num_not_fitted;
-  for (const ParameterBlock* block : problem.blocks()) {
+  double num_parameters = -num_not_fitted;
+  for (ParameterBlock* block : problem.blocks()) {
     if (!block->is_refined) continue;
-    const bool has_plays = block->kind == ParameterBlock::Kind::kInstant;  // counted before
-    num_fitted += problem.num_fitted(*block) - (has_plays ? std::ssize(problem.plays()) : 0);
+    const bool has_plays = block->kind == ParameterBlock::Kind::kInstant;
+    num_parameters += problem.num_fitted(*block) - (has_plays ? std::ssize(problem.plays()) : 0);
   }
-  const Weights weights(problem.data(), problem.squared_distances(), num_fitted);
+  const Weights weights(problem.data(), problem.squared_distances(), num_parameters,
+                        problem.num_determined_plays());
   // A joint that rested would seem to have moved by its play.
   problem.leave_out_play();
   // What is held has a derivative too.

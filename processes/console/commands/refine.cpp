@@ -185,7 +185,8 @@ void run_refine(const RefineArguments& given) {
               {"--urdf", arguments.urdf},
               {"--urdf-placement", arguments.urdf_placement}},
              arguments.inputs());
-  const Refinement result = refine(schema, samples_of(arguments, schema, recording), rig, options);
+  Refinement result = refine(schema, samples_of(arguments, schema, recording), rig, options);
+  result.warnings.insert(result.warnings.begin(), recording.hints.begin(), recording.hints.end());
   write_one_event_log(arguments.out, kBodySchema, to_message(result.schema));
   if (result.elasticity)
     write_one_event_log(arguments.elastic, kBodySchema, to_message(result.elasticity->schema));

@@ -143,6 +143,7 @@ TEST_F(EngineeredModelTest, WhatIsWrongIsSaid) {
   expect_error("<robot>", kPlacement, "robot.urdf: expected a URDF");
   expect_error(kRobot, replaced(kPlacement, "joint: j2", "joint: j7"), "the URDF has no joint j7");
   expect_error(kRobot, replaced(kPlacement, "joint: j2", "joint: j1"), "has a signal already");
+  expect_error(kRobot, replaced(kPlacement, "name: b", "name: a"), "another signal is called a");
   expect_error(kRobot, replaced(kPlacement, "joint: j2", "joint: j0"), "j0 is fixed");
   expect_error(kRobot, replaced(kPlacement, "link: slide", "link: sledge"), "no link sledge");
   expect_error(kRobot, replaced(kPlacement, "root: 3", "root: 2"), "expected one of the parts");
