@@ -157,6 +157,35 @@ std::unique_ptr<RefinementProblem> solved_problem(const BodySchema& schema,
                                                                         : std::move(exact);
 }
 
+/// A solved problem, and the schema that it began with, which it refers to.
+struct Fit {
+  std::unique_ptr<const BentSchema> start;
+  std::unique_ptr<RefinementProblem> problem;
+};
+
+/// Whoever gives loads says that droop is elastic: neither bends nor plays are looked for.
+Fit fit(const BodySchema& schema, const std::vector<RefinerSample>& samples,
+        const std::optional<RigCalibration>& rig, const RefineOptions& options, bool root_moves,
+        bool has_loads) {
+  const bool has_plays = !rig && !has_loads;
+  const auto begun_with = [&](BentSchema start) {
+    Fit result{std::make_unique<const BentSchema>(std::move(start)), nullptr};
+    result.problem =
+        solved_problem(result.start->schema, samples, rig, options, root_moves, has_plays);
+    return result;
+  };
+  if (has_loads) return begun_with({schema, {}, {}});
+  Fit bent = begun_with(with_bends(schema, samples, options, root_moves));
+  const auto& [_, bends, hardly_read] = *bent.start;
+  if (!has_plays || bends.empty() || bent.problem->plays().empty()) return bent;
+  // Bends were the likelier as long as no joint was off its command.
+  Fit straight = begun_with({schema, {}, hardly_read});
+  const double gain =
+      bent.problem->log_marginal_likelihood() - straight.problem->log_marginal_likelihood();
+  return gain < kWarpEvidence * static_cast<double>(bends.size()) ? std::move(straight)
+                                                                  : std::move(bent);
+}
+
 /// All, the farthest first.
 std::vector<RefinementOutlier> outliers_of(RefinementProblem& problem) {
   std::vector<RefinementOutlier> result;
@@ -327,25 +356,8 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   for (std::string& thing : held_things(schema, options, result.used_corners))
     result.held.push_back(std::move(thing));
 
-  // Whoever gives loads says that droop is elastic: neither bends nor plays are looked for.
-  const BentSchema bent = options.joint_loads
-                              ? BentSchema{schema, {}, {}}
-                              : with_bends(schema, training, stiff, result.root_moves);
-  const bool may_have_plays = !used_rig && !options.joint_loads;
-  auto solved =
-      solved_problem(bent.schema, training, used_rig, stiff, result.root_moves, may_have_plays);
-  const BentSchema straight{schema, {}, bent.hardly_read};
-  const BentSchema* start = &bent;
-  if (may_have_plays && !bent.bends.empty() && !solved->plays().empty()) {
-    // Bends were the likelier, as long as no joint was off its command.
-    auto other = solved_problem(straight.schema, training, used_rig, stiff, result.root_moves,
-                                may_have_plays);
-    if (solved->log_marginal_likelihood() - other->log_marginal_likelihood() <
-        kWarpEvidence * static_cast<double>(bent.bends.size())) {
-      solved = std::move(other);
-      start = &straight;
-    }
-  }
+  const auto [start, solved] =
+      fit(schema, training, used_rig, stiff, result.root_moves, options.joint_loads != nullptr);
   RefinementProblem& problem = *solved;
   for (const int part : problem.unseen_parts())
     result.held.push_back(fmt::format("the frame of part {}: it was never seen", part));
