@@ -12,7 +12,6 @@ using Eigen::VectorXd;
 using RowMajor = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>;
 
 constexpr double kLeastProbability = 0.01;
-constexpr double kInstantPrior = 1;  // m and rad, of a moving root
 
 /// Blocks' derivatives of one residual, free directions alone.
 struct Derivative {

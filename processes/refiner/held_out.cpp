@@ -136,9 +136,10 @@ HeldOutErrors held_out_errors(const BodySchema& schema, const std::vector<Refine
   return errors;
 }
 
-std::map<int, double> held_out_surprise(const BodySchema& schema,
-                                        const std::vector<RefinerSample>& samples,
-                                        const MeasurementModel& measurement, double noise_scale) {
+std::map<int, double> normalized_held_out_errors(const BodySchema& schema,
+                                                 const std::vector<RefinerSample>& samples,
+                                                 const MeasurementModel& measurement,
+                                                 double noise_scale) {
   constexpr std::size_t kFewest = 10;  // chosen
   std::map<int, std::vector<double>> squares;
   for (const RefinerSample& seen : samples) {

@@ -17,11 +17,13 @@ HeldOutErrors held_out_errors(const BodySchema& schema, const std::vector<Refine
                               const CornerNoise& corner_noise);
 
 /// How many times as far off the poses of each part in the root's frame are as is told of them, by
-/// the medians of their squared Mahalanobis distances: by Variance::kOneAction, and by the noise of
-/// the part and of the root, `noise_scale` times as told. Parts of ten poses and more.
-std::map<int, double> held_out_surprise(const BodySchema& schema,
-                                        const std::vector<RefinerSample>& samples,
-                                        const MeasurementModel& measurement, double noise_scale);
+/// the medians of their squared Mahalanobis distances (normalized estimation errors, NEES): by
+/// Variance::kOneAction, and by the noise of the part and of the root, `noise_scale` times as told.
+/// Parts of ten poses and more.
+std::map<int, double> normalized_held_out_errors(const BodySchema& schema,
+                                                 const std::vector<RefinerSample>& samples,
+                                                 const MeasurementModel& measurement,
+                                                 double noise_scale);
 
 /// Sets position_rms_m and rotation_rms_rad of every edge both of whose parts are seen: what it
 /// leaves of their poses, solved anew by the rig's tags and lens, of the inliers, for the degrees

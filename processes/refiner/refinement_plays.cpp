@@ -20,8 +20,8 @@ namespace {
 constexpr double kLeastPlay = 0.01, kMostPlay = 100;
 /// Of residuals that are bounded in the score; chosen.
 constexpr double kWildProbability = 1e-3;
-/// Information of a moving root's pose beforehand [1/m², 1/rad²].
-constexpr double kPosePrior = 1;
+/// Of a moving root's pose beforehand [1/m², 1/rad²].
+constexpr double kPoseInformation = 1 / (kInstantPrior * kInstantPrior);
 
 Eigen::LLT<Eigen::MatrixXd> factorized(const Eigen::MatrixXd& information) {
   Eigen::LLT<Eigen::MatrixXd> llt(information);
@@ -76,7 +76,7 @@ std::vector<Eigen::MatrixXd> RefinementProblem::information_of_instants() {
   }
   // The curvature of Student's t is less than that of its weights.
   const double alpha = curvature_share();
-  Eigen::VectorXd prior = Eigen::VectorXd::Constant(size, kPosePrior);
+  Eigen::VectorXd prior = Eigen::VectorXd::Constant(size, kPoseInformation);
   if (!plays_.empty()) prior.tail(std::ssize(plays_)) = play_sd_.array().square().inverse();
   for (Eigen::MatrixXd& information : result) {
     if (!plays_.empty())
@@ -204,7 +204,7 @@ double RefinementProblem::play_score() {
     Eigen::ArrayXd gradient = g[n].tail(num), information = A[n].diagonal().tail(num);
     if (num_others > 0) {
       Eigen::MatrixXd of_pose = A[n].topLeftCorner(num_others, num_others);
-      of_pose.diagonal().array() += kPosePrior;
+      of_pose.diagonal().array() += kPoseInformation;
       const Eigen::MatrixXd mixed = A[n].topRightCorner(num_others, num);
       const Eigen::MatrixXd effect = factorized(of_pose).solve(mixed);
       gradient -= (effect.transpose() * g[n].head(num_others)).array();

@@ -200,6 +200,9 @@ class RefinementProblem {
   ceres::Problem problem_;
 };
 
+/// Standard deviation beforehand of a moving root's pose at an instant [m, rad].
+inline constexpr double kInstantPrior = 1;
+
 /// Is a direction taken as known where parameters are told apart? Placements of these tags, one a
 /// part, and the size of the last, for all lengths have a common factor.
 bool is_frame(const std::vector<int>& frame_tags, const ParameterBlock& block, int direction);

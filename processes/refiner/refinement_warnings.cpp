@@ -98,11 +98,8 @@ std::vector<std::string> warnings_of_fit(RefinementProblem& problem,
                                          const std::vector<SignalCoverage>& coverage) {
   std::vector<std::string> result;
   std::map<int, int> num_seen, num_refuted;  // by part
-  double num_numbers = 0, num_parameters = 0;
-  for (const auto& datum : problem.data()) {
-    ++num_seen[datum.part];
-    num_numbers += datum.num_residuals;
-  }
+  double num_numbers = problem.num_residuals(), num_parameters = 0;
+  for (const auto& datum : problem.data()) ++num_seen[datum.part];
   for (const RefinementOutlier& outlier : outliers) ++num_refuted[outlier.part];
   for (const auto& [part, num] : num_refuted)
     if (num > kRefutedShare * num_seen.at(part))
@@ -141,7 +138,7 @@ std::vector<std::string> warnings_of_answer(const BodySchema& start, const Refin
     result.push_back(std::move(warning));
   if (answer.used_corners) return result;
   for (const auto& [part, times] :
-       held_out_surprise(answer.schema, held_out, measurement, answer.noise_scale))
+       normalized_held_out_errors(answer.schema, held_out, measurement, answer.noise_scale))
     if (times > kSurprising)
       result.push_back(
           fmt::format("held-out poses of part {} are {:.1f} times as far off as is told: the "

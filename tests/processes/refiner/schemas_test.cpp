@@ -388,6 +388,20 @@ TEST(RefineSchemas, WarnOfLimitsInAnotherUnit) {
   EXPECT_TRUE(names(refine(start, refiner_samples(samples), {}, {}).warnings, "another unit"));
 }
 
+TEST(RefineSchemas, KeepTheNoiseThatIsTold) {
+  Rng rng(3);
+  const SyntheticRobot robot = test::chapter_robot("a", rng);
+  RefineOptions options;
+  options.measurement.noise = Noise{0.004, 0.03};
+  const Refinement result =
+      refine(true_start(robot),
+             refiner_samples(test::babble(robot, 10, {.regime = test::Regime::kTagIso}, rng)), {},
+             options);
+  EXPECT_EQ(result.schema.noise.position_m, 0.004);
+  EXPECT_EQ(result.schema.noise.rotation_rad, 0.03);
+  EXPECT_TRUE(names(result.held, "bends of q1, q2: read at fewer than 15 positions"));
+}
+
 TEST(RefineSchemas, WarnOfFewNumbers) {
   Rng rng(12);
   const SyntheticRobot robot = test::chapter_robot("c", rng);
