@@ -62,6 +62,10 @@ struct ScrewChainLayout {
   static constexpr int transform(int d) { return 8 * d; }
   static constexpr int slide(int d) { return 8 * d + 6; }
   static constexpr int turn(int d) { return 8 * d + 7; }
+  /// The d of a place; of the last transform the number of screws.
+  static constexpr int screw_of(int place) { return place / 8; }
+  /// Whether a place is a screw's, not a transform's.
+  static constexpr bool is_screw(int place) { return place % 8 >= 6; }
 };
 
 /// One screw of a chain at its displacement q, and the transform that follows: Exp(ŝ q) · A.

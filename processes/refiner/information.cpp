@@ -1,12 +1,9 @@
 #include "processes/refiner/information.h"
 
-#include <ceres/crs_matrix.h>
-
 #include <Eigen/Cholesky>
 #include <Eigen/Eigenvalues>
 #include <algorithm>
 #include <cmath>
-#include <stdexcept>
 
 #include "common/estimation/chi_square.h"
 #include "common/estimation/student_t.h"
@@ -24,12 +21,10 @@ ceres::CRSMatrix jacobian_of(RefinementProblem& problem,
                              const std::vector<ParameterBlock*>& blocks) {
   ceres::Problem::EvaluateOptions options;
   options.apply_loss_function = false;
-  options.num_threads = 1;
   for (ParameterBlock* block : blocks) options.parameter_blocks.push_back(problem.memory_of(block));
   for (const auto& datum : problem.data()) options.residual_blocks.push_back(datum.id);
   ceres::CRSMatrix jacobian;
-  if (!problem.problem().Evaluate(options, nullptr, nullptr, nullptr, &jacobian))
-    throw std::runtime_error("the refined model cannot be evaluated");
+  problem.evaluate(options, nullptr, nullptr, &jacobian);
   return jacobian;
 }
 

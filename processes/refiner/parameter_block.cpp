@@ -1,6 +1,7 @@
 #include "processes/refiner/parameter_block.h"
 
 #include <algorithm>
+#include <cmath>
 
 #include "common/kinematics/screw_chain.h"
 
@@ -112,6 +113,11 @@ ParameterBlock edge_block(const Edge& edge, int index, bool is_position) {
       is_position ? std::vector<int>{0, 1, 2} : std::vector<int>{0, 1, 2, 3, 4, 5};
   free_pose(ScrewChainLayout::transform(static_cast<int>(edge.joints.size())), last);
   return block;
+}
+
+double half_travel(const BodySchema& schema, const ScrewJoint& joint) {
+  const Signal& signal = schema.signals.at(joint.signal);
+  return 0.5 * std::abs(joint.gain) * (signal.upper - signal.lower);
 }
 
 Edge edge_from(const ParameterBlock& block, Edge edge) {

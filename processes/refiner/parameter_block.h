@@ -71,6 +71,8 @@ class BlockManifold final : public ceres::Manifold {
 /// anywhere, so these directions are held, and with them a slide or turn of 0.
 /// `is_position`: of the part beyond positions alone are known.
 ParameterBlock edge_block(const Edge& edge, int index, bool is_position);
+/// By how much half of its signal's range moves a joint [rad, m]; an edge's gain is in its screw.
+double half_travel(const BodySchema& schema, const ScrewJoint& joint);
 /// The edge with the block's values.
 Edge edge_from(const ParameterBlock& block, Edge edge);
 /// Place of the edge block's values: left is X_after of joint −1.

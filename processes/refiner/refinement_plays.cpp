@@ -1,7 +1,5 @@
 // How far joints are off their commands: RefinementProblem's plays.
 
-#include <ceres/crs_matrix.h>
-
 #include <Eigen/Cholesky>
 #include <algorithm>
 #include <cmath>
@@ -61,11 +59,9 @@ std::vector<Eigen::MatrixXd> RefinementProblem::information_of_instants() {
   const std::vector<ParameterBlock*> instants = used_instants();
   if (instants.empty()) return {};
   ceres::Problem::EvaluateOptions options;
-  options.num_threads = 1;
   for (const ParameterBlock* block : instants) options.parameter_blocks.push_back(memory_of(block));
   ceres::CRSMatrix J;  // of all residuals, also the priors', with the loss's weights
-  if (!problem_.Evaluate(options, nullptr, nullptr, nullptr, &J))
-    throw std::runtime_error("the refined model cannot be evaluated");
+  evaluate(options, nullptr, nullptr, &J);
   const int size = instants.front()->num_free();
   std::vector<Eigen::MatrixXd> result(instants.size(), Eigen::MatrixXd::Zero(size, size));
   for (int row = 0; row < J.num_rows; ++row) {
@@ -173,15 +169,13 @@ Eigen::VectorXd RefinementProblem::shown_play_sd() const {
 double RefinementProblem::play_score() {
   ceres::Problem::EvaluateOptions options;
   options.apply_loss_function = false;
-  options.num_threads = 1;
   const std::vector<ParameterBlock*> instants = used_instants();
   for (const ParameterBlock* block : instants) options.parameter_blocks.push_back(memory_of(block));
   for (const Datum& datum : data_) options.residual_blocks.push_back(datum.id);
   const double scale = std::exchange(scale_.value, 1.0);
   std::vector<double> residuals;
   ceres::CRSMatrix J;
-  if (!problem_.Evaluate(options, nullptr, &residuals, nullptr, &J))
-    throw std::runtime_error("the refined model cannot be evaluated");
+  evaluate(options, &residuals, nullptr, &J);
   scale_.value = scale;
   const int size = instants.front()->num_free();
   const auto num = std::ssize(plays_), num_others = size - num;

@@ -10,6 +10,7 @@
 
 #include "common/estimation/student_t.h"
 #include "common/kinematics/kinematic_tree.h"
+#include "common/kinematics/screw_chain.h"
 #include "processes/refiner/calibrated_lens.h"
 
 namespace bodyschema {
@@ -53,6 +54,8 @@ RefinementProblem::RefinementProblem(const BodySchema& schema,
     throw std::invalid_argument(
         rig_ ? "no sample shows a tag of the rig on a part of the schema"
              : "no sample shows a part that the schema connects to its root");
+  if (std::ranges::all_of(data_, [&](const Datum& datum) { return datum.part == schema_.root; }))
+    throw std::invalid_argument("the samples show no part of the schema but its root");
   hold_unseen_frames();
   for (ParameterBlock* block : blocks())
     problem_.SetManifold(memory_of(block), &manifolds_.emplace_back(*block));
@@ -374,11 +377,10 @@ Eigen::VectorXd RefinementProblem::prior_of(const ParameterBlock& block) const {
 }
 
 double RefinementProblem::weak_sd(const ParameterBlock& block, int direction) const {
-  if (block.kind != ParameterBlock::Kind::kEdge || direction % 8 < 6) return 1;
-  const ScrewJoint& joint = schema_.edges[block.id].joints[direction / 8];
-  const Signal& signal = schema_.signals[joint.signal];
-  const double range = signal.upper - signal.lower;
-  return 1 / (std::abs(joint.gain) * (range > 0 ? 0.5 * range : 1));
+  if (block.kind != ParameterBlock::Kind::kEdge || !ScrewChainLayout::is_screw(direction)) return 1;
+  const ScrewJoint& joint = schema_.edges[block.id].joints[ScrewChainLayout::screw_of(direction)];
+  const double reach = half_travel(schema_, joint);
+  return 1 / (reach > 0 ? reach : std::abs(joint.gain));
 }
 
 double RefinementProblem::prior_information(const ParameterBlock& block, int direction) const {
@@ -399,14 +401,19 @@ void RefinementProblem::add_priors() {
   }
 }
 
+void RefinementProblem::evaluate(const ceres::Problem::EvaluateOptions& options,
+                                 std::vector<double>* residuals, std::vector<double>* gradient,
+                                 ceres::CRSMatrix* jacobian) {
+  if (!problem_.Evaluate(options, nullptr, residuals, gradient, jacobian))
+    throw std::runtime_error("the refined model cannot be evaluated");
+}
+
 std::vector<double> RefinementProblem::squared_distances() {
   ceres::Problem::EvaluateOptions options;
   options.apply_loss_function = false;
-  options.num_threads = 1;
   for (const Datum& datum : data_) options.residual_blocks.push_back(datum.id);
   std::vector<double> residuals;
-  if (!problem_.Evaluate(options, nullptr, &residuals, nullptr, nullptr))
-    throw std::runtime_error("the refined model cannot be evaluated");
+  evaluate(options, &residuals, nullptr, nullptr);
   std::vector<double> result;
   std::size_t row = 0;
   for (const Datum& datum : data_) {
@@ -434,11 +441,9 @@ double RefinementProblem::log_likelihood() {
 
 Eigen::VectorXd RefinementProblem::score(const std::vector<ParameterBlock*>& blocks) {
   ceres::Problem::EvaluateOptions options;
-  options.num_threads = 1;
   for (const ParameterBlock* block : blocks) options.parameter_blocks.push_back(memory_of(block));
   std::vector<double> gradient;  // of −log
-  if (!problem_.Evaluate(options, nullptr, nullptr, &gradient, nullptr))
-    throw std::runtime_error("the refined model cannot be evaluated");
+  evaluate(options, nullptr, &gradient, nullptr);
   return -Eigen::Map<const Eigen::VectorXd>(gradient.data(), std::ssize(gradient));
 }
 

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <ceres/crs_matrix.h>
 #include <ceres/problem.h>
 #include <ceres/solver.h>
 
@@ -70,6 +71,9 @@ class RefinementProblem {
   const std::vector<Datum>& data() const { return data_; }
   double num_residuals() const;
   ceres::Problem& problem() { return problem_; }
+  /// What Ceres makes of the values now; null: not wanted. @throws std::runtime_error.
+  void evaluate(const ceres::Problem::EvaluateOptions& options, std::vector<double>* residuals,
+                std::vector<double>* gradient, ceres::CRSMatrix* jacobian);
   /// Where Ceres knows a block's values. All are in one array, in the order of the blocks: Ceres
   /// orders blocks by address, and the same samples shall give the same bytes.
   double* memory_of(const ParameterBlock* block) { return &memory_[memory_offsets_.at(block)]; }

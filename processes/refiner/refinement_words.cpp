@@ -76,11 +76,8 @@ bool RefinementWords::is_told(const Place& place, Eigen::Index row) const {
   if (undetermined_shares_(row) >= kNamedShare) return false;
   const std::string unit = unit_of(*place.block, place.direction);
   double reach = 1;
-  if (unit.ends_with("/unit")) {
-    const ScrewJoint& joint = joint_of(*place.block, place.direction);
-    const Signal& signal = schema_.signals.at(joint.signal);
-    reach = 0.5 * std::abs(joint.gain) * (signal.upper - signal.lower);
-  }
+  if (unit.ends_with("/unit"))
+    reach = half_travel(schema_, joint_of(*place.block, place.direction));
   const double sd = reach * std::sqrt(std::max(covariance_(row, row), 0.0));
   if (unit.starts_with("rad")) return sd <= kLargestDeviation_rad;
   return !unit.starts_with("m") || sd <= kLargestDeviation_m;
@@ -108,14 +105,16 @@ std::string RefinementWords::thing_of(const ParameterBlock& block) const {
 
 const ScrewJoint& RefinementWords::joint_of(const ParameterBlock& block, int direction) const {
   const std::vector<ScrewJoint>& joints = schema_.edges[block.id].joints;
-  return joints[std::min(static_cast<std::size_t>(direction / 8), joints.size() - 1)];
+  return joints[std::min(static_cast<std::size_t>(ScrewChainLayout::screw_of(direction)),
+                         joints.size() - 1)];
 }
 
 std::string RefinementWords::edge_name(const ParameterBlock& block, int direction) const {
   const Edge& edge = schema_.edges[block.id];
   std::string thing = thing_of(block);
   if (edge.joints.empty()) return fmt::format("{}, {}", thing, kPoseWords[direction]);
-  const int d = direction / 8, component = direction % 8;
+  const int d = ScrewChainLayout::screw_of(direction);
+  const int component = direction - ScrewChainLayout::transform(d);
   const int num_joints = static_cast<int>(edge.joints.size());
   const ScrewJoint& joint = joint_of(block, direction);
   const std::string& signal = schema_.signals.at(joint.signal).name;
@@ -157,7 +156,10 @@ std::string RefinementWords::unit_of(const ParameterBlock& block, int direction)
   if (block.kind == Kind::kLens) return direction < 4 ? "px" : "1";
   if (block.kind == Kind::kDrive) return "unit";
   if (block.kind == Kind::kTag && direction == 6) return "1";
-  const int component = block.kind == Kind::kEdge ? direction % 8 : direction;
+  const int component =
+      block.kind == Kind::kEdge
+          ? direction - ScrewChainLayout::transform(ScrewChainLayout::screw_of(direction))
+          : direction;
   constexpr std::array<const char*, 8> kUnits = {"m",   "m",   "m",      "rad",
                                                  "rad", "rad", "m/unit", "rad/unit"};
   return kUnits[component];

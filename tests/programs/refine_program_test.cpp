@@ -162,6 +162,16 @@ TEST_F(RefineProgramTest, FitsTheRowsOfACsv) {
   EXPECT_EQ(judged.at("after").at("samples"), 10);
   EXPECT_EQ(judged.at("parameters"), json.at("parameters"));
   EXPECT_EQ(run("refine of_csv samples.csv --test samples.csv --out judged").exit_code, 2);
+  // What looks odd in the recording is a warning.
+  std::ofstream wrong(folder_ / "millimetres.csv");
+  std::vector<ActionPoseSample> scaled = babble(robot, 10, {.regime = Regime::kTagIso}, rng);
+  for (ActionPoseSample& sample : scaled)
+    for (PartObservation& seen : sample.parts) seen.X_CB.translation() *= 1000;
+  write_csv(scaled, wrong);
+  wrong.close();
+  const Json odd = json_of("refine of_csv millimetres.csv --out odd --json");
+  const std::string warning = odd.at("warnings").at(0);
+  EXPECT_NE(warning.find("look like millimetres"), std::string::npos) << warning;
 }
 
 /// Median distance of a part from where it is in the root, over random actions [m].

@@ -90,6 +90,17 @@ struct ThreeEdges {
   NoiseScale scale{1.7};
 };
 
+/// The root's pose and how far the four joints are off their commands.
+ParameterBlock instant_of(const ThreeEdges& robot, Rng& rng) {
+  ParameterBlock instant =
+      pose_block(ParameterBlock::Kind::kInstant, pose_at(robot.root.values.data()));
+  for (int n = 0; n < 4; ++n) {
+    instant.free.push_back(6 + n);
+    instant.add(0.01 * test::gaussian(rng));
+  }
+  return instant;
+}
+
 TEST(Residuals, ChainIsThatOfTheSchemasEdges) {
   Rng rng(1);
   const ThreeEdges robot(rng);
@@ -146,12 +157,7 @@ TEST(Residuals, OfCornersHaveTheirDerivatives) {
     robot.blocks.push_back(&drive);
     expect_right(moved, effects);
     // Of a root that moves, the plays are in its block.
-    ParameterBlock instant =
-        pose_block(ParameterBlock::Kind::kInstant, pose_at(robot.root.values.data()));
-    for (int n = 0; n < 4; ++n) {
-      instant.free.push_back(6 + n);
-      instant.add(0.01 * test::gaussian(rng));
-    }
+    ParameterBlock instant = instant_of(robot, rng);
     const ParameterBlock* const rests = std::exchange(robot.blocks[0], &instant);
     robot.blocks.erase(robot.blocks.end() - 2);
     expect_right(moved, effects);
@@ -197,8 +203,18 @@ TEST(Residuals, OfElasticJointsHaveTheirDerivatives) {
   for (int n = 0; n < 4; ++n) plays.add(0.01 * test::gaussian(rng));
   plays.free = {0, 1, 2, 3};
   robot.blocks.insert(robot.blocks.end() - 1, &plays);
-  const PoseResidual loose(chain, robot.blocks, observation, {}, robot.scale, shared);
-  expect_right_derivatives(loose, robot.blocks, 1e-6);
+  const auto expect_right_with_plays = [&] {
+    const PoseResidual loose(chain, robot.blocks, observation, {}, robot.scale, shared);
+    expect_right_derivatives(loose, robot.blocks, 1e-6);
+    const PositionResidual loose_position(chain, robot.blocks, observation, {}, robot.scale,
+                                          shared);
+    expect_right_derivatives(loose_position, robot.blocks, 1e-6);
+  };
+  expect_right_with_plays();
+  ParameterBlock instant = instant_of(robot, rng);
+  robot.blocks[0] = &instant;
+  robot.blocks.erase(robot.blocks.end() - 2);
+  expect_right_with_plays();
 }
 
 TEST(Residuals, OfAFlippedPoseAreThoseOfItsOtherReading) {

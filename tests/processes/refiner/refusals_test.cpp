@@ -61,6 +61,16 @@ TEST_F(RefineRefuses, PlacementsWithoutCorners) {
   expect_refusal("corners", robot_.truth);
 }
 
+TEST_F(RefineRefuses, SamplesThatShowTheRootAlone) {
+  options_.placements = false;
+  for (RefinerSample& seen : samples_) {
+    seen.sample.parts.resize(1);
+    seen.sample.parts.front().part = schema_.root;
+    seen.sample.parts.front().X_CB = schema_.X_CR;
+  }
+  expect_refusal("but its root", std::nullopt);
+}
+
 TEST_F(RefineRefuses, AnotherRig) {
   RigCalibration other = robot_.truth;
   other.markers.tags.front().size_m *= 1.01;
