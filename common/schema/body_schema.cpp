@@ -197,6 +197,13 @@ bool has_moved(const std::vector<MovedTag>& moved, int tag, std::int64_t sample_
   });
 }
 
+void forget_when_it_changed(BodySchema* schema) {
+  for (Edge& edge : schema->edges) edge.valid_since_sample = 0;
+  schema->changes.clear();
+  std::erase_if(schema->moved_tags, [](const MovedTag& tag) { return tag.until >= 0; });
+  for (MovedTag& tag : schema->moved_tags) tag.found = tag.since = 0;
+}
+
 void drop_moved_tags(const std::vector<MovedTag>& moved, ActionPoseSample* sample) {
   if (moved.empty()) return;
   sample->leave_out([&](int tag) { return has_moved(moved, tag, sample->sample_index); });

@@ -224,6 +224,10 @@ struct BodySchema {
   std::optional<Eigen::MatrixXd> jacobian(int from, int to, const Eigen::VectorXd& action) const;
 };
 
+/// Beside another recording, whose samples count anew: the schema holds for all of them, and tags
+/// that had moved stay so.
+void forget_when_it_changed(BodySchema* schema);
+
 /// By then.
 bool has_moved(const std::vector<MovedTag>& moved, int tag, std::int64_t sample_index);
 /// The sample as if tags that had moved had not been seen.

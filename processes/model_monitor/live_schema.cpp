@@ -173,13 +173,11 @@ bool LiveSchema::is_in_doubt() const {
          });
 }
 
-std::vector<health_event_t> LiveSchema::on_sample(const ActionPoseSample& sample) {
-  std::vector<health_event_t> result;
+std::vector<AdaptationEvent> LiveSchema::on_sample(const ActionPoseSample& sample) {
   std::optional<std::int64_t> changed_since;
   std::optional<int> unchanged_part, drifting_part;
-  const std::vector<AdaptationEvent> events = adaptation_.on_sample(sample);
+  std::vector<AdaptationEvent> events = adaptation_.on_sample(sample);
   for (const AdaptationEvent& event : events) {
-    result.push_back(to_message(event, schema_.signals, sample.utime));
     if ((event.kind == Kind::kCandidate || event.kind == Kind::kRestored) && event.tag < 0)
       changed_since = adaptation_.since();
     // What the tag was taken for was no change.
@@ -201,7 +199,7 @@ std::vector<health_event_t> LiveSchema::on_sample(const ActionPoseSample& sample
   if (adaptation_.is_settled()) probe_sample_ = -1;
   watch_flips(sample);
   update(sample, changed_since, unchanged_part, drifting_part);
-  return result;
+  return events;
 }
 
 void LiveSchema::watch_flips(const ActionPoseSample& sample) {

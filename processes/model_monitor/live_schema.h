@@ -26,9 +26,9 @@ class LiveSchema {
              const std::vector<ActionPoseSample>& past,
              const std::vector<finding_t>& findings = {});
 
-  /// What was decided at this sample; events are not numbered yet.
+  /// What was decided at this sample.
   /// @throws std::invalid_argument if the action does not have one value per signal.
-  std::vector<health_event_t> on_sample(const ActionPoseSample& sample);
+  std::vector<AdaptationEvent> on_sample(const ActionPoseSample& sample);
 
   /// Version s + 1 if it changed last at sample s; base_version is that of the base.
   const BodySchema& schema() const { return schema_; }

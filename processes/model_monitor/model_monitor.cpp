@@ -93,17 +93,9 @@ void ModelMonitor::start_from(const body_schema_t& schema) {
   memory.schemas = {schema};
   memory.at_base.num_test_samples = MonitorMemory::kOld;
   if (schema.last_sample_index < 0) {
-    // Its changes were those of another run.
-    body_schema_t& base = memory.schemas.back();
-    for (schema_edge_t& edge : base.edges) edge.valid_since_sample = 0;
-    set_array(base.num_changes, base.changes, {});
-    std::vector<moved_tag_t> moved;
-    for (moved_tag_t tag : base.moved_tags) {
-      if (tag.moved_until_sample >= 0) continue;
-      tag.moved_found_sample = tag.moved_since_sample = 0;
-      moved.push_back(tag);
-    }
-    set_array(base.num_moved_tags, base.moved_tags, std::move(moved));
+    BodySchema base = from_message(schema);
+    forget_when_it_changed(&base);
+    memory.schemas.back() = to_message(base);
   }
   memory.at_base.utime = memory.verdicts.utime = schema.utime;
   memory.at_base.judged_sample = memory.verdicts.judged_sample = schema.last_sample_index;
@@ -230,7 +222,10 @@ void ModelMonitor::advance(Standing* standing, const ActionPoseSample& sample) c
   standing->sample_index = sample.sample_index;
   if (standing->live && fits(standing->live->schema(), sample)) {
     const auto live = std::make_shared<LiveSchema>(*standing->live);
-    std::vector<health_event_t> events = live->on_sample(sample);
+    const std::vector<AdaptationEvent> decided = live->on_sample(sample);
+    std::vector<health_event_t> events;
+    for (const AdaptationEvent& event : decided)
+      events.push_back(to_message(event, live->schema().signals, sample.utime));
     const bool is_confirming =
         live->num_judged() > standing->live->num_judged() && sample.parts.size() > 1;
     for (health_event_t& event : standing->youth.on_sample(std::move(events), is_confirming))

@@ -40,7 +40,7 @@ bool moves(const Edge& edge, int signal) {
 
 /// Linear signals whose joints moved parts that were seen, by at how many positions.
 struct Candidates {
-  std::vector<int> well_read, hardly_read;
+  std::vector<int> well_read, too_few_positions;
 };
 
 Candidates candidates(const FitToPoses& fit, const std::vector<RefinerSample>& samples) {
@@ -60,7 +60,7 @@ Candidates candidates(const FitToPoses& fit, const std::vector<RefinerSample>& s
     if (num_positions >= kFewestWarpPositions)
       result.well_read.push_back(s);
     else if (num_positions > 1)
-      result.hardly_read.push_back(s);
+      result.too_few_positions.push_back(s);
   }
   return result;
 }
@@ -206,8 +206,8 @@ BentSchema with_bends(const BodySchema& schema, const std::vector<RefinerSample>
       samples, [](const RefinerSample& seen) { return !seen.sample.parts.empty(); });
   if (!has_poses) return result;
   auto fit = std::make_unique<FitToPoses>(schema, samples, options, root_moves);
-  auto [linear, hardly_read] = candidates(*fit, samples);
-  result.hardly_read = std::move(hardly_read);
+  auto [linear, too_few_positions] = candidates(*fit, samples);
+  result.too_few_positions = std::move(too_few_positions);
   if (!linear.empty()) fit->problem.solve();
   while (!linear.empty()) {
     std::vector<Candidate> bends = likely_bends(FreeWeights(*fit, linear, samples, options));

@@ -16,7 +16,7 @@ struct BentSchema {
   BodySchema schema;             ///< with the bends, its other parameters as they were
   std::vector<FoundBend> bends;  ///< in the order in which they were found
   /// Signals that moved, but were read at too few positions for bends of theirs to be looked for.
-  std::vector<int> hardly_read;
+  std::vector<int> too_few_positions;
 };
 
 /// Adds bends to a schema, of signals that are bendable. Where a fit to the parts' poses has its

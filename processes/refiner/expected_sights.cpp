@@ -89,7 +89,9 @@ std::vector<ExpectedSights::Tag> ExpectedSights::tags(const Eigen::VectorXd& act
   for (const TagPlacement& tag : rig_->markers.tags) {
     const auto part = X_RB.find(tag.part);
     const auto memory = tags_.find(tag.id);
-    if (part == X_RB.end() || memory == tags_.end() || memory->second.views.empty()) continue;
+    if (part == X_RB.end() || memory == tags_.end() || memory->second.views.empty() ||
+        has_moved(schema_.moved_tags, tag.id, sample_index()))
+      continue;
     auto view = view_of(tag, X_CR_ * part->second);
     if (!view) continue;
     const auto& [num_in_view, num_seen, views] = memory->second;

@@ -33,7 +33,7 @@ ceres::CRSMatrix jacobian_of(RefinementProblem& problem,
 // Over all free directions, the instants' eliminated: those refined and those held by priors.
 struct Information::Sums {
   std::vector<ParameterBlock*> blocks;
-  Eigen::MatrixXd H, shared;
+  Eigen::MatrixXd A, B, shared;  // curvature, covariance of the score, Σ G Gᵀ
   int num_instants = 0, instant_size = 0;
 };
 
@@ -90,7 +90,7 @@ Information::Information(RefinementProblem& problem, const MeasurementModel& mea
   const Weights weights(problem.data(), problem.squared_distances(), num_parameters,
                         problem.num_determined_plays());
   // A joint that rested would seem to have moved by its play.
-  problem.leave_out_play();
+  problem.zero_plays();
   // What is held has a derivative too.
   for (ParameterBlock* block : problem.blocks())
     if (!block->is_refined) problem.problem().SetParameterBlockVariable(problem.memory_of(block));
@@ -124,11 +124,9 @@ std::vector<Rows> rows_of(const ceres::CRSMatrix& jacobian,
   return result;
 }
 
-/// What belongs to one instant alone: its information, and that mixed with the other parameters'.
+/// Σ w JᵀJ of one instant's own parameters, and mixed with the others.
 struct Instant {
   Eigen::MatrixXd own, mixed;  // e×e, e×P
-
-  Eigen::MatrixXd effect() const { return own.ldlt().solve(mixed); }
 };
 
 /// Σ G Gᵀ over the errors, the instants' own parameters eliminated by their `effects`.
@@ -175,29 +173,38 @@ Information::Sums Information::weighted(RefinementProblem& problem, const Weight
   }
   const std::vector<Rows> rows = rows_of(jacobian_of(problem, problem.blocks()), problem.data());
   const int e = sums.instant_size, num_eliminated = e * sums.num_instants;
-  sums.H = Eigen::MatrixXd::Zero(size, size);
+  Eigen::MatrixXd H = Eigen::MatrixXd::Zero(size, size);
   std::map<int, Instant> instants;  // by their first column
   for (std::size_t n = 0; n < rows.size(); ++n) {
     const Eigen::MatrixXd product = weights.of_datum[n] * rows[n].J.transpose() * rows[n].J;
     const auto column = [&](int c) { return rows[n].columns[c] - num_eliminated; };
     const int width = static_cast<int>(rows[n].columns.size());
     for (int c = e; c < width; ++c)
-      for (int r = e; r < width; ++r) sums.H(column(r), column(c)) += product(r, c);
+      for (int r = e; r < width; ++r) H(column(r), column(c)) += product(r, c);
     if (e == 0) continue;
     Instant& instant = instants[rows[n].columns.front()];
     if (instant.own.size() == 0) {
       instant.own = Eigen::MatrixXd::Zero(e, e);
-      const auto num_plays = problem.play_sd().size();
-      instant.own.diagonal().tail(num_plays) = problem.play_sd().array().square().inverse();
       instant.mixed = Eigen::MatrixXd::Zero(e, size);
     }
     instant.own += product.topLeftCorner(e, e);
     for (int c = e; c < width; ++c) instant.mixed.col(column(c)) += product.col(c).head(e);
   }
   std::map<int, Eigen::MatrixXd> effects;
+  sums.A = weights.alpha * H;
+  sums.B = weights.beta * H;
+  // Plays have a prior, a moving root's pose has none here.
+  Eigen::VectorXd prior = Eigen::VectorXd::Zero(e);
+  if (e > 0) prior.tail(problem.play_sd().size()) = problem.play_sd().array().square().inverse();
   for (const auto& [column, instant] : instants) {
-    effects[column] = instant.effect();
-    sums.H -= instant.mixed.transpose() * effects[column];
+    Eigen::MatrixXd own_A = weights.alpha * instant.own, own_B = weights.beta * instant.own;
+    own_A.diagonal() += prior;
+    own_B.diagonal() += prior;
+    const Eigen::MatrixXd effect = own_A.ldlt().solve(weights.alpha * instant.mixed);
+    const Eigen::MatrixXd both = weights.beta * instant.mixed.transpose() * effect;
+    sums.A -= weights.alpha * instant.mixed.transpose() * effect;
+    sums.B += effect.transpose() * own_B * effect - both - both.transpose();
+    effects[column] = effect;
   }
   sums.shared = shared_score(rows, weights.of_datum, shared_errors(problem, measurement), effects,
                              {size, e, num_eliminated});
@@ -219,9 +226,8 @@ void Information::invert(const RefinementProblem& problem, const Sums& sums,
     }
   }
   const Eigen::VectorXd P = Eigen::Map<const Eigen::VectorXd>(prior.data(), std::ssize(prior));
-  const Eigen::MatrixXd H = sums.H(refined, refined);
   const Eigen::MatrixXd P_refined = P(refined).asDiagonal();
-  curvature_ = weights.alpha * H + P_refined;
+  curvature_ = sums.A(refined, refined) + P_refined;
   lasting_score_ = sums.shared(refined, refined);
   worth_ = weights.alpha * weights.mean;
   const Eigen::MatrixXd& A = curvature_;
@@ -237,12 +243,13 @@ void Information::invert(const RefinementProblem& problem, const Sums& sums,
       unit.asDiagonal() * eigen.eigenvectors() *
       values.cwiseMax(kLeastEigenvalue).cwiseSqrt().cwiseInverse().asDiagonal();
   const Eigen::MatrixXd inverse = half * half.transpose();
-  covariance_ = inverse * (weights.beta * H + P_refined + sums.shared(refined, refined)) * inverse;
+  covariance_ =
+      inverse * (sums.B(refined, refined) + P_refined + sums.shared(refined, refined)) * inverse;
   // Along what nothing tells there is no score either.
   const Eigen::MatrixXd open = half.leftCols(num_undetermined);
   covariance_ += open * open.transpose();
   if (held.empty()) return;
-  const Eigen::MatrixXd mixed = weights.alpha * sums.H(refined, held);
+  const Eigen::MatrixXd mixed = sums.A(refined, held);
   const Eigen::MatrixXd K = inverse * mixed;
   covariance_ += K * P(held).cwiseInverse().asDiagonal() * K.transpose();
   lasting_score_ += mixed * P(held).cwiseInverse().asDiagonal() * mixed.transpose();

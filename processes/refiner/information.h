@@ -11,14 +11,14 @@ namespace bodyschema {
 
 /// What the samples tell of the parameters at the refined values: the covariance of an M-estimator
 /// (Huber), with what each instant has of its own (a moving root's pose, the joints' plays)
-/// eliminated (Schur complement).
+/// eliminated (Schur complement: of A, and of B with the gain that A's has).
 ///
 ///   Cov = A⁻¹ B A⁻¹ + K C Kᵀ,  A = α H + P,  B = β H + P + Σ G Gᵀ,  H = Σ w JᵀJ,
 ///
-/// w the Student-t weights, P the priors' information, α and β the means of the second derivative
-/// and of the squared score per weight over all residuals, G what an error does that several poses
-/// share (shared_errors.h). K C Kᵀ is what the held parameters' priors C (tags, lens) make of the
-/// refined ones.
+/// w the Student-t weights, P the priors' information (the plays' too), α and β the means of the
+/// second derivative and of the squared score per weight over all residuals, G what an error does
+/// that several poses share (shared_errors.h). K C Kᵀ is what the held parameters' priors C (tags,
+/// lens) make of the refined ones.
 class Information {
  public:
   /// `measurement`: of poses. `num_not_fitted`: free directions that the fit did not move.
@@ -36,8 +36,8 @@ class Information {
   const Eigen::MatrixXd& undetermined() const { return undetermined_; }
   /// A, over the free directions of all blocks.
   const Eigen::MatrixXd& curvature() const { return curvature_; }
-  /// What further samples do not average out is in Cov as A⁻¹ X A⁻¹: this X, of the errors that
-  /// poses share and of what is held.
+  /// The part of B that further samples do not reduce, of errors that poses share and of what is
+  /// held: it is in Cov as A⁻¹ X A⁻¹.
   const Eigen::MatrixXd& lasting_score() const { return lasting_score_; }
   /// A further observation is expected to add as many times JᵀJ to A.
   double worth() const { return worth_; }

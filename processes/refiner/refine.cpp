@@ -7,7 +7,7 @@
 #include <algorithm>
 #include <chrono>
 #include <cmath>
-#include <map>
+#include <iterator>
 #include <memory>
 #include <set>
 #include <stdexcept>
@@ -27,6 +27,7 @@
 #include "processes/refiner/refinement_problem.h"
 #include "processes/refiner/refinement_warnings.h"
 #include "processes/refiner/refinement_words.h"
+#include "processes/refiner/sample_selection.h"
 #include "processes/refiner/wanted_actions.h"
 
 namespace bodyschema {
@@ -36,63 +37,6 @@ namespace {
 constexpr std::size_t kMostCorrelations = 20;
 /// Chosen: degrees are 57 times as many as radians.
 constexpr double kAbsurdShare = 10;
-
-bool is_finite(const RefinerSample& seen) {
-  if (!seen.sample.action.allFinite()) return false;
-  for (const PartObservation& o : seen.sample.parts)
-    if (!o.X_CB.matrix().allFinite() || !o.covariance.allFinite()) return false;
-  return std::all_of(seen.tags.begin(), seen.tags.end(), [](const TagSight& sight) {
-    return sight.corners_px.allFinite() && sight.covariance_px2.allFinite();
-  });
-}
-
-void check(const BodySchema& schema, const std::vector<RefinerSample>& samples) {
-  if (schema.edges.empty())
-    throw std::invalid_argument("the schema connects no parts: there is nothing to refine");
-  if (samples.empty()) throw std::invalid_argument("there are no samples");
-  for (const RefinerSample& seen : samples) {
-    const auto refuse = [&](const std::string& why) {
-      throw std::invalid_argument(fmt::format("sample {} {}", seen.sample.sample_index, why));
-    };
-    if (seen.sample.action.size() != std::ssize(schema.signals))
-      refuse(fmt::format("has {} action signals, the schema {}", seen.sample.action.size(),
-                         schema.signals.size()));
-    if (!is_finite(seen)) refuse("has numbers that are not finite");
-  }
-}
-
-bool has_corners(const std::vector<RefinerSample>& samples) {
-  return std::any_of(samples.begin(), samples.end(),
-                     [](const RefinerSample& seen) { return !seen.tags.empty(); });
-}
-
-/// Of the first sample that tells it; 0: none does.
-std::int64_t calibration_of(const std::vector<RefinerSample>& samples) {
-  const auto telling = std::ranges::find_if(
-      samples, [](const RefinerSample& seen) { return seen.sample.calibration_id != 0; });
-  return telling == samples.end() ? 0 : telling->sample.calibration_id;
-}
-
-void check_calibration(const std::vector<RefinerSample>& samples,
-                       const std::vector<RefinerSample>& held_out,
-                       const std::optional<RigCalibration>& rig, const RefineOptions& options) {
-  const char* const asked = options.placements ? "placements" : "intrinsics";
-  const bool is_asked = options.placements || options.intrinsics;
-  if (is_asked && !rig)
-    throw std::invalid_argument(
-        fmt::format("{} are refined against a rig's files: none given (--rig)", asked));
-  if (is_asked && !has_corners(samples))
-    throw std::invalid_argument(
-        fmt::format("{} are refined by the tags' corners, which the samples do not have", asked));
-  const std::int64_t id = rig ? calibration_id(rig->markers, rig->camera) : calibration_of(samples);
-  for (const auto* all : {&samples, &held_out})
-    for (const RefinerSample& seen : *all)
-      if (seen.sample.calibration_id != 0 && seen.sample.calibration_id != id)
-        throw std::invalid_argument(
-            fmt::format("sample {} was seen through another calibration of tags and lens than the "
-                        "{}: its markers.yaml or camera calibration is another",
-                        seen.sample.sample_index, rig ? "rig's" : "first one"));
-}
 
 /// Do the observed poses of the root differ by more than their noise is told to be?
 bool root_differs(const BodySchema& schema, const std::vector<RefinerSample>& samples,
@@ -176,10 +120,10 @@ Fit fit(const BodySchema& schema, const std::vector<RefinerSample>& samples,
   };
   if (has_loads) return begun_with({schema, {}, {}});
   Fit bent = begun_with(with_bends(schema, samples, options, root_moves));
-  const auto& [_, bends, hardly_read] = *bent.start;
+  const auto& [_, bends, too_few_positions] = *bent.start;
   if (!has_plays || bends.empty() || bent.problem->plays().empty()) return bent;
   // Bends were the likelier as long as no joint was off its command.
-  Fit straight = begun_with({schema, {}, hardly_read});
+  Fit straight = begun_with({schema, {}, too_few_positions});
   const double gain =
       bent.problem->log_marginal_likelihood() - straight.problem->log_marginal_likelihood();
   return gain < kWarpEvidence * static_cast<double>(bends.size()) ? std::move(straight)
@@ -201,10 +145,9 @@ std::vector<RefinementOutlier> outliers_of(RefinementProblem& problem) {
   return result;
 }
 
-/// Edges that nothing tells, parts that the schema does not have, joints that rested, bends.
-std::vector<std::string> things_not_told(const BentSchema& bent,
-                                         const std::vector<RefinerSample>& samples,
-                                         const RefinementProblem& problem) {
+/// Edges that nothing tells, joints that rested, bends that could not be told.
+std::vector<std::string> undetermined_things(const BentSchema& bent,
+                                             const RefinementProblem& problem) {
   const BodySchema& schema = bent.schema;
   std::vector<std::string> result;
   std::set<const Edge*> told;
@@ -215,18 +158,12 @@ std::vector<std::string> things_not_told(const BentSchema& bent,
   for (const Edge& edge : schema.edges)
     if (!told.contains(&edge))
       result.push_back(fmt::format("{}→{}: no part beyond it was seen", edge.from, edge.to));
-  std::set<int> others;
-  for (const RefinerSample& seen : samples)
-    for (const PartObservation& o : seen.sample.parts)
-      if (!schema.has_part(o.part)) others.insert(o.part);
-  for (const int part : others)
-    result.push_back(fmt::format("part {}: the schema does not have it", part));
   for (const auto& [e, d] : problem.joints_at_rest())
     result.push_back(fmt::format("axis and gain of {}: it rested",
                                  joint_name(schema, schema.edges[e], schema.edges[e].joints[d])));
-  if (!bent.hardly_read.empty()) {
+  if (!bent.too_few_positions.empty()) {
     std::vector<std::string> names;
-    for (const int s : bent.hardly_read) names.push_back(schema.signals[s].name);
+    for (const int s : bent.too_few_positions) names.push_back(schema.signals[s].name);
     result.push_back(fmt::format("bends of {}: read at fewer than {} positions",
                                  fmt::join(names, ", "), kFewestWarpPositions));
   }
@@ -281,42 +218,6 @@ std::vector<std::string> held_things(const BodySchema& schema, const RefineOptio
   return result;
 }
 
-void leave_out_repetitions(std::vector<RefinerSample>* samples, std::vector<std::string>* held) {
-  std::set<std::vector<double>> met;
-  const auto removed = std::erase_if(*samples, [&](const RefinerSample& seen) {
-    std::vector<double> numbers = numbers_of(seen.sample);
-    for (const TagSight& sight : seen.tags) {
-      numbers.push_back(sight.tag);
-      numbers.insert(numbers.end(), sight.corners_px.begin(), sight.corners_px.end());
-    }
-    return !met.insert(std::move(numbers)).second;
-  });
-  if (removed > 0)
-    held->push_back(fmt::format("{} samples that repeat others exactly: not fitted", removed));
-}
-
-void leave_out_those_without_corners(std::vector<RefinerSample>* samples,
-                                     std::vector<std::string>* held) {
-  const auto removed =
-      std::erase_if(*samples, [](const RefinerSample& seen) { return seen.tags.empty(); });
-  if (removed > 0) held->push_back(fmt::format("{} samples without corners: not fitted", removed));
-}
-
-/// Samples that are learned from and TEST samples, both in order.
-std::pair<std::vector<RefinerSample>, std::vector<RefinerSample>> split(
-    std::vector<RefinerSample> samples) {
-  std::stable_sort(samples.begin(), samples.end(), [](const auto& a, const auto& b) {
-    return a.sample.sample_index < b.sample.sample_index;
-  });
-  std::vector<RefinerSample> training, held_out;
-  for (const RefinerSample& seen : samples) {
-    if (is_learned_from(seen.sample)) training.push_back(seen);
-    if (seen.sample.purpose == Purpose::kTest) held_out.push_back(seen);
-  }
-  if (training.empty()) throw std::invalid_argument("there are no TRAIN samples");
-  return {training, held_out};
-}
-
 /// Over the signal's range, from the line that is nearest to its displacements.
 RefinedBend told_bend(const Signal& signal, double evidence) {
   constexpr int kPoints = 101;
@@ -328,22 +229,72 @@ RefinedBend told_bend(const Signal& signal, double evidence) {
   return {signal.name, evidence, left.cwiseAbs().maxCoeff()};
 }
 
+/// All that the fit tells of the parameters.
+void describe(const BentSchema& start, RefinementProblem& problem,
+              const std::vector<RefinerSample>& training, const std::optional<RigCalibration>& rig,
+              const RefineOptions& options, Refinement* result) {
+  for (const int part : problem.unseen_parts())
+    result->held.push_back(fmt::format("the frame of part {}: it was never seen", part));
+  std::ranges::move(undetermined_things(start, problem), std::back_inserter(result->held));
+  result->outliers = outliers_of(problem);
+  result->warnings = warnings_of_fit(problem, result->outliers, result->coverage);
+  result->num_outliers = static_cast<int>(result->outliers.size());
+  if (result->outliers.size() > kMostOutliers) result->outliers.resize(kMostOutliers);
+  const Information information(problem, options.measurement);
+  const RefinementWords words(start.schema, information, problem.frame_tags(), result->coverage);
+  result->num_observations = static_cast<int>(problem.data().size());
+  result->num_iterations = problem.num_iterations();
+  result->noise_scale = problem.scale();
+  result->parameters = words.parameters();
+  result->undetermined = words.undetermined();
+  result->correlations = words.correlations(kMostCorrelations);
+  result->plays = plays_of(start.schema, problem);
+  result->schema = refined_schema(start.schema, training, problem, information);
+  if (!options.joint_loads) set_scatter(problem, &result->schema);
+  for (const FoundBend& bend : start.bends)
+    result->bends.push_back(told_bend(result->schema.signals[bend.signal], bend.evidence));
+  std::optional<RigCalibration> refined;
+  if (result->used_corners) {
+    refined = result->rig = refined_rig(problem, *rig);
+    set_residuals(training, result->rig, &result->schema);
+    result->schema.calibration_id = calibration_id(refined->markers, refined->camera);
+  } else {
+    if (options.measurement.noise) result->schema.noise = *options.measurement.noise;
+    // The schema is of the calibration that the poses rest on, whatever it began with.
+    result->schema.calibration_id = calibration_of(training);
+  }
+  result->wanted_actions = wanted_actions(result->schema, refined, training, problem, information);
+}
+
+/// By TEST samples, beside the schema that it began with.
+void judge(const BodySchema& schema, const std::vector<RefinerSample>& held_out,
+           const std::optional<RigCalibration>& rig, const RefineOptions& options,
+           Refinement* result) {
+  const bool has_corners_of_rig = rig && has_corners(held_out);
+  const auto errors = [&](const BodySchema& of, const RigCalibration& seen_through) {
+    return held_out_errors(of, held_out,
+                           has_corners_of_rig ? std::optional(seen_through) : std::nullopt,
+                           options.corner_noise);
+  };
+  result->before = errors(schema, rig.value_or(RigCalibration()));
+  result->after = errors(result->schema, result->rig);
+  std::ranges::move(warnings_of_answer(schema, *result, held_out, options.measurement),
+                    std::back_inserter(result->warnings));
+}
+
 }  // namespace
 
 Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
                   const std::optional<RigCalibration>& claimed, const RefineOptions& options) {
+  const auto begin = std::chrono::steady_clock::now();
   std::optional<RigCalibration> rig = claimed;
   if (rig && options.intrinsics) rig->camera = with_all_coefficients(rig->camera);
-  const auto begin = std::chrono::steady_clock::now();
-  check(schema, samples);
-  auto [training, held_out] = split(std::move(samples));
   Refinement result;
-  check_calibration(training, held_out, rig, options);
+  auto [training, held_out, left_out] = select_samples(schema, std::move(samples), rig, options);
+  result.held = std::move(left_out);
   result.used_corners = options.placements || options.intrinsics;
-  if (result.used_corners) leave_out_those_without_corners(&training, &result.held);
   const std::optional<RigCalibration> used_rig = result.used_corners ? rig : std::nullopt;
   if (rig) result.rig = *rig;
-  leave_out_repetitions(&training, &result.held);
   result.num_available = static_cast<int>(training.size());
   RefineOptions stiff = options;
   stiff.joint_loads = nullptr;
@@ -353,56 +304,17 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   training = informative(std::move(training), schema, used_rig, stiff, result.root_moves);
   result.num_samples = static_cast<int>(training.size());
   result.coverage = coverage_of(schema, training);
-  for (std::string& thing : held_things(schema, options, result.used_corners))
-    result.held.push_back(std::move(thing));
+  std::ranges::move(held_things(schema, options, result.used_corners),
+                    std::back_inserter(result.held));
 
   const auto [start, solved] =
       fit(schema, training, used_rig, stiff, result.root_moves, options.joint_loads != nullptr);
-  RefinementProblem& problem = *solved;
-  for (const int part : problem.unseen_parts())
-    result.held.push_back(fmt::format("the frame of part {}: it was never seen", part));
-  for (std::string& thing : things_not_told(*start, training, problem))
-    result.held.push_back(std::move(thing));
-  result.outliers = outliers_of(problem);
-  result.warnings = warnings_of_fit(problem, result.outliers, result.coverage);
-  result.num_outliers = static_cast<int>(result.outliers.size());
-  if (result.outliers.size() > kMostOutliers) result.outliers.resize(kMostOutliers);
-  const Information information(problem, options.measurement);
-  const RefinementWords words(start->schema, information, problem.frame_tags(), result.coverage);
-  result.num_observations = static_cast<int>(problem.data().size());
-  result.num_iterations = problem.num_iterations();
-  result.noise_scale = problem.scale();
-  result.parameters = words.parameters();
-  result.undetermined = words.undetermined();
-  result.correlations = words.correlations(kMostCorrelations);
-  result.plays = plays_of(schema, problem);
-  if (result.used_corners) result.rig = refined_rig(problem, *rig);
-  result.schema = refined_schema(start->schema, training, problem, information);
-  if (!options.joint_loads) set_scatter(problem, &result.schema);
-  if (options.measurement.noise && !result.used_corners)
-    result.schema.noise = *options.measurement.noise;
-  for (const FoundBend& bend : start->bends)
-    result.bends.push_back(told_bend(result.schema.signals[bend.signal], bend.evidence));
-  if (result.used_corners) set_residuals(training, result.rig, &result.schema);
-  // Fitted to poses, the schema is of the calibration that these rest on, whatever it began with.
-  result.schema.calibration_id = result.used_corners
-                                     ? calibration_id(result.rig.markers, result.rig.camera)
-                                     : calibration_of(training);
-  result.wanted_actions =
-      wanted_actions(result.schema, result.used_corners ? std::optional(result.rig) : std::nullopt,
-                     training, problem, information);
+  describe(*start, *solved, training, rig, options, &result);
   if (options.joint_loads && !result.used_corners)
-    result.elasticity = fit_elasticity(result.schema, training, held_out, options, problem);
+    result.elasticity = fit_elasticity(result.schema, training, held_out, options, *solved);
   if (options.joint_loads && !result.elasticity)
     result.held.emplace_back("compliances of joints: no load of them changes");
-  const bool judges_corners = rig && has_corners(held_out);
-  result.before =
-      held_out_errors(schema, held_out, judges_corners ? rig : std::nullopt, options.corner_noise);
-  result.after = held_out_errors(result.schema, held_out,
-                                 judges_corners ? std::optional(result.rig) : std::nullopt,
-                                 options.corner_noise);
-  for (std::string& warning : warnings_of_answer(schema, result, held_out, options.measurement))
-    result.warnings.push_back(std::move(warning));
+  judge(schema, held_out, rig, options, &result);
   result.seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - begin).count();
   return result;
 }

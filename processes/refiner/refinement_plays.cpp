@@ -157,8 +157,8 @@ bool RefinementProblem::drop_plays(double least_evidence) {
 
 Eigen::VectorXd RefinementProblem::shown_play_sd() const {
   Eigen::VectorXd result = play_sd_;
-  for (std::size_t n = 0; n < plays_.size(); ++n)
-    if (is_exact_[n]) result(static_cast<Eigen::Index>(n)) = 0;
+  for (Eigen::Index n = 0; n < result.size(); ++n)
+    if (play_sd_(n) <= kLeastPlay * play_start_(n)) result(n) = 0;
   return result;
 }
 

@@ -50,12 +50,7 @@ RefinementProblem::RefinementProblem(const BodySchema& schema,
     actions_[sample.sample.sample_index] = sample.sample.action;
     rig_ ? add_corners(sample) : add_poses(sample);
   }
-  if (data_.empty())
-    throw std::invalid_argument(
-        rig_ ? "no sample shows a tag of the rig on a part of the schema"
-             : "no sample shows a part that the schema connects to its root");
-  if (std::ranges::all_of(data_, [&](const Datum& datum) { return datum.part == schema_.root; }))
-    throw std::invalid_argument("the samples show no part of the schema but its root");
+  if (data_.empty()) throw std::invalid_argument("the samples show nothing that can be fitted");
   hold_unseen_frames();
   for (ParameterBlock* block : blocks())
     problem_.SetManifold(memory_of(block), &manifolds_.emplace_back(*block));
@@ -140,9 +135,7 @@ std::optional<Pose> RefinementProblem::root_seen_in(const ActionPoseSample& samp
   std::vector<std::vector<Pose>> readings;  // of the root, by part
   std::vector<Matrix6d> covariances;        // of the part
   for (const PartObservation& seen : sample.parts) {
-    if (!seen.has_rotation || !X_RB.contains(seen.part) ||
-        !is_usable(seen.part, sample.sample_index))
-      continue;
+    if (!seen.has_rotation || !X_RB.contains(seen.part)) continue;
     const Pose X_BR = X_RB.at(seen.part).inverse();
     std::vector<Pose>& of_part = readings.emplace_back();
     of_part.push_back(seen.X_CB * X_BR);
@@ -219,13 +212,6 @@ void RefinementProblem::add_lens() {
   lens_block_->is_refined = options_.intrinsics;
 }
 
-bool RefinementProblem::is_usable(int part, std::int64_t sample_index) const {
-  const auto path = paths_.find(part);
-  return path != paths_.end() &&
-         std::none_of(path->second.begin(), path->second.end(),
-                      [&](const Edge* edge) { return sample_index < edge->valid_since_sample; });
-}
-
 std::vector<ParameterBlock*> RefinementProblem::chain_blocks(int part, std::int64_t sample_index) {
   std::vector<ParameterBlock*> blocks = {root_moves_ ? instants_.at(sample_index) : root_};
   for (const Edge* edge : paths_.at(part)) {
@@ -267,9 +253,7 @@ std::optional<RefinementProblem::Cost> RefinementProblem::cost_of(const TagSight
                                                                   const Eigen::VectorXd& action,
                                                                   std::int64_t sample_index) {
   const TagPlacement* tag = rig_->markers.find(sight.tag);
-  if (!tag || !is_usable(tag->part, sample_index) ||
-      has_moved(schema_.moved_tags, sight.tag, sample_index))
-    return std::nullopt;
+  if (!tag || !paths_.contains(tag->part)) return std::nullopt;
   const Matrix8d covariance = covariance_of(sight, options_.corner_noise);
   std::vector<ParameterBlock*> blocks = chain_blocks(tag->part, sample_index);
   blocks.push_back(tags_.at(sight.tag));
@@ -291,7 +275,7 @@ std::optional<RefinementProblem::Cost> RefinementProblem::cost_of(const TagSight
 std::optional<RefinementProblem::Cost> RefinementProblem::cost_of(
     const PartObservation& observation, const Eigen::VectorXd& action, std::int64_t sample_index) {
   const int part = observation.part;
-  if (!is_usable(part, sample_index)) return std::nullopt;
+  if (!paths_.contains(part)) return std::nullopt;
   std::vector<ParameterBlock*> blocks = chain_blocks(part, sample_index);
   if (!plays_.empty() && !root_moves_) blocks.push_back(instants_.at(sample_index));
   if (drive_) blocks.push_back(drive_);
@@ -447,7 +431,7 @@ Eigen::VectorXd RefinementProblem::score(const std::vector<ParameterBlock*>& blo
   return -Eigen::Map<const Eigen::VectorXd>(gradient.data(), std::ssize(gradient));
 }
 
-void RefinementProblem::leave_out_play() {
+void RefinementProblem::zero_plays() {
   for (const auto& [index, block] : instants_) {
     const auto num = std::ssize(plays_);
     std::fill_n(memory_of(block) + std::ssize(block->values) - num, num, 0);

@@ -36,10 +36,10 @@ class RefinementProblem {
     const PartObservation* observation = nullptr;  ///< of a pose
   };
 
-  /// `samples`: those to fit, ascending. `rig`: none where poses are fitted. What cannot be
-  /// used (a part that hangs on nothing, a tag that moved, a sample before an edge was valid) is
-  /// passed over. `poses_have_plays`: joints may be off their commands also where poses are fitted,
-  /// whose covariances else hold that. All arguments must outlive this.
+  /// `samples`: those to fit, as select_samples() has them. `rig`: none where poses are fitted. A
+  /// part that hangs on nothing is passed over. `poses_have_plays`: joints may be off their
+  /// commands also where poses are fitted, whose covariances else hold that. All arguments must
+  /// outlive this.
   /// @throws std::invalid_argument.
   RefinementProblem(const BodySchema& schema, const std::vector<RefinerSample>& samples,
                     const std::optional<RigCalibration>& rig, const RefineOptions& options,
@@ -51,11 +51,11 @@ class RefinementProblem {
     std::vector<ParameterBlock*> blocks;
     int part = 0;
   };
-  /// Of a tag's corners at an action; nothing if the rig has no such tag, it had moved by that
-  /// sample, its part cannot be used or is predicted behind the camera.
+  /// Of a tag's corners at an action; nothing if the rig has no such tag, or its part hangs on
+  /// nothing or is predicted behind the camera.
   std::optional<Cost> cost_of(const TagSight& sight, const Eigen::VectorXd& action,
                               std::int64_t sample_index);
-  /// Of a part's pose; nothing if the part cannot be used.
+  /// Of a part's pose; nothing if the part hangs on nothing.
   std::optional<Cost> cost_of(const PartObservation& observation, const Eigen::VectorXd& action,
                               std::int64_t sample_index);
 
@@ -79,6 +79,8 @@ class RefinementProblem {
   double* memory_of(const ParameterBlock* block) { return &memory_[memory_offsets_.at(block)]; }
   double scale() const { return scale_.value; }
   int num_iterations() const { return num_iterations_; }
+  /// Whether solve() came to where neither parameters nor scale and plays change.
+  bool has_converged() const { return has_converged_; }
   /// Of each part the tag that was seen most often.
   std::vector<int> frame_tags() const;
   bool root_moves() const { return root_moves_; }
@@ -98,7 +100,7 @@ class RefinementProblem {
   /// Parts on the way to others that were never seen: their frames are held.
   const std::vector<int>& unseen_parts() const { return unseen_parts_; }
   /// As if every joint had gone where it was told.
-  void leave_out_play();
+  void zero_plays();
   /// Of the data now, given the scale; up to a constant.
   double log_likelihood();
   /// The same, integrated over the instants: plays, and poses of a moving root (Laplace).
@@ -109,7 +111,7 @@ class RefinementProblem {
   /// After solve(): takes as exact the worse half of the joints whose plays gain less than this
   /// [nats] over none, the others' estimated. Returns whether there were some.
   bool drop_plays(double least_evidence);
-  /// play_sd(), 0 of joints that are taken as exact.
+  /// play_sd(), 0 of joints that are taken as exact or fit best as such.
   Eigen::VectorXd shown_play_sd() const;
   /// How many numbers of the data the plays took: the rest of each is its prior's.
   double num_determined_plays() const { return num_determined_plays_; }
@@ -153,7 +155,6 @@ class RefinementProblem {
   void place_blocks();
   void hold_unseen_frames();
   std::optional<Pose> root_seen_in(const ActionPoseSample& sample) const;
-  bool is_usable(int part, std::int64_t sample_index) const;
   ceres::Solver::Options solver_options();
   double estimated_scale();
   double estimate_play();
@@ -201,6 +202,7 @@ class RefinementProblem {
   std::vector<Datum> data_;
   std::vector<int> unseen_parts_;
   int num_iterations_ = 0;
+  bool has_converged_ = false;
   ceres::Problem problem_;
 };
 

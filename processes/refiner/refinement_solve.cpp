@@ -142,7 +142,8 @@ std::map<ParameterBlock*, std::vector<int>> RefinementProblem::hold_joints_at_re
 
 void RefinementProblem::solve() {
   // A step for which Cholesky fails is tried again with more damping; glog would tell the user.
-  FLAGS_minloglevel = google::GLOG_ERROR;
+  static const auto log_level = FLAGS_minloglevel = google::GLOG_ERROR;
+  static_cast<void>(log_level);
   const auto free_before = hold_joints_at_rest();
   ceres::Solver::Options options = solver_options();
   const auto run = [&](double tolerance, int max_iterations) {
@@ -152,6 +153,7 @@ void RefinementProblem::solve() {
     ceres::Solve(options, &problem_, &summary);
     num_iterations_ += static_cast<int>(summary.iterations.size());
     if (!summary.IsSolutionUsable()) throw std::runtime_error("the fit failed: " + summary.message);
+    return summary.termination_type == ceres::CONVERGENCE;
   };
   // Far from the minimum all residuals are large: with the scale that they have none is an outlier.
   std::vector<double> shares;
@@ -163,15 +165,16 @@ void RefinementProblem::solve() {
   constexpr double kSettledScale = 0.01;
   const double settled_play = rig_ ? 0.2 : 0.05;  // poses are compared by it
   constexpr int kMaxRounds = 20;
-  for (int round = 0; round < kMaxRounds; ++round) {
+  bool is_settled = false;
+  for (int round = 0; round < kMaxRounds && !is_settled; ++round) {
     run(1e-5, 10);
     const double scale = std::max(1.0, estimated_scale());
     const double change = std::abs(scale / scale_.value - 1);
     scale_.value = scale;
     const double change_of_play = estimate_play();
-    if (change < kSettledScale && change_of_play < settled_play) break;
+    is_settled = change < kSettledScale && change_of_play < settled_play;
   }
-  run(1e-9, 200);
+  has_converged_ = run(1e-9, 200) && is_settled;
   num_determined_plays_ = plays_.empty() ? 0 : determined_plays().sum();
   for (const auto& [block, directions] : free_before) set_free(block, directions);
   for (ParameterBlock* block : blocks())

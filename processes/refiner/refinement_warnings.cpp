@@ -107,6 +107,9 @@ std::vector<std::string> warnings_of_fit(RefinementProblem& problem,
           "{} of {} observations of part {} refute the refined model: another body, columns in "
           "another order, other units, or joints that are off their commands",
           num, num_seen.at(part), part));
+  if (!problem.has_converged())
+    result.emplace_back(
+        "the fit has not come to an end: deviations may be wrong; refine the refined schema again");
   if (problem.scale() > kLargeScale)
     result.push_back(fmt::format(
         "residuals are {:.1f} times as large as the noise is told to be: another body, columns in "

@@ -66,13 +66,14 @@ void RefinementWords::add(const ParameterBlock& block) {
     places_.push_back({&block, direction, name_of(block, direction)});
     RefinedParameter parameter{places_.back().element, block.kind == Kind::kTag ? block.id : -1,
                                unit_of(block, direction), change(direction), std::nullopt};
-    told_.push_back(is_told(places_.back(), first + n));
-    if (told_.back()) parameter.sd = std::sqrt(std::max(covariance_(first + n, first + n), 0.0));
+    determined_.push_back(is_determined(places_.back(), first + n));
+    if (determined_.back())
+      parameter.sd = std::sqrt(std::max(covariance_(first + n, first + n), 0.0));
     parameters_.push_back(std::move(parameter));
   }
 }
 
-bool RefinementWords::is_told(const Place& place, Eigen::Index row) const {
+bool RefinementWords::is_determined(const Place& place, Eigen::Index row) const {
   if (undetermined_shares_(row) >= kNamedShare) return false;
   const std::string unit = unit_of(*place.block, place.direction);
   double reach = 1;
@@ -170,7 +171,7 @@ std::vector<std::string> RefinementWords::undetermined() const {
   const Eigen::MatrixXd shared = open * open.transpose();
   std::vector<std::vector<Eigen::Index>> groups;  // of blocks that share open directions
   for (Eigen::Index n = 0; n < std::ssize(places_); ++n) {
-    if (told_[n]) continue;
+    if (determined_[n]) continue;
     std::vector<Eigen::Index> group = {n};
     std::erase_if(groups, [&](const std::vector<Eigen::Index>& other) {
       const bool is_same = std::ranges::any_of(other, [&](Eigen::Index m) {
@@ -243,7 +244,7 @@ std::vector<ParameterCorrelation> RefinementWords::correlations(std::size_t most
   const Eigen::VectorXd sd = covariance.diagonal().cwiseMax(0).cwiseSqrt();
   for (Eigen::Index i = 0; i < covariance.rows(); ++i) {
     for (Eigen::Index j = 0; j < i; ++j) {
-      if (!told_[i] || !told_[j]) continue;
+      if (!determined_[i] || !determined_[j]) continue;
       const double correlation = covariance(i, j) / (sd(i) * sd(j));
       if (!(std::abs(correlation) > kHighCorrelation)) continue;
       const Place &one = places_[j], &other = places_[i];

@@ -41,7 +41,7 @@ class RefinementWords {
   std::string edge_name(const ParameterBlock& block, int direction) const;
   std::string unit_of(const ParameterBlock& block, int direction) const;
   std::string thing_of(const ParameterBlock& block) const;
-  bool is_told(const Place& place, Eigen::Index row) const;
+  bool is_determined(const Place& place, Eigen::Index row) const;
   Eigen::MatrixXd in_frames_of_tags() const;
   /// Which further samples would tell these; "" if unknown.
   std::string advice(const std::vector<Place>& places) const;
@@ -51,7 +51,7 @@ class RefinementWords {
   const std::vector<int> frame_tags_;
   const std::vector<SignalCoverage> coverage_;
   std::vector<Place> places_;
-  std::vector<bool> told_;  // of each place
+  std::vector<bool> determined_;  // of each place
   std::vector<RefinedParameter> parameters_;
   Eigen::MatrixXd covariance_;           // in the frames that are told
   Eigen::VectorXd undetermined_shares_;  // of each place, 0 … 1

@@ -194,6 +194,40 @@ double distance_from_truth(const BodySchema& schema, const BodySchema& truth, in
   return distances[50];
 }
 
+// What was seen before the change is of another body; another recording counts its samples anew.
+TEST_F(RefineProgramTest, WhatMonitorRepairedIsRefinedByTheSamplesSince) {
+  Rng rng(74);
+  const SyntheticRobot robot = chapter_robot("a", rng);
+  SyntheticRobot bent = robot;
+  for (TrueLink& link : bent.links)
+    if (link.signal == 1) link.zero -= 0.06;
+  const ObservationOptions seen{.regime = Regime::kTagIso};
+  const auto write = [&](const char* file, const std::vector<ActionPoseSample>& samples) {
+    std::ofstream csv(folder_ / file);
+    write_csv(samples, csv);
+  };
+  std::vector<ActionPoseSample> changing;
+  for (int n = 0; n < 160; ++n)
+    changing.push_back(observe(n < 100 ? robot : bent, robot.random_action(rng), seen, n, rng));
+  write("healthy.csv", babble(robot, 60, seen, rng));
+  write("changing.csv", changing);
+  write("later.csv", babble(bent, 50, seen, rng));
+  ASSERT_EQ(run("learn healthy.csv --out learned --noise 0.003 1").exit_code, 0);
+  ASSERT_EQ(run("monitor learned changing.csv --out repaired").exit_code, 0);
+  const BodySchema truth = true_schema(bent);
+  const int end = truth.edges.back().to;
+  for (const std::string recording : {"changing.csv", "later.csv"}) {
+    const Json json = json_of("refine repaired " + recording + " --out refined --json");
+    const BodySchema refined = from_message(read_log(folder_ / "refined", kBodySchema).back());
+    EXPECT_LT(distance_from_truth(refined, truth, end), 0.002) << recording;
+    EXPECT_EQ(json.at("plays").size(), 0U) << recording;
+    EXPECT_EQ(json.at("held").dump().find("before it changed") != std::string::npos,
+              recording == "changing.csv")
+        << json.at("held");
+    std::filesystem::remove(folder_ / "refined");
+  }
+}
+
 // The job of robot_calibration: the URDF, robot.urdf with ends.yaml, is millimetres and degrees
 // off, and the camera sees the base and the end of seven joints, how the end is turned or not.
 class RefineKnownStructureTest : public RefineProgramTest {

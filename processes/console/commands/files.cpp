@@ -3,6 +3,7 @@
 #include <fmt/format.h>
 #include <unistd.h>
 
+#include <algorithm>
 #include <cerrno>
 #include <cmath>
 #include <cstring>
@@ -62,6 +63,13 @@ Recording load_for(const std::string& file, const BodySchema& schema) {
     std::cerr << "bodyschema: " << file << ": " << delay_text(delay) << "\n";
   }
   return recording;
+}
+
+void forget_changes_of_another(const Recording& recording, BodySchema* schema) {
+  const bool is_of_it = std::ranges::any_of(recording.samples, [&](const auto& sample) {
+    return sample.sample_index == schema->last_sample_index && sample.utime == schema->utime;
+  });
+  if (!is_of_it) forget_when_it_changed(schema);
 }
 
 void add_noise(Arguments& command, std::vector<double>& numbers, const std::string& more) {

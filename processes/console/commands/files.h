@@ -28,6 +28,9 @@ std::string delay_text(const CommandDelay& delay);
 /// said on stderr. @throws std::runtime_error.
 Recording load_for(const std::string& file, const BodySchema& schema);
 
+/// Of a schema whose last sample is not in the recording: forget_when_it_changed().
+void forget_changes_of_another(const Recording& recording, BodySchema* schema);
+
 /// Adds `--noise POS_M ROT_DEG`.
 void add_noise(Arguments& command, std::vector<double>& numbers, const std::string& more = "");
 /// Its two numbers. @throws as refuse_argument() where they are not above 0 or no noise of a

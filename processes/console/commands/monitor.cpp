@@ -16,7 +16,6 @@
 #include "processes/console/hint.h"
 #include "processes/console/views/health_view.h"
 #include "processes/console/views/structure_view.h"
-#include "processes/model_monitor/adaptation.h"
 #include "processes/model_monitor/baseline/chapter_adaptation.h"
 #include "processes/model_monitor/health/health_words.h"
 #include "processes/model_monitor/live_schema.h"
@@ -87,11 +86,11 @@ void tell_noise(const MonitorArguments& arguments, const std::optional<Noise>& n
 }
 
 /// A procedure that keeps the schema true.
-using Method = std::variant<Adaptation, ChapterAdaptation>;
+using Method = std::variant<LiveSchema, ChapterAdaptation>;
 
 Method method_of(const std::string& name, const AdaptationOptions& options,
                  const BodySchema& schema) {
-  if (name == "evidence") return Adaptation(schema, options);
+  if (name == "evidence") return LiveSchema(schema, options, {}, {});
   ChapterAdaptationOptions chapter;
   if (options.measurement.noise) {
     BaselineOptions baseline;
@@ -113,6 +112,7 @@ bool shows_any_part(const std::vector<ActionPoseSample>& samples, const BodySche
 void run_monitor(const MonitorArguments& arguments) {
   BodySchema schema = load_schema(arguments.schema);
   const Recording recording = load_for(arguments.samples, schema);
+  forget_changes_of_another(recording, &schema);
   std::optional<Recording> evaluation;
   if (!arguments.evaluate.empty()) evaluation = load_for(arguments.evaluate, schema);
   if (schema.edges.empty())
@@ -159,6 +159,7 @@ void run_monitor(const MonitorArguments& arguments) {
   schema = adapted();
   schema.base_version = schema.version;
   schema.last_sample_index = recording.samples.back().sample_index;
+  schema.utime = recording.samples.back().utime;
   schema.version = schema.last_sample_index + 1;
   write_one_event_log(arguments.out, kBodySchema, to_message(schema));
 }

@@ -48,6 +48,7 @@ Start begin_with(const RefineArguments& arguments) {
   if (arguments.structure.empty()) {
     start.schema = load_schema(arguments.schema);
     start.recording = load_for(arguments.samples, start.schema);
+    forget_changes_of_another(start.recording, &start.schema);
     return start;
   }
   std::vector<std::string> joints;

@@ -93,6 +93,9 @@ TEST(RefineCorners, FindPlacementsAndLensFromExactCorners) {
   // The common scale of prints stays what their mean is: 0.3 %/√20 of 50 mm.
   EXPECT_LT(worst.position_m, 1e-4);
   EXPECT_LT(worst.rotation_rad, 0.001 * kDegree);
+  // Exact joints are not off their commands by the least that the search knows.
+  ASSERT_EQ(result.plays.size(), 4U);
+  for (const JointPlay& play : result.plays) EXPECT_EQ(play.turn_rad, 0) << play.joint;
   EXPECT_LT(*result.after.px_rms, 1e-3);
   EXPECT_GT(*result.before.px_rms, 1);
   double mean = 0;
@@ -278,7 +281,6 @@ TEST(RefineCorners, WrongCornersAreNamedAsOutliersAndHardlyMoveTheModel) {
 
 TEST(RefineCorners, AJointThatDidNotMoveIsNamedAndNothingElse) {
   Case c(7, 40);
-  const Eigen::VectorXd still = c.samples.front().sample.action;
   Case resting = c;
   // q2 rests.
   SyntheticRobot& robot = resting.robot.robot;

@@ -49,6 +49,7 @@ BodySchema start_of(const Trial& trial, Rng& rng) {
 struct Judgement {
   double rms_m = 0;
   int num_inside = 0, num = 0;
+  double squared_distance = 0;  ///< sum of Mahalanobis's
 };
 
 Judgement judge(const BodySchema& schema, const Trial& trial) {
@@ -61,7 +62,9 @@ Judgement judge(const BodySchema& schema, const Trial& trial) {
     const Vector6d error = log(predicted->X_AB.inverse() *
                                (truth.at(trial.root()).inverse() * truth.at(trial.end_effector())));
     sum += error.head<3>().squaredNorm();
-    result.num_inside += squared_mahalanobis(error, predicted->covariance) < limit ? 1 : 0;
+    const double d2 = squared_mahalanobis(error, predicted->covariance);
+    result.squared_distance += d2;
+    result.num_inside += d2 < limit ? 1 : 0;
     ++result.num;
   }
   result.rms_m = std::sqrt(sum / result.num);
@@ -187,6 +190,23 @@ TEST(Refine, TellsByHowMuchJointsAreOffTheirCommands) {
     EXPECT_NEAR(median(told), 0.9, 0.2) << is_end_alone;
     EXPECT_GT(all.num_inside, 0.93 * all.num) << is_end_alone;
   }
+}
+
+TEST(Refine, DeviationsAreRightWhereScatterIsMostOfTheError) {
+  constexpr int kRobots = 12;
+  double sum = 0;
+  int num = 0;
+  for (int seed = 1; seed <= kRobots; ++seed) {
+    Rng rng(seed);
+    Trial trial = experiments::make_trial("c", Regime::kTag, 0, seed);
+    trial.samples = scattered(trial.robot, Eigen::Vector4d::Constant(3 * kScatter), 60, rng);
+    const Judgement judgement =
+        judge(refine(start_of(trial, rng), refiner_samples(trial.samples), {}, {}).schema, trial);
+    sum += judgement.squared_distance;
+    num += judgement.num;
+  }
+  std::cout << "mean d² of scattered " << sum / num << std::endl;
+  EXPECT_NEAR(sum / num / 6, 1, 0.15);
 }
 
 TEST(Refine, TellsWhichJointIsOffItsCommands) {
