@@ -392,7 +392,16 @@ std::vector<std::uint8_t> encode_event(const std::string& channel,
   return bytes;
 }
 
-void write_file_atomically(const std::filesystem::path& path, const std::string& text) {
+void write_file_atomically(const std::filesystem::path& given, const std::string& text) {
+  constexpr int kMaxLinks = 40;  // as Linux has it
+  std::error_code none;
+  std::filesystem::path path = given;
+  for (int hop = 0; hop < kMaxLinks && std::filesystem::is_symlink(path, none); ++hop)
+    path = path.parent_path() / std::filesystem::read_symlink(path);
+  if (std::filesystem::exists(path, none) && !std::filesystem::is_regular_file(path, none)) {
+    errno = EINVAL;
+    throw system_error(path, "expected a regular file");
+  }
   // Not named after the process: process ids repeat in containers and namespaces.
   std::random_device random;
   std::filesystem::path temporary;

@@ -225,9 +225,10 @@ std::vector<std::uint8_t> encode_event(const std::string& channel,
                                        std::int64_t event_number);
 
 /// Replaces a file as a whole: a temporary file in the same folder, synced, renamed, the folder
-/// synced. A reader of `path` sees the old or the new text, also after a power cut.
+/// synced. A reader of `file` sees the old or the new text, also after a power cut. Where it is a
+/// symbolic link, what it leads to is replaced; what is no regular file is not.
 /// @throws std::runtime_error naming the file.
-void write_file_atomically(const std::filesystem::path& path, const std::string& text);
+void write_file_atomically(const std::filesystem::path& file, const std::string& text);
 
 /// Copies a file that cannot be used as it is to "PATH.bad-1" (-2, …, the first name that is free),
 /// before it is replaced. Returns the new name. @throws std::runtime_error naming the file.

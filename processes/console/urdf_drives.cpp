@@ -1,5 +1,6 @@
 #include "processes/console/urdf_drives.h"
 
+#include <fmt/format.h>
 #include <urdf_parser/urdf_parser.h>
 
 #include <algorithm>
@@ -14,6 +15,11 @@ namespace {
 std::shared_ptr<const urdf::ModelInterface> read_urdf(const std::filesystem::path& file) {
   const auto model = urdf::parseURDF(read_file(file));
   if (!model) throw std::runtime_error(file.string() + ": expected a URDF, see the lines above");
+  for (const auto& [name, joint] : model->joints_)
+    if (const auto& parent = model->getLink(joint->child_link_name)->parent_joint; parent != joint)
+      throw std::runtime_error(fmt::format("{}: link {} is the child of two joints, {} and {}",
+                                           file.string(), joint->child_link_name, parent->name,
+                                           name));
   return model;
 }
 
@@ -43,6 +49,10 @@ void UrdfDrives::read_drive(const Yaml& entry) {
   const auto known = model_->getJoint(joint);
   if (!known) throw entry.error("joint", "the URDF has no joint " + joint);
   if (known->type == urdf::Joint::FIXED) throw entry.error("joint", "joint " + joint + " is fixed");
+  if (known->mimic)
+    throw entry.error(
+        "joint", fmt::format("joint {} mimics {} in the URDF: expected the signal there", joint,
+                             known->mimic->joint_name));
   Drive drive;
   drive.signal = static_cast<int>(signals_.size());
   drive.gain = entry.number("gain");

@@ -16,6 +16,8 @@
 #include "common/config/calibration_id.h"
 #include "common/estimation/chi_square.h"
 #include "common/estimation/quantile.h"
+#include "common/geometry/angle.h"
+#include "common/kinematics/screw_chain.h"
 #include "common/schema/warp_process.h"
 #include "processes/refiner/bends.h"
 #include "processes/refiner/calibrated_lens.h"
@@ -37,6 +39,27 @@ namespace {
 constexpr std::size_t kMostCorrelations = 20;
 /// Chosen: degrees are 57 times as many as radians.
 constexpr double kAbsurdShare = 10;
+
+/// Slides that hardly turn do not turn then. Returns how many there are.
+int make_slides_pure(BodySchema* schema) {
+  // Chosen: the likelihood decides. So small an angle is seldom a revolute joint's.
+  constexpr double kHardly = 2 * kDegree;
+  const Eigen::VectorXd middle = schema->displacements(mid_range(schema->signals));
+  int num = 0;
+  for (Edge& edge : schema->edges)
+    for (ScrewJoint& joint : edge.joints) {
+      if (!PartChain::has_block(edge) || joint.slide == 0 || joint.turn == 0 ||
+          std::abs(joint.turn) * half_travel(*schema, joint) > kHardly)
+        continue;
+      Pose turned = Pose::Identity();
+      Screw{0, joint.turn}.append_motion(joint.gain * middle(joint.signal) + joint.offset,
+                                         turned.linear(), turned.translation());
+      joint.X_after = turned * joint.X_after;
+      joint.turn = 0;
+      ++num;
+    }
+  return num;
+}
 
 /// Do the observed poses of the root differ by more than their noise is told to be?
 bool root_differs(const BodySchema& schema, const std::vector<RefinerSample>& samples,
@@ -128,6 +151,62 @@ Fit fit(const BodySchema& schema, const std::vector<RefinerSample>& samples,
       bent.problem->log_marginal_likelihood() - straight.problem->log_marginal_likelihood();
   return gain < kWarpEvidence * static_cast<double>(bends.size()) ? std::move(straight)
                                                                   : std::move(bent);
+}
+
+/// The same where slides that hardly turn do so only if that is likelier than not (BIC): nothing
+/// would tell where the axis of so small a turn is.
+Fit fit_with_pure_slides(const BodySchema& schema, const std::vector<RefinerSample>& samples,
+                         const std::optional<RigCalibration>& rig, const RefineOptions& options,
+                         bool root_moves, bool has_loads) {
+  BodySchema pure = schema;
+  const int num_pure = make_slides_pure(&pure);
+  Fit turning = fit(schema, samples, rig, options, root_moves, has_loads);
+  if (num_pure == 0) return turning;
+  Fit sliding = fit(pure, samples, rig, options, root_moves, has_loads);
+  constexpr int kParameters = 3;  // the turn, and where its axis is
+  const double gain =
+      turning.problem->log_marginal_likelihood() - sliding.problem->log_marginal_likelihood();
+  const double price = 0.5 * std::log(turning.problem->num_residuals());
+  return gain > kParameters * num_pure * price ? std::move(turning) : std::move(sliding);
+}
+
+/// Where revolute joints that slide as they turn, each by a pitch of its own, make poses likelier
+/// than bends and plays of pure ones do.
+std::optional<std::string> warning_of_pitch(const Fit& fit,
+                                            const std::vector<RefinerSample>& samples,
+                                            const RefineOptions& options, bool root_moves) {
+  constexpr double kSure = 10;  // chosen [nats], beside BIC's price
+  BodySchema helical = fit.start->schema;
+  int num = 0;
+  for (Edge& edge : helical.edges)
+    for (ScrewJoint& joint : edge.joints) {
+      if (!PartChain::has_block(edge) || joint.slide != 0 || joint.gain == 0) continue;
+      joint.slide = 1e-9 * joint.turn;  // free
+      ++num;
+    }
+  if (num == 0) return std::nullopt;
+  const std::optional<RigCalibration> no_rig;
+  RefinementProblem problem(helical, samples, no_rig, options, root_moves);
+  problem.begin_at(*fit.problem);
+  problem.solve();
+  const double price = 0.5 * std::log(problem.num_residuals());
+  if (problem.log_marginal_likelihood() - fit.problem->log_marginal_likelihood() <
+      kSure + num * price)
+    return std::nullopt;
+  double most = 0;
+  std::string words;
+  for (const ParameterBlock* block : problem.blocks()) {
+    if (block->kind != ParameterBlock::Kind::kEdge) continue;
+    const Edge edge = edge_from(*block, helical.edges[block->id]);
+    for (const ScrewJoint& joint : edge.joints) {
+      const double slide = std::abs(joint.slide) * half_travel(helical, joint);
+      if (joint.turn == 0 || slide <= most) continue;
+      most = slide;
+      words = fmt::format("{} slides as it turns, by {:.1f} mm a radian, which the model cannot",
+                          joint_name(helical, edge, joint), 1e3 * joint.slide / joint.turn);
+    }
+  }
+  return words;
 }
 
 /// All, the farthest first.
@@ -237,7 +316,8 @@ void describe(const BentSchema& start, RefinementProblem& problem,
     result->held.push_back(fmt::format("the frame of part {}: it was never seen", part));
   std::ranges::move(undetermined_things(start, problem), std::back_inserter(result->held));
   result->outliers = outliers_of(problem);
-  result->warnings = warnings_of_fit(problem, result->outliers, result->coverage);
+  std::ranges::move(warnings_of_fit(problem, result->outliers, result->coverage),
+                    std::back_inserter(result->warnings));
   result->num_outliers = static_cast<int>(result->outliers.size());
   if (result->outliers.size() > kMostOutliers) result->outliers.resize(kMostOutliers);
   const Information information(problem, options.measurement);
@@ -307,11 +387,15 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   std::ranges::move(held_things(schema, options, result.used_corners),
                     std::back_inserter(result.held));
 
-  const auto [start, solved] =
-      fit(schema, training, used_rig, stiff, result.root_moves, options.joint_loads != nullptr);
-  describe(*start, *solved, training, rig, options, &result);
+  const bool has_loads = options.joint_loads != nullptr;
+  const Fit best =
+      fit_with_pure_slides(schema, training, used_rig, stiff, result.root_moves, has_loads);
+  if (!has_loads && !result.used_corners)
+    if (auto warning = warning_of_pitch(best, training, stiff, result.root_moves))
+      result.warnings.push_back(std::move(*warning));
+  describe(*best.start, *best.problem, training, rig, options, &result);
   if (options.joint_loads && !result.used_corners)
-    result.elasticity = fit_elasticity(result.schema, training, held_out, options, *solved);
+    result.elasticity = fit_elasticity(result.schema, training, held_out, options, *best.problem);
   if (options.joint_loads && !result.elasticity)
     result.held.emplace_back("compliances of joints: no load of them changes");
   judge(schema, held_out, rig, options, &result);

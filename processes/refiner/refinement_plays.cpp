@@ -43,6 +43,17 @@ Eigen::Map<const Eigen::ArrayXd> RefinementProblem::plays_at(const ParameterBloc
   return {memory_of(&instant) + std::ssize(instant.values) - num, num};
 }
 
+std::map<std::int64_t, Eigen::VectorXd> RefinementProblem::plays_by_sample() const {
+  std::map<std::int64_t, Eigen::VectorXd> result;
+  if (plays_.empty()) return result;
+  for (const auto& [index, block] : instants_)
+    if (used_.contains(block))
+      result[index] =
+          Eigen::Map<const Eigen::VectorXd>(block->values.data(), std::ssize(block->values))
+              .tail(std::ssize(plays_));
+  return result;
+}
+
 double RefinementProblem::curvature_share() {
   const std::vector<double> d2 = squared_distances();
   double curvature = 0, weights = 0;

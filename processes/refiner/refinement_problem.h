@@ -69,6 +69,9 @@ class RefinementProblem {
   /// Those that a residual depends on: instants, root, edges, tags ascending, lens.
   std::vector<ParameterBlock*> blocks();
   const std::vector<Datum>& data() const { return data_; }
+  /// That it was made with.
+  const BodySchema& schema() const { return schema_; }
+  bool fits_corners() const { return rig_.has_value(); }
   double num_residuals() const;
   ceres::Problem& problem() { return problem_; }
   /// What Ceres makes of the values now; null: not wanted. @throws std::runtime_error.
@@ -87,6 +90,12 @@ class RefinementProblem {
   struct Joint {
     int edge = 0, joint = 0;  ///< indices into the schema's edges, and the edge's joints
   };
+  /// How far each joint is off its command, as solve() found it [command units]: by sample.
+  std::map<std::int64_t, Eigen::VectorXd> plays_by_sample() const;
+  /// The action of a sample.
+  const Eigen::VectorXd& action_of(std::int64_t sample_index) const {
+    return actions_.at(sample_index);
+  }
   /// Joints that may be off their command at every sample, and by how much, 1 σ [command units].
   const std::vector<Joint>& plays() const { return plays_; }
   const Eigen::VectorXd& play_sd() const { return play_sd_; }

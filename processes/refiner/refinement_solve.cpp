@@ -164,15 +164,18 @@ void RefinementProblem::solve() {
   // Chosen: scale and plays are estimates from few residuals, known to no more than these shares.
   constexpr double kSettledScale = 0.01;
   const double settled_play = rig_ ? 0.2 : 0.05;  // poses are compared by it
-  constexpr int kMaxRounds = 20;
+  constexpr int kMaxRounds = 40;
   bool is_settled = false;
-  for (int round = 0; round < kMaxRounds && !is_settled; ++round) {
-    run(1e-5, 10);
+  for (int round = 0; round < kMaxRounds; ++round) {
+    // In a long valley short runs go on without an end, and scale and plays seem to be settled.
+    const bool is_last = is_settled;
+    run(is_last ? 1e-9 : 1e-5, is_last ? 200 : 10);
     const double scale = std::max(1.0, estimated_scale());
     const double change = std::abs(scale / scale_.value - 1);
     scale_.value = scale;
     const double change_of_play = estimate_play();
     is_settled = change < kSettledScale && change_of_play < settled_play;
+    if (is_last && is_settled) break;
   }
   has_converged_ = run(1e-9, 200) && is_settled;
   num_determined_plays_ = plays_.empty() ? 0 : determined_plays().sum();

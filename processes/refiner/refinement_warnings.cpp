@@ -4,9 +4,12 @@
 
 #include <algorithm>
 #include <cmath>
+#include <iterator>
 #include <map>
+#include <numbers>
 #include <optional>
 
+#include "common/geometry/angle.h"
 #include "common/kinematics/screw_chain.h"
 #include "processes/refiner/elasticity.h"
 #include "processes/refiner/held_out.h"
@@ -76,7 +79,10 @@ Vector6d joint_twist(const BodySchema& schema, const Edge& edge, std::size_t joi
   return adjoint(X) * twist;
 }
 
-std::vector<std::string> warnings_of_reversed(const BodySchema& before, const BodySchema& after) {
+/// Joints that another robot has: of the other sense, another axis, or none.
+std::vector<std::string> warnings_of_axes(const BodySchema& before, const BodySchema& after) {
+  // Chosen: no arm is built so badly.
+  constexpr double kOtherAxis = 30 * kDegree, kStill = 0.1;
   std::vector<std::string> result;
   for (std::size_t e = 0; e < before.edges.size(); ++e)
     for (std::size_t d = 0; d < before.edges[e].joints.size(); ++d) {
@@ -84,10 +90,83 @@ std::vector<std::string> warnings_of_reversed(const BodySchema& before, const Bo
       const Vector6d then = joint_twist(before, before.edges[e], d),
                      now = joint_twist(after, after.edges[e], d);
       const int part = std::abs(joint.turn) > std::abs(joint.slide) ? 3 : 0;  // a metre a radian
-      if (then.segment<3>(part).dot(now.segment<3>(part)) < 0)
-        result.push_back(fmt::format("{} goes the other way round than in the model before",
-                                     joint_name(before, before.edges[e], joint)));
+      const Eigen::Vector3d axis = then.segment<3>(part), other = now.segment<3>(part);
+      const double angle = std::atan2(axis.cross(other).norm(), axis.dot(other));
+      const std::string name = joint_name(before, before.edges[e], joint);
+      if (other.norm() < kStill * axis.norm())
+        result.push_back(name + " hardly moves by its command");
+      else if (angle > std::numbers::pi - kOtherAxis)
+        result.push_back(name + " goes the other way round than in the model before");
+      else if (angle > kOtherAxis)
+        result.push_back(fmt::format("the axis of {} is {:.0f}° from that of the model before",
+                                     name, angle / kDegree));
     }
+  return result;
+}
+
+/// The share of y's sum of squares that x explains, both about their means.
+double explained_share(Eigen::VectorXd x, Eigen::VectorXd y) {
+  x.array() -= x.mean();
+  y.array() -= y.mean();
+  const double squares = x.squaredNorm() * y.squaredNorm();
+  return squares > 0 ? std::pow(x.dot(y), 2) / squares : 0;
+}
+
+/// What goes with a command, or changed at a sample, is no chance: the model lacks it.
+std::vector<std::string> warnings_of_plays(const RefinementProblem& problem) {
+  // Chosen: [nats] over chance with BIC's price of the sample where something may have changed, and
+  // what is worth a word.
+  constexpr double kSure = 10, kMuch = 0.3;
+  constexpr double kLargeShare = 0.1;  // chosen: no joint misses its command so
+  std::vector<std::string> result;
+  const BodySchema& schema = problem.schema();
+  const std::map<std::int64_t, Eigen::VectorXd> plays = problem.plays_by_sample();
+  const auto num = std::ssize(plays);
+  Eigen::MatrixXd off(num, std::ssize(problem.plays())), commands(num, std::ssize(schema.signals));
+  std::vector<std::int64_t> indices;
+  for (const auto& [index, play] : plays) {
+    off.row(std::ssize(indices)) = play;
+    commands.row(std::ssize(indices)) = problem.action_of(index);
+    indices.push_back(index);
+  }
+  const auto is_sure = [&](double share, double price) {
+    return share > kMuch && -0.5 * static_cast<double>(num) * std::log1p(-share) > kSure + price;
+  };
+  const Eigen::VectorXd sd = problem.shown_play_sd();
+  for (Eigen::Index n = 0; n < off.cols(); ++n) {
+    if (sd(n) == 0) continue;
+    const auto [e, d] = problem.plays()[static_cast<std::size_t>(n)];
+    const ScrewJoint& joint = schema.edges[e].joints[d];
+    const std::string name = joint_name(schema, schema.edges[e], joint);
+    const Signal& signal = schema.signals[joint.signal];
+    if (const double half = 0.5 * (signal.upper - signal.lower); sd(n) > kLargeShare * half)
+      result.push_back(
+          fmt::format("{} is off its command by {:.0f} % of half its range: another body, or "
+                      "columns in another "
+                      "order",
+                      name, 100 * sd(n) / half));
+    double most = 0;
+    std::string what;
+    for (Eigen::Index s = 0; s < commands.cols(); ++s) {
+      const double share = s == joint.signal ? 0 : explained_share(commands.col(s), off.col(n));
+      if (share <= most || !is_sure(share, 0)) continue;
+      most = share;
+      what = fmt::format("goes with the command of {}", schema.signals[s].name);
+    }
+    Eigen::VectorXd later = Eigen::VectorXd::Ones(num);
+    for (Eigen::Index t = 1; t < num; ++t) {
+      later(t - 1) = 0;
+      const double share = explained_share(later, off.col(n));
+      if (share <= most || !is_sure(share, std::log(num))) continue;
+      most = share;
+      what = fmt::format("changes at sample {}", indices[t]);
+    }
+    if (most > 0)
+      result.push_back(fmt::format(
+          "how far {} is off its command {} ({:.0f} % of it): {}", name, what, 100 * most,
+          what.starts_with("goes") ? "a coupling, or joints of another kind or order"
+                                   : "something moved then"));
+  }
   return result;
 }
 
@@ -130,13 +209,16 @@ std::vector<std::string> warnings_of_fit(RefinementProblem& problem,
         "deviations are told too small: more samples",
         num_numbers, num_parameters));
   if (auto warning = warning_of_units(coverage)) result.push_back(std::move(*warning));
+  // To corners all joints are fitted so, and what gravity makes of them is no surprise.
+  if (!problem.fits_corners())
+    std::ranges::move(warnings_of_plays(problem), std::back_inserter(result));
   return result;
 }
 
 std::vector<std::string> warnings_of_answer(const BodySchema& start, const Refinement& answer,
                                             const std::vector<RefinerSample>& held_out,
                                             const MeasurementModel& measurement) {
-  std::vector<std::string> result = warnings_of_reversed(start, answer.schema);
+  std::vector<std::string> result = warnings_of_axes(start, answer.schema);
   for (std::string& warning : warnings_of_worse(answer.before, answer.after))
     result.push_back(std::move(warning));
   if (answer.used_corners) return result;

@@ -13,7 +13,7 @@ std::vector<std::string> warnings_of_fit(RefinementProblem& problem,
                                          const std::vector<RefinementOutlier>& outliers,
                                          const std::vector<SignalCoverage>& coverage);
 
-/// Why an answer is not, beside the fit: joints that go the other way round than in `start`, and
+/// Why an answer is not, beside the fit: joints whose axes are others than those of `start`, and
 /// held-out samples.
 std::vector<std::string> warnings_of_answer(const BodySchema& start, const Refinement& answer,
                                             const std::vector<RefinerSample>& held_out,

@@ -207,6 +207,7 @@ TEST_F(BodyschemaProgramTest, MonitorRefusesWhatDoesNotBelongTogether) {
   expect_failure({"monitor", "schema.lcmlog", other}, "other.csv: the signals of the samples are");
   expect_failure({"monitor", "schema.lcmlog", csv, "--evaluate", other}, "other.csv");
   expect_failure({"monitor", "schema.lcmlog", csv, "--out", csv}, "--out");
+  expect_failure({"monitor", "schema.lcmlog", csv, "--out", "/dev/null"}, "no regular file");
   expect_failure({"monitor", "schema.lcmlog", csv, "--out", "no such folder/out.lcmlog"},
                  "cannot write no such");
   expect_failure({"monitor", csv, csv}, "robot.csv");

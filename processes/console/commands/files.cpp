@@ -114,6 +114,8 @@ void check_out(const std::string& out, const std::vector<std::string>& inputs,
     if (!out.empty() && std::filesystem::equivalent(out, input, is_new) && !is_new)
       throw std::invalid_argument(option + ": " + out + " is an input itself: " + input);
   if (out.empty()) return;
+  if (std::filesystem::exists(out, is_new) && !std::filesystem::is_regular_file(out, is_new))
+    throw std::invalid_argument(option + ": " + out + " is no regular file");
   const std::filesystem::path folder = std::filesystem::absolute(out).parent_path();
   if (::access(folder.c_str(), W_OK | X_OK) != 0)
     throw std::invalid_argument(option + ": cannot write " + out + ": " + std::strerror(errno));

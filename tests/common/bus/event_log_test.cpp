@@ -8,6 +8,8 @@
 #include <unistd.h>
 
 #include <algorithm>
+#include <cstring>
+#include <filesystem>
 #include <random>
 #include <stdexcept>
 #include <string>
@@ -407,6 +409,21 @@ TEST(OneEventLog, AFileThatCannotBeWrittenIsLeftAsItWas) {
   EXPECT_THROW(write_one_event_log(folder / "schema", kBodySchema, senseless), std::logic_error);
   EXPECT_EQ(read_bytes(folder / "schema"), before);
   EXPECT_THROW(write_file_atomically(folder / "none" / "x", "text"), std::runtime_error);
+}
+
+TEST(AtomicFile, OfALinkIsWhatItLeadsToAndNoDevice) {
+  const TemporaryFolder folder;
+  std::filesystem::create_symlink("middle", folder / "link");
+  std::filesystem::create_symlink(folder / "text", folder / "middle");
+  for (const char* const text : {"first", "second"}) {
+    write_file_atomically(folder / "link", text);
+    EXPECT_TRUE(std::filesystem::is_symlink(folder / "link"));
+    EXPECT_TRUE(std::filesystem::is_symlink(folder / "middle"));
+    EXPECT_EQ(read_bytes(folder / "text").size(), std::strlen(text));
+  }
+  ASSERT_EQ(::mkfifo((folder / "pipe").c_str(), 0600), 0);
+  EXPECT_THROW(write_file_atomically(folder / "pipe", "text"), std::runtime_error);
+  EXPECT_TRUE(std::filesystem::is_fifo(folder / "pipe"));
 }
 
 TEST(AtomicFile, IsReplacedAsAWholeAndReadableByOthers) {

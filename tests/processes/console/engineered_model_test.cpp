@@ -141,6 +141,12 @@ TEST_F(EngineeredModelTest, EdgesAreAsUncertainAsThePlacementSays) {
 
 TEST_F(EngineeredModelTest, WhatIsWrongIsSaid) {
   expect_error("<robot>", kPlacement, "robot.urdf: expected a URDF");
+  expect_error(replaced(kRobot, "</robot>",
+                        "<joint name=\"loop\" type=\"fixed\"><parent link=\"slide\"/><child "
+                        "link=\"wing\"/></joint></robot>"),
+               kPlacement, "link wing is the child of two joints");
+  expect_error(kRobot, replaced(kPlacement, "joint: j2", "joint: j3"),
+               "joint j3 mimics j1 in the URDF");
   expect_error(kRobot, replaced(kPlacement, "joint: j2", "joint: j7"), "the URDF has no joint j7");
   expect_error(kRobot, replaced(kPlacement, "joint: j2", "joint: j1"), "has a signal already");
   expect_error(kRobot, replaced(kPlacement, "name: b", "name: a"), "another signal is called a");
