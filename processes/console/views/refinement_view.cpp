@@ -214,8 +214,9 @@ std::string findings_text(const Refinement& result) {
                         std::ssize(result.outliers) < result.num_outliers ? ", the farthest" : "");
   for (const RefinementOutlier& outlier : result.outliers)
     text +=
-        fmt::format("    sample {}, part {}{}: {:.1f} σ\n", outlier.sample_index, outlier.part,
-                    outlier.tag < 0 ? "" : fmt::format(", tag {}", outlier.tag), outlier.distance);
+        fmt::format("    sample {}, part {}{}, image at {:.3f} s: {:.1f} σ\n", outlier.sample_index,
+                    outlier.part, outlier.tag < 0 ? "" : fmt::format(", tag {}", outlier.tag),
+                    1e-6 * static_cast<double>(outlier.image_utime), outlier.distance);
   return text;
 }
 

@@ -1,3 +1,4 @@
+#include <fmt/format.h>
 #include <gtest/gtest.h>
 
 #include <algorithm>
@@ -299,6 +300,37 @@ TEST(RefineCorners, AJointThatDidNotMoveIsNamedAndNothingElse) {
   EXPECT_LT(result.coverage[1].share, 1e-12);
   EXPECT_GT(result.coverage[0].share, 0.8);
   EXPECT_LT(*result.after.px_rms, 0.08);
+}
+
+// The end's second tag was read at one place of q4 alone: where it sits is told by how far q4 goes.
+TEST(RefineCorners, WhatATagAndAJointShareIsNamedWithWhatWouldTellThemApart) {
+  Case c(9, 0);
+  const int end = c.robot.robot.visible_parts().back();
+  std::vector<int> tags;
+  for (const TagPlacement& tag : c.rig.markers.tags)
+    if (tag.part == end) tags.push_back(tag.id);
+  for (const bool is_second : {false, true}) {
+    Signal& q4 = c.robot.robot.signals[3];
+    q4.lower = is_second ? 0.9 : -0.01;
+    q4.upper = is_second ? 0.9 : 0.01;
+    for (RefinerSample& seen :
+         test::seen_corners(c.robot, c.rig, is_second ? 40 : 80, 0.05, c.rng)) {
+      std::erase_if(seen.tags, [&](const TagSight& sight) {
+        const bool is_of_end = c.rig.markers.find(sight.tag)->part == end;
+        return is_of_end && sight.tag != (is_second ? tags[1] : tags[0]);
+      });
+      seen.sample.sample_index = std::ssize(c.samples);
+      c.samples.push_back(seen);
+    }
+  }
+  RefineOptions options = all();
+  options.config.tags = {0.05, 0.5, 0.003};
+  const Refinement result = refine(c.start, c.samples, c.rig, options);
+  const std::string advice = fmt::format("show tag {} while q4 moves", tags[1]);
+  EXPECT_TRUE(std::ranges::any_of(result.correlations, [&](const ParameterCorrelation& found) {
+    return found.advice == advice &&
+           found.other.starts_with(fmt::format("placement of tag {}", tags[1]));
+  }));
 }
 
 TEST(RefineCorners, ARootThatMovesHasAPoseAtEverySample) {
