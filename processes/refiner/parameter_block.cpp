@@ -78,15 +78,6 @@ bool BlockManifold::PlusJacobian(const double* /*x*/, double* jacobian) const {
   return true;
 }
 
-bool BlockManifold::RightMultiplyByPlusJacobian(const double* /*x*/, int num_rows,
-                                                const double* ambient_matrix,
-                                                double* tangent_matrix) const {
-  for (int row = 0; row < num_rows; ++row)
-    std::copy_n(ambient_matrix + row * AmbientSize(), TangentSize(),
-                tangent_matrix + row * TangentSize());
-  return true;
-}
-
 ParameterBlock edge_block(const Edge& edge, int index, bool is_position) {
   ParameterBlock block;
   block.kind = ParameterBlock::Kind::kEdge;

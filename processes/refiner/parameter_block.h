@@ -46,7 +46,7 @@ Pose pose_at(const double* values);
 /// Moves the free directions of a block. Cost functions write the derivative by these into the
 /// first columns of their Jacobian, so that nothing is left to multiply: the tangent is the
 /// linearisation that Ceres' LM steps in, and no other derivative by the matrices' 16 numbers
-/// exists anywhere.
+/// exists anywhere: nothing else of Ceres that asks for Jacobians may be used with it.
 class BlockManifold final : public ceres::Manifold {
  public:
   explicit BlockManifold(const ParameterBlock& block) : block_(block) {}
@@ -55,8 +55,6 @@ class BlockManifold final : public ceres::Manifold {
   int TangentSize() const override { return block_.num_free(); }
   bool Plus(const double* x, const double* delta, double* x_plus_delta) const override;
   bool PlusJacobian(const double* x, double* jacobian) const override;
-  bool RightMultiplyByPlusJacobian(const double* x, int num_rows, const double* ambient_matrix,
-                                   double* tangent_matrix) const override;
   /// Never asked by a least-squares solver.
   bool Minus(const double*, const double*, double*) const override { return false; }
   bool MinusJacobian(const double*, double*) const override { return false; }
