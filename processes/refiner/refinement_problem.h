@@ -72,6 +72,10 @@ class RefinementProblem {
   /// That it was made with.
   const BodySchema& schema() const { return schema_; }
   bool fits_corners() const { return rig_.has_value(); }
+  /// Of an observed pose, as told.
+  Matrix6d told_covariance(const PartObservation& observation) const {
+    return options_.measurement.covariance(observation);
+  }
   double num_residuals() const;
   ceres::Problem& problem() { return problem_; }
   /// What Ceres makes of the values now; null: not wanted. @throws std::runtime_error.

@@ -112,11 +112,42 @@ double explained_share(Eigen::VectorXd x, Eigen::VectorXd y) {
   return squares > 0 ? std::pow(x.dot(y), 2) / squares : 0;
 }
 
-/// What goes with a command, or changed at a sample, is no chance: the model lacks it.
-std::vector<std::string> warnings_of_plays(const RefinementProblem& problem) {
-  // Chosen: [nats] over chance with BIC's price of the sample where something may have changed, and
-  // what is worth a word.
+/// How far a joint is off its command over the samples, and what that goes with.
+struct PlayCause {
+  double share = 0;   ///< of its sum of squares
+  std::string words;  ///< "" where it is chance
+};
+
+/// A command, or the time. `off`: by sample; `commands`: samples × signals.
+PlayCause cause_of(const Eigen::VectorXd& off, const Eigen::MatrixXd& commands, int own_signal,
+                   const std::vector<Signal>& signals, const std::vector<std::int64_t>& indices) {
+  // Chosen: [nats] over chance, with the price of the sample at which it may have changed, and what
+  // is worth a word.
   constexpr double kSure = 10, kMuch = 0.3;
+  const auto num = off.size();
+  PlayCause result;
+  const auto consider = [&](const Eigen::VectorXd& x, double price, const std::string& words) {
+    const double share = explained_share(x, off);
+    const double gain = -0.5 * static_cast<double>(num) * std::log1p(-share);
+    if (share > std::max(kMuch, result.share) && gain > kSure + price) result = {share, words};
+  };
+  for (Eigen::Index s = 0; s < commands.cols(); ++s)
+    if (s != own_signal)
+      consider(commands.col(s), 0,
+               fmt::format("goes with the command of {}: a coupling, or joints of another kind or "
+                           "order",
+                           signals[s].name));
+  Eigen::VectorXd later = Eigen::VectorXd::Ones(num);
+  for (Eigen::Index t = 1; t < num; ++t) {
+    later(t - 1) = 0;
+    consider(later, std::log(num),
+             fmt::format("changes at sample {}: something moved then", indices[t]));
+  }
+  return result;
+}
+
+/// What is no chance the model lacks.
+std::vector<std::string> warnings_of_plays(const RefinementProblem& problem) {
   constexpr double kLargeShare = 0.1;  // chosen: no joint misses its command so
   std::vector<std::string> result;
   const BodySchema& schema = problem.schema();
@@ -129,9 +160,6 @@ std::vector<std::string> warnings_of_plays(const RefinementProblem& problem) {
     commands.row(std::ssize(indices)) = problem.action_of(index);
     indices.push_back(index);
   }
-  const auto is_sure = [&](double share, double price) {
-    return share > kMuch && -0.5 * static_cast<double>(num) * std::log1p(-share) > kSure + price;
-  };
   const Eigen::VectorXd sd = problem.shown_play_sd();
   for (Eigen::Index n = 0; n < off.cols(); ++n) {
     if (sd(n) == 0) continue;
@@ -141,33 +169,64 @@ std::vector<std::string> warnings_of_plays(const RefinementProblem& problem) {
     const Signal& signal = schema.signals[joint.signal];
     if (const double half = 0.5 * (signal.upper - signal.lower); sd(n) > kLargeShare * half)
       result.push_back(
-          fmt::format("{} is off its command by {:.0f} % of half its range: another body, or "
-                      "columns in another "
-                      "order",
+          fmt::format("{} is off its command by {:.0f} % of half its range: another "
+                      "body, or columns in another order",
                       name, 100 * sd(n) / half));
-    double most = 0;
-    std::string what;
-    for (Eigen::Index s = 0; s < commands.cols(); ++s) {
-      const double share = s == joint.signal ? 0 : explained_share(commands.col(s), off.col(n));
-      if (share <= most || !is_sure(share, 0)) continue;
-      most = share;
-      what = fmt::format("goes with the command of {}", schema.signals[s].name);
-    }
-    Eigen::VectorXd later = Eigen::VectorXd::Ones(num);
-    for (Eigen::Index t = 1; t < num; ++t) {
-      later(t - 1) = 0;
-      const double share = explained_share(later, off.col(n));
-      if (share <= most || !is_sure(share, std::log(num))) continue;
-      most = share;
-      what = fmt::format("changes at sample {}", indices[t]);
-    }
-    if (most > 0)
-      result.push_back(fmt::format(
-          "how far {} is off its command {} ({:.0f} % of it): {}", name, what, 100 * most,
-          what.starts_with("goes") ? "a coupling, or joints of another kind or order"
-                                   : "something moved then"));
+    if (const PlayCause cause =
+            cause_of(off.col(n), commands, joint.signal, schema.signals, indices);
+        cause.share > 0)
+      result.push_back(fmt::format("{:.0f} % of how far {} is off its command {}",
+                                   100 * cause.share, name, cause.words));
   }
   return result;
+}
+
+/// Where a root that rests was seen elsewhere from some sample on.
+std::optional<std::string> warning_of_moved_root(RefinementProblem& problem) {
+  // Chosen [nats], beside the price of six numbers and of the sample.
+  constexpr double kSure = 10, kMostSigma = 4;
+  if (problem.fits_corners() || problem.root_moves()) return std::nullopt;
+  std::vector<std::int64_t> indices;
+  std::vector<Vector6d> errors;  // whitened, wild ones bounded
+  for (const auto& datum : problem.data()) {
+    if (datum.part != problem.schema().root || datum.num_residuals != 6) continue;
+    const Matrix6d covariance = problem.told_covariance(*datum.observation);
+    const Vector6d error =
+        log(problem.X_CR(datum.sample_index).inverse() * datum.observation->X_CB);
+    errors.push_back((Vector6d(covariance.llt().matrixL().solve(error)) / problem.scale())
+                         .cwiseMax(-kMostSigma)
+                         .cwiseMin(kMostSigma));
+    indices.push_back(datum.sample_index);
+  }
+  const auto num = std::ssize(errors);
+  if (num < 3) return std::nullopt;
+  const Eigen::Map<const Eigen::Matrix<double, 6, Eigen::Dynamic>> all(errors.front().data(), 6,
+                                                                       num);
+  double most = 0;
+  Eigen::Index at = 0;
+  const auto gain_at = [&](Eigen::Index t) {
+    const Vector6d step =
+        all.rightCols(num - t).rowwise().mean() - all.leftCols(t).rowwise().mean();
+    return 0.5 * step.squaredNorm() * static_cast<double>(t) * static_cast<double>(num - t) /
+           static_cast<double>(num);
+  };
+  for (Eigen::Index t = 1; t < num; ++t)
+    if (const double gain = gain_at(t); gain > most) {
+      most = gain;
+      at = t;
+    }
+  // Errors of successive samples that are alike count less (AR(1)).
+  Eigen::MatrixXd rest = all;
+  rest.leftCols(at).colwise() -= Vector6d(all.leftCols(at).rowwise().mean());
+  rest.rightCols(num - at).colwise() -= Vector6d(all.rightCols(num - at).rowwise().mean());
+  const double correlation = std::clamp(
+      rest.leftCols(num - 1).cwiseProduct(rest.rightCols(num - 1)).sum() / rest.squaredNorm(), 0.0,
+      0.99);
+  const double worth = (1 - correlation) / (1 + correlation) *
+                       std::min(1.0, 6 * static_cast<double>(num) / rest.squaredNorm());
+  if (!(worth * most > kSure + 4 * std::log(num))) return std::nullopt;  // 0/0 where all is exact
+  return fmt::format("the camera, or part {}, moved at sample {}: give the samples since or before",
+                     problem.schema().root, indices[static_cast<std::size_t>(at)]);
 }
 
 }  // namespace
@@ -212,6 +271,7 @@ std::vector<std::string> warnings_of_fit(RefinementProblem& problem,
   // To corners all joints are fitted so, and what gravity makes of them is no surprise.
   if (!problem.fits_corners())
     std::ranges::move(warnings_of_plays(problem), std::back_inserter(result));
+  if (auto warning = warning_of_moved_root(problem)) result.push_back(std::move(*warning));
   return result;
 }
 

@@ -200,6 +200,18 @@ TEST(RefineWarnings, NameTheSampleAtWhichAJointSlipped) {
       << fmt::format("{}", fmt::join(warnings, "\n"));
 }
 
+TEST(RefineWarnings, NameTheSampleAtWhichTheCameraMoved) {
+  const auto bumped = [](const Eigen::VectorXd& action, int n, SyntheticRobot* robot) {
+    Vector6d step = Vector6d::Zero();
+    step(0) = 0.008;
+    if (n >= 50) robot->X_CR = exp(step) * robot->X_CR;
+    return action;
+  };
+  const std::vector<std::string> warnings = warnings_of(bumped);
+  EXPECT_TRUE(names(warnings, "moved at sample 50"))
+      << fmt::format("{}", fmt::join(warnings, "\n"));
+}
+
 TEST(RefineWarnings, NameAJointThatSlidesAsItTurns) {
   const auto helical = [](const Eigen::VectorXd& action, int, SyntheticRobot* robot) {
     for (test::TrueLink& link : robot->links)
