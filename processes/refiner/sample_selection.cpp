@@ -180,8 +180,9 @@ SampleSelection select_samples(const BodySchema& schema, std::vector<RefinerSamp
     result.left_out.push_back(
         fmt::format("what {} samples show of the body before it changed: not fitted", num_old));
   for (RefinerSample& seen : result.held_out) body.leave_out_old(&seen);
-  std::erase_if(result.held_out,
-                [&](const RefinerSample& seen) { return seen.sample.parts.empty(); });
+  std::erase_if(result.held_out, [](const RefinerSample& seen) {
+    return seen.sample.parts.empty() && seen.tags.empty();
+  });
   const ShownBody fitted(schema, fits_corners ? &*rig : nullptr);
   const auto num_empty = std::erase_if(
       result.training, [&](const RefinerSample& seen) { return !fitted.is_seen_in(seen); });
