@@ -3,6 +3,7 @@
 // rendered images, with errors of its tags and its lens; a real recording. Prints Markdown.
 //
 //   refinement robots [--robots 100] [--kinds a c d] [--noise tag flips chapter]
+//     [--samples 10 20 30 50 100]
 //   refinement nominal [--robots 100]
 //   refinement rig config/arm7 [--seeds 10]
 //   refinement recording CSV
@@ -86,8 +87,9 @@ std::vector<ActionPoseSample> with_flips(std::vector<ActionPoseSample> samples, 
   return samples;
 }
 
-void compare(const std::string& kind, test::Regime regime, bool has_flips, int num_robots) {
-  for (const int size : {10, 20, 30, 50, 100}) {
+void compare(const std::string& kind, test::Regime regime, bool has_flips,
+             const std::vector<int>& sizes, int num_robots) {
+  for (const int size : sizes) {
     Errors learned, refined;
     double bounds = 0;
     int num_right = 0;
@@ -123,7 +125,7 @@ void compare(const std::string& kind, test::Regime regime, bool has_flips, int n
 }
 
 void run_robots(const std::vector<std::string>& kinds, const std::vector<std::string>& noise,
-                int num_robots) {
+                const std::vector<int>& sizes, int num_robots) {
   std::printf(
       "Robots of the chapter whose structure was found; rms over robots and test poses of the end "
       "effector's position, coverage of the predicted ellipsoids of 95 %%.\n\n"
@@ -133,7 +135,7 @@ void run_robots(const std::vector<std::string>& kinds, const std::vector<std::st
   for (const std::string& kind : kinds)
     for (const std::string& of : noise)
       compare(kind, of == "chapter" ? test::Regime::kChapter : test::Regime::kTag, of == "flips",
-              num_robots);
+              sizes, num_robots);
 }
 
 /// A model as built, every length and angle of it off by 5 mm and 1° per axis; the arm's base and
@@ -437,9 +439,11 @@ int main(int argc, char** argv) {
   int num_robots = 100, num_seeds = 10, num_samples = 100;
   std::string rig, file;
   std::vector<std::string> kinds{"a", "c", "d"}, noise{"tag", "flips", "chapter"};
+  std::vector<int> sizes{10, 20, 30, 50, 100};
   CLI::App* robots = app.add_subcommand("robots", "random robots beside the Cramér–Rao bound");
   robots->add_option("--robots", num_robots);
   robots->add_option("--kinds", kinds, "chapter_robot()");
+  robots->add_option("--samples", sizes);
   robots->add_option("--noise", noise)->check(CLI::IsMember({"tag", "flips", "chapter"}));
   CLI::App* nominal = app.add_subcommand("nominal", "models as built, base and end seen");
   nominal->add_option("--robots", num_robots);
@@ -450,7 +454,7 @@ int main(int argc, char** argv) {
   CLI::App* recording = app.add_subcommand("recording", "a CSV, 70 % of it for training");
   recording->add_option("CSV", file)->required();
   CLI11_PARSE(app, argc, argv);
-  if (*robots) run_robots(kinds, noise, num_robots);
+  if (*robots) run_robots(kinds, noise, sizes, num_robots);
   if (*nominal) run_nominal(num_robots);
   if (*rigs) run_rig(rig, num_seeds, num_samples);
   if (*recording) run_recording(file);
