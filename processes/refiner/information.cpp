@@ -89,12 +89,15 @@ Information::Information(RefinementProblem& problem, const MeasurementModel& mea
   }
   const Weights weights(problem.data(), problem.squared_distances(), num_parameters,
                         problem.num_determined_plays());
+  const double correlation = problem.serial_correlation();
   // A joint that rested would seem to have moved by its play.
   problem.zero_plays();
   // What is held has a derivative too.
   for (ParameterBlock* block : problem.blocks())
     if (!block->is_refined) problem.problem().SetParameterBlockVariable(problem.memory_of(block));
-  const Sums sums = weighted(problem, weights, measurement);
+  Sums sums = weighted(problem, weights, measurement);
+  // The sum of a first-order autoregression's errors, over that of white ones.
+  sums.B *= (1 + correlation) / (1 - correlation);
   for (ParameterBlock* block : problem.blocks())
     if (!block->is_refined) problem.problem().SetParameterBlockConstant(problem.memory_of(block));
   invert(problem, sums, weights);

@@ -17,8 +17,9 @@ namespace bodyschema {
 ///
 /// w the Student-t weights, P the priors' information (the plays' too), α and β the means of the
 /// second derivative and of the squared score per weight over all residuals, G what an error does
-/// that several poses share (shared_errors.h). K C Kᵀ is what the held parameters' priors C (tags,
-/// lens) make of the refined ones.
+/// that several poses share (shared_errors.h); where residuals of successive samples are correlated
+/// by ρ, the β H of B is (1 + ρ) / (1 − ρ) times as large. K C Kᵀ is what the held parameters'
+/// priors C (tags, lens) make of the refined ones.
 class Information {
  public:
   /// `measurement`: of poses. `num_not_fitted`: free directions that the fit did not move.

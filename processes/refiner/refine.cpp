@@ -61,13 +61,64 @@ int make_slides_pure(BodySchema* schema) {
   return num;
 }
 
-/// Do the observed poses of the root differ by more than their noise is told to be?
-bool root_differs(const BodySchema& schema, const std::vector<RefinerSample>& samples,
-                  const MeasurementModel& measurement) {
+/// Observed poses of the root.
+struct SeenRoot {
   std::vector<const PartObservation*> seen;
+  std::vector<std::int64_t> indices;  ///< of their samples
+};
+SeenRoot seen_root(const BodySchema& schema, const std::vector<RefinerSample>& samples) {
+  SeenRoot result;
   for (const RefinerSample& sample : samples)
-    if (const PartObservation* o = sample.sample.find(schema.root); o && o->has_rotation)
-      seen.push_back(o);
+    if (const PartObservation* o = sample.sample.find(schema.root); o && o->has_rotation) {
+      result.seen.push_back(o);
+      result.indices.push_back(index_of(sample));
+    }
+  return result;
+}
+
+/// The sample from which on it was seen elsewhere, if there is one.
+std::optional<std::int64_t> step_of(const SeenRoot& root, const MeasurementModel& measurement) {
+  // Chosen: [nats] beside the price of six numbers and of the sample; wild poses are bounded.
+  constexpr double kSure = 10, kMostSigma = 4;
+  const auto num = std::ssize(root.seen);
+  if (num < 4) return std::nullopt;
+  Eigen::Matrix<double, 6, Eigen::Dynamic> errors(6, num);  // whitened, from the first pose
+  for (Eigen::Index n = 0; n < num; ++n) {
+    const PartObservation& o = *root.seen[static_cast<std::size_t>(n)];
+    errors.col(n) = measurement.covariance(o).llt().matrixL().solve(
+        log(root.seen.front()->X_CB.inverse() * o.X_CB));
+  }
+  for (Eigen::Index row = 0; row < 6; ++row) {
+    const double middle =
+        median(std::vector<double>(errors.row(row).begin(), errors.row(row).end()));
+    errors.row(row) = (errors.row(row).array() - middle).cwiseMax(-kMostSigma).cwiseMin(kMostSigma);
+  }
+  double most = 0;
+  Eigen::Index at = 1;
+  for (Eigen::Index t = 1; t < num; ++t) {
+    const Vector6d step =
+        errors.rightCols(num - t).rowwise().mean() - errors.leftCols(t).rowwise().mean();
+    const double gain =
+        0.5 * step.squaredNorm() * static_cast<double>(t * (num - t)) / static_cast<double>(num);
+    if (gain > most) {
+      most = gain;
+      at = t;
+    }
+  }
+  // Of noise that is larger than told, or lasts from sample to sample (AR(1)), it is less.
+  errors.leftCols(at).colwise() -= Vector6d(errors.leftCols(at).rowwise().mean());
+  errors.rightCols(num - at).colwise() -= Vector6d(errors.rightCols(num - at).rowwise().mean());
+  const double squares = std::max(errors.squaredNorm(), 1e-300);
+  const double correlation = std::clamp(
+      errors.leftCols(num - 1).cwiseProduct(errors.rightCols(num - 1)).sum() / squares, 0.0, 0.99);
+  const double worth =
+      (1 - correlation) / (1 + correlation) * std::min(1.0, 6 * static_cast<double>(num) / squares);
+  if (worth * most < kSure + 4 * std::log(num)) return std::nullopt;
+  return root.indices[static_cast<std::size_t>(at)];
+}
+
+/// Do its poses differ by more than their noise is told to be?
+bool differs(const std::vector<const PartObservation*>& seen, const MeasurementModel& measurement) {
   if (seen.empty()) return false;
   // The one that most of the others agree with.
   double best = std::numeric_limits<double>::infinity();
@@ -86,10 +137,14 @@ bool root_differs(const BodySchema& schema, const std::vector<RefinerSample>& sa
 
 /// Where the root differs: whether a pose of it at every sample is worth its parameters (Schwarz
 /// 1978), with the noise as large as either fit leaves; told too small, a root that rests differs,
-/// too, but the other parts do not go with it.
+/// too, but the other parts do not go with it. Where it was seen elsewhere from `step` on, two
+/// poses are all that there are, and one at every sample may gain chance alone, with a margin.
 bool root_moves(const BodySchema& schema, const std::vector<RefinerSample>& samples,
-                const std::optional<RigCalibration>& rig, const RefineOptions& options) {
-  if (!root_differs(schema, samples, options.measurement)) return false;
+                const std::optional<RigCalibration>& rig, const RefineOptions& options,
+                std::optional<std::int64_t>* step) {
+  const SeenRoot root = seen_root(schema, samples);
+  *step = step_of(root, options.measurement);
+  if (!*step && !differs(root.seen, options.measurement)) return false;
   double log_likelihoods[2];
   double num_residuals = 0;
   for (const bool moves : {false, true}) {
@@ -99,7 +154,8 @@ bool root_moves(const BodySchema& schema, const std::vector<RefinerSample>& samp
     num_residuals = problem.num_residuals();
   }
   const double num_more = 6 * (static_cast<double>(samples.size()) - 1);
-  return log_likelihoods[1] - log_likelihoods[0] > num_more * std::log(num_residuals) / 2;
+  return log_likelihoods[1] - log_likelihoods[0] >
+         num_more * (*step ? 1 : std::log(num_residuals) / 2);
 }
 
 /// Solved. With `has_plays`, joints of poses have those that gain more than BIC's price (Schwarz
@@ -320,6 +376,7 @@ void describe(const BentSchema& start, RefinementProblem& problem,
                     std::back_inserter(result->warnings));
   result->num_outliers = static_cast<int>(result->outliers.size());
   if (result->outliers.size() > kMostOutliers) result->outliers.resize(kMostOutliers);
+  result->serial_correlation = problem.serial_correlation();
   const Information information(problem, options.measurement);
   const RefinementWords words(start.schema, information, problem.frame_tags(), result->coverage);
   result->num_observations = static_cast<int>(problem.data().size());
@@ -378,9 +435,15 @@ Refinement refine(const BodySchema& schema, std::vector<RefinerSample> samples,
   result.num_available = static_cast<int>(training.size());
   RefineOptions stiff = options;
   stiff.joint_loads = nullptr;
+  std::optional<std::int64_t> step;
   result.root_moves =
       root_moves(schema, thinned(training, static_cast<std::size_t>(options.config.max_samples)),
-                 used_rig, stiff);
+                 used_rig, stiff, &step);
+  if (step)
+    result.warnings.push_back(fmt::format(
+        "part {} was seen elsewhere from sample {} on: {}", schema.root, *step,
+        result.root_moves ? "the camera, or the robot, moved; each sample has a place of it"
+                          : "its marker moved on it; give the samples since then"));
   training = informative(std::move(training), schema, used_rig, stiff, result.root_moves);
   result.num_samples = static_cast<int>(training.size());
   result.coverage = coverage_of(schema, training);

@@ -127,6 +127,9 @@ struct Refinement {
   int num_iterations = 0;
   /// The residuals are this many times as large as told (≥ 1).
   double noise_scale = 1;
+  /// Of the residuals of one sample with those of the next; 0 unless significant. Deviations are
+  /// those of errors that last so.
+  double serial_correlation = 0;
   std::vector<RefinedParameter> parameters;
   std::vector<std::string> undetermined;           ///< directions, in words
   std::vector<ParameterCorrelation> correlations;  ///< above kHighCorrelation, the highest first

@@ -408,6 +408,42 @@ std::vector<double> RefinementProblem::squared_distances() {
   return result;
 }
 
+double RefinementProblem::serial_correlation() {
+  // Chosen: of white noise one series in a thousand has an axis beyond it.
+  constexpr double kSignificant = 3.5, kLargest = 0.98;
+  constexpr int kFewest = 20;
+  ceres::Problem::EvaluateOptions options;
+  options.apply_loss_function = false;
+  for (const Datum& datum : data_) options.residual_blocks.push_back(datum.id);
+  std::vector<double> residuals;
+  evaluate(options, &residuals, nullptr, nullptr);
+  struct Last {
+    std::int64_t sample_index = 0;
+    Eigen::VectorXd influence;
+  };
+  std::map<std::pair<int, int>, Last> last;  // by part and tag
+  Eigen::Matrix<double, 8, 1> products = Eigen::Matrix<double, 8, 1>::Zero(), squares = products;
+  double count = 0;
+  const double* r = residuals.data();
+  for (const Datum& datum : data_) {
+    const Eigen::Map<const Eigen::VectorXd> residual(r, datum.num_residuals);
+    r += datum.num_residuals;
+    const Eigen::VectorXd influence =
+        robust_weight(residual.squaredNorm(), datum.num_residuals) * residual;
+    Last& before = last[{datum.part, datum.tag}];
+    if (before.influence.size() == influence.size() &&
+        before.sample_index + 1 == datum.sample_index) {
+      products.head(influence.size()) += before.influence.cwiseProduct(influence);
+      squares.head(influence.size()) +=
+          0.5 * (before.influence.cwiseAbs2() + influence.cwiseAbs2());
+      ++count;
+    }
+    before = {datum.sample_index, influence};
+  }
+  const double seen = products.cwiseQuotient(squares.cwiseMax(1e-300)).maxCoeff();
+  return count >= kFewest && seen > kSignificant / std::sqrt(count) ? std::min(seen, kLargest) : 0;
+}
+
 double RefinementProblem::num_residuals() const {
   double sum = 0;
   for (const Datum& datum : data_) sum += datum.num_residuals;

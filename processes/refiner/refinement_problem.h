@@ -72,10 +72,6 @@ class RefinementProblem {
   /// That it was made with.
   const BodySchema& schema() const { return schema_; }
   bool fits_corners() const { return rig_.has_value(); }
-  /// Of an observed pose, as told.
-  Matrix6d told_covariance(const PartObservation& observation) const {
-    return options_.measurement.covariance(observation);
-  }
   double num_residuals() const;
   ceres::Problem& problem() { return problem_; }
   /// What Ceres makes of the values now; null: not wanted. @throws std::runtime_error.
@@ -133,6 +129,9 @@ class RefinementProblem {
   const DriveModel& drive_model() const { return drive_model_; }
   /// Derivative of the log posterior by the free directions of these blocks, now.
   Eigen::VectorXd score(const std::vector<ParameterBlock*>& blocks);
+  /// Of the residuals of one sample with those of the next, in that axis where it is largest; 0
+  /// unless significant and positive.
+  double serial_correlation();
   /// d² of each datum now.
   std::vector<double> squared_distances();
   /// Standard deviations of a block's whole tangent beforehand; empty: nothing is known.

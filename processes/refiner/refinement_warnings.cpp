@@ -89,7 +89,10 @@ std::vector<std::string> warnings_of_axes(const BodySchema& before, const BodySc
       const ScrewJoint& joint = before.edges[e].joints[d];
       const Vector6d then = joint_twist(before, before.edges[e], d),
                      now = joint_twist(after, after.edges[e], d);
-      const int part = std::abs(joint.turn) > std::abs(joint.slide) ? 3 : 0;  // a metre a radian
+      const bool turns = std::abs(joint.turn) > std::abs(joint.slide);  // a metre a radian
+      const ScrewJoint& refined = after.edges[e].joints[d];
+      if (turns && refined.turn == 0 && refined.slide != 0) continue;  // about an axis far away
+      const int part = turns ? 3 : 0;
       const Eigen::Vector3d axis = then.segment<3>(part), other = now.segment<3>(part);
       const double angle = std::atan2(axis.cross(other).norm(), axis.dot(other));
       const std::string name = joint_name(before, before.edges[e], joint);
@@ -120,7 +123,8 @@ struct PlayCause {
 
 /// A command, or the time. `off`: by sample; `commands`: samples × signals.
 PlayCause cause_of(const Eigen::VectorXd& off, const Eigen::MatrixXd& commands, int own_signal,
-                   const std::vector<Signal>& signals, const std::vector<std::int64_t>& indices) {
+                   const std::vector<Signal>& signals, const std::vector<std::int64_t>& indices,
+                   double worth) {
   // Chosen: [nats] over chance, with the price of the sample at which it may have changed, and what
   // is worth a word.
   constexpr double kSure = 10, kMuch = 0.3;
@@ -128,7 +132,7 @@ PlayCause cause_of(const Eigen::VectorXd& off, const Eigen::MatrixXd& commands, 
   PlayCause result;
   const auto consider = [&](const Eigen::VectorXd& x, double price, const std::string& words) {
     const double share = explained_share(x, off);
-    const double gain = -0.5 * static_cast<double>(num) * std::log1p(-share);
+    const double gain = -0.5 * worth * static_cast<double>(num) * std::log1p(-share);
     if (share > std::max(kMuch, result.share) && gain > kSure + price) result = {share, words};
   };
   for (Eigen::Index s = 0; s < commands.cols(); ++s)
@@ -147,7 +151,7 @@ PlayCause cause_of(const Eigen::VectorXd& off, const Eigen::MatrixXd& commands, 
 }
 
 /// What is no chance the model lacks.
-std::vector<std::string> warnings_of_plays(const RefinementProblem& problem) {
+std::vector<std::string> warnings_of_plays(RefinementProblem& problem) {
   constexpr double kLargeShare = 0.1;  // chosen: no joint misses its command so
   std::vector<std::string> result;
   const BodySchema& schema = problem.schema();
@@ -160,6 +164,8 @@ std::vector<std::string> warnings_of_plays(const RefinementProblem& problem) {
     commands.row(std::ssize(indices)) = problem.action_of(index);
     indices.push_back(index);
   }
+  const double correlation = problem.serial_correlation();
+  const double worth = (1 - correlation) / (1 + correlation);
   const Eigen::VectorXd sd = problem.shown_play_sd();
   for (Eigen::Index n = 0; n < off.cols(); ++n) {
     if (sd(n) == 0) continue;
@@ -173,60 +179,12 @@ std::vector<std::string> warnings_of_plays(const RefinementProblem& problem) {
                       "body, or columns in another order",
                       name, 100 * sd(n) / half));
     if (const PlayCause cause =
-            cause_of(off.col(n), commands, joint.signal, schema.signals, indices);
+            cause_of(off.col(n), commands, joint.signal, schema.signals, indices, worth);
         cause.share > 0)
       result.push_back(fmt::format("{:.0f} % of how far {} is off its command {}",
                                    100 * cause.share, name, cause.words));
   }
   return result;
-}
-
-/// Where a root that rests was seen elsewhere from some sample on.
-std::optional<std::string> warning_of_moved_root(RefinementProblem& problem) {
-  // Chosen [nats], beside the price of six numbers and of the sample.
-  constexpr double kSure = 10, kMostSigma = 4;
-  if (problem.fits_corners() || problem.root_moves()) return std::nullopt;
-  std::vector<std::int64_t> indices;
-  std::vector<Vector6d> errors;  // whitened, wild ones bounded
-  for (const auto& datum : problem.data()) {
-    if (datum.part != problem.schema().root || datum.num_residuals != 6) continue;
-    const Matrix6d covariance = problem.told_covariance(*datum.observation);
-    const Vector6d error =
-        log(problem.X_CR(datum.sample_index).inverse() * datum.observation->X_CB);
-    errors.push_back((Vector6d(covariance.llt().matrixL().solve(error)) / problem.scale())
-                         .cwiseMax(-kMostSigma)
-                         .cwiseMin(kMostSigma));
-    indices.push_back(datum.sample_index);
-  }
-  const auto num = std::ssize(errors);
-  if (num < 3) return std::nullopt;
-  const Eigen::Map<const Eigen::Matrix<double, 6, Eigen::Dynamic>> all(errors.front().data(), 6,
-                                                                       num);
-  double most = 0;
-  Eigen::Index at = 0;
-  const auto gain_at = [&](Eigen::Index t) {
-    const Vector6d step =
-        all.rightCols(num - t).rowwise().mean() - all.leftCols(t).rowwise().mean();
-    return 0.5 * step.squaredNorm() * static_cast<double>(t) * static_cast<double>(num - t) /
-           static_cast<double>(num);
-  };
-  for (Eigen::Index t = 1; t < num; ++t)
-    if (const double gain = gain_at(t); gain > most) {
-      most = gain;
-      at = t;
-    }
-  // Errors of successive samples that are alike count less (AR(1)).
-  Eigen::MatrixXd rest = all;
-  rest.leftCols(at).colwise() -= Vector6d(all.leftCols(at).rowwise().mean());
-  rest.rightCols(num - at).colwise() -= Vector6d(all.rightCols(num - at).rowwise().mean());
-  const double correlation = std::clamp(
-      rest.leftCols(num - 1).cwiseProduct(rest.rightCols(num - 1)).sum() / rest.squaredNorm(), 0.0,
-      0.99);
-  const double worth = (1 - correlation) / (1 + correlation) *
-                       std::min(1.0, 6 * static_cast<double>(num) / rest.squaredNorm());
-  if (!(worth * most > kSure + 4 * std::log(num))) return std::nullopt;  // 0/0 where all is exact
-  return fmt::format("the camera, or part {}, moved at sample {}: give the samples since or before",
-                     problem.schema().root, indices[static_cast<std::size_t>(at)]);
 }
 
 }  // namespace
@@ -271,7 +229,6 @@ std::vector<std::string> warnings_of_fit(RefinementProblem& problem,
   // To corners all joints are fitted so, and what gravity makes of them is no surprise.
   if (!problem.fits_corners())
     std::ranges::move(warnings_of_plays(problem), std::back_inserter(result));
-  if (auto warning = warning_of_moved_root(problem)) result.push_back(std::move(*warning));
   return result;
 }
 

@@ -255,6 +255,7 @@ Json refinement_json(const Refinement& result, const std::optional<RigCalibratio
   json["iterations"] = result.num_iterations;
   json["seconds"] = result.seconds;
   json["noise_scale"] = result.noise_scale;
+  json["serial_correlation"] = result.serial_correlation;
   json["gauge"] = gauge_text(result);
   json["before"] = held_out_json(result.before);
   json["after"] = held_out_json(result.after);
@@ -307,6 +308,10 @@ std::string refinement_text(const Refinement& result,
   if (result.noise_scale > 1.05)
     text += fmt::format("  residuals are {:.2f} times as large as the noise that is told\n",
                         result.noise_scale);
+  if (result.serial_correlation > 0)
+    text += fmt::format(
+        "  noise lasts from one sample to the next (correlation {:.2f}): deviations are told so\n",
+        result.serial_correlation);
   for (const std::string& warning : result.warnings) text += "  warning: " + warning + "\n";
   text += "  " + gauge_text(result) + "\n";
   for (const std::string& held : result.held) text += "  held: " + held + "\n";

@@ -5,6 +5,7 @@
 
 #include <cmath>
 #include <functional>
+#include <map>
 #include <string>
 
 #include "common/geometry/angle.h"
@@ -200,16 +201,86 @@ TEST(RefineWarnings, NameTheSampleAtWhichAJointSlipped) {
       << fmt::format("{}", fmt::join(warnings, "\n"));
 }
 
-TEST(RefineWarnings, NameTheSampleAtWhichTheCameraMoved) {
-  const auto bumped = [](const Eigen::VectorXd& action, int n, SyntheticRobot* robot) {
-    Vector6d step = Vector6d::Zero();
-    step(0) = 0.008;
-    if (n >= 50) robot->X_CR = exp(step) * robot->X_CR;
-    return action;
-  };
-  const std::vector<std::string> warnings = warnings_of(bumped);
-  EXPECT_TRUE(names(warnings, "moved at sample 50"))
-      << fmt::format("{}", fmt::join(warnings, "\n"));
+TEST(RefineWarnings, NameTheSampleAtWhichTheCameraMovedAndFitBothPlaces) {
+  for (const double step_m : {0.01, 0.05}) {
+    Rng rng(21);
+    const SyntheticRobot robot = test::chapter_robot("c", rng);
+    std::vector<ActionPoseSample> samples;
+    for (int n = 0; n < 90; ++n) {
+      SyntheticRobot now = robot;
+      Vector6d step = Vector6d::Zero();
+      step(0) = step_m;
+      step(4) = step_m;
+      if (n >= 36) now.X_CR = exp(step) * now.X_CR;
+      samples.push_back(test::observe(now, robot.random_action(rng),
+                                      {.regime = test::Regime::kTagIso, .with_covariances = true},
+                                      n, rng));
+    }
+    const Refinement result =
+        refine(displaced(true_start(robot)), refiner_samples(samples), {}, {});
+    EXPECT_TRUE(result.root_moves);
+    ASSERT_EQ(result.warnings.size(), 1U) << fmt::format("{}", fmt::join(result.warnings, "\n"));
+    EXPECT_TRUE(names(result.warnings, "from sample 36 on: the camera, or the robot, moved"))
+        << result.warnings.front();
+    EXPECT_LT(worst_error_m(result.schema, robot, samples), 0.006);
+  }
+}
+
+TEST(RefineWarnings, NameTheSampleAtWhichTheRootsMarkerMoved) {
+  Rng rng(21);
+  const SyntheticRobot robot = test::chapter_robot("c", rng);
+  std::vector<ActionPoseSample> samples =
+      test::babble(robot, 90, {.regime = test::Regime::kTagIso, .with_covariances = true}, rng);
+  const BodySchema start = displaced(true_start(robot));
+  Vector6d step = Vector6d::Zero();
+  step(0) = 0.05;
+  for (int n = 60; n < 90; ++n)
+    for (PartObservation& seen : samples[n].parts)
+      if (seen.part == start.root) seen.X_CB = seen.X_CB * exp(step);
+  const Refinement result = refine(start, refiner_samples(samples), {}, {});
+  EXPECT_FALSE(result.root_moves);
+  EXPECT_TRUE(names(result.warnings, "from sample 60 on: its marker moved on it"));
+  EXPECT_LT(worst_error_m(result.schema, robot, samples), 0.006);
+}
+
+// Of the camera's frame, as a tracker's drift is, and of the parts'.
+TEST(RefineWarnings, DeviationsAreThoseOfNoiseThatLasts) {
+  for (const double correlation : {0.0, 0.9}) {
+    double sum = 0;
+    int num = 0;
+    for (int seed = 1; seed <= 8; ++seed) {
+      Rng rng(seed);
+      const SyntheticRobot robot = test::chapter_robot("a", rng);
+      std::vector<ActionPoseSample> samples = exact(robot, 60, rng);
+      std::map<int, Vector6d> lasting;
+      for (ActionPoseSample& sample : samples)
+        for (PartObservation& seen : sample.parts) {
+          const auto [at, is_first] = lasting.try_emplace(seen.part, test::gaussian6(rng));
+          if (!is_first)
+            at->second = correlation * at->second +
+                         std::sqrt(1 - correlation * correlation) * test::gaussian6(rng);
+          Vector6d error = at->second;
+          error.head<3>() *= kNoise.position_m;
+          error.tail<3>() *= kNoise.rotation_rad;
+          seen.X_CB = seen.X_CB * exp(error);
+        }
+      const Refinement result =
+          refine(displaced(true_start(robot)), refiner_samples(samples), {}, {});
+      EXPECT_EQ(result.serial_correlation > 0.5, correlation > 0.5);
+      const int end = robot.visible_parts().back();
+      for (int n = 0; n < 50; ++n) {
+        const Eigen::VectorXd action = robot.random_action(rng);
+        const auto truth = robot.poses_in_camera(action);
+        const auto predicted = result.schema.predict(result.schema.root, end, action);
+        const Vector6d error =
+            log(predicted->X_AB.inverse() * truth.at(result.schema.root).inverse() * truth.at(end));
+        sum += squared_mahalanobis(error, predicted->covariance) / 6;
+        ++num;
+      }
+    }
+    EXPECT_GT(sum / num, 0.3) << correlation;
+    EXPECT_LT(sum / num, 2) << correlation;  // 10 without
+  }
 }
 
 TEST(RefineWarnings, NameAJointThatSlidesAsItTurns) {
