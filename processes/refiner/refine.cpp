@@ -158,8 +158,8 @@ bool root_moves(const BodySchema& schema, const std::vector<RefinerSample>& samp
          num_more * (*step ? 1 : std::log(num_residuals) / 2);
 }
 
-/// Solved. With `has_plays`, joints of poses have those that gain more than BIC's price (Schwarz
-/// 1978). All arguments must outlive it.
+/// Solved. With `has_plays`, joints of poses have plays that gain more than BIC's price (Schwarz
+/// 1978), each joint's and all together. All arguments must outlive it.
 std::unique_ptr<RefinementProblem> solved_problem(const BodySchema& schema,
                                                   const std::vector<RefinerSample>& samples,
                                                   const std::optional<RigCalibration>& rig,
@@ -174,10 +174,10 @@ std::unique_ptr<RefinementProblem> solved_problem(const BodySchema& schema,
   if (loose->plays().empty() || loose->play_score() < std::sqrt(2 * price)) return exact;
   do loose->solve();
   while (loose->drop_plays(price));
-  const auto num_plays = (loose->shown_play_sd().array() > 0).count();
+  // Each joint's plays have paid for themselves.
+  const bool is_loose = (loose->shown_play_sd().array() > 0).any();
   const double gain = loose->log_marginal_likelihood() - exact->log_marginal_likelihood();
-  return num_plays > 0 && gain > price * static_cast<double>(num_plays) ? std::move(loose)
-                                                                        : std::move(exact);
+  return is_loose && gain > price ? std::move(loose) : std::move(exact);
 }
 
 /// A solved problem, and the schema that it began with, which it refers to.
