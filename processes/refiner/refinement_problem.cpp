@@ -422,14 +422,20 @@ double RefinementProblem::serial_correlation() {
     Eigen::VectorXd influence;
   };
   std::map<std::pair<int, int>, Last> last;  // by part and tag
-  Eigen::Matrix<double, 8, 1> products = Eigen::Matrix<double, 8, 1>::Zero(), squares = products;
+  Eigen::VectorXd products = Eigen::VectorXd::Zero(12), squares = products;
   double count = 0;
   const double* r = residuals.data();
   for (const Datum& datum : data_) {
     const Eigen::Map<const Eigen::VectorXd> residual(r, datum.num_residuals);
     r += datum.num_residuals;
-    const Eigen::VectorXd influence =
+    Eigen::VectorXd influence =
         robust_weight(residual.squaredNorm(), datum.num_residuals) * residual;
+    if (datum.observation && datum.num_residuals == 6) {  // also along the camera's axes
+      const Eigen::Matrix3d R_CB = datum.observation->X_CB.linear();
+      influence.conservativeResize(12);
+      influence.segment<3>(6) = R_CB * influence.head<3>();
+      influence.tail<3>() = R_CB * influence.segment<3>(3);
+    }
     Last& before = last[{datum.part, datum.tag}];
     if (before.influence.size() == influence.size() &&
         before.sample_index + 1 == datum.sample_index) {

@@ -129,8 +129,8 @@ class RefinementProblem {
   const DriveModel& drive_model() const { return drive_model_; }
   /// Derivative of the log posterior by the free directions of these blocks, now.
   Eigen::VectorXd score(const std::vector<ParameterBlock*>& blocks);
-  /// Of the residuals of one sample with those of the next, in that axis where it is largest; 0
-  /// unless significant and positive.
+  /// Of the residuals of one sample with those of the next, in that axis of the part or the camera
+  /// where it is largest; 0 unless significant and positive.
   double serial_correlation();
   /// d² of each datum now.
   std::vector<double> squared_distances();

@@ -7,6 +7,8 @@
 #include <functional>
 #include <map>
 #include <string>
+#include <utility>
+#include <vector>
 
 #include "common/geometry/angle.h"
 #include "processes/refiner/refine.h"
@@ -243,9 +245,10 @@ TEST(RefineWarnings, NameTheSampleAtWhichTheRootsMarkerMoved) {
   EXPECT_LT(worst_error_m(result.schema, robot, samples), 0.006);
 }
 
-// Of the camera's frame, as a tracker's drift is, and of the parts'.
+// Along the parts' axes, or the camera's, as a tracker's drift is.
 TEST(RefineWarnings, DeviationsAreThoseOfNoiseThatLasts) {
-  for (const double correlation : {0.0, 0.9}) {
+  for (const auto& [correlation, is_of_camera] :
+       std::vector<std::pair<double, bool>>{{0, false}, {0.9, false}, {0.9, true}}) {
     double sum = 0;
     int num = 0;
     for (int seed = 1; seed <= 8; ++seed) {
@@ -262,6 +265,11 @@ TEST(RefineWarnings, DeviationsAreThoseOfNoiseThatLasts) {
           Vector6d error = at->second;
           error.head<3>() *= kNoise.position_m;
           error.tail<3>() *= kNoise.rotation_rad;
+          if (is_of_camera) {
+            const Eigen::Matrix3d R_BC = seen.X_CB.linear().transpose();
+            const Vector6d along_camera = error;
+            error << R_BC * along_camera.head<3>(), R_BC * along_camera.tail<3>();
+          }
           seen.X_CB = seen.X_CB * exp(error);
         }
       const Refinement result =
