@@ -94,10 +94,10 @@ struct Bus::Impl {
 
   void open_log(const Url& url) {
     if (url.target.empty()) throw url_error(in_url, "names no file. Type file://PATH?speed=0");
-    if (url.options.count("mode") == 1 && url.options.at("mode") != "r") {
+    if (url.options.contains("mode") && url.options.at("mode") != "r") {
       throw url_error(in_url, "an input is not written: mode belongs to --out");
     }
-    if (url.options.count("speed") == 1) {
+    if (url.options.contains("speed")) {
       log_speed = parse_number(in_url, "speed", url.options.at("speed"));
     }
     log = std::make_unique<LogReader>(url.target);
@@ -109,7 +109,7 @@ struct Bus::Impl {
   void open_output_log(const Url& url) {
     const auto mode = url.options.find("mode");
     if (url.target.empty() || mode == url.options.end() ||
-        (mode->second != "w" && mode->second != "a") || url.options.count("speed") == 1) {
+        (mode->second != "w" && mode->second != "a") || url.options.contains("speed")) {
       throw url_error(out_url,
                       "as an output type file://PATH?mode=w (a new log) or "
                       "file://PATH?mode=a (extend it)");

@@ -100,7 +100,7 @@ Url parse_url(const std::string& url) {
     options.remove_prefix(std::min(options.size(), option.size() + 1));
     const std::size_t equals = option.find('=');
     const std::string key(option.substr(0, equals));
-    if (equals == std::string_view::npos || known->second.count(key) == 0) {
+    if (equals == std::string_view::npos || !known->second.contains(key)) {
       throw url_error(url, fmt::format("unknown option \"{}\"; {} knows: {}", option, result.scheme,
                                        fmt::join(known->second, ", ")));
     }
@@ -122,8 +122,8 @@ LcmPointer open_lcm(const std::string& url, const Url& parsed) {
   std::string full = url;
   if (parsed.scheme == "udpm") {
     probe_multicast(url, parsed);
-    if (parsed.options.count("ttl") == 1) parse_number(url, "ttl", parsed.options.at("ttl"));
-    if (parsed.options.count("recv_buf_size") == 0) {
+    if (parsed.options.contains("ttl")) parse_number(url, "ttl", parsed.options.at("ttl"));
+    if (!parsed.options.contains("recv_buf_size")) {
       full += url.find('?') == std::string::npos ? "?" : url.back() == '?' ? "" : "&";
       full += kReceiveBuffer;
     }
@@ -142,7 +142,7 @@ LcmPointer open_lcm(const std::string& url, const Url& parsed) {
   }
   // LCM's descriptors must not outlive an exec in a child: its port would stay taken.
   for (const int descriptor : open_descriptors()) {
-    if (before.count(descriptor) == 0) {
+    if (!before.contains(descriptor)) {
       ::fcntl(descriptor, F_SETFD, ::fcntl(descriptor, F_GETFD) | FD_CLOEXEC);
     }
   }

@@ -343,7 +343,7 @@ void check_tree(Checker& check, const body_schema_t& m) {
     check.require(!std::ranges::binary_search(m.position_parts, edge.from_part), "from_part",
                   "is in position_parts: such a part is a leaf");
     check.require(edge.to_part != m.root_part, "to_part", "is the root");
-    check.require(placed.count(edge.to_part) == 0, "to_part",
+    check.require(!placed.contains(edge.to_part), "to_part",
                   "was reached before: the edges are no tree ordered from the root outwards");
     placed.insert({edge.from_part, edge.to_part});
   });

@@ -171,12 +171,13 @@ std::map<std::string, std::vector<std::string>> load_hosts(const Yaml& yaml,
     }
   }
   for (const std::string& process : group) {
-    if (!host_of.count(process)) {
+    if (!host_of.contains(process)) {
       throw yaml.error("hosts", "'" + process + "' runs on no host");
     }
   }
   for (const auto& [process, host] : host_of) {
-    if (kImageProcesses.count(process) && host_of.count("camera") && host != host_of["camera"]) {
+    if (kImageProcesses.contains(process) && host_of.contains("camera") &&
+        host != host_of["camera"]) {
       throw section.error(host, "'" + process + "' must run where the camera does, on '" +
                                     host_of["camera"] + "': images do not survive a network");
     }

@@ -178,7 +178,7 @@ const YAML::Node Yaml::child(const std::string& key) const {
   std::set<std::string> others;
   for (const auto& entry : *node_) {
     const auto name = entry.first.as<std::string>();
-    if (!usage_->asked.count(name) && edit_distance(name, key) <= 1 + key.size() / 3) {
+    if (!usage_->asked.contains(name) && edit_distance(name, key) <= 1 + key.size() / 3) {
       others.insert(name);
     }
   }
@@ -324,7 +324,7 @@ std::vector<Yaml> Yaml::list(const std::string& key) const {
 void Yaml::finish() const {
   for (const auto& entry : *node_) {
     const auto key = entry.first.as<std::string>();
-    if (!usage_->asked.count(key)) {
+    if (!usage_->asked.contains(key)) {
       throw error(key, "this key is unknown" + did_you_mean(key, usage_->asked));
     }
   }

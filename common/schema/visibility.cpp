@@ -48,7 +48,7 @@ std::map<int, double> VisibilityModel::probabilities(const Eigen::VectorXd& acti
                     (static_cast<double>(here.x.size()) * kSignalWidth * kSignalWidth);
       }
       const double weight = std::exp(-0.5 * distance2);
-      const bool is_seen = before.parts.count(part) > 0;
+      const bool is_seen = before.parts.contains(part);
       all += weight;
       seen += is_seen ? weight : 0;
       num_seen += is_seen;

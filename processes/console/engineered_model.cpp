@@ -39,7 +39,7 @@ class Walk {
     }
     schema_.parts.assign(parts.begin(), parts.end());
     schema_.root = static_cast<int>(yaml.integer("root"));
-    if (!parts.count(schema_.root)) throw yaml.error("root", "expected one of the parts");
+    if (!parts.contains(schema_.root)) throw yaml.error("root", "expected one of the parts");
     const Yaml uncertainty = yaml.section("uncertainty");
     uncertainty_.position_m = uncertainty.number("position_m", 0, 1);
     uncertainty_.rotation_rad = uncertainty.number("rotation_deg", 0, 180) * kDegree;

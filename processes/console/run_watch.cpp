@@ -93,7 +93,7 @@ void RunWatch::forget_truths() {
   });
   action_ids_ = std::move(action_ids);
   std::erase_if(truth_, [&](const auto& entry) {
-    return entry.first <= newest_utime && !needed.count(&entry.second);
+    return entry.first <= newest_utime && !needed.contains(&entry.second);
   });
   // So that each of them costs the same, however many stay.
   most_truths_ = std::max(most_truths_, 2 * std::max(truth_.size(), action_ids_.size()));

@@ -69,7 +69,7 @@ std::size_t choose_action(const BodySchema& schema, const std::vector<SeenAction
     const Eigen::VectorXd phi = potential_terms(normalized(schema.signals, seen.action));
     for (std::size_t e = 0; e < edges.size(); ++e) {
       Edge& edge = edges[e];
-      if (!seen.parts.count(edge.from) || !seen.parts.count(edge.to)) continue;
+      if (!seen.parts.contains(edge.from) || !seen.parts.contains(edge.to)) continue;
       of_edge[e].add(phi);
       // The schema's covariance includes the samples that it rests on.
       if (seen.sample_index <= schema.last_sample_index || !has_parameters(edge)) continue;
@@ -78,7 +78,7 @@ std::size_t choose_action(const BodySchema& schema, const std::vector<SeenAction
       edge.parameter_covariance -= JC.transpose() * S.llt().solve(JC);
     }
     for (std::size_t u = 0; u < of_part.size(); ++u)
-      if (seen.parts.count(schema.unconnected[u].part)) of_part[u].add(phi);
+      if (seen.parts.contains(schema.unconnected[u].part)) of_part[u].add(phi);
   }
   for (PotentialInformation& information : of_edge) information.factorize();
   for (PotentialInformation& information : of_part) information.factorize();

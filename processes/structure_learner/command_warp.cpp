@@ -261,7 +261,7 @@ class WarpEstimate {
     std::set<int> used;
     std::vector<const std::vector<Reading>*> result;
     for (const Witness* witness : order) {
-      if (used.count(witness->pair.part_i) || used.count(witness->pair.part_j)) continue;
+      if (used.contains(witness->pair.part_i) || used.contains(witness->pair.part_j)) continue;
       used.insert({witness->pair.part_i, witness->pair.part_j});
       result.push_back(&witness->readings.at(signal));
       if (result.size() == kMaxModelsASignal) break;
@@ -301,7 +301,7 @@ class WarpEstimate {
     std::vector<Promise> promises;
     for (std::size_t i = 0; i < parts_.size(); ++i) {
       for (std::size_t j = i + 1; j < parts_.size(); ++j) {
-        if (known.count(std::minmax(parts_[i], parts_[j]))) continue;
+        if (known.contains(std::minmax(parts_[i], parts_[j]))) continue;
         const PairData pair = pair_data(parts_[i], parts_[j]);
         if (pair.size() < kFewest) continue;
         const auto screened = screen_one_joint(relative_motions(pair, 150), actions);

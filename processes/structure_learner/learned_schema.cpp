@@ -37,9 +37,9 @@ void visit_outwards(const std::vector<std::pair<int, int>>& edges, const BodySch
     const KinematicTree tree(edges, start);
     std::set<int> grown{start};
     for (const KinematicTree::Node& node : tree.nodes()) {
-      if (node.parent < 0 || reached.count(node.part)) continue;
+      if (node.parent < 0 || reached.contains(node.part)) continue;
       const int from = tree.nodes()[static_cast<std::size_t>(node.parent)].part;
-      if (!grown.count(from) || !visit(node.edge, from, node.part)) continue;
+      if (!grown.contains(from) || !visit(node.edge, from, node.part)) continue;
       grown.insert(node.part);
       reached.insert(node.part);
     }
@@ -62,18 +62,18 @@ void report_unconnected(const std::vector<int>& expected_parts,
   expected.insert(schema->parts.begin(), schema->parts.end());
   if (schema->root >= 0) expected.insert(schema->root);
   for (const int part : expected) {
-    if (connected.count(part)) continue;
+    if (connected.contains(part)) continue;
     schema->unconnected.push_back(
         schema->has_part(part) ? explain(part)
                                : UnconnectedPart{part, Unconnected::kNeverSeen, "never seen"});
   }
   const std::vector<int>& parts = schema->parts;
-  if (parts.size() == 1 && connected.count(parts.front()))
+  if (parts.size() == 1 && connected.contains(parts.front()))
     schema->unconnected.push_back({parts.front(), Unconnected::kNotEnoughData, kOnlyPart});
   // A part that was never seen is reported, but a tree over all the others is complete (Fig. 8,
   // 11).
   schema->complete = parts.size() > 1 && std::all_of(parts.begin(), parts.end(), [&](int part) {
-                       return connected.count(part) > 0;
+                       return connected.contains(part);
                      });
 }
 

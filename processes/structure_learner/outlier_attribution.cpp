@@ -99,7 +99,7 @@ class OutlierAttribution {
       if (!(d2 < outlier_threshold(num_residuals))) ++bad;
     };
     for (const PartObservation& other : s.parts) {
-      if (other.part == part || culprits.count(other.part) || !other.has_rotation) continue;
+      if (other.part == part || culprits.contains(other.part) || !other.has_rotation) continue;
       const auto& path = path_between(other.part, part);
       if (!path) continue;
       const Pose X = path->predict(s.action);

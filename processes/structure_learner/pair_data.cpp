@@ -4,6 +4,7 @@
 #include <cmath>
 #include <initializer_list>
 #include <map>
+#include <optional>
 #include <set>
 #include <stdexcept>
 
@@ -113,6 +114,14 @@ Matrix6d PairHypothesis::residual_jacobian(const Vector6d& error, const Pose& pr
   Matrix6d result = Matrix6d::Zero();
   result.topLeftCorner<3, 3>() = -whitening.topLeftCorner<3, 3>() * prediction.linear();
   return result;
+}
+
+std::optional<double> usual_value(std::vector<double> values) {
+  std::sort(values.begin(), values.end());
+  const std::size_t half = values.size() / 2;
+  for (std::size_t first = 0; first + half < values.size(); ++first)
+    if (values[first + half] - values[first] <= kResting) return values[first + half / 2];
+  return std::nullopt;
 }
 
 NormalizedActions::NormalizedActions(const std::vector<ActionPoseSample>& samples, int num_signals)

@@ -7,6 +7,7 @@
 #include <boost/math/distributions/fisher_f.hpp>
 #include <cmath>
 #include <limits>
+#include <numeric>
 
 #include "common/estimation/quantile.h"
 #include "common/estimation/student_t.h"
@@ -26,6 +27,10 @@ constexpr double kShortest = 0.1, kLongest = 30;
 // screws of a positioner leave 0.39 mm; processes from the start that is likeliest before a step
 // leave as much, those from the likeliest end 0.17 mm.
 constexpr std::array kStartLengths = {1.0, 3.0, 9.0};
+
+// Outliers in a row at an end of a signal's range that are no wild readings: that the only two of
+// 80 are there has a chance of 1 in 400 for two signals.
+constexpr std::ptrdiff_t kFewestAtEnd = 2;
 
 // At most so many instants that cover the inputs (D×n) evenly: each the one farthest from all
 // before.
@@ -194,7 +199,23 @@ void ResidualFitter::reweigh() {
     targets_.frames[t] = judged_.frames[t];
     targets_.weights(t) = robust_weight(judged_.squared_distance[t]);
   }
+  for (const int t : outliers_at_ends()) targets_.weights(t) = 1;
   set_targets(false);
+}
+
+std::vector<int> ResidualFitter::outliers_at_ends() const {
+  std::vector<int> result, order(static_cast<std::size_t>(pair_->size()));
+  if (actions_->blocks().is_stream()) return result;
+  for (Eigen::Index d = 0; d < inputs_.rows(); ++d)
+    for (const double sign : {-1.0, 1.0}) {
+      std::iota(order.begin(), order.end(), 0);
+      std::ranges::stable_sort(order, {}, [&](int t) { return sign * inputs_(d, t); });
+      const auto inlier = std::ranges::find_if(
+          order, [&](int t) { return judged_.squared_distance[t] <= kOutlierThreshold; });
+      if (inlier - order.begin() >= kFewestAtEnd)
+        result.insert(result.end(), order.begin(), inlier);
+    }
+  return result;
 }
 
 std::shared_ptr<const ResidualGp> ResidualFitter::residual_gp() const {

@@ -46,7 +46,8 @@ class ResidualFitter {
   ResidualFitter without(int place, int max_iterations) const;
   /// As many samples as a process takes, with the hyper-parameters as they are.
   void use_all_samples();
-  /// Readings and weights from the judgement.
+  /// Readings and weights from the judgement. Outliers in a row at an end of a signal's range weigh
+  /// as others: there a process that is too straight is off.
   void reweigh();
 
   /// Of the last fit().
@@ -81,6 +82,8 @@ class ResidualFitter {
   Eigen::VectorXd input_row(int signal) const;
   void set_targets(bool first = true);
   Eigen::VectorXd noise_scales() const;
+  // Of poses at rest: two or more at one end of a signal's range, with no inlier beyond.
+  std::vector<int> outliers_at_ends() const;
   // Among the frames that are no outliers, as far as one can tell.
   void choose_samples(std::size_t most);
   void set_signals(const std::vector<int>& signals);

@@ -53,14 +53,31 @@ double explained_share(const Eigen::MatrixXd& values, const Eigen::MatrixXd& oth
   return explained / y.squaredNorm();
 }
 
-/// Median product of the residuals of frames that follow each other within `most_apart` samples,
-/// whitened: noise apart, what is left of the motion. Negative if there are too few.
+/// By sample, whether one of the model's signals is away from where it mostly is; true of all if
+/// none rests. Where they rest shifted commands tell as much.
+std::vector<bool> is_moved(const LocalModel& model, const NormalizedActions& actions) {
+  std::vector<bool> result(static_cast<std::size_t>(actions.num_samples()));
+  for (const int signal : signal_set(model)) {
+    std::vector<double> values;
+    for (int n = 0; n < actions.num_samples(); ++n) values.push_back(actions(n, signal));
+    const auto usual = usual_value(values);
+    for (std::size_t n = 0; n < values.size(); ++n)
+      if (!usual || std::abs(values[n] - *usual) > kResting) result[n] = true;
+  }
+  return result;
+}
+
+/// Median product of the residuals of frames among `chosen` that follow each other within
+/// `most_apart` samples, whitened: noise apart, what is left of the motion. Negative if there are
+/// too few.
 double slow_residual(const LocalModel& model, const PairData& pair,
-                     const NormalizedActions& actions, int most_apart) {
+                     const NormalizedActions& actions, const std::vector<bool>& chosen,
+                     int most_apart) {
   const Fit fit = evaluate(model, pair, actions);
   std::vector<double> products;
   for (std::size_t n = 1; n < fit.frames.size(); ++n)
-    if (pair.frames[n].sample - pair.frames[n - 1].sample <= most_apart)
+    if (chosen[static_cast<std::size_t>(pair.frames[n].sample)] &&
+        pair.frames[n].sample - pair.frames[n - 1].sample <= most_apart)
       products.push_back(fit.frames[n - 1].residual.dot(fit.frames[n].residual));
   if (products.size() < kFewestProducts) return -1;
   return std::max(0.0, upper_median(std::move(products)));
@@ -146,8 +163,9 @@ bool SurrogateCommands::explain_as_well(const AcceptedModel& accepted) const {
   };
   const PairData few = data(kFitted), all = is_stream() ? data(actions_.num_samples()) : few;
   const int most_apart = std::max(1, blocks_.length() / 4);
+  const std::vector<bool> moved = is_moved(accepted.model, actions_);
   const auto left_by = [&](const LocalModel& model, const NormalizedActions& actions) {
-    return is_stream() ? slow_residual(model, all, actions, most_apart)
+    return is_stream() ? slow_residual(model, all, actions, moved, most_apart)
                        : typical_residual(model, all, actions);
   };
   const double own =

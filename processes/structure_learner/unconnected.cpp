@@ -71,7 +71,7 @@ TriedModels tried_models(int part, const std::set<int>& connected, const SearchR
     tried.is_too_short |= record.is_too_short;
     tried.has_one_rhythm |= record.has_one_rhythm;
     const int other = pair.first == part ? pair.second : pair.first;
-    if (!connected.count(other)) continue;
+    if (!connected.contains(other)) continue;
     tried.undecided |= !record.undecided.empty();
     tried.untold.insert(record.untold_signals.begin(), record.untold_signals.end());
     tried.was_soft_tried |= record.was_soft_tried;

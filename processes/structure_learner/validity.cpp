@@ -217,9 +217,6 @@ bool is_improbable_by_chance(const Fit& fit, const PairData& pair, const Normali
   return dof * log_spread(fit, pair) > std::log(num_candidates) + 7;
 }
 
-/// So near to each other [half ranges] values of a signal that rests are.
-constexpr double kUsual = 0.02;
-
 // log of the chance that of so many drawn from `total`, `marked` of which are marked, so many are.
 double log_hypergeometric(int drawn_marked, int drawn, int marked, int total) {
   const auto log_choose = [](int n, int k) {
@@ -230,34 +227,43 @@ double log_hypergeometric(int drawn_marked, int drawn, int marked, int total) {
          log_choose(total, drawn);
 }
 
-/// The value that a signal has at most of these, if it has one.
-std::optional<double> usual_value(std::vector<double> values) {
-  std::sort(values.begin(), values.end());
-  const std::size_t half = values.size() / 2;
-  for (std::size_t first = 0; first + half < values.size(); ++first)
-    if (values[first + half] - values[first] <= kUsual) return values[first + half / 2];
-  return std::nullopt;
+// How far a signal is from the value that it usually has, and whether that is an outlier; of a
+// stream by blocks of time, which are outliers if most of their samples are.
+struct Excursion {
+  double away = 0;
+  bool is_outlier = false;
+};
+std::vector<Excursion> excursions(const std::vector<int>& samples,
+                                  const std::vector<bool>& outlying,
+                                  const std::vector<double>& values, double usual,
+                                  const TimeBlocks& blocks) {
+  std::vector<Excursion> result;
+  for (std::size_t t = 0; t < samples.size();) {
+    Excursion block;
+    const int number = blocks.block_of(samples[t]);
+    int balance = 0;
+    for (; t < samples.size() && blocks.block_of(samples[t]) == number; ++t) {
+      block.away = std::max(block.away, std::abs(values[t] - usual));
+      balance += outlying[t] ? 1 : -1;
+    }
+    block.is_outlier = balance > 0;
+    result.push_back(block);
+  }
+  return result;
 }
 
 // Outliers where a signal is farthest from the value that it usually has; or at all poses where it
 // is away from that, so that no pose tells what it does.
-bool are_outliers_where_it_moved(const std::vector<double>& values,
-                                 const std::vector<bool>& outlying, int num_outliers,
-                                 double log_trials) {
+bool are_outliers_where_it_moved(std::vector<Excursion> all, double log_trials) {
   constexpr double kLogLeastChance = -6.9;  // 1e-3
-  const auto usual = usual_value(values);
-  if (!usual) return false;
-  const auto away = [&](int t) { return std::abs(values[static_cast<std::size_t>(t)] - *usual); };
-  std::vector<int> order(values.size());
-  std::iota(order.begin(), order.end(), 0);
-  std::ranges::stable_sort(order, std::ranges::greater(), away);
-  const auto inlier =
-      std::ranges::find_if(order, [&](int t) { return !outlying[static_cast<std::size_t>(t)]; });
-  const auto num = static_cast<int>(inlier - order.begin());
-  if (num == 0 || away(order.front()) <= kUsual) return false;
-  const int n = static_cast<int>(values.size());
-  return inlier == order.end() || away(*inlier) <= kUsual ||
-         log_trials + log_hypergeometric(num, num, num_outliers, n) < kLogLeastChance;
+  std::ranges::stable_sort(all, std::ranges::greater(), &Excursion::away);
+  const auto inlier = std::ranges::find(all, false, &Excursion::is_outlier);
+  const auto num = static_cast<int>(inlier - all.begin());
+  if (num == 0 || all.front().away <= kResting) return false;
+  const auto num_outliers = static_cast<int>(std::ranges::count(all, true, &Excursion::is_outlier));
+  return inlier == all.end() || inlier->away <= kResting ||
+         log_trials + log_hypergeometric(num, num, num_outliers, static_cast<int>(all.size())) <
+             kLogLeastChance;
 }
 
 }  // namespace
@@ -271,7 +277,7 @@ bool is_wrong_at_some_commands(const std::vector<int>& samples, const std::vecto
   constexpr int kFewestInside = 8;
   const int n = static_cast<int>(samples.size());
   const auto num_outliers = static_cast<int>(std::count(outlying.begin(), outlying.end(), true));
-  if (num_outliers == 0 || actions.blocks().is_stream()) return false;
+  if (num_outliers == 0) return false;
   const double log_trials = std::log(n * static_cast<double>(actions.moving().size()));
   const double log_share = std::log(num_outliers / static_cast<double>(n));
   const int fewest = std::max(kFewestInside, static_cast<int>(kLeastShare * n));
@@ -280,7 +286,11 @@ bool is_wrong_at_some_commands(const std::vector<int>& samples, const std::vecto
   for (const int signal : actions.moving()) {
     std::vector<double> values;
     for (const int sample : samples) values.push_back(actions(sample, signal));
-    if (are_outliers_where_it_moved(values, outlying, num_outliers, log_signals)) return true;
+    const auto usual = usual_value(values);
+    if (usual && are_outliers_where_it_moved(
+                     excursions(samples, outlying, values, *usual, actions.blocks()), log_signals))
+      return true;
+    if (actions.blocks().is_stream()) continue;
     std::iota(order.begin(), order.end(), 0);
     std::stable_sort(order.begin(), order.end(), [&](int a, int b) {
       return actions(samples[static_cast<std::size_t>(a)], signal) <

@@ -65,10 +65,10 @@ Validity check_validity(const Fit& fit, const LeaveOneOut& loo, const PairData& 
 /// Whether in the order of one of the signals that moved, be it one of the model's or not, so many
 /// outliers stand together that chance does not explain it, one after the other or many with few
 /// others between (hypergeometric): there the model is wrong, and not its poses. So it is where
-/// outliers are those at which a signal is farthest from the value that it has at half of the poses,
-/// or all that are away from that: nothing tells then what the signal does.
-/// `outlying`: by sample of `samples`. False in a stream, where outliers last. O(D (K² + N log N))
-/// of K outliers among N and D signals.
+/// outliers are those at which a signal is farthest from the value that it has at half of the
+/// poses, or all that are away from that: nothing tells then what the signal does. `outlying`: by
+/// sample of `samples`. In a stream, where outliers last, blocks of time count, and where signals
+/// that mostly rest move. O(D (K² + N log N)) of K outliers among N and D signals.
 bool is_wrong_at_some_commands(const std::vector<int>& samples, const std::vector<bool>& outlying,
                                const NormalizedActions& actions);
 /// `squared_distance`: by frame of the pair.

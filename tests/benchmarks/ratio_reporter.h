@@ -38,7 +38,7 @@ class RatioReporter : public benchmark::ConsoleReporter {
     ConsoleReporter::Finalize();
     std::ostream& out = GetOutputStream();
     for (const Ratio& ratio : ratios_) {
-      if (!time_.count(ratio.ours) || !time_.count(ratio.peer)) continue;
+      if (!time_.contains(ratio.ours) || !time_.contains(ratio.peer)) continue;
       out << ratio.ours << " / " << ratio.peer << " = " << time_[ratio.ours] / time_[ratio.peer]
           << "\n";
     }

@@ -143,7 +143,7 @@ TEST(LcmDefinitions, AnArraysCountStandsBeforeIt) {
       for (const std::string& dimension : field.dimensions) {
         if (std::isdigit(static_cast<unsigned char>(dimension[0])) != 0) continue;
         EXPECT_TRUE(dimension.starts_with("num_")) << name << "." << field.name;
-        EXPECT_EQ(seen.count(dimension), 1U) << name << "." << field.name;
+        EXPECT_TRUE(seen.contains(dimension)) << name << "." << field.name;
       }
       seen.insert(field.name);
     }

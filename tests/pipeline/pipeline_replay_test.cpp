@@ -196,9 +196,9 @@ TEST_F(Arm2, APlayedReplayLearnsTheSameAndNoCommandIsOnItsBus) {
   std::set<std::string> channels;
   for_each_event(run("played") / "run.lcmlog.00",
                  [&](const LogEvent& event) { channels.insert(event.channel); });
-  EXPECT_TRUE(channels.count("MARKER_POSES"));
-  EXPECT_FALSE(channels.count("ACTION_COMMAND"));
-  EXPECT_FALSE(channels.count("SIM_STATE")) << "the truth is on the bus";
+  EXPECT_TRUE(channels.contains("MARKER_POSES"));
+  EXPECT_FALSE(channels.contains("ACTION_COMMAND"));
+  EXPECT_FALSE(channels.contains("SIM_STATE")) << "the truth is on the bus";
   for (const char* robot : {"robot_simulator.log", "motor_babbler.log", "camera.log"})
     EXPECT_FALSE(fs::exists(run("played") / robot)) << robot;
 }
@@ -208,7 +208,7 @@ TEST_F(Arm2, AReplayWithAHoleSaysWhatIsLostAndLearnsFromTheRest) {
     const fs::path holed = folder_ / (name + ".lcmlog");
     LogAppender log(holed, LogAppender::Mode::kOverwrite, LogAppender::Durability::kToKernel);
     for (const sample_t& sample : read_log(kSource / "logs/arm2_15.lcmlog", kSample)) {
-      if (!removed.count(sample.sample_index)) log.append(kSample, sample);
+      if (!removed.contains(sample.sample_index)) log.append(kSample, sample);
     }
     return holed;
   };

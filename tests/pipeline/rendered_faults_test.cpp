@@ -125,7 +125,7 @@ TEST_P(AdaptationTest, IsFoundNamedAndMendedAndSoIsTheRepair) {
   ASSERT_TRUE(found) << told();
   EXPECT_LT(found->event_sample, kBrokenAt + soon) << told();
   EXPECT_EQ(found->event_from >= 0 ? found->event_to : found->event_part, c.part) << told();
-  EXPECT_TRUE(c.causes.count(cause_text(found->event_cause))) << told();
+  EXPECT_TRUE(c.causes.contains(cause_text(found->event_cause))) << told();
 
   run_.break_body(fault_command_t::FAULT_REPAIR);
   moved_marker_ = -1;

@@ -300,7 +300,7 @@ std::vector<ActionPoseSample> with_flying_parts(const std::set<int>& parts) {
   auto samples = babble(chapter_robot("a", rng), 60, {}, rng);
   for (ActionPoseSample& sample : samples) {
     for (PartObservation& part : sample.parts)
-      if (parts.count(part.part)) part.X_CB = random_pose(rng, 0.5, 2);
+      if (parts.contains(part.part)) part.X_CB = random_pose(rng, 0.5, 2);
   }
   return samples;
 }
@@ -373,7 +373,7 @@ TEST_F(BodyschemaProgramTest, TheRootIsTheLowestPartOrTheOneAskedFor) {
     // Every part but the root is led to once.
     std::set<int> led_to;
     for (const Json& edge : json["edges"]) EXPECT_TRUE(led_to.insert(edge["to"].get<int>()).second);
-    EXPECT_FALSE(led_to.count(root));
+    EXPECT_FALSE(led_to.contains(root));
     EXPECT_EQ(led_to.size(), 4U);
   }
 }

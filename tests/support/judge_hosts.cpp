@@ -102,7 +102,7 @@ void judge(const fs::path& folder, std::size_t num_samples) {
     const auto status = nlohmann::json::parse(file);
     for (const auto& process : status["processes"]) seen.insert(process["name"]);
     for (const auto& [name, info] : heard.processes)
-      expect(seen.count(name) > 0, std::string(host) + " does not see " + name);
+      expect(seen.contains(name), std::string(host) + " does not see " + name);
   }
   std::ifstream stream(folder / "learning/current/result.json");
   const auto result = nlohmann::json::parse(stream);

@@ -96,7 +96,7 @@ std::string RigTruth::objection(const BodySchema& schema, const std::vector<int>
   for (const Edge& edge : schema.edges) {
     const std::vector<int> used = edge.signals();
     const std::string name = "edge " + std::to_string(edge.from) + "-" + std::to_string(edge.to);
-    if (!component.count(edge.from) || !component.count(edge.to))
+    if (!component.contains(edge.from) || !component.contains(edge.to))
       return name + " names an unseen part";
     if (std::set<int>(used.begin(), used.end()) != path_signals(edge.from, edge.to)) {
       return name + " has the wrong signals";

@@ -92,7 +92,7 @@ ActionPoseSample observe(const SyntheticRobot& robot, const Eigen::VectorXd& act
   const auto poses = robot.poses_in_camera(action);
   const std::set<int> facing = facing_parts(robot, action, options.max_view_angle_rad);
   for (const TrueLink& link : robot.links) {
-    if (!facing.count(link.part)) continue;
+    if (!facing.contains(link.part)) continue;
     if (tags && uniform(rng, 0, 1) < 0.15) continue;
     const Pose& X_true = poses.at(link.part);
     const Matrix6d root = noise_root(options.regime, X_true);

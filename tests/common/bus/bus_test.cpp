@@ -167,7 +167,7 @@ TEST(BusTraps, AMessageWithACountAboveItsArrayIsNotPublished) {
   sample_t sample = example_sample();
   sample.num_parts = 1'000;
   EXPECT_THROW(bus.publish(kSample, sample), std::logic_error);
-  EXPECT_EQ(bus.counters().count("published SAMPLE"), 0U);
+  EXPECT_FALSE(bus.counters().contains("published SAMPLE"));
 }
 
 TEST(BusTraps, PublishingASenselessMessageIsABugAndNamesTheField) {
@@ -318,7 +318,7 @@ TEST(BusUrls, AnEmptyInputHearsNothingAndAnEmptyOutputPublishesNowhere) {
   bus.subscribe(kSample, [](const sample_t&) { FAIL(); });
   bus.publish(kSample, example_sample());
   EXPECT_TRUE(bus.handle(milliseconds(1)));
-  EXPECT_EQ(bus.counters().count("published SAMPLE"), 0U);
+  EXPECT_FALSE(bus.counters().contains("published SAMPLE"));
 }
 
 TEST(BusUrls, TheDefaultIsTheEnvironmentsOrStaysOnThisMachine) {

@@ -58,7 +58,7 @@ TEST(CalibrationId, EveryValueCounts) {
     change(other);
     EXPECT_TRUE(ids.insert(other.id()).second);
   }
-  EXPECT_EQ(ids.count(0), 0U);
+  EXPECT_FALSE(ids.contains(0));
 }
 
 TEST(CalibrationId, WhatSaysTheSameDoesNot) {

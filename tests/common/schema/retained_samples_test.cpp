@@ -77,7 +77,7 @@ TEST(RetainedSamples, AreNestedAsTheyGrow) {
     if (index % 500 != 0) continue;
     for (const std::int64_t kept : indices_of(samples.between(0, index)))
       if (kept <= index - 500) {
-        EXPECT_TRUE(ever.count(kept)) << kept << " came back";
+        EXPECT_TRUE(ever.contains(kept)) << kept << " came back";
       }
     ever.clear();
     for (const std::int64_t kept : indices_of(samples.between(0, index))) ever.insert(kept);

@@ -216,7 +216,7 @@ TEST(RunRecordTest, OfManyVersionsAnEvenChoiceIsKeptWithBothEndsOfEachBody) {
   EXPECT_LE(run.record.versions().size(), 256U);
   EXPECT_GT(run.record.versions().size(), 100U);
   for (const std::int64_t kept : {1, 999, 1000, 1009, 1010, 3000})
-    EXPECT_TRUE(run.record.versions().count(kept)) << kept;
+    EXPECT_TRUE(run.record.versions().contains(kept)) << kept;
 }
 
 // Images are read before the markers found in them.

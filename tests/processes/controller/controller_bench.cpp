@@ -157,7 +157,7 @@ void Bench::show_sample() {
   const Eigen::Vector3d action(motion.commanded.data());
   std::vector<part_observation_t> parts;
   for (const auto& [part, X_RB] : planar().predict_all(action)) {
-    if (hidden.count(part)) continue;
+    if (hidden.contains(part)) continue;
     part_observation_t seen{};
     seen.part_id = part;
     seen.has_rotation = 1;

@@ -98,7 +98,7 @@ TEST(Observer, DropsFramesFarAheadOfTheDriver) {
   EXPECT_EQ(observer.counters().at("frame far ahead of the driver"), 9);
   EXPECT_FALSE(observer.on_marker_poses(scene.frame(kRest_us)));
   EXPECT_TRUE(observer.on_marker_poses(scene.frame(kRest_us + 33'333)));
-  EXPECT_EQ(observer.counters().count("camera time ran backwards"), 0U);
+  EXPECT_FALSE(observer.counters().contains("camera time ran backwards"));
 }
 
 }  // namespace

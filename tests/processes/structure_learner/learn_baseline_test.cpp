@@ -241,7 +241,7 @@ TEST(LearnBaseline, EdgesPointAwayFromTheRootAndPredictEveryPart) {
   EXPECT_EQ(judge(schema, robot), Rightness::kRight);
   std::set<int> reached{3};
   for (const Edge& edge : schema.edges) {
-    EXPECT_TRUE(reached.count(edge.from));
+    EXPECT_TRUE(reached.contains(edge.from));
     EXPECT_TRUE(reached.insert(edge.to).second);
   }
   for (int n = 0; n < 10; ++n) {

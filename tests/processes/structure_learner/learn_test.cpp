@@ -179,7 +179,7 @@ TEST(Learn, EdgesPointAwayFromTheRootInOrder) {
   EXPECT_TRUE(is_right(schema, robot));
   std::set<int> reached{6};
   for (const Edge& edge : schema.edges) {
-    EXPECT_TRUE(reached.count(edge.from));
+    EXPECT_TRUE(reached.contains(edge.from));
     EXPECT_TRUE(reached.insert(edge.to).second);
   }
 }

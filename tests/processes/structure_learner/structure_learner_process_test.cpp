@@ -47,8 +47,8 @@ class StructureLearnerTest : public testing::Test {
     std::vector<body_schema_t> result;
     for (std::size_t i = 0; i < samples.size(); ++i) {
       learner.on_sample(samples[i]);
-      if (jobs_after.count(i) && learner.has_job()) result.push_back(learner.take_job()());
-      if (jobs_after.count(i) && i % 2 == 0) learner.take_preparation()();
+      if (jobs_after.contains(i) && learner.has_job()) result.push_back(learner.take_job()());
+      if (jobs_after.contains(i) && i % 2 == 0) learner.take_preparation()();
     }
     while (learner.has_job()) result.push_back(learner.take_job()());
     return result;
@@ -121,7 +121,7 @@ TEST_F(StructureLearnerTest, HowFastItIsDoesNotChangeAnyProposal) {
       proposed.insert(last);
     }
     EXPECT_EQ(last, 29);
-    for (std::int64_t i = 4; i < 30; i += 5) EXPECT_TRUE(proposed.count(i)) << i;
+    for (std::int64_t i = 4; i < 30; i += 5) EXPECT_TRUE(proposed.contains(i)) << i;
     if (speed == 1) {
       EXPECT_EQ(proposed.size(), 30U);
     }
