@@ -200,6 +200,7 @@ LearnedStructure find_with_bias(const std::vector<Signal>& signals,
   SearchOptions search_options = search_options_of(options);
   search_options.unknown_bias = unknown_bias;
   MeasurementModel& measurement = search_options.measurement;
+  measurement.told_parts = told_parts(samples);
   NoiseSource noise_source = NoiseSource::kCovariances;
   const auto set_noise = [&](const std::vector<Signal>& bent,
                              const std::vector<ActionPoseSample>& of) {

@@ -4,6 +4,8 @@
 #include <map>
 #include <set>
 
+#include "processes/structure_learner/told_noise.h"
+
 namespace bodyschema {
 namespace {
 
@@ -29,21 +31,6 @@ Pose robust_mean(const std::vector<Pose>& poses) {
     mean = mean * exp(step);
   }
   return mean;
-}
-
-// Those whose pose is always the same to the last bit: they are the frame that the others are given
-// in, and have no noise.
-std::set<int> parts_that_define_the_frame(const std::vector<ActionPoseSample>& samples) {
-  std::map<int, Pose> first;
-  std::set<int> result, moved;
-  for (const ActionPoseSample& sample : samples)
-    for (const PartObservation& o : sample.parts) {
-      const auto [it, is_new] = first.try_emplace(o.part, o.X_CB);
-      if (it->second.matrix() != o.X_CB.matrix()) moved.insert(o.part);
-    }
-  for (const auto& [part, pose] : first)
-    if (!moved.contains(part)) result.insert(part);
-  return result;
 }
 
 }  // namespace
@@ -91,13 +78,13 @@ std::vector<std::vector<int>> repeats(const NormalizedActions& actions) {
 
 std::optional<Noise> noise_from_repeats(const std::vector<ActionPoseSample>& samples,
                                         const NormalizedActions& actions) {
-  const std::set<int> defining = parts_that_define_the_frame(samples);
+  const std::set<int> told = told_parts(samples);
   std::vector<NoiseResidual> residuals;
   for (const std::vector<int>& members : repeats(actions)) {
     std::map<int, std::vector<Pose>> poses;
     for (const int t : members)
       for (const PartObservation& o : samples[t].parts)
-        if (!defining.contains(o.part)) poses[o.part].push_back(o.X_CB);
+        if (!told.contains(o.part)) poses[o.part].push_back(o.X_CB);
     for (const auto& [part, of_part] : poses) {
       const double n = static_cast<double>(of_part.size());
       if (n < kMinRepeats) continue;
@@ -114,13 +101,13 @@ std::optional<Noise> noise_from_repeats(const std::vector<ActionPoseSample>& sam
 std::optional<Noise> noise_from_neighbours(const std::vector<ActionPoseSample>& samples,
                                            const NormalizedActions& actions) {
   if (!actions.blocks().is_stream()) return std::nullopt;
-  const std::set<int> defining = parts_that_define_the_frame(samples);
+  const std::set<int> told = told_parts(samples);
   std::vector<NoiseResidual> residuals;
   for (std::size_t t = 1; t + 1 < samples.size(); ++t)
     for (const PartObservation& o : samples[t].parts) {
       const PartObservation* before = samples[t - 1].find(o.part);
       const PartObservation* after = samples[t + 1].find(o.part);
-      if (!before || !after || defining.contains(o.part)) continue;
+      if (!before || !after || told.contains(o.part)) continue;
       const Pose inverse = o.X_CB.inverse();
       residuals.push_back({log(inverse * before->X_CB) + log(inverse * after->X_CB),
                            Eigen::Vector3d::Zero(), 6.0});  // variance of (1, −2, 1)

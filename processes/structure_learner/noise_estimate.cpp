@@ -13,6 +13,7 @@
 #include "processes/structure_learner/residual_fit.h"
 #include "processes/structure_learner/screen.h"
 #include "processes/structure_learner/search/model_forest.h"
+#include "processes/structure_learner/told_noise.h"
 #include "processes/structure_learner/turn_scan.h"
 
 namespace bodyschema {
@@ -63,6 +64,7 @@ class ModelNoise {
   ModelNoise(const std::vector<ActionPoseSample>& samples, const NormalizedActions& actions)
       : samples_(samples),
         actions_(actions),
+        told_parts_(told_parts(samples)),
         quantile_(actions.blocks().is_stream() ? kUpperQuantile : kMedianQuantile) {}
   const NoiseQuantile& quantile() const { return quantile_; }
 
@@ -176,8 +178,11 @@ class ModelNoise {
 
   NoiseResidual residual_of(const Vector6d& residual, const PairData& pair,
                             const FrameFit& frame) const {
-    if (actions_.blocks().is_stream()) return {residual, Eigen::Vector3d::Zero(), 2};
-    return {residual, pair.hypotheses[frame.hypothesis].z.inverse().translation(), 2};
+    const bool is_told = told_parts_.contains(pair.part_i);
+    const double markers = is_told || told_parts_.contains(pair.part_j) ? 1 : 2;
+    if (is_told || actions_.blocks().is_stream())
+      return {residual, Eigen::Vector3d::Zero(), markers};
+    return {residual, pair.hypotheses[frame.hypothesis].z.inverse().translation(), markers};
   }
 
   PairData pair_data(int part_i, int part_j, const Noise& noise) const {
@@ -187,11 +192,13 @@ class ModelNoise {
   PairData pair_data(int part_i, int part_j, const Noise& noise, int max_frames) const {
     MeasurementModel measurement;
     measurement.noise = noise;
+    measurement.told_parts = told_parts_;
     return make_pair_data(samples_, part_i, part_j, measurement, max_frames);
   }
 
   const std::vector<ActionPoseSample>& samples_;
   const NormalizedActions& actions_;
+  const std::set<int> told_parts_;
   const NoiseQuantile quantile_;
 };
 

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <map>
 
 namespace bodyschema {
 
@@ -25,6 +26,26 @@ Noise typical_noise(const std::vector<ActionPoseSample>& samples) {
   }
   if (count == 0) return {};
   return {std::sqrt(position / count), std::sqrt(rotation / std::max(num_rotations, 1))};
+}
+
+std::set<int> told_parts(const std::vector<ActionPoseSample>& samples) {
+  constexpr int kFewest = 3;
+  struct Seen {
+    Pose first;
+    int count = 0;
+    bool has_moved = false;
+  };
+  std::map<int, Seen> seen;
+  for (const ActionPoseSample& sample : samples)
+    for (const PartObservation& o : sample.parts) {
+      Seen& part = seen.try_emplace(o.part, Seen{o.X_CB}).first->second;
+      ++part.count;
+      part.has_moved |= part.first.matrix() != o.X_CB.matrix();
+    }
+  std::set<int> result;
+  for (const auto& [part, of] : seen)
+    if (!of.has_moved && of.count >= kFewest) result.insert(part);
+  return result;
 }
 
 }  // namespace bodyschema

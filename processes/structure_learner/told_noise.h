@@ -1,5 +1,6 @@
 #pragma once
 
+#include <set>
 #include <vector>
 
 #include "common/estimation/measurement_model.h"
@@ -13,5 +14,9 @@ bool has_covariances(const std::vector<ActionPoseSample>& samples);
 /// Root mean squares per axis of what the observations say, rotations of those that have one; 0
 /// without observations.
 Noise typical_noise(const std::vector<ActionPoseSample>& samples);
+
+/// The parts whose pose is the same to the last bit in all samples, three at least: they are the
+/// frame that the others are given in. What they may be off by is no noise, for it never changes.
+std::set<int> told_parts(const std::vector<ActionPoseSample>& samples);
 
 }  // namespace bodyschema

@@ -228,7 +228,8 @@ double log_hypergeometric(int drawn_marked, int drawn, int marked, int total) {
 }
 
 // How far a signal is from the value that it usually has, and whether that is an outlier; of a
-// stream by blocks of time, which are outliers if most of their samples are.
+// stream by blocks of time, parted where it begins and ends to move, which are outliers if most of
+// their samples are.
 struct Excursion {
   double away = 0;
   bool is_outlier = false;
@@ -238,16 +239,21 @@ std::vector<Excursion> excursions(const std::vector<int>& samples,
                                   const std::vector<double>& values, double usual,
                                   const TimeBlocks& blocks) {
   std::vector<Excursion> result;
+  const auto away = [&](std::size_t t) { return std::abs(values[t] - usual); };
   for (std::size_t t = 0; t < samples.size();) {
-    Excursion block;
-    const int number = blocks.block_of(samples[t]);
+    const std::size_t first = t;
+    const auto is_of_this = [&](std::size_t other) {
+      return blocks.block_of(samples[other]) == blocks.block_of(samples[first]) &&
+             (away(other) > kResting) == (away(first) > kResting);
+    };
+    Excursion excursion;
     int balance = 0;
-    for (; t < samples.size() && blocks.block_of(samples[t]) == number; ++t) {
-      block.away = std::max(block.away, std::abs(values[t] - usual));
+    for (; t < samples.size() && is_of_this(t); ++t) {
+      excursion.away = std::max(excursion.away, away(t));
       balance += outlying[t] ? 1 : -1;
     }
-    block.is_outlier = balance > 0;
-    result.push_back(block);
+    excursion.is_outlier = balance > 0;
+    result.push_back(excursion);
   }
   return result;
 }

@@ -424,4 +424,31 @@ TEST(Learn, FitsTheWholeTreeToAllMarkersWhereTheRootRests) {
   EXPECT_LT(resting, 0.8 * moving);
 }
 
+// A slide of ±4 mm, 1.3 m from the origin of a tracker. Rotation noise of the frame in which all is
+// told would be 19 mm there.
+TEST(Learn, TheFrameThatPosesAreToldInHasNoNoise) {
+  Rng rng(1);
+  std::vector<ActionPoseSample> samples(40);
+  for (int t = 0; t < 40; ++t) {
+    samples[t].sample_index = t;
+    samples[t].utime = 2'000'000 * std::int64_t{t};
+    samples[t].action = Eigen::VectorXd::Constant(1, test::uniform(rng, -1, 1));
+    Vector6d noise = test::gaussian6(rng);
+    noise.head<3>() *= 5e-4;
+    noise.tail<3>() *= 0.85 * kDegree;
+    Pose slide = Pose::Identity();
+    slide.translation() = Eigen::Vector3d(1.3, 0.004 * samples[t].action(0), 0);
+    samples[t].parts = {{.part = 0}, {.part = 1, .X_CB = slide * exp(noise)}};
+  }
+  LearnOptions options;
+  options.measurement.noise = Noise{5e-4, 0.85 * kDegree};
+  for (const bool is_told : {true, false}) {
+    if (!is_told) options.measurement.noise.reset();
+    const BodySchema schema = learn({{"q1", -1, 1}}, samples, options).schema;
+    ASSERT_EQ(schema.edges.size(), 1U) << is_told;
+    ASSERT_EQ(schema.edges[0].joints.size(), 1U) << is_told;
+    EXPECT_NEAR(std::abs(schema.edges[0].joints[0].slide), 0.004, 0.0005) << is_told;
+  }
+}
+
 }  // namespace bodyschema

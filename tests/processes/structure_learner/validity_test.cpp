@@ -2,7 +2,9 @@
 
 #include <gtest/gtest.h>
 
+#include <cmath>
 #include <numeric>
+#include <vector>
 
 #include "common/geometry/angle.h"
 #include "processes/structure_learner/screen.h"
@@ -159,6 +161,29 @@ TEST(Validity, AJointThatFitsFewReadingsOfNoMotionIsNotYetTold) {
               Verdict::kValid)
         << seed;
   }
+}
+
+// 30 Hz for 60 s; signal 1 rests but for three stretches of 70 frames.
+TEST(Validity, OutliersOfAStreamWhereARestingSignalMovesAreMotion) {
+  std::vector<ActionPoseSample> samples(1800);
+  std::vector<bool> moving(1800), wild(1800), elsewhere(1800);
+  Rng rng(1);
+  for (int t = 0; t < 1800; ++t) {
+    samples[t].utime = 33'333 * std::int64_t{t};
+    const int phase = t % 600;
+    const double moved = phase < 70 ? std::sin(M_PI * phase / 70) : 0;
+    samples[t].action = Eigen::Vector2d(std::sin(0.02 * t), moved);
+    wild[t] = test::uniform(rng, 0, 1) < 0.05;
+    moving[t] = moved > 0.1 || wild[t];
+    elsewhere[t] = (phase >= 200 && phase < 270) || wild[t];
+  }
+  const NormalizedActions actions(samples, 2);
+  ASSERT_TRUE(actions.blocks().is_stream());
+  std::vector<int> all(1800);
+  std::iota(all.begin(), all.end(), 0);
+  EXPECT_TRUE(is_wrong_at_some_commands(all, moving, actions));
+  EXPECT_FALSE(is_wrong_at_some_commands(all, elsewhere, actions));
+  EXPECT_FALSE(is_wrong_at_some_commands(all, wild, actions));
 }
 
 }  // namespace
