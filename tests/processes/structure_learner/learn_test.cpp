@@ -6,6 +6,7 @@
 #include <utility>
 
 #include "common/geometry/angle.h"
+#include "processes/structure_learner/noise_estimate.h"
 #include "tests/support/synthetic_robot.h"
 
 namespace bodyschema {
@@ -424,9 +425,10 @@ TEST(Learn, FitsTheWholeTreeToAllMarkersWhereTheRootRests) {
   EXPECT_LT(resting, 0.8 * moving);
 }
 
-// A slide of ±4 mm, 1.3 m from the origin of a tracker. Rotation noise of the frame in which all is
-// told would be 19 mm there.
+// 1.3 m from the origin of a tracker. Rotation noise of the frame in which all is told would be
+// 19 mm there, and explain anything.
 TEST(Learn, TheFrameThatPosesAreToldInHasNoNoise) {
+  constexpr Noise kTold{5e-4, 0.85 * kDegree};
   Rng rng(1);
   std::vector<ActionPoseSample> samples(40);
   for (int t = 0; t < 40; ++t) {
@@ -434,21 +436,22 @@ TEST(Learn, TheFrameThatPosesAreToldInHasNoNoise) {
     samples[t].utime = 2'000'000 * std::int64_t{t};
     samples[t].action = Eigen::VectorXd::Constant(1, test::uniform(rng, -1, 1));
     Vector6d noise = test::gaussian6(rng);
-    noise.head<3>() *= 5e-4;
-    noise.tail<3>() *= 0.85 * kDegree;
+    noise.head<3>() *= kTold.position_m;
+    noise.tail<3>() *= kTold.rotation_rad;
     Pose slide = Pose::Identity();
     slide.translation() = Eigen::Vector3d(1.3, 0.004 * samples[t].action(0), 0);
     samples[t].parts = {{.part = 0}, {.part = 1, .X_CB = slide * exp(noise)}};
   }
   LearnOptions options;
-  options.measurement.noise = Noise{5e-4, 0.85 * kDegree};
-  for (const bool is_told : {true, false}) {
-    if (!is_told) options.measurement.noise.reset();
-    const BodySchema schema = learn({{"q1", -1, 1}}, samples, options).schema;
-    ASSERT_EQ(schema.edges.size(), 1U) << is_told;
-    ASSERT_EQ(schema.edges[0].joints.size(), 1U) << is_told;
-    EXPECT_NEAR(std::abs(schema.edges[0].joints[0].slide), 0.004, 0.0005) << is_told;
-  }
+  options.measurement.noise = kTold;
+  const MeasurementModel by = find_structure({{"q1", -1, 1}}, samples, options).options.measurement;
+  EXPECT_TRUE(by.covariance(samples[0].parts[0]).isZero(1e-9));
+  EXPECT_NEAR(by.covariance(samples[0].parts[1])(0, 0), 25e-8, 1e-9);
+
+  const auto estimate = estimate_noise(samples, 1);
+  ASSERT_TRUE(estimate);
+  EXPECT_NEAR(estimate->position_m, 1.2 * kTold.position_m, 0.2 * kTold.position_m);
+  EXPECT_NEAR(estimate->rotation_rad, 1.2 * kTold.rotation_rad, 0.4 * kTold.rotation_rad);
 }
 
 }  // namespace bodyschema
