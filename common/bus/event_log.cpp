@@ -120,8 +120,9 @@ bool EventJoiner::join(LogEvent* event) {
   std::string problem;
   auto whole = joiners_[event->channel].add(event->data, &problem);
   if (!problem.empty()) ++num_bad_;
-  if (whole) event->data = *std::move(whole);
-  return whole.has_value();
+  if (!whole) return false;
+  event->data = *std::move(whole);
+  return true;
 }
 
 std::int64_t EventJoiner::num_incomplete() const {

@@ -172,6 +172,8 @@ std::vector<std::string> Yaml::keys() const {
   return keys;
 }
 
+// One that is not const makes the keys that it is asked for.
+// NOLINTNEXTLINE(readability-const-return-type)
 const YAML::Node Yaml::child(const std::string& key) const {
   if (has(key)) return (*node_)[key];
   // A key that nobody knows yet may be this one misspelt.

@@ -14,8 +14,6 @@
 #include <iterator>
 #include <utility>
 
-extern char** environ;
-
 namespace bodyschema {
 namespace {
 

@@ -127,7 +127,7 @@ struct SceneRenderer::Implementation {
                           pinhole.width, pinhole.height);
   }
 
-  void paint_tags() {
+  void paint_tags() const {
     for (const int id : scene.markers().ids()) {
       const int texture = mj_name2id(model.get(), mjOBJ_TEXTURE, tag_name(id).c_str());
       const cv::Mat bitmap = tag_bitmap(id, kTagTexels / 10);

@@ -110,7 +110,7 @@ std::string why_taken_back(const TriedModels& tried, const LearnedStructure& str
            "move them apart, or leave one of them out";
   if (!tried.open_order.empty())
     return "the order of the joints of " + names_of(tried.open_order, structure) +
-           " is not told, for one rests while the other moves: move them together";
+           " is not told by these poses: move them together, and farther";
   if (structure.is_contested)
     return "another structure fits if the noise is larger than it is said to be: tell the true "
            "noise, or give more samples";
@@ -182,8 +182,17 @@ std::string why_refused(int part, const LearnedStructure& structure, const Refus
   return "";
 }
 
-std::string why_none_is_valid(const TriedModels& tried, const LearnedStructure& structure,
-                              int max_signals) {
+/// Where only the frame is connected that the others are told in: they may move against it.
+std::string doubt_of_frame(const std::set<int>& connected, const LearnedStructure& structure) {
+  if (connected.size() != 1 ||
+      !structure.options.measurement.told_parts.contains(*connected.begin()))
+    return "";
+  return "; the pose of part " + std::to_string(*connected.begin()) +
+         " is the same at all samples: if the others moved against it meanwhile, leave it out";
+}
+
+std::string why_none_is_valid(const TriedModels& tried, const std::set<int>& connected,
+                              const LearnedStructure& structure, int max_signals) {
   if (structure.actions.moving().empty())
     return "no signal moved, and it is not rigid with any connected part: tell the signals that "
            "move it";
@@ -194,7 +203,8 @@ std::string why_none_is_valid(const TriedModels& tried, const LearnedStructure& 
               ? "; their noise is guessed from what these models leave: tell it (--noise)"
           : structure.noise_source == NoiseSource::kAssumed
               ? "; how noisy poses are is not known: tell it (--noise)"
-              : "");
+              : "") +
+         doubt_of_frame(connected, structure);
 }
 
 }  // namespace
@@ -226,7 +236,7 @@ UnconnectedPart explain_unconnected(int part, const std::vector<ActionPoseSample
   const int parameters = 6 + 6 * max_signals;
   if (!tried.undecided && 6 * tried.num_common >= 5 * parameters)
     return {part, Unconnected::kNoValidModel,
-            seen + why_none_is_valid(tried, structure, max_signals)};
+            seen + why_none_is_valid(tried, connected, structure, max_signals)};
   return {part, Unconnected::kNotEnoughData,
           seen + wanted_samples(tried.num_common, tried.untold, count_actions(samples), max_signals,
                                 structure)};

@@ -157,7 +157,8 @@ class LeafSearch {
       const bool are_few = parents_.num_common(leaf) < 5 * kPosesPerJoint;
       return open(are_few, are_few ? "more samples are needed to trust a model"
                                    : "no model with up to two signals is valid for a position "
-                                     "alone: give orientations");
+                                     "alone: give orientations, as of three points of the part, or "
+                                     "the structure (refine --structure)");
     }
     const Contender& chosen = contenders.front();
     for (const Contender& other : contenders) {

@@ -119,9 +119,10 @@ struct Told {
   }
 };
 
-// A base that moves while its own pose is given as a constant: what stands on it is off by that.
-TEST(PredictionVariance, OfABaseThatMovesCountsThat) {
+// A base that moves while its own pose is given as a constant is no frame.
+TEST(PredictionVariance, OfABaseThatMovesCountsThatOrItIsDoubted) {
   Told told;
+  int num_doubted = 0;
   for (int seed = 1; seed <= 6; ++seed) {
     Rng rng(seed);
     const test::SyntheticRobot robot = test::chapter_robot("c", rng);
@@ -132,9 +133,12 @@ TEST(PredictionVariance, OfABaseThatMovesCountsThat) {
     };
     const BodySchema schema = learn(robot.signals, samples()).schema;
     told.add(schema, 1, 2, samples());
+    num_doubted += std::ranges::any_of(schema.unconnected, [](const UnconnectedPart& part) {
+      return part.detail.find("the pose of part 1 is the same at all samples") != std::string::npos;
+    });
   }
-  ASSERT_GE(told.num_complete, 2);
-  EXPECT_LT(told.ratio(), 2);
+  EXPECT_GE(told.num_complete + num_doubted, 5) << told.num_complete << " complete";
+  if (told.num_complete > 0) EXPECT_LT(told.ratio(), 2);
 }
 
 // Tendons that stop elsewhere each time.
