@@ -116,7 +116,7 @@ LearnResult fit_tree(const LearnedStructure& structure,
       why = Refusal::kWrongAtSomeCommands;
     else if (!options.is_monitored && is_wrong_at_an_end(fit, actions.blocks()))
       why = Refusal::kWrongAtAnEnd;
-    else if (!options.is_monitored && keeps_to_second_place(fit, data))
+    else if (!options.is_monitored && keeps_to_second_place(fit, data, fitted))
       why = Refusal::kSecondPlace;
     if (why) {
       refused[std::minmax(from, to)] = *why;

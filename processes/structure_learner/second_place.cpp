@@ -46,9 +46,10 @@ bool is_same_place(const Sight& one, const Sight& other) {
 
 // By what each link of an edge but the last would have to be off for the part to be where it was
 // seen, Δ in X = B Δ X_SB; of the first without those that turn the part that it begins at, whose
-// tag may be read turned over. `beside`: the same of the last.
+// tag may be read turned over but where it is `confirmed`. `beside`: the same of the last.
 std::vector<std::vector<Sight>> changes_of_links(const Edge& edge, const EdgeData& data,
-                                                 const std::vector<Sight>& beside, double apart_m) {
+                                                 const std::vector<Sight>& beside, double apart_m,
+                                                 const std::set<int>& confirmed) {
   std::vector<std::vector<Sight>> result(edge.joints.size(), beside);
   for (std::size_t n = 0; n < beside.size(); ++n) {
     const Eigen::VectorXd& theta = data.samples[static_cast<std::size_t>(beside[n].sample)].action;
@@ -66,7 +67,8 @@ std::vector<std::vector<Sight>> changes_of_links(const Edge& edge, const EdgeDat
   }
   if (!result.empty())
     std::erase_if(result.front(), [&](const Sight& sight) {
-      return (edge.left * sight.X * edge.left.inverse()).translation().norm() <= apart_m;
+      return !confirmed.contains(sight.sample) &&
+             (edge.left * sight.X * edge.left.inverse()).translation().norm() <= apart_m;
     });
   return result;
 }
@@ -83,6 +85,15 @@ std::vector<Sight> largest_group(const std::vector<Sight>& sights) {
   return largest;
 }
 
+// The samples that an edge to the part has right.
+std::set<int> confirmed_samples(int part, const std::vector<FittedEdge>& edges) {
+  std::set<int> result;
+  for (const FittedEdge& fitted : edges)
+    for (std::size_t t = 0; fitted.edge.to == part && t < fitted.frames.size(); ++t)
+      if (!fitted.outlying[t]) result.insert(fitted.frames[t]);
+  return result;
+}
+
 std::vector<Sight> sights_of(const PairData& pair) {
   std::vector<Sight> sights;
   for (const PairFrame& frame : pair.frames) {
@@ -94,7 +105,8 @@ std::vector<Sight> sights_of(const PairData& pair) {
 
 }  // namespace
 
-bool keeps_to_second_place(const FittedEdge& fitted, const EdgeData& data) {
+bool keeps_to_second_place(const FittedEdge& fitted, const EdgeData& data,
+                           const std::vector<FittedEdge>& before) {
   std::set<int> outlying;  // samples
   for (std::size_t t = 0; t < fitted.frames.size(); ++t)
     if (fitted.outlying[t]) outlying.insert(fitted.frames[t]);
@@ -129,8 +141,10 @@ bool keeps_to_second_place(const FittedEdge& fitted, const EdgeData& data) {
       elsewhere.insert(sight.sample);
   }
   if (has_second_place(beside)) return true;
+  const std::set<int> confirmed = confirmed_samples(edge.from, before);
   if (own.num_residuals() == 6 &&
-      std::ranges::any_of(changes_of_links(edge, data, beside, apart_m), has_second_place))
+      std::ranges::any_of(changes_of_links(edge, data, beside, apart_m, confirmed),
+                          has_second_place))
     return true;
   for (const int part : seen_parts(data.samples)) {
     if (part == edge.to) continue;

@@ -1,5 +1,7 @@
 #pragma once
 
+#include <vector>
+
 #include "processes/structure_learner/edge_fit.h"
 
 namespace bodyschema {
@@ -9,7 +11,9 @@ namespace bodyschema {
 /// table when it is not in the hand, a marker that rattles between two places, another marker that
 /// is read for its own, a joint that is not recorded. Poses do not tell which of these is the body.
 /// Tags that are read turned over are no other place, and nothing is said of a stream, where
-/// outliers last.
-bool keeps_to_second_place(const FittedEdge& fitted, const EdgeData& data);
+/// outliers last. `before`: the edges that lead to it; where that to its first part has a sample
+/// right, the tag of that part is not turned over there.
+bool keeps_to_second_place(const FittedEdge& fitted, const EdgeData& data,
+                           const std::vector<FittedEdge>& before = {});
 
 }  // namespace bodyschema
