@@ -20,6 +20,8 @@ constexpr double kLeastInPlace = 0.5, kMostByChance = 0.1;
 // Standard deviations of its position from which on it is another place, and no turn of the tag.
 constexpr double kApart = 5;
 
+constexpr int kAll = std::numeric_limits<int>::max();
+
 // A part as seen from something, at a sample.
 struct Sight {
   int sample = 0;
@@ -85,15 +87,6 @@ std::vector<Sight> largest_group(const std::vector<Sight>& sights) {
   return largest;
 }
 
-// The samples that an edge to the part has right.
-std::set<int> confirmed_samples(int part, const std::vector<FittedEdge>& edges) {
-  std::set<int> result;
-  for (const FittedEdge& fitted : edges)
-    for (std::size_t t = 0; fitted.edge.to == part && t < fitted.frames.size(); ++t)
-      if (!fitted.outlying[t]) result.insert(fitted.frames[t]);
-  return result;
-}
-
 std::vector<Sight> sights_of(const PairData& pair) {
   std::vector<Sight> sights;
   for (const PairFrame& frame : pair.frames) {
@@ -101,6 +94,20 @@ std::vector<Sight> sights_of(const PairData& pair) {
     sights.push_back({frame.sample, h.z, &h});
   }
   return sights;
+}
+
+// The samples at which an edge to the part has it right, or at which it is where it mostly is.
+std::set<int> confirmed_samples(int part, const EdgeData& data,
+                                const std::vector<FittedEdge>& before) {
+  std::set<int> result;
+  for (const FittedEdge& fitted : before)
+    for (std::size_t t = 0; fitted.edge.to == part && t < fitted.frames.size(); ++t)
+      if (!fitted.outlying[t]) result.insert(fitted.frames[t]);
+  const PairData own = make_part_data(data.samples, part, data.measurement, kAll);
+  const std::vector<Sight> resting = largest_group(sights_of(own));
+  if (2 * std::ssize(resting) > own.size())
+    for (const Sight& sight : resting) result.insert(sight.sample);
+  return result;
 }
 
 }  // namespace
@@ -129,7 +136,6 @@ bool keeps_to_second_place(const FittedEdge& fitted, const EdgeData& data,
         right, [&](const Sight& sight) { return is_same_place(group.front(), sight); });
     return static_cast<double>(by_chance) < kMostByChance * static_cast<double>(right.size());
   };
-  constexpr int kAll = std::numeric_limits<int>::max();
   const PairData own = make_pair_data(data.samples, edge.from, edge.to, data.measurement, kAll);
   const double apart_m = kApart * relative_motions(own, 1).sigma_m;
   // As seen from where the model has it.
@@ -141,7 +147,7 @@ bool keeps_to_second_place(const FittedEdge& fitted, const EdgeData& data,
       elsewhere.insert(sight.sample);
   }
   if (has_second_place(beside)) return true;
-  const std::set<int> confirmed = confirmed_samples(edge.from, before);
+  const std::set<int> confirmed = confirmed_samples(edge.from, data, before);
   if (own.num_residuals() == 6 &&
       std::ranges::any_of(changes_of_links(edge, data, beside, apart_m, confirmed),
                           has_second_place))

@@ -12,7 +12,7 @@ namespace bodyschema {
 /// is read for its own, a joint that is not recorded. Poses do not tell which of these is the body.
 /// Tags that are read turned over are no other place, and nothing is said of a stream, where
 /// outliers last. `before`: the edges that lead to it; where that to its first part has a sample
-/// right, the tag of that part is not turned over there.
+/// right, or that part is where it rests, its tag is not turned over there.
 bool keeps_to_second_place(const FittedEdge& fitted, const EdgeData& data,
                            const std::vector<FittedEdge>& before = {});
 

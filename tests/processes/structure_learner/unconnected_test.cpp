@@ -218,34 +218,38 @@ TEST(Unconnected, IsAPartBeyondAJointThatIsNotRecorded) {
 }
 
 // Where an edge begins, about the tag of the part before it: as if that were read turned over, but
-// the edge to that part has it right.
+// the edge to that part has it right, or it rests.
 TEST(Unconnected, IsAPartThatAJointBehindATagTurnsWhichIsNotRecorded) {
   const Noise noise{0.001, 0.005};
-  for (const double turn : {0.0, 0.4}) {
-    Rng rng(1);
-    std::vector<ActionPoseSample> samples(100);
-    for (int n = 0; n < 100; ++n) {
-      ActionPoseSample& sample = samples[static_cast<std::size_t>(n)];
-      sample.sample_index = n;
-      sample.utime = 2'000'000 * std::int64_t{n};
-      sample.action = Eigen::Vector2d(test::uniform(rng, -1, 1), test::uniform(rng, -1, 1));
-      Pose X = Pose::Identity();
-      sample.parts.push_back(test::seen_at(1, X, noise, rng));
-      X = X * Eigen::AngleAxisd(sample.action(0), Eigen::Vector3d::UnitZ()) *
-          Eigen::Translation3d(0.2, 0, 0);
-      sample.parts.push_back(test::seen_at(2, X, noise, rng));
-      X = X * Eigen::AngleAxisd(n % 6 == 0 ? turn : 0, Eigen::Vector3d::UnitY()) *
-          Eigen::Translation3d(0.3, 0, 0) *
-          Eigen::AngleAxisd(sample.action(1), Eigen::Vector3d::UnitX()) *
-          Eigen::Translation3d(0, 0.1, 0);
-      sample.parts.push_back(test::seen_at(3, X, noise, rng));
+  for (const bool is_root : {false, true})
+    for (const double turn : {0.0, 0.4}) {
+      Rng rng(1);
+      std::vector<ActionPoseSample> samples(100);
+      for (int n = 0; n < 100; ++n) {
+        ActionPoseSample& sample = samples[static_cast<std::size_t>(n)];
+        sample.sample_index = n;
+        sample.utime = 2'000'000 * std::int64_t{n};
+        sample.action = Eigen::Vector2d(test::uniform(rng, -1, 1), test::uniform(rng, -1, 1));
+        Pose X = Pose::Identity();
+        if (!is_root) {
+          sample.parts.push_back(test::seen_at(1, X, noise, rng));
+          X = X * Eigen::AngleAxisd(sample.action(0), Eigen::Vector3d::UnitZ()) *
+              Eigen::Translation3d(0.2, 0, 0);
+        }
+        sample.parts.push_back(test::seen_at(2, X, noise, rng));
+        X = X * Eigen::AngleAxisd(n % 6 == 0 ? turn : 0, Eigen::Vector3d::UnitY()) *
+            Eigen::Translation3d(0.3, 0, 0) *
+            Eigen::AngleAxisd(sample.action(1), Eigen::Vector3d::UnitX()) *
+            Eigen::Translation3d(0, 0.1, 0);
+        sample.parts.push_back(test::seen_at(3, X, noise, rng));
+      }
+      LearnOptions options;
+      options.measurement.noise = noise;
+      const BodySchema schema = learn({{"q1", -1, 1}, {"q2", -1, 1}}, samples, options).schema;
+      EXPECT_EQ(contains(schema.unconnected, "a joint that is not recorded is elsewhere"),
+                turn > 0);
+      EXPECT_EQ(schema.complete, turn == 0);
     }
-    LearnOptions options;
-    options.measurement.noise = noise;
-    const BodySchema schema = learn({{"q1", -1, 1}, {"q2", -1, 1}}, samples, options).schema;
-    EXPECT_EQ(contains(schema.unconnected, "a joint that is not recorded is elsewhere"), turn > 0);
-    EXPECT_EQ(schema.complete, turn == 0);
-  }
 }
 
 }  // namespace
