@@ -58,23 +58,14 @@ std::optional<Noise> noise_beside_soft_edges(const std::vector<ActionPoseSample>
   return all_soft ? noise_from_neighbours(displaced, actions) : std::nullopt;
 }
 
-// What models leave is noise, or the body's.
-void tell_noise_from_body(const std::vector<ActionPoseSample>& displaced,
-                          const NormalizedActions& actions, const std::optional<Noise>& told,
-                          BodySchema* schema) {
-  // The estimate is 1.2 times too large; known to a fifth.
-  constexpr double kRefuted = 1.5;
-  std::optional<Noise> common = noise_beside_soft_edges(displaced, actions, *schema);
-  if (!common) common = noise_in_common(*schema, displaced);
-  if (!common) common = told;
-  Noise& noise = schema->noise;
-  if (!common || (noise.position_m < kRefuted * common->position_m &&
-                  noise.rotation_rad < kRefuted * common->rotation_rad))
-    return;
-  noise.position_m = std::clamp(common->position_m, kNoiseFloor.position_m, noise.position_m);
-  noise.rotation_rad =
-      std::clamp(common->rotation_rad, kNoiseFloor.rotation_rad, noise.rotation_rad);
-  add_unexplained(noise, schema);
+// Noise of the markers, whatever the models leave.
+std::optional<Noise> noise_beside_models(const std::vector<ActionPoseSample>& displaced,
+                                         const NormalizedActions& actions,
+                                         const std::optional<Noise>& told,
+                                         const BodySchema& schema) {
+  if (const auto noise = noise_beside_soft_edges(displaced, actions, schema)) return noise;
+  const std::optional<Noise> common = noise_in_common(schema, displaced);
+  return common ? common : told;
 }
 
 LearnResult fit_tree(const LearnedStructure& structure,
@@ -130,7 +121,8 @@ LearnResult fit_tree(const LearnedStructure& structure,
     result.serial_correlation = fit_jointly(data, &fitted, &schema, &refused);
   for (const FittedEdge& f : fitted) schema.edges.push_back(f.edge);
   if (structure.noise_source == NoiseSource::kResiduals)
-    tell_noise_from_body(moved, actions, options.measurement.noise, &schema);
+    if (const auto noise = noise_beside_models(moved, actions, options.measurement.noise, schema))
+      tell_noise_from_body(*noise, &schema);
   schema.set_covered(samples);
 
   const std::set<int> connected = connected_to_root(schema);

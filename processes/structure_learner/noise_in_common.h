@@ -23,4 +23,9 @@ std::optional<Noise> noise_in_common(const BodySchema& schema,
 /// alike along all axes.
 void add_unexplained(const Noise& noise, BodySchema* schema);
 
+/// What the edges leave is the markers' noise or the body's: where schema->noise, estimated from it,
+/// is much more than `of_markers`, it is that instead; what an edge leaves beside that is the
+/// body's (add_unexplained()).
+void tell_noise_from_body(Noise of_markers, BodySchema* schema);
+
 }  // namespace bodyschema

@@ -101,6 +101,28 @@ TEST(AddUnexplained, IsWhatAnEdgeLeavesBesideTheNoise) {
   }
 }
 
+// An edge that leaves three times the noise, with noise that is estimated somewhat or much too
+// large.
+TEST(TellNoiseFromBody, WhatOneEdgeLeavesIsItsOwn) {
+  for (const double factor : {1.4, 1.6}) {
+    Rng rng(3);
+    BodySchema schema = test::true_schema(test::chapter_robot("c", rng));
+    for (Edge& edge : schema.edges) {
+      edge.parameter_covariance =
+          Eigen::MatrixXd::Zero(edge.num_parameters(), edge.num_parameters());
+      edge.rotation_rms_rad = std::sqrt(3 * 2) * kNoise.rotation_rad;
+      edge.position_rms_m = 0.001;
+    }
+    schema.edges[1].rotation_rms_rad *= 3;
+    schema.noise = {factor * kNoise.position_m, factor * kNoise.rotation_rad};
+    tell_noise_from_body(kNoise, &schema);
+    EXPECT_NEAR(schema.noise.rotation_rad, (factor < 1.5 ? factor : 1) * kNoise.rotation_rad, 1e-9);
+    const Eigen::VectorXd theta = schema.displacements(mid_range(schema.signals));
+    for (std::size_t e = 0; e < schema.edges.size(); ++e)
+      EXPECT_EQ(schema.edges[e].prediction_covariance(theta)(5, 5) > 0, e == 1) << factor;
+  }
+}
+
 struct Told {
   int num_complete = 0;
   double error2 = 0, variance = 0;  ///< of positions, summed
