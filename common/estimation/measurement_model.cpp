@@ -25,7 +25,7 @@ Matrix6d without_rotation(const Matrix6d& covariance) {
 }
 
 Matrix6d MeasurementModel::noise_covariance(const PartObservation& observation) const {
-  if (told_parts.contains(observation.part)) return Matrix6d::Zero();
+  if (fixed_parts.contains(observation.part)) return Matrix6d::Zero();
   const Matrix6d covariance = scale * scale * (noise ? isotropic(*noise) : observation.covariance);
   return observation.has_rotation ? covariance : without_rotation(covariance);
 }

@@ -43,8 +43,8 @@ struct MeasurementModel {
   /// A second reading of a planar part counts while its reprojection error is at most this multiple
   /// of the first's.
   double max_error_ratio = 10;
-  /// Parts whose pose is told, not measured, as the frame of a tracker: their ε is 0.
-  std::set<int> told_parts = {};
+  /// Parts whose pose is given, not measured, as the frame of a tracker: their ε is 0.
+  std::set<int> fixed_parts = {};
   /// By part: where its marker is read from time to time though it is not there, in the part's
   /// frame. Half of its outliers are expected there.
   std::map<int, std::vector<Pose>> misread = {};

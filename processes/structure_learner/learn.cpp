@@ -73,7 +73,8 @@ LearnResult fit_tree(const LearnedStructure& structure,
                      bool must_be_valid) {
   const int num_signals = check_actions(samples, structure.signals.size());
   const SearchResult& search = structure.search;
-  const MeasurementModel& measurement = structure.options.measurement;
+  MeasurementModel measurement = structure.options.measurement;
+  measurement.fixed_parts = fixed_parts(samples);
 
   LearnResult result;
   result.noise_source = structure.noise_source;
@@ -122,7 +123,7 @@ LearnResult fit_tree(const LearnedStructure& structure,
   for (const FittedEdge& f : fitted) schema.edges.push_back(f.edge);
   if (structure.noise_source == NoiseSource::kResiduals)
     if (const auto noise = noise_beside_models(moved, actions, options.measurement.noise, schema))
-      tell_noise_from_body(*noise, &schema);
+      tell_noise_from_body(*noise, measurement.fixed_parts, &schema);
   schema.set_covered(samples);
 
   const std::set<int> connected = connected_to_root(schema);
@@ -192,7 +193,7 @@ LearnedStructure find_with_bias(const std::vector<Signal>& signals,
   SearchOptions search_options = search_options_of(options);
   search_options.unknown_bias = unknown_bias;
   MeasurementModel& measurement = search_options.measurement;
-  measurement.told_parts = told_parts(samples);
+  measurement.fixed_parts = fixed_parts(samples);
   NoiseSource noise_source = NoiseSource::kCovariances;
   const auto set_noise = [&](const std::vector<Signal>& bent,
                              const std::vector<ActionPoseSample>& of) {

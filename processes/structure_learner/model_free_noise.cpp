@@ -78,7 +78,7 @@ std::vector<std::vector<int>> repeats(const NormalizedActions& actions) {
 
 std::optional<Noise> noise_from_repeats(const std::vector<ActionPoseSample>& samples,
                                         const NormalizedActions& actions) {
-  const std::set<int> told = told_parts(samples);
+  const std::set<int> told = fixed_parts(samples);
   std::vector<NoiseResidual> residuals;
   for (const std::vector<int>& members : repeats(actions)) {
     std::map<int, std::vector<Pose>> poses;
@@ -101,7 +101,7 @@ std::optional<Noise> noise_from_repeats(const std::vector<ActionPoseSample>& sam
 std::optional<Noise> noise_from_neighbours(const std::vector<ActionPoseSample>& samples,
                                            const NormalizedActions& actions) {
   if (!actions.blocks().is_stream()) return std::nullopt;
-  const std::set<int> told = told_parts(samples);
+  const std::set<int> told = fixed_parts(samples);
   std::vector<NoiseResidual> residuals;
   for (std::size_t t = 1; t + 1 < samples.size(); ++t)
     for (const PartObservation& o : samples[t].parts) {

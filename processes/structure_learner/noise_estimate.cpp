@@ -64,7 +64,7 @@ class ModelNoise {
   ModelNoise(const std::vector<ActionPoseSample>& samples, const NormalizedActions& actions)
       : samples_(samples),
         actions_(actions),
-        told_parts_(told_parts(samples)),
+        fixed_parts_(fixed_parts(samples)),
         quantile_(actions.blocks().is_stream() ? kUpperQuantile : kMedianQuantile) {}
   const NoiseQuantile& quantile() const { return quantile_; }
 
@@ -102,7 +102,8 @@ class ModelNoise {
       if (fit.scale < best.scale) best = std::move(fit);
     };
     const PairData pair = pair_data(part_i, part_j, kRough);
-    if (pair.size() < 3) return best;
+    const bool is_measured = !fixed_parts_.contains(part_i) || !fixed_parts_.contains(part_j);
+    if (pair.size() < 3 || !is_measured) return best;
     if (!with_two_joints) {
       offer(refine(screen_rigid(pair, actions_).model, part_i, part_j, kRough));
       best.rigid_scale = best.scale;
@@ -178,9 +179,9 @@ class ModelNoise {
 
   NoiseResidual residual_of(const Vector6d& residual, const PairData& pair,
                             const FrameFit& frame) const {
-    const bool is_told = told_parts_.contains(pair.part_i);
-    const double markers = is_told || told_parts_.contains(pair.part_j) ? 1 : 2;
-    if (is_told || actions_.blocks().is_stream())
+    const bool is_fixed = fixed_parts_.contains(pair.part_i);
+    const double markers = is_fixed || fixed_parts_.contains(pair.part_j) ? 1 : 2;
+    if (is_fixed || actions_.blocks().is_stream())
       return {residual, Eigen::Vector3d::Zero(), markers};
     return {residual, pair.hypotheses[frame.hypothesis].z.inverse().translation(), markers};
   }
@@ -192,13 +193,13 @@ class ModelNoise {
   PairData pair_data(int part_i, int part_j, const Noise& noise, int max_frames) const {
     MeasurementModel measurement;
     measurement.noise = noise;
-    measurement.told_parts = told_parts_;
+    measurement.fixed_parts = fixed_parts_;
     return make_pair_data(samples_, part_i, part_j, measurement, max_frames);
   }
 
   const std::vector<ActionPoseSample>& samples_;
   const NormalizedActions& actions_;
-  const std::set<int> told_parts_;
+  const std::set<int> fixed_parts_;
   const NoiseQuantile quantile_;
 };
 

@@ -6,6 +6,7 @@
 #include "common/kinematics/screw_chain.h"
 #include "common/schema/standard_deviations.h"
 #include "processes/structure_learner/noise_estimate.h"
+#include "processes/structure_learner/told_noise.h"
 
 namespace bodyschema {
 namespace {
@@ -54,6 +55,7 @@ Residuals residuals_of(const Edge& edge, const std::vector<ActionPoseSample>& di
 
 std::optional<Noise> noise_in_common(const BodySchema& schema,
                                      const std::vector<ActionPoseSample>& displaced) {
+  const std::set<int> fixed = fixed_parts(displaced);
   std::vector<Residuals> residuals;
   for (const Edge& edge : schema.edges) residuals.push_back(residuals_of(edge, displaced));
   // Of the products, x and y being off by the same.
@@ -69,7 +71,7 @@ std::optional<Noise> noise_in_common(const BodySchema& schema,
     for (std::size_t b = a + 1; b < residuals.size(); ++b)
       for (const int part : {schema.edges[b].from, schema.edges[b].to}) {
         const bool ends_there = schema.edges[a].to == part;
-        if (!ends_there && schema.edges[a].from != part) continue;
+        if ((!ends_there && schema.edges[a].from != part) || fixed.contains(part)) continue;
         for (std::size_t t = 0; t < displaced.size(); ++t) {
           const auto &of_a = residuals[a].of_samples[t], &of_b = residuals[b].of_samples[t];
           if (!of_a || !of_b) continue;
@@ -91,7 +93,7 @@ std::optional<Noise> noise_in_common(const BodySchema& schema,
                deviation(rotation, kNoiseFloor.rotation_rad)};
 }
 
-void add_unexplained(const Noise& noise, BodySchema* schema) {
+void add_unexplained(const Noise& noise, const std::set<int>& fixed_parts, BodySchema* schema) {
   // Above so many times what is explained it is no noise of markers that differ (chosen).
   constexpr double kMuch = 2;
   for (Edge& edge : schema->edges) {
@@ -99,7 +101,9 @@ void add_unexplained(const Noise& noise, BodySchema* schema) {
     const Eigen::VectorXd middle = schema->displacements(mid_range(schema->signals));
     const Vector6d whole = edge.empirical_covariance().diagonal();
     const Matrix6d scatter = edge.scatter_covariance(middle);
-    Vector6d explained = noise_of_pair(edge.predict(middle), noise);
+    Vector6d explained = fixed_parts.contains(edge.from)
+                             ? isotropic(noise).diagonal().eval()
+                             : noise_of_pair(edge.predict(middle), noise);
     explained.head<3>().array() += scatter.topLeftCorner<3, 3>().trace() / 3;
     explained.tail<3>().array() += scatter.bottomRightCorner<3, 3>().trace() / 3;
     const int last = ScrewChainLayout::transform(static_cast<int>(edge.joints.size()));
@@ -109,7 +113,7 @@ void add_unexplained(const Noise& noise, BodySchema* schema) {
   }
 }
 
-void tell_noise_from_body(Noise of_markers, BodySchema* schema) {
+void tell_noise_from_body(Noise of_markers, const std::set<int>& fixed_parts, BodySchema* schema) {
   // The estimate is 1.2 times too large; known to a fifth.
   constexpr double kRefuted = 1.5;
   Noise& noise = schema->noise;
@@ -120,7 +124,7 @@ void tell_noise_from_body(Noise of_markers, BodySchema* schema) {
         std::clamp(of_markers.rotation_rad, kNoiseFloor.rotation_rad, noise.rotation_rad);
     of_markers = noise;
   }
-  add_unexplained(of_markers, schema);
+  add_unexplained(of_markers, fixed_parts, schema);
 }
 
 }  // namespace bodyschema

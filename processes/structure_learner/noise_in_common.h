@@ -1,6 +1,7 @@
 #pragma once
 
 #include <optional>
+#include <set>
 #include <vector>
 
 #include "common/schema/body_schema.h"
@@ -14,18 +15,19 @@ namespace bodyschema {
 /// one standard error allows: where a body is off by much the mean itself may be any, below 0 too.
 ///
 /// Residuals of the fit are enlarged to the leave-one-out residuals. `displaced`: samples whose
-/// actions are displacements. std::nullopt: no two edges meet, or too few samples show both.
+/// actions are displacements. std::nullopt: no two edges meet at a part that is measured
+/// (fixed_parts()), or too few samples show both.
 std::optional<Noise> noise_in_common(const BodySchema& schema,
                                      const std::vector<ActionPoseSample>& displaced);
 
 /// Adds to the covariance of each edge of screws what it leaves that neither this noise nor the
 /// scatter of its joints explains: what it stands on moves, or it gives way. At the edge's end,
-/// alike along all axes.
-void add_unexplained(const Noise& noise, BodySchema* schema);
+/// alike along all axes. `fixed_parts` have no noise.
+void add_unexplained(const Noise& noise, const std::set<int>& fixed_parts, BodySchema* schema);
 
-/// What the edges leave is the markers' noise or the body's: where schema->noise, estimated from it,
-/// is much more than `of_markers`, it is that instead; what an edge leaves beside that is the
+/// What the edges leave is the markers' noise or the body's: where schema->noise, estimated from
+/// it, is much more than `of_markers`, it is that instead; what an edge leaves beside that is the
 /// body's (add_unexplained()).
-void tell_noise_from_body(Noise of_markers, BodySchema* schema);
+void tell_noise_from_body(Noise of_markers, const std::set<int>& fixed_parts, BodySchema* schema);
 
 }  // namespace bodyschema

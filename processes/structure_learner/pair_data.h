@@ -48,7 +48,8 @@ class NormalizedActions {
 
 /// So near to each other [half ranges] are values of a signal that rests.
 inline constexpr double kResting = 0.02;
-/// The value that a signal has at most of these, if it has one.
+/// The value [half ranges] that a signal has, within kResting, at more than half of these, if it
+/// has one.
 std::optional<double> usual_value(std::vector<double> values);
 
 /// One reading of z_ij = y_i⁻¹ y_j.

@@ -123,9 +123,9 @@ std::optional<SoftFit> fit_soft_model(const LocalModel& screws, const PairData& 
     std::sort(chosen.begin(), chosen.end());
   }
   if (!fitter.fit(chosen, nullptr, kIterations)) return std::nullopt;
-  fitter.reweigh();
+  const bool is_too_straight = fitter.reweigh();
   const Shape shape = fitter.shape();
-  if (!fitter.fit(chosen, &shape, kIterations)) return std::nullopt;
+  if (!fitter.fit(chosen, is_too_straight ? nullptr : &shape, kIterations)) return std::nullopt;
   const std::vector<int> doubtful = signals.empty() ? drop_signals(&fitter) : std::vector<int>{};
   if (fitter.signals().size() < chosen.size()) {
     chosen = fitter.signals();

@@ -28,9 +28,12 @@ constexpr double kShortest = 0.1, kLongest = 30;
 // leave as much, those from the likeliest end 0.17 mm.
 constexpr std::array kStartLengths = {1.0, 3.0, 9.0};
 
-// Outliers in a row at an end of a signal's range that are no wild readings: that the only two of
-// 80 are there has a chance of 1 in 400 for two signals.
-constexpr std::ptrdiff_t kFewestAtEnd = 2;
+// Chance of so many outliers in a row at any end of the signals' ranges below which they are no
+// wild readings: that the only two of 80 are there has one of 1 in 800 for two signals.
+constexpr double kLogChanceAtEnd = -4.6;  // 1e-2
+// d² of outliers from which on they are wild wherever they are, as tags that are read turned over:
+// 45 deviations, chosen.
+const double kWild = 100 * kOutlierThreshold;
 
 // At most so many instants that cover the inputs (D×n) evenly: each the one farthest from all
 // before.
@@ -194,26 +197,37 @@ void ResidualFitter::use_all_samples() {
   judge();
 }
 
-void ResidualFitter::reweigh() {
+bool ResidualFitter::reweigh() {
   for (int t = 0; t < pair_->size(); ++t) {
     targets_.frames[t] = judged_.frames[t];
     targets_.weights(t) = robust_weight(judged_.squared_distance[t]);
   }
-  for (const int t : outliers_at_ends()) targets_.weights(t) = 1;
+  const std::vector<int> at_ends = outliers_at_ends();
+  for (const int t : at_ends) targets_.weights(t) = 1;
   set_targets(false);
+  return !at_ends.empty();
 }
 
 std::vector<int> ResidualFitter::outliers_at_ends() const {
   std::vector<int> result, order(static_cast<std::size_t>(pair_->size()));
-  if (actions_->blocks().is_stream()) return result;
+  if (actions_->blocks().is_stream() || judged_.num_outliers == pair_->size()) return result;
+  const double log_trials = std::log(2.0 * static_cast<double>(inputs_.rows()));
+  const auto& d2 = judged_.squared_distance;
   for (Eigen::Index d = 0; d < inputs_.rows(); ++d)
     for (const double sign : {-1.0, 1.0}) {
+      const auto place = [&](int t) { return sign * inputs_(d, t); };
       std::iota(order.begin(), order.end(), 0);
-      std::ranges::stable_sort(order, {}, [&](int t) { return sign * inputs_(d, t); });
-      const auto inlier = std::ranges::find_if(
-          order, [&](int t) { return judged_.squared_distance[t] <= kOutlierThreshold; });
-      if (inlier - order.begin() >= kFewestAtEnd)
-        result.insert(result.end(), order.begin(), inlier);
+      std::ranges::stable_sort(order, {}, place);
+      const int inlier =
+          *std::ranges::find_if(order, [&](int t) { return d2[t] <= kOutlierThreshold; });
+      // Beyond all inliers, not where the signal often is.
+      const auto end = std::ranges::find_if(
+          order, [&](int t) { return place(t) >= place(inlier) - kResting || d2[t] > kWild; });
+      const auto num = static_cast<int>(end - order.begin());
+      if (num > 0 &&
+          log_trials + log_hypergeometric(num, num, judged_.num_outliers, pair_->size()) <
+              kLogChanceAtEnd)
+        result.insert(result.end(), order.begin(), end);
     }
   return result;
 }

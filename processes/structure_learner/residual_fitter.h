@@ -47,8 +47,9 @@ class ResidualFitter {
   /// As many samples as a process takes, with the hyper-parameters as they are.
   void use_all_samples();
   /// Readings and weights from the judgement. Outliers in a row at an end of a signal's range weigh
-  /// as others: there a process that is too straight is off.
-  void reweigh();
+  /// as others: there a process that is too straight is off. True if there are any: another start
+  /// may lead to one that bends.
+  bool reweigh();
 
   /// Of the last fit().
   const Shape& shape() const { return shape_; }
@@ -82,7 +83,8 @@ class ResidualFitter {
   Eigen::VectorXd input_row(int signal) const;
   void set_targets(bool first = true);
   Eigen::VectorXd noise_scales() const;
-  // Of poses at rest: two or more at one end of a signal's range, with no inlier beyond.
+  // Of poses at rest: more than chance explains at one end of a signal's range, with no inlier
+  // beyond and none that is wild.
   std::vector<int> outliers_at_ends() const;
   // Among the frames that are no outliers, as far as one can tell.
   void choose_samples(std::size_t most);

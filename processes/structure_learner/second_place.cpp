@@ -21,6 +21,8 @@ constexpr double kLeastInPlace = 0.5, kMostByChance = 0.1;
 constexpr double kApart = 5;
 
 constexpr int kAll = std::numeric_limits<int>::max();
+// Sights among which it is looked for where a part rests: a test for each two.
+constexpr int kSearched = 200;
 
 // A part as seen from something, at a sample.
 struct Sight {
@@ -103,10 +105,13 @@ std::set<int> confirmed_samples(int part, const EdgeData& data,
   for (const FittedEdge& fitted : before)
     for (std::size_t t = 0; fitted.edge.to == part && t < fitted.frames.size(); ++t)
       if (!fitted.outlying[t]) result.insert(fitted.frames[t]);
-  const PairData own = make_part_data(data.samples, part, data.measurement, kAll);
-  const std::vector<Sight> resting = largest_group(sights_of(own));
-  if (2 * std::ssize(resting) > own.size())
-    for (const Sight& sight : resting) result.insert(sight.sample);
+  const auto sights = [&](int most) {
+    return sights_of(make_part_data(data.samples, part, data.measurement, most));
+  };
+  const std::vector<Sight> some = sights(kSearched), resting = largest_group(some);
+  if (2 * resting.size() <= some.size()) return result;
+  for (const Sight& sight : sights(kAll))
+    if (is_same_place(resting.front(), sight)) result.insert(sight.sample);
   return result;
 }
 

@@ -24,6 +24,7 @@ constexpr double kSameCommands = 0.6;
 /// Frames of a fit, and products of a median. Chosen.
 constexpr int kFitted = 200;
 constexpr std::size_t kFewestProducts = 20;
+constexpr std::ptrdiff_t kFewestMoved = 2 * kFewestProducts;
 constexpr int kMotions = 200;
 constexpr int kIterations = 30;
 /// What a model may leave, of what time-shifted commands mostly leave, in squares: of enough
@@ -53,9 +54,9 @@ double explained_share(const Eigen::MatrixXd& values, const Eigen::MatrixXd& oth
   return explained / y.squaredNorm();
 }
 
-/// By sample, whether one of the model's signals is away from where it mostly is; true of all if
-/// none rests. Where they rest shifted commands tell as much.
-std::vector<bool> is_moved(const LocalModel& model, const NormalizedActions& actions) {
+/// By sample, whether one of the model's signals is away from where it mostly is: where they rest
+/// shifted commands tell as much. All samples if none rests, or if these are too few.
+std::vector<bool> moved_samples(const LocalModel& model, const NormalizedActions& actions) {
   std::vector<bool> result(static_cast<std::size_t>(actions.num_samples()));
   for (const int signal : signal_set(model)) {
     std::vector<double> values;
@@ -64,6 +65,7 @@ std::vector<bool> is_moved(const LocalModel& model, const NormalizedActions& act
     for (std::size_t n = 0; n < values.size(); ++n)
       if (!usual || std::abs(values[n] - *usual) > kResting) result[n] = true;
   }
+  if (std::ranges::count(result, true) < kFewestMoved) result.assign(result.size(), true);
   return result;
 }
 
@@ -163,7 +165,7 @@ bool SurrogateCommands::explain_as_well(const AcceptedModel& accepted) const {
   };
   const PairData few = data(kFitted), all = is_stream() ? data(actions_.num_samples()) : few;
   const int most_apart = std::max(1, blocks_.length() / 4);
-  const std::vector<bool> moved = is_moved(accepted.model, actions_);
+  const std::vector<bool> moved = moved_samples(accepted.model, actions_);
   const auto left_by = [&](const LocalModel& model, const NormalizedActions& actions) {
     return is_stream() ? slow_residual(model, all, actions, moved, most_apart)
                        : typical_residual(model, all, actions);
@@ -175,7 +177,7 @@ bool SurrogateCommands::explain_as_well(const AcceptedModel& accepted) const {
   for (const NormalizedActions& other : others_)
     left.push_back(left_by(best_of_as_many(accepted.model, few, other), other));
   if (!is_stream()) return !(own < kMostLeftAtRest * *std::ranges::min_element(left));
-  const double num_blocks = static_cast<double>(actions_.num_samples()) / blocks_.length();
+  const double num_blocks = static_cast<double>(std::ranges::count(moved, true)) / blocks_.length();
   const double most = kMostLeft * std::pow(std::min(1.0, num_blocks / kEnoughBlocks), 2);
   return !(own < most * upper_median(std::move(left)));
 }

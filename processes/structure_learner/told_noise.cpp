@@ -28,7 +28,7 @@ Noise typical_noise(const std::vector<ActionPoseSample>& samples) {
   return {std::sqrt(position / count), std::sqrt(rotation / std::max(num_rotations, 1))};
 }
 
-std::set<int> told_parts(const std::vector<ActionPoseSample>& samples) {
+std::set<int> fixed_parts(const std::vector<ActionPoseSample>& samples) {
   constexpr int kFewest = 3;
   struct Seen {
     Pose first;

@@ -16,7 +16,7 @@ bool has_covariances(const std::vector<ActionPoseSample>& samples);
 Noise typical_noise(const std::vector<ActionPoseSample>& samples);
 
 /// The parts whose pose is the same to the last bit in all samples, three at least: they are the
-/// frame that the others are given in. What they may be off by is no noise, for it never changes.
-std::set<int> told_parts(const std::vector<ActionPoseSample>& samples);
+/// frame that the others are given in. What they may be off by never changes, and is no noise.
+std::set<int> fixed_parts(const std::vector<ActionPoseSample>& samples);
 
 }  // namespace bodyschema

@@ -182,13 +182,12 @@ std::string why_refused(int part, const LearnedStructure& structure, const Refus
   return "";
 }
 
-/// Where only the frame is connected that the others are told in: they may move against it.
+/// Where only the frame is connected that the others are given in: they may move against it.
 std::string doubt_of_frame(const std::set<int>& connected, const LearnedStructure& structure) {
-  if (connected.size() != 1 ||
-      !structure.options.measurement.told_parts.contains(*connected.begin()))
-    return "";
-  return "; the pose of part " + std::to_string(*connected.begin()) +
-         " is the same at all samples: if the others moved against it meanwhile, leave it out";
+  const std::set<int>& fixed = structure.options.measurement.fixed_parts;
+  if (!std::ranges::all_of(connected, [&](int part) { return fixed.contains(part); })) return "";
+  return "; that keeps its pose at all samples, to the last digit: if the others moved against it "
+         "meanwhile, leave it out";
 }
 
 std::string why_none_is_valid(const TriedModels& tried, const std::set<int>& connected,

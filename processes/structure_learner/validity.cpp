@@ -217,19 +217,9 @@ bool is_improbable_by_chance(const Fit& fit, const PairData& pair, const Normali
   return dof * log_spread(fit, pair) > std::log(num_candidates) + 7;
 }
 
-// log of the chance that of so many drawn from `total`, `marked` of which are marked, so many are.
-double log_hypergeometric(int drawn_marked, int drawn, int marked, int total) {
-  const auto log_choose = [](int n, int k) {
-    return k < 0 || k > n ? -std::numeric_limits<double>::infinity()
-                          : std::lgamma(n + 1) - std::lgamma(k + 1) - std::lgamma(n - k + 1);
-  };
-  return log_choose(marked, drawn_marked) + log_choose(total - marked, drawn - drawn_marked) -
-         log_choose(total, drawn);
-}
-
 // How far a signal is from the value that it usually has, and whether that is an outlier; of a
-// stream by blocks of time, parted where it begins and ends to move, which are outliers if most of
-// their samples are.
+// stream by motions and, while it rests, blocks of time, which are outliers if most of their
+// samples are.
 struct Excursion {
   double away = 0;
   bool is_outlier = false;
@@ -242,9 +232,11 @@ std::vector<Excursion> excursions(const std::vector<int>& samples,
   const auto away = [&](std::size_t t) { return std::abs(values[t] - usual); };
   for (std::size_t t = 0; t < samples.size();) {
     const std::size_t first = t;
+    const bool moves = away(first) > kResting;
     const auto is_of_this = [&](std::size_t other) {
-      return blocks.block_of(samples[other]) == blocks.block_of(samples[first]) &&
-             (away(other) > kResting) == (away(first) > kResting);
+      if (blocks.block_of(samples[other]) == blocks.block_of(samples[first]))
+        return (away(other) > kResting) == moves;
+      return blocks.is_stream() && moves && away(other) > kResting;
     };
     Excursion excursion;
     int balance = 0;
@@ -259,13 +251,13 @@ std::vector<Excursion> excursions(const std::vector<int>& samples,
 }
 
 // Outliers where a signal is farthest from the value that it usually has; or at all poses where it
-// is away from that, so that no pose tells what it does.
-bool are_outliers_where_it_moved(std::vector<Excursion> all, double log_trials) {
+// is away from that, so that no pose tells what it does; `fewest` of them.
+bool are_outliers_where_it_moved(std::vector<Excursion> all, double log_trials, int fewest) {
   constexpr double kLogLeastChance = -6.9;  // 1e-3
   std::ranges::stable_sort(all, std::ranges::greater(), &Excursion::away);
   const auto inlier = std::ranges::find(all, false, &Excursion::is_outlier);
   const auto num = static_cast<int>(inlier - all.begin());
-  if (num == 0 || all.front().away <= kResting) return false;
+  if (num < fewest || all.front().away <= kResting) return false;
   const auto num_outliers = static_cast<int>(std::ranges::count(all, true, &Excursion::is_outlier));
   return inlier == all.end() || inlier->away <= kResting ||
          log_trials + log_hypergeometric(num, num, num_outliers, static_cast<int>(all.size())) <
@@ -273,6 +265,15 @@ bool are_outliers_where_it_moved(std::vector<Excursion> all, double log_trials) 
 }
 
 }  // namespace
+
+double log_hypergeometric(int drawn_marked, int drawn, int marked, int total) {
+  const auto log_choose = [](int n, int k) {
+    return k < 0 || k > n ? -std::numeric_limits<double>::infinity()
+                          : std::lgamma(n + 1) - std::lgamma(k + 1) - std::lgamma(n - k + 1);
+  };
+  return log_choose(marked, drawn_marked) + log_choose(total - marked, drawn - drawn_marked) -
+         log_choose(total, drawn);
+}
 
 bool is_wrong_at_some_commands(const std::vector<int>& samples, const std::vector<bool>& outlying,
                                const NormalizedActions& actions) {
@@ -293,8 +294,10 @@ bool is_wrong_at_some_commands(const std::vector<int>& samples, const std::vecto
     std::vector<double> values;
     for (const int sample : samples) values.push_back(actions(sample, signal));
     const auto usual = usual_value(values);
-    if (usual && are_outliers_where_it_moved(
-                     excursions(samples, outlying, values, *usual, actions.blocks()), log_signals))
+    // What hides a tag of a stream lasts, and may do so while a signal moves once.
+    if (usual &&
+        are_outliers_where_it_moved(excursions(samples, outlying, values, *usual, actions.blocks()),
+                                    log_signals, actions.blocks().is_stream() ? 2 : 1))
       return true;
     if (actions.blocks().is_stream()) continue;
     std::iota(order.begin(), order.end(), 0);

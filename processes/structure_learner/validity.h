@@ -67,13 +67,16 @@ Validity check_validity(const Fit& fit, const LeaveOneOut& loo, const PairData& 
 /// others between (hypergeometric): there the model is wrong, and not its poses. So it is where
 /// outliers are those at which a signal is farthest from the value that it has at half of the
 /// poses, or all that are away from that: nothing tells then what the signal does. `outlying`: by
-/// sample of `samples`. In a stream, where outliers last, blocks of time count, and where signals
-/// that mostly rest move. O(D (K² + N log N)) of K outliers among N and D signals.
+/// sample of `samples`. Of a stream, where outliers last, only the motions of signals that mostly
+/// rest are looked at, two at least. O(D (K² + N log N)) of K outliers among N and D signals.
 bool is_wrong_at_some_commands(const std::vector<int>& samples, const std::vector<bool>& outlying,
                                const NormalizedActions& actions);
 /// `squared_distance`: by frame of the pair.
 bool is_wrong_at_some_commands(const PairData& pair, const std::vector<double>& squared_distance,
                                const NormalizedActions& actions);
+
+/// log of the chance that of so many drawn from `total`, `marked` of which are marked, so many are.
+double log_hypergeometric(int drawn_marked, int drawn, int marked, int total);
 
 /// Expected share of frames of a pair with an outlier among its two markers.
 double pair_outlier_rate(const ValidityOptions& options);

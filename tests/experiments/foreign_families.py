@@ -466,3 +466,33 @@ def _(rng, seed):
     arm, inputs = marked(rng, serial_joints(rng, 5), frames=[0, 2, 5]), rng.uniform(-1.2, 1.2, (200, 4))
     state = np.where(rng.random(200) < rng.uniform(.1, .18), rng.uniform(.2, .6), 0)
     return record(rng, seed, lambda q: arm(np.insert(q, 3, state[:len(q)], axis=1)), [-1.2] * 4, 1.2, inputs=inputs)
+@family("41 tracker's frame, ends only")
+def _(rng, seed):
+    """The tracker's frame, 1 to 2 m away, is part 1: its pose is the same in all rows, to the last digit."""
+    joints, tool = dh_joints(rng)
+    away = pose(rng.uniform(1, 2) * unit(rng), rng.normal(0, 1, 3))
+    rec = record(rng, seed, tree(joints, {1: (0, away), 2: (6, tool @ placed(rng))}), [-1.5] * 6, 1.5, n=120, noise=(4e-4, .8 * DEG))
+    rec.read[1] = rec.seen[1].copy()
+    return rec
+@family("42 stream, joint that mostly rests")
+def _(rng, seed):
+    """One of four joints moves in the first 2 to 5 s of each 20 s alone."""
+    t, lasts, j = np.arange(1800) / 30, rng.uniform(2, 5), seed % 4
+    f, phase = rng.uniform(.05, .35, (3, 4)), rng.uniform(0, 2 * np.pi, (3, 4))
+    inputs = .5 * np.sin(2 * np.pi * f * t[:, None, None] + phase).sum(1)
+    inputs[:, j] = np.where(t % 20 < lasts, .8 * np.sin(np.pi * (t % 20) / lasts) ** 2, 0)
+    rests = rng.uniform(.9 * inputs.min(0), .9 * inputs.max(0), (100, 4))
+    rec = record(rng, seed, marked(rng, serial_joints(rng, 4)), [0] * 4, 1, inputs=np.vstack([inputs, rests]))
+    rec.times = np.concatenate([t, 70 + 2.0 * np.arange(100)])
+    rec.train = np.arange(1900) < 1800
+    return rec
+@family("43 booms moved by cylinders")
+def _(rng, seed):
+    """Slew and three hinges, each turned by a cylinder whose length is the input (law of cosines). Odd seeds: two joints between parts."""
+    near, far = rng.uniform(.15, .25, 3), rng.uniform(.3, .4, 3)
+    joints = [(i, pose([[0, 0, .2], [.05, 0, .1], [.5, 0, 0], [.4, 0, 0]][i]), Y if i else Z, False, i) for i in range(4)]
+    booms = marked(rng, joints, frames=[0, 2, 4] if seed % 2 else None)
+    angle = lambda s: np.arccos(np.clip((near ** 2 + far ** 2 - s ** 2) / (2 * near * far), -1, 1))
+    length = lambda a: np.sqrt(near ** 2 + far ** 2 - 2 * near * far * np.cos(a))
+    inputs = np.column_stack([rng.uniform(-1.5, 1.5, 200), length(rng.uniform(20 * DEG, 130 * DEG, (200, 3)))])
+    return record(rng, seed, lambda q: booms(np.column_stack([q[:, 0], angle(q[:, 1:])])), inputs.min(0), inputs.max(0), inputs=inputs)

@@ -30,7 +30,7 @@ struct Recording {
   bool has_noise = false;
   /// Whether the poses are those of camera markers, recorded by our observer.
   bool is_log = false;
-  /// measurement_of() a log; of a CSV without a systematic error.
+  /// measurement_of() a log; of a CSV with fixed_parts() and without a systematic error.
   MeasurementModel measurement;
   /// Damage of a log, for people: "" if it is whole. Samples before the damage were read.
   std::string damage;

@@ -13,6 +13,7 @@
 #include "common/geometry/angle.h"
 #include "common/text/text.h"
 #include "processes/structure_learner/recording/recording.h"
+#include "processes/structure_learner/told_noise.h"
 
 namespace bodyschema {
 namespace {
@@ -285,6 +286,7 @@ Recording parse_csv(const std::string& text, const std::string& name) {
     recording.signals[i].lower = observed[i].lower;
     recording.signals[i].upper = observed[i].upper;
   }
+  recording.measurement.fixed_parts = fixed_parts(recording.samples);
   recording.hints = hints_of(recording);
   add_mixture_hint(recording);
   return recording;

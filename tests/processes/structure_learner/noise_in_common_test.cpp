@@ -90,7 +90,7 @@ TEST(AddUnexplained, IsWhatAnEdgeLeavesBesideTheNoise) {
     edge.position_rms_m = 0.001;
   }
   schema.edges[1].rotation_rms_rad *= 3;
-  add_unexplained(kNoise, &schema);
+  add_unexplained(kNoise, {}, &schema);
   const Eigen::VectorXd theta = schema.displacements(mid_range(schema.signals));
   for (std::size_t e = 0; e < schema.edges.size(); ++e) {
     const Matrix6d covariance = schema.edges[e].prediction_covariance(theta);
@@ -115,7 +115,7 @@ TEST(TellNoiseFromBody, WhatOneEdgeLeavesIsItsOwn) {
     }
     schema.edges[1].rotation_rms_rad *= 3;
     schema.noise = {factor * kNoise.position_m, factor * kNoise.rotation_rad};
-    tell_noise_from_body(kNoise, &schema);
+    tell_noise_from_body(kNoise, {}, &schema);
     EXPECT_NEAR(schema.noise.rotation_rad, (factor < 1.5 ? factor : 1) * kNoise.rotation_rad, 1e-9);
     const Eigen::VectorXd theta = schema.displacements(mid_range(schema.signals));
     for (std::size_t e = 0; e < schema.edges.size(); ++e)
@@ -156,7 +156,7 @@ TEST(PredictionVariance, OfABaseThatMovesCountsThatOrItIsDoubted) {
     const BodySchema schema = learn(robot.signals, samples()).schema;
     told.add(schema, 1, 2, samples());
     num_doubted += std::ranges::any_of(schema.unconnected, [](const UnconnectedPart& part) {
-      return part.detail.find("the pose of part 1 is the same at all samples") != std::string::npos;
+      return part.detail.find("that keeps its pose at all samples") != std::string::npos;
     });
   }
   EXPECT_GE(told.num_complete + num_doubted, 5) << told.num_complete << " complete";

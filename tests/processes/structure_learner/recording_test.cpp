@@ -1,8 +1,11 @@
 #include "processes/structure_learner/recording/recording.h"
 
+#include <fmt/format.h>
 #include <gtest/gtest.h>
 
+#include <set>
 #include <sstream>
+#include <string>
 
 #include "common/geometry/angle.h"
 #include "tests/support/synthetic_robot.h"
@@ -355,6 +358,13 @@ TEST(RecordingTest, ANoiseThatIsNotPositiveIsRefused) {
             "f.csv:2:21: sp_m: expected a standard deviation above 0");
   EXPECT_EQ(error_of(header + "0,1,1,0,0,0,1,0,0,0,1,-1\n"),
             "f.csv:2:23: sr_deg: expected a standard deviation above 0");
+}
+
+TEST(RecordingTest, APartWhosePoseNeverChangesHasNoNoise) {
+  std::string text = kHeader;
+  for (int t = 0; t < 4; ++t)
+    text += fmt::format("{0},0.{0},0,1,1,0,0,1,0,0,0\n{0},0.{0},0,2,1,0.0{0},0,1,0,0,0\n", t);
+  EXPECT_EQ(parse_csv(text, "f.csv").measurement.fixed_parts, std::set<int>{1});
 }
 
 // Numbers that no robot has would overflow further on.

@@ -2,6 +2,7 @@
 
 #include <gtest/gtest.h>
 
+#include <algorithm>
 #include <cmath>
 #include <numeric>
 #include <vector>
@@ -168,12 +169,14 @@ TEST(Validity, OutliersOfAStreamWhereARestingSignalMovesAreMotion) {
   std::vector<ActionPoseSample> samples(1800);
   std::vector<bool> moving(1800), wild(1800), elsewhere(1800);
   Rng rng(1);
+  bool is_wild = false;
   for (int t = 0; t < 1800; ++t) {
     samples[t].utime = 33'333 * std::int64_t{t};
     const int phase = t % 600;
     const double moved = phase < 70 ? std::sin(M_PI * phase / 70) : 0;
     samples[t].action = Eigen::Vector2d(std::sin(0.02 * t), moved);
-    wild[t] = test::uniform(rng, 0, 1) < 0.05;
+    if (t % 30 == 0) is_wild = test::uniform(rng, 0, 1) < 0.1;
+    wild[t] = is_wild;
     moving[t] = moved > 0.1 || wild[t];
     elsewhere[t] = (phase >= 200 && phase < 270) || wild[t];
   }
@@ -184,6 +187,11 @@ TEST(Validity, OutliersOfAStreamWhereARestingSignalMovesAreMotion) {
   EXPECT_TRUE(is_wrong_at_some_commands(all, moving, actions));
   EXPECT_FALSE(is_wrong_at_some_commands(all, elsewhere, actions));
   EXPECT_FALSE(is_wrong_at_some_commands(all, wild, actions));
+  // What hides a tag while it moves once.
+  std::vector<bool> once(1800);
+  std::copy(moving.begin(), moving.begin() + 70, once.begin());
+  for (int t = 600; t < 1800; ++t) samples[t].action(1) = 0;
+  EXPECT_FALSE(is_wrong_at_some_commands(all, once, NormalizedActions(samples, 2)));
 }
 
 }  // namespace
