@@ -104,6 +104,10 @@ struct LearnedStructure {
 /// (position_leaves.h). Where the poses of a stream come after their commands (command_lag.h), each
 /// counts with the command that brought it there. Signals that are the rates of others are left out
 /// where the structure spans without them, or has more edges.
+///
+/// From outside in: rates left out, the delay of the poses (find_delayed), soft parts, chance and
+/// positions alone (find_in_step), how large the noise is (confirmed_structure()), which commands
+/// are bent (find_with_bias), search_structure().
 /// @throws std::invalid_argument as learn().
 LearnedStructure find_structure(const std::vector<Signal>& signals,
                                 const std::vector<ActionPoseSample>& samples,
