@@ -21,6 +21,8 @@ constexpr double kLeastInPlace = 0.5, kMostByChance = 0.1;
 constexpr double kApart = 5;
 
 constexpr int kAll = std::numeric_limits<int>::max();
+// Turn [rad] of a tag that is read turned over, at least: of one that is seen 20° from its normal.
+constexpr double kLeastFlip = 0.7;
 // Sights among which it is looked for where a part rests: a test for each two.
 constexpr int kSearched = 200;
 
@@ -49,10 +51,10 @@ bool is_same_place(const Sight& one, const Sight& other) {
 }
 
 // By what each link of an edge but the last would have to be off for the part to be where it was
-// seen, Δ in X = B Δ X_SB; of the first without those that turn the part that it begins at, whose
-// tag may be read turned over but where it is `confirmed`. `beside`: the same of the last.
+// seen, Δ in X = B Δ X_SB; of the first where no tag is read turned over: that of the part that it
+// begins at is `confirmed`, that beyond is turned too little. `beside`: the same of the last.
 std::vector<std::vector<Sight>> changes_of_links(const Edge& edge, const EdgeData& data,
-                                                 const std::vector<Sight>& beside, double apart_m,
+                                                 const std::vector<Sight>& beside,
                                                  const std::set<int>& confirmed) {
   std::vector<std::vector<Sight>> result(edge.joints.size(), beside);
   for (std::size_t n = 0; n < beside.size(); ++n) {
@@ -71,8 +73,7 @@ std::vector<std::vector<Sight>> changes_of_links(const Edge& edge, const EdgeDat
   }
   if (!result.empty())
     std::erase_if(result.front(), [&](const Sight& sight) {
-      return !confirmed.contains(sight.sample) &&
-             (edge.left * sight.X * edge.left.inverse()).translation().norm() <= apart_m;
+      return !confirmed.contains(sight.sample) || log(sight.X).tail<3>().norm() > kLeastFlip;
     });
   return result;
 }
@@ -89,6 +90,7 @@ std::vector<Sight> largest_group(const std::vector<Sight>& sights) {
   return largest;
 }
 
+// They point to what is read in the pair.
 std::vector<Sight> sights_of(const PairData& pair) {
   std::vector<Sight> sights;
   for (const PairFrame& frame : pair.frames) {
@@ -105,12 +107,11 @@ std::set<int> confirmed_samples(int part, const EdgeData& data,
   for (const FittedEdge& fitted : before)
     for (std::size_t t = 0; fitted.edge.to == part && t < fitted.frames.size(); ++t)
       if (!fitted.outlying[t]) result.insert(fitted.frames[t]);
-  const auto sights = [&](int most) {
-    return sights_of(make_part_data(data.samples, part, data.measurement, most));
-  };
-  const std::vector<Sight> some = sights(kSearched), resting = largest_group(some);
-  if (2 * resting.size() <= some.size()) return result;
-  for (const Sight& sight : sights(kAll))
+  const PairData some = make_part_data(data.samples, part, data.measurement, kSearched);
+  const std::vector<Sight> resting = largest_group(sights_of(some));
+  if (2 * std::ssize(resting) <= some.size()) return result;
+  const PairData all = make_part_data(data.samples, part, data.measurement, kAll);
+  for (const Sight& sight : sights_of(all))
     if (is_same_place(resting.front(), sight)) result.insert(sight.sample);
   return result;
 }
@@ -154,8 +155,7 @@ bool keeps_to_second_place(const FittedEdge& fitted, const EdgeData& data,
   if (has_second_place(beside)) return true;
   const std::set<int> confirmed = confirmed_samples(edge.from, data, before);
   if (own.num_residuals() == 6 &&
-      std::ranges::any_of(changes_of_links(edge, data, beside, apart_m, confirmed),
-                          has_second_place))
+      std::ranges::any_of(changes_of_links(edge, data, beside, confirmed), has_second_place))
     return true;
   for (const int part : seen_parts(data.samples)) {
     if (part == edge.to) continue;
