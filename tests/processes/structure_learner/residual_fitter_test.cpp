@@ -15,6 +15,17 @@ namespace {
 constexpr int kNumSignals = 6;
 constexpr Noise kNoise{3e-4, 0.005};
 
+// Part 1 at the origin and part 2 at exp(bend), as they are seen.
+void add_parts(const Vector6d& bend, test::Rng& rng, ActionPoseSample* sample) {
+  for (int part = 1; part <= 2; ++part) {
+    Vector6d noise = test::gaussian6(rng);
+    noise.head<3>() *= kNoise.position_m;
+    noise.tail<3>() *= kNoise.rotation_rad;
+    sample->parts.push_back({.part = part});
+    sample->parts.back().X_CB = (part == 1 ? Pose::Identity() : exp(bend)) * exp(noise);
+  }
+}
+
 // Part 1 at the origin, part 2 where signals 0 and 1 bend a segment to; four signals do nothing.
 std::vector<ActionPoseSample> bent_segment(unsigned seed) {
   test::Rng rng(seed);
@@ -28,13 +39,7 @@ std::vector<ActionPoseSample> bent_segment(unsigned seed) {
     const double u = sample.action(0), v = sample.action(1);
     Vector6d bend;
     bend << 0.1 * std::sin(2 * u), 0.1 * std::sin(2 * v), 0.1 * std::cos(u * v), -v, u, 0;
-    for (int part = 1; part <= 2; ++part) {
-      Vector6d noise = test::gaussian6(rng);
-      noise.head<3>() *= kNoise.position_m;
-      noise.tail<3>() *= kNoise.rotation_rad;
-      sample.parts.push_back({.part = part});
-      sample.parts.back().X_CB = (part == 1 ? Pose::Identity() : exp(bend)) * exp(noise);
-    }
+    add_parts(bend, rng, &sample);
   }
   return samples;
 }
@@ -87,13 +92,7 @@ std::vector<double> heights_at_end(double lift, bool often_ends) {
     sample.action = Eigen::Vector2d(u, test::uniform(rng, -1, 1));
     Vector6d bend;
     bend << 0.01 * std::sin(2 * u), 0, t < 2 ? lift * (u - 0.9) / 0.1 : 0, 0, 0.1 * u, 0;
-    for (int part = 1; part <= 2; ++part) {
-      Vector6d noise = test::gaussian6(rng);
-      noise.head<3>() *= kNoise.position_m;
-      noise.tail<3>() *= kNoise.rotation_rad;
-      sample.parts.push_back({.part = part});
-      sample.parts.back().X_CB = (part == 1 ? Pose::Identity() : exp(bend)) * exp(noise);
-    }
+    add_parts(bend, rng, &sample);
   }
   const NormalizedActions actions(samples, 2);
   const PairData pair = make_pair_data(samples, 1, 2, {.noise = kNoise}, 600);
