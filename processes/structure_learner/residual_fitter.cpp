@@ -210,7 +210,7 @@ bool ResidualFitter::reweigh() {
 
 std::vector<int> ResidualFitter::outliers_at_ends() const {
   std::vector<int> result, order(static_cast<std::size_t>(pair_->size()));
-  if (actions_->blocks().is_stream() || judged_.num_outliers == pair_->size()) return result;
+  if (actions_->blocks().is_stream()) return result;
   const double log_trials = std::log(2.0 * static_cast<double>(inputs_.rows()));
   const auto& d2 = judged_.squared_distance;
   for (Eigen::Index d = 0; d < inputs_.rows(); ++d)
@@ -218,11 +218,13 @@ std::vector<int> ResidualFitter::outliers_at_ends() const {
       const auto place = [&](int t) { return sign * inputs_(d, t); };
       std::iota(order.begin(), order.end(), 0);
       std::ranges::stable_sort(order, {}, place);
-      const int inlier =
-          *std::ranges::find_if(order, [&](int t) { return d2[t] <= kOutlierThreshold; });
+      const auto inlier =
+          std::ranges::find_if(order, [&](int t) { return d2[t] <= kOutlierThreshold; });
+      if (inlier == order.end()) return {};
       // Beyond all inliers, not where the signal often is.
-      const auto end = std::ranges::find_if(
-          order, [&](int t) { return place(t) >= place(inlier) - kResting || d2[t] > kWild; });
+      const double first = place(*inlier) - kResting;
+      const auto end =
+          std::ranges::find_if(order, [&](int t) { return place(t) >= first || d2[t] > kWild; });
       const auto num = static_cast<int>(end - order.begin());
       if (num > 0 &&
           log_trials + log_hypergeometric(num, num, judged_.num_outliers, pair_->size()) <
