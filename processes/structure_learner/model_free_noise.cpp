@@ -78,13 +78,13 @@ std::vector<std::vector<int>> repeats(const NormalizedActions& actions) {
 
 std::optional<Noise> noise_from_repeats(const std::vector<ActionPoseSample>& samples,
                                         const NormalizedActions& actions) {
-  const std::set<int> told = fixed_parts(samples);
+  const std::set<int> fixed = fixed_parts(samples);
   std::vector<NoiseResidual> residuals;
   for (const std::vector<int>& members : repeats(actions)) {
     std::map<int, std::vector<Pose>> poses;
     for (const int t : members)
       for (const PartObservation& o : samples[t].parts)
-        if (!told.contains(o.part)) poses[o.part].push_back(o.X_CB);
+        if (!fixed.contains(o.part)) poses[o.part].push_back(o.X_CB);
     for (const auto& [part, of_part] : poses) {
       const double n = static_cast<double>(of_part.size());
       if (n < kMinRepeats) continue;
@@ -101,13 +101,13 @@ std::optional<Noise> noise_from_repeats(const std::vector<ActionPoseSample>& sam
 std::optional<Noise> noise_from_neighbours(const std::vector<ActionPoseSample>& samples,
                                            const NormalizedActions& actions) {
   if (!actions.blocks().is_stream()) return std::nullopt;
-  const std::set<int> told = fixed_parts(samples);
+  const std::set<int> fixed = fixed_parts(samples);
   std::vector<NoiseResidual> residuals;
   for (std::size_t t = 1; t + 1 < samples.size(); ++t)
     for (const PartObservation& o : samples[t].parts) {
       const PartObservation* before = samples[t - 1].find(o.part);
       const PartObservation* after = samples[t + 1].find(o.part);
-      if (!before || !after || told.contains(o.part)) continue;
+      if (!before || !after || fixed.contains(o.part)) continue;
       const Pose inverse = o.X_CB.inverse();
       residuals.push_back({log(inverse * before->X_CB) + log(inverse * after->X_CB),
                            Eigen::Vector3d::Zero(), 6.0});  // variance of (1, −2, 1)

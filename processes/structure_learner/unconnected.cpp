@@ -185,9 +185,10 @@ std::string why_refused(int part, const LearnedStructure& structure, const Refus
 /// Where only the frame is connected that the others are given in: they may move against it.
 std::string doubt_of_frame(const std::set<int>& connected, const LearnedStructure& structure) {
   const std::set<int>& fixed = structure.options.measurement.fixed_parts;
-  if (!std::ranges::all_of(connected, [&](int part) { return fixed.contains(part); })) return "";
-  return "; that keeps its pose at all samples, to the last digit: if the others moved against it "
-         "meanwhile, leave it out";
+  if (connected.empty() || !std::ranges::includes(fixed, connected)) return "";
+  return "; what is connected keeps its pose at all samples, to the last digit: if the others "
+         "moved "
+         "against it meanwhile, leave it out";
 }
 
 std::string why_none_is_valid(const TriedModels& tried, const std::set<int>& connected,

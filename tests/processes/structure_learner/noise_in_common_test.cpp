@@ -156,7 +156,7 @@ TEST(PredictionVariance, OfABaseThatMovesCountsThatOrItIsDoubted) {
     const BodySchema schema = learn(robot.signals, samples()).schema;
     told.add(schema, 1, 2, samples());
     num_doubted += std::ranges::any_of(schema.unconnected, [](const UnconnectedPart& part) {
-      return part.detail.find("that keeps its pose at all samples") != std::string::npos;
+      return part.detail.find("keeps its pose at all samples") != std::string::npos;
     });
   }
   EXPECT_GE(told.num_complete + num_doubted, 5) << told.num_complete << " complete";
