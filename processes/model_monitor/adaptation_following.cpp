@@ -148,7 +148,10 @@ void Adaptation::watch_small_means(std::int64_t sample_index,
     // Likelihoods take the models' own errors for noise, means leave them out (before_): an edge
     // drifts where both say so, else more samples tell.
     if (drift && !moved->element.is_tag() && drift->drift.part != moved->element.id) return;
-    begin_drift(drift ? drift->drift.part : moved->element.id, sample_index, sample_index, events);
+    if (drift)
+      begin_drift(drift->drift.part, drift->begin + 1, sample_index, events);
+    else
+      begin_drift(moved->element.id, sample_index, sample_index, events);
   }
 }
 

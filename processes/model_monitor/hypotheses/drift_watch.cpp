@@ -221,6 +221,7 @@ void DriftWatch::add(const TreeFilter& filter, const TreeFilter::Instant& instan
       is_small_step(last_, displacements, schema.signals))
     return;
   last_ = displacements;
+  actions_.add(displacements, schema.signals, sample_index);
   const TreeFilter::Instant exact = with_exact_models(instant);
   const auto add = [&](const ElementId& element, int node, Measure how) {
     auto measured = measure(filter, instant, exact, node, how);
@@ -272,6 +273,7 @@ void DriftWatch::forget(int part, std::int64_t before) {
 
 void DriftWatch::forget_all() {
   last_.resize(0);
+  actions_.clear();
   measured_.clear();
   before_.clear();
 }

@@ -8,6 +8,7 @@
 #include <vector>
 
 #include "processes/model_monitor/changes/body_change.h"
+#include "processes/model_monitor/hypotheses/action_discrepancy.h"
 #include "processes/model_monitor/likelihood/tree_filter.h"
 
 namespace bodyschema {
@@ -132,14 +133,15 @@ class DriftWatch {
   static std::vector<Reading> readings(const BodySchema& schema, const ElementId& element,
                                        const Measured& measured);
   /// log of the chance of a mean so far from what the model says, or from that of the readings
-  /// before: in all directions, or along `twist`.
-  static double log_chance(const Mean& newest, const Mean* before, double worth,
+  /// before: in all directions, or along `twist`. `discrepancy`: of their actions.
+  static double log_chance(const Mean& newest, const Mean* before, double worth, double discrepancy,
                            const std::optional<Vector6d>& twist);
   void correlate(const ElementId& tag);
   const std::deque<Measured>* find(const ElementId& element, std::size_t fewest) const;
 
   const double log_sure_;
   std::map<ElementId, std::deque<Measured>> measured_;
+  ActionDiscrepancy actions_;
   Eigen::VectorXd last_;  ///< displacements of the sample that was added last
   std::map<ElementId, std::vector<Mean>> before_;  ///< of what is older, by link, under schema_
   BodySchema schema_;

@@ -24,8 +24,6 @@ constexpr std::size_t kFewest = 12, kMostNewest = 40, kEach = 4;
 constexpr double kNumMeans = 10;
 /// Measurements from before, of which the mean tells what the model is off by there.
 constexpr std::size_t kFewestBefore = 30;
-/// Share of the model's covariance that differs from action to action.
-constexpr double kWithTheAction = 0.15;
 /// Of the measurements whose spread is taken, one in so many, the farthest, may be an outlier.
 constexpr std::size_t kEachFarthest = 10;
 /// Samples between residuals whose correlations are looked at, the fewest pairs that tell them to
@@ -71,7 +69,7 @@ std::vector<DriftWatch::Reading> DriftWatch::readings(const BodySchema& schema,
 }
 
 double DriftWatch::log_chance(const Mean& newest, const Mean* before, double worth,
-                              const std::optional<Vector6d>& twist) {
+                              double discrepancy, const std::optional<Vector6d>& twist) {
   const Matrix6d model =
       newest.model / static_cast<double>(newest.size) + kExact * Matrix6d::Identity();
   const Matrix6d spread = newest.information.inverse();
@@ -81,7 +79,7 @@ double DriftWatch::log_chance(const Mean& newest, const Mean* before, double wor
     // What the model is off by is known from before, but for what differs with the action.
     const Matrix6d known = (model.inverse() + worth * before->information).inverse();
     offset -= worth * known * before->sum;
-    covariance += known + kWithTheAction * model;
+    covariance += known + std::min(discrepancy, 1.0) * model;
   } else {
     covariance += model;
   }
@@ -109,26 +107,32 @@ std::optional<DriftWatch::Moved> DriftWatch::moved(const BodySchema& schema) con
     if (!queue) continue;
     const Edge* edge = element.is_tag() ? nullptr : edge_to(schema, element.id);
     if (!edge && !element.is_tag() && element.id != schema.root) continue;
-    const auto before = before_.find(element);
-    std::vector<Mean> links;
-    const std::size_t begin = queue->size() > kMostNewest ? queue->size() - kMostNewest : 0;
-    for (std::size_t n = queue->size(); n-- > begin;) {
-      const std::vector<Reading> of = readings(schema, element, (*queue)[n]);
-      links.resize(of.size());
-      for (std::size_t link = 0; link < links.size(); ++link) {
-        links[link].add(of[link]);
-        if (links[link].size < kFewest || links[link].size % kEach != 0) continue;
-        // A joint's displacement is an offset of its own twist before the link that it carries.
-        std::optional<Vector6d> twist;
-        if (edge && link < edge->joints.size()) {
-          twist = screw_twist(edge->joints[link]);
-          if (link == 0) twist = adjoint(edge->left) * *twist;
-        }
+    std::vector<std::vector<Reading>> all;  // the newest last
+    for (const Measured& m : *queue) all.push_back(readings(schema, element, m));
+    const std::size_t num_links = all.back().size();
+    const auto popped = before_.find(element);
+    for (std::size_t link = 0; link < num_links; ++link) {
+      // A joint's displacement is an offset of its own twist before the link that it carries.
+      std::optional<Vector6d> twist;
+      if (edge && link < edge->joints.size()) {
+        twist = screw_twist(edge->joints[link]);
+        if (link == 0) twist = adjoint(edge->left) * *twist;
+      }
+      std::vector<Mean> older{popped == before_.end() ? Mean{} : popped->second[link]};
+      for (const std::vector<Reading>& of : all) {
+        older.push_back(older.back());
+        older.back().add(of[link]);
+      }
+      Mean newest;
+      for (std::size_t n = all.size(); n-- > 0 && newest.size < kMostNewest;) {
+        newest.add(all[n][link]);
+        if (newest.size < kFewest || newest.size % kEach != 0) continue;
         // What is off from the first sample on is no change, unless by much.
         double chance = 0;
-        if (queue->size() >= kMostNewest) chance = log_chance(links[link], nullptr, *worth, twist);
-        if (has_before && before != before_.end() && before->second[link].size >= kFewestBefore)
-          chance = std::min(chance, log_chance(links[link], &before->second[link], *worth, twist));
+        if (queue->size() >= kMostNewest) chance = log_chance(newest, nullptr, *worth, 1, twist);
+        if (has_before && older[n].size >= kFewestBefore)
+          chance = std::min(chance, log_chance(newest, &older[n], *worth,
+                                               actions_.since((*queue)[n].sample_index), twist));
         if (chance >= least) continue;
         least = chance;
         moved = Moved{element, (*queue)[n].sample_index, chance < log_sure_};

@@ -33,7 +33,7 @@ struct SmallFault {
 
 class EverySmallFault : public testing::TestWithParam<SmallFault> {};
 
-// tests/experiments/results/small_faults.md: 200 of 200.
+// tests/experiments/results/small_faults.md has whole rows.
 TEST_P(EverySmallFault, IsFoundWithinFortySamplesAndNothingElseIs) {
   for (const int seed : {1, 2, 3}) {
     BrokenArm arm({GetParam().fault, "", 0.85, 0, 0, GetParam().size}, Regime::kTagIso, kHealthy,
@@ -54,6 +54,7 @@ TEST_P(EverySmallFault, IsFoundWithinFortySamplesAndNothingElseIs) {
 
 INSTANTIATE_TEST_SUITE_P(Faults, EverySmallFault,
                          testing::Values(SmallFault{"offset", Fault::kOffset, 0.1, 4},
+                                         SmallFault{"offset_of_1_degree", Fault::kOffset, 0.05, 4},
                                          SmallFault{"bend", Fault::kBend, 2 / 45.0, 5},
                                          SmallFault{"tool", Fault::kTool, 2 / 80.0, 7},
                                          SmallFault{"marker", Fault::kMarker, 0.04, 3}),
