@@ -7,8 +7,8 @@
 #include "processes/structure_learner/joint_scatter.h"
 #include "processes/structure_learner/residual_fit.h"
 #include "processes/structure_learner/root_pose.h"
-#include "processes/structure_learner/serial_correlation.h"
 #include "processes/structure_learner/tree_fit.h"
+#include "processes/structure_learner/wrong_commands.h"
 
 namespace bodyschema {
 namespace {
@@ -102,6 +102,14 @@ void fit_soft_edge(const LocalModel& screws, const std::vector<int>& signals, co
   }
 }
 
+SerialCorrelation series_of(const Fit& fit, const PairData& pair) {
+  SerialCorrelation series;
+  for (int t = 1; t < pair.size(); ++t)
+    if (pair.frames[t].sample == pair.frames[t - 1].sample + 1)
+      series.add(fit.frames[t - 1], fit.frames[t]);
+  return series;
+}
+
 void fit_screw_edge(const LocalModel& start, const PairData& pair, const EdgeData& data,
                     bool must_be_valid, FittedEdge* result) {
   const Fit fit = fit_local_model(start, pair, data.actions, 60, 1e-6);
@@ -119,8 +127,10 @@ void fit_screw_edge(const LocalModel& start, const PairData& pair, const EdgeDat
   double weight = 0;
   for (int t = 0; t < pair.size(); ++t)
     if (!result->outlying[t]) weight += fit.frames[t].weight();
+  const bool is_stream = data.actions.blocks().is_stream();
+  if (!is_stream) result->series = series_of(fit, pair);
   const double lasting =
-      data.actions.blocks().is_stream()
+      is_stream || result->series.coefficient(pair.size()) > 0
           ? correlation_time(scores(fit, pair, data.actions), loo.parameter_covariance)
           : 1;
   // The robust weights are relative: an inlier counts as one measurement, on the average.
@@ -285,7 +295,10 @@ double fit_jointly(const EdgeData& data, std::vector<FittedEdge>* fitted, BodySc
   // are left to the pairs.
   constexpr int kMaxFrames = 2500;
   constexpr std::size_t kTooMany = 6000;
-  if (data.samples.size() > kTooMany) return 0;
+  SerialCorrelation series;
+  for (const FittedEdge& f : *fitted) series.add(f.series);
+  const double of_edges = series.coefficient(static_cast<int>(data.samples.size()));
+  if (data.samples.size() > kTooMany) return of_edges;
   std::vector<PairData> told;
   const auto seen = [&](int part) {
     told.push_back(make_part_data(data.samples, part, data.told, kMaxFrames));
@@ -293,16 +306,16 @@ double fit_jointly(const EdgeData& data, std::vector<FittedEdge>* fitted, BodySc
   };
   std::vector<TreeNode> nodes{{schema->root, -1, {}}};
   std::vector<PairData> poses{seen(schema->root)};
-  if (poses[0].size() < 2 || !is_at_rest(poses[0], data.actions, data.validity)) return 0;
+  if (poses[0].size() < 2 || !is_at_rest(poses[0], data.actions, data.validity)) return of_edges;
   for (const FittedEdge& f : *fitted) {
     const auto parent = std::find_if(
         nodes.begin(), nodes.end(), [&](const TreeNode& node) { return node.part == f.edge.from; });
-    if (parent == nodes.end()) continue;  // another component
-    if (f.edge.residual_gp) return 0;     // no chain of screws
+    if (parent == nodes.end()) continue;      // another component
+    if (f.edge.residual_gp) return of_edges;  // no chain of screws
     nodes.push_back({f.edge.to, static_cast<int>(parent - nodes.begin()), f.model});
     poses.push_back(seen(f.edge.to));
   }
-  if (nodes.size() < 2) return 0;
+  if (nodes.size() < 2) return of_edges;
   const Eigen::VectorXd of_pairs = scatter_of(*fitted, nodes, data.actions);
   TreeFit fit(std::move(nodes), std::move(poses), data.actions, true);
   fit.fit(20, 1e-6);

@@ -5,6 +5,7 @@
 #include <vector>
 
 #include "processes/structure_learner/search/model_forest.h"
+#include "processes/structure_learner/serial_correlation.h"
 #include "processes/structure_learner/validity.h"
 
 namespace bodyschema {
@@ -22,8 +23,9 @@ struct FittedEdge {
   Edge edge;
   std::vector<int> frames;  ///< samples at which it was judged
   std::vector<bool> outlying;
-  bool is_valid = true;  ///< as far as that was asked
-  LocalModel model;      ///< what of the edge is screws
+  bool is_valid = true;      ///< as far as that was asked
+  LocalModel model;          ///< what of the edge is screws
+  SerialCorrelation series;  ///< of what these leave; empty for a stream
 };
 
 /// Why an edge that the search accepted is none.
@@ -59,7 +61,7 @@ bool is_wrong_at_an_end(const FittedEdge& fitted, const TimeBlocks& blocks);
 /// fitted to before. X_CR with them, and the scatter of the joints. An edge whose part is elsewhere
 /// than all of them say, at most instants or at some of its commands, goes, and so does a joint
 /// that by its own deviation may be none. Left alone where the root moves or an edge is no chain of
-/// screws. Returns TreeFit::serial_correlation(); 0 where it left them alone.
+/// screws. Returns TreeFit::serial_correlation(); where it left them alone that of the edges.
 double fit_jointly(const EdgeData& data, std::vector<FittedEdge>* fitted, BodySchema* schema,
                    Refusals* refused);
 

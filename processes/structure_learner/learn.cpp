@@ -25,6 +25,7 @@
 #include "processes/structure_learner/surrogate_commands.h"
 #include "processes/structure_learner/told_noise.h"
 #include "processes/structure_learner/unconnected.h"
+#include "processes/structure_learner/wrong_commands.h"
 
 namespace bodyschema {
 namespace {
@@ -58,14 +59,20 @@ std::optional<Noise> noise_beside_soft_edges(const std::vector<ActionPoseSample>
   return all_soft ? noise_from_neighbours(displaced, actions) : std::nullopt;
 }
 
-// Noise of the markers, whatever the models leave.
+bool is_same(const Noise& noise, const std::optional<Noise>& told) {
+  return told && noise.position_m == std::max(told->position_m, kNoiseFloor.position_m) &&
+         noise.rotation_rad == std::max(told->rotation_rad, kNoiseFloor.rotation_rad);
+}
+
+// Noise of the markers, whatever the models leave; of a stream, where no two edges meet, what its
+// neighbours in time tell.
 std::optional<Noise> noise_beside_models(const std::vector<ActionPoseSample>& displaced,
                                          const NormalizedActions& actions,
                                          const std::optional<Noise>& told,
                                          const BodySchema& schema) {
   if (const auto noise = noise_beside_soft_edges(displaced, actions, schema)) return noise;
-  const std::optional<Noise> common = noise_in_common(schema, displaced);
-  return common ? common : told;
+  if (const auto common = noise_in_common(schema, displaced)) return common;
+  return told || !actions.blocks().is_stream() ? told : noise_from_neighbours(displaced, actions);
 }
 
 LearnResult fit_tree(const LearnedStructure& structure,
@@ -121,9 +128,14 @@ LearnResult fit_tree(const LearnedStructure& structure,
   if (schema.has_part(schema.root) && schema.has_rotation(schema.root))
     result.serial_correlation = fit_jointly(data, &fitted, &schema, &refused);
   for (const FittedEdge& f : fitted) schema.edges.push_back(f.edge);
-  if (structure.noise_source == NoiseSource::kResiduals)
-    if (const auto noise = noise_beside_models(moved, actions, options.measurement.noise, schema))
-      tell_noise_from_body(*noise, measurement.fixed_parts, &schema);
+  bool is_body_left = false;
+  if (structure.noise_source == NoiseSource::kResiduals ||
+      structure.noise_source == NoiseSource::kFrames)
+    if (const auto noise = noise_beside_models(moved, actions, options.measurement.noise, schema)) {
+      is_body_left = tell_noise_from_body(*noise, measurement.fixed_parts, &schema);
+      if (is_same(schema.noise, options.measurement.noise))
+        result.noise_source = NoiseSource::kGiven;
+    }
   schema.set_covered(samples);
 
   const std::set<int> connected = connected_to_root(schema);
@@ -135,7 +147,7 @@ LearnResult fit_tree(const LearnedStructure& structure,
                                    std::min(options.max_signals, num_moving));
       },
       &schema);
-  schema.undecided_signals = undecided_signals(schema, structure);
+  schema.undecided_signals = undecided_signals(schema, structure, is_body_left);
   result.is_one_cluster = is_one_cluster(schema, samples);
   result.outliers = attribute_outliers(schema, fitted, samples, measurement);
   return result;

@@ -93,9 +93,10 @@ std::optional<Noise> noise_in_common(const BodySchema& schema,
                deviation(rotation, kNoiseFloor.rotation_rad)};
 }
 
-void add_unexplained(const Noise& noise, const std::set<int>& fixed_parts, BodySchema* schema) {
+bool add_unexplained(const Noise& noise, const std::set<int>& fixed_parts, BodySchema* schema) {
   // Above so many times what is explained it is no noise of markers that differ (chosen).
   constexpr double kMuch = 2;
+  bool any = false;
   for (Edge& edge : schema->edges) {
     if (edge.residual_gp || edge.matrix_gp || edge.parameter_covariance.size() == 0) continue;
     const Eigen::VectorXd middle = schema->displacements(mid_range(schema->signals));
@@ -107,13 +108,16 @@ void add_unexplained(const Noise& noise, const std::set<int>& fixed_parts, BodyS
     explained.head<3>().array() += scatter.topLeftCorner<3, 3>().trace() / 3;
     explained.tail<3>().array() += scatter.bottomRightCorner<3, 3>().trace() / 3;
     const int last = ScrewChainLayout::transform(static_cast<int>(edge.joints.size()));
-    for (int axis = 0; axis < 6; ++axis)
-      if (whole(axis) > kMuch * explained(axis))
-        edge.parameter_covariance(last + axis, last + axis) += whole(axis) - explained(axis);
+    for (int axis = 0; axis < 6; ++axis) {
+      if (whole(axis) <= kMuch * explained(axis)) continue;
+      edge.parameter_covariance(last + axis, last + axis) += whole(axis) - explained(axis);
+      any = true;
+    }
   }
+  return any;
 }
 
-void tell_noise_from_body(Noise of_markers, const std::set<int>& fixed_parts, BodySchema* schema) {
+bool tell_noise_from_body(Noise of_markers, const std::set<int>& fixed_parts, BodySchema* schema) {
   // The estimate is 1.2 times too large; known to a fifth.
   constexpr double kRefuted = 1.5;
   Noise& noise = schema->noise;
@@ -124,7 +128,7 @@ void tell_noise_from_body(Noise of_markers, const std::set<int>& fixed_parts, Bo
         std::clamp(of_markers.rotation_rad, kNoiseFloor.rotation_rad, noise.rotation_rad);
     of_markers = noise;
   }
-  add_unexplained(of_markers, fixed_parts, schema);
+  return add_unexplained(of_markers, fixed_parts, schema);
 }
 
 }  // namespace bodyschema

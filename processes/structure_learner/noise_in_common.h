@@ -22,12 +22,12 @@ std::optional<Noise> noise_in_common(const BodySchema& schema,
 
 /// Adds to the covariance of each edge of screws what it leaves that neither this noise nor the
 /// scatter of its joints explains: what it stands on moves, or it gives way. At the edge's end,
-/// alike along all axes. `fixed_parts` have no noise.
-void add_unexplained(const Noise& noise, const std::set<int>& fixed_parts, BodySchema* schema);
+/// alike along all axes. `fixed_parts` have no noise. True if there was any.
+bool add_unexplained(const Noise& noise, const std::set<int>& fixed_parts, BodySchema* schema);
 
 /// What the edges leave is the markers' noise or the body's: where schema->noise, estimated from
 /// it, is much more than `of_markers`, it is that instead; what an edge leaves beside that is the
-/// body's (add_unexplained()).
-void tell_noise_from_body(Noise of_markers, const std::set<int>& fixed_parts, BodySchema* schema);
+/// body's (add_unexplained()). True if there is any.
+bool tell_noise_from_body(Noise of_markers, const std::set<int>& fixed_parts, BodySchema* schema);
 
 }  // namespace bodyschema

@@ -135,13 +135,15 @@ NormalizedActions::NormalizedActions(const std::vector<ActionPoseSample>& sample
                                   " action values, not " + std::to_string(num_signals));
     values_.col(t) = samples[t].action;
   }
-  if (samples.empty()) return;
+  if (samples.empty() || num_signals == 0) return;
+  const double farthest = (values_.rowwise().maxCoeff() - values_.rowwise().minCoeff()).maxCoeff();
   for (int s = 0; s < num_signals; ++s) {
     const double lower = values_.row(s).minCoeff();
     const double upper = values_.row(s).maxCoeff();
     centre_(s) = (lower + upper) / 2;
     // The rounding of a constant is not a motion.
-    if (upper - lower > 1e-9 * std::max(std::abs(lower), std::abs(upper))) {
+    const double rounding = 1e-9 * std::max(std::abs(lower), std::abs(upper));
+    if (upper - lower > std::max(rounding, kJitter * farthest)) {
       half_range_(s) = (upper - lower) / 2;
       moving_.push_back(s);
     }

@@ -6,6 +6,7 @@
 #include <numeric>
 
 #include "processes/structure_learner/residual_fitter.h"
+#include "processes/structure_learner/wrong_commands.h"
 
 namespace bodyschema {
 namespace {

@@ -12,6 +12,7 @@
 #include "common/estimation/quantile.h"
 #include "common/estimation/student_t.h"
 #include "common/gp/minimize_in_box.h"
+#include "processes/structure_learner/wrong_commands.h"
 
 namespace bodyschema {
 namespace {

@@ -15,11 +15,19 @@ void SerialCorrelation::add(const FrameFit& before, const FrameFit& now) {
   ++count_;
 }
 
+void SerialCorrelation::add(const SerialCorrelation& other) {
+  products_ += other.products_;
+  squares_ += other.squares_;
+  count_ += other.count_;
+}
+
 double SerialCorrelation::coefficient(int num_samples) const {
   constexpr int kFewest = 20;
-  constexpr double kLargest = 0.98;
+  constexpr double kLargest = 0.98, kNothing = 1e-6;
   if (count_ < kFewest || !(squares_.head<3>().minCoeff() > 0)) return 0;
-  const double seen = products_.cwiseQuotient(squares_.cwiseMax(1e-300)).maxCoeff();
+  // An axis in which nothing is left, as of a frame that was told, says nothing.
+  const double nothing = kNothing * count_;
+  const double seen = products_.cwiseQuotient(squares_.cwiseMax(nothing)).maxCoeff();
   if (seen < 2.5 / std::sqrt(count_)) return 0;
   // Kendall 1954: a series about its own mean.
   return std::min(seen + (1 + 4 * seen) / num_samples, kLargest);

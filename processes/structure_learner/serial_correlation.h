@@ -11,6 +11,7 @@ class SerialCorrelation {
  public:
   /// Residuals of one marker or pair, whitened, at two successive samples.
   void add(const FrameFit& before, const FrameFit& now);
+  void add(const SerialCorrelation& other);
   /// Correlation of one sample's noise with the next, in that axis where it is largest (a pose from
   /// several tags in turn keeps it in some only); unbiased to first order where each series of
   /// residuals has so many samples. 0 unless significant and positive.

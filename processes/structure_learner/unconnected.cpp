@@ -242,7 +242,8 @@ UnconnectedPart explain_unconnected(int part, const std::vector<ActionPoseSample
                                 structure)};
 }
 
-std::vector<int> undecided_signals(const BodySchema& schema, const LearnedStructure& structure) {
+std::vector<int> undecided_signals(const BodySchema& schema, const LearnedStructure& structure,
+                                   bool is_body_left) {
   std::set<int> result;
   for (const AcceptedModel& model : structure.search.models)
     result.insert(model.doubtful_signals.begin(), model.doubtful_signals.end());
@@ -250,7 +251,8 @@ std::vector<int> undecided_signals(const BodySchema& schema, const LearnedStruct
     // The structure is complete without the rates.
     if (schema.complete && std::ranges::count(structure.rates, s) > 0) continue;
     const auto information = structure.search.joint_information.find(s);
-    if (schema.complete && information != structure.search.joint_information.end()) {
+    if (schema.complete && !is_body_left &&
+        information != structure.search.joint_information.end()) {
       const Signal& signal = schema.signals[static_cast<std::size_t>(s)];
       const double range = signal.upper - signal.lower;
       const double share =

@@ -18,8 +18,10 @@ UnconnectedPart explain_unconnected(int part, const std::vector<ActionPoseSample
                                     int max_signals);
 
 /// Signals that no edge uses although one may have to: they moved too little for a joint of
-/// kLeastTurn (over their limits, where these are known) to show, or a part waits for its edge. And
-/// those that a soft edge may use in vain.
-std::vector<int> undecided_signals(const BodySchema& schema, const LearnedStructure& structure);
+/// kLeastTurn (over their limits, where these are known) to show, a part waits for its edge, or the
+/// edges leave more than the markers' noise, which may be theirs: `is_body_left`. And those that a
+/// soft edge may use in vain.
+std::vector<int> undecided_signals(const BodySchema& schema, const LearnedStructure& structure,
+                                   bool is_body_left);
 
 }  // namespace bodyschema

@@ -62,22 +62,6 @@ struct Validity {
 Validity check_validity(const Fit& fit, const LeaveOneOut& loo, const PairData& pair,
                         const NormalizedActions& actions, const ValidityOptions& options);
 
-/// Whether in the order of one of the signals that moved, be it one of the model's or not, so many
-/// outliers stand together that chance does not explain it, one after the other or many with few
-/// others between (hypergeometric): there the model is wrong, and not its poses. So it is where
-/// outliers are those at which a signal is farthest from the value that it has at half of the
-/// poses, or all that are away from that: nothing tells then what the signal does. `outlying`: by
-/// sample of `samples`. Of a stream, where outliers last, only the motions of signals that mostly
-/// rest are looked at, two at least. O(D (K² + N log N)) of K outliers among N and D signals.
-bool is_wrong_at_some_commands(const std::vector<int>& samples, const std::vector<bool>& outlying,
-                               const NormalizedActions& actions);
-/// `squared_distance`: by frame of the pair.
-bool is_wrong_at_some_commands(const PairData& pair, const std::vector<double>& squared_distance,
-                               const NormalizedActions& actions);
-
-/// log of the chance that of so many drawn from `total`, `marked` of which are marked, so many are.
-double log_hypergeometric(int drawn_marked, int drawn, int marked, int total);
-
 /// Expected share of frames of a pair with an outlier among its two markers.
 double pair_outlier_rate(const ValidityOptions& options);
 /// Bound on the mean d² of so many independent inliers of a true model, `sigmas` of its sampling

@@ -79,7 +79,7 @@ double DriftWatch::log_chance(const Mean& newest, const Mean* before, double wor
     // What the model is off by is known from before, but for what differs with the action.
     const Matrix6d known = (model.inverse() + worth * before->information).inverse();
     offset -= worth * known * before->sum;
-    covariance += known + std::min(discrepancy, 1.0) * model;
+    covariance += known + std::min(discrepancy / worth, 1.0) * model;
   } else {
     covariance += model;
   }

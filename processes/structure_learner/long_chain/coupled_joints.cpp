@@ -27,15 +27,23 @@ LocalModel with_coupling(const LocalModel& model, int d, int signal) {
   return result;
 }
 
-std::optional<Fit> with_best_coupling(const LocalModel& model, const PairData& pair,
-                                      const NormalizedActions& actions) {
+/// With a joint of `signal` before joint d, or at the end, about an axis of its own that does not
+/// move yet: z of `axes` as the frame there has it.
+LocalModel with_joint(const LocalModel& model, int d, int signal, const Eigen::Matrix3d& axes) {
+  LocalModel result = model;
+  Pose turned = Pose::Identity();
+  turned.linear() = axes;
+  result.transform(d) = result.transform(d) * turned;
+  result.joints.insert(result.joints.begin() + d,
+                       LocalModel::Joint{.signal = signal, .X_after = turned.inverse()});
+  return result;
+}
+
+std::optional<Fit> best_of(const std::vector<LocalModel>& models, const PairData& pair,
+                           const NormalizedActions& actions) {
   std::vector<Fit> starts;
-  for (int d = 0; d < model.num_joints(); ++d)
-    for (const int signal : signal_set(model)) {
-      if (model.joints[static_cast<std::size_t>(d)].signal == signal) continue;
-      starts.push_back(
-          fit_local_model(with_coupling(model, d, signal), pair, actions, kFewIterations, 1e-2));
-    }
+  for (const LocalModel& model : models)
+    starts.push_back(fit_local_model(model, pair, actions, kFewIterations, 1e-2));
   std::ranges::stable_sort(starts, {}, &Fit::cost);
   if (starts.size() > kFitted) starts.resize(kFitted);
   std::optional<Fit> best;
@@ -50,11 +58,29 @@ std::optional<Fit> with_best_coupling(const LocalModel& model, const PairData& p
 
 Fit with_coupled_joints(Fit fit, const PairData& pair, const NormalizedActions& actions) {
   for (int n = 0; n < kMostCoupled; ++n) {
-    std::optional<Fit> coupled = with_best_coupling(fit.model, pair, actions);
+    std::vector<LocalModel> models;
+    for (int d = 0; d < fit.model.num_joints(); ++d)
+      for (const int signal : signal_set(fit.model))
+        if (fit.model.joints[static_cast<std::size_t>(d)].signal != signal)
+          models.push_back(with_coupling(fit.model, d, signal));
+    std::optional<Fit> coupled = best_of(models, pair, actions);
     if (!coupled || fit.cost - coupled->cost < price_of_joint(pair)) break;
     fit = *std::move(coupled);
   }
   return fit;
+}
+
+Fit with_repeated_signal(Fit fit, const PairData& pair, const NormalizedActions& actions) {
+  std::vector<LocalModel> models;
+  for (int d = 0; d <= fit.model.num_joints(); ++d)
+    for (const int signal : signal_set(fit.model))
+      for (int axis = 0; axis < 3; ++axis) {
+        Eigen::Matrix3d axes;
+        for (int n = 0; n < 3; ++n) axes.col(n) = Eigen::Vector3d::Unit((axis + n + 1) % 3);
+        models.push_back(with_joint(fit.model, d, signal, axes));
+      }
+  std::optional<Fit> repeated = best_of(models, pair, actions);
+  return repeated && fit.cost - repeated->cost > price_of_joint(pair) ? *std::move(repeated) : fit;
 }
 
 }  // namespace bodyschema

@@ -7,6 +7,7 @@
 
 #include "common/estimation/chi_square.h"
 #include "common/estimation/quantile.h"
+#include "processes/structure_learner/long_chain/chain_positions.h"
 #include "processes/structure_learner/long_chain/chain_rotations.h"
 #include "processes/structure_learner/placed_screw.h"
 #include "processes/structure_learner/screen.h"
@@ -18,6 +19,7 @@ using Eigen::Matrix3d;
 using Eigen::Vector3d;
 
 constexpr int kSearchFrames = 40;
+constexpr int kSearchPositions = 60;
 constexpr int kHeldStarts = 8;
 constexpr int kFreeStarts = 60;  // one in ten succeeds
 constexpr int kOrderRestarts = 3;
@@ -29,8 +31,6 @@ constexpr double kGoal = 3;
 constexpr double kTypicalTurn = 1.2;
 // Turns below which a joint may slide [rad per half range].
 constexpr double kMaySlide = 0.12;
-// Links are shorter than that [m]: what the poses do not tell of them stays small.
-constexpr double kLongestLink = 1;
 // Nats between two orders that are told apart.
 constexpr double kSettledMargin = 3;
 // Nats below which an order is open. Chosen: of a range check with two poses of all joints, which
@@ -51,36 +51,19 @@ Pose rotation(const Matrix3d& R) {
   return X;
 }
 
-// The links l_0 … l_m and, for joints that slide, s_j: x(q) = l_0 + Σ (P_(j−1) s_j q_j + P_j l_j),
-// P_j = ∏_(i ≤ j) Exp(w_i q_i). Re-weighted least squares; slides take the place of turns.
-LocalModel place(const ChainRotations& chain, const std::vector<bool>& slides, const PairData& pair,
+// The links (links_design()) by re-weighted least squares; slides take the place of turns.
+LocalModel place(const ChainAxes& chain, const std::vector<bool>& slides, const PairData& pair,
                  const NormalizedActions& actions, double sigma_m) {
   constexpr int kRounds = 8;
   const int m = static_cast<int>(chain.signals.size()), n = pair.size();
-  std::vector<int> slide_at(m, -1);
-  int size = 3 * (m + 1);
-  for (int j = 0; j < m; ++j)
-    if (slides[j]) {
-      slide_at[j] = size;
-      size += 3;
-    }
-  Eigen::MatrixXd design = Eigen::MatrixXd::Zero(3 * n, size);
+  Eigen::MatrixXd q(actions.num_signals(), n);
   Eigen::VectorXd positions(3 * n);
   for (int t = 0; t < n; ++t) {
-    Matrix3d P = Matrix3d::Identity();
-    auto rows = design.middleRows<3>(3 * t);
-    rows.leftCols<3>().setIdentity();
-    for (int j = 0; j < m; ++j) {
-      const double q = actions(pair.frames[t].sample, chain.signals[j]);
-      if (slides[j])
-        rows.middleCols<3>(slide_at[j]) = q * P;
-      else
-        P = P * exp_so3(chain.axes[j] * q);
-      rows.middleCols<3>(3 * (j + 1)) = P;
-    }
+    for (const int s : chain.signals) q(s, t) = actions(pair.frames[t].sample, s);
     positions.segment<3>(3 * t) = pair.primary(t).z.translation();
   }
-  Eigen::VectorXd x = Eigen::VectorXd::Zero(size), weights = Eigen::VectorXd::Ones(3 * n);
+  const Eigen::MatrixXd design = links_design(chain, slides, q);
+  Eigen::VectorXd x, weights = Eigen::VectorXd::Ones(3 * n);
   for (int round = 0; round < kRounds; ++round) {
     Eigen::MatrixXd H = design.transpose() * weights.asDiagonal() * design;
     H.diagonal().array() += std::pow(sigma_m / kLongestLink, 2);
@@ -91,13 +74,17 @@ LocalModel place(const ChainRotations& chain, const std::vector<bool>& slides, c
           1 / std::max(1.0, residual.segment<3>(3 * t).norm() / (2 * sigma_m)));
   }
   LocalModel model;
+  model.is_position = pair.num_residuals() == 3;
   model.first = translation(x.head<3>());
+  int slide_at = 3 * (m + 1);
   for (int j = 0; j < m; ++j) {
     Vector6d xi = Vector6d::Zero();
-    if (slides[j])
-      xi.head<3>() = x.segment<3>(slide_at[j]);
-    else
+    if (slides[j]) {
+      xi.head<3>() = x.segment<3>(slide_at);
+      slide_at += 3;
+    } else {
       xi.tail<3>() = chain.axes[j];
+    }
     const PlacedScrew placed = PlacedScrew::of(xi, slides[j]);
     model.transform(j) = model.transform(j) * placed.X;
     model.joints.push_back(
@@ -110,14 +97,14 @@ LocalModel place(const ChainRotations& chain, const std::vector<bool>& slides, c
   return model;
 }
 
-std::vector<bool> sliding(const ChainRotations& chain) {
+std::vector<bool> sliding(const ChainAxes& chain) {
   std::vector<bool> slides;
   for (const Vector3d& axis : chain.axes) slides.push_back(axis.norm() < kMaySlide);
   return slides;
 }
 
 // All together, from the better of: joints that hardly turn slide; they turn.
-Fit refined(const ChainRotations& chain, const PairData& pair, const NormalizedActions& actions,
+Fit refined(const ChainAxes& chain, const PairData& pair, const NormalizedActions& actions,
             double sigma_m) {
   std::optional<Fit> best;
   std::vector<bool> slides = sliding(chain);
@@ -133,12 +120,11 @@ Fit refined(const ChainRotations& chain, const PairData& pair, const NormalizedA
 
 // Rotations do not order joints with parallel axes, nor those that slide: moves one joint at a time
 // to the place at which the positions, linear in the links, fit best.
-ChainRotations ordered_by_positions(ChainRotations chain, const RotationSearch& search,
-                                    const PairData& pair, const NormalizedActions& actions,
-                                    double sigma_m) {
+ChainAxes ordered_by_positions(ChainAxes chain, const RotationSearch& search, const PairData& pair,
+                               const NormalizedActions& actions, double sigma_m) {
   constexpr int kMaxSweeps = 3;
   constexpr double kSameRotations = 1.2;  // of the cost
-  const auto cost_of = [&](const ChainRotations& c) {
+  const auto cost_of = [&](const ChainAxes& c) {
     return evaluate(place(c, sliding(c), pair, actions, sigma_m), pair, actions).cost;
   };
   double cost = cost_of(chain);
@@ -148,7 +134,7 @@ ChainRotations ordered_by_positions(ChainRotations chain, const RotationSearch& 
     for (int from = 0; from < m; ++from)
       for (int to = 0; to < m; ++to) {
         if (to == from || to == from - 1) continue;  // the neighbours' exchange once
-        ChainRotations moved = chain;
+        ChainAxes moved = chain;
         move_element(&moved.signals, from, to);
         move_element(&moved.axes, from, to);
         moved = search.fit(std::move(moved), false, 10);
@@ -186,13 +172,13 @@ std::vector<std::vector<double>> held_lengths(const std::vector<int>& signals,
   return result;
 }
 
-ChainRotations find_rotations(RotationSearch* search, const NormalizedActions& actions,
-                              const std::vector<int>& listed, JointOrder order, double goal_rad) {
-  ChainRotations best;
-  const auto is_found_by = [&](ChainRotations found) {
+ChainAxes find_axes(ChainSearch* search, const NormalizedActions& actions,
+                    const std::vector<int>& listed, JointOrder order, double goal) {
+  ChainAxes best;
+  const auto is_found_by = [&](ChainAxes found) {
     found = search->fit(std::move(found), false, kFitIterations);
     if (best.signals.empty() || found.cost < best.cost) best = std::move(found);
-    return best.median_rad < goal_rad;
+    return best.median_left < goal;
   };
   const std::vector<int> reversed(listed.rbegin(), listed.rend());
   for (const std::vector<int>& signals : {listed, reversed})
@@ -200,9 +186,10 @@ ChainRotations find_rotations(RotationSearch* search, const NormalizedActions& a
       if (is_found_by(search->best_of(signals, lengths, kHeldStarts))) return best;
   if (is_found_by(search->best_of(listed, {}, kFreeStarts))) return best;
   if (order == JointOrder::kListed) return best;
+  if (best.median_left < search->nearly_nothing()) return search->with_joints_moved(best);
   for (int restart = 0; restart < kOrderRestarts; ++restart)
     for (const std::vector<double>& lengths : held_lengths(listed, actions))
-      if (is_found_by(search->best_order(listed, lengths, goal_rad))) return best;
+      if (is_found_by(search->best_order(listed, lengths, goal))) return best;
   return best;
 }
 
@@ -304,18 +291,21 @@ double price(int num_parameters, const PairData& pair) {
 }  // namespace
 
 std::optional<Fit> fit_long_chain(const PairData& pair, const NormalizedActions& actions,
-                                  const std::vector<int>& signals, JointOrder order,
-                                  double noise_rad) {
+                                  const std::vector<int>& signals, JointOrder order, double noise) {
   const int m = static_cast<int>(signals.size());
   if (m == 0 || m > kMaxChainJoints || pair.size() < 2 * m) return std::nullopt;
   const double sigma_m = relative_motions(pair, 1).sigma_m;
+  if (pair.num_residuals() == 3) {
+    PositionSearch search(pair, actions, kSearchPositions, sigma_m);
+    return refined(find_axes(&search, actions, signals, order, kGoal * noise), pair, actions,
+                   sigma_m);
+  }
   RotationSearch search(pair, actions, kSearchFrames);
-  const ChainRotations rotations =
-      find_rotations(&search, actions, signals, order, kGoal * noise_rad);
-  Fit fit = refined(rotations, pair, actions, sigma_m);
+  const ChainAxes axes = find_axes(&search, actions, signals, order, kGoal * noise);
+  Fit fit = refined(axes, pair, actions, sigma_m);
   if (fit.cost < kRightCost * pair.size()) return fit;
-  Fit ordered = refined(ordered_by_positions(rotations, search, pair, actions, sigma_m), pair,
-                        actions, sigma_m);
+  Fit ordered =
+      refined(ordered_by_positions(axes, search, pair, actions, sigma_m), pair, actions, sigma_m);
   return ordered.cost < fit.cost ? ordered : fit;
 }
 

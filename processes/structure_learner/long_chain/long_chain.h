@@ -20,14 +20,15 @@ inline constexpr double kRightCost = 8;
 enum class JointOrder { kListed, kUnknown };
 
 /// A chain through all of `signals`, fitted to a pair's poses: rotations first, then the positions,
-/// which are linear given the rotations, then all together. In the listed order, with one angle per
+/// which are linear given the rotations, then all together; of positions alone what turns is found
+/// from these. In the listed order, with one angle per
 /// command unit for all joints or with angles of their own, and reversed; where it is unknown, in
-/// an order that is searched for. `noise_rad`: of one rotation of the pair, per axis; a chain that
-/// leaves no more ends the search. Signals that move nothing get joints that move next to nothing.
-/// std::nullopt: too few frames, no signal or too many.
+/// an order that is searched for. `noise`: of one rotation of the pair, or position where it has
+/// positions alone, per axis [rad, m]; a chain that leaves no more ends the search. Signals that
+/// move nothing get joints that move next to nothing. std::nullopt: too few frames, no signal or
+/// too many.
 std::optional<Fit> fit_long_chain(const PairData& pair, const NormalizedActions& actions,
-                                  const std::vector<int>& signals, JointOrder order,
-                                  double noise_rad);
+                                  const std::vector<int>& signals, JointOrder order, double noise);
 
 /// What a joint more must explain [nats]: more than chance (Schwarz 1978), and more than what is
 /// below the noise of every single sight.

@@ -3,7 +3,9 @@
 #include <Eigen/Eigenvalues>
 #include <algorithm>
 #include <cmath>
+#include <functional>
 #include <limits>
+#include <numeric>
 #include <optional>
 #include <set>
 #include <tuple>
@@ -13,6 +15,8 @@
 #include "common/geometry/angle.h"
 #include "common/kinematics/kinematic_tree.h"
 #include "common/text/text.h"
+#include "processes/structure_learner/long_chain/coupled_joints.h"
+#include "processes/structure_learner/long_chain/long_chain.h"
 #include "processes/structure_learner/model_free_noise.h"
 #include "processes/structure_learner/positions/position_screen.h"
 #include "processes/structure_learner/search/withdrawal.h"
@@ -34,6 +38,13 @@ constexpr double kRivalMargin = 8;
 /// What a joint must have been seen to move a position by: kCommonTurn of withdrawal.cpp at 0.1 m.
 constexpr double kLever_m = 0.1;
 constexpr double kCommonMotion_m = 0.65 * kLever_m;
+/// Positions a joint below which no chain of all signals is looked for: twice as many equations as
+/// it has parameters.
+constexpr int kPositionsPerJoint = 4;
+/// Joints of a chain up to which one of its signals may move one more.
+constexpr int kMostRepeated = 4;
+/// Parents below which such a chain is looked for, those seen most often with the leaf.
+constexpr std::size_t kMaxChainParents = 3;
 /// More is no noise: as learn.cpp's kLargestGuess.
 constexpr Noise kLargestGuess{0.01, 3 * kDegree};
 constexpr double kSafety = 1.2;  // as noise_estimate.cpp
@@ -109,6 +120,38 @@ std::vector<StartAt> starts_of(const std::vector<PairData>& pairs, const Normali
   return starts;
 }
 
+/// The indices of a few pairs.
+std::vector<std::size_t> most_often_seen(const std::vector<PairData>& pairs) {
+  std::vector<std::size_t> result(pairs.size());
+  std::iota(result.begin(), result.end(), 0);
+  std::ranges::stable_sort(result, std::greater(), [&](std::size_t p) { return pairs[p].size(); });
+  result.resize(std::min(result.size(), kMaxChainParents));
+  return result;
+}
+
+/// An order is searched for where a leaf can hang on one part alone.
+JointOrder order_of_chains(const Parents& parents, const NormalizedActions& actions) {
+  const bool is_searched = parents.parts().size() == 1 && !actions.blocks().is_stream();
+  return is_searched ? JointOrder::kUnknown : JointOrder::kListed;
+}
+
+/// A chain on `signals` without the joints that do not pay, in the order that the positions prefer;
+/// std::nullopt if they are too few, or so are the positions. `noise_m`: as fit_long_chain().
+std::optional<Fit> fit_chain(const PairData& pair, const NormalizedActions& actions,
+                             const std::vector<int>& signals, JointOrder order, double noise_m) {
+  const int m = static_cast<int>(signals.size());
+  const int num_independent =
+      actions.blocks().count(pair.frames, [](const PairFrame& frame) { return frame.sample; });
+  if (num_independent < kPositionsPerJoint * m) return std::nullopt;
+  std::optional<Fit> fit = fit_long_chain(pair, actions, signals, order, noise_m);
+  if (!fit) return fit;
+  fit = without_idle_joints(with_pure_slides(*std::move(fit), pair, actions), pair, actions);
+  fit = with_settled_order(*std::move(fit), pair, actions);
+  return fit->model.num_joints() <= kMostRepeated
+             ? with_repeated_signal(*std::move(fit), pair, actions)
+             : fit;
+}
+
 struct Contender {
   int parent = 0;
   LocalModel model;
@@ -156,9 +199,10 @@ class LeafSearch {
     if (contenders.empty()) {
       const bool are_few = parents_.num_common(leaf) < 5 * kPosesPerJoint;
       return open(are_few, are_few ? "more samples are needed to trust a model"
-                                   : "no model with up to two signals is valid for a position "
-                                     "alone: give orientations, as of three points of the part, or "
-                                     "the structure (refine --structure)");
+                                   : "no model is valid for its positions alone: give "
+                                     "orientations, as of three points of the part, the structure "
+                                     "(refine --structure), or more noise (--noise) where links "
+                                     "bend or joints have play");
     }
     const Contender& chosen = contenders.front();
     for (const Contender& other : contenders) {
@@ -173,9 +217,7 @@ class LeafSearch {
     ++found_.num_fits;
     const LeaveOneOut loo = leave_one_out(fit, all, actions_);
     if (check_validity(fit, loo, all, actions_, options_.validity).verdict != Verdict::kValid)
-      return open(false,
-                  "no model with up to two signals is valid for a position alone: give "
-                  "orientations");
+      return open(false, "no model is valid for its positions alone: give orientations");
     if (const std::string untold = untold_signals(fit, loo, all); !untold.empty())
       return open(true, "more samples are needed: too few yet to tell what moves with " + untold);
     result->models.push_back(
@@ -190,24 +232,19 @@ class LeafSearch {
       pairs.push_back(parents_.pair(parent, leaf, kMaxFrames));
     std::vector<Contender> contenders;
     double best = -std::numeric_limits<double>::infinity();
+    const auto consider = [&](std::size_t p, const Fit& fit) {
+      ++found_.num_fits;
+      std::optional<Contender> c = contender(parents_.parts()[p], fit, pairs[p]);
+      if (!c) return;
+      if (c->is_valid) best = std::max(best, c->evidence);
+      contenders.push_back(*std::move(c));
+    };
     for (int k = 0; k <= std::min(options_.max_signals, kMaxScreenedJoints); ++k)
-      for (const StartAt& s : starts_of(pairs, actions_, k, &found_.num_screens)) {
-        const PairData& pair = pairs[s.parent];
-        const Fit fit = fit_local_model(s.start.model, pair, actions_, 60, 1e-3);
-        ++found_.num_fits;
-        const LeaveOneOut loo = leave_one_out(fit, pair, actions_);
-        const Validity validity = check_validity(fit, loo, pair, actions_, options_.validity);
-        if (validity.verdict == Verdict::kRefuted) continue;
-        const int parent = parents_.parts()[s.parent];
-        Contender c{parent, fit.model, paths_.at(parent), components_.of(parent)};
-        c.path.merge(signal_set(fit.model));
-        c.is_valid = validity.verdict == Verdict::kValid;
-        c.score = validity.score;
-        c.evidence = -0.5 * pair.size() * (validity.mean_capped - 3) -
-                     0.5 * loo.rank * std::log(3.0 * pair.size());
-        if (c.is_valid) best = std::max(best, c.evidence);
-        contenders.push_back(std::move(c));
-      }
+      for (const StartAt& s : starts_of(pairs, actions_, k, &found_.num_screens))
+        consider(s.parent, fit_local_model(s.start.model, pairs[s.parent], actions_, 60, 1e-3));
+    if (!std::isfinite(best))
+      for (const std::size_t p : most_often_seen(pairs))
+        if (const auto fit = chain_below(p, pairs[p])) consider(p, *fit);
     std::erase_if(contenders, [&](const Contender& c) { return c.evidence < best - kRivalMargin; });
     std::stable_sort(
         contenders.begin(), contenders.end(), [](const Contender& x, const Contender& y) {
@@ -215,6 +252,45 @@ class LeafSearch {
                  std::tuple(!y.is_valid, y.path.size(), y.model.num_joints(), -y.evidence);
         });
     return contenders;
+  }
+
+  // std::nullopt: refuted.
+  std::optional<Contender> contender(int parent, const Fit& fit, const PairData& pair) const {
+    const LeaveOneOut loo = leave_one_out(fit, pair, actions_);
+    const Validity validity = check_validity(fit, loo, pair, actions_, options_.validity);
+    if (validity.verdict == Verdict::kRefuted) return std::nullopt;
+    Contender c{parent, fit.model, paths_.at(parent), components_.of(parent)};
+    c.path.merge(signal_set(fit.model));
+    c.is_valid = validity.verdict == Verdict::kValid;
+    c.score = validity.score;
+    c.evidence = -0.5 * pair.size() * (validity.mean_capped - 3) -
+                 0.5 * loo.rank * std::log(3.0 * pair.size());
+    return c;
+  }
+
+  // A chain of any number of joints, on the signals that move no other part; else on all that do
+  // not move the parent.
+  std::optional<Fit> chain_below(std::size_t p, const PairData& pair) const {
+    std::set<int> used;
+    for (const AcceptedModel& m : found_.models) used.merge(signal_set(m.model));
+    const auto without = [this](const std::set<int>& signals) {
+      std::vector<int> result;
+      for (const int s : actions_.moving())
+        if (!signals.contains(s)) result.push_back(s);
+      return result;
+    };
+    std::vector<std::vector<int>> sets{without(used)};
+    if (auto all = without(paths_.at(parents_.parts()[p])); all != sets.front())
+      sets.push_back(std::move(all));
+    const JointOrder order = order_of_chains(parents_, actions_);
+    std::optional<Fit> best;
+    for (const std::vector<int>& signals : sets) {
+      if (static_cast<int>(signals.size()) > options_.max_signals) continue;
+      auto fit = fit_chain(pair, actions_, signals, order, relative_motions(pair, 1).sigma_m);
+      if (fit && (!best || fit->cost < best->cost)) best = std::move(fit);
+      if (best && best->cost < 0.5 * kRightCost * pair.size()) break;
+    }
+    return best;
   }
 
   std::string name_of(const Contender& c) const {
@@ -300,35 +376,43 @@ std::optional<double> noise_of_repeats(const std::vector<ActionPoseSample>& samp
   return deviation(std::move(lengths));
 }
 
-// Of the model of a leaf that leaves least, for its parameters.
+// Of the model of a leaf that leaves least, for its parameters, of up to two joints; or of all.
 std::optional<double> noise_of_best_model(int leaf, const Parents& parents,
-                                          const NormalizedActions& actions) {
+                                          const NormalizedActions& actions, bool with_chains) {
   constexpr int kFrames = 120;
   constexpr std::size_t kFits = 8;
+  // A chain that leaves so much less than one or two joints ends the search for a better one.
+  constexpr double kLessThanFew = 0.003;
   std::vector<PairData> pairs;
   for (const int parent : parents.parts()) pairs.push_back(parents.pair(parent, leaf, kFrames));
   std::optional<double> noise;
   double least = std::numeric_limits<double>::infinity();
+  const auto consider = [&](const Fit& fit, const PairData& pair) {
+    const LeaveOneOut loo = leave_one_out(fit, pair, actions);
+    const double count = 3.0 * pair.size(), dof = count - loo.rank;
+    if (dof < 2 * loo.rank) return;
+    std::vector<double> lengths;
+    for (const Vector6d& r : loo.residual)
+      lengths.push_back(std::sqrt(dof / count) * r.head<3>().norm());
+    const double sigma = std::max(deviation(std::move(lengths)), kNoiseFloor.position_m);
+    const double cost = count * std::log(sigma) + 0.5 * loo.rank * std::log(count);
+    if (cost >= least) return;
+    least = cost;
+    noise = sigma;
+  };
   int num_screens = 0;
   for (int k = 0; k <= kMaxScreenedJoints; ++k) {
     std::vector<StartAt> starts = starts_of(pairs, actions, k, &num_screens);
     starts.resize(std::min(starts.size(), kFits));
-    for (const StartAt& s : starts) {
-      const PairData& pair = pairs[s.parent];
-      const Fit fit = fit_local_model(s.start.model, pair, actions, 40, 1e-6);
-      const LeaveOneOut loo = leave_one_out(fit, pair, actions);
-      const double count = 3.0 * pair.size(), dof = count - loo.rank;
-      if (dof < 2 * loo.rank) continue;
-      std::vector<double> lengths;
-      for (const Vector6d& r : loo.residual)
-        lengths.push_back(std::sqrt(dof / count) * r.head<3>().norm());
-      const double sigma = std::max(deviation(std::move(lengths)), kNoiseFloor.position_m);
-      const double cost = count * std::log(sigma) + 0.5 * loo.rank * std::log(count);
-      if (cost >= least) continue;
-      least = cost;
-      noise = sigma;
-    }
+    for (const StartAt& s : starts)
+      consider(fit_local_model(s.start.model, pairs[s.parent], actions, 40, 1e-6), pairs[s.parent]);
   }
+  if (!with_chains) return noise;
+  const double goal_m = kLessThanFew * noise.value_or(kLargestGuess.position_m);
+  for (const std::size_t p : most_often_seen(pairs))
+    if (const auto chain = fit_chain(pairs[p], actions, actions.moving(),
+                                     order_of_chains(parents, actions), goal_m))
+      consider(*chain, pairs[p]);
   return noise;
 }
 
@@ -383,10 +467,18 @@ std::optional<SourcedNoise> estimate_position_noise(const std::vector<ActionPose
     MeasurementModel rough;
     rough.noise = Noise{0.005, kNoiseFloor.rotation_rad};
     const Parents parents(samples, actions, root, resting, rough);
-    // Parts that no model explains leave motion, others noise.
-    for (const int leaf : leaves)
-      if (const auto of_leaf = noise_of_best_model(leaf, parents, actions))
-        sigma = std::min(sigma.value_or(*of_leaf), *of_leaf);
+    // Parts that no model explains leave motion, others noise. A long chain is one of few that may
+    // be meant, and leaves more than noise where its signals move joints elsewhere, too: it is
+    // asked last, unless there is nothing else to ask.
+    const auto of_all = [&](bool with_chains) {
+      std::optional<double> least;
+      for (const int leaf : leaves)
+        if (const auto of_leaf = noise_of_best_model(leaf, parents, actions, with_chains))
+          least = std::min(least.value_or(*of_leaf), *of_leaf);
+      return least;
+    };
+    sigma = of_all(leaves.size() == 1);
+    if (leaves.size() > 1 && (!sigma || *sigma > kLargestGuess.position_m)) sigma = of_all(true);
     if (sigma && *sigma > kLargestGuess.position_m) return std::nullopt;
   }
   if (!sigma) return std::nullopt;

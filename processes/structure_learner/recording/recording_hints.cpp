@@ -1,8 +1,10 @@
 #include <fmt/format.h>
+#include <fmt/ranges.h>
 
 #include <algorithm>
 #include <cmath>
 #include <map>
+#include <optional>
 #include <utility>
 
 #include "common/estimation/quantile.h"
@@ -143,6 +145,30 @@ bool is_order_x_y_z_w(const std::vector<ActionPoseSample>& samples,
   return evidence > kEvidence;
 }
 
+/// Signals that vary, but too little to count as moving: joints held still, or another unit.
+std::optional<std::string> jitter_hint(const Recording& recording) {
+  const auto num_signals = static_cast<Eigen::Index>(recording.signals.size());
+  if (recording.samples.empty() || num_signals == 0) return std::nullopt;
+  Eigen::VectorXd lower = recording.samples.front().action, upper = lower;
+  for (const ActionPoseSample& sample : recording.samples) {
+    lower = lower.cwiseMin(sample.action);
+    upper = upper.cwiseMax(sample.action);
+  }
+  const Eigen::VectorXd range = upper - lower;
+  std::vector<std::string> held;
+  double most = 0;
+  for (Eigen::Index s = 0; s < num_signals; ++s)
+    if (range(s) > 0 && range(s) <= kJitter * range.maxCoeff()) {
+      held.push_back(recording.signals[static_cast<std::size_t>(s)].name);
+      most = std::max(most, range(s));
+    }
+  if (held.empty()) return std::nullopt;
+  return fmt::format(
+      "{} var{} by {:.2g} at most, where others move by {:.2g}: taken for joints held still; a "
+      "column in another unit than the others needs to be scaled",
+      fmt::join(held, ", "), held.size() == 1 ? "ies" : "y", most, range.maxCoeff());
+}
+
 }  // namespace
 
 bool looks_like_radians(const Noise& noise) {
@@ -175,6 +201,7 @@ std::vector<std::string> hints_of(const Recording& recording) {
              looks_like_radians({upper_median(noise_m), upper_median(noise_rad)}))
       hints.emplace_back("sr_deg looks like radians; expected degrees");
   }
+  if (auto jitter = jitter_hint(recording)) hints.push_back(*std::move(jitter));
   if (is_order_x_y_z_w(recording.samples, posed_tracks))
     hints.emplace_back("the quaternion column order looks like x y z w; expected qw,qx,qy,qz");
   return hints;

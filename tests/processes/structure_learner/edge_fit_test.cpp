@@ -7,6 +7,7 @@
 
 #include "common/geometry/angle.h"
 #include "processes/structure_learner/learn.h"
+#include "processes/structure_learner/wrong_commands.h"
 #include "tests/support/synthetic_robot.h"
 
 namespace bodyschema {

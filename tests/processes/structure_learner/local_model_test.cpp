@@ -163,6 +163,16 @@ TEST(NormalizedActions, TellWhichSignalsMoveAlike) {
   }
 }
 
+// Of a joint that is held still its encoder's last digits, and a stage of 1 mm in metres.
+TEST(NormalizedActions, JitterIsNoMotion) {
+  std::vector<ActionPoseSample> samples(20);
+  for (int t = 0; t < 20; ++t) {
+    const double x = t / 19.0;
+    samples[t].action = Eigen::Vector4d(2 * x, 0.5 + 2e-4 * x, 1e-3 * x, 1.0);
+  }
+  EXPECT_EQ(NormalizedActions(samples, 4).moving(), (std::vector{0, 2}));
+}
+
 TEST(NormalizedActions, ConstantSignalsDoNotMove) {
   Rng rng(7);
   auto samples = random_actions(5, rng);

@@ -7,6 +7,7 @@
 
 #include "common/geometry/angle.h"
 #include "processes/structure_learner/learn.h"
+#include "processes/structure_learner/long_chain/chain_positions.h"
 #include "processes/structure_learner/long_chain/chain_rotations.h"
 #include "processes/structure_learner/long_chain/coupled_joints.h"
 #include "tests/support/random_arm.h"
@@ -64,8 +65,8 @@ TEST(RotationSearch, FindsTheAxesOfAChainInItsListedOrder) {
   for (const bool own_gains : {true, false}) {
     const Case c({.share_sliding = 0, .own_gains = own_gains}, 40, 3);
     RotationSearch search(c.pair, c.actions, 60);
-    const ChainRotations found = search.fit(search.best_of(c.listed(), {}, 60), false, 60);
-    EXPECT_LT(found.median_rad, 1.5 * kDegree);
+    const ChainAxes found = search.fit(search.best_of(c.listed(), {}, 60), false, 60);
+    EXPECT_LT(found.median_left, 1.5 * kDegree);
     for (int j = 0; j < 7; ++j)
       EXPECT_NEAR(found.axes[j].norm(),
                   std::abs(c.robot.links[j + 1].turn) * c.actions.half_range(j), 0.05);
@@ -76,8 +77,47 @@ TEST(RotationSearch, LengthsThatAreHeldStay) {
   const Case c({}, 30, 1);
   RotationSearch search(c.pair, c.actions, 60);
   const std::vector<double> lengths(7, 1.2);
-  const ChainRotations found = search.best_of(c.listed(), lengths, 1);
+  const ChainAxes found = search.best_of(c.listed(), lengths, 1);
   for (const Eigen::Vector3d& axis : found.axes) EXPECT_NEAR(axis.norm(), 1.2, 1e-9);
+}
+
+TEST(PositionSearch, AQuarterOfTheStartsFindTheAxes) {
+  constexpr int kStarts = 10, kArms = 12;
+  int num_found = 0;
+  for (int seed = 1; seed <= kArms; ++seed) {
+    const Case c({.num_joints = 6, .share_sliding = 0, .own_gains = false}, 60, seed);
+    const auto samples = test::with_positions_alone(c.samples, {7});
+    const PairData pair = make_pair_data(samples, 1, 7, {.noise = kNoise}, 60);
+    PositionSearch search(pair, c.actions, 60, kNoise.position_m);
+    std::vector<double> lengths;
+    for (const int s : c.listed()) lengths.push_back(c.actions.half_range(s));
+    for (int n = 0; n < kStarts; ++n) {
+      const ChainAxes found =
+          search.fit(search.fit(search.random_start(c.listed(), lengths), true, 60), false, 60);
+      if (found.median_left > 3 * kNoise.position_m) continue;
+      ++num_found;
+      for (int j = 0; j < 6; ++j) EXPECT_NEAR(found.axes[j].norm(), lengths[j], 0.1);
+    }
+  }
+  EXPECT_GE(num_found, kArms * kStarts / 4);
+}
+
+TEST(PositionSearch, AnAxisThatIsZeroSlides) {
+  const Case c({.num_joints = 5, .share_sliding = 0.5}, 60, 2);
+  const auto samples = test::with_positions_alone(c.samples, {6});
+  const PairData pair = make_pair_data(samples, 1, 6, {.noise = kNoise}, 60);
+  PositionSearch search(pair, c.actions, 60, kNoise.position_m);
+  double least = 1;
+  for (int n = 0; n < 10; ++n) {
+    ChainAxes start = search.random_start(c.listed(), {});
+    for (int j = 0; j < 5; ++j)
+      if (c.robot.links[j + 1].slide != 0) start.axes[j].setZero();
+    const ChainAxes found = search.fit(start, false, 60);
+    least = std::min(least, found.median_left);
+    for (int j = 0; j < 5; ++j)
+      EXPECT_EQ(found.axes[j].isZero(0), c.robot.links[j + 1].slide != 0) << j;
+  }
+  EXPECT_LT(least, 3 * kNoise.position_m);
 }
 
 TEST(LongChain, AJointThatSlidesIsRecognised) {

@@ -50,6 +50,18 @@ TEST(RecordingHintsTest, ARecordingAsItShouldBeGetsNone) {
   });
 }
 
+TEST(RecordingHintsTest, SignalsThatHardlyMoveAreNamed) {
+  Recording recording;
+  recording.signals = {{.name = "shoulder"}, {.name = "elbow"}, {.name = "wrist"}};
+  for (int t = 0; t < 20; ++t) {
+    ActionPoseSample& sample = recording.samples.emplace_back();
+    sample.action = Eigen::Vector3d(0.1 * t, 1e-6 * t, 1.5);
+    sample.parts.push_back({.part = 1, .X_CB = Pose::Identity()});
+  }
+  ASSERT_TRUE(is_hinted(recording, "elbow varies by 1.9e-05 at most, where others move by 1.9"));
+  EXPECT_FALSE(is_hinted(recording, "wrist"));
+}
+
 TEST(RecordingHintsTest, MillimetresAreNamed) {
   for_each_robot(100, [](Recording& recording, int n) {
     change_poses(recording, [](Pose& X) { X.translation() *= 1000; });

@@ -394,7 +394,6 @@ TEST(LongChains, MayHaveASignalThatMovesOtherPartsToo) {
   EXPECT_GE(count_right(kSharedSignal, 9, Regime::kTag), 6);
 }
 
-
 TEST(MimicJoints, AreFoundWithNothingSeenBetween) {
   EXPECT_GE(count_right(kMimicJoint, 2, Regime::kTag), 9);
   // Of three the second joint adds so little that it may be how one joint is imperfect.

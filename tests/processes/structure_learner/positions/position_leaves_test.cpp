@@ -9,6 +9,7 @@
 
 #include "common/geometry/angle.h"
 #include "processes/structure_learner/learn.h"
+#include "tests/support/random_arm.h"
 #include "tests/support/synthetic_robot.h"
 
 namespace bodyschema {
@@ -133,8 +134,7 @@ INSTANTIATE_TEST_SUITE_P(, NoiseTold, testing::Bool());
 TEST_P(NoiseTold, NoPartIsWrongWhereAllBelowARestingRootHavePositionsAlone) {
   const Verdicts verdicts = learned(5, all_but_root);
   EXPECT_EQ(verdicts.wrong, "");
-  EXPECT_GE(verdicts.num_right, 2.3 * num_bodies_);
-  EXPECT_GE(verdicts.num_open, num_bodies_) << "parts three joints from the root";
+  EXPECT_GE(verdicts.num_right, 3.3 * num_bodies_);  // of four, some three joints from the root
 }
 
 TEST_P(NoiseTold, NoPartIsWrongWhereTheLeafAloneHasNoOrientation) {
@@ -224,6 +224,46 @@ TEST(PositionLeaves, AFewSamplesAreNotEnoughOrTellTheTruth) {
       const BodySchema schema = learned(hinge(0.2, rng), num_samples, rng);
       if (num_samples < 5) EXPECT_FALSE(schema.complete) << seed << ", " << num_samples;
       if (schema.complete) EXPECT_EQ(schema.edges[0].signals(), std::vector<int>{0}) << seed;
+    }
+}
+
+// As a laser tracker sees it: the base rests, the tip is a point.
+TEST_P(NoiseTold, AnArmOfManyJointsIsLearnedFromThePositionsOfItsTip) {
+  const test::RandomArmOptions kArms[] = {
+      {.num_joints = 3, .own_gains = false},
+      {.num_joints = 6, .own_gains = false},
+      {.num_joints = 7, .share_sliding = 0.3},
+      {.num_joints = 6, .share_sliding = 0, .own_gains = false, .scrambled = true}};
+  Verdicts verdicts;
+  int num_arms = 0;
+  for (const test::RandomArmOptions& options : kArms)
+    for (int seed = 1; seed <= 3; ++seed) {
+      Rng rng(seed);
+      const test::SyntheticRobot robot = test::random_arm(options, rng);
+      const int tip = options.num_joints + 1;
+      LearnOptions learning;
+      learning.root = 1;
+      if (GetParam()) learning.measurement.noise = kNoise;
+      const auto samples = test::with_positions_alone(noisy_babble(robot, 150, kNoise, rng), {tip});
+      judge_parts(learn(robot.signals, samples, learning).schema, robot, {tip}, rng, &verdicts);
+      ++num_arms;
+    }
+  EXPECT_EQ(verdicts.wrong, "");
+  EXPECT_GE(verdicts.num_right, num_arms - 1);
+}
+
+TEST_P(NoiseTold, OfTooFewPositionsNoArmIsLearnedWrong) {
+  for (const int num_samples : {8, 12, 16, 20, 24})
+    for (int seed = 1; seed <= 4; ++seed) {
+      Rng rng(seed);
+      const test::SyntheticRobot robot = test::random_arm({.num_joints = 6}, rng);
+      LearnOptions learning;
+      learning.root = 1;
+      if (GetParam()) learning.measurement.noise = kNoise;
+      const auto samples =
+          test::with_positions_alone(noisy_babble(robot, num_samples, kNoise, rng), {7});
+      const BodySchema schema = learn(robot.signals, samples, learning).schema;
+      if (schema.complete) EXPECT_EQ(schema.unused_signals().size(), 0U) << num_samples;
     }
 }
 
