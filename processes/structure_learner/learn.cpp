@@ -59,13 +59,14 @@ std::optional<Noise> noise_beside_soft_edges(const std::vector<ActionPoseSample>
   return all_soft ? noise_from_neighbours(displaced, actions) : std::nullopt;
 }
 
+// The told noise stands (tell_noise_from_body() keeps it as it is).
 bool is_same(const Noise& noise, const std::optional<Noise>& told) {
   return told && noise.position_m == std::max(told->position_m, kNoiseFloor.position_m) &&
          noise.rotation_rad == std::max(told->rotation_rad, kNoiseFloor.rotation_rad);
 }
 
-// Noise of the markers, whatever the models leave; of a stream, where no two edges meet, what its
-// neighbours in time tell.
+// Noise of the markers, whatever the models leave: what edges that meet have in common, else what
+// was told, else, of a stream, what its neighbours in time tell.
 std::optional<Noise> noise_beside_models(const std::vector<ActionPoseSample>& displaced,
                                          const NormalizedActions& actions,
                                          const std::optional<Noise>& told,

@@ -46,7 +46,8 @@ struct LearnResult {
   Refusals refused;               ///< what the search accepted, and the fit to all parts did not
   NoiseSource noise_source = NoiseSource::kAssumed;
   bool is_one_cluster = false;  ///< see one_cluster.h
-  /// Of poses at rest: what the joint fit leaves has this correlation from one sample to the next.
+  /// Of poses at rest: what the joint fit leaves, or where there is none the edges', has this
+  /// correlation from one sample to the next.
   double serial_correlation = 0;
   CommandDelay command_delay;  ///< of a stream's poses, taken into account
   int num_screens = 0;         ///< closed-form hypotheses looked at

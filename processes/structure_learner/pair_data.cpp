@@ -124,6 +124,14 @@ std::optional<double> usual_value(std::vector<double> values) {
   return std::nullopt;
 }
 
+bool is_jitter(double lower, double upper, double farthest) {
+  // Held joints of a KUKA iiwa had 10⁻⁶ to 2.4 · 10⁻⁴ of the farthest, which moved by a radian.
+  constexpr double kOfTheFarthest = 3e-4, kSmall = 1e-3, kOfTheValue = 1e-2;
+  const double range = upper - lower;
+  return range <= kOfTheFarthest * farthest &&
+         (range < kSmall || range < kOfTheValue * std::abs(upper + lower) / 2);
+}
+
 NormalizedActions::NormalizedActions(const std::vector<ActionPoseSample>& samples, int num_signals)
     : values_(num_signals, samples.size()),
       centre_(Eigen::VectorXd::Zero(num_signals)),
@@ -143,7 +151,7 @@ NormalizedActions::NormalizedActions(const std::vector<ActionPoseSample>& sample
     centre_(s) = (lower + upper) / 2;
     // The rounding of a constant is not a motion.
     const double rounding = 1e-9 * std::max(std::abs(lower), std::abs(upper));
-    if (upper - lower > std::max(rounding, kJitter * farthest)) {
+    if (upper - lower > rounding && !is_jitter(lower, upper, farthest)) {
       half_range_(s) = (upper - lower) / 2;
       moving_.push_back(s);
     }

@@ -12,13 +12,14 @@
 
 namespace bodyschema {
 
-/// A signal whose range is so small a share of the largest one's rests: what a joint that is held
-/// still reads is no command, though it may go with the load. Held joints of a KUKA iiwa had 10⁻⁶
-/// to 2.4 · 10⁻⁴; a stage of 1 mm in metres beside 3 rad has 3.3 · 10⁻⁴.
-inline constexpr double kJitter = 3e-4;
+/// What a joint reads that is held still is no command, though it may go with the load: its range
+/// is next to nothing beside that of the signal that moves `farthest`, and small in its own unit,
+/// or beside its value. So a stage of 1 mm in metres beside 3 rad moves, and 5 cm beside 180 in
+/// degrees.
+bool is_jitter(double lower, double upper, double farthest);
 
 /// The training actions, each signal scaled to [−1, 1] over its observed range, so that nothing in
-/// the fits depends on command units.
+/// the fits depends on command units, but for what counts as jitter.
 class NormalizedActions {
  public:
   /// @throws std::invalid_argument if an action does not have `num_signals` values.
@@ -30,8 +31,7 @@ class NormalizedActions {
   /// q = centre + half_range · value, in command units.
   double centre(int signal) const { return centre_(signal); }
   double half_range(int signal) const { return half_range_(signal); }
-  /// The signals that move, by more than kJitter of the farthest, ascending. The others can explain
-  /// nothing.
+  /// The signals that move, by more than jitter, ascending. The others can explain nothing.
   const std::vector<int>& moving() const { return moving_; }
   /// Of two signals that move over all samples, −1 … 1.
   double correlation(int a, int b) const;

@@ -2,10 +2,6 @@
 
 #include <algorithm>
 #include <cmath>
-#include <functional>
-#include <limits>
-#include <numeric>
-#include <optional>
 
 #include "common/estimation/quantile.h"
 #include "processes/structure_learner/serial_correlation.h"

@@ -103,16 +103,18 @@ Visits visits_to(int first, int last, const std::vector<int>& bins,
 // the next; and do not begin and end with them.
 bool is_wrong_at_visits(const std::vector<bool>& outlying, const std::vector<double>& values,
                         double log_signals) {
-  constexpr int kBins = 16;
+  constexpr int kBins = 32;  // chosen: with 16 a boundary within one blurs visits of half a second
   constexpr double kLogLeastChance = -9.2;  // 1e-4
   // Of the visits; of all samples, and of all outliers, that are outliers there. All chosen.
   constexpr double kLeastInside = 0.7, kLeastShare = 0.05, kLeastOfOutliers = 0.3;
-  constexpr double kLogMatches = -3;  // of an episode: its begin and its end, each to a tenth
+  // Of an episode to begin and to end with a visit, each to a tenth of it: about 1 in 20.
+  constexpr double kLogMatches = -3;
+  const auto n = static_cast<double>(values.size());
+  const auto num_outliers = static_cast<double>(std::ranges::count(outlying, true));
+  if (num_outliers < kLeastShare * n) return false;
   std::vector<int> bins;
   for (const double value : values)
     bins.push_back(std::clamp(static_cast<int>(0.5 * (value + 1) * kBins), 0, kBins - 1));
-  const auto n = static_cast<double>(values.size());
-  const auto num_outliers = static_cast<double>(std::ranges::count(outlying, true));
   const double log_share = std::log(num_outliers / n);
   const double log_trials = log_signals + std::log(kBins * (kBins + 1) / 2);
   for (int first = 0; first < kBins; ++first)

@@ -13,7 +13,7 @@ namespace bodyschema {
 /// poses, or all that are away from that: nothing tells then what the signal does. `outlying`: by
 /// sample of `samples`, which ascend. Of a stream, where outliers last, it is motions of signals
 /// that mostly rest that count, two at least, and visits to a stretch of a signal's range.
-/// O(D (K² + N log N)) of K outliers among N and D signals.
+/// O(D (K² + N log N)) of K outliers among N and D signals; of a stream O(D N), some 500 stretches.
 bool is_wrong_at_some_commands(const std::vector<int>& samples, const std::vector<bool>& outlying,
                                const NormalizedActions& actions);
 /// `squared_distance`: by frame of the pair.

@@ -1,14 +1,13 @@
 #include "processes/model_monitor/hypotheses/action_discrepancy.h"
 
 #include <algorithm>
-#include <cmath>
 
 namespace bodyschema {
 namespace {
 
-/// The newest ones of DriftWatch's window and as many before as tell the difference of two means.
+/// The newest 44 of DriftWatch's window, and 60 more that stand for all before (chosen).
 constexpr std::size_t kMost = 104;
-/// Of a signal's range −1 … 1: about a radian of a joint that turns by half a turn.
+/// Of a signal's range −1 … 1: about a radian of a joint that turns by half a turn (chosen).
 constexpr double kLength = 0.6;
 
 }  // namespace
@@ -42,9 +41,9 @@ void ActionDiscrepancy::add(const Eigen::VectorXd& action, const std::vector<Sig
   }
 }
 
-double ActionDiscrepancy::since(std::int64_t since) const {
-  const auto first = std::ranges::lower_bound(added_, since, {}, &Added::sample_index);
-  return first == added_.end() ? 1 : squared_[static_cast<std::size_t>(first - added_.begin())];
+double ActionDiscrepancy::since(std::int64_t first) const {
+  const auto at = std::ranges::lower_bound(added_, first, {}, &Added::sample_index);
+  return at == added_.end() ? 1 : squared_[static_cast<std::size_t>(at - added_.begin())];
 }
 
 }  // namespace bodyschema

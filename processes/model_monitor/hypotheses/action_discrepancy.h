@@ -14,15 +14,15 @@ namespace bodyschema {
 ///
 /// What a model is off by differs from action to action. As a Gaussian process of this kernel and
 /// unit variance it is off by so much variance more, or less, over the newest actions than over
-/// those before: about 1/n for n actions at random, up to 2 where a signal stays elsewhere.
+/// those before: about 1/n for n actions at random, up to 2 where all signals stay elsewhere.
 class ActionDiscrepancy {
  public:
   /// `action`: one value per signal, in its units.
   void add(const Eigen::VectorXd& action, const std::vector<Signal>& signals,
            std::int64_t sample_index);
   void clear() { *this = {}; }
-  /// Of the actions from sample `since` on and those before. 1 if there are none on one side.
-  double since(std::int64_t since) const;
+  /// Of the actions from sample `first` on and those before. 1 if there are none on one side.
+  double since(std::int64_t first) const;
 
  private:
   struct Added {

@@ -76,7 +76,8 @@ double DriftWatch::log_chance(const Mean& newest, const Mean* before, double wor
   Vector6d offset = spread * newest.sum;
   Matrix6d covariance = spread / worth;
   if (before) {
-    // What the model is off by is known from before, but for what differs with the action.
+    // What the model is off by is known from before, but for what differs with the action; where
+    // samples tell less than one each, so do their actions.
     const Matrix6d known = (model.inverse() + worth * before->information).inverse();
     offset -= worth * known * before->sum;
     covariance += known + std::min(discrepancy / worth, 1.0) * model;
@@ -118,7 +119,8 @@ std::optional<DriftWatch::Moved> DriftWatch::moved(const BodySchema& schema) con
         twist = screw_twist(edge->joints[link]);
         if (link == 0) twist = adjoint(edge->left) * *twist;
       }
-      std::vector<Mean> older{popped == before_.end() ? Mean{} : popped->second[link]};
+      std::vector<Mean> older{has_before && popped != before_.end() ? popped->second[link]
+                                                                    : Mean{}};
       for (const std::vector<Reading>& of : all) {
         older.push_back(older.back());
         older.back().add(of[link]);

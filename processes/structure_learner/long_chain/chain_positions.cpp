@@ -16,7 +16,7 @@ using Eigen::Vector3d;
 // Scale of the heavy-tailed loss, of the positions' spread: as wide, of what can be left, as that
 // of rotations.
 constexpr double kLossScale = 0.3;
-// Links that no position tells are held by the damping of exact positions [m].
+// Less is no noise and no motion [m].
 constexpr double kExact = 3e-5;
 
 std::vector<bool> sliding(const ChainAxes& chain) {
@@ -52,7 +52,8 @@ Eigen::MatrixXd links_design(const ChainAxes& chain, const std::vector<bool>& sl
   return design;
 }
 
-// The links that fit given axes best.
+// The links that fit given axes best. The weights are one round ahead of them: near the minimum
+// these are the same.
 struct PositionSearch::Projected {
   Eigen::MatrixXd design;
   Eigen::VectorXd weights, links, residual;

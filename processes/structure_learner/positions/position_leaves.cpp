@@ -38,8 +38,8 @@ constexpr double kRivalMargin = 8;
 /// What a joint must have been seen to move a position by: kCommonTurn of withdrawal.cpp at 0.1 m.
 constexpr double kLever_m = 0.1;
 constexpr double kCommonMotion_m = 0.65 * kLever_m;
-/// Positions a joint below which no chain of all signals is looked for: twice as many equations as
-/// it has parameters.
+/// Independent positions a signal below which no chain is looked for: twice as many equations as it
+/// has parameters.
 constexpr int kPositionsPerJoint = 4;
 /// Joints of a chain up to which one of its signals may move one more.
 constexpr int kMostRepeated = 4;
@@ -129,7 +129,8 @@ std::vector<std::size_t> most_often_seen(const std::vector<PairData>& pairs) {
   return result;
 }
 
-/// An order is searched for where a leaf can hang on one part alone.
+/// An order is searched for where a leaf can hang on one part alone, from poses at rest; else it is
+/// that of the signals, or the reverse.
 JointOrder order_of_chains(const Parents& parents, const NormalizedActions& actions) {
   const bool is_searched = parents.parts().size() == 1 && !actions.blocks().is_stream();
   return is_searched ? JointOrder::kUnknown : JointOrder::kListed;
@@ -146,10 +147,9 @@ std::optional<Fit> fit_chain(const PairData& pair, const NormalizedActions& acti
   std::optional<Fit> fit = fit_long_chain(pair, actions, signals, order, noise_m);
   if (!fit) return fit;
   fit = without_idle_joints(with_pure_slides(*std::move(fit), pair, actions), pair, actions);
-  fit = with_settled_order(*std::move(fit), pair, actions);
-  return fit->model.num_joints() <= kMostRepeated
-             ? with_repeated_signal(*std::move(fit), pair, actions)
-             : fit;
+  if (fit->model.num_joints() <= kMostRepeated)
+    fit = with_repeated_signal(*std::move(fit), pair, actions);
+  return with_settled_order(*std::move(fit), pair, actions);
 }
 
 struct Contender {
@@ -197,7 +197,10 @@ class LeafSearch {
       result->open[leaf] = {is_data_missing, reason};
     };
     if (contenders.empty()) {
-      const bool are_few = parents_.num_common(leaf) < 5 * kPosesPerJoint;
+      const int num_joints = std::min(
+          {static_cast<int>(actions_.moving().size()), options_.max_signals, kMaxChainJoints});
+      const bool are_few =
+          parents_.num_common(leaf) < std::max(5 * kPosesPerJoint, kPositionsPerJoint * num_joints);
       return open(are_few, are_few ? "more samples are needed to trust a model"
                                    : "no model is valid for its positions alone: give "
                                      "orientations, as of three points of the part, the structure "

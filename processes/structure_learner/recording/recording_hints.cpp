@@ -158,7 +158,7 @@ std::optional<std::string> jitter_hint(const Recording& recording) {
   std::vector<std::string> held;
   double most = 0;
   for (Eigen::Index s = 0; s < num_signals; ++s)
-    if (range(s) > 0 && range(s) <= kJitter * range.maxCoeff()) {
+    if (range(s) > 0 && is_jitter(lower(s), upper(s), range.maxCoeff())) {
       held.push_back(recording.signals[static_cast<std::size_t>(s)].name);
       most = std::max(most, range(s));
     }

@@ -163,7 +163,8 @@ TEST(NormalizedActions, TellWhichSignalsMoveAlike) {
   }
 }
 
-// Of a joint that is held still its encoder's last digits, and a stage of 1 mm in metres.
+// Of a joint that is held still its encoder's last digits; not a stage of 1 mm in metres, nor a
+// joint in radians beside ticks of an encoder.
 TEST(NormalizedActions, JitterIsNoMotion) {
   std::vector<ActionPoseSample> samples(20);
   for (int t = 0; t < 20; ++t) {
@@ -171,6 +172,9 @@ TEST(NormalizedActions, JitterIsNoMotion) {
     samples[t].action = Eigen::Vector4d(2 * x, 0.5 + 2e-4 * x, 1e-3 * x, 1.0);
   }
   EXPECT_EQ(NormalizedActions(samples, 4).moving(), (std::vector{0, 2}));
+  for (int t = 0; t < 20; ++t) samples[t].action(0) = 5000.0 * t;
+  for (int t = 0; t < 20; ++t) samples[t].action(3) = 0.05 * t;
+  EXPECT_EQ(NormalizedActions(samples, 4).moving(), (std::vector{0, 2, 3}));
 }
 
 TEST(NormalizedActions, ConstantSignalsDoNotMove) {

@@ -89,8 +89,9 @@ TEST(AddUnexplained, IsWhatAnEdgeLeavesBesideTheNoise) {
     edge.rotation_rms_rad = std::sqrt(3 * 2) * kNoise.rotation_rad;
     edge.position_rms_m = 0.001;
   }
+  EXPECT_FALSE(add_unexplained(kNoise, {}, &schema));
   schema.edges[1].rotation_rms_rad *= 3;
-  add_unexplained(kNoise, {}, &schema);
+  EXPECT_TRUE(add_unexplained(kNoise, {}, &schema));
   const Eigen::VectorXd theta = schema.displacements(mid_range(schema.signals));
   for (std::size_t e = 0; e < schema.edges.size(); ++e) {
     const Matrix6d covariance = schema.edges[e].prediction_covariance(theta);
@@ -115,7 +116,7 @@ TEST(TellNoiseFromBody, WhatOneEdgeLeavesIsItsOwn) {
     }
     schema.edges[1].rotation_rms_rad *= 3;
     schema.noise = {factor * kNoise.position_m, factor * kNoise.rotation_rad};
-    tell_noise_from_body(kNoise, {}, &schema);
+    EXPECT_TRUE(tell_noise_from_body(kNoise, {}, &schema));
     EXPECT_NEAR(schema.noise.rotation_rad, (factor < 1.5 ? factor : 1) * kNoise.rotation_rad, 1e-9);
     const Eigen::VectorXd theta = schema.displacements(mid_range(schema.signals));
     for (std::size_t e = 0; e < schema.edges.size(); ++e)
