@@ -19,6 +19,9 @@ constexpr double kLossScale = 0.3;
 // Less is no noise and no motion [m].
 constexpr double kExact = 3e-5;
 
+// One free start in five succeeds; a fit costs ten times what one to rotations does.
+constexpr ChainSearch::Effort kEffort{20, 1, 8, 0};
+
 std::vector<bool> sliding(const ChainAxes& chain) {
   std::vector<bool> slides;
   for (const Vector3d& axis : chain.axes) slides.push_back(axis.isZero(0));
@@ -63,7 +66,7 @@ struct PositionSearch::Projected {
 
 PositionSearch::PositionSearch(const PairData& pair, const NormalizedActions& actions,
                                int max_frames, double sigma_m)
-    : ChainSearch(pair, actions, max_frames),
+    : ChainSearch(pair, actions, max_frames, kEffort),
       positions_(3 * num_frames()),
       ridge_(std::pow(std::max(sigma_m, kExact) / kLongestLink, 2)) {
   Vector3d middle = Vector3d::Zero();

@@ -5,6 +5,7 @@
 
 #include "common/estimation/levenberg_marquardt.h"
 #include "common/estimation/quantile.h"
+#include "processes/structure_learner/long_chain/long_chain.h"
 
 namespace bodyschema {
 namespace {
@@ -15,6 +16,9 @@ using Eigen::Vector3d;
 // Scale of the heavy-tailed loss: wide enough to be drawn into the global minimum from tens of
 // degrees, narrow enough for one frame in five that is anything. research/long_chains.md.
 constexpr double kLossScale = 0.3;
+
+// One free start in ten succeeds.
+constexpr ChainSearch::Effort kEffort{60, 3, kMaxChainJoints, 2};
 
 // Of R̂ᵀ R: sin ϑ about its axis; 4 sin²(ϑ/2).
 Vector3d sine_axis(const Matrix3d& error) {
@@ -32,7 +36,7 @@ double weight(double chord2) { return 1 / (1 + chord2 / (kLossScale * kLossScale
 
 RotationSearch::RotationSearch(const PairData& pair, const NormalizedActions& actions,
                                int max_frames)
-    : ChainSearch(pair, actions, max_frames) {
+    : ChainSearch(pair, actions, max_frames, kEffort) {
   for (const int frame : frames_) rotations_.push_back(pair.primary(frame).z.linear());
 }
 

@@ -55,7 +55,9 @@ ChainAxes with_axes_moved(const ChainAxes& chain, const std::vector<Eigen::Matri
   return moved;
 }
 
-ChainSearch::ChainSearch(const PairData& pair, const NormalizedActions& actions, int max_frames) {
+ChainSearch::ChainSearch(const PairData& pair, const NormalizedActions& actions, int max_frames,
+                         const Effort& effort)
+    : effort_(effort) {
   const int n = std::min(pair.size(), max_frames);
   q_.resize(actions.num_signals(), n);
   for (int k = 0; k < n; ++k) {
@@ -126,7 +128,6 @@ ChainAxes ChainSearch::with_joints_moved(ChainAxes chain) const {
 ChainAxes ChainSearch::best_order(const std::vector<int>& signals,
                                   const std::vector<double>& lengths, double goal) {
   constexpr int kMaxSweeps = 8;
-  constexpr int kRandomStarts = 2;
   constexpr double kBetter = 0.98;
   const int m = static_cast<int>(signals.size());
   bool holds = true;
@@ -159,7 +160,7 @@ ChainAxes ChainSearch::best_order(const std::vector<int>& signals,
         move_element(&moved.signals, from, to);
         move_element(&moved.axes, from, to);
         fit_order(moved, &best);
-        for (int n = 0; n < kRandomStarts; ++n) {
+        for (int n = 0; n < effort_.random_starts; ++n) {
           for (Vector3d& axis : moved.axes) axis = axis.norm() * random_direction();
           fit_order(moved, &best);
         }

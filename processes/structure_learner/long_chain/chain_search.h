@@ -36,6 +36,13 @@ void move_element(std::vector<T>* v, int from, int to) {
 /// Deterministic: the starts are drawn by a seed of its own.
 class ChainSearch {
  public:
+  /// How hard is searched where nothing seems to fit: random starts in all, orders that are begun
+  /// with, joints of which an order is searched for at most, and, in best_order(), starts from
+  /// random axes beside each that is moved.
+  struct Effort {
+    int free_starts, orders, most_ordered, random_starts;
+  };
+
   virtual ~ChainSearch() = default;
 
   int num_frames() const { return static_cast<int>(samples_.size()); }
@@ -49,6 +56,11 @@ class ChainSearch {
 
   /// What a chain leaves at most that is near enough to the right order for with_joints_moved().
   virtual double nearly_nothing() const { return 0; }
+  int free_starts() const { return effort_.free_starts; }
+  /// Random orders that a search for one is worth begun with.
+  int num_orders(int num_joints) const {
+    return num_joints <= effort_.most_ordered ? effort_.orders : 0;
+  }
 
   /// A start with random directions; lengths |w_j| as given, or random where `lengths` is empty.
   ChainAxes random_start(const std::vector<int>& signals, const std::vector<double>& lengths);
@@ -65,7 +77,8 @@ class ChainSearch {
 
  protected:
   /// An even subset of at most `max_frames` of the pair's frames, by their first readings.
-  ChainSearch(const PairData& pair, const NormalizedActions& actions, int max_frames);
+  ChainSearch(const PairData& pair, const NormalizedActions& actions, int max_frames,
+              const Effort& effort);
   /// R_end that fits the axes best.
   virtual void set_end(ChainAxes*) const {}
 
@@ -77,6 +90,7 @@ class ChainSearch {
   double uniform();
   Eigen::Vector3d random_direction();
 
+  Effort effort_;
   std::mt19937_64 random_{20100511};
 };
 

@@ -21,8 +21,6 @@ using Eigen::Vector3d;
 constexpr int kSearchFrames = 40;
 constexpr int kSearchPositions = 60;
 constexpr int kHeldStarts = 8;
-constexpr int kFreeStarts = 60;  // one in ten succeeds
-constexpr int kOrderRestarts = 3;
 constexpr int kFitIterations = 60;
 // The median angle of three axes is 1.54 σ; heavy tails and what is systematic are above that.
 constexpr double kGoal = 3;
@@ -184,10 +182,10 @@ ChainAxes find_axes(ChainSearch* search, const NormalizedActions& actions,
   for (const std::vector<int>& signals : {listed, reversed})
     for (const std::vector<double>& lengths : held_lengths(signals, actions))
       if (is_found_by(search->best_of(signals, lengths, kHeldStarts))) return best;
-  if (is_found_by(search->best_of(listed, {}, kFreeStarts))) return best;
+  if (is_found_by(search->best_of(listed, {}, search->free_starts()))) return best;
   if (order == JointOrder::kListed) return best;
   if (best.median_left < search->nearly_nothing()) return search->with_joints_moved(best);
-  for (int restart = 0; restart < kOrderRestarts; ++restart)
+  for (int restart = 0; restart < search->num_orders(static_cast<int>(listed.size())); ++restart)
     for (const std::vector<double>& lengths : held_lengths(listed, actions))
       if (is_found_by(search->best_order(listed, lengths, goal))) return best;
   return best;

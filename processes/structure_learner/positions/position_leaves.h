@@ -35,7 +35,7 @@ struct PositionLeaves {
 /// of joints is looked for (fit_long_chain()), below the few parents that are seen most often with
 /// it: of the signals that move no part with poses, then of all that do not move the parent.
 /// Independent positions must be four times as many as these signals. Their order is searched for
-/// where one part alone can be the parent, from poses at rest.
+/// where one part alone can be the parent, from poses at rest, of up to eight.
 ///
 /// `samples` as of with_uniform_parts(), of which `actions` are; `root` is where the signals of a
 /// leaf are counted from; names of the signals are for people. Updates `found`'s number of fits,
