@@ -17,6 +17,7 @@
 #include "processes/structure_learner/noise_in_common.h"
 #include "processes/structure_learner/noise_instead.h"
 #include "processes/structure_learner/one_cluster.h"
+#include "processes/structure_learner/positions/position_noise.h"
 #include "processes/structure_learner/root_pose.h"
 #include "processes/structure_learner/search/withdrawal.h"
 #include "processes/structure_learner/second_place.h"
